@@ -1,0 +1,186 @@
+"""Direct solution of the banded linear systems of a rod, for all scenes of a batch at once.
+
+A `Pattern` says where the entries of the matrix stand; `solve` eliminates without pivoting (the systems are
+positive definite, or saddle points ordered so that every pivot exists). On the CPU a small C++ kernel runs one
+scene per SIMD lane; it is compiled once per machine with the compiler that `torch.compile` needs as well. Without
+a compiler, and on other devices, a dense batched solve gives the same result more slowly.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+import hashlib
+import logging
+import os
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Pattern:
+    """Where the entries of a sparse matrix stand, in an order of unknowns that keeps them near the diagonal."""
+
+    half_bandwidth: int
+    """How far from the diagonal entries reach, k."""
+    index: Tensor
+    """Entry that stands at A[i, i+d-k] (-1: zero, -2: one), int32, shape (2k+1, n)."""
+    order: Tensor
+    """Place in the right-hand side of the i-th unknown of the elimination order, int32, shape (n,)."""
+
+    @property
+    def size(self) -> int:
+        """Number of unknowns, n."""
+        return self.order.shape[0]
+
+
+def make_pattern(size: int, places: Sequence[tuple[int, int, int]], order: Sequence[int]) -> Pattern:
+    """Build a pattern.
+
+    Args:
+        size: number of unknowns.
+        places: (row, column, entry) triples in the numbering of the right-hand side.
+        order: elimination order, a permutation of range(size).
+    """
+    rank = [0] * size
+    for position, unknown in enumerate(order):
+        rank[unknown] = position
+    k = max((abs(rank[r] - rank[c]) for r, c, _ in places), default=0)
+    index = torch.full((2 * k + 1, size), -1, dtype=torch.int32)
+    rows = torch.tensor([rank[r] for r, _, _ in places])
+    cols = torch.tensor([rank[c] for _, c, _ in places])
+    index[cols - rows + k, rows] = torch.tensor([e for _, _, e in places], dtype=torch.int32)
+    return Pattern(k, index.contiguous(), torch.tensor(list(order), dtype=torch.int32))
+
+
+# Patterns are found by name inside the operator, so that a compiled graph holds a string instead of big constants.
+_FACTORIES: dict[str, Callable[[str], Pattern]] = {}
+
+
+def register_pattern(kind: str, factory: Callable[[str], Pattern]) -> None:
+    """Let names "kind:rest" stand for `factory(rest)`."""
+    _FACTORIES[kind] = factory
+
+
+@functools.lru_cache(maxsize=256)
+def pattern(name: str) -> Pattern:
+    """Return the pattern of a registered name."""
+    kind, _, rest = name.partition(":")
+    return _FACTORIES[kind](rest)
+
+
+@functools.lru_cache(maxsize=1)
+def kernel() -> ctypes.CDLL | None:
+    """Return the compiled kernel, or None where no C++ compiler is at hand."""
+    source = Path(__file__).with_name("banded.cpp")
+    compiler = os.environ.get("CXX") or shutil.which("g++") or shutil.which("clang++")
+    if compiler is None:
+        _log.warning("no C++ compiler found (g++ or clang++): banded systems use the slower dense solver")
+        return None
+    text = source.read_bytes()
+    machine = Path("/proc/cpuinfo").read_bytes()[:2048] if Path("/proc/cpuinfo").exists() else b""
+    flags = next((line for line in machine.splitlines() if line.startswith((b"model name", b"flags"))), b"")
+    key = hashlib.sha256(text + compiler.encode() + flags).hexdigest()[:16]
+    folder = Path(os.environ.get("TORCHDLO_CACHE", Path.home() / ".cache" / "torchdlo"))
+    target = folder / f"banded-{key}.so"
+    if not target.exists():
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=folder) as build:
+            fresh = Path(build) / "banded.so"
+            options = ["-O3", "-march=native", "-ffast-math", "-fopenmp", "-shared", "-fPIC", "-std=c++17"]
+            made = subprocess.run([compiler, *options, str(source), "-o", str(fresh)], capture_output=True, text=True)
+            if made.returncode:
+                _log.warning("%s could not build the banded kernel, using the dense solver: %s", compiler, made.stderr)
+                return None
+            os.replace(fresh, target)
+    library = ctypes.CDLL(str(target))
+    for name in ("solve_float", "solve_double"):
+        getattr(library, name).argtypes = [ctypes.c_void_p] * 5 + [ctypes.c_int] * 2 + [ctypes.c_int64] + [ctypes.c_int] * 2
+        getattr(library, name).restype = None
+    return library
+
+
+def _solve_cpu(entries: Tensor, rhs: Tensor, name: str, transpose: bool) -> Tensor:
+    library = kernel()
+    if library is None or rhs.dtype not in (torch.float32, torch.float64):
+        return solve_dense(entries, rhs, name, transpose)
+    shape = pattern(name)
+    entries, rhs = entries.contiguous(), rhs.contiguous()
+    out = rhs.new_empty(rhs.shape)
+    call = library.solve_double if rhs.dtype == torch.float64 else library.solve_float
+    call(entries.data_ptr(), shape.index.data_ptr(), shape.order.data_ptr(), rhs.data_ptr(), out.data_ptr(),
+         shape.size, shape.half_bandwidth, rhs.shape[1], int(transpose), torch.get_num_threads())  # fmt: skip
+    return out
+
+
+def dense_matrix(entries: Tensor, name: str) -> Tensor:
+    """Return the matrices that a pattern and its entries describe, shape (batch, n, n)."""
+    shape = pattern(name)
+    n, k = shape.size, shape.half_bandwidth
+    values = torch.cat([entries, torch.ones_like(entries[:1]), torch.zeros_like(entries[:1])])
+    at = torch.where(shape.index >= 0, shape.index, shape.index + values.shape[0] + 0).to(entries.device).long()
+    at = torch.where(shape.index.to(at.device) == -1, values.shape[0] - 1, at)
+    at = torch.where(shape.index.to(at.device) == -2, values.shape[0] - 2, at)
+    bands = values[at.reshape(-1)].reshape(2 * k + 1, n, -1)
+    matrix = entries.new_zeros(n, n, entries.shape[1])
+    order = shape.order.to(entries.device).long()
+    for d in range(2 * k + 1):
+        rows = torch.arange(max(0, k - d), min(n, n + k - d), device=entries.device)
+        matrix[order[rows], order[rows + d - k]] = bands[d, rows]
+    return matrix.permute(2, 0, 1)
+
+
+def solve_dense(entries: Tensor, rhs: Tensor, name: str, transpose: bool) -> Tensor:
+    """Solve with full matrices: the reference of the kernel, and the way without it."""
+    matrix = dense_matrix(entries, name)
+    matrix = matrix.mT if transpose else matrix
+    return torch.linalg.solve(matrix, rhs.T.unsqueeze(-1)).squeeze(-1).T.contiguous()
+
+
+_library = torch.library.Library("torchdlo", "FRAGMENT")
+_library.define(
+    "solve_banded(Tensor entries, Tensor rhs, str pattern, bool transpose) -> Tensor",
+    tags=(torch.Tag.needs_contiguous_strides,),
+)
+_library.impl("solve_banded", _solve_cpu, "CPU")
+_library.impl("solve_banded", solve_dense, "CUDA")
+_library.impl("solve_banded", lambda entries, rhs, pattern, transpose: rhs.new_empty(rhs.shape), "Meta")
+
+
+def _save(ctx, inputs, output) -> None:
+    entries, _, ctx.pattern, ctx.transpose = inputs
+    ctx.save_for_backward(entries)
+
+
+def _backward(ctx, gradient: Tensor):
+    if ctx.needs_input_grad[0]:
+        raise RuntimeError("solve_banded: the matrix is a constant of the solve; detach its entries")
+    (entries,) = ctx.saved_tensors
+    solved = torch.ops.torchdlo.solve_banded(entries, gradient.contiguous(), ctx.pattern, not ctx.transpose)
+    return None, solved, None, None
+
+
+torch.library.register_autograd("torchdlo::solve_banded", _backward, setup_context=_save, lib=_library)
+
+
+def solve(entries: Tensor, rhs: Tensor, name: str) -> Tensor:
+    """Solve A y = rhs for every scene; differentiable in `rhs`, with A as a constant.
+
+    Newton's method needs no more: with z = z* - A^-1 R(z*, inputs) and z* already a root, the derivative of z
+    with respect to the inputs is the one of the implicit function theorem.
+
+    Args:
+        entries: values of the matrix, shape (m, batch), without gradient.
+        rhs: right-hand sides, shape (n, batch).
+        name: a registered pattern.
+    """
+    return torch.ops.torchdlo.solve_banded(entries.detach(), rhs, name, False)

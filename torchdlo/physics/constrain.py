@@ -1,0 +1,256 @@
+"""Edges of given length: direct solution of the nonlinear system of one substep.
+
+Both solvers look for positions and tensions at the end of the substep such that the momentum balance holds and every
+edge has its length (or its strain times stiffness equals its tension). Newton's method runs without graph; one more
+Newton step, taken with graph, puts the derivative of the implicit function theorem on the result.
+
+The tension acts along the edge as it was at the start (SHAKE: Ryckaert, Ciccotti, Berendsen 1977,
+doi:10.1016/0021-9991(77)90098-5), so that linear and angular momentum are exact.
+"""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchdlo.physics import banded
+from torchdlo.physics.numerics import dot, safe_norm
+from torchdlo.physics.rod import edge_vectors
+from torchdlo.physics.topology import Topology, elimination_order, following, parse, preceding
+
+
+@dataclass(frozen=True)
+class Lengths:
+    """What the lengths of the edges have to be."""
+
+    topology: Topology
+    rest: Tensor
+    """Rest lengths [m], shape (..., V, 1)."""
+    compliance: Tensor
+    """Rest length over axial stiffness, 0 for inextensible edges [m/N], shape (..., V or 1, 1)."""
+    active: Tensor
+    """1 where the edge is real and one of its ends is free [1], shape (..., V, 1)."""
+    edge_mask: Tensor
+    """1 for real edges [1], shape (V, 1)."""
+
+    def error(self, pos: Tensor, tension: Tensor) -> tuple[Tensor, Tensor]:
+        """Return how much too long each edge is [m], shape (..., V, 1), and its direction, (..., V, 3)."""
+        edge = edge_vectors(self.topology, pos, self.edge_mask)
+        length = safe_norm(edge)
+        excess = length - self.rest - self.compliance * tension
+        return excess * self.active, edge / length.clamp(min=1e-12)
+
+
+def _rows(*parts: Tensor) -> Tensor:
+    """Stack (..., V, C) tensors as the rows of an (m, batch) matrix, component by component."""
+    batch = torch.broadcast_shapes(*(p.shape[:-2] for p in parts))
+    rows = []
+    for part in parts:
+        part = part.expand(batch + part.shape[-2:])
+        n = part.dim()
+        rows.append(part.permute(n - 1, n - 2, *range(n - 2)).reshape(part.shape[-1] * part.shape[-2], -1))
+    return torch.cat(rows)
+
+
+def _vertices(rows: Tensor, batch: tuple[int, ...], components: int) -> Tensor:
+    """Turn (components V, batch) rows back into (..., V, components)."""
+    stored = rows.reshape(components, -1, *batch)
+    return stored.permute(*range(2, 2 + len(batch)), 1, 0)
+
+
+def solve_slots(topology: Topology, diagonal: Tensor, to_next: Tensor, to_prev: Tensor, rhs: Tensor) -> Tensor:
+    """Solve a system that couples neighbouring slots; arguments and result have shape (..., V, 1).
+
+    Differentiable in `rhs` only, see `banded.solve`.
+    """
+    with torch.no_grad():
+        entries = _rows(diagonal.expand_as(rhs), to_next.expand_as(rhs), to_prev.expand_as(rhs))
+    solution = banded.solve(entries, _rows(rhs), f"tridiagonal:{topology.name}")
+    return _vertices(solution, rhs.shape[:-2], 1)
+
+
+def project(lengths: Lengths, moved: Tensor, answer: Tensor, direction: Tensor, tension: Tensor, steps: int) -> tuple[Tensor, Tensor]:
+    """Enforce lengths where every vertex moves by itself: a tridiagonal system for the tensions.
+
+    Args:
+        lengths: the constraint.
+        moved: positions after the substep without tension [m], shape (..., V, 3).
+        answer: how far a force moves a vertex along each axis [m/N], 0 if held, shape (..., V, 3).
+        direction: unit vectors along which tension acts, shape (..., V, 3).
+        tension: first guess [N], shape (..., V, 1).
+        steps: Newton steps before the last one.
+
+    Returns:
+        Positions (..., V, 3) and tensions (..., V, 1).
+    """
+    topology = lengths.topology
+
+    def place(tension: Tensor, moved: Tensor, answer: Tensor, direction: Tensor) -> Tensor:
+        pull = tension * direction
+        return moved + answer * (pull - preceding(topology, pull))
+
+    def newton(tension: Tensor, along: Tensor, excess: Tensor) -> Tensor:
+        both = answer + following(topology, answer)
+        active, off = lengths.active, 1 - lengths.active
+        # The small relative shift matters only when a taut rope has no solution.
+        shift = 1 + (1e-10 if tension.dtype == torch.float64 else 1e-6)
+        diagonal = active * (shift * (along * direction * both).sum(-1, keepdim=True) + lengths.compliance) + off
+        to_next = -active * (along * following(topology, direction * answer)).sum(-1, keepdim=True)
+        to_prev = -active * (along * answer * preceding(topology, direction)).sum(-1, keepdim=True)
+        return tension + solve_slots(topology, diagonal, to_next, to_prev, excess)
+
+    with torch.no_grad():
+        tension = tension * lengths.active
+        for _ in range(steps):
+            excess, along = lengths.error(place(tension, moved, answer, direction), tension)
+            tension = newton(tension, along, excess)
+    excess, along = lengths.error(place(tension, moved, answer, direction), tension)
+    tension = newton(tension, along, excess)
+    return place(tension, moved, answer, direction), tension
+
+
+@dataclass(frozen=True)
+class Inertia:
+    """Resistance of positions to change within a substep: masses, and stiffness taken as inertia.
+
+    Written for the change y of positions against unforced motion, it gives the impulse-like force
+    `vertex` y + K y, K the stiffness of a straight chain of hinges against turning of its edges.
+    """
+
+    vertex: Tensor
+    """Mass of the vertices along each axis [kg], shape (..., V, 3)."""
+    hinge: Tensor
+    """Weights of the hinges [kg m^2], shape (..., V, 1)."""
+    edge: Tensor
+    """Rest lengths of real edges, 1 for dummies [m], shape (..., V, 1)."""
+    edge_mask: Tensor
+    """1 for real edges [1], shape (V, 1)."""
+
+    def bending(self, topology: Topology, y: Tensor) -> Tensor:
+        """Return K y, shape (..., V, 3)."""
+        turn = (following(topology, y) - y) * self.edge_mask / self.edge
+        moment = self.hinge * (turn - preceding(topology, turn))
+        push = (moment - following(topology, moment)) * self.edge_mask / self.edge
+        return preceding(topology, push) - push
+
+    def apply(self, topology: Topology, y: Tensor) -> Tensor:
+        """Return vertex y + K y, shape (..., V, 3)."""
+        return self.vertex * y + self.bending(topology, y)
+
+    def bands(self, topology: Topology) -> tuple[Tensor, Tensor, Tensor]:
+        """Return K's entries to the same, the next, and the next but one vertex, shape (..., V, 1) each."""
+        after = self.edge_mask / self.edge
+        before = preceding(topology, after)
+        centre = after + before
+        w = self.hinge
+        next_w, prev_w = following(topology, w), preceding(topology, w)
+        same = w * centre.square() + next_w * after.square() + prev_w * before.square()
+        one = -w * centre * after - next_w * after * following(topology, centre)
+        two = next_w * after * following(topology, after)
+        return same, one, two
+
+
+def balance(
+    lengths: Lengths, inertia: Inertia, moved: Tensor, free: Tensor, force: Tensor, scale: Tensor,
+    direction: Tensor, ahead: Tensor, tension: Tensor, turning: float, steps: int,
+) -> tuple[Tensor, Tensor]:  # fmt: skip
+    """Enforce lengths where inertia couples the vertices: a banded saddle-point system for positions and tensions.
+
+    Args:
+        lengths: the constraint.
+        inertia: resistance to change.
+        moved: positions without any force, or where held vertices have to be [m], shape (..., V, 3).
+        free: 1 for free, 0 for held vertices [1], shape (V, 1).
+        force: force without tension [N], shape (..., V, 3).
+        scale: what turns force into inertia times displacement [s^2], shape (..., 1, 1).
+        direction: unit edges at the start, shape (..., V, 3).
+        ahead: what pulled edges lean towards beyond that [1], shape (..., V, 3).
+        tension: tension of the last substep [N], shape (..., V, 1).
+        turning: how much a pulled edge's direction follows the change of the positions.
+        steps: Newton steps before the last one.
+
+    Returns:
+        Positions (..., V, 3) and tensions (..., V, 1).
+    """
+    topology = lengths.topology
+    pulled = lengths.active * (tension.detach() > 0)
+    lean, start = turning * pulled / lengths.rest, direction + pulled * ahead
+
+    def residual(pos: Tensor, impulse: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        y = pos - moved
+        along_start = start + lean * (following(topology, y) - y)
+        pull = impulse * along_start
+        momentum = inertia.apply(topology, y) - scale * force - (pull - preceding(topology, pull))
+        excess, along = lengths.error(pos, impulse / scale)
+        return momentum * free, excess, along, along_start
+
+    def newton(pos: Tensor, impulse: Tensor) -> tuple[Tensor, Tensor]:
+        momentum, excess, along, along_start = residual(pos, impulse)
+        with torch.no_grad():
+            same, one, two = inertia.bands(topology)
+            string = impulse * lean
+            string = string.clamp(min=0.0)
+            after, active = following(topology, free), lengths.active
+            entries = _rows(
+                free * (inertia.vertex + same + string + preceding(topology, string)) + (1 - free),
+                free * (one - string),
+                free * preceding(topology, one - string),
+                free * two,
+                free * preceding(topology, preceding(topology, two)),
+                -free * active * along_start,
+                after * active * along_start,
+                -active * along,
+                active * along,
+                -active * lengths.compliance / scale + (active - 1),
+            )
+        rhs = -_rows(momentum, excess)
+        step = banded.solve(entries, rhs, f"saddle:{topology.name}")
+        batch, v3 = pos.shape[:-2], 3 * pos.shape[-2]
+        return pos + _vertices(step[:v3], batch, 3), impulse + _vertices(step[v3:], batch, 1)
+
+    with torch.no_grad():
+        pos, impulse = moved.detach(), tension * lengths.active * scale
+        for _ in range(steps):
+            pos, impulse = newton(pos, impulse)
+    pos = torch.where(free > 0, pos, moved)
+    pos, impulse = newton(pos, impulse)
+    return pos, impulse / scale
+
+
+def _saddle(name: str) -> banded.Pattern:
+    """Pattern of `balance`: unknowns x, y, z of all vertices, then tensions; see its `entries` for the numbering."""
+    topology = parse(name)
+    v, after = topology.size, topology.successor()
+    order = elimination_order(topology)
+    rank = {slot: k for k, slot in enumerate(order)}
+    unknowns: list[int] = []
+    edges = sorted(range(v), key=lambda i: max(rank[i], rank[after[i]]) if _is_edge(topology, i) else rank[i])
+    for slot in order:
+        unknowns += [slot, v + slot, 2 * v + slot]
+        while edges and (max(rank[edges[0]], rank[after[edges[0]]]) if _is_edge(topology, edges[0]) else rank[edges[0]]) <= rank[slot]:
+            unknowns.append(3 * v + edges.pop(0))
+    places: list[tuple[int, int, int]] = []
+    for i in range(v):
+        near, far = after[i], after[after[i]]
+        inside, further = _is_edge(topology, i), _is_edge(topology, i) and _is_edge(topology, near)
+        for c in range(3):
+            row = c * v
+            places.append((row + i, row + i, row + i))
+            if inside:
+                places += [(row + i, row + near, 3 * v + i), (row + near, row + i, 4 * v + near)]
+                places += [(row + i, 3 * v + i, 7 * v + row + i), (row + near, 3 * v + i, 10 * v + row + i)]
+                places += [(3 * v + i, row + i, 13 * v + row + i), (3 * v + i, row + near, 16 * v + row + i)]
+            if further:
+                places += [(row + i, row + far, 5 * v + i), (row + far, row + i, 6 * v + far)]
+        places.append((3 * v + i, 3 * v + i, 19 * v + i))
+    return banded.make_pattern(4 * v, places, unknowns)
+
+
+def _is_edge(topology: Topology, slot: int) -> bool:
+    return topology.edge_mask()[slot] > 0
+
+
+banded.register_pattern("saddle", functools.cache(_saddle))

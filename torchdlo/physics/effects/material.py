@@ -1,0 +1,130 @@
+"""Effects that change the rods themselves: natural curvature, stiffness along the rope, extra mass, inner friction."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from torchdlo.physics import tree
+from torchdlo.physics.effect import Effect, Param, Values
+from torchdlo.physics.effects.elastic import curvature
+from torchdlo.physics.rod import RodParams, View
+from torchdlo.physics.topology import Topology, preceding
+
+
+def arclength(params: RodParams) -> tuple[Tensor, Tensor]:
+    """Return arclength of vertices [m], shape (..., V, 1), and the whole length [m], shape (..., 1, 1).
+
+    Rods that share a scene are counted as one, end to end.
+    """
+    real = params.rest.length * params.rest.edge_mask
+    run = torch.cumsum(real, -2)
+    return run - real, run[..., -1:, :]
+
+
+@dataclass(frozen=True)
+class RestCurvature(Effect):
+    """Natural curvature, the same all along the rope, in the material frame. Needs `BendFrame`."""
+
+    name: ClassVar[str] = "rest_curvature"
+    params: ClassVar[dict[str, Param]] = {
+        "curvature": Param((0.0, 0.0), -30.0, 30.0, "1/m", "linear", 0.0, "Curvature about the two material directors.")
+    }
+
+    def alter(self, topology: Topology, params: RodParams, values: Values) -> RodParams:
+        """Add the curvature to the rest shape."""
+        length = params.rest.length
+        hinge = 0.5 * (length + preceding(topology, length)) * params.rest.hinge_mask
+        rest = tree.replace(params.rest, curvature=params.rest.curvature + hinge * values["curvature"])
+        return tree.replace(params, rest=rest)
+
+
+@dataclass(frozen=True)
+class NonuniformStiffness(Effect):
+    """Bending stiffness times 1 + slope (s/L - 1/2) and times a soft or stiff spot (factor at its centre)."""
+
+    name: ClassVar[str] = "nonuniform_stiffness"
+    params: ClassVar[dict[str, Param]] = {
+        "position": Param(0.5, 0.0, 1.0, "1", "linear", None, "Centre of the spot as a fraction of the length."),
+        "width": Param(0.1, 0.02, 0.5, "1", "log", None, "Half width of the spot as a fraction of the length."),
+        "factor": Param(0.0, -2.5, 2.5, "1", "linear", 0.0, "Logarithm of stiffness at the spot over that elsewhere."),
+        "slope": Param(0.0, -1.8, 1.8, "1", "linear", 0.0, "Relative change of stiffness from end to end."),
+    }
+
+    def alter(self, topology: Topology, params: RodParams, values: Values) -> RodParams:
+        """Scale the bending stiffness of the hinges."""
+        s, length = arclength(params)
+        at = s / length
+        spot = torch.exp(-0.5 * ((at - values["position"]) / values["width"]).square())
+        scale = torch.exp(values["factor"] * spot) * (1 + values["slope"] * (at - 0.5))
+        material = tree.replace(params.material, bend=params.material.bend * scale)
+        return tree.replace(params, material=material)
+
+
+@dataclass(frozen=True)
+class PointMass(Effect):
+    """An extra mass at one place, shared between the two vertices next to it; it has weight and inertia."""
+
+    name: ClassVar[str] = "point_mass"
+    params: ClassVar[dict[str, Param]] = {
+        "position": Param(0.5, 0.0, 10.0, "m", "linear", None, "Place along the rope."),
+        "mass": Param(0.0, 0.0, 1.0, "kg", "linear", 0.0, "The extra mass."),
+    }
+
+    def alter(self, topology: Topology, params: RodParams, values: Values) -> RodParams:
+        """Add the mass to the vertices."""
+        s, length = arclength(params)
+        real = params.rest.length * params.rest.edge_mask
+        at = torch.minimum(values["position"].clamp(min=0.0), length)
+        inside = (at >= s) & (at <= s + real) & (real > 0)
+        after = torch.where(inside, (at - s) / params.rest.length, 0.0)
+        weight = torch.where(inside, 1 - after, 0.0) + preceding(topology, after)
+        # At a vertex both neighbouring edges claim the place.
+        mass = params.material.mass + values["mass"] * weight / weight.sum(-2, keepdim=True)
+        return tree.replace(params, material=tree.replace(params.material, mass=mass))
+
+
+@dataclass(frozen=True)
+class BendingDamping(Effect):
+    """Kelvin-Voigt bending: a moment proportional to the rate of curvature."""
+
+    name: ClassVar[str] = "bending_damping"
+    frames: ClassVar[bool] = True
+    params: ClassVar[dict[str, Param]] = {
+        "coefficient": Param(0.0, 0.0, 1.0, "N m^2 s", "linear", 0.0, "Bending moment per rate of curvature.")
+    }
+
+    def loads(self, view: View, values: Values) -> Values:
+        """Return the moment's loads and how they answer to turning."""
+        hinge = curvature(view)
+        resistance = values["coefficient"] / view.hinge_length * view.params.rest.hinge_mask
+        return {**hinge.pull_back(view, resistance * hinge.rate(view)), "hinge_drag": resistance}
+
+
+@dataclass(frozen=True)
+class BendingPlasticity(Effect):
+    """Natural curvature flows towards the curvature while its elastic part is beyond yield. Needs `BendFrame`.
+
+    In a time dt the excess |k_el| - yield shrinks by exp(-rate dt), whatever the substep.
+    """
+
+    name: ClassVar[str] = "bending_plasticity"
+    frames: ClassVar[bool] = True
+    params: ClassVar[dict[str, Param]] = {
+        "yield_curvature": Param(1e6, 0.1, 1e6, "1/m", "log", 1e6, "Elastic curvature beyond which it flows."),
+        "rate": Param(10.0, 0.01, 1e4, "1/s", "log", None, "Rate of the flow."),
+    }
+
+    def flow(self, view: View, values: Values) -> Tensor:
+        """Return the change of the plastic curvature."""
+        natural = view.params.rest.curvature + view.state.plastic
+        elastic = (curvature(view).kappa - natural) * view.params.rest.hinge_mask
+        size = elastic.square().sum(-1, keepdim=True)
+        limit = values["yield_curvature"] * view.hinge_length
+        beyond = size > limit.square()
+        share = 1 - limit / torch.where(beyond, size, 1.0).sqrt()
+        fraction = 1 - torch.exp(-values["rate"] * view.dt)
+        return torch.where(beyond, fraction * share, 0.0) * elastic

@@ -1,0 +1,69 @@
+"""A horizontal table: it carries the rope, and it may rub."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from torchdlo.physics.effect import Effect, Param, Values
+from torchdlo.physics.rod import View
+
+_HEIGHT = Param(0.0, -10.0, 10.0, "m", "linear", None, "Height of the table's surface.")
+_HARDNESS = Param(500.0, 50.0, 1e4, "rad/s", "log", None, "Frequency at which a vertex would bounce on it.")
+
+
+def _pressure(view: View, values: Values) -> tuple[Tensor, Tensor]:
+    """Return the upward force on vertices [N] and its stiffness [N/m], shape (..., V, 1) each."""
+    stiffness = view.params.material.mass * values["hardness"].square()
+    depth = values["height"] + view.params.material.radius - view.state.pos[..., 2:]
+    touching = depth > 0
+    stiffness = torch.where(touching, stiffness, 0.0)
+    return stiffness * depth, stiffness
+
+
+@dataclass(frozen=True)
+class Table(Effect):
+    """Support without friction: a stiff spring per vertex, damped at half its critical value while it is pressed."""
+
+    name: ClassVar[str] = "table"
+    params: ClassVar[dict[str, Param]] = {"height": _HEIGHT, "hardness": _HARDNESS}
+
+    def loads(self, view: View, values: Values) -> Values:
+        """Return the upward force, its stiffness and resistance."""
+        force, stiffness = _pressure(view, values)
+        resistance = torch.where(stiffness > 0, view.params.material.mass * values["hardness"], 0.0)
+        up = force - resistance * view.state.vel[..., 2:]
+        none = torch.zeros_like(up)
+        return {
+            "force": torch.cat([none, none, up], -1),
+            "stiffness": torch.cat([none, none, stiffness], -1),
+            "drag": torch.cat([none, none, resistance], -1),
+        }
+
+
+@dataclass(frozen=True)
+class TableFriction(Effect):
+    """Coulomb friction on the table, -mu N v / sqrt(|v|^2 + slip^2) along the surface."""
+
+    name: ClassVar[str] = "table_friction"
+    params: ClassVar[dict[str, Param]] = {
+        "mu": Param(0.0, 0.0, 2.0, "1", "linear", 0.0, "Coefficient of friction."),
+        "slip": Param(1e-3, 1e-5, 0.1, "m/s", "log", None, "Speed below which friction grows with speed: creep."),
+        "height": _HEIGHT,
+        "hardness": _HARDNESS,
+    }
+
+    def loads(self, view: View, values: Values) -> Values:
+        """Return the friction force and how it answers to velocity."""
+        pressure, _ = _pressure(view, values)
+        along = view.state.vel[..., :2]
+        speed = (along.square().sum(-1, keepdim=True) + values["slip"].square()).sqrt()
+        resistance = values["mu"] * pressure / speed
+        none = torch.zeros_like(resistance)
+        return {
+            "force": torch.cat([-resistance * along, none], -1),
+            "drag": torch.cat([resistance, resistance, none], -1),
+        }

@@ -1,0 +1,237 @@
+"""One substep of the rods: kick by the loads, drift, keep lengths, carry the frames.
+
+Both integrators are Stoermer-Verlet in positions (velocities live half a substep earlier), so second order in the
+substep and free of numerical damping. "explicit" divides forces by masses. "implicit" divides by masses plus
+dt^2/4 or more of the bending stiffness of a straight chain: with a constant inertia M + g dt^2 K the frequency w of
+a mode becomes w / sqrt(1 + g dt^2 w^2), which is below the stability limit 2/dt for every g >= 1/4; g = 1/4 is the
+trapezoidal rule.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchdlo.physics import effect, rod, rotation, tree
+from torchdlo.physics.constrain import Inertia, Lengths, balance, project, solve_slots
+from torchdlo.physics.effect import Effect, Values
+from torchdlo.physics.numerics import wrap
+from torchdlo.physics.rod import RodParams, RodState, View
+from torchdlo.physics.topology import Topology, following, preceding
+
+INTEGRATORS = ("explicit", "implicit")
+TWISTS = ("none", "dynamic", "quasistatic")
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How the rods are stepped; all static."""
+
+    topology: Topology
+    effects: tuple[Effect, ...]
+    dt: float
+    """Substep [s]."""
+    integrator: str = "explicit"
+    twist: str = "dynamic"
+    """"dynamic" (edges have rotational inertia), "quasistatic" (twist is in balance at all times) or "none"."""
+    constrained: bool = True
+    """Whether edge lengths are solved for (inextensible, or stiff) instead of left to forces."""
+    held_vertices: tuple[int, ...] = ()
+    held_edges: tuple[int, ...] = ()
+    """Edges whose material frame is prescribed."""
+    newton: int = 3
+    """Newton steps for lengths."""
+    gamma: float = 0.3
+    """Share of dt^2 times stiffness that counts as inertia in "implicit"."""
+    ahead: float = 0.1
+    """In "implicit", stiff forces are taken this share of a substep ahead, which damps what is too fast to follow."""
+
+    @property
+    def frames(self) -> bool:
+        """Whether material frames are needed."""
+        return self.twist != "none" or any(e.frames for e in self.effects)
+
+
+@tree.struct
+class Targets:
+    """Where held vertices and edges are at the end of a substep."""
+
+    pos: Tensor
+    """Positions of the held vertices [m], shape (..., H, 3)."""
+    director: Tensor
+    """First material directors of the held edges, shape (..., G, 3)."""
+
+
+def _spread(values: Tensor, slots: tuple[int, ...], size: int, otherwise: Tensor) -> Tensor:
+    """Return `otherwise` (..., V, C) with `values` (..., H, C) put at the given slots."""
+    if not slots:
+        return otherwise
+    place = {slot: k for k, slot in enumerate(slots)}
+    pieces, start = [], 0
+    for slot in sorted(place):
+        if slot > start:
+            pieces.append(otherwise[..., start:slot, :])
+        k = place[slot]
+        pieces.append(values[..., k : k + 1, :].expand(*otherwise.shape[:-2], 1, otherwise.shape[-1]))
+        start = slot + 1
+    if start < size:
+        pieces.append(otherwise[..., start:, :])
+    return tree.cat_vertices(pieces)
+
+
+def _free(slots: tuple[int, ...], like: Tensor, size: int) -> Tensor:
+    """Return 1 for free and 0 for held slots, shape (V, 1)."""
+    return like.new_tensor([[0.0] if slot in slots else [1.0] for slot in range(size)])
+
+
+def substep(settings: Settings, params: RodParams, values: dict[str, Values], state: RodState, targets: Targets, first: Tensor) -> RodState:
+    """Advance the rods by one substep.
+
+    Args:
+        settings: static choices.
+        params: rest shape and material, before effects alter them.
+        values: numbers of the effects, by effect and name.
+        state: the rods now.
+        targets: where held parts are at the end.
+        first: 1 in the very first substep, when velocities stand at the same time as positions, else 0;
+            shape (..., 1, 1).
+    """
+    topology, dt = settings.topology, settings.dt
+    for each in settings.effects:
+        params = each.alter(topology, params, values.get(each.name, {}))
+    now = rod.view(topology, params, state, dt)
+    loads = effect.total(settings.effects, now, values)
+    pos, tension = _translate(settings, now, loads, targets, first)
+    fields: dict[str, Tensor] = {"pos": pos, "tension": tension}
+    half = torch.exp(-0.5 * dt * loads["rate"]) if "rate" in loads else 1.0
+    fields["vel"] = (pos - state.pos) / dt * half
+    for each in settings.effects:
+        change = each.flow(now, values.get(each.name, {}))
+        if change is not None:
+            fields["plastic"] = state.plastic + change
+    if settings.frames:
+        fields["director"], fields["ref_twist"] = rod.advance_frames(topology, params, now, pos)
+    moved = tree.replace(state, **fields)
+    if settings.twist == "dynamic":
+        return _turn(settings, now, loads, moved, targets, first)
+    if settings.twist == "quasistatic":
+        return settle_twist(settings, params, values, moved, targets)
+    return moved
+
+
+def _translate(settings: Settings, now: View, loads: Values, targets: Targets, first: Tensor) -> tuple[Tensor, Tensor]:
+    """Return positions after the substep and tensions."""
+    topology, dt, state, rest, material = settings.topology, settings.dt, now.state, now.params.rest, now.params.material
+    force = torch.zeros_like(state.pos)
+    if "gradient" in loads:
+        pull = loads["gradient"] * rest.edge_mask
+        force = pull - now.prev(pull)
+    if "force" in loads:
+        force = force + loads["force"]
+    if "acceleration" in loads:
+        force = force + material.mass * loads["acceleration"]
+    # v' = d (d v + s dt F / m), d half of the uniform decay, s a half in the first substep.
+    half = torch.exp(-0.5 * dt * loads["rate"]) if "rate" in loads else 1.0
+    drift = state.pos + dt * half * state.vel
+    scale = dt * dt * half * (1 - 0.5 * first)
+    free = _free(settings.held_vertices, state.pos, topology.size)
+    vertex = material.mass.expand_as(state.pos)
+    if "drag" in loads:
+        vertex = vertex + dt * loads["drag"]
+    implicit = settings.integrator == "implicit"
+    if implicit and "stiffness" in loads:
+        vertex = vertex + settings.gamma * dt * dt * loads["stiffness"]
+    active = rest.edge_mask * (1 - (1 - free) * (1 - following(topology, free)))
+    lengths = Lengths(topology, rest.length, rest.length / material.stretch, active, rest.edge_mask)
+    if implicit:
+        # Forces at x + ahead dt v, and their answer to the change of v.
+        share, drift_ahead = settings.gamma + 0.5 * settings.ahead, settings.ahead * dt * state.vel
+        stiff = dt * dt * loads.get("hinge_stiffness", torch.zeros_like(now.length)) * rest.hinge_mask
+        hinge = share * stiff
+        if "hinge_drag" in loads:
+            hinge = hinge + 0.5 * dt * loads["hinge_drag"]
+        inertia = Inertia(vertex, hinge, rest.length, rest.edge_mask)
+        force = force - tree.replace(inertia, hinge=stiff / (dt * dt)).bending(topology, drift_ahead)
+        moved = _spread(targets.pos, settings.held_vertices, topology.size, drift)
+        ahead = (now.next(drift_ahead) - drift_ahead) / rest.length
+        return balance(lengths, inertia, moved, free, force, scale.expand_as(now.length[..., :1, :]), now.tangent,
+                       ahead, state.tension, share, settings.newton - 1)  # fmt: skip
+    answer = scale / vertex * free
+    moved = _spread(targets.pos, settings.held_vertices, topology.size, drift + answer * force)
+    if not settings.constrained:
+        return moved, state.tension
+    return project(lengths, moved, answer, now.tangent, state.tension, settings.newton - 1)
+
+
+def _twist_matrix(now: View, loads: Values) -> tuple[Tensor, Tensor]:
+    """Return the diagonal and the coupling to the next edge of the twists' second derivatives, (..., V, 1) each."""
+    hessian = loads["twist_hessian"]
+    return hessian[..., 2:] + now.next(hessian[..., :1]), now.next(hessian[..., 1:2])
+
+
+def _prescribed(settings: Settings, params: RodParams, state: RodState, targets: Targets, angle: Tensor) -> Tensor:
+    """Return twists with those of held edges set so that their first material director is the target."""
+    if not settings.held_edges:
+        return angle
+    e = rod.edge_vectors(settings.topology, state.pos, params.rest.edge_mask)
+    slots = list(settings.held_edges)
+    tangent = e[..., slots, :]
+    tangent = tangent / tangent.norm(dim=-1, keepdim=True)
+    last = state.twist[..., slots, :]
+    held = last + wrap(rotation.signed_angle(state.director[..., slots, :], targets.director, tangent) - last)
+    return _spread(held, settings.held_edges, settings.topology.size, angle)
+
+
+def _turn(settings: Settings, now: View, loads: Values, moved: RodState, targets: Targets, first: Tensor) -> RodState:
+    """Advance twists by their rotational inertia."""
+    dt, state, rest, inertia = settings.dt, now.state, now.params.rest, now.params.material.inertia
+    half = torch.exp(-0.5 * dt * loads["twist_decay"]) if "twist_decay" in loads else 1.0
+    torque = loads.get("torque", torch.zeros_like(inertia)) * rest.edge_mask
+    kick = dt * (1 - 0.5 * first) * torque
+    free = _free(settings.held_edges, state.pos, settings.topology.size) * rest.edge_mask
+    if settings.integrator == "implicit" and "twist_hessian" in loads:
+        same, after = _twist_matrix(now, loads)
+        same, after = settings.gamma * dt * dt * same, settings.gamma * dt * dt * after
+
+        def newton(change: Tensor) -> Tensor:
+            coupled = after * now.next(change) + now.prev(after * change)
+            excess = (kick - (inertia + same) * change - coupled) * free
+            return change + solve_slots(settings.topology, free * (inertia + same) + 1 - free, free * after,
+                                        free * now.prev(after), excess)  # fmt: skip
+
+        with torch.no_grad():
+            start = newton(torch.zeros_like(kick))
+        change = newton(start)
+    else:
+        change = kick / inertia * free
+    rate = half * (half * state.twist_rate + change)
+    angle = _prescribed(settings, now.params, moved, targets, state.twist + dt * rate * free)
+    return tree.replace(moved, twist=angle, twist_rate=(angle - state.twist) / dt)
+
+
+def settle_twist(settings: Settings, params: RodParams, values: dict[str, Values], state: RodState, targets: Targets) -> RodState:
+    """Return the state with twists at which no free edge feels a torque (two Newton steps from the last ones).
+
+    Bergou 2008, section 4.2: twist waves are much faster than bending, so twist is taken to be in balance.
+    """
+    topology = settings.topology
+    effects = [e for e in settings.effects if e.name in ("bend", "twist")]
+    free = _free(settings.held_edges, state.pos, topology.size) * params.rest.edge_mask
+
+    def newton(angle: Tensor, state: RodState) -> Tensor:
+        here = rod.view(topology, params, tree.replace(state, twist=angle), settings.dt)
+        loads = effect.total(effects, here, values)
+        with torch.no_grad():
+            same, after = _twist_matrix(here, loads)
+            # A tiny spring on every edge: a rod free at both ends may spin as a whole.
+            same = same + 1e-9 * same.amax(-2, keepdim=True)
+        return angle + solve_slots(topology, free * same + 1 - free, free * after, free * here.prev(after), loads["torque"] * free)
+
+    angle = _prescribed(settings, params, state, targets, state.twist)
+    with torch.no_grad():
+        start = newton(angle, state)
+    start = torch.where(free > 0, start, angle)
+    settled = newton(start, state)
+    return tree.replace(state, twist=settled, twist_rate=(settled - state.twist) / settings.dt)

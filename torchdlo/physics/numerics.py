@@ -1,0 +1,45 @@
+"""Operations whose derivative stays finite where the plain ones have none: the only home of small numbers."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+
+def tiny(x: Tensor) -> float:
+    """Return a length far below any rope's and far above the underflow of a square, by dtype."""
+    return 1e-12 if x.dtype == torch.float64 else 1e-8
+
+
+def dot(a: Tensor, b: Tensor) -> Tensor:
+    """Return the scalar product over the last axis, kept as size 1; shape (..., 1)."""
+    return (a * b).sum(-1, keepdim=True)
+
+
+def cross(a: Tensor, b: Tensor) -> Tensor:
+    """Return the vector product over the last axis, shape (..., 3)."""
+    return torch.linalg.cross(a, b, dim=-1)
+
+
+def safe_norm(x: Tensor) -> Tensor:
+    """Return the length of vectors over the last axis, shape (..., 1); its gradient at zero is zero."""
+    squared = dot(x, x)
+    zero = squared <= tiny(x) ** 2
+    return torch.where(zero, 0.0, torch.where(zero, 1.0, squared).sqrt())
+
+
+def normalize(x: Tensor) -> Tensor:
+    """Return unit vectors; zero vectors give zero with a zero gradient."""
+    length = safe_norm(x)
+    return x / torch.where(length == 0, 1.0, length)
+
+
+def wrap(angle: Tensor) -> Tensor:
+    """Return the angle [rad] in (-pi, pi] that differs by whole turns; derivative 1."""
+    turns = torch.round(angle.detach() / (2 * torch.pi))
+    return angle - 2 * torch.pi * turns
+
+
+def smooth_positive(x: Tensor) -> Tensor:
+    """Return max(x, 0)."""
+    return x.clamp(min=0.0)

@@ -1,0 +1,96 @@
+"""Trees of tensors: frozen dataclasses registered as pytrees, and the storage layout they share.
+
+Logical shapes put the batch first, (..., V, C); storage puts it last, so that one instruction works on many
+scenes and vertices of one scene sit a whole batch apart. `batch_innermost` is the only place that knows.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from typing import Any, TypeVar, dataclass_transform
+
+import torch
+from torch import Tensor
+from torch.utils import _pytree as pytree
+
+T = TypeVar("T")
+
+
+@dataclass_transform(frozen_default=True)
+def struct(cls: type[T]) -> type[T]:
+    """Make a frozen dataclass whose fields are tensors or trees of tensors, known to torch's pytrees."""
+    cls = dataclasses.dataclass(frozen=True)(cls)
+    torch.export.register_dataclass(cls, serialized_type_name=f"{cls.__module__}.{cls.__qualname__}")
+    return cls
+
+
+def leaves(tree: Any) -> list[Tensor]:
+    """Return the tensors of a tree in a fixed order."""
+    return pytree.tree_leaves(tree)
+
+
+def map(fn: Callable[..., Tensor], tree: T, *others: T) -> T:
+    """Apply `fn` to matching leaves of one or several trees of the same structure."""
+    return pytree.tree_map(fn, tree, *others)
+
+
+def flatten(tree: T) -> tuple[list[Tensor], Callable[[Sequence[Tensor]], T]]:
+    """Return the leaves and a function that rebuilds the tree from such leaves."""
+    values, spec = pytree.tree_flatten(tree)
+    return values, lambda new: pytree.tree_unflatten(list(new), spec)
+
+
+def replace(tree: T, **fields: Any) -> T:
+    """Return a copy of a struct with some fields exchanged."""
+    return dataclasses.replace(tree, **fields)
+
+
+def detach(tree: T) -> T:
+    """Cut a tree from its gradient history."""
+    return map(lambda leaf: leaf.detach(), tree)
+
+
+def to(tree: T, *args: Any, **kwargs: Any) -> T:
+    """Move floating-point leaves to another dtype, all leaves to another device; keeps the layout."""
+
+    def move(leaf: Tensor) -> Tensor:
+        if not leaf.is_floating_point():
+            device = kwargs.get("device", next((a for a in args if not isinstance(a, torch.dtype)), None))
+            return leaf if device is None else leaf.to(device)
+        return leaf.to(*args, **kwargs)
+
+    return map(move, tree)
+
+
+def where(condition: Tensor, tree: T, other: T) -> T:
+    """Choose per scene: leaves of `tree` where `condition` (batch,) holds, else those of `other`."""
+
+    def choose(a: Tensor, b: Tensor) -> Tensor:
+        extra = a.dim() - condition.dim()
+        return torch.where(condition.reshape(condition.shape + (1,) * extra), a, b)
+
+    return map(choose, tree, other)
+
+
+def stack(trees: Sequence[T], dim: int = 0) -> T:
+    """Stack equal trees along a new axis, e.g. the states of a trajectory along time."""
+    return map(lambda *parts: torch.stack(parts, dim), trees[0], *trees[1:])
+
+
+def batch_innermost(x: Tensor) -> Tensor:
+    """Return `x`, shape (..., V, C), with the same values stored as (C, V, ...)."""
+    n = x.dim()
+    if n < 3:
+        return x
+    stored = x.permute(n - 1, n - 2, *range(n - 2)).contiguous()
+    return stored.permute(*range(2, n), 1, 0)
+
+
+def cat_vertices(parts: Sequence[Tensor]) -> Tensor:
+    """Concatenate (..., v, C) pieces along the vertex axis; the result is stored batch-innermost."""
+    n = parts[0].dim()
+    if n < 3:
+        return torch.cat(list(parts), -2)
+    stored = torch.cat([p.permute(n - 1, n - 2, *range(n - 2)) for p in parts], 1)
+    return stored.permute(*range(2, n), 1, 0)
