@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -200,17 +201,48 @@ def hold(scene: Scene, state: State) -> Control:
     return Control(rods.pos[..., list(scene.held_vertices), :], material[..., list(scene.held_edges), :])
 
 
-def step(scene: Scene, params: Params, state: State, control: Control) -> State:
-    """Advance a scene by `scene.dt`; held parts move evenly to where `control` wants them."""
-    settings, n = scene.settings, scene.substeps
-    rods, time = state.rods, state.time
-    start = rods.pos[..., list(scene.held_vertices), :]
-    for k in range(n):
-        share = (k + 1) / n
-        targets = Targets(start + share * (control.pos - start), control.director)
-        rods = substep(settings, params.rods, params.effects, rods, targets, (time == 0).to(time.dtype))
-        time = time + settings.dt
-    return State(rods, time)
+def advance(scene: Scene, params: Params, state: State, start: Tensor, control: Control, share: Tensor) -> State:
+    """Advance a scene by one substep.
+
+    Args:
+        scene: static choices.
+        params: constant numbers.
+        state: the scene now.
+        start: positions of the held vertices when the step began [m], shape (..., H, 3).
+        control: where held parts are at the end of the step.
+        share: part of the step that is over after this substep, shape (1,).
+    """
+    settings = scene.settings
+    targets = Targets(start + share * (control.pos - start), control.director)
+    first = (state.time == 0).to(state.time.dtype)
+    rods = substep(settings, params.rods, params.effects, state.rods, targets, first)
+    return State(rods, state.time + settings.dt)
+
+
+def step(scene: Scene, params: Params, state: State, control: Control, *, advance=advance) -> State:
+    """Advance a scene by `scene.dt`; held parts move evenly to where `control` wants them.
+
+    Args:
+        scene: static choices.
+        params: constant numbers.
+        state: the scene now.
+        control: where held parts are at the end.
+        advance: what does a substep; `stepper` puts a compiled one here.
+    """
+    start = state.rods.pos[..., list(scene.held_vertices), :]
+    for k in range(scene.substeps):
+        share = start.new_full((1,), (k + 1) / scene.substeps)
+        state = advance(scene, params, state, start, control, share)
+    return state
+
+
+def stepper(scene: Scene, *, compiled: bool = True):
+    """Return `step` bound to a scene: a function of (params, state, control).
+
+    Compiled steps take some ten seconds at the first call and are many times faster after it. Only a substep is
+    compiled, so that the number of substeps does not matter. They need a C++ compiler on the CPU.
+    """
+    return partial(step, scene, advance=torch.compile(advance, fullgraph=True, dynamic=False) if compiled else advance)
 
 
 def finite(state: State) -> Tensor:
@@ -219,4 +251,4 @@ def finite(state: State) -> Tensor:
     return ok & torch.isfinite(state.rods.vel).all(-1).all(-1)
 
 
-__all__ = ["Control", "Params", "Rope", "Scene", "State", "check_step", "finite", "hold", "limits", "make", "rollout", "step"]
+__all__ = ["Control", "Params", "Rope", "Scene", "State", "check_step", "finite", "hold", "limits", "make", "rollout", "step", "stepper"]

@@ -47,6 +47,8 @@ class Rope:
     """Initial velocities [m/s], shape (..., n, 3); at rest if not given."""
     director: Tensor | None = None
     """First material director of the first edge, shape (..., 3); made normal to it. Any if not given."""
+    rest_director: Tensor | None = None
+    """The same in the rest shape; `director` if not given."""
     bend2: Number | None = None
     """Bending stiffness [N m^2] about the second material director if it differs from `bend`."""
 
@@ -116,6 +118,7 @@ def _check(index: int, rope: Rope) -> None:
         raise ValueError(f"rope {index}: {x.shape[-2]} vertices given; a rope needs at least 3")
     if not bool(torch.isfinite(x).all()):
         raise ValueError(f"rope {index}: positions contain NaN or infinity; every coordinate must be a number")
+    x = x.detach()
     steps = torch.roll(x, -1, -2) - x if rope.closed else x[..., 1:, :] - x[..., :-1, :]
     short = steps.norm(dim=-1)
     if float(short.min()) < 1e-9:
@@ -127,7 +130,7 @@ def _check(index: int, rope: Rope) -> None:
         value = getattr(rope, name)
         if value is None:
             continue
-        least = float(value.min()) if isinstance(value, Tensor) else float(value)
+        least = float(value.detach().min()) if isinstance(value, Tensor) else float(value)
         zero_ok = name in ("youngs", "shear", "bend", "bend2", "twist")
         if not least >= 0 or (least == 0 and not zero_ok):
             raise ValueError(f"rope {index}: {name} is {least:g}; it must be {'at least 0' if zero_ok else 'positive'}")
@@ -157,7 +160,8 @@ def assemble(ropes: Sequence[Rope]) -> tuple[Topology, RodParams, RodState]:
     shapes = pack([(r.rest if isinstance(r.rest, Tensor) else r.positions).to(like) for r in ropes])
     given = [None if r.director is None else r.director.to(like) for r in ropes]
 
-    rest_director = bishop(topology, shapes, edge_mask, given)
+    given_rest = [g if r.rest_director is None else r.rest_director.to(like) for g, r in zip(given, ropes, strict=True)]
+    rest_director = bishop(topology, shapes, edge_mask, given_rest)
     length = edge_vectors(topology, shapes, edge_mask).norm(dim=-1, keepdim=True)
     length = torch.where(edge_mask > 0, length, 1.0)
     kappa, twist = frame_curvature(topology, shapes, rest_director, edge_mask, hinge_mask)

@@ -10,6 +10,7 @@ doi:10.1016/0021-9991(77)90098-5), so that linear and angular momentum are exact
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 from dataclasses import dataclass
 
@@ -176,7 +177,7 @@ def balance(
         Positions (..., V, 3) and tensions (..., V, 1).
     """
     topology = lengths.topology
-    pulled = lengths.active * (tension.detach() > 0)
+    pulled = lengths.active
     lean, start = turning * pulled / lengths.rest, direction + pulled * ahead
 
     def residual(pos: Tensor, impulse: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -192,7 +193,7 @@ def balance(
         with torch.no_grad():
             same, one, two = inertia.bands(topology)
             string = impulse * lean
-            string = string.clamp(min=0.0)
+
             after, active = following(topology, free), lengths.active
             entries = _rows(
                 free * (inertia.vertex + same + string + preceding(topology, string)) + (1 - free),
@@ -209,7 +210,12 @@ def balance(
         rhs = -_rows(momentum, excess)
         step = banded.solve(entries, rhs, f"saddle:{topology.name}")
         batch, v3 = pos.shape[:-2], 3 * pos.shape[-2]
-        return pos + _vertices(step[:v3], batch, 3), impulse + _vertices(step[v3:], batch, 1)
+        change, push = _vertices(step[:v3], batch, 3), _vertices(step[v3:], batch, 1)
+        # An edge may turn by about one radian per Newton step; beyond that its linearisation means nothing.
+        with torch.no_grad():
+            turn = lengths.active * (following(topology, change) - change) / lengths.rest
+            short = (1 / turn.square().sum(-1, keepdim=True).amax(-2, keepdim=True).sqrt().clamp(min=1e-9)).clamp(max=1.0)
+        return pos + short * change, impulse + short * push
 
     with torch.no_grad():
         pos, impulse = moved.detach(), tension * lengths.active * scale
@@ -254,3 +260,28 @@ def _is_edge(topology: Topology, slot: int) -> bool:
 
 
 banded.register_pattern("saddle", functools.cache(_saddle))
+
+
+def settle(lengths: Lengths, pos: Tensor, vel: Tensor, mobility: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the nearest positions and velocities that agree with fixed lengths, both shape (..., V, 3).
+
+    Args:
+        lengths: the constraint.
+        pos: positions that miss it a little, e.g. interpolated measurements [m].
+        vel: velocities that may stretch edges [m/s].
+        mobility: one over the mass of the vertices, 0 if held, shape (..., V, 1).
+    """
+    topology = lengths.topology
+    edge = edge_vectors(topology, pos, lengths.edge_mask)
+    answer = mobility.expand_as(pos)
+    stiff = dataclasses.replace(lengths, compliance=torch.zeros_like(lengths.compliance))
+    pos, _ = project(stiff, pos, answer, edge / safe_norm(edge).clamp(min=1e-12), torch.zeros_like(lengths.active), 6)
+    edge = edge_vectors(topology, pos, lengths.edge_mask)
+    along = edge / safe_norm(edge).clamp(min=1e-12)
+    stretching = dot(following(topology, vel) - vel, along) * lengths.active
+    both = answer + following(topology, answer)
+    diagonal = lengths.active * (along.square() * both).sum(-1, keepdim=True) * (1 + 1e-10) + 1 - lengths.active
+    coupling = -lengths.active * (along * following(topology, along * answer)).sum(-1, keepdim=True)
+    back = -lengths.active * (along * answer * preceding(topology, along)).sum(-1, keepdim=True)
+    pull = solve_slots(topology, diagonal, coupling, back, stretching) * along
+    return pos, vel + answer * (pull - preceding(topology, pull))

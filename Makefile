@@ -1,0 +1,33 @@
+# Every target makes and fills .venv by itself; nothing else needs to be installed first.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+FILLED := $(VENV)/.filled
+export OMP_NUM_THREADS := 1
+
+.PHONY: demo test bench lint clean
+
+demo: $(FILLED)  ## calibrate a rope to the recording in the package
+	$(BIN)/torchdlo calibrate torchdlo/data/sample_rope --out demo/model.json
+	@echo "Look at demo/report.html (its picture alone: demo/report.png)."
+
+test: $(FILLED)
+	$(BIN)/python -m pytest -n 2
+
+bench: $(FILLED)
+	$(BIN)/python experiments/bench_rod.py --quick
+
+lint: $(FILLED)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+
+clean:
+	rm -rf $(VENV) demo build dist *.egg-info .pytest_cache .ruff_cache
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
+
+# Filled again when what it holds changes.
+$(FILLED): setup.cfg pyproject.toml constraints.txt
+	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "torchdlo needs Python 3.11 or newer: make PYTHON=python3.11")'
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[dev]'
+	touch $(FILLED)

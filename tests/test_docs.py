@@ -1,0 +1,88 @@
+"""Every tensor field says what it is, in which unit and of which shape; public names have docs."""
+
+from __future__ import annotations
+
+import ast
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGE = ROOT / "torchdlo"
+FILES = sorted(PACKAGE.rglob("*.py"))
+CORE = [file for file in FILES if file.relative_to(PACKAGE).parts[0] in ("physics", "coupling")]
+CORE += [file for file in FILES if file == PACKAGE / "scene.py"]
+
+ARRAYS = re.compile(r"(torch\.)?Tensor( \| None)?|np\.ndarray( \| None)?")
+
+
+def decorated(node: ast.ClassDef) -> bool:
+    """Whether a class is a dataclass or one of our structs."""
+    names = {
+        name.id if isinstance(name, ast.Name) else getattr(name, "attr", "")
+        for decorator in node.decorator_list
+        for name in [decorator.func if isinstance(decorator, ast.Call) else decorator]
+    }
+    return bool(names & {"dataclass", "struct"})
+
+
+def array_fields(file: Path) -> Iterator[tuple[str, str]]:
+    """Name and docstring ("" if absent) of the tensor and array fields of a file's dataclasses."""
+    for node in ast.walk(ast.parse(file.read_text())):
+        if not isinstance(node, ast.ClassDef) or not decorated(node):
+            continue
+        for field, after in zip(node.body, [*node.body[1:], None], strict=True):
+            if not isinstance(field, ast.AnnAssign):
+                continue
+            if not ARRAYS.fullmatch(ast.unparse(field.annotation)):
+                continue
+            doc = ""
+            if isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant):
+                doc = str(after.value.value)
+            yield f"{file.relative_to(ROOT)}:{field.lineno}: {ast.unparse(field.target)}", doc
+
+
+@pytest.mark.parametrize("file", CORE, ids=lambda f: str(f.relative_to(ROOT)))
+def test_tensor_fields_say_unit_and_shape(file: Path) -> None:
+    for where, doc in array_fields(file):
+        assert doc, f"{where}: no docstring below the field"
+        assert re.search(r"\[[^\]]+\]", doc), f"{where}: no unit in [] ([-] if it has none)"
+        assert "shape (" in doc, f"{where}: no shape"
+
+
+def test_the_check_finds_fields() -> None:
+    assert sum(1 for file in CORE for _ in array_fields(file)) > 5
+
+
+def test_recordings_say_shape() -> None:
+    found = list(array_fields(PACKAGE / "sysid" / "recording.py"))
+    assert len(found) > 5
+    for where, doc in found:
+        assert "shape (" in doc, where
+
+
+@pytest.mark.parametrize("file", FILES, ids=lambda f: str(f.relative_to(ROOT)))
+def test_public_names_have_docstrings(file: Path) -> None:
+    tree = ast.parse(file.read_text())
+    assert ast.get_docstring(tree), f"{file.relative_to(ROOT)}: no module docstring"
+    for node in tree.body:
+        public = isinstance(node, (ast.FunctionDef, ast.ClassDef)) and node.name[0] != "_"
+        if public:
+            assert ast.get_docstring(node), f"{file.relative_to(ROOT)}:{node.lineno}: {node.name}"
+
+
+@pytest.mark.parametrize("file", FILES, ids=lambda f: str(f.relative_to(ROOT)))
+def test_files_and_functions_stay_small(file: Path) -> None:
+    text = file.read_text()
+    assert len(text.splitlines()) <= 400, f"{file.relative_to(ROOT)}: more than 400 lines"
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)):
+            size = (node.end_lineno or node.lineno) - node.lineno + 1
+            body = node.body[0]
+            # A docstring and the options of a command are not code that one must follow.
+            if isinstance(body, ast.Expr) and isinstance(body.value, ast.Constant):
+                size -= (body.end_lineno or body.lineno) - body.lineno + 1
+            size -= body.lineno - node.lineno
+            assert size <= 50, f"{file.relative_to(ROOT)}:{node.lineno}: {node.name} has {size}"

@@ -1,0 +1,364 @@
+"""The command `torchdlo`: check, convert and calibrate to recordings of real ropes.
+
+Everything slow to import is imported inside the command that needs it, so that help is quick.
+"""
+
+from __future__ import annotations
+
+import shlex
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from torchdlo.errors import InputError
+from torchdlo.files import check_writable, write_atomically
+
+if TYPE_CHECKING:
+    from torchdlo.sysid.recording import Recording
+    from torchdlo.sysid.result import Calibration
+
+__all__ = ["app", "main"]
+
+app = typer.Typer(
+    name="torchdlo",
+    help="Differentiable simulation of ropes, cables and wires, calibrated to real ones.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode="rich",
+)
+
+_QUICK = {"starts": 2, "iterations": 10}
+"""What --quick sets unless the options say otherwise."""
+_INTERRUPTED = 130
+"""Exit code after Ctrl-C, as shells have it."""
+
+RecordingArgument = Annotated[
+    Path,
+    typer.Argument(help="Recording folder: rope.json, train_*.npz and test_*.npz.", metavar="PATH"),
+]
+
+
+def main(args: list[str] | None = None) -> None:
+    """Run the command line; what is wrong with the input is one line on stderr and exit code 2."""
+    try:
+        app(args=args)
+    except InputError as error:
+        typer.echo("error: " + " ".join(str(error).splitlines()), err=True)
+        raise SystemExit(2) from None
+    except OSError as error:
+        typer.echo(f"error: {error}", err=True)
+        raise SystemExit(1) from None
+
+
+@app.callback(invoke_without_command=True)
+def _root(
+    version: Annotated[bool, typer.Option("--version", help="Print the version and exit.")] = False,
+) -> None:
+    if version:
+        from torchdlo import __version__
+
+        typer.echo(f"torchdlo {__version__}")
+        raise typer.Exit
+
+
+@app.command()
+def check(recording: RecordingArgument) -> None:
+    """Check a recording folder and say what is in it.
+
+    Exit code 0 means that the other commands accept it. Shown are also the errors of two
+    predictions without any parameter: what a calibrated model has to beat.
+
+    [bold]Example:[/bold] torchdlo check my_rope
+    """
+    from rich.console import Console
+
+    from torchdlo.sysid.recording import load_recording
+
+    loaded = load_recording(recording)
+    console = Console(soft_wrap=True)
+    console.print(_rope_line(loaded), highlight=False, markup=False)
+    console.print(_trial_table(loaded))
+
+
+@app.command("import-deform")
+def import_deform(
+    path: Annotated[
+        Path,
+        typer.Argument(help="Checkout of github.com/roahmlab/DEFORM, or one cable's folder in it."),
+    ],
+    out: Annotated[
+        Path,
+        typer.Argument(help="New folder; gets one recording folder per cable (dlo1, dlo2, ...)."),
+    ],
+    cable: Annotated[
+        list[str] | None,
+        typer.Option(help="Convert only this cable, for instance DLO1; may be repeated."),
+    ] = None,
+    mass: Annotated[
+        float | None,
+        typer.Option(help="Mass between the outer markers in kg; known for DLO1, DLO2 and DLO4."),
+    ] = None,
+) -> None:
+    """Convert the public DEFORM motion-capture data into recording folders.
+
+    The data carry no licence, so torchdlo does not ship them: get your own checkout first.
+    Pickle files are read as plain lists of numbers; anything else in them is refused, not run.
+
+    [bold]Example:[/bold] torchdlo import-deform DEFORM recordings --cable DLO1 --cable DLO4
+    """
+    from torchdlo.sysid.deform import MASSES, find_cables, read_cable
+    from torchdlo.sysid.recording import check_new_folder, save_recording
+
+    cables = find_cables(path)
+    for name in cable or []:
+        if name not in cables:
+            raise InputError(f"{path}: expected a cable {name}, found {', '.join(cables)}.")
+    if not cable and mass is None and len(cables) > 1:
+        skipped = [name for name in cables if name not in MASSES]
+        if skipped:
+            typer.echo(f"left out (give --cable and --mass): {', '.join(skipped)}", err=True)
+        cable = [name for name in cables if name in MASSES]
+    targets = {name: out / name.lower() for name in cable or cables}
+    for target in targets.values():
+        check_new_folder(target)
+    with _progress() as callback:
+        recordings = {
+            name: read_cable(cables[name], mass=mass, callback=callback) for name in targets
+        }
+    for name, target in targets.items():
+        save_recording(recordings[name], target)
+        n_train, n_test = len(recordings[name].train), len(recordings[name].test)
+        straight = recordings[name].rest_positions is None
+        rest = "no rest shape in train_DEFORM.py, taken as straight" if straight else "rest shape"
+        typer.echo(f"{target}: {n_train} train and {n_test} test trials, {rest}")
+
+
+@app.command()
+def calibrate(
+    recording: RecordingArgument,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            help="Model file to write; calibration.json, report.html and report.png go beside it. "
+            "Default: runs/calibrate/NAME/model.json.",
+            metavar="DIR/model.json",
+        ),
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the random starts.")] = 0,
+    starts: Annotated[
+        int | None, typer.Option(min=1, help="Number of starts, run as one batch.")
+    ] = None,
+    iterations: Annotated[int | None, typer.Option(min=1, help="Iterations of the fit.")] = None,
+    vertices: Annotated[
+        int | None, typer.Option(min=3, help="Vertices of the simulated rope.")
+    ] = None,
+    quick: Annotated[
+        bool, typer.Option("--quick", help="A rough fit in a fraction of the time.")
+    ] = False,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Go on from the checkpoint beside the model file.")
+    ] = False,
+) -> None:
+    """Fit a rope model to the train trials and judge it on the test trials.
+
+    Ctrl-C stops after the running iteration and keeps the best found so far.
+
+    [bold]Examples:[/bold]
+
+    torchdlo calibrate my_rope
+
+    torchdlo calibrate my_rope --out runs/my_rope/model.json --starts 16 --seed 1
+
+    torchdlo calibrate my_rope --quick --json | jq .test_mae_mm
+    """
+    from torchdlo.sysid.recording import load_recording
+
+    loaded = load_recording(recording)
+    if out is None:
+        out = Path("runs") / "calibrate" / recording.resolve().name / "model.json"
+    elif out.is_dir() or out.suffix != ".json":
+        out = out / "model.json"
+    _check_outputs(out, resume)
+    options: dict[str, Any] = {"starts": starts, "iterations": iterations, "vertices": vertices}
+    if quick:
+        options = {name: value or _QUICK.get(name) for name, value in options.items()}
+    options = {name: value for name, value in options.items() if value is not None}
+    result = _run_calibration(
+        loaded, seed=seed, checkpoint=out.with_name("checkpoint.pt"), resume=resume, **options
+    )
+    _write_outputs(result, loaded, recording, out, quiet=as_json)
+    if as_json:
+        from torchdlo.sysid.result import summary_json
+
+        typer.echo(summary_json(result, recording), nl=False)
+    if result.interrupted:
+        raise typer.Exit(_INTERRUPTED)
+
+
+def _run_calibration(recording: Recording, **options: Any) -> Calibration:
+    # Imported before the bar starts: a first import of torch takes seconds.
+    from torchdlo.sysid.calibrate import calibrate as fit
+
+    try:
+        with _progress() as show, _deferred_interrupt(show) as callback:
+            return fit(recording, callback=callback, **options)
+    except KeyboardInterrupt:
+        typer.echo("interrupted before there was a result; nothing was written", err=True)
+        raise SystemExit(_INTERRUPTED) from None
+
+
+def _check_outputs(out: Path, resume: bool) -> None:
+    """Refuse before the work what could not be written after it."""
+    from torchdlo.report import calibration as report
+
+    for name in (out.name, "calibration.json", report.PAGE, report.PICTURE):
+        check_writable(out.with_name(name))
+    checkpoint = out.with_name("checkpoint.pt")
+    if resume and not checkpoint.is_file():
+        raise InputError(
+            f"{checkpoint}: expected the checkpoint of an earlier calibration to resume, "
+            "found none; leave out --resume."
+        )
+
+
+def _write_outputs(
+    result: Calibration, recording: Recording, given: Path, out: Path, *, quiet: bool
+) -> None:
+    from torchdlo.report import calibration as report
+    from torchdlo.sysid.result import model_json, summary_json
+
+    command = shlex.join(["torchdlo", *sys.argv[1:]])
+    write_atomically(out, model_json(result))
+    write_atomically(out.with_name("calibration.json"), summary_json(result, given))
+    page, _ = report.write_report(result, recording, out.parent, command=command)
+    typer.echo(report.verdict(result, recording), err=quiet)
+    typer.echo(f"model:  {out}\nreport: {page}", err=quiet)
+
+
+@contextmanager
+def _progress() -> Iterator[Callable[[str, int, int, str], None]]:
+    """A bar with the time left on stderr; a callback(stage, done, total, message) moves it."""
+    from rich.console import Console
+    from rich.progress import (
+        BarColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+
+    console = Console(stderr=True)
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TextColumn("{task.completed:.0f}/{task.total:.0f}"),
+        TimeElapsedColumn(),
+        TextColumn("left"),
+        TimeRemainingColumn(),
+        TextColumn("{task.fields[message]}"),
+    )
+    # Off a terminal a bar is only noise in a log.
+    with Progress(*columns, console=console, disable=not console.is_terminal) as bar:
+        tasks: dict[str, Any] = {}
+
+        def callback(stage: str, done: int, total: int, message: str = "") -> None:
+            if stage not in tasks:
+                tasks[stage] = bar.add_task(stage, total=total, message=message)
+            bar.update(tasks[stage], completed=done, total=total, message=message)
+
+        yield callback
+
+
+@contextmanager
+def _deferred_interrupt(
+    callback: Callable[[str, int, int, str], None],
+) -> Iterator[Callable[[str, int, int, str], None]]:
+    """Let Ctrl-C raise KeyboardInterrupt only inside the callback; a second one raises at once."""
+    import signal
+    import threading
+
+    if threading.current_thread() is not threading.main_thread():
+        yield callback
+        return
+    asked = False
+    previous = signal.getsignal(signal.SIGINT)
+
+    def ask(signum: int, frame: Any) -> None:
+        nonlocal asked
+        if asked:
+            raise KeyboardInterrupt
+        asked = True
+        typer.echo("stopping after this iteration; Ctrl-C again to stop at once", err=True)
+
+    def checked(stage: str, done: int, total: int, message: str = "") -> None:
+        callback(stage, done, total, message)
+        if asked:
+            raise KeyboardInterrupt
+
+    signal.signal(signal.SIGINT, ask)
+    try:
+        yield checked
+    finally:
+        signal.signal(signal.SIGINT, previous)
+
+
+def _rope_line(recording: Recording) -> str:
+    radius = "unknown" if recording.radius is None else f"{recording.radius * 1e3:g} mm"
+    table = "none" if recording.table_height is None else f"at {recording.table_height:g} m"
+    rest = "straight" if recording.rest_positions is None else "given"
+    return (
+        f"{recording.path}: length {recording.length:g} m, mass {recording.mass * 1e3:g} g, "
+        f"radius {radius}, rest shape {rest}, table {table}"
+    )
+
+
+def _trial_table(recording: Recording) -> Any:
+    import numpy as np
+    from rich.table import Table
+
+    from torchdlo.sysid.baselines import BASELINES
+    from torchdlo.sysid.metrics import average, mean_absolute_error
+
+    splits = {"train": recording.train, "test": recording.test}
+
+    def pooled(trials: Any, pick: Callable[[Any], Any]) -> str:
+        return f"{np.mean(np.concatenate([pick(trial).ravel() for trial in trials])):.1%}"
+
+    def error(trials: Any, predict: Callable[..., Any]) -> str:
+        predicted = [predict(trial, recording) for trial in trials]
+        return f"{average(mean_absolute_error, predicted, trials) * 1e3:.1f} mm"
+
+    rows: dict[str, Callable[[Any], str]] = {
+        "trials": lambda trials: str(len(trials)),
+        "frames": lambda trials: str(sum(len(t.time) for t in trials)),
+        "rate": lambda trials: _span([1 / float(np.median(np.diff(t.time))) for t in trials], "Hz"),
+        "duration": lambda trials: _span([t.time[-1] for t in trials], "s"),
+        "markers": lambda trials: _span([t.markers.shape[1] for t in trials]),
+        "gripped markers": lambda trials: _span([t.gripped.sum() for t in trials]),
+        "markers not seen": lambda trials: pooled(trials, lambda t: np.isnan(t.markers[..., 0])),
+        "suspect frames": lambda trials: pooled(trials, lambda t: t.suspect),
+    }
+    for name, predict in BASELINES.items():
+        rows[f"error of {name.replace('_', ' ')}"] = lambda trials, p=predict: error(trials, p)
+    table = Table(box=None, pad_edge=False)
+    table.add_column("")
+    for split in splits:
+        table.add_column(split, justify="right", no_wrap=True)
+    for name, describe in rows.items():
+        table.add_row(name, *(describe(trials) for trials in splits.values()))
+    return table
+
+
+def _span(values: list[Any], unit: str = "") -> str:
+    low, high = f"{min(values):.4g}", f"{max(values):.4g}"
+    return f"{low if low == high else f'{low} to {high}'} {unit}".rstrip()
+
+
+if __name__ == "__main__":
+    main()

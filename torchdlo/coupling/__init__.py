@@ -1,0 +1,1 @@
+"""Coupling of ropes with rigid bodies, grippers and particles."""

@@ -1,0 +1,61 @@
+"""Writing files so that a reader never sees half of one, and nothing foreign is overwritten."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import secrets
+from collections.abc import Iterator
+from pathlib import Path
+
+from torchdlo.errors import InputError
+
+__all__ = ["check_writable", "replacing", "write_atomically"]
+
+
+@contextlib.contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """Yield a temporary path beside `path`, and rename it to `path` if the block succeeds."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    # The name ends like the final one: writers such as numpy's choose the format by the suffix.
+    temporary = path.with_name(f".{secrets.token_hex(4)}-{path.name}")
+    try:
+        yield temporary
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def write_atomically(path: Path, content: str | bytes) -> None:
+    """Write `content` to `path` through a temporary file in the same folder."""
+    with replacing(path) as temporary:
+        temporary.write_bytes(content.encode() if isinstance(content, str) else content)
+
+
+def check_writable(path: Path, *, mark: bytes = b"torchdlo") -> None:
+    """Refuse a path that is a folder, lies below a file, or holds a file without our `mark`.
+
+    Args:
+        path: The file about to be written.
+        mark: Bytes that every file written by torchdlo has near its start.
+    """
+    for parent in path.parents:
+        if parent.exists():
+            if not parent.is_dir():
+                raise InputError(
+                    f"{path}: cannot be written because {parent} is a file; choose another --out."
+                )
+            if not os.access(parent, os.W_OK):
+                raise InputError(
+                    f"{path}: the folder {parent} is not writable; choose another --out."
+                )
+            break
+    if path.is_dir():
+        raise InputError(f"{path}: expected a file name, found a folder; choose another --out.")
+    if path.exists() and path.stat().st_size:
+        with path.open("rb") as file:
+            if mark not in file.read(4096):
+                raise InputError(
+                    f"{path}: exists and was not written by torchdlo, so it is not overwritten; "
+                    "move it away or choose another --out."
+                )

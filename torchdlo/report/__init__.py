@@ -1,0 +1,7 @@
+"""Pictures and pages made of results."""
+
+from __future__ import annotations
+
+from torchdlo.report.calibration import write_report
+
+__all__ = ["write_report"]

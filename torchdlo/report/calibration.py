@@ -1,0 +1,194 @@
+"""The report of a calibration: one page that needs nothing but itself, and its picture."""
+
+from __future__ import annotations
+
+import base64
+import html
+import math
+from pathlib import Path
+from typing import Any
+
+from torchdlo.files import write_atomically
+from torchdlo.report.figure import calibration_png
+from torchdlo.sysid.recording import Recording
+from torchdlo.sysid.result import Calibration, versions
+
+__all__ = ["PAGE", "PICTURE", "calibration_html", "verdict", "write_report"]
+
+PAGE = "report.html"
+PICTURE = "report.png"
+
+
+def write_report(
+    result: Calibration, recording: Recording, folder: Path, *, command: str = ""
+) -> tuple[Path, Path]:
+    """Write the page and the picture.
+
+    Args:
+        result: What to report.
+        recording: What it was calibrated on.
+        folder: Where `report.html` and `report.png` go.
+        command: The command line that makes this result again.
+
+    Returns:
+        Paths of the page and of the picture.
+    """
+    png = calibration_png(result, recording)
+    page = calibration_html(result, recording, png, command=command)
+    write_atomically(folder / PICTURE, png)
+    write_atomically(folder / PAGE, page)
+    return folder / PAGE, folder / PICTURE
+
+
+def verdict(result: Calibration, recording: Recording) -> str:
+    """The result in one sentence."""
+    others = ", ".join(
+        f"{_words(name)} {_mm(values['test_mae_mm'])}" for name, values in result.baselines.items()
+    )
+    sentence = (
+        f"Calibrated on {_trials(len(recording.train))}; error on unseen trials "
+        f"{_mm(result.before['test_mae_mm'])} → {_mm(result.test_mae_mm)}"
+    )
+    sentence += f" ({others})." if others else "."
+    if result.interrupted:
+        sentence += " The fit was interrupted: this is the best it had found."
+    better = {
+        name: values["test_mae_mm"]
+        for name, values in result.baselines.items()
+        # Not finite counts as worse than anything.
+        if not result.test_mae_mm < values["test_mae_mm"]
+    }
+    if better:
+        name = min(better, key=lambda key: better[key])
+        sentence += f" The {_words(name)}, which has no parameter, is not worse: do not use this."
+    elif not result.test_mae_mm < result.before["test_mae_mm"]:
+        sentence += " Calibration did not help on the unseen trials."
+    return sentence
+
+
+def calibration_html(
+    result: Calibration, recording: Recording, png: bytes, *, command: str = ""
+) -> str:
+    """The page, with the picture inside."""
+    name = html.escape(recording.path.resolve().name)
+    picture = base64.b64encode(png).decode("ascii")
+    notes = "".join(f"<li>{html.escape(note)}</li>" for note in result.notes)
+    sections = [
+        f"<h1>{name}</h1>",
+        f'<p class="verdict">{html.escape(verdict(result, recording))}</p>',
+        f"<ul>{notes}</ul>" if notes else "",
+        f'<img alt="Measured and simulated shapes, errors along the rope and over time, and a '
+        f'comparison with trivial predictions" src="data:image/png;base64,{picture}">',
+        "<h2>Errors</h2>",
+        "<p>Mean absolute error per coordinate, all markers, from 0.02 s on. The test trials were "
+        "not used for the fit.</p>",
+        _error_table(result),
+        "<h2>Parameters</h2>",
+        _parameter_table(result),
+        "<h2>Trials</h2>",
+        _trial_table(result),
+        "<h2>Made by</h2>",
+        f"<pre>{html.escape(command)}</pre>" if command else "",
+        f"<p>{html.escape(_made_by(result))}</p>",
+    ]
+    return _PAGE.format(title=name, style=_STYLE, body="\n".join(s for s in sections if s))
+
+
+def _error_table(result: Calibration) -> str:
+    rows = [
+        (_words(name), values.get("train_mae_mm"), values["test_mae_mm"])
+        for name, values in result.baselines.items()
+    ]
+    before = result.before
+    rows.append(("before calibration", before.get("train_mae_mm"), before["test_mae_mm"]))
+    rows.append(("calibrated", result.train_mae_mm, result.test_mae_mm))
+    return _table(
+        ("prediction", "train trials [mm]", "test trials [mm]"),
+        [(name, _number(train), _number(test)) for name, train, test in rows],
+        last_is_ours=True,
+    )
+
+
+def _parameter_table(result: Calibration) -> str:
+    rows = [
+        (
+            _words(name),
+            _number(entry.get("value"), 4),
+            f"{_number(entry.get('low'), 4)} to {_number(entry.get('high'), 4)}",
+            str(entry.get("unit", "")),
+        )
+        for name, entry in result.parameters.items()
+    ]
+    return _table(("parameter", "value", "range", "unit"), rows)
+
+
+def _trial_table(result: Calibration) -> str:
+    columns = ("split", "before_mae_mm", "mae_mm", "free_distance_mm")
+    rows = [
+        (
+            str(entry.get("name", "")),
+            str(entry.get("split", "")),
+            *(_number(entry.get(column)) for column in columns[1:]),
+        )
+        for entry in sorted(result.per_trial, key=lambda entry: str(entry.get("split")))
+    ]
+    heads = ("trial", "split", "before [mm]", "calibrated [mm]", "free markers' distance [mm]")
+    return _table(heads, rows)
+
+
+def _table(
+    heads: tuple[str, ...], rows: list[tuple[str, ...]], *, last_is_ours: bool = False
+) -> str:
+    lines = ["<table><thead><tr>", *(f"<th>{html.escape(h)}</th>" for h in heads)]
+    lines.append("</tr></thead><tbody>")
+    for index, row in enumerate(rows):
+        ours = ' class="ours"' if last_is_ours and index == len(rows) - 1 else ""
+        cells = "".join(f"<td>{html.escape(cell)}</td>" for cell in row)
+        lines.append(f"<tr{ours}>{cells}</tr>")
+    return "".join(lines) + "</tbody></table>"
+
+
+def _made_by(result: Calibration) -> str:
+    tools = ", ".join(f"{name} {version}" for name, version in versions().items())
+    return f"{result.seconds:.0f} s, seed {result.seed}; {tools}."
+
+
+def _number(value: Any, digits: int = 3) -> str:
+    if value is None or not math.isfinite(value):
+        return "-"
+    return f"{value:.{digits}g}" if abs(value) < 10 ** (digits - 1) else f"{value:.1f}"
+
+
+def _mm(value: float) -> str:
+    return f"{value:.1f} mm" if math.isfinite(value) else "not finite"
+
+
+def _trials(count: int) -> str:
+    return f"{count} trial" if count == 1 else f"{count} trials"
+
+
+def _words(name: str) -> str:
+    return name.replace("_", " ")
+
+
+_PAGE = """<!doctype html>
+<html lang="en"><head><meta charset="utf-8"><meta name="generator" content="torchdlo">
+<meta name="viewport" content="width=device-width, initial-scale=1"><title>{title}</title>
+<style>{style}</style></head>
+<body>
+{body}
+</body></html>
+"""
+
+_STYLE = """
+body { font: 16px/1.5 system-ui, sans-serif; color: #1f2933; background: #fff;
+  max-width: 1100px; margin: 2rem auto; padding: 0 1rem; }
+h1 { margin-bottom: 0; } h2 { margin-top: 2.2rem; }
+.verdict { font-size: 1.2rem; border-left: 4px solid #00798c; padding-left: .8rem; }
+img { width: 100%; height: auto; }
+table { border-collapse: collapse; font-variant-numeric: tabular-nums; }
+th, td { text-align: right; padding: .3rem .9rem; border-bottom: 1px solid #e4e7eb; }
+th:first-child, td:first-child { text-align: left; }
+.ours td { font-weight: 600; color: #00798c; }
+pre { background: #f5f7fa; padding: .8rem; overflow-x: auto; }
+"""

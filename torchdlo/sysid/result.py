@@ -1,0 +1,105 @@
+"""What a calibration found, and the plain objects made of it for JSON files."""
+
+from __future__ import annotations
+
+import json
+import platform
+from dataclasses import dataclass, field
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+__all__ = ["Calibration", "model_json", "summary", "summary_json", "versions"]
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """A rope model fitted to the train trials of a recording, judged on its test trials."""
+
+    parameters: dict[str, dict[str, Any]]
+    """Fitted numbers by name, each with `value`, `low`, `high` (its uncertainty) and `unit`."""
+    train_mae_mm: float
+    """Mean absolute error per coordinate on the train trials after the fit [mm]."""
+    test_mae_mm: float
+    """Mean absolute error per coordinate on the test trials after the fit [mm]."""
+    before: dict[str, float]
+    """`train_mae_mm` and `test_mae_mm` with the numbers that the fit started from."""
+    baselines: dict[str, dict[str, float]]
+    """By baseline name (`frozen_shape`, `catenary`): `train_mae_mm` and `test_mae_mm`."""
+    per_trial: list[dict[str, Any]]
+    """One object per trial: `name`, `split`, `mae_mm`, `before_mae_mm`, `free_distance_mm`."""
+    seconds: float
+    """Time that the calibration took [s]."""
+    model: dict[str, Any]
+    """The model file: what the simulator needs to predict this rope again."""
+    predictions: dict[str, np.ndarray]
+    """Simulated marker positions after the fit by trial name [m], each of shape (F, M, 3)."""
+    predictions_before: dict[str, np.ndarray]
+    """Simulated marker positions before the fit by trial name [m], each of shape (F, M, 3)."""
+    seed: int = 0
+    """Seed of the random starts."""
+    interrupted: bool = False
+    """Whether the user stopped the fit, so that this is the best until then."""
+    notes: list[str] = field(default_factory=list)
+    """Sentences that a reader of the result should know."""
+
+
+def summary(result: Calibration, recording: str | Path) -> dict[str, Any]:
+    """The result without its motions, for people and programs."""
+    return {
+        "recording": str(recording),
+        "test_mae_mm": result.test_mae_mm,
+        "train_mae_mm": result.train_mae_mm,
+        "before": result.before,
+        "baselines": result.baselines,
+        "parameters": result.parameters,
+        "per_trial": result.per_trial,
+        "seconds": result.seconds,
+        "seed": result.seed,
+        "interrupted": result.interrupted,
+        "notes": result.notes,
+        "versions": versions(),
+    }
+
+
+def summary_json(result: Calibration, recording: str | Path) -> str:
+    """`summary` as JSON text."""
+    return _dump({"generator": "torchdlo calibrate"} | summary(result, recording))
+
+
+def model_json(result: Calibration) -> str:
+    """The model file as JSON text, marked as ours."""
+    return _dump({"generator": "torchdlo calibrate"} | result.model)
+
+
+def versions() -> dict[str, str]:
+    """Versions of what the result depends on."""
+    found = {"python": platform.python_version()}
+    for name in ("torchdlo", "torch", "numpy"):
+        try:
+            found[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            found[name] = "not installed"
+    return found
+
+
+def _dump(content: dict[str, Any]) -> str:
+    # JSON has no NaN: a number that is not finite is written as null.
+    return json.dumps(_plain(content), indent=1, allow_nan=False) + "\n"
+
+
+def _plain(value: Any) -> Any:
+    """Python numbers, lists and dicts only; None in the place of what is not finite."""
+    if isinstance(value, dict):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple, np.ndarray)):
+        return [_plain(item) for item in value]
+    if isinstance(value, np.generic):
+        return _plain(value.item())
+    if isinstance(value, Path):
+        return str(value)
+    if isinstance(value, float) and not np.isfinite(value):
+        return None
+    return value
