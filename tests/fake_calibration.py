@@ -17,19 +17,14 @@ def fake_result(recording: Recording, *, share: float = 0.8, **fields: Any) -> C
     """Predictions that lie between the catenary and the truth, `share` of the way."""
     trials = {t.name: t for t in recording.train + recording.test}
     trivial = {
-        name: {key: predict(trial, recording) for key, trial in trials.items()}
-        for name, predict in BASELINES.items()
+        name: {key: predict(trial, recording) for key, trial in trials.items()} for name, predict in BASELINES.items()
     }
     start = trivial["catenary"]
-    after = {
-        key: start[key] + share * np.nan_to_num(trial.markers - start[key])
-        for key, trial in trials.items()
-    }
+    after = {key: start[key] + share * np.nan_to_num(trial.markers - start[key]) for key, trial in trials.items()}
 
     def errors(predictions: dict[str, np.ndarray]) -> dict[str, float]:
         return {
-            f"{split}_mae_mm": 1e3
-            * average(mean_absolute_error, [predictions[t.name] for t in group], group)
+            f"{split}_mae_mm": 1e3 * average(mean_absolute_error, [predictions[t.name] for t in group], group)
             for split, group in (("train", recording.train), ("test", recording.test))
         }
 
@@ -69,9 +64,7 @@ class FakeFit:
         self.during: Callable[[int], None] = lambda iteration: None
         self.keep_best = True
 
-    def __call__(
-        self, recording: Recording, *, callback: Callable[..., None], **options: Any
-    ) -> Calibration:
+    def __call__(self, recording: Recording, *, callback: Callable[..., None], **options: Any) -> Calibration:
         self.options = options
         try:
             for iteration in range(options.get("iterations", 3)):

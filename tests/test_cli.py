@@ -67,9 +67,7 @@ def test_check_describes_the_recording(folder: Path, capsys: pytest.CaptureFixtu
     assert rows["suspect frames"] == ["5.0%", "5.0%"]
 
 
-def test_calibrate_writes_model_and_report(
-    folder: Path, fit: FakeFit, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_calibrate_writes_model_and_report(folder: Path, fit: FakeFit, capsys: pytest.CaptureFixture[str]) -> None:
     assert run("calibrate", folder) == 0
     out = Path("runs/calibrate/rope")
     assert sorted(p.name for p in out.iterdir()) == WRITTEN
@@ -80,9 +78,7 @@ def test_calibrate_writes_model_and_report(
     assert fit.options == {"seed": 0, "checkpoint": out / "checkpoint.pt", "resume": False}
 
 
-def test_calibrate_prints_json_and_nothing_else(
-    folder: Path, fit: FakeFit, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_calibrate_prints_json_and_nothing_else(folder: Path, fit: FakeFit, capsys: pytest.CaptureFixture[str]) -> None:
     assert run("calibrate", folder, "--json", "--seed", 7, "--out", "a/rope.json") == 0
     said = capsys.readouterr()
     result = json.loads(said.out)
@@ -148,9 +144,7 @@ def test_unusable_out_is_refused_before_the_work(
     assert not fit.options
 
 
-def test_resume_needs_a_checkpoint(
-    folder: Path, fit: FakeFit, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_resume_needs_a_checkpoint(folder: Path, fit: FakeFit, capsys: pytest.CaptureFixture[str]) -> None:
     assert run("calibrate", folder, "--out", "a", "--resume") == 2
     assert "checkpoint.pt" in capsys.readouterr().err and not Path("a").exists()
     Path("a").mkdir()
@@ -159,9 +153,7 @@ def test_resume_needs_a_checkpoint(
     assert fit.options["resume"] and fit.options["checkpoint"] == Path("a/checkpoint.pt")
 
 
-def test_control_c_keeps_the_best(
-    folder: Path, fit: FakeFit, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_control_c_keeps_the_best(folder: Path, fit: FakeFit, capsys: pytest.CaptureFixture[str]) -> None:
     finished = []
 
     def interrupt(iteration: int) -> None:
@@ -219,12 +211,8 @@ def test_the_recording_is_not_touched(folder: Path, fit: FakeFit) -> None:
     assert {p: (p.stat().st_mtime_ns, p.read_bytes()) for p in folder.iterdir()} == before
 
 
-def test_a_blown_up_model_is_reported_as_such(
-    folder: Path, fit: FakeFit, capsys: pytest.CaptureFixture[str]
-) -> None:
-    broken = {
-        name: np.full((40, 9, 3), np.nan) for name in ("train_0", "train_1", "test_0", "test_1")
-    }
+def test_a_blown_up_model_is_reported_as_such(folder: Path, fit: FakeFit, capsys: pytest.CaptureFixture[str]) -> None:
+    broken = {name: np.full((40, 9, 3), np.nan) for name in ("train_0", "train_1", "test_0", "test_1")}
     fit.fields = {"test_mae_mm": float("nan"), "predictions": broken}
     assert run("calibrate", folder, "--out", "a") == 0
     said = capsys.readouterr().out

@@ -32,7 +32,7 @@ LEARNING = TORCH | {"tensordict", "torchrl"}
 ALLOWED = {
     "errors": set(),
     "files": set(),
-    "physics": TORCH,
+    "physics": TORCH | {"triton"},  # comes with the CUDA builds of torch
     "coupling": TORCH,
     "scene": TORCH,
     "sysid": ARRAYS,

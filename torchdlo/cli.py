@@ -127,9 +127,7 @@ def import_deform(
     for target in targets.values():
         check_new_folder(target)
     with _progress() as callback:
-        recordings = {
-            name: read_cable(cables[name], mass=mass, callback=callback) for name in targets
-        }
+        recordings = {name: read_cable(cables[name], mass=mass, callback=callback) for name in targets}
     for name, target in targets.items():
         save_recording(recordings[name], target)
         n_train, n_test = len(recordings[name].train), len(recordings[name].test)
@@ -151,19 +149,11 @@ def calibrate(
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the random starts.")] = 0,
-    starts: Annotated[
-        int | None, typer.Option(min=1, help="Number of starts, run as one batch.")
-    ] = None,
+    starts: Annotated[int | None, typer.Option(min=1, help="Number of starts, run as one batch.")] = None,
     iterations: Annotated[int | None, typer.Option(min=1, help="Iterations of the fit.")] = None,
-    vertices: Annotated[
-        int | None, typer.Option(min=3, help="Vertices of the simulated rope.")
-    ] = None,
-    quick: Annotated[
-        bool, typer.Option("--quick", help="A rough fit in a fraction of the time.")
-    ] = False,
-    resume: Annotated[
-        bool, typer.Option("--resume", help="Go on from the checkpoint beside the model file.")
-    ] = False,
+    vertices: Annotated[int | None, typer.Option(min=3, help="Vertices of the simulated rope.")] = None,
+    quick: Annotated[bool, typer.Option("--quick", help="A rough fit in a fraction of the time.")] = False,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on from the checkpoint beside the model file.")] = False,
 ) -> None:
     """Fit a rope model to the train trials and judge it on the test trials.
 
@@ -189,9 +179,7 @@ def calibrate(
     if quick:
         options = {name: value or _QUICK.get(name) for name, value in options.items()}
     options = {name: value for name, value in options.items() if value is not None}
-    result = _run_calibration(
-        loaded, seed=seed, checkpoint=out.with_name("checkpoint.pt"), resume=resume, **options
-    )
+    result = _run_calibration(loaded, seed=seed, checkpoint=out.with_name("checkpoint.pt"), resume=resume, **options)
     _write_outputs(result, loaded, recording, out, quiet=as_json)
     if as_json:
         from torchdlo.sysid.result import summary_json
@@ -227,9 +215,7 @@ def _check_outputs(out: Path, resume: bool) -> None:
         )
 
 
-def _write_outputs(
-    result: Calibration, recording: Recording, given: Path, out: Path, *, quiet: bool
-) -> None:
+def _write_outputs(result: Calibration, recording: Recording, given: Path, out: Path, *, quiet: bool) -> None:
     from torchdlo.report import calibration as report
     from torchdlo.sysid.result import model_json, summary_json
 

@@ -42,13 +42,9 @@ def check_writable(path: Path, *, mark: bytes = b"torchdlo") -> None:
     for parent in path.parents:
         if parent.exists():
             if not parent.is_dir():
-                raise InputError(
-                    f"{path}: cannot be written because {parent} is a file; choose another --out."
-                )
+                raise InputError(f"{path}: cannot be written because {parent} is a file; choose another --out.")
             if not os.access(parent, os.W_OK):
-                raise InputError(
-                    f"{path}: the folder {parent} is not writable; choose another --out."
-                )
+                raise InputError(f"{path}: the folder {parent} is not writable; choose another --out.")
             break
     if path.is_dir():
         raise InputError(f"{path}: expected a file name, found a folder; choose another --out.")

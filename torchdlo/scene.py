@@ -48,7 +48,7 @@ class Control:
     pos: Tensor
     """Positions of the held vertices [m], shape (..., H, 3)."""
     director: Tensor
-    """First material directors of the held edges, shape (..., G, 3)."""
+    """First material directors of the held edges [1], shape (..., G, 3)."""
 
 
 @dataclass(frozen=True)
@@ -92,30 +92,50 @@ class Scene:
         names = [e.name for e in self.effects]
         twice = {n for n in names if names.count(n) > 1}
         need(not twice, f"effects {sorted(twice)} are listed twice")
-        need(self.integrator == "explicit" or self.constrained,
-             "implicit steps solve for edge lengths; keep constrained=True and give the rope its stretch stiffness")  # fmt: skip
+        need(
+            self.integrator == "explicit" or self.constrained,
+            "implicit steps solve for edge lengths; keep constrained=True and give the rope its stretch stiffness",
+        )
         if self.integrator == "implicit":
             loops = [n for n, c in zip(self.topology.counts, self.topology.closed, strict=True) if c and n < 5]
             need(not loops, f"a closed rope has {loops[:1]} vertices; implicit steps need at least 5")
-        need(self.twist != "quasistatic" or any(n == "twist" for n in names),
-             "quasistatic twist needs the Twist effect; add it, or set twist='none'")  # fmt: skip
+        need(
+            self.twist != "quasistatic" or any(n == "twist" for n in names),
+            "quasistatic twist needs the Twist effect; add it, or set twist='none'",
+        )
 
     @property
     def settings(self) -> Settings:
         """What a substep needs to know."""
-        return Settings(self.topology, self.effects, self.dt / self.substeps, self.integrator, self.twist, self.constrained,
-                        self.held_vertices, self.held_edges, self.newton, self.gamma, self.ahead)  # fmt: skip
+        return Settings(
+            self.topology,
+            self.effects,
+            self.dt / self.substeps,
+            self.integrator,
+            self.twist,
+            self.constrained,
+            self.held_vertices,
+            self.held_edges,
+            self.newton,
+            self.gamma,
+            self.ahead,
+        )
 
 
 def default_values(effect: Effect | type[Effect], like: Tensor) -> Values:
     """Return an effect's declared defaults as (1, C) tensors."""
     return {
-        name: like.new_tensor([p.default if isinstance(p.default, tuple) else (p.default,)]) for name, p in effect.params.items()
+        name: like.new_tensor([p.default if isinstance(p.default, tuple) else (p.default,)])
+        for name, p in effect.params.items()
     }
 
 
-def make(ropes: Sequence[Rope], effects: Sequence[Effect], values: dict[str, dict[str, float | Sequence[float] | Tensor]] | None = None,
-         **choices) -> tuple[Scene, Params, State]:  # fmt: skip
+def make(
+    ropes: Sequence[Rope],
+    effects: Sequence[Effect],
+    values: dict[str, dict[str, float | Sequence[float] | Tensor]] | None = None,
+    **choices,
+) -> tuple[Scene, Params, State]:
     """Build a scene with its parameters and its initial state.
 
     Args:
@@ -129,7 +149,9 @@ def make(ropes: Sequence[Rope], effects: Sequence[Effect], values: dict[str, dic
     numbers = {e.name: default_values(e, state.pos) for e in effects}
     for effect, given in (values or {}).items():
         if effect not in numbers:
-            raise ValueError(f"scene: values are given for {effect!r}, which is not among its effects {sorted(numbers)}")
+            raise ValueError(
+                f"scene: values are given for {effect!r}, which is not among its effects {sorted(numbers)}"
+            )
         for name, value in given.items():
             if name not in numbers[effect]:
                 raise ValueError(f"scene: {effect} has no number {name!r}; it has {sorted(numbers[effect])}")
@@ -251,4 +273,18 @@ def finite(state: State) -> Tensor:
     return ok & torch.isfinite(state.rods.vel).all(-1).all(-1)
 
 
-__all__ = ["Control", "Params", "Rope", "Scene", "State", "check_step", "finite", "hold", "limits", "make", "rollout", "step", "stepper"]
+__all__ = [
+    "Control",
+    "Params",
+    "Rope",
+    "Scene",
+    "State",
+    "check_step",
+    "finite",
+    "hold",
+    "limits",
+    "make",
+    "rollout",
+    "step",
+    "stepper",
+]

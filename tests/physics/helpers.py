@@ -167,19 +167,18 @@ class Statics:
             for _ in range(steps):
                 z = self.unknowns()
                 g = self.gradient(z, share)
-                scale = max(float(self.tension.abs().max()) if len(self.tension) else 0.0, 1e-300)
                 k = torch.func.jacrev(torch.func.grad(self.lagrangian), chunk_size=128)(z, share)
-                dz = -torch.linalg.lstsq(k, g[:, None]).solution[:, 0] if False else -torch.linalg.solve(k, g)
+                dz = -torch.linalg.solve(k, g)
                 a = len(self.free_x)
                 big = float(dz[:a].abs().max()) / (reach * h)
                 self.take(z + dz / max(1.0, big))
                 self.residual = float(dz[:a].abs().max()) / h
                 if self.residual < tolerance:
                     break
-            assert self.residual < 1e-7, f"statics did not converge: last change {self.residual:.1e} edges at {share}, {scale}"
+            assert self.residual < 1e-7, f"statics did not converge: last change {self.residual:.1e} edges at {share}"
         return self.state
 
-    def lowest(self, count: int = 1, inertia: bool = False) -> Tensor:
+    def lowest(self, count: int = 1) -> Tensor:
         """Lowest eigenvalues of the energy's second derivative on motions that keep lengths."""
         k = self.hessian()
         m = len(self.free_x) + len(self.free_t)

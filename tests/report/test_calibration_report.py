@@ -31,8 +31,7 @@ def test_verdict_names_before_after_and_what_to_beat(recording: Recording) -> No
         baselines={"frozen_shape": {"test_mae_mm": 31.8}, "catenary": {"test_mae_mm": 20.5}},
     )
     assert verdict(result, recording) == (
-        "Calibrated on 2 trials; error on unseen trials 20.0 mm → 5.1 mm "
-        "(frozen shape 31.8 mm, catenary 20.5 mm)."
+        "Calibrated on 2 trials; error on unseen trials 20.0 mm → 5.1 mm (frozen shape 31.8 mm, catenary 20.5 mm)."
     )
 
 

@@ -59,9 +59,7 @@ def test_round_trip(folder: Path, tmp_path: Path) -> None:
     assert [p.name for p in (tmp_path / "new").iterdir()] == ["copy"]
 
 
-def test_saving_leaves_no_half_recording(
-    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_saving_leaves_no_half_recording(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     recording = load_recording(folder)
 
     def fail(*args: object, **kwargs: object) -> None:
@@ -82,9 +80,7 @@ def test_saving_does_not_overwrite(folder: Path) -> None:
         save_recording(recording, folder)
 
 
-def test_last_marker_may_lie_at_the_end_within_float32(
-    folder: Path, edit_rope: Callable[..., None]
-) -> None:
+def test_last_marker_may_lie_at_the_end_within_float32(folder: Path, edit_rope: Callable[..., None]) -> None:
     edit_rope(length=float(np.float32(1.0)) - 5e-8)
     assert isinstance(load_recording(folder), Recording)
 

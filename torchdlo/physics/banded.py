@@ -3,7 +3,7 @@
 A `Pattern` says where the entries of the matrix stand; `solve` eliminates without pivoting (the systems are
 positive definite, or saddle points ordered so that every pivot exists). On the CPU a small C++ kernel runs one
 scene per SIMD lane; it is compiled once per machine with the compiler that `torch.compile` needs as well. Without
-a compiler, and on other devices, a dense batched solve gives the same result more slowly.
+a compiler a dense batched solve gives the same result more slowly. CUDA devices run one scene per thread.
 """
 
 from __future__ import annotations
@@ -26,16 +26,16 @@ from torch import Tensor
 _log = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Pattern:
     """Where the entries of a sparse matrix stand, in an order of unknowns that keeps them near the diagonal."""
 
     half_bandwidth: int
     """How far from the diagonal entries reach, k."""
     index: Tensor
-    """Entry that stands at A[i, i+d-k] (-1: zero, -2: one), int32, shape (2k+1, n)."""
+    """Entry that stands at A[i, i+d-k] (-1: zero, -2: one) [1], int32, shape (2k+1, n)."""
     order: Tensor
-    """Place in the right-hand side of the i-th unknown of the elimination order, int32, shape (n,)."""
+    """Place in the right-hand side of the i-th unknown of the elimination order [1], int32, shape (n,)."""
 
     @property
     def size(self) -> int:
@@ -104,7 +104,9 @@ def kernel() -> ctypes.CDLL | None:
             os.replace(fresh, target)
     library = ctypes.CDLL(str(target))
     for name in ("solve_float", "solve_double"):
-        getattr(library, name).argtypes = [ctypes.c_void_p] * 5 + [ctypes.c_int] * 2 + [ctypes.c_int64] + [ctypes.c_int] * 2
+        getattr(library, name).argtypes = (
+            [ctypes.c_void_p] * 5 + [ctypes.c_int] * 2 + [ctypes.c_int64] + [ctypes.c_int] * 2
+        )
         getattr(library, name).restype = None
     return library
 
@@ -117,9 +119,26 @@ def _solve_cpu(entries: Tensor, rhs: Tensor, name: str, transpose: bool) -> Tens
     entries, rhs = entries.contiguous(), rhs.contiguous()
     out = rhs.new_empty(rhs.shape)
     call = library.solve_double if rhs.dtype == torch.float64 else library.solve_float
-    call(entries.data_ptr(), shape.index.data_ptr(), shape.order.data_ptr(), rhs.data_ptr(), out.data_ptr(),
-         shape.size, shape.half_bandwidth, rhs.shape[1], int(transpose), torch.get_num_threads())  # fmt: skip
+    call(
+        entries.data_ptr(),
+        shape.index.data_ptr(),
+        shape.order.data_ptr(),
+        rhs.data_ptr(),
+        out.data_ptr(),
+        shape.size,
+        shape.half_bandwidth,
+        rhs.shape[1],
+        int(transpose),
+        torch.get_num_threads(),
+    )
     return out
+
+
+def _solve_cuda(entries: Tensor, rhs: Tensor, name: str, transpose: bool) -> Tensor:
+    # Triton comes with the CUDA builds of torch only.
+    from torchdlo.physics.banded_gpu import solve_cuda
+
+    return solve_cuda(entries.contiguous(), rhs.contiguous(), pattern(name), transpose)
 
 
 def dense_matrix(entries: Tensor, name: str) -> Tensor:
@@ -152,7 +171,7 @@ _library.define(
     tags=(torch.Tag.needs_contiguous_strides,),
 )
 _library.impl("solve_banded", _solve_cpu, "CPU")
-_library.impl("solve_banded", solve_dense, "CUDA")
+_library.impl("solve_banded", _solve_cuda, "CUDA")
 _library.impl("solve_banded", lambda entries, rhs, pattern, transpose: rhs.new_empty(rhs.shape), "Meta")
 
 

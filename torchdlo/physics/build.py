@@ -46,9 +46,9 @@ class Rope:
     velocities: Tensor | None = None
     """Initial velocities [m/s], shape (..., n, 3); at rest if not given."""
     director: Tensor | None = None
-    """First material director of the first edge, shape (..., 3); made normal to it. Any if not given."""
+    """First material director of the first edge [1], shape (..., 3); made normal to it. Any if not given."""
     rest_director: Tensor | None = None
-    """The same in the rest shape; `director` if not given."""
+    """The same in the rest shape [1], shape (..., 3); `director` if not given."""
     bend2: Number | None = None
     """Bending stiffness [N m^2] about the second material director if it differs from `bend`."""
 
@@ -83,7 +83,9 @@ def bishop(topology: Topology, pos: Tensor, edge_mask: Tensor, first: Sequence[T
     return tree.batch_innermost(torch.cat(out, -2))
 
 
-def frame_curvature(topology: Topology, pos: Tensor, director: Tensor, edge_mask: Tensor, hinge_mask: Tensor) -> tuple[Tensor, Tensor]:
+def frame_curvature(
+    topology: Topology, pos: Tensor, director: Tensor, edge_mask: Tensor, hinge_mask: Tensor
+) -> tuple[Tensor, Tensor]:
     """Return integrated curvatures (..., V, 2) and twists (..., V, 1) of a shape in given material frames."""
     t = normalize(edge_vectors(topology, pos, edge_mask))
     tp = preceding(topology, t)
@@ -165,14 +167,23 @@ def assemble(ropes: Sequence[Rope]) -> tuple[Topology, RodParams, RodState]:
     length = edge_vectors(topology, shapes, edge_mask).norm(dim=-1, keepdim=True)
     length = torch.where(edge_mask > 0, length, 1.0)
     kappa, twist = frame_curvature(topology, shapes, rest_director, edge_mask, hinge_mask)
-    curved = pack([like.new_full((r.positions.shape[-2], 1), float(r.rest != "straight" if isinstance(r.rest, str) else 1)) for r in ropes])
+    curved = pack(
+        [
+            like.new_full((r.positions.shape[-2], 1), float(r.rest != "straight" if isinstance(r.rest, str) else 1))
+            for r in ropes
+        ]
+    )
     rest = RodRest(length, kappa * curved, twist * curved, edge_mask, hinge_mask)
 
     director = bishop(topology, pos, edge_mask, given)
     _, reference = frame_curvature(topology, pos, director, edge_mask, hinge_mask)
     zero = torch.zeros_like(pos[..., :1])
-    velocities = pack([(torch.zeros_like(r.positions) if r.velocities is None else r.velocities).to(like) for r in ropes])
-    state = RodState(pos, velocities.expand_as(pos), zero, zero, director, reference, torch.zeros_like(pos[..., :2]), zero)
+    velocities = pack(
+        [(torch.zeros_like(r.positions) if r.velocities is None else r.velocities).to(like) for r in ropes]
+    )
+    state = RodState(
+        pos, velocities.expand_as(pos), zero, zero, director, reference, torch.zeros_like(pos[..., :2]), zero
+    )
     return topology, RodParams(rest, _material(topology, ropes, rest, pack, like)), state
 
 
@@ -186,13 +197,19 @@ def _material(topology: Topology, ropes: Sequence[Rope], rest: RodRest, pack, li
             line = _column(rope.mass, n, like, "mass") / real.sum(-2, keepdim=True)
         else:
             line = _column(rope.density, n, like, "density") * torch.pi * r.square()
-        bend = _column(rope.bend, n, like, "bend") if rope.bend is not None else (
-            _column(rope.youngs, n, like, "youngs", 0.0) * torch.pi * r.pow(4) / 4)  # fmt: skip
+        bend = (
+            _column(rope.bend, n, like, "bend")
+            if rope.bend is not None
+            else (_column(rope.youngs, n, like, "youngs", 0.0) * torch.pi * r.pow(4) / 4)
+        )
         second = bend if rope.bend2 is None else _column(rope.bend2, n, like, "bend2")
         both = any(other.bend2 is not None for other in ropes)
         columns["bend"].append(torch.cat(torch.broadcast_tensors(bend, second), -1) if both else bend)
-        columns["twist"].append(_column(rope.twist, n, like, "twist") if rope.twist is not None else (
-            _column(rope.shear, n, like, "shear", 0.0) * torch.pi * r.pow(4) / 2))  # fmt: skip
+        columns["twist"].append(
+            _column(rope.twist, n, like, "twist")
+            if rope.twist is not None
+            else (_column(rope.shear, n, like, "shear", 0.0) * torch.pi * r.pow(4) / 2)
+        )
         columns["stretch"].append(_column(rope.stretch, n, like, "stretch"))
         columns["radius"].append(r)
         columns["line"].append(line)

@@ -73,7 +73,9 @@ def solve_slots(topology: Topology, diagonal: Tensor, to_next: Tensor, to_prev: 
     return _vertices(solution, rhs.shape[:-2], 1)
 
 
-def project(lengths: Lengths, moved: Tensor, answer: Tensor, direction: Tensor, tension: Tensor, steps: int) -> tuple[Tensor, Tensor]:
+def project(
+    lengths: Lengths, moved: Tensor, answer: Tensor, direction: Tensor, tension: Tensor, steps: int
+) -> tuple[Tensor, Tensor]:
     """Enforce lengths where every vertex moves by itself: a tridiagonal system for the tensions.
 
     Args:
@@ -155,9 +157,18 @@ class Inertia:
 
 
 def balance(
-    lengths: Lengths, inertia: Inertia, moved: Tensor, free: Tensor, force: Tensor, scale: Tensor,
-    direction: Tensor, ahead: Tensor, tension: Tensor, turning: float, steps: int,
-) -> tuple[Tensor, Tensor]:  # fmt: skip
+    lengths: Lengths,
+    inertia: Inertia,
+    moved: Tensor,
+    free: Tensor,
+    force: Tensor,
+    scale: Tensor,
+    direction: Tensor,
+    ahead: Tensor,
+    tension: Tensor,
+    turning: float,
+    steps: int,
+) -> tuple[Tensor, Tensor]:
     """Enforce lengths where inertia couples the vertices: a banded saddle-point system for positions and tensions.
 
     Args:
@@ -214,7 +225,9 @@ def balance(
         # An edge may turn by about one radian per Newton step; beyond that its linearisation means nothing.
         with torch.no_grad():
             turn = lengths.active * (following(topology, change) - change) / lengths.rest
-            short = (1 / turn.square().sum(-1, keepdim=True).amax(-2, keepdim=True).sqrt().clamp(min=1e-9)).clamp(max=1.0)
+            short = (1 / turn.square().sum(-1, keepdim=True).amax(-2, keepdim=True).sqrt().clamp(min=1e-9)).clamp(
+                max=1.0
+            )
         return pos + short * change, impulse + short * push
 
     with torch.no_grad():
@@ -236,7 +249,11 @@ def _saddle(name: str) -> banded.Pattern:
     edges = sorted(range(v), key=lambda i: max(rank[i], rank[after[i]]) if _is_edge(topology, i) else rank[i])
     for slot in order:
         unknowns += [slot, v + slot, 2 * v + slot]
-        while edges and (max(rank[edges[0]], rank[after[edges[0]]]) if _is_edge(topology, edges[0]) else rank[edges[0]]) <= rank[slot]:
+        while (
+            edges
+            and (max(rank[edges[0]], rank[after[edges[0]]]) if _is_edge(topology, edges[0]) else rank[edges[0]])
+            <= rank[slot]
+        ):
             unknowns.append(3 * v + edges.pop(0))
     places: list[tuple[int, int, int]] = []
     for i in range(v):

@@ -19,7 +19,7 @@ from torchdlo.physics.constrain import Inertia, Lengths, balance, project, solve
 from torchdlo.physics.effect import Effect, Values
 from torchdlo.physics.numerics import wrap
 from torchdlo.physics.rod import RodParams, RodState, View
-from torchdlo.physics.topology import Topology, following, preceding
+from torchdlo.physics.topology import Topology, following
 
 INTEGRATORS = ("explicit", "implicit")
 TWISTS = ("none", "dynamic", "quasistatic")
@@ -61,7 +61,7 @@ class Targets:
     pos: Tensor
     """Positions of the held vertices [m], shape (..., H, 3)."""
     director: Tensor
-    """First material directors of the held edges, shape (..., G, 3)."""
+    """First material directors of the held edges [1], shape (..., G, 3)."""
 
 
 def _spread(values: Tensor, slots: tuple[int, ...], size: int, otherwise: Tensor) -> Tensor:
@@ -86,7 +86,9 @@ def _free(slots: tuple[int, ...], like: Tensor, size: int) -> Tensor:
     return like.new_tensor([[0.0] if slot in slots else [1.0] for slot in range(size)])
 
 
-def substep(settings: Settings, params: RodParams, values: dict[str, Values], state: RodState, targets: Targets, first: Tensor) -> RodState:
+def substep(
+    settings: Settings, params: RodParams, values: dict[str, Values], state: RodState, targets: Targets, first: Tensor
+) -> RodState:
     """Advance the rods by one substep.
 
     Args:
@@ -123,7 +125,13 @@ def substep(settings: Settings, params: RodParams, values: dict[str, Values], st
 
 def _translate(settings: Settings, now: View, loads: Values, targets: Targets, first: Tensor) -> tuple[Tensor, Tensor]:
     """Return positions after the substep and tensions."""
-    topology, dt, state, rest, material = settings.topology, settings.dt, now.state, now.params.rest, now.params.material
+    topology, dt, state, rest, material = (
+        settings.topology,
+        settings.dt,
+        now.state,
+        now.params.rest,
+        now.params.material,
+    )
     force = torch.zeros_like(state.pos)
     if "gradient" in loads:
         pull = loads["gradient"] * rest.edge_mask
@@ -156,8 +164,19 @@ def _translate(settings: Settings, now: View, loads: Values, targets: Targets, f
         force = force - tree.replace(inertia, hinge=stiff / (dt * dt)).bending(topology, drift_ahead)
         moved = _spread(targets.pos, settings.held_vertices, topology.size, drift)
         ahead = (now.next(drift_ahead) - drift_ahead) / rest.length
-        return balance(lengths, inertia, moved, free, force, scale.expand_as(now.length[..., :1, :]), now.tangent,
-                       ahead, state.tension, share, settings.newton - 1)  # fmt: skip
+        return balance(
+            lengths,
+            inertia,
+            moved,
+            free,
+            force,
+            scale.expand_as(now.length[..., :1, :]),
+            now.tangent,
+            ahead,
+            state.tension,
+            share,
+            settings.newton - 1,
+        )
     answer = scale / vertex * free
     moved = _spread(targets.pos, settings.held_vertices, topology.size, drift + answer * force)
     if not settings.constrained:
@@ -198,8 +217,9 @@ def _turn(settings: Settings, now: View, loads: Values, moved: RodState, targets
         def newton(change: Tensor) -> Tensor:
             coupled = after * now.next(change) + now.prev(after * change)
             excess = (kick - (inertia + same) * change - coupled) * free
-            return change + solve_slots(settings.topology, free * (inertia + same) + 1 - free, free * after,
-                                        free * now.prev(after), excess)  # fmt: skip
+            return change + solve_slots(
+                settings.topology, free * (inertia + same) + 1 - free, free * after, free * now.prev(after), excess
+            )
 
         with torch.no_grad():
             start = newton(torch.zeros_like(kick))
@@ -211,7 +231,9 @@ def _turn(settings: Settings, now: View, loads: Values, moved: RodState, targets
     return tree.replace(moved, twist=angle, twist_rate=(angle - state.twist) / dt)
 
 
-def settle_twist(settings: Settings, params: RodParams, values: dict[str, Values], state: RodState, targets: Targets) -> RodState:
+def settle_twist(
+    settings: Settings, params: RodParams, values: dict[str, Values], state: RodState, targets: Targets
+) -> RodState:
     """Return the state with twists at which no free edge feels a torque (two Newton steps from the last ones).
 
     Bergou 2008, section 4.2: twist waves are much faster than bending, so twist is taken to be in balance.
@@ -227,7 +249,9 @@ def settle_twist(settings: Settings, params: RodParams, values: dict[str, Values
             same, after = _twist_matrix(here, loads)
             # A tiny spring on every edge: a rod free at both ends may spin as a whole.
             same = same + 1e-9 * same.amax(-2, keepdim=True)
-        return angle + solve_slots(topology, free * same + 1 - free, free * after, free * here.prev(after), loads["torque"] * free)
+        return angle + solve_slots(
+            topology, free * same + 1 - free, free * after, free * here.prev(after), loads["torque"] * free
+        )
 
     angle = _prescribed(settings, params, state, targets, state.twist)
     with torch.no_grad():

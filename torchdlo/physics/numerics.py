@@ -18,7 +18,7 @@ def dot(a: Tensor, b: Tensor) -> Tensor:
 
 def cross(a: Tensor, b: Tensor) -> Tensor:
     """Return the vector product over the last axis, shape (..., 3)."""
-    return torch.linalg.cross(a, b, dim=-1)
+    return torch.linalg.cross(*torch.broadcast_tensors(a, b), dim=-1)
 
 
 def safe_norm(x: Tensor) -> Tensor:

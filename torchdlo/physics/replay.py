@@ -17,7 +17,9 @@ from torchdlo.physics import tree
 
 class _Replay(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, run: Callable[[list[Tensor]], list[Tensor]], offload: bool, *inputs: Tensor) -> tuple[Tensor, ...]:
+    def forward(
+        ctx: Any, run: Callable[[list[Tensor]], list[Tensor]], offload: bool, *inputs: Tensor
+    ) -> tuple[Tensor, ...]:
         ctx.run = run
         ctx.devices = [x.device for x in inputs]
         kept = [x.cpu() if offload and x.is_cuda else x for x in inputs]

@@ -92,9 +92,9 @@ class View:
     length: Tensor
     """Current edge lengths [m], shape (..., V, 1)."""
     tangent: Tensor
-    """Unit tangents; an arbitrary unit vector on dummy edges, shape (..., V, 3)."""
+    """Unit tangents; an arbitrary unit vector on dummy edges [1], shape (..., V, 3)."""
     before: Tensor
-    """Unit tangents of the preceding edges, shape (..., V, 3)."""
+    """Unit tangents of the preceding edges [1], shape (..., V, 3)."""
     hinge_length: Tensor
     """Half the sum of the rest lengths next to a hinge [m], shape (..., V, 1)."""
 
@@ -134,8 +134,16 @@ def view(topology: Topology, params: RodParams, state: RodState, dt: float) -> V
     length = safe_norm(e)
     tangent = e / length.clamp(min=1e-12)
     rest = params.rest.length
-    return View(topology, state, params, dt, length, tangent, preceding(topology, tangent),
-                0.5 * (rest + preceding(topology, rest)))  # fmt: skip
+    return View(
+        topology,
+        state,
+        params,
+        dt,
+        length,
+        tangent,
+        preceding(topology, tangent),
+        0.5 * (rest + preceding(topology, rest)),
+    )
 
 
 def advance_frames(topology: Topology, params: RodParams, old: View, pos: Tensor) -> tuple[Tensor, Tensor]:

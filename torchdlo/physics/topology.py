@@ -26,7 +26,9 @@ class Topology:
 
     def __post_init__(self) -> None:
         if len(self.counts) != len(self.closed) or not self.counts:
-            raise ValueError(f"topology: {len(self.counts)} counts and {len(self.closed)} closed flags; give one flag per rod")
+            raise ValueError(
+                f"topology: {len(self.counts)} counts and {len(self.closed)} closed flags; give one flag per rod"
+            )
         for rod, (count, loop) in enumerate(zip(self.counts, self.closed, strict=True)):
             if count < 3:
                 kind = "closed" if loop else "open"

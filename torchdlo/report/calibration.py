@@ -19,9 +19,7 @@ PAGE = "report.html"
 PICTURE = "report.png"
 
 
-def write_report(
-    result: Calibration, recording: Recording, folder: Path, *, command: str = ""
-) -> tuple[Path, Path]:
+def write_report(result: Calibration, recording: Recording, folder: Path, *, command: str = "") -> tuple[Path, Path]:
     """Write the page and the picture.
 
     Args:
@@ -42,9 +40,7 @@ def write_report(
 
 def verdict(result: Calibration, recording: Recording) -> str:
     """The result in one sentence."""
-    others = ", ".join(
-        f"{_words(name)} {_mm(values['test_mae_mm'])}" for name, values in result.baselines.items()
-    )
+    others = ", ".join(f"{_words(name)} {_mm(values['test_mae_mm'])}" for name, values in result.baselines.items())
     sentence = (
         f"Calibrated on {_trials(len(recording.train))}; error on unseen trials "
         f"{_mm(result.before['test_mae_mm'])} → {_mm(result.test_mae_mm)}"
@@ -66,9 +62,7 @@ def verdict(result: Calibration, recording: Recording) -> str:
     return sentence
 
 
-def calibration_html(
-    result: Calibration, recording: Recording, png: bytes, *, command: str = ""
-) -> str:
+def calibration_html(result: Calibration, recording: Recording, png: bytes, *, command: str = "") -> str:
     """The page, with the picture inside."""
     name = html.escape(recording.path.resolve().name)
     picture = base64.b64encode(png).decode("ascii")
@@ -96,8 +90,7 @@ def calibration_html(
 
 def _error_table(result: Calibration) -> str:
     rows = [
-        (_words(name), values.get("train_mae_mm"), values["test_mae_mm"])
-        for name, values in result.baselines.items()
+        (_words(name), values.get("train_mae_mm"), values["test_mae_mm"]) for name, values in result.baselines.items()
     ]
     before = result.before
     rows.append(("before calibration", before.get("train_mae_mm"), before["test_mae_mm"]))
@@ -136,9 +129,7 @@ def _trial_table(result: Calibration) -> str:
     return _table(heads, rows)
 
 
-def _table(
-    heads: tuple[str, ...], rows: list[tuple[str, ...]], *, last_is_ours: bool = False
-) -> str:
+def _table(heads: tuple[str, ...], rows: list[tuple[str, ...]], *, last_is_ours: bool = False) -> str:
     lines = ["<table><thead><tr>", *(f"<th>{html.escape(h)}</th>" for h in heads)]
     lines.append("</tr></thead><tbody>")
     for index, row in enumerate(rows):

@@ -157,10 +157,7 @@ def _error_over_time(axes: Any, result: Calibration, trials: Sequence[Trial]) ->
 
 
 def _bars(axes: Any, result: Calibration) -> None:
-    rows = [
-        (_NAMES.get(name, name), values["test_mae_mm"], _OTHER)
-        for name, values in result.baselines.items()
-    ]
+    rows = [(_NAMES.get(name, name), values["test_mae_mm"], _OTHER) for name, values in result.baselines.items()]
     rows += [
         ("before calibration", result.before["test_mae_mm"], _BEFORE),
         ("calibrated", result.test_mae_mm, _AFTER),

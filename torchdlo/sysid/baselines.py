@@ -71,9 +71,7 @@ BASELINES = {"frozen_shape": frozen_shape, "catenary": catenary}
 """Each takes a trial and its recording and returns marker positions [m], shape (F, M, 3)."""
 
 
-def hang(
-    start: np.ndarray, end: np.ndarray, along: np.ndarray, length: float, down: np.ndarray
-) -> np.ndarray:
+def hang(start: np.ndarray, end: np.ndarray, along: np.ndarray, length: float, down: np.ndarray) -> np.ndarray:
     """Points of an inextensible rope at rest between two supports; straight where it is too short.
 
     Args:

@@ -49,9 +49,7 @@ def trial_files(path: Path) -> dict[str, list[Path]]:
     if not path.exists():
         raise InputError(f"{path}: expected a recording folder, found nothing there.")
     if not path.is_dir():
-        raise InputError(
-            f"{path}: expected a recording folder with rope.json and .npz trials, found a file."
-        )
+        raise InputError(f"{path}: expected a recording folder with rope.json and .npz trials, found a file.")
     if not (path / "rope.json").is_file():
         raise InputError(
             f"{path / 'rope.json'}: expected this file with the rope's length, mass and so on, "
@@ -60,8 +58,7 @@ def trial_files(path: Path) -> dict[str, list[Path]]:
     for file in sorted(path.iterdir()):
         if file.name.startswith(("train_", "test_")) and file.suffix.lower() in _VIDEO_SUFFIXES:
             raise InputError(
-                f"{file}: video trials are not supported by this command yet; "
-                "give marker positions in an .npz."
+                f"{file}: video trials are not supported by this command yet; give marker positions in an .npz."
             )
     files = {split: sorted(path.glob(f"{split}_*.npz")) for split in ("train", "test")}
     for split, purpose in (("train", "fit on"), ("test", "judge on")):
@@ -107,17 +104,14 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
         with path.open("rb") as file:
             archive = np.load(file, allow_pickle=False)
             if not isinstance(archive, np.lib.npyio.NpzFile):
-                raise InputError(
-                    f"{path}: expected an .npz archive, found a single array; use numpy.savez."
-                )
+                raise InputError(f"{path}: expected an .npz archive, found a single array; use numpy.savez.")
             return {name: _read_array(path, archive, name) for name in archive.files}
     except InputError:
         raise
     except _UNREADABLE as error:
         if "pickle" in str(error):
             raise InputError(
-                f"{path}: expected an .npz archive, found a pickle or another kind of file; "
-                "use numpy.savez."
+                f"{path}: expected an .npz archive, found a pickle or another kind of file; use numpy.savez."
             ) from None
         raise InputError(
             f"{path}: expected a complete .npz archive, found one that cannot be read ({error}); "
@@ -203,9 +197,7 @@ def _read_object(path: Path) -> dict[str, Any]:
     except (OSError, ValueError, RecursionError) as error:
         raise InputError(f"{path}: expected valid JSON, but reading failed: {error}.") from None
     if not isinstance(rope, dict):
-        raise InputError(
-            f"{path}: expected a JSON object with length, mass and so on, found {_kind(rope)}."
-        )
+        raise InputError(f"{path}: expected a JSON object with length, mass and so on, found {_kind(rope)}.")
     return rope
 
 
@@ -226,8 +218,7 @@ def _check_names(
     missing = [name for name in required if name not in given]
     if missing:
         raise InputError(
-            f"{path}: {', '.join(missing)}: expected, but missing; {kind}s found: "
-            f"{', '.join(given) or 'none'}."
+            f"{path}: {', '.join(missing)}: expected, but missing; {kind}s found: {', '.join(given) or 'none'}."
         )
 
 
@@ -257,9 +248,7 @@ def _number(
     return number
 
 
-def _positions(
-    path: Path, rope: dict[str, Any], name: str, shape: tuple[int, ...], expected: str
-) -> np.ndarray:
+def _positions(path: Path, rope: dict[str, Any], name: str, shape: tuple[int, ...], expected: str) -> np.ndarray:
     try:
         array = np.array(rope[name])
     except ValueError:

@@ -195,9 +195,7 @@ def _as_positions(path: Path, content: object) -> np.ndarray:
     try:
         array = np.array(content, dtype=float)
     except (TypeError, ValueError, OverflowError):
-        raise InputError(
-            f"{path}: expected lists of numbers of one size, found something else."
-        ) from None
+        raise InputError(f"{path}: expected lists of numbers of one size, found something else.") from None
     if array.ndim == 3 and array.shape[1] == 3:
         array = array.transpose(0, 2, 1)
     if array.ndim != 3 or array.shape[2] != 3 or array.shape[1] < 5 or len(array) < 3:
@@ -212,10 +210,7 @@ def _as_positions(path: Path, content: object) -> np.ndarray:
 
 def _read_trials(folder: Path, callback: Callable[..., None] | None) -> dict[str, np.ndarray]:
     """Positions by trial name, the numbers written with three digits so that they sort."""
-    files = {
-        split: sorted((folder / split).glob("*.pkl"), key=lambda f: (len(f.stem), f.stem))
-        for split in _SPLITS
-    }
+    files = {split: sorted((folder / split).glob("*.pkl"), key=lambda f: (len(f.stem), f.stem)) for split in _SPLITS}
     for split, found in files.items():
         if not found:
             raise InputError(f"{folder / split}: expected .pkl files, found none.")
@@ -227,8 +222,7 @@ def _read_trials(folder: Path, callback: Callable[..., None] | None) -> dict[str
             first = next(iter(positions.values()), trial)
             if trial.shape[1] != first.shape[1]:
                 raise InputError(
-                    f"{file}: expected {first.shape[1]} markers as in the other files, "
-                    f"found {trial.shape[1]}."
+                    f"{file}: expected {first.shape[1]} markers as in the other files, found {trial.shape[1]}."
                 )
             positions[f"{_SPLITS[split]}_{file.stem.zfill(3)}"] = trial
             if callback is not None:
@@ -251,8 +245,7 @@ def _trial(name: str, positions: np.ndarray, arclength: np.ndarray, gripped: np.
 
 def _compares_with(test: ast.expr, cable: str) -> bool:
     return isinstance(test, ast.Compare) and any(
-        isinstance(side, ast.Constant) and side.value == cable
-        for side in (test.left, *test.comparators)
+        isinstance(side, ast.Constant) and side.value == cable for side in (test.left, *test.comparators)
     )
 
 

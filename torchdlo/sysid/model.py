@@ -24,6 +24,7 @@ from torchdlo.physics.effects.elastic import Bend, BendFrame, Twist
 from torchdlo.physics.effects.field import Damping, Gravity
 from torchdlo.physics.effects.table import Table
 from torchdlo.physics.numerics import normalize
+from torchdlo.sysid.mesh import make_mesh
 from torchdlo.sysid.recording import Recording, Trial
 
 PARAMETERS: dict[str, Param] = {
@@ -31,8 +32,15 @@ PARAMETERS: dict[str, Param] = {
     "twisting_stiffness": Param(1e-3, 1e-7, 1.0, "N m^2", "log", None, "Uniform twisting stiffness GJ."),
     "damping_rate": Param(0.5, 1e-2, 20.0, "1/s", "log", None, "Rate at which all velocities decay."),
     "rest_share": Param(1.0, 0.0, 2.0, "1", "linear", 0.0, "Share of the given rest shape's curvature that is real."),
-    "rest_roll": Param(0.0, -np.pi, np.pi, "rad", "linear", None,
-                       "Angle from the vertical to the normal of the rest shape's plane, about the first clamp."),  # fmt: skip
+    "rest_roll": Param(
+        0.0,
+        -np.pi,
+        np.pi,
+        "rad",
+        "linear",
+        None,
+        "Angle from the vertical to the normal of the rest shape's plane, about the first clamp.",
+    ),
 }
 """Numbers that calibration may fit."""
 
@@ -42,8 +50,11 @@ MAX_SUBSTEP = 5e-3
 _STRETCH = 1e4
 """Axial stiffness [N]: a strain of 1e-4 at 1 N. Real cables are near it, and taut trials stay solvable."""
 
-_CHUNK = 512
-"""Scenes that run together; more only costs cache."""
+_CHUNK = 128
+"""Scenes that run together in a compiled step: one size, so that there is one graph."""
+
+_COMPILE_FROM = 10_000
+"""Frames in the train trials from which compiling pays off."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,21 +85,33 @@ class Start:
 class RopeModel:
     """A recording's rope on a mesh that has a vertex at every marker."""
 
-    def __init__(self, recording: Recording, *, vertices: int | None = None, rest: str = "straight") -> None:
+    def __init__(
+        self, recording: Recording, *, vertices: int | None = None, rest: str = "straight", compiled: bool | None = None
+    ) -> None:
         trial = recording.train[0]
         self.recording = recording
         self.rest = rest
         self.count = trial.markers.shape[1]
-        self.arclength, self.marker_vertex = _mesh(trial.marker_arclength, recording.length, vertices)
+        self.mesh = make_mesh(trial, recording.length, vertices)
+        self.arclength, self.marker_vertex = self.mesh.arclength, self.mesh.marker_vertex
+        self.held, self.clamps = self.mesh.held, self.mesh.clamps
         self.gripped = np.flatnonzero(trial.gripped)
         for other in (*recording.train, *recording.test):
-            if not np.array_equal(other.gripped, trial.gripped) or not np.allclose(other.marker_arclength, trial.marker_arclength):
-                raise InputError(f"{other.name}.npz: gripped or marker_arclength differ from those of {trial.name}.npz; "
-                                 "put trials with other grips into a recording of their own.")  # fmt: skip
-        self.held, self.clamps = self._grips()
+            if not np.array_equal(other.gripped, trial.gripped) or not np.allclose(
+                other.marker_arclength, trial.marker_arclength
+            ):
+                raise InputError(
+                    f"{other.name}.npz: gripped or marker_arclength differ from {trial.name}.npz; "
+                    "put trials with other grips into a recording of their own."
+                )
         if rest == "given" and recording.rest_positions is None:
-            raise InputError("rope.json: rest_positions is missing; expected it for a calibration with the given rest shape.")
+            raise InputError(
+                "rope.json: rest_positions is missing; expected it for a calibration with the given rest shape."
+            )
         self.dt = float(trial.time[1] - trial.time[0])
+        frames = sum(len(t.time) for t in recording.train)
+        self.compiled = frames >= _COMPILE_FROM if compiled is None else compiled
+        self._stepper: tuple[scenes.Scene, Callable] | None = None
         self.substeps = max(1, int(np.ceil(self.dt / MAX_SUBSTEP - 1e-9)))
 
     @property
@@ -107,78 +130,53 @@ class RopeModel:
         known = {"bending_stiffness": bend, "twisting_stiffness": 0.7 * bend}
         return np.array([known.get(name, PARAMETERS[name].default) for name in self.parameters], dtype=float)
 
-    def _grips(self) -> tuple[tuple[int, ...], list[tuple[int, int]]]:
-        """Return the held vertices, and per clamp the edge next to the free rope and the marker at that clamp's outer end."""
-        at = self.marker_vertex
-        held: set[int] = {int(at[m]) for m in self.gripped}
-        clamps: list[tuple[int, int]] = []
-        runs = np.split(self.gripped, np.flatnonzero(np.diff(self.gripped) > 1) + 1)
-        for run in runs:
-            held |= set(range(int(at[run[0]]), int(at[run[-1]]) + 1))
-            if len(run) > 1:
-                inward = run[0] < self.count - 1 - run[-1] or run[0] == 0
-                edge = int(at[run[-1]]) - 1 if inward else int(at[run[0]])
-                clamps.append((edge, int(run[0] if inward else run[-1])))
-        return tuple(sorted(held)), clamps
-
     def motion(self, trials: Sequence[Trial]) -> Motion:
         """Return the grippers' motion of trials, and what was measured."""
         longest = max(len(t.time) for t in trials)
         held, director, measured = [], [], []
         for trial in trials:
-            vertices = self._along(trial.markers, trial.gripped)[:, list(self.held)]
+            vertices = self.mesh.along(trial.markers, trial.gripped)[:, list(self.held)]
             markers = np.where(trial.suspect[:, None, None], np.nan, trial.markers)
             pad = ((0, longest - len(trial.time)),)
             held.append(np.pad(vertices, (*pad, (0, 0), (0, 0)), mode="edge"))
-            director.append(np.pad(self._directors(trial), (*pad, (0, 0), (0, 0)), mode="edge"))
+            director.append(np.pad(self.mesh.directors(trial), (*pad, (0, 0), (0, 0)), mode="edge"))
             measured.append(np.pad(markers, (*pad, (0, 0), (0, 0)), constant_values=np.nan))
-        return Motion(tuple(t.name for t in trials), torch.as_tensor(np.stack(held)), torch.as_tensor(np.stack(director)),
-                      np.stack(measured), tuple(len(t.time) for t in trials))  # fmt: skip
-
-    def _along(self, markers: np.ndarray, known: np.ndarray) -> np.ndarray:
-        """Interpolate known markers (F, M, 3) linearly to all vertices, (F, V, 3)."""
-        s = self.arclength[self.marker_vertex][known]
-        right = np.clip(np.searchsorted(s, self.arclength), 1, max(len(s) - 1, 1))
-        if len(s) == 1:
-            return np.repeat(markers[:, known], len(self.arclength), 1)
-        share = (self.arclength - s[right - 1]) / (s[right] - s[right - 1])
-        m = markers[:, known]
-        return m[:, right - 1] + share[:, None] * (m[:, right] - m[:, right - 1])
-
-    def _directors(self, trial: Trial) -> np.ndarray:
-        """Return a material director per clamp and frame: measured, or carried without turning about the clamp's axis."""
-        out = []
-        for edge, marker in self.clamps:
-            if trial.gripper_quaternion is not None and marker in trial.gripper_marker:
-                which = int(np.flatnonzero(trial.gripper_marker == marker)[0])
-                quat = torch.as_tensor(trial.gripper_quaternion[:, which])
-                out.append(rotation.rotate(quat, quat.new_tensor([0.0, 1.0, 0.0]).expand(len(quat), 3)).numpy())
-                continue
-            ends = self._along(trial.markers, trial.gripped)[:, [edge, edge + 1]]
-            tangent = normalize(torch.as_tensor(ends[:, 1] - ends[:, 0]))
-            d = [_level_normal(tangent[:1])]
-            for a, b in zip(tangent[:-1], tangent[1:], strict=True):
-                d.append(rotation.transport(d[-1], a[None], b[None]))
-            out.append(torch.cat(d).numpy())
-        frames = len(trial.time)
-        return np.stack(out, 1) if out else np.zeros((frames, 0, 3))
+        return Motion(
+            tuple(t.name for t in trials),
+            torch.as_tensor(np.stack(held)),
+            torch.as_tensor(np.stack(director)),
+            np.stack(measured),
+            tuple(len(t.time) for t in trials),
+        )
 
     def measured_twist(self) -> bool:
         """Return whether the grippers' rotation about the rope is measured at every clamp."""
         return all(t.gripper_quaternion is not None for t in self.recording.train)
 
-    def build(self, motion: Motion, start: Start, values: np.ndarray) -> tuple[scenes.Scene, scenes.Params, scenes.State]:
+    def build(
+        self, motion: Motion, start: Start, values: np.ndarray
+    ) -> tuple[scenes.Scene, scenes.Params, scenes.State]:
         """Build scenes, one per row of `values` (N, K), `motion` and `start`; all have N trials."""
         recording, number = self.recording, dict(zip(self.parameters, torch.as_tensor(values).T, strict=True))
-        pos, vel = (torch.as_tensor(CubicSpline(self._marker_s(), x, axis=1)(self.arclength)) for x in (start.pos, start.vel))
+        pos, vel = (
+            torch.as_tensor(CubicSpline(self.mesh.marker_arclength, x, axis=1)(self.arclength))
+            for x in (start.pos, start.vel)
+        )
         held = list(self.held)
         pos[:, held] = motion.held[:, 0]
         vel[:, held] = (motion.held[:, 1] - motion.held[:, 0]) / self.dt
         rope = scenes.Rope(
-            pos, radius=recording.radius or 0.005, mass=recording.mass, bend=number["bending_stiffness"],
-            twist=number["twisting_stiffness"], stretch=_STRETCH, velocities=vel, rest=self._rest_shape(),
-            director=self._first_director(motion), rest_director=None if self.rest != "given" else pos.new_tensor([0.0, 0.0, 1.0]),
-        )  # fmt: skip
+            pos,
+            radius=recording.radius or 0.005,
+            mass=recording.mass,
+            bend=number["bending_stiffness"],
+            twist=number["twisting_stiffness"],
+            stretch=_STRETCH,
+            velocities=vel,
+            rest=self._rest_shape(),
+            director=self._first_director(motion),
+            rest_director=None if self.rest != "given" else pos.new_tensor([0.0, 0.0, 1.0]),
+        )
         effects: list[Effect] = [Gravity(), BendFrame() if self.rest == "given" else Bend(), Twist(), Damping()]
         numbers: dict[str, dict[str, Any]] = {
             "gravity": {"acceleration": list(recording.gravity)},
@@ -188,14 +186,19 @@ class RopeModel:
             effects.append(Table())
             numbers["table"] = {"height": recording.table_height}
         scene, params, state = scenes.make(
-            [rope], effects, numbers, dt=self.dt, substeps=self.substeps, integrator="implicit", twist="quasistatic",
-            held_vertices=self.held, held_edges=tuple(edge for edge, _ in self.clamps), newton=3,
-        )  # fmt: skip
+            [rope],
+            effects,
+            numbers,
+            dt=self.dt,
+            substeps=self.substeps,
+            integrator="implicit",
+            twist="quasistatic",
+            held_vertices=self.held,
+            held_edges=tuple(edge for edge, _ in self.clamps),
+            newton=3,
+        )
         params = self._measured_lengths(params, number)
         return scene, params, self._agree(scene, params, state)
-
-    def _marker_s(self) -> np.ndarray:
-        return self.arclength[self.marker_vertex]
 
     def _rest_shape(self) -> str | Tensor:
         """Return the rest shape at the vertices, flattened on its best plane: markers stand off the rope's axis."""
@@ -205,12 +208,16 @@ class RopeModel:
         centre = points.mean(0)
         _, _, axes = np.linalg.svd(points - centre)
         flat = (points - centre) @ axes[:2].T
-        shape = CubicSpline(self._marker_s(), flat, axis=0)(self.arclength)
+        shape = CubicSpline(self.mesh.marker_arclength, flat, axis=0)(self.arclength)
         return torch.as_tensor(np.pad(shape, ((0, 0), (0, 1))))
 
     def _first_director(self, motion: Motion) -> Tensor | None:
         """Return the director of the first edge: that of a clamp, if one holds it, else none."""
-        clamped = bool(self.clamps) and self.clamps[0][0] < len(self.held) and self.held[self.clamps[0][0]] == self.clamps[0][0]
+        clamped = (
+            bool(self.clamps)
+            and self.clamps[0][0] < len(self.held)
+            and self.held[self.clamps[0][0]] == self.clamps[0][0]
+        )
         return motion.director[:, 0, 0] if clamped else None
 
     def _commands(self, scene: scenes.Scene, state: scenes.State, motion: Motion) -> Tensor:
@@ -244,7 +251,9 @@ class RopeModel:
             for beside, edge in ((v - 1, v - 1), (v + 1, v)):
                 if 0 < v < len(free) - 1 and 0 <= beside < len(free) and free[beside] and not free[2 * v - beside]:
                     stiff[v] = (real[v - 1] + real[v]) / real[edge]
-        material = tree.replace(rods.material, mass=mass + extra, bend=rods.material.bend * stiff, twist=rods.material.twist * stiff)
+        material = tree.replace(
+            rods.material, mass=mass + extra, bend=rods.material.bend * stiff, twist=rods.material.twist * stiff
+        )
         rest = tree.replace(rods.rest, length=length)
         if "rest_share" in number:
             rest = tree.replace(rest, curvature=_turned(rods.rest.curvature, number))
@@ -261,10 +270,19 @@ class RopeModel:
         pos, vel = settle(lengths, rods.pos, rods.vel, free / params.rods.material.mass)
         lost = ~torch.isfinite(pos).all(-1).all(-1)[:, None, None]
         pos, vel = torch.where(lost, rods.pos, pos), torch.where(lost, rods.vel, vel)
-        return tree.replace(state, rods=tree.replace(rods, pos=tree.batch_innermost(pos), vel=tree.batch_innermost(vel)))
+        return tree.replace(
+            state, rods=tree.replace(rods, pos=tree.batch_innermost(pos), vel=tree.batch_innermost(vel))
+        )
 
-    def simulate(self, motion: Motion, start: Start, values: np.ndarray, *, frames: int | None = None,
-                 progress: Callable[[int], None] | None = None) -> np.ndarray:  # fmt: skip
+    def simulate(
+        self,
+        motion: Motion,
+        start: Start,
+        values: np.ndarray,
+        *,
+        frames: int | None = None,
+        progress: Callable[[int], None] | None = None,
+    ) -> np.ndarray:
         """Return simulated markers [m] for every parameter set and trial.
 
         Args:
@@ -280,12 +298,15 @@ class RopeModel:
         sets, trials = len(values), len(motion.names)
         total = frames or motion.held.shape[1]
         out = np.empty((sets * trials, total, self.count, 3))
-        for a in range(0, sets * trials, _CHUNK):
-            rows = np.arange(a, min(a + _CHUNK, sets * trials))
-            trial = rows % trials
-            begin = rows if len(start.pos) == sets * trials else trial
+        size = _CHUNK if self.compiled else 4 * _CHUNK
+        for a in range(0, sets * trials, size):
+            rows = np.arange(a, min(a + size, sets * trials))
+            filled = np.resize(rows, size) if self.compiled else rows
+            trial = filled % trials
+            begin = filled if len(start.pos) == sets * trials else trial
             part = Motion((), motion.held[trial], motion.director[trial], motion.markers[:0], ())
-            out[rows] = self._run(part, Start(start.pos[begin], start.vel[begin]), values[rows // trials], total)
+            done = self._run(part, Start(start.pos[begin], start.vel[begin]), values[filled // trials], total)
+            out[rows] = done[: len(rows)]
             if progress:
                 progress(int(rows[-1]) + 1)
         return out.reshape(sets, trials, total, self.count, 3)
@@ -295,21 +316,16 @@ class RopeModel:
         scene, params, state = self.build(motion, start, values)
         params = tree.map(tree.batch_innermost, params)
         at = list(self.marker_vertex)
+        if self._stepper is None or self._stepper[0] != scene:
+            self._stepper = scene, scenes.stepper(scene, compiled=self.compiled)
+        step = self._stepper[1]
         director = self._commands(scene, state, motion)
         seen = [state.rods.pos[:, at]]
         for k in range(1, frames):
             control = scenes.Control(tree.batch_innermost(motion.held[:, k]), tree.batch_innermost(director[:, k]))
-            state = scenes.step(scene, params, state, control)
+            state = step(params, state, control)
             seen.append(state.rods.pos[:, at])
         return torch.stack(seen, 1).numpy()
-
-
-def _level_normal(tangent: Tensor) -> Tensor:
-    """Return the unit normal of tangents (..., 3) that points up most; towards x for vertical ones."""
-    up = tangent.new_tensor([0.0, 0.0, 1.0]).expand_as(tangent)
-    steep = tangent[..., 2:].abs() > 0.999
-    axis = torch.where(steep, tangent.new_tensor([1.0, 0.0, 0.0]), up)
-    return normalize(axis - tangent * (axis * tangent).sum(-1, keepdim=True))
 
 
 def _turned(curvature: Tensor, number: dict[str, Tensor]) -> Tensor:
@@ -319,18 +335,3 @@ def _turned(curvature: Tensor, number: dict[str, Tensor]) -> Tensor:
     c, s = torch.cos(angle), torch.sin(angle)
     k1, k2 = curvature[..., :1], curvature[..., 1:]
     return share * torch.cat([c * k1 - s * k2, s * k1 + c * k2], -1)
-
-
-def _mesh(markers: np.ndarray, length: float, vertices: int | None) -> tuple[np.ndarray, np.ndarray]:
-    """Return arclengths of vertices [m], shape (V,), and the vertex at each marker, shape (M,)."""
-    stations = list(markers)
-    if length > markers[-1] * 1.01:
-        stations.append(length)
-    wanted = length / ((vertices or 2 * len(markers)) - 1)
-    parts, at = [], []
-    for a, b in zip(stations[:-1], stations[1:], strict=True):
-        at.append(sum(len(p) for p in parts))
-        pieces = max(1, round((b - a) / wanted))
-        parts.append(np.linspace(a, b, pieces, endpoint=False))
-    at.append(sum(len(p) for p in parts))
-    return np.concatenate([*parts, stations[-1:]]), np.array(at[: len(markers)])

@@ -27,9 +27,7 @@ _COINCIDE = 1e-7
 def check_time(path: Path, time: np.ndarray) -> None:
     """Times [s] must start at 0 and rise in even steps."""
     if abs(time[0]) > 1e-9:
-        raise InputError(
-            f"{path}: time: expected to start at 0 s, found {time[0]:g}; subtract the first time."
-        )
+        raise InputError(f"{path}: time: expected to start at 0 s, found {time[0]:g}; subtract the first time.")
     steps = np.diff(time)
     if (steps <= 0).any():
         frame = int(np.argmax(steps <= 0)) + 1
@@ -40,8 +38,7 @@ def check_time(path: Path, time: np.ndarray) -> None:
     step = float(np.median(steps))
     if step > _LONGEST_STEP:
         raise InputError(
-            f"{path}: time: expected seconds, found steps of {step:g}, which looks like "
-            "milliseconds; divide by 1000."
+            f"{path}: time: expected seconds, found steps of {step:g}, which looks like milliseconds; divide by 1000."
         )
     uneven = np.abs(steps - step) > _EVEN * step
     if uneven.any():
@@ -52,9 +49,7 @@ def check_time(path: Path, time: np.ndarray) -> None:
         )
 
 
-def check_markers(
-    path: Path, arrays: dict[str, np.ndarray], suspect: np.ndarray, length: float
-) -> None:
+def check_markers(path: Path, arrays: dict[str, np.ndarray], suspect: np.ndarray, length: float) -> None:
     """Places along the rope and positions [m] must fit each other and the rope's length [m]."""
     markers, arclength, gripped = arrays["markers"], arrays["marker_arclength"], arrays["gripped"]
     _check_arclength(path, arclength, length)
@@ -64,9 +59,7 @@ def check_markers(
             "without one nothing moves the rope."
         )
     if gripped.all():
-        raise InputError(
-            f"{path}: gripped: expected at least one free marker, found all {len(gripped)} gripped."
-        )
+        raise InputError(f"{path}: gripped: expected at least one free marker, found all {len(gripped)} gripped.")
     _check_seen(path, markers, gripped)
     _check_extent(path, markers, length)
     _check_spacing(path, markers, arclength, suspect)
@@ -94,18 +87,12 @@ def check_clamps(path: Path, arrays: dict[str, np.ndarray]) -> None:
         )
     for index in marker:
         if not 0 <= index < n_markers:
-            raise InputError(
-                f"{path}: gripper_marker: expected indices from 0 to {n_markers - 1}, "
-                f"found {index}."
-            )
+            raise InputError(f"{path}: gripper_marker: expected indices from 0 to {n_markers - 1}, found {index}.")
         if not arrays["gripped"][index]:
-            raise InputError(
-                f"{path}: gripper_marker: expected gripped markers, found {index}, which is free."
-            )
+            raise InputError(f"{path}: gripper_marker: expected gripped markers, found {index}, which is free.")
     if len(np.unique(marker)) < len(marker):
         raise InputError(
-            f"{path}: gripper_marker: expected a different marker for each clamp, "
-            f"found {marker.tolist()}."
+            f"{path}: gripper_marker: expected a different marker for each clamp, found {marker.tolist()}."
         )
     norm = np.linalg.norm(quaternion, axis=-1)
     off = np.abs(norm - 1) > 1e-3
@@ -120,8 +107,7 @@ def check_clamps(path: Path, arrays: dict[str, np.ndarray]) -> None:
 def _check_arclength(path: Path, arclength: np.ndarray, length: float) -> None:
     if arclength[0] < 0:
         raise InputError(
-            f"{path}: marker_arclength: expected metres from the first marker on, "
-            f"found {arclength[0]:g} for marker 0."
+            f"{path}: marker_arclength: expected metres from the first marker on, found {arclength[0]:g} for marker 0."
         )
     steps = np.diff(arclength)
     if (steps <= 0).any():
@@ -174,9 +160,7 @@ def _check_extent(path: Path, markers: np.ndarray, length: float) -> None:
         )
 
 
-def _check_spacing(
-    path: Path, markers: np.ndarray, arclength: np.ndarray, suspect: np.ndarray
-) -> None:
+def _check_spacing(path: Path, markers: np.ndarray, arclength: np.ndarray, suspect: np.ndarray) -> None:
     """Compare medians over time: single bad frames are a matter of data health, not of format."""
     trusted = markers[~suspect] if not suspect.all() else markers
     apart = np.linalg.norm(np.diff(trusted, axis=1), axis=-1)

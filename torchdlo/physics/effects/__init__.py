@@ -5,7 +5,13 @@ from __future__ import annotations
 from torchdlo.physics.effect import Effect
 from torchdlo.physics.effects.elastic import Bend, BendFrame, Stretch, Twist
 from torchdlo.physics.effects.field import AirDrag, Damping, Gravity
-from torchdlo.physics.effects.material import BendingDamping, BendingPlasticity, NonuniformStiffness, PointMass, RestCurvature
+from torchdlo.physics.effects.material import (
+    BendingDamping,
+    BendingPlasticity,
+    NonuniformStiffness,
+    PointMass,
+    RestCurvature,
+)
 from torchdlo.physics.effects.table import Table, TableFriction
 
 EFFECTS: dict[str, type[Effect]] = {

@@ -72,11 +72,11 @@ class Curvature:
     binormal: Tensor
     """Curvature binormal [1], shape (..., V, 3)."""
     mean: Tensor
-    """(t' + t) / (1 + t'.t), shape (..., V, 3)."""
+    """(t' + t) / (1 + t'.t) [1], shape (..., V, 3)."""
     mean1: Tensor
-    """(m1' + m1) / (1 + t'.t), shape (..., V, 3)."""
+    """(m1' + m1) / (1 + t'.t) [1], shape (..., V, 3)."""
     mean2: Tensor
-    """(m2' + m2) / (1 + t'.t), shape (..., V, 3)."""
+    """(m2' + m2) / (1 + t'.t) [1], shape (..., V, 3)."""
     by_twist: tuple[Tensor, Tensor, Tensor, Tensor]
     """Derivatives of (kappa1, kappa2) by the angle of the edge before, then after [1], shape (..., V, 1) each."""
 
@@ -150,7 +150,9 @@ class BendFrame(Effect):
         return {
             **loads,
             "hinge_stiffness": _tangent_stiffness(torch.maximum(s1, s2), curved),
-            "twist_hessian": torch.cat([s1 * b1 * b1 + s2 * b2 * b2, s1 * b1 * a1 + s2 * b2 * a2, s1 * a1 * a1 + s2 * a2 * a2], -1),
+            "twist_hessian": torch.cat(
+                [s1 * b1 * b1 + s2 * b2 * b2, s1 * b1 * a1 + s2 * b2 * a2, s1 * a1 * a1 + s2 * a2 * a2], -1
+            ),
         }
 
 

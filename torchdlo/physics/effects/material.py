@@ -126,5 +126,5 @@ class BendingPlasticity(Effect):
         limit = values["yield_curvature"] * view.hinge_length
         beyond = size > limit.square()
         share = 1 - limit / torch.where(beyond, size, 1.0).sqrt()
-        fraction = 1 - torch.exp(-values["rate"] * view.dt)
+        fraction = -torch.expm1(-values["rate"] * view.dt)
         return torch.where(beyond, fraction * share, 0.0) * elastic

@@ -1,0 +1,318 @@
+"""Calibration: the numbers of the baseline model with which it predicts the train trials best."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from torchdlo.errors import InputError
+from torchdlo.files import write_atomically
+from torchdlo.sysid import fit
+from torchdlo.sysid import start as starts_of
+from torchdlo.sysid.baselines import BASELINES
+from torchdlo.sysid.fit import Point, Space
+from torchdlo.sysid.metrics import average, free_marker_distance, mean_absolute_error
+from torchdlo.sysid.model import PARAMETERS, Motion, RopeModel, Start
+from torchdlo.sysid.recording import Recording, Trial
+from torchdlo.sysid.result import Calibration
+
+Callback = Callable[[str, int, int, str], None]
+"""Called with stage, steps done, steps in all, and a word on how it goes."""
+
+_SCOUTS = 6
+"""Train trials that the many starts are tried on."""
+
+_LOOKS = 6
+"""Iterations that the best starts get on those."""
+
+
+@dataclass(eq=False)
+class _Job:
+    """One fit of one variant of the model."""
+
+    model: RopeModel
+    space: Space
+    motion: Motion
+    start: Start
+    values: np.ndarray
+    point: Point | None = None
+
+
+def calibrate(
+    recording: Recording,
+    *,
+    starts: int = 48,
+    iterations: int = 20,
+    seed: int = 0,
+    vertices: int | None = None,
+    rest: str = "auto",
+    checkpoint: Path | None = None,
+    resume: bool = False,
+    callback: Callback | None = None,
+) -> Calibration:
+    """Fit the baseline model to the train trials and judge it on the test trials.
+
+    Stiffnesses and damping rate (and, with a given rest shape, how much of it is real and how it lies in the first
+    clamp) are fitted from several starts in one batch on a few trials, and from the best of them on all. Initial
+    velocities are estimated for each trial from its first 0.1 s.
+
+    Args:
+        recording: what was measured.
+        starts: number of starts.
+        iterations: most iterations of each of the two stages.
+        seed: of the random starts.
+        vertices: vertices of the simulated rope; about two per marker if not given.
+        rest: rest shape "straight", "given" (`rest_positions` of the recording), or "auto", whichever of the two
+            predicts the train trials better.
+        checkpoint: file that keeps the best so far.
+        resume: go on from it.
+        callback: see `Callback`; it may raise KeyboardInterrupt, which ends the fit with the best so far.
+
+    Raises:
+        InputError: the recording cannot be calibrated with these options.
+    """
+    begun = time.perf_counter()
+    if rest not in ("auto", "straight", "given"):
+        raise InputError(f"rest is {rest!r}; expected 'auto', 'straight' or 'given'.")
+    report = callback or (lambda stage, done, total, message: None)
+    kinds = [rest] if rest != "auto" else ["straight"] + (["given"] if recording.rest_positions is not None else [])
+    memory = _Memory(
+        checkpoint, recording, {"starts": starts, "seed": seed, "vertices": vertices, "rest": rest}, resume
+    )
+    best: _Job | None = None
+    interrupted = False
+    try:
+        for kind in kinds:
+            job = _job(recording, kind, vertices)
+            best = best or job
+            for improved in _fit(job, recording, starts, iterations, np.random.default_rng(seed), memory, report):
+                if best.point is None or best is improved or improved.point.cost < best.point.cost:
+                    best = improved
+    except KeyboardInterrupt:
+        if best is None or best.point is None:
+            raise
+        interrupted = True
+    return _judge(recording, best, seed, interrupted, begun, report)
+
+
+def _job(recording: Recording, rest: str, vertices: int | None) -> _Job:
+    model = RopeModel(recording, vertices=vertices, rest=rest)
+    space = Space(tuple(model.parameters), tuple(PARAMETERS[name] for name in model.parameters))
+    return _Job(model, space, model.motion(recording.train), starts_of.read_off(recording.train), model.guess())
+
+
+def _fit(
+    job: _Job,
+    recording: Recording,
+    starts: int,
+    iterations: int,
+    rng: np.random.Generator,
+    memory: _Memory,
+    report: Callback,
+) -> Iterator[_Job]:
+    """Yield the job each time it got better."""
+    name = f"{job.model.rest} rest shape"
+    kept = memory.recall(job.model.rest)
+    raw = job.space.to_raw(np.array(kept)) if kept else _scout(job, recording, starts, rng, report, name)
+    stage = f"fitting {len(recording.train)} trials, {name}"
+    report(stage, 0, iterations + 1, "")
+    job.start = starts_of.refine(job.model, job.motion, job.start, job.space.to_values(raw))
+
+    def simulate(values: np.ndarray) -> np.ndarray:
+        return job.model.simulate(job.motion, job.start, values)
+
+    points = fit.evaluate(simulate, job.motion.markers, job.space, raw[None])
+    if not np.isfinite(points[0].cost):
+        raise InputError(
+            f"{recording.path}: the simulation failed on the train trials from every start; check length, mass and "
+            "marker_arclength, or use fewer vertices."
+        )
+    job.point, job.values = points[0], job.space.to_values(points[0].raw)
+    yield job
+    report(stage, 1, iterations + 1, f"{1e3 * job.point.cost:.2f} mm")
+    for done, (point,) in enumerate(
+        fit.improve(simulate, job.motion.markers, job.space, points, iterations=iterations)
+    ):
+        job.point, job.values = point, job.space.to_values(point.raw)
+        memory.keep(job.model.rest, job.values)
+        yield job
+        report(stage, done + 2, iterations + 1, f"{1e3 * point.cost:.2f} mm")
+    report(stage, iterations + 1, iterations + 1, f"{1e3 * job.point.cost:.2f} mm")
+
+
+def _scout(
+    job: _Job, recording: Recording, starts: int, rng: np.random.Generator, report: Callback, name: str
+) -> np.ndarray:
+    """Return coordinates to start the fit from: many starts on a few trials, fewer and fewer over longer times.
+
+    In its first second a rope has not forgotten where it began and the cost has few local minima; over a long horizon
+    small errors of phase make many.
+    """
+    scouts = [recording.train[i] for i in _pick(len(recording.train), _SCOUTS)]
+    motion, begin = job.model.motion(scouts), starts_of.read_off(scouts)
+    begin = starts_of.refine(job.model, motion, begin, job.values)
+    stage, total = f"trying {starts} starts, {name}", 2 + _LOOKS
+
+    def over(share: float) -> tuple[fit.Simulate, np.ndarray]:
+        frames = max(10, round(share * motion.held.shape[1]))
+        return lambda values: job.model.simulate(motion, begin, values, frames=frames), motion.markers[:, :frames]
+
+    raws = _spread(job, starts, rng)
+    report(stage, 0, total, "")
+    for look, (share, keep) in enumerate(((0.3, max(2, starts // 3)), (1.0, max(2, starts // 8)))):
+        costs = fit.costs(*over(share), job.space, raws)
+        raws = raws[np.argsort(costs, kind="stable")[:keep]]
+        report(stage, look + 1, total, f"{1e3 * costs.min():.2f} mm over {share:.0%} of the time")
+    simulate, measured = over(1.0)
+    points = fit.evaluate(simulate, measured, job.space, raws)
+    for look, points in enumerate(fit.improve(simulate, measured, job.space, points, iterations=_LOOKS)):  # noqa: B020
+        report(stage, look + 3, total, f"{1e3 * min(p.cost for p in points):.2f} mm")
+    report(stage, total, total, "")
+    return min(points, key=lambda p: p.cost).raw
+
+
+def _pick(count: int, wanted: int) -> list[int]:
+    return sorted({round(i) for i in np.linspace(0, count - 1, min(count, wanted))})
+
+
+_REACH = {"bending_stiffness": np.log(40.0), "twisting_stiffness": np.log(4.0), "damping_rate": np.log(10.0)}
+"""How far starts go either way of the guess; the twisting stiffness relative to the bending stiffness."""
+
+
+def _spread(job: _Job, starts: int, rng: np.random.Generator) -> np.ndarray:
+    """Return starts (S, K) spread around the guess, evenly in every coordinate; the first is the guess itself."""
+    raws = np.repeat(job.space.to_raw(job.values)[None], starts, 0)
+    for k, (name, param) in enumerate(zip(job.space.names, job.space.params, strict=True)):
+        # A Latin hypercube: one start in each of `starts` slices of a coordinate, in a random order.
+        share = (rng.permutation(starts) + rng.uniform(size=starts)) / starts - 0.5
+        raws[1:, k] += (2 * _REACH[name] if name in _REACH else 1.0 if param.unit == "rad" else 0.4) * share[1:]
+    bend, twist = (job.space.names.index(name) for name in ("bending_stiffness", "twisting_stiffness"))
+    raws[1:, twist] += raws[1:, bend] - raws[0, bend]
+    return job.space.clip(raws)
+
+
+class _Memory:
+    """A checkpoint file with the best numbers of each variant."""
+
+    def __init__(self, path: Path | None, recording: Recording, options: dict[str, Any], resume: bool) -> None:
+        self.path = path
+        digest = hashlib.sha256(json.dumps(options, sort_keys=True).encode())
+        for trial in (*recording.train, *recording.test):
+            digest.update(trial.markers.tobytes())
+        self.content: dict[str, Any] = {"generator": "torchdlo calibrate", "key": digest.hexdigest(), "best": {}}
+        if not resume:
+            return
+        if path is None or not path.exists():
+            raise InputError(f"{path}: there is no checkpoint to resume from; run without --resume first.")
+        try:
+            found = json.loads(path.read_text())
+            same = found["key"] == self.content["key"]
+        except (ValueError, KeyError, TypeError):
+            raise InputError(
+                f"{path}: expected a checkpoint of torchdlo calibrate, found something else; run without --resume."
+            ) from None
+        if not same:
+            raise InputError(
+                f"{path}: the checkpoint belongs to another recording or other options; run without --resume."
+            )
+        self.content = found
+
+    def recall(self, rest: str) -> list[float] | None:
+        """Return the numbers kept for a variant."""
+        return self.content["best"].get(rest)
+
+    def keep(self, rest: str, values: np.ndarray) -> None:
+        """Write numbers down."""
+        self.content["best"][rest] = [float(v) for v in values]
+        if self.path is not None:
+            write_atomically(self.path, json.dumps(self.content))
+
+
+def _predict(job: _Job, trials: Sequence[Trial], values: np.ndarray) -> dict[str, np.ndarray]:
+    motion = job.model.motion(trials)
+    begin = starts_of.refine(job.model, motion, starts_of.read_off(trials), values)
+    sims = job.model.simulate(motion, begin, values[None])[0]
+    return {name: sim[:frames] for name, sim, frames in zip(motion.names, sims, motion.frames, strict=True)}
+
+
+def _judge(
+    recording: Recording, job: _Job, seed: int, interrupted: bool, begun: float, report: Callback
+) -> Calibration:
+    """Predict all trials before and after, and compare."""
+    guess, trials = job.model.guess(), (*recording.train, *recording.test)
+    report("predicting all trials", 0, 2, "")
+    before = _predict(job, trials, guess)
+    report("predicting all trials", 1, 2, "")
+    after = _predict(job, trials, job.values)
+    report("predicting all trials", 2, 2, "")
+
+    def errors(predictions: dict[str, np.ndarray]) -> dict[str, float]:
+        return {
+            f"{split}_mae_mm": 1e3 * average(mean_absolute_error, [predictions[t.name] for t in group], group)
+            for split, group in (("train", recording.train), ("test", recording.test))
+        }
+
+    low, high = fit.interval(job.point, job.space)
+    parameters = {
+        name: {"value": float(v), "low": float(a), "high": float(b), "unit": PARAMETERS[name].unit}
+        for name, v, a, b in zip(job.space.names, job.values, low, high, strict=True)
+    }
+    trivial = {name: errors({t.name: predict(t, recording) for t in trials}) for name, predict in BASELINES.items()}
+    per_trial = [
+        {
+            "name": t.name,
+            "split": "train" if t in recording.train else "test",
+            "mae_mm": 1e3 * mean_absolute_error(after[t.name], t),
+            "before_mae_mm": 1e3 * mean_absolute_error(before[t.name], t),
+            "free_distance_mm": 1e3 * free_marker_distance(after[t.name], t),
+        }
+        for t in trials
+    ]
+    notes = [f"Rest shape: {job.model.rest}."]
+    if not job.model.measured_twist() and job.model.clamps:
+        notes.append(
+            "Rotation of the grippers about the rope was not measured; the rope is taken to start without twist."
+        )
+    return Calibration(
+        parameters=parameters,
+        **errors(after),
+        before=errors(before),
+        baselines=trivial,
+        per_trial=per_trial,
+        seconds=time.perf_counter() - begun,
+        model=_model_file(job),
+        predictions=after,
+        predictions_before=before,
+        seed=seed,
+        interrupted=interrupted,
+        notes=notes,
+    )
+
+
+def _model_file(job: _Job) -> dict[str, Any]:
+    model, recording = job.model, job.model.recording
+    return {
+        "format": "torchdlo-model",
+        "version": 1,
+        "rope": {
+            "length": recording.length,
+            "radius": recording.radius,
+            "mass": recording.mass,
+            "marker_mass": recording.marker_mass,
+            "gravity": list(recording.gravity),
+            "table_height": recording.table_height,
+            "rest": model.rest,
+            "rest_positions": recording.rest_positions if model.rest == "given" else None,
+        },
+        "mesh": {"arclength": model.arclength, "marker_vertex": model.marker_vertex},
+        "parameters": dict(zip(job.space.names, job.values, strict=True)),
+        "effects": {},
+        "step": {"integrator": "implicit", "twist": "quasistatic", "dt": model.dt, "substeps": model.substeps},
+    }

@@ -1,0 +1,194 @@
+"""Levenberg-Marquardt over a few numbers of a rope, with all trials, starts and varied numbers in one batch.
+
+Marquardt 1963, doi:10.1137/0111030. The residuals are weighted so that the cost grows linearly with large errors
+(Huber-like, as the mean absolute error that is reported), which also keeps mis-tracked markers from leading the fit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from torchdlo.physics.effect import Param
+
+_KNEE = 2e-3
+"""Error [m] from which the cost grows linearly."""
+
+Simulate = Callable[[np.ndarray], np.ndarray]
+"""Maps parameter sets (P, K) to simulated markers (P, B, F, M, 3) [m]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Space:
+    """Declared numbers as coordinates without units: logarithms, or shares of the range."""
+
+    names: tuple[str, ...]
+    params: tuple[Param, ...]
+
+    def to_raw(self, values: np.ndarray) -> np.ndarray:
+        """Return coordinates of values, both (..., K)."""
+        return np.stack(
+            [
+                np.log(values[..., k]) if p.scale == "log" else values[..., k] / (p.high - p.low)
+                for k, p in enumerate(self.params)
+            ],
+            -1,
+        )
+
+    def to_values(self, raw: np.ndarray) -> np.ndarray:
+        """Return values of coordinates, both (..., K), within their bounds."""
+        raw = self.clip(raw)
+        return np.stack(
+            [
+                np.exp(raw[..., k]) if p.scale == "log" else raw[..., k] * (p.high - p.low)
+                for k, p in enumerate(self.params)
+            ],
+            -1,
+        )
+
+    def clip(self, raw: np.ndarray) -> np.ndarray:
+        """Keep coordinates within the declared bounds; angles turn round instead."""
+        bounds = [
+            (np.log(p.low), np.log(p.high))
+            if p.scale == "log"
+            else (p.low / (p.high - p.low), p.high / (p.high - p.low))
+            for p in self.params
+        ]
+        low, high = np.array(bounds).T
+        turned = low + (raw - low) % (high - low)
+        return np.where([p.unit == "rad" for p in self.params], turned, np.clip(raw, low, high))
+
+    def nudges(self) -> np.ndarray:
+        """Return the steps of finite differences, shape (K,)."""
+        return np.array([0.02 if p.scale == "log" else 0.01 for p in self.params])
+
+
+@dataclass(frozen=True, eq=False)
+class Point:
+    """A parameter set with everything that is known about it."""
+
+    raw: np.ndarray
+    """Coordinates, shape (K,)."""
+    cost: float
+    """Robust cost [m], mean over trials; infinite where the simulation failed."""
+    gradient: np.ndarray
+    """Of the cost by trial, shape (B, K)."""
+    curvature: np.ndarray
+    """Gauss-Newton curvature by trial, shape (B, K, K)."""
+    trial_costs: np.ndarray
+    """Cost by trial [m], shape (B,)."""
+
+
+def _robust(residual: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return cost and weight of each residual [m]: cost ~ r^2 / (2 knee) near zero, |r| - knee/2 beyond."""
+    size = np.sqrt(residual**2 + _KNEE**2)
+    return size - _KNEE, 1 / size
+
+
+def costs(simulate: Simulate, measured: np.ndarray, space: Space, raws: np.ndarray) -> np.ndarray:
+    """Return the cost [m] at each of S parameter sets, shape (S,), from S simulations of each trial."""
+    sims = simulate(space.to_values(raws))
+    seen = np.isfinite(measured)
+    residual = np.where(seen, sims - measured, 0.0).reshape(len(raws), len(measured), -1)
+    mean = _robust(residual)[0].sum(-1) / seen.reshape(len(measured), -1).sum(1)
+    return np.where(np.isfinite(mean).all(1), mean.mean(1), np.inf)
+
+
+def evaluate(simulate: Simulate, measured: np.ndarray, space: Space, raws: np.ndarray) -> list[Point]:
+    """Return costs and their slopes at S parameter sets, shape (S, K), from S (K + 1) simulations of each trial."""
+    count, k = raws.shape
+    nudge = space.nudges()
+    # Difference inwards where a number stands at its upper bound.
+    upward = space.clip(raws[:, None] + np.diag(nudge))
+    moved = np.where(np.isclose(upward, raws[:, None] + np.diag(nudge)), upward, raws[:, None] - np.diag(nudge))
+    sign = np.einsum("skk->sk", moved - raws[:, None])
+    sets = np.concatenate([raws[:, None], moved], 1)
+    sims = simulate(space.to_values(sets.reshape(-1, k))).reshape(count, k + 1, *measured.shape)
+    seen = np.isfinite(measured)
+    per_trial = seen.reshape(len(measured), -1).sum(1)
+    points = []
+    for s in range(count):
+        residual = np.where(seen, sims[s, 0] - measured, 0.0).reshape(len(measured), -1)
+        cost, weight = _robust(residual)
+        of_trial = cost.sum(1) / per_trial
+        failed = ~np.isfinite(of_trial)
+        slope = np.where(seen, sims[s, 1:] - sims[s, 0], 0.0).reshape(k, len(measured), -1) / sign[s][:, None, None]
+        # A trial that ran at the point but failed beside it tells nothing about slopes.
+        useless = ~np.isfinite(slope).all((0, 2)) | failed
+        slope, weight = np.where(useless[None, :, None], 0.0, slope), np.where(useless[:, None], 0.0, weight)
+        residual = np.where(useless[:, None], 0.0, residual)
+        gradient = np.einsum("kbr,br,br->bk", slope, weight, residual, optimize=True) / per_trial[:, None]
+        curvature = np.einsum("kbr,br,lbr->bkl", slope, weight, slope, optimize=True) / per_trial[:, None, None]
+        points.append(
+            Point(raws[s], float("inf") if failed.any() else float(of_trial.mean()), gradient, curvature, of_trial)
+        )
+    return points
+
+
+def improve(
+    simulate: Simulate,
+    measured: np.ndarray,
+    space: Space,
+    points: Sequence[Point],
+    *,
+    iterations: int,
+    tolerance: float = 2e-3,
+) -> Iterator[list[Point]]:
+    """Improve every point until it stands still; yield all of them after each iteration.
+
+    Args:
+        simulate: the model.
+        measured: markers [m], NaN where they do not count, shape (B, F, M, 3).
+        space: the numbers.
+        points: where to start, see `evaluate`.
+        iterations: at most so many.
+        tolerance: a point stands still when its cost falls by less than this share.
+    """
+    points, damping = list(points), [1e-2] * len(points)
+    active = [np.isfinite(p.cost) for p in points]
+    for _ in range(iterations):
+        rows = [i for i, on in enumerate(active) if on]
+        if not rows:
+            return
+        tries = np.stack([_step(points[i], damping[i], space) for i in rows])
+        for i, new in zip(rows, evaluate(simulate, measured, space, tries), strict=True):
+            old = points[i]
+            if new.cost < old.cost:
+                active[i] = old.cost - new.cost > tolerance * old.cost
+                points[i], damping[i] = new, max(damping[i] / 5, 1e-6)
+            else:
+                damping[i] *= 8
+                active[i] = damping[i] < 1e3
+        yield list(points)
+
+
+def _step(point: Point, damping: float, space: Space) -> np.ndarray:
+    curvature, gradient = point.curvature.mean(0), point.gradient.mean(0)
+    scale = np.diag(curvature) + 1e-9 * np.trace(curvature) + 1e-12
+    step = -np.linalg.solve(curvature + damping * np.diag(scale), gradient)
+    # Not more than a factor of three, or a fifth of the range, at a time.
+    limit = np.array([1.1 if p.scale == "log" else 0.2 for p in space.params])
+    return space.clip(point.raw + step / max(1.0, float(np.abs(step / limit).max())))
+
+
+def interval(point: Point, space: Space) -> tuple[np.ndarray, np.ndarray]:
+    """Return 90 % limits of the values, shape (K,) each, by leaving out one trial at a time (linearised jackknife).
+
+    With few trials they are rough; what every trial gets wrong in the same way they cannot show.
+    """
+    trials = len(point.gradient)
+    if trials < 2:
+        return space.to_values(point.raw - np.inf), space.to_values(point.raw + np.inf)
+    curvature = point.curvature.sum(0)
+    ridge = 1e-9 * np.trace(curvature) * np.eye(len(point.raw)) + 1e-12 * np.eye(len(point.raw))
+    moves = np.linalg.solve(curvature + ridge, point.gradient.T).T
+    deviation = np.sqrt((trials - 1) / trials * ((moves - moves.mean(0)) ** 2).sum(0)) * trials / (trials - 1)
+    quantile = _STUDENT_95[min(trials - 1, len(_STUDENT_95)) - 1]
+    reach = np.minimum(quantile * deviation, 20.0)
+    return space.to_values(point.raw - reach), space.to_values(point.raw + reach)
+
+
+_STUDENT_95 = (6.31, 2.92, 2.35, 2.13, 2.02, 1.94, 1.89, 1.86, 1.83, 1.81, 1.80, 1.78, 1.77, 1.76, 1.75, 1.70)
+"""95 % quantiles of Student's t for 1, 2, ... degrees of freedom."""
