@@ -75,7 +75,7 @@ def test_calibrate_writes_model_and_report(folder: Path, fit: FakeFit, capsys: p
     assert said.startswith("Calibrated on 2 trials; error on unseen trials ")
     assert "runs/calibrate/rope/report.html" in said
     assert json.loads((out / "model.json").read_text())["vertices"] == 31
-    assert fit.options == {"seed": 0, "checkpoint": out / "checkpoint.pt", "resume": False}
+    assert fit.options == {"seed": 0, "rest": "auto", "checkpoint": out / "checkpoint.json", "resume": False}
 
 
 def test_calibrate_prints_json_and_nothing_else(folder: Path, fit: FakeFit, capsys: pytest.CaptureFixture[str]) -> None:
@@ -146,11 +146,11 @@ def test_unusable_out_is_refused_before_the_work(
 
 def test_resume_needs_a_checkpoint(folder: Path, fit: FakeFit, capsys: pytest.CaptureFixture[str]) -> None:
     assert run("calibrate", folder, "--out", "a", "--resume") == 2
-    assert "checkpoint.pt" in capsys.readouterr().err and not Path("a").exists()
+    assert "checkpoint.json" in capsys.readouterr().err and not Path("a").exists()
     Path("a").mkdir()
-    Path("a/checkpoint.pt").touch()
+    Path("a/checkpoint.json").touch()
     assert run("calibrate", folder, "--out", "a", "--resume") == 0
-    assert fit.options["resume"] and fit.options["checkpoint"] == Path("a/checkpoint.pt")
+    assert fit.options["resume"] and fit.options["checkpoint"] == Path("a/checkpoint.json")
 
 
 def test_control_c_keeps_the_best(folder: Path, fit: FakeFit, capsys: pytest.CaptureFixture[str]) -> None:

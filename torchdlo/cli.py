@@ -32,7 +32,7 @@ app = typer.Typer(
     rich_markup_mode="rich",
 )
 
-_QUICK = {"starts": 2, "iterations": 10}
+_QUICK = {"starts": 12, "iterations": 5}
 """What --quick sets unless the options say otherwise."""
 _INTERRUPTED = 130
 """Exit code after Ctrl-C, as shells have it."""
@@ -179,7 +179,9 @@ def calibrate(
     if quick:
         options = {name: value or _QUICK.get(name) for name, value in options.items()}
     options = {name: value for name, value in options.items() if value is not None}
-    result = _run_calibration(loaded, seed=seed, checkpoint=out.with_name("checkpoint.pt"), resume=resume, **options)
+    result = _run_calibration(
+        loaded, seed=seed, rest=rest, checkpoint=out.with_name("checkpoint.json"), resume=resume, **options
+    )
     _write_outputs(result, loaded, recording, out, quiet=as_json)
     if as_json:
         from torchdlo.sysid.result import summary_json
@@ -207,7 +209,7 @@ def _check_outputs(out: Path, resume: bool) -> None:
 
     for name in (out.name, "calibration.json", report.PAGE, report.PICTURE):
         check_writable(out.with_name(name))
-    checkpoint = out.with_name("checkpoint.pt")
+    checkpoint = out.with_name("checkpoint.json")
     if resume and not checkpoint.is_file():
         raise InputError(
             f"{checkpoint}: expected the checkpoint of an earlier calibration to resume, "

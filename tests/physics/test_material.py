@@ -52,7 +52,7 @@ def test_released_hinge_springs_back_by_the_yield_curvature():
     assert float(state.rods.plastic[1].norm()) == pytest.approx(k - YIELD * H, rel=1e-10)
     free, params, fresh = plastic(angle, held=(0, 1), integrator="implicit")
     state = tree.replace(state, rods=tree.replace(state.rods, vel=torch.zeros_like(state.rods.vel)))
-    state, _ = run(free, params, state, 400, hold(free, state))
+    state, _ = run(free, params, state, 900, hold(free, state))
     assert speed(state) < 1e-9
     edge = state.rods.pos[2] - state.rods.pos[1]
     left = 2 * math.tan(0.5 * math.atan2(float(edge[1]), float(edge[0])))

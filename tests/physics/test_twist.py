@@ -122,7 +122,7 @@ def test_quasistatic_twist_is_the_long_time_limit_of_dynamic_twist():
         def wind(k, _, start=start):
             return Control(start.pos, torch.stack([wound(0), wound(2.0 * min(1.0, (k + 1) / 100))]))
 
-        state, _ = run(scene, params, state, 700, wind)
+        state, _ = run(scene, params, state, 900, wind)
         assert speed(state) < 1e-7, speed(state)
         last[twist] = state.rods
     a, b = last["quasistatic"], last["dynamic"]

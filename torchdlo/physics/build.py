@@ -42,7 +42,11 @@ class Rope:
     closed: bool = False
     """Whether the last vertex is joined to the first."""
     rest: Literal["straight", "as_placed"] | Tensor = "straight"
-    """Undeformed shape: straight, as placed, or vertex positions (..., n, 3) of it."""
+    """Undeformed shape: straight, as placed, or vertex positions (..., n, 3) of it [m]."""
+    rest_curvature: Tensor | None = None
+    """Natural curvature about the two material directors, in place of `rest`'s [1/m], shape (..., n, 2)."""
+    rest_twist: Number | None = None
+    """Natural twist, in place of `rest`'s [rad/m]."""
     velocities: Tensor | None = None
     """Initial velocities [m/s], shape (..., n, 3); at rest if not given."""
     director: Tensor | None = None
@@ -173,7 +177,8 @@ def assemble(ropes: Sequence[Rope]) -> tuple[Topology, RodParams, RodState]:
             for r in ropes
         ]
     )
-    rest = RodRest(length, kappa * curved, twist * curved, edge_mask, hinge_mask)
+    kappa, twist = _given_strains(topology, ropes, length, hinge_mask, kappa * curved, twist * curved)
+    rest = RodRest(length, kappa, twist, edge_mask, hinge_mask)
 
     director = bishop(topology, pos, edge_mask, given)
     _, reference = frame_curvature(topology, pos, director, edge_mask, hinge_mask)
@@ -185,6 +190,32 @@ def assemble(ropes: Sequence[Rope]) -> tuple[Topology, RodParams, RodState]:
         pos, velocities.expand_as(pos), zero, zero, director, reference, torch.zeros_like(pos[..., :2]), zero
     )
     return topology, RodParams(rest, _material(topology, ropes, rest, pack, like)), state
+
+
+def _given_strains(
+    topology: Topology, ropes: Sequence[Rope], length: Tensor, hinge_mask: Tensor, kappa: Tensor, twist: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Return integrated curvatures and twists with those that ropes give themselves put in."""
+    span = 0.5 * (length + preceding(topology, length)) * hinge_mask
+    for start, rope in zip(topology.starts, ropes, strict=True):
+        n = rope.positions.shape[-2]
+        here = slice(start, start + n)
+        if rope.rest_curvature is not None:
+            if rope.rest_curvature.shape[-2:] != (n, 2):
+                given = tuple(rope.rest_curvature.shape)
+                raise ValueError(
+                    f"rope: rest_curvature is {given}; expected (..., {n}, 2), two curvatures [1/m] per vertex"
+                )
+            kappa = _put(kappa, here, rope.rest_curvature.to(kappa) * span[..., here, :])
+        if rope.rest_twist is not None:
+            twist = _put(twist, here, _column(rope.rest_twist, n, twist, "rest_twist") * span[..., here, :])
+    return kappa, twist
+
+
+def _put(whole: Tensor, here: slice, part: Tensor) -> Tensor:
+    lead = torch.broadcast_shapes(whole.shape[:-2], part.shape[:-2])
+    pieces = [whole[..., : here.start, :], part, whole[..., here.stop :, :]]
+    return tree.batch_innermost(torch.cat([p.expand(lead + p.shape[-2:]) for p in pieces], -2))
 
 
 def _material(topology: Topology, ropes: Sequence[Rope], rest: RodRest, pack, like: Tensor) -> Material:

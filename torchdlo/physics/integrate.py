@@ -123,23 +123,24 @@ def substep(
     return moved
 
 
-def _translate(settings: Settings, now: View, loads: Values, targets: Targets, first: Tensor) -> tuple[Tensor, Tensor]:
-    """Return positions after the substep and tensions."""
-    topology, dt, state, rest, material = (
-        settings.topology,
-        settings.dt,
-        now.state,
-        now.params.rest,
-        now.params.material,
-    )
-    force = torch.zeros_like(state.pos)
+def _force(now: View, loads: Values) -> Tensor:
+    """Return the force on the vertices [N], shape (..., V, 3)."""
+    force = torch.zeros_like(now.state.pos)
     if "gradient" in loads:
-        pull = loads["gradient"] * rest.edge_mask
+        pull = loads["gradient"] * now.params.rest.edge_mask
         force = pull - now.prev(pull)
     if "force" in loads:
         force = force + loads["force"]
     if "acceleration" in loads:
-        force = force + material.mass * loads["acceleration"]
+        force = force + now.params.material.mass * loads["acceleration"]
+    return force
+
+
+def _translate(settings: Settings, now: View, loads: Values, targets: Targets, first: Tensor) -> tuple[Tensor, Tensor]:
+    """Return positions after the substep and tensions."""
+    topology, dt, state = settings.topology, settings.dt, now.state
+    rest, material = now.params.rest, now.params.material
+    force = _force(now, loads)
     # v' = d (d v + s dt F / m), d half of the uniform decay, s a half in the first substep.
     half = torch.exp(-0.5 * dt * loads["rate"]) if "rate" in loads else 1.0
     drift = state.pos + dt * half * state.vel
@@ -148,40 +149,46 @@ def _translate(settings: Settings, now: View, loads: Values, targets: Targets, f
     vertex = material.mass.expand_as(state.pos)
     if "drag" in loads:
         vertex = vertex + dt * loads["drag"]
-    implicit = settings.integrator == "implicit"
-    if implicit and "stiffness" in loads:
-        vertex = vertex + settings.gamma * dt * dt * loads["stiffness"]
     active = rest.edge_mask * (1 - (1 - free) * (1 - following(topology, free)))
     lengths = Lengths(topology, rest.length, rest.length / material.stretch, active, rest.edge_mask)
-    if implicit:
-        # Forces at x + ahead dt v, and their answer to the change of v.
-        share, drift_ahead = settings.gamma + 0.5 * settings.ahead, settings.ahead * dt * state.vel
-        stiff = dt * dt * loads.get("hinge_stiffness", torch.zeros_like(now.length)) * rest.hinge_mask
-        hinge = share * stiff
-        if "hinge_drag" in loads:
-            hinge = hinge + 0.5 * dt * loads["hinge_drag"]
-        inertia = Inertia(vertex, hinge, rest.length, rest.edge_mask)
-        force = force - tree.replace(inertia, hinge=stiff / (dt * dt)).bending(topology, drift_ahead)
+    if settings.integrator == "implicit":
         moved = _spread(targets.pos, settings.held_vertices, topology.size, drift)
-        ahead = (now.next(drift_ahead) - drift_ahead) / rest.length
-        return balance(
-            lengths,
-            inertia,
-            moved,
-            free,
-            force,
-            scale.expand_as(now.length[..., :1, :]),
-            now.tangent,
-            ahead,
-            state.tension,
-            share,
-            settings.newton - 1,
-        )
+        return _balance(settings, now, loads, lengths, vertex, force, moved, free, scale)
     answer = scale / vertex * free
     moved = _spread(targets.pos, settings.held_vertices, topology.size, drift + answer * force)
     if not settings.constrained:
         return moved, state.tension
     return project(lengths, moved, answer, now.tangent, state.tension, settings.newton - 1)
+
+
+def _balance(
+    settings: Settings,
+    now: View,
+    loads: Values,
+    lengths: Lengths,
+    vertex: Tensor,
+    force: Tensor,
+    moved: Tensor,
+    free: Tensor,
+    scale: Tensor,
+) -> tuple[Tensor, Tensor]:
+    """Return positions and tensions of an implicit substep; arguments as in `constrain.balance`."""
+    topology, dt, rest = settings.topology, settings.dt, now.params.rest
+    if "stiffness" in loads:
+        vertex = vertex + settings.gamma * dt * dt * loads["stiffness"]
+    # Stiff forces are taken at x + ahead dt v; `share` is their answer to the change of v.
+    share, lead = settings.gamma + 0.5 * settings.ahead, settings.ahead * dt * now.state.vel
+    stiff = loads.get("hinge_stiffness", torch.zeros_like(now.length)) * rest.hinge_mask
+    hinge = share * dt * dt * stiff
+    if "hinge_drag" in loads:
+        hinge = hinge + 0.5 * dt * loads["hinge_drag"]
+    inertia = Inertia(vertex, hinge, rest.length, rest.edge_mask)
+    force = force - tree.replace(inertia, hinge=stiff).bending(topology, lead)
+    ahead = (now.next(lead) - lead) / rest.length
+    scale = scale.expand_as(now.length[..., :1, :])
+    return balance(
+        lengths, inertia, moved, free, force, scale, now.tangent, ahead, now.state.tension, share, settings.newton - 1
+    )
 
 
 def _twist_matrix(now: View, loads: Values) -> tuple[Tensor, Tensor]:

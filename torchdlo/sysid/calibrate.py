@@ -80,7 +80,7 @@ def calibrate(
     """
     begun = time.perf_counter()
     if rest not in ("auto", "straight", "given"):
-        raise InputError(f"rest is {rest!r}; expected 'auto', 'straight' or 'given'.")
+        raise InputError(f"rest is {rest!r}; expected auto, straight or given.")
     report = callback or (lambda stage, done, total, message: None)
     kinds = [rest] if rest != "auto" else ["straight"] + (["given"] if recording.rest_positions is not None else [])
     memory = _Memory(
@@ -104,8 +104,20 @@ def calibrate(
 
 def _job(recording: Recording, rest: str, vertices: int | None) -> _Job:
     model = RopeModel(recording, vertices=vertices, rest=rest)
+    trials = _usable(recording)
     space = Space(tuple(model.parameters), tuple(PARAMETERS[name] for name in model.parameters))
-    return _Job(model, space, model.motion(recording.train), starts_of.read_off(recording.train), model.guess())
+    return _Job(model, space, model.motion(trials), starts_of.read_off(trials), model.guess())
+
+
+def _usable(recording: Recording) -> list[Trial]:
+    """Return the train trials that are not suspect from start to end."""
+    free = ~recording.train[0].gripped
+    usable = [t for t in recording.train if np.isfinite(t.markers[~t.suspect][:, free]).any()]
+    if not usable:
+        raise InputError(
+            f"{recording.path}: every frame of every train trial is marked suspect; expected some to fit on."
+        )
+    return usable
 
 
 def _fit(
@@ -121,7 +133,7 @@ def _fit(
     name = f"{job.model.rest} rest shape"
     kept = memory.recall(job.model.rest)
     raw = job.space.to_raw(np.array(kept)) if kept else _scout(job, recording, starts, rng, report, name)
-    stage = f"fitting {len(recording.train)} trials, {name}"
+    stage = f"fitting {len(job.motion.names)} trials, {name}"
     report(stage, 0, iterations + 1, "")
     job.start = starts_of.refine(job.model, job.motion, job.start, job.space.to_values(raw))
 
@@ -155,7 +167,8 @@ def _scout(
     In its first second a rope has not forgotten where it began and the cost has few local minima; over a long horizon
     small errors of phase make many.
     """
-    scouts = [recording.train[i] for i in _pick(len(recording.train), _SCOUTS)]
+    trials = _usable(recording)
+    scouts = [trials[i] for i in _pick(len(trials), _SCOUTS)]
     motion, begin = job.model.motion(scouts), starts_of.read_off(scouts)
     begin = starts_of.refine(job.model, motion, begin, job.values)
     stage, total = f"trying {starts} starts, {name}", 2 + _LOOKS
@@ -276,6 +289,9 @@ def _judge(
         for t in trials
     ]
     notes = [f"Rest shape: {job.model.rest}."]
+    unused = sorted({t.name for t in recording.train} - set(job.motion.names))
+    if unused:
+        notes.append(f"Not fitted because every frame is marked suspect: {', '.join(unused)}.")
     if not job.model.measured_twist() and job.model.clamps:
         notes.append(
             "Rotation of the grippers about the rope was not measured; the rope is taken to start without twist."
