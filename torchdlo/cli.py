@@ -152,6 +152,14 @@ def calibrate(
     starts: Annotated[int | None, typer.Option(min=1, help="Number of starts, run as one batch.")] = None,
     iterations: Annotated[int | None, typer.Option(min=1, help="Iterations of the fit.")] = None,
     vertices: Annotated[int | None, typer.Option(min=3, help="Vertices of the simulated rope.")] = None,
+    rest: Annotated[
+        str,
+        typer.Option(
+            help="Rest shape: straight, given (rest_positions of rope.json), or auto: whichever predicts the train "
+            "trials better.",
+            metavar="auto|straight|given",
+        ),
+    ] = "auto",
     quick: Annotated[bool, typer.Option("--quick", help="A rough fit in a fraction of the time.")] = False,
     resume: Annotated[bool, typer.Option("--resume", help="Go on from the checkpoint beside the model file.")] = False,
 ) -> None:

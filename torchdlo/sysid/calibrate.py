@@ -2,23 +2,18 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from torchdlo.errors import InputError
-from torchdlo.files import write_atomically
-from torchdlo.sysid import fit
+from torchdlo.sysid import fit, judge
 from torchdlo.sysid import start as starts_of
-from torchdlo.sysid.baselines import BASELINES
+from torchdlo.sysid.checkpoint import Checkpoint
 from torchdlo.sysid.fit import Point, Space
-from torchdlo.sysid.metrics import average, free_marker_distance, mean_absolute_error
 from torchdlo.sysid.model import PARAMETERS, Motion, RopeModel, Start
 from torchdlo.sysid.recording import Recording, Trial
 from torchdlo.sysid.result import Calibration
@@ -83,7 +78,7 @@ def calibrate(
         raise InputError(f"rest is {rest!r}; expected auto, straight or given.")
     report = callback or (lambda stage, done, total, message: None)
     kinds = [rest] if rest != "auto" else ["straight"] + (["given"] if recording.rest_positions is not None else [])
-    memory = _Memory(
+    memory = Checkpoint(
         checkpoint, recording, {"starts": starts, "seed": seed, "vertices": vertices, "rest": rest}, resume
     )
     best: _Job | None = None
@@ -126,7 +121,7 @@ def _fit(
     starts: int,
     iterations: int,
     rng: np.random.Generator,
-    memory: _Memory,
+    memory: Checkpoint,
     report: Callback,
 ) -> Iterator[_Job]:
     """Yield the job each time it got better."""
@@ -211,124 +206,41 @@ def _spread(job: _Job, starts: int, rng: np.random.Generator) -> np.ndarray:
     return job.space.clip(raws)
 
 
-class _Memory:
-    """A checkpoint file with the best numbers of each variant."""
-
-    def __init__(self, path: Path | None, recording: Recording, options: dict[str, Any], resume: bool) -> None:
-        self.path = path
-        digest = hashlib.sha256(json.dumps(options, sort_keys=True).encode())
-        for trial in (*recording.train, *recording.test):
-            digest.update(trial.markers.tobytes())
-        self.content: dict[str, Any] = {"generator": "torchdlo calibrate", "key": digest.hexdigest(), "best": {}}
-        if not resume:
-            return
-        if path is None or not path.exists():
-            raise InputError(f"{path}: there is no checkpoint to resume from; run without --resume first.")
-        try:
-            found = json.loads(path.read_text())
-            same = found["key"] == self.content["key"]
-        except (ValueError, KeyError, TypeError):
-            raise InputError(
-                f"{path}: expected a checkpoint of torchdlo calibrate, found something else; run without --resume."
-            ) from None
-        if not same:
-            raise InputError(
-                f"{path}: the checkpoint belongs to another recording or other options; run without --resume."
-            )
-        self.content = found
-
-    def recall(self, rest: str) -> list[float] | None:
-        """Return the numbers kept for a variant."""
-        return self.content["best"].get(rest)
-
-    def keep(self, rest: str, values: np.ndarray) -> None:
-        """Write numbers down."""
-        self.content["best"][rest] = [float(v) for v in values]
-        if self.path is not None:
-            write_atomically(self.path, json.dumps(self.content))
-
-
-def _predict(job: _Job, trials: Sequence[Trial], values: np.ndarray) -> dict[str, np.ndarray]:
-    motion = job.model.motion(trials)
-    begin = starts_of.refine(job.model, motion, starts_of.read_off(trials), values)
-    sims = job.model.simulate(motion, begin, values[None])[0]
-    return {name: sim[:frames] for name, sim, frames in zip(motion.names, sims, motion.frames, strict=True)}
-
-
 def _judge(
     recording: Recording, job: _Job, seed: int, interrupted: bool, begun: float, report: Callback
 ) -> Calibration:
     """Predict all trials before and after, and compare."""
-    guess, trials = job.model.guess(), (*recording.train, *recording.test)
+    trials = (*recording.train, *recording.test)
     report("predicting all trials", 0, 2, "")
-    before = _predict(job, trials, guess)
+    before = judge.predict(job.model, trials, job.model.guess())
     report("predicting all trials", 1, 2, "")
-    after = _predict(job, trials, job.values)
+    after = judge.predict(job.model, trials, job.values)
     report("predicting all trials", 2, 2, "")
-
-    def errors(predictions: dict[str, np.ndarray]) -> dict[str, float]:
-        return {
-            f"{split}_mae_mm": 1e3 * average(mean_absolute_error, [predictions[t.name] for t in group], group)
-            for split, group in (("train", recording.train), ("test", recording.test))
-        }
-
     low, high = fit.interval(job.point, job.space)
-    parameters = {
-        name: {"value": float(v), "low": float(a), "high": float(b), "unit": PARAMETERS[name].unit}
-        for name, v, a, b in zip(job.space.names, job.values, low, high, strict=True)
-    }
-    trivial = {name: errors({t.name: predict(t, recording) for t in trials}) for name, predict in BASELINES.items()}
-    per_trial = [
-        {
-            "name": t.name,
-            "split": "train" if t in recording.train else "test",
-            "mae_mm": 1e3 * mean_absolute_error(after[t.name], t),
-            "before_mae_mm": 1e3 * mean_absolute_error(before[t.name], t),
-            "free_distance_mm": 1e3 * free_marker_distance(after[t.name], t),
-        }
-        for t in trials
-    ]
+    return Calibration(
+        parameters={
+            name: {"value": float(v), "low": float(a), "high": float(b), "unit": PARAMETERS[name].unit}
+            for name, v, a, b in zip(job.space.names, job.values, low, high, strict=True)
+        },
+        **judge.errors(recording, after),
+        before=judge.errors(recording, before),
+        baselines=judge.trivial(recording),
+        per_trial=judge.by_trial(recording, before, after),
+        seconds=time.perf_counter() - begun,
+        model=judge.model_file(job.model, job.values),
+        predictions=after,
+        predictions_before=before,
+        seed=seed,
+        interrupted=interrupted,
+        notes=_notes(recording, job),
+    )
+
+
+def _notes(recording: Recording, job: _Job) -> list[str]:
     notes = [f"Rest shape: {job.model.rest}."]
     unused = sorted({t.name for t in recording.train} - set(job.motion.names))
     if unused:
         notes.append(f"Not fitted because every frame is marked suspect: {', '.join(unused)}.")
     if not job.model.measured_twist() and job.model.clamps:
-        notes.append(
-            "Rotation of the grippers about the rope was not measured; the rope is taken to start without twist."
-        )
-    return Calibration(
-        parameters=parameters,
-        **errors(after),
-        before=errors(before),
-        baselines=trivial,
-        per_trial=per_trial,
-        seconds=time.perf_counter() - begun,
-        model=_model_file(job),
-        predictions=after,
-        predictions_before=before,
-        seed=seed,
-        interrupted=interrupted,
-        notes=notes,
-    )
-
-
-def _model_file(job: _Job) -> dict[str, Any]:
-    model, recording = job.model, job.model.recording
-    return {
-        "format": "torchdlo-model",
-        "version": 1,
-        "rope": {
-            "length": recording.length,
-            "radius": recording.radius,
-            "mass": recording.mass,
-            "marker_mass": recording.marker_mass,
-            "gravity": list(recording.gravity),
-            "table_height": recording.table_height,
-            "rest": model.rest,
-            "rest_positions": recording.rest_positions if model.rest == "given" else None,
-        },
-        "mesh": {"arclength": model.arclength, "marker_vertex": model.marker_vertex},
-        "parameters": dict(zip(job.space.names, job.values, strict=True)),
-        "effects": {},
-        "step": {"integrator": "implicit", "twist": "quasistatic", "dt": model.dt, "substeps": model.substeps},
-    }
+        notes.append("The grippers' rotation about the rope was not measured; it is taken to start without twist.")
+    return notes
