@@ -26,20 +26,40 @@ def ropes(batch: tuple[int, ...] = (), seed: int = 0, dtype=F64) -> list[Rope]:
     """An open and a closed rope, both curved, near the table."""
     g = torch.Generator().manual_seed(seed)
     a = torch.arange(6, dtype=F64) / 6 * 2 * torch.pi
-    loop = 0.1 * torch.stack([torch.cos(a), torch.sin(a), 0.2 * torch.sin(2 * a)], -1) + torch.tensor([0.0, 0.5, 0.0], dtype=F64)
+    loop = 0.1 * torch.stack([torch.cos(a), torch.sin(a), 0.2 * torch.sin(2 * a)], -1) + torch.tensor(
+        [0.0, 0.5, 0.0], dtype=F64
+    )
     line = torch.linspace(0, 0.6, 7, dtype=F64)[:, None] * torch.tensor([1.0, 0.0, 0.0], dtype=F64)
     made = []
     for x, closed in ((line, False), (loop, True)):
         x = x + 0.02 * torch.randn(*batch, *x.shape, generator=g, dtype=F64)
         v = torch.randn(*batch, *x.shape[-2:], generator=g, dtype=F64)
-        made.append(Rope(x.to(dtype), velocities=v.to(dtype), mass=0.1, bend=1e-3, bend2=None, twist=2e-3, stretch=50.0, closed=closed, radius=0.01))
+        made.append(
+            Rope(
+                x.to(dtype),
+                velocities=v.to(dtype),
+                mass=0.1,
+                bend=1e-3,
+                bend2=None,
+                twist=2e-3,
+                stretch=50.0,
+                closed=closed,
+                radius=0.01,
+            )
+        )
     return made
 
 
 def scene(name: str, batch: tuple[int, ...] = (), seed: int = 0, dtype=F64, given: list[Rope] | None = None):
     """Scene, parameters and state in which the one effect acts."""
-    made, params, state = make(given or ropes(batch, seed, dtype), [EFFECTS[name]()], {EFFECTS[name].name: ACTIVE.get(name, {})},
-                               constrained=False, dt=1e-5, substeps=1)  # fmt: skip
+    made, params, state = make(
+        given or ropes(batch, seed, dtype),
+        [EFFECTS[name]()],
+        {EFFECTS[name].name: ACTIVE.get(name, {})},
+        constrained=False,
+        dt=1e-5,
+        substeps=1,
+    )
     g = torch.Generator().manual_seed(seed + 7)
     r = state.rods
     twist = torch.randn(r.twist.shape, generator=g, dtype=F64).to(dtype)

@@ -26,7 +26,9 @@ def test_effect_declares_its_numbers_completely(name):
     assert cls.__doc__
     for number, p in cls.params.items():
         default = p.default if isinstance(p.default, tuple) else (p.default,)
-        assert all(p.low <= d <= p.high for d in default), f"{name}.{number}: default {p.default} outside {p.low} to {p.high}"
+        assert all(p.low <= d <= p.high for d in default), (
+            f"{name}.{number}: default {p.default} outside {p.low} to {p.high}"
+        )
         assert p.unit and p.doc.endswith(".") and len(p.doc) > 8, f"{name}.{number}"
         assert p.scale in ("log", "linear") and math.isfinite(p.low) and math.isfinite(p.high) and p.low < p.high
         assert p.scale == "linear" or p.low > 0, f"{name}.{number}: logarithmic from {p.low}"
@@ -87,7 +89,9 @@ def test_loads_and_gradients_are_finite_in_degenerate_states(name, case):
     rope = degenerate().get(case, degenerate()["straight, at rest, touching exactly"])
     made, params, state = scene(name, given=rope)
     r = state.rods
-    state = tree.replace(state, rods=tree.replace(r, twist=torch.zeros_like(r.twist), twist_rate=torch.zeros_like(r.twist_rate)))
+    state = tree.replace(
+        state, rods=tree.replace(r, twist=torch.zeros_like(r.twist), twist_rate=torch.zeros_like(r.twist_rate))
+    )
     if case == "neighbours coincide":
         pos = state.rods.pos.clone()
         pos[2] = pos[1]
@@ -99,7 +103,9 @@ def test_loads_and_gradients_are_finite_in_degenerate_states(name, case):
     inputs = [x.detach().clone().requires_grad_() for x in leaves]
     rods, now, numbers = rebuild(inputs)
     found = respond(made, tree.replace(params, rods=rods), tree.replace(state, rods=now), numbers)
-    assert all(bool(torch.isfinite(load).all()) for load in found.values()), {k: bool(torch.isfinite(x).all()) for k, x in found.items()}
+    assert all(bool(torch.isfinite(load).all()) for load in found.values()), {
+        k: bool(torch.isfinite(x).all()) for k, x in found.items()
+    }
     total = sum(load.sum() for load in found.values() if load.requires_grad)
     if not isinstance(total, torch.Tensor):
         return
@@ -146,7 +152,9 @@ def test_loads_turn_about_the_vertical_and_move_with_the_rope(name, angle):
     made, params, state = scene(name)
     shift = torch.tensor([0.7, -1.3, 0.0 if name.startswith("table") else 0.9], dtype=F64)
     r = state.rods
-    moved = tree.replace(state, rods=tree.replace(r, pos=turn(r.pos) + shift, vel=turn(r.vel), director=turn(r.director)))
+    moved = tree.replace(
+        state, rods=tree.replace(r, pos=turn(r.pos) + shift, vel=turn(r.vel), director=turn(r.director))
+    )
     before, after = respond(made, params, state), respond(made, params, moved)
     for key, load in before.items():
         if key in ("stiffness", "drag"):
@@ -170,5 +178,7 @@ def test_resistances_are_not_negative(name):
 def test_internal_effects_exert_no_total_force():
     for name in ("stretch_force", "bend", "bend_frame", "twist", "bending_damping"):
         made, params, state = scene(name)
-        assert "force" not in respond(made, params, state), "inner forces belong in `gradient`, whose total is zero by construction"
+        assert "force" not in respond(made, params, state), (
+            "inner forces belong in `gradient`, whose total is zero by construction"
+        )
     assert ropes()

@@ -13,7 +13,7 @@ from torchdlo.physics import effect, rod, tree
 from torchdlo.physics.effects import EFFECTS
 from torchdlo.physics.effects.elastic import Bend, BendFrame, Stretch, Twist
 from torchdlo.physics.topology import preceding
-from torchdlo.scene import Params, Scene, State, hold, step
+from torchdlo.scene import Control, Params, Scene, State, hold, step
 
 F64 = torch.float64
 ELASTIC = (Stretch, Bend, BendFrame, Twist)
@@ -56,7 +56,9 @@ def altered(scene: Scene, params: Params) -> rod.RodParams:
     return rods
 
 
-def view(scene: Scene, params: Params, state: State, pos: Tensor | None = None, twist: Tensor | None = None) -> rod.View:
+def view(
+    scene: Scene, params: Params, state: State, pos: Tensor | None = None, twist: Tensor | None = None
+) -> rod.View:
     """The view of a state whose positions and twists are replaced; frames are carried along, differentiably."""
     rods = altered(scene, params)
     s = state.rods
@@ -69,7 +71,9 @@ def view(scene: Scene, params: Params, state: State, pos: Tensor | None = None, 
     return rod.view(scene.topology, rods, s, scene.dt / scene.substeps)
 
 
-def energy(scene: Scene, params: Params, state: State, pos: Tensor | None = None, twist: Tensor | None = None) -> Tensor:
+def energy(
+    scene: Scene, params: Params, state: State, pos: Tensor | None = None, twist: Tensor | None = None
+) -> Tensor:
     """Elastic energy of the scene's effects [J], per scene."""
     v = view(scene, params, state, pos, twist)
     parts = [e.energy(v, params.effects[e.name]).sum((-1, -2)) for e in scene.effects if isinstance(e, ELASTIC)]
@@ -144,7 +148,9 @@ class Statics:
         return u + (tension * (length - self.params.rods.rest.length[self.edges, 0])).sum()
 
     def unknowns(self) -> Tensor:
-        return torch.cat([self.state.rods.pos.reshape(-1)[self.free_x], self.state.rods.twist.reshape(-1)[self.free_t], self.tension])
+        return torch.cat(
+            [self.state.rods.pos.reshape(-1)[self.free_x], self.state.rods.twist.reshape(-1)[self.free_t], self.tension]
+        )
 
     def gradient(self, z: Tensor, share: float = 1.0) -> Tensor:
         return torch.func.grad(self.lagrangian)(z, share)
@@ -160,7 +166,9 @@ class Statics:
         self.state = tree.replace(self.state, rods=v.state)
         self.tension = tension
 
-    def solve(self, shares: Sequence[float] = (1.0,), steps: int = 40, tolerance: float = 1e-11, reach: float = 0.3) -> State:
+    def solve(
+        self, shares: Sequence[float] = (1.0,), steps: int = 40, tolerance: float = 1e-11, reach: float = 0.3
+    ) -> State:
         """Newton with the largest change of a step limited to `reach` edge lengths."""
         h = float(self.params.rods.rest.length[self.real].mean())
         for share in shares:
@@ -190,18 +198,23 @@ class Statics:
         return torch.linalg.eigvalsh(upper)[:count]
 
 
-def run(scene: Scene, params: Params, state: State, count: int, control=None, seen: Callable[[State], object] | None = None):
-    """Step without gradients; returns the last state and what `seen` said after every step."""
+def run(
+    scene: Scene,
+    params: Params,
+    state: State,
+    count: int,
+    control: Control | Callable[[int, State], Control] | None = None,
+    seen: Callable[[State], object] | None = None,
+) -> tuple[State, list]:
+    """Step without gradients; returns the last state and what `seen` said after every step.
+
+    Held parts stay where they are, or follow a control or a function (number of the step, state) -> control.
+    """
     out = []
     with torch.no_grad():
+        given = hold(scene, state) if control is None else control
         for k in range(count):
-            now = hold(scene, state) if control is None and k == 0 else control
-            if control is None:
-                fixed = now if k == 0 else fixed
-                now = fixed
-            elif callable(control):
-                now = control(k, state)
-            state = step(scene, params, state, now)
+            state = step(scene, params, state, given(k, state) if callable(given) else given)
             if seen is not None:
                 out.append(seen(state))
     return state, out

@@ -65,7 +65,10 @@ BAD = {
     "velocities of the wrong shape": (lambda: make(rope(velocities=X[:4]), []), "velocit"),
     "NaN velocities": (lambda: make(rope(velocities=nan_at(0)), []), "velocit"),
     "director along the edge": (lambda: make(rope(director=vec(1, 0, 0)), []), "director"),
-    "ropes of different batch": (lambda: make([*rope(positions=X.expand(2, 6, 3)), *rope(positions=X.expand(3, 6, 3))], []), "batch"),
+    "ropes of different batch": (
+        lambda: make([*rope(positions=X.expand(2, 6, 3)), *rope(positions=X.expand(3, 6, 3))], []),
+        "batch",
+    ),
     "unknown integrator": (lambda: make(rope(), [], integrator="magic"), "integrator"),
     "unknown twist": (lambda: make(rope(), [], twist="some"), "twist"),
     "dt 0": (lambda: make(rope(), [], dt=0.0), "dt"),
@@ -79,22 +82,40 @@ BAD = {
     "held vertex negative": (lambda: make(rope(), [], held_vertices=(-1,)), "held_vertices"),
     "held vertex twice": (lambda: make(rope(), [], held_vertices=(1, 1)), "held_vertices"),
     "held edge outside": (lambda: make(rope(), [], held_edges=(9,)), "held_edges"),
-    "held edge is the seam of an open rope": (lambda: make(rope(), effects("bend", "twist"), held_edges=(5,), twist="quasistatic"), "held_edges"),
+    "held edge is the seam of an open rope": (
+        lambda: make(rope(), effects("bend", "twist"), held_edges=(5,), twist="quasistatic"),
+        "held_edges",
+    ),
     "held edge without twist": (lambda: make(rope(), effects("bend"), held_edges=(0,)), "held_edges"),
     "effect twice": (lambda: make(rope(), effects("gravity", "gravity")), "gravity"),
     "both laws of bending": (lambda: make(rope(), effects("bend", "bend_frame")), "bend"),
     "implicit without lengths": (lambda: make(rope(), [], integrator="implicit", constrained=False), "constrained"),
-    "small loop, implicit": (lambda: make(rope(positions=circle(4), closed=True), [], integrator="implicit"), "at least 5"),
+    "small loop, implicit": (
+        lambda: make(rope(positions=circle(4), closed=True), [], integrator="implicit"),
+        "at least 5",
+    ),
     "quasistatic without twist": (lambda: make(rope(), effects("bend"), twist="quasistatic"), "Twist"),
     "isotropic law for two stiffnesses": (lambda: make(rope(bend2=2e-3), effects("bend")), "bend"),
-    "law without rest shape for a curved rest": (lambda: make(rope(positions=circle(6), closed=True, rest="as_placed"), effects("bend")), "rest|BendFrame"),
+    "law without rest shape for a curved rest": (
+        lambda: make(rope(positions=circle(6), closed=True, rest="as_placed"), effects("bend")),
+        "rest|BendFrame",
+    ),
     "plasticity without frames": (lambda: make(rope(), effects("bend", "bending_plasticity")), "BendFrame"),
     "values of an absent effect": (lambda: make(rope(), effects("gravity"), {"damping": {"rate": 1.0}}), "damping"),
     "unknown number": (lambda: make(rope(), effects("damping"), {"damping": {"speed": 1.0}}), "speed"),
-    "number of the wrong size": (lambda: make(rope(), effects("gravity"), {"gravity": {"acceleration": (0.0, 1.0)}}), "gravity.acceleration"),
+    "number of the wrong size": (
+        lambda: make(rope(), effects("gravity"), {"gravity": {"acceleration": (0.0, 1.0)}}),
+        "gravity.acceleration",
+    ),
     "NaN number": (lambda: make(rope(), effects("damping"), {"damping": {"rate": math.nan}}), "damping.rate"),
-    "stretch left to nothing": (lambda: make(rope(stretch=50.0), effects("bend"), constrained=False, dt=1e-4), "stretch"),
-    "infinite stretch as a force": (lambda: make(rope(), effects("bend", "stretch_force"), constrained=False, dt=1e-4), "stretch"),
+    "stretch left to nothing": (
+        lambda: make(rope(stretch=50.0), effects("bend"), constrained=False, dt=1e-4),
+        "stretch",
+    ),
+    "infinite stretch as a force": (
+        lambda: make(rope(), effects("bend", "stretch_force"), constrained=False, dt=1e-4),
+        "stretch",
+    ),
     "counts and flags differ": (lambda: Topology((3, 4), (True,)), "closed flags"),
     "empty topology": (lambda: Topology((), ()), "counts"),
     "controls of the wrong number": (lambda: wrong_control(2), "control"),
@@ -106,7 +127,8 @@ def wrong_control(count: int):
     return step(scene, params, state, Control(X[:count], X[:0]))
 
 
-# Accepted in silence, or refused by a crash further down: strict, so that a check that is added has to leave this list.
+# Accepted in silence, or refused by a crash further down: strict, so that a check that is added has to leave this
+# list.
 NOT_REFUSED = [
     "infinite bending stiffness",
     "infinite mass",
@@ -135,7 +157,11 @@ NOT_REFUSED = [
 
 
 @pytest.mark.parametrize(
-    "case", [pytest.param(c, marks=pytest.mark.xfail(strict=True, reason="not checked")) if c in NOT_REFUSED else c for c in BAD]
+    "case",
+    [
+        pytest.param(c, marks=pytest.mark.xfail(strict=True, reason="not checked")) if c in NOT_REFUSED else c
+        for c in BAD
+    ],
 )
 def test_a_malformed_scene_is_refused_by_name(case):
     build, words = BAD[case]
@@ -145,7 +171,11 @@ def test_a_malformed_scene_is_refused_by_name(case):
 
 UNSTABLE = {
     "bending": (effects("bend"), {"dt": 0.5, "substeps": 1}, {}),
-    "stretching": (effects("bend", "stretch_force"), {"dt": 0.02, "substeps": 1, "constrained": False}, {"stretch": 1e3}),
+    "stretching": (
+        effects("bend", "stretch_force"),
+        {"dt": 0.02, "substeps": 1, "constrained": False},
+        {"stretch": 1e3},
+    ),
     "twisting": (effects("bend", "twist"), {"dt": 0.02, "substeps": 1, "twist": "dynamic"}, {"twist": 1e-2}),
     "table contact": (effects("bend", "table"), {"dt": 0.008, "substeps": 1}, {}),
 }
@@ -170,7 +200,7 @@ def test_an_unstable_step_names_its_limit_and_a_cure_that_works(term):
 def test_limits_are_those_of_the_discrete_rod(term):
     # Beyond twice the limit a small disturbance grows by orders of magnitude; at 95 % it stays small.
     names, choices, changes = UNSTABLE[term]
-    scene, params, state = make(rope(**changes), names, **choices | {"substeps": 1000})
+    scene, params, _state = make(rope(**changes), names, **choices | {"substeps": 1000})
     bound = limits(scene, params)[term]
     for factor, stays in ((0.95, True), (1.5, False)):
         good, p, s = make(rope(**changes), names, **choices | {"substeps": 1000})
@@ -179,7 +209,9 @@ def test_limits_are_those_of_the_discrete_rod(term):
         kick = 1e-6 * torch.tensor([1.0, -1.0] * 3, dtype=X.dtype)[:, None]
         s = tree.replace(s, rods=tree.replace(r, pos=r.pos + kick * vec(1.0, 0, 1.0), twist=r.twist + kick))
         s, _ = run(fast, p, s, 60, hold(fast, s))
-        size = max(float((s.rods.pos - r.pos).abs().nan_to_num(1e9).max()), float(s.rods.twist.abs().nan_to_num(1e9).max()))
+        size = max(
+            float((s.rods.pos - r.pos).abs().nan_to_num(1e9).max()), float(s.rods.twist.abs().nan_to_num(1e9).max())
+        )
         assert (size < 1e-3) is stays, (factor, size)
 
 

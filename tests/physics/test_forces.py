@@ -9,8 +9,7 @@ import torch
 from helpers import ELASTIC, F64, circle, effects, energy, loads, rand, straight, vec, view, wild
 
 from torchdlo.physics import rotation, tree
-from torchdlo.physics.effects.elastic import Bend, BendFrame, Stretch, Twist
-from torchdlo.physics.effects.elastic import curvature
+from torchdlo.physics.effects.elastic import Bend, BendFrame, Stretch, Twist, curvature
 from torchdlo.scene import Rope, hold, make, step
 
 
@@ -20,9 +19,15 @@ def ropes(kind: str) -> list[Rope]:
     def one(n: int, seed: int, closed: bool) -> Rope:
         second = rand(n, seed=seed + 5)
         return Rope(
-            wild(n, seed, closed), closed=closed, mass=0.3, stretch=rand(n, seed=seed + 1), bend=rand(n, seed=seed + 2),
-            bend2=second, twist=rand(n, seed=seed + 3), rest=wild(n, seed + 4, closed),
-        )  # fmt: skip
+            wild(n, seed, closed),
+            closed=closed,
+            mass=0.3,
+            stretch=rand(n, seed=seed + 1),
+            bend=rand(n, seed=seed + 2),
+            bend2=second,
+            twist=rand(n, seed=seed + 3),
+            rest=wild(n, seed + 4, closed),
+        )
 
     if kind == "open":
         return [one(8, 1, False)]
@@ -50,8 +55,12 @@ def test_loads_are_the_negative_gradient_of_the_energy(kind, law):
     # F = -dU/dx with frames carried along by parallel transport, torque = -dU/dtheta. float64: 1e-9 relative.
     scene, params, state = make(ropes(kind), [law()], constrained=law is not Stretch, dt=1e-6)
     if law is Bend:  # isotropic law
-        params = tree.replace(params, rods=tree.replace(params.rods, material=tree.replace(
-            params.rods.material, bend=params.rods.material.bend[..., :1])))  # fmt: skip
+        params = tree.replace(
+            params,
+            rods=tree.replace(
+                params.rods, material=tree.replace(params.rods.material, bend=params.rods.material.bend[..., :1])
+            ),
+        )
     state = disturbed(state)
     pos = state.rods.pos.clone().requires_grad_()
     twist = state.rods.twist.clone().requires_grad_()
@@ -70,8 +79,12 @@ def test_internal_forces_and_torques_sum_to_zero(kind, law):
     # T9. sum F = 0; sum x cross F + sum t tau = 0, as a rigid turn changes no energy.
     scene, params, state = make(ropes(kind), [law()], constrained=law is not Stretch, dt=1e-6)
     if law is Bend:
-        params = tree.replace(params, rods=tree.replace(params.rods, material=tree.replace(
-            params.rods.material, bend=params.rods.material.bend[..., :1])))  # fmt: skip
+        params = tree.replace(
+            params,
+            rods=tree.replace(
+                params.rods, material=tree.replace(params.rods.material, bend=params.rods.material.bend[..., :1])
+            ),
+        )
     state = disturbed(state)
     force, torque = loads(scene, params, state)
     size = force.norm(dim=-1).sum()
@@ -84,7 +97,9 @@ def test_internal_forces_and_torques_sum_to_zero(kind, law):
 @pytest.mark.parametrize("kind", KINDS)
 def test_energy_does_not_change_under_rigid_motion(kind):
     # T9. All of the state turns with the rods: directors too. 1e-12 relative.
-    scene, params, state = make(ropes(kind), effects("stretch_force", "bend_frame", "twist"), constrained=False, dt=1e-6)
+    scene, params, state = make(
+        ropes(kind), effects("stretch_force", "bend_frame", "twist"), constrained=False, dt=1e-6
+    )
     state = disturbed(state)
     q = vec(0.3, -0.5, 0.7, 0.2)
     q = q / q.norm()
@@ -95,7 +110,8 @@ def test_energy_does_not_change_under_rigid_motion(kind):
     moved = tree.replace(state.rods, pos=turn(state.rods.pos) + vec(1, -2, 3), director=turn(state.rods.director))
     a, b = energy(scene, params, state), energy(scene, params, tree.replace(state, rods=moved))
     assert float((a - b).abs() / a) < 1e-12
-    # Turning in time (frames carried by transport plus the turn of the frame about the tangents) keeps it as well: the
+    # Turning in time (frames carried by transport plus the turn of the frame about the tangents) keeps it as well:
+    # the
     # forces turn with the rods.
     fa, ta = loads(scene, params, state)
     fb, tb = loads(scene, params, tree.replace(state, rods=moved))
@@ -140,7 +156,9 @@ def test_energy_per_hinge_is_stiffness_over_hinge_length():
 def test_uniform_twist_exerts_the_closed_form_torque_and_no_force():
     # T2. theta_j linear over the n - 1 hinges between the first and last edge: torque C Theta / (L - h), F = 0.
     n, length, c, total = 9, 1.0, 0.8, 5.0
-    scene, params, state = make([Rope(straight(n, length), mass=1.0, bend=1.0, twist=c)], [BendFrame(), Twist()], dt=1e-6)
+    scene, params, state = make(
+        [Rope(straight(n, length), mass=1.0, bend=1.0, twist=c)], [BendFrame(), Twist()], dt=1e-6
+    )
     h = length / (n - 1)
     theta = torch.linspace(0, total, n - 1, dtype=F64)
     theta = torch.cat([theta, theta.new_zeros(1)])[:, None]
@@ -151,7 +169,8 @@ def test_uniform_twist_exerts_the_closed_form_torque_and_no_force():
 
 
 def test_end_moment_rolls_a_rod_up_with_equal_hinge_angles():
-    # S4 and T3. Equal turning angles phi at every hinge carry the moment M = B 2 tan(phi/2)/h: it is what the closed-form
+    # S4 and T3. Equal turning angles phi at every hinge carry the moment M = B 2 tan(phi/2)/h: it is what the closed-
+    # form
     # forces exert on each inner edge, and they vanish on inner vertices. At phi = 2 pi / n the rod is a circle.
     n_edges, b = 20, 1.3
     phi = 2 * math.pi / n_edges
@@ -186,12 +205,22 @@ def test_loads_of_nearly_opposite_edges_are_bounded(law):
 
 
 def test_a_fold_opens_without_blowing_up():
-    # 170 degrees and exactly folded hinges, implicit steps of 5 ms: finite, inextensible, energy not above the start's.
+    # 170 degrees and exactly folded hinges, implicit steps of 5 ms: finite, inextensible, energy not above the
+    # start's.
     for angle in (170.0, 179.999):
         a = math.radians(angle)
-        pos = torch.stack([vec(-0.2, 0, 0), vec(-0.1, 0, 0), vec(0, 0, 0), vec(math.cos(a), math.sin(a), 0) * 0.1,
-                           vec(math.cos(a), math.sin(a), 0) * 0.2])  # fmt: skip
-        scene, params, state = make([Rope(pos, mass=0.01, bend=1e-4)], [Bend()], integrator="implicit", dt=5e-3, substeps=1)
+        pos = torch.stack(
+            [
+                vec(-0.2, 0, 0),
+                vec(-0.1, 0, 0),
+                vec(0, 0, 0),
+                vec(math.cos(a), math.sin(a), 0) * 0.1,
+                vec(math.cos(a), math.sin(a), 0) * 0.2,
+            ]
+        )
+        scene, params, state = make(
+            [Rope(pos, mass=0.01, bend=1e-4)], [Bend()], integrator="implicit", dt=5e-3, substeps=1
+        )
         control = hold(scene, state)
         start = float(energy(scene, params, state))
         for _ in range(40):
@@ -205,7 +234,9 @@ TREFOIL_TURN = -2.225662
 
 def trefoil(n: int) -> torch.Tensor:
     t = 2 * math.pi * torch.arange(n, dtype=F64) / n
-    return torch.stack([torch.sin(t) + 2 * torch.sin(2 * t), torch.cos(t) - 2 * torch.cos(2 * t), -torch.sin(3 * t)], -1)
+    return torch.stack(
+        [torch.sin(t) + 2 * torch.sin(2 * t), torch.cos(t) - 2 * torch.cos(2 * t), -torch.sin(3 * t)], -1
+    )
 
 
 def test_parallel_transport_round_a_trefoil_turns_by_its_writhe():
@@ -227,7 +258,9 @@ def test_parallel_transport_round_a_trefoil_turns_by_its_writhe():
 def test_loops_at_rest_as_placed_have_no_energy_and_stay(pos):
     # T8. Zero energy to 1e-12 of B/L; stepping a loop that is curved out of plane leaves it where it is.
     rope = Rope(0.05 * pos, mass=0.05, bend=1e-3, twist=1e-3, closed=True, rest="as_placed")
-    scene, params, state = make([rope], effects("bend_frame", "twist"), twist="dynamic", integrator="implicit", dt=2e-3, substeps=1)
+    scene, params, state = make(
+        [rope], effects("bend_frame", "twist"), twist="dynamic", integrator="implicit", dt=2e-3, substeps=1
+    )
     assert float(energy(scene, params, state).abs()) < 1e-15
     force, torque = loads(scene, params, state)
     assert float(force.abs().max()) < 1e-12 and float(torque.abs().max()) < 1e-14
@@ -251,7 +284,10 @@ def test_curvature_rate_is_the_time_derivative_of_curvature():
     moving = tree.replace(state, rods=tree.replace(state.rods, vel=v, twist_rate=w))
     rate = curvature(view(scene, params, moving)).rate(view(scene, params, moving))
     eps = 1e-6
-    k = [curvature(view(scene, params, state, state.rods.pos + s * eps * v, state.rods.twist + s * eps * w)).kappa for s in (1, -1)]
+    k = [
+        curvature(view(scene, params, state, state.rods.pos + s * eps * v, state.rods.twist + s * eps * w)).kappa
+        for s in (1, -1)
+    ]
     found = (k[0] - k[1]) / (2 * eps)
     mask = params.rods.rest.hinge_mask
     assert float(((rate - found) * mask).norm() / (found * mask).norm()) < 1e-8

@@ -20,7 +20,9 @@ def _scene(dtype: torch.dtype, closed: bool, **choices):
     x = x + 1e-3 * torch.randn(x.shape, dtype=dtype, generator=torch.Generator().manual_seed(0))
     rope = scenes.Rope(x, mass=0.05, bend=1e-3, twist=1e-3, closed=closed, rest="as_placed")
     effects = [Gravity(), BendFrame(), Twist(), Damping(), AirDrag(), Table(), TableFriction()]
-    return scenes.make([rope], effects, {"table_friction": {"mu": 0.3}}, dt=2e-3, substeps=2, held_vertices=(0, 1), **choices)
+    return scenes.make(
+        [rope], effects, {"table_friction": {"mu": 0.3}}, dt=2e-3, substeps=2, held_vertices=(0, 1), **choices
+    )
 
 
 @pytest.mark.parametrize("name", ["tridiagonal:o60", "tridiagonal:c24,o7", "saddle:o30", "saddle:c12,o9"])
@@ -37,7 +39,9 @@ def test_gpu_solves_banded_systems(name: str, transpose: bool) -> None:
 
 
 @pytest.mark.parametrize("closed", [False, True])
-@pytest.mark.parametrize("choices", [{"integrator": "explicit", "twist": "quasistatic"}, {"integrator": "implicit", "twist": "dynamic"}])
+@pytest.mark.parametrize(
+    "choices", [{"integrator": "explicit", "twist": "quasistatic"}, {"integrator": "implicit", "twist": "dynamic"}]
+)
 def test_gpu_rollout_and_gradient_equal_those_of_the_cpu(closed: bool, choices: dict) -> None:
     scene, params, state = _scene(torch.float64, closed, **choices)
     found = []
@@ -61,7 +65,9 @@ def test_gpu_replay_keeps_states_in_cpu_memory() -> None:
         vel = state.rods.vel.clone().requires_grad_()
         begin = tree.replace(state, rods=tree.replace(state.rods, vel=vel))
         control = tree.map(lambda c: c.expand(frames, *c.shape), scenes.hold(scene, state))
-        last, _ = scenes.rollout(lambda p, s, c: scenes.step(scene, p, s, c), params, begin, control, segment=5, keep=lambda s: s.time)
+        last, _ = scenes.rollout(
+            lambda p, s, c: scenes.step(scene, p, s, c), params, begin, control, segment=5, keep=lambda s: s.time
+        )
         last.rods.pos.sum().backward()
         return torch.cuda.max_memory_allocated()
 
@@ -72,7 +78,9 @@ def test_gpu_replay_keeps_states_in_cpu_memory() -> None:
 def test_bend_without_frames_runs_on_the_gpu() -> None:
     x = torch.zeros(3, 30, 3)
     x[..., 0] = torch.linspace(0, 1, 30)
-    scene, params, state = scenes.make([scenes.Rope(x, density=1000.0, youngs=1e6)], [Gravity(), Bend()], held_vertices=(0, 1))
+    scene, params, state = scenes.make(
+        [scenes.Rope(x, density=1000.0, youngs=1e6)], [Gravity(), Bend()], held_vertices=(0, 1)
+    )
     params, state = (tree.map(lambda t: t.to("cuda"), part) for part in (params, state))
     for _ in range(20):
         state = scenes.step(scene, params, state, scenes.hold(scene, state))

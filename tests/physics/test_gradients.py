@@ -6,7 +6,6 @@ All numbers of a case are disturbed at once in the batch axis: five-point differ
 
 from __future__ import annotations
 
-
 import pytest
 import torch
 from helpers import F64, circle, effects, rand, vec, wild
@@ -33,23 +32,52 @@ VALUES = {
     "point_mass": {"position": 0.53, "mass": 0.1},
 }
 CASES: dict[str, dict] = {
-    "explicit": {"effects": ["bend", "gravity", "damping", "air_drag", "point_mass", "nonuniform_stiffness"], "dt": 1e-3},
+    "explicit": {
+        "effects": ["bend", "gravity", "damping", "air_drag", "point_mass", "nonuniform_stiffness"],
+        "dt": 1e-3,
+    },
     "explicit extensible": {"effects": ["bend", "gravity", "damping"], "dt": 1e-3, "rope": {"stretch": 40.0}},
-    "explicit forces": {"effects": ["stretch_force", "bend", "gravity"], "dt": 1e-3, "rope": {"stretch": 40.0}, "constrained": False},
+    "explicit forces": {
+        "effects": ["stretch_force", "bend", "gravity"],
+        "dt": 1e-3,
+        "rope": {"stretch": 40.0},
+        "constrained": False,
+    },
     "explicit loop": {"effects": ["bend", "gravity"], "dt": 1e-3, "closed": True},
-    "explicit dynamic": {"effects": ["bend_frame", "twist", "gravity", "damping", "bending_damping", "rest_curvature"],
-                         "dt": 1e-3, "twist": "dynamic"},
-    "explicit quasistatic": {"effects": ["bend_frame", "twist", "gravity", "rest_curvature"], "dt": 1e-3, "twist": "quasistatic"},
-    "implicit": {"effects": ["bend", "gravity", "damping", "air_drag", "point_mass", "nonuniform_stiffness"], "dt": 3e-3},
+    "explicit dynamic": {
+        "effects": ["bend_frame", "twist", "gravity", "damping", "bending_damping", "rest_curvature"],
+        "dt": 1e-3,
+        "twist": "dynamic",
+    },
+    "explicit quasistatic": {
+        "effects": ["bend_frame", "twist", "gravity", "rest_curvature"],
+        "dt": 1e-3,
+        "twist": "quasistatic",
+    },
+    "implicit": {
+        "effects": ["bend", "gravity", "damping", "air_drag", "point_mass", "nonuniform_stiffness"],
+        "dt": 3e-3,
+    },
     "implicit extensible": {"effects": ["bend", "gravity"], "dt": 3e-3, "rope": {"stretch": 40.0}},
     "implicit table": {"effects": ["bend", "gravity", "damping", "table", "table_friction"], "dt": 3e-3},
     "explicit table": {"effects": ["bend", "gravity", "table", "table_friction"], "dt": 2e-3},
-    "implicit dynamic": {"effects": ["bend_frame", "twist", "gravity", "damping", "bending_damping", "bending_plasticity"],
-                         "dt": 2e-3, "twist": "dynamic"},
-    "implicit quasistatic": {"effects": ["bend_frame", "twist", "gravity", "bending_damping", "bending_plasticity"],
-                             "dt": 2e-3, "twist": "quasistatic"},
-    "implicit loop quasistatic": {"effects": ["bend_frame", "twist", "gravity", "damping"], "dt": 1e-3, "twist": "quasistatic", "closed": True},
-}  # fmt: skip
+    "implicit dynamic": {
+        "effects": ["bend_frame", "twist", "gravity", "damping", "bending_damping", "bending_plasticity"],
+        "dt": 2e-3,
+        "twist": "dynamic",
+    },
+    "implicit quasistatic": {
+        "effects": ["bend_frame", "twist", "gravity", "bending_damping", "bending_plasticity"],
+        "dt": 2e-3,
+        "twist": "quasistatic",
+    },
+    "implicit loop quasistatic": {
+        "effects": ["bend_frame", "twist", "gravity", "damping"],
+        "dt": 1e-3,
+        "twist": "quasistatic",
+        "closed": True,
+    },
+}
 
 
 def like(x: torch.Tensor) -> torch.Tensor:
@@ -84,7 +112,12 @@ def build(case: str):
     start = hold(scene, state)
     t = torch.linspace(0, 1, STEPS, dtype=F64)[:, None, None]
     pos = start.pos + 0.05 * torch.sin(6 * t) * vec(0.3, 1.0, 0.5)
-    controls = Control(pos, start.director + torch.sin(4 * t) * vec(0.1, 0.4, 0.6) if held.get("held_edges") else start.director.expand(STEPS, 0, 3))
+    controls = Control(
+        pos,
+        start.director + torch.sin(4 * t) * vec(0.1, 0.4, 0.6)
+        if held.get("held_edges")
+        else start.director.expand(STEPS, 0, 3),
+    )
     return scene, (params, state, controls)
 
 
@@ -102,7 +135,7 @@ def number(trees, path: str):
 
 def swapped(trees, leaves: dict[str, torch.Tensor]):
     """The trees with some leaves replaced."""
-    params, state, controls = trees
+    _params, _state, _controls = trees
     places = {id(number(trees, path)): new for path, new in leaves.items()}
     assert len(places) == len(leaves)
     return tree.map(lambda leaf: places.get(id(leaf), leaf), trees)
@@ -119,8 +152,12 @@ def paths(case: str, scene, trees) -> list[str]:
         found += ["rods.material.stretch"]
     if any(e.name in ("air_drag", "table") for e in scene.effects):
         found += ["rods.material.radius"]
-    found += [f"effects.{e}.{name}" for e, values in trees[0].effects.items() for name in values
-              if (e, name) != ("damping", "twist_rate") or scene.twist == "dynamic"]  # fmt: skip
+    found += [
+        f"effects.{e}.{name}"
+        for e, values in trees[0].effects.items()
+        for name in values
+        if (e, name) != ("damping", "twist_rate") or scene.twist == "dynamic"
+    ]
     return [*found, "state.pos", "state.vel", "controls.pos"]
 
 
@@ -145,9 +182,18 @@ def seen(state):
     return state.rods.pos
 
 
-UNSIZED = {"rods.rest.curvature": 1.0, "rods.rest.twist": 1.0, "state.pos": 0.01, "state.vel": 1.0, "state.twist": 1.0,
-           "state.twist_rate": 100.0, "controls.pos": 1e-3, "controls.director": 0.1}  # fmt: skip
-# Two steps of the differences, the better of which counts: at the larger one some vertices change over to contact or flow,
+UNSIZED = {
+    "rods.rest.curvature": 1.0,
+    "rods.rest.twist": 1.0,
+    "state.pos": 0.01,
+    "state.vel": 1.0,
+    "state.twist": 1.0,
+    "state.twist_rate": 100.0,
+    "controls.pos": 1e-3,
+    "controls.director": 0.1,
+}
+# Two steps of the differences, the better of which counts: at the larger one some vertices change over to contact or
+# flow,
 # at the smaller one small derivatives drown in rounding.
 SIZES = (1e-4, 1e-6)
 
@@ -168,18 +214,21 @@ def test_gradients_of_a_rollout_equal_central_differences(case):
     for k, p in enumerate(names):
         shift = torch.zeros(batch, dtype=F64)
         shift[k * len(shifts) : (k + 1) * len(shifts)] = shifts
-        spread[p] = number(trees, p).unsqueeze(int(p.startswith("controls"))) + shift[:, None, None] * moves[p].unsqueeze(int(p.startswith("controls")))
+        spread[p] = number(trees, p).unsqueeze(int(p.startswith("controls"))) + shift[:, None, None] * moves[
+            p
+        ].unsqueeze(int(p.startswith("controls")))
     with torch.no_grad():
         params, state, controls = swapped(trees, spread)
         state = tree.map(lambda x: x.expand(batch, *x.shape[-2:]), state)
-        controls = tree.map(lambda x: x if x.dim() == 4 else x.unsqueeze(1).expand(STEPS, batch, *x.shape[1:]), controls)
+        controls = tree.map(
+            lambda x: x if x.dim() == 4 else x.unsqueeze(1).expand(STEPS, batch, *x.shape[1:]), controls
+        )
         values = objective(*rollout(lambda *a: step(scene, *a), params, state, controls, keep=seen))
     slopes = (values.reshape(len(names), len(SIZES), len(POINTS)) * weights).sum(-1) / torch.tensor(SIZES, dtype=F64)
     wrong = {}
     for k, p in enumerate(names):
         got = float((gradients[p] * moves[p]).sum())
         errors = (slopes[k] / got - 1).abs()
-        print(f"{case:26s} {p:40s} {got: .8e}", [f"{float(e):.1e}" for e in errors])
         assert abs(got) > 1e-8, f"{p} does not matter here"
         if not float(errors.min()) <= 1e-5:
             wrong[p] = (got, *slopes[k].tolist())
@@ -195,7 +244,8 @@ def test_every_number_of_every_effect_is_checked_above():
 
 @pytest.mark.parametrize("case", ["explicit", "implicit dynamic", "implicit table"])
 def test_replayed_gradients_equal_plain_autograd(case):
-    # The same operations in the same order: equal to rounding, 1e-10 relative; segments that do not divide the steps, nested.
+    # The same operations in the same order: equal to rounding, 1e-10 relative; segments that do not divide the steps,
+    # nested.
     scene, trees = build(case)
     names = paths(case, scene, trees)
     trees = (*trees[:2], tree.map(lambda c: c[:50], trees[2]))

@@ -20,8 +20,13 @@ def corner(angle: float) -> torch.Tensor:
 
 def plastic(angle: float, held=(0, 1, 2), **choices):
     choices = {"dt": 0.01, "substeps": 1} | choices
-    return make([Rope(corner(angle), mass=0.1, bend=1e-3)], effects("bend_frame", "bending_plasticity", "damping"),
-                {"bending_plasticity": {"yield_curvature": YIELD, "rate": RATE}, "damping": {"rate": 20.0}}, held_vertices=held, **choices)  # fmt: skip
+    return make(
+        [Rope(corner(angle), mass=0.1, bend=1e-3)],
+        effects("bend_frame", "bending_plasticity", "damping"),
+        {"bending_plasticity": {"yield_curvature": YIELD, "rate": RATE}, "damping": {"rate": 20.0}},
+        held_vertices=held,
+        **choices,
+    )
 
 
 @pytest.mark.parametrize("integrator", ["explicit", "implicit"])
@@ -50,7 +55,7 @@ def test_released_hinge_springs_back_by_the_yield_curvature():
     state, _ = run(scene, params, state, 500)
     k = 2 * math.tan(angle / 2)
     assert float(state.rods.plastic[1].norm()) == pytest.approx(k - YIELD * H, rel=1e-10)
-    free, params, fresh = plastic(angle, held=(0, 1), integrator="implicit")
+    free, params, _fresh = plastic(angle, held=(0, 1), integrator="implicit")
     state = tree.replace(state, rods=tree.replace(state.rods, vel=torch.zeros_like(state.rods.vel)))
     state, _ = run(free, params, state, 900, hold(free, state))
     assert speed(state) < 1e-9
@@ -60,7 +65,8 @@ def test_released_hinge_springs_back_by_the_yield_curvature():
 
 
 def test_bending_to_and_fro_loses_energy_only_if_plastic():
-    # P3. Work of the held vertex round a closed path: zero for an elastic hinge to 1e-6 of the energy, positive beyond yield.
+    # P3. Work of the held vertex round a closed path: zero for an elastic hinge to 1e-6 of the energy, positive
+    # beyond yield.
     work = {}
     for limit in (1e6, YIELD):
         scene, params, state = plastic(0.0, dt=4e-3)
@@ -85,9 +91,15 @@ def test_natural_curvature_rolls_a_free_rod_into_an_arc():
     # Equilibrium without loads: every hinge has k = 2 tan(phi / 2) = curvature * l, the turning angles add up.
     n, k = 9, 2.0
     x = straight(n)
-    scene, params, state = make([Rope(x, mass=0.1, bend=0.05, twist=0.05, director=vec(0, 1, 0))], effects("bend_frame", "rest_curvature", "damping"),
-                                {"rest_curvature": {"curvature": (0.0, k)}, "damping": {"rate": 5.0}}, integrator="implicit",
-                                dt=2e-2, substeps=1, held_vertices=(0, 1))  # fmt: skip
+    scene, params, state = make(
+        [Rope(x, mass=0.1, bend=0.05, twist=0.05, director=vec(0, 1, 0))],
+        effects("bend_frame", "rest_curvature", "damping"),
+        {"rest_curvature": {"curvature": (0.0, k)}, "damping": {"rate": 5.0}},
+        integrator="implicit",
+        dt=2e-2,
+        substeps=1,
+        held_vertices=(0, 1),
+    )
     state, _ = run(scene, params, state, 500)
     assert speed(state) < 1e-8
     h = 1 / (n - 1)
@@ -95,7 +107,8 @@ def test_natural_curvature_rolls_a_free_rod_into_an_arc():
     t = edge / edge.norm(dim=-1, keepdim=True)
     turn = torch.acos((t[1:] * t[:-1]).sum(-1).clamp(-1, 1))
     assert float((2 * torch.tan(turn / 2) - k * h).abs().max()) < 1e-7
-    # About the second director, which is z for a first director along y: the rod stays in the plane of x and z or x and y.
+    # About the second director, which is z for a first director along y: the rod stays in the plane of x and z or x
+    # and y.
     assert float(t[-1, 0]) == pytest.approx(math.cos(float(turn.sum())), abs=1e-6)
 
 
@@ -103,7 +116,11 @@ def test_point_mass_adds_weight_where_it_is_said():
     # Mass m and its moment m s about the first vertex are exact, inside edges, at vertices and at both ends.
     n, length = 8, 0.7
     for where in (0.0, 0.13, 0.2, 0.4, length):
-        scene, params, _ = make([Rope(straight(n, length), mass=0.2)], effects("point_mass"), {"point_mass": {"position": where, "mass": 0.05}})
+        scene, params, _ = make(
+            [Rope(straight(n, length), mass=0.2)],
+            effects("point_mass"),
+            {"point_mass": {"position": where, "mass": 0.05}},
+        )
         added = (altered(scene, params).material.mass - params.rods.material.mass)[:, 0]
         s = torch.linspace(0, length, n, dtype=F64)
         assert float(added.sum()) == pytest.approx(0.05, rel=1e-12)
@@ -113,21 +130,33 @@ def test_point_mass_adds_weight_where_it_is_said():
 def test_stiffness_varies_along_the_rope_as_declared():
     # B(s) = B0 exp(factor exp(-((s/L - position)/width)^2 / 2)) (1 + slope (s/L - 1/2)).
     numbers = {"position": 0.3, "width": 0.15, "factor": 0.8, "slope": 0.5}
-    scene, params, _ = make([Rope(straight(11), mass=0.2, bend=0.01)], effects("bend", "nonuniform_stiffness"), {"nonuniform_stiffness": numbers})
+    scene, params, _ = make(
+        [Rope(straight(11), mass=0.2, bend=0.01)],
+        effects("bend", "nonuniform_stiffness"),
+        {"nonuniform_stiffness": numbers},
+    )
     s = torch.linspace(0, 1, 11, dtype=F64)
     wanted = 0.01 * torch.exp(0.8 * torch.exp(-0.5 * ((s - 0.3) / 0.15) ** 2)) * (1 + 0.5 * (s - 0.5))
     assert torch.allclose(altered(scene, params).material.bend[:, 0], wanted, rtol=1e-12)
 
 
 def test_bending_friction_decays_a_mode_at_the_kelvin_voigt_rate():
-    # Kelvin-Voigt: M = B k + c k', so a mode of frequency w decays at w^2 c / 2 B; small amplitude free-free three-vertex rod:
+    # Kelvin-Voigt: M = B k + c k', so a mode of frequency w decays at w^2 c / 2 B; small amplitude free-free three-
+    # vertex rod:
     # one hinge, w^2 = B k^T k / (m l): checked by the logarithmic decrement, 1 %.
     bend, c = 1e-3, 2e-6
     found = {}
     for integrator in ("explicit", "implicit"):
         x = corner(1e-3)
-        scene, params, state = make([Rope(x, mass=0.1, bend=bend, rest=straight(3, 2 * H))], effects("bend_frame", "bending_damping"),
-                                    {"bending_damping": {"coefficient": c}}, integrator=integrator, ahead=0.0, dt=4e-3, substeps=1)  # fmt: skip
+        scene, params, state = make(
+            [Rope(x, mass=0.1, bend=bend, rest=straight(3, 2 * H))],
+            effects("bend_frame", "bending_damping"),
+            {"bending_damping": {"coefficient": c}},
+            integrator=integrator,
+            ahead=0.0,
+            dt=4e-3,
+            substeps=1,
+        )
 
         def kink(st):
             e = st.rods.pos[1:] - st.rods.pos[:-1]
@@ -139,17 +168,24 @@ def test_bending_friction_decays_a_mode_at_the_kelvin_voigt_rate():
         peaks = [k for k in range(1, len(seen) - 1) if seen[k - 1] < seen[k] > seen[k + 1]]
         rate = math.log(seen[peaks[0]] / seen[peaks[-1]]) / (4e-3 * (peaks[-1] - peaks[0]))
         found[integrator] = rate / (w2 * c / (2 * bend))
-    print("decay over closed form", found)
     assert all(ratio == pytest.approx(1, abs=0.02) for ratio in found.values()), found
 
 
 def test_drag_slows_a_rod_by_the_quadratic_law():
-    # Straight rod moving sideways: m v' = -rho c_d r L v^2 -> v = v0 / (1 + v0 t rho c_d r L / m); along itself: no drag.
+    # Straight rod moving sideways: m v' = -rho c_d r L v^2 -> v = v0 / (1 + v0 t rho c_d r L / m); along itself: no
+    # drag.
     n, r, mass, v0 = 9, 0.02, 0.05, 3.0
     for axis, drags in ((vec(0, 1, 0), True), (vec(1, 0, 0), False)):
         rope = Rope(straight(n), mass=mass, bend=1e-3, radius=r, velocities=(v0 * axis).expand(n, 3))
         for integrator in ("explicit", "implicit"):
-            scene, params, state = make([rope], effects("bend", "air_drag"), {"air_drag": {"c_d": 1.5}}, integrator=integrator, dt=2e-3, substeps=1)
+            scene, params, state = make(
+                [rope],
+                effects("bend", "air_drag"),
+                {"air_drag": {"c_d": 1.5}},
+                integrator=integrator,
+                dt=2e-3,
+                substeps=1,
+            )
             state, _ = run(scene, params, state, 200)
             m = params.rods.material.mass
             v = float((m * state.rods.vel).sum(-2) @ axis / mass)

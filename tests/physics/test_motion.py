@@ -8,12 +8,11 @@ import pytest
 import torch
 from helpers import F64, circle, effects, energy, length_error, run, speed, straight, vec, wild
 
-from torchdlo.physics import tree
 from torchdlo.scene import Control, Rope, finite, hold, make, step
 
 
 def momentum(params, state):
-    """Linear and angular momentum of the vertices. With v half a step before x, x cross v = x_before cross v as well."""
+    """Linear and angular momentum of the vertices; v stands half a step before x, x cross v = x_before cross v."""
     p = params.rods.material.mass * state.rods.vel
     return p.sum(-2), torch.linalg.cross(state.rods.pos, p).sum(-2)
 
@@ -40,7 +39,8 @@ def test_free_rods_keep_linear_and_angular_momentum(closed):
 
 @pytest.mark.parametrize("integrator", ["explicit", "implicit"])
 def test_free_fall_is_a_parabola_in_every_integrator(integrator):
-    # D5. Centre of mass: Stoermer-Verlet is exact for constant acceleration, x0 + v t + g t^2 / 2, also with damping 0.
+    # D5. Centre of mass: Stoermer-Verlet is exact for constant acceleration, x0 + v t + g t^2 / 2, also with damping
+    # 0.
     scene, params, state = thrown(False, dt=5e-3, substeps=2, integrator=integrator, effects=["bend", "gravity"])
     m = params.rods.material.mass
     start, v = ((m * y).sum(-2) / m.sum() for y in (state.rods.pos, state.rods.vel))
@@ -102,7 +102,16 @@ def test_energy_of_undamped_rods_is_bounded_and_its_error_is_second_order(closed
 def test_energy_with_dynamic_twist_is_bounded():
     # As above with material frames, anisotropic bending and twist waves.
     x = wild(8, 5, rough=0.06)
-    rope = Rope(x, mass=0.4, bend=2e-3, bend2=4e-3, twist=2e-3, radius=0.02, rest="as_placed", velocities=thrown(False)[2].rods.vel[:8])
+    rope = Rope(
+        x,
+        mass=0.4,
+        bend=2e-3,
+        bend2=4e-3,
+        twist=2e-3,
+        radius=0.02,
+        rest="as_placed",
+        velocities=thrown(False)[2].rods.vel[:8],
+    )
     spread = []
     for k in (1, 2):
         scene, params, state = make([rope], effects("bend_frame", "twist"), dt=1e-3 / k, substeps=1, twist="dynamic")
@@ -147,8 +156,15 @@ def orders(choices, names, duration=0.048, finest=64, **rope):
     last = []
     for substeps in (finest // 4, finest // 2, finest):
         given = {"mass": 0.3, "bend": 2e-3, "twist": 1e-3, "radius": 0.02} | rope
-        scene, params, state = make([Rope(x, velocities=v, **given)], effects(*names), dt=duration, substeps=substeps,
-                                    held_vertices=(0,), held_edges=(0,) if choices.get("twist", "none") != "none" else (), **choices)  # fmt: skip
+        scene, params, state = make(
+            [Rope(x, velocities=v, **given)],
+            effects(*names),
+            dt=duration,
+            substeps=substeps,
+            held_vertices=(0,),
+            held_edges=(0,) if choices.get("twist", "none") != "none" else (),
+            **choices,
+        )
         state, _ = run(scene, params, state, 1, control=hold(scene, state))
         last.append(torch.cat([state.rods.pos, state.rods.twist], -1))
     return math.log2(float((last[0] - last[1]).norm() / (last[1] - last[2]).norm()))
@@ -188,8 +204,9 @@ def test_inextensible_rods_keep_their_lengths(integrator, closed):
     n = 15
     x = circle(n, 0.15) if closed else straight(n, 1.0)
     rope = Rope(x, mass=0.05, bend=1e-4, closed=closed)
-    scene, params, state = make([rope], effects("bend", "gravity"), integrator=integrator, dt=2e-3,
-                                substeps=1, held_vertices=(0,))  # fmt: skip
+    scene, params, state = make(
+        [rope], effects("bend", "gravity"), integrator=integrator, dt=2e-3, substeps=1, held_vertices=(0,)
+    )
     state, seen = run(scene, params, state, 200, seen=lambda s: length_error(scene, params, s))
     assert bool(finite(state))
     assert max(seen) < 1e-9, max(seen)
@@ -201,8 +218,14 @@ def test_lengths_hold_while_held_ends_move():
     s = torch.linspace(-1, 1, n, dtype=F64)
     x = torch.stack([0.3 * s, 0 * s, 0.3 * s**2], -1)
     for integrator in ("explicit", "implicit"):
-        scene, params, state = make([Rope(x, mass=0.05, bend=1e-5)], effects("bend", "gravity"), integrator=integrator,
-                                    dt=2e-3, substeps=2, held_vertices=(0, n - 1))  # fmt: skip
+        scene, params, state = make(
+            [Rope(x, mass=0.05, bend=1e-5)],
+            effects("bend", "gravity"),
+            integrator=integrator,
+            dt=2e-3,
+            substeps=2,
+            held_vertices=(0, n - 1),
+        )
         start = hold(scene, state)
 
         def shake(k, state, start=start):
@@ -218,8 +241,14 @@ def test_lengths_hold_while_held_ends_move():
 def test_a_taut_rope_pulled_beyond_its_length_stays_finite(integrator):
     # No solution exists: held ends go where they are told, the rest stays finite and comes back afterwards.
     n = 9
-    scene, params, state = make([Rope(straight(n), mass=0.05, bend=1e-5)], effects("bend", "gravity"), integrator=integrator,
-                                dt=2e-3, substeps=2, held_vertices=(0, n - 1))  # fmt: skip
+    scene, params, state = make(
+        [Rope(straight(n), mass=0.05, bend=1e-5)],
+        effects("bend", "gravity"),
+        integrator=integrator,
+        dt=2e-3,
+        substeps=2,
+        held_vertices=(0, n - 1),
+    )
     start = hold(scene, state)
 
     def pull(k, state):
@@ -236,15 +265,26 @@ def test_a_taut_rope_pulled_beyond_its_length_stays_finite(integrator):
     assert speed(state) < 30
 
 
-@pytest.mark.parametrize("choices", [{"integrator": "implicit"}, {"integrator": "explicit"}, {"integrator": "explicit", "constrained": False}],
-                         ids=["implicit", "explicit", "explicit forces"])  # fmt: skip
+@pytest.mark.parametrize(
+    "choices",
+    [{"integrator": "implicit"}, {"integrator": "explicit"}, {"integrator": "explicit", "constrained": False}],
+    ids=["implicit", "explicit", "explicit forces"],
+)
 def test_extensible_ropes_stretch_by_force_over_stiffness(choices):
-    # S1. A rope hung by one end carries the weight below each edge: strain = m' g (L - s) / EA; 1e-6 with residual speed.
+    # S1. A rope hung by one end carries the weight below each edge: strain = m' g (L - s) / EA; 1e-6 with residual
+    # speed.
     n, ea, mass, g = 6, 20.0, 0.2, 9.81
     rope = Rope(straight(n, 1.0, (0, 0, -1)), mass=mass, stretch=ea, bend=1e-6)
     names = ["bend", "gravity", "damping"] + ([] if choices.get("constrained", True) else ["stretch_force"])
-    scene, params, state = make([rope], effects(*names), {"damping": {"rate": 10.0}}, dt=0.01,
-                                substeps=1 if choices["integrator"] == "implicit" else 2, held_vertices=(0,), **choices)  # fmt: skip
+    scene, params, state = make(
+        [rope],
+        effects(*names),
+        {"damping": {"rate": 10.0}},
+        dt=0.01,
+        substeps=1 if choices["integrator"] == "implicit" else 2,
+        held_vertices=(0,),
+        **choices,
+    )
     state, _ = run(scene, params, state, 400)
     assert float(state.rods.vel.norm(dim=-1).max()) < 1e-8
     edge = (state.rods.pos[1:] - state.rods.pos[:-1]).norm(dim=-1)
@@ -257,8 +297,14 @@ def test_held_vertices_are_where_the_control_wants_them():
     # At the end of every step, and on the way at even shares of it.
     n = 10
     for integrator in ("explicit", "implicit"):
-        scene, params, state = make([Rope(straight(n), mass=0.05, bend=1e-5)], effects("bend", "gravity"),
-                                    integrator=integrator, dt=2e-3, substeps=2, held_vertices=(4, 0))  # fmt: skip
+        scene, params, state = make(
+            [Rope(straight(n), mass=0.05, bend=1e-5)],
+            effects("bend", "gravity"),
+            integrator=integrator,
+            dt=2e-3,
+            substeps=2,
+            held_vertices=(4, 0),
+        )
         for k in range(10):
             target = torch.stack([vec(0.44 - 0.001 * k, 0.02 * k, 0.0), vec(0, 0.005 * k, 0.01 * k)])
             before = state

@@ -13,8 +13,14 @@ GIVEN = {"mass": 0.1, "bend": 1e-3, "twist": 1e-3, "stretch": 200.0, "radius": 0
 KINDS = {
     "explicit": ({"integrator": "explicit", "dt": 2e-3, "substeps": 2}, ["bend", "gravity", "damping"]),
     "implicit": ({"integrator": "implicit", "dt": 2e-3, "substeps": 1}, ["bend", "gravity", "damping"]),
-    "explicit dynamic": ({"integrator": "explicit", "dt": 1e-3, "substeps": 1, "twist": "dynamic"}, ["bend_frame", "twist", "gravity"]),
-    "implicit quasistatic": ({"integrator": "implicit", "dt": 2e-3, "substeps": 1, "twist": "quasistatic"}, ["bend_frame", "twist", "gravity"]),
+    "explicit dynamic": (
+        {"integrator": "explicit", "dt": 1e-3, "substeps": 1, "twist": "dynamic"},
+        ["bend_frame", "twist", "gravity"],
+    ),
+    "implicit quasistatic": (
+        {"integrator": "implicit", "dt": 2e-3, "substeps": 1, "twist": "quasistatic"},
+        ["bend_frame", "twist", "gravity"],
+    ),
 }
 
 
@@ -23,8 +29,11 @@ def shapes(batch: tuple[int, ...] = ()) -> list[Rope]:
     ring = circle(6, 0.2) + vec(0, 1, 0) + 0.02 * wild(6, 2, batch=batch)
     line = wild(7, 1, batch=batch, rough=0.04)
     bow = wild(5, 3, batch=batch, rough=0.04) + vec(0, 2, 0)
-    return [Rope(line, **GIVEN), Rope(ring, closed=True, velocities=0.3 * wild(6, 5), **GIVEN | {"mass": 0.2}),
-            Rope(bow, bend2=3e-3, **GIVEN | {"twist": 2e-3})]  # fmt: skip
+    return [
+        Rope(line, **GIVEN),
+        Rope(ring, closed=True, velocities=0.3 * wild(6, 5), **GIVEN | {"mass": 0.2}),
+        Rope(bow, bend2=3e-3, **GIVEN | {"twist": 2e-3}),
+    ]
 
 
 def picked(ropes, kind):
@@ -33,7 +42,12 @@ def picked(ropes, kind):
 
 def tree_free(rope: Rope) -> Rope:
     """The same rope with one bending stiffness."""
-    return Rope(rope.positions, closed=rope.closed, velocities=rope.velocities, **{**GIVEN, "mass": rope.mass, "bend": rope.bend})
+    return Rope(
+        rope.positions,
+        closed=rope.closed,
+        velocities=rope.velocities,
+        **{**GIVEN, "mass": rope.mass, "bend": rope.bend},
+    )
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -41,7 +55,9 @@ def test_ropes_in_one_scene_move_as_each_alone(kind):
     choices, names = KINDS[kind]
     ropes = picked(shapes(), kind)
     spun = choices.get("twist") == "quasistatic"  # else a free rod may spin as a whole
-    scene, params, state = make(ropes, effects(*names), held_vertices=(0, 8), held_edges=(0, 7, 13) if spun else (), **choices)
+    scene, params, state = make(
+        ropes, effects(*names), held_vertices=(0, 8), held_edges=(0, 7, 13) if spun else (), **choices
+    )
     together, _ = run(scene, params, state, 60)
     start = 0
     for index, rope in enumerate(ropes):
@@ -61,10 +77,14 @@ def test_batches_move_as_each_scene_alone(kind):
     choices, names = KINDS[kind]
     ropes = picked(shapes((2, 2)), kind)
     spun = choices.get("twist") == "quasistatic"
-    scene, params, state = make(ropes, effects(*names), held_vertices=(0,), held_edges=(0, 7, 13) if spun else (), **choices)
+    scene, params, state = make(
+        ropes, effects(*names), held_vertices=(0,), held_edges=(0, 7, 13) if spun else (), **choices
+    )
     scale = rand(2, 2, 1, 1, seed=4, low=0.5, high=1.5)
     material = params.rods.material
-    params = tree.replace(params, rods=tree.replace(params.rods, material=tree.replace(material, bend=material.bend * scale)))
+    params = tree.replace(
+        params, rods=tree.replace(params.rods, material=tree.replace(material, bend=material.bend * scale))
+    )
     many, _ = run(scene, params, state, 40)
     for i in range(2):
         for j in range(2):
@@ -79,9 +99,15 @@ def test_batches_move_as_each_scene_alone(kind):
 
 def test_ropes_of_different_batch_share_one():
     # One rope for all scenes beside one that differs from scene to scene.
-    scene, _, state = make([Rope(straight(5), mass=0.1), Rope(wild(6, 1, batch=(3,)), mass=0.1)], effects("gravity"), dt=1e-3)
+    scene, _, state = make(
+        [Rope(straight(5), mass=0.1), Rope(wild(6, 1, batch=(3,)), mass=0.1)], effects("gravity"), dt=1e-3
+    )
     assert state.rods.pos.shape == (3, 11, 3)
-    state, _ = run(scene, *make([Rope(straight(5), mass=0.1), Rope(wild(6, 1, batch=(3,)), mass=0.1)], effects("gravity"), dt=1e-3)[1:], 2)
+    state, _ = run(
+        scene,
+        *make([Rope(straight(5), mass=0.1), Rope(wild(6, 1, batch=(3,)), mass=0.1)], effects("gravity"), dt=1e-3)[1:],
+        2,
+    )
     assert state.rods.pos.shape == (3, 11, 3)
 
 
@@ -99,7 +125,11 @@ def test_state_stays_batch_innermost_through_steps(kind):
     control = hold(scene, state)
     for _ in range(2):
         state = step(scene, params, state, control)
-    wrong = [f for f in state.rods.__dataclass_fields__ if getattr(state.rods, f).shape[0] == 8 and not innermost(getattr(state.rods, f))]
+    wrong = [
+        f
+        for f in state.rods.__dataclass_fields__
+        if getattr(state.rods, f).shape[0] == 8 and not innermost(getattr(state.rods, f))
+    ]
     assert not wrong, wrong
 
 
@@ -141,7 +171,9 @@ def test_single_precision_follows_double(kind):
 def test_shared_controls_drive_every_scene_of_a_batch():
     # A control without batch axes holds all scenes of a batch, frames included.
     ropes = [Rope(wild(6, 1, batch=(3,), rough=0.02), **GIVEN)]
-    scene, params, state = make(ropes, effects("bend_frame", "twist"), held_vertices=(0,), held_edges=(0,), twist="dynamic", dt=1e-3)
+    scene, params, state = make(
+        ropes, effects("bend_frame", "twist"), held_vertices=(0,), held_edges=(0,), twist="dynamic", dt=1e-3
+    )
     control = Control(vec(0, 0, 0)[None], vec(0, 0, 1)[None])
     state = step(scene, params, state, control)
     assert float(state.rods.pos[:, 0].abs().max()) == 0

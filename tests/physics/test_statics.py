@@ -1,8 +1,8 @@
 """Closed forms of the elastica, of buckling and of curved and twisted rods, from the energies that the steps use.
 
-Equilibria are found by Newton's method on the Lagrangian of the discrete rod with fixed lengths (`helpers.Statics`), to a last
-change below 1e-9 edges; `test_equilibria_stand_still_in_the_simulator` ties them to the time steps. A clamp that holds the
-first edge acts in the middle of it, so rods are extended backwards by half an edge.
+Equilibria are found by Newton's method on the Lagrangian of the discrete rod with fixed lengths (`helpers.Statics`), to
+a last change below 1e-9 edges; `test_equilibria_stand_still_in_the_simulator` ties them to the steps. A clamp holding
+the first edge acts in the middle of it, so rods are extended backwards by half an edge.
 """
 
 from __future__ import annotations
@@ -36,8 +36,13 @@ def tip_loaded(n_edges: int, a: float) -> torch.Tensor:
     return torch.stack([-pos[-1, 2], pos[-1, 0], torch.atan2(-edge[2], edge[0])])
 
 
-TIP = [(0.25, 0.08275, 0.99588, 0.1243), (1.0, 0.30172, 0.94357, 0.4614), (2.0, 0.49346, 0.83936, 0.7818),
-       (5.0, 0.71379, 0.61237, 1.2154), (10.0, 0.81061, 0.44500, 1.4303)]  # fmt: skip
+TIP = [
+    (0.25, 0.08275, 0.99588, 0.1243),
+    (1.0, 0.30172, 0.94357, 0.4614),
+    (2.0, 0.49346, 0.83936, 0.7818),
+    (5.0, 0.71379, 0.61237, 1.2154),
+    (10.0, 0.81061, 0.44500, 1.4303),
+]
 
 
 @pytest.mark.parametrize(("a", "drop", "reach", "angle"), TIP)
@@ -85,15 +90,19 @@ def test_cantilever_converges_with_the_square_of_the_edge_length():
 
 
 def test_equilibria_stand_still_in_the_simulator():
-    # The Newton equilibrium is one of the time steps, explicit and implicit: no vertex moves by more than rounding allows.
+    # The Newton equilibrium is one of the time steps, explicit and implicit: no vertex moves by more than rounding
+    # allows.
     for integrator in ("explicit", "implicit"):
         h = 1.0 / 11.5
         x = straight(13, 12 * h, start=-h / 2)
         rope = Rope(x, mass=12 * h, bend=1.0)
-        scene, params, state = make([rope], effects("bend", "gravity"), integrator=integrator, dt=2e-4, substeps=1,
-                                    held_vertices=(0, 1))  # fmt: skip
+        scene, params, state = make(
+            [rope], effects("bend", "gravity"), integrator=integrator, dt=2e-4, substeps=1, held_vertices=(0, 1)
+        )
         mass = params.rods.material.mass
-        rod = Statics(scene, params, state, fixed=CLAMPED, potential=lambda pos, s, m=mass: s * G * (m[:, 0] * pos[:, 2]).sum())
+        rod = Statics(
+            scene, params, state, fixed=CLAMPED, potential=lambda pos, s, m=mass: s * G * (m[:, 0] * pos[:, 2]).sum()
+        )
         still = rod.solve([0.1, 0.4, 1.0])
         after, _ = run(scene, params, still, 300)
         assert speed(after) < 1e-7, (integrator, speed(after))
@@ -106,10 +115,16 @@ def test_dynamic_relaxation_ends_at_the_elastica():
     h = 1.0 / (n_edges - 0.5)
     x = straight(n_edges + 1, n_edges * h, start=-h / 2)
     rope = Rope(x, mass=n_edges * h, bend=G / 10)
-    scene, params, state = make([rope], effects("bend", "gravity", "damping"), {"damping": {"rate": 6.0}}, integrator="implicit",
-                                dt=0.02, substeps=1, held_vertices=(0, 1))  # fmt: skip
+    scene, params, state = make(
+        [rope],
+        effects("bend", "gravity", "damping"),
+        {"damping": {"rate": 6.0}},
+        integrator="implicit",
+        dt=0.02,
+        substeps=1,
+        held_vertices=(0, 1),
+    )
     state, _ = run(scene, params, state, 600)
-    print("residual speed", speed(state))
     assert speed(state) < 1e-8
     _, wanted = weighted(n_edges, 10.0)
     assert float((state.rods.pos - wanted.rods.pos).abs().max()) < 1e-6
@@ -117,7 +132,7 @@ def test_dynamic_relaxation_ends_at_the_elastica():
 
 
 def column(n_edges: int, clamps: str) -> tuple[Statics, torch.Tensor]:
-    """Straight rod of length 1, B = 1, along x, with the constraints of an Euler case; returns it and the length's axis."""
+    """Straight rod of length 1, B = 1, along x, with the constraints of an Euler case; and its vertices."""
     extra = {"pinned": 0, "free": 1, "clamped": 2}[clamps]
     h = 1.0 / (n_edges - 0.5 * extra)
     x = straight(n_edges + 1, n_edges * h, start=-0.5 * h if extra else 0.0)
@@ -138,7 +153,8 @@ EULER = {"pinned": math.pi**2, "free": math.pi**2 / 4, "clamped": 4 * math.pi**2
 
 @pytest.mark.parametrize("clamps", EULER)
 def test_columns_buckle_at_eulers_load(clamps):
-    # S5. The compressed straight rod loses stability where the smallest eigenvalue of the Lagrangian's second derivative on
+    # S5. The compressed straight rod loses stability where the smallest eigenvalue of the Lagrangian's second
+    # derivative on
     # motions that keep lengths changes sign: P = pi^2 B/L^2 (pinned), /4 (clamped-free), x4 (clamped-clamped). 1 %.
     rod, _ = column(40, clamps)
 
@@ -153,7 +169,6 @@ def test_columns_buckle_at_eulers_load(clamps):
     for _ in range(14):
         middle = 0.5 * (low + high)
         low, high = (middle, high) if lowest(middle) > 0 else (low, middle)
-    print(clamps, low / EULER[clamps] - 1)
     assert low == pytest.approx(EULER[clamps], rel=0.01)
 
 
@@ -162,7 +177,8 @@ POST = [(20, 1.01540, 0.96973, 0.10971), (60, 1.15172, 0.74102, 0.29660), (120, 
 
 @pytest.mark.parametrize(("slope", "load", "chord", "deflection"), POST)
 def test_buckled_columns_follow_the_elastica(slope, load, chord, deflection):
-    # S5. Pinned rod under P / Pcr: chord and deflection in the middle; 60 edges, started from the sine of that slope. The error of
+    # S5. Pinned rod under P / Pcr: chord and deflection in the middle; 60 edges, started from the sine of that slope.
+    # The error of
     # the discrete Pcr, pi^2 / 12 n^2, is amplified near the bifurcation: 1 %.
     n = 60
     rod, _ = column(n, "pinned")
@@ -194,9 +210,12 @@ def test_columns_buckle_under_their_own_weight_between_the_brackets():
         assert (float(rod.lowest()) > 0) is stable
 
 
-@pytest.mark.parametrize(("span", "a", "sag"), [(0.9, 0.560094, 0.190709), (0.8, 0.338202, 0.265438), (0.5, 0.114820, 0.398194)])
+@pytest.mark.parametrize(
+    ("span", "a", "sag"), [(0.9, 0.560094, 0.190709), (0.8, 0.338202, 0.265438), (0.5, 0.114820, 0.398194)]
+)
 def test_hanging_chain_is_a_catenary(span, a, sag):
-    # S7. 2 a sinh(D / 2a) = L, sag a (cosh(D/2a) - 1), horizontal tension w a, end tension w a cosh(D/2a); 0.2 % at 60 edges.
+    # S7. 2 a sinh(D / 2a) = L, sag a (cosh(D/2a) - 1), horizontal tension w a, end tension w a cosh(D/2a); 0.2 % at
+    # 60 edges.
     n, w = 60, G
     s = torch.linspace(-0.5, 0.5, n + 1, dtype=F64)
     x0 = a * torch.asinh(s / a)
@@ -208,8 +227,13 @@ def test_hanging_chain_is_a_catenary(span, a, sag):
     rope = Rope(shape, mass=1.0, bend=1e-9, rest=straight(n + 1))
     scene, params, state = make([rope], effects("bend"), dt=1e-6)
     m = params.rods.material.mass[:, 0]
-    rod = Statics(scene, params, state, fixed=[(0, k) for k in range(3)] + [(n, k) for k in range(3)],
-                  potential=lambda pos, share: G * (m * pos[:, 2]).sum())  # fmt: skip
+    rod = Statics(
+        scene,
+        params,
+        state,
+        fixed=[(0, k) for k in range(3)] + [(n, k) for k in range(3)],
+        potential=lambda pos, share: G * (m * pos[:, 2]).sum(),
+    )
     rod.tension = torch.full_like(rod.tension, w * a)
     pos = rod.solve().rods.pos
     assert float(pos[0, 2] - pos[:, 2].min()) == pytest.approx(sag, rel=2e-3)
@@ -224,7 +248,8 @@ def test_hanging_chain_is_a_catenary(span, a, sag):
 
 
 def test_forty_five_degree_bend_follows_bathe_and_bolourchi():
-    # S8 (Bathe and Bolourchi 1979): R = 100, 45 degrees, EI = 8.3333e5 both ways, GJ = 8.333e5, tip force 600 out of plane.
+    # S8 (Bathe and Bolourchi 1979): R = 100, 45 degrees, EI = 8.3333e5 both ways, GJ = 8.333e5, tip force 600 out of
+    # plane.
     # Converged displacements (-23.646, -13.721, 53.578) with EA = 1e7; 64 edges; 1 % of the largest.
     n, radius, force = 64, 100.0, 600.0
     step_angle = math.pi / 4 / (n - 0.5)
@@ -232,11 +257,18 @@ def test_forty_five_degree_bend_follows_bathe_and_bolourchi():
     x = radius * torch.stack([torch.sin(a), 1 - torch.cos(a), 0 * a], -1)
     rope = Rope(x, mass=1.0, bend=8.3333e5, twist=8.333e5, stretch=1e7, rest="as_placed")
     scene, params, state = make([rope], effects("stretch_force", "bend_frame", "twist"), constrained=False, dt=1e-9)
-    rod = Statics(scene, params, state, fixed=CLAMPED, fixed_twist=[0], twisting=True, lengths=False,
-                  potential=lambda pos, share: -share * force * pos[-1, 2])  # fmt: skip
+    rod = Statics(
+        scene,
+        params,
+        state,
+        fixed=CLAMPED,
+        fixed_twist=[0],
+        twisting=True,
+        lengths=False,
+        potential=lambda pos, share: -share * force * pos[-1, 2],
+    )
     pos = rod.solve([0.1, 0.3, 0.6, 1.0], reach=2.0).rods.pos
     moved = pos[-1] - x[-1]
-    print("moved", moved)
     assert float((moved - vec(-23.646, -13.721, 53.578)).abs().max()) < 0.01 * 53.578
 
 
@@ -252,7 +284,8 @@ def ring(n: int, twist_stiffness: float, total: float) -> Statics:
 
 @pytest.mark.parametrize("n", [16, 24])
 def test_twisted_rings_buckle_at_michells_twist(n):
-    # T4 (Michell, Zajac). Unstable beyond 2 pi sqrt(3) B / C; at n vertices times 1 + 30.3 / n^2 (1.0535 at 24): 2 % after it.
+    # T4 (Michell, Zajac). Unstable beyond 2 pi sqrt(3) B / C; at n vertices times 1 + 30.3 / n^2 (1.0535 at 24): 2 %
+    # after it.
     c = 1.3
 
     def lowest(total: float) -> float:
@@ -272,22 +305,23 @@ def test_twisted_rings_buckle_at_michells_twist(n):
         middle = 0.5 * (low + high)
         low, high = (middle, high) if lowest(middle) > -1e-7 else (low, middle)
     expected = 10.8828 / c * (1 + 0.0535 * 24**2 / n**2)
-    print("ring", n, low / expected - 1)
     assert low == pytest.approx(expected, rel=0.02)
 
 
 @pytest.mark.parametrize(("law", "n"), [("bend", 36), ("bend_frame", 72)])
 def test_twisted_straight_rods_buckle_at_greenhills_moment(law, n):
-    # T5. Clamped-clamped, no thrust: M L / B = 8.98682; the end may slide along the axis. 1 %. Averaging the material frames of
+    # T5. Clamped-clamped, no thrust: M L / B = 8.98682; the end may slide along the axis. 1 %. Averaging the material
+    # frames of
     # both edges (Bergou 2010) makes bending softer by cos^2(twist per hinge / 2): `bend_frame` needs more edges.
     c = 0.8
     h = 1.0 / (n - 1)
     x = straight(n + 1, n * h, start=-h / 2)
     scene, params, state = make([Rope(x, mass=1.0, bend=1.0, twist=c)], effects(law, "twist"), dt=1e-6)
-    fixed = CLAMPED + [(n - 1, 1), (n - 1, 2), (n, 1), (n, 2)]
+    fixed = [*CLAMPED, (n - 1, 1), (n - 1, 2), (n, 1), (n, 2)]
 
     def lowest(moment: float) -> float:
-        # Inextensible motions of a straight rod do not stretch or twist it to first order: twists need not be unknowns.
+        # Inextensible motions of a straight rod do not stretch or twist it to first order: twists need not be
+        # unknowns.
         rod = Statics(scene, params, state, fixed=fixed)
         twist = (moment / c * h * torch.arange(n + 1, dtype=F64))[:, None]
         twist[-1] = 0
@@ -299,18 +333,25 @@ def test_twisted_straight_rods_buckle_at_greenhills_moment(law, n):
     for _ in range(9):
         middle = 0.5 * (low + high)
         low, high = (middle, high) if lowest(middle) > 0 else (low, middle)
-    print("Greenhill", law, low / 8.98682 - 1)
     assert low == pytest.approx(8.98682, rel=0.01)
 
 
 def test_twist_spreads_linearly_and_keeps_a_straight_rod_straight():
     # T2. Statics with the far edge held at 3 rad: twists linear to 1e-8, no transverse motion.
     n = 12
-    scene, params, state = make([Rope(straight(n), mass=1.0, bend=1.0, twist=0.5)], effects("bend_frame", "twist"), dt=1e-6)
+    scene, params, state = make(
+        [Rope(straight(n), mass=1.0, bend=1.0, twist=0.5)], effects("bend_frame", "twist"), dt=1e-6
+    )
     twist = torch.zeros(n, 1, dtype=F64)
     twist[n - 2] = 3.0
-    rod = Statics(scene, params, tree.replace(state, rods=tree.replace(state.rods, twist=twist)), fixed=CLAMPED + [(n - 1, 1), (n - 1, 2)],
-                  twisting=True, fixed_twist=[0, n - 2])  # fmt: skip
+    rod = Statics(
+        scene,
+        params,
+        tree.replace(state, rods=tree.replace(state.rods, twist=twist)),
+        fixed=[*CLAMPED, (n - 1, 1), (n - 1, 2)],
+        twisting=True,
+        fixed_twist=[0, n - 2],
+    )
     found = rod.solve().rods
     wanted = 3.0 * torch.arange(n - 1, dtype=F64) / (n - 2)
     assert float((found.twist[:-1, 0] - wanted).abs().max()) < 1e-8

@@ -31,7 +31,8 @@ def lying(angle: float = 0.0, mu: float | None = None, height: float = 0.0, drop
 @pytest.mark.parametrize("choices", [{}, {"integrator": "explicit", "substeps": 1}], ids=["implicit", "explicit"])
 @pytest.mark.parametrize("drop", [0.0, 0.02])
 def test_a_rope_comes_to_rest_on_the_table_at_the_height_of_its_radius(choices, drop):
-    # C1: rests g / hardness^2 below first touch (each vertex: k = m hardness^2), 1.1 % of the radius here; then no motion at all.
+    # C1: rests g / hardness^2 below first touch (each vertex: k = m hardness^2), 1.1 % of the radius here; then no
+    # motion at all.
     scene, params, state = lying(height=0.3, drop=drop, **choices)
     state, _ = run(scene, params, state, 600)
     assert speed(state) < 1e-8, speed(state)
@@ -44,14 +45,25 @@ def test_a_rope_comes_to_rest_on_the_table_at_the_height_of_its_radius(choices, 
 @pytest.mark.parametrize("toward", [(0.0, 1.0), (1.0, 0.0)], ids=["across", "along"])
 @pytest.mark.parametrize("integrator", ["explicit", "implicit"])
 def test_a_rope_on_an_incline_sticks_below_and_slides_above_the_friction_angle(integrator, toward):
-    # C3: tan a < mu: only the declared creep, v = slip q / sqrt(1 - q^2) with q = tan a / mu; above: a = g (sin a - mu cos a).
+    # C3: tan a < mu: only the declared creep, v = slip q / sqrt(1 - q^2) with q = tan a / mu; above: a = g (sin a -
+    # mu cos a).
     # Friction is mu N v_new / |v_old|, so a / v dt too large: 2 % at these speeds.
     mu = 0.5
     for tangent, slides in ((0.25, False), (0.45, False), (0.6, True), (0.9, True)):
         angle = math.atan(tangent)
         dt, count = 1e-3, 600
-        scene, params, state = lying(angle, mu, drop=-G * math.cos(angle) / 300.0**2, integrator=integrator, dt=dt, toward=toward)
-        state, seen = run(scene, params, state, count, seen=lambda s: float((params.rods.material.mass * s.rods.vel[:, :2]).sum(0) @ vec(*toward)) / 0.1)  # noqa: B023
+        scene, params, state = lying(
+            angle, mu, drop=-G * math.cos(angle) / 300.0**2, integrator=integrator, dt=dt, toward=toward
+        )
+        state, seen = run(
+            scene,
+            params,
+            state,
+            count,
+            seen=lambda s, params=params: (
+                float((params.rods.material.mass * s.rods.vel[:, :2]).sum(0) @ vec(*toward)) / 0.1
+            ),
+        )
         if slides:
             found = (seen[-1] - seen[199]) / (dt * (count - 200))
             assert found == pytest.approx(G * (math.sin(angle) - mu * math.cos(angle)), rel=0.02), tangent

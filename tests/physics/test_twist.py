@@ -23,8 +23,14 @@ def clamped(x: torch.Tensor, names=("bend", "twist", "damping"), rate: float = 5
     given = {"mass": 0.2, "bend": 2e-3, "twist": 1.5e-3, "radius": 0.02} | choices.pop("rope", {})
     values = {"damping": {"rate": rate, "twist_rate": rate}} if "damping" in names else {}
     choices = {"dt": 5e-3, "substeps": 1, "integrator": "implicit"} | choices
-    return make([Rope(x, director=vec(0, 1, 0), **given)], effects(*names), values,
-                held_vertices=(0, 1, n - 2, n - 1), held_edges=(0, n - 2), **choices)  # fmt: skip
+    return make(
+        [Rope(x, director=vec(0, 1, 0), **given)],
+        effects(*names),
+        values,
+        held_vertices=(0, 1, n - 2, n - 1),
+        held_edges=(0, n - 2),
+        **choices,
+    )
 
 
 def arc(n: int, slack: float = 0.8) -> torch.Tensor:
@@ -85,15 +91,21 @@ def writhe(points: torch.Tensor) -> float:
 
 @pytest.mark.parametrize("twist", ["quasistatic", "dynamic"])
 def test_linking_number_follows_the_clamp_while_the_rod_buckles(twist):
-    # T7 (Calugareanu): Tw + Wr of the rod closed by a fixed far path = turns commanded, to 1e-3 turn, with growing writhe.
+    # T7 (Calugareanu): Tw + Wr of the rod closed by a fixed far path = turns commanded, to 1e-3 turn, with growing
+    # writhe.
     n, turns, steps = 25, 2.0, 240
     x = arc(n, 0.85)
     scene, params, state = clamped(x, twist=twist, rate=4.0)
     start = hold(scene, state)
     a = torch.linspace(0, math.pi, 12, dtype=F64)[1:-1]
     middle, half = 0.5 * float(x[-1, 0]), 0.5 * float(x[-1, 0]) + 2.0
-    closure = torch.cat([vec(middle + half, 0, 0)[None], torch.stack([middle + half * torch.cos(a), 0 * a, -3 * torch.sin(a)], -1),
-                         vec(middle - half, 0, 0)[None]])  # fmt: skip
+    closure = torch.cat(
+        [
+            vec(middle + half, 0, 0)[None],
+            torch.stack([middle + half * torch.cos(a), 0 * a, -3 * torch.sin(a)], -1),
+            vec(middle - half, 0, 0)[None],
+        ]
+    )
 
     def link(st):
         r = st.rods
@@ -108,7 +120,6 @@ def test_linking_number_follows_the_clamp_while_the_rod_buckles(twist):
     _, seen = run(scene, params, state, steps, wind, link)
     for k, (tw, wr) in enumerate(seen):
         assert tw + wr - tw0 - wr0 == pytest.approx(turns * (k + 1) / steps, abs=1e-3), k
-    print(twist, "twist and writhe at the end", seen[-1])
     assert abs(seen[-1][1]) > 0.1
 
 
@@ -116,7 +127,9 @@ def test_quasistatic_twist_is_the_long_time_limit_of_dynamic_twist():
     # A hanging bow whose end turns by 2 rad and then rests: both come to the same shape and the same twists.
     last = {}
     for twist in ("quasistatic", "dynamic"):
-        scene, params, state = clamped(arc(16) * vec(1, 1, -1), names=("bend", "twist", "damping", "gravity"), twist=twist, rate=8.0)
+        scene, params, state = clamped(
+            arc(16) * vec(1, 1, -1), names=("bend", "twist", "damping", "gravity"), twist=twist, rate=8.0
+        )
         start = hold(scene, state)
 
         def wind(k, _, start=start):
@@ -136,7 +149,9 @@ def test_quasistatic_twist_is_the_long_time_limit_of_dynamic_twist():
 def test_held_frames_are_where_the_control_wants_them(integrator, twist):
     # Directors of held edges equal their targets at the end of a step while their edge turns, over several turns.
     n = 10
-    scene, params, state = clamped(arc(n), names=("bend_frame", "twist", "damping"), twist=twist, integrator=integrator, dt=2e-3, substeps=2)
+    scene, params, state = clamped(
+        arc(n), names=("bend_frame", "twist", "damping"), twist=twist, integrator=integrator, dt=2e-3, substeps=2
+    )
     start = hold(scene, state)
     for k in range(60):
         wanted = torch.stack([wound(0.1 * k), wound(-0.3 * k)])
@@ -149,21 +164,28 @@ def test_held_frames_are_where_the_control_wants_them(integrator, twist):
 
 
 def test_held_frames_turn_evenly_within_a_step():
-    # `step`: held parts move evenly to where the control wants them. One step of ten substeps equals ten steps of one.
+    # `step`: held parts move evenly to where the control wants them. One step of ten substeps equals ten steps of
+    # one.
     found = []
     for steps, substeps in ((1, 10), (10, 1)):
         n = 8
-        scene, params, state = clamped(arc(n), twist="dynamic", dt=0.01 / steps, substeps=substeps, integrator="explicit", names=("bend", "twist"))
+        scene, params, state = clamped(
+            arc(n), twist="dynamic", dt=0.01 / steps, substeps=substeps, integrator="explicit", names=("bend", "twist")
+        )
         start = hold(scene, state)
         for k in range(steps):
-            state = step(scene, params, state, Control(start.pos, torch.stack([wound(0), wound(0.5 * (k + 1) / steps)])))
+            state = step(
+                scene, params, state, Control(start.pos, torch.stack([wound(0), wound(0.5 * (k + 1) / steps)]))
+            )
         found.append(torch.cat([state.rods.twist, state.rods.twist_rate * 1e-3], -1))
     assert float((found[0] - found[1]).abs().max()) < 1e-9, (found[0] - found[1]).abs().max()
 
 
 def test_twist_does_not_move_a_straight_isotropic_rod_at_rest():
     # T2 dynamically: twist waves in a straight rod exert no force on its vertices.
-    scene, params, state = clamped(straight(10), names=("bend_frame", "twist"), twist="dynamic", dt=1e-3, rope={"stretch": 1e5})
+    scene, params, state = clamped(
+        straight(10), names=("bend_frame", "twist"), twist="dynamic", dt=1e-3, rope={"stretch": 1e5}
+    )
     twist = torch.linspace(0, 2, 9, dtype=F64)[:, None]
     state = tree.replace(state, rods=tree.replace(state.rods, twist=torch.cat([twist, torch.zeros(1, 1, dtype=F64)])))
     state, _ = run(scene, params, state, 100, hold(scene, state))

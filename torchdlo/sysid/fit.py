@@ -38,8 +38,7 @@ class Space:
         )
 
     def to_values(self, raw: np.ndarray) -> np.ndarray:
-        """Return values of coordinates, both (..., K), within their bounds."""
-        raw = self.clip(raw)
+        """Return values of coordinates, both (..., K)."""
         return np.stack(
             [
                 np.exp(raw[..., k]) if p.scale == "log" else raw[..., k] * (p.high - p.low)
@@ -180,13 +179,14 @@ def interval(point: Point, space: Space) -> tuple[np.ndarray, np.ndarray]:
     """
     trials = len(point.gradient)
     if trials < 2:
-        return space.to_values(point.raw - np.inf), space.to_values(point.raw + np.inf)
+        return np.array([p.low for p in space.params]), np.array([p.high for p in space.params])
     curvature = point.curvature.sum(0)
     ridge = 1e-9 * np.trace(curvature) * np.eye(len(point.raw)) + 1e-12 * np.eye(len(point.raw))
     moves = np.linalg.solve(curvature + ridge, point.gradient.T).T
-    deviation = np.sqrt((trials - 1) / trials * ((moves - moves.mean(0)) ** 2).sum(0)) * trials / (trials - 1)
+    # Without trial b the minimum moves by moves[b] n / (n - 1); their scatter times (n - 1)^2 / n is the variance.
+    deviation = np.sqrt(trials / (trials - 1) * ((moves - moves.mean(0)) ** 2).sum(0))
     quantile = _STUDENT_95[min(trials - 1, len(_STUDENT_95)) - 1]
-    reach = np.minimum(quantile * deviation, 20.0)
+    reach = np.minimum(quantile * deviation, 10.0)
     return space.to_values(point.raw - reach), space.to_values(point.raw + reach)
 
 

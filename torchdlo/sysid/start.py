@@ -15,7 +15,10 @@ WINDOW = 0.1
 _NOISE = 2e-3
 """How far model and markers may be apart within the window [m]."""
 
-_DOUBT = 0.1
+_POSITION = 1e-3
+"""How far off the first positions may be [m]."""
+
+_VELOCITY = 0.2
 """How wrong the velocities read off the markers may be [m/s]."""
 
 
@@ -33,7 +36,9 @@ def read_off(trials: Sequence[Trial]) -> Start:
             if degree >= 0:
                 terms = np.vander(time[good], degree + 1, increasing=True)
                 fit = np.linalg.lstsq(terms, seen[good, marker], rcond=None)[0]
-                p[marker], v[marker] = fit[0], fit[1] if degree else 0.0
+                # A parabola bends away from quick motion at its end: the first frame itself is nearer.
+                p[marker] = seen[0, marker] if good[0] else fit[0]
+                v[marker] = fit[1] if degree else 0.0
         pos.append(_fill(p, trial.marker_arclength))
         vel.append(_fill(v, trial.marker_arclength))
     return Start(np.stack(pos), np.stack(vel))
@@ -46,10 +51,10 @@ def _fill(values: np.ndarray, arclength: np.ndarray) -> np.ndarray:
 
 
 def refine(model: RopeModel, motion: Motion, start: Start, values: np.ndarray) -> Start:
-    """Return velocities with which the simulation follows the markers best through the window.
+    """Return positions and velocities with which the simulation follows the markers best through the window.
 
-    One Gauss-Newton step: all velocities of the free markers are varied in one batch; what the markers say at first
-    glance counts as a measurement of its own.
+    One Gauss-Newton step: positions and velocities of all free markers are varied in one batch; what the markers say
+    at first glance counts as a measurement of its own.
 
     Args:
         model: the rope.
@@ -59,20 +64,24 @@ def refine(model: RopeModel, motion: Motion, start: Start, values: np.ndarray) -
     """
     frames = min(max(3, round(WINDOW / model.dt) + 1), motion.held.shape[1])
     free = np.setdiff1d(np.arange(model.count), model.gripped)
-    trials, unknowns, nudge = len(motion.names), 3 * len(free), 1e-3
-    vel = np.repeat(start.vel[None], unknowns + 1, 0)
-    for u in range(unknowns):
-        vel[u + 1, :, free[u // 3], u % 3] += nudge
-    varied = Start(np.tile(start.pos, (unknowns + 1, 1, 1)), vel.reshape(-1, *start.vel.shape[1:]))
-    sim = model.simulate(motion, varied, np.tile(values, (unknowns + 1, 1)), frames=frames)
-    residual = np.nan_to_num(motion.markers[:, :frames] - sim[0]).reshape(trials, -1)
-    slope = (sim[1:] - sim[0]).reshape(unknowns, trials, -1).transpose(1, 2, 0) / nudge
-    seen = np.isfinite(motion.markers[:, :frames]).reshape(trials, -1, 1)
-    slope = np.where(seen, slope, 0.0)
-    # Errors of neighbouring frames are alike: a window counts as one measurement per marker.
-    weight = 1 / (_NOISE**2 * frames)
-    normal = weight * slope.transpose(0, 2, 1) @ slope + np.eye(unknowns) / _DOUBT**2
-    step = np.linalg.solve(normal, weight * np.einsum("bru,br->bu", slope, residual)[..., None])[..., 0]
-    better = start.vel.copy()
-    better[:, free] += np.nan_to_num(step).reshape(trials, len(free), 3)
-    return Start(start.pos, better)
+    trials, half = len(motion.names), 3 * len(free)
+    nudge = np.repeat([1e-4, 1e-3], half)
+    pos, vel = (np.repeat(x[None], 2 * half + 1, 0) for x in (start.pos, start.vel))
+    for u in range(half):
+        pos[u + 1, :, free[u // 3], u % 3] += nudge[u]
+        vel[half + u + 1, :, free[u // 3], u % 3] += nudge[half + u]
+    varied = Start(pos.reshape(-1, *start.pos.shape[1:]), vel.reshape(-1, *start.vel.shape[1:]))
+    sim = model.simulate(motion, varied, np.tile(values, (2 * half + 1, 1)), frames=frames)
+    measured = motion.markers[:, :frames]
+    seen = np.isfinite(measured).reshape(trials, -1)
+    residual = np.where(seen, (measured - sim[0]).reshape(trials, -1), 0.0)
+    slope = (sim[1:] - sim[0]).reshape(2 * half, trials, -1).transpose(1, 2, 0) / nudge
+    slope = np.where(seen[..., None], slope, 0.0)
+    prior = np.repeat([1 / _POSITION**2, 1 / _VELOCITY**2], half)
+    normal = slope.transpose(0, 2, 1) @ slope / _NOISE**2 + np.diag(prior)
+    step = np.linalg.solve(normal, (slope.transpose(0, 2, 1) @ residual[..., None]) / _NOISE**2)[..., 0]
+    step = np.nan_to_num(step).reshape(trials, 2, len(free), 3)
+    better = Start(start.pos.copy(), start.vel.copy())
+    better.pos[:, free] += step[:, 0]
+    better.vel[:, free] += step[:, 1]
+    return better

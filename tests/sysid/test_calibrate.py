@@ -1,0 +1,187 @@
+"""Calibration finds the numbers that made a recording, keeps its promises on the way, and predicts unseen trials."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from torchdlo.errors import InputError
+from torchdlo.sysid import fit, start
+from torchdlo.sysid.calibrate import calibrate
+from torchdlo.sysid.model import PARAMETERS, RopeModel, Start
+from torchdlo.sysid.recording import Recording, Trial, load_recording
+
+SAMPLE = Path(__file__).parents[2] / "torchdlo" / "data" / "sample_rope"
+TRUE = np.array([2e-3, 1.2e-3, 0.8])  # bending, twisting stiffness [N m^2], damping rate [1/s]
+OPTIONS = {"starts": 6, "iterations": 5, "vertices": 13}
+
+
+def make_recording(path: Path, *, ends: int = 2, seed: int = 0, noise: float = 0.0) -> Recording:
+    """A rope of known numbers, shaken at one or both ends for 0.8 s, as the model itself moves it."""
+    rng = np.random.default_rng(seed)
+    s = np.array([0.0, 0.03, 0.14, 0.25, 0.36, 0.47, 0.5])
+    gripped = np.array([True, True, False, False, False, ends == 2, ends == 2])
+    time = np.arange(41) * 0.02
+
+    def trial(name: str) -> Trial:
+        a, b = rng.uniform(0.05, 0.1, 2)
+        w = rng.uniform(6, 12, 2)
+        span = 0.8 * s[-1]
+        line = np.stack([s / s[-1] * span, 0 * s, 0.3 - 0.4 * (s / s[-1]) * (1 - s / s[-1])], -1)
+        sway = np.stack([0 * time, a * np.sin(w[0] * time), b * np.sin(w[1] * time)], -1)
+        weight = np.where(s < 0.25, 1.0, -0.5)
+        markers = line[None] + weight[None, :, None] * sway[:, None]
+        return Trial(name, time, markers, s, gripped, None, None, np.zeros(len(time), bool))
+
+    trials = tuple(trial(n) for n in ("train_0", "train_1", "test_0"))
+    empty = Recording(
+        path, 0.5, 0.004, 0.03, np.array([0, 0, -9.81]), None, None, None, None, False, "", trials[:2], trials[2:]
+    )
+    model = RopeModel(empty, vertices=OPTIONS["vertices"])
+    motion = model.motion(trials)
+    begin = start.read_off(trials)
+    sims = model.simulate(motion, Start(begin.pos, 0 * begin.vel), TRUE[None])[0] + noise * rng.normal(
+        size=motion.markers.shape
+    )
+    sims[:, :, gripped] = motion.markers[:, :, gripped]
+    made = tuple(replace(t, markers=m) for t, m in zip(trials, sims, strict=True))
+    return replace(empty, train=made[:2], test=made[2:])
+
+
+def test_true_numbers_are_found_again(tmp_path: Path) -> None:
+    # G4 of the reference cases: stiffness within 1 % asks for better than the mesh; here model and data share it.
+    result = calibrate(make_recording(tmp_path, noise=2e-4), **OPTIONS)
+    found = [result.parameters[name]["value"] for name in ("bending_stiffness", "damping_rate")]
+    assert found == pytest.approx(TRUE[[0, 2]], rel=0.03)
+    assert result.test_mae_mm < 0.6 and result.test_mae_mm < 0.1 * result.before["test_mae_mm"]
+    assert all(p["low"] < p["value"] < p["high"] for p in result.parameters.values())
+
+
+def test_a_rope_held_at_one_end_is_calibrated(tmp_path: Path) -> None:
+    result = calibrate(make_recording(tmp_path, ends=1), **OPTIONS)
+    assert result.parameters["bending_stiffness"]["value"] == pytest.approx(TRUE[0], rel=0.03)
+
+
+def test_same_seed_same_numbers(tmp_path: Path) -> None:
+    recording = make_recording(tmp_path)
+    one, two = (calibrate(recording, seed=3, starts=4, iterations=1, vertices=13) for _ in range(2))
+    assert one.parameters == two.parameters and one.test_mae_mm == two.test_mae_mm
+
+
+def test_interruption_keeps_the_best_and_resume_goes_on(tmp_path: Path) -> None:
+    recording, checkpoint = make_recording(tmp_path), tmp_path / "checkpoint.json"
+
+    def stop(stage: str, done: int, total: int, message: str) -> None:
+        if stage.startswith("fitting") and done == 2:
+            raise KeyboardInterrupt
+
+    first = calibrate(recording, checkpoint=checkpoint, callback=stop, **OPTIONS)
+    assert first.interrupted and np.isfinite(first.test_mae_mm) and checkpoint.exists()
+    stages = []
+    second = calibrate(
+        recording, checkpoint=checkpoint, resume=True, callback=lambda s, *_: stages.append(s), **OPTIONS
+    )
+    assert not second.interrupted and not any("trying" in s for s in stages)
+    assert second.train_mae_mm <= first.train_mae_mm * 1.001
+
+
+def test_interruption_before_any_result_is_passed_on(tmp_path: Path) -> None:
+    def stop(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        calibrate(make_recording(tmp_path), callback=stop, **OPTIONS)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"rest": "bent"}, "rest is 'bent'"),
+        ({"rest": "given"}, "rest_positions is missing"),
+        ({"resume": True}, "no checkpoint"),
+    ],
+)
+def test_wrong_options_are_refused(tmp_path: Path, options: dict, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        calibrate(make_recording(tmp_path), **OPTIONS, **options)
+
+
+def test_a_checkpoint_of_other_data_is_refused(tmp_path: Path) -> None:
+    checkpoint = tmp_path / "checkpoint.json"
+    calibrate(make_recording(tmp_path), starts=2, iterations=1, vertices=13, checkpoint=checkpoint)
+    with pytest.raises(InputError, match="belongs to another recording"):
+        calibrate(
+            make_recording(tmp_path, seed=1), starts=2, iterations=1, vertices=13, checkpoint=checkpoint, resume=True
+        )
+
+
+def test_a_trial_that_is_suspect_throughout_is_left_out(tmp_path: Path) -> None:
+    recording = make_recording(tmp_path)
+    bad = replace(recording.train[1], suspect=np.ones(41, bool), markers=recording.train[1].markers + 0.1)
+    result = calibrate(replace(recording, train=(recording.train[0], bad)), **OPTIONS)
+    assert any("train_1" in note for note in result.notes)
+    assert result.parameters["bending_stiffness"]["value"] == pytest.approx(TRUE[0], rel=0.05)
+
+
+def test_starts_use_nothing_after_the_first_tenth_of_a_second(tmp_path: Path) -> None:
+    recording = make_recording(tmp_path)
+    trial = recording.test[0]
+    later = trial.markers.copy()
+    later[6:, ~trial.gripped] += 0.05
+    model = RopeModel(recording, vertices=13)
+    starts = []
+    for markers in (trial.markers, later):
+        changed = replace(trial, markers=markers)
+        starts.append(start.refine(model, model.motion([changed]), start.read_off([changed]), TRUE))
+    np.testing.assert_array_equal(starts[0].vel, starts[1].vel)
+    np.testing.assert_array_equal(starts[0].pos, starts[1].pos)
+
+
+def test_the_measured_rest_shape_turns_with_the_clamp(tmp_path: Path) -> None:
+    # A rope that is an arc at rest and hangs from one clamp without weight keeps to its arc, whichever way it is held.
+    recording = make_recording(tmp_path, ends=1)
+    s = recording.train[0].marker_arclength
+    arc = np.stack([0.3 * np.sin(s / 0.3), 0.3 * (1 - np.cos(s / 0.3)), 0 * s], -1)
+    still = replace(recording.train[0], markers=np.repeat(arc[None], 41, 0))
+    flat = replace(recording, rest_positions=arc, gravity=np.zeros(3), train=(still,), test=(still,))
+    model = RopeModel(flat, vertices=13, rest="given")
+    motion, begin = model.motion([still]), start.read_off([still])
+    errors = []
+    for roll in (0.0, np.pi):
+        sim = model.simulate(motion, begin, np.array([[2e-3, 1.2e-3, 0.8, 1.0, roll]]))[0, 0]
+        errors.append(np.abs(sim - still.markers).max())
+    assert min(errors) < 2e-3 < 0.05 < max(errors)
+
+
+def test_space_keeps_bounds_and_turns_angles_round() -> None:
+    space = fit.Space(("damping_rate", "rest_roll"), (PARAMETERS["damping_rate"], PARAMETERS["rest_roll"]))
+    values = np.array([1e6, np.pi + 0.1])
+    limited = space.to_values(space.clip(space.to_raw(values)))
+    assert limited[0] == pytest.approx(PARAMETERS["damping_rate"].high)
+    assert limited[1] == pytest.approx(-np.pi + 0.1)
+
+
+def test_levenberg_marquardt_finds_the_minimum_of_a_known_curve() -> None:
+    space = fit.Space(("damping_rate",), (PARAMETERS["damping_rate"],))
+    time = np.linspace(0, 1, 50)
+
+    def decay(values: np.ndarray) -> np.ndarray:
+        curve = np.exp(-values[:, 0, None] * time)
+        return np.broadcast_to(curve[:, None, :, None, None], (len(values), 2, 50, 1, 3))
+
+    measured = np.array(decay(np.array([[1.7]]))[0])
+    points = fit.evaluate(decay, measured, space, space.to_raw(np.array([[0.3]])))
+    for points in fit.improve(decay, measured, space, points, iterations=30, tolerance=1e-9):  # noqa: B020
+        pass
+    assert space.to_values(points[0].raw)[0] == pytest.approx(1.7, rel=1e-4)
+
+
+@pytest.mark.slow
+def test_the_sample_recording_is_predicted_far_better_than_by_a_catenary() -> None:
+    result = calibrate(load_recording(SAMPLE), starts=12, iterations=4)
+    assert result.test_mae_mm < 3.0 < 0.2 * result.baselines["catenary"]["test_mae_mm"]
+    # True numbers: 3e-3 and 2e-3 N m^2, 0.6 1/s.
+    assert result.parameters["bending_stiffness"]["value"] == pytest.approx(3e-3, rel=0.1)
