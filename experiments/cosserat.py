@@ -262,9 +262,7 @@ def simulate(
         acceleration = np.array([0.0, 0.0, -gravity])
         simulator.add_forcing_to(rod).using(ea.GravityForces, acc_gravity=acceleration)
     if damping:
-        simulator.dampen(rod).using(
-            ea.AnalyticalLinearDamper, uniform_damping_constant=damping, time_step=dt
-        )
+        simulator.dampen(rod).using(ea.AnalyticalLinearDamper, uniform_damping_constant=damping, time_step=dt)
     simulator.finalize()
     stepper, now = ea.PositionVerlet(), 0.0
     positions, d1 = [], []

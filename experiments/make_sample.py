@@ -133,9 +133,7 @@ def record(config: Config, rng: np.random.Generator) -> dict[str, np.ndarray]:
         "markers": markers.astype(np.float32),
         "marker_arclength": arclength,
         "gripped": gripped,
-        "gripper_quaternion": np.stack([quaternion(turns[:, i]) for i in range(2)], 1).astype(
-            np.float32
-        ),
+        "gripper_quaternion": np.stack([quaternion(turns[:, i]) for i in range(2)], 1).astype(np.float32),
         "gripper_marker": np.array([0, 12]),
     }
 

@@ -113,9 +113,7 @@ def run_elastica(dt: float, scenes: int = 1, clamp: Clamp | None = None) -> Time
             youngs_modulus=YOUNGS,
         )
         simulator.append(rod)
-        simulator.constrain(rod).using(
-            ea.OneEndFixedBC, constrained_position_idx=(0,), constrained_director_idx=(0,)
-        )
+        simulator.constrain(rod).using(ea.OneEndFixedBC, constrained_position_idx=(0,), constrained_director_idx=(0,))
         simulator.add_forcing_to(rod).using(ea.GravityForces, acc_gravity=GRAVITY)
         rods.append(rod)
     simulator.finalize()
@@ -286,9 +284,7 @@ def fastest_within(rows: list[dict[str, float]], error: str) -> list[dict[str, f
         keep = [row for row in rows if row["stable"] and row[error] <= bound]
         if keep:
             best = max(keep, key=lambda row: row["one_per_cpu_s"])
-            found.append(
-                {"bound_m": bound, "dt": best["dt"], "one_per_cpu_s": best["one_per_cpu_s"]}
-            )
+            found.append({"bound_m": bound, "dt": best["dt"], "one_per_cpu_s": best["one_per_cpu_s"]})
     return found
 
 
@@ -363,10 +359,7 @@ def main() -> None:
     config = Config(**options)
     with np.load(config.reference, allow_pickle=False) as file:
         every = (len(file["time"]) - 1) // FRAMES
-        targets = {
-            name: file[name][every::every, -1].astype(float)
-            for name in ("converged", "converged_extensible")
-        }
+        targets = {name: file[name][every::every, -1].astype(float) for name in ("converged", "converged_extensible")}
     measures = {"pyelastica": measure_elastica, "mujoco": measure_mujoco}
     results = []
     for name, measure in measures.items():

@@ -14,7 +14,7 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from torchdlo.physics import build, rod, tree
+from torchdlo.physics import build, rod, rotation, tree
 from torchdlo.physics.build import Rope
 from torchdlo.physics.effect import Effect, Values
 from torchdlo.physics.integrate import INTEGRATORS, TWISTS, Settings, Targets, settle_twist, substep
@@ -70,8 +70,11 @@ class Scene:
     held_vertices: tuple[int, ...] = ()
     held_edges: tuple[int, ...] = ()
     newton: int = 3
+    """Newton steps for edge lengths per substep."""
     gamma: float = 0.3
-    ahead: float = 0.1
+    """Share of dt^2 times stiffness that counts as inertia in implicit steps."""
+    ahead: float = 0.0
+    """Share of a substep by which implicit steps look ahead: it damps fast modes and makes the step first order."""
 
     def __post_init__(self) -> None:
         def need(ok: bool, sentence: str) -> None:
@@ -81,14 +84,24 @@ class Scene:
         need(self.integrator in INTEGRATORS, f"integrator is {self.integrator!r}; expected one of {INTEGRATORS}")
         need(self.twist in TWISTS, f"twist is {self.twist!r}; expected one of {TWISTS}")
         need(math.isfinite(self.dt) and self.dt > 0, f"dt is {self.dt}; expected a positive number of seconds")
-        need(self.substeps >= 1, f"substeps is {self.substeps}; expected at least 1")
+        need(
+            isinstance(self.substeps, int) and self.substeps >= 1,
+            f"substeps is {self.substeps}; expected a whole number from 1 up",
+        )
         need(self.newton >= 1, f"newton is {self.newton}; expected at least 1 step")
         need(self.gamma >= 0.25, f"gamma is {self.gamma}; below 0.25 implicit steps are not stable")
+        need(0 <= self.ahead <= 1, f"ahead is {self.ahead}; expected a share of a substep, 0 to 1")
         size = self.topology.size
         for name, slots in (("held_vertices", self.held_vertices), ("held_edges", self.held_edges)):
             wrong = [s for s in slots if not 0 <= s < size]
             need(not wrong, f"{name} names {wrong}; the scene has slots 0 to {size - 1}")
             need(len(set(slots)) == len(slots), f"{name} {list(slots)} names a slot twice")
+        seams = [s for s in self.held_edges if not self.topology.edge_mask()[s]]
+        need(not seams, f"held_edges names {seams}, the gap between the ends of an open rope")
+        need(
+            not self.held_edges or self.twist != "none",
+            "held_edges prescribe twist, but twist is 'none'; choose 'quasistatic' or 'dynamic'",
+        )
         names = [e.name for e in self.effects]
         twice = {n for n in names if names.count(n) > 1}
         need(not twice, f"effects {sorted(twice)} are listed twice")
@@ -134,6 +147,8 @@ def make(
     ropes: Sequence[Rope],
     effects: Sequence[Effect],
     values: dict[str, dict[str, float | Sequence[float] | Tensor]] | None = None,
+    *,
+    check: bool = True,
     **choices,
 ) -> tuple[Scene, Params, State]:
     """Build a scene with its parameters and its initial state.
@@ -142,6 +157,8 @@ def make(
         ropes: the ropes.
         effects: what acts on them.
         values: numbers of effects that differ from their defaults, e.g. {"damping": {"rate": 0.6}}.
+        check: whether to refuse what could not be stepped: laws that do not fit the ropes, ropes far from their length,
+            unstable substeps. Scenes whose loads are only evaluated may be anything.
         choices: fields of `Scene`.
     """
     topology, rods, state = build.assemble(ropes)
@@ -160,18 +177,54 @@ def make(
             number = number.reshape(1, 1) if number.dim() == 0 else number
             if number.shape[-1] != wanted:
                 raise ValueError(f"scene: {effect}.{name} has {number.shape[-1]} components; expected {wanted}")
+            if not bool(torch.isfinite(number).all()):
+                raise ValueError(f"scene: {effect}.{name} is {number.flatten().tolist()[:3]}; expected finite numbers")
             numbers[effect][name] = number
     params = Params(rods, numbers)
-    check_step(scene, params)
+    if check:
+        _check_laws(scene, params, state)
+        check_step(scene, params)
     first = State(state, state.pos.new_zeros((*state.pos.shape[:-2], 1, 1)))
     if scene.twist == "quasistatic":
         held = hold(scene, first)
         altered = rods
         for e in scene.effects:
             altered = e.alter(topology, altered, numbers.get(e.name, {}))
-        settled = settle_twist(scene.settings, altered, numbers, state, Targets(held.pos, held.director))
+        settled = settle_twist(scene.settings, altered, numbers, state, Targets(held.pos, held.director), 30)
         first = tree.replace(first, rods=tree.replace(settled, twist_rate=torch.zeros_like(settled.twist)))
     return scene, params, first
+
+
+def _check_laws(scene: Scene, params: Params, state: RodState) -> None:
+    """Raise a `ValueError` where the rods have what no effect of the scene acts on."""
+    rest, material = params.rods.rest, params.rods.material
+    kinds = {type(e).__name__ for e in scene.effects}
+    if "Bend" in kinds:
+        if material.bend.shape[-1] == 2:
+            raise ValueError("scene: a rope has bend2, which Bend leaves out; use BendFrame")
+        if bool((rest.curvature != 0).any()):
+            raise ValueError(
+                "scene: a rope is curved at rest, which Bend leaves out; use BendFrame, or rest='straight'"
+            )
+        frames = kinds & {"BendingPlasticity", "RestCurvature"}
+        if frames:
+            raise ValueError(
+                f"scene: {sorted(frames)[0]} changes the natural curvature, which Bend leaves out; use BendFrame"
+            )
+    if not scene.constrained and "Stretch" not in kinds and bool(torch.isfinite(material.stretch).any()):
+        raise ValueError("scene: stretch is given, but lengths are not constrained and no Stretch effect acts; add it")
+    if "Stretch" in kinds and not bool(torch.isfinite(material.stretch).all()):
+        raise ValueError(
+            "scene: stretch is infinite, which no force can be; give EA [N], or keep constrained=True without Stretch"
+        )
+    if scene.constrained:
+        length = rod.edge_vectors(scene.topology, state.pos.detach(), rest.edge_mask).norm(dim=-1, keepdim=True)
+        strain = ((length / rest.length.detach() - 1) * rest.edge_mask).abs().max()
+        if float(strain) > 0.1:
+            raise ValueError(
+                f"scene: a rope is placed with edges {float(strain):.0%} off their length in its rest shape; place it at its "
+                "length, or use constrained=False with a Stretch effect"
+            )
 
 
 def limits(scene: Scene, params: Params) -> dict[str, float]:
@@ -223,19 +276,20 @@ def hold(scene: Scene, state: State) -> Control:
     return Control(rods.pos[..., list(scene.held_vertices), :], material[..., list(scene.held_edges), :])
 
 
-def advance(scene: Scene, params: Params, state: State, start: Tensor, control: Control, share: Tensor) -> State:
+def advance(scene: Scene, params: Params, state: State, start: Control, control: Control, share: Tensor) -> State:
     """Advance a scene by one substep.
 
     Args:
         scene: static choices.
         params: constant numbers.
         state: the scene now.
-        start: positions of the held vertices when the step began [m], shape (..., H, 3).
+        start: where held parts were when the step began.
         control: where held parts are at the end of the step.
         share: part of the step that is over after this substep, shape (1,).
     """
     settings = scene.settings
-    targets = Targets(start + share * (control.pos - start), control.director)
+    director = rotation.turn_towards(start.director, control.director, share)
+    targets = Targets(start.pos + share * (control.pos - start.pos), director)
     first = (state.time == 0).to(state.time.dtype)
     rods = substep(settings, params.rods, params.effects, state.rods, targets, first)
     return State(rods, state.time + settings.dt)
@@ -251,9 +305,15 @@ def step(scene: Scene, params: Params, state: State, control: Control, *, advanc
         control: where held parts are at the end.
         advance: what does a substep; `stepper` puts a compiled one here.
     """
-    start = state.rods.pos[..., list(scene.held_vertices), :]
+    wanted = (len(scene.held_vertices), len(scene.held_edges))
+    if (control.pos.shape[-2], control.director.shape[-2]) != wanted:
+        given = (tuple(control.pos.shape), tuple(control.director.shape))
+        raise ValueError(
+            f"control: pos and director are {given}; expected (..., {wanted[0]}, 3) and (..., {wanted[1]}, 3)"
+        )
+    start = hold(scene, state)
     for k in range(scene.substeps):
-        share = start.new_full((1,), (k + 1) / scene.substeps)
+        share = start.pos.new_full((1,), (k + 1) / scene.substeps)
         state = advance(scene, params, state, start, control, share)
     return state
 

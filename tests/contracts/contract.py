@@ -57,6 +57,7 @@ def scene(name: str, batch: tuple[int, ...] = (), seed: int = 0, dtype=F64, give
         [EFFECTS[name]()],
         {EFFECTS[name].name: ACTIVE.get(name, {})},
         constrained=False,
+        check=False,
         dt=1e-5,
         substeps=1,
     )

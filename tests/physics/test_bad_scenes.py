@@ -127,42 +127,7 @@ def wrong_control(count: int):
     return step(scene, params, state, Control(X[:count], X[:0]))
 
 
-# Accepted in silence, or refused by a crash further down: strict, so that a check that is added has to leave this
-# list.
-NOT_REFUSED = [
-    "infinite bending stiffness",
-    "infinite mass",
-    "stiffness of the wrong length",
-    "youngs and bend",
-    "unknown rest",
-    "rest of the wrong length",
-    "rest with NaN",
-    "rest longer than the placed rope",
-    "velocities of the wrong shape",
-    "NaN velocities",
-    "director along the edge",
-    "ropes of different batch",
-    "half a substep",
-    "negative ahead",
-    "held edge is the seam of an open rope",
-    "held edge without twist",
-    "isotropic law for two stiffnesses",
-    "law without rest shape for a curved rest",
-    "plasticity without frames",
-    "NaN number",
-    "stretch left to nothing",
-    "infinite stretch as a force",
-    "controls of the wrong number",
-]
-
-
-@pytest.mark.parametrize(
-    "case",
-    [
-        pytest.param(c, marks=pytest.mark.xfail(strict=True, reason="not checked")) if c in NOT_REFUSED else c
-        for c in BAD
-    ],
-)
+@pytest.mark.parametrize("case", BAD)
 def test_a_malformed_scene_is_refused_by_name(case):
     build, words = BAD[case]
     with pytest.raises(ValueError, match=words):

@@ -53,7 +53,7 @@ KINDS = ["open", "closed", "loop of three", "mixed"]
 @pytest.mark.parametrize("law", ELASTIC)
 def test_loads_are_the_negative_gradient_of_the_energy(kind, law):
     # F = -dU/dx with frames carried along by parallel transport, torque = -dU/dtheta. float64: 1e-9 relative.
-    scene, params, state = make(ropes(kind), [law()], constrained=law is not Stretch, dt=1e-6)
+    scene, params, state = make(ropes(kind), [law()], constrained=law is not Stretch, dt=1e-6, check=False)
     if law is Bend:  # isotropic law
         params = tree.replace(
             params,
@@ -77,7 +77,7 @@ def test_loads_are_the_negative_gradient_of_the_energy(kind, law):
 @pytest.mark.parametrize("law", ELASTIC)
 def test_internal_forces_and_torques_sum_to_zero(kind, law):
     # T9. sum F = 0; sum x cross F + sum t tau = 0, as a rigid turn changes no energy.
-    scene, params, state = make(ropes(kind), [law()], constrained=law is not Stretch, dt=1e-6)
+    scene, params, state = make(ropes(kind), [law()], constrained=law is not Stretch, dt=1e-6, check=False)
     if law is Bend:
         params = tree.replace(
             params,
@@ -98,7 +98,7 @@ def test_internal_forces_and_torques_sum_to_zero(kind, law):
 def test_energy_does_not_change_under_rigid_motion(kind):
     # T9. All of the state turns with the rods: directors too. 1e-12 relative.
     scene, params, state = make(
-        ropes(kind), effects("stretch_force", "bend_frame", "twist"), constrained=False, dt=1e-6
+        ropes(kind), effects("stretch_force", "bend_frame", "twist"), constrained=False, dt=1e-6, check=False
     )
     state = disturbed(state)
     q = vec(0.3, -0.5, 0.7, 0.2)
@@ -122,7 +122,9 @@ def test_energy_does_not_change_under_rigid_motion(kind):
 def test_stiffness_maps_from_material_and_radius():
     # T1. EA given; EI = E pi r^4/4, GJ = G pi r^4/2 per hinge length; masses rho pi r^2 h, half at the ends.
     n, r, e, g, rho, length = 11, 0.003, 2e7, 8e6, 1200.0, 0.7
-    _, params, _ = make([Rope(straight(n, length), radius=r, youngs=e, shear=g, density=rho, stretch=55.0)], [])
+    _, params, _ = make(
+        [Rope(straight(n, length), radius=r, youngs=e, shear=g, density=rho, stretch=55.0)], [], check=False
+    )
     m = params.rods.material
     assert torch.allclose(m.bend, torch.full_like(m.bend, e * math.pi * r**4 / 4), rtol=1e-12, atol=0)
     assert torch.allclose(m.twist, torch.full_like(m.twist, g * math.pi * r**4 / 2), rtol=1e-12, atol=0)
@@ -140,15 +142,15 @@ def test_energy_per_hinge_is_stiffness_over_hinge_length():
     h, phi, tau, eps, b, c, ea = 0.2, 0.4, 0.3, 0.05, 1.7, 0.9, 30.0
     bent = torch.stack([vec(0, 0, 0), vec(h, 0, 0), vec(h + h * math.cos(phi), h * math.sin(phi), 0)])
     rope = Rope(bent, mass=1.0, bend=b, twist=c, stretch=ea, rest=straight(3, 2 * h))
-    scene, params, state = make([rope], [Bend()], dt=1e-6)
+    scene, params, state = make([rope], [Bend()], dt=1e-6, check=False)
     wanted = b * (2 * math.tan(phi / 2)) ** 2 / (2 * h)
     assert float(energy(scene, params, state)) == pytest.approx(wanted, rel=1e-12)
-    scene, params, state = make([rope], [BendFrame()], dt=1e-6)
+    scene, params, state = make([rope], [BendFrame()], dt=1e-6, check=False)
     assert float(energy(scene, params, state)) == pytest.approx(wanted, rel=1e-12)
-    scene, params, state = make([rope], [Twist()], dt=1e-6)
+    scene, params, state = make([rope], [Twist()], dt=1e-6, check=False)
     twist = torch.tensor([[0.0], [tau], [0.0]], dtype=F64)
     assert float(energy(scene, params, state, twist=twist)) == pytest.approx(c * tau**2 / (2 * h), rel=1e-12)
-    scene, params, state = make([rope], [Stretch()], constrained=False, dt=1e-6)
+    scene, params, state = make([rope], [Stretch()], constrained=False, dt=1e-6, check=False)
     stretched = state.rods.pos * (1 + eps)
     assert float(energy(scene, params, state, stretched)) == pytest.approx(ea * eps**2 * h, rel=1e-12)
 
@@ -157,7 +159,7 @@ def test_uniform_twist_exerts_the_closed_form_torque_and_no_force():
     # T2. theta_j linear over the n - 1 hinges between the first and last edge: torque C Theta / (L - h), F = 0.
     n, length, c, total = 9, 1.0, 0.8, 5.0
     scene, params, state = make(
-        [Rope(straight(n, length), mass=1.0, bend=1.0, twist=c)], [BendFrame(), Twist()], dt=1e-6
+        [Rope(straight(n, length), mass=1.0, bend=1.0, twist=c)], [BendFrame(), Twist()], dt=1e-6, check=False
     )
     h = length / (n - 1)
     theta = torch.linspace(0, total, n - 1, dtype=F64)
@@ -180,7 +182,7 @@ def test_end_moment_rolls_a_rod_up_with_equal_hinge_angles():
     pos = torch.cat([torch.zeros(1, 3, dtype=F64), torch.cumsum(edges, 0)])
     assert float(pos[-1].norm()) < 1e-14
     for law in (Bend(), BendFrame()):
-        scene, params, state = make([Rope(pos, mass=1.0, bend=b)], [law], dt=1e-6)
+        scene, params, state = make([Rope(pos, mass=1.0, bend=b)], [law], dt=1e-6, check=False)
         force, _ = loads(scene, params, state)
         moment = b * 2 * math.tan(phi / 2) / h
         # Inner vertices are free of force, and the couple h F on the first edge is the moment. The hinge energy
@@ -197,7 +199,7 @@ def test_loads_of_nearly_opposite_edges_are_bounded(law):
     for gap in (1e-3, 1e-7, 0.0):
         pos = torch.stack([vec(0, 0, 0), vec(0.1, 0, 0), vec(0, gap, 0), vec(0.1, gap, 0.05)]).requires_grad_()
         rope = Rope(pos, mass=1.0, bend=0.01, twist=0.01, rest=straight(4, 0.3))
-        scene, params, state = make([rope], effects(law), dt=1e-6)
+        scene, params, state = make([rope], effects(law), dt=1e-6, check=False)
         force, torque = loads(scene, params, state)
         assert bool(torch.isfinite(force).all() and torch.isfinite(torque).all())
         (gradient,) = torch.autograd.grad(force.sum() + torque.sum(), pos, allow_unused=True)
@@ -250,7 +252,7 @@ def test_parallel_transport_round_a_trefoil_turns_by_its_writhe():
         found = float(rotation.signed_angle(start, d, t[0]))
         assert found == pytest.approx(turn, abs=5e-7)
         # What the simulator spreads over the edges: the reference twists sum to minus the holonomy.
-        _, _, state = make([Rope(pos, mass=1.0, closed=True)], [Twist()], dt=1e-6)
+        _, _, state = make([Rope(pos, mass=1.0, closed=True)], [Twist()], dt=1e-6, check=False)
         assert float(state.rods.ref_twist.sum()) == pytest.approx(-turn, abs=5e-7)
 
 
@@ -278,7 +280,7 @@ def test_loops_at_rest_as_placed_have_no_energy_and_stay(pos):
 
 def test_curvature_rate_is_the_time_derivative_of_curvature():
     # Central difference of kappa along the motion: x +- dt v, theta +- dt omega; error O(dt^2).
-    scene, params, state = make(ropes("mixed"), [BendFrame(), Twist()], dt=1e-6)
+    scene, params, state = make(ropes("mixed"), [BendFrame(), Twist()], dt=1e-6, check=False)
     state = disturbed(state)
     v, w = rand(*state.rods.pos.shape, seed=21, low=-1), rand(*state.rods.twist.shape, seed=22, low=-1)
     moving = tree.replace(state, rods=tree.replace(state.rods, vel=v, twist_rate=w))

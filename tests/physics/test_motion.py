@@ -180,9 +180,10 @@ def test_positions_are_second_order_in_the_step(name):
 
 
 @pytest.mark.parametrize("name", ["explicit", "implicit, nothing ahead"])
-def test_order_does_not_depend_on_extensibility(name):
+def test_finite_stretch_under_constraints_is_first_order(name):
+    # Tension follows the strain at the end of the substep (backward Euler along the rope): stated order 1.
     found = orders(ORDERS[name], ["bend", "gravity"], stretch=3.0)
-    assert found > 1.85, found
+    assert 0.9 < found < 1.3, found
 
 
 @pytest.mark.parametrize("twist", ["dynamic", "quasistatic"])
@@ -245,6 +246,7 @@ def test_a_taut_rope_pulled_beyond_its_length_stays_finite(integrator):
         [Rope(straight(n), mass=0.05, bend=1e-5)],
         effects("bend", "gravity"),
         integrator=integrator,
+        ahead=0.1 if integrator == "implicit" else 0.0,
         dt=2e-3,
         substeps=2,
         held_vertices=(0, n - 1),

@@ -9,7 +9,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from torchdlo.physics import rotation, tree
+from torchdlo.physics import checks, rotation, tree
 from torchdlo.physics.numerics import cross, dot, normalize
 from torchdlo.physics.rod import Material, RodParams, RodRest, RodState, edge_vectors
 from torchdlo.physics.topology import Topology, preceding
@@ -115,33 +115,6 @@ def _column(value: Number | None, count: int, like: Tensor, what: str, default: 
     return value.to(like)[..., None, None].expand(*value.shape, count, 1)
 
 
-def _check(index: int, rope: Rope) -> None:
-    x = rope.positions
-    if not isinstance(x, Tensor) or x.dim() < 2 or x.shape[-1] != 3 or not x.is_floating_point():
-        given = tuple(x.shape) if isinstance(x, Tensor) else type(x).__name__
-        raise ValueError(f"rope {index}: positions are {given}; expected a float tensor (..., n, 3) in metres")
-    if x.shape[-2] < 3:
-        raise ValueError(f"rope {index}: {x.shape[-2]} vertices given; a rope needs at least 3")
-    if not bool(torch.isfinite(x).all()):
-        raise ValueError(f"rope {index}: positions contain NaN or infinity; every coordinate must be a number")
-    x = x.detach()
-    steps = torch.roll(x, -1, -2) - x if rope.closed else x[..., 1:, :] - x[..., :-1, :]
-    short = steps.norm(dim=-1)
-    if float(short.min()) < 1e-9:
-        at = int((short < 1e-9).nonzero()[0, -1])
-        raise ValueError(f"rope {index}: vertices {at} and {(at + 1) % x.shape[-2]} coincide; neighbours must be apart")
-    if (rope.mass is None) == (rope.density is None):
-        raise ValueError(f"rope {index}: give either mass [kg] or density [kg/m^3], exactly one of them")
-    for name in ("radius", "mass", "density", "youngs", "shear", "bend", "bend2", "twist", "stretch"):
-        value = getattr(rope, name)
-        if value is None:
-            continue
-        least = float(value.detach().min()) if isinstance(value, Tensor) else float(value)
-        zero_ok = name in ("youngs", "shear", "bend", "bend2", "twist")
-        if not least >= 0 or (least == 0 and not zero_ok):
-            raise ValueError(f"rope {index}: {name} is {least:g}; it must be {'at least 0' if zero_ok else 'positive'}")
-
-
 def assemble(ropes: Sequence[Rope]) -> tuple[Topology, RodParams, RodState]:
     """Pack ropes on one vertex axis.
 
@@ -151,7 +124,8 @@ def assemble(ropes: Sequence[Rope]) -> tuple[Topology, RodParams, RodState]:
     if not ropes:
         raise ValueError("no rope given; a scene needs at least one")
     for index, rope in enumerate(ropes):
-        _check(index, rope)
+        checks.rope(index, rope)
+    checks.together(ropes)
     topology = Topology(tuple(r.positions.shape[-2] for r in ropes), tuple(r.closed for r in ropes))
     batch = torch.broadcast_shapes(*(r.positions.shape[:-2] for r in ropes))
     like = ropes[0].positions
@@ -182,6 +156,7 @@ def assemble(ropes: Sequence[Rope]) -> tuple[Topology, RodParams, RodState]:
 
     director = bishop(topology, pos, edge_mask, given)
     _, reference = frame_curvature(topology, pos, director, edge_mask, hinge_mask)
+    reference = tree.batch_innermost(reference)
     zero = torch.zeros_like(pos[..., :1])
     velocities = pack(
         [(torch.zeros_like(r.positions) if r.velocities is None else r.velocities).to(like) for r in ropes]

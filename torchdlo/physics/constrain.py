@@ -36,12 +36,27 @@ class Lengths:
     """1 where the edge is real and one of its ends is free [1], shape (..., V, 1)."""
     edge_mask: Tensor
     """1 for real edges [1], shape (V, 1)."""
+    give: Tensor | None = None
+    """How far a unit of force moves an end of the edge within the substep [m/N], shape (..., V, 1)."""
+    most: float = 0.25
+    """Tension at which edges give way, over the one at which explicit steps are not stable."""
+
+    def yielding(self, tension: Tensor) -> tuple[Tensor | float, Tensor | float]:
+        """Return how much an edge lengthens beyond the tension that steps can follow [m], and the slope of that [m/N].
+
+        A tension T makes transverse waves of w dt = 2 sqrt(T give / length); beyond a share of the stable T edges
+        give way, so that ropes pulled beyond their length stay finite.
+        """
+        if self.give is None:
+            return 0.0, 0.0
+        beyond = tension - self.most * self.rest / self.give
+        return self.give * beyond.clamp(min=0.0), torch.where(beyond > 0, self.give, 0.0)
 
     def error(self, pos: Tensor, tension: Tensor) -> tuple[Tensor, Tensor]:
         """Return how much too long each edge is [m], shape (..., V, 1), and its direction, (..., V, 3)."""
         edge = edge_vectors(self.topology, pos, self.edge_mask)
         length = safe_norm(edge)
-        excess = length - self.rest - self.compliance * tension
+        excess = length - self.rest - self.compliance * tension - self.yielding(tension)[0]
         return excess * self.active, edge / length.clamp(min=1e-12)
 
 
@@ -100,7 +115,15 @@ def project(
         active, off = lengths.active, 1 - lengths.active
         # The small relative shift matters only when a taut rope has no solution.
         shift = 1 + (1e-10 if tension.dtype == torch.float64 else 1e-6)
-        diagonal = active * (shift * (along * direction * both).sum(-1, keepdim=True) + lengths.compliance) + off
+        diagonal = (
+            active
+            * (
+                shift * (along * direction * both).sum(-1, keepdim=True)
+                + lengths.compliance
+                + lengths.yielding(tension)[1]
+            )
+            + off
+        )
         to_next = -active * (along * following(topology, direction * answer)).sum(-1, keepdim=True)
         to_prev = -active * (along * answer * preceding(topology, direction)).sum(-1, keepdim=True)
         return tension + solve_slots(topology, diagonal, to_next, to_prev, excess)
@@ -206,6 +229,7 @@ def balance(
             string = impulse * lean
 
             after, active = following(topology, free), lengths.active
+            shift = 1e-10 if pos.dtype == torch.float64 else 1e-6
             entries = _rows(
                 free * (inertia.vertex + same + string + preceding(topology, string)) + (1 - free),
                 free * (one - string),
@@ -216,7 +240,8 @@ def balance(
                 after * active * along_start,
                 -active * along,
                 active * along,
-                -active * lengths.compliance / scale + (active - 1),
+                -active * (lengths.compliance + lengths.yielding(impulse / scale)[1] + shift * lengths.give) / scale
+                + (active - 1),
             )
         rhs = -_rows(momentum, excess)
         step = banded.solve(entries, rhs, f"saddle:{topology.name}")

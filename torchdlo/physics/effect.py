@@ -28,7 +28,8 @@ LOADS = {
     "hinge_drag": "The same per rate of turning, for implicit steps [N m s], shape (..., V, 1).",
     "edge_stiffness": "Transverse stiffness that a pulled edge has [N/m], for implicit steps, shape (..., V, 1).",
     "twist_hessian": "Second derivatives of an energy by the twists (before, before), (before, after), (after, after) "
-    "of each hinge [N m], shape (..., V, 3).",
+    "of each hinge, without their part that may be negative [N m], shape (..., V, 3).",
+    "twist_geometry": "That part of (before, before) and (after, after) [N m], shape (..., V, 2).",
 }
 """What an effect may return. Those "for implicit steps" say how the loads answer to motion; they change the step, not
 the equations that it solves, and explicit steps leave them out unless they are drags."""

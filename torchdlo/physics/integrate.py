@@ -4,7 +4,8 @@ Both integrators are Stoermer-Verlet in positions (velocities live half a subste
 substep and free of numerical damping. "explicit" divides forces by masses. "implicit" divides by masses plus
 dt^2/4 or more of the bending stiffness of a straight chain: with a constant inertia M + g dt^2 K the frequency w of
 a mode becomes w / sqrt(1 + g dt^2 w^2), which is below the stability limit 2/dt for every g >= 1/4; g = 1/4 is the
-trapezoidal rule.
+trapezoidal rule. Two choices are first order: finite stretch of edges whose length is solved for (tension follows the
+strain at the end of the substep, which damps axial waves), and `ahead` above zero.
 """
 
 from __future__ import annotations
@@ -45,8 +46,8 @@ class Settings:
     """Newton steps for lengths."""
     gamma: float = 0.3
     """Share of dt^2 times stiffness that counts as inertia in "implicit"."""
-    ahead: float = 0.1
-    """In "implicit", stiff forces are taken this share of a substep ahead, which damps what is too fast to follow."""
+    ahead: float = 0.0
+    """In "implicit", stiff forces are taken this share of a substep ahead: damps fast modes, first order if not 0."""
 
     @property
     def frames(self) -> bool:
@@ -150,7 +151,16 @@ def _translate(settings: Settings, now: View, loads: Values, targets: Targets, f
     if "drag" in loads:
         vertex = vertex + dt * loads["drag"]
     active = rest.edge_mask * (1 - (1 - free) * (1 - following(topology, free)))
-    lengths = Lengths(topology, rest.length, rest.length / material.stretch, active, rest.edge_mask)
+    lightest = torch.minimum(material.mass, following(topology, material.mass)).detach()
+    lengths = Lengths(
+        topology,
+        rest.length,
+        rest.length / material.stretch,
+        active,
+        rest.edge_mask,
+        dt * dt / lightest,
+        1e4 if settings.integrator == "implicit" else 0.25,
+    )
     if settings.integrator == "implicit":
         moved = _spread(targets.pos, settings.held_vertices, topology.size, drift)
         return _balance(settings, now, loads, lengths, vertex, force, moved, free, scale)
@@ -239,9 +249,9 @@ def _turn(settings: Settings, now: View, loads: Values, moved: RodState, targets
 
 
 def settle_twist(
-    settings: Settings, params: RodParams, values: dict[str, Values], state: RodState, targets: Targets
+    settings: Settings, params: RodParams, values: dict[str, Values], state: RodState, targets: Targets, steps: int = 3
 ) -> RodState:
-    """Return the state with twists at which no free edge feels a torque (two Newton steps from the last ones).
+    """Return the state with twists at which no free edge feels a torque (Newton steps from the last ones).
 
     Bergou 2008, section 4.2: twist waves are much faster than bending, so twist is taken to be in balance.
     """
@@ -249,11 +259,16 @@ def settle_twist(
     effects = [e for e in settings.effects if e.name in ("bend", "twist")]
     free = _free(settings.held_edges, state.pos, topology.size) * params.rest.edge_mask
 
-    def newton(angle: Tensor, state: RodState) -> Tensor:
+    def newton(angle: Tensor, state: RodState, exact: bool) -> Tensor:
         here = rod.view(topology, params, tree.replace(state, twist=angle), settings.dt)
         loads = effect.total(effects, here, values)
         with torch.no_grad():
             same, after = _twist_matrix(here, loads)
+            if "twist_geometry" in loads:
+                # Without its negative part the matrix leads to minima only; near one the exact matrix converges fast,
+                # and in the last step it makes the derivative exact.
+                bent = loads["twist_geometry"] if exact else loads["twist_geometry"].clamp(min=0.0)
+                same = same + bent[..., 1:] + here.next(bent[..., :1])
             # A tiny spring on every edge: a rod free at both ends may spin as a whole.
             same = same + 1e-9 * same.amax(-2, keepdim=True)
         return angle + solve_slots(
@@ -262,7 +277,9 @@ def settle_twist(
 
     angle = _prescribed(settings, params, state, targets, state.twist)
     with torch.no_grad():
-        start = newton(angle, state)
+        start = angle
+        for k in range(steps - 1):
+            start = newton(start, state, k >= steps - 2)
     start = torch.where(free > 0, start, angle)
-    settled = newton(start, state)
+    settled = newton(start, state, True)
     return tree.replace(state, twist=settled, twist_rate=(settled - state.twist) / settings.dt)

@@ -131,8 +131,8 @@ def edge_vectors(topology: Topology, pos: Tensor, edge_mask: Tensor) -> Tensor:
 def view(topology: Topology, params: RodParams, state: RodState, dt: float) -> View:
     """Compute the geometry of a state."""
     e = edge_vectors(topology, state.pos, params.rest.edge_mask)
-    length = safe_norm(e)
-    tangent = e / length.clamp(min=1e-12)
+    length = safe_norm(e).clamp(min=1e-12)
+    tangent = e / length
     rest = params.rest.length
     return View(
         topology,

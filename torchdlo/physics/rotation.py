@@ -8,7 +8,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchdlo.physics.numerics import cross, dot, normalize
+from torchdlo.physics.numerics import cross, dot, normalize, safe_norm
 
 
 def multiply(a: Tensor, b: Tensor) -> Tensor:
@@ -44,6 +44,16 @@ def transport(vector: Tensor, start: Tensor, end: Tensor) -> Tensor:
 def signed_angle(start: Tensor, end: Tensor, axis: Tensor) -> Tensor:
     """Return the angle [rad] in (-pi, pi] from `start` to `end` about unit `axis`, shape (..., 1)."""
     return torch.atan2(dot(cross(start, end), axis), dot(start, end))
+
+
+def turn_towards(start: Tensor, end: Tensor, share: Tensor) -> Tensor:
+    """Turn unit vectors by a share of the angle to `end`, shapes (..., 3); undefined for opposite ones."""
+    angle = torch.atan2(safe_norm(cross(start, end)), dot(start, end))
+    small = angle < 1e-4
+    sine = torch.where(small, 1.0, angle).sin()
+    before = torch.where(small, 1 - share, torch.sin((1 - share) * angle) / sine)
+    after = torch.where(small, share, torch.sin(share * angle) / sine)
+    return before * start + after * end
 
 
 def any_normal(tangent: Tensor) -> Tensor:

@@ -50,6 +50,9 @@ MAX_SUBSTEP = 5e-3
 _STRETCH = 1e4
 """Axial stiffness [N]: a strain of 1e-4 at 1 N. Real cables are near it, and taut trials stay solvable."""
 
+_AHEAD = 0.1
+"""How far steps look ahead: real ropes are jerked taut, and what then rings within a substep must die out."""
+
 _CHUNK = 128
 """Scenes that run together in a compiled step: one size, so that there is one graph."""
 
@@ -195,7 +198,7 @@ class RopeModel:
             twist="quasistatic",
             held_vertices=self.held,
             held_edges=tuple(edge for edge, _ in self.clamps),
-            newton=3,
+            ahead=_AHEAD,
         )
         params = self._measured_lengths(params, number)
         return scene, params, self._agree(scene, params, state)

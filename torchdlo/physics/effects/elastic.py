@@ -145,6 +145,7 @@ class BendFrame(Effect):
         moment = stiffness * (hinge.kappa - natural)
         loads = hinge.pull_back(view, moment)
         s1, s2 = stiffness[..., :1], stiffness[..., -1:]
+        f1, f2 = moment[..., :1], moment[..., 1:]
         b1, b2, a1, a2 = hinge.by_twist
         curved = dot(hinge.binormal, hinge.binormal) / 4
         return {
@@ -153,6 +154,7 @@ class BendFrame(Effect):
             "twist_hessian": torch.cat(
                 [s1 * b1 * b1 + s2 * b2 * b2, s1 * b1 * a1 + s2 * b2 * a2, s1 * a1 * a1 + s2 * a2 * a2], -1
             ),
+            "twist_geometry": torch.cat([f1 * b2 - f2 * b1, f1 * a2 - f2 * a1], -1),
         }
 
 
