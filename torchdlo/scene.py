@@ -222,8 +222,8 @@ def _check_laws(scene: Scene, params: Params, state: RodState) -> None:
         strain = ((length / rest.length.detach() - 1) * rest.edge_mask).abs().max()
         if float(strain) > 0.1:
             raise ValueError(
-                f"scene: a rope is placed with edges {float(strain):.0%} off their length in its rest shape; place it at its "
-                "length, or use constrained=False with a Stretch effect"
+                f"scene: a rope is placed with edges {float(strain):.0%} off their length in its rest shape; place it "
+                "at its length, or use constrained=False with a Stretch effect"
             )
 
 

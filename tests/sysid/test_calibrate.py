@@ -54,8 +54,10 @@ def make_recording(path: Path, *, ends: int = 2, seed: int = 0, noise: float = 0
 def test_true_numbers_are_found_again(tmp_path: Path) -> None:
     # G4 of the reference cases: stiffness within 1 % asks for better than the mesh; here model and data share it.
     result = calibrate(make_recording(tmp_path, noise=2e-4), **OPTIONS)
-    found = [result.parameters[name]["value"] for name in ("bending_stiffness", "damping_rate")]
-    assert found == pytest.approx(TRUE[[0, 2]], rel=0.03)
+    found = result.parameters
+    assert found["bending_stiffness"]["value"] == pytest.approx(TRUE[0], rel=0.02)
+    # In 0.8 s damping takes a few tenths of the motion, and starts are known to a millimetre: it is known roughly.
+    assert found["damping_rate"]["low"] < TRUE[2] < found["damping_rate"]["high"]
     assert result.test_mae_mm < 0.6 and result.test_mae_mm < 0.1 * result.before["test_mae_mm"]
     assert all(p["low"] < p["value"] < p["high"] for p in result.parameters.values())
 
@@ -174,9 +176,8 @@ def test_levenberg_marquardt_finds_the_minimum_of_a_known_curve() -> None:
 
     measured = np.array(decay(np.array([[1.7]]))[0])
     points = fit.evaluate(decay, measured, space, space.to_raw(np.array([[0.3]])))
-    for points in fit.improve(decay, measured, space, points, iterations=30, tolerance=1e-9):  # noqa: B020
-        pass
-    assert space.to_values(points[0].raw)[0] == pytest.approx(1.7, rel=1e-4)
+    *_, last = fit.improve(decay, measured, space, points, iterations=30, tolerance=1e-9)
+    assert space.to_values(last[0].raw)[0] == pytest.approx(1.7, rel=1e-4)
 
 
 @pytest.mark.slow

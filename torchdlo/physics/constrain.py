@@ -179,6 +179,17 @@ class Inertia:
         return same, one, two
 
 
+def _shortening(lengths: Lengths, change: Tensor) -> Tensor:
+    """Return the share of a Newton step to take, shape (..., 1, 1).
+
+    An edge may turn by about one radian; beyond that its linearisation means nothing.
+    """
+    with torch.no_grad():
+        turn = lengths.active * (following(lengths.topology, change) - change) / lengths.rest
+        most = turn.square().sum(-1, keepdim=True).amax(-2, keepdim=True).sqrt()
+        return (1 / most.clamp(min=1e-9)).clamp(max=1.0)
+
+
 def balance(
     lengths: Lengths,
     inertia: Inertia,
@@ -247,12 +258,7 @@ def balance(
         step = banded.solve(entries, rhs, f"saddle:{topology.name}")
         batch, v3 = pos.shape[:-2], 3 * pos.shape[-2]
         change, push = _vertices(step[:v3], batch, 3), _vertices(step[v3:], batch, 1)
-        # An edge may turn by about one radian per Newton step; beyond that its linearisation means nothing.
-        with torch.no_grad():
-            turn = lengths.active * (following(topology, change) - change) / lengths.rest
-            short = (1 / turn.square().sum(-1, keepdim=True).amax(-2, keepdim=True).sqrt().clamp(min=1e-9)).clamp(
-                max=1.0
-            )
+        short = _shortening(lengths, change)
         return pos + short * change, impulse + short * push
 
     with torch.no_grad():

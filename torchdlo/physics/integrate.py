@@ -249,7 +249,7 @@ def _turn(settings: Settings, now: View, loads: Values, moved: RodState, targets
 
 
 def settle_twist(
-    settings: Settings, params: RodParams, values: dict[str, Values], state: RodState, targets: Targets, steps: int = 3
+    settings: Settings, params: RodParams, values: dict[str, Values], state: RodState, targets: Targets, steps: int = 4
 ) -> RodState:
     """Return the state with twists at which no free edge feels a torque (Newton steps from the last ones).
 
@@ -279,7 +279,7 @@ def settle_twist(
     with torch.no_grad():
         start = angle
         for k in range(steps - 1):
-            start = newton(start, state, k >= steps - 2)
+            start = newton(start, state, k >= steps - 3)
     start = torch.where(free > 0, start, angle)
     settled = newton(start, state, True)
     return tree.replace(state, twist=settled, twist_rate=(settled - state.twist) / settings.dt)
