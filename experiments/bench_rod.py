@@ -1,320 +1,375 @@
-"""How fast rods are stepped and differentiated, how cost grows with vertices and memory with the horizon.
+"""Time torchdlo on a falling rope: frames per second, first calls, memory, and other simulators beside it.
 
-The workload is an inextensible rope of 1 m, clamped horizontally at one end, that falls and swings: radius 5 mm,
-1000 kg/m^3, E = 1e6 Pa, uniform damping. A frame is 1 ms in 5 explicit substeps. Frames are counted over all scenes.
-Every case runs in fresh processes with one thread each; `--workers 2` splits the scenes over two of them, which is how
-two cores are used best.
+The rope is inextensible, 60 vertices and 1 m long (or as many more edges of the same length), 5 mm in radius,
+1000 kg/m^3, E = 1e6 Pa. Its first edge is clamped horizontally; it falls and swings under gravity with damping rate
+0.5 1/s. A frame is 1 ms in 5 explicit substeps, or 5 ms in 1 implicit one; frames are counted over all scenes.
 
-    python experiments/bench_rod.py --quick
-    python experiments/bench_rod.py --json rod.json --peers /path/to/python-with-pyelastica-and-mujoco
+Every case runs in fresh processes of one thread each that start together. `frames_per_s` is by their CPU time, as if
+nothing else used the machine; `frames_per_wall_s` is by the clock.
+
+examples:
+  python experiments/bench_rod.py --quick
+  python experiments/bench_rod.py --json bench.json --peers /path/to/python-with-pyelastica-and-mujoco
+  TORCHDLO_BENCH_ROD_WORKERS=1 python experiments/bench_rod.py --only memory,first
 """
 
 from __future__ import annotations
 
-import argparse
-import json
+import contextlib
 import math
 import multiprocessing
 import os
 import platform
+import queue
 import resource
-import subprocess
+import signal
+import statistics
 import sys
+import tempfile
 import time
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass, replace
+from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
-GOALS = {  # (scenes, mode): frames/s with 60 vertices on two cores
-    (1, "forward"): 1_000,
-    (100, "forward"): 25_000,
-    (100, "forward+backward"): 8_000,
-}
+from options import Parser, count, save
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+FORWARD, BOTH = "forward", "forward+backward"
+PARTS = ("peers", "memory", "first", "rows")
+ROLLOUT, SEGMENT = 20, 10
+"""Frames of a rollout with gradients, and of one replayed segment where memory is measured."""
+EDGE = 1 / 59
+"""Length of an edge [m]."""
+GOALS = {(1, FORWARD): 1_000, (100, FORWARD): 25_000, (100, BOTH): 8_000}
+"""Frames/s by scenes and mode, with 60 vertices in float32 and explicit steps, on two cores."""
 
 
 @dataclass(frozen=True)
 class Case:
-    """One row of the table."""
+    """One thing to time."""
 
     scenes: int = 100
+    """Scenes of all workers together."""
     vertices: int = 60
-    mode: str = "forward"
+    mode: str = FORWARD
     dtype: str = "float32"
     compiled: bool = True
     integrator: str = "explicit"
-    law: str = "bend"
-    """"bend", or "frame": rest curvature and dynamic twist in material frames."""
+    twist: str = "none"
+    """"none" with Bend; "dynamic" or "quasistatic" with BendFrame and Twist."""
     workers: int = 1
-    seconds: float = 2.0
+    seconds: float = 0.6
+    """CPU time of one of five repeats, about [s]."""
 
 
-def build(case: Case, scenes: int):
-    """Return a step function, parameters, state and control."""
+def build(case: Case, scenes: int) -> tuple[Any, Any, Any]:
+    """Return the scene, its parameters and its initial state."""
     import torch
 
-    from torchdlo import scene as sc
+    from torchdlo import scene
     from torchdlo.physics import tree
-    from torchdlo.physics.effects.elastic import Bend, BendFrame, Twist
-    from torchdlo.physics.effects.field import Damping, Gravity
+    from torchdlo.physics.effects import EFFECTS
 
-    dtype = getattr(torch, case.dtype)
-    x = torch.zeros(scenes, case.vertices, 3, dtype=dtype)
-    x[..., 0] = torch.linspace(0, 1, case.vertices, dtype=dtype)
-    # Stiffness falls with the square of the spacing where explicit steps ask for it.
-    youngs = 1e6 * min(1.0, (59 / (case.vertices - 1)) ** 4) if case.integrator == "explicit" else 1e6
-    rope = sc.Rope(x, radius=5e-3, density=1000.0, youngs=youngs, shear=youngs / 3)
-    frame = case.law == "frame"
-    effects = [Gravity(), *((BendFrame(), Twist()) if frame else (Bend(),)), Damping()]
+    x = torch.zeros(scenes, case.vertices, 3, dtype=getattr(torch, case.dtype))
+    x[..., 0] = torch.arange(case.vertices, dtype=x.dtype) * EDGE
+    framed = case.twist != "none"
+    rope = scene.Rope(x, radius=0.005, density=1000.0, youngs=1e6, shear=1e6 / 3)
+    names = ("bend_frame", "twist", "gravity", "damping") if framed else ("bend", "gravity", "damping")
     step = {"dt": 1e-3, "substeps": 5} if case.integrator == "explicit" else {"dt": 5e-3, "substeps": 1}
-    twist = "quasistatic" if frame else "none"
-    scene, params, state = sc.make(
-        [rope], effects, held_vertices=(0, 1), integrator=case.integrator, twist=twist, **step
-    )
-    params = tree.map(tree.batch_innermost, params)
-    return sc.stepper(scene, compiled=case.compiled), params, state, sc.hold(scene, state)
+    held = {"held_vertices": (0, 1), "held_edges": (0,) if framed else ()}
+    choices = {"integrator": case.integrator, "twist": case.twist, **step, **held}
+    made, params, state = scene.make([rope], [EFFECTS[name]() for name in names], {"damping": {"rate": 0.5}}, **choices)
+    return made, tree.map(tree.batch_innermost, params), state
 
 
-def work(case: Case, scenes: int, gate, results) -> None:
-    """Measure one case in this process and put (frames, seconds, first call, peak memory) into `results`."""
+def gradient(step: Callable, made: tuple[Any, Any, Any], frames: int, **replay: Any) -> None:
+    """Differentiate the final positions by bending stiffness and initial velocity."""
     import torch
 
-    from torchdlo import scene as sc
+    from torchdlo import scene
     from torchdlo.physics import tree
+
+    choice, params, state = made
+    rods = params.rods
+    bend, vel = (x.detach().clone().requires_grad_() for x in (rods.material.bend, state.rods.vel))
+    params = tree.replace(params, rods=tree.replace(rods, material=tree.replace(rods.material, bend=bend)))
+    state = tree.replace(state, rods=tree.replace(state.rods, vel=vel))
+    controls = tree.map(lambda c: c.expand(frames, *c.shape), scene.hold(choice, made[2]))
+    last, _ = scene.rollout(step, params, state, controls, keep=lambda s: s.time, **replay)
+    found = torch.autograd.grad(last.rods.pos.square().sum(), [bend, vel])
+    if not all(bool(torch.isfinite(g).all()) for g in found):
+        raise ArithmeticError("bench_rod: a gradient is not finite")
+
+
+def forward(step: Callable, made: tuple[Any, Any, Any], frames: int) -> None:
+    """Run without gradients."""
+    import torch
+
+    from torchdlo import scene
+
+    choice, params, state = made
+    with torch.no_grad():
+        control = scene.hold(choice, state)
+        for _ in range(frames):
+            state = step(params, state, control)
+    if not bool(scene.finite(state).all()):
+        raise ArithmeticError("bench_rod: a scene is not finite")
+
+
+def clocked(work: Callable[[], None]) -> tuple[float, float]:
+    """CPU and elapsed seconds of a call."""
+    cpu, wall = time.process_time(), time.perf_counter()
+    work()
+    return time.process_time() - cpu, time.perf_counter() - wall
+
+
+def peak_mb(restart: bool = False) -> float:
+    """Largest resident memory of this process so far, or since the last restart where the system can do that."""
+    status = Path("/proc/self/status")
+    if not status.exists():
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (1e6 if sys.platform == "darwin" else 1e3)
+    if restart:
+        with contextlib.suppress(OSError):
+            Path("/proc/self/clear_refs").write_text("5")
+    line = next(line for line in status.read_text().splitlines() if line.startswith("VmHWM"))
+    return int(line.split()[1]) / 1e3
+
+
+def work(case: Case, share: int, go: Any, results: Any) -> None:
+    """Time a share of a case in this process: put None when ready, wait for `go`, put what was found."""
+    import torch
+
+    from torchdlo import scene
 
     torch.set_num_threads(1)
-    step, params, state, control = build(case, scenes)
-    length = 20
-
-    def forward() -> int:
-        nonlocal state
-        with torch.no_grad():
-            for _ in range(length):
-                state = step(params, state, control)
-        return length
-
-    def both() -> int:
-        bend = params.rods.material.bend.clone().requires_grad_()
-        material = tree.replace(params.rods.material, bend=bend)
-        learned = tree.replace(params, rods=tree.replace(params.rods, material=material))
-        vel = state.rods.vel.clone().requires_grad_()
-        start = tree.replace(state, rods=tree.replace(state.rods, vel=vel))
-        controls = tree.map(lambda c: c.expand(length, *c.shape), control)
-        last, _ = sc.rollout(step, learned, start, controls, keep=lambda s: s.time)
-        last.rods.pos.square().sum().backward()
-        return length
-
-    run = forward if case.mode == "forward" else both
-    begun = time.perf_counter()
-    run()
-    first = time.perf_counter() - begun
-    run()
-    gate.wait()
-    begun, frames = time.perf_counter(), 0
-    while time.perf_counter() - begun < case.seconds:
-        frames += run() * scenes
-    spent = time.perf_counter() - begun
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    results.put((frames, spent, first, peak, bool(sc.finite(state).all())))
+    made = build(case, share)
+    step = scene.stepper(made[0], compiled=case.compiled)
+    run = forward if case.mode == FORWARD else gradient
+    first = clocked(lambda: run(step, made, ROLLOUT))[1]
+    once = clocked(lambda: run(step, made, ROLLOUT))[0]
+    rounds = max(1, round(case.seconds / max(once, 1e-3)))
+    results.put(None)
+    go.wait()
+    times = [clocked(lambda: [run(step, made, ROLLOUT) for _ in range(rounds)]) for _ in range(5)]
+    cpu, wall = (statistics.median(t) / rounds / ROLLOUT for t in zip(*times, strict=True))
+    us = 1e6 * cpu / made[0].substeps
+    results.put({"first_call_s": first, "cpu": share / cpu, "wall": share / wall, "us": us, "peak_mb": peak_mb()})
 
 
-def measure(case: Case) -> dict:
-    """Run a case in fresh processes and return its row."""
-    context = multiprocessing.get_context("spawn")
-    workers = min(case.workers, case.scenes)
-    gate, results = context.Barrier(workers), context.Queue()
-    shares = [case.scenes // workers + (k < case.scenes % workers) for k in range(workers)]
-    jobs = [context.Process(target=work, args=(case, share, gate, results)) for share in shares]
+def remember(frames: int, go: Any, results: Any) -> None:
+    """Measure the memory of one backward pass of 10 scenes with nested replay, first calls not counted."""
+    import torch
+
+    from torchdlo import scene
+
+    torch.set_num_threads(1)
+    made = build(Case(), 10)
+    step = scene.stepper(made[0])
+    gradient(step, made, 2 * SEGMENT, segment=SEGMENT, nested=True)
+    before = peak_mb(restart=True)
+    cpu, _ = clocked(lambda: gradient(step, made, frames, segment=SEGMENT, nested=True))
+    results.put({"substeps": 5 * frames, "before_mb": before, "peak_mb": peak_mb(), "cpu_s": cpu})
+
+
+def receive(jobs: list[Any], results: Any) -> Any:
+    """Return what a process reports next; fail if one died instead."""
+    while True:
+        with contextlib.suppress(queue.Empty):
+            return results.get(timeout=1.0)
+        if any(job.exitcode for job in jobs):
+            raise RuntimeError("bench_rod: a process failed; its message is above")
+
+
+def start(jobs: list[Any]) -> None:
+    """Start processes that never see Ctrl-C, which is for their parent to answer."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     for job in jobs:
         job.start()
-    found = [results.get(timeout=1800) for _ in jobs]
-    for job in jobs:
-        job.join()
-    rate = sum(frames / spent for frames, spent, *_ in found)
-    substeps = 5 if case.integrator == "explicit" else 1
-    return asdict(case) | {
-        "workers": workers,
-        "frames_per_s": rate,
-        "us_per_substep": 1e6 * max(shares) * workers / rate / substeps,
-        "first_call_s": max(f[2] for f in found),
-        "peak_mb": sum(f[3] for f in found),
-        "finite": all(f[4] for f in found),
+    signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+@contextlib.contextmanager
+def processes(target: Callable, heads: list[tuple]) -> Iterator[tuple[list[Any], Any, Any]]:
+    """Yield a process per tuple of first arguments, not yet started, with their event and queue; none outlives this."""
+    context = multiprocessing.get_context("spawn")
+    go, results = context.Event(), context.Queue()
+    jobs = [context.Process(target=target, args=(*head, go, results), daemon=True) for head in heads]
+    try:
+        yield jobs, go, results
+    finally:
+        for job in jobs:
+            if job.pid:
+                job.terminate()
+                job.join()
+
+
+def measure(case: Case) -> dict[str, Any]:
+    """Return the row of a case, summed over its workers."""
+    workers = min(case.workers, case.scenes)
+    shares = [case.scenes // workers + (k < case.scenes % workers) for k in range(workers)]
+    with processes(work, [(case, share) for share in shares]) as (jobs, go, results):
+        # One compiles, the others find its work.
+        for crew in (jobs[:1], jobs[1:]):
+            start(crew)
+            for _ in crew:
+                receive(jobs, results)
+        go.set()
+        found = [receive(jobs, results) for _ in jobs]
+    row = {name: value for name, value in asdict(case).items() if name != "seconds"} | {"workers": workers}
+    return row | {
+        "frames_per_s": sum(f["cpu"] for f in found),
+        "frames_per_wall_s": sum(f["wall"] for f in found),
+        "us_per_substep": statistics.mean(f["us"] for f in found),
+        "peak_mb": sum(f["peak_mb"] for f in found),
+        "first_call_s": max(f["first_call_s"] for f in found),
     }
 
 
-def _long(frames: int, queue) -> None:
-    import torch
-
-    from torchdlo import scene as sc
-    from torchdlo.physics import tree
-
-    torch.set_num_threads(1)
-    step, params, state, control = build(Case(vertices=20, compiled=False, dtype="float64"), 4)
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    vel = state.rods.vel.clone().requires_grad_()
-    start = tree.replace(state, rods=tree.replace(state.rods, vel=vel))
-    controls = tree.map(lambda c: c.expand(frames, *c.shape), control)
-    last, _ = sc.rollout(step, params, start, controls, segment=8, nested=True, keep=lambda s: s.time)
-    last.rods.pos.sum().backward()
-    queue.put((resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, before))
-
-
-def memory() -> dict:
-    """Return the peak memory of the gradient of 2 000 and of 20 000 substeps, in fresh processes."""
-    context, peaks = multiprocessing.get_context("spawn"), {}
-    for substeps in (2_000, 20_000):
-        queue = context.Queue()
-        job = context.Process(target=_long, args=(substeps // 5, queue))
-        job.start()
-        peaks[substeps], base = queue.get(timeout=3600)
-        job.join()
-    return {"peak_mb": peaks, "before_mb": base, "ratio": peaks[20_000] / peaks[2_000], "goal": 1.2}
-
-
-def exponent(rows: list[dict]) -> float:
-    """Return the power of the vertex count that the time per frame grows with, from 100 to 3000 vertices."""
-    points = sorted((r["vertices"], r["scenes"] / r["frames_per_s"]) for r in rows if r["vertices"] in (100, 3000))
-    return math.log(points[-1][1] / points[0][1]) / math.log(points[-1][0] / points[0][0])
-
-
-def swing(scenes: int, dt: float, seconds: float) -> dict:
-    """Time the rope that falls for 1 s with implicit steps, and its tip error against the converged reference."""
-    import numpy as np
-    import torch
-
-    from torchdlo import scene as sc
-    from torchdlo.physics import tree
-    from torchdlo.physics.effects.elastic import Bend
-    from torchdlo.physics.effects.field import Gravity
-
-    torch.set_num_threads(1)
-    data = np.load(Path(__file__).parents[1] / "tests" / "reference" / "swing.npz")
-    x = torch.zeros(scenes, 60, 3, dtype=torch.float64)
-    x[..., 0] = torch.linspace(0, 1, 60, dtype=torch.float64)
-    h = 1 / 59
-    # Held: the clamped end, and a vertex behind it for the direction of the clamp.
-    rope = sc.Rope(torch.cat([x[:, :1] - torch.tensor([h, 0, 0]), x], -2), radius=5e-3, density=1000.0, youngs=1e6)
-    scene, params, state = sc.make(
-        [rope], [Gravity(), Bend()], dt=dt, substeps=1, integrator="implicit", held_vertices=(0, 1)
-    )
-    # The clamp's hinge has only the free half of its length to bend in.
-    stiff = torch.ones(61, 1, dtype=torch.float64)
-    stiff[1] = 2.0
-    material = tree.replace(params.rods.material, bend=params.rods.material.bend * stiff)
-    params = tree.map(tree.batch_innermost, tree.replace(params, rods=tree.replace(params.rods, material=material)))
-    step, control = sc.stepper(scene), sc.hold(scene, state)
-
-    def fall() -> list:
-        s, tips = state, []
-        with torch.no_grad():
-            for k in range(round(1 / dt)):
-                s = step(params, s, control)
-                if (k + 1) % round(0.05 / dt) == 0:
-                    tips.append(s.rods.pos[0, -1])
-        return tips
-
-    tips = torch.stack(fall()).numpy()
-    target = data["converged"][1:, -1]
-    axis = [0, int(np.argmax(np.ptp(target[:, 1:], axis=0))) + 1]
-    error = np.linalg.norm(tips[:, [0, 2]] - target[:, axis], axis=-1)
-    begun, runs = time.process_time(), 0
-    while time.process_time() - begun < seconds:
-        fall()
-        runs += 1
-    speed = runs * scenes / (time.process_time() - begun)
-    return {"name": "torchdlo", "scenes": scenes, "dt": dt, "tip_error_mm": 1e3 * float(error[-1]),
-            "mean_tip_error_mm": 1e3 * float(error.mean()), "simulated_s_per_cpu_s": speed}  # fmt: skip
-
-
-def peers(interpreter: str, quick: bool) -> dict:
-    """Run `peers.py` with an interpreter that has them, and our rope beside it."""
-    target = Path(os.environ.get("TMPDIR", "/tmp")) / f"peers-{os.getpid()}.json"
-    script = Path(__file__).with_name("peers.py")
-    subprocess.run([interpreter, str(script), "--json", str(target)] + (["--smoke"] if quick else []), check=True)
-    theirs = json.loads(target.read_text())
-    target.unlink()
-    ours = []
-    for scenes in (1, 100):
-        for dt in (2e-3, 5e-3, 1e-2):
-            code = f"import json, bench_rod; print(json.dumps(bench_rod.swing({scenes}, {dt}, 3.0)))"
-            done = subprocess.run(
-                [sys.executable, "-c", code], cwd=script.parent, capture_output=True, text=True, check=True
-            )
-            ours.append(json.loads(done.stdout.splitlines()[-1]))
-    return {"ours": ours, "theirs": theirs}
-
-
-def cases(quick: bool, workers: int) -> list[Case]:
-    """Return the rows to measure."""
-    both = ("forward", "forward+backward")
+def cases(quick: bool, smoke: bool, workers: int) -> list[Case]:
+    """Return what is timed."""
+    both = (FORWARD, BOTH)
+    if smoke:
+        return [Case(2, 6, mode=m, compiled=False, seconds=0.01) for m in both]
     if quick:
-        rows = [Case(scenes=100, mode=mode, workers=workers, seconds=1.5) for mode in both]
-        return [*rows, Case(scenes=1, seconds=1.0), Case(compiled=False, seconds=1.0)]
-    rows = [
-        Case(scenes=s, mode=m, dtype=d, compiled=c, workers=workers if s > 1 else 1)
-        for d in ("float32", "float64")
-        for c in (False, True)
-        for s in (1, 10, 100, 1000)
-        for m in both
-    ]
-    rows += [Case(scenes=1, vertices=v, dtype="float64") for v in (30, 100, 300, 1000, 3000)]
-    rows += [Case(scenes=s, integrator="implicit", dtype="float64", mode=m) for s in (1, 100) for m in both]
-    return [*rows, Case(law="frame", mode="forward"), Case(law="frame", mode="forward+backward")]
+        found = [*(Case(100, mode=m, workers=workers) for m in both), Case(1), Case(1, integrator="implicit")]
+        return [replace(case, seconds=0.3) for case in found]
+    found = [Case(100, mode=m, workers=workers) for m in both]
+    for dtype in ("float32", "float64"):
+        found += [Case(n, dtype=dtype, mode=m) for n in (1, 10, 100, 1000) for m in both]
+        found += [Case(n, dtype=dtype, compiled=False, mode=m) for n in (1, 100) for m in both]
+    found += [Case(n, integrator="implicit", mode=m) for n in (1, 100) for m in both]
+    found += [Case(100, twist="dynamic", mode=m) for m in both]
+    found += [Case(100, integrator="implicit", twist="quasistatic", mode=m) for m in both]
+    return found + [Case(scenes, vertices=n) for scenes in (1, 10) for n in (100, 300, 1000, 3000)]
 
 
-def show(rows: list[dict]) -> None:
-    """Print the table."""
-    from rich.console import Console
-    from rich.table import Table
-
-    table = Table(title="frames per second, all scenes together")
-    for name in ("scenes", "vertices", "mode", "dtype", "steps", "workers", "frames/s", "us/substep", "first call s",
-                 "peak MB", "goal"):  # fmt: skip
-        table.add_column(name, justify="left" if name in ("mode", "dtype", "steps") else "right")
-    for r in rows:
-        goal = GOALS.get((r["scenes"], r["mode"])) if r["vertices"] == 60 and r["integrator"] == "explicit" else None
-        if not (r["compiled"] and r["dtype"] == "float32" and r["law"] == "bend"):
-            goal = None
-        met = "" if goal is None else f"{goal:,} {'met' if r['frames_per_s'] >= goal else 'MISSED'}"
-        steps = f"{r['integrator']}, {r['law']}, {'compiled' if r['compiled'] else 'eager'}"
-        table.add_row(str(r["scenes"]), str(r["vertices"]), r["mode"], r["dtype"], steps, str(r["workers"]),
-                      f"{r['frames_per_s']:,.0f}", f"{r['us_per_substep']:,.0f}", f"{r['first_call_s']:.1f}",
-                      f"{r['peak_mb']:,.0f}", met)  # fmt: skip
-    Console(width=150).print(table)
+@contextlib.contextmanager
+def environment(**values: str) -> Iterator[None]:
+    """Set environment variables for a while."""
+    before = {name: os.environ.get(name) for name in values}
+    os.environ.update(values)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="the rows with goals only, about a minute")
-    parser.add_argument("--smoke", action="store_true", help="one tiny eager row: does the script run?")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write rows and machine to FILE")
-    parser.add_argument("--workers", type=int, default=2, help="processes that share the scenes (default 2)")
-    parser.add_argument(
-        "--memory", action="store_true", help="also the memory of gradients over 2 000 and 20 000 substeps"
-    )
-    parser.add_argument(
-        "--peers", nargs="?", const=sys.executable, metavar="PYTHON", help="compare with PyElastica and MuJoCo"
-    )
+def first_calls(name: str, case: Case) -> list[dict[str, Any]]:
+    """Return seconds of the first call without and with gradients, with empty and with filled caches."""
+    found = []
+    with tempfile.TemporaryDirectory() as folder:
+        caches = {"TORCHINDUCTOR_CACHE_DIR": folder + "/inductor", "TORCHDLO_CACHE": folder + "/torchdlo"}
+        for temperature in ("cold", "warm"):
+            for mode in (FORWARD, BOTH):
+                with environment(**caches):
+                    row = measure(replace(case, mode=mode, seconds=0.01))
+                found.append({"case": name, "cache": temperature, "mode": mode, "seconds": row["first_call_s"]})
+    return found
+
+
+def memory(frames: int) -> dict[str, Any]:
+    """Return the memory of a backward pass over so many frames."""
+    with processes(remember, [(frames,)]) as (jobs, _, results):
+        start(jobs)
+        return receive(jobs, results)
+
+
+def exponents(rows: list[dict[str, Any]]) -> dict[str, float]:
+    """Exponent of cost against vertices from 100 to 3000, least squares over the logarithms, by scenes."""
+    found = {}
+    for scenes in (1, 10):
+        part = [r for r in rows if r["scenes"] == scenes and r["vertices"] >= 100]
+        if len(part) > 1:
+            x, y = ([math.log(r[name]) for r in part] for name in ("vertices", "us_per_substep"))
+            found[str(scenes)] = statistics.linear_regression(x, y).slope
+    return found
+
+
+def implicit_cost(scenes: int) -> float:
+    """CPU seconds of an implicit step of all scenes."""
+    return 1e-6 * measure(Case(scenes, integrator="implicit"))["us_per_substep"]
+
+
+def jobs(options: Any, content: dict[str, Any]) -> Iterator[tuple[str, float, Callable[[], None]]]:
+    """Yield name, expected seconds and work of every part of the run; the work adds to `content`."""
+    parts = PARTS if options.only is None else options.only
+    if options.quick or options.smoke:
+        parts = ["rows"]
+
+    def row(case: Case) -> None:
+        content["rows"].append(measure(case))
+        content["exponent"] = exponents(content["rows"])
+
+    if "peers" in parts:
+        from versus import compare
+
+        def peers() -> None:
+            content["peers"] = compare(options.peers or sys.executable, options.peers_json, implicit_cost)
+
+        yield "other simulators", 60 if options.peers_json else 400, peers
+    if "memory" in parts:
+        for frames in (400, 4000):
+            yield f"memory, {frames} frames", frames / 50, lambda f=frames: content["memory"].append(memory(f))
+    if "first" in parts:
+        slow = Case(100, integrator="implicit", twist="quasistatic")
+        for name, case in (("explicit", Case()), ("implicit, one scene", Case(1, integrator="implicit")),
+                           ("implicit, quasistatic twist", slow)):  # fmt: skip
+            yield f"first calls, {name}", 120, lambda n=name, c=case: content["first_call_s"].extend(first_calls(n, c))
+    if "rows" in parts:
+        for case in cases(options.quick, options.smoke, options.workers):
+            about = 8 + 5 * case.seconds + (15 if case.compiled else 2)
+            yield f"{case.scenes} scenes, {case.vertices} vertices, {case.mode}", about, lambda case=case: row(case)
+
+
+def chosen(text: str) -> list[str]:
+    """Read parts to run, separated by commas."""
+    parts = text.split(",")
+    if not set(parts) <= set(PARTS):
+        raise ValueError(text)
+    return parts
+
+
+def main() -> int:
+    """Measure, print and save; what was found so far is in the file after every case."""
+    from report_rod import show
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+    parser = Parser(__file__, description=__doc__)
+    parser.flag("quick", "the rows with goals only, at most a minute with warm caches")
+    parser.flag("smoke", "two tiny rows: does the script run?")
+    parser.add_argument("--json", metavar="FILE", default="", help="file that the results go to")
+    parser.add_argument("--workers", type=count, default=2, help="processes that share 100 scenes (default: 2)")
+    parser.add_argument("--peers", metavar="PYTHON", default="", help="interpreter with the extra `peers`")
+    parser.add_argument("--peers-json", metavar="FILE", default="", help="results of peers.py instead of a new run")
+    parser.add_argument("--only", type=chosen, metavar="PARTS", help=f"parts of {','.join(PARTS)} (default: all)")
     options = parser.parse_args()
-    smoke = [Case(scenes=2, vertices=6, compiled=False, seconds=0.1)]
-    result = {"machine": platform.processor() or platform.machine(), "cores": os.cpu_count(), "rows": []}
-    for case in smoke if options.smoke else cases(options.quick, options.workers):
-        result["rows"].append(measure(case))
-    show(result["rows"])
-    if any(r["vertices"] == 3000 for r in result["rows"]):
-        single = [r for r in result["rows"] if r["scenes"] == 1 and r["dtype"] == "float64" and r["mode"] == "forward"]
-        result["exponent"] = exponent([r for r in single if r["compiled"] and r["integrator"] == "explicit"])
-        print(f"cost against vertex count, 100 to 3000: exponent {result['exponent']:.2f} (goal 1.1)")
-    if options.memory:
-        result["memory"] = memory()
-        print(f"memory of the gradient, 20 000 over 2 000 substeps: {result['memory']['ratio']:.2f} (goal 1.2)")
-    if options.peers:
-        result["peers"] = peers(options.peers, options.quick)
-        for row in result["peers"]["ours"]:
-            print(row)
-    if options.json:
-        scratch = options.json.with_suffix(".tmp")
-        scratch.write_text(json.dumps(result, indent=1))
-        os.replace(scratch, options.json)
+    content: dict[str, Any] = {
+        "machine": {"cores": os.cpu_count(), "cpu": platform.processor() or platform.machine()},
+        "versions": {"python": platform.python_version(), "torch": version("torch")},
+    } | {name: [] for name in ("rows", "first_call_s", "memory")}
+    todo, stopped = list(jobs(options, content)), False
+    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn())
+    with Progress(*columns) as progress:
+        task = progress.add_task("", total=sum(about for _, about, _ in todo))
+        try:
+            for name, about, do in todo:
+                progress.update(task, description=name)
+                do()
+                save(options.json, content)
+                progress.advance(task, about)
+        except KeyboardInterrupt:
+            stopped = True
+    save(options.json, content)
+    show(content, GOALS)
+    return 130 if stopped else 0
 
 
 if __name__ == "__main__":
-    main()
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+    sys.exit(main())

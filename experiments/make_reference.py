@@ -14,7 +14,6 @@ it; positions then converge with the square of the edge length.
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -35,6 +34,7 @@ from cosserat import (
     smooth,
     still,
 )
+from options import Parser
 
 
 @dataclass(frozen=True)
@@ -263,10 +263,10 @@ class Config:
 
 def main() -> None:
     """Make the files that are asked for."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n\n")[0])
+    parser = Parser(__file__, description=(__doc__ or "").split("\n\n")[0])
     parser.add_argument("--case", default=Config.case, choices=["all", "swing", "twisted", "held"])
     parser.add_argument("--out", default=Config.out, help="folder the files go to")
-    parser.add_argument("--smoke", action="store_true", help="coarse and quick")
+    parser.flag("smoke", "coarse and quick")
     config = Config(**vars(parser.parse_args()))
     out = Path(config.out)
     out.mkdir(parents=True, exist_ok=True)

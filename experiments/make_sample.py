@@ -7,7 +7,6 @@ moving in the first frame. Its notes say the true numbers. Needs the extra `peer
 
 from __future__ import annotations
 
-import argparse
 import json
 import math
 from dataclasses import dataclass
@@ -25,6 +24,7 @@ from cosserat import (
     simulate,
     smooth,
 )
+from options import Parser, count
 
 LENGTH, RADIUS, MASS, BENDING = 0.8, 0.004, 0.045, 3.0e-3
 DAMPING = 0.6
@@ -180,15 +180,15 @@ def draw(trials: dict[str, dict[str, np.ndarray]], path: str) -> None:
 
 def main() -> None:
     """Make the recording."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n\n")[0])
+    parser = Parser(__file__, description=(__doc__ or "").split("\n\n")[0])
     for name in ("out", "picture"):
         parser.add_argument(f"--{name}", default=getattr(Config, name))
-    for name in ("elements", "seed"):
-        parser.add_argument(f"--{name}", type=int, default=getattr(Config, name))
+    parser.add_argument("--elements", type=count, default=Config.elements)
+    parser.add_argument("--seed", type=int, default=Config.seed)
     for name in ("duration", "noise", "dropout"):
         parser.add_argument(f"--{name}", type=float, default=getattr(Config, name))
-    parser.add_argument("--smoke", action="store_true", help="one short, coarse trial")
-    parser.add_argument("--converge", action="store_true", help="only compare element counts")
+    parser.flag("smoke", "one short, coarse trial")
+    parser.flag("converge", "only compare element counts")
     options = vars(parser.parse_args())
     converge, config = options.pop("converge"), Config(**options)
     if converge:

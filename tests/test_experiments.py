@@ -4,31 +4,111 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
 
 EXPERIMENTS = Path(__file__).parents[1] / "experiments"
 SCRIPTS = ["bench_rod.py", "make_reference.py", "make_sample.py", "peers.py"]
+PREFIX = "TORCHDLO_PROBE_"
+BAD = {"WORKERS": ["x", "", "0", "1.5"], "NOISE": ["much", ""], "QUICK": ["maybe", ""]}
+PROBE = """
+import json
+from options import Parser, count
+
+parser = Parser("probe.py")
+parser.add_argument("--workers", type=count, default=2)
+parser.add_argument("--noise", type=float, default=0.5)
+parser.add_argument("--some-file", default="")
+parser.flag("quick", "be quick")
+print(json.dumps(vars(parser.parse_args())))
+"""
 
 
-def call(*words: object) -> subprocess.CompletedProcess[str]:
-    env = os.environ | {"OMP_NUM_THREADS": "1", "PYTHONPATH": str(EXPERIMENTS.parent)}
-    return subprocess.run([sys.executable, *map(str, words)], capture_output=True, text=True, env=env, check=False)
+def surroundings(**given: str) -> dict[str, str]:
+    """Environment of a script, without options that someone has set."""
+    kept = {k: v for k, v in os.environ.items() if not k.startswith(("TORCHDLO_BENCH_ROD_", PREFIX))}
+    return kept | {"OMP_NUM_THREADS": "1", "PYTHONPATH": str(EXPERIMENTS.parent)} | given
+
+
+def call(*words: object, **given: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, *map(str, words)]
+    return subprocess.run(command, capture_output=True, text=True, env=surroundings(**given), check=False)
+
+
+@pytest.fixture
+def probe(tmp_path: Path):
+    """Return a function that runs a script with one option of each kind."""
+    script = tmp_path / "probe.py"
+    script.write_text(f"import sys\nsys.path.insert(0, {str(EXPERIMENTS)!r})\n{PROBE}")
+
+    def run(*words: str, **given: str) -> subprocess.CompletedProcess[str]:
+        return call(script, *words, **{PREFIX + name: value for name, value in given.items()})
+
+    return run
 
 
 @pytest.mark.parametrize("script", SCRIPTS)
 def test_scripts_explain_themselves(script: str) -> None:
     done = call(EXPERIMENTS / script, "--help")
     assert done.returncode == 0 and "usage" in done.stdout.lower(), done.stderr
+    assert f"TORCHDLO_{Path(script).stem.upper()}_SMOKE" in done.stdout
+
+
+def test_the_command_line_wins_over_the_environment_and_that_over_the_default(probe) -> None:
+    default = {"workers": 2, "noise": 0.5, "some_file": "", "quick": False}
+    assert json.loads(probe().stdout) == default
+    given = {"WORKERS": "3", "NOISE": "-1e-3", "SOME_FILE": "-a b", "QUICK": "true"}
+    assert json.loads(probe(**given).stdout) == {"workers": 3, "noise": -1e-3, "some_file": "-a b", "quick": True}
+    done = probe("--workers", "4", "--noise=-2", "--some-file", "", "--no-quick", **given)
+    assert json.loads(done.stdout) == {"workers": 4, "noise": -2.0, "some_file": "", "quick": False}
+    assert json.loads(probe("--quick", QUICK="off").stdout)["quick"]
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [(name, value) for name, bad in BAD.items() for value in bad],
+)
+def test_malformed_environment_is_refused_by_name(probe, name: str, value: str) -> None:
+    done = probe(**{name: value})
+    assert done.returncode == 2 and not done.stdout
+    assert f"{PREFIX}{name}={value}" in done.stderr and "Traceback" not in done.stderr, done.stderr
+    assert probe(f"--{name.lower()}", *["1"] * (name != "QUICK"), **{name: value}).returncode == 0
 
 
 def test_the_rod_benchmark_writes_its_rows(tmp_path: Path) -> None:
-    target = tmp_path / "rod.json"
-    done = call(EXPERIMENTS / "bench_rod.py", "--smoke", "--json", target)
+    target = tmp_path / "results" / "rod.json"
+    done = call(EXPERIMENTS / "bench_rod.py", "--json", target, TORCHDLO_BENCH_ROD_SMOKE="1")
     assert done.returncode == 0, done.stderr
-    (row,) = json.loads(target.read_text())["rows"]
-    wanted = {"scenes", "vertices", "mode", "dtype", "compiled", "frames_per_s", "peak_mb"}
-    assert wanted <= set(row) and row["frames_per_s"] > 0 and row["finite"]
+    rows = json.loads(target.read_text())["rows"]
+    assert [row["mode"] for row in rows] == ["forward", "forward+backward"]
+    for row in rows:
+        assert {"scenes", "vertices", "dtype", "compiled"} <= set(row)
+        assert row["frames_per_s"] > 0 and row["peak_mb"] > 10
+    assert [p.name for p in target.parent.iterdir()] == [target.name]
+
+
+def test_the_rod_benchmark_refuses_parts_that_it_does_not_have() -> None:
+    done = call(EXPERIMENTS / "bench_rod.py", TORCHDLO_BENCH_ROD_ONLY="rows,bread")
+    assert done.returncode == 2 and "rows,bread" in done.stderr and "Traceback" not in done.stderr
+
+
+def test_an_interrupted_rod_benchmark_keeps_its_rows(tmp_path: Path) -> None:
+    target = tmp_path / "rod.json"
+    process = subprocess.Popen(
+        [sys.executable, str(EXPERIMENTS / "bench_rod.py"), "--smoke", "--json", str(target)],
+        env=surroundings(),
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        start_new_session=True,
+    )
+    while process.poll() is None and not target.exists():
+        time.sleep(0.02)
+    os.killpg(process.pid, signal.SIGINT)  # the second row has to load torch first, which takes seconds
+    _, error = process.communicate(timeout=60)
+    assert process.returncode == 130 and b"Traceback" not in error, error.decode()
+    assert len(json.loads(target.read_text())["rows"]) == 1
