@@ -6,6 +6,8 @@ import torch
 
 from torchdlo.physics import effect, rod, tree
 from torchdlo.physics.effects import EFFECTS
+from torchdlo.physics.effects.grip import GripperCompliance
+from torchdlo.physics.effects.measure import Track
 from torchdlo.scene import Rope, default_values, make
 
 F64 = torch.float64
@@ -19,7 +21,19 @@ ACTIVE = {
     "rest_curvature": {"curvature": (0.8, -0.4)},
     "nonuniform_stiffness": {"position": 0.4, "width": 0.2, "factor": 0.5, "slope": 0.3},
     "point_mass": {"position": 0.23, "mass": 0.1},
+    "wind": {"velocity": (1.5, -0.7, 0.4), "c_d": 1.1},
+    "tilted_gravity": {"angles": (0.1, -0.15), "acceleration": (0.3, 0.2, -9.7)},
+    "stretch": {"EA": 80.0},
+    "internal_friction": {"moment": 1e-3, "kappa_c": 0.8},
+    "stiffening_bending": {"c": 0.02},
+    "anisotropic_bending": {"ratio": 2.5, "direction": 0.4},
+    "gripper_compliance": {"stiffness": 0.02},
+    "link_chain": {"length": 0.05},
+    "time_delay": {"delay": 0.013},
+    "marker_offset": {"offset": (0.01, -0.02)},
 }
+# Effects that need static choices.
+INSTANCES = {"gripper_compliance": GripperCompliance(hinges=(1,))}
 
 
 def ropes(batch: tuple[int, ...] = (), seed: int = 0, dtype=F64) -> list[Rope]:
@@ -54,7 +68,7 @@ def scene(name: str, batch: tuple[int, ...] = (), seed: int = 0, dtype=F64, give
     """Scene, parameters and state in which the one effect acts."""
     made, params, state = make(
         given or ropes(batch, seed, dtype),
-        [EFFECTS[name]()],
+        [INSTANCES.get(name) or EFFECTS[name]()],
         {EFFECTS[name].name: ACTIVE.get(name, {})},
         constrained=False,
         check=False,
@@ -69,22 +83,60 @@ def scene(name: str, batch: tuple[int, ...] = (), seed: int = 0, dtype=F64, give
     return made, params, tree.replace(state, rods=tree.replace(r, pos=pos, twist=twist, twist_rate=rate))
 
 
+def remembering(made, params, state, values):
+    """The state with what the effect remembers of the same ropes a moment earlier."""
+    one, r = made.effects[0], state.rods
+    if not one.memory:
+        return state
+    earlier = tree.replace(r, pos=r.pos - 0.02 * r.vel, twist=r.twist - 0.1 * r.twist_rate, vel=0.9 * r.vel)
+    seen = one.remember(rod.view(made.topology, params.rods, earlier, made.dt), values)
+    seen = one.remember(rod.view(made.topology, params.rods, tree.replace(r, memory={one.name: seen}), made.dt), values)
+    pos, rate = r.pos + 0.02 * r.vel.flip(-2), r.twist + 0.1 * r.twist_rate.flip(-2)
+    return tree.replace(state, rods=tree.replace(r, pos=pos, twist=rate, memory={one.name: seen}))
+
+
+def track(view: rod.View) -> Track:
+    """Seven frames of markers where edges begin, the first two of which are gripped."""
+    real = [slot for slot, mask in enumerate(view.topology.edge_mask()) if mask]  # others have no frame
+    time = 0.01 * torch.arange(7, dtype=view.state.pos.dtype)
+    t = time[:, None, None]
+    m1, m2, pos, vel = (x[..., real, :].unsqueeze(-3) for x in (*view.frames(), view.state.pos, view.state.vel))
+    pos = pos + t * vel + 3 * t.square() * m1
+    gripped = torch.arange(len(real)) < 2
+    return Track(time, pos, m1 + t * m2, m2 - t * m1, gripped)
+
+
+def matrix(bend: torch.Tensor) -> torch.Tensor:
+    """Bending stiffness of 1, 2 or 3 numbers as (11, 22, 12)."""
+    if bend.shape[-1] == 3:
+        return bend
+    return torch.cat([bend[..., :1], bend[..., -1:], torch.zeros_like(bend[..., :1])], -1)
+
+
 def respond(made, params, state, values=None) -> dict[str, torch.Tensor]:
-    """Everything the effect does: loads, flow, and the numbers that it alters."""
+    """Everything the effect does: loads, flow, what it remembers, shifts of markers, and the numbers it alters."""
     one = made.effects[0]
     values = params.effects[one.name] if values is None else values
     altered = one.alter(made.topology, params.rods, values)
+    state = remembering(made, params, state, values)
     view = rod.view(made.topology, altered, state.rods, made.dt)
     found = dict(effect.total([one], view, {one.name: values}))
     flow = one.flow(view, values)
     if flow is not None:
         found["flow"] = flow
+    if one.memory:
+        found["remembered"] = one.remember(view, values)
+    if one.kind == "measurement":
+        seen = track(view)
+        found["observed"] = one.observe(seen, values) - seen.pos
     for part in ("rest", "material"):
         before, after = getattr(params.rods, part), getattr(altered, part)
         for field in before.__dataclass_fields__:
-            if getattr(before, field) is not getattr(after, field):
-                found[f"altered {part}.{field}"] = getattr(after, field) - getattr(before, field)
+            old, new = getattr(before, field), getattr(after, field)
+            if old is not new:
+                old, new = (matrix(old), matrix(new)) if field == "bend" else (old, new)
+                found[f"altered {part}.{field}"] = new - old
     return found
 
 
-__all__ = ["ACTIVE", "EFFECTS", "F64", "default_values", "respond", "ropes", "scene"]
+__all__ = ["ACTIVE", "EFFECTS", "F64", "INSTANCES", "default_values", "respond", "ropes", "scene", "track"]

@@ -205,21 +205,19 @@ def hang(n_edges: int, dt: float, count: int, every: int, **choices):
     return torch.stack(seen)[every - 1 :: every].numpy(), (np.arange(n_edges + 1) - 0.5) * h
 
 
-HANGS = {
-    "60 explicit": (60, 1e-3, {"integrator": "explicit"}, 0.010),
-    "60 implicit": (60, 1e-3, {"integrator": "implicit"}, 0.010),
-    "120 implicit": (120, 1e-3, {"integrator": "implicit", "ahead": 0.0}, 0.004),
-}
+def along(found: np.ndarray, s: np.ndarray, arclength: np.ndarray) -> np.ndarray:
+    """Positions read off at given arclengths, per frame."""
+    return np.stack([[np.interp(arclength, s, p[:, c]) for c in range(3)] for p in found]).swapaxes(1, 2)
 
 
-@pytest.mark.parametrize("name", HANGS)
-def test_released_rope_falls_like_the_reference(name):
-    # D8: tip every 0.1 s of PyElastica, 0.02 up to 0.5 s; the converged run over the whole rope up to 0.5 s to
-    # O(h^2): 10 mm at
-    # 60 edges, a quarter of that and the reference's own shear and stretch (1 mm) at 120.
-    n, dt, choices, gate = HANGS[name]
-    found, s = hang(n, dt, round(0.5 / dt), round(0.05 / dt), **choices)
-    tips = found[1::2, -1][:, [0, 2]]
+@pytest.mark.parametrize("integrator", ["explicit", "implicit"])
+def test_released_rope_falls_like_the_reference(integrator):
+    # D8: tip every 0.1 s of PyElastica, 0.02 up to 0.5 s at 60 edges. Then the converged run over the whole rope every
+    # 0.05 s. At order h^2 the differences of 60 and 120 edges are three times the error left at 120 (a quarter allowed
+    # on top); where the tip whips, after 0.4 s, the order drops to 1.3 and they are 1.5 times it. The reference itself
+    # is good to 0.2 mm before and to 1 mm after: shearing and stretching stiffness 100 times that of E.
+    coarse, s = hang(60, 1e-3, 500, 50, integrator=integrator)
+    tips = coarse[1::2, -1][:, [0, 2]]
     assert np.abs(tips - np.array(TABLE)).max() < 0.02, tips
     path = REFERENCE / "swing.npz"
     if not path.exists():
@@ -227,9 +225,17 @@ def test_released_rope_falls_like_the_reference(name):
     with np.load(path) as data:
         time, arclength, converged = data["time"], data["arclength"], data["converged"]
     assert np.allclose(time[1:11], 0.05 * np.arange(1, 11))
-    at = np.stack([[np.interp(arclength, s, p[:, c]) for c in range(3)] for p in found]).swapaxes(1, 2)
-    apart = np.linalg.norm(at - converged[1:11], axis=-1).max(-1)
-    assert apart.max() < gate
+    coarse = along(coarse, s, arclength)
+    fine = along(*hang(120, 1e-3, 500, 50, integrator="implicit"), arclength)
+
+    def worst(x: np.ndarray) -> np.ndarray:
+        return np.linalg.norm(x, axis=-1).max(-1)
+
+    step, late = worst(coarse - fine), np.arange(10) >= 8
+    wanted = np.where(late, step / 1.5 + 1e-3, step / 3 * 1.25 + 2e-4)
+    found = worst(fine - converged[1:11])
+    assert (found < wanted).all(), (found, wanted)
+    assert worst(fine + (fine - coarse) / 3 - converged[1:11]).max() < 2e-3
 
 
 def recorded(name: str, dt: float, **choices):

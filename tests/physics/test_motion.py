@@ -264,7 +264,10 @@ def test_a_taut_rope_pulled_beyond_its_length_stays_finite(integrator):
     state, seen = run(scene, params, state, 140, lambda k, s: pull(k + 60, s), lambda s: bool(finite(s)))
     assert all(seen)
     assert length_error(scene, params, state) < 1e-9
-    assert speed(state) < 30
+    # The bound is that of the explicit step: at its tensions of 98 to 129 N edges give way by 0.02 m, which stores
+    # 2.3 J, and a vertex of 6.25 g with all of it runs at 27 m/s. Implicit steps allow 40 000 times the tension and
+    # shake much faster while the rope is pulled; `ahead` has calmed them by now.
+    assert speed(state) < 27
 
 
 @pytest.mark.parametrize(

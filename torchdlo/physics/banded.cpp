@@ -1,36 +1,27 @@
 // Banded LU without pivoting for many systems of one sparsity, one scene per SIMD lane.
 //
 // entries (m, batch): values that may occur in the matrix, batch innermost.
-// index (2k+1, n): which entry stands at A[i, i+d-k]; -1 is zero, -2 is one.
+// places (count, 2): entry, and where it stands in rows of 2k+1 bands, row * (2k+1) + column - row + k.
 // order (n): the place in the right-hand side of the i-th unknown of the elimination order.
 #include <cstdint>
 #include <cstdlib>
 #include <cstring>
 
-template <typename T, int W>
-static void solve_lanes(const T* entries, const int32_t* index, const int32_t* order, const T* rhs, T* out,
-                        int n, int k, int64_t batch, int64_t first, int lanes, int transpose, T* work) {
-  const int width = 2 * k + 1;
+// K is k where it is known at compile time, else 0. k rows of zeros follow the matrix, so that all loops are of length k.
+template <typename T, int W, int K>
+static void solve_lanes(const T* entries, const int32_t* places, int count, const int32_t* order, const T* rhs, T* out,
+                        int n, int half, int64_t batch, int64_t first, int lanes, T* work) {
+  const int k = K ? K : half, width = 2 * k + 1;
   T* a = work;
-  T* y = work + (size_t)n * width * W;
-  std::memset(a, 0, sizeof(T) * (size_t)n * width * W);
-  for (int d = 0; d < width; ++d) {
-    for (int i = 0; i < n; ++i) {
-      const int32_t which = index[(size_t)d * n + i];
-      if (which == -1) continue;
-      const int row = transpose ? i + d - k : i;
-      const int col = transpose ? 2 * k - d : d;
-      T* target = a + ((size_t)row * width + col) * W;
-      if (which == -2) {
-        for (int w = 0; w < W; ++w) target[w] = T(1);
-        continue;
-      }
-      const T* source = entries + (size_t)which * batch + first;
-      if (lanes == W) {
-        for (int w = 0; w < W; ++w) target[w] = source[w];
-      } else {
-        for (int w = 0; w < W; ++w) target[w] = source[w < lanes ? w : 0];
-      }
+  T* y = work + (size_t)(n + k) * width * W;
+  std::memset(a, 0, sizeof(T) * (size_t)(n + k) * (width + 1) * W);
+  for (int p = 0; p < count; ++p) {
+    const T* source = entries + (size_t)places[2 * p] * batch + first;
+    T* target = a + (size_t)places[2 * p + 1] * W;
+    if (lanes == W) {
+      for (int w = 0; w < W; ++w) target[w] = source[w];
+    } else {
+      for (int w = 0; w < W; ++w) target[w] = source[w < lanes ? w : 0];
     }
   }
   for (int i = 0; i < n; ++i) {
@@ -41,12 +32,11 @@ static void solve_lanes(const T* entries, const int32_t* index, const int32_t* o
     T* pivot_row = a + ((size_t)i * width + k) * W;
     T inverse[W];
     for (int w = 0; w < W; ++w) inverse[w] = pivot_row[w] = T(1) / pivot_row[w];
-    const int reach = n - 1 - i < k ? n - 1 - i : k;
-    for (int l = 1; l <= reach; ++l) {
+    for (int l = 1; l <= k; ++l) {
       T* row = a + ((size_t)(i + l) * width + k - l) * W;
       T factor[W];
       for (int w = 0; w < W; ++w) factor[w] = row[w] * inverse[w];
-      for (int u = 1; u <= reach; ++u)
+      for (int u = 1; u <= k; ++u)
         for (int w = 0; w < W; ++w) row[(size_t)u * W + w] -= factor[w] * pivot_row[(size_t)u * W + w];
       T* yl = y + (size_t)(i + l) * W;
       const T* yi = y + (size_t)i * W;
@@ -56,8 +46,7 @@ static void solve_lanes(const T* entries, const int32_t* index, const int32_t* o
   for (int i = n - 1; i >= 0; --i) {
     const T* pivot_row = a + ((size_t)i * width + k) * W;
     T* yi = y + (size_t)i * W;
-    const int reach = n - 1 - i < k ? n - 1 - i : k;
-    for (int u = 1; u <= reach; ++u)
+    for (int u = 1; u <= k; ++u)
       for (int w = 0; w < W; ++w) yi[w] -= pivot_row[(size_t)u * W + w] * yi[(size_t)u * W + w];
     for (int w = 0; w < W; ++w) yi[w] *= pivot_row[w];
     T* target = out + (size_t)order[i] * batch + first;
@@ -65,33 +54,41 @@ static void solve_lanes(const T* entries, const int32_t* index, const int32_t* o
   }
 }
 
-template <typename T, int W>
-static void solve_all(const T* entries, const int32_t* index, const int32_t* order, const T* rhs, T* out, int n,
-                      int k, int64_t batch, int transpose, int threads) {
+template <typename T, int W, int K>
+static void solve_all(const T* entries, const int32_t* places, int count, const int32_t* order, const T* rhs, T* out,
+                      int n, int k, int64_t batch, int threads) {
   const int64_t blocks = (batch + W - 1) / W;
 #pragma omp parallel num_threads(threads) if (threads > 1 && blocks > 1)
   {
     void* memory = nullptr;
-    if (posix_memalign(&memory, 64, sizeof(T) * (size_t)n * (2 * k + 2) * W)) std::abort();
+    if (posix_memalign(&memory, 64, sizeof(T) * (size_t)(n + k) * (2 * k + 2) * W)) std::abort();
 #pragma omp for schedule(static)
     for (int64_t block = 0; block < blocks; ++block) {
       const int64_t first = block * W;
       const int lanes = batch - first < W ? (int)(batch - first) : W;
-      solve_lanes<T, W>(entries, index, order, rhs, out, n, k, batch, first, lanes, transpose, (T*)memory);
+      solve_lanes<T, W, K>(entries, places, count, order, rhs, out, n, k, batch, first, lanes, (T*)memory);
     }
     std::free(memory);
   }
 }
 
-extern "C" {
-void solve_float(const float* entries, const int32_t* index, const int32_t* order, const float* rhs, float* out,
-                 int n, int k, int64_t batch, int transpose, int threads) {
-  if (batch == 1) solve_all<float, 1>(entries, index, order, rhs, out, n, k, batch, transpose, 1);
-  else solve_all<float, 16>(entries, index, order, rhs, out, n, k, batch, transpose, threads);
+// Open ropes have k = 1 (lengths, twist) and k = 8 (implicit steps). One scene gains nothing from knowing k.
+template <typename T, int W>
+static void solve(const T* entries, const int32_t* places, int count, const int32_t* order, const T* rhs, T* out,
+                  int n, int k, int64_t batch, int threads) {
+  if (batch == 1) solve_all<T, 1, 0>(entries, places, count, order, rhs, out, n, k, batch, 1);
+  else if (k == 1) solve_all<T, W, 1>(entries, places, count, order, rhs, out, n, k, batch, threads);
+  else if (k == 8) solve_all<T, W, 8>(entries, places, count, order, rhs, out, n, k, batch, threads);
+  else solve_all<T, W, 0>(entries, places, count, order, rhs, out, n, k, batch, threads);
 }
-void solve_double(const double* entries, const int32_t* index, const int32_t* order, const double* rhs, double* out,
-                  int n, int k, int64_t batch, int transpose, int threads) {
-  if (batch == 1) solve_all<double, 1>(entries, index, order, rhs, out, n, k, batch, transpose, 1);
-  else solve_all<double, 8>(entries, index, order, rhs, out, n, k, batch, transpose, threads);
+
+extern "C" {
+void solve_float(const float* entries, const int32_t* places, int count, const int32_t* order, const float* rhs,
+                 float* out, int n, int k, int64_t batch, int threads) {
+  solve<float, 16>(entries, places, count, order, rhs, out, n, k, batch, threads);
+}
+void solve_double(const double* entries, const int32_t* places, int count, const int32_t* order, const double* rhs,
+                  double* out, int n, int k, int64_t batch, int threads) {
+  solve<double, 8>(entries, places, count, order, rhs, out, n, k, batch, threads);
 }
 }

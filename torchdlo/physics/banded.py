@@ -34,6 +34,8 @@ class Pattern:
     """How far from the diagonal entries reach, k."""
     index: Tensor
     """Entry that stands at A[i, i+d-k] (-1: zero, -2: one) [1], int32, shape (2k+1, n)."""
+    places: tuple[Tensor, Tensor]
+    """Entry and its place among rows of 2k+1 bands, of the matrix and of its transpose [1], int32, shape (m, 2)."""
     order: Tensor
     """Place in the right-hand side of the i-th unknown of the elimination order [1], int32, shape (n,)."""
 
@@ -58,8 +60,14 @@ def make_pattern(size: int, places: Sequence[tuple[int, int, int]], order: Seque
     index = torch.full((2 * k + 1, size), -1, dtype=torch.int32)
     rows = torch.tensor([rank[r] for r, _, _ in places])
     cols = torch.tensor([rank[c] for _, c, _ in places])
-    index[cols - rows + k, rows] = torch.tensor([e for _, _, e in places], dtype=torch.int32)
-    return Pattern(k, index.contiguous(), torch.tensor(list(order), dtype=torch.int32))
+    entry = torch.tensor([e for _, _, e in places], dtype=torch.int32)
+    index[cols - rows + k, rows] = entry
+
+    def stored(rows: Tensor, cols: Tensor) -> Tensor:
+        return torch.stack([entry, (rows * 2 * k + cols + k).to(torch.int32)], -1).contiguous()
+
+    both = stored(rows, cols), stored(cols, rows)
+    return Pattern(k, index.contiguous(), both, torch.tensor(list(order), dtype=torch.int32))
 
 
 # Patterns are found by name inside the operator, so that a compiled graph holds a string instead of big constants.
@@ -104,33 +112,40 @@ def kernel() -> ctypes.CDLL | None:
             os.replace(fresh, target)
     library = ctypes.CDLL(str(target))
     for name in ("solve_float", "solve_double"):
-        getattr(library, name).argtypes = (
-            [ctypes.c_void_p] * 5 + [ctypes.c_int] * 2 + [ctypes.c_int64] + [ctypes.c_int] * 2
-        )
+        getattr(library, name).argtypes = [
+            *(ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_void_p),
+            *(ctypes.c_int, ctypes.c_int, ctypes.c_int64, ctypes.c_int),
+        ]
         getattr(library, name).restype = None
     return library
 
 
-def _solve_cpu(entries: Tensor, rhs: Tensor, name: str, transpose: bool) -> Tensor:
+@functools.lru_cache(maxsize=1024)
+def _prepared(name: str, transpose: bool, double: bool) -> Callable[..., None] | None:
+    """Return the kernel for a pattern as a function of addresses (entries, rhs, out), batch and threads."""
     library = kernel()
-    if library is None or rhs.dtype not in (torch.float32, torch.float64):
-        return solve_dense(entries, rhs, name, transpose)
+    if library is None:
+        return None
     shape = pattern(name)
+    call, places = library.solve_double if double else library.solve_float, shape.places[int(transpose)]
+    at, count, order = places.data_ptr(), places.shape[0], shape.order.data_ptr()
+    n, k = shape.size, shape.half_bandwidth
+
+    # The default argument keeps the tensors behind the addresses.
+    def run(entries: int, rhs: int, out: int, batch: int, threads: int, _kept: Pattern = shape) -> None:
+        call(entries, at, count, order, rhs, out, n, k, batch, threads)
+
+    return run
+
+
+def _solve_cpu(entries: Tensor, rhs: Tensor, name: str, transpose: bool) -> Tensor:
+    dtype = rhs.dtype
+    run = _prepared(name, transpose, dtype == torch.float64) if dtype in (torch.float32, torch.float64) else None
+    if run is None:
+        return solve_dense(entries, rhs, name, transpose)
     entries, rhs = entries.contiguous(), rhs.contiguous()
     out = rhs.new_empty(rhs.shape)
-    call = library.solve_double if rhs.dtype == torch.float64 else library.solve_float
-    call(
-        entries.data_ptr(),
-        shape.index.data_ptr(),
-        shape.order.data_ptr(),
-        rhs.data_ptr(),
-        out.data_ptr(),
-        shape.size,
-        shape.half_bandwidth,
-        rhs.shape[1],
-        int(transpose),
-        torch.get_num_threads(),
-    )
+    run(entries.data_ptr(), rhs.data_ptr(), out.data_ptr(), rhs.shape[1], torch.get_num_threads())
     return out
 
 
@@ -166,13 +181,15 @@ def solve_dense(entries: Tensor, rhs: Tensor, name: str, transpose: bool) -> Ten
 
 
 _library = torch.library.Library("torchdlo", "FRAGMENT")
-_library.define(
-    "solve_banded(Tensor entries, Tensor rhs, str pattern, bool transpose) -> Tensor",
-    tags=(torch.Tag.needs_contiguous_strides,),
-)
-_library.impl("solve_banded", _solve_cpu, "CPU")
-_library.impl("solve_banded", _solve_cuda, "CUDA")
-_library.impl("solve_banded", lambda entries, rhs, pattern, transpose: rhs.new_empty(rhs.shape), "Meta")
+# Without derivative a call costs a third less.
+for _op in ("solve_banded", "solve_banded_plain"):
+    _library.define(
+        f"{_op}(Tensor entries, Tensor rhs, str pattern, bool transpose) -> Tensor",
+        tags=(torch.Tag.needs_contiguous_strides,),
+    )
+    _library.impl(_op, _solve_cpu, "CPU")
+    _library.impl(_op, _solve_cuda, "CUDA")
+    _library.impl(_op, lambda entries, rhs, pattern, transpose: rhs.new_empty(rhs.shape), "Meta")
 
 
 def _save(ctx, inputs, output) -> None:
@@ -202,4 +219,6 @@ def solve(entries: Tensor, rhs: Tensor, name: str) -> Tensor:
         rhs: right-hand sides, shape (n, batch).
         name: a registered pattern.
     """
-    return torch.ops.torchdlo.solve_banded(entries.detach(), rhs, name, False)
+    if torch.is_grad_enabled() and rhs.requires_grad:
+        return torch.ops.torchdlo.solve_banded(entries.detach(), rhs, name, False)
+    return torch.ops.torchdlo.solve_banded_plain(entries.detach(), rhs, name, False)

@@ -5,12 +5,19 @@ from __future__ import annotations
 from abc import ABC
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import TYPE_CHECKING, ClassVar, Literal
 
 from torch import Tensor
 
+from torchdlo.physics import tree
 from torchdlo.physics.rod import RodParams, View
 from torchdlo.physics.topology import Topology
+
+if TYPE_CHECKING:
+    from torchdlo.physics.effects.measure import Track
+
+KINDS = ("force", "material", "boundary", "measurement")
+"""What an effect can be: a load from outside, a law of the rope, of how it is held, or of how it is measured."""
 
 Values = dict[str, Tensor]
 """Numbers of one effect by name, each (..., 1, C): shared along the rod; or its history, or its loads."""
@@ -30,6 +37,8 @@ LOADS = {
     "twist_hessian": "Second derivatives of an energy by the twists (before, before), (before, after), (after, after) "
     "of each hinge, without their part that may be negative [N m], shape (..., V, 3).",
     "twist_geometry": "That part of (before, before) and (after, after) [N m], shape (..., V, 2).",
+    "twist_skew": "For moments without an energy: by how much the slope (before, after) is above (after, before), "
+    "halved [N m], shape (..., V, 1).",
 }
 """What an effect may return. Those "for implicit steps" say how the loads answer to motion; they change the step, not
 the equations that it solves, and explicit steps leave them out unless they are drags."""
@@ -47,12 +56,27 @@ class Param:
     """Greatest sensible value."""
     unit: str
     """SI unit, "1" if it has none."""
-    scale: Literal["log", "linear"]
-    """How it is searched: by factors or by differences."""
+    scale: Literal["log", "linear", "reciprocal"]
+    """How it is searched: by factors, by differences, or by differences of one over it (a stiffness of springs in
+    series, whose off value is a huge one that stands for infinity)."""
     off: float | None
     """Value at which the effect does nothing, None if this number does not switch it."""
     doc: str
     """What it is, in one sentence."""
+    periodic: bool = False
+    """Whether its least and its greatest value mean the same, as those of an angle may."""
+
+    def coordinate(self, value: Tensor) -> Tensor:
+        """Return what `scale` searches in place of the value."""
+        if self.scale == "linear":
+            return value
+        return value.log() if self.scale == "log" else 1 / value
+
+    def value(self, coordinate: Tensor) -> Tensor:
+        """Return the value at a coordinate."""
+        if self.scale == "linear":
+            return coordinate
+        return coordinate.exp() if self.scale == "log" else 1 / coordinate
 
     @property
     def size(self) -> int:
@@ -60,15 +84,48 @@ class Param:
         return len(self.default) if isinstance(self.default, tuple) else 1
 
 
+@tree.struct
+class Motion:
+    """Where vertices would go in a substep."""
+
+    change: Tensor
+    """By how much they would move, with the tension of the last substep [m], shape (..., V, 3)."""
+    mobility: Tensor
+    """By how much a force moves a vertex along each axis if it is not held [m/N], shape (..., V, 3)."""
+    answer: Tensor
+    """The same, 0 if it is held [m/N], shape (..., V, 3)."""
+
+
 class Effect(ABC):
-    """A force law, a constitutive law, or a property of the rods. Subclasses are frozen dataclasses and final."""
+    """A force law, a law of the rods, of their grips or of their markers. Subclasses are frozen dataclasses and final.
+
+    Effects that are combined add their loads; properties that several alter go from one to the next.
+    """
 
     name: ClassVar[str]
     """Name in scenes, parameter trees and findings."""
+    kind: ClassVar[Literal["force", "material", "boundary", "measurement"]]
+    """What it is, see `KINDS`."""
     params: ClassVar[dict[str, Param]] = {}
     """Its numbers."""
     frames: ClassVar[bool] = False
     """Whether it reads the material frames or exerts torques about the edges' axes."""
+    frame_bending: ClassVar[bool] = False
+    """Whether it changes what only `BendFrame` reads: natural curvature, or stiffness by direction."""
+    settles: ClassVar[bool] = False
+    """Whether its torques take part in quasistatic twist."""
+    memory: ClassVar[int] = 0
+    """How many numbers per slot it remembers from substep to substep. They are 0 at the start."""
+    reacts: ClassVar[bool] = False
+    """Whether it has `react`, and with it `survey` and `shortfall`."""
+    rounds: int = 1
+    """How often per substep it reacts, each time to the motion that the lengths of the edges leave."""
+    last: ClassVar[bool] = False
+    """Whether it alters or observes what the other effects have made, wherever it is listed."""
+
+    def check(self, topology: Topology) -> None:
+        """Raise a `ValueError` if its static choices do not fit the rods."""
+        return
 
     def alter(self, topology: Topology, params: RodParams, values: Values) -> RodParams:
         """Return the rods' parameters as this effect changes them: rest shape, stiffness, mass."""
@@ -81,6 +138,50 @@ class Effect(ABC):
     def flow(self, view: View, values: Values) -> Tensor | None:
         """Return the change of `RodState.plastic` over the substep, shape (..., V, 2), if the effect causes one."""
         return None
+
+    def remember(self, view: View, values: Values) -> Tensor:
+        """Return what it remembers of the view, shape (..., V, memory); asked only if `memory` is not 0."""
+        return view.state.memory[self.name]
+
+    def observe(self, track: Track, values: Values) -> Tensor:
+        """Return where markers are seen [m], shape (..., F, M, 3)."""
+        return track.pos
+
+    def survey(self, view: View, carried: Tensor) -> Values:
+        """Return what it looks up once per step and finds among its numbers in every substep of it.
+
+        Args:
+            view: the rods when the step begins; its dt is the whole step.
+            carried: how far held vertices are moved in it [m], shape (..., H, 3).
+        """
+        return {}
+
+    def shortfall(self, pos: Tensor, values: Values) -> Tensor:
+        """Return what the survey had no room for [1] and by how much it was outrun [m], shape (..., 1, 2)."""
+        return pos.new_zeros(1, 2)
+
+    def react(self, view: View, motion: Motion, values: Values) -> Tensor:
+        """Return forces on vertices that answer to where they would go [N], shape (..., V, 3)."""
+        return view.state.pos.new_zeros(1, 3)
+
+
+def _in_order(effects: Iterable[Effect]) -> list[Effect]:
+    effects = list(effects)
+    return [e for e in effects if not e.last] + [e for e in effects if e.last]
+
+
+def altered(effects: Iterable[Effect], topology: Topology, params: RodParams, values: dict[str, Values]) -> RodParams:
+    """Return the rods' parameters as all effects together change them."""
+    for effect in _in_order(effects):
+        params = effect.alter(topology, params, values.get(effect.name, {}))
+    return params
+
+
+def observed(effects: Iterable[Effect], track: Track, values: dict[str, Values]) -> Tensor:
+    """Return where markers are seen under all effects together [m], shape (..., F, M, 3)."""
+    for effect in _in_order(effects):
+        track = tree.replace(track, pos=effect.observe(track, values.get(effect.name, {})))
+    return track.pos
 
 
 def total(effects: Iterable[Effect], view: View, params: dict[str, Values]) -> Values:

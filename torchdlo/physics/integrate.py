@@ -10,6 +10,7 @@ strain at the end of the substep, which damps axial waves), and `ahead` above ze
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 
 import torch
@@ -17,7 +18,7 @@ from torch import Tensor
 
 from torchdlo.physics import effect, rod, rotation, tree
 from torchdlo.physics.constrain import Inertia, Lengths, balance, project, solve_slots
-from torchdlo.physics.effect import Effect, Values
+from torchdlo.physics.effect import Effect, Motion, Values
 from torchdlo.physics.numerics import wrap
 from torchdlo.physics.rod import RodParams, RodState, View
 from torchdlo.physics.topology import Topology, following
@@ -44,6 +45,8 @@ class Settings:
     """Edges whose material frame is prescribed."""
     newton: int = 3
     """Newton steps for lengths."""
+    settling: int = 4
+    """Newton steps for quasistatic twist."""
     gamma: float = 0.3
     """Share of dt^2 times stiffness that counts as inertia in "implicit"."""
     ahead: float = 0.0
@@ -102,18 +105,21 @@ def substep(
             shape (..., 1, 1).
     """
     topology, dt = settings.topology, settings.dt
-    for each in settings.effects:
-        params = each.alter(topology, params, values.get(each.name, {}))
+    params = effect.altered(settings.effects, topology, params, values)
     now = rod.view(topology, params, state, dt)
     loads = effect.total(settings.effects, now, values)
-    pos, tension = _translate(settings, now, loads, targets, first)
+    kick = _kick(settings, now, loads, first)
+    pos, tension = _answered(settings, now, loads, values, kick, targets)
     fields: dict[str, Tensor] = {"pos": pos, "tension": tension}
     half = torch.exp(-0.5 * dt * loads["rate"]) if "rate" in loads else 1.0
     fields["vel"] = (pos - state.pos) / dt * half
     for each in settings.effects:
         change = each.flow(now, values.get(each.name, {}))
         if change is not None:
-            fields["plastic"] = state.plastic + change
+            fields["plastic"] = fields.get("plastic", state.plastic) + change
+    remembering = [e for e in settings.effects if e.memory]
+    if remembering:
+        fields["memory"] = {e.name: e.remember(now, values.get(e.name, {})) for e in remembering}
     if settings.frames:
         fields["director"], fields["ref_twist"] = rod.advance_frames(topology, params, now, pos)
     moved = tree.replace(state, **fields)
@@ -137,19 +143,68 @@ def _force(now: View, loads: Values) -> Tensor:
     return force
 
 
-def _translate(settings: Settings, now: View, loads: Values, targets: Targets, first: Tensor) -> tuple[Tensor, Tensor]:
-    """Return positions after the substep and tensions."""
-    topology, dt, state = settings.topology, settings.dt, now.state
-    rest, material = now.params.rest, now.params.material
-    force = _force(now, loads)
+@dataclass(frozen=True)
+class _Kick:
+    """What moves the vertices in a substep, but for tension and reactions."""
+
+    force: Tensor
+    """Force [N], shape (..., V, 3)."""
+    drift: Tensor
+    """Positions without any force [m], shape (..., V, 3)."""
+    scale: Tensor | float
+    """What turns force into mass times displacement [s^2], shape (..., 1, 1)."""
+    vertex: Tensor
+    """Mass along the axes [kg], shape (..., V, 3)."""
+    free: Tensor
+    """1 for free, 0 for held vertices [1], shape (V, 1)."""
+
+
+def _kick(settings: Settings, now: View, loads: Values, first: Tensor) -> _Kick:
+    dt, state, material = settings.dt, now.state, now.params.material
     # v' = d (d v + s dt F / m), d half of the uniform decay, s a half in the first substep.
     half = torch.exp(-0.5 * dt * loads["rate"]) if "rate" in loads else 1.0
-    drift = state.pos + dt * half * state.vel
-    scale = dt * dt * half * (1 - 0.5 * first)
-    free = _free(settings.held_vertices, state.pos, topology.size)
     vertex = material.mass.expand_as(state.pos)
     if "drag" in loads:
         vertex = vertex + dt * loads["drag"]
+    return _Kick(
+        _force(now, loads),
+        state.pos + dt * half * state.vel,
+        dt * dt * half * (1 - 0.5 * first),
+        vertex,
+        _free(settings.held_vertices, state.pos, settings.topology.size),
+    )
+
+
+def _answered(
+    settings: Settings, now: View, loads: Values, values: dict[str, Values], kick: _Kick, targets: Targets
+) -> tuple[Tensor, Tensor]:
+    """Return positions and tensions where effects answer to the motion: foreseen with the last tension, then found."""
+    reacting = [e for e in settings.effects if e.reacts]
+    if not reacting:
+        return _translate(settings, now, loads, kick, targets, now.state.tension)
+    firm, tension = kick.vertex, now.state.tension
+    if settings.integrator == "implicit" and "stiffness" in loads:
+        firm = firm + settings.gamma * settings.dt**2 * loads["stiffness"]
+    mobility = (kick.scale / firm).expand_as(firm)
+    answer = mobility * kick.free
+    pull = tension * now.params.rest.edge_mask * now.tangent
+    aimed = kick.drift + answer * (kick.force + pull - now.prev(pull))
+    aimed = _spread(targets.pos, settings.held_vertices, settings.topology.size, aimed)
+    for _ in range(max(e.rounds for e in reacting)):
+        motion = Motion(aimed - now.state.pos, mobility, answer)
+        reaction = sum(e.react(now, motion, values[e.name]) for e in reacting)
+        pushed = dataclasses.replace(kick, force=kick.force + reaction)
+        pos, tension = _translate(settings, now, loads, pushed, targets, tension)
+        aimed = pos - answer * reaction
+    return pos, tension
+
+
+def _translate(
+    settings: Settings, now: View, loads: Values, kick: _Kick, targets: Targets, tension: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Return positions after the substep and tensions, whose first guess is given."""
+    topology, dt, state = settings.topology, settings.dt, now.state
+    rest, material, free = now.params.rest, now.params.material, kick.free
     active = rest.edge_mask * (1 - (1 - free) * (1 - following(topology, free)))
     lightest = torch.minimum(material.mass, following(topology, material.mass)).detach()
     lengths = Lengths(
@@ -162,13 +217,13 @@ def _translate(settings: Settings, now: View, loads: Values, targets: Targets, f
         1e4 if settings.integrator == "implicit" else 0.25,
     )
     if settings.integrator == "implicit":
-        moved = _spread(targets.pos, settings.held_vertices, topology.size, drift)
-        return _balance(settings, now, loads, lengths, vertex, force, moved, free, scale)
-    answer = scale / vertex * free
-    moved = _spread(targets.pos, settings.held_vertices, topology.size, drift + answer * force)
+        moved = _spread(targets.pos, settings.held_vertices, topology.size, kick.drift)
+        return _balance(settings, now, loads, lengths, kick, moved, tension)
+    answer = kick.scale / kick.vertex * free
+    moved = _spread(targets.pos, settings.held_vertices, topology.size, kick.drift + answer * kick.force)
     if not settings.constrained:
         return moved, state.tension
-    return project(lengths, moved, answer, now.tangent, state.tension, settings.newton - 1)
+    return project(lengths, moved, answer, now.tangent, tension, settings.newton - 1)
 
 
 def _balance(
@@ -176,14 +231,12 @@ def _balance(
     now: View,
     loads: Values,
     lengths: Lengths,
-    vertex: Tensor,
-    force: Tensor,
+    kick: _Kick,
     moved: Tensor,
-    free: Tensor,
-    scale: Tensor,
+    tension: Tensor,
 ) -> tuple[Tensor, Tensor]:
     """Return positions and tensions of an implicit substep; arguments as in `constrain.balance`."""
-    topology, dt, rest = settings.topology, settings.dt, now.params.rest
+    topology, dt, rest, vertex = settings.topology, settings.dt, now.params.rest, kick.vertex
     if "stiffness" in loads:
         vertex = vertex + settings.gamma * dt * dt * loads["stiffness"]
     # Stiff forces are taken at x + ahead dt v; `share` is their answer to the change of v.
@@ -193,11 +246,11 @@ def _balance(
     if "hinge_drag" in loads:
         hinge = hinge + 0.5 * dt * loads["hinge_drag"]
     inertia = Inertia(vertex, hinge, rest.length, rest.edge_mask)
-    force = force - tree.replace(inertia, hinge=stiff).bending(topology, lead)
+    force = kick.force - tree.replace(inertia, hinge=stiff).bending(topology, lead)
     ahead = (now.next(lead) - lead) / rest.length
-    scale = scale.expand_as(now.length[..., :1, :])
+    scale = kick.scale.expand_as(now.length[..., :1, :])
     return balance(
-        lengths, inertia, moved, free, force, scale, now.tangent, ahead, now.state.tension, share, settings.newton - 1
+        lengths, inertia, moved, kick.free, force, scale, now.tangent, ahead, tension, share, settings.newton - 1
     )
 
 
@@ -249,14 +302,25 @@ def _turn(settings: Settings, now: View, loads: Values, moved: RodState, targets
 
 
 def settle_twist(
-    settings: Settings, params: RodParams, values: dict[str, Values], state: RodState, targets: Targets, steps: int = 4
+    settings: Settings,
+    params: RodParams,
+    values: dict[str, Values],
+    state: RodState,
+    targets: Targets,
+    steps: int | None = None,
 ) -> RodState:
     """Return the state with twists at which no free edge feels a torque (Newton steps from the last ones).
 
     Bergou 2008, section 4.2: twist waves are much faster than bending, so twist is taken to be in balance.
     """
     topology = settings.topology
-    effects = [e for e in settings.effects if e.name in ("bend", "twist")]
+    effects = [e for e in settings.effects if e.settles]
+    if all(e.name == "twist" for e in effects):
+        # Its torque is linear in the twists: one step is exact.
+        steps = 1
+    elif steps is None:
+        # What depends on the path answers to the direction of a small change: Newton's method begins to converge later.
+        steps = settings.settling + (2 if any(e.memory for e in effects) else 0)
     free = _free(settings.held_edges, state.pos, topology.size) * params.rest.edge_mask
 
     def newton(angle: Tensor, state: RodState, exact: bool) -> Tensor:
@@ -269,10 +333,15 @@ def settle_twist(
                 # and in the last step it makes the derivative exact.
                 bent = loads["twist_geometry"] if exact else loads["twist_geometry"].clamp(min=0.0)
                 same = same + bent[..., 1:] + here.next(bent[..., :1])
+            skew = loads.get("twist_skew", torch.zeros_like(after))
             # A tiny spring on every edge: a rod free at both ends may spin as a whole.
             same = same + 1e-9 * same.amax(-2, keepdim=True)
         return angle + solve_slots(
-            topology, free * same + 1 - free, free * after, free * here.prev(after), loads["torque"] * free
+            topology,
+            free * same + 1 - free,
+            free * (after + here.next(skew)),
+            free * (here.prev(after) - skew),
+            loads["torque"] * free,
         )
 
     angle = _prescribed(settings, params, state, targets, state.twist)

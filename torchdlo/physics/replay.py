@@ -76,6 +76,19 @@ def _finish(outputs: tuple[Tensor, ...], shape: list[Any]) -> Any:
     return shape[0](outputs)
 
 
+def alike(state: Any, others: Any) -> Any:
+    """Let every tensor of `state` need a gradient if any tensor of it or of `others` does.
+
+    Compiled steps are made for which of their inputs need one; in a rollout, first steps are then as all later ones.
+    """
+    own = tree.leaves(state)
+    if all(x.requires_grad for x in own):
+        return state
+    if not any(x.requires_grad for x in (*own, *tree.leaves(others))):
+        return state
+    return tree.map(lambda x: x if x.requires_grad else x.detach().requires_grad_(), state)
+
+
 def rollout(
     step: Callable[[Any, Any, Any], Any],
     params: Any,

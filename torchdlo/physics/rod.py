@@ -6,7 +6,7 @@ Bergou et al. 2008, doi:10.1145/1360612.1360662 (rods, frames); Bergou et al. 20
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
@@ -36,6 +36,8 @@ class RodState:
     """Plastic part of the natural curvature, as `RodRest.curvature` [1], shape (..., V, 2)."""
     tension: Tensor
     """Tension of edges whose length is a constraint, positive when pulled [N], shape (..., V, 1)."""
+    memory: dict[str, Tensor] = field(default_factory=dict)
+    """What effects remember, by their name, in units of their own; shape (..., V, C) each."""
 
 
 @tree.struct
@@ -61,7 +63,8 @@ class Material:
     stretch: Tensor
     """Axial stiffness EA of edges [N], shape (..., V or 1, 1); infinite where the length is fixed."""
     bend: Tensor
-    """Bending stiffness EI of hinges [N m^2], shape (..., V or 1, 1), or 2 for the two material directions."""
+    """Bending stiffness EI of hinges [N m^2], shape (..., V or 1, 1); or 2 for bending towards the two material
+    directors, or 3: these two and the one that couples them."""
     twist: Tensor
     """Twisting stiffness GJ of hinges [N m^2], shape (..., V or 1, 1)."""
     mass: Tensor

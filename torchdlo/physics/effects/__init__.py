@@ -4,14 +4,19 @@ from __future__ import annotations
 
 from torchdlo.physics.effect import Effect
 from torchdlo.physics.effects.elastic import Bend, BendFrame, Stretch, Twist
-from torchdlo.physics.effects.field import AirDrag, Damping, Gravity
+from torchdlo.physics.effects.field import AirDrag, Damping, Gravity, TiltedGravity, Wind
+from torchdlo.physics.effects.grid import LinkChain
+from torchdlo.physics.effects.grip import GripperCompliance
+from torchdlo.physics.effects.hinge import AnisotropicBending, InternalFriction, StiffeningBending
 from torchdlo.physics.effects.material import (
+    AxialStiffness,
     BendingDamping,
     BendingPlasticity,
     NonuniformStiffness,
     PointMass,
     RestCurvature,
 )
+from torchdlo.physics.effects.measure import MarkerOffset, TimeDelay
 from torchdlo.physics.effects.table import Table, TableFriction
 
 EFFECTS: dict[str, type[Effect]] = {
@@ -21,7 +26,9 @@ EFFECTS: dict[str, type[Effect]] = {
     "twist": Twist,
     "gravity": Gravity,
     "damping": Damping,
+    "tilted_gravity": TiltedGravity,
     "air_drag": AirDrag,
+    "wind": Wind,
     "table": Table,
     "table_friction": TableFriction,
     "bending_damping": BendingDamping,
@@ -29,6 +36,14 @@ EFFECTS: dict[str, type[Effect]] = {
     "rest_curvature": RestCurvature,
     "nonuniform_stiffness": NonuniformStiffness,
     "point_mass": PointMass,
+    "stretch": AxialStiffness,
+    "internal_friction": InternalFriction,
+    "stiffening_bending": StiffeningBending,
+    "anisotropic_bending": AnisotropicBending,
+    "gripper_compliance": GripperCompliance,
+    "link_chain": LinkChain,
+    "time_delay": TimeDelay,
+    "marker_offset": MarkerOffset,
 }
 
 __all__ = ["EFFECTS"]

@@ -21,6 +21,7 @@ class Stretch(Effect):
     """Axial stiffness as a force: energy EA strain^2 length / 2 per edge."""
 
     name: ClassVar[str] = "stretch_force"
+    kind: ClassVar[str] = "material"
 
     def energy(self, view: View, values: Values) -> Tensor:
         """Return the energy per edge [J], shape (..., V, 1)."""
@@ -40,10 +41,12 @@ class Bend(Effect):
     """Bending of a rod that is straight at rest and equally stiff in all directions.
 
     The energy EI |kb|^2 / (2 l) needs no material frame and does not depend on twist. Use `BendFrame` for curved rest
-    shapes, two stiffnesses, or plasticity.
+    shapes, stiffness that depends on direction, or plasticity.
     """
 
     name: ClassVar[str] = "bend"
+    kind: ClassVar[str] = "material"
+    settles: ClassVar[bool] = True
 
     def energy(self, view: View, values: Values) -> Tensor:
         """Return the energy per hinge [J], shape (..., V, 1)."""
@@ -60,7 +63,7 @@ class Bend(Effect):
         after = slope / view.length * (view.before - cosine * view.tangent)
         before = slope * (view.tangent - cosine * view.before)
         gradient = after + view.next(before) / view.length
-        return {"gradient": gradient, "hinge_stiffness": _tangent_stiffness(stiffness, (1 - cosine) / chi)}
+        return {"gradient": gradient, "hinge_stiffness": closing(stiffness, (1 - cosine) / chi)}
 
 
 @dataclass(frozen=True)
@@ -120,41 +123,77 @@ def curvature(view: View) -> Curvature:
     return Curvature(kappa, kb, (view.before + view.tangent) / chi, mean1, mean2, by_twist)
 
 
+def elastic_curvature(view: View, hinge: Curvature) -> Tensor:
+    """Return the integrated curvatures beyond the natural ones [1], shape (..., V, 2)."""
+    natural = view.params.rest.curvature + view.state.plastic
+    return (hinge.kappa - natural) * view.params.rest.hinge_mask
+
+
+def hinge_stiffness(view: View) -> Tensor:
+    """Return the bending stiffness of the hinges [N m], shape (..., V, 1, 2 or 3) as `Material.bend`."""
+    return view.params.material.bend / view.hinge_length * view.params.rest.hinge_mask
+
+
+def act(stiffness: Tensor, strain: Tensor) -> Tensor:
+    """Return the moments of strains, both shape (..., V, 2), for a stiffness (..., V, 1, 2 or 3)."""
+    if stiffness.shape[-1] < 3:
+        return stiffness * strain
+    return stiffness[..., :2] * strain + stiffness[..., 2:] * strain.flip(-1)
+
+
+def answers(hinge: Curvature, moment: Tensor, stiffness: Tensor) -> Values:
+    """Return how moments answer to the twists: parts of `LOADS` for a stiffness (..., V, 1, 2 or 3)."""
+    s1 = stiffness[..., :1]
+    s2 = s1 if stiffness.shape[-1] == 1 else stiffness[..., 1:2]
+    f1, f2 = moment[..., :1], moment[..., 1:]
+    b1, b2, a1, a2 = hinge.by_twist
+    parts = [s1 * b1 * b1 + s2 * b2 * b2, s1 * b1 * a1 + s2 * b2 * a2, s1 * a1 * a1 + s2 * a2 * a2]
+    if stiffness.shape[-1] == 3:
+        coupling = stiffness[..., 2:]
+        for k, more in enumerate((2 * b1 * b2, b1 * a2 + b2 * a1, 2 * a1 * a2)):
+            parts[k] = parts[k] + coupling * more
+    return {
+        "twist_hessian": torch.cat(parts, -1),
+        "twist_geometry": torch.cat([f1 * b2 - f2 * b1, f1 * a2 - f2 * a1], -1),
+    }
+
+
+def greatest(stiffness: Tensor) -> Tensor:
+    """Return a bound on the stiffness over all directions, exact without coupling; shape (..., V, 1)."""
+    if stiffness.shape[-1] == 1:
+        return stiffness
+    most = torch.maximum(stiffness[..., :1], stiffness[..., 1:2])
+    return most + stiffness[..., 2:].abs() if stiffness.shape[-1] == 3 else most
+
+
 @dataclass(frozen=True)
 class BendFrame(Effect):
-    """Bending with rest curvature, two stiffnesses and plastic curvature, in the material frame."""
+    """Bending with rest curvature, stiffness that depends on direction, and plastic curvature, in the material frame.
+
+    The stiffness may be one number, one for bending towards each director, or a symmetric matrix of both.
+    """
 
     name: ClassVar[str] = "bend"
+    kind: ClassVar[str] = "material"
     frames: ClassVar[bool] = True
-
-    def strain(self, view: View) -> Tensor:
-        """Return the elastic part of the integrated curvatures [1], shape (..., V, 2)."""
-        natural = view.params.rest.curvature + view.state.plastic
-        return (curvature(view).kappa - natural) * view.params.rest.hinge_mask
+    settles: ClassVar[bool] = True
 
     def energy(self, view: View, values: Values) -> Tensor:
         """Return the energy per hinge [J], shape (..., V, 1)."""
-        stiffness = view.params.material.bend / view.hinge_length
-        return 0.5 * (stiffness * self.strain(view).square()).sum(-1, keepdim=True)
+        strain = elastic_curvature(view, curvature(view))
+        return 0.5 * dot(act(hinge_stiffness(view), strain), strain)
 
     def loads(self, view: View, values: Values) -> Values:
         """Return gradients by the edges and torques."""
         hinge = curvature(view)
-        stiffness = view.params.material.bend / view.hinge_length * view.params.rest.hinge_mask
+        stiffness = hinge_stiffness(view)
         natural = view.params.rest.curvature + view.state.plastic
-        moment = stiffness * (hinge.kappa - natural)
-        loads = hinge.pull_back(view, moment)
-        s1, s2 = stiffness[..., :1], stiffness[..., -1:]
-        f1, f2 = moment[..., :1], moment[..., 1:]
-        b1, b2, a1, a2 = hinge.by_twist
+        moment = act(stiffness, hinge.kappa - natural)
         curved = dot(hinge.binormal, hinge.binormal) / 4
         return {
-            **loads,
-            "hinge_stiffness": _tangent_stiffness(torch.maximum(s1, s2), curved),
-            "twist_hessian": torch.cat(
-                [s1 * b1 * b1 + s2 * b2 * b2, s1 * b1 * a1 + s2 * b2 * a2, s1 * a1 * a1 + s2 * a2 * a2], -1
-            ),
-            "twist_geometry": torch.cat([f1 * b2 - f2 * b1, f1 * a2 - f2 * a1], -1),
+            **hinge.pull_back(view, moment),
+            **answers(hinge, moment, stiffness),
+            "hinge_stiffness": closing(greatest(stiffness), curved),
         }
 
 
@@ -163,7 +202,9 @@ class Twist(Effect):
     """Twisting: energy GJ (twist - rest twist)^2 / (2 l) per hinge."""
 
     name: ClassVar[str] = "twist"
+    kind: ClassVar[str] = "material"
     frames: ClassVar[bool] = True
+    settles: ClassVar[bool] = True
 
     def strain(self, view: View) -> Tensor:
         """Return the twist across each hinge beyond its rest value [rad], shape (..., V, 1)."""
@@ -187,7 +228,7 @@ class Twist(Effect):
         }
 
 
-def _tangent_stiffness(stiffness: Tensor, squared: Tensor) -> Tensor:
+def closing(stiffness: Tensor, squared: Tensor) -> Tensor:
     """Return the bending moment per turning, given tan^2(angle/2): it grows as the hinge closes.
 
     Second derivative of 2 k tan^2(angle/2); capped, for hinges that are folded flat.

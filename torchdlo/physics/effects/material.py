@@ -1,4 +1,4 @@
-"""Effects that change the rods themselves: natural curvature, stiffness along the rope, extra mass, inner friction."""
+"""Effects that change the rods themselves: natural curvature, stiffness along the rope, extra mass, viscous bending."""
 
 from __future__ import annotations
 
@@ -30,6 +30,8 @@ class RestCurvature(Effect):
     """Natural curvature, the same all along the rope, in the material frame. Needs `BendFrame`."""
 
     name: ClassVar[str] = "rest_curvature"
+    kind: ClassVar[str] = "material"
+    frame_bending: ClassVar[bool] = True
     params: ClassVar[dict[str, Param]] = {
         "curvature": Param((0.0, 0.0), -30.0, 30.0, "1/m", "linear", 0.0, "Curvature about the two material directors.")
     }
@@ -47,6 +49,7 @@ class NonuniformStiffness(Effect):
     """Bending stiffness times 1 + slope (s/L - 1/2) and times a soft or stiff spot (factor at its centre)."""
 
     name: ClassVar[str] = "nonuniform_stiffness"
+    kind: ClassVar[str] = "material"
     params: ClassVar[dict[str, Param]] = {
         "position": Param(0.5, 0.0, 1.0, "1", "linear", None, "Centre of the spot as a fraction of the length."),
         "width": Param(0.1, 0.02, 0.5, "1", "log", None, "Half width of the spot as a fraction of the length."),
@@ -69,6 +72,7 @@ class PointMass(Effect):
     """An extra mass at one place, shared between the two vertices next to it; it has weight and inertia."""
 
     name: ClassVar[str] = "point_mass"
+    kind: ClassVar[str] = "material"
     params: ClassVar[dict[str, Param]] = {
         "position": Param(0.5, 0.0, 10.0, "m", "linear", None, "Place along the rope."),
         "mass": Param(0.0, 0.0, 1.0, "kg", "linear", 0.0, "The extra mass."),
@@ -88,10 +92,30 @@ class PointMass(Effect):
 
 
 @dataclass(frozen=True)
+class AxialStiffness(Effect):
+    """Finite axial stiffness, in series with the one that the rope has: 1/EA adds to it."""
+
+    name: ClassVar[str] = "stretch"
+    kind: ClassVar[str] = "material"
+    params: ClassVar[dict[str, Param]] = {
+        "EA": Param(1e18, 1.0, 1e18, "N", "reciprocal", 1e18, "Axial stiffness; 1e18 stands for inextensible.")
+    }
+
+    def alter(self, topology: Topology, params: RodParams, values: Values) -> RodParams:
+        """Soften the edges."""
+        stretch, stiffness = params.material.stretch, values["EA"]
+        fixed = torch.isinf(stretch)
+        soft = torch.where(fixed, 1.0, stretch)
+        stretch = torch.where(fixed, stiffness, soft / (1 + soft / stiffness))
+        return tree.replace(params, material=tree.replace(params.material, stretch=stretch))
+
+
+@dataclass(frozen=True)
 class BendingDamping(Effect):
     """Kelvin-Voigt bending: a moment proportional to the rate of curvature."""
 
     name: ClassVar[str] = "bending_damping"
+    kind: ClassVar[str] = "material"
     frames: ClassVar[bool] = True
     params: ClassVar[dict[str, Param]] = {
         "coefficient": Param(0.0, 0.0, 1.0, "N m^2 s", "linear", 0.0, "Bending moment per rate of curvature.")
@@ -108,23 +132,32 @@ class BendingDamping(Effect):
 class BendingPlasticity(Effect):
     """Natural curvature flows towards the curvature while its elastic part is beyond yield. Needs `BendFrame`.
 
-    In a time dt the excess |k_el| - yield shrinks by exp(-rate dt), whatever the substep.
+    In a time dt the excess |d| - yield shrinks by exp(-rate dt), whatever the substep; without hardening d is the
+    elastic curvature k_el. Hardening is kinematic (Prager's rule: Simo and Hughes 1998, Computational Inelasticity,
+    chapter 1, doi:10.1007/b98904): the centre of the elastic range moves by `hardening` times the plastic
+    curvature k_p, so that d = k_el - hardening k_p. A flow by g along d lowers |d| by (1 + hardening) g; hence the full
+    return is g = (|d| - yield) / (1 + hardening). It needs no memory besides k_p, and a rod that was bent one way
+    yields sooner the other way (Bauschinger effect). Isotropic hardening would need the whole path of flow.
     """
 
     name: ClassVar[str] = "bending_plasticity"
+    kind: ClassVar[str] = "material"
+    frame_bending: ClassVar[bool] = True
     frames: ClassVar[bool] = True
     params: ClassVar[dict[str, Param]] = {
         "yield_curvature": Param(1e6, 0.1, 1e6, "1/m", "log", 1e6, "Elastic curvature beyond which it flows."),
         "rate": Param(10.0, 0.01, 1e4, "1/s", "log", None, "Rate of the flow."),
+        "hardening": Param(0.0, 0.0, 100.0, "1", "linear", None, "Growth of yield per plastic curvature."),
     }
 
     def flow(self, view: View, values: Values) -> Tensor:
         """Return the change of the plastic curvature."""
-        natural = view.params.rest.curvature + view.state.plastic
-        elastic = (curvature(view).kappa - natural) * view.params.rest.hinge_mask
-        size = elastic.square().sum(-1, keepdim=True)
+        plastic, hardening = view.state.plastic, values["hardening"]
+        natural = view.params.rest.curvature + plastic
+        driving = (curvature(view).kappa - natural - hardening * plastic) * view.params.rest.hinge_mask
+        size = driving.square().sum(-1, keepdim=True)
         limit = values["yield_curvature"] * view.hinge_length
         beyond = size > limit.square()
         share = 1 - limit / torch.where(beyond, size, 1.0).sqrt()
-        fraction = -torch.expm1(-values["rate"] * view.dt)
-        return torch.where(beyond, fraction * share, 0.0) * elastic
+        fraction = -torch.expm1(-values["rate"] * view.dt) / (1 + hardening)
+        return torch.where(beyond, fraction * share, 0.0) * driving
