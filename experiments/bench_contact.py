@@ -17,6 +17,8 @@ import time
 from pathlib import Path
 from typing import Any
 
+from options import Parser, save
+
 EXAMPLES = """examples:
   python experiments/bench_contact.py --json contact.json
   python experiments/bench_contact.py --scenes 100 --sizes ""
@@ -64,7 +66,7 @@ def pile(vertices: int) -> tuple[Any, Any, Any]:
     return scene.make([scene.Rope(x, radius=r, density=1000.0, bend=1e-5)], effects, dt=1e-3, substeps=SUBSTEPS)
 
 
-def timed(made: tuple[Any, Any, Any], backward: bool, seconds: float) -> dict[str, float]:
+def timed(made: tuple[Any, Any, Any], backward: bool, seconds: float, compiled: bool) -> dict[str, float]:
     """Return CPU seconds per frame, median of five runs after a first one."""
     import torch
 
@@ -73,7 +75,7 @@ def timed(made: tuple[Any, Any, Any], backward: bool, seconds: float) -> dict[st
 
     torch.set_num_threads(1)
     choice, params, state = made
-    step, control = scene.stepper(choice), scene.hold(choice, state)
+    step, control = scene.stepper(choice, compiled=compiled), scene.hold(choice, state)
 
     def forward(count: int) -> None:
         now = state
@@ -115,7 +117,7 @@ def timed(made: tuple[Any, Any, Any], backward: bool, seconds: float) -> dict[st
 def worker(case: dict[str, Any]) -> dict[str, Any]:
     """Time one case in this process."""
     made = pile(case["vertices"]) if case["pile"] else knotted(case["scenes"], case["contact"])
-    found = timed(made, case["backward"], case["seconds"])
+    found = timed(made, case["backward"], case["seconds"], case["compiled"])
     return case | found | {"frames_per_s_per_core": case["scenes"] / found["cpu_s_per_frame"]}
 
 
@@ -135,9 +137,8 @@ def run(case: dict[str, Any]) -> dict[str, Any]:
 
 def main() -> None:
     """Measure, print and save."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, epilog=EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = Parser(__file__, description=__doc__, epilog=EXAMPLES)
+    parser.flag("smoke", "one small case without compiling, to see that the script runs")
     parser.add_argument("--scenes", default="1,10,100", help="numbers of scenes of the knotted rope (%(default)s)")
     parser.add_argument("--sizes", default="300,1000,3000", help="vertices of the piles (%(default)s)")
     parser.add_argument("--seconds", type=float, default=2.0, help="CPU seconds per timing (%(default)s)")
@@ -148,6 +149,9 @@ def main() -> None:
         print(json.dumps(worker(json.loads(options.worker))), flush=True)
         return
     base = {"seconds": options.seconds, "pile": False, "contact": True, "backward": False, "vertices": 60, "scenes": 1}
+    base["compiled"] = True
+    if options.smoke:
+        options.scenes, options.sizes, base = "1", "", base | {"compiled": False, "seconds": 0.02}
     scenes = [int(n) for n in options.scenes.split(",") if n]
     rows = [run(base | {"scenes": n, "backward": b}) for n in reversed(scenes) for b in (False, True)]
     if scenes:
@@ -158,8 +162,7 @@ def main() -> None:
         x, y = zip(*((math.log(p["vertices"]), math.log(p["cpu_s_per_frame"])) for p in piles), strict=True)
         content["exponent"] = statistics.linear_regression(x, y).slope
         print(f"cost of a pile grows with the vertices to the power {content['exponent']:.2f}")
-    if options.json:
-        Path(options.json).write_text(json.dumps(content, indent=1) + "\n")
+    save(options.json, content)
 
 
 if __name__ == "__main__":

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 EXPERIMENTS = Path(__file__).parents[1] / "experiments"
-SCRIPTS = ["bench_rod.py", "make_reference.py", "make_sample.py", "peers.py"]
+SCRIPTS = ["bench_contact.py", "bench_rod.py", "make_reference.py", "make_sample.py", "peers.py"]
 PREFIX = "TORCHDLO_PROBE_"
 BAD = {"WORKERS": ["x", "", "0", "1.5"], "NOISE": ["much", ""], "QUICK": ["maybe", ""]}
 PROBE = """
@@ -50,6 +50,14 @@ def probe(tmp_path: Path):
         return call(script, *words, **{PREFIX + name: value for name, value in given.items()})
 
     return run
+
+
+def test_the_contact_benchmark_writes_its_rows(tmp_path: Path) -> None:
+    target = tmp_path / "contact.json"
+    done = call(EXPERIMENTS / "bench_contact.py", "--smoke", "--json", target)
+    assert done.returncode == 0, done.stderr
+    rows = json.loads(target.read_text())["rows"]
+    assert len(rows) == 3 and all(row["frames_per_s_per_core"] > 0 for row in rows)
 
 
 @pytest.mark.parametrize("script", SCRIPTS)

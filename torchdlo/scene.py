@@ -14,11 +14,13 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from torchdlo.physics import build, rod, rotation, tree
+from torchdlo.coupling import watch
+from torchdlo.coupling.watch import survey
+from torchdlo.physics import build, rod, rotation, stability, tree
 from torchdlo.physics.build import Rope
-from torchdlo.physics.effect import Effect, Values
+from torchdlo.physics.effect import Effect, Values, altered
 from torchdlo.physics.integrate import INTEGRATORS, TWISTS, Settings, Targets, settle_twist, substep
-from torchdlo.physics.replay import rollout
+from torchdlo.physics.replay import alike, rollout
 from torchdlo.physics.rod import RodParams, RodState
 from torchdlo.physics.topology import Topology
 
@@ -39,6 +41,9 @@ class State:
     rods: RodState
     time: Tensor
     """Time since the start [s], shape (..., 1, 1)."""
+    missed: Tensor
+    """Contacts that may have been missed since the start: pairs without room [1], and by how much vertices were
+    faster than foreseen [m]; zeros if all is well, shape (..., 1, 2)."""
 
 
 @tree.struct
@@ -71,8 +76,10 @@ class Scene:
     held_edges: tuple[int, ...] = ()
     newton: int = 3
     """Newton steps for edge lengths per substep."""
+    settling: int = 4
+    """Newton steps for quasistatic twist per substep, where bending has a part in it; without, one is exact."""
     gamma: float = 0.3
-    """Share of dt^2 times stiffness that counts as inertia in implicit steps."""
+    """Share of dt^2 times stiffness that counts as inertia in implicit steps; at least 0.5 where twist is dynamic."""
     ahead: float = 0.0
     """Share of a substep by which implicit steps look ahead: it damps fast modes and makes the step first order."""
 
@@ -89,6 +96,7 @@ class Scene:
             f"substeps is {self.substeps}; expected a whole number from 1 up",
         )
         need(self.newton >= 1, f"newton is {self.newton}; expected at least 1 step")
+        need(self.settling >= 1, f"settling is {self.settling}; expected at least 1 step")
         need(self.gamma >= 0.25, f"gamma is {self.gamma}; below 0.25 implicit steps are not stable")
         need(0 <= self.ahead <= 1, f"ahead is {self.ahead}; expected a share of a substep, 0 to 1")
         size = self.topology.size
@@ -130,7 +138,9 @@ class Scene:
             self.held_vertices,
             self.held_edges,
             self.newton,
-            self.gamma,
+            self.settling,
+            # Twist and bending answer to each other only in the next step: that costs stability.
+            max(self.gamma, 0.5) if self.twist == "dynamic" else self.gamma,
             self.ahead,
         )
 
@@ -164,6 +174,10 @@ def make(
     topology, rods, state = build.assemble(ropes)
     scene = Scene(topology, tuple(effects), **choices)
     numbers = {e.name: default_values(e, state.pos) for e in effects}
+    memory = {
+        e.name: tree.batch_innermost(state.pos.new_zeros(*state.pos.shape[:-1], e.memory)) for e in effects if e.memory
+    }
+    state = tree.replace(state, memory=memory)
     for effect, given in (values or {}).items():
         if effect not in numbers:
             raise ValueError(
@@ -182,76 +196,22 @@ def make(
             numbers[effect][name] = number
     params = Params(rods, numbers)
     if check:
-        _check_laws(scene, params, state)
+        stability.check_laws(scene.settings, rods, numbers, state)
         check_step(scene, params)
-    first = State(state, state.pos.new_zeros((*state.pos.shape[:-2], 1, 1)))
+    batch = state.pos.shape[:-2]
+    first = State(state, state.pos.new_zeros(*batch, 1, 1), state.pos.new_zeros(*batch, 1, 2))
     if scene.twist == "quasistatic":
         held = hold(scene, first)
-        altered = rods
-        for e in scene.effects:
-            altered = e.alter(topology, altered, numbers.get(e.name, {}))
-        settled = settle_twist(scene.settings, altered, numbers, state, Targets(held.pos, held.director), 30)
+        changed = altered(scene.effects, topology, rods, numbers)
+        settled = settle_twist(scene.settings, changed, numbers, state, Targets(held.pos, held.director), 30)
         first = tree.replace(first, rods=tree.replace(settled, twist_rate=torch.zeros_like(settled.twist)))
-    return scene, params, first
-
-
-def _check_laws(scene: Scene, params: Params, state: RodState) -> None:
-    """Raise a `ValueError` where the rods have what no effect of the scene acts on."""
-    rest, material = params.rods.rest, params.rods.material
-    kinds = {type(e).__name__ for e in scene.effects}
-    if "Bend" in kinds:
-        if material.bend.shape[-1] == 2:
-            raise ValueError("scene: a rope has bend2, which Bend leaves out; use BendFrame")
-        if bool((rest.curvature != 0).any()):
-            raise ValueError(
-                "scene: a rope is curved at rest, which Bend leaves out; use BendFrame, or rest='straight'"
-            )
-        frames = kinds & {"BendingPlasticity", "RestCurvature"}
-        if frames:
-            raise ValueError(
-                f"scene: {sorted(frames)[0]} changes the natural curvature, which Bend leaves out; use BendFrame"
-            )
-    if not scene.constrained and "Stretch" not in kinds and bool(torch.isfinite(material.stretch).any()):
-        raise ValueError("scene: stretch is given, but lengths are not constrained and no Stretch effect acts; add it")
-    if "Stretch" in kinds and not bool(torch.isfinite(material.stretch).all()):
-        raise ValueError(
-            "scene: stretch is infinite, which no force can be; give EA [N], or keep constrained=True without Stretch"
-        )
-    if scene.constrained:
-        length = rod.edge_vectors(scene.topology, state.pos.detach(), rest.edge_mask).norm(dim=-1, keepdim=True)
-        strain = ((length / rest.length.detach() - 1) * rest.edge_mask).abs().max()
-        if float(strain) > 0.1:
-            raise ValueError(
-                f"scene: a rope is placed with edges {float(strain):.0%} off their length in its rest shape; place it "
-                "at its length, or use constrained=False with a Stretch effect"
-            )
+    # No two leaves share memory: steps are compiled for which of them do, and later states have none.
+    return scene, params, tree.map(torch.clone, first)
 
 
 def limits(scene: Scene, params: Params) -> dict[str, float]:
-    """Return the largest stable substep [s] by the term that limits it.
-
-    Bending waves reach w = 4/l^2 sqrt(EI/m'), stretching waves w = 2/l sqrt(EA/m'), twist waves w = 2 sqrt(GJ/(l I));
-    Stoermer-Verlet is stable for w dt < 2. Implicit steps are limited by none of them.
-    """
-    if scene.integrator == "implicit":
-        return {}
-    rest, material = params.rods.rest, params.rods.material
-    names = {e.name for e in scene.effects}
-    real = (rest.edge_mask > 0).expand_as(rest.length)
-    length = torch.where(real, rest.length, torch.inf)
-    inner = (rest.hinge_mask > 0).expand_as(rest.length)
-    mass = torch.where(inner, material.mass, torch.inf)
-    found = {}
-    if "bend" in names:
-        bend = material.bend.amax(-1, keepdim=True)
-        found["bending"] = 0.5 * (mass * length.square().clamp(max=1e6) * length / bend).amin().sqrt()
-    if "stretch_force" in names and not scene.constrained:
-        found["stretching"] = (mass * length / material.stretch).amin().sqrt()
-    if "twist" in names and scene.twist == "dynamic":
-        found["twisting"] = (torch.where(real, material.inertia, torch.inf) * length / material.twist).amin().sqrt()
-    if "table" in names:
-        found["table contact"] = 2 / params.effects["table"]["hardness"].max()
-    return {name: float(value) for name, value in found.items()}
+    """Return the largest stable substep [s] by the term that limits it; see `physics.stability`."""
+    return stability.limits(scene.settings, params.rods, params.effects)
 
 
 def check_step(scene: Scene, params: Params) -> None:
@@ -292,10 +252,10 @@ def advance(scene: Scene, params: Params, state: State, start: Control, control:
     targets = Targets(start.pos + share * (control.pos - start.pos), director)
     first = (state.time == 0).to(state.time.dtype)
     rods = substep(settings, params.rods, params.effects, state.rods, targets, first)
-    return State(rods, state.time + settings.dt)
+    return State(rods, state.time + settings.dt, watch.missed(scene.effects, rods.pos, params.effects, state.missed))
 
 
-def step(scene: Scene, params: Params, state: State, control: Control, *, advance=advance) -> State:
+def step(scene: Scene, params: Params, state: State, control: Control, *, advance=advance, survey=survey) -> State:
     """Advance a scene by `scene.dt`; held parts move evenly to where `control` wants them.
 
     Args:
@@ -304,14 +264,25 @@ def step(scene: Scene, params: Params, state: State, control: Control, *, advanc
         state: the scene now.
         control: where held parts are at the end.
         advance: what does a substep; `stepper` puts a compiled one here.
+        survey: what looks up once per step what effects need to know; likewise.
     """
+    _check_control(scene, control)
+    return _step(scene, params, state, control, advance, survey)
+
+
+def _check_control(scene: Scene, control: Control) -> None:
     wanted = (len(scene.held_vertices), len(scene.held_edges))
     if (control.pos.shape[-2], control.director.shape[-2]) != wanted:
         given = (tuple(control.pos.shape), tuple(control.director.shape))
         raise ValueError(
             f"control: pos and director are {given}; expected (..., {wanted[0]}, 3) and (..., {wanted[1]}, 3)"
         )
+
+
+def _step(scene: Scene, params: Params, state: State, control: Control, advance, survey) -> State:
     start = hold(scene, state)
+    if any(e.reacts for e in scene.effects):
+        params = survey(scene, params, state, start, control)
     for k in range(scene.substeps):
         share = start.pos.new_full((1,), (k + 1) / scene.substeps)
         state = advance(scene, params, state, start, control, share)
@@ -321,10 +292,31 @@ def step(scene: Scene, params: Params, state: State, control: Control, *, advanc
 def stepper(scene: Scene, *, compiled: bool = True):
     """Return `step` bound to a scene: a function of (params, state, control).
 
-    Compiled steps take some ten seconds at the first call and are many times faster after it. Only a substep is
-    compiled, so that the number of substeps does not matter. They need a C++ compiler on the CPU.
+    Compiled steps take some ten seconds at the first call, with and without gradients, and are many times faster after
+    it. A step of one substep is compiled as a whole; of more, the substep is, so that their number does not matter.
+    Compiled steps need a C++ compiler on the CPU.
     """
-    return partial(step, scene, advance=torch.compile(advance, fullgraph=True, dynamic=False) if compiled else advance)
+    if not compiled:
+        return partial(step, scene)
+    once = scene.substeps == 1 and not any(e.reacts for e in scene.effects)
+
+    def made(inline: bool):
+        # Without gradients, neighbours are best read where they are used; with them, copies are worth their cost.
+        part = partial(torch.compile, fullgraph=True, dynamic=False, options={"force_pointwise_cat": inline})
+        return (part(_step), advance) if once else (_step, part(advance))
+
+    ways = {True: made(False), False: made(True)}
+    look = torch.compile(survey, fullgraph=True, dynamic=False)
+
+    def run(params: Params, state: State, control: Control) -> State:
+        _check_control(scene, control)
+        graded = torch.is_grad_enabled()
+        if graded:
+            state = tree.replace(state, rods=alike(state.rods, (params, control)))
+        whole, part = ways[graded]
+        return whole(scene, params, state, control, part, look)
+
+    return run
 
 
 def finite(state: State) -> Tensor:
@@ -333,17 +325,30 @@ def finite(state: State) -> Tensor:
     return ok & torch.isfinite(state.rods.vel).all(-1).all(-1)
 
 
+def ok(state: State) -> Tensor:
+    """Return which scenes are finite and missed no contact, bool, shape (...)."""
+    return finite(state) & (state.missed == 0).all(-1).all(-1)
+
+
+def check_state(state: State) -> None:
+    """Raise a `RuntimeError` that says what went wrong, if something did."""
+    if not bool(ok(state).all()):
+        raise RuntimeError(f"scene: {watch.explain(state.missed) or 'positions or velocities are not finite'}")
+
+
 __all__ = [
     "Control",
     "Params",
     "Rope",
     "Scene",
     "State",
+    "check_state",
     "check_step",
     "finite",
     "hold",
     "limits",
     "make",
+    "ok",
     "rollout",
     "step",
     "stepper",

@@ -1,0 +1,142 @@
+"""Candidate lists hold every pair that can touch, and say when they do not."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from touching import F64, distances, line, trefoil, two
+
+from torchdlo.coupling import RodContact, nearby
+from torchdlo.coupling.watch import survey
+from torchdlo.physics import tree
+from torchdlo.physics.effects.elastic import Bend
+from torchdlo.scene import Rope, check_state, hold, make, ok, step
+
+
+def walk(n: int, seed: int, step_m: float = 0.015, box: float = 0.12) -> torch.Tensor:
+    """A random walk of n vertices in a box, crowded enough for many pairs."""
+    g = torch.Generator().manual_seed(seed)
+    x, out = torch.zeros(3, dtype=F64), []
+    for _ in range(n):
+        out.append(x)
+        d = torch.randn(3, generator=g, dtype=F64) - x / box
+        x = x + step_m * d / d.norm()
+    return torch.stack(out)
+
+
+def listed(scene, params, state) -> tuple[list[set[tuple[int, int]]], float]:
+    """Pairs on the list of each scene, and how many found no room."""
+    control = hold(scene, state)
+    found = survey(scene, params, state, control, control).effects["rod_contact"]
+    at, batch = found["corners"], found["corners"].shape[:-2]
+    pairs = []
+    for b in range(batch.numel()):
+        vertices = at.reshape(-1, *at.shape[-2:])[b] // batch.numel()
+        real = found["real"].reshape(batch.numel(), -1)[b] > 0
+        first, second = vertices[0][real].tolist(), vertices[2][real].tolist()
+        pairs.append(set(zip(first, second, strict=True)))
+        assert len(pairs[-1]) == int(real.sum()), "a pair is listed twice"
+    return pairs, float(found["lost"].max())
+
+
+def wanted(x: torch.Tensor, counts: tuple[int, ...], limit: float, arc: float) -> set[tuple[int, int]]:
+    """Pairs within a distance, by trying all."""
+    rod = [k for k, n in enumerate(counts) for _ in range(n)]
+    i, j = torch.triu_indices(len(x) - 1, len(x) - 1, 1)
+    length = (x[1:] - x[:-1]).norm(dim=-1)
+    s = torch.cat([length.new_zeros(1), length.cumsum(0)])
+    d = distances(x, i, j)
+    return {
+        (a, b)
+        for a, b, near in zip(i.tolist(), j.tolist(), (d <= limit).tolist(), strict=True)
+        if near
+        and rod[a] == rod[a + 1]
+        and rod[b] == rod[b + 1]
+        and (rod[a] != rod[b] or (b - a >= 3 and s[b] - s[a + 1] >= arc))
+    }
+
+
+@pytest.mark.parametrize("n", [60, 300], ids=["all pairs", "cells"])
+def test_the_list_is_what_trying_all_pairs_finds(n):
+    r, burst, dt = 0.005, 0.5, 1e-3
+    x = torch.stack([walk(n, seed) for seed in (1, 2)])
+    contact = RodContact(room=40 * n, row=200, burst=burst)
+    ropes = [Rope(x[:, : n - 20], radius=r, density=1000.0), Rope(x[:, n - 20 :], radius=r, density=1000.0)]
+    scene, params, state = make(ropes, [Bend(), contact], dt=dt, substeps=5)
+    found, lost = listed(scene, params, state)
+    assert lost == 0
+    limit = 2 * r + 2 * burst * dt
+    for b in range(2):
+        # Distances that are found differ by the pull to the middle, PULL l^2 / (4 d), so 1 % at most here.
+        inner = wanted(x[b], (n - 20, 20), 0.99 * limit, math.pi * r)
+        outer = wanted(x[b], (n - 20, 20), limit, math.pi * r)
+        assert len(inner) > 20 and inner <= found[b] <= outer
+
+
+def test_both_ways_give_the_same_list(monkeypatch):
+    scene, params, state = make(
+        [Rope(walk(150, 5), radius=0.005, density=1000.0)], [RodContact(room=2000, row=200)], check=False
+    )
+    few, _ = listed(scene, params, state)
+    monkeypatch.setattr(nearby, "FEW", 1)
+    assert listed(scene, params, state)[0] == few and few[0]
+
+
+def test_neighbours_along_a_fine_rope_do_not_touch_and_strands_of_a_hairpin_do():
+    # Edges of a third of the radius: a straight rope is nearer to itself than its diameter, but not in contact.
+    r = 0.006
+    straight = make([Rope(line(40, 39 * r / 3), radius=r, density=1000.0)], [RodContact(room=1000, burst=0.1)])
+    assert listed(*straight) == ([set()], 0.0)
+    a = torch.linspace(0, math.pi, 30, dtype=F64)
+    arc = 0.9 * r * torch.stack([torch.sin(a), torch.cos(a), 0 * a], -1)  # bent just below its own radius
+    legs = [
+        torch.stack([-u, torch.full_like(u, s), 0 * u], -1)
+        for u, s in (
+            (torch.linspace(0.05, 0.001, 20, dtype=F64), 0.9 * r),
+            (torch.linspace(0.001, 0.05, 20, dtype=F64), -0.9 * r),
+        )
+    ]
+    x = torch.cat([legs[0], arc, legs[1]])
+    pairs, _ = listed(*make([Rope(x, radius=r, density=1000.0)], [RodContact(room=3000, burst=0.1)]))
+    assert {(10, 58)} <= pairs[0]
+
+
+def test_a_closed_rope_is_not_near_itself_across_its_seam():
+    a = 2 * math.pi * torch.arange(30, dtype=F64) / 30
+    ring = 0.1 * torch.stack([torch.cos(a), torch.sin(a), 0 * a], -1)
+    assert listed(*make([Rope(ring, radius=0.005, density=1000.0, closed=True)], [RodContact()])) == ([set()], 0.0)
+    flat = ring * torch.tensor([1.0, 0.05, 1.0], dtype=F64)  # squeezed until its sides meet
+    pairs, _ = listed(*make([Rope(flat, radius=0.005, density=1000.0, closed=True)], [RodContact()], check=False))
+    assert (7, 22) in pairs[0]
+
+
+def test_a_full_list_and_fast_vertices_are_reported():
+    full = two(contact=RodContact(room=5))
+    state = step(*full, hold(full[0], full[2]))
+    assert not bool(ok(state)) and float(state.missed[..., 0]) > 0
+    with pytest.raises(RuntimeError, match=r"no room for .* pairs of edges; give RodContact a larger `room`"):
+        check_state(state)
+    scene, params, state = two(contact=RodContact(burst=0.0), speed=0.0)
+    check_state(step(scene, params, state, hold(scene, state)))
+    shoved = tree.replace(
+        state, rods=tree.replace(state.rods, vel=state.rods.vel.index_fill(0, torch.tensor([3]), 1.0))
+    )
+    control = hold(scene, state)
+    from_rest = survey(scene, params, state, control, control)
+    late = step(scene, from_rest, shoved, control, survey=lambda scene, params, *others: params)
+    with pytest.raises(RuntimeError, match="mm further within a step than contact looked"):
+        check_state(late)
+
+
+def test_a_crowded_row_of_cells_is_reported():
+    x = torch.stack([walk(300, 1)])
+    scene, params, state = make([Rope(x, radius=0.005, density=1000.0)], [RodContact(room=20000, row=2)], check=False)
+    assert listed(scene, params, state)[1] > 0
+
+
+def test_the_overhand_knot_is_found_with_room_to_spare():
+    scene, params, state = make([Rope(trefoil(121), radius=0.003, density=1000.0)], [RodContact()])
+    pairs, lost = listed(scene, params, state)
+    assert lost == 0 and 3 <= len(pairs[0]) < 242

@@ -1,0 +1,74 @@
+"""What a step is compiled of, and how often."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from torchdlo import scene
+from torchdlo.physics import tree
+from torchdlo.physics.effects.elastic import Bend
+from torchdlo.physics.effects.field import Gravity
+
+
+def hanging(scenes: int, **choices):
+    """A rope of five vertices held at one end, with controls that move it."""
+    x = torch.zeros(scenes, 5, 3, dtype=torch.float64)
+    x[..., 0] = torch.linspace(0, 1, 5, dtype=torch.float64)
+    made = scene.make([scene.Rope(x, mass=0.1, bend=1e-3)], [Gravity(), Bend()], held_vertices=(0, 1), **choices)
+    start = scene.hold(made[0], made[2])
+    shift = 1e-3 * torch.arange(1, 5, dtype=torch.float64).reshape(4, 1, 1, 1)
+    return *made, tree.replace(tree.map(lambda c: c.expand(4, *c.shape).clone(), start), pos=start.pos + shift)
+
+
+@pytest.fixture
+def graphs(monkeypatch: pytest.MonkeyPatch):
+    """Return a function that counts the graphs made so far; they are run without a code generator."""
+    compile = torch.compile
+    monkeypatch.setattr(torch, "compile", lambda fn, *, options=None, **given: compile(fn, backend="eager", **given))
+    torch._dynamo.reset()
+    torch._dynamo.utils.counters.clear()
+    return lambda: torch._dynamo.utils.counters["stats"]["unique_graphs"]
+
+
+@pytest.mark.compile
+@pytest.mark.slow
+@pytest.mark.parametrize("choices", [{"substeps": 2}, {"integrator": "implicit", "substeps": 1}])
+@pytest.mark.parametrize("learned", ["bend", "vel"])
+def test_a_rollout_with_gradients_compiles_one_graph(graphs, choices, learned):
+    made, params, state, controls = hanging(2, **choices)
+    number = (params.rods.material.bend if learned == "bend" else state.rods.vel).clone().requires_grad_()
+    if learned == "bend":
+        params = tree.replace(
+            params, rods=tree.replace(params.rods, material=tree.replace(params.rods.material, bend=number))
+        )
+    else:
+        state = tree.replace(state, rods=tree.replace(state.rods, vel=number))
+    found = {}
+    for compiled in (False, True):
+        last, _ = scene.rollout(scene.stepper(made, compiled=compiled), params, state, controls)
+        (found[compiled],) = torch.autograd.grad(last.rods.pos.square().sum(), number)
+    assert graphs() == 1
+    assert float(found[False].abs().max()) > 0
+    # The same operations in the same order: rounding of float64 over 4 steps at most.
+    assert torch.allclose(found[True], found[False], rtol=1e-12, atol=0)
+
+
+@pytest.mark.compile
+@pytest.mark.slow
+@pytest.mark.parametrize("substeps", [1, 3])
+def test_a_rollout_without_gradients_compiles_one_graph(graphs, substeps):
+    made, params, state, controls = hanging(2, substeps=substeps)
+    with torch.no_grad():
+        last, _ = scene.rollout(scene.stepper(made), params, state, controls)
+        expected, _ = scene.rollout(scene.stepper(made, compiled=False), params, state, controls)
+    assert graphs() == 1
+    assert torch.allclose(last.rods.pos, expected.rods.pos, rtol=1e-12, atol=0)
+
+
+@pytest.mark.parametrize("compiled", [False, True])
+def test_controls_of_the_wrong_shape_are_refused(compiled):
+    made, params, state, controls = hanging(2, substeps=1)
+    wrong = tree.map(lambda c: c[0, ..., :1, :], controls)
+    with pytest.raises(ValueError, match="control: pos and director"):
+        scene.stepper(made, compiled=compiled)(params, state, wrong)
