@@ -22,6 +22,7 @@ FLOORS = {
     "sysid": 5,
     "agents": 6,
     "report": 7,
+    "progress": 7,
     "cli": 8,
 }
 """Parts of the package by height; an import goes down, so siblings do not import each other."""
@@ -39,6 +40,7 @@ ALLOWED = {
     "envs": LEARNING | {"pytorch_kinematics", "trimesh"},
     "agents": LEARNING | {"cma"},
     "report": ARRAYS | {"matplotlib"},
+    "progress": {"rich"},
     "cli": ARRAYS | {"rich", "typer"},
     "": TORCH,  # torchdlo/__init__.py
 }

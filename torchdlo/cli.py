@@ -1,4 +1,4 @@
-"""The command `torchdlo`: check, convert and calibrate to recordings of real ropes.
+"""The command `torchdlo`: check, convert, calibrate to and diagnose recordings of real ropes.
 
 Everything slow to import is imported inside the command that needs it, so that help is quick.
 """
@@ -7,8 +7,7 @@ from __future__ import annotations
 
 import shlex
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -16,6 +15,7 @@ import typer
 
 from torchdlo.errors import InputError
 from torchdlo.files import check_writable, write_atomically
+from torchdlo.progress import deferred_interrupt, progress
 
 if TYPE_CHECKING:
     from torchdlo.sysid.recording import Recording
@@ -126,7 +126,7 @@ def import_deform(
     targets = {name: out / name.lower() for name in cable or cables}
     for target in targets.values():
         check_new_folder(target)
-    with _progress() as callback:
+    with progress() as callback:
         recordings = {name: read_cable(cables[name], mass=mass, callback=callback) for name in targets}
     for name, target in targets.items():
         save_recording(recordings[name], target)
@@ -199,12 +199,62 @@ def calibrate(
         raise typer.Exit(_INTERRUPTED)
 
 
+@app.command()
+def diagnose(
+    recording: RecordingArgument,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out",
+            "-o",
+            help="Folder for findings.json, model.json and report.html. Default: runs/diagnose/NAME.",
+            metavar="DIR",
+        ),
+    ] = None,
+    budget: Annotated[str, typer.Option(help="How much work to do.", metavar="fast|full")] = "fast",
+    as_json: Annotated[bool, typer.Option("--json", help="Print the findings as JSON.")] = False,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the random starts.")] = 0,
+    vertices: Annotated[int | None, typer.Option(min=3, help="Vertices of the simulated rope.")] = None,
+    workers: Annotated[int | None, typer.Option(min=1, help="Processes; one per core if not given.")] = None,
+) -> None:
+    """Find what the model lacks: name the missing effect, add it, and show the gap shrink.
+
+    The baseline is calibrated first; every effect of the library is then tried on what it leaves over, and kept only if
+    it closes the gap on trials that were not used.
+
+    [bold]Example:[/bold] torchdlo diagnose my_rope -o runs/my_rope
+    """
+    from torchdlo.report import diagnosis as report
+    from torchdlo.sysid.diagnose import diagnose as search
+    from torchdlo.sysid.findings import findings_json, model_json, sentence
+    from torchdlo.sysid.recording import load_recording
+
+    loaded = load_recording(recording)
+    out = out or Path("runs") / "diagnose" / recording.resolve().name
+    names = ("findings.json", "model.json", report.PAGE)
+    for name in names:
+        check_writable(out / name)
+    try:
+        with progress() as show, deferred_interrupt(show) as callback:
+            result = search(loaded, budget=budget, seed=seed, vertices=vertices, workers=workers, callback=callback)
+    except KeyboardInterrupt:
+        typer.echo("interrupted before there was a verdict; nothing was written", err=True)
+        raise SystemExit(_INTERRUPTED) from None
+    write_atomically(out / "findings.json", findings_json(result, loaded))
+    write_atomically(out / "model.json", model_json(result, loaded))
+    page = report.write_report(result, loaded, out, command=shlex.join(["torchdlo", *sys.argv[1:]]))
+    typer.echo(sentence(result, loaded), err=as_json)
+    typer.echo(f"findings: {out / 'findings.json'}\nreport:   {page}", err=as_json)
+    if as_json:
+        typer.echo(findings_json(result, loaded), nl=False)
+
+
 def _run_calibration(recording: Recording, **options: Any) -> Calibration:
     # Imported before the bar starts: a first import of torch takes seconds.
     from torchdlo.sysid.calibrate import calibrate as fit
 
     try:
-        with _progress() as show, _deferred_interrupt(show) as callback:
+        with progress() as show, deferred_interrupt(show) as callback:
             return fit(recording, callback=callback, **options)
     except KeyboardInterrupt:
         typer.echo("interrupted before there was a result; nothing was written", err=True)
@@ -235,73 +285,6 @@ def _write_outputs(result: Calibration, recording: Recording, given: Path, out: 
     page, _ = report.write_report(result, recording, out.parent, command=command)
     typer.echo(report.verdict(result, recording), err=quiet)
     typer.echo(f"model:  {out}\nreport: {page}", err=quiet)
-
-
-@contextmanager
-def _progress() -> Iterator[Callable[[str, int, int, str], None]]:
-    """A bar with the time left on stderr; a callback(stage, done, total, message) moves it."""
-    from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        Progress,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
-
-    console = Console(stderr=True)
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        TextColumn("{task.completed:.0f}/{task.total:.0f}"),
-        TimeElapsedColumn(),
-        TextColumn("left"),
-        TimeRemainingColumn(),
-        TextColumn("{task.fields[message]}"),
-    )
-    # Off a terminal a bar is only noise in a log.
-    with Progress(*columns, console=console, disable=not console.is_terminal) as bar:
-        tasks: dict[str, Any] = {}
-
-        def callback(stage: str, done: int, total: int, message: str = "") -> None:
-            if stage not in tasks:
-                tasks[stage] = bar.add_task(stage, total=total, message=message)
-            bar.update(tasks[stage], completed=done, total=total, message=message)
-
-        yield callback
-
-
-@contextmanager
-def _deferred_interrupt(
-    callback: Callable[[str, int, int, str], None],
-) -> Iterator[Callable[[str, int, int, str], None]]:
-    """Let Ctrl-C raise KeyboardInterrupt only inside the callback; a second one raises at once."""
-    import signal
-    import threading
-
-    if threading.current_thread() is not threading.main_thread():
-        yield callback
-        return
-    asked = False
-    previous = signal.getsignal(signal.SIGINT)
-
-    def ask(signum: int, frame: Any) -> None:
-        nonlocal asked
-        if asked:
-            raise KeyboardInterrupt
-        asked = True
-        typer.echo("stopping after this iteration; Ctrl-C again to stop at once", err=True)
-
-    def checked(stage: str, done: int, total: int, message: str = "") -> None:
-        callback(stage, done, total, message)
-        if asked:
-            raise KeyboardInterrupt
-
-    signal.signal(signal.SIGINT, ask)
-    try:
-        yield checked
-    finally:
-        signal.signal(signal.SIGINT, previous)
 
 
 def _rope_line(recording: Recording) -> str:

@@ -11,7 +11,9 @@ import pytest
 from torchdlo.errors import InputError
 from torchdlo.sysid import fit, start
 from torchdlo.sysid.calibrate import calibrate
-from torchdlo.sysid.model import PARAMETERS, RopeModel, Start
+from torchdlo.sysid.library import PARAMETERS
+from torchdlo.sysid.model import RopeModel
+from torchdlo.sysid.motion import Start
 from torchdlo.sysid.recording import Recording, Trial, load_recording
 
 SAMPLE = Path(__file__).parents[2] / "torchdlo" / "data" / "sample_rope"

@@ -6,10 +6,10 @@ import base64
 import html
 import math
 from pathlib import Path
-from typing import Any
 
 from torchdlo.files import write_atomically
 from torchdlo.report.figure import calibration_png
+from torchdlo.report.page import STYLE, number, page, table, words
 from torchdlo.sysid.recording import Recording
 from torchdlo.sysid.result import Calibration, versions
 
@@ -40,7 +40,7 @@ def write_report(result: Calibration, recording: Recording, folder: Path, *, com
 
 def verdict(result: Calibration, recording: Recording) -> str:
     """The result in one sentence."""
-    others = ", ".join(f"{_words(name)} {_mm(values['test_mae_mm'])}" for name, values in result.baselines.items())
+    others = ", ".join(f"{words(name)} {_mm(values['test_mae_mm'])}" for name, values in result.baselines.items())
     sentence = (
         f"Calibrated on {_trials(len(recording.train))}; error on unseen trials "
         f"{_mm(result.before['test_mae_mm'])} → {_mm(result.test_mae_mm)}"
@@ -56,7 +56,7 @@ def verdict(result: Calibration, recording: Recording) -> str:
     }
     if better:
         name = min(better, key=lambda key: better[key])
-        sentence += f" The {_words(name)}, which has no parameter, is not worse: do not use this."
+        sentence += f" The {words(name)}, which has no parameter, is not worse: do not use this."
     elif not result.test_mae_mm < result.before["test_mae_mm"]:
         sentence += " Calibration did not help on the unseen trials."
     return sentence
@@ -85,19 +85,19 @@ def calibration_html(result: Calibration, recording: Recording, png: bytes, *, c
         f"<pre>{html.escape(command)}</pre>" if command else "",
         f"<p>{html.escape(_made_by(result))}</p>",
     ]
-    return _PAGE.format(title=name, style=_STYLE, body="\n".join(s for s in sections if s))
+    return page(name, STYLE, "\n".join(s for s in sections if s))
 
 
 def _error_table(result: Calibration) -> str:
     rows = [
-        (_words(name), values.get("train_mae_mm"), values["test_mae_mm"]) for name, values in result.baselines.items()
+        (words(name), values.get("train_mae_mm"), values["test_mae_mm"]) for name, values in result.baselines.items()
     ]
     before = result.before
     rows.append(("before calibration", before.get("train_mae_mm"), before["test_mae_mm"]))
     rows.append(("calibrated", result.train_mae_mm, result.test_mae_mm))
-    return _table(
+    return table(
         ("prediction", "train trials [mm]", "test trials [mm]"),
-        [(name, _number(train), _number(test)) for name, train, test in rows],
+        [(name, number(train), number(test)) for name, train, test in rows],
         last_is_ours=True,
     )
 
@@ -105,14 +105,14 @@ def _error_table(result: Calibration) -> str:
 def _parameter_table(result: Calibration) -> str:
     rows = [
         (
-            _words(name),
-            _number(entry.get("value"), 4),
-            f"{_number(entry.get('low'), 4)} to {_number(entry.get('high'), 4)}",
+            words(name),
+            number(entry.get("value"), 4),
+            f"{number(entry.get('low'), 4)} to {number(entry.get('high'), 4)}",
             str(entry.get("unit", "")),
         )
         for name, entry in result.parameters.items()
     ]
-    return _table(("parameter", "value", "range", "unit"), rows)
+    return table(("parameter", "value", "range", "unit"), rows)
 
 
 def _trial_table(result: Calibration) -> str:
@@ -121,33 +121,17 @@ def _trial_table(result: Calibration) -> str:
         (
             str(entry.get("name", "")),
             str(entry.get("split", "")),
-            *(_number(entry.get(column)) for column in columns[1:]),
+            *(number(entry.get(column)) for column in columns[1:]),
         )
         for entry in sorted(result.per_trial, key=lambda entry: str(entry.get("split")))
     ]
     heads = ("trial", "split", "before [mm]", "calibrated [mm]", "free markers' distance [mm]")
-    return _table(heads, rows)
-
-
-def _table(heads: tuple[str, ...], rows: list[tuple[str, ...]], *, last_is_ours: bool = False) -> str:
-    lines = ["<table><thead><tr>", *(f"<th>{html.escape(h)}</th>" for h in heads)]
-    lines.append("</tr></thead><tbody>")
-    for index, row in enumerate(rows):
-        ours = ' class="ours"' if last_is_ours and index == len(rows) - 1 else ""
-        cells = "".join(f"<td>{html.escape(cell)}</td>" for cell in row)
-        lines.append(f"<tr{ours}>{cells}</tr>")
-    return "".join(lines) + "</tbody></table>"
+    return table(heads, rows)
 
 
 def _made_by(result: Calibration) -> str:
     tools = ", ".join(f"{name} {version}" for name, version in versions().items())
     return f"{result.seconds:.0f} s, seed {result.seed}; {tools}."
-
-
-def _number(value: Any, digits: int = 3) -> str:
-    if value is None or not math.isfinite(value):
-        return "-"
-    return f"{value:.{digits}g}" if abs(value) < 10 ** (digits - 1) else f"{value:.1f}"
 
 
 def _mm(value: float) -> str:
@@ -156,30 +140,3 @@ def _mm(value: float) -> str:
 
 def _trials(count: int) -> str:
     return f"{count} trial" if count == 1 else f"{count} trials"
-
-
-def _words(name: str) -> str:
-    return name.replace("_", " ")
-
-
-_PAGE = """<!doctype html>
-<html lang="en"><head><meta charset="utf-8"><meta name="generator" content="torchdlo">
-<meta name="viewport" content="width=device-width, initial-scale=1"><title>{title}</title>
-<style>{style}</style></head>
-<body>
-{body}
-</body></html>
-"""
-
-_STYLE = """
-body { font: 16px/1.5 system-ui, sans-serif; color: #1f2933; background: #fff;
-  max-width: 1100px; margin: 2rem auto; padding: 0 1rem; }
-h1 { margin-bottom: 0; } h2 { margin-top: 2.2rem; }
-.verdict { font-size: 1.2rem; border-left: 4px solid #00798c; padding-left: .8rem; }
-img { width: 100%; height: auto; }
-table { border-collapse: collapse; font-variant-numeric: tabular-nums; }
-th, td { text-align: right; padding: .3rem .9rem; border-bottom: 1px solid #e4e7eb; }
-th:first-child, td:first-child { text-align: left; }
-.ours td { font-weight: 600; color: #00798c; }
-pre { background: #f5f7fa; padding: .8rem; overflow-x: auto; }
-"""

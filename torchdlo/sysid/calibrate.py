@@ -14,7 +14,9 @@ from torchdlo.sysid import fit, judge
 from torchdlo.sysid import start as starts_of
 from torchdlo.sysid.checkpoint import Checkpoint
 from torchdlo.sysid.fit import Point, Space
-from torchdlo.sysid.model import PARAMETERS, Motion, RopeModel, Start
+from torchdlo.sysid.library import PARAMETERS
+from torchdlo.sysid.model import RopeModel
+from torchdlo.sysid.motion import Motion, Start
 from torchdlo.sysid.recording import Recording, Trial
 from torchdlo.sysid.result import Calibration
 
@@ -100,8 +102,8 @@ def calibrate(
 def _job(recording: Recording, rest: str, vertices: int | None) -> _Job:
     model = RopeModel(recording, vertices=vertices, rest=rest)
     trials = _usable(recording)
-    space = Space(tuple(model.parameters), tuple(PARAMETERS[name] for name in model.parameters))
-    return _Job(model, space, model.motion(trials), starts_of.read_off(trials), model.guess())
+    space = Space(tuple(model.parameters), tuple(model.params))
+    return _Job(model, space, model.motion(trials), starts_of.begin(model, trials), model.guess())
 
 
 def _usable(recording: Recording) -> list[Trial]:
@@ -164,12 +166,12 @@ def _scout(
     """
     trials = _usable(recording)
     scouts = [trials[i] for i in _pick(len(trials), _SCOUTS)]
-    motion, begin = job.model.motion(scouts), starts_of.read_off(scouts)
+    motion, begin = job.model.motion(scouts), starts_of.begin(job.model, scouts)
     begin = starts_of.refine(job.model, motion, begin, job.values)
     stage, total = f"trying {starts} starts, {name}", 2 + _LOOKS
 
     def over(share: float) -> tuple[fit.Simulate, np.ndarray]:
-        frames = max(10, round(share * motion.held.shape[1]))
+        frames = max(10, round(share * motion.markers.shape[1]))
         return lambda values: job.model.simulate(motion, begin, values, frames=frames), motion.markers[:, :frames]
 
     raws = _spread(job, starts, rng)
@@ -200,7 +202,7 @@ def _spread(job: _Job, starts: int, rng: np.random.Generator) -> np.ndarray:
     for k, (name, param) in enumerate(zip(job.space.names, job.space.params, strict=True)):
         # A Latin hypercube: one start in each of `starts` slices of a coordinate, in a random order.
         share = (rng.permutation(starts) + rng.uniform(size=starts)) / starts - 0.5
-        raws[1:, k] += (2 * _REACH[name] if name in _REACH else 1.0 if param.unit == "rad" else 0.4) * share[1:]
+        raws[1:, k] += (2 * _REACH[name] if name in _REACH else 1.0 if param.periodic else 0.4) * share[1:]
     bend, twist = (job.space.names.index(name) for name in ("bending_stiffness", "twisting_stiffness"))
     raws[1:, twist] += raws[1:, bend] - raws[0, bend]
     return job.space.clip(raws)

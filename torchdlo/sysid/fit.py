@@ -22,46 +22,47 @@ Simulate = Callable[[np.ndarray], np.ndarray]
 
 @dataclass(frozen=True, eq=False)
 class Space:
-    """Declared numbers as coordinates without units: logarithms, or shares of the range."""
+    """Declared numbers as coordinates without units: logarithms, or shares of a size."""
 
     names: tuple[str, ...]
     params: tuple[Param, ...]
+    sizes: tuple[float, ...] | None = None
+    """What counts as much of each number, in the terms of its scale; its whole range if not given."""
+
+    @property
+    def units(self) -> np.ndarray:
+        """What one coordinate is worth: 1 for logarithms, a size for the others, shape (K,)."""
+        ranges = {"log": lambda p: 1.0, "linear": lambda p: p.high - p.low, "reciprocal": lambda p: 1 / p.low}
+        sizes = self.sizes or [ranges[p.scale](p) for p in self.params]
+        return np.array([1.0 if p.scale == "log" else s for s, p in zip(sizes, self.params, strict=True)])
+
+    def _map(self, values: np.ndarray, rules: dict[str, Callable[[np.ndarray], np.ndarray]]) -> np.ndarray:
+        return np.stack([rules[p.scale](values[..., k]) for k, p in enumerate(self.params)], -1)
 
     def to_raw(self, values: np.ndarray) -> np.ndarray:
         """Return coordinates of values, both (..., K)."""
-        return np.stack(
-            [
-                np.log(values[..., k]) if p.scale == "log" else values[..., k] / (p.high - p.low)
-                for k, p in enumerate(self.params)
-            ],
-            -1,
-        )
+        return self._map(values, {"log": np.log, "linear": np.asarray, "reciprocal": np.reciprocal}) / self.units
 
     def to_values(self, raw: np.ndarray) -> np.ndarray:
         """Return values of coordinates, both (..., K)."""
-        return np.stack(
-            [
-                np.exp(raw[..., k]) if p.scale == "log" else raw[..., k] * (p.high - p.low)
-                for k, p in enumerate(self.params)
-            ],
-            -1,
-        )
+        return self._map(raw * self.units, {"log": np.exp, "linear": np.asarray, "reciprocal": np.reciprocal})
 
     def clip(self, raw: np.ndarray) -> np.ndarray:
         """Keep coordinates within the declared bounds; angles turn round instead."""
-        bounds = [
-            (np.log(p.low), np.log(p.high))
-            if p.scale == "log"
-            else (p.low / (p.high - p.low), p.high / (p.high - p.low))
-            for p in self.params
-        ]
-        low, high = np.array(bounds).T
+        ends = self.to_raw(np.array([[p.low for p in self.params], [p.high for p in self.params]]))
+        low, high = ends.min(0), ends.max(0)
         turned = low + (raw - low) % (high - low)
-        return np.where([p.unit == "rad" for p in self.params], turned, np.clip(raw, low, high))
+        return np.where([p.periodic for p in self.params], turned, np.clip(raw, low, high))
 
     def nudges(self) -> np.ndarray:
         """Return the steps of finite differences, shape (K,)."""
-        return np.array([0.02 if p.scale == "log" else 0.01 for p in self.params])
+        share = 0.01 if self.sizes is None else 0.1
+        return np.array([0.02 if p.scale == "log" else share for p in self.params])
+
+    def limits(self) -> np.ndarray:
+        """Return how far a coordinate may go at a time: a factor of three, a fifth of the range, or ten sizes."""
+        far = 0.2 if self.sizes is None else 10.0
+        return np.array([1.1 if p.scale == "log" else far for p in self.params])
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,9 +168,7 @@ def _step(point: Point, damping: float, space: Space) -> np.ndarray:
     curvature, gradient = point.curvature.mean(0), point.gradient.mean(0)
     scale = np.diag(curvature) + 1e-9 * np.trace(curvature) + 1e-12
     step = -np.linalg.solve(curvature + damping * np.diag(scale), gradient)
-    # Not more than a factor of three, or a fifth of the range, at a time.
-    limit = np.array([1.1 if p.scale == "log" else 0.2 for p in space.params])
-    return space.clip(point.raw + step / max(1.0, float(np.abs(step / limit).max())))
+    return space.clip(point.raw + step / max(1.0, float(np.abs(step / space.limits()).max())))
 
 
 def interval(point: Point, space: Space) -> tuple[np.ndarray, np.ndarray]:

@@ -20,7 +20,7 @@ Predictions = dict[str, np.ndarray]
 def predict(model: RopeModel, trials: Sequence[Trial], values: np.ndarray) -> Predictions:
     """Simulate trials from starts estimated from their first 0.1 s."""
     motion = model.motion(trials)
-    begin = starts.refine(model, motion, starts.read_off(trials), values)
+    begin = starts.refine(model, motion, starts.begin(model, trials), values)
     sims = model.simulate(motion, begin, values[None])[0]
     return {name: sim[:frames] for name, sim, frames in zip(motion.names, sims, motion.frames, strict=True)}
 
@@ -54,24 +54,28 @@ def by_trial(recording: Recording, before: Predictions, after: Predictions) -> l
     ]
 
 
+def rope(recording: Recording, rest: str) -> dict[str, Any]:
+    """Return what a model file says of the rope itself."""
+    return {
+        "length": recording.length,
+        "radius": recording.radius,
+        "mass": recording.mass,
+        "marker_mass": recording.marker_mass,
+        "gravity": list(recording.gravity),
+        "table_height": recording.table_height,
+        "rest": rest,
+        "rest_positions": recording.rest_positions if rest == "given" else None,
+    }
+
+
 def model_file(model: RopeModel, values: np.ndarray) -> dict[str, Any]:
     """Return what another command needs to simulate this rope again."""
-    recording = model.recording
     return {
         "format": "torchdlo-model",
         "version": 1,
-        "rope": {
-            "length": recording.length,
-            "radius": recording.radius,
-            "mass": recording.mass,
-            "marker_mass": recording.marker_mass,
-            "gravity": list(recording.gravity),
-            "table_height": recording.table_height,
-            "rest": model.rest,
-            "rest_positions": recording.rest_positions if model.rest == "given" else None,
-        },
+        "rope": rope(model.recording, model.rest),
         "mesh": {"arclength": model.arclength, "marker_vertex": model.marker_vertex},
         "parameters": dict(zip(model.parameters, values, strict=True)),
         "effects": {},
-        "step": {"integrator": "implicit", "twist": "quasistatic", "dt": model.dt, "substeps": model.substeps},
+        "step": model.step,
     }

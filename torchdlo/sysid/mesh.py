@@ -26,11 +26,40 @@ class Mesh:
     """Vertices at gripped markers and between neighbouring ones."""
     clamps: tuple[tuple[int, int], ...]
     """Per pair or run of gripped markers: the held edge next to the free rope, and the clamp's outermost marker."""
+    runs: tuple[np.ndarray, ...]
+    """The gripped markers of each clamp, in their order along the rope."""
 
     @property
     def marker_arclength(self) -> np.ndarray:
         """Arclength of the markers [m], shape (M,)."""
         return self.arclength[self.marker_vertex]
+
+    @property
+    def clamp_hinges(self) -> tuple[int, ...]:
+        """The held vertex next to the free rope, of each clamp."""
+        # A clamp is named by its outermost marker; the free rope is on the other side.
+        return tuple(
+            edge + 1 if marker == run[0] else edge for (edge, marker), run in zip(self.clamps, self.runs, strict=True)
+        )
+
+    def clamp_stiffness(self, grip: float) -> np.ndarray:
+        """Return by how much the hinges at clamps are stiffer than a hinge of their length, shape (V,).
+
+        A clamp's direction is that of the chord between its two markers next to the free rope. A rope that bends
+        between them has that direction in their middle (`grip` 0), one that is held stiffly up to the last of them
+        has it there (`grip` 1). The hinge stands for the rope from that point to the middle of the first free edge.
+        """
+        stiff, length = np.ones(len(self.arclength)), np.diff(self.arclength)
+        for (edge, _), markers, vertex in zip(self.clamps, self.runs, self.clamp_hinges, strict=True):
+            after = vertex == edge + 1
+            if not 0 < vertex < len(self.arclength) - 1:
+                continue
+            at = self.marker_arclength[markers]
+            gap = at[-1] - at[-2] if after else at[1] - at[0]
+            free = length[vertex] if after else length[vertex - 1]
+            whole = 0.5 * (length[vertex - 1] + length[vertex])
+            stiff[vertex] = whole / (0.5 * gap * (1 - grip) + 0.5 * free)
+        return stiff
 
     def along(self, markers: np.ndarray, known: np.ndarray) -> np.ndarray:
         """Interpolate known markers, shape (F, M, 3), linearly to all vertices, (F, V, 3)."""
@@ -79,10 +108,13 @@ def make_mesh(trial: Trial, length: float, vertices: int | None) -> Mesh:
     return Mesh(np.concatenate([*parts, stations[-1:]]), vertex, *_grips(np.flatnonzero(trial.gripped), vertex))
 
 
-def _grips(gripped: np.ndarray, at: np.ndarray) -> tuple[tuple[int, ...], tuple[tuple[int, int], ...]]:
-    """Return held vertices and clamps of gripped markers, see `Mesh`."""
+def _grips(
+    gripped: np.ndarray, at: np.ndarray
+) -> tuple[tuple[int, ...], tuple[tuple[int, int], ...], tuple[np.ndarray, ...]]:
+    """Return held vertices, clamps of gripped markers and their runs of markers, see `Mesh`."""
     held: set[int] = set()
     clamps: list[tuple[int, int]] = []
+    runs: list[np.ndarray] = []
     for run in np.split(gripped, np.flatnonzero(np.diff(gripped) > 1) + 1):
         held |= set(range(int(at[run[0]]), int(at[run[-1]]) + 1))
         if len(run) > 1:
@@ -90,7 +122,8 @@ def _grips(gripped: np.ndarray, at: np.ndarray) -> tuple[tuple[int, ...], tuple[
             after = run[0] == 0 or run[0] < len(at) - 1 - run[-1]
             edge = int(at[run[-1]]) - 1 if after else int(at[run[0]])
             clamps.append((edge, int(run[0] if after else run[-1])))
-    return tuple(sorted(held)), tuple(clamps)
+            runs.append(run)
+    return tuple(sorted(held)), tuple(clamps), tuple(runs)
 
 
 def level_normal(tangent: Tensor) -> Tensor:

@@ -1,13 +1,14 @@
-"""The baseline model of a recorded rope: recordings in, simulated markers out, many parameter sets at once.
+"""The model of a recorded rope: recordings in, simulated markers out, many parameter sets at once.
 
-Gravity, an almost inextensible rod, straight or given rest shape, uniform bending and twisting stiffness, one damping
-rate, a frictionless table where there is one, and clamps that follow the gripped markers.
+Its baseline is gravity, an almost inextensible rod, straight or given rest shape, uniform bending and twisting
+stiffness, one damping rate, a frictionless table where there is one, and clamps that follow the gripped markers.
+Effects of the library may be added to it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
@@ -17,32 +18,19 @@ from torch import Tensor
 
 from torchdlo import scene as scenes
 from torchdlo.errors import InputError
-from torchdlo.physics import rotation, tree
-from torchdlo.physics.constrain import Lengths, settle
+from torchdlo.physics import constrain, rotation, tree
 from torchdlo.physics.effect import Effect, Param
 from torchdlo.physics.effects.elastic import Bend, BendFrame, Twist
 from torchdlo.physics.effects.field import Damping, Gravity
+from torchdlo.physics.effects.measure import Track
 from torchdlo.physics.effects.table import Table
 from torchdlo.physics.numerics import normalize
+from torchdlo.sysid import library, settle
+from torchdlo.sysid.drive import drive
+from torchdlo.sysid.library import PARAMETERS, Number
 from torchdlo.sysid.mesh import make_mesh
+from torchdlo.sysid.motion import WINDOW, Motion, Start
 from torchdlo.sysid.recording import Recording, Trial
-
-PARAMETERS: dict[str, Param] = {
-    "bending_stiffness": Param(1e-3, 1e-7, 1.0, "N m^2", "log", None, "Uniform bending stiffness EI."),
-    "twisting_stiffness": Param(1e-3, 1e-7, 1.0, "N m^2", "log", None, "Uniform twisting stiffness GJ."),
-    "damping_rate": Param(0.5, 1e-2, 20.0, "1/s", "log", None, "Rate at which all velocities decay."),
-    "rest_share": Param(1.0, 0.0, 2.0, "1", "linear", 0.0, "Share of the given rest shape's curvature that is real."),
-    "rest_roll": Param(
-        0.0,
-        -np.pi,
-        np.pi,
-        "rad",
-        "linear",
-        None,
-        "Angle from the vertical to the normal of the rest shape's plane, about the first clamp.",
-    ),
-}
-"""Numbers that calibration may fit."""
 
 MAX_SUBSTEP = 5e-3
 """Longest substep [s]; the implicit integrator is stable and accurate to a per cent there."""
@@ -53,56 +41,53 @@ _STRETCH = 1e4
 _AHEAD = 0.1
 """How far steps look ahead: real ropes are jerked taut, and what then rings within a substep must die out."""
 
-_CHUNK = 128
+_CHUNK = 64
 """Scenes that run together in a compiled step: one size, so that there is one graph."""
 
 _COMPILE_FROM = 10_000
 """Frames in the train trials from which compiling pays off."""
 
 
-@dataclass(frozen=True, eq=False)
-class Motion:
-    """Trials of one recording as inputs of the simulation, stacked; short trials are padded with their last frame."""
-
-    names: tuple[str, ...]
-    held: Tensor
-    """Positions of the held vertices [m], shape (B, F, H, 3)."""
-    director: Tensor
-    """First directors of the held edges, shape (B, F, G, 3)."""
-    markers: np.ndarray
-    """Measured markers [m], NaN where not seen, padded or suspect, shape (B, F, M, 3)."""
-    frames: tuple[int, ...]
-    """True number of frames of each trial."""
-
-
-@dataclass(frozen=True, eq=False)
-class Start:
-    """Where trials begin."""
-
-    pos: np.ndarray
-    """Marker positions at time 0 [m], shape (B, M, 3)."""
-    vel: np.ndarray
-    """Marker velocities at time 0 [m/s], shape (B, M, 3)."""
-
-
 class RopeModel:
     """A recording's rope on a mesh that has a vertex at every marker."""
 
     def __init__(
-        self, recording: Recording, *, vertices: int | None = None, rest: str = "straight", compiled: bool | None = None
+        self,
+        recording: Recording,
+        *,
+        vertices: int | None = None,
+        rest: str = "straight",
+        effects: Sequence[str] = (),
+        substep: float = MAX_SUBSTEP,
+        ahead: float = _AHEAD,
+        grip: float = 1.0,
+        compiled: bool | None = None,
+        threads: int = 1,
     ) -> None:
+        """Prepare the model.
+
+        Args:
+            recording: what was measured.
+            vertices: about how many vertices; two per marker if not given.
+            rest: "straight" or "given".
+            effects: names of effects of the library to add to the baseline.
+            substep: longest substep [s].
+            ahead: see `torchdlo.scene.Scene`.
+            grip: where clamps hold the rope's direction, see `Mesh.clamp_stiffness`.
+            compiled: whether steps are compiled; by the length of the recording if not given.
+            threads: how many chunks of scenes run at the same time.
+        """
         trial = recording.train[0]
-        self.recording = recording
-        self.rest = rest
+        self.recording, self.rest, self.effects = recording, rest, tuple(effects)
         self.count = trial.markers.shape[1]
         self.mesh = make_mesh(trial, recording.length, vertices)
         self.arclength, self.marker_vertex = self.mesh.arclength, self.mesh.marker_vertex
         self.held, self.clamps = self.mesh.held, self.mesh.clamps
         self.gripped = np.flatnonzero(trial.gripped)
+        self.ahead, self.grip, self.threads = ahead, grip, threads
         for other in (*recording.train, *recording.test):
-            if not np.array_equal(other.gripped, trial.gripped) or not np.allclose(
-                other.marker_arclength, trial.marker_arclength
-            ):
+            same = np.array_equal(other.gripped, trial.gripped)
+            if not same or not np.allclose(other.marker_arclength, trial.marker_arclength):
                 raise InputError(
                     f"{other.name}.npz: gripped or marker_arclength differ from {trial.name}.npz; "
                     "put trials with other grips into a recording of their own."
@@ -115,35 +100,50 @@ class RopeModel:
         frames = sum(len(t.time) for t in recording.train)
         self.compiled = frames >= _COMPILE_FROM if compiled is None else compiled
         self._stepper: tuple[scenes.Scene, Callable] | None = None
-        self.substeps = max(1, int(np.ceil(self.dt / MAX_SUBSTEP - 1e-9)))
+        self.substeps = max(1, int(np.ceil(self.dt / substep - 1e-9)))
+        baseline = ["bending_stiffness", "twisting_stiffness", "damping_rate"]
+        baseline += ["rest_share", "rest_roll"] if rest == "given" else []
+        self.numbers = [Number(name, PARAMETERS[name], float(PARAMETERS[name].default)) for name in baseline]
+        for name in self.effects:
+            self.numbers += library.numbers(name, recording)
 
     @property
     def parameters(self) -> list[str]:
         """Names of the numbers to fit."""
-        names = ["bending_stiffness", "twisting_stiffness", "damping_rate"]
-        return names + (["rest_share", "rest_roll"] if self.rest == "given" else [])
+        return [n.name for n in self.numbers]
+
+    @property
+    def params(self) -> list[Param]:
+        """Declarations of the numbers to fit."""
+        return [n.param for n in self.numbers]
+
+    @property
+    def step(self) -> dict[str, Any]:
+        """How the model is stepped, as a model file says it."""
+        return {"integrator": "implicit", "twist": "quasistatic", "dt": self.dt, "substeps": self.substeps}
 
     def guess(self) -> np.ndarray:
-        """Return numbers to start from, in the order of `parameters`.
+        """Return numbers to start from, in the order of `parameters`; effects are off.
 
         The bending stiffness is the one at which weight bends the rope over a tenth of its length.
         """
         weight = self.recording.mass * np.linalg.norm(self.recording.gravity) / self.recording.length
         bend = max(weight, 1e-4) * (0.1 * self.recording.length) ** 3
-        known = {"bending_stiffness": bend, "twisting_stiffness": 0.7 * bend}
-        return np.array([known.get(name, PARAMETERS[name].default) for name in self.parameters], dtype=float)
+        first = {"bending_stiffness": bend, "twisting_stiffness": 0.7 * bend}
+        return np.array([first.get(n.name, n.off) for n in self.numbers], dtype=float)
 
     def motion(self, trials: Sequence[Trial]) -> Motion:
         """Return the grippers' motion of trials, and what was measured."""
         longest = max(len(t.time) for t in trials)
         held, director, measured = [], [], []
         for trial in trials:
-            vertices = self.mesh.along(trial.markers, trial.gripped)[:, list(self.held)]
+            vertices, turns = drive(self.mesh, trial, self.substeps)
             markers = np.where(trial.suspect[:, None, None], np.nan, trial.markers)
-            pad = ((0, longest - len(trial.time)),)
-            held.append(np.pad(vertices, (*pad, (0, 0), (0, 0)), mode="edge"))
-            director.append(np.pad(self.mesh.directors(trial), (*pad, (0, 0), (0, 0)), mode="edge"))
-            measured.append(np.pad(markers, (*pad, (0, 0), (0, 0)), constant_values=np.nan))
+            pad = (0, longest - len(trial.time))
+            fine = (0, self.substeps * pad[1])
+            held.append(np.pad(vertices, (fine, (0, 0), (0, 0)), mode="edge"))
+            director.append(np.pad(turns, (fine, (0, 0), (0, 0)), mode="edge"))
+            measured.append(np.pad(markers, (pad, (0, 0), (0, 0)), constant_values=np.nan))
         return Motion(
             tuple(t.name for t in trials),
             torch.as_tensor(np.stack(held)),
@@ -167,7 +167,7 @@ class RopeModel:
         )
         held = list(self.held)
         pos[:, held] = motion.held[:, 0]
-        vel[:, held] = (motion.held[:, 1] - motion.held[:, 0]) / self.dt
+        vel[:, held] = (motion.held[:, 1] - motion.held[:, 0]) / (self.dt / self.substeps)
         rope = scenes.Rope(
             pos,
             radius=recording.radius or 0.005,
@@ -180,28 +180,44 @@ class RopeModel:
             director=self._first_director(motion),
             rest_director=None if self.rest != "given" else pos.new_tensor([0.0, 0.0, 1.0]),
         )
-        effects: list[Effect] = [Gravity(), BendFrame() if self.rest == "given" else Bend(), Twist(), Damping()]
-        numbers: dict[str, dict[str, Any]] = {
-            "gravity": {"acceleration": list(recording.gravity)},
-            "damping": {"rate": number["damping_rate"].reshape(-1, 1, 1)},
-        }
-        if recording.table_height is not None:
-            effects.append(Table())
-            numbers["table"] = {"height": recording.table_height}
         scene, params, state = scenes.make(
             [rope],
-            effects,
-            numbers,
-            dt=self.dt,
-            substeps=self.substeps,
+            self._laws(),
+            self._values(number),
+            dt=self.dt / self.substeps,
+            substeps=1,
             integrator="implicit",
             twist="quasistatic",
             held_vertices=self.held,
             held_edges=tuple(edge for edge, _ in self.clamps),
-            ahead=_AHEAD,
+            ahead=self.ahead,
+            settling=2,
         )
         params = self._measured_lengths(params, number)
         return scene, params, self._agree(scene, params, state)
+
+    def _laws(self) -> list[Effect]:
+        """Return the effects of the scene."""
+        extra = [library.instance(name, self.mesh) for name in self.effects]
+        framed = self.rest == "given" or any(e.frame_bending for e in extra)
+        table = [Table()] if self.recording.table_height is not None else []
+        return [Gravity(), BendFrame() if framed else Bend(), Twist(), Damping(), *table, *extra]
+
+    def _values(self, number: dict[str, Tensor]) -> dict[str, dict[str, Any]]:
+        """Return the numbers of the effects: fitted ones with shape (N, 1, C), known ones as they are."""
+        numbers: dict[str, dict[str, Any]] = {
+            "gravity": {"acceleration": list(self.recording.gravity)},
+            "damping": {"rate": number["damping_rate"].reshape(-1, 1, 1)},
+        }
+        if self.recording.table_height is not None:
+            numbers["table"] = {"height": self.recording.table_height}
+        for name in self.effects:
+            numbers[name] = dict(library.known(name, self.recording))
+            parts: dict[str, list[Tensor]] = {}
+            for each in library.numbers(name, self.recording):
+                parts.setdefault(each.name.split(".")[1], []).append(number[each.name])
+            numbers[name] |= {key: torch.stack(part, -1).unsqueeze(-2) for key, part in parts.items()}
+        return numbers
 
     def _rest_shape(self) -> str | Tensor:
         """Return the rest shape at the vertices, flattened on its best plane: markers stand off the rope's axis."""
@@ -216,15 +232,12 @@ class RopeModel:
 
     def _first_director(self, motion: Motion) -> Tensor | None:
         """Return the director of the first edge: that of a clamp, if one holds it, else none."""
-        clamped = (
-            bool(self.clamps)
-            and self.clamps[0][0] < len(self.held)
-            and self.held[self.clamps[0][0]] == self.clamps[0][0]
-        )
+        edge = self.clamps[0][0] if self.clamps else len(self.held)
+        clamped = edge < len(self.held) and self.held[edge] == edge
         return motion.director[:, 0, 0] if clamped else None
 
     def _commands(self, scene: scenes.Scene, state: scenes.State, motion: Motion) -> Tensor:
-        """Return directors of the held edges, shape (N, F, G, 3).
+        """Return directors of the held edges, shape (N, S, G, 3).
 
         Where the grippers' rotation was not measured, the rope is taken to be without twist at the start.
         """
@@ -238,7 +251,7 @@ class RopeModel:
         return rotation.about(tangent, angle[:, None], motion.director)
 
     def _measured_lengths(self, params: scenes.Params, number: dict[str, Tensor]) -> scenes.Params:
-        """Put rest lengths as measured along the rope, masses by them, and stiff clamps where grippers end."""
+        """Put rest lengths as measured along the rope, masses by them, and the stiffness of hinges at clamps."""
         rods = params.rods
         step = torch.as_tensor(np.diff(self.arclength)).reshape(-1, 1)
         length = torch.cat([step, step.new_ones(1, 1)])
@@ -247,13 +260,7 @@ class RopeModel:
         mass = 0.5 * (line + torch.roll(line, 1, -2))
         extra = torch.zeros_like(mass)
         extra[torch.as_tensor(self.marker_vertex)] = self.recording.marker_mass or 0.0
-        # A clamp holds the tangent at its end; the hinge there spans only the free half of its length.
-        stiff = torch.ones_like(mass)
-        free = np.array([v not in self.held for v in range(len(self.arclength))])
-        for v in self.held:
-            for beside, edge in ((v - 1, v - 1), (v + 1, v)):
-                if 0 < v < len(free) - 1 and 0 <= beside < len(free) and free[beside] and not free[2 * v - beside]:
-                    stiff[v] = (real[v - 1] + real[v]) / real[edge]
+        stiff = torch.as_tensor(self.mesh.clamp_stiffness(self.grip)).unsqueeze(-1)
         material = tree.replace(
             rods.material, mass=mass + extra, bend=rods.material.bend * stiff, twist=rods.material.twist * stiff
         )
@@ -269,8 +276,8 @@ class RopeModel:
         free[list(self.held)] = 0.0
         free = free.to(rods.pos)
         active = rest.edge_mask * (1 - (1 - free) * (1 - torch.roll(free, -1, -2)))
-        lengths = Lengths(scene.topology, rest.length, torch.zeros_like(rest.length), active, rest.edge_mask)
-        pos, vel = settle(lengths, rods.pos, rods.vel, free / params.rods.material.mass)
+        lengths = constrain.Lengths(scene.topology, rest.length, torch.zeros_like(rest.length), active, rest.edge_mask)
+        pos, vel = constrain.settle(lengths, rods.pos, rods.vel, free / params.rods.material.mass)
         lost = ~torch.isfinite(pos).all(-1).all(-1)[:, None, None]
         pos, vel = torch.where(lost, rods.pos, pos), torch.where(lost, rods.vel, vel)
         return tree.replace(
@@ -284,7 +291,6 @@ class RopeModel:
         values: np.ndarray,
         *,
         frames: int | None = None,
-        progress: Callable[[int], None] | None = None,
     ) -> np.ndarray:
         """Return simulated markers [m] for every parameter set and trial.
 
@@ -293,42 +299,96 @@ class RopeModel:
             start: their beginnings, B trials or (P B) ones.
             values: parameter sets, shape (P, K).
             frames: how many frames to simulate; all if not given.
-            progress: called with the number of scenes that are done.
 
         Returns:
             Marker positions, shape (P, B, F, M, 3); NaN from where a simulation failed.
         """
         sets, trials = len(values), len(motion.names)
-        total = frames or motion.held.shape[1]
+        total = frames or motion.markers.shape[1]
         out = np.empty((sets * trials, total, self.count, 3))
-        size = _CHUNK if self.compiled else 4 * _CHUNK
-        for a in range(0, sets * trials, size):
-            rows = np.arange(a, min(a + size, sets * trials))
+        size = _CHUNK if self.compiled else max(1, min(4 * _CHUNK, -(-sets * trials // self.threads)))
+        chunks = [np.arange(a, min(a + size, sets * trials)) for a in range(0, sets * trials, size)]
+
+        def run(rows: np.ndarray) -> None:
             filled = np.resize(rows, size) if self.compiled else rows
             trial = filled % trials
-            begin = filled if len(start.pos) == sets * trials else trial
-            part = Motion((), motion.held[trial], motion.director[trial], motion.markers[:0], ())
-            done = self._run(part, Start(start.pos[begin], start.vel[begin]), values[filled // trials], total)
-            out[rows] = done[: len(rows)]
-            if progress:
-                progress(int(rows[-1]) + 1)
+            begin = start.pick(filled if len(start.pos) == sets * trials else trial)
+            out[rows] = self._run(motion.pick(trial), begin, values[filled // trials], total)[: len(rows)]
+
+        # Compiled kernels and solvers release the interpreter's lock, so threads share the cores.
+        with ThreadPoolExecutor(self.threads) as pool:
+            list(map(run, chunks) if self.threads == 1 else pool.map(run, chunks))
         return out.reshape(sets, trials, total, self.count, 3)
 
     @torch.no_grad()
     def _run(self, motion: Motion, start: Start, values: np.ndarray, frames: int) -> np.ndarray:
         scene, params, state = self.build(motion, start, values)
         params = tree.map(tree.batch_innermost, params)
-        at = list(self.marker_vertex)
         if self._stepper is None or self._stepper[0] != scene:
             self._stepper = scene, scenes.stepper(scene, compiled=self.compiled)
         step = self._stepper[1]
         director = self._commands(scene, state, motion)
-        seen = [state.rods.pos[:, at]]
-        for k in range(1, frames):
-            control = scenes.Control(tree.batch_innermost(motion.held[:, k]), tree.batch_innermost(director[:, k]))
+        controls = [
+            scenes.Control(tree.batch_innermost(motion.held[:, k]), tree.batch_innermost(director[:, k]))
+            for k in range((frames - 1) * self.substeps + 1)
+        ]
+        if start.still is not None and start.still.any():
+            still = torch.as_tensor(start.still)
+            resting = settle.come_to_rest(step, params, state, controls[0], self.dt / self.substeps)
+            resting = self._corrected(step, scene, params, resting, controls, motion)
+            state = tree.map(tree.batch_innermost, tree.where(still, resting, state))
+        seen = [self._marked(state)]
+        for k, control in enumerate(controls[1:], 1):
             state = step(params, state, control)
-            seen.append(state.rods.pos[:, at])
-        return torch.stack(seen, 1).numpy()
+            if k % self.substeps == 0:
+                seen.append(self._marked(state))
+        track = Track(
+            torch.arange(frames, dtype=torch.float64) * self.dt,
+            *(torch.stack([s[i] for s in seen], 1) for i in range(3)),
+            torch.as_tensor(np.isin(np.arange(self.count), self.gripped)),
+        )
+        for each in sorted(scene.effects, key=lambda e: e.last):
+            track = tree.replace(track, pos=each.observe(track, params.effects.get(each.name, {})))
+        return track.pos.numpy()
+
+    def _corrected(
+        self,
+        step: Callable,
+        scene: scenes.Scene,
+        params: scenes.Params,
+        state: scenes.State,
+        controls: Sequence[scenes.Control],
+        motion: Motion,
+    ) -> scenes.State:
+        """Return a resting state moved, and set in motion, as the markers say in the first tenth of a second."""
+        free = np.setdiff1d(np.arange(self.count), self.gripped)
+        frames = min(1 + round(WINDOW / self.dt), motion.markers.shape[1], 1 + (len(controls) - 1) // self.substeps)
+        shapes = settle.smooth_shapes(self.mesh, free)
+        if shapes is None or frames < 4:
+            return state
+        at, seen, now = list(self.marker_vertex), [], state
+        for k, control in enumerate(controls[: (frames - 1) * self.substeps + 1]):
+            now = step(params, now, control) if k else state
+            if k % self.substeps == 0:
+                seen.append(now.rods.pos[:, at])
+        gap = motion.markers[:, :frames] - torch.stack(seen, 1).numpy()
+        shift, drift = (torch.as_tensor(x) for x in settle.explain(gap[:, :, free], shapes[at][free], self.dt, shapes))
+        rods = tree.replace(state.rods, pos=state.rods.pos + shift, vel=state.rods.vel + drift)
+        return self._agree(scene, params, tree.replace(state, rods=rods))
+
+    def _marked(self, state: scenes.State) -> tuple[Tensor, Tensor, Tensor]:
+        """Return positions and material directors at the markers, shape (N, M, 3) each."""
+        at, rods = list(self.marker_vertex), state.rods
+        pos = rods.pos[:, at]
+        if "marker_offset" not in self.effects:
+            return pos, pos, pos
+        edge = [min(v, len(self.arclength) - 2) for v in at]
+        ends = [v + 1 for v in edge]
+        tangent = normalize(rods.pos[:, ends] - rods.pos[:, edge])
+        u, angle = rods.director[:, edge], rods.twist[:, edge]
+        v = torch.linalg.cross(tangent, u)
+        c, s = torch.cos(angle), torch.sin(angle)
+        return pos, c * u + s * v, c * v - s * u
 
 
 def _turned(curvature: Tensor, number: dict[str, Tensor]) -> Tensor:

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["Calibration", "model_json", "summary", "summary_json", "versions"]
+__all__ = ["Calibration", "dump", "model_json", "summary", "summary_json", "versions"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,12 +66,12 @@ def summary(result: Calibration, recording: str | Path) -> dict[str, Any]:
 
 def summary_json(result: Calibration, recording: str | Path) -> str:
     """`summary` as JSON text."""
-    return _dump({"generator": "torchdlo calibrate"} | summary(result, recording))
+    return dump({"generator": "torchdlo calibrate"} | summary(result, recording))
 
 
 def model_json(result: Calibration) -> str:
     """The model file as JSON text, marked as ours."""
-    return _dump({"generator": "torchdlo calibrate"} | result.model)
+    return dump({"generator": "torchdlo calibrate"} | result.model)
 
 
 def versions() -> dict[str, str]:
@@ -85,7 +85,8 @@ def versions() -> dict[str, str]:
     return found
 
 
-def _dump(content: dict[str, Any]) -> str:
+def dump(content: dict[str, Any]) -> str:
+    """Plain objects as JSON text."""
     # JSON has no NaN: a number that is not finite is written as null.
     return json.dumps(_plain(content), indent=1, allow_nan=False) + "\n"
 

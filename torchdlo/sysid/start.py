@@ -6,11 +6,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from torchdlo.sysid.model import Motion, RopeModel, Start
-from torchdlo.sysid.recording import Trial
+from torchdlo.sysid.model import RopeModel
+from torchdlo.sysid.motion import WINDOW, Motion, Start
+from torchdlo.sysid.recording import Recording, Trial
 
-WINDOW = 0.1
-"""Seconds of a trial that its start may be estimated from."""
+_CALM = 0.05
+"""Speed below which a rope is taken to start almost in balance [m/s], if no marker moves by more in the window."""
 
 _NOISE = 2e-3
 """How far model and markers may be apart within the window [m]."""
@@ -44,6 +45,31 @@ def read_off(trials: Sequence[Trial]) -> Start:
     return Start(np.stack(pos), np.stack(vel))
 
 
+def calm(recording: Recording, trials: Sequence[Trial]) -> np.ndarray:
+    """Return which trials begin almost at rest, hanging free, shape (B,) bool.
+
+    Where a table carries the rope, friction may hold it in any shape: it starts as measured.
+    """
+    out = []
+    for trial in trials:
+        frames = max(4, int(np.searchsorted(trial.time, WINDOW + 1e-9)))
+        seen, time = trial.markers[:frames], trial.time[:frames]
+        good = np.isfinite(seen).all((0, 2))
+        slope = np.tensordot(time - time.mean(), seen[:, good], axes=(0, 0)) / ((time - time.mean()) ** 2).sum()
+        low = np.nanmin(trial.markers[:frames, ~trial.gripped, 2])
+        lying = recording.table_height is not None and low < recording.table_height + 3 * (recording.radius or 0.005)
+        enough = good.sum() >= 0.5 * len(good)
+        # Of noise of 1 mm the slope over eleven frames would be 1 cm/s.
+        out.append(bool(enough and not lying and np.sqrt((slope**2).sum(-1)).mean() < _CALM))
+    return np.array(out)
+
+
+def begin(model: RopeModel, trials: Sequence[Trial]) -> Start:
+    """Return the first estimate of where trials begin."""
+    start = read_off(trials)
+    return Start(start.pos, start.vel, calm(model.recording, trials))
+
+
 def _fill(values: np.ndarray, arclength: np.ndarray) -> np.ndarray:
     """Interpolate missing rows of (M, 3) along the rope."""
     known = np.isfinite(values[:, 0])
@@ -62,7 +88,9 @@ def refine(model: RopeModel, motion: Motion, start: Start, values: np.ndarray) -
         start: first estimate.
         values: the rope's numbers, shape (K,).
     """
-    frames = min(max(3, round(WINDOW / model.dt) + 1), motion.held.shape[1])
+    if start.still is not None and start.still.all():
+        return start
+    frames = min(max(3, round(WINDOW / model.dt) + 1), motion.markers.shape[1])
     free = np.setdiff1d(np.arange(model.count), model.gripped)
     trials, half = len(motion.names), 3 * len(free)
     nudge = np.repeat([1e-4, 1e-3], half)
@@ -70,7 +98,8 @@ def refine(model: RopeModel, motion: Motion, start: Start, values: np.ndarray) -
     for u in range(half):
         pos[u + 1, :, free[u // 3], u % 3] += nudge[u]
         vel[half + u + 1, :, free[u // 3], u % 3] += nudge[half + u]
-    varied = Start(pos.reshape(-1, *start.pos.shape[1:]), vel.reshape(-1, *start.vel.shape[1:]))
+    still = None if start.still is None else np.tile(start.still, 2 * half + 1)
+    varied = Start(pos.reshape(-1, *start.pos.shape[1:]), vel.reshape(-1, *start.vel.shape[1:]), still)
     sim = model.simulate(motion, varied, np.tile(values, (2 * half + 1, 1)), frames=frames)
     measured = motion.markers[:, :frames]
     seen = np.isfinite(measured).reshape(trials, -1)
@@ -81,7 +110,7 @@ def refine(model: RopeModel, motion: Motion, start: Start, values: np.ndarray) -
     normal = slope.transpose(0, 2, 1) @ slope / _NOISE**2 + np.diag(prior)
     step = np.linalg.solve(normal, (slope.transpose(0, 2, 1) @ residual[..., None]) / _NOISE**2)[..., 0]
     step = np.nan_to_num(step).reshape(trials, 2, len(free), 3)
-    better = Start(start.pos.copy(), start.vel.copy())
+    better = Start(start.pos.copy(), start.vel.copy(), start.still)
     better.pos[:, free] += step[:, 0]
     better.vel[:, free] += step[:, 1]
     return better

@@ -1,0 +1,77 @@
+"""What long commands show while they run, and how they are stopped."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+__all__ = ["deferred_interrupt", "progress"]
+
+
+@contextmanager
+def progress() -> Iterator[Callable[[str, int, int, str], None]]:
+    """A bar with the time left on stderr; a callback(stage, done, total, message) moves it."""
+    from rich.console import Console
+    from rich.progress import (
+        BarColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+
+    console = Console(stderr=True)
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TextColumn("{task.completed:.0f}/{task.total:.0f}"),
+        TimeElapsedColumn(),
+        TextColumn("left"),
+        TimeRemainingColumn(),
+        TextColumn("{task.fields[message]}"),
+    )
+    # Off a terminal a bar is only noise in a log.
+    with Progress(*columns, console=console, disable=not console.is_terminal) as bar:
+        tasks: dict[str, Any] = {}
+
+        def callback(stage: str, done: int, total: int, message: str = "") -> None:
+            if stage not in tasks:
+                tasks[stage] = bar.add_task(stage, total=total, message=message)
+            bar.update(tasks[stage], completed=done, total=total, message=message)
+
+        yield callback
+
+
+@contextmanager
+def deferred_interrupt(
+    callback: Callable[[str, int, int, str], None],
+) -> Iterator[Callable[[str, int, int, str], None]]:
+    """Let Ctrl-C raise KeyboardInterrupt only inside the callback; a second one raises at once."""
+    import signal
+    import threading
+
+    if threading.current_thread() is not threading.main_thread():
+        yield callback
+        return
+    asked = False
+    previous = signal.getsignal(signal.SIGINT)
+
+    def ask(signum: int, frame: Any) -> None:
+        nonlocal asked
+        if asked:
+            raise KeyboardInterrupt
+        asked = True
+        sys.stderr.write("stopping after this iteration; Ctrl-C again to stop at once\n")
+
+    def checked(stage: str, done: int, total: int, message: str = "") -> None:
+        callback(stage, done, total, message)
+        if asked:
+            raise KeyboardInterrupt
+
+    signal.signal(signal.SIGINT, ask)
+    try:
+        yield checked
+    finally:
+        signal.signal(signal.SIGINT, previous)

@@ -1,0 +1,190 @@
+"""Many small models at once, each in a process of its own; a single one would leave cores idle."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+import numpy as np
+
+from torchdlo.sysid import fit
+from torchdlo.sysid import start as starts
+from torchdlo.sysid.fit import Point, Space
+from torchdlo.sysid.model import RopeModel
+from torchdlo.sysid.motion import Motion, Start
+from torchdlo.sysid.recording import Recording
+
+Job = TypeVar("Job")
+
+
+@dataclass(frozen=True, eq=False)
+class Simulation:
+    """Parameter sets to simulate."""
+
+    effects: tuple[str, ...]
+    """Effects of the model."""
+    values: np.ndarray
+    """Parameter sets in the order of the model's numbers, shape (P, K)."""
+    split: str = "train"
+    """Trials: "train" or "test"."""
+    start: Start | None = None
+    """Where the trials begin; read off them if not given."""
+    options: tuple[tuple[str, Any], ...] = ()
+    """Options of `RopeModel` that differ from those of the pool."""
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """Numbers to fit to the train trials."""
+
+    effects: tuple[str, ...]
+    """Effects of the model."""
+    values: np.ndarray
+    """Where to start, in the order of the model's numbers, shape (S, K)."""
+    free: tuple[str, ...]
+    """Numbers to fit; the others stay as they are in the first start."""
+    sizes: tuple[float, ...]
+    """What counts as much of each of them, see `Space`."""
+    iterations: int
+    """Most iterations."""
+    start: Start | None = None
+    """Where the trials begin; read off them if not given."""
+    frames: int | None = None
+    """How many frames to fit; all if not given."""
+
+
+@dataclass(frozen=True, eq=False)
+class Fitted:
+    """What a fit found."""
+
+    effects: tuple[str, ...]
+    """Effects of the model."""
+    values: np.ndarray
+    """Best numbers, in the order of the model's, shape (K,)."""
+    space: Space
+    """The numbers that were fitted."""
+    point: Point
+    """Their coordinates, with costs and slopes."""
+
+
+class Models:
+    """Models of one process by their effects and options."""
+
+    def __init__(self, recording: Recording, options: dict[str, Any]) -> None:
+        self.recording, self.options = recording, options
+        self._models: dict[Any, RopeModel] = {}
+        self._motions: dict[Any, Motion] = {}
+
+    def model(self, effects: Sequence[str], options: tuple[tuple[str, Any], ...] = ()) -> RopeModel:
+        """Return the model with these effects."""
+        key = (tuple(effects), options)
+        if key not in self._models:
+            self._models[key] = RopeModel(self.recording, effects=effects, **(self.options | dict(options)))
+        return self._models[key]
+
+    def motion(self, model: RopeModel, split: str) -> Motion:
+        """Return the motion of the trials of a split."""
+        key = (split, model.substeps, len(model.arclength))
+        if key not in self._motions:
+            self._motions[key] = model.motion(getattr(self.recording, split))
+        return self._motions[key]
+
+    def simulate(self, job: Simulation) -> np.ndarray:
+        """Return markers [m], shape (P, B, F, M, 3)."""
+        model = self.model(job.effects, job.options)
+        start = job.start or starts.begin(model, getattr(self.recording, job.split))
+        return model.simulate(self.motion(model, job.split), start, job.values)
+
+    def fit(self, job: Fit) -> Fitted:
+        """Return the best of the fits from all starts."""
+        model = self.model(job.effects)
+        motion = self.motion(model, "train")
+        start = job.start or starts.begin(model, self.recording.train)
+        columns = [model.parameters.index(name) for name in job.free]
+        space = Space(job.free, tuple(model.params[k] for k in columns), job.sizes)
+
+        def simulate(values: np.ndarray) -> np.ndarray:
+            full = np.repeat(job.values[:1], len(values), 0)
+            full[:, columns] = values
+            return model.simulate(motion, start, full, frames=job.frames)
+
+        measured = motion.markers[:, : job.frames]
+        raws = space.clip(space.to_raw(job.values[:, columns]))
+        points = fit.evaluate(simulate, measured, space, raws)
+        *_, points = [points, *fit.improve(simulate, measured, space, points, iterations=job.iterations)]
+        best = min(points, key=lambda p: p.cost)
+        values = job.values[0].copy()
+        values[columns] = space.to_values(best.raw)
+        return Fitted(job.effects, values, space, best)
+
+
+class Pool:
+    """Worker processes that keep their models."""
+
+    def __init__(self, recording: Recording, options: dict[str, Any], workers: int | None = None) -> None:
+        """Start the workers.
+
+        Args:
+            recording: what is simulated.
+            options: options of every model.
+            workers: how many; one per core if not given. One means this process.
+        """
+        workers = workers or max(1, os.cpu_count() or 1)
+        self.recording, self.local = recording, Models(recording, options)
+        self._pool = None
+        if workers > 1:
+            context = multiprocessing.get_context("spawn")
+            self._pool = ProcessPoolExecutor(workers, context, _begin, (recording, options))
+
+    def __enter__(self) -> Pool:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._pool is not None:
+            self._pool.shutdown(wait=False, cancel_futures=True)
+
+    def simulate(self, jobs: Sequence[Simulation]) -> Iterator[tuple[int, np.ndarray]]:
+        """Yield the index and the markers of every job as they get ready."""
+        return self._run(_simulate, self.local.simulate, jobs)
+
+    def fit(self, jobs: Sequence[Fit]) -> Iterator[tuple[int, Fitted]]:
+        """Yield the index and the result of every fit as they get ready."""
+        return self._run(_fit, self.local.fit, jobs)
+
+    def _run(
+        self, remote: Callable[[Job], Any], local: Callable[[Job], Any], jobs: Sequence[Job]
+    ) -> Iterator[tuple[int, Any]]:
+        if self._pool is None:
+            yield from ((k, local(job)) for k, job in enumerate(jobs))
+            return
+        waiting = {self._pool.submit(remote, job): k for k, job in enumerate(jobs)}
+        for future in as_completed(waiting):
+            yield waiting[future], future.result()
+
+
+_models: Models | None = None
+"""Those of a worker process."""
+
+
+def _begin(recording: Recording, options: dict[str, Any]) -> None:
+    import signal
+
+    import torch
+
+    global _models
+    torch.set_num_threads(1)
+    # Ctrl-C is the parent's to handle.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    _models = Models(recording, options)
+
+
+def _simulate(job: Simulation) -> np.ndarray:
+    return _models.simulate(job)
+
+
+def _fit(job: Fit) -> Fitted:
+    return _models.fit(job)

@@ -1,0 +1,211 @@
+"""Which effects could explain what a model gets wrong: doses of each, against the residual.
+
+Every effect is added in small doses to the calibrated model, in one batch. What a dose changes, after the baseline's
+own numbers have been allowed to take up what they can, is compared with what is left over (an efficient score: Rao
+1948, doi:10.1017/S0305004100023987). The score is the share of the left-over that the best mixture of doses takes away.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import lsq_linear
+
+from torchdlo.sysid import library
+from torchdlo.sysid.library import Probe
+from torchdlo.sysid.pool import Fitted, Pool, Simulation
+
+_KNEE = 2e-3
+"""Residual from which it counts less [m]."""
+
+_HORIZON = 0.6
+"""Share of each trial that is compared: over longer times the answer to a dose is not linear any more."""
+
+_MOST = 20.0
+"""Most doses of an effect."""
+
+
+@dataclass(frozen=True, eq=False)
+class Score:
+    """How well an effect fits to a residual."""
+
+    name: str
+    """The effect."""
+    share: float
+    """Share of the weighted squared residual that it takes away beyond what the baseline can."""
+    dose: dict[str, float]
+    """Its numbers where a fit should start."""
+    sizes: dict[str, float]
+    """What counts as much of each number, in the terms of its scale."""
+    direction: np.ndarray
+    """What it changes after the baseline took up its part, unit length, weighted residuals, shape (R,)."""
+
+
+def curvature_scale(markers: np.ndarray) -> float:
+    """Return a large curvature of measured shapes (B, F, M, 3) [1/m]: the 95th percentile."""
+    a, b = np.diff(markers, axis=2)[:, :, :-1], np.diff(markers, axis=2)[:, :, 1:]
+    la, lb = (np.linalg.norm(x, axis=-1) for x in (a, b))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        cosine = (a * b).sum(-1) / (la * lb)
+        angle = np.arccos(np.clip(cosine, -1, 1)) / (0.5 * (la + lb))
+    return float(max(np.nanpercentile(angle, 95), 0.5))
+
+
+def screen(
+    pool: Pool, base: Fitted, names: Sequence[str], start: object, report: Callable[[int, int], None]
+) -> list[Score]:
+    """Return the scores of effects, best first.
+
+    Args:
+        pool: the simulations.
+        base: the calibrated model.
+        names: effects to try.
+        start: where the train trials begin.
+        report: called with the number of groups done and in all.
+    """
+    recording, model = pool.recording, pool.local.model(base.effects)
+    motion = pool.local.motion(model, "train")
+    known = dict(zip(model.parameters, base.values, strict=True))
+    curved = curvature_scale(motion.markers[:, :: max(1, motion.markers.shape[1] // 50)])
+    doses = {n: library.probes(n, recording, model.mesh, curved, known) for n in names}
+    groups = _groups(names, doses)
+    jobs = [_job(pool, base, group, doses, start) for group in groups]
+    baseline = np.repeat(base.values[None], len(base.space.names) + 1, 0)
+    columns = [model.parameters.index(n) for n in base.space.names]
+    nudge = base.space.nudges()
+    for k, column in enumerate(columns):
+        moved = base.point.raw.copy()
+        moved[k] += nudge[k]
+        baseline[k + 1, column] = base.space.to_values(moved)[k]
+    jobs.append(Simulation(base.effects, baseline, start=start))
+    found: dict[int, np.ndarray] = {}
+    report(0, len(jobs))
+    for k, sims in pool.simulate(jobs):
+        found[k] = sims
+        report(len(found), len(jobs))
+    frames = max(10, int(_HORIZON * motion.markers.shape[1]))
+    free = np.setdiff1d(np.arange(model.count), model.gripped)
+
+    def pick(x: np.ndarray) -> np.ndarray:
+        return x[..., :frames, free, :].reshape(*x.shape[:-4], -1)
+
+    own = found[len(groups)]
+    residual = pick(motion.markers - own[0])
+    good = np.isfinite(residual) & np.isfinite(pick(own)).all(0)
+    weight = np.where(good, 1 / np.sqrt(np.nan_to_num(residual) ** 2 + _KNEE**2), 0.0) ** 0.5
+    residual = np.nan_to_num(residual) * weight
+    jacobian = np.stack([np.nan_to_num(pick(own[k + 1] - own[0])) * weight for k in range(len(columns))], 1)
+    q, _ = np.linalg.qr(jacobian)
+    left = residual - q @ (q.T @ residual)
+    scores = []
+    for group, sims in zip(groups, (found[k] for k in range(len(groups))), strict=True):
+        row = 1
+        for name in group:
+            answers = []
+            for _ in doses[name]:
+                change = np.nan_to_num(pick(sims[row] - sims[0])) * weight
+                answers.append(change - q @ (q.T @ change))
+                row += 1
+            scores.append(_score(name, doses[name], np.stack(answers, 1), left))
+    return sorted(scores, key=lambda s: -s.share)
+
+
+def _groups(names: Sequence[str], doses: dict[str, list[Probe]]) -> list[list[str]]:
+    """Return effects that are simulated together: a scene of many effects is slow, one scene per effect wasteful."""
+    groups: list[list[str]] = []
+    for name in sorted(names, key=lambda n: -len(doses[n])):
+        fitting = [g for g in groups if len(g) < 4 and sum(len(doses[n]) for n in g) + len(doses[name]) <= 12]
+        # Drag and wind are the same law.
+        fitting = [g for g in fitting if not ({name, *g} >= {"air_drag", "wind"})]
+        if fitting:
+            min(fitting, key=lambda g: sum(len(doses[n]) for n in g)).append(name)
+        else:
+            groups.append([name])
+    return groups
+
+
+def _job(pool: Pool, base: Fitted, group: Sequence[str], doses: dict[str, list[Probe]], start: object) -> Simulation:
+    effects = (*base.effects, *group)
+    model = pool.local.model(effects)
+    first = model.guess()
+    first[: len(base.values)] = base.values
+    rows = [first]
+    for name in group:
+        for probe in doses[name]:
+            row = first.copy()
+            for key, value in probe.values.items():
+                row[model.parameters.index(key)] = value
+            rows.append(row)
+    return Simulation(effects, np.stack(rows), start=start)
+
+
+def _score(name: str, doses: list[Probe], answers: np.ndarray, left: np.ndarray) -> Score:
+    """Return the score of one effect from the answers (R, J) to its doses."""
+    whole = float(left @ left) + 1e-30
+    scale = np.linalg.norm(answers, axis=0) + 1e-30
+    low = np.array([-_MOST if d.signed else 0.0 for d in doses])
+    together = _additive(doses)
+    choices = [list(range(len(doses)))] if together else [[k] for k in range(len(doses))]
+    best: tuple[float, dict[str, float], np.ndarray] = (0.0, {}, np.zeros(len(left)))
+    for rows in choices:
+        a = answers[:, rows] / scale[rows]
+        bounds = (low[rows] * scale[rows] - 1e-9, _MOST * scale[rows] + 1e-9)
+        amount = lsq_linear(a, left, bounds=bounds).x
+        taken = whole - float(np.sum((left - a @ amount) ** 2))
+        if taken / whole > best[0] or not best[1]:
+            amounts = amount / scale[rows]
+            best = (taken / whole, _mixture(name, [doses[k] for k in rows], amounts), a @ amount)
+    direction = best[2] / (np.linalg.norm(best[2]) + 1e-30)
+    return Score(name, max(best[0], 0.0), best[1], _sizes(name, doses), direction)
+
+
+def _additive(doses: list[Probe]) -> bool:
+    """Return whether doses are of different numbers, so that they may be mixed."""
+    keys = [tuple(d.values) for d in doses]
+    return len(keys) > 1 and all(len(k) == 1 for k in keys) and len(set(keys)) == len(keys)
+
+
+_STRENGTH = {
+    "wind": "velocity",
+    "point_mass": "mass",
+    "nonuniform_stiffness": "factor",
+    "internal_friction": "moment",
+    "anisotropic_bending": "ratio",
+    "bending_plasticity": "",
+}
+"""The number of an effect that grows with the dose; the others say where or how. Default: all."""
+
+
+def _mixture(name: str, doses: list[Probe], amounts: np.ndarray) -> dict[str, float]:
+    """Return numbers for amounts of doses, kept within reason."""
+    found: dict[str, float] = {}
+    for dose, raw in zip(doses, amounts, strict=True):
+        amount = float(np.clip(raw, -8, 8))
+        amount = amount if abs(amount) > 0.2 else (0.2 if amount >= 0 else -0.2)
+        for key, value in dose.values.items():
+            number = key.split(".")[1]
+            if name in ("stretch", "gripper_compliance"):
+                found[key] = value / amount
+            elif name == "anisotropic_bending" and number == "ratio":
+                found[key] = float(np.exp(np.clip(amount * np.log(value), -1.5, 1.5)))
+            elif name in _STRENGTH and number != _STRENGTH[name] and number != "slope":
+                found[key] = value
+            else:
+                found[key] = value * amount
+    return found
+
+
+def _sizes(name: str, doses: list[Probe]) -> dict[str, float]:
+    """Return what counts as much of each number: the dose of strengths, a share of the range of places."""
+    sizes: dict[str, float] = {}
+    for dose in doses:
+        for key, value in dose.values.items():
+            inverse = name in ("stretch", "gripper_compliance")
+            sizes[key] = 1 / value if inverse else abs(value) or 1.0
+    for key in ("point_mass.position", "nonuniform_stiffness.position"):
+        if key in sizes:
+            sizes[key] = 0.2 * max(d.values.get(key, 0.0) for d in doses)
+    sizes |= {k: 0.2 for k in sizes if k.endswith(".direction")}
+    return sizes
