@@ -332,8 +332,7 @@ def test_clamps_that_are_not_at_hinges_are_refused(hinges):
 
 @pytest.mark.compile
 @pytest.mark.slow
-@pytest.mark.parametrize("twist", ["quasistatic", "dynamic"])
-def test_compiled_steps_with_every_law_equal_eager_ones(twist):
+def test_compiled_steps_with_every_law_equal_eager_ones():
     # The same operations in another order: 1e-10 of the rope's size after 20 steps.
     laws = ["internal_friction", "stiffening_bending", "anisotropic_bending", "stretch", "wind", "tilted_gravity"]
     values = {"wind": {"velocity": (1.0, 2.0, 0.0)}, "stretch": {"EA": 60.0}, "tilted_gravity": {"angles": (0.1, 0.0)}}
@@ -344,7 +343,8 @@ def test_compiled_steps_with_every_law_equal_eager_ones(twist):
         [*effects("bend_frame", "twist", "gravity", "damping", *laws), GripperCompliance(hinges=(1,))],
         values,
         integrator="implicit",
-        twist=twist,
+        # In balance, every Newton step is a copy of the laws: it compiles for minutes and shows nothing else.
+        twist="dynamic",
         dt=2e-3,
         substeps=1,
         held_vertices=(0, 1),

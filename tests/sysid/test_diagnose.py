@@ -150,13 +150,13 @@ def test_an_unknown_budget_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("effects", "named"), [({"air_drag.c_d": 3.0}, ["air_drag"]), ({}, [])])
+@pytest.mark.parametrize(("effects", "named"), [({"air_drag.c_d": 6.0}, ["air_drag"]), ({}, [])])
 def test_a_hidden_effect_is_named_and_none_where_there_is_none(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, effects: dict[str, float], named: list[str]
 ) -> None:
     # Two names keep it short; the mesh and the steps are not those of the recording.
     monkeypatch.setattr(library, "LIBRARY", ("air_drag", "point_mass"))
-    monkeypatch.setattr(search, "BUDGETS", {"fast": search.Budget(4, 2, 4, 1)})
+    monkeypatch.setattr(search, "BUDGETS", {"fast": search.Budget(3, 2, 3, 1)})
     recording = make_recording(tmp_path, effects)
     stages = []
     result = search.diagnose(recording, vertices=31, workers=1, callback=lambda *step: stages.append(step))
@@ -164,8 +164,10 @@ def test_a_hidden_effect_is_named_and_none_where_there_is_none(
     found = findings(result, recording)
     assert set(found["gap"]) >= {"test_rmse_before_m", "test_rmse_after_m", "noise_floor_m", "per_trial"}
     if named:
-        assert found["effects"][0]["parameters"]["c_d"]["value"] == pytest.approx(3.0, rel=0.2)
-        assert found["gap"]["test_rmse_after_m"] < 0.5 * found["gap"]["test_rmse_before_m"]
+        assert found["effects"][0]["parameters"]["c_d"]["value"] == pytest.approx(6.0, rel=0.2)
+        # Most of what is above the noise of 0.2 mm is closed; the rest is the grid, which is not the recording's.
+        before, after = (found["gap"][f"test_rmse_{when}_m"] ** 2 - 2e-4**2 for when in ("before", "after"))
+        assert after < 0.3 * before
     assert json.loads(findings_json(result, recording))["verdict"] == result.verdict
     assert set(json.loads(model_json(result, recording))["effects"]) >= set(named)
     page = report.diagnosis_html(result, recording)

@@ -11,7 +11,7 @@ from torchdlo import scene as scenes
 from torchdlo.physics import tree
 from torchdlo.sysid.mesh import Mesh
 
-_SETTLING = 1.5
+_SETTLING = 1.0
 """Time that a rope gets to come to rest where a trial starts [s]."""
 
 _SETTLING_RATE = 8.0
