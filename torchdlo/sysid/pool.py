@@ -144,8 +144,13 @@ class Pool:
         return self
 
     def __exit__(self, *_: object) -> None:
-        if self._pool is not None:
-            self._pool.shutdown(wait=False, cancel_futures=True)
+        if self._pool is None:
+            return
+        # After Ctrl-C nobody waits for fits that are still running; idle workers do not mind.
+        workers = list((self._pool._processes or {}).values())
+        self._pool.shutdown(wait=False, cancel_futures=True)
+        for worker in workers:
+            worker.terminate()
 
     def simulate(self, jobs: Sequence[Simulation]) -> Iterator[tuple[int, np.ndarray]]:
         """Yield the index and the markers of every job as they get ready."""
@@ -172,14 +177,23 @@ _models: Models | None = None
 
 def _begin(recording: Recording, options: dict[str, Any]) -> None:
     import signal
+    import threading
 
     import torch
 
     global _models
     torch.set_num_threads(1)
-    # Ctrl-C is the parent's to handle.
+    # Ctrl-C is the parent's to handle; and when the parent is gone, nobody wants the rest.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
     _models = Models(recording, options)
+
+
+def _end_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
 
 
 def _simulate(job: Simulation) -> np.ndarray:
