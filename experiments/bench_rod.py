@@ -191,6 +191,22 @@ def start(jobs: list[Any]) -> None:
 
 
 @contextlib.contextmanager
+def interrupts() -> Iterator[list[int]]:
+    """Yield a list that a Ctrl-C is added to as well as raised: Python drops one that arrives inside a finaliser."""
+    seen: list[int] = []
+
+    def note(number: int, _: Any) -> None:
+        seen.append(number)
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGINT, note)
+    try:
+        yield seen
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+@contextlib.contextmanager
 def processes(target: Callable, heads: list[tuple]) -> Iterator[tuple[list[Any], Any, Any]]:
     """Yield a process per tuple of first arguments, not yet started, with their event and queue; none outlives this."""
     context = multiprocessing.get_context("spawn")
@@ -353,18 +369,18 @@ def main() -> int:
         "machine": {"cores": os.cpu_count(), "cpu": platform.processor() or platform.machine()},
         "versions": {"python": platform.python_version(), "torch": version("torch")},
     } | {name: [] for name in ("rows", "first_call_s", "memory")}
-    todo, stopped = list(jobs(options, content)), False
+    todo = list(jobs(options, content))
     columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn())
-    with Progress(*columns) as progress:
+    with Progress(*columns) as progress, interrupts() as stopped:
         task = progress.add_task("", total=sum(about for _, about, _ in todo))
-        try:
+        with contextlib.suppress(KeyboardInterrupt):
             for name, about, do in todo:
+                if stopped:
+                    break
                 progress.update(task, description=name)
                 do()
                 save(options.json, content)
                 progress.advance(task, about)
-        except KeyboardInterrupt:
-            stopped = True
     save(options.json, content)
     show(content, GOALS)
     return 130 if stopped else 0
