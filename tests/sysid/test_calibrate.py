@@ -130,6 +130,18 @@ def test_a_trial_that_is_suspect_throughout_is_left_out(tmp_path: Path) -> None:
     assert result.parameters["bending_stiffness"]["value"] == pytest.approx(TRUE[0], rel=0.05)
 
 
+def test_a_trial_that_starts_with_a_mistracked_marker_is_simulated(tmp_path: Path) -> None:
+    recording = make_recording(tmp_path)
+    trial = recording.test[0]
+    jumped = trial.markers.copy()
+    jumped[:6, 3] += [0.05, 0.0, 0.08]  # its edges are tens of per cent longer than the rope's
+    model = RopeModel(recording, vertices=13)
+    first = start.read_off([replace(trial, markers=jumped)])
+    sim = model.simulate(model.motion([trial]), first, TRUE[None])[0, 0]
+    edges = np.linalg.norm(np.diff(sim, axis=1), axis=-1)[:, 1:-1]  # the others are between gripped markers
+    assert (edges <= np.diff(trial.marker_arclength)[1:-1] * (1 + 1e-3)).all()
+
+
 def test_starts_use_nothing_after_the_first_tenth_of_a_second(tmp_path: Path) -> None:
     recording = make_recording(tmp_path)
     trial = recording.test[0]
