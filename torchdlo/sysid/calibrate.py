@@ -6,19 +6,20 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from torchdlo.errors import InputError
-from torchdlo.sysid import fit, judge
+from torchdlo.sysid import fit, judge, saved
 from torchdlo.sysid import start as starts_of
 from torchdlo.sysid.checkpoint import Checkpoint
 from torchdlo.sysid.fit import Point, Space
-from torchdlo.sysid.library import PARAMETERS
 from torchdlo.sysid.model import RopeModel
 from torchdlo.sysid.motion import Motion, Start
 from torchdlo.sysid.recording import Recording, Trial
 from torchdlo.sysid.result import Calibration
+from torchdlo.sysid.saved import Saved
 
 Callback = Callable[[str, int, int, str], None]
 """Called with stage, steps done, steps in all, and a word on how it goes."""
@@ -38,8 +39,21 @@ class _Job:
     space: Space
     motion: Motion
     start: Start
+    first: np.ndarray
     values: np.ndarray
+    given: bool = False
     point: Point | None = None
+
+    @property
+    def columns(self) -> list[int]:
+        """Return where the numbers that are fitted stand among those of the model."""
+        return [self.model.parameters.index(name) for name in self.space.names]
+
+    def full(self, values: np.ndarray) -> np.ndarray:
+        """Return all numbers of the model for fitted ones, both (..., K)."""
+        out = np.broadcast_to(self.first, (*values.shape[:-1], len(self.first))).copy()
+        out[..., self.columns] = values
+        return out
 
 
 def calibrate(
@@ -52,6 +66,7 @@ def calibrate(
     rest: str = "auto",
     checkpoint: Path | None = None,
     resume: bool = False,
+    given: Saved | None = None,
     callback: Callback | None = None,
 ) -> Calibration:
     """Fit the baseline model to the train trials and judge it on the test trials.
@@ -70,6 +85,7 @@ def calibrate(
             predicts the train trials better.
         checkpoint: file that keeps the best so far.
         resume: go on from it.
+        given: model to start from in place of many starts, with its effects; it says what the rest shape is.
         callback: see `Callback`; it may raise KeyboardInterrupt, which ends the fit with the best so far.
 
     Raises:
@@ -79,15 +95,19 @@ def calibrate(
     if rest not in ("auto", "straight", "given"):
         raise InputError(f"rest is {rest!r}; expected auto, straight or given.")
     report = callback or (lambda stage, done, total, message: None)
+    if given is not None and rest not in ("auto", given.options["rest"]):
+        raise InputError(f"rest is {rest!r}; expected auto or {given.options['rest']}, as {given.path} has it.")
+    rest = rest if given is None else given.options["rest"]
     kinds = [rest] if rest != "auto" else ["straight"] + (["given"] if recording.rest_positions is not None else [])
-    memory = Checkpoint(
-        checkpoint, recording, {"starts": starts, "seed": seed, "vertices": vertices, "rest": rest}, resume
-    )
+    asked: dict[str, Any] = {"starts": starts, "seed": seed, "vertices": vertices, "rest": rest}
+    if given is not None:
+        asked |= {"values": given.values, "options": given.options}
+    memory = Checkpoint(checkpoint, recording, asked, resume)
     best: _Job | None = None
     interrupted = False
     try:
         for kind in kinds:
-            job = _job(recording, kind, vertices)
+            job = _job(recording, kind, vertices, given)
             best = best or job
             for improved in _fit(job, recording, starts, iterations, np.random.default_rng(seed), memory, report):
                 if best.point is None or best is improved or improved.point.cost < best.point.cost:
@@ -99,11 +119,17 @@ def calibrate(
     return _judge(recording, best, seed, interrupted, begun, report)
 
 
-def _job(recording: Recording, rest: str, vertices: int | None) -> _Job:
-    model = RopeModel(recording, vertices=vertices, rest=rest)
+def _job(recording: Recording, rest: str, vertices: int | None, given: Saved | None) -> _Job:
     trials = _usable(recording)
-    space = Space(tuple(model.parameters), tuple(model.params))
-    return _Job(model, space, model.motion(trials), starts_of.begin(model, trials), model.guess())
+    if given is None:
+        model = RopeModel(recording, vertices=vertices, rest=rest)
+        space, values = Space(tuple(model.parameters), tuple(model.params)), model.guess()
+    else:
+        model = given.model(recording, **({} if vertices is None else {"vertices": vertices}))
+        sizes, values = given.sizes(model), given.start(model)
+        params = tuple(p for name, p in zip(model.parameters, model.params, strict=True) if name in sizes)
+        space = Space(tuple(sizes), params, tuple(sizes.values()))
+    return _Job(model, space, model.motion(trials), starts_of.begin(model, trials), values, values, given is not None)
 
 
 def _usable(recording: Recording) -> list[Trial]:
@@ -129,13 +155,16 @@ def _fit(
     """Yield the job each time it got better."""
     name = f"{job.model.rest} rest shape"
     kept = memory.recall(job.model.rest)
-    raw = job.space.to_raw(np.array(kept)) if kept else _scout(job, recording, starts, rng, report, name)
+    if kept or job.given:
+        raw = job.space.to_raw(np.array(kept or job.first)[job.columns])
+    else:
+        raw = _scout(job, recording, starts, rng, report, name)
     stage = f"fitting {len(job.motion.names)} trials, {name}"
     report(stage, 0, iterations + 1, "")
-    job.start = starts_of.refine(job.model, job.motion, job.start, job.space.to_values(raw))
+    job.start = starts_of.refine(job.model, job.motion, job.start, job.full(job.space.to_values(raw)))
 
     def simulate(values: np.ndarray) -> np.ndarray:
-        return job.model.simulate(job.motion, job.start, values)
+        return job.model.simulate(job.motion, job.start, job.full(values))
 
     points = fit.evaluate(simulate, job.motion.markers, job.space, raw[None])
     if not np.isfinite(points[0].cost):
@@ -143,13 +172,13 @@ def _fit(
             f"{recording.path}: the simulation failed on the train trials from every start; check length, mass and "
             "marker_arclength, or use fewer vertices."
         )
-    job.point, job.values = points[0], job.space.to_values(points[0].raw)
+    job.point, job.values = points[0], job.full(job.space.to_values(points[0].raw))
     yield job
     report(stage, 1, iterations + 1, f"{1e3 * job.point.cost:.2f} mm")
     for done, (point,) in enumerate(
         fit.improve(simulate, job.motion.markers, job.space, points, iterations=iterations)
     ):
-        job.point, job.values = point, job.space.to_values(point.raw)
+        job.point, job.values = point, job.full(job.space.to_values(point.raw))
         memory.keep(job.model.rest, job.values)
         yield job
         report(stage, done + 2, iterations + 1, f"{1e3 * point.cost:.2f} mm")
@@ -214,22 +243,24 @@ def _judge(
     """Predict all trials before and after, and compare."""
     trials = (*recording.train, *recording.test)
     report("predicting all trials", 0, 2, "")
-    before = judge.predict(job.model, trials, job.model.guess())
+    before = judge.predict(job.model, trials, job.first)
     report("predicting all trials", 1, 2, "")
     after = judge.predict(job.model, trials, job.values)
     report("predicting all trials", 2, 2, "")
     low, high = fit.interval(job.point, job.space)
     return Calibration(
         parameters={
-            name: {"value": float(v), "low": float(a), "high": float(b), "unit": PARAMETERS[name].unit}
-            for name, v, a, b in zip(job.space.names, job.values, low, high, strict=True)
+            name: {"value": float(v), "low": float(min(a, b)), "high": float(max(a, b)), "unit": param.unit}
+            for name, param, v, a, b in zip(
+                job.space.names, job.space.params, job.values[job.columns], low, high, strict=True
+            )
         },
         **judge.errors(recording, after),
         before=judge.errors(recording, before),
         baselines=judge.trivial(recording),
         per_trial=judge.by_trial(recording, before, after),
         seconds=time.perf_counter() - begun,
-        model=judge.model_file(job.model, job.values),
+        model=saved.content(job.model, job.values),
         predictions=after,
         predictions_before=before,
         seed=seed,
@@ -240,6 +271,8 @@ def _judge(
 
 def _notes(recording: Recording, job: _Job) -> list[str]:
     notes = [f"Rest shape: {job.model.rest}."]
+    if job.model.effects:
+        notes.append(f"Effects of the given model: {', '.join(e.replace('_', ' ') for e in job.model.effects)}.")
     unused = sorted({t.name for t in recording.train} - set(job.motion.names))
     if unused:
         notes.append(f"Not fitted because every frame is marked suspect: {', '.join(unused)}.")

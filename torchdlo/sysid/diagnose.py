@@ -10,18 +10,23 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from torchdlo.errors import InputError
 from torchdlo.sysid import floor as floors
-from torchdlo.sysid import library
+from torchdlo.sysid import health, library
 from torchdlo.sysid import start as starts
 from torchdlo.sysid.floor import Floor
+from torchdlo.sysid.health import Fault
+from torchdlo.sysid.journal import Journal
 from torchdlo.sysid.model import RopeModel
 from torchdlo.sysid.motion import Start
 from torchdlo.sysid.pool import Fit, Fitted, Pool, Simulation
 from torchdlo.sysid.recording import Recording
+from torchdlo.sysid.saved import Saved
 from torchdlo.sysid.screen import Score, screen
 
 Callback = Callable[[str, int, int, str], None]
@@ -102,6 +107,10 @@ class Diagnosis:
     """Time that it took."""
     notes: list[str] = field(default_factory=list)
     """Sentences that a reader should know."""
+    health: list[Fault] = field(default_factory=list)
+    """What is wrong with the data."""
+    options: dict[str, Any] = field(default_factory=dict)
+    """What was asked for."""
 
 
 def rms(gaps: np.ndarray) -> float:
@@ -117,6 +126,9 @@ def diagnose(
     vertices: int | None = None,
     workers: int | None = None,
     callback: Callback | None = None,
+    journal: Path | None = None,
+    resume: bool = False,
+    given: Saved | None = None,
 ) -> Diagnosis:
     """Name what a recording shows that the baseline model lacks.
 
@@ -127,14 +139,23 @@ def diagnose(
         vertices: vertices of the rope; from the spacing of the markers if not given.
         workers: processes; one per core if not given.
         callback: see `Callback`.
+        journal: folder that keeps what is done, so that a search which was stopped can go on.
+        resume: go on from it.
+        given: model to take as the baseline, with its effects, in place of many starts.
     """
     if budget not in BUDGETS:
         raise InputError(f"budget is {budget!r}; expected one of {', '.join(BUDGETS)}.")
     begun, report = time.perf_counter(), callback or (lambda *_: None)
+    recording, faults = health.check(recording)
     options = {"vertices": vertices or _vertices(recording), "ahead": 0.0, "grip": 0.0, "compiled": False}
-    with Pool(recording, options, workers) as pool:
+    if given is not None:
+        options |= given.options if vertices is None else given.options | {"vertices": vertices}
+    asked = {"budget": BUDGETS[budget], "seed": seed, "options": options, "first": given and given.values}
+    kept = None if journal is None else Journal(journal, recording, asked, resume=resume)
+    with Pool(recording, options, workers, kept) as pool:
         search = _Search(pool, BUDGETS[budget], np.random.default_rng(seed), report)
-        found = search.run()
+        found = search.run(given)
+    found.health, found.options = faults, {"budget": budget, "seed": seed, "vertices": options["vertices"]}
     found.seconds = time.perf_counter() - begun
     return found
 
@@ -156,9 +177,9 @@ class _Search:
         self.notes: list[str] = []
         self._known: dict[tuple[str, tuple[str, ...], bytes], np.ndarray] = {}
 
-    def run(self) -> Diagnosis:
+    def run(self, given: Saved | None = None) -> Diagnosis:
         """Go through all stages."""
-        base = self._calibrate()
+        base = self._calibrate() if given is None else self._go_on(given)
         baseline = base
         floor, test_floor = self._floor(base, "train"), self._floor(base, "test")
         effects: list[str] = []
@@ -167,7 +188,7 @@ class _Search:
         shares: dict[str, float] = {}
         whole = max(rms(self._gaps(baseline, "test")) ** 2 - test_floor.noise**2, 1e-12)
         while len(effects) < self.budget.rounds:
-            names = [n for n in self._possible() if n not in effects]
+            names = [n for n in self._possible() if n not in base.effects]
             best, candidates, rivals = self._round(base, names, floor, test_floor, f"round {len(effects) + 1}")
             rounds.append(candidates)
             if best is None:
@@ -180,8 +201,7 @@ class _Search:
         return self._conclude(baseline, base, effects, ties, shares, rounds, test_floor)
 
     def _possible(self) -> list[str]:
-        mesh = self.pool.local.model(()).mesh
-        return [n for n in library.LIBRARY if library.applicable(n, self.recording, mesh)]
+        return [n for n in library.LIBRARY if library.applicable(n, self.recording, self.pool.local.model(()).mesh)]
 
     def _begin(self, base: np.ndarray, effects: Sequence[str]) -> None:
         """Estimate where trials begin with these numbers."""
@@ -247,6 +267,15 @@ class _Search:
             )
         self.report(stage, 4, 4, f"{1e3 * rms(self._gaps(better, 'train')):.2f} mm")
         return better
+
+    def _go_on(self, given: Saved) -> Fitted:
+        """Return the given model, fitted to this recording."""
+        model = given.model(self.recording, **self.pool.local.options)
+        sizes, values = given.sizes(model), given.start(model)
+        self._begin(values, given.effects)
+        free, start = (tuple(sizes), tuple(sizes.values())), self.starts["train"]
+        job = Fit(given.effects, values[None], *free, self.budget.iterations, start)
+        return self._best([job], "fitting the given model", 1, 1)
 
     def _best(self, jobs: list[Fit], stage: str, done: int, total: int) -> Fitted:
         best = min((f for _, f in self.pool.fit(jobs)), key=lambda f: f.point.cost)
@@ -328,10 +357,8 @@ class _Search:
         return Fit(effects, first[None], free, tuple(units), self.budget.iterations, self.starts["train"])
 
     def _again(self, base: Fitted) -> Fit:
-        units = tuple(base.space.units)
-        return Fit(
-            base.effects, base.values[None], base.space.names, units, self.budget.iterations, self.starts["train"]
-        )
+        space, start = base.space, self.starts["train"]
+        return Fit(base.effects, base.values[None], space.names, tuple(space.units), self.budget.iterations, start)
 
     def _conclude(
         self,

@@ -2,29 +2,19 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
-from torchdlo.sysid import fit, library
+from torchdlo.physics.effects import EFFECTS
+from torchdlo.sysid import fit, saved
 from torchdlo.sysid.diagnose import Diagnosis, rms
-from torchdlo.sysid.judge import rope
+from torchdlo.sysid.journal import digest
+from torchdlo.sysid.laws import law, separating
+from torchdlo.sysid.localise import localise
 from torchdlo.sysid.recording import Recording
 from torchdlo.sysid.result import dump, versions
 
-__all__ = ["findings", "findings_json", "kind", "model_json", "sentence", "separating"]
-
-_SEPARATING = {
-    frozenset(("wind", "tilted_gravity")): "add a known weight: a tilt turns with the weight, a flow does not",
-    frozenset(("air_drag", "wind")): "repeat the motion in both directions: a flow favours one",
-    frozenset(("air_drag", "bending_damping")): "pluck short waves, then swing the whole rope slowly: air brakes fast "
-    "swings, inner damping short waves",
-    frozenset(
-        ("bending_damping", "internal_friction")
-    ): "bend it slowly at two rates: friction does not depend on them",
-    frozenset(("rest_curvature", "marker_offset")): "roll the rope by half a turn in its grippers",
-    frozenset(("point_mass", "nonuniform_stiffness")): "bend it slowly, then swing it fast: masses are silent at rest",
-    frozenset(("gripper_compliance", "nonuniform_stiffness")): "put markers on the grippers, or grip it elsewhere",
-}
-"""What would tell two effects apart."""
+__all__ = ["absorbed", "confidence", "findings", "findings_json", "model_json", "sentence"]
 
 
 def findings(result: Diagnosis, recording: Recording) -> dict[str, Any]:
@@ -33,9 +23,12 @@ def findings(result: Diagnosis, recording: Recording) -> dict[str, Any]:
     effects = [
         {
             "name": name,
+            "kind": EFFECTS[name].kind,
+            "law": law(name),
             "parameters": {k.split(".", 1)[1]: v for k, v in numbers.items() if k.startswith(f"{name}.")},
             "share_of_gap": result.shares[name],
             "indistinguishable_from": result.ties[name],
+            "separating_experiments": {other: separating(name, other) for other in result.ties[name]},
         }
         for name in result.effects
     ]
@@ -47,11 +40,16 @@ def findings(result: Diagnosis, recording: Recording) -> dict[str, Any]:
     ]
     return {
         "recording": str(recording.path),
+        "recording_sha256": digest({f.name: getattr(recording, f.name) for f in dataclasses.fields(recording)[1:]}),
         "verdict": result.verdict,
         "effects": effects,
+        "confidence": confidence(result),
         "gap": _gap(result, recording),
         "candidates": candidates,
         "baseline": {k: v for k, v in numbers.items() if "." not in k},
+        "absorbed_by_calibration": absorbed(result),
+        "health": [dataclasses.asdict(fault) for fault in result.health],
+        "options": result.options,
         "model": "model.json",
         "notes": result.notes,
         "seconds": result.seconds,
@@ -81,66 +79,109 @@ def _gap(result: Diagnosis, recording: Recording) -> dict[str, Any]:
     }
 
 
+def absorbed(result: Diagnosis) -> list[dict[str, Any]]:
+    """Return the baseline's numbers without and with the effects; `change` is how far off the first ones were."""
+    before = dict(
+        zip(result.baseline.space.names, result.baseline.space.to_values(result.baseline.point.raw), strict=True)
+    )
+    return [
+        {
+            "name": name,
+            "before": float(before[name]),
+            "after": n["value"],
+            "change": float(before[name] / n["value"] - 1),
+            "unit": n["unit"],
+        }
+        for name, n in _numbers(result).items()
+        if name in before and "." not in name and n["value"]
+    ]
+
+
+def confidence(result: Diagnosis) -> dict[str, Any] | None:
+    """Return how much speaks for the names, in one word, and what speaks against them; None without names."""
+    if not result.effects:
+        return None
+    doubts = []
+    worse = int((result.after >= result.before).sum())
+    if worse:
+        doubts.append(f"{worse} of {len(result.after)} test trials did not get better")
+    ties = sorted({t for name in result.effects for t in result.ties[name]})
+    if ties:
+        doubts.append(f"{_listed(ties)} would do as well")
+    open_ended = [name for name in result.effects if _may_be_off(name, _numbers(result))]
+    if open_ended:
+        doubts.append(f"the range of {_listed(open_ended)} reaches the value at which it does nothing")
+    if len(result.after) < 2:
+        doubts.append("there is one test trial only")
+    if len(result.final.point.trial_costs) < 3:
+        doubts.append("there are fewer than three train trials")
+    return {"word": ("high", "moderate")[len(doubts)] if len(doubts) < 2 else "low", "doubts": doubts}
+
+
+def _may_be_off(name: str, numbers: dict[str, dict[str, Any]]) -> bool:
+    """Return whether the ranges of all numbers that switch an effect hold their off values."""
+    held = []
+    for key, n in numbers.items():
+        effect, _, number = key.partition(".")
+        off = EFFECTS[name].params[number.split(".")[0]].off if effect == name else None
+        if off is not None:
+            held.append(n["low"] <= off <= n["high"])
+    return bool(held) and all(held)
+
+
 def findings_json(result: Diagnosis, recording: Recording) -> str:
     """Return the findings as JSON text."""
-    return dump({"generator": "torchdlo diagnose"} | findings(result, recording))
-
-
-def model_json(result: Diagnosis, recording: Recording) -> str:
-    """Return the model with the effects as JSON text."""
-    numbers = dict(zip(result.model.parameters, map(float, result.final.values), strict=True))
-    effects: dict[str, dict[str, float]] = {name: {} for name in result.final.effects}
-    for key, value in numbers.items():
-        if "." in key:
-            effect, number = key.split(".", 1)
-            effects[effect][number] = value
-    content = {
-        "generator": "torchdlo diagnose",
-        "format": "torchdlo-model",
-        "version": 1,
-        "rope": rope(recording, "straight"),
-        "mesh": {"arclength": result.model.arclength, "marker_vertex": result.model.marker_vertex},
-        "parameters": {key: value for key, value in numbers.items() if "." not in key},
-        "effects": effects,
-        "step": result.model.step,
+    where = localise(recording, result.predictions, result.floor)
+    place = {
+        "before": where.words,
+        "after": where.rest,
+        "share_explained_by": {a.name: [a.share_before, a.share_after] for a in where.against},
+        "share_made_of": {k: [v, where.parts_after[k]] for k, v in where.parts_before.items()},
     }
-    return dump(content)
+    return dump({"generator": "torchdlo diagnose"} | findings(result, recording) | {"localisation": place})
+
+
+def model_json(result: Diagnosis) -> str:
+    """Return the model with the effects as JSON text."""
+    return dump({"generator": "torchdlo diagnose"} | saved.content(result.model, result.final.values))
 
 
 def sentence(result: Diagnosis, recording: Recording) -> str:
     """Return the verdict in words."""
-    found = findings(result, recording)
-    before, after, floor = (1e3 * found["gap"][k] for k in ("test_rmse_before_m", "test_rmse_after_m", "noise_floor_m"))
+    before, after, floor = (1e3 * x for x in (rms(result.before), rms(result.after), result.floor.total))
     if result.verdict == "none":
         return (
-            f"Nothing is missing that the data could show: the gap on test trials is {before:.1f} mm, "
-            f"the floor {floor:.1f} mm."
+            "Nothing is missing that these data could show: the calibrated baseline is "
+            f"{before:.1f} mm off on trials that were not used, and {floor:.1f} mm is the floor of noise and grid."
         )
     if result.verdict == "unknown":
         return (
-            "Something is missing, and no effect of the library explains it: the gap on test trials is "
-            f"{before:.1f} mm, the floor {floor:.1f} mm."
+            "Something is missing that no effect of the library explains: the calibrated baseline is "
+            f"{before:.1f} mm off on trials that were not used, {before / floor:.1f} times the floor of noise and grid "
+            f"({floor:.1f} mm)."
         )
-    named = " and ".join(_named(effect) for effect in found["effects"])
-    rest = "" if result.verdict == "effects" else " A part of the gap remains that no effect of the library explains."
-    return f"Missing: {named}; gap on test trials {before:.1f} -> {after:.1f} mm (floor {floor:.1f} mm).{rest}"
+    numbers = _numbers(result)
+    named = " and ".join(_named(name, numbers, result.ties[name]) for name in result.effects)
+    # The squares add up: noise is in both.
+    excess = before**2 - (1e3 * result.floor.noise) ** 2
+    share = f", {(before**2 - after**2) / excess:.0%} of what is above the noise closed" if excess > 0 else ""
+    said = f"Missing: {named}. Gap on trials that were not used: {before:.1f} → {after:.1f} mm"
+    said += f" (floor {floor:.1f} mm){share}."
+    if result.verdict == "partial":
+        said += " A part remains that no effect of the library explains."
+    sure = confidence(result)
+    return said + f" Confidence: {sure['word']}" + (f" ({'; '.join(sure['doubts'])})." if sure["doubts"] else ".")
 
 
-def _named(effect: dict[str, Any]) -> str:
-    numbers = ", ".join(
-        f"{key} {n['value']:.3g}" + ("" if n["unit"] == "1" else f" {n['unit']}")
-        for key, n in effect["parameters"].items()
+def _named(name: str, numbers: dict[str, dict[str, Any]], ties: list[str]) -> str:
+    own = {k.split(".", 1)[1]: n for k, n in numbers.items() if k.startswith(f"{name}.")}
+    told = ", ".join(
+        f"{key} {n['value']:.3g} [{n['low']:.3g}, {n['high']:.3g}]{'' if n['unit'] == '1' else ' ' + n['unit']}"
+        for key, n in own.items()
     )
-    ties = effect["indistinguishable_from"]
-    other = f", not to be told from {' or '.join(t.replace('_', ' ') for t in ties)}" if ties else ""
-    return f"{effect['name'].replace('_', ' ')} ({numbers}){other}"
+    other = f", not to be told from {_listed(ties)}" if ties else ""
+    return f"{name.replace('_', ' ')}{f' ({told})' if told else ''}{other}"
 
 
-def separating(name: str, other: str) -> str:
-    """Return the experiment that would tell two effects apart."""
-    return _SEPARATING.get(frozenset((name, other)), "record motions of other speeds, amplitudes and directions")
-
-
-def kind(name: str) -> str:
-    """Return what an effect is: force, material, boundary or measurement."""
-    return library.EFFECTS[name].kind
+def _listed(names: list[str]) -> str:
+    return " or ".join(n.replace("_", " ") for n in names)

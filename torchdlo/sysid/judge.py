@@ -66,16 +66,3 @@ def rope(recording: Recording, rest: str) -> dict[str, Any]:
         "rest": rest,
         "rest_positions": recording.rest_positions if rest == "given" else None,
     }
-
-
-def model_file(model: RopeModel, values: np.ndarray) -> dict[str, Any]:
-    """Return what another command needs to simulate this rope again."""
-    return {
-        "format": "torchdlo-model",
-        "version": 1,
-        "rope": rope(model.recording, model.rest),
-        "mesh": {"arclength": model.arclength, "marker_vertex": model.marker_vertex},
-        "parameters": dict(zip(model.parameters, values, strict=True)),
-        "effects": {},
-        "step": model.step,
-    }

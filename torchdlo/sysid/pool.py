@@ -7,6 +7,7 @@ import os
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, TypeVar
 
 import numpy as np
@@ -14,6 +15,7 @@ import numpy as np
 from torchdlo.sysid import fit
 from torchdlo.sysid import start as starts
 from torchdlo.sysid.fit import Point, Space
+from torchdlo.sysid.journal import Journal
 from torchdlo.sysid.model import RopeModel
 from torchdlo.sysid.motion import Motion, Start
 from torchdlo.sysid.recording import Recording
@@ -125,15 +127,23 @@ class Models:
 class Pool:
     """Worker processes that keep their models."""
 
-    def __init__(self, recording: Recording, options: dict[str, Any], workers: int | None = None) -> None:
+    def __init__(
+        self,
+        recording: Recording,
+        options: dict[str, Any],
+        workers: int | None = None,
+        journal: Journal | None = None,
+    ) -> None:
         """Start the workers.
 
         Args:
             recording: what is simulated.
             options: options of every model.
             workers: how many; one per core if not given. One means this process.
+            journal: keeps the results of jobs, and has those that need not be computed again.
         """
         workers = workers or max(1, os.cpu_count() or 1)
+        self.journal = journal
         self.recording, self.local = recording, Models(recording, options)
         self._pool = None
         if workers > 1:
@@ -161,6 +171,12 @@ class Pool:
         return self._run(_fit, self.local.fit, jobs)
 
     def _run(
+        self, remote: Callable[[Job], Any], local: Callable[[Job], Any], jobs: Sequence[Job]
+    ) -> Iterator[tuple[int, Any]]:
+        compute = partial(self._compute, remote, local)
+        yield from compute(jobs) if self.journal is None else self.journal.through(jobs, compute)
+
+    def _compute(
         self, remote: Callable[[Job], Any], local: Callable[[Job], Any], jobs: Sequence[Job]
     ) -> Iterator[tuple[int, Any]]:
         if self._pool is None:

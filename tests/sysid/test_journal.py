@@ -1,0 +1,196 @@
+"""A search that was stopped goes on from what it wrote down, and only if it is the same search."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+import pytest
+
+from tests.sysid.swaying import recording as swaying
+from torchdlo.errors import InputError
+from torchdlo.sysid import diagnose as search
+from torchdlo.sysid import journal as journals
+from torchdlo.sysid import library, saved
+from torchdlo.sysid import pool as pools
+from torchdlo.sysid.findings import findings, model_json
+from torchdlo.sysid.fit import Point, Space
+from torchdlo.sysid.journal import Journal, digest
+from torchdlo.sysid.library import PARAMETERS
+from torchdlo.sysid.motion import Start
+from torchdlo.sysid.pool import Fit, Fitted, Models, Pool, Simulation
+from torchdlo.sysid.recording import Recording, load_recording
+
+OPTIONS = {"seed": 0, "budget": "fast"}
+
+
+@pytest.fixture
+def recording(folder: Path) -> Recording:
+    """A small recording."""
+    return load_recording(folder)
+
+
+def fitted() -> Fitted:
+    """A result with all kinds of content, numbers that are not finite among them."""
+    space = Space(("damping_rate",), (PARAMETERS["damping_rate"],), (1.0,))
+    point = Point(np.array([0.3]), float("inf"), np.ones((2, 1)), np.full((2, 1, 1), np.nan), np.array([1.0, np.inf]))
+    return Fitted(("air_drag",), np.linspace(0, 1, 4), space, point)
+
+
+def fit_job(value: float = 1.0) -> Fit:
+    """A job."""
+    start = Start(np.zeros((2, 9, 3)), np.ones((2, 9, 3)), np.array([True, False]))
+    return Fit(("air_drag",), np.full((2, 4), value), ("damping_rate",), (1.0,), 6, start)
+
+
+def test_results_come_back_to_the_last_bit(recording: Recording, tmp_path: Path) -> None:
+    journal, job, result = Journal(tmp_path / "j", recording, OPTIONS), fit_job(), fitted()
+    assert journal.recall(job) is None
+    journal.keep(job, result)
+    again = Journal(tmp_path / "j", recording, OPTIONS, resume=True).recall(fit_job())
+    assert digest(again) == digest(result) and again.space.params == result.space.params
+    np.testing.assert_array_equal(again.point.curvature, result.point.curvature)
+
+
+def test_other_content_is_another_job() -> None:
+    job = fit_job()
+    others = (
+        fit_job(np.nextafter(1.0, 2.0)),
+        replace(job, iterations=7),
+        replace(job, start=None),
+        replace(job, frames=3),
+        Simulation(job.effects, job.values),
+        replace(job, values=job.values.reshape(4, 2)),
+    )
+    assert len({digest(each) for each in (job, *others)}) == 1 + len(others)
+
+
+def test_only_what_is_missing_is_computed(recording: Recording, tmp_path: Path) -> None:
+    journal = Journal(tmp_path / "j", recording, OPTIONS)
+    jobs = [fit_job(v) for v in (1.0, 2.0, 3.0)]
+    asked: list[Any] = []
+
+    def compute(rest: Sequence[Fit]) -> Iterator[tuple[int, np.ndarray]]:
+        asked.extend(rest)
+        # Results come in any order.
+        yield from ((k, 10 * rest[k].values) for k in reversed(range(len(rest))))
+
+    first = journal.through(jobs, compute)
+    assert next(first)[0] == 2  # the search is stopped after one result
+    first.close()
+    asked.clear()
+    found = dict(journal.through(jobs, compute))
+    assert asked == jobs[:2] and sorted(found) == [0, 1, 2]
+    for k, job in enumerate(jobs):
+        np.testing.assert_array_equal(found[k], 10 * job.values)
+
+
+def test_a_pool_reads_what_another_one_computed(recording: Recording, tmp_path: Path) -> None:
+    options = {"vertices": 15, "compiled": False}
+    job = Simulation((), np.array([[1e-3, 1e-3, 0.5]]))
+    with Pool(recording, options, 1, Journal(tmp_path / "j", recording, OPTIONS)) as pool:
+        ((_, computed),) = pool.simulate([job])
+    with Pool(recording, options, 1, Journal(tmp_path / "j", recording, OPTIONS, resume=True)) as pool:
+        pool.local.simulate = lambda job: pytest.fail("computed again")
+        ((_, kept),) = pool.simulate([job])
+    np.testing.assert_array_equal(kept, computed)
+
+
+def test_a_damaged_result_is_computed_again(recording: Recording, tmp_path: Path) -> None:
+    journal, job = Journal(tmp_path / "j", recording, OPTIONS), fit_job()
+    journal.keep(job, fitted())
+    (file,) = (tmp_path / "j").glob("*.npz")
+    whole = file.read_bytes()
+    for part in (b"", whole[: len(whole) // 2], b"not an archive"):
+        file.write_bytes(part)
+        assert journal.recall(job) is None
+
+
+def test_another_search_is_refused(recording: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "j"
+    with pytest.raises(InputError, match=r"expected the journal of a search to resume, found none; leave out --resume"):
+        Journal(path, recording, OPTIONS, resume=True)
+    Journal(path, recording, OPTIONS).keep(fit_job(), fitted())
+    shifted = replace(recording.test[0], markers=recording.test[0].markers + 1e-9)
+    for other, options in (
+        (replace(recording, test=(shifted, *recording.test[1:])), OPTIONS),
+        (replace(recording, mass=0.06), OPTIONS),
+        (recording, OPTIONS | {"seed": 1}),
+        (recording, OPTIONS | {"budget": "full"}),
+    ):
+        with pytest.raises(InputError, match="belongs to another recording or to other options"):
+            Journal(path, other, options, resume=True)
+    # A copy of the folder elsewhere is the same recording.
+    Journal(path, replace(recording, path=tmp_path / "elsewhere"), OPTIONS, resume=True)
+    monkeypatch.setattr(journals, "_program", lambda: "newer")
+    with pytest.raises(InputError, match="written by another version of torchdlo"):
+        Journal(path, recording, OPTIONS, resume=True)
+
+
+def test_a_new_search_begins_with_an_empty_journal(recording: Recording, tmp_path: Path) -> None:
+    Journal(tmp_path / "j", recording, OPTIONS).keep(fit_job(), fitted())
+    assert Journal(tmp_path / "j", recording, OPTIONS).recall(fit_job()) is None
+
+
+def test_foreign_folders_are_not_emptied(recording: Recording, tmp_path: Path) -> None:
+    (tmp_path / "thesis.txt").write_text("years of work")
+    with pytest.raises(InputError, match="expected a journal of torchdlo, found something else"):
+        Journal(tmp_path, recording, OPTIONS)
+    assert (tmp_path / "thesis.txt").exists()
+
+
+class FakeModels(Models):
+    """Answers of jobs that depend on nothing but the job, in no time; it counts them."""
+
+    computed: ClassVar[list[str]] = []
+
+    def simulate(self, job: Simulation) -> np.ndarray:
+        """Return the measured markers, moved by what the numbers are."""
+        self.computed.append(digest(job))
+        trials = getattr(self.recording, job.split)
+        shift = 1e-3 * np.sin(1e3 * job.values.sum(1) + len(job.effects))
+        return np.stack([t.markers for t in trials])[None] + shift[:, None, None, None, None]
+
+    def fit(self, job: Fit) -> Fitted:
+        """Return the first start, a little changed."""
+        self.computed.append(digest(job))
+        model = self.model(job.effects)
+        params = tuple(model.params[model.parameters.index(n)] for n in job.free)
+        space, values = Space(job.free, params, job.sizes), job.values[0] * 1.01
+        raw = space.to_raw(values[[model.parameters.index(n) for n in job.free]])
+        slopes = np.ones((len(self.recording.train), len(raw)))
+        curvature = np.tile(np.eye(len(raw)), (len(slopes), 1, 1))
+        return Fitted(job.effects, values, space, Point(raw, 1e-3, slopes, curvature, np.ones(len(slopes))))
+
+
+def test_a_stopped_diagnosis_goes_on_and_its_model_starts_the_next(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(pools, "Models", FakeModels)
+    monkeypatch.setattr(library, "LIBRARY", ("air_drag", "point_mass", "time_delay"))
+    recording, computed = swaying(tmp_path, frames=60), FakeModels.computed
+    options = {"vertices": 21, "workers": 1, "journal": tmp_path / "j"}
+
+    def stop(stage: str, done: int, *_: object) -> None:
+        if stage.endswith("screening") and done == 1:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        search.diagnose(recording, **options, callback=stop)
+    before = set(computed)
+    computed.clear()
+    resumed = search.diagnose(recording, **options, resume=True)
+    # Nothing that was done is done again, and the rest leads to where an unbroken search leads.
+    assert before and computed and not before & set(computed)
+    whole = search.diagnose(recording, **options)
+    keys = ("verdict", "effects", "gap", "candidates", "baseline")
+    assert {k: findings(resumed, recording)[k] for k in keys} == {k: findings(whole, recording)[k] for k in keys}
+    (tmp_path / "model.json").write_text(model_json(whole))
+    given = saved.load(tmp_path / "model.json")
+    assert given.effects == whole.final.effects
+    again = search.diagnose(recording, vertices=21, workers=1, given=given)
+    assert again.baseline.effects == given.effects and again.options["vertices"] == 21
+    np.testing.assert_allclose(again.baseline.values, whole.final.values * 1.01)
