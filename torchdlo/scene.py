@@ -6,20 +6,26 @@ Four kinds of data are never mixed: `Scene` (static), `Params` (what one may lea
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 
 import torch
 from torch import Tensor
 
-from torchdlo.coupling import watch
+from torchdlo.coupling import bodies as rigid
+from torchdlo.coupling import mpm, rod_matter, watch
+from torchdlo.coupling.bodies import Body, BodyParams, BodyState, BodyTargets, Solid, place
+from torchdlo.coupling.body_contact import BodyContact
+from torchdlo.coupling.particles import Matter, Medium, Particles
 from torchdlo.coupling.watch import survey
 from torchdlo.physics import build, rod, rotation, stability, tree
 from torchdlo.physics.build import Rope
-from torchdlo.physics.effect import Effect, Values, altered
-from torchdlo.physics.integrate import INTEGRATORS, TWISTS, Settings, Targets, settle_twist, substep
+from torchdlo.physics.effect import Effect, altered, default_values, numbers_of
+from torchdlo.physics.hold import Reaction, Targets, check_grip
+from torchdlo.physics.integrate import INTEGRATORS, TWISTS, Settings, settle_twist, substep
 from torchdlo.physics.replay import alike, rollout
 from torchdlo.physics.rod import RodParams, RodState
 from torchdlo.physics.topology import Topology
@@ -32,6 +38,10 @@ class Params:
     rods: RodParams
     effects: dict[str, dict[str, Tensor]]
     """Numbers of each effect by its name and theirs, shape (..., 1, C)."""
+    bodies: BodyParams | tuple[()] = ()
+    """Numbers of the rigid bodies, () if there are none."""
+    matter: Matter | tuple[()] = ()
+    """Numbers of the matter, () if there is none."""
 
 
 @tree.struct
@@ -44,6 +54,12 @@ class State:
     missed: Tensor
     """Contacts that may have been missed since the start: pairs without room [1], and by how much vertices were
     faster than foreseen [m]; zeros if all is well, shape (..., 1, 2)."""
+    reaction: Reaction
+    """What holds exerted on the ropes in the last step, its mean."""
+    bodies: BodyState | tuple[()] = ()
+    """Poses and velocities of the rigid bodies, () if there are none."""
+    matter: Particles | tuple[()] = ()
+    """Particles of the matter, () if there is none."""
 
 
 @tree.struct
@@ -54,6 +70,11 @@ class Control:
     """Positions of the held vertices [m], shape (..., H, 3)."""
     director: Tensor
     """First material directors of the held edges [1], shape (..., G, 3)."""
+    grip: dict[str, Tensor] = field(default_factory=dict)
+    """How firmly the held "vertices" (..., H, 1) and "edges" (..., G, 1) are held during the step: 0 is let go, 1 is
+    firm, between them the hold gives as if its parts were that much heavier; 1 for what is not said."""
+    bodies: BodyTargets | tuple[()] = ()
+    """Poses of the kinematic bodies, () if the scene has no bodies."""
 
 
 @dataclass(frozen=True)
@@ -82,6 +103,10 @@ class Scene:
     """Share of dt^2 times stiffness that counts as inertia in implicit steps; at least 0.5 where twist is dynamic."""
     ahead: float = 0.0
     """Share of a substep by which implicit steps look ahead: it damps fast modes and makes the step first order."""
+    bodies: tuple[Body, ...] = ()
+    """Rigid bodies."""
+    matter: Medium | None = None
+    """Elastic, plastic, liquid or granular matter."""
 
     def __post_init__(self) -> None:
         def need(ok: bool, sentence: str) -> None:
@@ -117,6 +142,13 @@ class Scene:
             self.integrator == "explicit" or self.constrained,
             "implicit steps solve for edge lengths; keep constrained=True and give the rope its stretch stiffness",
         )
+        need(
+            bool(self.bodies) or not {"rod_body", "finger_pads"} & set(names),
+            "RodBody or FingerPads is among the effects, but there are no bodies; give make(..., bodies=[Solid(...)])",
+        )
+        for effect in self.effects:
+            if isinstance(effect, BodyContact):
+                effect.check_pairs(self.bodies)
         if self.integrator == "implicit":
             loops = [n for n, c in zip(self.topology.counts, self.topology.closed, strict=True) if c and n < 5]
             need(not loops, f"a closed rope has {loops[:1]} vertices; implicit steps need at least 5")
@@ -145,19 +177,13 @@ class Scene:
         )
 
 
-def default_values(effect: Effect | type[Effect], like: Tensor) -> Values:
-    """Return an effect's declared defaults as (1, C) tensors."""
-    return {
-        name: like.new_tensor([p.default if isinstance(p.default, tuple) else (p.default,)])
-        for name, p in effect.params.items()
-    }
-
-
 def make(
     ropes: Sequence[Rope],
     effects: Sequence[Effect],
     values: dict[str, dict[str, float | Sequence[float] | Tensor]] | None = None,
     *,
+    bodies: Sequence[Solid] = (),
+    matter: tuple[Medium, Matter, Particles] | tuple[()] = (),
     check: bool = True,
     **choices,
 ) -> tuple[Scene, Params, State]:
@@ -167,43 +193,40 @@ def make(
         ropes: the ropes.
         effects: what acts on them.
         values: numbers of effects that differ from their defaults, e.g. {"damping": {"rate": 0.6}}.
+        bodies: rigid bodies; `RodBody` among the effects makes ropes touch them.
+        matter: what `coupling.particles.assemble` returned; `RodMatter` among the effects makes ropes touch it.
         check: whether to refuse what could not be stepped: laws that do not fit the ropes, ropes far from their length,
             unstable substeps. Scenes whose loads are only evaluated may be anything.
         choices: fields of `Scene`.
     """
     topology, rods, state = build.assemble(ropes)
-    scene = Scene(topology, tuple(effects), **choices)
-    numbers = {e.name: default_values(e, state.pos) for e in effects}
+    kinds, solid, placed = place(bodies, state.pos) if bodies else ((), (), ())
+    if bodies:
+        batch = torch.broadcast_shapes(state.pos.shape[:-2], placed.pos.shape[:-2])
+        state, placed = tree.map(lambda x: tree.batch_innermost(x.expand(*batch, *x.shape[-2:])), (state, placed))
+    medium, stuff, particles = matter or (None, (), ())
+    if matter:
+        state, particles = rod_matter.together(state, particles)
+    effects = rod_matter.fitted(effects, medium, rods)
+    scene = Scene(topology, effects, bodies=kinds, matter=medium, **choices)
+    numbers = numbers_of(effects, values or {}, state.pos)
     memory = {
         e.name: tree.batch_innermost(state.pos.new_zeros(*state.pos.shape[:-1], e.memory)) for e in effects if e.memory
     }
     state = tree.replace(state, memory=memory)
-    for effect, given in (values or {}).items():
-        if effect not in numbers:
-            raise ValueError(
-                f"scene: values are given for {effect!r}, which is not among its effects {sorted(numbers)}"
-            )
-        for name, value in given.items():
-            if name not in numbers[effect]:
-                raise ValueError(f"scene: {effect} has no number {name!r}; it has {sorted(numbers[effect])}")
-            wanted = numbers[effect][name].shape[-1]
-            number = value.to(state.pos) if isinstance(value, Tensor) else state.pos.new_tensor(value).reshape(1, -1)
-            number = number.reshape(1, 1) if number.dim() == 0 else number
-            if number.shape[-1] != wanted:
-                raise ValueError(f"scene: {effect}.{name} has {number.shape[-1]} components; expected {wanted}")
-            if not bool(torch.isfinite(number).all()):
-                raise ValueError(f"scene: {effect}.{name} is {number.flatten().tolist()[:3]}; expected finite numbers")
-            numbers[effect][name] = number
-    params = Params(rods, numbers)
+    params = Params(rods, numbers, solid, stuff)
     if check:
         stability.check_laws(scene.settings, rods, numbers, state)
         check_step(scene, params)
     batch = state.pos.shape[:-2]
-    first = State(state, state.pos.new_zeros(*batch, 1, 1), state.pos.new_zeros(*batch, 1, 2))
+    parts = len(scene.held_vertices), len(scene.held_edges)
+    unfelt = Reaction(state.pos.new_zeros(*batch, parts[0], 3), state.pos.new_zeros(*batch, parts[1], 1))
+    zero = state.pos.new_zeros(*batch, 1, 2)
+    first = State(state, zero[..., :1], zero, unfelt, placed, particles)
     if scene.twist == "quasistatic":
         held = hold(scene, first)
         changed = altered(scene.effects, topology, rods, numbers)
-        settled = settle_twist(scene.settings, changed, numbers, state, Targets(held.pos, held.director), 30)
+        settled, _ = settle_twist(scene.settings, changed, numbers, state, Targets(held.pos, held.director), 30)
         first = tree.replace(first, rods=tree.replace(settled, twist_rate=torch.zeros_like(settled.twist)))
     # No two leaves share memory: steps are compiled for which of them do, and later states have none.
     return scene, params, tree.map(torch.clone, first)
@@ -217,6 +240,8 @@ def limits(scene: Scene, params: Params) -> dict[str, float]:
 def check_step(scene: Scene, params: Params) -> None:
     """Raise a `ValueError` that names the limiting term if the substep is not stable."""
     dt = scene.dt / scene.substeps
+    if scene.matter:
+        mpm.check_step(scene.matter, params.matter, dt)
     for term, bound in limits(scene, params).items():
         if not dt < bound:
             need = math.ceil(scene.dt / bound * 1.05)
@@ -227,13 +252,14 @@ def check_step(scene: Scene, params: Params) -> None:
 
 
 def hold(scene: Scene, state: State) -> Control:
-    """Return the control that keeps held parts where they are."""
+    """Return the control that keeps held parts and kinematic bodies where they are, with a firm grip."""
     rods = state.rods
     e = rod.edge_vectors(scene.topology, rods.pos, rods.pos.new_tensor(scene.topology.edge_mask()).unsqueeze(-1))
     tangent = e / e.norm(dim=-1, keepdim=True)
     c, s = torch.cos(rods.twist), torch.sin(rods.twist)
     material = c * rods.director + s * torch.linalg.cross(tangent, rods.director)
-    return Control(rods.pos[..., list(scene.held_vertices), :], material[..., list(scene.held_edges), :])
+    pos, director = rods.pos[..., list(scene.held_vertices), :], material[..., list(scene.held_edges), :]
+    return Control(pos, director, bodies=rigid.hold(scene.bodies, state.bodies) if scene.bodies else ())
 
 
 def advance(scene: Scene, params: Params, state: State, start: Control, control: Control, share: Tensor) -> State:
@@ -249,10 +275,23 @@ def advance(scene: Scene, params: Params, state: State, start: Control, control:
     """
     settings = scene.settings
     director = rotation.turn_towards(start.director, control.director, share)
-    targets = Targets(start.pos + share * (control.pos - start.pos), director)
+    targets = Targets(start.pos + share * (control.pos - start.pos), director, control.grip)
     first = (state.time == 0).to(state.time.dtype)
-    rods = substep(settings, params.rods, params.effects, state.rods, targets, first)
-    return State(rods, state.time + settings.dt, watch.missed(scene.effects, rods.pos, params.effects, state.missed))
+    foresee = poses = matter = None
+    if scene.bodies:
+        poses = rigid.between(start.bodies, control.bodies, share)
+        foresee = partial(rigid.foresee, scene.bodies, params.bodies, state.bodies, poses, first=first, dt=settings.dt)
+    if scene.matter:
+        matter = rod_matter.foresee(scene.matter, params.matter, state.matter, first, settings.dt)
+    rods, reaction, (body, pool, push) = substep(
+        settings, params.rods, params.effects, state.rods, targets, first, foresee, matter
+    )
+    mean = tree.map(lambda sum, now: sum + now / scene.substeps, state.reaction, reaction)
+    missed = watch.missed(scene.effects, rods.pos, params.effects, state.missed)
+    moved, particles = rigid.advance(body, poses, push) if scene.bodies else (), ()
+    if scene.matter:
+        particles, missed = rod_matter.finish(scene.matter, params.matter, pool, push, settings.dt, missed)
+    return State(rods, state.time + settings.dt, missed, mean, moved, particles)
 
 
 def step(scene: Scene, params: Params, state: State, control: Control, *, advance=advance, survey=survey) -> State:
@@ -277,10 +316,13 @@ def _check_control(scene: Scene, control: Control) -> None:
         raise ValueError(
             f"control: pos and director are {given}; expected (..., {wanted[0]}, 3) and (..., {wanted[1]}, 3)"
         )
+    rigid.check_targets(scene.bodies, control.bodies)
+    check_grip(control.grip, wanted)
 
 
 def _step(scene: Scene, params: Params, state: State, control: Control, advance, survey) -> State:
     start = hold(scene, state)
+    state = tree.replace(state, reaction=tree.map(torch.zeros_like, state.reaction))
     if any(e.reacts for e in scene.effects):
         params = survey(scene, params, state, start, control)
     for k in range(scene.substeps):
@@ -312,7 +354,8 @@ def stepper(scene: Scene, *, compiled: bool = True):
         _check_control(scene, control)
         graded = torch.is_grad_enabled()
         if graded:
-            state = tree.replace(state, rods=alike(state.rods, (params, control)))
+            moving = alike((state.rods, state.matter), (params, control))
+            state = tree.replace(state, rods=moving[0], matter=moving[1])
         whole, part = ways[graded]
         return whole(scene, params, state, control, part, look)
 
@@ -321,8 +364,8 @@ def stepper(scene: Scene, *, compiled: bool = True):
 
 def finite(state: State) -> Tensor:
     """Return which scenes are made of numbers only, bool, shape (...)."""
-    ok = torch.isfinite(state.rods.pos).all(-1).all(-1)
-    return ok & torch.isfinite(state.rods.vel).all(-1).all(-1)
+    moving = [state.rods.pos, state.rods.vel, *tree.leaves((state.bodies, state.matter))]
+    return functools.reduce(torch.logical_and, (torch.isfinite(x).all(-1).all(-1) for x in moving))
 
 
 def ok(state: State) -> Tensor:
@@ -341,9 +384,11 @@ __all__ = [
     "Params",
     "Rope",
     "Scene",
+    "Solid",
     "State",
     "check_state",
     "check_step",
+    "default_values",
     "finite",
     "hold",
     "limits",

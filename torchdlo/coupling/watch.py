@@ -23,7 +23,7 @@ def survey(scene: Any, params: Any, state: Any, start: Any, control: Any) -> Any
         control: where held parts are at the end of the step.
     """
     with torch.no_grad():
-        carried = control.pos - start.pos
+        carried = (control.pos - start.pos) * control.grip.get("vertices", 1.0)
         leaves = tree.leaves((params, state.rods, carried))
         batch = torch.broadcast_shapes(*(x.shape[:-2] for x in leaves))
         pos, vel = (x.expand(*batch, *x.shape[-2:]) for x in (state.rods.pos, state.rods.vel))

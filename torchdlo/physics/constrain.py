@@ -154,6 +154,15 @@ class Inertia:
     """Rest lengths of real edges, 1 for dummies [m], shape (..., V, 1)."""
     edge_mask: Tensor
     """1 for real edges [1], shape (V, 1)."""
+    turning: Tensor | None = None
+    """Inertia of edges against turning, beside that of their ends' masses [kg], shape (..., V, 1)."""
+
+    def swing(self, topology: Topology, y: Tensor) -> Tensor | float:
+        """Return the part of edges that resist turning, shape (..., V, 3); 0 if none do."""
+        if self.turning is None:
+            return 0.0
+        push = self.turning * (following(topology, y) - y)
+        return preceding(topology, push) - push
 
     def bending(self, topology: Topology, y: Tensor) -> Tensor:
         """Return K y, shape (..., V, 3)."""
@@ -161,10 +170,6 @@ class Inertia:
         moment = self.hinge * (turn - preceding(topology, turn))
         push = (moment - following(topology, moment)) * self.edge_mask / self.edge
         return preceding(topology, push) - push
-
-    def apply(self, topology: Topology, y: Tensor) -> Tensor:
-        """Return vertex y + K y, shape (..., V, 3)."""
-        return self.vertex * y + self.bending(topology, y)
 
     def bands(self, topology: Topology) -> tuple[Tensor, Tensor, Tensor]:
         """Return K's entries to the same, the next, and the next but one vertex, shape (..., V, 1) each."""
@@ -176,6 +181,8 @@ class Inertia:
         same = w * centre.square() + next_w * after.square() + prev_w * before.square()
         one = -w * centre * after - next_w * after * following(topology, centre)
         two = next_w * after * following(topology, after)
+        if self.turning is not None:
+            same, one = same + self.turning + preceding(topology, self.turning), one - self.turning
         return same, one, two
 
 
@@ -202,14 +209,14 @@ def balance(
     tension: Tensor,
     turning: float,
     steps: int,
-) -> tuple[Tensor, Tensor]:
+) -> tuple[Tensor, Tensor, Tensor]:
     """Enforce lengths where inertia couples the vertices: a banded saddle-point system for positions and tensions.
 
     Args:
         lengths: the constraint.
         inertia: resistance to change.
         moved: positions without any force, or where held vertices have to be [m], shape (..., V, 3).
-        free: 1 for free, 0 for held vertices [1], shape (V, 1).
+        free: 1 for free, 0 for held vertices, between for loosely held ones [1], shape (V, 1) or (..., V, 1).
         force: force without tension [N], shape (..., V, 3).
         scale: what turns force into inertia times displacement [s^2], shape (..., 1, 1).
         direction: unit edges at the start, shape (..., V, 3).
@@ -219,22 +226,25 @@ def balance(
         steps: Newton steps before the last one.
 
     Returns:
-        Positions (..., V, 3) and tensions (..., V, 1).
+        Positions (..., V, 3), tensions (..., V, 1), and what moves vertices of given mass: force with tension and with
+        the answer of the hinges [N], (..., V, 3).
     """
     topology = lengths.topology
     pulled = lengths.active
     lean, start = turning * pulled / lengths.rest, direction + pulled * ahead
 
-    def residual(pos: Tensor, impulse: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    def residual(pos: Tensor, impulse: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
         y = pos - moved
         along_start = start + lean * (following(topology, y) - y)
         pull = impulse * along_start
-        momentum = inertia.apply(topology, y) - scale * force - (pull - preceding(topology, pull))
+        push = (
+            scale * force + pull - preceding(topology, pull) - inertia.bending(topology, y) - inertia.swing(topology, y)
+        )
         excess, along = lengths.error(pos, impulse / scale)
-        return momentum * free, excess, along, along_start
+        return y, push, excess, along, along_start
 
     def newton(pos: Tensor, impulse: Tensor) -> tuple[Tensor, Tensor]:
-        momentum, excess, along, along_start = residual(pos, impulse)
+        y, push, excess, along, along_start = residual(pos, impulse)
         with torch.no_grad():
             same, one, two = inertia.bands(topology)
             string = impulse * lean
@@ -242,7 +252,7 @@ def balance(
             after, active = following(topology, free), lengths.active
             shift = 1e-10 if pos.dtype == torch.float64 else 1e-6
             entries = _rows(
-                free * (inertia.vertex + same + string + preceding(topology, string)) + (1 - free),
+                inertia.vertex + free * (same + string + preceding(topology, string)),
                 free * (one - string),
                 free * preceding(topology, one - string),
                 free * two,
@@ -254,12 +264,12 @@ def balance(
                 -active * (lengths.compliance + lengths.yielding(impulse / scale)[1] + shift * lengths.give) / scale
                 + (active - 1),
             )
-        rhs = -_rows(momentum, excess)
+        rhs = -_rows(inertia.vertex * y - free * push, excess)
         step = banded.solve(entries, rhs, f"saddle:{topology.name}")
         batch, v3 = pos.shape[:-2], 3 * pos.shape[-2]
-        change, push = _vertices(step[:v3], batch, 3), _vertices(step[v3:], batch, 1)
+        change, pull = _vertices(step[:v3], batch, 3), _vertices(step[v3:], batch, 1)
         short = _shortening(lengths, change)
-        return pos + short * change, impulse + short * push
+        return pos + short * change, impulse + short * pull
 
     with torch.no_grad():
         pos, impulse = moved.detach(), tension * lengths.active * scale
@@ -267,7 +277,7 @@ def balance(
             pos, impulse = newton(pos, impulse)
     pos = torch.where(free > 0, pos, moved)
     pos, impulse = newton(pos, impulse)
-    return pos, impulse / scale
+    return pos, impulse / scale, residual(pos, impulse)[1] / scale
 
 
 def _saddle(name: str) -> banded.Pattern:

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from abc import ABC
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
+import torch
 from torch import Tensor
 
 from torchdlo.physics import tree
@@ -34,6 +35,8 @@ LOADS = {
     "hinge_stiffness": "Bending moment per turning of an edge, for implicit steps [N m], shape (..., V, 1).",
     "hinge_drag": "The same per rate of turning, for implicit steps [N m s], shape (..., V, 1).",
     "edge_stiffness": "Transverse stiffness that a pulled edge has [N/m], for implicit steps, shape (..., V, 1).",
+    "turning_inertia": "Inertia of edges against turning beside that of their ends' masses, over a squared length; "
+    "explicit steps, which divide by masses, leave it out [kg], shape (..., V, 1).",
     "twist_hessian": "Second derivatives of an energy by the twists (before, before), (before, after), (after, after) "
     "of each hinge, without their part that may be negative [N m], shape (..., V, 3).",
     "twist_geometry": "That part of (before, before) and (after, after) [N m], shape (..., V, 2).",
@@ -94,6 +97,29 @@ class Motion:
     """By how much a force moves a vertex along each axis if it is not held [m/N], shape (..., V, 3)."""
     answer: Tensor
     """The same, 0 if it is held [m/N], shape (..., V, 3)."""
+    bodies: Any = None
+    """Where rigid bodies would go, see `coupling.bodies.BodyMotion`; None in a scene without."""
+    matter: Any = None
+    """Where matter would go, see `coupling.rod_matter.Foreseen`; None in a scene without."""
+
+
+@tree.struct
+class Push:
+    """What an effect exerts on rods and on rigid bodies."""
+
+    force: Tensor
+    """Force on vertices [N], shape (..., V or 1, 3)."""
+    body_force: Tensor
+    """Force on bodies [N], shape (..., K or 1, 3)."""
+    body_torque: Tensor
+    """Torque on bodies about their centres of mass [N m], shape (..., K or 1, 3)."""
+    matter: Any = ()
+    """What is left of matter, see `coupling.rod_matter.Touched`; () if it is not touched."""
+
+    def plus(self, other: Push) -> Push:
+        """Return what both exert together; no more than one effect touches matter."""
+        sums = [getattr(self, n) + getattr(other, n) for n in ("force", "body_force", "body_torque")]
+        return Push(*sums, self.matter if self.matter != () else other.matter)
 
 
 class Effect(ABC):
@@ -160,14 +186,52 @@ class Effect(ABC):
         """Return what the survey had no room for [1] and by how much it was outrun [m], shape (..., 1, 2)."""
         return pos.new_zeros(1, 2)
 
-    def react(self, view: View, motion: Motion, values: Values) -> Tensor:
-        """Return forces on vertices that answer to where they would go [N], shape (..., V, 3)."""
+    def react(self, view: View, motion: Motion, values: Values) -> Tensor | Push:
+        """Return forces on vertices that answer to where they would go [N], shape (..., V, 3), or on bodies too."""
         return view.state.pos.new_zeros(1, 3)
 
 
 def _in_order(effects: Iterable[Effect]) -> list[Effect]:
     effects = list(effects)
     return [e for e in effects if not e.last] + [e for e in effects if e.last]
+
+
+def default_values(effect: Effect | type[Effect], like: Tensor) -> Values:
+    """Return an effect's declared defaults as (1, C) tensors."""
+    return {
+        name: like.new_tensor([p.default if isinstance(p.default, tuple) else (p.default,)])
+        for name, p in effect.params.items()
+    }
+
+
+def numbers_of(
+    effects: Iterable[Effect], values: dict[str, dict[str, float | Sequence[float] | Tensor]], like: Tensor
+) -> dict[str, Values]:
+    """Return the numbers of effects by their names: the given ones, and defaults for those that are not given.
+
+    Args:
+        effects: the effects.
+        values: numbers that differ from their defaults.
+        like: a tensor of the dtype and device that they get.
+    """
+    numbers = {e.name: default_values(e, like) for e in effects}
+    for effect, given in values.items():
+        if effect not in numbers:
+            raise ValueError(
+                f"scene: values are given for {effect!r}, which is not among its effects {sorted(numbers)}"
+            )
+        for name, value in given.items():
+            if name not in numbers[effect]:
+                raise ValueError(f"scene: {effect} has no number {name!r}; it has {sorted(numbers[effect])}")
+            wanted = numbers[effect][name].shape[-1]
+            number = value.to(like) if isinstance(value, Tensor) else like.new_tensor(value).reshape(1, -1)
+            number = number.reshape(1, 1) if number.dim() == 0 else number
+            if number.shape[-1] != wanted:
+                raise ValueError(f"scene: {effect}.{name} has {number.shape[-1]} components; expected {wanted}")
+            if not bool(torch.isfinite(number).all()):
+                raise ValueError(f"scene: {effect}.{name} is {number.flatten().tolist()[:3]}; expected finite numbers")
+            numbers[effect][name] = number
+    return numbers
 
 
 def altered(effects: Iterable[Effect], topology: Topology, params: RodParams, values: dict[str, Values]) -> RodParams:

@@ -11,14 +11,18 @@ strain at the end of the substep, which damps axial waves), and `ahead` above ze
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from torchdlo.physics import effect, rod, rotation, tree
 from torchdlo.physics.constrain import Inertia, Lengths, balance, project, solve_slots
-from torchdlo.physics.effect import Effect, Motion, Values
+from torchdlo.physics.effect import Effect, Motion, Push, Values
+from torchdlo.physics.hold import Reaction, Targets, put
+from torchdlo.physics.hold import free as free_slots
 from torchdlo.physics.numerics import wrap
 from torchdlo.physics.rod import RodParams, RodState, View
 from torchdlo.physics.topology import Topology, following
@@ -58,41 +62,21 @@ class Settings:
         return self.twist != "none" or any(e.frames for e in self.effects)
 
 
-@tree.struct
-class Targets:
-    """Where held vertices and edges are at the end of a substep."""
-
-    pos: Tensor
-    """Positions of the held vertices [m], shape (..., H, 3)."""
-    director: Tensor
-    """First material directors of the held edges [1], shape (..., G, 3)."""
-
-
-def _spread(values: Tensor, slots: tuple[int, ...], size: int, otherwise: Tensor) -> Tensor:
-    """Return `otherwise` (..., V, C) with `values` (..., H, C) put at the given slots."""
-    if not slots:
-        return otherwise
-    place = {slot: k for k, slot in enumerate(slots)}
-    pieces, start = [], 0
-    for slot in sorted(place):
-        if slot > start:
-            pieces.append(otherwise[..., start:slot, :])
-        k = place[slot]
-        pieces.append(values[..., k : k + 1, :].expand(*otherwise.shape[:-2], 1, otherwise.shape[-1]))
-        start = slot + 1
-    if start < size:
-        pieces.append(otherwise[..., start:, :])
-    return tree.cat_vertices(pieces)
-
-
-def _free(slots: tuple[int, ...], like: Tensor, size: int) -> Tensor:
-    """Return 1 for free and 0 for held slots, shape (V, 1)."""
-    return like.new_tensor([[0.0] if slot in slots else [1.0] for slot in range(size)])
+def _placed(settings: Settings, targets: Targets, pos: Tensor) -> Tensor:
+    """Return positions with held vertices where they are told to be, shape (..., V, 3)."""
+    return put(targets.pos, settings.held_vertices, targets.grip.get("vertices"), pos)
 
 
 def substep(
-    settings: Settings, params: RodParams, values: dict[str, Values], state: RodState, targets: Targets, first: Tensor
-) -> RodState:
+    settings: Settings,
+    params: RodParams,
+    values: dict[str, Values],
+    state: RodState,
+    targets: Targets,
+    first: Tensor,
+    foresee: Callable[[Tensor | float], Any] | None = None,
+    matter: Callable[[Tensor | float], Any] | None = None,
+) -> tuple[RodState, Reaction, tuple[Any, Any, Push]]:
     """Advance the rods by one substep.
 
     Args:
@@ -103,13 +87,21 @@ def substep(
         targets: where held parts are at the end.
         first: 1 in the very first substep, when velocities stand at the same time as positions, else 0;
             shape (..., 1, 1).
+        foresee: where rigid bodies would go under an acceleration (..., 1, 3) [m/s^2]; None in a scene without.
+        matter: where matter would go; likewise.
+
+    Returns:
+        The rods, what held them, and where bodies and matter would go with what is exerted on them.
     """
     topology, dt = settings.topology, settings.dt
     params = effect.altered(settings.effects, topology, params, values)
     now = rod.view(topology, params, state, dt)
     loads = effect.total(settings.effects, now, values)
-    kick = _kick(settings, now, loads, first)
-    pos, tension = _answered(settings, now, loads, values, kick, targets)
+    kick = _kick(settings, now, loads, first, targets)
+    others = [f(loads.get("acceleration", 0.0)) if f else None for f in (foresee, matter)]
+    pos, tension, push, contact = _answered(settings, now, loads, values, kick, targets, *others)
+    held = list(settings.held_vertices)
+    force = (kick.vertex * (pos - kick.drift) / kick.scale - push)[..., held, :]
     fields: dict[str, Tensor] = {"pos": pos, "tension": tension}
     half = torch.exp(-0.5 * dt * loads["rate"]) if "rate" in loads else 1.0
     fields["vel"] = (pos - state.pos) / dt * half
@@ -123,11 +115,12 @@ def substep(
     if settings.frames:
         fields["director"], fields["ref_twist"] = rod.advance_frames(topology, params, now, pos)
     moved = tree.replace(state, **fields)
+    couple = force.new_zeros(*force.shape[:-2], len(settings.held_edges), 1)
     if settings.twist == "dynamic":
-        return _turn(settings, now, loads, moved, targets, first)
+        moved, couple = _turn(settings, now, loads, moved, targets, first)
     if settings.twist == "quasistatic":
-        return settle_twist(settings, params, values, moved, targets)
-    return moved
+        moved, couple = settle_twist(settings, params, values, moved, targets)
+    return moved, Reaction(force, couple), (*others, contact)
 
 
 def _force(now: View, loads: Values) -> Tensor:
@@ -156,10 +149,10 @@ class _Kick:
     vertex: Tensor
     """Mass along the axes [kg], shape (..., V, 3)."""
     free: Tensor
-    """1 for free, 0 for held vertices [1], shape (V, 1)."""
+    """1 for free vertices, 1 less the grip for held ones [1], shape (V, 1) or (..., V, 1)."""
 
 
-def _kick(settings: Settings, now: View, loads: Values, first: Tensor) -> _Kick:
+def _kick(settings: Settings, now: View, loads: Values, first: Tensor, targets: Targets) -> _Kick:
     dt, state, material = settings.dt, now.state, now.params.material
     # v' = d (d v + s dt F / m), d half of the uniform decay, s a half in the first substep.
     half = torch.exp(-0.5 * dt * loads["rate"]) if "rate" in loads else 1.0
@@ -171,17 +164,29 @@ def _kick(settings: Settings, now: View, loads: Values, first: Tensor) -> _Kick:
         state.pos + dt * half * state.vel,
         dt * dt * half * (1 - 0.5 * first),
         vertex,
-        _free(settings.held_vertices, state.pos, settings.topology.size),
+        free_slots(settings.held_vertices, targets.grip.get("vertices"), state.pos, settings.topology.size),
     )
 
 
 def _answered(
-    settings: Settings, now: View, loads: Values, values: dict[str, Values], kick: _Kick, targets: Targets
-) -> tuple[Tensor, Tensor]:
-    """Return positions and tensions where effects answer to the motion: foreseen with the last tension, then found."""
+    settings: Settings,
+    now: View,
+    loads: Values,
+    values: dict[str, Values],
+    kick: _Kick,
+    targets: Targets,
+    bodies: Any = None,
+    matter: Any = None,
+) -> tuple[Tensor, Tensor, Tensor, Push]:
+    """Return what `_translate` does where effects answer to the motion, and what they exert.
+
+    The motion is foreseen with the last tension, then found. Each effect answers to what the others exert.
+    """
     reacting = [e for e in settings.effects if e.reacts]
+    none = kick.force.new_zeros(1, 3)
+    total = Push(none, none, none)
     if not reacting:
-        return _translate(settings, now, loads, kick, targets, now.state.tension)
+        return *_translate(settings, now, loads, kick, targets, now.state.tension), total
     firm, tension = kick.vertex, now.state.tension
     if settings.integrator == "implicit" and "stiffness" in loads:
         firm = firm + settings.gamma * settings.dt**2 * loads["stiffness"]
@@ -189,23 +194,33 @@ def _answered(
     answer = mobility * kick.free
     pull = tension * now.params.rest.edge_mask * now.tangent
     aimed = kick.drift + answer * (kick.force + pull - now.prev(pull))
-    aimed = _spread(targets.pos, settings.held_vertices, settings.topology.size, aimed)
+    aimed = _placed(settings, targets, aimed)
+    pushes: dict[str, Push] = {}
     for _ in range(max(e.rounds for e in reacting)):
-        motion = Motion(aimed - now.state.pos, mobility, answer)
-        reaction = sum(e.react(now, motion, values[e.name]) for e in reacting)
-        pushed = dataclasses.replace(kick, force=kick.force + reaction)
-        pos, tension = _translate(settings, now, loads, pushed, targets, tension)
-        aimed = pos - answer * reaction
-    return pos, tension
+        for e in reacting:
+            motion = Motion(aimed - now.state.pos, mobility, answer, bodies, matter)
+            for other in (push for name, push in pushes.items() if name != e.name):
+                change = motion.change + answer * other.force
+                motion = Motion(change, mobility, answer, bodies and motion.bodies.pushed(other), matter)
+            found = e.react(now, motion, values[e.name])
+            pushes[e.name] = found if isinstance(found, Push) else Push(found, none, none)
+        total = Push(none, none, none)
+        for push in pushes.values():
+            total = total.plus(push)
+        pushed = dataclasses.replace(kick, force=kick.force + total.force)
+        pos, tension, held = _translate(settings, now, loads, pushed, targets, tension)
+        aimed = pos - answer * total.force
+    return pos, tension, held, total
 
 
 def _translate(
     settings: Settings, now: View, loads: Values, kick: _Kick, targets: Targets, tension: Tensor
-) -> tuple[Tensor, Tensor]:
-    """Return positions after the substep and tensions, whose first guess is given."""
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return positions after the substep, tensions, whose first guess is given, and the force with them [N]."""
     topology, dt, state = settings.topology, settings.dt, now.state
     rest, material, free = now.params.rest, now.params.material, kick.free
-    active = rest.edge_mask * (1 - (1 - free) * (1 - following(topology, free)))
+    fixed = (1 - free) * (1 - following(topology, free)) >= 1
+    active = rest.edge_mask * (1 - fixed.to(free.dtype))
     lightest = torch.minimum(material.mass, following(topology, material.mass)).detach()
     lengths = Lengths(
         topology,
@@ -217,13 +232,15 @@ def _translate(
         1e4 if settings.integrator == "implicit" else 0.25,
     )
     if settings.integrator == "implicit":
-        moved = _spread(targets.pos, settings.held_vertices, topology.size, kick.drift)
+        moved = _placed(settings, targets, kick.drift)
         return _balance(settings, now, loads, lengths, kick, moved, tension)
     answer = kick.scale / kick.vertex * free
-    moved = _spread(targets.pos, settings.held_vertices, topology.size, kick.drift + answer * kick.force)
+    moved = _placed(settings, targets, kick.drift + kick.scale / kick.vertex * kick.force)
     if not settings.constrained:
-        return moved, state.tension
-    return project(lengths, moved, answer, now.tangent, tension, settings.newton - 1)
+        return moved, state.tension, kick.force
+    pos, tension = project(lengths, moved, answer, now.tangent, tension, settings.newton - 1)
+    pull = tension * now.tangent
+    return pos, tension, kick.force + pull - now.prev(pull)
 
 
 def _balance(
@@ -234,8 +251,8 @@ def _balance(
     kick: _Kick,
     moved: Tensor,
     tension: Tensor,
-) -> tuple[Tensor, Tensor]:
-    """Return positions and tensions of an implicit substep; arguments as in `constrain.balance`."""
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return what `_translate` does for an implicit substep; arguments as in `constrain.balance`."""
     topology, dt, rest, vertex = settings.topology, settings.dt, now.params.rest, kick.vertex
     if "stiffness" in loads:
         vertex = vertex + settings.gamma * dt * dt * loads["stiffness"]
@@ -245,10 +262,12 @@ def _balance(
     hinge = share * dt * dt * stiff
     if "hinge_drag" in loads:
         hinge = hinge + 0.5 * dt * loads["hinge_drag"]
-    inertia = Inertia(vertex, hinge, rest.length, rest.edge_mask)
+    inertia = Inertia(vertex, hinge, rest.length, rest.edge_mask, loads.get("turning_inertia"))
     force = kick.force - tree.replace(inertia, hinge=stiff).bending(topology, lead)
     ahead = (now.next(lead) - lead) / rest.length
     scale = kick.scale.expand_as(now.length[..., :1, :])
+    if inertia.turning is not None:  # held vertices do not move freely either
+        force = force - inertia.swing(topology, (1 - kick.free) * (moved - kick.drift)) / scale
     return balance(
         lengths, inertia, moved, kick.free, force, scale, now.tangent, ahead, tension, share, settings.newton - 1
     )
@@ -270,25 +289,30 @@ def _prescribed(settings: Settings, params: RodParams, state: RodState, targets:
     tangent = tangent / tangent.norm(dim=-1, keepdim=True)
     last = state.twist[..., slots, :]
     held = last + wrap(rotation.signed_angle(state.director[..., slots, :], targets.director, tangent) - last)
-    return _spread(held, settings.held_edges, settings.topology.size, angle)
+    return put(held, settings.held_edges, targets.grip.get("edges"), angle)
 
 
-def _turn(settings: Settings, now: View, loads: Values, moved: RodState, targets: Targets, first: Tensor) -> RodState:
-    """Advance twists by their rotational inertia."""
+def _turn(
+    settings: Settings, now: View, loads: Values, moved: RodState, targets: Targets, first: Tensor
+) -> tuple[RodState, Tensor]:
+    """Advance twists by their rotational inertia; also return the couples [N m] on held edges, shape (..., G, 1)."""
     dt, state, rest, inertia = settings.dt, now.state, now.params.rest, now.params.material.inertia
     half = torch.exp(-0.5 * dt * loads["twist_decay"]) if "twist_decay" in loads else 1.0
     torque = loads.get("torque", torch.zeros_like(inertia)) * rest.edge_mask
-    kick = dt * (1 - 0.5 * first) * torque
-    free = _free(settings.held_edges, state.pos, settings.topology.size) * rest.edge_mask
+    span = dt * (1 - 0.5 * first)
+    kick = span * torque
+    free = (
+        free_slots(settings.held_edges, targets.grip.get("edges"), state.pos, settings.topology.size) * rest.edge_mask
+    )
     if settings.integrator == "implicit" and "twist_hessian" in loads:
         same, after = _twist_matrix(now, loads)
         same, after = settings.gamma * dt * dt * same, settings.gamma * dt * dt * after
 
         def newton(change: Tensor) -> Tensor:
             coupled = after * now.next(change) + now.prev(after * change)
-            excess = (kick - (inertia + same) * change - coupled) * free
+            excess = (kick - same * change - coupled) * free - inertia * change
             return change + solve_slots(
-                settings.topology, free * (inertia + same) + 1 - free, free * after, free * now.prev(after), excess
+                settings.topology, inertia + free * same, free * after, free * now.prev(after), excess
             )
 
         with torch.no_grad():
@@ -297,8 +321,10 @@ def _turn(settings: Settings, now: View, loads: Values, moved: RodState, targets
     else:
         change = kick / inertia * free
     rate = half * (half * state.twist_rate + change)
-    angle = _prescribed(settings, now.params, moved, targets, state.twist + dt * rate * free)
-    return tree.replace(moved, twist=angle, twist_rate=(angle - state.twist) / dt)
+    angle = _prescribed(settings, now.params, moved, targets, state.twist + dt * rate * rest.edge_mask)
+    rate = (angle - state.twist) / dt
+    couple = inertia * (rate / half - half * state.twist_rate) / span - torque
+    return tree.replace(moved, twist=angle, twist_rate=rate), couple[..., list(settings.held_edges), :]
 
 
 def settle_twist(
@@ -308,8 +334,10 @@ def settle_twist(
     state: RodState,
     targets: Targets,
     steps: int | None = None,
-) -> RodState:
+) -> tuple[RodState, Tensor]:
     """Return the state with twists at which no free edge feels a torque (Newton steps from the last ones).
+
+    Also return the couples that hold the held edges [N m], shape (..., G, 1).
 
     Bergou 2008, section 4.2: twist waves are much faster than bending, so twist is taken to be in balance.
     """
@@ -321,9 +349,9 @@ def settle_twist(
     elif steps is None:
         # What depends on the path answers to the direction of a small change: Newton's method begins to converge later.
         steps = settings.settling + (2 if any(e.memory for e in effects) else 0)
-    free = _free(settings.held_edges, state.pos, topology.size) * params.rest.edge_mask
+    free = free_slots(settings.held_edges, targets.grip.get("edges"), state.pos, topology.size) * params.rest.edge_mask
 
-    def newton(angle: Tensor, state: RodState, exact: bool) -> Tensor:
+    def newton(angle: Tensor, exact: bool) -> tuple[Tensor, Tensor]:
         here = rod.view(topology, params, tree.replace(state, twist=angle), settings.dt)
         loads = effect.total(effects, here, values)
         with torch.no_grad():
@@ -336,19 +364,17 @@ def settle_twist(
             skew = loads.get("twist_skew", torch.zeros_like(after))
             # A tiny spring on every edge: a rod free at both ends may spin as a whole.
             same = same + 1e-9 * same.amax(-2, keepdim=True)
-        return angle + solve_slots(
-            topology,
-            free * same + 1 - free,
-            free * (after + here.next(skew)),
-            free * (here.prev(after) - skew),
-            loads["torque"] * free,
-        )
+            onward, back = after + here.next(skew), here.prev(after) - skew
+        torque = loads["torque"]
+        change = solve_slots(topology, free * same + 1 - free, free * onward, free * back, torque * free)
+        left = torque - same * change - onward * here.next(change) - back * here.prev(change)
+        return angle + change, -left[..., list(settings.held_edges), :]
 
     angle = _prescribed(settings, params, state, targets, state.twist)
     with torch.no_grad():
         start = angle
         for k in range(steps - 1):
-            start = newton(start, state, k >= steps - 3)
+            start, _ = newton(start, k >= steps - 3)
     start = torch.where(free > 0, start, angle)
-    settled = newton(start, state, True)
-    return tree.replace(state, twist=settled, twist_rate=(settled - state.twist) / settings.dt)
+    settled, couple = newton(start, True)
+    return tree.replace(state, twist=settled, twist_rate=(settled - state.twist) / settings.dt), couple
