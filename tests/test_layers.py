@@ -18,12 +18,15 @@ FLOORS = {
     "physics": 2,
     "coupling": 3,
     "scene": 4,
+    "describe": 5,
     "envs": 5,
     "sysid": 5,
     "agents": 6,
+    "run": 6,
     "report": 7,
     "progress": 7,
-    "cli": 8,
+    "commands": 8,
+    "cli": 9,
 }
 """Parts of the package by height; an import goes down, so siblings do not import each other."""
 
@@ -34,13 +37,16 @@ ALLOWED = {
     "errors": set(),
     "files": set(),
     "physics": TORCH | {"triton"},  # comes with the CUDA builds of torch
-    "coupling": TORCH,
+    "coupling": TORCH | {"pytorch_kinematics", "trimesh"},
     "scene": TORCH,
+    "describe": TORCH,
     "sysid": ARRAYS,
     "envs": LEARNING | {"pytorch_kinematics", "trimesh"},
     "agents": LEARNING | {"cma"},
     "report": ARRAYS | {"matplotlib"},
     "progress": {"rich"},
+    "run": ARRAYS,
+    "commands": {"typer"},
     "cli": ARRAYS | {"rich", "typer"},
     "": TORCH,  # torchdlo/__init__.py
 }

@@ -39,6 +39,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
+from torchdlo.coupling.coulomb import parting, rebounding, rub
 from torchdlo.coupling.nearby import near_pairs
 from torchdlo.coupling.pairs import Four, columns, corners, drop, pick
 from torchdlo.coupling.segments import closest
@@ -268,14 +269,11 @@ class RodContact(Effect):
 
     def _target(self, contacts: Contacts, change: Four, vel: Four, values: Values, dt: float) -> tuple[Tensor, Tensor]:
         """Return by how much pairs have to part at least [m], and which of them would touch, shape (..., K, 1) each."""
-        # Of an overlap, a share goes at once, and all of it that is deeper than a tenth of the radius.
-        overlap = (-contacts.gap).clamp(min=0.0)
-        deep = (overlap - 0.05 * (contacts.distance - contacts.gap)).clamp(min=0.0)
-        wanted = torch.where(contacts.gap > 0, -contacts.gap, self.recovery * overlap + (1 - self.recovery) * deep)
+        # Overlaps are shallow up to a tenth of the radius.
+        wanted = parting(contacts.gap, 0.05 * (contacts.distance - contacts.gap), self.recovery)
         pressed = contacts.real * (dot(contacts.normal, _sum(contacts.weight, change)) < wanted)
         approach = -dot(contacts.normal, _sum(contacts.weight, vel))
-        rebound = pressed * (approach > self.slowest) * values["restitution"] * approach * dt
-        return torch.maximum(wanted, torch.where(rebound > 0, rebound, wanted)), pressed
+        return rebounding(wanted, pressed, approach, values["restitution"], self.slowest, dt), pressed
 
     def _sweep(
         self,
@@ -291,17 +289,14 @@ class RodContact(Effect):
         apart = _sum(contacts.weight, change)
         along = dot(contacts.normal, apart)
         mobile = contacts.real * (softness[0] > 0)
-        parting = torch.where(mobile > 0, softness[0], 1.0)
-        normal = (forces.normal + mobile * (wanted - along) / parting).clamp(min=0.0)
+        give = torch.where(mobile > 0, softness[0], 1.0)
+        normal = (forces.normal + mobile * (wanted - along) / give).clamp(min=0.0)
         if couple is None:
             return Forces(normal, forces.friction)
         slip = apart - cross(couple.seen(change), contacts.distance * contacts.normal)
         slip = slip - contacts.normal * dot(contacts.normal, slip)
         trial = forces.friction - contacts.real * slip / torch.where(contacts.real > 0, softness[1], 1.0)
-        size = safe_norm(trial)
-        sticks = size <= values["mu_s"] * normal
-        sliding = values["mu_k"] * normal * trial / torch.where(size > 0, size, 1.0)
-        return Forces(normal, torch.where(sticks, trial, sliding))
+        return Forces(normal, rub(trial, normal, values["mu_s"], values["mu_k"]))
 
 
 def _softness(
