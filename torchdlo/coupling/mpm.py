@@ -1,0 +1,190 @@
+"""Moving least squares material point method (MLS-MPM) with affine transfers (APIC), explicit in time.
+
+A substep, Hu et al. 2018, doi:10.1145/3197517.3201293: particles deform by their velocity gradient C; momentum and
+stress go to the grid, p_i = sum w_ip (m v + (m C - dt V 4/h^2 tau)(x_i - x_p)) (eqs. 12 and 18); gravity, walls and
+whatever touches matter change the velocities of nodes; particles take back v = sum w v_i and C = 4/h^2 sum w v_i
+(x_i - x_p)^T, and move with v. Linear and angular momentum are exact (Jiang et al. 2015, doi:10.1145/2766996).
+
+Velocities live half a substep before positions, as those of rods do: the first substep is half a kick.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from torchdlo.coupling import transfer
+from torchdlo.coupling.particles import MARGIN, Grid, Matter, Medium, Particles
+from torchdlo.physics import tree
+from torchdlo.physics.numerics import safe_norm
+
+COURANT = 0.6
+"""Longest allowed substep times speed of sound over node spacing; elastic blocks at rest are stable up to 1, liquids,
+which stiffen, up to 0.8."""
+
+
+@tree.struct
+class Nodes:
+    """The grid in the middle of a substep."""
+
+    at: Tensor
+    """Places of the particles in node spacings from the first node [1], shape (B, 3, P)."""
+    origin: Tensor
+    """Number of the first node along each axis, whole [1], shape (B, 3)."""
+    mass: Tensor
+    """Mass of nodes [kg], shape (B, N)."""
+    vel: Tensor
+    """Velocity of nodes, zero where there is no matter [m/s], shape (B, N, 3)."""
+    share: Tensor
+    """Part of an impulse that acts in this substep, see `to_grid` [1], shape (B or 1, 1, 1)."""
+
+
+def flat(x: Tensor) -> Tensor:
+    """Return (..., P, C) as (B, C, P)."""
+    return x.mT.reshape(-1, x.shape[-1], x.shape[-2])
+
+
+def density(medium: Medium, matter: Matter) -> Tensor:
+    """Return the density of particles at rest [kg/m^3], shape (..., P, 1)."""
+    parts = [matter.laws[g.name]["density"] for g in medium.groups]
+    lead = torch.broadcast_shapes(*(p.shape[:-2] for p in parts))
+    return torch.cat([p.expand(*lead, g.count, 1) for p, g in zip(parts, medium.groups, strict=True)], -2)
+
+
+def deform(medium: Medium, matter: Matter, particles: Particles, dt: float) -> tuple[Tensor, Particles]:
+    """Return the Kirchhoff stress [Pa], shape (..., P, 6), and particles deformed by their velocity gradients."""
+    stresses, strains, histories = [], [], []
+    for group, here in medium.pieces():
+        numbers = {n: v[..., 0] for n, v in matter.laws[group.name].items()}
+        strain = particles.strain[..., here, :].unbind(-1)
+        change = (dt * particles.affine[..., here, :]).unbind(-1)
+        history = particles.history[..., here, 0]
+        stress, strain, history = group.law.answer(numbers, strain, history, change, dt)
+        stresses.append(torch.stack(torch.broadcast_tensors(*stress), -2))
+        strains.append(torch.stack(torch.broadcast_tensors(*strain), -2))
+        histories.append(history.unsqueeze(-2))
+    stress, strain, history = (torch.cat(parts, -1).mT for parts in (stresses, strains, histories))
+    return stress, tree.replace(particles, strain=strain, history=history)
+
+
+def _locate(grid: Grid, pos: Tensor) -> tuple[Tensor, Tensor]:
+    """Return places from the first computed node (B, 3, P) and the number of that node (B, 3)."""
+    at = (flat(pos) - pos.new_tensor(grid.first).unsqueeze(-1)) / grid.spacing
+    most = pos.new_tensor(grid.nodes) - pos.new_tensor(grid.size)
+    with torch.no_grad():
+        # The window is centred on the matter.
+        middle = 0.5 * (at.amin(-1) + at.amax(-1)) - 0.5 * (pos.new_tensor(grid.size) - 1)
+        origin = torch.minimum(middle.round().clamp(min=0.0), most)
+    return at - origin.unsqueeze(-1), origin
+
+
+def to_grid(
+    medium: Medium, matter: Matter, particles: Particles, acceleration: Tensor, dt: float, share: Tensor
+) -> tuple[Nodes, Particles]:
+    """Return the grid after inner forces and gravity, and the particles with their new strain.
+
+    Args:
+        medium: static choices.
+        matter: constant numbers.
+        particles: matter now.
+        acceleration: of all matter, shape (..., 1, 3) [m/s^2].
+        dt: substep [s].
+        share: part of the kick that this substep gives: 1, or 0.5 in the first one; shape (..., 1, 1).
+    """
+    grid, h = medium.grid, medium.grid.spacing
+    at, origin = _locate(grid, particles.pos)
+    stress, particles = deform(medium, matter, particles, dt)
+    mass = density(medium, matter) * matter.volume
+    full = stress[..., [0, 3, 4, 3, 1, 5, 4, 5, 2]]
+    # Slopes are per node spacing.
+    slope = h * mass * particles.affine - share * (4 * dt / h) * matter.volume * full
+    moved = particles.vel + share * dt * acceleration
+    said = torch.cat([(mass * moved).mT, mass.expand(*moved.shape[:-1], 1).mT], -2)
+    summed = transfer.spread(at, said.reshape(-1, 4, said.shape[-1]), flat(slope), grid.size)
+    there = summed[..., 3:] > 0
+    vel = torch.where(there, summed[..., :3] / torch.where(there, summed[..., 3:], 1.0), 0.0)
+    return Nodes(at, origin, summed[..., 3], vel, share.reshape(-1, 1, 1)), particles
+
+
+def walls(grid: Grid, origin: Tensor, vel: Tensor, friction: Tensor) -> Tensor:
+    """Return velocities of nodes after the faces of the box, shape (B, N, 3).
+
+    Args:
+        grid: box and walls.
+        origin: number of the first computed node, shape (B, 3).
+        vel: velocities of nodes [m/s], shape (B, N, 3).
+        friction: coefficient [1], shape (B or 1, 1).
+    """
+    size = grid.size
+    shaped = vel.unflatten(1, size)
+    left, lost, sticks = [], [], torch.zeros_like(shaped[..., 0], dtype=torch.bool)
+    for axis, v in enumerate(shaped.unbind(-1)):
+        number = origin[:, axis, None] + torch.arange(size[axis], device=vel.device)
+        number = number.reshape(-1, *(size[axis] if a == axis else 1 for a in range(3)))
+        lower, upper = number <= MARGIN, number >= grid.nodes[axis] - 1 - MARGIN
+        kept, taken = v, torch.zeros_like(v)
+        for behind, kind, into in ((lower, grid.walls[2 * axis], v < 0), (upper, grid.walls[2 * axis + 1], v > 0)):
+            stopped = behind & into if kind == "separate" else behind & (kind != "open")
+            kept = torch.where(stopped, 0.0, kept)
+            taken = torch.where(stopped, v, taken) if kind == "separate" else taken
+            sticks = sticks | behind if kind == "stick" else sticks
+        left.append(kept)
+        lost.append(taken)
+    # Coulomb: what the faces take along their normals, they take mu times as much across, down to rest.
+    speed, press = safe_norm(torch.stack(left, -1)), safe_norm(torch.stack(lost, -1))
+    share = (1 - friction.reshape(-1, 1, 1, 1, 1) * press / torch.where(speed > 0, speed, 1.0)).clamp(min=0.0)
+    share = torch.where(sticks[..., None], 0.0, share)
+    return (share * torch.stack(left, -1)).flatten(1, 3)
+
+
+def from_grid(medium: Medium, matter: Matter, particles: Particles, nodes: Nodes, dt: float) -> Particles:
+    """Return the particles after the substep, moved with the nodes; walls act last."""
+    vel = walls(medium.grid, nodes.origin, nodes.vel, matter.friction)
+    filled = torch.cat([vel, torch.zeros_like(vel[..., :1])], -1)
+    value, slope = transfer.collect(nodes.at, filled, medium.grid.size)
+    batch = particles.pos.shape[:-2]
+    vel = value[:, :3].reshape(*batch, 3, -1).mT
+    affine = (slope * (4 / medium.grid.spacing)).reshape(*batch, 9, -1).mT
+    return tree.replace(particles, pos=particles.pos + dt * vel, vel=vel, affine=affine)
+
+
+def advance(
+    medium: Medium, matter: Matter, particles: Particles, acceleration: Tensor, dt: float, share: Tensor
+) -> Particles:
+    """Advance matter that touches nothing but the walls by one substep; arguments as in `to_grid`."""
+    nodes, strained = to_grid(medium, matter, particles, acceleration, dt, share)
+    return from_grid(medium, matter, strained, nodes, dt)
+
+
+def outside(grid: Grid, pos: Tensor) -> Tensor:
+    """Return how many particles lie where no node is computed, shape (..., 1, 1); they no longer move rightly."""
+    at, _ = _locate(grid, pos)
+    most = pos.new_tensor(grid.size).reshape(3, 1) - 1.5
+    lost = ~((at >= 0.5) & (at <= most)).all(1)
+    return lost.sum(-1).to(pos.dtype).reshape(*pos.shape[:-2], 1, 1)
+
+
+def limits(medium: Medium, matter: Matter) -> dict[str, float]:
+    """Return the longest stable substep [s] by the group that limits it."""
+    found = {}
+    for group in medium.groups:
+        numbers = matter.laws[group.name]
+        speed = (group.law.modulus(numbers) / numbers["density"]).max().sqrt()
+        found[f"sound in {group.name} ({float(speed):.3g} m/s)"] = COURANT * medium.grid.spacing / float(speed)
+        if "viscosity" in numbers and float(numbers["viscosity"].max()) > 0:
+            diffusion = float((numbers["viscosity"] / numbers["density"]).max())
+            found[f"viscosity of {group.name}"] = medium.grid.spacing**2 / (8 * diffusion)
+    return found
+
+
+def check_step(medium: Medium, matter: Matter, dt: float) -> None:
+    """Raise a `ValueError` that names the limiting term if substeps of `dt` [s] are not stable."""
+    for term, bound in limits(medium, matter).items():
+        if not dt < bound:
+            raise ValueError(
+                f"matter: a substep of {dt:.3g} s is not stable: {term} allows less than {bound:.3g} s on a grid of "
+                f"{medium.grid.spacing:g} m. Use {math.ceil(dt / bound * 1.05)} times the substeps, or softer or "
+                "denser matter, or a coarser grid."
+            )
