@@ -6,6 +6,7 @@ Everything slow to import is imported inside the command that needs it, so that 
 from __future__ import annotations
 
 import shlex
+import shutil
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -13,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from torchdlo.commands import simulate
 from torchdlo.errors import InputError
 from torchdlo.files import check_writable, write_atomically
 from torchdlo.progress import deferred_interrupt, progress
@@ -40,6 +42,16 @@ _INTERRUPTED = 130
 RecordingArgument = Annotated[
     Path,
     typer.Argument(help="Recording folder: rope.json, train_*.npz and test_*.npz.", metavar="PATH"),
+]
+
+
+ModelOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--model",
+        help="Start from the numbers and effects of this model file, which calibrate or diagnose wrote.",
+        metavar="FILE",
+    ),
 ]
 
 
@@ -160,6 +172,7 @@ def calibrate(
             metavar="auto|straight|given",
         ),
     ] = "auto",
+    model: ModelOption = None,
     quick: Annotated[bool, typer.Option("--quick", help="A rough fit in a fraction of the time.")] = False,
     resume: Annotated[bool, typer.Option("--resume", help="Go on from the checkpoint beside the model file.")] = False,
 ) -> None:
@@ -174,6 +187,8 @@ def calibrate(
     torchdlo calibrate my_rope --out runs/my_rope/model.json --starts 16 --seed 1
 
     torchdlo calibrate my_rope --quick --json | jq .test_mae_mm
+
+    torchdlo calibrate my_rope --model runs/diagnose/my_rope/model.json
     """
     from torchdlo.sysid.recording import load_recording
 
@@ -186,7 +201,7 @@ def calibrate(
     options: dict[str, Any] = {"starts": starts, "iterations": iterations, "vertices": vertices}
     if quick:
         options = {name: value or _QUICK.get(name) for name, value in options.items()}
-    options = {name: value for name, value in options.items() if value is not None}
+    options = {name: value for name, value in options.items() if value is not None} | _given(model)
     result = _run_calibration(
         loaded, seed=seed, rest=rest, checkpoint=out.with_name("checkpoint.json"), resume=resume, **options
     )
@@ -216,13 +231,23 @@ def diagnose(
     seed: Annotated[int, typer.Option(min=0, help="Seed of the random starts.")] = 0,
     vertices: Annotated[int | None, typer.Option(min=3, help="Vertices of the simulated rope.")] = None,
     workers: Annotated[int | None, typer.Option(min=1, help="Processes; one per core if not given.")] = None,
+    model: ModelOption = None,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Go on from the journal of a search that was stopped.")
+    ] = False,
 ) -> None:
     """Find what the model lacks: name the missing effect, add it, and show the gap shrink.
 
     The baseline is calibrated first; every effect of the library is then tried on what it leaves over, and kept only if
-    it closes the gap on trials that were not used.
+    it closes the gap on trials that were not used. Ctrl-C stops after the running step; --resume goes on from there.
 
-    [bold]Example:[/bold] torchdlo diagnose my_rope -o runs/my_rope
+    [bold]Examples:[/bold]
+
+    torchdlo diagnose my_rope
+
+    torchdlo diagnose my_rope --out runs/my_rope --resume
+
+    torchdlo diagnose my_rope --model runs/my_rope/model.json --out runs/my_rope_2
     """
     from torchdlo.report import diagnosis as report
     from torchdlo.sysid.diagnose import diagnose as search
@@ -234,19 +259,30 @@ def diagnose(
     names = ("findings.json", "model.json", report.PAGE)
     for name in names:
         check_writable(out / name)
+    options = {"budget": budget, "seed": seed, "vertices": vertices, "workers": workers}
+    options |= _given(model)
+    journal = out / "journal"
     try:
         with progress() as show, deferred_interrupt(show) as callback:
-            result = search(loaded, budget=budget, seed=seed, vertices=vertices, workers=workers, callback=callback)
+            result = search(loaded, **options, callback=callback, journal=journal, resume=resume)
     except KeyboardInterrupt:
-        typer.echo("interrupted before there was a verdict; nothing was written", err=True)
+        typer.echo(f"interrupted before there was a verdict; --resume goes on from {journal}", err=True)
         raise SystemExit(_INTERRUPTED) from None
+    # What cannot be trusted was taken out of it.
+    loaded = result.model.recording
     write_atomically(out / "findings.json", findings_json(result, loaded))
-    write_atomically(out / "model.json", model_json(result, loaded))
+    write_atomically(out / "model.json", model_json(result))
     page = report.write_report(result, loaded, out, command=shlex.join(["torchdlo", *sys.argv[1:]]))
+    shutil.rmtree(journal, ignore_errors=True)
     typer.echo(sentence(result, loaded), err=as_json)
+    for fault in result.health:
+        typer.echo(f"data: {fault.trial + ': ' if fault.trial else ''}{fault.said}", err=as_json)
     typer.echo(f"findings: {out / 'findings.json'}\nreport:   {page}", err=as_json)
     if as_json:
         typer.echo(findings_json(result, loaded), nl=False)
+
+
+app.command()(simulate)
 
 
 def _run_calibration(recording: Recording, **options: Any) -> Calibration:
@@ -259,6 +295,15 @@ def _run_calibration(recording: Recording, **options: Any) -> Calibration:
     except KeyboardInterrupt:
         typer.echo("interrupted before there was a result; nothing was written", err=True)
         raise SystemExit(_INTERRUPTED) from None
+
+
+def _given(model: Path | None) -> dict[str, Any]:
+    """Return the option of a search that starts from a model file."""
+    if model is None:
+        return {}
+    from torchdlo.sysid import saved
+
+    return {"given": saved.load(model)}
 
 
 def _check_outputs(out: Path, resume: bool) -> None:
