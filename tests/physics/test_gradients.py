@@ -39,7 +39,7 @@ VALUES = {
     # Far from one, twist in balance snaps over in this throw and no derivative exists.
     "anisotropic_bending": {"ratio": 1.4, "direction": 0.4},
     "gripper_compliance": {"stiffness": 0.02},
-    "link_chain": {"length": 0.05},
+    "link_chain": {"length": 0.03},
 }
 INSTANCES = {"gripper_compliance": GripperCompliance(hinges=(1,))}
 LAWS = ["internal_friction", "stiffening_bending", "anisotropic_bending", "gripper_compliance"]

@@ -150,7 +150,7 @@ class FakeModels(Models):
     def simulate(self, job: Simulation) -> np.ndarray:
         """Return the measured markers, moved by what the numbers are."""
         self.computed.append(digest(job))
-        trials = getattr(self.recording, job.split)
+        trials = self.recording.trials(job.split)
         shift = 1e-3 * np.sin(1e3 * job.values.sum(1) + len(job.effects))
         return np.stack([t.markers for t in trials])[None] + shift[:, None, None, None, None]
 

@@ -12,8 +12,9 @@ import numpy as np
 from torchdlo.files import write_atomically
 from torchdlo.report import chart, player
 from torchdlo.report.page import STYLE, listed, number, page, percent, table, words
-from torchdlo.sysid.diagnose import Diagnosis, rms
+from torchdlo.sysid.diagnose import Diagnosis
 from torchdlo.sysid.findings import absorbed, findings, sentence
+from torchdlo.sysid.floor import rms
 from torchdlo.sysid.laws import MEANING, law, separating
 from torchdlo.sysid.localise import PARTS, Localisation, localise
 from torchdlo.sysid.recording import Recording

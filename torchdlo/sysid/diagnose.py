@@ -8,7 +8,7 @@ search goes on from there. Test trials are used at the end only: to confirm, or 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -16,24 +16,19 @@ from typing import Any
 import numpy as np
 
 from torchdlo.errors import InputError
+from torchdlo.sysid import baseline as baselines
 from torchdlo.sysid import floor as floors
 from torchdlo.sysid import health, library
-from torchdlo.sysid import start as starts
-from torchdlo.sysid.floor import Floor
+from torchdlo.sysid.baseline import CHAIN
+from torchdlo.sysid.bench import Bench, Callback
+from torchdlo.sysid.floor import Floor, rms
 from torchdlo.sysid.health import Fault
 from torchdlo.sysid.journal import Journal
 from torchdlo.sysid.model import RopeModel
-from torchdlo.sysid.motion import Start
-from torchdlo.sysid.pool import Fit, Fitted, Pool, Simulation
+from torchdlo.sysid.pool import Fit, Fitted, Pool
 from torchdlo.sysid.recording import Recording
 from torchdlo.sysid.saved import Saved
 from torchdlo.sysid.screen import Score, screen
-
-Callback = Callable[[str, int, int, str], None]
-"""Called with stage, steps done, steps in all, and a word on how it goes."""
-
-GRID = "link_chain"
-"""What a coarse chain does that a rope does not: candidate number 0, fitted before any effect is considered."""
 
 
 @dataclass(frozen=True)
@@ -45,15 +40,23 @@ class Budget:
     candidates: int
     """Effects that are fitted in each round."""
     iterations: int
-    """Iterations of each fit."""
+    """Iterations of each first fit."""
+    more: int
+    """Iterations more of the baseline and of the fits that lead."""
     rounds: int
     """Most effects that are added one after the other."""
 
 
-BUDGETS = {"fast": Budget(12, 4, 6, 2), "full": Budget(32, 8, 15, 3)}
+BUDGETS = {"fast": Budget(12, 4, 4, 6, 2), "full": Budget(32, 8, 6, 12, 3)}
 
 PAYS = 0.15
 """Share of the excess gap that an effect has to close, on the train and on the test trials."""
+
+LEADERS = 2
+"""Effects that are fitted further in each round."""
+
+SILENT = 1.3
+"""Times the floor: below, there is nothing left to look for."""
 
 TIE = 0.05
 """Fits whose gaps differ by less than this share of the excess, or of the floor, are not told apart."""
@@ -113,11 +116,6 @@ class Diagnosis:
     """What was asked for."""
 
 
-def rms(gaps: np.ndarray) -> float:
-    """Return the root mean square of the gaps of trials."""
-    return float(np.sqrt(np.mean(np.square(gaps))))
-
-
 def diagnose(
     recording: Recording,
     *,
@@ -171,143 +169,83 @@ class _Search:
 
     def __init__(self, pool: Pool, budget: Budget, rng: np.random.Generator, report: Callback) -> None:
         self.pool, self.budget, self.rng, self.report = pool, budget, rng, report
-        self.recording = pool.recording
-        self.trials = {"train": self.recording.train, "test": self.recording.test}
-        self.starts: dict[str, Start] = {}
-        self.notes: list[str] = []
-        self._known: dict[tuple[str, tuple[str, ...], bytes], np.ndarray] = {}
+        self.bench, self.recording = Bench(pool), pool.recording
 
     def run(self, given: Saved | None = None) -> Diagnosis:
         """Go through all stages."""
-        base = self._calibrate() if given is None else self._go_on(given)
-        baseline = base
-        floor, test_floor = self._floor(base, "train"), self._floor(base, "test")
-        effects: list[str] = []
+        count, most = self.budget.starts, self.budget.more
+        if given is None:
+            base = baselines.calibrate(self.bench, count, most, self.rng, self.report)
+        else:
+            base = baselines.go_on(self.bench, given, most, self.report)
+        baseline, floor = base, self._floor(base)
         rounds: list[list[Candidate]] = []
         ties: dict[str, list[str]] = {}
         shares: dict[str, float] = {}
-        whole = max(rms(self._gaps(baseline, "test")) ** 2 - test_floor.noise**2, 1e-12)
-        while len(effects) < self.budget.rounds:
+        whole = max(rms(self.bench.gaps(baseline, "test")) ** 2 - floor.noise**2, 1e-12)
+        while len(rounds) < self.budget.rounds + (len(shares) < len(rounds)):
+            if shares and rms(self.bench.gaps(base, "all")) < SILENT * floor.total:
+                break
             names = [n for n in self._possible() if n not in base.effects]
-            best, candidates, rivals = self._round(base, names, floor, test_floor, f"round {len(effects) + 1}")
+            best, candidates, rivals = self._round(base, names, floor, f"round {len(rounds) + 1}")
             rounds.append(candidates)
             if best is None:
                 break
             name = best.effects[-1]
-            gained = rms(self._gaps(base, "test")) ** 2 - rms(self._gaps(best, "test")) ** 2
+            gained = rms(self.bench.gaps(base, "test")) ** 2 - rms(self.bench.gaps(best, "test")) ** 2
             shares[name], ties[name] = float(gained / whole), rivals
-            effects.append(name)
-            base = best
-        return self._conclude(baseline, base, effects, ties, shares, rounds, test_floor)
+            base = self._pruned(best, shares, floor)
+        return self._conclude(baseline, base, list(shares), ties, shares, rounds, floor)
+
+    def _pruned(self, fitted: Fitted, shares: dict[str, float], floor: Floor) -> Fitted:
+        """Return the model without the effects that the last one has made needless, which takes over their shares."""
+        *earlier, last = shares
+        for name in earlier:
+            keep = [k for k, n in enumerate(fitted.space.names) if n.split(".")[0] != name]
+            left = [
+                k for k, n in enumerate(self.pool.local.model(fitted.effects).parameters) if n.split(".")[0] != name
+            ]
+            names, sizes = (tuple(x[k] for k in keep) for x in (fitted.space.names, fitted.space.units))
+            effects, start = tuple(e for e in fitted.effects if e != name), self.bench.starts["train"]
+            less = self.bench.fit([Fit(effects, fitted.values[None, left], names, sizes, self.budget.more, start)])[0]
+            self.report(f"without {name}", 1, 1, f"{1e3 * less.point.cost:.2f} mm")
+            if self._gain(less, fitted, floor, "train") < PAYS:
+                fitted, shares[last] = less, shares[last] + shares.pop(name)
+        return fitted
 
     def _possible(self) -> list[str]:
         return [n for n in library.LIBRARY if library.applicable(n, self.recording, self.pool.local.model(()).mesh)]
 
-    def _begin(self, base: np.ndarray, effects: Sequence[str]) -> None:
-        """Estimate where trials begin with these numbers."""
-        model = self.pool.local.model(effects)
-        for split, trials in self.trials.items():
-            first = starts.begin(model, trials)
-            self.starts[split] = starts.refine(model, self.pool.local.motion(model, split), first, base)
-
-    def _simulate(self, fitted: Fitted, split: str) -> np.ndarray:
-        job = Simulation(fitted.effects, fitted.values[None], split, self.starts[split])
-        return next(iter(self.pool.simulate([job])))[1][0]
-
-    def _gaps(self, fitted: Fitted, split: str) -> np.ndarray:
-        """Return the gap of each trial of a split [m]."""
-        key = (split, fitted.effects, fitted.values.tobytes())
-        if key not in self._known:
-            self._known[key] = floors.gap(self._simulate(fitted, split), self.trials[split])
-        return self._known[key]
-
-    def _floor(self, base: Fitted, split: str) -> Floor:
-        self.report("measuring the floor", 0 if split == "train" else 1, 2, "")
-        floor = floors.measure(self.pool, base, self._simulate(base, split), self.starts[split], split)
-        self.report("measuring the floor", 1 if split == "train" else 2, 2, f"{1e3 * floor.total:.2f} mm")
+    def _floor(self, base: Fitted) -> Floor:
+        """Return the floor on the test trials."""
+        self.report("measuring the floor", 0, 1, "")
+        floor = floors.measure(self.pool, base, self.bench.starts["test"], "test", CHAIN)
+        self.report("measuring the floor", 1, 1, f"{1e3 * floor.total:.2f} mm")
         return floor
 
-    def _calibrate(self) -> Fitted:
-        """Return the fitted baseline; candidate number 0, the grid, is part of it where it helps."""
-        model = self.pool.local.model(())
-        guess = model.guess()
-        self._begin(guess, ())
-        names, stage = tuple(model.parameters), "calibrating the baseline"
-        count = self.budget.starts
-        self.report(stage, 0, 4, f"{count} starts")
-        spread = self.rng.uniform(-1, 1, (count, len(names))) * np.log([30.0, 4.0, 6.0, 1, 1][: len(names)])
-        spread[0], spread[:, 1] = 0.0, spread[:, 1] + spread[:, 0]
-        values = guess * np.exp(spread)
-        frames = self.pool.local.motion(model, "train").markers.shape[1]
-        halves = np.array_split(values, 2)
-        short = [Fit((), part, names, (1.0,) * len(names), 4, self.starts["train"], frames // 3) for part in halves]
-        first = self._best(short, stage, 1, 4)
-        if not self.starts["train"].still.all():
-            self._begin(first.values, ())
-        # Phases of late times are right only after early ones are: the horizon grows.
-        middle = Fit((), first.values[None], names, (1.0,) * len(names), 5, self.starts["train"], 2 * frames // 3)
-        first = self._best([middle], stage, 2, 4)
-        size = float(np.diff(model.arclength).min())
-        chained = self.pool.local.model((GRID,)).guess()
-        chained[: len(first.values)] = first.values
-        jobs = [Fit((), first.values[None], names, (1.0,) * len(names), self.budget.iterations, self.starts["train"])]
-        for length in (size, -size):
-            chained = chained.copy()
-            chained[-1] = length
-            free = (*names, f"{GRID}.length")
-            sizes = (1.0,) * len(names) + (0.5 * size,)
-            jobs.append(Fit((GRID,), chained[None], free, sizes, self.budget.iterations, self.starts["train"]))
-        done = dict(self.pool.fit(jobs))
-        plain, chain = done[0], min((done[1], done[2]), key=lambda f: f.point.cost)
-        better = chain if chain.point.cost < 0.9 * plain.point.cost else plain
-        if better is chain:
-            self.notes.append(
-                f"The rope moves like a chain of links of about {1e3 * abs(chain.values[-1]):.0f} mm, as "
-                "simulated ones may; that was taken up before any effect was considered."
-            )
-        self.report(stage, 4, 4, f"{1e3 * rms(self._gaps(better, 'train')):.2f} mm")
-        return better
-
-    def _go_on(self, given: Saved) -> Fitted:
-        """Return the given model, fitted to this recording."""
-        model = given.model(self.recording, **self.pool.local.options)
-        sizes, values = given.sizes(model), given.start(model)
-        self._begin(values, given.effects)
-        free, start = (tuple(sizes), tuple(sizes.values())), self.starts["train"]
-        job = Fit(given.effects, values[None], *free, self.budget.iterations, start)
-        return self._best([job], "fitting the given model", 1, 1)
-
-    def _best(self, jobs: list[Fit], stage: str, done: int, total: int) -> Fitted:
-        best = min((f for _, f in self.pool.fit(jobs)), key=lambda f: f.point.cost)
-        if not np.isfinite(best.point.cost):
-            raise InputError(
-                f"{self.recording.path}: the simulation failed on the train trials from every start; check length, "
-                "mass and marker_arclength, or use fewer vertices."
-            )
-        self.report(stage, done, total, f"{1e3 * best.point.cost:.2f} mm")
-        return best
-
     def _round(
-        self, base: Fitted, names: Sequence[str], floor: Floor, test_floor: Floor, stage: str
+        self, base: Fitted, names: Sequence[str], floor: Floor, stage: str
     ) -> tuple[Fitted | None, list[Candidate], list[str]]:
         """Return the model with the best effect added, if one pays, all candidates, and those as good as it."""
         scores = screen(
-            self.pool, base, names, self.starts["train"], lambda k, n: self.report(f"{stage}: screening", k, n, "")
+            self.pool,
+            base,
+            names,
+            self.bench.starts["train"],
+            lambda k, n: self.report(f"{stage}: screening", k, n, ""),
         )
         tried = scores[: self.budget.candidates]
-        jobs = [self._candidate(base, score) for score in tried] + [self._again(base)]
-        fits: dict[int, Fitted] = {}
-        self.report(f"{stage}: fitting", 0, len(jobs), "")
-        for k, fitted in self.pool.fit(jobs):
-            fits[k] = fitted
-            self.report(
-                f"{stage}: fitting", len(fits), len(jobs), fitted.effects[-1] if k < len(tried) else "no effect"
-            )
+        found = self._fitted([self._candidate(base, score) for score in tried] + [self._further(base, base)], stage)
+        lead = sorted(range(len(tried)), key=lambda k: found[k].point.cost)[:LEADERS]
+        ahead = [*lead, len(tried)]
+        for k, fitted in zip(ahead, self._fitted([self._further(base, found[k]) for k in ahead], stage), strict=True):
+            found[k] = fitted
         # The fair rival of an effect is the baseline that was fitted for as long.
-        rival = fits.pop(len(tried))
+        *fits, rival = found
         rival = rival if rival.point.cost < base.point.cost else base
-        gains = {tried[k].name: self._gain(rival, f, floor, "train") for k, f in fits.items()}
-        order = sorted(fits, key=lambda k: fits[k].point.cost)
+        self.bench.predict([base, rival, *fits])
+        gains = {s.name: self._gain(rival, f, floor, "train") for s, f in zip(tried, fits, strict=True)}
+        order = sorted(range(len(fits)), key=lambda k: fits[k].point.cost)
         best, reasons, rivals = None, {}, []
         for k in order:
             name, fitted = tried[k].name, fits[k]
@@ -320,11 +258,11 @@ class _Search:
                 reasons[name] = "helps on too few trials"
             elif gains[name] < PAYS:
                 reasons[name] = f"closes {max(gains[name], 0):.0%} of the gap"
-            elif self._gain(rival, fitted, test_floor, "test") < PAYS:
+            elif self._gain(rival, fitted, floor, "test") < PAYS:
                 reasons[name] = "does not help on the test trials"
             else:
                 best, reasons[name] = fitted, "taken"
-        held = {tried[k].name: self._gain(rival, f, test_floor, "test") for k, f in fits.items()}
+        held = {s.name: self._gain(rival, f, floor, "test") for s, f in zip(tried, fits, strict=True)}
         candidates = [
             Candidate(
                 s.name, s.share, gains.get(s.name), held.get(s.name), reasons.get(s.name, "its doses explain less")
@@ -335,30 +273,44 @@ class _Search:
 
     def _gain(self, base: Fitted, fitted: Fitted, floor: Floor, split: str) -> float:
         """Return the share of the excess gap (squared, above noise) that a fit closes."""
-        before, after = rms(self._gaps(base, split)) ** 2, rms(self._gaps(fitted, split)) ** 2
+        before, after = rms(self.bench.gaps(base, split)) ** 2, rms(self.bench.gaps(fitted, split)) ** 2
         return float((before - after) / max(before - floor.noise**2, (0.3 * floor.noise) ** 2, 1e-12))
 
     def _on_most(self, base: Fitted, fitted: Fitted) -> bool:
-        better = self._gaps(fitted, "train") < self._gaps(base, "train")
+        better = self.bench.gaps(fitted, "train") < self.bench.gaps(base, "train")
         return bool(better.mean() > 0.6)
 
     def _candidate(self, base: Fitted, score: Score) -> Fit:
         effects = (*base.effects, score.name)
         model = self.pool.local.model(effects)
-        first = model.guess()
-        first[: len(base.values)] = base.values
-        mine = [n.name for n in library.numbers(score.name, self.recording)]
-        for name, value in score.dose.items():
-            first[model.parameters.index(name)] = value
+        space, columns = base.space, [model.parameters.index(n) for n in base.space.names]
+        values = np.repeat(model.guess()[None], len(score.starts), 0)
+        values[:, : len(base.values)] = base.values
+        for row, (dose, raw) in zip(values, score.starts, strict=True):
+            row[columns] = space.to_values(space.clip(raw))
+            for name, value in dose.items():
+                row[model.parameters.index(name)] = value
         # Numbers that no dose uses stay off: a slope where a spot fits better.
-        used = [n for n in mine if n in score.dose]
-        free = (*base.space.names, *used)
-        units = (*base.space.units, *(score.sizes[n] for n in used))
-        return Fit(effects, first[None], free, tuple(units), self.budget.iterations, self.starts["train"])
+        used = [n.name for n in library.numbers(score.name, self.recording) if n.name in score.dose]
+        units = (*space.units, *(score.sizes[n] for n in used))
+        most, start = self.budget.iterations, self.bench.starts["train"]
+        return Fit(effects, values, (*space.names, *used), tuple(units), most, start, keep=1)
 
-    def _again(self, base: Fitted) -> Fit:
-        space, start = base.space, self.starts["train"]
-        return Fit(base.effects, base.values[None], space.names, tuple(space.units), self.budget.iterations, start)
+    def _further(self, base: Fitted, fitted: Fitted) -> Fit:
+        """Return the job of fitting on."""
+        most = self.budget.iterations if fitted is base else self.budget.more
+        space, start = fitted.space, self.bench.starts["train"]
+        return Fit(fitted.effects, fitted.values[None], space.names, tuple(space.units), most, start)
+
+    def _fitted(self, jobs: Sequence[Fit], stage: str) -> list[Fitted]:
+        """Return the results of fits in their order, and say how they go."""
+        found: dict[int, Fitted] = {}
+        self.report(f"{stage}: fitting", 0, len(jobs), "")
+        for k, fitted in self.pool.fit(jobs):
+            found[k] = fitted
+            last = fitted.effects[-1] if k < len(jobs) - 1 else "no effect"
+            self.report(f"{stage}: fitting", len(found), len(jobs), last)
+        return [found[k] for k in range(len(jobs))]
 
     def _conclude(
         self,
@@ -370,15 +322,14 @@ class _Search:
         rounds: list[list[Candidate]],
         floor: Floor,
     ) -> Diagnosis:
-        before, after = self._gaps(baseline, "test"), self._gaps(final, "test")
+        before, after = self.bench.gaps(baseline, "test"), self.bench.gaps(final, "test")
         explained = rms(after) <= UNEXPLAINED * floor.total
         verdict = ("effects" if explained else "partial") if effects else ("none" if explained else "unknown")
         predictions: dict[str, dict[str, np.ndarray]] = {}
         for when, fitted in (("before", baseline), ("after", final)):
             predictions[when] = {}
-            for split, trials in self.trials.items():
-                for sim, trial in zip(self._simulate(fitted, split), trials, strict=True):
-                    predictions[when][trial.name] = sim[: len(trial.time)]
+            for sim, trial in zip(self.bench.prediction(fitted, "all"), self.bench.trials["all"], strict=True):
+                predictions[when][trial.name] = sim[: len(trial.time)]
         return Diagnosis(
             verdict,
             effects,
@@ -392,7 +343,7 @@ class _Search:
             rounds,
             predictions,
             self.pool.local.model(final.effects),
-            notes=self.notes,
+            notes=baselines.notes(baseline),
         )
 
 

@@ -7,7 +7,8 @@ from typing import Any
 
 from torchdlo.physics.effects import EFFECTS
 from torchdlo.sysid import fit, saved
-from torchdlo.sysid.diagnose import Diagnosis, rms
+from torchdlo.sysid.diagnose import Diagnosis
+from torchdlo.sysid.floor import rms
 from torchdlo.sysid.journal import digest
 from torchdlo.sysid.laws import law, separating
 from torchdlo.sysid.localise import localise

@@ -16,6 +16,9 @@ from torchdlo.physics.effect import Param
 _KNEE = 2e-3
 """Error [m] from which the cost grows linearly."""
 
+_FIRM = 5e-3
+"""Share of the cost that a number has to save per squared coordinate to be followed as far as its slope says."""
+
 Simulate = Callable[[np.ndarray], np.ndarray]
 """Maps parameter sets (P, K) to simulated markers (P, B, F, M, 3) [m]."""
 
@@ -167,7 +170,9 @@ def improve(
 def _step(point: Point, damping: float, space: Space) -> np.ndarray:
     curvature, gradient = point.curvature.mean(0), point.gradient.mean(0)
     scale = np.diag(curvature) + 1e-9 * np.trace(curvature) + 1e-12
-    step = -np.linalg.solve(curvature + damping * np.diag(scale), gradient)
+    # Numbers that hardly matter stay where they are instead of following noise far away.
+    firm = damping * scale + _FIRM * point.cost
+    step = -np.linalg.solve(curvature + np.diag(firm), gradient)
     return space.clip(point.raw + step / max(1.0, float(np.abs(step / space.limits()).max())))
 
 

@@ -50,26 +50,41 @@ def gap(simulated: np.ndarray, trials: tuple[Trial, ...] | list[Trial]) -> np.nd
     return np.array(out)
 
 
-def measure(pool: Pool, base: Fitted, reference: np.ndarray, start: object, split: str = "train") -> Floor:
+def rms(gaps: np.ndarray) -> float:
+    """Return the root mean square of the gaps of trials."""
+    return float(np.sqrt(np.mean(np.square(gaps))))
+
+
+def measure(pool: Pool, base: Fitted, start: object, split: str, chain: str) -> Floor:
     """Return the floor of a calibrated model.
 
     Args:
         pool: the simulations.
         base: the model.
-        reference: its prediction of the trials, shape (B, F, M, 3).
         start: where they begin.
         split: which trials.
+        chain: effect that belongs to one grid and is left out on two that are compared.
     """
     model = pool.local.model(base.effects)
-    options = (
-        (("substep", model.dt / (2 * model.substeps)),),
-        (("vertices", 2 * len(model.arclength) - 1),),
-    )
-    jobs = [Simulation(base.effects, base.values[None], split, start, each) for each in options]
+    plain = tuple(e for e in base.effects if e != chain)
+    kept = [k for k, name in enumerate(model.parameters) if name.split(".")[0] != chain]
+    finer = (("vertices", 2 * len(model.arclength) - 1),)
+    half = (("substep", model.dt / (2 * model.substeps)),)
+    whole, smooth = base.values[None], base.values[None, kept]
+    jobs = [
+        Simulation(base.effects, whole, split, start),
+        Simulation(base.effects, whole, split, start, half),
+        Simulation(plain, smooth, split, start),
+        Simulation(plain, smooth, split, start, finer),
+    ]
+    sims = dict(pool.simulate(jobs if plain != base.effects else [jobs[0], jobs[1], jobs[3]]))
     free = np.setdiff1d(np.arange(model.count), model.gripped)
-    changes = [0.0, 0.0]
-    for k, sims in pool.simulate(jobs):
-        change = (sims[0] - reference)[:, :, free]
-        # Where a refined simulation fails the grid is far too coarse.
-        changes[k] = float(np.sqrt(np.mean(change**2))) if np.isfinite(change).all() else float("inf")
-    return Floor(noise(pool.recording), *changes)
+    pairs = ((0, 1), (2, 3)) if plain != base.effects else ((0, 1), (0, 2))
+    return Floor(noise(pool.recording), *(_apart(sims[a][0], sims[b][0], free) for a, b in pairs))
+
+
+def _apart(sims: np.ndarray, others: np.ndarray, free: np.ndarray) -> float:
+    """Return how far two predictions are apart [m], root mean square per coordinate of the free markers."""
+    change = (others - sims)[:, :, free]
+    # Where a refined simulation fails the grid is far too coarse.
+    return float(np.sqrt(np.mean(change**2))) if np.isfinite(change).all() else float("inf")

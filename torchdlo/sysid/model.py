@@ -18,7 +18,7 @@ from torch import Tensor
 
 from torchdlo import scene as scenes
 from torchdlo.errors import InputError
-from torchdlo.physics import constrain, rotation, tree
+from torchdlo.physics import constrain, rotation, traced, tree
 from torchdlo.physics.effect import Effect, Param
 from torchdlo.physics.effects.elastic import Bend, BendFrame, Twist
 from torchdlo.physics.effects.field import Damping, Gravity
@@ -192,7 +192,8 @@ class RopeModel:
             held_vertices=self.held,
             held_edges=tuple(edge for edge, _ in self.clamps),
             ahead=self.ahead,
-            settling=2,
+            newton=2,
+            settling=3,
         )
         params = self._measured_lengths(params, number)
         return scene, params, self._agree(scene, params, state)
@@ -307,7 +308,7 @@ class RopeModel:
         sets, trials = len(values), len(motion.names)
         total = frames or motion.markers.shape[1]
         out = np.empty((sets * trials, total, self.count, 3))
-        size = _CHUNK if self.compiled else max(1, min(4 * _CHUNK, -(-sets * trials // self.threads)))
+        size = _CHUNK if self.compiled else min(4 * _CHUNK, -(-sets * trials // self.threads))
         chunks = [np.arange(a, min(a + size, sets * trials)) for a in range(0, sets * trials, size)]
 
         def run(rows: np.ndarray) -> None:
@@ -333,11 +334,12 @@ class RopeModel:
             scenes.Control(tree.batch_innermost(motion.held[:, k]), tree.batch_innermost(director[:, k]))
             for k in range((frames - 1) * self.substeps + 1)
         ]
+        if not self.compiled:
+            step = traced.record(step, params, state, controls[0])
         if start.still is not None and start.still.any():
-            still = torch.as_tensor(start.still)
-            resting = settle.come_to_rest(step, params, state, controls[0], self.dt / self.substeps)
+            resting = settle.come_to_rest(scene, params, state, controls[0])
             resting = self._corrected(step, scene, params, resting, controls, motion)
-            state = tree.map(tree.batch_innermost, tree.where(still, resting, state))
+            state = tree.map(tree.batch_innermost, tree.where(torch.as_tensor(start.still), resting, state))
         seen = [self._marked(state)]
         for k, control in enumerate(controls[1:], 1):
             state = step(params, state, control)
@@ -386,16 +388,13 @@ class RopeModel:
         edge = [min(v, len(self.arclength) - 2) for v in at]
         ends = [v + 1 for v in edge]
         tangent = normalize(rods.pos[:, ends] - rods.pos[:, edge])
-        u, angle = rods.director[:, edge], rods.twist[:, edge]
-        v = torch.linalg.cross(tangent, u)
-        c, s = torch.cos(angle), torch.sin(angle)
-        return pos, c * u + s * v, c * v - s * u
+        first = rotation.about(tangent, rods.twist[:, edge], rods.director[:, edge])
+        return pos, first, torch.linalg.cross(tangent, first)
 
 
 def _turned(curvature: Tensor, number: dict[str, Tensor]) -> Tensor:
     """Scale integrated curvatures (..., V, 2) and turn them about the rope's axis."""
-    share = number["rest_share"].reshape(-1, 1, 1)
-    angle = number["rest_roll"].reshape(-1, 1, 1)
+    share, angle = (number[name].reshape(-1, 1, 1) for name in ("rest_share", "rest_roll"))
     c, s = torch.cos(angle), torch.sin(angle)
     k1, k2 = curvature[..., :1], curvature[..., 1:]
     return share * torch.cat([c * k1 - s * k2, s * k1 + c * k2], -1)

@@ -32,7 +32,7 @@ class Simulation:
     values: np.ndarray
     """Parameter sets in the order of the model's numbers, shape (P, K)."""
     split: str = "train"
-    """Trials: "train" or "test"."""
+    """Trials: "train", "test" or "all"."""
     start: Start | None = None
     """Where the trials begin; read off them if not given."""
     options: tuple[tuple[str, Any], ...] = ()
@@ -57,6 +57,8 @@ class Fit:
     """Where the trials begin; read off them if not given."""
     frames: int | None = None
     """How many frames to fit; all if not given."""
+    keep: int | None = None
+    """With how many of the starts, the best, to go on; all if not given."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,13 +94,13 @@ class Models:
         """Return the motion of the trials of a split."""
         key = (split, model.substeps, len(model.arclength))
         if key not in self._motions:
-            self._motions[key] = model.motion(getattr(self.recording, split))
+            self._motions[key] = model.motion(self.recording.trials(split))
         return self._motions[key]
 
     def simulate(self, job: Simulation) -> np.ndarray:
         """Return markers [m], shape (P, B, F, M, 3)."""
         model = self.model(job.effects, job.options)
-        start = job.start or starts.begin(model, getattr(self.recording, job.split))
+        start = job.start or starts.begin(model, self.recording.trials(job.split))
         return model.simulate(self.motion(model, job.split), start, job.values)
 
     def fit(self, job: Fit) -> Fitted:
@@ -116,6 +118,8 @@ class Models:
 
         measured = motion.markers[:, : job.frames]
         raws = space.clip(space.to_raw(job.values[:, columns]))
+        if job.keep is not None:
+            raws = raws[np.argsort(fit.costs(simulate, measured, space, raws))[: job.keep]]
         points = fit.evaluate(simulate, measured, space, raws)
         *_, points = [points, *fit.improve(simulate, measured, space, points, iterations=job.iterations)]
         best = min(points, key=lambda p: p.cost)

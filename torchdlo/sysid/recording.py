@@ -81,6 +81,10 @@ class Recording:
     test: tuple[Trial, ...]
     """Trials to judge on, never to fit on."""
 
+    def trials(self, split: str) -> tuple[Trial, ...]:
+        """Return the trials of a split: "train", "test", or "all", those to fit on first."""
+        return {"train": self.train, "test": self.test, "all": self.train + self.test}[split]
+
 
 def load_recording(path: str | Path) -> Recording:
     """Read and check a recording folder.

@@ -15,6 +15,7 @@ from scipy.optimize import lsq_linear
 
 from torchdlo.sysid import library
 from torchdlo.sysid.library import Probe
+from torchdlo.sysid.model import RopeModel
 from torchdlo.sysid.pool import Fitted, Pool, Simulation
 
 _KNEE = 2e-3
@@ -22,6 +23,9 @@ _KNEE = 2e-3
 
 _HORIZON = 0.6
 """Share of each trial that is compared: over longer times the answer to a dose is not linear any more."""
+
+_ON_THE_WAY = (1.0, 0.5, 0.2)
+"""Shares of the best mixture from which a fit may start: the answer to large doses is not linear."""
 
 _MOST = 20.0
 """Most doses of an effect."""
@@ -36,7 +40,9 @@ class Score:
     share: float
     """Share of the weighted squared residual that it takes away beyond what the baseline can."""
     dose: dict[str, float]
-    """Its numbers where a fit should start."""
+    """Its numbers where the best mixture of doses has them."""
+    starts: tuple[tuple[dict[str, float], np.ndarray], ...]
+    """Where a fit may start: its numbers and the coordinates of the baseline's, on the way to the best mixture."""
     sizes: dict[str, float]
     """What counts as much of each number, in the terms of its scale."""
     direction: np.ndarray
@@ -72,44 +78,54 @@ def screen(
     doses = {n: library.probes(n, recording, model.mesh, curved, known) for n in names}
     groups = _groups(names, doses)
     jobs = [_job(pool, base, group, doses, start) for group in groups]
-    baseline = np.repeat(base.values[None], len(base.space.names) + 1, 0)
-    columns = [model.parameters.index(n) for n in base.space.names]
     nudge = base.space.nudges()
-    for k, column in enumerate(columns):
-        moved = base.point.raw.copy()
-        moved[k] += nudge[k]
-        baseline[k + 1, column] = base.space.to_values(moved)[k]
-    jobs.append(Simulation(base.effects, baseline, start=start))
-    found: dict[int, np.ndarray] = {}
+    jobs.append(Simulation(base.effects, _nudged(model, base, nudge), start=start))
+    sims_of: dict[int, np.ndarray] = {}
     report(0, len(jobs))
     for k, sims in pool.simulate(jobs):
-        found[k] = sims
-        report(len(found), len(jobs))
+        sims_of[k] = sims
+        report(len(sims_of), len(jobs))
     frames = max(10, int(_HORIZON * motion.markers.shape[1]))
     free = np.setdiff1d(np.arange(model.count), model.gripped)
 
     def pick(x: np.ndarray) -> np.ndarray:
         return x[..., :frames, free, :].reshape(*x.shape[:-4], -1)
 
-    own = found[len(groups)]
+    own = sims_of[len(groups)]
     residual = pick(motion.markers - own[0])
     good = np.isfinite(residual) & np.isfinite(pick(own)).all(0)
     weight = np.where(good, 1 / np.sqrt(np.nan_to_num(residual) ** 2 + _KNEE**2), 0.0) ** 0.5
     residual = np.nan_to_num(residual) * weight
-    jacobian = np.stack([np.nan_to_num(pick(own[k + 1] - own[0])) * weight for k in range(len(columns))], 1)
-    q, _ = np.linalg.qr(jacobian)
+    jacobian = np.stack([np.nan_to_num(pick(sim - own[0])) * weight for sim in own[1:]], 1)
+    q, r = np.linalg.qr(jacobian / nudge)
     left = residual - q @ (q.T @ residual)
-    scores = []
-    for group, sims in zip(groups, (found[k] for k in range(len(groups))), strict=True):
+    scores: list[Score] = []
+    for group, sims in zip(groups, (sims_of[k] for k in range(len(groups))), strict=True):
         row = 1
         for name in group:
-            answers = []
-            for _ in doses[name]:
-                change = np.nan_to_num(pick(sims[row] - sims[0])) * weight
-                answers.append(change - q @ (q.T @ change))
-                row += 1
-            scores.append(_score(name, doses[name], np.stack(answers, 1), left))
+            rows = range(row, row + len(doses[name]))
+            row += len(rows)
+            change = np.stack([np.nan_to_num(pick(sims[k] - sims[0])) * weight for k in rows], 1)
+            absorbed = q.T @ change
+            found = _best(doses[name], change - q @ absorbed, left)
+            # The baseline's numbers go back where they would be if they did not have to make up for the effect.
+            back = np.linalg.lstsq(r, absorbed @ found.amounts, rcond=1e-6)[0]
+            starts = tuple(
+                (_mixture(name, doses[name], share * found.amounts), base.point.raw - np.clip(share * back, -1.0, 1.0))
+                for share in _ON_THE_WAY
+            )
+            sizes = _sizes(name, doses[name])
+            scores.append(Score(name, found.share, starts[0][0], starts, sizes, found.direction))
     return sorted(scores, key=lambda s: -s.share)
+
+
+def _nudged(model: RopeModel, base: Fitted, nudge: np.ndarray) -> np.ndarray:
+    """Return the baseline's parameter set and one more for each of its numbers, moved a little."""
+    rows = np.repeat(base.values[None], len(nudge) + 1, 0)
+    for k, name in enumerate(base.space.names):
+        raw = base.point.raw + nudge * (np.arange(len(nudge)) == k)
+        rows[k + 1, model.parameters.index(name)] = base.space.to_values(raw)[k]
+    return rows
 
 
 def _groups(names: Sequence[str], doses: dict[str, list[Probe]]) -> list[list[str]]:
@@ -141,24 +157,34 @@ def _job(pool: Pool, base: Fitted, group: Sequence[str], doses: dict[str, list[P
     return Simulation(effects, np.stack(rows), start=start)
 
 
-def _score(name: str, doses: list[Probe], answers: np.ndarray, left: np.ndarray) -> Score:
-    """Return the score of one effect from the answers (R, J) to its doses."""
+@dataclass(frozen=True, eq=False)
+class _Mixture:
+    """How doses of one effect explain a residual best."""
+
+    share: float
+    amounts: np.ndarray
+    """Of each dose, shape (J,)."""
+    direction: np.ndarray
+
+
+def _best(doses: list[Probe], answers: np.ndarray, left: np.ndarray) -> _Mixture:
+    """Return the best mixture of doses, whose answers have shape (R, J)."""
     whole = float(left @ left) + 1e-30
     scale = np.linalg.norm(answers, axis=0) + 1e-30
     low = np.array([-_MOST if d.signed else 0.0 for d in doses])
-    together = _additive(doses)
-    choices = [list(range(len(doses)))] if together else [[k] for k in range(len(doses))]
-    best: tuple[float, dict[str, float], np.ndarray] = (0.0, {}, np.zeros(len(left)))
+    choices = [list(range(len(doses)))] if _additive(doses) else [[k] for k in range(len(doses))]
+    best: _Mixture | None = None
     for rows in choices:
         a = answers[:, rows] / scale[rows]
         bounds = (low[rows] * scale[rows] - 1e-9, _MOST * scale[rows] + 1e-9)
         amount = lsq_linear(a, left, bounds=bounds).x
-        taken = whole - float(np.sum((left - a @ amount) ** 2))
-        if taken / whole > best[0] or not best[1]:
-            amounts = amount / scale[rows]
-            best = (taken / whole, _mixture(name, [doses[k] for k in rows], amounts), a @ amount)
-    direction = best[2] / (np.linalg.norm(best[2]) + 1e-30)
-    return Score(name, max(best[0], 0.0), best[1], _sizes(name, doses), direction)
+        share = 1 - float(np.sum((left - a @ amount) ** 2)) / whole
+        if best is None or share > best.share:
+            amounts = np.zeros(len(doses))
+            amounts[rows] = amount / scale[rows]
+            direction = a @ amount
+            best = _Mixture(max(share, 0.0), amounts, direction / (np.linalg.norm(direction) + 1e-30))
+    return best
 
 
 def _additive(doses: list[Probe]) -> bool:
@@ -181,9 +207,13 @@ _STRENGTH = {
 def _mixture(name: str, doses: list[Probe], amounts: np.ndarray) -> dict[str, float]:
     """Return numbers for amounts of doses, kept within reason."""
     found: dict[str, float] = {}
+    additive = _additive(doses)
     for dose, raw in zip(doses, amounts, strict=True):
+        if raw == 0.0 and not additive:
+            continue
         amount = float(np.clip(raw, -8, 8))
-        amount = amount if abs(amount) > 0.2 else (0.2 if amount >= 0 else -0.2)
+        least = 0.05
+        amount = amount if abs(amount) > least else (least if amount >= 0 else -least)
         for key, value in dose.values.items():
             number = key.split(".")[1]
             if name in ("stretch", "gripper_compliance"):

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import dataclasses
+import math
 
 import numpy as np
 import torch
@@ -11,10 +12,13 @@ from torchdlo import scene as scenes
 from torchdlo.physics import tree
 from torchdlo.sysid.mesh import Mesh
 
-_SETTLING = 1.0
+_SETTLING = 4.0
 """Time that a rope gets to come to rest where a trial starts [s]."""
 
-_SETTLING_RATE = 8.0
+_SETTLING_STEP = 0.1
+"""One step meanwhile [s]: implicit steps this long are nearly steps of Newton's method for the balance."""
+
+_SETTLING_RATE = 6.0
 """Damping rate meanwhile [1/s]: a rope of a metre swings at 4 rad/s."""
 
 _SHAPES = 4
@@ -22,23 +26,23 @@ _SHAPES = 4
 
 
 def come_to_rest(
-    step: Callable, params: scenes.Params, state: scenes.State, control: scenes.Control, dt: float
+    scene: scenes.Scene, params: scenes.Params, state: scenes.State, control: scenes.Control
 ) -> scenes.State:
     """Return the state in balance, with the grippers as they are at the start.
 
     Args:
-        step: what does a step of `dt` seconds.
+        scene: the ropes.
         params: numbers of the scenes; their damping is raised meanwhile.
         state: where they are.
         control: where the grippers stay.
-        dt: one step [s].
     """
+    calm = dataclasses.replace(scene, dt=_SETTLING_STEP, substeps=1, ahead=1.0)
     damping = dict(params.effects["damping"])
     damping["rate"] = torch.full_like(damping["rate"], _SETTLING_RATE)
     calmed = tree.replace(params, effects=params.effects | {"damping": damping})
     rest = tree.replace(state, rods=tree.replace(state.rods, vel=torch.zeros_like(state.rods.vel)))
-    for _ in range(int(np.ceil(_SETTLING / dt))):
-        rest = step(calmed, rest, control)
+    for _ in range(math.ceil(_SETTLING / _SETTLING_STEP)):
+        rest = scenes.step(calm, calmed, rest, control)
     zero = {name: torch.zeros_like(getattr(rest.rods, name)) for name in ("vel", "twist_rate")}
     return tree.replace(rest, rods=tree.replace(rest.rods, **zero), time=state.time)
 

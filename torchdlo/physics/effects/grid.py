@@ -1,4 +1,4 @@
-"""What a chain of links does that a rope does not: errors of the first order in the length of a link."""
+"""What a chain of rigid links does that a rope does not: errors of the first and second order in a link's length."""
 
 from __future__ import annotations
 
@@ -9,18 +9,19 @@ import torch
 
 from torchdlo.physics.effect import Effect, Param, Values
 from torchdlo.physics.effects.elastic import Twist, curvature, greatest, hinge_stiffness
-from torchdlo.physics.numerics import dot, safe_norm
+from torchdlo.physics.numerics import dot
 from torchdlo.physics.rod import View
 
 
 @dataclass(frozen=True)
 class LinkChain(Effect):
-    """The rope behaves like rigid links whose joints turn about one axis after the other.
+    """The rope behaves like rigid links whose joints turn about one axis after the other, with a spring on each.
 
-    The angle of such a joint about the links differs from the twist by half the product of the two others, as turns do
-    not commute: twist strain becomes tau - l k1 k2 / 2 per length for links of length l; the order of the axes gives
-    the sign. The springs of the joints are linear in the angle instead of its tangent, which makes tight bends softer.
-    Both vanish with l. A simulator of such joints shows them, a rope does not.
+    A joint turns by x about the link, then by y and z across it (with negative length in the opposite order). The three
+    angles of such a joint are not the strains of a rope: to leading order x is the twist less half the product of the
+    two bending angles, as turns do not commute, and springs that are linear in angles are softer than a rope's. Links
+    have mass along their length, not at their ends, and so less inertia against turning. All of it vanishes with the
+    length. A simulator of such joints shows it, a rope does not.
     """
 
     name: ClassVar[str] = "link_chain"
@@ -33,42 +34,82 @@ class LinkChain(Effect):
 
     def energy(self, view: View, values: Values) -> torch.Tensor:
         """Return what it adds to the energy per hinge [J], shape (..., V, 1)."""
-        twist = Twist().strain(view)
-        kappa = curvature(view).kappa
-        joint = -0.5 * values["length"] / view.hinge_length * kappa[..., :1] * kappa[..., 1:]
-        twisted = view.params.material.twist / view.hinge_length * (twist * joint + 0.5 * joint.square())
-        # (2 atan(w |k| / 2) / w)^2 in place of |k|^2, w links per hinge: p^2 for w = 1, as |k| = 2 tan(p/2).
-        links = (values["length"] / view.hinge_length).abs()
-        some = links > 0
-        angle = 2 * torch.atan(0.5 * links * safe_norm(kappa)) / torch.where(some, links, 1.0)
-        softer = torch.where(some, dot(kappa, kappa) - angle.square(), 0.0)
-        return twisted - 0.5 * greatest(hinge_stiffness(view)) * softer
+        return _Joint(view, values).energy()
 
     def loads(self, view: View, values: Values) -> Values:
-        """Return loads and how they answer to twist."""
-        hinge = curvature(view)
-        stiffness = view.params.material.twist / view.hinge_length * view.params.rest.hinge_mask
-        share = -0.5 * values["length"] / view.hinge_length
+        """Return loads and how they answer to twist, the latter to leading order."""
+        joint = _Joint(view, values)
+        hinge, by_kappa, moment = joint.hinge, *joint.slopes()
+        bent = hinge.pull_back(view, by_kappa)
+        pull = 0.5 * moment * view.binormal()
+        stiffness, share = joint.twisting, -0.5 * joint.links
         k1, k2 = hinge.kappa[..., :1], hinge.kappa[..., 1:]
-        joint = stiffness * share * k1 * k2
-        whole = stiffness * Twist().strain(view) + joint
-        # Derivative of the springs' part by k over k: atan(x) / (x (1 + x^2)) - 1, x = w |k| / 2.
-        x = (0.5 * values["length"] / view.hinge_length).abs() * safe_norm(hinge.kappa)
-        small = x < 1e-2
-        bent_x = torch.where(small, 1.0, x)
-        ratio = torch.where(small, 1 - x.square() / 3, torch.atan(bent_x) / bent_x) / (1 + x.square())
-        spring = greatest(hinge_stiffness(view)) * (ratio - 1)
-        bent = hinge.pull_back(view, share * whole * torch.cat([k2, k1], -1) + spring * hinge.kappa)
-        pull = 0.5 * joint * view.binormal()
         b1, b2, a1, a2 = hinge.by_twist
         before, after = share * (k2 * b1 + k1 * b2), share * (k2 * a1 + k1 * a2)
-        f = share * whole
+        f = share * (stiffness * joint.twist + moment)
+        rest = view.params.rest
+        line = view.params.material.mass.sum(-2, keepdim=True) / (rest.length * rest.edge_mask).sum(-2, keepdim=True)
+        # Rods instead of masses at their ends: m l^2 / 12 in place of m l^2 / 4.
+        length = values["length"].abs().minimum(rest.length)
         return {
+            "turning_inertia": -line * length.square() / (6 * rest.length) * rest.edge_mask,
             "gradient": bent["gradient"] + (pull + view.next(pull)) / view.length,
-            "torque": bent["torque"] + view.next(joint) - joint,
+            "torque": bent["torque"] + view.next(moment) - moment,
             # k g g^T for the strain's gradient g by the twists, without Twist's own part, g = (-1, 1).
             "twist_hessian": stiffness
             * torch.cat([before.square() - 2 * before, before - after + before * after, after.square() + 2 * after], -1)
             + f * torch.cat([2 * b1 * b2, b1 * a2 + b2 * a1, 2 * a1 * a2], -1),
             "twist_geometry": f * torch.cat([k2 * b2 - k1 * b1, k2 * a2 - k1 * a1], -1),
         }
+
+
+class _Joint:
+    """The angles of the joints, from the quaternion (c, s, p, q) of the turn from one link to the next.
+
+    Not of unit length: c and s belong to half the twist, p and q are half the curvatures about the axes across, which
+    are -d2 and d1 of a hinge.
+    """
+
+    def __init__(self, view: View, values: Values) -> None:
+        self.hinge, self.twist = curvature(view), Twist().strain(view)
+        self.bending = greatest(hinge_stiffness(view))
+        self.twisting = view.params.material.twist / view.hinge_length * view.params.rest.hinge_mask
+        links = values["length"] / view.hinge_length
+        self.links, self.some = links, links.abs() > 1e-4
+        self.w = torch.where(self.some, links, 1.0)
+        kappa, turn = self.hinge.kappa, self.w * self.twist
+        self.c, self.s = torch.cos(0.5 * turn), torch.sin(0.5 * turn)
+        self.p, self.q = -0.5 * self.w * kappa[..., :1], -0.5 * self.w * kappa[..., 1:]
+        p, q, c, s = self.p, self.q, self.c, self.s
+        self.norm = 1 + p.square() + q.square()
+        self.x_of = 2 * (c * s - p * q), c.square() - s.square() + q.square() - p.square()
+        self.y_of = 2 * (s * q + c * p)
+        self.z_of = 2 * (c * q - s * p), 1 - p.square() - q.square()
+        self.x, self.z = torch.atan2(*self.x_of), torch.atan2(*self.z_of)
+        # Short of a right angle, where the first and the third axis fall together.
+        self.sine = (self.y_of / self.norm).clamp(-0.99, 0.99)
+        self.y = torch.asin(self.sine)
+
+    def energy(self) -> torch.Tensor:
+        """Return the energy of its springs less that of a rope [J], shape (..., V, 1)."""
+        kappa = self.hinge.kappa
+        bent = (self.y.square() + self.z.square()) / self.w.square() - dot(kappa, kappa)
+        twisted = self.x.square() / self.w.square() - self.twist.square()
+        return torch.where(self.some, 0.5 * self.bending * bent + 0.5 * self.twisting * twisted, 0.0)
+
+    def slopes(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return the derivatives of the energy by curvatures (..., V, 2) and by twist (..., V, 1)."""
+        p, q, c, s = self.p, self.q, self.c, self.s
+        nx, dx = self.x_of
+        nz, dz = self.z_of
+        ex = self.twisting * self.x / (nx.square() + dx.square())
+        ez = self.bending * self.z / (nz.square() + dz.square())
+        ey = self.bending * self.y / (self.norm * (1 - self.sine.square()).sqrt())
+        by_p = ex * (-2 * q * dx + 2 * p * nx) + ez * (-2 * s * dz + 2 * p * nz) + ey * (2 * c - 2 * p * self.sine)
+        by_q = ex * (-2 * p * dx - 2 * q * nx) + ez * (2 * c * dz + 2 * q * nz) + ey * (2 * s - 2 * q * self.sine)
+        cosine, sine = c.square() - s.square(), 2 * c * s
+        by_t = ex * (cosine * dx + sine * nx) - 0.5 * ez * self.y_of * dz + 0.5 * ey * nz
+        kappa = self.hinge.kappa
+        by_kappa = -torch.cat([by_p, by_q], -1) / (2 * self.w) - self.bending * kappa
+        by_twist = by_t / self.w - self.twisting * self.twist
+        return torch.where(self.some, by_kappa, 0.0), torch.where(self.some, by_twist, 0.0)

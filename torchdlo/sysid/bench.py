@@ -1,0 +1,70 @@
+"""What a search works on: the trials of a recording, where they begin, and what models say of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from torchdlo.errors import InputError
+from torchdlo.sysid import floor as floors
+from torchdlo.sysid import start as starts
+from torchdlo.sysid.motion import Start
+from torchdlo.sysid.pool import Fit, Fitted, Pool, Simulation
+
+Callback = Callable[[str, int, int, str], None]
+"""Called with stage, steps done, steps in all, and a word on how it goes."""
+
+
+def _key(fitted: Fitted) -> tuple[tuple[str, ...], bytes]:
+    return fitted.effects, fitted.values.tobytes()
+
+
+class Bench:
+    """Trials, their starts and the predictions that were asked for."""
+
+    def __init__(self, pool: Pool) -> None:
+        self.pool, self.recording = pool, pool.recording
+        self.trials = {split: self.recording.trials(split) for split in ("train", "test", "all")}
+        self.starts: dict[str, Start] = {}
+        self._known: dict[tuple[tuple[str, ...], bytes], np.ndarray] = {}
+
+    def begin(self, base: np.ndarray, effects: Sequence[str]) -> None:
+        """Estimate where trials begin with these numbers."""
+        model = self.pool.local.model(effects)
+        first = starts.begin(model, self.trials["all"])
+        start = starts.refine(model, self.pool.local.motion(model, "all"), first, base)
+        train = np.arange(len(self.trials["train"]))
+        test = np.arange(len(train), len(self.trials["all"]))
+        self.starts = {"all": start, "train": start.pick(train), "test": start.pick(test)}
+
+    def predict(self, fits: Sequence[Fitted]) -> None:
+        """Simulate all trials with several models at once, for `gaps` and `prediction` to look up."""
+        new = [f for f in fits if _key(f) not in self._known]
+        jobs = [Simulation(f.effects, f.values[None], "all", self.starts["all"]) for f in new]
+        for k, sims in self.pool.simulate(jobs):
+            self._known[_key(new[k])] = sims[0]
+
+    def prediction(self, fitted: Fitted, split: str) -> np.ndarray:
+        """Return the simulated markers of the trials of a split, shape (B, F, M, 3)."""
+        self.predict([fitted])
+        first = len(self.trials["train"])
+        return self._known[_key(fitted)][{"train": slice(first), "test": slice(first, None), "all": slice(None)}[split]]
+
+    def gaps(self, fitted: Fitted, split: str) -> np.ndarray:
+        """Return the gap of each trial of a split [m]."""
+        return floors.gap(self.prediction(fitted, split), self.trials[split])
+
+    def fit(self, jobs: Sequence[Fit]) -> list[Fitted]:
+        """Return the results of fits in their order.
+
+        Raises:
+            InputError: No simulation ran through.
+        """
+        found = [f for _, f in sorted(self.pool.fit(jobs), key=lambda pair: pair[0])]
+        if not np.isfinite(min(f.point.cost for f in found)):
+            raise InputError(
+                f"{self.recording.path}: the simulation failed on the train trials from every start; check length, "
+                "mass and marker_arclength, or use fewer vertices."
+            )
+        return found
