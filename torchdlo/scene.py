@@ -6,11 +6,10 @@ Four kinds of data are never mixed: `Scene` (static), `Params` (what one may lea
 
 from __future__ import annotations
 
-import functools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from functools import partial
+from functools import partial, reduce
 
 import torch
 from torch import Tensor
@@ -286,7 +285,9 @@ def advance(scene: Scene, params: Params, state: State, start: Control, control:
     rods, reaction, (body, pool, push) = substep(
         settings, params.rods, params.effects, state.rods, targets, first, foresee, matter
     )
-    mean = tree.map(lambda sum, now: sum + now / scene.substeps, state.reaction, reaction)
+    # Over the substeps of this step; a sum set to zero outside would have no gradient at first.
+    later = share * scene.substeps > 1.5
+    mean = tree.map(lambda old, now: torch.where(later, old, 0.0) + now / scene.substeps, state.reaction, reaction)
     missed = watch.missed(scene.effects, rods.pos, params.effects, state.missed)
     moved, particles = rigid.advance(body, poses, push) if scene.bodies else (), ()
     if scene.matter:
@@ -322,7 +323,6 @@ def _check_control(scene: Scene, control: Control) -> None:
 
 def _step(scene: Scene, params: Params, state: State, control: Control, advance, survey) -> State:
     start = hold(scene, state)
-    state = tree.replace(state, reaction=tree.map(torch.zeros_like, state.reaction))
     if any(e.reacts for e in scene.effects):
         params = survey(scene, params, state, start, control)
     for k in range(scene.substeps):
@@ -354,8 +354,8 @@ def stepper(scene: Scene, *, compiled: bool = True):
         _check_control(scene, control)
         graded = torch.is_grad_enabled()
         if graded:
-            moving = alike((state.rods, state.matter), (params, control))
-            state = tree.replace(state, rods=moving[0], matter=moving[1])
+            moving = alike((state.rods, state.reaction, state.matter), (params, control))
+            state = tree.replace(state, rods=moving[0], reaction=moving[1], matter=moving[2])
         whole, part = ways[graded]
         return whole(scene, params, state, control, part, look)
 
@@ -365,7 +365,7 @@ def stepper(scene: Scene, *, compiled: bool = True):
 def finite(state: State) -> Tensor:
     """Return which scenes are made of numbers only, bool, shape (...)."""
     moving = [state.rods.pos, state.rods.vel, *tree.leaves((state.bodies, state.matter))]
-    return functools.reduce(torch.logical_and, (torch.isfinite(x).all(-1).all(-1) for x in moving))
+    return reduce(torch.logical_and, (torch.isfinite(x).all(-1).all(-1) for x in moving))
 
 
 def ok(state: State) -> Tensor:
