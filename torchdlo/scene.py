@@ -23,7 +23,7 @@ from torchdlo.coupling.watch import survey
 from torchdlo.physics import build, rod, rotation, stability, tree
 from torchdlo.physics.build import Rope
 from torchdlo.physics.effect import Effect, altered, default_values, numbers_of
-from torchdlo.physics.hold import Reaction, Targets, check_grip
+from torchdlo.physics.hold import Reaction, Targets, check_grip, unfelt
 from torchdlo.physics.integrate import INTEGRATORS, TWISTS, Settings, settle_twist, substep
 from torchdlo.physics.replay import alike, rollout
 from torchdlo.physics.rod import RodParams, RodState
@@ -157,6 +157,11 @@ class Scene:
         )
 
     @property
+    def held(self) -> tuple[int, int]:
+        """How many vertices and edges are held."""
+        return len(self.held_vertices), len(self.held_edges)
+
+    @property
     def settings(self) -> Settings:
         """What a substep needs to know."""
         return Settings(
@@ -209,19 +214,14 @@ def make(
     effects = rod_matter.fitted(effects, medium, rods)
     scene = Scene(topology, effects, bodies=kinds, matter=medium, **choices)
     numbers = numbers_of(effects, values or {}, state.pos)
-    memory = {
-        e.name: tree.batch_innermost(state.pos.new_zeros(*state.pos.shape[:-1], e.memory)) for e in effects if e.memory
-    }
-    state = tree.replace(state, memory=memory)
+    blank = {e.name: state.pos.new_zeros(*state.pos.shape[:-1], e.memory) for e in effects if e.memory}
+    state = tree.replace(state, memory=tree.map(tree.batch_innermost, blank))
     params = Params(rods, numbers, solid, stuff)
     if check:
         stability.check_laws(scene.settings, rods, numbers, state)
         check_step(scene, params)
-    batch = state.pos.shape[:-2]
-    parts = len(scene.held_vertices), len(scene.held_edges)
-    unfelt = Reaction(state.pos.new_zeros(*batch, parts[0], 3), state.pos.new_zeros(*batch, parts[1], 1))
-    zero = state.pos.new_zeros(*batch, 1, 2)
-    first = State(state, zero[..., :1], zero, unfelt, placed, particles)
+    zero = state.pos.new_zeros(*state.pos.shape[:-2], 1, 2)
+    first = State(state, zero[..., :1], zero, unfelt(state.pos, *scene.held), placed, particles)
     if scene.twist == "quasistatic":
         held = hold(scene, first)
         changed = altered(scene.effects, topology, rods, numbers)
@@ -311,18 +311,16 @@ def step(scene: Scene, params: Params, state: State, control: Control, *, advanc
 
 
 def _check_control(scene: Scene, control: Control) -> None:
-    wanted = (len(scene.held_vertices), len(scene.held_edges))
-    if (control.pos.shape[-2], control.director.shape[-2]) != wanted:
-        given = (tuple(control.pos.shape), tuple(control.director.shape))
-        raise ValueError(
-            f"control: pos and director are {given}; expected (..., {wanted[0]}, 3) and (..., {wanted[1]}, 3)"
-        )
+    given, (h, g) = (tuple(control.pos.shape), tuple(control.director.shape)), scene.held
+    if (given[0][-2], given[1][-2]) != (h, g):
+        raise ValueError(f"control: pos and director are {given}; expected (..., {h}, 3) and (..., {g}, 3)")
     rigid.check_targets(scene.bodies, control.bodies)
-    check_grip(control.grip, wanted)
+    check_grip(control.grip, scene.held)
 
 
 def _step(scene: Scene, params: Params, state: State, control: Control, advance, survey) -> State:
     start = hold(scene, state)
+    state = tree.replace(state, reaction=state.reaction.sized(state.rods.pos, *scene.held))
     if any(e.reacts for e in scene.effects):
         params = survey(scene, params, state, start, control)
     for k in range(scene.substeps):
@@ -340,15 +338,16 @@ def stepper(scene: Scene, *, compiled: bool = True):
     """
     if not compiled:
         return partial(step, scene)
+    compile = partial(torch.compile, fullgraph=True, dynamic=False, isolate_recompiles=True)
     once = scene.substeps == 1 and not any(e.reacts for e in scene.effects)
 
     def made(inline: bool):
         # Without gradients, neighbours are best read where they are used; with them, copies are worth their cost.
-        part = partial(torch.compile, fullgraph=True, dynamic=False, options={"force_pointwise_cat": inline})
+        part = partial(compile, options={"force_pointwise_cat": inline})
         return (part(_step), advance) if once else (_step, part(advance))
 
     ways = {True: made(False), False: made(True)}
-    look = torch.compile(survey, fullgraph=True, dynamic=False)
+    look = compile(survey)
 
     def run(params: Params, state: State, control: Control) -> State:
         _check_control(scene, control)
@@ -364,7 +363,7 @@ def stepper(scene: Scene, *, compiled: bool = True):
 
 def finite(state: State) -> Tensor:
     """Return which scenes are made of numbers only, bool, shape (...)."""
-    moving = [state.rods.pos, state.rods.vel, *tree.leaves((state.bodies, state.matter))]
+    moving = (state.rods.pos, state.rods.vel, *tree.leaves((state.bodies, state.matter)))
     return reduce(torch.logical_and, (torch.isfinite(x).all(-1).all(-1) for x in moving))
 
 

@@ -156,7 +156,7 @@ def test_a_hidden_effect_is_named_and_none_where_there_is_none(
 ) -> None:
     # Two names keep it short; the mesh and the steps are not those of the recording.
     monkeypatch.setattr(library, "LIBRARY", ("air_drag", "point_mass"))
-    monkeypatch.setattr(search, "BUDGETS", {"fast": search.Budget(3, 2, 3, 1)})
+    monkeypatch.setattr(search, "BUDGETS", {"fast": search.Budget(3, 2, 3, 3, 1)})
     recording = make_recording(tmp_path, effects)
     stages = []
     result = search.diagnose(recording, vertices=31, workers=1, callback=lambda *step: stages.append(step))

@@ -31,6 +31,18 @@ class Reaction:
     couple: Tensor
     """Torque on the held edges about their axis [N m], shape (..., G, 1)."""
 
+    def sized(self, like: Tensor, vertices: int, edges: int) -> Reaction:
+        """Return this reaction, or none where other parts than these were held; `like` has shape (..., V, 3)."""
+        if (self.force.shape[-2], self.couple.shape[-2]) == (vertices, edges):
+            return self
+        return unfelt(like, vertices, edges)
+
+
+def unfelt(like: Tensor, vertices: int, edges: int) -> Reaction:
+    """Return no reaction; `like` has shape (..., V, 3)."""
+    batch = like.shape[:-2]
+    return Reaction(like.new_zeros(*batch, vertices, 3), like.new_zeros(*batch, edges, 1))
+
 
 def spread(values: Tensor, slots: tuple[int, ...], size: int, otherwise: Tensor) -> Tensor:
     """Return `otherwise` (..., V, C) with `values` (..., H, C) put at the given slots."""

@@ -52,6 +52,9 @@ BUDGETS = {"fast": Budget(12, 4, 4, 6, 2), "full": Budget(32, 8, 6, 12, 3)}
 PAYS = 0.15
 """Share of the excess gap that an effect has to close, on the train and on the test trials."""
 
+MATTERS = 0.03
+"""Share of the baseline's excess gap that each effect has to close, whatever the others leave."""
+
 LEADERS = 2
 """Effects that are fitted further in each round."""
 
@@ -170,6 +173,7 @@ class _Search:
     def __init__(self, pool: Pool, budget: Budget, rng: np.random.Generator, report: Callback) -> None:
         self.pool, self.budget, self.rng, self.report = pool, budget, rng, report
         self.bench, self.recording = Bench(pool), pool.recording
+        self.baseline: Fitted | None = None
 
     def run(self, given: Saved | None = None) -> Diagnosis:
         """Go through all stages."""
@@ -178,11 +182,11 @@ class _Search:
             base = baselines.calibrate(self.bench, count, most, self.rng, self.report)
         else:
             base = baselines.go_on(self.bench, given, most, self.report)
-        baseline, floor = base, self._floor(base)
+        self.baseline, floor = base, self._floor(base)
         rounds: list[list[Candidate]] = []
         ties: dict[str, list[str]] = {}
         shares: dict[str, float] = {}
-        whole = max(rms(self.bench.gaps(baseline, "test")) ** 2 - floor.noise**2, 1e-12)
+        whole = max(rms(self.bench.gaps(base, "test")) ** 2 - floor.noise**2, 1e-12)
         while len(rounds) < self.budget.rounds + (len(shares) < len(rounds)):
             if shares and rms(self.bench.gaps(base, "all")) < SILENT * floor.total:
                 break
@@ -195,7 +199,7 @@ class _Search:
             gained = rms(self.bench.gaps(base, "test")) ** 2 - rms(self.bench.gaps(best, "test")) ** 2
             shares[name], ties[name] = float(gained / whole), rivals
             base = self._pruned(best, shares, floor)
-        return self._conclude(baseline, base, list(shares), ties, shares, rounds, floor)
+        return self._conclude(base, list(shares), ties, shares, rounds, floor)
 
     def _pruned(self, fitted: Fitted, shares: dict[str, float], floor: Floor) -> Fitted:
         """Return the model without the effects that the last one has made needless, which takes over their shares."""
@@ -209,7 +213,7 @@ class _Search:
             effects, start = tuple(e for e in fitted.effects if e != name), self.bench.starts["train"]
             less = self.bench.fit([Fit(effects, fitted.values[None, left], names, sizes, self.budget.more, start)])[0]
             self.report(f"without {name}", 1, 1, f"{1e3 * less.point.cost:.2f} mm")
-            if self._gain(less, fitted, floor, "train") < PAYS:
+            if not self._matters(less, fitted, floor, "train"):
                 fitted, shares[last] = less, shares[last] + shares.pop(name)
         return fitted
 
@@ -260,6 +264,8 @@ class _Search:
                 reasons[name] = f"closes {max(gains[name], 0):.0%} of the gap"
             elif self._gain(rival, fitted, floor, "test") < PAYS:
                 reasons[name] = "does not help on the test trials"
+            elif not all(self._matters(rival, fitted, floor, split) for split in ("train", "test")):
+                reasons[name] = "closes less than the floor leaves open"
             else:
                 best, reasons[name] = fitted, "taken"
         held = {s.name: self._gain(rival, f, floor, "test") for s, f in zip(tried, fits, strict=True)}
@@ -275,6 +281,11 @@ class _Search:
         """Return the share of the excess gap (squared, above noise) that a fit closes."""
         before, after = rms(self.bench.gaps(base, split)) ** 2, rms(self.bench.gaps(fitted, split)) ** 2
         return float((before - after) / max(before - floor.noise**2, (0.3 * floor.noise) ** 2, 1e-12))
+
+    def _matters(self, less: Fitted, more: Fitted, floor: Floor, split: str) -> bool:
+        """Return whether a model's gap is smaller by more than the floor, and by a share of the baseline's."""
+        first, before, after = (rms(self.bench.gaps(f, split)) ** 2 for f in (self.baseline, less, more))
+        return before - after > max(floor.total**2, MATTERS * (first - floor.noise**2))
 
     def _on_most(self, base: Fitted, fitted: Fitted) -> bool:
         better = self.bench.gaps(fitted, "train") < self.bench.gaps(base, "train")
@@ -314,7 +325,6 @@ class _Search:
 
     def _conclude(
         self,
-        baseline: Fitted,
         final: Fitted,
         effects: list[str],
         ties: dict[str, list[str]],
@@ -322,6 +332,7 @@ class _Search:
         rounds: list[list[Candidate]],
         floor: Floor,
     ) -> Diagnosis:
+        baseline = self.baseline
         before, after = self.bench.gaps(baseline, "test"), self.bench.gaps(final, "test")
         explained = rms(after) <= UNEXPLAINED * floor.total
         verdict = ("effects" if explained else "partial") if effects else ("none" if explained else "unknown")
