@@ -324,7 +324,7 @@ def _step(scene: Scene, params: Params, state: State, control: Control, advance,
     if any(e.reacts for e in scene.effects):
         params = survey(scene, params, state, start, control)
     for k in range(scene.substeps):
-        share = start.pos.new_full((1,), (k + 1) / scene.substeps)
+        share = start.pos.new_ones(1) * (k + 1) / scene.substeps
         state = advance(scene, params, state, start, control, share)
     return state
 

@@ -7,7 +7,8 @@ fast as they are in eager mode. It is for simulations without gradients.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
+from collections import OrderedDict
+from collections.abc import Callable, Hashable
 from typing import Any
 
 import torch
@@ -29,13 +30,38 @@ def record(step: Callable[..., Any], *inputs: Any) -> Callable[..., Any]:
         return tuple(found)
 
     with torch.no_grad(), warnings.catch_warnings():
-        # Deprecated in favour of compiling, which takes too long here; and shapes are meant to be fixed.
-        warnings.simplefilter("ignore", DeprecationWarning)
+        # Shapes are meant to be fixed.
         warnings.simplefilter("ignore", torch.jit.TracerWarning)
-        recorded = torch.jit.trace(run, tuple(leaves), check_trace=False)
+        # What `torch.jit.trace` makes is kept for as long as the process lives, some 30 MB each.
+        graph, _ = torch._C._create_graph_by_tracing(run, tuple(leaves), lambda _: "", True, False, None, [])
+        recorded = torch._C._create_function_from_graph("step", graph)
 
     @torch.no_grad()
     def replayed(*trees: Any) -> Any:
         return rebuild[0](recorded(*tree.flatten(trees)[0]))
 
     return replayed
+
+
+class Recordings:
+    """The steps that were recorded or used last."""
+
+    def __init__(self, most: int) -> None:
+        """Prepare to keep `most` of them; each takes some 30 MB."""
+        self._most, self._kept = most, OrderedDict[Hashable, Callable[..., Any]]()
+
+    def find(self, key: Hashable, step: Callable[..., Any], *inputs: Any) -> Callable[..., Any]:
+        """Return `step`, recorded with inputs of these shapes unless it is known already.
+
+        Args:
+            key: equal for steps that do the same.
+            step: see `record`.
+            inputs: likewise.
+        """
+        key = key, tuple((x.shape, x.dtype) for x in tree.leaves(inputs))
+        if key not in self._kept:
+            self._kept[key] = record(step, *inputs)
+        self._kept.move_to_end(key)
+        if len(self._kept) > self._most:
+            self._kept.popitem(last=False)
+        return self._kept[key]

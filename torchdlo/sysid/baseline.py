@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from torchdlo.sysid.bench import Bench, Callback
@@ -16,11 +18,11 @@ _SPREAD = np.log([30.0, 4.0, 6.0])
 """How far random starts are from the first guess, in logarithms of the baseline's numbers."""
 
 _BETTER = 0.9
-"""Share of the cost that is left where the rope is taken for a chain."""
+"""Share of the cost that is left where the rope is taken for a chain, or for one that clamps hold to their ends."""
 
 
 def calibrate(bench: Bench, count: int, iterations: int, rng: np.random.Generator, report: Callback) -> Fitted:
-    """Return the fitted baseline, with the law of a chain where that helps.
+    """Return the fitted baseline, with the law of a chain where that helps, and clamps as firm as they seem.
 
     Args:
         bench: the trials.
@@ -37,8 +39,9 @@ def calibrate(bench: Bench, count: int, iterations: int, rng: np.random.Generato
     ones, link = (1.0,) * len(names), float(np.diff(model.arclength).min())
     free, sizes = (*names, f"{CHAIN}.length"), (*ones, 0.5 * link)
 
-    def plain(values: np.ndarray, most: int, frames: int | None) -> Fit:
-        return Fit((), values, names, ones, most, bench.starts["train"], frames)
+    def plain(values: np.ndarray, most: int, frames: int | None, **options: float) -> Fit:
+        start = bench.starts["train"]
+        return Fit((), values, names, ones, most, start, frames, options=tuple(options.items()))
 
     def chain(values: np.ndarray, most: int, frames: int | None) -> Fit:
         return Fit((CHAIN,), values, free, sizes, most, bench.starts["train"], frames)
@@ -56,8 +59,12 @@ def calibrate(bench: Bench, count: int, iterations: int, rng: np.random.Generato
     # Phases of late times are right only after early ones are: the horizon grows. The order of the axes of its joints
     # gives a chain's length a sign.
     sides = [chain(np.append(best, length)[None], 4, 2 * frames // 3) for length in (link, -link)]
-    smooth, *linked = fit([plain(best[None], 5, 2 * frames // 3), *sides], 2)
-    side = min(linked, key=lambda f: f.point.cost)
+    firm = [plain(best[None], 5, 2 * frames // 3, grip=1.0)] if model.mesh.clamps else []
+    smooth, *others = fit([plain(best[None], 5, 2 * frames // 3), *sides, *firm], 2)
+    side = min(others[:2], key=lambda f: f.point.cost)
+    if firm and others[2].point.cost < _BETTER * min(smooth.point.cost, side.point.cost):
+        bench.pool.choose(grip=1.0)
+        smooth, side = others[2], replace(side, values=np.append(others[2].values, side.values[-1]))
     smooth, side = fit([plain(smooth.values[None], iterations, None), chain(side.values[None], iterations, None)], 3)
     better = side if side.point.cost < _BETTER * smooth.point.cost else smooth
     report(stage, 4, 4, f"{1e3 * rms(bench.gaps(better, 'train')):.2f} mm")

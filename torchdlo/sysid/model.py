@@ -44,6 +44,9 @@ _AHEAD = 0.1
 _CHUNK = 64
 """Scenes that run together in a compiled step: one size, so that there is one graph."""
 
+_RECORDINGS = traced.Recordings(24)
+"""Steps of this process that are not compiled."""
+
 _COMPILE_FROM = 10_000
 """Frames in the train trials from which compiling pays off."""
 
@@ -286,14 +289,7 @@ class RopeModel:
             state, rods=tree.replace(rods, pos=tree.batch_innermost(pos), vel=tree.batch_innermost(vel))
         )
 
-    def simulate(
-        self,
-        motion: Motion,
-        start: Start,
-        values: np.ndarray,
-        *,
-        frames: int | None = None,
-    ) -> np.ndarray:
+    def simulate(self, motion: Motion, start: Start, values: np.ndarray, *, frames: int | None = None) -> np.ndarray:
         """Return simulated markers [m] for every parameter set and trial.
 
         Args:
@@ -335,7 +331,7 @@ class RopeModel:
             for k in range((frames - 1) * self.substeps + 1)
         ]
         if not self.compiled:
-            step = traced.record(step, params, state, controls[0])
+            step = _RECORDINGS.find(scene, step, params, state, controls[0])
         if start.still is not None and start.still.any():
             resting = settle.come_to_rest(scene, params, state, controls[0])
             resting = self._corrected(step, scene, params, resting, controls, motion)

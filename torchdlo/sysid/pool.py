@@ -6,7 +6,7 @@ import multiprocessing
 import os
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, TypeVar
 
@@ -59,6 +59,8 @@ class Fit:
     """How many frames to fit; all if not given."""
     keep: int | None = None
     """With how many of the starts, the best, to go on; all if not given."""
+    options: tuple[tuple[str, Any], ...] = ()
+    """Options of `RopeModel` that differ from those of the pool."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,7 +107,7 @@ class Models:
 
     def fit(self, job: Fit) -> Fitted:
         """Return the best of the fits from all starts."""
-        model = self.model(job.effects)
+        model = self.model(job.effects, job.options)
         motion = self.motion(model, "train")
         start = job.start or starts.begin(model, self.recording.train)
         columns = [model.parameters.index(name) for name in job.free]
@@ -149,6 +151,7 @@ class Pool:
         workers = workers or max(1, os.cpu_count() or 1)
         self.journal = journal
         self.recording, self.local = recording, Models(recording, options)
+        self._chosen: tuple[tuple[str, Any], ...] = ()
         self._pool = None
         if workers > 1:
             context = multiprocessing.get_context("spawn")
@@ -166,6 +169,11 @@ class Pool:
         for worker in workers:
             worker.terminate()
 
+    def choose(self, **options: Any) -> None:
+        """Give all models other options from now on."""
+        self.local = Models(self.recording, self.local.options | options)
+        self._chosen = (*self._chosen, *options.items())
+
     def simulate(self, jobs: Sequence[Simulation]) -> Iterator[tuple[int, np.ndarray]]:
         """Yield the index and the markers of every job as they get ready."""
         return self._run(_simulate, self.local.simulate, jobs)
@@ -178,6 +186,7 @@ class Pool:
         self, remote: Callable[[Job], Any], local: Callable[[Job], Any], jobs: Sequence[Job]
     ) -> Iterator[tuple[int, Any]]:
         compute = partial(self._compute, remote, local)
+        jobs = [replace(job, options=(*self._chosen, *job.options)) for job in jobs]
         yield from compute(jobs) if self.journal is None else self.journal.through(jobs, compute)
 
     def _compute(

@@ -1,0 +1,74 @@
+"""Recorded steps do what steps do."""
+
+import gc
+from pathlib import Path
+
+import pytest
+import torch
+
+from torchdlo import scene as scenes
+from torchdlo.physics import traced, tree
+from torchdlo.physics.effects import EFFECTS
+
+
+def _rope(batch=2, vertices=8):
+    x = torch.linspace(0, 0.5, vertices, dtype=torch.float64)
+    points = torch.stack([x, torch.zeros_like(x), torch.zeros_like(x)], -1).expand(batch, -1, 3)
+    rope = scenes.Rope(points, radius=0.005, mass=0.03, bend=1e-4)
+    return scenes.make([rope], [EFFECTS["gravity"](), EFFECTS["bend"]()], held_vertices=(0,))
+
+
+def test_a_recorded_step_does_what_the_step_does_with_other_numbers_too():
+    scene, params, state = _rope()
+    step = scenes.stepper(scene, compiled=False)
+    control = scenes.hold(scene, state)
+    recorded = traced.record(step, params, state, control)
+    stiffer = tree.replace(params, rods=tree.map(lambda x: 1.5 * x, params.rods))
+    for numbers in (params, stiffer):
+        a = b = state
+        for k in range(5):
+            moved = tree.replace(control, pos=control.pos + 1e-3 * k)
+            a, b = step(numbers, a, moved), recorded(numbers, b, moved)
+        for x, y in zip(tree.leaves(a), tree.leaves(b), strict=True):
+            # The executor of recorded steps may round otherwise: seen are 1e-10 of a velocity per substep, of 25.
+            torch.testing.assert_close(x, y, rtol=1e-6, atol=1e-8)
+
+
+def test_recordings_are_found_again_by_key_and_shapes_and_the_oldest_goes():
+    calls = []
+
+    def step(x):
+        calls.append(x.shape)
+        return (2 * x,)
+
+    known, x = traced.Recordings(2), torch.ones(3)
+    first = known.find("double", step, x)
+    assert known.find("double", step, 5 * x) is first and len(calls) == 1
+    assert torch.equal(first(5 * x)[0], 10 * x)
+    known.find("double", step, torch.ones(4))
+    known.find("other", step, x)
+    assert known.find("double", step, x) is not first and len(calls) == 4
+
+
+@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="memory of a process is read from /proc")
+def test_recordings_that_are_let_go_free_their_memory():
+    def megabytes():
+        gc.collect()
+        return int(Path("/proc/self/statm").read_text().split()[1]) * 4096 / 2**20
+
+    def step(x):
+        for _ in range(800):
+            x = 1.0001 * x + torch.ones(3)
+        return (x,)
+
+    def use():
+        recorded = traced.record(step, torch.zeros(3))
+        for _ in range(3):
+            recorded(torch.zeros(3))
+
+    use()
+    before = megabytes()
+    for _ in range(4):
+        use()
+    # Kept, each would take 25 MB.
+    assert megabytes() - before < 30
