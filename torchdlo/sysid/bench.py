@@ -27,6 +27,8 @@ class Bench:
         self.pool, self.recording = pool, pool.recording
         self.trials = {split: self.recording.trials(split) for split in ("train", "test", "all")}
         self.starts: dict[str, Start] = {}
+        self.early = np.empty(0)
+        """The baseline's numbers that fit the beginning of the trials, as far as they are known."""
         self._known: dict[tuple[tuple[str, ...], bytes], np.ndarray] = {}
 
     def begin(self, base: np.ndarray, effects: Sequence[str]) -> None:

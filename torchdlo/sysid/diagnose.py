@@ -18,36 +18,18 @@ import numpy as np
 from torchdlo.errors import InputError
 from torchdlo.sysid import baseline as baselines
 from torchdlo.sysid import floor as floors
-from torchdlo.sysid import health, library
+from torchdlo.sysid import health, library, plan
 from torchdlo.sysid.baseline import CHAIN
 from torchdlo.sysid.bench import Bench, Callback
 from torchdlo.sysid.floor import Floor, rms
 from torchdlo.sysid.health import Fault
 from torchdlo.sysid.journal import Journal
 from torchdlo.sysid.model import RopeModel
+from torchdlo.sysid.plan import BUDGETS, Budget
 from torchdlo.sysid.pool import Fit, Fitted, Pool
 from torchdlo.sysid.recording import Recording
 from torchdlo.sysid.saved import Saved
 from torchdlo.sysid.screen import Score, screen
-
-
-@dataclass(frozen=True)
-class Budget:
-    """How much work to do."""
-
-    starts: int
-    """Starts of the baseline fit."""
-    candidates: int
-    """Effects that are fitted in each round."""
-    iterations: int
-    """Iterations of each first fit."""
-    more: int
-    """Iterations more of the baseline and of the fits that lead."""
-    rounds: int
-    """Most effects that are added one after the other."""
-
-
-BUDGETS = {"fast": Budget(12, 4, 4, 6, 2), "full": Budget(32, 8, 6, 12, 3)}
 
 PAYS = 0.15
 """Share of the excess gap that an effect has to close, on the train and on the test trials."""
@@ -56,7 +38,10 @@ MATTERS = 0.03
 """Share of the baseline's excess gap that each effect has to close, whatever the others leave."""
 
 LEADERS = 2
-"""Effects that are fitted further in each round."""
+"""Effects that are fitted further in each round, besides those that are as good."""
+
+SHORT = 0.6
+"""Share of the trials that first fits see."""
 
 SILENT = 1.3
 """Times the floor: below, there is nothing left to look for."""
@@ -125,6 +110,7 @@ def diagnose(
     budget: str = "fast",
     seed: int = 0,
     vertices: int | None = None,
+    trials: int | None = None,
     workers: int | None = None,
     callback: Callback | None = None,
     journal: Path | None = None,
@@ -138,6 +124,7 @@ def diagnose(
         budget: "fast" or "full".
         seed: of the random starts.
         vertices: vertices of the rope; from the spacing of the markers if not given.
+        trials: most train trials to use; by the budget if not given.
         workers: processes; one per core if not given.
         callback: see `Callback`.
         journal: folder that keeps what is done, so that a search which was stopped can go on.
@@ -148,7 +135,9 @@ def diagnose(
         raise InputError(f"budget is {budget!r}; expected one of {', '.join(BUDGETS)}.")
     begun, report = time.perf_counter(), callback or (lambda *_: None)
     recording, faults = health.check(recording)
-    options = {"vertices": vertices or _vertices(recording), "ahead": 0.0, "grip": 0.0, "compiled": False}
+    whole = len(recording.train)
+    recording = plan.some(recording, trials or BUDGETS[budget].trials)
+    options = plan.options(recording, vertices)
     if given is not None:
         options |= given.options if vertices is None else given.options | {"vertices": vertices}
     asked = {"budget": BUDGETS[budget], "seed": seed, "options": options, "first": given and given.values}
@@ -157,14 +146,10 @@ def diagnose(
         search = _Search(pool, BUDGETS[budget], np.random.default_rng(seed), report)
         found = search.run(given)
     found.health, found.options = faults, {"budget": budget, "seed": seed, "vertices": options["vertices"]}
+    if len(recording.train) < whole:
+        found.notes.append(f"{len(recording.train)} of the {whole} train trials were used, evenly picked.")
     found.seconds = time.perf_counter() - begun
     return found
-
-
-def _vertices(recording: Recording) -> int:
-    """Return how many vertices suit the closest free or gripped neighbours among the markers, 40 to 80."""
-    nearest = float(np.diff(recording.train[0].marker_arclength).min())
-    return int(np.clip(round(recording.length / nearest) + 1, 41, 81))
 
 
 class _Search:
@@ -198,8 +183,10 @@ class _Search:
             name = best.effects[-1]
             gained = rms(self.bench.gaps(base, "test")) ** 2 - rms(self.bench.gaps(best, "test")) ** 2
             shares[name], ties[name] = float(gained / whole), rivals
-            base = self._pruned(best, shares, floor)
-        return self._conclude(base, list(shares), ties, shares, rounds, floor)
+            base = baselines.go_further(self.bench, self._pruned(best, shares, floor), self.budget.more, self.report)
+        # A wrong model's floor is wrong, too.
+        floor = self._floor(base) if shares else floor
+        return self._conclude(base, list(shares), {n: ties[n] for n in shares}, shares, rounds, floor)
 
     def _pruned(self, fitted: Fitted, shares: dict[str, float], floor: Floor) -> Fitted:
         """Return the model without the effects that the last one has made needless, which takes over their shares."""
@@ -240,7 +227,7 @@ class _Search:
         )
         tried = scores[: self.budget.candidates]
         found = self._fitted([self._candidate(base, score) for score in tried] + [self._further(base, base)], stage)
-        lead = sorted(range(len(tried)), key=lambda k: found[k].point.cost)[:LEADERS]
+        lead = self._leaders(found)
         ahead = [*lead, len(tried)]
         for k, fitted in zip(ahead, self._fitted([self._further(base, found[k]) for k in ahead], stage), strict=True):
             found[k] = fitted
@@ -249,25 +236,18 @@ class _Search:
         rival = rival if rival.point.cost < base.point.cost else base
         self.bench.predict([base, rival, *fits])
         gains = {s.name: self._gain(rival, f, floor, "train") for s, f in zip(tried, fits, strict=True)}
-        order = sorted(range(len(fits)), key=lambda k: fits[k].point.cost)
-        best, reasons, rivals = None, {}, []
-        for k in order:
-            name, fitted = tried[k].name, fits[k]
-            if best is not None:
-                close = fitted.point.cost - best.point.cost < TIE * max(rival.point.cost - best.point.cost, 1e-9)
-                if close and fitted.point.cost < rival.point.cost:
-                    rivals.append(name)
-                reasons[name] = "as good as the best" if close else "fits worse"
-            elif not self._on_most(rival, fitted):
-                reasons[name] = "helps on too few trials"
-            elif gains[name] < PAYS:
-                reasons[name] = f"closes {max(gains[name], 0):.0%} of the gap"
-            elif self._gain(rival, fitted, floor, "test") < PAYS:
-                reasons[name] = "does not help on the test trials"
-            elif not all(self._matters(rival, fitted, floor, split) for split in ("train", "test")):
-                reasons[name] = "closes less than the floor leaves open"
-            else:
-                best, reasons[name] = fitted, "taken"
+        order = sorted(lead, key=lambda k: fits[k].point.cost)
+        refused = {k: self._refused(rival, fits[k], floor) for k in order}
+        fair = [k for k in order if refused[k] is None]
+        best, rivals = None, []
+        reasons = {s.name: refused.get(k) or "fits worse" for k, s in enumerate(tried)}
+        if fair:
+            lead = fits[fair[0]].point.cost
+            close = [k for k in order if fits[k].point.cost - lead < TIE * max(rival.point.cost - lead, 1e-9)]
+            # Of laws that fit as well, the one with the fewest numbers: others may contain it.
+            first = min((k for k in fair if k in close), key=lambda k: len(fits[k].space.names))
+            reasons |= {tried[k].name: "as good as the best" for k in close} | {tried[first].name: "taken"}
+            best, rivals = fits[first], [tried[k].name for k in close if k != first]
         held = {s.name: self._gain(rival, f, floor, "test") for s, f in zip(tried, fits, strict=True)}
         candidates = [
             Candidate(
@@ -276,6 +256,26 @@ class _Search:
             for s in scores
         ]
         return best, candidates, rivals
+
+    def _leaders(self, found: Sequence[Fitted]) -> list[int]:
+        """Return which of the fits to short trials are worth more work; the last of them is that without the effect."""
+        costs = [f.point.cost for f in found[:-1]]
+        order, lead = sorted(range(len(costs)), key=costs.__getitem__), min(costs)
+        near = 2 * TIE * max(found[-1].point.cost - lead, 0.0)
+        return [k for n, k in enumerate(order) if n < LEADERS or costs[k] - lead < near]
+
+    def _refused(self, rival: Fitted, fitted: Fitted, floor: Floor) -> str | None:
+        """Return why a fit is no better than its rival, None if it is."""
+        gain = self._gain(rival, fitted, floor, "train")
+        if not self._on_most(rival, fitted):
+            return "helps on too few trials"
+        if gain < PAYS:
+            return f"closes {max(gain, 0):.0%} of the gap"
+        if self._gain(rival, fitted, floor, "test") < PAYS:
+            return "does not help on the test trials"
+        if not all(self._matters(rival, fitted, floor, split) for split in ("train", "test")):
+            return "closes less than the floor leaves open"
+        return None
 
     def _gain(self, base: Fitted, fitted: Fitted, floor: Floor, split: str) -> float:
         """Return the share of the excess gap (squared, above noise) that a fit closes."""
@@ -295,23 +295,30 @@ class _Search:
         effects = (*base.effects, score.name)
         model = self.pool.local.model(effects)
         space, columns = base.space, [model.parameters.index(n) for n in base.space.names]
-        values = np.repeat(model.guess()[None], len(score.starts), 0)
+        values = np.repeat(model.guess()[None], 2 * len(score.starts), 0)
         values[:, : len(base.values)] = base.values
-        for row, (dose, raw) in zip(values, score.starts, strict=True):
-            row[columns] = space.to_values(space.clip(raw))
+        for k, (dose, raw) in enumerate(score.starts):
+            values[k, columns] = space.to_values(space.clip(raw))
+            # What fitted the beginning alone had less to make up for.
+            values[len(score.starts) + k, : len(self.bench.early)] = self.bench.early
             for name, value in dose.items():
-                row[model.parameters.index(name)] = value
+                values[k :: len(score.starts), model.parameters.index(name)] = value
         # Numbers that no dose uses stay off: a slope where a spot fits better.
         used = [n.name for n in library.numbers(score.name, self.recording) if n.name in score.dose]
         units = (*space.units, *(score.sizes[n] for n in used))
         most, start = self.budget.iterations, self.bench.starts["train"]
-        return Fit(effects, values, (*space.names, *used), tuple(units), most, start, keep=1)
+        free = (*space.names, *used)
+        return Fit(effects, values, free, tuple(units), most, start, self._short(), keep=1)
+
+    def _short(self) -> int:
+        """Return how many frames the first fits see: late ones mislead as long as early ones do not fit."""
+        return max(10, int(SHORT * self.bench.trials["train"][0].markers.shape[0]))
 
     def _further(self, base: Fitted, fitted: Fitted) -> Fit:
         """Return the job of fitting on."""
-        most = self.budget.iterations if fitted is base else self.budget.more
+        most, frames = (self.budget.iterations, self._short()) if fitted is base else (self.budget.more, None)
         space, start = fitted.space, self.bench.starts["train"]
-        return Fit(fitted.effects, fitted.values[None], space.names, tuple(space.units), most, start)
+        return Fit(fitted.effects, fitted.values[None], space.names, tuple(space.units), most, start, frames)
 
     def _fitted(self, jobs: Sequence[Fit], stage: str) -> list[Fitted]:
         """Return the results of fits in their order, and say how they go."""
