@@ -1,0 +1,45 @@
+"""The benchmark runs, reads what is finished, and puts published returns beside its own."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("pytorch_kinematics", reason="arms need the extra robots")
+
+REPOSITORY = Path(__file__).resolve().parents[2]
+SCRIPT = REPOSITORY / "experiments" / "benchmark_trajopt.py"
+
+
+def call(*words: object) -> subprocess.CompletedProcess[str]:
+    kept = {k: v for k, v in os.environ.items() if not k.startswith("TORCHDLO_BENCHMARK_TRAJOPT_")}
+    environment = kept | {"OMP_NUM_THREADS": "1", "PYTHONPATH": str(REPOSITORY)}
+    command = [sys.executable, str(SCRIPT), *map(str, words)]
+    return subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
+
+
+@pytest.mark.slow
+def test_the_benchmark_writes_its_table_and_reads_finished_runs(tmp_path: Path) -> None:
+    words = ("--smoke", "--tasks", "wiring_post", "--methods", "cmaes", "--out", tmp_path)
+    done = call(*words)
+    assert done.returncode == 0, done.stderr
+    (row,) = json.loads((tmp_path / "benchmark.json").read_text())["rows"]
+    assert (row["task"], row["method"], row["seeds"], row["episodes"]) == ("wiring_post", "cmaes", 1, 4)
+    assert row["published"] == 64.31 and 0 <= row["return"] <= 1
+    assert "| wiring_post | cmaes | 1 |" in done.stdout == (tmp_path / "benchmark.md").read_text()
+    assert (tmp_path / "curves.png").read_bytes().startswith(b"\x89PNG")
+    result = tmp_path / "wiring_post-cmaes-0" / "result.json"
+    # What a finished run has written is taken as it is.
+    content = json.loads(result.read_text())
+    result.write_text(json.dumps(content | {"return": 0.25}))
+    assert "| 0.25 |" in call(*words).stdout
+
+
+def test_unknown_names_are_refused() -> None:
+    done = call("--methods", "luck")
+    assert done.returncode == 2 and "--methods is 'luck'; expected some of cmaes, gd, hybrid" in done.stderr

@@ -1,0 +1,187 @@
+"""A search that was stopped or killed ends as if it had never stopped, and only the same search goes on."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from torch import Tensor
+
+from tests.agents.problems import Push, signature
+from torchdlo.agents.problem import Outcome
+from torchdlo.agents.result import result_json, trajectory_json
+from torchdlo.agents.search import METHODS, Found, Robust, Settings, optimize
+from torchdlo.errors import InputError
+
+SETTINGS = Settings(episodes=96, population=8, hold=5, chunk=5)
+REPOSITORY = Path(__file__).resolve().parents[2]
+
+
+def files(found: Found, settings: Settings) -> tuple[str, dict]:
+    """What is written about a search, without the time it took."""
+    result = json.loads(result_json(found, Push(), settings))
+    del result["seconds"]
+    return trajectory_json(found, Push()), result
+
+
+class Stopping(Push):
+    """A problem that breaks after a number of batches, as a process that is killed."""
+
+    def __init__(self, after: int) -> None:
+        super().__init__()
+        object.__setattr__(self, "left", [after])
+
+    def evaluate(self, actions: Tensor) -> Outcome:
+        self.left[0] -= 1
+        if self.left[0] < 0:
+            raise MemoryError
+        return super().evaluate(actions)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_killed_search_ends_as_one_that_was_not(method: str, tmp_path: Path) -> None:
+    settings = replace(SETTINGS, method=method)
+    whole = optimize(Push(), settings)
+    for after in (3, 4, 9):
+        with pytest.raises(MemoryError):
+            optimize(Stopping(after), settings, journal=tmp_path / "j", resume=after > 3)
+    found = optimize(Push(), settings, journal=tmp_path / "j", resume=True)
+    assert files(found, settings) == files(whole, settings)
+    assert not (tmp_path / "j").exists()
+
+
+def test_what_is_written_is_not_played_again(tmp_path: Path) -> None:
+    played = []
+
+    class Counting(Push):
+        def evaluate(self, actions: Tensor) -> Outcome:
+            played.append(len(actions))
+            return super().evaluate(actions)
+
+    with pytest.raises(MemoryError):
+        optimize(Stopping(7), SETTINGS, journal=tmp_path / "j")
+    optimize(Counting(), SETTINGS, journal=tmp_path / "j", resume=True)
+    # 12 iterations of 5 and 3 trajectories, less seven batches; then the best alone.
+    assert played == [3, *[5, 3] * 8, 1]
+
+
+def test_ctrl_c_keeps_the_best_and_resume_goes_on(tmp_path: Path) -> None:
+    whole = optimize(Push(), SETTINGS)
+
+    def stop(stage: str, done: int, total: int, message: str) -> None:
+        assert stage == "optimize" and total == 96 and message.startswith("best ")
+        if done >= 37:
+            raise KeyboardInterrupt
+
+    found = optimize(Push(), SETTINGS, journal=tmp_path / "j", callback=stop)
+    assert found.interrupted and found.searched == whole.curve[3]["best"]
+    assert found.curve == whole.curve[:4]
+    assert files(optimize(Push(), SETTINGS, journal=tmp_path / "j", resume=True), SETTINGS) == files(whole, SETTINGS)
+
+
+def test_ctrl_c_before_the_first_iteration_is_passed_on(tmp_path: Path) -> None:
+    def stop(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        optimize(Push(), SETTINGS, journal=tmp_path / "j", callback=stop)
+    assert (tmp_path / "j" / "000000.pt").is_file(), "the batch that was played is kept"
+
+
+def test_a_robust_search_goes_on_as_well(tmp_path: Path) -> None:
+    settings = replace(SETTINGS, method="hybrid", robust=Robust(copies=2, finalists=2, trials=4))
+    whole = optimize(Push(), settings)
+
+    def stop(stage: str, done: int, total: int, message: str) -> None:
+        if done > 50:
+            raise KeyboardInterrupt
+
+    optimize(Push(), settings, journal=tmp_path / "j", callback=stop)
+    found = optimize(Push(), settings, journal=tmp_path / "j", resume=True)
+    assert files(found, settings) == files(whole, settings)
+
+
+PROGRAM = """
+import sys, time
+from pathlib import Path
+from tests.agents.problems import Push
+from tests.agents.test_resume import SETTINGS
+from torchdlo.agents.search import optimize
+
+class Slow(Push):
+    def evaluate(self, actions):
+        time.sleep(0.05)
+        return super().evaluate(actions)
+
+optimize(Slow(), SETTINGS, journal=Path(sys.argv[1]))
+"""
+
+
+def test_a_process_that_is_killed_leaves_what_can_be_resumed(tmp_path: Path) -> None:
+    journal = tmp_path / "j"
+    environment = os.environ | {"PYTHONPATH": str(REPOSITORY), "OMP_NUM_THREADS": "1"}
+    process = subprocess.Popen([sys.executable, "-c", PROGRAM, str(journal)], env=environment)
+    until = time.monotonic() + 60
+    while not (journal / "000004.pt").exists():
+        assert process.poll() is None and time.monotonic() < until
+        time.sleep(0.01)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    found = optimize(Push(), SETTINGS, journal=journal, resume=True)
+    assert signature(found.actions) == signature(optimize(Push(), SETTINGS).actions)
+
+
+def stopped(journal: Path) -> None:
+    with pytest.raises(MemoryError):
+        optimize(Stopping(3), SETTINGS, journal=journal)
+
+
+def refused(journal: Path, settings: Settings = SETTINGS) -> str:
+    with pytest.raises(InputError) as error:
+        optimize(Push(), settings, journal=journal, resume=True)
+    return str(error.value)
+
+
+def test_only_the_same_search_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    journal = tmp_path / "j"
+    assert "found none; leave out --resume" in refused(journal)
+    stopped(journal)
+    assert "a search with seed 0 (now 1)" in refused(journal, replace(SETTINGS, seed=1))
+    assert "method cmaes (now gd), population 8 (now 4)" in refused(
+        journal, replace(SETTINGS, method="gd", population=4)
+    )
+    with monkeypatch.context() as patch:
+        patch.setattr("torchdlo.agents.journal.program", lambda: "another")
+        assert "another version of torchdlo" in refused(journal)
+
+
+def test_results_of_another_search_are_noticed(tmp_path: Path) -> None:
+    journal = tmp_path / "j"
+    stopped(journal)
+    (journal / "000001.pt").write_bytes((journal / "000000.pt").read_bytes())
+    assert "expected the results of batch 1 of this search" in refused(journal)
+    (journal / "000001.pt").write_bytes(b"half a file")
+    assert "000001.pt: expected the results of a batch, found something else" in refused(journal)
+
+
+def test_folders_of_others_are_left_alone(tmp_path: Path) -> None:
+    (tmp_path / "j").mkdir()
+    (tmp_path / "j" / "thesis.txt").write_text("years of work")
+    for resume in (True, False):
+        with pytest.raises(InputError, match="choose another --out"):
+            optimize(Push(), SETTINGS, journal=tmp_path / "j", resume=resume)
+    assert (tmp_path / "j" / "thesis.txt").read_text() == "years of work"
+
+
+def test_a_new_search_empties_the_journal_of_an_old_one(tmp_path: Path) -> None:
+    stopped(tmp_path / "j")
+    other = replace(SETTINGS, seed=5)
+    found = optimize(Push(), other, journal=tmp_path / "j")
+    assert signature(found.actions) == signature(optimize(Push(), other).actions)

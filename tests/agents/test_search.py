@@ -1,0 +1,195 @@
+"""Optimisers find known optima, depend on nothing but their seed, and the hybrid finds more than its parts."""
+
+from __future__ import annotations
+
+import random
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from tests.agents.problems import Drag, Peaks, Plain, Push, Reach, signature
+from torchdlo.agents.problem import Outcome
+from torchdlo.agents.search import METHODS, Found, Robust, Settings, optimize
+from torchdlo.errors import InputError
+
+SMALL = Settings(episodes=64, population=8, hold=5)
+
+
+def returned(found: Found) -> float:
+    return float(found.outcome.returns[0])
+
+
+@pytest.mark.parametrize(("method", "episodes"), [("cmaes", 2400), ("gd", 800), ("hybrid", 400)])
+def test_the_known_optimum_is_found(method: str, episodes: int) -> None:
+    problem = Reach()
+    found = optimize(problem, Settings(method, episodes=episodes, population=16, hold=5))
+    # 0 is the best there is. Success asks that the tip ends within one action's way, 1 cm, of the goal; a path that is
+    # nowhere further off than that loses at most 100 * 20 * 0.01^2.
+    assert bool(found.outcome.success[0])
+    assert -100 * 20 * 0.01**2 <= returned(found) <= 0
+
+
+def test_descent_in_the_hybrid_converges_on_a_quadratic() -> None:
+    # The residual of L-BFGS on a convex quadratic falls at least linearly; Adam's last steps leave an error of about a
+    # thousandth of its first ones, 1e-3 m * 1e-3, per number: 100 * 60 * (1e-6)^2 * 20 / 2 of the return.
+    found = optimize(Reach(), Settings("hybrid", episodes=1600, population=16, hold=5))
+    assert returned(found) > -100 * 60 * 1e-12 * 10
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_the_seed_decides_everything(method: str) -> None:
+    same, again, other = (optimize(Reach(), replace(SMALL, method=method, seed=seed)) for seed in (3, 3, 4))
+    assert signature(same.actions) == signature(again.actions) and same.curve == again.curve
+    assert same.curve != other.curve
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_generators_of_others_are_left_alone(method: str) -> None:
+    def states() -> tuple:
+        # The package cma would use the generator of numpy's old interface, which all of a process share.
+        return random.getstate(), np.random.get_state()[1].tolist(), torch.get_rng_state().tolist()  # noqa: NPY002
+
+    before = states()
+    optimize(Push(), replace(SMALL, method=method))
+    assert states() == before
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_the_budget_is_kept_and_the_best_is_the_best(method: str) -> None:
+    seen: list[Tensor] = []
+
+    class Watched(Push):
+        def evaluate(self, actions: Tensor) -> Outcome:
+            outcome = super().evaluate(actions)
+            seen.append(outcome.returns.detach())
+            return outcome
+
+    found = optimize(Watched(), replace(SMALL, method=method, episodes=70, chunk=3))
+    played = torch.cat(seen)
+    assert found.episodes == 64 == len(played) - 1, "the best is played once more, alone"
+    assert found.searched == float(played[:-1].max()) == found.curve[-1]["best"]
+    assert all(len(batch) <= 3 for batch in seen)
+    best = [point["best"] for point in found.curve]
+    assert best == sorted(best)
+
+
+def test_chunks_change_nothing_but_the_size_of_batches() -> None:
+    # Sums over 30 steps in an order that does not depend on the batch: the results are equal to rounding, and nothing
+    # is chosen by a comparison so close.
+    one, many = (optimize(Reach(), replace(SMALL, method="cmaes", chunk=chunk)) for chunk in (8, 3))
+    torch.testing.assert_close(one.actions, many.actions)
+
+
+def test_slopes_are_zero_before_contact() -> None:
+    actions = torch.zeros(1, 30, 3, dtype=torch.float64, requires_grad=True)
+    outcome = Push().evaluate(actions)
+    assert (torch.autograd.grad(outcome.loss.sum(), actions)[0] == 0).all()
+
+
+def test_the_hybrid_beats_both_where_slopes_begin_at_contact() -> None:
+    results = {
+        method: [returned(optimize(Push(), Settings(method, 320, 16, seed, hold=5))) for seed in range(3)]
+        for method in METHODS
+    }
+    mean = {method: sum(values) / 3 for method, values in results.items()}
+    assert mean["hybrid"] >= max(mean["cmaes"], mean["gd"]), results
+    assert min(results["hybrid"]) >= max(min(results["cmaes"]), min(results["gd"])), results
+
+
+@pytest.mark.slow
+def test_the_hybrid_beats_both_on_a_rope_dragged_over_a_table() -> None:
+    results = {m: returned(optimize(Drag(), Settings(m, 48, 8, 1, hold=2))) for m in METHODS}
+    assert results["hybrid"] >= max(results["cmaes"], results["gd"]), results
+
+
+@dataclass(frozen=True)
+class Broken(Reach):
+    """Breaks down where the first action goes up, and has no slope where it goes left."""
+
+    always: bool = False
+
+    def evaluate(self, actions: Tensor) -> Outcome:
+        outcome = super().evaluate(actions)
+        up = (actions[:, 0, 2] > 0) | self.always
+        left = torch.where(actions[:, 0, 0] < 0, torch.nan, 1.0)
+        nan = torch.where(up, torch.nan, outcome.returns)
+        return Outcome(
+            nan,
+            outcome.loss * torch.where(left.isnan(), (actions.sum((1, 2)) * 0).sqrt() + 1, 1.0),
+            outcome.success & ~up,
+            up,
+        )
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_what_has_no_number_is_never_chosen_and_hides_nothing(method: str) -> None:
+    found = optimize(Broken(), replace(SMALL, method=method, episodes=160))
+    assert not bool(found.outcome.failed[0]) and np.isfinite(returned(found))
+    assert sum(point["failed"] for point in found.curve) > 0
+    if method != "cmaes":
+        assert sum(point["without_slope"] for point in found.curve) > 0
+    with pytest.raises(InputError, match=r"reach: none of 160 episodes had a finite return"):
+        optimize(Broken(always=True), replace(SMALL, method=method, episodes=160))
+
+
+def test_robust_trajectories_hold_in_worlds_that_no_search_has_seen() -> None:
+    best = torch.tensor(Peaks().narrow, dtype=torch.float64).expand(4, 3) / 4
+    assert float(Peaks().evaluate(best[None]).returns) == pytest.approx(1)
+    robust = optimize(Peaks(), Settings("cmaes", 400 * 8 + 64, 20, hold=4, robust=Robust()))
+    worlds = Peaks().varied(64, 1.0, 10**9)
+    # Starts are even in a cube of 2 cm each way, so that the mean of d^2 is 0.02^2 and that of exp(-d^2 / 0.06^2) at
+    # least exp(-1/9), by convexity: 0.72 at the broad peak. Of the narrow one's 8 mm ball at half its height, volume
+    # 2.6e-3 of the cube's, little is left; half of the starts at the foot of the broad one would earn 0.3.
+    held = [float(worlds.evaluate(actions[None]).returns[0]) for actions in (best, robust.actions)]
+    assert held[1] > 0.5 > held[0], held
+
+
+def test_a_robust_search_counts_every_copy_and_grows_its_worlds() -> None:
+    how = Robust(copies=2, warm=0.5, finalists=2, trials=4)
+    found = optimize(Push(), replace(SMALL, method="cmaes", episodes=200, robust=how))
+    assert found.episodes == 12 * 8 * 2 + 8
+    scales = [point["scale"] for point in found.curve]
+    assert scales == sorted(scales) and scales[0] == pytest.approx(1 / 6) and scales[-1] == 1
+    with pytest.raises(InputError, match="expected at least 24: 16 for an iteration and 8 for the last judgement"):
+        optimize(Push(), replace(SMALL, method="cmaes", episodes=23, robust=how))
+
+
+@pytest.mark.parametrize(
+    ("wrong", "sentence"),
+    [
+        ({"method": "luck"}, "method is 'luck'; expected one of cmaes, gd, hybrid."),
+        ({"episodes": 7}, "episodes is 7; expected at least 8: 8 for an iteration."),
+        ({"population": 3}, "population is 3; expected at least 4 for cmaes."),
+        ({"population": 0, "method": "gd"}, "population is 0; expected at least 1 for gd."),
+        ({"hold": 31}, "hold is 31; expected 1 to 30 actions."),
+        ({"sigma": float("nan")}, "sigma is nan; expected a positive number."),
+        ({"rate": 0.0}, "rate is 0.0; expected a positive number."),
+        ({"chunk": 0}, "chunk is 0; expected at least 1."),
+        ({"seed": -1}, "seed is -1; expected a whole number from 0 up."),
+    ],
+)
+def test_settings_that_make_no_search_are_refused(wrong: dict, sentence: str) -> None:
+    with pytest.raises(InputError) as error:
+        optimize(Push(), replace(SMALL, **wrong))
+    assert str(error.value) == sentence
+
+
+def test_problems_of_any_width_are_searched() -> None:
+    @dataclass(frozen=True)
+    class Line(Plain):
+        name: str = "line"
+        horizon: int = 1
+        width: int = 1
+        group: int = 1
+        limit: float = 1.0
+
+        def evaluate(self, actions: Tensor) -> Outcome:
+            returns = -(actions[:, 0, 0] - 0.3).square()
+            return Outcome(returns, -returns, returns > -1e-6, returns.isnan())
+
+    for method in METHODS:
+        found = optimize(Line(), Settings(method, episodes=400, population=4))
+        assert float(found.actions) == pytest.approx(0.3, abs=1e-3), method

@@ -1,0 +1,63 @@
+"""Covariance matrix adaptation evolution strategy (Hansen 2016, arXiv:1604.00772) over way-points, by package `cma`."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchdlo.agents.plan import Ask, Plan, Search, costs
+from torchdlo.agents.problem import Encoding
+from torchdlo.errors import InputError
+
+__all__ = ["cmaes", "drawn", "strategy"]
+
+
+def strategy(start: Tensor, sigma: float, population: int, rng: torch.Generator) -> Any:
+    """Return a `cma.CMAEvolutionStrategy` that draws from `rng` and writes nothing."""
+    try:
+        import cma
+    except ModuleNotFoundError:
+        raise InputError("cmaes and hybrid need the package cma; pip install 'torchdlo[cmaes]', or use gd.") from None
+
+    def randn(*shape: int) -> Any:
+        return torch.randn(*shape, generator=rng, dtype=torch.float64).numpy()
+
+    options = {
+        "popsize": population,
+        "randn": randn,
+        "seed": math.nan,
+        "verbose": -9,
+        "verb_log": 0,
+        # Returns may stay flat until something is touched; that is no reason to give up.
+        "tolflatfitness": math.inf,
+        "tolstagnation": math.inf,
+        "maxiter": math.inf,
+    }
+    return cma.CMAEvolutionStrategy(start.numpy(), sigma, options)
+
+
+def drawn(found: Any, encoding: Encoding, given: Tensor | None = None) -> Tensor:
+    """Return the next population within the limits, shape (P, size); points that are given come first.
+
+    The strategy is told of what was played, not of what it drew: it would else go on where limits make all alike.
+    """
+    count = 0 if given is None else len(given)
+    if count:
+        found.inject(list(given.numpy()), force=True)
+    x = torch.stack([torch.as_tensor(x) for x in found.ask()])
+    # Points that were given are known to the strategy by their last bit.
+    return torch.cat([x[:count], encoding.project(x[count:])])
+
+
+def cmaes(plan: Plan, rng: torch.Generator) -> Search:
+    """Search way-points without gradients; starts again when the spread has shrunk to nothing."""
+    encoding = plan.encoding(plan.hold)
+    while True:
+        found = strategy(torch.zeros(encoding.size, dtype=torch.float64), plan.sigma, plan.population, rng)
+        while not found.stop():
+            x = drawn(found, encoding)
+            told = yield Ask(encoding, x)
+            found.tell(list(x.numpy()), costs(told).tolist())

@@ -1,0 +1,116 @@
+"""What the optimisers agree on: what they ask for, what they are told, and how much of it there is."""
+
+from __future__ import annotations
+
+from collections.abc import Generator
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchdlo.agents.problem import Encoding, Problem
+
+__all__ = ["Ask", "Plan", "Search", "Told", "costs", "sweeps", "walks"]
+
+
+@dataclass(frozen=True, eq=False)
+class Ask:
+    """Trajectories to play."""
+
+    encoding: Encoding
+    points: Tensor
+    """Displacements of the way-points [m], shape (P, size)."""
+    graded: bool = False
+    """Whether the slope of the loss is wanted."""
+
+
+@dataclass(frozen=True, eq=False)
+class Told:
+    """How they went."""
+
+    returns: Tensor
+    """Returns; -inf where there is no number [-], shape (P,)."""
+    loss: Tensor
+    """Losses; inf where there is no number [-], shape (P,)."""
+    success: Tensor
+    """Whether the task was done, bool [-], shape (P,)."""
+    failed: Tensor
+    """Whether the episode broke down, bool [-], shape (P,)."""
+    slope: Tensor
+    """Slope of the loss [1/m], zero where there is no number, shape (P, size), or (P, 0) if not asked for."""
+
+
+Search = Generator[Ask, Told, None]
+"""An optimiser: yields what it wants played, and is sent how that went. It never runs anything itself."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Size of a problem and of the search; lengths in metres."""
+
+    horizon: int
+    width: int
+    group: int
+    limit: float
+    population: int
+    """Trajectories per iteration."""
+    iterations: int
+    """Iterations that the budget allows."""
+    hold: int = 10
+    """Actions per way-point of CMA-ES."""
+    sigma: float = 0.05
+    """First standard deviation of a way-point's displacement [m]."""
+    rate: float = 1e-3
+    """First step of Adam [m]."""
+    last: float = 1e-6
+    """Its last step [m]."""
+    steps: int = 100
+    """Steps of Adam from one start at most."""
+    patience: int = 10
+    """Steps without gain after which a start is given up."""
+    drifts: bool = False
+    """Whether worlds get harder from one iteration to the next, so that results of different ones do not compare."""
+
+    @classmethod
+    def of(cls, problem: Problem, population: int, iterations: int, **choices: Any) -> Plan:
+        """Return the plan for a problem; lengths that are not given follow from its limit."""
+        hold = choices.setdefault("hold", min(10, problem.horizon))
+        # 0.05 m, 1 mm and 1 um where tools go 1 cm per action and way-points have ten.
+        lengths = {"sigma": 0.5 * hold * problem.limit, "rate": 0.1 * problem.limit, "last": 1e-4 * problem.limit}
+        sizes = (problem.horizon, problem.width, problem.group, problem.limit)
+        return cls(*sizes, population, iterations, **(lengths | choices))
+
+    def encoding(self, hold: int) -> Encoding:
+        """Return the encoding with `hold` actions per way-point."""
+        return Encoding(self.horizon, self.width, self.group, self.limit, hold)
+
+
+def walks(plan: Plan, rng: torch.Generator) -> Tensor:
+    """Return random way-points [m], shape (population, size), as CMA-ES would draw them at first."""
+    size = plan.encoding(plan.hold).size
+    return plan.sigma * torch.randn(plan.population, size, generator=rng, dtype=torch.float64)
+
+
+def sweeps(plan: Plan, rng: torch.Generator) -> Tensor:
+    """Return way-points of straight sweeps in one to three legs [m], shape (population, size).
+
+    Independent displacements walk as far as the root of their number; sweeps go as far as possible, and so meet things
+    that lie away from the start. The first is the trajectory that does nothing.
+    """
+    encoding = plan.encoding(plan.hold)
+    knots, groups, count = encoding.knots, plan.width // plan.group, plan.population
+    draw = torch.randn(count, 3, groups, plan.group, generator=rng, dtype=torch.float64)
+    heading = draw / torch.linalg.vector_norm(draw, dim=-1, keepdim=True)
+    length = encoding.reach * torch.rand(count, 3, groups, 1, generator=rng, dtype=torch.float64)
+    legs = 1 + torch.arange(count) % 3
+    leg = torch.arange(knots)[None] * legs[:, None] // knots
+    moves = (heading * length)[torch.arange(count)[:, None], leg].flatten(1)
+    return torch.cat([torch.zeros_like(moves[:1]), moves[1:]])
+
+
+def costs(told: Told) -> Tensor:
+    """Return costs to be minimised, shape (P,): what has no number is worse than everything that has one."""
+    good = torch.isfinite(told.returns)
+    worst = (-told.returns[good]).max() if bool(good.any()) else told.returns.new_zeros(())
+    return torch.where(good, -told.returns, worst + 1)

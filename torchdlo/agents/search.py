@@ -1,0 +1,262 @@
+"""Trajectory optimisation: plays what an optimiser asks for, keeps the best, and can go on where it was stopped."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchdlo.agents.cmaes import cmaes
+from torchdlo.agents.descent import descent
+from torchdlo.agents.hybrid import hybrid
+from torchdlo.agents.journal import Journal
+from torchdlo.agents.plan import Ask, Plan, Search, Told
+from torchdlo.agents.problem import Outcome, Problem
+from torchdlo.errors import InputError
+
+__all__ = ["METHODS", "Found", "Robust", "Settings", "optimize"]
+
+METHODS: dict[str, Callable[[Plan, torch.Generator], Search]] = {"cmaes": cmaes, "gd": descent, "hybrid": hybrid}
+"""Optimisers by name."""
+
+Callback = Callable[[str, int, int, str], None]
+
+
+@dataclass(frozen=True)
+class Robust:
+    """Trajectories that are to work in perturbed worlds, too; every copy counts as an episode."""
+
+    copies: int = 8
+    """Perturbed worlds in which each trajectory is played."""
+    warm: float = 0.5
+    """Share of the iterations over which the perturbations grow to their full size."""
+    finalists: int = 4
+    """Best trajectories that are judged once more in the end."""
+    trials: int = 16
+    """Perturbed worlds of that judgement, which no search has seen."""
+
+    @property
+    def final(self) -> int:
+        """Episodes of the judgement in the end."""
+        return self.finalists * self.trials
+
+    def scale(self, share: float) -> float:
+        """Return the size of the perturbations after a share of the iterations."""
+        return min(1.0, share / self.warm) if self.warm > 0 else 1.0
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How to search; what is None follows from the problem, see `Plan`."""
+
+    method: str = "cmaes"
+    episodes: int = 20_000
+    """Budget; an episode that is played with gradient counts as one."""
+    population: int = 400
+    seed: int = 0
+    hold: int | None = None
+    sigma: float | None = None
+    rate: float | None = None
+    steps: int | None = None
+    chunk: int = 100
+    """Most episodes that are played as one batch."""
+    robust: Robust | None = None
+
+    def plan(self, problem: Problem) -> Plan:
+        """Return the plan for a problem; says so if the settings make none."""
+
+        def need(ok: bool, name: str, expected: str) -> None:
+            if not ok:
+                raise InputError(f"{name} is {getattr(self, name)!r}; expected {expected}.")
+
+        need(self.method in METHODS, "method", f"one of {', '.join(METHODS)}")
+        least = 1 if self.method == "gd" else 4
+        need(self.population >= least, "population", f"at least {least} for {self.method}")
+        need(self.seed >= 0, "seed", "a whole number from 0 up")
+        need(self.chunk >= 1, "chunk", "at least 1")
+        need(self.hold is None or 1 <= self.hold <= problem.horizon, "hold", f"1 to {problem.horizon} actions")
+        for name in ("sigma", "rate", "steps"):
+            value = getattr(self, name)
+            need(value is None or (math.isfinite(value) and value > 0), name, "a positive number")
+        per, spare = (self.robust.copies, self.robust.final) if self.robust else (1, 0)
+        least = self.population * per + spare
+        judged = f" and {spare} for the last judgement" if spare else ""
+        need(self.episodes >= least, "episodes", f"at least {least}: {least - spare} for an iteration{judged}")
+        given = {k: getattr(self, k) for k in ("hold", "sigma", "rate", "steps") if getattr(self, k) is not None}
+        iterations = (self.episodes - spare) // (self.population * per)
+        return Plan.of(problem, self.population, iterations, drifts=self.robust is not None, **given)
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """What an optimisation found."""
+
+    actions: Tensor
+    """Best trajectory, shape (T, A)."""
+    outcome: Outcome
+    """How it went when it was played alone, one entry."""
+    kept: dict[str, Any]
+    """What `Problem.record` keeps of it."""
+    searched: float
+    """Its return as the search saw it, in a batch and, if robust, in perturbed worlds."""
+    episodes: int
+    """Episodes played, without the one that plays the best alone."""
+    seconds: float
+    """Time spent on playing them [s]."""
+    curve: list[dict[str, Any]]
+    """One entry per iteration, see `_point`."""
+    interrupted: bool = False
+
+
+def optimize(
+    problem: Problem,
+    settings: Settings,
+    *,
+    journal: Path | None = None,
+    resume: bool = False,
+    callback: Callback | None = None,
+) -> Found:
+    """Search the trajectory with the largest return.
+
+    A `KeyboardInterrupt` that `callback` raises ends the search; the best so far is returned.
+
+    Args:
+        problem: what to solve.
+        settings: how, and with which budget.
+        journal: folder that keeps the results of all batches; it is deleted when the search is over.
+        resume: go on from what is in the journal.
+        callback: told (stage, episodes done, all episodes, message) after every batch.
+    """
+    plan, robust = settings.plan(problem), settings.robust
+    player = _Player(problem, settings, Journal(journal, _options(problem, settings), resume=resume), callback)
+    search = METHODS[settings.method](plan, torch.Generator().manual_seed(settings.seed))
+    told, curve, interrupted = None, [], False
+    best = _Best(robust.finalists if robust else 1)
+    try:
+        for k in range(plan.iterations):
+            ask = search.send(told)
+            scale = robust.scale((k + 1) / plan.iterations) if robust else 0.0
+            told = player.batch(ask, scale)
+            if robust and scale == 1 and curve and curve[-1]["scale"] < 1:
+                best.kept = []  # what did well in milder worlds has to do so in these
+            best.offer(ask, told)
+            curve.append(_point(player, told, best.kept[0][0], scale))
+        searched, actions = player.judge(best.kept)
+    except KeyboardInterrupt:
+        if not best.kept:
+            raise
+        interrupted = True
+        searched, actions = best.kept[0]
+    if not math.isfinite(searched):
+        raise InputError(f"{problem.name}: none of {player.done} episodes had a finite return; nothing was found.")
+    with torch.no_grad():
+        outcome, kept = problem.record(actions)
+    if not interrupted:
+        player.journal.remove()
+    return Found(actions, outcome, kept, searched, player.done, player.seconds, curve, interrupted)
+
+
+def _options(problem: Problem, settings: Settings) -> dict[str, Any]:
+    sizes = {k: getattr(problem, k) for k in ("name", "horizon", "width", "group", "limit")}
+    return sizes | problem.choices | asdict(settings)
+
+
+def _point(player: _Player, told: Told, best: float, scale: float) -> dict[str, Any]:
+    """Return what a learning curve has about an iteration."""
+    good = told.returns[torch.isfinite(told.returns)]
+    return {
+        "episodes": player.done,
+        "best": best,
+        "median": float(good.median()) if len(good) else None,
+        "success": float(told.success.double().mean()),
+        "failed": float(told.failed.double().mean()),
+        "without_slope": player.blind,
+        "scale": scale,
+    }
+
+
+class _Best:
+    """The best trajectories so far."""
+
+    def __init__(self, room: int) -> None:
+        self.room = room
+        self.kept: list[tuple[float, Tensor]] = []
+
+    def offer(self, ask: Ask, told: Told) -> None:
+        """Keep what is better than what there is; the earlier of equals stays."""
+        for k in told.returns.argsort(descending=True, stable=True)[: self.room].tolist():
+            value = float(told.returns[k])
+            if len(self.kept) < self.room or value > self.kept[-1][0]:
+                actions = ask.encoding.decode(ask.points[k : k + 1])[0]
+                self.kept = sorted([*self.kept, (value, actions)], key=lambda pair: -pair[0])[: self.room]
+
+
+class _Player:
+    """Plays batches, or reads how they went."""
+
+    def __init__(self, problem: Problem, settings: Settings, journal: Journal, callback: Callback | None) -> None:
+        self.problem, self.settings, self.journal = problem, settings, journal
+        self.callback = callback or (lambda *_: None)
+        self.done, self.seconds, self.blind, self.highest = 0, 0.0, 0, -math.inf
+
+    def _worlds(self, copies: int, scale: float, number: int) -> Problem:
+        return self.problem.varied(copies, scale, self.settings.seed * 1_000_003 + number)
+
+    def batch(self, ask: Ask, scale: float) -> Told:
+        """Play what is asked for, in chunks."""
+        robust, problem, copies = self.settings.robust, self.problem, 1
+        if robust:
+            copies = robust.copies
+            problem = self._worlds(copies, scale, 1)
+        parts = [self._chunk(problem, ask, x, copies) for x in ask.points.split(max(1, self.settings.chunk // copies))]
+        returns, loss, success, failed, slope = (torch.cat(column) for column in zip(*parts, strict=True))
+        good = torch.isfinite(slope).all(-1)
+        self.blind = int((~good).sum())
+        returns = torch.where(torch.isfinite(returns), returns, -math.inf)
+        loss = torch.where(torch.isfinite(loss), loss, math.inf)
+        return Told(returns, loss, success, failed, torch.where(good[:, None], slope, 0.0))
+
+    def _chunk(self, problem: Problem, ask: Ask, points: Tensor, copies: int) -> tuple[Tensor, ...]:
+        names = ("returns", "loss", "success", "failed", "slope")
+        kept = self.journal.recall(points)
+        if kept is None:
+            began = time.perf_counter()
+            kept = dict(zip(names, _play(problem, ask, points), strict=True))
+            kept["seconds"] = time.perf_counter() - began
+            self.journal.keep(points, kept)
+        self.done += len(points) * copies
+        self.seconds += kept["seconds"]
+        self.highest = max([self.highest, *kept["returns"][torch.isfinite(kept["returns"])].tolist()])
+        self.callback("optimize", self.done, self.settings.episodes, f"best {self.highest:.4g}")
+        return tuple(kept[name] for name in names)
+
+    def judge(self, kept: list[tuple[float, Tensor]]) -> tuple[float, Tensor]:
+        """Return the best; of a robust search the best in worlds that it has not seen, with the mean return there."""
+        robust = self.settings.robust
+        if robust is None:
+            return kept[0]
+        with torch.no_grad():
+            worlds = self._worlds(robust.trials, 1.0, 0)
+            returns = [float(worlds.evaluate(actions[None]).returns[0]) for _, actions in kept]
+        self.done += robust.trials * len(kept)
+        k = max(range(len(kept)), key=lambda k: returns[k] if math.isfinite(returns[k]) else -math.inf)
+        return returns[k], kept[k][1]
+
+
+def _play(problem: Problem, ask: Ask, points: Tensor) -> tuple[Tensor, ...]:
+    """Return returns, losses, successes, failures and slopes, on the CPU."""
+    x = points.detach().clone().requires_grad_(ask.graded)
+    with torch.set_grad_enabled(ask.graded):
+        outcome = problem.evaluate(ask.encoding.decode(x))
+        slope = x.new_zeros(len(x), 0)
+        if ask.graded:
+            # Trajectories do not touch each other, so that the slope of the sum is that of each.
+            (slope,) = torch.autograd.grad(outcome.loss.sum(), x, allow_unused=True, materialize_grads=True)
+    parts = (outcome.returns.double(), outcome.loss.double(), outcome.success, outcome.failed)
+    return *(p.detach().cpu() for p in parts), slope

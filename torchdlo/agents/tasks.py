@@ -1,0 +1,125 @@
+"""Manipulation tasks as problems of trajectory optimisation: tools move, and keep their orientation."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchdlo.agents.problem import Outcome
+from torchdlo.envs import episode, find
+from torchdlo.envs.task import Task
+from torchdlo.errors import InputError
+
+__all__ = ["TaskProblem", "problem"]
+
+
+def problem(name: str, **choices: Any) -> TaskProblem:
+    """Return the problem of a task by its name; `choices` are fields of `TaskProblem`."""
+    return TaskProblem(find(name), **choices)
+
+
+@dataclass(frozen=True, eq=False)
+class TaskProblem:
+    """A task from its one start, without variation."""
+
+    task: Task
+    double: bool = False
+    """Whether the physics runs in double precision."""
+    compiled: bool = True
+    """Whether steps are compiled."""
+    device: str = "cpu"
+    _episodes: dict[int, episode.Episode] = field(default_factory=dict)
+    """Prepared once per size of batch."""
+
+    group = 3
+
+    @property
+    def name(self) -> str:
+        """The task's name."""
+        return self.task.name
+
+    @property
+    def horizon(self) -> int:
+        """Actions of an episode."""
+        return self.task.horizon
+
+    @property
+    def width(self) -> int:
+        """Ways of all tools: three numbers each."""
+        return 3 * self.task.arms.count
+
+    @property
+    def limit(self) -> float:
+        """Greatest way of a tool in an action [m]."""
+        return self.task.reach
+
+    @property
+    def choices(self) -> dict[str, Any]:
+        """What else results depend on."""
+        return {"double": self.double, "compiled": self.compiled, "device": self.device}
+
+    @property
+    def like(self) -> Tensor:
+        """A tensor of the dtype and on the device of the physics."""
+        return torch.zeros((), dtype=torch.float64 if self.double else torch.float32, device=self.device)
+
+    def prepared(self, count: int) -> episode.Episode:
+        """Return the episode for a batch; gradients run five frames again at once."""
+        if count not in self._episodes:
+            choices = {"compiled": self.compiled, "segment": 5}
+            self._episodes[count] = episode.prepare(self.task, count, like=self.like, **choices)
+        return self._episodes[count]
+
+    def full(self, actions: Tensor) -> Tensor:
+        """Return the task's actions, shape (P, T, 2 A): tools do not turn."""
+        return torch.cat([actions, torch.zeros_like(actions)], -1).to(self.like)
+
+    def evaluate(self, actions: Tensor) -> Outcome:
+        """Play actions from the one start."""
+        went = episode.play(self.task, self.full(actions), episode=self.prepared(len(actions)))
+        return Outcome(went.returns, went.loss, went.success, went.failed)
+
+    def varied(self, copies: int, scale: float, seed: int) -> Varied:
+        """Return the problem with `copies` starts that differ by `scale` times what the task calls its spread."""
+        if not any(value for pair in self.task.spread for value in pair):
+            raise InputError(f"{self.name}: its start does not vary; leave out --robust.")
+        return Varied(self, copies, scale, seed)
+
+    def record(self, actions: Tensor) -> tuple[Outcome, dict[str, Any]]:
+        """Play one trajectory alone; kept are joints and tools after every action, by arm, [rad or m] and [m]."""
+        went = episode.play(self.task, self.full(actions[None]), episode=self.prepared(1), keep_path=True)
+        kept = {name: went.path[name][:, 0].tolist() for name in ("joints", "tool")}
+        kept["rewards"] = went.rewards[:, 0].tolist()
+        finite = all(math.isfinite(value) for value in kept["rewards"])
+        return Outcome(went.returns, went.loss, went.success, went.failed), kept if finite else {}
+
+
+@dataclass(frozen=True, eq=False)
+class Varied:
+    """A task from several starts; every trajectory is played from all of them, and the means count."""
+
+    inner: TaskProblem
+    copies: int
+    scale: float
+    seed: int
+
+    def evaluate(self, actions: Tensor) -> Outcome:
+        """Return means of return and loss; success means from all starts, failure from any."""
+        task, like = self.inner.task, self.inner.like
+        count = len(actions) * self.copies
+        rng = torch.Generator().manual_seed(self.seed)
+        draw = torch.rand(self.copies, len(task.spread), 2, generator=rng, dtype=torch.float64)
+        away = self.scale * (2 * draw - 1) * torch.tensor(task.spread, dtype=torch.float64)
+        moved = torch.cat([away, torch.zeros_like(away[..., :1])], -1).to(like).repeat(len(actions), 1, 1)
+        _, params, state = task.build(moved)
+        base = self.inner.prepared(count)
+        base = replace(base, params=params, start=episode.begin(replace(base, params=params), state))
+        went = episode.play(task, self.inner.full(actions).repeat_interleave(self.copies, 0), episode=base)
+        returns, loss, success, failed = (
+            getattr(went, name).reshape(len(actions), self.copies) for name in ("returns", "loss", "success", "failed")
+        )
+        return Outcome(returns.mean(-1), loss.mean(-1), success.all(-1), failed.any(-1))

@@ -1,0 +1,57 @@
+"""The picture of a trajectory optimisation: returns over episodes."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+__all__ = ["learning_png"]
+
+_COLORS = {"cmaes": "#3d348b", "gd": "#e09f3e", "hybrid": "#00798c"}
+_OTHER = "#1f2933"
+
+
+def learning_png(panels: Mapping[str, Mapping[str, Sequence[Sequence[Mapping[str, Any]]]]]) -> bytes:
+    """The picture as PNG; drawn without a display.
+
+    Args:
+        panels: by title, by method, one learning curve per seed; a curve has entries with `episodes`, `best` and
+            `median`. The middle of the seeds is a line, their range is a band; the median of the population is dotted
+            where there is one seed.
+    """
+    columns = min(3, len(panels))
+    rows = -(-len(panels) // columns)
+    figure = Figure(figsize=(5.4 * columns, 3.8 * rows), dpi=120, facecolor="white", layout="constrained")
+    FigureCanvasAgg(figure)
+    grid = figure.subplots(rows, columns, squeeze=False).ravel()
+    for axes, (title, methods) in zip(grid, panels.items(), strict=False):
+        for method, curves in methods.items():
+            _draw(axes, method, curves)
+        axes.set(title=title, xlabel="episodes", ylabel="best return so far")
+        axes.grid(alpha=0.3)
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.legend(frameon=False, fontsize=8)
+    for axes in grid[len(panels) :]:
+        axes.set_axis_off()
+    content = io.BytesIO()
+    figure.savefig(content, format="png", metadata={"Software": "torchdlo"})
+    return content.getvalue()
+
+
+def _draw(axes: Axes, method: str, curves: Sequence[Sequence[Mapping[str, Any]]]) -> None:
+    color = _COLORS.get(method, _OTHER)
+    count = min(len(curve) for curve in curves)
+    episodes = [point["episodes"] for point in curves[0][:count]]
+    best = np.array([[np.nan if p["best"] is None else p["best"] for p in curve[:count]] for curve in curves])
+    axes.plot(episodes, np.median(best, 0), color=color, lw=2, label=method)
+    if len(curves) > 1:
+        axes.fill_between(episodes, best.min(0), best.max(0), color=color, alpha=0.15, lw=0)
+        return
+    median = np.array([np.nan if p["median"] is None else p["median"] for p in curves[0]])
+    axes.plot(episodes, median, color=color, lw=1, ls=":", label="median of the population")
