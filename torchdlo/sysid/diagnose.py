@@ -171,7 +171,7 @@ class _Search:
         rounds: list[list[Candidate]] = []
         ties: dict[str, list[str]] = {}
         shares: dict[str, float] = {}
-        whole = max(rms(self.bench.gaps(base, "test")) ** 2 - floor.noise**2, 1e-12)
+        whole = max(self._squared(base) - floor.noise**2, 1e-12)
         while len(rounds) < self.budget.rounds + (len(shares) < len(rounds)):
             if shares and rms(self.bench.gaps(base, "all")) < SILENT * floor.total:
                 break
@@ -180,13 +180,18 @@ class _Search:
             rounds.append(candidates)
             if best is None:
                 break
-            name = best.effects[-1]
-            gained = rms(self.bench.gaps(base, "test")) ** 2 - rms(self.bench.gaps(best, "test")) ** 2
-            shares[name], ties[name] = float(gained / whole), rivals
-            base = baselines.go_further(self.bench, self._pruned(best, shares, floor), self.budget.more, self.report)
-        # A wrong model's floor is wrong, too.
-        floor = self._floor(base) if shares else floor
+            name, old = best.effects[-1], self._squared(base)
+            shares[name], ties[name] = (old - self._squared(best)) / whole, rivals
+            kept = self._pruned(best, shares, floor)
+            base = baselines.go_further(self.bench, kept, self.budget.more, self.report)
+            shares[name] += (self._squared(kept) - self._squared(base)) / whole
+            # A wrong model's floor is wrong, too.
+            floor = self._floor(base)
         return self._conclude(base, list(shares), {n: ties[n] for n in shares}, shares, rounds, floor)
+
+    def _squared(self, fitted: Fitted) -> float:
+        """Return the squared gap on the test trials [m^2]."""
+        return float(rms(self.bench.gaps(fitted, "test")) ** 2)
 
     def _pruned(self, fitted: Fitted, shares: dict[str, float], floor: Floor) -> Fitted:
         """Return the model without the effects that the last one has made needless, which takes over their shares."""
