@@ -18,10 +18,11 @@ import torch
 from torch import Tensor
 
 from torchdlo.coupling import shapes
+from torchdlo.coupling.components import axes, local, world
 from torchdlo.physics import tree
 from torchdlo.physics.effect import Push
 from torchdlo.physics.numerics import safe_norm
-from torchdlo.physics.rotation import multiply, rotate
+from torchdlo.physics.rotation import multiply
 
 MOTIONS = ("free", "fixed", "kinematic")
 """How a body can move: by forces, not at all, or as `Control` says."""
@@ -113,7 +114,9 @@ class BodyMotion:
 
     def turned(self, torque: Tensor) -> Tensor:
         """Return by how much torques in the world turn the bodies [rad], shape (..., K, 3)."""
-        return rotate(self.state.quat, self.agility * rotate(conjugate(self.state.quat), torque))
+        columns = axes(self.state.quat)
+        inside = local(columns, torque.split(1, -1))
+        return torch.cat(world(columns, [a * t for a, t in zip(self.agility.split(1, -1), inside, strict=True)]), -1)
 
     def pushed(self, push: Push) -> BodyMotion:
         """Return the motion under what contact exerts as well."""
@@ -271,18 +274,21 @@ def spin(quat: Tensor, inertia: Tensor, omega: Tensor, dt: float) -> tuple[Tenso
     Dullweber et al. 1997, eq. 3.6: in the frame of the body, the angular momentum p turns about axis i by -t p_i / I_i
     while the body turns by the opposite.
     """
-    p = list((inertia * rotate(conjugate(quat), omega)).split(1, -1))
-    zero = torch.zeros_like(p[0])
+    moments = inertia.split(1, -1)
+    p = [m * o for m, o in zip(moments, local(axes(quat), omega.split(1, -1)), strict=True)]
+    q = list(quat.split(1, -1))
     for axis, share in ((0, 0.5), (1, 0.5), (2, 1.0), (1, 0.5), (0, 0.5)):
-        angle = share * dt * p[axis] / inertia[..., axis : axis + 1]
+        angle = share * dt * p[axis] / moments[axis]
         j, k = (axis + 1) % 3, (axis + 2) % 3
         c, s = torch.cos(angle), torch.sin(angle)
         p[j], p[k] = c * p[j] + s * p[k], c * p[k] - s * p[j]
-        turn = [torch.cos(0.5 * angle), zero, zero, zero]
-        turn[axis + 1] = torch.sin(0.5 * angle)
-        quat = multiply(quat, torch.cat(turn, -1))
+        # The product with the quaternion of a turn about that axis.
+        c, s = torch.cos(0.5 * angle), torch.sin(0.5 * angle)
+        w, own, one, two = q[0], q[1 + axis], q[1 + j], q[1 + k]
+        q[0], q[1 + axis], q[1 + j], q[1 + k] = w * c - own * s, own * c + w * s, one * c + two * s, two * c - one * s
+    quat = torch.cat(q, -1)
     quat = quat / quat.square().sum(-1, keepdim=True).sqrt()  # rounding only
-    return quat, rotate(quat, torch.cat(p, -1) / inertia)
+    return quat, torch.cat(world(axes(quat), [a / m for a, m in zip(p, moments, strict=True)]), -1)
 
 
 def advance(motion: BodyMotion, targets: BodyTargets, push: Push) -> BodyState:
@@ -298,7 +304,9 @@ def advance(motion: BodyMotion, targets: BodyTargets, push: Push) -> BodyState:
     free = _is(bodies, "free", state.pos)
     change = motion.change + motion.mobility * push.body_force
     omega = free * half * state.omega + motion.turned(push.body_torque) / dt
-    quat, omega = spin(state.quat, params.inertia, omega, dt)
+    quat = state.quat
+    if any(b.motion == "free" for b in bodies):
+        quat, omega = spin(quat, params.inertia, omega, dt)
     pos = _spread(bodies, targets.pos, state.pos + change)
     quat = _spread(bodies, targets.quat, torch.where(free > 0, quat, state.quat))
     shared = 1 - free + free * half

@@ -29,6 +29,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
+from torchdlo.coupling import body_sweeps
 from torchdlo.coupling.bodies import BodyMotion, conjugate
 from torchdlo.coupling.coulomb import parting, rebounding, rub
 from torchdlo.coupling.edge_points import EdgePoints, families, find
@@ -203,6 +204,10 @@ class RodBody(Effect):
     def react(self, view: View, motion: Motion, values: Values) -> Push:
         """Return the forces that keep ropes outside of bodies and rub [N]."""
         bodies = motion.bodies
+        if body_sweeps.fits(bodies.bodies, view.state.pos):
+            pieces = [families(b, self.pieces) - 2 for b in bodies.bodies]
+            law = (self.recovery, self.slowest)
+            return body_sweeps.push(view, motion, pieces, sweeps=self.sweeps, friction=self.friction, law=law)
         points = _points(view, bodies, self.pieces)
         answer = motion.answer.amax(-1, keepdim=True)
         along, slip = points.seen(motion.change, bodies)

@@ -163,7 +163,8 @@ def _mesh(size: Tensor, p: Tensor, grid: Tensor, cells: tuple[int, int, int]) ->
     place = (inside / size + 1) * 0.5 * count
     low = torch.minimum(place.detach().floor().clamp(min=0.0), count - 1)
     f = place - low
-    low = low.to(torch.int64)
+    # A place that is not a number may be looked up anywhere: its share f makes the answer not a number.
+    low = low.nan_to_num().to(torch.int64)
     _, ny, nz = (n + 1 for n in cells)
     first = (low[..., 0] * ny + low[..., 1]) * nz + low[..., 2]
     values = grid[..., 0, :].expand(*first.shape[:-1], grid.shape[-1])

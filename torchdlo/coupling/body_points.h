@@ -1,0 +1,287 @@
+// Ropes, bodies, and points of edges on bodies for a block of scenes side by side: how points come about, how they move,
+// and what forces on them exert, with the derivatives of all three.
+#pragma once
+#include "edge_points.h"
+
+#include <vector>
+
+template <typename T>
+struct Point {
+  Lanes<T> share;
+  Vec<T> normal, arm;
+  Lanes<T> wanted, turning, sliding;
+};
+template <typename T>
+struct Edge {
+  Vec<T> tangent;
+  Lanes<T> lever, radius, real;
+};
+template <typename T>
+struct Vertex {
+  Vec<T> pos, vel, change, answer;
+  Lanes<T> soft;
+};
+template <typename T>
+struct Solid {
+  Vec<T> pos, axes[3], offset;
+  Lanes<T> numbers[4];
+  Vec<T> vel, omega, change, turn;
+  Lanes<T> mobility, xx, yy, zz, xy, xz, yz, agile, mu_s, mu_k, restitution;
+  Vec<T> turned(const Vec<T>& t) const {
+    return {xx * t.x + xy * t.y + xz * t.z, xy * t.x + yy * t.y + yz * t.z, xz * t.x + yz * t.y + zz * t.z};
+  }
+  void add_turned(const Vec<T>& a, const Vec<T>& b) {  // derivative of a . turned(b)
+    xx += a.x * b.x, yy += a.y * b.y, zz += a.z * b.z;
+    xy += a.x * b.y + a.y * b.x, xz += a.x * b.z + a.z * b.x, yz += a.y * b.z + a.z * b.y;
+  }
+  Vec<T> local(const Vec<T>& a) const { return {dot(axes[0], a), dot(axes[1], a), dot(axes[2], a)}; }
+  Vec<T> world(const Vec<T>& a) const { return axes[0] * a.x + axes[1] * a.y + axes[2] * a.z; }
+  void add_world(const Vec<T>& by, const Vec<T>& a) {  // derivative by the axes of by . world(a)
+    axes[0] += by * a.x, axes[1] += by * a.y, axes[2] += by * a.z;
+  }
+};
+template <typename T>
+struct Force {
+  Lanes<T> normal;
+  Vec<T> friction;
+};
+template <typename T>
+struct Wrench {
+  Vec<T> force, torque;
+};
+
+struct Sizes {
+  int64_t families, vertices, bodies, scenes, sweeps, friction;
+  const int64_t *shape, *pieces, *after;  // per body, and vertex after each vertex
+  double recovery, slowest, dt;
+};
+
+// Moves a block of scenes between arrays (rows, scenes), one per field, and structs of lanes.
+template <typename T, class S>
+static void fetch(std::vector<S>& to, const T* const* from, int64_t b, int64_t scenes) {
+  const int64_t rows = to.size(), fields = sizeof(S) / sizeof(Lanes<T>);
+  for (int64_t r = 0; r < rows; ++r)
+    for (int64_t f = 0; f < fields; ++f) ((Lanes<T>*)&to[r])[f] = load(from[f] + r * scenes + b, scenes - b);
+}
+template <typename T, class S>
+static void put(const std::vector<S>& from, T* const* to, int64_t b, int64_t scenes) {
+  const int64_t rows = from.size(), fields = sizeof(S) / sizeof(Lanes<T>);
+  for (int64_t r = 0; r < rows; ++r)
+    for (int64_t f = 0; f < fields; ++f)
+      store<T>(to[f] + r * scenes + b, ((const Lanes<T>*)&from[r])[f], scenes - b);
+}
+
+// Numbers that contact depends on, or derivatives by them.
+template <typename T>
+struct Inputs {
+  std::vector<Edge<T>> edges;
+  std::vector<Vertex<T>> vertices;
+  std::vector<Solid<T>> bodies;
+  std::vector<Point<T>> points;  // made of the others
+
+  explicit Inputs(const Sizes& n)
+      : edges(n.vertices), vertices(n.vertices), bodies(n.bodies), points(n.families * n.vertices) {}
+  template <typename P>
+  void all(P work) {
+    work(edges, 0), work(vertices, 1), work(bodies, 2);
+  }
+};
+
+template <typename T>
+struct Geometry : Inputs<T> {
+  using Inputs<T>::points;
+  using Inputs<T>::edges;
+  using Inputs<T>::vertices;
+  using Inputs<T>::bodies;
+  typedef Lanes<T> L;
+  typedef Vec<T> R;
+  typedef std::vector<R> Shifts;
+  typedef std::vector<Wrench<T>> Turns;
+  Sizes n;
+  std::vector<int> owner, piece;  // body of each family; piece of an edge, or -2 and -1 for its ends
+  std::vector<Found<T>> found;
+  std::vector<char> searched;
+  std::vector<L> distance;
+  Shifts change, vel;  // how vertices move now
+  Turns motion, spin;  // and bodies
+
+  explicit Geometry(const Sizes& n)
+      : Inputs<T>(n), n(n), found(points.size()), searched(points.size()), distance(points.size()),
+        change(n.vertices), vel(n.vertices), motion(n.bodies), spin(n.bodies) {
+    for (int k = 0; k < n.bodies; ++k)
+      for (int j = -2; j < n.pieces[k]; ++j) owner.push_back(k), piece.push_back(j);
+  }
+
+  int edge(int p) const { return p % n.vertices; }
+  int body(int p) const { return owner[p / n.vertices]; }
+
+  // By how much a point moves against its body without friction's turn.
+  R apart(int p, const Shifts& x, const Turns& m) const {
+    const Point<T>& a = points[p];
+    const int v = edge(p);
+    const Wrench<T>& k = m[body(p)];
+    const R &i = x[v], &j = x[n.after[v]];
+    return i + (j - i) * a.share - k.force - cross(k.torque, a.arm);
+  }
+  // The turn that friction's couple sees.
+  R turned(int p, const Shifts& x, const Turns& m) const {
+    const int v = edge(p);
+    const Edge<T>& e = edges[v];
+    const R stretch = x[n.after[v]] - x[v], &turn = m[body(p)].torque;
+    return cross(e.tangent, stretch) * e.lever - (turn - e.tangent * dot(e.tangent, turn)) * e.radius;
+  }
+
+  // Adds what forces on points exert, and its transpose: motions seen at the points, `slip` with its normal part.
+  void exert(int p, const L& normal, const R& friction, Shifts& f, Turns& m) const {
+    const Point<T>& a = points[p];
+    const int v = edge(p);
+    const Edge<T>& e = edges[v];
+    const R whole = a.normal * normal + friction, couple = cross(friction, a.normal);
+    const R pair = cross(couple, e.tangent) * e.lever, second = whole * a.share + pair;
+    f[v] += whole - second;
+    f[n.after[v]] += second;
+    m[body(p)].force -= whole;
+    m[body(p)].torque -= cross(a.arm, whole) + (couple - e.tangent * dot(e.tangent, couple)) * e.radius;
+  }
+  Force<T> seen(int p, const Shifts& x, const Turns& m) const {
+    const R d = apart(p, x, m);
+    return {dot(points[p].normal, d), d + cross(points[p].normal, turned(p, x, m))};
+  }
+  // Adds the derivative by the geometry of (normal, friction) . seen = what they exert . motion.
+  void tilt(int p, const L& normal, const R& friction, const Shifts& x, const Turns& m,
+            Inputs<T>& to) const {
+    const Point<T>& a = points[p];
+    const int v = edge(p);
+    const Edge<T>& e = edges[v];
+    const R stretch = x[n.after[v]] - x[v], &turn = m[body(p)].torque;
+    const R whole = a.normal * normal + friction, couple = cross(friction, a.normal);
+    Point<T>& da = to.points[p];
+    Edge<T>& de = to.edges[v];
+    da.share += dot(whole, stretch);
+    da.normal += apart(p, x, m) * normal + cross(turned(p, x, m), friction);
+    da.arm += cross(turn, whole);
+    de.lever += dot(couple, cross(e.tangent, stretch));
+    de.radius -= dot(couple, turn - e.tangent * dot(e.tangent, turn));
+    de.tangent += cross(stretch, couple) * e.lever +
+                  (couple * dot(e.tangent, turn) + turn * dot(e.tangent, couple)) * e.radius;
+  }
+
+
+  void foresee() {
+    for (int v = 0; v < n.vertices; ++v) change[v] = vertices[v].change, vel[v] = vertices[v].vel;
+    for (int k = 0; k < n.bodies; ++k)
+      motion[k] = {bodies[k].change, bodies[k].turn}, spin[k] = {bodies[k].vel, bodies[k].omega};
+  }
+  void prepare() {
+    foresee();
+    for (int p = 0; p < int(points.size()); ++p) place(p);
+  }
+
+  // Whether an edge may come within a radius of a body in some scene, if it moves twice as far as foreseen.
+  bool close(int p, const Line<T, 0>& line) const {
+    const int v = edge(p), first = (p / n.vertices - piece[p / n.vertices] - 2) * n.vertices + v;
+    const auto size = [](const R& x) { return root<T>(dot(x, x)); };
+    const L i = size(change[v]), j = size(change[n.after[v]]), arm = size(points[first].arm) + line.length.x;
+    const L moved = (i > j ? i : j) + size(motion[body(p)].force) + size(motion[body(p)].torque) * arm;
+    const L reach = T(2) * edges[v].radius + T(2) * moved;
+    return any((edges[v].real > T(0)) & (distance[first] - line.length.x <= reach));
+  }
+  T share(int family) const {
+    const int j = piece[family];
+    return j < 0 ? T(j + 2) : T((j + 0.5) / n.pieces[owner[family]]);
+  }
+  template <int N>
+  Line<T, N> line(int p) const {
+    const Solid<T>& b = bodies[body(p)];
+    const R from = vertices[edge(p)].pos, to = vertices[n.after[edge(p)]].pos;
+    return Line<T, N>(n.shape[body(p)], b.local(from - b.pos) + b.offset, b.local(to - from), b.numbers);
+  }
+
+  void place(int p) {
+    const int f = p / n.vertices, v = edge(p);
+    const Solid<T>& b = bodies[body(p)];
+    const Line<T, 0> line = this->template line<0>(p);
+    searched[p] = piece[f] >= 0 && close(p, line);
+    if (searched[p]) {
+      const T count = n.pieces[body(p)];
+      found[p] = nearest<T>(line, piece[f] / count, (piece[f] + 1) / count);
+    }
+    Num<T, 0> r[5];
+    end<T, 0>(line, searched[p] ? &found[p] : nullptr, share(f), r);
+    Point<T>& a = points[p];
+    const R from = vertices[v].pos, to = vertices[n.after[v]].pos;
+    a.share = r[0].x, distance[p] = r[1].x;
+    a.normal = b.world({r[2].x, r[3].x, r[4].x});
+    a.arm = from - b.pos + (to - from) * a.share;
+    a.wanted = wanted(p);
+    const R x = cross(a.arm, a.normal);
+    a.turning = length(dot(x, b.turned(x))), a.sliding = length(b.agile * dot(a.arm, a.arm));
+  }
+  static L length(const L& squared) {
+    const auto there = squared > T(0);
+    return there ? root<T>(there ? squared : L{} + T(1)) : L{};
+  }
+
+  // By how much a point has to part at least; see coulomb.py.
+  L overlap(int p) const { return edges[edge(p)].radius - distance[p]; }
+  L deep(int p) const { return overlap(p) - T(0.1) * edges[edge(p)].radius; }
+  L simple(int p) const {
+    const L over = overlap(p), more = deep(p), rest = T(1 - n.recovery) * (more > T(0) ? more : L{});
+    return over < T(0) ? over : T(n.recovery) * over + rest;
+  }
+  L approach(int p) const { return -dot(points[p].normal, apart(p, vel, spin)); }
+  L rebound(int p) const {
+    const L fast = approach(p), along = dot(points[p].normal, apart(p, change, motion));
+    const auto hits = (edges[edge(p)].real > T(0)) & (along < simple(p)) & (fast > T(n.slowest));
+    return hits ? bodies[body(p)].restitution * fast * T(n.dt) : L{};
+  }
+  L wanted(int p) const {
+    const L by = simple(p), back = rebound(p);
+    return (back > T(0)) & (back > by) ? back : by;
+  }
+
+  // Adds the derivative by ropes and bodies of what depends on a point as `to.points[p]` says.
+  void place_back(int p, Inputs<T>& to, Shifts& dvel, Turns& dspin) {
+    const int f = p / n.vertices, v = edge(p), w = n.after[v], k = body(p);
+    const Solid<T>& b = bodies[k];
+    const Point<T>& a = points[p];
+    Point<T>& d = to.points[p];
+    Solid<T>& db = to.bodies[k];
+    const L zero{}, one = zero + T(1);
+    const R x = cross(a.arm, a.normal), turned = b.turned(x);
+    const L by_turning = a.turning > T(0) ? d.turning / (a.turning > T(0) ? a.turning : one) : zero;
+    const L by_sliding = a.sliding > T(0) ? d.sliding / (a.sliding > T(0) ? a.sliding : one) : zero;
+    db.add_turned(x * (T(0.5) * by_turning), x);
+    const R dx = turned * by_turning;
+    d.arm += cross(a.normal, dx) + a.arm * (by_sliding * b.agile);
+    d.normal += cross(dx, a.arm);
+    db.agile += T(0.5) * by_sliding * dot(a.arm, a.arm);
+    const L back = rebound(p);
+    const auto bounces = (back > T(0)) & (back > simple(p));
+    const L bounced = bounces ? d.wanted * T(n.dt) : zero, kept = bounces ? zero : d.wanted;
+    db.restitution += bounced * approach(p);
+    exert(p, -bounced * b.restitution, R{}, dvel, dspin);
+    tilt(p, -bounced * b.restitution, R{}, vel, spin, to);
+    const L more = deep(p) > T(0) ? kept * T(1 - n.recovery) : zero;
+    const L dover = overlap(p) < T(0) ? kept : kept * T(n.recovery) + more;
+    to.edges[v].radius += dover - (overlap(p) < T(0) ? zero : T(0.1) * more);
+    const R way = vertices[w].pos - vertices[v].pos, from = vertices[v].pos - b.pos;
+    d.share += dot(d.arm, way);
+    const R normal = b.local(d.normal), local = b.local(a.normal);
+    db.add_world(d.normal, local);
+    R dway = d.arm * a.share, dfrom = d.arm;
+    const Line<T, 10> line = this->template line<10>(p);
+    Num<T, 10> r[5];
+    end<T, 10>(line, searched[p] ? &found[p] : nullptr, share(f), r);
+    L g[10];
+    for (int i = 0; i < 10; ++i)
+      g[i] = d.share * r[0].g[i] - dover * r[1].g[i] + normal.x * r[2].g[i] + normal.y * r[3].g[i] + normal.z * r[4].g[i];
+    const R start = {g[0], g[1], g[2]}, along = {g[3], g[4], g[5]};
+    for (int i = 0; i < 4; ++i) db.numbers[i] += g[6 + i];
+    db.offset += start;
+    db.add_world(from, start), db.add_world(way, along);
+    dfrom += b.world(start), dway += b.world(along);
+    to.vertices[v].pos += dfrom - dway, to.vertices[w].pos += dway;
+    db.pos -= dfrom;
+  }
+};

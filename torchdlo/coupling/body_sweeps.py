@@ -1,0 +1,202 @@
+"""Contact forces of ropes on bodies as a C++ kernel, with its derivative.
+
+The formulas stand in `rod_body` and `edge_points`, as tensor operations; these are used on a GPU, for meshes, and where
+there is no C++ compiler. The kernel does the same, several scenes per instruction, skips what touches in none of them,
+and looks for the nearest point of an edge only where it may come within a radius of the body if the edge moves twice as
+far as foreseen. Compilers of graphs take minutes to unroll the sweeps; for them the kernel is one operation.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+import hashlib
+import itertools
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from torchdlo.coupling import shapes
+from torchdlo.coupling.bodies import Body, BodyMotion
+from torchdlo.coupling.components import axes
+from torchdlo.physics import native
+from torchdlo.physics.effect import Motion, Push
+from torchdlo.physics.rod import View
+
+_OPTIONS = ("-fno-math-errno", "-fno-trapping-math", "-Wno-psabi")
+_HEADERS = ("lanes.h", "edge_points.h", "body_points.h")
+_ORDER = tuple(shapes.SIZES)
+_INPUTS = "Tensor[] edges, Tensor[] vertices, Tensor[] bodies"
+_STATIC = "int[] shapes, int[] pieces, int[] after, int sweeps, bool friction, float[] law"
+
+
+@functools.cache
+def _function(dtype: torch.dtype, what: str):
+    """Return a function of the kernel for numbers of a dtype, None where there is none."""
+    source = Path(__file__).with_name("body_sweeps.cpp")
+    # The library is named after its source and its options: a changed header has to be among them.
+    text = b"".join(source.with_name(name).read_bytes() for name in _HEADERS)
+    version = f"-DHEADERS=0x{hashlib.sha256(text).hexdigest()[:16]}"
+    library = native.library(source, *_OPTIONS, version, f"-I{source.parent}")
+    kind = {torch.float32: "float", torch.float64: "double"}.get(dtype)
+    return None if library is None or kind is None else getattr(library, f"body_sweeps_{kind}_{what}")
+
+
+@torch.compiler.assume_constant_result
+def ready(device: str, dtype: torch.dtype) -> bool:
+    """Return whether the kernel works for tensors of a kind of device and a dtype."""
+    return device == "cpu" and _function(dtype, "back") is not None
+
+
+class _Sizes(ctypes.Structure):
+    _fields_ = (
+        *((name, ctypes.c_int64) for name in ("families", "vertices", "bodies", "scenes", "sweeps", "friction")),
+        *((name, ctypes.c_void_p) for name in ("shape", "pieces", "after")),
+        *((name, ctypes.c_double) for name in ("recovery", "slowest", "dt")),
+    )
+
+
+@functools.cache
+def _kept(numbers: tuple[int, ...]) -> ctypes.Array:
+    return (ctypes.c_int64 * len(numbers))(*numbers)
+
+
+def _sizes(count: int, scenes: int, kinds, pieces, after, sweeps: int, friction: bool, law: Sequence[float]):
+    families = sum(2 + n for n in pieces)
+    lists = (ctypes.addressof(_kept(tuple(x))) for x in (kinds, pieces, after))
+    return ctypes.byref(_Sizes(families, len(after), count, scenes, sweeps, friction, *lists, *law))
+
+
+def _fields(tensors: Sequence[Tensor]) -> ctypes.Array:
+    """Return the addresses of all fields of tensors (C, n, B)."""
+    at = [t.data_ptr() + k * t[0].nbytes for t in tensors for k in range(t.shape[0])]
+    return (ctypes.c_void_p * len(at))(*at)
+
+
+def _sweep(edges: list[Tensor], vertices: list[Tensor], bodies: list[Tensor], *static) -> tuple[Tensor, Tensor]:
+    out = _sweep_meta(edges, vertices, bodies)
+    places = [_fields(x) for x in (edges, vertices, bodies)]
+    sizes = _sizes(*bodies[0].shape[1:], *static)
+    _function(out[0].dtype, "sweep")(*places, *(_fields([x]) for x in out), sizes, torch.get_num_threads())
+    return out
+
+
+def _sweep_meta(edges: list[Tensor], vertices: list[Tensor], bodies: list[Tensor], *static) -> tuple[Tensor, Tensor]:
+    return tuple(x[0].new_empty(n, *x[0].shape[1:]) for x, n in ((vertices, 3), (bodies, 6)))
+
+
+def _back(edges: list[Tensor], vertices: list[Tensor], bodies: list[Tensor], force: Tensor, push: Tensor, *static):
+    out = _back_meta(edges, vertices, bodies)
+    places = [_fields(x) for x in (edges, vertices, bodies, [force], [push])]
+    sizes = _sizes(*bodies[0].shape[1:], *static)
+    _function(force.dtype, "back")(*places, *(_fields([x]) for x in out), sizes, torch.get_num_threads())
+    return out
+
+
+def _back_meta(edges: list[Tensor], vertices: list[Tensor], bodies: list[Tensor], *others):
+    wide = ((x[0], sum(t.shape[0] for t in x)) for x in (edges, vertices, bodies))
+    return tuple(x.new_empty(n, *x.shape[1:]) for x, n in wide)
+
+
+_library = torch.library.Library("torchdlo", "FRAGMENT")
+for _schema, _make, _fake in (
+    (f"body_sweeps({_INPUTS}, {_STATIC}) -> (Tensor, Tensor)", _sweep, _sweep_meta),
+    (
+        f"body_sweeps_back({_INPUTS}, Tensor force, Tensor push, {_STATIC}) -> (Tensor, Tensor, Tensor)",
+        _back,
+        _back_meta,
+    ),
+):
+    _name = _schema.partition("(")[0]
+    _library.define(_schema, tags=(torch.Tag.needs_contiguous_strides,))
+    _library.impl(_name, _make, "CPU")
+    _library.impl(_name, _fake, "Meta")
+
+
+def _save(ctx, inputs, output) -> None:
+    ctx.save_for_backward(*inputs[0], *inputs[1], *inputs[2])
+    ctx.counts = [len(x) for x in inputs[:3]]
+    ctx.static = inputs[3:]
+
+
+def _backward(ctx, force: Tensor, push: Tensor):
+    groups, saved = [], list(ctx.saved_tensors)
+    for count in ctx.counts:
+        groups.append(saved[:count])
+        saved = saved[count:]
+    both = (force.contiguous(), push.contiguous())
+    found = torch.ops.torchdlo.body_sweeps_back(*groups, *both, *ctx.static)
+    parts = [list(x.split([t.shape[0] for t in group])) for x, group in zip(found, groups, strict=True)]
+    return *parts, *(None for _ in ctx.static)
+
+
+torch.library.register_autograd("torchdlo::body_sweeps", _backward, setup_context=_save, lib=_library)
+
+
+def _stored(parts: Sequence[Tensor], batch: Sequence[int], count: int) -> list[Tensor]:
+    """Return tensors (..., n or 1, C) as (C, n, B) each."""
+    n = len(batch) + 2
+    wide = (x.expand(*batch, count, x.shape[-1]).permute(n - 1, n - 2, *range(n - 2)) for x in parts)
+    return [x.reshape(x.shape[0], count, batch.numel()).contiguous() for x in wide]
+
+
+def _logical(x: Tensor, batch: Sequence[int]) -> Tensor:
+    """Return (C, n, B) as (..., n, C)."""
+    x = x.reshape(*x.shape[:2], *batch)
+    return x.permute(*range(2, x.dim()), 1, 0)
+
+
+def _solids(bodies: BodyMotion) -> list[Tensor]:
+    """Return the fields of bodies in the order of the kernel, shape (..., K, C) each."""
+    state, params, agility = bodies.state, bodies.params, bodies.agility
+    columns, turning = axes(state.quat), agility.split(1, -1)
+    answers = [
+        sum(a * c[i] * c[j] for a, c in zip(turning, columns, strict=True))
+        for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+    ]
+    ring = state.pos.new_tensor([[float(b.shape == "ring")] for b in bodies.bodies]) > 0
+    half, zero = 0.5 * params.size[..., 2:], torch.zeros_like(params.size[..., :1])
+    third, fourth = torch.where(ring, torch.cos(half), 2 * half), torch.where(ring, torch.sin(half), 0.0)
+    numbers = [params.size[..., :2], third, fourth]
+    offset = [torch.where(ring, shapes.ring_centre(params.size), 0.0), zero, zero]
+    moves = [state.vel, state.omega, bodies.change, bodies.turn, bodies.mobility]
+    laws = [agility.amax(-1, keepdim=True), params.mu_s, params.mu_k, params.restitution]
+    return [state.pos, *itertools.chain(*columns), *offset, *numbers, *moves, *answers, *laws]
+
+
+def push(
+    view: View, motion: Motion, pieces: Sequence[int], *, sweeps: int, friction: bool, law: tuple[float, float]
+) -> Push:
+    """Return what contact exerts; differentiable once.
+
+    Args:
+        view: the rods.
+        motion: where they and the bodies would go.
+        pieces: pieces of an edge that are searched for each body.
+        sweeps: projected Jacobi sweeps.
+        friction: whether ropes rub.
+        law: share of a shallow overlap that a substep removes, and approach below which nothing rebounds [m/s].
+    """
+    bodies, size, material = motion.bodies, view.topology.size, view.params.material
+    edges = [view.tangent, material.radius / view.length, material.radius, view.params.rest.edge_mask]
+    vertices = [view.state.pos, view.state.vel, motion.change, motion.answer, motion.answer.amax(-1, keepdim=True)]
+    solids = _solids(bodies)
+    batch = torch.broadcast_shapes(*(x.shape[:-2] for x in (*edges, *vertices, *solids)))
+    inputs = (_stored(x, batch, n) for x, n in ((edges, size), (vertices, size), (solids, len(bodies.bodies))))
+    force, wrench = torch.ops.torchdlo.body_sweeps(
+        *inputs,
+        [_ORDER.index(b.shape) for b in bodies.bodies],
+        list(pieces),
+        view.topology.successor(),
+        sweeps,
+        friction,
+        [*law, view.dt],
+    )
+    return Push(_logical(force, batch), *_logical(wrench, batch).split(3, -1))
+
+
+def fits(bodies: Sequence[Body], like: Tensor) -> bool:
+    """Return whether the kernel can do what these bodies need."""
+    return all(b.shape != "mesh" for b in bodies) and ready(like.device.type, like.dtype)
