@@ -11,6 +11,7 @@ import torch
 
 from torchdlo import cli, describe
 from torchdlo.describe import Body, Description, Hold, Key, Rope
+from torchdlo.describe.assembly import _rope
 from torchdlo.errors import InputError
 from torchdlo.physics import tree
 from torchdlo.scene import rollout, step
@@ -65,10 +66,10 @@ def test_a_described_scene_runs_and_held_parts_go_where_keys_say():
 
 def test_a_line_is_cut_into_equal_parts():
     corner = Rope(points=((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), (1.0, 1.0, 0.0)), vertices=5, mass=1.0)
-    positions = describe._rope(corner, torch.float64).positions
+    positions = _rope(corner, torch.float64).positions
     assert positions.tolist() == [[0, 0, 0], [0.5, 0, 0], [1, 0, 0], [1, 0.5, 0], [1, 1, 0]]
     square = Rope(points=((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), (1.0, 1.0, 0.0), (0.0, 1.0, 0.0)), vertices=8, closed=True)
-    found = describe._rope(square, torch.float64).positions
+    found = _rope(square, torch.float64).positions
     assert len(found) == 8 and found[-1].tolist() == [0, 0.5, 0]
 
 
@@ -81,7 +82,7 @@ def test_single_precision_is_used_throughout():
 
 def change(*path, to=None, drop=False):
     """The file with one entry changed, as text."""
-    content = {"format": describe.FORMAT} | json.loads(json.dumps(describe._plain(LIFT)))
+    content = {"format": describe.FORMAT} | json.loads(json.dumps(describe.plain(LIFT)))
     at = content
     for key in path[:-1]:
         at = at[key]
@@ -168,6 +169,24 @@ def test_the_command_keeps_frames_and_a_picture(file, tmp_path, capsys):
     assert simulate(file, "--out", tmp_path / "run") == 0
     (tmp_path / "run" / "shapes.png").write_bytes(b"mine")
     assert simulate(file, "--out", tmp_path / "run") == 2
+
+
+def test_the_command_draws_a_picture_and_a_video(file, tmp_path, capsys):
+    pytest.importorskip("pyvista", reason="pictures need the extra view")
+    av = pytest.importorskip("av", reason="videos need the extra view")
+    assert simulate(file, "--out", tmp_path / "run", "--video", "--picture", "--speed", 0.5) == 0
+    written = sorted(p.name for p in (tmp_path / "run").iterdir())
+    assert written == ["frames.npz", "motion.mp4", "picture.png", "shapes.png"]
+    said = capsys.readouterr().out
+    assert all(name in said for name in written)
+    with av.open(str(tmp_path / "run" / "motion.mp4")) as video:
+        # 0.03 s at half speed: pictures at 0, 1/30 and 2/30 s.
+        assert sum(1 for _ in video.decode(video=0)) == 3
+    # Its own video is replaced, that of others is not; nothing is simulated before.
+    (tmp_path / "run" / "motion.mp4").write_bytes(b"mine")
+    (tmp_path / "run" / "frames.npz").unlink()
+    assert simulate(file, "--out", tmp_path / "run", "--video") == 2
+    assert not (tmp_path / "run" / "frames.npz").exists()
 
 
 def test_ctrl_c_keeps_frames_so_far(file, tmp_path, monkeypatch):

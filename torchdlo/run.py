@@ -2,24 +2,27 @@
 
 from __future__ import annotations
 
+import zipfile
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 
 from torchdlo import describe
 from torchdlo import scene as scenes
+from torchdlo.errors import InputError
 from torchdlo.files import replacing
-from torchdlo.physics import tree
+from torchdlo.physics import traced
 
-__all__ = ["Frames", "run", "save_frames"]
+__all__ = ["Frames", "load_frames", "run", "save_frames"]
 
 
 @dataclass(frozen=True, eq=False)
 class Frames:
-    """What happened, F moments of it."""
+    """What happened, F moments of it, and what one needs to draw it."""
 
     time: np.ndarray
     """Moments [s], shape (F,)."""
@@ -30,11 +33,37 @@ class Frames:
     force: np.ndarray
     """Forces that holds exert on held vertices [N], shape (F, H, 3)."""
     body_pos: np.ndarray
-    """Positions of bodies [m], shape (F, K, 3)."""
+    """Positions of bodies, those of robots' links last [m], shape (F, K, 3)."""
     body_quat: np.ndarray
     """Orientations of bodies (w, x, y, z) [1], shape (F, K, 4)."""
+    matter: np.ndarray
+    """Points of matter [m], shape (F, P, 3)."""
     rope: np.ndarray
     """Number of the rope that each vertex belongs to, shape (V,)."""
+    closed: np.ndarray
+    """Whether ropes are closed, shape (R,)."""
+    radius: np.ndarray
+    """Radii of the edges after vertices [m], shape (V,)."""
+    weight: np.ndarray
+    """Masses that hang on vertices [kg], shape (V,)."""
+    body_shape: np.ndarray
+    """Shapes of bodies as in `shapes.SIZES`, shape (K,)."""
+    body_size: np.ndarray
+    """Their sizes, see there [m or rad], shape (K, 3)."""
+    body_motion: np.ndarray
+    """"free", "fixed", "kinematic", or "robot" for the links of one, shape (K,)."""
+    mesh_vertices: np.ndarray
+    """Vertices of all meshes, in the frames of their bodies [m], shape (M, 3)."""
+    mesh_faces: np.ndarray
+    """Their triangles, shape (T, 3)."""
+    mesh_body: np.ndarray
+    """The body of each triangle, shape (T,)."""
+    law: np.ndarray
+    """Law of each point of matter, shape (P,)."""
+    table: np.ndarray
+    """Heights of tables that effects hold [m], shape (0,) or (1,)."""
+    look: np.ndarray
+    """Direction from the scene to the camera, shape (3,)."""
     interrupted: bool = False
     """Whether it was stopped before its end."""
     problem: str = ""
@@ -44,13 +73,46 @@ class Frames:
 def _seen(state: scenes.State) -> list[np.ndarray]:
     rods, none = state.rods, state.rods.pos.new_zeros(0, 4)
     bodies = (state.bodies.pos, state.bodies.quat) if state.bodies else (none[:, :3], none)
-    found = (state.time[0, 0], rods.pos, rods.twist[:, 0], state.reaction.force, *bodies)
+    # Pictures need no more digits, and there are many points.
+    matter = (state.matter.pos if state.matter else none[:, :3]).to(torch.float32)
+    found = (state.time[0, 0], rods.pos, rods.twist[:, 0], state.reaction.force, *bodies, matter)
     return [x.cpu().numpy().copy() for x in found]
+
+
+def _looks(made: describe.Simulation, description: describe.Description) -> dict[str, np.ndarray]:
+    """Return what stays the same in pictures, by the names of `Frames`."""
+    scene, params, counts = made.scene, made.params, made.scene.topology.counts
+    own = len(description.bodies)
+    motion = [b.motion if k < own else "robot" for k, b in enumerate(scene.bodies)]
+    vertices, faces, owner, start = [np.zeros((0, 3))], [np.zeros((0, 3), int)], [np.zeros(0, int)], 0
+    for k, mesh in made.meshes.items():
+        vertices.append(mesh.vertices.numpy())
+        faces.append(mesh.faces.numpy() + start)
+        owner.append(np.full(len(mesh.faces), k))
+        start += len(mesh.vertices)
+    groups = scene.matter.groups if scene.matter else ()
+    heights = [v["height"].reshape(-1)[:1].numpy() for n, v in params.effects.items() if n.startswith("table")]
+    return {
+        "rope": np.repeat(np.arange(len(counts)), counts),
+        "closed": np.array(scene.topology.closed, bool),
+        "radius": params.rods.material.radius[:, 0].numpy(),
+        "weight": made.weight[:, 0].numpy(),
+        "body_shape": np.array([b.shape for b in scene.bodies], str),
+        "body_size": params.bodies.size.numpy() if scene.bodies else np.zeros((0, 3)),
+        "body_motion": np.array(motion, str),
+        "mesh_vertices": np.concatenate(vertices),
+        "mesh_faces": np.concatenate(faces),
+        "mesh_body": np.concatenate(owner),
+        "law": np.repeat([g.law.name for g in groups] or np.zeros(0, str), [g.count for g in groups]),
+        "table": heights[0] if heights else np.zeros(0),
+        "look": np.array(description.look),
+    }
 
 
 def run(
     description: describe.Description,
     *,
+    folder: str | Path = ".",
     every: int = 10,
     compiled: bool = False,
     callback: Callable[[str, int, int, str], None] | None = None,
@@ -62,17 +124,23 @@ def run(
 
     Args:
         description: the scene.
+        folder: where the files that it names are looked for.
         every: steps per frame.
-        compiled: whether to compile the step, worth it for long runs.
+        compiled: whether to compile the step, worth it for long runs; else it is recorded.
         callback: told (stage, steps done, steps in all, message) after every frame.
     """
-    scene, params, state, controls = describe.build(description)
+    made = describe.assemble(description, folder=folder)
+    scene, params, state = made.scene, made.params, made.state
     step = scenes.stepper(scene, compiled=compiled)
-    total = round(description.duration / description.dt)
+    control = made.plan.follow(scene)
+    total = max(1, round(description.duration / description.dt))
     kept, interrupted, problem = [_seen(state)], False, ""
     with torch.no_grad():
         for k in range(total):
-            state = step(params, state, tree.map(lambda c, k=k: c[k], controls))
+            command = control(k, state)
+            if k == 0 and not compiled and total > 50:
+                step = _recorded(step, params, state, command)
+            state = step(params, state, command)
             if (k + 1) % every and k + 1 < total:
                 continue
             try:
@@ -87,13 +155,16 @@ def run(
             except KeyboardInterrupt:
                 interrupted = True
                 break
-    counts = scene.topology.counts
-    return Frames(
-        *(np.stack(parts) for parts in zip(*kept, strict=True)),
-        rope=np.repeat(np.arange(len(counts)), counts),
-        interrupted=interrupted,
-        problem=problem,
-    )
+    moving = (np.stack(parts) for parts in zip(*kept, strict=True))
+    return Frames(*moving, **_looks(made, description), interrupted=interrupted, problem=problem)
+
+
+def _recorded(step: Callable, *inputs: Any) -> Callable:
+    """Return the step recorded, or as it is where recording does not know one of its operations."""
+    try:
+        return traced.record(step, *inputs)
+    except RuntimeError:
+        return step
 
 
 def save_frames(frames: Frames, description: describe.Description, path: Path) -> None:
@@ -101,3 +172,20 @@ def save_frames(frames: Frames, description: describe.Description, path: Path) -
     arrays = {name: value for name, value in vars(frames).items() if isinstance(value, np.ndarray)}
     with replacing(path) as temporary:
         np.savez_compressed(temporary, torchdlo_scene=np.array(describe.text(description)), **arrays)
+
+
+def load_frames(path: str | Path) -> Frames:
+    """Read what `save_frames` wrote; `path` may be the folder of the run."""
+    path = Path(path)
+    file = path / "frames.npz" if path.is_dir() else path
+    if not file.is_file():
+        raise InputError(f"{file}: expected the frames of a run, found none; torchdlo simulate --out writes them.")
+    names = [f.name for f in fields(Frames) if f.type == "np.ndarray"]
+    try:
+        with np.load(file, allow_pickle=False) as found:
+            missing = [name for name in names if name not in found.files]
+            if missing:
+                raise InputError(f"{file}: lacks {', '.join(missing)}; simulate the scene again with this version.")
+            return Frames(**{name: found[name] for name in names})
+    except (ValueError, EOFError, OSError, zipfile.BadZipFile) as error:
+        raise InputError(f"{file}: expected the frames of a run; reading failed: {error}.") from None
