@@ -13,7 +13,17 @@ from pathlib import Path
 import pytest
 
 EXPERIMENTS = Path(__file__).parents[1] / "experiments"
-SCRIPTS = ["bench_contact.py", "bench_rod.py", "make_reference.py", "make_sample.py", "peers.py"]
+SCRIPTS = [
+    "bench_contact.py",
+    "bench_coupled.py",
+    "bench_env.py",
+    "bench_rod.py",
+    "draw_tasks.py",
+    "gallery.py",
+    "make_reference.py",
+    "make_sample.py",
+    "peers.py",
+]
 PREFIX = "TORCHDLO_PROBE_"
 BAD = {"WORKERS": ["x", "", "0", "1.5"], "NOISE": ["much", ""], "QUICK": ["maybe", ""]}
 PROBE = """
@@ -58,6 +68,44 @@ def test_the_contact_benchmark_writes_its_rows(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     rows = json.loads(target.read_text())["rows"]
     assert len(rows) == 3 and all(row["frames_per_s_per_core"] > 0 for row in rows)
+
+
+def test_the_gallery_runs_a_scene_and_says_what_happened(tmp_path: Path) -> None:
+    target = tmp_path / "gallery.json"
+    done = call(EXPERIMENTS / "gallery.py", "--smoke", "--json", target, "--out", tmp_path)
+    assert done.returncode == 0, done.stderr
+    (row,) = json.loads(target.read_text())["rows"]
+    assert row["name"] == "chain" and not row["wrong"]
+    assert row["claims"]["least linking number"][0] == pytest.approx(1, abs=1e-6)
+    assert (tmp_path / "chain" / "scene.json").is_file() and (tmp_path / "chain" / "frames.npz").is_file()
+    done = call(EXPERIMENTS / "gallery.py", "--only", "chain,knott")
+    assert done.returncode == 2 and "there is no knott; known are knot, chain" in done.stderr
+
+
+@pytest.mark.slow
+def test_the_coupled_benchmark_writes_its_rows(tmp_path: Path) -> None:
+    target = tmp_path / "coupled.json"
+    done = call(EXPERIMENTS / "bench_coupled.py", "--smoke", "--json", target)
+    assert done.returncode == 0, done.stderr
+    rows = json.loads(target.read_text())["rows"]
+    assert [row["scenario"] for row in rows] == ["coiling", "lifting", "gathering", "coiling"]
+    assert all(row["frames_per_s"] > 0 for row in rows)
+
+
+def test_the_benchmark_of_tasks_writes_its_rows(tmp_path: Path) -> None:
+    target = tmp_path / "env.json"
+    done = call(EXPERIMENTS / "bench_env.py", "--smoke", "--tasks", "unknotting", "--json", target)
+    assert done.returncode == 0, done.stderr
+    rows = json.loads(target.read_text())["rows"]
+    assert [row["mode"] for row in rows] == ["forward", "forward+backward"]
+    assert all(row["frames_per_cpu_s"] > 0 and row["published"] > 0 for row in rows)
+    done = call(EXPERIMENTS / "bench_env.py", "--tasks", "knot")
+    assert done.returncode == 1 and "there is no task knot; known are coiling" in done.stderr
+
+
+def test_pictures_of_tasks_are_drawn(tmp_path: Path) -> None:
+    done = call(EXPERIMENTS / "draw_tasks.py", "--tasks", "slingshot", "--out", tmp_path)
+    assert done.returncode == 0 and (tmp_path / "task_slingshot.png").stat().st_size > 1000, done.stderr
 
 
 @pytest.mark.parametrize("script", SCRIPTS)

@@ -126,7 +126,7 @@ def walls(grid: Grid, origin: Tensor, vel: Tensor, friction: Tensor) -> Tensor:
         lower, upper = number <= MARGIN, number >= grid.nodes[axis] - 1 - MARGIN
         kept, taken = v, torch.zeros_like(v)
         for behind, kind, into in ((lower, grid.walls[2 * axis], v < 0), (upper, grid.walls[2 * axis + 1], v > 0)):
-            stopped = behind & into if kind == "separate" else behind & (kind != "open")
+            stopped = behind & into if kind == "separate" else (behind if kind != "open" else torch.zeros_like(behind))
             kept = torch.where(stopped, 0.0, kept)
             taken = torch.where(stopped, v, taken) if kind == "separate" else taken
             sticks = sticks | behind if kind == "stick" else sticks

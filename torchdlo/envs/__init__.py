@@ -1,1 +1,108 @@
-"""Tasks and environments for reinforcement learning."""
+"""Manipulation tasks, run as functions of tensors (`episode.play`) or as TorchRL environments (`make`).
+
+Importing this package needs torch only. Arms need the extra `robots`, `make` needs `rl` as well.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import torch
+
+from torchdlo.envs.coiling import Coiling
+from torchdlo.envs.gathering import Gathering
+from torchdlo.envs.lifting import Lifting
+from torchdlo.envs.separation import Separation
+from torchdlo.envs.slingshot import Slingshot
+from torchdlo.envs.task import Task
+from torchdlo.envs.unknotting import Unknotting
+from torchdlo.envs.wiring_post import WiringPost
+from torchdlo.envs.wrapping import Wrapping
+from torchdlo.errors import InputError
+
+if TYPE_CHECKING:
+    from torchdlo.envs.env import DloEnv
+
+TASKS: dict[str, type[Task]] = {
+    "coiling": Coiling,
+    "gathering": Gathering,
+    "lifting": Lifting,
+    "separation": Separation,
+    "slingshot": Slingshot,
+    "unknotting": Unknotting,
+    "wiring_post": WiringPost,
+    "wrapping": Wrapping,
+}
+
+__all__ = ["TASKS", "Task", "find", "listing", "make"]
+
+
+def find(name: str) -> Task:
+    """Return a task by its name."""
+    if name not in TASKS:
+        raise InputError(f"there is no task {name!r}; expected one of {', '.join(sorted(TASKS))}.")
+    return TASKS[name]()
+
+
+def listing() -> list[dict[str, Any]]:
+    """Return what every task is: name, what to do, arms, actions, and seconds per action."""
+    return [
+        {
+            "name": name,
+            "what": (kind.__doc__ or "").splitlines()[0],
+            "arms": kind.arms.count,
+            "actions": kind().horizon,
+            "seconds": 1e-3 * kind().frames,
+        }
+        for name, kind in TASKS.items()
+    ]
+
+
+def make(
+    task: str | Task,
+    *,
+    num_envs: int = 1,
+    device: torch.device | str | None = None,
+    dtype: torch.dtype = torch.float32,
+    seed: int | None = None,
+    gradients: bool = False,
+    compiled: bool = True,
+    segment: int | None = 1,
+    variation: bool = True,
+    randomize: Mapping[str, float] | None = None,
+) -> DloEnv:
+    """Return a task as a TorchRL environment.
+
+    Args:
+        task: a name of `TASKS`, or a task of your own.
+        num_envs: scenes in the batch.
+        device: where they live.
+        dtype: precision of the physics; observations and rewards are in single precision.
+        seed: of the starts and of what is randomised.
+        gradients: whether rewards and observations carry gradients to actions.
+        compiled: whether to compile steps: some ten seconds to a minute at first, then many times faster.
+        segment: frames that gradients run again at once; None keeps all of them in memory.
+        variation: whether starts differ, by as much as `Task.spread` says.
+        randomize: numbers of effects that differ from scene to scene and are drawn at every reset, e.g.
+            {"rod_contact.mu_k": 0.2}: a share of the range in which the number is declared, about its usual value.
+    """
+    try:
+        from torchdlo.envs.env import DloEnv
+    except ImportError as error:
+        raise InputError(
+            f"environments need torchrl and tensordict ({error}); install them with pip install 'torchdlo[rl,robots]'."
+        ) from None
+    chosen = find(task) if isinstance(task, str) else task
+    return DloEnv(
+        chosen,
+        num_envs=num_envs,
+        device=device,
+        dtype=dtype,
+        seed=seed,
+        gradients=gradients,
+        compiled=compiled,
+        segment=segment,
+        variation=variation,
+        randomize=randomize,
+    )

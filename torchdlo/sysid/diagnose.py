@@ -176,9 +176,11 @@ class _Search:
             if shares and rms(self.bench.gaps(base, "all")) < SILENT * floor.total:
                 break
             names = [n for n in self._possible() if n not in base.effects]
-            best, candidates, rivals = self._round(base, names, floor, f"round {len(rounds) + 1}")
+            best, rival, candidates, rivals = self._round(base, names, floor, f"round {len(rounds) + 1}")
             rounds.append(candidates)
             if best is None:
+                if shares and rival is not base:
+                    base, floor = rival, self._floor(rival)
                 break
             name, old = best.effects[-1], self._squared(base)
             shares[name], ties[name] = (old - self._squared(best)) / whole, rivals
@@ -221,8 +223,8 @@ class _Search:
 
     def _round(
         self, base: Fitted, names: Sequence[str], floor: Floor, stage: str
-    ) -> tuple[Fitted | None, list[Candidate], list[str]]:
-        """Return the model with the best effect added, if one pays, all candidates, and those as good as it."""
+    ) -> tuple[Fitted | None, Fitted, list[Candidate], list[str]]:
+        """Return the model with the best effect added, if one pays, that without, all candidates, and equal ones."""
         scores = screen(
             self.pool,
             base,
@@ -260,7 +262,7 @@ class _Search:
             )
             for s in scores
         ]
-        return best, candidates, rivals
+        return best, rival, candidates, rivals
 
     def _leaders(self, found: Sequence[Fitted]) -> list[int]:
         """Return which of the fits to short trials are worth more work; the last of them is that without the effect."""

@@ -1,0 +1,167 @@
+"""Tasks as TorchRL environments: specs, seeds, resets, gradients, and what TorchRL offers around them."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import subprocess
+import sys
+
+import pytest
+import torch
+from test_contract import F64, small
+
+from torchdlo import envs
+from torchdlo.envs import TASKS
+
+pytest.importorskip("torchrl")
+
+from torchrl.collectors import Collector
+from torchrl.envs import ParallelEnv, RewardSum, StepCounter, TransformedEnv
+from torchrl.envs.utils import check_env_specs, step_mdp
+
+pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::FutureWarning")
+
+
+def made(name: str = "unknotting", horizon: int = 2, **choices):
+    choices = {"num_envs": 2, "compiled": False, "seed": 0} | choices
+    return envs.make(small(name, horizon), **choices)
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_specs_say_what_environments_return(name: str):
+    check_env_specs(made(name, variation=False))
+
+
+def test_the_seed_decides_starts_and_what_follows():
+    def played(seed: int) -> torch.Tensor:
+        env = made(seed=seed)
+        actions = torch.full((2, 12), 0.002)
+        return env.rollout(2, lambda td: td.set("action", actions))["next", "observation"]
+
+    torch.testing.assert_close(played(1), played(1), rtol=0, atol=0)
+    # Starts differ by centimetres.
+    assert (played(1) - played(2)).abs().max() > 1e-3
+
+
+def test_scenes_are_reset_one_by_one():
+    env = made(horizon=3)
+    td = env.reset()
+    td = env.step(td.set("action", torch.zeros(2, 12)))
+    before = td["next", "observation"]
+    mask = torch.tensor([[True], [False]])
+    again = env.reset(step_mdp(td).set("_reset", mask))
+    torch.testing.assert_close(again["observation"][1], before[1], rtol=0, atol=0)
+    assert (again["observation"][0] - before[0]).abs().max() > 1e-3
+    td = env.step(again.set("action", torch.zeros(2, 12)))
+    td = env.step(step_mdp(td).set("action", torch.zeros(2, 12)))
+    assert td["next", "truncated"].flatten().tolist() == [False, True]
+
+
+def test_rollouts_carry_gradients_to_actions():
+    task = small("unknotting")
+    env = made(gradients=True, dtype=F64, variation=False)
+    actions = torch.full((2, 12), 0.002, requires_grad=True)
+    found = env.rollout(2, lambda td: td.set("action", actions))["next", "reward"]
+    (slope,) = torch.autograd.grad(found.sum(), actions)
+    made_ = envs.episode.prepare(task, 2, like=torch.zeros((), dtype=F64), compiled=False)
+    other = actions.detach().double().requires_grad_()
+    outcome = envs.episode.play(task, other[:, None].expand(-1, 2, -1), episode=made_)
+    (wanted,) = torch.autograd.grad(outcome.returns.sum(), other)
+    # Rewards and actions pass the border in single precision.
+    torch.testing.assert_close(slope.double(), wanted, rtol=1e-5, atol=1e-7)
+
+
+def test_windows_are_cut_where_one_asks_for_it():
+    env = made(horizon=4, gradients=True)
+    actions = torch.full((2, 12), 0.002, requires_grad=True)
+    td = env.rollout(2, lambda td: td.set("action", actions), break_when_any_done=False)
+    env.detach()
+    after = env.rollout(
+        2, lambda td: td.set("action", torch.zeros(2, 12)), auto_reset=False, tensordict=step_mdp(td[..., -1]).detach()
+    )
+    assert td["next", "reward"].requires_grad and not after["next", "reward"].requires_grad
+
+
+def test_without_gradients_nothing_is_recorded():
+    actions = torch.zeros(2, 12, requires_grad=True)
+    td = made().rollout(1, lambda td: td.set("action", actions))
+    assert not td["next", "reward"].requires_grad
+
+
+def test_random_numbers_of_effects_stay_in_their_declared_range():
+    env = made(randomize={"rod_contact.mu_k": 0.2, "damping.rate": 1.0}, num_envs=64, seed=3)
+    env.reset()
+    numbers = env.episode.params.effects
+    mu, rate = numbers["rod_contact"]["mu_k"].flatten(), numbers["damping"]["rate"].flatten()
+    # A fifth of 0 to 2 about 0.25; the whole of 1e-3 to 50 about 30, by factors, cut off at 50.
+    assert 0.05 <= float(mu.min()) < 0.12 and 0.38 < float(mu.max()) <= 0.45
+    assert float(rate.max()) == pytest.approx(50) and float(rate.min()) < 5
+    assert numbers["rod_contact"]["mu_s"].unique().numel() == 1
+    with pytest.raises(ValueError, match=r"there is no number 'rod_contact\.mu'"):
+        made(randomize={"rod_contact.mu": 0.1})
+    with pytest.raises(ValueError, match="a share of its declared range"):
+        made(randomize={"rod_contact.mu_k": 2.0})
+
+
+def test_transforms_and_collectors_work():
+    env = TransformedEnv(made(horizon=2), RewardSum())
+    env.append_transform(StepCounter())
+    collector = Collector(
+        env, env.rand_action, frames_per_batch=8, total_frames=8, auto_register_policy_transforms=False
+    )
+    (batch,) = list(collector)
+    collector.shutdown()
+    assert batch.shape == (2, 4) and batch["next", "done"].sum() == 4
+    assert batch["next", "step_count"].max() == 2
+    whole = batch["next", "reward"][:, :2].sum(1)
+    torch.testing.assert_close(batch["next", "episode_reward"][:, 1], whole)
+
+
+def test_other_words_for_a_task_are_refused():
+    with pytest.raises(envs.InputError, match="there is no task 'knot'; expected one of coiling"):
+        envs.make("knot")
+
+
+def test_a_missing_extra_is_named():
+    code = (
+        "import sys\nsys.modules['torchrl'] = None\nfrom torchdlo import envs\n"
+        "try:\n    envs.make('coiling')\nexcept envs.InputError as e:\n    print(e)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert "pip install 'torchdlo[rl,robots]'" in done.stdout, done.stderr
+
+
+def test_tasks_are_listed_without_torchrl():
+    code = "import sys\nfrom torchdlo import envs\nenvs.find('coiling')\nassert 'torchrl' not in sys.modules"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.slow
+def test_processes_hold_environments_of_their_own():
+    env = ParallelEnv(2, functools.partial(made, num_envs=1, horizon=2))
+    try:
+        td = env.rollout(2)
+        assert td.shape[:2] == (2, 1) and torch.isfinite(td["next", "reward"]).all()
+    finally:
+        env.close()
+
+
+def test_gymnasium_takes_environments_through_torchrl():
+    gymnasium = pytest.importorskip("gymnasium")
+    from torchdlo.envs.env import DloEnv
+
+    DloEnv.register_gym(
+        "torchdlo/unknotting-v0", entry_point=functools.partial(made, num_envs=1), to_numpy=True, backend="gymnasium"
+    )
+    env = gymnasium.make("torchdlo/unknotting-v0", disable_env_checker=True)
+    seen, _ = env.reset()
+    after = env.step(env.action_space.sample())
+    assert len(after) == 5 and seen is not None
+
+
+def test_tasks_can_be_changed_field_by_field():
+    task = dataclasses.replace(TASKS["coiling"](), horizon=7)
+    assert task.reference().shape == (7, 6)
+    assert envs.make(dataclasses.replace(task, frames=1), compiled=False).task.horizon == 7

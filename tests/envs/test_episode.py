@@ -1,0 +1,142 @@
+"""How actions move tools, and what episodes are worth."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import pytest
+import torch
+from test_contract import F64, prepared, small
+
+from torchdlo.coupling.bodies import turn_by
+from torchdlo.coupling.robot import tool_pose
+from torchdlo.envs import TASKS, episode
+from torchdlo.envs.task import through
+from torchdlo.physics import tree
+from torchdlo.physics.rotation import multiply
+
+
+def led(name: str, rows: list[list[float]]) -> list[episode.World]:
+    """The worlds after each of some actions, the same in both scenes."""
+    made = prepared(name)
+    world, found = made.start, []
+    with torch.no_grad():
+        for row in rows:
+            world = episode.act(made, world, torch.tensor(row, dtype=F64).expand(2, -1))
+            found.append(world)
+    return found
+
+
+def test_a_tool_goes_where_the_action_says_and_the_rope_with_it():
+    start = prepared("coiling").start
+    (after,) = led("coiling", [[0.004, -0.003, 0.006, 0, 0, 0]])
+    way = torch.tensor([0.004, -0.003, 0.006], dtype=F64)
+    # To what inverse kinematics counts as there.
+    torch.testing.assert_close(after.tool.pos - start.tool.pos, way.expand(2, 1, 3), atol=1e-4, rtol=0)
+    # The held vertex is where the tool is, to rounding.
+    torch.testing.assert_close(after.state.rods.pos[:, 1:2], after.tool.pos, atol=1e-9, rtol=0)
+
+
+def test_joints_are_those_of_the_tool():
+    made = prepared("wrapping")
+    (after,) = led("wrapping", [[0.0, 0.0, 0.006, 0.005, 0, 0, 0, 0, 0, 0, 0, 0]])
+    base = torch.tensor(made.task.arms.base, dtype=F64)
+    found = tool_pose(episode._robot(), after.joints)
+    torch.testing.assert_close(found.pos + base, after.tool.pos, atol=1e-9, rtol=0)
+
+
+def test_long_ways_are_cut_and_keep_their_direction():
+    task = prepared("coiling").task
+    way, turn = episode.limited(task, torch.tensor([[0.03, 0.04, 0.0, 0.05, -3.0, 0.1]], dtype=F64))
+    torch.testing.assert_close(way[0, 0], torch.tensor([0.006, 0.008, 0.0], dtype=F64))
+    torch.testing.assert_close(turn[0, 0], torch.deg2rad(torch.tensor([0.05, -0.1, 0.1], dtype=F64)))
+
+
+def test_turns_are_about_the_axes_of_the_tool():
+    start = prepared("wrapping").start
+    (after,) = led("wrapping", [[0.0] * 6 + [0.1, 0, 0, 0, 0, -0.1]])
+    vectors = torch.tensor([[0.1, 0, 0], [0, 0, -0.1]], dtype=F64).deg2rad()
+    torch.testing.assert_close(after.target.quat, multiply(start.target.quat, turn_by(vectors)), atol=1e-12, rtol=0)
+
+
+def test_tools_stay_above_their_floor_but_are_not_lifted_to_it():
+    low = prepared("coiling").start.target.pos[0, 0, 2]
+    down, up, again = led("coiling", [[0, 0, -0.01, 0, 0, 0], [0, 0, 0.005, 0, 0, 0], [0, 0, -0.01, 0, 0, 0]])
+    assert float(down.target.pos[0, 0, 2]) == pytest.approx(float(low), abs=1e-12)
+    assert float(up.target.pos[0, 0, 2]) == pytest.approx(float(low) + 0.005, abs=1e-12)
+    # Still below the floor of 3 cm, it may not go down again.
+    assert float(again.target.pos[0, 0, 2]) == pytest.approx(float(low) + 0.005, abs=1e-12)
+
+
+def test_what_an_action_misses_is_not_made_up_for_later():
+    made = prepared("coiling")
+    far = tree.replace(made.start.target, pos=made.start.target.pos - made.start.target.pos.new_tensor([2.0, 0, 0]))
+    with torch.no_grad():
+        after = episode.act(made, tree.replace(made.start, target=far), torch.zeros(2, 6, dtype=F64))
+    assert (after.target.pos - far.pos).norm(dim=-1).min() > 0.5
+    torch.testing.assert_close(after.target.pos, after.tool.pos)
+
+
+def test_actions_of_a_wrong_size_are_refused():
+    with pytest.raises(ValueError, match=r"actions have 5 components; expected 6: ways of 1 tools"):
+        episode.play(prepared("coiling").task, torch.zeros(2, 1, 5, dtype=F64), episode=prepared("coiling"))
+    with pytest.raises(ValueError, match=r"expected \(scenes, actions, 6\)"):
+        episode.play(prepared("coiling").task, torch.zeros(2, 6), episode=prepared("coiling"))
+
+
+def test_replayed_gradients_are_those_of_the_recorded_graph():
+    made = prepared("wiring_post")
+    slopes = []
+    for segment in (None, 1):
+        actions = torch.full((2, 2, 6), 0.003, dtype=F64, requires_grad=True)
+        outcome = episode.play(made.task, actions, episode=dataclasses.replace(made, segment=segment))
+        slopes.append(torch.autograd.grad(outcome.loss.sum(), actions)[0])
+    torch.testing.assert_close(slopes[1], slopes[0], rtol=1e-10, atol=1e-12)
+
+
+def test_way_points_become_actions_of_the_greatest_length():
+    actions = through([[(0.03, 0.0, 0.0)], [(0.03, 0.0, 0.0155)]], 6, 1)
+    assert actions[:, 0].tolist() == pytest.approx([0.01, 0.01, 0.01, 0, 0, 0])
+    assert actions[:, 2].tolist() == pytest.approx([0, 0, 0, 0.00775, 0.00775, 0])
+    with pytest.raises(ValueError, match="they take 5 actions"):
+        through([[(0.05, 0.0, 0.0)]], 4, 1)
+
+
+@pytest.mark.parametrize(
+    ("name", "idle"),
+    [("coiling", 7.0), ("wrapping", 73.5), ("slingshot", 6.90), ("lifting", 249.0), ("gathering", 39.5)],
+)
+def test_doing_nothing_earns_what_is_published(name: str, idle: float):
+    # Ropes and bodies lie still: the first reward is that of all actions. They fall 2 mm meanwhile and tools keep
+    # what they hold; the bar is 2 %.
+    if name not in TASKS:
+        pytest.skip(f"{name} is not among the tasks")
+    task = small(name, 1)
+    made = episode.prepare(task, 1, like=torch.zeros((), dtype=F64), compiled=False)
+    with torch.no_grad():
+        outcome = episode.play(task, torch.zeros(1, 1, task.width, dtype=F64), episode=made)
+    assert float(outcome.returns) * TASKS[name]().horizon == pytest.approx(idle, rel=0.02)
+
+
+def test_a_rope_torn_between_two_hands_has_failed():
+    made = prepared("unknotting")
+    torn = tree.map(torch.clone, made.start)
+    torn.notes["rest"][1] *= 0.9
+    with torch.no_grad():
+        after = episode.act(made, torn, torch.zeros(2, 12, dtype=F64))
+    assert after.failed.tolist() == [False, True]
+    assert math.isclose(made.task.stretch, 1.05)
+
+
+def test_scores_are_0_for_doing_nothing_and_1_for_the_way_by_hand():
+    task = small("coiling", 1)
+    way = [[(0.004, -0.003, 0.006)]]
+    led_ = type("Led", (type(task),), {"waypoints": lambda self: way, "__doc__": "A task with a way of its own."})
+    task = led_(horizon=1, frames=1)
+    actions = torch.stack([torch.zeros(1, 6, dtype=F64), task.reference(), 0.5 * task.reference()])
+    with torch.no_grad():
+        returns = episode.play(task, actions, compiled=False).returns
+    score = episode.normalized(task, returns, compiled=False)
+    torch.testing.assert_close(score[:2], score.new_tensor([0.0, 1.0]), atol=1e-6, rtol=0)
+    assert 0 < float(score[2]) < 1

@@ -1,0 +1,175 @@
+"""Conditions of success, on shapes that are made to be right and on others that are not quite."""
+
+from __future__ import annotations
+
+import functools
+import itertools
+import math
+
+import pytest
+import torch
+
+from torchdlo.coupling.pose import Pose
+from torchdlo.envs import TASKS
+from torchdlo.envs import wiring_post as wiring
+from torchdlo.envs.solids import c_ring
+from torchdlo.envs.task import Seen, even
+from torchdlo.physics import tree
+
+F64 = torch.float64
+
+
+@functools.cache
+def first(name: str):
+    """The scene of a task at its start."""
+    return TASKS[name]().start(1, like=torch.zeros((), dtype=F64))[2]
+
+
+def judged(name: str, *shapes: torch.Tensor, notes: dict | None = None, bodies: list | None = None, matter=None):
+    """Whether a task has succeeded with each of some shapes of its ropes (V, 3), and positions of its bodies."""
+    state, task = first(name), TASKS[name]()
+    count = max(len(shapes), len(bodies or ()))
+    state = tree.map(lambda x: x.expand(count, *x.shape[1:]).clone(), state)
+    if shapes:
+        state = tree.replace(state, rods=tree.replace(state.rods, pos=torch.stack(shapes)))
+    if bodies:
+        state = tree.replace(state, bodies=tree.replace(state.bodies, pos=torch.stack(bodies)))
+    if matter is not None:
+        state = tree.replace(state, matter=tree.replace(state.matter, pos=matter))
+    arms = task.arms.count
+    tool = Pose(torch.zeros(count, arms, 3, dtype=F64), torch.zeros(count, arms, 4, dtype=F64))
+    seen = Seen(state, tool, torch.ones(count, arms, 1, dtype=F64), notes or {})
+    if notes is None:
+        seen = tree.replace(seen, notes=task.note(seen))
+    return task.success(seen).tolist()
+
+
+def helix(turns: float, off: float, count: int = 60) -> torch.Tensor:
+    """A rope round the cone at a distance from its flank, rising."""
+    dense = torch.linspace(0, 1, 4000, dtype=F64)
+    height = 0.02 + 0.1 * dense
+    radius = 0.12 * (1 - height / 0.30) + off
+    angle = 2 * math.pi * turns * dense
+    return even(torch.stack([radius * angle.cos(), radius * angle.sin(), height], -1), count)
+
+
+def test_coiling_takes_a_whole_turn_near_the_cone():
+    assert judged("coiling", helix(1.1, 0.02), helix(-1.1, 0.02), helix(0.9, 0.02), helix(1.5, 0.12)) == [
+        True,
+        True,
+        False,
+        False,
+    ]
+
+
+def test_wiring_takes_the_right_sides_of_both_posts():
+    goal = wiring.goal()
+    mirrored = goal * goal.new_tensor([1.0, -1.0, 1.0]) + goal.new_tensor([0.0, 0.4, 0.0])
+    line = torch.stack([torch.linspace(0.62, 0.04, 30, dtype=F64), torch.full((30,), 0.2, dtype=F64)], -1)
+    line = torch.cat([line.flip(0), torch.full((30, 1), 0.01, dtype=F64)], -1)
+    near = goal + goal.new_tensor([0.0, 0.0, 0.005])
+    far = goal + goal.new_tensor([0.0, 0.0, 0.03])
+    assert judged("wiring_post", goal, near, far, line, mirrored) == [True, True, False, False, False]
+
+
+def test_the_goal_of_wiring_is_where_the_task_says():
+    goal = wiring.goal()
+    step = (goal[1:] - goal[:-1]).norm(dim=-1)
+    # Chords of an arc of 3 cm that are 2 cm along it: 2 r sin(s / 2 r) = 1.963 cm.
+    assert float(step.min()) > 0.0196 and float(step.max()) < 0.02 + 1e-6
+    assert float((goal[15, :2] - goal.new_tensor(wiring.MIDDLE)).norm()) < 0.005
+    for post, side in zip(wiring.POSTS, (-1, 1), strict=True):
+        apart = (goal[:, :2] - goal.new_tensor(post)).norm(dim=-1)
+        assert float(apart.min()) == pytest.approx(wiring.CLEAR, abs=1.7e-3)
+        assert side * float(goal[apart.argmin(), 1] - post[1]) > 0
+
+
+def band(points: list[tuple[float, float]], height: float = 0.02) -> torch.Tensor:
+    """A loop of 50 vertices about some points in the plane, its first vertex not repeated."""
+    corners = torch.tensor([*points, points[0]], dtype=F64)
+    dense = torch.cat(
+        [torch.lerp(a, b, torch.linspace(0, 1, 500, dtype=F64)[:, None]) for a, b in itertools.pairwise(corners)]
+    )
+    flat = even(torch.cat([dense, torch.full((len(dense), 1), height, dtype=F64)], -1), 51)
+    return flat[:-1]
+
+
+def test_wrapping_takes_all_three_posts():
+    # A triangle 2 cm outside of the posts' axes, seen from their middle.
+    posts = torch.tensor([(0.45, -0.115), (0.45, 0.115), (0.25, 0.0)], dtype=F64)
+    middle = posts.mean(0)
+    out = [tuple((middle + (p - middle) * (1 + 0.024 / (p - middle).norm())).tolist()) for p in posts]
+    two = [out[0], out[1], (0.32, 0.0)]
+    wide = [tuple((middle + (p - middle) * 1.6).tolist()) for p in posts]
+    assert judged("wrapping", band(out), band(out).flip(0), band(two), band(wide), band(out, 0.08)) == [
+        True,
+        True,
+        False,
+        False,
+        False,
+    ]
+
+
+def test_separation_takes_room_between_the_ropes():
+    along = torch.arange(30, dtype=F64) * 0.02
+    one = torch.stack([along, 0 * along, 0.01 + 0 * along], -1)
+
+    def other(gap: float, slope: float) -> torch.Tensor:
+        return torch.cat([one, one + torch.stack([0 * along, gap + slope * along, 0 * along], -1)])
+
+    shapes = [other(0.06, 0.0), other(0.04, 0.0), other(-0.06, 0.2), first("separation").rods.pos[0]]
+    assert judged("separation", *shapes) == [True, False, False, False]
+
+
+def test_unknotting_takes_more_than_an_unknotted_rope():
+    along = torch.arange(50, dtype=F64) * 0.02
+    line = torch.stack([along, 0 * along, 0.01 + 0 * along], -1)
+    # A loop of a long cycloid: one crossing, no knot.
+    angle = torch.linspace(-2.8, 2.8, 50, dtype=F64)
+    curl = torch.stack([0.04 * angle - 0.1 * angle.sin(), 0.1 * angle.cos(), 0.05 + 0.01 * angle], -1)
+    assert judged("unknotting", line, curl, first("unknotting").rods.pos[0]) == [True, False, False]
+
+
+def test_slingshot_takes_a_hit():
+    start = first("slingshot").bodies.pos[0]
+
+    def moved(ball: float, cube: float) -> torch.Tensor:
+        return start + start.new_tensor([[0, 0, 0], [0, ball, 0], [0, cube, 0.0]])
+
+    assert judged("slingshot", bodies=[moved(0.1, 0.06), moved(0.1, 0.04), moved(0.0, 0.06)]) == [True, False, False]
+
+
+def test_lifting_takes_both_rings_for_a_while():
+    heights = torch.full((4, 5, 2), 0.115, dtype=F64)
+    heights[1, 0, 1] = 0.105  # fell below within the last 0.1 s
+    heights[2, :, 0] = 0.06
+    heights[3] = 0.11 + 1e-9
+    shapes = [first("lifting").rods.pos[0]] * 4
+    assert judged("lifting", *shapes, notes={"heights": heights}) == [True, False, False, True]
+
+
+def test_gathering_takes_objects_together_and_hands_clear():
+    state = first("gathering")
+    shapes = [state.rods.pos[0]] * 3
+    ball = state.matter.pos[0] - state.matter.pos[0].mean(0) + state.rods.pos.new_tensor([0.2, 0.0, 0.05])
+    plane = state.bodies.pos[0, 0]
+    close = torch.stack([plane, plane.new_tensor([0.3, 0.0, 0.03]), plane.new_tensor([0.2, 0.11, 0.03])])
+    apart = torch.stack([plane, plane.new_tensor([0.3, 0.0, 0.03]), plane.new_tensor([0.2, 0.18, 0.03])])
+    notes = {"closest": torch.tensor([0.07, 0.07, 0.05], dtype=F64)}
+    matter = ball.expand(3, *ball.shape)
+    assert judged("gathering", *shapes, notes=notes, bodies=[close, apart, close], matter=matter) == [
+        True,
+        False,
+        False,
+    ]
+
+
+def test_c_rings_have_the_mass_of_their_parts_and_stand():
+    ring = c_ring()
+    # Three quarters of a torus with round ends, and a box; they overlap in a thin slice, counted in cells of 1.5 mm.
+    tube = 2 * math.pi**2 * 0.045 * 0.012**2 * 0.75 + 4 / 3 * math.pi * 0.012**3
+    box = 0.04 * 0.06 * 0.008
+    assert float(ring.volume) == pytest.approx(tube + box, rel=0.05)
+    assert abs(float(ring.centre[0])) < 1e-6
+    # The centre of mass is above the foot.
+    assert abs(float(ring.centre[1])) < 0.03

@@ -1,0 +1,67 @@
+"""Coil a rope round a cone.
+
+A straight rope lies behind a cone; one arm holds it near its end. Success: the part of the rope that is near the cone
+turns by a whole turn round its axis.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from torchdlo.coupling.bodies import Solid
+from torchdlo.envs import geometry
+from torchdlo.envs.task import RADIUS, Arms, Seen, Task, make, straight
+from torchdlo.physics.numerics import safe_norm
+from torchdlo.scene import Params, Rope, Scene, State
+
+__all__ = ["Coiling"]
+
+BASE, HEIGHT = 0.12, 0.30
+"""Radius and height of the cone [m]."""
+NEAR = 0.06
+"""Distance from the cone's surface within which the rope counts as wound round it [m]."""
+
+
+@dataclass(frozen=True)
+class Coiling(Task):
+    """Coil a rope round a cone."""
+
+    name: ClassVar[str] = "coiling"
+    arms: ClassVar[Arms] = Arms(base=((-0.25, -0.4, 0.0),), vertex=(1,))
+    spread: ClassVar[tuple[tuple[float, float], ...]] = ((0.05, 0.01),)
+
+    def build(self, moved: Tensor) -> tuple[Scene, Params, State]:
+        """Return the scene; the rope may be moved."""
+        x = straight((-0.6, 0.265, 0.012), 60, moved[:, 0])
+        cone = Solid("cone", (BASE, HEIGHT), (0.0, 0.0, HEIGHT / 4), motion="fixed", mu_s=0.7, mu_k=0.7)
+        return make(self, [Rope(x, RADIUS, mass=0.059, youngs=1e3)], solids=[cone])
+
+    def _missing(self, seen: Seen) -> Tensor:
+        """Return the sum of the vertices' distances to the middle of the cone [m]."""
+        return safe_norm(seen.x - seen.x.new_tensor([0.0, 0.0, HEIGHT / 2])).sum((-1, -2))
+
+    def rewards(self, seen: Seen) -> dict[str, Tensor]:
+        """Return 1 for a rope in the middle of the cone, less the further its vertices are from it."""
+        return {"near": torch.exp(-0.1 * self._missing(seen))}
+
+    def extra(self, seen: Seen) -> dict[str, Tensor]:
+        """Return the distances themselves: the exponential is flat far from the goal."""
+        return {"distance": self._missing(seen)}
+
+    def success(self, seen: Seen) -> Tensor:
+        """Return whether the rope turns by a whole turn within 6 cm of the cone."""
+        return wound(seen.x).abs() >= 2 * math.pi
+
+
+def wound(x: Tensor) -> Tensor:
+    """Return by how much curves turn round the cone where they are near it [rad], shape (...)."""
+    # Distance from the cone's flank, positive outside: its profile leads from (BASE, 0) to (0, HEIGHT).
+    across = 0.5 * (x[..., 1:, :] + x[..., :-1, :])
+    slant = math.hypot(BASE, HEIGHT)
+    out = ((across[..., :2].norm(dim=-1) - BASE) * HEIGHT + across[..., 2] * BASE) / slant
+    return (geometry.turns(x, x.new_zeros(2)) * (out - RADIUS <= NEAR)).sum(-1)

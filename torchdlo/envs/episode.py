@@ -1,0 +1,370 @@
+"""Running tasks: from actions to joints, from joints to the ends that are held, and what an episode earned.
+
+Everything is a function of tensors with the scenes of a batch first; nothing here knows of TensorDict. Actions move the
+target of each tool from the pose that was reached last, inverse kinematics says where the joints go, and in the frames
+of an action the tool moves evenly from pose to pose with what it holds. Arms touch nothing: their links pass through
+ropes and bodies.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchdlo import scene as scenes
+from torchdlo.coupling import grasp, ik
+from torchdlo.coupling.bodies import BodyTargets, turn_between, turn_by
+from torchdlo.coupling.grasp import Grasp, Hands
+from torchdlo.coupling.pose import Pose
+from torchdlo.coupling.robot import Robot, panda
+from torchdlo.envs.task import Seen, Task, combined
+from torchdlo.errors import InputError
+from torchdlo.physics import tree
+from torchdlo.physics.numerics import safe_norm
+from torchdlo.physics.replay import rollout
+from torchdlo.physics.rotation import multiply, rotate
+from torchdlo.scene import Control, Params, Scene, State
+
+__all__ = ["Episode", "Outcome", "World", "act", "begin", "normalized", "observe", "play", "prepare"]
+
+POSTURE = (1.56, -0.72, -0.02, -2.09, 0.04, 1.33, 2.4, 0.0)
+"""Where joints would like to be [rad], and how far the fingers are open [m]."""
+FIND = ik.Search(starts=8)
+"""How hard to look for the joints of the start."""
+FOLLOW = ik.Search(steps=4, closing=2, polish=2)
+"""The same for those of an action, which are near the last ones."""
+ELBOWS = 7
+"""Joints of an arm that are observed."""
+
+
+@tree.struct
+class World:
+    """A running episode: scenes and the arms in them."""
+
+    state: State
+    joints: Tensor
+    """Joints of the arms [rad or m], shape (B, R, J)."""
+    target: Pose
+    """Pose to which the next action is added: the last target, or what was reached of it; (B, R, 3) and (B, R, 4)."""
+    tool: Pose
+    """Where the tools are, (B, R, 3) and (B, R, 4)."""
+    grasp: Grasp
+    notes: dict[str, Tensor]
+    """What the task remembers, shapes (B, ...)."""
+    failed: Tensor
+    """Whether the episode has failed [-], bool, shape (B,)."""
+
+    def seen(self, hands: int) -> Seen:
+        """Return what a task judges."""
+        return Seen(self.state, self.tool, self.grasp.closed[..., :hands, :], self.notes)
+
+
+@tree.struct
+class Outcome:
+    """What episodes came to."""
+
+    returns: Tensor
+    """Sums of rewards [1], shape (B,)."""
+    loss: Tensor
+    """What gradients should descend: minus the return, and what the task adds to it [1], shape (B,)."""
+    success: Tensor
+    """Which episodes reached the goal [-], bool, shape (B,)."""
+    failed: Tensor
+    """Which failed; they earn nothing from then on [-], bool, shape (B,)."""
+    rewards: Tensor
+    """Rewards of the actions [1], shape (T, B)."""
+    terms: dict[str, Tensor]
+    """Terms of the reward by name [1], shape (T, B) each."""
+    world: World
+    """The end."""
+    path: dict[str, Tensor] = field(default_factory=dict)
+    """If asked for: "pos" (T, B, V, 3) of the ropes, "tool" (T, B, R, 3) and "joints" (T, B, R, J)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Episode:
+    """A task with its scene, made for a batch; the parts that stay the same."""
+
+    task: Task
+    scene: Scene
+    params: Params
+    step: Callable[[Params, State, Control], State]
+    """What advances the scene by a frame."""
+    hands: Hands
+    start: World
+    segment: int | None = None
+    """Frames that gradients run again at once, None to keep all of them, see `physics.replay`."""
+
+
+@functools.cache
+def _robot() -> Robot:
+    return panda()
+
+
+def _bases(task: Task, like: Tensor) -> Tensor:
+    return like.new_tensor(task.arms.base)
+
+
+def _solve(task: Task, target: Pose, joints: Tensor, search: ik.Search) -> ik.Solution:
+    """Return where joints bring the tools to their targets. All arms are alike, so they are one more batch axis."""
+    base = _bases(task, joints)
+    wanted = Pose(target.pos - base, target.quat)
+    found = ik.solve(_robot(), wanted, joints, search=search, posture=joints.new_tensor(POSTURE))
+    moved = [Pose(p.pos + base, p.quat) for p in (found.pose, found.handed)]
+    return tree.replace(found, pose=moved[0], handed=moved[1])
+
+
+def _begin(task: Task, scene: Scene, state: State, hands: Hands) -> World:
+    """Return the world before the first action: tools stand at what they hold."""
+    x = state.rods.pos
+    pos = x[:, list(task.arms.vertex)]
+    quat = x.new_tensor(task.arms.quats)
+    target = Pose(pos, (quat / quat.norm(dim=-1, keepdim=True)).expand(*pos.shape[:-1], 4))
+    joints = x.new_tensor(POSTURE).expand(*pos.shape[:-1], len(POSTURE))
+    found = tree.detach(_solve(task, target, joints, FIND))
+    if not bool(found.converged.all()):
+        far = found.missing.reshape(-1, 2).amax(0)
+        raise InputError(
+            f"{task.name}: an arm cannot reach the vertex that it is to hold, by {1e3 * far[0]:.0f} mm and "
+            f"{math.degrees(far[1]):.1f} degrees; place its base or the rope nearer to each other."
+        )
+    closed = torch.ones_like(pos[..., :1])
+    held = grasp.weld(scene, hands, scenes.hold(scene, state), target, closed)
+    failed = torch.zeros(x.shape[0], dtype=torch.bool, device=x.device)
+    world = World(state, found.joints, target, target, held, {}, failed)
+    seen = world.seen(task.arms.count)
+    return tree.replace(world, notes={"rest": task.rest(seen), **task.note(seen)})
+
+
+def begin(episode: Episode, state: State) -> World:
+    """Return the world of an episode whose scenes start in a state, shape (B, ...)."""
+    return _settled(episode, _begin(episode.task, episode.scene, state, episode.hands))
+
+
+def _settled(episode: Episode, world: World) -> World:
+    """Return the world after the frames before the first action."""
+    count = episode.task.settle
+    if not count:
+        return world
+    state = _run(episode, world, world.tool, world.grasp, count)
+    return tree.replace(world, state=state)
+
+
+def prepare(
+    task: Task,
+    num: int,
+    *,
+    like: Tensor | None = None,
+    generator: torch.Generator | None = None,
+    variation: bool = False,
+    compiled: bool = True,
+    segment: int | None = None,
+) -> Episode:
+    """Return an episode of a task for a batch.
+
+    Args:
+        task: the task.
+        num: scenes in the batch.
+        like: a tensor of the dtype and device that they get; float32 on the CPU if not given.
+        generator: where random numbers come from.
+        variation: whether starts differ.
+        compiled: whether to compile steps, see `scene.stepper`.
+        segment: frames that gradients run again at once; None keeps all of them in memory.
+    """
+    scene, params, state = task.start(num, like=like, generator=generator, variation=variation)
+    fixed = len(scene.held_vertices) - task.arms.count
+    hands = Hands(task.arms.count, (*range(task.arms.count), *[-1] * fixed))
+    step = scenes.stepper(scene, compiled=compiled)
+    world = _begin(task, scene, state, hands)
+    episode = Episode(task, scene, params, step, hands, world, segment)
+    return episode if not task.settle else _replaced(episode, _settled(episode, world))
+
+
+def _replaced(episode: Episode, start: World) -> Episode:
+    return Episode(episode.task, episode.scene, episode.params, episode.step, episode.hands, start, episode.segment)
+
+
+def _run(episode: Episode, world: World, tool: Pose, held: Grasp, count: int) -> State:
+    """Return the scenes after frames in which the tools move evenly to their poses."""
+    x = world.tool.pos
+    share = torch.linspace(0, 1, count + 1, dtype=x.dtype, device=x.device)[1:].reshape(-1, 1, 1, 1)
+    turn = turn_between(world.tool.quat, tool.quat)
+    last = world.tool.quat.expand(count, *world.tool.quat.shape)
+    poses = Pose(x + share * (tool.pos - x), multiply(turn_by(share * turn), last))
+    pos, director, grip = grasp.carry(episode.hands, held, poses)
+    bodies: Any = ()
+    if episode.scene.bodies:
+        still = scenes.hold(episode.scene, world.state).bodies
+        bodies = BodyTargets(*(p.expand(count, *p.shape) for p in (still.pos, still.quat)))
+    grip = {name: g.expand(count, *g.shape) for name, g in grip.items()}
+    controls = Control(pos, director.expand(count, *director.shape[-3:]), grip, bodies)
+    none = tree.leaves(world.state)[0][..., :0, :0]
+    state, _ = rollout(
+        episode.step, episode.params, world.state, controls, segment=episode.segment, keep=lambda _: none
+    )
+    return state
+
+
+def limited(task: Task, action: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the ways [m] and turns [rad] of the tools that an action (B, A) asks for, (B, R, 3) each.
+
+    Ways that are too long keep their direction.
+    """
+    if action.shape[-1] != task.width:
+        raise ValueError(
+            f"{task.name}: actions have {action.shape[-1]} components; expected {task.width}: ways of "
+            f"{task.arms.count} tools in x, y, z [m], then their turns about x, y, z [degrees]"
+        )
+    way, turn = action.unflatten(-1, (2, task.arms.count, 3)).unbind(-3)
+    far = safe_norm(way)
+    way = way * torch.where(far > task.reach, task.reach / torch.where(far > 0, far, 1.0), 1.0)
+    return way, torch.deg2rad(turn.clamp(-task.twist, task.twist))
+
+
+def _aim(task: Task, world: World, action: Tensor) -> Pose:
+    """Return the poses that an action asks the tools to take."""
+    way, turn = limited(task, action)
+    pos = world.target.pos + way
+    # A tool that starts lower is not lifted by the rule, but may not go down.
+    least = world.target.pos[..., 2:].detach().clamp(max=task.floor)
+    height = torch.where(pos[..., 2:] >= least, pos[..., 2:], least)
+    quat = multiply(world.target.quat, turn_by(turn))
+    return Pose(torch.cat([pos[..., :2], height], -1), quat / quat.square().sum(-1, keepdim=True).sqrt())
+
+
+def _slipped(task: Task, state: State, tool: Pose, closed: Tensor) -> Tensor:
+    """Return how firmly hands still hold: those whose friction was not enough in the last frame are open."""
+    if math.isinf(task.arms.squeeze):
+        return closed
+    force = state.reaction.force[..., : task.arms.count, :]
+    normal = rotate(tool.quat, force.new_tensor([0.0, 1.0, 0.0]).expand_as(force))
+    along = force - normal * (force * normal).sum(-1, keepdim=True)
+    return torch.where(safe_norm(along) > 2 * task.arms.mu * task.arms.squeeze, 0.0, closed)
+
+
+def act(episode: Episode, world: World, action: Tensor) -> World:
+    """Return the world after an action, shape (B, A) in metres and degrees; see `Task.width`.
+
+    Scenes that are no longer finite stay as they were and have failed.
+    """
+    task = episode.task
+    found = _solve(task, _aim(task, world, action), world.joints, FOLLOW)
+    state = _run(episode, world, found.pose, world.grasp, task.frames)
+    closed = _slipped(task, state, found.pose, world.grasp.closed)
+    held = tree.replace(world.grasp, closed=closed)
+    after = World(state, found.joints, found.handed, found.pose, held, world.notes, world.failed)
+    return _judged(task, world, after)
+
+
+def _judged(task: Task, before: World, after: World) -> World:
+    """Return the new world with its notes and failures, and the old one where the new one is not finite."""
+    good = scenes.finite(after.state)
+    after = tree.where(good, after, before)
+    seen = after.seen(task.arms.count)
+    after = tree.replace(after, notes={"rest": before.notes["rest"], **task.note(seen)})
+    seen = after.seen(task.arms.count)
+    torn = task.rest(seen) > task.stretch * seen.notes["rest"]
+    return tree.replace(after, failed=before.failed | ~good | torn | task.failed(seen))
+
+
+def finish(episode: Episode, world: World) -> World:
+    """Return the world after the hands have opened at the end, for tasks that ask for it."""
+    task = episode.task
+    if not task.release:
+        return world
+    held = tree.replace(world.grasp, closed=torch.zeros_like(world.grasp.closed))
+    state = _run(episode, world, world.tool, held, task.release)
+    return _judged(task, world, tree.replace(world, state=state, grasp=held))
+
+
+def earned(episode: Episode, world: World) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
+    """Return the reward of the last action, its loss, and the terms of the reward, shape (B,) each."""
+    task, seen = episode.task, world.seen(episode.task.arms.count)
+    terms = task.rewards(seen)
+    reward = combined(task, terms)
+    loss = sum(task.extra(seen).values(), -reward)
+    nothing = torch.zeros_like(reward)
+    return torch.where(world.failed, nothing, reward), torch.where(world.failed, nothing, loss), terms
+
+
+def observe(episode: Episode, world: World) -> Tensor:
+    """Return observations in single precision, shape (B, O).
+
+    Positions and velocities of vertices, of free bodies and of the middle of matter; then positions, orientations and
+    joint angles of the arms.
+    """
+    state = world.state
+    parts = [state.rods.pos, state.rods.vel]
+    free = [k for k, body in enumerate(episode.scene.bodies) if body.motion == "free"]
+    if free:
+        parts += [state.bodies.pos[:, free], state.bodies.vel[:, free]]
+    if state.matter:
+        parts += [state.matter.pos.mean(-2, keepdim=True), state.matter.vel.mean(-2, keepdim=True)]
+    parts += [world.tool.pos, world.tool.quat, world.joints[..., :ELBOWS]]
+    return torch.cat([p.flatten(-2) for p in parts], -1).to(torch.float32)
+
+
+def play(
+    task: Task,
+    actions: Tensor,
+    *,
+    episode: Episode | None = None,
+    keep_path: bool = False,
+    callback: Callable[[int, int], None] | None = None,
+    **choices: Any,
+) -> Outcome:
+    """Return what actions earn, with gradients with respect to them.
+
+    Args:
+        task: the task.
+        actions: shape (B, T, A), in metres and degrees; one sequence per scene of the batch. They need not be as many
+            as the task's horizon.
+        episode: what `prepare` returned for B scenes; made if not given.
+        keep_path: whether to return where ropes, tools and joints were after every action.
+        callback: told (actions done, actions in all) after each.
+        choices: of `prepare`.
+    """
+    if actions.dim() != 3 or 0 in actions.shape:
+        raise ValueError(f"{task.name}: actions are {tuple(actions.shape)}; expected (scenes, actions, {task.width})")
+    episode = episode or prepare(task, len(actions), like=actions.detach(), **choices)
+    world, count, rows, path = episode.start, actions.shape[1], [], []
+    if len(world.joints) != len(actions):
+        raise ValueError(f"{task.name}: {len(actions)} sequences for an episode of {len(world.joints)} scenes")
+    for k in range(count):
+        world = act(episode, world, actions[:, k])
+        if k + 1 == count:
+            world = finish(episode, world)
+        rows.append(earned(episode, world))
+        if keep_path:
+            path.append({"pos": world.state.rods.pos, "tool": world.tool.pos, "joints": world.joints})
+        if callback is not None:
+            callback(k + 1, count)
+    rewards, losses, terms = tree.stack(rows)
+    seen = world.seen(task.arms.count)
+    success = task.success(seen) & ~world.failed
+    kept = tree.stack(path) if keep_path else {}
+    return Outcome(rewards.sum(0), losses.sum(0), success, world.failed, rewards, terms, world, kept)
+
+
+def normalized(task: Task, returns: Tensor, **choices: Any) -> Tensor:
+    """Return scores of episodes: 0 for doing nothing, 1 for the way by hand of `Task.reference`, shape of `returns`.
+
+    Both are played for it, which takes as long as an episode of two scenes.
+
+    Args:
+        task: the task.
+        returns: returns of episodes from its one start, without variation.
+        choices: of `prepare`.
+    """
+    way = task.reference().to(returns)
+    if not bool((way != 0).any()):
+        raise ValueError(f"{task.name}: has no way by hand to compare with; give it `waypoints`")
+    with torch.no_grad():
+        idle, best = play(task, torch.stack([torch.zeros_like(way), way]), **choices).returns.to(returns)
+    return (returns - idle) / (best - idle)

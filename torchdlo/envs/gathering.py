@@ -1,0 +1,100 @@
+"""Gather three objects with a rope.
+
+A soft plastic ball, a pebble and a cylinder lie between two arms and the rope whose ends they hold. Success: all three
+are within 16 cm of each other, and no hand came within 6 cm of one.
+
+The ball is matter, which meets the rope and the floor but passes through the other two, as matter does not meet rigid
+bodies here.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from torchdlo.coupling.bodies import Solid
+from torchdlo.coupling.laws import Plastic
+from torchdlo.coupling.particles import Blob, Grid, assemble, fill_ball
+from torchdlo.envs import geometry
+from torchdlo.envs.solids import pebble
+from torchdlo.envs.task import RADIUS, Arms, Seen, Task, make, straight
+from torchdlo.physics.numerics import safe_norm
+from torchdlo.scene import Params, Rope, Scene, State
+
+__all__ = ["Gathering"]
+
+FINE, CELL = 0.0064, 0.01
+"""Distance of particles and spacing of the grid [m]."""
+BALL, PEBBLE, CYLINDER = (0.25, 0.02, 0.07), (0.5, -0.05, 0.07), (0.08, -0.08, 0.025)
+"""Where the objects start [m]."""
+BOX = Grid((-0.4, -0.6, 0.0), (0.9, 0.4, 0.4), CELL, ("open", "open", "open", "open", "separate", "open"), (26, 26, 26))
+"""Where matter may be. The window follows the ball: 26 nodes are twice its width."""
+
+
+@dataclass(frozen=True)
+class Gathering(Task):
+    """Gather three objects with a rope."""
+
+    name: ClassVar[str] = "gathering"
+    arms: ClassVar[Arms] = Arms(base=((-0.2, -0.63, 0.0), (0.5, -0.63, 0.0)), vertex=(1, 43), squeeze=10.0)
+    combine: ClassVar[str] = "product"
+    stretch: ClassVar[float] = 1.1
+    spread: ClassVar[tuple[tuple[float, float], ...]] = ((0.025, 0.0),) * 3
+
+    def build(self, moved: Tensor) -> tuple[Scene, Params, State]:
+        """Return the scene; each of the objects may be moved."""
+        x = straight((-0.15, 0.1, 0.012), 45, moved.new_zeros(len(moved), 3))
+        rope = Rope(x, RADIUS, mass=0.44, youngs=1e3, stretch=1e5 * math.pi * RADIUS**2)
+        rub = {"mu_s": 0.3, "mu_k": 0.3, "density": 600.0}
+        at = [moved[:, k] + moved.new_tensor(p) for k, p in enumerate((BALL, PEBBLE, CYLINDER))]
+        solids = [
+            Solid("plane", motion="fixed", mu_s=0.3, mu_k=0.3),
+            pebble().solid(at[1].double(), name="pebble", **rub),
+            Solid("cylinder", (0.05, 0.025), at[2], **rub),
+        ]
+        points = fill_ball((0.0, 0.0, 0.0), 0.05, FINE, moved) + at[0][:, None]
+        numbers = {"youngs": 1e5, "poisson": 0.3, "yield_stress": 1e3, "density": 1000.0}
+        matter = assemble([Blob(points, Plastic(), FINE**3, numbers=numbers)], BOX)
+        values = {"damping": {"rate": 15.0, "twist_rate": 10.0}}
+        return make(self, [rope], values=values, solids=solids, matter=matter)
+
+    def _objects(self, seen: Seen) -> Tensor:
+        """Return the centres of the objects [m], shape (B, 3, 3)."""
+        return torch.cat([seen.state.matter.pos.mean(-2, keepdim=True), seen.state.bodies.pos[:, 1:]], -2)
+
+    def _hands(self, seen: Seen) -> Tensor:
+        """Return the distances of the hands to their nearest objects [m], shape (B, 2)."""
+        return geometry.nearest(seen.tool.pos, self._objects(seen))
+
+    def rewards(self, seen: Seen) -> dict[str, Tensor]:
+        """Return exponentials of how far objects are from each other and from the rope, and of hands too close."""
+        objects = self._objects(seen)
+        apart = geometry.distances(objects, objects.roll(1, -2)).diagonal(dim1=-2, dim2=-1).sum(-1)
+        return {
+            "together": torch.exp(-apart),
+            "rope": torch.exp(-0.1 * geometry.nearest(objects, seen.x).sum(-1)),
+            "clear": torch.exp(-100 * (0.1 - self._hands(seen)).clamp(min=0).sum(-1)),
+        }
+
+    def extra(self, seen: Seen) -> dict[str, Tensor]:
+        """Return how far the hands are from each other: far from the objects, nothing else tells the way."""
+        return {"span": 0.1 * safe_norm(seen.tool.pos[:, 0] - seen.tool.pos[:, 1]).squeeze(-1)}
+
+    def note(self, seen: Seen) -> dict[str, Tensor]:
+        """Return how close hands came to objects so far [m], shape (B,)."""
+        now = self._hands(seen).amin(-1)
+        return {"closest": torch.minimum(now, seen.notes.get("closest", now))}
+
+    def failed(self, seen: Seen) -> Tensor:
+        """Return whether a hand has lost the rope."""
+        return (seen.closed == 0).any(-1).any(-1)
+
+    def success(self, seen: Seen) -> Tensor:
+        """Return whether the objects are together and no hand came too close."""
+        objects = self._objects(seen)
+        together = geometry.distances(objects, objects).amax((-1, -2)) <= 0.16
+        return together & (seen.notes["closest"] >= 0.06)

@@ -1,0 +1,78 @@
+"""Lift two rings with one rope.
+
+Two open rings stand upright on small feet, their gaps towards the arms; the rope lies behind them. Success: both have
+been 5 cm or more above their start for 0.1 s.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from torchdlo.coupling.bodies import Solid
+from torchdlo.envs import geometry
+from torchdlo.envs.solids import c_ring, origin
+from torchdlo.envs.task import RADIUS, Arms, Seen, Task, make, straight
+from torchdlo.physics.numerics import safe_norm
+from torchdlo.scene import Params, Rope, Scene, State
+
+__all__ = ["Lifting"]
+
+CENTRES = ((0.53, 0.0, 0.06), (0.67, 0.0, 0.06))
+"""Where the rings' centres are at the start [m]."""
+LIFT = 0.05
+"""By how much rings are to be lifted [m]."""
+LATE = 5
+"""Actions at the end that count: 0.1 s."""
+
+
+@dataclass(frozen=True)
+class Lifting(Task):
+    """Lift two rings with one rope."""
+
+    name: ClassVar[str] = "lifting"
+    arms: ClassVar[Arms] = Arms(base=((0.25, -0.4, 0.0), (0.95, -0.4, 0.0)), vertex=(4, 25))
+    stretch: ClassVar[float] = 1.1
+    spread: ClassVar[tuple[tuple[float, float], ...]] = ((0.05, 0.025),)
+
+    def build(self, moved: Tensor) -> tuple[Scene, Params, State]:
+        """Return the scene; the rope may be moved."""
+        x = straight((0.3, 0.1, 0.012), 30, moved[:, 0])
+        rope = Rope(x, RADIUS, mass=0.029, youngs=5e3, stretch=1e5 * math.pi * RADIUS**2)
+        rub = {"mu_s": 0.6, "mu_k": 0.6}
+        rings = [c_ring().solid(p, density=120.0, name=f"ring {k}", **rub) for k, p in enumerate(CENTRES)]
+        return make(self, [rope], solids=[Solid("plane", motion="fixed", **rub), *rings])
+
+    def _rings(self, seen: Seen) -> Tensor:
+        """Return the centres of the rings [m], shape (B, 2, 3)."""
+        return torch.stack([origin(c_ring(), seen.state.bodies, k) for k in (1, 2)], -2)
+
+    def rewards(self, seen: Seen) -> dict[str, Tensor]:
+        """Return how high the rings are, how near and how far below the rope is, and how close hands come to them."""
+        rings = self._rings(seen)
+        apart = geometry.distances(rings, seen.x)
+        near, which = apart.min(-1)
+        above = torch.take_along_dim(seen.x[..., 2], which, -1) - rings[..., 2]
+        close = (0.08 - safe_norm(seen.tool.pos - rings).squeeze(-1)).clamp(min=0)
+        return {
+            "present": torch.full_like(near[:, 0], 2.0),
+            "height": 5.0 * rings[..., 2].sum(-1),
+            "carried": 0.5 * above.clamp(0.0, 0.03).sum(-1),
+            "near": -0.5 * near.sum(-1),
+            "clear": -100.0 * close.sum(-1),
+        }
+
+    def note(self, seen: Seen) -> dict[str, Tensor]:
+        """Return the heights of the rings after the last actions, shape (B, 5, 2)."""
+        now = self._rings(seen)[:, None, :, 2]
+        last = seen.notes.get("heights", now.expand(-1, LATE, -1))
+        return {"heights": torch.cat([last[:, 1:], now], 1)}
+
+    def success(self, seen: Seen) -> Tensor:
+        """Return whether both rings stayed up for the last 0.1 s."""
+        start = seen.x.new_tensor([c[2] for c in CENTRES])
+        return (seen.notes["heights"] >= start + LIFT).all(-1).all(-1)

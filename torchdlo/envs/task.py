@@ -1,0 +1,313 @@
+"""What a manipulation task is: a scene, arms that hold ropes, a reward, and when it has succeeded or failed.
+
+A task is a frozen dataclass without tensors. `episode` runs it, `env` offers it to TorchRL.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import ClassVar, Literal
+
+import torch
+from torch import Tensor
+
+from torchdlo import scene as scenes
+from torchdlo.coupling import BodyContact, RodBody, RodContact, RodMatter
+from torchdlo.coupling.bodies import Solid
+from torchdlo.coupling.pose import Pose
+from torchdlo.envs import geometry
+from torchdlo.physics import tree
+from torchdlo.physics.effect import Effect
+from torchdlo.physics.effects.elastic import Bend, Stretch
+from torchdlo.physics.effects.field import Damping, Gravity
+from torchdlo.physics.effects.table import Table, TableFriction
+from torchdlo.scene import Params, Rope, Scene, State
+
+__all__ = [
+    "DOWN",
+    "RADIUS",
+    "SPACING",
+    "Arms",
+    "Seen",
+    "Task",
+    "combined",
+    "even",
+    "make",
+    "raised",
+    "settled",
+    "straight",
+    "through",
+]
+
+RADIUS, SPACING = 0.01, 0.02
+"""Radius of all ropes and distance of their vertices [m]."""
+DOWN = (0.0, 1.0, 0.0, 0.0)
+"""Orientation of a tool that points straight down, (w, x, y, z)."""
+
+
+@dataclass(frozen=True)
+class Arms:
+    """The arms of a task, one entry each. They stand still and hold one vertex each from the start."""
+
+    base: tuple[tuple[float, float, float], ...]
+    """Where they stand [m]."""
+    vertex: tuple[int, ...]
+    """What they hold, slots on the vertex axis of the scene."""
+    quat: tuple[tuple[float, float, float, float], ...] = ()
+    """Orientations of the tools at the start, straight down if not given."""
+    squeeze: float = math.inf
+    """Force of each finger [N]. A hand loses the rope where holding it along its fingers takes more than friction of
+    both can exert, 2 mu times this; infinite: never."""
+    mu: float = 0.5
+    """Coefficient of friction between fingers and rope [1]."""
+
+    @property
+    def count(self) -> int:
+        """How many arms there are."""
+        return len(self.base)
+
+    @property
+    def quats(self) -> tuple[tuple[float, float, float, float], ...]:
+        """Orientations of all tools at the start."""
+        return self.quat or (DOWN,) * self.count
+
+
+@tree.struct
+class Seen:
+    """What rewards, success and failure are judged by, after an action."""
+
+    state: State
+    tool: Pose
+    """Where the tools are: positions (B, R, 3) and orientations (B, R, 4)."""
+    closed: Tensor
+    """1 for hands that hold, 0 for those that are open or lost the rope [1], shape (B, R, 1)."""
+    notes: dict[str, Tensor]
+    """What the task remembers since the start, see `Task.note`; shapes (B, ...)."""
+
+    @property
+    def x(self) -> Tensor:
+        """Positions of all vertices [m], shape (B, V, 3)."""
+        return self.state.rods.pos
+
+
+@dataclass(frozen=True)
+class Task(ABC):
+    """A task. Subclasses are final; what they leave as it is here is a rule of all tasks."""
+
+    horizon: int = 100
+    """Actions in an episode."""
+    frames: int = 20
+    """Steps of the scene per action."""
+    settle: int = 0
+    """Steps before the first action."""
+    release: int = 0
+    """Steps after the last action with open hands; the last reward is the one after them."""
+
+    name: ClassVar[str]
+    """Its name in `envs.TASKS`."""
+    arms: ClassVar[Arms]
+    combine: ClassVar[Literal["sum", "product"]] = "sum"
+    """How the terms of `rewards` make the one reward."""
+    floor: ClassVar[float] = 0.03
+    """Height below which tools are not led [m]."""
+    reach: ClassVar[float] = 0.01
+    """Greatest way of a tool in an action [m]."""
+    twist: ClassVar[float] = 0.1
+    """Greatest turn of a tool in an action about each of its axes [degrees]."""
+    stretch: ClassVar[float] = math.inf
+    """Length of the rope between the hands over that at the start, above which an episode has failed [1]."""
+    spread: ClassVar[tuple[tuple[float, float], ...]] = ((0.0, 0.0),)
+    """By how much each of the things that `build` can move is moved in x and in y at most [m]."""
+
+    @property
+    def width(self) -> int:
+        """Components of an action: ways of all tools (x, y, z in the world) [m], then their turns about x, y, z of the
+        tool [degrees]."""
+        return 6 * self.arms.count
+
+    @property
+    def limit(self) -> tuple[float, ...]:
+        """Greatest magnitude of each component of an action."""
+        return (self.reach,) * (3 * self.arms.count) + (self.twist,) * (3 * self.arms.count)
+
+    @abstractmethod
+    def build(self, moved: Tensor) -> tuple[Scene, Params, State]:
+        """Return the scene at its start, in the dtype and on the device of `moved`.
+
+        Args:
+            moved: how far the things of `spread` are off their places [m], shape (B, things, 3).
+        """
+
+    @abstractmethod
+    def rewards(self, seen: Seen) -> dict[str, Tensor]:
+        """Return the named terms of the reward of an action, shape (B,) each."""
+
+    @abstractmethod
+    def success(self, seen: Seen) -> Tensor:
+        """Return which episodes have reached the goal, judged at their end, bool, shape (B,)."""
+
+    def extra(self, seen: Seen) -> dict[str, Tensor]:
+        """Return what the loss of an action has beside the reward's negative, shape (B,) each."""
+        return {}
+
+    def note(self, seen: Seen) -> dict[str, Tensor]:
+        """Return what is to be remembered, asked at the start (without notes) and after every action."""
+        return {}
+
+    def failed(self, seen: Seen) -> Tensor:
+        """Return which episodes have failed for good, bool, shape (B,)."""
+        return torch.zeros(seen.x.shape[0], dtype=torch.bool, device=seen.x.device)
+
+    def waypoints(self) -> Sequence[Sequence[tuple[float, float, float]]]:
+        """Return a way to the goal by hand: per point, how far each tool is from its start [m]."""
+        return ()
+
+    def start(
+        self, num: int, *, like: Tensor | None = None, generator: torch.Generator | None = None, variation: bool = False
+    ) -> tuple[Scene, Params, State]:
+        """Return the scene with `num` starts.
+
+        Args:
+            num: how many.
+            like: a tensor of the dtype and device that it gets; float32 on the CPU if not given.
+            generator: where random numbers come from.
+            variation: whether starts differ from each other, by as much as `spread` says.
+        """
+        like = torch.zeros(()) if like is None else like
+        moved = like.new_zeros(num, len(self.spread), 3)
+        if variation:
+            random = torch.rand(num, len(self.spread), 2, generator=generator, dtype=torch.float64)
+            away = (2 * random - 1).to(like) * like.new_tensor(self.spread)
+            moved = torch.cat([away, moved[..., 2:]], -1)
+        return self.build(moved)
+
+    def reference(self) -> Tensor:
+        """Return the actions that lead the tools along `waypoints`, evenly, shape (horizon, width)."""
+        return through(self.waypoints(), self.horizon, self.arms.count)
+
+    def rest(self, seen: Seen) -> Tensor:
+        """Return the length of the rope between two hands [m], shape (B,); ones if there are not two on one rope."""
+        if self.arms.count < 2 or not math.isfinite(self.stretch):
+            return torch.ones_like(seen.x[:, 0, 0])
+        a, b = sorted(self.arms.vertex)
+        return geometry.length(seen.x[:, a : b + 1])
+
+
+def combined(task: Task, terms: dict[str, Tensor]) -> Tensor:
+    """Return the one reward that terms make, shape (B,)."""
+    parts = torch.stack(list(terms.values()))
+    return parts.sum(0) if task.combine == "sum" else parts.prod(0)
+
+
+def straight(start: tuple[float, float, float], count: int, moved: Tensor) -> Tensor:
+    """Return vertices of a rope along +x, shape (B, count, 3); `moved` is how far off it is, shape (B, 3)."""
+    along = torch.arange(count, dtype=moved.dtype, device=moved.device) * SPACING
+    line = torch.stack([along, 0 * along, 0 * along], -1) + moved.new_tensor(start)
+    return line + moved.unsqueeze(-2)
+
+
+def through(points: Sequence[Sequence[tuple[float, float, float]]], horizon: int, arms: int) -> Tensor:
+    """Return actions that lead tools through points and then keep them there, shape (horizon, 6 arms).
+
+    Every leg takes actions in proportion to the longest way of a tool on it.
+
+    Args:
+        points: how far the tools are from their starts [m], one row of points per leg, one point per tool.
+        horizon: actions in all.
+        arms: tools.
+    """
+    way = torch.tensor([[(0.0, 0.0, 0.0)] * arms, *points], dtype=torch.float64)
+    legs = way[1:] - way[:-1]
+    need = [max(1, math.ceil(float(leg.norm(dim=-1).max()) / Task.reach - 1e-9)) for leg in legs]
+    if sum(need) > horizon:
+        raise ValueError(f"way-points: they take {sum(need)} actions of {Task.reach} m; expected at most {horizon}")
+    rows = [(leg / n).flatten().expand(n, -1) for leg, n in zip(legs, need, strict=True)]
+    xyz = torch.cat([*rows, way.new_zeros(horizon - sum(need), 3 * arms)])
+    return torch.cat([xyz, torch.zeros_like(xyz)], -1)
+
+
+def make(
+    task: Task,
+    ropes: Sequence[Rope],
+    effects: Sequence[Effect] = (),
+    values: dict[str, dict[str, float]] | None = None,
+    *,
+    solids: Sequence[Solid] = (),
+    fixed: Sequence[int] = (),
+    matter: tuple = (),
+    held: Sequence[int] | None = None,
+) -> tuple[Scene, Params, State]:
+    """Return a scene with what all tasks share: 1 ms in five substeps, gravity, damping, friction, a floor at z = 0.
+
+    A scene without a plane among its solids has a table as its floor, which is cheaper. Velocities decay by 30 1/s and
+    ropes do not resist twisting: ropes with free ends that are held at points do not twist, and those of tasks have no
+    inertia about their axis.
+
+    Args:
+        task: the task.
+        ropes: its ropes; those with a finite stiffness in stretch are elastic, else they are inextensible.
+        effects: what acts on ropes beside elasticity, gravity, damping and contact.
+        values: numbers that differ from those of all tasks.
+        solids: its bodies.
+        fixed: vertices that stay in their places, beside those that arms hold.
+        matter: its matter, as `coupling.particles.assemble` returns it.
+        held: vertices that can be held at all, if others than those of the arms.
+    """
+    elastic = all(isinstance(r.stretch, Tensor) or math.isfinite(r.stretch) for r in ropes)
+    floor = not any(s.shape == "plane" for s in solids)
+    room = 3 * sum(r.positions.shape[-2] for r in ropes)
+    acting: list[Effect] = [Gravity(), Damping(), RodContact(sweeps=5, room=room), *effects]
+    if not any(e.frame_bending for e in effects):
+        acting.append(Bend())
+    numbers = {"damping": {"rate": 30.0, "twist_rate": 20.0}, "rod_contact": {"mu_s": 0.3, "mu_k": 0.25}}
+    if elastic:
+        acting.append(Stretch())
+    if floor:
+        acting += [Table(), TableFriction()]
+        numbers["table_friction"] = {"mu": 0.3}
+    if solids:
+        acting.append(RodBody())
+    if any(s.motion == "free" for s in solids):
+        acting.append(BodyContact())
+    if matter:
+        acting.append(RodMatter())
+    for name, given in (values or {}).items():
+        numbers[name] = numbers.get(name, {}) | given
+    at = (*(task.arms.vertex if held is None else held), *fixed)
+    return scenes.make(
+        ropes, acting, numbers, bodies=solids, matter=matter, held_vertices=at, constrained=not elastic, substeps=5
+    )
+
+
+def settled(made: tuple[Scene, Params, State], frames: int) -> Tensor:
+    """Return where vertices of a single scene, shape (1, V, 3), are after some frames with nothing held."""
+    scene, params, state = made
+    control = scenes.hold(scene, state)
+    control = tree.replace(control, grip={"vertices": torch.zeros_like(control.pos[..., :1])})
+    with torch.no_grad():
+        for _ in range(frames):
+            state = scenes.step(scene, params, state, control)
+    scenes.check_state(state)
+    return state.rods.pos[0].clone()
+
+
+def raised(flat: Tensor, places: Tensor, width: float = 1.7) -> Tensor:
+    """Return a curve that lies on the floor, shape (V, 3), and passes over others at places, counted in vertices.
+
+    There it rises by a little more than the diameter, over about `width` vertices on either side.
+    """
+    index = torch.arange(len(flat), dtype=flat.dtype)[:, None]
+    rise = torch.exp(-((index - places) / width).square()).sum(-1, keepdim=True)
+    return even(torch.cat([flat[:, :2], RADIUS * (1.05 + 2.6 * rise)], -1), len(flat))
+
+
+def even(curve: Tensor, count: int) -> Tensor:
+    """Return `count` vertices along a dense curve (n, 3), at even distances along it."""
+    along = torch.cat([curve.new_zeros(1), (curve[1:] - curve[:-1]).norm(dim=-1).cumsum(0)])
+    wanted = torch.linspace(0, 1, count, dtype=curve.dtype) * along[-1]
+    k = torch.searchsorted(along, wanted).clamp(1, len(along) - 1)
+    share = ((wanted - along[k - 1]) / (along[k] - along[k - 1]))[:, None]
+    return (1 - share) * curve[k - 1] + share * curve[k]
