@@ -144,7 +144,8 @@ def _job(bench: Bench, base: Fitted, score: Score, iterations: int) -> Fit:
         row[columns] = base.space.to_values(base.space.clip(raw))
         for name, value in dose.items():
             row[model.parameters.index(name)] = value
-    used = [n.name for n in library.numbers(score.name, bench.recording) if n.name in score.dose]
+    # All that any dose uses: a wind may turn from where the best dose blows.
+    used = [n.name for n in library.numbers(score.name, bench.recording) if n.name in score.sizes]
     sizes: tuple[Any, ...] = (*base.space.units, *(score.sizes[n] for n in used))
     return Fit(effects, values, (*base.space.names, *used), sizes, iterations, bench.starts["train"], keep=1)
 
