@@ -126,8 +126,11 @@ def _begin(task: Task, scene: Scene, state: State, hands: Hands) -> World:
     pos = x[:, list(task.arms.vertex)]
     quat = x.new_tensor(task.arms.quats)
     target = Pose(pos, (quat / quat.norm(dim=-1, keepdim=True)).expand(*pos.shape[:-1], 4))
-    joints = x.new_tensor(POSTURE).expand(*pos.shape[:-1], len(POSTURE))
-    found = tree.detach(_solve(task, target, joints, FIND))
+    # An arm that faces its tool has the most room to move; contorted ones may be nearer to the posture.
+    posture, off = x.new_tensor(POSTURE).expand(*pos.shape[:-1], -1), pos - _bases(task, x)
+    facing = torch.cat([torch.atan2(off[..., 1:2], off[..., :1]), posture[..., 1:]], -1)
+    plain, found = (tree.detach(_solve(task, target, *guess)) for guess in ((facing, ik.Search()), (posture, FIND)))
+    found = tree.where(plain.converged, plain, found)
     if not bool(found.converged.all()):
         far = found.missing.reshape(-1, 2).amax(0)
         raise InputError(

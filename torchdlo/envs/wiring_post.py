@@ -109,6 +109,18 @@ class WiringPost(Task):
             good = good & (side * (closest - post[1]) > 0) & (bent(x, near).abs() >= math.pi / 4)
         return good
 
+    def waypoints(self) -> list[list[tuple[float, float, float]]]:
+        """Return a way along the floor: past the first post, between both, and round the second one."""
+        way = [
+            (-0.06, 0.035, 0.0),
+            (-0.11, 0.06, 0.0),
+            (-0.19, 0.185, 0.0),
+            (-0.22, 0.25, 0.0),
+            (-0.26, 0.265, 0.0),
+            (-0.352, 0.255, 0.0),
+        ]
+        return [[point] for point in way]
+
 
 def bent(x: Tensor, near: Tensor, reach: float = 0.08) -> Tensor:
     """Return by how much curves change their direction in the top view within reach of a post [rad], shape (...).

@@ -57,7 +57,7 @@ def verdict(result: Calibration, recording: Recording) -> str:
     if better:
         name = min(better, key=lambda key: better[key])
         sentence += f" The {words(name)}, which has no parameter, is not worse: do not use this."
-    elif not result.test_mae_mm < result.before["test_mae_mm"]:
+    elif result.test_mae_mm >= result.before["test_mae_mm"]:
         sentence += " Calibration did not help on the unseen trials."
     return sentence
 

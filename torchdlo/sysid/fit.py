@@ -19,6 +19,9 @@ _KNEE = 2e-3
 _FIRM = 5e-3
 """Share of the cost that a number has to save per squared coordinate to be followed as far as its slope says."""
 
+_FAILED = 0.3
+"""What a trial costs whose simulation fails while others run through [m]: so that numbers may lead away from there."""
+
 Simulate = Callable[[np.ndarray], np.ndarray]
 """Maps parameter sets (P, K) to simulated markers (P, B, F, M, 3) [m]."""
 
@@ -75,7 +78,7 @@ class Point:
     raw: np.ndarray
     """Coordinates, shape (K,)."""
     cost: float
-    """Robust cost [m], mean over trials; infinite where the simulation failed."""
+    """Robust cost [m], mean over trials; infinite where the simulation failed on all of them."""
     gradient: np.ndarray
     """Of the cost by trial, shape (B, K)."""
     curvature: np.ndarray
@@ -96,7 +99,13 @@ def costs(simulate: Simulate, measured: np.ndarray, space: Space, raws: np.ndarr
     seen = np.isfinite(measured)
     residual = np.where(seen, sims - measured, 0.0).reshape(len(raws), len(measured), -1)
     mean = _robust(residual)[0].sum(-1) / seen.reshape(len(measured), -1).sum(1)
-    return np.where(np.isfinite(mean).all(1), mean.mean(1), np.inf)
+    return _together(mean)
+
+
+def _together(of_trial: np.ndarray) -> np.ndarray:
+    """Return the mean cost of trials (..., B); infinite if none ran through."""
+    ran = np.isfinite(of_trial)
+    return np.where(ran.any(-1), np.where(ran, of_trial, _FAILED).mean(-1), np.inf)
 
 
 def evaluate(simulate: Simulate, measured: np.ndarray, space: Space, raws: np.ndarray) -> list[Point]:
@@ -124,9 +133,7 @@ def evaluate(simulate: Simulate, measured: np.ndarray, space: Space, raws: np.nd
         residual = np.where(useless[:, None], 0.0, residual)
         gradient = np.einsum("kbr,br,br->bk", slope, weight, residual, optimize=True) / per_trial[:, None]
         curvature = np.einsum("kbr,br,lbr->bkl", slope, weight, slope, optimize=True) / per_trial[:, None, None]
-        points.append(
-            Point(raws[s], float("inf") if failed.any() else float(of_trial.mean()), gradient, curvature, of_trial)
-        )
+        points.append(Point(raws[s], float(_together(of_trial)), gradient, curvature, of_trial))
     return points
 
 

@@ -195,8 +195,9 @@ class RopeModel:
             held_vertices=self.held,
             held_edges=tuple(edge for edge, _ in self.clamps),
             ahead=self.ahead,
-            newton=2,
-            settling=3,
+            # Ropes that are jerked taut need more; others do as well with less.
+            newton=3 if self.ahead else 2,
+            settling=4 if self.ahead else 3,
         )
         params = self._measured_lengths(params, number)
         return scene, params, self._agree(scene, params, state)
