@@ -314,7 +314,7 @@ def _check_outputs(out: Path, resume: bool) -> None:
     """Refuse before the work what could not be written after it."""
     from torchdlo.report import calibration as report
 
-    for name in (out.name, "calibration.json", report.PAGE, report.PICTURE):
+    for name in (out.name, "calibration.json", "checkpoint.json", report.PAGE, report.PICTURE):
         check_writable(out.with_name(name))
     checkpoint = out.with_name("checkpoint.json")
     if resume and not checkpoint.is_file():

@@ -66,8 +66,11 @@ def deferred_interrupt(
         sys.stderr.write("stopping after this iteration; Ctrl-C again to stop at once\n")
 
     def checked(stage: str, done: int, total: int, message: str = "") -> None:
+        nonlocal asked
         callback(stage, done, total, message)
         if asked:
+            # Said once: what is left to do with the best so far reports its progress, too.
+            asked = False
             raise KeyboardInterrupt
 
     signal.signal(signal.SIGINT, ask)

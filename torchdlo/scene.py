@@ -115,16 +115,16 @@ class Scene:
         need(self.integrator in INTEGRATORS, f"integrator is {self.integrator!r}; expected one of {INTEGRATORS}")
         need(self.twist in TWISTS, f"twist is {self.twist!r}; expected one of {TWISTS}")
         need(math.isfinite(self.dt) and self.dt > 0, f"dt is {self.dt}; expected a positive number of seconds")
-        need(
-            isinstance(self.substeps, int) and self.substeps >= 1,
-            f"substeps is {self.substeps}; expected a whole number from 1 up",
-        )
+        whole = isinstance(self.substeps, int) and self.substeps >= 1
+        need(whole, f"substeps is {self.substeps}; expected a whole number from 1 up")
         need(self.newton >= 1, f"newton is {self.newton}; expected at least 1 step")
         need(self.settling >= 1, f"settling is {self.settling}; expected at least 1 step")
         need(self.gamma >= 0.25, f"gamma is {self.gamma}; below 0.25 implicit steps are not stable")
         need(0 <= self.ahead <= 1, f"ahead is {self.ahead}; expected a share of a substep, 0 to 1")
         size = self.topology.size
-        for name, slots in (("held_vertices", self.held_vertices), ("held_edges", self.held_edges)):
+        for name in ("held_vertices", "held_edges"):
+            slots = tuple(map(int, getattr(self, name)))  # lists are welcome, but a scene is hashable
+            object.__setattr__(self, name, slots)
             wrong = [s for s in slots if not 0 <= s < size]
             need(not wrong, f"{name} names {wrong}; the scene has slots 0 to {size - 1}")
             need(len(set(slots)) == len(slots), f"{name} {list(slots)} names a slot twice")

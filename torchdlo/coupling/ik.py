@@ -138,7 +138,9 @@ def _stopped(problem: _Problem, joints: Tensor, change: Tensor) -> Tensor:
 def _inverse(slope: Tensor, give: Tensor, damping: Tensor) -> Tensor:
     """Return (J G J^T + m)^-1, shape (B, 6, 6)."""
     square = (slope * give[..., None, :]) @ slope.transpose(-1, -2)
-    return torch.linalg.inv(square + damping[..., None] * torch.eye(6, dtype=slope.dtype, device=slope.device))
+    # In single precision a stretched arm may be singular: that pose does not settle, and must not stop the others.
+    eye = torch.eye(6, dtype=slope.dtype, device=slope.device)
+    return torch.linalg.inv_ex(square + damping[..., None] * eye).inverse
 
 
 def _damping(here: _Here, give: Tensor) -> Tensor:
@@ -209,7 +211,7 @@ def _newton(problem: _Problem, joints: Tensor, here: _Here) -> tuple[Tensor, Ten
         on = slope * free[:, None, :]
         low = torch.diag_embed(-damping.expand(-1, 6))
         whole = torch.cat([torch.cat([matrix, on.transpose(-1, -2)], -1), torch.cat([on, low], -1)], -2)
-        inverse = torch.linalg.inv(whole)[:, :n]
+        inverse = torch.linalg.inv_ex(whole).inverse[:, :n]
         pull = stiff * wish - (on.transpose(-1, -2) @ force.unsqueeze(-1)).squeeze(-1)
         return (inverse[..., :n] @ pull.unsqueeze(-1)).squeeze(-1), inverse[..., n:]
 

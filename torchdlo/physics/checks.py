@@ -54,6 +54,8 @@ def _positions(where: str, rope: Rope) -> None:
     if not isinstance(x, Tensor) or x.dim() < 2 or x.shape[-1] != 3 or not x.is_floating_point():
         given = tuple(x.shape) if isinstance(x, Tensor) else type(x).__name__
         raise ValueError(f"{where}: positions are {given}; expected a float tensor (..., n, 3) in metres")
+    if x.dtype not in (torch.float32, torch.float64):
+        raise ValueError(f"{where}: positions are {x.dtype}; expected torch.float32 or torch.float64")
     if x.shape[-2] < 3:
         raise ValueError(f"{where}: {x.shape[-2]} vertices given; a rope needs at least 3")
     x = x.detach()
@@ -80,6 +82,11 @@ def _number(where: str, name: str, value: float | Tensor, positions: Tensor) -> 
             raise ValueError(
                 f"{where}: {name} is {shape}; expected one number, (..., {count}) along the rope, or {batch} per scene"
             )
+        if per_vertex and per_scene and count > 1 and shape == (count,):
+            raise ValueError(
+                f"{where}: {name} is {shape}, along the rope or per scene? Give (1, {count}) or ({count}, 1)"
+            )
+        value = value.detach()
         least, most, finite = float(value.min()), float(value.max()), bool((value == value).all())
     else:
         least = most = float(value)

@@ -214,7 +214,8 @@ def numbers_of(
         values: numbers that differ from their defaults.
         like: a tensor of the dtype and device that they get.
     """
-    numbers = {e.name: default_values(e, like) for e in effects}
+    declared = {e.name: e for e in effects}
+    numbers = {name: default_values(e, like) for name, e in declared.items()}
     for effect, given in values.items():
         if effect not in numbers:
             raise ValueError(
@@ -228,8 +229,15 @@ def numbers_of(
             number = number.reshape(1, 1) if number.dim() == 0 else number
             if number.shape[-1] != wanted:
                 raise ValueError(f"scene: {effect}.{name} has {number.shape[-1]} components; expected {wanted}")
+            if number.dim() > 1 and number.shape[-2] != 1:
+                raise ValueError(
+                    f"scene: {effect}.{name} is {tuple(number.shape)}; expected (..., 1, {wanted}), one per scene: "
+                    "the axis before the last counts vertices, along which it is shared"
+                )
             if not bool(torch.isfinite(number).all()):
                 raise ValueError(f"scene: {effect}.{name} is {number.flatten().tolist()[:3]}; expected finite numbers")
+            if declared[effect].params[name].low >= 0 and bool((number < 0).any()):
+                raise ValueError(f"scene: {effect}.{name} is {float(number.min()):g}; expected no negative number")
             numbers[effect][name] = number
     return numbers
 

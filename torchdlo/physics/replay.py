@@ -113,7 +113,11 @@ def rollout(
     Returns:
         The last state, and the kept trees stacked along a first time axis.
     """
-    count = tree.leaves(controls)[0].shape[0]
+    counts = {tuple(x.shape)[:1] for x in tree.leaves(controls)}
+    if len(counts) != 1 or () in counts:
+        shapes = [tuple(x.shape) for x in tree.leaves(controls)]
+        raise ValueError(f"rollout: controls are {shapes}; expected the same number of steps as first axis of each")
+    ((count,),) = counts
     if count == 0:
         raise ValueError("rollout: controls have 0 steps; give at least one")
 

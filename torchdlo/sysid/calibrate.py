@@ -200,7 +200,7 @@ def _scout(
     stage, total = f"trying {starts} starts, {name}", 2 + _LOOKS
 
     def over(share: float) -> tuple[fit.Simulate, np.ndarray]:
-        frames = max(10, round(share * motion.markers.shape[1]))
+        frames = min(max(10, round(share * motion.markers.shape[1])), motion.markers.shape[1])
         return lambda values: job.model.simulate(motion, begin, values, frames=frames), motion.markers[:, :frames]
 
     raws = _spread(job, starts, rng)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +11,7 @@ import numpy as np
 
 from torchdlo.errors import InputError
 from torchdlo.files import write_atomically
+from torchdlo.sysid.journal import digest
 from torchdlo.sysid.recording import Recording
 
 
@@ -19,10 +20,8 @@ class Checkpoint:
 
     def __init__(self, path: Path | None, recording: Recording, options: dict[str, Any], resume: bool) -> None:
         self.path = path
-        digest = hashlib.sha256(json.dumps(options, sort_keys=True).encode())
-        for trial in (*recording.train, *recording.test):
-            digest.update(trial.markers.tobytes())
-        self.content: dict[str, Any] = {"generator": "torchdlo calibrate", "key": digest.hexdigest(), "best": {}}
+        measured = {f.name: getattr(recording, f.name) for f in fields(recording) if f.name != "path"}
+        self.content: dict[str, Any] = {"generator": "torchdlo calibrate", "key": digest(measured, options), "best": {}}
         if not resume:
             return
         if path is None or not path.exists():

@@ -267,7 +267,7 @@ class _Search:
     def _leaders(self, found: Sequence[Fitted]) -> list[int]:
         """Return which of the fits to short trials are worth more work; the last of them is that without the effect."""
         costs = [f.point.cost for f in found[:-1]]
-        order, lead = sorted(range(len(costs)), key=costs.__getitem__), min(costs)
+        order, lead = sorted(range(len(costs)), key=costs.__getitem__), min(costs, default=0.0)
         near = 2 * TIE * max(found[-1].point.cost - lead, 0.0)
         return [k for n, k in enumerate(order) if n < LEADERS or costs[k] - lead < near]
 

@@ -175,8 +175,9 @@ class RopeModel:
             pos,
             radius=recording.radius or 0.005,
             mass=recording.mass,
-            bend=number["bending_stiffness"],
-            twist=number["twisting_stiffness"],
+            # (N, 1): per scene, however many vertices there are.
+            bend=number["bending_stiffness"].unsqueeze(-1),
+            twist=number["twisting_stiffness"].unsqueeze(-1),
             stretch=_STRETCH,
             velocities=vel,
             rest=self._rest_shape(),

@@ -161,6 +161,16 @@ def _check_together(path: Path, rope: dict, trials: tuple[Trial, ...]) -> None:
                 f"{first.name}.npz, found {len(trial.marker_arclength)}; all trials of a recording "
                 "must be of the same rope and markers."
             )
+        for name in ("gripped", "marker_arclength"):
+            if not np.allclose(getattr(trial, name), getattr(first, name)):
+                raise InputError(
+                    f"{path / trial.name}.npz: {name}: expected the same as in {first.name}.npz, found other values; "
+                    "put trials with other grips into a recording of their own."
+                )
+    if rope["closed"]:
+        raise InputError(
+            f"{path / 'rope.json'}: closed: expected false or none, found true; loops cannot be calibrated yet."
+        )
     rest = rope["rest_positions"]
     if rest is not None and len(rest) != n_markers:
         raise InputError(
