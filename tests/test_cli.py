@@ -15,6 +15,7 @@ import pytest
 
 from tests.fake_calibration import FakeFit
 from torchdlo import cli
+from torchdlo.progress import deferred_interrupt
 
 WRITTEN = ["calibration.json", "model.json", "report.html", "report.png"]
 
@@ -218,3 +219,13 @@ def test_a_blown_up_model_is_reported_as_such(folder: Path, fit: FakeFit, capsys
     said = capsys.readouterr().out
     assert "→ not finite" in said and "do not use this" in said
     assert json.loads(Path("a/calibration.json").read_text())["test_mae_mm"] is None
+
+
+def test_one_interrupt_stops_a_search_once_and_lets_the_rest_report() -> None:
+    told = []
+    with deferred_interrupt(lambda *step: told.append(step)) as callback:
+        signal.raise_signal(signal.SIGINT)
+        with pytest.raises(KeyboardInterrupt):
+            callback("fitting", 1, 5, "")
+        callback("judging", 1, 1, "")
+    assert [stage for stage, *_ in told] == ["fitting", "judging"]

@@ -11,7 +11,7 @@ from helpers import circle, effects, run, straight, vec
 
 from torchdlo.physics import tree
 from torchdlo.physics.topology import Topology
-from torchdlo.scene import Control, Params, Rope, Scene, finite, hold, limits, make, step
+from torchdlo.scene import Control, Params, Rope, Scene, finite, hold, limits, make, rollout, step
 
 X = straight(6)
 GOOD = {"mass": 0.1, "bend": 1e-3, "twist": 1e-3}
@@ -108,6 +108,17 @@ BAD = {
         "gravity.acceleration",
     ),
     "NaN number": (lambda: make(rope(), effects("damping"), {"damping": {"rate": math.nan}}), "damping.rate"),
+    "negative number": (lambda: make(rope(), effects("damping"), {"damping": {"rate": -1.0}}), "damping.rate is -1"),
+    "number along the vertices": (
+        lambda: make(rope(), effects("damping"), {"damping": {"rate": torch.ones(6, 1)}}),
+        "damping.rate is .6, 1.",
+    ),
+    "stiffness along the rope or per scene": (
+        lambda: make(rope(positions=X.expand(6, 6, 3), bend=torch.ones(6)), effects("bend")),
+        "along the rope or per scene",
+    ),
+    "half precision": (lambda: make(rope(positions=X.half()), []), "float16"),
+    "controls of two lengths": (lambda: uneven_controls(), "number of steps"),
     "stretch left to nothing": (
         lambda: make(rope(stretch=50.0), effects("bend"), constrained=False, dt=1e-4),
         "stretch",
@@ -125,6 +136,18 @@ BAD = {
 def wrong_control(count: int):
     scene, params, state = make(rope(), effects("bend"), held_vertices=(0,), dt=1e-3)
     return step(scene, params, state, Control(X[:count], X[:0]))
+
+
+def uneven_controls():
+    scene, params, state = make(rope(), effects("bend", "twist"), held_vertices=(0,), held_edges=(0,), twist="dynamic")
+    control = hold(scene, state)
+    several = Control(control.pos.expand(5, *control.pos.shape), control.director.expand(7, *control.director.shape))
+    return rollout(scene, params, state, several)
+
+
+def test_a_scene_with_lists_of_held_parts_is_hashable():
+    scene, _, _ = make(rope(), effects("bend"), held_vertices=[0, 1], dt=1e-3)
+    assert hash(scene) and scene.held_vertices == (0, 1)
 
 
 @pytest.mark.parametrize("case", BAD)

@@ -129,6 +129,8 @@ CASES: dict[str, tuple[Callable[[Path], None], tuple[str, ...]]] = {
     "unknown key": (rope(lenght=1.0), ("rope.json", "lenght", "did you mean length")),
     "misspelt key": (rope(length=..., lenght=1.0), ("rope.json", "lenght", "did you mean length")),
     "unlike any key": (rope(zzz=1), ("rope.json", "zzz", "known are length")),
+    "a loop": (rope(closed=True), ("rope.json", "closed", "expected false")),
+    "other grips in one trial": (put("gripped", 1, False), (TRIAL, "gripped", "recording of their own")),
     "length is a text": (rope(length="1 m"), ("rope.json", "length", "number", "'1 m'")),
     "length is zero": (rope(length=0), ("rope.json", "length", "above 0", "found 0")),
     "length is true": (rope(length=True), ("rope.json", "length", "number")),

@@ -142,6 +142,21 @@ def test_a_trial_that_starts_with_a_mistracked_marker_is_simulated(tmp_path: Pat
     assert (edges <= np.diff(trial.marker_arclength)[1:-1] * (1 + 1e-3)).all()
 
 
+def test_as_many_parameter_sets_as_vertices_are_still_one_per_scene(tmp_path: Path) -> None:
+    recording = make_recording(tmp_path)
+    model = RopeModel(recording, vertices=13, compiled=False)
+    motion, begin = model.motion(recording.train[:1]), start.read_off(recording.train[:1])
+    many = TRUE * np.linspace(0.5, 2.0, len(model.arclength))[:, None]
+    together = model.simulate(motion, begin, many, frames=8)
+    np.testing.assert_allclose(together[[3]], model.simulate(motion, begin, many[[3]], frames=8), atol=1e-7)
+
+
+def test_a_trial_that_fails_costs_much_and_not_everything() -> None:
+    costs = fit._together(np.array([[0.01, np.nan, 0.03], [np.nan, np.inf, np.nan], [0.01, 0.02, 0.03]]))
+    assert costs[0] == pytest.approx((0.01 + fit._FAILED + 0.03) / 3) and np.isinf(costs[1])
+    assert costs[2] == pytest.approx(0.02)
+
+
 def test_starts_use_nothing_after_the_first_tenth_of_a_second(tmp_path: Path) -> None:
     recording = make_recording(tmp_path)
     trial = recording.test[0]
