@@ -15,6 +15,7 @@ import pytest
 
 from tests.fake_calibration import FakeFit
 from torchdlo import cli
+from torchdlo.files import replacing
 from torchdlo.progress import deferred_interrupt
 
 WRITTEN = ["calibration.json", "model.json", "report.html", "report.png"]
@@ -229,3 +230,9 @@ def test_one_interrupt_stops_a_search_once_and_lets_the_rest_report() -> None:
             callback("fitting", 1, 5, "")
         callback("judging", 1, 1, "")
     assert [stage for stage, *_ in told] == ["fitting", "judging"]
+
+
+def test_a_full_disk_is_named_by_what_did_not_fit(tmp_path: Path) -> None:
+    with pytest.raises(OSError, match=r"No space left on device.*model\.json"), replacing(tmp_path / "model.json"):
+        raise OSError(28, "No space left on device")
+    assert not list(tmp_path.iterdir())
