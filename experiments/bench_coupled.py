@@ -25,7 +25,7 @@ import sys
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
-from bench_rod import BOTH, FORWARD, clocked, forward, gradient, peak_mb, processes, receive, start
+from bench_rod import BOTH, FORWARD, clocked, forward, gathered, gradient, peak_mb
 from options import Parser, count, save
 
 PUBLISHED = {
@@ -128,17 +128,8 @@ def work(case: Case, share: int, go: Any, results: Any) -> None:
 
 def measure(case: Case) -> dict[str, Any]:
     """Return the row of a case, summed over its workers."""
-    workers = min(case.workers, case.scenes)
-    shares = [case.scenes // workers + (k < case.scenes % workers) for k in range(workers)]
-    with processes(work, [(case, share) for share in shares]) as (jobs, go, results):
-        # One compiles, the others find its work.
-        for crew in (jobs[:1], jobs[1:]):
-            start(crew)
-            for _ in crew:
-                receive(jobs, results)
-        go.set()
-        found = [receive(jobs, results) for _ in jobs]
-    row = asdict(case) | {"workers": workers, "published": None}
+    found = gathered(work, case)
+    row = asdict(case) | {"workers": len(found), "published": None}
     if case.scenes in SCENES:
         row["published"] = PUBLISHED[case.scenario, case.mode][SCENES.index(case.scenes)]
     sums = {"frames_per_s": "cpu", "frames_per_wall_s": "wall", "peak_mb": "peak_mb"}

@@ -221,8 +221,8 @@ def processes(target: Callable, heads: list[tuple]) -> Iterator[tuple[list[Any],
                 job.join()
 
 
-def measure(case: Case) -> dict[str, Any]:
-    """Return the row of a case, summed over its workers."""
+def gathered(work: Callable, case: Any) -> list[dict[str, Any]]:
+    """Return what each of a case's workers measured, with its share of the scenes, all at the same time."""
     workers = min(case.workers, case.scenes)
     shares = [case.scenes // workers + (k < case.scenes % workers) for k in range(workers)]
     with processes(work, [(case, share) for share in shares]) as (jobs, go, results):
@@ -232,8 +232,13 @@ def measure(case: Case) -> dict[str, Any]:
             for _ in crew:
                 receive(jobs, results)
         go.set()
-        found = [receive(jobs, results) for _ in jobs]
-    row = {name: value for name, value in asdict(case).items() if name != "seconds"} | {"workers": workers}
+        return [receive(jobs, results) for _ in jobs]
+
+
+def measure(case: Case) -> dict[str, Any]:
+    """Return the row of a case, summed over its workers."""
+    found = gathered(work, case)
+    row = {name: value for name, value in asdict(case).items() if name != "seconds"} | {"workers": len(found)}
     return row | {
         "frames_per_s": sum(f["cpu"] for f in found),
         "frames_per_wall_s": sum(f["wall"] for f in found),

@@ -141,7 +141,7 @@ def test_parts_keep_their_place_in_the_tool():
             tool = Pose(first.pos + vec(0.0, 0.1, 0.05) * (k / 100), turned(torch.tensor([[0.4 + k / 100]], dtype=F64)))
             state = step(scene, params, state, control(hands, held, tool))
     again = weld(scene, hands, hold(scene, state), tool, torch.ones(1, 1, dtype=F64))
-    assert torch.allclose(again.offset, held.offset, atol=1e-12)
+    assert torch.allclose(again.offset, held.offset, atol=1e-12, rtol=0)
     assert torch.allclose(again.director, held.director, atol=1e-9)
 
 
@@ -174,11 +174,11 @@ def test_scenes_of_a_batch_are_grasped_and_released_each_at_its_own_time(integra
         alone = rope_scene(x[k], integrator, held_vertices=(4, 0))
         seen = lifted(*alone, lambda step, k=k: closing(step)[k])
         for a, b in zip(together, seen, strict=True):
-            assert torch.allclose(a.rods.pos[k], b.rods.pos, atol=1e-10)
+            assert torch.allclose(a.rods.pos[k], b.rods.pos, atol=1e-10, rtol=0)
     height = torch.stack([s.rods.pos[:, 4, 2] for s in together])
     rise = height[1:] - height[:-1]
-    assert torch.allclose(rise[9:29, 1], torch.full((20,), 4e-4, dtype=F64), atol=1e-12)
-    assert torch.allclose(rise[19:, 2], torch.full((30,), 4e-4, dtype=F64), atol=1e-12)
+    assert torch.allclose(rise[9:29, 1], torch.full((20,), 4e-4, dtype=F64), atol=1e-12, rtol=0)
+    assert torch.allclose(rise[19:, 2], torch.full((30,), 4e-4, dtype=F64), atol=1e-12, rtol=0)
     # Let go, the vertex flies on with the tool's speed, less gravity and the pull of its neighbours.
     assert 0 < float(rise[29, 1]) < 4e-4
     # Rounding of positions, 1e-17, times 3e-2 kg over the square of the substep, 4e-8 s^2.
@@ -205,7 +205,7 @@ def test_open_hands_leave_the_rope_alone_and_closed_ones_are_plain_holds(integra
     # Rounding, grown by Newton's stopping.
     assert torch.allclose(states["open"].rods.pos, states["none"].rods.pos, atol=1e-9)
     assert torch.allclose(states["open"].rods.twist, states["none"].rods.twist, atol=1e-7)
-    assert torch.allclose(states["closed"].rods.pos, states["held"].rods.pos, atol=1e-12)
+    assert torch.allclose(states["closed"].rods.pos, states["held"].rods.pos, atol=1e-12, rtol=0)
 
 
 def test_a_loose_grip_adds_inertia():
@@ -320,6 +320,6 @@ def test_a_compiled_step_with_grips_is_the_same():
     led = tree.replace(led, pos=led.pos + vec(0, 0, 1e-3), grip={"vertices": share})
     with torch.no_grad():
         fast, slow = stepper(scene)(params, state, led), step(scene, params, state, led)
-    assert torch.allclose(fast.rods.pos, slow.rods.pos, atol=1e-12)
+    assert torch.allclose(fast.rods.pos, slow.rods.pos, atol=1e-12, rtol=0)
     # Forces are differences of positions over the square of the step.
     assert torch.allclose(fast.reaction.force, slow.reaction.force, rtol=1e-6, atol=1e-6)

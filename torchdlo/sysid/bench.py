@@ -11,6 +11,7 @@ from torchdlo.sysid import floor as floors
 from torchdlo.sysid import start as starts
 from torchdlo.sysid.motion import Start
 from torchdlo.sysid.pool import Fit, Fitted, Pool, Simulation
+from torchdlo.sysid.screen import Score
 
 Callback = Callable[[str, int, int, str], None]
 """Called with stage, steps done, steps in all, and a word on how it goes."""
@@ -56,6 +57,35 @@ class Bench:
     def gaps(self, fitted: Fitted, split: str) -> np.ndarray:
         """Return the gap of each trial of a split [m]."""
         return floors.gap(self.prediction(fitted, split), self.trials[split])
+
+    def extension(self, base: Fitted, score: Score, numbers: Sequence[str], iterations: int, frames: int | None) -> Fit:
+        """Return the job of fitting a model with one effect more, from the best of several starts.
+
+        Args:
+            base: the model.
+            score: the effect, with the doses that suit best.
+            numbers: which of the effect's numbers to fit, besides those of the model.
+            iterations: most iterations.
+            frames: how many frames to fit; all if None.
+        """
+        effects, space = (*base.effects, score.name), base.space
+        model, count = self.pool.local.model(effects), len(score.starts)
+        columns = [model.parameters.index(n) for n in space.names]
+        values = np.repeat(model.guess()[None], 2 * count, 0)
+        values[:, : len(base.values)] = base.values
+        for k, (dose, raw) in enumerate(score.starts):
+            values[k, columns] = space.to_values(space.clip(raw))
+            # What fitted the beginning alone had less to make up for.
+            values[count + k, : len(self.early)] = self.early
+            for name, value in dose.items():
+                values[k::count, model.parameters.index(name)] = value
+        free, sizes = (*space.names, *numbers), (*space.units, *(score.sizes[n] for n in numbers))
+        return Fit(effects, values, free, sizes, iterations, self.starts["train"], frames, keep=1)
+
+    def further(self, found: Fitted, iterations: int, frames: int | None = None) -> Fit:
+        """Return the job of fitting on."""
+        space, start = found.space, self.starts["train"]
+        return Fit(found.effects, found.values[None], space.names, tuple(space.units), iterations, start, frames)
 
     def fit(self, jobs: Sequence[Fit]) -> list[Fitted]:
         """Return the results of fits in their order.

@@ -8,15 +8,14 @@ doi:10.1093/biomet/62.1.57). Nobody knows which one is true: the smallest distan
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any
 
 import numpy as np
 from scipy.optimize import lsq_linear
 
-from torchdlo.sysid import library, motions, pool
+from torchdlo.sysid import library, motions
 from torchdlo.sysid.bench import Bench, Callback
 from torchdlo.sysid.fit import Space
 from torchdlo.sysid.model import RopeModel
@@ -178,10 +177,6 @@ def _follow(models: Models, job: _Follow) -> tuple[np.ndarray, np.ndarray]:
     return _Chase(models, job).run()
 
 
-def _remote(what: Any, job: Any) -> Any:
-    return what(pool._models, job)
-
-
 class Contest:
     """Rival models of one recording."""
 
@@ -211,10 +206,6 @@ class Contest:
         for done, (k, sims) in enumerate(self.bench.pool.simulate(jobs), 1):
             self._past[names[k]] = sims
             report(stage, done, len(jobs), "")
-
-    def _run(self, what: Any, jobs: Sequence[Any]) -> Iterator[tuple[int, Any]]:
-        there = self.bench.pool
-        return there._run(partial(_remote, what), partial(what, there.local), jobs)
 
     def _load(self, mass: float) -> tuple[float, ...]:
         """Return the numbers of a mass on the rope: at the free end, or in the middle between two grippers."""
@@ -255,12 +246,12 @@ class Contest:
         for mass in loads:
             rows = [k for k, g in enumerate(gestures) if g.mass == mass]
             some, shown = [gestures[k] for k in rows], {}
-            for k, sims in self._run(_play, [self._showing(some, n) for n in names]):
+            for k, sims in self.bench.pool.run(_play, [self._showing(some, n) for n in names]):
                 shown[names[k]], done = sims[0], done + 1
                 report(stage, done, total, said)
             start, load = motions.first_pose(self.rig, some), self._load(mass)
             jobs = [self._chase(a, b, load, self._trials(some, shown[a]), start, iterations) for a, b in self.pairs]
-            for p, (values, left) in self._run(_follow, jobs):
+            for p, (values, left) in self.bench.pool.run(_follow, jobs):
                 for row, v, gap, seen in zip(rows, values, left, shown[self.pairs[p][0]], strict=True):
                     found[row, p] = Pair(*self.pairs[p], seen[None], gap, v)
                 done += 1
@@ -271,7 +262,7 @@ class Contest:
         """Return what is left between each pair in the trials at hand."""
         jobs, found = [self._chase(a, b, (), (), None, iterations) for a, b in self.pairs], {}
         report(stage, 0, len(jobs), "")
-        for p, (values, left) in self._run(_follow, jobs):
+        for p, (values, left) in self.bench.pool.run(_follow, jobs):
             found[p] = Pair(*self.pairs[p], self._past[self.pairs[p][0]][0], left[0], values[0])
             report(stage, len(found), len(jobs), "")
         return [found[p] for p in range(len(jobs))]

@@ -299,23 +299,10 @@ class _Search:
         return bool(better.mean() > 0.6)
 
     def _candidate(self, base: Fitted, score: Score) -> Fit:
-        effects = (*base.effects, score.name)
-        model = self.pool.local.model(effects)
-        space, columns = base.space, [model.parameters.index(n) for n in base.space.names]
-        values = np.repeat(model.guess()[None], 2 * len(score.starts), 0)
-        values[:, : len(base.values)] = base.values
-        for k, (dose, raw) in enumerate(score.starts):
-            values[k, columns] = space.to_values(space.clip(raw))
-            # What fitted the beginning alone had less to make up for.
-            values[len(score.starts) + k, : len(self.bench.early)] = self.bench.early
-            for name, value in dose.items():
-                values[k :: len(score.starts), model.parameters.index(name)] = value
+        """Return the first fit of an effect."""
         # Numbers that no dose uses stay off: a slope where a spot fits better.
         used = [n.name for n in library.numbers(score.name, self.recording) if n.name in score.dose]
-        units = (*space.units, *(score.sizes[n] for n in used))
-        most, start = self.budget.iterations, self.bench.starts["train"]
-        free = (*space.names, *used)
-        return Fit(effects, values, free, tuple(units), most, start, self._short(), keep=1)
+        return self.bench.extension(base, score, used, self.budget.iterations, self._short())
 
     def _short(self) -> int:
         """Return how many frames the first fits see: late ones mislead as long as early ones do not fit."""
@@ -324,8 +311,7 @@ class _Search:
     def _further(self, base: Fitted, fitted: Fitted) -> Fit:
         """Return the job of fitting on."""
         most, frames = (self.budget.iterations, self._short()) if fitted is base else (self.budget.more, None)
-        space, start = fitted.space, self.bench.starts["train"]
-        return Fit(fitted.effects, fitted.values[None], space.names, tuple(space.units), most, start, frames)
+        return self.bench.further(fitted, most, frames)
 
     def _fitted(self, jobs: Sequence[Fit], stage: str) -> list[Fitted]:
         """Return the results of fits in their order, and say how they go."""

@@ -176,26 +176,28 @@ class Pool:
 
     def simulate(self, jobs: Sequence[Simulation]) -> Iterator[tuple[int, np.ndarray]]:
         """Yield the index and the markers of every job as they get ready."""
-        return self._run(_simulate, self.local.simulate, jobs)
+        return self.run(Models.simulate, jobs)
 
     def fit(self, jobs: Sequence[Fit]) -> Iterator[tuple[int, Fitted]]:
         """Yield the index and the result of every fit as they get ready."""
-        return self._run(_fit, self.local.fit, jobs)
+        return self.run(Models.fit, jobs)
 
-    def _run(
-        self, remote: Callable[[Job], Any], local: Callable[[Job], Any], jobs: Sequence[Job]
-    ) -> Iterator[tuple[int, Any]]:
-        compute = partial(self._compute, remote, local)
+    def run(self, what: Callable[[Models, Job], Any], jobs: Sequence[Job]) -> Iterator[tuple[int, Any]]:
+        """Yield the index and the result of `what` for every job as they get ready.
+
+        Args:
+            what: a function of a module, of the models of a process and a job.
+            jobs: dataclasses with `options` of models.
+        """
+        compute = partial(self._compute, what)
         jobs = [replace(job, options=(*self._chosen, *job.options)) for job in jobs]
         yield from compute(jobs) if self.journal is None else self.journal.through(jobs, compute)
 
-    def _compute(
-        self, remote: Callable[[Job], Any], local: Callable[[Job], Any], jobs: Sequence[Job]
-    ) -> Iterator[tuple[int, Any]]:
+    def _compute(self, what: Callable[[Models, Job], Any], jobs: Sequence[Job]) -> Iterator[tuple[int, Any]]:
         if self._pool is None:
-            yield from ((k, local(job)) for k, job in enumerate(jobs))
+            yield from ((k, what(self.local, job)) for k, job in enumerate(jobs))
             return
-        waiting = {self._pool.submit(remote, job): k for k, job in enumerate(jobs)}
+        waiting = {self._pool.submit(_do, what, job): k for k, job in enumerate(jobs)}
         for future in as_completed(waiting):
             yield waiting[future], future.result()
 
@@ -225,9 +227,5 @@ def _end_with_parent() -> None:
         os._exit(1)
 
 
-def _simulate(job: Simulation) -> np.ndarray:
-    return _models.simulate(job)
-
-
-def _fit(job: Fit) -> Fitted:
-    return _models.fit(job)
+def _do(what: Callable[[Models, Job], Any], job: Job) -> Any:
+    return what(_models, job)

@@ -8,7 +8,6 @@ import json
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -120,7 +119,7 @@ def fit_rivals(
         jobs |= {n: own for n in names if n in given.effects and not set(given.effects) & ({*names} - {n})}
     found: dict[str, Fitted] = {}
     for more in (0, budget.more):
-        again = [jobs[n] if not more else _further(found[n], more, start) for n in names]
+        again = [jobs[n] if not more else bench.further(found[n], more) for n in names]
         report(stage, 1 if more else 0, 2, "")
         found = dict(zip(names, bench.fit(again), strict=True))
     report(stage, 2, 2, ", ".join(f"{n.replace('_', ' ')} {1e3 * found[n].point.cost:.2f} mm" for n in names))
@@ -135,22 +134,6 @@ def _without(given: Saved, names: Sequence[str]) -> Saved:
 
 def _job(bench: Bench, base: Fitted, score: Score, iterations: int) -> Fit:
     """Return the job of fitting the baseline with one effect more, from the doses that suit best."""
-    effects = (*base.effects, score.name)
-    model = bench.pool.local.model(effects)
-    columns = [model.parameters.index(n) for n in base.space.names]
-    values = np.repeat(model.guess()[None], len(score.starts), 0)
-    values[:, : len(base.values)] = base.values
-    for row, (dose, raw) in zip(values, score.starts, strict=True):
-        row[columns] = base.space.to_values(base.space.clip(raw))
-        for name, value in dose.items():
-            row[model.parameters.index(name)] = value
     # All that any dose uses: a wind may turn from where the best dose blows.
     used = [n.name for n in library.numbers(score.name, bench.recording) if n.name in score.sizes]
-    sizes: tuple[Any, ...] = (*base.space.units, *(score.sizes[n] for n in used))
-    return Fit(effects, values, (*base.space.names, *used), sizes, iterations, bench.starts["train"], keep=1)
-
-
-def _further(found: Fitted, iterations: int, start: Any) -> Fit:
-    """Return the job of fitting on."""
-    space = found.space
-    return Fit(found.effects, found.values[None], space.names, tuple(space.units), iterations, start)
+    return bench.extension(base, score, used, iterations, None)
