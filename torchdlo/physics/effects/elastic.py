@@ -46,7 +46,6 @@ class Bend(Effect):
 
     name: ClassVar[str] = "bend"
     kind: ClassVar[str] = "material"
-    settles: ClassVar[bool] = True
 
     def energy(self, view: View, values: Values) -> Tensor:
         """Return the energy per hinge [J], shape (..., V, 1)."""
