@@ -23,7 +23,7 @@ from torchdlo.sysid.floor import gap
 from torchdlo.sysid.journal import digest
 from torchdlo.sysid.model import RopeModel
 from torchdlo.sysid.motion import Start
-from torchdlo.sysid.pool import Fit, Models, Simulation
+from torchdlo.sysid.pool import Fit, Models, Simulation, Together
 from torchdlo.sysid.recording import Recording, Trial, save_recording
 
 S = np.array([0.0, 0.015, 0.06, 0.12, 0.18, 0.24, 0.3])
@@ -115,7 +115,7 @@ def refitted(design: Design, recording: Recording, new: Trial) -> dict[str, tupl
     for name, rival in design.models.items():
         start = starts.begin(models.model(rival.effects), joined.train)
         job = Fit(rival.effects, rival.values[None], rival.space.names, tuple(rival.space.units), 3, start)
-        fitted = models.fit(job)
+        (fitted,) = models.fit(Together((job,)))
         sims = models.simulate(Simulation(rival.effects, fitted.values[None], "train", start))[0]
         gaps = gap(sims, joined.train)
         found[name] = float(np.sqrt(np.mean(gaps[:-1] ** 2))), float(gaps[-1])

@@ -15,6 +15,14 @@ import torch
 
 from torchdlo.physics import tree
 
+_ROUND = 16
+"""Larger batches are filled up to multiples of this."""
+
+
+def batch(scenes: int) -> int:
+    """Return how many scenes to run in place of so many: to record a step for a new size takes longer than its use."""
+    return next((size for size in (1, 2, 3, 5, 8) if size >= scenes), -(-scenes // _ROUND) * _ROUND)
+
 
 def record(step: Callable[..., Any], *inputs: Any) -> Callable[..., Any]:
     """Return a function that does what `step` does to trees of tensors of the same shapes as `inputs`.

@@ -206,7 +206,8 @@ def _scout(
     raws = _spread(job, starts, rng)
     report(stage, 0, total, "")
     for look, (share, keep) in enumerate(((0.3, max(2, starts // 3)), (1.0, max(2, starts // 8)))):
-        costs = fit.costs(*over(share), job.space, raws)
+        simulate, measured = over(share)
+        costs = fit.costs(simulate(job.space.to_values(raws)), measured)
         raws = raws[np.argsort(costs, kind="stable")[:keep]]
         report(stage, look + 1, total, f"{1e3 * costs.min():.2f} mm over {share:.0%} of the time")
     simulate, measured = over(1.0)

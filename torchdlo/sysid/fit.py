@@ -93,11 +93,10 @@ def _robust(residual: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return size - _KNEE, 1 / size
 
 
-def costs(simulate: Simulate, measured: np.ndarray, space: Space, raws: np.ndarray) -> np.ndarray:
-    """Return the cost [m] at each of S parameter sets, shape (S,), from S simulations of each trial."""
-    sims = simulate(space.to_values(raws))
+def costs(sims: np.ndarray, measured: np.ndarray) -> np.ndarray:
+    """Return the cost [m] of simulations (S, B, F, M, 3), shape (S,)."""
     seen = np.isfinite(measured)
-    residual = np.where(seen, sims - measured, 0.0).reshape(len(raws), len(measured), -1)
+    residual = np.where(seen, sims - measured, 0.0).reshape(len(sims), len(measured), -1)
     mean = _robust(residual)[0].sum(-1) / seen.reshape(len(measured), -1).sum(1)
     return _together(mean)
 
@@ -108,33 +107,82 @@ def _together(of_trial: np.ndarray) -> np.ndarray:
     return np.where(ran.any(-1), np.where(ran, of_trial, _FAILED).mean(-1), np.inf)
 
 
+class Look:
+    """What it takes to know costs and their slopes at S points (S, K): S (K + 1) simulations of each trial."""
+
+    def __init__(self, space: Space, raws: np.ndarray) -> None:
+        """Prepare to look at these coordinates."""
+        self.raws, k = raws, raws.shape[1]
+        nudge = np.diag(space.nudges())
+        # Difference inwards where a number stands at its upper bound.
+        upward = space.clip(raws[:, None] + nudge)
+        moved = np.where(np.isclose(upward, raws[:, None] + nudge), upward, raws[:, None] - nudge)
+        self._sign = np.einsum("skk->sk", moved - raws[:, None])
+        self.values = space.to_values(np.concatenate([raws[:, None], moved], 1).reshape(-1, k))
+        """What to simulate, shape (S (K + 1), K)."""
+
+    def points(self, sims: np.ndarray, measured: np.ndarray) -> list[Point]:
+        """Return the points, from simulations of `values`."""
+        count, k = self.raws.shape
+        sims = sims.reshape(count, k + 1, *measured.shape)
+        seen = np.isfinite(measured)
+        per_trial = seen.reshape(len(measured), -1).sum(1)
+        points = []
+        for s in range(count):
+            residual = np.where(seen, sims[s, 0] - measured, 0.0).reshape(len(measured), -1)
+            cost, weight = _robust(residual)
+            of_trial = cost.sum(1) / per_trial
+            failed = ~np.isfinite(of_trial)
+            slope = np.where(seen, sims[s, 1:] - sims[s, 0], 0.0).reshape(k, len(measured), -1)
+            slope = slope / self._sign[s][:, None, None]
+            # A trial that ran at the point but failed beside it tells nothing about slopes.
+            useless = ~np.isfinite(slope).all((0, 2)) | failed
+            slope, weight = np.where(useless[None, :, None], 0.0, slope), np.where(useless[:, None], 0.0, weight)
+            residual = np.where(useless[:, None], 0.0, residual)
+            gradient = np.einsum("kbr,br,br->bk", slope, weight, residual, optimize=True) / per_trial[:, None]
+            curvature = np.einsum("kbr,br,lbr->bkl", slope, weight, slope, optimize=True) / per_trial[:, None, None]
+            points.append(Point(self.raws[s], float(_together(of_trial)), gradient, curvature, of_trial))
+        return points
+
+
 def evaluate(simulate: Simulate, measured: np.ndarray, space: Space, raws: np.ndarray) -> list[Point]:
-    """Return costs and their slopes at S parameter sets, shape (S, K), from S (K + 1) simulations of each trial."""
-    count, k = raws.shape
-    nudge = space.nudges()
-    # Difference inwards where a number stands at its upper bound.
-    upward = space.clip(raws[:, None] + np.diag(nudge))
-    moved = np.where(np.isclose(upward, raws[:, None] + np.diag(nudge)), upward, raws[:, None] - np.diag(nudge))
-    sign = np.einsum("skk->sk", moved - raws[:, None])
-    sets = np.concatenate([raws[:, None], moved], 1)
-    sims = simulate(space.to_values(sets.reshape(-1, k))).reshape(count, k + 1, *measured.shape)
-    seen = np.isfinite(measured)
-    per_trial = seen.reshape(len(measured), -1).sum(1)
-    points = []
-    for s in range(count):
-        residual = np.where(seen, sims[s, 0] - measured, 0.0).reshape(len(measured), -1)
-        cost, weight = _robust(residual)
-        of_trial = cost.sum(1) / per_trial
-        failed = ~np.isfinite(of_trial)
-        slope = np.where(seen, sims[s, 1:] - sims[s, 0], 0.0).reshape(k, len(measured), -1) / sign[s][:, None, None]
-        # A trial that ran at the point but failed beside it tells nothing about slopes.
-        useless = ~np.isfinite(slope).all((0, 2)) | failed
-        slope, weight = np.where(useless[None, :, None], 0.0, slope), np.where(useless[:, None], 0.0, weight)
-        residual = np.where(useless[:, None], 0.0, residual)
-        gradient = np.einsum("kbr,br,br->bk", slope, weight, residual, optimize=True) / per_trial[:, None]
-        curvature = np.einsum("kbr,br,lbr->bkl", slope, weight, slope, optimize=True) / per_trial[:, None, None]
-        points.append(Point(raws[s], float(_together(of_trial)), gradient, curvature, of_trial))
-    return points
+    """Return costs and their slopes at S parameter sets, shape (S, K)."""
+    look = Look(space, raws)
+    return look.points(simulate(look.values), measured)
+
+
+class Climb:
+    """Levenberg-Marquardt from several points at once, until each stands still."""
+
+    def __init__(self, space: Space, points: Sequence[Point], tolerance: float = 2e-3) -> None:
+        """Begin.
+
+        Args:
+            space: the numbers.
+            points: where to start.
+            tolerance: a point stands still when its cost falls by less than this share.
+        """
+        self.space, self.points, self._tolerance = space, list(points), tolerance
+        self._damping = [1e-2] * len(self.points)
+        self._active = [np.isfinite(p.cost) for p in self.points]
+
+    def tries(self) -> np.ndarray:
+        """Return the coordinates to look at next, shape (S, K); none when all points stand still."""
+        tries = [
+            _step(p, d, self.space) for p, d, on in zip(self.points, self._damping, self._active, strict=True) if on
+        ]
+        return np.array(tries).reshape(-1, len(self.space.names))
+
+    def take(self, found: Sequence[Point]) -> None:
+        """Go on from what was found there."""
+        for i, new in zip([i for i, on in enumerate(self._active) if on], found, strict=True):
+            old = self.points[i]
+            if new.cost < old.cost:
+                self._active[i] = old.cost - new.cost > self._tolerance * old.cost
+                self.points[i], self._damping[i] = new, max(self._damping[i] / 5, 1e-6)
+            else:
+                self._damping[i] *= 8
+                self._active[i] = self._damping[i] < 1e3
 
 
 def improve(
@@ -156,22 +204,13 @@ def improve(
         iterations: at most so many.
         tolerance: a point stands still when its cost falls by less than this share.
     """
-    points, damping = list(points), [1e-2] * len(points)
-    active = [np.isfinite(p.cost) for p in points]
+    climb = Climb(space, points, tolerance)
     for _ in range(iterations):
-        rows = [i for i, on in enumerate(active) if on]
-        if not rows:
+        tries = climb.tries()
+        if not len(tries):
             return
-        tries = np.stack([_step(points[i], damping[i], space) for i in rows])
-        for i, new in zip(rows, evaluate(simulate, measured, space, tries), strict=True):
-            old = points[i]
-            if new.cost < old.cost:
-                active[i] = old.cost - new.cost > tolerance * old.cost
-                points[i], damping[i] = new, max(damping[i] / 5, 1e-6)
-            else:
-                damping[i] *= 8
-                active[i] = damping[i] < 1e3
-        yield list(points)
+        climb.take(evaluate(simulate, measured, space, tries))
+        yield list(climb.points)
 
 
 def _step(point: Point, damping: float, space: Space) -> np.ndarray:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import multiprocessing
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass, replace
 from functools import partial
@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from torchdlo.sysid import fit
+from torchdlo.sysid import fit, library
 from torchdlo.sysid import start as starts
 from torchdlo.sysid.fit import Point, Space
 from torchdlo.sysid.journal import Journal
@@ -77,6 +77,19 @@ class Fitted:
     """Their coordinates, with costs and slopes."""
 
 
+@dataclass(frozen=True, eq=False)
+class Together:
+    """Fits that simulate in one batch, step by step: a large batch takes little longer than a small one."""
+
+    jobs: tuple[Fit, ...]
+    """The fits, with the same start, frames and options."""
+    options: tuple[tuple[str, Any], ...] = ()
+    """See `Fit`; those of its jobs."""
+
+
+_Search = Generator[np.ndarray, np.ndarray, Fitted]
+
+
 class Models:
     """Models of one process by their effects and options."""
 
@@ -105,29 +118,67 @@ class Models:
         start = job.start or starts.begin(model, self.recording.trials(job.split))
         return model.simulate(self.motion(model, job.split), start, job.values)
 
-    def fit(self, job: Fit) -> Fitted:
-        """Return the best of the fits from all starts."""
-        model = self.model(job.effects, job.options)
+    def fit(self, together: Together) -> tuple[Fitted, ...]:
+        """Return the best that each of several fits found from all of its starts."""
+        jobs = together.jobs
+        effects = tuple(dict.fromkeys(e for job in jobs for e in job.effects))
+        model, first, options = self.model(effects, together.options), jobs[0], together.options
         motion = self.motion(model, "train")
-        start = job.start or starts.begin(model, self.recording.train)
-        columns = [model.parameters.index(name) for name in job.free]
-        space = Space(job.free, tuple(model.params[k] for k in columns), job.sizes)
+        start = first.start or starts.begin(model, self.recording.train)
+        searches, places = [], []
+        for job in jobs:
+            own = self.model(job.effects, options)
+            columns = [own.parameters.index(name) for name in job.free]
+            space = Space(job.free, tuple(own.params[k] for k in columns), job.sizes)
+            searches.append(_search(job, space, columns, motion.markers[:, : job.frames]))
+            places.append([model.parameters.index(name) for name in own.parameters])
+        found: dict[int, Fitted] = {}
+        asked = {k: next(search) for k, search in enumerate(searches)}
+        while asked:
+            rows = [_filled(model.guess(), places[k], values) for k, values in asked.items()]
+            sims = model.simulate(motion, start, np.concatenate(rows), frames=first.frames)
+            ends = np.cumsum([len(r) for r in rows])[:-1]
+            for k, sim in zip(list(asked), np.split(sims, ends), strict=True):
+                try:
+                    asked[k] = searches[k].send(sim)
+                except StopIteration as end:
+                    found[k] = end.value
+                    del asked[k]
+        return tuple(found[k] for k in range(len(jobs)))
 
-        def simulate(values: np.ndarray) -> np.ndarray:
-            full = np.repeat(job.values[:1], len(values), 0)
-            full[:, columns] = values
-            return model.simulate(motion, start, full, frames=job.frames)
+    def framed(self, job: Fit) -> bool:
+        """Return whether twists have to be searched for in the model of a fit, which takes longer."""
+        laws = [library.instance(e, self.model(()).mesh) for e in job.effects]
+        return any(law.frame_bending or law.settles for law in laws)
 
-        measured = motion.markers[:, : job.frames]
-        raws = space.clip(space.to_raw(job.values[:, columns]))
-        if job.keep is not None:
-            raws = raws[np.argsort(fit.costs(simulate, measured, space, raws))[: job.keep]]
-        points = fit.evaluate(simulate, measured, space, raws)
-        *_, points = [points, *fit.improve(simulate, measured, space, points, iterations=job.iterations)]
-        best = min(points, key=lambda p: p.cost)
-        values = job.values[0].copy()
-        values[columns] = space.to_values(best.raw)
-        return Fitted(job.effects, values, space, best)
+
+def _filled(guess: np.ndarray, places: Sequence[int], values: np.ndarray) -> np.ndarray:
+    """Return values of some numbers (P, K) among all; the others do nothing."""
+    full = np.repeat(guess[None], len(values), 0)
+    full[:, places] = values
+    return full
+
+
+def _search(job: Fit, space: Space, columns: Sequence[int], measured: np.ndarray) -> _Search:
+    """Fit: yield parameter sets (P, K) of the job's model, take their simulations, return the best."""
+
+    def full(values: np.ndarray) -> np.ndarray:
+        return _filled(job.values[0], columns, values)
+
+    raws = space.clip(space.to_raw(job.values[:, columns]))
+    if job.keep is not None:
+        costs = fit.costs((yield full(space.to_values(raws))), measured)
+        raws = raws[np.argsort(costs)[: job.keep]]
+    look = fit.Look(space, raws)
+    climb = fit.Climb(space, look.points((yield full(look.values)), measured))
+    for _ in range(job.iterations):
+        tries = climb.tries()
+        if not len(tries):
+            break
+        look = fit.Look(space, tries)
+        climb.take(look.points((yield full(look.values)), measured))
+    best = min(climb.points, key=lambda p: p.cost)
+    return Fitted(job.effects, full(space.to_values(best.raw)[None])[0], space, best)
 
 
 class Pool:
@@ -148,7 +199,7 @@ class Pool:
             workers: how many; one per core if not given. One means this process.
             journal: keeps the results of jobs, and has those that need not be computed again.
         """
-        workers = workers or max(1, os.cpu_count() or 1)
+        self.workers = workers = workers or max(1, os.cpu_count() or 1)
         self.journal = journal
         self.recording, self.local = recording, Models(recording, options)
         self._chosen: tuple[tuple[str, Any], ...] = ()
@@ -180,7 +231,18 @@ class Pool:
 
     def fit(self, jobs: Sequence[Fit]) -> Iterator[tuple[int, Fitted]]:
         """Yield the index and the result of every fit as they get ready."""
-        return self.run(Models.fit, jobs)
+        groups = self.groups(jobs)
+        together = [Together(tuple(jobs[k] for k in g), jobs[g[0]].options) for g in groups]
+        for n, results in self.run(Models.fit, together):
+            yield from zip(groups[n], results, strict=True)
+
+    def groups(self, jobs: Sequence[Fit]) -> list[list[int]]:
+        """Return the indices of the fits that run together: alike ones, spread over the workers."""
+        kinds: dict[Any, list[int]] = {}
+        for k, job in enumerate(jobs):
+            kind = id(job.start), job.frames, job.options, self.local.framed(job)
+            kinds.setdefault(kind, []).append(k)
+        return [some for alike in kinds.values() for n in range(self.workers) if (some := alike[n :: self.workers])]
 
     def run(self, what: Callable[[Models, Job], Any], jobs: Sequence[Job]) -> Iterator[tuple[int, Any]]:
         """Yield the index and the result of `what` for every job as they get ready.
