@@ -2,25 +2,35 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
 
-from torchdlo.sysid.bench import Bench, Callback
+from torchdlo.sysid.bench import CHAIN, Bench, Callback
 from torchdlo.sysid.floor import rms
 from torchdlo.sysid.model import RopeModel
 from torchdlo.sysid.pool import Fit, Fitted
 from torchdlo.sysid.saved import Saved
 
-CHAIN = "link_chain"
-"""What a chain of links does that a rope does not: candidate number 0, fitted before any effect is considered."""
-
-_SPREAD = np.log([30.0, 4.0, 6.0])
+_SPREAD = np.log([100.0, 4.0, 6.0])
 """How far random starts are from the first guess, in logarithms of the baseline's numbers."""
+
+_STIFFER = 3.0
+"""Bending stiffness in the middle of the starts over that of the first guess."""
+
+_KEPT = 1 / 3
+"""Share of the starts, the best, that are fitted."""
 
 _BETTER = 0.9
 """Share of the cost that is left where the rope is taken for a chain, or for one that clamps hold to their ends."""
 
+
+_CALMER = 0.7
+"""Share of the cost that is left where steps have to look ahead, which makes them less exact."""
+
+_AHEAD = 0.1
+"""How far steps look ahead where they fail otherwise, see `torchdlo.scene.Scene`."""
 
 _ROUND = 0.75
 """Twisting over bending stiffness of a round rope of one material."""
@@ -48,8 +58,8 @@ def calibrate(bench: Bench, count: int, iterations: int, rng: np.random.Generato
     free, sizes = (*names, f"{CHAIN}.length"), (*ones, 0.5 * link)
 
     def plain(values: np.ndarray, most: int, frames: int | None, **options: float) -> Fit:
-        start = bench.starts["train"]
-        return Fit((), values, names, ones, most, start, frames, options=tuple(options.items()))
+        start, keep = bench.starts["train"], math.ceil(_KEPT * len(values)) if len(values) > 1 else None
+        return Fit((), values, names, ones, most, start, frames, keep, tuple(options.items()))
 
     def chain(values: np.ndarray, most: int, frames: int | None) -> Fit:
         return Fit((CHAIN,), values, free, sizes, most, bench.starts["train"], frames)
@@ -60,7 +70,12 @@ def calibrate(bench: Bench, count: int, iterations: int, rng: np.random.Generato
         return found
 
     values = _random(model, count, rng)
-    first = fit([plain(values[k::2], 4, frames // 3) for k in range(2)], 1)
+    # What rings within a step, from a start that is measured badly, may grow without end unless steps look ahead.
+    calm = [] if bench.pool.local.options["ahead"] else [plain(values[::2], 4, frames // 3, ahead=_AHEAD)]
+    first = fit([*(plain(values[k::2], 4, frames // 3) for k in range(2)), *calm], 1)
+    if calm and first[-1].point.cost < _CALMER * min(f.point.cost for f in first[:-1]):
+        bench.pool.choose(ahead=_AHEAD)
+        first = first[-1:]
     bench.early = best = min(first, key=lambda f: f.point.cost).values
     if not bench.starts["train"].still.all():
         bench.begin(best, ())
@@ -73,6 +88,7 @@ def calibrate(bench: Bench, count: int, iterations: int, rng: np.random.Generato
     if firm and others[2].point.cost < _BETTER * min(smooth.point.cost, side.point.cost):
         bench.pool.choose(grip=1.0)
         smooth, side = others[2], replace(side, values=np.append(others[2].values, side.values[-1]))
+    bench.correct(smooth)
     smooth, side = fit([plain(smooth.values[None], iterations, None), chain(side.values[None], iterations, None)], 3)
     better = side if side.point.cost < _BETTER * smooth.point.cost else smooth
     report(stage, 4, 4, f"{1e3 * rms(bench.gaps(better, 'train')):.2f} mm")
@@ -85,6 +101,7 @@ def _random(model: RopeModel, count: int, rng: np.random.Generator) -> np.ndarra
     spread = rng.uniform(-1, 1, (count, len(_SPREAD))) * _SPREAD
     # Twisting stiffness follows bending stiffness.
     spread[0], spread[:, 1] = 0.0, spread[:, 1] + spread[:, 0]
+    spread[1:, :2] += np.log(_STIFFER)
     values[:, : len(_SPREAD)] *= np.exp(spread)
     if "rest_roll" in model.parameters:
         # A lying shape may be rolled to any side where it is held.
@@ -97,24 +114,26 @@ def go_further(bench: Bench, base: Fitted, iterations: int, report: Callback) ->
 
     That is the law of a chain, and a twisting stiffness that hardly shows and ran away.
     """
-    model, start = bench.pool.local.model(base.effects), bench.starts["train"]
+    model = bench.pool.local.model(base.effects)
     bend, twist = (model.parameters.index(f"{way}ing_stiffness") for way in ("bend", "twist"))
     values, link = base.values[None], float(np.diff(model.arclength).min())
     if abs(np.log(base.values[twist] / (_ROUND * base.values[bend]))) > _FAR:
         back = base.values.copy()
         back[twist] = _ROUND * back[bend]
         values = np.stack([base.values, back])
+    bench.correct(base)
+    start = bench.starts["train"]
     names, sizes = base.space.names, tuple(base.space.units)
-    jobs = [Fit(base.effects, values, names, sizes, iterations, start)] if len(values) > 1 else []
+    jobs = [Fit(base.effects, values, names, sizes, iterations, start)]
     if CHAIN not in base.effects:
         effects, free = (*base.effects, CHAIN), (*names, f"{CHAIN}.length")
         for length in (link, -link):
             rows = np.pad(values, ((0, 0), (0, 1)), constant_values=length)
             jobs.append(Fit(effects, rows, free, (*sizes, 0.5 * link), iterations, start))
     report("fitting all numbers again", 0, len(jobs), "")
-    for found in bench.fit(jobs) if jobs else []:
-        share = 1.0 if found.effects == base.effects else _BETTER
-        base = found if found.point.cost < share * base.point.cost else base
+    base, *chains = bench.fit(jobs)
+    for found in chains:
+        base = found if found.point.cost < _BETTER * base.point.cost else base
     report("fitting all numbers again", len(jobs), len(jobs), f"{1e3 * rms(bench.gaps(base, 'train')):.2f} mm")
     return base
 
@@ -124,8 +143,14 @@ def go_on(bench: Bench, given: Saved, iterations: int, report: Callback) -> Fitt
     model = given.model(bench.recording, **bench.pool.local.options)
     sizes, values = given.sizes(model), given.start(model)
     bench.begin(values, given.effects)
-    job = Fit(given.effects, values[None], tuple(sizes), tuple(sizes.values()), iterations, bench.starts["train"])
-    found = bench.fit([job])[0]
+
+    def fit(values: np.ndarray, most: int) -> Fitted:
+        start = bench.starts["train"]
+        return bench.fit([Fit(given.effects, values[None], tuple(sizes), tuple(sizes.values()), most, start)])[0]
+
+    found = fit(values, iterations // 2)
+    bench.correct(found)
+    found = fit(found.values, iterations)
     report("fitting the given model", 1, 1, f"{1e3 * found.point.cost:.2f} mm")
     return found
 

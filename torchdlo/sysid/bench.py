@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -15,6 +16,9 @@ from torchdlo.sysid.screen import Score
 
 Callback = Callable[[str, int, int, str], None]
 """Called with stage, steps done, steps in all, and a word on how it goes."""
+
+CHAIN = "link_chain"
+"""What a chain of links does that a rope does not: candidate number 0, fitted before any effect is considered."""
 
 
 def _key(fitted: Fitted) -> tuple[tuple[str, ...], bytes]:
@@ -30,6 +34,8 @@ class Bench:
         self.starts: dict[str, Start] = {}
         self.early = np.empty(0)
         """The baseline's numbers that fit the beginning of the trials, as far as they are known."""
+        self.floor = floors.Floor(floors.noise(self.recording), float("inf"), float("inf"))
+        """What no effect explains, on the test trials, as far as it is known."""
         self._known: dict[tuple[tuple[str, ...], bytes], np.ndarray] = {}
 
     def begin(self, base: np.ndarray, effects: Sequence[str]) -> None:
@@ -40,6 +46,16 @@ class Bench:
         train = np.arange(len(self.trials["train"]))
         test = np.arange(len(train), len(self.trials["all"]))
         self.starts = {"all": start, "train": start.pick(train), "test": start.pick(test)}
+
+    def correct(self, base: Fitted) -> None:
+        """Correct simulations from now on by what finer steps and a finer mesh change of this model, see `floor`."""
+        found = floors.refine(self.pool, base, self.starts["all"], CHAIN)
+        train = len(self.trials["train"])
+        self.floor = found.floor(slice(train, None), ~self.trials["all"][0].gripped)
+        start = replace(self.starts["all"], finer=found.correction)
+        rows = np.arange(len(start.pos))
+        self.starts = {"all": start, "train": start.pick(rows[:train]), "test": start.pick(rows[train:])}
+        self._known.clear()
 
     def predict(self, fits: Sequence[Fitted]) -> None:
         """Simulate all trials with several models at once, for `gaps` and `prediction` to look up."""

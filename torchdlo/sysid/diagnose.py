@@ -17,9 +17,7 @@ import numpy as np
 
 from torchdlo.errors import InputError
 from torchdlo.sysid import baseline as baselines
-from torchdlo.sysid import floor as floors
 from torchdlo.sysid import health, library, plan
-from torchdlo.sysid.baseline import CHAIN
 from torchdlo.sysid.bench import Bench, Callback
 from torchdlo.sysid.floor import Floor, rms
 from torchdlo.sysid.health import Fault
@@ -167,7 +165,8 @@ class _Search:
             base = baselines.calibrate(self.bench, count, most, self.rng, self.report)
         else:
             base = baselines.go_on(self.bench, given, most, self.report)
-        self.baseline, floor = base, self._floor(base)
+        self.baseline, floor = base, self._floor()
+        self.before = self.bench.prediction(base, "all"), self.bench.gaps(base, "test")
         rounds: list[list[Candidate]] = []
         ties: dict[str, list[str]] = {}
         shares: dict[str, float] = {}
@@ -176,11 +175,13 @@ class _Search:
             if shares and rms(self.bench.gaps(base, "all")) < SILENT * floor.total:
                 break
             names = [n for n in self._possible() if n not in base.effects]
+            if not names:
+                break
             best, rival, candidates, rivals = self._round(base, names, floor, f"round {len(rounds) + 1}")
             rounds.append(candidates)
             if best is None:
                 if shares and rival is not base:
-                    base, floor = rival, self._floor(rival)
+                    base = rival
                 break
             name, old = best.effects[-1], self._squared(base)
             shares[name], ties[name] = (old - self._squared(best)) / whole, rivals
@@ -188,7 +189,7 @@ class _Search:
             base = baselines.go_further(self.bench, kept, self.budget.more, self.report)
             shares[name] += (self._squared(kept) - self._squared(base)) / whole
             # A wrong model's floor is wrong, too.
-            floor = self._floor(base)
+            floor = self._floor()
         return self._conclude(base, list(shares), {n: ties[n] for n in shares}, shares, rounds, floor)
 
     def _squared(self, fitted: Fitted) -> float:
@@ -214,12 +215,10 @@ class _Search:
     def _possible(self) -> list[str]:
         return [n for n in library.LIBRARY if library.applicable(n, self.recording, self.pool.local.model(()).mesh)]
 
-    def _floor(self, base: Fitted) -> Floor:
+    def _floor(self) -> Floor:
         """Return the floor on the test trials."""
-        self.report("measuring the floor", 0, 1, "")
-        floor = floors.measure(self.pool, base, self.bench.starts["test"], "test", CHAIN)
-        self.report("measuring the floor", 1, 1, f"{1e3 * floor.total:.2f} mm")
-        return floor
+        self.report("measuring the floor", 1, 1, f"{1e3 * self.bench.floor.total:.2f} mm")
+        return self.bench.floor
 
     def _round(
         self, base: Fitted, names: Sequence[str], floor: Floor, stage: str
@@ -232,30 +231,55 @@ class _Search:
             self.bench.starts["train"],
             lambda k, n: self.report(f"{stage}: screening", k, n, ""),
         )
-        tried = scores[: self.budget.candidates]
-        found = self._fitted([self._candidate(base, score) for score in tried] + [self._further(base, base)], stage)
-        lead = self._leaders(found)
-        ahead = [*lead, len(tried)]
+        fits, led, rival = self._fits(base, scores[: self.budget.candidates], None, stage)
+        self.bench.predict([base, rival, *fits.values()])
+        first = min(led, key=lambda name: fits[name].point.cost)
+        if rms(self.bench.gaps(fits[first], "all")) > SILENT * floor.total:
+            # Something is left: one that does alike things may be right, however little its doses explain.
+            kin = [s for s in scores if s.name not in fits and any({s.name, first} <= k for k in library.KIN)]
+            more, also, _ = self._fits(base, kin, rival, f"{stage}, effects like {first}") if kin else ({}, [], rival)
+            self.bench.predict([*more.values()])
+            fits, led = fits | more, led + also
+        return self._judged(scores, fits, sorted(led, key=lambda name: fits[name].point.cost), rival, floor)
+
+    def _fits(
+        self, base: Fitted, scores: Sequence[Score], rival: Fitted | None, stage: str
+    ) -> tuple[dict[str, Fitted], list[str], Fitted]:
+        """Return fits of effects, the names of those that lead and were fitted to whole trials, and the fair rival.
+
+        The fair rival of an effect is the baseline that was fitted for as long; it is fitted if not given.
+        """
+        jobs = [self._candidate(base, score) for score in scores]
+        found = self._fitted(jobs if rival else [*jobs, self._further(base, base)], stage)
+        ahead = self._leaders(found if rival else found[:-1], rival or found[-1])
+        lead = [scores[k].name for k in ahead]
+        if rival is None:
+            ahead.append(len(scores))
         for k, fitted in zip(ahead, self._fitted([self._further(base, found[k]) for k in ahead], stage), strict=True):
             found[k] = fitted
-        # The fair rival of an effect is the baseline that was fitted for as long.
-        *fits, rival = found
-        rival = rival if rival.point.cost < base.point.cost else base
-        self.bench.predict([base, rival, *fits])
-        gains = {s.name: self._gain(rival, f, floor, "train") for s, f in zip(tried, fits, strict=True)}
-        order = sorted(lead, key=lambda k: fits[k].point.cost)
-        refused = {k: self._refused(rival, fits[k], floor) for k in order}
-        fair = [k for k in order if refused[k] is None]
+        if rival is None:
+            rival = min(found.pop(), base, key=lambda f: f.point.cost)
+        return {s.name: f for s, f in zip(scores, found, strict=True)}, lead, rival
+
+    def _judged(
+        self, scores: Sequence[Score], fits: dict[str, Fitted], order: Sequence[str], rival: Fitted, floor: Floor
+    ) -> tuple[Fitted | None, Fitted, list[Candidate], list[str]]:
+        """Return what `_round` does, from fits; those in order lead, best first."""
+        refused = {name: self._refused(rival, fits[name], floor) for name in order}
+        fair = [name for name in order if refused[name] is None]
         best, rivals = None, []
-        reasons = {s.name: refused.get(k) or "fits worse" for k, s in enumerate(tried)}
+        reasons = {name: refused.get(name) or "fits worse" for name in fits}
         if fair:
             lead = fits[fair[0]].point.cost
-            close = [k for k in order if fits[k].point.cost - lead < TIE * max(rival.point.cost - lead, 1e-9)]
+            close = [n for n in order if fits[n].point.cost - lead < TIE * max(rival.point.cost - lead, 1e-9)]
             # Of laws that fit as well, the one with the fewest numbers: others may contain it.
-            first = min((k for k in fair if k in close), key=lambda k: len(fits[k].space.names))
-            reasons |= {tried[k].name: "as good as the best" for k in close} | {tried[first].name: "taken"}
-            best, rivals = fits[first], [tried[k].name for k in close if k != first]
-        held = {s.name: self._gain(rival, f, floor, "test") for s, f in zip(tried, fits, strict=True)}
+            first = min((n for n in fair if n in close), key=lambda n: len(fits[n].space.names))
+            reasons |= dict.fromkeys(close, "as good as the best") | {first: "taken"}
+            best, rivals = fits[first], [n for n in close if n != first]
+        gains, held = (
+            {name: self._gain(rival, fitted, floor, split) for name, fitted in fits.items()}
+            for split in ("train", "test")
+        )
         candidates = [
             Candidate(
                 s.name, s.share, gains.get(s.name), held.get(s.name), reasons.get(s.name, "its doses explain less")
@@ -264,11 +288,11 @@ class _Search:
         ]
         return best, rival, candidates, rivals
 
-    def _leaders(self, found: Sequence[Fitted]) -> list[int]:
-        """Return which of the fits to short trials are worth more work; the last of them is that without the effect."""
-        costs = [f.point.cost for f in found[:-1]]
+    def _leaders(self, found: Sequence[Fitted], rival: Fitted) -> list[int]:
+        """Return which of the fits to short trials are worth more work."""
+        costs = [f.point.cost for f in found]
         order, lead = sorted(range(len(costs)), key=costs.__getitem__), min(costs, default=0.0)
-        near = 2 * TIE * max(found[-1].point.cost - lead, 0.0)
+        near = 2 * TIE * max(rival.point.cost - lead, 0.0)
         return [k for n, k in enumerate(order) if n < LEADERS or costs[k] - lead < near]
 
     def _refused(self, rival: Fitted, fitted: Fitted, floor: Floor) -> str | None:
@@ -316,10 +340,11 @@ class _Search:
     def _fitted(self, jobs: Sequence[Fit], stage: str) -> list[Fitted]:
         """Return the results of fits in their order, and say how they go."""
         found: dict[int, Fitted] = {}
+        plain = max(len(job.effects) for job in jobs) - 1
         self.report(f"{stage}: fitting", 0, len(jobs), "")
         for k, fitted in self.pool.fit(jobs):
             found[k] = fitted
-            last = fitted.effects[-1] if k < len(jobs) - 1 else "no effect"
+            last = fitted.effects[-1] if len(fitted.effects) > plain else "no effect"
             self.report(f"{stage}: fitting", len(found), len(jobs), last)
         return [found[k] for k in range(len(jobs))]
 
@@ -332,21 +357,19 @@ class _Search:
         rounds: list[list[Candidate]],
         floor: Floor,
     ) -> Diagnosis:
-        baseline = self.baseline
-        before, after = self.bench.gaps(baseline, "test"), self.bench.gaps(final, "test")
+        (simulated, before), after = self.before, self.bench.gaps(final, "test")
         explained = rms(after) <= UNEXPLAINED * floor.total
         verdict = ("effects" if explained else "partial") if effects else ("none" if explained else "unknown")
-        predictions: dict[str, dict[str, np.ndarray]] = {}
-        for when, fitted in (("before", baseline), ("after", final)):
-            predictions[when] = {}
-            for sim, trial in zip(self.bench.prediction(fitted, "all"), self.bench.trials["all"], strict=True):
-                predictions[when][trial.name] = sim[: len(trial.time)]
+        predictions = {
+            when: {t.name: sim[: len(t.time)] for sim, t in zip(sims, self.bench.trials["all"], strict=True)}
+            for when, sims in (("before", simulated), ("after", self.bench.prediction(final, "all")))
+        }
         return Diagnosis(
             verdict,
             effects,
             ties,
             shares,
-            baseline,
+            self.baseline,
             final,
             floor,
             before,
@@ -354,7 +377,7 @@ class _Search:
             rounds,
             predictions,
             self.pool.local.model(final.effects),
-            notes=baselines.notes(baseline),
+            notes=baselines.notes(self.baseline),
         )
 
 

@@ -1,11 +1,12 @@
-"""How well a perfect model could do on a recording: noise of the markers, jitter of the grippers, and the grid."""
+"""How well a perfect model could do on a recording: noise of the markers, and what steps and mesh get wrong."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from torchdlo.sysid.motion import Start
 from torchdlo.sysid.pool import Fitted, Pool, Simulation
 from torchdlo.sysid.recording import Recording, Trial
 
@@ -17,9 +18,9 @@ class Floor:
     noise: float
     """Noise of the markers."""
     step: float
-    """Change with half the substep."""
+    """What may be left of the error of the steps."""
     grid: float
-    """Change with more vertices."""
+    """The same of the mesh."""
 
     @property
     def total(self) -> float:
@@ -55,36 +56,73 @@ def rms(gaps: np.ndarray) -> float:
     return float(np.sqrt(np.mean(np.square(gaps))))
 
 
-def measure(pool: Pool, base: Fitted, start: object, split: str, chain: str) -> Floor:
-    """Return the floor of a calibrated model.
+_WILD = 0.05
+"""Change of a trial from which the finer simulation is not to be trusted [m]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Refinement:
+    """What finer steps and a finer mesh change of the markers of all trials [m], shape (B, F, M, 3) each."""
+
+    step: np.ndarray
+    grid: np.ndarray
+    noise: float
+    """Noise of the markers [m]."""
+    order: int
+    """Order of the simulation's errors in its steps; 2 in its mesh."""
+
+    @property
+    def _rest(self) -> tuple[float, float]:
+        """What halving leaves over, of the change that it makes."""
+        return 1 / (2**self.order - 1), 1 / 3
+
+    @property
+    def correction(self) -> np.ndarray:
+        """What is to be added to simulations [m], shape (B, F, M, 3); nothing where that is not known.
+
+        Richardson's extrapolation (1911, doi:10.1098/rsta.1911.0009).
+        """
+        step, grid = ((1 + rest) * np.nan_to_num(x) for rest, x in zip(self._rest, (self.step, self.grid), strict=True))
+        return step + grid
+
+    def floor(self, trials: slice, free: np.ndarray) -> Floor:
+        """Return the floor on some of the trials: of the corrections, what was extrapolated may be wrong.
+
+        Args:
+            trials: which ones.
+            free: which markers are not held.
+        """
+        parts = []
+        for rest, change in zip(self._rest, (self.step, self.grid), strict=True):
+            known = np.isfinite(change).all((1, 2, 3))
+            chosen = change[trials][known[trials]] if known[trials].any() else change[known]
+            parts.append(rest * float(np.sqrt(np.mean(chosen[:, :, free] ** 2))) if known.any() else float("inf"))
+        return Floor(self.noise, *parts)
+
+
+def refine(pool: Pool, base: Fitted, start: Start, chain: str) -> Refinement:
+    """Return what half the steps, and with them twice the vertices, change of a calibrated model's markers.
 
     Args:
         pool: the simulations.
         base: the model.
-        start: where they begin.
-        split: which trials.
-        chain: effect that belongs to one grid and is left out on two that are compared.
+        start: where all trials begin.
+        chain: effect that belongs to one mesh and is left out.
     """
     model = pool.local.model(base.effects)
     plain = tuple(e for e in base.effects if e != chain)
-    kept = [k for k, name in enumerate(model.parameters) if name.split(".")[0] != chain]
-    finer = (("vertices", 2 * len(model.arclength) - 1),)
-    half = (("substep", model.dt / (2 * model.substeps)),)
-    whole, smooth = base.values[None], base.values[None, kept]
-    jobs = [
-        Simulation(base.effects, whole, split, start),
-        Simulation(base.effects, whole, split, start, half),
-        Simulation(plain, smooth, split, start),
-        Simulation(plain, smooth, split, start, finer),
-    ]
-    sims = dict(pool.simulate(jobs if plain != base.effects else [jobs[0], jobs[1], jobs[3]]))
-    free = np.setdiff1d(np.arange(model.count), model.gripped)
-    pairs = ((0, 1), (2, 3)) if plain != base.effects else ((0, 1), (0, 2))
-    return Floor(noise(pool.recording), *(_apart(sims[a][0], sims[b][0], free) for a, b in pairs))
+    values = base.values[None, [k for k, name in enumerate(model.parameters) if name.split(".")[0] != chain]]
+    half = ("substep", model.dt / (2 * model.substeps))
+    finer = ("vertices", 2 * len(model.arclength) - 1)
+    start = replace(start, finer=None)
+    jobs = [Simulation(plain, values, "all", start, options) for options in ((half, finer), (half,), ())]
+    sims = dict(pool.simulate(jobs))
+    step, grid = _tame(sims[1][0] - sims[2][0]), _tame(sims[0][0] - sims[1][0])
+    return Refinement(step, grid, noise(pool.recording), 1 if model.ahead else 2)
 
 
-def _apart(sims: np.ndarray, others: np.ndarray, free: np.ndarray) -> float:
-    """Return how far two predictions are apart [m], root mean square per coordinate of the free markers."""
-    change = (others - sims)[:, :, free]
-    # Where a refined simulation fails the grid is far too coarse.
-    return float(np.sqrt(np.mean(change**2))) if np.isfinite(change).all() else float("inf")
+def _tame(change: np.ndarray) -> np.ndarray:
+    """Return the changes (B, F, M, 3); NaN for trials in which a simulation failed."""
+    with np.errstate(invalid="ignore", over="ignore"):
+        size = np.sqrt(np.mean(change**2, (1, 2, 3)))
+    return np.where((size < _WILD)[:, None, None, None], change, np.nan)

@@ -53,6 +53,15 @@ LIBRARY: tuple[str, ...] = (
 )
 """Names of the effects that may be found missing."""
 
+KIN: tuple[frozenset[str], ...] = (
+    frozenset({"air_drag", "bending_damping", "internal_friction", "bending_plasticity"}),
+    frozenset({"wind", "tilted_gravity", "rest_curvature", "marker_offset"}),
+    frozenset({"nonuniform_stiffness", "stiffening_bending", "anisotropic_bending", "gripper_compliance"}),
+    frozenset({"point_mass", "nonuniform_stiffness"}),
+)
+"""Effects that do alike things: take up energy, push or bend to one side, change how firm the rope is, or where it is
+slow. Small doses of them are hard to tell apart, fits are not."""
+
 _KNOWN = {
     "tilted_gravity": ("acceleration",),
     "bending_plasticity": ("hardening",),

@@ -306,11 +306,11 @@ class RopeModel:
         sets, trials = len(values), len(motion.names)
         total = frames or motion.markers.shape[1]
         out = np.empty((sets * trials, total, self.count, 3))
-        size = _CHUNK if self.compiled else min(4 * _CHUNK, -(-sets * trials // self.threads))
+        size = _CHUNK if self.compiled else min(4 * _CHUNK, traced.batch(-(-sets * trials // self.threads)))
         chunks = [np.arange(a, min(a + size, sets * trials)) for a in range(0, sets * trials, size)]
 
         def run(rows: np.ndarray) -> None:
-            filled = np.resize(rows, size) if self.compiled else rows
+            filled = np.resize(rows, size if self.compiled else traced.batch(len(rows)))
             trial = filled % trials
             begin = start.pick(filled if len(start.pos) == sets * trials else trial)
             out[rows] = self._run(motion.pick(trial), begin, values[filled // trials], total)[: len(rows)]
@@ -318,6 +318,8 @@ class RopeModel:
         # Compiled kernels and solvers release the interpreter's lock, so threads share the cores.
         with ThreadPoolExecutor(self.threads) as pool:
             list(map(run, chunks) if self.threads == 1 else pool.map(run, chunks))
+        if start.finer is not None:
+            out += np.resize(start.finer[:, :total], out.shape)
         return out.reshape(sets, trials, total, self.count, 3)
 
     @torch.no_grad()

@@ -43,7 +43,10 @@ class Start:
     """Marker velocities at time 0 [m/s], shape (B, M, 3)."""
     still: np.ndarray | None = None
     """Which trials begin almost in balance, at rest: they start near where the model comes to rest, (B,) bool."""
+    finer: np.ndarray | None = None
+    """What finer steps on a finer mesh would change of the markers of simulations that begin here, to be added to them
+    [m], shape (B, F, M, 3)."""
 
     def pick(self, rows: np.ndarray) -> Start:
         """Return the starts of these trials."""
-        return Start(self.pos[rows], self.vel[rows], None if self.still is None else self.still[rows])
+        return Start(*(None if x is None else x[rows] for x in (self.pos, self.vel, self.still, self.finer)))

@@ -16,7 +16,7 @@ class Budget:
     """How much work to do."""
 
     starts: int
-    """Starts of the baseline fit."""
+    """Starts of the baseline fit, of which the best third is fitted."""
     candidates: int
     """Effects that are fitted in each round."""
     iterations: int
@@ -29,7 +29,7 @@ class Budget:
     """Most train trials that are used."""
 
 
-BUDGETS = {"fast": Budget(12, 4, 4, 6, 2), "full": Budget(32, 8, 6, 12, 3, 16)}
+BUDGETS = {"fast": Budget(36, 4, 4, 6, 2), "full": Budget(96, 8, 6, 12, 3, 16)}
 
 TAUT = 0.95
 """Share of the rope's length between two grippers from which it may be jerked taut."""

@@ -27,6 +27,10 @@ _HORIZON = 0.6
 _ON_THE_WAY = (1.0, 0.5, 0.2)
 """Shares of the best mixture from which a fit may start: the answer to large doses is not linear."""
 
+_PLACES = 3
+"""How many of an effect's doses that exclude each other a fit may start from: the answer to a soft spot's place, to a
+yield point or to the side from which wind blows has many optima."""
+
 _MOST = 20.0
 """Most doses of an effect."""
 
@@ -107,15 +111,16 @@ def screen(
             row += len(rows)
             change = np.stack([np.nan_to_num(pick(sims[k] - sims[0])) * weight for k in rows], 1)
             absorbed = q.T @ change
-            found = _best(doses[name], change - q @ absorbed, left)
-            # The baseline's numbers go back where they would be if they did not have to make up for the effect.
-            back = np.linalg.lstsq(r, absorbed @ found.amounts, rcond=1e-6)[0]
-            starts = tuple(
-                (_mixture(name, doses[name], share * found.amounts), base.point.raw - np.clip(share * back, -1.0, 1.0))
-                for share in _ON_THE_WAY
-            )
+            best, *others = _mixtures(doses[name], change - q @ absorbed, left)
+            starts = []
+            for found in (best, *others[: _PLACES - 1]):
+                # The baseline's numbers go back where they would be if they did not have to make up for the effect.
+                back = np.linalg.lstsq(r, absorbed @ found.amounts, rcond=1e-6)[0]
+                for share in _ON_THE_WAY:
+                    raw = base.point.raw - np.clip(share * back, -1.0, 1.0)
+                    starts.append((_mixture(name, doses[name], share * found.amounts), raw))
             sizes = _sizes(name, doses[name])
-            scores.append(Score(name, found.share, starts[0][0], starts, sizes, found.direction))
+            scores.append(Score(name, best.share, starts[0][0], tuple(starts), sizes, best.direction))
     return sorted(scores, key=lambda s: -s.share)
 
 
@@ -167,24 +172,25 @@ class _Mixture:
     direction: np.ndarray
 
 
-def _best(doses: list[Probe], answers: np.ndarray, left: np.ndarray) -> _Mixture:
-    """Return the best mixture of doses, whose answers have shape (R, J)."""
+def _mixtures(doses: list[Probe], answers: np.ndarray, left: np.ndarray) -> list[_Mixture]:
+    """Return the mixtures of doses, whose answers have shape (R, J), that explain a residual; best first.
+
+    Doses that exclude each other are taken one at a time.
+    """
     whole = float(left @ left) + 1e-30
     scale = np.linalg.norm(answers, axis=0) + 1e-30
     low = np.array([-_MOST if d.signed else 0.0 for d in doses])
-    choices = [list(range(len(doses)))] if _additive(doses) else [[k] for k in range(len(doses))]
-    best: _Mixture | None = None
-    for rows in choices:
+    found = []
+    for rows in [list(range(len(doses)))] if _additive(doses) else [[k] for k in range(len(doses))]:
         a = answers[:, rows] / scale[rows]
         bounds = (low[rows] * scale[rows] - 1e-9, _MOST * scale[rows] + 1e-9)
         amount = lsq_linear(a, left, bounds=bounds).x
         share = 1 - float(np.sum((left - a @ amount) ** 2)) / whole
-        if best is None or share > best.share:
-            amounts = np.zeros(len(doses))
-            amounts[rows] = amount / scale[rows]
-            direction = a @ amount
-            best = _Mixture(max(share, 0.0), amounts, direction / (np.linalg.norm(direction) + 1e-30))
-    return best
+        amounts = np.zeros(len(doses))
+        amounts[rows] = amount / scale[rows]
+        direction = a @ amount
+        found.append(_Mixture(max(share, 0.0), amounts, direction / (np.linalg.norm(direction) + 1e-30)))
+    return sorted(found, key=lambda m: -m.share)
 
 
 def _additive(doses: list[Probe]) -> bool:

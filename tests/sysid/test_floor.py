@@ -1,0 +1,62 @@
+"""What finer steps and meshes change is added to simulations, and what may be left of it is the floor."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.sysid.swaying import recording as swaying
+from torchdlo.sysid import floor
+from torchdlo.sysid.bench import Bench
+from torchdlo.sysid.fit import Point, Space
+from torchdlo.sysid.floor import Refinement
+from torchdlo.sysid.pool import Fitted, Pool, Simulation
+
+OPTIONS = {"vertices": 33, "ahead": 0.0, "grip": 0.0, "compiled": False}
+
+
+def test_a_correction_takes_away_much_of_the_error_of_steps_and_mesh(tmp_path: Path) -> None:
+    with Pool(swaying(tmp_path, frames=40), OPTIONS, workers=1) as pool:
+        bench, model = Bench(pool), pool.local.model(())
+        values = np.array([3e-3, 2e-3, 2.0])
+        bench.begin(values, ())
+        none = Space((), ())
+        fitted = Fitted((), values, none, Point(np.empty(0), 0.0, np.empty(0), np.empty(0), np.empty(0)))
+        coarse, count = bench.prediction(fitted, "all"), len(model.arclength)
+        fine = (("vertices", 4 * count - 3), ("substep", model.dt / (8 * model.substeps)))
+        exact = dict(pool.simulate([Simulation((), values[None], "all", bench.starts["all"], fine)]))[0][0]
+        bench.correct(fitted)
+        corrected = bench.prediction(fitted, "all")
+    free = ~pool.recording.train[0].gripped
+
+    def error(sims: np.ndarray) -> float:
+        """Of the test trials, as the floor is."""
+        return float(np.sqrt(np.mean((sims - exact)[3:][:, :, free] ** 2)))
+
+    # Had the motion no kink at its start, a quarter or less would be left.
+    assert error(corrected) < 0.75 * error(coarse)
+    assert np.hypot(bench.floor.step, bench.floor.grid) < 0.75 * error(coarse)
+    # Held markers are where they are told to be on any mesh.
+    assert np.abs(corrected - coarse)[:, :, ~free].max() < 1e-12
+
+
+def test_extrapolation_knows_the_order_of_the_steps() -> None:
+    step, grid = np.full((2, 3, 4, 3), 0.3), np.full((2, 3, 4, 3), 0.6)
+    for order, rest in ((2, 1 / 3), (1, 1.0)):
+        found = Refinement(step, grid, 1e-4, order)
+        np.testing.assert_allclose(found.correction, (1 + rest) * 0.3 + 4 / 3 * 0.6)
+        parts = found.floor(slice(1, None), np.ones(4, bool))
+        assert (parts.noise, parts.step, parts.grid) == pytest.approx((1e-4, rest * 0.3, 0.2))
+
+
+def test_trials_whose_finer_simulation_fails_are_not_corrected() -> None:
+    step, grid = np.full((2, 3, 4, 3), 0.03), np.full((2, 3, 4, 3), 0.03)
+    step[0], grid[1, 2, 1, 0] = 7.0, np.nan
+    found = Refinement(floor._tame(step), floor._tame(grid), 1e-4, 2)
+    np.testing.assert_allclose(found.correction, np.full(step.shape, 0.04))
+    # Where no test trial tells, the others do; where none does, nothing is known.
+    assert found.floor(slice(1, None), np.ones(4, bool)).grid == pytest.approx(0.01)
+    assert replace(found, grid=np.full_like(grid, np.nan)).floor(slice(None), np.ones(4, bool)).grid == np.inf
