@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import os
 import signal
@@ -11,6 +12,9 @@ import time
 from pathlib import Path
 
 import pytest
+import torch
+
+from torchdlo.physics import tree
 
 EXPERIMENTS = Path(__file__).parents[1] / "experiments"
 SCRIPTS = [
@@ -101,6 +105,35 @@ def test_the_benchmark_of_tasks_writes_its_rows(tmp_path: Path) -> None:
     assert all(row["frames_per_cpu_s"] > 0 and row["published"] > 0 for row in rows)
     done = call(EXPERIMENTS / "bench_env.py", "--tasks", "knot")
     assert done.returncode == 1 and "there is no task knot; known are coiling" in done.stderr
+
+
+@pytest.mark.slow
+def test_random_scenes_write_a_row_each_and_say_what_is_wrong(tmp_path: Path) -> None:
+    target = tmp_path / "random.json"
+    words = ["--scenes", 2, "--batch", 2, "--seconds", 0.02, "--json", target]
+    done = call(EXPERIMENTS / "random_scenes.py", *words)
+    assert done.returncode == 0, done.stderr
+    content = json.loads(target.read_text())
+    assert content["summary"]["scenes"] == len(content["rows"]) == 2
+    assert all(not row["faults"] and row["strain"] < 0.01 for row in content["rows"])
+
+
+def test_overlaps_of_random_scenes_are_seen(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(EXPERIMENTS))
+    random_scenes = importlib.import_module("random_scenes")
+    made, shapes = random_scenes.build(0, 2, (2e-3, 4))
+    assert len(shapes) == 3
+    body, own = random_scenes.overlaps(made, made[2])
+    assert not body.any() and not own.any()
+    # Laid on the plane, then half a radius deeper; the lowest vertex of a tangle starts 25 cm up.
+    rods = made[2].rods
+    down = rods.pos - rods.pos.new_tensor([1.0, 0.0, 0.25 - 0.5 * random_scenes.RADIUS])
+    body, own = random_scenes.overlaps(made, tree.replace(made[2], rods=tree.replace(rods, pos=down)))
+    assert body.tolist() == pytest.approx([0.5, 0.5], abs=1e-9) and not own.any()
+    # Folded flat onto itself: its two halves are in one place.
+    folded = torch.cat([rods.pos[:, :20], rods.pos[:, :20].flip(1)], 1)
+    _, own = random_scenes.overlaps(made, tree.replace(made[2], rods=tree.replace(rods, pos=folded)))
+    assert own.tolist() == pytest.approx([2.0, 2.0], abs=1e-6)
 
 
 def test_pictures_of_tasks_are_drawn(tmp_path: Path) -> None:

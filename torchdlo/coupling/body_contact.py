@@ -37,20 +37,16 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
+from torchdlo.coupling import body_pairs
 from torchdlo.coupling.balls import touches
 from torchdlo.coupling.bodies import Body, BodyMotion
+from torchdlo.coupling.body_pairs import FIT, HARD
 from torchdlo.coupling.coulomb import parting, rebounding
 from torchdlo.coupling.linked import Links, System, gather, inertia
 from torchdlo.physics import tree
 from torchdlo.physics.effect import Effect, Motion, Push, Values
 from torchdlo.physics.numerics import dot, safe_norm
 from torchdlo.physics.rod import View
-
-HARD = 1e4
-"""Stiffness of contact times the mobility of the two bodies: its inverse is the share of an impact that is let through.
-Harder contact takes more rounds, and single precision has no digits for it."""
-FIT = 1e-2
-"""By how much forces may do more than is asked for before they are dropped."""
 
 
 def _combined(x: Tensor, pairs: tuple[tuple[int, int], ...], counts: tuple[int, ...]) -> Tensor:
@@ -187,6 +183,9 @@ def _detached(links: Links) -> Links:
 
 def resolve(contact: BodyContact, motion: BodyMotion) -> tuple[Tensor, Tensor]:
     """Return forces [N] and torques about the centres of mass [N m] of contact on bodies, shape (..., K, 3) each."""
+    if body_pairs.fits(motion):
+        law = (contact.recovery, contact.shallow, contact.slowest)
+        return body_pairs.wrench(motion, contact.chosen(motion.bodies), contact.points, contact.steps, law)
     free = [k for k, b in enumerate(motion.bodies) if b.motion == "free"]
     links = _links(contact, motion)
     system = System(links, free, inertia(motion, free))

@@ -56,21 +56,6 @@ struct Sizes {
   double recovery, slowest, dt;
 };
 
-// Moves a block of scenes between arrays (rows, scenes), one per field, and structs of lanes.
-template <typename T, class S>
-static void fetch(std::vector<S>& to, const T* const* from, int64_t b, int64_t scenes) {
-  const int64_t rows = to.size(), fields = sizeof(S) / sizeof(Lanes<T>);
-  for (int64_t r = 0; r < rows; ++r)
-    for (int64_t f = 0; f < fields; ++f) ((Lanes<T>*)&to[r])[f] = load(from[f] + r * scenes + b, scenes - b);
-}
-template <typename T, class S>
-static void put(const std::vector<S>& from, T* const* to, int64_t b, int64_t scenes) {
-  const int64_t rows = from.size(), fields = sizeof(S) / sizeof(Lanes<T>);
-  for (int64_t r = 0; r < rows; ++r)
-    for (int64_t f = 0; f < fields; ++f)
-      store<T>(to[f] + r * scenes + b, ((const Lanes<T>*)&from[r])[f], scenes - b);
-}
-
 // Numbers that contact depends on, or derivatives by them.
 template <typename T>
 struct Inputs {

@@ -249,8 +249,9 @@ struct Block : Geometry<T> {
 template <typename T>
 static Block<T>& working(const Sizes& n) {
   static thread_local std::unique_ptr<Block<T>> kept;
-  const bool fits = kept && kept->n.families == n.families && kept->n.vertices == n.vertices &&
-                    kept->n.bodies == n.bodies && kept->n.sweeps == n.sweeps;
+  // Equal lists of numbers stand at the same place, see blocks.py.
+  const bool fits = kept && kept->n.shape == n.shape && kept->n.pieces == n.pieces && kept->n.after == n.after &&
+                    kept->n.bodies == n.bodies && kept->n.vertices == n.vertices && kept->n.sweeps == n.sweeps;
   if (!fits) kept.reset(new Block<T>(n));
   kept->n = n;
   return *kept;

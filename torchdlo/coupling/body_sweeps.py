@@ -9,39 +9,25 @@ far as foreseen. Compilers of graphs take minutes to unroll the sweeps; for them
 from __future__ import annotations
 
 import ctypes
-import functools
-import hashlib
 import itertools
 from collections.abc import Sequence
-from pathlib import Path
 
 import torch
 from torch import Tensor
 
-from torchdlo.coupling import shapes
+from torchdlo.coupling import blocks, shapes
 from torchdlo.coupling.bodies import Body, BodyMotion
 from torchdlo.coupling.components import axes
-from torchdlo.physics import native
 from torchdlo.physics.effect import Motion, Push
 from torchdlo.physics.rod import View
 
-_OPTIONS = ("-fno-math-errno", "-fno-trapping-math", "-Wno-psabi")
-_HEADERS = ("lanes.h", "edge_points.h", "body_points.h")
 _ORDER = tuple(shapes.SIZES)
 _INPUTS = "Tensor[] edges, Tensor[] vertices, Tensor[] bodies"
 _STATIC = "int[] shapes, int[] pieces, int[] after, int sweeps, bool friction, float[] law"
 
 
-@functools.cache
 def _function(dtype: torch.dtype, what: str):
-    """Return a function of the kernel for numbers of a dtype, None where there is none."""
-    source = Path(__file__).with_name("body_sweeps.cpp")
-    # The library is named after its source and its options: a changed header has to be among them.
-    text = b"".join(source.with_name(name).read_bytes() for name in _HEADERS)
-    version = f"-DHEADERS=0x{hashlib.sha256(text).hexdigest()[:16]}"
-    library = native.library(source, *_OPTIONS, version, f"-I{source.parent}")
-    kind = {torch.float32: "float", torch.float64: "double"}.get(dtype)
-    return None if library is None or kind is None else getattr(library, f"body_sweeps_{kind}_{what}")
+    return blocks.function("body_sweeps", what, dtype)
 
 
 @torch.compiler.assume_constant_result
@@ -58,28 +44,17 @@ class _Sizes(ctypes.Structure):
     )
 
 
-@functools.cache
-def _kept(numbers: tuple[int, ...]) -> ctypes.Array:
-    return (ctypes.c_int64 * len(numbers))(*numbers)
-
-
 def _sizes(count: int, scenes: int, kinds, pieces, after, sweeps: int, friction: bool, law: Sequence[float]):
     families = sum(2 + n for n in pieces)
-    lists = (ctypes.addressof(_kept(tuple(x))) for x in (kinds, pieces, after))
+    lists = (blocks.integers(tuple(x)) for x in (kinds, pieces, after))
     return ctypes.byref(_Sizes(families, len(after), count, scenes, sweeps, friction, *lists, *law))
-
-
-def _fields(tensors: Sequence[Tensor]) -> ctypes.Array:
-    """Return the addresses of all fields of tensors (C, n, B)."""
-    at = [t.data_ptr() + k * t[0].nbytes for t in tensors for k in range(t.shape[0])]
-    return (ctypes.c_void_p * len(at))(*at)
 
 
 def _sweep(edges: list[Tensor], vertices: list[Tensor], bodies: list[Tensor], *static) -> tuple[Tensor, Tensor]:
     out = _sweep_meta(edges, vertices, bodies)
-    places = [_fields(x) for x in (edges, vertices, bodies)]
+    places = [blocks.fields(x) for x in (edges, vertices, bodies)]
     sizes = _sizes(*bodies[0].shape[1:], *static)
-    _function(out[0].dtype, "sweep")(*places, *(_fields([x]) for x in out), sizes, torch.get_num_threads())
+    _function(out[0].dtype, "sweep")(*places, *(blocks.fields([x]) for x in out), sizes, torch.get_num_threads())
     return out
 
 
@@ -89,9 +64,9 @@ def _sweep_meta(edges: list[Tensor], vertices: list[Tensor], bodies: list[Tensor
 
 def _back(edges: list[Tensor], vertices: list[Tensor], bodies: list[Tensor], force: Tensor, push: Tensor, *static):
     out = _back_meta(edges, vertices, bodies)
-    places = [_fields(x) for x in (edges, vertices, bodies, [force], [push])]
+    places = [blocks.fields(x) for x in (edges, vertices, bodies, [force], [push])]
     sizes = _sizes(*bodies[0].shape[1:], *static)
-    _function(force.dtype, "back")(*places, *(_fields([x]) for x in out), sizes, torch.get_num_threads())
+    _function(force.dtype, "back")(*places, *(blocks.fields([x]) for x in out), sizes, torch.get_num_threads())
     return out
 
 
@@ -133,19 +108,7 @@ def _backward(ctx, force: Tensor, push: Tensor):
 
 
 torch.library.register_autograd("torchdlo::body_sweeps", _backward, setup_context=_save, lib=_library)
-
-
-def _stored(parts: Sequence[Tensor], batch: Sequence[int], count: int) -> list[Tensor]:
-    """Return tensors (..., n or 1, C) as (C, n, B) each."""
-    n = len(batch) + 2
-    wide = (x.expand(*batch, count, x.shape[-1]).permute(n - 1, n - 2, *range(n - 2)) for x in parts)
-    return [x.reshape(x.shape[0], count, batch.numel()).contiguous() for x in wide]
-
-
-def _logical(x: Tensor, batch: Sequence[int]) -> Tensor:
-    """Return (C, n, B) as (..., n, C)."""
-    x = x.reshape(*x.shape[:2], *batch)
-    return x.permute(*range(2, x.dim()), 1, 0)
+torch.library.register_autograd("torchdlo::body_sweeps_back", blocks.once, lib=_library)
 
 
 def _solids(bodies: BodyMotion) -> list[Tensor]:
@@ -184,7 +147,7 @@ def push(
     vertices = [view.state.pos, view.state.vel, motion.change, motion.answer, motion.answer.amax(-1, keepdim=True)]
     solids = _solids(bodies)
     batch = torch.broadcast_shapes(*(x.shape[:-2] for x in (*edges, *vertices, *solids)))
-    inputs = (_stored(x, batch, n) for x, n in ((edges, size), (vertices, size), (solids, len(bodies.bodies))))
+    inputs = (blocks.stored(x, batch, n) for x, n in ((edges, size), (vertices, size), (solids, len(bodies.bodies))))
     force, wrench = torch.ops.torchdlo.body_sweeps(
         *inputs,
         [_ORDER.index(b.shape) for b in bodies.bodies],
@@ -194,7 +157,7 @@ def push(
         friction,
         [*law, view.dt],
     )
-    return Push(_logical(force, batch), *_logical(wrench, batch).split(3, -1))
+    return Push(blocks.logical(force, batch), *blocks.logical(wrench, batch).split(3, -1))
 
 
 def fits(bodies: Sequence[Body], like: Tensor) -> bool:

@@ -1,6 +1,6 @@
 // Points of edges that are nearest to bodies; the same formulas as in shapes.py and edge_points.py, for scenes side by side.
 #pragma once
-#include "lanes.h"
+#include "tape.h"
 
 enum Shape { PLANE, SPHERE, BOX, CAPSULE, CYLINDER, CONE, TORUS, RING };
 
@@ -111,6 +111,13 @@ struct Line {
     const Lanes<T> all[10] = {from.x,  from.y,     from.z,     along.x,    along.y,
                               along.z, numbers[0], numbers[1], numbers[2], numbers[3]};
     for (int k = 0; k < 10; ++k) (k < 3 ? start[k] : k < 6 ? edge[k - 3] : size[k - 6]) = Num<T, N>::variable(all[k], k);
+    Num<T, N> direction[3];
+    length = unit<3>(edge, 0, direction);
+  }
+
+  Line(int shape, const Three<T, N>& from, const Three<T, N>& along, const Num<T, N>* numbers) : shape(shape) {
+    for (int k = 0; k < 3; ++k) start[k] = from[k], edge[k] = along[k];
+    for (int k = 0; k < 4; ++k) size[k] = numbers[k];
     Num<T, N> direction[3];
     length = unit<3>(edge, 0, direction);
   }

@@ -3,6 +3,7 @@
 #include <cmath>
 #include <cstdint>
 #include <cstring>
+#include <vector>
 
 template <typename T>
 struct Pack {
@@ -15,7 +16,7 @@ constexpr int WIDTH = 64 / sizeof(T);
 
 template <typename T>
 static inline Lanes<T> load(const T* from, int64_t count) {
-  Lanes<T> x{};
+  Lanes<T> x = Lanes<T>{} + *from;  // lanes behind the end do what the first does
   if (count >= WIDTH<T>)
     std::memcpy(&x, from, sizeof(x));
   else
@@ -29,6 +30,21 @@ static inline void store(T* to, const Lanes<T>& x, int64_t count) {
     std::memcpy(to, &x, sizeof(x));
   else
     std::memcpy(to, &x, count * sizeof(T));
+}
+
+// Moves a block of scenes between arrays (rows, scenes), one per field, and structs of lanes.
+template <typename T, class S>
+static void fetch(std::vector<S>& to, const T* const* from, int64_t b, int64_t scenes) {
+  const int64_t rows = to.size(), fields = sizeof(S) / sizeof(Lanes<T>);
+  for (int64_t r = 0; r < rows; ++r)
+    for (int64_t f = 0; f < fields; ++f) ((Lanes<T>*)&to[r])[f] = load(from[f] + r * scenes + b, scenes - b);
+}
+template <typename T, class S>
+static void put(const std::vector<S>& from, T* const* to, int64_t b, int64_t scenes) {
+  const int64_t rows = from.size(), fields = sizeof(S) / sizeof(Lanes<T>);
+  for (int64_t r = 0; r < rows; ++r)
+    for (int64_t f = 0; f < fields; ++f)
+      store<T>(to[f] + r * scenes + b, ((const Lanes<T>*)&from[r])[f], scenes - b);
 }
 
 template <typename T>
@@ -55,7 +71,7 @@ constexpr T TINY = sizeof(T) == 8 ? T(1e-12) : T(1e-8);
 template <typename T, int N>
 struct Num {
   Lanes<T> x;
-  Lanes<T> g[N ? N : 1];
+  Lanes<T> g[N];
   Num() {}
   Num(const Lanes<T>& value) : x(value) {
     for (int i = 0; i < N; ++i) g[i] = Lanes<T>{};
@@ -117,6 +133,8 @@ static inline Num<T, N> select(const M& mask, const Num<T, N>& yes, const Num<T,
 }
 NUM larger(const Num<T, N>& a, const Num<T, N>& b) { return select(a.x >= b.x, a, b); }
 NUM smaller(const Num<T, N>& a, const Num<T, N>& b) { return select(a.x <= b.x, a, b); }
+// What is not a number stays so.
+NUM positive(const Num<T, N>& a) { return select(a.x < T(0), Num<T, N>(T(0)), a); }
 NUM magnitude(const Num<T, N>& a) { return select(a.x < T(0), -a, a); }
 
 // Three numbers.

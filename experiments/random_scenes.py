@@ -1,0 +1,240 @@
+"""Run random scenes of ropes among bodies and look for what must not happen.
+
+A kind of scene is a set of bodies; its scenes, which differ in everything else, run as one batch: a tangled rope of
+random stiffness, friction and speed falls on a plane and on a free, a fixed and a moved body of random shapes, sizes,
+densities and spins. Found at fault are scenes that are not finite, that missed a contact, whose edges are not as long
+as they are meant to be, and those in which things overlap by more than 10 % of the rope's radius once the rope is at
+rest. A kind that is run again from the same seed has to end in the same bits.
+
+examples:
+  python experiments/random_scenes.py --scenes 1000 --json random_scenes.json
+  python experiments/random_scenes.py --scenes 40 --batch 20 --seconds 0.5
+"""
+
+from __future__ import annotations
+
+import math
+import random
+import sys
+import time
+from typing import Any
+
+from options import Parser, count, save
+
+RADIUS, EDGE, VERTICES = 0.01, 0.02, 40
+SIZES = {
+    "sphere": (0.04,),
+    "box": (0.05, 0.04, 0.03),
+    "capsule": (0.02, 0.05),
+    "cylinder": (0.03, 0.05),
+    "cone": (0.05, 0.1),
+    "torus": (0.06, 0.02),
+    "ring": (0.06, 0.02, 4.0),
+}
+AT_REST = 0.05
+"""Speed below which a rope counts as being at rest [m/s]."""
+DEEPEST = 0.1
+"""Overlap at rest over the rope's radius above which a scene is at fault."""
+LONGEST = 0.01
+"""Strain of an edge above which a scene is at fault."""
+
+
+def tangles(scenes: int, generator: Any) -> Any:
+    """Return random smooth curves with even edges whose parts are two diameters apart, (scenes, VERTICES, 3)."""
+    import torch
+
+    found: list[Any] = []
+    along = torch.linspace(0, 1, 1000, dtype=torch.float64)
+    near = torch.ones(VERTICES, VERTICES).triu(4) > 0
+    while len(found) < scenes:
+        waves = torch.arange(1, 4, dtype=torch.float64)
+        size = torch.randn(200, 3, 3, 1, generator=generator, dtype=torch.float64) / waves[:, None] * 0.12
+        phase = 2 * math.pi * torch.rand(200, 3, 3, 1, generator=generator, dtype=torch.float64)
+        curve = (size * torch.sin(math.pi * waves[:, None] * along + phase)).sum(2).mT
+        length = torch.cat([torch.zeros(200, 1), (curve[:, 1:] - curve[:, :-1]).norm(dim=-1).cumsum(-1)], -1)
+        for x, s in zip(curve, length, strict=True):
+            if float(s[-1]) < (VERTICES - 1) * EDGE:
+                continue
+            at = torch.searchsorted(s, torch.arange(VERTICES) * EDGE).clamp(max=len(s) - 1)
+            x = x[at]
+            apart = torch.cdist(x, x)[near]
+            turn = torch.nn.functional.cosine_similarity(x[2:] - x[1:-1], x[1:-1] - x[:-2], dim=-1)
+            if float(apart.min()) > 4 * RADIUS and float(turn.min()) > 0.3:
+                found.append(x - torch.stack([*x.mean(0)[:2], x[:, 2].min() - 0.25]))
+    return torch.stack(found[:scenes])
+
+
+def build(seed: int, scenes: int, step: tuple[float, int]) -> tuple[tuple[Any, Any, Any], list[str]]:
+    """Return a kind of scene with its parameters and first state, and the shapes of its bodies."""
+    import torch
+
+    from torchdlo import scene
+    from torchdlo.coupling import BodyContact, RodBody, RodContact
+    from torchdlo.physics import tree
+    from torchdlo.physics.effects.elastic import Bend
+    from torchdlo.physics.effects.field import Damping, Gravity
+
+    g = torch.Generator().manual_seed(seed)
+    shapes = random.Random(seed).choices(sorted(SIZES), k=3)
+
+    def uniform(low: float, high: float, *shape: int) -> Any:
+        return low + (high - low) * torch.rand(scenes, *shape, generator=g, dtype=torch.float64)
+
+    solids = [scene.Solid("plane", motion="fixed", mu_s=0.5, mu_k=0.4)]
+    for k, (shape, motion) in enumerate(zip(shapes, ("free", "fixed", "kinematic"), strict=True)):
+        angle = 2 * math.pi * k / 3
+        at = torch.tensor([0.16 * math.cos(angle), 0.16 * math.sin(angle), 0.11], dtype=torch.float64)
+        turn = torch.randn(scenes, 4, generator=g, dtype=torch.float64)
+        size = torch.tensor(SIZES[shape], dtype=torch.float64) * uniform(0.6, 1.0, 1)
+        if shape == "ring":
+            size = torch.cat([size[:, :2], torch.full_like(size[:, :1], 4.0)], -1)
+        free = motion == "free"
+        moves = {"vel": uniform(-0.5, 0.5, 3), "omega": uniform(-5, 5, 3), "density": uniform(200, 2000)}
+        rub = uniform(0, 0.8)
+        solids.append(
+            scene.Solid(
+                shape, size, at + uniform(-0.02, 0.02, 3), turn / turn.norm(dim=-1, keepdim=True), motion=motion,
+                mu_s=rub, mu_k=0.9 * rub, restitution=uniform(0, 0.6), name=f"{shape} {k}", **(moves if free else {}),
+            )
+        )  # fmt: skip
+    rub = uniform(0, 0.6, 1, 1)
+    values = {
+        "damping": {"rate": 10 ** uniform(0, 1, 1, 1)},
+        "rod_contact": {"mu_s": rub, "mu_k": 0.9 * rub, "restitution": uniform(0, 0.5, 1, 1)},
+    }
+    rope = scene.Rope(tangles(scenes, g), radius=RADIUS, density=1000.0, bend=1e-4)
+    effects = [Gravity(), Bend(), Damping(), RodContact(burst=3.0, room=400), RodBody(), BodyContact()]
+    made = scene.make([rope], effects, values, bodies=solids, dt=step[0], substeps=step[1])
+    thrown = uniform(-1.0, 1.0, 1, 3) + uniform(-0.2, 0.2, VERTICES, 3)
+    material = tree.replace(made[1].rods.material, bend=10 ** uniform(-6, -4, 1, 1))
+    rods = tree.replace(made[1].rods, material=material)
+    state = tree.replace(made[2], rods=tree.replace(made[2].rods, vel=tree.batch_innermost(thrown)))
+    return (made[0], tree.replace(made[1], rods=rods), state), shapes
+
+
+def run(made: tuple[Any, Any, Any], seconds: float) -> Any:
+    """Return the state after a time in which the moved body goes once to and fro through the pile."""
+    import torch
+
+    from torchdlo import scene
+    from torchdlo.physics import tree
+
+    choice, params, state = made
+    first = scene.hold(choice, state)
+    frames = round(seconds / choice.dt)
+    with torch.no_grad():
+        for k in range(frames):
+            # It comes to rest at three quarters of the time.
+            share = min(1.0, (k + 1) / (0.75 * frames))
+            way = 0.06 * math.sin(math.pi * share) ** 2
+            pos = first.bodies.pos + first.bodies.pos.new_tensor([way, way, 0.0])
+            state = scene.step(choice, params, state, tree.replace(first, bodies=tree.replace(first.bodies, pos=pos)))
+    return state
+
+
+def overlaps(made: tuple[Any, Any, Any], state: Any) -> tuple[Any, Any]:
+    """Return how deep ropes are in bodies, and in themselves, over the radius, shape (scenes,) each."""
+    import torch
+
+    from torchdlo.coupling import segments, shapes
+    from torchdlo.coupling.bodies import conjugate
+    from torchdlo.physics.rotation import rotate
+
+    choice, params, _ = made
+    x = state.rods.pos
+    ends = (x[:, :-1], x[:, 1:])
+    share = torch.linspace(0, 1, 9, dtype=x.dtype)[:, None]
+    points = torch.lerp(*(e.unsqueeze(2) for e in ends), share).flatten(1, 2)
+    nearest = []
+    for k, body in enumerate(choice.bodies):
+        at, quat = state.bodies.pos[:, k : k + 1], state.bodies.quat[:, k : k + 1]
+        size = params.bodies.size[..., k : k + 1, :]
+        nearest.append(shapes.distance(body.shape, size, rotate(conjugate(quat), points - at)).amin((-1, -2)))
+    first, second = torch.triu_indices(VERTICES - 1, VERTICES - 1, 3)
+    one, two = (tuple(e[:, rows] for e in ends) for rows in (first, second))
+    s, t = segments.closest(one, two)
+    between = torch.lerp(*one, s) - torch.lerp(*two, t)
+    inside = 1 - torch.stack(nearest).amin(0) / RADIUS
+    return inside.clamp(min=0), (2 - between.norm(dim=-1).amin(-1) / RADIUS).clamp(min=0)
+
+
+def examine(seed: int, scenes: int, seconds: float, step: tuple[float, int]) -> list[dict[str, Any]]:
+    """Run a kind of scene and return a row for each of its scenes."""
+    import torch
+
+    from torchdlo import scene
+
+    made, shapes = build(seed, scenes, step)
+    start = time.process_time()
+    state = run(made, seconds)
+    used = time.process_time() - start
+    x, v = state.rods.pos, state.rods.vel
+    speed = v.norm(dim=-1).amax(-1)
+    length = (x[:, 1:] - x[:, :-1]).norm(dim=-1)
+    strain = (length / made[1].rods.rest.length[..., :-1, 0] - 1).abs().amax(-1)
+    body, own = overlaps(made, state)
+    short = 0.05
+    twice = [run(build(seed, scenes, step)[0], short) for _ in range(2)]
+    same = torch.equal(twice[0].rods.pos, twice[1].rods.pos) and torch.equal(twice[0].bodies.pos, twice[1].bodies.pos)
+    finite, fine = scene.finite(state), scene.ok(state)
+    rows = []
+    for k in range(scenes):
+        resting, deep = float(speed[k]) < AT_REST, max(float(body[k]), float(own[k]))
+        faults = [
+            name
+            for name, wrong in (
+                ("not finite", not bool(finite[k])),
+                ("missed a contact", bool(finite[k]) and not bool(fine[k])),
+                ("lengths", not float(strain[k]) <= LONGEST),
+                ("overlaps at rest", resting and not deep <= DEEPEST),
+                ("other bits", not same),
+            )
+            if wrong
+        ]
+        numbers = {"speed": speed[k], "strain": strain[k], "in_bodies": body[k], "in_itself": own[k]}
+        row = {"kind": seed, "scene": k, "shapes": shapes, "at_rest": resting, "faults": faults}
+        row |= {name: float(x) for name, x in numbers.items()} | {"missed": state.missed[k, 0].tolist()}
+        rows.append(row | {"cpu_s": used / scenes})
+    return rows
+
+
+def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """Return how many scenes there were, and how many with each fault."""
+    faults = sorted({f for r in rows for f in r["faults"]})
+    resting = [r for r in rows if r["at_rest"]]
+    deepest = max((max(r["in_bodies"], r["in_itself"]) for r in resting), default=None)
+    return {
+        "scenes": len(rows),
+        "at_rest": len(resting),
+        "deepest_at_rest": deepest,
+        "faults": {f: sum(f in r["faults"] for r in rows) for f in faults},
+    }
+
+
+def main() -> int:
+    """Run kinds until there were enough scenes; what was found so far is in the file after each."""
+    parser = Parser(__file__, description=__doc__)
+    parser.add_argument("--json", metavar="FILE", default="", help="file that the results go to")
+    parser.add_argument("--scenes", type=count, default=1000, help="scenes in all (%(default)s)")
+    parser.add_argument("--batch", type=count, default=100, help="scenes of a kind, run together (%(default)s)")
+    parser.add_argument("--seconds", type=float, default=2.0, help="simulated time (%(default)s)")
+    parser.add_argument("--seed", type=int, default=0, help="of the first kind (%(default)s)")
+    parser.add_argument("--dt", type=float, default=2e-3, help="step [s] (%(default)s)")
+    parser.add_argument("--substeps", type=count, default=4, help="substeps per step (%(default)s)")
+    options = parser.parse_args()
+    import torch
+
+    torch.set_num_threads(1)
+    rows: list[dict[str, Any]] = []
+    seed = options.seed
+    while len(rows) < options.scenes:
+        size = min(options.batch, options.scenes - len(rows))
+        rows += examine(seed, size, options.seconds, (options.dt, options.substeps))
+        seed += 1
+        print(f"{len(rows):6} scenes: {summary(rows)}", flush=True)
+        save(options.json, {"summary": summary(rows), "rows": rows})
+    return int(bool(summary(rows)["faults"]))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,162 @@
+"""The kernel for contact among bodies does what the tensor operations do, and so does its derivative."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+import torch
+
+from tests.coupling.tumbling import F64, ground
+from torchdlo.coupling import body_pairs
+from torchdlo.coupling.bodies import BodyMotion, Solid, foresee, hold, place
+from torchdlo.coupling.body_contact import BodyContact, resolve
+from torchdlo.physics import tree
+
+pytestmark = pytest.mark.skipif(not body_pairs.ready("cpu", F64), reason="there is no C++ compiler")
+
+DT = 2e-3
+SIZES = {
+    "sphere": 0.05,
+    "box": (0.05, 0.04, 0.03),
+    "capsule": (0.03, 0.05),
+    "cylinder": (0.04, 0.05),
+    "cone": (0.05, 0.1),
+    "torus": (0.06, 0.02),
+    "ring": (0.06, 0.02, 4.0),
+}
+SCENES = 11
+"""Fill one block of lanes and a part of the next."""
+
+
+def thrown(kinds: tuple[str, ...], seed: int = 1) -> list[Solid]:
+    """Bodies that fly at each other, in another way in every scene; the first may be the ground."""
+    g = torch.Generator().manual_seed(seed)
+
+    def random(width: int, scale: float) -> torch.Tensor:
+        return scale * torch.randn(SCENES, width, generator=g, dtype=F64)
+
+    solids = (
+        [ground(pos=(0.0, 0.0, -0.06), quat=(0.998, 0.05, 0.04, 0.0), restitution=0.4)] if kinds[0] == "plane" else []
+    )
+    for k, kind in enumerate(kinds[len(solids) :]):
+        at = torch.tensor([0.09 * k - 0.02, 0.01 * k, 0.0], dtype=F64)
+        toward = torch.tensor([0.8 - 0.8 * k, 0.1, -0.5], dtype=F64)
+        turn = random(4, 1.0)
+        solids.append(
+            Solid(
+                kind, SIZES[kind], at + random(3, 0.02), turn / turn.norm(dim=-1, keepdim=True),
+                toward + random(3, 0.2), random(3, 1.0), density=600.0, restitution=0.3, mu_s=0.4, mu_k=0.3,
+            )
+        )  # fmt: skip
+    return solids
+
+
+def answered(solids: list[Solid], contact: BodyContact, shift: float = 0.0):
+    """Forces and torques, and the derivatives of a sum of them by all numbers, each of which is changed by a share."""
+    kinds, params, state = place(solids, torch.zeros(SCENES, 1, 3, dtype=F64))
+    leaves, build = tree.flatten((params, state))
+    signs = torch.Generator().manual_seed(2)
+    leaves = [x * (1 + shift * torch.randn(x.shape, generator=signs, dtype=F64).sign()) for x in leaves]
+    leaves = [x.requires_grad_() for x in leaves]
+    params, state = build(leaves)
+    one = torch.zeros(1, 1, dtype=F64)
+    pulled = torch.tensor([[0.0, 0.0, -9.81]], dtype=F64)
+    motion = foresee(kinds, params, state, hold(kinds, state), pulled, one, DT)
+    found = torch.cat([x.expand(SCENES, -1, -1) for x in resolve(contact, motion)], -1)
+    weight = torch.sin(torch.arange(found.numel(), dtype=F64)).reshape(found.shape)
+    gradient = torch.autograd.grad((weight * found).sum(), leaves, allow_unused=True)
+    return found.detach(), [torch.zeros_like(x) if g is None else g for x, g in zip(leaves, gradient, strict=True)]
+
+
+CASES = {
+    "box on plane": (("plane", "box"), {}),
+    "cylinder on plane": (("plane", "cylinder"), {}),
+    "sphere and box": (("sphere", "box"), {}),
+    "box and cone": (("box", "cone"), {}),
+    "capsule and cylinder": (("capsule", "cylinder"), {}),
+    "cone and torus": (("cone", "torus"), {}),
+    "torus and ring": (("torus", "ring"), {}),
+    "ring and capsule": (("ring", "capsule"), {}),
+    "a heap": (("plane", "box", "cylinder", "capsule"), {"points": 4}),
+    "too few rounds": (("plane", "box", "box"), {"steps": 1}),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_the_kernel_and_tensor_operations_agree_with_their_gradients(case: str, monkeypatch) -> None:
+    kinds, choices = CASES[case]
+    solids, contact = thrown(kinds), BodyContact(**choices)
+    found, gradient = answered(solids, contact)
+    monkeypatch.setattr(body_pairs, "ready", lambda *_: False)
+    wanted, expected = answered(solids, contact)
+    assert int((wanted.abs().amax((-1, -2)) > 0).sum()) >= 3  # scenes with contact
+    assert float((found - wanted).norm()) < 1e-9 * float(wanted.norm())
+    # Derivatives answer to rounding as the stiffness of contact makes them: the scale is what the tensor operations
+    # themselves find when their inputs are rounded otherwise, by the last bit.
+    _, rounded = answered(solids, contact, 2**-52)
+    for one, other, near in zip(gradient, expected, rounded, strict=True):
+        noise = float((near - other).norm()) + 1e-12 * float(other.norm())
+        assert float((one - other).norm()) <= 30 * noise
+
+
+def test_scenes_of_a_block_do_what_each_does_alone() -> None:
+    solids = thrown(("plane", "box", "cylinder", "capsule"))
+    kinds, params, state = place(solids, torch.zeros(SCENES, 1, 3, dtype=F64))
+    still, zero = hold(kinds, state), torch.zeros(1, 1, dtype=F64)
+    motion = foresee(kinds, params, state, still, 0.0, zero, DT)
+    together = resolve(BodyContact(), motion)
+    for k in (0, 7, 10):
+        one = tree.map(lambda x, k=k: x[k : k + 1], state)
+        own = params if params.mass.dim() == 2 else tree.map(lambda x, k=k: x[k : k + 1] if x.dim() == 3 else x, params)
+        alone = resolve(BodyContact(), foresee(kinds, own, one, hold(kinds, one), 0.0, zero, DT))
+        for whole, part in zip(together, alone, strict=True):
+            assert torch.equal(whole[k : k + 1], part)
+
+
+def moving(pos: torch.Tensor, vel: tuple[float, float, float]) -> BodyMotion:
+    """Two balls, the second one at rest at `pos`, (B, 3)."""
+    balls = [Solid("sphere", 0.05, vel=vel, mass=1.0), Solid("sphere", 0.05, pos, mass=1.0)]
+    kinds, params, state = place(balls, torch.zeros(len(pos), 1, 3, dtype=F64))
+    return foresee(kinds, params, state, hold(kinds, state), 0.0, torch.zeros(1, 1, dtype=F64), DT)
+
+
+def test_pairs_are_skipped_only_where_they_cannot_meet() -> None:
+    # 1 m/s over 2 ms closes gaps below 2 mm.
+    gap = torch.linspace(0.7e-3, 10.2e-3, 20, dtype=F64)[:, None]
+    force, _ = resolve(BodyContact(), moving(torch.cat([0.1 + gap, 0 * gap, 0 * gap], -1), (1.0, 0.0, 0.0)))
+    assert torch.equal(force[:, 0, 0] < 0, gap[:, 0] < 1.0 * DT)
+    assert torch.equal(force[:, 0, 0] == 0, gap[:, 0] > 1.0 * DT)
+
+
+def test_what_is_not_a_number_stays_so_and_spoils_no_other_scene() -> None:
+    motion = moving(torch.tensor([[0.0999, 0.0, 0.0]] * 3, dtype=F64), (1.0, 0.0, 0.0))
+    change = motion.change.clone()
+    change[1, 0, 1] = torch.nan
+    force, _ = resolve(BodyContact(), dataclasses.replace(motion, change=change))
+    assert bool(force[1].isnan().any())
+    assert torch.equal(force[0], force[2])
+    assert bool(force[0].isfinite().all())
+
+
+def test_the_operator_tells_compilers_the_truth() -> None:
+    state = place(thrown(("box", "cone")), torch.zeros(SCENES, 1, 3, dtype=F64))[2]
+    members = torch.cat(
+        [state.pos.mT, torch.rand(SCENES, 34, 2, generator=torch.Generator().manual_seed(0), dtype=F64)], 1
+    )
+    fields = [members.permute(1, 2, 0).contiguous().requires_grad_()]
+    given = (fields, [2, 5], [0, 1], [0, 1], 8, 8, [0.2, 1e-3, 0.02, DT])
+    torch.library.opcheck(
+        torch.ops.torchdlo.body_pairs.default,
+        given,
+        test_utils=("test_schema", "test_autograd_registration", "test_faketensor"),
+    )
+
+
+def test_second_derivatives_are_refused() -> None:
+    motion = moving(torch.tensor([[0.0999, 0.0, 0.0]], dtype=F64), (1.0, 0.0, 0.0))
+    change = motion.change.clone().requires_grad_()
+    force, _ = resolve(BodyContact(), dataclasses.replace(motion, change=change))
+    (once,) = torch.autograd.grad(force.square().sum(), change, create_graph=True)
+    with pytest.raises(RuntimeError, match="no second derivative"):
+        torch.autograd.grad(once.sum(), change)

@@ -1,0 +1,71 @@
+"""Tensors as the C++ kernels want them that work on blocks of scenes: one array (rows, scenes) per number."""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+import hashlib
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from torchdlo.physics import native
+
+_OPTIONS = ("-fno-math-errno", "-fno-trapping-math", "-Wno-psabi")
+_KINDS = {torch.float32: "float", torch.float64: "double"}
+
+
+@functools.cache
+def function(name: str, what: str, dtype: torch.dtype, *options: str):
+    """Return a function of the kernel in `name`.cpp for numbers of a dtype, None where there is none.
+
+    Args:
+        name: of the source file, beside this one.
+        what: of the function.
+        dtype: of its numbers.
+        options: what the compiler is told besides the usual.
+    """
+    source = Path(__file__).with_name(f"{name}.cpp")
+    # The library is named after its source and its options: a changed header has to be among them.
+    text = b"".join(header.read_bytes() for header in sorted(source.parent.glob("*.h")))
+    version = f"-DHEADERS=0x{hashlib.sha256(text).hexdigest()[:16]}"
+    library = native.library(source, *_OPTIONS, *options, version, f"-I{source.parent}")
+    kind = _KINDS.get(dtype)
+    return None if library is None or kind is None else getattr(library, f"{name}_{kind}_{what}")
+
+
+@functools.cache
+def integers(numbers: tuple[int, ...]) -> int:
+    """Return the address of whole numbers that stay in memory."""
+    return ctypes.addressof(_kept(numbers))
+
+
+@functools.cache
+def _kept(numbers: tuple[int, ...]) -> ctypes.Array:
+    return (ctypes.c_int64 * len(numbers))(*numbers)
+
+
+def fields(tensors: Sequence[Tensor]) -> ctypes.Array:
+    """Return the addresses of all fields of tensors (C, n, B)."""
+    at = [t.data_ptr() + k * t[0].nbytes for t in tensors for k in range(t.shape[0])]
+    return (ctypes.c_void_p * len(at))(*at)
+
+
+def stored(parts: Sequence[Tensor], batch: Sequence[int], count: int) -> list[Tensor]:
+    """Return tensors (..., n or 1, C) as (C, n, B) each."""
+    n = len(batch) + 2
+    wide = (x.expand(*batch, count, x.shape[-1]).permute(n - 1, n - 2, *range(n - 2)) for x in parts)
+    return [x.reshape(x.shape[0], count, batch.numel()).contiguous() for x in wide]
+
+
+def logical(x: Tensor, batch: Sequence[int]) -> Tensor:
+    """Return (C, n, B) as (..., n, C)."""
+    x = x.reshape(*x.shape[:2], *batch)
+    return x.permute(*range(2, x.dim()), 1, 0)
+
+
+def once(ctx, *by) -> None:
+    """Refuse to differentiate a derivative: what stands in for the backward pass of an operator's backward pass."""
+    raise RuntimeError("contact with bodies has no second derivative; do not ask for create_graph through it")

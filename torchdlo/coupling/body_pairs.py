@@ -1,0 +1,148 @@
+"""Contact forces among bodies as a C++ kernel, with its derivative.
+
+The formulas stand in `body_contact`, `balls` and `linked`, as tensor operations; these are used on a GPU, for meshes,
+and where there is no C++ compiler. The kernel does the same, several scenes per instruction, and skips pairs of bodies
+that cannot meet even if they move twice as far as foreseen. For compilers of graphs it is one operation.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import itertools
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from torchdlo.coupling import balls, blocks, shapes
+from torchdlo.coupling.bodies import BodyMotion
+from torchdlo.coupling.components import axes
+
+_ORDER = tuple(shapes.SIZES)
+_STATIC = "int[] shapes, int[] free, int[] pairs, int points, int steps, float[] law"
+HARD = 1e4
+"""Stiffness of contact times the mobility of the two bodies: its inverse is the share of an impact that is let through.
+Harder contact takes more rounds, and single precision has no digits for it."""
+FIT = 1e-2
+"""By how much forces may do more than is asked for before they are dropped."""
+_NUMBERS = {"HARD": HARD, "FIT": FIT} | {n: getattr(balls, n) for n in ("ROUND", "FEET", "ARC", "SPREAD", "FLAT")}
+_OPTIONS = tuple(f"-D{name}={value}" for name, value in _NUMBERS.items())
+
+
+def _function(dtype: torch.dtype, what: str):
+    return blocks.function("body_pairs", what, dtype, *_OPTIONS)
+
+
+@torch.compiler.assume_constant_result
+def ready(device: str, dtype: torch.dtype) -> bool:
+    """Return whether the kernel works for tensors of a kind of device and a dtype."""
+    return device == "cpu" and _function(dtype, "back") is not None
+
+
+class _Sizes(ctypes.Structure):
+    _fields_ = (
+        *((name, ctypes.c_int64) for name in ("bodies", "scenes", "pairs", "points", "steps")),
+        *((name, ctypes.c_void_p) for name in ("shape", "free", "pair")),
+        *((name, ctypes.c_double) for name in ("recovery", "shallow", "slowest", "dt")),
+    )
+
+
+def _sizes(bodies: list[Tensor], kinds, free, pairs, points: int, steps: int, law: Sequence[float]):
+    lists = (blocks.integers(tuple(x)) for x in (kinds, free, pairs))
+    return ctypes.byref(_Sizes(*bodies[0].shape[1:], len(pairs) // 2, points, steps, *lists, *law))
+
+
+def _exert(bodies: list[Tensor], *static) -> Tensor:
+    out = _exert_meta(bodies)
+    places = (blocks.fields(bodies), blocks.fields([out]))
+    _function(out.dtype, "exert")(*places, _sizes(bodies, *static), torch.get_num_threads())
+    return out
+
+
+def _exert_meta(bodies: list[Tensor], *static) -> Tensor:
+    return bodies[0].new_empty(6, *bodies[0].shape[1:])
+
+
+def _back(bodies: list[Tensor], by: Tensor, *static) -> Tensor:
+    out = _back_meta(bodies)
+    places = (blocks.fields(x) for x in (bodies, [by], [out]))
+    _function(out.dtype, "back")(*places, _sizes(bodies, *static), torch.get_num_threads())
+    return out
+
+
+def _back_meta(bodies: list[Tensor], *others) -> Tensor:
+    return bodies[0].new_empty(sum(x.shape[0] for x in bodies), *bodies[0].shape[1:])
+
+
+_library = torch.library.Library("torchdlo", "FRAGMENT")
+for _schema, _make, _fake in (
+    (f"body_pairs(Tensor[] bodies, {_STATIC}) -> Tensor", _exert, _exert_meta),
+    (f"body_pairs_back(Tensor[] bodies, Tensor by, {_STATIC}) -> Tensor", _back, _back_meta),
+):
+    _name = _schema.partition("(")[0]
+    _library.define(_schema, tags=(torch.Tag.needs_contiguous_strides,))
+    _library.impl(_name, _make, "CPU")
+    _library.impl(_name, _fake, "Meta")
+
+
+def _save(ctx, inputs, output) -> None:
+    ctx.save_for_backward(*inputs[0])
+    ctx.static = inputs[1:]
+
+
+def _backward(ctx, by: Tensor):
+    bodies = list(ctx.saved_tensors)
+    found = torch.ops.torchdlo.body_pairs_back(bodies, by.contiguous(), *ctx.static)
+    return list(found.split([x.shape[0] for x in bodies])), *(None for _ in ctx.static)
+
+
+torch.library.register_autograd("torchdlo::body_pairs", _backward, setup_context=_save, lib=_library)
+torch.library.register_autograd("torchdlo::body_pairs_back", blocks.once, lib=_library)
+
+
+def _members(motion: BodyMotion) -> list[Tensor]:
+    """Return the fields of bodies in the order of the kernel, shape (..., K, C) each."""
+    state, params = motion.state, motion.params
+    ring = state.pos.new_tensor([[float(b.shape == "ring")] for b in motion.bodies]) > 0
+    size, arc = params.size, params.size[..., 2:]
+    half, none = 0.5 * arc, torch.zeros_like(arc)
+    offset = torch.where(ring, shapes.ring_centre(size), none)
+    numbers = [size[..., :2], torch.where(ring, torch.cos(half), arc), torch.where(ring, torch.sin(half), none), arc]
+    moves = [state.vel, state.omega, motion.change, motion.turn, motion.mobility, motion.agility]
+    laws = [params.mu_s, params.mu_k, params.restitution]
+    return [state.pos, *itertools.chain(*axes(state.quat)), offset, *numbers, *moves, *laws]
+
+
+def wrench(
+    motion: BodyMotion, pairs: Sequence[tuple[int, int]], points: int, steps: int, law: tuple[float, float, float]
+) -> tuple[Tensor, Tensor]:
+    """Return forces [N] and torques [N m] of contact on bodies, shape (..., K, 3) each; differentiable once.
+
+    Args:
+        motion: where bodies would go.
+        pairs: which of them may touch.
+        points: points per pair at most.
+        steps: choices of the contacts that press and stick.
+        law: share of a shallow overlap that a substep removes, overlap up to which only that share goes [m], and
+            approach below which nothing rebounds [m/s].
+    """
+    members, count = _members(motion), len(motion.bodies)
+    batch = torch.broadcast_shapes(*(x.shape[:-2] for x in members))
+    order = itertools.count()
+    found = torch.ops.torchdlo.body_pairs(
+        blocks.stored(members, batch, count),
+        [_ORDER.index(b.shape) for b in motion.bodies],
+        [next(order) if b.motion == "free" else -1 for b in motion.bodies],
+        list(itertools.chain(*pairs)),
+        points,
+        steps,
+        [*law, motion.dt],
+    )
+    force, torque = blocks.logical(found, batch).split(3, -1)
+    return force, torque
+
+
+def fits(motion: BodyMotion) -> bool:
+    """Return whether the kernel can do what these bodies need."""
+    like = motion.state.pos
+    return all(b.shape != "mesh" for b in motion.bodies) and ready(like.device.type, like.dtype)
