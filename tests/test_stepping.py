@@ -6,16 +6,17 @@ import pytest
 import torch
 
 from torchdlo import scene
+from torchdlo.coupling import RodBody
 from torchdlo.physics import tree
 from torchdlo.physics.effects.elastic import Bend
 from torchdlo.physics.effects.field import Gravity
 
 
-def hanging(scenes: int, **choices):
+def hanging(scenes: int, held: tuple[int, ...] = (0, 1), **choices):
     """A rope of five vertices held at one end, with controls that move it."""
     x = torch.zeros(scenes, 5, 3, dtype=torch.float64)
     x[..., 0] = torch.linspace(0, 1, 5, dtype=torch.float64)
-    made = scene.make([scene.Rope(x, mass=0.1, bend=1e-3)], [Gravity(), Bend()], held_vertices=(0, 1), **choices)
+    made = scene.make([scene.Rope(x, mass=0.1, bend=1e-3)], [Gravity(), Bend()], held_vertices=held, **choices)
     start = scene.hold(made[0], made[2])
     shift = 1e-3 * torch.arange(1, 5, dtype=torch.float64).reshape(4, 1, 1, 1)
     return *made, tree.replace(tree.map(lambda c: c.expand(4, *c.shape).clone(), start), pos=start.pos + shift)
@@ -56,14 +57,38 @@ def test_a_rollout_with_gradients_compiles_one_graph(graphs, choices, learned):
 
 @pytest.mark.compile
 @pytest.mark.slow
-@pytest.mark.parametrize("substeps", [1, 3])
-def test_a_rollout_without_gradients_compiles_one_graph(graphs, substeps):
-    made, params, state, controls = hanging(2, substeps=substeps)
+@pytest.mark.parametrize(
+    ("scenes", "held", "substeps"),
+    # Strides of axes of size 1 are whatever an operation leaves them to be: one scene, or one held vertex.
+    [(2, (0, 1), 1), (2, (0, 1), 3), (1, (0, 1), 2), (2, (0,), 2)],
+)
+def test_a_rollout_without_gradients_compiles_one_graph(graphs, scenes, held, substeps):
+    made, params, state, controls = hanging(scenes, held, substeps=substeps)
     with torch.no_grad():
         last, _ = scene.rollout(scene.stepper(made), params, state, controls)
         expected, _ = scene.rollout(scene.stepper(made, compiled=False), params, state, controls)
     assert graphs() == 1
     assert torch.allclose(last.rods.pos, expected.rods.pos, rtol=1e-12, atol=0)
+
+
+@pytest.mark.compile
+@pytest.mark.slow
+def test_a_rollout_with_bodies_and_gradients_compiles_one_graph_and_the_survey(graphs):
+    # Bodies have no gradient at first, and one as soon as a rope has touched them.
+    x = torch.zeros(1, 5, 3, dtype=torch.float64)
+    x[..., 0] = torch.linspace(0, 0.1, 5, dtype=torch.float64)
+    ball = scene.Solid("sphere", 0.02, (0.05, 0, -0.0245), density=500.0)
+    rope = scene.Rope(x, mass=0.01, bend=1e-5, radius=0.005)
+    made, params, state = scene.make([rope], [Gravity(), RodBody()], held_vertices=(0,), substeps=2, bodies=[ball])
+    control = scene.hold(made, state)
+    vel = state.rods.vel.clone().requires_grad_()
+    state = tree.replace(state, rods=tree.replace(state.rods, vel=vel))
+    step = scene.stepper(made)
+    for _ in range(3):
+        state = step(params, state, control)
+    (gradient,) = torch.autograd.grad(state.bodies.pos.square().sum(), vel)
+    assert float(gradient.abs().max()) > 0
+    assert graphs() == 2
 
 
 @pytest.mark.parametrize("compiled", [False, True])

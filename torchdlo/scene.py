@@ -25,7 +25,7 @@ from torchdlo.physics.build import Rope
 from torchdlo.physics.effect import Effect, altered, default_values, numbers_of
 from torchdlo.physics.hold import Reaction, Targets, check_grip, unfelt
 from torchdlo.physics.integrate import INTEGRATORS, TWISTS, Settings, settle_twist, substep
-from torchdlo.physics.replay import alike, rollout
+from torchdlo.physics.replay import alike, laid_out, rollout
 from torchdlo.physics.rod import RodParams, RodState
 from torchdlo.physics.topology import Topology
 
@@ -292,7 +292,8 @@ def advance(scene: Scene, params: Params, state: State, start: Control, control:
     moved, particles = rigid.advance(body, poses, push) if scene.bodies else (), ()
     if scene.matter:
         particles, missed = rod_matter.finish(scene.matter, params.matter, pool, push, settings.dt, missed)
-    return State(rods, state.time + settings.dt, missed, mean, moved, particles)
+    after = State(rods, state.time + settings.dt, missed, mean, moved, particles)
+    return laid_out(after) if torch.compiler.is_compiling() else after
 
 
 def step(scene: Scene, params: Params, state: State, control: Control, *, advance=advance, survey=survey) -> State:
@@ -351,10 +352,10 @@ def stepper(scene: Scene, *, compiled: bool = True):
 
     def run(params: Params, state: State, control: Control) -> State:
         _check_control(scene, control)
-        graded = torch.is_grad_enabled()
+        graded, state = torch.is_grad_enabled(), laid_out(state)
         if graded:
-            moving = alike((state.rods, state.reaction, state.matter), (params, control))
-            state = tree.replace(state, rods=moving[0], reaction=moving[1], matter=moving[2])
+            moving = alike((state.rods, state.reaction, state.bodies, state.matter), (params, control))
+            state = tree.replace(state, **dict(zip(("rods", "reaction", "bodies", "matter"), moving, strict=True)))
         whole, part = ways[graded]
         return whole(scene, params, state, control, part, look)
 

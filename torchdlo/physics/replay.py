@@ -6,13 +6,15 @@ doi:10.1145/347837.347846) with the leaves of trees as the only interface.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
 
 from torchdlo.physics import tree
+
+T = TypeVar("T")
 
 
 class _Replay(torch.autograd.Function):
@@ -87,6 +89,33 @@ def alike(state: Any, others: Any) -> Any:
     if not any(x.requires_grad for x in (*own, *tree.leaves(others))):
         return state
     return tree.map(lambda x: x if x.requires_grad else x.detach().requires_grad_(), state)
+
+
+def laid_out(state: T) -> T:
+    """Return a state with its tensors stored batch-innermost, to the last stride.
+
+    Compiled steps are made for the strides of their inputs, also of axes of size 1, where operations leave any: later
+    states are then stored as first ones.
+    """
+
+    def lay(x: Tensor) -> Tensor:
+        n = x.dim()
+        if n < 3:
+            return x
+        stored = x.permute(n - 1, n - 2, *range(n - 2))
+        if stored.stride() == _dense(stored.shape):
+            return x
+        return stored.clone(memory_format=torch.contiguous_format).permute(*range(2, n), 1, 0)
+
+    return tree.map(lay, state)
+
+
+def _dense(shape: Sequence[int]) -> tuple[int, ...]:
+    strides, step = [], 1
+    for size in reversed(shape):
+        strides.append(step)
+        step *= max(size, 1)
+    return tuple(reversed(strides))
 
 
 def rollout(
