@@ -31,8 +31,20 @@ def outline(body, params, state, k: int) -> list[list[float]]:
             [v for r in rings for v in [*r[0].tolist(), math.nan]],
             [v for r in rings for v in [*r[1].tolist(), math.nan]],
         ]
-    t = [2 * math.pi * i / 60 for i in range(61)]
-    return [[x + size[0] * math.cos(a) for a in t], [y + size[0] * math.sin(a) for a in t]]
+    t, out = [2 * math.pi * i / 60 for i in range(61)], [size[0]]
+    if body.shape == "torus":
+        ax, ay, az = rotate(state.quat[0, k], state.quat.new_tensor([0.0, 0.0, 1.0])).tolist()
+        if abs(az) < 0.5:
+            # It stands upright: the shadow of a ring with its axis along (ax, ay).
+            long, wide = size[0] + size[1], size[1]
+            corners = [[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]]
+            return [
+                [x - a * long * ay + b * wide * ax for a, b in corners],
+                [y + a * long * ax + b * wide * ay for a, b in corners],
+            ]
+        out = [size[0] + size[1], size[0] - size[1]]
+    circles = [([x + r * math.cos(a) for a in t], [y + r * math.sin(a) for a in t]) for r in out]
+    return [[v for c in circles for v in [*c[0], math.nan]], [v for c in circles for v in [*c[1], math.nan]]]
 
 
 def draw(name: str, target: Path) -> None:

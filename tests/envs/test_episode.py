@@ -96,11 +96,19 @@ def test_replayed_gradients_are_those_of_the_recorded_graph():
 
 
 def test_way_points_become_actions_of_the_greatest_length():
-    actions = through([[(0.03, 0.0, 0.0)], [(0.03, 0.0, 0.0155)]], 6, 1)
+    actions = through([[(0.03, 0.0, 0.0)], [(0.03, 0.0, 0.0155)]], 6, torch.zeros(1, 3))
     assert actions[:, 0].tolist() == pytest.approx([0.01, 0.01, 0.01, 0, 0, 0])
     assert actions[:, 2].tolist() == pytest.approx([0, 0, 0, 0.00775, 0.00775, 0])
     with pytest.raises(ValueError, match="they take 5 actions"):
-        through([[(0.05, 0.0, 0.0)]], 4, 1)
+        through([[(0.05, 0.0, 0.0)]], 4, torch.zeros(1, 3))
+
+
+def test_way_points_that_are_off_make_the_first_leg_longer_or_shorter():
+    off = torch.tensor([[[0.0, 0.0, 0.0]], [[0.015, 0.0, 0.0]]])
+    actions = through([[(0.03, 0.0, 0.0)], [(0.03, 0.0, 0.02)]], 7, off)
+    assert actions[0, :, 0].tolist() == pytest.approx([0.01, 0.01, 0.01, 0, 0, 0, 0])
+    assert actions[1, :, 0].tolist() == pytest.approx([0.009] * 5 + [0, 0])
+    assert actions[1, :, 2].tolist() == pytest.approx([0] * 5 + [0.01, 0.01])
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,8 @@ import torch
 
 from torchdlo import scene as scenes
 from torchdlo.coupling.grasp import Hands
-from torchdlo.envs import TASKS, episode
+from torchdlo.envs import TASKS, episode, geometry
+from torchdlo.envs.task import Task
 from torchdlo.physics import tree
 from torchdlo.physics.traced import record
 
@@ -36,6 +37,21 @@ def test_arms_can_go_the_way_by_hand(name: str) -> None:
     torch.testing.assert_close(world.tool.pos, want, atol=2e-4, rtol=0)
 
 
+@pytest.mark.parametrize("name", LED)
+def test_ways_by_hand_fit_into_the_episode_from_all_starts(name: str) -> None:
+    task, sign = TASKS[name](), torch.tensor([[-1.0, -1.0], [-1.0, 1.0], [1.0, -1.0], [1.0, 1.0], [0.0, 0.0]])
+    moved = torch.nn.functional.pad(sign[:, None] * torch.tensor(task.spread), (0, 1))
+    start = task.build(moved)[2]
+    tools = start.rods.pos[:, list(task.arms.vertex)].double()
+    actions = task.reference(start)
+    assert actions.shape == (5, task.horizon, task.width)
+    torch.testing.assert_close(actions[4], task.reference())
+    ends = tools + actions.sum(-2).unflatten(-1, (2, -1, 3))[:, 0]
+    want = ends[4] if task.anchored else ends[4] + tools - tools[4]
+    # Starts are in single precision.
+    torch.testing.assert_close(ends, want.expand_as(ends), atol=1e-6, rtol=0)
+
+
 @pytest.mark.parametrize("name", ["lifting", "separation", "wiring_post"])
 def test_arms_begin_with_elbow_and_wrist_in_line(name: str) -> None:
     # These arms face what they hold, with tools straight down: a plane arm does it, with nothing turned sideways.
@@ -46,15 +62,37 @@ def test_arms_begin_with_elbow_and_wrist_in_line(name: str) -> None:
     assert world.joints[..., [2, 4]].abs().max() < TURNED
 
 
+def led(task: Task, count: int, moved: tuple[float, float] = (0.0, 0.0)) -> episode.Outcome:
+    """What the first actions of the way by hand come to, from a start that is moved in x and y."""
+    made = episode.prepare(task, 1, compiled=False)
+    start = task.build(torch.tensor([[[*moved, 0.0]]]))[2]
+    control = scenes.hold(made.scene, start)
+    grip = {"vertices": torch.ones_like(control.pos[..., :1]), "edges": torch.ones_like(control.director[..., :1])}
+    step = record(made.step, made.params, start, tree.replace(control, grip=grip))
+    actions = task.reference(start)[:, :count].float()
+    with torch.no_grad():
+        made = dataclasses.replace(made, step=step, start=episode.begin(made, start))
+        return episode.play(task, actions, episode=made)
+
+
 @pytest.mark.slow
 def test_the_way_by_hand_takes_hooked_ropes_apart() -> None:
     # Of 94 actions on the way 60 bring the hands 85 cm further apart, more than the 58 cm of a rope.
-    task = TASKS["separation"]()
-    made = episode.prepare(task, 1, compiled=False)
-    control = scenes.hold(made.scene, made.start.state)
-    grip = {"vertices": torch.ones_like(control.pos[..., :1]), "edges": torch.ones_like(control.director[..., :1])}
-    step = record(made.step, made.params, made.start.state, tree.replace(control, grip=grip))
-    actions = task.reference().float()[None, :60]
-    with torch.no_grad():
-        outcome = episode.play(task, actions, episode=dataclasses.replace(made, step=step))
-    assert outcome.success.all()
+    assert led(TASKS["separation"](), 60).success.all()
+
+
+def test_the_way_by_hand_coils_a_rope() -> None:
+    # The start that is nearest to the cone is on its way for 87 actions.
+    assert led(TASKS["coiling"](), 87, (0.05, -0.01)).success.all()
+
+
+def test_the_way_by_hand_takes_an_end_out_of_the_knot() -> None:
+    # After 32 actions the first hand is beyond the second strand; then what is left has crossings, but no knot.
+    found = led(TASKS["unknotting"](), 32)
+    assert not found.failed.any()
+    assert (geometry.determinant(found.world.state.rods.pos) == 1).all()
+
+
+def test_the_way_by_hand_shoots_the_ball_at_the_cube() -> None:
+    # The band slips out of the fingers in action 10; scenes lie still from the start, up to the sag of the band.
+    assert led(dataclasses.replace(TASKS["slingshot"](), settle=0), 10).success.all()

@@ -10,7 +10,8 @@ import pytest
 import torch
 
 from torchdlo.coupling.pose import Pose
-from torchdlo.envs import TASKS
+from torchdlo.envs import TASKS, geometry
+from torchdlo.envs import letter_art as letters
 from torchdlo.envs import wiring_post as wiring
 from torchdlo.envs.solids import c_ring
 from torchdlo.envs.task import Seen, even
@@ -173,3 +174,66 @@ def test_c_rings_have_the_mass_of_their_parts_and_stand():
     assert abs(float(ring.centre[0])) < 1e-6
     # The centre of mass is above the foot.
     assert abs(float(ring.centre[1])) < 0.03
+
+
+def led_through(*corners: tuple[float, float, float], count: int = 30) -> torch.Tensor:
+    """A rope of 2 cm per edge from its lead end along some corners, straight on behind the last one."""
+    points = torch.tensor(corners, dtype=F64)
+    away = points[-1] - points[-2]
+    points = torch.cat([points, points[-1:] + away / away.norm()])
+    dense = torch.cat(
+        [torch.lerp(a, b, torch.linspace(0, 1, 2000, dtype=F64)[:, None]) for a, b in itertools.pairwise(points)]
+    )
+    along = torch.cat([dense.new_zeros(1), (dense[1:] - dense[:-1]).norm(dim=-1).cumsum(0)])
+    return dense[torch.searchsorted(along, 0.02 * torch.arange(count, dtype=F64))]
+
+
+def test_wiring_takes_both_rings_in_order():
+    turn, behind = (0.09, 0.0, 0.05), (0.4, 0.0, 0.05)
+    good = led_through((0.09, -0.301, 0.05), turn, behind)
+    short = led_through((0.09, -0.299, 0.05), turn, behind)
+    first_only = led_through((0.2, -0.31, 0.05), (0.2, 0.0, 0.05), behind)
+    above = led_through((0.09, -0.31, 0.1), (0.09, 0.0, 0.1), (0.4, 0.0, 0.1))
+    # Out of the first ring at its far side, having come through the second: both rings, the wrong one first.
+    wrong = led_through((0.3, 0.02, 0.05), (0.25, 0.0, 0.05), (0.09, -0.2, 0.05), (0.09, -0.4, 0.05))
+    notes = {"tool": torch.zeros(5, 2, 3, dtype=F64), "through": torch.zeros(5, dtype=torch.bool)}
+    shapes = [good, short, first_only, above, wrong]
+    assert judged("wiring_ring", *shapes, notes=notes) == [True, False, False, False, False]
+
+
+def test_a_hand_that_goes_through_a_ring_has_failed():
+    task, state = TASKS["wiring_ring"](), first("wiring_ring")
+    state = tree.map(lambda x: x.expand(3, *x.shape[1:]), state)
+    quat = torch.zeros(3, 2, 4, dtype=F64)
+    before = torch.tensor([0.28, 0.0, 0.05], dtype=F64).expand(3, 2, 3)
+    # Through the hole, through the tube, over the ring.
+    after = before.clone()
+    after[:, 1] = torch.tensor([[0.26, 0.0, 0.05], [0.26, 0.04, 0.05], [0.26, 0.0, 0.15]], dtype=F64)
+    closed = torch.ones(3, 2, 1, dtype=F64)
+    seen = Seen(state, Pose(before, quat), closed, {})
+    seen = Seen(state, Pose(after, quat), closed, task.note(seen))
+    seen = tree.replace(seen, notes=task.note(seen))
+    assert task.failed(seen).tolist() == [True, True, False]
+
+
+def test_letters_are_taken_in_their_places():
+    goal = torch.cat(letters.goals())
+    off = torch.zeros_like(goal)
+    off[:, 1] = 0.0074  # each vertex at most that far from its goal, both ways: at most 1.48 cm in all
+    aside, apart = goal + off, goal.clone()
+    # The L is a wire of its own: 2 cm beside its place, its mean distance is more than 1.5 cm on the long leg's side.
+    apart[54:] += goal.new_tensor([0.015, 0.015, 0.0])
+    shapes = [goal, aside, apart, first("letter_art").rods.pos[0]]
+    assert judged("letter_art", *shapes) == [True, True, False, False]
+
+
+def test_letters_are_rounded_where_posts_are():
+    for corners, goal, count in zip(letters.CORNERS, letters.goals(), letters.COUNTS, strict=True):
+        _, centres = letters.rounded(corners)
+        dense = geometry.distances(centres, letters.rounded(corners)[0])
+        for away in dense:
+            # A circle of that radius about the post touches the curve from within.
+            assert float(away.min()) == pytest.approx(letters.ROUND, rel=1e-9)
+        step = (goal[1:] - goal[:-1]).norm(dim=-1)
+        # Chords of 2 cm along arcs of 3 cm: 2 r sin(s / 2 r) = 1.963 cm.
+        assert len(goal) == count and float(step.min()) > 0.0196 and float(step.max()) < 0.02 + 1e-6

@@ -12,12 +12,14 @@ import torch
 
 from torchdlo.envs.coiling import Coiling
 from torchdlo.envs.gathering import Gathering
+from torchdlo.envs.letter_art import LetterArt
 from torchdlo.envs.lifting import Lifting
 from torchdlo.envs.separation import Separation
 from torchdlo.envs.slingshot import Slingshot
 from torchdlo.envs.task import Task
 from torchdlo.envs.unknotting import Unknotting
 from torchdlo.envs.wiring_post import WiringPost
+from torchdlo.envs.wiring_ring import WiringRing
 from torchdlo.envs.wrapping import Wrapping
 from torchdlo.errors import InputError
 
@@ -27,11 +29,13 @@ if TYPE_CHECKING:
 TASKS: dict[str, type[Task]] = {
     "coiling": Coiling,
     "gathering": Gathering,
+    "letter_art": LetterArt,
     "lifting": Lifting,
     "separation": Separation,
     "slingshot": Slingshot,
     "unknotting": Unknotting,
     "wiring_post": WiringPost,
+    "wiring_ring": WiringRing,
     "wrapping": Wrapping,
 }
 

@@ -50,7 +50,6 @@ class DloEnv(EnvBase):
         made = episodes.prepare(task, num_envs, like=self._like, compiled=compiled, segment=segment)
         _check(self._randomize, made.scene)
         self.episode, self.world, self._usual = made, made.start, made.params
-        self._count = torch.zeros(num_envs, dtype=torch.long, device=self.device)
         self._make_specs()
         self.set_seed(seed if seed is not None else 0)
 
@@ -95,7 +94,6 @@ class DloEnv(EnvBase):
         mask = None if tensordict is None else tensordict.get("_reset", None)
         again = torch.ones_like(self.world.failed) if mask is None else mask.reshape(self.batch_size)
         self.world = tree.where(again, fresh, self.world)
-        self._count = torch.where(again, 0, self._count)
         if self._randomize:
             drawn = drawn_effects(self._usual, self.episode.scene, self._randomize, self._generator, len(again))
             effects = tree.where(again, drawn, _wide(self.episode.params.effects, drawn))
@@ -109,7 +107,7 @@ class DloEnv(EnvBase):
         """Return the worlds of new episodes."""
         if not self.variation:
             return self.episode.start
-        start = self.task.start(len(self._count), like=self._like, generator=self._generator, variation=True)
+        start = self.task.start(len(self.world.count), like=self._like, generator=self._generator, variation=True)
         return episodes.begin(self.episode, start[2])
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
@@ -117,9 +115,8 @@ class DloEnv(EnvBase):
             return self._stepped(tensordict.get("action"))
 
     def _stepped(self, action: Tensor) -> TensorDict:
-        self._count = self._count + 1
-        over = self._count >= self.task.horizon
         world = episodes.act(self.episode, self.world, action.to(self._like.dtype))
+        over = world.count >= self.task.horizon
         if self.task.release and bool(over.any()):
             world = tree.where(over, episodes.finish(self.episode, world), world)
         self.world = world

@@ -23,6 +23,7 @@ from torchdlo.coupling.bodies import BodyTargets, turn_between, turn_by
 from torchdlo.coupling.grasp import Grasp, Hands
 from torchdlo.coupling.pose import Pose
 from torchdlo.coupling.robot import Robot, panda
+from torchdlo.envs.stages import repeated
 from torchdlo.envs.task import Seen, Task, combined
 from torchdlo.errors import InputError
 from torchdlo.physics import tree
@@ -59,10 +60,12 @@ class World:
     """What the task remembers, shapes (B, ...)."""
     failed: Tensor
     """Whether the episode has failed [-], bool, shape (B,)."""
+    count: Tensor
+    """Actions done [1], whole, shape (B,)."""
 
     def seen(self, hands: int) -> Seen:
         """Return what a task judges."""
-        return Seen(self.state, self.tool, self.grasp.closed[..., :hands, :], self.notes)
+        return Seen(self.state, self.tool, self.grasp.closed.unflatten(-2, (hands, -1)).amax(-2), self.notes)
 
 
 @tree.struct
@@ -120,6 +123,13 @@ def _solve(task: Task, target: Pose, joints: Tensor, search: ik.Search) -> ik.So
     return tree.replace(found, pose=moved[0], handed=moved[1])
 
 
+def hands_of(task: Task, scene: Scene) -> Hands:
+    """Return which grips of the task's hands hold what; what no hand ever holds is fixed."""
+    plan = task.schedule
+    fixed = len(scene.held_vertices) - len(plan.held)
+    return Hands(task.arms.count * plan.room, (*plan.tools, *[-1] * fixed))
+
+
 def _begin(task: Task, scene: Scene, state: State, hands: Hands) -> World:
     """Return the world before the first action: tools stand at what they hold."""
     x = state.rods.pos
@@ -137,10 +147,11 @@ def _begin(task: Task, scene: Scene, state: State, hands: Hands) -> World:
             f"{task.name}: an arm cannot reach the vertex that it is to hold, by {1e3 * far[0]:.0f} mm and "
             f"{math.degrees(far[1]):.1f} degrees; place its base or the rope nearer to each other."
         )
-    closed = torch.ones_like(pos[..., :1])
-    held = grasp.weld(scene, hands, scenes.hold(scene, state), target, closed)
     failed = torch.zeros(x.shape[0], dtype=torch.bool, device=x.device)
-    world = World(state, found.joints, target, target, held, {}, failed)
+    plan, none = task.schedule, torch.zeros_like(failed, dtype=torch.long)
+    closed = plan.closed(none, target, x)
+    held = grasp.weld(scene, hands, scenes.hold(scene, state), repeated(target, plan.room), closed)
+    world = World(state, found.joints, target, target, held, {}, failed, none)
     seen = world.seen(task.arms.count)
     return tree.replace(world, notes={"rest": task.rest(seen), **task.note(seen)})
 
@@ -181,8 +192,7 @@ def prepare(
         segment: frames that gradients run again at once; None keeps all of them in memory.
     """
     scene, params, state = task.start(num, like=like, generator=generator, variation=variation)
-    fixed = len(scene.held_vertices) - task.arms.count
-    hands = Hands(task.arms.count, (*range(task.arms.count), *[-1] * fixed))
+    hands = hands_of(task, scene)
     step = scenes.stepper(scene, compiled=compiled)
     world = _begin(task, scene, state, hands)
     episode = Episode(task, scene, params, step, hands, world, segment)
@@ -200,7 +210,7 @@ def _run(episode: Episode, world: World, tool: Pose, held: Grasp, count: int) ->
     turn = turn_between(world.tool.quat, tool.quat)
     last = world.tool.quat.expand(count, *world.tool.quat.shape)
     poses = Pose(x + share * (tool.pos - x), multiply(turn_by(share * turn), last))
-    pos, director, grip = grasp.carry(episode.hands, held, poses)
+    pos, director, grip = grasp.carry(episode.hands, held, repeated(poses, episode.task.schedule.room))
     bodies: Any = ()
     if episode.scene.bodies:
         still = scenes.hold(episode.scene, world.state).bodies
@@ -241,11 +251,13 @@ def _aim(task: Task, world: World, action: Tensor) -> Pose:
     return Pose(torch.cat([pos[..., :2], height], -1), quat / quat.square().sum(-1, keepdim=True).sqrt())
 
 
-def _slipped(task: Task, state: State, tool: Pose, closed: Tensor) -> Tensor:
+def _slipped(episode: Episode, state: State, tool: Pose, closed: Tensor) -> Tensor:
     """Return how firmly hands still hold: those whose friction was not enough in the last frame are open."""
+    task = episode.task
     if math.isinf(task.arms.squeeze):
         return closed
-    force = state.reaction.force[..., : task.arms.count, :]
+    tool = repeated(tool, task.schedule.room)
+    force, _ = grasp.felt(episode.scene, episode.hands, state, tool)
     normal = rotate(tool.quat, force.new_tensor([0.0, 1.0, 0.0]).expand_as(force))
     along = force - normal * (force * normal).sum(-1, keepdim=True)
     return torch.where(safe_norm(along) > 2 * task.arms.mu * task.arms.squeeze, 0.0, closed)
@@ -257,12 +269,23 @@ def act(episode: Episode, world: World, action: Tensor) -> World:
     Scenes that are no longer finite stay as they were and have failed.
     """
     task = episode.task
-    found = _solve(task, _aim(task, world, action), world.joints, FOLLOW)
-    state = _run(episode, world, found.pose, world.grasp, task.frames)
-    closed = _slipped(task, state, found.pose, world.grasp.closed)
-    held = tree.replace(world.grasp, closed=closed)
-    after = World(state, found.joints, found.handed, found.pose, held, world.notes, world.failed)
-    return _judged(task, world, after)
+    aim, held = _aim(task, world, action), world.grasp
+    if len(task.schedule.stages) > 1:
+        aim, held = _staged(episode, world, aim)
+    found = _solve(task, aim, world.joints, FOLLOW)
+    state = _run(episode, world, found.pose, held, task.frames)
+    held = tree.replace(held, closed=_slipped(episode, state, found.pose, held.closed))
+    after = World(state, found.joints, found.handed, found.pose, held, world.notes, world.failed, world.count)
+    return tree.replace(_judged(task, world, after), count=world.count + 1)
+
+
+def _staged(episode: Episode, world: World, aim: Pose) -> tuple[Pose, Grasp]:
+    """Return where tools are to go and what they hold in an action: hands open, travel and close as stages say."""
+    plan, x = episode.task.schedule, world.state.rods.pos
+    closed = plan.closed(world.count, world.tool, x, world.grasp.closed)
+    now = scenes.hold(episode.scene, world.state)
+    held = grasp.weld(episode.scene, episode.hands, now, repeated(world.tool, plan.room), closed, world.grasp)
+    return Pose(plan.steer(world.count, world.target.pos, aim.pos, x), aim.quat), held
 
 
 def _judged(task: Task, before: World, after: World) -> World:

@@ -97,6 +97,24 @@ def _meetings(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     return skew & (s >= 0) & (s < 1) & (t >= 0) & (t < 1), s, t
 
 
+def pierced(x: Tensor, centre: Tensor, normal: Tensor, radius: float) -> Tensor:
+    """Return which edges of polylines (..., V, 3) pass through a disc, either way, bool, shape (..., V - 1).
+
+    Args:
+        x: polylines.
+        centre: the disc's centre [m], shape (3,).
+        normal: unit vector normal to it, shape (3,).
+        radius: its radius [m].
+    """
+    arm = x - centre
+    height = (arm * normal).sum(-1)
+    before, after = height[..., :-1], height[..., 1:]
+    through = (before < 0) != (after < 0)
+    share = before / torch.where(through, before - after, 1.0)
+    place = torch.lerp(arm[..., :-1, :], arm[..., 1:, :], share.unsqueeze(-1))
+    return through & (place.norm(dim=-1) <= radius)
+
+
 def crossings(a: Tensor, b: Tensor | None = None) -> Tensor:
     """Return how often two curves, or a curve and itself, cross in the top view [1], shape (...)."""
     found, _, _ = _meetings(a, a if b is None else b)

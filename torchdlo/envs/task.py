@@ -5,6 +5,7 @@ A task is a frozen dataclass without tensors. `episode` runs it, `env` offers it
 
 from __future__ import annotations
 
+import functools
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
@@ -19,6 +20,7 @@ from torchdlo.coupling import BodyContact, RodBody, RodContact, RodMatter
 from torchdlo.coupling.bodies import Solid
 from torchdlo.coupling.pose import Pose
 from torchdlo.envs import geometry
+from torchdlo.envs.stages import Schedule, Stage
 from torchdlo.physics import tree
 from torchdlo.physics.effect import Effect
 from torchdlo.physics.effects.elastic import Bend, Stretch
@@ -32,6 +34,7 @@ __all__ = [
     "SPACING",
     "Arms",
     "Seen",
+    "Stage",
     "Task",
     "combined",
     "even",
@@ -50,12 +53,12 @@ DOWN = (0.0, 1.0, 0.0, 0.0)
 
 @dataclass(frozen=True)
 class Arms:
-    """The arms of a task, one entry each. They stand still and hold one vertex each from the start."""
+    """The arms of a task, one entry each. They stand still; their tools start at one vertex each."""
 
     base: tuple[tuple[float, float, float], ...]
     """Where they stand [m]."""
     vertex: tuple[int, ...]
-    """What they hold, slots on the vertex axis of the scene."""
+    """Where tools start and, in tasks without stages, what they hold: slots on the vertex axis of the scene."""
     quat: tuple[tuple[float, float, float, float], ...] = ()
     """Orientations of the tools at the start, straight down if not given."""
     squeeze: float = math.inf
@@ -121,6 +124,17 @@ class Task(ABC):
     """Length of the rope between the hands over that at the start, above which an episode has failed [1]."""
     spread: ClassVar[tuple[tuple[float, float], ...]] = ((0.0, 0.0),)
     """By how much each of the things that `build` can move is moved in x and in y at most [m]."""
+    anchored: ClassVar[bool] = False
+    """Whether ways by hand lead to the same places wherever the rope starts, as what they lead to is fixed."""
+    stages: ClassVar[tuple[Stage, ...]] = ()
+    """What hands hold from which action on; if not given, they hold what they start at until the end."""
+    travel: ClassVar[int] = 10
+    """Actions that a hand takes from what it held to what it holds in the next stage."""
+
+    @property
+    def schedule(self) -> Schedule:
+        """The stages of the task, one at least."""
+        return _schedule(self.stages or (Stage(0, self.arms.vertex),), self.travel)
 
     @property
     def width(self) -> int:
@@ -165,6 +179,10 @@ class Task(ABC):
         """Return a way to the goal by hand: per point, how far each tool is from its start [m]."""
         return ()
 
+    def ways(self) -> Sequence[Sequence[Sequence[tuple[float, float, float]]]]:
+        """Return `waypoints` stage by stage, in a stage from where the tools are when it begins."""
+        return [self.waypoints()]
+
     def start(
         self, num: int, *, like: Tensor | None = None, generator: torch.Generator | None = None, variation: bool = False
     ) -> tuple[Scene, Params, State]:
@@ -184,9 +202,31 @@ class Task(ABC):
             moved = torch.cat([away, moved[..., 2:]], -1)
         return self.build(moved)
 
-    def reference(self) -> Tensor:
-        """Return the actions that lead the tools along `waypoints`, evenly, shape (horizon, width)."""
-        return through(self.waypoints(), self.horizon, self.arms.count)
+    def reference(self, start: State | None = None) -> Tensor:
+        """Return the actions that lead the tools along `ways`, evenly, shape (horizon, width).
+
+        Args:
+            start: where scenes start, for actions of shape (B, horizon, width); all alike if not given.
+        """
+        off = (
+            self._strays(start) if start is not None else [torch.zeros(self.arms.count, 3)] * len(self.schedule.stages)
+        )
+        legs = zip(self.ways(), self.schedule.actions(self.horizon), off, strict=True)
+        return torch.cat([through(*leg) for leg in legs], -2)
+
+    def _strays(self, start: State) -> list[Tensor]:
+        """Return what each stage's way takes besides to lead to the same places from another start [m], (B, R, 3)."""
+        scene, _, usual = self.start(1, like=start.rods.pos)
+        moved, counts = usual.rods.pos - start.rods.pos, scene.topology.counts
+        rope = [k for k, count in enumerate(counts) for _ in range(count)]
+        found, led = [], set()
+        for stage in self.schedule.stages:
+            hands = list(zip(stage.vertex, self.arms.vertex, strict=True))
+            # What has been led before is where it was led to.
+            first = [[float(self.anchored and v is not None and rope[v] not in led)] for v in stage.vertex]
+            found.append(moved[:, [h if v is None else v for v, h in hands]] * moved.new_tensor(first))
+            led |= {rope[v] for v in stage.vertex if v is not None}
+        return found
 
     def rest(self, seen: Seen) -> Tensor:
         """Return the length of the rope between two hands [m], shape (B,); ones if there are not two on one rope."""
@@ -194,6 +234,11 @@ class Task(ABC):
             return torch.ones_like(seen.x[:, 0, 0])
         a, b = sorted(self.arms.vertex)
         return geometry.length(seen.x[:, a : b + 1])
+
+
+@functools.cache
+def _schedule(stages: tuple[Stage, ...], travel: int) -> Schedule:
+    return Schedule(stages, travel)
 
 
 def combined(task: Task, terms: dict[str, Tensor]) -> Tensor:
@@ -209,23 +254,27 @@ def straight(start: tuple[float, float, float], count: int, moved: Tensor) -> Te
     return line + moved.unsqueeze(-2)
 
 
-def through(points: Sequence[Sequence[tuple[float, float, float]]], horizon: int, arms: int) -> Tensor:
-    """Return actions that lead tools through points and then keep them there, shape (horizon, 6 arms).
+def through(points: Sequence[Sequence[tuple[float, float, float]]], horizon: int, off: Tensor) -> Tensor:
+    """Return actions that lead tools through points and then keep them there, shape (..., horizon, 6 arms).
 
     Every leg takes actions in proportion to the longest way of a tool on it.
 
     Args:
         points: how far the tools are from their starts [m], one row of points per leg, one point per tool.
         horizon: actions in all.
-        arms: tools.
+        off: what is added to all points [m], shape (..., arms, 3).
     """
-    way = torch.tensor([[(0.0, 0.0, 0.0)] * arms, *points], dtype=torch.float64)
-    legs = way[1:] - way[:-1]
-    need = [max(1, math.ceil(float(leg.norm(dim=-1).max()) / Task.reach - 1e-9)) for leg in legs]
-    if sum(need) > horizon:
-        raise ValueError(f"way-points: they take {sum(need)} actions of {Task.reach} m; expected at most {horizon}")
-    rows = [(leg / n).flatten().expand(n, -1) for leg, n in zip(legs, need, strict=True)]
-    xyz = torch.cat([*rows, way.new_zeros(horizon - sum(need), 3 * arms)])
+    off = off.to(torch.float64).unsqueeze(-3)
+    way = torch.tensor(points, dtype=torch.float64).reshape(-1, *off.shape[-2:]) + off
+    legs = torch.cat([torch.zeros_like(off), way], -3).diff(dim=-3)
+    need = (legs.norm(dim=-1).amax(-1) / Task.reach - 1e-9).ceil().clamp(min=1)
+    most = int(need.sum(-1).max())
+    if most > horizon:
+        raise ValueError(f"way-points: they take {most} actions of {Task.reach} m; expected at most {horizon}")
+    # Which share of each leg is behind the tools before and after each action.
+    done = torch.arange(horizon + 1, dtype=torch.float64).unsqueeze(-1) - (need.cumsum(-1) - need).unsqueeze(-2)
+    share = (done / need.unsqueeze(-2)).clamp(0, 1)
+    xyz = (share @ legs.flatten(-2)).diff(dim=-2)
     return torch.cat([xyz, torch.zeros_like(xyz)], -1)
 
 
@@ -276,7 +325,7 @@ def make(
         acting.append(RodMatter())
     for name, given in (values or {}).items():
         numbers[name] = numbers.get(name, {}) | given
-    at = (*(task.arms.vertex if held is None else held), *fixed)
+    at = (*(task.schedule.held if held is None else held), *fixed)
     return scenes.make(
         ropes, acting, numbers, bodies=solids, matter=matter, held_vertices=at, constrained=not elastic, substeps=5
     )

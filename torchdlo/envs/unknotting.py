@@ -76,3 +76,20 @@ class Unknotting(Task):
     def success(self, seen: Seen) -> Tensor:
         """Return whether the rope is not knotted and does not cross itself."""
         return (geometry.crossings(seen.x) == 0) & (geometry.determinant(seen.x) == 1)
+
+    def waypoints(self) -> list[list[tuple[float, float, float]]]:
+        """Return a way back through the knot and then apart. It earns 30.5.
+
+        The first hand takes the rope's end under the strand that it crosses first, over the next one and out of the
+        knot; what is left is a loop that crosses itself once. Both hands pull it open, the second one beside its own
+        end, which follows without crossing.
+        """
+        still = (0.0, 0.0, 0.0)
+        return [
+            [(0.112, -0.168, 0.0), still],
+            [(0.147, -0.198, 0.04), still],
+            [(0.157, -0.303, 0.045), still],
+            [(0.057, -0.453, 0.02), (0.053, -0.034, 0.07)],
+            [(-0.123, -0.423, 0.03), (0.233, -0.014, 0.07)],
+            [(-0.183, -0.383, 0.02), (0.273, 0.016, 0.01)],
+        ]

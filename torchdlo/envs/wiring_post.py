@@ -79,6 +79,7 @@ class WiringPost(Task):
     name: ClassVar[str] = "wiring_post"
     arms: ClassVar[Arms] = Arms(base=((-0.2, -0.25, 0.0),), vertex=(3,))
     combine: ClassVar[str] = "product"
+    anchored: ClassVar[bool] = True
     spread: ClassVar[tuple[tuple[float, float], ...]] = ((0.05, 0.025),)
 
     def build(self, moved: Tensor) -> tuple[Scene, Params, State]:

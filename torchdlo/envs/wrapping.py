@@ -41,6 +41,7 @@ class Wrapping(Task):
     )
     floor: ClassVar[float] = 0.04
     stretch: ClassVar[float] = 1.2
+    anchored: ClassVar[bool] = True
     spread: ClassVar[tuple[tuple[float, float], ...]] = ((0.025, 0.01),)
 
     def build(self, moved: Tensor) -> tuple[Scene, Params, State]:
