@@ -40,22 +40,17 @@ class Lengths:
     """How far a unit of force moves an end of the edge within the substep [m/N], shape (..., V, 1)."""
     most: float = 0.25
     """Tension at which edges give way, over the one at which explicit steps are not stable."""
-    press: Tensor | None = None
-    """Compression at which edges give way [N], shape (..., V, 1); where None, the share `most` holds for it too."""
 
     def yielding(self, tension: Tensor) -> tuple[Tensor | float, Tensor | float]:
         """Return how much an edge lengthens beyond the tension that steps can follow [m], and the slope of that [m/N].
 
         A tension T makes transverse waves of w dt = 2 sqrt(T give / length); beyond a share of the stable T edges
-        give way, so that ropes pulled beyond their length stay finite. Under compression such waves grow as fast
-        instead of oscillating: beyond `press`, a rope buckles faster than steps can follow, and edges give way too.
+        give way, so that ropes pulled beyond their length stay finite.
         """
         if self.give is None:
             return 0.0, 0.0
-        limit = self.most * self.rest / self.give
-        high, low = tension - limit, tension + (limit if self.press is None else self.press)
-        beyond = high.clamp(min=0.0) + low.clamp(max=0.0)
-        return self.give * beyond, torch.where((high > 0) | (low < 0), self.give, 0.0)
+        beyond = tension - self.most * self.rest / self.give
+        return self.give * beyond.clamp(min=0.0), torch.where(beyond > 0, self.give, 0.0)
 
     def error(self, pos: Tensor, tension: Tensor) -> tuple[Tensor, Tensor]:
         """Return how much too long each edge is [m], shape (..., V, 1), and its direction, (..., V, 3)."""

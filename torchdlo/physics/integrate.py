@@ -229,10 +229,9 @@ def _translate(
         active,
         rest.edge_mask,
         dt * dt / lightest,
-        0.25,
+        1e4 if settings.integrator == "implicit" else 0.25,
     )
     if settings.integrator == "implicit":
-        lengths = dataclasses.replace(lengths, most=1e4, press=_buckling(now, loads, lengths))
         moved = _placed(settings, targets, kick.drift)
         return _balance(settings, now, loads, lengths, kick, moved, tension)
     answer = kick.scale / kick.vertex * free
@@ -242,23 +241,6 @@ def _translate(
     pos, tension = project(lengths, moved, answer, now.tangent, tension, settings.newton - 1)
     pull = tension * now.tangent
     return pos, tension, kick.force + pull - now.prev(pull)
-
-
-def _buckling(now: View, loads: Values, lengths: Lengths) -> Tensor:
-    """Return the compression under which a rope buckles about as fast as implicit steps can follow [N], (..., V, 1).
-
-    Under compression T a straight rod of stiffness B and mass r per length grows waves at rates up to T / (2 sqrt(B r))
-    (from r s^2 = T k^2 - B k^4 at k^2 = T / 2 B), a chain of masses m without stiffness at 2 sqrt(T / (m h)). Ropes
-    that were pulled harder than that just now may spring back as hard.
-    """
-    with torch.no_grad():
-        least = torch.maximum(
-            0.25 * now.params.rest.length / lengths.give, now.state.tension.amax(-2, keepdim=True).clamp(min=0.0)
-        )
-        if "hinge_stiffness" not in loads:
-            return least
-        hinge = loads["hinge_stiffness"] * now.params.rest.hinge_mask
-        return torch.maximum(least, (torch.maximum(hinge, now.next(hinge)) / lengths.give).sqrt())
 
 
 def _balance(

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from torchdlo.sysid.bench import CHAIN, Bench, Callback
+from torchdlo.sysid.bench import CHAIN, SILENT, Bench, Callback
 from torchdlo.sysid.floor import rms
 from torchdlo.sysid.model import RopeModel
 from torchdlo.sysid.pool import Fit, Fitted
@@ -124,17 +124,15 @@ def go_further(bench: Bench, base: Fitted, iterations: int, report: Callback) ->
     bench.correct(base)
     start = bench.starts["train"]
     names, sizes = base.space.names, tuple(base.space.units)
-    jobs = [Fit(base.effects, values, names, sizes, iterations, start)]
-    if CHAIN not in base.effects:
-        effects, free = (*base.effects, CHAIN), (*names, f"{CHAIN}.length")
-        for length in (link, -link):
-            rows = np.pad(values, ((0, 0), (0, 1)), constant_values=length)
-            jobs.append(Fit(effects, rows, free, (*sizes, 0.5 * link), iterations, start))
-    report("fitting all numbers again", 0, len(jobs), "")
-    base, *chains = bench.fit(jobs)
-    for found in chains:
-        base = found if found.point.cost < _BETTER * base.point.cost else base
-    report("fitting all numbers again", len(jobs), len(jobs), f"{1e3 * rms(bench.gaps(base, 'train')):.2f} mm")
+    stage, effects, free = "fitting all numbers again", (*base.effects, CHAIN), (*names, f"{CHAIN}.length")
+    report(stage, 0, 2, "")
+    base = bench.fit([Fit(base.effects, values, names, sizes, iterations, start)])[0]
+    report(stage, 1, 2, f"{1e3 * base.point.cost:.2f} mm")
+    if CHAIN not in base.effects and rms(bench.gaps(base, "train")) > SILENT * bench.floor.total:
+        rows = [np.pad(values, ((0, 0), (0, 1)), constant_values=length) for length in (link, -link)]
+        for found in bench.fit([Fit(effects, r, free, (*sizes, 0.5 * link), iterations, start) for r in rows]):
+            base = found if found.point.cost < _BETTER * base.point.cost else base
+    report(stage, 2, 2, f"{1e3 * rms(bench.gaps(base, 'train')):.2f} mm")
     return base
 
 

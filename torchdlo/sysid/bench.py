@@ -17,6 +17,9 @@ from torchdlo.sysid.screen import Score
 Callback = Callable[[str, int, int, str], None]
 """Called with stage, steps done, steps in all, and a word on how it goes."""
 
+SILENT = 1.3
+"""Times the floor: below, there is nothing left to look for."""
+
 CHAIN = "link_chain"
 """What a chain of links does that a rope does not: candidate number 0, fitted before any effect is considered."""
 

@@ -18,7 +18,7 @@ import numpy as np
 from torchdlo.errors import InputError
 from torchdlo.sysid import baseline as baselines
 from torchdlo.sysid import health, library, plan
-from torchdlo.sysid.bench import Bench, Callback
+from torchdlo.sysid.bench import SILENT, Bench, Callback
 from torchdlo.sysid.floor import Floor, rms
 from torchdlo.sysid.health import Fault
 from torchdlo.sysid.journal import Journal
@@ -40,9 +40,6 @@ LEADERS = 2
 
 SHORT = 0.6
 """Share of the trials that first fits see."""
-
-SILENT = 1.3
-"""Times the floor: below, there is nothing left to look for."""
 
 TIE = 0.05
 """Fits whose gaps differ by less than this share of the excess, or of the floor, are not told apart."""
