@@ -8,7 +8,7 @@ import math
 import pytest
 import torch
 
-from tests.coupling.tumbling import F64, G, energy, ground, momenta, move, run
+from tests.coupling.tumbling import F64, SHAPES, G, energy, ground, momenta, move, run
 from torchdlo.coupling.bodies import Solid, place
 from torchdlo.coupling.body_contact import BodyContact
 from torchdlo.physics import tree
@@ -47,17 +47,6 @@ def test_a_row_of_balls_hands_the_speed_on() -> None:
     row = [ball(0.101 * k, 0.5 if k == 0 else 0.0) for k in range(4)]
     _, _, end = run(row, 0.05, gravity=(0, 0, 0))
     assert torch.allclose(end.vel[:, 0], torch.tensor([0.0, 0.0, 0.0, 0.5], dtype=F64), atol=3 * 1e-4)
-
-
-SHAPES = {
-    "sphere": R,
-    "box": (0.05, 0.04, 0.03),
-    "capsule": (0.03, 0.05),
-    "cylinder": (0.04, 0.05),
-    "cone": (0.05, 0.1),
-    "torus": (0.06, 0.02),
-    "ring": (0.06, 0.02, 4.0),
-}
 
 
 @pytest.mark.parametrize(("one", "other"), list(itertools.combinations_with_replacement(SHAPES, 2)))

@@ -7,7 +7,7 @@ import dataclasses
 import pytest
 import torch
 
-from tests.coupling.tumbling import F64, ground
+from tests.coupling.tumbling import F64, SHAPES, ground
 from torchdlo.coupling import body_pairs
 from torchdlo.coupling.bodies import BodyMotion, Solid, foresee, hold, place
 from torchdlo.coupling.body_contact import BodyContact, resolve
@@ -16,15 +16,6 @@ from torchdlo.physics import tree
 pytestmark = pytest.mark.skipif(not body_pairs.ready("cpu", F64), reason="there is no C++ compiler")
 
 DT = 2e-3
-SIZES = {
-    "sphere": 0.05,
-    "box": (0.05, 0.04, 0.03),
-    "capsule": (0.03, 0.05),
-    "cylinder": (0.04, 0.05),
-    "cone": (0.05, 0.1),
-    "torus": (0.06, 0.02),
-    "ring": (0.06, 0.02, 4.0),
-}
 SCENES = 11
 """Fill one block of lanes and a part of the next."""
 
@@ -45,7 +36,7 @@ def thrown(kinds: tuple[str, ...], seed: int = 1) -> list[Solid]:
         turn = random(4, 1.0)
         solids.append(
             Solid(
-                kind, SIZES[kind], at + random(3, 0.02), turn / turn.norm(dim=-1, keepdim=True),
+                kind, SHAPES[kind], at + random(3, 0.02), turn / turn.norm(dim=-1, keepdim=True),
                 toward + random(3, 0.2), random(3, 1.0), density=600.0, restitution=0.3, mu_s=0.4, mu_k=0.3,
             )
         )  # fmt: skip

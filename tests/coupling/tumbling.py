@@ -15,6 +15,16 @@ from torchdlo.physics.rotation import rotate
 
 F64 = torch.float64
 G = 9.81
+SHAPES = {
+    "sphere": 0.05,
+    "box": (0.05, 0.04, 0.03),
+    "capsule": (0.03, 0.05),
+    "cylinder": (0.04, 0.05),
+    "cone": (0.05, 0.1),
+    "torus": (0.06, 0.02),
+    "ring": (0.06, 0.02, 4.0),
+}
+"""Sizes of one body of each shape."""
 
 
 def ground(**numbers: Any) -> Solid:

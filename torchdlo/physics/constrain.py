@@ -349,9 +349,10 @@ def settle(lengths: Lengths, pos: Tensor, vel: Tensor, mobility: Tensor) -> tupl
             pos, _ = project(aim, pos, answer, edge / length, torch.zeros_like(lengths.active), 6 if left == 1 else 1)
         return pos
 
-    near, far = reach(pos, 1), reach(pos, _PARTS)
+    near = reach(pos, 1)
     missed = (safe_norm(edge_vectors(topology, near, lengths.edge_mask)) - lengths.rest).abs() * lengths.active
-    pos = torch.where((missed < _REACHED * lengths.rest).all(-2, keepdim=True), near, far)
+    there = (missed < _REACHED * lengths.rest).all(-2, keepdim=True)
+    pos = near if bool(there.all()) else torch.where(there, near, reach(pos, _PARTS))
     edge = edge_vectors(topology, pos, lengths.edge_mask)
     along = edge / safe_norm(edge).clamp(min=1e-12)
     stretching = dot(following(topology, vel) - vel, along) * lengths.active

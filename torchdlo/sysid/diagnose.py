@@ -162,19 +162,20 @@ class _Search:
             base = baselines.calibrate(self.bench, count, most, self.rng, self.report)
         else:
             base = baselines.go_on(self.bench, given, most, self.report)
-        self.baseline, floor = base, self._floor()
+        self.baseline = base
+        self._say_floor()
         self.before = self.bench.prediction(base, "all"), self.bench.gaps(base, "test")
         rounds: list[list[Candidate]] = []
         ties: dict[str, list[str]] = {}
         shares: dict[str, float] = {}
-        whole = max(self._squared(base) - floor.noise**2, 1e-12)
+        whole = max(self._squared(base) - self.bench.floor.noise**2, 1e-12)
         while len(rounds) < self.budget.rounds + (len(shares) < len(rounds)):
-            if shares and rms(self.bench.gaps(base, "all")) < SILENT * floor.total:
+            if shares and rms(self.bench.gaps(base, "all")) < SILENT * self.bench.floor.total:
                 break
             names = [n for n in self._possible() if n not in base.effects]
             if not names:
                 break
-            best, rival, candidates, rivals = self._round(base, names, floor, f"round {len(rounds) + 1}")
+            best, rival, candidates, rivals = self._round(base, names, f"round {len(rounds) + 1}")
             rounds.append(candidates)
             if best is None:
                 if shares and rival is not base:
@@ -182,18 +183,17 @@ class _Search:
                 break
             name, old = best.effects[-1], self._squared(base)
             shares[name], ties[name] = (old - self._squared(best)) / whole, rivals
-            kept = self._pruned(best, shares, floor)
+            kept = self._pruned(best, shares)
             base = baselines.go_further(self.bench, kept, self.budget.more, self.report)
             shares[name] += (self._squared(kept) - self._squared(base)) / whole
-            # A wrong model's floor is wrong, too.
-            floor = self._floor()
-        return self._conclude(base, list(shares), {n: ties[n] for n in shares}, shares, rounds, floor)
+            self._say_floor()
+        return self._conclude(base, list(shares), {n: ties[n] for n in shares}, shares, rounds)
 
     def _squared(self, fitted: Fitted) -> float:
         """Return the squared gap on the test trials [m^2]."""
         return float(rms(self.bench.gaps(fitted, "test")) ** 2)
 
-    def _pruned(self, fitted: Fitted, shares: dict[str, float], floor: Floor) -> Fitted:
+    def _pruned(self, fitted: Fitted, shares: dict[str, float]) -> Fitted:
         """Return the model without the effects that the last one has made needless, which takes over their shares."""
         *earlier, last = shares
         for name in earlier:
@@ -205,20 +205,18 @@ class _Search:
             effects, start = tuple(e for e in fitted.effects if e != name), self.bench.starts["train"]
             less = self.bench.fit([Fit(effects, fitted.values[None, left], names, sizes, self.budget.more, start)])[0]
             self.report(f"without {name}", 1, 1, f"{1e3 * less.point.cost:.2f} mm")
-            if not self._matters(less, fitted, floor, "train"):
+            if not self._matters(less, fitted, "train"):
                 fitted, shares[last] = less, shares[last] + shares.pop(name)
         return fitted
 
     def _possible(self) -> list[str]:
         return [n for n in library.LIBRARY if library.applicable(n, self.recording, self.pool.local.model(()).mesh)]
 
-    def _floor(self) -> Floor:
-        """Return the floor on the test trials."""
+    def _say_floor(self) -> None:
         self.report("measuring the floor", 1, 1, f"{1e3 * self.bench.floor.total:.2f} mm")
-        return self.bench.floor
 
     def _round(
-        self, base: Fitted, names: Sequence[str], floor: Floor, stage: str
+        self, base: Fitted, names: Sequence[str], stage: str
     ) -> tuple[Fitted | None, Fitted, list[Candidate], list[str]]:
         """Return the model with the best effect added, if one pays, that without, all candidates, and equal ones."""
         scores = screen(
@@ -231,13 +229,13 @@ class _Search:
         fits, led, rival = self._fits(base, scores[: self.budget.candidates], None, stage)
         self.bench.predict([base, rival, *fits.values()])
         first = min(led, key=lambda name: fits[name].point.cost)
-        if rms(self.bench.gaps(fits[first], "all")) > SILENT * floor.total:
+        if rms(self.bench.gaps(fits[first], "all")) > SILENT * self.bench.floor.total:
             # Something is left: one that does alike things may be right, however little its doses explain.
             kin = [s for s in scores if s.name not in fits and any({s.name, first} <= k for k in library.KIN)]
             more, also, _ = self._fits(base, kin, rival, f"{stage}, effects like {first}") if kin else ({}, [], rival)
             self.bench.predict([*more.values()])
             fits, led = fits | more, led + also
-        return self._judged(scores, fits, sorted(led, key=lambda name: fits[name].point.cost), rival, floor)
+        return self._judged(scores, fits, sorted(led, key=lambda name: fits[name].point.cost), rival)
 
     def _fits(
         self, base: Fitted, scores: Sequence[Score], rival: Fitted | None, stage: str
@@ -259,10 +257,10 @@ class _Search:
         return {s.name: f for s, f in zip(scores, found, strict=True)}, lead, rival
 
     def _judged(
-        self, scores: Sequence[Score], fits: dict[str, Fitted], order: Sequence[str], rival: Fitted, floor: Floor
+        self, scores: Sequence[Score], fits: dict[str, Fitted], order: Sequence[str], rival: Fitted
     ) -> tuple[Fitted | None, Fitted, list[Candidate], list[str]]:
         """Return what `_round` does, from fits; those in order lead, best first."""
-        refused = {name: self._refused(rival, fits[name], floor) for name in order}
+        refused = {name: self._refused(rival, fits[name]) for name in order}
         fair = [name for name in order if refused[name] is None]
         best, rivals = None, []
         reasons = {name: refused.get(name) or "fits worse" for name in fits}
@@ -274,8 +272,7 @@ class _Search:
             reasons |= dict.fromkeys(close, "as good as the best") | {first: "taken"}
             best, rivals = fits[first], [n for n in close if n != first]
         gains, held = (
-            {name: self._gain(rival, fitted, floor, split) for name, fitted in fits.items()}
-            for split in ("train", "test")
+            {name: self._gain(rival, fitted, split) for name, fitted in fits.items()} for split in ("train", "test")
         )
         candidates = [
             Candidate(
@@ -292,28 +289,30 @@ class _Search:
         near = 2 * TIE * max(rival.point.cost - lead, 0.0)
         return [k for n, k in enumerate(order) if n < LEADERS or costs[k] - lead < near]
 
-    def _refused(self, rival: Fitted, fitted: Fitted, floor: Floor) -> str | None:
+    def _refused(self, rival: Fitted, fitted: Fitted) -> str | None:
         """Return why a fit is no better than its rival, None if it is."""
-        gain = self._gain(rival, fitted, floor, "train")
+        gain = self._gain(rival, fitted, "train")
         if not self._on_most(rival, fitted):
             return "helps on too few trials"
         if gain < PAYS:
             return f"closes {max(gain, 0):.0%} of the gap"
-        if self._gain(rival, fitted, floor, "test") < PAYS:
+        if self._gain(rival, fitted, "test") < PAYS:
             return "does not help on the test trials"
-        if not all(self._matters(rival, fitted, floor, split) for split in ("train", "test")):
+        if not all(self._matters(rival, fitted, split) for split in ("train", "test")):
             return "closes less than the floor leaves open"
         return None
 
-    def _gain(self, base: Fitted, fitted: Fitted, floor: Floor, split: str) -> float:
+    def _gain(self, base: Fitted, fitted: Fitted, split: str) -> float:
         """Return the share of the excess gap (squared, above noise) that a fit closes."""
         before, after = rms(self.bench.gaps(base, split)) ** 2, rms(self.bench.gaps(fitted, split)) ** 2
-        return float((before - after) / max(before - floor.noise**2, (0.3 * floor.noise) ** 2, 1e-12))
+        return float(
+            (before - after) / max(before - self.bench.floor.noise**2, (0.3 * self.bench.floor.noise) ** 2, 1e-12)
+        )
 
-    def _matters(self, less: Fitted, more: Fitted, floor: Floor, split: str) -> bool:
+    def _matters(self, less: Fitted, more: Fitted, split: str) -> bool:
         """Return whether a model's gap is smaller by more than the floor, and by a share of the baseline's."""
         first, before, after = (rms(self.bench.gaps(f, split)) ** 2 for f in (self.baseline, less, more))
-        return before - after > max(floor.total**2, MATTERS * (first - floor.noise**2))
+        return before - after > max(self.bench.floor.total**2, MATTERS * (first - self.bench.floor.noise**2))
 
     def _on_most(self, base: Fitted, fitted: Fitted) -> bool:
         better = self.bench.gaps(fitted, "train") < self.bench.gaps(base, "train")
@@ -352,10 +351,9 @@ class _Search:
         ties: dict[str, list[str]],
         shares: dict[str, float],
         rounds: list[list[Candidate]],
-        floor: Floor,
     ) -> Diagnosis:
         (simulated, before), after = self.before, self.bench.gaps(final, "test")
-        explained = rms(after) <= UNEXPLAINED * floor.total
+        explained = rms(after) <= UNEXPLAINED * self.bench.floor.total
         verdict = ("effects" if explained else "partial") if effects else ("none" if explained else "unknown")
         predictions = {
             when: {t.name: sim[: len(t.time)] for sim, t in zip(sims, self.bench.trials["all"], strict=True)}
@@ -368,7 +366,7 @@ class _Search:
             shares,
             self.baseline,
             final,
-            floor,
+            self.bench.floor,
             before,
             after,
             rounds,
