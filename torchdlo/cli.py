@@ -230,6 +230,9 @@ def diagnose(
     as_json: Annotated[bool, typer.Option("--json", help="Print the findings as JSON.")] = False,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the random starts.")] = 0,
     vertices: Annotated[int | None, typer.Option(min=3, help="Vertices of the simulated rope.")] = None,
+    trials: Annotated[
+        int | None, typer.Option(min=1, help="Most train trials to use, evenly picked; fast takes 8, full 16.")
+    ] = None,
     workers: Annotated[int | None, typer.Option(min=1, help="Processes; one per core if not given.")] = None,
     model: ModelOption = None,
     resume: Annotated[
@@ -259,7 +262,7 @@ def diagnose(
     names = ("findings.json", "model.json", report.PAGE)
     for name in names:
         check_writable(out / name)
-    options = {"budget": budget, "seed": seed, "vertices": vertices, "workers": workers}
+    options = {"budget": budget, "seed": seed, "vertices": vertices, "trials": trials, "workers": workers}
     options |= _given(model)
     journal = out / "journal"
     try:

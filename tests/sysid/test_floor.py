@@ -77,3 +77,51 @@ def test_trials_whose_finer_simulation_fails_are_not_corrected() -> None:
     # Where no test trial tells, the others do; where none does, nothing is known.
     assert found.floor(slice(1, None), np.ones(4, bool)).grid == pytest.approx(0.01)
     assert replace(found, grid=np.full_like(grid, np.nan)).floor(slice(None), np.ones(4, bool)).grid == np.inf
+
+
+def test_motions_that_magnify_errors_count_less() -> None:
+    free, noise = np.array([False, True, True]), 1e-3
+    step, grid = np.zeros((2, 4, 3, 3)), np.zeros((2, 4, 3, 3))
+    grid[0, 2:, free] = 9e-3
+    found = Refinement(step, grid, noise, 2)
+    trust, level = found.trust(free)
+    # What is left of a change of 9 mm is a third of it.
+    deviation = np.full((2, 4), noise)
+    deviation[0, 2:] = np.hypot(noise, 3e-3)
+    np.testing.assert_allclose(trust * deviation, level)
+    assert np.mean(trust**2) == pytest.approx(1.0)
+    # The links of a chain are where vertices of the mesh are: nothing to correct, but all the more may be wrong.
+    chain = replace(found, wrong=0.0)
+    assert not chain.correction.any()
+    assert chain.floor(slice(None), free).grid == pytest.approx(3 * found.floor(slice(None), free).grid)
+    assert chain.trust(free)[0][0, 2] < trust[0, 2]
+
+
+def test_a_chain_is_corrected_by_what_its_links_do_not_explain(tmp_path: Path) -> None:
+    with Pool(swaying(tmp_path, frames=5), OPTIONS, workers=1) as pool:
+        bench, none = Bench(pool), Space((), ())
+        bench.begin(pool.local.model(()).guess(), ())
+        edge = np.mean(np.diff(pool.local.model(()).arclength))
+        for links, wrong in ((0.0, 1.0), (0.5, 0.75), (-1.0, 0.0), (4.0, -1.0)):
+            values = np.append(pool.local.model(()).guess(), links * edge)
+            point = Point(np.empty(0), 0.0, np.empty(0), np.empty(0), np.empty(0))
+            base = Fitted(("link_chain",), values, none, point)
+            assert floor.refine(pool, base, bench.starts["all"], "link_chain").wrong == pytest.approx(wrong)
+
+
+def test_trials_that_tell_nothing_of_their_errors_count_as_others_do() -> None:
+    step, grid = np.zeros((3, 2, 4, 3)), np.full((3, 2, 4, 3), 3e-3)
+    grid[1] = np.nan
+    trust, level = Refinement(step, grid, 1e-3, 2).trust(np.ones(4, bool))
+    np.testing.assert_allclose(trust, 1.0)
+    assert level == pytest.approx(np.hypot(1e-3, 1e-3))
+    assert Refinement(step, np.full_like(grid, np.nan), 1e-3, 2).trust(np.ones(4, bool))[1] == np.inf
+
+
+def test_gaps_are_weighted_by_frame(tmp_path: Path) -> None:
+    trials = swaying(tmp_path, frames=10).train
+    sims = np.stack([t.markers for t in trials]) + 1e-3
+    trust = np.zeros((3, 10))
+    trust[1], trust[2, :5] = 1.0, 2.0
+    np.testing.assert_allclose(floor.gap(sims, trials), 1e-3)
+    np.testing.assert_allclose(floor.gap(sims, trials, trust), [0.0, 1e-3, np.sqrt(2) * 1e-3])

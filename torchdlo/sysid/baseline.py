@@ -89,8 +89,16 @@ def calibrate(bench: Bench, count: int, iterations: int, rng: np.random.Generato
         bench.pool.choose(grip=1.0)
         smooth, side = others[2], replace(side, values=np.append(others[2].values, side.values[-1]))
     bench.correct(smooth)
-    smooth, side = fit([plain(smooth.values[None], iterations, None), chain(side.values[None], iterations, None)], 3)
-    better = side if side.point.cost < _BETTER * smooth.point.cost else smooth
+    better = fit([plain(smooth.values[None], iterations, None)], 3)[0]
+    if side.point.cost < _BETTER * smooth.point.cost:
+        level = bench.level
+        bench.correct(side)
+        found = fit([chain(side.values[None], iterations, None)], 3)[0]
+        # Each in its own measure of what can be known.
+        if found.point.cost / bench.level < _BETTER * better.point.cost / level:
+            better = found
+        else:
+            bench.correct(better)
     report(stage, 4, 4, f"{1e3 * rms(bench.gaps(better, 'train')):.2f} mm")
     return better
 
@@ -128,7 +136,7 @@ def go_further(bench: Bench, base: Fitted, iterations: int, report: Callback) ->
     report(stage, 0, 2, "")
     base = bench.fit([Fit(base.effects, values, names, sizes, iterations, start)])[0]
     report(stage, 1, 2, f"{1e3 * base.point.cost:.2f} mm")
-    if CHAIN not in base.effects and rms(bench.gaps(base, "train")) > SILENT * bench.floor.total:
+    if CHAIN not in base.effects and rms(bench.gaps(base, "train")) > SILENT * bench.level:
         rows = [np.pad(values, ((0, 0), (0, 1)), constant_values=length) for length in (link, -link)]
         for found in bench.fit([Fit(effects, r, free, (*sizes, 0.5 * link), iterations, start) for r in rows]):
             base = found if found.point.cost < _BETTER * base.point.cost else base

@@ -39,6 +39,8 @@ class Bench:
         """The baseline's numbers that fit the beginning of the trials, as far as they are known."""
         self.floor = floors.Floor(floors.noise(self.recording), float("inf"), float("inf"))
         """What no effect explains, on the test trials, as far as it is known."""
+        self.level = float("inf")
+        """What `gaps` are for a perfect model [m]."""
         self._known: dict[tuple[tuple[str, ...], bytes], np.ndarray] = {}
 
     def begin(self, base: np.ndarray, effects: Sequence[str]) -> None:
@@ -54,8 +56,10 @@ class Bench:
         """Correct simulations from now on by what finer steps and a finer mesh change of this model, see `floor`."""
         found = floors.refine(self.pool, base, self.starts["all"], CHAIN)
         train = len(self.trials["train"])
-        self.floor = found.floor(slice(train, None), ~self.trials["all"][0].gripped)
-        start = replace(self.starts["all"], finer=found.correction)
+        free = ~self.trials["all"][0].gripped
+        self.floor = found.floor(slice(train, None), free)
+        trust, self.level = found.trust(free)
+        start = replace(self.starts["all"], finer=found.correction, trust=trust)
         rows = np.arange(len(start.pos))
         self.starts = {"all": start, "train": start.pick(rows[:train]), "test": start.pick(rows[train:])}
         self._known.clear()
@@ -74,8 +78,8 @@ class Bench:
         return self._known[_key(fitted)][{"train": slice(first), "test": slice(first, None), "all": slice(None)}[split]]
 
     def gaps(self, fitted: Fitted, split: str) -> np.ndarray:
-        """Return the gap of each trial of a split [m]."""
-        return floors.gap(self.prediction(fitted, split), self.trials[split])
+        """Return the gap of each trial of a split [m], frames weighted by what they tell."""
+        return floors.gap(self.prediction(fitted, split), self.trials[split], self.starts[split].trust)
 
     def extension(self, base: Fitted, score: Score, numbers: Sequence[str], iterations: int, frames: int | None) -> Fit:
         """Return the job of fitting a model with one effect more, from the best of several starts.

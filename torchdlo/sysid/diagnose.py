@@ -19,7 +19,7 @@ from torchdlo.errors import InputError
 from torchdlo.sysid import baseline as baselines
 from torchdlo.sysid import health, library, plan
 from torchdlo.sysid.bench import SILENT, Bench, Callback
-from torchdlo.sysid.floor import Floor, rms
+from torchdlo.sysid.floor import Floor, gap, rms
 from torchdlo.sysid.health import Fault
 from torchdlo.sysid.journal import Journal
 from torchdlo.sysid.model import RopeModel
@@ -164,13 +164,13 @@ class _Search:
             base = baselines.go_on(self.bench, given, most, self.report)
         self.baseline = base
         self._say_floor()
-        self.before = self.bench.prediction(base, "all"), self.bench.gaps(base, "test")
+        self.before = self.bench.prediction(base, "all")
         rounds: list[list[Candidate]] = []
         ties: dict[str, list[str]] = {}
         shares: dict[str, float] = {}
         whole = max(self._squared(base) - self.bench.floor.noise**2, 1e-12)
         while len(rounds) < self.budget.rounds + (len(shares) < len(rounds)):
-            if shares and rms(self.bench.gaps(base, "all")) < SILENT * self.bench.floor.total:
+            if shares and rms(self.bench.gaps(base, "all")) < SILENT * self.bench.level:
                 break
             names = [n for n in self._possible() if n not in base.effects]
             if not names:
@@ -229,7 +229,7 @@ class _Search:
         fits, led, rival = self._fits(base, scores[: self.budget.candidates], None, stage)
         self.bench.predict([base, rival, *fits.values()])
         first = min(led, key=lambda name: fits[name].point.cost)
-        if rms(self.bench.gaps(fits[first], "all")) > SILENT * self.bench.floor.total:
+        if rms(self.bench.gaps(fits[first], "all")) > SILENT * self.bench.level:
             # Something is left: one that does alike things may be right, however little its doses explain.
             kin = [s for s in scores if s.name not in fits and any({s.name, first} <= k for k in library.KIN)]
             more, also, _ = self._fits(base, kin, rival, f"{stage}, effects like {first}") if kin else ({}, [], rival)
@@ -312,7 +312,7 @@ class _Search:
     def _matters(self, less: Fitted, more: Fitted, split: str) -> bool:
         """Return whether a model's gap is smaller by more than the floor, and by a share of the baseline's."""
         first, before, after = (rms(self.bench.gaps(f, split)) ** 2 for f in (self.baseline, less, more))
-        return before - after > max(self.bench.floor.total**2, MATTERS * (first - self.bench.floor.noise**2))
+        return before - after > max(self.bench.level**2, MATTERS * (first - self.bench.floor.noise**2))
 
     def _on_most(self, base: Fitted, fitted: Fitted) -> bool:
         better = self.bench.gaps(fitted, "train") < self.bench.gaps(base, "train")
@@ -352,12 +352,14 @@ class _Search:
         shares: dict[str, float],
         rounds: list[list[Candidate]],
     ) -> Diagnosis:
-        (simulated, before), after = self.before, self.bench.gaps(final, "test")
-        explained = rms(after) <= UNEXPLAINED * self.bench.floor.total
+        explained = rms(self.bench.gaps(final, "test")) <= UNEXPLAINED * self.bench.level
+        trials, train = self.bench.trials, len(self.bench.trials["train"])
+        simulated = {"before": self.before, "after": self.bench.prediction(final, "all")}
+        before, after = (gap(sims[train:], trials["test"]) for sims in simulated.values())
         verdict = ("effects" if explained else "partial") if effects else ("none" if explained else "unknown")
         predictions = {
-            when: {t.name: sim[: len(t.time)] for sim, t in zip(sims, self.bench.trials["all"], strict=True)}
-            for when, sims in (("before", simulated), ("after", self.bench.prediction(final, "all")))
+            when: {t.name: sim[: len(t.time)] for sim, t in zip(sims, trials["all"], strict=True)}
+            for when, sims in simulated.items()
         }
         return Diagnosis(
             verdict,

@@ -40,12 +40,19 @@ def noise(recording: Recording) -> float:
     return float(np.median(parts))
 
 
-def gap(simulated: np.ndarray, trials: tuple[Trial, ...] | list[Trial]) -> np.ndarray:
-    """Return the error of each trial [m], root mean square per coordinate of the free markers, shape (B,)."""
+def gap(simulated: np.ndarray, trials: tuple[Trial, ...] | list[Trial], trust: np.ndarray | None = None) -> np.ndarray:
+    """Return the error of each trial [m], root mean square per coordinate of the free markers, shape (B,).
+
+    Args:
+        simulated: markers [m], shape (B, F, M, 3).
+        trials: B trials.
+        trust: what errors of frames are multiplied by [1], shape (B, F); 1 if not given.
+    """
     out = []
-    for sim, trial in zip(simulated, trials, strict=True):
+    for sim, trial, of_frame in zip(simulated, trials, [None] * len(trials) if trust is None else trust, strict=True):
         free = ~trial.gripped
         error = sim[: len(trial.time)][:, free] - np.where(trial.suspect[:, None, None], np.nan, trial.markers)[:, free]
+        error = error if of_frame is None else of_frame[: len(error), None, None] * error
         known = np.isfinite(trial.markers[:, free]) & ~trial.suspect[:, None, None]
         out.append(float("inf") if not np.isfinite(error[known]).all() else float(np.sqrt(np.mean(error[known] ** 2))))
     return np.array(out)
@@ -70,11 +77,22 @@ class Refinement:
     """Noise of the markers [m]."""
     order: int
     """Order of the simulation's errors in its steps; 2 in its mesh."""
+    wrong: float = 1.0
+    """Share of the mesh's error that is one: where a chain of links was measured, its own links explain the rest."""
 
     @property
     def _rest(self) -> tuple[float, float]:
         """What halving leaves over, of the change that it makes."""
         return 1 / (2**self.order - 1), 1 / 3
+
+    @property
+    def _unsure(self) -> tuple[np.ndarray, np.ndarray]:
+        """What may be wrong with corrections [m], shape (B, F, M, 3) each: what was extrapolated.
+
+        How a chain's errors go with its links is not known that well.
+        """
+        step, grid = self._rest
+        return step * self.step, (grid if self.wrong == 1.0 else 1.0) * self.grid
 
     @property
     def correction(self) -> np.ndarray:
@@ -83,21 +101,37 @@ class Refinement:
         Richardson's extrapolation (1911, doi:10.1098/rsta.1911.0009).
         """
         step, grid = ((1 + rest) * np.nan_to_num(x) for rest, x in zip(self._rest, (self.step, self.grid), strict=True))
-        return step + grid
+        return step + self.wrong * grid
 
     def floor(self, trials: slice, free: np.ndarray) -> Floor:
-        """Return the floor on some of the trials: of the corrections, what was extrapolated may be wrong.
+        """Return the floor on some of the trials.
 
         Args:
             trials: which ones.
             free: which markers are not held.
         """
         parts = []
-        for rest, change in zip(self._rest, (self.step, self.grid), strict=True):
-            known = np.isfinite(change).all((1, 2, 3))
-            chosen = change[trials][known[trials]] if known[trials].any() else change[known]
-            parts.append(rest * float(np.sqrt(np.mean(chosen[:, :, free] ** 2))) if known.any() else float("inf"))
+        for unsure in self._unsure:
+            known = np.isfinite(unsure).all((1, 2, 3))
+            chosen = unsure[trials][known[trials]] if known[trials].any() else unsure[known]
+            parts.append(float(np.sqrt(np.mean(chosen[:, :, free] ** 2))) if known.any() else float("inf"))
         return Floor(self.noise, *parts)
+
+    def trust(self, free: np.ndarray) -> tuple[np.ndarray, float]:
+        """Return what errors of frames count [1], shape (B, F), and the gap that leaves a perfect model [m].
+
+        Where finer simulations differ much, as some motions magnify small errors, measurements tell little. Squares of
+        weights have a mean of 1.
+        """
+        with np.errstate(invalid="ignore"):
+            unsure = sum(np.mean(part[:, :, free] ** 2, (2, 3)) for part in self._unsure)
+        known = np.isfinite(unsure).all(1)
+        if not known.any():
+            return np.ones(unsure.shape), float("inf")
+        # Of trials that are not known, as much as of others.
+        variance = self.noise**2 + np.where(known[:, None], unsure, np.median(unsure[known], 0))
+        level = float(1 / np.sqrt(np.mean(1 / variance)))
+        return level / np.sqrt(variance), level
 
 
 def refine(pool: Pool, base: Fitted, start: Start, chain: str) -> Refinement:
@@ -107,18 +141,21 @@ def refine(pool: Pool, base: Fitted, start: Start, chain: str) -> Refinement:
         pool: the simulations.
         base: the model.
         start: where all trials begin.
-        chain: effect that belongs to one mesh and is left out.
+        chain: effect that makes the rope a chain of links, by their length; it is left out.
     """
     model = pool.local.model(base.effects)
     plain = tuple(e for e in base.effects if e != chain)
-    values = base.values[None, [k for k, name in enumerate(model.parameters) if name.split(".")[0] != chain]]
+    links = np.array([name.split(".")[0] == chain for name in model.parameters])
+    values = base.values[None, ~links]
+    # The mesh's error grows with the squared length of edges; that of a chain with edges as long as its links is none.
+    ratio = float(np.sum(base.values[links] ** 2) / np.mean(np.diff(model.arclength)) ** 2)
     half = ("substep", model.dt / (2 * model.substeps))
     finer = ("vertices", 2 * len(model.arclength) - 1)
     start = replace(start, finer=None)
     jobs = [Simulation(plain, values, "all", start, options) for options in ((half, finer), (half,), ())]
     sims = dict(pool.simulate(jobs))
     step, grid = _tame(sims[1][0] - sims[2][0]), _tame(sims[0][0] - sims[1][0])
-    return Refinement(step, grid, noise(pool.recording), 1 if model.ahead else 2)
+    return Refinement(step, grid, noise(pool.recording), 1 if model.ahead else 2, max(1 - ratio, -1.0))
 
 
 def _tame(change: np.ndarray) -> np.ndarray:

@@ -198,7 +198,7 @@ class RopeModel:
             ahead=self.ahead,
             # Ropes that are jerked taut need more; others do as well with less.
             newton=3 if self.ahead else 2,
-            settling=4 if self.ahead else 3,
+            settling=4 if self.ahead else 2,
         )
         params = self._measured_lengths(params, number)
         return scene, params, self._agree(scene, params, state)

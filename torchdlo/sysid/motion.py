@@ -46,7 +46,11 @@ class Start:
     finer: np.ndarray | None = None
     """What finer steps on a finer mesh would change of the markers of simulations that begin here, to be added to them
     [m], shape (B, F, M, 3)."""
+    trust: np.ndarray | None = None
+    """What errors of frames are multiplied by in fits [1], shape (B, F); 1 if not given."""
 
     def pick(self, rows: np.ndarray) -> Start:
         """Return the starts of these trials."""
-        return Start(*(None if x is None else x[rows] for x in (self.pos, self.vel, self.still, self.finer)))
+        return Start(
+            *(None if x is None else x[rows] for x in (self.pos, self.vel, self.still, self.finer, self.trust))
+        )

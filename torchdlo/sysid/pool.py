@@ -125,12 +125,13 @@ class Models:
         model, first, options = self.model(effects, together.options), jobs[0], together.options
         motion = self.motion(model, "train")
         start = first.start or starts.begin(model, self.recording.train)
+        trust = 1.0 if start.trust is None else start.trust[:, : first.frames, None, None]
         searches, places = [], []
         for job in jobs:
             own = self.model(job.effects, options)
             columns = [own.parameters.index(name) for name in job.free]
             space = Space(job.free, tuple(own.params[k] for k in columns), job.sizes)
-            searches.append(_search(job, space, columns, motion.markers[:, : job.frames]))
+            searches.append(_search(job, space, columns, motion.markers[:, : job.frames], trust))
             places.append([model.parameters.index(name) for name in own.parameters])
         found: dict[int, Fitted] = {}
         asked = {k: next(search) for k, search in enumerate(searches)}
@@ -159,24 +160,28 @@ def _filled(guess: np.ndarray, places: Sequence[int], values: np.ndarray) -> np.
     return full
 
 
-def _search(job: Fit, space: Space, columns: Sequence[int], measured: np.ndarray) -> _Search:
-    """Fit: yield parameter sets (P, K) of the job's model, take their simulations, return the best."""
+def _search(job: Fit, space: Space, columns: Sequence[int], measured: np.ndarray, trust: np.ndarray | float) -> _Search:
+    """Fit: yield parameter sets (P, K) of the job's model, take their simulations, return the best.
+
+    Markers (..., B, F, M, 3), measured and simulated, are multiplied by what they are trusted, (B, F, 1, 1).
+    """
+    measured = trust * measured
 
     def full(values: np.ndarray) -> np.ndarray:
         return _filled(job.values[0], columns, values)
 
     raws = space.clip(space.to_raw(job.values[:, columns]))
     if job.keep is not None:
-        costs = fit.costs((yield full(space.to_values(raws))), measured)
+        costs = fit.costs(trust * (yield full(space.to_values(raws))), measured)
         raws = raws[np.argsort(costs)[: job.keep]]
     look = fit.Look(space, raws)
-    climb = fit.Climb(space, look.points((yield full(look.values)), measured))
+    climb = fit.Climb(space, look.points(trust * (yield full(look.values)), measured))
     for _ in range(job.iterations):
         tries = climb.tries()
         if not len(tries):
             break
         look = fit.Look(space, tries)
-        climb.take(look.points((yield full(look.values)), measured))
+        climb.take(look.points(trust * (yield full(look.values)), measured))
     best = min(climb.points, key=lambda p: p.cost)
     return Fitted(job.effects, full(space.to_values(best.raw)[None])[0], space, best)
 

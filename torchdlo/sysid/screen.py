@@ -16,6 +16,7 @@ from scipy.optimize import lsq_linear
 from torchdlo.sysid import library
 from torchdlo.sysid.library import Probe
 from torchdlo.sysid.model import RopeModel
+from torchdlo.sysid.motion import Start
 from torchdlo.sysid.pool import Fitted, Pool, Simulation
 
 _KNEE = 2e-3
@@ -64,7 +65,7 @@ def curvature_scale(markers: np.ndarray) -> float:
 
 
 def screen(
-    pool: Pool, base: Fitted, names: Sequence[str], start: object, report: Callable[[int, int], None]
+    pool: Pool, base: Fitted, names: Sequence[str], start: Start, report: Callable[[int, int], None]
 ) -> list[Score]:
     """Return the scores of effects, best first.
 
@@ -98,7 +99,9 @@ def screen(
     own = sims_of[len(groups)]
     residual = pick(motion.markers - own[0])
     good = np.isfinite(residual) & np.isfinite(pick(own)).all(0)
-    weight = np.where(good, 1 / np.sqrt(np.nan_to_num(residual) ** 2 + _KNEE**2), 0.0) ** 0.5
+    trust = 1.0 if start.trust is None else pick(np.broadcast_to(start.trust[..., None, None], motion.markers.shape))
+    size = np.nan_to_num(trust * residual)
+    weight = np.where(good, trust / (size**2 + _KNEE**2) ** 0.25, 0.0)
     residual = np.nan_to_num(residual) * weight
     jacobian = np.stack([np.nan_to_num(pick(sim - own[0])) * weight for sim in own[1:]], 1)
     q, r = np.linalg.qr(jacobian / nudge)
@@ -147,7 +150,7 @@ def _groups(names: Sequence[str], doses: dict[str, list[Probe]]) -> list[list[st
     return groups
 
 
-def _job(pool: Pool, base: Fitted, group: Sequence[str], doses: dict[str, list[Probe]], start: object) -> Simulation:
+def _job(pool: Pool, base: Fitted, group: Sequence[str], doses: dict[str, list[Probe]], start: Start) -> Simulation:
     effects = (*base.effects, *group)
     model = pool.local.model(effects)
     first = model.guess()
