@@ -1,7 +1,8 @@
 """What contact costs: a knotted rope in many scenes, and piles of up to 3000 vertices.
 
 Frames are 1 ms in 5 substeps. CPU seconds of one thread are counted, so that other work on the machine matters less;
-two cores give twice the frames. Every run ends with `scene.check_state`: no pair was left out for want of room.
+two cores give twice the frames. Every run ends with `scene.check_state`: no pair was left out for want of room. Of
+piles, the part of contact alone is timed too, not compiled: with its pairs looked up once per frame.
 """
 
 from __future__ import annotations
@@ -50,7 +51,7 @@ def knotted(scenes: int, contact: bool) -> tuple[Any, Any, Any]:
 
 
 def pile(vertices: int) -> tuple[Any, Any, Any]:
-    """A rope coiled on itself, turn upon turn, on a table."""
+    """A rope coiled on itself in eight turns on a table: its contacts are in proportion to its length."""
     import torch
 
     from torchdlo import scene
@@ -59,11 +60,17 @@ def pile(vertices: int) -> tuple[Any, Any, Any]:
     from torchdlo.physics.effects.field import Damping, Gravity
     from torchdlo.physics.effects.table import Table
 
-    r, edge, wide = 0.005, 0.015, 0.06
+    r, edge = 0.005, 0.015
+    wide = vertices * edge / (8 * 2 * math.pi)
     a = torch.arange(vertices, dtype=torch.float64) * edge / wide
-    x = torch.stack([wide * a.cos(), wide * a.sin(), r + 2.02 * r * a / (2 * math.pi)], -1).float()
+    x = torch.stack([wide * a.cos(), wide * a.sin(), r + 2 * r * a / (2 * math.pi)], -1).float()
     effects = [Bend(), Gravity(), Damping(), Table(), RodContact(room=6 * vertices)]
-    return scene.make([scene.Rope(x, radius=r, density=1000.0, bend=1e-5)], effects, dt=1e-3, substeps=SUBSTEPS)
+    ropes = [scene.Rope(x, radius=r, density=1000.0, bend=1e-6)]
+    choice, params, state = scene.make(ropes, effects, dt=1e-3, substeps=SUBSTEPS)
+    with torch.no_grad():
+        for _ in range(40):
+            state = scene.step(choice, params, state, scene.hold(choice, state))
+    return choice, params, state
 
 
 def timed(made: tuple[Any, Any, Any], backward: bool, seconds: float, compiled: bool) -> dict[str, float]:
@@ -114,10 +121,43 @@ def timed(made: tuple[Any, Any, Any], backward: bool, seconds: float, compiled: 
     return {"cpu_s_per_frame": statistics.median(times), "first_call_s": first}
 
 
+def contact_alone(made: tuple[Any, Any, Any], seconds: float) -> float:
+    """Return CPU seconds per frame of what contact does by itself: it looks once, reacts and checks in each substep."""
+    import torch
+
+    from torchdlo import scene
+    from torchdlo.coupling import RodContact
+
+    choice, params, state = made
+    contact = next(e for e in choice.effects if e.name == "rod_contact")
+    parts = {"survey": 1, "react": SUBSTEPS, "shortfall": SUBSTEPS}
+    plain, given = {name: getattr(RodContact, name) for name in parts}, {}
+
+    def watched(name: str):
+        return lambda self, *words: given.update({name: words}) or plain[name](self, *words)
+
+    for name in parts:
+        setattr(RodContact, name, watched(name))
+    with torch.no_grad():
+        scene.step(choice, params, state, scene.hold(choice, state))
+        total = 0.0
+        for name, often in parts.items():
+            setattr(RodContact, name, plain[name])
+            times, start = [], time.process_time()
+            while len(times) < 5 or time.process_time() - start < seconds / 3:
+                before = time.process_time()
+                plain[name](contact, *given[name])
+                times.append(time.process_time() - before)
+            total += often * statistics.median(times)
+    return total
+
+
 def worker(case: dict[str, Any]) -> dict[str, Any]:
     """Time one case in this process."""
     made = pile(case["vertices"]) if case["pile"] else knotted(case["scenes"], case["contact"])
     found = timed(made, case["backward"], case["seconds"], case["compiled"])
+    if case["pile"]:
+        found["contact_cpu_s_per_frame"] = contact_alone(made, case["seconds"])
     return case | found | {"frames_per_s_per_core": case["scenes"] / found["cpu_s_per_frame"]}
 
 
@@ -139,6 +179,7 @@ def main() -> None:
     """Measure, print and save."""
     parser = Parser(__file__, description=__doc__, epilog=EXAMPLES)
     parser.flag("smoke", "one small case without compiling, to see that the script runs")
+    parser.flag("eager", "do not compile")
     parser.add_argument("--scenes", default="1,10,100", help="numbers of scenes of the knotted rope (%(default)s)")
     parser.add_argument("--sizes", default="300,1000,3000", help="vertices of the piles (%(default)s)")
     parser.add_argument("--seconds", type=float, default=2.0, help="CPU seconds per timing (%(default)s)")
@@ -149,7 +190,7 @@ def main() -> None:
         print(json.dumps(worker(json.loads(options.worker))), flush=True)
         return
     base = {"seconds": options.seconds, "pile": False, "contact": True, "backward": False, "vertices": 60, "scenes": 1}
-    base["compiled"] = True
+    base["compiled"] = not options.eager
     if options.smoke:
         options.scenes, options.sizes, base = "1", "", base | {"compiled": False, "seconds": 0.02}
     scenes = [int(n) for n in options.scenes.split(",") if n]
@@ -158,10 +199,11 @@ def main() -> None:
         rows.append(run(base | {"scenes": max(scenes), "contact": False}))
     piles = [run(base | {"pile": True, "vertices": int(n)}) for n in options.sizes.split(",") if n]
     content: dict[str, Any] = {"rows": rows + piles}
-    if len(piles) > 1:
-        x, y = zip(*((math.log(p["vertices"]), math.log(p["cpu_s_per_frame"])) for p in piles), strict=True)
-        content["exponent"] = statistics.linear_regression(x, y).slope
-        print(f"cost of a pile grows with the vertices to the power {content['exponent']:.2f}")
+    for part in ("", "contact_") if len(piles) > 1 else ():
+        x, y = zip(*((math.log(p["vertices"]), math.log(p[part + "cpu_s_per_frame"])) for p in piles), strict=True)
+        content[part + "exponent"] = statistics.linear_regression(x, y).slope
+        what = "contact in piles" if part else "piles"
+        print(f"cost of {what} grows with the vertices to the power {content[part + 'exponent']:.2f}")
     save(options.json, content)
 
 

@@ -8,11 +8,20 @@ import pytest
 import torch
 from touching import F64, distances, line, trefoil, two
 
-from torchdlo.coupling import RodContact, nearby
+from torchdlo.coupling import RodContact, nearby, rod_near
 from torchdlo.coupling.watch import survey
 from torchdlo.physics import tree
 from torchdlo.physics.effects.elastic import Bend
 from torchdlo.scene import Rope, check_state, hold, make, ok, step
+
+
+@pytest.fixture(params=["kernel", "tensors"])
+def way(request, monkeypatch):
+    """Pairs are found by the kernel, or by tensor operations."""
+    if request.param == "tensors":
+        monkeypatch.setattr(rod_near, "ready", lambda *_: False)
+    elif not rod_near.ready("cpu", F64):
+        pytest.skip("there is no C++ compiler")
 
 
 def walk(n: int, seed: int, step_m: float = 0.015, box: float = 0.12) -> torch.Tensor:
@@ -59,7 +68,7 @@ def wanted(x: torch.Tensor, counts: tuple[int, ...], limit: float, arc: float) -
 
 
 @pytest.mark.parametrize("n", [60, 300], ids=["all pairs", "cells"])
-def test_the_list_is_what_trying_all_pairs_finds(n):
+def test_the_list_is_what_trying_all_pairs_finds(n, way):
     r, burst, dt = 0.005, 0.5, 1e-3
     x = torch.stack([walk(n, seed) for seed in (1, 2)])
     contact = RodContact(room=40 * n, row=200, burst=burst)
@@ -75,7 +84,7 @@ def test_the_list_is_what_trying_all_pairs_finds(n):
         assert len(inner) > 20 and inner <= found[b] <= outer
 
 
-def test_both_ways_give_the_same_list(monkeypatch):
+def test_both_ways_give_the_same_list(way, monkeypatch):
     scene, params, state = make(
         [Rope(walk(150, 5), radius=0.005, density=1000.0)], [RodContact(room=2000, row=200)], check=False
     )
@@ -84,7 +93,7 @@ def test_both_ways_give_the_same_list(monkeypatch):
     assert listed(scene, params, state)[0] == few and few[0]
 
 
-def test_neighbours_along_a_fine_rope_do_not_touch_and_strands_of_a_hairpin_do():
+def test_neighbours_along_a_fine_rope_do_not_touch_and_strands_of_a_hairpin_do(way):
     # Edges of a third of the radius: a straight rope is nearer to itself than its diameter, but not in contact.
     r = 0.006
     straight = make([Rope(line(40, 39 * r / 3), radius=r, density=1000.0)], [RodContact(room=1000, burst=0.1)])
@@ -103,7 +112,7 @@ def test_neighbours_along_a_fine_rope_do_not_touch_and_strands_of_a_hairpin_do()
     assert {(10, 58)} <= pairs[0]
 
 
-def test_a_closed_rope_is_not_near_itself_across_its_seam():
+def test_a_closed_rope_is_not_near_itself_across_its_seam(way):
     a = 2 * math.pi * torch.arange(30, dtype=F64) / 30
     ring = 0.1 * torch.stack([torch.cos(a), torch.sin(a), 0 * a], -1)
     assert listed(*make([Rope(ring, radius=0.005, density=1000.0, closed=True)], [RodContact()])) == ([set()], 0.0)
@@ -112,7 +121,7 @@ def test_a_closed_rope_is_not_near_itself_across_its_seam():
     assert (7, 22) in pairs[0]
 
 
-def test_a_full_list_and_fast_vertices_are_reported():
+def test_a_full_list_and_fast_vertices_are_reported(way):
     full = two(contact=RodContact(room=5))
     state = step(*full, hold(full[0], full[2]))
     assert not bool(ok(state)) and float(state.missed[..., 0]) > 0
@@ -130,13 +139,55 @@ def test_a_full_list_and_fast_vertices_are_reported():
         check_state(late)
 
 
-def test_a_crowded_row_of_cells_is_reported():
+@pytest.mark.parametrize("dtype", [torch.float32, F64], ids=["float32", "float64"])
+@pytest.mark.parametrize("n", [60, 300], ids=["all pairs", "cells"])
+@pytest.mark.skipif(not rod_near.ready("cpu", F64), reason="there is no C++ compiler")
+def test_the_kernel_finds_what_tensor_operations_find(n, dtype, monkeypatch):
+    # Three ropes, one of them a loop, in eleven scenes that move differently, one vertex held and carried away.
+    g = torch.Generator().manual_seed(3)
+    x = torch.stack([walk(n, seed, box=0.12 + 0.0005 * n) for seed in range(11)]).to(dtype)
+    parts = [x[:, : n // 2], x[:, n // 2 : n - 12], x[:, n - 12 :]]
+    ropes = [
+        Rope(
+            p,
+            radius=0.005 + 0.001 * k,
+            density=1000.0,
+            closed=k == 2,
+            velocities=torch.randn(p.shape, generator=g).to(p),
+        )
+        for k, p in enumerate(parts)
+    ]
+    contact = RodContact(room=60 * n, row=300, burst=0.5)
+    scene, params, state = make(ropes, [contact], dt=1e-3, held_vertices=(4,), check=False)
+    start = hold(scene, state)
+    aimed = tree.replace(start, pos=start.pos + 0.004)  # faster than all others
+    found = []
+    for there in (True, False):
+        with monkeypatch.context() as patch:
+            if not there:
+                patch.setattr(rod_near, "ready", lambda *_: False)
+            values = survey(scene, params, state, start, aimed).effects["rod_contact"]
+            moved = state.rods.pos + 0.03 * torch.sin(torch.arange(3 * n, dtype=dtype)).reshape(n, 3)
+            found.append((listed(scene, params, state), values["reach"], contact.shortfall(moved, values)))
+    (pairs, lost), reach, short = found[0]
+    (others, lost_too), reach_too, short_too = found[1]
+    # Pairs whose distance is within rounding of the limit may be on one list only.
+    limit = 1 if dtype == torch.float32 else 0
+    assert lost == lost_too == 0 and all(len(a) > n and len(a ^ b) <= limit for a, b in zip(pairs, others, strict=True))
+    rounding = 20 * torch.finfo(dtype).eps
+    assert torch.allclose(reach, reach_too, rtol=rounding, atol=0) and float(reach.min()) > 0.01
+    assert float(short[..., 1].min()) > 0 and torch.allclose(short, short_too, rtol=0, atol=rounding * 0.2)
+
+
+def test_a_crowded_row_of_cells_is_reported(monkeypatch):
+    # Of tensor operations only: the kernel has room for any number of edges in a row.
+    monkeypatch.setattr(rod_near, "ready", lambda *_: False)
     x = torch.stack([walk(300, 1)])
     scene, params, state = make([Rope(x, radius=0.005, density=1000.0)], [RodContact(room=20000, row=2)], check=False)
     assert listed(scene, params, state)[1] > 0
 
 
-def test_the_overhand_knot_is_found_with_room_to_spare():
+def test_the_overhand_knot_is_found_with_room_to_spare(way):
     scene, params, state = make([Rope(trefoil(121), radius=0.003, density=1000.0)], [RodContact()])
     pairs, lost = listed(scene, params, state)
     assert lost == 0 and 3 <= len(pairs[0]) < 242

@@ -49,7 +49,7 @@ def _kept(numbers: tuple[int, ...]) -> ctypes.Array:
 
 def fields(tensors: Sequence[Tensor]) -> ctypes.Array:
     """Return the addresses of all fields of tensors (C, n, B)."""
-    at = [t.data_ptr() + k * t[0].nbytes for t in tensors for k in range(t.shape[0])]
+    at = [t.data_ptr() + k * (t.nbytes // t.shape[0]) for t in tensors for k in range(t.shape[0])]
     return (ctypes.c_void_p * len(at))(*at)
 
 
@@ -68,4 +68,4 @@ def logical(x: Tensor, batch: Sequence[int]) -> Tensor:
 
 def once(ctx, *by) -> None:
     """Refuse to differentiate a derivative: what stands in for the backward pass of an operator's backward pass."""
-    raise RuntimeError("contact with bodies has no second derivative; do not ask for create_graph through it")
+    raise RuntimeError("contact has no second derivative; do not ask for create_graph through it")

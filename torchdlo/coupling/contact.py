@@ -27,6 +27,8 @@ Ropes are not spun by friction: they slide and do not roll, and parallel ropes r
 The derivative is the one of the step as computed: of normals, closest points, friction and inverse masses. It is
 finite everywhere, and one-sided where a pair starts to touch or to slide.
 
+On the CPU C++ kernels do what the tensor operations below say, see `rod_near` and `rod_pairs`.
+
 Stewart and Trinkle 1996, doi:10.1002/(SICI)1097-0207(19960815)39:15<2673::AID-NME972>3.0.CO;2-I (velocity-level time
 stepping); Tonge, Benevolenski, Voroshilov 2012, doi:10.1145/2185520.2185601 (Jacobi sweeps with split masses).
 """
@@ -39,17 +41,16 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
+from torchdlo.coupling import rod_near, rod_pairs
 from torchdlo.coupling.coulomb import parting, rebounding, rub
 from torchdlo.coupling.nearby import near_pairs
 from torchdlo.coupling.pairs import Four, columns, corners, drop, pick
+from torchdlo.coupling.rod_pairs import WEAK
 from torchdlo.coupling.segments import closest
 from torchdlo.physics import tree
 from torchdlo.physics.effect import Effect, Motion, Param, Values
 from torchdlo.physics.numerics import cross, dot, safe_norm
 from torchdlo.physics.rod import View
-
-WEAK = 0.01
-"""Inertia of two edges against each other in the balance of friction's couple, over what it is."""
 
 
 @tree.struct
@@ -174,7 +175,7 @@ class RodContact(Effect):
     room: int = 0
     """Pairs of edges per scene that there is room for; 0: two per slot and at least 64."""
     row: int = 64
-    """Edges per row of three cells that there is room for, in scenes with many edges."""
+    """Edges per row of three cells that tensor operations have room for, in scenes with many edges."""
     recovery: float = 0.2
     """Share of a shallow overlap that a substep removes; a small one lets piles come to rest."""
     burst: float = 1.0
@@ -206,12 +207,14 @@ class RodContact(Effect):
             carried: how far held vertices are moved in it [m], shape (..., H, 3).
         """
         topology, pos, params = view.topology, view.state.pos, view.params
+        room = self.room or max(64, 2 * topology.size)
+        if rod_near.ready(pos.device.type, pos.dtype):
+            return rod_near.survey(view, carried, room, self.burst)
         mean = view.state.vel.mean(-2, keepdim=True)
         fastest = safe_norm(view.state.vel - mean).amax(-2, keepdim=True)
         if carried.shape[-2]:
             fastest = torch.maximum(fastest, safe_norm(carried / view.dt - mean).amax(-2, keepdim=True))
         reach = (view.dt * (1.5 * fastest + self.burst)).expand(*pos.shape[:-2], 1, 1)
-        room = self.room or max(64, 2 * topology.size)
         first, second, there, lost = near_pairs(topology, params, pos, reach, room, self.row)
         after = torch.tensor(topology.successor(), device=pos.device)
         at = corners(torch.stack([first, after[first], second, after[second]], -2))
@@ -225,12 +228,18 @@ class RodContact(Effect):
 
     def shortfall(self, pos: Tensor, values: Values) -> Tensor:
         """Return how many pairs found no room, and by how much vertices outran the survey [m], shape (..., 1, 2)."""
+        if rod_near.ready(pos.device.type, pos.dtype):
+            return torch.cat([values["lost"], rod_near.beyond(pos, values)], -1).detach()
         moved = pos - values["origin"]
         far = safe_norm(moved - moved.mean(-2, keepdim=True)).amax(-2, keepdim=True)
         return torch.cat([values["lost"], (far - values["reach"]).clamp(min=0.0)], -1).detach()
 
     def react(self, view: View, motion: Motion, values: Values) -> Tensor:
         """Return the forces on vertices that keep ropes apart and rub [N], shape (..., V, 3)."""
+        like = view.state.pos
+        if rod_pairs.ready(like.device.type, like.dtype):
+            law = (self.recovery, self.slowest)
+            return rod_pairs.push(view, motion, values, sweeps=self.sweeps, friction=self.friction, law=law)
         _, forces, spread = self.solve(view, motion, values)
         return drop(spread(forces), values["corners"], view.topology.size)
 

@@ -46,6 +46,6 @@ def rub(trial: Tensor, normal: Tensor, mu_s: Tensor, mu_k: Tensor) -> Tensor:
     Else sliding friction, mu_k times the normal force in the direction of `trial`.
     """
     size = safe_norm(trial)
-    sticks = size <= mu_s * normal
+    sticks = (normal > 0) & (size <= mu_s * normal)
     sliding = mu_k * normal * trial / torch.where(size > 0, size, 1.0)
     return torch.where(sticks, trial, sliding)
