@@ -27,6 +27,21 @@ def change(description: Description, **fields) -> Description:
     return dataclasses.replace(description, **fields)
 
 
+def test_bodies_touch_matter_where_the_effect_says_so():
+    ball = Matter("elastic", (0.03,), 0.01, "ball", (0.0, 0.0, 0.3), vel=(0.0, 0.0, -1.0))
+    room, plate = (
+        Box((-0.06, -0.06, 0.2), (0.06, 0.06, 0.36), 0.02),
+        Body("box", (0.1, 0.1, 0.02), (0.0, 0.0, 0.24), mass=1.0),
+    )
+    speed = {}
+    for effects in ({}, {"body_matter": {"sweeps": 6}}):
+        d = change(FALL, effects=effects, bodies=(plate,), matter=(ball,), box=room, duration=0.02, substeps=5)
+        scene, params, state, controls = describe.build(d)
+        state, _ = rollout(lambda p, s, c, scene=scene: step(scene, p, s, c), params, state, controls)
+        speed[bool(effects)] = float(state.bodies.vel[0, 2])
+    assert speed[False] == 0.0 and speed[True] < -0.02
+
+
 def test_all_parts_read_back_as_they_were_written(tmp_path):
     whole = Description(
         (change(LINE, weights=(Weight(-1, 1 / 3),)), Rope(((0.0, 0.0, 0.0), (1.0, 0.0, 0.0)), model="model.json")),

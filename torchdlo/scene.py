@@ -15,9 +15,8 @@ import torch
 from torch import Tensor
 
 from torchdlo.coupling import bodies as rigid
-from torchdlo.coupling import mpm, rod_matter, watch
+from torchdlo.coupling import body_matter, mpm, rod_matter, watch
 from torchdlo.coupling.bodies import Body, BodyParams, BodyState, BodyTargets, Solid, place
-from torchdlo.coupling.body_contact import BodyContact
 from torchdlo.coupling.particles import Matter, Medium, Particles
 from torchdlo.coupling.watch import survey
 from torchdlo.physics import build, rod, rotation, stability, tree
@@ -142,11 +141,11 @@ class Scene:
             "implicit steps solve for edge lengths; keep constrained=True and give the rope its stretch stiffness",
         )
         need(
-            bool(self.bodies) or not {"rod_body", "finger_pads"} & set(names),
-            "RodBody or FingerPads is among the effects, but there are no bodies; give make(..., bodies=[Solid(...)])",
+            bool(self.bodies) or not {"rod_body", "finger_pads", "body_matter"} & set(names),
+            "RodBody, BodyMatter or FingerPads needs bodies, but there are none; give make(..., bodies=[Solid(...)])",
         )
         for effect in self.effects:
-            if isinstance(effect, BodyContact):
+            if effect.name == "body_contact":
                 effect.check_pairs(self.bodies)
         if self.integrator == "implicit":
             loops = [n for n, c in zip(self.topology.counts, self.topology.closed, strict=True) if c and n < 5]
@@ -198,7 +197,7 @@ def make(
         effects: what acts on them.
         values: numbers of effects that differ from their defaults, e.g. {"damping": {"rate": 0.6}}.
         bodies: rigid bodies; `RodBody` among the effects makes ropes touch them.
-        matter: what `coupling.particles.assemble` returned; `RodMatter` among the effects makes ropes touch it.
+        matter: what `coupling.particles.assemble` returned; `RodMatter` and `BodyMatter` let ropes and bodies touch it.
         check: whether to refuse what could not be stepped: laws that do not fit the ropes, ropes far from their length,
             unstable substeps. Scenes whose loads are only evaluated may be anything.
         choices: fields of `Scene`.
@@ -210,7 +209,7 @@ def make(
         state, placed = tree.map(lambda x: tree.batch_innermost(x.expand(*batch, *x.shape[-2:])), (state, placed))
     medium, stuff, particles = matter or (None, (), ())
     if matter:
-        state, particles = rod_matter.together(state, particles)
+        state, placed, particles = rod_matter.together(state, placed, particles)
     effects = rod_matter.fitted(effects, medium, rods)
     scene = Scene(topology, effects, bodies=kinds, matter=medium, **choices)
     numbers = numbers_of(effects, values or {}, state.pos)
@@ -289,6 +288,7 @@ def advance(scene: Scene, params: Params, state: State, start: Control, control:
     later = share * scene.substeps > 1.5
     mean = tree.map(lambda old, now: torch.where(later, old, 0.0) + now / scene.substeps, state.reaction, reaction)
     missed = watch.missed(scene.effects, rods.pos, params.effects, state.missed)
+    push = body_matter.meet(scene.effects, body, pool, push)
     moved, particles = rigid.advance(body, poses, push) if scene.bodies else (), ()
     if scene.matter:
         particles, missed = rod_matter.finish(scene.matter, params.matter, pool, push, settings.dt, missed)

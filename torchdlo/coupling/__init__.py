@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from torchdlo.coupling.body_contact import BodyContact
+from torchdlo.coupling.body_matter import BodyMatter
 from torchdlo.coupling.contact import RodContact
 from torchdlo.coupling.pads import FingerPads
 from torchdlo.coupling.rod_body import RodBody
@@ -16,4 +17,4 @@ EFFECTS: dict[str, type[Effect]] = {
     "finger_pads": FingerPads,
 }
 
-__all__ = ["EFFECTS", "BodyContact", "FingerPads", "RodBody", "RodContact", "RodMatter"]
+__all__ = ["EFFECTS", "BodyContact", "BodyMatter", "FingerPads", "RodBody", "RodContact", "RodMatter"]

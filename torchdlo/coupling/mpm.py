@@ -80,6 +80,13 @@ def _locate(grid: Grid, pos: Tensor) -> tuple[Tensor, Tensor]:
     return at - origin.unsqueeze(-1), origin
 
 
+def places(grid: Grid, nodes: Nodes) -> Tensor:
+    """Return where the computed nodes are [m], shape (B, N, 3)."""
+    ranges = [torch.arange(n, dtype=nodes.vel.dtype, device=nodes.vel.device) for n in grid.size]
+    number = nodes.origin.unsqueeze(1) + torch.cartesian_prod(*ranges)
+    return number * grid.spacing + number.new_tensor(grid.first)
+
+
 def to_grid(
     medium: Medium, matter: Matter, particles: Particles, acceleration: Tensor, dt: float, share: Tensor
 ) -> tuple[Nodes, Particles]:

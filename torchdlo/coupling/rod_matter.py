@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from torchdlo.coupling import mpm
+from torchdlo.coupling.bodies import BodyState
 from torchdlo.coupling.exchange import Lines, Touch, block_size, exchange
 from torchdlo.coupling.mpm import Nodes
 from torchdlo.coupling.particles import Grid, Matter, Medium, Particles, stored
@@ -91,9 +92,9 @@ def fitted(effects: Sequence[Effect], medium: Medium | None, rods: RodParams) ->
     """Return the effects with the block of nodes that `RodMatter` needs for these ropes."""
     found = []
     for e in effects:
-        if isinstance(e, RodMatter) and medium is None:
+        if e.name in ("rod_matter", "body_matter") and medium is None:
             raise ValueError(
-                "scene: RodMatter is among the effects, but there is no matter; give make(..., matter=...)"
+                f"scene: {type(e).__name__} is among the effects, but there is no matter; give make(..., matter=...)"
             )
         if isinstance(e, RodMatter) and not e.block:
             longest = float((rods.rest.length * rods.rest.edge_mask).max())
@@ -137,9 +138,11 @@ def finish(
     return mpm.from_grid(medium, matter, now.particles, nodes, dt), missed
 
 
-def together(rods: RodState, particles: Particles) -> tuple[RodState, Particles]:
-    """Return both with the batch axes of both."""
+def together(
+    rods: RodState, bodies: BodyState | tuple[()], particles: Particles
+) -> tuple[RodState, BodyState | tuple[()], Particles]:
+    """Return all with the batch axes of all."""
     batch = torch.broadcast_shapes(rods.pos.shape[:-2], particles.pos.shape[:-2])
-    wide = tree.map(lambda x: tree.batch_innermost(x.expand(*batch, *x.shape[-2:])), rods)
+    wide = tree.map(lambda x: tree.batch_innermost(x.expand(*batch, *x.shape[-2:])), (rods, bodies))
     particles = tree.to(particles, rods.pos.dtype)
-    return wide, tree.map(lambda x: stored(x.expand(*batch, *x.shape[-2:])), particles)
+    return *wide, tree.map(lambda x: stored(x.expand(*batch, *x.shape[-2:])), particles)

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from torchdlo.coupling import EFFECTS as COUPLING
+from torchdlo.coupling.body_matter import BodyMatter
 from torchdlo.coupling.rod_matter import RodMatter
 from torchdlo.describe.kinds import Description
 from torchdlo.errors import InputError
@@ -20,7 +21,7 @@ from torchdlo.physics.effects import EFFECTS as PHYSICS
 
 __all__ = ["EFFECTS", "FORMAT", "like", "parse", "plain", "read", "save", "text"]
 
-EFFECTS = PHYSICS | COUPLING | {"rod_matter": RodMatter}
+EFFECTS = PHYSICS | COUPLING | {e.name: e for e in (RodMatter, BodyMatter)}
 FORMAT = "torchdlo scene 1"
 """What the entry "format" of a file says."""
 
