@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -102,3 +103,9 @@ def test_every_effect_has_a_law_with_its_numbers() -> None:
 
 def test_experiments_do_not_depend_on_the_order() -> None:
     assert separating("wind", "tilted_gravity") == separating("tilted_gravity", "wind") != separating("wind", "stretch")
+
+
+def test_the_page_on_diagnoses_has_the_library_with_its_laws() -> None:
+    page = Path(__file__).parents[2] / "docs" / "diagnose.md"
+    rows = dict(re.findall(r"^\| `(\w+)` \| (.*?) \| `", page.read_text(), re.MULTILINE))
+    assert rows == {name: LAWS[name].replace("|", "\\|") for name in library.LIBRARY}

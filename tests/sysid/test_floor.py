@@ -63,7 +63,7 @@ def test_a_correction_leaves_little_of_the_error_of_steps_and_mesh(tmp_path: Pat
 def test_extrapolation_knows_the_order_of_the_steps() -> None:
     step, grid = np.full((2, 3, 4, 3), 0.3), np.full((2, 3, 4, 3), 0.6)
     for order, rest in ((2, 1 / 3), (1, 1.0)):
-        found = Refinement(step, grid, 1e-4, order)
+        found = Refinement(step, grid, 1e-4, order, 0.02)
         np.testing.assert_allclose(found.correction, (1 + rest) * 0.3 + 4 / 3 * 0.6)
         parts = found.floor(slice(1, None), np.ones(4, bool))
         assert (parts.noise, parts.step, parts.grid) == pytest.approx((1e-4, rest * 0.3, 0.2))
@@ -72,7 +72,7 @@ def test_extrapolation_knows_the_order_of_the_steps() -> None:
 def test_trials_whose_finer_simulation_fails_are_not_corrected() -> None:
     step, grid = np.full((2, 3, 4, 3), 0.03), np.full((2, 3, 4, 3), 0.03)
     step[0], grid[1, 2, 1, 0] = 7.0, np.nan
-    found = Refinement(floor._tame(step), floor._tame(grid), 1e-4, 2)
+    found = Refinement(floor._tame(step), floor._tame(grid), 1e-4, 2, 0.02)
     np.testing.assert_allclose(found.correction, np.full(step.shape, 0.04))
     # Where no test trial tells, the others do; where none does, nothing is known.
     assert found.floor(slice(1, None), np.ones(4, bool)).grid == pytest.approx(0.01)
@@ -83,7 +83,7 @@ def test_motions_that_magnify_errors_count_less() -> None:
     free, noise = np.array([False, True, True]), 1e-3
     step, grid = np.zeros((2, 4, 3, 3)), np.zeros((2, 4, 3, 3))
     grid[0, 2:, free] = 9e-3
-    found = Refinement(step, grid, noise, 2)
+    found = Refinement(step, grid, noise, 2, 0.02)
     trust, level = found.trust(free)
     # What is left of a change of 9 mm is a third of it.
     deviation = np.full((2, 4), noise)
@@ -91,7 +91,7 @@ def test_motions_that_magnify_errors_count_less() -> None:
     np.testing.assert_allclose(trust * deviation, level)
     assert np.mean(trust**2) == pytest.approx(1.0)
     # The links of a chain are where vertices of the mesh are: nothing to correct, but all the more may be wrong.
-    chain = replace(found, wrong=0.0)
+    chain = replace(found, links=0.02)
     assert not chain.correction.any()
     assert chain.floor(slice(None), free).grid == pytest.approx(3 * found.floor(slice(None), free).grid)
     assert chain.trust(free)[0][0, 2] < trust[0, 2]
@@ -112,10 +112,10 @@ def test_a_chain_is_corrected_by_what_its_links_do_not_explain(tmp_path: Path) -
 def test_trials_that_tell_nothing_of_their_errors_count_as_others_do() -> None:
     step, grid = np.zeros((3, 2, 4, 3)), np.full((3, 2, 4, 3), 3e-3)
     grid[1] = np.nan
-    trust, level = Refinement(step, grid, 1e-3, 2).trust(np.ones(4, bool))
+    trust, level = Refinement(step, grid, 1e-3, 2, 0.02).trust(np.ones(4, bool))
     np.testing.assert_allclose(trust, 1.0)
     assert level == pytest.approx(np.hypot(1e-3, 1e-3))
-    assert Refinement(step, np.full_like(grid, np.nan), 1e-3, 2).trust(np.ones(4, bool))[1] == np.inf
+    assert Refinement(step, np.full_like(grid, np.nan), 1e-3, 2, 0.02).trust(np.ones(4, bool))[1] == np.inf
 
 
 def test_gaps_are_weighted_by_frame(tmp_path: Path) -> None:

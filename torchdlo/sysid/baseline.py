@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from torchdlo.sysid.bench import CHAIN, SILENT, Bench, Callback
-from torchdlo.sysid.floor import rms
+from torchdlo.sysid.floor import Refinement, rms
 from torchdlo.sysid.model import RopeModel
 from torchdlo.sysid.pool import Fit, Fitted
 from torchdlo.sysid.saved import Saved
@@ -88,17 +89,10 @@ def calibrate(bench: Bench, count: int, iterations: int, rng: np.random.Generato
     if firm and others[2].point.cost < _BETTER * min(smooth.point.cost, side.point.cost):
         bench.pool.choose(grip=1.0)
         smooth, side = others[2], replace(side, values=np.append(others[2].values, side.values[-1]))
-    bench.correct(smooth)
+    rope = bench.correct(smooth)
     better = fit([plain(smooth.values[None], iterations, None)], 3)[0]
     if side.point.cost < _BETTER * smooth.point.cost:
-        level = bench.level
-        bench.correct(side)
-        found = fit([chain(side.values[None], iterations, None)], 3)[0]
-        # Each in its own measure of what can be known.
-        if found.point.cost / bench.level < _BETTER * better.point.cost / level:
-            better = found
-        else:
-            bench.correct(better)
+        better = _chain_or(bench, better, rope, [chain(side.values[None], iterations, None)])
     report(stage, 4, 4, f"{1e3 * rms(bench.gaps(better, 'train')):.2f} mm")
     return better
 
@@ -129,19 +123,37 @@ def go_further(bench: Bench, base: Fitted, iterations: int, report: Callback) ->
         back = base.values.copy()
         back[twist] = _ROUND * back[bend]
         values = np.stack([base.values, back])
-    bench.correct(base)
-    start = bench.starts["train"]
-    names, sizes = base.space.names, tuple(base.space.units)
+    rope, names, sizes = bench.correct(base), base.space.names, tuple(base.space.units)
     stage, effects, free = "fitting all numbers again", (*base.effects, CHAIN), (*names, f"{CHAIN}.length")
     report(stage, 0, 2, "")
-    base = bench.fit([Fit(base.effects, values, names, sizes, iterations, start)])[0]
+    base = bench.fit([Fit(base.effects, values, names, sizes, iterations, bench.starts["train"])])[0]
     report(stage, 1, 2, f"{1e3 * base.point.cost:.2f} mm")
     if CHAIN not in base.effects and rms(bench.gaps(base, "train")) > SILENT * bench.level:
-        rows = [np.pad(values, ((0, 0), (0, 1)), constant_values=length) for length in (link, -link)]
-        for found in bench.fit([Fit(effects, r, free, (*sizes, 0.5 * link), iterations, start) for r in rows]):
-            base = found if found.point.cost < _BETTER * base.point.cost else base
+        rows = [np.append(base.values, length)[None] for length in (link, -link)]
+        sides = [Fit(effects, r, free, (*sizes, 0.5 * link), iterations, bench.starts["train"]) for r in rows]
+        base = _chain_or(bench, base, rope, sides)
     report(stage, 2, 2, f"{1e3 * rms(bench.gaps(base, 'train')):.2f} mm")
     return base
+
+
+def _chain_or(bench: Bench, smooth: Fitted, rope: Refinement, sides: Sequence[Fit]) -> Fitted:
+    """Return the best fit of a chain, if it is better than that of a smooth rope, else the latter.
+
+    Args:
+        bench: the trials.
+        smooth: what was fitted.
+        rope: how simulations were corrected for it.
+        sides: fits of the chain.
+    """
+    level = bench.level
+    bench.use(replace(rope, links=abs(float(sides[0].values[0, -1]))))
+    found = bench.fit([replace(side, start=bench.starts["train"]) for side in sides])
+    best = min(found, key=lambda f: f.point.cost)
+    # Each in its own measure of what can be known.
+    if best.point.cost / bench.level < _BETTER * smooth.point.cost / level:
+        return best
+    bench.use(rope)
+    return smooth
 
 
 def go_on(bench: Bench, given: Saved, iterations: int, report: Callback) -> Fitted:

@@ -52,11 +52,15 @@ class Bench:
         test = np.arange(len(train), len(self.trials["all"]))
         self.starts = {"all": start, "train": start.pick(train), "test": start.pick(test)}
 
-    def correct(self, base: Fitted) -> None:
-        """Correct simulations from now on by what finer steps and a finer mesh change of this model, see `floor`."""
+    def correct(self, base: Fitted) -> floors.Refinement:
+        """Correct simulations from now on by what finer steps and a finer mesh change of this model; return that."""
         found = floors.refine(self.pool, base, self.starts["all"], CHAIN)
-        train = len(self.trials["train"])
-        free = ~self.trials["all"][0].gripped
+        self.use(found)
+        return found
+
+    def use(self, found: floors.Refinement) -> None:
+        """Correct simulations from now on by this."""
+        train, free = len(self.trials["train"]), ~self.trials["all"][0].gripped
         self.floor = found.floor(slice(train, None), free)
         trust, self.level = found.trust(free)
         start = replace(self.starts["all"], finer=found.correction, trust=trust)

@@ -35,6 +35,9 @@ PAYS = 0.15
 MATTERS = 0.03
 """Share of the baseline's excess gap that each effect has to close, whatever the others leave."""
 
+MORE = 2.0
+"""Times the floor that have to be left for another effect to be looked for: one of three times the floor leaves 3.2."""
+
 LEADERS = 2
 """Effects that are fitted further in each round, besides those that are as good."""
 
@@ -170,7 +173,7 @@ class _Search:
         shares: dict[str, float] = {}
         whole = max(self._squared(base) - self.bench.floor.noise**2, 1e-12)
         while len(rounds) < self.budget.rounds + (len(shares) < len(rounds)):
-            if shares and rms(self.bench.gaps(base, "all")) < SILENT * self.bench.level:
+            if shares and rms(self.bench.gaps(base, "all")) < MORE * self.bench.level:
                 break
             names = [n for n in self._possible() if n not in base.effects]
             if not names:

@@ -77,8 +77,19 @@ class Refinement:
     """Noise of the markers [m]."""
     order: int
     """Order of the simulation's errors in its steps; 2 in its mesh."""
-    wrong: float = 1.0
-    """Share of the mesh's error that is one: where a chain of links was measured, its own links explain the rest."""
+    edge: float
+    """Mean length of the mesh's edges [m]."""
+    links: float = 0.0
+    """Length of the links if the rope is taken for a chain of stiff ones [m]."""
+
+    @property
+    def wrong(self) -> float:
+        """Share of the mesh's error that is one.
+
+        It grows with the squared length of edges, and a chain's own difference to a rope with that of its links: a
+        mesh with edges as long as the links has none.
+        """
+        return max(1 - (self.links / self.edge) ** 2, -1.0)
 
     @property
     def _rest(self) -> tuple[float, float]:
@@ -92,7 +103,7 @@ class Refinement:
         How a chain's errors go with its links is not known that well.
         """
         step, grid = self._rest
-        return step * self.step, (grid if self.wrong == 1.0 else 1.0) * self.grid
+        return step * self.step, (1.0 if self.links else grid) * self.grid
 
     @property
     def correction(self) -> np.ndarray:
@@ -147,15 +158,14 @@ def refine(pool: Pool, base: Fitted, start: Start, chain: str) -> Refinement:
     plain = tuple(e for e in base.effects if e != chain)
     links = np.array([name.split(".")[0] == chain for name in model.parameters])
     values = base.values[None, ~links]
-    # The mesh's error grows with the squared length of edges; that of a chain with edges as long as its links is none.
-    ratio = float(np.sum(base.values[links] ** 2) / np.mean(np.diff(model.arclength)) ** 2)
+    edge, length = float(np.mean(np.diff(model.arclength))), float(np.abs(base.values[links]).sum())
     half = ("substep", model.dt / (2 * model.substeps))
     finer = ("vertices", 2 * len(model.arclength) - 1)
     start = replace(start, finer=None)
     jobs = [Simulation(plain, values, "all", start, options) for options in ((half, finer), (half,), ())]
     sims = dict(pool.simulate(jobs))
     step, grid = _tame(sims[1][0] - sims[2][0]), _tame(sims[0][0] - sims[1][0])
-    return Refinement(step, grid, noise(pool.recording), 1 if model.ahead else 2, max(1 - ratio, -1.0))
+    return Refinement(step, grid, noise(pool.recording), 1 if model.ahead else 2, edge, length)
 
 
 def _tame(change: np.ndarray) -> np.ndarray:
