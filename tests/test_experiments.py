@@ -24,6 +24,7 @@ SCRIPTS = [
     "bench_rod.py",
     "draw_tasks.py",
     "gallery.py",
+    "learn_through_contact.py",
     "make_reference.py",
     "make_sample.py",
     "peers.py",

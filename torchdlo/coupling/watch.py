@@ -55,8 +55,8 @@ def explain(missed: Tensor) -> str:
     room, beyond = (float(x) for x in missed.reshape(-1, 2).amax(0))
     if room > 0:
         return (
-            f"contact had no room for {room:.0f} pairs of edges; give RodContact a larger `room`, or a larger `row` in "
-            "scenes of many edges"
+            f"contact had no room for {room:.0f} pairs of edges, edges or nodes; give a larger `room` to RodContact, "
+            "RodMatter or BodyMatter, whichever has one"
         )
     if beyond > 0:
         return (

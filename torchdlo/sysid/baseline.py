@@ -84,11 +84,18 @@ def calibrate(bench: Bench, count: int, iterations: int, rng: np.random.Generato
     # gives a chain's length a sign.
     sides = [chain(np.append(best, length)[None], 4, 2 * frames // 3) for length in (link, -link)]
     firm = [plain(best[None], 5, 2 * frames // 3, grip=1.0)] if model.mesh.clamps else []
-    smooth, *others = fit([plain(best[None], 5, 2 * frames // 3), *sides, *firm], 2)
-    side = min(others[:2], key=lambda f: f.point.cost)
-    if firm and others[2].point.cost < _BETTER * min(smooth.point.cost, side.point.cost):
+    # Simulations may get lost later, too.
+    calm = [] if bench.pool.local.options["ahead"] else [plain(best[None], 5, 2 * frames // 3, ahead=_AHEAD)]
+    smooth, one, other, *others = fit([plain(best[None], 5, 2 * frames // 3), *sides, *calm, *firm], 2)
+    side, least = min((one, other), key=lambda f: f.point.cost), min(f.point.cost for f in (smooth, one, other))
+    if calm and others[0].point.cost < _CALMER * least:
+        bench.pool.choose(ahead=_AHEAD)
+        smooth, least = others[0], others[0].point.cost
+        side = replace(side, values=np.append(smooth.values, side.values[-1]))
+    if firm and others[-1].point.cost < _BETTER * least:
         bench.pool.choose(grip=1.0)
-        smooth, side = others[2], replace(side, values=np.append(others[2].values, side.values[-1]))
+        smooth = others[-1]
+        side = replace(side, values=np.append(smooth.values, side.values[-1]))
     rope = bench.correct(smooth)
     better = fit([plain(smooth.values[None], iterations, None)], 3)[0]
     if side.point.cost < _BETTER * smooth.point.cost:

@@ -35,7 +35,7 @@ PAYS = 0.15
 MATTERS = 0.03
 """Share of the baseline's excess gap that each effect has to close, whatever the others leave."""
 
-MORE = 2.0
+MORE = 2.5
 """Times the floor that have to be left for another effect to be looked for: one of three times the floor leaves 3.2."""
 
 LEADERS = 2
