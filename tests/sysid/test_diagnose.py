@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -21,6 +22,7 @@ from torchdlo.sysid.fit import Space
 from torchdlo.sysid.mesh import make_mesh
 from torchdlo.sysid.model import RopeModel
 from torchdlo.sysid.motion import Start
+from torchdlo.sysid.plan import BUDGETS
 from torchdlo.sysid.recording import Recording, Trial
 
 S = np.array([0.0, 0.02, 0.08, 0.16, 0.24, 0.32, 0.4, 0.48, 0.56, 0.6])
@@ -173,3 +175,23 @@ def test_a_hidden_effect_is_named_and_none_where_there_is_none(
     page = report.diagnosis_html(result, recording)
     assert page.count("data:image/png") == 2 and "point mass" in page and sentence(result, recording)[:7] in page
     assert {stage[0] for stage in stages} >= {"calibrating the baseline", "measuring the floor"}
+
+
+@pytest.mark.parametrize(
+    ("name", "dose", "fitted"),
+    [
+        ("wind", {"c_d": 1.0, "velocity.1": 0.5}, {"c_d", "velocity.0", "velocity.1", "velocity.2"}),
+        ("nonuniform_stiffness", {"slope": 0.1}, {"slope"}),
+        ("point_mass", {"mass": 0.01, "position": 0.3}, {"mass", "position"}),
+    ],
+)
+def test_vectors_are_fitted_whole_and_what_no_dose_uses_is_not(
+    name: str, dose: dict[str, float], fitted: set[str], tmp_path: Path
+) -> None:
+    one = search._Search.__new__(search._Search)
+    one.recording, one.budget = make_empty(tmp_path), BUDGETS["fast"]
+    one.bench = SimpleNamespace(
+        trials={"train": one.recording.train}, extension=lambda base, score, numbers, *_: numbers
+    )
+    score = SimpleNamespace(name=name, dose={f"{name}.{k}": v for k, v in dose.items()})
+    assert set(one._candidate(None, score)) == {f"{name}.{k}" for k in fitted}

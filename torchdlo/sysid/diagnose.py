@@ -323,8 +323,9 @@ class _Search:
 
     def _candidate(self, base: Fitted, score: Score) -> Fit:
         """Return the first fit of an effect."""
-        # Numbers that no dose uses stay off: a slope where a spot fits better.
-        used = [n.name for n in library.numbers(score.name, self.recording) if n.name in score.dose]
+        # Numbers that no dose uses stay off, a slope where a spot fits better; but vectors are fitted whole.
+        vectors = {_vector(name) for name in score.dose}
+        used = [n.name for n in library.numbers(score.name, self.recording) if _vector(n.name) in vectors]
         return self.bench.extension(base, score, used, self.budget.iterations, self._short())
 
     def _short(self) -> int:
@@ -379,6 +380,11 @@ class _Search:
             self.pool.local.model(final.effects),
             notes=baselines.notes(self.baseline),
         )
+
+
+def _vector(name: str) -> str:
+    """Return the name of a number without that of its component."""
+    return ".".join(name.split(".")[:2])
 
 
 UNEXPLAINED = 3.0
