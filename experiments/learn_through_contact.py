@@ -101,8 +101,11 @@ def main() -> int:
     parser.flag("compiled", "compile the steps first, which takes minutes and pays off for many iterations")
     parser.flag("pictures", "draw start, middle and end of what was learned; needs the extra view of the package")
     parser.flag("video", "and videos")
+    parser.flag("smoke", "one step of the first problem: does the script run?")
     args = parser.parse_args()
     names = [n for n in args.problem.split(",") if n] or list(NAMES)
+    if args.smoke:
+        names, args.iterations = names[:1], 1
     wrong = [n for n in names if n not in NAMES]
     if wrong:
         parser.error(f"--problem {args.problem}: there is no {', '.join(wrong)}; known are {', '.join(NAMES)}")

@@ -125,7 +125,7 @@ def test_a_full_list_and_fast_vertices_are_reported(way):
     full = two(contact=RodContact(room=5))
     state = step(*full, hold(full[0], full[2]))
     assert not bool(ok(state)) and float(state.missed[..., 0]) > 0
-    with pytest.raises(RuntimeError, match=r"no room for .* pairs of edges; give RodContact a larger `room`"):
+    with pytest.raises(RuntimeError, match=r"no room for .* pairs of edges.*; give a larger `room` to RodContact"):
         check_state(state)
     scene, params, state = two(contact=RodContact(burst=0.0), speed=0.0)
     check_state(step(scene, params, state, hold(scene, state)))

@@ -87,21 +87,24 @@ def calibrate(bench: Bench, count: int, iterations: int, rng: np.random.Generato
     # Simulations may get lost later, too.
     calm = [] if bench.pool.local.options["ahead"] else [plain(best[None], 5, 2 * frames // 3, ahead=_AHEAD)]
     smooth, one, other, *others = fit([plain(best[None], 5, 2 * frames // 3), *sides, *calm, *firm], 2)
-    side, least = min((one, other), key=lambda f: f.point.cost), min(f.point.cost for f in (smooth, one, other))
-    if calm and others[0].point.cost < _CALMER * least:
+    side = min((one, other), key=lambda f: f.point.cost)
+    if calm and others[0].point.cost < _CALMER * min(smooth.point.cost, side.point.cost):
         bench.pool.choose(ahead=_AHEAD)
-        smooth, least = others[0], others[0].point.cost
-        side = replace(side, values=np.append(smooth.values, side.values[-1]))
-    if firm and others[-1].point.cost < _BETTER * least:
+        smooth, side = others[0], _moved(side, others[0])
+    if firm and others[-1].point.cost < _BETTER * min(smooth.point.cost, side.point.cost):
         bench.pool.choose(grip=1.0)
-        smooth = others[-1]
-        side = replace(side, values=np.append(smooth.values, side.values[-1]))
+        smooth, side = others[-1], _moved(side, others[-1])
     rope = bench.correct(smooth)
     better = fit([plain(smooth.values[None], iterations, None)], 3)[0]
     if side.point.cost < _BETTER * smooth.point.cost:
         better = _chain_or(bench, better, rope, [chain(side.values[None], iterations, None)])
     report(stage, 4, 4, f"{1e3 * rms(bench.gaps(better, 'train')):.2f} mm")
     return better
+
+
+def _moved(side: Fitted, smooth: Fitted) -> Fitted:
+    """Return a chain with the numbers of a smooth rope."""
+    return replace(side, values=np.append(smooth.values, side.values[-1]))
 
 
 def _random(model: RopeModel, count: int, rng: np.random.Generator) -> np.ndarray:
