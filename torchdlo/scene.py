@@ -142,7 +142,7 @@ class Scene:
         )
         need(
             bool(self.bodies) or not {"rod_body", "finger_pads", "body_matter"} & set(names),
-            "RodBody, BodyMatter or FingerPads is there, but there are no bodies; give make(..., bodies=[Solid(...)])",
+            "RodBody, BodyMatter or FingerPads needs bodies, but there are no bodies; give make(..., bodies=[Solid()])",
         )
         for effect in self.effects:
             if effect.name == "body_contact":
