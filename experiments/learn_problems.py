@@ -241,31 +241,34 @@ def _slack(x: float, high: float, low: float) -> Rope:
     return Rope(line, 13, 0.006, density=900.0, bend=1e-4, stretch=5.0)
 
 
+def _held(rope: Rope, hands: tuple[Key, ...], **others: Any) -> Description:
+    """Return a scene of a soft rope whose ends both hands lead the same way."""
+    effects = {name: {} for name in ("gravity", "bend", "stretch_force", "rod_body", "body_contact")}
+    return Description(
+        ropes=(rope,),
+        effects=effects | {"damping": {"rate": 1.0}},
+        holds=(Hold((0,), keys=hands), Hold((-1,), keys=hands)),
+        duration=0.4,
+        dt=2e-3,
+        substeps=1,
+        constrained=False,
+        **others,
+    )
+
+
 BALL_GOAL = (0.12, 0.03)
 
 
 def push() -> Description:
     """A ball on the ground, and a slack rope between two hands behind it."""
     hands = tuple(Key(t, (0.25 * t, 0.0, 0.0)) for t in (0.15, 0.3, 0.4))
-    return Description(
-        ropes=(_slack(-0.05, 0.04, 0.012),),
-        effects={
-            "gravity": {},
-            "bend": {},
-            "stretch_force": {},
-            "damping": {"rate": 1.0},
-            "rod_body": {},
-            "body_contact": {},
-        },
+    return _held(
+        _slack(-0.05, 0.04, 0.012),
+        hands,
         bodies=(
             Body("sphere", (0.03,), (0.0, 0.0, 0.03), density=300.0, damping=1.0, name="ball"),
             Body("plane", motion="fixed"),
         ),
-        holds=(Hold((0,), keys=hands), Hold((-1,), keys=hands)),
-        duration=0.4,
-        dt=2e-3,
-        substeps=1,
-        constrained=False,
         look=(0.35, -0.6, 0.7),
     )
 
@@ -286,27 +289,15 @@ RING_GOAL = (0.06, 0.05, 0.12)
 def hook() -> Description:
     """A ring that stands on the ground, and a slack rope between two hands that is led through it."""
     hands = tuple(Key(t, (0.0, 0.0, 0.2 * t)) for t in (0.15, 0.3, 0.4))
-    return Description(
-        ropes=(_slack(0.0, 0.055, 0.04),),
-        effects={
-            "gravity": {},
-            "bend": {},
-            "stretch_force": {},
-            "damping": {"rate": 1.0},
-            "rod_body": {},
-            "body_contact": {},
-        },
+    return _held(
+        _slack(0.0, 0.055, 0.04),
+        hands,
         bodies=(
             Body(
                 "torus", (0.035, 0.008), (0.0, 0.0, 0.043), (0.5**0.5, 0.5**0.5, 0.0, 0.0), density=400.0, damping=1.0
             ),
             Body("plane", motion="fixed"),
         ),
-        holds=(Hold((0,), keys=hands), Hold((-1,), keys=hands)),
-        duration=0.4,
-        dt=2e-3,
-        substeps=1,
-        constrained=False,
         look=(0.8, -0.6, 0.35),
     )
 

@@ -26,7 +26,6 @@ _KEPT = 1 / 3
 _BETTER = 0.9
 """Share of the cost that is left where the rope is taken for a chain, or for one that clamps hold to their ends."""
 
-
 _CALMER = 0.7
 """Share of the cost that is left where steps have to look ahead, which makes them less exact."""
 
