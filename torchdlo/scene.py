@@ -24,6 +24,7 @@ from torchdlo.physics.build import Rope
 from torchdlo.physics.effect import Effect, altered, default_values, numbers_of
 from torchdlo.physics.hold import Reaction, Targets, check_grip, unfelt
 from torchdlo.physics.integrate import INTEGRATORS, TWISTS, Settings, settle_twist, substep
+from torchdlo.physics.numerics import cross, normalize
 from torchdlo.physics.replay import alike, laid_out, rollout
 from torchdlo.physics.rod import RodParams, RodState
 from torchdlo.physics.topology import Topology
@@ -251,12 +252,11 @@ def check_step(scene: Scene, params: Params) -> None:
 
 def hold(scene: Scene, state: State) -> Control:
     """Return the control that keeps held parts and kinematic bodies where they are, with a firm grip."""
-    rods = state.rods
+    rods, edges = state.rods, list(scene.held_edges)
     e = rod.edge_vectors(scene.topology, rods.pos, rods.pos.new_tensor(scene.topology.edge_mask()).unsqueeze(-1))
-    tangent = e / e.norm(dim=-1, keepdim=True)
-    c, s = torch.cos(rods.twist), torch.sin(rods.twist)
-    material = c * rods.director + s * torch.linalg.cross(tangent, rods.director)
-    pos, director = rods.pos[..., list(scene.held_vertices), :], material[..., list(scene.held_edges), :]
+    tangent, twist, reference = normalize(e[..., edges, :]), rods.twist[..., edges, :], rods.director[..., edges, :]
+    director = torch.cos(twist) * reference + torch.sin(twist) * cross(tangent, reference)
+    pos = rods.pos[..., list(scene.held_vertices), :]
     return Control(pos, director, bodies=rigid.hold(scene.bodies, state.bodies) if scene.bodies else ())
 
 

@@ -206,7 +206,7 @@ UNSIZED = {
     "state.vel": 1.0,
     "state.twist": 1.0,
     "state.twist_rate": 100.0,
-    "controls.pos": 1e-3,
+    "controls.pos": 3e-3,
     "controls.director": 0.1,
 }
 # Two steps of the differences, the better of which counts: at the larger one some vertices change over to contact or

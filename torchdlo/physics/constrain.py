@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from torchdlo.physics import banded
-from torchdlo.physics.numerics import dot, safe_norm
+from torchdlo.physics.numerics import dot, safe_norm, total
 from torchdlo.physics.rod import edge_vectors
 from torchdlo.physics.topology import Topology, elimination_order, following, parse, preceding
 
@@ -116,16 +116,10 @@ def project(
         # The small relative shift matters only when a taut rope has no solution.
         shift = 1 + (1e-10 if tension.dtype == torch.float64 else 1e-6)
         diagonal = (
-            active
-            * (
-                shift * (along * direction * both).sum(-1, keepdim=True)
-                + lengths.compliance
-                + lengths.yielding(tension)[1]
-            )
-            + off
+            active * (shift * total(along * direction * both) + lengths.compliance + lengths.yielding(tension)[1]) + off
         )
-        to_next = -active * (along * following(topology, direction * answer)).sum(-1, keepdim=True)
-        to_prev = -active * (along * answer * preceding(topology, direction)).sum(-1, keepdim=True)
+        to_next = -active * dot(along, following(topology, direction * answer))
+        to_prev = -active * total(along * answer * preceding(topology, direction))
         return tension + solve_slots(topology, diagonal, to_next, to_prev, excess)
 
     with torch.no_grad():
@@ -193,7 +187,7 @@ def _shortening(lengths: Lengths, change: Tensor) -> Tensor:
     """
     with torch.no_grad():
         turn = lengths.active * (following(lengths.topology, change) - change) / lengths.rest
-        most = turn.square().sum(-1, keepdim=True).amax(-2, keepdim=True).sqrt()
+        most = total(turn.square()).amax(-2, keepdim=True).sqrt()
         return (1 / most.clamp(min=1e-9)).clamp(max=1.0)
 
 
@@ -357,8 +351,8 @@ def settle(lengths: Lengths, pos: Tensor, vel: Tensor, mobility: Tensor) -> tupl
     along = edge / safe_norm(edge).clamp(min=1e-12)
     stretching = dot(following(topology, vel) - vel, along) * lengths.active
     both = answer + following(topology, answer)
-    diagonal = lengths.active * (along.square() * both).sum(-1, keepdim=True) * (1 + 1e-10) + 1 - lengths.active
-    coupling = -lengths.active * (along * following(topology, along * answer)).sum(-1, keepdim=True)
-    back = -lengths.active * (along * answer * preceding(topology, along)).sum(-1, keepdim=True)
+    diagonal = lengths.active * total(along.square() * both) * (1 + 1e-10) + 1 - lengths.active
+    coupling = -lengths.active * dot(along, following(topology, along * answer))
+    back = -lengths.active * total(along * answer * preceding(topology, along))
     pull = solve_slots(topology, diagonal, coupling, back, stretching) * along
     return pos, vel + answer * (pull - preceding(topology, pull))

@@ -23,7 +23,7 @@ from torchdlo.physics.constrain import Inertia, Lengths, balance, project, solve
 from torchdlo.physics.effect import Effect, Motion, Push, Values
 from torchdlo.physics.hold import Reaction, Targets, put
 from torchdlo.physics.hold import free as free_slots
-from torchdlo.physics.numerics import wrap
+from torchdlo.physics.numerics import normalize, wrap
 from torchdlo.physics.rod import RodParams, RodState, View
 from torchdlo.physics.topology import Topology, following
 
@@ -285,8 +285,7 @@ def _prescribed(settings: Settings, params: RodParams, state: RodState, targets:
         return angle
     e = rod.edge_vectors(settings.topology, state.pos, params.rest.edge_mask)
     slots = list(settings.held_edges)
-    tangent = e[..., slots, :]
-    tangent = tangent / tangent.norm(dim=-1, keepdim=True)
+    tangent = normalize(e[..., slots, :])
     last = state.twist[..., slots, :]
     held = last + wrap(rotation.signed_angle(state.director[..., slots, :], targets.director, tangent) - last)
     return put(held, settings.held_edges, targets.grip.get("edges"), angle)

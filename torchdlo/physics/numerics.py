@@ -5,20 +5,37 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from torchdlo.physics import tree
+
 
 def tiny(x: Tensor) -> float:
     """Return a length far below any rope's and far above the underflow of a square, by dtype."""
     return 1e-12 if x.dtype == torch.float64 else 1e-8
 
 
+def total(x: Tensor) -> Tensor:
+    """Return the sum over the last axis, kept as size 1; shape (..., 1)."""
+    # In the order of storage: otherwise the result would be stored batch-outermost, which makes what follows slow.
+    return x.sum(-1, keepdim=True) if x.dim() < 2 else tree.logical(tree.stored(x).sum(0, keepdim=True))
+
+
 def dot(a: Tensor, b: Tensor) -> Tensor:
     """Return the scalar product over the last axis, kept as size 1; shape (..., 1)."""
-    return (a * b).sum(-1, keepdim=True)
+    return total(a * b)
 
 
 def cross(a: Tensor, b: Tensor) -> Tensor:
     """Return the vector product over the last axis, shape (..., 3)."""
-    return torch.linalg.cross(*torch.broadcast_tensors(a, b), dim=-1)
+    a, b = torch.broadcast_tensors(a, b)
+    if a.dim() < 2:
+        return torch.linalg.cross(a, b, dim=-1)
+    a, b = tree.stored(a), tree.stored(b)
+    if torch.jit.is_tracing():
+        # Twice as fast as the operation made for it: components are moved as wholes, as (y, z, x).
+        turn = torch.tensor([1, 2, 0], device=a.device)
+        turned = a * b.index_select(0, turn) - a.index_select(0, turn) * b
+        return tree.logical(turned.index_select(0, turn))
+    return tree.logical(torch.linalg.cross(a, b, dim=0))
 
 
 def safe_norm(x: Tensor) -> Tensor:

@@ -42,6 +42,9 @@ def record(step: Callable[..., Any], *inputs: Any) -> Callable[..., Any]:
         warnings.simplefilter("ignore", torch.jit.TracerWarning)
         # What `torch.jit.trace` makes is kept for as long as the process lives, some 30 MB each.
         graph, _ = torch._C._create_graph_by_tracing(run, tuple(leaves), lambda _: "", True, False, None, [])
+        # Sizes are fixed: numbers made of them are computed now.
+        torch._C._jit_pass_peephole(graph, True)
+        torch._C._jit_pass_constant_propagation(graph)
         # Terms of a step look at the same edges and hinges: what several of them compute is computed once.
         torch._C._jit_pass_cse(graph)
         torch._C._jit_pass_dce(graph)

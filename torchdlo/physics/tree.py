@@ -78,19 +78,27 @@ def stack(trees: Sequence[T], dim: int = 0) -> T:
     return map(lambda *parts: torch.stack(parts, dim), trees[0], *trees[1:])
 
 
+def stored(x: Tensor) -> Tensor:
+    """Return a view of `x`, shape (..., V, C), with its axes in the order of storage, (C, V, ...)."""
+    n = x.dim()
+    return x.permute(n - 1, n - 2, *range(n - 2))
+
+
+def logical(x: Tensor) -> Tensor:
+    """Return a view of `x`, shape (C, V, ...), with its axes in the logical order, (..., V, C)."""
+    return x.permute(*range(2, x.dim()), 1, 0)
+
+
 def batch_innermost(x: Tensor) -> Tensor:
     """Return `x`, shape (..., V, C), with the same values stored as (C, V, ...)."""
-    n = x.dim()
-    if n < 3:
-        return x
-    stored = x.permute(n - 1, n - 2, *range(n - 2)).contiguous()
-    return stored.permute(*range(2, n), 1, 0)
+    return x if x.dim() < 3 else logical(stored(x).contiguous())
 
 
 def cat_vertices(parts: Sequence[Tensor]) -> Tensor:
     """Concatenate (..., v, C) pieces along the vertex axis; the result is stored batch-innermost."""
-    n = parts[0].dim()
-    if n < 3:
-        return torch.cat(list(parts), -2)
-    stored = torch.cat([p.permute(n - 1, n - 2, *range(n - 2)) for p in parts], 1)
-    return stored.permute(*range(2, n), 1, 0)
+    return logical(torch.cat([stored(p) for p in parts], 1))
+
+
+def cat_components(parts: Sequence[Tensor]) -> Tensor:
+    """Concatenate (..., V, c) pieces along the last axis; the result is stored batch-innermost."""
+    return logical(torch.cat([stored(p) for p in parts]))

@@ -11,6 +11,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
+from torchdlo.physics import tree
 from torchdlo.physics.effect import Effect, Values
 from torchdlo.physics.numerics import cross, dot
 from torchdlo.physics.rod import View
@@ -106,7 +107,7 @@ class Curvature:
         stretched = dot(self.mean, before + turning)
         k1 = dot(self.mean2, swept) - self.kappa[..., :1] * stretched
         k2 = -dot(self.mean1, swept) - self.kappa[..., 1:] * stretched
-        return torch.cat([k1 + b1 * view.prev(spin) + a1 * spin, k2 + b2 * view.prev(spin) + a2 * spin], -1)
+        return tree.cat_components([k1 + b1 * view.prev(spin) + a1 * spin, k2 + b2 * view.prev(spin) + a2 * spin])
 
 
 def curvature(view: View) -> Curvature:
@@ -116,7 +117,7 @@ def curvature(view: View) -> Curvature:
     m1, m2 = view.frames()
     m1p, m2p = view.prev(m1), view.prev(m2)
     mean1, mean2 = (m1p + m1) / chi, (m2p + m2) / chi
-    kappa = torch.cat([dot(kb, mean2), -dot(kb, mean1)], -1) * chi / 2
+    kappa = tree.cat_components([dot(kb, mean2), -dot(kb, mean1)]) * chi / 2
     # dk1/dtheta = -kb.m1 / 2, dk2/dtheta = -kb.m2 / 2 for the edge that turns.
     by_twist = tuple(-0.5 * dot(kb, m) for m in (m1p, m2p, m1, m2))
     return Curvature(kappa, kb, (view.before + view.tangent) / chi, mean1, mean2, by_twist)
@@ -152,8 +153,8 @@ def answers(hinge: Curvature, moment: Tensor, stiffness: Tensor) -> Values:
         for k, more in enumerate((2 * b1 * b2, b1 * a2 + b2 * a1, 2 * a1 * a2)):
             parts[k] = parts[k] + coupling * more
     return {
-        "twist_hessian": torch.cat(parts, -1),
-        "twist_geometry": torch.cat([f1 * b2 - f2 * b1, f1 * a2 - f2 * a1], -1),
+        "twist_hessian": tree.cat_components(parts),
+        "twist_geometry": tree.cat_components([f1 * b2 - f2 * b1, f1 * a2 - f2 * a1]),
     }
 
 
@@ -223,7 +224,7 @@ class Twist(Effect):
         return {
             "gradient": (pull + view.next(pull)) / view.length,
             "torque": view.next(moment) - moment,
-            "twist_hessian": torch.cat([stiffness, -stiffness, stiffness], -1),
+            "twist_hessian": tree.cat_components([stiffness, -stiffness, stiffness]),
         }
 
 

@@ -7,6 +7,7 @@ from typing import ClassVar
 
 import torch
 
+from torchdlo.physics import tree
 from torchdlo.physics.effect import Effect, Param, Values
 from torchdlo.physics.effects.elastic import Twist, curvature, greatest, hinge_stiffness
 from torchdlo.physics.numerics import dot
@@ -57,9 +58,11 @@ class LinkChain(Effect):
             "torque": bent["torque"] + view.next(moment) - moment,
             # k g g^T for the strain's gradient g by the twists, without Twist's own part, g = (-1, 1).
             "twist_hessian": stiffness
-            * torch.cat([before.square() - 2 * before, before - after + before * after, after.square() + 2 * after], -1)
-            + f * torch.cat([2 * b1 * b2, b1 * a2 + b2 * a1, 2 * a1 * a2], -1),
-            "twist_geometry": f * torch.cat([k2 * b2 - k1 * b1, k2 * a2 - k1 * a1], -1),
+            * tree.cat_components(
+                [before.square() - 2 * before, before - after + before * after, after.square() + 2 * after]
+            )
+            + f * tree.cat_components([2 * b1 * b2, b1 * a2 + b2 * a1, 2 * a1 * a2]),
+            "twist_geometry": f * tree.cat_components([k2 * b2 - k1 * b1, k2 * a2 - k1 * a1]),
         }
 
 
@@ -110,6 +113,6 @@ class _Joint:
         cosine, sine = c.square() - s.square(), 2 * c * s
         by_t = ex * (cosine * dx + sine * nx) - 0.5 * ez * self.y_of * dz + 0.5 * ey * nz
         kappa = self.hinge.kappa
-        by_kappa = -torch.cat([by_p, by_q], -1) / (2 * self.w) - self.bending * kappa
+        by_kappa = -tree.cat_components([by_p, by_q]) / (2 * self.w) - self.bending * kappa
         by_twist = by_t / self.w - self.twisting * self.twist
         return torch.where(self.some, by_kappa, 0.0), torch.where(self.some, by_twist, 0.0)

@@ -22,7 +22,7 @@ def _in_series(stiffness: Tensor, other: Tensor) -> Tensor:
     # S (1 + S/k)^-1 by the cofactors of a symmetric 2 x 2 matrix.
     both = (s11 * s22 - s12.square()) / other
     divisor = 1 + (s11 + s22) / other + both / other
-    return torch.cat(torch.broadcast_tensors(s11 + both, s22 + both, s12), -1) / divisor
+    return tree.cat_components(torch.broadcast_tensors(s11 + both, s22 + both, s12)) / divisor
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,7 @@ from torchdlo.physics.topology import Topology
 
 def _outer(a: Tensor, b: Tensor) -> Tensor:
     """Return the symmetric part of a b^T as (11, 22, 12), shape (..., V, 3)."""
-    return torch.cat([a * b, 0.5 * dot(a, b.flip(-1))], -1)
+    return tree.cat_components([a * b, 0.5 * dot(a, b.flip(-1))])
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,7 @@ class InternalFriction(Effect):
         safe = torch.where(small, 1.0, size)
         w = change * torch.where(small, -0.5 + size / 3, (decay - mean) / safe) - before * decay
         u = torch.where(size > 0, change / torch.where(size > 0, size, 1.0), 0.0)
-        even = torch.cat([mean, mean, torch.zeros_like(mean)], -1)
+        even = tree.cat_components([mean, mean, torch.zeros_like(mean)])
         started = view.state.memory[self.name][..., 4:]
         b1, b2, a1, a2 = hinge.by_twist
         odd = 0.5 * (w[..., :1] * u[..., 1:] - w[..., 1:] * u[..., :1])
@@ -89,7 +89,7 @@ class InternalFriction(Effect):
         kappa = curvature(view).kappa
         change, _, decay, mean = self._change(view, values, kappa)
         z = view.state.memory[self.name][..., :2] * decay + change * mean
-        return torch.cat([z, kappa.expand_as(z), torch.ones_like(z[..., :1])], -1)
+        return tree.cat_components([z, kappa.expand_as(z), torch.ones_like(z[..., :1])])
 
 
 @dataclass(frozen=True)
@@ -123,8 +123,8 @@ class StiffeningBending(Effect):
         moment = share * (square * linear + work * strain)
         s1, s2 = stiffness[..., :1], stiffness[..., 1:2] if stiffness.shape[-1] > 1 else stiffness
         coupling = stiffness[..., 2:] if stiffness.shape[-1] == 3 else torch.zeros_like(s1)
-        slope = square * torch.cat([s1, s2, coupling], -1) + 4 * _outer(linear, strain)
-        slope = share * (slope + torch.cat([work, work, torch.zeros_like(work)], -1))
+        slope = square * tree.cat_components([s1, s2, coupling]) + 4 * _outer(linear, strain)
+        slope = share * (slope + tree.cat_components([work, work, torch.zeros_like(work)]))
         curved = dot(hinge.binormal, hinge.binormal) / 4
         return {
             **hinge.pull_back(view, moment),
@@ -176,5 +176,5 @@ class AnisotropicBending(Effect):
             q12 * b11 + q22 * b12,
             q12 * b12 + q22 * b22,
         )
-        made = torch.cat([r11 * q11 + r12 * q12, r21 * q12 + r22 * q22, r11 * q12 + r12 * q22], -1)
+        made = tree.cat_components([r11 * q11 + r12 * q12, r21 * q12 + r22 * q22, r11 * q12 + r12 * q22])
         return tree.replace(params, material=tree.replace(params.material, bend=made))

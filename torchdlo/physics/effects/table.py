@@ -8,7 +8,9 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
+from torchdlo.physics import tree
 from torchdlo.physics.effect import Effect, Param, Values
+from torchdlo.physics.numerics import total
 from torchdlo.physics.rod import View
 
 _HEIGHT = Param(0.0, -10.0, 10.0, "m", "linear", None, "Height of the table's surface.")
@@ -39,9 +41,9 @@ class Table(Effect):
         up = force - resistance * view.state.vel[..., 2:]
         none = torch.zeros_like(up)
         return {
-            "force": torch.cat([none, none, up], -1),
-            "stiffness": torch.cat([none, none, stiffness], -1),
-            "drag": torch.cat([none, none, resistance], -1),
+            "force": tree.cat_components([none, none, up]),
+            "stiffness": tree.cat_components([none, none, stiffness]),
+            "drag": tree.cat_components([none, none, resistance]),
         }
 
 
@@ -62,10 +64,10 @@ class TableFriction(Effect):
         """Return the friction force and how it answers to velocity."""
         pressure, _ = _pressure(view, values)
         along = view.state.vel[..., :2]
-        speed = (along.square().sum(-1, keepdim=True) + values["slip"].square()).sqrt()
+        speed = (total(along.square()) + values["slip"].square()).sqrt()
         resistance = values["mu"] * pressure / speed
         none = torch.zeros_like(resistance)
         return {
-            "force": torch.cat([-resistance * along, none], -1),
-            "drag": torch.cat([resistance, resistance, none], -1),
+            "force": tree.cat_components([-resistance * along, none]),
+            "drag": tree.cat_components([resistance, resistance, none]),
         }
