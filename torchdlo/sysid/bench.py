@@ -11,7 +11,7 @@ from torchdlo.errors import InputError
 from torchdlo.sysid import floor as floors
 from torchdlo.sysid import start as starts
 from torchdlo.sysid.motion import Start
-from torchdlo.sysid.pool import Fit, Fitted, Pool, Simulation
+from torchdlo.sysid.pool import Fit, Fitted, Pool
 from torchdlo.sysid.screen import Score
 
 Callback = Callable[[str, int, int, str], None]
@@ -71,9 +71,11 @@ class Bench:
     def predict(self, fits: Sequence[Fitted]) -> None:
         """Simulate all trials with several models at once, for `gaps` and `prediction` to look up."""
         new = [f for f in fits if _key(f) not in self._known]
-        jobs = [Simulation(f.effects, f.values[None], "all", self.starts["all"]) for f in new]
-        for k, sims in self.pool.simulate(jobs):
-            self._known[_key(new[k])] = sims[0]
+        # Models that settle twists take longer than others, which all fit into one batch.
+        alike = [[f for f in new if self.pool.local.framed(f.effects) == framed] for framed in (False, True)]
+        groups = [some for group in alike for k in range(self.pool.workers) if (some := group[k :: self.pool.workers])]
+        for k, sims in self.pool.simulate([self.pool.local.joined(g, "all", self.starts["all"]) for g in groups]):
+            self._known |= {_key(f): sim for f, sim in zip(groups[k], sims, strict=True)}
 
     def prediction(self, fitted: Fitted, split: str) -> np.ndarray:
         """Return the simulated markers of the trials of a split, shape (B, F, M, 3)."""

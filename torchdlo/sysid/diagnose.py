@@ -229,35 +229,42 @@ class _Search:
             self.bench.starts["train"],
             lambda k, n: self.report(f"{stage}: screening", k, n, ""),
         )
-        fits, led, rival = self._fits(base, scores[: self.budget.candidates], None, stage)
+        fits, led, rival, worst = self._fits(base, scores[: self.budget.candidates], stage)
         self.bench.predict([base, rival, *fits.values()])
         first = min(led, key=lambda name: fits[name].point.cost)
         if rms(self.bench.gaps(fits[first], "all")) > SILENT * self.bench.level:
             # Something is left: one that does alike things may be right, however little its doses explain.
             kin = [s for s in scores if s.name not in fits and any({s.name, first} <= k for k in library.KIN)]
-            more, also, _ = self._fits(base, kin, rival, f"{stage}, effects like {first}") if kin else ({}, [], rival)
+            more, also = self._fits_of_kin(base, kin, worst, f"{stage}, effects like {first}") if kin else ({}, [])
             self.bench.predict([*more.values()])
             fits, led = fits | more, led + also
         return self._judged(scores, fits, sorted(led, key=lambda name: fits[name].point.cost), rival)
 
     def _fits(
-        self, base: Fitted, scores: Sequence[Score], rival: Fitted | None, stage: str
-    ) -> tuple[dict[str, Fitted], list[str], Fitted]:
-        """Return fits of effects, the names of those that lead and were fitted to whole trials, and the fair rival.
+        self, base: Fitted, scores: Sequence[Score], stage: str
+    ) -> tuple[dict[str, Fitted], list[str], Fitted, float]:
+        """Return fits of effects, and the names of those that lead and were fitted to whole trials.
 
-        The fair rival of an effect is the baseline that was fitted for as long; it is fitted if not given.
+        Also return their fair rival, which is the baseline that was fitted for as long, and a cost of short fits that
+        does not close half as much as the best of them.
         """
-        jobs = [self._candidate(base, score) for score in scores]
-        found = self._fitted(jobs if rival else [*jobs, self._further(base, base)], stage)
-        ahead = self._leaders(found if rival else found[:-1], rival or found[-1])
-        lead = [scores[k].name for k in ahead]
-        if rival is None:
-            ahead.append(len(scores))
-        for k, fitted in zip(ahead, self._fitted([self._further(base, found[k]) for k in ahead], stage), strict=True):
-            found[k] = fitted
-        if rival is None:
-            rival = min(found.pop(), base, key=lambda f: f.point.cost)
-        return {s.name: f for s, f in zip(scores, found, strict=True)}, lead, rival
+        *short, alone = self._fitted([*(self._candidate(base, s) for s in scores), self._further(base, base)], stage)
+        lead = self._leaders(short, alone)
+        worst = 0.5 * (alone.point.cost + min(f.point.cost for f in (*short, alone)))
+        *further, rival = self._fitted([self._further(base, f) for f in (*(short[k] for k in lead), alone)], stage)
+        fits = {s.name: f for s, f in zip(scores, short, strict=True)}
+        names = [scores[k].name for k in lead]
+        return fits | dict(zip(names, further, strict=True)), names, min(rival, base, key=lambda f: f.point.cost), worst
+
+    def _fits_of_kin(
+        self, base: Fitted, scores: Sequence[Score], worst: float, stage: str
+    ) -> tuple[dict[str, Fitted], list[str]]:
+        """Return fits of effects, and the names of those that were fitted to whole trials: better ones than `worst`."""
+        short = self._fitted([self._candidate(base, s) for s in scores], stage)
+        fits = {s.name: f for s, f in zip(scores, short, strict=True)}
+        names = [name for name, fitted in fits.items() if fitted.point.cost < worst]
+        further = self._fitted([self._further(base, fits[name]) for name in names], stage) if names else []
+        return fits | dict(zip(names, further, strict=True)), names
 
     def _judged(
         self, scores: Sequence[Score], fits: dict[str, Fitted], order: Sequence[str], rival: Fitted

@@ -132,7 +132,7 @@ class Models:
             columns = [own.parameters.index(name) for name in job.free]
             space = Space(job.free, tuple(own.params[k] for k in columns), job.sizes)
             searches.append(_search(job, space, columns, motion.markers[:, : job.frames], trust))
-            places.append([model.parameters.index(name) for name in own.parameters])
+            places.append(self._places(model, job.effects))
         found: dict[int, Fitted] = {}
         asked = {k: next(search) for k, search in enumerate(searches)}
         while asked:
@@ -147,10 +147,20 @@ class Models:
                     del asked[k]
         return tuple(found[k] for k in range(len(jobs)))
 
-    def framed(self, job: Fit) -> bool:
-        """Return whether twists have to be searched for in the model of a fit, which takes longer."""
-        laws = [library.instance(e, self.model(()).mesh) for e in job.effects]
+    def framed(self, effects: Sequence[str]) -> bool:
+        """Return whether twists have to be searched for in a model with these effects, which takes longer."""
+        laws = [library.instance(e, self.model(()).mesh) for e in effects]
         return any(law.frame_bending or law.settles for law in laws)
+
+    def joined(self, fits: Sequence[Fitted], split: str, start: Start) -> Simulation:
+        """Return one job that simulates several fits, by a model that has the effects of all."""
+        model = self.model(tuple(dict.fromkeys(e for f in fits for e in f.effects)))
+        rows = [_filled(model.guess(), self._places(model, f.effects), f.values[None]) for f in fits]
+        return Simulation(model.effects, np.concatenate(rows), split, start)
+
+    def _places(self, model: RopeModel, effects: Sequence[str]) -> list[int]:
+        """Return where the numbers of a model with some of the effects are among those of a model with all."""
+        return [model.parameters.index(name) for name in self.model(effects).parameters]
 
 
 def _filled(guess: np.ndarray, places: Sequence[int], values: np.ndarray) -> np.ndarray:
@@ -245,7 +255,7 @@ class Pool:
         """Return the indices of the fits that run together: alike ones, spread over the workers."""
         kinds: dict[Any, list[int]] = {}
         for k, job in enumerate(jobs):
-            kind = id(job.start), job.frames, job.options, self.local.framed(job)
+            kind = id(job.start), job.frames, job.options, self.local.framed(job.effects)
             kinds.setdefault(kind, []).append(k)
         return [some for alike in kinds.values() for n in range(self.workers) if (some := alike[n :: self.workers])]
 
