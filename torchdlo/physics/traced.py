@@ -50,9 +50,13 @@ def record(step: Callable[..., Any], *inputs: Any) -> Callable[..., Any]:
         torch._C._jit_pass_dce(graph)
         recorded = torch._C._create_function_from_graph("step", graph)
 
+    known: list[Any] = [None, []]
+
     @torch.no_grad()
-    def replayed(*trees: Any) -> Any:
-        return rebuild[0](recorded(*tree.flatten(trees)[0]))
+    def replayed(first: Any, *others: Any) -> Any:
+        if known[0] is not first:  # constants stay the same over many steps
+            known[:] = first, tree.leaves(first)
+        return rebuild[0](recorded(*known[1], *tree.leaves(others)))
 
     return replayed
 

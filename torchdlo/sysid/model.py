@@ -31,6 +31,7 @@ from torchdlo.sysid.library import PARAMETERS, Number
 from torchdlo.sysid.mesh import make_mesh
 from torchdlo.sysid.motion import WINDOW, Motion, Start
 from torchdlo.sysid.recording import Recording, Trial
+from torchdlo.sysid.steps import recorded
 
 MAX_SUBSTEP = 5e-3
 """Longest substep [s]; the implicit integrator is stable and accurate to a per cent there."""
@@ -43,9 +44,6 @@ _AHEAD = 0.1
 
 _CHUNK = 64
 """Scenes that run together in a compiled step: one size, so that there is one graph."""
-
-_RECORDINGS = traced.Recordings(24)
-"""Steps of this process that are not compiled."""
 
 _COMPILE_FROM = 10_000
 """Frames in the train trials from which compiling pays off."""
@@ -326,16 +324,14 @@ class RopeModel:
     def _run(self, motion: Motion, start: Start, values: np.ndarray, frames: int) -> np.ndarray:
         scene, params, state = self.build(motion, start, values)
         params = tree.map(tree.batch_innermost, params)
-        if self._stepper is None or self._stepper[0] != scene:
-            self._stepper = scene, scenes.stepper(scene, compiled=self.compiled)
-        step = self._stepper[1]
         director = self._commands(scene, state, motion)
         controls = [
             scenes.Control(tree.batch_innermost(motion.held[:, k]), tree.batch_innermost(director[:, k]))
             for k in range((frames - 1) * self.substeps + 1)
         ]
-        if not self.compiled:
-            step = _RECORDINGS.find(scene, step, params, state, controls[0])
+        if self.compiled and (self._stepper is None or self._stepper[0] != scene):
+            self._stepper = scene, scenes.stepper(scene)
+        step = self._stepper[1] if self.compiled else recorded(scene, params, state, controls[0])
         if start.still is not None and start.still.any():
             resting = settle.come_to_rest(scene, params, state, controls[0])
             resting = self._corrected(step, scene, params, resting, controls, motion)

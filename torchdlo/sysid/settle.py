@@ -11,6 +11,7 @@ import torch
 from torchdlo import scene as scenes
 from torchdlo.physics import tree
 from torchdlo.sysid.mesh import Mesh
+from torchdlo.sysid.steps import recorded
 
 _SETTLING = 4.0
 """Time that a rope gets to come to rest where a trial starts [s]."""
@@ -41,8 +42,10 @@ def come_to_rest(
     damping["rate"] = torch.full_like(damping["rate"], _SETTLING_RATE)
     calmed = tree.replace(params, effects=params.effects | {"damping": damping})
     rest = tree.replace(state, rods=tree.replace(state.rods, vel=torch.zeros_like(state.rods.vel)))
-    for _ in range(math.ceil(_SETTLING / _SETTLING_STEP)):
-        rest = scenes.step(calm, calmed, rest, control)
+    rest = scenes.step(calm, calmed, rest, control)
+    step = recorded(calm, calmed, rest, control)
+    for _ in range(math.ceil(_SETTLING / _SETTLING_STEP) - 1):
+        rest = step(calmed, rest, control)
     zero = {name: torch.zeros_like(getattr(rest.rods, name)) for name in ("vel", "twist_rate")}
     return tree.replace(rest, rods=tree.replace(rest.rods, **zero), time=state.time)
 
