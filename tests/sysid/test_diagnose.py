@@ -44,14 +44,14 @@ def hanging(name: str, rng: np.random.Generator, frames: int = 41) -> Trial:
     return Trial(name, time, markers, S, GRIPPED, quaternion, np.array([0]), np.zeros(frames, bool))
 
 
-def make_recording(path: Path, effects: dict[str, float], noise: float = 2e-4) -> Recording:
+def make_recording(path: Path, effects: dict[str, float], noise: float = 2e-4, grip: float = 0.0) -> Recording:
     """Three trials of a rope with an effect, on a finer mesh and with shorter steps than the search uses."""
     rng = np.random.default_rng(5)
     trials = tuple(hanging(n, rng) for n in ("train_0", "train_1", "test_0"))
     gravity = np.array([0, 0, -9.81])
     empty = Recording(path, 0.6, 0.005, 0.03, gravity, None, noise, None, None, False, "", trials[:2], trials[2:])
     names = sorted({key.split(".")[0] for key in effects})
-    model = RopeModel(empty, vertices=61, effects=names, substep=2.5e-3, ahead=0.0, grip=0.0, compiled=False)
+    model = RopeModel(empty, vertices=61, effects=names, substep=2.5e-3, ahead=0.0, grip=grip, compiled=False)
     values = dict(zip(model.parameters, model.guess(), strict=True))
     values |= {"bending_stiffness": 2e-3, "twisting_stiffness": 1.5e-3, "damping_rate": 0.5} | effects
     start = Start(np.stack([t.markers[0] for t in trials]), np.zeros((3, len(S), 3)), np.ones(3, bool))
@@ -175,6 +175,20 @@ def test_a_hidden_effect_is_named_and_none_where_there_is_none(
     page = report.diagnosis_html(result, recording)
     assert page.count("data:image/png") == 2 and "point mass" in page and sentence(result, recording)[:7] in page
     assert {stage[0] for stage in stages} >= {"calibrating the baseline", "measuring the floor"}
+
+
+@pytest.mark.slow
+def test_a_clamp_that_turns_is_told_from_one_in_which_the_rope_bends(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # As soft as 5 mm of rope: half way between a clamp that is stiff up to its last marker and one that is not.
+    monkeypatch.setattr(library, "LIBRARY", ("gripper_compliance", "nonuniform_stiffness"))
+    monkeypatch.setattr(search, "BUDGETS", {"fast": search.Budget(3, 1, 3, 3, 1)})
+    recording = make_recording(tmp_path, {"gripper_compliance.stiffness": 0.4}, grip=1.0)
+    result = search.diagnose(recording, vertices=31, workers=1)
+    assert result.effects == ["gripper_compliance"]
+    found = findings(result, recording)["effects"][0]["parameters"]["stiffness"]["value"]
+    assert found == pytest.approx(0.4, rel=0.2)
 
 
 @pytest.mark.parametrize(

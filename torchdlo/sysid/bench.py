@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -24,8 +24,8 @@ CHAIN = "link_chain"
 """What a chain of links does that a rope does not: candidate number 0, fitted before any effect is considered."""
 
 
-def _key(fitted: Fitted) -> tuple[tuple[str, ...], bytes]:
-    return fitted.effects, fitted.values.tobytes()
+def _key(fitted: Fitted) -> Hashable:
+    return fitted.effects, fitted.options, fitted.values.tobytes()
 
 
 class Bench:
@@ -41,7 +41,7 @@ class Bench:
         """What no effect explains, on the test trials, as far as it is known."""
         self.level = float("inf")
         """What `gaps` are for a perfect model [m]."""
-        self._known: dict[tuple[tuple[str, ...], bytes], np.ndarray] = {}
+        self._known: dict[Hashable, np.ndarray] = {}
 
     def begin(self, base: np.ndarray, effects: Sequence[str]) -> None:
         """Estimate where trials begin with these numbers."""
@@ -72,8 +72,11 @@ class Bench:
         """Simulate all trials with several models at once, for `gaps` and `prediction` to look up."""
         new = [f for f in fits if _key(f) not in self._known]
         # Models that settle twists take longer than others, which all fit into one batch.
-        alike = [[f for f in new if self.pool.local.framed(f.effects) == framed] for framed in (False, True)]
-        groups = [some for group in alike for k in range(self.pool.workers) if (some := group[k :: self.pool.workers])]
+        alike: dict[Hashable, list[Fitted]] = {}
+        for fitted in new:
+            alike.setdefault((self.pool.local.framed(fitted.effects), fitted.options), []).append(fitted)
+        count = self.pool.workers
+        groups = [some for group in alike.values() for k in range(count) if (some := group[k::count])]
         for k, sims in self.pool.simulate([self.pool.local.joined(g, "all", self.starts["all"]) for g in groups]):
             self._known |= {_key(f): sim for f, sim in zip(groups[k], sims, strict=True)}
 
@@ -109,12 +112,13 @@ class Bench:
             for name, value in dose.items():
                 values[k::count, model.parameters.index(name)] = value
         free, sizes = (*space.names, *numbers), (*space.units, *(score.sizes[n] for n in numbers))
-        return Fit(effects, values, free, sizes, iterations, self.starts["train"], frames, keep=1)
+        return Fit(effects, values, free, sizes, iterations, self.starts["train"], frames, 1, base.options)
 
     def further(self, found: Fitted, iterations: int, frames: int | None = None) -> Fit:
         """Return the job of fitting on."""
         space, start = found.space, self.starts["train"]
-        return Fit(found.effects, found.values[None], space.names, tuple(space.units), iterations, start, frames)
+        values, sizes = found.values[None], tuple(space.units)
+        return Fit(found.effects, values, space.names, sizes, iterations, start, frames, None, found.options)
 
     def fit(self, jobs: Sequence[Fit]) -> list[Fitted]:
         """Return the results of fits in their order.

@@ -17,7 +17,7 @@ import numpy as np
 
 from torchdlo.errors import InputError
 from torchdlo.sysid import baseline as baselines
-from torchdlo.sysid import health, library, plan
+from torchdlo.sysid import clamps, health, library, plan
 from torchdlo.sysid.bench import SILENT, Bench, Callback
 from torchdlo.sysid.floor import Floor, gap, rms
 from torchdlo.sysid.health import Fault
@@ -165,9 +165,8 @@ class _Search:
             base = baselines.calibrate(self.bench, count, most, self.rng, self.report)
         else:
             base = baselines.go_on(self.bench, given, most, self.report)
-        self.baseline = base
+        self.baseline, self.before = base, self.bench.prediction(base, "all")
         self._say_floor()
-        self.before = self.bench.prediction(base, "all")
         rounds: list[list[Candidate]] = []
         ties: dict[str, list[str]] = {}
         shares: dict[str, float] = {}
@@ -175,8 +174,7 @@ class _Search:
         while len(rounds) < self.budget.rounds + (len(shares) < len(rounds)):
             if shares and rms(self.bench.gaps(base, "all")) < MORE * self.bench.level:
                 break
-            names = [n for n in self._possible() if n not in base.effects]
-            if not names:
+            if not (names := [n for n in self._possible() if n not in base.effects]):
                 break
             best, rival, candidates, rivals = self._round(base, names, f"round {len(rounds) + 1}")
             rounds.append(candidates)
@@ -185,6 +183,7 @@ class _Search:
                     base = rival
                 break
             name, old = best.effects[-1], self._squared(base)
+            self.pool.choose(**dict(best.options))
             shares[name], ties[name] = (old - self._squared(best)) / whole, rivals
             kept = self._pruned(best, shares)
             base = baselines.go_further(self.bench, kept, self.budget.more, self.report)
@@ -229,7 +228,8 @@ class _Search:
             self.bench.starts["train"],
             lambda k, n: self.report(f"{stage}: screening", k, n, ""),
         )
-        fits, led, rival, worst = self._fits(base, scores[: self.budget.candidates], stage)
+        soft = [s for s in scores[self.budget.candidates :] if s.name == clamps.NAME and clamps.soft(self.bench, base)]
+        fits, led, rival, worst = self._fits(base, [*scores[: self.budget.candidates], *soft], stage)
         self.bench.predict([base, rival, *fits.values()])
         first = min(led, key=lambda name: fits[name].point.cost)
         if rms(self.bench.gaps(fits[first], "all")) > SILENT * self.bench.level:
@@ -325,15 +325,17 @@ class _Search:
         return before - after > max(self.bench.level**2, MATTERS * (first - self.bench.floor.noise**2))
 
     def _on_most(self, base: Fitted, fitted: Fitted) -> bool:
-        better = self.bench.gaps(fitted, "train") < self.bench.gaps(base, "train")
-        return bool(better.mean() > 0.6)
+        return float(np.mean(self.bench.gaps(fitted, "train") < self.bench.gaps(base, "train"))) > 0.6
 
     def _candidate(self, base: Fitted, score: Score) -> Fit:
         """Return the first fit of an effect."""
+        most, frames = self.budget.iterations, self._short()
+        if score.name == clamps.NAME and clamps.soft(self.bench, base):
+            return clamps.stiff(self.bench, base, score, most, frames)
         # Numbers that no dose uses stay off, a slope where a spot fits better; but vectors are fitted whole.
         vectors = {_vector(name) for name in score.dose}
         used = [n.name for n in library.numbers(score.name, self.recording) if _vector(n.name) in vectors]
-        return self.bench.extension(base, score, used, self.budget.iterations, self._short())
+        return self.bench.extension(base, score, used, most, frames)
 
     def _short(self) -> int:
         """Return how many frames the first fits see: late ones mislead as long as early ones do not fit."""
@@ -341,8 +343,8 @@ class _Search:
 
     def _further(self, base: Fitted, fitted: Fitted) -> Fit:
         """Return the job of fitting on."""
-        most, frames = (self.budget.iterations, self._short()) if fitted is base else (self.budget.more, None)
-        return self.bench.further(fitted, most, frames)
+        how = (self.budget.iterations, self._short()) if fitted is base else (self.budget.more,)
+        return self.bench.further(fitted, *how)
 
     def _fitted(self, jobs: Sequence[Fit], stage: str) -> list[Fitted]:
         """Return the results of fits in their order, and say how they go."""

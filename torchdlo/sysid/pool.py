@@ -75,6 +75,8 @@ class Fitted:
     """The numbers that were fitted."""
     point: Point
     """Their coordinates, with costs and slopes."""
+    options: tuple[tuple[str, Any], ...] = ()
+    """Options of `RopeModel` that differ from those of the pool."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,7 +145,7 @@ class Models:
                 try:
                     asked[k] = searches[k].send(sim)
                 except StopIteration as end:
-                    found[k] = end.value
+                    found[k] = replace(end.value, options=options)
                     del asked[k]
         return tuple(found[k] for k in range(len(jobs)))
 
@@ -153,10 +155,10 @@ class Models:
         return any(law.frame_bending or law.settles for law in laws)
 
     def joined(self, fits: Sequence[Fitted], split: str, start: Start) -> Simulation:
-        """Return one job that simulates several fits, by a model that has the effects of all."""
+        """Return one job that simulates several fits with the same options, by a model that has the effects of all."""
         model = self.model(tuple(dict.fromkeys(e for f in fits for e in f.effects)))
         rows = [_filled(model.guess(), self._places(model, f.effects), f.values[None]) for f in fits]
-        return Simulation(model.effects, np.concatenate(rows), split, start)
+        return Simulation(model.effects, np.concatenate(rows), split, start, fits[0].options)
 
     def _places(self, model: RopeModel, effects: Sequence[str]) -> list[int]:
         """Return where the numbers of a model with some of the effects are among those of a model with all."""
@@ -217,7 +219,8 @@ class Pool:
         self.workers = workers = workers or max(1, os.cpu_count() or 1)
         self.journal = journal
         self.recording, self.local = recording, Models(recording, options)
-        self._chosen: tuple[tuple[str, Any], ...] = ()
+        # Named in every job, so that what was found with them is not mixed up with what others find later.
+        self._chosen = {name: options[name] for name in ("ahead", "grip") if name in options}
         self._pool = None
         if workers > 1:
             context = multiprocessing.get_context("spawn")
@@ -237,8 +240,12 @@ class Pool:
 
     def choose(self, **options: Any) -> None:
         """Give all models other options from now on."""
-        self.local = Models(self.recording, self.local.options | options)
-        self._chosen = (*self._chosen, *options.items())
+        if not options.items() <= self._chosen.items():
+            self.local = Models(self.recording, self.local.options | options)
+            self._chosen |= options
+
+    def _whole(self, options: tuple[tuple[str, Any], ...]) -> tuple[tuple[str, Any], ...]:
+        return tuple((self._chosen | dict(options)).items())
 
     def simulate(self, jobs: Sequence[Simulation]) -> Iterator[tuple[int, np.ndarray]]:
         """Yield the index and the markers of every job as they get ready."""
@@ -255,7 +262,7 @@ class Pool:
         """Return the indices of the fits that run together: alike ones, spread over the workers."""
         kinds: dict[Any, list[int]] = {}
         for k, job in enumerate(jobs):
-            kind = id(job.start), job.frames, job.options, self.local.framed(job.effects)
+            kind = id(job.start), job.frames, self._whole(job.options), self.local.framed(job.effects)
             kinds.setdefault(kind, []).append(k)
         return [some for alike in kinds.values() for n in range(self.workers) if (some := alike[n :: self.workers])]
 
@@ -267,7 +274,7 @@ class Pool:
             jobs: dataclasses with `options` of models.
         """
         compute = partial(self._compute, what)
-        jobs = [replace(job, options=(*self._chosen, *job.options)) for job in jobs]
+        jobs = [replace(job, options=self._whole(job.options)) for job in jobs]
         yield from compute(jobs) if self.journal is None else self.journal.through(jobs, compute)
 
     def _compute(self, what: Callable[[Models, Job], Any], jobs: Sequence[Job]) -> Iterator[tuple[int, Any]]:

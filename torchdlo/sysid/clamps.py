@@ -1,0 +1,45 @@
+"""Clamps that turn elastically, told from those in which the rope bends.
+
+Where the data does not say that clamps hold the rope stiffly up to their last marker, the baseline lets it bend between
+the markers of a clamp. That takes up a part of what an elastic clamp does, so its law is tried with stiff ones.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from torchdlo.sysid.bench import SILENT, Bench
+from torchdlo.sysid.floor import rms
+from torchdlo.sysid.pool import Fit, Fitted
+from torchdlo.sysid.screen import Score
+
+NAME = "gripper_compliance"
+
+_SHARES = (0.2, 0.5, 1.5)
+"""Lengths of rope that are as soft as a clamp where fits start, over the distance of its markers."""
+
+
+def soft(bench: Bench, base: Fitted) -> bool:
+    """Return whether the rope bends between the markers of clamps in a model that leaves something to be explained."""
+    bends = bool(bench.pool.local.model(()).mesh.clamps) and not dict(base.options).get("grip", 1.0)
+    return bends and NAME not in base.effects and rms(bench.gaps(base, "all")) > SILENT * bench.level
+
+
+def stiff(bench: Bench, base: Fitted, score: Score, iterations: int, frames: int | None) -> Fit:
+    """Return the job of fitting elastic clamps that hold the rope stiffly up to their last marker.
+
+    Args:
+        bench: the trials.
+        base: the model without.
+        score: of the effect.
+        iterations: most iterations.
+        frames: how many frames to fit; all if None.
+    """
+    model, number = bench.pool.local.model(base.effects), f"{NAME}.stiffness"
+    apart = min(float(np.diff(model.mesh.marker_arclength[run]).min()) for run in model.mesh.runs)
+    bend = base.values[model.parameters.index("bending_stiffness")]
+    starts = tuple(({number: bend / (share * apart)}, base.point.raw) for share in _SHARES)
+    job = bench.extension(base, replace(score, starts=starts), [number], iterations, frames)
+    return replace(job, options=(*job.options, ("grip", 1.0)))
