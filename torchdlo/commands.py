@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shlex
+import shutil
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -273,10 +274,13 @@ def design_experiment(
     vertices: Annotated[int | None, typer.Option(min=3, help="Vertices of the simulated rope.")] = None,
     workers: Annotated[int | None, typer.Option(min=1, help="Processes; one per core if not given.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the design as JSON.")] = False,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Go on from the journal of a search that was stopped.")
+    ] = False,
 ) -> None:
     """Find the motion of the grippers that tells apart effects which a recording cannot.
 
-    Ctrl-C stops after the running step and writes nothing.
+    Ctrl-C stops after the running step; --resume goes on from there.
 
     [bold]Examples:[/bold]
 
@@ -299,14 +303,16 @@ def design_experiment(
     if (out / "motion.npz").exists() and not (out / "design.json").exists():
         raise InputError(f"{out / 'motion.npz'}: exists without design.json; move it away or choose another --out.")
     options = {"seconds": seconds, "scale": scale, "mass": tip_mass, "seed": seed}
-    options |= {"vertices": vertices, "workers": workers}
+    journal = out / "journal"
+    options |= {"vertices": vertices, "workers": workers, "journal": journal, "resume": resume}
     try:
         with progress() as show, deferred_interrupt(show) as callback:
             design = designs.design_experiment(loaded, asked, findings=findings, callback=callback, **options)
     except KeyboardInterrupt:
-        typer.echo("interrupted before there was a result; nothing was written", err=True)
+        typer.echo(f"interrupted before there was a result; --resume goes on from {journal}", err=True)
         raise typer.Exit(_INTERRUPTED) from None
     report.write_design(design, out, command=shlex.join(["torchdlo", *sys.argv[1:]]))
+    shutil.rmtree(journal, ignore_errors=True)
     typer.echo(f"{designs.sentence(design)}\n", err=as_json)
     typer.echo("\n".join(f"- {said}" for said in designs.why(design)), err=as_json)
     typer.echo(f"\n{report.design_table(design)}\n", err=as_json)

@@ -3,16 +3,23 @@
 from __future__ import annotations
 
 import sys
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
 __all__ = ["deferred_interrupt", "progress"]
 
+_QUIET = 10.0
+"""Shortest time between two lines in a log [s]."""
+
 
 @contextmanager
 def progress() -> Iterator[Callable[[str, int, int, str], None]]:
-    """A bar with the time left on stderr; a callback(stage, done, total, message) moves it."""
+    """A bar with the time left on stderr; a callback(stage, done, total, message) moves it.
+
+    Off a terminal, as in a log, it is a line now and then.
+    """
     from rich.console import Console
     from rich.progress import (
         BarColumn,
@@ -23,6 +30,9 @@ def progress() -> Iterator[Callable[[str, int, int, str], None]]:
     )
 
     console = Console(stderr=True)
+    if not console.is_terminal:
+        yield _lines()
+        return
     columns = (
         TextColumn("{task.description}"),
         BarColumn(),
@@ -32,8 +42,7 @@ def progress() -> Iterator[Callable[[str, int, int, str], None]]:
         TimeRemainingColumn(),
         TextColumn("{task.fields[message]}"),
     )
-    # Off a terminal a bar is only noise in a log.
-    with Progress(*columns, console=console, disable=not console.is_terminal) as bar:
+    with Progress(*columns, console=console) as bar:
         tasks: dict[str, Any] = {}
 
         def callback(stage: str, done: int, total: int, message: str = "") -> None:
@@ -42,6 +51,19 @@ def progress() -> Iterator[Callable[[str, int, int, str], None]]:
             bar.update(tasks[stage], completed=done, total=total, message=message)
 
         yield callback
+
+
+def _lines() -> Callable[[str, int, int, str], None]:
+    begun = said = time.monotonic()
+
+    def callback(stage: str, done: int, total: int, message: str = "") -> None:
+        nonlocal said
+        now = time.monotonic()
+        if now - said > _QUIET:
+            said = now
+            sys.stderr.write(f"{now - begun:6.0f} s  {stage} {done}/{total} {message}".rstrip() + "\n")
+
+    return callback
 
 
 @contextmanager

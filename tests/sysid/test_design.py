@@ -23,7 +23,7 @@ from torchdlo.sysid.floor import gap
 from torchdlo.sysid.journal import digest
 from torchdlo.sysid.model import RopeModel
 from torchdlo.sysid.motion import Start
-from torchdlo.sysid.pool import Fit, Models, Simulation, Together
+from torchdlo.sysid.pool import Fit, Models, Pool, Simulation, Together
 from torchdlo.sysid.recording import Recording, Trial, save_recording
 
 S = np.array([0.0, 0.015, 0.06, 0.12, 0.18, 0.24, 0.3])
@@ -98,14 +98,25 @@ def write_findings(folder: Path, recording: Recording, ties: list[str]) -> Path:
 
 
 @pytest.fixture(scope="module")
-def design(recording: Recording, tmp_path_factory: pytest.TempPathFactory) -> Design:
-    """The motion that tells tilt and natural curvature apart."""
-    folder = write_findings(tmp_path_factory.mktemp("found") / "rope", recording, ["rest_curvature"])
+def found(recording: Recording, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Findings, in a folder that takes the journal of the design, too."""
+    return write_findings(tmp_path_factory.mktemp("found") / "rope", recording, ["rest_curvature"])
+
+
+def designed(recording: Recording, found: Path, *, resume: bool = False) -> Design:
+    """A short search."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(plan, "BUDGETS", {"fast": plan.Budget(2, 2, 2, 1, 1)})
         for name, value in {"WIDTHS": (0.5,), "COUNT": 4, "LEADERS": 1, "ITERATIONS": 1}.items():
             patch.setattr(search, name, value)
-        return design_experiment(recording, findings=folder, seconds=1.0, workers=1)
+        options = {"journal": found / "journal", "resume": resume}
+        return design_experiment(recording, findings=found, seconds=1.0, workers=1, **options)
+
+
+@pytest.fixture(scope="module")
+def design(recording: Recording, found: Path) -> Design:
+    """The motion that tells tilt and natural curvature apart."""
+    return designed(recording, found)
 
 
 def refitted(design: Design, recording: Recording, new: Trial) -> dict[str, tuple[float, float]]:
@@ -238,6 +249,18 @@ def test_findings_must_be_of_this_recording_and_tie(recording: Recording, tmp_pa
 
 
 @pytest.mark.slow
+def test_a_search_that_was_stopped_goes_on(
+    design: Design, recording: Recording, found: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def lost(*_: object) -> None:
+        raise AssertionError("computed again")
+
+    monkeypatch.setattr(Pool, "_compute", lost)
+    again = designed(recording, found, resume=True)
+    assert again.separation == design.separation and again.options[0].gesture == design.options[0].gesture
+
+
+@pytest.mark.slow
 def test_the_command_writes_the_suggestion(
     design: Design,
     recording: Recording,
@@ -281,4 +304,4 @@ def test_the_command_says_why_it_stops(
 
     monkeypatch.setattr(search, "design_experiment", stopped)
     assert run("design-experiment", "rope", "--names", "wind,time_delay") == 130
-    assert "nothing was written" in capsys.readouterr().err and not (tmp_path / "runs").exists()
+    assert "--resume goes on from runs/design/rope/journal" in capsys.readouterr().err

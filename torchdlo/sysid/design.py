@@ -21,6 +21,7 @@ from torchdlo.sysid import floor as floors
 from torchdlo.sysid import health, motions, plan, rivals
 from torchdlo.sysid.bench import Bench, Callback
 from torchdlo.sysid.contest import Contest, Pair, measured_misfit, size
+from torchdlo.sysid.journal import Journal
 from torchdlo.sysid.laws import separating
 from torchdlo.sysid.motions import KINDS, Gesture, Rig
 from torchdlo.sysid.pool import Fitted, Pool
@@ -129,6 +130,8 @@ def design_experiment(
     seed: int = 0,
     workers: int | None = None,
     callback: Callback | None = None,
+    journal: Path | None = None,
+    resume: bool = False,
 ) -> Design:
     """Find the motion of the grippers that tells apart effects which a recording cannot.
 
@@ -143,6 +146,8 @@ def design_experiment(
         seed: of the search.
         workers: processes; one per core if not given.
         callback: see `bench.Callback`.
+        journal: folder that keeps what is done, so that a search which was stopped can go on.
+        resume: go on from it.
 
     Raises:
         InputError: There is nothing to separate, or the findings are of another recording.
@@ -156,7 +161,10 @@ def design_experiment(
     if given is not None:
         options |= given.options if vertices is None else given.options | {"vertices": vertices}
     rig, noise = motions.make_rig(recording, scale), max(floors.noise(recording), LEAST_NOISE)
-    with Pool(recording, options, workers) as pool:
+    asked = {"design": list(names), "seconds": seconds, "scale": scale, "mass": mass, "seed": seed, "options": options}
+    asked |= {"ties": ties, "first": given and given.values}
+    kept = None if journal is None else Journal(journal, recording, asked, resume=resume)
+    with Pool(recording, options, workers, kept) as pool:
         bench = Bench(pool)
         names = rivals.check_names(names, ties, bench)
         if mass and "point_mass" in (*names, *(given.effects if given else ())):
