@@ -7,7 +7,9 @@ from pathlib import Path
 import numpy as np
 
 from tests.sysid.swaying import recording as swaying
-from torchdlo.sysid.pool import Fit, Pool
+from torchdlo.sysid.bench import Bench
+from torchdlo.sysid.fit import Point, Space
+from torchdlo.sysid.pool import Fit, Fitted, Pool
 
 OPTIONS = {"vertices": 17, "ahead": 0.0, "grip": 0.0, "compiled": False}
 BASE = ("bending_stiffness", "damping_rate")
@@ -50,3 +52,22 @@ def test_fits_find_together_what_they_find_alone(tmp_path: Path) -> None:
 def test_fits_are_spread_over_the_workers(tmp_path: Path) -> None:
     with Pool(swaying(tmp_path, frames=40), OPTIONS, workers=2) as pool:
         assert sorted(map(sorted, pool.groups(fits(pool)))) == [[0, 2], [1], [3]]
+
+
+def test_a_model_loses_an_effect_and_starts_from_several_baselines(tmp_path: Path) -> None:
+    with Pool(swaying(tmp_path, frames=10), OPTIONS, workers=1) as pool:
+        bench = Bench(pool)
+        bench.starts, bench.early = {"train": None}, np.array([1.0, 2.0, 3.0])
+        model = pool.local.model(("air_drag", "point_mass"))
+        values = np.arange(10.0, 10.0 + len(model.parameters))
+        names = ("bending_stiffness", "air_drag.c_d", "point_mass.mass")
+        params = tuple(model.params[model.parameters.index(n)] for n in names)
+        point = Point(np.zeros(3), 1.0, np.zeros((1, 3)), np.zeros((1, 3, 3)), np.ones(1))
+        joint = Fitted(model.effects, values, Space(names, params, (1.0, 2.0, 3.0)), point)
+        plain = Fitted((), np.array([4.0, 5.0, 6.0]), Space((), ()), point)
+        job = bench.reduction(joint, "air_drag", plain, 5)
+        assert job.effects == ("point_mass",) and job.free == (names[0], names[2]) and job.sizes == (1.0, 3.0)
+        kept = dict(zip(pool.local.model(job.effects).parameters, job.values.T, strict=True))
+        np.testing.assert_array_equal(kept["damping_rate"], [values[2], 6.0, 3.0])
+        at = model.parameters.index("point_mass.mass")
+        np.testing.assert_array_equal(kept["point_mass.mass"], np.full(3, values[at]))

@@ -114,6 +114,23 @@ class Bench:
         free, sizes = (*space.names, *numbers), (*space.units, *(score.sizes[n] for n in numbers))
         return Fit(effects, values, free, sizes, iterations, self.starts["train"], frames, 1, base.options)
 
+    def reduction(self, fitted: Fitted, name: str, plain: Fitted, iterations: int) -> Fit:
+        """Return the job of fitting a model without one of its effects, from the best of several starts.
+
+        Args:
+            fitted: the model.
+            name: the effect to leave out.
+            plain: the baseline, whose numbers may be nearer than those that made up for the effect.
+            iterations: most iterations.
+        """
+        keep = [k for k, n in enumerate(fitted.space.names) if n.split(".")[0] != name]
+        left = [k for k, n in enumerate(self.pool.local.model(fitted.effects).parameters) if n.split(".")[0] != name]
+        names, sizes = (tuple(x[k] for k in keep) for x in (fitted.space.names, fitted.space.units))
+        effects, values = tuple(e for e in fitted.effects if e != name), np.repeat(fitted.values[None, left], 3, 0)
+        for row, numbers in zip(values[1:], (plain.values, self.early), strict=True):
+            row[: len(self.early)] = numbers[: len(self.early)]
+        return Fit(effects, values, names, sizes, iterations, self.starts["train"], keep=2)
+
     def further(self, found: Fitted, iterations: int, frames: int | None = None) -> Fit:
         """Return the job of fitting on."""
         space, start = found.space, self.starts["train"]

@@ -199,13 +199,7 @@ class _Search:
         """Return the model without the effects that the last one has made needless, which takes over their shares."""
         *earlier, last = shares
         for name in earlier:
-            keep = [k for k, n in enumerate(fitted.space.names) if n.split(".")[0] != name]
-            left = [
-                k for k, n in enumerate(self.pool.local.model(fitted.effects).parameters) if n.split(".")[0] != name
-            ]
-            names, sizes = (tuple(x[k] for k in keep) for x in (fitted.space.names, fitted.space.units))
-            effects, start = tuple(e for e in fitted.effects if e != name), self.bench.starts["train"]
-            less = self.bench.fit([Fit(effects, fitted.values[None, left], names, sizes, self.budget.more, start)])[0]
+            less = self.bench.fit([self.bench.reduction(fitted, name, self.baseline, 2 * self.budget.more)])[0]
             self.report(f"without {name}", 1, 1, f"{1e3 * less.point.cost:.2f} mm")
             if not self._matters(less, fitted, "train"):
                 fitted, shares[last] = less, shares[last] + shares.pop(name)
