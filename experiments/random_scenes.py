@@ -4,19 +4,23 @@ A kind of scene is a set of bodies; its scenes, which differ in everything else,
 random stiffness, friction and speed falls on a plane and on a free, a fixed and a moved body of random shapes, sizes,
 densities and spins. Found at fault are scenes that are not finite, that missed a contact, whose edges are not as long
 as they are meant to be, and those in which things overlap by more than 10 % of the rope's radius once the rope is at
-rest. A kind that is run again from the same seed has to end in the same bits.
+rest. A kind that is built and started again from the same seed, and a part of the run in the middle of the pile that
+is repeated, have to end in the same bits.
 
 examples:
   python experiments/random_scenes.py --scenes 1000 --json random_scenes.json
+  python experiments/random_scenes.py --scenes 2000 --json random_scenes.json --resume
   python experiments/random_scenes.py --scenes 40 --batch 20 --seconds 0.5
 """
 
 from __future__ import annotations
 
+import json
 import math
 import random
 import sys
 import time
+from pathlib import Path
 from typing import Any
 
 from options import Parser, count, save
@@ -112,24 +116,40 @@ def build(seed: int, scenes: int, step: tuple[float, int]) -> tuple[tuple[Any, A
     return (made[0], tree.replace(made[1], rods=rods), state), shapes
 
 
-def run(made: tuple[Any, Any, Any], seconds: float) -> Any:
-    """Return the state after a time in which the moved body goes once to and fro through the pile."""
+def run(made: tuple[Any, Any, Any], state: Any, seconds: float, first: int, last: int) -> Any:
+    """Return the state after frames `first` to `last` of a time; the moved body goes to and fro through the pile."""
     import torch
 
     from torchdlo import scene
     from torchdlo.physics import tree
 
-    choice, params, state = made
-    first = scene.hold(choice, state)
-    frames = round(seconds / choice.dt)
+    choice, params, placed = made
+    control = scene.hold(choice, placed)
     with torch.no_grad():
-        for k in range(frames):
+        for k in range(first, last):
             # It comes to rest at three quarters of the time.
-            share = min(1.0, (k + 1) / (0.75 * frames))
+            share = min(1.0, (k + 1) * choice.dt / (0.75 * seconds))
             way = 0.06 * math.sin(math.pi * share) ** 2
-            pos = first.bodies.pos + first.bodies.pos.new_tensor([way, way, 0.0])
-            state = scene.step(choice, params, state, tree.replace(first, bodies=tree.replace(first.bodies, pos=pos)))
+            pos = control.bodies.pos + control.bodies.pos.new_tensor([way, way, 0.0])
+            moved = tree.replace(control, bodies=tree.replace(control.bodies, pos=pos))
+            state = scene.step(choice, params, state, moved)
     return state
+
+
+def travel(made: tuple[Any, Any, Any], again: tuple[Any, Any, Any], seconds: float) -> tuple[Any, bool]:
+    """Return the last state, and whether what is done twice ends in the same bits."""
+    import torch
+
+    from torchdlo.physics import tree
+
+    frames = round(seconds / made[0].dt)
+    half, few = frames // 2, min(25, frames // 2)
+    early = run(made, made[2], seconds, 0, few)
+    middle = run(made, early, seconds, few, half)
+    later = run(made, middle, seconds, half, half + few)
+    twice = run(again, again[2], seconds, 0, few), run(again, middle, seconds, half, half + few)
+    pairs = zip(tree.leaves(twice), tree.leaves((early, later)), strict=True)
+    return run(made, later, seconds, half + few, frames), all(torch.equal(a, b) for a, b in pairs)
 
 
 def overlaps(made: tuple[Any, Any, Any], state: Any) -> tuple[Any, Any]:
@@ -160,22 +180,17 @@ def overlaps(made: tuple[Any, Any, Any], state: Any) -> tuple[Any, Any]:
 
 def examine(seed: int, scenes: int, seconds: float, step: tuple[float, int]) -> list[dict[str, Any]]:
     """Run a kind of scene and return a row for each of its scenes."""
-    import torch
-
     from torchdlo import scene
 
     made, shapes = build(seed, scenes, step)
     start = time.process_time()
-    state = run(made, seconds)
+    state, same = travel(made, build(seed, scenes, step)[0], seconds)
     used = time.process_time() - start
     x, v = state.rods.pos, state.rods.vel
     speed = v.norm(dim=-1).amax(-1)
     length = (x[:, 1:] - x[:, :-1]).norm(dim=-1)
     strain = (length / made[1].rods.rest.length[..., :-1, 0] - 1).abs().amax(-1)
     body, own = overlaps(made, state)
-    short = 0.05
-    twice = [run(build(seed, scenes, step)[0], short) for _ in range(2)]
-    same = torch.equal(twice[0].rods.pos, twice[1].rods.pos) and torch.equal(twice[0].bodies.pos, twice[1].bodies.pos)
     finite, fine = scene.finite(state), scene.ok(state)
     rows = []
     for k in range(scenes):
@@ -211,6 +226,16 @@ def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
     }
 
 
+def earlier(parser: Parser, path: str, choices: dict[str, Any]) -> list[dict[str, Any]]:
+    """Return the rows of a file whose run is to go on; it must have been made with the same choices."""
+    if not path or not Path(path).exists():
+        parser.error(f"--resume goes on with the file of --json, but {path or 'none'} is there; leave out --resume")
+    found = json.loads(Path(path).read_text())
+    if found.get("choices") != choices:
+        parser.error(f"{path} was made with {found.get('choices')}; --resume needs the same, not {choices}")
+    return found["rows"]
+
+
 def main() -> int:
     """Run kinds until there were enough scenes; what was found so far is in the file after each."""
     parser = Parser(__file__, description=__doc__)
@@ -221,18 +246,20 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=0, help="of the first kind (%(default)s)")
     parser.add_argument("--dt", type=float, default=2e-3, help="step [s] (%(default)s)")
     parser.add_argument("--substeps", type=count, default=4, help="substeps per step (%(default)s)")
+    parser.flag("resume", "go on with the file of --json")
     options = parser.parse_args()
+    choices = {name: getattr(options, name) for name in ("batch", "seconds", "seed", "dt", "substeps")}
+    rows = earlier(parser, options.json, choices) if options.resume else []
     import torch
 
     torch.set_num_threads(1)
-    rows: list[dict[str, Any]] = []
-    seed = options.seed
+    seed = rows[-1]["kind"] + 1 if rows else options.seed
     while len(rows) < options.scenes:
         size = min(options.batch, options.scenes - len(rows))
         rows += examine(seed, size, options.seconds, (options.dt, options.substeps))
         seed += 1
         print(f"{len(rows):6} scenes: {summary(rows)}", flush=True)
-        save(options.json, {"summary": summary(rows), "rows": rows})
+        save(options.json, {"choices": choices, "summary": summary(rows), "rows": rows})
     return int(bool(summary(rows)["faults"]))
 
 

@@ -117,6 +117,9 @@ def test_random_scenes_write_a_row_each_and_say_what_is_wrong(tmp_path: Path) ->
     content = json.loads(target.read_text())
     assert content["summary"]["scenes"] == len(content["rows"]) == 2
     assert all(not row["faults"] and row["strain"] < 0.01 for row in content["rows"])
+    done = call(EXPERIMENTS / "random_scenes.py", *words, "--resume", "--scenes", 4)
+    rows = json.loads(target.read_text())["rows"]
+    assert done.returncode == 0 and rows[:2] == content["rows"] and [row["kind"] for row in rows] == [0, 0, 1, 1]
 
 
 def test_overlaps_of_random_scenes_are_seen(monkeypatch: pytest.MonkeyPatch) -> None:
