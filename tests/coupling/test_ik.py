@@ -159,3 +159,21 @@ def test_gradients_are_finite_where_the_target_is_out_of_reach():
     found = ik.solve(arm(), Pose(pos, torch.tensor([0.0, 1, 0, 0], dtype=F64)), middle(1)[0])
     (gradient,) = torch.autograd.grad(found.joints.sum() + found.handed.pos.sum(), pos)
     assert torch.isfinite(gradient).all()
+
+
+def test_joints_at_their_limits_leave_single_precision_all_its_digits():
+    # Five free joints make a singular matrix, which had random digits in single precision, and sometimes no inverse:
+    # so at the first of these poses, a turn of the wrist away from where the arm is.
+    search, limits = Search(steps=4, closing=2, polish=2), [0, 6]
+    posture = torch.tensor([1.56, -0.72, -0.02, -2.09, 0.04, 1.33, 2.4, 0.0])
+    start = reachable(200)[0].float()
+    start[:, limits] = arm().upper[limits].float()
+    start[0] = torch.tensor([2.8973, 0.33648232, -0.38172328, -2.3516445, 0.43148533, 2.6547818, 2.8972995, 0.0])
+    target = tree.map(lambda x: x.float(), robot.tool_pose(arm(), start))
+    target = Pose(target.pos + 0.02 * torch.randn(200, 3, generator=torch.Generator().manual_seed(3)), target.quat)
+    target.pos[0] = torch.tensor([-0.40955785, 0.30928865, 0.09328924])
+    target.quat[0] = torch.tensor([0.02178209, 0.99901599, 0.02058091, -0.03269737])
+    found = ik.solve(arm(), target, start, search=search, posture=posture)
+    wanted = ik.solve(arm(), tree.map(torch.Tensor.double, target), start.double(), search=search, posture=posture)
+    assert bool(found.converged[0]) and 0 < int(found.converged.sum()) < 200
+    assert torch.equal(found.joints, wanted.joints.float())

@@ -12,6 +12,9 @@ depend on the way there, but for the choice among separate solutions, and redund
     answer. The derivative by the target is exact where the tool is there and the posture is settled; it is one-sided
     where a joint just reaches a limit. Second derivatives are refused.
 
+All of it is done in double precision. Where an arm is stretched, or two of seven joints are at a limit, J D^-1 J^T is
+singular but for m, and single precision has no digits for that. Results have the precision of the start.
+
 The second derivatives of a chain are products of the columns of its Jacobian: for joint j before i, the velocity v_i
 and the angular velocity w_i of joint i change by w_j x v_i and w_j x w_i per unit of joint j.
 """
@@ -138,7 +141,7 @@ def _stopped(problem: _Problem, joints: Tensor, change: Tensor) -> Tensor:
 def _inverse(slope: Tensor, give: Tensor, damping: Tensor) -> Tensor:
     """Return (J G J^T + m)^-1, shape (B, 6, 6)."""
     square = (slope * give[..., None, :]) @ slope.transpose(-1, -2)
-    # In single precision a stretched arm may be singular: that pose does not settle, and must not stop the others.
+    # A singular pose does not settle, and must not stop the others.
     eye = torch.eye(6, dtype=slope.dtype, device=slope.device)
     return torch.linalg.inv_ex(square + damping[..., None] * eye).inverse
 
@@ -302,6 +305,7 @@ def solve(
         within_time: if given, joints go no further than their greatest speeds allow in that time [s].
     """
     check_joints(robot, start)
+    given = start.dtype
     problem, start, batch = _pose(robot, target, start, posture, within_time)
     with torch.no_grad():
         many = _repeated(problem, search.starts)
@@ -318,17 +322,18 @@ def solve(
     joints = joints.reshape(*batch, -1)
     missing = _missing(error.detach()).reshape(*batch, 2)
     there = _reached(missing, search)
-    pose = tool_pose(robot, joints)
-    wanted = tree.map(lambda x: x.expand(*batch, x.shape[-1]), target)
     # Half of the digits: the next Newton step would find the rest.
     settled = there & (left.reshape(batch) < torch.finfo(joints.dtype).eps ** 0.5 * 100)
+    joints, missing, pose = tree.map(lambda x: x.to(given), (joints, missing, tool_pose(robot, joints)))
+    wanted = tree.map(lambda x: x.expand(*batch, x.shape[-1]).to(given), target)
     return Solution(joints, pose, tree.where(there, wanted, pose), missing, there, settled)
 
 
 def _pose(
     robot: Robot, target: Pose, start: Tensor, posture: Tensor | None, within_time: float | None
 ) -> tuple[_Problem, Tensor, tuple[int, ...]]:
-    """Return the problem and the start with flat batches, and the batch."""
+    """Return the problem and the start with flat batches, in double precision, and the batch."""
+    start = start.detach().double()
     lower, upper = robot.lower.to(start), robot.upper.to(start)
     low, high = lower.clamp(min=-torch.pi), upper.clamp(max=torch.pi)
     on = start.new_tensor([float(k in robot.arm) for k in range(len(robot.joints))])
@@ -338,7 +343,7 @@ def _pose(
     def flat(x: Tensor) -> Tensor:
         return x.expand(*batch, x.shape[-1]).reshape(-1, x.shape[-1])
 
-    start = flat(start.detach())
+    start = flat(start)
     lower, upper = lower.expand_as(start), upper.expand_as(start)
     if within_time is not None:
         reach = robot.velocity.to(start) * within_time
