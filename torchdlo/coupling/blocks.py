@@ -5,7 +5,7 @@ from __future__ import annotations
 import ctypes
 import functools
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import torch
@@ -17,23 +17,31 @@ _OPTIONS = ("-fno-math-errno", "-fno-trapping-math", "-Wno-psabi")
 _KINDS = {torch.float32: "float", torch.float64: "double"}
 
 
-@functools.cache
-def function(name: str, what: str, dtype: torch.dtype, *options: str):
-    """Return a function of the kernel in `name`.cpp for numbers of a dtype, None where there is none.
+def kernel(name: str, *options: str) -> tuple[Callable, Callable[[str, torch.dtype], bool]]:
+    """Return what finds a function of a C++ kernel by its name and the dtype of its numbers, and `ready`.
 
     Args:
         name: of the source file, beside this one.
-        what: of the function.
-        dtype: of its numbers.
         options: what the compiler is told besides the usual.
     """
-    source = Path(__file__).with_name(f"{name}.cpp")
-    # The library is named after its source and its options: a changed header has to be among them.
-    text = b"".join(header.read_bytes() for header in sorted(source.parent.glob("*.h")))
-    version = f"-DHEADERS=0x{hashlib.sha256(text).hexdigest()[:16]}"
-    library = native.library(source, *_OPTIONS, *options, version, f"-I{source.parent}")
-    kind = _KINDS.get(dtype)
-    return None if library is None or kind is None else getattr(library, f"{name}_{kind}_{what}")
+
+    @functools.cache
+    def library() -> ctypes.CDLL | None:
+        source = Path(__file__).with_name(f"{name}.cpp")
+        # The library is named after its source and its options: a changed header has to be among them.
+        text = b"".join(header.read_bytes() for header in sorted(source.parent.glob("*.h")))
+        version = f"-DHEADERS=0x{hashlib.sha256(text).hexdigest()[:16]}"
+        return native.library(source, *_OPTIONS, *options, version, f"-I{source.parent}")
+
+    def function(what: str, dtype: torch.dtype) -> Callable:
+        return getattr(library(), f"{name}_{_KINDS[dtype]}_{what}")
+
+    @torch.compiler.assume_constant_result
+    def ready(device: str, dtype: torch.dtype) -> bool:
+        """Return whether the kernel works for tensors of a kind of device and a dtype."""
+        return device == "cpu" and dtype in _KINDS and library() is not None
+
+    return function, ready
 
 
 @functools.cache

@@ -27,16 +27,7 @@ FIT = 1e-2
 """By how much forces may do more than is asked for before they are dropped."""
 _NUMBERS = {"HARD": HARD, "FIT": FIT} | {n: getattr(balls, n) for n in ("ROUND", "FEET", "ARC", "SPREAD", "FLAT")}
 _OPTIONS = tuple(f"-D{name}={value}" for name, value in _NUMBERS.items())
-
-
-def _function(dtype: torch.dtype, what: str):
-    return blocks.function("body_pairs", what, dtype, *_OPTIONS)
-
-
-@torch.compiler.assume_constant_result
-def ready(device: str, dtype: torch.dtype) -> bool:
-    """Return whether the kernel works for tensors of a kind of device and a dtype."""
-    return device == "cpu" and _function(dtype, "back") is not None
+_function, ready = blocks.kernel("body_pairs", *_OPTIONS)
 
 
 class _Sizes(ctypes.Structure):
@@ -55,7 +46,7 @@ def _sizes(bodies: list[Tensor], kinds, free, pairs, points: int, steps: int, la
 def _exert(bodies: list[Tensor], *static) -> Tensor:
     out = _exert_meta(bodies)
     places = (blocks.fields(bodies), blocks.fields([out]))
-    _function(out.dtype, "exert")(*places, _sizes(bodies, *static), torch.get_num_threads())
+    _function("exert", out.dtype)(*places, _sizes(bodies, *static), torch.get_num_threads())
     return out
 
 
@@ -66,7 +57,7 @@ def _exert_meta(bodies: list[Tensor], *static) -> Tensor:
 def _back(bodies: list[Tensor], by: Tensor, *static) -> Tensor:
     out = _back_meta(bodies)
     places = (blocks.fields(x) for x in (bodies, [by], [out]))
-    _function(out.dtype, "back")(*places, _sizes(bodies, *static), torch.get_num_threads())
+    _function("back", out.dtype)(*places, _sizes(bodies, *static), torch.get_num_threads())
     return out
 
 

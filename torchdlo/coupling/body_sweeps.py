@@ -24,16 +24,7 @@ from torchdlo.physics.rod import View
 _ORDER = tuple(shapes.SIZES)
 _INPUTS = "Tensor[] edges, Tensor[] vertices, Tensor[] bodies"
 _STATIC = "int[] shapes, int[] pieces, int[] after, int sweeps, bool friction, float[] law"
-
-
-def _function(dtype: torch.dtype, what: str):
-    return blocks.function("body_sweeps", what, dtype)
-
-
-@torch.compiler.assume_constant_result
-def ready(device: str, dtype: torch.dtype) -> bool:
-    """Return whether the kernel works for tensors of a kind of device and a dtype."""
-    return device == "cpu" and _function(dtype, "back") is not None
+_function, ready = blocks.kernel("body_sweeps")
 
 
 class _Sizes(ctypes.Structure):
@@ -54,7 +45,7 @@ def _sweep(edges: list[Tensor], vertices: list[Tensor], bodies: list[Tensor], *s
     out = _sweep_meta(edges, vertices, bodies)
     places = [blocks.fields(x) for x in (edges, vertices, bodies)]
     sizes = _sizes(*bodies[0].shape[1:], *static)
-    _function(out[0].dtype, "sweep")(*places, *(blocks.fields([x]) for x in out), sizes, torch.get_num_threads())
+    _function("sweep", out[0].dtype)(*places, *(blocks.fields([x]) for x in out), sizes, torch.get_num_threads())
     return out
 
 
@@ -66,7 +57,7 @@ def _back(edges: list[Tensor], vertices: list[Tensor], bodies: list[Tensor], for
     out = _back_meta(edges, vertices, bodies)
     places = [blocks.fields(x) for x in (edges, vertices, bodies, [force], [push])]
     sizes = _sizes(*bodies[0].shape[1:], *static)
-    _function(force.dtype, "back")(*places, *(blocks.fields([x]) for x in out), sizes, torch.get_num_threads())
+    _function("back", force.dtype)(*places, *(blocks.fields([x]) for x in out), sizes, torch.get_num_threads())
     return out
 
 

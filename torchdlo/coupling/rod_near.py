@@ -17,16 +17,7 @@ from torchdlo.physics.effect import Values
 from torchdlo.physics.rod import View
 
 _OPTIONS = (f"-DPULL={segments.PULL}",)
-
-
-def _function(dtype: torch.dtype, what: str):
-    return blocks.function("rod_near", what, dtype, *_OPTIONS)
-
-
-@torch.compiler.assume_constant_result
-def ready(device: str, dtype: torch.dtype) -> bool:
-    """Return whether the kernel works for tensors of a kind of device and a dtype."""
-    return device == "cpu" and _function(dtype, "outrun") is not None
+_function, ready = blocks.kernel("rod_near", *_OPTIONS)
 
 
 class _Sizes(ctypes.Structure):
@@ -47,7 +38,7 @@ def _look(rods: list[Tensor], carried: Tensor, counts: list[int], closed: list[i
     sizes = (*rods[0].shape[1:], carried.shape[1], len(counts), room, few, nearby.APART)
     places = blocks.fields(rods), blocks.fields([carried]), *(_place(x) for x in out)
     sizes = ctypes.byref(_Sizes(*sizes, *lists, *rule))
-    _function(carried.dtype, "look")(*places, sizes, torch.get_num_threads())
+    _function("look", carried.dtype)(*places, sizes, torch.get_num_threads())
     return out
 
 
@@ -61,7 +52,7 @@ def _outrun(pos: Tensor, origin: Tensor, reach: Tensor) -> Tensor:
     out = _outrun_meta(pos, origin, reach)
     sizes = ctypes.byref(_Sizes(*pos.shape[1:]))
     places = blocks.fields([pos]), blocks.fields([origin]), _place(reach), _place(out)
-    _function(pos.dtype, "outrun")(*places, sizes, torch.get_num_threads())
+    _function("outrun", pos.dtype)(*places, sizes, torch.get_num_threads())
     return out
 
 

@@ -22,16 +22,7 @@ WEAK = 0.01
 _OPTIONS = (f"-DWEAK={WEAK}", f"-DPULL={segments.PULL}")
 _INPUTS = "Tensor[] vertices, Tensor laws, Tensor at, Tensor real"
 _STATIC = "int sweeps, bool friction, float[] rule"
-
-
-def _function(dtype: torch.dtype, what: str):
-    return blocks.function("rod_pairs", what, dtype, *_OPTIONS)
-
-
-@torch.compiler.assume_constant_result
-def ready(device: str, dtype: torch.dtype) -> bool:
-    """Return whether the kernel works for tensors of a kind of device and a dtype."""
-    return device == "cpu" and _function(dtype, "back") is not None
+_function, ready = blocks.kernel("rod_pairs", *_OPTIONS)
 
 
 class _Sizes(ctypes.Structure):
@@ -46,7 +37,7 @@ def _call(what: str, inputs: Sequence, others: Sequence[Tensor], sweeps: int, fr
     places = blocks.fields(vertices), blocks.fields([laws]), at.data_ptr(), real.data_ptr()
     arrays = (ctypes.c_void_p(x) if isinstance(x, int) else x for x in places)
     sizes = _Sizes(*vertices[0].shape[1:], real.shape[0], sweeps, friction, *rule)
-    call = _function(real.dtype, what)
+    call = _function(what, real.dtype)
     call(*arrays, *(blocks.fields([x]) for x in others), ctypes.byref(sizes), torch.get_num_threads())
 
 
