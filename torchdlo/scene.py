@@ -51,8 +51,8 @@ class State:
     time: Tensor
     """Time since the start [s], shape (..., 1, 1)."""
     missed: Tensor
-    """Contacts that may have been missed since the start: pairs without room [1], and by how much vertices were
-    faster than foreseen [m]; zeros if all is well, shape (..., 1, 2)."""
+    """What steps missed since the start, zeros if all is well: contacts without room [1], by how much vertices were
+    faster than foreseen [m], and by what share an edge was too short [1], shape (..., 1, 3)."""
     reaction: Reaction
     """What holds exerted on the ropes in the last step, its mean."""
     bodies: BodyState | tuple[()] = ()
@@ -220,7 +220,7 @@ def make(
     if check:
         stability.check_laws(scene.settings, rods, numbers, state)
         check_step(scene, params)
-    zero = state.pos.new_zeros(*state.pos.shape[:-2], 1, 2)
+    zero = state.pos.new_zeros(*state.pos.shape[:-2], 1, 3)
     first = State(state, zero[..., :1], zero, unfelt(state.pos, *scene.held), placed, particles)
     if scene.twist == "quasistatic":
         held = hold(scene, first)
@@ -287,7 +287,7 @@ def advance(scene: Scene, params: Params, state: State, start: Control, control:
     # Over the substeps of this step; a sum set to zero outside would have no gradient at first.
     later = share * scene.substeps > 1.5
     mean = tree.map(lambda old, now: torch.where(later, old, 0.0) + now / scene.substeps, state.reaction, reaction)
-    missed = watch.missed(scene.effects, rods.pos, params.effects, state.missed)
+    missed = watch.missed(scene, params, rods, state.missed)
     push = body_matter.meet(scene.effects, body, pool, push)
     moved, particles = rigid.advance(body, poses, push) if scene.bodies else (), ()
     if scene.matter:
@@ -369,7 +369,7 @@ def finite(state: State) -> Tensor:
 
 
 def ok(state: State) -> Tensor:
-    """Return which scenes are finite and missed no contact, bool, shape (...)."""
+    """Return which scenes are finite and missed nothing, bool, shape (...)."""
     return finite(state) & (state.missed == 0).all(-1).all(-1)
 
 

@@ -129,12 +129,12 @@ def foresee(medium: Medium, matter: Matter, particles: Particles, first: Tensor,
 def finish(
     medium: Medium, matter: Matter, now: Foreseen, push: Push, dt: float, missed: Tensor
 ) -> tuple[Particles, Tensor]:
-    """Return the particles after a substep and what was missed so far, shape (..., 1, 2)."""
+    """Return the particles after a substep and what was missed so far, shape (..., 1, 3)."""
     nodes = now.nodes
     if push.matter != ():
         nodes, lost = push.matter.nodes, push.matter.lost.detach()
         lost = lost.reshape(*missed.shape[:-2], 1, 1)
-        missed = torch.maximum(missed, torch.cat([lost, torch.zeros_like(lost)], -1))
+        missed = torch.maximum(missed, torch.cat([lost, torch.zeros_like(lost), torch.zeros_like(lost)], -1))
     return mpm.from_grid(medium, matter, now.particles, nodes, dt), missed
 
 

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from torchdlo.physics import rod, tree
-from torchdlo.physics.effect import Effect, Values, altered
+from torchdlo.physics.effect import altered
+from torchdlo.physics.numerics import safe_norm, tiny
+from torchdlo.physics.rod import RodState
+
+SHORT = 0.05
+"""By what share of its length an edge may be too short before it counts; lengths are kept to 1e-5 and better."""
 
 
 def survey(scene: Any, params: Any, state: Any, start: Any, control: Any) -> Any:
@@ -35,24 +39,41 @@ def survey(scene: Any, params: Any, state: Any, start: Any, control: Any) -> Any
     return tree.replace(params, effects=params.effects | {n: params.effects[n] | given for n, given in found.items()})
 
 
-def missed(effects: Iterable[Effect], pos: Tensor, values: dict[str, Values], before: Tensor) -> Tensor:
-    """Return what was missed so far, shape (..., 1, 2).
+def missed(scene: Any, params: Any, rods: RodState, before: Tensor) -> Tensor:
+    """Return what was missed so far, shape (..., 1, 3).
 
     Args:
-        effects: what acts on the rods.
-        pos: vertex positions after a substep [m], shape (..., V, 3).
-        values: the effects' numbers with what they looked up.
+        scene: static choices, see `scene.Scene`.
+        params: the rods' parameters before effects alter them, and the effects' numbers with what they looked up.
+        rods: the rods after a substep.
         before: what was missed before.
     """
-    for e in effects:
+    contact, short = before.split((2, 1), -1)
+    for e in scene.effects:
         if e.reacts:
-            before = torch.maximum(before, e.shortfall(pos, values[e.name]))
-    return before
+            contact = torch.maximum(contact, e.shortfall(rods.pos, params.effects[e.name]))
+    if scene.constrained:
+        short = torch.maximum(short, _shortened(scene, params, rods))
+    return torch.cat([contact, short], -1)
+
+
+@torch.no_grad()
+def _shortened(scene: Any, params: Any, rods: RodState) -> Tensor:
+    """Return by what share of its length an edge is too short, 0 where it is by less than `SHORT`, (..., 1, 1)."""
+    held, after = set(scene.held_vertices), scene.topology.successor()
+    # Hands that hold both ends of an edge set its length.
+    solved = [m * (not {k, after[k]} <= held) for k, m in enumerate(scene.topology.edge_mask())]
+    changed = altered(scene.effects, scene.topology, params.rods, params.effects)
+    edge = rod.edge_vectors(scene.topology, rods.pos, changed.rest.edge_mask)
+    wanted = changed.rest.length * (1 + rods.tension / changed.material.stretch)
+    short = (1 - safe_norm(edge) / wanted.clamp(min=tiny(wanted))) * wanted.new_tensor(solved).unsqueeze(-1)
+    most = short.amax(-2, keepdim=True)
+    return torch.where(most > SHORT, most, 0.0)
 
 
 def explain(missed: Tensor) -> str:
     """Return what went wrong and how to mend it, "" if nothing did."""
-    room, beyond = (float(x) for x in missed.reshape(-1, 2).amax(0))
+    room, beyond, short = (float(x) for x in missed.reshape(-1, 3).amax(0))
     if room > 0:
         return (
             f"contact had no room for {room:.0f} pairs of edges, edges or nodes; give a larger `room` to RodContact, "
@@ -62,5 +83,10 @@ def explain(missed: Tensor) -> str:
         return (
             f"vertices went {1e3 * beyond:.2g} mm further within a step than contact looked; give RodContact a larger "
             "`burst`, or shorten dt"
+        )
+    if short > 0:
+        return (
+            f"an edge became {short:.0%} shorter than it has to be: a straight rope was pressed along its line, or "
+            "jerked; lay it in a slight bend, move what holds it more slowly, or give it a finite `stretch`"
         )
     return ""

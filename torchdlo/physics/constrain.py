@@ -40,6 +40,8 @@ class Lengths:
     """How far a unit of force moves an end of the edge within the substep [m/N], shape (..., V, 1)."""
     most: float = 0.25
     """Tension at which edges give way, over the one at which explicit steps are not stable."""
+    least: float = 0.25
+    """Compression from which on that of the last substep is no first guess, likewise."""
 
     def yielding(self, tension: Tensor) -> tuple[Tensor | float, Tensor | float]:
         """Return how much an edge lengthens beyond the tension that steps can follow [m], and the slope of that [m/N].
@@ -51,6 +53,16 @@ class Lengths:
             return 0.0, 0.0
         beyond = tension - self.most * self.rest / self.give
         return self.give * beyond.clamp(min=0.0), torch.where(beyond > 0, self.give, 0.0)
+
+    def guess(self, tension: Tensor) -> Tensor:
+        """Return a first guess for the tensions [N], shape (..., V, 1): those of the last substep.
+
+        A straight rope pressed along its line has no tensions that keep its lengths, and leaves ones of any size. From
+        there Newton's method goes astray for good; from none it finds the bent shape as soon as there is one.
+        """
+        if self.give is None:
+            return tension * self.active
+        return torch.where(tension < -self.least * self.rest / self.give, 0.0, tension) * self.active
 
     def error(self, pos: Tensor, tension: Tensor) -> tuple[Tensor, Tensor]:
         """Return how much too long each edge is [m], shape (..., V, 1), and its direction, (..., V, 3)."""
@@ -123,7 +135,7 @@ def project(
         return tension + solve_slots(topology, diagonal, to_next, to_prev, excess)
 
     with torch.no_grad():
-        tension = tension * lengths.active
+        tension = lengths.guess(tension)
         for _ in range(steps):
             excess, along = lengths.error(place(tension, moved, answer, direction), tension)
             tension = newton(tension, along, excess)
@@ -266,7 +278,7 @@ def balance(
         return pos + short * change, impulse + short * pull
 
     with torch.no_grad():
-        pos, impulse = moved.detach(), tension * lengths.active * scale
+        pos, impulse = moved.detach(), lengths.guess(tension) * scale
         for _ in range(steps):
             pos, impulse = newton(pos, impulse)
     pos = torch.where(free > 0, pos, moved)

@@ -222,6 +222,7 @@ def _translate(
     fixed = (1 - free) * (1 - following(topology, free)) >= 1
     active = rest.edge_mask * (1 - fixed.to(free.dtype))
     lightest = torch.minimum(material.mass, following(topology, material.mass)).detach()
+    most, least = (1e4, 10.0) if settings.integrator == "implicit" else (0.25, 0.25)
     lengths = Lengths(
         topology,
         rest.length,
@@ -229,7 +230,8 @@ def _translate(
         active,
         rest.edge_mask,
         dt * dt / lightest,
-        1e4 if settings.integrator == "implicit" else 0.25,
+        most,
+        least,
     )
     if settings.integrator == "implicit":
         moved = _placed(settings, targets, kick.drift)
