@@ -32,6 +32,9 @@ _CALMER = 0.7
 _AHEAD = 0.1
 """How far steps look ahead where they fail otherwise, see `torchdlo.scene.Scene`."""
 
+_ASTRAY = 3.0
+"""Times the gap of another model from which a simulation has gone astray."""
+
 _ROUND = 0.75
 """Twisting over bending stiffness of a round rope of one material."""
 
@@ -132,6 +135,7 @@ def go_further(bench: Bench, base: Fitted, iterations: int, report: Callback) ->
         back = base.values.copy()
         back[twist] = _ROUND * back[bend]
         values = np.stack([base.values, back])
+    before = bench.gaps(base, "all")
     rope, names, sizes = bench.correct(base), base.space.names, tuple(base.space.units)
     stage, effects, free = "fitting all numbers again", (*base.effects, CHAIN), (*names, f"{CHAIN}.length")
     report(stage, 0, 2, "")
@@ -141,6 +145,9 @@ def go_further(bench: Bench, base: Fitted, iterations: int, report: Callback) ->
         rows = [np.append(base.values, length)[None] for length in (link, -link)]
         sides = [Fit(effects, r, free, (*sizes, 0.5 * link), iterations, bench.starts["train"]) for r in rows]
         base = _chain_or(bench, base, rope, sides)
+    if not bench.pool.local.options["ahead"] and _lost(bench, base, before):
+        bench.pool.choose(ahead=_AHEAD)
+        base = bench.fit([bench.further(replace(base, options=()), iterations)])[0]
     report(stage, 2, 2, f"{1e3 * rms(bench.gaps(base, 'train')):.2f} mm")
     return base
 
@@ -154,15 +161,20 @@ def _chain_or(bench: Bench, smooth: Fitted, rope: Refinement, sides: Sequence[Fi
         rope: how simulations were corrected for it.
         sides: fits of the chain.
     """
-    level = bench.level
+    level, before = bench.level, bench.gaps(smooth, "all")
     bench.use(replace(rope, links=abs(float(sides[0].values[0, -1]))))
     found = bench.fit([replace(side, start=bench.starts["train"]) for side in sides])
     best = min(found, key=lambda f: f.point.cost)
     # Each in its own measure of what can be known.
-    if best.point.cost / bench.level < _BETTER * smooth.point.cost / level:
+    if best.point.cost / bench.level < _BETTER * smooth.point.cost / level and not _lost(bench, best, before):
         return best
     bench.use(rope)
     return smooth
+
+
+def _lost(bench: Bench, fitted: Fitted, before: np.ndarray) -> bool:
+    """Return whether a model goes astray in a trial whose gap another one kept as small as `before` [m], shape (B,)."""
+    return not bool((bench.gaps(fitted, "all") < _ASTRAY * np.maximum(before, bench.level)).all())
 
 
 def go_on(bench: Bench, given: Saved, iterations: int, report: Callback) -> Fitted:
