@@ -161,9 +161,19 @@ def test_gymnasium_takes_environments_through_torchrl():
     assert len(after) == 5 and seen is not None
 
 
+def test_arms_stand_still_without_a_way_by_hand():
+    @dataclasses.dataclass(frozen=True)
+    class Still(type(TASKS["gathering"]())):
+        """Without a way."""
+
+        def waypoints(self):
+            """Return no way."""
+            return ()
+
+    assert not Still(horizon=7).reference().any() and Still(horizon=7).reference().shape == (7, 12)
+
+
 def test_tasks_can_be_changed_field_by_field():
-    # Without a way by hand, the arms stand still.
-    assert dataclasses.replace(TASKS["gathering"](), horizon=7).reference().shape == (7, 12)
     short = dataclasses.replace(TASKS["coiling"](), horizon=7, frames=1)
     assert envs.make(short, compiled=False).task.horizon == 7
     with pytest.raises(ValueError, match=r"take 96 actions of 0\.01 m; expected at most 7"):

@@ -2,9 +2,6 @@
 
 A soft plastic ball, a pebble and a cylinder lie between two arms and the rope whose ends they hold. Success: all three
 are within 16 cm of each other, and no hand came within 6 cm of one.
-
-The ball is matter, which meets the rope and the floor but passes through the other two, as matter does not meet rigid
-bodies here.
 """
 
 from __future__ import annotations
@@ -16,6 +13,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
+from torchdlo.coupling import BodyMatter
 from torchdlo.coupling.bodies import Solid
 from torchdlo.coupling.laws import Plastic
 from torchdlo.coupling.particles import Blob, Grid, assemble, fill_ball
@@ -33,6 +31,8 @@ BALL, PEBBLE, CYLINDER = (0.25, 0.02, 0.07), (0.5, -0.05, 0.07), (0.08, -0.08, 0
 """Where the objects start [m]."""
 BOX = Grid((-0.4, -0.6, 0.0), (0.9, 0.4, 0.4), CELL, ("open", "open", "open", "open", "separate", "open"), (26, 26, 26))
 """Where matter may be. The window follows the ball: 26 nodes are twice its width."""
+ROOM = 600
+"""Nodes that there is room for next to rigid bodies; the flattened ball has 270 at the floor and 360 once gathered."""
 
 
 @dataclass(frozen=True)
@@ -47,20 +47,21 @@ class Gathering(Task):
 
     def build(self, moved: Tensor) -> tuple[Scene, Params, State]:
         """Return the scene; each of the objects may be moved."""
-        x = straight((-0.15, 0.1, 0.012), 45, moved.new_zeros(len(moved), 3))
-        rope = Rope(x, RADIUS, mass=0.44, youngs=1e3, stretch=1e5 * math.pi * RADIUS**2)
         rub = {"mu_s": 0.3, "mu_k": 0.3, "density": 600.0}
         at = [moved[:, k] + moved.new_tensor(p) for k, p in enumerate((BALL, PEBBLE, CYLINDER))]
-        solids = [
-            Solid("plane", motion="fixed", mu_s=0.3, mu_k=0.3),
-            pebble().solid(at[1].double(), name="pebble", **rub),
-            Solid("cylinder", (0.05, 0.025), at[2], **rub),
-        ]
+        solids = [pebble().solid(at[1].double(), name="pebble", **rub), Solid("cylinder", (0.05, 0.025), at[2], **rub)]
         points = fill_ball((0.0, 0.0, 0.0), 0.05, FINE, moved) + at[0][:, None]
         numbers = {"youngs": 1e5, "poisson": 0.3, "yield_stress": 1e3, "density": 1000.0}
-        matter = assemble([Blob(points, Plastic(), FINE**3, numbers=numbers)], BOX)
+        return self._made(moved, solids, assemble([Blob(points, Plastic(), FINE**3, numbers=numbers)], BOX))
+
+    def _made(self, like: Tensor, solids: list[Solid], matter: tuple = ()) -> tuple[Scene, Params, State]:
+        """Return the scene of some objects, on a plane, with the rope beside them."""
+        x = straight((-0.15, 0.1, 0.012), 45, like.new_zeros(len(like), 3))
+        rope = Rope(x, RADIUS, mass=0.44, youngs=1e3, stretch=1e5 * math.pi * RADIUS**2)
+        floor = Solid("plane", motion="fixed", mu_s=0.3, mu_k=0.3)
         values = {"damping": {"rate": 15.0, "twist_rate": 10.0}}
-        return make(self, [rope], values=values, solids=solids, matter=matter)
+        meet = [BodyMatter(room=ROOM)] if matter else []
+        return make(self, [rope], meet, values, solids=[floor, *solids], matter=matter)
 
     def _objects(self, seen: Seen) -> Tensor:
         """Return the centres of the objects [m], shape (B, 3, 3)."""
@@ -98,3 +99,7 @@ class Gathering(Task):
         objects = self._objects(seen)
         together = geometry.distances(objects, objects).amax((-1, -2)) <= 0.16
         return together & (seen.notes["closest"] >= 0.06)
+
+    def waypoints(self) -> list[list[tuple[float, float, float]]]:
+        """Return a way by which the hands draw the rope round the objects, until it is a narrow bow about them."""
+        return [[(0.04, -0.2, 0.018), (-0.07, -0.2, 0.018)], [(0.23, -0.5, 0.018), (-0.41, -0.5, 0.018)]]

@@ -37,6 +37,7 @@ class Lifting(Task):
     name: ClassVar[str] = "lifting"
     arms: ClassVar[Arms] = Arms(base=((0.25, -0.4, 0.0), (0.95, -0.4, 0.0)), vertex=(4, 25))
     stretch: ClassVar[float] = 1.1
+    anchored: ClassVar[bool] = True
     spread: ClassVar[tuple[tuple[float, float], ...]] = ((0.05, 0.025),)
 
     def build(self, moved: Tensor) -> tuple[Scene, Params, State]:
@@ -76,3 +77,8 @@ class Lifting(Task):
         """Return whether both rings stayed up for the last 0.1 s."""
         start = seen.x.new_tensor([c[2] for c in CENTRES])
         return (seen.notes["heights"] >= start + LIFT).all(-1).all(-1)
+
+    def waypoints(self) -> list[list[tuple[float, float, float]]]:
+        """Return a way by which the rope, pulled straight, goes over the rings, into their gaps and up with them."""
+        way = [(-0.033, 0.133), (-0.17, 0.133), (-0.19, 0.048), (-0.1, 0.048), (-0.1, 0.53)]
+        return [[(-0.0025, y, z), (0.0225, y, z)] for y, z in way]
