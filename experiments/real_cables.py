@@ -24,10 +24,11 @@ from options import Parser, count, save
 
 from torchdlo.progress import progress
 from torchdlo.sysid import start as starts
-from torchdlo.sysid.diagnose import BUDGETS, Diagnosis, diagnose
+from torchdlo.sysid.diagnose import BUDGETS, diagnose
 from torchdlo.sysid.metrics import average, mean_absolute_error
 from torchdlo.sysid.model import RopeModel
 from torchdlo.sysid.recording import Recording, Trial, load_recording
+from torchdlo.sysid.verdict import Diagnosis
 
 DELAY, TILT = 0.02, np.radians(2.0)
 

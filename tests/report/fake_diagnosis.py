@@ -9,12 +9,12 @@ import numpy as np
 
 from torchdlo.physics.effects import EFFECTS
 from torchdlo.sysid import floor as floors
-from torchdlo.sysid.diagnose import Candidate, Diagnosis
 from torchdlo.sysid.fit import Point, Space
 from torchdlo.sysid.floor import Floor
 from torchdlo.sysid.library import PARAMETERS
 from torchdlo.sysid.pool import Fitted
 from torchdlo.sysid.recording import Recording
+from torchdlo.sysid.verdict import Candidate, Diagnosis
 
 BASELINE = {"bending_stiffness": 2e-3, "twisting_stiffness": 1.5e-3, "damping_rate": 0.8}
 

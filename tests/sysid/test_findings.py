@@ -14,12 +14,12 @@ from tests.report.fake_diagnosis import BASELINE, fake_diagnosis, fitted
 from tests.sysid.swaying import recording as swaying
 from torchdlo.physics.effects import EFFECTS
 from torchdlo.sysid import library
-from torchdlo.sysid.diagnose import Diagnosis
 from torchdlo.sysid.findings import absorbed, confidence, findings_json, sentence
 from torchdlo.sysid.floor import Floor
 from torchdlo.sysid.health import Fault
 from torchdlo.sysid.laws import LAWS, MEANING, separating
 from torchdlo.sysid.recording import Recording
+from torchdlo.sysid.verdict import Diagnosis
 
 
 @pytest.fixture(scope="module")

@@ -12,12 +12,12 @@ import numpy as np
 from torchdlo.files import write_atomically
 from torchdlo.report import chart, player
 from torchdlo.report.page import STYLE, listed, number, page, percent, table, words
-from torchdlo.sysid.diagnose import Diagnosis
 from torchdlo.sysid.findings import absorbed, findings, sentence
 from torchdlo.sysid.floor import rms
 from torchdlo.sysid.laws import MEANING, law, separating
 from torchdlo.sysid.localise import PARTS, Localisation, localise
 from torchdlo.sysid.recording import Recording
+from torchdlo.sysid.verdict import Diagnosis
 from torchdlo.sysid.wording import STATES
 
 __all__ = ["PAGE", "diagnosis_html", "snippet", "write_report"]

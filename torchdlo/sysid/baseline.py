@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from torchdlo.sysid.bench import CHAIN, SILENT, Bench, Callback
+from torchdlo.sysid.bench import AHEAD, CHAIN, SILENT, Bench, Callback
 from torchdlo.sysid.floor import Refinement, rms
 from torchdlo.sysid.model import RopeModel
 from torchdlo.sysid.pool import Fit, Fitted
@@ -29,11 +29,8 @@ _BETTER = 0.9
 _CALMER = 0.7
 """Share of the cost that is left where steps have to look ahead, which makes them less exact."""
 
-_AHEAD = 0.1
-"""How far steps look ahead where they fail otherwise, see `torchdlo.scene.Scene`."""
-
-_ASTRAY = 3.0
-"""Times the gap of another model from which a simulation has gone astray."""
+_FIRMER = 0.95
+"""The same for clamps once an effect is known: those in which the rope bends were taken without need."""
 
 _ROUND = 0.75
 """Twisting over bending stiffness of a round rope of one material."""
@@ -74,10 +71,10 @@ def calibrate(bench: Bench, count: int, iterations: int, rng: np.random.Generato
 
     values = _random(model, count, rng)
     # What rings within a step, from a start that is measured badly, may grow without end unless steps look ahead.
-    calm = [] if bench.pool.local.options["ahead"] else [plain(values[::2], 4, frames // 3, ahead=_AHEAD)]
+    calm = [] if bench.pool.local.options["ahead"] else [plain(values[::2], 4, frames // 3, ahead=AHEAD)]
     first = fit([*(plain(values[k::2], 4, frames // 3) for k in range(2)), *calm], 1)
     if calm and first[-1].point.cost < _CALMER * min(f.point.cost for f in first[:-1]):
-        bench.pool.choose(ahead=_AHEAD)
+        bench.pool.choose(ahead=AHEAD)
         first = first[-1:]
     bench.early = best = min(first, key=lambda f: f.point.cost).values
     if not bench.starts["train"].still.all():
@@ -87,11 +84,11 @@ def calibrate(bench: Bench, count: int, iterations: int, rng: np.random.Generato
     sides = [chain(np.append(best, length)[None], 4, 2 * frames // 3) for length in (link, -link)]
     firm = [plain(best[None], 5, 2 * frames // 3, grip=1.0)] if model.mesh.clamps else []
     # Simulations may get lost later, too.
-    calm = [] if bench.pool.local.options["ahead"] else [plain(best[None], 5, 2 * frames // 3, ahead=_AHEAD)]
+    calm = [] if bench.pool.local.options["ahead"] else [plain(best[None], 5, 2 * frames // 3, ahead=AHEAD)]
     smooth, one, other, *others = fit([plain(best[None], 5, 2 * frames // 3), *sides, *calm, *firm], 2)
     side = min((one, other), key=lambda f: f.point.cost)
     if calm and others[0].point.cost < _CALMER * min(smooth.point.cost, side.point.cost):
-        bench.pool.choose(ahead=_AHEAD)
+        bench.pool.choose(ahead=AHEAD)
         smooth, side = others[0], _moved(side, others[0])
     if firm and others[-1].point.cost < _BETTER * min(smooth.point.cost, side.point.cost):
         bench.pool.choose(grip=1.0)
@@ -139,15 +136,21 @@ def go_further(bench: Bench, base: Fitted, iterations: int, report: Callback) ->
     rope, names, sizes = bench.correct(base), base.space.names, tuple(base.space.units)
     stage, effects, free = "fitting all numbers again", (*base.effects, CHAIN), (*names, f"{CHAIN}.length")
     report(stage, 0, 2, "")
-    base = bench.fit([Fit(base.effects, values, names, sizes, iterations, bench.starts["train"])])[0]
+    jobs = [Fit(base.effects, values, names, sizes, iterations, bench.starts["train"])]
+    if model.mesh.clamps and not bench.pool.local.options["grip"]:
+        jobs.append(replace(jobs[0], options=(("grip", 1.0),)))
+    base, *firm = bench.fit(jobs)
+    if firm and firm[0].point.cost < _FIRMER * base.point.cost:
+        base = firm[0]
+        bench.pool.choose(grip=1.0)
     report(stage, 1, 2, f"{1e3 * base.point.cost:.2f} mm")
     if CHAIN not in base.effects and rms(bench.gaps(base, "train")) > SILENT * bench.level:
         rows = [np.append(base.values, length)[None] for length in (link, -link)]
         sides = [Fit(effects, r, free, (*sizes, 0.5 * link), iterations, bench.starts["train"]) for r in rows]
         base = _chain_or(bench, base, rope, sides)
-    if not bench.pool.local.options["ahead"] and _lost(bench, base, before):
-        bench.pool.choose(ahead=_AHEAD)
-        base = bench.fit([bench.further(replace(base, options=()), iterations)])[0]
+    if not bench.pool.local.options["ahead"] and bench.astray(base, before):
+        bench.pool.choose(ahead=AHEAD)
+        base = bench.fit([bench.calmer(base, iterations)])[0]
     report(stage, 2, 2, f"{1e3 * rms(bench.gaps(base, 'train')):.2f} mm")
     return base
 
@@ -166,15 +169,10 @@ def _chain_or(bench: Bench, smooth: Fitted, rope: Refinement, sides: Sequence[Fi
     found = bench.fit([replace(side, start=bench.starts["train"]) for side in sides])
     best = min(found, key=lambda f: f.point.cost)
     # Each in its own measure of what can be known.
-    if best.point.cost / bench.level < _BETTER * smooth.point.cost / level and not _lost(bench, best, before):
+    if best.point.cost / bench.level < _BETTER * smooth.point.cost / level and not bench.astray(best, before):
         return best
     bench.use(rope)
     return smooth
-
-
-def _lost(bench: Bench, fitted: Fitted, before: np.ndarray) -> bool:
-    """Return whether a model goes astray in a trial whose gap another one kept as small as `before` [m], shape (B,)."""
-    return not bool((bench.gaps(fitted, "all") < _ASTRAY * np.maximum(before, bench.level)).all())
 
 
 def go_on(bench: Bench, given: Saved, iterations: int, report: Callback) -> Fitted:

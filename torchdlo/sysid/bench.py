@@ -20,6 +20,12 @@ Callback = Callable[[str, int, int, str], None]
 SILENT = 1.3
 """Times the floor: below, there is nothing left to look for."""
 
+AHEAD = 0.1
+"""How far steps look ahead where they fail otherwise, see `torchdlo.scene.Scene`."""
+
+_ASTRAY = 3.0
+"""Times the gap of another model from which a simulation has gone astray."""
+
 CHAIN = "link_chain"
 """What a chain of links does that a rope does not: candidate number 0, fitted before any effect is considered."""
 
@@ -89,6 +95,15 @@ class Bench:
     def gaps(self, fitted: Fitted, split: str) -> np.ndarray:
         """Return the gap of each trial of a split [m], frames weighted by what they tell."""
         return floors.gap(self.prediction(fitted, split), self.trials[split], self.starts[split].trust)
+
+    def astray(self, fitted: Fitted, before: np.ndarray) -> bool:
+        """Return whether a model goes astray in a trial whose gap another one kept as small as `before` [m], (B,)."""
+        return not bool((self.gaps(fitted, "all") < _ASTRAY * np.maximum(before, self.level)).all())
+
+    def calmer(self, fitted: Fitted, iterations: int) -> Fit:
+        """Return the job of fitting on with steps that look ahead, which damps what grows from step to step."""
+        job = self.further(fitted, iterations)
+        return replace(job, options=(*job.options, ("ahead", AHEAD)))
 
     def extension(self, base: Fitted, score: Score, numbers: Sequence[str], iterations: int, frames: int | None) -> Fit:
         """Return the job of fitting a model with one effect more, from the best of several starts.

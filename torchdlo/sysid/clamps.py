@@ -27,6 +27,11 @@ def soft(bench: Bench, base: Fitted) -> bool:
     return bends and NAME not in base.effects and rms(bench.gaps(base, "all")) > SILENT * bench.level
 
 
+def firm(base: Fitted, job: Fit) -> Fit:
+    """Return the job of fitting the model without, likewise with clamps that hold the rope up to their last marker."""
+    return replace(job, options=(*base.options, ("grip", 1.0)))
+
+
 def stiff(bench: Bench, base: Fitted, score: Score, iterations: int, frames: int | None) -> Fit:
     """Return the job of fitting elastic clamps that hold the rope stiffly up to their last marker.
 
@@ -42,4 +47,4 @@ def stiff(bench: Bench, base: Fitted, score: Score, iterations: int, frames: int
     bend = base.values[model.parameters.index("bending_stiffness")]
     starts = tuple(({number: bend / (share * apart)}, base.point.raw) for share in _SHARES)
     job = bench.extension(base, replace(score, starts=starts), [number], iterations, frames)
-    return replace(job, options=(*job.options, ("grip", 1.0)))
+    return firm(base, job)

@@ -9,9 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -19,15 +17,14 @@ from torchdlo.errors import InputError
 from torchdlo.sysid import baseline as baselines
 from torchdlo.sysid import clamps, health, library, plan
 from torchdlo.sysid.bench import SILENT, Bench, Callback
-from torchdlo.sysid.floor import Floor, gap, rms
-from torchdlo.sysid.health import Fault
+from torchdlo.sysid.floor import gap, rms
 from torchdlo.sysid.journal import Journal
-from torchdlo.sysid.model import RopeModel
 from torchdlo.sysid.plan import BUDGETS, Budget
 from torchdlo.sysid.pool import Fit, Fitted, Pool
 from torchdlo.sysid.recording import Recording
 from torchdlo.sysid.saved import Saved
 from torchdlo.sysid.screen import Score, screen
+from torchdlo.sysid.verdict import Candidate, Diagnosis
 
 PAYS = 0.15
 """Share of the excess gap that an effect has to close, on the train and on the test trials."""
@@ -46,60 +43,6 @@ SHORT = 0.6
 
 TIE = 0.05
 """Fits whose gaps differ by less than this share of the excess, or of the floor, are not told apart."""
-
-
-@dataclass(frozen=True, eq=False)
-class Candidate:
-    """What became of one effect in one round."""
-
-    name: str
-    """The effect."""
-    score: float
-    """Share of the residual that its doses explain."""
-    gain: float | None
-    """Share of the train trials' excess gap that it closes after the fit; None if it was not fitted."""
-    heldout_gain: float | None
-    """The same on the test trials."""
-    reason: str
-    """Why it was taken or left."""
-
-
-@dataclass(eq=False)
-class Diagnosis:
-    """What was found."""
-
-    verdict: str
-    """"none", "effects", "partial" or "unknown"."""
-    effects: list[str]
-    """Names of the missing effects, in the order in which they were found."""
-    ties: dict[str, list[str]]
-    """By effect: others that the data cannot tell from it."""
-    shares: dict[str, float]
-    """By effect: share of the gap above the floor that it closed on the test trials."""
-    baseline: Fitted
-    """The calibrated baseline."""
-    final: Fitted
-    """The model with the effects."""
-    floor: Floor
-    """What no effect explains, on the test trials."""
-    before: np.ndarray
-    """Gap of each test trial with the baseline [m]."""
-    after: np.ndarray
-    """Gap of each test trial with the effects [m]."""
-    candidates: list[list[Candidate]]
-    """By round."""
-    predictions: dict[str, dict[str, np.ndarray]]
-    """Simulated markers [m] of "before" and "after", by trial name, shape (F, M, 3)."""
-    model: RopeModel
-    """The model with the effects."""
-    seconds: float = 0.0
-    """Time that it took."""
-    notes: list[str] = field(default_factory=list)
-    """Sentences that a reader should know."""
-    health: list[Fault] = field(default_factory=list)
-    """What is wrong with the data."""
-    options: dict[str, Any] = field(default_factory=dict)
-    """What was asked for."""
 
 
 def diagnose(
@@ -179,8 +122,9 @@ class _Search:
             best, rival, candidates, rivals = self._round(base, names, f"round {len(rounds) + 1}")
             rounds.append(candidates)
             if best is None:
-                if shares and rival is not base:
+                if rival is not base and (shares or rival.options != base.options):
                     base = rival
+                    self.pool.choose(**dict(base.options))
                 break
             name, old = best.effects[-1], self._squared(base)
             self.pool.choose(**dict(best.options))
@@ -224,14 +168,14 @@ class _Search:
         )
         soft = [s for s in scores[self.budget.candidates :] if s.name == clamps.NAME and clamps.soft(self.bench, base)]
         fits, led, rival, worst = self._fits(base, [*scores[: self.budget.candidates], *soft], stage)
-        self.bench.predict([base, rival, *fits.values()])
+        fits = self._calmed(base, fits, led, stage)
+        self.bench.predict([rival])
         first = min(led, key=lambda name: fits[name].point.cost)
         if rms(self.bench.gaps(fits[first], "all")) > SILENT * self.bench.level:
             # Something is left: one that does alike things may be right, however little its doses explain.
             kin = [s for s in scores if s.name not in fits and any({s.name, first} <= k for k in library.KIN)]
             more, also = self._fits_of_kin(base, kin, worst, f"{stage}, effects like {first}") if kin else ({}, [])
-            self.bench.predict([*more.values()])
-            fits, led = fits | more, led + also
+            fits, led = fits | self._calmed(base, more, also, stage), led + also
         return self._judged(scores, fits, sorted(led, key=lambda name: fits[name].point.cost), rival)
 
     def _fits(
@@ -242,13 +186,18 @@ class _Search:
         Also return their fair rival, which is the baseline that was fitted for as long, and a cost of short fits that
         does not close half as much as the best of them.
         """
-        *short, alone = self._fitted([*(self._candidate(base, s) for s in scores), self._further(base, base)], stage)
-        lead = self._leaders(short, alone)
-        worst = 0.5 * (alone.point.cost + min(f.point.cost for f in (*short, alone)))
-        *further, rival = self._fitted([self._further(base, f) for f in (*(short[k] for k in lead), alone)], stage)
+        rivals = [self._further(base, base)]
+        if clamps.soft(self.bench, base):
+            rivals.append(clamps.firm(base, rivals[0]))
+        found = self._fitted([*(self._candidate(base, s) for s in scores), *rivals], stage)
+        short, alone = found[: len(scores)], sorted(found[len(scores) :], key=lambda f: f.point.cost)
+        lead = self._leaders(short, alone[0])
+        worst = 0.5 * (alone[0].point.cost + min(f.point.cost for f in found))
+        further = self._fitted([self._further(base, f) for f in (*(short[k] for k in lead), *alone)], stage)
+        further, rival = further[: len(lead)], min((base, *further[len(lead) :]), key=lambda f: f.point.cost)
         fits = {s.name: f for s, f in zip(scores, short, strict=True)}
         names = [scores[k].name for k in lead]
-        return fits | dict(zip(names, further, strict=True)), names, min(rival, base, key=lambda f: f.point.cost), worst
+        return fits | dict(zip(names, further, strict=True)), names, rival, worst
 
     def _fits_of_kin(
         self, base: Fitted, scores: Sequence[Score], worst: float, stage: str
@@ -259,6 +208,16 @@ class _Search:
         names = [name for name, fitted in fits.items() if fitted.point.cost < worst]
         further = self._fitted([self._further(base, fits[name]) for name in names], stage) if names else []
         return fits | dict(zip(names, further, strict=True)), names
+
+    def _calmed(self, base: Fitted, fits: dict[str, Fitted], led: Sequence[str], stage: str) -> dict[str, Fitted]:
+        """Return fits, those that lead with steps that look ahead where simulations go astray otherwise."""
+        self.bench.predict([base, *fits.values()])
+        astray = [n for n in led if self.bench.astray(fits[n], self.bench.gaps(base, "all"))]
+        if not astray or dict(base.options).get("ahead"):
+            return fits
+        again = self._fitted([self.bench.calmer(fits[n], self.budget.more) for n in astray], f"{stage}, looking ahead")
+        self.bench.predict(again)
+        return fits | dict(zip(astray, again, strict=True))
 
     def _judged(
         self, scores: Sequence[Score], fits: dict[str, Fitted], order: Sequence[str], rival: Fitted

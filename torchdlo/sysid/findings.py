@@ -7,13 +7,13 @@ from typing import Any
 
 from torchdlo.physics.effects import EFFECTS
 from torchdlo.sysid import fit, saved
-from torchdlo.sysid.diagnose import Diagnosis
 from torchdlo.sysid.floor import rms
 from torchdlo.sysid.journal import digest
 from torchdlo.sysid.laws import law, separating
 from torchdlo.sysid.localise import localise
 from torchdlo.sysid.recording import Recording
 from torchdlo.sysid.result import dump, versions
+from torchdlo.sysid.verdict import Diagnosis
 
 __all__ = ["absorbed", "confidence", "findings", "findings_json", "model_json", "sentence"]
 

@@ -1,0 +1,67 @@
+"""What a diagnosis found."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from torchdlo.sysid.floor import Floor
+from torchdlo.sysid.health import Fault
+from torchdlo.sysid.model import RopeModel
+from torchdlo.sysid.pool import Fitted
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """What became of one effect in one round."""
+
+    name: str
+    """The effect."""
+    score: float
+    """Share of the residual that its doses explain."""
+    gain: float | None
+    """Share of the train trials' excess gap that it closes after the fit; None if it was not fitted."""
+    heldout_gain: float | None
+    """The same on the test trials."""
+    reason: str
+    """Why it was taken or left."""
+
+
+@dataclass(eq=False)
+class Diagnosis:
+    """What was found."""
+
+    verdict: str
+    """"none", "effects", "partial" or "unknown"."""
+    effects: list[str]
+    """Names of the missing effects, in the order in which they were found."""
+    ties: dict[str, list[str]]
+    """By effect: others that the data cannot tell from it."""
+    shares: dict[str, float]
+    """By effect: share of the gap above the floor that it closed on the test trials."""
+    baseline: Fitted
+    """The calibrated baseline."""
+    final: Fitted
+    """The model with the effects."""
+    floor: Floor
+    """What no effect explains, on the test trials."""
+    before: np.ndarray
+    """Gap of each test trial with the baseline [m]."""
+    after: np.ndarray
+    """Gap of each test trial with the effects [m]."""
+    candidates: list[list[Candidate]]
+    """By round."""
+    predictions: dict[str, dict[str, np.ndarray]]
+    """Simulated markers [m] of "before" and "after", by trial name, shape (F, M, 3)."""
+    model: RopeModel
+    """The model with the effects."""
+    seconds: float = 0.0
+    """Time that it took."""
+    notes: list[str] = field(default_factory=list)
+    """Sentences that a reader should know."""
+    health: list[Fault] = field(default_factory=list)
+    """What is wrong with the data."""
+    options: dict[str, Any] = field(default_factory=dict)
+    """What was asked for."""
