@@ -29,8 +29,11 @@ _BETTER = 0.9
 _CALMER = 0.7
 """Share of the cost that is left where steps have to look ahead, which makes them less exact."""
 
+_UNDECIDED = 1.5
+"""Share of the cost up to which clamps may hold the rope to their ends, although others fit better."""
+
 _FIRMER = 0.95
-"""The same for clamps once an effect is known: those in which the rope bends were taken without need."""
+"""Share of the cost that is left where clamps are found to do so once an effect is known."""
 
 _ROUND = 0.75
 """Twisting over bending stiffness of a round rope of one material."""
@@ -90,15 +93,24 @@ def calibrate(bench: Bench, count: int, iterations: int, rng: np.random.Generato
     if calm and others[0].point.cost < _CALMER * min(smooth.point.cost, side.point.cost):
         bench.pool.choose(ahead=AHEAD)
         smooth, side = others[0], _moved(side, others[0])
-    if firm and others[-1].point.cost < _BETTER * min(smooth.point.cost, side.point.cost):
-        bench.pool.choose(grip=1.0)
-        smooth, side = others[-1], _moved(side, others[-1])
+    if firm:
+        smooth, side = _held(bench, others[-1], smooth, side)
     rope = bench.correct(smooth)
     better = fit([plain(smooth.values[None], iterations, None)], 3)[0]
     if side.point.cost < _BETTER * smooth.point.cost:
         better = _chain_or(bench, better, rope, [chain(side.values[None], iterations, None)])
     report(stage, 4, 4, f"{1e3 * rms(bench.gaps(better, 'train')):.2f} mm")
     return better
+
+
+def _held(bench: Bench, firm: Fitted, smooth: Fitted, side: Fitted) -> tuple[Fitted, Fitted]:
+    """Return a smooth rope and a chain in the clamps that fit better: those that hold it to their ends, or others."""
+    least = min(smooth.point.cost, side.point.cost)
+    bench.undecided = _BETTER * least <= firm.point.cost < _UNDECIDED * least
+    if firm.point.cost >= _BETTER * least:
+        return smooth, side
+    bench.pool.choose(grip=1.0)
+    return firm, _moved(side, firm)
 
 
 def _moved(side: Fitted, smooth: Fitted) -> Fitted:
@@ -137,7 +149,7 @@ def go_further(bench: Bench, base: Fitted, iterations: int, report: Callback) ->
     stage, effects, free = "fitting all numbers again", (*base.effects, CHAIN), (*names, f"{CHAIN}.length")
     report(stage, 0, 2, "")
     jobs = [Fit(base.effects, values, names, sizes, iterations, bench.starts["train"])]
-    if model.mesh.clamps and not bench.pool.local.options["grip"]:
+    if bench.undecided and not bench.pool.local.options["grip"]:
         jobs.append(replace(jobs[0], options=(("grip", 1.0),)))
     base, *firm = bench.fit(jobs)
     if firm and firm[0].point.cost < _FIRMER * base.point.cost:

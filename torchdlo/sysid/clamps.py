@@ -22,8 +22,8 @@ _SHARES = (0.2, 0.5, 1.5)
 
 
 def soft(bench: Bench, base: Fitted) -> bool:
-    """Return whether the rope bends between the markers of clamps in a model that leaves something to be explained."""
-    bends = bool(bench.pool.local.model(()).mesh.clamps) and not dict(base.options).get("grip", 1.0)
+    """Return whether clamps may be stiff that are not in a model which leaves something to be explained."""
+    bends = bench.undecided and not dict(base.options).get("grip", 1.0)
     return bends and NAME not in base.effects and rms(bench.gaps(base, "all")) > SILENT * bench.level
 
 
