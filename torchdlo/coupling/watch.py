@@ -54,7 +54,9 @@ def missed(scene: Any, params: Any, rods: RodState, before: Tensor) -> Tensor:
             contact = torch.maximum(contact, e.shortfall(rods.pos, params.effects[e.name]))
     if scene.constrained:
         short = torch.maximum(short, _shortened(scene, params, rods))
-    return torch.cat([contact, short], -1)
+    # A state may have been given a batch in some of its parts only.
+    batch = torch.broadcast_shapes(contact.shape[:-2], short.shape[:-2])
+    return torch.cat([x.expand(*batch, *x.shape[-2:]) for x in (contact, short)], -1)
 
 
 @torch.no_grad()
