@@ -27,6 +27,7 @@ def batch(scenes: int) -> int:
 def record(step: Callable[..., Any], *inputs: Any) -> Callable[..., Any]:
     """Return a function that does what `step` does to trees of tensors of the same shapes as `inputs`.
 
+    Its first argument is read once for as long as it is the same object; give it a new one rather than change it.
     Whatever `step` captures besides its arguments stays as it is now, and so does every choice that Python makes.
     """
     leaves, build = tree.flatten(inputs)

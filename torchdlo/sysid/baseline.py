@@ -8,9 +8,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from torchdlo.sysid.bench import AHEAD, CHAIN, SILENT, Bench, Callback
+from torchdlo.sysid.bench import CHAIN, SILENT, Bench, Callback
 from torchdlo.sysid.floor import Refinement, rms
-from torchdlo.sysid.model import RopeModel
+from torchdlo.sysid.model import AHEAD, RopeModel
 from torchdlo.sysid.pool import Fit, Fitted
 from torchdlo.sysid.saved import Saved
 

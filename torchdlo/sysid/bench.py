@@ -10,8 +10,9 @@ import numpy as np
 from torchdlo.errors import InputError
 from torchdlo.sysid import floor as floors
 from torchdlo.sysid import start as starts
+from torchdlo.sysid.model import AHEAD
 from torchdlo.sysid.motion import Start
-from torchdlo.sysid.pool import Fit, Fitted, Pool
+from torchdlo.sysid.pool import Fit, Fitted, Pool, spread
 from torchdlo.sysid.screen import Score
 
 Callback = Callable[[str, int, int, str], None]
@@ -19,9 +20,6 @@ Callback = Callable[[str, int, int, str], None]
 
 SILENT = 1.3
 """Times the floor: below, there is nothing left to look for."""
-
-AHEAD = 0.1
-"""How far steps look ahead where they fail otherwise, see `torchdlo.scene.Scene`."""
 
 _ASTRAY = 3.0
 """Times the gap of another model from which a simulation has gone astray."""
@@ -80,11 +78,8 @@ class Bench:
         """Simulate all trials with several models at once, for `gaps` and `prediction` to look up."""
         new = [f for f in fits if _key(f) not in self._known]
         # Models that settle twists take longer than others, which all fit into one batch.
-        alike: dict[Hashable, list[Fitted]] = {}
-        for fitted in new:
-            alike.setdefault((self.pool.local.framed(fitted.effects), fitted.options), []).append(fitted)
-        count = self.pool.workers
-        groups = [some for group in alike.values() for k in range(count) if (some := group[k::count])]
+        kinds = [(self.pool.local.framed(f.effects), f.options) for f in new]
+        groups = [[new[k] for k in group] for group in spread(kinds, self.pool.workers)]
         for k, sims in self.pool.simulate([self.pool.local.joined(g, "all", self.starts["all"]) for g in groups]):
             self._known |= {_key(f): sim for f, sim in zip(groups[k], sims, strict=True)}
 

@@ -39,7 +39,7 @@ MAX_SUBSTEP = 5e-3
 _STRETCH = 1e4
 """Axial stiffness [N]: a strain of 1e-4 at 1 N. Real cables are near it, and taut trials stay solvable."""
 
-_AHEAD = 0.1
+AHEAD = 0.1
 """How far steps look ahead: real ropes are jerked taut, and what then rings within a substep must die out."""
 
 _CHUNK = 64
@@ -60,7 +60,7 @@ class RopeModel:
         rest: str = "straight",
         effects: Sequence[str] = (),
         substep: float = MAX_SUBSTEP,
-        ahead: float = _AHEAD,
+        ahead: float = AHEAD,
         grip: float = 1.0,
         compiled: bool | None = None,
         threads: int = 1,

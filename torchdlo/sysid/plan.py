@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from torchdlo.sysid.model import AHEAD
 from torchdlo.sysid.recording import Recording, Trial
 
 
@@ -50,7 +51,7 @@ def options(recording: Recording, vertices: int | None) -> dict[str, Any]:
         "vertices": vertices or _vertices(recording),
         "rest": "straight" if recording.rest_positions is None else "given",
         # What rings when a rope is jerked taut must die out within a substep or two.
-        "ahead": 0.1 if taut else 0.0,
+        "ahead": AHEAD if taut else 0.0,
         "grip": 0.0,
         "compiled": False,
     }

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import multiprocessing
 import os
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Hashable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass, replace
 from functools import partial
@@ -198,6 +198,14 @@ def _search(job: Fit, space: Space, columns: Sequence[int], measured: np.ndarray
     return Fitted(job.effects, full(space.to_values(best.raw)[None])[0], space, best)
 
 
+def spread(kinds: Sequence[Hashable], workers: int) -> list[list[int]]:
+    """Return indices of jobs by their kinds, those of each kind in as many groups as there are workers."""
+    alike: dict[Hashable, list[int]] = {}
+    for k, kind in enumerate(kinds):
+        alike.setdefault(kind, []).append(k)
+    return [some for group in alike.values() for n in range(workers) if (some := group[n::workers])]
+
+
 class Pool:
     """Worker processes that keep their models."""
 
@@ -260,11 +268,8 @@ class Pool:
 
     def groups(self, jobs: Sequence[Fit]) -> list[list[int]]:
         """Return the indices of the fits that run together: alike ones, spread over the workers."""
-        kinds: dict[Any, list[int]] = {}
-        for k, job in enumerate(jobs):
-            kind = id(job.start), job.frames, self._whole(job.options), self.local.framed(job.effects)
-            kinds.setdefault(kind, []).append(k)
-        return [some for alike in kinds.values() for n in range(self.workers) if (some := alike[n :: self.workers])]
+        kinds = [(id(j.start), j.frames, self._whole(j.options), self.local.framed(j.effects)) for j in jobs]
+        return spread(kinds, self.workers)
 
     def run(self, what: Callable[[Models, Job], Any], jobs: Sequence[Job]) -> Iterator[tuple[int, Any]]:
         """Yield the index and the result of `what` for every job as they get ready.
