@@ -60,6 +60,7 @@ def fake_diagnosis(recording: Recording, **fields: Any) -> Diagnosis:
             "shares": {"air_drag": 0.93},
             "baseline": fitted(BASELINE),
             "final": fitted(numbers, ("air_drag",)),
+            "drifts": np.full((2, len(numbers)), 0.01),
             "floor": Floor(3e-4, 1e-4, 2e-4),
             "before": gaps[0],
             "after": gaps[1],

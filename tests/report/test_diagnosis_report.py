@@ -89,7 +89,15 @@ def test_tags_are_closed(page: Path) -> None:
 def test_verdicts_without_a_name_have_a_page_too(rope: Recording, verdict: str, said: str) -> None:
     found = fake_diagnosis(rope)
     none = replace(
-        found, verdict=verdict, effects=[], ties={}, shares={}, final=found.baseline, after=found.before, candidates=[]
+        found,
+        verdict=verdict,
+        effects=[],
+        ties={},
+        shares={},
+        final=found.baseline,
+        drifts=found.drifts[:, : len(found.baseline.space.names)],
+        after=found.before,
+        candidates=[],
     )
     text = diagnosis_html(none, rope)
     assert said in text and "What was found</h2>" not in text and "What calibration had absorbed" not in text

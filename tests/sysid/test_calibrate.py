@@ -210,6 +210,23 @@ def test_levenberg_marquardt_finds_the_minimum_of_a_known_curve() -> None:
 
 
 @pytest.mark.slow
+def test_ranges_take_in_what_wrong_simulations_change() -> None:
+    space = fit.Space(("damping_rate",), (PARAMETERS["damping_rate"],))
+    time = np.linspace(0.0, 1.0, 20)[None, :, None, None] * np.ones((3, 1, 1, 3))
+
+    def slide(values: np.ndarray) -> np.ndarray:  # 1 mm a second for each unit of the coordinate
+        return 1e-3 * space.to_raw(values)[:, 0, None, None, None, None] * time
+
+    raw = space.to_raw(np.array([[0.8]]))
+    look, measured = fit.Look(space, raw), slide(np.array([[0.8]]))[0]
+    (point,) = look.points(slide(look.values), measured)
+    drifts = fit.drift(look, slide(look.values), measured, [2e-5 * time, 0.0 * time])
+    # Simulations that run 2 % of a unit too fast make the fit find so much less.
+    np.testing.assert_allclose(drifts, [[-0.02], [0.0]], atol=1e-5)
+    (low,), (high,) = fit.interval(point, space, drifts)
+    assert np.log([low, high]) == pytest.approx(np.log(0.8) + 1.645 * np.array([-0.02, 0.02]), abs=1e-4)
+
+
 def test_the_sample_recording_is_predicted_far_better_than_by_a_catenary() -> None:
     result = calibrate(load_recording(SAMPLE), starts=12, iterations=4)
     assert result.test_mae_mm < 3.0 < 0.2 * result.baselines["catenary"]["test_mae_mm"]

@@ -145,6 +145,9 @@ def go_further(bench: Bench, base: Fitted, iterations: int, report: Callback) ->
         back[twist] = _ROUND * back[bend]
         values = np.stack([base.values, back])
     before = bench.gaps(base, "all")
+    if not bench.starts["train"].still.all():
+        # What moves at the start was estimated without the effect.
+        bench.begin(base.values, base.effects)
     rope, names, sizes = bench.correct(base), base.space.names, tuple(base.space.units)
     stage, effects, free = "fitting all numbers again", (*base.effects, CHAIN), (*names, f"{CHAIN}.length")
     report(stage, 0, 2, "")

@@ -10,9 +10,10 @@ import numpy as np
 from torchdlo.errors import InputError
 from torchdlo.sysid import floor as floors
 from torchdlo.sysid import start as starts
+from torchdlo.sysid.fit import Look, drift
 from torchdlo.sysid.model import AHEAD
 from torchdlo.sysid.motion import Start
-from torchdlo.sysid.pool import Fit, Fitted, Pool, spread
+from torchdlo.sysid.pool import Fit, Fitted, Pool, Simulation, spread
 from torchdlo.sysid.screen import Score
 
 Callback = Callable[[str, int, int, str], None]
@@ -47,6 +48,7 @@ class Bench:
         """What no effect explains, on the test trials, as far as it is known."""
         self.level = float("inf")
         """What `gaps` are for a perfect model [m]."""
+        self._finer: floors.Refinement | None = None
         self._known: dict[Hashable, np.ndarray] = {}
 
     def begin(self, base: np.ndarray, effects: Sequence[str]) -> None:
@@ -67,7 +69,7 @@ class Bench:
     def use(self, found: floors.Refinement) -> None:
         """Correct simulations from now on by this."""
         train, free = len(self.trials["train"]), ~self.trials["all"][0].gripped
-        self.floor = found.floor(slice(train, None), free)
+        self.floor, self._finer = found.floor(slice(train, None), free), found
         trust, self.level = found.trust(free)
         start = replace(self.starts["all"], finer=found.correction, trust=trust)
         rows = np.arange(len(start.pos))
@@ -148,6 +150,18 @@ class Bench:
         space, start = found.space, self.starts["train"]
         values, sizes = found.values[None], tuple(space.units)
         return Fit(found.effects, values, space.names, sizes, iterations, start, frames, None, found.options)
+
+    def drift(self, fitted: Fitted) -> np.ndarray:
+        """Return what simulations get wrong by their steps and by their mesh in a fit's coordinates, shape (2, K)."""
+        look, start = Look(fitted.space, fitted.point.raw[None]), self.starts["train"]
+        model = self.pool.local.model(fitted.effects)
+        rows = np.repeat(fitted.values[None], len(look.values), 0)
+        rows[:, [model.parameters.index(n) for n in fitted.space.names]] = look.values
+        ((_, sims),) = self.pool.simulate([Simulation(fitted.effects, rows, "train", start, fitted.options)])
+        trust = 1.0 if start.trust is None else start.trust[..., None, None]
+        measured = self.pool.local.motion(model, "train").markers
+        errors = [np.nan_to_num(e[: len(measured)]) for e in self._finer.unsure]
+        return drift(look, trust * sims, trust * measured, [trust * e for e in errors])
 
     def fit(self, jobs: Sequence[Fit]) -> list[Fitted]:
         """Return the results of fits in their order.

@@ -340,6 +340,7 @@ class _Search:
             rounds,
             predictions,
             self.pool.local.model(final.effects),
+            self.bench.drift(final),
             notes=baselines.notes(self.baseline),
         )
 

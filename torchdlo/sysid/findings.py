@@ -61,7 +61,9 @@ def findings(result: Diagnosis, recording: Recording) -> dict[str, Any]:
 def _numbers(result: Diagnosis) -> dict[str, dict[str, Any]]:
     """Return the fitted numbers with their ranges."""
     space, point = result.final.space, result.final.point
-    rows = zip(space.names, space.to_values(point.raw), *fit.interval(point, space), space.params, strict=True)
+    rows = zip(
+        space.names, space.to_values(point.raw), *fit.interval(point, space, result.drifts), space.params, strict=True
+    )
     return {
         name: {"value": float(v), "low": float(min(a, b)), "high": float(max(a, b)), "unit": p.unit}
         for name, v, a, b, p in rows

@@ -222,23 +222,50 @@ def _step(point: Point, damping: float, space: Space) -> np.ndarray:
     return space.clip(point.raw + step / max(1.0, float(np.abs(step / space.limits()).max())))
 
 
-def interval(point: Point, space: Space) -> tuple[np.ndarray, np.ndarray]:
-    """Return 90 % limits of the values, shape (K,) each, by leaving out one trial at a time (linearised jackknife).
+def drift(look: Look, sims: np.ndarray, measured: np.ndarray, errors: Sequence[np.ndarray]) -> np.ndarray:
+    """Return how far the minimum moves when simulations are wrong, shape (E, K): one step of Gauss-Newton.
 
-    With few trials they are rough; what every trial gets wrong in the same way they cannot show.
+    Args:
+        look: at the minimum.
+        sims: simulations of its values, shape (K + 1, B, F, M, 3) [m].
+        measured: markers, shape (B, F, M, 3) [m].
+        errors: E ways in which simulations may be wrong, shape (B, F, M, 3) each [m].
+    """
+    here, *others = (look.points(sims, measured - e)[0] for e in (0.0, *errors))
+    curvature = _firm(here.curvature.sum(0))
+    return np.array([np.linalg.solve(curvature, (here.gradient - p.gradient).sum(0)) for p in others])
+
+
+def _firm(curvature: np.ndarray) -> np.ndarray:
+    """Return a curvature (K, K) that can be inverted."""
+    return curvature + (1e-9 * np.trace(curvature) + 1e-12) * np.eye(len(curvature))
+
+
+def interval(point: Point, space: Space, drifts: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """Return 90 % limits of the values, shape (K,) each.
+
+    How trials differ says how far the minimum may be off (linearised jackknife, leaving out one trial at a time). What
+    every trial gets wrong in the same way that cannot show.
+
+    Args:
+        point: the minimum.
+        space: its numbers.
+        drifts: standard deviations that all trials have in common, shape (E, K).
     """
     trials = len(point.gradient)
     if trials < 2:
         return np.array([p.low for p in space.params]), np.array([p.high for p in space.params])
-    curvature = point.curvature.sum(0)
-    ridge = 1e-9 * np.trace(curvature) * np.eye(len(point.raw)) + 1e-12 * np.eye(len(point.raw))
-    moves = np.linalg.solve(curvature + ridge, point.gradient.T).T
+    moves = np.linalg.solve(_firm(point.curvature.sum(0)), point.gradient.T).T
     # Without trial b the minimum moves by moves[b] n / (n - 1); their scatter times (n - 1)^2 / n is the variance.
     deviation = np.sqrt(trials / (trials - 1) * ((moves - moves.mean(0)) ** 2).sum(0))
     quantile = _STUDENT_95[min(trials - 1, len(_STUDENT_95)) - 1]
-    reach = np.minimum(quantile * deviation, 10.0)
+    common = 0.0 if drifts is None else _NORMAL_95 * np.linalg.norm(drifts, axis=0)
+    reach = np.minimum(np.hypot(quantile * deviation, common), 10.0)
     return space.to_values(point.raw - reach), space.to_values(point.raw + reach)
 
 
 _STUDENT_95 = (6.31, 2.92, 2.35, 2.13, 2.02, 1.94, 1.89, 1.86, 1.83, 1.81, 1.80, 1.78, 1.77, 1.76, 1.75, 1.70)
 """95 % quantiles of Student's t for 1, 2, ... degrees of freedom."""
+
+_NORMAL_95 = 1.645
+"""95 % quantile of the normal distribution."""

@@ -97,7 +97,7 @@ class Refinement:
         return 1 / (2**self.order - 1), 1 / 3
 
     @property
-    def _unsure(self) -> tuple[np.ndarray, np.ndarray]:
+    def unsure(self) -> tuple[np.ndarray, np.ndarray]:
         """What may be wrong with corrections [m], shape (B, F, M, 3) each: what was extrapolated.
 
         How a chain's errors go with its links is not known that well.
@@ -122,7 +122,7 @@ class Refinement:
             free: which markers are not held.
         """
         parts = []
-        for unsure in self._unsure:
+        for unsure in self.unsure:
             known = np.isfinite(unsure).all((1, 2, 3))
             chosen = unsure[trials][known[trials]] if known[trials].any() else unsure[known]
             parts.append(float(np.sqrt(np.mean(chosen[:, :, free] ** 2))) if known.any() else float("inf"))
@@ -135,7 +135,7 @@ class Refinement:
         weights have a mean of 1.
         """
         with np.errstate(invalid="ignore"):
-            unsure = sum(np.mean(part[:, :, free] ** 2, (2, 3)) for part in self._unsure)
+            unsure = sum(np.mean(part[:, :, free] ** 2, (2, 3)) for part in self.unsure)
         known = np.isfinite(unsure).all(1)
         if not known.any():
             return np.ones(unsure.shape), float("inf")

@@ -57,6 +57,8 @@ class Diagnosis:
     """Simulated markers [m] of "before" and "after", by trial name, shape (F, M, 3)."""
     model: RopeModel
     """The model with the effects."""
+    drifts: np.ndarray
+    """What the simulation's own errors change of the final model's coordinates, shape (2, K): of steps, of the mesh."""
     seconds: float = 0.0
     """Time that it took."""
     notes: list[str] = field(default_factory=list)
