@@ -171,6 +171,10 @@ def optimize(
     robust: Annotated[
         bool, typer.Option("--robust", help="Play each trajectory from several starts that grow apart.")
     ] = False,
+    rope: Annotated[
+        Path | None,
+        typer.Option(help="What ropes are made of: model.json of a calibration or diagnosis.", metavar="MODEL"),
+    ] = None,
     double: Annotated[bool, typer.Option("--double", help="Physics in double precision.")] = False,
     compiled: Annotated[bool, typer.Option(help="Compile the step: slow at first, then many times faster.")] = True,
     resume: Annotated[
@@ -196,12 +200,13 @@ def optimize(
     from torchdlo.agents.search import Robust
     from torchdlo.agents.search import optimize as search
     from torchdlo.agents.tasks import problem
+    from torchdlo.describe import cable
     from torchdlo.report.learning import learning_png
 
     out = out or Path("runs") / "optimize" / f"{task}-{method}"
     for name in ("result.json", "trajectory.json", "curve.png"):
         check_writable(out / name)
-    chosen = problem(task, double=double, compiled=compiled)
+    chosen = problem(task, None if rope is None else cable(rope), double=double, compiled=compiled)
     given = {"episodes": episodes, "population": population, "robust": Robust() if robust else None, "seed": seed}
     settings = preset(task, method, **given)
     try:

@@ -5,14 +5,21 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+import pytest
+from test_cable import write
+
 from torchdlo.envs import TASKS
 
 PAGE = Path(__file__).parents[2] / "docs" / "tasks.md"
 
 
-def test_examples_of_the_page_run() -> None:
+def test_examples_of_the_page_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    model = tmp_path / "runs" / "diagnose" / "my_rope" / "model.json"
+    model.parent.mkdir(parents=True)
+    write(model, ("air_drag",))
+    monkeypatch.chdir(tmp_path)
     blocks = re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.DOTALL)
-    assert len(blocks) == 3
+    assert len(blocks) == 4
     found: dict = {"__name__": "page"}
     for block in blocks:
         exec(compile(block, str(PAGE), "exec", dont_inherit=True), found)

@@ -157,6 +157,7 @@ def test_a_malformed_scene_is_refused_by_name(case):
         build()
 
 
+DAMPED = {"bending_damping": {"coefficient": 1e-3}}
 UNSTABLE = {
     "bending": (effects("bend"), {"dt": 0.5, "substeps": 1}, {}),
     "stretching": (
@@ -166,6 +167,7 @@ UNSTABLE = {
     ),
     "twisting": (effects("bend", "twist"), {"dt": 0.02, "substeps": 1, "twist": "dynamic"}, {"twist": 1e-2}),
     "table contact": (effects("bend", "table"), {"dt": 0.008, "substeps": 1}, {}),
+    "bending damping": (effects("bend", "bending_damping"), {"dt": 0.05, "substeps": 1, "values": DAMPED}, {}),
 }
 
 

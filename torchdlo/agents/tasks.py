@@ -3,23 +3,29 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from torchdlo.agents.problem import Outcome
-from torchdlo.envs import episode, find
+from torchdlo.envs import Cable, episode, find
 from torchdlo.envs.task import Task
 from torchdlo.errors import InputError
 
 __all__ = ["TaskProblem", "problem"]
 
 
-def problem(name: str, **choices: Any) -> TaskProblem:
-    """Return the problem of a task by its name; `choices` are fields of `TaskProblem`."""
-    return TaskProblem(find(name), **choices)
+def problem(name: str, rope: Cable | None = None, **choices: Any) -> TaskProblem:
+    """Return the problem of a task by its name, with a rope of its own or a given one.
+
+    Args:
+        name: of the task.
+        rope: see `torchdlo.envs.make`.
+        choices: fields of `TaskProblem`.
+    """
+    return TaskProblem(find(name, rope), **choices)
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +66,8 @@ class TaskProblem:
     @property
     def choices(self) -> dict[str, Any]:
         """What else results depend on."""
-        return {"double": self.double, "compiled": self.compiled, "device": self.device}
+        rope = {} if self.task.rope is None else {"rope": asdict(self.task.rope)}
+        return {"double": self.double, "compiled": self.compiled, "device": self.device} | rope
 
     @property
     def like(self) -> Tensor:

@@ -10,6 +10,7 @@ from __future__ import annotations
 from torchdlo.describe.assembly import Simulation, assemble, build, load
 from torchdlo.describe.files import FORMAT, parse, plain, read, save, text
 from torchdlo.describe.kinds import Body, Box, Description, Hold, Key, Matter, Robot, Rope, Weight
+from torchdlo.describe.model import cable
 
 __all__ = [
     "FORMAT",
@@ -25,6 +26,7 @@ __all__ = [
     "Weight",
     "assemble",
     "build",
+    "cable",
     "load",
     "parse",
     "plain",

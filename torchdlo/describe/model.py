@@ -12,11 +12,12 @@ import torch
 from torch import Tensor
 
 from torchdlo.describe.kinds import Description, Rope
+from torchdlo.envs.cable import Cable
 from torchdlo.errors import InputError
 from torchdlo.physics.build import frame_curvature
 from torchdlo.physics.topology import Topology
 
-__all__ = ["Modelled", "with_models"]
+__all__ = ["Modelled", "cable", "with_models"]
 
 _OF_RECORDINGS = ("time_delay", "marker_offset", "gripper_compliance")
 """Effects of how a rope was measured and clamped, which are not its own."""
@@ -65,22 +66,55 @@ def with_models(d: Description, folder: Path) -> tuple[Description, Modelled | N
             "ropes: the effects of a model act on all ropes of a scene; expected the same model for every rope, given "
             f"{', '.join(sorted(n or 'none' for n in names))}."
         )
-    from torchdlo.sysid import saved
-
     path = folder / d.ropes[0].model
-    model = saved.load(path)
-    said = json.loads(path.read_text(encoding="utf-8"))
+    model, said = _read(path)
     rope, shape = said["rope"], said["rope"].get("rest_positions")
-    if model.options["rest"] == "given" and shape is None:
-        raise InputError(f"{path}: rope.rest_positions: is missing; expected the natural shape of the rope.")
     ropes = tuple(_filled(r, k, path, rope, model.values, said["mesh"]) for k, r in enumerate(d.ropes))
     effects = _effects(d, model, rope, framed=shape is not None)
     twist = d.twist if d.twist != "none" else "quasistatic"
-    given = None
-    if shape is not None:
-        roll, share = (model.values.get(name, usual) for name, usual in (("rest_roll", 0.0), ("rest_share", 1.0)))
-        given = Modelled(_flat(torch.tensor(shape, dtype=torch.float64)), share, roll)
-    return dataclasses.replace(d, ropes=ropes, effects=effects, twist=twist), given
+    return dataclasses.replace(d, ropes=ropes, effects=effects, twist=twist), _shape(shape, model.values)
+
+
+def cable(path: str | Path) -> Cable:
+    """Return what a model file says of a rope, for a task: `envs.make("wiring_post", rope=cable("model.json"))`.
+
+    Left out are twisting, which ropes of tasks do not resist, and what belongs to the recording or to its scene: delay,
+    marker offset, clamps, tilt, the table.
+
+    Raises:
+        InputError: The file is not a model.
+    """
+    model, said = _read(Path(path))
+    rope = said["rope"]
+    shape = _shape(rope.get("rest_positions"), model.values)
+    curvature = () if shape is None else tuple(map(tuple, shape.curvature(len(shape.shape)).tolist()))
+    others = (*_OF_RECORDINGS, "tilted_gravity", "table_friction")
+    effects = tuple(
+        (name, tuple((key, tuple(x) if isinstance(x, list) else (x,)) for key, x in numbers.items()))
+        for name, numbers in _own(model).items()
+        if name not in others
+    )
+    values = model.values
+    return Cable(rope["mass"] / rope["length"], values["bending_stiffness"], values["damping_rate"], effects, curvature)
+
+
+def _read(path: Path) -> tuple[Any, dict[str, Any]]:
+    """Return the model of a file, and the file as it is."""
+    from torchdlo.sysid import saved
+
+    model = saved.load(path)
+    said = json.loads(path.read_text(encoding="utf-8"))
+    if model.options["rest"] == "given" and said["rope"].get("rest_positions") is None:
+        raise InputError(f"{path}: rope.rest_positions: is missing; expected the natural shape of the rope.")
+    return model, said
+
+
+def _shape(points: Any, values: dict[str, float]) -> Modelled | None:
+    """Return the natural shape through measured points, None for none."""
+    if points is None:
+        return None
+    roll, share = (values.get(name, usual) for name, usual in (("rest_roll", 0.0), ("rest_share", 1.0)))
+    return Modelled(_flat(torch.tensor(points, dtype=torch.float64)), share, roll)
 
 
 def _filled(r: Rope, k: int, path: Path, rope: dict[str, Any], values: dict[str, float], mesh: dict[str, Any]) -> Rope:
@@ -117,19 +151,7 @@ def _effects(d: Description, model: Any, rope: dict[str, Any], *, framed: bool) 
         "twist": {},
         "damping": {"rate": model.values["damping_rate"]},
     }
-    for name in model.effects:
-        if name in _OF_RECORDINGS:
-            continue
-        found[name] = {}
-        for key, value in model.values.items():
-            effect, _, number = key.partition(".")
-            if effect != name:
-                continue
-            number, _, part = number.partition(".")
-            if part:
-                found[name].setdefault(number, []).append(value)
-            else:
-                found[name][number] = value
+    found |= {name: numbers for name, numbers in _own(model).items() if name not in _OF_RECORDINGS}
     if "tilted_gravity" in found:
         found["tilted_gravity"].setdefault("acceleration", rope["gravity"])
     if "table_friction" in found:
@@ -138,6 +160,21 @@ def _effects(d: Description, model: Any, rope: dict[str, Any], *, framed: bool) 
         if "table" in d.effects:
             found["table_friction"] = rub | d.effects["table"]
     return found | d.effects
+
+
+def _own(model: Any) -> dict[str, dict[str, Any]]:
+    """Return the numbers of a model's effects, vectors as lists."""
+    found: dict[str, dict[str, Any]] = {name: {} for name in model.effects}
+    for key, value in model.values.items():
+        effect, _, number = key.partition(".")
+        number, _, part = number.partition(".")
+        if not number:
+            continue
+        if part:
+            found[effect].setdefault(number, []).append(value)
+        else:
+            found[effect][number] = value
+    return found
 
 
 def _flat(points: Tensor) -> Tensor:

@@ -5,11 +5,13 @@ Importing this package needs torch only. Arms need the extra `robots`, `make` ne
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import torch
 
+from torchdlo.envs.cable import Cable
 from torchdlo.envs.coiling import Coiling
 from torchdlo.envs.gathering import Gathering
 from torchdlo.envs.letter_art import LetterArt
@@ -39,14 +41,14 @@ TASKS: dict[str, type[Task]] = {
     "wrapping": Wrapping,
 }
 
-__all__ = ["TASKS", "Task", "find", "listing", "make"]
+__all__ = ["TASKS", "Cable", "Task", "find", "listing", "make"]
 
 
-def find(name: str) -> Task:
-    """Return a task by its name."""
+def find(name: str, rope: Cable | None = None) -> Task:
+    """Return a task by its name, with its ropes made of a cable if one is given."""
     if name not in TASKS:
         raise InputError(f"there is no task {name!r}; expected one of {', '.join(sorted(TASKS))}.")
-    return TASKS[name]()
+    return TASKS[name](rope=rope)
 
 
 def listing() -> list[dict[str, Any]]:
@@ -75,6 +77,7 @@ def make(
     segment: int | None = 1,
     variation: bool = True,
     randomize: Mapping[str, float] | None = None,
+    rope: Cable | None = None,
 ) -> DloEnv:
     """Return a task as a TorchRL environment.
 
@@ -90,6 +93,8 @@ def make(
         variation: whether starts differ, by as much as `Task.spread` says.
         randomize: numbers of effects that differ from scene to scene and are drawn at every reset, e.g.
             {"rod_contact.mu_k": 0.2}: a share of the range in which the number is declared, about its usual value.
+        rope: what ropes are made of, if not what the task says: `torchdlo.describe.cable("model.json")` reads what
+            `torchdlo calibrate` or `diagnose` found.
     """
     try:
         from torchdlo.envs.env import DloEnv
@@ -98,6 +103,8 @@ def make(
             f"environments need torchrl and tensordict ({error}); install them with pip install 'torchdlo[rl,robots]'."
         ) from None
     chosen = find(task) if isinstance(task, str) else task
+    if rope is not None:
+        chosen = dataclasses.replace(chosen, rope=rope)
     return DloEnv(
         chosen,
         num_envs=num_envs,

@@ -20,10 +20,12 @@ from torchdlo.coupling import BodyContact, RodBody, RodContact, RodMatter
 from torchdlo.coupling.bodies import Solid
 from torchdlo.coupling.pose import Pose
 from torchdlo.envs import geometry
+from torchdlo.envs.cable import Cable
 from torchdlo.envs.stages import Schedule, Stage
+from torchdlo.errors import InputError
 from torchdlo.physics import tree
 from torchdlo.physics.effect import Effect
-from torchdlo.physics.effects.elastic import Bend, Stretch
+from torchdlo.physics.effects.elastic import Bend, BendFrame, Stretch
 from torchdlo.physics.effects.field import Damping, Gravity
 from torchdlo.physics.effects.table import Table, TableFriction
 from torchdlo.scene import Params, Rope, Scene, State
@@ -108,6 +110,8 @@ class Task(ABC):
     """Steps before the first action."""
     release: int = 0
     """Steps after the last action with open hands; the last reward is the one after them."""
+    rope: Cable | None = None
+    """What all ropes are made of, if not what the task says."""
 
     name: ClassVar[str]
     """Its name in `envs.TASKS`."""
@@ -293,7 +297,8 @@ def make(
 
     A scene without a plane among its solids has a table as its floor, which is cheaper. Velocities decay by 30 1/s and
     ropes do not resist twisting: ropes with free ends that are held at points do not twist, and those of tasks have no
-    inertia about their axis.
+    inertia about their axis. A `rope` of the task takes the place of what ropes are made of and how fast they come to
+    rest; its effects act beside the others.
 
     Args:
         task: the task.
@@ -308,9 +313,12 @@ def make(
     elastic = all(isinstance(r.stretch, Tensor) or math.isfinite(r.stretch) for r in ropes)
     floor = not any(s.shape == "plane" for s in solids)
     room = 3 * sum(r.positions.shape[-2] for r in ropes)
+    own = [] if task.rope is None else task.rope.laws
+    effects = [*(e for e in effects if e.name not in {o.name for o in own}), *own]
     acting: list[Effect] = [Gravity(), Damping(), RodContact(sweeps=5, room=room), *effects]
-    if not any(e.frame_bending for e in effects):
-        acting.append(Bend())
+    if not any(e.name == "bend" for e in effects):
+        framed = any(e.frame_bending for e in effects) or (task.rope is not None and task.rope.curvature)
+        acting.append(BendFrame() if framed else Bend())
     numbers = {"damping": {"rate": 30.0, "twist_rate": 20.0}, "rod_contact": {"mu_s": 0.3, "mu_k": 0.25}}
     if elastic:
         acting.append(Stretch())
@@ -323,12 +331,18 @@ def make(
         acting.append(BodyContact())
     if matter:
         acting.append(RodMatter())
+    if task.rope is not None:
+        ropes, values = task.rope.pieces(ropes), (values or {}) | task.rope.values
     for name, given in (values or {}).items():
         numbers[name] = numbers.get(name, {}) | given
     at = (*(task.schedule.held if held is None else held), *fixed)
-    return scenes.make(
-        ropes, acting, numbers, bodies=solids, matter=matter, held_vertices=at, constrained=not elastic, substeps=5
-    )
+    choices = {"held_vertices": at, "constrained": not elastic, "substeps": 5}
+    try:
+        return scenes.make(ropes, acting, numbers, bodies=solids, matter=matter, **choices)
+    except ValueError as error:
+        if task.rope is None:
+            raise
+        raise InputError(f"rope: {task.name} steps by 0.2 ms and cannot take it: {error}") from None
 
 
 def settled(made: tuple[Scene, Params, State], frames: int) -> Tensor:

@@ -49,7 +49,9 @@ def limits(settings: Settings, rods: RodParams, values: dict[str, Values]) -> di
     """Return the largest stable substep [s] by the term that limits it.
 
     Bending waves reach w = 4/l^2 sqrt(EI/m'), stretching waves w = 2/l sqrt(EA/m'), twist waves w = 2 sqrt(GJ/(l I));
-    Stoermer-Verlet is stable for w dt < 2. Implicit steps are limited by none of them.
+    Stoermer-Verlet is stable for w dt < 2. Bending damping takes its force from the velocities before, and damps the
+    shortest waves by r = 16 c/(m' l^4): both together are stable for (w dt)^2/4 + r dt/2 < 1. Implicit steps are
+    limited by none of them.
     """
     if settings.integrator == "implicit":
         return {}
@@ -66,7 +68,11 @@ def limits(settings: Settings, rods: RodParams, values: dict[str, Values]) -> di
         if "internal_friction" in names:  # up to twice its first stiffness where bending turns back
             friction = values["internal_friction"]
             bend = bend + 2 * friction["moment"] / friction["kappa_c"]
-        found["bending"] = 0.5 * (mass * length.square().clamp(max=1e6) * length / bend).amin().sqrt()
+        heavy = mass * length.square().clamp(max=1e6) * length
+        found["bending"] = 0.5 * (heavy / bend).amin().sqrt()
+        if "bending_damping" in names:
+            wave, rate = 4 * bend / heavy, 8 * values["bending_damping"]["coefficient"] / heavy
+            found["bending damping"] = (2 / (rate + (rate.square() + 4 * wave).sqrt())).amin()
     if "stretch_force" in names and not settings.constrained:
         found["stretching"] = (mass * length / material.stretch).amin().sqrt()
     if "twist" in names and settings.twist == "dynamic":
