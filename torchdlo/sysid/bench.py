@@ -160,8 +160,9 @@ class Bench:
         ((_, sims),) = self.pool.simulate([Simulation(fitted.effects, rows, "train", start, fitted.options)])
         trust = 1.0 if start.trust is None else start.trust[..., None, None]
         measured = self.pool.local.motion(model, "train").markers
-        errors = [np.nan_to_num(e[: len(measured)]) for e in self._finer.unsure]
-        return drift(look, trust * sims, trust * measured, [trust * e for e in errors])
+        step, grid = (trust * np.nan_to_num(e[: len(measured)]) for e in self._finer.unsure)
+        # Next to clamps the mesh's error may be of first order: extrapolating to that would change twice as much.
+        return drift(look, trust * sims, trust * measured, (step, 2 * grid))
 
     def fit(self, jobs: Sequence[Fit]) -> list[Fitted]:
         """Return the results of fits in their order.
