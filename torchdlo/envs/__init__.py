@@ -48,7 +48,8 @@ def find(name: str, rope: Cable | None = None) -> Task:
     """Return a task by its name, with its ropes made of a cable if one is given."""
     if name not in TASKS:
         raise InputError(f"there is no task {name!r}; expected one of {', '.join(sorted(TASKS))}.")
-    return TASKS[name](rope=rope)
+    task = TASKS[name]()
+    return task if rope is None else dataclasses.replace(task, rope=rope)
 
 
 def listing() -> list[dict[str, Any]]:
