@@ -72,6 +72,8 @@ def test_a_rope_of_a_model_file_is_that_of_the_task(tmp_path: Path) -> None:
     assert float(params.rods.material.mass.sum()) == pytest.approx(found.line_density * float(length.sum()))
     assert (params.rods.material.bend == 2e-3).all() and float(params.effects["damping"]["rate"]) == 4.0
     assert float(params.effects["damping"]["twist_rate"]) == 20.0  # the task's
+    damping = find("gathering", found).start(1)[1].effects["damping"]
+    assert float(damping["rate"]) == 4.0 and float(damping["twist_rate"]) == 10.0
     assert find("separation").start(1)[2].rods.pos.double().sub(state.rods.pos).abs().max() < 1e-6
 
 

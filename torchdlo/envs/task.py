@@ -331,10 +331,12 @@ def make(
         acting.append(BodyContact())
     if matter:
         acting.append(RodMatter())
-    if task.rope is not None:
-        ropes, values = task.rope.pieces(ropes), (values or {}) | task.rope.values
     for name, given in (values or {}).items():
         numbers[name] = numbers.get(name, {}) | given
+    if task.rope is not None:
+        ropes = task.rope.pieces(ropes)
+        for name, given in task.rope.values.items():
+            numbers[name] = numbers.get(name, {}) | given
     at = (*(task.schedule.held if held is None else held), *fixed)
     choices = {"held_vertices": at, "constrained": not elastic, "substeps": 5}
     try:
