@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ctypes
 import functools
-import hashlib
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -27,11 +26,7 @@ def kernel(name: str, *options: str) -> tuple[Callable, Callable[[str, torch.dty
 
     @functools.cache
     def library() -> ctypes.CDLL | None:
-        source = Path(__file__).with_name(f"{name}.cpp")
-        # The library is named after its source and its options: a changed header has to be among them.
-        text = b"".join(header.read_bytes() for header in sorted(source.parent.glob("*.h")))
-        version = f"-DHEADERS=0x{hashlib.sha256(text).hexdigest()[:16]}"
-        return native.library(source, *_OPTIONS, *options, version, f"-I{source.parent}")
+        return native.library(Path(__file__).with_name(f"{name}.cpp"), *_OPTIONS, *options)
 
     def function(what: str, dtype: torch.dtype) -> Callable:
         return getattr(library(), f"{name}_{_KINDS[dtype]}_{what}")

@@ -10,12 +10,6 @@ from __future__ import annotations
 
 import ctypes
 import functools
-import hashlib
-import logging
-import os
-import shutil
-import subprocess
-import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,7 +17,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-_log = logging.getLogger(__name__)
+from torchdlo.physics import native
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,28 +83,9 @@ def pattern(name: str) -> Pattern:
 @functools.lru_cache(maxsize=1)
 def kernel() -> ctypes.CDLL | None:
     """Return the compiled kernel, or None where no C++ compiler is at hand."""
-    source = Path(__file__).with_name("banded.cpp")
-    compiler = os.environ.get("CXX") or shutil.which("g++") or shutil.which("clang++")
-    if compiler is None:
-        _log.warning("no C++ compiler found (g++ or clang++): banded systems use the slower dense solver")
+    library = native.library(Path(__file__).with_name("banded.cpp"), "-ffast-math", "-Wno-psabi")
+    if library is None:
         return None
-    text = source.read_bytes()
-    machine = Path("/proc/cpuinfo").read_bytes()[:2048] if Path("/proc/cpuinfo").exists() else b""
-    flags = next((line for line in machine.splitlines() if line.startswith((b"model name", b"flags"))), b"")
-    key = hashlib.sha256(text + compiler.encode() + flags).hexdigest()[:16]
-    folder = Path(os.environ.get("TORCHDLO_CACHE", Path.home() / ".cache" / "torchdlo"))
-    target = folder / f"banded-{key}.so"
-    if not target.exists():
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=folder) as build:
-            fresh = Path(build) / "banded.so"
-            options = ["-O3", "-march=native", "-ffast-math", "-fopenmp", "-shared", "-fPIC", "-std=c++17"]
-            made = subprocess.run([compiler, *options, str(source), "-o", str(fresh)], capture_output=True, text=True)
-            if made.returncode:
-                _log.warning("%s could not build the banded kernel, using the dense solver: %s", compiler, made.stderr)
-                return None
-            os.replace(fresh, target)
-    library = ctypes.CDLL(str(target))
     for name in ("solve_float", "solve_double"):
         getattr(library, name).argtypes = [
             *(ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_void_p),

@@ -1,4 +1,7 @@
-"""C++ kernels: compiled once per machine with the compiler that `torch.compile` needs as well."""
+"""C++ kernels: compiled once per machine with the compiler that `torch.compile` needs as well.
+
+Headers stand beside the sources, or beside this file.
+"""
 
 from __future__ import annotations
 
@@ -29,7 +32,10 @@ def library(source: Path, *options: str) -> ctypes.CDLL | None:
         return None
     machine = Path("/proc/cpuinfo").read_bytes()[:2048] if Path("/proc/cpuinfo").exists() else b""
     flags = next((line for line in machine.splitlines() if line.startswith((b"model name", b"flags"))), b"")
-    key = hashlib.sha256(source.read_bytes() + " ".join((compiler, *options)).encode() + flags).hexdigest()[:16]
+    folders = sorted({source.parent, Path(__file__).parent})
+    texts = [source, *(header for folder in folders for header in sorted(folder.glob("*.h")))]
+    text = b"".join(each.read_bytes() for each in texts)
+    key = hashlib.sha256(text + " ".join((compiler, *options)).encode() + flags).hexdigest()[:16]
     folder = Path(os.environ.get("TORCHDLO_CACHE", Path.home() / ".cache" / "torchdlo"))
     target = folder / f"{source.stem}-{key}.so"
     if not target.exists():
@@ -37,7 +43,8 @@ def library(source: Path, *options: str) -> ctypes.CDLL | None:
         with tempfile.TemporaryDirectory(dir=folder) as build:
             fresh = Path(build) / target.name
             usual = ["-O3", "-march=native", "-fopenmp", "-shared", "-fPIC", "-std=c++17"]
-            command = [compiler, *usual, *options, str(source), "-o", str(fresh)]
+            headers = [f"-I{each}" for each in folders]
+            command = [compiler, *usual, *options, *headers, str(source), "-o", str(fresh)]
             made = subprocess.run(command, capture_output=True, text=True)
             if made.returncode:
                 _log.warning("%s could not build %s, using tensor operations: %s", compiler, source.name, made.stderr)
