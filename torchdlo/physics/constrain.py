@@ -17,7 +17,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchdlo.physics import banded
+from torchdlo.physics import balance as kernel
+from torchdlo.physics import banded, lanes
 from torchdlo.physics.numerics import dot, safe_norm, total
 from torchdlo.physics.rod import edge_vectors
 from torchdlo.physics.topology import Topology, elimination_order, following, parse, preceding
@@ -236,6 +237,20 @@ def balance(
         the answer of the hinges [N], (..., V, 3).
     """
     topology = lengths.topology
+    shift = 1e-10 if force.dtype == torch.float64 else 1e-6
+    if lanes.ready("balance", force):
+        none = force.new_zeros(1, 1)
+        return kernel.solve(
+            topology.name,
+            (
+                *(lengths.rest, lengths.compliance, lengths.active, lengths.edge_mask, lengths.give),
+                *(inertia.hinge, none if inertia.turning is None else inertia.turning, free, tension),
+            ),
+            (inertia.vertex, moved, force, direction, ahead),
+            scale,
+            steps,
+            (turning, lengths.most, lengths.least, shift),
+        )
     pulled = lengths.active
     lean, start = turning * pulled / lengths.rest, direction + pulled * ahead
 
@@ -256,7 +271,6 @@ def balance(
             string = impulse * lean
 
             after, active = following(topology, free), lengths.active
-            shift = 1e-10 if pos.dtype == torch.float64 else 1e-6
             entries = _rows(
                 inertia.vertex + free * (same + string + preceding(topology, string)),
                 free * (one - string),

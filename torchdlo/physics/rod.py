@@ -11,7 +11,8 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from torchdlo.physics import rotation, tree
+from torchdlo.physics import lanes, rotation, tree
+from torchdlo.physics.carry import carry
 from torchdlo.physics.numerics import cross, dot, normalize, safe_norm, wrap
 from torchdlo.physics.topology import Topology, following, preceding
 
@@ -155,6 +156,10 @@ def advance_frames(topology: Topology, params: RodParams, old: View, pos: Tensor
     Returns:
         Directors (..., V, 3) and unwrapped reference twist [rad], (..., V, 1).
     """
+    if lanes.ready("carry", pos):
+        mask, last = params.rest.edge_mask, old.state.ref_twist
+        director, sine, cosine = carry(topology.name, old.state.director, old.tangent, pos, mask)
+        return director, _nearest(torch.atan2(sine, cosine), last, params)
     e = edge_vectors(topology, pos, params.rest.edge_mask)
     tangent = e / safe_norm(e).clamp(min=1e-12)
     director = rotation.transport(old.state.director, old.tangent, tangent)
@@ -165,5 +170,8 @@ def advance_frames(topology: Topology, params: RodParams, old: View, pos: Tensor
 def reference_twist(topology: Topology, params: RodParams, tangent: Tensor, director: Tensor, last: Tensor) -> Tensor:
     """Return the angle [rad] of the directors across each hinge that is nearest to `last`, shape (..., V, 1)."""
     carried = rotation.transport(preceding(topology, director), preceding(topology, tangent), tangent)
-    angle = rotation.signed_angle(carried, director, tangent)
+    return _nearest(rotation.signed_angle(carried, director, tangent), last, params)
+
+
+def _nearest(angle: Tensor, last: Tensor, params: RodParams) -> Tensor:
     return (last + wrap(angle - last)) * params.rest.hinge_mask

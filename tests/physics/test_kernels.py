@@ -1,0 +1,144 @@
+"""The C++ kernels of the rods do what the tensor operations do that have derivatives."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from helpers import F64, circle, effects, run, straight, vec, wild
+
+from torchdlo.physics import lanes, tree
+from torchdlo.scene import Rope, hold, make, step
+
+GIVEN = {"mass": 0.1, "bend": 1e-3, "twist": 1e-3, "radius": 0.01}
+
+
+def ropes(batch: tuple[int, ...], dtype: torch.dtype, *, loop: bool) -> list[Rope]:
+    """An open rope, and a closed one beside it."""
+    line = wild(9, 1, batch=batch, rough=0.05)
+    given = GIVEN | {"stretch": 200.0}
+    ring = circle(6, 0.2) + vec(0, 1, 0) + 0.02 * wild(6, 2, batch=batch)
+    made = [Rope(line.to(dtype), velocities=wild(9, 4, batch=batch).to(dtype), **given)]
+    return [*made, Rope(ring.to(dtype), closed=True, **GIVEN, stretch=1e3)] if loop else made
+
+
+def stepped(monkeypatch, kernels: bool, built, steps: int):
+    """States of a scene with or without the kernels, and which of them were used."""
+    used, ready = set(), lanes.ready
+
+    def watched(name, like):
+        found = kernels and ready(name, like)
+        used.update({name} if found else ())
+        return found
+
+    with monkeypatch.context() as patch:
+        patch.setattr(lanes, "ready", watched)
+        with torch.no_grad():
+            state, _ = run(*built, steps)
+    return state, used
+
+
+def assert_same(monkeypatch, built, tolerance, steps=6, uses=("balance", "carry")):
+    there, used = stepped(monkeypatch, True, built, steps)
+    here, unused = stepped(monkeypatch, False, built, steps)
+    assert used == set(uses), used
+    assert not unused
+    for a, b in zip(tree.leaves(there.rods), tree.leaves(here.rods), strict=True):
+        assert a.shape == b.shape
+        assert bool(torch.isfinite(b).all())
+        assert float((a - b).abs().max()) < tolerance * max(1.0, float(b.abs().max()))
+
+
+@pytest.mark.parametrize("batch", [(), (1,), (11,), (2, 3)])
+@pytest.mark.parametrize("loop", [False, True])
+def test_implicit_steps_are_the_same_for_any_batch(batch, loop, monkeypatch):
+    built = make(
+        ropes(batch, F64, loop=loop),
+        effects("gravity", "bend_frame", "twist", "damping"),
+        {"damping": {"rate": 0.5}},
+        dt=2e-3,
+        integrator="implicit",
+        twist="quasistatic",
+        held_vertices=(0, 1),
+        held_edges=(0, 9) if loop else (0,),
+    )
+    assert_same(monkeypatch, built, 1e-9)
+
+
+@pytest.mark.parametrize("ahead", [0.0, 0.1])
+def test_drag_of_hinges_and_steps_that_look_ahead_are_the_same(ahead, monkeypatch):
+    built = make(
+        ropes((3,), F64, loop=False),
+        effects("gravity", "bend", "bending_damping", "damping"),
+        {"bending_damping": {"coefficient": 1e-4}},
+        dt=2e-3,
+        integrator="implicit",
+        ahead=ahead,
+        held_vertices=(0, 8),
+    )
+    assert_same(monkeypatch, built, 1e-9)
+
+
+def test_single_precision_is_as_good_as_the_operations_are(monkeypatch):
+    built = make(
+        ropes((5,), torch.float32, loop=True),
+        effects("gravity", "bend_frame", "twist"),
+        dt=2e-3,
+        integrator="implicit",
+        twist="quasistatic",
+        held_vertices=(0, 1),
+        held_edges=(0, 9),
+    )
+    assert_same(monkeypatch, built, 2e-3, steps=5)
+
+
+def test_explicit_steps_carry_frames_the_same_way(monkeypatch):
+    built = make(
+        ropes((3,), F64, loop=True),
+        effects("gravity", "bend_frame", "twist"),
+        dt=5e-4,
+        integrator="explicit",
+        twist="dynamic",
+        held_vertices=(0,),
+    )
+    assert_same(monkeypatch, built, 1e-9, uses=("carry",))
+
+
+def test_a_rope_pulled_beyond_its_length_gives_way_the_same(monkeypatch):
+    pos = straight(8, 1.0)
+    scene, params, state = make(
+        [Rope(pos, **GIVEN)],
+        effects("gravity", "bend"),
+        dt=2e-3,
+        integrator="implicit",
+        ahead=0.1,
+        held_vertices=(0, 7),
+    )
+    still = hold(scene, state)
+    pulled = tree.replace(still, pos=still.pos + torch.linspace(0, 0.02, 2, dtype=F64)[:, None] * vec(1, 0, 0))
+    found = []
+    for kernels in (True, False):
+        with monkeypatch.context() as patch, torch.no_grad():
+            if not kernels:
+                patch.setattr(lanes, "ready", lambda name, like: False)
+            now = state
+            for _ in range(5):
+                now = step(scene, params, now, pulled)
+            found.append(now.rods)
+    assert float(found[1].tension.max()) > 1.0
+    for name in ("pos", "tension"):
+        a, b = (getattr(rods, name) for rods in found)
+        torch.testing.assert_close(a, b, rtol=1e-7, atol=1e-10)
+
+
+def test_derivatives_are_those_of_the_operations():
+    built = make(ropes((2,), F64, loop=False), effects("gravity", "bend"), dt=2e-3, integrator="implicit")
+    pos = built[2].rods.pos.clone().requires_grad_()
+    state = tree.replace(built[2], rods=tree.replace(built[2].rods, pos=pos))
+    moved = state
+    for _ in range(3):
+        moved = step(built[0], built[1], moved, hold(built[0], built[2]))
+    (slope,) = torch.autograd.grad(moved.rods.pos[..., 2].sum(), pos)
+    assert float(slope.abs().sum()) > 0
+    with torch.no_grad():
+        plain, _ = run(*built, 3)
+    torch.testing.assert_close(moved.rods.pos.detach(), plain.rods.pos, rtol=0, atol=1e-11)

@@ -1,0 +1,239 @@
+// Positions and tensions of one implicit substep by Newton's method, for `balance.py`, several scenes per instruction.
+//
+// The formulas stand in constrain.py (`balance`, `Inertia`, `Lengths`), as tensor operations.
+#include <cstdlib>
+#include <vector>
+
+#include "banded.h"
+#include "lanes.h"
+
+namespace {
+
+struct Sizes {
+  int64_t slots, scenes, steps, half, count;
+  const int32_t *places, *order;
+  const int64_t* after;
+  double turning, most, least, shift;
+};
+
+template <typename T>
+struct Slot {
+  Lanes<T> rest, compliance, active, mask, give, hinge, swing, free, tension;
+  Vec<T> vertex, moved, force, start, lead;
+};
+
+template <typename T>
+using Row = std::vector<Lanes<T>>;
+template <typename T>
+using Rows = std::vector<Vec<T>>;
+
+template <typename T>
+class Block {
+ public:
+  explicit Block(const Sizes& sizes)
+      : s(sizes),
+        v(sizes.slots),
+        before(v),
+        slot(v),
+        pos(v),
+        y(v),
+        along(v),
+        begin(v),
+        push(v),
+        pull(v),
+        turn(v),
+        moment(v),
+        resist(v),
+        lean(v),
+        centre(v),
+        same(v),
+        one(v),
+        two(v),
+        string(v),
+        impulse(v),
+        excess(v),
+        entries(20 * v),
+        rhs(4 * v),
+        found(4 * v) {
+    for (int64_t i = 0; i < v; ++i) before[s.after[i]] = i;
+    const size_t bytes = sizeof(Lanes<T>) * (size_t)(4 * v + s.half) * (2 * s.half + 2);
+    if (posix_memalign((void**)&work, 64, bytes)) std::abort();
+  }
+  ~Block() { std::free(work); }
+  Block(const Block&) = delete;
+
+  void read(const Field<T>* from, int64_t b) {
+    fetch(slot, from, b, s.scenes);
+    scale = from[sizeof(Slot<T>) / sizeof(Lanes<T>)].read(0, b, s.scenes);
+    for (int64_t i = 0; i < v; ++i) {
+      Slot<T>& p = slot[i];
+      lean[i] = T(s.turning) * p.active / p.rest;
+      p.start += p.lead * p.active;
+      // A straight rope pressed along its line leaves tensions of any size: no first guess.
+      const Lanes<T> least = -T(s.least) * p.rest / p.give;
+      impulse[i] = (p.tension < least ? Lanes<T>{} : p.tension) * p.active * scale;
+      pos[i] = p.moved;
+    }
+    bands();
+  }
+
+  void solve() {
+    for (int64_t k = 0; k < s.steps; ++k) newton();
+    for (int64_t i = 0; i < v; ++i)
+      for (int c = 0; c < 3; ++c) {
+        Lanes<T>& x = part(pos[i], c);
+        x = slot[i].free > T(0) ? x : part(slot[i].moved, c);
+      }
+    newton();
+    residual();
+  }
+
+  // Positions (3, V), tensions (V) and forces (3, V).
+  void write(T* const* to, int64_t b) {
+    const int64_t lanes = s.scenes - b;
+    for (int64_t i = 0; i < v; ++i) {
+      for (int c = 0; c < 3; ++c) {
+        store<T>(to[0] + (c * v + i) * s.scenes + b, part(pos[i], c), lanes);
+        store<T>(to[2] + (c * v + i) * s.scenes + b, part(push[i], c) / scale, lanes);
+      }
+      store<T>(to[1] + i * s.scenes + b, impulse[i] / scale, lanes);
+    }
+  }
+
+ private:
+  static Lanes<T>& part(Vec<T>& x, int c) { return (&x.x)[c]; }
+
+  void bands() {
+    for (int64_t i = 0; i < v; ++i) {
+      const int64_t p = before[i];
+      centre[i] = slot[i].mask / slot[i].rest + slot[p].mask / slot[p].rest;
+    }
+    for (int64_t i = 0; i < v; ++i) {
+      const int64_t n = s.after[i], p = before[i];
+      const Lanes<T> after = slot[i].mask / slot[i].rest, next = slot[n].mask / slot[n].rest;
+      one[i] = -slot[i].hinge * centre[i] * after - slot[n].hinge * after * centre[n] - slot[i].swing;
+      two[i] = slot[n].hinge * after * next;
+      const Lanes<T> last = slot[p].mask / slot[p].rest;
+      same[i] = slot[i].hinge * centre[i] * centre[i] + slot[n].hinge * after * after + slot[p].hinge * last * last +
+                slot[i].swing + slot[p].swing;
+    }
+  }
+  Lanes<T> yielding(int64_t i) const { return T(s.most) * slot[i].rest / slot[i].give; }
+
+  void residual() {
+    for (int64_t i = 0; i < v; ++i) y[i] = pos[i] - slot[i].moved;
+    for (int64_t i = 0; i < v; ++i) {
+      const Slot<T>& p = slot[i];
+      const int64_t n = s.after[i];
+      const Vec<T> turned = y[n] - y[i];
+      begin[i] = p.start + turned * lean[i];
+      pull[i] = begin[i] * impulse[i] + turned * p.swing;
+      turn[i] = turned * (p.mask / p.rest);
+      Vec<T> edge = pos[n] - pos[i];
+      edge = {p.mask > T(0) ? edge.x : Lanes<T>{} + T(1), p.mask > T(0) ? edge.y : Lanes<T>{},
+              p.mask > T(0) ? edge.z : Lanes<T>{}};
+      const Lanes<T> squared = dot(edge, edge);
+      const Lanes<T> length = squared <= TINY<T> * TINY<T> ? Lanes<T>{} : root<T>(squared);
+      along[i] = edge * (T(1) / (length < T(1e-12) ? Lanes<T>{} + T(1e-12) : length));
+      const Lanes<T> tension = impulse[i] / scale, beyond = tension - yielding(i);
+      excess[i] = (length - p.rest - p.compliance * tension - p.give * (beyond > T(0) ? beyond : Lanes<T>{})) * p.active;
+    }
+    for (int64_t i = 0; i < v; ++i) moment[i] = (turn[i] - turn[before[i]]) * slot[i].hinge;
+    for (int64_t i = 0; i < v; ++i)
+      resist[i] = (moment[i] - moment[s.after[i]]) * (slot[i].mask / slot[i].rest);
+    for (int64_t i = 0; i < v; ++i) {
+      const int64_t p = before[i];
+      push[i] = slot[i].force * scale + pull[i] - pull[p] - resist[p] + resist[i];
+    }
+  }
+
+  void newton() {
+    residual();
+    const Lanes<T> zero{};
+    for (int64_t i = 0; i < v; ++i) string[i] = impulse[i] * lean[i];
+    Lanes<T>* e = entries.data();
+    for (int64_t i = 0; i < v; ++i) {
+      const Slot<T>& p = slot[i];
+      const int64_t n = s.after[i], b = before[i];
+      const Lanes<T> own = p.free * (same[i] + string[i] + string[b]);
+      const Lanes<T> pressed = p.free * p.active, onward = slot[n].free * p.active;
+      e[3 * v + i] = p.free * (one[i] - string[i]);
+      e[4 * v + i] = p.free * (one[b] - string[b]);
+      e[5 * v + i] = p.free * two[i];
+      e[6 * v + i] = p.free * two[before[b]];
+      for (int c = 0; c < 3; ++c) {
+        e[c * v + i] = part(slot[i].vertex, c) + own;
+        e[(7 + c) * v + i] = -pressed * part(begin[i], c);
+        e[(10 + c) * v + i] = onward * part(begin[i], c);
+        e[(13 + c) * v + i] = -p.active * part(along[i], c);
+        e[(16 + c) * v + i] = p.active * part(along[i], c);
+        rhs[c * v + i] = p.free * part(push[i], c) - part(slot[i].vertex, c) * part(y[i], c);
+      }
+      const Lanes<T> soft = impulse[i] / scale > yielding(i) ? p.give : zero;
+      e[19 * v + i] = -p.active * (p.compliance + soft + T(s.shift) * p.give) / scale + (p.active - T(1));
+      rhs[3 * v + i] = -excess[i];
+    }
+    eliminate();
+    Lanes<T> most{};
+    for (int64_t i = 0; i < v; ++i) {
+      const int64_t n = s.after[i];
+      Lanes<T> squared{};
+      for (int c = 0; c < 3; ++c) {
+        const Lanes<T> turned = slot[i].active * (found[c * v + n] - found[c * v + i]) / slot[i].rest;
+        squared += turned * turned;
+      }
+      most = squared > most ? squared : most;
+    }
+    most = root<T>(most);
+    // An edge may turn by about one radian at a time.
+    const Lanes<T> share = most > T(1) ? T(1) / most : zero + T(1);
+    for (int64_t i = 0; i < v; ++i) {
+      for (int c = 0; c < 3; ++c) part(pos[i], c) += share * found[c * v + i];
+      impulse[i] += share * found[3 * v + i];
+    }
+  }
+
+  void eliminate() {
+    const T *e = (const T*)entries.data(), *r = (const T*)rhs.data();
+    const int n = 4 * (int)v, k = (int)s.half, count = (int)s.count;
+    constexpr int W = WIDTH<T>;
+    // Open ropes have k = 8.
+    if (k == 8) solve_lanes<T, Lanes<T>, 8>(e, s.places, count, s.order, r, (T*)found.data(), n, k, W, 0, W, work);
+    else solve_lanes<T, Lanes<T>, 0>(e, s.places, count, s.order, r, (T*)found.data(), n, k, W, 0, W, work);
+  }
+
+  const Sizes& s;
+  const int64_t v;
+  std::vector<int64_t> before;
+  std::vector<Slot<T>> slot;
+  Rows<T> pos, y, along, begin, push, pull, turn, moment, resist;
+  Row<T> lean, centre, same, one, two, string, impulse, excess, entries, rhs, found;
+  Lanes<T> scale;
+  Lanes<T>* work;
+};
+
+template <typename T>
+void balance(const Field<T>* from, T* const* to, const Sizes& sizes, int threads) {
+  const int64_t blocks = (sizes.scenes + WIDTH<T> - 1) / WIDTH<T>;
+#pragma omp parallel num_threads(threads) if (threads > 1 && blocks > 1)
+  {
+    Block<T> block(sizes);
+#pragma omp for schedule(static)
+    for (int64_t k = 0; k < blocks; ++k) {
+      block.read(from, k * WIDTH<T>);
+      block.solve();
+      block.write(to, k * WIDTH<T>);
+    }
+  }
+}
+
+}  // namespace
+
+extern "C" {
+void balance_float(const Field<float>* from, float* const* to, const Sizes* sizes, int threads) {
+  balance<float>(from, to, *sizes, threads);
+}
+void balance_double(const Field<double>* from, double* const* to, const Sizes* sizes, int threads) {
+  balance<double>(from, to, *sizes, threads);
+}
+}
