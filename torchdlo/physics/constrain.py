@@ -17,7 +17,6 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchdlo.physics import balance as kernel
 from torchdlo.physics import banded, lanes
 from torchdlo.physics.numerics import dot, safe_norm, total
 from torchdlo.physics.rod import edge_vectors
@@ -238,19 +237,12 @@ def balance(
     """
     topology = lengths.topology
     shift = 1e-10 if force.dtype == torch.float64 else 1e-6
-    if lanes.ready("balance", force):
-        none = force.new_zeros(1, 1)
-        return kernel.solve(
-            topology.name,
-            (
-                *(lengths.rest, lengths.compliance, lengths.active, lengths.edge_mask, lengths.give),
-                *(inertia.hinge, none if inertia.turning is None else inertia.turning, free, tension),
-            ),
-            (inertia.vertex, moved, force, direction, ahead),
-            scale,
-            steps,
-            (turning, lengths.most, lengths.least, shift),
-        )
+    if lanes.ready(force):
+        swing = force.new_zeros(1, 1) if inertia.turning is None else inertia.turning
+        edges = lengths.rest, lengths.compliance, lengths.active, lengths.edge_mask, lengths.give, inertia.hinge, swing
+        inputs = *edges, free, tension, inertia.vertex, moved, force, direction, ahead, scale
+        law = turning, lengths.most, lengths.least, shift, steps
+        return tuple(lanes.apply("balance", topology.name, inputs, (3, 1, 3), "saddle", law))
     pulled = lengths.active
     lean, start = turning * pulled / lengths.rest, direction + pulled * ahead
 

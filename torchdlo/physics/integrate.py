@@ -18,7 +18,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchdlo.physics import effect, rod, rotation, tree
+from torchdlo.physics import effect, lanes, rod, rotation, tree
 from torchdlo.physics.constrain import Inertia, Lengths, balance, project, solve_slots
 from torchdlo.physics.effect import Effect, Motion, Push, Values
 from torchdlo.physics.hold import Reaction, Targets, put
@@ -355,6 +355,13 @@ def settle_twist(
     def newton(angle: Tensor, exact: bool) -> tuple[Tensor, Tensor]:
         here = rod.view(topology, params, tree.replace(state, twist=angle), settings.dt)
         loads = effect.total(effects, here, values)
+        if lanes.ready(angle):
+            none = angle.new_zeros(1, 1)
+            bent = loads.get("twist_geometry", none.expand(1, 2))
+            bent = bent if exact else bent.clamp(min=0.0)
+            inputs = free, loads["twist_hessian"], loads["torque"], bent, loads.get("twist_skew", none)
+            change, left = lanes.apply("settle", topology.name, inputs, (1, 1), "tridiagonal")
+            return angle + change, -left[..., list(settings.held_edges), :]
         with torch.no_grad():
             same, after = _twist_matrix(here, loads)
             if "twist_geometry" in loads:

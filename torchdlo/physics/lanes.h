@@ -47,23 +47,6 @@ static void put(const std::vector<S>& from, T* const* to, int64_t b, int64_t sce
       store<T>(to[f] + r * scenes + b, ((const Lanes<T>*)&from[r])[f], scenes - b);
 }
 
-// Where a component of a tensor (slots or 1, scenes or 1) stands; steps between slots and scenes are 0 for one.
-template <typename T>
-struct Field {
-  const T* at;
-  int64_t slot, scene;
-  Lanes<T> read(int64_t i, int64_t b, int64_t scenes) const {
-    const T* from = at + i * slot;
-    return scene ? load(from + b, scenes - b) : Lanes<T>{} + *from;
-  }
-};
-template <typename T, class S>
-static void fetch(std::vector<S>& to, const Field<T>* from, int64_t b, int64_t scenes) {
-  const int64_t rows = to.size(), fields = sizeof(S) / sizeof(Lanes<T>);
-  for (int64_t r = 0; r < rows; ++r)
-    for (int64_t f = 0; f < fields; ++f) ((Lanes<T>*)&to[r])[f] = from[f].read(r, b, scenes);
-}
-
 template <typename T>
 static inline Lanes<T> root(const Lanes<T>& x) {
   Lanes<T> y;

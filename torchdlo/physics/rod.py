@@ -12,7 +12,6 @@ import torch
 from torch import Tensor
 
 from torchdlo.physics import lanes, rotation, tree
-from torchdlo.physics.carry import carry
 from torchdlo.physics.numerics import cross, dot, normalize, safe_norm, wrap
 from torchdlo.physics.topology import Topology, following, preceding
 
@@ -134,10 +133,13 @@ def edge_vectors(topology: Topology, pos: Tensor, edge_mask: Tensor) -> Tensor:
 
 def view(topology: Topology, params: RodParams, state: RodState, dt: float) -> View:
     """Compute the geometry of a state."""
+    rest = params.rest.length
+    if lanes.ready(state.pos):
+        inputs = state.pos, rest, params.rest.edge_mask
+        return View(topology, state, params, dt, *lanes.apply("look", topology.name, inputs, (1, 3, 3, 1)))
     e = edge_vectors(topology, state.pos, params.rest.edge_mask)
     length = safe_norm(e).clamp(min=1e-12)
     tangent = e / length
-    rest = params.rest.length
     return View(
         topology,
         state,
@@ -156,10 +158,10 @@ def advance_frames(topology: Topology, params: RodParams, old: View, pos: Tensor
     Returns:
         Directors (..., V, 3) and unwrapped reference twist [rad], (..., V, 1).
     """
-    if lanes.ready("carry", pos):
-        mask, last = params.rest.edge_mask, old.state.ref_twist
-        director, sine, cosine = carry(topology.name, old.state.director, old.tangent, pos, mask)
-        return director, _nearest(torch.atan2(sine, cosine), last, params)
+    if lanes.ready(pos):
+        inputs = old.state.director, old.tangent, pos, params.rest.edge_mask
+        director, sine, cosine = lanes.apply("carry", topology.name, inputs, (3, 1, 1))
+        return director, _nearest(torch.atan2(sine, cosine), old.state.ref_twist, params)
     e = edge_vectors(topology, pos, params.rest.edge_mask)
     tangent = e / safe_norm(e).clamp(min=1e-12)
     director = rotation.transport(old.state.director, old.tangent, tangent)

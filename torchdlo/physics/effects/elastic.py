@@ -11,7 +11,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from torchdlo.physics import tree
+from torchdlo.physics import lanes, tree
 from torchdlo.physics.effect import Effect, Values
 from torchdlo.physics.numerics import cross, dot
 from torchdlo.physics.rod import View
@@ -55,10 +55,14 @@ class Bend(Effect):
 
     def loads(self, view: View, values: Values) -> Values:
         """Return the force as a gradient by the edges."""
-        rest = view.params.rest
+        rest, bend = view.params.rest, view.params.material.bend
+        if lanes.ready(view.tangent):
+            inputs = view.before, view.tangent, view.length, view.hinge_length, bend, rest.hinge_mask
+            gradient, stiffness = lanes.apply("bend", view.topology.name, inputs, (3, 1))
+            return {"gradient": gradient, "hinge_stiffness": stiffness}
         cosine = dot(view.before, view.tangent)
         chi = (1 + cosine).clamp(min=1e-6)
-        stiffness = view.params.material.bend / view.hinge_length * rest.hinge_mask
+        stiffness = bend / view.hinge_length * rest.hinge_mask
         slope = -4 * stiffness / chi.square()  # dE/dcos of E = 2 EI/l (1 - cos)/(1 + cos)
         after = slope / view.length * (view.before - cosine * view.tangent)
         before = slope * (view.tangent - cosine * view.before)
@@ -85,6 +89,11 @@ class Curvature:
 
     def pull_back(self, view: View, moment: Tensor) -> Values:
         """Return the loads of moments [N m], shape (..., V, 2), that work against the two curvatures."""
+        if lanes.ready(self.kappa):
+            own = self.kappa, self.mean, self.mean1, self.mean2, *self.by_twist
+            inputs = *own, view.before, view.tangent, view.length, moment
+            gradient, torque = lanes.apply("pull", view.topology.name, inputs, (3, 1))
+            return {"gradient": gradient, "torque": torque}
         f1, f2 = moment[..., :1], moment[..., 1:]
         # dk1/de = (-k1 t~ + t' x d2~)/|e|, dk2/de = (-k2 t~ - t' x d1~)/|e|, and with the other sign for e'.
         turned = f1 * self.mean2 - f2 * self.mean1
@@ -112,6 +121,11 @@ class Curvature:
 
 def curvature(view: View) -> Curvature:
     """Return the curvature of every hinge."""
+    if lanes.ready(view.tangent):
+        angle = view.state.twist
+        inputs = view.before, view.tangent, view.state.director, angle.cos(), angle.sin(), view.params.rest.hinge_mask
+        *shape, b1, b2, a1, a2 = lanes.apply("curve", view.topology.name, inputs, (2, 3, 3, 3, 3, 1, 1, 1, 1))
+        return Curvature(*shape, (b1, b2, a1, a2))
     chi = (1 + dot(view.before, view.tangent)).clamp(min=1e-6)
     kb = 2 * cross(view.before, view.tangent) / chi * view.params.rest.hinge_mask
     m1, m2 = view.frames()
@@ -217,6 +231,11 @@ class Twist(Effect):
 
     def loads(self, view: View, values: Values) -> Values:
         """Return gradients by the edges and torques."""
+        if lanes.ready(view.tangent):
+            rest, stiffness, now = view.params.rest, view.params.material.twist, view.state
+            hinge = view.length, view.hinge_length, stiffness, rest.hinge_mask, now.twist, now.ref_twist, rest.twist
+            found = lanes.apply("twist", view.topology.name, (view.before, view.tangent, *hinge), (3, 1, 3))
+            return dict(zip(("gradient", "torque", "twist_hessian"), found, strict=True))
         stiffness = view.params.material.twist / view.hinge_length * view.params.rest.hinge_mask
         moment = stiffness * self.strain(view)
         # The twist of the reference frames changes with the edges by kb / (2 |e|) each (Bergou 2008, eq. 9).

@@ -1,26 +1,12 @@
-// Positions and tensions of one implicit substep by Newton's method, for `balance.py`, several scenes per instruction.
+// Positions and tensions of one implicit substep by Newton's method.
 //
 // The formulas stand in constrain.py (`balance`, `Inertia`, `Lengths`), as tensor operations.
+#pragma once
 #include <cstdlib>
-#include <vector>
 
-#include "banded.h"
-#include "lanes.h"
+#include "rods.h"
 
 namespace {
-
-struct Sizes {
-  int64_t slots, scenes, steps, half, count;
-  const int32_t *places, *order;
-  const int64_t* after;
-  double turning, most, least, shift;
-};
-
-template <typename T>
-struct Slot {
-  Lanes<T> rest, compliance, active, mask, give, hinge, swing, free, tension;
-  Vec<T> vertex, moved, force, start, lead;
-};
 
 template <typename T>
 using Row = std::vector<Lanes<T>>;
@@ -28,12 +14,18 @@ template <typename T>
 using Rows = std::vector<Vec<T>>;
 
 template <typename T>
-class Block {
+class Balance {
  public:
-  explicit Block(const Sizes& sizes)
-      : s(sizes),
-        v(sizes.slots),
-        before(v),
+  struct In {
+    Lanes<T> rest, compliance, active, mask, give, hinge, swing, free, tension;
+    Vec<T> vertex, moved, force, start, lead;
+    Lanes<T> scale;
+  };
+
+  explicit Balance(const Call& call)
+      : s(call),
+        v(call.slots),
+        before(preceding(call)),
         slot(v),
         pos(v),
         y(v),
@@ -55,30 +47,18 @@ class Block {
         entries(20 * v),
         rhs(4 * v),
         found(4 * v) {
-    for (int64_t i = 0; i < v; ++i) before[s.after[i]] = i;
     const size_t bytes = sizeof(Lanes<T>) * (size_t)(4 * v + s.half) * (2 * s.half + 2);
     if (posix_memalign((void**)&work, 64, bytes)) std::abort();
   }
-  ~Block() { std::free(work); }
-  Block(const Block&) = delete;
+  ~Balance() { std::free(work); }
+  Balance(const Balance&) = delete;
 
-  void read(const Field<T>* from, int64_t b) {
-    fetch(slot, from, b, s.scenes);
-    scale = from[sizeof(Slot<T>) / sizeof(Lanes<T>)].read(0, b, s.scenes);
-    for (int64_t i = 0; i < v; ++i) {
-      Slot<T>& p = slot[i];
-      lean[i] = T(s.turning) * p.active / p.rest;
-      p.start += p.lead * p.active;
-      // A straight rope pressed along its line leaves tensions of any size: no first guess.
-      const Lanes<T> least = -T(s.least) * p.rest / p.give;
-      impulse[i] = (p.tension < least ? Lanes<T>{} : p.tension) * p.active * scale;
-      pos[i] = p.moved;
-    }
-    bands();
-  }
-
-  void solve() {
-    for (int64_t k = 0; k < s.steps; ++k) newton();
+  // Positions, tensions, and forces.
+  void operator()(const std::vector<In>& given, const Out<T>& out) {
+    slot = given;
+    scale = slot[0].scale;
+    begin_with();
+    for (int64_t k = 0; k < s.numbers[4]; ++k) newton();
     for (int64_t i = 0; i < v; ++i)
       for (int c = 0; c < 3; ++c) {
         Lanes<T>& x = part(pos[i], c);
@@ -86,22 +66,29 @@ class Block {
       }
     newton();
     residual();
-  }
-
-  // Positions (3, V), tensions (V) and forces (3, V).
-  void write(T* const* to, int64_t b) {
-    const int64_t lanes = s.scenes - b;
     for (int64_t i = 0; i < v; ++i) {
-      for (int c = 0; c < 3; ++c) {
-        store<T>(to[0] + (c * v + i) * s.scenes + b, part(pos[i], c), lanes);
-        store<T>(to[2] + (c * v + i) * s.scenes + b, part(push[i], c) / scale, lanes);
-      }
-      store<T>(to[1] + i * s.scenes + b, impulse[i] / scale, lanes);
+      out.put(0, i, pos[i]);
+      out.put(3, i, impulse[i] / scale);
+      out.put(4, i, push[i] * (T(1) / scale));
     }
   }
 
  private:
   static Lanes<T>& part(Vec<T>& x, int c) { return (&x.x)[c]; }
+
+  void begin_with() {
+    const T turning = T(s.numbers[0]), pressed = T(s.numbers[2]);
+    for (int64_t i = 0; i < v; ++i) {
+      In& p = slot[i];
+      lean[i] = turning * p.active / p.rest;
+      p.start += p.lead * p.active;
+      // A straight rope pressed along its line leaves tensions of any size: no first guess.
+      const Lanes<T> least = -pressed * p.rest / p.give;
+      impulse[i] = (p.tension < least ? Lanes<T>{} : p.tension) * p.active * scale;
+      pos[i] = p.moved;
+    }
+    bands();
+  }
 
   void bands() {
     for (int64_t i = 0; i < v; ++i) {
@@ -118,12 +105,12 @@ class Block {
                 slot[i].swing + slot[p].swing;
     }
   }
-  Lanes<T> yielding(int64_t i) const { return T(s.most) * slot[i].rest / slot[i].give; }
+  Lanes<T> yielding(int64_t i) const { return T(s.numbers[1]) * slot[i].rest / slot[i].give; }
 
   void residual() {
     for (int64_t i = 0; i < v; ++i) y[i] = pos[i] - slot[i].moved;
     for (int64_t i = 0; i < v; ++i) {
-      const Slot<T>& p = slot[i];
+      const In& p = slot[i];
       const int64_t n = s.after[i];
       const Vec<T> turned = y[n] - y[i];
       begin[i] = p.start + turned * lean[i];
@@ -153,7 +140,7 @@ class Block {
     for (int64_t i = 0; i < v; ++i) string[i] = impulse[i] * lean[i];
     Lanes<T>* e = entries.data();
     for (int64_t i = 0; i < v; ++i) {
-      const Slot<T>& p = slot[i];
+      const In& p = slot[i];
       const int64_t n = s.after[i], b = before[i];
       const Lanes<T> own = p.free * (same[i] + string[i] + string[b]);
       const Lanes<T> pressed = p.free * p.active, onward = slot[n].free * p.active;
@@ -170,7 +157,7 @@ class Block {
         rhs[c * v + i] = p.free * part(push[i], c) - part(slot[i].vertex, c) * part(y[i], c);
       }
       const Lanes<T> soft = impulse[i] / scale > yielding(i) ? p.give : zero;
-      e[19 * v + i] = -p.active * (p.compliance + soft + T(s.shift) * p.give) / scale + (p.active - T(1));
+      e[19 * v + i] = -p.active * (p.compliance + soft + T(s.numbers[3]) * p.give) / scale + (p.active - T(1));
       rhs[3 * v + i] = -excess[i];
     }
     eliminate();
@@ -198,42 +185,18 @@ class Block {
     const int n = 4 * (int)v, k = (int)s.half, count = (int)s.count;
     constexpr int W = WIDTH<T>;
     // Open ropes have k = 8.
-    if (k == 8) solve_lanes<T, Lanes<T>, 8>(e, s.places, count, s.order, r, (T*)found.data(), n, k, W, 0, W, work);
-    else solve_lanes<T, Lanes<T>, 0>(e, s.places, count, s.order, r, (T*)found.data(), n, k, W, 0, W, work);
+    if (k == 8) solve_lanes<T, Lanes<T>, 8>(e, s.pattern, count, s.order, r, (T*)found.data(), n, k, W, 0, W, work);
+    else solve_lanes<T, Lanes<T>, 0>(e, s.pattern, count, s.order, r, (T*)found.data(), n, k, W, 0, W, work);
   }
 
-  const Sizes& s;
+  const Call& s;
   const int64_t v;
   std::vector<int64_t> before;
-  std::vector<Slot<T>> slot;
+  std::vector<In> slot;
   Rows<T> pos, y, along, begin, push, pull, turn, moment, resist;
   Row<T> lean, centre, same, one, two, string, impulse, excess, entries, rhs, found;
   Lanes<T> scale;
   Lanes<T>* work;
 };
 
-template <typename T>
-void balance(const Field<T>* from, T* const* to, const Sizes& sizes, int threads) {
-  const int64_t blocks = (sizes.scenes + WIDTH<T> - 1) / WIDTH<T>;
-#pragma omp parallel num_threads(threads) if (threads > 1 && blocks > 1)
-  {
-    Block<T> block(sizes);
-#pragma omp for schedule(static)
-    for (int64_t k = 0; k < blocks; ++k) {
-      block.read(from, k * WIDTH<T>);
-      block.solve();
-      block.write(to, k * WIDTH<T>);
-    }
-  }
-}
-
 }  // namespace
-
-extern "C" {
-void balance_float(const Field<float>* from, float* const* to, const Sizes* sizes, int threads) {
-  balance<float>(from, to, *sizes, threads);
-}
-void balance_double(const Field<double>* from, double* const* to, const Sizes* sizes, int threads) {
-  balance<double>(from, to, *sizes, threads);
-}
-}

@@ -1,0 +1,264 @@
+// Geometry and loads of rods, for `lanes.py`, several scenes per instruction.
+//
+// The formulas stand in rod.py, effects/elastic.py, rotation.py, integrate.py and constrain.py, as tensor operations.
+// Each kernel reads the components of its inputs in the order of the fields of `In`, and numbers those of its results.
+#include "balance.h"
+#include "rods.h"
+
+namespace {
+
+template <typename T>
+Lanes<T> at_least(const Lanes<T>& x, T least) {
+  return x < least ? Lanes<T>{} + least : x;
+}
+
+// Zero vectors have length zero.
+template <typename T>
+Lanes<T> length(const Vec<T>& x) {
+  const Lanes<T> squared = dot(x, x);
+  return squared <= TINY<T> * TINY<T> ? Lanes<T>{} : root<T>(squared);
+}
+
+// The edge from one vertex to the next: a unit vector on dummy edges.
+template <typename T>
+Vec<T> edge(const Vec<T>& start, const Vec<T>& end, const Lanes<T>& mask) {
+  const Vec<T> e = end - start;
+  const auto real = mask > T(0);
+  return {real ? e.x : Lanes<T>{} + T(1), real ? e.y : Lanes<T>{}, real ? e.z : Lanes<T>{}};
+}
+
+template <typename T>
+Vec<T> transport(const Vec<T>& x, const Vec<T>& start, const Vec<T>& end) {
+  const Vec<T> axis = cross(start, end), once = cross(axis, x);
+  return x + once + cross(axis, once) * (T(1) / at_least<T>(dot(start, end) + T(1), T(1e-6)));
+}
+
+template <typename T>
+struct Look {  // rod.view: lengths, tangents, tangents before, lengths of hinges
+  struct In {
+    Vec<T> pos;
+    Lanes<T> rest, mask;
+  };
+  explicit Look(const Call&) {}
+  void operator()(const std::vector<In>& slot, const Out<T>& out) {
+    for (int64_t i = 0; i < out.call.slots; ++i) {
+      const int64_t n = out.call.after[i];
+      const Vec<T> e = edge(slot[i].pos, slot[n].pos, slot[i].mask);
+      const Lanes<T> size = at_least<T>(length(e), T(1e-12));
+      const Vec<T> tangent = e * (T(1) / size);
+      out.put(0, i, size);
+      out.put(1, i, tangent);
+      out.put(4, n, tangent);
+      out.put(7, n, (slot[n].rest + slot[i].rest) * T(0.5));
+    }
+  }
+};
+
+template <typename T>
+struct Carry {  // rod.advance_frames: directors, sine and cosine of the angle across hinges
+  struct In {
+    Vec<T> director, tangent, pos;
+    Lanes<T> mask;
+  };
+  struct Now {
+    Vec<T> director, tangent;
+  };
+  explicit Carry(const Call&) {}
+  void operator()(const std::vector<In>& slot, const Out<T>& out) {
+    std::vector<Now> now(out.call.slots);
+    for (int64_t i = 0; i < out.call.slots; ++i) {
+      const Vec<T> e = edge(slot[i].pos, slot[out.call.after[i]].pos, slot[i].mask);
+      const Vec<T> tangent = e * (T(1) / at_least<T>(length(e), T(1e-12)));
+      Vec<T> director = transport(slot[i].director, slot[i].tangent, tangent);
+      director -= tangent * dot(tangent, director);
+      const Lanes<T> whole = length(director);
+      now[i] = {director * (T(1) / (whole == T(0) ? Lanes<T>{} + T(1) : whole)), tangent};
+      out.put(0, i, now[i].director);
+    }
+    for (int64_t i = 0; i < out.call.slots; ++i) {
+      const Now& next = now[out.call.after[i]];
+      const Vec<T> carried = transport(now[i].director, now[i].tangent, next.tangent);
+      out.put(3, out.call.after[i], dot(cross(carried, next.director), next.tangent));
+      out.put(4, out.call.after[i], dot(carried, next.director));
+    }
+  }
+};
+
+template <typename T>
+struct Bend {  // elastic.Bend.loads: gradient, stiffness of hinges
+  struct In {
+    Vec<T> before, tangent;
+    Lanes<T> length, hinge, bend, mask;
+  };
+  explicit Bend(const Call&) {}
+  void operator()(const std::vector<In>& slot, const Out<T>& out) {
+    std::vector<Vec<T>> back(out.call.slots), gradient(out.call.slots);
+    for (int64_t i = 0; i < out.call.slots; ++i) {
+      const In& p = slot[i];
+      const Lanes<T> cosine = dot(p.before, p.tangent), chi = at_least<T>(cosine + T(1), T(1e-6));
+      const Lanes<T> stiffness = p.bend / p.hinge * p.mask, slope = T(-4) * stiffness / (chi * chi);
+      gradient[i] = (p.before - p.tangent * cosine) * (slope / p.length);
+      back[i] = (p.tangent - p.before * cosine) * slope;
+      const Lanes<T> steep = (T(1) - cosine) / chi, s = steep > T(100) ? Lanes<T>{} + T(100) : steep;
+      out.put(3, i, stiffness * (T(1) + s) * (T(1) + T(3) * s));
+    }
+    for (int64_t i = 0; i < out.call.slots; ++i)
+      out.put(0, i, gradient[i] + back[out.call.after[i]] * (T(1) / slot[i].length));
+  }
+};
+
+template <typename T>
+struct Twist {  // elastic.Twist.loads: gradient, torque, second derivatives
+  struct In {
+    Vec<T> before, tangent;
+    Lanes<T> length, hinge, twist, mask, angle, reference, rest;
+  };
+  explicit Twist(const Call&) {}
+  void operator()(const std::vector<In>& slot, const Out<T>& out) {
+    std::vector<Vec<T>> pull(out.call.slots);
+    std::vector<Lanes<T>> moment(out.call.slots);
+    for (int64_t k = 0; k < out.call.slots; ++k) {
+      const int64_t i = out.call.after[k];
+      const In& p = slot[i];
+      const Lanes<T> stiffness = p.twist / p.hinge * p.mask;
+      moment[i] = stiffness * ((p.angle - slot[k].angle + p.reference - p.rest) * p.mask);
+      const Lanes<T> chi = at_least<T>(dot(p.before, p.tangent) + T(1), T(1e-6));
+      pull[i] = cross(p.before, p.tangent) * (p.mask / chi * moment[i]);
+      out.put(4, i, stiffness);
+      out.put(5, i, -stiffness);
+      out.put(6, i, stiffness);
+    }
+    for (int64_t i = 0; i < out.call.slots; ++i) {
+      const int64_t n = out.call.after[i];
+      out.put(0, i, (pull[i] + pull[n]) * (T(1) / slot[i].length));
+      out.put(3, i, moment[n] - moment[i]);
+    }
+  }
+};
+
+template <typename T>
+struct Curve {  // elastic.curvature: kappa, binormal, three means, four derivatives by twists
+  struct In {
+    Vec<T> before, tangent, director;
+    Lanes<T> cosine, sine, mask;
+  };
+  explicit Curve(const Call&) {}
+  void operator()(const std::vector<In>& slot, const Out<T>& out) {
+    struct Frame {
+      Vec<T> m1, m2;
+    };
+    std::vector<Frame> frame(out.call.slots);
+    for (int64_t i = 0; i < out.call.slots; ++i) {
+      const In& p = slot[i];
+      const Vec<T> v = cross(p.tangent, p.director);
+      frame[i] = {p.director * p.cosine + v * p.sine, v * p.cosine - p.director * p.sine};
+    }
+    for (int64_t k = 0; k < out.call.slots; ++k) {
+      const int64_t i = out.call.after[k];
+      const In& p = slot[i];
+      const Frame &old = frame[k], &own = frame[i];
+      const Lanes<T> chi = at_least<T>(dot(p.before, p.tangent) + T(1), T(1e-6)), inverse = T(1) / chi;
+      const Vec<T> kb = cross(p.before, p.tangent) * (T(2) * inverse * p.mask);
+      const Vec<T> mean1 = (old.m1 + own.m1) * inverse, mean2 = (old.m2 + own.m2) * inverse;
+      out.put(0, i, dot(kb, mean2) * chi * T(0.5));
+      out.put(1, i, -dot(kb, mean1) * chi * T(0.5));
+      out.put(2, i, kb);
+      out.put(5, i, (p.before + p.tangent) * inverse);
+      out.put(8, i, mean1);
+      out.put(11, i, mean2);
+      out.put(14, i, dot(kb, old.m1) * T(-0.5));
+      out.put(15, i, dot(kb, old.m2) * T(-0.5));
+      out.put(16, i, dot(kb, own.m1) * T(-0.5));
+      out.put(17, i, dot(kb, own.m2) * T(-0.5));
+    }
+  }
+};
+
+template <typename T>
+struct Pull {  // elastic.Curvature.pull_back: gradient, torque
+  struct In {
+    Lanes<T> kappa1, kappa2;
+    Vec<T> mean, mean1, mean2;
+    Lanes<T> b1, b2, a1, a2;
+    Vec<T> before, tangent;
+    Lanes<T> length, f1, f2;
+  };
+  explicit Pull(const Call&) {}
+  void operator()(const std::vector<In>& slot, const Out<T>& out) {
+    struct Part {
+      Vec<T> after, back;
+      Lanes<T> torque;
+    };
+    std::vector<Part> part(out.call.slots);
+    for (int64_t i = 0; i < out.call.slots; ++i) {
+      const In& p = slot[i];
+      const Vec<T> turned = p.mean2 * p.f1 - p.mean1 * p.f2;
+      const Vec<T> along = p.mean * -(p.f1 * p.kappa1 + p.f2 * p.kappa2);
+      part[i] = {along - cross(p.before, turned), along + cross(p.tangent, turned), p.f1 * p.b1 + p.f2 * p.b2};
+    }
+    for (int64_t i = 0; i < out.call.slots; ++i) {
+      const In& p = slot[i];
+      const Part& next = part[out.call.after[i]];
+      out.put(0, i, (part[i].after + next.back) * (T(1) / p.length));
+      out.put(3, i, -(p.f1 * p.a1 + p.f2 * p.a2) - next.torque);
+    }
+  }
+};
+
+template <typename T>
+struct Settle {  // integrate.settle_twist: one step of Newton's method, and the torques that it leaves
+  struct In {
+    Lanes<T> free, before, across, own, torque, geometry, geometry_own, skew;
+  };
+  explicit Settle(const Call&) {}
+  void operator()(const std::vector<In>& slot, const Out<T>& out) {
+    const Call& s = out.call;
+    const int64_t v = s.slots;
+    const std::vector<int64_t> prior = preceding(s);
+    std::vector<Lanes<T>> same(v), onward(v), back(v), entries(3 * v), rhs(v), change(v);
+    std::vector<Lanes<T>> space((v + s.half) * (2 * s.half + 2));
+    Lanes<T> most{};
+    for (int64_t i = 0; i < v; ++i) {
+      const In &p = slot[i], &next = slot[s.after[i]];
+      same[i] = p.own + next.before + p.geometry_own + next.geometry;
+      onward[i] = next.across + next.skew;
+      most = i == 0 || same[i] > most ? same[i] : most;
+    }
+    for (int64_t i = 0; i < v; ++i) {
+      const In& p = slot[i];
+      same[i] += T(1e-9) * most;
+      back[i] = slot[i].across - p.skew;
+      entries[i] = p.free * same[i] + T(1) - p.free;
+      entries[v + i] = p.free * onward[i];
+      entries[2 * v + i] = p.free * back[i];
+      rhs[i] = p.torque * p.free;
+    }
+    const T *e = (const T*)entries.data(), *r = (const T*)rhs.data();
+    constexpr int W = WIDTH<T>;
+    const auto solve = s.half == 1 ? solve_lanes<T, Lanes<T>, 1> : solve_lanes<T, Lanes<T>, 0>;
+    solve(e, s.pattern, (int)s.count, s.order, r, (T*)change.data(), (int)v, (int)s.half, W, 0, W, space.data());
+    for (int64_t i = 0; i < v; ++i) {
+      out.put(0, i, change[i]);
+      out.put(1, i, slot[i].torque - same[i] * change[i] - onward[i] * change[s.after[i]] - back[i] * change[prior[i]]);
+    }
+  }
+};
+
+}  // namespace
+
+#define KERNEL(NAME, KIND, T)                                                                            \
+  extern "C" void NAME##_##T(const T* const* from, T* to, const Call* call, int threads) {               \
+    blocks<T, KIND<T>>(from, to, *call, threads);                                                        \
+  }
+#define KERNELS(NAME, KIND) \
+  KERNEL(NAME, KIND, float) \
+  KERNEL(NAME, KIND, double)
+
+KERNELS(look, Look)
+KERNELS(carry, Carry)
+KERNELS(bend, Bend)
+KERNELS(twist, Twist)
+KERNELS(curve, Curve)
+KERNELS(pull, Pull)
+KERNELS(settle, Settle)
+KERNELS(balance, Balance)

@@ -1,0 +1,63 @@
+// How kernels of rods are called from `lanes.py`: inputs read where they are, results next to each other.
+#pragma once
+#include <vector>
+
+#include "banded.h"
+#include "lanes.h"
+
+// Where a component of an input stands.
+struct Place {
+  int64_t input, offset, slot, scene;  // steps between slots and scenes are 0 for one
+};
+
+struct Call {
+  int64_t slots, scenes, fields;
+  const Place* places;
+  const int64_t* after;
+  const double* numbers;
+  int64_t half, count;  // of the pattern, where a system is solved
+  const int32_t *pattern, *order;
+};
+
+static std::vector<int64_t> preceding(const Call& call) {
+  std::vector<int64_t> found(call.slots);
+  for (int64_t i = 0; i < call.slots; ++i) found[call.after[i]] = i;
+  return found;
+}
+
+// Results of a block of scenes, (components, slots, scenes).
+template <typename T>
+struct Out {
+  T* to;
+  const Call& call;
+  int64_t b;
+  void put(int component, int64_t i, const Lanes<T>& x) const {
+    store<T>(to + (component * call.slots + i) * call.scenes + b, x, call.scenes - b);
+  }
+  void put(int component, int64_t i, const Vec<T>& x) const {
+    put(component, i, x.x);
+    put(component + 1, i, x.y);
+    put(component + 2, i, x.z);
+  }
+};
+
+template <typename T, class Kernel>
+static void blocks(const T* const* from, T* to, const Call& call, int threads) {
+  const int64_t count = (call.scenes + WIDTH<T> - 1) / WIDTH<T>, own = sizeof(typename Kernel::In) / sizeof(Lanes<T>);
+#pragma omp parallel num_threads(threads) if (threads > 1 && count > 1)
+  {
+    std::vector<typename Kernel::In> slot(call.slots);
+    Kernel kernel(call);
+#pragma omp for schedule(static)
+    for (int64_t block = 0; block < count; ++block) {
+      const int64_t b = block * WIDTH<T>;
+      for (int64_t f = 0; f < own; ++f) {
+        const Place& p = call.places[f];
+        const T* at = from[p.input] + p.offset + (p.scene ? b : 0);
+        for (int64_t i = 0; i < call.slots; ++i, at += p.slot)
+          ((Lanes<T>*)&slot[i])[f] = p.scene ? load(at, call.scenes - b) : Lanes<T>{} + *at;
+      }
+      kernel(slot, Out<T>{to, call, b});
+    }
+  }
+}
