@@ -272,8 +272,11 @@ def advance(scene: Scene, params: Params, state: State, start: Control, control:
         share: part of the step that is over after this substep, shape (1,).
     """
     settings = scene.settings
-    director = rotation.turn_towards(start.director, control.director, share)
-    targets = Targets(start.pos + share * (control.pos - start.pos), director, control.grip)
+    pos, director = control.pos, control.director
+    if scene.substeps > 1:
+        pos = start.pos + share * (control.pos - start.pos)
+        director = rotation.turn_towards(start.director, control.director, share)
+    targets = Targets(pos, director, control.grip)
     first = (state.time == 0).to(state.time.dtype)
     foresee = poses = matter = None
     if scene.bodies:

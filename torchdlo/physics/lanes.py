@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import ctypes
 import functools
+import itertools
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -55,34 +57,50 @@ class _Plan:
     """How to call a kernel with inputs of given shapes."""
 
     run: Callable[..., None]
-    call: _Call
+    call: int
+    """Address of the description."""
     pointers: Callable[..., ctypes.Array]
     """Makes an array of addresses."""
+    copied: tuple[int, ...]
+    """Inputs that are not stored as kernels read them."""
     batch: tuple[int, ...]
+    size: int
+    """Numbers in all results."""
+    views: tuple[tuple[tuple[int, ...], tuple[int, ...], int], ...]
+    """Shape, strides and offset of each result among them."""
     kept: tuple
     """What `call` points to."""
 
 
-_Layout = tuple[tuple[torch.Size, tuple[int, ...]], ...]
+_Layout = tuple[tuple[torch.Size, tuple[int, ...], torch.dtype], ...]
 
 
 @functools.lru_cache(maxsize=4096)
 def _plan(
-    kernel: str, topology: str, system: str, numbers: tuple[float, ...], dtype: torch.dtype, layout: _Layout
+    kernel: str,
+    topology: str,
+    components: tuple[int, ...],
+    system: str,
+    numbers: tuple[float, ...],
+    layout: _Layout,
 ) -> _Plan:
-    batch = torch.broadcast_shapes(*(shape[:-2] for shape, _ in layout))
-    after = parse(topology).successor()
-    places = []
-    for k, (shape, stride) in enumerate(layout):
+    batch, dtype = tuple(torch.broadcast_shapes(*(shape[:-2] for shape, *_ in layout))), layout[0][2]
+    after, scenes = parse(topology).successor(), math.prod(batch)
+    places, copied = [], []
+    for k, (shape, stride, own) in enumerate(layout):
+        many = len(shape) > 2 and math.prod(shape[:-2]) > 1
+        if own != dtype or (many and (len(shape) > 3 or stride[0] != 1)):
+            copied.append(k)
+            stride = (1, scenes, scenes * shape[-2]) if len(shape) > 2 else (shape[-1], 1)
+            many = len(shape) > 2 and scenes > 1
         slot = stride[-2] if shape[-2] > 1 else 0
-        scene = 1 if len(shape) == 3 and shape[0] > 1 else 0
-        places += [_Place(k, c * stride[-1], slot, scene) for c in range(shape[-1])]
+        places += [_Place(k, c * stride[-1], slot, int(many)) for c in range(shape[-1])]
     kept = (
         (_Place * len(places))(*places),
         (ctypes.c_int64 * len(after))(*after),
         (ctypes.c_double * len(numbers))(*numbers),
     )
-    call = _Call(len(after), batch.numel(), len(places), *(ctypes.addressof(x) for x in kept))
+    call = _Call(len(after), scenes, len(places), *(ctypes.addressof(x) for x in kept))
     if system:
         pattern = banded.pattern(f"{system}:{topology}")
         entries = pattern.places[0]
@@ -91,39 +109,45 @@ def _plan(
         kept = (*kept, pattern)
     run = getattr(_library(), f"{kernel}_{_DTYPES[dtype]}")
     run.argtypes, run.restype = (ctypes.c_void_p, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int), None
-    return _Plan(run, call, ctypes.c_void_p * len(layout), tuple(batch), kept)
+    each, inner = len(after) * scenes, tuple(math.prod(batch[k + 1 :]) for k in range(len(batch)))
+    starts = itertools.accumulate(components, initial=0)
+    views = tuple(
+        ((*batch, len(after), count), (*inner, scenes, each), start * each)
+        for start, count in zip(starts, components, strict=False)
+    )
+    pointers = ctypes.c_void_p * len(layout)
+    size = sum(components) * each
+    return _Plan(run, ctypes.addressof(call), pointers, tuple(copied), batch, size, views, (*kept, call))
 
 
-def _flat(inputs: Sequence[Tensor]) -> list[Tensor]:
-    """Return inputs of one dtype with at most one batch axis, stored innermost, as they are where they can be."""
-    dtype, deep = inputs[0].dtype, max(x.dim() for x in inputs)
-    batch = torch.broadcast_shapes(*(x.shape[:-2] for x in inputs)) if deep > 3 else ()
-    found = []
-    for x in inputs:
-        x = x if x.dtype == dtype else x.to(dtype)
-        if x.dim() > 2 and deep > 3:
-            x = x.expand(*batch, *x.shape[-2:]).reshape(-1, *x.shape[-2:])
-        if x.dim() == 3 and x.shape[0] > 1 and x.stride(0) != 1:
-            x = tree.batch_innermost(x)
-        found.append(x)
-    return found
+def _stored(x: Tensor, batch: Sequence[int], dtype: torch.dtype) -> Tensor:
+    """Return an input as a kernel reads it."""
+    if x.dim() < 3:
+        return x.to(dtype).contiguous()
+    return tree.batch_innermost(x.to(dtype).expand(*batch, *x.shape[-2:]).reshape(-1, *x.shape[-2:]))
 
 
 def _apply(
-    inputs: list[Tensor], kernel: str, topology: str, components: int, system: str, numbers: list[float]
-) -> Tensor:
-    flat = _flat(inputs)
-    layout = tuple([(x.shape, x.stride()) for x in flat])
-    plan = _plan(kernel, topology, system, tuple(numbers), flat[0].dtype, layout)
-    out = flat[0].new_empty(components, plan.call.slots, plan.call.scenes)
-    addresses = plan.pointers(*[x.data_ptr() for x in flat])
-    plan.run(addresses, out.data_ptr(), ctypes.addressof(plan.call), torch.get_num_threads())
-    return out
+    inputs: list[Tensor],
+    kernel: str,
+    topology: str,
+    components: list[int],
+    system: str,
+    numbers: list[float],
+) -> list[Tensor]:
+    layout = tuple([(x.shape, x.stride(), x.dtype) for x in inputs])
+    plan = _plan(kernel, topology, tuple(components), system, tuple(numbers), layout)
+    out = inputs[0].new_empty(plan.size)
+    if plan.copied:
+        inputs = [_stored(x, plan.batch, out.dtype) if k in plan.copied else x for k, x in enumerate(inputs)]
+    addresses = plan.pointers(*[x.data_ptr() for x in inputs])
+    plan.run(addresses, out.data_ptr(), plan.call, torch.get_num_threads())
+    return [out.as_strided(*view) for view in plan.views]
 
 
 _operators = torch.library.Library("torchdlo", "FRAGMENT")
 _operators.define(
-    "rods(Tensor[] inputs, str kernel, str topology, int components, str system, float[] numbers) -> Tensor"
+    "rods(Tensor[] inputs, str kernel, str topology, int[] components, str system, float[] numbers) -> Tensor[]"
 )
 _operators.impl("rods", _apply, "CPU")
 
@@ -142,11 +166,8 @@ def apply(
         kernel: its name.
         topology: name of the topology.
         inputs: what it reads, shape (..., V or 1, C) each.
-        components: of the results.
+        components: C of the results.
         system: pattern of the linear system that it solves, if it does.
         numbers: what it needs to know besides.
     """
-    batch = torch.broadcast_shapes(*(x.shape[:-2] for x in inputs))
-    stored = torch.ops.torchdlo.rods(list(inputs), kernel, topology, sum(components), system, list(numbers))
-    stored = stored.reshape(*stored.shape[:2], *batch)
-    return [tree.logical(part) for part in stored.split(list(components))]
+    return torch.ops.torchdlo.rods(list(inputs), kernel, topology, list(components), system, list(numbers))

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import warnings
 from collections import OrderedDict
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Sequence
 from typing import Any
 
 import torch
@@ -27,7 +27,8 @@ def batch(scenes: int) -> int:
 def record(step: Callable[..., Any], *inputs: Any) -> Callable[..., Any]:
     """Return a function that does what `step` does to trees of tensors of the same shapes as `inputs`.
 
-    Its first argument is read once for as long as it is the same object; give it a new one rather than change it.
+    Its first two arguments are read once for as long as they are the same objects; give it new ones rather than change
+    them. What it returns may be the second.
     Whatever `step` captures besides its arguments stays as it is now, and so does every choice that Python makes.
     """
     leaves, build = tree.flatten(inputs)
@@ -51,13 +52,21 @@ def record(step: Callable[..., Any], *inputs: Any) -> Callable[..., Any]:
         torch._C._jit_pass_dce(graph)
         recorded = torch._C._create_function_from_graph("step", graph)
 
-    known: list[Any] = [None, []]
+    known: dict[int, tuple[Any, Sequence[torch.Tensor]]] = {}
+
+    def leaves(place: int, given: Any) -> Sequence[torch.Tensor]:
+        # Constants stay the same over many steps, and what a step returns is given to the next one.
+        if place not in known or known[place][0] is not given:
+            known[place] = given, tree.leaves(given)
+        return known[place][1]
 
     @torch.no_grad()
     def replayed(first: Any, *others: Any) -> Any:
-        if known[0] is not first:  # constants stay the same over many steps
-            known[:] = first, tree.leaves(first)
-        return rebuild[0](recorded(*known[1], *tree.leaves(others)))
+        now = leaves(1, others[0]) if others else ()
+        found = recorded(*leaves(0, first), *now, *tree.leaves(others[1:]))
+        made = rebuild[0](found)
+        known[1] = made, found
+        return made
 
     return replayed
 

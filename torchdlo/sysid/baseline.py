@@ -26,6 +26,9 @@ _KEPT = 1 / 3
 _BETTER = 0.9
 """Share of the cost that is left where the rope is taken for a chain, or for one that clamps hold to their ends."""
 
+_LOOK = 2
+"""Iterations after which a chain has to fit better than a rope, if it is to be fitted further."""
+
 _CALMER = 0.7
 """Share of the cost that is left where steps have to look ahead, which makes them less exact."""
 
@@ -189,9 +192,12 @@ def _chain_or(bench: Bench, smooth: Fitted, rope: Refinement, sides: Sequence[Fi
     """
     level, before = bench.level, bench.gaps(smooth, "all")
     bench.use(replace(rope, links=abs(float(sides[0].values[0, -1]))))
-    found = bench.fit([replace(side, start=bench.starts["train"]) for side in sides])
+    start, most = bench.starts["train"], sides[0].iterations
+    found = bench.fit([replace(side, start=start, iterations=min(_LOOK, most)) for side in sides])
     best = min(found, key=lambda f: f.point.cost)
-    # Each in its own measure of what can be known.
+    # Each in its own measure of what can be known. A rope that is no chain fits worse from the beginning.
+    if most > _LOOK and best.point.cost / bench.level < smooth.point.cost / level:
+        best = bench.fit([bench.further(best, most - _LOOK)])[0]
     if best.point.cost / bench.level < _BETTER * smooth.point.cost / level and not bench.astray(best, before):
         return best
     bench.use(rope)
