@@ -9,11 +9,6 @@
 namespace {
 
 template <typename T>
-using Row = std::vector<Lanes<T>>;
-template <typename T>
-using Rows = std::vector<Vec<T>>;
-
-template <typename T>
 class Balance {
  public:
   struct In {
@@ -22,39 +17,18 @@ class Balance {
     Lanes<T> scale;
   };
 
-  explicit Balance(const Call& call)
-      : s(call),
-        v(call.slots),
-        before(preceding(call)),
-        slot(v),
-        pos(v),
-        y(v),
-        along(v),
-        begin(v),
-        push(v),
-        pull(v),
-        turn(v),
-        moment(v),
-        resist(v),
-        lean(v),
-        centre(v),
-        same(v),
-        one(v),
-        two(v),
-        string(v),
-        impulse(v),
-        excess(v),
-        entries(20 * v),
-        rhs(4 * v),
-        found(4 * v) {
-    const size_t bytes = sizeof(Lanes<T>) * (size_t)(4 * v + s.half) * (2 * s.half + 2);
-    if (posix_memalign((void**)&work, 64, bytes)) std::abort();
+  Balance(const Call& call, Scratch<T>& scratch) : s(call), v(call.slots), before(preceding(call)) {
+    for (Vec<T>** x : {&pos, &y, &along, &begin, &start, &push, &pull, &turn, &moment, &resist})
+      *x = scratch.template take<Vec<T>>(v);
+    for (Lanes<T>** x : {&lean, &centre, &same, &one, &two, &string, &impulse, &excess}) *x = scratch.take(v);
+    entries = scratch.take(20 * v);
+    rhs = scratch.take(4 * v);
+    found = scratch.take(4 * v);
+    work = scratch.take((4 * v + s.half) * (2 * s.half + 2));
   }
-  ~Balance() { std::free(work); }
-  Balance(const Balance&) = delete;
 
   // Positions, tensions, and forces.
-  void operator()(const std::vector<In>& given, const Out<T>& out) {
+  void operator()(const In* given, const Out<T>& out) {
     slot = given;
     scale = slot[0].scale;
     begin_with();
@@ -75,13 +49,14 @@ class Balance {
 
  private:
   static Lanes<T>& part(Vec<T>& x, int c) { return (&x.x)[c]; }
+  static const Lanes<T>& part(const Vec<T>& x, int c) { return (&x.x)[c]; }
 
   void begin_with() {
     const T turning = T(s.numbers[0]), pressed = T(s.numbers[2]);
     for (int64_t i = 0; i < v; ++i) {
-      In& p = slot[i];
+      const In& p = slot[i];
       lean[i] = turning * p.active / p.rest;
-      p.start += p.lead * p.active;
+      start[i] = p.start + p.lead * p.active;
       // A straight rope pressed along its line leaves tensions of any size: no first guess.
       const Lanes<T> least = -pressed * p.rest / p.give;
       impulse[i] = (p.tension < least ? Lanes<T>{} : p.tension) * p.active * scale;
@@ -113,7 +88,7 @@ class Balance {
       const In& p = slot[i];
       const int64_t n = s.after[i];
       const Vec<T> turned = y[n] - y[i];
-      begin[i] = p.start + turned * lean[i];
+      begin[i] = start[i] + turned * lean[i];
       pull[i] = begin[i] * impulse[i] + turned * p.swing;
       turn[i] = turned * (p.mask / p.rest);
       Vec<T> edge = pos[n] - pos[i];
@@ -138,7 +113,7 @@ class Balance {
     residual();
     const Lanes<T> zero{};
     for (int64_t i = 0; i < v; ++i) string[i] = impulse[i] * lean[i];
-    Lanes<T>* e = entries.data();
+    Lanes<T>* e = entries;
     for (int64_t i = 0; i < v; ++i) {
       const In& p = slot[i];
       const int64_t n = s.after[i], b = before[i];
@@ -181,22 +156,21 @@ class Balance {
   }
 
   void eliminate() {
-    const T *e = (const T*)entries.data(), *r = (const T*)rhs.data();
+    const T *e = (const T*)entries, *r = (const T*)rhs;
     const int n = 4 * (int)v, k = (int)s.half, count = (int)s.count;
     constexpr int W = WIDTH<T>;
     // Open ropes have k = 8.
-    if (k == 8) solve_lanes<T, Lanes<T>, 8>(e, s.pattern, count, s.order, r, (T*)found.data(), n, k, W, 0, W, work);
-    else solve_lanes<T, Lanes<T>, 0>(e, s.pattern, count, s.order, r, (T*)found.data(), n, k, W, 0, W, work);
+    if (k == 8) solve_lanes<T, Lanes<T>, 8>(e, s.pattern, count, s.order, r, (T*)found, n, k, W, 0, W, work);
+    else solve_lanes<T, Lanes<T>, 0>(e, s.pattern, count, s.order, r, (T*)found, n, k, W, 0, W, work);
   }
 
   const Call& s;
   const int64_t v;
   std::vector<int64_t> before;
-  std::vector<In> slot;
-  Rows<T> pos, y, along, begin, push, pull, turn, moment, resist;
-  Row<T> lean, centre, same, one, two, string, impulse, excess, entries, rhs, found;
+  const In* slot = nullptr;
+  Vec<T> *pos, *y, *along, *begin, *start, *push, *pull, *turn, *moment, *resist;
+  Lanes<T> *lean, *centre, *same, *one, *two, *string, *impulse, *excess, *entries, *rhs, *found, *work;
   Lanes<T> scale;
-  Lanes<T>* work;
 };
 
 }  // namespace

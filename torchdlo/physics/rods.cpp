@@ -39,8 +39,8 @@ struct Look {  // rod.view: lengths, tangents, tangents before, lengths of hinge
     Vec<T> pos;
     Lanes<T> rest, mask;
   };
-  explicit Look(const Call&) {}
-  void operator()(const std::vector<In>& slot, const Out<T>& out) {
+  Look(const Call&, const Scratch<T>&) {}
+  void operator()(const In* slot, const Out<T>& out) {
     for (int64_t i = 0; i < out.call.slots; ++i) {
       const int64_t n = out.call.after[i];
       const Vec<T> e = edge(slot[i].pos, slot[n].pos, slot[i].mask);
@@ -63,9 +63,10 @@ struct Carry {  // rod.advance_frames: directors, sine and cosine of the angle a
   struct Now {
     Vec<T> director, tangent;
   };
-  explicit Carry(const Call&) {}
-  void operator()(const std::vector<In>& slot, const Out<T>& out) {
-    std::vector<Now> now(out.call.slots);
+  Carry(const Call&, const Scratch<T>& free) : room(free) {}
+  void operator()(const In* slot, const Out<T>& out) {
+    Scratch<T> scratch = room;
+    Now* now = scratch.template take<Now>(out.call.slots);
     for (int64_t i = 0; i < out.call.slots; ++i) {
       const Vec<T> e = edge(slot[i].pos, slot[out.call.after[i]].pos, slot[i].mask);
       const Vec<T> tangent = e * (T(1) / at_least<T>(length(e), T(1e-12)));
@@ -82,6 +83,7 @@ struct Carry {  // rod.advance_frames: directors, sine and cosine of the angle a
       out.put(4, out.call.after[i], dot(carried, next.director));
     }
   }
+  const Scratch<T>& room;
 };
 
 template <typename T>
@@ -90,9 +92,11 @@ struct Bend {  // elastic.Bend.loads: gradient, stiffness of hinges
     Vec<T> before, tangent;
     Lanes<T> length, hinge, bend, mask;
   };
-  explicit Bend(const Call&) {}
-  void operator()(const std::vector<In>& slot, const Out<T>& out) {
-    std::vector<Vec<T>> back(out.call.slots), gradient(out.call.slots);
+  Bend(const Call&, const Scratch<T>& free) : room(free) {}
+  void operator()(const In* slot, const Out<T>& out) {
+    Scratch<T> scratch = room;
+    Vec<T>* back = scratch.template take<Vec<T>>(out.call.slots);
+    Vec<T>* gradient = scratch.template take<Vec<T>>(out.call.slots);
     for (int64_t i = 0; i < out.call.slots; ++i) {
       const In& p = slot[i];
       const Lanes<T> cosine = dot(p.before, p.tangent), chi = at_least<T>(cosine + T(1), T(1e-6));
@@ -105,6 +109,7 @@ struct Bend {  // elastic.Bend.loads: gradient, stiffness of hinges
     for (int64_t i = 0; i < out.call.slots; ++i)
       out.put(0, i, gradient[i] + back[out.call.after[i]] * (T(1) / slot[i].length));
   }
+  const Scratch<T>& room;
 };
 
 template <typename T>
@@ -113,10 +118,11 @@ struct Twist {  // elastic.Twist.loads: gradient, torque, second derivatives
     Vec<T> before, tangent;
     Lanes<T> length, hinge, twist, mask, angle, reference, rest;
   };
-  explicit Twist(const Call&) {}
-  void operator()(const std::vector<In>& slot, const Out<T>& out) {
-    std::vector<Vec<T>> pull(out.call.slots);
-    std::vector<Lanes<T>> moment(out.call.slots);
+  Twist(const Call&, const Scratch<T>& free) : room(free) {}
+  void operator()(const In* slot, const Out<T>& out) {
+    Scratch<T> scratch = room;
+    Vec<T>* pull = scratch.template take<Vec<T>>(out.call.slots);
+    Lanes<T>* moment = scratch.take(out.call.slots);
     for (int64_t k = 0; k < out.call.slots; ++k) {
       const int64_t i = out.call.after[k];
       const In& p = slot[i];
@@ -134,6 +140,7 @@ struct Twist {  // elastic.Twist.loads: gradient, torque, second derivatives
       out.put(3, i, moment[n] - moment[i]);
     }
   }
+  const Scratch<T>& room;
 };
 
 template <typename T>
@@ -142,12 +149,13 @@ struct Curve {  // elastic.curvature: kappa, binormal, three means, four derivat
     Vec<T> before, tangent, director;
     Lanes<T> cosine, sine, mask;
   };
-  explicit Curve(const Call&) {}
-  void operator()(const std::vector<In>& slot, const Out<T>& out) {
+  Curve(const Call&, const Scratch<T>& free) : room(free) {}
+  void operator()(const In* slot, const Out<T>& out) {
     struct Frame {
       Vec<T> m1, m2;
     };
-    std::vector<Frame> frame(out.call.slots);
+    Scratch<T> scratch = room;
+    Frame* frame = scratch.template take<Frame>(out.call.slots);
     for (int64_t i = 0; i < out.call.slots; ++i) {
       const In& p = slot[i];
       const Vec<T> v = cross(p.tangent, p.director);
@@ -172,6 +180,7 @@ struct Curve {  // elastic.curvature: kappa, binormal, three means, four derivat
       out.put(17, i, dot(kb, own.m2) * T(-0.5));
     }
   }
+  const Scratch<T>& room;
 };
 
 template <typename T>
@@ -183,13 +192,14 @@ struct Pull {  // elastic.Curvature.pull_back: gradient, torque
     Vec<T> before, tangent;
     Lanes<T> length, f1, f2;
   };
-  explicit Pull(const Call&) {}
-  void operator()(const std::vector<In>& slot, const Out<T>& out) {
+  Pull(const Call&, const Scratch<T>& free) : room(free) {}
+  void operator()(const In* slot, const Out<T>& out) {
     struct Part {
       Vec<T> after, back;
       Lanes<T> torque;
     };
-    std::vector<Part> part(out.call.slots);
+    Scratch<T> scratch = room;
+    Part* part = scratch.template take<Part>(out.call.slots);
     for (int64_t i = 0; i < out.call.slots; ++i) {
       const In& p = slot[i];
       const Vec<T> turned = p.mean2 * p.f1 - p.mean1 * p.f2;
@@ -203,6 +213,7 @@ struct Pull {  // elastic.Curvature.pull_back: gradient, torque
       out.put(3, i, -(p.f1 * p.a1 + p.f2 * p.a2) - next.torque);
     }
   }
+  const Scratch<T>& room;
 };
 
 template <typename T>
@@ -210,13 +221,14 @@ struct Settle {  // integrate.settle_twist: one step of Newton's method, and the
   struct In {
     Lanes<T> free, before, across, own, torque, geometry, geometry_own, skew;
   };
-  explicit Settle(const Call&) {}
-  void operator()(const std::vector<In>& slot, const Out<T>& out) {
+  Settle(const Call&, const Scratch<T>& free) : room(free) {}
+  void operator()(const In* slot, const Out<T>& out) {
     const Call& s = out.call;
     const int64_t v = s.slots;
     const std::vector<int64_t> prior = preceding(s);
-    std::vector<Lanes<T>> same(v), onward(v), back(v), entries(3 * v), rhs(v), change(v);
-    std::vector<Lanes<T>> space((v + s.half) * (2 * s.half + 2));
+    Scratch<T> scratch = room;
+    Lanes<T> *same = scratch.take(v), *onward = scratch.take(v), *back = scratch.take(v), *entries = scratch.take(3 * v),
+             *rhs = scratch.take(v), *change = scratch.take(v), *space = scratch.take((v + s.half) * (2 * s.half + 2));
     Lanes<T> most{};
     for (int64_t i = 0; i < v; ++i) {
       const In &p = slot[i], &next = slot[s.after[i]];
@@ -233,15 +245,16 @@ struct Settle {  // integrate.settle_twist: one step of Newton's method, and the
       entries[2 * v + i] = p.free * back[i];
       rhs[i] = p.torque * p.free;
     }
-    const T *e = (const T*)entries.data(), *r = (const T*)rhs.data();
+    const T *e = (const T*)entries, *r = (const T*)rhs;
     constexpr int W = WIDTH<T>;
     const auto solve = s.half == 1 ? solve_lanes<T, Lanes<T>, 1> : solve_lanes<T, Lanes<T>, 0>;
-    solve(e, s.pattern, (int)s.count, s.order, r, (T*)change.data(), (int)v, (int)s.half, W, 0, W, space.data());
+    solve(e, s.pattern, (int)s.count, s.order, r, (T*)change, (int)v, (int)s.half, W, 0, W, space);
     for (int64_t i = 0; i < v; ++i) {
       out.put(0, i, change[i]);
       out.put(1, i, slot[i].torque - same[i] * change[i] - onward[i] * change[s.after[i]] - back[i] * change[prior[i]]);
     }
   }
+  const Scratch<T>& room;
 };
 
 }  // namespace

@@ -19,6 +19,24 @@ struct Call {
   const int32_t *pattern, *order;
 };
 
+// Room that a thread keeps from call to call.
+template <typename T>
+class Scratch {
+ public:
+  template <class S = Lanes<T>>
+  S* take(int64_t count) {
+    const size_t size = count * sizeof(S) / sizeof(Lanes<T>);
+    if (used_ == rooms.size()) rooms.emplace_back();
+    std::vector<Lanes<T>>& room = rooms[used_++];
+    if (room.size() < size) room.resize(size);
+    return (S*)room.data();
+  }
+
+ private:
+  static inline thread_local std::vector<std::vector<Lanes<T>>> rooms;
+  size_t used_ = 0;
+};
+
 static std::vector<int64_t> preceding(const Call& call) {
   std::vector<int64_t> found(call.slots);
   for (int64_t i = 0; i < call.slots; ++i) found[call.after[i]] = i;
@@ -46,8 +64,9 @@ static void blocks(const T* const* from, T* to, const Call& call, int threads) {
   const int64_t count = (call.scenes + WIDTH<T> - 1) / WIDTH<T>, own = sizeof(typename Kernel::In) / sizeof(Lanes<T>);
 #pragma omp parallel num_threads(threads) if (threads > 1 && count > 1)
   {
-    std::vector<typename Kernel::In> slot(call.slots);
-    Kernel kernel(call);
+    Scratch<T> scratch;
+    typename Kernel::In* slot = scratch.template take<typename Kernel::In>(call.slots);
+    Kernel kernel(call, scratch);
 #pragma omp for schedule(static)
     for (int64_t block = 0; block < count; ++block) {
       const int64_t b = block * WIDTH<T>;
