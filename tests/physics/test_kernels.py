@@ -36,7 +36,7 @@ def stepped(monkeypatch, kernels: bool, built, steps: int):
     return state, used
 
 
-FRAMED = ("look", "carry", "curve", "pull", "twist", "settle", "balance")
+FRAMED = ("look", "carry", "curve", "pull", "answer", "twist", "settle", "balance")
 
 
 def assert_same(monkeypatch, built, tolerance, steps=6, uses=FRAMED):
@@ -110,7 +110,7 @@ def test_explicit_steps_carry_frames_the_same_way(monkeypatch):
         twist="dynamic",
         held_vertices=(0,),
     )
-    assert_same(monkeypatch, built, 1e-9, uses=("look", "carry", "curve", "pull", "twist"))
+    assert_same(monkeypatch, built, 1e-9, uses=("look", "carry", "curve", "pull", "answer", "twist"))
 
 
 def test_a_rope_pulled_beyond_its_length_gives_way_the_same(monkeypatch):

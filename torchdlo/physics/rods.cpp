@@ -217,6 +217,27 @@ struct Pull {  // elastic.Curvature.pull_back: gradient, torque
 };
 
 template <typename T>
+struct Answer {  // elastic.answers: second derivatives by twists, and what moments add to them
+  struct In {
+    Lanes<T> b1, b2, a1, a2, f1, f2, s1, s2, coupling;
+  };
+  Answer(const Call&, const Scratch<T>&) {}
+  void operator()(const In* slot, const Out<T>& out) {
+    for (int64_t i = 0; i < out.call.slots; ++i) {
+      const In& p = slot[i];
+      const auto product = [&](const Lanes<T>& x1, const Lanes<T>& x2, const Lanes<T>& y1, const Lanes<T>& y2) {
+        return p.s1 * x1 * y1 + p.s2 * x2 * y2 + p.coupling * (x1 * y2 + x2 * y1);
+      };
+      out.put(0, i, product(p.b1, p.b2, p.b1, p.b2));
+      out.put(1, i, product(p.b1, p.b2, p.a1, p.a2));
+      out.put(2, i, product(p.a1, p.a2, p.a1, p.a2));
+      out.put(3, i, p.f1 * p.b2 - p.f2 * p.b1);
+      out.put(4, i, p.f1 * p.a2 - p.f2 * p.a1);
+    }
+  }
+};
+
+template <typename T>
 struct Settle {  // integrate.settle_twist: one step of Newton's method, and the torques that it leaves
   struct In {
     Lanes<T> free, before, across, own, torque, geometry, geometry_own, skew;
@@ -273,5 +294,6 @@ KERNELS(bend, Bend)
 KERNELS(twist, Twist)
 KERNELS(curve, Curve)
 KERNELS(pull, Pull)
+KERNELS(answer, Answer)
 KERNELS(settle, Settle)
 KERNELS(balance, Balance)

@@ -155,10 +155,15 @@ def act(stiffness: Tensor, strain: Tensor) -> Tensor:
     return stiffness[..., :2] * strain + stiffness[..., 2:] * strain.flip(-1)
 
 
-def answers(hinge: Curvature, moment: Tensor, stiffness: Tensor) -> Values:
+def answers(view: View, hinge: Curvature, moment: Tensor, stiffness: Tensor) -> Values:
     """Return how moments answer to the twists: parts of `LOADS` for a stiffness (..., V, 1, 2 or 3)."""
     s1 = stiffness[..., :1]
     s2 = s1 if stiffness.shape[-1] == 1 else stiffness[..., 1:2]
+    if lanes.ready(moment):
+        coupling = stiffness[..., 2:] if stiffness.shape[-1] == 3 else moment.new_zeros(1, 1)
+        inputs = *hinge.by_twist, moment, s1, s2, coupling
+        hessian, geometry = lanes.apply("answer", view.topology.name, inputs, (3, 2))
+        return {"twist_hessian": hessian, "twist_geometry": geometry}
     f1, f2 = moment[..., :1], moment[..., 1:]
     b1, b2, a1, a2 = hinge.by_twist
     parts = [s1 * b1 * b1 + s2 * b2 * b2, s1 * b1 * a1 + s2 * b2 * a2, s1 * a1 * a1 + s2 * a2 * a2]
@@ -206,7 +211,7 @@ class BendFrame(Effect):
         curved = dot(hinge.binormal, hinge.binormal) / 4
         return {
             **hinge.pull_back(view, moment),
-            **answers(hinge, moment, stiffness),
+            **answers(view, hinge, moment, stiffness),
             "hinge_stiffness": closing(greatest(stiffness), curved),
         }
 

@@ -78,7 +78,7 @@ class InternalFriction(Effect):
         odd = 0.5 * (w[..., :1] * u[..., 1:] - w[..., 1:] * u[..., :1])
         return {
             **hinge.pull_back(view, moment),
-            **answers(hinge, moment, slope * started * (even + _outer(w, u))),
+            **answers(view, hinge, moment, slope * started * (even + _outer(w, u))),
             "twist_skew": slope * started * odd * (b1 * a2 - b2 * a1),
             # Turning back, friction is up to twice as stiff.
             "hinge_stiffness": closing(slope * (1 + safe_norm(before)), dot(hinge.binormal, hinge.binormal) / 4),
@@ -128,7 +128,7 @@ class StiffeningBending(Effect):
         curved = dot(hinge.binormal, hinge.binormal) / 4
         return {
             **hinge.pull_back(view, moment),
-            **answers(hinge, moment, slope),
+            **answers(view, hinge, moment, slope),
             # 3 c k^2 B along the curvature, the stiffest direction.
             "hinge_stiffness": closing(6 * share * square * greatest(stiffness), curved),
         }
