@@ -69,7 +69,7 @@ def tilted(trial: Trial) -> Trial:
 def simulated(recording: Recording, name: str, base: Diagnosis) -> Recording:
     """Return the recording with what an effect changes in a simulation added to the free markers."""
     options = {"grip": base.model.grip, "ahead": base.model.ahead, "rest": base.model.rest}
-    models = [RopeModel(recording, effects=e, compiled=False, **options) for e in ((), (name,))]
+    models = [RopeModel(recording, effects=e, **options) for e in ((), (name,))]
     known = dict(zip(base.model.parameters, base.final.values, strict=True))
     numbers = dict(SIMULATED[name])
     if name == "point_mass":

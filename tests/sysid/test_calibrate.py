@@ -144,7 +144,7 @@ def test_a_trial_that_starts_with_a_mistracked_marker_is_simulated(tmp_path: Pat
 
 def test_as_many_parameter_sets_as_vertices_are_still_one_per_scene(tmp_path: Path) -> None:
     recording = make_recording(tmp_path)
-    model = RopeModel(recording, vertices=13, compiled=False)
+    model = RopeModel(recording, vertices=13)
     motion, begin = model.motion(recording.train[:1]), start.read_off(recording.train[:1])
     many = TRUE * np.linspace(0.5, 2.0, len(model.arclength))[:, None]
     together = model.simulate(motion, begin, many, frames=8)

@@ -51,7 +51,7 @@ def make_recording(path: Path, effects: dict[str, float], noise: float = 2e-4, g
     gravity = np.array([0, 0, -9.81])
     empty = Recording(path, 0.6, 0.005, 0.03, gravity, None, noise, None, None, False, "", trials[:2], trials[2:])
     names = sorted({key.split(".")[0] for key in effects})
-    model = RopeModel(empty, vertices=61, effects=names, substep=2.5e-3, ahead=0.0, grip=grip, compiled=False)
+    model = RopeModel(empty, vertices=61, effects=names, substep=2.5e-3, ahead=0.0, grip=grip)
     values = dict(zip(model.parameters, model.guess(), strict=True))
     values |= {"bending_stiffness": 2e-3, "twisting_stiffness": 1.5e-3, "damping_rate": 0.5} | effects
     start = Start(np.stack([t.markers[0] for t in trials]), np.zeros((3, len(S), 3)), np.ones(3, bool))

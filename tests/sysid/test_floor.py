@@ -17,7 +17,7 @@ from torchdlo.sysid.floor import Refinement
 from torchdlo.sysid.pool import Fitted, Pool, Simulation
 from torchdlo.sysid.recording import Recording, Trial
 
-OPTIONS = {"vertices": 33, "ahead": 0.0, "grip": 0.0, "compiled": False}
+OPTIONS = {"vertices": 33, "ahead": 0.0, "grip": 0.0}
 
 
 def carried(path: Path) -> Recording:

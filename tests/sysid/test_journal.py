@@ -89,7 +89,7 @@ def test_only_what_is_missing_is_computed(recording: Recording, tmp_path: Path) 
 
 
 def test_a_pool_reads_what_another_one_computed(recording: Recording, tmp_path: Path) -> None:
-    options = {"vertices": 15, "compiled": False}
+    options = {"vertices": 15}
     job = Simulation((), np.array([[1e-3, 1e-3, 0.5]]))
     with Pool(recording, options, 1, Journal(tmp_path / "j", recording, OPTIONS)) as pool:
         ((_, computed),) = pool.simulate([job])

@@ -11,7 +11,7 @@ from torchdlo.sysid.bench import Bench
 from torchdlo.sysid.fit import Point, Space
 from torchdlo.sysid.pool import Fit, Fitted, Pool
 
-OPTIONS = {"vertices": 17, "ahead": 0.0, "grip": 0.0, "compiled": False}
+OPTIONS = {"vertices": 17, "ahead": 0.0, "grip": 0.0}
 BASE = ("bending_stiffness", "damping_rate")
 
 

@@ -8,7 +8,6 @@ Effects of the library may be added to it.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
@@ -42,11 +41,8 @@ _STRETCH = 1e4
 AHEAD = 0.1
 """How far steps look ahead: real ropes are jerked taut, and what then rings within a substep must die out."""
 
-_CHUNK = 64
-"""Scenes that run together in a compiled step: one size, so that there is one graph."""
-
-_COMPILE_FROM = 10_000
-"""Frames in the train trials from which compiling pays off."""
+_CHUNK = 256
+"""Most scenes that run together."""
 
 
 class RopeModel:
@@ -62,8 +58,6 @@ class RopeModel:
         substep: float = MAX_SUBSTEP,
         ahead: float = AHEAD,
         grip: float = 1.0,
-        compiled: bool | None = None,
-        threads: int = 1,
     ) -> None:
         """Prepare the model.
 
@@ -75,8 +69,6 @@ class RopeModel:
             substep: longest substep [s].
             ahead: see `torchdlo.scene.Scene`.
             grip: where clamps hold the rope's direction, see `Mesh.clamp_stiffness`.
-            compiled: whether steps are compiled; by the length of the recording if not given.
-            threads: how many chunks of scenes run at the same time.
         """
         trial = recording.train[0]
         self.recording, self.rest, self.effects = recording, rest, tuple(effects)
@@ -85,7 +77,7 @@ class RopeModel:
         self.arclength, self.marker_vertex = self.mesh.arclength, self.mesh.marker_vertex
         self.held, self.clamps = self.mesh.held, self.mesh.clamps
         self.gripped = np.flatnonzero(trial.gripped)
-        self.ahead, self.grip, self.threads = ahead, grip, threads
+        self.ahead, self.grip = ahead, grip
         for other in (*recording.train, *recording.test):
             same = np.array_equal(other.gripped, trial.gripped)
             if not same or not np.allclose(other.marker_arclength, trial.marker_arclength):
@@ -98,9 +90,6 @@ class RopeModel:
                 "rope.json: rest_positions is missing; expected it for a calibration with the given rest shape."
             )
         self.dt = float(trial.time[1] - trial.time[0])
-        frames = sum(len(t.time) for t in recording.train)
-        self.compiled = frames >= _COMPILE_FROM if compiled is None else compiled
-        self._stepper: tuple[scenes.Scene, Callable] | None = None
         self.substeps = max(1, int(np.ceil(self.dt / substep - 1e-9)))
         baseline = ["bending_stiffness", "twisting_stiffness", "damping_rate"]
         baseline += ["rest_share", "rest_roll"] if rest == "given" else []
@@ -304,18 +293,11 @@ class RopeModel:
         sets, trials = len(values), len(motion.names)
         total = frames or motion.markers.shape[1]
         out = np.empty((sets * trials, total, self.count, 3))
-        size = _CHUNK if self.compiled else min(4 * _CHUNK, traced.batch(-(-sets * trials // self.threads)))
-        chunks = [np.arange(a, min(a + size, sets * trials)) for a in range(0, sets * trials, size)]
-
-        def run(rows: np.ndarray) -> None:
-            filled = np.resize(rows, size if self.compiled else traced.batch(len(rows)))
+        for rows in np.split(np.arange(sets * trials), range(_CHUNK, sets * trials, _CHUNK)):
+            filled = np.resize(rows, traced.batch(len(rows)))
             trial = filled % trials
             begin = start.pick(filled if len(start.pos) == sets * trials else trial)
             out[rows] = self._run(motion.pick(trial), begin, values[filled // trials], total)[: len(rows)]
-
-        # Compiled kernels and solvers release the interpreter's lock, so threads share the cores.
-        with ThreadPoolExecutor(self.threads) as pool:
-            list(map(run, chunks) if self.threads == 1 else pool.map(run, chunks))
         if start.finer is not None:
             out += np.resize(start.finer[:, :total], out.shape)
         return out.reshape(sets, trials, total, self.count, 3)
@@ -329,9 +311,7 @@ class RopeModel:
             scenes.Control(tree.batch_innermost(motion.held[:, k]), tree.batch_innermost(director[:, k]))
             for k in range((frames - 1) * self.substeps + 1)
         ]
-        if self.compiled and (self._stepper is None or self._stepper[0] != scene):
-            self._stepper = scene, scenes.stepper(scene)
-        step = self._stepper[1] if self.compiled else recorded(scene, params, state, controls[0])
+        step = recorded(scene, params, state, controls[0])
         if start.still is not None and start.still.any():
             resting = settle.come_to_rest(scene, params, state, controls[0])
             resting = self._corrected(step, scene, params, resting, controls, motion)

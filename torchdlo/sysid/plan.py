@@ -53,7 +53,6 @@ def options(recording: Recording, vertices: int | None) -> dict[str, Any]:
         # What rings when a rope is jerked taut must die out within a substep or two.
         "ahead": AHEAD if taut else 0.0,
         "grip": 0.0,
-        "compiled": False,
     }
 
 
