@@ -19,10 +19,10 @@ from torchdlo.coupling import body_matter, mpm, rod_matter, watch
 from torchdlo.coupling.bodies import Body, BodyParams, BodyState, BodyTargets, Solid, place
 from torchdlo.coupling.particles import Matter, Medium, Particles
 from torchdlo.coupling.watch import survey
-from torchdlo.physics import build, rod, rotation, stability, tree
+from torchdlo.physics import build, rod, stability, tree
 from torchdlo.physics.build import Rope
 from torchdlo.physics.effect import Effect, altered, default_values, numbers_of
-from torchdlo.physics.hold import Reaction, Targets, check_grip, unfelt
+from torchdlo.physics.hold import Reaction, Targets, between, check_grip, unfelt
 from torchdlo.physics.integrate import INTEGRATORS, TWISTS, Settings, settle_twist, substep
 from torchdlo.physics.numerics import cross, normalize
 from torchdlo.physics.replay import alike, laid_out, rollout
@@ -272,11 +272,7 @@ def advance(scene: Scene, params: Params, state: State, start: Control, control:
         share: part of the step that is over after this substep, shape (1,).
     """
     settings = scene.settings
-    pos, director = control.pos, control.director
-    if scene.substeps > 1:
-        pos = start.pos + share * (control.pos - start.pos)
-        director = rotation.turn_towards(start.director, control.director, share)
-    targets = Targets(pos, director, control.grip)
+    targets = between(start, control, share if scene.substeps > 1 else None)
     first = (state.time == 0).to(state.time.dtype)
     foresee = poses = matter = None
     if scene.bodies:

@@ -6,7 +6,7 @@ import pytest
 import torch
 from helpers import F64, circle, effects, run, straight, vec, wild
 
-from torchdlo.physics import lanes, tree
+from torchdlo.physics import lanes, traced, tree
 from torchdlo.scene import Rope, hold, make, step
 
 GIVEN = {"mass": 0.1, "bend": 1e-3, "twist": 1e-3, "radius": 0.01}
@@ -23,14 +23,14 @@ def ropes(batch: tuple[int, ...], dtype: torch.dtype, *, loop: bool) -> list[Rop
 
 def stepped(monkeypatch, kernels: bool, built, steps: int):
     """States of a scene with or without the kernels, and which of them were used."""
-    used, ready, apply = set(), lanes.ready, lanes.apply
+    used, apply = set(), lanes.apply
 
     def watched(kernel, *others, **more):
         used.add(kernel)
         return apply(kernel, *others, **more)
 
     with monkeypatch.context() as patch, torch.no_grad():
-        patch.setattr(lanes, "ready", lambda like: kernels and ready(like))
+        patch.setattr(lanes, "ready", lambda like: kernels and lanes.available(like))
         patch.setattr(lanes, "apply", watched)
         state, _ = run(*built, steps)
     return state, used
@@ -78,6 +78,21 @@ def test_drag_of_hinges_and_steps_that_look_ahead_are_the_same(ahead, monkeypatc
         held_vertices=(0, 8),
     )
     assert_same(monkeypatch, built, 1e-9, uses=("look", "bend", "curve", "pull", "carry", "balance"))
+
+
+@pytest.mark.parametrize("length", [0.03, -0.02, 0.0])
+def test_chains_of_links_are_the_same(length, monkeypatch):
+    built = make(
+        ropes((3,), F64, loop=False),
+        effects("gravity", "bend_frame", "twist", "link_chain"),
+        {"link_chain": {"length": length}},
+        dt=2e-3,
+        integrator="implicit",
+        twist="quasistatic",
+        held_vertices=(0, 1),
+        held_edges=(0,),
+    )
+    assert_same(monkeypatch, built, 1e-9, uses=(*FRAMED, "joint", "spring"))
 
 
 def test_single_precision_is_as_good_as_the_operations_are(monkeypatch):
@@ -128,8 +143,7 @@ def test_a_rope_pulled_beyond_its_length_gives_way_the_same(monkeypatch):
     found = []
     for kernels in (True, False):
         with monkeypatch.context() as patch, torch.no_grad():
-            if not kernels:
-                patch.setattr(lanes, "ready", lambda like: False)
+            patch.setattr(lanes, "ready", lambda like, kernels=kernels: kernels and lanes.available(like))
             now = state
             for _ in range(5):
                 now = step(scene, params, now, pulled)
@@ -140,15 +154,16 @@ def test_a_rope_pulled_beyond_its_length_gives_way_the_same(monkeypatch):
         torch.testing.assert_close(a, b, rtol=1e-7, atol=1e-10)
 
 
-def test_derivatives_are_those_of_the_operations():
-    built = make(ropes((2,), F64, loop=False), effects("gravity", "bend"), dt=2e-3, integrator="implicit")
-    pos = built[2].rods.pos.clone().requires_grad_()
-    state = tree.replace(built[2], rods=tree.replace(built[2].rods, pos=pos))
-    moved = state
-    for _ in range(3):
-        moved = step(built[0], built[1], moved, hold(built[0], built[2]))
-    (slope,) = torch.autograd.grad(moved.rods.pos[..., 2].sum(), pos)
-    assert float(slope.abs().sum()) > 0
+def test_they_are_used_in_recorded_steps_only(monkeypatch):
+    scene, params, state = make(
+        ropes((2,), F64, loop=False), effects("gravity", "bend"), dt=2e-3, integrator="implicit"
+    )
+    used, apply = [], lanes.apply
+    monkeypatch.setattr(lanes, "apply", lambda kernel, *others: (used.append(kernel), apply(kernel, *others))[1])
+    control = hold(scene, state)
     with torch.no_grad():
-        plain, _ = run(*built, 3)
-    torch.testing.assert_close(moved.rods.pos.detach(), plain.rods.pos, rtol=0, atol=1e-11)
+        plain = step(scene, params, state, control)
+    assert not used
+    fast = traced.record(lambda *given: step(scene, *given), params, state, control)(params, state, control)
+    assert {"look", "bend", "balance"} <= set(used)
+    torch.testing.assert_close(fast.rods.pos, plain.rods.pos, rtol=0, atol=1e-14)

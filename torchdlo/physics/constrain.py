@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -42,6 +43,11 @@ class Lengths:
     """Tension at which edges give way, over the one at which explicit steps are not stable."""
     least: float = 0.25
     """Compression from which on that of the last substep is no first guess, likewise."""
+
+    @property
+    def shift(self) -> float:
+        """Relative shift of the systems [1], which matters only when a taut rope has no solution."""
+        return 1e-10 if self.rest.dtype == torch.float64 else 1e-6
 
     def yielding(self, tension: Tensor) -> tuple[Tensor | float, Tensor | float]:
         """Return how much an edge lengthens beyond the tension that steps can follow [m], and the slope of that [m/N].
@@ -125,10 +131,14 @@ def project(
     def newton(tension: Tensor, along: Tensor, excess: Tensor) -> Tensor:
         both = answer + following(topology, answer)
         active, off = lengths.active, 1 - lengths.active
-        # The small relative shift matters only when a taut rope has no solution.
-        shift = 1 + (1e-10 if tension.dtype == torch.float64 else 1e-6)
         diagonal = (
-            active * (shift * total(along * direction * both) + lengths.compliance + lengths.yielding(tension)[1]) + off
+            active
+            * (
+                (1 + lengths.shift) * total(along * direction * both)
+                + lengths.compliance
+                + lengths.yielding(tension)[1]
+            )
+            + off
         )
         to_next = -active * dot(along, following(topology, direction * answer))
         to_prev = -active * total(along * answer * preceding(topology, direction))
@@ -236,13 +246,8 @@ def balance(
         the answer of the hinges [N], (..., V, 3).
     """
     topology = lengths.topology
-    shift = 1e-10 if force.dtype == torch.float64 else 1e-6
     if lanes.ready(force):
-        swing = force.new_zeros(1, 1) if inertia.turning is None else inertia.turning
-        edges = lengths.rest, lengths.compliance, lengths.active, lengths.edge_mask, lengths.give, inertia.hinge, swing
-        inputs = *edges, free, tension, inertia.vertex, moved, force, direction, ahead, scale
-        law = turning, lengths.most, lengths.least, shift, steps
-        return tuple(lanes.apply("balance", topology.name, inputs, (3, 1, 3), "saddle", law))
+        return _balanced(lengths, inertia, (free, tension), (moved, force, direction, ahead, scale), turning, steps)
     pulled = lengths.active
     lean, start = turning * pulled / lengths.rest, direction + pulled * ahead
 
@@ -263,6 +268,7 @@ def balance(
             string = impulse * lean
 
             after, active = following(topology, free), lengths.active
+            soft = lengths.yielding(impulse / scale)[1] + lengths.shift * lengths.give
             entries = _rows(
                 inertia.vertex + free * (same + string + preceding(topology, string)),
                 free * (one - string),
@@ -273,8 +279,7 @@ def balance(
                 after * active * along_start,
                 -active * along,
                 active * along,
-                -active * (lengths.compliance + lengths.yielding(impulse / scale)[1] + shift * lengths.give) / scale
-                + (active - 1),
+                -active * (lengths.compliance + soft) / scale + (active - 1),
             )
         rhs = -_rows(inertia.vertex * y - free * push, excess)
         step = banded.solve(entries, rhs, f"saddle:{topology.name}")
@@ -290,6 +295,22 @@ def balance(
     pos = torch.where(free > 0, pos, moved)
     pos, impulse = newton(pos, impulse)
     return pos, impulse / scale, residual(pos, impulse)[1] / scale
+
+
+def _balanced(
+    lengths: Lengths,
+    inertia: Inertia,
+    scalars: Sequence[Tensor],
+    vectors: Sequence[Tensor],
+    turning: float,
+    steps: int,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return what `balance` does, by a kernel that reads its inputs in this order."""
+    swing = inertia.vertex.new_zeros(1, 1) if inertia.turning is None else inertia.turning
+    edges = lengths.rest, lengths.compliance, lengths.active, lengths.edge_mask, lengths.give, inertia.hinge, swing
+    inputs = *edges, *scalars, inertia.vertex, *vectors
+    law = turning, lengths.most, lengths.least, lengths.shift, steps
+    return tuple(lanes.apply("balance", lengths.topology.name, inputs, (3, 1, 3), "saddle", law))
 
 
 def _saddle(name: str) -> banded.Pattern:

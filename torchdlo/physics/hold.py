@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import field
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from torchdlo.physics import tree
+from torchdlo.physics import rotation, tree
 
 
 @tree.struct
@@ -20,6 +21,20 @@ class Targets:
     """First material directors of the held edges [1], shape (..., G, 3)."""
     grip: dict[str, Tensor] = field(default_factory=dict)
     """How firmly the held "vertices" (..., H, 1) and "edges" (..., G, 1) are held, 0 to 1; 1 if not said."""
+
+
+def between(start: Any, control: Any, share: Tensor | None) -> Targets:
+    """Return where held parts are at the end of a substep.
+
+    Args:
+        start: where they were when the step began, see `scene.Control`.
+        control: where they are at its end.
+        share: part of the step that is over then, shape (1,); None at its end.
+    """
+    if share is None:
+        return Targets(control.pos, control.director, control.grip)
+    director = rotation.turn_towards(start.director, control.director, share)
+    return Targets(start.pos + share * (control.pos - start.pos), director, control.grip)
 
 
 @tree.struct

@@ -1,7 +1,7 @@
-"""C++ kernels of rods, several scenes per instruction, that take the place of tensor operations without derivatives.
+"""C++ kernels of rods, several scenes per instruction, that take the place of tensor operations in recorded steps.
 
 A substep is some eight hundred operations on small tensors; a kernel does dozens of them without leaving the cache. The
-formulas stand beside the calls of `apply`, as the operations that are used where derivatives are asked for.
+formulas stand beside the calls of `apply`, as the operations that are used elsewhere.
 """
 
 from __future__ import annotations
@@ -42,14 +42,17 @@ def _library() -> ctypes.CDLL | None:
     return native.library(source, "-fno-math-errno", "-fno-trapping-math", "-Wno-psabi")
 
 
-def ready(like: Tensor) -> bool:
-    """Return whether kernels may be used now, in place of the tensor operations that have derivatives.
-
-    On a GPU and in compiled graphs, where operations are fused anyway, they are used as well.
-    """
-    if torch.is_grad_enabled() or torch.compiler.is_compiling():
-        return False
+def available(like: Tensor) -> bool:
+    """Return whether there are kernels for tensors like this one."""
     return like.device.type == "cpu" and like.dtype in _DTYPES and _library() is not None
+
+
+def ready(like: Tensor) -> bool:
+    """Return whether to use kernels now: only in steps that are being recorded (`traced`), without derivatives.
+
+    They round in another way than the tensor operations, and motions are to be the same with and without derivatives.
+    """
+    return torch.jit.is_tracing() and not torch.is_grad_enabled() and available(like)
 
 
 @dataclass(frozen=True)

@@ -238,6 +238,70 @@ struct Answer {  // elastic.answers: second derivatives by twists, and what mome
 };
 
 template <typename T>
+struct Joint {  // grid._Joint: what the angles of a joint are angles of, and the sine of the second
+  struct In {
+    Lanes<T> k1, k2, twist, c, s, w;
+    Lanes<T> p() const { return T(-0.5) * w * k1; }
+    Lanes<T> q() const { return T(-0.5) * w * k2; }
+    Lanes<T> nx() const { return T(2) * (c * s - p() * q()); }
+    Lanes<T> dx() const { return c * c - s * s + q() * q() - p() * p(); }
+    Lanes<T> y() const { return T(2) * (s * q() + c * p()); }
+    Lanes<T> nz() const { return T(2) * (c * q() - s * p()); }
+    Lanes<T> dz() const { return T(1) - p() * p() - q() * q(); }
+    Lanes<T> norm() const { return T(1) + p() * p() + q() * q(); }
+    Lanes<T> sine() const {
+      const Lanes<T> x = y() / norm(), most = Lanes<T>{} + T(0.99);
+      return x > most ? most : x < -most ? -most : x;
+    }
+  };
+  Joint(const Call&, const Scratch<T>&) {}
+  void operator()(const In* slot, const Out<T>& out) {
+    for (int64_t i = 0; i < out.call.slots; ++i) {
+      out.put(0, i, slot[i].nx());
+      out.put(1, i, slot[i].dx());
+      out.put(2, i, slot[i].nz());
+      out.put(3, i, slot[i].dz());
+      out.put(4, i, slot[i].sine());
+    }
+  }
+};
+
+template <typename T>
+struct Spring {  // grid._Joint.answers: moments, second derivatives by twists, and what moments add to them
+  struct In {
+    typename Joint<T>::In joint;
+    Lanes<T> bending, twisting, some, links, b1, b2, a1, a2, x, y, z;
+  };
+  Spring(const Call&, const Scratch<T>&) {}
+  void operator()(const In* slot, const Out<T>& out) {
+    for (int64_t i = 0; i < out.call.slots; ++i) {
+      const In& h = slot[i];
+      const auto& j = h.joint;
+      const Lanes<T> p = j.p(), q = j.q(), c = j.c, s = j.s, nx = j.nx(), dx = j.dx(), nz = j.nz(), dz = j.dz();
+      const Lanes<T> sine = j.sine();
+      const Lanes<T> ex = h.twisting * h.x / (nx * nx + dx * dx), ez = h.bending * h.z / (nz * nz + dz * dz);
+      const Lanes<T> ey = h.bending * h.y / (j.norm() * root<T>(T(1) - sine * sine));
+      const Lanes<T> by_p = ex * T(2) * (p * nx - q * dx) + ez * T(2) * (p * nz - s * dz) + ey * T(2) * (c - p * sine);
+      const Lanes<T> by_q = ex * T(-2) * (p * dx + q * nx) + ez * T(2) * (c * dz + q * nz) + ey * T(2) * (s - q * sine);
+      const Lanes<T> turned = (c * c - s * s) * dx + T(2) * c * s * nx;
+      const Lanes<T> by_t = ex * turned - T(0.5) * ez * j.y() * dz + T(0.5) * ey * nz;
+      const auto on = h.some > T(0);
+      const Lanes<T> none{}, moment = on ? by_t / j.w - h.twisting * j.twist : none;
+      out.put(0, i, on ? -by_p / (T(2) * j.w) - h.bending * j.k1 : none);
+      out.put(1, i, on ? -by_q / (T(2) * j.w) - h.bending * j.k2 : none);
+      out.put(2, i, moment);
+      const Lanes<T> share = T(-0.5) * h.links, f = share * (h.twisting * j.twist + moment);
+      const Lanes<T> before = share * (j.k2 * h.b1 + j.k1 * h.b2), after = share * (j.k2 * h.a1 + j.k1 * h.a2);
+      out.put(3, i, h.twisting * (before * before - T(2) * before) + f * T(2) * h.b1 * h.b2);
+      out.put(4, i, h.twisting * (before - after + before * after) + f * (h.b1 * h.a2 + h.b2 * h.a1));
+      out.put(5, i, h.twisting * (after * after + T(2) * after) + f * T(2) * h.a1 * h.a2);
+      out.put(6, i, f * (j.k2 * h.b2 - j.k1 * h.b1));
+      out.put(7, i, f * (j.k2 * h.a2 - j.k1 * h.a1));
+    }
+  }
+};
+
+template <typename T>
 struct Settle {  // integrate.settle_twist: one step of Newton's method, and the torques that it leaves
   struct In {
     Lanes<T> free, before, across, own, torque, geometry, geometry_own, skew;
@@ -295,5 +359,7 @@ KERNELS(twist, Twist)
 KERNELS(curve, Curve)
 KERNELS(pull, Pull)
 KERNELS(answer, Answer)
+KERNELS(joint, Joint)
+KERNELS(spring, Spring)
 KERNELS(settle, Settle)
 KERNELS(balance, Balance)

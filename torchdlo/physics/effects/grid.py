@@ -7,7 +7,7 @@ from typing import ClassVar
 
 import torch
 
-from torchdlo.physics import tree
+from torchdlo.physics import lanes, tree
 from torchdlo.physics.effect import Effect, Param, Values
 from torchdlo.physics.effects.elastic import Twist, curvature, greatest, hinge_stiffness
 from torchdlo.physics.numerics import dot
@@ -40,15 +40,9 @@ class LinkChain(Effect):
     def loads(self, view: View, values: Values) -> Values:
         """Return loads and how they answer to twist, the latter to leading order."""
         joint = _Joint(view, values)
-        hinge, by_kappa, moment = joint.hinge, *joint.slopes()
-        bent = hinge.pull_back(view, by_kappa)
-        pull = 0.5 * moment * view.binormal()
-        stiffness, share = joint.twisting, -0.5 * joint.links
-        k1, k2 = hinge.kappa[..., :1], hinge.kappa[..., 1:]
-        b1, b2, a1, a2 = hinge.by_twist
-        before, after = share * (k2 * b1 + k1 * b2), share * (k2 * a1 + k1 * a2)
-        f = share * (stiffness * joint.twist + moment)
-        rest = view.params.rest
+        hinge, rest = joint.hinge, view.params.rest
+        by_kappa, moment, hessian, geometry = joint.answers()
+        bent, pull = hinge.pull_back(view, by_kappa), 0.5 * moment * hinge.binormal
         line = view.params.material.mass.sum(-2, keepdim=True) / (rest.length * rest.edge_mask).sum(-2, keepdim=True)
         # Rods instead of masses at their ends: m l^2 / 12 in place of m l^2 / 4.
         length = values["length"].abs().minimum(rest.length)
@@ -56,13 +50,8 @@ class LinkChain(Effect):
             "turning_inertia": -line * length.square() / (6 * rest.length) * rest.edge_mask,
             "gradient": bent["gradient"] + (pull + view.next(pull)) / view.length,
             "torque": bent["torque"] + view.next(moment) - moment,
-            # k g g^T for the strain's gradient g by the twists, without Twist's own part, g = (-1, 1).
-            "twist_hessian": stiffness
-            * tree.cat_components(
-                [before.square() - 2 * before, before - after + before * after, after.square() + 2 * after]
-            )
-            + f * tree.cat_components([2 * b1 * b2, b1 * a2 + b2 * a1, 2 * a1 * a2]),
-            "twist_geometry": f * tree.cat_components([k2 * b2 - k1 * b1, k2 * a2 - k1 * a1]),
+            "twist_hessian": hessian,
+            "twist_geometry": geometry,
         }
 
 
@@ -74,6 +63,7 @@ class _Joint:
     """
 
     def __init__(self, view: View, values: Values) -> None:
+        self.view, self.fast = view, lanes.ready(view.tangent)
         self.hinge, self.twist = curvature(view), Twist().strain(view)
         self.bending = greatest(hinge_stiffness(view))
         self.twisting = view.params.material.twist / view.hinge_length * view.params.rest.hinge_mask
@@ -82,6 +72,11 @@ class _Joint:
         self.w = torch.where(self.some, links, 1.0)
         kappa, turn = self.hinge.kappa, self.w * self.twist
         self.c, self.s = torch.cos(0.5 * turn), torch.sin(0.5 * turn)
+        if self.fast:
+            self.own = kappa, self.twist, self.c, self.s, self.w
+            *parts, self.sine = lanes.apply("joint", view.topology.name, self.own, (1, 1, 1, 1, 1))
+            self.x, self.z, self.y = torch.atan2(*parts[:2]), torch.atan2(*parts[2:]), torch.asin(self.sine)
+            return
         self.p, self.q = -0.5 * self.w * kappa[..., :1], -0.5 * self.w * kappa[..., 1:]
         p, q, c, s = self.p, self.q, self.c, self.s
         self.norm = 1 + p.square() + q.square()
@@ -99,6 +94,28 @@ class _Joint:
         bent = (self.y.square() + self.z.square()) / self.w.square() - dot(kappa, kappa)
         twisted = self.x.square() / self.w.square() - self.twist.square()
         return torch.where(self.some, 0.5 * self.bending * bent + 0.5 * self.twisting * twisted, 0.0)
+
+    def answers(self) -> tuple[torch.Tensor, ...]:
+        """Return derivatives of the energy by curvatures and by twist, and how they answer to the twists.
+
+        The latter to leading order: `twist_hessian` and `twist_geometry` of `LOADS`.
+        """
+        hinge = self.hinge
+        if self.fast:
+            some, angles = self.some.to(self.x.dtype), (self.x, self.y, self.z)
+            inputs = *self.own, self.bending, self.twisting, some, self.links, *hinge.by_twist, *angles
+            return tuple(lanes.apply("spring", self.view.topology.name, inputs, (2, 1, 3, 2)))
+        by_kappa, moment = self.slopes()
+        stiffness, share = self.twisting, -0.5 * self.links
+        k1, k2 = hinge.kappa[..., :1], hinge.kappa[..., 1:]
+        b1, b2, a1, a2 = hinge.by_twist
+        before, after = share * (k2 * b1 + k1 * b2), share * (k2 * a1 + k1 * a2)
+        f = share * (stiffness * self.twist + moment)
+        # k g g^T for the strain's gradient g by the twists, without Twist's own part, g = (-1, 1).
+        direct = before.square() - 2 * before, before - after + before * after, after.square() + 2 * after
+        crossed = 2 * b1 * b2, b1 * a2 + b2 * a1, 2 * a1 * a2
+        hessian = stiffness * tree.cat_components(direct) + f * tree.cat_components(crossed)
+        return by_kappa, moment, hessian, f * tree.cat_components([k2 * b2 - k1 * b1, k2 * a2 - k1 * a1])
 
     def slopes(self) -> tuple[torch.Tensor, torch.Tensor]:
         """Return the derivatives of the energy by curvatures (..., V, 2) and by twist (..., V, 1)."""
