@@ -11,6 +11,9 @@ from torchdlo.scene import Rope, hold, make, step
 
 GIVEN = {"mass": 0.1, "bend": 1e-3, "twist": 1e-3, "radius": 0.01}
 
+IMPLICIT = {"dt": 2e-3, "integrator": "implicit"}
+BALANCED = IMPLICIT | {"twist": "quasistatic", "held_vertices": (0, 1)}
+
 
 def ropes(batch: tuple[int, ...], dtype: torch.dtype, *, loop: bool) -> list[Rope]:
     """An open rope, and a closed one beside it."""
@@ -57,10 +60,7 @@ def test_implicit_steps_are_the_same_for_any_batch(batch, loop, monkeypatch):
         ropes(batch, F64, loop=loop),
         effects("gravity", "bend_frame", "twist", "damping"),
         {"damping": {"rate": 0.5}},
-        dt=2e-3,
-        integrator="implicit",
-        twist="quasistatic",
-        held_vertices=(0, 1),
+        **BALANCED,
         held_edges=(0, 9) if loop else (0,),
     )
     assert_same(monkeypatch, built, 1e-9)
@@ -72,8 +72,7 @@ def test_drag_of_hinges_and_steps_that_look_ahead_are_the_same(ahead, monkeypatc
         ropes((3,), F64, loop=False),
         effects("gravity", "bend", "bending_damping", "damping"),
         {"bending_damping": {"coefficient": 1e-4}},
-        dt=2e-3,
-        integrator="implicit",
+        **IMPLICIT,
         ahead=ahead,
         held_vertices=(0, 8),
     )
@@ -86,10 +85,7 @@ def test_chains_of_links_are_the_same(length, monkeypatch):
         ropes((3,), F64, loop=False),
         effects("gravity", "bend_frame", "twist", "link_chain"),
         {"link_chain": {"length": length}},
-        dt=2e-3,
-        integrator="implicit",
-        twist="quasistatic",
-        held_vertices=(0, 1),
+        **BALANCED,
         held_edges=(0,),
     )
     assert_same(monkeypatch, built, 1e-9, uses=(*FRAMED, "joint", "spring"))
@@ -100,10 +96,7 @@ def test_single_precision_is_as_good_as_the_operations_are(monkeypatch):
         built = make(
             ropes((5,), dtype, loop=True),
             effects("gravity", "bend_frame", "twist"),
-            dt=2e-3,
-            integrator="implicit",
-            twist="quasistatic",
-            held_vertices=(0, 1),
+            **BALANCED,
             held_edges=(0, 9),
         )
         return stepped(monkeypatch, kernels, built, 5)[0].rods
@@ -133,8 +126,7 @@ def test_a_rope_pulled_beyond_its_length_gives_way_the_same(monkeypatch):
     scene, params, state = make(
         [Rope(pos, **GIVEN)],
         effects("gravity", "bend"),
-        dt=2e-3,
-        integrator="implicit",
+        **IMPLICIT,
         ahead=0.1,
         held_vertices=(0, 7),
     )
@@ -155,9 +147,7 @@ def test_a_rope_pulled_beyond_its_length_gives_way_the_same(monkeypatch):
 
 
 def test_they_are_used_in_recorded_steps_only(monkeypatch):
-    scene, params, state = make(
-        ropes((2,), F64, loop=False), effects("gravity", "bend"), dt=2e-3, integrator="implicit"
-    )
+    scene, params, state = make(ropes((2,), F64, loop=False), effects("gravity", "bend"), **IMPLICIT)
     used, apply = [], lanes.apply
     monkeypatch.setattr(lanes, "apply", lambda kernel, *others: (used.append(kernel), apply(kernel, *others))[1])
     control = hold(scene, state)

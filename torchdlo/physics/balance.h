@@ -2,8 +2,6 @@
 //
 // The formulas stand in constrain.py (`balance`, `Inertia`, `Lengths`), as tensor operations.
 #pragma once
-#include <cstdlib>
-
 #include "rods.h"
 
 namespace {
@@ -91,14 +89,11 @@ class Balance {
       begin[i] = start[i] + turned * lean[i];
       pull[i] = begin[i] * impulse[i] + turned * p.swing;
       turn[i] = turned * (p.mask / p.rest);
-      Vec<T> edge = pos[n] - pos[i];
-      edge = {p.mask > T(0) ? edge.x : Lanes<T>{} + T(1), p.mask > T(0) ? edge.y : Lanes<T>{},
-              p.mask > T(0) ? edge.z : Lanes<T>{}};
-      const Lanes<T> squared = dot(edge, edge);
-      const Lanes<T> length = squared <= TINY<T> * TINY<T> ? Lanes<T>{} : root<T>(squared);
-      along[i] = edge * (T(1) / (length < T(1e-12) ? Lanes<T>{} + T(1e-12) : length));
+      const Vec<T> e = edge(pos[i], pos[n], p.mask);
+      const Lanes<T> size = length(e);
+      along[i] = e * (T(1) / at_least<T>(size, T(1e-12)));
       const Lanes<T> tension = impulse[i] / scale, beyond = tension - yielding(i);
-      excess[i] = (length - p.rest - p.compliance * tension - p.give * (beyond > T(0) ? beyond : Lanes<T>{})) * p.active;
+      excess[i] = (size - p.rest - p.compliance * tension - p.give * (beyond > T(0) ? beyond : Lanes<T>{})) * p.active;
     }
     for (int64_t i = 0; i < v; ++i) moment[i] = (turn[i] - turn[before[i]]) * slot[i].hinge;
     for (int64_t i = 0; i < v; ++i)

@@ -131,15 +131,8 @@ def project(
     def newton(tension: Tensor, along: Tensor, excess: Tensor) -> Tensor:
         both = answer + following(topology, answer)
         active, off = lengths.active, 1 - lengths.active
-        diagonal = (
-            active
-            * (
-                (1 + lengths.shift) * total(along * direction * both)
-                + lengths.compliance
-                + lengths.yielding(tension)[1]
-            )
-            + off
-        )
+        soft = lengths.compliance + lengths.yielding(tension)[1]
+        diagonal = active * ((1 + lengths.shift) * total(along * direction * both) + soft) + off
         to_next = -active * dot(along, following(topology, direction * answer))
         to_prev = -active * total(along * answer * preceding(topology, direction))
         return tension + solve_slots(topology, diagonal, to_next, to_prev, excess)

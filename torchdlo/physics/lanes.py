@@ -29,7 +29,7 @@ class _Place(ctypes.Structure):
 
 class _Call(ctypes.Structure):
     _fields_ = (
-        *((name, ctypes.c_int64) for name in ("slots", "scenes", "fields")),
+        *((name, ctypes.c_int64) for name in ("slots", "scenes")),
         *((name, ctypes.c_void_p) for name in ("places", "after", "numbers")),
         *((name, ctypes.c_int64) for name in ("half", "count")),
         *((name, ctypes.c_void_p) for name in ("pattern", "order")),
@@ -103,7 +103,7 @@ def _plan(
         (ctypes.c_int64 * len(after))(*after),
         (ctypes.c_double * len(numbers))(*numbers),
     )
-    call = _Call(len(after), scenes, len(places), *(ctypes.addressof(x) for x in kept))
+    call = _Call(len(after), scenes, *(ctypes.addressof(x) for x in kept))
     if system:
         pattern = banded.pattern(f"{system}:{topology}")
         entries = pattern.places[0]

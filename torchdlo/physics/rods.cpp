@@ -2,30 +2,11 @@
 //
 // The formulas stand in rod.py, effects/elastic.py, rotation.py, integrate.py and constrain.py, as tensor operations.
 // Each kernel reads the components of its inputs in the order of the fields of `In`, and numbers those of its results.
-#include "balance.h"
 #include "rods.h"
 
+#include "balance.h"
+
 namespace {
-
-template <typename T>
-Lanes<T> at_least(const Lanes<T>& x, T least) {
-  return x < least ? Lanes<T>{} + least : x;
-}
-
-// Zero vectors have length zero.
-template <typename T>
-Lanes<T> length(const Vec<T>& x) {
-  const Lanes<T> squared = dot(x, x);
-  return squared <= TINY<T> * TINY<T> ? Lanes<T>{} : root<T>(squared);
-}
-
-// The edge from one vertex to the next: a unit vector on dummy edges.
-template <typename T>
-Vec<T> edge(const Vec<T>& start, const Vec<T>& end, const Lanes<T>& mask) {
-  const Vec<T> e = end - start;
-  const auto real = mask > T(0);
-  return {real ? e.x : Lanes<T>{} + T(1), real ? e.y : Lanes<T>{}, real ? e.z : Lanes<T>{}};
-}
 
 template <typename T>
 Vec<T> transport(const Vec<T>& x, const Vec<T>& start, const Vec<T>& end) {
@@ -306,11 +287,10 @@ struct Settle {  // integrate.settle_twist: one step of Newton's method, and the
   struct In {
     Lanes<T> free, before, across, own, torque, geometry, geometry_own, skew;
   };
-  Settle(const Call&, const Scratch<T>& free) : room(free) {}
+  Settle(const Call& call, const Scratch<T>& free) : room(free), prior(preceding(call)) {}
   void operator()(const In* slot, const Out<T>& out) {
     const Call& s = out.call;
     const int64_t v = s.slots;
-    const std::vector<int64_t> prior = preceding(s);
     Scratch<T> scratch = room;
     Lanes<T> *same = scratch.take(v), *onward = scratch.take(v), *back = scratch.take(v), *entries = scratch.take(3 * v),
              *rhs = scratch.take(v), *change = scratch.take(v), *space = scratch.take((v + s.half) * (2 * s.half + 2));
@@ -340,6 +320,7 @@ struct Settle {  // integrate.settle_twist: one step of Newton's method, and the
     }
   }
   const Scratch<T>& room;
+  const std::vector<int64_t> prior;
 };
 
 }  // namespace

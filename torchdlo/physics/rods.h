@@ -11,13 +11,33 @@ struct Place {
 };
 
 struct Call {
-  int64_t slots, scenes, fields;
+  int64_t slots, scenes;
   const Place* places;
   const int64_t* after;
   const double* numbers;
   int64_t half, count;  // of the pattern, where a system is solved
   const int32_t *pattern, *order;
 };
+
+template <typename T>
+static Lanes<T> at_least(const Lanes<T>& x, T least) {
+  return x < least ? Lanes<T>{} + least : x;
+}
+
+// Zero vectors have length zero.
+template <typename T>
+static Lanes<T> length(const Vec<T>& x) {
+  const Lanes<T> squared = dot(x, x);
+  return squared <= TINY<T> * TINY<T> ? Lanes<T>{} : root<T>(squared);
+}
+
+// The edge from one vertex to the next: a unit vector on dummy edges.
+template <typename T>
+static Vec<T> edge(const Vec<T>& start, const Vec<T>& end, const Lanes<T>& mask) {
+  const Vec<T> e = end - start;
+  const auto real = mask > T(0);
+  return {real ? e.x : Lanes<T>{} + T(1), real ? e.y : Lanes<T>{}, real ? e.z : Lanes<T>{}};
+}
 
 // Room that a thread keeps from call to call.
 template <typename T>
