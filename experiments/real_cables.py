@@ -18,12 +18,14 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from options import Parser, count, save
 
 from torchdlo.progress import progress
 from torchdlo.sysid import start as starts
+from torchdlo.sysid.bench import Callback
 from torchdlo.sysid.diagnose import BUDGETS, diagnose
 from torchdlo.sysid.metrics import average, mean_absolute_error
 from torchdlo.sysid.model import RopeModel
@@ -98,6 +100,11 @@ def planted(recording: Recording, name: str, base: Diagnosis | None) -> Recordin
     return replace(recording, train=tuple(map(change, recording.train)), test=tuple(map(change, recording.test)))
 
 
+def kept_up(recording: Recording, journal: Path, choices: dict[str, Any], callback: Callback) -> Diagnosis:
+    """Return the diagnosis, going on from where an earlier one was stopped."""
+    return diagnose(recording, **choices, callback=callback, journal=journal, resume=journal.exists())
+
+
 def row(recording: Recording, found: Diagnosis, plant: str) -> dict:
     """Return what a diagnosis found, for the table."""
     errors = {
@@ -162,9 +169,9 @@ def main() -> None:
             with progress() as callback:
                 print(tag, flush=True)
                 if plant in SIMULATED and base is None:
-                    base = diagnose(recording, **(choices | {"budget": "fast"}), callback=callback)
+                    base = kept_up(recording, kept.with_name(f"{path.name}-base"), choices | {"budget": "fast"}, callback)
                 here = planted(recording, plant, base) if plant else recording
-                found = diagnose(here, **choices, callback=callback)
+                found = kept_up(here, kept.with_suffix(""), choices, callback)
             rows.append(row(here, found, plant))
             save(str(kept), rows[-1])
     show(rows)

@@ -23,7 +23,7 @@ from torchdlo.sysid.floor import gap
 from torchdlo.sysid.journal import digest
 from torchdlo.sysid.model import RopeModel
 from torchdlo.sysid.motion import Start
-from torchdlo.sysid.pool import Fit, Models, Pool, Simulation, Together
+from torchdlo.sysid.pool import Fit, Pool, Simulation
 from torchdlo.sysid.recording import Recording, Trial, save_recording
 
 S = np.array([0.0, 0.015, 0.06, 0.12, 0.18, 0.24, 0.3])
@@ -122,14 +122,15 @@ def design(recording: Recording, found: Path) -> Design:
 def refitted(design: Design, recording: Recording, new: Trial) -> dict[str, tuple[float, float]]:
     """Gap of each rival in the old train trials and in a new one [m] after a fit to all of them."""
     joined = replace(recording, train=(*recording.train, new), test=())
-    models, found = Models(joined, OPTIONS), {}
-    for name, rival in design.models.items():
-        start = starts.begin(models.model(rival.effects), joined.train)
-        job = Fit(rival.effects, rival.values[None], rival.space.names, tuple(rival.space.units), 3, start)
-        (fitted,) = models.fit(Together((job,)))
-        sims = models.simulate(Simulation(rival.effects, fitted.values[None], "train", start))[0]
-        gaps = gap(sims, joined.train)
-        found[name] = float(np.sqrt(np.mean(gaps[:-1] ** 2))), float(gaps[-1])
+    found = {}
+    with Pool(joined, OPTIONS, workers=1) as pool:
+        for name, rival in design.models.items():
+            start = starts.begin(pool.local.model(rival.effects), joined.train)
+            job = Fit(rival.effects, rival.values[None], rival.space.names, tuple(rival.space.units), 3, start)
+            ((_, fitted),) = pool.fit([job])
+            ((_, sims),) = pool.simulate([Simulation(rival.effects, fitted.values[None], "train", start)])
+            gaps = gap(sims[0], joined.train)
+            found[name] = float(np.sqrt(np.mean(gaps[:-1] ** 2))), float(gaps[-1])
     return found
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar
@@ -21,7 +21,7 @@ from torchdlo.sysid.fit import Point, Space
 from torchdlo.sysid.journal import Journal, digest
 from torchdlo.sysid.library import PARAMETERS
 from torchdlo.sysid.motion import Start
-from torchdlo.sysid.pool import Fit, Fitted, Models, Pool, Simulation, Together
+from torchdlo.sysid.pool import Fit, Fitted, Models, Pool, Simulation
 from torchdlo.sysid.recording import Recording, load_recording
 
 OPTIONS = {"seed": 0, "budget": "fast"}
@@ -147,17 +147,18 @@ class FakeModels(Models):
 
     computed: ClassVar[list[str]] = []
 
-    def simulate(self, job: Simulation) -> np.ndarray:
+    def simulate(self, job: Simulation, part: int = 0, parts: int = 1) -> np.ndarray:
         """Return the measured markers, moved by what the numbers are."""
         self.computed.append(digest(job))
         trials = self.recording.trials(job.split)
         shift = 1e-3 * np.sin(1e3 * job.values.sum(1) + len(job.effects))
         return np.stack([t.markers for t in trials])[None] + shift[:, None, None, None, None]
 
-    def fit(self, together: Together) -> tuple[Fitted, ...]:
+    def search(self, jobs: Sequence[Fit]) -> Generator[Simulation, np.ndarray, tuple[Fitted, ...]]:
         """Return the first start of every fit, a little changed."""
-        self.computed.append(digest(together))
-        return tuple(self._fitted(job) for job in together.jobs)
+        self.computed += [digest(job) for job in jobs]
+        yield Simulation(jobs[0].effects, jobs[0].values)
+        return tuple(self._fitted(job) for job in jobs)
 
     def _fitted(self, job: Fit) -> Fitted:
         model = self.model(job.effects)

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from tests.sysid.swaying import recording as swaying
+from torchdlo.sysid import pool as pools
+from torchdlo.sysid import start as starts
 from torchdlo.sysid.bench import Bench
 from torchdlo.sysid.fit import Point, Space
-from torchdlo.sysid.pool import Fit, Fitted, Pool
+from torchdlo.sysid.pool import Fit, Fitted, Pool, Simulation
 
 OPTIONS = {"vertices": 17, "ahead": 0.0, "grip": 0.0}
 BASE = ("bending_stiffness", "damping_rate")
@@ -49,9 +53,31 @@ def test_fits_find_together_what_they_find_alone(tmp_path: Path) -> None:
         assert np.abs(together[1].values / jobs[1].values[0] - 1).max() > 1e-2
 
 
-def test_fits_are_spread_over_the_workers(tmp_path: Path) -> None:
-    with Pool(swaying(tmp_path, frames=40), OPTIONS, workers=2) as pool:
-        assert sorted(map(sorted, pool.groups(fits(pool)))) == [[0, 2], [1], [3]]
+def test_workers_share_the_scenes_of_a_fit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pools, "_FEW", 2)
+    with Pool(swaying(tmp_path, frames=40), OPTIONS, workers=1) as pool:
+        jobs = fits(pool)
+        alone, plain = dict(pool.fit(jobs)), simulation(pool, jobs[2])
+        ((_, whole),) = pool.simulate([plain])
+        # Three sets of three trials, in parts that cut through a set.
+        parts = [pool.local.simulate(plain, k, 4) for k in range(4)]
+        assert [len(p) for p in parts] == [3, 2, 2, 2]
+        np.testing.assert_allclose(np.concatenate(parts).reshape(whole.shape), whole, rtol=0, atol=1e-12)
+    with Pool(swaying(tmp_path / "again", frames=40), OPTIONS, workers=2) as pool:
+        shared = dict(pool.fit(jobs))
+        assert sorted(map(sorted, pool.groups(jobs))) == [[0, 1, 2], [3]]
+        for k, one in alone.items():
+            np.testing.assert_allclose(shared[k].values, one.values, rtol=1e-6, atol=1e-9)
+        ((_, both),) = pool.simulate([plain])
+        np.testing.assert_allclose(both, whole, rtol=0, atol=1e-12)
+
+
+def simulation(pool: Pool, job: Fit) -> Simulation:
+    """The simulation of the starts of a fit, where another estimate says that trials begin."""
+    model = pool.local.model(job.effects)
+    start = starts.begin(model, pool.recording.train)
+    finer = 1e-3 * np.random.default_rng(0).normal(size=(len(start.pos), 40, 1, 3)) * np.ones((model.count, 1))
+    return Simulation(job.effects, job.values, "train", replace(start, finer=finer), frames=30)
 
 
 def test_a_model_loses_an_effect_and_starts_from_several_baselines(tmp_path: Path) -> None:

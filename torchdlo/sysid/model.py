@@ -291,16 +291,34 @@ class RopeModel:
             Marker positions, shape (P, B, F, M, 3); NaN from where a simulation failed.
         """
         sets, trials = len(values), len(motion.names)
-        total = frames or motion.markers.shape[1]
-        out = np.empty((sets * trials, total, self.count, 3))
-        for rows in np.split(np.arange(sets * trials), range(_CHUNK, sets * trials, _CHUNK)):
-            filled = np.resize(rows, traced.batch(len(rows)))
+        out = self.scenes(motion, start, values, np.arange(sets * trials), frames=frames)
+        return out.reshape(sets, trials, *out.shape[1:])
+
+    def scenes(
+        self, motion: Motion, start: Start, values: np.ndarray, wanted: np.ndarray, *, frames: int | None = None
+    ) -> np.ndarray:
+        """Return simulated markers [m] of some of the (P B) pairs of parameter sets and trials.
+
+        Args:
+            motion: see `simulate`.
+            start: likewise.
+            values: likewise.
+            wanted: indices of the pairs, shape (N,).
+            frames: see `simulate`.
+
+        Returns:
+            Marker positions, shape (N, F, M, 3); NaN from where a simulation failed.
+        """
+        trials, total = len(motion.names), frames or motion.markers.shape[1]
+        out = np.empty((len(wanted), total, self.count, 3))
+        for rows in np.split(np.arange(len(wanted)), range(_CHUNK, len(wanted), _CHUNK)):
+            filled = wanted[np.resize(rows, traced.batch(len(rows)))]
             trial = filled % trials
-            begin = start.pick(filled if len(start.pos) == sets * trials else trial)
+            begin = start.pick(trial if len(start.pos) == trials else filled)
             out[rows] = self._run(motion.pick(trial), begin, values[filled // trials], total)[: len(rows)]
-        if start.finer is not None:
-            out += np.resize(start.finer[:, :total], out.shape)
-        return out.reshape(sets, trials, total, self.count, 3)
+            if start.finer is not None:
+                out[rows] += begin.finer[: len(rows), :total]
+        return out
 
     @torch.no_grad()
     def _run(self, motion: Motion, start: Start, values: np.ndarray, frames: int) -> np.ndarray:

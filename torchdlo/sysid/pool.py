@@ -1,11 +1,11 @@
-"""Many small models at once, each in a process of its own; a single one would leave cores idle."""
+"""Simulations of many models, shared out over processes: a single one would leave cores idle."""
 
 from __future__ import annotations
 
 import multiprocessing
 import os
 from collections.abc import Callable, Generator, Hashable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, as_completed, wait
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, TypeVar
@@ -37,6 +37,8 @@ class Simulation:
     """Where the trials begin; read off them if not given."""
     options: tuple[tuple[str, Any], ...] = ()
     """Options of `RopeModel` that differ from those of the pool."""
+    frames: int | None = None
+    """How many frames to simulate; all if not given."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,17 +81,17 @@ class Fitted:
     """Options of `RopeModel` that differ from those of the pool."""
 
 
-@dataclass(frozen=True, eq=False)
-class Together:
-    """Fits that simulate in one batch, step by step: a large batch takes little longer than a small one."""
-
-    jobs: tuple[Fit, ...]
-    """The fits, with the same start, frames and options."""
-    options: tuple[tuple[str, Any], ...] = ()
-    """See `Fit`; those of its jobs."""
-
-
 _Search = Generator[np.ndarray, np.ndarray, Fitted]
+"""Yields parameter sets (P, K) of its model, takes their simulations (P, B, F, M, 3)."""
+
+_Asking = Generator[Simulation, np.ndarray, Any]
+"""Yields simulations, takes their markers."""
+
+_FEW = 16
+"""Scenes that are not shared out: each step costs as much as they do, however few there are."""
+
+_SMALL = 5000
+"""Frames of scenes, some tenths of a second, that no worker is asked for: they need seconds to begin."""
 
 
 class Models:
@@ -114,32 +116,35 @@ class Models:
             self._motions[key] = model.motion(self.recording.trials(split))
         return self._motions[key]
 
-    def simulate(self, job: Simulation) -> np.ndarray:
-        """Return markers [m], shape (P, B, F, M, 3)."""
+    def simulate(self, job: Simulation, part: int = 0, parts: int = 1) -> np.ndarray:
+        """Return markers [m], shape (P, B, F, M, 3); of one of several parts, those of its P B / parts scenes."""
         model = self.model(job.effects, job.options)
         start = job.start or starts.begin(model, self.recording.trials(job.split))
-        return model.simulate(self.motion(model, job.split), start, job.values)
+        motion = self.motion(model, job.split)
+        if parts == 1:
+            return model.simulate(motion, start, job.values, frames=job.frames)
+        rows = np.array_split(np.arange(len(job.values) * len(motion.names)), parts)[part]
+        return model.scenes(motion, start, job.values, rows, frames=job.frames)
 
-    def fit(self, together: Together) -> tuple[Fitted, ...]:
-        """Return the best that each of several fits found from all of its starts."""
-        jobs = together.jobs
-        effects = tuple(dict.fromkeys(e for job in jobs for e in job.effects))
-        model, first, options = self.model(effects, together.options), jobs[0], together.options
-        motion = self.motion(model, "train")
-        start = first.start or starts.begin(model, self.recording.train)
-        trust = 1.0 if start.trust is None else start.trust[:, : first.frames, None, None]
+    def search(self, jobs: Sequence[Fit]) -> _Asking:
+        """Ask for what several fits with the same start, frames and options need, together; return their results."""
+        effects, options = tuple(dict.fromkeys(e for job in jobs for e in job.effects)), jobs[0].options
+        model = self.model(effects, options)
+        measured = self.motion(model, "train").markers[:, : jobs[0].frames]
+        start = jobs[0].start or starts.begin(model, self.recording.train)
+        trust = 1.0 if start.trust is None else start.trust[:, : jobs[0].frames, None, None]
         searches, places = [], []
         for job in jobs:
             own = self.model(job.effects, options)
             columns = [own.parameters.index(name) for name in job.free]
             space = Space(job.free, tuple(own.params[k] for k in columns), job.sizes)
-            searches.append(_search(job, space, columns, motion.markers[:, : job.frames], trust))
+            searches.append(_search(job, space, columns, measured, trust))
             places.append(self._places(model, job.effects))
         found: dict[int, Fitted] = {}
         asked = {k: next(search) for k, search in enumerate(searches)}
         while asked:
             rows = [_filled(model.guess(), places[k], values) for k, values in asked.items()]
-            sims = model.simulate(motion, start, np.concatenate(rows), frames=first.frames)
+            sims = yield Simulation(effects, np.concatenate(rows), "train", start, options, jobs[0].frames)
             ends = np.cumsum([len(r) for r in rows])[:-1]
             for k, sim in zip(list(asked), np.split(sims, ends), strict=True):
                 try:
@@ -198,12 +203,12 @@ def _search(job: Fit, space: Space, columns: Sequence[int], measured: np.ndarray
     return Fitted(job.effects, full(space.to_values(best.raw)[None])[0], space, best)
 
 
-def spread(kinds: Sequence[Hashable], workers: int) -> list[list[int]]:
-    """Return indices of jobs by their kinds, those of each kind in as many groups as there are workers."""
-    alike: dict[Hashable, list[int]] = {}
+def alike(kinds: Sequence[Hashable]) -> list[list[int]]:
+    """Return the indices of each kind."""
+    found: dict[Hashable, list[int]] = {}
     for k, kind in enumerate(kinds):
-        alike.setdefault(kind, []).append(k)
-    return [some for group in alike.values() for n in range(workers) if (some := group[n::workers])]
+        found.setdefault(kind, []).append(k)
+    return list(found.values())
 
 
 class Pool:
@@ -257,19 +262,11 @@ class Pool:
 
     def simulate(self, jobs: Sequence[Simulation]) -> Iterator[tuple[int, np.ndarray]]:
         """Yield the index and the markers of every job as they get ready."""
-        return self.run(Models.simulate, jobs)
+        return self._new(jobs, lambda new: self._led([_once(job) for job in new]))
 
     def fit(self, jobs: Sequence[Fit]) -> Iterator[tuple[int, Fitted]]:
         """Yield the index and the result of every fit as they get ready."""
-        groups = self.groups(jobs)
-        together = [Together(tuple(jobs[k] for k in g), jobs[g[0]].options) for g in groups]
-        for n, results in self.run(Models.fit, together):
-            yield from zip(groups[n], results, strict=True)
-
-    def groups(self, jobs: Sequence[Fit]) -> list[list[int]]:
-        """Return the indices of the fits that run together: alike ones, spread over the workers."""
-        kinds = [(id(j.start), j.frames, self._whole(j.options), self.local.framed(j.effects)) for j in jobs]
-        return spread(kinds, self.workers)
+        return self._new(jobs, self._fitted)
 
     def run(self, what: Callable[[Models, Job], Any], jobs: Sequence[Job]) -> Iterator[tuple[int, Any]]:
         """Yield the index and the result of `what` for every job as they get ready.
@@ -278,17 +275,72 @@ class Pool:
             what: a function of a module, of the models of a process and a job.
             jobs: dataclasses with `options` of models.
         """
-        compute = partial(self._compute, what)
+        return self._new(jobs, partial(self._done, what))
+
+    def _new(
+        self, jobs: Sequence[Job], compute: Callable[[Sequence[Job]], Iterator[tuple[int, Any]]]
+    ) -> Iterator[tuple[int, Any]]:
+        """Yield what is computed for jobs, or written down."""
         jobs = [replace(job, options=self._whole(job.options)) for job in jobs]
         yield from compute(jobs) if self.journal is None else self.journal.through(jobs, compute)
 
-    def _compute(self, what: Callable[[Models, Job], Any], jobs: Sequence[Job]) -> Iterator[tuple[int, Any]]:
+    def _fitted(self, jobs: Sequence[Fit]) -> Iterator[tuple[int, Fitted]]:
+        groups = self.groups(jobs)
+        for n, found in self._led([self.local.search([jobs[k] for k in group]) for group in groups]):
+            yield from zip(groups[n], found, strict=True)
+
+    def groups(self, jobs: Sequence[Fit]) -> list[list[int]]:
+        """Return the indices of the fits that run together: alike ones."""
+        return alike([(id(j.start), j.frames, self._whole(j.options), self.local.framed(j.effects)) for j in jobs])
+
+    def _done(self, what: Callable[[Models, Job], Any], jobs: Sequence[Job]) -> Iterator[tuple[int, Any]]:
         if self._pool is None:
             yield from ((k, what(self.local, job)) for k, job in enumerate(jobs))
             return
         waiting = {self._pool.submit(_do, what, job): k for k, job in enumerate(jobs)}
         for future in as_completed(waiting):
             yield waiting[future], future.result()
+
+    def _led(self, searches: Sequence[_Asking]) -> Iterator[tuple[int, Any]]:
+        """Yield the index and the result of every search as they get ready; all workers simulate what they ask for."""
+        asked: dict[int, Simulation] = {}
+        waiting: dict[Future, tuple[int, int]] = {}
+        parts: dict[int, list[np.ndarray | None]] = {}
+
+        def go_on(n: int, sims: np.ndarray | None) -> Iterator[tuple[int, Any]]:
+            """Give a search what it asked for; yield its result, or have the next simulation done."""
+            try:
+                asked[n] = job = searches[n].send(sims)
+                while not (count := self._parts(job)):
+                    asked[n] = job = searches[n].send(self.local.simulate(job))
+            except StopIteration as end:
+                yield n, end.value
+                return
+            parts[n] = [None] * count
+            waiting.update({self._pool.submit(_do, _simulated, (job, p, count)): (n, p) for p in range(count)})
+
+        for n in range(len(searches)):
+            yield from go_on(n, None)
+        while waiting:
+            for future in wait(waiting, return_when=FIRST_COMPLETED).done:
+                n, p = waiting.pop(future)
+                parts[n][p] = future.result()
+                if all(part is not None for part in parts[n]):
+                    sims = np.concatenate(parts.pop(n))
+                    yield from go_on(n, sims.reshape(len(asked[n].values), -1, *sims.shape[-3:]))
+
+    def _parts(self, job: Simulation) -> int:
+        """Return into how many parts a simulation is split for the workers; 0 if this process had better do it."""
+        trials = self.recording.trials(job.split)
+        scenes, frames = len(job.values) * len(trials), job.frames or max(len(t.time) for t in trials)
+        if self._pool is None or scenes * frames < _SMALL:
+            return 0
+        return max(1, min(self.workers, scenes // _FEW))
+
+
+def _once(job: Simulation) -> _Asking:
+    """Ask for one simulation and return it."""
+    return (yield job)
 
 
 _models: Models | None = None
@@ -318,3 +370,7 @@ def _end_with_parent() -> None:
 
 def _do(what: Callable[[Models, Job], Any], job: Job) -> Any:
     return what(_models, job)
+
+
+def _simulated(models: Models, asked: tuple[Simulation, int, int]) -> np.ndarray:
+    return models.simulate(*asked)
