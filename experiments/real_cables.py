@@ -169,7 +169,8 @@ def main() -> None:
             with progress() as callback:
                 print(tag, flush=True)
                 if plant in SIMULATED and base is None:
-                    base = kept_up(recording, kept.with_name(f"{path.name}-base"), choices | {"budget": "fast"}, callback)
+                    fast = choices | {"budget": "fast"}
+                    base = kept_up(recording, kept.with_name(f"{path.name}-base"), fast, callback)
                 here = planted(recording, plant, base) if plant else recording
                 found = kept_up(here, kept.with_suffix(""), choices, callback)
             rows.append(row(here, found, plant))

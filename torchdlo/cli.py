@@ -298,7 +298,7 @@ def _run_calibration(recording: Recording, **options: Any) -> Calibration:
 
     try:
         with progress() as show, deferred_interrupt(show) as callback:
-            return fit(recording, callback=callback, **options)
+            return fit(recording, workers=None, callback=callback, **options)
     except KeyboardInterrupt:
         typer.echo("interrupted before there was a result; nothing was written", err=True)
         raise SystemExit(_INTERRUPTED) from None

@@ -152,7 +152,7 @@ class FakeModels(Models):
         self.computed.append(digest(job))
         trials = self.recording.trials(job.split)
         shift = 1e-3 * np.sin(1e3 * job.values.sum(1) + len(job.effects))
-        return np.stack([t.markers for t in trials])[None] + shift[:, None, None, None, None]
+        return np.stack([t.markers[: job.frames] for t in trials])[None] + shift[:, None, None, None, None]
 
     def search(self, jobs: Sequence[Fit]) -> Generator[Simulation, np.ndarray, tuple[Fitted, ...]]:
         """Return the first start of every fit, a little changed."""

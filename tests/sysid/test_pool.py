@@ -22,19 +22,19 @@ BASE = ("bending_stiffness", "damping_rate")
 def fits(pool: Pool) -> list[Fit]:
     """A model without effects, two with one each, one of them from several starts, and one that needs frames."""
     jobs = []
-    for effects, number, starts in (
+    for effects, number, begun in (
         ((), None, (0.0,)),
         (("air_drag",), "air_drag.c_d", (0.5,)),
         (("point_mass",), "point_mass.mass", (1e-3, 2e-3, 4e-3)),
         (("rest_curvature",), "rest_curvature.curvature.0", (0.1,)),
     ):
         model = pool.local.model(effects)
-        values = np.repeat(model.guess()[None], len(starts), 0)
+        values = np.repeat(model.guess()[None], len(begun), 0)
         free, sizes = BASE, (1.0, 1.0)
         if number is not None:
-            values[:, model.parameters.index(number)] = starts
-            free, sizes = (*BASE, number), (1.0, 1.0, max(starts))
-        jobs.append(Fit(effects, values, free, sizes, 2, frames=40, keep=1 if len(starts) > 1 else None))
+            values[:, model.parameters.index(number)] = begun
+            free, sizes = (*BASE, number), (1.0, 1.0, max(begun))
+        jobs.append(Fit(effects, values, free, sizes, 2, frames=40, keep=1 if len(begun) > 1 else None))
     return jobs
 
 

@@ -55,7 +55,8 @@ class Bench:
         """Estimate where trials begin with these numbers."""
         model = self.pool.local.model(effects)
         first = starts.begin(model, self.trials["all"])
-        start = starts.refine(model, self.pool.local.motion(model, "all"), first, base)
+        simulate = self.pool.simulator(effects, "all")
+        start = starts.refine(model, self.pool.local.motion(model, "all"), first, base, simulate)
         train = np.arange(len(self.trials["train"]))
         test = np.arange(len(train), len(self.trials["all"]))
         self.starts = {"all": start, "train": start.pick(train), "test": start.pick(test)}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,6 +17,7 @@ from torchdlo.sysid.checkpoint import Checkpoint
 from torchdlo.sysid.fit import Point, Space
 from torchdlo.sysid.model import RopeModel
 from torchdlo.sysid.motion import Motion, Start
+from torchdlo.sysid.pool import Pool
 from torchdlo.sysid.recording import Recording, Trial
 from torchdlo.sysid.result import Calibration
 from torchdlo.sysid.saved import Saved
@@ -35,6 +36,8 @@ _LOOKS = 6
 class _Job:
     """One fit of one variant of the model."""
 
+    pool: Pool
+    options: tuple[tuple[str, Any], ...]
     model: RopeModel
     space: Space
     motion: Motion
@@ -48,6 +51,10 @@ class _Job:
     def columns(self) -> list[int]:
         """Return where the numbers that are fitted stand among those of the model."""
         return [self.model.parameters.index(name) for name in self.space.names]
+
+    def simulator(self, trials: Sequence[Trial]) -> starts_of.Simulator:
+        """Return what simulates trials, on all cores."""
+        return self.pool.simulator(self.model.effects, tuple(t.name for t in trials), self.options)
 
     def full(self, values: np.ndarray) -> np.ndarray:
         """Return all numbers of the model for fitted ones, both (..., K)."""
@@ -67,6 +74,7 @@ def calibrate(
     checkpoint: Path | None = None,
     resume: bool = False,
     given: Saved | None = None,
+    workers: int | None = 1,
     callback: Callback | None = None,
 ) -> Calibration:
     """Fit the baseline model to the train trials and judge it on the test trials.
@@ -86,6 +94,8 @@ def calibrate(
         checkpoint: file that keeps the best so far.
         resume: go on from it.
         given: model to start from in place of many starts, with its effects; it says what the rest shape is.
+        workers: processes, one per core if None. More than one begin by importing the program's main module: a script
+            that asks for them has to guard what it does by `if __name__ == "__main__":`.
         callback: see `Callback`; it may raise KeyboardInterrupt, which ends the fit with the best so far.
 
     Raises:
@@ -105,31 +115,36 @@ def calibrate(
     memory = Checkpoint(checkpoint, recording, asked, resume)
     best: _Job | None = None
     interrupted = False
-    try:
-        for kind in kinds:
-            job = _job(recording, kind, vertices, given)
-            best = best or job
-            for improved in _fit(job, recording, starts, iterations, np.random.default_rng(seed), memory, report):
-                if best.point is None or best is improved or improved.point.cost < best.point.cost:
-                    best = improved
-    except KeyboardInterrupt:
-        if best is None or best.point is None:
-            raise
-        interrupted = True
-    return _judge(recording, best, seed, interrupted, begun, report)
+    with Pool(recording, {"vertices": vertices} if given is None else given.options, workers) as pool:
+        try:
+            for kind in kinds:
+                job = _job(pool, kind, vertices, given)
+                best = best or job
+                for improved in _fit(job, starts, iterations, np.random.default_rng(seed), memory, report):
+                    if best.point is None or best is improved or improved.point.cost < best.point.cost:
+                        best = improved
+        except KeyboardInterrupt:
+            if best is None or best.point is None:
+                raise
+            interrupted = True
+        return _judge(best, seed, interrupted, begun, report)
 
 
-def _job(recording: Recording, rest: str, vertices: int | None, given: Saved | None) -> _Job:
+def _job(pool: Pool, rest: str, vertices: int | None, given: Saved | None) -> _Job:
+    recording = pool.recording
     trials = _usable(recording)
     if given is None:
-        model = RopeModel(recording, vertices=vertices, rest=rest)
+        options = {"rest": rest}
+        model = pool.local.model((), tuple(options.items()))
         space, values = Space(tuple(model.parameters), tuple(model.params)), model.guess()
     else:
-        model = given.model(recording, **({} if vertices is None else {"vertices": vertices}))
+        options = {} if vertices is None else {"vertices": vertices}
+        model = given.model(recording, **options)
         sizes, values = given.sizes(model), given.start(model)
         params = tuple(p for name, p in zip(model.parameters, model.params, strict=True) if name in sizes)
         space = Space(tuple(sizes), params, tuple(sizes.values()))
-    return _Job(model, space, model.motion(trials), starts_of.begin(model, trials), values, values, given is not None)
+    start, motion = starts_of.begin(model, trials), model.motion(trials)
+    return _Job(pool, tuple(options.items()), model, space, motion, start, values, values, given is not None)
 
 
 def _usable(recording: Recording) -> list[Trial]:
@@ -145,7 +160,6 @@ def _usable(recording: Recording) -> list[Trial]:
 
 def _fit(
     job: _Job,
-    recording: Recording,
     starts: int,
     iterations: int,
     rng: np.random.Generator,
@@ -158,19 +172,20 @@ def _fit(
     if kept or job.given:
         raw = job.space.to_raw(np.array(kept or job.first)[job.columns])
     else:
-        raw = _scout(job, recording, starts, rng, report, name)
+        raw = _scout(job, starts, rng, report, name)
     stage = f"fitting {len(job.motion.names)} trials, {name}"
     report(stage, 0, iterations + 1, "")
-    job.start = starts_of.refine(job.model, job.motion, job.start, job.full(job.space.to_values(raw)))
+    run = job.simulator(_usable(job.pool.recording))
+    job.start = starts_of.refine(job.model, job.motion, job.start, job.full(job.space.to_values(raw)), run)
 
     def simulate(values: np.ndarray) -> np.ndarray:
-        return job.model.simulate(job.motion, job.start, job.full(values))
+        return run(job.start, job.full(values), None)
 
     points = fit.evaluate(simulate, job.motion.markers, job.space, raw[None])
     if not np.isfinite(points[0].cost):
         raise InputError(
-            f"{recording.path}: the simulation failed on the train trials from every start; check length, mass and "
-            "marker_arclength, or use fewer vertices."
+            f"{job.pool.recording.path}: the simulation failed on the train trials from every start; check length, "
+            "mass and marker_arclength, or use fewer vertices."
         )
     job.point, job.values = points[0], job.full(job.space.to_values(points[0].raw))
     yield job
@@ -185,23 +200,21 @@ def _fit(
     report(stage, iterations + 1, iterations + 1, f"{1e3 * job.point.cost:.2f} mm")
 
 
-def _scout(
-    job: _Job, recording: Recording, starts: int, rng: np.random.Generator, report: Callback, name: str
-) -> np.ndarray:
+def _scout(job: _Job, starts: int, rng: np.random.Generator, report: Callback, name: str) -> np.ndarray:
     """Return coordinates to start the fit from: many starts on a few trials, fewer and fewer over longer times.
 
     In its first second a rope has not forgotten where it began and the cost has few local minima; over a long horizon
     small errors of phase make many.
     """
-    trials = _usable(recording)
+    trials = _usable(job.pool.recording)
     scouts = [trials[i] for i in _pick(len(trials), _SCOUTS)]
-    motion, begin = job.model.motion(scouts), starts_of.begin(job.model, scouts)
-    begin = starts_of.refine(job.model, motion, begin, job.values)
+    motion, begin, run = job.model.motion(scouts), starts_of.begin(job.model, scouts), job.simulator(scouts)
+    begin = starts_of.refine(job.model, motion, begin, job.values, run)
     stage, total = f"trying {starts} starts, {name}", 2 + _LOOKS
 
     def over(share: float) -> tuple[fit.Simulate, np.ndarray]:
         frames = min(max(10, round(share * motion.markers.shape[1])), motion.markers.shape[1])
-        return lambda values: job.model.simulate(motion, begin, values, frames=frames), motion.markers[:, :frames]
+        return lambda values: run(begin, values, frames), motion.markers[:, :frames]
 
     raws = _spread(job, starts, rng)
     report(stage, 0, total, "")
@@ -238,15 +251,15 @@ def _spread(job: _Job, starts: int, rng: np.random.Generator) -> np.ndarray:
     return job.space.clip(raws)
 
 
-def _judge(
-    recording: Recording, job: _Job, seed: int, interrupted: bool, begun: float, report: Callback
-) -> Calibration:
+def _judge(job: _Job, seed: int, interrupted: bool, begun: float, report: Callback) -> Calibration:
     """Predict all trials before and after, and compare."""
-    trials = (*recording.train, *recording.test)
+    recording = job.pool.recording
+    trials = recording.trials("all")
+    simulate = job.simulator(trials)
     report("predicting all trials", 0, 2, "")
-    before = judge.predict(job.model, trials, job.first)
+    before = judge.predict(job.model, trials, job.first, simulate)
     report("predicting all trials", 1, 2, "")
-    after = judge.predict(job.model, trials, job.values)
+    after = judge.predict(job.model, trials, job.values, simulate)
     report("predicting all trials", 2, 2, "")
     low, high = fit.interval(job.point, job.space)
     return Calibration(

@@ -17,11 +17,14 @@ Predictions = dict[str, np.ndarray]
 """Marker positions [m] by trial name, each of shape (F, M, 3)."""
 
 
-def predict(model: RopeModel, trials: Sequence[Trial], values: np.ndarray) -> Predictions:
-    """Simulate trials from starts estimated from their first 0.1 s."""
+def predict(
+    model: RopeModel, trials: Sequence[Trial], values: np.ndarray, simulate: starts.Simulator | None = None
+) -> Predictions:
+    """Simulate trials from starts estimated from their first 0.1 s, by the model itself or what stands in for it."""
     motion = model.motion(trials)
-    begin = starts.refine(model, motion, starts.begin(model, trials), values)
-    sims = model.simulate(motion, begin, values[None])[0]
+    simulate = simulate or (lambda begin, rows, frames: model.simulate(motion, begin, rows, frames=frames))
+    begin = starts.refine(model, motion, starts.begin(model, trials), values, simulate)
+    sims = simulate(begin, values[None], None)[0]
     return {name: sim[:frames] for name, sim, frames in zip(motion.names, sims, motion.frames, strict=True)}
 
 

@@ -31,8 +31,8 @@ class Simulation:
     """Effects of the model."""
     values: np.ndarray
     """Parameter sets in the order of the model's numbers, shape (P, K)."""
-    split: str = "train"
-    """Trials: "train", "test" or "all"."""
+    split: str | tuple[str, ...] = "train"
+    """Trials: "train", "test", "all", or their names."""
     start: Start | None = None
     """Where the trials begin; read off them if not given."""
     options: tuple[tuple[str, Any], ...] = ()
@@ -109,7 +109,7 @@ class Models:
             self._models[key] = RopeModel(self.recording, effects=effects, **(self.options | dict(options)))
         return self._models[key]
 
-    def motion(self, model: RopeModel, split: str) -> Motion:
+    def motion(self, model: RopeModel, split: str | tuple[str, ...]) -> Motion:
         """Return the motion of the trials of a split."""
         key = (split, model.substeps, len(model.arclength))
         if key not in self._motions:
@@ -263,6 +263,17 @@ class Pool:
     def simulate(self, jobs: Sequence[Simulation]) -> Iterator[tuple[int, np.ndarray]]:
         """Yield the index and the markers of every job as they get ready."""
         return self._new(jobs, lambda new: self._led([_once(job) for job in new]))
+
+    def simulator(
+        self, effects: Sequence[str], split: str | tuple[str, ...], options: tuple[tuple[str, Any], ...] = ()
+    ) -> starts.Simulator:
+        """Return a function that simulates trials with one model."""
+
+        def simulate(start: Start, values: np.ndarray, frames: int | None = None) -> np.ndarray:
+            ((_, sims),) = self.simulate([Simulation(tuple(effects), values, split, start, options, frames)])
+            return sims
+
+        return simulate
 
     def fit(self, jobs: Sequence[Fit]) -> Iterator[tuple[int, Fitted]]:
         """Yield the index and the result of every fit as they get ready."""

@@ -81,9 +81,13 @@ class Recording:
     test: tuple[Trial, ...]
     """Trials to judge on, never to fit on."""
 
-    def trials(self, split: str) -> tuple[Trial, ...]:
-        """Return the trials of a split: "train", "test", or "all", those to fit on first."""
-        return {"train": self.train, "test": self.test, "all": self.train + self.test}[split]
+    def trials(self, split: str | tuple[str, ...]) -> tuple[Trial, ...]:
+        """Return the trials of a split: "train", "test", or "all", those to fit on first; or those of these names."""
+        splits = {"train": self.train, "test": self.test, "all": self.train + self.test}
+        if isinstance(split, str):
+            return splits[split]
+        named = {t.name: t for t in splits["all"]}
+        return tuple(named[name] for name in split)
 
 
 def load_recording(path: str | Path) -> Recording:

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
 from torchdlo.sysid.model import RopeModel
 from torchdlo.sysid.motion import WINDOW, Motion, Start
 from torchdlo.sysid.recording import Recording, Trial
+
+Simulator = Callable[[Start, np.ndarray, int | None], np.ndarray]
+"""Maps beginnings of trials, parameter sets (P, K) and a number of frames to markers, see `RopeModel.simulate`."""
 
 _CALM = 0.05
 """Speed below which a rope is taken to start almost in balance [m/s], if no marker moves by more in the window."""
@@ -76,7 +79,9 @@ def _fill(values: np.ndarray, arclength: np.ndarray) -> np.ndarray:
     return np.stack([np.interp(arclength, arclength[known], values[known, c]) for c in range(3)], -1)
 
 
-def refine(model: RopeModel, motion: Motion, start: Start, values: np.ndarray) -> Start:
+def refine(
+    model: RopeModel, motion: Motion, start: Start, values: np.ndarray, simulate: Simulator | None = None
+) -> Start:
     """Return positions and velocities with which the simulation follows the markers best through the window.
 
     One Gauss-Newton step: positions and velocities of all free markers are varied in one batch; what the markers say
@@ -87,7 +92,9 @@ def refine(model: RopeModel, motion: Motion, start: Start, values: np.ndarray) -
         motion: B trials.
         start: first estimate.
         values: the rope's numbers, shape (K,).
+        simulate: what simulates the trials; the model itself if not given.
     """
+    simulate = simulate or (lambda begin, rows, count: model.simulate(motion, begin, rows, frames=count))
     if start.still is not None and start.still.all():
         return start
     frames = min(max(3, round(WINDOW / model.dt) + 1), motion.markers.shape[1])
@@ -100,7 +107,7 @@ def refine(model: RopeModel, motion: Motion, start: Start, values: np.ndarray) -
         vel[half + u + 1, :, free[u // 3], u % 3] += nudge[half + u]
     still = None if start.still is None else np.tile(start.still, 2 * half + 1)
     varied = Start(pos.reshape(-1, *start.pos.shape[1:]), vel.reshape(-1, *start.vel.shape[1:]), still)
-    sim = model.simulate(motion, varied, np.tile(values, (2 * half + 1, 1)), frames=frames)
+    sim = simulate(varied, np.tile(values, (2 * half + 1, 1)), frames)
     measured = motion.markers[:, :frames]
     seen = np.isfinite(measured).reshape(trials, -1)
     residual = np.where(seen, (measured - sim[0]).reshape(trials, -1), 0.0)
