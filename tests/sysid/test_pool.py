@@ -55,6 +55,7 @@ def test_fits_find_together_what_they_find_alone(tmp_path: Path) -> None:
 
 def test_workers_share_the_scenes_of_a_fit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(pools, "_FEW", 2)
+    monkeypatch.setattr(pools, "_SMALL", 0)
     with Pool(swaying(tmp_path, frames=40), OPTIONS, workers=1) as pool:
         jobs = fits(pool)
         alone, plain = dict(pool.fit(jobs)), simulation(pool, jobs[2])
@@ -64,10 +65,15 @@ def test_workers_share_the_scenes_of_a_fit(tmp_path: Path, monkeypatch: pytest.M
         assert [len(p) for p in parts] == [3, 2, 2, 2]
         np.testing.assert_allclose(np.concatenate(parts).reshape(whole.shape), whole, rtol=0, atol=1e-12)
     with Pool(swaying(tmp_path / "again", frames=40), OPTIONS, workers=2) as pool:
+        # One alone, so that its scenes have to be shared; then all.
+        shared = dict(pool.fit(jobs[2:3]))
+        np.testing.assert_allclose(shared[0].values, alone[2].values, rtol=1e-6, atol=1e-9)
         shared = dict(pool.fit(jobs))
-        assert sorted(map(sorted, pool.groups(jobs))) == [[0, 1, 2], [3]]
+        assert sorted(map(sorted, pool.groups(jobs))) == [[0, 2], [1], [3]]
         for k, one in alone.items():
             np.testing.assert_allclose(shared[k].values, one.values, rtol=1e-6, atol=1e-9)
+        monkeypatch.setattr(pools, "_MANY", 6)
+        assert sorted(map(sorted, pool.groups(jobs))) == [[0], [1], [2], [3]]
         ((_, both),) = pool.simulate([plain])
         np.testing.assert_allclose(both, whole, rtol=0, atol=1e-12)
 

@@ -13,7 +13,7 @@ from torchdlo.sysid import start as starts
 from torchdlo.sysid.fit import Look, drift
 from torchdlo.sysid.model import AHEAD
 from torchdlo.sysid.motion import Start
-from torchdlo.sysid.pool import Fit, Fitted, Pool, Simulation, alike
+from torchdlo.sysid.pool import Fit, Fitted, Pool, Simulation, spread
 from torchdlo.sysid.screen import Score
 
 Callback = Callable[[str, int, int, str], None]
@@ -82,7 +82,7 @@ class Bench:
         new = [f for f in fits if _key(f) not in self._known]
         # Models that settle twists take longer than others, which all fit into one batch.
         kinds = [(self.pool.local.framed(f.effects), f.options) for f in new]
-        groups = [[new[k] for k in group] for group in alike(kinds)]
+        groups = [[new[k] for k in group] for group in spread(kinds, self.pool.workers)]
         for k, sims in self.pool.simulate([self.pool.local.joined(g, "all", self.starts["all"]) for g in groups]):
             self._known |= {_key(f): sim for f, sim in zip(groups[k], sims, strict=True)}
 

@@ -90,6 +90,9 @@ _Asking = Generator[Simulation, np.ndarray, Any]
 _FEW = 16
 """Scenes that are not shared out: each step costs as much as they do, however few there are."""
 
+_MANY = 64
+"""Scenes from which the time of a step goes with their number."""
+
 _SMALL = 5000
 """Frames of scenes, some tenths of a second, that no worker is asked for: they need seconds to begin."""
 
@@ -203,12 +206,12 @@ def _search(job: Fit, space: Space, columns: Sequence[int], measured: np.ndarray
     return Fitted(job.effects, full(space.to_values(best.raw)[None])[0], space, best)
 
 
-def alike(kinds: Sequence[Hashable]) -> list[list[int]]:
-    """Return the indices of each kind."""
-    found: dict[Hashable, list[int]] = {}
+def spread(kinds: Sequence[Hashable], parts: int) -> list[list[int]]:
+    """Return indices of jobs by their kinds, those of each kind in so many groups or less."""
+    alike: dict[Hashable, list[int]] = {}
     for k, kind in enumerate(kinds):
-        found.setdefault(kind, []).append(k)
-    return list(found.values())
+        alike.setdefault(kind, []).append(k)
+    return [some for group in alike.values() for n in range(parts) if (some := group[n::parts])]
 
 
 class Pool:
@@ -301,8 +304,13 @@ class Pool:
             yield from zip(groups[n], found, strict=True)
 
     def groups(self, jobs: Sequence[Fit]) -> list[list[int]]:
-        """Return the indices of the fits that run together: alike ones."""
-        return alike([(id(j.start), j.frames, self._whole(j.options), self.local.framed(j.effects)) for j in jobs])
+        """Return the indices of the fits that run together: alike ones, as long as few scenes come together.
+
+        A step of few scenes costs hardly more for more of them, but each effect of one costs in all scenes.
+        """
+        kinds = [(id(j.start), j.frames, self._whole(j.options), self.local.framed(j.effects)) for j in jobs]
+        scenes = sum(len(j.free) + 1 for j in jobs) * len(self.recording.train)
+        return spread(kinds, max(self.workers, scenes // _MANY))
 
     def _done(self, what: Callable[[Models, Job], Any], jobs: Sequence[Job]) -> Iterator[tuple[int, Any]]:
         if self._pool is None:
@@ -317,14 +325,16 @@ class Pool:
         asked: dict[int, Simulation] = {}
         waiting: dict[Future, tuple[int, int]] = {}
         parts: dict[int, list[np.ndarray | None]] = {}
+        left = set(range(len(searches)))
 
         def go_on(n: int, sims: np.ndarray | None) -> Iterator[tuple[int, Any]]:
             """Give a search what it asked for; yield its result, or have the next simulation done."""
             try:
                 asked[n] = job = searches[n].send(sims)
-                while not (count := self._parts(job)):
+                while not (count := self._parts(job, len(left))):
                     asked[n] = job = searches[n].send(self.local.simulate(job))
             except StopIteration as end:
+                left.remove(n)
                 yield n, end.value
                 return
             parts[n] = [None] * count
@@ -340,13 +350,16 @@ class Pool:
                     sims = np.concatenate(parts.pop(n))
                     yield from go_on(n, sims.reshape(len(asked[n].values), -1, *sims.shape[-3:]))
 
-    def _parts(self, job: Simulation) -> int:
-        """Return into how many parts a simulation is split for the workers; 0 if this process had better do it."""
+    def _parts(self, job: Simulation, searches: int) -> int:
+        """Return into how many parts a simulation is split for the workers, which others may keep busy as well.
+
+        0 if this process had better do it.
+        """
         trials = self.recording.trials(job.split)
         scenes, frames = len(job.values) * len(trials), job.frames or max(len(t.time) for t in trials)
         if self._pool is None or scenes * frames < _SMALL:
             return 0
-        return max(1, min(self.workers, scenes // _FEW))
+        return max(1, min(-(-self.workers // searches), scenes // _FEW))
 
 
 def _once(job: Simulation) -> _Asking:

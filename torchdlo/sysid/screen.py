@@ -8,7 +8,7 @@ own numbers have been allowed to take up what they can, is compared with what is
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.optimize import lsq_linear
@@ -81,16 +81,16 @@ def screen(
     known = dict(zip(model.parameters, base.values, strict=True))
     curved = curvature_scale(motion.markers[:, :: max(1, motion.markers.shape[1] // 50)])
     doses = {n: library.probes(n, recording, model.mesh, curved, known) for n in names}
-    groups = _groups(names, doses)
-    jobs = [_job(pool, base, group, doses, start) for group in groups]
-    nudge = base.space.nudges()
-    jobs.append(Simulation(base.effects, _nudged(model, base, nudge), start=start))
+    groups, nudge = _groups(names, doses), base.space.nudges()
+    jobs = [_job(pool, base, group, doses) for group in groups]
+    jobs.append(Simulation(base.effects, _nudged(model, base, nudge)))
+    frames = min(max(10, int(_HORIZON * motion.markers.shape[1])), motion.markers.shape[1])
+    jobs = [replace(job, start=start, frames=frames) for job in jobs]
     sims_of: dict[int, np.ndarray] = {}
     report(0, len(jobs))
     for k, sims in pool.simulate(jobs):
         sims_of[k] = sims
         report(len(sims_of), len(jobs))
-    frames = max(10, int(_HORIZON * motion.markers.shape[1]))
     free = np.setdiff1d(np.arange(model.count), model.gripped)
 
     def pick(x: np.ndarray) -> np.ndarray:
@@ -150,7 +150,7 @@ def _groups(names: Sequence[str], doses: dict[str, list[Probe]]) -> list[list[st
     return groups
 
 
-def _job(pool: Pool, base: Fitted, group: Sequence[str], doses: dict[str, list[Probe]], start: Start) -> Simulation:
+def _job(pool: Pool, base: Fitted, group: Sequence[str], doses: dict[str, list[Probe]]) -> Simulation:
     effects = (*base.effects, *group)
     model = pool.local.model(effects)
     first = model.guess()
@@ -162,7 +162,7 @@ def _job(pool: Pool, base: Fitted, group: Sequence[str], doses: dict[str, list[P
             for key, value in probe.values.items():
                 row[model.parameters.index(key)] = value
             rows.append(row)
-    return Simulation(effects, np.stack(rows), start=start)
+    return Simulation(effects, np.stack(rows))
 
 
 @dataclass(frozen=True, eq=False)
