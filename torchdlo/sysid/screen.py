@@ -97,7 +97,7 @@ def screen(
         return x[..., :frames, free, :].reshape(*x.shape[:-4], -1)
 
     own = sims_of[len(groups)]
-    residual = pick(motion.markers - own[0])
+    residual = pick(motion.markers) - pick(own[0])
     good = np.isfinite(residual) & np.isfinite(pick(own)).all(0)
     trust = 1.0 if start.trust is None else pick(np.broadcast_to(start.trust[..., None, None], motion.markers.shape))
     size = np.nan_to_num(trust * residual)
