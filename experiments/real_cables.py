@@ -9,13 +9,15 @@ by their numbers, the test trials: published splits interleave cuts of the same 
 
 Planted are: a delay of 20 ms (markers of the rope are taken from two hundredths of a second earlier than those of the
 grippers), a frame that is 2 degrees out of level (all markers turned about x), and, as differences of two simulations
-with and without them, markers 8 mm beside the axis and a bead of 10 g at 0.4 of the length. A plant counts as named if
-it is among the named effects or those that cannot be told from them.
+with and without them, markers 8 mm beside the axis and a bead of 10 g at 0.4 of the length. What the cable lacks anyhow
+is known then: the model that its own diagnosis wrote is the baseline. A plant counts as named if it is among the
+effects that are named in addition, or among those that cannot be told from them.
 """
 
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -23,13 +25,16 @@ from typing import Any
 import numpy as np
 from options import Parser, count, save
 
+from torchdlo.files import write_atomically
 from torchdlo.progress import progress
+from torchdlo.sysid import saved
 from torchdlo.sysid import start as starts
-from torchdlo.sysid.bench import Callback
 from torchdlo.sysid.diagnose import BUDGETS, diagnose
+from torchdlo.sysid.findings import model_json
 from torchdlo.sysid.metrics import average, mean_absolute_error
 from torchdlo.sysid.model import RopeModel
 from torchdlo.sysid.recording import Recording, Trial, load_recording
+from torchdlo.sysid.saved import Saved
 from torchdlo.sysid.verdict import Diagnosis
 
 DELAY, TILT = 0.02, np.radians(2.0)
@@ -68,18 +73,18 @@ def tilted(trial: Trial) -> Trial:
     return replace(trial, markers=trial.markers @ np.array([[1, 0, 0], [0, c, -s], [0, s, c]]).T)
 
 
-def simulated(recording: Recording, name: str, base: Diagnosis) -> Recording:
+def simulated(recording: Recording, name: str, base: Saved) -> Recording:
     """Return the recording with what an effect changes in a simulation added to the free markers."""
-    options = {"grip": base.model.grip, "ahead": base.model.ahead, "rest": base.model.rest}
-    models = [RopeModel(recording, effects=e, **options) for e in ((), (name,))]
-    known = dict(zip(base.model.parameters, base.final.values, strict=True))
-    numbers = dict(SIMULATED[name])
+    if name in base.effects:
+        raise SystemExit(f"{base.path}: {name} is there already; expected a cable without it to plant it.")
+    models = [base.model(recording), RopeModel(recording, effects=(*base.effects, name), **base.options)]
+    numbers = base.values | SIMULATED[name]
     if name == "point_mass":
         numbers["point_mass.position"] *= recording.length
     trials, sims = recording.trials("all"), []
     for model in models:
         values = np.array(
-            [numbers.get(n, known.get(n, g)) for n, g in zip(model.parameters, model.guess(), strict=True)]
+            [numbers.get(n, g) for n, g in zip(model.parameters, model.guess(), strict=True)], dtype=float
         )
         motion = model.motion(trials)
         sims.append(model.simulate(motion, starts.begin(model, trials), values[None])[0])
@@ -92,7 +97,7 @@ def simulated(recording: Recording, name: str, base: Diagnosis) -> Recording:
     return replace(recording, train=tuple(made[:first]), test=tuple(made[first:]))
 
 
-def planted(recording: Recording, name: str, base: Diagnosis | None) -> Recording:
+def planted(recording: Recording, name: str, base: Saved) -> Recording:
     """Return the recording with an effect planted."""
     if name in SIMULATED:
         return simulated(recording, name, base)
@@ -100,12 +105,21 @@ def planted(recording: Recording, name: str, base: Diagnosis | None) -> Recordin
     return replace(recording, train=tuple(map(change, recording.train)), test=tuple(map(change, recording.test)))
 
 
-def kept_up(recording: Recording, journal: Path, choices: dict[str, Any], callback: Callback) -> Diagnosis:
-    """Return the diagnosis, going on from where an earlier one was stopped."""
-    return diagnose(recording, **choices, callback=callback, journal=journal, resume=journal.exists())
+def diagnosed(recording: Recording, out: Path, plant: str, base: Saved | None, choices: dict[str, Any]) -> dict:
+    """Return the row of the table, from the file if it was written before; a search that was stopped goes on."""
+    kept, model = out.with_suffix(".json"), out.with_name(f"{out.name}-model.json")
+    if kept.exists():
+        return json.loads(kept.read_text())
+    print(out.name, flush=True)
+    with progress() as callback:
+        found = diagnose(recording, **choices, callback=callback, journal=out, resume=out.exists(), given=base)
+    write_atomically(model, model_json(found))
+    save(str(kept), row(recording, found, plant, base))
+    shutil.rmtree(out)
+    return json.loads(kept.read_text())
 
 
-def row(recording: Recording, found: Diagnosis, plant: str) -> dict:
+def row(recording: Recording, found: Diagnosis, plant: str, base: Saved | None) -> dict:
     """Return what a diagnosis found, for the table."""
     errors = {
         when: 1e3 * average(mean_absolute_error, [sims[t.name] for t in recording.test], recording.test)
@@ -125,7 +139,8 @@ def row(recording: Recording, found: Diagnosis, plant: str) -> dict:
         "gap_before_mm": (1e3 * found.before).tolist(),
         "gap_after_mm": (1e3 * found.after).tolist(),
         "numbers": numbers,
-        "named": not plant or plant in found.effects or any(plant in found.ties.get(e, []) for e in found.effects),
+        "baseline": list(base.effects) if base else [],
+        "named": not plant or any(plant in (e, *found.ties.get(e, [])) for e in found.effects),
         "seconds": found.seconds,
     }
 
@@ -159,22 +174,14 @@ def main() -> None:
     for path in args.recordings:
         recording = load_recording(path)
         recording = blocks(recording) if args.blocks else recording
-        base: Diagnosis | None = None
-        for plant in args.plant or [""]:
-            tag = "-".join([path.name, *(["blocks"] if args.blocks else []), *([plant] if plant else [])])
-            kept = Path(args.out) / f"{tag}.json"
-            if kept.exists():
-                rows.append(json.loads(kept.read_text()))
-                continue
-            with progress() as callback:
-                print(tag, flush=True)
-                if plant in SIMULATED and base is None:
-                    fast = choices | {"budget": "fast"}
-                    base = kept_up(recording, kept.with_name(f"{path.name}-base"), fast, callback)
-                here = planted(recording, plant, base) if plant else recording
-                found = kept_up(here, kept.with_suffix(""), choices, callback)
-            rows.append(row(here, found, plant))
-            save(str(kept), rows[-1])
+        out = Path(args.out) / (f"{path.name}-blocks" if args.blocks else path.name)
+        plain = diagnosed(recording, out, "", None, choices)
+        if not args.plant:
+            rows.append(plain)
+        for plant in args.plant:
+            base = saved.load(out.with_name(f"{out.name}-model.json"))
+            here = planted(recording, plant, base)
+            rows.append(diagnosed(here, out.with_name(f"{out.name}-{plant}"), plant, base, choices))
     show(rows)
     save(f"{args.out}/real_cables.json", rows)
 
