@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from torchdlo.sysid.bench import CHAIN, SILENT, Bench, Callback
-from torchdlo.sysid.floor import Refinement, rms
+from torchdlo.sysid.floor import Refinement, gap, rms
 from torchdlo.sysid.model import AHEAD, RopeModel
 from torchdlo.sysid.pool import Fit, Fitted
 from torchdlo.sysid.saved import Saved
@@ -190,7 +190,12 @@ def _chain_or(bench: Bench, smooth: Fitted, rope: Refinement, sides: Sequence[Fi
         rope: how simulations were corrected for it.
         sides: fits of the chain.
     """
-    level, before = bench.level, bench.gaps(smooth, "all")
+    level, before, trust = bench.level, bench.gaps(smooth, "all"), bench.starts["train"].trust
+
+    def left(fitted: Fitted) -> float:
+        return rms(gap(bench.prediction(fitted, "train"), bench.trials["train"], trust))
+
+    smoothly = left(smooth)
     bench.use(replace(rope, links=abs(float(sides[0].values[0, -1]))))
     start, most = bench.starts["train"], sides[0].iterations
     found = bench.fit([replace(side, start=start, iterations=min(_LOOK, most)) for side in sides])
@@ -198,7 +203,9 @@ def _chain_or(bench: Bench, smooth: Fitted, rope: Refinement, sides: Sequence[Fi
     # Each in its own measure of what can be known. A rope that is no chain fits worse from the beginning.
     if most > _LOOK and best.point.cost / bench.level < smooth.point.cost / level:
         best = bench.fit([bench.further(best, most - _LOOK)])[0]
-    if best.point.cost / bench.level < _BETTER * smooth.point.cost / level and not bench.astray(best, before):
+    # Less is known of a chain: that alone does not make it better where much more is left than can be known.
+    better = best.point.cost / bench.level < _BETTER * smooth.point.cost / level and left(best) < _BETTER * smoothly
+    if better and not bench.astray(best, before):
         return best
     bench.use(rope)
     return smooth

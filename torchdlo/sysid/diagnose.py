@@ -136,8 +136,8 @@ class _Search:
         return self._conclude(base, list(shares), {n: ties[n] for n in shares}, shares, rounds)
 
     def _squared(self, fitted: Fitted) -> float:
-        """Return the squared gap on the test trials [m^2]."""
-        return float(rms(self.bench.gaps(fitted, "test")) ** 2)
+        """Return the squared gap on the test trials [m^2]; all frames count the same, whatever is known of them."""
+        return float(rms(gap(self.bench.prediction(fitted, "test"), self.bench.trials["test"])) ** 2)
 
     def _pruned(self, fitted: Fitted, shares: dict[str, float]) -> Fitted:
         """Return the model without the effects that the last one has made needless, which takes over their shares."""
