@@ -11,8 +11,8 @@ from torchdlo.physics.effects import EFFECTS
 from torchdlo.sysid import floor as floors
 from torchdlo.sysid.fit import Point, Space
 from torchdlo.sysid.floor import Floor
+from torchdlo.sysid.jobs import Fitted
 from torchdlo.sysid.library import PARAMETERS
-from torchdlo.sysid.pool import Fitted
 from torchdlo.sysid.recording import Recording
 from torchdlo.sysid.verdict import Candidate, Diagnosis
 

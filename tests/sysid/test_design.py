@@ -20,10 +20,11 @@ from torchdlo.sysid import start as starts
 from torchdlo.sysid.contest import size
 from torchdlo.sysid.design import Design, design_experiment, design_json
 from torchdlo.sysid.floor import gap
+from torchdlo.sysid.jobs import Fit, Simulation
 from torchdlo.sysid.journal import digest
 from torchdlo.sysid.model import RopeModel
 from torchdlo.sysid.motion import Start
-from torchdlo.sysid.pool import Fit, Pool, Simulation
+from torchdlo.sysid.pool import Pool
 from torchdlo.sysid.recording import Recording, Trial, save_recording
 
 S = np.array([0.0, 0.015, 0.06, 0.12, 0.18, 0.24, 0.3])

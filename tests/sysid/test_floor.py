@@ -14,7 +14,8 @@ from torchdlo.sysid import floor
 from torchdlo.sysid.bench import Bench
 from torchdlo.sysid.fit import Point, Space
 from torchdlo.sysid.floor import Refinement
-from torchdlo.sysid.pool import Fitted, Pool, Simulation
+from torchdlo.sysid.jobs import Fitted, Simulation
+from torchdlo.sysid.pool import Pool
 from torchdlo.sysid.recording import Recording, Trial
 
 OPTIONS = {"vertices": 33, "ahead": 0.0, "grip": 0.0}

@@ -18,10 +18,11 @@ from torchdlo.sysid import library, saved
 from torchdlo.sysid import pool as pools
 from torchdlo.sysid.findings import findings, model_json
 from torchdlo.sysid.fit import Point, Space
+from torchdlo.sysid.jobs import Fit, Fitted, Models, Simulation
 from torchdlo.sysid.journal import Journal, digest
 from torchdlo.sysid.library import PARAMETERS
 from torchdlo.sysid.motion import Start
-from torchdlo.sysid.pool import Fit, Fitted, Models, Pool, Simulation
+from torchdlo.sysid.pool import Pool
 from torchdlo.sysid.recording import Recording, load_recording
 
 OPTIONS = {"seed": 0, "budget": "fast"}

@@ -13,7 +13,8 @@ from torchdlo.sysid import pool as pools
 from torchdlo.sysid import start as starts
 from torchdlo.sysid.bench import Bench
 from torchdlo.sysid.fit import Point, Space
-from torchdlo.sysid.pool import Fit, Fitted, Pool, Simulation
+from torchdlo.sysid.jobs import Fit, Fitted, Simulation
+from torchdlo.sysid.pool import Pool
 
 OPTIONS = {"vertices": 17, "ahead": 0.0, "grip": 0.0}
 BASE = ("bending_stiffness", "damping_rate")

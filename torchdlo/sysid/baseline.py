@@ -10,8 +10,8 @@ import numpy as np
 
 from torchdlo.sysid.bench import CHAIN, SILENT, Bench, Callback
 from torchdlo.sysid.floor import Refinement, gap, rms
+from torchdlo.sysid.jobs import Fit, Fitted
 from torchdlo.sysid.model import AHEAD, RopeModel
-from torchdlo.sysid.pool import Fit, Fitted
 from torchdlo.sysid.saved import Saved
 
 _SPREAD = np.log([100.0, 4.0, 6.0])

@@ -11,9 +11,10 @@ from torchdlo.errors import InputError
 from torchdlo.sysid import floor as floors
 from torchdlo.sysid import start as starts
 from torchdlo.sysid.fit import Look, drift
+from torchdlo.sysid.jobs import Fit, Fitted, Simulation
 from torchdlo.sysid.model import AHEAD
 from torchdlo.sysid.motion import Start
-from torchdlo.sysid.pool import Fit, Fitted, Pool, Simulation, spread
+from torchdlo.sysid.pool import Pool, spread
 from torchdlo.sysid.screen import Score
 
 Callback = Callable[[str, int, int, str], None]

@@ -12,7 +12,7 @@ import numpy as np
 
 from torchdlo.sysid.bench import SILENT, Bench
 from torchdlo.sysid.floor import rms
-from torchdlo.sysid.pool import Fit, Fitted
+from torchdlo.sysid.jobs import Fit, Fitted
 from torchdlo.sysid.screen import Score
 
 NAME = "gripper_compliance"

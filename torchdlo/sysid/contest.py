@@ -18,10 +18,10 @@ from scipy.optimize import lsq_linear
 from torchdlo.sysid import library, motions
 from torchdlo.sysid.bench import Bench, Callback
 from torchdlo.sysid.fit import Space
+from torchdlo.sysid.jobs import Fitted, Models, Simulation
 from torchdlo.sysid.model import RopeModel
 from torchdlo.sysid.motion import Start
 from torchdlo.sysid.motions import Gesture, Rig
-from torchdlo.sysid.pool import Fitted, Models, Simulation
 from torchdlo.sysid.recording import Trial
 
 __all__ = ["Contest", "Pair", "measured_misfit", "size"]

@@ -21,10 +21,11 @@ from torchdlo.sysid import floor as floors
 from torchdlo.sysid import health, motions, plan, rivals
 from torchdlo.sysid.bench import Bench, Callback
 from torchdlo.sysid.contest import Contest, Pair, measured_misfit, size
+from torchdlo.sysid.jobs import Fitted
 from torchdlo.sysid.journal import Journal
 from torchdlo.sysid.laws import separating
 from torchdlo.sysid.motions import KINDS, Gesture, Rig
-from torchdlo.sysid.pool import Fitted, Pool
+from torchdlo.sysid.pool import Pool
 from torchdlo.sysid.recording import Recording, Trial
 from torchdlo.sysid.result import dump, versions
 from torchdlo.sysid.screen import curvature_scale

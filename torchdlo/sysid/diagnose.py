@@ -18,9 +18,10 @@ from torchdlo.sysid import baseline as baselines
 from torchdlo.sysid import clamps, health, library, plan
 from torchdlo.sysid.bench import SILENT, Bench, Callback
 from torchdlo.sysid.floor import gap, rms
+from torchdlo.sysid.jobs import Fit, Fitted
 from torchdlo.sysid.journal import Journal
 from torchdlo.sysid.plan import BUDGETS, Budget
-from torchdlo.sysid.pool import Fit, Fitted, Pool
+from torchdlo.sysid.pool import Pool
 from torchdlo.sysid.recording import Recording
 from torchdlo.sysid.saved import Saved
 from torchdlo.sysid.screen import Score, screen

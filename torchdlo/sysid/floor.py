@@ -6,8 +6,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from torchdlo.sysid.jobs import Fitted, Simulation
 from torchdlo.sysid.motion import Start
-from torchdlo.sysid.pool import Fitted, Pool, Simulation
+from torchdlo.sysid.pool import Pool
 from torchdlo.sysid.recording import Recording, Trial
 
 

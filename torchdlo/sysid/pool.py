@@ -2,90 +2,24 @@
 
 from __future__ import annotations
 
+import itertools
 import multiprocessing
 import os
-from collections.abc import Callable, Generator, Hashable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, as_completed, wait
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Hashable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from dataclasses import replace
 from functools import partial
 from typing import Any, TypeVar
 
 import numpy as np
 
-from torchdlo.sysid import fit, library
 from torchdlo.sysid import start as starts
-from torchdlo.sysid.fit import Point, Space
+from torchdlo.sysid.jobs import Fit, Fitted, Models, Search, Simulation
 from torchdlo.sysid.journal import Journal
-from torchdlo.sysid.model import RopeModel
-from torchdlo.sysid.motion import Motion, Start
+from torchdlo.sysid.motion import Start
 from torchdlo.sysid.recording import Recording
 
 Job = TypeVar("Job")
-
-
-@dataclass(frozen=True, eq=False)
-class Simulation:
-    """Parameter sets to simulate."""
-
-    effects: tuple[str, ...]
-    """Effects of the model."""
-    values: np.ndarray
-    """Parameter sets in the order of the model's numbers, shape (P, K)."""
-    split: str | tuple[str, ...] = "train"
-    """Trials: "train", "test", "all", or their names."""
-    start: Start | None = None
-    """Where the trials begin; read off them if not given."""
-    options: tuple[tuple[str, Any], ...] = ()
-    """Options of `RopeModel` that differ from those of the pool."""
-    frames: int | None = None
-    """How many frames to simulate; all if not given."""
-
-
-@dataclass(frozen=True, eq=False)
-class Fit:
-    """Numbers to fit to the train trials."""
-
-    effects: tuple[str, ...]
-    """Effects of the model."""
-    values: np.ndarray
-    """Where to start, in the order of the model's numbers, shape (S, K)."""
-    free: tuple[str, ...]
-    """Numbers to fit; the others stay as they are in the first start."""
-    sizes: tuple[float, ...]
-    """What counts as much of each of them, see `Space`."""
-    iterations: int
-    """Most iterations."""
-    start: Start | None = None
-    """Where the trials begin; read off them if not given."""
-    frames: int | None = None
-    """How many frames to fit; all if not given."""
-    keep: int | None = None
-    """With how many of the starts, the best, to go on; all if not given."""
-    options: tuple[tuple[str, Any], ...] = ()
-    """Options of `RopeModel` that differ from those of the pool."""
-
-
-@dataclass(frozen=True, eq=False)
-class Fitted:
-    """What a fit found."""
-
-    effects: tuple[str, ...]
-    """Effects of the model."""
-    values: np.ndarray
-    """Best numbers, in the order of the model's, shape (K,)."""
-    space: Space
-    """The numbers that were fitted."""
-    point: Point
-    """Their coordinates, with costs and slopes."""
-    options: tuple[tuple[str, Any], ...] = ()
-    """Options of `RopeModel` that differ from those of the pool."""
-
-
-_Search = Generator[np.ndarray, np.ndarray, Fitted]
-"""Yields parameter sets (P, K) of its model, takes their simulations (P, B, F, M, 3)."""
-
-_Asking = Generator[Simulation, np.ndarray, Any]
-"""Yields simulations, takes their markers."""
 
 _FEW = 16
 """Scenes that are not shared out: each step costs as much as they do, however few there are."""
@@ -95,115 +29,6 @@ _MANY = 64
 
 _SMALL = 5000
 """Frames of scenes, some tenths of a second, that no worker is asked for: they need seconds to begin."""
-
-
-class Models:
-    """Models of one process by their effects and options."""
-
-    def __init__(self, recording: Recording, options: dict[str, Any]) -> None:
-        self.recording, self.options = recording, options
-        self._models: dict[Any, RopeModel] = {}
-        self._motions: dict[Any, Motion] = {}
-
-    def model(self, effects: Sequence[str], options: tuple[tuple[str, Any], ...] = ()) -> RopeModel:
-        """Return the model with these effects."""
-        key = (tuple(effects), options)
-        if key not in self._models:
-            self._models[key] = RopeModel(self.recording, effects=effects, **(self.options | dict(options)))
-        return self._models[key]
-
-    def motion(self, model: RopeModel, split: str | tuple[str, ...]) -> Motion:
-        """Return the motion of the trials of a split."""
-        key = (split, model.substeps, len(model.arclength))
-        if key not in self._motions:
-            self._motions[key] = model.motion(self.recording.trials(split))
-        return self._motions[key]
-
-    def simulate(self, job: Simulation, part: int = 0, parts: int = 1) -> np.ndarray:
-        """Return markers [m], shape (P, B, F, M, 3); of one of several parts, those of its P B / parts scenes."""
-        model = self.model(job.effects, job.options)
-        start = job.start or starts.begin(model, self.recording.trials(job.split))
-        motion = self.motion(model, job.split)
-        if parts == 1:
-            return model.simulate(motion, start, job.values, frames=job.frames)
-        rows = np.array_split(np.arange(len(job.values) * len(motion.names)), parts)[part]
-        return model.scenes(motion, start, job.values, rows, frames=job.frames)
-
-    def search(self, jobs: Sequence[Fit]) -> _Asking:
-        """Ask for what several fits with the same start, frames and options need, together; return their results."""
-        effects, options = tuple(dict.fromkeys(e for job in jobs for e in job.effects)), jobs[0].options
-        model = self.model(effects, options)
-        measured = self.motion(model, "train").markers[:, : jobs[0].frames]
-        start = jobs[0].start or starts.begin(model, self.recording.train)
-        trust = 1.0 if start.trust is None else start.trust[:, : jobs[0].frames, None, None]
-        searches, places = [], []
-        for job in jobs:
-            own = self.model(job.effects, options)
-            columns = [own.parameters.index(name) for name in job.free]
-            space = Space(job.free, tuple(own.params[k] for k in columns), job.sizes)
-            searches.append(_search(job, space, columns, measured, trust))
-            places.append(self._places(model, job.effects))
-        found: dict[int, Fitted] = {}
-        asked = {k: next(search) for k, search in enumerate(searches)}
-        while asked:
-            rows = [_filled(model.guess(), places[k], values) for k, values in asked.items()]
-            sims = yield Simulation(effects, np.concatenate(rows), "train", start, options, jobs[0].frames)
-            ends = np.cumsum([len(r) for r in rows])[:-1]
-            for k, sim in zip(list(asked), np.split(sims, ends), strict=True):
-                try:
-                    asked[k] = searches[k].send(sim)
-                except StopIteration as end:
-                    found[k] = replace(end.value, options=options)
-                    del asked[k]
-        return tuple(found[k] for k in range(len(jobs)))
-
-    def framed(self, effects: Sequence[str]) -> bool:
-        """Return whether twists have to be searched for in a model with these effects, which takes longer."""
-        laws = [library.instance(e, self.model(()).mesh) for e in effects]
-        return any(law.frame_bending or law.settles for law in laws)
-
-    def joined(self, fits: Sequence[Fitted], split: str, start: Start) -> Simulation:
-        """Return one job that simulates several fits with the same options, by a model that has the effects of all."""
-        model = self.model(tuple(dict.fromkeys(e for f in fits for e in f.effects)))
-        rows = [_filled(model.guess(), self._places(model, f.effects), f.values[None]) for f in fits]
-        return Simulation(model.effects, np.concatenate(rows), split, start, fits[0].options)
-
-    def _places(self, model: RopeModel, effects: Sequence[str]) -> list[int]:
-        """Return where the numbers of a model with some of the effects are among those of a model with all."""
-        return [model.parameters.index(name) for name in self.model(effects).parameters]
-
-
-def _filled(guess: np.ndarray, places: Sequence[int], values: np.ndarray) -> np.ndarray:
-    """Return values of some numbers (P, K) among all; the others do nothing."""
-    full = np.repeat(guess[None], len(values), 0)
-    full[:, places] = values
-    return full
-
-
-def _search(job: Fit, space: Space, columns: Sequence[int], measured: np.ndarray, trust: np.ndarray | float) -> _Search:
-    """Fit: yield parameter sets (P, K) of the job's model, take their simulations, return the best.
-
-    Markers (..., B, F, M, 3), measured and simulated, are multiplied by what they are trusted, (B, F, 1, 1).
-    """
-    measured = trust * measured
-
-    def full(values: np.ndarray) -> np.ndarray:
-        return _filled(job.values[0], columns, values)
-
-    raws = space.clip(space.to_raw(job.values[:, columns]))
-    if job.keep is not None:
-        costs = fit.costs(trust * (yield full(space.to_values(raws))), measured)
-        raws = raws[np.argsort(costs)[: job.keep]]
-    look = fit.Look(space, raws)
-    climb = fit.Climb(space, look.points(trust * (yield full(look.values)), measured))
-    for _ in range(job.iterations):
-        tries = climb.tries()
-        if not len(tries):
-            break
-        look = fit.Look(space, tries)
-        climb.take(look.points(trust * (yield full(look.values)), measured))
-    best = min(climb.points, key=lambda p: p.cost)
-    return Fitted(job.effects, full(space.to_values(best.raw)[None])[0], space, best)
 
 
 def spread(kinds: Sequence[Hashable], parts: int) -> list[list[int]]:
@@ -237,22 +62,22 @@ class Pool:
         self.recording, self.local = recording, Models(recording, options)
         # Named in every job, so that what was found with them is not mixed up with what others find later.
         self._chosen = {name: options[name] for name in ("ahead", "grip") if name in options}
-        self._pool = None
-        if workers > 1:
-            context = multiprocessing.get_context("spawn")
-            self._pool = ProcessPoolExecutor(workers, context, _begin, (recording, options))
+        context = multiprocessing.get_context("spawn")
+        # Each has a queue of its own: what was recorded for a model's steps is known to the process that did it.
+        self._queues = [
+            ProcessPoolExecutor(1, context, _begin, (recording, options)) for _ in range(workers if workers > 1 else 0)
+        ]
 
     def __enter__(self) -> Pool:
         return self
 
     def __exit__(self, *_: object) -> None:
-        if self._pool is None:
-            return
         # After Ctrl-C nobody waits for fits that are still running; idle workers do not mind.
-        workers = list((self._pool._processes or {}).values())
-        self._pool.shutdown(wait=False, cancel_futures=True)
-        for worker in workers:
-            worker.terminate()
+        for queue in self._queues:
+            processes = list((queue._processes or {}).values())
+            queue.shutdown(wait=False, cancel_futures=True)
+            for process in processes:
+                process.terminate()
 
     def choose(self, **options: Any) -> None:
         """Give all models other options from now on."""
@@ -313,19 +138,38 @@ class Pool:
         return spread(kinds, max(self.workers, scenes // _MANY))
 
     def _done(self, what: Callable[[Models, Job], Any], jobs: Sequence[Job]) -> Iterator[tuple[int, Any]]:
-        if self._pool is None:
+        if not self._queues:
             yield from ((k, what(self.local, job)) for k, job in enumerate(jobs))
             return
-        waiting = {self._pool.submit(_do, what, job): k for k, job in enumerate(jobs)}
-        for future in as_completed(waiting):
-            yield waiting[future], future.result()
+        waiting: dict[Future, tuple[int, ProcessPoolExecutor]] = {}
+        left = enumerate(jobs)
 
-    def _led(self, searches: Sequence[_Asking]) -> Iterator[tuple[int, Any]]:
+        def next_for(queue: ProcessPoolExecutor) -> None:
+            waiting.update({queue.submit(_do, what, job): (k, queue) for k, job in itertools.islice(left, 1)})
+
+        for queue in self._queues:
+            next_for(queue)
+        while waiting:
+            for future in wait(waiting, return_when=FIRST_COMPLETED).done:
+                k, queue = waiting.pop(future)
+                next_for(queue)
+                yield k, future.result()
+
+    def _led(self, searches: Sequence[Search]) -> Iterator[tuple[int, Any]]:
         """Yield the index and the result of every search as they get ready; all workers simulate what they ask for."""
         asked: dict[int, Simulation] = {}
-        waiting: dict[Future, tuple[int, int]] = {}
+        waiting: dict[Future, tuple[int, int, int]] = {}
         parts: dict[int, list[np.ndarray | None]] = {}
-        left = set(range(len(searches)))
+        left, home = set(range(len(searches))), {n: n % self.workers for n in range(len(searches))}
+
+        def idlest(n: int) -> int:
+            """Return the worker for a search: the one it had last, unless another one has less to do."""
+            load = [0] * self.workers
+            for *_, worker in waiting.values():
+                load[worker] += 1
+            if load[home[n]] > min(load):
+                home[n] = load.index(min(load))
+            return home[n]
 
         def go_on(n: int, sims: np.ndarray | None) -> Iterator[tuple[int, Any]]:
             """Give a search what it asked for; yield its result, or have the next simulation done."""
@@ -338,13 +182,14 @@ class Pool:
                 yield n, end.value
                 return
             parts[n] = [None] * count
-            waiting.update({self._pool.submit(_do, _simulated, (job, p, count)): (n, p) for p in range(count)})
+            for p, worker in enumerate(range(count) if count > 1 else [idlest(n)]):
+                waiting[self._queues[worker].submit(_do, _simulated, (job, p, count))] = n, p, worker
 
         for n in range(len(searches)):
             yield from go_on(n, None)
         while waiting:
             for future in wait(waiting, return_when=FIRST_COMPLETED).done:
-                n, p = waiting.pop(future)
+                n, p, _ = waiting.pop(future)
                 parts[n][p] = future.result()
                 if all(part is not None for part in parts[n]):
                     sims = np.concatenate(parts.pop(n))
@@ -357,12 +202,12 @@ class Pool:
         """
         trials = self.recording.trials(job.split)
         scenes, frames = len(job.values) * len(trials), job.frames or max(len(t.time) for t in trials)
-        if self._pool is None or scenes * frames < _SMALL:
+        if not self._queues or scenes * frames < _SMALL:
             return 0
         return max(1, min(-(-self.workers // searches), scenes // _FEW))
 
 
-def _once(job: Simulation) -> _Asking:
+def _once(job: Simulation) -> Search:
     """Ask for one simulation and return it."""
     return (yield job)
 

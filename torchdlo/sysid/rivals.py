@@ -15,8 +15,8 @@ from torchdlo.errors import InputError
 from torchdlo.sysid import baseline as baselines
 from torchdlo.sysid import library, plan, saved
 from torchdlo.sysid.bench import Bench, Callback
+from torchdlo.sysid.jobs import Fit, Fitted
 from torchdlo.sysid.journal import digest
-from torchdlo.sysid.pool import Fit, Fitted
 from torchdlo.sysid.recording import Recording
 from torchdlo.sysid.saved import Saved
 from torchdlo.sysid.screen import Score, screen

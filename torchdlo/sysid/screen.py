@@ -14,10 +14,11 @@ import numpy as np
 from scipy.optimize import lsq_linear
 
 from torchdlo.sysid import library
+from torchdlo.sysid.jobs import Fitted, Simulation
 from torchdlo.sysid.library import Probe
 from torchdlo.sysid.model import RopeModel
 from torchdlo.sysid.motion import Start
-from torchdlo.sysid.pool import Fitted, Pool, Simulation
+from torchdlo.sysid.pool import Pool
 
 _KNEE = 2e-3
 """Residual from which it counts less [m]."""

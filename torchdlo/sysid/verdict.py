@@ -9,8 +9,8 @@ import numpy as np
 
 from torchdlo.sysid.floor import Floor
 from torchdlo.sysid.health import Fault
+from torchdlo.sysid.jobs import Fitted
 from torchdlo.sysid.model import RopeModel
-from torchdlo.sysid.pool import Fitted
 
 
 @dataclass(frozen=True, eq=False)
