@@ -21,7 +21,7 @@ from torchdlo.sysid.recording import Recording
 
 Job = TypeVar("Job")
 
-_FEW = 16
+_FEW = 32
 """Scenes that are not shared out: each step costs as much as they do, however few there are."""
 
 _MANY = 64
@@ -163,12 +163,12 @@ class Pool:
         left, home = set(range(len(searches))), {n: n % self.workers for n in range(len(searches))}
 
         def idlest(n: int) -> int:
-            """Return the worker for a search: the one it had last, unless another one has less to do."""
+            """Return the worker for a search: the one it had last, unless that is busy and another one is idle."""
             load = [0] * self.workers
             for *_, worker in waiting.values():
                 load[worker] += 1
-            if load[home[n]] > min(load):
-                home[n] = load.index(min(load))
+            if load[home[n]] and 0 in load:
+                home[n] = load.index(0)
             return home[n]
 
         def go_on(n: int, sims: np.ndarray | None) -> Iterator[tuple[int, Any]]:
