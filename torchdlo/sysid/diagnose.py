@@ -17,6 +17,7 @@ from torchdlo.errors import InputError
 from torchdlo.sysid import baseline as baselines
 from torchdlo.sysid import clamps, health, library, plan
 from torchdlo.sysid.bench import SILENT, Bench, Callback
+from torchdlo.sysid.fit import interval
 from torchdlo.sysid.floor import gap, rms
 from torchdlo.sysid.jobs import Fit, Fitted
 from torchdlo.sysid.journal import Journal
@@ -231,6 +232,9 @@ class _Search:
         if fair:
             lead = fits[fair[0]].point.cost
             close = [n for n in order if fits[n].point.cost - lead < TIE * max(rival.point.cost - lead, 1e-9)]
+            special, numbers = library.CONTAINED.get(fair[0], (None, {}))
+            if special in fair and _may_be(fits[fair[0]], numbers):
+                close.append(special)
             # Of laws that fit as well, the one with the fewest numbers: others may contain it.
             first = min((n for n in fair if n in close), key=lambda n: len(fits[n].space.names))
             reasons |= dict.fromkeys(close, "as good as the best") | {first: "taken"}
@@ -344,6 +348,14 @@ class _Search:
             self.bench.drift(final),
             notes=baselines.notes(self.baseline),
         )
+
+
+def _may_be(fitted: Fitted, numbers: dict[str, float]) -> bool:
+    """Return whether the last effect's numbers may have these values, as far as their ranges tell."""
+    low, high = interval(fitted.point, fitted.space)
+    asked = {f"{fitted.effects[-1]}.{name}": value for name, value in numbers.items()}
+    ranges = [(asked.get(_vector(name)), a, b) for name, a, b in zip(fitted.space.names, low, high, strict=True)]
+    return all(value is None or a <= value <= b for value, a, b in ranges)
 
 
 def _vector(name: str) -> str:

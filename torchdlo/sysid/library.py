@@ -62,6 +62,9 @@ KIN: tuple[frozenset[str], ...] = (
 """Effects that do alike things: take up energy, push or bend to one side, change how firm the rope is, or where it is
 slow. Small doses of them are hard to tell apart, fits are not."""
 
+CONTAINED = {"wind": ("air_drag", {"velocity": 0.0})}
+"""Effects by more general ones, and which of their numbers are what where they are the same: more numbers fit noise."""
+
 _KNOWN = {
     "tilted_gravity": ("acceleration",),
     "bending_plasticity": ("hardening",),

@@ -27,8 +27,8 @@ _FEW = 32
 _MANY = 64
 """Scenes from which the time of a step goes with their number."""
 
-_SMALL = 5000
-"""Frames of scenes, some tenths of a second, that no worker is asked for: they need seconds to begin."""
+_SMALL = 1000
+"""Frames of scenes, less than a tenth of a second, that no worker is asked for: they need seconds to begin."""
 
 
 def spread(kinds: Sequence[Hashable], parts: int) -> list[list[int]]:
@@ -202,7 +202,7 @@ class Pool:
         """
         trials = self.recording.trials(job.split)
         scenes, frames = len(job.values) * len(trials), job.frames or max(len(t.time) for t in trials)
-        if not self._queues or scenes * frames < _SMALL:
+        if not self._queues or (searches == 1 and scenes * frames < _SMALL):
             return 0
         return max(1, min(-(-self.workers // searches), scenes // _FEW))
 
