@@ -18,7 +18,8 @@ from torchdlo.sysid import diagnose as search
 from torchdlo.sysid import floor, library, settle
 from torchdlo.sysid.drive import drive
 from torchdlo.sysid.findings import findings, findings_json, model_json, sentence
-from torchdlo.sysid.fit import Space
+from torchdlo.sysid.fit import Point, Space, interval
+from torchdlo.sysid.jobs import Fitted
 from torchdlo.sysid.mesh import make_mesh
 from torchdlo.sysid.model import RopeModel
 from torchdlo.sysid.motion import Start
@@ -209,3 +210,29 @@ def test_vectors_are_fitted_whole_and_what_no_dose_uses_is_not(
     )
     score = SimpleNamespace(name=name, dose={f"{name}.{k}": v for k, v in dose.items()})
     assert set(one._candidate(None, score)) == {f"{name}.{k}" for k in fitted}
+
+
+@pytest.mark.parametrize(("speed", "first"), [(0.02, "air_drag"), (0.4, "wind")])
+def test_a_general_law_is_named_only_where_its_other_numbers_tell(
+    speed: float, first: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    numbers = {name: library.numbers(name, make_empty(tmp_path)) for name in ("wind", "air_drag")}
+    values = {"wind": [speed, -speed, 0.0, 1.6], "air_drag": [1.7]}
+    slopes = 0.1 * np.random.default_rng(0).normal(size=(4, 4))
+
+    def fitted(name: str, cost: float) -> Fitted:
+        params = tuple(n.param for n in numbers[name])
+        space = Space(tuple(n.name for n in numbers[name]), params, (1.0,) * len(params))
+        k, raw = len(params), space.to_raw(np.array(values[name]))
+        # By how much trials would have numbers differ: some hundredths.
+        return Fitted((name,), raw, space, Point(raw, cost, slopes[:, :k], np.tile(np.eye(k), (4, 1, 1)), np.ones(4)))
+
+    fits = {"wind": fitted("wind", 0.8e-3), "air_drag": fitted("air_drag", 1e-3)}
+    low, high = interval(fits["wind"].point, fits["wind"].space)
+    assert (low[0] < 0) == (first == "air_drag") and high[0] < 1.0
+    judge = object.__new__(search._Search)
+    for name, value in {"_refused": None, "_gain": 0.5}.items():
+        monkeypatch.setattr(judge, name, lambda *_, value=value: value, raising=False)
+    # Wind fits better than drag, by more than a tie.
+    best, _, _, also = judge._judged([], fits, ["wind", "air_drag"], fitted("air_drag", 2e-3))
+    assert best is fits[first] and also == (["wind"] if first == "air_drag" else [])
