@@ -328,6 +328,10 @@ def _turn(
     return tree.replace(moved, twist=angle, twist_rate=rate), couple[..., list(settings.held_edges), :]
 
 
+_SETTLED, _NEAR = 1e-12, 1e-4
+"""Largest change of twists in a step of Newton's method that is none, and one near the balance [rad]."""
+
+
 def settle_twist(
     settings: Settings,
     params: RodParams,
@@ -342,7 +346,7 @@ def settle_twist(
 
     Bergou 2008, section 4.2: twist waves are much faster than bending, so twist is taken to be in balance.
     """
-    topology = settings.topology
+    topology, patient = settings.topology, steps is not None
     effects = [e for e in settings.effects if e.settles]
     if all(e.name == "twist" for e in effects):
         # Its torque is linear in the twists: one step is exact.
@@ -380,9 +384,11 @@ def settle_twist(
 
     angle = _prescribed(settings, params, state, targets, state.twist)
     with torch.no_grad():
-        start = angle
+        start, change = angle, float("inf")
         for k in range(steps - 1):
-            start, _ = newton(start, k >= steps - 3)
+            last, (start, _) = start, newton(start, k >= steps - 3 or change < _NEAR)
+            if patient and (change := float((start - last).abs().max())) < _SETTLED:
+                break
     start = torch.where(free > 0, start, angle)
     settled, couple = newton(start, True)
     return tree.replace(state, twist=settled, twist_rate=(settled - state.twist) / settings.dt), couple
