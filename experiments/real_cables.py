@@ -30,7 +30,7 @@ from torchdlo.progress import progress
 from torchdlo.sysid import saved
 from torchdlo.sysid import start as starts
 from torchdlo.sysid.diagnose import BUDGETS, diagnose
-from torchdlo.sysid.findings import model_json
+from torchdlo.sysid.findings import findings, model_json
 from torchdlo.sysid.metrics import average, mean_absolute_error
 from torchdlo.sysid.model import RopeModel
 from torchdlo.sysid.recording import Recording, Trial, load_recording
@@ -133,6 +133,7 @@ def row(recording: Recording, found: Diagnosis, plant: str, base: Saved | None) 
         "effects": found.effects,
         "ties": found.ties,
         "shares": found.shares,
+        "candidates": findings(found, recording)["candidates"],
         "test_mae_before_mm": errors["before"],
         "test_mae_after_mm": errors["after"],
         "floor_mm": 1e3 * found.floor.total,
