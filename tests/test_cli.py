@@ -77,7 +77,8 @@ def test_calibrate_writes_model_and_report(folder: Path, fit: FakeFit, capsys: p
     assert said.startswith("Calibrated on 2 trials; error on unseen trials ")
     assert "runs/calibrate/rope/report.html" in said
     assert json.loads((out / "model.json").read_text())["vertices"] == 31
-    assert fit.options == {"seed": 0, "rest": "auto", "checkpoint": out / "checkpoint.json", "resume": False}
+    asked = {"seed": 0, "rest": "auto", "checkpoint": out / "checkpoint.json", "resume": False, "workers": None}
+    assert fit.options == asked
 
 
 def test_calibrate_prints_json_and_nothing_else(folder: Path, fit: FakeFit, capsys: pytest.CaptureFixture[str]) -> None:

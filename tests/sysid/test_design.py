@@ -257,7 +257,8 @@ def test_a_search_that_was_stopped_goes_on(
     def lost(*_: object) -> None:
         raise AssertionError("computed again")
 
-    monkeypatch.setattr(Pool, "_compute", lost)
+    for name in ("_led", "_done"):
+        monkeypatch.setattr(Pool, name, lost)
     again = designed(recording, found, resume=True)
     assert again.separation == design.separation and again.options[0].gesture == design.options[0].gesture
 
