@@ -22,7 +22,7 @@ def predict(
 ) -> Predictions:
     """Simulate trials from starts estimated from their first 0.1 s, by the model itself or what stands in for it."""
     motion = model.motion(trials)
-    simulate = simulate or (lambda begin, rows, frames: model.simulate(motion, begin, rows, frames=frames))
+    simulate = simulate or starts.simulator(model, motion)
     begin = starts.refine(model, motion, starts.begin(model, trials), values, simulate)
     sims = simulate(begin, values[None], None)[0]
     return {name: sim[:frames] for name, sim, frames in zip(motion.names, sims, motion.frames, strict=True)}

@@ -79,6 +79,11 @@ def _fill(values: np.ndarray, arclength: np.ndarray) -> np.ndarray:
     return np.stack([np.interp(arclength, arclength[known], values[known, c]) for c in range(3)], -1)
 
 
+def simulator(model: RopeModel, motion: Motion) -> Simulator:
+    """Return a function that simulates trials with a model, in this process."""
+    return lambda start, values, frames: model.simulate(motion, start, values, frames=frames)
+
+
 def refine(
     model: RopeModel, motion: Motion, start: Start, values: np.ndarray, simulate: Simulator | None = None
 ) -> Start:
@@ -94,7 +99,7 @@ def refine(
         values: the rope's numbers, shape (K,).
         simulate: what simulates the trials; the model itself if not given.
     """
-    simulate = simulate or (lambda begin, rows, count: model.simulate(motion, begin, rows, frames=count))
+    simulate = simulate or simulator(model, motion)
     if start.still is not None and start.still.all():
         return start
     frames = min(max(3, round(WINDOW / model.dt) + 1), motion.markers.shape[1])
