@@ -278,7 +278,7 @@ def test_a_natural_shape_of_a_model_is_that_of_the_rope(modelled):
 
 def test_frames_read_back_and_others_are_refused(tmp_path):
     frames = run(change(FALL, duration=0.02))
-    save_frames(frames, FALL, tmp_path / "frames.npz")
+    save_frames(frames, tmp_path / "frames.npz", FALL)
     back = load_frames(tmp_path)
     for name, value in vars(frames).items():
         assert not isinstance(value, np.ndarray) or np.array_equal(getattr(back, name), value), name

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from torchdlo.commands import design_experiment, optimize, simulate, tasks, view
+from torchdlo.commands import design_experiment, optimize, play, simulate, tasks, view
 from torchdlo.errors import InputError
 from torchdlo.files import check_writable, write_atomically
 from torchdlo.progress import deferred_interrupt, progress
@@ -289,6 +289,7 @@ app.command("design-experiment")(design_experiment)
 app.command()(simulate)
 app.command()(view)
 app.command()(optimize)
+app.command()(play)
 app.command()(tasks)
 
 

@@ -18,7 +18,7 @@ from torchdlo.progress import deferred_interrupt, progress
 if TYPE_CHECKING:
     from torchdlo.run import Frames
 
-__all__ = ["design_experiment", "optimize", "simulate", "tasks", "view"]
+__all__ = ["design_experiment", "optimize", "play", "simulate", "tasks", "view"]
 
 _INTERRUPTED = 130
 """Exit code after Ctrl-C, as shells have it."""
@@ -64,7 +64,7 @@ def simulate(
         raise typer.Exit(_INTERRUPTED) from None
     except ValueError as error:
         raise InputError(f"{scene}: {error}") from None
-    save_frames(frames, described, files["frames"])
+    save_frames(frames, files["frames"], described)
     made = _draw(frames, files, scene.stem, speed)
     typer.echo(f"{scene}: {len(frames.time)} frames, {frames.time[-1]:g} s", err=as_json)
     for name, file in files.items():
@@ -242,6 +242,71 @@ def tasks(as_json: Annotated[bool, typer.Option("--json", help="Print the list a
     for row in rows:
         arms = "1 arm" if row["arms"] == 1 else f"{row['arms']} arms"
         typer.echo(f"{row['name']:<12} {row['what']} ({arms}, {row['actions']} actions of {row['seconds']:g} s)")
+
+
+def play(
+    task: Annotated[str, typer.Argument(help="Name of the task.", metavar="TASK")],
+    trajectory: Annotated[
+        Path | None,
+        typer.Option(help="What optimize found. Default: the way by hand.", metavar="FILE"),
+    ] = None,
+    idle: Annotated[bool, typer.Option("--idle", help="Do nothing.")] = False,
+    vary: Annotated[
+        int | None, typer.Option(min=0, help="Seed of a start that differs from the usual one.", metavar="SEED")
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", "-o", help="Folder for frames.npz and pictures. Default: runs/play/TASK.", metavar="DIR"),
+    ] = None,
+    video: Annotated[bool, typer.Option("--video", help="Write motion.mp4, too.")] = False,
+    picture: Annotated[bool, typer.Option("--picture", help="Write picture.png, too: start, middle and end.")] = False,
+    speed: Annotated[float, typer.Option(min=0.001, help="Seconds of the episode per second of the video.")] = 0.5,
+    arms: Annotated[bool, typer.Option(help="Show the arms.")] = True,
+    rope: Annotated[
+        Path | None,
+        typer.Option(help="What ropes are made of: model.json of a calibration or diagnosis.", metavar="MODEL"),
+    ] = None,
+    compiled: Annotated[
+        bool, typer.Option("--compiled", help="Compile the step: minutes at first, then three times as fast.")
+    ] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print how it went as JSON.")] = False,
+) -> None:
+    """Play an episode of a task, say what it earns, and keep frames to look at.
+
+    [bold]Examples:[/bold]
+
+    torchdlo play wrapping --video
+
+    torchdlo play coiling --trajectory runs/optimize/coiling-hybrid/trajectory.json --picture
+
+    torchdlo view runs/play/wrapping
+    """
+    from torchdlo.agents.script import script
+    from torchdlo.describe import cable
+    from torchdlo.errors import InputError
+    from torchdlo.report.episode import film, outcome_of
+    from torchdlo.run import save_frames
+
+    if idle and trajectory is not None:
+        raise InputError("--idle and --trajectory: expected one of them, or neither for the way by hand.")
+    files = _check_files(out or Path("runs") / "play" / task, video=video, picture=picture)
+    played = script(task, trajectory, None if rope is None else cable(rope), idle=idle, vary=vary, compiled=compiled)
+    try:
+        with progress() as show, deferred_interrupt(show) as callback:
+            frames, went = film(played.task, played.actions, made=played.episode, arms=arms, callback=callback)
+    except KeyboardInterrupt:
+        typer.echo("interrupted before the episode ended; nothing was written", err=True)
+        raise typer.Exit(_INTERRUPTED) from None
+    save_frames(frames, files["frames"])
+    drawn = _draw(frames, files, task, speed)
+    said = outcome_of(went) | {"files": [str(file) for file in files.values() if file.exists()]}
+    how = "failed" if said["failed"] else "success" if said["success"] else "no success"
+    typer.echo(f"{task}: return {said['return']:.4g}, {how}", err=as_json)
+    typer.echo("\n".join(said["files"]), err=as_json)
+    if as_json:
+        typer.echo(json.dumps(said, indent=1))
+    if not drawn:
+        raise typer.Exit(_INTERRUPTED)
 
 
 def design_experiment(

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from torchdlo import describe
 from torchdlo import scene as scenes
@@ -17,7 +18,7 @@ from torchdlo.errors import InputError
 from torchdlo.files import replacing
 from torchdlo.physics import traced
 
-__all__ = ["Frames", "load_frames", "run", "save_frames"]
+__all__ = ["Frames", "appearance", "load_frames", "run", "save_frames"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,34 +80,49 @@ def _seen(state: scenes.State) -> list[np.ndarray]:
     return [x.cpu().numpy().copy() for x in found]
 
 
-def _looks(made: describe.Simulation, description: describe.Description) -> dict[str, np.ndarray]:
-    """Return what stays the same in pictures, by the names of `Frames`."""
-    scene, params, counts = made.scene, made.params, made.scene.topology.counts
-    own = len(description.bodies)
-    motion = [b.motion if k < own else "robot" for k, b in enumerate(scene.bodies)]
+def appearance(
+    scene: scenes.Scene, params: scenes.Params, meshes: Mapping[int, tuple[Tensor, Tensor]], robots: int = 0
+) -> dict[str, np.ndarray]:
+    """Return what stays the same in pictures, by the names of `Frames`; of a batch, of its first scene.
+
+    Args:
+        scene: the scene.
+        params: its parameters.
+        meshes: vertices [m] and triangles of bodies that are meshes, by the number of the body.
+        robots: how many of the bodies, the last ones, are links of robots.
+    """
+    counts, own = scene.topology.counts, len(scene.bodies) - robots
     vertices, faces, owner, start = [np.zeros((0, 3))], [np.zeros((0, 3), int)], [np.zeros(0, int)], 0
-    for k, mesh in made.meshes.items():
-        vertices.append(mesh.vertices.numpy())
-        faces.append(mesh.faces.numpy() + start)
-        owner.append(np.full(len(mesh.faces), k))
-        start += len(mesh.vertices)
+    for k, (corners, triangles) in meshes.items():
+        vertices.append(corners.numpy())
+        faces.append(triangles.numpy() + start)
+        owner.append(np.full(len(triangles), k))
+        start += len(corners)
     groups = scene.matter.groups if scene.matter else ()
     heights = [v["height"].reshape(-1)[:1].numpy() for n, v in params.effects.items() if n.startswith("table")]
+    radius = params.rods.material.radius
     return {
         "rope": np.repeat(np.arange(len(counts)), counts),
         "closed": np.array(scene.topology.closed, bool),
-        "radius": params.rods.material.radius[:, 0].numpy(),
-        "weight": made.weight[:, 0].numpy(),
+        "radius": radius.reshape(-1, radius.shape[-2])[0].numpy(),
+        "weight": np.zeros(sum(counts)),
         "body_shape": np.array([b.shape for b in scene.bodies], str),
-        "body_size": params.bodies.size.numpy() if scene.bodies else np.zeros((0, 3)),
-        "body_motion": np.array(motion, str),
+        "body_size": params.bodies.size.reshape(-1, len(scene.bodies), 3)[0].numpy()
+        if scene.bodies
+        else np.zeros((0, 3)),
+        "body_motion": np.array([b.motion if k < own else "robot" for k, b in enumerate(scene.bodies)], str),
         "mesh_vertices": np.concatenate(vertices),
         "mesh_faces": np.concatenate(faces),
         "mesh_body": np.concatenate(owner),
         "law": np.repeat([g.law.name for g in groups] or np.zeros(0, str), [g.count for g in groups]),
         "table": heights[0] if heights else np.zeros(0),
-        "look": np.array(description.look),
     }
+
+
+def _looks(made: describe.Simulation, description: describe.Description) -> dict[str, np.ndarray]:
+    meshes = {k: (mesh.vertices, mesh.faces) for k, mesh in made.meshes.items()}
+    seen = appearance(made.scene, made.params, meshes, len(made.scene.bodies) - len(description.bodies))
+    return seen | {"weight": made.weight[:, 0].numpy(), "look": np.array(description.look)}
 
 
 def run(
@@ -167,11 +183,12 @@ def _recorded(step: Callable, *inputs: Any) -> Callable:
         return step
 
 
-def save_frames(frames: Frames, description: describe.Description, path: Path) -> None:
-    """Write frames as .npz, with the scene itself as JSON text in "torchdlo_scene"."""
+def save_frames(frames: Frames, path: Path, description: describe.Description | None = None) -> None:
+    """Write frames as .npz, with the scene itself as JSON text in "torchdlo_scene", "" if it is not given."""
     arrays = {name: value for name, value in vars(frames).items() if isinstance(value, np.ndarray)}
+    text = "" if description is None else describe.text(description)
     with replacing(path) as temporary:
-        np.savez_compressed(temporary, torchdlo_scene=np.array(describe.text(description)), **arrays)
+        np.savez_compressed(temporary, torchdlo_scene=np.array(text), **arrays)
 
 
 def load_frames(path: str | Path) -> Frames:

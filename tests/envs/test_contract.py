@@ -48,7 +48,7 @@ def played(name: str) -> tuple[episode.Outcome, torch.Tensor]:
     """An episode of two actions with the gradient of its loss."""
     task = prepared(name).task
     actions = ways(task).requires_grad_()
-    outcome = episode.play(task, actions, episode=prepared(name), keep_path=True)
+    outcome = episode.play(task, actions, episode=prepared(name), keep=episode.places)
     (slope,) = torch.autograd.grad(outcome.loss.sum(), actions, retain_graph=True)
     return tree.detach(outcome), slope
 

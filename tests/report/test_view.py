@@ -83,7 +83,7 @@ def test_the_command_serves_a_run_until_ctrl_c(tmp_path, monkeypatch, viewer):
     from torchdlo.report import view
     from torchdlo.run import save_frames
 
-    save_frames(viewer.frames, Description((), {}), tmp_path / "frames.npz")
+    save_frames(viewer.frames, tmp_path / "frames.npz", Description((), {}))
     seen = []
 
     def interrupt(self):

@@ -98,7 +98,7 @@ class TaskProblem:
 
     def record(self, actions: Tensor) -> tuple[Outcome, dict[str, Any]]:
         """Play one trajectory alone; kept are joints and tools after every action, by arm, [rad or m] and [m]."""
-        went = episode.play(self.task, self.full(actions[None]), episode=self.prepared(1), keep_path=True)
+        went = episode.play(self.task, self.full(actions[None]), episode=self.prepared(1), keep=episode.places)
         kept = {name: went.path[name][:, 0].tolist() for name in ("joints", "tool")}
         kept["rewards"] = went.rewards[:, 0].tolist()
         finite = all(math.isfinite(value) for value in kept["rewards"])

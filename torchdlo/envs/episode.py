@@ -32,7 +32,7 @@ from torchdlo.physics.replay import rollout
 from torchdlo.physics.rotation import multiply, rotate
 from torchdlo.scene import Control, Params, Scene, State
 
-__all__ = ["Episode", "Outcome", "World", "act", "begin", "normalized", "observe", "play", "prepare"]
+__all__ = ["Episode", "Outcome", "World", "act", "begin", "normalized", "observe", "places", "play", "prepare"]
 
 POSTURE = (1.56, -0.72, -0.02, -2.09, 0.04, 1.33, 2.4, 0.0)
 """Where joints would like to be [rad], and how far the fingers are open [m]."""
@@ -87,7 +87,7 @@ class Outcome:
     world: World
     """The end."""
     path: dict[str, Tensor] = field(default_factory=dict)
-    """If asked for: "pos" (T, B, V, 3) of the ropes, "tool" (T, B, R, 3) and "joints" (T, B, R, J)."""
+    """What `keep` returned after every action, (T, ...) each."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -336,12 +336,17 @@ def observe(episode: Episode, world: World) -> Tensor:
     return torch.cat([p.flatten(-2) for p in parts], -1).to(torch.float32)
 
 
+def places(world: World) -> dict[str, Tensor]:
+    """Return where things are: "pos" (B, V, 3) of the ropes, "tool" (B, R, 3) and "joints" (B, R, J)."""
+    return {"pos": world.state.rods.pos, "tool": world.tool.pos, "joints": world.joints}
+
+
 def play(
     task: Task,
     actions: Tensor,
     *,
     episode: Episode | None = None,
-    keep_path: bool = False,
+    keep: Callable[[World], dict[str, Tensor]] = lambda _: {},
     callback: Callable[[int, int], None] | None = None,
     **choices: Any,
 ) -> Outcome:
@@ -352,7 +357,7 @@ def play(
         actions: shape (B, T, A), in metres and degrees; one sequence per scene of the batch. They need not be as many
             as the task's horizon.
         episode: what `prepare` returned for B scenes; made if not given.
-        keep_path: whether to return where ropes, tools and joints were after every action.
+        keep: what to keep of the world after every action, such as `places`.
         callback: told (actions done, actions in all) after each.
         choices: of `prepare`.
     """
@@ -367,15 +372,13 @@ def play(
         if k + 1 == count:
             world = finish(episode, world)
         rows.append(earned(episode, world))
-        if keep_path:
-            path.append({"pos": world.state.rods.pos, "tool": world.tool.pos, "joints": world.joints})
+        path.append(keep(world))
         if callback is not None:
             callback(k + 1, count)
     rewards, losses, terms = tree.stack(rows)
     seen = world.seen(task.arms.count)
     success = task.success(seen) & ~world.failed
-    kept = tree.stack(path) if keep_path else {}
-    return Outcome(rewards.sum(0), losses.sum(0), success, world.failed, rewards, terms, world, kept)
+    return Outcome(rewards.sum(0), losses.sum(0), success, world.failed, rewards, terms, world, tree.stack(path))
 
 
 def normalized(task: Task, returns: Tensor, **choices: Any) -> Tensor:

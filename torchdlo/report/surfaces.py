@@ -35,6 +35,8 @@ COLORS = {
     "sand": "#c9a868",
 }
 """Colours of what is not a rope."""
+_NEAR = 0.15
+"""Links of robots within this distance of all else are in the picture [m]."""
 _STEEL = 7850.0
 """Density by which weights are drawn [kg/m^3]."""
 
@@ -192,16 +194,22 @@ def bounds(frames: Frames) -> tuple[np.ndarray, np.ndarray]:
 
 
 def extent(frames: Frames) -> np.ndarray:
-    """Return points round all that moves, and round bodies not much larger than that [m], shape (N, 3)."""
+    """Return points round all that moves, and round bodies not much larger than that [m], shape (N, 3).
+
+    Links of robots count where they are near.
+    """
     thin = max(1, frames.matter.size // 300_000)
     moving = [frames.pos.reshape(-1, 3), frames.matter.reshape(-1, 3)[::thin]]
     points = np.concatenate(moving)
-    span = float(np.linalg.norm(np.ptp(points, axis=0)))
+    span, middle = float(np.linalg.norm(np.ptp(points, axis=0))), 0.5 * (points.min(0) + points.max(0))
     for k, shape in enumerate(frames.body_shape):
         corners, _ = _local(frames, k, 0.0)
         if shape == "plane" or (
             frames.body_motion[k] == "fixed" and np.linalg.norm(np.ptp(corners, axis=0)) > 2 * span
         ):
+            continue
+        far = np.linalg.norm(frames.body_pos[:, k] - middle, axis=1).min() > 0.5 * span + _NEAR
+        if frames.body_motion[k] == "robot" and far:
             continue
         corners = np.stack(np.meshgrid(*zip(corners.min(0), corners.max(0), strict=True)), -1).reshape(-1, 3)
         turns = Rotation.from_quat(np.roll(frames.body_quat[:, k], -1, axis=1)).as_matrix()

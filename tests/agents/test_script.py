@@ -1,0 +1,106 @@
+"""The command that plays episodes: by hand, idle, from a file, bit by bit."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("pytorch_kinematics", reason="arms need the extra robots")
+
+from test_tasks import Lead
+
+from torchdlo import cli, envs
+from torchdlo.run import load_frames
+
+
+class Led(Lead):
+    """With a way by hand."""
+
+    def waypoints(self):
+        """To the left."""
+        return [[(0.0, 0.03, 0.0)]]
+
+
+@pytest.fixture(autouse=True)
+def _tasks(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setitem(envs.TASKS, "lead", Lead)
+    monkeypatch.setitem(envs.TASKS, "led", Led)
+
+
+def play(*words: object) -> int:
+    """Exit code of the command."""
+    with pytest.raises(SystemExit) as caught:
+        cli.main(["play", *map(str, words)])
+    return int(caught.value.code or 0)
+
+
+def test_the_way_by_hand_is_played_and_kept(capsys):
+    assert play("led", "--json") == 0
+    said = capsys.readouterr()
+    went = json.loads(said.out)
+    assert went["success"] and not went["failed"] and f"led: return {went['return']:.4g}, success" in said.err
+    assert went["files"] == ["runs/play/led/frames.npz", "runs/play/led/shapes.png"]
+    frames = load_frames("runs/play/led")
+    assert len(frames.time) == 4 and frames.pos[-1, 1, 1] - frames.pos[0, 1, 1] == pytest.approx(0.03, abs=3e-4)
+    # Its own files are replaced.
+    assert play("led", "--idle", "--json") == 0
+    assert not json.loads(capsys.readouterr().out)["success"]
+
+
+def test_another_start_is_that_of_its_seed(capsys):
+    starts = []
+    for seed in (1, 1, 2):
+        assert play("led", "--vary", seed, "--json") == 0
+        capsys.readouterr()
+        starts.append(load_frames("runs/play/led").pos[0])
+    assert np.array_equal(starts[0], starts[1]) and not np.allclose(starts[0], starts[2], atol=1e-4)
+
+
+def test_a_trajectory_comes_back_bit_by_bit(capsys):
+    words = ["optimize", "lead", "--method", "cmaes", "--episodes", "8", "--population", "4", "--double"]
+    with pytest.raises(SystemExit):
+        cli.main([*words, "--no-compiled", "--out", "found"])
+    capsys.readouterr()
+    assert play("lead", "--trajectory", "found/trajectory.json", "--json") == 0
+    went, kept = json.loads(capsys.readouterr().out), json.loads(Path("found/trajectory.json").read_text())
+    assert went["return"] == kept["return"] and went["rewards"] == kept["rewards"]
+    # Not for a rope of other material.
+    kept["choices"]["rope"] = {"bend": 1e-3}
+    Path("other.json").write_text(json.dumps(kept))
+    assert play("lead", "--trajectory", "other.json") == 2
+    assert "found for another rope" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (["nothing"], "there is no task 'nothing'; expected one of"),
+        (["lead"], "lead: has no way by hand; give a --trajectory, or --idle"),
+        (["lead", "--idle", "--trajectory", "x.json"], "--idle and --trajectory: expected one of them"),
+        (["lead", "--trajectory", "x.json"], "x.json: expected a trajectory of torchdlo optimize"),
+    ],
+)
+def test_it_says_what_is_wrong(words, sentence, capsys):
+    assert play(*words) == 2
+    assert sentence in " ".join(capsys.readouterr().err.split())
+    assert not list(Path().rglob("*.npz"))
+
+
+def test_ctrl_c_writes_nothing(monkeypatch, capsys):
+    from torchdlo import commands
+
+    @contextlib.contextmanager
+    def impatient(show):
+        def callback(stage, done, total, message=""):
+            raise KeyboardInterrupt
+
+        yield callback
+
+    monkeypatch.setattr(commands, "deferred_interrupt", impatient)
+    assert play("led") == 130
+    assert "nothing was written" in capsys.readouterr().err and not list(Path().rglob("*.npz"))
