@@ -6,7 +6,6 @@ import zipfile
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -16,7 +15,6 @@ from torchdlo import describe
 from torchdlo import scene as scenes
 from torchdlo.errors import InputError
 from torchdlo.files import replacing
-from torchdlo.physics import traced
 
 __all__ = ["Frames", "appearance", "load_frames", "run", "save_frames"]
 
@@ -147,15 +145,13 @@ def run(
     """
     made = describe.assemble(description, folder=folder)
     scene, params, state = made.scene, made.params, made.state
-    step = scenes.stepper(scene, compiled=compiled)
     control = made.plan.follow(scene)
     total = max(1, round(description.duration / description.dt))
+    step = scenes.stepper(scene, compiled=compiled, recorded=total > 50)
     kept, interrupted, problem = [_seen(state)], False, ""
     with torch.no_grad():
         for k in range(total):
             command = control(k, state)
-            if k == 0 and not compiled and total > 50:
-                step = _recorded(step, params, state, command)
             state = step(params, state, command)
             if (k + 1) % every and k + 1 < total:
                 continue
@@ -173,14 +169,6 @@ def run(
                 break
     moving = (np.stack(parts) for parts in zip(*kept, strict=True))
     return Frames(*moving, **_looks(made, description), interrupted=interrupted, problem=problem)
-
-
-def _recorded(step: Callable, *inputs: Any) -> Callable:
-    """Return the step recorded, or as it is where recording does not know one of its operations."""
-    try:
-        return traced.record(step, *inputs)
-    except RuntimeError:
-        return step
 
 
 def save_frames(frames: Frames, path: Path, description: describe.Description | None = None) -> None:

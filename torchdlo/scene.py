@@ -19,7 +19,7 @@ from torchdlo.coupling import body_matter, mpm, rod_matter, watch
 from torchdlo.coupling.bodies import Body, BodyParams, BodyState, BodyTargets, Solid, place
 from torchdlo.coupling.particles import Matter, Medium, Particles
 from torchdlo.coupling.watch import survey
-from torchdlo.physics import build, rod, stability, tree
+from torchdlo.physics import build, rod, stability, traced, tree
 from torchdlo.physics.build import Rope
 from torchdlo.physics.effect import Effect, altered, default_values, numbers_of
 from torchdlo.physics.hold import Reaction, Targets, between, check_grip, unfelt
@@ -329,15 +329,16 @@ def _step(scene: Scene, params: Params, state: State, control: Control, advance,
     return state
 
 
-def stepper(scene: Scene, *, compiled: bool = True):
+def stepper(scene: Scene, *, compiled: bool = True, recorded: bool = False):
     """Return `step` bound to a scene: a function of (params, state, control).
 
-    Compiled steps take some ten seconds at the first call, with and without gradients, and are many times faster after
-    it. A step of one substep is compiled as a whole; of more, the substep is, so that their number does not matter.
+    Recorded steps take seconds at the first call, and then, without gradients, half to a third of the time. Compiled
+    ones take ten seconds to minutes at first, with and without gradients, and are many times faster then. A step of one
+    substep is compiled as a whole; of more, the substep is, so that their number does not matter.
     Compiled steps need a C++ compiler on the CPU.
     """
     if not compiled:
-        return partial(step, scene)
+        return traced.Recorded(partial(step, scene)) if recorded else partial(step, scene)
     compile = partial(torch.compile, fullgraph=True, dynamic=False, isolate_recompiles=True)
     once = scene.substeps == 1 and not any(e.reacts for e in scene.effects)
 

@@ -7,8 +7,9 @@ import math
 
 import pytest
 import torch
-from test_contract import F64, prepared, small
+from test_contract import F64, prepared, small, ways
 
+from torchdlo import scene as scenes
 from torchdlo.coupling.bodies import turn_by
 from torchdlo.coupling.robot import tool_pose
 from torchdlo.envs import TASKS, episode
@@ -93,6 +94,22 @@ def test_replayed_gradients_are_those_of_the_recorded_graph():
         outcome = episode.play(made.task, actions, episode=dataclasses.replace(made, segment=segment))
         slopes.append(torch.autograd.grad(outcome.loss.sum(), actions)[0])
     torch.testing.assert_close(slopes[1], slopes[0], rtol=1e-10, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["wrapping"])
+def test_recorded_episodes_go_as_others_do(name: str) -> None:
+    made = prepared(name)
+    recorded = dataclasses.replace(made, step=scenes.stepper(made.scene, compiled=False, recorded=True))
+    actions = ways(made.task)
+    plain, again = (episode.play(e.task, actions.clone(), episode=e, keep=episode.places) for e in (made, recorded))
+    torch.testing.assert_close(again.returns, plain.returns, rtol=1e-9, atol=1e-9)
+    torch.testing.assert_close(again.path["pos"], plain.path["pos"], rtol=0, atol=1e-9)
+    # With gradients they are the same.
+    slopes = []
+    for e in (made, recorded):
+        asked = actions.clone().requires_grad_()
+        slopes.append(torch.autograd.grad(episode.play(e.task, asked, episode=e).loss.sum(), asked)[0])
+    assert torch.equal(*slopes)
 
 
 def test_way_points_become_actions_of_the_greatest_length():

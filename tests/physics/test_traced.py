@@ -72,3 +72,38 @@ def test_recordings_that_are_let_go_free_their_memory():
         use()
     # Kept, each would take 25 MB.
     assert megabytes() - before < 30
+
+
+def test_steps_are_recorded_at_first_use_without_gradients_and_run_as_they_are_with_them():
+    calls = []
+
+    def step(factor, x):
+        calls.append(None)
+        return (factor * x,)
+
+    recorded = traced.Recorded(step)
+    factor, x = torch.tensor(2.0), torch.ones(3)
+    for _ in range(3):
+        assert torch.equal(recorded(factor, x)[0], 2 * x)
+    assert len(calls) == 1
+    learned = factor.clone().requires_grad_()
+    (found,) = recorded(learned, x)
+    assert len(calls) == 2 and torch.autograd.grad(found.sum(), learned)[0] == 3
+    with torch.no_grad():
+        assert torch.equal(recorded(learned, x)[0], 2 * x)
+    assert len(calls) == 2
+
+
+def test_a_step_that_cannot_be_recorded_runs_as_it_is():
+    calls = []
+
+    def step(x):
+        calls.append(None)
+        if len(calls) == 1:
+            raise RuntimeError("the recorder does not know this operation")
+        return (2 * x,)
+
+    recorded, x = traced.Recorded(step), torch.ones(3)
+    for _ in range(2):
+        assert torch.equal(recorded(x)[0], 2 * x)
+    assert len(calls) == 3

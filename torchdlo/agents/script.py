@@ -18,6 +18,10 @@ from torchdlo.errors import InputError
 __all__ = ["Script", "script"]
 
 
+_LONG = 10
+"""Actions of episodes that are worth recording their steps."""
+
+
 @dataclass(frozen=True, eq=False)
 class Script:
     """An episode of one scene, and its actions."""
@@ -56,12 +60,10 @@ def script(
     chosen = problem(name, rope, double=bool(choices["double"]), compiled=bool(choices.get("compiled", compiled)))
     if trajectory is not None and choices.get("rope") != json.loads(json.dumps(chosen.choices)).get("rope"):
         raise InputError(f"{trajectory}: it was found for another rope; give the model of that one with --rope.")
-    made = chosen.prepared(1)
-    if vary is not None:
-        seeded = torch.Generator().manual_seed(vary)
-        made = episode.prepare(
-            task, 1, like=chosen.like, generator=seeded, variation=True, compiled=chosen.compiled, segment=5
-        )
+    seeded = torch.Generator().manual_seed(vary or 0)
+    start = {"generator": seeded, "variation": vary is not None}
+    recorded = trajectory is None and task.horizon > _LONG
+    made = episode.prepare(task, 1, like=chosen.like, compiled=chosen.compiled, recorded=recorded, **start)
     if trajectory is not None:
         return Script(task, made, chosen.full(load_actions(trajectory, chosen)))
     way = task.reference() if vary is None else task.reference(made.start.state)[0]

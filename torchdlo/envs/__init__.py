@@ -75,6 +75,7 @@ def make(
     seed: int | None = None,
     gradients: bool = False,
     compiled: bool = True,
+    recorded: bool = False,
     segment: int | None = 1,
     variation: bool = True,
     randomize: Mapping[str, float] | None = None,
@@ -89,7 +90,8 @@ def make(
         dtype: precision of the physics; observations and rewards are in single precision.
         seed: of the starts and of what is randomised.
         gradients: whether rewards and observations carry gradients to actions.
-        compiled: whether to compile steps: some ten seconds to a minute at first, then many times faster.
+        compiled: whether to compile steps: minutes at first, then about three times as fast, with gradients too.
+        recorded: if not, whether to record them: seconds at first, then two to three times as fast without gradients.
         segment: frames that gradients run again at once; None keeps all of them in memory.
         variation: whether starts differ, by as much as `Task.spread` says.
         randomize: numbers of effects that differ from scene to scene and are drawn at every reset, e.g.
@@ -114,6 +116,7 @@ def make(
         seed=seed,
         gradients=gradients,
         compiled=compiled,
+        recorded=recorded,
         segment=segment,
         variation=variation,
         randomize=randomize,

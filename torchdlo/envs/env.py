@@ -37,6 +37,7 @@ class DloEnv(EnvBase):
         seed: int | None = None,
         gradients: bool = False,
         compiled: bool = True,
+        recorded: bool = False,
         segment: int | None = 1,
         variation: bool = True,
         randomize: Mapping[str, float] | None = None,
@@ -47,7 +48,7 @@ class DloEnv(EnvBase):
         self._like = torch.zeros((), dtype=dtype, device=self.device)
         self._generator = torch.Generator()
         self._randomize = dict(randomize or {})
-        made = episodes.prepare(task, num_envs, like=self._like, compiled=compiled, segment=segment)
+        made = episodes.prepare(task, num_envs, like=self._like, compiled=compiled, recorded=recorded, segment=segment)
         _check(self._randomize, made.scene)
         self.episode, self.world, self._usual = made, made.start, made.params
         self._make_specs()

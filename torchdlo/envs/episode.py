@@ -178,6 +178,7 @@ def prepare(
     generator: torch.Generator | None = None,
     variation: bool = False,
     compiled: bool = True,
+    recorded: bool = False,
     segment: int | None = None,
 ) -> Episode:
     """Return an episode of a task for a batch.
@@ -188,12 +189,12 @@ def prepare(
         like: a tensor of the dtype and device that they get; float32 on the CPU if not given.
         generator: where random numbers come from.
         variation: whether starts differ.
-        compiled: whether to compile steps, see `scene.stepper`.
+        compiled: whether to compile steps; `recorded`: if not, whether to record them, see `scene.stepper`.
         segment: frames that gradients run again at once; None keeps all of them in memory.
     """
     scene, params, state = task.start(num, like=like, generator=generator, variation=variation)
     hands = hands_of(task, scene)
-    step = scenes.stepper(scene, compiled=compiled)
+    step = scenes.stepper(scene, compiled=compiled, recorded=recorded)
     world = _begin(task, scene, state, hands)
     episode = Episode(task, scene, params, step, hands, world, segment)
     return episode if not task.settle else _replaced(episode, _settled(episode, world))

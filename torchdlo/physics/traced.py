@@ -93,3 +93,26 @@ class Recordings:
         if len(self._kept) > self._most:
             self._kept.popitem(last=False)
         return self._kept[key]
+
+
+class Recorded:
+    """A step that is recorded when it is first used without gradients, and runs as it is where they are asked for.
+
+    So it does where recording does not know one of its operations.
+    """
+
+    def __init__(self, step: Callable[..., Any]) -> None:
+        """Prepare the step; see `record`."""
+        self._step, self._recordings, self._known = step, Recordings(2), True
+
+    def __call__(self, *inputs: Any) -> Any:
+        """Do the step."""
+        graded = torch.is_grad_enabled() and any(x.requires_grad for x in tree.leaves(inputs))
+        if graded or not self._known:
+            return self._step(*inputs)
+        try:
+            recorded = self._recordings.find((), self._step, *inputs)
+        except RuntimeError:
+            self._known = False
+            return self._step(*inputs)
+        return recorded(*inputs)
