@@ -2,23 +2,31 @@
 
 Measured are whole actions as `torchdlo.envs.episode.act` runs them: inverse kinematics, 20 frames of five substeps, and
 the reward. With gradients, the reward of a window of actions is differentiated by them. CPU seconds are counted, as
-other work on the machine may take turns with this one. Beside each row stands the figure that DLO-Lab published for an
-L40S GPU, for orientation: another machine, and other code for the same scene.
+other work on the machine may take turns with this one; rates are summed over processes of one thread each that start
+together and share the environments. Steps are recorded where no gradients are asked for, and compiled where they are,
+unless --steps says otherwise. Beside each row stands the figure that DLO-Lab published for an L40S GPU, for
+orientation: another machine, and other code for the same scene. Rows that the JSON file has already are not measured
+again.
+
+examples:
+  python experiments/bench_env.py --quick
+  python experiments/bench_env.py --tasks coiling,wrapping --envs 1,10,100 --json bench_env.json
 """
 
 from __future__ import annotations
 
 import argparse
+import json
+import os
 import sys
-import time
+from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any
 
-from options import Parser, save
+from bench_rod import BOTH, FORWARD, clocked, gathered, peak_mb
+from options import Parser, count, save
 
-EXAMPLES = """examples:
-  python experiments/bench_env.py --quick
-  python experiments/bench_env.py --tasks coiling,wrapping --envs 1,10,100 --json bench_env.json
-"""
+STEPS = ("plain", "recorded", "compiled")
 NAMES = ("coiling", "gathering", "lifting", "separation", "slingshot", "unknotting", "wiring_post", "wrapping")
 PUBLISHED = {
     ("forward", 1): (90.85, 32.31, 50.03, 87.20, 90.08, 80.70, 90.82, 83.71),
@@ -33,19 +41,34 @@ PUBLISHED = {
 """Frames per second on one L40S, summed over environments."""
 
 
-def measure(name: str, count: int, mode: str, choices: argparse.Namespace) -> dict[str, Any]:
-    """Time a task."""
+@dataclass(frozen=True)
+class Case:
+    """One row."""
+
+    task: str
+    scenes: int
+    mode: str
+    steps: str
+    workers: int = 2
+    seconds: float = 5.0
+    """CPU time in each process, after two actions [s]."""
+
+
+def work(case: Case, share: int, go: Any, results: Any) -> None:
+    """Time a share of a case in this process: put None when ready, wait for `go`, put what was found."""
     import torch
 
     from torchdlo.envs import episode, find
 
     torch.set_num_threads(1)
-    task, backward = find(name), mode == "forward+backward"
-    start = time.perf_counter()
-    made = episode.prepare(task, count, compiled=choices.compiled, segment=1)
-    action = torch.full((count, task.width), 1e-3)
+    task, backward = find(case.task), case.mode == BOTH
+    ways = {"compiled": case.steps == "compiled", "recorded": case.steps == "recorded"}
+    action = torch.full((share, task.width), 1e-3)
 
-    def act() -> None:
+    def begin() -> Any:
+        return episode.prepare(task, share, segment=1, **ways)
+
+    def act(made: Any) -> None:
         chosen = action.clone().requires_grad_(backward)
         with torch.set_grad_enabled(backward):
             world = episode.act(made, made.start, chosen)
@@ -53,68 +76,101 @@ def measure(name: str, count: int, mode: str, choices: argparse.Namespace) -> di
         if backward:
             torch.autograd.grad(reward.sum(), chosen)
 
-    act()
-    first, used, actions = time.perf_counter() - start, time.process_time(), 0
-    while not actions or time.process_time() - used < choices.seconds:
-        act()
+    found: list[Any] = []
+    first = clocked(lambda: (found.append(begin()), act(found[0])))[1]
+    act(found[0])
+    results.put(None)
+    go.wait()
+    used, actions = 0.0, 0
+    while not actions or used < case.seconds:
+        used += clocked(lambda: act(found[0]))[0]
         actions += 1
-    used = time.process_time() - used
-    published = PUBLISHED.get((mode, count), ())
-    return {
-        "task": name,
-        "envs": count,
-        "mode": mode,
-        "frames_per_cpu_s": actions * task.frames * count / used,
-        "first_call_s": first,
-        "published": published[NAMES.index(name)] if published and name in NAMES else None,
-    }
+    rate = actions * task.frames * share / used
+    results.put({"cpu": rate, "first_call_s": first, "peak_mb": peak_mb()})
+
+
+def measure(case: Case) -> dict[str, Any]:
+    """Return the row of a case."""
+    found = gathered(work, case)
+    row = asdict(case) | {"workers": len(found), "published": None}
+    row["frames_per_cpu_s"] = sum(f["cpu"] for f in found)
+    row["peak_mb"] = sum(f["peak_mb"] for f in found)
+    row["first_call_s"] = max(f["first_call_s"] for f in found)
+    if case.task in NAMES and (case.mode, case.scenes) in PUBLISHED:
+        row["published"] = PUBLISHED[case.mode, case.scenes][NAMES.index(case.task)]
+    return row
 
 
 def shown(row: dict[str, Any]) -> str:
     """Return a row of the table."""
-    beside = "" if row["published"] is None else f"{row['published']:.0f}"
-    return (
-        f"{row['task']:<12} {row['envs']:>5} {row['mode']:<17} {row['frames_per_cpu_s']:>10.0f} {beside:>10} "
-        f"{row['first_call_s']:>8.1f}"
-    )
+    goal = row["published"]
+    beside = "" if goal is None else f"{goal:8.0f}  {'missed' if row['frames_per_cpu_s'] < goal else 'reached'}"
+    head = f"{row['task']:<12} {row['scenes']:>5} {row['mode']:<17} {row['steps']:<9}"
+    return f"{head} {row['frames_per_cpu_s']:>10.0f} {beside:17} first call {row['first_call_s']:.0f} s"
 
 
 def parsed() -> argparse.Namespace:
     """Read the options."""
-    parser = Parser(__file__, description=__doc__, epilog=EXAMPLES)
-    parser.add_argument("--tasks", default="", help="names, separated by commas; all if not given")
-    parser.add_argument("--envs", default="", help="environments, e.g. 1,10,50,100 (the default)")
-    parser.add_argument("--seconds", type=float, default=5.0, help="CPU seconds per row, after a first action")
+    parser = Parser(__file__, description=__doc__)
+    parser.add_argument("--tasks", default="", help="names, separated by commas; all that are published if not given")
+    parser.add_argument("--envs", default="1,10,50,100", help="environments (%(default)s)")
+    parser.add_argument("--modes", default=f"{FORWARD},{BOTH}", help="of %(default)s")
+    parser.add_argument(
+        "--steps", default="", choices=("", *STEPS), help="recorded forward, else compiled if not given"
+    )
+    parser.add_argument("--seconds", type=float, default=5.0, help="CPU seconds per row and process (%(default)s)")
+    parser.add_argument("--workers", type=count, default=2, help="processes that share the environments (%(default)s)")
     parser.add_argument("--json", default="", help="file for the rows")
-    parser.flag("compiled", "compile the steps, which costs up to a minute per row at first")
-    parser.flag("quick", "one and ten environments, one second per row")
+    parser.flag("quick", "one and ten environments without gradients, one second per row")
     parser.flag("smoke", "one task, one environment: does it run?")
     return parser.parse_args()
+
+
+def cases(choices: argparse.Namespace) -> list[Case]:
+    """Return what is timed."""
+    from torchdlo.envs import TASKS
+
+    names = [n for n in choices.tasks.split(",") if n] or list(NAMES)
+    wrong = sorted(set(names) - set(TASKS))
+    if wrong:
+        sys.exit(f"bench_env: there is no task {', '.join(wrong)}; known are {', '.join(TASKS)}")
+    modes = [m for m in choices.modes.split(",") if m]
+    if not modes or not set(modes) <= {FORWARD, BOTH}:
+        sys.exit(f"bench_env: --modes is {choices.modes!r}; expected some of {FORWARD}, {BOTH}")
+    envs, seconds, steps = [int(n) for n in choices.envs.split(",") if n], choices.seconds, choices.steps
+    if choices.quick:
+        envs, modes, seconds = [1, 10], [FORWARD], 1.0
+    if choices.smoke:
+        names, envs, seconds, steps = names[:1], [1], 0.0, "plain"
+    usual = {FORWARD: "recorded", BOTH: "compiled"}
+    return [
+        Case(name, n, mode, steps or usual[mode], choices.workers, seconds)
+        for name in names
+        for n in envs
+        for mode in modes
+    ]
+
+
+def known(path: str) -> list[dict[str, Any]]:
+    """Return the rows that a file has."""
+    if not path or not Path(path).is_file():
+        return []
+    return json.loads(Path(path).read_text())["rows"]
 
 
 def main() -> None:
     """Print and keep one row per task, number of environments, and mode."""
     choices = parsed()
-    from torchdlo.envs import TASKS
-
-    names = [n for n in choices.tasks.split(",") if n] or list(TASKS)
-    envs = [int(n) for n in choices.envs.split(",") if n] or [1, 10, 50, 100]
-    if choices.quick:
-        envs, choices.seconds = envs[:2], min(choices.seconds, 1.0)
-    if choices.smoke:
-        names, envs, choices.seconds = names[:1], envs[:1], 0.0
-    wrong = sorted(set(names) - set(TASKS))
-    if wrong:
-        sys.exit(f"bench_env: there is no task {', '.join(wrong)}; known are {', '.join(TASKS)}")
-    print(f"{'task':<12} {'envs':>5} {'mode':<17} {'frames/CPU s':>10} {'L40S':>8} {'first s':>8}")
-    rows = []
-    for name in names:
-        for count in envs:
-            for mode in ("forward", "forward+backward"):
-                rows.append(measure(name, count, mode, choices))
-                print(shown(rows[-1]), flush=True)
-                save(choices.json, {"rows": rows, "compiled": choices.compiled})
+    rows = known(choices.json)
+    for case in cases(choices):
+        same = ("task", "scenes", "mode", "steps")
+        found = next((r for r in rows if all(r[name] == getattr(case, name) for name in same)), None)
+        if found is None:
+            rows.append(found := measure(case))
+            save(choices.json, {"cores": os.cpu_count(), "rows": rows})
+        print(shown(found), flush=True)
 
 
 if __name__ == "__main__":
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
     main()
