@@ -12,6 +12,7 @@ import platform
 import subprocess
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -44,6 +45,8 @@ class Config:
     """As of `torchdlo diagnose`."""
     workers: int = 2
     """Processes of a diagnosis."""
+    jobs: int = 1
+    """Diagnoses at the same time."""
     timeout: float = 3600.0
     """Longest time for one diagnosis [s]."""
     ready: bool = False
@@ -104,10 +107,17 @@ def run(config: Config, names: list[str]) -> dict[str, str]:
     """Diagnose what is not diagnosed yet; return failures by name."""
     todo = [] if config.ready else [n for n in names if findings(Path(config.out) / n) is None]
     failed, begun = {}, time.perf_counter()
-    for k, name in enumerate(todo, 1):
-        failed[name] = diagnose(Path(config.recordings) / name, Path(config.out) / name, config)
-        left = (time.perf_counter() - begun) / k * (len(todo) - k)
-        print(f"{k}/{len(todo)} {name}: {failed[name] or 'done'}; {left / 60:.0f} min left", flush=True)
+    with ThreadPoolExecutor(config.jobs) as pool:
+        jobs = {pool.submit(diagnose, Path(config.recordings) / n, Path(config.out) / n, config): n for n in todo}
+        try:
+            for k, job in enumerate(as_completed(jobs), 1):
+                name = jobs[job]
+                failed[name] = job.result()
+                left = (time.perf_counter() - begun) / k * (len(todo) - k)
+                print(f"{k}/{len(todo)} {name}: {failed[name] or 'done'}; {left / 60:.0f} min left", flush=True)
+        except KeyboardInterrupt:
+            pool.shutdown(cancel_futures=True)
+            raise
     return {name: why for name, why in failed.items() if why}
 
 
@@ -133,6 +143,7 @@ def main() -> None:
     parser.add_argument("--subset", default=Config.subset, choices=("there", *PARTS))
     parser.add_argument("--budget", default=Config.budget, choices=("fast", "full"))
     parser.add_argument("--workers", type=count, default=Config.workers)
+    parser.add_argument("--jobs", type=count, default=Config.jobs, help="diagnoses at the same time (%(default)s)")
     parser.add_argument("--timeout", type=float, default=Config.timeout)
     parser.flag("ready", "score only what is diagnosed already")
     parser.flag("smoke", "only the first recording")

@@ -158,7 +158,7 @@ def go_further(bench: Bench, base: Fitted, iterations: int, report: Callback) ->
     if firm and firm[0].point.cost < _FIRMER * base.point.cost:
         base = firm[0]
         bench.pool.choose(grip=1.0)
-    report(stage, 1, 3, f"{1e3 * base.point.cost:.2f} mm")
+    report(stage, 1, 3, f"{1e3 * rms(bench.gaps(base, 'train')):.2f} mm")
     if CHAIN not in base.effects and rms(bench.gaps(base, "train")) > SILENT * bench.level:
         rows = [np.append(base.values, length)[None] for length in (link, -link)]
         sides = [Fit(effects, r, free, (*sizes, 0.5 * link), iterations, bench.starts["train"]) for r in rows]
