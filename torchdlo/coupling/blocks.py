@@ -10,6 +10,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from torchdlo.coupling.bodies import BodyMotion
 from torchdlo.physics import native
 
 _OPTIONS = ("-fno-math-errno", "-fno-trapping-math", "-Wno-psabi")
@@ -67,6 +68,30 @@ def logical(x: Tensor, batch: Sequence[int]) -> Tensor:
     """Return (C, n, B) as (..., n, C)."""
     x = x.reshape(*x.shape[:2], *batch)
     return x.permute(*range(2, x.dim()), 1, 0)
+
+
+def alike(motion: BodyMotion) -> bool:
+    """Return whether meshes are the same in all scenes, and not learned."""
+    meshed = any(b.shape == "mesh" for b in motion.bodies)
+    parts = (motion.params.grid, motion.params.balls)
+    return not meshed or all(x.shape[:-2].numel() == 1 and not x.requires_grad for x in parts)
+
+
+def sampled(motion: BodyMotion) -> tuple[Tensor, list[int]]:
+    """Return the grids of all bodies, shape (K, n), and the cells of each in x, y and z, 0 where there is none."""
+    return _rows(motion, motion.params.grid), [n for b in motion.bodies for n in (b.cells or (0, 0, 0))]
+
+
+def inscribed(motion: BodyMotion) -> tuple[Tensor, list[int]]:
+    """Return the balls within all bodies that stand for meshes, shape (K, 4 P), and how many each has."""
+    return _rows(motion, motion.params.balls), [b.balls for b in motion.bodies]
+
+
+def _rows(motion: BodyMotion, x: Tensor) -> Tensor:
+    """Return what is alike in all scenes, (..., K, n), as (K, n)."""
+    if not any(b.shape == "mesh" for b in motion.bodies):
+        return x.new_zeros(len(motion.bodies), 0)
+    return x.detach().reshape(x.shape[-2:]).contiguous()
 
 
 def once(ctx, *by) -> None:

@@ -39,11 +39,27 @@ struct Candidate {
   int first, second, kind, number;
 };
 
-static inline int how_many(int kind, int shape) {
-  static const int counts[3][8] = {
-      {0, 1, 8, 2, 2 * FEET, FEET + 1, FEET, ARC}, {0, 0, 0, 0, 2, 1, 1, 0}, {0, 0, 12, 1, 1, 0, 0, 0}};
-  return counts[kind][shape];
-}
+struct Sizes {
+  int64_t bodies, scenes, pairs, points, steps;
+  const int64_t *shape, *free, *pair;  // per body; its place among free bodies, or -1; two bodies per pair
+  const int64_t *cells, *many;         // three per body, and how many balls stand for a mesh
+  const void *grids, *balls;           // of all bodies, each with so many corners, and with so many numbers
+  int64_t corners, numbers;
+  double recovery, shallow, slowest, dt;
+  template <typename T>
+  Grid<T> grid(int body) const {
+    return {(const T*)grids + body * corners, cells + 3 * body};
+  }
+  template <typename T>
+  const T* ball(int body, int number) const {
+    return (const T*)balls + body * numbers + 4 * number;
+  }
+  int how_many(int kind, int body) const {
+    static const int counts[3][9] = {
+        {0, 1, 8, 2, 2 * FEET, FEET + 1, FEET, ARC, 0}, {0, 0, 0, 0, 2, 1, 1, 0, 0}, {0, 0, 12, 1, 1, 0, 0, 0, 0}};
+    return kind == STANDING && shape[body] == MESH ? int(many[body]) : counts[kind][shape[body]];
+  }
+};
 
 // The least of some numbers; equal ones share the derivative.
 NUM least(const Num<T, N>* x, int count) {
@@ -61,7 +77,7 @@ NUM least(const Num<T, N>* x, int count) {
 
 // Radius of rounded edges.
 NUM rounding(const Member<T, N>& body, int shape, int field) {
-  static const int sizes[] = {0, 1, 3, 2, 2, 2, 2, 0};
+  static const int sizes[] = {0, 1, 3, 2, 2, 2, 2, 0, 0};
   if (field == PLANE || !sizes[shape]) return Num<T, N>(T(0));
   return least(body.numbers, sizes[shape]) * Num<T, N>(T(shape == CONE ? 0.5 * ROUND : ROUND));
 }
@@ -135,11 +151,12 @@ static Num<T, N> segment(const Member<T, N>& body, int shape, int number, const 
 // A ball of one body in the field of another; `late` is how much later than others of its gap it counts. The search for
 // the nearest point of a segment is done without derivatives, and found before otherwise.
 template <typename T, int N>
-static Touch<T, N> touch(const Candidate& c, const Member<T, N>& one, const Member<T, N>& other, const int64_t* shapes,
+static Touch<T, N> touch(const Candidate& c, const Member<T, N>& one, const Member<T, N>& other, const Sizes& n,
                          Found<T>& found, Num<T, N>& late) {
   typedef Num<T, N> S;
   typedef Three<T, N> V;
-  const int shape = int(shapes[c.first]), field = int(shapes[c.second]);
+  const int shape = int(n.shape[c.first]), field = int(n.shape[c.second]);
+  const Grid<T> grid = n.grid<T>(c.second);
   const S zero(T(0)), edge = rounding(one, shape, field);
   const V between = one.pos - other.pos;
   const auto seen = [&](const V& a) {
@@ -154,24 +171,29 @@ static Touch<T, N> touch(const Candidate& c, const Member<T, N>& one, const Memb
     V ends[2];
     thick = segment(one, shape, c.number, edge, ends);
     const V start = seen(ends[0]), along = seen(ends[1]) - start;
-    const Line<T, N> line(field, start, along, other.numbers);
+    const Line<T, N> line(field, grid, start, along, other.numbers);
     if constexpr (N == 0) found = nearest<T>(line, T(0), T(1));
     end<T, N>(line, &found, T(0.5), r);
     p = start + along * r[0];
     late = edge * S(T(0.25));
   } else {
-    if (c.kind == STANDING) thick = standing(one, shape, c.number, edge, at);
+    if (c.kind == STANDING && shape == MESH) {
+      const T* ball = n.ball<T>(c.first, c.number);
+      at = {S(ball[0]), S(ball[1]), S(ball[2])}, thick = S(ball[3]);
+    } else if (c.kind == STANDING) {
+      thick = standing(one, shape, c.number, edge, at);
+    }
     if (c.kind == CIRCLE) {
       const V ring = circle(one, shape, c.number, edge), middle = seen({zero, zero, ring.x});
       V out, way;
-      probe(field, other.numbers, &middle.x, &out.x);
+      probe(field, grid, other.numbers, &middle.x, &out.x);
       const V down = one.local(other.world(out)), flat = {-down.x, -down.y, zero};
       const S steep = measured(flat, way), share = ring.y / larger(steep, S(T(FLAT)));
       at = {flat.x * share, flat.y * share, ring.x};
       thick = ring.z;
     }
     p = seen(at);
-    r[1] = probe(field, other.numbers, &p.x, r + 2);
+    r[1] = probe(field, grid, other.numbers, &p.x, r + 2);
   }
   const V normal = {r[2], r[3], r[4]};
   p.x = p.x - other.offset;

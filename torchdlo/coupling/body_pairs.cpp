@@ -300,7 +300,8 @@ template <typename T>
 static Block<T>& working(const Sizes& n) {
   static thread_local std::unique_ptr<Block<T>> kept;
   const bool fits = kept && kept->n.shape == n.shape && kept->n.free == n.free && kept->n.pair == n.pair &&
-                    kept->n.bodies == n.bodies && kept->n.pairs == n.pairs && kept->n.points == n.points;
+                    kept->n.many == n.many && kept->n.bodies == n.bodies && kept->n.pairs == n.pairs &&
+                    kept->n.points == n.points;
   if (!fits) kept.reset(new Block<T>(n));
   kept->n = n;
   return *kept;

@@ -1,8 +1,9 @@
 """Contact forces among bodies as a C++ kernel, with its derivative.
 
-The formulas stand in `body_contact`, `balls` and `linked`, as tensor operations; these are used on a GPU, for meshes,
-and where there is no C++ compiler. The kernel does the same, several scenes per instruction, and skips pairs of bodies
-that cannot meet even if they move twice as far as foreseen. For compilers of graphs it is one operation.
+The formulas stand in `body_contact`, `balls` and `linked`, as tensor operations; these are used on a GPU, where there
+is no C++ compiler, and for meshes that differ from scene to scene or are learned. The kernel does the same, several
+scenes per instruction, and skips pairs of bodies that cannot meet even if they move twice as far as foreseen. For
+compilers of graphs it is one operation.
 """
 
 from __future__ import annotations
@@ -19,7 +20,9 @@ from torchdlo.coupling.bodies import BodyMotion
 from torchdlo.coupling.components import axes
 
 _ORDER = tuple(shapes.SIZES)
-_STATIC = "int[] shapes, int[] free, int[] pairs, int points, int steps, float[] law"
+_FIRST = "Tensor[] bodies"
+_LISTS = "int[] cells, int[] many, int[] shapes, int[] free, int[] pairs"
+_OTHERS = f"Tensor grids, Tensor balls, {_LISTS}, int points, int steps, float[] law"
 HARD = 1e4
 """Stiffness of contact times the mobility of the two bodies: its inverse is the share of an impact that is let through.
 Harder contact takes more rounds, and single precision has no digits for it."""
@@ -33,31 +36,33 @@ _function, ready = blocks.kernel("body_pairs", *_OPTIONS)
 class _Sizes(ctypes.Structure):
     _fields_ = (
         *((name, ctypes.c_int64) for name in ("bodies", "scenes", "pairs", "points", "steps")),
-        *((name, ctypes.c_void_p) for name in ("shape", "free", "pair")),
+        *((name, ctypes.c_void_p) for name in ("shape", "free", "pair", "cells", "many", "grids", "balls")),
+        *((name, ctypes.c_int64) for name in ("corners", "numbers")),
         *((name, ctypes.c_double) for name in ("recovery", "shallow", "slowest", "dt")),
     )
 
 
-def _sizes(bodies: list[Tensor], kinds, free, pairs, points: int, steps: int, law: Sequence[float]):
-    lists = (blocks.integers(tuple(x)) for x in (kinds, free, pairs))
-    return ctypes.byref(_Sizes(*bodies[0].shape[1:], len(pairs) // 2, points, steps, *lists, *law))
+def _sizes(like, grids, inscribed, cells, many, kinds, free, pairs, points: int, steps: int, law: Sequence[float]):
+    lists = (blocks.integers(tuple(x)) for x in (kinds, free, pairs, cells, many))
+    fixed = (grids.data_ptr(), inscribed.data_ptr(), grids.shape[1], inscribed.shape[1])
+    return ctypes.byref(_Sizes(*like.shape[1:], len(pairs) // 2, points, steps, *lists, *fixed, *law))
 
 
-def _exert(bodies: list[Tensor], *static) -> Tensor:
+def _exert(bodies: list[Tensor], *others) -> Tensor:
     out = _exert_meta(bodies)
     places = (blocks.fields(bodies), blocks.fields([out]))
-    _function("exert", out.dtype)(*places, _sizes(bodies, *static), torch.get_num_threads())
+    _function("exert", out.dtype)(*places, _sizes(bodies[0], *others), torch.get_num_threads())
     return out
 
 
-def _exert_meta(bodies: list[Tensor], *static) -> Tensor:
+def _exert_meta(bodies: list[Tensor], *others) -> Tensor:
     return bodies[0].new_empty(6, *bodies[0].shape[1:])
 
 
-def _back(bodies: list[Tensor], by: Tensor, *static) -> Tensor:
+def _back(bodies: list[Tensor], by: Tensor, *others) -> Tensor:
     out = _back_meta(bodies)
     places = (blocks.fields(x) for x in (bodies, [by], [out]))
-    _function("back", out.dtype)(*places, _sizes(bodies, *static), torch.get_num_threads())
+    _function("back", out.dtype)(*places, _sizes(bodies[0], *others), torch.get_num_threads())
     return out
 
 
@@ -67,8 +72,8 @@ def _back_meta(bodies: list[Tensor], *others) -> Tensor:
 
 _library = torch.library.Library("torchdlo", "FRAGMENT")
 for _schema, _make, _fake in (
-    (f"body_pairs(Tensor[] bodies, {_STATIC}) -> Tensor", _exert, _exert_meta),
-    (f"body_pairs_back(Tensor[] bodies, Tensor by, {_STATIC}) -> Tensor", _back, _back_meta),
+    (f"body_pairs({_FIRST}, {_OTHERS}) -> Tensor", _exert, _exert_meta),
+    (f"body_pairs_back({_FIRST}, Tensor by, {_OTHERS}) -> Tensor", _back, _back_meta),
 ):
     _name = _schema.partition("(")[0]
     _library.define(_schema, tags=(torch.Tag.needs_contiguous_strides,))
@@ -77,14 +82,14 @@ for _schema, _make, _fake in (
 
 
 def _save(ctx, inputs, output) -> None:
-    ctx.save_for_backward(*inputs[0])
-    ctx.static = inputs[1:]
+    ctx.save_for_backward(*inputs[0], *inputs[1:3])
+    ctx.static = inputs[3:]
 
 
 def _backward(ctx, by: Tensor):
-    bodies = list(ctx.saved_tensors)
-    found = torch.ops.torchdlo.body_pairs_back(bodies, by.contiguous(), *ctx.static)
-    return list(found.split([x.shape[0] for x in bodies])), *(None for _ in ctx.static)
+    *bodies, grids, inscribed = ctx.saved_tensors
+    found = torch.ops.torchdlo.body_pairs_back(bodies, by.contiguous(), grids, inscribed, *ctx.static)
+    return list(found.split([x.shape[0] for x in bodies])), None, None, *(None for _ in ctx.static)
 
 
 torch.library.register_autograd("torchdlo::body_pairs", _backward, setup_context=_save, lib=_library)
@@ -120,8 +125,13 @@ def wrench(
     members, count = _members(motion), len(motion.bodies)
     batch = torch.broadcast_shapes(*(x.shape[:-2] for x in members))
     order = itertools.count()
+    (grids, cells), (inscribed, many) = blocks.sampled(motion), blocks.inscribed(motion)
     found = torch.ops.torchdlo.body_pairs(
         blocks.stored(members, batch, count),
+        grids,
+        inscribed,
+        cells,
+        many,
         [_ORDER.index(b.shape) for b in motion.bodies],
         [next(order) if b.motion == "free" else -1 for b in motion.bodies],
         list(itertools.chain(*pairs)),
@@ -136,4 +146,4 @@ def wrench(
 def fits(motion: BodyMotion) -> bool:
     """Return whether the kernel can do what these bodies need."""
     like = motion.state.pos
-    return all(b.shape != "mesh" for b in motion.bodies) and ready(like.device.type, like.dtype)
+    return ready(like.device.type, like.dtype) and blocks.alike(motion)

@@ -52,8 +52,14 @@ struct Wrench {
 
 struct Sizes {
   int64_t families, vertices, bodies, scenes, sweeps, friction;
-  const int64_t *shape, *pieces, *after;  // per body, and vertex after each vertex
+  const int64_t *shape, *pieces, *after, *cells;  // per body, vertex after each vertex, and three per body
+  const void* grids;                              // of all bodies, each with so many corners
+  int64_t corners;
   double recovery, slowest, dt;
+  template <typename T>
+  Grid<T> grid(int body) const {
+    return {(const T*)grids + body * corners, cells + 3 * body};
+  }
 };
 
 // Numbers that contact depends on, or derivatives by them.
@@ -177,9 +183,10 @@ struct Geometry : Inputs<T> {
   }
   template <int N>
   Line<T, N> line(int p) const {
-    const Solid<T>& b = bodies[body(p)];
+    const int k = body(p);
+    const Solid<T>& b = bodies[k];
     const R from = vertices[edge(p)].pos, to = vertices[n.after[edge(p)]].pos;
-    return Line<T, N>(n.shape[body(p)], b.local(from - b.pos) + b.offset, b.local(to - from), b.numbers);
+    return Line<T, N>(n.shape[k], n.grid<T>(k), b.local(from - b.pos) + b.offset, b.local(to - from), b.numbers);
   }
 
   void place(int p) {

@@ -1,9 +1,10 @@
 """Contact forces of ropes on bodies as a C++ kernel, with its derivative.
 
-The formulas stand in `rod_body` and `edge_points`, as tensor operations; these are used on a GPU, for meshes, and where
-there is no C++ compiler. The kernel does the same, several scenes per instruction, skips what touches in none of them,
-and looks for the nearest point of an edge only where it may come within a radius of the body if the edge moves twice as
-far as foreseen. Compilers of graphs take minutes to unroll the sweeps; for them the kernel is one operation.
+The formulas stand in `rod_body` and `edge_points`, as tensor operations; these are used on a GPU, where there is no C++
+compiler, and for meshes that differ from scene to scene or are learned. The kernel does the same, several scenes per
+instruction, skips what touches in none of them, and looks for the nearest point of an edge only where it may come
+within a radius of the body if the edge moves twice as far as foreseen. Compilers of graphs take minutes to unroll the
+sweeps; for them the kernel is one operation.
 """
 
 from __future__ import annotations
@@ -16,47 +17,59 @@ import torch
 from torch import Tensor
 
 from torchdlo.coupling import blocks, shapes
-from torchdlo.coupling.bodies import Body, BodyMotion
+from torchdlo.coupling.bodies import BodyMotion
 from torchdlo.coupling.components import axes
 from torchdlo.physics.effect import Motion, Push
 from torchdlo.physics.rod import View
 
 _ORDER = tuple(shapes.SIZES)
-_INPUTS = "Tensor[] edges, Tensor[] vertices, Tensor[] bodies"
-_STATIC = "int[] shapes, int[] pieces, int[] after, int sweeps, bool friction, float[] law"
+_INPUTS = "Tensor[] edges, Tensor[] vertices, Tensor[] bodies, Tensor grids"
+_STATIC = "int[] cells, int[] shapes, int[] pieces, int[] after, int sweeps, bool friction, float[] law"
 _function, ready = blocks.kernel("body_sweeps")
 
 
 class _Sizes(ctypes.Structure):
     _fields_ = (
         *((name, ctypes.c_int64) for name in ("families", "vertices", "bodies", "scenes", "sweeps", "friction")),
-        *((name, ctypes.c_void_p) for name in ("shape", "pieces", "after")),
+        *((name, ctypes.c_void_p) for name in ("shape", "pieces", "after", "cells", "grids")),
+        ("corners", ctypes.c_int64),
         *((name, ctypes.c_double) for name in ("recovery", "slowest", "dt")),
     )
 
 
-def _sizes(count: int, scenes: int, kinds, pieces, after, sweeps: int, friction: bool, law: Sequence[float]):
-    families = sum(2 + n for n in pieces)
-    lists = (blocks.integers(tuple(x)) for x in (kinds, pieces, after))
-    return ctypes.byref(_Sizes(families, len(after), count, scenes, sweeps, friction, *lists, *law))
+def _sizes(like: Tensor, grids: Tensor, cells, kinds, pieces, after, sweeps: int, friction: bool, law: Sequence[float]):
+    families, (_, count, scenes) = sum(2 + n for n in pieces), like.shape
+    lists = (blocks.integers(tuple(x)) for x in (kinds, pieces, after, cells))
+    sizes = (families, len(after), count, scenes, sweeps, friction, *lists, grids.data_ptr(), grids.shape[1], *law)
+    return ctypes.byref(_Sizes(*sizes))
 
 
-def _sweep(edges: list[Tensor], vertices: list[Tensor], bodies: list[Tensor], *static) -> tuple[Tensor, Tensor]:
+def _sweep(
+    edges: list[Tensor], vertices: list[Tensor], bodies: list[Tensor], grids: Tensor, *static
+) -> tuple[Tensor, Tensor]:
     out = _sweep_meta(edges, vertices, bodies)
     places = [blocks.fields(x) for x in (edges, vertices, bodies)]
-    sizes = _sizes(*bodies[0].shape[1:], *static)
+    sizes = _sizes(bodies[0], grids, *static)
     _function("sweep", out[0].dtype)(*places, *(blocks.fields([x]) for x in out), sizes, torch.get_num_threads())
     return out
 
 
-def _sweep_meta(edges: list[Tensor], vertices: list[Tensor], bodies: list[Tensor], *static) -> tuple[Tensor, Tensor]:
+def _sweep_meta(edges: list[Tensor], vertices: list[Tensor], bodies: list[Tensor], *others) -> tuple[Tensor, Tensor]:
     return tuple(x[0].new_empty(n, *x[0].shape[1:]) for x, n in ((vertices, 3), (bodies, 6)))
 
 
-def _back(edges: list[Tensor], vertices: list[Tensor], bodies: list[Tensor], force: Tensor, push: Tensor, *static):
+def _back(
+    edges: list[Tensor],
+    vertices: list[Tensor],
+    bodies: list[Tensor],
+    grids: Tensor,
+    force: Tensor,
+    push: Tensor,
+    *static,
+):
     out = _back_meta(edges, vertices, bodies)
     places = [blocks.fields(x) for x in (edges, vertices, bodies, [force], [push])]
-    sizes = _sizes(*bodies[0].shape[1:], *static)
+    sizes = _sizes(bodies[0], grids, *static)
     _function("back", force.dtype)(*places, *(blocks.fields([x]) for x in out), sizes, torch.get_num_threads())
     return out
 
@@ -82,9 +95,9 @@ for _schema, _make, _fake in (
 
 
 def _save(ctx, inputs, output) -> None:
-    ctx.save_for_backward(*inputs[0], *inputs[1], *inputs[2])
+    ctx.save_for_backward(*inputs[0], *inputs[1], *inputs[2], inputs[3])
     ctx.counts = [len(x) for x in inputs[:3]]
-    ctx.static = inputs[3:]
+    ctx.static = inputs[4:]
 
 
 def _backward(ctx, force: Tensor, push: Tensor):
@@ -93,9 +106,9 @@ def _backward(ctx, force: Tensor, push: Tensor):
         groups.append(saved[:count])
         saved = saved[count:]
     both = (force.contiguous(), push.contiguous())
-    found = torch.ops.torchdlo.body_sweeps_back(*groups, *both, *ctx.static)
+    found = torch.ops.torchdlo.body_sweeps_back(*groups, *saved, *both, *ctx.static)
     parts = [list(x.split([t.shape[0] for t in group])) for x, group in zip(found, groups, strict=True)]
-    return *parts, *(None for _ in ctx.static)
+    return *parts, None, *(None for _ in ctx.static)
 
 
 torch.library.register_autograd("torchdlo::body_sweeps", _backward, setup_context=_save, lib=_library)
@@ -141,6 +154,7 @@ def push(
     inputs = (blocks.stored(x, batch, n) for x, n in ((edges, size), (vertices, size), (solids, len(bodies.bodies))))
     force, wrench = torch.ops.torchdlo.body_sweeps(
         *inputs,
+        *blocks.sampled(bodies),
         [_ORDER.index(b.shape) for b in bodies.bodies],
         list(pieces),
         view.topology.successor(),
@@ -151,6 +165,7 @@ def push(
     return Push(blocks.logical(force, batch), *blocks.logical(wrench, batch).split(3, -1))
 
 
-def fits(bodies: Sequence[Body], like: Tensor) -> bool:
+def fits(bodies: BodyMotion) -> bool:
     """Return whether the kernel can do what these bodies need."""
-    return all(b.shape != "mesh" for b in bodies) and ready(like.device.type, like.dtype)
+    like = bodies.state.pos
+    return ready(like.device.type, like.dtype) and blocks.alike(bodies)

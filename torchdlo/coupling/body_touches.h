@@ -2,12 +2,6 @@
 #pragma once
 #include "body_balls.h"
 
-struct Sizes {
-  int64_t bodies, scenes, pairs, points, steps;
-  const int64_t *shape, *free, *pair;  // per body; its place among free bodies, or -1; two bodies per pair
-  double recovery, shallow, slowest, dt;
-};
-
 template <typename T>
 struct Pairs {
   typedef Lanes<T> L;
@@ -43,7 +37,7 @@ struct Pairs {
   void add(int a, int b) {
     for (int kind : {STANDING, CIRCLE, SEGMENT})
       if (kind != SEGMENT || n.shape[b] != PLANE)
-        for (int k = 0; k < how_many(kind, int(n.shape[a])); ++k) candidates.push_back({a, b, kind, k});
+        for (int k = 0; k < n.how_many(kind, a); ++k) candidates.push_back({a, b, kind, k});
   }
 
   // A radius about the centre of mass that a body does not exceed.
@@ -51,7 +45,8 @@ struct Pairs {
     const P* s = bodies[k].numbers;
     switch (n.shape[k]) {
       case SPHERE: return s[0].x;
-      case BOX: return s[0].x + s[1].x + s[2].x;
+      case BOX:
+      case MESH: return s[0].x + s[1].x + s[2].x;
       case RING: return T(2) * (s[0].x + s[1].x);
       default: return s[0].x + s[1].x;
     }
@@ -81,7 +76,7 @@ struct Pairs {
     for (int c = 0; c < count; ++c) {
       const Candidate& each = candidates[from + c];
       P late;
-      touches[from + c] = touch<T, 0>(each, bodies[each.first], bodies[each.second], n.shape, found[from + c], late);
+      touches[from + c] = touch<T, 0>(each, bodies[each.first], bodies[each.second], n, found[from + c], late);
       Touch<T, 0>& t = touches[from + c];
       if (each.first != n.pair[2 * p]) t.normal = t.normal * P(T(-1));
       rank[c] = t.gap.x + late.x;
@@ -129,7 +124,7 @@ struct Pairs {
     Member<T, TAPED> one, other;
     remember<PLACE>(bodies[each.first], one), remember<PLACE>(bodies[each.second], other);
     R late;
-    Touch<T, TAPED> t = touch<T, TAPED>(each, one, other, n.shape, found[candidate], late);
+    Touch<T, TAPED> t = touch<T, TAPED>(each, one, other, n, found[candidate], late);
     if (each.first != n.pair[2 * p]) t.normal = t.normal * R(T(-1));
     tape.begin();
     for (int i = 0; i < FIELDS; ++i) ((R*)&t)[i].give(by[i]);

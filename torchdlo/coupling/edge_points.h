@@ -2,7 +2,14 @@
 #pragma once
 #include "tape.h"
 
-enum Shape { PLANE, SPHERE, BOX, CAPSULE, CYLINDER, CONE, TORUS, RING };
+enum Shape { PLANE, SPHERE, BOX, CAPSULE, CYLINDER, CONE, TORUS, RING, MESH };
+
+// Distances of a mesh at the corners of the cells of its grid, z fastest; the same in all scenes.
+template <typename T>
+struct Grid {
+  const T* values;
+  const int64_t* cells;  // in x, y and z
+};
 
 // Length of a vector of M numbers, and its direction; that of zero vectors is an axis.
 template <int M, typename T, int N>
@@ -60,11 +67,61 @@ NUM tube(const Num<T, N>* size, const Num<T, N>* p, const Num<T, N>* on, Num<T, 
   return unit<3>(away, 2, n) - size[1];
 }
 
-NUM probe(int shape, const Num<T, N>* size, const Num<T, N>* p, Num<T, N>* n) {
+// Interpolates the grid trilinearly; beyond it, goes on from the surface nearest to its border.
+NUM sampled(const Grid<T>& grid, const Num<T, N>* size, const Num<T, N>* p, Num<T, N>* n) {
+  typedef Num<T, N> S;
+  const S zero(T(0)), one(T(1));
+  const int64_t nz = grid.cells[2] + 1, ny = grid.cells[1] + 1;
+  int64_t first[WIDTH<T>] = {};
+  S inside[3], f[3], g[3], at[2][2][2], low[2][2], slab[2], beyond[3];
+  auto out = zero.x > T(0);
+  for (int k = 0; k < 3; ++k) {
+    inside[k] = larger(smaller(p[k], size[k]), -size[k]);
+    const int64_t last = grid.cells[k] - 1;
+    const S place = (inside[k] / size[k] + one) * S(T(0.5 * grid.cells[k]));
+    Lanes<T> cell{};
+    for (int i = 0; i < WIDTH<T>; ++i) {
+      // A place that is not a number may be looked up anywhere: its share makes the answer not a number.
+      const T x = place.x[i] > T(0) ? std::floor(place.x[i]) : T(0);
+      const int64_t c = x < T(last) ? int64_t(x) : last;
+      cell[i] = T(c);
+      first[i] += c * (k == 0 ? ny * nz : k == 1 ? nz : 1);
+    }
+    f[k] = place - S(cell), g[k] = one - f[k];
+    beyond[k] = p[k] - inside[k];
+    out = out | (magnitude(beyond[k]).x > T(0));
+  }
+  for (int i = 0; i < 2; ++i)
+    for (int j = 0; j < 2; ++j) {
+      for (int k = 0; k < 2; ++k) {
+        Lanes<T> corner;
+        for (int l = 0; l < WIDTH<T>; ++l) corner[l] = grid.values[first[l] + (i * ny + j) * nz + k];
+        at[i][j][k] = S(corner);
+      }
+      low[i][j] = at[i][j][0] * g[2] + at[i][j][1] * f[2];
+    }
+  for (int i = 0; i < 2; ++i) slab[i] = low[i][0] * g[1] + low[i][1] * f[1];
+  const S distance = slab[0] * g[0] + slab[1] * f[0];
+  S rise[3] = {slab[1] - slab[0], (low[0][1] - low[0][0]) * g[0] + (low[1][1] - low[1][0]) * f[0], zero}, away[3];
+  for (int i = 0; i < 2; ++i) {
+    const S step = (at[i][0][1] - at[i][0][0]) * g[1] + (at[i][1][1] - at[i][1][0]) * f[1];
+    rise[2] = rise[2] + step * (i ? f[0] : g[0]);
+  }
+  for (int k = 0; k < 3; ++k) rise[k] = rise[k] * S(T(grid.cells[k])) / size[k];
+  unit<3>(rise, 2, n);
+  for (int k = 0; k < 3; ++k) beyond[k] = beyond[k] + distance * n[k];
+  const S far = unit<3>(beyond, 2, away);
+  for (int k = 0; k < 3; ++k) n[k] = select(out, away[k], n[k]);
+  return select(out, far, distance);
+}
+
+NUM probe(int shape, const Grid<T>& grid, const Num<T, N>* size, const Num<T, N>* p, Num<T, N>* n) {
   typedef Num<T, N> S;
   const S zero(T(0)), one(T(1));
   S out[2], on[2];
   switch (shape) {
+    case MESH:
+      return sampled(grid, size, p, n);
     case SPHERE:
       return unit<3>(p, 2, n) - size[0];
     case BOX: {
@@ -105,9 +162,11 @@ NUM probe(int shape, const Num<T, N>* size, const Num<T, N>* p, Num<T, N>* n) {
 template <typename T, int N>
 struct Line {
   int shape;
+  Grid<T> grid;
   Num<T, N> start[3], edge[3], size[4], length;
 
-  Line(int shape, const Vec<T>& from, const Vec<T>& along, const Lanes<T>* numbers) : shape(shape) {
+  Line(int shape, const Grid<T>& grid, const Vec<T>& from, const Vec<T>& along, const Lanes<T>* numbers)
+      : shape(shape), grid(grid) {
     const Lanes<T> all[10] = {from.x,  from.y,     from.z,     along.x,    along.y,
                               along.z, numbers[0], numbers[1], numbers[2], numbers[3]};
     for (int k = 0; k < 10; ++k) (k < 3 ? start[k] : k < 6 ? edge[k - 3] : size[k - 6]) = Num<T, N>::variable(all[k], k);
@@ -115,7 +174,8 @@ struct Line {
     length = unit<3>(edge, 0, direction);
   }
 
-  Line(int shape, const Three<T, N>& from, const Three<T, N>& along, const Num<T, N>* numbers) : shape(shape) {
+  Line(int shape, const Grid<T>& grid, const Three<T, N>& from, const Three<T, N>& along, const Num<T, N>* numbers)
+      : shape(shape), grid(grid) {
     for (int k = 0; k < 3; ++k) start[k] = from[k], edge[k] = along[k];
     for (int k = 0; k < 4; ++k) size[k] = numbers[k];
     Num<T, N> direction[3];
@@ -124,7 +184,7 @@ struct Line {
 
   Num<T, N> at(const Num<T, N>& share, Num<T, N>* normal) const {
     const Num<T, N> p[3] = {start[0] + share * edge[0], start[1] + share * edge[1], start[2] + share * edge[2]};
-    return probe(shape, size, p, normal);
+    return probe(shape, grid, size, p, normal);
   }
 
   Num<T, N> slope(const Num<T, N>& share, T middle) const {

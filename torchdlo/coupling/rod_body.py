@@ -204,7 +204,7 @@ class RodBody(Effect):
     def react(self, view: View, motion: Motion, values: Values) -> Push:
         """Return the forces that keep ropes outside of bodies and rub [N]."""
         bodies = motion.bodies
-        if body_sweeps.fits(bodies.bodies, view.state.pos):
+        if body_sweeps.fits(bodies):
             pieces = [families(b, self.pieces) - 2 for b in bodies.bodies]
             law = (self.recovery, self.slowest)
             return body_sweeps.push(view, motion, pieces, sweeps=self.sweeps, friction=self.friction, law=law)
