@@ -177,6 +177,9 @@ def optimize(
     ] = None,
     double: Annotated[bool, typer.Option("--double", help="Physics in double precision.")] = False,
     compiled: Annotated[bool, typer.Option(help="Compile the step: slow at first, then many times faster.")] = True,
+    recorded: Annotated[
+        bool, typer.Option("--recorded", help="Record the step instead: takes seconds, helps where cmaes searches.")
+    ] = False,
     resume: Annotated[
         bool, typer.Option("--resume", help="Go on from the journal of a search that was stopped.")
     ] = False,
@@ -206,7 +209,8 @@ def optimize(
     out = out or Path("runs") / "optimize" / f"{task}-{method}"
     for name in ("result.json", "trajectory.json", "curve.png"):
         check_writable(out / name)
-    chosen = problem(task, None if rope is None else cable(rope), double=double, compiled=compiled)
+    steps = {"compiled": compiled and not recorded, "recorded": recorded}
+    chosen = problem(task, None if rope is None else cable(rope), double=double, **steps)
     given = {"episodes": episodes, "population": population, "robust": Robust() if robust else None, "seed": seed}
     settings = preset(task, method, **given)
     try:

@@ -56,14 +56,15 @@ def script(
         InputError: The trajectory is none, is one of another task or rope, or there is no way by hand.
     """
     task = find(name, rope)
-    choices = {"double": False} if trajectory is None else _choices(trajectory)
-    chosen = problem(name, rope, double=bool(choices["double"]), compiled=bool(choices.get("compiled", compiled)))
-    if trajectory is not None and choices.get("rope") != json.loads(json.dumps(chosen.choices)).get("rope"):
+    found = {"compiled": compiled, "recorded": task.horizon > _LONG} if trajectory is None else _choices(trajectory)
+    material = found.pop("rope", None)
+    chosen = problem(name, rope, **found)
+    if trajectory is not None and material != json.loads(json.dumps(chosen.choices)).get("rope"):
         raise InputError(f"{trajectory}: it was found for another rope; give the model of that one with --rope.")
     seeded = torch.Generator().manual_seed(vary or 0)
     start = {"generator": seeded, "variation": vary is not None}
-    recorded = trajectory is None and task.horizon > _LONG
-    made = episode.prepare(task, 1, like=chosen.like, compiled=chosen.compiled, recorded=recorded, **start)
+    steps = {"compiled": chosen.compiled, "recorded": chosen.recorded}
+    made = episode.prepare(task, 1, like=chosen.like, **steps, **start)
     if trajectory is not None:
         return Script(task, made, chosen.full(load_actions(trajectory, chosen)))
     way = task.reference() if vary is None else task.reference(made.start.state)[0]
@@ -76,6 +77,7 @@ def _choices(path: Path) -> dict[str, Any]:
     """Return how a trajectory was found."""
     try:
         choices = json.loads(path.read_text(encoding="utf-8"))["choices"]
-        return {"double": choices["double"], "compiled": choices["compiled"], "rope": choices.get("rope")}
+        steps = {"compiled": bool(choices["compiled"]), "recorded": bool(choices.get("recorded"))}
+        return {"double": bool(choices["double"]), **steps, "rope": choices.get("rope")}
     except (OSError, ValueError, KeyError, TypeError):
         raise InputError(f"{path}: expected a trajectory of torchdlo optimize, found something else.") from None

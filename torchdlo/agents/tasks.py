@@ -37,6 +37,8 @@ class TaskProblem:
     """Whether the physics runs in double precision."""
     compiled: bool = True
     """Whether steps are compiled."""
+    recorded: bool = False
+    """If not, whether they are recorded, see `torchdlo.scene.stepper`."""
     device: str = "cpu"
     _episodes: dict[int, episode.Episode] = field(default_factory=dict)
     """Prepared once per size of batch."""
@@ -67,7 +69,8 @@ class TaskProblem:
     def choices(self) -> dict[str, Any]:
         """What else results depend on."""
         rope = {} if self.task.rope is None else {"rope": asdict(self.task.rope)}
-        return {"double": self.double, "compiled": self.compiled, "device": self.device} | rope
+        steps = {"compiled": self.compiled, "recorded": self.recorded and not self.compiled}
+        return {"double": self.double, **steps, "device": self.device} | rope
 
     @property
     def like(self) -> Tensor:
@@ -77,7 +80,7 @@ class TaskProblem:
     def prepared(self, count: int) -> episode.Episode:
         """Return the episode for a batch; gradients run five frames again at once."""
         if count not in self._episodes:
-            choices = {"compiled": self.compiled, "segment": 5}
+            choices = {"compiled": self.compiled, "recorded": self.recorded, "segment": 5}
             self._episodes[count] = episode.prepare(self.task, count, like=self.like, **choices)
         return self._episodes[count]
 
