@@ -78,7 +78,7 @@ def show(name: str, out: Path, *, quick: bool, draw: bool, video: bool) -> dict[
     with progress() as callback:
         frames = run(describe.read(here / "scene.json"), every=one.every, callback=callback)
     seconds = time.perf_counter() - begin
-    save_frames(frames, description, here / "frames.npz")
+    save_frames(frames, here / "frames.npz", description)
     claims = {} if frames.problem else one.claims(frames, description)
     wrong = [text for text, (value, low, high) in claims.items() if not low <= value <= high]
     if frames.problem:

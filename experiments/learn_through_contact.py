@@ -48,7 +48,7 @@ def one(name: str, args: Any, out: Path) -> dict[str, Any]:
         description = described(problem, found.keys)
         describe.save(description, out / "scene.json")
         frames = run(describe.read(out / "scene.json"), every=5)
-    save_frames(frames, description, out / "frames.npz")
+    save_frames(frames, out / "frames.npz", description)
     (first, _), (value, solved) = measured(problem, run(problem.scene(), every=5)), measured(problem, frames)
     if args.pictures:
         from torchdlo.report.render import stills_png

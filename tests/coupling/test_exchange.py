@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import pytest
@@ -10,7 +11,7 @@ from matter import DOUBLE, ONE, OPEN, ball, derivative, momenta
 
 from torchdlo import scene
 from torchdlo.coupling import RodMatter, mpm
-from torchdlo.coupling.exchange import Lines, Touch, block_size, exchange
+from torchdlo.coupling.exchange import Lines, Touch, block_size, exchange, near_size
 from torchdlo.coupling.laws import Elastic, Liquid
 from torchdlo.coupling.particles import Blob, Grid, assemble, fill_ball, fill_box
 from torchdlo.physics import tree
@@ -70,6 +71,21 @@ def test_sweeps_converge():
     sizes = [exchange(grid, nodes, lines, touch(sweeps=n), friction)[0] for n in (4, 16, 64, 256)]
     errors = [float((s - sizes[-1]).norm() / sizes[-1].norm()) for s in sizes[:-1]]
     assert errors[0] > 2 * errors[1] > 4 * errors[2]
+
+
+def test_room_for_the_nodes_of_a_capsule_is_enough_and_less_is_said():
+    grid, nodes, lines = lines_through_a_ball()
+    friction = torch.full((1, 1, 1), 0.3, dtype=DOUBLE)
+    sizes = (0.025, RADIUS, SPACING)
+    every = Touch(block_size(*sizes), 14)
+    capsule = dataclasses.replace(every, near=near_size(*sizes))
+    assert capsule.near < 0.6 * every.block**3
+    wanted, other = (exchange(grid, nodes, lines, t, friction) for t in (every, capsule))
+    assert float(other[2].max()) == 0
+    torch.testing.assert_close(other[0], wanted[0], rtol=1e-12, atol=1e-18)
+    torch.testing.assert_close(other[1].vel, wanted[1].vel, rtol=1e-12, atol=1e-15)
+    few = exchange(grid, nodes, lines, dataclasses.replace(every, near=3), friction)
+    assert float(few[2].min()) > 0
 
 
 def test_edges_far_from_matter_need_no_room():

@@ -12,7 +12,8 @@ off the centreline by d; the couple d x J is exerted by the ends of the edge as 
 own direction a centreline exerts nothing: as if it spun freely, that part of the friction is taken out of all nodes of
 an edge in proportion to how hard they press.
 
-Only edges near matter are looked at, as many as there is room for, and only nodes of a small block around each.
+Only edges near matter are looked at, as many as there is room for, and only nodes of a small block around each; sweeps
+work on those of them that are near, as many as a capsule round the edge can hold.
 
 Only velocities are exchanged, so matter is held off the rope but not drawn to its surface: a rope in a liquid displaces
 a cylinder that is wider than itself, by up to `thickness` node spacings in radius, and heavy matter sinks in slowly
@@ -31,6 +32,7 @@ import torch
 from torch import Tensor
 
 from torchdlo.coupling.mpm import Nodes
+from torchdlo.coupling.nearby import take
 from torchdlo.coupling.particles import Grid
 from torchdlo.physics import tree
 from torchdlo.physics.numerics import cross, dot, safe_norm
@@ -51,6 +53,8 @@ class Touch:
     """Jacobi sweeps; more of them make light ropes follow heavy matter more closely within a substep."""
     thickness: float = 1.0
     """How far off the rope's surface nodes are pushed, in node spacings."""
+    near: int = 0
+    """Nodes of a block that there is room for, those to which its edge is the nearest; see `near_size`. 0: all."""
 
 
 @tree.struct
@@ -103,6 +107,20 @@ def block_size(longest: float, radius: float, spacing: float, thickness: float =
         thickness: as in `Touch`.
     """
     return math.floor((longest + 2 * radius) / spacing + 2 * thickness) + 1
+
+
+def near_size(longest: float, radius: float, spacing: float, thickness: float = 1.0) -> int:
+    """Return how many nodes an edge can be the nearest to, at most: those of a capsule half a spacing wider than it sees.
+
+    Args:
+        longest: as in `block_size`, like the others.
+        radius: of edges [m].
+        spacing: of nodes [m].
+        thickness: as in `Touch`.
+    """
+    reach = radius + (thickness + 0.5) * spacing
+    capsule = math.pi * reach**2 * longest + 4 / 3 * math.pi * reach**3
+    return min(math.ceil(capsule / spacing**3), block_size(longest, radius, spacing, thickness) ** 3)
 
 
 def _take(x: Tensor, index: Tensor) -> Tensor:
@@ -174,7 +192,16 @@ def _pair(grid: Grid, nodes: Nodes, lines: Lines, touch: Touch) -> tuple[_Pairs,
     real = (near & _nearest(torch.where(near, distance.detach(), torch.inf), node, nodes.mass)).to(mass.dtype)
     inverse = real * nodes.share.unsqueeze(-1) / torch.where(real > 0, mass, 1.0)
     normal = arm / torch.where(distance > 0, distance, 1.0)
-    return _Pairs(node, ends, real, s, arm, normal, edge, inverse), lost
+    if not 0 < touch.near < real.shape[2]:
+        return _Pairs(node, ends, real, s, arm, normal, edge, inverse), lost
+    chosen, there, crowded = take(real[..., 0] > 0, touch.near)
+
+    def kept(x: Tensor) -> Tensor:
+        return x.gather(2, chosen.unsqueeze(-1).expand(*chosen.shape, x.shape[-1]))
+
+    node, real = node.unflatten(1, number.shape[1:3]).gather(2, chosen).flatten(1), there.unsqueeze(-1).to(real.dtype)
+    pairs = _Pairs(node, ends, real, kept(s), kept(arm), kept(normal), edge, real * kept(inverse))
+    return pairs, lost + crowded.sum(1)
 
 
 def _exert(pairs: _Pairs, impulse: Tensor, size: int) -> Tensor:

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from torchdlo.coupling import mpm
 from torchdlo.coupling.bodies import BodyState
-from torchdlo.coupling.exchange import Lines, Touch, block_size, exchange
+from torchdlo.coupling.exchange import Lines, Touch, block_size, exchange, near_size
 from torchdlo.coupling.mpm import Nodes
 from torchdlo.coupling.particles import Grid, Matter, Medium, Particles, stored
 from torchdlo.physics import tree
@@ -51,6 +51,8 @@ class RodMatter(Effect):
     """How far off the rope's surface matter is held, in node spacings."""
     block: int = 0
     """Nodes along each axis that are looked at around an edge; 0: found from the ropes when the scene is made."""
+    near: int = 0
+    """Nodes of them that there is room for where an edge is the nearest; 0: found likewise."""
 
     name: ClassVar[str] = "rod_matter"
     kind: ClassVar[str] = "force"
@@ -60,7 +62,7 @@ class RodMatter(Effect):
     }
 
     def __post_init__(self) -> None:
-        for name, least in (("sweeps", 1), ("room", 0), ("thickness", 0.0), ("block", 0)):
+        for name, least in (("sweeps", 1), ("room", 0), ("thickness", 0.0), ("block", 0), ("near", 0)):
             if not getattr(self, name) >= least:
                 raise ValueError(f"RodMatter: {name} is {getattr(self, name)}; expected at least {least}")
 
@@ -82,7 +84,7 @@ class RodMatter(Effect):
             view.params.rest.edge_mask,
             after,
         )
-        touch = Touch(self.block, self.room or size, self.sweeps, self.thickness)
+        touch = Touch(self.block, self.room or size, self.sweeps, self.thickness, self.near)
         impulse, nodes, lost = exchange(motion.matter.grid, nodes, lines, touch, all_scenes(values["mu"]))
         none = impulse.new_zeros(1, 3)
         return Push((impulse / dt).reshape(*batch, size, 3), none, none, Touched(nodes, lost.to(impulse.dtype)))
@@ -96,11 +98,11 @@ def fitted(effects: Sequence[Effect], medium: Medium | None, rods: RodParams) ->
             raise ValueError(
                 f"scene: {type(e).__name__} is among the effects, but there is no matter; give make(..., matter=...)"
             )
-        if isinstance(e, RodMatter) and not e.block:
+        if isinstance(e, RodMatter) and not (e.block and e.near):
             longest = float((rods.rest.length * rods.rest.edge_mask).max())
             # Edges that stretch by more than a tenth are not seen to their ends.
-            radius = float(rods.material.radius.max())
-            e = dataclasses.replace(e, block=block_size(1.1 * longest, radius, medium.grid.spacing, e.thickness))
+            sizes = (1.1 * longest, float(rods.material.radius.max()), medium.grid.spacing, e.thickness)
+            e = dataclasses.replace(e, block=e.block or block_size(*sizes), near=e.near or near_size(*sizes))
         found.append(e)
     return tuple(found)
 
