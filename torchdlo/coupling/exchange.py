@@ -110,7 +110,7 @@ def block_size(longest: float, radius: float, spacing: float, thickness: float =
 
 
 def near_size(longest: float, radius: float, spacing: float, thickness: float = 1.0) -> int:
-    """Return how many nodes an edge can be the nearest to, at most: those of a capsule half a spacing wider than it sees.
+    """Return how many nodes an edge can be the nearest to: those of a capsule half a spacing wider than its reach.
 
     Args:
         longest: as in `block_size`, like the others.
