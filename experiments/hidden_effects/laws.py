@@ -73,6 +73,8 @@ TABLE_RATE = 350.0
 """Frequency at which a node would bounce on the table or the wall [rad/s]."""
 SLIP = 5e-4
 """Speed at which friction on the table is three quarters of what it becomes [m/s]."""
+STOP = 1.0
+"""Stiffness of what ends the play in a clamp [N m/rad]."""
 SOFT_CLAMP = ("gripper_compliance", "backlash")
 
 
@@ -298,6 +300,8 @@ def grip_moment(given: Laws, q: Array, turns: Array, both: bool) -> Array:
     """Return the lack of moment (3, ..., B, N) [N m], in the nodes' frames, that springs of the clamps make."""
     out = np.zeros((3, *q.shape[1:]))
     spring, play = given.get("gripper_compliance.stiffness")[:, 0], given.get("backlash.angle")[:, 0]
+    # What ends the play gives way a little, some hundred times less than the rope: Newton's method would miss a wall.
+    spring = np.where(play > 0, np.minimum(spring, STOP), spring)
     for k, node in enumerate((0, -1)[: 1 + both]):
         grip = turns[:, None, :, k] if q.ndim == 4 else turns[..., k]
         angle = logarithm(multiply(conjugate(grip), q[..., node]))
