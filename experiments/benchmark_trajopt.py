@@ -33,7 +33,7 @@ def run(task: str, method: str, seed: int, args: Any) -> dict[str, Any]:
     folder = Path(args.out) / f"{task}-{method}-{seed}"
     given = {"episodes": args.episodes or None, "population": args.population or None, "seed": seed}
     settings = preset(task, method, **given)
-    # Where no gradients are asked for, recorded steps are as fast as compiled ones and take seconds to make.
+    # Recorded steps take seconds to make, but help only where no gradients are asked for.
     steps = {"compiled": args.compiled and method != "cmaes", "recorded": args.compiled and method == "cmaes"}
     chosen = problem(task, double=args.double, **steps)
     wanted = json.loads(json.dumps(asdict(settings) | chosen.choices))

@@ -271,7 +271,7 @@ def play(
         typer.Option(help="What ropes are made of: model.json of a calibration or diagnosis.", metavar="MODEL"),
     ] = None,
     compiled: Annotated[
-        bool, typer.Option("--compiled", help="Compile the step: minutes at first, then three times as fast.")
+        bool, typer.Option("--compiled", help="Compile the step instead of recording it: minutes at first.")
     ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print how it went as JSON.")] = False,
 ) -> None:

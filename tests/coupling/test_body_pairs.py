@@ -137,6 +137,20 @@ def test_what_is_not_a_number_stays_so_and_spoils_no_other_scene() -> None:
     assert bool(force[0].isfinite().all())
 
 
+def test_a_mesh_that_is_nowhere_is_nowhere_for_the_kernel_too(monkeypatch) -> None:
+    kinds, params, state = place(thrown(("sphere", "mesh")), torch.zeros(SCENES, 1, 3, dtype=F64))
+    pos = state.pos.clone()
+    pos[3, 0, 1] = torch.nan
+    state = tree.replace(state, pos=pos)
+    motion = foresee(kinds, params, state, hold(kinds, state), 0.0, torch.zeros(1, 1, dtype=F64), DT)
+    found = resolve(BodyContact(), motion)[0]
+    monkeypatch.setattr(body_pairs, "ready", lambda *_: False)
+    wanted = resolve(BodyContact(), motion)[0]
+    good = torch.arange(SCENES) != 3
+    assert bool(found[3].isnan().any()) and bool(found[good].isfinite().all())
+    torch.testing.assert_close(found[good], wanted[good], rtol=1e-9, atol=1e-9)
+
+
 def test_the_operator_tells_compilers_the_truth() -> None:
     state = place(thrown(("box", "cone")), torch.zeros(SCENES, 1, 3, dtype=F64))[2]
     members = torch.cat(

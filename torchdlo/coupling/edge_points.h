@@ -76,7 +76,7 @@ NUM sampled(const Grid<T>& grid, const Num<T, N>* size, const Num<T, N>* p, Num<
   S inside[3], f[3], g[3], at[2][2][2], low[2][2], slab[2], beyond[3];
   auto out = zero.x > T(0);
   for (int k = 0; k < 3; ++k) {
-    inside[k] = larger(smaller(p[k], size[k]), -size[k]);
+    inside[k] = larger(-size[k], smaller(size[k], p[k]));  // in this order what is not a number stays so
     const int64_t last = grid.cells[k] - 1;
     const S place = (inside[k] / size[k] + one) * S(T(0.5 * grid.cells[k]));
     Lanes<T> cell{};
