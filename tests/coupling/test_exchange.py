@@ -10,7 +10,7 @@ import torch
 from matter import DOUBLE, ONE, OPEN, ball, derivative, momenta
 
 from torchdlo import scene
-from torchdlo.coupling import RodMatter, mpm
+from torchdlo.coupling import RodMatter, mpm, node_sweeps
 from torchdlo.coupling.exchange import Lines, Touch, block_size, exchange, near_size
 from torchdlo.coupling.laws import Elastic, Liquid
 from torchdlo.coupling.particles import Blob, Grid, assemble, fill_ball, fill_box
@@ -41,6 +41,12 @@ def touch(room=14, sweeps=3):
     return Touch(block_size(0.025, RADIUS, SPACING), room, sweeps)
 
 
+@pytest.fixture
+def by_tensors(monkeypatch):
+    """No kernel: tensor operations, as on a GPU."""
+    monkeypatch.setattr(node_sweeps, "ready", lambda *_: False)
+
+
 def sums(grid, nodes, lines, vel):
     """Linear and angular momentum and energy of nodes and vertices."""
     at = torch.cartesian_prod(*[torch.arange(n, dtype=DOUBLE) for n in grid.size]) * grid.spacing
@@ -52,7 +58,10 @@ def sums(grid, nodes, lines, vel):
 
 @pytest.mark.parametrize("mu", [0.0, 0.3, 5.0])
 @pytest.mark.parametrize("sweeps", [1, 3, 30])
-def test_exchange_keeps_momentum_and_never_adds_energy(mu, sweeps):
+@pytest.mark.parametrize("kernel", [True, False], ids=["kernel", "tensors"])
+def test_exchange_keeps_momentum_and_never_adds_energy(mu, sweeps, kernel, monkeypatch):
+    if not kernel:
+        monkeypatch.setattr(node_sweeps, "ready", lambda *_: False)
     grid, nodes, lines = lines_through_a_ball()
     friction = torch.full((1, 1, 1), mu, dtype=DOUBLE)
     impulse, after, lost = exchange(grid, nodes, lines, touch(sweeps=sweeps), friction)
@@ -65,6 +74,43 @@ def test_exchange_keeps_momentum_and_never_adds_energy(mu, sweeps):
     assert bool((later[2] < before[2]).all())
 
 
+def exchanged(friction, sweeps):
+    """Impulses and velocities after them, and the derivative of a sum of both by all numbers."""
+    grid, nodes, lines = lines_through_a_ball()
+    lead = ["vel", "mass", "share"], ["pos", "vel", "inverse"]
+    leaves = [
+        getattr(x, n).clone().requires_grad_() for x, names in zip((nodes, lines), lead, strict=True) for n in names
+    ]
+    leaves.append(torch.full((1, 1, 1), friction, dtype=DOUBLE, requires_grad=True))
+    nodes = tree.replace(nodes, **dict(zip(lead[0], leaves[:3], strict=True)))
+    lines = tree.replace(lines, **dict(zip(lead[1], leaves[3:6], strict=True)))
+    impulse, after, _ = exchange(grid, nodes, lines, touch(sweeps=sweeps), leaves[6])
+    both = torch.cat([1e3 * impulse.flatten(), after.vel.flatten()])
+    weight = torch.sin(torch.arange(len(both), dtype=DOUBLE))
+    return both.detach(), torch.autograd.grad((weight * both).sum(), leaves)
+
+
+@pytest.mark.skipif(not node_sweeps.ready("cpu", DOUBLE), reason="there is no C++ compiler")
+@pytest.mark.parametrize("mu", [0.0, 0.05, 5.0])
+@pytest.mark.parametrize("sweeps", [1, 4])
+def test_the_kernel_and_tensor_operations_agree_with_their_gradients(mu, sweeps, monkeypatch):
+    found, gradient = exchanged(mu, sweeps)
+    monkeypatch.setattr(node_sweeps, "ready", lambda *_: False)
+    wanted, expected = exchanged(mu, sweeps)
+    torch.testing.assert_close(found, wanted, rtol=1e-12, atol=1e-14)
+    assert all(float(g.abs().max()) > 0 for g in expected)
+    for mine, theirs in zip(gradient, expected, strict=True):
+        assert float((mine - theirs).abs().max() / theirs.abs().max()) < 1e-11
+
+
+def test_places_that_are_no_numbers_touch_nothing():
+    grid, nodes, lines = lines_through_a_ball()
+    lines.pos[0, 4:6] = torch.nan
+    impulse, after, _ = exchange(grid, nodes, lines, touch(), torch.full((1, 1, 1), 0.3, dtype=DOUBLE))
+    assert bool(after.vel.isfinite().all())
+    assert float(impulse[1].norm()) > 0
+
+
 def test_sweeps_converge():
     grid, nodes, lines = lines_through_a_ball()
     friction = torch.full((1, 1, 1), 0.3, dtype=DOUBLE)
@@ -73,7 +119,7 @@ def test_sweeps_converge():
     assert errors[0] > 2 * errors[1] > 4 * errors[2]
 
 
-def test_room_for_the_nodes_of_a_capsule_is_enough_and_less_is_said():
+def test_room_for_the_nodes_of_a_capsule_is_enough_and_less_is_said(by_tensors):
     grid, nodes, lines = lines_through_a_ball()
     friction = torch.full((1, 1, 1), 0.3, dtype=DOUBLE)
     sizes = (0.025, RADIUS, SPACING)
@@ -88,7 +134,7 @@ def test_room_for_the_nodes_of_a_capsule_is_enough_and_less_is_said():
     assert float(few[2].min()) > 0
 
 
-def test_edges_far_from_matter_need_no_room():
+def test_edges_far_from_matter_need_no_room(by_tensors):
     grid, nodes, lines = lines_through_a_ball(30)
     friction = torch.full((1, 1, 1), 0.3, dtype=DOUBLE)
     everything, _, _ = exchange(grid, nodes, lines, touch(room=30), friction)

@@ -12,8 +12,9 @@ off the centreline by d; the couple d x J is exerted by the ends of the edge as 
 own direction a centreline exerts nothing: as if it spun freely, that part of the friction is taken out of all nodes of
 an edge in proportion to how hard they press.
 
-Only edges near matter are looked at, as many as there is room for, and only nodes of a small block around each; sweeps
-work on those of them that are near, as many as a capsule round the edge can hold.
+Tensor operations, used on a GPU and where there is no C++ compiler, look only at edges near matter, as many as there is
+room for, and at nodes of a small block around each; sweeps work on those of them that are near, as many as a capsule
+round the edge can hold. The kernel of `node_sweeps` has room for all.
 
 Only velocities are exchanged, so matter is held off the rope but not drawn to its surface: a rope in a liquid displaces
 a cylinder that is wider than itself, by up to `thickness` node spacings in radius, and heavy matter sinks in slowly
@@ -31,6 +32,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from torchdlo.coupling import node_sweeps
 from torchdlo.coupling.mpm import Nodes
 from torchdlo.coupling.nearby import take
 from torchdlo.coupling.particles import Grid
@@ -231,6 +233,27 @@ def _softness(pairs: _Pairs, lines: Lines, count: int) -> tuple[Tensor, Tensor]:
     return node + rope(1 - s, s), node + rope(1 - s + lever, s + lever)
 
 
+def _by_kernel(grid: Grid, nodes: Nodes, lines: Lines, touch: Touch, friction: Tensor) -> tuple[Tensor, Nodes, Tensor]:
+    """Return what `exchange` does; no edge and no node lacks room."""
+    scenes, vertices = lines.pos.shape[:2]
+    corner = nodes.origin * grid.spacing + nodes.at.new_tensor(grid.first)
+    reach = lines.radius[..., 0] + touch.thickness * grid.spacing
+    inputs = (
+        nodes.vel,
+        nodes.mass,
+        nodes.share[:, 0].expand(scenes, 1),
+        corner,
+        lines.pos,
+        lines.vel,
+        lines.inverse[..., 0],
+        reach.detach().expand(scenes, vertices),
+        friction[:, 0].expand(scenes, 1),
+        torch.where(lines.real[:, 0] > 0, lines.after, -1),
+    )
+    given, vel = node_sweeps.sweep(inputs, grid.size, touch.sweeps, grid.spacing, RELAXATION)
+    return given, tree.replace(nodes, vel=vel), torch.zeros_like(corner[:, :1])
+
+
 def exchange(grid: Grid, nodes: Nodes, lines: Lines, touch: Touch, friction: Tensor) -> tuple[Tensor, Nodes, Tensor]:
     """Return impulses on vertices [N s], shape (B, V, 3), the nodes after it, and how many edges found no room.
 
@@ -241,6 +264,8 @@ def exchange(grid: Grid, nodes: Nodes, lines: Lines, touch: Touch, friction: Ten
         touch: static choices.
         friction: coefficient [1], shape (B or 1, 1, 1).
     """
+    if node_sweeps.ready(nodes.vel.device.type, nodes.vel.dtype):
+        return _by_kernel(grid, nodes, lines, touch, friction)
     pairs, lost = _pair(grid, nodes, lines, touch)
     count, size = nodes.vel.shape[1], lines.pos.shape[1]
     soft_normal, soft_slip = (torch.where(pairs.real > 0, x, 1.0) for x in _softness(pairs, lines, count))

@@ -16,9 +16,9 @@ import torch
 from torch import Tensor
 
 from torchdlo.coupling import transfer
-from torchdlo.coupling.particles import MARGIN, Grid, Matter, Medium, Particles
+from torchdlo.coupling.particles import Grid, Matter, Medium, Particles
+from torchdlo.coupling.walls import walls
 from torchdlo.physics import tree
-from torchdlo.physics.numerics import safe_norm
 
 COURANT = 0.6
 """Longest allowed substep times speed of sound over node spacing; elastic blocks at rest are stable up to 1, liquids,
@@ -104,7 +104,9 @@ def to_grid(
     at, origin = _locate(grid, particles.pos)
     stress, particles = deform(medium, matter, particles, dt)
     mass = density(medium, matter) * matter.volume
-    full = stress[..., [0, 3, 4, 3, 1, 5, 4, 5, 2]]
+    # By rows and not by an index, whose derivative would be a sum over places.
+    rows = stress.mT.unbind(-2)
+    full = torch.stack([rows[k] for k in (0, 3, 4, 3, 1, 5, 4, 5, 2)], -2).mT
     # Slopes are per node spacing.
     slope = h * mass * particles.affine - share * (4 * dt / h) * matter.volume * full
     moved = particles.vel + share * dt * acceleration
@@ -115,41 +117,9 @@ def to_grid(
     return Nodes(at, origin, summed[..., 3], vel, share.reshape(-1, 1, 1)), particles
 
 
-def walls(grid: Grid, origin: Tensor, vel: Tensor, friction: Tensor) -> Tensor:
-    """Return velocities of nodes after the faces of the box, shape (B, N, 3).
-
-    Args:
-        grid: box and walls.
-        origin: number of the first computed node, shape (B, 3).
-        vel: velocities of nodes [m/s], shape (B, N, 3).
-        friction: coefficient [1], shape (B or 1, 1).
-    """
-    size = grid.size
-    shaped = vel.unflatten(1, size)
-    left, lost, sticks = [], [], torch.zeros_like(shaped[..., 0], dtype=torch.bool)
-    for axis, v in enumerate(shaped.unbind(-1)):
-        number = origin[:, axis, None] + torch.arange(size[axis], device=vel.device)
-        number = number.reshape(-1, *(size[axis] if a == axis else 1 for a in range(3)))
-        lower, upper = number <= MARGIN, number >= grid.nodes[axis] - 1 - MARGIN
-        kept, taken = v, torch.zeros_like(v)
-        for behind, kind, into in ((lower, grid.walls[2 * axis], v < 0), (upper, grid.walls[2 * axis + 1], v > 0)):
-            stopped = behind & into if kind == "separate" else (behind if kind != "open" else torch.zeros_like(behind))
-            kept = torch.where(stopped, 0.0, kept)
-            taken = torch.where(stopped, v, taken) if kind == "separate" else taken
-            sticks = sticks | behind if kind == "stick" else sticks
-        left.append(kept)
-        lost.append(taken)
-    # Coulomb: what the faces take along their normals, they take mu times as much across, down to rest.
-    speed, press = safe_norm(torch.stack(left, -1)), safe_norm(torch.stack(lost, -1))
-    share = (1 - friction.reshape(-1, 1, 1, 1, 1) * press / torch.where(speed > 0, speed, 1.0)).clamp(min=0.0)
-    share = torch.where(sticks[..., None], 0.0, share)
-    return (share * torch.stack(left, -1)).flatten(1, 3)
-
-
 def from_grid(medium: Medium, matter: Matter, particles: Particles, nodes: Nodes, dt: float) -> Particles:
     """Return the particles after the substep, moved with the nodes; walls act last."""
-    vel = walls(medium.grid, nodes.origin, nodes.vel, matter.friction)
-    filled = torch.cat([vel, torch.zeros_like(vel[..., :1])], -1)
+    filled = walls(medium.grid, nodes.origin, nodes.vel, matter.friction)
     value, slope = transfer.collect(nodes.at, filled, medium.grid.size)
     batch = particles.pos.shape[:-2]
     vel = value[:, :3].reshape(*batch, 3, -1).mT
