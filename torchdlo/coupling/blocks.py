@@ -96,4 +96,4 @@ def _rows(motion: BodyMotion, x: Tensor) -> Tensor:
 
 def once(ctx, *by) -> None:
     """Refuse to differentiate a derivative: what stands in for the backward pass of an operator's backward pass."""
-    raise RuntimeError("contact has no second derivative; do not ask for create_graph through it")
+    raise RuntimeError("contact and matter have no second derivative; do not ask for create_graph through them")

@@ -98,7 +98,7 @@ torch.library.register_autograd("torchdlo::node_sweeps_back", blocks.once, lib=_
 def sweep(
     inputs: Sequence[Tensor], size: Sequence[int], sweeps: int, spacing: float, relaxation: float
 ) -> tuple[Tensor, Tensor]:
-    """Return impulses on vertices [N s], shape (B, V, 3), and velocities of nodes after them [m/s]; differentiable once.
+    """Return impulses on vertices [N s] (B, V, 3), and velocities of nodes after them [m/s]; differentiable once.
 
     Args:
         inputs: velocities (B, N, 3) and masses (B, N) of nodes, the part of an impulse that acts (B, 1), the first

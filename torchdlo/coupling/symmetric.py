@@ -3,20 +3,21 @@
 Components are tensors of one shape each, (..., N), so that one instruction works on many particles. Isotropic functions
 are taken through the eigenvectors. Their derivative is exact and finite for every tensor, also where eigenvalues
 coincide and eigenvectors have none: in the eigenbasis it multiplies by divided differences of the function
-(Daleckii and Krein 1965; Higham 2008, Functions of Matrices, theorem 3.11, doi:10.1137/1.9780898717778). Second
-derivatives are those of the linearised function and not exact.
+(Daleckii and Krein 1965; Higham 2008, Functions of Matrices, theorem 3.11, doi:10.1137/1.9780898717778).
+
+On the CPU a C++ kernel does it, which has no second derivative; elsewhere, and without a compiler, tensor operations do,
+whose second derivatives are those of the linearised function and not exact.
 """
 
 from __future__ import annotations
 
 import ctypes
 from collections.abc import Callable
-from pathlib import Path
 
 import torch
 from torch import Tensor
 
-from torchdlo.physics import native
+from torchdlo.coupling import blocks
 
 Symmetric = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]
 """Components xx, yy, zz, xy, xz, yz of a symmetric tensor, shape (..., N) each."""
@@ -108,20 +109,10 @@ def _jacobi(tensors: Tensor) -> tuple[Tensor, Tensor]:
     return torch.stack(value[:3]), torch.stack(vectors)
 
 
-def _eigen(tensors: Tensor) -> tuple[Tensor, Tensor]:
-    library = native.library(Path(__file__).with_name("symmetric.cpp"), "-fno-math-errno", "-fno-trapping-math")
-    if tensors.device.type != "cpu" or library is None or tensors.dtype not in (torch.float32, torch.float64):
-        return _jacobi(tensors)
-    values, vectors = tensors.new_empty(3, tensors.shape[1]), tensors.new_empty(9, tensors.shape[1])
-    call = library.eigen_double if tensors.dtype == torch.float64 else library.eigen_float
-    call(*(ctypes.c_void_p(t.data_ptr()) for t in (tensors, values, vectors)), ctypes.c_int64(tensors.shape[1]))
-    return values, vectors
-
-
 # An operator of its own: compilers take minutes to unroll the rotations.
 _library = torch.library.Library("torchdlo", "FRAGMENT")
 _library.define("eigen3(Tensor tensors) -> (Tensor, Tensor)", tags=(torch.Tag.needs_contiguous_strides,))
-_library.impl("eigen3", _eigen, "CompositeExplicitAutograd")
+_library.impl("eigen3", _jacobi, "CompositeExplicitAutograd")
 _library.impl("eigen3", lambda t: (t.new_empty(3, t.shape[1]), t.new_empty(9, t.shape[1])), "Meta")
 
 
@@ -146,7 +137,7 @@ def _rotate(u: Square, s: Symmetric, back: bool) -> Symmetric:
     return tuple(sum(left[i][k] * at(j, k) for k in range(3)) for i, j in PAIRS)
 
 
-def isotropic(
+def _plainly(
     e: Symmetric, value: Callable[[Tensor], Tensor], slope: Callable[[Tensor, Tensor], Tensor], least: float | None
 ) -> Symmetric:
     """Return the function of a tensor that acts on its eigenvalues.
@@ -173,11 +164,58 @@ def isotropic(
     return _rotate(u, found, back=True)
 
 
+_FUNCTIONS = ("stretch", "hencky", "from_hencky")
+_function, ready = blocks.kernel("symmetric")
+
+
+def _run(tensors: Tensor, by: Tensor | None, which: str) -> Tensor:
+    out = torch.empty_like(tensors)
+    places = (None if x is None else ctypes.c_void_p(x.data_ptr()) for x in (tensors, by, out))
+    call = _function("act", tensors.dtype)
+    call(_FUNCTIONS.index(which), *places, ctypes.c_int64(tensors.shape[1]), torch.get_num_threads())
+    return out
+
+
+for _schema, _make in (
+    ("isotropic(Tensor tensors, str which) -> Tensor", lambda tensors, which: _run(tensors, None, which)),
+    ("isotropic_back(Tensor tensors, Tensor by, str which) -> Tensor", _run),
+):
+    _name = _schema.partition("(")[0]
+    _library.define(_schema, tags=(torch.Tag.needs_contiguous_strides,))
+    _library.impl(_name, _make, "CPU")
+    _library.impl(_name, lambda tensors, *others: torch.empty_like(tensors), "Meta")
+
+
+def _save(ctx, inputs, output) -> None:
+    tensors, ctx.which = inputs
+    ctx.save_for_backward(tensors)
+
+
+def _backward(ctx, by: Tensor):
+    return torch.ops.torchdlo.isotropic_back(*ctx.saved_tensors, by.contiguous(), ctx.which), None
+
+
+torch.library.register_autograd("torchdlo::isotropic", _backward, setup_context=_save, lib=_library)
+torch.library.register_autograd("torchdlo::isotropic_back", blocks.once, lib=_library)
+
+
+def _isotropic(e: Symmetric, which: str, *formulas) -> Symmetric:
+    """Return a function of a tensor by its name in the kernel, or by its formulas as `_plainly` takes them."""
+    if not ready(e[0].device.type, e[0].dtype):
+        return _plainly(e, *formulas)
+    parts = torch.broadcast_tensors(*e)
+    found = torch.ops.torchdlo.isotropic(torch.stack([x.reshape(-1) for x in parts]), which)
+    return tuple(found.reshape(6, *parts[0].shape).unbind(0))
+
+
 def stretch(e: Symmetric) -> Symmetric:
     """Return sqrt(I + e) - I."""
-    return isotropic(
-        e, lambda l: l / (1 + (1 + l).sqrt()), lambda a, b: 1 / ((1 + a).sqrt() + (1 + b).sqrt()), CRUSHED - 1
-    )
+
+
+    def slope(a: Tensor, b: Tensor) -> Tensor:
+        return 1 / ((1 + a).sqrt() + (1 + b).sqrt())
+
+    return _isotropic(e, "stretch", lambda l: l / (1 + (1 + l).sqrt()), slope, CRUSHED - 1)
 
 
 def hencky(e: Symmetric) -> Symmetric:
@@ -191,7 +229,7 @@ def hencky(e: Symmetric) -> Symmetric:
         direct = torch.atanh(torch.where(small, 0.5, z)) / torch.where(small, 0.5, z)
         return torch.where(small, 1 + z2 * (1 / 3 + z2 * (1 / 5 + z2 * (1 / 7 + z2 / 9))), direct) / (2 + a + b)
 
-    return isotropic(e, lambda l: 0.5 * torch.log1p(l), slope, CRUSHED - 1)
+    return _isotropic(e, "hencky", lambda l: 0.5 * torch.log1p(l), slope, CRUSHED - 1)
 
 
 def from_hencky(h: Symmetric) -> Symmetric:
@@ -204,4 +242,4 @@ def from_hencky(h: Symmetric) -> Symmetric:
         direct = torch.sinh(d) / torch.where(small, 1.0, d)
         return 2 * torch.exp(a + b) * torch.where(small, 1 + d2 * (1 / 6 + d2 * (1 / 120 + d2 / 5040)), direct)
 
-    return isotropic(h, lambda l: torch.expm1(2 * l), slope, None)
+    return _isotropic(h, "from_hencky", lambda l: torch.expm1(2 * l), slope, None)
