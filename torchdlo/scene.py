@@ -17,7 +17,7 @@ from torch import Tensor
 from torchdlo.coupling import bodies as rigid
 from torchdlo.coupling import body_matter, mpm, rod_matter, watch
 from torchdlo.coupling.bodies import Body, BodyParams, BodyState, BodyTargets, Solid, place
-from torchdlo.coupling.particles import Matter, Medium, Particles
+from torchdlo.coupling.particles import Matter, Medium, Particles, rows_of
 from torchdlo.coupling.watch import survey
 from torchdlo.physics import build, rod, stability, traced, tree
 from torchdlo.physics.build import Rope
@@ -130,17 +130,13 @@ class Scene:
             need(len(set(slots)) == len(slots), f"{name} {list(slots)} names a slot twice")
         seams = [s for s in self.held_edges if not self.topology.edge_mask()[s]]
         need(not seams, f"held_edges names {seams}, the gap between the ends of an open rope")
-        need(
-            not self.held_edges or self.twist != "none",
-            "held_edges prescribe twist, but twist is 'none'; choose 'quasistatic' or 'dynamic'",
-        )
+        free = not self.held_edges or self.twist != "none"
+        need(free, "held_edges prescribe twist, but twist is 'none'; choose 'quasistatic' or 'dynamic'")
         names = [e.name for e in self.effects]
         twice = {n for n in names if names.count(n) > 1}
         need(not twice, f"effects {sorted(twice)} are listed twice")
-        need(
-            self.integrator == "explicit" or self.constrained,
-            "implicit steps solve for edge lengths; keep constrained=True and give the rope its stretch stiffness",
-        )
+        solved = self.integrator == "explicit" or self.constrained
+        need(solved, "implicit steps solve for edge lengths; keep constrained=True and give ropes a stretch stiffness")
         need(
             bool(self.bodies) or not {"rod_body", "finger_pads", "body_matter"} & set(names),
             "RodBody, BodyMatter or FingerPads needs bodies, but there are no bodies; give make(..., bodies=[Solid()])",
@@ -151,10 +147,8 @@ class Scene:
         if self.integrator == "implicit":
             loops = [n for n, c in zip(self.topology.counts, self.topology.closed, strict=True) if c and n < 5]
             need(not loops, f"a closed rope has {loops[:1]} vertices; implicit steps need at least 5")
-        need(
-            self.twist != "quasistatic" or any(n == "twist" for n in names),
-            "quasistatic twist needs the Twist effect; add it, or set twist='none'",
-        )
+        twisted = self.twist != "quasistatic" or "twist" in names
+        need(twisted, "quasistatic twist needs the Twist effect; add it, or set twist='none'")
 
     @property
     def held(self) -> tuple[int, int]:
@@ -292,7 +286,13 @@ def advance(scene: Scene, params: Params, state: State, start: Control, control:
     if scene.matter:
         particles, missed = rod_matter.finish(scene.matter, params.matter, pool, push, settings.dt, missed)
     after = State(rods, state.time + settings.dt, missed, mean, moved, particles)
-    return laid_out(after) if torch.compiler.is_compiling() else after
+    return _laid_out(after) if torch.compiler.is_compiling() else after
+
+
+def _laid_out(state: State) -> State:
+    """Return a state that is stored to the last stride as compiled steps expect it."""
+    particles = laid_out(state.matter, rows_of, rows_of)
+    return tree.replace(laid_out(tree.replace(state, matter=())), matter=particles)
 
 
 def step(scene: Scene, params: Params, state: State, control: Control, *, advance=advance, survey=survey) -> State:
@@ -343,8 +343,8 @@ def stepper(scene: Scene, *, compiled: bool = True, recorded: bool = False):
     once = scene.substeps == 1 and not any(e.reacts for e in scene.effects)
 
     def made(inline: bool):
-        # Without gradients, neighbours are best read where they are used; with them, copies are worth their cost.
-        part = partial(compile, options={"force_pointwise_cat": inline})
+        # Neighbours are best read where they are used, but with gradients and of much matter copies pay.
+        part = partial(compile, options={"force_pointwise_cat": inline and scene.matter is None})
         return (part(_step), advance) if once else (_step, part(advance))
 
     ways = {True: made(False), False: made(True)}
@@ -352,7 +352,7 @@ def stepper(scene: Scene, *, compiled: bool = True, recorded: bool = False):
 
     def run(params: Params, state: State, control: Control) -> State:
         _check_control(scene, control)
-        graded, state = torch.is_grad_enabled(), laid_out(state)
+        graded, state = torch.is_grad_enabled(), _laid_out(state)
         if graded:
             moving = alike((state.rods, state.reaction, state.bodies, state.matter), (params, control))
             state = tree.replace(state, **dict(zip(("rods", "reaction", "bodies", "matter"), moving, strict=True)))

@@ -8,7 +8,7 @@ import pytest
 import torch
 from matter import DOUBLE, derivative, run
 
-from torchdlo.coupling import laws
+from torchdlo.coupling import laws, symmetric
 from torchdlo.coupling.laws import Elastic, Liquid, Plastic, Sand
 from torchdlo.coupling.particles import Blob, Grid, assemble, fill_box
 from torchdlo.coupling.symmetric import deviator, eigen, from_hencky, full, hencky, squared, stretch, trace
@@ -218,3 +218,24 @@ def test_a_heap_below_its_angle_stays_and_one_far_above_slides_until_it_is():
     most = 2 * math.sqrt(3) * math.sin(math.radians(10)) / (3 - math.sin(math.radians(10)))
     assert moved > 0.2
     assert slope < most * (1 + 0.01 / 0.036 + 0.01 / 0.14)
+
+
+@pytest.mark.skipif(not symmetric.ready("cpu", DOUBLE), reason="there is no C++ compiler")
+@pytest.mark.parametrize("function", [stretch, hencky, from_hencky])
+@pytest.mark.parametrize("size", [1e-6, 1e-2, 0.15, 0.5])
+def test_the_kernel_and_tensor_operations_agree_with_their_derivatives(function, size, monkeypatch):
+    weight = torch.sin(torch.arange(240, dtype=DOUBLE)).reshape(6, 40)
+
+    def both():
+        root = size * torch.randn(40, 3, 3, generator=torch.Generator().manual_seed(1), dtype=DOUBLE)
+        root[:4] = 0.0
+        e = root + root.mT + root @ root.mT  # (I + root)(I + root)^T - I: no eigenvalue is below -1
+        x = torch.stack([e[:, i, j] for i, j in symmetric.PAIRS]).requires_grad_()
+        found = torch.stack(function(tuple(x)))
+        return found.detach(), torch.autograd.grad((weight * found).sum(), x)[0]
+
+    mine = both()
+    monkeypatch.setattr(symmetric, "ready", lambda *_: False)
+    for found, wanted in zip(mine, both(), strict=True):
+        # Tensors that are nearly crushed magnify rounding by up to the square of their stretch.
+        torch.testing.assert_close(found, wanted, rtol=1e-10, atol=1e-12 * size)

@@ -162,9 +162,14 @@ def fill_ball(centre: Sequence[float], radius: float, spacing: float, like: Tens
     return points[points.norm(dim=-1) <= radius] + points.new_tensor(list(centre))
 
 
+def rows_of(x: Tensor) -> Tensor:
+    """Return a view of (..., P, C) in the order of its storage, (..., C, P), or of that in the logical order."""
+    return x.mT
+
+
 def stored(x: Tensor) -> Tensor:
     """Return (..., P, C) with the same values stored as (..., C, P)."""
-    return x.mT.contiguous().mT
+    return rows_of(rows_of(x).contiguous())
 
 
 def assemble(blobs: Sequence[Blob], grid: Grid, *, friction: float | Tensor = 0.3) -> tuple[Medium, Matter, Particles]:

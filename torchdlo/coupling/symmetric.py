@@ -5,7 +5,7 @@ are taken through the eigenvectors. Their derivative is exact and finite for eve
 coincide and eigenvectors have none: in the eigenbasis it multiplies by divided differences of the function
 (Daleckii and Krein 1965; Higham 2008, Functions of Matrices, theorem 3.11, doi:10.1137/1.9780898717778).
 
-On the CPU a C++ kernel does it, which has no second derivative; elsewhere, and without a compiler, tensor operations do,
+On the CPU a C++ kernel does it, without a second derivative; elsewhere, and without a compiler, tensor operations do,
 whose second derivatives are those of the linearised function and not exact.
 """
 
@@ -210,7 +210,6 @@ def _isotropic(e: Symmetric, which: str, *formulas) -> Symmetric:
 
 def stretch(e: Symmetric) -> Symmetric:
     """Return sqrt(I + e) - I."""
-
 
     def slope(a: Tensor, b: Tensor) -> Tensor:
         return 1 / ((1 + a).sqrt() + (1 + b).sqrt())

@@ -91,21 +91,27 @@ def alike(state: Any, others: Any) -> Any:
     return tree.map(lambda x: x if x.requires_grad else x.detach().requires_grad_(), state)
 
 
-def laid_out(state: T) -> T:
-    """Return a state with its tensors stored batch-innermost, to the last stride.
+def laid_out(
+    state: T, stored: Callable[[Tensor], Tensor] = tree.stored, logical: Callable[[Tensor], Tensor] = tree.logical
+) -> T:
+    """Return a state with its tensors stored in one way, batch-innermost unless told otherwise, to the last stride.
 
     Compiled steps are made for the strides of their inputs, also of axes of size 1, where operations leave any: later
     states are then stored as first ones.
+
+    Args:
+        state: what to store.
+        stored: returns a view of a tensor (..., V, C) with its axes in the order of storage.
+        logical: returns a view of that with its axes in the logical order.
     """
 
     def lay(x: Tensor) -> Tensor:
-        n = x.dim()
-        if n < 3:
+        if x.dim() < 3:
             return x
-        stored = x.permute(n - 1, n - 2, *range(n - 2))
-        if stored.stride() == _dense(stored.shape):
+        rows = stored(x)
+        if rows.stride() == _dense(rows.shape):
             return x
-        return stored.clone(memory_format=torch.contiguous_format).permute(*range(2, n), 1, 0)
+        return logical(rows.clone(memory_format=torch.contiguous_format))
 
     return tree.map(lay, state)
 
