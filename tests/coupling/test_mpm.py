@@ -30,6 +30,12 @@ def test_transfers_have_the_derivatives_that_they_say():
     at, value, slope, grid = (t.requires_grad_() for t in tensors)
     assert torch.autograd.gradcheck(lambda a, v, s: transfer.spread(a, v, s, size), (at, value, slope))
     assert torch.autograd.gradcheck(lambda a, g: transfer.collect(a, g, size), (at, grid))
+    massive = grid.detach()[:, :40].clone()
+    massive[..., 3] = massive[..., 3].abs() + 0.1
+    massive[:, ::5] = 0.0  # no mass
+    massive.requires_grad_()
+    there = massive[..., 3:] > 0
+    assert torch.autograd.gradcheck(lambda g: transfer.divide(g * there), (massive,))
 
 
 def test_the_kernel_does_what_tensor_operations_do(monkeypatch):
@@ -37,12 +43,16 @@ def test_the_kernel_does_what_tensor_operations_do(monkeypatch):
     at[0, :, 0], at[1, 1, 1], at[1, 0, 2] = -5.0, 1e9, torch.nan  # lost particles, too
     calls = torch.ops.torchdlo
 
-    def all_three():
-        return calls.spread(at, value, slope, size), *calls.collect(at, grid, size)
+    grid[:, ::5] = 0.0
 
-    fast = all_three()
+    def everything():
+        carried = calls.divide(grid), calls.divide_back(grid, *calls.divide(grid + 1))
+        return calls.spread(at, value, slope, size), *calls.collect(at, grid, size), *carried[0], carried[1]
+
+    fast = everything()
     monkeypatch.setattr(transfer, "_native", lambda *_: False)
-    for a, b in zip(fast, all_three(), strict=True):
+    monkeypatch.setattr(transfer, "_native_divide", lambda *_: False)
+    for a, b in zip(fast, everything(), strict=True):
         assert torch.allclose(a.nan_to_num(), b.nan_to_num(), rtol=1e-12, atol=1e-12)
         assert a.shape == b.shape
 

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from torchdlo.coupling import transfer
-from torchdlo.coupling.particles import Grid, Matter, Medium, Particles
+from torchdlo.coupling.particles import Grid, Matter, Medium, Particles, rows_of
 from torchdlo.coupling.walls import walls
 from torchdlo.physics import tree
 
@@ -58,8 +58,9 @@ def deform(medium: Medium, matter: Matter, particles: Particles, dt: float) -> t
     stresses, strains, histories = [], [], []
     for group, here in medium.pieces():
         numbers = {n: v[..., 0] for n, v in matter.laws[group.name].items()}
-        strain = particles.strain[..., here, :].unbind(-1)
-        change = (dt * particles.affine[..., here, :]).unbind(-1)
+        # Component by component, as they are stored; so are the derivatives then.
+        strain = rows_of(particles.strain)[..., here].unbind(-2)
+        change = tuple(dt * row for row in rows_of(particles.affine)[..., here].unbind(-2))
         history = particles.history[..., here, 0]
         stress, strain, history = group.law.answer(numbers, strain, history, change, dt)
         stresses.append(torch.stack(torch.broadcast_tensors(*stress), -2))
@@ -104,17 +105,15 @@ def to_grid(
     at, origin = _locate(grid, particles.pos)
     stress, particles = deform(medium, matter, particles, dt)
     mass = density(medium, matter) * matter.volume
-    # By rows and not by an index, whose derivative would be a sum over places.
-    rows = stress.mT.unbind(-2)
-    full = torch.stack([rows[k] for k in (0, 3, 4, 3, 1, 5, 4, 5, 2)], -2).mT
+    # Not by an index, whose derivative would be a sum over places.
+    rows = rows_of(stress).unbind(-2)
+    full = rows_of(torch.stack([rows[k] for k in (0, 3, 4, 3, 1, 5, 4, 5, 2)], -2))
     # Slopes are per node spacing.
     slope = h * mass * particles.affine - share * (4 * dt / h) * matter.volume * full
     moved = particles.vel + share * dt * acceleration
     said = torch.cat([(mass * moved).mT, mass.expand(*moved.shape[:-1], 1).mT], -2)
-    summed = transfer.spread(at, said.reshape(-1, 4, said.shape[-1]), flat(slope), grid.size)
-    there = summed[..., 3:] > 0
-    vel = torch.where(there, summed[..., :3] / torch.where(there, summed[..., 3:], 1.0), 0.0)
-    return Nodes(at, origin, summed[..., 3], vel, share.reshape(-1, 1, 1)), particles
+    vel, summed = transfer.divide(transfer.spread(at, said.reshape(-1, 4, said.shape[-1]), flat(slope), grid.size))
+    return Nodes(at, origin, summed, vel, share.reshape(-1, 1, 1)), particles
 
 
 def from_grid(medium: Medium, matter: Matter, particles: Particles, nodes: Nodes, dt: float) -> Particles:

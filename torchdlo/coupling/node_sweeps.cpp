@@ -238,11 +238,11 @@ struct Scene {
     }
   }
 
-  // Goes backwards: `by` is the derivative by what is given to vertices, `felt` that by the velocities of nodes.
-  void backward(const Inputs<T>& in, std::vector<R>& by, const R* felt, Inputs<T>& to) {
+  // Goes backwards: `by` is the derivative by what is given to vertices; that by the velocities of nodes is in `to`.
+  void backward(const Inputs<T>& in, std::vector<R>& by, Inputs<T>& to) {
     std::vector<Adjoint> d(pairs.size(), Adjoint{});
     std::vector<R> along(edges.size(), R{}), after(nodes.size());
-    for (size_t i = 0; i < nodes.size(); ++i) after[i] = felt[nodes[i]];
+    for (size_t i = 0; i < nodes.size(); ++i) after[i] = to.vel[nodes[i]];
     for (int s = n.sweeps; s--;) back(s, in, by, after, d, along, to);
     for (size_t i = 0; i < nodes.size(); ++i) to.vel[nodes[i]] += after[i];
     harden(in, d, along, to);
@@ -402,20 +402,19 @@ static void sweep(T* const* from, V3<T>* given, V3<T>* vel, const Sizes& n, int 
   }
 }
 
-// The derivatives are zero at first, but for that by the velocities of nodes, which is what is given for them.
+// The derivatives that are found are zero at first, but for that by the velocities of nodes: what is given for them.
 template <typename T>
 static void back(T* const* from, const V3<T>* by, T* const* out, const Sizes& n, int threads) {
 #pragma omp parallel num_threads(threads)
   {
     Scene<T> scene(n);
-    std::vector<V3<T>> given, felt;
+    std::vector<V3<T>> given;
     SCENES {
       const Inputs<T> in(from, b, n);
       Inputs<T> to(out, b, n);
       scene.forward(in);
       given.assign(by + b * n.vertices, by + (b + 1) * n.vertices);
-      felt.assign(to.vel, to.vel + n.nodes);
-      scene.backward(in, given, felt.data(), to);
+      scene.backward(in, given, to);
     }
   }
 }

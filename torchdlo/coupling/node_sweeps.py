@@ -59,8 +59,8 @@ def _sweep_meta(*args) -> tuple[Tensor, Tensor]:
 
 def _back(*args) -> list[Tensor]:
     inputs, (given, vel), static = args[:_COUNT], args[_COUNT : _COUNT + 2], args[_COUNT + 2 :]
-    out = [torch.zeros_like(x) for x in inputs]
-    out[0].copy_(vel)
+    rest = enumerate(inputs[1:], 1)
+    out = [vel.clone(), *(torch.empty_like(x) if k in _FIXED else torch.zeros_like(x) for k, x in rest)]
     _run("back", inputs, (ctypes.c_void_p(given.data_ptr()), _places(out)), static)
     return out
 

@@ -128,6 +128,29 @@ static void tilt(const T* at, const T* value, const T* slope, const T* grid, T* 
   }
 }
 
+// What moves at the nodes: grid holds momentum and mass, vel (scenes, nodes, 3), mass (scenes, nodes).
+template <typename T>
+static void divide(const T* grid, T* vel, T* mass, int64_t nodes) {
+  for (int64_t i = 0; i < nodes; ++i) {
+    const T m = mass[i] = grid[4 * i + 3];
+    for (int a = 0; a < 3; ++a) vel[3 * i + a] = m > 0 ? grid[4 * i + a] / m : T(0);
+  }
+}
+
+// Its derivative: `by` is that by the velocities, `mass_by` that by the masses.
+template <typename T>
+static void divide_back(const T* grid, const T* by, const T* mass_by, T* out, int64_t nodes) {
+  for (int64_t i = 0; i < nodes; ++i) {
+    const T *g = grid + 4 * i, *d = by + 3 * i;
+    T moved = 0;
+    for (int a = 0; a < 3; ++a) {
+      out[4 * i + a] = g[3] > 0 ? d[a] / g[3] : T(0);
+      moved += g[3] > 0 ? g[a] / g[3] * out[4 * i + a] : T(0);
+    }
+    out[4 * i + 3] = mass_by[i] - moved;
+  }
+}
+
 #define SCENES _Pragma("omp parallel for num_threads(threads)") for (int64_t b = 0; b < scenes; ++b)
 
 template <typename T>
@@ -142,6 +165,17 @@ static void run(int which, const T* at, T* value, T* slope, T* grid, T* out, int
     if (which == 2) tilt<T>(a, v, s, g, out + 3 * b * count, count, size);
   }
 }
+
+#define DIVIDE(T)                                                                                                  \
+  extern "C" void transfer_divide_##T(const T* grid, T* vel, T* mass, int64_t scenes, int64_t nodes, int threads) {   \
+    SCENES divide<T>(grid + 4 * b * nodes, vel + 3 * b * nodes, mass + b * nodes, nodes);                             \
+  }                                                                                                                   \
+  extern "C" void transfer_divide_back_##T(const T* grid, const T* by, const T* mass_by, T* out, int64_t scenes,      \
+                                           int64_t nodes, int threads) {                                              \
+    SCENES divide_back<T>(grid + 4 * b * nodes, by + 3 * b * nodes, mass_by + b * nodes, out + 4 * b * nodes, nodes); \
+  }
+DIVIDE(float)
+DIVIDE(double)
 
 extern "C" void transfer_float(int which, const float* at, float* value, float* slope, float* grid, float* out,
                                int64_t scenes, int64_t count, const int64_t* size, int threads) {

@@ -18,6 +18,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from torchdlo.coupling import blocks
 from torchdlo.physics import native
 
 _SPREAD, _COLLECT, _TILT = range(3)
@@ -103,6 +104,40 @@ def _tilt(at: Tensor, value: Tensor, slope: Tensor, grid: Tensor, size: Sequence
     return tilted - torch.einsum("bkap,bkp->bap", slope.unflatten(1, (3, 3)), means)
 
 
+def _divide(grid: Tensor) -> tuple[Tensor, Tensor]:
+    vel, mass = _divide_meta(grid)
+    if _native_divide("divide", grid, vel, mass):
+        return vel, mass
+    there = grid[..., 3:] > 0
+    return torch.where(there, grid[..., :3] / torch.where(there, grid[..., 3:], 1.0), 0.0), grid[..., 3].clone()
+
+
+def _divide_meta(grid: Tensor) -> tuple[Tensor, Tensor]:
+    return grid.new_empty(*grid.shape[:2], 3), grid.new_empty(grid.shape[:2])
+
+
+def _divide_back(grid: Tensor, vel: Tensor, mass: Tensor) -> Tensor:
+    out = torch.empty_like(grid)
+    if _native_divide("divide_back", grid, vel, mass, out):
+        return out
+    there = grid[..., 3:] > 0
+    whole = torch.where(there, grid[..., 3:], 1.0)
+    found = torch.where(there, vel / whole, 0.0)
+    moved = torch.where(there, grid[..., :3] / whole * found, 0.0).sum(-1)
+    return torch.cat([found, (mass - moved).unsqueeze(-1)], -1)
+
+
+def _native_divide(what: str, grid: Tensor, *tensors: Tensor) -> bool:
+    """Run a C++ kernel on (grid, ...); whether it could."""
+    library = native.library(Path(__file__).with_name("transfer.cpp")) if grid.device.type == "cpu" else None
+    if library is None or grid.dtype not in (torch.float32, torch.float64):
+        return False
+    call = getattr(library, f"transfer_{what}_{'double' if grid.dtype == torch.float64 else 'float'}")
+    address = [ctypes.c_void_p(t.data_ptr()) for t in (grid, *tensors)]
+    call(*address, *(ctypes.c_int64(n) for n in grid.shape[:2]), torch.get_num_threads())
+    return True
+
+
 _library = torch.library.Library("torchdlo", "FRAGMENT")
 _OPS: dict[str, tuple[str, Callable, Callable]] = {
     "spread": (
@@ -119,6 +154,12 @@ _OPS: dict[str, tuple[str, Callable, Callable]] = {
         "(Tensor at, Tensor value, Tensor slope, Tensor grid, int[] size) -> Tensor",
         _tilt,
         lambda at, value, slope, grid, size: at.new_empty(at.shape),
+    ),
+    "divide": ("(Tensor grid) -> (Tensor, Tensor)", _divide, _divide_meta),
+    "divide_back": (
+        "(Tensor grid, Tensor vel, Tensor mass) -> Tensor",
+        _divide_back,
+        lambda grid, vel, mass: torch.empty_like(grid),
     ),
 }
 for _name, (_schema, _make, _fake) in _OPS.items():
@@ -148,6 +189,14 @@ def _collect_backward(ctx, value: Tensor, slope: Tensor):
 
 torch.library.register_autograd("torchdlo::spread", _spread_backward, setup_context=_save_spread, lib=_library)
 torch.library.register_autograd("torchdlo::collect", _collect_backward, setup_context=_save_spread, lib=_library)
+torch.library.register_autograd(
+    "torchdlo::divide",
+    lambda ctx, vel, mass: torch.ops.torchdlo.divide_back(*ctx.saved_tensors, vel.contiguous(), mass.contiguous()),
+    setup_context=lambda ctx, inputs, output: ctx.save_for_backward(*inputs),
+    lib=_library,
+)
+for _name in ("tilt", "divide_back"):
+    torch.library.register_autograd(f"torchdlo::{_name}", blocks.once, lib=_library)
 
 
 def spread(at: Tensor, value: Tensor, slope: Tensor, size: Sequence[int]) -> Tensor:
@@ -171,3 +220,12 @@ def collect(at: Tensor, grid: Tensor, size: Sequence[int]) -> tuple[Tensor, Tens
         size: as in `spread`.
     """
     return torch.ops.torchdlo.collect(at.contiguous(), grid.contiguous(), list(size))
+
+
+def divide(grid: Tensor) -> tuple[Tensor, Tensor]:
+    """Return velocities of nodes, zero where there is no mass [m/s] (B, N, 3), and masses [kg] (B, N).
+
+    Args:
+        grid: momentum [kg m/s] and mass [kg] of nodes, shape (B, N, 4).
+    """
+    return torch.ops.torchdlo.divide(grid.contiguous())
