@@ -236,3 +236,21 @@ def test_a_general_law_is_named_only_where_its_other_numbers_tell(
     # Wind fits better than drag, by more than a tie.
     best, _, _, also = judge._judged([], fits, ["wind", "air_drag"], fitted("air_drag", 2e-3))
     assert best is fits[first] and also == (["wind"] if first == "air_drag" else [])
+
+
+def test_an_effect_matters_beside_a_baseline_that_went_astray() -> None:
+    # On one trial the baseline was off by half a metre; fitted further it was not. The effect closes most of the rest.
+    gaps = {"baseline": [5e-3, 0.5], "rival": [5e-3, 30e-3], "more": [5e-3, 10e-3], "less": [5e-3, 29.9e-3]}
+    judge = object.__new__(search._Search)
+    judge.bench = SimpleNamespace(
+        gaps=lambda f, split: np.array(gaps[f]), level=1e-3, floor=SimpleNamespace(noise=1e-3)
+    )
+    judge.plain = ["baseline", "rival"]
+    assert judge._matters("rival", "more", "test")
+    assert not judge._matters("rival", "less", "test")
+
+
+def test_nothing_counts_as_explained_where_the_floor_is_not_known() -> None:
+    assert search._verdict([], 2e-3, 1e-3) == "none" and search._verdict([], 4e-3, 1e-3) == "unknown"
+    assert search._verdict([], 0.2, float("inf")) == "unknown"
+    assert search._verdict(["stretch"], 1e-3, float("inf")) == "partial"

@@ -17,14 +17,14 @@ from torch import Tensor
 
 from torchdlo import scene as scenes
 from torchdlo.errors import InputError
-from torchdlo.physics import constrain, rotation, traced, tree
+from torchdlo.physics import rotation, traced, tree
 from torchdlo.physics.effect import Effect, Param
 from torchdlo.physics.effects.elastic import Bend, BendFrame, Twist
 from torchdlo.physics.effects.field import Damping, Gravity
 from torchdlo.physics.effects.measure import Track
 from torchdlo.physics.effects.table import Table
 from torchdlo.physics.numerics import normalize
-from torchdlo.sysid import library, settle
+from torchdlo.sysid import lengths, library, settle
 from torchdlo.sysid.drive import drive
 from torchdlo.sysid.library import PARAMETERS, Number
 from torchdlo.sysid.mesh import make_mesh
@@ -175,7 +175,7 @@ class RopeModel:
             [rope],
             self._laws(),
             self._values(number),
-            check=False,  # of mis-tracked markers the lengths are wrong until `_agree`
+            check=False,  # lengths are wrong until they agree
             dt=self.dt / self.substeps,
             substeps=1,
             integrator="implicit",
@@ -188,7 +188,7 @@ class RopeModel:
             settling=4 if self.ahead else 2,
         )
         params = self._measured_lengths(params, number)
-        return scene, params, self._agree(scene, params, state)
+        return scene, params, lengths.agree(scene, params, state)
 
     def _laws(self) -> list[Effect]:
         """Return the effects of the scene."""
@@ -262,21 +262,6 @@ class RopeModel:
         if "rest_share" in number:
             rest = tree.replace(rest, curvature=_turned(rods.rest.curvature, number))
         return tree.replace(params, rods=tree.replace(rods, rest=rest, material=material))
-
-    def _agree(self, scene: scenes.Scene, params: scenes.Params, state: scenes.State) -> scenes.State:
-        """Return the state with positions and velocities that keep the rope's length."""
-        rest, rods = params.rods.rest, state.rods
-        free = torch.ones(scene.topology.size, 1)
-        free[list(self.held)] = 0.0
-        free = free.to(rods.pos)
-        active = rest.edge_mask * (1 - (1 - free) * (1 - torch.roll(free, -1, -2)))
-        lengths = constrain.Lengths(scene.topology, rest.length, torch.zeros_like(rest.length), active, rest.edge_mask)
-        pos, vel = constrain.settle(lengths, rods.pos, rods.vel, free / params.rods.material.mass)
-        lost = ~torch.isfinite(pos).all(-1).all(-1)[:, None, None]
-        pos, vel = torch.where(lost, rods.pos, pos), torch.where(lost, rods.vel, vel)
-        return tree.replace(
-            state, rods=tree.replace(rods, pos=tree.batch_innermost(pos), vel=tree.batch_innermost(vel))
-        )
 
     def simulate(self, motion: Motion, start: Start, values: np.ndarray, *, frames: int | None = None) -> np.ndarray:
         """Return simulated markers [m] for every parameter set and trial.
@@ -371,7 +356,7 @@ class RopeModel:
         gap = motion.markers[:, :frames] - torch.stack(seen, 1).numpy()
         shift, drift = (torch.as_tensor(x) for x in settle.explain(gap[:, :, free], shapes[at][free], self.dt, shapes))
         rods = tree.replace(state.rods, pos=state.rods.pos + shift, vel=state.rods.vel + drift)
-        return self._agree(scene, params, tree.replace(state, rods=rods))
+        return lengths.agree(scene, params, tree.replace(state, rods=rods))
 
     def _marked(self, state: scenes.State) -> tuple[Tensor, Tensor, Tensor]:
         """Return positions and material directors at the markers, shape (N, M, 3) each."""
