@@ -25,6 +25,7 @@ from torchdlo.sysid.model import RopeModel
 from torchdlo.sysid.motion import Start
 from torchdlo.sysid.plan import BUDGETS
 from torchdlo.sysid.recording import Recording, Trial
+from torchdlo.sysid.verdict import word
 
 S = np.array([0.0, 0.02, 0.08, 0.16, 0.24, 0.32, 0.4, 0.48, 0.56, 0.6])
 GRIPPED = np.arange(10) < 2
@@ -251,6 +252,21 @@ def test_an_effect_matters_beside_a_baseline_that_went_astray() -> None:
 
 
 def test_nothing_counts_as_explained_where_the_floor_is_not_known() -> None:
-    assert search._verdict([], 2e-3, 1e-3) == "none" and search._verdict([], 4e-3, 1e-3) == "unknown"
-    assert search._verdict([], 0.2, float("inf")) == "unknown"
-    assert search._verdict(["stretch"], 1e-3, float("inf")) == "partial"
+    assert word([], 2e-3, 1e-3) == "none" and word([], 4e-3, 1e-3) == "unknown"
+    assert word([], 0.2, float("inf")) == "unknown"
+    assert word(["stretch"], 1e-3, float("inf")) == "partial"
+
+
+@pytest.mark.parametrize(("cost", "named"), [(0.7e-3, "air_drag"), (1.5e-3, "wind")])
+def test_a_special_law_takes_the_place_of_a_general_one_that_fits_no_better(cost: float, named: str) -> None:
+    def model(left: float, *effects: str) -> SimpleNamespace:
+        return SimpleNamespace(point=SimpleNamespace(cost=left), effects=effects)
+
+    judge = object.__new__(search._Search)
+    judge.report, judge.budget, judge.plain = lambda *_: None, BUDGETS["fast"], [model(9e-3), model(6e-3)]
+    plain = model(cost, "air_drag", "time_delay")
+    judge.bench = SimpleNamespace(exchange=lambda *job: job[1:3], fit=lambda jobs: [plain] * len(jobs))
+    shares, ties = {"wind": 0.5, "time_delay": 0.4}, {"wind": ["tilted_gravity"], "time_delay": []}
+    found = judge._plainer(model(0.5e-3, "wind", "time_delay"), shares, ties)
+    assert list(found[1]) == [named, "time_delay"] == list(found[2]) == list(found[0].effects)
+    assert found[2][named] == ["tilted_gravity", "wind"][: 1 + (named == "air_drag")]

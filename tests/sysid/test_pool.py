@@ -87,6 +87,25 @@ def simulation(pool: Pool, job: Fit) -> Simulation:
     return Simulation(job.effects, job.values, "train", replace(start, finer=finer), frames=30)
 
 
+def test_a_special_law_takes_over_the_numbers_of_a_general_one(tmp_path: Path) -> None:
+    with Pool(swaying(tmp_path, frames=10), OPTIONS, workers=1) as pool:
+        bench = Bench(pool)
+        bench.starts = {"train": None}
+        model = pool.local.model(("wind", "point_mass"))
+        values = dict(zip(model.parameters, np.arange(10.0, 10.0 + len(model.parameters)), strict=True))
+        names = ("bending_stiffness", "wind.velocity.1", "wind.c_d", "point_mass.mass")
+        params = tuple(model.params[model.parameters.index(n)] for n in names)
+        point = Point(np.zeros(4), 1.0, np.zeros((1, 4)), np.zeros((1, 4, 4)), np.ones(1))
+        fitted = Fitted(
+            model.effects, np.array(list(values.values())), Space(names, params, (1.0, 2.0, 3.0, 4.0)), point
+        )
+        job = bench.exchange(fitted, "wind", "air_drag", 5)
+        assert job.effects == ("air_drag", "point_mass") and job.iterations == 5
+        assert job.free == ("bending_stiffness", "air_drag.c_d", "point_mass.mass") and job.sizes == (1.0, 3.0, 4.0)
+        less = dict(zip(pool.local.model(job.effects).parameters, job.values[0], strict=True))
+        assert less.pop("air_drag.c_d") == values["wind.c_d"] and less.items() <= values.items()
+
+
 def test_a_model_loses_an_effect_and_starts_from_several_baselines(tmp_path: Path) -> None:
     with Pool(swaying(tmp_path, frames=10), OPTIONS, workers=1) as pool:
         bench = Bench(pool)

@@ -147,6 +147,28 @@ class Bench:
             row[: len(self.early)] = numbers[: len(self.early)]
         return Fit(effects, values, names, sizes, iterations, self.starts["train"], keep=2)
 
+    def exchange(self, fitted: Fitted, general: str, special: str, iterations: int) -> Fit:
+        """Return the job of fitting a model in which a special law takes the place of one that contains it.
+
+        Args:
+            fitted: the model.
+            general: one of its effects.
+            special: another one, whose numbers have the same names there.
+            iterations: most iterations.
+        """
+
+        def named(number: str) -> str:
+            effect, *rest = number.split(".")
+            return ".".join([special if effect == general else effect, *rest])
+
+        effects = tuple(special if e == general else e for e in fitted.effects)
+        model, before = self.pool.local.model(effects), self.pool.local.model(fitted.effects).parameters
+        values = dict(zip(map(named, before), fitted.values, strict=True))
+        units = dict(zip(map(named, fitted.space.names), fitted.space.units, strict=True))
+        names, first = tuple(n for n in units if n in model.parameters), [values[n] for n in model.parameters]
+        sizes, start = tuple(units[n] for n in names), self.starts["train"]
+        return Fit(effects, np.array([first]), names, sizes, iterations, start, options=fitted.options)
+
     def further(self, found: Fitted, iterations: int, frames: int | None = None) -> Fit:
         """Return the job of fitting on."""
         space, start = found.space, self.starts["train"]

@@ -26,7 +26,7 @@ from torchdlo.sysid.pool import Pool
 from torchdlo.sysid.recording import Recording
 from torchdlo.sysid.saved import Saved
 from torchdlo.sysid.screen import Score, screen
-from torchdlo.sysid.verdict import Candidate, Diagnosis
+from torchdlo.sysid.verdict import UNKNOWN_FLOOR, Candidate, Diagnosis, word
 
 PAYS = 0.15
 """Share of the excess gap that an effect has to close, on the train and on the test trials."""
@@ -136,6 +136,7 @@ class _Search:
             kept = self._pruned(best, shares)
             base = baselines.go_further(self.bench, kept, self.budget.more, self.report)
             shares[name] += (self._squared(kept) - self._squared(base)) / whole
+            base, shares, ties = self._plainer(base, shares, ties)
             self._say_floor()
         return self._conclude(base, list(shares), {n: ties[n] for n in shares}, shares, rounds)
 
@@ -152,6 +153,27 @@ class _Search:
             if not self._matters(less, fitted, "train"):
                 fitted, shares[last] = less, shares[last] + shares.pop(name)
         return fitted
+
+    def _plainer(
+        self, fitted: Fitted, shares: dict[str, float], ties: dict[str, list[str]]
+    ) -> tuple[Fitted, dict[str, float], dict[str, list[str]]]:
+        """Return the model with special laws in the place of general ones, where they fit as well, and their names.
+
+        What one effect alone cannot explain bends a law with more numbers than it needs; with the others it may do
+        without them.
+        """
+        for general, (special, _) in library.CONTAINED.items():
+            if general not in shares or special in fitted.effects:
+                continue
+            less = self.bench.fit([self.bench.exchange(fitted, general, special, self.budget.more)])[0]
+            self.report(f"{special} in the place of {general}", 1, 1, f"{1e3 * less.point.cost:.2f} mm")
+            if less.point.cost - fitted.point.cost < TIE * max(self.plain[-1].point.cost - fitted.point.cost, 1e-9):
+                fitted, also = less, [n for n in ties[general] if n != special]
+                shares = {special if n == general else n: share for n, share in shares.items()}
+                ties = {special if n == general else n: names for n, names in ties.items()} | {
+                    special: [*also, general]
+                }
+        return fitted, shares, ties
 
     def _possible(self) -> list[str]:
         return [n for n in library.LIBRARY if library.applicable(n, self.recording, self.pool.local.model(()).mesh)]
@@ -332,7 +354,7 @@ class _Search:
         trials, train = self.bench.trials, len(self.bench.trials["train"])
         simulated = {"before": self.before, "after": self.bench.prediction(final, "all")}
         before, after = (gap(sims[train:], trials["test"]) for sims in simulated.values())
-        verdict = _verdict(effects, rms(self.bench.gaps(final, "test")), self.bench.level)
+        verdict = word(effects, rms(self.bench.gaps(final, "test")), self.bench.level)
         predictions = {
             when: {t.name: sim[: len(t.time)] for sim, t in zip(sims, trials["all"], strict=True)}
             for when, sims in simulated.items()
@@ -355,12 +377,6 @@ class _Search:
         )
 
 
-def _verdict(effects: Sequence[str], left: float, level: float) -> str:
-    """Return the verdict on a gap [m] where a perfect model leaves `level`; where that is not known, none is small."""
-    explained = np.isfinite(level) and left <= UNEXPLAINED * level
-    return ("effects" if explained else "partial") if effects else ("none" if explained else "unknown")
-
-
 def _may_be(fitted: Fitted, numbers: dict[str, float]) -> bool:
     """Return whether the last effect's numbers may have these values, as far as their ranges tell."""
     low, high = interval(fitted.point, fitted.space)
@@ -372,14 +388,3 @@ def _may_be(fitted: Fitted, numbers: dict[str, float]) -> bool:
 def _vector(name: str) -> str:
     """Return the name of a number without that of its component."""
     return ".".join(name.split(".")[:2])
-
-
-UNEXPLAINED = 3.0
-"""Times the floor: a gap beyond that is not explained."""
-
-UNKNOWN_FLOOR = (
-    "Finer simulations of the calibrated model fail or differ from it by more than 5 cm: how well a perfect model "
-    "could do is not known, so nothing counts as explained. Look at the first frames, and at the rope's length and "
-    "mass, or give `--vertices`."
-)
-"""Note where nothing is known of the simulation's own errors."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -11,6 +12,22 @@ from torchdlo.sysid.floor import Floor
 from torchdlo.sysid.health import Fault
 from torchdlo.sysid.jobs import Fitted
 from torchdlo.sysid.model import RopeModel
+
+UNEXPLAINED = 3.0
+"""Times the floor: a gap beyond that is not explained."""
+
+UNKNOWN_FLOOR = (
+    "Finer simulations of the calibrated model fail or differ from it by more than 5 cm: how well a perfect model "
+    "could do is not known, so nothing counts as explained. Look at the first frames, and at the rope's length and "
+    "mass, or give `--vertices`."
+)
+"""Note where nothing is known of the simulation's own errors."""
+
+
+def word(effects: Sequence[str], left: float, level: float) -> str:
+    """Return the verdict on a gap [m] where a perfect model leaves `level`; where that is not known, none is small."""
+    explained = np.isfinite(level) and left <= UNEXPLAINED * level
+    return ("effects" if explained else "partial") if effects else ("none" if explained else "unknown")
 
 
 @dataclass(frozen=True, eq=False)
