@@ -46,7 +46,7 @@ class RodMatter(Effect):
     sweeps: int = 3
     """Jacobi sweeps per substep."""
     room: int = 0
-    """Edges per scene that there is room for, those next to matter; 0: all."""
+    """Edges per scene that there is room for, those next to matter; 0: all. The C++ kernel has room for all."""
     thickness: float = 1.0
     """How far off the rope's surface matter is held, in node spacings."""
     block: int = 0
