@@ -59,6 +59,15 @@ def test_edges_get_their_lengths_and_what_is_held_stays(case):
     assert float((found - pos).norm(dim=-1).max()) < 0.05
 
 
+def test_a_start_does_not_depend_on_the_others_of_its_batch():
+    torch.manual_seed(0)
+    wrong, held = stretched()
+    good = arch() + 1e-4 * torch.randn(2, COUNT, 3, dtype=F64)
+    good[:, list(held)] = wrong[:, list(held)] = arch()[:, list(held)]
+    found = [agree(*started(torch.stack([good[0], other]), held)).rods.pos[0] for other in (good[1], wrong[1])]
+    assert float((found[0] - found[1]).abs().max()) == 0
+
+
 def test_what_is_laid_keeps_directions_and_what_is_held():
     torch.manual_seed(0)
     pos = arch() + 1e-3 * torch.randn(2, COUNT, 3, dtype=F64)

@@ -43,9 +43,11 @@ def agree(scene: scenes.Scene, params: scenes.Params, state: scenes.State) -> sc
         return pos, vel, missed.nan_to_num(torch.inf)
 
     pos, vel, missed = settled(rods.pos)
-    if bool((missed > _MISSED).any()):
+    astray = missed > _MISSED
+    if bool(astray.any()):
         other = settled(laid(rods.pos, rest.length, scene.held_vertices or (0,), scene.topology.closed[0]))
-        better = other[2] < missed
+        # Only there: elsewhere both agree with the lengths, but they are not the same.
+        better = astray & (other[2] < missed)
         pos, vel, missed = (torch.where(better, b, a) for a, b in zip((pos, vel, missed), other, strict=True))
     lost = ~torch.isfinite(pos).all(-1).all(-1)[:, None, None]
     pos, vel = torch.where(lost, rods.pos, pos), torch.where(lost, rods.vel, vel)
