@@ -25,6 +25,7 @@ from torchdlo.sysid.model import RopeModel
 from torchdlo.sysid.motion import Start
 from torchdlo.sysid.plan import BUDGETS
 from torchdlo.sysid.recording import Recording, Trial
+from torchdlo.sysid.revise import Found, Revision
 from torchdlo.sysid.verdict import word
 
 S = np.array([0.0, 0.02, 0.08, 0.16, 0.24, 0.32, 0.4, 0.48, 0.56, 0.6])
@@ -242,13 +243,10 @@ def test_a_general_law_is_named_only_where_its_other_numbers_tell(
 def test_an_effect_matters_beside_a_baseline_that_went_astray() -> None:
     # On one trial the baseline was off by half a metre; fitted further it was not. The effect closes most of the rest.
     gaps = {"baseline": [5e-3, 0.5], "rival": [5e-3, 30e-3], "more": [5e-3, 10e-3], "less": [5e-3, 29.9e-3]}
-    judge = object.__new__(search._Search)
-    judge.bench = SimpleNamespace(
-        gaps=lambda f, split: np.array(gaps[f]), level=1e-3, floor=SimpleNamespace(noise=1e-3)
-    )
-    judge.plain = ["baseline", "rival"]
-    assert judge._matters("rival", "more", "test")
-    assert not judge._matters("rival", "less", "test")
+    bench = SimpleNamespace(gaps=lambda f, split: np.array(gaps[f]), level=1e-3, floor=SimpleNamespace(noise=1e-3))
+    revision = Revision(bench, BUDGETS["fast"], ["baseline", "rival"], lambda *_: None)
+    assert revision.matters("rival", "more", "test")
+    assert not revision.matters("rival", "less", "test")
 
 
 def test_nothing_counts_as_explained_where_the_floor_is_not_known() -> None:
@@ -262,11 +260,41 @@ def test_a_special_law_takes_the_place_of_a_general_one_that_fits_no_better(cost
     def model(left: float, *effects: str) -> SimpleNamespace:
         return SimpleNamespace(point=SimpleNamespace(cost=left), effects=effects)
 
-    judge = object.__new__(search._Search)
-    judge.report, judge.budget, judge.plain = lambda *_: None, BUDGETS["fast"], [model(9e-3), model(6e-3)]
     plain = model(cost, "air_drag", "time_delay")
-    judge.bench = SimpleNamespace(exchange=lambda *job: job[1:3], fit=lambda jobs: [plain] * len(jobs))
-    shares, ties = {"wind": 0.5, "time_delay": 0.4}, {"wind": ["tilted_gravity"], "time_delay": []}
-    found = judge._plainer(model(0.5e-3, "wind", "time_delay"), shares, ties)
-    assert list(found[1]) == [named, "time_delay"] == list(found[2]) == list(found[0].effects)
-    assert found[2][named] == ["tilted_gravity", "wind"][: 1 + (named == "air_drag")]
+    bench = SimpleNamespace(exchange=lambda *job: job[1:3], fit=lambda jobs: [plain] * len(jobs))
+    revision = Revision(bench, BUDGETS["fast"], [model(9e-3), model(6e-3)], lambda *_: None)
+    found = Found({"wind": 0.5, "time_delay": 0.4}, {"wind": ["tilted_gravity"], "time_delay": []})
+    fitted = revision.plainer(model(0.5e-3, "wind", "time_delay"), found)
+    assert list(found.shares) == [named, "time_delay"] == list(found.ties) == list(fitted.effects)
+    assert found.ties[named] == ["tilted_gravity", "wind"][: 1 + (named == "air_drag")]
+
+
+@pytest.mark.parametrize(("cost", "named"), [(1e-3, "tilted_gravity"), (2.15e-3, "tilted_gravity"), (2.6e-3, "wind")])
+def test_an_effect_gives_way_to_another_that_fits_better_beside_the_rest(cost: float, named: str, monkeypatch) -> None:
+    def model(left: float, names: int, *effects: str) -> SimpleNamespace:
+        space = SimpleNamespace(names=tuple(range(names)))
+        return SimpleNamespace(point=SimpleNamespace(cost=left), effects=effects, space=space, options=())
+
+    tried = []
+
+    def instead(_: Revision, fitted: SimpleNamespace, old: str, names: list[str]) -> SimpleNamespace:
+        tried.append((old, names))
+        rest = [n for n in fitted.effects if n != old]
+        return model(cost if old == "wind" else 9e-3, 3, *rest, "tilted_gravity" if old == "wind" else "air_drag")
+
+    monkeypatch.setattr(Revision, "_instead", instead)
+    pool = SimpleNamespace(choose=lambda **_: None)
+    bench = SimpleNamespace(gaps=lambda f, _: np.array([5e-3]), level=1e-3, astray=lambda *_: False, pool=pool)
+    revision = Revision(bench, BUDGETS["fast"], [model(9e-3, 3), model(6e-3, 3)], lambda *_: None)
+    found = Found({"wind": 0.5, "point_mass": 0.3}, {"wind": ["rest_curvature"], "point_mass": []})
+    # Of 4 mm that are explained, 0.2 mm are a tie: fewer numbers win that.
+    fitted = revision.exchanged(model(2e-3, 5, "wind", "point_mass"), found, ["wind", "tilted_gravity", "air_drag"])
+    assert set(fitted.effects) == {named, "point_mass"} and [*found.shares] == [named, "point_mass"]
+    assert found.ties[named] == (
+        ["rest_curvature", "wind"] if cost == 2.15e-3 else ["rest_curvature"][: named == "wind"]
+    )
+    # What was exchanged is not looked at again; what stands beside it is.
+    assert [old for old, _ in tried] == (["wind"] if named == "wind" else ["wind", "point_mass"])
+    assert "wind" not in tried[0][1]
+    bench.gaps = lambda *_: np.array([1e-3])
+    assert revision.exchanged(fitted, found, ["air_drag"]) is fitted and len(tried) == 1 + (named != "wind")

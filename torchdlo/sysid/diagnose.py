@@ -17,6 +17,7 @@ from torchdlo.errors import InputError
 from torchdlo.sysid import baseline as baselines
 from torchdlo.sysid import clamps, health, library, plan
 from torchdlo.sysid.bench import SILENT, Bench, Callback
+from torchdlo.sysid.extend import extend, short, vector
 from torchdlo.sysid.fit import interval
 from torchdlo.sysid.floor import gap, rms
 from torchdlo.sysid.jobs import Fit, Fitted
@@ -24,6 +25,7 @@ from torchdlo.sysid.journal import Journal
 from torchdlo.sysid.plan import BUDGETS, Budget
 from torchdlo.sysid.pool import Pool
 from torchdlo.sysid.recording import Recording
+from torchdlo.sysid.revise import TIE, Found, Revision
 from torchdlo.sysid.saved import Saved
 from torchdlo.sysid.screen import Score, screen
 from torchdlo.sysid.verdict import UNKNOWN_FLOOR, Candidate, Diagnosis, word
@@ -31,20 +33,11 @@ from torchdlo.sysid.verdict import UNKNOWN_FLOOR, Candidate, Diagnosis, word
 PAYS = 0.15
 """Share of the excess gap that an effect has to close, on the train and on the test trials."""
 
-MATTERS = 0.03
-"""Share of the baseline's excess gap that each effect has to close, whatever the others leave."""
-
 MORE = 2.5
 """Times the floor that have to be left for another effect to be looked for: one of three times the floor leaves 3.2."""
 
 LEADERS = 2
 """Effects that are fitted further in each round, besides those that are as good."""
-
-SHORT = 0.6
-"""Share of the trials that first fits see."""
-
-TIE = 0.05
-"""Fits whose gaps differ by less than this share of the excess, or of the floor, are not told apart."""
 
 
 def diagnose(
@@ -104,6 +97,7 @@ class _Search:
         self.baseline: Fitted | None = None
         self.plain: list[Fitted] = []
         """The baseline, and what it became when it was fitted for as long as the first candidates were."""
+        self.revision = Revision(self.bench, budget, self.plain, report)
 
     def run(self, given: Saved | None = None) -> Diagnosis:
         """Go through all stages."""
@@ -112,68 +106,38 @@ class _Search:
             base = baselines.calibrate(self.bench, count, most, self.rng, self.report)
         else:
             base = baselines.go_on(self.bench, given, most, self.report)
-        self.baseline, self.before, self.plain = base, self.bench.prediction(base, "all"), [base]
+        self.baseline, self.before = base, self.bench.prediction(base, "all")
+        self.plain.append(base)
         self._say_floor()
         rounds: list[list[Candidate]] = []
-        ties: dict[str, list[str]] = {}
-        shares: dict[str, float] = {}
+        found = Found()
         whole = max(self._squared(base) - self.bench.floor.noise**2, 1e-12)
-        while len(rounds) < self.budget.rounds + (len(shares) < len(rounds)):
-            if shares and rms(self.bench.gaps(base, "all")) < MORE * self.bench.level:
+        while len(rounds) < self.budget.rounds + (len(found.shares) < len(rounds)):
+            if found.shares and rms(self.bench.gaps(base, "all")) < MORE * self.bench.level:
                 break
             if not (names := [n for n in self._possible() if n not in base.effects]):
                 break
             best, rival, candidates, rivals = self._round(base, names, f"round {len(rounds) + 1}")
             rounds.append(candidates)
             if best is None:
-                if rival is not base and (shares or rival.options != base.options):
+                if rival is not base and (found.shares or rival.options != base.options):
                     base = rival
                     self.pool.choose(**dict(base.options))
                 break
             name, old = best.effects[-1], self._squared(base)
             self.pool.choose(**dict(best.options))
-            shares[name], ties[name] = (old - self._squared(best)) / whole, rivals
-            kept = self._pruned(best, shares)
+            found.shares[name], found.ties[name] = (old - self._squared(best)) / whole, rivals
+            kept = self.revision.pruned(best, found)
             base = baselines.go_further(self.bench, kept, self.budget.more, self.report)
-            shares[name] += (self._squared(kept) - self._squared(base)) / whole
-            base, shares, ties = self._plainer(base, shares, ties)
+            found.shares[name] += (self._squared(kept) - self._squared(base)) / whole
+            base = self.revision.plainer(base, found)
+            base = self.revision.exchanged(base, found, self._possible())
             self._say_floor()
-        return self._conclude(base, list(shares), {n: ties[n] for n in shares}, shares, rounds)
+        return self._conclude(base, found, rounds)
 
     def _squared(self, fitted: Fitted) -> float:
         """Return the squared gap on the test trials [m^2]; all frames count the same, whatever is known of them."""
         return float(rms(gap(self.bench.prediction(fitted, "test"), self.bench.trials["test"])) ** 2)
-
-    def _pruned(self, fitted: Fitted, shares: dict[str, float]) -> Fitted:
-        """Return the model without the effects that the last one has made needless, which takes over their shares."""
-        *earlier, last = shares
-        for name in earlier:
-            less = self.bench.fit([self.bench.reduction(fitted, name, self.baseline, 2 * self.budget.more)])[0]
-            self.report(f"without {name}", 1, 1, f"{1e3 * less.point.cost:.2f} mm")
-            if not self._matters(less, fitted, "train"):
-                fitted, shares[last] = less, shares[last] + shares.pop(name)
-        return fitted
-
-    def _plainer(
-        self, fitted: Fitted, shares: dict[str, float], ties: dict[str, list[str]]
-    ) -> tuple[Fitted, dict[str, float], dict[str, list[str]]]:
-        """Return the model with special laws in the place of general ones, where they fit as well, and their names.
-
-        What one effect alone cannot explain bends a law with more numbers than it needs; with the others it may do
-        without them.
-        """
-        for general, (special, _) in library.CONTAINED.items():
-            if general not in shares or special in fitted.effects:
-                continue
-            less = self.bench.fit([self.bench.exchange(fitted, general, special, self.budget.more)])[0]
-            self.report(f"{special} in the place of {general}", 1, 1, f"{1e3 * less.point.cost:.2f} mm")
-            if less.point.cost - fitted.point.cost < TIE * max(self.plain[-1].point.cost - fitted.point.cost, 1e-9):
-                fitted, also = less, [n for n in ties[general] if n != special]
-                shares = {special if n == general else n: share for n, share in shares.items()}
-                ties = {special if n == general else n: names for n, names in ties.items()} | {
-                    special: [*also, general]
-                }
-        return fitted, shares, ties
 
     def _possible(self) -> list[str]:
         return [n for n in library.LIBRARY if library.applicable(n, self.recording, self.pool.local.model(()).mesh)]
@@ -292,7 +256,7 @@ class _Search:
             return f"closes {max(gain, 0):.0%} of the gap"
         if self._gain(rival, fitted, "test") < PAYS:
             return "does not help on the test trials"
-        if not all(self._matters(rival, fitted, split) for split in ("train", "test")):
+        if not all(self.revision.matters(rival, fitted, split) for split in ("train", "test")):
             return "closes less than the floor leaves open"
         return None
 
@@ -303,33 +267,15 @@ class _Search:
             (before - after) / max(before - self.bench.floor.noise**2, (0.3 * self.bench.floor.noise) ** 2, 1e-12)
         )
 
-    def _matters(self, less: Fitted, more: Fitted, split: str) -> bool:
-        """Return whether a model's gap is smaller by more than the floor, and by a share of the baseline's."""
-        # A baseline may go astray on a trial: then what it became when it was fitted further tells what a share is.
-        first = min(rms(self.bench.gaps(f, split)) for f in self.plain) ** 2
-        before, after = (rms(self.bench.gaps(f, split)) ** 2 for f in (less, more))
-        return before - after > max(self.bench.level**2, MATTERS * (first - self.bench.floor.noise**2))
-
     def _on_most(self, base: Fitted, fitted: Fitted) -> bool:
         return float(np.mean(self.bench.gaps(fitted, "train") < self.bench.gaps(base, "train"))) > 0.6
 
     def _candidate(self, base: Fitted, score: Score) -> Fit:
-        """Return the first fit of an effect."""
-        most, frames = self.budget.iterations, self._short()
-        if score.name == clamps.NAME and clamps.soft(self.bench, base):
-            return clamps.stiff(self.bench, base, score, most, frames)
-        # Numbers that no dose uses stay off, a slope where a spot fits better; but vectors are fitted whole.
-        vectors = {_vector(name) for name in score.dose}
-        used = [n.name for n in library.numbers(score.name, self.recording) if _vector(n.name) in vectors]
-        return self.bench.extension(base, score, used, most, frames)
-
-    def _short(self) -> int:
-        """Return how many frames the first fits see: late ones mislead as long as early ones do not fit."""
-        return max(10, int(SHORT * self.bench.trials["train"][0].markers.shape[0]))
+        return extend(self.bench, base, score, self.budget.iterations, short(self.bench))
 
     def _further(self, base: Fitted, fitted: Fitted) -> Fit:
         """Return the job of fitting on."""
-        how = (self.budget.iterations, self._short()) if fitted is base else (self.budget.more,)
+        how = (self.budget.iterations, short(self.bench)) if fitted is base else (self.budget.more,)
         return self.bench.further(fitted, *how)
 
     def _fitted(self, jobs: Sequence[Fit], stage: str) -> list[Fitted]:
@@ -343,14 +289,8 @@ class _Search:
             self.report(f"{stage}: fitting", len(found), len(jobs), last)
         return [found[k] for k in range(len(jobs))]
 
-    def _conclude(
-        self,
-        final: Fitted,
-        effects: list[str],
-        ties: dict[str, list[str]],
-        shares: dict[str, float],
-        rounds: list[list[Candidate]],
-    ) -> Diagnosis:
+    def _conclude(self, final: Fitted, found: Found, rounds: list[list[Candidate]]) -> Diagnosis:
+        effects = list(found.shares)
         trials, train = self.bench.trials, len(self.bench.trials["train"])
         simulated = {"before": self.before, "after": self.bench.prediction(final, "all")}
         before, after = (gap(sims[train:], trials["test"]) for sims in simulated.values())
@@ -362,8 +302,8 @@ class _Search:
         return Diagnosis(
             verdict,
             effects,
-            ties,
-            shares,
+            {name: found.ties[name] for name in effects},
+            found.shares,
             self.baseline,
             final,
             self.bench.floor,
@@ -381,10 +321,5 @@ def _may_be(fitted: Fitted, numbers: dict[str, float]) -> bool:
     """Return whether the last effect's numbers may have these values, as far as their ranges tell."""
     low, high = interval(fitted.point, fitted.space)
     asked = {f"{fitted.effects[-1]}.{name}": value for name, value in numbers.items()}
-    ranges = [(asked.get(_vector(name)), a, b) for name, a, b in zip(fitted.space.names, low, high, strict=True)]
+    ranges = [(asked.get(vector(name)), a, b) for name, a, b in zip(fitted.space.names, low, high, strict=True)]
     return all(value is None or a <= value <= b for value, a, b in ranges)
-
-
-def _vector(name: str) -> str:
-    """Return the name of a number without that of its component."""
-    return ".".join(name.split(".")[:2])
