@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from torchdlo.errors import InputError
+from torchdlo.physics.effect import Param
 from torchdlo.sysid import fit, start
 from torchdlo.sysid.calibrate import calibrate
 from torchdlo.sysid.library import PARAMETERS
@@ -152,9 +153,32 @@ def test_as_many_parameter_sets_as_vertices_are_still_one_per_scene(tmp_path: Pa
 
 
 def test_a_trial_that_fails_costs_much_and_not_everything() -> None:
-    costs = fit._together(np.array([[0.01, np.nan, 0.03], [np.nan, np.inf, np.nan], [0.01, 0.02, 0.03]]))
-    assert costs[0] == pytest.approx((0.01 + fit._FAILED + 0.03) / 3) and np.isinf(costs[1])
-    assert costs[2] == pytest.approx(0.02)
+    # Two trials of markers that move by a metre; what the third set shows of the second trial grows without end.
+    measured = np.broadcast_to(np.linspace(0.0, 1.0, 5)[:, None, None], (2, 5, 4, 3))
+    sims = measured + np.zeros((4, 1, 1, 1, 1))
+    sims[1, 1], sims[2, 1, 3:] = np.nan, 1e3
+    sims[3] = np.inf
+    costs = fit.costs(sims, measured)
+    assert costs[0] == 0.0 and costs[1] == costs[2] == pytest.approx(0.5 * fit._LOST) and np.isinf(costs[3])
+
+
+@pytest.mark.parametrize("far", [np.nan, 1e3])
+def test_trials_that_go_astray_tell_nothing_about_slopes(far: float) -> None:
+    # x = a t + b; the second trial goes astray as soon as a is changed.
+    time = np.linspace(0.0, 1.0, 5)[:, None, None] * np.ones((1, 4, 3))
+    measured = np.stack([0.5 * time, time])
+    params = (Param(1.0, -9.0, 9.0, "m/s", "linear", None, ""), Param(0.0, -9.0, 9.0, "m", "linear", None, ""))
+    space = fit.Space(("a", "b"), params, (0.1, 0.1))
+
+    def simulate(values: np.ndarray) -> np.ndarray:
+        a, b = (values[:, k, None, None, None, None] for k in (0, 1))
+        sims = a * np.stack([0.5 * time, time]) + b
+        sims[np.abs(values[:, 0] - 1.0) > 1e-9, 1, 3:] = far
+        return sims
+
+    (point,) = fit.evaluate(simulate, measured, space, np.array([[10.0, 0.0]]))
+    assert point.cost == pytest.approx(0.0, abs=1e-12)
+    assert point.curvature[0].all() and not point.curvature[1].any() and not point.gradient[1].any()
 
 
 def test_starts_use_nothing_after_the_first_tenth_of_a_second(tmp_path: Path) -> None:

@@ -17,6 +17,7 @@ from torchdlo.report import diagnosis as report
 from torchdlo.sysid import diagnose as search
 from torchdlo.sysid import floor, library, settle
 from torchdlo.sysid.drive import drive
+from torchdlo.sysid.extend import extend
 from torchdlo.sysid.findings import findings, findings_json, model_json, sentence
 from torchdlo.sysid.fit import Point, Space, interval
 from torchdlo.sysid.jobs import Fitted
@@ -205,13 +206,9 @@ def test_a_clamp_that_turns_is_told_from_one_in_which_the_rope_bends(
 def test_vectors_are_fitted_whole_and_what_no_dose_uses_is_not(
     name: str, dose: dict[str, float], fitted: set[str], tmp_path: Path
 ) -> None:
-    one = search._Search.__new__(search._Search)
-    one.recording, one.budget = make_empty(tmp_path), BUDGETS["fast"]
-    one.bench = SimpleNamespace(
-        trials={"train": one.recording.train}, extension=lambda base, score, numbers, *_: numbers
-    )
+    bench = SimpleNamespace(recording=make_empty(tmp_path), extension=lambda base, score, numbers, *_: numbers)
     score = SimpleNamespace(name=name, dose={f"{name}.{k}": v for k, v in dose.items()})
-    assert set(one._candidate(None, score)) == {f"{name}.{k}" for k in fitted}
+    assert set(extend(bench, None, score, 4, None)) == {f"{name}.{k}" for k in fitted}
 
 
 @pytest.mark.parametrize(("speed", "first"), [(0.02, "air_drag"), (0.4, "wind")])

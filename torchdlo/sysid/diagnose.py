@@ -130,10 +130,9 @@ class _Search:
             kept = self.revision.pruned(best, found)
             base = baselines.go_further(self.bench, kept, self.budget.more, self.report)
             found.shares[name] += (self._squared(kept) - self._squared(base)) / whole
-            base = self.revision.plainer(base, found)
             base = self.revision.exchanged(base, found, self._possible())
             self._say_floor()
-        return self._conclude(base, found, rounds)
+        return self._conclude(self.revision.plainer(base, found), found, rounds)
 
     def _squared(self, fitted: Fitted) -> float:
         """Return the squared gap on the test trials [m^2]; all frames count the same, whatever is known of them."""

@@ -19,8 +19,12 @@ _KNEE = 2e-3
 _FIRM = 5e-3
 """Share of the cost that a number has to save per squared coordinate to be followed as far as its slope says."""
 
-_FAILED = 0.3
-"""What a trial costs whose simulation fails while others run through [m]: so that numbers may lead away from there."""
+_LOST = 0.3
+"""Cost of a trial from which its simulation counts as failed, as a share of what is measured there: what grows without
+end may stay finite. So much a failed one costs while others run through, so that numbers may lead away from there."""
+
+_WILD = 0.1
+"""Mean change of a trial by a step of finite differences, likewise, from which it is no slope."""
 
 Simulate = Callable[[np.ndarray], np.ndarray]
 """Maps parameter sets (P, K) to simulated markers (P, B, F, M, 3) [m]."""
@@ -98,13 +102,18 @@ def costs(sims: np.ndarray, measured: np.ndarray) -> np.ndarray:
     seen = np.isfinite(measured)
     residual = np.where(seen, sims - measured, 0.0).reshape(len(sims), len(measured), -1)
     mean = _robust(residual)[0].sum(-1) / seen.reshape(len(measured), -1).sum(1)
-    return _together(mean)
+    return _together(mean, _LOST * extent(measured))
 
 
-def _together(of_trial: np.ndarray) -> np.ndarray:
-    """Return the mean cost of trials (..., B); infinite if none ran through."""
-    ran = np.isfinite(of_trial)
-    return np.where(ran.any(-1), np.where(ran, of_trial, _FAILED).mean(-1), np.inf)
+def extent(measured: np.ndarray) -> float:
+    """Return the largest range of a coordinate of the markers (B, F, M, 3) in a trial [m]."""
+    return float(np.max(np.nanmax(measured, (1, 2)) - np.nanmin(measured, (1, 2))))
+
+
+def _together(of_trial: np.ndarray, lost: float) -> np.ndarray:
+    """Return the mean cost of trials (..., B), where they are less than `lost`; infinite if none are."""
+    ran = of_trial < lost
+    return np.where(ran.any(-1), np.where(ran, of_trial, lost).mean(-1), np.inf)
 
 
 class Look:
@@ -126,22 +135,22 @@ class Look:
         count, k = self.raws.shape
         sims = sims.reshape(count, k + 1, *measured.shape)
         seen = np.isfinite(measured)
-        per_trial = seen.reshape(len(measured), -1).sum(1)
+        per_trial, whole = seen.reshape(len(measured), -1).sum(1), extent(measured)
         points = []
         for s in range(count):
             residual = np.where(seen, sims[s, 0] - measured, 0.0).reshape(len(measured), -1)
             cost, weight = _robust(residual)
             of_trial = cost.sum(1) / per_trial
-            failed = ~np.isfinite(of_trial)
-            slope = np.where(seen, sims[s, 1:] - sims[s, 0], 0.0).reshape(k, len(measured), -1)
-            slope = slope / self._sign[s][:, None, None]
+            change = np.where(seen, sims[s, 1:] - sims[s, 0], 0.0).reshape(k, len(measured), -1)
             # A trial that ran at the point but failed beside it tells nothing about slopes.
-            useless = ~np.isfinite(slope).all((0, 2)) | failed
+            wild = ~(np.abs(change).sum(-1) < _WILD * whole * per_trial).all(0)
+            useless = wild | ~(of_trial < _LOST * whole)
+            slope = change / self._sign[s][:, None, None]
             slope, weight = np.where(useless[None, :, None], 0.0, slope), np.where(useless[:, None], 0.0, weight)
             residual = np.where(useless[:, None], 0.0, residual)
             gradient = np.einsum("kbr,br,br->bk", slope, weight, residual, optimize=True) / per_trial[:, None]
             curvature = np.einsum("kbr,br,lbr->bkl", slope, weight, slope, optimize=True) / per_trial[:, None, None]
-            points.append(Point(self.raws[s], float(_together(of_trial)), gradient, curvature, of_trial))
+            points.append(Point(self.raws[s], float(_together(of_trial, _LOST * whole)), gradient, curvature, of_trial))
         return points
 
 

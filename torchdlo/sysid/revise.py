@@ -108,7 +108,9 @@ class Revision:
         while waiting and count < _EXCHANGES and rms(self.bench.gaps(fitted, "all")) > SILENT * self.bench.level:
             old = waiting.pop(0)
             best = self._instead(fitted, old, [n for n in possible if n not in fitted.effects])
-            if not self._better(best, fitted):
+            if self._better(best, fitted) and self._astray(best, fitted) and not dict(best.options).get("ahead"):
+                best = self.bench.fit([self.bench.calmer(best, self.budget.more)])[0]
+            if not self._better(best, fitted) or self._astray(best, fitted):
                 continue
             new, count = best.effects[-1], count + 1
             alike = fitted.point.cost - best.point.cost < self._tie(fitted)
@@ -126,7 +128,10 @@ class Revision:
         """Return whether another model fits better, or as well with fewer numbers."""
         fewer = len(other.space.names) < len(fitted.space.names)
         bar = fitted.point.cost + (1 if fewer else -1) * self._tie(fitted)
-        return other.point.cost < bar and not self.bench.astray(other, self.bench.gaps(fitted, "all"))
+        return other.point.cost < bar
+
+    def _astray(self, other: Fitted, fitted: Fitted) -> bool:
+        return self.bench.astray(other, self.bench.gaps(fitted, "all"))
 
     def _without(self, fitted: Fitted, name: str) -> Fitted:
         less = self.bench.fit([self.bench.reduction(fitted, name, self.plain[0], 2 * self.budget.more)])[0]
