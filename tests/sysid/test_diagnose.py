@@ -240,10 +240,16 @@ def test_a_general_law_is_named_only_where_its_other_numbers_tell(
 def test_an_effect_matters_beside_a_baseline_that_went_astray() -> None:
     # On one trial the baseline was off by half a metre; fitted further it was not. The effect closes most of the rest.
     gaps = {"baseline": [5e-3, 0.5], "rival": [5e-3, 30e-3], "more": [5e-3, 10e-3], "less": [5e-3, 29.9e-3]}
+    gaps["third"] = [2e-3, 2e-3]
     bench = SimpleNamespace(gaps=lambda f, split: np.array(gaps[f]), level=1e-3, floor=SimpleNamespace(noise=1e-3))
     revision = Revision(bench, BUDGETS["fast"], ["baseline", "rival"], lambda *_: None)
     assert revision.matters("rival", "more", "test")
     assert not revision.matters("rival", "less", "test")
+    # Beside a gap of 20 mm, 2 mm are little, but not if hardly anything is left without them; what the floor hides is.
+    gaps |= {"baseline": [20e-3, 20e-3], "rival": [19e-3, 19e-3], "one": [3e-3, 2e-3], "two": [1.2e-3, 1e-3]}
+    assert revision.matters("one", "two", "test") and not revision.matters("one", "third", "test")
+    gaps |= {"one": [1.3e-3, 1.3e-3], "two": [1e-3, 1e-3]}
+    assert not revision.matters("one", "two", "test")
 
 
 def test_nothing_counts_as_explained_where_the_floor_is_not_known() -> None:

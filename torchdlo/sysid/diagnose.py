@@ -132,7 +132,8 @@ class _Search:
             found.shares[name] += (self._squared(kept) - self._squared(base)) / whole
             base = self.revision.exchanged(base, found, self._possible())
             self._say_floor()
-        return self._conclude(self.revision.plainer(base, found), found, rounds)
+        base = self.revision.plainer(self.revision.pruned(base, found), found)
+        return self._conclude(base, found, rounds)
 
     def _squared(self, fitted: Fitted) -> float:
         """Return the squared gap on the test trials [m^2]; all frames count the same, whatever is known of them."""

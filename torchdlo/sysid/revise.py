@@ -21,6 +21,9 @@ from torchdlo.sysid.screen import screen
 MATTERS = 0.03
 """Share of the baseline's excess gap that each effect has to close, whatever the others leave."""
 
+NEARLY_ALL = 0.8
+"""Share of what is left above the floor."""
+
 TIE = 0.05
 """Fits whose gaps differ by less than this share of the excess, or of the floor, are not told apart."""
 
@@ -67,14 +70,19 @@ class Revision:
         self.bench, self.budget, self.plain, self.report = bench, budget, plain, report
 
     def matters(self, less: Fitted, more: Fitted, split: str) -> bool:
-        """Return whether a model's gap is smaller by more than the floor, and by a share of the baseline's."""
+        """Return whether a model's gap is smaller by more than the floor, and by a share of the baseline's.
+
+        What takes away nearly all that the others leave matters, however small that is beside the baseline's gap.
+        """
         # A baseline may go astray on a trial: then what it became when it was fitted further tells what a share is.
         first = min(rms(self.bench.gaps(f, split)) for f in self.plain) ** 2
         before, after = (rms(self.bench.gaps(f, split)) ** 2 for f in (less, more))
-        return before - after > max(self.bench.level**2, MATTERS * (first - self.bench.floor.noise**2))
+        floor, closed = self.bench.level**2, before - after
+        enough = min(MATTERS * (first - self.bench.floor.noise**2), NEARLY_ALL * (before - floor))
+        return closed > max(floor, enough)
 
     def pruned(self, fitted: Fitted, found: Found) -> Fitted:
-        """Return the model without the effects that the last one has made needless."""
+        """Return the model without the effects that the last one, or other numbers, have made needless."""
         for name in [*found.shares][:-1]:
             less = self._without(fitted, name)
             if not self.matters(less, fitted, "train"):
