@@ -19,7 +19,7 @@ from torchdlo.coupling import body_matter, mpm, rod_matter, watch
 from torchdlo.coupling.bodies import Body, BodyParams, BodyState, BodyTargets, Solid, place
 from torchdlo.coupling.particles import Matter, Medium, Particles, rows_of
 from torchdlo.coupling.watch import survey
-from torchdlo.physics import build, rod, stability, traced, tree
+from torchdlo.physics import build, checks, rod, stability, traced, tree
 from torchdlo.physics.build import Rope
 from torchdlo.physics.effect import Effect, altered, default_values, numbers_of
 from torchdlo.physics.hold import Reaction, Targets, between, check_grip, unfelt
@@ -114,9 +114,10 @@ class Scene:
 
         need(self.integrator in INTEGRATORS, f"integrator is {self.integrator!r}; expected one of {INTEGRATORS}")
         need(self.twist in TWISTS, f"twist is {self.twist!r}; expected one of {TWISTS}")
-        need(math.isfinite(self.dt) and self.dt > 0, f"dt is {self.dt}; expected a positive number of seconds")
-        whole = isinstance(self.substeps, int) and self.substeps >= 1
-        need(whole, f"substeps is {self.substeps}; expected a whole number from 1 up")
+        need(
+            isinstance(self.dt, int | float) and 0 < self.dt < math.inf, f"dt is {self.dt!r}; expected seconds above 0"
+        )
+        need(self.substeps in range(1, 10**6), f"substeps is {self.substeps!r}; expected a whole number from 1 up")
         need(self.newton >= 1, f"newton is {self.newton}; expected at least 1 step")
         need(self.settling >= 1, f"settling is {self.settling}; expected at least 1 step")
         need(self.gamma >= 0.25, f"gamma is {self.gamma}; below 0.25 implicit steps are not stable")
@@ -197,6 +198,7 @@ def make(
             unstable substeps. Scenes whose loads are only evaluated may be anything.
         choices: fields of `Scene`.
     """
+    checks.listed(effects, Effect, "effects")
     topology, rods, state = build.assemble(ropes)
     kinds, solid, placed = place(bodies, state.pos) if bodies else ((), (), ())
     if bodies:

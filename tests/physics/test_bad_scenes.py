@@ -10,6 +10,7 @@ import torch
 from helpers import circle, effects, run, straight, vec
 
 from torchdlo.physics import tree
+from torchdlo.physics.effects.field import Gravity
 from torchdlo.physics.topology import Topology
 from torchdlo.scene import Control, Params, Rope, Scene, finite, hold, limits, make, rollout, step
 
@@ -73,6 +74,15 @@ BAD = {
     "unknown twist": (lambda: make(rope(), [], twist="some"), "twist"),
     "dt 0": (lambda: make(rope(), [], dt=0.0), "dt"),
     "dt NaN": (lambda: make(rope(), [], dt=math.nan), "dt"),
+    "a rope that is not in a list": (lambda: make(rope()[0], []), "a Rope is given; expected a list of ropes"),
+    "positions in place of a rope": (lambda: make([X], []), "a Tensor is at place 0"),
+    "the class of an effect": (lambda: make(rope(), [Gravity]), "class Gravity"),
+    "the name of an effect": (lambda: make(rope(), ["gravity"]), "a str is at place 0 .* effects"),
+    "effects by name": (lambda: make(rope(), "gravity"), "a str is given; expected a list of effects"),
+    "a word for a mass": (lambda: make(rope(mass="heavy"), []), "mass is 'heavy'"),
+    "a director of four numbers": (lambda: make(rope(director=torch.ones(4)), []), "director is .4,."),
+    "a rest director along the rope": (lambda: make(rope(rest_director=X[1] - X[0]), []), "rest_director points along"),
+    "a word for dt": (lambda: make(rope(), [], dt="1ms"), "dt is '1ms'"),
     "no substep": (lambda: make(rope(), [], substeps=0), "substeps"),
     "half a substep": (lambda: make(rope(), [], substeps=2.5), "substeps"),
     "no newton step": (lambda: make(rope(), [], newton=0), "newton"),

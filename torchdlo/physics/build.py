@@ -128,6 +128,7 @@ def assemble(ropes: Sequence[Rope]) -> tuple[Topology, RodParams, RodState]:
     Returns:
         The topology, and parameters and state with the batch axes of the ropes.
     """
+    checks.listed(ropes, Rope, "ropes")
     if not ropes:
         raise ValueError("no rope given; a scene needs at least one")
     for index, rope in enumerate(ropes):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, SupportsFloat
 
 import torch
 from torch import Tensor
@@ -13,6 +13,20 @@ if TYPE_CHECKING:
 
 _ZERO_ALLOWED = ("youngs", "shear", "bend", "bend2", "twist")
 _NUMBERS = ("radius", "mass", "density", "stretch", "rest_twist", *_ZERO_ALLOWED)
+
+
+def listed(given: object, kind: type, what: str) -> None:
+    """Raise a `ValueError` if something is not a sequence of things of a kind."""
+    wanted = f"expected a list of {what}"
+    if not isinstance(given, Sequence) or isinstance(given, str):
+        raise ValueError(f"scene: {_called(given)} is given; {wanted}")
+    for k, each in enumerate(given):
+        if not isinstance(each, kind):
+            raise ValueError(f"scene: {_called(each)} is at place {k} of a list; {wanted}")
+
+
+def _called(given: object) -> str:
+    return f"the class {given.__name__} (without brackets?)" if isinstance(given, type) else f"a {type(given).__name__}"
 
 
 def rope(index: int, rope: Rope) -> None:
@@ -33,11 +47,9 @@ def rope(index: int, rope: Rope) -> None:
         _vectors(where, "rest", rope.rest, rope.positions)
     elif rope.rest not in ("straight", "as_placed"):
         raise ValueError(f"{where}: rest is {rope.rest!r}; expected 'straight', 'as_placed' or vertex positions")
-    if rope.director is not None:
-        edge = rope.positions[..., 1, :] - rope.positions[..., 0, :]
-        across = torch.linalg.cross(*torch.broadcast_tensors(edge, rope.director.to(edge)), dim=-1).norm(dim=-1)
-        if not bool((across > 1e-6 * edge.norm(dim=-1) * rope.director.norm(dim=-1)).all()):
-            raise ValueError(f"{where}: director points along the first edge; expected a direction across it")
+    for name, shape in (("director", rope.positions), ("rest_director", rope.rest)):
+        if getattr(rope, name) is not None:
+            _across(where, name, getattr(rope, name), shape if isinstance(shape, Tensor) else rope.positions)
 
 
 def together(ropes: Sequence[Rope]) -> None:
@@ -72,6 +84,16 @@ def _steps(x: Tensor, closed: bool) -> Tensor:
     return steps.norm(dim=-1)
 
 
+def _across(where: str, name: str, value: Tensor, positions: Tensor) -> None:
+    if not isinstance(value, Tensor) or value.shape[-1:] != (3,):
+        given = tuple(value.shape) if isinstance(value, Tensor) else type(value).__name__
+        raise ValueError(f"{where}: {name} is {given}; expected a tensor (..., 3)")
+    edge = positions[..., 1, :] - positions[..., 0, :]
+    across = torch.linalg.cross(*torch.broadcast_tensors(edge, value.to(edge)), dim=-1).norm(dim=-1)
+    if not bool((across > 1e-6 * edge.norm(dim=-1) * value.norm(dim=-1)).all()):
+        raise ValueError(f"{where}: {name} points along the first edge; expected a direction across it")
+
+
 def _number(where: str, name: str, value: float | Tensor, positions: Tensor) -> None:
     count, batch = positions.shape[-2], tuple(positions.shape[:-2])
     if isinstance(value, Tensor):
@@ -89,6 +111,8 @@ def _number(where: str, name: str, value: float | Tensor, positions: Tensor) -> 
         value = value.detach()
         least, most, finite = float(value.min()), float(value.max()), bool((value == value).all())
     else:
+        if not isinstance(value, SupportsFloat):
+            raise ValueError(f"{where}: {name} is {value!r}; expected a number or a tensor")
         least = most = float(value)
         finite = value == value
     if name == "rest_twist":
