@@ -7,8 +7,11 @@ An episode that is played with gradient counts as one. Returns are those of the 
 from __future__ import annotations
 
 import json
+import os
 import statistics
+import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -16,7 +19,7 @@ from typing import Any
 from options import Parser, count, save
 
 EXAMPLES = """examples:
-  python experiments/benchmark_trajopt.py --out runs/trajopt
+  python experiments/benchmark_trajopt.py --out runs/trajopt --jobs 2
   python experiments/benchmark_trajopt.py --tasks wiring_post --methods cmaes,hybrid --seeds 5 --episodes 2000
 """
 
@@ -51,6 +54,41 @@ def run(task: str, method: str, seed: int, args: Any) -> dict[str, Any]:
     write_atomically(folder / "trajectory.json", trajectory_json(found, chosen))
     write_atomically(result, result_json(found, chosen, settings))
     return json.loads(result.read_text())
+
+
+def side_by_side(args: Any) -> None:
+    """Run what is not there yet, each in a process of one thread, several at a time; what they say goes to log.txt."""
+    common = ["--episodes", str(args.episodes), "--population", str(args.population), "--out", args.out]
+    common += ["--jobs", "1", "--quiet", *(["--double"] if args.double else []), *(["--smoke"] if args.smoke else [])]
+
+    def one(task: str, method: str, seed: int) -> None:
+        folder = Path(args.out) / f"{task}-{method}-{seed}"
+        folder.mkdir(parents=True, exist_ok=True)
+        words = ["--tasks", task, "--methods", method, "--first", str(seed), "--seeds", "1", *common]
+        with open(folder / "log.txt", "a", encoding="utf-8") as log:
+            done = subprocess.run(
+                [sys.executable, __file__, *words],
+                stdout=log,
+                stderr=log,
+                check=False,
+                env={"OMP_NUM_THREADS": "1"} | dict(os.environ),
+            )
+        print(f"{folder.name}: {'done' if not done.returncode else f'failed, see {folder}/log.txt'}", flush=True)
+
+    with ThreadPoolExecutor(args.jobs) as pool:
+        try:
+            waiting = [
+                pool.submit(one, task, method, args.first + k)
+                for k in range(args.seeds)
+                for method in args.methods
+                for task in args.tasks
+            ]
+            for each in waiting:
+                each.result()
+        except KeyboardInterrupt:
+            # Ctrl-C reaches the processes as well: they write down where they are.
+            pool.shutdown(cancel_futures=True)
+            raise
 
 
 def row(task: str, method: str, runs: list[dict[str, Any]]) -> dict[str, Any]:
@@ -118,11 +156,14 @@ def arguments(words: list[str] | None = None) -> Any:
     parser = Parser("benchmark_trajopt.py", description=__doc__, epilog=EXAMPLES)
     parser.add_argument("--tasks", default=",".join(TASKS), help=f"of {', '.join(TASKS)}; default: all")
     parser.add_argument("--methods", default=",".join(METHODS), help=f"of {', '.join(METHODS)}; default: all")
-    parser.add_argument("--seeds", type=count, default=3, help="seeds per task and method, from 0; default: 3")
+    parser.add_argument("--seeds", type=count, default=3, help="seeds per task and method; default: 3")
+    parser.add_argument("--first", type=int, default=0, help="first seed; default: 0")
+    parser.add_argument("--jobs", type=count, default=1, help="searches at the same time, one core each; default: 1")
     parser.add_argument("--episodes", type=int, default=0, help="budget; default: the published one of each task")
     parser.add_argument("--population", type=int, default=0, help="default: that of each method")
     parser.add_argument("--out", default="runs/trajopt", help="folder; default: runs/trajopt")
     parser.flag("double", "physics in double precision")
+    parser.flag("quiet", "search only; no table")
     parser.flag("smoke", "one iteration of each method on short episodes with uncompiled steps")
     args = parser.parse_args(words)
     args.compiled = not args.smoke
@@ -146,11 +187,14 @@ def main() -> None:
         shorten()
     runs: dict[tuple[str, str], list[dict[str, Any]]] = {}
     try:
+        if args.jobs > 1:
+            side_by_side(args)
         for task in args.tasks:
             for method in args.methods:
-                for seed in range(args.seeds):
+                for seed in range(args.first, args.first + args.seeds):
                     runs.setdefault((task, method), []).append(run(task, method, seed, args))
-                report(runs, args)
+                if not args.quiet:
+                    report(runs, args)
     except KeyboardInterrupt:
         sys.exit("interrupted; the same command goes on from here")
     except InputError as error:
