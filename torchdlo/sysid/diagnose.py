@@ -16,7 +16,7 @@ import numpy as np
 from torchdlo.errors import InputError
 from torchdlo.sysid import baseline as baselines
 from torchdlo.sysid import clamps, health, library, plan
-from torchdlo.sysid.bench import SILENT, Bench, Callback
+from torchdlo.sysid.bench import CHAIN, SILENT, Bench, Callback
 from torchdlo.sysid.extend import extend, short, vector
 from torchdlo.sysid.fit import interval
 from torchdlo.sysid.floor import gap, rms
@@ -111,7 +111,7 @@ class _Search:
         self._say_floor()
         rounds: list[list[Candidate]] = []
         found = Found()
-        whole = max(self._squared(base) - self.bench.floor.noise**2, 1e-12)
+        whole = self._excess(base)
         while len(rounds) < self.budget.rounds + (len(found.shares) < len(rounds)):
             if found.shares and rms(self.bench.gaps(base, "all")) < MORE * self.bench.level:
                 break
@@ -120,6 +120,9 @@ class _Search:
             best, rival, candidates, rivals = self._round(base, names, f"round {len(rounds) + 1}")
             rounds.append(candidates)
             if best is None:
+                if not found.shares and (chain := self._chain(rival)):
+                    base, whole = chain, self._excess(chain)
+                    continue
                 if rival is not base and (found.shares or rival.options != base.options):
                     base = rival
                     self.pool.choose(**dict(base.options))
@@ -134,6 +137,20 @@ class _Search:
             self._say_floor()
         base = self.revision.plainer(self.revision.pruned(base, found), found)
         return self._conclude(base, found, rounds)
+
+    def _chain(self, base: Fitted) -> Fitted | None:
+        """Return the baseline as a chain of links if that is what it turns out to be where no effect explains it."""
+        if CHAIN in base.effects or rms(self.bench.gaps(base, "all")) < SILENT * self.bench.level:
+            return None
+        further = baselines.go_further(self.bench, base, self.budget.more, self.report)
+        if CHAIN not in further.effects:
+            return None
+        self.baseline, self.before = further, self.bench.prediction(further, "all")
+        self.plain[:] = [further]
+        return further
+
+    def _excess(self, fitted: Fitted) -> float:
+        return max(self._squared(fitted) - self.bench.floor.noise**2, 1e-12)
 
     def _squared(self, fitted: Fitted) -> float:
         """Return the squared gap on the test trials [m^2]; all frames count the same, whatever is known of them."""
