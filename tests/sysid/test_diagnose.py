@@ -15,14 +15,14 @@ from torchdlo.errors import InputError
 from torchdlo.physics.effects import EFFECTS
 from torchdlo.report import diagnosis as report
 from torchdlo.sysid import diagnose as search
-from torchdlo.sysid import floor, library, settle
+from torchdlo.sysid import baseline, floor, library, settle
 from torchdlo.sysid.drive import drive
 from torchdlo.sysid.extend import extend
 from torchdlo.sysid.findings import findings, findings_json, model_json, sentence
 from torchdlo.sysid.fit import Point, Space, interval
 from torchdlo.sysid.jobs import Fitted
 from torchdlo.sysid.mesh import make_mesh
-from torchdlo.sysid.model import RopeModel
+from torchdlo.sysid.model import AHEAD, RopeModel
 from torchdlo.sysid.motion import Start
 from torchdlo.sysid.plan import BUDGETS
 from torchdlo.sysid.recording import Recording, Trial
@@ -301,3 +301,19 @@ def test_an_effect_gives_way_to_another_that_fits_better_beside_the_rest(cost: f
     assert "wind" not in tried[0][1]
     bench.gaps = lambda *_: np.array([1e-3])
     assert revision.exchanged(fitted, found, ["air_drag"]) is fitted and len(tried) == 1 + (named != "wind")
+
+
+@pytest.mark.parametrize(("lost", "ahead"), [((0, 0), 0.0), ((2, 0), AHEAD), ((2, 2), 0.0)])
+def test_steps_look_ahead_where_finer_simulations_go_astray_otherwise(lost: tuple[int, int], ahead: float) -> None:
+    options, used = {"ahead": 0.0}, []
+    pool = SimpleNamespace(local=SimpleNamespace(options=options), choose=options.update)
+    bench = SimpleNamespace(
+        pool=pool,
+        fit=lambda jobs: jobs,
+        calmer=lambda fitted, _: f"{fitted}, calm",
+        correct=lambda fitted: used.append(fitted) or SimpleNamespace(of=fitted, lost=lost[len(used) - 1]),
+        use=lambda found: used.append(found.of),
+    )
+    fitted, found = baseline._corrected(bench, "rope", 4)
+    assert options["ahead"] == ahead and fitted == found.of == used[-1]
+    assert fitted == ("rope, calm" if ahead else "rope")

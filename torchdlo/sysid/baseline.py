@@ -98,7 +98,7 @@ def calibrate(bench: Bench, count: int, iterations: int, rng: np.random.Generato
         smooth, side = others[0], _moved(side, others[0])
     if firm:
         smooth, side = _held(bench, others[-1], smooth, side)
-    rope = bench.correct(smooth)
+    smooth, rope = _corrected(bench, smooth, iterations)
     better = fit([plain(smooth.values[None], iterations, None)], 3)[0]
     if side.point.cost < _BETTER * smooth.point.cost:
         better = _chain_or(bench, better, rope, [chain(side.values[None], iterations, None)])
@@ -140,6 +140,8 @@ def go_further(bench: Bench, base: Fitted, iterations: int, report: Callback) ->
 
     That is the law of a chain, and a twisting stiffness that hardly shows and ran away.
     """
+    before = bench.gaps(base, "all")
+    base, rope = _begin_anew(bench, base, iterations)
     model = bench.pool.local.model(base.effects)
     bend, twist = (model.parameters.index(f"{way}ing_stiffness") for way in ("bend", "twist"))
     values, link = base.values[None], float(np.diff(model.arclength).min())
@@ -147,7 +149,6 @@ def go_further(bench: Bench, base: Fitted, iterations: int, report: Callback) ->
         back = base.values.copy()
         back[twist] = _ROUND * back[bend]
         values = np.stack([base.values, back])
-    before, rope = bench.gaps(base, "all"), _begin_anew(bench, base)
     names, sizes = base.space.names, tuple(base.space.units)
     stage, effects, free = "fitting all numbers again", (*base.effects, CHAIN), (*names, f"{CHAIN}.length")
     report(stage, 0, 3, "")
@@ -168,17 +169,35 @@ def go_further(bench: Bench, base: Fitted, iterations: int, report: Callback) ->
         base = bench.fit([bench.calmer(base, iterations)])[0]
     report(stage, 2, 3, f"{1e3 * rms(bench.gaps(base, 'train')):.2f} mm")
     # Corrections of another motion are wrong where motions part.
-    _begin_anew(bench, base)
+    base, _ = _begin_anew(bench, base, iterations)
     base = bench.fit([bench.further(base, iterations // 2)])[0]
     report(stage, 3, 3, f"{1e3 * rms(bench.gaps(base, 'train')):.2f} mm")
     return base
 
 
-def _begin_anew(bench: Bench, base: Fitted) -> Refinement:
-    """Begin trials as a model says, correct simulations by what finer ones of it change, and return that."""
+def _begin_anew(bench: Bench, base: Fitted, iterations: int) -> tuple[Fitted, Refinement]:
+    """Begin trials as a model says, and correct simulations by what finer ones of it change; see `_corrected`."""
     if not bench.starts["train"].still.all():
         bench.begin(base.values, base.effects)
-    return bench.correct(base)
+    return _corrected(bench, base, iterations)
+
+
+def _corrected(bench: Bench, fitted: Fitted, iterations: int) -> tuple[Fitted, Refinement]:
+    """Correct simulations by what finer ones change; return the model and that.
+
+    Finer simulations may go astray where others do not. Where fewer do with steps that look ahead, those are chosen.
+    """
+    found = bench.correct(fitted)
+    if not found.lost or bench.pool.local.options["ahead"]:
+        return fitted, found
+    bench.pool.choose(ahead=AHEAD)
+    calm = bench.fit([bench.calmer(fitted, iterations)])[0]
+    calmer = bench.correct(calm)
+    if calmer.lost < found.lost:
+        return calm, calmer
+    bench.pool.choose(ahead=0.0)
+    bench.use(found)
+    return fitted, found
 
 
 def _chain_or(bench: Bench, smooth: Fitted, rope: Refinement, sides: Sequence[Fit]) -> Fitted:

@@ -115,6 +115,11 @@ class Refinement:
         step, grid = ((1 + rest) * np.nan_to_num(x) for rest, x in zip(self._rest, (self.step, self.grid), strict=True))
         return step + self.wrong * grid
 
+    @property
+    def lost(self) -> int:
+        """Trials of which a finer simulation failed, or differed too much."""
+        return int((~np.isfinite(self.step + self.grid)).any((1, 2, 3)).sum())
+
     def floor(self, trials: slice, free: np.ndarray) -> Floor:
         """Return the floor on some of the trials.
 

@@ -41,10 +41,6 @@ _STRETCH = 1e4
 AHEAD = 0.1
 """How far steps look ahead: real ropes are jerked taut, and what then rings within a substep must die out."""
 
-_GAMMA = 0.5
-"""Share of dt^2 times stiffness that counts as inertia: steps of straight ropes are stable from 0.25 on, but near that
-limit what rings, as starts from noisy markers do, grows without end in some motions of bent ones."""
-
 _CHUNK = 256
 """Most scenes that run together."""
 
@@ -187,7 +183,6 @@ class RopeModel:
             held_vertices=self.held,
             held_edges=tuple(edge for edge, _ in self.clamps),
             ahead=self.ahead,
-            gamma=_GAMMA,
             # Ropes that are jerked taut need more; others do as well with less.
             newton=3 if self.ahead else 2,
             settling=4 if self.ahead else 2,
