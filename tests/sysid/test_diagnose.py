@@ -14,8 +14,8 @@ from scipy.spatial.transform import Rotation
 from torchdlo.errors import InputError
 from torchdlo.physics.effects import EFFECTS
 from torchdlo.report import diagnosis as report
-from torchdlo.sysid import diagnose as search
 from torchdlo.sysid import baseline, floor, library, settle
+from torchdlo.sysid import diagnose as search
 from torchdlo.sysid.drive import drive
 from torchdlo.sysid.extend import extend
 from torchdlo.sysid.findings import findings, findings_json, model_json, sentence
