@@ -114,9 +114,7 @@ class Scene:
 
         need(self.integrator in INTEGRATORS, f"integrator is {self.integrator!r}; expected one of {INTEGRATORS}")
         need(self.twist in TWISTS, f"twist is {self.twist!r}; expected one of {TWISTS}")
-        need(
-            isinstance(self.dt, int | float) and 0 < self.dt < math.inf, f"dt is {self.dt!r}; expected seconds above 0"
-        )
+        need(isinstance(self.dt, int | float) and 0 < self.dt < math.inf, f"dt is {self.dt!r}; give seconds above 0")
         need(self.substeps in range(1, 10**6), f"substeps is {self.substeps!r}; expected a whole number from 1 up")
         need(self.newton >= 1, f"newton is {self.newton}; expected at least 1 step")
         need(self.settling >= 1, f"settling is {self.settling}; expected at least 1 step")

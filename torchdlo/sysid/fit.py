@@ -20,11 +20,12 @@ _FIRM = 5e-3
 """Share of the cost that a number has to save per squared coordinate to be followed as far as its slope says."""
 
 _LOST = 0.3
-"""Cost of a trial from which its simulation counts as failed, as a share of what is measured there: what grows without
-end may stay finite. So much a failed one costs while others run through, so that numbers may lead away from there."""
+"""What a trial costs whose simulation fails while others run through, as a share of what is measured there: so that
+numbers may lead away from there."""
 
 _WILD = 0.1
-"""Mean change of a trial by a step of finite differences, likewise, from which it is no slope."""
+"""Mean change of a trial by a step of finite differences, likewise, from which it is no slope: what grows without end
+may stay finite, but small changes of numbers change all of it."""
 
 Simulate = Callable[[np.ndarray], np.ndarray]
 """Maps parameter sets (P, K) to simulated markers (P, B, F, M, 3) [m]."""
@@ -102,7 +103,7 @@ def costs(sims: np.ndarray, measured: np.ndarray) -> np.ndarray:
     seen = np.isfinite(measured)
     residual = np.where(seen, sims - measured, 0.0).reshape(len(sims), len(measured), -1)
     mean = _robust(residual)[0].sum(-1) / seen.reshape(len(measured), -1).sum(1)
-    return _together(mean, _LOST * extent(measured))
+    return _together(np.where(np.isfinite(mean), np.minimum(mean, extent(measured)), np.inf), measured)
 
 
 def extent(measured: np.ndarray) -> float:
@@ -110,10 +111,10 @@ def extent(measured: np.ndarray) -> float:
     return float(np.max(np.nanmax(measured, (1, 2)) - np.nanmin(measured, (1, 2))))
 
 
-def _together(of_trial: np.ndarray, lost: float) -> np.ndarray:
-    """Return the mean cost of trials (..., B), where they are less than `lost`; infinite if none are."""
-    ran = of_trial < lost
-    return np.where(ran.any(-1), np.where(ran, of_trial, lost).mean(-1), np.inf)
+def _together(of_trial: np.ndarray, measured: np.ndarray) -> np.ndarray:
+    """Return the mean cost of trials (..., B), some of which may have failed; infinite if all did."""
+    ran = np.isfinite(of_trial)
+    return np.where(ran.any(-1), np.where(ran, of_trial, _LOST * extent(measured)).mean(-1), np.inf)
 
 
 class Look:
@@ -143,14 +144,15 @@ class Look:
             of_trial = cost.sum(1) / per_trial
             change = np.where(seen, sims[s, 1:] - sims[s, 0], 0.0).reshape(k, len(measured), -1)
             # A trial that ran at the point but failed beside it tells nothing about slopes.
-            wild = ~(np.abs(change).sum(-1) < _WILD * whole * per_trial).all(0)
-            useless = wild | ~(of_trial < _LOST * whole)
+            useless = ~(np.isfinite(of_trial) & (np.abs(change).sum(-1) < _WILD * whole * per_trial).all(0))
+            # Nor does what it costs where it is far off, if a little beside it is quite another motion.
+            of_trial = np.where(useless & (of_trial > _LOST * whole), np.inf, of_trial)
             slope = change / self._sign[s][:, None, None]
             slope, weight = np.where(useless[None, :, None], 0.0, slope), np.where(useless[:, None], 0.0, weight)
             residual = np.where(useless[:, None], 0.0, residual)
             gradient = np.einsum("kbr,br,br->bk", slope, weight, residual, optimize=True) / per_trial[:, None]
             curvature = np.einsum("kbr,br,lbr->bkl", slope, weight, slope, optimize=True) / per_trial[:, None, None]
-            points.append(Point(self.raws[s], float(_together(of_trial, _LOST * whole)), gradient, curvature, of_trial))
+            points.append(Point(self.raws[s], float(_together(of_trial, measured)), gradient, curvature, of_trial))
         return points
 
 
