@@ -103,7 +103,8 @@ def costs(sims: np.ndarray, measured: np.ndarray) -> np.ndarray:
     seen = np.isfinite(measured)
     residual = np.where(seen, sims - measured, 0.0).reshape(len(sims), len(measured), -1)
     mean = _robust(residual)[0].sum(-1) / seen.reshape(len(measured), -1).sum(1)
-    return _together(np.where(np.isfinite(mean), np.minimum(mean, extent(measured)), np.inf), measured)
+    whole = extent(measured)
+    return _together(np.where(np.isfinite(mean), np.minimum(mean, whole), np.inf), _LOST * whole)
 
 
 def extent(measured: np.ndarray) -> float:
@@ -111,10 +112,10 @@ def extent(measured: np.ndarray) -> float:
     return float(np.max(np.nanmax(measured, (1, 2)) - np.nanmin(measured, (1, 2))))
 
 
-def _together(of_trial: np.ndarray, measured: np.ndarray) -> np.ndarray:
-    """Return the mean cost of trials (..., B), some of which may have failed; infinite if all did."""
+def _together(of_trial: np.ndarray, lost: float) -> np.ndarray:
+    """Return the mean cost of trials (..., B), of which those that failed cost `lost`; infinite if all did."""
     ran = np.isfinite(of_trial)
-    return np.where(ran.any(-1), np.where(ran, of_trial, _LOST * extent(measured)).mean(-1), np.inf)
+    return np.where(ran.any(-1), np.where(ran, of_trial, lost).mean(-1), np.inf)
 
 
 class Look:
@@ -152,7 +153,7 @@ class Look:
             residual = np.where(useless[:, None], 0.0, residual)
             gradient = np.einsum("kbr,br,br->bk", slope, weight, residual, optimize=True) / per_trial[:, None]
             curvature = np.einsum("kbr,br,lbr->bkl", slope, weight, slope, optimize=True) / per_trial[:, None, None]
-            points.append(Point(self.raws[s], float(_together(of_trial, measured)), gradient, curvature, of_trial))
+            points.append(Point(self.raws[s], float(_together(of_trial, _LOST * whole)), gradient, curvature, of_trial))
         return points
 
 

@@ -51,7 +51,8 @@ class Found:
 
     def leave_out(self, name: str) -> None:
         """Forget an effect that the last one makes needless; the last one takes over its share."""
-        share, _ = self.shares.pop(name), self.ties.pop(name, None)
+        del self.ties[name]
+        share = self.shares.pop(name)
         self.shares[[*self.shares][-1]] += share
 
 
