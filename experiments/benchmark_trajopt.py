@@ -23,6 +23,9 @@ EXAMPLES = """examples:
   python experiments/benchmark_trajopt.py --tasks wiring_post --methods cmaes,hybrid --seeds 5 --episodes 2000
 """
 
+INTERRUPTED = 130
+"""Exit status after Ctrl-C."""
+
 
 def run(task: str, method: str, seed: int, args: Any) -> dict[str, Any]:
     """One run: read if it is finished, resumed if it was stopped."""
@@ -73,7 +76,8 @@ def side_by_side(args: Any) -> None:
                 check=False,
                 env={"OMP_NUM_THREADS": "1"} | dict(os.environ),
             )
-        print(f"{folder.name}: {'done' if not done.returncode else f'failed, see {folder}/log.txt'}", flush=True)
+        ends = {0: "done", INTERRUPTED: "interrupted"}
+        print(f"{folder.name}: {ends.get(done.returncode, f'failed, see {folder}/log.txt')}", flush=True)
 
     with ThreadPoolExecutor(args.jobs) as pool:
         try:
@@ -196,7 +200,8 @@ def main() -> None:
                 if not args.quiet:
                     report(runs, args)
     except KeyboardInterrupt:
-        sys.exit("interrupted; the same command goes on from here")
+        print("interrupted; the same command goes on from here", file=sys.stderr)
+        sys.exit(INTERRUPTED)
     except InputError as error:
         sys.exit(f"error: {error}")
 

@@ -58,6 +58,11 @@ def test_version(capsys: pytest.CaptureFixture[str]) -> None:
     assert capsys.readouterr().out.startswith("torchdlo 0.")
 
 
+def test_the_package_runs_as_a_module() -> None:
+    done = subprocess.run([sys.executable, "-m", "torchdlo", "--version"], capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0 and done.stdout.startswith("torchdlo 0."), done.stderr
+
+
 def test_check_describes_the_recording(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run("check", folder) == 0
     said = capsys.readouterr().out

@@ -33,15 +33,7 @@ def firm(base: Fitted, job: Fit) -> Fit:
 
 
 def stiff(bench: Bench, base: Fitted, score: Score, iterations: int, frames: int | None) -> Fit:
-    """Return the job of fitting elastic clamps that hold the rope stiffly up to their last marker.
-
-    Args:
-        bench: the trials.
-        base: the model without.
-        score: of the effect.
-        iterations: most iterations.
-        frames: how many frames to fit; all if None.
-    """
+    """Return the job of fitting elastic clamps that hold the rope stiffly up to their last marker, see `extend`."""
     model, number = bench.pool.local.model(base.effects), f"{NAME}.stiffness"
     apart = min(float(np.diff(model.mesh.marker_arclength[run]).min()) for run in model.mesh.runs)
     bend = base.values[model.parameters.index("bending_stiffness")]
