@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
+import pytest
 import torch
 
 from torchdlo.agents.problem import Encoding
@@ -31,6 +34,41 @@ def test_no_tool_goes_further_than_its_limit_and_directions_stay() -> None:
 def test_projected_points_decode_to_the_same_actions() -> None:
     points = torch.randn(20, TWO_TOOLS.size, generator=torch.Generator().manual_seed(1), dtype=torch.float64) * 0.05
     torch.testing.assert_close(TWO_TOOLS.decode(TWO_TOOLS.project(points)), TWO_TOOLS.decode(points))
+
+
+@pytest.mark.parametrize("apart", [None, 0.2])
+def test_tools_go_together_or_each_for_itself(apart: float | None) -> None:
+    encoding = replace(TWO_TOOLS, apart=apart)
+    moves = 0.01 * torch.randn(5, 3, 2, 3, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    points = encoding.encode(moves)
+    torch.testing.assert_close(encoding.decode(points), TWO_TOOLS.decode(moves.flatten(1)))
+    torch.testing.assert_close(
+        encoding.decode(encoding.project(5 * points)), encoding.decode(5 * points), rtol=1e-5, atol=0
+    )
+    if apart is not None:
+        # By halves of two tools: a number of 1 moves them 0.2 each from their mean.
+        one = points.reshape(5, 3, 2, 3)[:, :, 1]
+        torch.testing.assert_close(one, (moves[:, :, 1] - moves[:, :, 0]) / 2 / apart)
+
+
+def test_slopes_by_actions_become_slopes_by_points() -> None:
+    encoding = replace(TWO_TOOLS, apart=0.2)
+    points = 0.01 * torch.randn(4, encoding.size, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+    weights = torch.linspace(-1, 1, 42, dtype=torch.float64).expand(4, 42)
+
+    def loss(x: torch.Tensor) -> torch.Tensor:
+        return (encoding.decode(x).flatten(1) * weights).sum()
+
+    slope = torch.stack([(loss(points + 1e-7 * e) - loss(points - 1e-7 * e)) / 2e-7 for e in torch.eye(18).double()])
+    torch.testing.assert_close(encoding.pull(points, weights).sum(0), slope, rtol=1e-6, atol=1e-7)
+
+
+def test_tools_at_their_limit_can_brake() -> None:
+    points = torch.tensor([[0.05, 0.02, 0.0]], dtype=torch.float64)
+    encoding = Encoding(horizon=2, width=3, group=3, limit=0.01, hold=2)
+    at = encoding.project(points).requires_grad_()
+    (slope,) = torch.autograd.grad(encoding.decode(at).norm(dim=-1).sum(), at)
+    assert float((slope @ at[0] / at.norm()).detach()) == pytest.approx(1, rel=1e-6)
 
 
 def test_gradients_are_those_of_finite_differences_on_both_sides_of_the_limit() -> None:

@@ -120,7 +120,7 @@ def test_the_command_finds_keeps_and_plays_again(
     [
         (["nothing"], "there is no task 'nothing'; expected one of"),
         (["lead", "--method", "luck"], "method is 'luck'; expected one of cmaes, gd, hybrid"),
-        (["lead", "--episodes", "10"], "episodes is 10; expected at least 100"),
+        (["lead", "--episodes", "10"], "episodes is 10; expected at least 20"),
         (["lead", "--resume"], "expected the journal of a search to resume, found none; leave out --resume"),
     ],
 )
@@ -152,6 +152,9 @@ def test_trajectories_of_other_tasks_are_refused(lead: TaskProblem, tmp_path: Pa
 def test_presets_are_the_published_settings() -> None:
     assert preset("lifting", "cmaes").sigma == 0.005 and preset("lifting", "gd").rate == 1e-4
     assert preset("coiling", "cmaes").episodes // preset("coiling", "cmaes").population == 50
+    # Small budgets leave room for as many iterations.
+    assert [preset("coiling", "cmaes", episodes=n).population for n in (2000, 100)] == [40, 20]
+    assert preset("coiling", "hybrid", episodes=2000, population=7).population == 7
     assert preset("coiling", "cmaes", seed=None, episodes=7).episodes == 7
     plan = preset("coiling", "cmaes").plan(problem("coiling"))
     assert plan.encoding(plan.hold).knots == 10 and plan.encoding(plan.hold).reach == pytest.approx(0.1)

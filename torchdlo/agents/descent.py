@@ -19,7 +19,7 @@ def descent(plan: Plan, rng: torch.Generator) -> Search:
     encoding, coarse = plan.encoding(1), plan.encoding(plan.hold)
 
     def fresh() -> torch.Tensor:
-        return coarse.decode(walks(plan, rng)).flatten(1)
+        return encoding.project(coarse.decode(walks(plan, rng)).flatten(1))
 
     x = fresh()
     x[0] = 0

@@ -20,7 +20,7 @@ class Ask:
 
     encoding: Encoding
     points: Tensor
-    """Displacements of the way-points [m], shape (P, size)."""
+    """Numbers of the way-points [m], shape (P, size)."""
     graded: bool = False
     """Whether the slope of the loss is wanted."""
 
@@ -69,8 +69,9 @@ class Plan:
     """Steps of Adam from one start at most."""
     patience: int = 10
     """Steps without gain after which a start is given up."""
-    drifts: bool = False
-    """Whether worlds get harder from one iteration to the next, so that results of different ones do not compare."""
+    drifts: float = 0.0
+    """Share of the iterations in which worlds get harder from one to the next: results of different ones do not compare
+    until then."""
 
     @classmethod
     def of(cls, problem: Problem, population: int, iterations: int, **choices: Any) -> Plan:
@@ -81,32 +82,37 @@ class Plan:
         sizes = (problem.horizon, problem.width, problem.group, problem.limit)
         return cls(*sizes, population, iterations, **(lengths | choices))
 
-    def encoding(self, hold: int) -> Encoding:
-        """Return the encoding with `hold` actions per way-point."""
-        return Encoding(self.horizon, self.width, self.group, self.limit, hold)
+    def encoding(self, hold: int, apart: float | None = None) -> Encoding:
+        """Return the encoding with `hold` actions per way-point, see `Encoding`."""
+        return Encoding(self.horizon, self.width, self.group, self.limit, hold, apart)
 
 
-def walks(plan: Plan, rng: torch.Generator) -> Tensor:
-    """Return random way-points [m], shape (population, size), as CMA-ES would draw them at first."""
+def walks(plan: Plan, rng: torch.Generator, count: int | None = None) -> Tensor:
+    """Return random way-points [m], shape (count, size), as CMA-ES would draw them at first; a population if not given.
+
+    They may reach further than tools do.
+    """
     size = plan.encoding(plan.hold).size
-    return plan.sigma * torch.randn(plan.population, size, generator=rng, dtype=torch.float64)
+    return plan.sigma * torch.randn(count or plan.population, size, generator=rng, dtype=torch.float64)
 
 
-def sweeps(plan: Plan, rng: torch.Generator) -> Tensor:
-    """Return way-points of straight sweeps in one to three legs [m], shape (population, size).
+def sweeps(plan: Plan, encoding: Encoding, rng: torch.Generator) -> Tensor:
+    """Return points of straight sweeps in one to three legs, shape (population, size).
 
     Independent displacements walk as far as the root of their number; sweeps go as far as possible, and so meet things
-    that lie away from the start. The first is the trajectory that does nothing.
+    that lie away from the start. Tools go their own ways in some, which may tear what they hold, and together in the
+    others. The first is the trajectory that does nothing.
     """
-    encoding = plan.encoding(plan.hold)
     knots, groups, count = encoding.knots, plan.width // plan.group, plan.population
     draw = torch.randn(count, 3, groups, plan.group, generator=rng, dtype=torch.float64)
     heading = draw / torch.linalg.vector_norm(draw, dim=-1, keepdim=True)
     length = encoding.reach * torch.rand(count, 3, groups, 1, generator=rng, dtype=torch.float64)
-    legs = 1 + torch.arange(count) % 3
-    leg = torch.arange(knots)[None] * legs[:, None] // knots
-    moves = (heading * length)[torch.arange(count)[:, None], leg].flatten(1)
-    return torch.cat([torch.zeros_like(moves[:1]), moves[1:]])
+    ways = heading * length
+    each = torch.arange(count)
+    ways = torch.where((each % 4 < 2)[:, None, None, None], ways, ways[:, :, :1])
+    leg = torch.arange(knots)[None] * (1 + each % 3)[:, None] // knots
+    moves = ways[each[:, None], leg]
+    return encoding.project(encoding.encode(torch.cat([torch.zeros_like(moves[:1]), moves[1:]])))
 
 
 def costs(told: Told) -> Tensor:

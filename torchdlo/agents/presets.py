@@ -16,8 +16,10 @@ SIGMA = {"gathering": 0.005, "lifting": 0.005, "letter_art": 0.005}
 RATE = {"gathering": 1e-4, "lifting": 1e-4, "unknotting": 1e-4}
 """First steps of Adam that differ from 1 mm."""
 POPULATION = {"cmaes": 400, "gd": 16, "hybrid": 100}
-"""Trajectories per iteration. One start of gradient descent is published; more of them use up the same budget. Slopes
-need iterations more than numbers."""
+"""Most trajectories per iteration. One start of gradient descent is published; more of them use up the same budget.
+Slopes need iterations more than numbers."""
+_ITERATIONS, _FEWEST = 50, 20
+"""Iterations that a small budget allows all the same, as long as populations have so many trajectories."""
 
 PUBLISHED = {
     "coiling": {"gd": 11.59, "cmaes": 11.73},
@@ -34,11 +36,13 @@ PUBLISHED = {
 
 def preset(task: str, method: str, **given: Any) -> Settings:
     """Return the settings for a task and a method; what is given and not None wins."""
+    episodes = given.get("episodes") or EPISODES.get(task, 20_000)
     found = Settings(
         method=method,
-        episodes=EPISODES.get(task, 20_000),
-        population=POPULATION.get(method, 400),
-        sigma=SIGMA.get(task, 0.05),
+        episodes=episodes,
+        population=min(POPULATION.get(method, 400), max(_FEWEST, episodes // _ITERATIONS)),
+        # Tools that go together, or down a slope, do not need the small steps that keep them from tearing a rope.
+        sigma=0.05 if method == "hybrid" else SIGMA.get(task, 0.05),
         rate=RATE.get(task, 1e-3),
     )
     return replace(found, **{name: value for name, value in given.items() if value is not None})

@@ -65,6 +65,10 @@ class Problem(Protocol):
         ...
 
 
+_WITHIN = 1 - 1e-6
+"""Share of the limit that projected ways reach: a way of just the limit, cut by rounding, has no slope along itself."""
+
+
 @dataclass(frozen=True)
 class Encoding:
     """Trajectories as way-points: each is a displacement that is spread evenly over `hold` actions."""
@@ -74,6 +78,9 @@ class Encoding:
     group: int
     limit: float
     hold: int
+    apart: float | None = None
+    """If given, the numbers of a way-point are the mean displacement of all groups, then how far each but the first is
+    from it, over `apart`; else those of each group."""
 
     @property
     def knots(self) -> int:
@@ -91,14 +98,34 @@ class Encoding:
         return self.hold * self.limit
 
     def decode(self, points: Tensor) -> Tensor:
-        """Return actions (P, T, A) within the limits from displacements [m], shape (P, size)."""
-        moves = points.reshape(len(points), self.knots, self.width // self.group, self.group) / self.hold
+        """Return actions (P, T, A) within the limits from the numbers of points, shape (P, size)."""
+        moves = self._moves(points) / self.hold
         length = numerics.safe_norm(moves)
         moves = moves * (self.limit / length.clamp(min=self.limit))
         return moves.flatten(2).repeat_interleave(self.hold, 1)[:, : self.horizon]
 
+    def encode(self, moves: Tensor) -> Tensor:
+        """Return the points (P, size) of displacements [m], shape (P, knots, A / group, group)."""
+        if self.apart is not None:
+            mean = moves.mean(-2, keepdim=True)
+            moves = torch.cat([mean, (moves[..., 1:, :] - mean) / self.apart], -2)
+        return moves.flatten(1)
+
     def project(self, points: Tensor) -> Tensor:
         """Return the points with displacements cut to what can be reached, shape (P, size)."""
-        moves = points.reshape(len(points), self.knots, self.width // self.group, self.group)
+        moves, most = self._moves(points), _WITHIN * self.reach
         length = torch.linalg.vector_norm(moves, dim=-1, keepdim=True)
-        return (moves * (self.reach / length.clamp(min=self.reach))).reshape(points.shape)
+        return self.encode(moves * (most / length.clamp(min=most)))
+
+    def pull(self, points: Tensor, slope: Tensor) -> Tensor:
+        """Return slopes by the numbers of points from slopes by their actions, shape (P, T A)."""
+        x = points.detach().requires_grad_()
+        return torch.autograd.grad(self.decode(x).flatten(1), x, slope)[0]
+
+    def _moves(self, points: Tensor) -> Tensor:
+        """Return displacements [m], shape (P, knots, A / group, group)."""
+        x = points.reshape(len(points), self.knots, self.width // self.group, self.group)
+        if self.apart is None:
+            return x
+        own = self.apart * x[..., 1:, :]
+        return x[..., :1, :] + torch.cat([-own.sum(-2, keepdim=True), own], -2)

@@ -90,7 +90,7 @@ class Settings:
         need(self.episodes >= least, "episodes", f"at least {least}: {least - spare} for an iteration{judged}")
         given = {k: getattr(self, k) for k in ("hold", "sigma", "rate", "steps") if getattr(self, k) is not None}
         iterations = (self.episodes - spare) // (self.population * per)
-        return Plan.of(problem, self.population, iterations, drifts=self.robust is not None, **given)
+        return Plan.of(problem, self.population, iterations, drifts=self.robust.warm if self.robust else 0.0, **given)
 
 
 @dataclass(frozen=True, eq=False)
@@ -219,7 +219,8 @@ class _Player:
         good = torch.isfinite(slope).all(-1)
         self.blind = int((~good).sum())
         returns = torch.where(torch.isfinite(returns), returns, -math.inf)
-        loss = torch.where(torch.isfinite(loss), loss, math.inf)
+        # An episode that broke down may have a small loss, as nothing is added up from then on.
+        loss = torch.where(torch.isfinite(loss) & ~failed, loss, math.inf)
         return Told(returns, loss, success, failed, torch.where(good[:, None], slope, 0.0))
 
     def _chunk(self, problem: Problem, ask: Ask, points: Tensor, copies: int) -> tuple[Tensor, ...]:
