@@ -11,6 +11,7 @@ strain at the end of the substep, which damps axial waves), and `ahead` above ze
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -347,6 +348,8 @@ def settle_twist(
     Bergou 2008, section 4.2: twist waves are much faster than bending, so twist is taken to be in balance.
     """
     topology, patient = settings.topology, steps is not None
+    # Given all the time there is, twists come to rest against what resists their rate, too.
+    span = math.inf if patient else settings.dt
     effects = [e for e in settings.effects if e.settles]
     if all(e.name == "twist" for e in effects):
         # Its torque is linear in the twists: one step is exact.
@@ -357,7 +360,8 @@ def settle_twist(
     free = free_slots(settings.held_edges, targets.grip.get("edges"), state.pos, topology.size) * params.rest.edge_mask
 
     def newton(angle: Tensor, exact: bool) -> tuple[Tensor, Tensor]:
-        here = rod.view(topology, params, tree.replace(state, twist=angle), settings.dt)
+        turning = tree.replace(state, twist=angle, twist_rate=(angle - state.twist) / span)
+        here = rod.view(topology, params, turning, span)
         loads = effect.total(effects, here, values)
         if lanes.ready(angle):
             none = angle.new_zeros(1, 1)

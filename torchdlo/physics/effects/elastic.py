@@ -108,15 +108,18 @@ class Curvature:
 
     def rate(self, view: View) -> Tensor:
         """Return the rate of change of the curvatures [1/s], shape (..., V, 2)."""
-        turning = (view.next(view.state.vel) - view.state.vel) / view.length * view.params.rest.edge_mask
-        spin = view.state.twist_rate
-        before, b1, b2, a1, a2 = view.prev(turning), *self.by_twist
+        spin, (b1, b2, a1, a2) = view.state.twist_rate, self.by_twist
         # Scalar triple products a.(b x c) of the formulas in `pull_back`.
-        swept = cross(before, view.tangent) - cross(turning, view.before)
-        stretched = dot(self.mean, before + turning)
+        swept, stretched = self.swept(view)
         k1 = dot(self.mean2, swept) - self.kappa[..., :1] * stretched
         k2 = -dot(self.mean1, swept) - self.kappa[..., 1:] * stretched
         return tree.cat_components([k1 + b1 * view.prev(spin) + a1 * spin, k2 + b2 * view.prev(spin) + a2 * spin])
+
+    def swept(self, view: View) -> tuple[Tensor, Tensor]:
+        """Return the rates of the cross product of the tangents (..., V, 3) and of their stretching, as edges move."""
+        turning = (view.next(view.state.vel) - view.state.vel) / view.length * view.params.rest.edge_mask
+        before = view.prev(turning)
+        return cross(before, view.tangent) - cross(turning, view.before), dot(self.mean, before + turning)
 
 
 def curvature(view: View) -> Curvature:

@@ -10,7 +10,8 @@ from torch import Tensor
 
 from torchdlo.physics import tree
 from torchdlo.physics.effect import Effect, Param, Values
-from torchdlo.physics.effects.elastic import curvature
+from torchdlo.physics.effects.elastic import Curvature, curvature
+from torchdlo.physics.numerics import dot
 from torchdlo.physics.rod import RodParams, View
 from torchdlo.physics.topology import Topology, preceding
 
@@ -117,15 +118,50 @@ class BendingDamping(Effect):
     name: ClassVar[str] = "bending_damping"
     kind: ClassVar[str] = "material"
     frames: ClassVar[bool] = True
+    settles: ClassVar[bool] = True
     params: ClassVar[dict[str, Param]] = {
         "coefficient": Param(0.0, 0.0, 1.0, "N m^2 s", "linear", 0.0, "Bending moment per rate of curvature.")
     }
 
     def loads(self, view: View, values: Values) -> Values:
-        """Return the moment's loads and how they answer to turning."""
+        """Return the moment's loads and how they answer to turning and to twists."""
         hinge = curvature(view)
         resistance = values["coefficient"] / view.hinge_length * view.params.rest.hinge_mask
-        return {**hinge.pull_back(view, resistance * hinge.rate(view)), "hinge_drag": resistance}
+        rate = hinge.rate(view)
+        # The integrated curvature is 2 tan(angle/2): it grows by 1 + tan^2 per turning, and so does its work.
+        faster = 1 + (dot(hinge.binormal, hinge.binormal) / 4).clamp(max=100.0)
+        return {
+            **hinge.pull_back(view, resistance * rate),
+            **_twisted(view, hinge, resistance, rate),
+            "hinge_drag": resistance * faster.square(),
+        }
+
+
+def _twisted(view: View, hinge: Curvature, resistance: Tensor, rate: Tensor) -> Values:
+    """Return how moments in proportion to the rate of curvature answer to twists that are reached in a substep.
+
+    With k the curvatures and a, b how they change by the angles of the edges after and before, rates change by
+    a / dt + a' and b / dt + b': mixed derivatives do not depend on their order.
+    """
+    swept, stretched = hinge.swept(view)
+    moved = 2 * swept / (1 + dot(view.before, view.tangent)).clamp(min=1e-6) - hinge.binormal * stretched
+    m1, m2 = view.frames()
+    spin, (b1, b2, a1, a2) = view.state.twist_rate, hinge.by_twist
+    back = view.prev(spin)
+    grown = (
+        b1 / view.dt - 0.5 * dot(moved, view.prev(m1)) + back * b2,
+        b2 / view.dt - 0.5 * dot(moved, view.prev(m2)) - back * b1,
+        a1 / view.dt - 0.5 * dot(moved, m1) + spin * a2,
+        a2 / view.dt - 0.5 * dot(moved, m2) - spin * a1,
+    )
+    same_b, onward = b1 * grown[0] + b2 * grown[1], b1 * grown[2] + b2 * grown[3]
+    backward, same_a = a1 * grown[0] + a2 * grown[1], a1 * grown[2] + a2 * grown[3]
+    f1, f2 = rate[..., :1], rate[..., 1:]
+    return {
+        "twist_hessian": resistance * tree.cat_components([same_b, 0.5 * (onward + backward), same_a]),
+        "twist_skew": 0.5 * resistance * (onward - backward),
+        "twist_geometry": resistance * tree.cat_components([f1 * b2 - f2 * b1, f1 * a2 - f2 * a1]),
+    }
 
 
 @dataclass(frozen=True)
