@@ -14,19 +14,20 @@ from scipy.spatial.transform import Rotation
 from torchdlo.errors import InputError
 from torchdlo.physics.effects import EFFECTS
 from torchdlo.report import diagnosis as report
-from torchdlo.sysid import baseline, floor, library, settle
 from torchdlo.sysid import diagnose as search
+from torchdlo.sysid import floor, library, settle
 from torchdlo.sysid.drive import drive
 from torchdlo.sysid.extend import extend
 from torchdlo.sysid.findings import findings, findings_json, model_json, sentence
 from torchdlo.sysid.fit import Point, Space, interval
 from torchdlo.sysid.jobs import Fitted
 from torchdlo.sysid.mesh import make_mesh
-from torchdlo.sysid.model import AHEAD, RopeModel
+from torchdlo.sysid.model import RopeModel
 from torchdlo.sysid.motion import Start
 from torchdlo.sysid.plan import BUDGETS
 from torchdlo.sysid.recording import Recording, Trial
 from torchdlo.sysid.revise import Found, Revision
+from torchdlo.sysid.screen import Score
 from torchdlo.sysid.verdict import word
 
 S = np.array([0.0, 0.02, 0.08, 0.16, 0.24, 0.32, 0.4, 0.48, 0.56, 0.6])
@@ -117,12 +118,12 @@ def test_a_clamp_holds_from_the_middle_of_its_markers(tmp_path: Path) -> None:
     # Where hinges are as far apart as the clamp's markers, the hinge at the clamp is one like any other.
     recording = make_empty(tmp_path)
     mesh = make_mesh(recording.train[0], 0.6, 31)
-    stiff = mesh.clamp_stiffness(0.0)
-    assert mesh.clamp_hinges == (1,) and stiff[1] == pytest.approx(1.0, abs=0.01)
-    assert mesh.clamp_stiffness(1.0)[1] == pytest.approx(2.0, abs=0.02)
+    shares = mesh.clamp_shares(0.0)
+    assert mesh.clamp_hinges == (1,) and shares[1] == pytest.approx(1.0, abs=0.01)
+    assert mesh.clamp_shares(1.0)[1] == pytest.approx(0.5, abs=0.01)
     fine = make_mesh(recording.train[0], 0.6, 61)
     # From the middle, 1 cm before the hinge, to 0.5 cm behind it: 1.5 cm in place of 1 cm.
-    assert fine.clamp_stiffness(0.0)[fine.clamp_hinges[0]] == pytest.approx(2 / 3, rel=0.01)
+    assert fine.clamp_shares(0.0)[fine.clamp_hinges[0]] == pytest.approx(3 / 2, rel=0.01)
 
 
 def test_smooth_starts_are_explained_exactly(tmp_path: Path) -> None:
@@ -207,8 +208,22 @@ def test_vectors_are_fitted_whole_and_what_no_dose_uses_is_not(
     name: str, dose: dict[str, float], fitted: set[str], tmp_path: Path
 ) -> None:
     bench = SimpleNamespace(recording=make_empty(tmp_path), extension=lambda base, score, numbers, *_: numbers)
-    score = SimpleNamespace(name=name, dose={f"{name}.{k}": v for k, v in dose.items()})
-    assert set(extend(bench, None, score, 4, None)) == {f"{name}.{k}" for k in fitted}
+    doses = {f"{name}.{k}": v for k, v in dose.items()}
+    score = Score(name, 0.5, doses, ((doses, np.zeros(0)),), {}, np.zeros(0))
+    (numbers,) = extend(bench, None, score, 4, None)
+    assert set(numbers) == {f"{name}.{k}" for k in fitted}
+
+
+def test_a_slope_and_a_spot_are_fitted_side_by_side(tmp_path: Path) -> None:
+    def extension(base: object, score: Score, numbers: list[str], *_: object) -> tuple[list[str], int]:
+        return [n.split(".")[1] for n in numbers], len(score.starts)
+
+    bench = SimpleNamespace(recording=make_empty(tmp_path), extension=extension)
+    slope, spot = {"nonuniform_stiffness.slope": 0.1}, {"nonuniform_stiffness.factor": -1.0}
+    spot |= {"nonuniform_stiffness.position": 0.4, "nonuniform_stiffness.width": 0.1}
+    score = Score("nonuniform_stiffness", 0.5, slope, tuple((d, np.zeros(0)) for d in (slope, spot, slope)), {}, None)
+    jobs = extend(bench, None, score, 4, None)
+    assert jobs == [(["slope"], 2), (["position", "width", "factor"], 1)]
 
 
 @pytest.mark.parametrize(("speed", "first"), [(0.02, "air_drag"), (0.4, "wind")])
@@ -301,19 +316,3 @@ def test_an_effect_gives_way_to_another_that_fits_better_beside_the_rest(cost: f
     assert "wind" not in tried[0][1]
     bench.gaps = lambda *_: np.array([1e-3])
     assert revision.exchanged(fitted, found, ["air_drag"]) is fitted and len(tried) == 1 + (named != "wind")
-
-
-@pytest.mark.parametrize(("lost", "ahead"), [((0, 0), 0.0), ((2, 0), AHEAD), ((2, 2), 0.0)])
-def test_steps_look_ahead_where_finer_simulations_go_astray_otherwise(lost: tuple[int, int], ahead: float) -> None:
-    options, used = {"ahead": 0.0}, []
-    pool = SimpleNamespace(local=SimpleNamespace(options=options), choose=options.update)
-    bench = SimpleNamespace(
-        pool=pool,
-        fit=lambda jobs: jobs,
-        calmer=lambda fitted, _: f"{fitted}, calm",
-        correct=lambda fitted: used.append(fitted) or SimpleNamespace(of=fitted, lost=lost[len(used) - 1]),
-        use=lambda found: used.append(found.of),
-    )
-    fitted, found = baseline._corrected(bench, "rope", 4)
-    assert options["ahead"] == ahead and fitted == found.of == used[-1]
-    assert fitted == ("rope, calm" if ahead else "rope")

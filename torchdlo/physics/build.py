@@ -160,7 +160,7 @@ def assemble(ropes: Sequence[Rope]) -> tuple[Topology, RodParams, RodState]:
         ]
     )
     kappa, twist = _given_strains(topology, ropes, length, hinge_mask, kappa * curved, twist * curved)
-    rest = RodRest(length, kappa, twist, edge_mask, hinge_mask)
+    rest = RodRest(length, kappa, twist, like.new_ones(1, 1), edge_mask, hinge_mask)
 
     director = bishop(topology, pos, edge_mask, given)
     _, reference = frame_curvature(topology, pos, director, edge_mask, hinge_mask)

@@ -50,6 +50,8 @@ class RodRest:
     """Curvature integrated over each hinge, in the material frame: 2 tan(angle/2) [1], shape (..., V or 1, 2)."""
     twist: Tensor
     """Twist across each hinge [rad], shape (..., V or 1, 1)."""
+    share: Tensor
+    """Length of rope that a hinge stands for, over half the sum of the edges next to it [1], shape (..., V or 1, 1)."""
     edge_mask: Tensor
     """1 for real edges, 0 for dummies [1], shape (V, 1)."""
     hinge_mask: Tensor
@@ -99,7 +101,7 @@ class View:
     before: Tensor
     """Unit tangents of the preceding edges [1], shape (..., V, 3)."""
     hinge_length: Tensor
-    """Half the sum of the rest lengths next to a hinge [m], shape (..., V, 1)."""
+    """Rest length of rope that a hinge stands for: half of each edge next to it, if `share` is 1 [m], (..., V, 1)."""
 
     def next(self, x: Tensor) -> Tensor:
         """Return at each slot the value of the following one."""
@@ -131,11 +133,16 @@ def edge_vectors(topology: Topology, pos: Tensor, edge_mask: Tensor) -> Tensor:
     return torch.where(edge_mask > 0, e, unit)
 
 
+def hinge_length(topology: Topology, rest: RodRest) -> Tensor:
+    """Return the rest length of rope that each hinge stands for [m], shape (..., V, 1)."""
+    return 0.5 * (rest.length + preceding(topology, rest.length)) * rest.share
+
+
 def view(topology: Topology, params: RodParams, state: RodState, dt: float) -> View:
     """Compute the geometry of a state."""
     rest = params.rest.length
     if lanes.ready(state.pos):
-        inputs = state.pos, rest, params.rest.edge_mask
+        inputs = state.pos, rest, params.rest.share, params.rest.edge_mask
         return View(topology, state, params, dt, *lanes.apply("look", topology.name, inputs, (1, 3, 3, 1)))
     e = edge_vectors(topology, state.pos, params.rest.edge_mask)
     length = safe_norm(e).clamp(min=1e-12)
@@ -148,7 +155,7 @@ def view(topology: Topology, params: RodParams, state: RodState, dt: float) -> V
         length,
         tangent,
         preceding(topology, tangent),
-        0.5 * (rest + preceding(topology, rest)),
+        hinge_length(topology, params.rest),
     )
 
 

@@ -18,7 +18,7 @@ template <typename T>
 struct Look {  // rod.view: lengths, tangents, tangents before, lengths of hinges
   struct In {
     Vec<T> pos;
-    Lanes<T> rest, mask;
+    Lanes<T> rest, share, mask;
   };
   Look(const Call&, const Scratch<T>&) {}
   void operator()(const In* slot, const Out<T>& out) {
@@ -30,7 +30,7 @@ struct Look {  // rod.view: lengths, tangents, tangents before, lengths of hinge
       out.put(0, i, size);
       out.put(1, i, tangent);
       out.put(4, n, tangent);
-      out.put(7, n, (slot[n].rest + slot[i].rest) * T(0.5));
+      out.put(7, n, (slot[n].rest + slot[i].rest) * T(0.5) * slot[n].share);
     }
   }
 };

@@ -11,7 +11,7 @@ import numpy as np
 from torchdlo.sysid.bench import CHAIN, SILENT, Bench, Callback
 from torchdlo.sysid.floor import Refinement, gap, rms
 from torchdlo.sysid.jobs import Fit, Fitted
-from torchdlo.sysid.model import AHEAD, RopeModel
+from torchdlo.sysid.model import RopeModel
 from torchdlo.sysid.saved import Saved
 
 _SPREAD = np.log([100.0, 4.0, 6.0])
@@ -28,9 +28,6 @@ _BETTER = 0.9
 
 _LOOK = 2
 """Iterations after which a chain has to fit better than a rope, if it is to be fitted further."""
-
-_CALMER = 0.7
-"""Share of the cost that is left where steps have to look ahead, which makes them less exact."""
 
 _UNDECIDED = 1.5
 """Share of the cost up to which clamps may hold the rope to their ends, although others fit better."""
@@ -76,12 +73,7 @@ def calibrate(bench: Bench, count: int, iterations: int, rng: np.random.Generato
         return found
 
     values = _random(model, count, rng)
-    # What rings within a step, from a start that is measured badly, may grow without end unless steps look ahead.
-    calm = [] if bench.pool.local.options["ahead"] else [plain(values[::2], 4, frames // 3, ahead=AHEAD)]
-    first = fit([*(plain(values[k::2], 4, frames // 3) for k in range(2)), *calm], 1)
-    if calm and first[-1].point.cost < _CALMER * min(f.point.cost for f in first[:-1]):
-        bench.pool.choose(ahead=AHEAD)
-        first = first[-1:]
+    first = fit([plain(values[k::2], 4, frames // 3) for k in range(2)], 1)
     bench.early = best = min(first, key=lambda f: f.point.cost).values
     if not bench.starts["train"].still.all():
         bench.begin(best, ())
@@ -89,16 +81,11 @@ def calibrate(bench: Bench, count: int, iterations: int, rng: np.random.Generato
     # gives a chain's length a sign.
     sides = [chain(np.append(best, length)[None], 4, 2 * frames // 3) for length in (link, -link)]
     firm = [plain(best[None], 5, 2 * frames // 3, grip=1.0)] if model.mesh.clamps else []
-    # Simulations may get lost later, too.
-    calm = [] if bench.pool.local.options["ahead"] else [plain(best[None], 5, 2 * frames // 3, ahead=AHEAD)]
-    smooth, one, other, *others = fit([plain(best[None], 5, 2 * frames // 3), *sides, *calm, *firm], 2)
+    smooth, one, other, *held = fit([plain(best[None], 5, 2 * frames // 3), *sides, *firm], 2)
     side = min((one, other), key=lambda f: f.point.cost)
-    if calm and others[0].point.cost < _CALMER * min(smooth.point.cost, side.point.cost):
-        bench.pool.choose(ahead=AHEAD)
-        smooth, side = others[0], _moved(side, others[0])
-    if firm:
-        smooth, side = _held(bench, others[-1], smooth, side)
-    smooth, rope = _corrected(bench, smooth, iterations)
+    if held:
+        smooth, side = _held(bench, held[0], smooth, side)
+    rope = bench.correct(smooth)
     better = fit([plain(smooth.values[None], iterations, None)], 3)[0]
     if side.point.cost < _BETTER * smooth.point.cost:
         better = _chain_or(bench, better, rope, [chain(side.values[None], iterations, None)])
@@ -140,8 +127,7 @@ def go_further(bench: Bench, base: Fitted, iterations: int, report: Callback) ->
 
     That is the law of a chain, and a twisting stiffness that hardly shows and ran away.
     """
-    before = bench.gaps(base, "all")
-    base, rope = _begin_anew(bench, base, iterations)
+    rope = _begin_anew(bench, base)
     model = bench.pool.local.model(base.effects)
     bend, twist = (model.parameters.index(f"{way}ing_stiffness") for way in ("bend", "twist"))
     values, link = base.values[None], float(np.diff(model.arclength).min())
@@ -164,40 +150,19 @@ def go_further(bench: Bench, base: Fitted, iterations: int, report: Callback) ->
         rows = [np.append(base.values, length)[None] for length in (link, -link)]
         sides = [Fit(effects, r, free, (*sizes, 0.5 * link), iterations, bench.starts["train"]) for r in rows]
         base = _chain_or(bench, base, rope, sides)
-    if not bench.pool.local.options["ahead"] and bench.astray(base, before):
-        bench.pool.choose(ahead=AHEAD)
-        base = bench.fit([bench.calmer(base, iterations)])[0]
     report(stage, 2, 3, f"{1e3 * rms(bench.gaps(base, 'train')):.2f} mm")
     # Corrections of another motion are wrong where motions part.
-    base, _ = _begin_anew(bench, base, iterations)
+    _begin_anew(bench, base)
     base = bench.fit([bench.further(base, iterations // 2)])[0]
     report(stage, 3, 3, f"{1e3 * rms(bench.gaps(base, 'train')):.2f} mm")
     return base
 
 
-def _begin_anew(bench: Bench, base: Fitted, iterations: int) -> tuple[Fitted, Refinement]:
-    """Begin trials as a model says, and correct simulations by what finer ones of it change; see `_corrected`."""
+def _begin_anew(bench: Bench, base: Fitted) -> Refinement:
+    """Begin trials as a model says, and correct simulations by what finer ones of it change; return that."""
     if not bench.starts["train"].still.all():
         bench.begin(base.values, base.effects)
-    return _corrected(bench, base, iterations)
-
-
-def _corrected(bench: Bench, fitted: Fitted, iterations: int) -> tuple[Fitted, Refinement]:
-    """Correct simulations by what finer ones change; return the model and that.
-
-    Finer simulations may go astray where others do not. Where fewer do with steps that look ahead, those are chosen.
-    """
-    found = bench.correct(fitted)
-    if not found.lost or bench.pool.local.options["ahead"]:
-        return fitted, found
-    bench.pool.choose(ahead=AHEAD)
-    calm = bench.fit([bench.calmer(fitted, iterations)])[0]
-    calmer = bench.correct(calm)
-    if calmer.lost < found.lost:
-        return calm, calmer
-    bench.pool.choose(ahead=0.0)
-    bench.use(found)
-    return fitted, found
+    return bench.correct(base)
 
 
 def _chain_or(bench: Bench, smooth: Fitted, rope: Refinement, sides: Sequence[Fit]) -> Fitted:

@@ -10,9 +10,8 @@ import numpy as np
 from torchdlo.errors import InputError
 from torchdlo.sysid import floor as floors
 from torchdlo.sysid import start as starts
-from torchdlo.sysid.fit import Look, drift
+from torchdlo.sysid.fit import Look, cost_of, drift
 from torchdlo.sysid.jobs import Fit, Fitted, Simulation
-from torchdlo.sysid.model import AHEAD
 from torchdlo.sysid.motion import Start
 from torchdlo.sysid.pool import Pool, spread
 from torchdlo.sysid.screen import Score
@@ -25,6 +24,12 @@ SILENT = 1.3
 
 _ASTRAY = 3.0
 """Times the gap of another model from which a simulation has gone astray."""
+
+_TIE = 0.05
+"""Share of what fits save by which their costs have to differ to be told apart,"""
+
+_CLOSE = 0.5
+"""if not by this share of what is left, or of what noise costs."""
 
 CHAIN = "link_chain"
 """What a chain of links does that a rope does not: candidate number 0, fitted before any effect is considered."""
@@ -101,10 +106,15 @@ class Bench:
         """Return whether a model goes astray in a trial whose gap another one kept as small as `before` [m], (B,)."""
         return not bool((self.gaps(fitted, "all") < _ASTRAY * np.maximum(before, self.level)).all())
 
-    def calmer(self, fitted: Fitted, iterations: int) -> Fit:
-        """Return the job of fitting on with steps that look ahead, which damps what grows from step to step."""
-        job = self.further(fitted, iterations)
-        return replace(job, options=(*job.options, ("ahead", AHEAD)))
+    def tie(self, worse: float, best: float) -> float:
+        """Return the difference in cost up to which fits are not told apart [m].
+
+        Args:
+            worse: cost of the model without what they have in common.
+            best: cost of the best of them.
+        """
+        noise = cost_of(self.level) if np.isfinite(self.level) else np.inf
+        return max(min(_TIE * (worse - best), _CLOSE * max(noise, best)), 1e-12)
 
     def extension(self, base: Fitted, score: Score, numbers: Sequence[str], iterations: int, frames: int | None) -> Fit:
         """Return the job of fitting a model with one effect more, from the best of several starts.

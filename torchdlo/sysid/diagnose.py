@@ -17,7 +17,7 @@ from torchdlo.errors import InputError
 from torchdlo.sysid import baseline as baselines
 from torchdlo.sysid import clamps, health, library, plan
 from torchdlo.sysid.bench import CHAIN, SILENT, Bench, Callback
-from torchdlo.sysid.extend import extend, short, vector
+from torchdlo.sysid.extend import extended, short, vector
 from torchdlo.sysid.fit import interval
 from torchdlo.sysid.floor import gap, rms
 from torchdlo.sysid.jobs import Fit, Fitted
@@ -25,7 +25,7 @@ from torchdlo.sysid.journal import Journal
 from torchdlo.sysid.plan import BUDGETS, Budget
 from torchdlo.sysid.pool import Pool
 from torchdlo.sysid.recording import Recording
-from torchdlo.sysid.revise import TIE, Found, Revision
+from torchdlo.sysid.revise import Found, Revision
 from torchdlo.sysid.saved import Saved
 from torchdlo.sysid.screen import Score, screen
 from torchdlo.sysid.verdict import UNKNOWN_FLOOR, Candidate, Diagnosis, word
@@ -37,7 +37,10 @@ MORE = 2.5
 """Times the floor that have to be left for another effect to be looked for: one of three times the floor leaves 3.2."""
 
 LEADERS = 2
-"""Effects that are fitted further in each round, besides those that are as good."""
+"""Effects that are fitted further in each round, besides those that are nearly as good."""
+
+_NEAR = 0.1
+"""Share of what the best short fit saves that makes others nearly as good."""
 
 
 def diagnose(
@@ -120,10 +123,11 @@ class _Search:
             best, rival, candidates, rivals = self._round(base, names, f"round {len(rounds) + 1}")
             rounds.append(candidates)
             if best is None:
-                if not found.shares and (chain := self._chain(rival)):
-                    base, whole = chain, self._excess(chain)
-                    continue
-                if rival is not base and (found.shares or rival.options != base.options):
+                if not found.shares and (further := self._anew(rival)):
+                    base, whole = further, self._excess(further)
+                    if CHAIN in base.effects:
+                        continue
+                elif rival is not base and (found.shares or rival.options != base.options):
                     base = rival
                     self.pool.choose(**dict(base.options))
                 break
@@ -138,13 +142,14 @@ class _Search:
         base = self.revision.plainer(self.revision.pruned(base, found), found)
         return self._conclude(base, found, rounds)
 
-    def _chain(self, base: Fitted) -> Fitted | None:
-        """Return the baseline as a chain of links if that is what it turns out to be where no effect explains it."""
+    def _anew(self, base: Fitted) -> Fitted | None:
+        """Return a baseline that no effect explains, fitted further, as a chain of links if that is what it then is.
+
+        None where nothing is left to be explained, or it is known to be a chain.
+        """
         if CHAIN in base.effects or rms(self.bench.gaps(base, "all")) < SILENT * self.bench.level:
             return None
         further = baselines.go_further(self.bench, base, self.budget.more, self.report)
-        if CHAIN not in further.effects:
-            return None
         self.baseline, self.before = further, self.bench.prediction(further, "all")
         self.plain[:] = [further]
         return further
@@ -175,8 +180,7 @@ class _Search:
         )
         soft = [s for s in scores[self.budget.candidates :] if s.name == clamps.NAME and clamps.soft(self.bench, base)]
         fits, led, rival, worst = self._fits(base, [*scores[: self.budget.candidates], *soft], stage)
-        fits = self._calmed(base, fits, led, stage)
-        self.bench.predict([rival])
+        self.bench.predict([base, rival, *fits.values()])
         if base is self.baseline:
             self.plain.append(rival)
         first = min(led, key=lambda name: fits[name].point.cost)
@@ -184,7 +188,8 @@ class _Search:
             # Something is left: one that does alike things may be right, however little its doses explain.
             kin = [s for s in scores if s.name not in fits and any({s.name, first} <= k for k in library.KIN)]
             more, also = self._fits_of_kin(base, kin, worst, f"{stage}, effects like {first}") if kin else ({}, [])
-            fits, led = fits | self._calmed(base, more, also, stage), led + also
+            self.bench.predict(list(more.values()))
+            fits, led = fits | more, led + also
         return self._judged(scores, fits, sorted(led, key=lambda name: fits[name].point.cost), rival)
 
     def _fits(
@@ -198,10 +203,10 @@ class _Search:
         rivals = [self._further(base, base)]
         if clamps.soft(self.bench, base):
             rivals.append(clamps.firm(base, rivals[0]))
-        found = self._fitted([*(self._candidate(base, s) for s in scores), *rivals], stage)
-        short, alone = found[: len(scores)], sorted(found[len(scores) :], key=lambda f: f.point.cost)
+        short, alone = self._extended(base, scores, stage, rivals)
+        alone = sorted(alone, key=lambda f: f.point.cost)
         lead = self._leaders(short, alone[0])
-        worst = 0.5 * (alone[0].point.cost + min(f.point.cost for f in found))
+        worst = 0.5 * (alone[0].point.cost + min(f.point.cost for f in (*short, *alone)))
         further = self._fitted([self._further(base, f) for f in (*(short[k] for k in lead), *alone)], stage)
         further, rival = further[: len(lead)], min((base, *further[len(lead) :]), key=lambda f: f.point.cost)
         fits = {s.name: f for s, f in zip(scores, short, strict=True)}
@@ -212,21 +217,11 @@ class _Search:
         self, base: Fitted, scores: Sequence[Score], worst: float, stage: str
     ) -> tuple[dict[str, Fitted], list[str]]:
         """Return fits of effects, and the names of those that were fitted to whole trials: better ones than `worst`."""
-        short = self._fitted([self._candidate(base, s) for s in scores], stage)
+        short, _ = self._extended(base, scores, stage)
         fits = {s.name: f for s, f in zip(scores, short, strict=True)}
         names = [name for name, fitted in fits.items() if fitted.point.cost < worst]
         further = self._fitted([self._further(base, fits[name]) for name in names], stage) if names else []
         return fits | dict(zip(names, further, strict=True)), names
-
-    def _calmed(self, base: Fitted, fits: dict[str, Fitted], led: Sequence[str], stage: str) -> dict[str, Fitted]:
-        """Return fits, those that lead with steps that look ahead where simulations go astray otherwise."""
-        self.bench.predict([base, *fits.values()])
-        astray = [n for n in led if self.bench.astray(fits[n], self.bench.gaps(base, "all"))]
-        if not astray or dict(base.options).get("ahead"):
-            return fits
-        again = self._fitted([self.bench.calmer(fits[n], self.budget.more) for n in astray], f"{stage}, looking ahead")
-        self.bench.predict(again)
-        return fits | dict(zip(astray, again, strict=True))
 
     def _judged(
         self, scores: Sequence[Score], fits: dict[str, Fitted], order: Sequence[str], rival: Fitted
@@ -238,9 +233,9 @@ class _Search:
         reasons = {name: refused.get(name) or "fits worse" for name in fits}
         if fair:
             lead = fits[fair[0]].point.cost
-            close = [n for n in order if fits[n].point.cost - lead < TIE * max(rival.point.cost - lead, 1e-9)]
+            close = [n for n in order if fits[n].point.cost - lead < self.bench.tie(rival.point.cost, lead)]
             special, numbers = library.CONTAINED.get(fair[0], (None, {}))
-            if special in fair and _may_be(fits[fair[0]], numbers):
+            if special in fair and special not in close and _may_be(fits[fair[0]], numbers):
                 close.append(special)
             # Of laws that fit as well, the one with the fewest numbers: others may contain it.
             first = min((n for n in fair if n in close), key=lambda n: len(fits[n].space.names))
@@ -261,7 +256,7 @@ class _Search:
         """Return which of the fits to short trials are worth more work."""
         costs = [f.point.cost for f in found]
         order, lead = sorted(range(len(costs)), key=costs.__getitem__), min(costs, default=0.0)
-        near = 2 * TIE * max(rival.point.cost - lead, 0.0)
+        near = _NEAR * max(rival.point.cost - lead, 0.0)
         return [k for n, k in enumerate(order) if n < LEADERS or costs[k] - lead < near]
 
     def _refused(self, rival: Fitted, fitted: Fitted) -> str | None:
@@ -287,8 +282,13 @@ class _Search:
     def _on_most(self, base: Fitted, fitted: Fitted) -> bool:
         return float(np.mean(self.bench.gaps(fitted, "train") < self.bench.gaps(base, "train"))) > 0.6
 
-    def _candidate(self, base: Fitted, score: Score) -> Fit:
-        return extend(self.bench, base, score, self.budget.iterations, short(self.bench))
+    def _extended(
+        self, base: Fitted, scores: Sequence[Score], stage: str, others: Sequence[Fit] = ()
+    ) -> tuple[list[Fitted], list[Fitted]]:
+        """Return first fits of effects, and those of other jobs."""
+        return extended(
+            self.bench, base, scores, self.budget.iterations, lambda jobs: self._fitted(jobs, stage), others
+        )
 
     def _further(self, base: Fitted, fitted: Fitted) -> Fit:
         """Return the job of fitting on."""
@@ -328,7 +328,7 @@ class _Search:
             after,
             rounds,
             predictions,
-            self.pool.local.model(final.effects),
+            self.pool.local.model(final.effects, final.options),
             self.bench.drift(final),
             notes=[*baselines.notes(self.baseline), *([] if np.isfinite(self.bench.level) else [UNKNOWN_FLOOR])],
         )

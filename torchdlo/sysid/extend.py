@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
 from torchdlo.sysid import clamps, library
 from torchdlo.sysid.bench import Bench
 from torchdlo.sysid.jobs import Fit, Fitted
@@ -11,8 +14,8 @@ _SHORT = 0.6
 """Share of the trials that first fits see."""
 
 
-def extend(bench: Bench, base: Fitted, score: Score, iterations: int, frames: int | None) -> Fit:
-    """Return the job of fitting a model with one effect more, from the doses that suit best.
+def extend(bench: Bench, base: Fitted, score: Score, iterations: int, frames: int | None) -> list[Fit]:
+    """Return the jobs of fitting a model with one effect more, from the doses that suit best.
 
     Args:
         bench: the trials.
@@ -22,11 +25,40 @@ def extend(bench: Bench, base: Fitted, score: Score, iterations: int, frames: in
         frames: how many frames to fit; all if None.
     """
     if score.name == clamps.NAME and clamps.soft(bench, base):
-        return clamps.stiff(bench, base, score, iterations, frames)
+        return [clamps.stiff(bench, base, score, iterations, frames)]
     # Numbers that no dose uses stay off, a slope where a spot fits better; but vectors are fitted whole.
-    vectors = {vector(name) for name in score.dose}
-    used = [n.name for n in library.numbers(score.name, bench.recording) if vector(n.name) in vectors]
-    return bench.extension(base, score, used, iterations, frames)
+    kinds: dict[frozenset[str], list] = {}
+    for start in score.starts:
+        kinds.setdefault(frozenset(vector(name) for name in start[0]), []).append(start)
+    jobs = []
+    for vectors, starts in kinds.items():
+        used = [n.name for n in library.numbers(score.name, bench.recording) if vector(n.name) in vectors]
+        jobs.append(bench.extension(base, replace(score, starts=tuple(starts)), used, iterations, frames))
+    return jobs
+
+
+def extended(
+    bench: Bench,
+    base: Fitted,
+    scores: Sequence[Score],
+    iterations: int,
+    fit: Callable[[Sequence[Fit]], Sequence[Fitted]],
+    others: Sequence[Fit] = (),
+) -> tuple[list[Fitted], list[Fitted]]:
+    """Return the best short fit of each of several effects, and those of other jobs.
+
+    Args:
+        bench: the trials.
+        base: the model without.
+        scores: of the effects.
+        iterations: most iterations.
+        fit: does jobs.
+        others: what to do besides.
+    """
+    jobs = [extend(bench, base, score, iterations, short(bench)) for score in scores]
+    found = list(fit([*(job for alike in jobs for job in alike), *others]))
+    best = [min((found.pop(0) for _ in alike), key=lambda f: f.point.cost) for alike in jobs]
+    return best, found
 
 
 def short(bench: Bench) -> int:

@@ -90,12 +90,20 @@ class Point:
     """Gauss-Newton curvature by trial, shape (B, K, K)."""
     trial_costs: np.ndarray
     """Cost by trial [m], shape (B,)."""
+    flatter: np.ndarray | None = None
+    """How much of the Gauss-Newton curvature is left where large errors cost only in proportion, by trial [1], (B,);
+    all of it if not given."""
 
 
 def _robust(residual: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return cost and weight of each residual [m]: cost ~ r^2 / (2 knee) near zero, |r| - knee/2 beyond."""
     size = np.sqrt(residual**2 + _KNEE**2)
     return size - _KNEE, 1 / size
+
+
+def cost_of(error: float) -> float:
+    """Return the cost [m] of an error of a coordinate [m]."""
+    return float(_robust(np.array(error))[0])
 
 
 def costs(sims: np.ndarray, measured: np.ndarray) -> np.ndarray:
@@ -153,7 +161,10 @@ class Look:
             residual = np.where(useless[:, None], 0.0, residual)
             gradient = np.einsum("kbr,br,br->bk", slope, weight, residual, optimize=True) / per_trial[:, None]
             curvature = np.einsum("kbr,br,lbr->bkl", slope, weight, slope, optimize=True) / per_trial[:, None, None]
-            points.append(Point(self.raws[s], float(_together(of_trial, _LOST * whole)), gradient, curvature, of_trial))
+            # The second derivative of the cost is knee^2 / size^3, where Gauss-Newton takes 1 / size.
+            flatter = (seen.reshape(weight.shape) * weight**3 * _KNEE**2).sum(-1) / np.maximum(weight.sum(-1), 1e-300)
+            cost = float(_together(of_trial, _LOST * whole))
+            points.append(Point(self.raws[s], cost, gradient, curvature, of_trial, flatter))
         return points
 
 
@@ -264,15 +275,23 @@ def interval(point: Point, space: Space, drifts: np.ndarray | None = None) -> tu
         space: its numbers.
         drifts: standard deviations that all trials have in common, shape (E, K).
     """
-    trials = len(point.gradient)
+    # Trials that were lost tell nothing.
+    ran = np.trace(point.curvature, axis1=1, axis2=2) > 0
+    trials = int(ran.sum())
     if trials < 2:
         return np.array([p.low for p in space.params]), np.array([p.high for p in space.params])
-    moves = np.linalg.solve(_firm(point.curvature.sum(0)), point.gradient.T).T
+    flatter = np.ones(len(ran)) if point.flatter is None else point.flatter
+    curvature = (flatter[:, None, None] * point.curvature)[ran].sum(0)
+    moves = np.linalg.solve(_firm(curvature), point.gradient[ran].T).T
     # Without trial b the minimum moves by moves[b] n / (n - 1); their scatter times (n - 1)^2 / n is the variance.
     deviation = np.sqrt(trials / (trials - 1) * ((moves - moves.mean(0)) ** 2).sum(0))
     quantile = _STUDENT_95[min(trials - 1, len(_STUDENT_95)) - 1]
-    common = 0.0 if drifts is None else _NORMAL_95 * np.linalg.norm(drifts, axis=0)
-    reach = np.minimum(np.hypot(quantile * deviation, common), 10.0)
+    common = np.zeros(0) if drifts is None else _NORMAL_95 * drifts
+    # Fits end a little before the minimum.
+    left = space.clip(point.raw - moves.sum(0)) - point.raw
+    left = np.where([p.periodic for p in space.params], moves.sum(0), left)
+    reach = np.linalg.norm([quantile * deviation, left, *common], axis=0)
+    reach = np.minimum(reach, 10.0)
     return space.to_values(point.raw - reach), space.to_values(point.raw + reach)
 
 

@@ -21,7 +21,6 @@ from torchdlo.physics import rotation, traced, tree
 from torchdlo.physics.effect import Effect, Param
 from torchdlo.physics.effects.elastic import Bend, BendFrame, Twist
 from torchdlo.physics.effects.field import Damping, Gravity
-from torchdlo.physics.effects.measure import Track
 from torchdlo.physics.effects.table import Table
 from torchdlo.physics.numerics import normalize
 from torchdlo.sysid import lengths, library, settle
@@ -29,6 +28,7 @@ from torchdlo.sysid.drive import drive
 from torchdlo.sysid.library import PARAMETERS, Number
 from torchdlo.sysid.mesh import make_mesh
 from torchdlo.sysid.motion import WINDOW, Motion, Start
+from torchdlo.sysid.observe import Markers
 from torchdlo.sysid.recording import Recording, Trial
 from torchdlo.sysid.steps import recorded
 
@@ -40,6 +40,9 @@ _STRETCH = 1e4
 
 AHEAD = 0.1
 """How far steps look ahead: real ropes are jerked taut, and what then rings within a substep must die out."""
+
+_PASSES = 2
+"""How often a rope is moved to where markers beside it say that it is: its directors, that they sit along, follow."""
 
 _CHUNK = 256
 """Most scenes that run together."""
@@ -68,7 +71,7 @@ class RopeModel:
             effects: names of effects of the library to add to the baseline.
             substep: longest substep [s].
             ahead: see `torchdlo.scene.Scene`.
-            grip: where clamps hold the rope's direction, see `Mesh.clamp_stiffness`.
+            grip: where clamps hold the rope's direction, see `Mesh.clamp_shares`.
         """
         trial = recording.train[0]
         self.recording, self.rest, self.effects = recording, rest, tuple(effects)
@@ -90,6 +93,8 @@ class RopeModel:
                 "rope.json: rest_positions is missing; expected it for a calibration with the given rest shape."
             )
         self.dt = float(trial.time[1] - trial.time[0])
+        beside = "marker_offset" in self.effects
+        self.markers = Markers(self.marker_vertex, torch.as_tensor(np.array(trial.gripped)), self.dt, beside)
         self.substeps = max(1, int(np.ceil(self.dt / substep - 1e-9)))
         baseline = ["bending_stiffness", "twisting_stiffness", "damping_rate"]
         baseline += ["rest_share", "rest_roll"] if rest == "given" else []
@@ -149,19 +154,38 @@ class RopeModel:
     def build(
         self, motion: Motion, start: Start, values: np.ndarray
     ) -> tuple[scenes.Scene, scenes.Params, scenes.State]:
-        """Build scenes, one per row of `values` (N, K), `motion` and `start`; all have N trials."""
-        recording, number = self.recording, dict(zip(self.parameters, torch.as_tensor(values).T, strict=True))
+        """Build scenes, one per row of `values` (N, K), `motion` and `start`; all have N trials.
+
+        Markers may be seen late and beside the rope: it begins where they then say that it is.
+        """
+        number = dict(zip(self.parameters, torch.as_tensor(values).T, strict=True))
+        free = ~self.markers.gripped.unsqueeze(-1)
+        markers, speed = (torch.as_tensor(x) for x in (start.pos, start.vel))
+        if "time_delay" in self.effects:
+            markers = markers + free * number["time_delay.delay"].reshape(-1, 1, 1) * speed
+        found = self._assembled(motion, markers, speed, number)
+        for _ in range(_PASSES if self.markers.beside else 0):
+            scene, params, state = found
+            here = self.markers.frame(state)
+            beside = self.markers.seen(scene, params, [here], late=False)[:, 0] - here[0]
+            found = self._assembled(motion, markers - free * beside, speed, number)
+        return found
+
+    def _assembled(
+        self, motion: Motion, markers: Tensor, speed: Tensor, number: dict[str, Tensor]
+    ) -> tuple[scenes.Scene, scenes.Params, scenes.State]:
+        """Build scenes that begin with the rope's axis in places (N, M, 3) and with velocities at the markers."""
         pos, vel = (
-            torch.as_tensor(CubicSpline(self.mesh.marker_arclength, x, axis=1)(self.arclength))
-            for x in (start.pos, start.vel)
+            torch.as_tensor(CubicSpline(self.mesh.marker_arclength, x.numpy(), axis=1)(self.arclength))
+            for x in (markers, speed)
         )
         held = list(self.held)
         pos[:, held] = motion.held[:, 0]
         vel[:, held] = (motion.held[:, 1] - motion.held[:, 0]) / (self.dt / self.substeps)
         rope = scenes.Rope(
             pos,
-            radius=recording.radius or 0.005,
-            mass=recording.mass,
+            radius=self.recording.radius or 0.005,
+            mass=self.recording.mass,
             # (N, 1): per scene, however many vertices there are.
             bend=number["bending_stiffness"].unsqueeze(-1),
             twist=number["twisting_stiffness"].unsqueeze(-1),
@@ -245,7 +269,7 @@ class RopeModel:
         return rotation.about(tangent, angle[:, None], motion.director)
 
     def _measured_lengths(self, params: scenes.Params, number: dict[str, Tensor]) -> scenes.Params:
-        """Put rest lengths as measured along the rope, masses by them, and the stiffness of hinges at clamps."""
+        """Put rest lengths as measured along the rope, masses by them, and what hinges at clamps stand for."""
         rods = params.rods
         step = torch.as_tensor(np.diff(self.arclength)).reshape(-1, 1)
         length = torch.cat([step, step.new_ones(1, 1)])
@@ -254,11 +278,9 @@ class RopeModel:
         mass = 0.5 * (line + torch.roll(line, 1, -2))
         extra = torch.zeros_like(mass)
         extra[torch.as_tensor(self.marker_vertex)] = self.recording.marker_mass or 0.0
-        stiff = torch.as_tensor(self.mesh.clamp_stiffness(self.grip)).unsqueeze(-1)
-        material = tree.replace(
-            rods.material, mass=mass + extra, bend=rods.material.bend * stiff, twist=rods.material.twist * stiff
-        )
-        rest = tree.replace(rods.rest, length=length)
+        material = tree.replace(rods.material, mass=mass + extra)
+        share = torch.as_tensor(self.mesh.clamp_shares(self.grip)).unsqueeze(-1)
+        rest = tree.replace(rods.rest, length=length, share=share)
         if "rest_share" in number:
             rest = tree.replace(rest, curvature=_turned(rods.rest.curvature, number))
         return tree.replace(params, rods=tree.replace(rods, rest=rest, material=material))
@@ -319,19 +341,12 @@ class RopeModel:
             resting = settle.come_to_rest(scene, params, state, controls[0])
             resting = self._corrected(step, scene, params, resting, controls, motion)
             state = tree.map(tree.batch_innermost, tree.where(torch.as_tensor(start.still), resting, state))
-        seen = [self._marked(state)]
+        seen = [self.markers.frame(state)]
         for k, control in enumerate(controls[1:], 1):
             state = step(params, state, control)
             if k % self.substeps == 0:
-                seen.append(self._marked(state))
-        track = Track(
-            torch.arange(frames, dtype=torch.float64) * self.dt,
-            *(torch.stack([s[i] for s in seen], 1) for i in range(3)),
-            torch.as_tensor(np.isin(np.arange(self.count), self.gripped)),
-        )
-        for each in sorted(scene.effects, key=lambda e: e.last):
-            track = tree.replace(track, pos=each.observe(track, params.effects.get(each.name, {})))
-        return track.pos.numpy()
+                seen.append(self.markers.frame(state))
+        return self.markers.seen(scene, params, seen, late=True).numpy()
 
     def _corrected(
         self,
@@ -352,23 +367,11 @@ class RopeModel:
         for k, control in enumerate(controls[: (frames - 1) * self.substeps + 1]):
             now = step(params, now, control) if k else state
             if k % self.substeps == 0:
-                seen.append(now.rods.pos[:, at])
-        gap = motion.markers[:, :frames] - torch.stack(seen, 1).numpy()
+                seen.append(self.markers.frame(now))
+        gap = motion.markers[:, :frames] - self.markers.seen(scene, params, seen, late=False).numpy()
         shift, drift = (torch.as_tensor(x) for x in settle.explain(gap[:, :, free], shapes[at][free], self.dt, shapes))
         rods = tree.replace(state.rods, pos=state.rods.pos + shift, vel=state.rods.vel + drift)
         return lengths.agree(scene, params, tree.replace(state, rods=rods))
-
-    def _marked(self, state: scenes.State) -> tuple[Tensor, Tensor, Tensor]:
-        """Return positions and material directors at the markers, shape (N, M, 3) each."""
-        at, rods = list(self.marker_vertex), state.rods
-        pos = rods.pos[:, at]
-        if "marker_offset" not in self.effects:
-            return pos, pos, pos
-        edge = [min(v, len(self.arclength) - 2) for v in at]
-        ends = [v + 1 for v in edge]
-        tangent = normalize(rods.pos[:, ends] - rods.pos[:, edge])
-        first = rotation.about(tangent, rods.twist[:, edge], rods.director[:, edge])
-        return pos, first, torch.linalg.cross(tangent, first)
 
 
 def _turned(curvature: Tensor, number: dict[str, Tensor]) -> Tensor:

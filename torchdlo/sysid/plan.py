@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import itertools
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from torchdlo.sysid.model import AHEAD
-from torchdlo.sysid.recording import Recording, Trial
+from torchdlo.sysid.recording import Recording
 
 
 @dataclass(frozen=True)
@@ -32,9 +31,6 @@ class Budget:
 
 BUDGETS = {"fast": Budget(36, 4, 4, 6, 2), "full": Budget(96, 8, 6, 12, 3, 16)}
 
-TAUT = 0.95
-"""Share of the rope's length between two grippers from which it may be jerked taut."""
-
 
 def some(recording: Recording, most: int) -> Recording:
     """Return the recording with at most so many train trials, evenly picked."""
@@ -46,12 +42,11 @@ def some(recording: Recording, most: int) -> Recording:
 
 def options(recording: Recording, vertices: int | None) -> dict[str, Any]:
     """Return options of the models that suit a recording."""
-    taut = any(_stretched(trial) > TAUT for trial in recording.train)
     return {
         "vertices": vertices or _vertices(recording),
         "rest": "straight" if recording.rest_positions is None else "given",
-        # What rings when a rope is jerked taut must die out within a substep or two.
-        "ahead": AHEAD if taut else 0.0,
+        # Short waves that ring, from starts that are measured badly, would drive friction within the rope to and fro.
+        "ahead": AHEAD,
         "grip": 0.0,
     }
 
@@ -60,14 +55,3 @@ def _vertices(recording: Recording) -> int:
     """Return how many vertices suit the closest free or gripped neighbours among the markers, 40 to 80."""
     nearest = float(np.diff(recording.train[0].marker_arclength).min())
     return int(np.clip(round(recording.length / nearest) + 1, 41, 81))
-
-
-def _stretched(trial: Trial) -> float:
-    """Return the greatest share of the rope's length between two neighbouring grippers that their distance takes up."""
-    held, at = np.flatnonzero(trial.gripped), trial.marker_arclength
-    shares = [
-        float(np.linalg.norm(trial.markers[:, a] - trial.markers[:, b], axis=-1).max() / (at[b] - at[a]))
-        for a, b in itertools.pairwise(held)
-        if b > a + 1
-    ]
-    return max(shares, default=0.0)

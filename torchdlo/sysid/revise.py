@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 
 from torchdlo.sysid import library
 from torchdlo.sysid.bench import SILENT, Bench, Callback
-from torchdlo.sysid.extend import extend, short
+from torchdlo.sysid.extend import extended
 from torchdlo.sysid.floor import rms
 from torchdlo.sysid.jobs import Fitted
 from torchdlo.sysid.plan import Budget
@@ -23,9 +23,6 @@ MATTERS = 0.03
 
 NEARLY_ALL = 0.8
 """Share of what is left above the floor."""
-
-TIE = 0.05
-"""Fits whose gaps differ by less than this share of the excess, or of the floor, are not told apart."""
 
 _TRIED = 2
 """Effects that are tried in the place of another, besides those that do alike things."""
@@ -117,8 +114,6 @@ class Revision:
         while waiting and count < _EXCHANGES and rms(self.bench.gaps(fitted, "all")) > SILENT * self.bench.level:
             old = waiting.pop(0)
             best = self._instead(fitted, old, [n for n in possible if n not in fitted.effects])
-            if self._better(best, fitted) and self._astray(best, fitted) and not dict(best.options).get("ahead"):
-                best = self.bench.fit([self.bench.calmer(best, self.budget.more)])[0]
             if not self._better(best, fitted) or self._astray(best, fitted):
                 continue
             new, count = best.effects[-1], count + 1
@@ -131,7 +126,7 @@ class Revision:
 
     def _tie(self, fitted: Fitted) -> float:
         """Return the difference in cost up to which models are not told apart from one [m]."""
-        return TIE * max(self.plain[-1].point.cost - fitted.point.cost, 1e-9)
+        return self.bench.tie(self.plain[-1].point.cost, fitted.point.cost)
 
     def _better(self, other: Fitted, fitted: Fitted) -> bool:
         """Return whether another model fits better, or as well with fewer numbers."""
@@ -154,7 +149,7 @@ class Revision:
         kin = {n for group in library.KIN if old in group for n in group}
         tried = [*scores[:_TRIED], *(s for s in scores[_TRIED:] if s.name in kin)]
         first, more = self.budget.iterations, self.budget.more
-        fits = self.bench.fit([extend(self.bench, less, s, first, short(self.bench)) for s in tried])
+        fits, _ = extended(self.bench, less, tried, first, self.bench.fit)
         lead = sorted(fits, key=lambda f: f.point.cost)[:_TRIED]
         best = min(self.bench.fit([self.bench.further(f, more) for f in lead]), key=lambda f: f.point.cost)
         self.report(f"{stage}: {best.effects[-1]}", 1, 1, f"{1e3 * best.point.cost:.2f} mm")

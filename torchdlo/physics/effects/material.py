@@ -12,7 +12,7 @@ from torchdlo.physics import tree
 from torchdlo.physics.effect import Effect, Param, Values
 from torchdlo.physics.effects.elastic import Curvature, curvature
 from torchdlo.physics.numerics import dot
-from torchdlo.physics.rod import RodParams, View
+from torchdlo.physics.rod import RodParams, View, hinge_length
 from torchdlo.physics.topology import Topology, preceding
 
 
@@ -39,8 +39,7 @@ class RestCurvature(Effect):
 
     def alter(self, topology: Topology, params: RodParams, values: Values) -> RodParams:
         """Add the curvature to the rest shape."""
-        length = params.rest.length
-        hinge = 0.5 * (length + preceding(topology, length)) * params.rest.hinge_mask
+        hinge = hinge_length(topology, params.rest) * params.rest.hinge_mask
         rest = tree.replace(params.rest, curvature=params.rest.curvature + hinge * values["curvature"])
         return tree.replace(params, rest=rest)
 

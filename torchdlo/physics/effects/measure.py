@@ -43,28 +43,31 @@ def _slopes(x: Tensor) -> Tensor:
 
 
 def interpolate(x: Tensor, frame: Tensor) -> Tensor:
-    """Return x (..., F, M, 3) at fractions of frames (..., F), kept within the first and the last frame.
+    """Return x (..., F, M, 3) at fractions of frames (..., F).
 
     Cubic Hermite interpolation: once differentiable, exact for cubics, error O(step^4); frames themselves are exact.
+    Before the first and after the last frame x goes on evenly.
     """
     count = x.shape[-3]
     if count < 5:
         raise ValueError(f"track: {count} frames given; interpolation in time needs at least 5")
     batch = torch.broadcast_shapes(x.shape[:-3], frame.shape[:-1])
-    x, frame = x.expand(*batch, *x.shape[-3:]), frame.expand(*batch, count).clamp(0, count - 1)
+    x, asked = x.expand(*batch, *x.shape[-3:]), frame.expand(*batch, count)
+    frame = asked.clamp(0, count - 1)
+    over = (asked - frame)[..., None, None]
     index = frame.detach().floor().clamp(max=count - 2).long()
     s = (frame - index)[..., None, None]
     slopes = _slopes(x)
     start = (1 + 2 * s) * (1 - s).square() * _at(x, index) + s * (1 - s).square() * _at(slopes, index)
     end = s.square() * (3 - 2 * s) * _at(x, index + 1) - s.square() * (1 - s) * _at(slopes, index + 1)
-    return start + end
+    return start + end + over.clamp(max=0) * slopes[..., :1, :, :] + over.clamp(min=0) * slopes[..., -1:, :, :]
 
 
 @dataclass(frozen=True)
 class TimeDelay(Effect):
     """Free markers lag the log of the grippers: they are seen where the rope was `delay` ago.
 
-    Before the first and after the last frame the rope is taken to be where it is at that frame.
+    Before the first and after the last frame the rope is taken to move as it does at that frame.
     """
 
     name: ClassVar[str] = "time_delay"
