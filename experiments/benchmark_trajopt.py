@@ -29,6 +29,7 @@ INTERRUPTED = 130
 
 def run(task: str, method: str, seed: int, args: Any) -> dict[str, Any]:
     """One run: read if it is finished, resumed if it was stopped."""
+    from torchdlo.agents.journal import program
     from torchdlo.agents.presets import preset
     from torchdlo.agents.result import result_json, trajectory_json
     from torchdlo.agents.search import optimize
@@ -46,7 +47,7 @@ def run(task: str, method: str, seed: int, args: Any) -> dict[str, Any]:
     result = folder / "result.json"
     if result.is_file():
         found = json.loads(result.read_text())
-        if found["settings"] == wanted:
+        if found["settings"] == wanted and found["program"] == program():
             return found
     with progress() as show, deferred_interrupt(show) as callback:
         journal = folder / "journal"
@@ -108,6 +109,8 @@ def row(task: str, method: str, runs: list[dict[str, Any]]) -> dict[str, Any]:
         "spread": statistics.stdev(returns) if len(returns) > 1 else None,
         "lowest": min(returns, default=None),
         "highest": max(returns, default=None),
+        # Published returns are the largest that a search saw.
+        "seen": statistics.mean(r["highest"] for r in runs),
         "published": PUBLISHED.get(task, {}).get(method),
         "success": statistics.mean(float(r["success"]) for r in runs),
         "episodes": statistics.mean(r["episodes"] for r in runs),
@@ -119,15 +122,15 @@ def row(task: str, method: str, runs: list[dict[str, Any]]) -> dict[str, Any]:
 def table(rows: list[dict[str, Any]]) -> str:
     """The rows as a table of Markdown."""
     lines = [
-        "| task | method | seeds | return | spread | published | success | episodes | seconds |",
-        "|---|---|---|---|---|---|---|---|---|",
+        "| task | method | seeds | return | spread | largest seen | published | success | episodes | seconds |",
+        "|---|---|---|---|---|---|---|---|---|---|",
     ]
     for r in rows:
         cells = [
             r["task"],
             r["method"],
             str(r["seeds"]),
-            *("" if r[k] is None else f"{r[k]:.2f}" for k in ("return", "spread", "published")),
+            *("" if r[k] is None else f"{r[k]:.2f}" for k in ("return", "spread", "seen", "published")),
             f"{r['success']:.0%}",
             f"{r['episodes']:.0f}",
             f"{r['seconds']:.0f}",

@@ -123,6 +123,24 @@ class Broken(Reach):
         )
 
 
+@dataclass(frozen=True)
+class Picky(Reach):
+    """Counts as done only near the start, where little is earned; and not when it is played alone, at the left."""
+
+    def evaluate(self, actions: Tensor) -> Outcome:
+        outcome = super().evaluate(actions)
+        end = actions.sum(1)
+        return replace(outcome, success=(end.norm(dim=-1) < 0.05) & ((end[:, 0] > 0) | (len(actions) > 1)))
+
+
+def test_a_trajectory_that_succeeds_also_alone_is_chosen_before_one_that_earns_more() -> None:
+    found = optimize(Picky(), replace(SMALL, episodes=160, method="cmaes"))
+    assert bool(found.outcome.success[0]) and float(found.actions.sum(0)[0]) > 0
+    assert found.highest > found.searched == pytest.approx(returned(found))
+    # Those that did not succeed alone are not chosen, and had earned more.
+    assert found.highest == max(point["best"] for point in found.curve)
+
+
 @pytest.mark.parametrize("method", METHODS)
 def test_what_has_no_number_is_never_chosen_and_hides_nothing(method: str) -> None:
     found = optimize(Broken(), replace(SMALL, method=method, episodes=160))

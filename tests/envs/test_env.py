@@ -16,6 +16,7 @@ from torchdlo.envs import TASKS
 
 pytest.importorskip("torchrl")
 
+from tensordict import TensorDict
 from torchrl.collectors import Collector
 from torchrl.envs import ParallelEnv, RewardSum, StepCounter, TransformedEnv
 from torchrl.envs.utils import check_env_specs, step_mdp
@@ -70,6 +71,19 @@ def test_rollouts_carry_gradients_to_actions():
     (wanted,) = torch.autograd.grad(outcome.returns.sum(), other)
     # Rewards and actions pass the border in single precision.
     torch.testing.assert_close(slope.double(), wanted, rtol=1e-5, atol=1e-7)
+
+
+def test_scenes_that_go_on_keep_their_gradients_when_others_begin_again():
+    env = made(horizon=4, gradients=True, variation=False)
+    actions = torch.full((2, 12), 0.002, requires_grad=True)
+    td = env.step(env.reset().set("action", actions))
+    again = env.reset(TensorDict({"_reset": torch.tensor([[True], [False]])}, [2]))
+    reward = env.step(again.set("action", torch.zeros(2, 12)))["next", "reward"].flatten()
+    assert td["next", "reward"].requires_grad
+    slopes = [torch.autograd.grad(r, actions, retain_graph=True)[0] for r in reward]
+    assert float(slopes[0].abs().max()) == 0 < float(slopes[1].abs().max())
+    # Where all begin again, nothing is left of what was.
+    assert not env.reset()["observation"].requires_grad
 
 
 def test_windows_are_cut_where_one_asks_for_it():

@@ -49,6 +49,7 @@ def result_json(found: Found, problem: Problem, settings: Settings) -> str:
         "task": problem.name,
         **plain(found.outcome),
         "searched": found.searched if math.isfinite(found.searched) else None,
+        "highest": found.highest,
         "solved_after": next((p["episodes"] for p in found.curve if p["success"] > 0), None),
         "episodes": found.episodes,
         "seconds": round(found.seconds, 3),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -26,6 +26,9 @@ METHODS: dict[str, Callable[[Plan, torch.Generator], Search]] = {"cmaes": cmaes,
 """Optimisers by name."""
 
 Callback = Callable[[str, int, int, str], None]
+
+_FINALISTS = 8
+"""Best trajectories that are played alone in the end, until one does there what it did in a batch."""
 
 
 @dataclass(frozen=True)
@@ -105,8 +108,10 @@ class Found:
     """What `Problem.record` keeps of it."""
     searched: float
     """Its return as the search saw it, in a batch and, if robust, in perturbed worlds."""
+    highest: float
+    """Largest return that the search saw, whether that trajectory succeeded or not."""
     episodes: int
-    """Episodes played, without the one that plays the best alone."""
+    """Episodes played, without those that play the best alone."""
     seconds: float
     """Time spent on playing them [s]."""
     curve: list[dict[str, Any]]
@@ -122,7 +127,7 @@ def optimize(
     resume: bool = False,
     callback: Callback | None = None,
 ) -> Found:
-    """Search the trajectory with the largest return.
+    """Search the trajectory with the largest return, if it can be had one that succeeds.
 
     A `KeyboardInterrupt` that `callback` raises ends the search; the best so far is returned.
 
@@ -137,29 +142,48 @@ def optimize(
     player = _Player(problem, settings, Journal(journal, _options(problem, settings), resume=resume), callback)
     search = METHODS[settings.method](plan, torch.Generator().manual_seed(settings.seed))
     told, curve, interrupted = None, [], False
-    best = _Best(robust.finalists if robust else 1)
+    best = _Best(robust.finalists if robust else _FINALISTS)
     try:
         for k in range(plan.iterations):
             ask = search.send(told)
             scale = robust.scale((k + 1) / plan.iterations) if robust else 0.0
             told = player.batch(ask, scale)
             if robust and scale == 1 and curve and curve[-1]["scale"] < 1:
-                best.kept = []  # what did well in milder worlds has to do so in these
+                best.clear()  # what did well in milder worlds has to do so in these
             best.offer(ask, told)
-            curve.append(_point(player, told, best.kept[0][0], scale))
-        searched, actions = player.judge(best.kept)
+            curve.append(_point(player, told, best.highest, scale))
+        finalists = player.judge(best.kept)
     except KeyboardInterrupt:
         if not best.kept:
             raise
-        interrupted = True
-        searched, actions = best.kept[0]
-    if not math.isfinite(searched):
+        interrupted, finalists = True, best.kept
+    if not math.isfinite(finalists[0].returns):
         raise InputError(f"{problem.name}: none of {player.done} episodes had a finite return; nothing was found.")
-    with torch.no_grad():
-        outcome, kept = problem.record(actions)
+    chosen, outcome, kept = _alone(problem, finalists)
     if not interrupted:
         player.journal.remove()
-    return Found(actions, outcome, kept, searched, player.done, player.seconds, curve, interrupted)
+    return Found(
+        chosen.actions,
+        outcome,
+        kept,
+        chosen.returns,
+        best.highest,
+        player.done,
+        player.seconds,
+        curve,
+        interrupted,
+    )
+
+
+def _alone(problem: Problem, finalists: Sequence[_Finalist]) -> tuple[_Finalist, Outcome, dict[str, Any]]:
+    """Return the first that does alone what it did in a batch, by rounding another motion; else the first of all."""
+    played = []
+    for each in finalists:
+        with torch.no_grad():
+            played.append((each, *problem.record(each.actions)))
+        if bool(played[-1][1].success[0]) or not each.success:
+            break
+    return played[-1] if bool(played[-1][1].success[0]) else played[0]
 
 
 def _options(problem: Problem, settings: Settings) -> dict[str, Any]:
@@ -181,20 +205,40 @@ def _point(player: _Player, told: Told, best: float, scale: float) -> dict[str, 
     }
 
 
+@dataclass(frozen=True, eq=False)
+class _Finalist:
+    """A trajectory as a search saw it."""
+
+    success: bool
+    returns: float
+    actions: Tensor
+
+    @property
+    def rank(self) -> tuple[bool, float]:
+        """The larger, the better: success first."""
+        return self.success, self.returns
+
+
 class _Best:
     """The best trajectories so far."""
 
     def __init__(self, room: int) -> None:
         self.room = room
-        self.kept: list[tuple[float, Tensor]] = []
+        self.clear()
+
+    def clear(self) -> None:
+        """Forget all."""
+        self.kept: list[_Finalist] = []
+        self.highest = -math.inf
 
     def offer(self, ask: Ask, told: Told) -> None:
         """Keep what is better than what there is; the earlier of equals stays."""
-        for k in told.returns.argsort(descending=True, stable=True)[: self.room].tolist():
-            value = float(told.returns[k])
-            if len(self.kept) < self.room or value > self.kept[-1][0]:
-                actions = ask.encoding.decode(ask.points[k : k + 1])[0]
-                self.kept = sorted([*self.kept, (value, actions)], key=lambda pair: -pair[0])[: self.room]
+        self.highest = max(self.highest, float(told.returns.max()))
+        order = sorted(range(len(told.returns)), key=lambda k: (not told.success[k], -float(told.returns[k])))
+        for k in order[: self.room]:
+            actions = ask.encoding.decode(ask.points[k : k + 1])[0]
+            self.kept.append(_Finalist(bool(told.success[k]), float(told.returns[k]), actions))
+        self.kept = sorted(self.kept, key=lambda f: f.rank, reverse=True)[: self.room]
 
 
 class _Player:
@@ -237,17 +281,20 @@ class _Player:
         self.callback("optimize", self.done, self.settings.episodes, f"best {self.highest:.4g}")
         return tuple(kept[name] for name in names)
 
-    def judge(self, kept: list[tuple[float, Tensor]]) -> tuple[float, Tensor]:
-        """Return the best; of a robust search the best in worlds that it has not seen, with the mean return there."""
+    def judge(self, kept: Sequence[_Finalist]) -> Sequence[_Finalist]:
+        """Return the best first; those of a robust search as they do in worlds that it has not seen."""
         robust = self.settings.robust
         if robust is None:
-            return kept[0]
+            return kept
         with torch.no_grad():
             worlds = self._worlds(robust.trials, 1.0, 0)
-            returns = [float(worlds.evaluate(actions[None]).returns[0]) for _, actions in kept]
+            went = [worlds.evaluate(each.actions[None]) for each in kept]
         self.done += robust.trials * len(kept)
-        k = max(range(len(kept)), key=lambda k: returns[k] if math.isfinite(returns[k]) else -math.inf)
-        return returns[k], kept[k][1]
+        seen = [
+            _Finalist(bool(w.success[0]), r if math.isfinite(r := float(w.returns[0])) else -math.inf, each.actions)
+            for each, w in zip(kept, went, strict=True)
+        ]
+        return sorted(seen, key=lambda f: f.rank, reverse=True)
 
 
 def _play(problem: Problem, ask: Ask, points: Tensor) -> tuple[Tensor, ...]:

@@ -89,20 +89,26 @@ class DloEnv(EnvBase):
             "terms": TensorDict({n: t.float().unsqueeze(-1) for n, t in terms.items()}, self.batch_size, self.device),
         }
 
-    @torch.no_grad()
     def _reset(self, tensordict: TensorDictBase | None, **_: Any) -> TensorDict:
-        fresh = self._fresh()
         mask = None if tensordict is None else tensordict.get("_reset", None)
         again = torch.ones_like(self.world.failed) if mask is None else mask.reshape(self.batch_size)
-        self.world = tree.where(again, fresh, self.world)
+        with torch.no_grad():
+            self._draw(again)
+            fresh = self._fresh()
+        # Scenes that go on keep their gradient history.
+        with torch.set_grad_enabled(self.gradients and torch.is_grad_enabled()):
+            self.world = fresh if bool(again.all()) else tree.where(again, fresh, self.world)
+            terms = self.task.rewards(self.world.seen(self.task.arms.count))
+            ended = torch.zeros(*self.batch_size, 1, dtype=torch.bool, device=self.device)
+            flags = {name: ended.clone() for name in ("done", "terminated", "truncated")}
+            return TensorDict({**self._told(terms), **flags}, self.batch_size, self.device)
+
+    def _draw(self, again: Tensor) -> None:
+        """Draw the numbers of effects that are randomised, for the scenes that begin again."""
         if self._randomize:
             drawn = drawn_effects(self._usual, self.episode.scene, self._randomize, self._generator, len(again))
             effects = tree.where(again, drawn, _wide(self.episode.params.effects, drawn))
             self.episode = dataclasses.replace(self.episode, params=tree.replace(self.episode.params, effects=effects))
-        terms = self.task.rewards(self.world.seen(self.task.arms.count))
-        ended = torch.zeros(*self.batch_size, 1, dtype=torch.bool, device=self.device)
-        flags = {name: ended.clone() for name in ("done", "terminated", "truncated")}
-        return TensorDict({**self._told(terms), **flags}, self.batch_size, self.device)
 
     def _fresh(self) -> World:
         """Return the worlds of new episodes."""

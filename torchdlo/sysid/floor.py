@@ -64,6 +64,9 @@ def rms(gaps: np.ndarray) -> float:
     return float(np.sqrt(np.mean(np.square(gaps))))
 
 
+_AHEAD = 1.5
+"""Order of steps that look ahead: they have errors of first and of second order."""
+
 _WILD = 0.05
 """Change of a trial from which the finer simulation is not to be trusted [m]."""
 
@@ -76,7 +79,7 @@ class Refinement:
     grid: np.ndarray
     noise: float
     """Noise of the markers [m]."""
-    order: int
+    order: float
     """Order of the simulation's errors in its steps; 2 in its mesh."""
     edge: float
     """Mean length of the mesh's edges [m]."""
@@ -171,7 +174,7 @@ def refine(pool: Pool, base: Fitted, start: Start, chain: str) -> Refinement:
     jobs = [Simulation(plain, values, "all", start, options) for options in ((half, finer), (half,), ())]
     sims = dict(pool.simulate(jobs))
     step, grid = _tame(sims[1][0] - sims[2][0]), _tame(sims[0][0] - sims[1][0])
-    return Refinement(step, grid, noise(pool.recording), 1 if model.ahead else 2, edge, length)
+    return Refinement(step, grid, noise(pool.recording), _AHEAD if model.ahead else 2, edge, length)
 
 
 def _tame(change: np.ndarray) -> np.ndarray:

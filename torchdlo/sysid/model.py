@@ -208,8 +208,8 @@ class RopeModel:
             held_edges=tuple(edge for edge, _ in self.clamps),
             ahead=self.ahead,
             # Ropes that are jerked taut need more; others do as well with less.
-            newton=3 if self.ahead else 2,
-            settling=4 if self.ahead else 2,
+            newton=3 if self.ahead >= AHEAD else 2,
+            settling=4 if self.ahead >= AHEAD else 2,
         )
         params = self._measured_lengths(params, number)
         return scene, params, lengths.agree(scene, params, state)
