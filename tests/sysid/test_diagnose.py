@@ -16,6 +16,7 @@ from torchdlo.physics.effects import EFFECTS
 from torchdlo.report import diagnosis as report
 from torchdlo.sysid import diagnose as search
 from torchdlo.sysid import floor, library, settle
+from torchdlo.sysid.bench import Bench
 from torchdlo.sysid.drive import drive
 from torchdlo.sysid.extend import extend
 from torchdlo.sysid.findings import findings, findings_json, model_json, sentence
@@ -226,6 +227,39 @@ def test_a_slope_and_a_spot_are_fitted_side_by_side(tmp_path: Path) -> None:
     assert jobs == [(["slope"], 2), (["position", "width", "factor"], 1)]
 
 
+def twentieth(worse: float, best: float) -> float:
+    """A tie that is a twentieth of what is explained."""
+    return 0.05 * (worse - best)
+
+
+def test_fits_tie_by_what_they_save_and_by_what_they_leave() -> None:
+    bench = SimpleNamespace(level=0.5e-3)
+    # A twentieth of what is saved; noise of 0.5 mm costs sqrt(0.5^2 + 2^2) - 2 = 0.06 mm, and half of that is less.
+    assert Bench.tie(bench, 1.2e-3, 0.9e-3) == pytest.approx(0.05 * 0.3e-3)
+    assert Bench.tie(bench, 10e-3, 0.0) == pytest.approx(0.5 * (np.hypot(0.5, 2) - 2) * 1e-3)
+    assert Bench.tie(bench, 10e-3, 0.6e-3) == pytest.approx(0.3e-3)
+    bench.level = float("inf")
+    assert Bench.tie(bench, 10e-3, 0.0) == pytest.approx(0.5e-3)
+
+
+def test_an_effect_is_left_out_once_only_from_the_same_model() -> None:
+    asked = []
+
+    def fit(jobs: list[str]) -> list[str]:
+        asked.extend(jobs)
+        return [SimpleNamespace(point=SimpleNamespace(cost=1e-3), of=job) for job in jobs]
+
+    bench = SimpleNamespace(starts={"train": object()}, fit=fit, reduction=lambda fitted, name, *_: (fitted, name))
+    revision = Revision(bench, BUDGETS["fast"], ["plain"], lambda *_: None)
+    fitted = SimpleNamespace(effects=("wind", "stretch"), options=(), values=np.ones(3))
+    again = SimpleNamespace(effects=("wind", "stretch"), options=(), values=np.ones(3))
+    assert revision._without(fitted, "wind") is revision._without(again, "wind") and len(asked) == 1
+    assert revision._without(fitted, "stretch").of == (fitted, "stretch")
+    bench.starts = {"train": object()}
+    revision._without(fitted, "wind")
+    assert len(asked) == 3
+
+
 @pytest.mark.parametrize(("speed", "first"), [(0.02, "air_drag"), (0.4, "wind")])
 def test_a_general_law_is_named_only_where_its_other_numbers_tell(
     speed: float, first: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -245,6 +279,7 @@ def test_a_general_law_is_named_only_where_its_other_numbers_tell(
     low, high = interval(fits["wind"].point, fits["wind"].space)
     assert (low[0] < 0) == (first == "air_drag") and high[0] < 1.0
     judge = object.__new__(search._Search)
+    judge.bench = SimpleNamespace(tie=twentieth)
     for name, value in {"_refused": None, "_gain": 0.5}.items():
         monkeypatch.setattr(judge, name, lambda *_, value=value: value, raising=False)
     # Wind fits better than drag, by more than a tie.
@@ -279,7 +314,7 @@ def test_a_special_law_takes_the_place_of_a_general_one_that_fits_no_better(cost
         return SimpleNamespace(point=SimpleNamespace(cost=left), effects=effects)
 
     plain = model(cost, "air_drag", "time_delay")
-    bench = SimpleNamespace(exchange=lambda *job: job[1:3], fit=lambda jobs: [plain] * len(jobs))
+    bench = SimpleNamespace(exchange=lambda *job: job[1:3], fit=lambda jobs: [plain] * len(jobs), tie=twentieth)
     revision = Revision(bench, BUDGETS["fast"], [model(9e-3), model(6e-3)], lambda *_: None)
     found = Found({"wind": 0.5, "time_delay": 0.4}, {"wind": ["tilted_gravity"], "time_delay": []})
     fitted = revision.plainer(model(0.5e-3, "wind", "time_delay"), found)
@@ -303,6 +338,7 @@ def test_an_effect_gives_way_to_another_that_fits_better_beside_the_rest(cost: f
     monkeypatch.setattr(Revision, "_instead", instead)
     pool = SimpleNamespace(choose=lambda **_: None)
     bench = SimpleNamespace(gaps=lambda f, _: np.array([5e-3]), level=1e-3, astray=lambda *_: False, pool=pool)
+    bench.tie = twentieth
     revision = Revision(bench, BUDGETS["fast"], [model(9e-3, 3), model(6e-3, 3)], lambda *_: None)
     found = Found({"wind": 0.5, "point_mass": 0.3}, {"wind": ["rest_curvature"], "point_mass": []})
     # Of 4 mm that are explained, 0.2 mm are a tie: fewer numbers win that.

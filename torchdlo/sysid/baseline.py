@@ -26,6 +26,9 @@ _KEPT = 1 / 3
 _BETTER = 0.9
 """Share of the cost that is left where the rope is taken for a chain, or for one that clamps hold to their ends."""
 
+_LINKED = 1.3
+"""Share of the cost up to which it may turn out to be one once an effect is known."""
+
 _LOOK = 2
 """Iterations after which a chain has to fit better than a rope, if it is to be fitted further."""
 
@@ -83,6 +86,7 @@ def calibrate(bench: Bench, count: int, iterations: int, rng: np.random.Generato
     firm = [plain(best[None], 5, 2 * frames // 3, grip=1.0)] if model.mesh.clamps else []
     smooth, one, other, *held = fit([plain(best[None], 5, 2 * frames // 3), *sides, *firm], 2)
     side = min((one, other), key=lambda f: f.point.cost)
+    bench.linked = side.point.cost < _LINKED * smooth.point.cost
     if held:
         smooth, side = _held(bench, held[0], smooth, side)
     rope = bench.correct(smooth)
@@ -146,7 +150,7 @@ def go_further(bench: Bench, base: Fitted, iterations: int, report: Callback) ->
         base = firm[0]
         bench.pool.choose(grip=1.0)
     report(stage, 1, 3, f"{1e3 * rms(bench.gaps(base, 'train')):.2f} mm")
-    if CHAIN not in base.effects and rms(bench.gaps(base, "train")) > SILENT * bench.level:
+    if bench.linked and CHAIN not in base.effects and rms(bench.gaps(base, "train")) > SILENT * bench.level:
         rows = [np.append(base.values, length)[None] for length in (link, -link)]
         sides = [Fit(effects, r, free, (*sizes, 0.5 * link), iterations, bench.starts["train"]) for r in rows]
         base = _chain_or(bench, base, rope, sides)

@@ -50,6 +50,8 @@ class Bench:
         """The baseline's numbers that fit the beginning of the trials, as far as they are known."""
         self.undecided = False
         """Whether clamps may be stiff up to their last marker, although the baseline lets the rope bend in them."""
+        self.linked = True
+        """Whether the rope may move like a chain of links, as far as the baseline tells."""
         self.floor = floors.Floor(floors.noise(self.recording), float("inf"), float("inf"))
         """What no effect explains, on the test trials, as far as it is known."""
         self.level = float("inf")

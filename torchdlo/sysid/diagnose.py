@@ -134,10 +134,9 @@ class _Search:
             name, old = best.effects[-1], self._squared(base)
             self.pool.choose(**dict(best.options))
             found.shares[name], found.ties[name] = (old - self._squared(best)) / whole, rivals
-            kept = self.revision.pruned(best, found)
-            base = baselines.go_further(self.bench, kept, self.budget.more, self.report)
-            found.shares[name] += (self._squared(kept) - self._squared(base)) / whole
-            base = self.revision.exchanged(base, found, self._possible())
+            base = baselines.go_further(self.bench, best, self.budget.more, self.report)
+            found.shares[name] += (self._squared(best) - self._squared(base)) / whole
+            base = self.revision.exchanged(self.revision.pruned(base, found), found, self._possible())
             self._say_floor()
         base = self.revision.plainer(self.revision.pruned(base, found), found)
         return self._conclude(base, found, rounds)

@@ -7,7 +7,7 @@ doi:10.1016/0167-8655(94)90127-9).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, field
 
 from torchdlo.sysid import library
@@ -15,6 +15,7 @@ from torchdlo.sysid.bench import SILENT, Bench, Callback
 from torchdlo.sysid.extend import extended
 from torchdlo.sysid.floor import rms
 from torchdlo.sysid.jobs import Fitted
+from torchdlo.sysid.motion import Start
 from torchdlo.sysid.plan import Budget
 from torchdlo.sysid.screen import screen
 
@@ -66,6 +67,7 @@ class Revision:
             report: told how it goes.
         """
         self.bench, self.budget, self.plain, self.report = bench, budget, plain, report
+        self._reductions: dict[Hashable, tuple[Start, Fitted]] = {}
 
     def matters(self, less: Fitted, more: Fitted, split: str) -> bool:
         """Return whether a model's gap is smaller by more than the floor, and by a share of the baseline's.
@@ -138,8 +140,13 @@ class Revision:
         return self.bench.astray(other, self.bench.gaps(fitted, "all"))
 
     def _without(self, fitted: Fitted, name: str) -> Fitted:
-        less = self.bench.fit([self.bench.reduction(fitted, name, self.plain[0], 2 * self.budget.more)])[0]
-        self.report(f"without {name}", 1, 1, f"{1e3 * less.point.cost:.2f} mm")
+        """Return the model without one of its effects; what was asked for before is not fitted again."""
+        start, key = self.bench.starts["train"], (fitted.effects, fitted.options, fitted.values.tobytes(), name)
+        at, less = self._reductions.get(key, (None, None))
+        if at is not start:
+            less = self.bench.fit([self.bench.reduction(fitted, name, self.plain[0], 2 * self.budget.more)])[0]
+            self.report(f"without {name}", 1, 1, f"{1e3 * less.point.cost:.2f} mm")
+            self._reductions[key] = start, less
         return less
 
     def _instead(self, fitted: Fitted, old: str, names: Sequence[str]) -> Fitted:
