@@ -27,6 +27,7 @@ FLOORS = {
     "progress": 8,
     "commands": 9,
     "cli": 10,
+    "__main__": 11,
 }
 """Parts of the package by height; an import goes down, so siblings do not import each other."""
 
@@ -48,6 +49,7 @@ ALLOWED = {
     "run": ARRAYS,
     "commands": {"typer"},
     "cli": ARRAYS | {"rich", "typer"},
+    "__main__": set(),
     "": TORCH,  # torchdlo/__init__.py
 }
 """Libraries that each part may import besides the standard library."""

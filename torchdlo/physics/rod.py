@@ -101,7 +101,7 @@ class View:
     before: Tensor
     """Unit tangents of the preceding edges [1], shape (..., V, 3)."""
     hinge_length: Tensor
-    """Rest length of rope that a hinge stands for: half of each edge next to it, if `share` is 1 [m], (..., V, 1)."""
+    """Rest length of rope that a hinge stands for, see `RodRest.share` [m], shape (..., V, 1)."""
 
     def next(self, x: Tensor) -> Tensor:
         """Return at each slot the value of the following one."""

@@ -147,17 +147,20 @@ def _twisted(view: View, hinge: Curvature, resistance: Tensor, rate: Tensor) -> 
     m1, m2 = view.frames()
     spin, (b1, b2, a1, a2) = view.state.twist_rate, hinge.by_twist
     back = view.prev(spin)
-    grown = (
-        b1 / view.dt - 0.5 * dot(moved, view.prev(m1)) + back * b2,
-        b2 / view.dt - 0.5 * dot(moved, view.prev(m2)) - back * b1,
-        a1 / view.dt - 0.5 * dot(moved, m1) + spin * a2,
-        a2 / view.dt - 0.5 * dot(moved, m2) - spin * a1,
-    )
-    same_b, onward = b1 * grown[0] + b2 * grown[1], b1 * grown[2] + b2 * grown[3]
-    backward, same_a = a1 * grown[0] + a2 * grown[1], a1 * grown[2] + a2 * grown[3]
+    grown_b1 = -0.5 * dot(moved, view.prev(m1)) + back * b2
+    grown_b2 = -0.5 * dot(moved, view.prev(m2)) - back * b1
+    grown_a1 = -0.5 * dot(moved, m1) + spin * a2
+    grown_a2 = -0.5 * dot(moved, m2) - spin * a1
+    # What 1 / dt goes with is symmetric: it would drown the rest of what is not.
+    onward, backward = b1 * grown_a1 + b2 * grown_a2, a1 * grown_b1 + a2 * grown_b2
+    parts = [
+        (b1 * b1 + b2 * b2) / view.dt + b1 * grown_b1 + b2 * grown_b2,
+        (a1 * b1 + a2 * b2) / view.dt + 0.5 * (onward + backward),
+        (a1 * a1 + a2 * a2) / view.dt + a1 * grown_a1 + a2 * grown_a2,
+    ]
     f1, f2 = rate[..., :1], rate[..., 1:]
     return {
-        "twist_hessian": resistance * tree.cat_components([same_b, 0.5 * (onward + backward), same_a]),
+        "twist_hessian": resistance * tree.cat_components(parts),
         "twist_skew": 0.5 * resistance * (onward - backward),
         "twist_geometry": resistance * tree.cat_components([f1 * b2 - f2 * b1, f1 * a2 - f2 * a1]),
     }
