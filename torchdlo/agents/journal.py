@@ -47,10 +47,10 @@ def program() -> str:
     """Return a hash of the code and the libraries that results depend on."""
     root = Path(__file__).parents[1]
     found = hashlib.sha256(json.dumps(versions(), sort_keys=True).encode())
-    for part in ("physics", "coupling", "envs", "agents", "scene.py"):
+    for part in ("physics", "coupling", "envs", "agents", "data/robots", "scene.py"):
         files = [root / part] if part.endswith(".py") else sorted((root / part).rglob("*"))
         for file in files:
-            if file.suffix in (".py", ".cpp"):
+            if file.suffix in (".py", ".cpp", ".h", ".urdf"):
                 found.update(file.name.encode() + file.read_bytes())
     return found.hexdigest()
 
