@@ -96,6 +96,7 @@ def test_the_hybrid_beats_both_where_slopes_begin_at_contact() -> None:
     }
     mean = {method: sum(values) / 6 for method, values in results.items()}
     assert mean["hybrid"] >= max(mean["cmaes"], mean["gd"]), results
+    assert min(results["hybrid"]) >= max(min(results["cmaes"]), min(results["gd"])), results
 
 
 @pytest.mark.slow

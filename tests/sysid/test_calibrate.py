@@ -234,6 +234,17 @@ def test_levenberg_marquardt_finds_the_minimum_of_a_known_curve() -> None:
     assert space.to_values(last[0].raw)[0] == pytest.approx(1.7, rel=1e-4)
 
 
+def test_large_errors_leave_less_curvature_and_what_is_not_seen_none() -> None:
+    space = fit.Space(("damping_rate",), (PARAMETERS["damping_rate"],))
+    look = fit.Look(space, space.to_raw(np.array([[0.8]])))
+    measured = np.linspace(0.0, 1.0, 20)[None, :, None, None] * np.ones((2, 1, 4, 3))
+    measured[1, 5:] = np.nan  # a short trial
+    off = np.array([0.0, 3e-3])[:, None, None, None] + 1e-4 * np.arange(len(look.values))[:, None, None, None, None]
+    (point,) = look.points(np.nan_to_num(measured) + off, measured)
+    # knee^2 / size^3 over 1 / size, with size^2 = error^2 + knee^2 and a knee of 2 mm.
+    np.testing.assert_allclose(point.flatter, [1.0, 4 / 13], rtol=1e-6)
+
+
 @pytest.mark.slow
 def test_ranges_take_in_what_wrong_simulations_change() -> None:
     space = fit.Space(("damping_rate",), (PARAMETERS["damping_rate"],))

@@ -7,7 +7,7 @@ Two parts share the budget, iteration by iteration, and every episode of both is
    they are handed over as in Hansen 2011 (arXiv:1110.4181).
 2. The best points descend in all actions, see `lbfgs`.
 
-CMA-ES begins; then the part goes on whose last iteration gained more, but each in its turn.
+CMA-ES begins; then the part goes on that gained more lately, but each in its turn.
 """
 
 from __future__ import annotations
@@ -45,11 +45,6 @@ def hybrid(plan: Plan, rng: torch.Generator) -> Search:
     alone = max(drifts, math.ceil(_COARSE * plan.iterations))
     gain, last, best = {coarse: 0.0, fine: math.inf}, {coarse: 0, fine: 0}, -math.inf
     for k in itertools.count():
-        # What was measured in milder worlds does not compare.
-        if k < drifts:
-            coarse.forget()
-            fine.clear()
-            best = -math.inf
 
         def turn(part: _Evolution | Descent, k: int = k) -> tuple[bool, float, int]:
             return k - last[part] >= _TURN, gain[part], -last[part]
@@ -57,6 +52,11 @@ def hybrid(plan: Plan, rng: torch.Generator) -> Search:
         part = coarse if k < alone else max((coarse, fine), key=turn)
         x = part.ask()
         told = yield Ask(encoding, x, graded=True)
+        # What was measured in milder worlds does not compare.
+        if k < drifts:
+            coarse.lines = None
+            fine.clear()
+            best = -math.inf
         part.tell(x, told)
         if part is coarse:
             fine.offer(x, told)
@@ -75,16 +75,12 @@ class _Evolution:
         self.x[1::2] = self.encoding.project(walks(plan, rng))[1::2]
         self.found: Any = None
         self.lines: _Lines | None = None
-
-    def forget(self) -> None:
-        """Let lines start anew."""
-        self.lines = None
+        """None lets them start anew from what is told next."""
 
     def ask(self) -> Tensor:
         """Return what to play: points that were moved, and what the strategy draws."""
         if self.found is not None:
-            down = self.x[:0] if self.lines is None else self.lines.moved(self.found)
-            self.x = drawn(self.found, self.encoding, self.encoding.project(down))
+            self.x = drawn(self.found, self.encoding, self.encoding.project(self.lines.moved(self.found)))
         return self.encoding.decode(self.x).flatten(1)
 
     def tell(self, _: Tensor, told: Told) -> None:

@@ -162,7 +162,8 @@ class Look:
             gradient = np.einsum("kbr,br,br->bk", slope, weight, residual, optimize=True) / per_trial[:, None]
             curvature = np.einsum("kbr,br,lbr->bkl", slope, weight, slope, optimize=True) / per_trial[:, None, None]
             # The second derivative of the cost is knee^2 / size^3, where Gauss-Newton takes 1 / size.
-            flatter = (seen.reshape(weight.shape) * weight**3 * _KNEE**2).sum(-1) / np.maximum(weight.sum(-1), 1e-300)
+            weight = np.where(seen.reshape(weight.shape), weight, 0.0)
+            flatter = (weight**3 * _KNEE**2).sum(-1) / np.maximum(weight.sum(-1), 1e-300)
             cost = float(_together(of_trial, _LOST * whole))
             points.append(Point(self.raws[s], cost, gradient, curvature, of_trial, flatter))
         return points

@@ -32,7 +32,6 @@ class Budget:
 
 BUDGETS = {"fast": Budget(36, 4, 4, 6, 2), "full": Budget(96, 8, 6, 12, 3, 16)}
 
-
 TAUT = 0.95
 """Share of the rope's length between two grippers from which it may be jerked taut."""
 
