@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import ClassVar
 
@@ -113,6 +113,29 @@ def test_the_command_finds_keeps_and_plays_again(
     base = torch.tensor(Lead.arms.base, dtype=torch.float64)
     tool = tool_pose(panda(), torch.tensor(kept["joints"], dtype=torch.float64)).pos + base
     torch.testing.assert_close(tool, torch.tensor(kept["tool"], dtype=torch.float64), atol=1e-12, rtol=0)
+
+
+class Missing(Lead):
+    """The same, of which contact has missed something."""
+
+    def build(self, moved: Tensor) -> tuple[Scene, Params, State]:
+        """As if an edge had become a fifth too short."""
+        scene, params, state = super().build(moved)
+        return scene, params, replace(state, missed=state.missed + torch.tensor([0.0, 0.0, 0.2]))
+
+
+def test_a_trajectory_that_cannot_be_trusted_says_so(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["optimize", "lead", "--episodes", "4", "--population", "4", "--no-compiled", "--json"]
+    for kind, missed in ((Lead, ""), (Missing, "an edge became 20% shorter than it has to be")):
+        monkeypatch.setitem(envs.TASKS, "lead", kind)
+        with pytest.raises(SystemExit):
+            cli.main([*words, "--out", str(tmp_path / kind.__name__)])
+        said = capsys.readouterr()
+        found = json.loads(said.out)["missed"]
+        assert found.startswith(missed) and bool(found) == bool(missed)
+        assert ("do not trust it: an edge became" in said.err) == bool(missed)
 
 
 @pytest.mark.parametrize(

@@ -39,7 +39,8 @@ def summary(found: Found, task: str) -> str:
     value = "no finite number" if went["return"] is None else f"{went['return']:.4g}"
     how = "failed" if went["failed"] else "success" if went["success"] else "no success"
     stopped = "; stopped early" if found.interrupted else ""
-    return f"{task}: return {value} after {found.episodes} episodes, {how}{stopped}"
+    missed = f"; do not trust it: {found.kept['missed']}" if found.kept.get("missed") else ""
+    return f"{task}: return {value} after {found.episodes} episodes, {how}{stopped}{missed}"
 
 
 def result_json(found: Found, problem: Problem, settings: Settings) -> str:
@@ -49,6 +50,7 @@ def result_json(found: Found, problem: Problem, settings: Settings) -> str:
         "task": problem.name,
         **plain(found.outcome),
         "searched": found.searched if math.isfinite(found.searched) else None,
+        "missed": found.kept.get("missed", ""),
         "highest": found.highest,
         "solved_after": next((p["episodes"] for p in found.curve if p["success"] > 0), None),
         "episodes": found.episodes,

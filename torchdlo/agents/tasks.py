@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from torchdlo.agents.problem import Outcome
+from torchdlo.coupling import watch
 from torchdlo.envs import Cable, episode, find
 from torchdlo.envs.task import Task
 from torchdlo.errors import InputError
@@ -100,10 +101,15 @@ class TaskProblem:
         return Varied(self, copies, scale, seed)
 
     def record(self, actions: Tensor) -> tuple[Outcome, dict[str, Any]]:
-        """Play one trajectory alone; kept are joints and tools after every action, by arm, [rad or m] and [m]."""
+        """Play one trajectory alone.
+
+        Kept are joints and tools after every action, by arm, [rad or m] and [m], rewards, and what contact missed: ""
+        if all is well.
+        """
         went = episode.play(self.task, self.full(actions[None]), episode=self.prepared(1), keep=episode.places)
         kept = {name: went.path[name][:, 0].tolist() for name in ("joints", "tool")}
         kept["rewards"] = went.rewards[:, 0].tolist()
+        kept["missed"] = watch.explain(went.world.state.missed)
         finite = all(math.isfinite(value) for value in kept["rewards"])
         return Outcome(went.returns, went.loss, went.success, went.failed), kept if finite else {}
 
