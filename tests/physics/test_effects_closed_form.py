@@ -300,26 +300,30 @@ def test_a_rope_bends_least_towards_the_stiffer_direction():
         assert float(energy) == pytest.approx(0.5 * 1e-3 * factor * squared / H, rel=1e-12)
 
 
+@pytest.mark.parametrize("share", [1.0, 0.5])
 @pytest.mark.parametrize("names", [[], ["anisotropic_bending"]], ids=["one", "three"])
-def test_a_clamp_that_turns_is_a_spring_in_series(names):
-    # (l B^-1 + 1/k)^-1 = B' / l at the clamp's hinge, in bending and in twist; nothing elsewhere.
-    spring, n = 0.03, 6
+def test_a_clamp_that_turns_is_a_spring_in_series(names, share):
+    # (l B^-1 + 1/k)^-1 = B' / l at the clamp's hinge, in bending and in twist; nothing elsewhere. The hinge may stand
+    # for less rope than lies between the middles of its edges; the spring is not softer for that.
+    spring, n, span = 0.03, 6, share * H
     built, params, _ = make(
         [Rope(straight(n, 0.5), mass=0.1, bend=1e-3, twist=2e-3)],
         [GripperCompliance(hinges=(1,)), *effects("bend_frame", "twist", *names)],
         {"gripper_compliance": {"stiffness": spring}} | {name: NUMBERS[name] for name in names},
         check=True,
     )
-    free = effect.altered(built.effects[1:], built.topology, params.rods, params.effects).material
-    held = effect.altered(built.effects, built.topology, params.rods, params.effects).material
+    rest = params.rods.rest
+    rods = tree.replace(params.rods, rest=tree.replace(rest, share=share * rest.share))
+    free = effect.altered(built.effects[1:], built.topology, rods, params.effects).material
+    held = effect.altered(built.effects, built.topology, rods, params.effects).material
 
     def matrix(bend):
         return torch.stack([bend[[0, 2]], bend[[2, 1]]]) if bend.shape[-1] == 3 else bend[:, None]
 
-    before, after = matrix(free.bend[1]) / H, matrix(held.bend[1]) / H
+    before, after = matrix(free.bend[1]) / span, matrix(held.bend[1]) / span
     wanted = torch.linalg.inv(torch.linalg.inv(before) + torch.eye(len(before), dtype=F64) / spring)
     assert torch.allclose(after, wanted, rtol=1e-13, atol=0.0)
-    assert float(held.twist[1]) / H == pytest.approx(1 / (H / 2e-3 + 1 / spring), rel=1e-13)
+    assert float(held.twist[1]) / span == pytest.approx(1 / (span / 2e-3 + 1 / spring), rel=1e-13)
     others = [0, 2, 3, 4, 5]
     assert torch.equal(held.bend[others], free.bend[others].expand_as(held.bend[others]))
 

@@ -10,8 +10,8 @@ from torch import Tensor
 
 from torchdlo.physics import tree
 from torchdlo.physics.effect import Effect, Param, Values
-from torchdlo.physics.rod import RodParams
-from torchdlo.physics.topology import Topology, preceding
+from torchdlo.physics.rod import RodParams, hinge_length
+from torchdlo.physics.topology import Topology
 
 
 def _in_series(stiffness: Tensor, other: Tensor) -> Tensor:
@@ -58,9 +58,9 @@ class GripperCompliance(Effect):
 
     def alter(self, topology: Topology, params: RodParams, values: Values) -> RodParams:
         """Soften the hinges."""
-        length, material = params.rest.length, params.material
+        length, material = hinge_length(topology, params.rest), params.material
         here = length.new_tensor([[float(slot in self.hinges)] for slot in range(topology.size)]) > 0
-        spring = values["stiffness"] * 0.5 * (length + preceding(topology, length))
+        spring = values["stiffness"] * length
         bend = torch.where(here, _in_series(material.bend, spring), material.bend)
         twist = torch.where(here, _in_series(material.twist, spring), material.twist)
         return tree.replace(params, material=tree.replace(material, bend=bend, twist=twist))
