@@ -14,8 +14,8 @@ from scipy.spatial.transform import Rotation
 from torchdlo.errors import InputError
 from torchdlo.physics.effects import EFFECTS
 from torchdlo.report import diagnosis as report
+from torchdlo.sysid import clamps, floor, library, settle
 from torchdlo.sysid import diagnose as search
-from torchdlo.sysid import floor, library, settle
 from torchdlo.sysid.bench import Bench
 from torchdlo.sysid.drive import drive
 from torchdlo.sysid.extend import extend
@@ -29,6 +29,7 @@ from torchdlo.sysid.plan import BUDGETS
 from torchdlo.sysid.recording import Recording, Trial
 from torchdlo.sysid.revise import Found, Revision
 from torchdlo.sysid.screen import Score
+from torchdlo.sysid.start import read_off
 from torchdlo.sysid.verdict import word
 
 S = np.array([0.0, 0.02, 0.08, 0.16, 0.24, 0.32, 0.4, 0.48, 0.56, 0.6])
@@ -195,6 +196,23 @@ def test_a_clamp_that_turns_is_told_from_one_in_which_the_rope_bends(
     assert result.effects == ["gripper_compliance"]
     found = findings(result, recording)["effects"][0]["parameters"]["stiffness"]["value"]
     assert found == pytest.approx(0.4, rel=0.2)
+
+
+def test_what_a_clamp_may_be_in_which_the_rope_bends_moves_alike(tmp_path: Path) -> None:
+    recording = make_recording(tmp_path, {})
+    said, sims = [], []
+    for grip, effects in ((0.0, ()), (1.0, ("gripper_compliance",))):
+        model = RopeModel(recording, vertices=31, effects=effects, grip=grip)
+        numbers = dict(zip(model.parameters, model.guess(), strict=True)) | {"bending_stiffness": 2e-3}
+        # 1 cm of rope from the middle of the clamp to its end: 2e-3 / 0.01 N m/rad. The grippers do not twist the rope.
+        numbers |= {"gripper_compliance.stiffness": 0.2} if effects else {}
+        values = np.array([numbers[name] for name in model.parameters])
+        said.append(clamps.notes(model, SimpleNamespace(effects=effects, values=values)))
+        motion = model.motion(recording.train)
+        sims.append(model.simulate(motion, read_off(recording.train), values[None])[0])
+    assert ["0.2 N m/rad (gripper compliance)" in note for note in said[0]] == [True] and not said[1]
+    np.testing.assert_allclose(sims[0], sims[1], atol=1e-6)
+    assert not clamps.notes(RopeModel(recording, vertices=31, grip=1.0), SimpleNamespace(effects=(), values=values))
 
 
 @pytest.mark.parametrize(

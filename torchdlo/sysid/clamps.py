@@ -13,6 +13,7 @@ import numpy as np
 from torchdlo.sysid.bench import SILENT, Bench
 from torchdlo.sysid.floor import rms
 from torchdlo.sysid.jobs import Fit, Fitted
+from torchdlo.sysid.model import RopeModel
 from torchdlo.sysid.screen import Score
 
 NAME = "gripper_compliance"
@@ -32,11 +33,28 @@ def firm(base: Fitted, job: Fit) -> Fit:
     return replace(job, options=(*base.options, ("grip", 1.0)))
 
 
+def notes(model: RopeModel, final: Fitted) -> list[str]:
+    """Return a sentence on what a clamp may be in which the rope bends, for a reader of a model."""
+    if model.grip >= 1 or not model.mesh.clamps or NAME in final.effects:
+        return []
+    bend = final.values[model.parameters.index("bending_stiffness")]
+    spring = bend / (0.5 * (1 - model.grip) * _apart(model))
+    return [
+        "The rope seems to bend between the two markers of a clamp. A clamp that turns like a spring of "
+        f"{spring:.2g} N m/rad ({NAME.replace('_', ' ')}) would look alike: to tell them apart, hold it close to the "
+        "inner marker and record again."
+    ]
+
+
+def _apart(model: RopeModel) -> float:
+    """Return the distance of the markers of a clamp [m]."""
+    return min(float(np.diff(model.mesh.marker_arclength[run]).min()) for run in model.mesh.runs)
+
+
 def stiff(bench: Bench, base: Fitted, score: Score, iterations: int, frames: int | None) -> Fit:
     """Return the job of fitting elastic clamps that hold the rope stiffly up to their last marker, see `extend`."""
     model, number = bench.pool.local.model(base.effects), f"{NAME}.stiffness"
-    apart = min(float(np.diff(model.mesh.marker_arclength[run]).min()) for run in model.mesh.runs)
     bend = base.values[model.parameters.index("bending_stiffness")]
-    starts = tuple(({number: bend / (share * apart)}, base.point.raw) for share in _SHARES)
+    starts = tuple(({number: bend / (share * _apart(model))}, base.point.raw) for share in _SHARES)
     job = bench.extension(base, replace(score, starts=starts), [number], iterations, frames)
     return firm(base, job)

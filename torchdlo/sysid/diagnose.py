@@ -311,6 +311,8 @@ class _Search:
         simulated = {"before": self.before, "after": self.bench.prediction(final, "all")}
         before, after = (gap(sims[train:], trials["test"]) for sims in simulated.values())
         verdict = word(effects, rms(self.bench.gaps(final, "test")), self.bench.level)
+        model = self.pool.local.model(final.effects, final.options)
+        said = [*baselines.notes(self.baseline), *clamps.notes(model, final)]
         predictions = {
             when: {t.name: sim[: len(t.time)] for sim, t in zip(sims, trials["all"], strict=True)}
             for when, sims in simulated.items()
@@ -327,9 +329,9 @@ class _Search:
             after,
             rounds,
             predictions,
-            self.pool.local.model(final.effects, final.options),
+            model,
             self.bench.drift(final),
-            notes=[*baselines.notes(self.baseline), *([] if np.isfinite(self.bench.level) else [UNKNOWN_FLOOR])],
+            notes=[*said, *([] if np.isfinite(self.bench.level) else [UNKNOWN_FLOOR])],
         )
 
 
