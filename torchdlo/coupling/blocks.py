@@ -14,6 +14,7 @@ from torchdlo.coupling.bodies import BodyMotion
 from torchdlo.physics import native
 
 _OPTIONS = ("-fno-math-errno", "-fno-trapping-math", "-Wno-psabi")
+_operators = torch.library.Library("torchdlo", "FRAGMENT")
 _KINDS = {torch.float32: "float", torch.float64: "double"}
 
 
@@ -38,6 +39,24 @@ def kernel(name: str, *options: str) -> tuple[Callable, Callable[[str, torch.dty
         return device == "cpu" and dtype in _KINDS and library() is not None
 
     return function, ready
+
+
+def operator(schema: str, run: Callable, empty: Callable, save=None, backward=None) -> None:
+    """Register an operator `torch.ops.torchdlo.NAME` that runs a kernel on the CPU.
+
+    Args:
+        schema: its name, inputs and outputs; tensors come to it contiguous.
+        run: what it does.
+        empty: what makes outputs of the right shapes for the compiler.
+        save: see `setup_context` of `torch.library.register_autograd`.
+        backward: its derivative; None if it has none.
+    """
+    name = schema.partition("(")[0]
+    _operators.define(schema, tags=(torch.Tag.needs_contiguous_strides,))
+    _operators.impl(name, run, "CPU")
+    _operators.impl(name, empty, "Meta")
+    if backward is not None:
+        torch.library.register_autograd(f"torchdlo::{name}", backward, setup_context=save, lib=_operators)
 
 
 @functools.cache

@@ -70,17 +70,6 @@ def _back_meta(bodies: list[Tensor], *others) -> Tensor:
     return bodies[0].new_empty(sum(x.shape[0] for x in bodies), *bodies[0].shape[1:])
 
 
-_library = torch.library.Library("torchdlo", "FRAGMENT")
-for _schema, _make, _fake in (
-    (f"body_pairs({_FIRST}, {_OTHERS}) -> Tensor", _exert, _exert_meta),
-    (f"body_pairs_back({_FIRST}, Tensor by, {_OTHERS}) -> Tensor", _back, _back_meta),
-):
-    _name = _schema.partition("(")[0]
-    _library.define(_schema, tags=(torch.Tag.needs_contiguous_strides,))
-    _library.impl(_name, _make, "CPU")
-    _library.impl(_name, _fake, "Meta")
-
-
 def _save(ctx, inputs, output) -> None:
     ctx.save_for_backward(*inputs[0], *inputs[1:3])
     ctx.static = inputs[3:]
@@ -92,8 +81,8 @@ def _backward(ctx, by: Tensor):
     return list(found.split([x.shape[0] for x in bodies])), None, None, *(None for _ in ctx.static)
 
 
-torch.library.register_autograd("torchdlo::body_pairs", _backward, setup_context=_save, lib=_library)
-torch.library.register_autograd("torchdlo::body_pairs_back", blocks.once, lib=_library)
+blocks.operator(f"body_pairs({_FIRST}, {_OTHERS}) -> Tensor", _exert, _exert_meta, _save, _backward)
+blocks.operator(f"body_pairs_back({_FIRST}, Tensor by, {_OTHERS}) -> Tensor", _back, _back_meta, backward=blocks.once)
 
 
 def _members(motion: BodyMotion) -> list[Tensor]:

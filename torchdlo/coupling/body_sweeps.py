@@ -79,21 +79,6 @@ def _back_meta(edges: list[Tensor], vertices: list[Tensor], bodies: list[Tensor]
     return tuple(x.new_empty(n, *x.shape[1:]) for x, n in wide)
 
 
-_library = torch.library.Library("torchdlo", "FRAGMENT")
-for _schema, _make, _fake in (
-    (f"body_sweeps({_INPUTS}, {_STATIC}) -> (Tensor, Tensor)", _sweep, _sweep_meta),
-    (
-        f"body_sweeps_back({_INPUTS}, Tensor force, Tensor push, {_STATIC}) -> (Tensor, Tensor, Tensor)",
-        _back,
-        _back_meta,
-    ),
-):
-    _name = _schema.partition("(")[0]
-    _library.define(_schema, tags=(torch.Tag.needs_contiguous_strides,))
-    _library.impl(_name, _make, "CPU")
-    _library.impl(_name, _fake, "Meta")
-
-
 def _save(ctx, inputs, output) -> None:
     ctx.save_for_backward(*inputs[0], *inputs[1], *inputs[2], inputs[3])
     ctx.counts = [len(x) for x in inputs[:3]]
@@ -111,8 +96,13 @@ def _backward(ctx, force: Tensor, push: Tensor):
     return *parts, None, *(None for _ in ctx.static)
 
 
-torch.library.register_autograd("torchdlo::body_sweeps", _backward, setup_context=_save, lib=_library)
-torch.library.register_autograd("torchdlo::body_sweeps_back", blocks.once, lib=_library)
+blocks.operator(f"body_sweeps({_INPUTS}, {_STATIC}) -> (Tensor, Tensor)", _sweep, _sweep_meta, _save, _backward)
+blocks.operator(
+    f"body_sweeps_back({_INPUTS}, Tensor force, Tensor push, {_STATIC}) -> (Tensor, Tensor, Tensor)",
+    _back,
+    _back_meta,
+    backward=blocks.once,
+)
 
 
 def _solids(bodies: BodyMotion) -> list[Tensor]:

@@ -69,17 +69,6 @@ def _back_meta(*args) -> list[Tensor]:
     return [torch.empty_like(x) for x in args[:_COUNT]]
 
 
-_library = torch.library.Library("torchdlo", "FRAGMENT")
-for _schema, _make, _fake in (
-    (f"node_sweeps({_INPUTS}, {_STATIC}) -> (Tensor, Tensor)", _sweep, _sweep_meta),
-    (f"node_sweeps_back({_INPUTS}, Tensor by_given, Tensor by_vel, {_STATIC}) -> Tensor[]", _back, _back_meta),
-):
-    _name = _schema.partition("(")[0]
-    _library.define(_schema, tags=(torch.Tag.needs_contiguous_strides,))
-    _library.impl(_name, _make, "CPU")
-    _library.impl(_name, _fake, "Meta")
-
-
 def _save(ctx, inputs, output) -> None:
     ctx.save_for_backward(*inputs[:_COUNT])
     ctx.static = inputs[_COUNT:]
@@ -91,8 +80,13 @@ def _backward(ctx, given: Tensor, vel: Tensor):
     return *(None if k in _FIXED else x for k, x in enumerate(found)), *(None for _ in ctx.static)
 
 
-torch.library.register_autograd("torchdlo::node_sweeps", _backward, setup_context=_save, lib=_library)
-torch.library.register_autograd("torchdlo::node_sweeps_back", blocks.once, lib=_library)
+blocks.operator(f"node_sweeps({_INPUTS}, {_STATIC}) -> (Tensor, Tensor)", _sweep, _sweep_meta, _save, _backward)
+blocks.operator(
+    f"node_sweeps_back({_INPUTS}, Tensor by_given, Tensor by_vel, {_STATIC}) -> Tensor[]",
+    _back,
+    _back_meta,
+    backward=blocks.once,
+)
 
 
 def sweep(

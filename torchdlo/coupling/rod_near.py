@@ -60,16 +60,11 @@ def _outrun_meta(pos: Tensor, origin: Tensor, reach: Tensor) -> Tensor:
     return torch.empty_like(reach)
 
 
-_library = torch.library.Library("torchdlo", "FRAGMENT")
 _STATIC = "int[] counts, int[] closed, int room, int few, float dt, float burst"
-for _schema, _make, _fake in (
-    (f"rod_near(Tensor[] rods, Tensor carried, {_STATIC}) -> (Tensor, Tensor, Tensor, Tensor)", _look, _look_meta),
-    ("rod_outrun(Tensor pos, Tensor origin, Tensor reach) -> Tensor", _outrun, _outrun_meta),
-):
-    _name = _schema.partition("(")[0]
-    _library.define(_schema, tags=(torch.Tag.needs_contiguous_strides,))
-    _library.impl(_name, _make, "CPU")
-    _library.impl(_name, _fake, "Meta")
+blocks.operator(
+    f"rod_near(Tensor[] rods, Tensor carried, {_STATIC}) -> (Tensor, Tensor, Tensor, Tensor)", _look, _look_meta
+)
+blocks.operator("rod_outrun(Tensor pos, Tensor origin, Tensor reach) -> Tensor", _outrun, _outrun_meta)
 
 
 def survey(view: View, carried: Tensor, room: int, burst: float) -> Values:

@@ -61,17 +61,6 @@ def _back_meta(vertices: list[Tensor], laws: Tensor, *others) -> tuple[Tensor, T
     return vertices[0].new_empty(sum(x.shape[0] for x in vertices), *vertices[0].shape[1:]), torch.empty_like(laws)
 
 
-_library = torch.library.Library("torchdlo", "FRAGMENT")
-for _schema, _make, _fake in (
-    (f"rod_pairs({_INPUTS}, {_STATIC}) -> Tensor", _sweep, _sweep_meta),
-    (f"rod_pairs_back({_INPUTS}, Tensor by, {_STATIC}) -> (Tensor, Tensor)", _back, _back_meta),
-):
-    _name = _schema.partition("(")[0]
-    _library.define(_schema, tags=(torch.Tag.needs_contiguous_strides,))
-    _library.impl(_name, _make, "CPU")
-    _library.impl(_name, _fake, "Meta")
-
-
 def _save(ctx, inputs, output) -> None:
     vertices, *others = inputs
     ctx.save_for_backward(*vertices, *others[:3])
@@ -84,8 +73,10 @@ def _backward(ctx, by: Tensor):
     return list(found.split([x.shape[0] for x in vertices])), law, None, None, *(None for _ in ctx.static)
 
 
-torch.library.register_autograd("torchdlo::rod_pairs", _backward, setup_context=_save, lib=_library)
-torch.library.register_autograd("torchdlo::rod_pairs_back", blocks.once, lib=_library)
+blocks.operator(f"rod_pairs({_INPUTS}, {_STATIC}) -> Tensor", _sweep, _sweep_meta, _save, _backward)
+blocks.operator(
+    f"rod_pairs_back({_INPUTS}, Tensor by, {_STATIC}) -> (Tensor, Tensor)", _back, _back_meta, backward=blocks.once
+)
 
 
 def push(

@@ -56,17 +56,6 @@ def _back_meta(vel: Tensor, origin: Tensor, friction: Tensor, *others) -> tuple[
     return torch.empty_like(vel), torch.empty_like(friction)
 
 
-_library = torch.library.Library("torchdlo", "FRAGMENT")
-for _schema, _make, _fake in (
-    (f"walls({_INPUTS}, {_STATIC}) -> Tensor", _act, _act_meta),
-    (f"walls_back({_INPUTS}, Tensor by, {_STATIC}) -> (Tensor, Tensor)", _back, _back_meta),
-):
-    _name = _schema.partition("(")[0]
-    _library.define(_schema, tags=(torch.Tag.needs_contiguous_strides,))
-    _library.impl(_name, _make, "CPU")
-    _library.impl(_name, _fake, "Meta")
-
-
 def _save(ctx, inputs, output) -> None:
     ctx.save_for_backward(*inputs[:3])
     ctx.static = inputs[3:]
@@ -77,8 +66,10 @@ def _backward(ctx, by: Tensor):
     return vel, None, friction, None, None, None
 
 
-torch.library.register_autograd("torchdlo::walls", _backward, setup_context=_save, lib=_library)
-torch.library.register_autograd("torchdlo::walls_back", blocks.once, lib=_library)
+blocks.operator(f"walls({_INPUTS}, {_STATIC}) -> Tensor", _act, _act_meta, _save, _backward)
+blocks.operator(
+    f"walls_back({_INPUTS}, Tensor by, {_STATIC}) -> (Tensor, Tensor)", _back, _back_meta, backward=blocks.once
+)
 
 
 def walls(grid: Grid, origin: Tensor, vel: Tensor, friction: Tensor) -> Tensor:
