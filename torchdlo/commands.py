@@ -295,17 +295,14 @@ def play(
         raise InputError("--idle and --trajectory: expected one of them, or neither for the way by hand.")
     files = _check_files(out or Path("runs") / "play" / task, video=video, picture=picture)
     played = script(task, trajectory, None if rope is None else cable(rope), idle=idle, vary=vary, compiled=compiled)
-    try:
-        with progress() as show, deferred_interrupt(show) as callback:
-            frames, went = film(played.task, played.actions, made=played.episode, arms=arms, callback=callback)
-    except KeyboardInterrupt:
-        typer.echo("interrupted before the episode ended; nothing was written", err=True)
-        raise typer.Exit(_INTERRUPTED) from None
+    with progress() as show, deferred_interrupt(show) as callback:
+        frames, went = film(played.task, played.actions, made=played.episode, arms=arms, callback=callback)
     save_frames(frames, files["frames"])
-    drawn = _draw(frames, files, task, speed)
+    drawn = _draw(frames, files, task, speed) and went is not None
     said = outcome_of(went) | {"files": [str(file) for file in files.values() if file.exists()]}
     how = "failed" if said["failed"] else "success" if said["success"] else "no success"
-    typer.echo(f"{task}: return {said['return']:.4g}, {how}", err=as_json)
+    earned = "interrupted" if went is None else f"return {said['return']:.4g}, {how}"
+    typer.echo(f"{task}: {earned}", err=as_json)
     typer.echo("\n".join(said["files"]), err=as_json)
     if as_json:
         typer.echo(json.dumps(said, indent=1))

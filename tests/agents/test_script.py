@@ -91,16 +91,24 @@ def test_it_says_what_is_wrong(words, sentence, capsys):
     assert not list(Path().rglob("*.npz"))
 
 
-def test_ctrl_c_writes_nothing(monkeypatch, capsys):
+def test_ctrl_c_keeps_the_frames_so_far(monkeypatch, capsys):
     from torchdlo import commands
 
     @contextlib.contextmanager
     def impatient(show):
         def callback(stage, done, total, message=""):
-            raise KeyboardInterrupt
+            if done == 2:
+                raise KeyboardInterrupt
 
         yield callback
 
+    assert play("led") == 0
+    whole = load_frames("runs/play/led")
+    capsys.readouterr()
     monkeypatch.setattr(commands, "deferred_interrupt", impatient)
-    assert play("led") == 130
-    assert "nothing was written" in capsys.readouterr().err and not list(Path().rglob("*.npz"))
+    assert play("led", "--out", "cut", "--json") == 130
+    said = capsys.readouterr()
+    went = json.loads(said.out)
+    assert went["return"] is None and went["interrupted"] and "led: interrupted" in said.err
+    cut = load_frames("cut")
+    assert len(cut.time) == 3 < len(whole.time) and np.array_equal(cut.pos, whole.pos[:3])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable
 from typing import Any
 
@@ -23,6 +24,10 @@ _ASIDE = np.radians(25)
 """By how much it is beside the direction in which arms reach."""
 
 
+class _Stopped(Exception):
+    """The callback ended an episode."""
+
+
 def film(
     task: Task,
     actions: Tensor,
@@ -31,8 +36,10 @@ def film(
     arms: bool = True,
     callback: Callable[[str, int, int, str], None] | None = None,
     **choices: Any,
-) -> tuple[Frames, episode.Outcome]:
+) -> tuple[Frames, episode.Outcome | None]:
     """Play an episode; return a frame of its start and after every action, and what it came to.
+
+    A `KeyboardInterrupt` that `callback` raises ends it; the frames so far are returned, and None for what it came to.
 
     Args:
         task: the task.
@@ -45,12 +52,21 @@ def film(
     made = made or episode.prepare(task, 1, like=actions, **choices)
 
     def told(done: int, total: int) -> None:
-        if callback is not None:
-            callback("play", done, total, task.name)
+        try:
+            if callback is not None:
+                callback("play", done, total, task.name)
+        except KeyboardInterrupt:
+            raise _Stopped from None
 
-    with torch.no_grad():
-        went = episode.play(task, actions[None], episode=made, keep=_seen, callback=told)
-        kept = {name: torch.cat([first[None], went.path[name]])[:, 0] for name, first in _seen(made.start).items()}
+    seen, went = [_seen(made.start)], None
+
+    def keep(world: episode.World) -> dict[str, Tensor]:
+        seen.append(_seen(world))
+        return {}
+
+    with torch.no_grad(), contextlib.suppress(_Stopped):
+        went = episode.play(task, actions[None], episode=made, keep=keep, callback=told)
+    kept = {name: torch.cat([frame[name] for frame in seen]) for name in seen[0]}
     joints = kept.pop("joints")
     looks = appearance(made.scene, made.params, surfaces(made.scene, made.params))
     moving = {name: value.numpy() for name, value in kept.items()}
@@ -59,7 +75,7 @@ def film(
         moving["body_pos"] = np.concatenate([moving["body_pos"], pos], 1)
         moving["body_quat"] = np.concatenate([moving["body_quat"], quat], 1)
         looks = looks | {name: np.concatenate([looks[name], value]) for name, value in shapes.items()}
-    return Frames(**moving, **looks, look=_look(task, made.start)), went
+    return Frames(**moving, **looks, look=_look(task, made.start), interrupted=went is None), went
 
 
 def _look(task: Task, start: episode.World) -> np.ndarray:
@@ -75,8 +91,10 @@ def _look(task: Task, start: episode.World) -> np.ndarray:
     return np.array([cos * x - sin * y, sin * x + cos * y, _STEEP])
 
 
-def outcome_of(went: episode.Outcome) -> dict[str, Any]:
-    """Return what an episode of one scene came to, as plain data."""
+def outcome_of(went: episode.Outcome | None) -> dict[str, Any]:
+    """Return what an episode of one scene came to, as plain data; None stands for one that was interrupted."""
+    if went is None:
+        return {"return": None, "success": False, "failed": False, "rewards": [], "interrupted": True}
     return {
         "return": float(went.returns[0]),
         "success": bool(went.success[0]),
