@@ -9,6 +9,7 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -21,6 +22,7 @@ import cases  # noqa: E402
 import laws  # noqa: E402
 import make  # noqa: E402
 import scenes  # noqa: E402
+import score  # noqa: E402
 import table  # noqa: E402
 from laws import GRAVITY, Laws  # noqa: E402
 from simulate import Mesh, Rope, Simulator, at_rest, settle  # noqa: E402
@@ -251,7 +253,8 @@ def test_doses_are_found_between_those_that_were_tried() -> None:
 
 
 def test_every_effect_has_a_dose_and_every_case_a_recording_of_its_own() -> None:
-    every = cases.all_cases()
+    every = [*cases.all_cases(), *cases.subset("fresh")]
+    assert len({c.seed for c in cases.subset("fresh")} - {c.seed for c in cases.all_cases()}) == 27
     assert len({make.identity(c, "s") for c in every}) == len(every)
     for case in every:
         x = np.zeros((2, 3, 2, 5))
@@ -320,6 +323,42 @@ def test_the_scorer_tells_right_from_wrong() -> None:
     assert rates["failed"] == {"yes": 1, "of": 12}
     page = table.markdown(rows, "Test")
     assert "| air_drag | 1 |" in page and "| (wall) |" in page and "| wrong |" in page
+
+
+def test_without_the_right_effect_a_diagnosis_should_not_claim_to_explain_everything() -> None:
+    drag = truth("single", {"air_drag": {"c_d": 2.0}})
+    verdicts = ("unknown", "partial", "none", "effects")
+    named = [("wind", {"c_d": 1.0, "velocity.0": 0.0}, [])]
+    given = [found(v, *(named if v in ("partial", "effects") else [])) for v in verdicts]
+    rows = [table.judge(v, table.without_it(drag), f) for v, f in zip(verdicts, given, strict=True)]
+    assert [r["right"] for r in rows] == [True, True, False, False] and rows[0]["truth"] == ["air_drag"]
+    rates = table.summary(rows)["rates"]
+    assert rates["taken out of the library, abstained"] == {"yes": 2, "of": 4}
+    assert rates["taken out of the library, called explained"] == {"yes": 1, "of": 4}
+    assert "single, named first" not in rates and "| (air_drag) |" in table.markdown(rows, "Test")
+
+
+def test_what_is_hidden_is_left_out_of_the_library(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, kind in (("ra", "single"), ("rb", "null")):
+        (tmp_path / "recordings" / name).mkdir(parents=True)
+        (tmp_path / "recordings" / name / "rope.json").write_text("{}")
+        answer = truth(kind, {"air_drag": {"c_d": 2.0}} if kind == "single" else {})
+        (tmp_path / f"{name}.json").write_text(json.dumps(answer))
+    ran = []
+
+    def fake(command: list[str], **_: object) -> object:
+        ran.append(command)
+        Path(command[command.index("-o") + 1]).mkdir(parents=True)
+        (Path(command[command.index("-o") + 1]) / "findings.json").write_text(json.dumps(found("unknown")))
+        return SimpleNamespace(returncode=0)
+
+    monkeypatch.setattr(score.subprocess, "run", fake)
+    words = ["--recordings", str(tmp_path / "recordings"), "--answers", str(tmp_path), "--out", str(tmp_path / "out")]
+    monkeypatch.setattr(sys, "argv", ["score.py", *words, "--subset", "there", "--removed"])
+    score.main()
+    assert len(ran) == 1 and ran[0][-2:] == ["--without", "air_drag"]
+    rates = json.loads((tmp_path / "out" / "removed" / "score.json").read_text())["rates"]
+    assert rates["taken out of the library, abstained"] == {"yes": 1, "of": 1}
 
 
 def test_numbers_with_directions_are_compared_as_vectors() -> None:

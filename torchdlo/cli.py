@@ -235,6 +235,7 @@ def diagnose(
     ] = None,
     workers: Annotated[int | None, typer.Option(min=1, help="Processes; one per core if not given.")] = None,
     model: ModelOption = None,
+    without: Annotated[list[str] | None, typer.Option(help="An effect not to look for.", metavar="EFFECT")] = None,
     resume: Annotated[
         bool, typer.Option("--resume", help="Go on from the journal of a search that was stopped.")
     ] = False,
@@ -263,7 +264,7 @@ def diagnose(
     for name in names:
         check_writable(out / name)
     options = {"budget": budget, "seed": seed, "vertices": vertices, "trials": trials, "workers": workers}
-    options |= _given(model)
+    options |= _given(model) | {"without": without or ()}
     journal = out / "journal"
     try:
         with progress() as show, deferred_interrupt(show) as callback:

@@ -1,7 +1,7 @@
 """Run `torchdlo diagnose` on recordings that hide an effect, and hold its findings against the answers.
 
 Findings that are there already are kept, and a diagnosis that was stopped goes on, so that a run may be stopped at any
-time. The answers are read only after all diagnoses.
+time. The answers are read only after all diagnoses, but for the names of what `--removed` leaves out.
 """
 
 from __future__ import annotations
@@ -12,8 +12,9 @@ import platform
 import subprocess
 import sys
 import time
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 sys.path.append(str(Path(__file__).resolve().parents[1]))
@@ -22,7 +23,7 @@ from cases import PARTS, subset
 from make import Config as Made
 from make import identity
 from options import Parser, count, save
-from table import judge, markdown, summary
+from table import judge, markdown, summary, without_it
 
 COMMAND = "from torchdlo.cli import main; main()"
 
@@ -49,16 +50,19 @@ class Config:
     """Diagnoses at the same time."""
     timeout: float = 3600.0
     """Longest time for one diagnosis [s]."""
+    removed: bool = False
+    """Look for what single recordings hide in a library without it; findings go to a folder of their own."""
     ready: bool = False
     """Score only what is diagnosed already."""
     smoke: bool = False
     """Only the first recording."""
 
 
-def diagnose(recording: Path, out: Path, config: Config) -> str:
-    """Diagnose one recording; return why that failed, or nothing."""
+def diagnose(recording: Path, out: Path, config: Config, without: Sequence[str] = ()) -> str:
+    """Diagnose one recording with a library without some effects; return why that failed, or nothing."""
     command = [sys.executable, "-c", COMMAND, "diagnose", str(recording), "--json", "-o", str(out)]
     command += ["--budget", config.budget, "--workers", str(config.workers)]
+    command += [word for effect in without for word in ("--without", effect)]
     if (out / "journal").exists():
         command.append("--resume")
     try:
@@ -103,12 +107,21 @@ def chosen(config: Config) -> list[str]:
     return there[: 1 if config.smoke else None]
 
 
+def answer_of(config: Config, name: str) -> dict:
+    """Return what a recording hides."""
+    return json.loads((Path(config.answers) / f"{name}.json").read_text())
+
+
 def run(config: Config, names: list[str]) -> dict[str, str]:
     """Diagnose what is not diagnosed yet; return failures by name."""
     todo = [] if config.ready else [n for n in names if findings(Path(config.out) / n) is None]
     failed, begun = {}, time.perf_counter()
     with ThreadPoolExecutor(config.jobs) as pool:
-        jobs = {pool.submit(diagnose, Path(config.recordings) / n, Path(config.out) / n, config): n for n in todo}
+        jobs = {}
+        for name in todo:
+            without = answer_of(config, name)["answer"] if config.removed else ()
+            folders = Path(config.recordings) / name, Path(config.out) / name
+            jobs[pool.submit(diagnose, *folders, config, without)] = name
         try:
             for k, job in enumerate(as_completed(jobs), 1):
                 name = jobs[job]
@@ -128,8 +141,8 @@ def score(config: Config, names: list[str], failed: dict[str, str]) -> list[dict
         found = findings(Path(config.out) / name)
         if found is None and name not in failed:
             continue
-        answer = json.loads((Path(config.answers) / f"{name}.json").read_text())
-        rows.append(judge(name, answer, found))
+        answer = answer_of(config, name)
+        rows.append(judge(name, without_it(answer) if config.removed else answer, found))
         if found is None:
             rows[-1]["why"] = failed[name]
     return sorted(rows, key=lambda row: row["case"])
@@ -145,10 +158,14 @@ def main() -> None:
     parser.add_argument("--workers", type=count, default=Config.workers)
     parser.add_argument("--jobs", type=count, default=Config.jobs, help="diagnoses at the same time (%(default)s)")
     parser.add_argument("--timeout", type=float, default=Config.timeout)
+    parser.flag("removed", "single effects only, in a library without the one that is hidden")
     parser.flag("ready", "score only what is diagnosed already")
     parser.flag("smoke", "only the first recording")
     config = Config(**vars(parser.parse_args()))
     names = chosen(config)
+    if config.removed:
+        config = replace(config, out=str(Path(config.out) / "removed"))
+        names = [name for name in names if answer_of(config, name)["kind"] == "single"]
     rows = score(config, names, run(config, names))
     page = markdown(rows, f"Hidden effects: {len(rows)} of {len(names)} recordings")
     machine = {"cores": os.cpu_count(), "python": platform.python_version()}

@@ -66,6 +66,13 @@ COVERED = {
     "marker_offset": ("offset.0", "offset.1"),
 }
 """Numbers whose ranges are held against the truth."""
+ABSENT = ("outside", "removed")
+"""Kinds of recordings that hide what is not in the library."""
+
+
+def without_it(answer: dict[str, Any]) -> dict[str, Any]:
+    """Return the answer for a library without what is hidden."""
+    return answer | {"kind": "removed", "answer": [], "effects": {}, "measurement": []}
 
 
 def judge(name: str, answer: dict[str, Any], found: dict[str, Any] | None) -> dict[str, Any]:
@@ -74,7 +81,7 @@ def judge(name: str, answer: dict[str, Any], found: dict[str, Any] | None) -> di
         "recording": name,
         "case": answer["case"],
         "kind": answer["kind"],
-        "truth": answer["answer"] or ([answer["case"].split("-")[1]] if answer["kind"] == "outside" else []),
+        "truth": answer["answer"] or ([answer["case"].split("-")[1]] if answer["kind"] in ABSENT else []),
         "ratio": answer["ratio"],
         "measurement": bool(answer["measurement"]),
     }
@@ -97,7 +104,7 @@ def _right(row: dict[str, Any], answer: dict[str, Any]) -> tuple[bool, str]:
     said = f"said {verdict}" + (f": {', '.join(named)}" if named else "")
     if answer["kind"] == "null":
         return verdict == "none" and not named, said
-    if answer["kind"] == "outside":
+    if answer["kind"] in ABSENT:
         return verdict in ("unknown", "partial"), said
     if answer["kind"] == "compound":
         return set(truth) <= set(named), said
@@ -156,6 +163,8 @@ def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
         "nothing missing, an effect named": _rate(kind("null"), lambda r: r["named"]),
         "outside the library, abstained": _rate(kind("outside"), lambda r: r["right"]),
         "outside the library, called explained": _rate(kind("outside"), lambda r: r["verdict"] == "effects"),
+        "taken out of the library, abstained": _rate(kind("removed"), lambda r: r["right"]),
+        "taken out of the library, called explained": _rate(kind("removed"), lambda r: r["verdict"] == "effects"),
         "two at once, both named": _rate(kind("compound"), lambda r: r["right"]),
         "two at once, something false named": _rate(kind("compound"), lambda r: r.get("false")),
         "hard to tell apart, set or name right": _rate(kind("tie"), lambda r: r["right"]),
@@ -187,7 +196,7 @@ def confusion(rows: list[dict[str, Any]]) -> list[list[str]]:
 
 def _label(row: dict[str, Any]) -> str:
     name = " + ".join(row["truth"]) or "nothing"
-    return f"({name})" if row["kind"] == "outside" else name
+    return f"({name})" if row["kind"] in ABSENT else name
 
 
 def grid(lines: list[list[str]]) -> str:

@@ -189,13 +189,20 @@ def test_a_clamp_that_turns_is_told_from_one_in_which_the_rope_bends(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # As soft as 5 mm of rope: half way between a clamp that is stiff up to its last marker and one that is not.
-    monkeypatch.setattr(library, "LIBRARY", ("gripper_compliance", "nonuniform_stiffness"))
     monkeypatch.setattr(search, "BUDGETS", {"fast": search.Budget(3, 1, 3, 3, 1)})
     recording = make_recording(tmp_path, {"gripper_compliance.stiffness": 0.4}, grip=1.0)
-    result = search.diagnose(recording, vertices=31, workers=1)
+    looked = {"gripper_compliance", "nonuniform_stiffness"}
+    without = [name for name in library.LIBRARY if name not in looked]
+    result = search.diagnose(recording, vertices=31, workers=1, without=without)
     assert result.effects == ["gripper_compliance"]
-    found = findings(result, recording)["effects"][0]["parameters"]["stiffness"]["value"]
-    assert found == pytest.approx(0.4, rel=0.2)
+    said = findings(result, recording)
+    assert said["effects"][0]["parameters"]["stiffness"]["value"] == pytest.approx(0.4, rel=0.2)
+    assert {c["name"] for c in said["candidates"]} == looked and "air_drag" in said["options"]["without"]
+
+
+def test_an_effect_that_is_not_there_cannot_be_left_out(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="without: windy is no effect that can be looked for; did you mean wind"):
+        search.diagnose(make_empty(tmp_path), without=["windy"])
 
 
 def test_what_a_clamp_may_be_in_which_the_rope_bends_moves_alike(tmp_path: Path) -> None:

@@ -55,6 +55,7 @@ def diagnose(
     journal: Path | None = None,
     resume: bool = False,
     given: Saved | None = None,
+    without: Sequence[str] = (),
 ) -> Diagnosis:
     """Name what a recording shows that the baseline model lacks.
 
@@ -69,9 +70,12 @@ def diagnose(
         journal: folder that keeps what is done, so that a search which was stopped can go on.
         resume: go on from it.
         given: model to take as the baseline, with its effects, in place of many starts.
+        without: effects of the library that are not looked for.
     """
     if budget not in BUDGETS:
         raise InputError(f"budget is {budget!r}; expected one of {', '.join(BUDGETS)}.")
+    for name in without:
+        library.check_known("without", name)
     begun, report = time.perf_counter(), callback or (lambda *_: None)
     recording, faults = health.check(recording)
     whole = len(recording.train)
@@ -80,11 +84,13 @@ def diagnose(
     if given is not None:
         options |= given.options if vertices is None else given.options | {"vertices": vertices}
     asked = {"budget": BUDGETS[budget], "seed": seed, "options": options, "first": given and given.values}
+    asked |= {"without": sorted(set(without))} if without else {}
     kept = None if journal is None else Journal(journal, recording, asked, resume=resume)
     with Pool(recording, options, workers, kept) as pool:
-        search = _Search(pool, BUDGETS[budget], np.random.default_rng(seed), report)
+        search = _Search(pool, BUDGETS[budget], np.random.default_rng(seed), report, without)
         found = search.run(given)
     found.health, found.options = faults, {"budget": budget, "seed": seed, "vertices": options["vertices"]}
+    found.options |= {"without": ", ".join(sorted(set(without)))} if without else {}
     if len(recording.train) < whole:
         found.notes.append(f"{len(recording.train)} of the {whole} train trials were used, evenly picked.")
     found.seconds = time.perf_counter() - begun
@@ -94,9 +100,11 @@ def diagnose(
 class _Search:
     """One diagnosis."""
 
-    def __init__(self, pool: Pool, budget: Budget, rng: np.random.Generator, report: Callback) -> None:
+    def __init__(
+        self, pool: Pool, budget: Budget, rng: np.random.Generator, report: Callback, without: Sequence[str] = ()
+    ) -> None:
         self.pool, self.budget, self.rng, self.report = pool, budget, rng, report
-        self.bench, self.recording = Bench(pool), pool.recording
+        self.bench, self.recording, self.excluded = Bench(pool), pool.recording, without
         self.baseline: Fitted | None = None
         self.plain: list[Fitted] = []
         """The baseline, and what it became when it was fitted for as long as the first candidates were."""
@@ -161,7 +169,8 @@ class _Search:
         return float(rms(gap(self.bench.prediction(fitted, "test"), self.bench.trials["test"])) ** 2)
 
     def _possible(self) -> list[str]:
-        return [n for n in library.LIBRARY if library.applicable(n, self.recording, self.pool.local.model(()).mesh)]
+        mesh, names = self.pool.local.model(()).mesh, [n for n in library.LIBRARY if n not in self.excluded]
+        return [n for n in names if library.applicable(n, self.recording, mesh)]
 
     def _say_floor(self) -> None:
         self.report("measuring the floor", 1, 1, f"{1e3 * self.bench.floor.total:.2f} mm")

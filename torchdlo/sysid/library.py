@@ -6,10 +6,12 @@ effect can show in it at all, numbers that are known, and where a search for the
 
 from __future__ import annotations
 
+import difflib
 from dataclasses import dataclass, replace
 
 import numpy as np
 
+from torchdlo.errors import InputError
 from torchdlo.physics.effect import Effect, Param
 from torchdlo.physics.effects import EFFECTS
 from torchdlo.sysid.mesh import Mesh
@@ -83,6 +85,14 @@ class Number:
     """Its declaration, for a component by itself."""
     off: float
     """Value at which its effect does nothing, or at which it is while the effect is off."""
+
+
+def check_known(what: str, name: str) -> None:
+    """Raise an `InputError` that begins with `what` if there is no such effect in the library."""
+    if name not in LIBRARY:
+        close = difflib.get_close_matches(name, LIBRARY, n=1)
+        hint = f"did you mean {close[0]}?" if close else f"known are {', '.join(LIBRARY)}."
+        raise InputError(f"{what}: {name} is no effect that can be looked for; {hint}")
 
 
 def applicable(name: str, recording: Recording, mesh: Mesh) -> bool:

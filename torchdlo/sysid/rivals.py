@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import json
 from collections.abc import Sequence
 from dataclasses import replace
@@ -68,10 +67,7 @@ def check_names(names: Sequence[str], ties: list[list[str]] | None, bench: Bench
     """
     recording, mesh = bench.recording, bench.pool.local.model(()).mesh
     for name in names:
-        if name not in library.LIBRARY:
-            close = difflib.get_close_matches(name, library.LIBRARY, n=1)
-            hint = f"did you mean {close[0]}?" if close else f"known are {', '.join(library.LIBRARY)}."
-            raise InputError(f"names: {name} is no effect that can be looked for; {hint}")
+        library.check_known("names", name)
         if not library.applicable(name, recording, mesh):
             raise InputError(
                 f"names: {name} cannot act in {recording.path} (no table, or no clamp of two markers); leave it out."
