@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from torchdlo.sysid import clamps
 from torchdlo.sysid.bench import CHAIN, SILENT, Bench, Callback
 from torchdlo.sysid.floor import Refinement, gap, rms
 from torchdlo.sysid.jobs import Fit, Fitted
@@ -31,9 +32,6 @@ _LINKED = 1.3
 
 _LOOK = 2
 """Iterations after which a chain has to fit better than a rope, if it is to be fitted further."""
-
-_UNDECIDED = 1.5
-"""Share of the cost up to which clamps may hold the rope to their ends, although others fit better."""
 
 _FIRMER = 0.95
 """Share of the cost that is left where clamps are found to do so once an effect is known."""
@@ -100,7 +98,6 @@ def calibrate(bench: Bench, count: int, iterations: int, rng: np.random.Generato
 def _held(bench: Bench, firm: Fitted, smooth: Fitted, side: Fitted) -> tuple[Fitted, Fitted]:
     """Return a smooth rope and a chain in the clamps that fit better: those that hold it to their ends, or others."""
     least = min(smooth.point.cost, side.point.cost)
-    bench.undecided = _BETTER * least <= firm.point.cost < _UNDECIDED * least
     if firm.point.cost >= _BETTER * least:
         return smooth, side
     bench.pool.choose(grip=1.0)
@@ -143,7 +140,7 @@ def go_further(bench: Bench, base: Fitted, iterations: int, report: Callback) ->
     stage, effects, free = "fitting all numbers again", (*base.effects, CHAIN), (*names, f"{CHAIN}.length")
     report(stage, 0, 3, "")
     jobs = [Fit(base.effects, values, names, sizes, iterations, bench.starts["train"])]
-    if bench.undecided and not bench.pool.local.options["grip"]:
+    if clamps.loose(bench):
         jobs.append(replace(jobs[0], options=(("grip", 1.0),)))
     base, *firm = bench.fit(jobs)
     if firm and firm[0].point.cost < _FIRMER * base.point.cost:

@@ -48,8 +48,6 @@ class Bench:
         self.starts: dict[str, Start] = {}
         self.early = np.empty(0)
         """The baseline's numbers that fit the beginning of the trials, as far as they are known."""
-        self.undecided = False
-        """Whether clamps may be stiff up to their last marker, although the baseline lets the rope bend in them."""
         self.linked = True
         """Whether the rope may move like a chain of links, as far as the baseline tells."""
         self.floor = floors.Floor(floors.noise(self.recording), float("inf"), float("inf"))

@@ -1,12 +1,15 @@
 """Clamps that turn elastically, told from those in which the rope bends.
 
-Where the data does not say that clamps hold the rope stiffly up to their last marker, the baseline lets it bend between
-the markers of a clamp. That takes up a part of what an elastic clamp does, so its law is tried with stiff ones.
+Where clamps do not seem to hold the rope stiffly up to their last marker, the baseline lets it bend between the markers
+of a clamp. That takes up a part of what an elastic clamp does, so its law is tried with stiff ones; and what is missing
+may have made clamps seem soft.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -22,10 +25,16 @@ _SHARES = (0.2, 0.5, 1.5)
 """Lengths of rope that are as soft as a clamp where fits start, over the distance of its markers."""
 
 
+def loose(bench: Bench, options: Iterable[tuple[str, Any]] = ()) -> bool:
+    """Return whether a model with these options lets the rope bend between the markers of a clamp."""
+    model = bench.pool.local.model((), tuple(options))
+    return bool(model.mesh.clamps) and model.grip < 1
+
+
 def soft(bench: Bench, base: Fitted) -> bool:
     """Return whether clamps may be stiff that are not in a model which leaves something to be explained."""
-    bends = bench.undecided and not dict(base.options).get("grip", 1.0)
-    return bends and NAME not in base.effects and rms(bench.gaps(base, "all")) > SILENT * bench.level
+    bends = NAME not in base.effects and loose(bench, base.options)
+    return bends and rms(bench.gaps(base, "all")) > SILENT * bench.level
 
 
 def firm(base: Fitted, job: Fit) -> Fit:
