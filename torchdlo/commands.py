@@ -275,7 +275,7 @@ def play(
     ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print how it went as JSON.")] = False,
 ) -> None:
-    """Play an episode of a task, say what it earns, and keep frames to look at.
+    """Play an episode of a task, say what it earns, and keep frames to look at. Ctrl-C stops and keeps those so far.
 
     [bold]Examples:[/bold]
 

@@ -104,6 +104,8 @@ def chosen(config: Config) -> list[str]:
         there = sorted(wanted)
     if not there:
         raise SystemExit(f"{config.recordings}: no recordings found; make some with make.py")
+    if config.removed:
+        there = [name for name in there if answer_of(config, name)["kind"] == "single"]
     return there[: 1 if config.smoke else None]
 
 
@@ -165,7 +167,6 @@ def main() -> None:
     names = chosen(config)
     if config.removed:
         config = replace(config, out=str(Path(config.out) / "removed"))
-        names = [name for name in names if answer_of(config, name)["kind"] == "single"]
     rows = score(config, names, run(config, names))
     page = markdown(rows, f"Hidden effects: {len(rows)} of {len(names)} recordings")
     machine = {"cores": os.cpu_count(), "python": platform.python_version()}

@@ -94,12 +94,13 @@ def _look(task: Task, start: episode.World) -> np.ndarray:
 def outcome_of(went: episode.Outcome | None) -> dict[str, Any]:
     """Return what an episode of one scene came to, as plain data; None stands for one that was interrupted."""
     if went is None:
-        return {"return": None, "success": False, "failed": False, "rewards": [], "interrupted": True}
+        return dict.fromkeys(("return", "success", "failed", "rewards")) | {"interrupted": True}
     return {
         "return": float(went.returns[0]),
         "success": bool(went.success[0]),
         "failed": bool(went.failed[0]),
         "rewards": went.rewards[:, 0].tolist(),
+        "interrupted": False,
     }
 
 

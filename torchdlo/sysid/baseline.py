@@ -140,8 +140,8 @@ def go_further(bench: Bench, base: Fitted, iterations: int, report: Callback) ->
     stage, effects, free = "fitting all numbers again", (*base.effects, CHAIN), (*names, f"{CHAIN}.length")
     report(stage, 0, 3, "")
     jobs = [Fit(base.effects, values, names, sizes, iterations, bench.starts["train"])]
-    if clamps.loose(bench):
-        jobs.append(replace(jobs[0], options=(("grip", 1.0),)))
+    if clamps.loose(model):
+        jobs.append(clamps.firm(base, jobs[0]))
     base, *firm = bench.fit(jobs)
     if firm and firm[0].point.cost < _FIRMER * base.point.cost:
         base = firm[0]

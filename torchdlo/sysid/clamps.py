@@ -7,9 +7,7 @@ may have made clamps seem soft.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
@@ -25,16 +23,15 @@ _SHARES = (0.2, 0.5, 1.5)
 """Lengths of rope that are as soft as a clamp where fits start, over the distance of its markers."""
 
 
-def loose(bench: Bench, options: Iterable[tuple[str, Any]] = ()) -> bool:
-    """Return whether a model with these options lets the rope bend between the markers of a clamp."""
-    model = bench.pool.local.model((), tuple(options))
+def loose(model: RopeModel) -> bool:
+    """Return whether a model lets the rope bend between the markers of a clamp."""
     return bool(model.mesh.clamps) and model.grip < 1
 
 
 def soft(bench: Bench, base: Fitted) -> bool:
     """Return whether clamps may be stiff that are not in a model which leaves something to be explained."""
-    bends = NAME not in base.effects and loose(bench, base.options)
-    return bends and rms(bench.gaps(base, "all")) > SILENT * bench.level
+    bends = loose(bench.pool.local.model(base.effects, base.options))
+    return bends and NAME not in base.effects and rms(bench.gaps(base, "all")) > SILENT * bench.level
 
 
 def firm(base: Fitted, job: Fit) -> Fit:
@@ -44,7 +41,7 @@ def firm(base: Fitted, job: Fit) -> Fit:
 
 def notes(model: RopeModel, final: Fitted) -> list[str]:
     """Return a sentence on what a clamp may be in which the rope bends, for a reader of a model."""
-    if model.grip >= 1 or not model.mesh.clamps or NAME in final.effects:
+    if not loose(model) or NAME in final.effects:
         return []
     bend = final.values[model.parameters.index("bending_stiffness")]
     spring = bend / (0.5 * (1 - model.grip) * _apart(model))

@@ -84,13 +84,12 @@ def diagnose(
     if given is not None:
         options |= given.options if vertices is None else given.options | {"vertices": vertices}
     asked = {"budget": BUDGETS[budget], "seed": seed, "options": options, "first": given and given.values}
-    asked |= {"without": sorted(set(without))} if without else {}
-    kept = None if journal is None else Journal(journal, recording, asked, resume=resume)
+    less = {"without": ", ".join(sorted(set(without)))} if without else {}
+    kept = None if journal is None else Journal(journal, recording, asked | less, resume=resume)
     with Pool(recording, options, workers, kept) as pool:
         search = _Search(pool, BUDGETS[budget], np.random.default_rng(seed), report, without)
         found = search.run(given)
-    found.health, found.options = faults, {"budget": budget, "seed": seed, "vertices": options["vertices"]}
-    found.options |= {"without": ", ".join(sorted(set(without)))} if without else {}
+    found.health, found.options = faults, {"budget": budget, "seed": seed, "vertices": options["vertices"]} | less
     if len(recording.train) < whole:
         found.notes.append(f"{len(recording.train)} of the {whole} train trials were used, evenly picked.")
     found.seconds = time.perf_counter() - begun

@@ -24,7 +24,7 @@ def extend(bench: Bench, base: Fitted, score: Score, iterations: int, frames: in
         iterations: most iterations.
         frames: how many frames to fit; all if None.
     """
-    if score.name == clamps.NAME and clamps.loose(bench, base.options):
+    if score.name == clamps.NAME and clamps.loose(bench.pool.local.model(base.effects, base.options)):
         return [clamps.stiff(bench, base, score, iterations, frames)]
     # Numbers that no dose uses stay off, a slope where a spot fits better; but vectors are fitted whole.
     kinds: dict[frozenset[str], list] = {}
