@@ -168,10 +168,11 @@ def main() -> None:
     parser.add_argument("--trials", type=count, default=None, help="most train trials to use")
     parser.add_argument("--vertices", type=count, default=None, help="vertices of the rope")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--workers", type=count, default=None, help="processes; one per core if not given")
     parser.add_argument("--out", default="runs/cables", help="folder of the results; what is in it is not done again")
     parser.flag("blocks", "test on the last fifth of the trials")
     args = parser.parse_args()
-    rows, choices = [], {"budget": args.budget, "seed": args.seed, "trials": args.trials, "vertices": args.vertices}
+    rows, choices = [], {k: getattr(args, k) for k in ("budget", "seed", "trials", "vertices", "workers")}
     for path in args.recordings:
         recording = load_recording(path)
         recording = blocks(recording) if args.blocks else recording
