@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import laws
 import numpy as np
@@ -21,8 +21,8 @@ ABSORBED = {"baseline.bending": 1.05, "baseline.twisting": 1.3, "baseline.dampin
 
 MEASUREMENT = ("time_delay", "marker_offset")
 """Effects of the measurement, not of the rope."""
-PARTS = ("first", "ci", "singles", "nulls", "compounds", "outside", "ties", "all", "fresh")
-"""Parts of the benchmark; what is fresh is not in all."""
+PARTS = ("first", "ci", "singles", "nulls", "compounds", "outside", "ties", "all", "fresh", "links")
+"""Parts of the benchmark; what is fresh, and what is made of links, is not in all."""
 TIES = {"wind": ["tilted_gravity"], "tilted_gravity": ["wind"]}
 """Effects that the motions here hardly tell apart."""
 PAIRS = (
@@ -58,11 +58,14 @@ class Case:
     """Seed of rope and motions."""
     variant: str = ""
     """How a null differs from a plain one: grid, coloured; how a tie does: slow."""
+    simulator: str = ""
+    """What the recording is made with if not with exact rods: links."""
 
     @property
     def name(self) -> str:
         """Name that tells what it is; not the recording's."""
-        parts = [self.kind, *self.effects, self.variant, f"{self.ratio:g}" if self.ratio else "", str(self.seed)]
+        ratio = f"{self.ratio:g}" if self.ratio else ""
+        parts = [self.kind, *self.effects, self.variant, ratio, str(self.seed), self.simulator]
         return "-".join(p for p in parts if p)
 
     @property
@@ -222,20 +225,23 @@ def all_cases() -> list[Case]:
     return cases
 
 
-def fresh_cases() -> list[Case]:
+def other_cases(seed: int, nulls: tuple[str, ...], pairs: tuple[tuple[str, str], ...], simulator: str) -> list[Case]:
     """Return other ropes and motions, in case that the program was fitted to those of the whole benchmark."""
     singles = [c for c in all_cases() if c.kind == "single" and c.ratio == 10]
     sizes = (10.0, 3.0, 30.0)
-    cases = [Case("single", c.effects, sizes[k % 3], 600 + k) for k, c in enumerate(singles)]
-    cases += [Case("null", (), 0.0, 700 + k, v) for k, v in enumerate(("", "grid", "coloured", "table"))]
-    cases += [Case("compound", p, 10.0, 800 + k) for k, p in enumerate(PAIRS[::3])]
-    return cases + [Case("outside", (e,), 10.0, 900 + k) for k, e in enumerate(OUTSIDE[::2])]
+    cases = [Case("single", c.effects, sizes[k % 3], seed + k) for k, c in enumerate(singles)]
+    cases += [Case("null", (), 0.0, seed + 100 + k, v) for k, v in enumerate(nulls)]
+    cases += [Case("compound", p, 10.0, seed + 200 + k) for k, p in enumerate(pairs)]
+    cases += [Case("outside", (e,), 10.0, seed + 300 + k) for k, e in enumerate(OUTSIDE[::2])]
+    return [replace(c, simulator=simulator) for c in cases]
 
 
 def subset(name: str) -> list[Case]:
     """Return a part of the benchmark, one of `PARTS`."""
     if name == "fresh":
-        return fresh_cases()
+        return other_cases(600, ("", "grid", "coloured", "table"), PAIRS[::3], "")
+    if name == "links":
+        return other_cases(1100, ("", "", "coloured", "table"), PAIRS[1::3], "links")
     cases = all_cases()
     if name == "all":
         return cases

@@ -13,6 +13,7 @@ import sys
 import time
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -21,7 +22,11 @@ sys.path.append(str(Path(__file__).resolve().parents[1]))
 from cases import COARSE, FINE, MEASUREMENT, PARTS, TIES, TRIALS, Case, look, plain, size, subset
 from options import Parser, save
 from scenes import Scene, run, seen
+from simulate import Mesh, Track
 from vectors import Array, exponential, multiply
+
+if TYPE_CHECKING:
+    from links import Chain
 
 HELD = 0.1
 """Noise of gripped markers, relative to that of free ones."""
@@ -71,12 +76,24 @@ def coloured(rng: np.random.Generator, shape: tuple[int, ...], memory: float) ->
     return white
 
 
+def simulate(case: Case, scene: Scene, rows: list[dict], fine: tuple[int, float]) -> tuple[Track, Mesh | Chain]:
+    """Return the rope's motion in all trials, by the case's simulator."""
+    if case.simulator != "links":
+        return run(scene, TRIALS, rows, *fine)
+    try:
+        import links
+    except ImportError as e:
+        raise SystemExit(
+            f"{e.name} is not installed; chains of links need MuJoCo: pip install 'torchdlo[peers]'"
+        ) from e
+    return links.run(scene, TRIALS, rows, links.count(scene.seed), links.STEP)
+
+
 def record(case: Case, scene: Scene, numbers: dict[str, float], fine: tuple[int, float], salt: str) -> list[dict]:
     """Return the arrays of all trials."""
     seed = int(hashlib.sha256(f"{salt} {case.name} noise".encode()).hexdigest()[:8], 16)
     rows = [numbers] * len(TRIALS)
-    track, mesh = run(scene, TRIALS, rows, *fine)
-    markers, turns = seen(scene, TRIALS, rows, track, mesh)
+    markers, turns = seen(scene, TRIALS, rows, *simulate(case, scene, rows, fine))
     out = []
     for b, clean in enumerate(markers):
         rng = np.random.default_rng([seed, b])

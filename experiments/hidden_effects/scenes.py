@@ -152,8 +152,8 @@ def seen(scene: Scene, trials: list[str], numbers: list[dict], track: Track, mes
     for b, row in enumerate(numbers):
         delay = row.get("time_delay.delay", 0.0)
         offset = np.array([0.0, *(row.get(f"marker_offset.offset.{k}", 0.0) for k in range(2))])
-        free = _points(*_at(track, b, times - delay), mesh, scene.arclength, offset)
-        held = _points(*_at(track, b, times), mesh, scene.arclength, np.zeros(3))
+        free = mesh.points(*_at(track, b, times - delay), scene.arclength, offset)
+        held = mesh.points(*_at(track, b, times), scene.arclength, np.zeros(3))
         x, q = poses[0][:, b].transpose(0, 2, 1), poses[1][:, b].transpose(0, 2, 1)
         ahead = np.array([scene.grip, -scene.grip])[: scene.grippers]
         axis = rotate(q, np.eye(3)[:, :1, None])
@@ -174,21 +174,3 @@ def _at(track: Track, b: int, times: Array) -> tuple[Array, Array]:
     q = track.q[low, :, b] * (1 - share) + track.q[low + 1, :, b] * share
     q = q / np.sqrt((q * q).sum(1, keepdims=True))
     return x.transpose(1, 0, 2), q.transpose(1, 0, 2)
-
-
-def _points(x: Array, q: Array, mesh: Mesh, arclength: Array, offset: Array) -> Array:
-    """Return markers (3, F, M) between nodes, by cubics with the nodes' tangents, and beside the axis."""
-    low = np.clip(np.searchsorted(mesh.arclength, arclength, side="right") - 1, 0, mesh.elements - 1)
-    step = mesh.step[low]
-    u = np.clip((arclength - mesh.arclength[low]) / step, 0.0, 1.0)
-    tangent = rotate(q, np.eye(3)[:, :1, None])
-    axis = (
-        (1 + 2 * u) * (1 - u) ** 2 * x[..., low]
-        + u * (1 - u) ** 2 * step * tangent[..., low]
-        + u * u * (3 - 2 * u) * x[..., low + 1]
-        - u * u * (1 - u) * step * tangent[..., low + 1]
-    )
-    if not offset.any():
-        return axis
-    turn = q[..., low] * (1 - u) + q[..., low + 1] * u
-    return axis + rotate(turn / np.sqrt((turn * turn).sum(0)), offset[:, None, None])

@@ -88,6 +88,23 @@ class Mesh:
         """Length of rope that belongs to each node [m], (N,)."""
         return 0.5 * (np.append(self.step, 0.0) + np.append(0.0, self.step))
 
+    def points(self, x: Array, q: Array, arclength: Array, offset: Array) -> Array:
+        """Return markers (3, F, M) between nodes, by cubics with the nodes' tangents, and beside the axis."""
+        low = np.clip(np.searchsorted(self.arclength, arclength, side="right") - 1, 0, self.elements - 1)
+        step = self.step[low]
+        u = np.clip((arclength - self.arclength[low]) / step, 0.0, 1.0)
+        tangent = rotate(q, np.eye(3)[:, :1, None])
+        axis = (
+            (1 + 2 * u) * (1 - u) ** 2 * x[..., low]
+            + u * (1 - u) ** 2 * step * tangent[..., low]
+            + u * u * (3 - 2 * u) * x[..., low + 1]
+            - u * u * (1 - u) * step * tangent[..., low + 1]
+        )
+        if not offset.any():
+            return axis
+        turn = q[..., low] * (1 - u) + q[..., low + 1] * u
+        return axis + rotate(turn / np.sqrt((turn * turn).sum(0)), offset[:, None, None])
+
 
 @dataclass
 class State:
