@@ -121,8 +121,9 @@ def diagnosed(recording: Recording, out: Path, plant: str, base: Saved | None, c
 
 def row(recording: Recording, found: Diagnosis, plant: str, base: Saved | None) -> dict:
     """Return what a diagnosis found, for the table."""
+    compared = [t for t, through in zip(recording.test, found.compared, strict=True) if through]
     errors = {
-        when: 1e3 * average(mean_absolute_error, [sims[t.name] for t in recording.test], recording.test)
+        when: 1e3 * average(mean_absolute_error, [sims[t.name] for t in compared], compared)
         for when, sims in found.predictions.items()
     }
     numbers = dict(zip(found.model.parameters, map(float, found.final.values), strict=True))
@@ -136,6 +137,7 @@ def row(recording: Recording, found: Diagnosis, plant: str, base: Saved | None) 
         "candidates": findings(found, recording)["candidates"],
         "test_mae_before_mm": errors["before"],
         "test_mae_after_mm": errors["after"],
+        "test_trials": [len(compared), len(recording.test)],
         "floor_mm": 1e3 * found.floor.total,
         "gap_before_mm": (1e3 * found.before).tolist(),
         "gap_after_mm": (1e3 * found.after).tolist(),
@@ -157,6 +159,10 @@ def show(rows: list[dict]) -> None:
             f"{r['test_mae_before_mm']:8.2f}{r['test_mae_after_mm']:8.2f}  {names}{mark}"
         )
     print("before, after: mean absolute error per coordinate on the test trials [mm]")
+    for r in rows:
+        through, tested = r["test_trials"]
+        if through < tested:
+            print(f"{r['recording']}: on {through} of {tested} test trials; a simulation fails on the others")
 
 
 def main() -> None:

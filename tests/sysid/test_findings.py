@@ -14,7 +14,7 @@ from tests.report.fake_diagnosis import BASELINE, fake_diagnosis, fitted
 from tests.sysid.swaying import recording as swaying
 from torchdlo.physics.effects import EFFECTS
 from torchdlo.sysid import library
-from torchdlo.sysid.findings import absorbed, confidence, findings_json, sentence
+from torchdlo.sysid.findings import absorbed, confidence, findings, findings_json, sentence
 from torchdlo.sysid.floor import Floor
 from torchdlo.sysid.health import Fault
 from torchdlo.sysid.laws import LAWS, MEANING, separating
@@ -41,6 +41,19 @@ def test_the_sentence_has_number_range_gap_and_doubt(rope: Recording, found: Dia
     # (25 - 1) / (25 - 0.36) = 97.4 %.
     assert "not to be told from wind. Gap on trials that were not used: 5.0 → 1.0 mm (floor 1.0 mm), 97% of" in said
     assert said.endswith("Confidence: moderate (wind would do as well).")
+
+
+def test_trials_that_a_simulation_fails_on_are_left_out_and_said(rope: Recording, found: Diagnosis) -> None:
+    failed = replace(found, before=np.array([5e-3, np.inf]), after=np.array([1e-3, 3e-3]))
+    said = sentence(failed, rope)
+    assert "5.0 → 1.0 mm" in said and "Left out are 1 of 2 such trials, which a simulation fails on." in said
+    gap = findings(failed, rope)["gap"]
+    assert (gap["test_rmse_before_m"], gap["test_rmse_after_m"]) == (5e-3, 1e-3)
+    unknown = replace(failed, verdict="unknown", effects=[], ties={}, final=found.baseline)
+    assert "Left out are 1 of 2" in sentence(unknown, rope)
+    assert "Left out" not in sentence(found, rope)
+    nothing = replace(found, before=np.full(2, np.inf), after=np.full(2, np.inf))
+    assert np.isinf(nothing.gaps).all()
 
 
 @pytest.mark.parametrize(("verdict", "start"), [("none", "Nothing is missing"), ("unknown", "Something is missing")])

@@ -13,7 +13,6 @@ from torchdlo.files import write_atomically
 from torchdlo.report import chart, player
 from torchdlo.report.page import STYLE, listed, number, page, percent, table, words
 from torchdlo.sysid.findings import absorbed, findings, sentence
-from torchdlo.sysid.floor import rms
 from torchdlo.sysid.laws import MEANING, law, separating
 from torchdlo.sysid.localise import PARTS, Localisation, localise
 from torchdlo.sysid.recording import Recording
@@ -74,7 +73,7 @@ def _section(title: str, content: str) -> str:
 
 
 def _bars(result: Diagnosis, recording: Recording) -> str:
-    rows = [("all test trials", rms(result.before), rms(result.after))]
+    rows = [("all test trials" if result.compared.all() else "test trials that none fails on", *result.gaps)]
     rows += [(t.name, b, a) for t, b, a in zip(recording.test, result.before, result.after, strict=True)]
     shown = chart.bars([(n, 1e3 * b, 1e3 * a) for n, b, a in rows], 1e3 * result.floor.total)
     note = "<p class=soft>Root mean square per coordinate of the free markers, in mm.</p>"

@@ -28,7 +28,7 @@ from torchdlo.sysid.recording import Recording
 from torchdlo.sysid.revise import Found, Revision
 from torchdlo.sysid.saved import Saved
 from torchdlo.sysid.screen import Score, screen
-from torchdlo.sysid.verdict import UNKNOWN_FLOOR, Candidate, Diagnosis, word
+from torchdlo.sysid.verdict import UNKNOWN_FLOOR, Candidate, Diagnosis, both, word
 
 PAYS = 0.15
 """Share of the excess gap that an effect has to close, on the train and on the test trials."""
@@ -164,8 +164,13 @@ class _Search:
         return max(self._squared(fitted) - self.bench.floor.noise**2, 1e-12)
 
     def _squared(self, fitted: Fitted) -> float:
-        """Return the squared gap on the test trials [m^2]; all frames count the same, whatever is known of them."""
-        return float(rms(gap(self.bench.prediction(fitted, "test"), self.bench.trials["test"])) ** 2)
+        """Return the squared gap on the test trials [m^2]; all frames count the same, whatever is known of them.
+
+        Trials that the baseline does not get through are left out, as nothing can be compared with them.
+        """
+        trials = self.bench.trials["test"]
+        gaps, plain = (gap(s, trials) for s in (self.bench.prediction(fitted, "test"), self.before[-len(trials) :]))
+        return float(rms(gaps[both(plain, plain)]) ** 2)
 
     def _possible(self) -> list[str]:
         mesh, names = self.pool.local.model(()).mesh, [n for n in library.LIBRARY if n not in self.excluded]

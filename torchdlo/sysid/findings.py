@@ -7,7 +7,6 @@ from typing import Any
 
 from torchdlo.physics.effects import EFFECTS
 from torchdlo.sysid import fit, saved
-from torchdlo.sysid.floor import rms
 from torchdlo.sysid.journal import digest
 from torchdlo.sysid.laws import law, separating
 from torchdlo.sysid.localise import localise
@@ -74,8 +73,8 @@ def _gap(result: Diagnosis, recording: Recording) -> dict[str, Any]:
     """Return the gap on the test trials and the floor."""
     floor, trials = result.floor, zip(recording.test, result.before, result.after, strict=True)
     return {
-        "test_rmse_before_m": rms(result.before),
-        "test_rmse_after_m": rms(result.after),
+        "test_rmse_before_m": result.gaps[0],
+        "test_rmse_after_m": result.gaps[1],
         "noise_floor_m": floor.total,
         "floor_parts_m": {"marker_noise": floor.noise, "step": floor.step, "grid": floor.grid},
         "per_trial": [{"name": t.name, "before_m": float(b), "after_m": float(a)} for t, b, a in trials],
@@ -151,17 +150,20 @@ def model_json(result: Diagnosis) -> str:
 
 def sentence(result: Diagnosis, recording: Recording) -> str:
     """Return the verdict in words."""
-    before, after, floor = (1e3 * x for x in (rms(result.before), rms(result.after), result.floor.total))
+    before, after, floor = (1e3 * x for x in (*result.gaps, result.floor.total))
+    failed, count = int((~result.compared).sum()), len(result.before)
+    left_out = f" Left out are {failed} of {count} such trials, which a simulation fails on." if failed else ""
     if result.verdict == "none":
         return (
             "Nothing is missing that these data could show: the calibrated baseline is "
             f"{before:.1f} mm off on trials that were not used, and {floor:.1f} mm is the floor of noise and grid."
+            f"{left_out}"
         )
     if result.verdict == "unknown":
         return (
             "Something is missing that no effect of the library explains: the calibrated baseline is "
             f"{before:.1f} mm off on trials that were not used, {before / floor:.1f} times the floor of noise and grid "
-            f"({floor:.1f} mm)."
+            f"({floor:.1f} mm).{left_out}"
         )
     numbers = _numbers(result)
     named = " and ".join(_named(name, numbers, result.ties[name]) for name in result.effects)
@@ -169,7 +171,7 @@ def sentence(result: Diagnosis, recording: Recording) -> str:
     excess = before**2 - (1e3 * result.floor.noise) ** 2
     share = f", {(before**2 - after**2) / excess:.0%} of what is above the noise closed" if excess > 0 else ""
     said = f"Missing: {named}. Gap on trials that were not used: {before:.1f} → {after:.1f} mm"
-    said += f" (floor {floor:.1f} mm){share}."
+    said += f" (floor {floor:.1f} mm){share}.{left_out}"
     if result.verdict == "partial":
         said += " A part remains that no effect of the library explains."
     sure = confidence(result)

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from torchdlo.sysid.floor import Floor
+from torchdlo.sysid.floor import Floor, rms
 from torchdlo.sysid.health import Fault
 from torchdlo.sysid.jobs import Fitted
 from torchdlo.sysid.model import RopeModel
@@ -84,3 +84,19 @@ class Diagnosis:
     """What is wrong with the data."""
     options: dict[str, Any] = field(default_factory=dict)
     """What was asked for."""
+
+    @property
+    def compared(self) -> np.ndarray:
+        """Which test trials both the baseline and the final model get through; all where that is none."""
+        return both(self.before, self.after)
+
+    @property
+    def gaps(self) -> tuple[float, float]:
+        """Root mean square gap [m] on these trials, with the baseline and with the effects."""
+        return rms(self.before[self.compared]), rms(self.after[self.compared])
+
+
+def both(before: np.ndarray, after: np.ndarray) -> np.ndarray:
+    """Return which of the gaps (B,) [m] of trials are finite before and after; all where none are."""
+    through = np.isfinite(before) & np.isfinite(after)
+    return through if through.any() else np.ones_like(through)
