@@ -130,5 +130,8 @@ def test_chains_hide_what_rods_do_in_recordings_of_their_own() -> None:
     }
     assert {c.kind for c in chains} == {"single", "null", "compound", "outside"}
     assert not {make.identity(c, "s") for c in chains} & {make.identity(c, "s") for c in others}
+    for scene in (c.scene for c in chains):  # clamps hold whole links
+        free = (scene.free_end - scene.grip) / scene.grip
+        assert free == pytest.approx(round(free)) and scene.arclength[1] == scene.grip
     rods = [replace(c, simulator="") for c in chains]
     assert not {make.identity(c, "s") for c in chains} & {make.identity(c, "s") for c in rods}

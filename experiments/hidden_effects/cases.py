@@ -23,6 +23,8 @@ MEASUREMENT = ("time_delay", "marker_offset")
 """Effects of the measurement, not of the rope."""
 PARTS = ("first", "ci", "singles", "nulls", "compounds", "outside", "ties", "all", "fresh", "links")
 """Parts of the benchmark; what is fresh, and what is made of links, is not in all."""
+LINKS = (40, 61)
+"""Least number of links in a chain, with those that clamps hold, and one more than the greatest."""
 TIES = {"wind": ["tilted_gravity"], "tilted_gravity": ["wind"]}
 """Effects that the motions here hardly tell apart."""
 PAIRS = (
@@ -78,7 +80,12 @@ class Case:
             held = 1
         pace = 0.4 if self.variant == "slow" else 1.25 if "air_drag" in has else 1.0
         table = "table_friction" in has or self.variant == "table"
-        return draw(self.seed, table=table, grippers=held, pace=pace)
+        scene = draw(self.seed, table=table, grippers=held, pace=pace)
+        if self.simulator == "links":
+            # A clamp holds one link.
+            count = int(np.random.default_rng([self.seed, 15]).integers(*LINKS))
+            scene = replace(scene, grip=scene.rope.length / count)
+        return scene
 
 
 @dataclass(frozen=True)

@@ -215,11 +215,6 @@ def _prescribed(poses: Poses, times: Array) -> tuple[Array, ...]:
     return x, q, (x1 - x0) / (2 * e), 0.5 * (ahead - back), (x1 - 2 * x + x0) / e**2, (ahead + back) / e
 
 
-def count(seed: int) -> int:
-    """Return how many free links a rope has."""
-    return int(np.random.default_rng([seed, 15]).integers(36, 61))
-
-
 def settle(links: Links, poses: Poses, dt: float) -> None:
     """Bring the rope to rest in the clamps' poses at time 0, from a straight line."""
     x1, q1 = (p[..., 0] for p in poses(np.zeros(1)))

@@ -86,7 +86,7 @@ def simulate(case: Case, scene: Scene, rows: list[dict], fine: tuple[int, float]
         raise SystemExit(
             f"{e.name} is not installed; chains of links need MuJoCo: pip install 'torchdlo[peers]'"
         ) from e
-    return links.run(scene, TRIALS, rows, links.count(scene.seed), links.STEP)
+    return links.run(scene, TRIALS, rows, round((scene.free_end - scene.grip) / scene.grip), links.STEP)
 
 
 def record(case: Case, scene: Scene, numbers: dict[str, float], fine: tuple[int, float], salt: str) -> list[dict]:

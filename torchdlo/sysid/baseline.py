@@ -44,7 +44,7 @@ _FAR = np.log(8.0)
 
 
 def calibrate(bench: Bench, count: int, iterations: int, rng: np.random.Generator, report: Callback) -> Fitted:
-    """Return the fitted baseline, with the law of a chain where that helps, and clamps as firm as they seem.
+    """Return the fitted baseline, straight if a given rest shape fits worse, a chain or in firm clamps if that helps.
 
     Args:
         bench: the trials.
@@ -75,8 +75,13 @@ def calibrate(bench: Bench, count: int, iterations: int, rng: np.random.Generato
 
     values = _random(model, count, rng)
     first = fit([plain(values[k::2], 4, frames // 3) for k in range(2)], 1)
-    bench.early = best = min(first, key=lambda f: f.point.cost).values
-    if not bench.starts["train"].still.all():
+    best = min(first, key=lambda f: f.point.cost).values
+    straight = _straight(bench, values, best, frames) if model.rest == "given" else None
+    if straight is not None:
+        best, names, ones = straight, _names(bench, "straight"), ones[: len(straight)]
+        free, sizes = (*names, free[-1]), (*ones, sizes[-1])
+    bench.early = best
+    if straight is not None or not bench.starts["train"].still.all():
         bench.begin(best, ())
     # Phases of late times are right only after early ones are: the horizon grows. The order of the axes of its joints
     # gives a chain's length a sign.
@@ -93,6 +98,31 @@ def calibrate(bench: Bench, count: int, iterations: int, rng: np.random.Generato
         better = _chain_or(bench, better, rope, [chain(side.values[None], iterations, None)])
     report(stage, 4, 4, f"{1e3 * rms(bench.gaps(better, 'train')):.2f} mm")
     return better
+
+
+def _straight(bench: Bench, values: np.ndarray, given: np.ndarray, frames: int) -> np.ndarray | None:
+    """Return the numbers of a rope without rest shape if it fits better, and give up the shape; None if it does not.
+
+    Such a rope is one whose share of the rest shape is 0, which searches that begin with the shape do not always find.
+    """
+
+    def job(values: np.ndarray, most: int, frames: int, rest: str = "straight") -> Fit:
+        names, keep = _names(bench, rest), math.ceil(_KEPT * len(values)) if len(values) > 1 else None
+        start, ones = bench.starts["train"], (1.0,) * len(names)
+        return Fit((), values[:, : len(names)], names, ones, most, start, frames, keep, (("rest", rest),))
+
+    found = bench.fit([job(values[k::2], 4, frames // 3) for k in range(2)])
+    best = min(found, key=lambda f: f.point.cost).values
+    longer = 2 * frames // 3
+    straight, shaped = bench.fit([job(best[None], 5, longer), job(given[None], 5, longer, "given")])
+    if straight.point.cost >= shaped.point.cost:
+        return None
+    bench.pool.choose(rest="straight")
+    return straight.values
+
+
+def _names(bench: Bench, rest: str) -> tuple[str, ...]:
+    return tuple(bench.pool.local.model((), (("rest", rest),)).parameters)
 
 
 def _held(bench: Bench, firm: Fitted, smooth: Fitted, side: Fitted) -> tuple[Fitted, Fitted]:

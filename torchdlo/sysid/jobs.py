@@ -126,7 +126,7 @@ class Models:
             columns = [own.parameters.index(name) for name in job.free]
             space = Space(job.free, tuple(own.params[k] for k in columns), job.sizes)
             searches.append(_search(job, space, columns, measured, trust))
-            places.append(self._places(model, job.effects))
+            places.append(_places(model, own))
         found: dict[int, Fitted] = {}
         asked = {k: next(search) for k, search in enumerate(searches)}
         while asked:
@@ -148,13 +148,16 @@ class Models:
 
     def joined(self, fits: Sequence[Fitted], split: str, start: Start) -> Simulation:
         """Return one job that simulates several fits with the same options, by a model that has the effects of all."""
-        model = self.model(tuple(dict.fromkeys(e for f in fits for e in f.effects)))
-        rows = [_filled(model.guess(), self._places(model, f.effects), f.values[None]) for f in fits]
-        return Simulation(model.effects, np.concatenate(rows), split, start, fits[0].options)
+        options = fits[0].options
+        model = self.model(tuple(dict.fromkeys(e for f in fits for e in f.effects)), options)
+        owns = [_places(model, self.model(f.effects, options)) for f in fits]
+        rows = [_filled(model.guess(), own, f.values[None]) for own, f in zip(owns, fits, strict=True)]
+        return Simulation(model.effects, np.concatenate(rows), split, start, options)
 
-    def _places(self, model: RopeModel, effects: Sequence[str]) -> list[int]:
-        """Return where the numbers of a model with some of the effects are among those of a model with all."""
-        return [model.parameters.index(name) for name in self.model(effects).parameters]
+
+def _places(model: RopeModel, own: RopeModel) -> list[int]:
+    """Return where the numbers of a model with some of the effects are among those of a model with all."""
+    return [model.parameters.index(name) for name in own.parameters]
 
 
 def _filled(guess: np.ndarray, places: Sequence[int], values: np.ndarray) -> np.ndarray:
