@@ -11,6 +11,7 @@ import pytest
 from tests.sysid.test_diagnose import S, hanging
 from torchdlo.sysid import baseline
 from torchdlo.sysid.bench import Bench
+from torchdlo.sysid.jobs import Fit
 from torchdlo.sysid.model import RopeModel
 from torchdlo.sysid.motion import Start
 from torchdlo.sysid.plan import options
@@ -51,3 +52,24 @@ def test_a_rest_shape_is_given_up_only_where_a_straight_rope_fits_better(
         numbers = dict(zip(pool.local.model(found.effects).parameters, found.values, strict=True))
         assert numbers["bending_stiffness"] == pytest.approx(1.5e-3, rel=0.15)
         assert ("rest_share" in numbers) == (rest == "given")
+
+
+@pytest.mark.slow
+def test_a_rest_shape_that_was_given_up_is_tried_again_with_an_effect(tmp_path: Path) -> None:
+    recording = made(tmp_path, 1.0)
+    with Pool(recording, options(recording, 31), 1) as pool:
+        bench = Bench(pool)
+        pool.choose(rest="straight")
+        model = pool.local.model(())
+        bench.begin(model.guess(), ())
+        names, start = tuple(model.parameters), bench.starts["train"]
+        straight = bench.fit([Fit((), model.guess()[None], names, (1.0,) * len(names), 4, start)])[0]
+        before = np.sqrt(np.mean(bench.gaps(straight, "test") ** 2))
+        found = baseline.go_further(bench, straight, 6, lambda *_: None)
+        assert pool.local.model(()).rest == "given" == dict(found.options)["rest"]
+        numbers = dict(zip(pool.local.model(found.effects).parameters, found.values, strict=True))
+        assert numbers["rest_share"] == pytest.approx(1.0, abs=0.1)
+        left = np.sqrt(np.mean(bench.gaps(found, "test") ** 2))
+        assert left < 0.2 * before
+        # What was fitted before is still simulated without the shape.
+        assert np.sqrt(np.mean(bench.gaps(straight, "test") ** 2)) > 2 * left

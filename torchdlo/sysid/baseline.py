@@ -34,7 +34,10 @@ _LOOK = 2
 """Iterations after which a chain has to fit better than a rope, if it is to be fitted further."""
 
 _FIRMER = 0.95
-"""Share of the cost that is left where clamps are found to do so once an effect is known."""
+"""Share of the cost that is left where clamps are found to do so, or a rest shape is, once an effect is known."""
+
+_ROLLS = 6
+"""Sides to which a given rest shape may be rolled where fits with it start."""
 
 _ROUND = 0.75
 """Twisting over bending stiffness of a round rope of one material."""
@@ -156,7 +159,7 @@ def _random(model: RopeModel, count: int, rng: np.random.Generator) -> np.ndarra
 def go_further(bench: Bench, base: Fitted, iterations: int, report: Callback) -> Fitted:
     """Return a model that took up an effect, with what the lack of that effect kept the baseline from finding.
 
-    That is the law of a chain, and a twisting stiffness that hardly shows and ran away.
+    That is the law of a chain, a given rest shape, and a twisting stiffness that hardly shows and ran away.
     """
     rope = _begin_anew(bench, base)
     model = bench.pool.local.model(base.effects)
@@ -166,16 +169,20 @@ def go_further(bench: Bench, base: Fitted, iterations: int, report: Callback) ->
         back = base.values.copy()
         back[twist] = _ROUND * back[bend]
         values = np.stack([base.values, back])
-    names, sizes = base.space.names, tuple(base.space.units)
-    stage, effects, free = "fitting all numbers again", (*base.effects, CHAIN), (*names, f"{CHAIN}.length")
+    stage, effects, start = "fitting all numbers again", (*base.effects, CHAIN), bench.starts["train"]
     report(stage, 0, 3, "")
-    jobs = [Fit(base.effects, values, names, sizes, iterations, bench.starts["train"])]
+    jobs = [Fit(base.effects, values, base.space.names, tuple(base.space.units), iterations, start)]
     if clamps.loose(model):
         jobs.append(clamps.firm(base, jobs[0]))
-    base, *firm = bench.fit(jobs)
-    if firm and firm[0].point.cost < _FIRMER * base.point.cost:
-        base = firm[0]
-        bench.pool.choose(grip=1.0)
+    if model.rest == "straight" and bench.recording.rest_positions is not None:
+        jobs.append(_shaped(bench, base, jobs[0]))
+    base, *others = bench.fit(jobs)
+    better = min(others, key=lambda f: f.point.cost, default=base)
+    if better.point.cost < _FIRMER * base.point.cost:
+        base = better
+        bench.pool.choose(**dict(base.options))
+    names, sizes = base.space.names, tuple(base.space.units)
+    free = (*names, f"{CHAIN}.length")
     report(stage, 1, 3, f"{1e3 * rms(bench.gaps(base, 'train')):.2f} mm")
     if bench.linked and CHAIN not in base.effects and rms(bench.gaps(base, "train")) > SILENT * bench.level:
         rows = [np.append(base.values, length)[None] for length in (link, -link)]
@@ -187,6 +194,18 @@ def go_further(bench: Bench, base: Fitted, iterations: int, report: Callback) ->
     base = bench.fit([bench.further(base, iterations // 2)])[0]
     report(stage, 3, 3, f"{1e3 * rms(bench.gaps(base, 'train')):.2f} mm")
     return base
+
+
+def _shaped(bench: Bench, base: Fitted, job: Fit) -> Fit:
+    """Return the job of fitting the model without, likewise with half of the given rest shape, rolled to any side."""
+    options = (*base.options, ("rest", "given"))
+    model, before = bench.pool.local.model(base.effects, options), bench.pool.local.model(base.effects)
+    values = np.repeat(model.guess()[None], _ROLLS, 0)
+    values[:, [model.parameters.index(n) for n in before.parameters]] = base.values
+    values[:, model.parameters.index("rest_share")] = 0.5
+    values[:, model.parameters.index("rest_roll")] = np.linspace(-np.pi, np.pi, _ROLLS, endpoint=False)
+    free, sizes = (*job.free, "rest_share", "rest_roll"), (*job.sizes, 1.0, 1.0)
+    return replace(job, values=values, free=free, sizes=sizes, keep=2, options=options)
 
 
 def _begin_anew(bench: Bench, base: Fitted) -> Refinement:
