@@ -180,7 +180,8 @@ class Links:
         slope = laws.stiffness(given, rope, self.chain, time) * np.sqrt(given.get("anisotropic_bending.ratio"))
         slope = slope * (1 + 3 * given.get("stiffening_bending.c") * (kappa[1:] ** 2).sum(0))
         slope = slope + given.get("internal_friction.moment") / given.get("internal_friction.kappa_c")
-        rub = given.get("bending_damping.coefficient") + self.model.opt.timestep * slope
+        # The law's own damping is implicit as well: what is enough need not be added.
+        rub = np.maximum(given.get("bending_damping.coefficient"), self.model.opt.timestep * slope)
         return rub[0] / self.chain.length
 
     def _behind(self, x: Array, q: Array) -> Array:
