@@ -40,7 +40,7 @@ def end(numbers: dict[str, float], gravity: float = GRAVITY) -> np.ndarray:
     rope = links.Links(STIFF, chain, Laws([numbers], gravity=gravity), dt)
     links.settle(rope, level, dt)
     track = rope.run(level, np.arange(2) * dt, 1)
-    x, q = (a[-1, :, 0][:, None] for a in (track.x, track.q))
+    x, q = (a[0, :, 0][:, None] for a in (track.x, track.q))
     return chain.points(x, q, np.array([STIFF.length]), np.zeros(3))[:, 0, 0]
 
 

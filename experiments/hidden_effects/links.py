@@ -22,7 +22,9 @@ from vectors import Array, conjugate, exponential, logarithm, multiply, rotate
 HEAVY = 1e4
 """Mass of clamps [kg], beside which a rope's is nothing; their motion is prescribed."""
 STEP = 4e-4
-"""Step to make recordings with [s]; a quarter of it changes them by 0.02 to 0.05 mm."""
+"""Step to make recordings with [s]; a quarter of it changes them by 0.01 to 0.03 mm."""
+IMPLICIT = 0.5
+"""Implicit damping of a spring's joint, over step times stiffness."""
 HALVINGS = 3
 """How often the step is halved where the simulation fails."""
 KEPT = 4
@@ -123,7 +125,7 @@ class Links:
                 f'<body name="link{k}" {ahead}>'
                 f'<inertial pos="{centre} 0 0" mass="{mass}" diaginertia="{inertia[0]} {inertia[1]} {inertia[2]}"/>'
                 + f'<joint type="slide" axis="1 0 0" stiffness="{pull}" damping="{dt * pull}"/>' * self.stretches
-                + f'<joint name="x{k}" axis="1 0 0" damping="{dt * rope.twisting / h}"/>'
+                + f'<joint name="x{k}" axis="1 0 0"/>'
                 + f'<joint name="y{k}" axis="0 1 0"/><joint name="z{k}" axis="0 0 1"/>'
             )
             ends += "</body>"
@@ -169,20 +171,29 @@ class Links:
             kappa = d.qpos[self.angles][:, None] / chain.length
             moment = self.soft * laws.moment(given, rope, chain, kappa, still, memory, float(time))
             memory = laws.remember(given, kappa, memory, m.opt.timestep)
-            d.qfrc_applied[self.hinges] = -moment[:, 0]
-            m.dof_damping[self.hinges[1:]] = self._damping(given, rope, kappa, float(time))
+            rub, added = self._damping(given, rope, kappa, float(time), IMPLICIT if damping is None else 1.0)
+            m.dof_damping[self.hinges] = rub + added
+            # What is added is taken back with the velocities before the step, so that it damps nothing; a weld is not
+            # stable without it, and who comes to rest may keep it.
+            back = 0.0 if chain.both or damping is not None else added * d.qvel[self.hinges]
+            d.qfrc_applied[self.hinges] = back - moment[:, 0]
             d.xfrc_applied[self.bodies] = self._loads(given, rope, x[:, 0, k], q[:, 0, k], float(time))
             mujoco.mj_step2(m, d)
         return Track(times[::kept], np.array(xs)[:, :, None], np.array(qs)[:, :, None])
 
-    def _damping(self, given: Laws, rope: Rope, kappa: Array, time: float) -> Array:
-        """Return the hinges' damping [N m s]: a law's, and what makes the springs' part of a step implicit."""
+    def _damping(self, given: Laws, rope: Rope, kappa: Array, time: float, share: float) -> tuple[Array, Array]:
+        """Return the hinges' damping (3, N - 1) [N m s]: a law's, and what keeps springs stable at any step.
+
+        That is a share of step times stiffness, of which a quarter is enough.
+        """
         slope = laws.stiffness(given, rope, self.chain, time) * np.sqrt(given.get("anisotropic_bending.ratio"))
         slope = slope * (1 + 3 * given.get("stiffening_bending.c") * (kappa[1:] ** 2).sum(0))
         slope = slope + given.get("internal_friction.moment") / given.get("internal_friction.kappa_c")
-        # The law's own damping is implicit as well: what is enough need not be added.
-        rub = np.maximum(given.get("bending_damping.coefficient"), self.model.opt.timestep * slope)
-        return rub[0] / self.chain.length
+        rub = np.zeros((3, len(slope[0])))
+        rub[1:] = given.get("bending_damping.coefficient")
+        slopes = np.stack([np.full_like(slope[0], rope.twisting), slope[0], slope[0]])
+        added = np.maximum(share * self.model.opt.timestep * slopes - rub, 0.0)
+        return rub / self.chain.length, added / self.chain.length
 
     def _behind(self, x: Array, q: Array) -> Array:
         """Return where the link that the first clamp holds begins."""
