@@ -8,7 +8,7 @@ places, and beside its clamps over the length of a link.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import laws
@@ -68,10 +68,8 @@ class Chain:
 
     def points(self, x: Array, q: Array, arclength: Array, offset: Array) -> Array:
         """Return markers (3, F, M) on links that begin at x (3, F, N) [m] and point along the x axis of q."""
-        low = (
-            np.clip(np.floor((arclength - self.first) / self.length + 1e-9).astype(int), -1, self.links - 1 + self.both)
-            + 1
-        )
+        last = len(self.arclength) - 1
+        low = np.clip(np.floor((arclength - self.first) / self.length + 1e-9).astype(int) + 1, 0, last)
         along = arclength - (self.first + (low - 1) * self.length)
         beside = np.concatenate([along[None, None], np.broadcast_to(offset[1:, None, None], (2, 1, len(along)))])
         return x[..., low] + rotate(q[..., low], beside)
@@ -153,7 +151,7 @@ class Links:
         m, d, given, chain = self.model, self.data, self.given, self.chain
         rate = self.rope.damping * float(given.get("baseline.damping")[0, 0]) if damping is None else damping
         given = given if damping is None else laws.elastic(given)
-        rope = Rope(**{**vars(self.rope), "damping": rate})
+        rope = replace(self.rope, damping=rate)
         x, q, v, spin, a, turn = _prescribed(poses, times)
         memory: dict[str, Array] = {}
         xs, qs, still = [], [], np.zeros((3, 1, len(chain.arclength)))
@@ -251,13 +249,12 @@ def run(scene: Scene, trials: list[str], numbers: list[dict], links: int, dt: fl
     given = Laws(numbers[:1], scene.table)
     if given.on("table_friction"):
         dt *= 0.25  # what is slow enough to stick would chatter
-    for tries in range(HALVINGS + 1):
+    for _ in range(HALVINGS):
         try:
-            return _run(scene, trials, given, links, dt * 0.5**tries)
+            return _run(scene, trials, given, links, dt)
         except Diverged:
-            if tries == HALVINGS:
-                raise
-    raise AssertionError
+            dt *= 0.5
+    return _run(scene, trials, given, links, dt)
 
 
 def _run(scene: Scene, trials: list[str], given: Laws, links: int, dt: float) -> tuple[Track, Chain]:

@@ -83,9 +83,7 @@ def simulate(case: Case, scene: Scene, rows: list[dict], fine: tuple[int, float]
     try:
         import links
     except ImportError as e:
-        raise SystemExit(
-            f"{e.name} is not installed; chains of links need MuJoCo: pip install 'torchdlo[peers]'"
-        ) from e
+        raise SystemExit(f"{e.name} is not installed; chains of links need it: pip install mujoco") from e
     return links.run(scene, TRIALS, rows, round((scene.free_end - scene.grip) / scene.grip), links.STEP)
 
 

@@ -28,7 +28,7 @@ from torchdlo.sysid.recording import Recording
 from torchdlo.sysid.revise import Found, Revision
 from torchdlo.sysid.saved import Saved
 from torchdlo.sysid.screen import Score, screen
-from torchdlo.sysid.verdict import UNKNOWN_FLOOR, Candidate, Diagnosis, both, word
+from torchdlo.sysid.verdict import UNKNOWN_FLOOR, Candidate, Diagnosis, through, word
 
 PAYS = 0.15
 """Share of the excess gap that an effect has to close, on the train and on the test trials."""
@@ -170,7 +170,7 @@ class _Search:
         """
         trials = self.bench.trials["test"]
         gaps, plain = (gap(s, trials) for s in (self.bench.prediction(fitted, "test"), self.before[-len(trials) :]))
-        return float(rms(gaps[both(plain, plain)]) ** 2)
+        return float(rms(gaps[through(plain)]) ** 2)
 
     def _possible(self) -> list[str]:
         mesh, names = self.pool.local.model(()).mesh, [n for n in library.LIBRARY if n not in self.excluded]

@@ -88,7 +88,7 @@ class Diagnosis:
     @property
     def compared(self) -> np.ndarray:
         """Which test trials both the baseline and the final model get through; all where that is none."""
-        return both(self.before, self.after)
+        return through(self.before, self.after)
 
     @property
     def gaps(self) -> tuple[float, float]:
@@ -96,7 +96,7 @@ class Diagnosis:
         return rms(self.before[self.compared]), rms(self.after[self.compared])
 
 
-def both(before: np.ndarray, after: np.ndarray) -> np.ndarray:
-    """Return which of the gaps (B,) [m] of trials are finite before and after; all where none are."""
-    through = np.isfinite(before) & np.isfinite(after)
-    return through if through.any() else np.ones_like(through)
+def through(*gaps: np.ndarray) -> np.ndarray:
+    """Return which trials have finite gaps (B,) [m] with all models, shape (B,); all trials where none have."""
+    finite = np.isfinite(gaps).all(0)
+    return finite if finite.any() else np.ones_like(finite)
