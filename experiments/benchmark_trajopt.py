@@ -1,7 +1,8 @@
 """Trajectory optimisation of the tasks: tasks by methods by seeds, beside published returns.
 
-Every run keeps a journal, so that a benchmark that was stopped goes on where it was; runs that are finished are read.
-An episode that is played with gradient counts as one. Returns are those of the best trajectory played alone.
+All searches of a task run at the same time and share their batches, so that their seconds are shared ones; the best
+trajectories are played alone in the end, and returns are those. An episode that is played with gradient counts as one.
+Every search keeps a journal, so that a benchmark that was stopped goes on where it was; finished ones are read.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ import statistics
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -27,68 +28,109 @@ INTERRUPTED = 130
 """Exit status after Ctrl-C."""
 
 
-def run(task: str, method: str, seed: int, args: Any) -> dict[str, Any]:
-    """One run: read if it is finished, resumed if it was stopped."""
-    from torchdlo.agents.journal import program
+@dataclass(frozen=True)
+class Case:
+    """One search."""
+
+    task: str
+    method: str
+    seed: int
+    settings: Any
+    folder: Path
+
+    @property
+    def result(self) -> Path:
+        """The file that says that it is finished."""
+        return self.folder / "result.json"
+
+    def found(self, choices: dict[str, Any]) -> dict[str, Any] | None:
+        """Return its result, if it is there and of the same settings and program."""
+        from torchdlo.agents.journal import program
+
+        if not self.result.is_file():
+            return None
+        found = json.loads(self.result.read_text())
+        wanted = json.loads(json.dumps(asdict(self.settings) | choices))
+        return found if found["settings"] == wanted and found["program"] == program() else None
+
+    def search(self, problem: Any, callback: Any) -> None:
+        """Search, resumed if it was stopped, and write what was found."""
+        from torchdlo.agents.result import result_json, trajectory_json
+        from torchdlo.agents.search import optimize
+        from torchdlo.files import write_atomically
+
+        journal = self.folder / "journal"
+        resume = (journal / "journal.json").is_file()
+        found = optimize(problem, self.settings, journal=journal, resume=resume, callback=callback)
+        if found.interrupted:
+            raise KeyboardInterrupt
+        write_atomically(self.folder / "trajectory.json", trajectory_json(found, problem))
+        write_atomically(self.result, result_json(found, problem, self.settings))
+
+
+def cases(task: str, args: Any) -> list[Case]:
+    """All searches of a task."""
     from torchdlo.agents.presets import preset
-    from torchdlo.agents.result import result_json, trajectory_json
-    from torchdlo.agents.search import optimize
+
+    given = {"episodes": args.episodes or None, "population": args.population or None}
+    seeds = range(args.first, args.first + args.seeds)
+    return [
+        Case(task, method, seed, preset(task, method, seed=seed, **given), Path(args.out) / f"{task}-{method}-{seed}")
+        for method in args.methods
+        for seed in seeds
+    ]
+
+
+def solve(task: str, args: Any) -> list[tuple[Case, dict[str, Any]]]:
+    """Run what is not there yet of a task, all at once, and return all results."""
     from torchdlo.agents.tasks import problem
-    from torchdlo.files import write_atomically
+    from torchdlo.agents.together import together
     from torchdlo.progress import deferred_interrupt, progress
 
-    folder = Path(args.out) / f"{task}-{method}-{seed}"
-    given = {"episodes": args.episodes or None, "population": args.population or None, "seed": seed}
-    settings = preset(task, method, **given)
-    # Recorded steps take seconds to make, but help only where no gradients are asked for.
-    steps = {"compiled": args.compiled and method != "cmaes", "recorded": args.compiled and method == "cmaes"}
-    chosen = problem(task, double=args.double, **steps)
-    wanted = json.loads(json.dumps(asdict(settings) | chosen.choices))
-    result = folder / "result.json"
-    if result.is_file():
-        found = json.loads(result.read_text())
-        if found["settings"] == wanted and found["program"] == program():
-            return found
+    chosen, wanted = problem(task, double=args.double, compiled=args.compiled), cases(task, args)
+    left = [case for case in wanted if case.found(chosen.choices) is None]
+    said: dict[Path, tuple[int, int, str]] = {}
     with progress() as show, deferred_interrupt(show) as callback:
-        journal = folder / "journal"
-        resume = (journal / "journal.json").is_file()
-        found = optimize(chosen, settings, journal=journal, resume=resume, callback=callback)
-    if found.interrupted:
-        raise KeyboardInterrupt
-    write_atomically(folder / "trajectory.json", trajectory_json(found, chosen))
-    write_atomically(result, result_json(found, chosen, settings))
-    return json.loads(result.read_text())
+
+        def pulse() -> None:
+            done, total, words = zip(*said.values(), strict=True) if said else ((0,), (1,), ("",))
+            callback("optimize", sum(done), max(sum(total), 1), f"{task} {words[0]}")
+
+        def searching(case: Case) -> Any:
+            def note(_: str, done: int, total: int, words: str) -> None:
+                said[case.folder] = (done, total, words)
+
+            said[case.folder] = (0, case.settings.episodes, "")
+            return lambda shared: case.search(shared, note)
+
+        room = sum(min(case.settings.population, case.settings.chunk) for case in wanted)
+        together(chosen, [searching(case) for case in left], room, pulse)
+    return [(case, json.loads(case.result.read_text())) for case in wanted]
 
 
 def side_by_side(args: Any) -> None:
-    """Run what is not there yet, each in a process of one thread, several at a time; what they say goes to log.txt."""
+    """Run tasks each in a process of one thread, several at a time; what they say goes to log files."""
     common = ["--episodes", str(args.episodes), "--population", str(args.population), "--out", args.out]
+    common += ["--methods", ",".join(args.methods), "--first", str(args.first), "--seeds", str(args.seeds)]
     common += ["--jobs", "1", "--quiet", *(["--double"] if args.double else []), *(["--smoke"] if args.smoke else [])]
 
-    def one(task: str, method: str, seed: int) -> None:
-        folder = Path(args.out) / f"{task}-{method}-{seed}"
-        folder.mkdir(parents=True, exist_ok=True)
-        words = ["--tasks", task, "--methods", method, "--first", str(seed), "--seeds", "1", *common]
-        with open(folder / "log.txt", "a", encoding="utf-8") as log:
+    def one(task: str) -> None:
+        file = Path(args.out) / f"{task}.log"
+        file.parent.mkdir(parents=True, exist_ok=True)
+        with open(file, "a", encoding="utf-8") as log:
             done = subprocess.run(
-                [sys.executable, __file__, *words],
+                [sys.executable, __file__, "--tasks", task, *common],
                 stdout=log,
                 stderr=log,
                 check=False,
                 env={"OMP_NUM_THREADS": "1"} | dict(os.environ),
             )
         ends = {0: "done", INTERRUPTED: "interrupted"}
-        print(f"{folder.name}: {ends.get(done.returncode, f'failed, see {folder}/log.txt')}", flush=True)
+        print(f"{task}: {ends.get(done.returncode, f'failed, see {file}')}", flush=True)
 
     with ThreadPoolExecutor(args.jobs) as pool:
         try:
-            waiting = [
-                pool.submit(one, task, method, args.first + k)
-                for k in range(args.seeds)
-                for method in args.methods
-                for task in args.tasks
-            ]
-            for each in waiting:
+            for each in [pool.submit(one, task) for task in args.tasks]:
                 each.result()
         except KeyboardInterrupt:
             # Ctrl-C reaches the processes as well: they write down where they are.
@@ -165,7 +207,7 @@ def arguments(words: list[str] | None = None) -> Any:
     parser.add_argument("--methods", default=",".join(METHODS), help=f"of {', '.join(METHODS)}; default: all")
     parser.add_argument("--seeds", type=count, default=3, help="seeds per task and method; default: 3")
     parser.add_argument("--first", type=int, default=0, help="first seed; default: 0")
-    parser.add_argument("--jobs", type=count, default=1, help="searches at the same time, one core each; default: 1")
+    parser.add_argument("--jobs", type=count, default=1, help="tasks at the same time, one core each; default: 1")
     parser.add_argument("--episodes", type=int, default=0, help="budget; default: the published one of each task")
     parser.add_argument("--population", type=int, default=0, help="default: that of each method")
     parser.add_argument("--out", default="runs/trajopt", help="folder; default: runs/trajopt")
@@ -197,11 +239,10 @@ def main() -> None:
         if args.jobs > 1:
             side_by_side(args)
         for task in args.tasks:
-            for method in args.methods:
-                for seed in range(args.first, args.first + args.seeds):
-                    runs.setdefault((task, method), []).append(run(task, method, seed, args))
-                if not args.quiet:
-                    report(runs, args)
+            for case, found in solve(task, args):
+                runs.setdefault((task, case.method), []).append(found)
+            if not args.quiet:
+                report(runs, args)
     except KeyboardInterrupt:
         print("interrupted; the same command goes on from here", file=sys.stderr)
         sys.exit(INTERRUPTED)
