@@ -25,6 +25,13 @@ SILENT = 1.3
 _ASTRAY = 3.0
 """Times the gap of another model from which a simulation has gone astray."""
 
+_TORN = 0.1
+"""Share of the rope's length by which markers may be further apart than along it: a simulated rope that is torn
+further has missed what happened within a step."""
+
+_FINER = 4
+"""How many times shorter the steps are with which such a trial is simulated once more."""
+
 _TIE = 0.05
 """Share of what fits save by which their costs have to differ to be told apart,"""
 
@@ -37,6 +44,12 @@ CHAIN = "link_chain"
 
 def _key(fitted: Fitted) -> Hashable:
     return fitted.effects, fitted.options, fitted.values.tobytes()
+
+
+def torn_apart(sims: np.ndarray, arclength: np.ndarray) -> np.ndarray:
+    """Return which trials of simulated markers (B, F, M, 3), at places (M,) along the rope [m], tear it; shape (B,)."""
+    apart = np.linalg.norm(np.diff(sims, axis=2), axis=3) - np.diff(arclength)
+    return ~(apart <= _TORN * (arclength[-1] - arclength[0])).all((1, 2))
 
 
 class Bench:
@@ -54,6 +67,8 @@ class Bench:
         """What no effect explains, on the test trials, as far as it is known."""
         self.level = float("inf")
         """What `gaps` are for a perfect model [m]."""
+        self.mended: set[str] = set()
+        """Trials that were simulated once more in finer steps."""
         self._finer: floors.Refinement | None = None
         self._known: dict[Hashable, np.ndarray] = {}
 
@@ -91,6 +106,31 @@ class Bench:
         groups = [[new[k] for k in group] for group in spread(kinds, self.pool.workers)]
         for k, sims in self.pool.simulate([self.pool.local.joined(g, "all", self.starts["all"]) for g in groups]):
             self._known |= {_key(f): sim for f, sim in zip(groups[k], sims, strict=True)}
+        for fitted in new:
+            self._mend(fitted, self._known[_key(fitted)])
+
+    def _mend(self, fitted: Fitted, sims: np.ndarray) -> None:
+        """Simulate the trials in which the rope was torn apart once more, in finer steps, into (B, F, M, 3)."""
+        model = self.pool.local.model(fitted.effects, fitted.options)
+        torn = np.flatnonzero(torn_apart(sims, model.mesh.marker_arclength))
+        if not len(torn):
+            return
+        options = dict(fitted.options) | {"substep": model.dt / (_FINER * model.substeps)}
+        names = tuple(self.trials["all"][k].name for k in torn)
+        start = replace(self.starts["all"].pick(torn), finer=None)
+        job = Simulation(fitted.effects, fitted.values[None], names, start, tuple(options.items()))
+        ((_, again),) = self.pool.simulate([job])
+        sims[torn, : again.shape[2]] = again[0]
+        self.mended |= set(names)
+
+    def notes(self) -> list[str]:
+        """Return sentences on the simulations that a reader should know."""
+        if not self.mended:
+            return []
+        return [
+            f"Simulated ropes were torn apart in {', '.join(sorted(self.mended))}, by some model at least; they were "
+            f"simulated once more there in steps of a {_FINER}th."
+        ]
 
     def prediction(self, fitted: Fitted, split: str) -> np.ndarray:
         """Return the simulated markers of the trials of a split, shape (B, F, M, 3)."""

@@ -325,7 +325,7 @@ class _Search:
         before, after = (gap(sims[train:], trials["test"]) for sims in simulated.values())
         verdict = word(effects, rms(self.bench.gaps(final, "test")), self.bench.level)
         model = self.pool.local.model(final.effects, final.options)
-        said = [*baselines.notes(self.baseline), *clamps.notes(model, final)]
+        said = [*baselines.notes(self.baseline), *clamps.notes(model, final), *self.bench.notes()]
         predictions = {
             when: {t.name: sim[: len(t.time)] for sim, t in zip(sims, trials["all"], strict=True)}
             for when, sims in simulated.items()
