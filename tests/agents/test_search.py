@@ -142,6 +142,23 @@ def test_a_trajectory_that_succeeds_also_alone_is_chosen_before_one_that_earns_m
     assert found.highest == max(point["best"] for point in found.curve)
 
 
+@dataclass(frozen=True)
+class Narrow(Reach):
+    """Trajectories that come near the goal break down alone; in a batch they do not."""
+
+    def evaluate(self, actions: Tensor) -> Outcome:
+        outcome = super().evaluate(actions)
+        broken = (len(actions) == 1) & (outcome.returns > -0.5)
+        return replace(outcome, returns=torch.where(broken, -100.0, outcome.returns), success=outcome.success & ~broken)
+
+
+def test_of_what_breaks_down_alone_the_next_is_chosen(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("torchdlo.agents.search._FINALISTS", 64)
+    found = optimize(Narrow(), replace(SMALL, episodes=160, method="cmaes"))
+    assert found.highest > -0.5 > returned(found) > -2
+    assert found.searched == pytest.approx(returned(found))
+
+
 @pytest.mark.parametrize("method", METHODS)
 def test_what_has_no_number_is_never_chosen_and_hides_nothing(method: str) -> None:
     found = optimize(Broken(), replace(SMALL, method=method, episodes=160))

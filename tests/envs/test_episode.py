@@ -165,3 +165,25 @@ def test_scores_are_0_for_doing_nothing_and_1_for_the_way_by_hand():
     score = episode.normalized(task, returns, compiled=False)
     torch.testing.assert_close(score[:2], score.new_tensor([0.0, 1.0]), atol=1e-6, rtol=0)
     assert 0 < float(score[2]) < 1
+
+
+def test_a_hand_in_a_post_has_failed_and_one_above_it_has_not():
+    made = prepared("wiring_post")
+    way = made.start.tool.pos.new_tensor((0.28, 0.14, 0.0)) - made.start.tool.pos[:, 0]
+    step = torch.cat([way[:, :2] / 20, torch.zeros(2, 4, dtype=F64)], -1)
+    rise = torch.tensor([[0.0, 0.0, 0.008, 0, 0, 0]], dtype=F64).expand(2, -1)
+
+    def went(actions: list[torch.Tensor]) -> list[list[bool]]:
+        world, failed = made.start, []
+        with torch.no_grad():
+            for action in actions:
+                world = episode.act(made, world, action)
+                gap = (world.tool.pos[:, 0, :2] - world.tool.pos.new_tensor((0.28, 0.14))).norm(dim=-1)
+                inside = (gap < 0.02) & (world.tool.pos[:, 0, 2] < 0.04)
+                failed.append([*world.failed.tolist(), *inside.tolist()])
+        return failed
+
+    rows = went([step] * 20)
+    assert rows[0] == [False] * 4 and rows[-1] == [True] * 4
+    assert all(row[:2] == row[2:] for row in rows), "episodes fail with the first action that leads into the post"
+    assert not any(map(any, went([rise] * 6 + [step] * 20)))

@@ -1,9 +1,8 @@
 """Running tasks: from actions to joints, from joints to the ends that are held, and what an episode earned.
 
-Everything is a function of tensors with the scenes of a batch first; nothing here knows of TensorDict. Actions move the
-target of each tool from the pose that was reached last, inverse kinematics says where the joints go, and in the frames
-of an action the tool moves evenly from pose to pose with what it holds. Arms touch nothing: their links pass through
-ropes and bodies.
+Everything is a function of tensors, scenes of a batch first; nothing here knows of TensorDict. Actions move the target
+of each tool from the pose that was reached last, inverse kinematics says where the joints go, and in the frames of an
+action the tool moves evenly from pose to pose with what it holds. Links of arms pass through ropes and bodies.
 """
 
 from __future__ import annotations
@@ -23,6 +22,7 @@ from torchdlo.coupling.bodies import BodyTargets, turn_between, turn_by
 from torchdlo.coupling.grasp import Grasp, Hands
 from torchdlo.coupling.pose import Pose
 from torchdlo.coupling.robot import Robot, panda
+from torchdlo.envs.crash import inside
 from torchdlo.envs.stages import repeated
 from torchdlo.envs.task import Seen, Task, combined
 from torchdlo.errors import InputError
@@ -277,7 +277,7 @@ def act(episode: Episode, world: World, action: Tensor) -> World:
     state = _run(episode, world, found.pose, held, task.frames)
     held = tree.replace(held, closed=_slipped(episode, state, found.pose, held.closed))
     after = World(state, found.joints, found.handed, found.pose, held, world.notes, world.failed, world.count)
-    return tree.replace(_judged(task, world, after), count=world.count + 1)
+    return tree.replace(_judged(episode, world, after), count=world.count + 1)
 
 
 def _staged(episode: Episode, world: World, aim: Pose) -> tuple[Pose, Grasp]:
@@ -289,15 +289,16 @@ def _staged(episode: Episode, world: World, aim: Pose) -> tuple[Pose, Grasp]:
     return Pose(plan.steer(world.count, world.target.pos, aim.pos, x), aim.quat), held
 
 
-def _judged(task: Task, before: World, after: World) -> World:
+def _judged(episode: Episode, before: World, after: World) -> World:
     """Return the new world with its notes and failures, and the old one where the new one is not finite."""
-    good = scenes.finite(after.state)
+    task, good = episode.task, scenes.finite(after.state)
     after = tree.where(good, after, before)
-    seen = after.seen(task.arms.count)
-    after = tree.replace(after, notes={"rest": before.notes["rest"], **task.note(seen)})
+    notes = task.note(after.seen(task.arms.count))
+    after = tree.replace(after, notes={"rest": before.notes["rest"], **notes})
     seen = after.seen(task.arms.count)
     torn = task.rest(seen) > task.stretch * seen.notes["rest"]
-    return tree.replace(after, failed=before.failed | ~good | torn | task.failed(seen))
+    stuck = (inside(episode.scene, episode.params, after.state, after.tool.pos) & (seen.closed[..., 0] > 0)).any(-1)
+    return tree.replace(after, failed=before.failed | ~good | torn | stuck | task.failed(seen))
 
 
 def finish(episode: Episode, world: World) -> World:
@@ -307,7 +308,7 @@ def finish(episode: Episode, world: World) -> World:
         return world
     held = tree.replace(world.grasp, closed=torch.zeros_like(world.grasp.closed))
     state = _run(episode, world, world.tool, held, task.release)
-    return _judged(task, world, tree.replace(world, state=state, grasp=held))
+    return _judged(episode, world, tree.replace(world, state=state, grasp=held))
 
 
 def earned(episode: Episode, world: World) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
@@ -316,8 +317,7 @@ def earned(episode: Episode, world: World) -> tuple[Tensor, Tensor, dict[str, Te
     terms = task.rewards(seen)
     reward = combined(task, terms)
     loss = sum(task.extra(seen).values(), -reward)
-    nothing = torch.zeros_like(reward)
-    return torch.where(world.failed, nothing, reward), torch.where(world.failed, nothing, loss), terms
+    return torch.where(world.failed, 0.0, reward), torch.where(world.failed, 0.0, loss), terms
 
 
 def observe(episode: Episode, world: World) -> Tensor:
