@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from tests.agents.problems import Drag, Peaks, Plain, Push, Reach, signature
+from torchdlo.agents.plan import ranking
 from torchdlo.agents.problem import Outcome
 from torchdlo.agents.search import METHODS, Found, Robust, Settings, optimize
 from torchdlo.errors import InputError
@@ -140,6 +141,33 @@ def test_a_trajectory_that_succeeds_also_alone_is_chosen_before_one_that_earns_m
     assert found.highest > found.searched == pytest.approx(returned(found))
     # Those that did not succeed alone are not chosen, and had earned more.
     assert found.highest == max(point["best"] for point in found.curve)
+
+
+@dataclass(frozen=True)
+class Latch(Reach):
+    """Earns the same for all but a way once round a circle; the loss says how far a way is from that."""
+
+    def evaluate(self, actions: Tensor) -> Outcome:
+        turn = torch.linspace(0, 2 * torch.pi, self.horizon + 1, dtype=actions.dtype)[1:]
+        circle = 0.025 * torch.stack([1 - turn.cos(), turn.sin(), 0 * turn], -1)
+        far = (actions.cumsum(1) - circle).square().sum(-1).mean(-1)
+        done = far < 0.003**2
+        outcome = super().evaluate(actions)
+        return replace(outcome, returns=1.0 + done.to(far), loss=far - 1.0 - done.to(far), success=done)
+
+
+def test_where_all_earn_the_same_the_hybrid_follows_the_loss() -> None:
+    found = optimize(Latch(), Settings("hybrid", episodes=256, population=16, hold=5))
+    assert bool(found.outcome.success[0]) and returned(found) == 2
+    assert found.curve[0]["best"] == 1, "it is not met by chance"
+
+
+def test_trajectories_are_ranked_by_return_and_then_by_loss() -> None:
+    returns = torch.tensor([1.0, 2.0, 2.00001, -torch.inf, 2.1, 2.0], dtype=torch.float64)
+    loss = torch.tensor([-9.0, 0.3, 0.4, torch.inf, 7.0, 0.1], dtype=torch.float64)
+    assert ranking(returns, loss).tolist() == [4, 5, 1, 2, 0, 3]
+    assert ranking(torch.zeros(3), torch.tensor([2.0, torch.inf, 1.0])).tolist() == [2, 0, 1]
+    assert ranking(torch.full((2,), -torch.inf), torch.full((2,), torch.inf)).tolist() == [0, 1]
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,7 @@ from torch import Tensor
 
 from torchdlo.agents.cmaes import drawn, strategy
 from torchdlo.agents.lbfgs import Descent
-from torchdlo.agents.plan import Ask, Plan, Search, Told, costs, sweeps, walks
+from torchdlo.agents.plan import Ask, Plan, Search, Told, ranking, sweeps, walks
 
 __all__ = ["hybrid"]
 
@@ -87,7 +87,9 @@ class _Evolution:
         """Learn from how that went."""
         told = replace(told, slope=self.encoding.pull(self.x, told.slope))
         if self.found is not None:
-            self.found.tell(list(self.x.numpy()), costs(told).tolist())
+            # The strategy looks at nothing but the order.
+            place = ranking(told.returns, told.loss).argsort()
+            self.found.tell(list(self.x.numpy()), place.double().tolist())
         if self.lines is None:
             self.lines = _Lines(self.x, told, max(1, round(_LINES * self.plan.population)))
         else:
@@ -100,7 +102,7 @@ class _Lines:
     """Points that go down their slopes within an evolution strategy, the best first at the start."""
 
     def __init__(self, x: Tensor, told: Told, count: int) -> None:
-        best = told.returns.argsort(descending=True, stable=True)[:count]
+        best = ranking(told.returns, told.loss)[:count]
         self.x, self.returns, self.loss, self.slope = x[best], told.returns[best], told.loss[best], told.slope[best]
         # A drawn point lies about the root of the dimension away from the mean; half of it is a step.
         self.first = 0.5 * math.sqrt(x.shape[1])
@@ -120,7 +122,7 @@ class _Lines:
         down = told.loss[:n] < self.loss[active]
         self.length[active] *= torch.where(down, 2.0, 0.5)
         self._put(active[down], x, told, torch.arange(n)[down])
-        fresh = told.returns[n:].argsort(descending=True, stable=True)[: len(self.x) // 2] + n
+        fresh = ranking(told.returns[n:], told.loss[n:])[: len(self.x) // 2] + n
         value = torch.where(self.length > _SHORT * self.first, self.returns, -math.inf)
         worst = value.argsort(stable=True)[: len(fresh)]
         better = told.returns[fresh] > value[worst]

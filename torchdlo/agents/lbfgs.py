@@ -10,7 +10,7 @@ import math
 import torch
 from torch import Tensor
 
-from torchdlo.agents.plan import Plan, Told, walks
+from torchdlo.agents.plan import Plan, Told, ranking, walks
 
 __all__ = ["Descent"]
 
@@ -42,15 +42,13 @@ class Descent:
         self.best = (-math.inf, empty.new_zeros(self.encoding.size))
 
     def offer(self, x: Tensor, told: Told) -> None:
-        """Take what earns more than the lines do; told slopes are by actions, shape (P, T A)."""
+        """Take what is better than the lines; told slopes are by actions, shape (P, T A)."""
         self._note(x, told)
-        best = torch.cat([self.returns, told.returns]).argsort(descending=True, stable=True)[: self.count]
+        returns, loss = torch.cat([self.returns, told.returns]), torch.cat([self.loss, told.loss])
+        best = ranking(returns, loss)[: self.count]
         none = torch.zeros(_PAIRS, *x.shape, dtype=x.dtype)
         self.x, self.slope = torch.cat([self.x, x])[best], torch.cat([self.slope, told.slope])[best]
-        self.returns, self.loss = (
-            torch.cat([self.returns, told.returns])[best],
-            torch.cat([self.loss, told.loss])[best],
-        )
+        self.returns, self.loss = returns[best], loss[best]
         self.step = torch.cat([self.step, torch.full_like(told.loss, self.plan.rate)])[best]
         self.moved, self.turned = (torch.cat([old, none], 1)[:, best] for old in (self.moved, self.turned))
 

@@ -11,7 +11,10 @@ from torch import Tensor
 
 from torchdlo.agents.problem import Encoding, Problem
 
-__all__ = ["Ask", "Plan", "Search", "Told", "costs", "sweeps", "walks"]
+__all__ = ["Ask", "Plan", "Search", "Told", "costs", "ranking", "sweeps", "walks"]
+
+_ALIKE = 1e-4
+"""Share of the largest return by which returns differ that are not to be told apart."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,3 +123,19 @@ def costs(told: Told) -> Tensor:
     good = torch.isfinite(told.returns)
     worst = (-told.returns[good]).max() if bool(good.any()) else told.returns.new_zeros(())
     return torch.where(good, -told.returns, worst + 1)
+
+
+def ranking(returns: Tensor, loss: Tensor) -> Tensor:
+    """Return indices, the best first: of the larger return; where returns are alike, of the smaller loss; shape (P,).
+
+    Returns may be flat until something is touched, while the loss leads there.
+
+    Args:
+        returns: shape (P,).
+        loss: shape (P,).
+    """
+    good = returns[torch.isfinite(returns)].abs()
+    grain = _ALIKE * float(good.max()) if len(good) else 0.0
+    coarse = (returns / grain).round() if grain else returns
+    first = loss.argsort(stable=True)
+    return first[coarse[first].argsort(descending=True, stable=True)]

@@ -177,9 +177,7 @@ def optimize(
     )
 
 
-def _alone(
-    problem: Problem, finalists: Sequence[_Finalist], robust: bool
-) -> tuple[_Finalist, Outcome, dict[str, Any]]:
+def _alone(problem: Problem, finalists: Sequence[_Finalist], robust: bool) -> tuple[_Finalist, Outcome, dict[str, Any]]:
     """Return the one that does best alone, of those that promise more than any before them did there.
 
     What rests on a narrow escape does not do alone what it did in a batch, where numbers are rounded otherwise. Returns
