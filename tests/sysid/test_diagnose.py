@@ -333,6 +333,11 @@ def test_nothing_counts_as_explained_where_the_floor_is_not_known() -> None:
     assert word(["stretch"], 1e-3, float("inf")) == "partial"
 
 
+def test_effects_that_leave_the_gap_as_it_was_do_not_explain_it() -> None:
+    assert [word(["wind"], 2e-3, 1e-3, share) for share in (0.3, 0.9, 1.1)] == ["effects", "partial", "partial"]
+    assert word([], 2e-3, 1e-3, 1.0) == "none"
+
+
 @pytest.mark.parametrize(("cost", "named"), [(0.7e-3, "air_drag"), (1.5e-3, "wind")])
 def test_a_special_law_takes_the_place_of_a_general_one_that_fits_no_better(cost: float, named: str) -> None:
     def model(left: float, *effects: str) -> SimpleNamespace:
@@ -342,7 +347,9 @@ def test_a_special_law_takes_the_place_of_a_general_one_that_fits_no_better(cost
     bench = SimpleNamespace(exchange=lambda *job: job[1:3], fit=lambda jobs: [plain] * len(jobs), tie=twentieth)
     revision = Revision(bench, BUDGETS["fast"], [model(9e-3), model(6e-3)], lambda *_: None)
     found = Found({"wind": 0.5, "time_delay": 0.4}, {"wind": ["tilted_gravity"], "time_delay": []})
-    fitted = revision.plainer(model(0.5e-3, "wind", "time_delay"), found)
+    wind = model(0.5e-3, "wind", "time_delay")
+    assert revision.plainer(wind, found, ["wind", "time_delay"]) is wind, "air drag is not to be looked for"
+    fitted = revision.plainer(wind, found, ["wind", "time_delay", "air_drag"])
     assert list(found.shares) == [named, "time_delay"] == list(found.ties) == list(fitted.effects)
     assert found.ties[named] == ["tilted_gravity", "wind"][: 1 + (named == "air_drag")]
 

@@ -145,7 +145,7 @@ class _Search:
             found.shares[name] += (self._squared(best) - self._squared(base)) / whole
             base = self.revision.exchanged(self.revision.pruned(base, found), found, self._possible())
             self._say_floor()
-        base = self.revision.plainer(self.revision.pruned(base, found), found)
+        base = self.revision.plainer(self.revision.pruned(base, found), found, self._possible())
         return self._conclude(base, found, rounds)
 
     def _anew(self, base: Fitted) -> Fitted | None:
@@ -323,7 +323,7 @@ class _Search:
         trials, train = self.bench.trials, len(self.bench.trials["train"])
         simulated = {"before": self.before, "after": self.bench.prediction(final, "all")}
         before, after = (gap(sims[train:], trials["test"]) for sims in simulated.values())
-        verdict = word(effects, rms(self.bench.gaps(final, "test")), self.bench.level)
+        verdict = word(effects, rms(self.bench.gaps(final, "test")), self.bench.level, rms(after) / rms(before))
         model = self.pool.local.model(final.effects, final.options)
         said = [*baselines.notes(self.baseline), *clamps.notes(model, final), *self.bench.notes()]
         predictions = {

@@ -90,14 +90,14 @@ class Revision:
                 found.leave_out(name)
         return fitted
 
-    def plainer(self, fitted: Fitted, found: Found) -> Fitted:
-        """Return the model with special laws in the place of general ones, where they fit as well.
+    def plainer(self, fitted: Fitted, found: Found, possible: Sequence[str]) -> Fitted:
+        """Return the model with possible special laws in the place of general ones, where they fit as well.
 
         What one effect alone cannot explain bends a law with more numbers than it needs; with the others it may do
         without them.
         """
         for general, (special, _) in library.CONTAINED.items():
-            if general not in found.shares or special in fitted.effects:
+            if general not in found.shares or special in fitted.effects or special not in possible:
                 continue
             less = self.bench.fit([self.bench.exchange(fitted, general, special, self.budget.more)])[0]
             self.report(f"{special} in the place of {general}", 1, 1, f"{1e3 * less.point.cost:.2f} mm")

@@ -16,6 +16,9 @@ from torchdlo.sysid.model import RopeModel
 UNEXPLAINED = 3.0
 """Times the floor: a gap beyond that is not explained."""
 
+_SHRUNK = 0.8
+"""Share of a gap that effects may leave at most if they are to explain it."""
+
 UNKNOWN_FLOOR = (
     "Finer simulations of the calibrated model fail or differ from it by more than 5 cm: how well a perfect model "
     "could do is not known, so nothing counts as explained. Look at the first frames, and at the rope's length and "
@@ -24,9 +27,16 @@ UNKNOWN_FLOOR = (
 """Note where nothing is known of the simulation's own errors."""
 
 
-def word(effects: Sequence[str], left: float, level: float) -> str:
-    """Return the verdict on a gap [m] where a perfect model leaves `level`; where that is not known, none is small."""
-    explained = np.isfinite(level) and left <= UNEXPLAINED * level
+def word(effects: Sequence[str], left: float, level: float, share: float = 0.0) -> str:
+    """Return the verdict on a gap [m] where a perfect model leaves `level`; where that is not known, none is small.
+
+    Args:
+        effects: what was found.
+        left: the gap, weighted by what frames tell.
+        level: the same of a perfect model.
+        share: share of the plain gap that is left.
+    """
+    explained = np.isfinite(level) and left <= UNEXPLAINED * level and not (effects and share > _SHRUNK)
     return ("effects" if explained else "partial") if effects else ("none" if explained else "unknown")
 
 
