@@ -93,8 +93,8 @@ def solve(task: str, args: Any) -> list[tuple[Case, dict[str, Any]]]:
     with progress() as show, deferred_interrupt(show) as callback:
 
         def pulse() -> None:
-            done, total, words = zip(*said.values(), strict=True) if said else ((0,), (1,), ("",))
-            callback("optimize", sum(done), max(sum(total), 1), f"{task} {words[0]}")
+            done, total, words = zip(*said.values(), strict=True)
+            callback("optimize", sum(done), sum(total), f"{task}: {', '.join(filter(None, words))}")
 
         def searching(case: Case) -> Any:
             def note(_: str, done: int, total: int, words: str) -> None:
