@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchdlo.agents.plan import Ask, Plan, Search, costs
+from torchdlo.agents.plan import Ask, Plan, Search, Told
 from torchdlo.agents.problem import Encoding
 from torchdlo.errors import InputError
 
@@ -60,4 +60,11 @@ def cmaes(plan: Plan, rng: torch.Generator) -> Search:
         while not found.stop():
             x = drawn(found, encoding)
             told = yield Ask(encoding, x)
-            found.tell(list(x.numpy()), costs(told).tolist())
+            found.tell(list(x.numpy()), _costs(told).tolist())
+
+
+def _costs(told: Told) -> Tensor:
+    """Return costs to be minimised, shape (P,): what has no number is worse than everything that has one."""
+    good = torch.isfinite(told.returns)
+    worst = (-told.returns[good]).max() if bool(good.any()) else told.returns.new_zeros(())
+    return torch.where(good, -told.returns, worst + 1)

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchdlo.agents.problem import Encoding, Problem
 
-__all__ = ["Ask", "Plan", "Search", "Told", "costs", "ranking", "sweeps", "walks"]
+__all__ = ["Ask", "Plan", "Search", "Told", "ranking", "sweeps", "walks"]
 
 _ALIKE = 1e-4
 """Share of the largest return by which returns differ that are not to be told apart."""
@@ -116,13 +116,6 @@ def sweeps(plan: Plan, encoding: Encoding, rng: torch.Generator) -> Tensor:
     leg = torch.arange(knots)[None] * (1 + each % 3)[:, None] // knots
     moves = ways[each[:, None], leg]
     return encoding.project(encoding.encode(torch.cat([torch.zeros_like(moves[:1]), moves[1:]])))
-
-
-def costs(told: Told) -> Tensor:
-    """Return costs to be minimised, shape (P,): what has no number is worse than everything that has one."""
-    good = torch.isfinite(told.returns)
-    worst = (-told.returns[good]).max() if bool(good.any()) else told.returns.new_zeros(())
-    return torch.where(good, -told.returns, worst + 1)
 
 
 def ranking(returns: Tensor, loss: Tensor) -> Tensor:
