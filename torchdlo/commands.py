@@ -302,7 +302,8 @@ def play(
     said = outcome_of(went) | {"files": [str(file) for file in files.values() if file.exists()]}
     how = "failed" if said["failed"] else "success" if said["success"] else "no success"
     earned = "interrupted" if went is None else f"return {said['return']:.4g}, {how}"
-    typer.echo(f"{task}: {earned}", err=as_json)
+    missed = f"; do not trust it: {said['missed']}" if said["missed"] else ""
+    typer.echo(f"{task}: {earned}{missed}", err=as_json)
     typer.echo("\n".join(said["files"]), err=as_json)
     if as_json:
         typer.echo(json.dumps(said, indent=1))

@@ -127,15 +127,18 @@ class Missing(Lead):
 def test_a_trajectory_that_cannot_be_trusted_says_so(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    words = ["optimize", "lead", "--episodes", "4", "--population", "4", "--no-compiled", "--json"]
+    words = ["--episodes", "4", "--population", "4", "--no-compiled", "--json"]
     for kind, missed in ((Lead, ""), (Missing, "an edge became 20% shorter than it has to be")):
         monkeypatch.setitem(envs.TASKS, "lead", kind)
-        with pytest.raises(SystemExit):
-            cli.main([*words, "--out", str(tmp_path / kind.__name__)])
-        said = capsys.readouterr()
-        found = json.loads(said.out)["missed"]
-        assert found.startswith(missed) and bool(found) == bool(missed)
-        assert ("do not trust it: an edge became" in said.err) == bool(missed)
+        out = tmp_path / kind.__name__
+        found = ["--trajectory", str(out / "trajectory.json"), "--out", str(out / "play"), "--json"]
+        for command in (["optimize", "lead", *words, "--out", str(out)], ["play", "lead", *found]):
+            with pytest.raises(SystemExit):
+                cli.main(command)
+            said = capsys.readouterr()
+            told = json.loads(said.out)["missed"]
+            assert told.startswith(missed) and bool(told) == bool(missed)
+            assert ("do not trust it: an edge became" in said.err) == bool(missed)
 
 
 @pytest.mark.parametrize(

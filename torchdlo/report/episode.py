@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from torchdlo.coupling import robot as robots
+from torchdlo.coupling import watch
 from torchdlo.envs import Task, episode
 from torchdlo.errors import InputError
 from torchdlo.run import Frames, appearance
@@ -94,11 +95,12 @@ def _look(task: Task, start: episode.World) -> np.ndarray:
 def outcome_of(went: episode.Outcome | None) -> dict[str, Any]:
     """Return what an episode of one scene came to, as plain data; None stands for one that was interrupted."""
     if went is None:
-        return dict.fromkeys(("return", "success", "failed", "rewards")) | {"interrupted": True}
+        return dict.fromkeys(("return", "success", "failed", "missed", "rewards")) | {"interrupted": True}
     return {
         "return": float(went.returns[0]),
         "success": bool(went.success[0]),
         "failed": bool(went.failed[0]),
+        "missed": watch.explain(went.world.state.missed),
         "rewards": went.rewards[:, 0].tolist(),
         "interrupted": False,
     }
