@@ -25,6 +25,8 @@ BALL_Y, CUBE_Y = 0.06, 0.23
 """Where they start [m]."""
 DRAW = 0.1
 """How far back the loss would have the band [m]."""
+SNAP = 50.0
+"""How fast the band becomes within a step when it is let go [m/s]."""
 SLIPPERY = 0.02
 """Friction of the table with what lies on it [1]."""
 
@@ -54,7 +56,7 @@ class Slingshot(Task):
             Solid("sphere", 0.02, ball, density=200.0, mu_s=1.0, mu_k=1.0),
             Solid("box", (0.04, 0.04, 0.04), cube, density=20.0, mu_s=1.0, mu_k=1.0),
         ]
-        return make(self, [band], solids=solids, fixed=(0, 1, 10, 11))
+        return make(self, [band], solids=solids, fixed=(0, 1, 10, 11), burst=SNAP)
 
     def rewards(self, seen: Seen) -> dict[str, Tensor]:
         """Return how far away the cube is."""

@@ -292,6 +292,7 @@ def make(
     fixed: Sequence[int] = (),
     matter: tuple = (),
     held: Sequence[int] | None = None,
+    burst: float = 1.0,
 ) -> tuple[Scene, Params, State]:
     """Return a scene with what all tasks share: 1 ms in five substeps, gravity, damping, friction, a floor at z = 0.
 
@@ -309,13 +310,14 @@ def make(
         fixed: vertices that stay in their places, beside those that arms hold.
         matter: its matter, as `coupling.particles.assemble` returns it.
         held: vertices that can be held at all, if others than those of the arms.
+        burst: by how much vertices may speed up within a step, beside half their speed [m/s].
     """
     elastic = all(isinstance(r.stretch, Tensor) or math.isfinite(r.stretch) for r in ropes)
     floor = not any(s.shape == "plane" for s in solids)
     room = 3 * sum(r.positions.shape[-2] for r in ropes)
     own = [] if task.rope is None else task.rope.laws
     effects = [*(e for e in effects if e.name not in {o.name for o in own}), *own]
-    acting: list[Effect] = [Gravity(), Damping(), RodContact(sweeps=5, room=room), *effects]
+    acting: list[Effect] = [Gravity(), Damping(), RodContact(sweeps=5, room=room, burst=burst), *effects]
     if not any(e.name == "bend" for e in effects):
         framed = any(e.frame_bending for e in effects) or (task.rope is not None and task.rope.curvature)
         acting.append(BendFrame() if framed else Bend())
