@@ -1,12 +1,11 @@
 """What episodes cost: frames of 1 ms per second, summed over environments, for every task.
 
-Measured are whole actions as `torchdlo.envs.episode.act` runs them: inverse kinematics, 20 frames of five substeps, and
-the reward. With gradients, the reward of a window of actions is differentiated by them. CPU seconds are counted, as
-other work on the machine may take turns with this one; rates are summed over processes of one thread each that start
-together and share the environments. Steps are recorded where no gradients are asked for, and compiled where they are,
-unless --steps says otherwise. Beside each row stands the figure that DLO-Lab published for an L40S GPU, for
-orientation: another machine, and other code for the same scene. Rows that the JSON file has already are not measured
-again.
+Measured are `reset` and `step` of the TorchRL environment: inverse kinematics, 20 frames of five substeps, the reward
+and the observation. With gradients, the reward of an action is differentiated by it; what that takes stays in memory,
+so that nothing is run again. CPU seconds are counted, as other work on the machine may take turns with this one; rates
+are summed over processes of one thread each that start together and share the environments. Steps are compiled, unless
+--steps says otherwise. Beside each row stands the figure that DLO-Lab published for an L40S GPU, for orientation:
+another machine, and other code for the same scene. Rows that the JSON file has already are not measured again.
 
 examples:
   python experiments/bench_env.py --quick
@@ -58,26 +57,22 @@ def work(case: Case, share: int, go: Any, results: Any) -> None:
     """Time a share of a case in this process: put None when ready, wait for `go`, put what was found."""
     import torch
 
-    from torchdlo.envs import episode, find
+    from torchdlo import envs
 
     torch.set_num_threads(1)
-    task, backward = find(case.task), case.mode == BOTH
-    ways = {"compiled": case.steps == "compiled", "recorded": case.steps == "recorded"}
-    action = torch.full((share, task.width), 1e-3)
+    backward = case.mode == BOTH
+    steps = {"compiled": case.steps == "compiled", "recorded": case.steps == "recorded"}
+    choices = {"gradients": backward, "segment": None, "variation": False, **steps}
 
-    def begin() -> Any:
-        return episode.prepare(task, share, segment=1, **ways)
-
-    def act(made: Any) -> None:
-        chosen = action.clone().requires_grad_(backward)
-        with torch.set_grad_enabled(backward):
-            world = episode.act(made, made.start, chosen)
-            reward = episode.earned(made, world)[0]
+    def act(env: Any) -> None:
+        start = env.reset()
+        action = torch.full_like(env.action_spec.zero(), 1e-3).requires_grad_(backward)
+        reward = env.step(start.set("action", action))["next", "reward"]
         if backward:
-            torch.autograd.grad(reward.sum(), chosen)
+            torch.autograd.grad(reward.sum(), action)
 
     found: list[Any] = []
-    first = clocked(lambda: (found.append(begin()), act(found[0])))[1]
+    first = clocked(lambda: (found.append(envs.make(case.task, num_envs=share, **choices)), act(found[0])))[1]
     act(found[0])
     results.put(None)
     go.wait()
@@ -85,7 +80,7 @@ def work(case: Case, share: int, go: Any, results: Any) -> None:
     while not actions or used < case.seconds:
         used += clocked(lambda: act(found[0]))[0]
         actions += 1
-    rate = actions * task.frames * share / used
+    rate = actions * found[0].task.frames * share / used
     results.put({"cpu": rate, "first_call_s": first, "peak_mb": peak_mb()})
 
 
@@ -115,9 +110,7 @@ def parsed() -> argparse.Namespace:
     parser.add_argument("--tasks", default="", help="names, separated by commas; all that are published if not given")
     parser.add_argument("--envs", default="1,10,50,100", help="environments (%(default)s)")
     parser.add_argument("--modes", default=f"{FORWARD},{BOTH}", help="of %(default)s")
-    parser.add_argument(
-        "--steps", default="", choices=("", *STEPS), help="recorded forward, else compiled if not given"
-    )
+    parser.add_argument("--steps", default="compiled", choices=STEPS, help="how steps are run (%(default)s)")
     parser.add_argument("--seconds", type=float, default=5.0, help="CPU seconds per row and process (%(default)s)")
     parser.add_argument("--workers", type=count, default=2, help="processes that share the environments (%(default)s)")
     parser.add_argument("--json", default="", help="file for the rows")
@@ -142,13 +135,7 @@ def cases(choices: argparse.Namespace) -> list[Case]:
         envs, modes, seconds = [1, 10], [FORWARD], 1.0
     if choices.smoke:
         names, envs, seconds, steps = names[:1], [1], 0.0, "plain"
-    usual = {FORWARD: "recorded", BOTH: "compiled"}
-    return [
-        Case(name, n, mode, steps or usual[mode], choices.workers, seconds)
-        for name in names
-        for n in envs
-        for mode in modes
-    ]
+    return [Case(name, n, mode, steps, choices.workers, seconds) for name in names for n in envs for mode in modes]
 
 
 def known(path: str) -> list[dict[str, Any]]:
