@@ -7,6 +7,9 @@ are summed over processes of one thread each that start together and share the e
 --steps says otherwise. Beside each row stands the figure that DLO-Lab published for an L40S GPU, for orientation:
 another machine, and other code for the same scene. Rows that the JSON file has already are not measured again.
 
+With --memory: peak memory of the gradient of an episode's return with respect to all its actions, ten environments that
+run five frames again at once, over 200 and over 2 000 frames.
+
 examples:
   python experiments/bench_env.py --quick
   python experiments/bench_env.py --tasks coiling,wrapping --envs 1,10,100 --json bench_env.json
@@ -22,7 +25,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from bench_rod import BOTH, FORWARD, clocked, gathered, peak_mb
+from bench_rod import BOTH, FORWARD, clocked, gathered, peak_mb, processes, receive, start
 from options import Parser, count, save
 
 STEPS = ("plain", "recorded", "compiled")
@@ -38,6 +41,8 @@ PUBLISHED = {
     ("forward+backward", 100): (3015.49, 300.56, 245.21, 1655.18, 661.25, 1134.70, 2509.35, 1048.17),
 }
 """Frames per second on one L40S, summed over environments."""
+SEGMENT = 5
+"""Frames that are run again at once where memory is measured."""
 
 
 @dataclass(frozen=True)
@@ -84,6 +89,37 @@ def work(case: Case, share: int, go: Any, results: Any) -> None:
     results.put({"cpu": rate, "first_call_s": first, "peak_mb": peak_mb()})
 
 
+def remember(task: str, actions: int, compiled: bool, go: Any, results: Any) -> None:
+    """Put the peak memory of the gradient of a return, first calls not counted."""
+    import torch
+
+    from torchdlo import envs
+
+    torch.set_num_threads(1)
+    choices = {"gradients": True, "compiled": compiled, "variation": False, "segment": SEGMENT}
+    env = envs.make(task, num_envs=10, **choices)
+    ways = [torch.full_like(env.action_spec.zero(), 1e-3).requires_grad_() for _ in range(actions)]
+
+    def gradient(chosen: list[Any]) -> None:
+        td, earned = env.reset(), 0.0
+        for action in chosen:
+            stepped, td = env.step_and_maybe_reset(td.set("action", action))
+            earned = earned + stepped["next", "reward"].sum()
+        torch.autograd.grad(earned, chosen)
+
+    gradient(ways[:2])
+    before = peak_mb(restart=True)
+    gradient(ways)
+    results.put({"frames": actions * env.task.frames, "before_mb": before, "peak_mb": peak_mb()})
+
+
+def memory(task: str, actions: int, compiled: bool) -> dict[str, Any]:
+    """Return the memory of the gradient of a return of so many actions."""
+    with processes(remember, [(task, actions, compiled)]) as (jobs, _, results):
+        start(jobs)
+        return {"task": task, **receive(jobs, results)}
+
+
 def measure(case: Case) -> dict[str, Any]:
     """Return the row of a case."""
     found = gathered(work, case)
@@ -114,19 +150,26 @@ def parsed() -> argparse.Namespace:
     parser.add_argument("--seconds", type=float, default=5.0, help="CPU seconds per row and process (%(default)s)")
     parser.add_argument("--workers", type=count, default=2, help="processes that share the environments (%(default)s)")
     parser.add_argument("--json", default="", help="file for the rows")
+    parser.flag("memory", "memory instead of speed")
     parser.flag("quick", "one and ten environments without gradients, one second per row")
     parser.flag("smoke", "one task, one environment: does it run?")
     return parser.parse_args()
 
 
-def cases(choices: argparse.Namespace) -> list[Case]:
-    """Return what is timed."""
+def names(choices: argparse.Namespace) -> list[str]:
+    """Return the names of the tasks."""
     from torchdlo.envs import TASKS
 
-    names = [n for n in choices.tasks.split(",") if n] or list(NAMES)
-    wrong = sorted(set(names) - set(TASKS))
+    found = [n for n in choices.tasks.split(",") if n] or list(NAMES)
+    wrong = sorted(set(found) - set(TASKS))
     if wrong:
         sys.exit(f"bench_env: there is no task {', '.join(wrong)}; known are {', '.join(TASKS)}")
+    return found
+
+
+def cases(choices: argparse.Namespace) -> list[Case]:
+    """Return what is timed."""
+    chosen = names(choices)
     modes = [m for m in choices.modes.split(",") if m]
     if not modes or not set(modes) <= {FORWARD, BOTH}:
         sys.exit(f"bench_env: --modes is {choices.modes!r}; expected some of {FORWARD}, {BOTH}")
@@ -134,8 +177,8 @@ def cases(choices: argparse.Namespace) -> list[Case]:
     if choices.quick:
         envs, modes, seconds = [1, 10], [FORWARD], 1.0
     if choices.smoke:
-        names, envs, seconds, steps = names[:1], [1], 0.0, "plain"
-    return [Case(name, n, mode, steps, choices.workers, seconds) for name in names for n in envs for mode in modes]
+        chosen, envs, seconds, steps = chosen[:1], [1], 0.0, "plain"
+    return [Case(name, n, mode, steps, choices.workers, seconds) for name in chosen for n in envs for mode in modes]
 
 
 def known(path: str) -> list[dict[str, Any]]:
@@ -148,6 +191,15 @@ def known(path: str) -> list[dict[str, Any]]:
 def main() -> None:
     """Print and keep one row per task, number of environments, and mode."""
     choices = parsed()
+    if choices.memory:
+        lengths = (1, 2) if choices.smoke else (10, 100)
+        rows = [memory(name, actions, not choices.smoke) for name in names(choices) for actions in lengths]
+        for row in rows:
+            print(
+                f"{row['task']:<12} {row['frames']:>5} frames {row['peak_mb']:6.0f} MB, {row['before_mb']:.0f} before"
+            )
+        save(choices.json, {"cores": os.cpu_count(), "memory": rows})
+        return
     rows = known(choices.json)
     for case in cases(choices):
         same = ("task", "scenes", "mode", "steps")

@@ -104,6 +104,9 @@ def test_the_benchmark_of_tasks_writes_its_rows(tmp_path: Path) -> None:
     rows = json.loads(target.read_text())["rows"]
     assert [row["mode"] for row in rows] == ["forward", "forward+backward"]
     assert all(row["frames_per_cpu_s"] > 0 and row["published"] > 0 for row in rows)
+    done = call(EXPERIMENTS / "bench_env.py", "--memory", "--smoke", "--tasks", "unknotting", "--json", target)
+    assert done.returncode == 0, done.stderr
+    assert [row["frames"] for row in json.loads(target.read_text())["memory"]] == [20, 40]
     done = call(EXPERIMENTS / "bench_env.py", "--tasks", "knot")
     assert done.returncode == 1 and "there is no task knot; known are coiling" in done.stderr
 
