@@ -7,12 +7,12 @@ from functools import partial
 
 import pytest
 import torch
-from matter import DOUBLE, ONE, OPEN, ball, momenta
+from matter import DOUBLE, OPEN, momenta
+from meetings import SHAPES, meeting
 
 from torchdlo import scene
 from torchdlo.coupling import BodyMatter, mpm
-from torchdlo.coupling.bodies import Solid, conjugate, foresee, hold, place
-from torchdlo.coupling.body_matter import exchange
+from torchdlo.coupling.bodies import Solid, conjugate
 from torchdlo.coupling.laws import Elastic, Liquid
 from torchdlo.coupling.particles import Blob, Grid, assemble, fill_box
 from torchdlo.coupling.rod_matter import RodMatter
@@ -81,57 +81,6 @@ def test_a_ball_and_the_block_that_it_hits_keep_their_momentum(vel, mu):
     assert turned > 1.0 if mu else turned < 1e-9  # a smooth ball does not begin to spin
     assert float((after[0] - before[0]).norm()) / scale < 1e-12
     assert float((after[1] - before[1]).norm()) / (0.1 * scale) < 1e-12
-
-
-SHAPES = {
-    "plane": ((), "kinematic"),
-    "sphere": (0.02, "free"),
-    "box": ((0.02, 0.03, 0.015), "free"),
-    "capsule": ((0.015, 0.02), "free"),
-    "cylinder": ((0.02, 0.02), "free"),
-    "cone": ((0.025, 0.05), "free"),
-    "torus": ((0.025, 0.012), "free"),
-    "ring": ((0.025, 0.012, 4.0), "free"),
-    "mesh": ((0.04,) * 3, "free"),
-}
-
-
-def a_mesh():
-    """Distances of a ball of 2 cm on a grid of 17 corners along each side."""
-    line = torch.linspace(-0.04, 0.04, 17, dtype=DOUBLE)
-    return torch.stack(torch.meshgrid(line, line, line, indexing="ij"), -1).norm(dim=-1) - 0.02
-
-
-def meeting(names, effect, mu=0.4):
-    """Matter at random velocities and bodies that overlap it, before and after one exchange."""
-    medium, matter, state = ball(Elastic(), batch=(2,), shake=0.3)
-    generator, solids = torch.Generator().manual_seed(0), []
-    for k, name in enumerate(names):
-        size, motion = SHAPES[name]
-        speed = {"vel": (0.1, -0.2, 0.3 - 0.5 * k), "omega": (3.0, -2.0, 4.0)} if motion == "free" else {}
-        bulk = {"mass": 0.05, "inertia": (8e-6, 1e-5, 1.2e-5)} if motion == "free" else {}
-        grid = a_mesh() if name == "mesh" else None
-        quat = torch.randn(4, generator=generator, dtype=DOUBLE)
-        quat = quat if motion == "free" else (1.0, 0.0, 0.0, 0.0)
-        solids.append(
-            Solid(
-                name,
-                size,
-                (0.1, 0.105, 0.08 + 0.04 * k),
-                quat,
-                motion=motion,
-                mu_s=mu,
-                mu_k=mu,
-                grid=grid,
-                **speed,
-                **bulk,
-            )
-        )
-    bodies, params, placed = place(solids, state.pos)
-    motion = foresee(bodies, params, placed, hold(bodies, placed), 0.0, 0 * ONE, 2e-4)
-    nodes, _ = mpm.to_grid(medium, matter, state, 0 * ONE, 2e-4, ONE)
-    impulse, torque, after, lost = exchange(effect, medium.grid, nodes, motion, (2,))
-    return medium.grid, nodes, after, motion, (impulse, torque, lost)
 
 
 def sums(grid, nodes, motion, impulse, torque):

@@ -10,6 +10,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from torchdlo.coupling import shapes
 from torchdlo.coupling.bodies import BodyMotion
 from torchdlo.physics import native
 
@@ -87,6 +88,23 @@ def logical(x: Tensor, batch: Sequence[int]) -> Tensor:
     """Return (C, n, B) as (..., n, C)."""
     x = x.reshape(*x.shape[:2], *batch)
     return x.permute(*range(2, x.dim()), 1, 0)
+
+
+def kinds(motion: BodyMotion) -> list[int]:
+    """Return the shapes of bodies by their numbers in the kernels."""
+    return [tuple(shapes.SIZES).index(b.shape) for b in motion.bodies]
+
+
+def measures(motion: BodyMotion) -> tuple[Tensor, list[Tensor]]:
+    """Return how far in x shapes are from the centres of mass, and four numbers of their sizes, shape (..., K, C).
+
+    The size of a ring ends in cosine and sine of half its arc.
+    """
+    size = motion.params.size
+    ring = size.new_tensor([[float(b.shape == "ring")] for b in motion.bodies]) > 0
+    third, none = size[..., 2:], torch.zeros_like(size[..., 2:])
+    third, fourth = torch.where(ring, torch.cos(0.5 * third), third), torch.where(ring, torch.sin(0.5 * third), none)
+    return torch.where(ring, shapes.ring_centre(size), none), [size[..., :2], third, fourth]
 
 
 def alike(motion: BodyMotion) -> bool:

@@ -39,7 +39,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from torchdlo.coupling import shapes
+from torchdlo.coupling import body_near, shapes
 from torchdlo.coupling.bodies import BodyMotion, conjugate
 from torchdlo.coupling.coulomb import rub
 from torchdlo.coupling.mpm import Nodes, places
@@ -250,14 +250,17 @@ def exchange(
         motion: the bodies.
         batch: axes of the scenes, B of them.
     """
-    solids, points = _solids(motion, batch), places(grid, nodes)
-    chosen, near, lost = None, nodes, nodes.mass.new_zeros(nodes.mass.shape[0], 1)
-    if 0 < effect.room < points.shape[1]:
-        chosen, lost = _chosen(motion, solids, nodes, points, effect.reach * grid.spacing, effect.room)
+    solids, near, chosen = _solids(motion, batch), nodes, None
+    lost = nodes.mass.new_zeros(nodes.mass.shape[0], 1)
+    if 0 < effect.room < nodes.mass.shape[1]:
+        reach, room = effect.reach * grid.spacing, effect.room
+        if body_near.fits(motion):
+            chosen, lost = body_near.choose(motion, grid, nodes, batch, reach, room)
+        else:
+            chosen, lost = _chosen(motion, solids, nodes, places(grid, nodes), reach, room)
         index = chosen.unsqueeze(-1).expand(-1, -1, 3)
-        points = points.expand(chosen.shape[0], -1, -1).gather(1, index)
         near = tree.replace(nodes, mass=nodes.mass.gather(1, chosen), vel=nodes.vel.gather(1, index))
-    pairs = _pairs(effect, motion, solids, near, points, grid.spacing)
+    pairs = _pairs(effect, motion, solids, near, places(grid, near, chosen), grid.spacing)
     u = _sweep(pairs, solids, near.vel, effect.sweeps)
     push, torque = _felt(pairs, u)
     given = (pairs.answer * u.sum(1, keepdim=True)).squeeze(1)

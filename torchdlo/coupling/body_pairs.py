@@ -15,11 +15,10 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from torchdlo.coupling import balls, blocks, shapes
+from torchdlo.coupling import balls, blocks
 from torchdlo.coupling.bodies import BodyMotion
 from torchdlo.coupling.components import axes
 
-_ORDER = tuple(shapes.SIZES)
 _FIRST = "Tensor[] bodies"
 _LISTS = "int[] cells, int[] many, int[] shapes, int[] free, int[] pairs"
 _OTHERS = f"Tensor grids, Tensor balls, {_LISTS}, int points, int steps, float[] law"
@@ -88,11 +87,8 @@ blocks.operator(f"body_pairs_back({_FIRST}, Tensor by, {_OTHERS}) -> Tensor", _b
 def _members(motion: BodyMotion) -> list[Tensor]:
     """Return the fields of bodies in the order of the kernel, shape (..., K, C) each."""
     state, params = motion.state, motion.params
-    ring = state.pos.new_tensor([[float(b.shape == "ring")] for b in motion.bodies]) > 0
-    size, arc = params.size, params.size[..., 2:]
-    half, none = 0.5 * arc, torch.zeros_like(arc)
-    offset = torch.where(ring, shapes.ring_centre(size), none)
-    numbers = [size[..., :2], torch.where(ring, torch.cos(half), arc), torch.where(ring, torch.sin(half), none), arc]
+    offset, numbers = blocks.measures(motion)
+    numbers.append(params.size[..., 2:])
     moves = [state.vel, state.omega, motion.change, motion.turn, motion.mobility, motion.agility]
     laws = [params.mu_s, params.mu_k, params.restitution]
     return [state.pos, *itertools.chain(*axes(state.quat)), offset, *numbers, *moves, *laws]
@@ -121,7 +117,7 @@ def wrench(
         inscribed,
         cells,
         many,
-        [_ORDER.index(b.shape) for b in motion.bodies],
+        blocks.kinds(motion),
         [next(order) if b.motion == "free" else -1 for b in motion.bodies],
         list(itertools.chain(*pairs)),
         points,

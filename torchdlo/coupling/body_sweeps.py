@@ -16,13 +16,12 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from torchdlo.coupling import blocks, shapes
+from torchdlo.coupling import blocks
 from torchdlo.coupling.bodies import BodyMotion
 from torchdlo.coupling.components import axes
 from torchdlo.physics.effect import Motion, Push
 from torchdlo.physics.rod import View
 
-_ORDER = tuple(shapes.SIZES)
 _INPUTS = "Tensor[] edges, Tensor[] vertices, Tensor[] bodies, Tensor grids"
 _STATIC = "int[] cells, int[] shapes, int[] pieces, int[] after, int sweeps, bool friction, float[] law"
 _function, ready = blocks.kernel("body_sweeps")
@@ -113,14 +112,11 @@ def _solids(bodies: BodyMotion) -> list[Tensor]:
         sum(a * c[i] * c[j] for a, c in zip(turning, columns, strict=True))
         for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
     ]
-    ring = state.pos.new_tensor([[float(b.shape == "ring")] for b in bodies.bodies]) > 0
-    half, zero = 0.5 * params.size[..., 2:], torch.zeros_like(params.size[..., :1])
-    third, fourth = torch.where(ring, torch.cos(half), 2 * half), torch.where(ring, torch.sin(half), 0.0)
-    numbers = [params.size[..., :2], third, fourth]
-    offset = [torch.where(ring, shapes.ring_centre(params.size), 0.0), zero, zero]
+    offset, numbers = blocks.measures(bodies)
+    zero = torch.zeros_like(offset)
     moves = [state.vel, state.omega, bodies.change, bodies.turn, bodies.mobility]
     laws = [agility.amax(-1, keepdim=True), params.mu_s, params.mu_k, params.restitution]
-    return [state.pos, *itertools.chain(*columns), *offset, *numbers, *moves, *answers, *laws]
+    return [state.pos, *itertools.chain(*columns), offset, zero, zero, *numbers, *moves, *answers, *laws]
 
 
 def push(
@@ -145,7 +141,7 @@ def push(
     force, wrench = torch.ops.torchdlo.body_sweeps(
         *inputs,
         *blocks.sampled(bodies),
-        [_ORDER.index(b.shape) for b in bodies.bodies],
+        blocks.kinds(bodies),
         list(pieces),
         view.topology.successor(),
         sweeps,

@@ -81,10 +81,12 @@ def _locate(grid: Grid, pos: Tensor) -> tuple[Tensor, Tensor]:
     return at - origin.unsqueeze(-1), origin
 
 
-def places(grid: Grid, nodes: Nodes) -> Tensor:
-    """Return where the computed nodes are [m], shape (B, N, 3)."""
-    ranges = [torch.arange(n, dtype=nodes.vel.dtype, device=nodes.vel.device) for n in grid.size]
-    number = nodes.origin.unsqueeze(1) + torch.cartesian_prod(*ranges)
+def places(grid: Grid, nodes: Nodes, chosen: Tensor | None = None) -> Tensor:
+    """Return where the computed nodes are [m], shape (B, N, 3), or those with the numbers `chosen` (B, R)."""
+    _, y, z = grid.size
+    each = torch.arange(math.prod(grid.size), device=nodes.vel.device) if chosen is None else chosen
+    steps = (each.div(y * z, rounding_mode="floor"), each.div(z, rounding_mode="floor") % y, each % z)
+    number = nodes.origin.unsqueeze(1) + torch.stack(steps, -1).to(nodes.vel.dtype)
     return number * grid.spacing + number.new_tensor(grid.first)
 
 

@@ -1,0 +1,43 @@
+"""The kernel that finds nodes near bodies against tensor operations."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+import torch
+from matter import DOUBLE
+from meetings import SHAPES, meeting
+
+from torchdlo.coupling import BodyMatter, body_matter, body_near, mpm
+from torchdlo.physics import tree
+
+pytestmark = pytest.mark.skipif(not body_near.ready("cpu", DOUBLE), reason="there is no C++ compiler")
+
+
+@pytest.mark.parametrize("room", [600, 60])
+@pytest.mark.parametrize("names", [*([n] for n in SHAPES), ["box", "sphere"]], ids="-".join)
+def test_the_kernel_chooses_as_tensors_do(names, room, monkeypatch):
+    found = meeting(names, BodyMatter(room=room, reach=0.7))
+    monkeypatch.setattr(body_near, "ready", lambda *_: False)
+    again = meeting(names, BodyMatter(room=room, reach=0.7))
+    for mine, theirs in zip((found[2].vel, *found[4]), (again[2].vel, *again[4]), strict=True):
+        assert mine.shape == theirs.shape
+        torch.testing.assert_close(mine, theirs, rtol=1e-12, atol=1e-15)
+    assert bool((found[4][2] > 0).any()) == (room == 60)
+
+
+def test_the_kernel_chooses_every_node_once_and_none_without_mass():
+    grid, nodes, _, motion, _ = meeting(["box", "sphere"], BodyMatter())
+    reach = 0.01
+    near, lost = body_near.choose(motion, grid, nodes, (2,), reach, 700)
+    assert all(len(row.unique()) == 700 for row in near) and not lost.any()
+    off = body_matter._probe(motion, body_matter._solids(motion, (2,)), mpm.places(grid, nodes).unsqueeze(1))[0]
+    wanted = (off.amin(1)[..., 0] < reach) & (nodes.mass > 0)
+    for row, there in zip(near, wanted, strict=True):
+        count = int(there.sum())
+        assert row[:count].tolist() == there.nonzero()[:, 0].tolist() and 60 < count < 700
+    state, params, nodes = (tree.map(lambda x: x.float(), y) for y in (motion.state, motion.params, nodes))
+    single = dataclasses.replace(motion, state=state, params=params)
+    again, _ = body_near.choose(single, grid, nodes, (2,), reach, 700)
+    assert all(set(a.tolist()) == set(b.tolist()) for a, b in zip(again, near, strict=True))
