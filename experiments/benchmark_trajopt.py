@@ -2,7 +2,8 @@
 
 All searches of a task run at the same time and share their batches, so that their seconds are shared ones; the best
 trajectories are played alone in the end, and returns are those. An episode that is played with gradient counts as one.
-Every search keeps a journal, so that a benchmark that was stopped goes on where it was; finished ones are read.
+Every search keeps a journal, so that a benchmark that was stopped goes on where it was; finished ones are read. Those
+of another version of the program or of libraries are marked with a star in the table, and run anew with --again.
 """
 
 from __future__ import annotations
@@ -28,6 +29,13 @@ INTERRUPTED = 130
 """Exit status after Ctrl-C."""
 
 
+def earlier(result: dict[str, Any]) -> bool:
+    """Return whether a result is of another version of the program or of libraries."""
+    from torchdlo.agents.journal import program
+
+    return result["program"] != program()
+
+
 @dataclass(frozen=True)
 class Case:
     """One search."""
@@ -43,15 +51,13 @@ class Case:
         """The file that says that it is finished."""
         return self.folder / "result.json"
 
-    def found(self, choices: dict[str, Any]) -> dict[str, Any] | None:
-        """Return its result, if it is there and of the same settings and program."""
-        from torchdlo.agents.journal import program
-
+    def found(self, choices: dict[str, Any], again: bool) -> dict[str, Any] | None:
+        """Return its result, if it is there and of the same settings; with `again`, of the same program as well."""
         if not self.result.is_file():
             return None
         found = json.loads(self.result.read_text())
         wanted = json.loads(json.dumps(asdict(self.settings) | choices))
-        return found if found["settings"] == wanted and found["program"] == program() else None
+        return found if found["settings"] == wanted and not (again and earlier(found)) else None
 
     def search(self, problem: Any, callback: Any) -> None:
         """Search, resumed if it was stopped, and write what was found."""
@@ -88,7 +94,7 @@ def solve(task: str, args: Any) -> list[tuple[Case, dict[str, Any]]]:
     from torchdlo.progress import deferred_interrupt, progress
 
     chosen, wanted = problem(task, double=args.double, compiled=args.compiled), cases(task, args)
-    left = [case for case in wanted if case.found(chosen.choices) is None]
+    left = [case for case in wanted if case.found(chosen.choices, args.again) is None]
     said: dict[Path, tuple[int, int, str]] = {}
     with progress() as show, deferred_interrupt(show) as callback:
 
@@ -113,6 +119,7 @@ def side_by_side(args: Any) -> None:
     common = ["--episodes", str(args.episodes), "--population", str(args.population), "--out", args.out]
     common += ["--methods", ",".join(args.methods), "--first", str(args.first), "--seeds", str(args.seeds)]
     common += ["--jobs", "1", "--quiet", *(["--double"] if args.double else []), *(["--smoke"] if args.smoke else [])]
+    common += ["--again"] if args.again else []
 
     def one(task: str) -> None:
         file = Path(args.out) / f"{task}.log"
@@ -158,6 +165,7 @@ def row(task: str, method: str, runs: list[dict[str, Any]]) -> dict[str, Any]:
         "episodes": statistics.mean(r["episodes"] for r in runs),
         "solved_after": [r["solved_after"] for r in runs],
         "seconds": statistics.mean(r["seconds"] for r in runs),
+        "earlier": any(earlier(r) for r in runs),
     }
 
 
@@ -171,13 +179,15 @@ def table(rows: list[dict[str, Any]]) -> str:
         cells = [
             r["task"],
             r["method"],
-            str(r["seeds"]),
+            f"{r['seeds']}{'*' * r['earlier']}",
             *("" if r[k] is None else f"{r[k]:.2f}" for k in ("return", "spread", "seen", "published")),
             f"{r['success']:.0%}",
             f"{r['episodes']:.0f}",
             f"{r['seconds']:.0f}",
         ]
         lines.append(f"| {' | '.join(cells)} |")
+    if any(r["earlier"] for r in rows):
+        lines += ["", "\\* of another version of the program or of libraries; --again runs them anew"]
     return "\n".join(lines) + "\n"
 
 
@@ -211,6 +221,7 @@ def arguments(words: list[str] | None = None) -> Any:
     parser.add_argument("--episodes", type=int, default=0, help="budget; default: the published one of each task")
     parser.add_argument("--population", type=int, default=0, help="default: that of each method")
     parser.add_argument("--out", default="runs/trajopt", help="folder; default: runs/trajopt")
+    parser.flag("again", "run anew what was found by another version of the program or of libraries")
     parser.flag("double", "physics in double precision")
     parser.flag("quiet", "search only; no table")
     parser.flag("smoke", "one iteration of each method on short episodes with uncompiled steps")

@@ -37,7 +37,12 @@ def test_the_benchmark_writes_its_table_and_reads_finished_runs(tmp_path: Path) 
     # What a finished run has written is taken as it is.
     content = json.loads(result.read_text())
     result.write_text(json.dumps(content | {"return": 0.25}))
-    assert "| 0.25 |" in call(*words).stdout
+    assert "| wiring_post | cmaes | 1 | 0.25 |" in call(*words).stdout
+    # What another version has written is marked, and found anew if that is asked for.
+    result.write_text(json.dumps(content | {"return": 0.25, "program": "another"}))
+    marked = call(*words).stdout
+    assert "| wiring_post | cmaes | 1* | 0.25 |" in marked and "another version of the program" in marked
+    assert call(*words, "--again").stdout == done.stdout
 
 
 def test_unknown_names_are_refused() -> None:
