@@ -19,7 +19,7 @@ from torchdlo.physics.effects.table import Table, TableFriction
 
 def judged(returns: Tensor, success: Tensor) -> Outcome:
     """An outcome whose loss is the negative return."""
-    return Outcome(returns, -returns, success, ~torch.isfinite(returns))
+    return Outcome(returns, -returns, 0 * returns, success, ~torch.isfinite(returns))
 
 
 class Plain:
@@ -54,10 +54,10 @@ class Varied(Plain):
             outcomes.append(
                 replace(self.inner, start=tuple((torch.tensor(self.inner.start) + shift).tolist())).evaluate(actions)
             )
-        returns, loss = (torch.stack([getattr(o, n) for o in outcomes]).mean(0) for n in ("returns", "loss"))
+        names = ("returns", "loss", "shortfall")
+        means = (torch.stack([getattr(o, n) for o in outcomes]).mean(0) for n in names)
         return Outcome(
-            returns,
-            loss,
+            *means,
             torch.stack([o.success for o in outcomes]).all(0),
             torch.stack([o.failed for o in outcomes]).any(0),
         )
@@ -165,7 +165,7 @@ class Drag(Plain):
         angle = torch.linspace(0, 3.0, 10, dtype=torch.float64)
         goal = 0.06 * torch.stack([1 - angle.cos(), angle.sin(), 0 * angle], -1) + torch.tensor([0.0, 0.05, 0.0])
         loss = (last.rods.pos - goal)[..., :2].square().sum(-1).mean(-1)
-        return Outcome(-loss, loss, loss < 0.02**2, ~scene.finite(last))
+        return Outcome(-loss, loss, 0 * loss, loss < 0.02**2, ~scene.finite(last))
 
 
 def signature(actions: Tensor) -> str:

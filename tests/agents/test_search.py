@@ -120,6 +120,7 @@ class Broken(Reach):
         return Outcome(
             nan,
             outcome.loss * torch.where(left.isnan(), (actions.sum((1, 2)) * 0).sqrt() + 1, 1.0),
+            outcome.shortfall,
             outcome.success & ~up,
             up,
         )
@@ -251,7 +252,7 @@ def test_problems_of_any_width_are_searched() -> None:
 
         def evaluate(self, actions: Tensor) -> Outcome:
             returns = -(actions[:, 0, 0] - 0.3).square()
-            return Outcome(returns, -returns, returns > -1e-6, returns.isnan())
+            return Outcome(returns, -returns, 0 * returns, returns > -1e-6, returns.isnan())
 
     for method in METHODS:
         found = optimize(Line(), Settings(method, episodes=400, population=4))

@@ -60,7 +60,7 @@ def hybrid(plan: Plan, rng: torch.Generator) -> Search:
         part.tell(x, told)
         if part is coarse:
             fine.offer(x, told)
-        highest = float(told.returns.max())
+        highest = float(told.value.max())
         gained = max(0.0, highest - best) if math.isfinite(best) else 0.0
         gain[part] = gained if math.isinf(gain[part]) else 0.5 * (gain[part] + gained)
         last[part], best = k, max(best, highest)
@@ -88,7 +88,7 @@ class _Evolution:
         told = replace(told, slope=self.encoding.pull(self.x, told.slope))
         if self.found is not None:
             # The strategy looks at nothing but the order.
-            place = ranking(told.returns, told.loss).argsort()
+            place = ranking(told.value, told.loss).argsort()
             self.found.tell(list(self.x.numpy()), place.double().tolist())
         if self.lines is None:
             self.lines = _Lines(self.x, told, max(1, round(_LINES * self.plan.population)))
@@ -102,8 +102,8 @@ class _Lines:
     """Points that go down their slopes within an evolution strategy, the best first at the start."""
 
     def __init__(self, x: Tensor, told: Told, count: int) -> None:
-        best = ranking(told.returns, told.loss)[:count]
-        self.x, self.returns, self.loss, self.slope = x[best], told.returns[best], told.loss[best], told.slope[best]
+        best = ranking(told.value, told.loss)[:count]
+        self.x, self.value, self.loss, self.slope = x[best], told.value[best], told.loss[best], told.slope[best]
         # A drawn point lies about the root of the dimension away from the mean; half of it is a step.
         self.first = 0.5 * math.sqrt(x.shape[1])
         self.length = torch.full_like(self.loss, self.first)
@@ -122,13 +122,13 @@ class _Lines:
         down = told.loss[:n] < self.loss[active]
         self.length[active] *= torch.where(down, 2.0, 0.5)
         self._put(active[down], x, told, torch.arange(n)[down])
-        fresh = ranking(told.returns[n:], told.loss[n:])[: len(self.x) // 2] + n
-        value = torch.where(self.length > _SHORT * self.first, self.returns, -math.inf)
+        fresh = ranking(told.value[n:], told.loss[n:])[: len(self.x) // 2] + n
+        value = torch.where(self.length > _SHORT * self.first, self.value, -math.inf)
         worst = value.argsort(stable=True)[: len(fresh)]
-        better = told.returns[fresh] > value[worst]
+        better = told.value[fresh] > value[worst]
         self.length[worst[better]] = self.first
         self._put(worst[better], x, told, fresh[better])
 
     def _put(self, rows: Tensor, x: Tensor, told: Told, of: Tensor) -> None:
         self.x[rows], self.slope[rows] = x[of], told.slope[of]
-        self.returns[rows], self.loss[rows] = told.returns[of], told.loss[of]
+        self.value[rows], self.loss[rows] = told.value[of], told.loss[of]

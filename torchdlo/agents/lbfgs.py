@@ -36,7 +36,7 @@ class Descent:
         """Forget all lines."""
         empty = torch.zeros(0, self.encoding.size, dtype=torch.float64)
         self.x = self.slope = empty
-        self.returns = self.loss = self.step = empty[:, 0]
+        self.value = self.loss = self.step = empty[:, 0]
         # Steps and changes of slope, oldest first; zero where there are none.
         self.moved = self.turned = torch.zeros(_PAIRS, *empty.shape, dtype=torch.float64)
         self.best = (-math.inf, empty.new_zeros(self.encoding.size))
@@ -44,11 +44,11 @@ class Descent:
     def offer(self, x: Tensor, told: Told) -> None:
         """Take what is better than the lines; told slopes are by actions, shape (P, T A)."""
         self._note(x, told)
-        returns, loss = torch.cat([self.returns, told.returns]), torch.cat([self.loss, told.loss])
-        best = ranking(returns, loss)[: self.count]
+        value, loss = torch.cat([self.value, told.value]), torch.cat([self.loss, told.loss])
+        best = ranking(value, loss)[: self.count]
         none = torch.zeros(_PAIRS, *x.shape, dtype=x.dtype)
         self.x, self.slope = torch.cat([self.x, x])[best], torch.cat([self.slope, told.slope])[best]
-        self.returns, self.loss = returns[best], loss[best]
+        self.value, self.loss = value[best], loss[best]
         self.step = torch.cat([self.step, torch.full_like(told.loss, self.plan.rate)])[best]
         self.moved, self.turned = (torch.cat([old, none], 1)[:, best] for old in (self.moved, self.turned))
 
@@ -82,16 +82,16 @@ class Descent:
         self.x, self.slope = (
             torch.where(taken[:, None], new[at], was) for new, was in ((x, self.x), (told.slope, self.slope))
         )
-        self.returns, self.loss = (
-            torch.where(taken, new[at], was) for new, was in ((told.returns, self.returns), (told.loss, self.loss))
+        self.value, self.loss = (
+            torch.where(taken, new[at], was) for new, was in ((told.value, self.value), (told.loss, self.loss))
         )
         step = torch.where(down, self.lengths[row, pick], self.lengths[:, -1] / 16)
         self.step = torch.where(self.over, self.plan.rate, step)
 
     def _note(self, x: Tensor, told: Told) -> None:
-        best = int(told.returns.argmax())
-        if float(told.returns[best]) > self.best[0]:
-            self.best = float(told.returns[best]), x[best]
+        best = int(told.value.argmax())
+        if float(told.value[best]) > self.best[0]:
+            self.best = float(told.value[best]), x[best]
 
 
 def _direction(slope: Tensor, moved: Tensor, turned: Tensor) -> Tensor:

@@ -36,12 +36,19 @@ class Told:
     """Returns; -inf where there is no number [-], shape (P,)."""
     loss: Tensor
     """Losses; inf where there is no number [-], shape (P,)."""
+    shortfall: Tensor
+    """How far the ends are from success, in the units of the return [-], shape (P,)."""
     success: Tensor
     """Whether the task was done, bool [-], shape (P,)."""
     failed: Tensor
     """Whether the episode broke down, bool [-], shape (P,)."""
     slope: Tensor
     """Slope of the loss [1/m], zero where there is no number, shape (P, size), or (P, 0) if not asked for."""
+
+    @property
+    def value(self) -> Tensor:
+        """Returns without what is missing to success; -inf where there is no number [-], shape (P,)."""
+        return self.returns - self.shortfall
 
 
 Search = Generator[Ask, Told, None]

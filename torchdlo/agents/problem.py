@@ -21,6 +21,8 @@ class Outcome:
     """Sum of the rewards, to be maximised [-], shape (P,)."""
     loss: Tensor
     """What gradients are taken of, to be minimised [-], shape (P,)."""
+    shortfall: Tensor
+    """How far the ends are from what counts as success, in the units of the return [-], shape (P,)."""
     success: Tensor
     """Whether the task was done, bool [-], shape (P,)."""
     failed: Tensor

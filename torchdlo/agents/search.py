@@ -270,16 +270,17 @@ class _Player:
             copies = robust.copies
             problem = self._worlds(copies, scale, 1)
         parts = [self._chunk(problem, ask, x, copies) for x in ask.points.split(max(1, self.settings.chunk // copies))]
-        returns, loss, success, failed, slope = (torch.cat(column) for column in zip(*parts, strict=True))
+        columns = zip(*parts, strict=True)
+        returns, loss, short, success, failed, slope = (torch.cat(column) for column in columns)
         good = torch.isfinite(slope).all(-1)
         self.blind = int((~good).sum())
         returns = torch.where(torch.isfinite(returns), returns, -math.inf)
         # An episode that broke down may have a small loss, as nothing is added up from then on.
         loss = torch.where(torch.isfinite(loss) & ~failed, loss, math.inf)
-        return Told(returns, loss, success, failed, torch.where(good[:, None], slope, 0.0))
+        return Told(returns, loss, short.nan_to_num(), success, failed, torch.where(good[:, None], slope, 0.0))
 
     def _chunk(self, problem: Problem, ask: Ask, points: Tensor, copies: int) -> tuple[Tensor, ...]:
-        names = ("returns", "loss", "success", "failed", "slope")
+        names = ("returns", "loss", "shortfall", "success", "failed", "slope")
         kept = self.journal.recall(points)
         if kept is None:
             began = time.perf_counter()
@@ -317,5 +318,6 @@ def _play(problem: Problem, ask: Ask, points: Tensor) -> tuple[Tensor, ...]:
         if ask.graded:
             # Trajectories do not touch each other, so that the slope of the sum is that of each.
             (slope,) = torch.autograd.grad(outcome.loss.sum(), x, allow_unused=True, materialize_grads=True)
-    parts = (outcome.returns.double(), outcome.loss.double(), outcome.success, outcome.failed)
+    numbers = (x.double() for x in (outcome.returns, outcome.loss, outcome.shortfall))
+    parts = (*numbers, outcome.success, outcome.failed)
     return *(p.detach().cpu() for p in parts), slope

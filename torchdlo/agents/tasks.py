@@ -14,6 +14,7 @@ from torchdlo.coupling import watch
 from torchdlo.envs import Cable, episode, find
 from torchdlo.envs.task import Task
 from torchdlo.errors import InputError
+from torchdlo.physics import tree
 
 __all__ = ["TaskProblem", "problem"]
 
@@ -92,7 +93,7 @@ class TaskProblem:
     def evaluate(self, actions: Tensor) -> Outcome:
         """Play actions from the one start."""
         went = episode.play(self.task, self.full(actions), episode=self.prepared(len(actions)))
-        return Outcome(went.returns, went.loss, went.success, went.failed)
+        return _outcome(went)
 
     def varied(self, copies: int, scale: float, seed: int) -> Varied:
         """Return the problem with `copies` starts that differ by `scale` times what the task calls its spread."""
@@ -111,7 +112,7 @@ class TaskProblem:
         kept["rewards"] = went.rewards[:, 0].tolist()
         kept["missed"] = watch.explain(went.world.state.missed)
         finite = all(math.isfinite(value) for value in kept["rewards"])
-        return Outcome(went.returns, went.loss, went.success, went.failed), kept if finite else {}
+        return _outcome(went), kept if finite else {}
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,7 +136,10 @@ class Varied:
         base = self.inner.prepared(count)
         base = replace(base, params=params, start=episode.begin(replace(base, params=params), state))
         went = episode.play(task, self.inner.full(actions).repeat_interleave(self.copies, 0), episode=base)
-        returns, loss, success, failed = (
-            getattr(went, name).reshape(len(actions), self.copies) for name in ("returns", "loss", "success", "failed")
-        )
-        return Outcome(returns.mean(-1), loss.mean(-1), success.all(-1), failed.any(-1))
+        went = tree.map(lambda x: x.reshape(len(actions), self.copies), _outcome(went))
+        means = (x.mean(-1) for x in (went.returns, went.loss, went.shortfall))
+        return Outcome(*means, went.success.all(-1), went.failed.any(-1))
+
+
+def _outcome(went: episode.Outcome) -> Outcome:
+    return Outcome(went.returns, went.loss, went.shortfall, went.success, went.failed)

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from torchdlo.agents.problem import Outcome, Problem
 from torchdlo.errors import InputError
+from torchdlo.physics import tree
 
 __all__ = ["together"]
 
@@ -136,15 +137,14 @@ def _play(problem: Problem, wishes: Sequence[_Wish], room: int) -> None:
     ]
     columns = [torch.cat(column) for column in zip(*parts, strict=True)]
     sizes = [len(wish.actions) for wish in shared]
-    for wish, (returns, loss, success, failed, slope) in zip(
+    for wish, (*outcome, slope) in zip(
         shared, zip(*(column.split(sizes) for column in columns), strict=True), strict=True
     ):
-        went = Outcome(returns, loss, success, failed)
-        wish.answer.set_result((went, slope if wish.actions.requires_grad else None))
+        wish.answer.set_result((Outcome(*outcome), slope if wish.actions.requires_grad else None))
 
 
 def _batch(problem: Problem, actions: Tensor, room: int, graded: bool) -> tuple[Tensor, ...]:
-    """Return returns, losses, successes, failures and slopes of a batch that is filled up with its first trajectory."""
+    """Return the parts of the outcome and the slopes of a batch that is filled up with its first trajectory."""
     count = len(actions)
     x = torch.cat([actions, actions[:1].expand(room - count, -1, -1)]).requires_grad_(graded)
     with torch.set_grad_enabled(graded):
@@ -152,5 +152,4 @@ def _batch(problem: Problem, actions: Tensor, room: int, graded: bool) -> tuple[
         slope = torch.zeros_like(x)
         if graded:
             (slope,) = torch.autograd.grad(went.loss.sum(), x, allow_unused=True, materialize_grads=True)
-    found = (went.returns, went.loss, went.success, went.failed, slope)
-    return tuple(part.detach()[:count] for part in found)
+    return tuple(part.detach()[:count] for part in (*tree.leaves(went), slope))

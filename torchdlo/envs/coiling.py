@@ -25,6 +25,8 @@ BASE, HEIGHT = 0.12, 0.30
 """Radius and height of the cone [m]."""
 NEAR = 0.06
 """Distance from the cone's surface within which the rope counts as wound round it [m]."""
+SHORT, SPARE = 10.0, 0.02
+"""What a whole turn that is missing counts in the return, and the share by which it is to be exceeded."""
 
 
 @dataclass(frozen=True)
@@ -57,6 +59,10 @@ class Coiling(Task):
     def success(self, seen: Seen) -> Tensor:
         """Return whether the rope turns by a whole turn within 6 cm of the cone."""
         return wound(seen.x).abs() >= 2 * math.pi
+
+    def shortfall(self, seen: Seen) -> Tensor:
+        """Return the share of a whole turn that is missing: coils that are wide and loose may earn as much."""
+        return SHORT * (1 - wound(seen.x).abs() / (1 + SPARE) / (2 * math.pi)).clamp(min=0)
 
     def waypoints(self) -> list[list[tuple[float, float, float]]]:
         """Return a way up and straight to the cone's upper part, and on round it at its side. It earns 12.1.

@@ -10,7 +10,7 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
@@ -76,6 +76,8 @@ class Outcome:
     """Sums of rewards [1], shape (B,)."""
     loss: Tensor
     """What gradients should descend: minus the return, and what the task adds to it [1], shape (B,)."""
+    shortfall: Tensor
+    """What the loss has for how far the end is from success, see `Task.shortfall` [1], shape (B,)."""
     success: Tensor
     """Which episodes reached the goal [-], bool, shape (B,)."""
     failed: Tensor
@@ -197,11 +199,7 @@ def prepare(
     step = scenes.stepper(scene, compiled=compiled, recorded=recorded)
     world = _begin(task, scene, state, hands)
     episode = Episode(task, scene, params, step, hands, world, segment)
-    return episode if not task.settle else _replaced(episode, _settled(episode, world))
-
-
-def _replaced(episode: Episode, start: World) -> Episode:
-    return Episode(episode.task, episode.scene, episode.params, episode.step, episode.hands, start, episode.segment)
+    return episode if not task.settle else replace(episode, start=_settled(episode, world))
 
 
 def _run(episode: Episode, world: World, tool: Pose, held: Grasp, count: int) -> State:
@@ -378,8 +376,9 @@ def play(
             callback(k + 1, count)
     rewards, losses, terms = tree.stack(rows)
     seen = world.seen(task.arms.count)
-    success = task.success(seen) & ~world.failed
-    return Outcome(rewards.sum(0), losses.sum(0), success, world.failed, rewards, terms, world, tree.stack(path))
+    success, short = task.success(seen) & ~world.failed, task.shortfall(seen)
+    loss = losses.sum(0) + torch.where(world.failed, 0.0, short)
+    return Outcome(rewards.sum(0), loss, short, success, world.failed, rewards, terms, world, tree.stack(path))
 
 
 def normalized(task: Task, returns: Tensor, **choices: Any) -> Tensor:

@@ -171,6 +171,13 @@ class Task(ABC):
         """Return what the loss of an action has beside the reward's negative, shape (B,) each."""
         return {}
 
+    def shortfall(self, seen: Seen) -> Tensor:
+        """Return how far the end of an episode is from success, 0 if it is reached [return], shape (B,).
+
+        The loss has it after the last action, as the return need not be largest where the goal is reached.
+        """
+        return torch.zeros_like(seen.x[:, 0, 0])
+
     def note(self, seen: Seen) -> dict[str, Tensor]:
         """Return what is to be remembered, asked at the start (without notes) and after every action."""
         return {}

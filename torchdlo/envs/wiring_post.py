@@ -29,6 +29,10 @@ CLEAR = 0.03
 MIDDLE = (0.198, 0.198)
 """Where vertex 15 belongs [m]."""
 COUNT = 30
+NEAR, TURN = 0.03, math.pi / 4
+"""How near the goal [m] and how much bent round each post [rad] a rope has to be."""
+SHORT, SPARE = 10.0, 0.03
+"""What a condition of success counts in the return as long as it is missed, and the share by which to exceed it."""
 
 
 @functools.cache
@@ -101,14 +105,29 @@ class WiringPost(Task):
 
     def success(self, seen: Seen) -> Tensor:
         """Return whether the rope passes each post on its side, turns round it, and is near the goal."""
-        x = seen.x
-        good = geometry.chamfer(x, goal().to(x).expand(len(x), -1, -1)) <= 0.03
+        beside, turn, off = self._judged(seen.x)
+        return (off <= NEAR) & (beside > 0).all(-1) & (turn >= TURN).all(-1)
+
+    def shortfall(self, seen: Seen) -> Tensor:
+        """Return what is missing of each condition of success, 1 at most each: ropes that are near need not be bent."""
+        beside, turn, off = self._judged(seen.x)
+        off = (off / (1 - SPARE) - NEAR).clamp(min=0) / NEAR
+        beside, turn = (-beside / CLEAR).clamp(min=0), 1 - turn / TURN / (1 + SPARE)
+        missing = torch.cat([off[:, None], beside, turn.clamp(min=0)], -1)
+        return SHORT * (missing / (1 + missing)).sum(-1)
+
+    @staticmethod
+    def _judged(x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return by how much the rope passes posts on their sides [m] and turns there [rad], shape (B, 2), and how far
+        it is from the goal [m], shape (B,)."""
+        beside, turn = [], []
         for post, side in zip(POSTS, (-1.0, 1.0), strict=True):
-            centre = x.new_tensor(post)
-            near = geometry.distances(x[..., :2], centre.expand(len(x), 1, 2)).squeeze(-1)
+            near = geometry.distances(x[..., :2], x.new_tensor(post).expand(len(x), 1, 2)).squeeze(-1)
             closest = torch.take_along_dim(x[..., 1], near.argmin(-1, keepdim=True), -1).squeeze(-1)
-            good = good & (side * (closest - post[1]) > 0) & (bent(x, near).abs() >= math.pi / 4)
-        return good
+            beside.append(side * (closest - post[1]))
+            turn.append(bent(x, near).abs())
+        off = geometry.chamfer(x, goal().to(x).expand(len(x), -1, -1))
+        return torch.stack(beside, -1), torch.stack(turn, -1), off
 
     def waypoints(self) -> list[list[tuple[float, float, float]]]:
         """Return a way along the floor: past the first post, between both, round the second. It earns 69.5."""
