@@ -163,6 +163,27 @@ def test_where_all_earn_the_same_the_hybrid_follows_the_loss() -> None:
     assert found.curve[0]["best"] == 1, "it is not met by chance"
 
 
+@dataclass(frozen=True)
+class Lure(Reach):
+    """Earns most at the goal, and a little less at one corner of it, which alone counts as done."""
+
+    shown: bool = True
+
+    def evaluate(self, actions: Tensor) -> Outcome:
+        end, goal = actions.sum(1), actions.new_tensor(self.goal)
+        returns = 10.0 - (end - goal).norm(dim=-1)
+        far = (end - goal - actions.new_tensor([-0.02, 0.02, 0.0])).norm(dim=-1)
+        shortfall = self.shown * 5 * (far - 0.004).clamp(min=0)
+        return Outcome(returns, shortfall - returns, shortfall, far < 0.005, returns.isnan())
+
+
+def test_the_hybrid_goes_where_it_succeeds_and_not_where_it_earns_most() -> None:
+    settings = Settings("hybrid", episodes=384, population=16, hold=5)
+    done, blind = (optimize(Lure(shown=shown), settings) for shown in (True, False))
+    assert bool(done.outcome.success[0]) and not bool(blind.outcome.success[0])
+    assert returned(blind) > returned(done) > 9.96
+
+
 def test_trajectories_are_ranked_by_return_and_then_by_loss() -> None:
     returns = torch.tensor([1.0, 2.0, 2.00001, -torch.inf, 2.1, 2.0], dtype=torch.float64)
     loss = torch.tensor([-9.0, 0.3, 0.4, torch.inf, 7.0, 0.1], dtype=torch.float64)

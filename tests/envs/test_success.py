@@ -14,7 +14,7 @@ from torchdlo.envs import TASKS, geometry
 from torchdlo.envs import letter_art as letters
 from torchdlo.envs import wiring_post as wiring
 from torchdlo.envs.solids import c_ring
-from torchdlo.envs.task import Seen, even
+from torchdlo.envs.task import Seen, Task, even
 from torchdlo.physics import tree
 
 F64 = torch.float64
@@ -42,7 +42,10 @@ def judged(name: str, *shapes: torch.Tensor, notes: dict | None = None, bodies: 
     seen = Seen(state, tool, torch.ones(count, arms, 1, dtype=F64), notes or {})
     if notes is None:
         seen = tree.replace(seen, notes=task.note(seen))
-    return task.success(seen).tolist()
+    done, short = task.success(seen), task.shortfall(seen)
+    if type(task).shortfall is not Task.shortfall:
+        assert (short >= 0).all() and (done | (short > 0)).all()
+    return done.tolist()
 
 
 def helix(turns: float, off: float, count: int = 60) -> torch.Tensor:
@@ -71,6 +74,24 @@ def test_wiring_takes_the_right_sides_of_both_posts():
     near = goal + goal.new_tensor([0.0, 0.0, 0.005])
     far = goal + goal.new_tensor([0.0, 0.0, 0.03])
     assert judged("wiring_post", goal, near, far, line, mirrored) == [True, True, False, False, False]
+
+
+@pytest.mark.parametrize(
+    ("name", "good", "worse"),
+    [
+        ("coiling", helix(1.1, 0.02), (helix(0.9, 0.02), helix(0.5, 0.02), helix(0.5, 0.12))),
+        ("wiring_post", wiring.goal(), tuple(wiring.goal() + step * torch.eye(3)[2] for step in (0.02, 0.03, 0.05))),
+    ],
+)
+def test_the_further_from_success_the_more_is_lacking(name, good, worse):
+    state = tree.map(lambda x: x.expand(len(worse) + 1, *x.shape[1:]).clone(), first(name))
+    x = torch.stack([good, *worse]).requires_grad_()
+    seen = Seen(tree.replace(state, rods=tree.replace(state.rods, pos=x)), None, None, {})
+    short = TASKS[name]().shortfall(seen)
+    assert short[0] == 0 and (short.diff() > 0).all()
+    (slope,) = torch.autograd.grad(short.sum(), x)
+    # The rope that is nowhere near the cone turns round it by nothing, wherever it is moved.
+    assert torch.isfinite(slope).all() and not slope[0].any() and slope[1:3].flatten(1).any(1).all()
 
 
 def test_the_goal_of_wiring_is_where_the_task_says():
