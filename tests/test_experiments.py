@@ -18,6 +18,7 @@ from torchdlo.physics import tree
 
 EXPERIMENTS = Path(__file__).parents[1] / "experiments"
 SCRIPTS = [
+    "baselines.py",
     "bench_contact.py",
     "bench_coupled.py",
     "bench_env.py",
@@ -108,6 +109,20 @@ def test_the_benchmark_of_tasks_writes_its_rows(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     assert [row["frames"] for row in json.loads(target.read_text())["memory"]] == [20, 40]
     done = call(EXPERIMENTS / "bench_env.py", "--tasks", "knot")
+    assert done.returncode == 1 and "there is no task knot; known are coiling" in done.stderr
+
+
+def test_baselines_of_tasks_are_measured_once(tmp_path: Path) -> None:
+    target = tmp_path / "baselines.json"
+    words = (EXPERIMENTS / "baselines.py", "--smoke", "--tasks", "coiling", "--json", target)
+    done = call(*words)
+    assert done.returncode == 0, done.stderr
+    (row,) = json.loads(target.read_text())["rows"]
+    assert row["nothing"] != row["hand"] and row["published"] == 7.0 and not row["random_varied_done"]
+    assert [len(row[f"{what}_varied"]) for what in ("nothing", "random", "hand")] == [2, 2, 2]
+    assert len({*row["random_varied"]}) == 2 and f"| coiling | {row['nothing']:.2f} | 7 | " in done.stdout
+    assert call(*words).stdout == done.stdout and target.stat().st_size > 0
+    done = call(EXPERIMENTS / "baselines.py", "--tasks", "knot")
     assert done.returncode == 1 and "there is no task knot; known are coiling" in done.stderr
 
 
