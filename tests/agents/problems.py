@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
 
 import torch
@@ -26,6 +26,9 @@ class Plain:
     """What the problems share."""
 
     choices: ClassVar[dict[str, Any]] = {}
+
+    def rehearsal(self) -> Any:
+        """There is none."""
 
     def varied(self, copies: int, scale: float, seed: int) -> Varied:
         """The same problem with its target moved."""
@@ -133,6 +136,34 @@ class Push(Plain):
             left = numerics.safe_norm(disc - actions.new_tensor(self.goal))[:, 0]
             returns = returns + (1 - left / far) / self.horizon
         return judged(returns, left < 0.01)
+
+
+@dataclass(frozen=True)
+class Rehearsed(Push):
+    """The same with a disc that is a little larger, or easily found in the rehearsal, and too far off for slopes."""
+
+    name: str = "rehearsed"
+    reach: float = 0.028
+    played: list[str] = field(default_factory=list, compare=False)
+
+    def evaluate(self, actions: Tensor) -> Outcome:
+        """Note that it was played."""
+        self.played.append("earnest")
+        return super().evaluate(actions)
+
+    def rehearsal(self) -> Any:
+        """The plain one, with a smaller disc."""
+        return _Rehearsal(played=self.played)
+
+
+@dataclass(frozen=True)
+class _Rehearsal(Push):
+    played: list[str] = field(default_factory=list, compare=False)
+
+    def evaluate(self, actions: Tensor) -> Outcome:
+        """Note that it was played."""
+        self.played.append("rehearsal")
+        return super().evaluate(actions)
 
 
 @dataclass(frozen=True)

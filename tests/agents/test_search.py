@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import random
 from dataclasses import dataclass, replace
 
@@ -10,7 +11,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from tests.agents.problems import Drag, Peaks, Plain, Push, Reach, signature
+from tests.agents.problems import Drag, Peaks, Plain, Push, Reach, Rehearsed, signature
 from torchdlo.agents.plan import ranking
 from torchdlo.agents.problem import Outcome
 from torchdlo.agents.search import METHODS, Found, Robust, Settings, optimize
@@ -184,6 +185,19 @@ def test_the_hybrid_goes_where_it_succeeds_and_not_where_it_earns_most() -> None
     assert returned(blind) > returned(done) > 9.96
 
 
+def test_a_search_begins_with_a_rehearsal() -> None:
+    settings = Settings("hybrid", episodes=160, population=16, hold=5, rehearsed=0.8)
+    problem = Rehearsed()
+    found = optimize(problem, settings)
+    # Eight iterations of ten; the best is played alone once more.
+    assert problem.played == ["rehearsal"] * 8 + ["earnest"] * 3
+    assert [point["rehearsed"] for point in found.curve] == [True] * 8 + [False] * 2
+    assert found.curve[7]["best"] == -math.inf and found.curve[7]["success"] == 0 and found.curve[7]["median"] is None
+    blind = optimize(Rehearsed(), replace(settings, episodes=32, rehearsed=0.0))
+    assert returned(found) > returned(blind) + 0.1, "two iterations alone do less"
+    assert returned(found) == pytest.approx(max(point["best"] for point in found.curve))
+
+
 def test_trajectories_are_ranked_by_return_and_then_by_loss() -> None:
     returns = torch.tensor([1.0, 2.0, 2.00001, -torch.inf, 2.1, 2.0], dtype=torch.float64)
     loss = torch.tensor([-9.0, 0.3, 0.4, torch.inf, 7.0, 0.1], dtype=torch.float64)
@@ -253,6 +267,9 @@ def test_a_robust_search_counts_every_copy_and_grows_its_worlds() -> None:
         ({"sigma": float("nan")}, "sigma is nan; expected a positive number."),
         ({"rate": 0.0}, "rate is 0.0; expected a positive number."),
         ({"chunk": 0}, "chunk is 0; expected at least 1."),
+        ({"rehearsed": 0.5}, "rehearsed is 0.5; expected 0 for cmaes."),
+        ({"rehearsed": 1.0}, "rehearsed is 1.0; expected a share of the iterations from 0 up, less than 1."),
+        ({"rehearsed": 0.5, "method": "hybrid", "episodes": 32}, "push: it has no rehearsal; set rehearsed to 0."),
         ({"seed": -1}, "seed is -1; expected a whole number from 0 up."),
     ],
 )

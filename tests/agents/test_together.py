@@ -11,7 +11,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from tests.agents.problems import Drag, Push, signature
+from tests.agents.problems import Drag, Push, Rehearsed, signature
 from torchdlo.agents.problem import Outcome, Problem
 from torchdlo.agents.search import METHODS, Robust, Settings, optimize
 from torchdlo.agents.together import together
@@ -51,6 +51,15 @@ def test_searches_find_what_they_find_alone() -> None:
         assert each.episodes == alone.episodes == 48
     # Two chunks of five and three in each of six iterations, then the best of each alone.
     assert sorted(set(problem.sizes)) == [1, 30] and problem.sizes.count(30) == 12
+
+
+def test_rehearsals_are_shared_as_well() -> None:
+    settings = [Settings("hybrid", episodes=48, population=8, hold=5, seed=seed, rehearsed=0.5) for seed in (0, 1)]
+    problem = Rehearsed()
+    found = together(problem, [searching(each) for each in settings], room=16)
+    assert problem.played == ["rehearsal"] * 3 + ["earnest"] * 5
+    for each, alone in zip(found, settings, strict=True):
+        assert signature(each.actions) == signature(optimize(Rehearsed(), alone).actions)
 
 
 @pytest.mark.parametrize("kind", [Push, Drag])

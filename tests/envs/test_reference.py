@@ -9,18 +9,15 @@ import pytest
 import torch
 
 from torchdlo import scene as scenes
-from torchdlo.coupling.bodies import Solid
 from torchdlo.coupling.grasp import Hands
 from torchdlo.envs import TASKS, episode, geometry
-from torchdlo.envs.gathering import BALL, CYLINDER, PEBBLE, Gathering
+from torchdlo.envs.gathering import Rehearsal
 from torchdlo.envs.task import Task
 from torchdlo.physics import tree
 from torchdlo.physics.traced import record
 
 LED = [name for name in TASKS if TASKS[name]().waypoints()]
 TURNED = math.radians(45)
-MASSES = (0.524, 0.123, 0.236)
-"""Masses of the ball, the pebble and the cylinder of Gathering [kg]."""
 
 
 @pytest.mark.parametrize("name", LED)
@@ -66,21 +63,15 @@ def test_arms_begin_with_elbow_and_wrist_in_line(name: str) -> None:
     assert world.joints[..., [2, 4]].abs().max() < TURNED
 
 
-@dataclasses.dataclass(frozen=True)
-class Drums(Gathering):
-    """With upright cylinders in place of the soft ball and the pebble, as wide, high and heavy: quick to simulate."""
-
-    def build(self, moved: torch.Tensor):
-        """Return the scene; each of the objects may be moved."""
-        sizes = ((0.06, 0.033), (0.045, 0.03), (0.05, 0.025))
-        solids = []
-        for k, (place, (radius, half), mass) in enumerate(zip((BALL, PEBBLE, CYLINDER), sizes, MASSES, strict=True)):
-            at = moved[:, k] + moved.new_tensor([*place[:2], half])
-            solids.append(Solid("cylinder", (radius, half), at, mass=mass, mu_s=0.3, mu_k=0.3))
-        return self._made(moved, solids)
-
-    def _objects(self, seen):
-        return seen.state.bodies.pos[:, 1:]
+def test_the_rehearsal_of_gathering_has_objects_as_heavy_and_where_they_are() -> None:
+    task = TASKS["gathering"]()
+    (_, real, start), (_, drums, begun) = task.start(1), task.rehearsal().start(1)
+    ball = float((real.matter.volume * next(iter(real.matter.laws.values()))["density"]).sum())
+    masses = [ball, *real.bodies.mass[..., 1:, 0].flatten().tolist()]
+    assert drums.bodies.mass[..., 1:, 0].flatten().tolist() == pytest.approx(masses, rel=0.02)
+    places = torch.cat([start.matter.pos.mean(-2, keepdim=True), start.bodies.pos[:, 1:]], -2)
+    torch.testing.assert_close(begun.bodies.pos[:, 1:, :2], places[..., :2], atol=4e-3, rtol=0)
+    assert task.rehearsal().rehearsal() is None and task.rehearsal().horizon == task.horizon
 
 
 def led(task: Task, count: int, moved: tuple[float, float] = (0.0, 0.0)) -> episode.Outcome:
@@ -122,7 +113,7 @@ def test_the_way_by_hand_shoots_the_ball_at_the_cube() -> None:
 @pytest.mark.slow
 def test_the_way_by_hand_gathers_drums() -> None:
     # The way takes 72 actions; hands then wait.
-    assert led(Drums(), 75).success.all()
+    assert led(Rehearsal(), 75).success.all()
 
 
 @pytest.mark.slow

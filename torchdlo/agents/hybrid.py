@@ -7,7 +7,8 @@ Two parts share the budget, iteration by iteration, and every episode of both is
    they are handed over as in Hansen 2011 (arXiv:1110.4181).
 2. The best points descend in all actions, see `lbfgs`.
 
-CMA-ES begins; then the part goes on that gained more lately, but each in its turn.
+CMA-ES begins; then the part goes on that gained more lately, but each in its turn. Where both begin in a rehearsal, the
+best of its iterations are the first to be played in the problem itself.
 """
 
 from __future__ import annotations
@@ -44,7 +45,16 @@ def hybrid(plan: Plan, rng: torch.Generator) -> Search:
     drifts = math.ceil(plan.drifts * plan.iterations)
     alone = max(drifts, math.ceil(_COARSE * plan.iterations))
     gain, last, best = {coarse: 0.0, fine: math.inf}, {coarse: 0, fine: 0}, -math.inf
+    rehearsed: list[Tensor] = []
     for k in itertools.count():
+        if k == plan.rehearsals and rehearsed:
+            x = torch.cat(rehearsed[::-1])[: plan.population]
+            told = yield Ask(encoding, x, graded=True)
+            coarse.lines = None
+            fine.clear()
+            fine.offer(x, told)
+            best = float(told.value.max())
+            continue
 
         def turn(part: _Evolution | Descent, k: int = k) -> tuple[bool, float, int]:
             return k - last[part] >= _TURN, gain[part], -last[part]
@@ -57,6 +67,8 @@ def hybrid(plan: Plan, rng: torch.Generator) -> Search:
             coarse.lines = None
             fine.clear()
             best = -math.inf
+        if k < plan.rehearsals:
+            rehearsed.append(x[ranking(told.value, told.loss)[: math.ceil(plan.population / plan.rehearsals)]])
         part.tell(x, told)
         if part is coarse:
             fine.offer(x, told)

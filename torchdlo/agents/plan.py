@@ -82,6 +82,8 @@ class Plan:
     drifts: float = 0.0
     """Share of the iterations in which worlds get harder from one to the next: results of different ones do not compare
     until then."""
+    rehearsals: int = 0
+    """Iterations that are played in a problem much like this one; their results do not compare with later ones."""
 
     @classmethod
     def of(cls, problem: Problem, population: int, iterations: int, **choices: Any) -> Plan:

@@ -15,6 +15,8 @@ SIGMA = {"gathering": 0.005, "lifting": 0.005, "letter_art": 0.005}
 """First spreads of CMA-ES that differ from 0.05 m."""
 RATE = {"gathering": 1e-4, "lifting": 1e-4, "unknotting": 1e-4}
 """First steps of Adam that differ from 1 mm."""
+REHEARSED = {"gathering": 0.9}
+"""Shares of iterations in which hybrids play the task's rehearsal, if not 0."""
 POPULATION = {"cmaes": 400, "gd": 16, "hybrid": 100}
 """Most trajectories per iteration. One start of gradient descent is published; more of them use up the same budget.
 Slopes need iterations more than numbers."""
@@ -45,4 +47,6 @@ def preset(task: str, method: str, **given: Any) -> Settings:
         sigma=0.05 if method == "hybrid" else SIGMA.get(task, 0.05),
         rate=RATE.get(task, 1e-3),
     )
+    if method == "hybrid" and not given.get("robust"):
+        found = replace(found, rehearsed=REHEARSED.get(task, 0.0))
     return replace(found, **{name: value for name, value in given.items() if value is not None})

@@ -48,6 +48,10 @@ class Problem(Protocol):
         """Play actions, shape (P, T, A), float64 on the CPU, one episode each."""
         ...
 
+    def rehearsal(self) -> Problem | None:
+        """Return a problem of the same size that is much like this one and quicker to play, if there is one."""
+        ...
+
     def varied(self, copies: int, scale: float, seed: int) -> Problem:
         """Return the problem that plays each trajectory in `copies` perturbed worlds, and gives the means.
 

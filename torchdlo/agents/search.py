@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -72,6 +72,8 @@ class Settings:
     chunk: int = 100
     """Most episodes that are played as one batch."""
     robust: Robust | None = None
+    rehearsed: float = 0.0
+    """Share of the iterations that are played in the problem's rehearsal."""
 
     def plan(self, problem: Problem) -> Plan:
         """Return the plan for a problem; says so if the settings make none."""
@@ -89,13 +91,18 @@ class Settings:
         for name in ("sigma", "rate", "steps"):
             value = getattr(self, name)
             need(value is None or (math.isfinite(value) and value > 0), name, "a positive number")
+        need(0 <= self.rehearsed < 1, "rehearsed", "a share of the iterations from 0 up, less than 1")
+        alone = self.rehearsed == 0 or (self.method == "hybrid" and self.robust is None)
+        need(alone, "rehearsed", f"0 for {self.method}{' with robust' if self.robust else ''}")
         per, spare = (self.robust.copies, self.robust.final) if self.robust else (1, 0)
         least = self.population * per + spare
         judged = f" and {spare} for the last judgement" if spare else ""
         need(self.episodes >= least, "episodes", f"at least {least}: {least - spare} for an iteration{judged}")
         given = {k: getattr(self, k) for k in ("hold", "sigma", "rate", "steps") if getattr(self, k) is not None}
         iterations = (self.episodes - spare) // (self.population * per)
-        return Plan.of(problem, self.population, iterations, drifts=self.robust.warm if self.robust else 0.0, **given)
+        given["drifts"] = self.robust.warm if self.robust else 0.0
+        given["rehearsals"] = min(int(self.rehearsed * iterations), iterations - 1)
+        return Plan.of(problem, self.population, iterations, **given)
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,6 +148,9 @@ def optimize(
         callback: told (stage, episodes done, all episodes, message) after every batch.
     """
     plan, robust = settings.plan(problem), settings.robust
+    stand_in = problem.rehearsal() if plan.rehearsals else None
+    if plan.rehearsals and stand_in is None:
+        raise InputError(f"{problem.name}: it has no rehearsal; set rehearsed to 0.")
     player = _Player(problem, settings, Journal(journal, _options(problem, settings), resume=resume), callback)
     search = METHODS[settings.method](plan, torch.Generator().manual_seed(settings.seed))
     told, curve, interrupted = None, [], False
@@ -149,11 +159,14 @@ def optimize(
         for k in range(plan.iterations):
             ask = search.send(told)
             scale = robust.scale((k + 1) / plan.iterations) if robust else 0.0
-            told = player.batch(ask, scale)
+            rehearses = k < plan.rehearsals
+            told = player.batch(ask, scale, stand_in if rehearses else problem)
+            if k == plan.rehearsals > 0:
+                best.clear()  # what did well in a rehearsal has to do so in earnest
             if robust and scale == 1 and curve and curve[-1]["scale"] < 1:
                 best.clear()  # what did well in milder worlds has to do so in these
             best.offer(ask, told)
-            curve.append(_point(player, told, best.highest, scale))
+            curve.append(_point(player, told, best.highest, scale, rehearses))
         finalists = player.judge(best.kept)
     except KeyboardInterrupt:
         if not best.kept:
@@ -202,8 +215,10 @@ def _options(problem: Problem, settings: Settings) -> dict[str, Any]:
     return sizes | problem.choices | asdict(settings)
 
 
-def _point(player: _Player, told: Told, best: float, scale: float) -> dict[str, Any]:
-    """Return what a learning curve has about an iteration."""
+def _point(player: _Player, told: Told, best: float, scale: float, rehearsed: bool) -> dict[str, Any]:
+    """Return what a learning curve has about an iteration; of a rehearsal, it tells nothing of the problem itself."""
+    if rehearsed:
+        told, best = replace(told, returns=told.returns[:0], success=torch.zeros_like(told.success)), -math.inf
     good = told.returns[torch.isfinite(told.returns)]
     return {
         "episodes": player.done,
@@ -213,6 +228,7 @@ def _point(player: _Player, told: Told, best: float, scale: float) -> dict[str, 
         "failed": float(told.failed.double().mean()),
         "without_slope": player.blind,
         "scale": scale,
+        "rehearsed": rehearsed,
     }
 
 
@@ -263,9 +279,9 @@ class _Player:
     def _worlds(self, copies: int, scale: float, number: int) -> Problem:
         return self.problem.varied(copies, scale, self.settings.seed * 1_000_003 + number)
 
-    def batch(self, ask: Ask, scale: float) -> Told:
-        """Play what is asked for, in chunks."""
-        robust, problem, copies = self.settings.robust, self.problem, 1
+    def batch(self, ask: Ask, scale: float, problem: Problem) -> Told:
+        """Play what is asked for in a problem or its rehearsal, in chunks."""
+        robust, copies = self.settings.robust, 1
         if robust:
             copies = robust.copies
             problem = self._worlds(copies, scale, 1)

@@ -95,6 +95,12 @@ class TaskProblem:
         went = episode.play(self.task, self.full(actions), episode=self.prepared(len(actions)))
         return _outcome(went)
 
+    def rehearsal(self) -> TaskProblem | None:
+        """Return the problem of the task's rehearsal, if it has one."""
+        found = self.task.rehearsal()
+        choices = (self.double, self.compiled, self.recorded, self.device)
+        return None if found is None else TaskProblem(found, *choices)
+
     def varied(self, copies: int, scale: float, seed: int) -> Varied:
         """Return the problem with `copies` starts that differ by `scale` times what the task calls its spread."""
         if not any(value for pair in self.task.spread for value in pair):

@@ -42,9 +42,10 @@ def together(
         BaseException: what the first search that failed raised, when all have ended.
     """
     desk: SimpleQueue[_Wish | None] = SimpleQueue()
+    stand_in = problem.rehearsal()
     over: BaseException | None = None
     with ThreadPoolExecutor(max(1, len(searches))) as pool:
-        running = [pool.submit(search, _Port(problem, desk)) for search in searches]
+        running = [pool.submit(search, _Port(problem, stand_in, desk)) for search in searches]
         for each in running:
             each.add_done_callback(lambda _: desk.put(None))
         live, waiting = len(running), []
@@ -58,7 +59,8 @@ def together(
                 if len(waiting) < max(1, live):
                     continue
                 if over is None:
-                    _play(problem, waiting, room)
+                    for one in (problem, stand_in):
+                        _play(one, [wish for wish in waiting if wish.problem is one], room)
                     pulse()
             except BaseException as error:  # threads that wait have to hear of it, whatever it is
                 over = error
@@ -74,6 +76,7 @@ def together(
 class _Wish:
     """What a search asks for."""
 
+    problem: Problem
     actions: Tensor
     """Shape (P, T, A), or (T, A) for a trajectory that is to be recorded alone."""
     answer: Future[Any] = field(default_factory=Future)
@@ -82,14 +85,14 @@ class _Wish:
 class _Port:
     """A problem as one search sees it."""
 
-    def __init__(self, problem: Problem, desk: SimpleQueue[_Wish | None]) -> None:
+    def __init__(self, problem: Problem, stand_in: Problem | None, desk: SimpleQueue[_Wish | None]) -> None:
         self.name, self.choices = problem.name, problem.choices
         self.horizon, self.width = problem.horizon, problem.width
         self.group, self.limit = problem.group, problem.limit
-        self._desk = desk
+        self._problem, self._stand_in, self._desk = problem, stand_in, desk
 
     def _ask(self, actions: Tensor) -> Any:
-        wish = _Wish(actions)
+        wish = _Wish(self._problem, actions)
         self._desk.put(wish)
         return wish.answer.result()
 
@@ -101,6 +104,10 @@ class _Port:
     def record(self, actions: Tensor) -> tuple[Outcome, dict[str, Any]]:
         """Wait until the trajectory is played alone."""
         return self._ask(actions)
+
+    def rehearsal(self) -> _Port | None:
+        """Return the rehearsal, which is shared as well."""
+        return None if self._stand_in is None else _Port(self._stand_in, None, self._desk)
 
     def varied(self, copies: int, scale: float, seed: int) -> Problem:
         """Refuse: worlds differ from search to search."""

@@ -23,7 +23,7 @@ from torchdlo.envs.task import RADIUS, Arms, Seen, Task, make, straight
 from torchdlo.physics.numerics import safe_norm
 from torchdlo.scene import Params, Rope, Scene, State
 
-__all__ = ["Gathering"]
+__all__ = ["Gathering", "Rehearsal"]
 
 FINE, CELL = 0.0064, 0.01
 """Distance of particles and spacing of the grid [m]."""
@@ -33,6 +33,10 @@ BOX = Grid((-0.4, -0.6, 0.0), (0.9, 0.4, 0.4), CELL, ("open", "open", "open", "o
 """Where matter may be. The window follows the ball: 26 nodes are twice its width."""
 ROOM = 600
 """Nodes that there is room for next to rigid bodies; the flattened ball has 270 at the floor and 360 once gathered."""
+DRUMS = ((0.06, 0.033), (0.045, 0.03), (0.05, 0.025))
+"""Radius and half height of rigid stand-ins for ball, pebble and cylinder [m]."""
+MASSES = (0.524, 0.123, 0.236)
+"""Masses of the three [kg]."""
 
 
 @dataclass(frozen=True)
@@ -100,6 +104,29 @@ class Gathering(Task):
         together = geometry.distances(objects, objects).amax((-1, -2)) <= 0.16
         return together & (seen.notes["closest"] >= 0.06)
 
+    def rehearsal(self) -> Rehearsal | None:
+        """Return the task with rigid objects only."""
+        return Rehearsal(self.horizon, self.frames, self.settle, self.release, self.rope)
+
     def waypoints(self) -> list[list[tuple[float, float, float]]]:
         """Return a way by which the hands draw the rope round the objects, until it is a narrow bow about them."""
         return [[(0.04, -0.2, 0.018), (-0.07, -0.2, 0.018)], [(0.23, -0.5, 0.018), (-0.41, -0.5, 0.018)]]
+
+
+@dataclass(frozen=True)
+class Rehearsal(Gathering):
+    """Upright cylinders in place of the soft ball and the pebble, as wide, high and heavy as they are at rest."""
+
+    def build(self, moved: Tensor) -> tuple[Scene, Params, State]:
+        """Return the scene; each of the objects may be moved."""
+        solids = []
+        for k, (place, (radius, half), mass) in enumerate(zip((BALL, PEBBLE, CYLINDER), DRUMS, MASSES, strict=True)):
+            at = moved[:, k] + moved.new_tensor([*place[:2], half])
+            solids.append(Solid("cylinder", (radius, half), at, mass=mass, mu_s=0.3, mu_k=0.3))
+        return self._made(moved, solids)
+
+    def rehearsal(self) -> None:
+        """Return nothing: this is it."""
+
+    def _objects(self, seen: Seen) -> Tensor:
+        return seen.state.bodies.pos[:, 1:]

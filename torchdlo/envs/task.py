@@ -186,6 +186,10 @@ class Task(ABC):
         """Return which episodes have failed for good, bool, shape (B,)."""
         return torch.zeros(seen.x.shape[0], dtype=torch.bool, device=seen.x.device)
 
+    def rehearsal(self) -> Task | None:
+        """Return a task that is much like this one and quicker to play, for searches to begin with, if there is one."""
+        return None
+
     def waypoints(self) -> Sequence[Sequence[tuple[float, float, float]]]:
         """Return a way to the goal by hand: per point, how far each tool is from its start [m]."""
         return ()
