@@ -25,7 +25,7 @@ BASE, HEIGHT = 0.12, 0.30
 """Radius and height of the cone [m]."""
 NEAR = 0.06
 """Distance from the cone's surface within which the rope counts as wound round it [m]."""
-SHORT, SPARE = 10.0, 0.02
+SHORT, SPARE = 30.0, 0.02
 """What a whole turn that is missing counts in the return, and the share by which it is to be exceeded."""
 
 
@@ -53,8 +53,8 @@ class Coiling(Task):
         return {"near": torch.exp(-0.1 * self._missing(seen))}
 
     def extra(self, seen: Seen) -> dict[str, Tensor]:
-        """Return the distances themselves: the exponential is flat far from the goal."""
-        return {"distance": self._missing(seen)}
+        """Return the distances themselves, a tenth of the exponent: the exponential is flat far from the goal."""
+        return {"distance": 0.01 * self._missing(seen)}
 
     def success(self, seen: Seen) -> Tensor:
         """Return whether the rope turns by a whole turn within 6 cm of the cone."""

@@ -31,7 +31,7 @@ MIDDLE = (0.198, 0.198)
 COUNT = 30
 NEAR, TURN = 0.03, math.pi / 4
 """How near the goal [m] and how much bent round each post [rad] a rope has to be."""
-SHORT, SPARE = 10.0, 0.03
+SHORT, SPARE = 30.0, 0.03
 """What a condition of success counts in the return as long as it is missed, and the share by which to exceed it."""
 
 
