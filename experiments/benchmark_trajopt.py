@@ -53,11 +53,14 @@ class Case:
 
     def found(self, choices: dict[str, Any], again: bool) -> dict[str, Any] | None:
         """Return its result, if it is there and of the same settings; with `again`, of the same program as well."""
+        from torchdlo.agents.search import Settings
+
         if not self.result.is_file():
             return None
         found = json.loads(self.result.read_text())
-        wanted = json.loads(json.dumps(asdict(self.settings) | choices))
-        return found if found["settings"] == wanted and not (again and earlier(found)) else None
+        # Earlier versions had fewer settings.
+        had, wanted = (json.loads(json.dumps(x)) for x in (asdict(Settings()), asdict(self.settings) | choices))
+        return found if had | found["settings"] == wanted and not (again and earlier(found)) else None
 
     def search(self, problem: Any, callback: Any) -> None:
         """Search, resumed if it was stopped, and write what was found."""
