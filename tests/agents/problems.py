@@ -140,7 +140,7 @@ class Push(Plain):
 
 @dataclass(frozen=True)
 class Rehearsed(Push):
-    """The same with a disc that is a little larger, or easily found in the rehearsal, and too far off for slopes."""
+    """The same with a disc that is a little smaller than that of its rehearsal, and a note of what was played."""
 
     name: str = "rehearsed"
     reach: float = 0.028
@@ -152,7 +152,7 @@ class Rehearsed(Push):
         return super().evaluate(actions)
 
     def rehearsal(self) -> Any:
-        """The plain one, with a smaller disc."""
+        """The plain one, with its disc of the usual size."""
         return _Rehearsal(played=self.played)
 
 

@@ -163,6 +163,7 @@ def optimize(
             told = player.batch(ask, scale, stand_in if rehearses else problem)
             if k == plan.rehearsals > 0:
                 best.clear()  # what did well in a rehearsal has to do so in earnest
+                player.highest = float(told.returns.max())
             if robust and scale == 1 and curve and curve[-1]["scale"] < 1:
                 best.clear()  # what did well in milder worlds has to do so in these
             best.offer(ask, told)
