@@ -15,6 +15,8 @@ SIGMA = {"gathering": 0.005, "lifting": 0.005, "letter_art": 0.005}
 """First spreads of CMA-ES that differ from 0.05 m."""
 RATE = {"gathering": 1e-4, "lifting": 1e-4, "unknotting": 1e-4}
 """First steps of Adam that differ from 1 mm."""
+HOLD = {"coiling": 5}
+"""Actions per way-point of hybrids that differ from 10: ways of 10 cm are chords too long for a small circle."""
 REHEARSED = {"gathering": 0.9}
 """Shares of iterations in which hybrids play the task's rehearsal, if not 0."""
 POPULATION = {"cmaes": 400, "gd": 16, "hybrid": 100}
@@ -43,10 +45,13 @@ def preset(task: str, method: str, **given: Any) -> Settings:
         method=method,
         episodes=episodes,
         population=min(POPULATION.get(method, 400), max(_FEWEST, episodes // _ITERATIONS)),
-        # Tools that go together, or down a slope, do not need the small steps that keep them from tearing a rope.
-        sigma=0.05 if method == "hybrid" else SIGMA.get(task, 0.05),
+        sigma=SIGMA.get(task, 0.05),
         rate=RATE.get(task, 1e-3),
     )
-    if method == "hybrid" and not given.get("robust"):
-        found = replace(found, rehearsed=REHEARSED.get(task, 0.0))
+    if method == "hybrid":
+        # Tools that go together, or down a slope, do not need the small steps that keep them from tearing a rope: the
+        # first spread is the one that follows from `hold`.
+        found = replace(found, hold=HOLD.get(task), sigma=None)
+        if not given.get("robust"):
+            found = replace(found, rehearsed=REHEARSED.get(task, 0.0))
     return replace(found, **{name: value for name, value in given.items() if value is not None})
