@@ -333,6 +333,21 @@ def test_a_body_and_a_rope_touch_the_same_matter():
     assert float((after[0] + felt.sum(-2) - before).norm() / before.norm()) < 1e-12
 
 
+def test_planes_may_be_left_to_walls():
+    floor = Solid("plane", pos=(0.0, 0.0, 0.04), motion="fixed")
+    ball = Solid("sphere", 0.02, pos=(0.1, 0.1, 0.105), vel=(0.0, 0.0, -1.0), density=1500.0)
+    matter = block((0.075, 0.075, 0.04), (0.125, 0.125, 0.08), youngs=5e4)
+
+    def met(solids, **choices):
+        return go(world(matter, solids, [BodyMatter(**choices)], gravity=False), 10)
+
+    alone, both, left = met([ball]), met([floor, ball]), met([floor, ball], planes=False)
+    assert torch.equal(left.matter.pos, alone.matter.pos)
+    assert torch.equal(left.bodies.vel[1], alone.bodies.vel[0]) and not left.bodies.vel[0].any()
+    assert float((both.matter.pos - alone.matter.pos).abs().max()) > 1e-4
+    assert torch.equal(met([floor], planes=False).matter.pos, matter[2].pos)
+
+
 def test_the_effect_needs_bodies_and_matter():
     solid, matter = Solid("sphere", 0.02, density=100.0), block((0.07,) * 3, (0.1,) * 3)
     with pytest.raises(ValueError, match="BodyMatter is among the effects, but there is no matter"):

@@ -126,6 +126,16 @@ class BodyMotion:
             turn=self.turn + self.turned(push.body_torque),
         )
 
+    def only(self, part: Sequence[int]) -> BodyMotion:
+        """Return the motion of some of the bodies, by their numbers."""
+
+        def cut(x: Tensor) -> Tensor:
+            return torch.stack([x[..., k, :] for k in part], -2)
+
+        names = ("params", "state", "change", "turn", "mobility", "agility")
+        parts = {name: tree.map(cut, getattr(self, name)) for name in names}
+        return dataclasses.replace(self, bodies=tuple(self.bodies[k] for k in part), **parts)
+
 
 @dataclass(frozen=True, eq=False)
 class Solid:

@@ -69,6 +69,8 @@ class BodyMatter(Effect):
     """Distance off the surface at which nodes begin to feel it, in node spacings."""
     recovery: float = 10.0
     """Rate at which matter leaves the inside of a body [1/s]."""
+    planes: bool = True
+    """Whether planes take part. Not where walls of the box stand for them, which cost less."""
 
     name: ClassVar[str] = "body_matter"
     kind: ClassVar[str] = "force"
@@ -86,14 +88,24 @@ class BodyMatter(Effect):
             matter: where matter would go without contact.
             push: what all other contact exerts on bodies, and what it leaves of the matter.
         """
+        part = [k for k, body in enumerate(motion.bodies) if self.planes or body.shape != "plane"]
+        if not part:
+            return push
         touched = Touched(matter.nodes, 0.0) if push.matter == () else push.matter
         batch = matter.particles.pos.shape[:-2]
-        impulse, torque, nodes, lost = exchange(self, matter.grid, touched.nodes, motion.pushed(push), batch)
-        shape = (*batch, len(motion.bodies), 3)
+        met = motion.pushed(push)
+        met = met if len(part) == len(met.bodies) else met.only(part)
+        impulse, torque, nodes, lost = exchange(self, matter.grid, touched.nodes, met, batch)
+
+        def force(x: Tensor) -> Tensor:
+            rows = dict(zip(part, (x / motion.dt).reshape(*batch, len(part), 3).unbind(-2), strict=True))
+            none = x.new_zeros(*batch, 3)
+            return torch.stack([rows.get(k, none) for k in range(len(motion.bodies))], -2)
+
         return dataclasses.replace(
             push,
-            body_force=push.body_force + (impulse / motion.dt).reshape(shape),
-            body_torque=push.body_torque + (torque / motion.dt).reshape(shape),
+            body_force=push.body_force + force(impulse),
+            body_torque=push.body_torque + force(torque),
             matter=Touched(nodes, touched.lost + lost.to(impulse.dtype)),
         )
 

@@ -31,8 +31,8 @@ BALL, PEBBLE, CYLINDER = (0.25, 0.02, 0.07), (0.5, -0.05, 0.07), (0.08, -0.08, 0
 """Where the objects start [m]."""
 BOX = Grid((-0.4, -0.6, 0.0), (0.9, 0.4, 0.4), CELL, ("open", "open", "open", "open", "separate", "open"), (26, 26, 26))
 """Where matter may be. The window follows the ball: 26 nodes are twice its width."""
-ROOM = 600
-"""Nodes that there is room for next to rigid bodies; the flattened ball has 270 at the floor and 360 once gathered."""
+ROOM = 200
+"""Nodes that there is room for next to pebble and cylinder; the gathered ball has 96 there."""
 DRUMS = ((0.06, 0.033), (0.045, 0.03), (0.05, 0.025))
 """Radius and half height of rigid stand-ins for ball, pebble and cylinder [m]."""
 MASSES = (0.524, 0.123, 0.236)
@@ -64,7 +64,8 @@ class Gathering(Task):
         rope = Rope(x, RADIUS, mass=0.44, youngs=1e3, stretch=1e5 * math.pi * RADIUS**2)
         floor = Solid("plane", motion="fixed", mu_s=0.3, mu_k=0.3)
         values = {"damping": {"rate": 15.0, "twist_rate": 10.0}}
-        meet = [BodyMatter(room=ROOM)] if matter else []
+        # A wall of the box is the floor for matter.
+        meet = [BodyMatter(room=ROOM, planes=False)] if matter else []
         return make(self, [rope], meet, values, solids=[floor, *solids], matter=matter)
 
     def _objects(self, seen: Seen) -> Tensor:
