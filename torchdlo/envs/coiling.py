@@ -25,8 +25,10 @@ BASE, HEIGHT = 0.12, 0.30
 """Radius and height of the cone [m]."""
 NEAR = 0.06
 """Distance from the cone's surface within which the rope counts as wound round it [m]."""
-SHORT, SPARE = 30.0, 0.02
+SHORT, SPARE = 100.0, 0.02
 """What a whole turn that is missing counts in the return, and the share by which it is to be exceeded."""
+FADE = 0.2
+"""Distance beyond `NEAR` over which turns come to count a third in half of the shortfall [m]."""
 
 
 @dataclass(frozen=True)
@@ -61,8 +63,12 @@ class Coiling(Task):
         return wound(seen.x).abs() >= 2 * math.pi
 
     def shortfall(self, seen: Seen) -> Tensor:
-        """Return the share of a whole turn that is missing: coils that are wide and loose may earn as much."""
-        return SHORT * (1 - wound(seen.x).abs() / (1 + SPARE) / (2 * math.pi)).clamp(min=0)
+        """Return the share of a whole turn that is missing: coils that are wide and loose may earn as much.
+
+        Half of it counts what turns further out, too, by less the further: the other half does not say how to get near.
+        """
+        done = torch.stack([wound(seen.x), wound(seen.x, FADE)]).abs() / (1 + SPARE) / (2 * math.pi)
+        return SHORT * (1 - done).clamp(min=0).mean(0)
 
     def waypoints(self) -> list[list[tuple[float, float, float]]]:
         """Return a way up and straight to the cone's upper part, and on round it at its side. It earns 12.1.
@@ -81,10 +87,16 @@ class Coiling(Task):
         return [[point] for point in way]
 
 
-def wound(x: Tensor) -> Tensor:
-    """Return by how much curves turn round the cone where they are near it [rad], shape (...)."""
+def wound(x: Tensor, fade: float = 0.0) -> Tensor:
+    """Return by how much curves turn round the cone where they are near it [rad], shape (...).
+
+    Args:
+        x: a polyline, shape (..., V, 3).
+        fade: distance further out over which turns come to count a third [m]; 0: they count nothing.
+    """
     # Distance from the cone's flank, positive outside: its profile leads from (BASE, 0) to (0, HEIGHT).
     across = 0.5 * (x[..., 1:, :] + x[..., :-1, :])
     slant = math.hypot(BASE, HEIGHT)
-    out = ((across[..., :2].norm(dim=-1) - BASE) * HEIGHT + across[..., 2] * BASE) / slant
-    return (geometry.turns(x, x.new_zeros(2)) * (out - RADIUS <= NEAR)).sum(-1)
+    out = ((safe_norm(across[..., :2]).squeeze(-1) - BASE) * HEIGHT + across[..., 2] * BASE) / slant - RADIUS
+    share = torch.exp(-(out - NEAR).clamp(min=0) / fade) if fade else out <= NEAR
+    return (geometry.turns(x, x.new_zeros(2)) * share).sum(-1)
