@@ -43,7 +43,9 @@ def test_the_benchmark_writes_its_table_and_reads_finished_runs(tmp_path: Path) 
     result.write_text(json.dumps(content | {"return": 0.25, "program": "another", "settings": fewer}))
     marked = call(*words).stdout
     assert "| wiring_post | cmaes | 1* | 0.25 |" in marked and "another version of the program" in marked
-    assert call(*words, "--again").stdout == done.stdout
+    # All but the seconds, the last column, is as it was.
+    again, first = (text.rsplit("|", 2)[0] for text in (call(*words, "--again").stdout, done.stdout))
+    assert again == first
 
 
 def test_unknown_names_are_refused() -> None:

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from tests.agents.problems import Drag, Peaks, Plain, Push, Reach, Rehearsed, signature
-from torchdlo.agents.plan import ranking
+from torchdlo.agents.plan import Told, ranking
 from torchdlo.agents.problem import Outcome
 from torchdlo.agents.search import METHODS, Found, Robust, Settings, optimize
 from torchdlo.errors import InputError
@@ -183,6 +183,27 @@ def test_the_hybrid_goes_where_it_succeeds_and_not_where_it_earns_most() -> None
     done, blind = (optimize(Lure(shown=shown), settings) for shown in (True, False))
     assert bool(done.outcome.success[0]) and not bool(blind.outcome.success[0])
     assert returned(blind) > returned(done) > 9.96
+
+
+def test_islands_know_nothing_of_each_other() -> None:
+    def asked(shift: float) -> list[Tensor]:
+        problem = Reach()
+        plan = Settings("hybrid", episodes=600, population=40, hold=5).plan(problem)
+        search, told, points = METHODS["hybrid"](plan, torch.Generator().manual_seed(0)), None, []
+        for _ in range(12):
+            ask = search.send(told)
+            points.append(ask.points)
+            x = ask.points.clone().requires_grad_()
+            went = problem.evaluate(ask.encoding.decode(x))
+            (slope,) = torch.autograd.grad(went.loss.sum(), x)
+            # The second island is told of another problem.
+            off = torch.where(torch.arange(len(x)) < 20, 0.0, shift * torch.arange(len(x)))
+            told = Told(went.returns.detach() - off, went.loss.detach() + off, 0 * off, *[off < 0] * 2, slope)
+        return points
+
+    same, other = asked(0.0), asked(1.0)
+    assert all(len(a) == 40 and torch.equal(a[:20], b[:20]) for a, b in zip(same, other, strict=True))
+    assert torch.equal(same[0], other[0]) and not torch.equal(same[-1][20:], other[-1][20:])
 
 
 def test_a_search_begins_with_a_rehearsal() -> None:

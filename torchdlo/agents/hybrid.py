@@ -1,6 +1,8 @@
 """Gradients inside an evolution strategy, and descent beside it: for losses that are flat until something is touched.
 
-Two parts share the budget, iteration by iteration, and every episode of both is played with gradient:
+Large populations live on islands that know nothing of each other: whichever way round an obstacle a search goes, it
+seldom comes back, and another one may go the other way. On each of them, two parts share the budget, iteration by
+iteration, and every episode of both is played with gradient:
 
 1. Straight sweeps over what can be reached find out what there is to touch. CMA-ES searches way-points from the best of
    them. A part of each population are the best points so far, moved down their slope in the metric of the strategy;
@@ -27,6 +29,8 @@ from torchdlo.agents.plan import Ask, Plan, Search, Told, ranking, sweeps, walks
 
 __all__ = ["hybrid"]
 
+_ISLAND = 20
+"""Trajectories that an island needs."""
 _COARSE = 0.3
 """Share of the iterations in which CMA-ES is alone."""
 _TURN = 5
@@ -40,7 +44,23 @@ _APART = 0.2
 
 
 def hybrid(plan: Plan, rng: torch.Generator) -> Search:
-    """Search with sweeps, CMA-ES and descent, see above."""
+    """Search on islands, see above."""
+    count = max(1, plan.population // _ISLAND)
+    sizes = [(plan.population + k) // count for k in range(count)]
+    seeds = torch.randint(2**31, (count,), generator=rng).tolist()
+    islands = [
+        _island(replace(plan, population=size), torch.Generator().manual_seed(seed))
+        for size, seed in zip(sizes, seeds, strict=True)
+    ]
+    parts: list[Told | None] = [None] * count
+    while True:
+        asks = [island.send(told) for island, told in zip(islands, parts, strict=True)]
+        told = yield Ask(asks[0].encoding, torch.cat([ask.points for ask in asks]), graded=True)
+        parts = told.split([len(ask.points) for ask in asks])
+
+
+def _island(plan: Plan, rng: torch.Generator) -> Search:
+    """Search with sweeps, CMA-ES and descent."""
     encoding, coarse, fine = plan.encoding(1), _Evolution(plan, rng), Descent(plan, rng)
     drifts = math.ceil(plan.drifts * plan.iterations)
     alone = max(drifts, math.ceil(_COARSE * plan.iterations))
@@ -92,7 +112,8 @@ class _Evolution:
     def ask(self) -> Tensor:
         """Return what to play: points that were moved, and what the strategy draws."""
         if self.found is not None:
-            self.x = drawn(self.found, self.encoding, self.encoding.project(self.lines.moved(self.found)))
+            moved = self.x[:0] if self.lines is None else self.encoding.project(self.lines.moved(self.found))
+            self.x = drawn(self.found, self.encoding, moved)
         return self.encoding.decode(self.x).flatten(1)
 
     def tell(self, _: Tensor, told: Told) -> None:

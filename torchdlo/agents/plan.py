@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator
+import dataclasses
+from collections.abc import Generator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -49,6 +50,11 @@ class Told:
     def value(self) -> Tensor:
         """Returns without what is missing to success; -inf where there is no number [-], shape (P,)."""
         return self.returns - self.shortfall
+
+    def split(self, sizes: Sequence[int]) -> list[Told]:
+        """Return the parts for so many trajectories each."""
+        columns = (getattr(self, f.name).split(list(sizes)) for f in dataclasses.fields(self))
+        return [Told(*part) for part in zip(*columns, strict=True)]
 
 
 Search = Generator[Ask, Told, None]
