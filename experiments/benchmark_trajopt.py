@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import statistics
 import subprocess
 import sys
@@ -62,6 +63,26 @@ class Case:
         had, wanted = (json.loads(json.dumps(x)) for x in (asdict(Settings()), asdict(self.settings) | choices))
         return found if had | found["settings"] == wanted and not (again and earlier(found)) else None
 
+    def ready(self, choices: dict[str, Any], again: bool) -> None:
+        """Say so before anything runs if the journal of a stopped search is of another one; `again` removes it."""
+        from torchdlo.agents.journal import program
+        from torchdlo.errors import InputError
+
+        journal = self.folder / "journal"
+        if not (journal / "journal.json").is_file():
+            return
+        had = json.loads((journal / "journal.json").read_text())
+        wanted = json.loads(json.dumps(asdict(self.settings) | choices))
+        other = [name for name, value in wanted.items() if had["options"].get(name) != value]
+        other += ["version"] if had["program"] != program() else []
+        if other and again:
+            shutil.rmtree(journal)
+        elif other:
+            raise InputError(
+                f"{journal}: a search was stopped here whose {', '.join(other)} differ; --again begins anew, or choose "
+                "another --out."
+            )
+
     def search(self, problem: Any, callback: Any) -> None:
         """Search, resumed if it was stopped, and write what was found."""
         from torchdlo.agents.result import result_json, trajectory_json
@@ -98,6 +119,8 @@ def solve(task: str, args: Any) -> list[tuple[Case, dict[str, Any]]]:
 
     chosen, wanted = problem(task, double=args.double, compiled=args.compiled), cases(task, args)
     left = [case for case in wanted if case.found(chosen.choices, args.again) is None]
+    for case in left:
+        case.ready(chosen.choices, args.again)
     said: dict[Path, tuple[int, int, str]] = {}
     with progress() as show, deferred_interrupt(show) as callback:
 

@@ -46,6 +46,15 @@ def test_the_benchmark_writes_its_table_and_reads_finished_runs(tmp_path: Path) 
     # All but the seconds, the last column, is as it was.
     again, first = (text.rsplit("|", 2)[0] for text in (call(*words, "--again").stdout, done.stdout))
     assert again == first
+    # What was stopped with other settings is not gone on with.
+    result.unlink()
+    journal = result.parent / "journal" / "journal.json"
+    journal.parent.mkdir()
+    mark = {"generator": "torchdlo optimize", "options": content["settings"] | {"population": 7}, "program": "another"}
+    journal.write_text(json.dumps(mark))
+    refused = call(*words)
+    assert refused.returncode == 1 and "whose population, version differ; --again begins anew" in refused.stderr
+    assert call(*words, "--again").returncode == 0 and result.is_file() and not journal.exists()
 
 
 def test_unknown_names_are_refused() -> None:
