@@ -13,8 +13,9 @@ from torchdlo.coupling.pose import Pose
 from torchdlo.envs import TASKS, geometry
 from torchdlo.envs import letter_art as letters
 from torchdlo.envs import wiring_post as wiring
+from torchdlo.envs.lifting import into
 from torchdlo.envs.solids import c_ring
-from torchdlo.envs.task import Seen, Task, even
+from torchdlo.envs.task import Seen, Task, even, straight
 from torchdlo.physics import tree
 
 F64 = torch.float64
@@ -90,8 +91,7 @@ def test_the_further_from_success_the_more_is_lacking(name, good, worse):
     short = TASKS[name]().shortfall(seen)
     assert short[0] == 0 and (short.diff() > 0).all()
     (slope,) = torch.autograd.grad(short.sum(), x)
-    # The rope that is nowhere near the cone turns round it by nothing, wherever it is moved.
-    assert torch.isfinite(slope).all() and not slope[0].any() and slope[1:3].flatten(1).any(1).all()
+    assert torch.isfinite(slope).all() and not slope[0].any() and slope[1:].flatten(1).any(1).all()
 
 
 def test_the_goal_of_wiring_is_where_the_task_says():
@@ -168,6 +168,32 @@ def test_lifting_takes_both_rings_for_a_while():
     heights[3] = 0.11 + 1e-9
     shapes = [first("lifting").rods.pos[0]] * 4
     assert judged("lifting", *shapes, notes={"heights": heights}) == [True, False, False, True]
+
+
+def test_the_way_into_a_ring_leads_over_it_and_through_its_gap():
+    degrees = torch.tensor([0.0, 40.0, 60.0, 90.0, 135.0, 180.0, 225.0, 300.0], dtype=F64)
+    angle = torch.deg2rad(degrees)
+    round_it = torch.stack([-angle.cos(), angle.sin()], -1)
+    way = into(0.1 * round_it)
+    # From the gap straight; from elsewhere down to the ring's outside, 45 degrees before it, and along it.
+    out = 0.045 + 0.012 + 0.01
+    expected = 0.1 + out * torch.deg2rad((degrees - 45).clamp(min=0))
+    assert torch.allclose(way, expected) and torch.allclose(into(0.02 * round_it), way.new_tensor(0.02))
+    middle = torch.zeros(1, 2, dtype=F64, requires_grad=True)
+    assert torch.isfinite(torch.autograd.grad(into(middle).sum(), middle)[0]).all()
+
+
+def test_lifting_lacks_less_in_front_of_the_gaps_than_behind_the_rings_and_nothing_in_raised_ones():
+    state = tree.map(lambda x: x.expand(4, *x.shape[1:]).clone(), first("lifting"))
+    x = straight((0.3, 0.0, 0.06), 30, state.rods.pos.new_zeros(4, 3))
+    x[:, :, 1] = x.new_tensor([0.1, -0.1, 0.0, 0.0])[:, None]
+    bodies = state.bodies.pos.clone()
+    x[3, :, 2] += 0.05
+    bodies[3, 1:, 2] += 0.05
+    seen = Seen(tree.replace(state, rods=tree.replace(state.rods, pos=x)), None, None, {})
+    seen = tree.replace(seen, state=tree.replace(seen.state, bodies=tree.replace(state.bodies, pos=bodies)))
+    short = TASKS["lifting"]().shortfall(seen)
+    assert (short.diff() < 0).all() and short[2:].tolist() == pytest.approx([40.0, 0.0])
 
 
 def test_gathering_takes_objects_together_and_hands_clear():

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from torchdlo.coupling.bodies import Solid
 from torchdlo.envs import geometry
-from torchdlo.envs.solids import c_ring, origin
+from torchdlo.envs.solids import GAP, RING, TUBE, c_ring, origin
 from torchdlo.envs.task import RADIUS, Arms, Seen, Task, make, straight
 from torchdlo.physics.numerics import safe_norm
 from torchdlo.scene import Params, Rope, Scene, State
@@ -28,6 +28,8 @@ LIFT = 0.05
 """By how much rings are to be lifted [m]."""
 LATE = 5
 """Actions at the end that count: 0.1 s."""
+AWAY, LOW = 100.0, 20.0
+"""What a metre counts in the return that the rope still has to go into a ring, and a lift that is missing."""
 
 
 @dataclass(frozen=True)
@@ -78,7 +80,35 @@ class Lifting(Task):
         start = seen.x.new_tensor([c[2] for c in CENTRES])
         return (seen.notes["heights"] >= start + LIFT).all(-1).all(-1)
 
+    def shortfall(self, seen: Seen) -> Tensor:
+        """Return how far the rope has to go into the rings, and by how much they are too low.
+
+        Behind a ring the rope is as near to its centre as in front of its gap, but has the whole way round to go.
+        """
+        rings, x = self._rings(seen).unsqueeze(-2), seen.x.unsqueeze(-3)
+        side = x[..., 0] - rings[..., 0]
+        way = safe_norm(torch.stack([side, into(x[..., 1:] - rings[..., 1:])], -1)).squeeze(-1).amin(-1)
+        start = x.new_tensor([c[2] for c in CENTRES])
+        low = (1 - (rings[..., 0, 2] - start) / LIFT).clamp(min=0)
+        return (AWAY * (way - RING).clamp(min=0) + LOW * low).sum(-1)
+
     def waypoints(self) -> list[list[tuple[float, float, float]]]:
         """Return a way by which the rope, pulled straight, goes over the rings, into their gaps and up with them."""
         way = [(-0.033, 0.133), (-0.17, 0.133), (-0.19, 0.048), (-0.1, 0.048), (-0.1, 0.53)]
         return [[(-0.0025, y, z), (0.0225, y, z)] for y, z in way]
+
+
+def into(p: Tensor) -> Tensor:
+    """Return how far it is to the middle of an upright ring, over it and through its gap [m], shape (...).
+
+    Args:
+        p: points in its plane, along y and z from its centre; the gap is at -y; shape (..., 2).
+    """
+    far = safe_norm(p).squeeze(-1)
+    # Angle from an end of the gap, over the top: the floor bars the way below. In the very middle there is none.
+    p = torch.where(far.unsqueeze(-1) > 0, p, 1.0)
+    angle = torch.atan2(p[..., 1], -p[..., 0]) - 0.5 * GAP
+    angle = torch.where(angle < -GAP, angle + 2 * math.pi, angle)
+    out = RING + TUBE + RADIUS
+    outside = (far > RING) & (angle > 0)
+    return torch.where(outside, far.clamp(min=out) + out * angle, far)
