@@ -34,7 +34,7 @@ def earlier(result: dict[str, Any]) -> bool:
     """Return whether a result is of another version of the program or of libraries."""
     from torchdlo.agents.journal import program
 
-    return result["program"] != program()
+    return result["program"] != program(result["task"])
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,7 @@ class Case:
         had = json.loads((journal / "journal.json").read_text())
         wanted = json.loads(json.dumps(asdict(self.settings) | choices))
         other = [name for name, value in wanted.items() if had["options"].get(name) != value]
-        other += ["version"] if had["program"] != program() else []
+        other += ["version"] if had["program"] != program(self.task) else []
         if other and again:
             shutil.rmtree(journal)
         elif other:

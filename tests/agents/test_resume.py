@@ -15,6 +15,7 @@ import pytest
 from torch import Tensor
 
 from tests.agents.problems import Push, signature
+from torchdlo.agents.journal import program
 from torchdlo.agents.problem import Outcome
 from torchdlo.agents.result import result_json, trajectory_json
 from torchdlo.agents.search import METHODS, Found, Robust, Settings, optimize
@@ -158,8 +159,12 @@ def test_only_the_same_search_goes_on(tmp_path: Path, monkeypatch: pytest.Monkey
         journal, replace(SETTINGS, method="gd", population=4)
     )
     with monkeypatch.context() as patch:
-        patch.setattr("torchdlo.agents.journal.program", lambda: "another")
+        patch.setattr("torchdlo.agents.journal.program", lambda _: "another")
         assert "another version of torchdlo" in refused(journal)
+
+
+def test_results_depend_on_the_code_of_their_own_task_only() -> None:
+    assert len({program("coiling"), program("wrapping"), program("push")}) == 3 and program("push") == program("reach")
 
 
 def test_results_of_another_search_are_noticed(tmp_path: Path) -> None:

@@ -17,6 +17,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torchdlo.envs import TASKS
 from torchdlo.errors import InputError
 from torchdlo.files import replacing, write_atomically
 
@@ -43,14 +44,17 @@ def _package_version() -> str:
     return __version__
 
 
-def program() -> str:
-    """Return a hash of the code and the libraries that results depend on."""
-    root = Path(__file__).parents[1]
+def program(name: str) -> str:
+    """Return a hash of the code and the libraries that results of a problem depend on.
+
+    Other tasks do not belong to it, nor do presets: settings are written down themselves.
+    """
+    root, others = Path(__file__).parents[1], {"presets.py", *(f"{task}.py" for task in TASKS if task != name)}
     found = hashlib.sha256(json.dumps(versions(), sort_keys=True).encode())
     for part in ("physics", "coupling", "envs", "agents", "data/robots", "scene.py"):
         files = [root / part] if part.endswith(".py") else sorted((root / part).rglob("*"))
         for file in files:
-            if file.suffix in (".py", ".cpp", ".h", ".urdf"):
+            if file.suffix in (".py", ".cpp", ".h", ".urdf") and file.name not in others:
                 found.update(file.name.encode() + file.read_bytes())
     return found.hexdigest()
 
@@ -69,7 +73,7 @@ class Journal:
         self.path, self.count = path, 0
         if path is None:
             return
-        mark = {"generator": "torchdlo optimize", "options": options, "program": program()}
+        mark = {"generator": "torchdlo optimize", "options": options, "program": program(options["name"])}
         mark = json.loads(json.dumps(mark))
         found = self._found(path)
         if resume:

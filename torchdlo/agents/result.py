@@ -58,7 +58,7 @@ def result_json(found: Found, problem: Problem, settings: Settings) -> str:
         "interrupted": found.interrupted,
         "settings": asdict(settings) | problem.choices,
         "versions": versions(),
-        "program": program(),
+        "program": program(problem.name),
         "curve": [{k: _finite(v) for k, v in point.items()} for point in found.curve],
     }
     return json.dumps(content, indent=1, allow_nan=False) + "\n"
