@@ -15,7 +15,7 @@ import statistics
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -52,16 +52,21 @@ class Case:
         """The file that says that it is finished."""
         return self.folder / "result.json"
 
-    def found(self, choices: dict[str, Any], again: bool) -> dict[str, Any] | None:
+    def found(self, problem: Any, again: bool) -> dict[str, Any] | None:
         """Return its result, if it is there and of the same settings; with `again`, of the same program as well."""
         from torchdlo.agents.search import Settings
+
+        def resolved(settings: dict[str, Any]) -> dict[str, Any]:
+            own = Settings(**{f.name: settings[f.name] for f in fields(Settings)})
+            return settings | {name: getattr(own.plan(problem), name) for name in ("hold", "sigma", "rate", "steps")}
 
         if not self.result.is_file():
             return None
         found = json.loads(self.result.read_text())
         # Earlier versions had fewer settings.
-        had, wanted = (json.loads(json.dumps(x)) for x in (asdict(Settings()), asdict(self.settings) | choices))
-        return found if had | found["settings"] == wanted and not (again and earlier(found)) else None
+        had, wanted = (json.loads(json.dumps(x)) for x in (asdict(Settings()), asdict(self.settings) | problem.choices))
+        same = resolved(had | found["settings"]) == resolved(wanted)
+        return found if same and not (again and earlier(found)) else None
 
     def ready(self, choices: dict[str, Any], again: bool) -> None:
         """Say so before anything runs if the journal of a stopped search is of another one; `again` removes it."""
@@ -118,7 +123,7 @@ def solve(task: str, args: Any) -> list[tuple[Case, dict[str, Any]]]:
     from torchdlo.progress import deferred_interrupt, progress
 
     chosen, wanted = problem(task, double=args.double, compiled=args.compiled), cases(task, args)
-    left = [case for case in wanted if case.found(chosen.choices, args.again) is None]
+    left = [case for case in wanted if case.found(chosen, args.again) is None]
     for case in left:
         case.ready(chosen.choices, args.again)
     said: dict[Path, tuple[int, int, str]] = {}
