@@ -32,6 +32,17 @@ def test_the_kernel_chooses_as_tensors_do(names, room, monkeypatch):
     assert bool((found[4][2] > 0).any()) == (room == 60)
 
 
+def test_of_nodes_that_are_as_far_either_is_right():
+    grid, nodes, _, motion, _ = meeting(["torus"], BodyMatter())
+    solids, points = body_matter._solids(motion, (2,)), mpm.places(grid, nodes)
+    off = body_matter._probe(motion, solids, points.unsqueeze(1))[0][:, 0, :, 0]
+    mine, lost = body_near.choose(motion, grid, nodes, (2,), 0.007, 60)
+    theirs, missed = body_matter._chosen(motion, solids, nodes, points, 0.007, 60)
+    assert torch.equal(lost.long(), missed.long()) and (lost > 0).any()
+    far = [off.gather(1, chosen).sort(-1)[0] for chosen in (mine, theirs)]
+    torch.testing.assert_close(*far, rtol=0, atol=1e-12)
+
+
 def test_the_kernel_chooses_every_node_once_and_none_without_mass():
     grid, nodes, _, motion, _ = meeting(["box", "sphere"], BodyMatter())
     reach = 0.01

@@ -93,13 +93,15 @@ class BodyMatter(Effect):
             return push
         touched = Touched(matter.nodes, 0.0) if push.matter == () else push.matter
         batch = matter.particles.pos.shape[:-2]
-        met = motion.pushed(push)
-        met = met if len(part) == len(met.bodies) else met.only(part)
+        met, some = motion.pushed(push), len(part) < len(motion.bodies)
+        met = met.only(part) if some else met
         impulse, torque, nodes, lost = exchange(self, matter.grid, touched.nodes, met, batch)
 
         def force(x: Tensor) -> Tensor:
-            rows = dict(zip(part, (x / motion.dt).reshape(*batch, len(part), 3).unbind(-2), strict=True))
-            none = x.new_zeros(*batch, 3)
+            x = (x / motion.dt).reshape(*batch, len(part), 3)
+            if not some:
+                return x
+            rows, none = dict(zip(part, x.unbind(-2), strict=True)), x.new_zeros(*batch, 3)
             return torch.stack([rows.get(k, none) for k in range(len(motion.bodies))], -2)
 
         return dataclasses.replace(
