@@ -8,7 +8,7 @@ import pytest
 import torch
 from touching import F64, line, run
 
-from torchdlo.coupling import RodBody, shapes
+from torchdlo.coupling import RodBody, body_sweeps, shapes
 from torchdlo.coupling.bodies import conjugate
 from torchdlo.physics import tree
 from torchdlo.physics.effects.elastic import Bend
@@ -208,3 +208,22 @@ def test_a_rope_that_falls_on_a_body_stays_outside(shape):
         state = run(scene, params, state, 50)
         assert min(gap(scene, params, state, k) for k in range(2)) > -0.1
     assert abs(min(gap(scene, params, state, k) for k in range(2))) < 0.1 and bool(finite(state))
+
+
+@pytest.mark.parametrize("eager", [False, True], ids=["kernel", "tensors"])
+@pytest.mark.parametrize("off", [0.0, 1e-5, 2e-4, 3e-3, 6e-3])
+def test_a_body_that_overlaps_a_held_vertex_does_not_throw_the_free_ends_of_its_edges(off, eager, monkeypatch):
+    # The body is nearest to a point that is `off` from the held vertex in the middle. A free end would have to move by
+    # length / off times the overlap to bring that point out at once.
+    monkeypatch.setattr(body_sweeps, "ready", lambda *_: not eager)
+    x, overlap = line(3, 0.04), 0.003
+    ball = Solid("sphere", 0.03, pos=(off, 0.0, -0.035 + overlap), motion="fixed")
+    rope, effects = Rope(x, radius=0.005, mass=0.003), [RodBody(), Damping()]
+    made = make([rope], effects, bodies=[ball], dt=2e-4, substeps=1, held_vertices=(1,))
+    after = run(*made, 1)
+    assert torch.equal(after.rods.pos[1], made[2].rods.pos[1])
+    speed = float(after.rods.vel.norm(dim=-1).max())
+    assert speed <= 2 * overlap / 2e-4
+    # They come to rest outside.
+    after = run(*made, 500)
+    assert float(after.rods.vel.norm(dim=-1).max()) < 0.02 and bool(finite(after).all())

@@ -4,8 +4,8 @@ Per substep, for every edge and every body: the two ends of the edge and the poi
 body (several where bodies are not convex), see `edge_points`. A point of the centreline at the share s of an edge has
 the gap g = distance - radius and the unit normal n, out of the body. From then on contact is as among ropes (see
 `contact`): no overlap at the end of the substep, n . (d_rod - d_body) >= -g with the motions d that are foreseen;
-rebound; Coulomb friction; forces by projected Jacobi sweeps with row sums as inverse masses; then the lengths of the
-edges. All edges are tried with all bodies in every substep, so nothing can be missed for lack of room; the sign of the
+rebound; Coulomb friction; forces by projected Jacobi sweeps with row sums as inverse masses, held vertices counted as
+heavy ones; then the lengths of the edges. All edges are tried with all bodies in every substep, so nothing can be missed for lack of room; the sign of the
 gap comes from the start of the substep, so a fast edge does not get past a thin post.
 
 The body takes the opposite impulse at the same place, its torque included: linear and angular momentum are exact. The
@@ -37,6 +37,11 @@ from torchdlo.physics.effect import Effect, Motion, Push, Values
 from torchdlo.physics.numerics import cross, dot
 from torchdlo.physics.rod import View
 from torchdlo.physics.rotation import rotate
+
+HELD = 0.1
+"""Share of its free mobility with which a held vertex counts in how points give way, though it stays where it is. A
+point close to it that overlaps can hardly be moved by the free end of its edge: all of the overlap would throw that
+end away."""
 
 
 @dataclass(frozen=True)
@@ -127,7 +132,7 @@ class _Softness:
 
     points: _Points
     first: Tensor
-    """By how much a force moves the first vertices of the edges, 0 if held [m/N], shape (..., 1, V, 1)."""
+    """By how much a force counts as moving the first vertices of the edges [m/N], shape (..., 1, V, 1)."""
     second: Tensor
     """The same for the second ones [m/N], shape (..., 1, V, 1)."""
     mobility: Tensor
@@ -157,7 +162,7 @@ class _Softness:
 
 
 def _softness(points: _Points, answer: Tensor, bodies: BodyMotion) -> _Softness:
-    """Return how points give way; `answer` is by how much a force moves vertices [m/N], shape (..., V, 1)."""
+    """Return how points give way; `answer` is by how much a force counts as moving vertices [m/N], (..., V, 1)."""
     axes, at = points.axes, points.at
     agility = axes.of_bodies(bodies.agility)
     local = rotate(conjugate(axes.of_bodies(bodies.state.quat)), cross(at.arm, at.normal))
@@ -204,12 +209,12 @@ class RodBody(Effect):
     def react(self, view: View, motion: Motion, values: Values) -> Push:
         """Return the forces that keep ropes outside of bodies and rub [N]."""
         bodies = motion.bodies
+        answer = torch.maximum(motion.answer, HELD * motion.mobility).amax(-1, keepdim=True)
         if body_sweeps.fits(bodies):
             pieces = [families(b, self.pieces) - 2 for b in bodies.bodies]
             law = (self.recovery, self.slowest)
-            return body_sweeps.push(view, motion, pieces, sweeps=self.sweeps, friction=self.friction, law=law)
+            return body_sweeps.push(view, motion, answer, pieces, sweeps=self.sweeps, friction=self.friction, law=law)
         points = _points(view, bodies, self.pieces)
-        answer = motion.answer.amax(-1, keepdim=True)
         along, slip = points.seen(motion.change, bodies)
         wanted = self._target(points, view, bodies, along)
         softness = _softness(points, answer, bodies)
