@@ -1,4 +1,4 @@
-"""Which points are inside bodies that do not give way."""
+"""Which points are inside bodies that do not give way, and which ropes broke down."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ import torch
 from torchdlo import scene as scenes
 from torchdlo.coupling.bodies import Solid
 from torchdlo.coupling.rod_body import RodBody
-from torchdlo.envs.crash import inside
+from torchdlo.envs.crash import broken, inside
+from torchdlo.physics import tree
 
 F64 = torch.float64
 POINTS = {
@@ -44,3 +45,15 @@ def test_nothing_is_inside_where_there_are_no_bodies():
     line = torch.tensor([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.2, 0.0, 0.0]], dtype=F64).expand(1, 3, 3)
     scene, params, state = scenes.make([scenes.Rope(line, 0.01, mass=0.01, bend=1e-4)], [], {}, dt=1e-3, substeps=1)
     assert inside(scene, params, state, torch.zeros(1, 4, 3, dtype=F64)).tolist() == [[False] * 4]
+
+
+def test_inextensible_ropes_that_lost_their_lengths_are_broken():
+    line = torch.tensor([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.2, 0.0, 0.0]], dtype=F64)
+    # As it is, bent, too short by a fifth, torn apart.
+    ends = line.new_tensor([[0.2, 0.0, 0.0], [0.1, 0.1, 0.0], [0.18, 0.0, 0.0], [1e7, 0.0, 0.0]])
+    for stretch, expected in ((math.inf, [False, False, True, True]), (1e3, [False] * 4)):
+        rope = scenes.Rope(line.expand(4, 3, 3), 0.01, mass=0.01, bend=1e-4, stretch=stretch)
+        scene, params, state = scenes.make([rope], [], {}, dt=1e-3, substeps=10)
+        pos = torch.cat([line[:2].expand(4, 2, 3), ends[:, None]], 1)
+        moved = tree.replace(state, rods=tree.replace(state.rods, pos=pos))
+        assert broken(scene, params, moved).tolist() == expected

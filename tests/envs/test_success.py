@@ -175,25 +175,29 @@ def test_the_way_into_a_ring_leads_over_it_and_through_its_gap():
     angle = torch.deg2rad(degrees)
     round_it = torch.stack([-angle.cos(), angle.sin()], -1)
     way = into(0.1 * round_it)
-    # From the gap straight; from elsewhere down to the ring's outside, 45 degrees before it, and along it.
-    out = 0.045 + 0.012 + 0.01
-    expected = 0.1 + out * torch.deg2rad((degrees - 45).clamp(min=0))
-    assert torch.allclose(way, expected) and torch.allclose(into(0.02 * round_it), way.new_tensor(0.02))
+    # From the gap straight to where the rope touches the top of the hole; from elsewhere along the ring's outside to an
+    # end of the gap, 45 degrees from its middle, and on from there as far out.
+    out, top = 0.045 + 0.012 + 0.01, way.new_tensor([0.0, 0.045 - 0.012 - 0.01])
+    end = way.new_tensor([-math.sqrt(0.5), math.sqrt(0.5)])
+    begin = torch.where((degrees > 45)[:, None], end, round_it)
+    expected = (0.1 * begin - top).norm(dim=-1) + out * torch.deg2rad((degrees - 45).clamp(min=0))
+    assert torch.allclose(way, expected)
+    assert torch.allclose(into(0.02 * round_it), (0.02 * round_it - top).norm(dim=-1)) and float(into(top)) < 1e-9
     middle = torch.zeros(1, 2, dtype=F64, requires_grad=True)
     assert torch.isfinite(torch.autograd.grad(into(middle).sum(), middle)[0]).all()
 
 
 def test_lifting_lacks_less_in_front_of_the_gaps_than_behind_the_rings_and_nothing_in_raised_ones():
-    state = tree.map(lambda x: x.expand(4, *x.shape[1:]).clone(), first("lifting"))
-    x = straight((0.3, 0.0, 0.06), 30, state.rods.pos.new_zeros(4, 3))
-    x[:, :, 1] = x.new_tensor([0.1, -0.1, 0.0, 0.0])[:, None]
+    state = tree.map(lambda x: x.expand(5, *x.shape[1:]).clone(), first("lifting"))
+    x = straight((0.3, 0.0, 0.06), 30, state.rods.pos.new_zeros(5, 3))
+    x[:, :, 1] = x.new_tensor([0.1, -0.1, 0.0, 0.0, 0.0])[:, None]
+    x[:, :, 2] += x.new_tensor([0.0, 0.0, 0.0, 0.023, 0.073])[:, None]
     bodies = state.bodies.pos.clone()
-    x[3, :, 2] += 0.05
-    bodies[3, 1:, 2] += 0.05
+    bodies[4, 1:, 2] += 0.05
     seen = Seen(tree.replace(state, rods=tree.replace(state.rods, pos=x)), None, None, {})
     seen = tree.replace(seen, state=tree.replace(seen.state, bodies=tree.replace(state.bodies, pos=bodies)))
     short = TASKS["lifting"]().shortfall(seen)
-    assert (short.diff() < 0).all() and short[2:].tolist() == pytest.approx([40.0, 0.0])
+    assert (short.diff() < 0).all() and short[3:].tolist() == pytest.approx([40.0, 0.0])
 
 
 def test_gathering_takes_objects_together_and_hands_clear():

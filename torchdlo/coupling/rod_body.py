@@ -5,8 +5,9 @@ body (several where bodies are not convex), see `edge_points`. A point of the ce
 the gap g = distance - radius and the unit normal n, out of the body. From then on contact is as among ropes (see
 `contact`): no overlap at the end of the substep, n . (d_rod - d_body) >= -g with the motions d that are foreseen;
 rebound; Coulomb friction; forces by projected Jacobi sweeps with row sums as inverse masses, held vertices counted as
-heavy ones; then the lengths of the edges. All edges are tried with all bodies in every substep, so nothing can be missed for lack of room; the sign of the
-gap comes from the start of the substep, so a fast edge does not get past a thin post.
+heavy ones; then the lengths of the edges. All edges are tried with all bodies in every substep, so nothing can be
+missed for lack of room; the sign of the gap comes from the start of the substep, so a fast edge does not get past a
+thin post.
 
 The body takes the opposite impulse at the same place, its torque included: linear and angular momentum are exact. The
 normal force acts along the normal through the centreline. Friction acts at the surface of the rope, r n off the

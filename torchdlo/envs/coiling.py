@@ -25,8 +25,11 @@ BASE, HEIGHT = 0.12, 0.30
 """Radius and height of the cone [m]."""
 NEAR = 0.06
 """Distance from the cone's surface within which the rope counts as wound round it [m]."""
-SHORT, SPARE = 100.0, 0.02
+SHORT, SPARE = 10.0, 0.02
 """What a whole turn that is missing counts in the return, and the share by which it is to be exceeded."""
+LAST, RANGE = 20.0, 0.1
+"""What the last of it counts in addition, and the share of a turn over which it comes to that: far from success the
+return leads to the cone, close to it a turn is to count more than a wider coil."""
 FADE = 0.2
 """Distance beyond `NEAR` over which turns come to count a third in half of the shortfall [m]."""
 
@@ -55,8 +58,8 @@ class Coiling(Task):
         return {"near": torch.exp(-0.1 * self._missing(seen))}
 
     def extra(self, seen: Seen) -> dict[str, Tensor]:
-        """Return the distances themselves, a tenth of the exponent: the exponential is flat far from the goal."""
-        return {"distance": 0.01 * self._missing(seen)}
+        """Return the exponent: the exponential is flat far from the goal."""
+        return {"distance": 0.1 * self._missing(seen)}
 
     def success(self, seen: Seen) -> Tensor:
         """Return whether the rope turns by a whole turn within 6 cm of the cone."""
@@ -68,7 +71,8 @@ class Coiling(Task):
         Half of it counts what turns further out, too, by less the further: the other half does not say how to get near.
         """
         done = torch.stack([wound(seen.x), wound(seen.x, FADE)]).abs() / (1 + SPARE) / (2 * math.pi)
-        return SHORT * (1 - done).clamp(min=0).mean(0)
+        lack = (1 - done).clamp(min=0).mean(0)
+        return SHORT * lack + LAST * (1 - torch.exp(-lack / RANGE))
 
     def waypoints(self) -> list[list[tuple[float, float, float]]]:
         """Return a way up and straight to the cone's upper part, and on round it at its side. It earns 12.1.

@@ -1,4 +1,4 @@
-"""Hands that are led into what does not give way."""
+"""Hands that are led into what does not give way, and ropes that broke down."""
 
 from __future__ import annotations
 
@@ -7,10 +7,15 @@ from torch import Tensor
 
 from torchdlo.coupling import shapes
 from torchdlo.coupling.bodies import conjugate
+from torchdlo.physics.numerics import safe_norm
+from torchdlo.physics.rod import edge_vectors
 from torchdlo.physics.rotation import rotate
 from torchdlo.scene import Params, Scene, State
 
-__all__ = ["inside"]
+__all__ = ["broken", "inside"]
+
+_OFF = 0.1
+"""Share by which the edges of inextensible ropes may miss their lengths; solved ones miss them by 1e-6."""
 
 
 def inside(scene: Scene, params: Params, state: State, points: Tensor) -> Tensor:
@@ -23,3 +28,11 @@ def inside(scene: Scene, params: Params, state: State, points: Tensor) -> Tensor
             size, grid = (x[..., one, :] for x in (params.bodies.size, params.bodies.grid))
             found = found | (shapes.distance(body.shape, size, away, grid, body.cells)[..., 0] < 0)
     return found
+
+
+def broken(scene: Scene, params: Params, state: State) -> Tensor:
+    """Return where inextensible ropes lost their lengths: numbers, but no motion; bool, shape (B,)."""
+    rest, topology = params.rods.rest, scene.settings.topology
+    length = safe_norm(edge_vectors(topology, state.rods.pos, rest.edge_mask))
+    fixed = torch.isinf(params.rods.material.stretch) & (rest.edge_mask > 0)
+    return (fixed & ((length - rest.length).abs() > _OFF * rest.length)).any(-1).any(-1)

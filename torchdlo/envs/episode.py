@@ -22,7 +22,7 @@ from torchdlo.coupling.bodies import BodyTargets, turn_between, turn_by
 from torchdlo.coupling.grasp import Grasp, Hands
 from torchdlo.coupling.pose import Pose
 from torchdlo.coupling.robot import Robot, panda
-from torchdlo.envs.crash import inside
+from torchdlo.envs.crash import broken, inside
 from torchdlo.envs.stages import repeated
 from torchdlo.envs.task import Seen, Task, combined
 from torchdlo.errors import InputError
@@ -296,7 +296,8 @@ def _judged(episode: Episode, before: World, after: World) -> World:
     seen = after.seen(task.arms.count)
     torn = task.rest(seen) > task.stretch * seen.notes["rest"]
     stuck = (inside(episode.scene, episode.params, after.state, after.tool.pos) & (seen.closed[..., 0] > 0)).any(-1)
-    return tree.replace(after, failed=before.failed | ~good | torn | stuck | task.failed(seen))
+    lost = ~good | broken(episode.scene, episode.params, after.state)
+    return tree.replace(after, failed=before.failed | lost | torn | stuck | task.failed(seen))
 
 
 def finish(episode: Episode, world: World) -> World:

@@ -28,8 +28,11 @@ LIFT = 0.05
 """By how much rings are to be lifted [m]."""
 LATE = 5
 """Actions at the end that count: 0.1 s."""
-AWAY, LOW = 100.0, 20.0
-"""What a metre counts in the return that the rope still has to go into a ring, and a lift that is missing."""
+AWAY, LOW, CLOSE = 100.0, 20.0, 0.01
+"""What a metre counts in the return that the rope still has to go to where it lifts a ring, and a lift that is missing;
+how close is close enough [m]."""
+TOP = RING - TUBE - RADIUS
+"""Height over a ring's centre at which the rope carries it [m]."""
 
 
 @dataclass(frozen=True)
@@ -90,7 +93,7 @@ class Lifting(Task):
         way = safe_norm(torch.stack([side, into(x[..., 1:] - rings[..., 1:])], -1)).squeeze(-1).amin(-1)
         start = x.new_tensor([c[2] for c in CENTRES])
         low = (1 - (rings[..., 0, 2] - start) / LIFT).clamp(min=0)
-        return (AWAY * (way - RING).clamp(min=0) + LOW * low).sum(-1)
+        return (AWAY * (way - CLOSE).clamp(min=0) + LOW * low).sum(-1)
 
     def waypoints(self) -> list[list[tuple[float, float, float]]]:
         """Return a way by which the rope, pulled straight, goes over the rings, into their gaps and up with them."""
@@ -99,16 +102,19 @@ class Lifting(Task):
 
 
 def into(p: Tensor) -> Tensor:
-    """Return how far it is to the middle of an upright ring, over it and through its gap [m], shape (...).
+    """Return how far it is to the top of an upright ring's hole, over it and through its gap [m], shape (...).
 
     Args:
         p: points in its plane, along y and z from its centre; the gap is at -y; shape (..., 2).
     """
     far = safe_norm(p).squeeze(-1)
     # Angle from an end of the gap, over the top: the floor bars the way below. In the very middle there is none.
-    p = torch.where(far.unsqueeze(-1) > 0, p, 1.0)
-    angle = torch.atan2(p[..., 1], -p[..., 0]) - 0.5 * GAP
+    q = torch.where(far.unsqueeze(-1) > 0, p, 1.0)
+    angle = torch.atan2(q[..., 1], -q[..., 0]) - 0.5 * GAP
     angle = torch.where(angle < -GAP, angle + 2 * math.pi, angle)
-    out = RING + TUBE + RADIUS
     outside = (far > RING) & (angle > 0)
-    return torch.where(outside, far.clamp(min=out) + out * angle, far)
+    # Round the ring as far out as it is now, to an end of the gap, and straight on from there.
+    out = far.clamp(min=RING + TUBE + RADIUS)
+    end = p.new_tensor([-math.cos(0.5 * GAP), math.sin(0.5 * GAP)]) * out.unsqueeze(-1)
+    straight_on = safe_norm(torch.where(outside.unsqueeze(-1), end, p) - p.new_tensor([0.0, TOP])).squeeze(-1)
+    return straight_on + torch.where(outside, (RING + TUBE + RADIUS) * angle, 0.0)
