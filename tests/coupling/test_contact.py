@@ -8,12 +8,12 @@ import pytest
 import torch
 from touching import F64, distances, line, momenta, nearest, run, two, with_velocity
 
-from torchdlo.coupling import RodContact
+from torchdlo.coupling import RodContact, rod_pairs
 from torchdlo.coupling.watch import survey
 from torchdlo.physics import effect, rod, tree
 from torchdlo.physics.effect import Motion
 from torchdlo.physics.effects.elastic import Bend
-from torchdlo.physics.effects.field import Gravity
+from torchdlo.physics.effects.field import Damping, Gravity
 from torchdlo.scene import Rope, check_state, finite, hold, make, ok, step
 
 ANGLES = pytest.mark.parametrize("angle", [0.0, math.pi / 6, math.pi / 2], ids=["parallel", "inclined", "crossed"])
@@ -296,3 +296,21 @@ def test_the_sides_of_a_closed_rope_stay_apart():
     assert float(distances(state.rods.pos, i[far], j[far]).min()) < 0.96 * 0.02
     after = run(scene, params, state, 60)
     assert float(distances(after.rods.pos, i[far], j[far]).min()) > 0.99 * 0.02 and bool(ok(after))
+
+
+@pytest.mark.parametrize("eager", [False, True], ids=["kernel", "tensors"])
+@pytest.mark.parametrize("off", [0.0, 1e-4, 1e-3, 3e-3])
+def test_held_vertices_that_overlap_do_not_throw_the_free_ends_of_their_edges(off, eager, monkeypatch):
+    # Two ropes of two edges cross close to their middles, which are held: free ends can hardly part them.
+    monkeypatch.setattr(rod_pairs, "ready", lambda *_: not eager)
+    overlap, dt = 3e-3, 2e-4
+    ropes = [line(3, 0.04), line(3, 0.04, math.pi / 2, 0.02 - overlap) + torch.tensor([off, off, 0.0], dtype=F64)]
+    ropes = [Rope(x, radius=0.01, mass=0.003) for x in ropes]
+    rubbing = {"rod_contact": {"mu_s": 0.3, "mu_k": 0.3}}
+    made = make(ropes, [RodContact(), Damping()], rubbing, dt=dt, substeps=1, held_vertices=(1, 4))
+    scene, params, state = made
+    fastest = []
+    for _ in range(100):
+        state = step(scene, params, state, hold(scene, state))
+        fastest.append(float(state.rods.vel.norm(dim=-1).max()))
+    assert max(fastest) < 2 * overlap / dt and fastest[-1] < 0.5

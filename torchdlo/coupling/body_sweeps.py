@@ -122,7 +122,6 @@ def _solids(bodies: BodyMotion) -> list[Tensor]:
 def push(
     view: View,
     motion: Motion,
-    answer: Tensor,
     pieces: Sequence[int],
     *,
     sweeps: int,
@@ -134,7 +133,6 @@ def push(
     Args:
         view: the rods.
         motion: where they and the bodies would go.
-        answer: by how much a force counts as moving vertices where sweeps share it out [m/N], shape (..., V, 1).
         pieces: pieces of an edge that are searched for each body.
         sweeps: projected Jacobi sweeps.
         friction: whether ropes rub.
@@ -142,7 +140,7 @@ def push(
     """
     bodies, size, material = motion.bodies, view.topology.size, view.params.material
     edges = [view.tangent, material.radius / view.length, material.radius, view.params.rest.edge_mask]
-    vertices = [view.state.pos, view.state.vel, motion.change, motion.answer, answer]
+    vertices = [view.state.pos, view.state.vel, motion.change, motion.answer, motion.give]
     solids = _solids(bodies)
     batch = torch.broadcast_shapes(*(x.shape[:-2] for x in (*edges, *vertices, *solids)))
     inputs = (blocks.stored(x, batch, n) for x, n in ((edges, size), (vertices, size), (solids, len(bodies.bodies))))

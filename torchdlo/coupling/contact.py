@@ -12,7 +12,7 @@ An edge is a capsule: the points within a radius of a segment. Per substep, on a
     slides with mu_k times it, against the slip.
 5.  Forces that do so are found by projected Jacobi sweeps. A pair answers with the inverse mass sum w_i W_i / m_i,
     W_i the sum of the shares of all pairs that press vertex i: the row sum of the matrix of the problem, so that sweeps
-    converge for every pile and treat all pairs alike.
+    converge for every pile and treat all pairs alike. Held vertices count as heavy ones, see `Motion.give`.
 6.  The forces join the other loads; then the lengths of the edges are solved for as ever.
 
 Contact comes before the lengths and not after them: lengths stay exact, and the tension that presses ropes together is
@@ -248,7 +248,6 @@ class RodContact(Effect):
         at, size = values["corners"], view.topology.size
         batch = at.shape[:-2]
         like = view.state.pos
-        inverse = motion.answer.amax(-1, keepdim=True)
         mass = 1 / motion.mobility.amax(-1, keepdim=True)
         parts = [like, motion.change, view.state.vel, view.params.material.radius, mass]
         widths = [p.shape[-1] for p in parts]
@@ -265,7 +264,7 @@ class RodContact(Effect):
             return tuple(w * whole - b for w, b in zip(contacts.weight, back, strict=True))
 
         wanted, pressed = self._target(contacts, change, vel, values, view.dt)
-        softness = _softness(contacts, pressed, inverse, 1 / mass, at, size)
+        softness = _softness(contacts, pressed, motion.give, 1 / mass, at, size)
         if couple is not None:
             softness = (softness[0], softness[1] + couple.softness(contacts))
         forces = Forces(torch.zeros_like(contacts.gap), torch.zeros_like(contacts.normal))
@@ -309,21 +308,21 @@ class RodContact(Effect):
 
 
 def _softness(
-    contacts: Contacts, pressed: Tensor, inverse: Tensor, free: Tensor, at: Tensor, size: int
+    contacts: Contacts, pressed: Tensor, give: Tensor, free: Tensor, at: Tensor, size: int
 ) -> tuple[Tensor, Tensor]:
     """Return how far pairs part or slip at most under one newton on every pressed pair [m/N], shape (..., K, 1) each.
 
     Args:
         contacts: the pairs.
         pressed: 1 where a pair would touch, shape (..., K, 1).
-        inverse: answer of the vertices to a force, 0 if held [m/N], shape (..., V, 1).
+        give: that of `Motion`.
         free: the same as if none were held.
         at: corners of the pairs.
         size: number of vertices.
     """
     weight = tuple(w.abs() for w in contacts.weight)
     load = drop(tuple(w * pressed for w in weight), at, size)
-    four = pick(columns([load * inverse, load * free, inverse.expand_as(load), free.expand_as(load)]), at)
+    four = pick(columns([load * give, load * free, give.expand_as(load), free.expand_as(load)]), at)
     mine = 1 - pressed
     normal = sum(w * (c[..., :1] + mine * w * c[..., 2:3]) for w, c in zip(weight, four, strict=True))
     slip = sum(w * (c[..., 1:2] + mine * w * c[..., 3:]) for w, c in zip(weight, four, strict=True))

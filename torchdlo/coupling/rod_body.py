@@ -39,11 +39,6 @@ from torchdlo.physics.numerics import cross, dot
 from torchdlo.physics.rod import View
 from torchdlo.physics.rotation import rotate
 
-HELD = 0.1
-"""Share of its free mobility with which a held vertex counts in how points give way, though it stays where it is. A
-point close to it that overlaps can hardly be moved by the free end of its edge: all of the overlap would throw that
-end away."""
-
 
 @dataclass(frozen=True)
 class _Axes:
@@ -162,8 +157,8 @@ class _Softness:
         return self._whole(active, self.sliding) + self.points.lever.square() * (self.first + self.second) * many
 
 
-def _softness(points: _Points, answer: Tensor, bodies: BodyMotion) -> _Softness:
-    """Return how points give way; `answer` is by how much a force counts as moving vertices [m/N], (..., V, 1)."""
+def _softness(points: _Points, give: Tensor, bodies: BodyMotion) -> _Softness:
+    """Return how points give way; `give` is that of `Motion`."""
     axes, at = points.axes, points.at
     agility = axes.of_bodies(bodies.agility)
     local = rotate(conjugate(axes.of_bodies(bodies.state.quat)), cross(at.arm, at.normal))
@@ -172,7 +167,7 @@ def _softness(points: _Points, answer: Tensor, bodies: BodyMotion) -> _Softness:
         torch.where(square > 0, torch.where(square > 0, square, 1.0).sqrt(), 0.0) for square in (turning, sliding)
     )
     return _Softness(
-        points, axes.wide(answer), axes.wide(axes.view.next(answer)), axes.of_bodies(bodies.mobility), turning, sliding
+        points, axes.wide(give), axes.wide(axes.view.next(give)), axes.of_bodies(bodies.mobility), turning, sliding
     )
 
 
@@ -210,15 +205,14 @@ class RodBody(Effect):
     def react(self, view: View, motion: Motion, values: Values) -> Push:
         """Return the forces that keep ropes outside of bodies and rub [N]."""
         bodies = motion.bodies
-        answer = torch.maximum(motion.answer, HELD * motion.mobility).amax(-1, keepdim=True)
         if body_sweeps.fits(bodies):
             pieces = [families(b, self.pieces) - 2 for b in bodies.bodies]
             law = (self.recovery, self.slowest)
-            return body_sweeps.push(view, motion, answer, pieces, sweeps=self.sweeps, friction=self.friction, law=law)
+            return body_sweeps.push(view, motion, pieces, sweeps=self.sweeps, friction=self.friction, law=law)
         points = _points(view, bodies, self.pieces)
         along, slip = points.seen(motion.change, bodies)
         wanted = self._target(points, view, bodies, along)
-        softness = _softness(points, answer, bodies)
+        softness = _softness(points, motion.give, bodies)
         normal, friction = torch.zeros_like(along), torch.zeros_like(slip)
         push = None
         for _ in range(self.sweeps):

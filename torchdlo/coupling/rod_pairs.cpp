@@ -13,8 +13,8 @@ struct Sizes {
   int64_t vertices, scenes, room, sweeps, friction;
   double recovery, slowest, dt;
 };
-// Numbers of vertices: those that are given, and the greatest of the answers and of the mobilities along the axes.
-enum { POS = 0, VEL = 3, CHANGE = 6, ANSWER = 9, MOBILITY = 12, RADIUS = 15, GIVEN, SOFT = GIVEN, FREE, FIELDS };
+// Numbers of vertices; SOFT is what `Motion.give` returns, FREE the same if none were held.
+enum { POS = 0, VEL = 3, CHANGE = 6, ANSWER = 9, SOFT = 12, FREE, RADIUS, FIELDS };
 enum { MU_S, MU_K, RESTITUTION, LAWS };
 
 template <typename T>
@@ -65,25 +65,9 @@ struct Work {
   // Shares of the corners without their sign.
   void shares(const Pair<T>& a, P* to) const { to[0] = one - a.s, to[1] = a.s, to[2] = one - a.t, to[3] = a.t; }
 
-  // The greatest of three fields; equal ones share the derivative by it.
-  void largest(int from, int to) {
-    for (int i = from * size, j = to * size; j < (to + 1) * size; ++i, ++j) {
-      const T x = vertices[i], y = vertices[i + size], z = vertices[i + 2 * size], more = x < y ? y : x;
-      vertices[j] = more < z ? z : more;
-    }
-  }
-  void share(int to, int from) {
-    for (int i = to * size, j = from * size; j < (from + 1) * size; ++i, ++j) {
-      int count = 0;
-      for (int k = 0; k < 3; ++k) count += vertices[i + k * size] == vertices[j];
-      for (int k = 0; k < 3; ++k) by[i + k * size] += vertices[i + k * size] == vertices[j] ? by[j] / T(count) : T(0);
-    }
-  }
-
   void read(const T* const* in, const T* const* laws, const int64_t* at, const T* real, int64_t b) {
-    for (int f = 0; f < GIVEN; ++f)
+    for (int f = 0; f < FIELDS; ++f)
       for (int v = 0; v < size; ++v) vertices[f * size + v] = in[f][v * n.scenes + b];
-    largest(ANSWER, SOFT), largest(MOBILITY, FREE);
     for (int f = 0; f < LAWS; ++f) law[f] = laws[f][b];
     groups.clear();
     for (int64_t k = 0; k < n.room; ++k) {
@@ -329,7 +313,6 @@ struct Work {
     soften_back(soft);
     for (size_t k = 0; k < groups.size(); ++k)
       if (groups[k].used) place_back(k);
-    share(ANSWER, SOFT), share(MOBILITY, FREE);
   }
 };
 
@@ -369,7 +352,7 @@ static void back(const T* const* in, const T* const* laws, const int64_t* at, co
     for (int k = 0; k < 3; ++k)
       for (int v = 0; v < w.size; ++v) w.force[k * w.size + v] = by[k][v * n.scenes + b];
     w.back();
-    for (int f = 0; f < GIVEN; ++f)
+    for (int f = 0; f < FIELDS; ++f)
       for (int v = 0; v < w.size; ++v) out[f][v * n.scenes + b] = w.by[f * w.size + v];
     for (int f = 0; f < LAWS; ++f) out_laws[f][b] = w.by_law[f];
   }

@@ -95,7 +95,8 @@ def push(
     at, size = values["corners"], view.topology.size
     batch, count = at.shape[:-2], at.shape[-1]
     state, radius = view.state, view.params.material.radius
-    vertices = [state.pos, state.vel, motion.change, motion.answer, motion.mobility, radius]
+    free = motion.mobility.amax(-1, keepdim=True)
+    vertices = [state.pos, state.vel, motion.change, motion.answer, motion.give, free, radius]
     laws = torch.cat([values[name].expand(*batch, 1, 1) for name in ("mu_s", "mu_k", "restitution")], -1)
     (laws,), (real,) = blocks.stored([laws], batch, 1), blocks.stored([values["real"]], batch, count)
     at = at.permute(at.dim() - 2, at.dim() - 1, *range(at.dim() - 2)).reshape(4, count, batch.numel()).contiguous()

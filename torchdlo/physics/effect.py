@@ -87,6 +87,10 @@ class Param:
         return len(self.default) if isinstance(self.default, tuple) else 1
 
 
+_HELD = 0.1
+"""Share of its mobility with which a held vertex counts in `Motion.give`."""
+
+
 @tree.struct
 class Motion:
     """Where vertices would go in a substep."""
@@ -101,6 +105,15 @@ class Motion:
     """Where rigid bodies would go, see `coupling.bodies.BodyMotion`; None in a scene without."""
     matter: Any = None
     """Where matter would go, see `coupling.rod_matter.Foreseen`; None in a scene without."""
+
+    @property
+    def give(self) -> Tensor:
+        """By how much a force counts as moving a vertex where forces of contact are shared out [m/N], (..., V, 1).
+
+        A point close to a held vertex can hardly be moved by the free end of its edge: all of an overlap would throw
+        that end away. So held vertices count as heavy ones, though they stay where they are.
+        """
+        return torch.maximum(self.answer, _HELD * self.mobility).amax(-1, keepdim=True)
 
 
 @tree.struct
