@@ -25,11 +25,9 @@ BASE, HEIGHT = 0.12, 0.30
 """Radius and height of the cone [m]."""
 NEAR = 0.06
 """Distance from the cone's surface within which the rope counts as wound round it [m]."""
-SHORT, SPARE = 10.0, 0.02
-"""What a whole turn that is missing counts in the return, and the share by which it is to be exceeded."""
-LAST, RANGE = 20.0, 0.1
-"""What the last of it counts in addition, and the share of a turn over which it comes to that: far from success the
-return leads to the cone, close to it a turn is to count more than a wider coil."""
+SHORT, SPARE = 100.0, 0.02
+"""What a whole turn that is missing counts in the return, and the share by which it is to be exceeded. It is much: a
+rope that is hung over the cone earns more than one that is wound round it, and its loss is a little smaller, too."""
 FADE = 0.2
 """Distance beyond `NEAR` over which turns come to count a third in half of the shortfall [m]."""
 
@@ -66,13 +64,12 @@ class Coiling(Task):
         return wound(seen.x).abs() >= 2 * math.pi
 
     def shortfall(self, seen: Seen) -> Tensor:
-        """Return the share of a whole turn that is missing: coils that are wide and loose may earn as much.
+        """Return what a whole turn that is missing counts: coils that are wide and loose may earn as much.
 
         Half of it counts what turns further out, too, by less the further: the other half does not say how to get near.
         """
         done = torch.stack([wound(seen.x), wound(seen.x, FADE)]).abs() / (1 + SPARE) / (2 * math.pi)
-        lack = (1 - done).clamp(min=0).mean(0)
-        return SHORT * lack + LAST * (1 - torch.exp(-lack / RANGE))
+        return SHORT * (1 - done).clamp(min=0).mean(0)
 
     def waypoints(self) -> list[list[tuple[float, float, float]]]:
         """Return a way up and straight to the cone's upper part, and on round it at its side. It earns 12.1.
