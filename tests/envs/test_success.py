@@ -77,11 +77,40 @@ def test_wiring_takes_the_right_sides_of_both_posts():
     assert judged("wiring_post", goal, near, far, line, mirrored) == [True, True, False, False, False]
 
 
+def band(points: list[tuple[float, float]], height: float = 0.02) -> torch.Tensor:
+    """A loop of 50 vertices about some points in the plane, its first vertex not repeated."""
+    corners = torch.tensor([*points, points[0]], dtype=F64)
+    dense = torch.cat(
+        [torch.lerp(a, b, torch.linspace(0, 1, 500, dtype=F64)[:, None]) for a, b in itertools.pairwise(corners)]
+    )
+    flat = even(torch.cat([dense, torch.full((len(dense), 1), height, dtype=F64)], -1), 51)
+    return flat[:-1]
+
+
+def triangle(wider: float, longer: float = 1.0) -> list[tuple[float, float]]:
+    """The corners of a triangle about the three posts, `wider` outside of their axes, or some times as long."""
+    posts = torch.tensor([(0.45, -0.115), (0.45, 0.115), (0.25, 0.0)], dtype=F64)
+    middle = posts.mean(0)
+    arms = posts - middle
+    arms = longer * arms * (1 + wider / arms.norm(dim=-1, keepdim=True))
+    return [tuple(p) for p in (middle + arms).tolist()]
+
+
+def two_of_three() -> list[tuple[float, float]]:
+    """The corners of a triangle about two of the posts."""
+    return [*triangle(0.024)[:2], (0.32, 0.0)]
+
+
 @pytest.mark.parametrize(
     ("name", "good", "worse"),
     [
         ("coiling", helix(1.1, 0.02), (helix(0.9, 0.02), helix(0.5, 0.02), helix(0.5, 0.12))),
         ("wiring_post", wiring.goal(), tuple(wiring.goal() + step * torch.eye(3)[2] for step in (0.02, 0.03, 0.05))),
+        (
+            "wrapping",
+            band(triangle(0.024)),
+            (band(triangle(0.024), 0.09), band(two_of_three()), band([(0.55, -0.1), (0.55, 0.1), (0.75, 0.0)])),
+        ),
     ],
 )
 def test_the_further_from_success_the_more_is_lacking(name, good, worse):
@@ -106,24 +135,9 @@ def test_the_goal_of_wiring_is_where_the_task_says():
         assert side * float(goal[apart.argmin(), 1] - post[1]) > 0
 
 
-def band(points: list[tuple[float, float]], height: float = 0.02) -> torch.Tensor:
-    """A loop of 50 vertices about some points in the plane, its first vertex not repeated."""
-    corners = torch.tensor([*points, points[0]], dtype=F64)
-    dense = torch.cat(
-        [torch.lerp(a, b, torch.linspace(0, 1, 500, dtype=F64)[:, None]) for a, b in itertools.pairwise(corners)]
-    )
-    flat = even(torch.cat([dense, torch.full((len(dense), 1), height, dtype=F64)], -1), 51)
-    return flat[:-1]
-
-
 def test_wrapping_takes_all_three_posts():
-    # A triangle 2 cm outside of the posts' axes, seen from their middle.
-    posts = torch.tensor([(0.45, -0.115), (0.45, 0.115), (0.25, 0.0)], dtype=F64)
-    middle = posts.mean(0)
-    out = [tuple((middle + (p - middle) * (1 + 0.024 / (p - middle).norm())).tolist()) for p in posts]
-    two = [out[0], out[1], (0.32, 0.0)]
-    wide = [tuple((middle + (p - middle) * 1.6).tolist()) for p in posts]
-    assert judged("wrapping", band(out), band(out).flip(0), band(two), band(wide), band(out, 0.08)) == [
+    out, wide = triangle(0.024), triangle(0.0, 1.6)
+    assert judged("wrapping", band(out), band(out).flip(0), band(two_of_three()), band(wide), band(out, 0.08)) == [
         True,
         True,
         False,

@@ -25,6 +25,11 @@ TOP = 0.04
 """Their height [m]."""
 POST = 0.015
 """Their radius [m]."""
+LOW, NEAR = TOP + RADIUS, 0.03
+"""How low and how near to a post's axis the loop has to be [m]."""
+OUT, AWAY, SPARE = 10.0, 100.0, 0.001
+"""What counts in the return: a post that the loop does not go round, a metre that it still has to go to one; how much
+less than a limit it is to be [m]."""
 COUNT, LOOP = 50, 0.14
 """Vertices of the loop and its radius [m]."""
 
@@ -71,12 +76,24 @@ class Wrapping(Task):
 
     def success(self, seen: Seen) -> Tensor:
         """Return whether the loop goes round every post once, and touches each within 5 mm below its top."""
-        x = seen.x
-        around = (self._wound(x).abs() - 1).abs() < 0.5
-        apart = geometry.distances(self._posts(x)[:, :2].expand(len(x), -1, -1), x[..., :2])
-        low = x[..., 2] <= TOP + RADIUS
-        near = torch.where(low.unsqueeze(-2), apart, math.inf).amin(-1) <= 0.03
-        return (around & near).all(-1)
+        apart = self._apart(seen.x)
+        near = torch.where((seen.x[..., 2] <= LOW).unsqueeze(-2), apart, math.inf).amin(-1) <= NEAR
+        return (self._around(seen.x) & near).all(-1)
+
+    def shortfall(self, seen: Seen) -> Tensor:
+        """Return how far the loop has to go up and over posts, and then down beside them."""
+        apart, height = self._apart(seen.x), seen.x[..., 2].unsqueeze(-2)
+        over = (apart + (LOW + SPARE - height).clamp(min=0)).amin(-1)
+        beside = (apart + (height - LOW + SPARE).clamp(min=0)).amin(-1) - (NEAR - SPARE)
+        return torch.where(self._around(seen.x), AWAY * beside.clamp(min=0), OUT + AWAY * over).sum(-1)
+
+    def _around(self, x: Tensor) -> Tensor:
+        """Return whether the loop goes round each post once, bool, shape (B, 3)."""
+        return (self._wound(x).abs() - 1).abs() < 0.5
+
+    def _apart(self, x: Tensor) -> Tensor:
+        """Return how far each vertex is from each post's axis [m], shape (B, 3, 50)."""
+        return geometry.distances(self._posts(x)[:, :2].expand(len(x), -1, -1), x[..., :2])
 
     def waypoints(self) -> list[list[tuple[float, float, float]]]:
         """Return a way over the first two posts, down to lay the band outside of them, over the third, and back."""
