@@ -26,6 +26,7 @@ class Plain:
     """What the problems share."""
 
     choices: ClassVar[dict[str, Any]] = {}
+    touch: ClassVar[tuple[tuple[float, float, float], ...]] = ()
 
     def rehearsal(self) -> Any:
         """There is none."""

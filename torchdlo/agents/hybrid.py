@@ -4,9 +4,9 @@ Large populations live on islands that know nothing of each other: whichever way
 seldom comes back, and another one may go the other way. On each of them, two parts share the budget, iteration by
 iteration, and every episode of both is played with gradient:
 
-1. Straight sweeps over what can be reached find out what there is to touch. CMA-ES searches way-points from the best of
-   them. A part of each population are the best points so far, moved down their slope in the metric of the strategy;
-   they are handed over as in Hansen 2011 (arXiv:1110.4181).
+1. Straight sweeps over what can be reached find out what there is to touch, and rounds about bodies what comes of it.
+   CMA-ES searches way-points from the best of them. A part of each population are the best points so far, moved down
+   their slope in the metric of the strategy; they are handed over as in Hansen 2011 (arXiv:1110.4181).
 2. The best points descend in all actions, see `lbfgs`.
 
 CMA-ES begins; then the part goes on that gained more lately, but each in its turn. Where both begin in a rehearsal, the
@@ -25,7 +25,7 @@ from torch import Tensor
 
 from torchdlo.agents.cmaes import drawn, strategy
 from torchdlo.agents.lbfgs import Descent
-from torchdlo.agents.plan import Ask, Plan, Search, Told, ranking, sweeps, walks
+from torchdlo.agents.plan import Ask, Plan, Search, Told, ranking, rounds, sweeps, walks
 
 __all__ = ["hybrid"]
 
@@ -60,7 +60,7 @@ def hybrid(plan: Plan, rng: torch.Generator) -> Search:
 
 
 def _island(plan: Plan, rng: torch.Generator) -> Search:
-    """Search with sweeps, CMA-ES and descent."""
+    """Search with sweeps, rounds, CMA-ES and descent."""
     encoding, coarse, fine = plan.encoding(1), _Evolution(plan, rng), Descent(plan, rng)
     drifts = math.ceil(plan.drifts * plan.iterations)
     alone = max(drifts, math.ceil(_COARSE * plan.iterations))
@@ -99,12 +99,15 @@ def _island(plan: Plan, rng: torch.Generator) -> Search:
 
 
 class _Evolution:
-    """CMA-ES over way-points from the best of straight sweeps, with lines; asked and told by turns."""
+    """CMA-ES over way-points from the best of sweeps and rounds, with lines; asked and told by turns."""
 
     def __init__(self, plan: Plan, rng: torch.Generator) -> None:
         self.plan, self.rng, self.encoding = plan, rng, plan.encoding(plan.hold, _APART)
         self.x = sweeps(plan, self.encoding, rng)
         self.x[1::2] = self.encoding.project(walks(plan, rng))[1::2]
+        if plan.touch:
+            half = torch.arange(len(self.x)) % 6 > 2
+            self.x[half] = rounds(plan, self.encoding, rng, int(half.sum()))
         self.found: Any = None
         self.lines: _Lines | None = None
         """None lets them start anew from what is told next."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Generator, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -12,10 +13,13 @@ from torch import Tensor
 
 from torchdlo.agents.problem import Encoding, Problem
 
-__all__ = ["Ask", "Plan", "Search", "Told", "ranking", "sweeps", "walks"]
+__all__ = ["Ask", "Plan", "Search", "Told", "ranking", "rounds", "sweeps", "walks"]
 
 _ALIKE = 1e-4
 """Share of the largest return by which returns differ that are not to be told apart."""
+_ROUND = (2, 20)
+"""Smallest and greatest radius of rounds, and how far they are above things at most: what a tool goes in one action is
+1."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,6 +94,8 @@ class Plan:
     until then."""
     rehearsals: int = 0
     """Iterations that are played in a problem much like this one; their results do not compare with later ones."""
+    touch: tuple[tuple[float, float, float], ...] = ()
+    """Where there are things to touch, see `Problem.touch`."""
 
     @classmethod
     def of(cls, problem: Problem, population: int, iterations: int, **choices: Any) -> Plan:
@@ -98,7 +104,7 @@ class Plan:
         # 0.05 m, 1 mm and 1 um where tools go 1 cm per action and way-points have ten.
         lengths = {"sigma": 0.5 * hold * problem.limit, "rate": 0.1 * problem.limit, "last": 1e-4 * problem.limit}
         sizes = (problem.horizon, problem.width, problem.group, problem.limit)
-        return cls(*sizes, population, iterations, **(lengths | choices))
+        return cls(*sizes, population, iterations, touch=problem.touch, **(lengths | choices))
 
     def encoding(self, hold: int, apart: float | None = None) -> Encoding:
         """Return the encoding with `hold` actions per way-point, see `Encoding`."""
@@ -131,6 +137,41 @@ def sweeps(plan: Plan, encoding: Encoding, rng: torch.Generator) -> Tensor:
     leg = torch.arange(knots)[None] * (1 + each % 3)[:, None] // knots
     moves = ways[each[:, None], leg]
     return encoding.project(encoding.encode(torch.cat([torch.zeros_like(moves[:1]), moves[1:]])))
+
+
+def rounds(plan: Plan, encoding: Encoding, rng: torch.Generator, count: int) -> Tensor:
+    """Return points of ways straight to a circle about a thing that can be touched, and on along it, (count, size).
+
+    Ropes are put round and over things, and drawn round them. Every fourth circle is upright, in line with the way to
+    the thing; the others are level, somewhat higher than its middle. Tools go together.
+    """
+    if not plan.touch:
+        raise ValueError("rounds: there is nothing to touch; expected a plan with touch")
+
+    def rand() -> Tensor:
+        return torch.rand(count, 1, generator=rng, dtype=torch.float64)
+
+    things = torch.tensor(plan.touch, dtype=torch.float64)
+    up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+    middle = things[torch.randint(len(things), (count,), generator=rng)] + _ROUND[1] * plan.limit * rand() * up
+    radius = plan.limit * _ROUND[0] * (_ROUND[1] / _ROUND[0]) ** rand()
+    ahead = middle * (1 - up)
+    ahead = ahead / torch.linalg.vector_norm(ahead, dim=-1, keepdim=True).clamp(min=1e-9)
+    upright = (torch.arange(count) % 4 == 3).unsqueeze(-1)
+    side = torch.where(upright, up, torch.linalg.cross(up.expand_as(ahead), ahead))
+    first, way = 2 * math.pi * rand(), torch.where(rand() < 0.5, -1.0, 1.0)
+    speed = torch.where(rand() < 0.5, 1.0, 0.5 + 0.5 * rand()) * plan.limit
+    entry = middle + radius * (first.cos() * ahead + first.sin() * side)
+    far = torch.linalg.vector_norm(entry, dim=-1, keepdim=True).clamp(min=1e-9)
+    # How far tools have come at each way-point: up to the circle, then along it.
+    done = speed * encoding.hold * torch.arange(encoding.knots + 1, dtype=torch.float64)
+    angle = first + way * (done - far).clamp(min=0) / radius
+    straight_on = entry.unsqueeze(1) * (done / far).clamp(max=1).unsqueeze(-1)
+    turn = (angle.cos() - first.cos()).unsqueeze(-1) * ahead.unsqueeze(1)
+    turn = turn + (angle.sin() - first.sin()).unsqueeze(-1) * side.unsqueeze(1)
+    moves = (straight_on + radius.unsqueeze(-1) * turn).diff(dim=1)
+    tools = plan.width // plan.group
+    return encoding.project(encoding.encode(moves.unsqueeze(2).expand(-1, -1, tools, -1)))
 
 
 def ranking(returns: Tensor, loss: Tensor) -> Tensor:

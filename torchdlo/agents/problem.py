@@ -41,6 +41,8 @@ class Problem(Protocol):
     """Numbers of a group, e.g. 3 for how far a tool moves."""
     limit: float
     """Largest length of a group in one action [m]."""
+    touch: tuple[tuple[float, float, float], ...]
+    """Where bodies are, from the middle of all tools at the start [m]; () if there are none, or groups are no ways."""
     choices: dict[str, Any]
     """What else its results depend on, as plain data."""
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
@@ -66,6 +67,16 @@ class TaskProblem:
     def limit(self) -> float:
         """Greatest way of a tool in an action [m]."""
         return self.task.reach
+
+    @functools.cached_property
+    def touch(self) -> tuple[tuple[float, float, float], ...]:
+        """Where solids and matter are, from the middle of the tools [m]; planes are everywhere."""
+        scene, _, state = self.task.start(1, like=torch.zeros((), dtype=torch.float64))
+        things = [state.bodies.pos[0, k] for k, body in enumerate(scene.bodies) if body.shape != "plane"]
+        if state.matter:
+            things.append(state.matter.pos[0].mean(0))
+        middle = state.rods.pos[0, list(self.task.arms.vertex)].mean(0)
+        return tuple(tuple((thing - middle).tolist()) for thing in things)
 
     @property
     def choices(self) -> dict[str, Any]:

@@ -87,7 +87,7 @@ class _Port:
 
     def __init__(self, problem: Problem, stand_in: Problem | None, desk: SimpleQueue[_Wish | None]) -> None:
         self.name, self.choices = problem.name, problem.choices
-        self.horizon, self.width = problem.horizon, problem.width
+        self.horizon, self.width, self.touch = problem.horizon, problem.width, problem.touch
         self.group, self.limit = problem.group, problem.limit
         self._problem, self._stand_in, self._desk = problem, stand_in, desk
 

@@ -1,0 +1,78 @@
+"""What searches begin with."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import pytest
+import torch
+
+from tests.agents.problems import Plain, judged
+from torchdlo.agents.plan import rounds
+from torchdlo.agents.search import Settings, optimize
+from torchdlo.agents.tasks import problem
+
+
+@dataclass(frozen=True)
+class Orbit(Plain):
+    """A point that is to go once round an axis, within 15 cm of it; the return is by how much it turns there."""
+
+    name: str = "orbit"
+    horizon: int = 100
+    width: int = 3
+    group: int = 3
+    limit: float = 0.01
+    touch: tuple[tuple[float, float, float], ...] = ((0.3, 0.4, 0.0),)
+    axis: tuple[float, float] = (0.3, 0.4)
+
+    def evaluate(self, actions):
+        """Turns, in whole ones."""
+        arm = actions.cumsum(1)[..., :2] - actions.new_tensor(self.axis)
+        a, b = arm[:, :-1], arm[:, 1:]
+        turn = torch.atan2(a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0], (a * b).sum(-1)) / (2 * torch.pi)
+        turns = torch.where(a.norm(dim=-1) < 0.15, turn, 0.0).sum(-1).abs()
+        return judged(turns, turns > 1)
+
+
+def test_rounds_go_straight_to_a_circle_about_a_thing_and_on_along_it():
+    orbit = Orbit(touch=((0.3, 0.4, 0.1),))
+    plan = Settings(method="hybrid", episodes=40, population=20, hold=1).plan(orbit)
+    encoding = plan.encoding(1)
+    points = rounds(plan, encoding, torch.Generator().manual_seed(0), 40)
+    path = encoding.decode(points).cumsum(1)
+    assert points.shape == (40, encoding.size) and path.diff(dim=1).norm(dim=-1).max() <= 0.01
+    # Those that are fast enough end on a circle of 2 to 20 cm about its axis, at an even height up to 20 cm above it.
+    end = path[:, -10:]
+    level = torch.arange(40) % 4 != 3
+    apart = (end[..., :2] - torch.tensor(orbit.axis)).norm(dim=-1)
+    reached = level & (apart.std(1) < 1e-5)
+    assert reached.sum() > 20 and (apart[reached] > 0.0199).all() and (apart[reached] < 0.2001).all()
+    height = end[reached][..., 2]
+    assert height.std(1).max() < 1e-6 and height.min() > 0.1 - 1e-5 and height.max() < 0.3 + 1e-5
+    assert end[~level][..., 2].std(1).median() > 1e-3
+    # Before that, they go straight.
+    leg = path[:, :20]
+    assert (leg - leg[:, -1:] * torch.arange(1, 21)[:, None] / 20).abs().max() < 1e-6
+
+
+def test_rounds_need_something_to_touch():
+    plan = Settings(method="hybrid", episodes=40, population=20).plan(Orbit(touch=()))
+    with pytest.raises(ValueError, match="nothing to touch"):
+        rounds(plan, plan.encoding(10), torch.Generator(), 3)
+
+
+@pytest.mark.parametrize("touch", [(), ((0.3, 0.4, 0.0),)])
+def test_a_hybrid_goes_round_what_it_is_told_of(touch):
+    settings = [Settings(method="hybrid", episodes=40, population=40, seed=seed) for seed in range(4)]
+    done = [bool(optimize(Orbit(touch=touch), s).outcome.success) for s in settings]
+    assert done == [bool(touch)] * 4
+
+
+def test_tasks_say_where_their_bodies_and_matter_are_but_not_where_the_floor_is():
+    assert problem("unknotting").touch == ()
+    (cone,) = problem("coiling").touch
+    assert cone == pytest.approx((0.58, -0.265, 0.063))
+    lifting, gathering = problem("lifting").touch, problem("gathering").touch
+    assert len(lifting) == 2 and len(gathering) == 3
+    # The middle of the ball is given last.
+    assert gathering[-1] == pytest.approx((0.25 - 0.29, 0.02 - 0.1, 0.07 - 0.012), abs=2e-3)
