@@ -26,11 +26,14 @@ from torch import Tensor
 from torchdlo.agents.cmaes import drawn, strategy
 from torchdlo.agents.lbfgs import Descent
 from torchdlo.agents.plan import Ask, Plan, Search, Told, ranking, rounds, sweeps, walks
+from torchdlo.agents.problem import Encoding
 
 __all__ = ["hybrid"]
 
 _ISLAND = 20
 """Trajectories that an island needs."""
+_FRESH = 0.1
+"""Share of the iterations that only try sweeps and rounds."""
 _COARSE = 0.3
 """Share of the iterations in which CMA-ES is alone."""
 _TURN = 5
@@ -103,18 +106,17 @@ class _Evolution:
 
     def __init__(self, plan: Plan, rng: torch.Generator) -> None:
         self.plan, self.rng, self.encoding = plan, rng, plan.encoding(plan.hold, _APART)
-        self.x = sweeps(plan, self.encoding, rng)
-        self.x[1::2] = self.encoding.project(walks(plan, rng))[1::2]
-        if plan.touch:
-            half = torch.arange(len(self.x)) % 6 > 2
-            self.x[half] = rounds(plan, self.encoding, rng, int(half.sum()))
+        self.fresh = max(1, round(_FRESH * plan.iterations))
+        self.tried: list[tuple[Tensor, Told]] = []
         self.found: Any = None
         self.lines: _Lines | None = None
         """None lets them start anew from what is told next."""
 
     def ask(self) -> Tensor:
-        """Return what to play: points that were moved, and what the strategy draws."""
-        if self.found is not None:
+        """Return what to play: beginnings at first, then points that were moved, and what the strategy draws."""
+        if self.found is None:
+            self.x = _beginnings(self.plan, self.encoding, self.rng)
+        else:
             moved = self.x[:0] if self.lines is None else self.encoding.project(self.lines.moved(self.found))
             self.x = drawn(self.found, self.encoding, moved)
         return self.encoding.decode(self.x).flatten(1)
@@ -122,16 +124,31 @@ class _Evolution:
     def tell(self, _: Tensor, told: Told) -> None:
         """Learn from how that went."""
         told = replace(told, slope=self.encoding.pull(self.x, told.slope))
-        if self.found is not None:
-            # The strategy looks at nothing but the order.
-            place = ranking(told.value, told.loss).argsort()
-            self.found.tell(list(self.x.numpy()), place.double().tolist())
+        count = max(1, round(_LINES * self.plan.population))
+        if self.found is None:
+            self.tried.append((self.x, told))
+            if len(self.tried) == self.fresh:
+                x, parts = zip(*self.tried, strict=True)
+                self.lines = _Lines(torch.cat(x), Told.cat(parts), count)
+                self.found = strategy(self.lines.x[0], self.plan.sigma, self.plan.population, self.rng)
+            return
+        # The strategy looks at nothing but the order.
+        place = ranking(told.value, told.loss).argsort()
+        self.found.tell(list(self.x.numpy()), place.double().tolist())
         if self.lines is None:
-            self.lines = _Lines(self.x, told, max(1, round(_LINES * self.plan.population)))
+            self.lines = _Lines(self.x, told, count)
         else:
             self.lines.learn(self.x, told)
-        if self.found is None:
-            self.found = strategy(self.lines.x[0], self.plan.sigma, self.plan.population, self.rng)
+
+
+def _beginnings(plan: Plan, encoding: Encoding, rng: torch.Generator) -> Tensor:
+    """Return points of sweeps and of random walks, and as many of rounds where there is something to touch."""
+    x = sweeps(plan, encoding, rng)
+    x[1::2] = encoding.project(walks(plan, rng))[1::2]
+    if plan.touch:
+        half = torch.arange(len(x)) % 6 > 2
+        x[half] = rounds(plan, encoding, rng, int(half.sum()))
+    return x
 
 
 class _Lines:

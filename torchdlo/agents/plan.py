@@ -60,6 +60,11 @@ class Told:
         columns = (getattr(self, f.name).split(list(sizes)) for f in dataclasses.fields(self))
         return [Told(*part) for part in zip(*columns, strict=True)]
 
+    @classmethod
+    def cat(cls, parts: Sequence[Told]) -> Told:
+        """Return how the trajectories of all parts went."""
+        return cls(*(torch.cat([getattr(part, f.name) for part in parts]) for f in dataclasses.fields(cls)))
+
 
 Search = Generator[Ask, Told, None]
 """An optimiser: yields what it wants played, and is sent how that went. It never runs anything itself."""
@@ -143,7 +148,8 @@ def rounds(plan: Plan, encoding: Encoding, rng: torch.Generator, count: int) -> 
     """Return points of ways straight to a circle about a thing that can be touched, and on along it, (count, size).
 
     Ropes are put round and over things, and drawn round them. Every fourth circle is upright, in line with the way to
-    the thing; the others are level, somewhat higher than its middle. Tools go together.
+    the thing; the others are level, somewhat higher than its middle. The middle of all things is one, too. Tools go
+    together.
     """
     if not plan.touch:
         raise ValueError("rounds: there is nothing to touch; expected a plan with touch")
@@ -152,6 +158,8 @@ def rounds(plan: Plan, encoding: Encoding, rng: torch.Generator, count: int) -> 
         return torch.rand(count, 1, generator=rng, dtype=torch.float64)
 
     things = torch.tensor(plan.touch, dtype=torch.float64)
+    if len(things) > 1:
+        things = torch.cat([things, things.mean(0, keepdim=True)])
     up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
     middle = things[torch.randint(len(things), (count,), generator=rng)] + _ROUND[1] * plan.limit * rand() * up
     radius = plan.limit * _ROUND[0] * (_ROUND[1] / _ROUND[0]) ** rand()

@@ -17,6 +17,8 @@ RATE = {"gathering": 1e-4, "lifting": 1e-4, "unknotting": 1e-4}
 """First steps of Adam that differ from 1 mm."""
 HOLD = {"coiling": 5}
 """Actions per way-point of hybrids that differ from 10: ways of 10 cm are chords too long for a small circle."""
+SPREAD = {"lifting": 0.02}
+"""First spreads of hybrids, if not the one that follows from `HOLD` [m]: hands that go far from a good way tear it."""
 REHEARSED = {"gathering": 0.9}
 """Shares of iterations in which hybrids play the task's rehearsal, if not 0."""
 POPULATION = {"cmaes": 400, "gd": 16, "hybrid": 100}
@@ -50,8 +52,8 @@ def preset(task: str, method: str, **given: Any) -> Settings:
     )
     if method == "hybrid":
         # Tools that go together, or down a slope, do not need the small steps that keep them from tearing a rope: the
-        # first spread is the one that follows from `hold`.
-        found = replace(found, hold=HOLD.get(task), sigma=None)
+        # first spread is the one that follows from `hold`, most often.
+        found = replace(found, hold=HOLD.get(task), sigma=SPREAD.get(task))
         if not given.get("robust"):
             found = replace(found, rehearsed=REHEARSED.get(task, 0.0))
     return replace(found, **{name: value for name, value in given.items() if value is not None})
