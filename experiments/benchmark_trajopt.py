@@ -107,7 +107,7 @@ def cases(task: str, args: Any) -> list[Case]:
     """All searches of a task."""
     from torchdlo.agents.presets import preset
 
-    given = {"episodes": args.episodes or None, "population": args.population or None}
+    given = {"episodes": args.episodes or None, "population": args.population or None, "rehearsed": args.rehearsed}
     seeds = range(args.first, args.first + args.seeds)
     return [
         Case(task, method, seed, preset(task, method, seed=seed, **given), Path(args.out) / f"{task}-{method}-{seed}")
@@ -151,6 +151,7 @@ def side_by_side(args: Any) -> None:
     common += ["--methods", ",".join(args.methods), "--first", str(args.first), "--seeds", str(args.seeds)]
     common += ["--jobs", "1", "--quiet", *(["--double"] if args.double else []), *(["--smoke"] if args.smoke else [])]
     common += ["--again"] if args.again else []
+    common += [] if args.rehearsed is None else ["--rehearsed", str(args.rehearsed)]
 
     def one(task: str) -> None:
         file = Path(args.out) / f"{task}.log"
@@ -251,6 +252,11 @@ def arguments(words: list[str] | None = None) -> Any:
     parser.add_argument("--jobs", type=count, default=1, help="tasks at the same time, one core each; default: 1")
     parser.add_argument("--episodes", type=int, default=0, help="budget; default: the published one of each task")
     parser.add_argument("--population", type=int, default=0, help="default: that of each method")
+    parser.add_argument(
+        "--rehearsed",
+        type=float,
+        help="share of the iterations that all methods play in the task's rehearsal; default: that of each method",
+    )
     parser.add_argument("--out", default="runs/trajopt", help="folder; default: runs/trajopt")
     parser.flag("again", "run anew what was found by another version of the program or of libraries")
     parser.flag("double", "physics in double precision")

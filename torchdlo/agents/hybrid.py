@@ -25,7 +25,7 @@ from torch import Tensor
 
 from torchdlo.agents.cmaes import drawn, strategy
 from torchdlo.agents.lbfgs import Descent
-from torchdlo.agents.plan import Ask, Plan, Search, Told, ranking, rounds, sweeps, walks
+from torchdlo.agents.plan import Ask, Plan, Rehearsed, Search, Told, ranking, rounds, sweeps, walks
 from torchdlo.agents.problem import Encoding
 
 __all__ = ["hybrid"]
@@ -68,10 +68,10 @@ def _island(plan: Plan, rng: torch.Generator) -> Search:
     drifts = math.ceil(plan.drifts * plan.iterations)
     alone = max(drifts, math.ceil(_COARSE * plan.iterations))
     gain, last, best = {coarse: 0.0, fine: math.inf}, {coarse: 0, fine: 0}, -math.inf
-    rehearsed: list[Tensor] = []
+    rehearsed = Rehearsed(plan)
     for k in itertools.count():
-        if k == plan.rehearsals and rehearsed:
-            x = torch.cat(rehearsed[::-1])[: plan.population]
+        if k == plan.rehearsals > 0:
+            x = rehearsed.actions
             told = yield Ask(encoding, x, graded=True)
             coarse.lines = None
             fine.clear()
@@ -91,7 +91,7 @@ def _island(plan: Plan, rng: torch.Generator) -> Search:
             fine.clear()
             best = -math.inf
         if k < plan.rehearsals:
-            rehearsed.append(x[ranking(told.value, told.loss)[: math.ceil(plan.population / plan.rehearsals)]])
+            rehearsed.note(x, told)
         part.tell(x, told)
         if part is coarse:
             fine.offer(x, told)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 from collections.abc import Generator, Sequence
 from dataclasses import dataclass
@@ -13,7 +14,7 @@ from torch import Tensor
 
 from torchdlo.agents.problem import Encoding, Problem
 
-__all__ = ["Ask", "Plan", "Search", "Told", "ranking", "rounds", "sweeps", "walks"]
+__all__ = ["Ask", "Plan", "Rehearsed", "Search", "Told", "handed", "ranking", "rounds", "sweeps", "walks"]
 
 _ALIKE = 1e-4
 """Share of the largest return by which returns differ that are not to be told apart."""
@@ -114,6 +115,36 @@ class Plan:
     def encoding(self, hold: int, apart: float | None = None) -> Encoding:
         """Return the encoding with `hold` actions per way-point, see `Encoding`."""
         return Encoding(self.horizon, self.width, self.group, self.limit, hold, apart)
+
+
+class Rehearsed:
+    """The best of every iteration of a rehearsal: the first to be played in the problem itself."""
+
+    def __init__(self, plan: Plan) -> None:
+        self.plan = plan
+        self.parts: list[Tensor] = []
+
+    def note(self, actions: Tensor, told: Told) -> None:
+        """Keep the best of an iteration; actions (P, T A) [m]."""
+        each = math.ceil(self.plan.population / self.plan.rehearsals)
+        self.parts.append(actions[ranking(told.value, told.loss)[:each]])
+
+    @property
+    def actions(self) -> Tensor:
+        """Those of the latest iterations, as many as a population has, shape (P, T A) [m]."""
+        return torch.cat(self.parts[::-1])[: self.plan.population]
+
+
+def handed(search: Search, plan: Plan) -> Search:
+    """Search as `search` does; what did well in a rehearsal is played in the problem itself before that goes on."""
+    kept, told = Rehearsed(plan), None
+    for k in itertools.count():
+        ask = search.send(told)
+        if k == plan.rehearsals > 0:
+            yield Ask(plan.encoding(1), kept.actions)
+        told = yield ask
+        if k < plan.rehearsals:
+            kept.note(ask.encoding.decode(ask.points).flatten(1), told)
 
 
 def walks(plan: Plan, rng: torch.Generator, count: int | None = None) -> Tensor:

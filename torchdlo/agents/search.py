@@ -16,7 +16,7 @@ from torchdlo.agents.cmaes import cmaes
 from torchdlo.agents.descent import descent
 from torchdlo.agents.hybrid import hybrid
 from torchdlo.agents.journal import Journal
-from torchdlo.agents.plan import Ask, Plan, Search, Told
+from torchdlo.agents.plan import Ask, Plan, Search, Told, handed
 from torchdlo.agents.problem import Outcome, Problem
 from torchdlo.errors import InputError
 
@@ -24,6 +24,9 @@ __all__ = ["METHODS", "Found", "Robust", "Settings", "optimize"]
 
 METHODS: dict[str, Callable[[Plan, torch.Generator], Search]] = {"cmaes": cmaes, "gd": descent, "hybrid": hybrid}
 """Optimisers by name."""
+
+REHEARSING = ("hybrid",)
+"""Those that see to it themselves that what did well in a rehearsal is played in the problem itself."""
 
 Callback = Callable[[str, int, int, str], None]
 
@@ -92,8 +95,7 @@ class Settings:
             value = getattr(self, name)
             need(value is None or (math.isfinite(value) and value > 0), name, "a positive number")
         need(0 <= self.rehearsed < 1, "rehearsed", "a share of the iterations from 0 up, less than 1")
-        alone = self.rehearsed == 0 or (self.method == "hybrid" and self.robust is None)
-        need(alone, "rehearsed", f"0 for {self.method}{' with robust' if self.robust else ''}")
+        need(self.rehearsed == 0 or self.robust is None, "rehearsed", "0 with robust")
         per, spare = (self.robust.copies, self.robust.final) if self.robust else (1, 0)
         least = self.population * per + spare
         judged = f" and {spare} for the last judgement" if spare else ""
@@ -153,11 +155,15 @@ def optimize(
         raise InputError(f"{problem.name}: it has no rehearsal; set rehearsed to 0.")
     player = _Player(problem, settings, Journal(journal, _options(problem, settings), resume=resume), callback)
     search = METHODS[settings.method](plan, torch.Generator().manual_seed(settings.seed))
+    if settings.method not in REHEARSING:
+        search = handed(search, plan)
     told, curve, interrupted = None, [], False
     best = _Best(robust.finalists if robust else _FINALISTS)
     try:
         for k in range(plan.iterations):
             ask = search.send(told)
+            if k + 1 == plan.iterations:
+                ask = replace(ask, graded=False)  # nothing is told of it
             scale = robust.scale((k + 1) / plan.iterations) if robust else 0.0
             rehearses = k < plan.rehearsals
             told = player.batch(ask, scale, stand_in if rehearses else problem)
