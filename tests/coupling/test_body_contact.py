@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from tests.coupling.tumbling import F64, SHAPES, G, energy, ground, momenta, move, run
+from torchdlo.coupling import body_pairs
 from torchdlo.coupling.bodies import Solid, place
 from torchdlo.coupling.body_contact import BodyContact
 from torchdlo.physics import tree
@@ -196,6 +197,40 @@ def test_gradients_of_200_steps_agree_with_differences() -> None:
         ahead, behind = outcome(step * torch.stack([torch.eye(7, dtype=F64), -torch.eye(7, dtype=F64)]))
     differences = (ahead - behind) / (2 * step)
     assert (found - differences).abs().max() < 1e-4 * differences.abs().max(), (found, differences)
+
+
+@pytest.mark.parametrize("kernel", [True, False])
+@pytest.mark.parametrize("shape", ["box", "cylinder", "sphere"])
+def test_gradients_know_that_bodies_at_rest_are_held_by_friction(shape: str, kernel: bool, monkeypatch) -> None:
+    # Points of a body at rest do not slip at all: the direction of the slip says nothing of what friction does next.
+    size = SHAPES[shape]
+    height = {"box": 0.03, "cylinder": 0.05, "sphere": 0.05}[shape]
+    rub = {"mu_s": 0.6, "mu_k": 0.6, "density": 120.0}
+    kinds, params, state = place(
+        [ground(**rub), Solid(shape, size, (0.0, 0.0, height), **rub)], torch.zeros(1, dtype=F64)
+    )
+    if not kernel:
+        monkeypatch.setattr(body_pairs, "fits", lambda _: False)
+    gravity = torch.tensor([[0.0, 0.0, -G]], dtype=F64)
+
+    def speeds(x: torch.Tensor, begun) -> torch.Tensor:
+        """Return velocity and turn rate (6,) after three substeps, from those that are added at first."""
+        added = torch.stack([torch.zeros_like(x), x])
+        begun = tree.replace(begun, vel=begun.vel + added[:, :3], omega=begun.omega + added[:, 3:])
+        end = move(kinds, params, begun, 3, 1e-3, gravity, BodyContact())
+        return torch.cat([end.vel[1], end.omega[1]])
+
+    with torch.no_grad():
+        rest = move(kinds, params, state, 100, 1e-3, gravity, BodyContact())
+    slopes = torch.autograd.functional.jacobian(lambda x: speeds(x, rest), torch.zeros(6, dtype=F64))
+    with torch.no_grad():
+        steps = 1e-7 * torch.eye(6, dtype=F64)
+        differences = torch.stack([(speeds(x, rest) - speeds(-x, rest)) / 2e-7 for x in steps], -1)
+    # Upwards it is another thing to push a body than downwards.
+    across = [0, 1, 3, 4] if shape == "sphere" else [0, 1, 5]
+    torch.testing.assert_close(slopes[:, across], differences[:, across], atol=2e-3, rtol=1e-3)
+    # Friction alone stops what slides; a ball is set rolling by 5/7 of what is left of both.
+    assert slopes[:2, :2].abs().max() < (0.8 if shape == "sphere" else 1e-3)
 
 
 def test_single_precision_stands_too() -> None:

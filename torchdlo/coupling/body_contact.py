@@ -157,9 +157,11 @@ def _forces(links: Links, sets: _Sets, moved: Tensor) -> Tensor:
     load = (links.stiff * sets.press * (links.wanted - dot(links.normal, moved))).clamp(min=0.0)
     size, along = _slip(links, moved)
     # A contact that sticks may rub by mu_s of its load, one that slides by mu_k.
-    sticking = torch.minimum(sets.drag * size, links.mu_s * load)
-    rubs = torch.where(sets.slides > 0, links.mu_k * load, sticking)
-    return load * links.normal - rubs * along
+    limit = torch.where(sets.slides > 0, links.mu_k, links.mu_s) * load
+    # What sticks is held along its slip, not along the direction of that: bodies at rest have none.
+    sticks = (sets.slides <= 0) & (sets.drag * size <= limit)
+    held = sets.drag * (moved - dot(links.normal, moved) * links.normal)
+    return load * links.normal - torch.where(sticks, held, limit * along)
 
 
 def _settled(system: System, dt: float, slowest: float, rounds: int) -> tuple[_Sets, Tensor]:

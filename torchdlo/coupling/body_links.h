@@ -98,8 +98,12 @@ struct Linked : Pairs<T> {
     Three<T, N> along;
     const S size = slip(l, c, moved, along);
     const S load = positive(S(stiff[c] * s.press) * (l.wanted - dot(l.normal, moved)));
-    const S sticking = smaller(S(s.drag) * size, l.mu_s * load);
-    return l.normal * load - along * select(s.slides > T(0), l.mu_k * load, sticking);
+    const auto slides = s.slides > T(0);
+    const S limit = select(slides, l.mu_k, l.mu_s) * load;
+    // What sticks is held along its slip, not along the direction of that: bodies at rest have none.
+    const auto sticks = ~slides & (s.drag * size.x <= limit.x);
+    const Three<T, N> held = (moved - l.normal * dot(l.normal, moved)) * S(s.drag), rubs = along * limit;
+    return l.normal * load - Three<T, N>{select(sticks, held.x, rubs.x), select(sticks, held.y, rubs.y), select(sticks, held.z, rubs.z)};
   }
 
   // The share of forces at which they do what is asked for; see `_fitting` in body_contact.py.
