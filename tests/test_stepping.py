@@ -73,6 +73,20 @@ def test_a_rollout_without_gradients_compiles_one_graph(graphs, scenes, held, su
 
 @pytest.mark.compile
 @pytest.mark.slow
+def test_replays_run_the_graph_of_rollouts_without_gradients(graphs):
+    made, params, state, controls = hanging(2, substeps=2)
+    step = scene.stepper(made)
+    with torch.no_grad():
+        scene.rollout(step, params, state, controls)
+    moved = tree.replace(controls, pos=controls.pos.clone().requires_grad_())
+    last, _ = scene.rollout(step, params, state, moved, segment=1)
+    assert graphs() == 1, "what is replayed backwards is not recorded before"
+    (slope,) = torch.autograd.grad(last.rods.pos.square().sum(), moved.pos)
+    assert graphs() == 2 and float(slope.abs().max()) > 0
+
+
+@pytest.mark.compile
+@pytest.mark.slow
 def test_a_rollout_with_bodies_and_gradients_compiles_one_graph_and_the_survey(graphs):
     # Bodies have no gradient at first, and one as soon as a rope has touched them.
     x = torch.zeros(1, 5, 3, dtype=torch.float64)

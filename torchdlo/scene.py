@@ -353,13 +353,21 @@ def stepper(scene: Scene, *, compiled: bool = True, recorded: bool = False):
     def run(params: Params, state: State, control: Control) -> State:
         _check_control(scene, control)
         graded, state = torch.is_grad_enabled(), _laid_out(state)
+        # Compilers tell numbers that need a gradient from others, also where none is taken: replays run both ways.
+        state = tree.replace(state, time=_plain(state.time), missed=_plain(state.missed))
         if graded:
             moving = alike((state.rods, state.reaction, state.bodies, state.matter), (params, control))
             state = tree.replace(state, **dict(zip(("rods", "reaction", "bodies", "matter"), moving, strict=True)))
+        else:
+            params, state, control = tree.map(_plain, (params, state, control))
         whole, part = ways[graded]
         return whole(scene, params, state, control, part, look)
 
     return run
+
+
+def _plain(x: Tensor) -> Tensor:
+    return x.detach() if x.requires_grad else x
 
 
 def finite(state: State) -> Tensor:
