@@ -3,17 +3,21 @@
 All searches of a task run at the same time and share their batches, so that their seconds are shared ones; the best
 trajectories are played alone in the end, and returns are those. An episode that is played with gradient counts as one.
 Every search keeps a journal, so that a benchmark that was stopped goes on where it was; finished ones are read. Those
-of another version of the program or of libraries are marked with a star in the table, and run anew with --again.
+of another version of the program or of libraries are marked with a star in the table, and run anew with --again. With
+--minutes, searches end with what they found by then; without it, the same command goes on with them.
 """
 
 from __future__ import annotations
 
 import json
+import math
 import os
 import shutil
 import statistics
 import subprocess
 import sys
+import time
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
@@ -38,6 +42,28 @@ def earlier(result: dict[str, Any]) -> bool:
 
 
 @dataclass(frozen=True)
+class Timed:
+    """A problem of which no batch is begun any more when the time is over; what was found can still be recorded."""
+
+    inner: Any
+    over: Callable[[], bool]
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.inner, name)
+
+    def evaluate(self, actions: Any) -> Any:
+        """Play actions, or end the search as Ctrl-C does."""
+        if self.over():
+            raise KeyboardInterrupt
+        return self.inner.evaluate(actions)
+
+    def rehearsal(self) -> Any:
+        """Return the rehearsal, which ends at the same time."""
+        found = self.inner.rehearsal()
+        return None if found is None else Timed(found, self.over)
+
+
+@dataclass(frozen=True)
 class Case:
     """One search."""
 
@@ -52,8 +78,14 @@ class Case:
         """The file that says that it is finished."""
         return self.folder / "result.json"
 
-    def found(self, problem: Any, again: bool) -> dict[str, Any] | None:
-        """Return its result, if it is there and of the same settings; with `again`, of the same program as well."""
+    def found(self, problem: Any, again: bool, ended: bool) -> dict[str, Any] | None:
+        """Return its result, if it is there and of the same settings.
+
+        Args:
+            problem: what it is of.
+            again: whether it has to be of the same program as well.
+            ended: whether one that ended early counts.
+        """
         from torchdlo.agents.search import Settings
 
         def resolved(settings: dict[str, Any]) -> dict[str, Any]:
@@ -66,7 +98,7 @@ class Case:
         # Earlier versions had fewer settings.
         had, wanted = (json.loads(json.dumps(x)) for x in (asdict(Settings()), asdict(self.settings) | problem.choices))
         same = resolved(had | found["settings"]) == resolved(wanted)
-        return found if same and not (again and earlier(found)) else None
+        return found if same and not (again and earlier(found)) and (ended or not found["interrupted"]) else None
 
     def ready(self, choices: dict[str, Any], again: bool) -> None:
         """Say so before anything runs if the journal of a stopped search is of another one; `again` removes it."""
@@ -88,16 +120,17 @@ class Case:
                 "another --out."
             )
 
-    def search(self, problem: Any, callback: Any) -> None:
-        """Search, resumed if it was stopped, and write what was found."""
+    def search(self, problem: Any, callback: Any, over: Callable[[], bool]) -> None:
+        """Search until it is over, resumed if it was stopped, and write what was found."""
         from torchdlo.agents.result import result_json, trajectory_json
         from torchdlo.agents.search import optimize
         from torchdlo.files import write_atomically
 
         journal = self.folder / "journal"
         resume = (journal / "journal.json").is_file()
-        found = optimize(problem, self.settings, journal=journal, resume=resume, callback=callback)
-        if found.interrupted:
+        timed = Timed(problem, over)
+        found = optimize(timed, self.settings, journal=journal, resume=resume, callback=callback)
+        if found.interrupted and not over():
             raise KeyboardInterrupt
         write_atomically(self.folder / "trajectory.json", trajectory_json(found, problem))
         write_atomically(self.result, result_json(found, problem, self.settings))
@@ -123,7 +156,8 @@ def solve(task: str, args: Any) -> list[tuple[Case, dict[str, Any]]]:
     from torchdlo.progress import deferred_interrupt, progress
 
     chosen, wanted = problem(task, double=args.double, compiled=args.compiled), cases(task, args)
-    left = [case for case in wanted if case.found(chosen, args.again) is None]
+    left = [case for case in wanted if case.found(chosen, args.again, args.minutes is not None) is None]
+    end = math.inf if args.minutes is None else time.monotonic() + 60 * args.minutes
     for case in left:
         case.ready(chosen.choices, args.again)
     said: dict[Path, tuple[int, int, str]] = {}
@@ -138,7 +172,7 @@ def solve(task: str, args: Any) -> list[tuple[Case, dict[str, Any]]]:
                 said[case.folder] = (done, total, words)
 
             said[case.folder] = (0, case.settings.episodes, "")
-            return lambda shared: case.search(shared, note)
+            return lambda shared: case.search(shared, note, lambda: time.monotonic() > end)
 
         room = sum(min(case.settings.population, case.settings.chunk) for case in wanted)
         together(chosen, [searching(case) for case in left], room, pulse)
@@ -151,7 +185,9 @@ def side_by_side(args: Any) -> None:
     common += ["--methods", ",".join(args.methods), "--first", str(args.first), "--seeds", str(args.seeds)]
     common += ["--jobs", "1", "--quiet", *(["--double"] if args.double else []), *(["--smoke"] if args.smoke else [])]
     common += ["--again"] if args.again else []
-    common += [] if args.rehearsed is None else ["--rehearsed", str(args.rehearsed)]
+    for name in ("rehearsed", "minutes"):
+        value = getattr(args, name)
+        common += [] if value is None else [f"--{name}", str(value)]
 
     def one(task: str) -> None:
         file = Path(args.out) / f"{task}.log"
@@ -257,6 +293,7 @@ def arguments(words: list[str] | None = None) -> Any:
         type=float,
         help="share of the iterations that all methods play in the task's rehearsal; default: that of each method",
     )
+    parser.add_argument("--minutes", type=float, help="time for the searches of a task; default: as long as it takes")
     parser.add_argument("--out", default="runs/trajopt", help="folder; default: runs/trajopt")
     parser.flag("again", "run anew what was found by another version of the program or of libraries")
     parser.flag("double", "physics in double precision")

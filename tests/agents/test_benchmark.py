@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import os
 import subprocess
@@ -9,6 +10,9 @@ import sys
 from pathlib import Path
 
 import pytest
+
+from tests.agents.problems import Push
+from torchdlo.agents.search import Settings
 
 pytest.importorskip("pytorch_kinematics", reason="arms need the extra robots")
 
@@ -55,6 +59,28 @@ def test_the_benchmark_writes_its_table_and_reads_finished_runs(tmp_path: Path) 
     refused = call(*words)
     assert refused.returncode == 1 and "whose population, version differ; --again begins anew" in refused.stderr
     assert call(*words, "--again").returncode == 0 and result.is_file() and not journal.exists()
+    # What ended early counts where time is limited, and is gone on with where it is not.
+    result.write_text(json.dumps(content | {"return": 0.25, "interrupted": True}))
+    assert "| wiring_post | cmaes | 1 | 0.25 |" in call(*words, "--minutes", "60").stdout
+    assert call(*words).stdout.rsplit("|", 2)[0] == first
+
+
+def test_a_search_ends_when_time_is_over_and_keeps_what_it_has(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(SCRIPT.parent)
+    benchmark = importlib.import_module("benchmark_trajopt")
+    settings = Settings("cmaes", episodes=80, population=8, hold=5)
+    case, calls = benchmark.Case("push", "cmaes", 0, settings, tmp_path), []
+
+    def over() -> bool:
+        calls.append(None)
+        return len(calls) > 3
+
+    case.search(Push(), lambda *_: None, over)
+    found = json.loads(case.result.read_text())
+    assert found["interrupted"] and found["episodes"] == 24 and len(found["curve"]) == 3
+    case.search(Push(), lambda *_: None, lambda: False)
+    found = json.loads(case.result.read_text())
+    assert not found["interrupted"] and found["episodes"] == 80 and len(found["curve"]) == 10
 
 
 def test_unknown_names_are_refused() -> None:
