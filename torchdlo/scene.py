@@ -17,7 +17,7 @@ from torch import Tensor
 from torchdlo.coupling import bodies as rigid
 from torchdlo.coupling import body_matter, mpm, rod_matter, watch
 from torchdlo.coupling.bodies import Body, BodyParams, BodyState, BodyTargets, Solid, place
-from torchdlo.coupling.particles import Matter, Medium, Particles, rows_of
+from torchdlo.coupling.particles import Matter, Medium, Particles, laid_out
 from torchdlo.coupling.watch import survey
 from torchdlo.physics import build, checks, rod, stability, traced, tree
 from torchdlo.physics.build import Rope
@@ -25,7 +25,7 @@ from torchdlo.physics.effect import Effect, altered, default_values, numbers_of
 from torchdlo.physics.hold import Reaction, Targets, between, check_grip, unfelt
 from torchdlo.physics.integrate import INTEGRATORS, TWISTS, Settings, settle_twist, substep
 from torchdlo.physics.numerics import cross, normalize
-from torchdlo.physics.replay import alike, laid_out, rollout
+from torchdlo.physics.replay import alike, rollout
 from torchdlo.physics.rod import RodParams, RodState
 from torchdlo.physics.topology import Topology
 
@@ -286,13 +286,7 @@ def advance(scene: Scene, params: Params, state: State, start: Control, control:
     if scene.matter:
         particles, missed = rod_matter.finish(scene.matter, params.matter, pool, push, settings.dt, missed)
     after = State(rods, state.time + settings.dt, missed, mean, moved, particles)
-    return _laid_out(after) if torch.compiler.is_compiling() else after
-
-
-def _laid_out(state: State) -> State:
-    """Return a state that is stored to the last stride as compiled steps expect it."""
-    particles = laid_out(state.matter, rows_of, rows_of)
-    return tree.replace(laid_out(tree.replace(state, matter=())), matter=particles)
+    return laid_out(after) if torch.compiler.is_compiling() else after
 
 
 def step(scene: Scene, params: Params, state: State, control: Control, *, advance=advance, survey=survey) -> State:
@@ -352,22 +346,18 @@ def stepper(scene: Scene, *, compiled: bool = True, recorded: bool = False):
 
     def run(params: Params, state: State, control: Control) -> State:
         _check_control(scene, control)
-        graded, state = torch.is_grad_enabled(), _laid_out(state)
+        graded, state = torch.is_grad_enabled(), laid_out(state)
         # Compilers tell numbers that need a gradient from others, also where none is taken: replays run both ways.
-        state = tree.replace(state, time=_plain(state.time), missed=_plain(state.missed))
+        state = tree.replace(state, time=state.time.detach(), missed=state.missed.detach())
         if graded:
             moving = alike((state.rods, state.reaction, state.bodies, state.matter), (params, control))
             state = tree.replace(state, **dict(zip(("rods", "reaction", "bodies", "matter"), moving, strict=True)))
         else:
-            params, state, control = tree.map(_plain, (params, state, control))
+            params, state, control = tree.detach((params, state, control))
         whole, part = ways[graded]
         return whole(scene, params, state, control, part, look)
 
     return run
-
-
-def _plain(x: Tensor) -> Tensor:
-    return x.detach() if x.requires_grad else x
 
 
 def finite(state: State) -> Tensor:

@@ -5,17 +5,20 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import TypeVar
 
 import torch
 from torch import Tensor
 
 from torchdlo.coupling.laws import Law
-from torchdlo.physics import tree
+from torchdlo.physics import replay, tree
 from torchdlo.physics.effect import Values
 
 WALLS = ("open", "separate", "slip", "stick")
 """What a side of the box is: nothing; a wall that lets go, with friction; one that holds matter along its normal only;
 one that holds it."""
+
+T = TypeVar("T")
 
 MARGIN = 2
 """Layers of nodes outside of the box."""
@@ -170,6 +173,12 @@ def rows_of(x: Tensor) -> Tensor:
 def stored(x: Tensor) -> Tensor:
     """Return (..., P, C) with the same values stored as (..., C, P)."""
     return rows_of(rows_of(x).contiguous())
+
+
+def laid_out(state: T) -> T:
+    """Return the state of a scene, stored to the last stride as compiled steps expect it; matter in its own order."""
+    particles = replay.laid_out(state.matter, rows_of, rows_of)
+    return tree.replace(replay.laid_out(tree.replace(state, matter=())), matter=particles)
 
 
 def assemble(blobs: Sequence[Blob], grid: Grid, *, friction: float | Tensor = 0.3) -> tuple[Medium, Matter, Particles]:
