@@ -103,7 +103,8 @@ struct Linked : Pairs<T> {
     // What sticks is held along its slip, not along the direction of that: bodies at rest have none.
     const auto sticks = ~slides & (s.drag * size.x <= limit.x);
     const Three<T, N> held = (moved - l.normal * dot(l.normal, moved)) * S(s.drag), rubs = along * limit;
-    return l.normal * load - Three<T, N>{select(sticks, held.x, rubs.x), select(sticks, held.y, rubs.y), select(sticks, held.z, rubs.z)};
+    return l.normal * load - Three<T, N>{select(sticks, held.x, rubs.x), select(sticks, held.y, rubs.y),
+                                         select(sticks, held.z, rubs.z)};
   }
 
   // The share of forces at which they do what is asked for; see `_fitting` in body_contact.py.
