@@ -30,6 +30,8 @@ EXAMPLES = """examples:
   python experiments/benchmark_trajopt.py --tasks wiring_post --methods cmaes,hybrid --seeds 5 --episodes 2000
 """
 
+SHARE = {"hybrid": 4}
+"""Slopes are wanted of one in so many trajectories; batches are as large, since steps are compiled for one size."""
 INTERRUPTED = 130
 """Exit status after Ctrl-C."""
 
@@ -174,7 +176,7 @@ def solve(task: str, args: Any) -> list[tuple[Case, dict[str, Any]]]:
             said[case.folder] = (0, case.settings.episodes, "")
             return lambda shared: case.search(shared, note, lambda: time.monotonic() > end)
 
-        room = sum(min(case.settings.population, case.settings.chunk) for case in wanted)
+        room = sum(min(case.settings.population, case.settings.chunk) // SHARE.get(case.method, 1) for case in wanted)
         together(chosen, [searching(case) for case in left], room, pulse)
     return [(case, json.loads(case.result.read_text())) for case in wanted]
 

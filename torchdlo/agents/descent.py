@@ -26,7 +26,7 @@ def descent(plan: Plan, rng: torch.Generator) -> Search:
     mean, square = torch.zeros_like(x), torch.zeros_like(x)
     step, stall, best = x.new_zeros(len(x), 1), x.new_zeros(len(x), 1), x.new_full((len(x), 1), -math.inf)
     while True:
-        told = yield Ask(encoding, x, graded=True)
+        told = yield Ask(encoding, x, graded=len(x))
         gain = told.returns[:, None] > best
         best, stall = torch.where(gain, told.returns[:, None], best), torch.where(gain, 0, stall + 1)
         rate = plan.last + (plan.rate - plan.last) * 0.5 * (1 + torch.cos(math.pi * step / plan.steps))

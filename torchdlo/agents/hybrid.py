@@ -2,7 +2,7 @@
 
 Large populations live on islands that know nothing of each other: whichever way round an obstacle a search goes, it
 seldom comes back, and another one may go the other way. On each of them, two parts share the budget, iteration by
-iteration, and every episode of both is played with gradient:
+iteration, and both have the slopes of the best quarter of what they play:
 
 1. Straight sweeps over what can be reached find out what there is to touch, and rounds about bodies what comes of it.
    CMA-ES searches way-points from the best of them. A part of each population are the best points so far, moved down
@@ -24,8 +24,8 @@ import torch
 from torch import Tensor
 
 from torchdlo.agents.cmaes import drawn, strategy
-from torchdlo.agents.lbfgs import Descent
-from torchdlo.agents.plan import Ask, Plan, Rehearsed, Search, Told, ranking, rounds, sweeps, walks
+from torchdlo.agents.lbfgs import TRIES, Descent
+from torchdlo.agents.plan import Ask, Plan, Rehearsed, Search, Told, best, ranking, rounds, sweeps, walks
 from torchdlo.agents.problem import Encoding
 
 __all__ = ["hybrid"]
@@ -38,8 +38,8 @@ _COARSE = 0.3
 """Share of the iterations in which CMA-ES is alone."""
 _TURN = 5
 """Iterations of which each part has at least one."""
-_LINES = 0.25
-"""Share of a population that are points moved down their slopes."""
+_SURGE, _CUT = 3, 10.0
+"""Slopes of all actions are believed up to so many times the largest one of the last third of them."""
 _SHORT = 0.1
 """Share of the first step from which shorter ones are given up."""
 _APART = 0.2
@@ -48,7 +48,7 @@ _APART = 0.2
 
 def hybrid(plan: Plan, rng: torch.Generator) -> Search:
     """Search on islands, see above."""
-    count = max(1, plan.population // _ISLAND)
+    count = max(1, plan.population // _ISLAND)  # of islands
     sizes = [(plan.population + k) // count for k in range(count)]
     seeds = torch.randint(2**31, (count,), generator=rng).tolist()
     islands = [
@@ -58,25 +58,34 @@ def hybrid(plan: Plan, rng: torch.Generator) -> Search:
     parts: list[Told | None] = [None] * count
     while True:
         asks = [island.send(told) for island, told in zip(islands, parts, strict=True)]
-        told = yield Ask(asks[0].encoding, torch.cat([ask.points for ask in asks]), graded=True)
-        parts = told.split([len(ask.points) for ask in asks])
+        counts = [len(ask.points) for ask in asks]
+
+        def pick(told: Told, _: int, asks: list[Ask] = asks, counts: list[int] = counts) -> Tensor:
+            first = itertools.accumulate(counts, initial=0)
+            own = zip(asks, told.split(counts), first, strict=False)
+            return torch.cat([ask.pick(part, ask.graded) + start for ask, part, start in own])
+
+        told = yield Ask(asks[0].encoding, torch.cat([ask.points for ask in asks]), sum(a.graded for a in asks), pick)
+        parts = told.split(counts)
 
 
 def _island(plan: Plan, rng: torch.Generator) -> Search:
     """Search with sweeps, rounds, CMA-ES and descent."""
     encoding, coarse, fine = plan.encoding(1), _Evolution(plan, rng), Descent(plan, rng)
+    graded = fine.count
     drifts = math.ceil(plan.drifts * plan.iterations)
     alone = max(drifts, math.ceil(_COARSE * plan.iterations))
-    gain, last, best = {coarse: 0.0, fine: math.inf}, {coarse: 0, fine: 0}, -math.inf
+    gain, last, top = {coarse: 0.0, fine: math.inf}, {coarse: 0, fine: 0}, -math.inf
     rehearsed = Rehearsed(plan)
     for k in itertools.count():
         if k == plan.rehearsals > 0:
             x = rehearsed.actions
-            told = yield Ask(encoding, x, graded=True)
+            told = yield Ask(encoding, x, min(graded, len(x)))
+            told = replace(told, slope=_tame(told.slope, plan.horizon))
             coarse.lines = None
             fine.clear()
             fine.offer(x, told)
-            best = float(told.value.max())
+            top = float(told.value.max())
             continue
 
         def turn(part: _Evolution | Descent, k: int = k) -> tuple[bool, float, int]:
@@ -84,21 +93,35 @@ def _island(plan: Plan, rng: torch.Generator) -> Search:
 
         part = coarse if k < alone else max((coarse, fine), key=turn)
         x = part.ask()
-        told = yield Ask(encoding, x, graded=True)
+        told = yield Ask(encoding, x, graded, best if part is coarse else fine.pick)
+        told = replace(told, slope=_tame(told.slope, plan.horizon))
         # What was measured in milder worlds does not compare.
         if k < drifts:
             coarse.lines = None
             fine.clear()
-            best = -math.inf
+            top = -math.inf
         if k < plan.rehearsals:
             rehearsed.note(x, told)
         part.tell(x, told)
         if part is coarse:
             fine.offer(x, told)
         highest = float(told.value.max())
-        gained = max(0.0, highest - best) if math.isfinite(best) else 0.0
+        gained = max(0.0, highest - top) if math.isfinite(top) else 0.0
         gain[part] = gained if math.isinf(gain[part]) else 0.5 * (gain[part] + gained)
-        last[part], best = k, max(best, highest)
+        last[part], top = k, max(top, highest)
+
+
+def _tame(slope: Tensor, horizon: int) -> Tensor:
+    """Return slopes by actions, shape (P, T A), with those that grew beyond measure scaled down by the square of it.
+
+    Ropes may move chaotically: derivatives then grow from action to action, back in time, and hold for ways so short
+    that they are of no use. Left alone, the largest would be all that steps go by.
+    """
+    each = slope.unflatten(-1, (horizon, -1))
+    size = torch.linalg.vector_norm(each, dim=-1, keepdim=True)
+    most = _CUT * size[:, -math.ceil(horizon / _SURGE) :].amax(1, keepdim=True)
+    factor = torch.where((most > 0) & (size > most), most / size, 1.0)
+    return (each * factor.square()).flatten(1)
 
 
 class _Evolution:
@@ -124,7 +147,7 @@ class _Evolution:
     def tell(self, _: Tensor, told: Told) -> None:
         """Learn from how that went."""
         told = replace(told, slope=self.encoding.pull(self.x, told.slope))
-        count = max(1, round(_LINES * self.plan.population))
+        count = max(1, self.plan.population // TRIES)
         if self.found is None:
             self.tried.append((self.x, told))
             if len(self.tried) == self.fresh:
@@ -155,8 +178,8 @@ class _Lines:
     """Points that go down their slopes within an evolution strategy, the best first at the start."""
 
     def __init__(self, x: Tensor, told: Told, count: int) -> None:
-        best = ranking(told.value, told.loss)[:count]
-        self.x, self.value, self.loss, self.slope = x[best], told.value[best], told.loss[best], told.slope[best]
+        rows = best(told, count)
+        self.x, self.value, self.loss, self.slope = x[rows], told.value[rows], told.loss[rows], told.slope[rows]
         # A drawn point lies about the root of the dimension away from the mean; half of it is a step.
         self.first = 0.5 * math.sqrt(x.shape[1])
         self.length = torch.full_like(self.loss, self.first)
@@ -176,7 +199,8 @@ class _Lines:
         self.length[active] *= torch.where(down, 2.0, 0.5)
         self._put(active[down], x, told, torch.arange(n)[down])
         fresh = ranking(told.value[n:], told.loss[n:])[: len(self.x) // 2] + n
-        value = torch.where(self.length > _SHORT * self.first, self.value, -math.inf)
+        live = (self.length > _SHORT * self.first) & (self.slope != 0).any(-1)
+        value = torch.where(live, self.value, -math.inf)
         worst = value.argsort(stable=True)[: len(fresh)]
         better = told.value[fresh] > value[worst]
         self.length[worst[better]] = self.first

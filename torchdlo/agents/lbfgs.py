@@ -12,11 +12,11 @@ from torch import Tensor
 
 from torchdlo.agents.plan import Plan, Told, ranking, walks
 
-__all__ = ["Descent"]
+__all__ = ["TRIES", "Descent"]
 
 _PAIRS = 8
 """Steps that a line remembers."""
-_TRIES = 4
+TRIES = 4
 """Step lengths that are tried side by side, from four times the last one to a sixteenth of it."""
 _NOISE = 0.5
 """How far from the best point a line starts again, over the first steps of CMA-ES: so far times lengths of steps."""
@@ -28,7 +28,7 @@ class Descent:
     def __init__(self, plan: Plan, rng: torch.Generator) -> None:
         """Begin without any line."""
         self.plan, self.rng, self.encoding = plan, rng, plan.encoding(1)
-        self.count = max(1, plan.population // _TRIES)
+        self.count = max(1, plan.population // TRIES)
         self.tries = plan.population // self.count
         self.clear()
 
@@ -42,7 +42,7 @@ class Descent:
         self.best = (-math.inf, empty.new_zeros(self.encoding.size))
 
     def offer(self, x: Tensor, told: Told) -> None:
-        """Take what is better than the lines; told slopes are by actions, shape (P, T A)."""
+        """Take what is better than the lines; told slopes are by actions, shape (P, T A), of the best at least."""
         self._note(x, told)
         value, loss = torch.cat([self.value, told.value]), torch.cat([self.loss, told.loss])
         best = ranking(value, loss)[: self.count]
@@ -66,12 +66,16 @@ class Descent:
         tried = torch.where(self.over[:, None, None], self.best[1] + away, tried)
         return self.encoding.project(tried.flatten(0, 1))
 
+    def pick(self, told: Told, _: int = 0) -> Tensor:
+        """Return which of a line's step lengths went furthest down, shape (L,); no other slopes are needed."""
+        losses = told.loss.reshape(-1, self.tries)
+        return torch.arange(len(losses)) * self.tries + losses.argmin(-1)
+
     def tell(self, x: Tensor, told: Told) -> None:
         """Take steps that went down, and shorten those that did not."""
         self._note(x, told)
-        row = torch.arange(len(self.x))
-        pick = told.loss.reshape(len(row), self.tries).argmin(-1)
-        at = row * self.tries + pick
+        row, at = torch.arange(len(self.x)), self.pick(told)
+        tried = at - row * self.tries
         down = ~self.over & (told.loss[at] < self.loss)
         # A line that failed goes on along its plain slope, with lengths that it has not tried.
         self.moved, self.turned = (
@@ -85,7 +89,7 @@ class Descent:
         self.value, self.loss = (
             torch.where(taken, new[at], was) for new, was in ((told.value, self.value), (told.loss, self.loss))
         )
-        step = torch.where(down, self.lengths[row, pick], self.lengths[:, -1] / 16)
+        step = torch.where(down, self.lengths[row, tried], self.lengths[:, -1] / 16)
         self.step = torch.where(self.over, self.plan.rate, step)
 
     def _note(self, x: Tensor, told: Told) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
-from collections.abc import Generator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,24 +14,13 @@ from torch import Tensor
 
 from torchdlo.agents.problem import Encoding, Problem
 
-__all__ = ["Ask", "Plan", "Rehearsed", "Search", "Told", "handed", "ranking", "rounds", "sweeps", "walks"]
+__all__ = ["Ask", "Plan", "Rehearsed", "Search", "Told", "best", "handed", "ranking", "rounds", "sweeps", "walks"]
 
 _ALIKE = 1e-4
 """Share of the largest return by which returns differ that are not to be told apart."""
 _ROUND = (2, 20)
 """Smallest and greatest radius of rounds, and how far they are above things at most: what a tool goes in one action is
 1."""
-
-
-@dataclass(frozen=True, eq=False)
-class Ask:
-    """Trajectories to play."""
-
-    encoding: Encoding
-    points: Tensor
-    """Numbers of the way-points [m], shape (P, size)."""
-    graded: bool = False
-    """Whether the slope of the loss is wanted."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +38,8 @@ class Told:
     failed: Tensor
     """Whether the episode broke down, bool [-], shape (P,)."""
     slope: Tensor
-    """Slope of the loss [1/m], zero where there is no number, shape (P, size), or (P, 0) if not asked for."""
+    """Slope of the loss [1/m], zero where there is no number and where it was not asked for, shape (P, size); (P, 0) if
+    it was asked for nowhere."""
 
     @property
     def value(self) -> Tensor:
@@ -65,6 +55,25 @@ class Told:
     def cat(cls, parts: Sequence[Told]) -> Told:
         """Return how the trajectories of all parts went."""
         return cls(*(torch.cat([getattr(part, f.name) for part in parts]) for f in dataclasses.fields(cls)))
+
+
+def best(told: Told, count: int) -> Tensor:
+    """Return the indices of the best, shape (count,) or, if there are fewer, (P,)."""
+    return ranking(told.value, told.loss)[:count]
+
+
+@dataclass(frozen=True, eq=False)
+class Ask:
+    """Trajectories to play."""
+
+    encoding: Encoding
+    points: Tensor
+    """Numbers of the way-points [m], shape (P, size)."""
+    graded: int = 0
+    """How many slopes of the loss are wanted."""
+    pick: Callable[[Told, int], Tensor] = best
+    """Returns which ones, `graded` indices, from how all went. A slope costs several times what playing does: those of
+    a part are had by playing that part once more."""
 
 
 Search = Generator[Ask, Told, None]
@@ -127,7 +136,7 @@ class Rehearsed:
     def note(self, actions: Tensor, told: Told) -> None:
         """Keep the best of an iteration; actions (P, T A) [m]."""
         each = math.ceil(self.plan.population / self.plan.rehearsals)
-        self.parts.append(actions[ranking(told.value, told.loss)[:each]])
+        self.parts.append(actions[best(told, each)])
 
     @property
     def actions(self) -> Tensor:

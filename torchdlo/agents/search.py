@@ -17,7 +17,7 @@ from torchdlo.agents.descent import descent
 from torchdlo.agents.hybrid import hybrid
 from torchdlo.agents.journal import Journal
 from torchdlo.agents.plan import Ask, Plan, Search, Told, handed
-from torchdlo.agents.problem import Outcome, Problem
+from torchdlo.agents.problem import Encoding, Outcome, Problem
 from torchdlo.errors import InputError
 
 __all__ = ["METHODS", "Found", "Robust", "Settings", "optimize"]
@@ -65,7 +65,7 @@ class Settings:
 
     method: str = "cmaes"
     episodes: int = 20_000
-    """Budget; an episode that is played with gradient counts as one."""
+    """Budget; an episode counts once, whether its slope is had or not."""
     population: int = 400
     seed: int = 0
     hold: int | None = None
@@ -162,11 +162,10 @@ def optimize(
     try:
         for k in range(plan.iterations):
             ask = search.send(told)
-            if k + 1 == plan.iterations:
-                ask = replace(ask, graded=False)  # nothing is told of it
             scale = robust.scale((k + 1) / plan.iterations) if robust else 0.0
             rehearses = k < plan.rehearsals
-            told = player.batch(ask, scale, stand_in if rehearses else problem)
+            last = k + 1 == plan.iterations  # nothing is told of it
+            told = player.batch(ask, scale, stand_in if rehearses else problem, slopes=not last)
             if k == plan.rehearsals > 0:
                 best.clear()  # what did well in a rehearsal has to do so in earnest
                 player.highest = float(told.returns.max())
@@ -282,17 +281,26 @@ class _Player:
         self.problem, self.settings, self.journal = problem, settings, journal
         self.callback = callback or (lambda *_: None)
         self.done, self.seconds, self.blind, self.highest = 0, 0.0, 0, -math.inf
+        self._copies = settings.robust.copies if settings.robust else 1
 
     def _worlds(self, copies: int, scale: float, number: int) -> Problem:
         return self.problem.varied(copies, scale, self.settings.seed * 1_000_003 + number)
 
-    def batch(self, ask: Ask, scale: float, problem: Problem) -> Told:
-        """Play what is asked for in a problem or its rehearsal, in chunks."""
-        robust, copies = self.settings.robust, 1
-        if robust:
-            copies = robust.copies
-            problem = self._worlds(copies, scale, 1)
-        parts = [self._chunk(problem, ask, x, copies) for x in ask.points.split(max(1, self.settings.chunk // copies))]
+    def batch(self, ask: Ask, scale: float, problem: Problem, slopes: bool) -> Told:
+        """Play what is asked for in a problem or its rehearsal, and what needs slopes once more if not all do."""
+        if self.settings.robust:
+            problem = self._worlds(self._copies, scale, 1)
+        if not slopes or not 0 < ask.graded < len(ask.points):
+            return self._told(problem, ask, slopes and ask.graded > 0)
+        told = self._told(problem, ask, False)
+        rows, slope = ask.pick(told, ask.graded), torch.zeros_like(ask.points)
+        slope[rows] = self._told(problem, replace(ask, points=ask.points[rows]), True, again=True).slope
+        return replace(told, slope=slope)
+
+    def _told(self, problem: Problem, ask: Ask, graded: bool, again: bool = False) -> Told:
+        """Play trajectories in chunks; all of about one size, as steps are compiled for each."""
+        room = min(max(1, self.settings.chunk // self._copies), ask.graded or len(ask.points))
+        parts = [self._chunk(problem, ask.encoding, x, graded, again) for x in ask.points.split(room)]
         columns = zip(*parts, strict=True)
         returns, loss, short, success, failed, slope = (torch.cat(column) for column in columns)
         good = torch.isfinite(slope).all(-1)
@@ -302,15 +310,17 @@ class _Player:
         loss = torch.where(torch.isfinite(loss) & ~failed, loss, math.inf)
         return Told(returns, loss, short.nan_to_num(), success, failed, torch.where(good[:, None], slope, 0.0))
 
-    def _chunk(self, problem: Problem, ask: Ask, points: Tensor, copies: int) -> tuple[Tensor, ...]:
+    def _chunk(
+        self, problem: Problem, encoding: Encoding, points: Tensor, graded: bool, again: bool
+    ) -> tuple[Tensor, ...]:
         names = ("returns", "loss", "shortfall", "success", "failed", "slope")
         kept = self.journal.recall(points)
         if kept is None:
             began = time.perf_counter()
-            kept = dict(zip(names, _play(problem, ask, points), strict=True))
+            kept = dict(zip(names, _play(problem, encoding, points, graded), strict=True))
             kept["seconds"] = time.perf_counter() - began
             self.journal.keep(points, kept)
-        self.done += len(points) * copies
+        self.done += 0 if again else len(points) * self._copies
         self.seconds += kept["seconds"]
         self.highest = max([self.highest, *kept["returns"][torch.isfinite(kept["returns"])].tolist()])
         self.callback("optimize", self.done, self.settings.episodes, f"best {self.highest:.4g}")
@@ -332,13 +342,13 @@ class _Player:
         return sorted(seen, key=lambda f: f.rank, reverse=True)
 
 
-def _play(problem: Problem, ask: Ask, points: Tensor) -> tuple[Tensor, ...]:
+def _play(problem: Problem, encoding: Encoding, points: Tensor, graded: bool) -> tuple[Tensor, ...]:
     """Return returns, losses, successes, failures and slopes, on the CPU."""
-    x = points.detach().clone().requires_grad_(ask.graded)
-    with torch.set_grad_enabled(ask.graded):
-        outcome = problem.evaluate(ask.encoding.decode(x))
+    x = points.detach().clone().requires_grad_(graded)
+    with torch.set_grad_enabled(graded):
+        outcome = problem.evaluate(encoding.decode(x))
         slope = x.new_zeros(len(x), 0)
-        if ask.graded:
+        if graded:
             # Trajectories do not touch each other, so that the slope of the sum is that of each.
             (slope,) = torch.autograd.grad(outcome.loss.sum(), x, allow_unused=True, materialize_grads=True)
     numbers = (x.double() for x in (outcome.returns, outcome.loss, outcome.shortfall))

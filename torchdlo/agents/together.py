@@ -131,23 +131,19 @@ class _Known(torch.autograd.Function):
 
 def _play(problem: Problem, wishes: Sequence[_Wish], room: int) -> None:
     """Answer wishes: trajectories that are to be recorded one by one, all others in batches."""
-    shared = [wish for wish in wishes if wish.actions.dim() == 3]
     for wish in wishes:
         if wish.actions.dim() == 2:
             with torch.no_grad():
                 wish.answer.set_result(problem.record(wish.actions))
-    if not shared:
-        return
-    graded = any(wish.actions.requires_grad for wish in shared)
-    parts = [
-        _batch(problem, part, room, graded) for part in torch.cat([w.actions.detach() for w in shared]).split(room)
-    ]
-    columns = [torch.cat(column) for column in zip(*parts, strict=True)]
-    sizes = [len(wish.actions) for wish in shared]
-    for wish, (*outcome, slope) in zip(
-        shared, zip(*(column.split(sizes) for column in columns), strict=True), strict=True
-    ):
-        wish.answer.set_result((Outcome(*outcome), slope if wish.actions.requires_grad else None))
+    for graded in (False, True):
+        alike = [wish for wish in wishes if wish.actions.dim() == 3 and wish.actions.requires_grad == graded]
+        if not alike:
+            continue
+        actions, sizes = torch.cat([wish.actions.detach() for wish in alike]), [len(wish.actions) for wish in alike]
+        parts = [_batch(problem, part, room, graded) for part in actions.split(room)]
+        columns = [torch.cat(column).split(sizes) for column in zip(*parts, strict=True)]
+        for wish, (*outcome, slope) in zip(alike, zip(*columns, strict=True), strict=True):
+            wish.answer.set_result((Outcome(*outcome), slope if graded else None))
 
 
 def _batch(problem: Problem, actions: Tensor, room: int, graded: bool) -> tuple[Tensor, ...]:
