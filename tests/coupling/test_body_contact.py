@@ -233,6 +233,33 @@ def test_gradients_know_that_bodies_at_rest_are_held_by_friction(shape: str, ker
     assert slopes[:2, :2].abs().max() < (0.8 if shape == "sphere" else 1e-3)
 
 
+@pytest.mark.parametrize("kernel", [True, False])
+def test_gradients_hold_where_rounds_have_not_found_the_slip(kernel: bool, monkeypatch) -> None:
+    # A box slides and spins on the ground, hit by a ball that turns fast: six rounds are too few for both.
+    rub = {"mu_s": 0.6, "mu_k": 0.5, "density": 120.0}
+    solids = [ground(**rub), Solid("box", (0.03, 0.03, 0.03), (0.0, 0.0, 0.03), **rub)]
+    solids += [Solid("sphere", 0.03, (0.0, -0.0599, 0.035), **rub)]
+    kinds, params, state = place(solids, torch.zeros(1, dtype=F64))
+    if not kernel:
+        monkeypatch.setattr(body_pairs, "fits", lambda _: False)
+    gravity = torch.tensor([[0.0, 0.0, -G]], dtype=F64)
+
+    def speeds(x: torch.Tensor) -> torch.Tensor:
+        """Return velocities and turn rates (2, 6) after a substep, from those at first."""
+        begun = tree.replace(
+            state, vel=torch.cat([x.new_zeros(1, 3), x[:, :3]]), omega=torch.cat([x.new_zeros(1, 3), x[:, 3:]])
+        )
+        end = move(kinds, params, begun, 1, 1e-3, gravity, BodyContact(steps=6))
+        return torch.cat([end.vel[1:], end.omega[1:]], -1)
+
+    x = torch.tensor([[0.8, 0.3, -0.01, 0.1, 0.2, 8.0], [0.3, 0.7, -0.02, -30.0, 3.0, 2.0]], dtype=F64)
+    slopes = torch.autograd.functional.jacobian(speeds, x).flatten(2).flatten(0, 1)
+    with torch.no_grad():
+        steps = 1e-7 * torch.eye(12, dtype=F64).unflatten(-1, (2, 6))
+        differences = torch.stack([(speeds(x + h) - speeds(x - h)).flatten() / 2e-7 for h in steps], -1)
+    torch.testing.assert_close(slopes, differences, atol=2e-3, rtol=1e-3)
+
+
 def test_single_precision_stands_too() -> None:
     stack = [ground(), box(), box((0.0, 0.0, 3 * R))]
     _, start, end = run(stack, 0.5, 5e-3, dtype=torch.float32, pairs=((0, 1), (1, 2)))

@@ -91,10 +91,11 @@ def test_the_kernel_and_tensor_operations_agree_with_their_gradients(case: str, 
     assert int((wanted.abs().amax((-1, -2)) > 0).sum()) >= 3  # scenes with contact
     assert float((found - wanted).norm()) < 1e-9 * float(wanted.norm())
     # Derivatives answer to rounding as the stiffness of contact makes them: the scale is what the tensor operations
-    # themselves find when their inputs are rounded otherwise, by the last bit.
+    # themselves find when their inputs are rounded otherwise, by the last bit. Whether a step is worth taking that
+    # changes next to nothing is a matter of rounding, too.
     _, rounded = answered(solids, contact, 2**-52)
     for one, other, near in zip(gradient, expected, rounded, strict=True):
-        noise = float((near - other).norm()) + 1e-12 * float(other.norm())
+        noise = float((near - other).norm()) + 1e-10 * float(other.norm())
         assert float((one - other).norm()) <= 30 * noise
 
 

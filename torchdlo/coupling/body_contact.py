@@ -11,8 +11,10 @@ Per substep, on a fixed number of points of each pair of bodies (see `balls`):
     scene are coupled through one linear system of six unknowns per body, so that stacks stand at once and need no
     warm start. Rounds choose which contacts press and which stick; sliding friction is taken as resistance
     mu_k p / |s| meanwhile, which cannot overshoot.
-5.  One more step, with the exact slope, gives q its derivative by the implicit function theorem. Forces are those of
-    the contacts in the sets of the last round, none pulls and none rubs by more than Coulomb allows.
+5.  A step with the exact slope ends at the solution, as rounds may leave what slides a tenth of its friction away from
+    it; it is taken where that leaves less to do. One more gives q its derivative by the implicit function theorem.
+    Forces are those of the contacts in the sets of the last round, none pulls and none rubs by more than Coulomb
+    allows.
 6.  Rounds may end too early where many edges hit at once. Forces that would add energy are dropped then, and contacts
     press in proportion to how fast they approach, as much as fits in the mean: safe, but they may overlap a little.
 
@@ -178,6 +180,21 @@ def _settled(system: System, dt: float, slowest: float, rounds: int) -> tuple[_S
     return sets, q
 
 
+def _exact(system: System, sets: _Sets, q: Tensor) -> tuple[_Sets, Tensor]:
+    """Return the sets with the slip, and the slopes (..., C, 3, 3) of forces, at displacements q (..., F, 6)."""
+    links, moved = system.links, system.moved(q)
+    load = (links.stiff * sets.press * (links.wanted - dot(links.normal, moved))).clamp(min=0.0)
+    size, slip = _slip(links, moved)
+    sets = dataclasses.replace(sets, slip=slip)
+    return sets, _slopes(links, sets, load, size)
+
+
+def _excess(system: System, sets: _Sets, q: Tensor) -> Tensor:
+    """Return what contacts exert on the free bodies beyond what displaces them by q, shape (..., F, 6)."""
+    force = _forces(system.links, sets, system.moved(q))
+    return system.load(force) - (system.inertia @ q.unsqueeze(-1)).squeeze(-1)
+
+
 def _detached(links: Links) -> Links:
     found = {f.name: getattr(links, f.name) for f in dataclasses.fields(links)}
     return Links(**{k: tree.detach(v) if isinstance(v, Tensor) or k == "arms" else v for k, v in found.items()})
@@ -194,11 +211,14 @@ def resolve(contact: BodyContact, motion: BodyMotion) -> tuple[Tensor, Tensor]:
     with torch.no_grad():
         plain = System(_detached(links), free, system.inertia.detach())
         sets, q = _settled(plain, motion.dt, contact.slowest, contact.steps)
-        moved = plain.moved(q)
-        load = (plain.links.stiff * sets.press * (plain.links.wanted - dot(plain.links.normal, moved))).clamp(min=0.0)
-        slopes = _slopes(plain.links, sets, load, _slip(plain.links, moved)[0])
-    excess = system.load(_forces(links, sets, system.moved(q))) - (system.inertia @ q.unsqueeze(-1)).squeeze(-1)
-    q = q + plain.solve(slopes, excess)
+        sets, slopes = _exact(plain, sets, q)
+        excess = _excess(plain, sets, q)
+        ahead = q + plain.solve(slopes, excess)
+        resisted = plain.inertia.diagonal(dim1=-2, dim2=-1)
+        off, left = ((x.square() / resisted).sum((-1, -2), keepdim=True) for x in (excess, _excess(plain, sets, ahead)))
+        q = torch.where(left < off, ahead, q)
+        sets, slopes = _exact(plain, sets, q)
+    q = q + plain.solve(slopes, _excess(system, sets, q))
     force = _forces(links, sets, system.moved(q))
     # Where rounds ended before contacts were found, all press along their normals, by as much as fits at best.
     simple = (links.wanted - dot(links.normal, links.free)).clamp(min=0.0) * links.stiff / HARD * links.normal

@@ -200,9 +200,57 @@ struct Block : Linked<T> {
     }
     if (!near) return false;
     settle();
-    const std::vector<V> found = moved(links, constants<0>(motion));
-    assemble(&found);
+    // Rounds may leave what slides off the solution, and derivatives hold there only.
+    linearize();
+    std::vector<P> more = excess<0>(bodies, links, constants<0>(motion));
+    std::vector<L> ahead(system.n);
+    for (int i = 0; i < system.n; ++i) ahead[i] = more[i].x;
+    system.solve(ahead);
+    for (int i = 0; i < system.n; ++i) ahead[i] += motion[i];
+    const auto better = weight(excess<0>(bodies, links, constants<0>(ahead))) < weight(more);
+    for (int i = 0; i < system.n; ++i) motion[i] = better ? ahead[i] : motion[i];
+    linearize();
     return true;
+  }
+  // How much is left to do, (forces and torques)^2 over what resists them.
+  L weight(const std::vector<P>& more) const {
+    L sum{};
+    for (int k = 0; k < n.bodies; ++k)
+      for (int i = 0; n.free[k] >= 0 && i < 3; ++i) {
+        const V unit = {P(T(i == 0)), P(T(i == 1)), P(T(i == 2))};
+        const L force = more[6 * n.free[k] + i].x, torque = more[6 * n.free[k] + 3 + i].x;
+        sum += force * force * bodies[k].mobility.x + torque * torque / dot(unit, bodies[k].resisted(unit)).x;
+      }
+    return sum;
+  }
+  // Puts together the exact matrix at the displacements that were found.
+  void linearize() {
+    const std::vector<V> found = moved(links, constants<0>(motion));
+    for (size_t c = 0; c < links.size(); ++c)
+      if (active[owner[c]]) slip(links[c], int(c), found[c], sets[c].slip);
+    assemble(&found);
+  }
+
+  // What contacts exert at displacements of free bodies, and what that is beyond what displaces them so.
+  template <int N>
+  std::vector<Three<T, N>> pressed(const std::vector<Link<T, N>>& l, const std::vector<Num<T, N>>& q) const {
+    const std::vector<Three<T, N>> m = moved(l, q);
+    std::vector<Three<T, N>> f(l.size());
+    for (size_t c = 0; c < l.size(); ++c)
+      if (active[owner[c]]) f[c] = this->force(l[c], int(c), m[c]);
+    return f;
+  }
+  template <int N>
+  std::vector<Num<T, N>> excess(const Bodies<N>& b, const std::vector<Link<T, N>>& l,
+                                const std::vector<Num<T, N>>& q) const {
+    std::vector<Num<T, N>> more = gathered(this->exerted(l, pressed(l, q)));
+    for (int k = 0; k < n.bodies; ++k) {
+      if (n.free[k] < 0) continue;
+      const Wrench<T, N>& w = *(const Wrench<T, N>*)&q[6 * n.free[k]];
+      const Three<T, N> back[2] = {w.force * (Num<T, N>(T(1)) / b[k].mobility), b[k].resisted(w.torque)};
+      for (int i = 0; i < 6; ++i) more[6 * n.free[k] + i] = more[6 * n.free[k] + i] - back[i / 3][i % 3];
+    }
+    return more;
   }
 
   struct Unknowns {  // where they stand on the tape
@@ -218,26 +266,13 @@ struct Block : Linked<T> {
   Wrenches<N> finish(const Bodies<N>& b, const std::vector<Touch<T, N>>& contacts) {
     typedef Num<T, N> S;
     const std::vector<Link<T, N>> l = this->template link<N>(b, contacts);
-    const auto pressed = [&](const std::vector<S>& q) {
-      const std::vector<Three<T, N>> m = moved(l, q);
-      std::vector<Three<T, N>> f(l.size());
-      for (size_t c = 0; c < l.size(); ++c)
-        if (active[owner[c]]) f[c] = this->force(l[c], int(c), m[c]);
-      return f;
-    };
-    std::vector<S> q = constants<N>(motion), excess = gathered(this->exerted(l, pressed(q)));
-    for (int k = 0; k < n.bodies; ++k) {
-      if (n.free[k] < 0) continue;
-      const Wrench<T, N>& w = *(const Wrench<T, N>*)&q[6 * n.free[k]];
-      const Three<T, N> back[2] = {w.force * (S(T(1)) / b[k].mobility), b[k].resisted(w.torque)};
-      for (int i = 0; i < 6; ++i) excess[6 * n.free[k] + i] = excess[6 * n.free[k] + i] - back[i / 3][i % 3];
-    }
+    std::vector<S> q = constants<N>(motion), more = excess(b, l, q);
     std::vector<L> change(system.n);
-    for (int i = 0; i < system.n; ++i) change[i] = excess[i].x;
+    for (int i = 0; i < system.n; ++i) change[i] = more[i].x;
     system.solve(change);
     for (int i = 0; i < system.n; ++i) q[i] = S::variable(motion[i] + change[i], 0);
-    if constexpr (N == TAPED) last() = {excess, q};
-    std::vector<Three<T, N>> f = pressed(q);
+    if constexpr (N == TAPED) last() = {more, q};
+    std::vector<Three<T, N>> f = pressed(l, q);
     std::vector<V> plain(f.size());
     for (size_t c = 0; c < f.size(); ++c) plain[c] = {P(f[c].x.x), P(f[c].y.x), P(f[c].z.x)};
     const auto good = this->template fitting<0>(bodies, links, plain).x > T(1 - FIT);
