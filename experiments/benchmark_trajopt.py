@@ -1,7 +1,7 @@
 """Trajectory optimisation of the tasks: tasks by methods by seeds, beside published returns.
 
 All searches of a task run at the same time and share their batches, so that their seconds are shared ones; the best
-trajectories are played alone in the end, and returns are those. An episode that is played with gradient counts as one.
+trajectories are played alone in the end, and returns are those. An episode counts once, with its slope or without.
 Every search keeps a journal, so that a benchmark that was stopped goes on where it was; finished ones are read. Those
 of another version of the program or of libraries are marked with a star in the table, and run anew with --again. With
 --minutes, searches end with what they found by then; without it, the same command goes on with them.

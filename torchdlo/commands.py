@@ -164,7 +164,7 @@ def optimize(
         typer.Option(help="CMA-ES, gradient descent, or both with a search for contact.", metavar="cmaes|gd|hybrid"),
     ] = "hybrid",
     episodes: Annotated[
-        int | None, typer.Option(min=1, help="Budget; an episode played with gradient counts as one.")
+        int | None, typer.Option(min=1, help="Budget; an episode counts once, with its slope or without.")
     ] = None,
     population: Annotated[int | None, typer.Option(min=1, help="Trajectories per iteration.")] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the search.")] = 0,
