@@ -4,7 +4,11 @@ All searches of a task run at the same time and share their batches, so that the
 trajectories are played alone in the end, and returns are those. An episode counts once, with its slope or without.
 Every search keeps a journal, so that a benchmark that was stopped goes on where it was; finished ones are read. Those
 of another version of the program or of libraries are marked with a star in the table, and run anew with --again. With
---minutes, searches end with what they found by then; without it, the same command goes on with them.
+--minutes, searches end with what they found by then; without it, the same command goes on with them. With --report,
+nothing is run: the table is made of all that is finished in --out.
+
+The table says what the hybrid had seen after as many episodes as a method had, and what was published of the method;
+beside the hybrid stands published CMA-ES. Seconds are those of all seeds together, on one core.
 """
 
 from __future__ import annotations
@@ -28,6 +32,7 @@ from options import Parser, count, save
 EXAMPLES = """examples:
   python experiments/benchmark_trajopt.py --out runs/trajopt --jobs 2
   python experiments/benchmark_trajopt.py --tasks wiring_post --methods cmaes,hybrid --seeds 5 --episodes 2000
+  python experiments/benchmark_trajopt.py --report --out experiments/trajopt
 """
 
 SHARE = {"hybrid": 4}
@@ -215,10 +220,25 @@ def side_by_side(args: Any) -> None:
             raise
 
 
-def row(task: str, method: str, runs: list[dict[str, Any]]) -> dict[str, Any]:
-    """One row of the table: mean and spread over the seeds."""
-    from torchdlo.agents.presets import PUBLISHED
+def finished(task: str, method: str, out: Path) -> list[dict[str, Any]]:
+    """All results of a task by a method that are there, of any settings, by seed."""
+    found = [json.loads(file.read_text()) for file in out.glob(f"{task}-{method}-*/result.json")]
+    return sorted(found, key=lambda run: run["settings"]["seed"])
 
+
+def seen(runs: list[dict[str, Any]], episodes: float) -> float | None:
+    """Largest return that searches had seen after so many episodes, mean over the seeds; None before the first."""
+    sofar = [[p["best"] for p in run["curve"] if p["episodes"] <= episodes and p["best"] is not None] for run in runs]
+    return statistics.mean(max(best) for best in sofar) if sofar and all(sofar) else None
+
+
+def row(task: str, method: str, runs: list[dict[str, Any]], hybrid: list[dict[str, Any]]) -> dict[str, Any]:
+    """One row of the table: mean and spread over the seeds, and what the hybrid saw of the same task."""
+    from torchdlo.agents.presets import PUBLISHED, preset
+
+    known = "cmaes" if method == "hybrid" else method
+    goal, solved = PUBLISHED.get(task, {}).get(known, (None, None))
+    episodes = statistics.mean(r["episodes"] for r in runs)
     returns = [r["return"] for r in runs if r["return"] is not None]
     return {
         "task": task,
@@ -230,9 +250,12 @@ def row(task: str, method: str, runs: list[dict[str, Any]]) -> dict[str, Any]:
         "highest": max(returns, default=None),
         # Published returns are the largest that a search saw.
         "seen": statistics.mean(r["highest"] for r in runs),
-        "published": PUBLISHED.get(task, {}).get(method),
+        "hybrid": seen(hybrid, episodes),
+        "published": goal,
+        "published_success": solved,
+        "published_episodes": None if goal is None else preset(task, known).episodes,
         "success": statistics.mean(float(r["success"]) for r in runs),
-        "episodes": statistics.mean(r["episodes"] for r in runs),
+        "episodes": episodes,
         "solved_after": [r["solved_after"] for r in runs],
         "seconds": statistics.mean(r["seconds"] for r in runs),
         "earlier": any(earlier(r) for r in runs),
@@ -242,18 +265,22 @@ def row(task: str, method: str, runs: list[dict[str, Any]]) -> dict[str, Any]:
 def table(rows: list[dict[str, Any]]) -> str:
     """The rows as a table of Markdown."""
     lines = [
-        "| task | method | seeds | return | spread | largest seen | published | success | episodes | seconds |",
-        "|---|---|---|---|---|---|---|---|---|---|",
+        "| task | method | seeds | return | spread | largest | hybrid | success | episodes | seconds | published |",
+        "|---|---|---|---|---|---|---|---|---|---|---|",
     ]
     for r in rows:
+        beside = ""
+        if r["published"] is not None:
+            beside = f"{r['published']:.2f}, {r['published_success']:.0%} after {r['published_episodes']}"
         cells = [
             r["task"],
             r["method"],
             f"{r['seeds']}{'*' * r['earlier']}",
-            *("" if r[k] is None else f"{r[k]:.2f}" for k in ("return", "spread", "seen", "published")),
+            *("" if r[k] is None else f"{r[k]:.2f}" for k in ("return", "spread", "seen", "hybrid")),
             f"{r['success']:.0%}",
             f"{r['episodes']:.0f}",
             f"{r['seconds']:.0f}",
+            beside,
         ]
         lines.append(f"| {' | '.join(cells)} |")
     if any(r["earlier"] for r in rows):
@@ -266,7 +293,7 @@ def report(runs: dict[tuple[str, str], list[dict[str, Any]]], args: Any) -> None
     from torchdlo.files import write_atomically
     from torchdlo.report.learning import learning_png
 
-    rows = [row(task, method, found) for (task, method), found in runs.items()]
+    rows = [row(task, method, found, runs.get((task, "hybrid"), [])) for (task, method), found in runs.items()]
     out, text = Path(args.out), table(rows)
     save(str(out / "benchmark.json"), {"generator": "torchdlo benchmark_trajopt", "rows": rows})
     write_atomically(out / "benchmark.md", text)
@@ -298,6 +325,7 @@ def arguments(words: list[str] | None = None) -> Any:
     parser.add_argument("--minutes", type=float, help="time for the searches of a task; default: as long as it takes")
     parser.add_argument("--out", default="runs/trajopt", help="folder; default: runs/trajopt")
     parser.flag("again", "run anew what was found by another version of the program or of libraries")
+    parser.flag("report", "run nothing; show what is finished in --out, whatever its settings")
     parser.flag("double", "physics in double precision")
     parser.flag("quiet", "search only; no table")
     parser.flag("smoke", "one iteration of each method on short episodes with uncompiled steps")
@@ -322,6 +350,13 @@ def main() -> None:
     if args.smoke:
         shorten()
     runs: dict[tuple[str, str], list[dict[str, Any]]] = {}
+    if args.report:
+        every = {(task, m): finished(task, m, Path(args.out)) for task in args.tasks for m in args.methods}
+        runs = {key: found for key, found in every.items() if found}
+        if not runs:
+            sys.exit(f"error: {args.out}: expected finished searches of these tasks and methods, found none.")
+        report(runs, args)
+        return
     try:
         if args.jobs > 1:
             side_by_side(args)

@@ -47,8 +47,8 @@ def test_the_benchmark_writes_its_table_and_reads_finished_runs(tmp_path: Path) 
     result.write_text(json.dumps(content | {"return": 0.25, "program": "another", "settings": fewer}))
     marked = call(*words).stdout
     assert "| wiring_post | cmaes | 1* | 0.25 |" in marked and "another version of the program" in marked
-    # All but the seconds, the last column, is as it was.
-    again, first = (text.rsplit("|", 2)[0] for text in (call(*words, "--again").stdout, done.stdout))
+    # All but the seconds, the last column but one, is as it was.
+    again, first = (text.rsplit("|", 3)[0] for text in (call(*words, "--again").stdout, done.stdout))
     assert again == first
     # What was stopped with other settings is not gone on with.
     result.unlink()
@@ -62,7 +62,7 @@ def test_the_benchmark_writes_its_table_and_reads_finished_runs(tmp_path: Path) 
     # What ended early counts where time is limited, and is gone on with where it is not.
     result.write_text(json.dumps(content | {"return": 0.25, "interrupted": True}))
     assert "| wiring_post | cmaes | 1 | 0.25 |" in call(*words, "--minutes", "60").stdout
-    assert call(*words).stdout.rsplit("|", 2)[0] == first
+    assert call(*words).stdout.rsplit("|", 3)[0] == first
 
 
 def test_a_search_ends_when_time_is_over_and_keeps_what_it_has(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -81,6 +81,38 @@ def test_a_search_ends_when_time_is_over_and_keeps_what_it_has(tmp_path: Path, m
     case.search(Push(), lambda *_: None, lambda: False)
     found = json.loads(case.result.read_text())
     assert not found["interrupted"] and found["episodes"] == 80 and len(found["curve"]) == 10
+
+
+def test_a_report_shows_what_is_finished_beside_the_hybrid_at_as_many_episodes(tmp_path: Path) -> None:
+    def finish(method: str, seed: int, best: dict[int, float]) -> None:
+        curve = [{"episodes": n, "best": value} for n, value in best.items()]
+        found = {
+            "task": "lifting",
+            "return": max(best.values()),
+            "highest": max(best.values()),
+            "success": seed == 0,
+            "episodes": max(best),
+            "seconds": 1.0,
+            "solved_after": None,
+            "settings": {"seed": seed, "episodes": max(best)},
+            "program": "another",
+            "curve": [point | {"median": 0.0} for point in curve],
+        }
+        folder = tmp_path / f"lifting-{method}-{seed}"
+        folder.mkdir()
+        (folder / "result.json").write_text(json.dumps(found))
+
+    for seed in (0, 1):
+        finish("gd", seed, {10: 249.0, 20: 250.0})
+        finish("hybrid", seed, {10: 251.0, 20: 252.0 + seed, 30: 340.0})
+    done = call("--report", "--tasks", "lifting,coiling", "--out", tmp_path)
+    assert done.returncode == 0, done.stderr
+    descent, hybrid = json.loads((tmp_path / "benchmark.json").read_text())["rows"]
+    assert (descent["method"], descent["episodes"], descent["return"], descent["hybrid"]) == ("gd", 20, 250.0, 252.5)
+    assert (hybrid["method"], hybrid["episodes"], hybrid["hybrid"], hybrid["success"]) == ("hybrid", 30, 340.0, 0.5)
+    assert "| 255.55, 0% after 10000 |" in done.stdout and "| 335.59, 87% after 10000 |" in done.stdout
+    nothing = call("--report", "--out", tmp_path / "elsewhere")
+    assert nothing.returncode == 1 and "elsewhere: expected finished searches" in nothing.stderr
 
 
 def test_unknown_names_are_refused() -> None:

@@ -185,4 +185,4 @@ def test_presets_are_the_published_settings() -> None:
     plan = preset("coiling", "cmaes").plan(problem("coiling"))
     assert plan.encoding(plan.hold).knots == 10 and plan.encoding(plan.hold).reach == pytest.approx(0.1)
     assert plan.rate == 1e-3 and plan.last == pytest.approx(1e-6)
-    assert all(row["cmaes"] >= row["gd"] for name, row in PUBLISHED.items() if name != "separation")
+    assert all(row["cmaes"][0] >= row["gd"][0] for name, row in PUBLISHED.items() if name != "separation")
