@@ -5,14 +5,22 @@
 #include <cstring>
 #include <vector>
 
+// As many numbers as a register holds: compilers take comparisons of longer vectors apart, number by number.
+#if defined(__AVX512F__)
+#define LANES_BYTES 64
+#elif defined(__AVX__)
+#define LANES_BYTES 32
+#else
+#define LANES_BYTES 16
+#endif
 template <typename T>
 struct Pack {
-  typedef T type __attribute__((vector_size(64)));
+  typedef T type __attribute__((vector_size(LANES_BYTES)));
 };
 template <typename T>
 using Lanes = typename Pack<T>::type;
 template <typename T>
-constexpr int WIDTH = 64 / sizeof(T);
+constexpr int WIDTH = LANES_BYTES / sizeof(T);
 
 template <typename T>
 static inline Lanes<T> load(const T* from, int64_t count) {
@@ -57,9 +65,9 @@ static inline Lanes<T> root(const Lanes<T>& x) {
 // Whether a comparison holds in any lane.
 template <typename M>
 static inline bool any(const M& mask) {
-  int64_t part[8], whole = 0;
+  int64_t part[sizeof(M) / 8], whole = 0;
   std::memcpy(part, &mask, sizeof(part));
-  for (int i = 0; i < 8; ++i) whole |= part[i];
+  for (const int64_t x : part) whole |= x;
   return whole != 0;
 }
 
