@@ -159,6 +159,22 @@ NUM probe(int shape, const Grid<T>& grid, const Num<T, N>* size, const Num<T, N>
   }
 }
 
+// Radius of a ball about the origin that holds a shape; planes have none.
+template <typename T>
+static Lanes<T> bounding(int shape, const Lanes<T>* size) {
+  switch (shape) {
+    case SPHERE:
+      return size[0];
+    case BOX:
+    case MESH:
+      return root<T>(size[0] * size[0] + size[1] * size[1] + size[2] * size[2]);
+    case CYLINDER:
+      return root<T>(size[0] * size[0] + size[1] * size[1]);
+    default:  // capsules, cones, and what is round
+      return size[0] + size[1];
+  }
+}
+
 template <typename T, int N>
 struct Line {
   int shape;
@@ -190,6 +206,10 @@ struct Line {
   Num<T, N> slope(const Num<T, N>& share, T middle) const {
     Num<T, N> n[3];
     at(share, n);
+    return rise(share, n, middle);
+  }
+  // The same where the normal is known.
+  Num<T, N> rise(const Num<T, N>& share, const Num<T, N>* n, T middle) const {
     const Num<T, N> pull(PULL), half(middle);
     return n[0] * edge[0] + n[1] * edge[1] + n[2] * edge[2] + pull * length * (share - half);
   }
@@ -202,36 +222,43 @@ struct Found {
   Lanes<T> share, steep, left, right;
 };
 
+// Whether the distance from a shape is convex, so that slopes alone tell where it is least.
+static inline bool convex(int shape) { return shape != TORUS && shape != RING && shape != MESH; }
+
 // See `_nearest` in edge_points.py.
 template <typename T>
 static Found<T> nearest(const Line<T, 0>& line, T low, T high) {
   typedef Lanes<T> L;
   typedef Num<T, 0> S;
   const int places = 8;
-  const T middle = T(0.5) * (low + high), part = (high - low) / places, step = sizeof(T) == 8 ? T(1e-4) : T(2e-3);
-  const L pull = Line<T, 0>::PULL * line.length.x;
-  L best{}, least{};
-  S n[3];
-  for (int k = 0; k <= places; ++k) {
-    const T share = low + part * k;
-    const L value = line.at(S(share), n).x + T(0.5) * pull * ((share - middle) * (share - middle));
-    const auto better = k == 0 ? value == value : value < least;
-    least = better ? value : least;
-    best = better ? L{} + share : best;
+  const T middle = T(0.5) * (low + high), step = sizeof(T) == 8 ? T(1e-4) : T(2e-3);
+  const L pull = Line<T, 0>::PULL * line.length.x, floor = pull > TINY<T> ? pull : L{} + TINY<T>;
+  L left = L{} + low, right = L{} + high;
+  if (!convex(line.shape)) {
+    const T part = (high - low) / places;
+    L best = left, least{}, rise{};
+    S n[3];
+    for (int k = 0; k <= places; ++k) {
+      const T share = low + part * k;
+      const L value = line.at(S(share), n).x + T(0.5) * pull * ((share - middle) * (share - middle));
+      const auto better = k == 0 ? value == value : value < least;
+      least = better ? value : least;
+      best = better ? L{} + share : best;
+      rise = better ? line.rise(S(share), n, middle).x : rise;
+    }
+    const L before = best - part, after = best + part;
+    left = rise <= T(0) ? best : before > left ? before : left;
+    right = rise <= T(0) ? (after < right ? after : right) : best;
   }
-  const L lo = L{} + low, hi = L{} + high;
-  L left = best - part, right = best + part, falling{};
-  left = left > lo ? left : lo;
-  right = right < hi ? right : hi;
-  for (int k = 1; k < places; ++k)
-    falling += line.slope(S(left + (right - left) * T(k) / T(places)), middle).x <= T(0) ? L{} + T(1) : L{};
-  const L width = (right - left) / T(places);
-  left = left + width * falling;
-  right = left + width;
+  for (int k = convex(line.shape) ? 5 : 2; k--;) {
+    const L half = T(0.5) * (left + right);
+    const auto falling = line.slope(S(half), middle).x <= T(0);
+    left = falling ? half : left;
+    right = falling ? right : half;
+  }
   Found<T> f{T(0.5) * (left + right), L{}, left, right};
   for (int k = 0;; ++k) {
-    const L rise = line.slope(S(f.share + step), middle).x - line.slope(S(f.share - step), middle).x;
-    const L steep = rise / (2 * step), floor = pull > TINY<T> ? pull : L{} + TINY<T>;
+    const L steep = (line.slope(S(f.share + step), middle).x - line.slope(S(f.share - step), middle).x) / (2 * step);
     f.steep = steep > floor ? steep : floor;
     if (k == 2) return f;
     const L next = f.share - line.slope(S(f.share), middle).x / f.steep;

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -18,7 +19,9 @@ PULL = 0.01
 """Slope of the distance along an edge below which its nearest point is drawn to the middle: it makes that point unique
 on flat surfaces. From a surface of radius R it moves the point by less than PULL R / 2, the gap by PULL^2 R / 8."""
 PLACES = 8
-"""Parts into which a piece of an edge is cut, twice, before Newton's method finds its nearest point."""
+"""Parts into which a piece of an edge is cut where the distance from a shape may have several minima along it."""
+HALVES = 5
+"""How often a piece is halved, all in all, before Newton's method finds its nearest point."""
 NEWTON = 2
 """Steps of that method without graph."""
 
@@ -64,7 +67,11 @@ class _Line:
 
     def slope(self, share: Tensor, middle: float) -> Tensor:
         """Return the slope of the distance by the share, with the pull to the middle of a piece [m]."""
-        return dot(self.probe(share)[1], self.edge) + PULL * safe_norm(self.edge) * (share - middle)
+        return self.rise(self.probe(share)[1], share, middle)
+
+    def rise(self, normal: Tensor, share: Tensor, middle: float) -> Tensor:
+        """Return the same where the normal is known."""
+        return dot(normal, self.edge) + PULL * safe_norm(self.edge) * (share - middle)
 
     def still(self) -> _Line:
         """Return the edges without gradient history, with room for several shares in front of the vertex axis."""
@@ -75,28 +82,29 @@ class _Line:
 def _nearest(line: _Line, low: float, high: float) -> Tensor:
     """Return the share at which edges are nearest to a body (or deepest in it) between two shares, shape (..., V, 1).
 
-    The best of some places and the slopes around it enclose the nearest point, Newton's method finds it, and one more
-    step of it, with graph, gives it the derivative of the implicit function theorem.
+    Slopes enclose the nearest point, about the best of some places where the distance may have several minima; Newton's
+    method finds it, and one more step of it, with graph, gives it the derivative of the implicit function theorem.
     """
-    middle, part = 0.5 * (low + high), (high - low) / PLACES
+    middle = 0.5 * (low + high)
     step = 1e-4 if line.start.dtype == torch.float64 else 2e-3
     still = line.still()
     length = safe_norm(line.edge).detach()
-    node = torch.arange(PLACES + 1, dtype=length.dtype, device=length.device)[:, None, None]
 
     def newton(share: Tensor) -> tuple[Tensor, Tensor]:
-        before, here, after = still.slope(share.unsqueeze(-3) + step * (node[:3] - 1), middle).unbind(-3)
+        three = share.unsqueeze(-3) + step * torch.arange(-1, 2, dtype=share.dtype, device=share.device)[:, None, None]
+        before, here, after = still.slope(three, middle).unbind(-3)
         return here, torch.maximum((after - before) / (2 * step), PULL * length).clamp(min=tiny(length))
 
     with torch.no_grad():
-        share = low + part * node
-        pull = 0.5 * PULL * length.unsqueeze(-3) * (share - middle).square()
-        value = still.probe(share)[0] + pull
-        best = low + part * value.argmin(-3).to(value.dtype)
-        left, right = (best - part).clamp(min=low), (best + part).clamp(max=high)
-        share = left.unsqueeze(-3) + (right - left).unsqueeze(-3) * node[1:-1] / PLACES
-        falling = (still.slope(share, middle) <= 0).to(left.dtype).sum(-3)
-        left, right = (left + (right - left) * (falling + k) / PLACES for k in (0, 1))
+        left, right = torch.full_like(length, low), torch.full_like(length, high)
+        halves = HALVES
+        if line.body.shape not in shapes.CONVEX:
+            left, right = _about_best(still, low, high)
+            halves -= round(math.log2(PLACES))
+        for _ in range(halves):
+            half = 0.5 * (left + right)
+            falling = still.slope(half.unsqueeze(-3), middle).squeeze(-3) <= 0
+            left, right = torch.where(falling, half, left), torch.where(falling, right, half)
         share = 0.5 * (left + right)
         for _ in range(NEWTON):
             slope, steep = newton(share)
@@ -104,6 +112,18 @@ def _nearest(line: _Line, low: float, high: float) -> Tensor:
         _, steep = newton(share)
     share = share - line.slope(share, middle) / steep
     return torch.minimum(torch.maximum(share, left), right)
+
+
+def _about_best(still: _Line, low: float, high: float) -> tuple[Tensor, Tensor]:
+    """Return shares between which edges come nearest to a body, as far as some places tell, shape (..., V, 1) each."""
+    middle, part, length = 0.5 * (low + high), (high - low) / PLACES, safe_norm(still.edge)
+    share = low + part * torch.arange(PLACES + 1, dtype=length.dtype, device=length.device)[:, None, None]
+    distance, normal = still.probe(share)
+    best = (distance + 0.5 * PULL * length * (share - middle).square()).argmin(-3, keepdim=True)
+    rise = torch.take_along_dim(still.rise(normal, share, middle), best, -3).squeeze(-3)
+    here = low + part * best.squeeze(-3).to(length.dtype)
+    left, right = torch.where(rise <= 0, here, here - part), torch.where(rise <= 0, here + part, here)
+    return left.clamp(min=low), right.clamp(max=high)
 
 
 def find(view: View, motion: BodyMotion, pieces: int) -> EdgePoints:
