@@ -89,7 +89,13 @@ struct Geometry : Inputs<T> {
   typedef std::vector<R> Shifts;
   typedef std::vector<Wrench<T>> Turns;
   Sizes n;
-  std::vector<int> owner, piece;  // body of each family; piece of an edge, or -2 and -1 for its ends
+  struct Far {  // an edge, a body, and how much nearer they have to come before points of them matter
+    int edge, body;
+    L gap, arm;
+  };
+  std::vector<int> owner, piece, first;  // body of each family; piece of an edge, or -2 and -1 for its ends; by body
+  std::vector<int> near;                 // points that may press
+  std::vector<Far> far;                  // where there are none
   std::vector<Found<T>> found;
   std::vector<char> searched;
   std::vector<L> distance;
@@ -99,8 +105,10 @@ struct Geometry : Inputs<T> {
   explicit Geometry(const Sizes& n)
       : Inputs<T>(n), n(n), found(points.size()), searched(points.size()), distance(points.size()),
         change(n.vertices), vel(n.vertices), motion(n.bodies), spin(n.bodies) {
-    for (int k = 0; k < n.bodies; ++k)
+    for (int k = 0; k < n.bodies; ++k) {
+      first.push_back(owner.size());
       for (int j = -2; j < n.pieces[k]; ++j) owner.push_back(k), piece.push_back(j);
+    }
   }
 
   int edge(int p) const { return p % n.vertices; }
@@ -163,19 +171,50 @@ struct Geometry : Inputs<T> {
     for (int k = 0; k < n.bodies; ++k)
       motion[k] = {bodies[k].change, bodies[k].turn}, spin[k] = {bodies[k].vel, bodies[k].omega};
   }
+  // Places points where edges may come near to bodies; the others wait, see `reach`.
   void prepare() {
     foresee();
-    for (int p = 0; p < int(points.size()); ++p) place(p);
+    near.clear(), far.clear();
+    for (int k = 0; k < n.bodies; ++k)
+      for (int v = 0; v < n.vertices; ++v) {
+        const Far f = apart(v, k);
+        if (any((edges[v].real > T(0)) & ~(f.gap > edges[v].radius + T(2) * moved(f))))
+          place(v, k);
+        else
+          far.push_back(f);
+      }
+  }
+  // Places the points of those that go so far by now that they may touch after all; as foreseen, like the others.
+  void reach() {
+    std::vector<Far> late, kept;
+    for (const Far& f : far) (any((edges[f.edge].real > T(0)) & ~(f.gap > moved(f))) ? late : kept).push_back(f);
+    if (late.empty()) return;
+    const Shifts shifts = change;
+    const Turns turns = motion;
+    foresee();
+    for (const Far& f : late) place(f.edge, f.body);
+    far = kept, change = shifts, motion = turns;
+  }
+
+  static L size(const R& x) { return root<T>(dot(x, x)); }
+  // By how much an edge and a body come nearer to each other at most.
+  L moved(const Far& f) const {
+    const L i = size(change[f.edge]), j = size(change[n.after[f.edge]]);
+    return (i > j ? i : j) + size(motion[f.body].force) + size(motion[f.body].torque) * f.arm;
+  }
+  Far apart(int v, int k) const {
+    const Solid<T>& b = bodies[k];
+    const R from = vertices[v].pos - b.pos, way = vertices[n.after[v]].pos - vertices[v].pos;
+    const R at = b.local(from) + b.offset;
+    const L length = size(way), out = n.shape[k] == PLANE ? at.z : size(at) - bounding<T>(n.shape[k], b.numbers);
+    return {v, k, out - length - edges[v].radius, size(from) + length};
   }
 
   // Whether an edge may come within a radius of a body in some scene, if it moves twice as far as foreseen.
   bool close(int p, const Line<T, 0>& line) const {
-    const int v = edge(p), first = (p / n.vertices - piece[p / n.vertices] - 2) * n.vertices + v;
-    const auto size = [](const R& x) { return root<T>(dot(x, x)); };
-    const L i = size(change[v]), j = size(change[n.after[v]]), arm = size(points[first].arm) + line.length.x;
-    const L moved = (i > j ? i : j) + size(motion[body(p)].force) + size(motion[body(p)].torque) * arm;
-    const L reach = T(2) * edges[v].radius + T(2) * moved;
-    return any((edges[v].real > T(0)) & (distance[first] - line.length.x <= reach));
+    const int v = edge(p), k = body(p), start = first[k] * n.vertices + v;
+    const L reach = T(2) * (edges[v].radius + moved({v, k, L{}, size(points[start].arm) + line.length.x}));
+    return any((edges[v].real > T(0)) & (distance[start] - line.length.x <= reach));
   }
   T share(int family) const {
     const int j = piece[family];
@@ -189,6 +228,9 @@ struct Geometry : Inputs<T> {
     return Line<T, N>(n.shape[k], n.grid<T>(k), b.local(from - b.pos) + b.offset, b.local(to - from), b.numbers);
   }
 
+  void place(int v, int k) {
+    for (int f = first[k]; f < first[k] + 2 + n.pieces[k]; ++f) near.push_back(f * n.vertices + v), place(near.back());
+  }
   void place(int p) {
     const int f = p / n.vertices, v = edge(p);
     const Solid<T>& b = bodies[body(p)];

@@ -13,7 +13,7 @@ template <typename T>
 struct Block : Geometry<T> {
   typedef Geometry<T> G;
   using G::points, G::edges, G::vertices, G::bodies, G::n, G::change, G::motion;
-  using G::edge, G::body, G::apart, G::exert, G::seen, G::tilt;
+  using G::near, G::edge, G::body, G::apart, G::exert, G::seen, G::tilt;
   typedef Lanes<T> L;
   typedef Vec<T> R;
   struct Step {  // what a sweep starts from, and what it finds
@@ -121,7 +121,11 @@ struct Block : Geometry<T> {
     now.force = force, now.push = push;
     move(now);
     now.pressed.clear(), now.rubbing.clear();
-    for (int p = 0; p < int(points.size()); ++p) {
+    const size_t known = near.size();
+    this->reach();
+    for (size_t i = known; i < near.size(); ++i)
+      for (Step& each : steps) each.found[near[i]] = Force<T>{};
+    for (int p : near) {
       const auto on = presses(s, p);
       now.found[p] = Force<T>{};
       if (!any(on)) continue;
