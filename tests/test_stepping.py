@@ -73,6 +73,22 @@ def test_a_rollout_without_gradients_compiles_one_graph(graphs, scenes, held, su
 
 @pytest.mark.compile
 @pytest.mark.slow
+def test_compiled_steps_tell_tensors_of_different_kinds_apart(graphs):
+    made = hanging(2)[0]
+    step = scene.stepper(made)
+    for scenes, double in ((2, True), (3, True), (2, True), (3, False), (3, True), (3, False), (2, True)):
+        _, *inputs, controls = hanging(scenes)
+        inputs = [*inputs, tree.map(lambda c: c[0], controls)]
+        if not double:
+            inputs = tree.to(inputs, torch.float32)
+        found, wanted = (run(*inputs).rods.pos for run in (step, scene.stepper(made, compiled=False)))
+        assert found.shape == wanted.shape and found.dtype == wanted.dtype
+        assert torch.allclose(found, wanted, rtol=1e-12 if double else 1e-5, atol=0 if double else 1e-8)
+    assert graphs() == 3
+
+
+@pytest.mark.compile
+@pytest.mark.slow
 def test_replays_run_the_graph_of_rollouts_without_gradients(graphs):
     made, params, state, controls = hanging(2, substeps=2)
     step = scene.stepper(made)

@@ -342,7 +342,7 @@ def stepper(scene: Scene, *, compiled: bool = True, recorded: bool = False):
         return (part(_step), advance) if once else (_step, part(advance))
 
     ways = {True: made(False), False: made(True)}
-    look = compile(survey)
+    look, trusting = compile(survey), traced.Trusting()
 
     def run(params: Params, state: State, control: Control) -> State:
         _check_control(scene, control)
@@ -355,7 +355,8 @@ def stepper(scene: Scene, *, compiled: bool = True, recorded: bool = False):
         else:
             params, state, control = tree.detach((params, state, control))
         whole, part = ways[graded]
-        return whole(scene, params, state, control, part, look)
+        with trusting((params, state, control), graded, *control.grip):
+            return whole(scene, params, state, control, part, look)
 
     return run
 
