@@ -36,7 +36,7 @@ EXAMPLES = """examples:
 """
 
 SHARE = {"hybrid": 4}
-"""Slopes are wanted of one in so many trajectories; batches are as large, since steps are compiled for one size."""
+"""Slopes are wanted of one in so many trajectories."""
 INTERRUPTED = 130
 """Exit status after Ctrl-C."""
 
@@ -181,8 +181,9 @@ def solve(task: str, args: Any) -> list[tuple[Case, dict[str, Any]]]:
             said[case.folder] = (0, case.settings.episodes, "")
             return lambda shared: case.search(shared, note, lambda: time.monotonic() > end)
 
-        room = sum(min(case.settings.population, case.settings.chunk) // SHARE.get(case.method, 1) for case in wanted)
-        together(chosen, [searching(case) for case in left], room, pulse)
+        sizes = [min(case.settings.population, case.settings.chunk) for case in wanted]
+        graded = sum(size // SHARE.get(case.method, 1) for size, case in zip(sizes, wanted, strict=True))
+        together(chosen, [searching(case) for case in left], sum(sizes), pulse, graded=graded)
     return [(case, json.loads(case.result.read_text())) for case in wanted]
 
 

@@ -82,8 +82,10 @@ def test_slopes_are_those_of_the_problem(kind: Any) -> None:
 def test_one_that_wants_no_slope_gets_none() -> None:
     actions = torch.zeros(2, 30, 3, dtype=torch.float64)
     searches = [lambda p: p.evaluate(actions), lambda p: p.evaluate(actions.clone().requires_grad_())]
-    plain, graded = together(Push(), searches, room=4)
+    problem = Counting()
+    plain, graded = together(problem, searches, room=5, graded=3)
     assert not plain.loss.requires_grad and graded.loss.requires_grad
+    assert problem.sizes == [5, 3]
 
 
 def test_searches_that_were_stopped_go_on(tmp_path: Path) -> None:

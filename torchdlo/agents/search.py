@@ -298,8 +298,8 @@ class _Player:
         return replace(told, slope=slope)
 
     def _told(self, problem: Problem, ask: Ask, graded: bool, again: bool = False) -> Told:
-        """Play trajectories in chunks; all of about one size, as steps are compiled for each."""
-        room = min(max(1, self.settings.chunk // self._copies), ask.graded or len(ask.points))
+        """Play trajectories in chunks."""
+        room = max(1, self.settings.chunk // self._copies)
         parts = [self._chunk(problem, ask.encoding, x, graded, again) for x in ask.points.split(room)]
         columns = zip(*parts, strict=True)
         returns, loss, short, success, failed, slope = (torch.cat(column) for column in columns)

@@ -5,7 +5,7 @@ Every search runs in a thread of its own and waits for what it asked for; the th
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from queue import SimpleQueue
@@ -26,14 +26,17 @@ def together(
     searches: Sequence[Callable[[Problem], Any]],
     room: int,
     pulse: Callable[[], None] = lambda: None,
+    *,
+    graded: int | None = None,
 ) -> list[Any]:
-    """Run searches at the same time, and play what they ask for in batches of `room` episodes.
+    """Run searches at the same time, and play what they ask for in batches.
 
     Args:
         problem: what to solve.
         searches: each is called with the problem that it is to search.
-        room: episodes of a batch; short ones are filled up, so that steps are compiled for one size only.
+        room: episodes of a batch; short ones are filled up, as steps are compiled for every size.
         pulse: called after every batch; a `KeyboardInterrupt` that it raises ends all searches that ask for more.
+        graded: episodes of a batch with slopes; as many as without if not given.
 
     Returns:
         What the searches returned, in order.
@@ -41,6 +44,7 @@ def together(
     Raises:
         BaseException: what the first search that failed raised, when all have ended.
     """
+    rooms = {False: room, True: room if graded is None else graded}
     desk: SimpleQueue[_Wish | None] = SimpleQueue()
     stand_in = problem.rehearsal()
     over: BaseException | None = None
@@ -60,7 +64,7 @@ def together(
                     continue
                 if over is None:
                     for one in (problem, stand_in):
-                        _play(one, [wish for wish in waiting if wish.problem is one], room)
+                        _play(one, [wish for wish in waiting if wish.problem is one], rooms)
                     pulse()
             except BaseException as error:  # threads that wait have to hear of it, whatever it is
                 over = error
@@ -129,13 +133,13 @@ class _Known(torch.autograd.Function):
         return pull[:, None, None] * ctx.saved_tensors[0], None, None
 
 
-def _play(problem: Problem, wishes: Sequence[_Wish], room: int) -> None:
-    """Answer wishes: trajectories that are to be recorded one by one, all others in batches."""
+def _play(problem: Problem, wishes: Sequence[_Wish], rooms: Mapping[bool, int]) -> None:
+    """Answer wishes: trajectories that are to be recorded one by one, all others in batches without or with slopes."""
     for wish in wishes:
         if wish.actions.dim() == 2:
             with torch.no_grad():
                 wish.answer.set_result(problem.record(wish.actions))
-    for graded in (False, True):
+    for graded, room in rooms.items():
         alike = [wish for wish in wishes if wish.actions.dim() == 3 and wish.actions.requires_grad == graded]
         if not alike:
             continue
