@@ -86,6 +86,47 @@ def test_the_kernel_and_tensor_operations_agree_with_their_gradients(choices, mo
     assert bool((sizes[1:, 0] > 0).all()), dict(zip(SOLIDS, sizes[:, 0].tolist(), strict=True))
 
 
+@pytest.mark.parametrize("kernel", [True, False])
+def test_edges_flat_on_a_surface_have_the_derivative_of_their_nearest_point(kernel, monkeypatch):
+    # It is the middle of each edge, and goes towards the end that is lowered.
+    monkeypatch.setattr(body_sweeps, "ready", lambda *_, ready=body_sweeps.ready: kernel and ready(*_))
+    x = line(4, 0.03)
+    table = Solid("box", (0.1, 0.1, 0.02), (0.0, 0.0, -0.0249), motion="fixed", mu_s=0.5, mu_k=0.3)
+    choice, params, state = make([Rope(x, radius=0.005, density=1e3)], [RodBody()], bodies=[table], dt=2e-4)
+    control = hold(choice, state)
+
+    def turned(pos: torch.Tensor) -> torch.Tensor:
+        now = tree.replace(state, rods=tree.replace(state.rods, pos=pos))
+        vel = scene.step(choice, params, now, control).rods.vel
+        return (vel[..., 2] * torch.tensor([1.0, -2.0, 3.0, 1.0], dtype=F64)).sum()
+
+    pos = state.rods.pos.clone().requires_grad_()
+    (slope,) = torch.autograd.grad(turned(pos), pos)
+    for k in range(4):
+        step = torch.zeros_like(state.rods.pos)
+        step[..., k, 2] = 1e-9
+        difference = float(turned(state.rods.pos + step) - turned(state.rods.pos - step)) / 2e-9
+        assert float(slope[..., k, 2]) == pytest.approx(difference, rel=1e-3), k
+
+
+def test_what_is_pushed_on_to_a_body_that_was_far_touches_it(monkeypatch):
+    # The rope starts deep in the floor, which puts it out at once, more than a diameter up and against a ceiling.
+    x = line(12, 0.03).expand(3, -1, -1).clone()
+    x[..., 2] -= 0.001 * torch.arange(3, dtype=F64)[:, None]
+    rope = Rope(x, radius=0.005, density=1e3, bend=1e-4)
+    floor = Solid("plane", pos=(0, 0, 0.01), motion="fixed", mu_s=0.5, mu_k=0.3)
+    above = Solid("plane", pos=(0, 0, 0.0175), quat=(0, 1, 0, 0), motion="fixed", mu_s=0.5, mu_k=0.3)
+    alone, made = (make([rope], [RodBody()], bodies=[floor, *more], dt=1e-3, substeps=1) for more in ([], [above]))
+    moved = [scene.step(*each, hold(each[0], each[2])).rods.vel for each in (alone, made)]
+    assert bool(((moved[0] - moved[1]).norm(dim=-1).amax(-1) > 0.1).all()), "nothing was hit"
+    found, gradient = rolled(made, 1)
+    monkeypatch.setattr(body_sweeps, "ready", lambda *_: False)
+    wanted, expected = rolled(made, 1)
+    assert float((found - wanted).norm()) < 1e-9 * float(wanted.norm())
+    one, other = (torch.cat([x.flatten() for x in parts]) for parts in (gradient, expected))
+    assert float((one - other).norm()) <= 1e-9 * float(other.norm())
+
+
 def test_bodies_in_another_order_do_the_same():
     # As many bodies and points, but for other bodies: what the kernel keeps from the first scene is of no use.
     ends = []

@@ -256,6 +256,9 @@ static Found<T> nearest(const Line<T, 0>& line, T low, T high) {
     left = falling ? half : left;
     right = falling ? right : half;
   }
+  // The middle of a piece is nearest to what is flat: it must not be a bound, where the share would have no derivative.
+  const L spare = T(0.25) * (right - left), below = left - spare, above = right + spare;
+  left = below > low ? below : L{} + low, right = above < high ? above : L{} + high;
   Found<T> f{T(0.5) * (left + right), L{}, left, right};
   for (int k = 0;; ++k) {
     const L steep = (line.slope(S(f.share + step), middle).x - line.slope(S(f.share - step), middle).x) / (2 * step);

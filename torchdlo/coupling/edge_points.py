@@ -105,6 +105,9 @@ def _nearest(line: _Line, low: float, high: float) -> Tensor:
             half = 0.5 * (left + right)
             falling = still.slope(half.unsqueeze(-3), middle).squeeze(-3) <= 0
             left, right = torch.where(falling, half, left), torch.where(falling, right, half)
+        # The middle of a piece is nearest to what is flat: it must not be a bound, where the share has no derivative.
+        spare = 0.25 * (right - left)
+        left, right = (left - spare).clamp(min=low), (right + spare).clamp(max=high)
         share = 0.5 * (left + right)
         for _ in range(NEWTON):
             slope, steep = newton(share)
