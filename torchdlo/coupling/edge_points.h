@@ -250,7 +250,7 @@ static Found<T> nearest(const Line<T, 0>& line, T low, T high) {
     left = rise <= T(0) ? best : before > left ? before : left;
     right = rise <= T(0) ? (after < right ? after : right) : best;
   }
-  for (int k = convex(line.shape) ? 5 : 2; k--;) {
+  for (int k = convex(line.shape) ? 5 : 4; k--;) {
     const L half = T(0.5) * (left + right);
     const auto falling = line.slope(S(half), middle).x <= T(0);
     left = falling ? half : left;

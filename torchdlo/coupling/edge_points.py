@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import torch
@@ -20,8 +19,9 @@ PULL = 0.01
 on flat surfaces. From a surface of radius R it moves the point by less than PULL R / 2, the gap by PULL^2 R / 8."""
 PLACES = 8
 """Parts into which a piece of an edge is cut where the distance from a shape may have several minima along it."""
-HALVES = 5
-"""How often a piece is halved, all in all, before Newton's method finds its nearest point."""
+HALVES = {True: 5, False: 4}
+"""How often what is left of a piece is halved before Newton's method finds its nearest point; by whether the distance
+from the shape is convex."""
 NEWTON = 2
 """Steps of that method without graph."""
 
@@ -97,11 +97,10 @@ def _nearest(line: _Line, low: float, high: float) -> Tensor:
 
     with torch.no_grad():
         left, right = torch.full_like(length, low), torch.full_like(length, high)
-        halves = HALVES
-        if line.body.shape not in shapes.CONVEX:
+        convex = line.body.shape in shapes.CONVEX
+        if not convex:
             left, right = _about_best(still, low, high)
-            halves -= round(math.log2(PLACES))
-        for _ in range(halves):
+        for _ in range(HALVES[convex]):
             half = 0.5 * (left + right)
             falling = still.slope(half.unsqueeze(-3), middle).squeeze(-3) <= 0
             left, right = torch.where(falling, half, left), torch.where(falling, right, half)
