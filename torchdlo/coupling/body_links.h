@@ -23,8 +23,8 @@ struct Linked : Pairs<T> {
   typedef Lanes<T> L;
   typedef Num<T, 0> P;
   using Pairs<T>::n, Pairs<T>::owner, Pairs<T>::active;
-  std::vector<L> stiff;
-  std::vector<Sets<T>> sets;
+  List<L> stiff;
+  List<Sets<T>> sets;
   using Pairs<T>::Pairs;
 
   template <int N>
@@ -34,9 +34,9 @@ struct Linked : Pairs<T> {
   }
 
   template <int N>
-  using Bodies = std::vector<Member<T, N>>;
+  using Bodies = List<Member<T, N>>;
   template <int N>
-  using Wrenches = std::vector<Wrench<T, N>>;
+  using Wrenches = List<Wrench<T, N>>;
 
   // How a contact's points move against each other, if bodies move like that.
   template <int N>
@@ -45,7 +45,7 @@ struct Linked : Pairs<T> {
   }
   // What forces on the first bodies of contacts exert.
   template <int N>
-  Wrenches<N> exerted(const std::vector<Link<T, N>>& links, const std::vector<Three<T, N>>& forces) const {
+  Wrenches<N> exerted(const List<Link<T, N>>& links, const List<Three<T, N>>& forces) const {
     const Num<T, N> none(T(0));
     Wrenches<N> to(n.bodies, {{none, none, none}, {none, none, none}});
     for (size_t c = 0; c < links.size(); ++c) {
@@ -58,10 +58,10 @@ struct Linked : Pairs<T> {
   }
 
   template <int N>
-  std::vector<Link<T, N>> link(const Bodies<N>& b, const std::vector<Touch<T, N>>& contacts) const {
+  List<Link<T, N>> link(const Bodies<N>& b, const List<Touch<T, N>>& contacts) const {
     typedef Num<T, N> S;
     const S none(T(0));
-    std::vector<Link<T, N>> links(owner.size());
+    List<Link<T, N>> links(owner.size());
     Wrenches<N> moves, speeds;
     for (const auto& k : b) moves.push_back({k.change, k.turn}), speeds.push_back({k.vel, k.omega});
     for (size_t c = 0; c < links.size(); ++c) {
@@ -109,7 +109,7 @@ struct Linked : Pairs<T> {
 
   // The share of forces at which they do what is asked for; see `_fitting` in body_contact.py.
   template <int N>
-  Num<T, N> fitting(const Bodies<N>& b, const std::vector<Link<T, N>>& links, const std::vector<Three<T, N>>& f) const {
+  Num<T, N> fitting(const Bodies<N>& b, const List<Link<T, N>>& links, const List<Three<T, N>>& f) const {
     typedef Num<T, N> S;
     Wrenches<N> m = exerted(links, f);
     for (int k = 0; k < n.bodies; ++k) m[k] = {m[k].force * b[k].mobility, b[k].turned(m[k].torque)};

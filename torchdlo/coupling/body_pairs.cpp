@@ -17,13 +17,13 @@ struct Block : Linked<T> {
   using Pairs<T>::bodies, Pairs<T>::active, Pairs<T>::contacts, Pairs<T>::FIELDS, Pairs<T>::ALL;
   using Linked<T>::stiff, Linked<T>::sets, Linked<T>::seen, Linked<T>::slip;
   template <int N>
-  using Bodies = std::vector<Member<T, N>>;
+  using Bodies = List<Member<T, N>>;
   template <int N>
-  using Wrenches = std::vector<Wrench<T, N>>;
+  using Wrenches = List<Wrench<T, N>>;
   Blocks<T> system;
-  std::vector<L> load;
-  std::vector<Link<T, 0>> links;
-  std::vector<L> motion;  // of free bodies
+  List<L> load;
+  List<Link<T, 0>> links;
+  List<L> motion;  // of free bodies
   bool near;
 
   explicit Block(const Sizes& n) : Linked<T>(n), system(places(n)) {
@@ -40,10 +40,10 @@ struct Block : Linked<T> {
     return count;
   }
   // Which contacts press and slide, after those of the last round moved the points of a pair.
-  void update(int p, const std::vector<V>& moved) {
+  void update(int p, const List<V>& moved) {
     const int from = first[p], to = first[p + 1];
-    std::vector<L> sizes(to - from);
-    std::vector<V> ways(to - from);
+    List<L> sizes(to - from);
+    List<V> ways(to - from);
     L rubs{}, whole{}, most{};
     for (int c = from; c < to; ++c) {
       const L over = links[c].wanted.x - dot(links[c].normal, moved[c]).x, press = sets[c].press;
@@ -93,7 +93,7 @@ struct Block : Linked<T> {
   }
 
   // Puts together and eliminates the matrix of the displacements of free bodies.
-  void assemble(const std::vector<V>* moved) {
+  void assemble(const List<V>* moved) {
     std::fill(system.a.begin(), system.a.end(), zero);
     for (int k = 0; k < n.bodies; ++k) {
       const int at = 6 * int(n.free[k]);
@@ -135,7 +135,7 @@ struct Block : Linked<T> {
 
   // Motions of bodies from the unknowns, and unknowns from what is exerted on bodies.
   template <int N>
-  Wrenches<N> spread(const std::vector<Num<T, N>>& q) const {
+  Wrenches<N> spread(const List<Num<T, N>>& q) const {
     const Num<T, N> none(T(0));
     Wrenches<N> m(n.bodies, {{none, none, none}, {none, none, none}});
     for (int k = 0; k < n.bodies; ++k)
@@ -143,23 +143,23 @@ struct Block : Linked<T> {
     return m;
   }
   template <int N>
-  std::vector<Three<T, N>> moved(const std::vector<Link<T, N>>& links, const std::vector<Num<T, N>>& q) const {
-    std::vector<Three<T, N>> to(links.size());
+  List<Three<T, N>> moved(const List<Link<T, N>>& links, const List<Num<T, N>>& q) const {
+    List<Three<T, N>> to(links.size());
     const Wrenches<N> m = spread(q);
     for (size_t c = 0; c < links.size(); ++c)
       if (active[owner[c]]) to[c] = links[c].free + seen(links[c], m);
     return to;
   }
   template <int N>
-  std::vector<Num<T, N>> gathered(const Wrenches<N>& w) const {
-    std::vector<Num<T, N>> q(system.n);
+  List<Num<T, N>> gathered(const Wrenches<N>& w) const {
+    List<Num<T, N>> q(system.n);
     for (int k = 0; k < n.bodies; ++k)
       for (int i = 0; n.free[k] >= 0 && i < 6; ++i) q[6 * n.free[k] + i] = ((const Num<T, N>*)&w[k])[i];
     return q;
   }
 
   void settle() {
-    std::vector<V> stays(links.size());
+    List<V> stays(links.size());
     for (int step = 0; step < n.steps; ++step) {
       assemble(nullptr);
       for (size_t c = 0; c < links.size(); ++c) {
@@ -170,17 +170,17 @@ struct Block : Linked<T> {
         const P press(stiff[c] * sets[c].press);
         stays[c] = links[c].normal * (press * links[c].wanted) - V{dot(rows[0], f), dot(rows[1], f), dot(rows[2], f)};
       }
-      const std::vector<P> right = gathered(this->exerted(links, stays));
+      const List<P> right = gathered(this->exerted(links, stays));
       for (int i = 0; i < system.n; ++i) motion[i] = right[i].x;
       system.solve(motion);
-      const std::vector<V> found = moved(links, constants<0>(motion));
+      const List<V> found = moved(links, constants<0>(motion));
       for (int p = 0; p < n.pairs; ++p)
         if (active[p]) update(p, found);
     }
   }
   template <int N>
-  static std::vector<Num<T, N>> constants(const std::vector<L>& x) {
-    return std::vector<Num<T, N>>(x.begin(), x.end());
+  static List<Num<T, N>> constants(const List<L>& x) {
+    return List<Num<T, N>>(x.begin(), x.end());
   }
 
   // Finds contacts, and which of them press; returns whether any may.
@@ -202,8 +202,8 @@ struct Block : Linked<T> {
     settle();
     // Rounds may leave what slides off the solution, and derivatives hold there only.
     linearize();
-    std::vector<P> more = excess<0>(bodies, links, constants<0>(motion));
-    std::vector<L> ahead(system.n);
+    List<P> more = excess<0>(bodies, links, constants<0>(motion));
+    List<L> ahead(system.n);
     for (int i = 0; i < system.n; ++i) ahead[i] = more[i].x;
     system.solve(ahead);
     for (int i = 0; i < system.n; ++i) ahead[i] += motion[i];
@@ -213,7 +213,7 @@ struct Block : Linked<T> {
     return true;
   }
   // How much is left to do, (forces and torques)^2 over what resists them.
-  L weight(const std::vector<P>& more) const {
+  L weight(const List<P>& more) const {
     L sum{};
     for (int k = 0; k < n.bodies; ++k)
       for (int i = 0; n.free[k] >= 0 && i < 3; ++i) {
@@ -225,7 +225,7 @@ struct Block : Linked<T> {
   }
   // Puts together the exact matrix at the displacements that were found.
   void linearize() {
-    const std::vector<V> found = moved(links, constants<0>(motion));
+    const List<V> found = moved(links, constants<0>(motion));
     for (size_t c = 0; c < links.size(); ++c)
       if (active[owner[c]]) slip(links[c], int(c), found[c], sets[c].slip);
     assemble(&found);
@@ -233,17 +233,17 @@ struct Block : Linked<T> {
 
   // What contacts exert at displacements of free bodies, and what that is beyond what displaces them so.
   template <int N>
-  std::vector<Three<T, N>> pressed(const std::vector<Link<T, N>>& l, const std::vector<Num<T, N>>& q) const {
-    const std::vector<Three<T, N>> m = moved(l, q);
-    std::vector<Three<T, N>> f(l.size());
+  List<Three<T, N>> pressed(const List<Link<T, N>>& l, const List<Num<T, N>>& q) const {
+    const List<Three<T, N>> m = moved(l, q);
+    List<Three<T, N>> f(l.size());
     for (size_t c = 0; c < l.size(); ++c)
       if (active[owner[c]]) f[c] = this->force(l[c], int(c), m[c]);
     return f;
   }
   template <int N>
-  std::vector<Num<T, N>> excess(const Bodies<N>& b, const std::vector<Link<T, N>>& l,
-                                const std::vector<Num<T, N>>& q) const {
-    std::vector<Num<T, N>> more = gathered(this->exerted(l, pressed(l, q)));
+  List<Num<T, N>> excess(const Bodies<N>& b, const List<Link<T, N>>& l,
+                                const List<Num<T, N>>& q) const {
+    List<Num<T, N>> more = gathered(this->exerted(l, pressed(l, q)));
     for (int k = 0; k < n.bodies; ++k) {
       if (n.free[k] < 0) continue;
       const Wrench<T, N>& w = *(const Wrench<T, N>*)&q[6 * n.free[k]];
@@ -254,7 +254,7 @@ struct Block : Linked<T> {
   }
 
   struct Unknowns {  // where they stand on the tape
-    std::vector<Num<T, TAPED>> excess, motion;
+    List<Num<T, TAPED>> excess, motion;
   };
   static Unknowns& last() {
     static thread_local Unknowns kept;
@@ -263,17 +263,17 @@ struct Block : Linked<T> {
 
   // What contacts exert on bodies, from bodies and contacts.
   template <int N>
-  Wrenches<N> finish(const Bodies<N>& b, const std::vector<Touch<T, N>>& contacts) {
+  Wrenches<N> finish(const Bodies<N>& b, const List<Touch<T, N>>& contacts) {
     typedef Num<T, N> S;
-    const std::vector<Link<T, N>> l = this->template link<N>(b, contacts);
-    std::vector<S> q = constants<N>(motion), more = excess(b, l, q);
-    std::vector<L> change(system.n);
+    const List<Link<T, N>> l = this->template link<N>(b, contacts);
+    List<S> q = constants<N>(motion), more = excess(b, l, q);
+    List<L> change(system.n);
     for (int i = 0; i < system.n; ++i) change[i] = more[i].x;
     system.solve(change);
     for (int i = 0; i < system.n; ++i) q[i] = S::variable(motion[i] + change[i], 0);
     if constexpr (N == TAPED) last() = {more, q};
-    std::vector<Three<T, N>> f = pressed(l, q);
-    std::vector<V> plain(f.size());
+    List<Three<T, N>> f = pressed(l, q);
+    List<V> plain(f.size());
     for (size_t c = 0; c < f.size(); ++c) plain[c] = {P(f[c].x.x), P(f[c].y.x), P(f[c].z.x)};
     const auto good = this->template fitting<0>(bodies, links, plain).x > T(1 - FIT);
     if (any(~good)) simplify(b, l, good, f);
@@ -281,9 +281,9 @@ struct Block : Linked<T> {
   }
   // Where rounds ended too early, all contacts press along their normals, by as much as fits at best.
   template <int N, typename M>
-  void simplify(const Bodies<N>& b, const std::vector<Link<T, N>>& l, const M& good, std::vector<Three<T, N>>& f) {
+  void simplify(const Bodies<N>& b, const List<Link<T, N>>& l, const M& good, List<Three<T, N>>& f) {
     typedef Num<T, N> S;
-    std::vector<Three<T, N>> simple(f.size());
+    List<Three<T, N>> simple(f.size());
     for (size_t c = 0; c < f.size(); ++c)
       if (active[owner[c]])
         simple[c] = l[c].normal * (positive(l[c].wanted - dot(l[c].normal, l[c].free)) * S(stiff[c] / T(HARD)));
@@ -303,7 +303,7 @@ struct Block : Linked<T> {
     Tape<T>& tape = Tape<T>::on();
     tape.nodes.clear();
     Bodies<TAPED> b(n.bodies);
-    std::vector<Touch<T, TAPED>> c(contacts.size());
+    List<Touch<T, TAPED>> c(contacts.size());
     for (int k = 0; k < n.bodies; ++k) this->template remember<ALL>(bodies[k], b[k]);
     for (size_t k = 0; k < c.size(); ++k)
       if (active[owner[k]]) this->template remember<FIELDS>(contacts[k], c[k]);
@@ -315,13 +315,13 @@ struct Block : Linked<T> {
     const int from = at.motion.empty() ? 0 : at.motion[0].at;
     tape.back(int(tape.nodes.size()), from);
     // The displacements follow from the excess by the system, which is a constant.
-    std::vector<L> x;
+    List<L> x;
     for (const auto& q : at.motion) x.push_back(q.by());
     system.solve_transposed(x);
     for (int i = 0; i < system.n; ++i) at.excess[i].give(x[i]);
     tape.back(from, 0);
     for (int k = 0; k < n.bodies; ++k) this->template collect<ALL>(b[k], to[k]);
-    std::vector<Touch<T, 0>> part(contacts.size());
+    List<Touch<T, 0>> part(contacts.size());
     for (size_t k = 0; k < c.size(); ++k)
       for (int i = 0; active[owner[k]] && i < FIELDS; ++i) ((P*)&part[k])[i] = P(((Num<T, TAPED>*)&c[k])[i].by());
     for (int p = 0; p < n.pairs; ++p)
@@ -351,7 +351,7 @@ static void exert(const T* const* in, T* const* out, const Sizes& n, int threads
     fetch(block.bodies, in, b, n.scenes);
     const Num<T, 0> none(T(0));
     const bool near = block.prepare();
-    std::vector<Wrench<T, 0>> found(n.bodies, {{none, none, none}, {none, none, none}});
+    List<Wrench<T, 0>> found(n.bodies, {{none, none, none}, {none, none, none}});
     if (near) found = block.template finish<0>(block.bodies, block.contacts);
     put(found, out, b, n.scenes);
   }
@@ -362,7 +362,7 @@ static void back(const T* const* in, const T* const* by, T* const* out, const Si
   BLOCKS {
     Block<T>& block = working<T>(n);
     fetch(block.bodies, in, b, n.scenes);
-    std::vector<Wrench<T, 0>> given(n.bodies);
+    List<Wrench<T, 0>> given(n.bodies);
     fetch(given, by, b, n.scenes);
     block.prepare();
     put(block.backward(given), out, b, n.scenes);

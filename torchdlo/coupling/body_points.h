@@ -3,6 +3,7 @@
 #pragma once
 #include "edge_points.h"
 
+#include <algorithm>
 #include <vector>
 
 template <typename T>
@@ -65,10 +66,10 @@ struct Sizes {
 // Numbers that contact depends on, or derivatives by them.
 template <typename T>
 struct Inputs {
-  std::vector<Edge<T>> edges;
-  std::vector<Vertex<T>> vertices;
-  std::vector<Solid<T>> bodies;
-  std::vector<Point<T>> points;  // made of the others
+  List<Edge<T>> edges;
+  List<Vertex<T>> vertices;
+  List<Solid<T>> bodies;
+  List<Point<T>> points;  // made of the others
 
   explicit Inputs(const Sizes& n)
       : edges(n.vertices), vertices(n.vertices), bodies(n.bodies), points(n.families * n.vertices) {}
@@ -86,19 +87,19 @@ struct Geometry : Inputs<T> {
   using Inputs<T>::bodies;
   typedef Lanes<T> L;
   typedef Vec<T> R;
-  typedef std::vector<R> Shifts;
-  typedef std::vector<Wrench<T>> Turns;
+  typedef List<R> Shifts;
+  typedef List<Wrench<T>> Turns;
   Sizes n;
   struct Far {  // an edge, a body, and how much nearer they have to come before points of them matter
     int edge, body;
     L gap, arm;
   };
-  std::vector<int> owner, piece, first;  // body of each family; piece of an edge, or -2 and -1 for its ends; by body
-  std::vector<int> near;                 // points that may press
-  std::vector<Far> far;                  // where there are none
-  std::vector<Found<T>> found;
-  std::vector<char> searched;
-  std::vector<L> distance;
+  List<int> owner, piece, first;  // body of each family; piece of an edge, or -2 and -1 for its ends; by body
+  List<int> near;                 // points that may press
+  List<Far> far;                  // where there are none
+  List<Found<T>> found;
+  List<char> searched;
+  List<L> distance;
   Shifts change, vel;  // how vertices move now
   Turns motion, spin;  // and bodies
 
@@ -186,14 +187,15 @@ struct Geometry : Inputs<T> {
   }
   // Places the points of those that go so far by now that they may touch after all; as foreseen, like the others.
   void reach() {
-    std::vector<Far> late, kept;
-    for (const Far& f : far) (any((edges[f.edge].real > T(0)) & ~(f.gap > moved(f))) ? late : kept).push_back(f);
-    if (late.empty()) return;
+    const auto touches = [&](const Far& f) { return any((edges[f.edge].real > T(0)) & ~(f.gap > moved(f))); };
+    const auto waits = [&](const Far& f) { return !touches(f); };
+    if (std::all_of(far.begin(), far.end(), waits)) return;
+    const auto late = std::stable_partition(far.begin(), far.end(), waits);
     const Shifts shifts = change;
     const Turns turns = motion;
     foresee();
-    for (const Far& f : late) place(f.edge, f.body);
-    far = kept, change = shifts, motion = turns;
+    for (auto f = late; f != far.end(); ++f) place(f->edge, f->body);
+    far.erase(late, far.end()), change = shifts, motion = turns;
   }
 
   static L size(const R& x) { return root<T>(dot(x, x)); }

@@ -17,15 +17,15 @@ struct Block : Geometry<T> {
   typedef Lanes<T> L;
   typedef Vec<T> R;
   struct Step {  // what a sweep starts from, and what it finds
-    std::vector<Vec<T>> force;    // on vertices, from the sweep before
-    std::vector<Wrench<T>> push;  // on bodies, likewise
-    std::vector<Force<T>> found;
-    std::vector<int> pressed, rubbing;  // points that are active in some scene
+    List<Vec<T>> force;    // on vertices, from the sweep before
+    List<Wrench<T>> push;  // on bodies, likewise
+    List<Force<T>> found;
+    List<int> pressed, rubbing;  // points that are active in some scene
   };
-  std::vector<Step> steps;
-  std::vector<Vec<T>> force;
-  std::vector<Wrench<T>> push;
-  std::vector<L> active, load_, many, count, levers;
+  List<Step> steps;
+  List<Vec<T>> force;
+  List<Wrench<T>> push;
+  List<L> active, load_, many, count, levers;
 
   explicit Block(const Sizes& n)
       : G(n), steps(n.sweeps), active(points.size()) {
@@ -41,7 +41,7 @@ struct Block : Geometry<T> {
   }
 
   // Sums over active points that all softness is made of; `root` is the turning or the sliding part of a point.
-  void gather(const std::vector<int>& list, L Point<T>::*root) {
+  void gather(const List<int>& list, L Point<T>::*root) {
     const L zero{};
     load_.assign(n.vertices, zero), many.assign(n.vertices, zero);
     count.assign(n.bodies, zero), levers.assign(n.bodies, zero);
@@ -61,9 +61,9 @@ struct Block : Geometry<T> {
     return friction ? sum + lever * lever * (i + j) * many[v] : sum;
   }
   // Adds the derivative of the softness of all points, given as `by`.
-  void soften(const std::vector<int>& list, const std::vector<L>& by, L Point<T>::*root, bool friction, Inputs<T>& to) {
+  void soften(const List<int>& list, const List<L>& by, L Point<T>::*root, bool friction, Inputs<T>& to) {
     const L zero{};
-    std::vector<L> dload(n.vertices, zero), dlevers(n.bodies, zero);
+    List<L> dload(n.vertices, zero), dlevers(n.bodies, zero);
     for (int p : list) {
       const Point<T>& a = points[p];
       const int v = edge(p), w = n.after[v], k = body(p);
@@ -163,11 +163,11 @@ struct Block : Geometry<T> {
   }
 
   // Goes through a sweep backwards: `by` holds derivatives by its forces, then by those before.
-  void backward(int s, std::vector<Force<T>>& by, std::vector<R>& df, std::vector<Wrench<T>>& dm, Inputs<T>& to) {
+  void backward(int s, List<Force<T>>& by, List<R>& df, List<Wrench<T>>& dm, Inputs<T>& to) {
     Step& now = steps[s];
     const L zero{}, one = zero + T(1);
-    std::vector<L> soft(points.size(), zero);
-    std::vector<Force<T>> later(points.size());
+    List<L> soft(points.size(), zero);
+    List<Force<T>> later(points.size());
     // Where nothing presses, forces are constant. Else they count for the next sweep and by what they exert.
     later.swap(by);
     for (int p : now.rubbing) by[p] = later[p];
@@ -228,19 +228,19 @@ struct Block : Geometry<T> {
   }
   // Goes back from points to ropes and bodies. A point that has never been active has no part in the forces.
   void begin(Inputs<T>& to) {
-    std::vector<char> used(points.size());
+    List<char> used(points.size());
     for (const Step& s : steps)
       for (int p : s.pressed) used[p] = 1;
     this->foresee();
-    std::vector<R> dvel(n.vertices);
-    std::vector<Wrench<T>> dspin(n.bodies);
+    List<R> dvel(n.vertices);
+    List<Wrench<T>> dspin(n.bodies);
     for (int p = 0; p < int(points.size()); ++p)
       if (used[p]) this->place_back(p, to, dvel, dspin);
     for (int v = 0; v < n.vertices; ++v) to.vertices[v].vel += dvel[v];
     for (int k = 0; k < n.bodies; ++k) to.bodies[k].vel += dspin[k].force, to.bodies[k].omega += dspin[k].torque;
   }
   // Adds the derivative by the motion and the geometry of the slip, given as `by`.
-  void slipped(int p, const R& by, std::vector<R>& df, std::vector<Wrench<T>>& dm, Inputs<T>& to) const {
+  void slipped(int p, const R& by, List<R>& df, List<Wrench<T>>& dm, Inputs<T>& to) const {
     const R& a = points[p].normal;
     const R all = seen(p, change, motion).friction, across = by - a * dot(a, by);
     to.points[p].normal -= by * dot(a, all) + all * dot(a, by);
@@ -286,7 +286,7 @@ static void back(const Fields<const T>& in, const T* const* by, const T* const* 
     block.all([&](auto& part, int k) { fetch(part, in[k], b, n.scenes); });
     block.run();
     Inputs<T> to(n);
-    std::vector<Force<T>> forces(block.points.size());
+    List<Force<T>> forces(block.points.size());
     fetch(block.force, by, b, n.scenes);
     fetch(block.push, body_by, b, n.scenes);
     for (int s = n.sweeps; s--;) block.backward(s, forces, block.force, block.push, to);

@@ -11,13 +11,13 @@ struct Pairs {
   static constexpr int FIELDS = sizeof(Touch<T, 0>) / sizeof(P), ALL = sizeof(Member<T, 0>) / sizeof(P), PLACE = 18;
   const L zero{}, one = zero + T(1);
   Sizes n;
-  std::vector<Candidate> candidates;
-  std::vector<int> start, first, owner;  // candidates and contacts of each pair; pair of each contact
-  std::vector<Member<T, 0>> bodies;
-  std::vector<char> active;  // pairs that may touch
-  std::vector<Found<T>> found;
-  std::vector<Touch<T, 0>> touches, contacts;
-  std::vector<L> chosen;  // candidate of each contact, within its pair
+  List<Candidate> candidates;
+  List<int> start, first, owner;  // candidates and contacts of each pair; pair of each contact
+  List<Member<T, 0>> bodies;
+  List<char> active;  // pairs that may touch
+  List<Found<T>> found;
+  List<Touch<T, 0>> touches, contacts;
+  List<L> chosen;  // candidate of each contact, within its pair
 
   explicit Pairs(const Sizes& n) : n(n), bodies(n.bodies), active(n.pairs) {
     for (int p = 0; p < n.pairs; ++p) {
@@ -72,7 +72,7 @@ struct Pairs {
 
   void choose(int p) {
     const int from = start[p], count = start[p + 1] - from, size = first[p + 1] - first[p];
-    std::vector<L> rank(count), far(count, zero);
+    List<L> rank(count), far(count, zero);
     for (int c = 0; c < count; ++c) {
       const Candidate& each = candidates[from + c];
       P late;
@@ -108,7 +108,7 @@ struct Pairs {
   }
 
   // Adds the derivative of a candidate by its bodies, from those of the contacts that it was chosen for.
-  void place_back(int p, int candidate, const std::vector<Touch<T, 0>>& part, std::vector<Member<T, 0>>& to) {
+  void place_back(int p, int candidate, const List<Touch<T, 0>>& part, List<Member<T, 0>>& to) {
     const Candidate& each = candidates[candidate];
     L by[FIELDS] = {};
     bool used = false;

@@ -7,8 +7,8 @@ template <typename T>
 struct Blocks {
   typedef Lanes<T> L;
   int count, n;
-  std::vector<char> fill;
-  std::vector<L> a;
+  List<char> fill;
+  List<L> a;
   explicit Blocks(int count) : count(count), n(6 * count), fill(count * count), a(n * n) {}
 
   L& at(int i, int j) { return a[i * n + j]; }
@@ -36,14 +36,14 @@ struct Blocks {
       });
     }
   }
-  void solve(std::vector<L>& x) {
+  void solve(List<L>& x) {
     for (int k = 0; k < n; ++k) each(k, k + 1, [&](int i) { x[i] -= at(i, k) * x[k]; });
     for (int k = n; k--;) {
       each(k, k + 1, [&](int j) { x[k] -= at(k, j) * x[j]; });
       x[k] /= at(k, k);
     }
   }
-  void solve_transposed(std::vector<L>& x) {
+  void solve_transposed(List<L>& x) {
     for (int k = 0; k < n; ++k) {
       x[k] /= at(k, k);
       each(k, k + 1, [&](int j) { x[j] -= at(k, j) * x[k]; });

@@ -33,17 +33,17 @@ struct Work {
     bool used;
   };
   struct Sweep {
-    std::vector<T> force;  // on vertices, from the sweep before
-    std::vector<F> found;
-    std::vector<char> active;
+    List<T> force;  // on vertices, from the sweep before
+    List<F> found;
+    List<char> active;
   };
   const P zero{T(0)}, one{T(1)};
   Sizes n;
   const int size;
-  std::vector<T> vertices, by, change, force, load;  // field by field
-  std::vector<Group> groups;
-  std::vector<Pair<T>> parts;  // derivatives by the pairs
-  std::vector<Sweep> sweeps;
+  List<T> vertices, by, change, force, load;  // field by field
+  List<Group> groups;
+  List<Pair<T>> parts;  // derivatives by the pairs
+  List<Sweep> sweeps;
   T law[LAWS], by_law[LAWS];
 
   explicit Work(const Sizes& n)
@@ -208,10 +208,10 @@ struct Work {
   }
   // Goes through a sweep backwards: `later` holds derivatives by its forces, then by those before; `force` by what the
   // forces exert on vertices, likewise.
-  void backward(int s, std::vector<F>& later, std::vector<F>& soft) {
+  void backward(int s, List<F>& later, List<F>& soft) {
     const Sweep& now = sweeps[s];
     move(now);
-    std::vector<T> moved(3 * size);
+    List<T> moved(3 * size);
     for (size_t k = 0; k < groups.size(); ++k) {
       if (!now.active[k]) {
         later[k] = F{zero, {zero, zero, zero}};
@@ -247,8 +247,8 @@ struct Work {
   }
 
   // Adds the derivative of how far pairs part and slip under a newton.
-  void soften_back(const std::vector<F>& soft) {
-    std::vector<T> dload(size);
+  void soften_back(const List<F>& soft) {
+    List<T> dload(size);
     for (size_t k = 0; k < groups.size(); ++k) {
       const Group& g = groups[k];
       if (!g.used) continue;
@@ -307,7 +307,7 @@ struct Work {
     Pair<T> nothing;
     for (int i = 0; i < ALL; ++i) ((P*)&nothing)[i] = zero;
     parts.assign(groups.size(), nothing);
-    std::vector<F> later(groups.size(), none), soft(groups.size(), none);
+    List<F> later(groups.size(), none), soft(groups.size(), none);
     std::fill(by.begin(), by.end(), T(0)), std::fill(by_law, by_law + LAWS, T(0));
     for (int s = int(n.sweeps); s--;) backward(s, later, soft);
     soften_back(soft);

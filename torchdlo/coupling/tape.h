@@ -10,8 +10,8 @@ struct Tape {
     Lanes<T> da, db;
     int a, b;
   };
-  std::vector<Node> nodes;
-  std::vector<Lanes<T>> by;  // derivative of the result by each number
+  List<Node> nodes;
+  List<Lanes<T>> by;  // derivative of the result by each number
 
   static Tape& on() {
     static thread_local Tape tape;

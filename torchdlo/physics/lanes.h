@@ -2,7 +2,9 @@
 #pragma once
 #include <cmath>
 #include <cstdint>
+#include <cstdlib>
 #include <cstring>
+#include <new>
 #include <vector>
 
 // As many numbers as a register holds: compilers take comparisons of longer vectors apart, number by number.
@@ -21,6 +23,40 @@ template <typename T>
 using Lanes = typename Pack<T>::type;
 template <typename T>
 constexpr int WIDTH = LANES_BYTES / sizeof(T);
+
+// Memory that was given back is given out again, by each thread: that of aligned vectors takes long to find.
+template <class S>
+struct Kept {
+  typedef S value_type;
+  Kept() {}
+  template <class O>
+  Kept(const Kept<O>&) {}
+  static std::vector<void*>& shelf(size_t count, size_t& bytes) {
+    static thread_local auto* shelves = new std::vector<void*>[64];  // never gone: others may end later than it would
+    int k = 6;
+    while ((size_t(1) << k) < count * sizeof(S)) ++k;
+    bytes = size_t(1) << k;
+    return shelves[k];
+  }
+  S* allocate(size_t count) {
+    size_t bytes;
+    std::vector<void*>& free = shelf(count, bytes);
+    void* found = free.empty() ? std::aligned_alloc(64, bytes) : free.back();
+    if (!found) throw std::bad_alloc();
+    if (!free.empty()) free.pop_back();
+    return static_cast<S*>(found);
+  }
+  void deallocate(S* gone, size_t count) {
+    size_t bytes;
+    shelf(count, bytes).push_back(gone);
+  }
+  template <class O>
+  bool operator==(const Kept<O>&) const { return true; }
+  template <class O>
+  bool operator!=(const Kept<O>&) const { return false; }
+};
+template <class S>
+using List = std::vector<S, Kept<S>>;
 
 template <typename T>
 static inline Lanes<T> load(const T* from, int64_t count) {
@@ -41,14 +77,14 @@ static inline void store(T* to, const Lanes<T>& x, int64_t count) {
 }
 
 // Moves a block of scenes between arrays (rows, scenes), one per field, and structs of lanes.
-template <typename T, class S>
-static void fetch(std::vector<S>& to, const T* const* from, int64_t b, int64_t scenes) {
+template <typename T, class S, class A>
+static void fetch(std::vector<S, A>& to, const T* const* from, int64_t b, int64_t scenes) {
   const int64_t rows = to.size(), fields = sizeof(S) / sizeof(Lanes<T>);
   for (int64_t r = 0; r < rows; ++r)
     for (int64_t f = 0; f < fields; ++f) ((Lanes<T>*)&to[r])[f] = load(from[f] + r * scenes + b, scenes - b);
 }
-template <typename T, class S>
-static void put(const std::vector<S>& from, T* const* to, int64_t b, int64_t scenes) {
+template <typename T, class S, class A>
+static void put(const std::vector<S, A>& from, T* const* to, int64_t b, int64_t scenes) {
   const int64_t rows = from.size(), fields = sizeof(S) / sizeof(Lanes<T>);
   for (int64_t r = 0; r < rows; ++r)
     for (int64_t f = 0; f < fields; ++f)
