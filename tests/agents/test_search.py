@@ -346,6 +346,24 @@ def test_the_hybrid_has_slopes_of_the_best_quarter() -> None:
         assert sorted(chosen.tolist()) == pytest.approx(sorted(island.tolist())[-5:])
 
 
+def test_islands_that_are_behind_go_on_from_the_best_trajectory_of_all() -> None:
+    plan = Settings("hybrid", episodes=1200, population=60, hold=5).plan(Push())
+    search, told, away = METHODS["hybrid"](plan, torch.Generator().manual_seed(0)), None, []
+    none = torch.zeros(60, dtype=torch.bool)
+    for k in range(plan.iterations):
+        ask = search.send(told)
+        # The second island of three is ahead from the start, the first one follows, the third one is last.
+        value = torch.tensor([1.0, 2.0, 0.0], dtype=torch.float64).repeat_interleave(20)
+        if k == 0:
+            value[25] += 1
+            leading = ask.points[25]
+        away.append([float((part - leading).norm(dim=-1).median()) for part in ask.points.split(20)])
+        told = Told(value, -value, 0 * value, none, none, 0 * ask.points)
+    first, _, last = zip(*away, strict=True)
+    assert max(last[8], first[14]) < 0.3 * min(*first[:8], *last[:8])
+    assert first[8] > 0.9 * min(first[:8]), "the first island goes on until later"
+
+
 def test_slopes_that_grew_beyond_measure_are_cut() -> None:
     # Back in time, from the last of thirty actions, slopes double with each.
     growth = 2.0 ** torch.arange(29, -1, -1, dtype=torch.float64)

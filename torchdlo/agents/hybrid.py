@@ -11,6 +11,9 @@ iteration, and both have the slopes of the best quarter of what they play:
 
 CMA-ES begins; then the part goes on that gained more lately, but each in its turn. Where both begin in a rehearsal, the
 best of its iterations are the first to be played in the problem itself.
+
+Islands that have fallen behind seldom catch up: they are given up in favour of the best one, half of them first. In
+their place, CMA-ES searches about the best trajectory of all, in small steps.
 """
 
 from __future__ import annotations
@@ -42,6 +45,12 @@ _SURGE, _CUT = 3, 10.0
 """Slopes of all actions are believed up to so many times the largest one of the last third of them."""
 _SHORT = 0.1
 """Share of the first step from which shorter ones are given up."""
+_GIVEN_UP = {0.4: 0.5, 0.7: 1.0}
+"""Which shares of the islands are given up if they are behind, after which shares of the iterations."""
+_CLOSE = 0.2
+"""First spread about the best trajectory of all, over that of other beginnings."""
+_BEHIND = 1e-4
+"""Share of the largest value by which an island has to be behind."""
 _APART = 0.2
 """How far tools go their own ways where they go 1 together: they hold on to the same things."""
 
@@ -49,14 +58,22 @@ _APART = 0.2
 def hybrid(plan: Plan, rng: torch.Generator) -> Search:
     """Search on islands, see above."""
     count = max(1, plan.population // _ISLAND)  # of islands
-    sizes = [(plan.population + k) // count for k in range(count)]
-    seeds = torch.randint(2**31, (count,), generator=rng).tolist()
-    islands = [
-        _island(replace(plan, population=size), torch.Generator().manual_seed(seed))
-        for size, seed in zip(sizes, seeds, strict=True)
-    ]
+    plans = [replace(plan, population=(plan.population + k) // count) for k in range(count)]
+    rngs = [torch.Generator().manual_seed(seed) for seed in torch.randint(2**31, (count,), generator=rng).tolist()]
+    islands = [_island(*each) for each in zip(plans, rngs, strict=True)]
     parts: list[Told | None] = [None] * count
-    while True:
+    given_up = {math.ceil(when * plan.iterations): share for when, share in _GIVEN_UP.items()}
+    # What was measured in a rehearsal or in milder worlds does not compare with what comes after.
+    anew = {*range(math.ceil(plan.drifts * plan.iterations) + 1), plan.rehearsals}
+    top: list[tuple[float, Tensor]] = []
+    for k in itertools.count():
+        if k in anew:
+            top = [(-math.inf, torch.empty(0))] * count
+        order = sorted(range(count), key=lambda j: -top[j][0])
+        value, leading = top[order[0]]
+        for j in order[count - round(given_up.get(k, 0.0) * (count - 1)) :]:
+            if top[j][0] < value - _BEHIND * abs(value):
+                islands[j], parts[j] = _island(plans[j], rngs[j], k, leading), None
         asks = [island.send(told) for island, told in zip(islands, parts, strict=True)]
         counts = [len(ask.points) for ask in asks]
 
@@ -67,17 +84,27 @@ def hybrid(plan: Plan, rng: torch.Generator) -> Search:
 
         told = yield Ask(asks[0].encoding, torch.cat([ask.points for ask in asks]), sum(a.graded for a in asks), pick)
         parts = told.split(counts)
+        for j, (ask, part) in enumerate(zip(asks, parts, strict=True)):
+            at = int(part.value.argmax())
+            top[j] = max(top[j], (float(part.value[at]), ask.points[at]), key=lambda found: found[0])
 
 
-def _island(plan: Plan, rng: torch.Generator) -> Search:
-    """Search with sweeps, rounds, CMA-ES and descent."""
-    encoding, coarse, fine = plan.encoding(1), _Evolution(plan, rng), Descent(plan, rng)
+def _island(plan: Plan, rng: torch.Generator, first: int = 0, about: Tensor | None = None) -> Search:
+    """Search with sweeps, rounds, CMA-ES and descent.
+
+    Args:
+        plan: of this island.
+        rng: where random numbers come from.
+        first: iterations that are over.
+        about: actions to begin with in place of sweeps and rounds [m], shape (T A,).
+    """
+    encoding, coarse, fine = plan.encoding(1), _Evolution(plan, rng, about), Descent(plan, rng)
     graded = fine.count
     drifts = math.ceil(plan.drifts * plan.iterations)
-    alone = max(drifts, math.ceil(_COARSE * plan.iterations))
-    gain, last, top = {coarse: 0.0, fine: math.inf}, {coarse: 0, fine: 0}, -math.inf
+    alone = max(drifts, first + 1 if first else math.ceil(_COARSE * plan.iterations))
+    gain, last, top = {coarse: 0.0, fine: math.inf}, {coarse: first, fine: first}, -math.inf
     rehearsed = Rehearsed(plan)
-    for k in itertools.count():
+    for k in itertools.count(first):
         if k == plan.rehearsals > 0:
             x = rehearsed.actions
             told = yield Ask(encoding, x, min(graded, len(x)))
@@ -125,13 +152,19 @@ def _tame(slope: Tensor, horizon: int) -> Tensor:
 
 
 class _Evolution:
-    """CMA-ES over way-points from the best of sweeps and rounds, with lines; asked and told by turns."""
+    """CMA-ES over way-points, with lines; asked and told by turns.
 
-    def __init__(self, plan: Plan, rng: torch.Generator) -> None:
-        self.plan, self.rng, self.encoding = plan, rng, plan.encoding(plan.hold, _APART)
+    It begins with the best of sweeps and rounds, or adds its way-points to actions (T A,) that are given.
+    """
+
+    def __init__(self, plan: Plan, rng: torch.Generator, about: Tensor | None = None) -> None:
+        self.plan, self.rng, self.encoding, self.about = plan, rng, plan.encoding(plan.hold, _APART), about
         self.fresh = max(1, round(_FRESH * plan.iterations))
         self.tried: list[tuple[Tensor, Told]] = []
+        self.x = torch.zeros(0, self.encoding.size, dtype=torch.float64)
         self.found: Any = None
+        if about is not None:
+            self.found = strategy(about.new_zeros(self.encoding.size), _CLOSE * plan.sigma, plan.population, rng)
         self.lines: _Lines | None = None
         """None lets them start anew from what is told next."""
 
@@ -142,7 +175,8 @@ class _Evolution:
         else:
             moved = self.x[:0] if self.lines is None else self.encoding.project(self.lines.moved(self.found))
             self.x = drawn(self.found, self.encoding, moved)
-        return self.encoding.decode(self.x).flatten(1)
+        actions = self.encoding.decode(self.x).flatten(1)
+        return actions if self.about is None else self.plan.encoding(1).project(self.about + actions)
 
     def tell(self, _: Tensor, told: Told) -> None:
         """Learn from how that went."""
