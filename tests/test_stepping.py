@@ -83,7 +83,8 @@ def test_compiled_steps_tell_tensors_of_different_kinds_apart(graphs):
             inputs = tree.to(inputs, torch.float32)
         found, wanted = (run(*inputs).rods.pos for run in (step, scene.stepper(made, compiled=False)))
         assert found.shape == wanted.shape and found.dtype == wanted.dtype
-        assert torch.allclose(found, wanted, rtol=1e-12 if double else 1e-5, atol=0 if double else 1e-8)
+        # The same operations in the same order: rounding at most.
+        assert torch.allclose(found, wanted, rtol=1e-12 if double else 1e-6, atol=0)
     assert graphs() == 3
 
 

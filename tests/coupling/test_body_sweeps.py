@@ -71,8 +71,8 @@ def rolled(made, frames: int) -> tuple[torch.Tensor, list[torch.Tensor]]:
 
 @pytest.mark.parametrize("choices", CHOICES, ids=["default", "smooth", "rounds"])
 def test_the_kernel_and_tensor_operations_agree_with_their_gradients(choices, monkeypatch):
-    # Eleven scenes fill one block of lanes and a part of the next. Rounding of 1e-16 grows with the stiffness of
-    # contact, 1e4, and from step to step.
+    # Eleven scenes fill one block of lanes at least, and a part of another. Rounding of 1e-16 grows with the stiffness
+    # of contact, 1e4, and from step to step.
     solids = list(SOLIDS.values())
     made = crossing(11, solids, **choices)
     found, gradient = rolled(made, 3)

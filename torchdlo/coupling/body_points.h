@@ -178,7 +178,7 @@ struct Geometry : Inputs<T> {
     near.clear(), far.clear();
     for (int k = 0; k < n.bodies; ++k)
       for (int v = 0; v < n.vertices; ++v) {
-        const Far f = apart(v, k);
+        const Far f = distant(v, k);
         if (any((edges[v].real > T(0)) & ~(f.gap > edges[v].radius + T(2) * moved(f))))
           place(v, k);
         else
@@ -204,7 +204,8 @@ struct Geometry : Inputs<T> {
     const L i = size(change[f.edge]), j = size(change[n.after[f.edge]]);
     return (i > j ? i : j) + size(motion[f.body].force) + size(motion[f.body].torque) * f.arm;
   }
-  Far apart(int v, int k) const {
+  // How far an edge is from the ball about a body, or from a plane.
+  Far distant(int v, int k) const {
     const Solid<T>& b = bodies[k];
     const R from = vertices[v].pos - b.pos, way = vertices[n.after[v]].pos - vertices[v].pos;
     const R at = b.local(from) + b.offset;
