@@ -27,6 +27,7 @@ class Plain:
 
     choices: ClassVar[dict[str, Any]] = {}
     touch: ClassVar[tuple[tuple[float, float, float], ...]] = ()
+    tools: ClassVar[tuple[tuple[float, float, float], ...]] = ()
 
     def rehearsal(self) -> Any:
         """There is none."""

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from tests.agents.problems import Plain, judged
-from torchdlo.agents.plan import rounds
+from torchdlo.agents.plan import drags, rounds
 from torchdlo.agents.search import Settings, optimize
 from torchdlo.agents.tasks import problem
 
@@ -23,6 +23,7 @@ class Orbit(Plain):
     group: int = 3
     limit: float = 0.01
     touch: tuple[tuple[float, float, float], ...] = ((0.3, 0.4, 0.0),)
+    tools: tuple[tuple[float, float, float], ...] = ()
     axis: tuple[float, float] = (0.3, 0.4)
 
     def evaluate(self, actions):
@@ -55,10 +56,33 @@ def test_rounds_go_straight_to_a_circle_about_a_thing_and_on_along_it():
     assert (leg - leg[:, -1:] * torch.arange(1, 21)[:, None] / 20).abs().max() < 1e-6
 
 
-def test_rounds_need_something_to_touch():
+def test_drags_go_straight_over_a_thing_and_tools_draw_nearer():
+    aim, tools = torch.tensor([0.3, 0.4, 0.0]), torch.tensor([[-0.3, 0.0, 0.0], [0.2, 0.1, 0.0], [0.1, -0.1, 0.0]])
+    pulled = Orbit(width=9, touch=(tuple(aim.tolist()),), tools=tuple(map(tuple, tools.tolist())))
+    plan = Settings(method="hybrid", episodes=60, population=60, hold=10).plan(pulled)
+    encoding = plan.encoding(10, 0.2)
+    points = drags(plan, encoding, torch.Generator().manual_seed(0), 60)
+    actions = encoding.decode(points).unflatten(-1, (3, 3))
+    path = actions.cumsum(1)
+    assert actions.norm(dim=-1).max() <= 0.01
+    # Tools are cut to their limit one by one; those that are not stay in line with each other and with the thing.
+    slow = actions.norm(dim=-1).amax((1, 2)) < 0.0099
+    assert slow.sum() > 20
+    middle = path[slow].mean(2)
+    assert torch.linalg.cross(middle, aim.double().expand_as(middle)).abs().max() < 1e-9
+    assert (middle @ aim.double()).min() >= 0
+    share = (path[slow] - middle.unsqueeze(2)) / tools.where(tools != 0, torch.nan).double()
+    share = -share.nanmean((-2, -1))
+    # Nearer with every action, to no less than nothing; from hardly at all to nearly all of the way.
+    assert (share.diff(dim=1) >= -1e-9).all() and share[:, -1].max() < 1
+    assert share[:, -1].min() < 0.2 and share[:, -1].max() > 0.8
+
+
+@pytest.mark.parametrize("kind", [rounds, drags])
+def test_rounds_and_drags_need_something_to_touch(kind):
     plan = Settings(method="hybrid", episodes=40, population=20).plan(Orbit(touch=()))
     with pytest.raises(ValueError, match="nothing to touch"):
-        rounds(plan, plan.encoding(10), torch.Generator(), 3)
+        kind(plan, plan.encoding(10), torch.Generator(), 3)
 
 
 @pytest.mark.parametrize("touch", [(), ((0.3, 0.4, 0.0),)])
@@ -74,5 +98,8 @@ def test_tasks_say_where_their_bodies_and_matter_are_but_not_where_the_floor_is(
     assert cone == pytest.approx((0.58, -0.265, 0.063))
     lifting, gathering = problem("lifting").touch, problem("gathering").touch
     assert len(lifting) == 2 and len(gathering) == 3
+    assert problem("coiling").tools == ((0.0, 0.0, 0.0),)
+    left, right = problem("gathering").tools
+    assert left == pytest.approx((-0.42, 0.0, 0.0)) and right == pytest.approx((0.42, 0.0, 0.0))
     # The middle of the ball is given last.
     assert gathering[-1] == pytest.approx((0.25 - 0.29, 0.02 - 0.1, 0.07 - 0.012), abs=2e-3)

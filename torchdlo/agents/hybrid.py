@@ -4,9 +4,10 @@ Large populations live on islands that know nothing of each other: whichever way
 seldom comes back, and another one may go the other way. On each of them, two parts share the budget, iteration by
 iteration, and both have the slopes of the best quarter of what they play:
 
-1. Straight sweeps over what can be reached find out what there is to touch, and rounds about bodies what comes of it.
-   CMA-ES searches way-points from the best of them. A part of each population are the best points so far, moved down
-   their slope in the metric of the strategy; they are handed over as in Hansen 2011 (arXiv:1110.4181).
+1. Straight sweeps over what can be reached find out what there is to touch; rounds about bodies, and drags over them by
+   tools that draw nearer, find out what comes of it. CMA-ES searches way-points from the best of them. A part of each
+   population are the best points so far, moved down their slope in the metric of the strategy; they are handed over as
+   in Hansen 2011 (arXiv:1110.4181).
 2. The best points descend in all actions, see `lbfgs`.
 
 CMA-ES begins; then the part goes on that gained more lately, but each in its turn. Where both begin in a rehearsal, the
@@ -28,7 +29,7 @@ from torch import Tensor
 
 from torchdlo.agents.cmaes import drawn, strategy
 from torchdlo.agents.lbfgs import TRIES, Descent
-from torchdlo.agents.plan import Ask, Plan, Rehearsed, Search, Told, best, ranking, rounds, sweeps, walks
+from torchdlo.agents.plan import Ask, Plan, Rehearsed, Search, Told, best, drags, ranking, rounds, sweeps, walks
 from torchdlo.agents.problem import Encoding
 
 __all__ = ["hybrid"]
@@ -199,12 +200,18 @@ class _Evolution:
 
 
 def _beginnings(plan: Plan, encoding: Encoding, rng: torch.Generator) -> Tensor:
-    """Return points of sweeps and of random walks, and as many of rounds where there is something to touch."""
+    """Return points of sweeps and of random walks.
+
+    Half are rounds where there is something to touch; several tools drag what they hold over it in most others.
+    """
     x = sweeps(plan, encoding, rng)
     x[1::2] = encoding.project(walks(plan, rng))[1::2]
     if plan.touch:
-        half = torch.arange(len(x)) % 6 > 2
-        x[half] = rounds(plan, encoding, rng, int(half.sum()))
+        turn = torch.arange(len(x)) % 6
+        if len(plan.tools) > 1:
+            dragged = (turn == 1) | (turn == 2)
+            x[dragged] = drags(plan, encoding, rng, int(dragged.sum()))
+        x[turn > 2] = rounds(plan, encoding, rng, int((turn > 2).sum()))
     return x
 
 

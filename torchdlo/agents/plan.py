@@ -14,7 +14,8 @@ from torch import Tensor
 
 from torchdlo.agents.problem import Encoding, Problem
 
-__all__ = ["Ask", "Plan", "Rehearsed", "Search", "Told", "best", "handed", "ranking", "rounds", "sweeps", "walks"]
+__all__ = ["Ask", "Plan", "Rehearsed", "Search", "Told", "best", "drags", "handed"]
+__all__ += ["ranking", "rounds", "sweeps", "walks"]
 
 _ALIKE = 1e-4
 """Share of the largest return by which returns differ that are not to be told apart."""
@@ -111,6 +112,8 @@ class Plan:
     """Iterations that are played in a problem much like this one; their results do not compare with later ones."""
     touch: tuple[tuple[float, float, float], ...] = ()
     """Where there are things to touch, see `Problem.touch`."""
+    tools: tuple[tuple[float, float, float], ...] = ()
+    """Where tools are at the start, see `Problem.tools`."""
 
     @classmethod
     def of(cls, problem: Problem, population: int, iterations: int, **choices: Any) -> Plan:
@@ -119,7 +122,8 @@ class Plan:
         # 0.05 m, 1 mm and 1 um where tools go 1 cm per action and way-points have ten.
         lengths = {"sigma": 0.5 * hold * problem.limit, "rate": 0.1 * problem.limit, "last": 1e-4 * problem.limit}
         sizes = (problem.horizon, problem.width, problem.group, problem.limit)
-        return cls(*sizes, population, iterations, touch=problem.touch, **(lengths | choices))
+        places = {"touch": problem.touch, "tools": problem.tools}
+        return cls(*sizes, population, iterations, **(places | lengths | choices))
 
     def encoding(self, hold: int, apart: float | None = None) -> Encoding:
         """Return the encoding with `hold` actions per way-point, see `Encoding`."""
@@ -179,9 +183,39 @@ def sweeps(plan: Plan, encoding: Encoding, rng: torch.Generator) -> Tensor:
     ways = heading * length
     each = torch.arange(count)
     ways = torch.where((each % 4 < 2)[:, None, None, None], ways, ways[:, :, :1])
-    leg = torch.arange(knots)[None] * (1 + each % 3)[:, None] // knots
-    moves = ways[each[:, None], leg]
+    moves = ways[each[:, None], _legs(knots, count)]
     return encoding.project(encoding.encode(torch.cat([torch.zeros_like(moves[:1]), moves[1:]])))
+
+
+def drags(plan: Plan, encoding: Encoding, rng: torch.Generator, count: int) -> Tensor:
+    """Return points of ways straight over a thing that can be touched, by tools that draw nearer, (count, size).
+
+    What tools hold between them comes to lie about the things on its way, and is drawn together there. Ways have one to
+    three legs, which differ in how far tools go and in how much nearer they draw.
+    """
+    things, leg = _targets(plan), _legs(encoding.knots, count)
+    aim = things[torch.randint(len(things), (count,), generator=rng)]
+    ahead = aim / torch.linalg.vector_norm(aim, dim=-1, keepdim=True).clamp(min=1e-9)
+    speed = encoding.reach * torch.rand(count, 3, generator=rng, dtype=torch.float64).gather(1, leg)
+    nearer = torch.rand(count, 3, generator=rng, dtype=torch.float64).gather(1, leg)
+    # All of it together is a share of the way to where tools would meet.
+    nearer = nearer / nearer.sum(1, keepdim=True) * torch.rand(count, 1, generator=rng, dtype=torch.float64)
+    together = speed[..., None, None] * ahead[:, None, None]
+    apart = torch.tensor(plan.tools, dtype=torch.float64)
+    return encoding.project(encoding.encode(together - nearer[..., None, None] * apart))
+
+
+def _legs(knots: int, count: int) -> Tensor:
+    """Return to which leg each way-point belongs, of one, two and three by turns, shape (count, knots)."""
+    return torch.arange(knots)[None] * (1 + torch.arange(count) % 3)[:, None] // knots
+
+
+def _targets(plan: Plan) -> Tensor:
+    """Return where things are, and the middle of several [m], shape (N, 3)."""
+    if not plan.touch:
+        raise ValueError("there is nothing to touch; expected a plan with touch")
+    things = torch.tensor(plan.touch, dtype=torch.float64)
+    return torch.cat([things, things.mean(0, keepdim=True)]) if len(things) > 1 else things
 
 
 def rounds(plan: Plan, encoding: Encoding, rng: torch.Generator, count: int) -> Tensor:
@@ -191,15 +225,11 @@ def rounds(plan: Plan, encoding: Encoding, rng: torch.Generator, count: int) -> 
     the thing; the others are level, somewhat higher than its middle. The middle of all things is one, too. Tools go
     together.
     """
-    if not plan.touch:
-        raise ValueError("rounds: there is nothing to touch; expected a plan with touch")
 
     def rand() -> Tensor:
         return torch.rand(count, 1, generator=rng, dtype=torch.float64)
 
-    things = torch.tensor(plan.touch, dtype=torch.float64)
-    if len(things) > 1:
-        things = torch.cat([things, things.mean(0, keepdim=True)])
+    things = _targets(plan)
     up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
     middle = things[torch.randint(len(things), (count,), generator=rng)] + _ROUND[1] * plan.limit * rand() * up
     radius = plan.limit * _ROUND[0] * (_ROUND[1] / _ROUND[0]) ** rand()

@@ -43,6 +43,8 @@ class Problem(Protocol):
     """Largest length of a group in one action [m]."""
     touch: tuple[tuple[float, float, float], ...]
     """Where bodies are, from the middle of all tools at the start [m]; () if there are none, or groups are no ways."""
+    tools: tuple[tuple[float, float, float], ...]
+    """Where tools are at the start, from the middle of them all [m]; () if groups are no ways."""
     choices: dict[str, Any]
     """What else its results depend on, as plain data."""
 

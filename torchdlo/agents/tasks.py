@@ -68,15 +68,24 @@ class TaskProblem:
         """Greatest way of a tool in an action [m]."""
         return self.task.reach
 
-    @functools.cached_property
+    @property
     def touch(self) -> tuple[tuple[float, float, float], ...]:
         """Where solids and matter are, from the middle of the tools [m]; planes are everywhere."""
+        return self._places[0]
+
+    @property
+    def tools(self) -> tuple[tuple[float, float, float], ...]:
+        """Where tools are at the start, from the middle of them all [m]."""
+        return self._places[1]
+
+    @functools.cached_property
+    def _places(self) -> tuple[tuple[tuple[float, float, float], ...], ...]:
         scene, _, state = self.task.start(1, like=torch.zeros((), dtype=torch.float64))
         things = [state.bodies.pos[0, k] for k, body in enumerate(scene.bodies) if body.shape != "plane"]
         if state.matter:
             things.append(state.matter.pos[0].mean(0))
-        middle = state.rods.pos[0, list(self.task.arms.vertex)].mean(0)
-        return tuple(tuple((thing - middle).tolist()) for thing in things)
+        tools = state.rods.pos[0, list(self.task.arms.vertex)]
+        return tuple(tuple(tuple((p - tools.mean(0)).tolist()) for p in places) for places in (things, tools))
 
     @property
     def choices(self) -> dict[str, Any]:

@@ -91,8 +91,8 @@ class _Port:
 
     def __init__(self, problem: Problem, stand_in: Problem | None, desk: SimpleQueue[_Wish | None]) -> None:
         self.name, self.choices = problem.name, problem.choices
-        self.horizon, self.width, self.touch = problem.horizon, problem.width, problem.touch
-        self.group, self.limit = problem.group, problem.limit
+        self.horizon, self.width, self.group = problem.horizon, problem.width, problem.group
+        self.limit, self.touch, self.tools = problem.limit, problem.touch, problem.tools
         self._problem, self._stand_in, self._desk = problem, stand_in, desk
 
     def _ask(self, actions: Tensor) -> Any:
