@@ -326,6 +326,27 @@ def test_replay_says_that_closed_over_tensors_get_no_gradient():
     assert "captured ones get none" in replay.replay.__doc__
 
 
+def test_replay_does_not_follow_outputs_that_nothing_depends_on():
+    class Counted(torch.autograd.Function):
+        """Hand on a tensor, and count how often its gradient is asked for."""
+
+        asked = 0
+
+        @staticmethod
+        def forward(ctx, x):
+            return x.clone()
+
+        @staticmethod
+        def backward(ctx, slope):
+            Counted.asked += 1
+            return slope
+
+    x = rand(3).requires_grad_()
+    used, unused = replay.replay(lambda t: (t.sin(), Counted.apply(t)), x)
+    assert torch.equal(torch.autograd.grad(used.sum(), x, retain_graph=True)[0], x.cos()) and Counted.asked == 0
+    assert torch.equal(torch.autograd.grad(unused.sum(), x)[0], torch.ones_like(x)) and Counted.asked == 1
+
+
 def test_rollout_rejects_bad_lengths_and_segments():
     scene, (params, state, controls) = build("explicit")
     none = tree.map(lambda c: c[:0], controls)

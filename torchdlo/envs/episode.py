@@ -216,7 +216,8 @@ def _run(episode: Episode, world: World, tool: Pose, held: Grasp, count: int) ->
         bodies = BodyTargets(*(p.expand(count, *p.shape) for p in (still.pos, still.quat)))
     grip = {name: g.expand(count, *g.shape) for name, g in grip.items()}
     controls = Control(pos, director.expand(count, *director.shape[-3:]), grip, bodies)
-    none = tree.leaves(world.state)[0][..., :0, :0]
+    # Nothing is kept; what has a history would be followed back to its start from every segment.
+    none = tree.leaves(world.state)[0].detach()[..., :0, :0]
     state, _ = rollout(
         episode.step, episode.params, world.state, controls, segment=episode.segment, keep=lambda _: none
     )

@@ -23,6 +23,7 @@ class _Replay(torch.autograd.Function):
         ctx: Any, run: Callable[[list[Tensor]], list[Tensor]], offload: bool, *inputs: Tensor
     ) -> tuple[Tensor, ...]:
         ctx.run = run
+        ctx.set_materialize_grads(False)
         ctx.devices = [x.device for x in inputs]
         kept = [x.cpu() if offload and x.is_cuda else x for x in inputs]
         ctx.save_for_backward(*kept)
