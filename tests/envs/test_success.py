@@ -230,6 +230,23 @@ def test_gathering_takes_objects_together_and_hands_clear():
     ]
 
 
+def test_the_further_objects_are_apart_and_the_nearer_hands_the_more_is_lacking():
+    state = tree.map(lambda x: x.expand(4, *x.shape[1:]).clone(), first("gathering"))
+    ball = state.matter.pos[0] - state.matter.pos[0].mean(0) + state.rods.pos.new_tensor([0.2, 0.0, 0.05])
+    bodies = state.bodies.pos.clone()
+    bodies[:, 1] = bodies.new_tensor([0.3, 0.0, 0.03])
+    bodies[:, 2] = bodies.new_tensor([0.2, 0.11, 0.03])
+    bodies[1:3, 2, 1] += bodies.new_tensor([0.03, 0.06])
+    bodies.requires_grad_()
+    state = tree.replace(state, bodies=tree.replace(state.bodies, pos=bodies))
+    state = tree.replace(state, matter=tree.replace(state.matter, pos=ball.expand(4, *ball.shape)))
+    closest = torch.tensor([0.07, 0.07, 0.07, 0.05], dtype=F64, requires_grad=True)
+    short = TASKS["gathering"]().shortfall(Seen(state, None, None, {"closest": closest}))
+    assert short[0] == 0 and 0 < short[1] < short[2] and short[3] > 0
+    moved, nearer = torch.autograd.grad(short.sum(), [bodies, closest])
+    assert moved.flatten(1).any(1).tolist() == [False, True, True, False] and nearer.nonzero().tolist() == [[3]]
+
+
 def test_c_rings_have_the_mass_of_their_parts_and_stand():
     ring = c_ring()
     # Three quarters of a torus with round ends, and a box; they overlap in a thin slice, counted in cells of 1.5 mm.

@@ -37,6 +37,10 @@ DRUMS = ((0.06, 0.033), (0.045, 0.03), (0.05, 0.025))
 """Radius and half height of rigid stand-ins for ball, pebble and cylinder [m]."""
 MASSES = (0.524, 0.123, 0.236)
 """Masses of the three [kg]."""
+NEAR, CLEAR = 0.16, 0.06
+"""Success: how far objects may be from each other, and how near hands may come [m]."""
+SHORT, SPARE = 10.0, 0.03
+"""What each missing condition counts at most, and by which share it is to be more than met."""
 
 
 @dataclass(frozen=True)
@@ -72,17 +76,20 @@ class Gathering(Task):
         """Return the centres of the objects [m], shape (B, 3, 3)."""
         return torch.cat([seen.state.matter.pos.mean(-2, keepdim=True), seen.state.bodies.pos[:, 1:]], -2)
 
+    def _apart(self, seen: Seen) -> Tensor:
+        """Return how far each two objects are from each other [m], shape (B, 3)."""
+        objects = self._objects(seen)
+        return geometry.distances(objects, objects.roll(1, -2)).diagonal(dim1=-2, dim2=-1)
+
     def _hands(self, seen: Seen) -> Tensor:
         """Return the distances of the hands to their nearest objects [m], shape (B, 2)."""
         return geometry.nearest(seen.tool.pos, self._objects(seen))
 
     def rewards(self, seen: Seen) -> dict[str, Tensor]:
         """Return exponentials of how far objects are from each other and from the rope, and of hands too close."""
-        objects = self._objects(seen)
-        apart = geometry.distances(objects, objects.roll(1, -2)).diagonal(dim1=-2, dim2=-1).sum(-1)
         return {
-            "together": torch.exp(-apart),
-            "rope": torch.exp(-0.1 * geometry.nearest(objects, seen.x).sum(-1)),
+            "together": torch.exp(-self._apart(seen).sum(-1)),
+            "rope": torch.exp(-0.1 * geometry.nearest(self._objects(seen), seen.x).sum(-1)),
             "clear": torch.exp(-100 * (0.1 - self._hands(seen)).clamp(min=0).sum(-1)),
         }
 
@@ -101,9 +108,14 @@ class Gathering(Task):
 
     def success(self, seen: Seen) -> Tensor:
         """Return whether the objects are together and no hand came too close."""
-        objects = self._objects(seen)
-        together = geometry.distances(objects, objects).amax((-1, -2)) <= 0.16
-        return together & (seen.notes["closest"] >= 0.06)
+        return (self._apart(seen) <= NEAR).all(-1) & (seen.notes["closest"] >= CLEAR)
+
+    def shortfall(self, seen: Seen) -> Tensor:
+        """Return what is missing of each condition of success: of each two objects, and of the nearer hand."""
+        apart = self._apart(seen) / (1 - SPARE) / NEAR - 1
+        clear = 1 - seen.notes["closest"] / (1 + SPARE) / CLEAR
+        missing = torch.cat([apart, clear[:, None]], -1).clamp(min=0)
+        return SHORT * (missing / (1 + missing)).sum(-1)
 
     def rehearsal(self) -> Rehearsal | None:
         """Return the task with rigid objects only."""
