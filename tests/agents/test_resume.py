@@ -15,7 +15,7 @@ import pytest
 from torch import Tensor
 
 from tests.agents.problems import Push, signature
-from torchdlo.agents.journal import program
+from torchdlo.agents.journal import _code, program
 from torchdlo.agents.problem import Outcome
 from torchdlo.agents.result import result_json, trajectory_json
 from torchdlo.agents.search import METHODS, Found, Robust, Settings, optimize
@@ -165,6 +165,15 @@ def test_only_the_same_search_goes_on(tmp_path: Path, monkeypatch: pytest.Monkey
 
 def test_results_depend_on_the_code_of_their_own_task_only() -> None:
     assert len({program("coiling"), program("wrapping"), program("push")}) == 3 and program("push") == program("reach")
+
+
+def test_results_depend_on_what_runs_not_on_comments(tmp_path: Path) -> None:
+    texts = ["x = 1\n", '"""Why."""\nx = 1  # one\n', "x = 2\n", "x = '1'\n"]
+    files = [tmp_path / f"{k}.py" for k in range(4)]
+    for file, text in zip(files, texts, strict=True):
+        file.write_text(text)
+    first, commented, *others = map(_code, files)
+    assert first == commented and len({first, *others}) == 3
 
 
 def test_results_of_another_search_are_noticed(tmp_path: Path) -> None:

@@ -6,6 +6,8 @@ same batches, and comes to where it was stopped by reading instead of playing: t
 
 from __future__ import annotations
 
+import ast
+import functools
 import hashlib
 import json
 import shutil
@@ -47,16 +49,29 @@ def _package_version() -> str:
 def program(name: str) -> str:
     """Return a hash of the code and the libraries that results of a problem depend on.
 
-    Other tasks do not belong to it, nor do presets: settings are written down themselves.
+    Other tasks do not belong to it, nor do presets: settings are written down themselves. Nor does what Python does not
+    run, such as comments.
     """
-    root, others = Path(__file__).parents[1], {"presets.py", *(f"{task}.py" for task in TASKS if task != name)}
+    root, others = Path(__file__).parents[1], {"presets.py", "journal.py", *(f"{t}.py" for t in TASKS if t != name)}
     found = hashlib.sha256(json.dumps(versions(), sort_keys=True).encode())
     for part in ("physics", "coupling", "envs", "agents", "data/robots", "scene.py"):
         files = [root / part] if part.endswith(".py") else sorted((root / part).rglob("*"))
         for file in files:
             if file.suffix in (".py", ".cpp", ".h", ".urdf") and file.name not in others:
-                found.update(file.name.encode() + file.read_bytes())
+                found.update(file.name.encode() + _code(file))
     return found.hexdigest()
+
+
+@functools.lru_cache(None)
+def _code(file: Path) -> bytes:
+    """Return what counts of a file: for Python its syntax tree without docstrings, else all."""
+    if file.suffix != ".py":
+        return file.read_bytes()
+    tree = ast.parse(file.read_bytes())
+    for node in ast.walk(tree):
+        if isinstance(node, (ast.Module, ast.ClassDef, ast.FunctionDef)) and ast.get_docstring(node) is not None:
+            del node.body[0]
+    return ast.dump(tree).encode()
 
 
 class Journal:

@@ -355,8 +355,7 @@ def play(
 
     Args:
         task: the task.
-        actions: shape (B, T, A), in metres and degrees; one sequence per scene of the batch. They need not be as many
-            as the task's horizon.
+        actions: shape (B, T, A), in metres and degrees; one sequence per scene, of any length.
         episode: what `prepare` returned for B scenes; made if not given.
         keep: what to keep of the world after every action, such as `places`.
         callback: told (actions done, actions in all) after each.
