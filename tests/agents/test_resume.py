@@ -168,7 +168,7 @@ def test_results_depend_on_the_code_of_their_own_task_only() -> None:
 
 
 def test_results_depend_on_what_runs_not_on_comments(tmp_path: Path) -> None:
-    texts = ["x = 1\n", '"""Why."""\nx = 1  # one\n', "x = 2\n", "x = '1'\n"]
+    texts = ["x = 1\n", '"""Why."""\nx = 1  # one\n"""What."""\n', "x = 2\n", "x = '1'\n"]
     files = [tmp_path / f"{k}.py" for k in range(4)]
     for file, text in zip(files, texts, strict=True):
         file.write_text(text)

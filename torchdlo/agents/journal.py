@@ -62,15 +62,15 @@ def program(name: str) -> str:
     return found.hexdigest()
 
 
-@functools.lru_cache(None)
+@functools.cache
 def _code(file: Path) -> bytes:
-    """Return what counts of a file: for Python its syntax tree without docstrings, else all."""
+    """Return what counts of a file: its syntax tree without docstrings, which depends on the version of Python."""
     if file.suffix != ".py":
         return file.read_bytes()
     tree = ast.parse(file.read_bytes())
     for node in ast.walk(tree):
-        if isinstance(node, (ast.Module, ast.ClassDef, ast.FunctionDef)) and ast.get_docstring(node) is not None:
-            del node.body[0]
+        if isinstance(node, (ast.Module, ast.ClassDef, ast.FunctionDef)):
+            node.body = [s for s in node.body if not (isinstance(s, ast.Expr) and isinstance(s.value, ast.Constant))]
     return ast.dump(tree).encode()
 
 
