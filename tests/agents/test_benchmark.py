@@ -83,6 +83,20 @@ def test_a_search_ends_when_time_is_over_and_keeps_what_it_has(tmp_path: Path, m
     assert not found["interrupted"] and found["episodes"] == 80 and len(found["curve"]) == 10
 
 
+def test_a_trajectory_is_played_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(SCRIPT.parent)
+    benchmark, replays = (importlib.import_module(name) for name in ("benchmark_trajopt", "replay_trajopt"))
+    settings = Settings("cmaes", episodes=80, population=8, hold=5)
+    benchmark.Case("push", "cmaes", 0, settings, tmp_path / "push").search(Push(), lambda *_: None, lambda: False)
+    row = replays.replay(tmp_path / "push" / "trajectory.json", lambda task, **_: Push(name=task))
+    before, now = row["return"]
+    assert row["search"] == "push" and before == now and row["success"][0] == row["success"][1]
+    content = json.loads((tmp_path / "push" / "trajectory.json").read_text())
+    (tmp_path / "push" / "trajectory.json").write_text(json.dumps(content | {"return": before + 1}))
+    other = replays.replay(tmp_path / "push" / "trajectory.json", lambda task, **_: Push(name=task))
+    assert other["return"] == [before + 1, now] and f"now {now:10.4f}" in replays.shown(other)
+
+
 def test_a_report_shows_what_is_finished_beside_the_hybrid_at_as_many_episodes(tmp_path: Path) -> None:
     def finish(method: str, seed: int, best: dict[int, float]) -> None:
         curve = [{"episodes": n, "best": value} for n, value in best.items()]

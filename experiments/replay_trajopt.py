@@ -1,0 +1,78 @@
+"""Play trajectories that were found once more, and put what they earn now beside what they earned.
+
+Every `trajectory.json` in the subfolders of --out is played alone, with the precision and the kind of steps with which
+it was found. On the machine and with the versions of the search every bit comes back; what changes with others shows
+how far a result rests on rounding.
+"""
+
+from __future__ import annotations
+
+import functools
+import json
+import os
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from options import Parser, save
+
+EXAMPLES = """examples:
+  python experiments/replay_trajopt.py --out experiments/trajopt --json runs/replays.json
+  python experiments/replay_trajopt.py --searches coiling-hybrid-0,coiling-hybrid-1
+"""
+
+
+STEPS = ("double", "compiled")
+"""Choices of a problem that change how numbers are rounded."""
+
+
+def replay(file: Path, make: Callable[..., Any]) -> dict[str, Any]:
+    """Play a trajectory in the problem that `make(task, **choices)` returns, and return how that went."""
+    from torchdlo.agents.result import load_actions, plain
+
+    had = json.loads(file.read_text(encoding="utf-8"))
+    problem = make(had["task"], **{name: had["choices"][name] for name in STEPS if name in had["choices"]})
+    outcome, kept = problem.record(load_actions(file, problem))
+    now = plain(outcome)
+    row = {"search": file.parent.name, "missed": kept.get("missed", "")}
+    return row | {name: [had[name], now[name]] for name in ("return", "success")}
+
+
+def shown(row: dict[str, Any]) -> str:
+    """Return a row as a line."""
+    numbers = ["no number" if value is None else f"{value:.4f}" for value in row["return"]]
+    words = ["success" if ok else "no success" for ok in row["success"]]
+    line = f"{row['search']:<22} {numbers[0]:>10}, {words[0]:<10}  now {numbers[1]:>10}, {words[1]:<10} {row['missed']}"
+    return line.rstrip()
+
+
+def main() -> None:
+    """Play all that is there."""
+    from torchdlo.agents.tasks import problem
+
+    parser = Parser("replay_trajopt.py", description=__doc__, epilog=EXAMPLES)
+    parser.add_argument("--out", default="experiments/trajopt", help="folder of the searches; default: %(default)s")
+    parser.add_argument("--searches", default="", help="names of its subfolders, separated by commas; default: all")
+    parser.add_argument("--json", default="", help="file for the rows")
+    args = parser.parse_args()
+    files = sorted(Path(args.out).glob("*/trajectory.json"))
+    wanted = [name for name in args.searches.split(",") if name]
+    wrong = sorted(set(wanted) - {file.parent.name for file in files})
+    if wrong or not files:
+        sys.exit(
+            f"error: {args.out}: expected the trajectories {', '.join(wrong) or 'of searches'}, found none of them."
+        )
+    rows, make = [], functools.cache(problem)
+    for file in files:
+        if not wanted or file.parent.name in wanted:
+            rows.append(replay(file, make))
+            print(shown(rows[-1]), flush=True)
+            save(args.json, {"generator": "torchdlo replay_trajopt", "rows": rows})
+    before, now = (sum(row["success"][k] for row in rows) for k in (0, 1))
+    print(f"{len(rows)} trajectories: {before} succeeded when they were found, {now} do now")
+
+
+if __name__ == "__main__":
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+    main()
