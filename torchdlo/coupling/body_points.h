@@ -190,12 +190,14 @@ struct Geometry : Inputs<T> {
     const auto touches = [&](const Far& f) { return any((edges[f.edge].real > T(0)) & ~(f.gap > moved(f))); };
     const auto waits = [&](const Far& f) { return !touches(f); };
     if (std::all_of(far.begin(), far.end(), waits)) return;
-    const auto late = std::stable_partition(far.begin(), far.end(), waits);
+    // Not std::stable_partition: its buffer is not aligned as lanes have to be.
+    List<Far> late, wait;
+    for (const Far& f : far) (touches(f) ? late : wait).push_back(f);
     const Shifts shifts = change;
     const Turns turns = motion;
     foresee();
-    for (auto f = late; f != far.end(); ++f) place(f->edge, f->body);
-    far.erase(late, far.end()), change = shifts, motion = turns;
+    for (const Far& f : late) place(f.edge, f.body);
+    far.swap(wait), change = shifts, motion = turns;
   }
 
   static L size(const R& x) { return root<T>(dot(x, x)); }
