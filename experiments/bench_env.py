@@ -181,11 +181,9 @@ def cases(choices: argparse.Namespace) -> list[Case]:
     return [Case(name, n, mode, steps, choices.workers, seconds) for name in chosen for n in envs for mode in modes]
 
 
-def known(path: str) -> list[dict[str, Any]]:
-    """Return the rows that a file has."""
-    if not path or not Path(path).is_file():
-        return []
-    return json.loads(Path(path).read_text())["rows"]
+def kept(path: str) -> dict[str, Any]:
+    """Return what a file has."""
+    return json.loads(Path(path).read_text()) if path and Path(path).is_file() else {}
 
 
 def main() -> None:
@@ -198,15 +196,15 @@ def main() -> None:
             print(
                 f"{row['task']:<12} {row['frames']:>5} frames {row['peak_mb']:6.0f} MB, {row['before_mb']:.0f} before"
             )
-        save(choices.json, {"cores": os.cpu_count(), "memory": rows})
+        save(choices.json, kept(choices.json) | {"cores": os.cpu_count(), "memory": rows})
         return
-    rows = known(choices.json)
+    rows = kept(choices.json).get("rows", [])
     for case in cases(choices):
-        same = ("task", "scenes", "mode", "steps")
-        found = next((r for r in rows if all(r[name] == getattr(case, name) for name in same)), None)
+        wanted = asdict(case) | {"workers": min(case.workers, case.scenes)}
+        found = next((r for r in rows if all(r[name] == value for name, value in wanted.items())), None)
         if found is None:
             rows.append(found := measure(case))
-            save(choices.json, {"cores": os.cpu_count(), "rows": rows})
+            save(choices.json, kept(choices.json) | {"cores": os.cpu_count(), "rows": rows})
         print(shown(found), flush=True)
 
 
