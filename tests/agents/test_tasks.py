@@ -14,6 +14,7 @@ from torch import Tensor
 from torchdlo import cli, envs
 from torchdlo.agents.presets import PUBLISHED, preset
 from torchdlo.agents.result import load_actions
+from torchdlo.agents.search import Robust
 from torchdlo.agents.tasks import TaskProblem, problem
 from torchdlo.coupling.robot import panda, tool_pose
 from torchdlo.envs.task import RADIUS, Arms, Seen, Task, make, straight
@@ -180,6 +181,7 @@ def test_presets_are_the_published_settings() -> None:
     assert preset("coiling", "cmaes").episodes // preset("coiling", "cmaes").population == 50
     # Small budgets leave room for as many iterations.
     assert [preset("coiling", "cmaes", episodes=n).population for n in (2000, 100)] == [40, 20]
+    assert preset("coiling", "cmaes", episodes=20_000, robust=Robust(copies=8)).population == 50
     assert preset("coiling", "hybrid", episodes=2000, population=7).population == 7
     assert preset("coiling", "cmaes", seed=None, episodes=7).episodes == 7
     plan = preset("coiling", "cmaes").plan(problem("coiling"))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import torch
@@ -25,7 +26,10 @@ def descent(plan: Plan, rng: torch.Generator) -> Search:
     x[0] = 0
     mean, square = torch.zeros_like(x), torch.zeros_like(x)
     step, stall, best = x.new_zeros(len(x), 1), x.new_zeros(len(x), 1), x.new_full((len(x), 1), -math.inf)
-    while True:
+    drifts = math.ceil(plan.drifts * plan.iterations)
+    for k in itertools.count():
+        if k <= drifts or k == plan.rehearsals:
+            best = torch.full_like(best, -math.inf)  # what was had in milder worlds, or in a rehearsal, is no measure
         told = yield Ask(encoding, x, graded=len(x))
         gain = told.returns[:, None] > best
         best, stall = torch.where(gain, told.returns[:, None], best), torch.where(gain, 0, stall + 1)

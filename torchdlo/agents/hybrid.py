@@ -239,7 +239,7 @@ class _Lines:
         down = told.loss[:n] < self.loss[active]
         self.length[active] *= torch.where(down, 2.0, 0.5)
         self._put(active[down], x, told, torch.arange(n)[down])
-        fresh = ranking(told.value[n:], told.loss[n:])[: len(self.x) // 2] + n
+        fresh = ranking(told.value[n:], told.loss[n:])[: max(1, len(self.x) // 2)] + n
         live = (self.length > _SHORT * self.first) & (self.slope != 0).any(-1)
         value = torch.where(live, self.value, -math.inf)
         worst = value.argsort(stable=True)[: len(fresh)]

@@ -44,10 +44,11 @@ PUBLISHED = {
 def preset(task: str, method: str, **given: Any) -> Settings:
     """Return the settings for a task and a method; what is given and not None wins."""
     episodes = given.get("episodes") or EPISODES.get(task, 20_000)
+    copies = given["robust"].copies if given.get("robust") else 1
     found = Settings(
         method=method,
         episodes=episodes,
-        population=min(POPULATION.get(method, 400), max(_FEWEST, episodes // _ITERATIONS)),
+        population=min(POPULATION.get(method, 400), max(_FEWEST, episodes // (copies * _ITERATIONS))),
         sigma=SIGMA.get(task, 0.05),
         rate=RATE.get(task, 1e-3),
     )
