@@ -69,11 +69,11 @@ def test_a_trajectory_comes_back_bit_by_bit(capsys):
     assert play("lead", "--trajectory", "found/trajectory.json", "--json") == 0
     went, kept = json.loads(capsys.readouterr().out), json.loads(Path("found/trajectory.json").read_text())
     assert went["return"] == kept["return"] and went["rewards"] == kept["rewards"]
-    # Not for a rope of other material.
+    # What was found for a rope of its own needs one.
     kept["choices"]["rope"] = {"bend": 1e-3}
     Path("other.json").write_text(json.dumps(kept))
     assert play("lead", "--trajectory", "other.json") == 2
-    assert "found for another rope" in capsys.readouterr().err
+    assert "found for a rope of its own; give that one, or another, with --rope" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

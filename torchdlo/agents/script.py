@@ -47,20 +47,20 @@ def script(
         name: of the task.
         trajectory: a file that `torchdlo optimize` wrote, played with the precision and the kind of steps with which it
             was found, so that every bit of it comes back; the way by hand if not given.
-        rope: see `torchdlo.envs.make`.
+        rope: see `torchdlo.envs.make`; a trajectory that was found for another one shows how well it carries over.
         idle: do nothing.
         vary: seed of a start that differs from the usual one.
         compiled: whether to compile steps.
 
     Raises:
-        InputError: The trajectory is none, is one of another task or rope, or there is no way by hand.
+        InputError: The trajectory is none, is one of another task, needs a rope, or there is no way by hand.
     """
     task = find(name, rope)
     found = {"compiled": compiled, "recorded": task.horizon > _LONG} if trajectory is None else _choices(trajectory)
     material = found.pop("rope", None)
     chosen = problem(name, rope, **found)
-    if trajectory is not None and material != json.loads(json.dumps(chosen.choices)).get("rope"):
-        raise InputError(f"{trajectory}: it was found for another rope; give the model of that one with --rope.")
+    if material is not None and rope is None:
+        raise InputError(f"{trajectory}: it was found for a rope of its own; give that one, or another, with --rope.")
     seeded = torch.Generator().manual_seed(vary or 0)
     start = {"generator": seeded, "variation": vary is not None}
     steps = {"compiled": chosen.compiled, "recorded": chosen.recorded}
