@@ -17,7 +17,6 @@ import json
 import math
 import os
 import shutil
-import statistics
 import subprocess
 import sys
 import time
@@ -27,7 +26,8 @@ from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
-from options import Parser, count, save
+from options import Parser, count
+from report_trajopt import earlier, finished, report
 
 EXAMPLES = """examples:
   python experiments/benchmark_trajopt.py --out runs/trajopt --jobs 2
@@ -35,17 +35,10 @@ EXAMPLES = """examples:
   python experiments/benchmark_trajopt.py --report --out experiments/trajopt
 """
 
-SHARE = {"hybrid": 4}
-"""Slopes are wanted of one in so many trajectories."""
+SHARE = {"cmaes": 0.0, "hybrid": 0.25}
+"""Of which share of the trajectories slopes are wanted, if not of all."""
 INTERRUPTED = 130
 """Exit status after Ctrl-C."""
-
-
-def earlier(result: dict[str, Any]) -> bool:
-    """Return whether a result is of another version of the program or of libraries."""
-    from torchdlo.agents.journal import program
-
-    return result["program"] != program(result["task"])
 
 
 @dataclass(frozen=True)
@@ -86,14 +79,18 @@ class Case:
         return self.folder / "result.json"
 
     def found(self, problem: Any, again: bool, ended: bool) -> dict[str, Any] | None:
-        """Return its result, if it is there and of the same settings.
+        """Return its result, if it is there.
 
         Args:
             problem: what it is of.
-            again: whether it has to be of the same program as well.
+            again: whether it has to be of the same program, and what is of other settings does not count.
             ended: whether one that ended early counts.
+
+        Raises:
+            InputError: It is there, but of other settings.
         """
         from torchdlo.agents.search import Settings
+        from torchdlo.errors import InputError
 
         def resolved(settings: dict[str, Any]) -> dict[str, Any]:
             own = Settings(**{f.name: settings[f.name] for f in fields(Settings)})
@@ -105,6 +102,11 @@ class Case:
         # Earlier versions had fewer settings.
         had, wanted = (json.loads(json.dumps(x)) for x in (asdict(Settings()), asdict(self.settings) | problem.choices))
         same = resolved(had | found["settings"]) == resolved(wanted)
+        if not (same or again):
+            raise InputError(
+                f"{self.result}: what a search with other settings found is here; --again replaces it, or choose "
+                "another --out."
+            )
         return found if same and not (again and earlier(found)) and (ended or not found["interrupted"]) else None
 
     def ready(self, choices: dict[str, Any], again: bool) -> None:
@@ -128,7 +130,8 @@ class Case:
             )
 
     def search(self, problem: Any, callback: Any, over: Callable[[], bool]) -> None:
-        """Search until it is over, resumed if it was stopped, and write what was found."""
+        """Search, resumed if it was stopped, and write what was found; nothing if there was no time for anything."""
+        from torchdlo.agents.journal import remove
         from torchdlo.agents.result import result_json, trajectory_json
         from torchdlo.agents.search import optimize
         from torchdlo.files import write_atomically
@@ -136,11 +139,19 @@ class Case:
         journal = self.folder / "journal"
         resume = (journal / "journal.json").is_file()
         timed = Timed(problem, over)
-        found = optimize(timed, self.settings, journal=journal, resume=resume, callback=callback)
+        try:
+            found = optimize(timed, self.settings, journal=journal, resume=resume, callback=callback)
+        except KeyboardInterrupt:
+            if not over():
+                raise
+            print(f"{self.folder.name}: time was over before the first iteration was", file=sys.stderr)
+            return
         if found.interrupted and not over():
             raise KeyboardInterrupt
         write_atomically(self.folder / "trajectory.json", trajectory_json(found, problem))
         write_atomically(self.result, result_json(found, problem, self.settings))
+        if not found.interrupted:
+            remove(journal)
 
 
 def cases(task: str, args: Any) -> list[Case]:
@@ -182,9 +193,9 @@ def solve(task: str, args: Any) -> list[tuple[Case, dict[str, Any]]]:
             return lambda shared: case.search(shared, note, lambda: time.monotonic() > end)
 
         sizes = [min(case.settings.population, case.settings.chunk) for case in wanted]
-        graded = sum(size // SHARE.get(case.method, 1) for size, case in zip(sizes, wanted, strict=True))
+        graded = sum(int(size * SHARE.get(case.method, 1)) for size, case in zip(sizes, wanted, strict=True))
         together(chosen, [searching(case) for case in left], sum(sizes), pulse, graded=graded)
-    return [(case, json.loads(case.result.read_text())) for case in wanted]
+    return [(case, json.loads(case.result.read_text())) for case in wanted if case.result.is_file()]
 
 
 def side_by_side(args: Any) -> None:
@@ -221,90 +232,6 @@ def side_by_side(args: Any) -> None:
             raise
 
 
-def finished(task: str, method: str, out: Path) -> list[dict[str, Any]]:
-    """All results of a task by a method that are there, of any settings, by seed."""
-    found = [json.loads(file.read_text()) for file in out.glob(f"{task}-{method}-*/result.json")]
-    return sorted(found, key=lambda run: run["settings"]["seed"])
-
-
-def seen(runs: list[dict[str, Any]], episodes: float) -> float | None:
-    """Largest return that searches had seen after so many episodes, mean over the seeds; None before the first."""
-    sofar = [[p["best"] for p in run["curve"] if p["episodes"] <= episodes and p["best"] is not None] for run in runs]
-    return statistics.mean(max(best) for best in sofar) if sofar and all(sofar) else None
-
-
-def row(task: str, method: str, runs: list[dict[str, Any]], hybrid: list[dict[str, Any]]) -> dict[str, Any]:
-    """One row of the table: mean and spread over the seeds, and what the hybrid saw of the same task."""
-    from torchdlo.agents.presets import PUBLISHED, preset
-
-    known = "cmaes" if method == "hybrid" else method
-    goal, solved = PUBLISHED.get(task, {}).get(known, (None, None))
-    episodes = statistics.mean(r["episodes"] for r in runs)
-    returns = [r["return"] for r in runs if r["return"] is not None]
-    return {
-        "task": task,
-        "method": method,
-        "seeds": len(runs),
-        "return": statistics.mean(returns) if returns else None,
-        "spread": statistics.stdev(returns) if len(returns) > 1 else None,
-        "lowest": min(returns, default=None),
-        "highest": max(returns, default=None),
-        # Published returns are the largest that a search saw.
-        "seen": statistics.mean(r["highest"] for r in runs),
-        "hybrid": seen(hybrid, episodes),
-        "published": goal,
-        "published_success": solved,
-        "published_episodes": None if goal is None else preset(task, known).episodes,
-        "success": statistics.mean(float(r["success"]) for r in runs),
-        "episodes": episodes,
-        "solved_after": [r["solved_after"] for r in runs],
-        "seconds": statistics.mean(r["seconds"] for r in runs),
-        "earlier": any(earlier(r) for r in runs),
-    }
-
-
-def table(rows: list[dict[str, Any]]) -> str:
-    """The rows as a table of Markdown."""
-    lines = [
-        "| task | method | seeds | return | spread | largest | hybrid | success | episodes | seconds | published |",
-        "|---|---|---|---|---|---|---|---|---|---|---|",
-    ]
-    for r in rows:
-        beside = ""
-        if r["published"] is not None:
-            beside = f"{r['published']:.2f}, {r['published_success']:.0%} after {r['published_episodes']}"
-        cells = [
-            r["task"],
-            r["method"],
-            f"{r['seeds']}{'*' * r['earlier']}",
-            *("" if r[k] is None else f"{r[k]:.2f}" for k in ("return", "spread", "seen", "hybrid")),
-            f"{r['success']:.0%}",
-            f"{r['episodes']:.0f}",
-            f"{r['seconds']:.0f}",
-            beside,
-        ]
-        lines.append(f"| {' | '.join(cells)} |")
-    if any(r["earlier"] for r in rows):
-        lines += ["", "\\* of another version of the program or of libraries; --again runs them anew"]
-    return "\n".join(lines) + "\n"
-
-
-def report(runs: dict[tuple[str, str], list[dict[str, Any]]], args: Any) -> None:
-    """Print and write the table and the curves of what is there so far."""
-    from torchdlo.files import write_atomically
-    from torchdlo.report.learning import learning_png
-
-    rows = [row(task, method, found, runs.get((task, "hybrid"), [])) for (task, method), found in runs.items()]
-    out, text = Path(args.out), table(rows)
-    save(str(out / "benchmark.json"), {"generator": "torchdlo benchmark_trajopt", "rows": rows})
-    write_atomically(out / "benchmark.md", text)
-    panels: dict[str, dict[str, list[Any]]] = {}
-    for (task, method), found in runs.items():
-        panels.setdefault(task, {})[method] = [r["curve"] for r in found]
-    write_atomically(out / "curves.png", learning_png(panels))
-    print(text, end="", flush=True)
-
-
 def arguments(words: list[str] | None = None) -> Any:
     """The options."""
     from torchdlo.agents.search import METHODS
@@ -324,7 +251,7 @@ def arguments(words: list[str] | None = None) -> Any:
         help="share of the iterations that all methods play in the task's rehearsal; default: that of each method",
     )
     parser.add_argument("--minutes", type=float, help="time for the searches of a task; default: as long as it takes")
-    parser.add_argument("--out", default="runs/trajopt", help="folder; default: runs/trajopt")
+    parser.add_argument("--out", help="folder; default: runs/trajopt, with --smoke runs/smoke")
     parser.flag("again", "run anew what was found by another version of the program or of libraries")
     parser.flag("report", "run nothing; show what is finished in --out, whatever its settings")
     parser.flag("double", "physics in double precision")
@@ -338,8 +265,11 @@ def arguments(words: list[str] | None = None) -> Any:
         if wrong or not chosen:
             parser.error(f"--{name} is {getattr(args, name)!r}; expected some of {', '.join(known)}")
         setattr(args, name, chosen)
+    if args.minutes is not None and not args.minutes > 0:
+        parser.error(f"--minutes is {args.minutes:g}; expected more than 0")
     if args.smoke:
         args.seeds, args.episodes, args.population = 1, 4, 4
+    args.out = args.out or ("runs/smoke" if args.smoke else "runs/trajopt")
     return args
 
 
@@ -356,7 +286,7 @@ def main() -> None:
         runs = {key: found for key, found in every.items() if found}
         if not runs:
             sys.exit(f"error: {args.out}: expected finished searches of these tasks and methods, found none.")
-        report(runs, args)
+        report(runs, Path(args.out))
         return
     try:
         if args.jobs > 1:
@@ -365,7 +295,7 @@ def main() -> None:
             for case, found in solve(task, args):
                 runs.setdefault((task, case.method), []).append(found)
             if not args.quiet:
-                report(runs, args)
+                report(runs, Path(args.out))
     except KeyboardInterrupt:
         print("interrupted; the same command goes on from here", file=sys.stderr)
         sys.exit(INTERRUPTED)

@@ -23,6 +23,12 @@ __all__ = ["design_experiment", "optimize", "play", "simulate", "tasks", "view"]
 _INTERRUPTED = 130
 """Exit code after Ctrl-C, as shells have it."""
 
+_Rope = Annotated[
+    Path | None,
+    typer.Option(help="What ropes are made of: model.json of a calibration or diagnosis.", metavar="MODEL"),
+]
+_Resume = Annotated[bool, typer.Option("--resume", help="Go on from the journal of a search that was stopped.")]
+
 
 def simulate(
     scene: Annotated[Path, typer.Argument(help="Scene file, see docs/scenes.md.", metavar="SCENE")],
@@ -155,7 +161,8 @@ def optimize(
         typer.Option(
             "--out",
             "-o",
-            help="Folder for result.json, trajectory.json and curve.png. Default: runs/optimize/TASK-METHOD.",
+            help="Folder for result.json, trajectory.json and curve.png. Default: runs/optimize/TASK-METHOD, "
+            "and -SEED if that is not 0.",
             metavar="DIR",
         ),
     ] = None,
@@ -171,33 +178,30 @@ def optimize(
     robust: Annotated[
         bool, typer.Option("--robust", help="Play each trajectory from several starts that grow apart.")
     ] = False,
-    rope: Annotated[
-        Path | None,
-        typer.Option(help="What ropes are made of: model.json of a calibration or diagnosis.", metavar="MODEL"),
-    ] = None,
+    rope: _Rope = None,
     double: Annotated[bool, typer.Option("--double", help="Physics in double precision.")] = False,
     compiled: Annotated[bool, typer.Option(help="Compile the step: slow at first, then many times faster.")] = True,
     recorded: Annotated[
         bool, typer.Option("--recorded", help="Record the step instead: takes seconds, helps where cmaes searches.")
     ] = False,
-    resume: Annotated[
-        bool, typer.Option("--resume", help="Go on from the journal of a search that was stopped.")
-    ] = False,
+    resume: _Resume = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
 ) -> None:
     """Search the trajectory of the tools that earns most in a task.
 
-    Settings that are not given are the published ones of the task. Ctrl-C keeps the best so far; a search that was
-    stopped or killed goes on with --resume, and ends as if it had never stopped.
+    Budget, way-points and first steps that are not given are the published ones of the task: hours on one core, where
+    --episodes 600 takes minutes to an hour. Ctrl-C keeps the best so far; a search that was stopped or killed goes on
+    with --resume, and ends as if it had never stopped. Without it, a search begins anew and what was stopped is lost.
 
     [bold]Examples:[/bold]
 
-    torchdlo optimize coiling --out runs/coil
+    torchdlo optimize coiling --episodes 600 --out runs/coil
 
     torchdlo optimize wiring_post --method cmaes --seed 1 --episodes 4000 --population 100
 
     torchdlo optimize wiring_post --robust --resume
     """
+    from torchdlo.agents.journal import remove
     from torchdlo.agents.presets import preset
     from torchdlo.agents.result import result_json, summary, trajectory_json
     from torchdlo.agents.search import Robust
@@ -206,7 +210,7 @@ def optimize(
     from torchdlo.describe import cable
     from torchdlo.report.learning import learning_png
 
-    out = out or Path("runs") / "optimize" / f"{task}-{method}"
+    out = out or Path("runs") / "optimize" / f"{task}-{method}{f'-{seed}' if seed else ''}"
     for name in ("result.json", "trajectory.json", "curve.png"):
         check_writable(out / name)
     steps = {"compiled": compiled and not recorded, "recorded": recorded}
@@ -221,14 +225,17 @@ def optimize(
         raise typer.Exit(_INTERRUPTED) from None
     result = result_json(found, chosen, settings)
     write_atomically(out / "trajectory.json", trajectory_json(found, chosen))
-    write_atomically(out / "curve.png", learning_png({f"{task}, seed {seed}": {method: [found.curve]}}))
     write_atomically(out / "result.json", result)
+    write_atomically(out / "curve.png", learning_png({f"{task}, seed {seed}": {method: [found.curve]}}))
+    if not found.interrupted:
+        remove(out / "journal")
     typer.echo(summary(found, task), err=as_json)
     typer.echo(f"result:     {out / 'result.json'}\ntrajectory: {out / 'trajectory.json'}", err=as_json)
     typer.echo(f"curve:      {out / 'curve.png'}", err=as_json)
     if as_json:
         typer.echo(result, nl=False)
     if found.interrupted:
+        typer.echo(f"--resume goes on from {out / 'journal'}", err=True)
         raise typer.Exit(_INTERRUPTED)
 
 
@@ -266,12 +273,14 @@ def play(
     picture: Annotated[bool, typer.Option("--picture", help="Write picture.png, too: start, middle and end.")] = False,
     speed: Annotated[float, typer.Option(min=0.001, help="Seconds of the episode per second of the video.")] = 0.5,
     arms: Annotated[bool, typer.Option(help="Show the arms.")] = True,
-    rope: Annotated[
-        Path | None,
-        typer.Option(help="What ropes are made of: model.json of a calibration or diagnosis.", metavar="MODEL"),
-    ] = None,
+    rope: _Rope = None,
     compiled: Annotated[
-        bool, typer.Option("--compiled", help="Compile the step instead of recording it: minutes at first.")
+        bool,
+        typer.Option(
+            "--compiled",
+            help="Compile the step instead of recording it: minutes at first. "
+            "A trajectory is played with the steps with which it was found.",
+        ),
     ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print how it went as JSON.")] = False,
 ) -> None:
@@ -346,9 +355,7 @@ def design_experiment(
     vertices: Annotated[int | None, typer.Option(min=3, help="Vertices of the simulated rope.")] = None,
     workers: Annotated[int | None, typer.Option(min=1, help="Processes; one per core if not given.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the design as JSON.")] = False,
-    resume: Annotated[
-        bool, typer.Option("--resume", help="Go on from the journal of a search that was stopped.")
-    ] = False,
+    resume: _Resume = False,
 ) -> None:
     """Find the motion of the grippers that tells apart effects which a recording cannot.
 

@@ -7,12 +7,14 @@ import json
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from tests.agents.problems import Push
 from torchdlo.agents.search import Settings
+from torchdlo.errors import InputError
 
 pytest.importorskip("pytorch_kinematics", reason="arms need the extra robots")
 
@@ -65,7 +67,9 @@ def test_the_benchmark_writes_its_table_and_reads_finished_runs(tmp_path: Path) 
     assert call(*words).stdout.rsplit("|", 3)[0] == first
 
 
-def test_a_search_ends_when_time_is_over_and_keeps_what_it_has(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_search_ends_when_time_is_over_and_keeps_what_it_has(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     monkeypatch.syspath_prepend(SCRIPT.parent)
     benchmark = importlib.import_module("benchmark_trajopt")
     settings = Settings("cmaes", episodes=80, population=8, hold=5)
@@ -81,6 +85,15 @@ def test_a_search_ends_when_time_is_over_and_keeps_what_it_has(tmp_path: Path, m
     case.search(Push(), lambda *_: None, lambda: False)
     found = json.loads(case.result.read_text())
     assert not found["interrupted"] and found["episodes"] == 80 and len(found["curve"]) == 10
+    late = benchmark.Case("push", "cmaes", 1, settings, tmp_path / "late")
+    late.search(Push(), lambda *_: None, lambda: True)
+    assert "late: time was over before the first iteration was" in capsys.readouterr().err
+    assert not late.result.exists()
+    # What others found here is not overwritten.
+    other = benchmark.Case("push", "cmaes", 0, replace(settings, episodes=160), tmp_path)
+    with pytest.raises(InputError, match="a search with other settings found is here; --again replaces it"):
+        other.found(Push(), again=False, ended=False)
+    assert other.found(Push(), again=True, ended=False) is None
 
 
 def test_a_trajectory_is_played_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

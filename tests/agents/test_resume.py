@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import resource
 import signal
 import subprocess
 import sys
@@ -12,10 +13,11 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import torch
 from torch import Tensor
 
 from tests.agents.problems import Push, signature
-from torchdlo.agents.journal import _code, program
+from torchdlo.agents.journal import _code, program, remove
 from torchdlo.agents.problem import Outcome
 from torchdlo.agents.result import result_json, trajectory_json
 from torchdlo.agents.search import METHODS, Found, Robust, Settings, optimize
@@ -55,6 +57,7 @@ def test_a_killed_search_ends_as_one_that_was_not(method: str, tmp_path: Path) -
             optimize(Stopping(after), settings, journal=tmp_path / "j", resume=after > 3)
     found = optimize(Push(), settings, journal=tmp_path / "j", resume=True)
     assert files(found, settings) == files(whole, settings)
+    remove(tmp_path / "j")
     assert not (tmp_path / "j").exists()
 
 
@@ -181,8 +184,52 @@ def test_results_of_another_search_are_noticed(tmp_path: Path) -> None:
     stopped(journal)
     (journal / "000001.pt").write_bytes((journal / "000000.pt").read_bytes())
     assert "expected the results of batch 1 of this search" in refused(journal)
-    (journal / "000001.pt").write_bytes(b"half a file")
-    assert "000001.pt: expected the results of a batch, found something else" in refused(journal)
+
+
+@pytest.mark.parametrize("damage", ["empty", "half", "zeros in it", "zeros at its beginning"])
+def test_what_is_damaged_is_played_again(damage: str, tmp_path: Path) -> None:
+    whole, journal = optimize(Push(), SETTINGS), tmp_path / "j"
+    stopped(journal)
+    file = journal / "000001.pt"
+    written = file.read_bytes()
+    at = written.index(torch.load(file)["returns"].numpy().tobytes())
+    spoilt = {
+        "empty": b"",
+        "half": written[: len(written) // 2],
+        "zeros in it": written[:at] + bytes(8) + written[at + 8 :],
+        "zeros at its beginning": bytes(64) + written[64:],
+    }
+    file.write_bytes(spoilt[damage])
+    found = optimize(Push(), SETTINGS, journal=journal, resume=True)
+    assert files(found, SETTINGS) == files(whole, SETTINGS)
+
+
+def test_a_full_disk_is_named_and_what_was_written_is_kept(tmp_path: Path) -> None:
+    whole, journal = optimize(Push(), SETTINGS), tmp_path / "j"
+    stopped(journal)
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, limits[1]))
+    try:
+        with pytest.raises(OSError, match=r"000003\.pt"):
+            optimize(Push(), SETTINGS, journal=journal, resume=True)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert files(optimize(Push(), SETTINGS, journal=journal, resume=True), SETTINGS) == files(whole, SETTINGS)
+
+
+def test_two_searches_do_not_write_into_one_journal(tmp_path: Path) -> None:
+    said = []
+
+    def second(*_: object) -> None:
+        if not said:
+            with pytest.raises(InputError) as refusal:
+                optimize(Push(), replace(SETTINGS, seed=1), journal=tmp_path / "j")
+            said.append(str(refusal.value))
+
+    whole = optimize(Push(), SETTINGS)
+    found = optimize(Push(), SETTINGS, journal=tmp_path / "j", callback=second)
+    assert said == [f"{tmp_path / 'j'}: another search is writing here; choose another --out."]
+    assert files(found, SETTINGS) == files(whole, SETTINGS)
 
 
 def test_folders_of_others_are_left_alone(tmp_path: Path) -> None:

@@ -301,7 +301,8 @@ def test_a_robust_search_counts_every_copy_and_grows_its_worlds() -> None:
         ({"rehearsed": 0.5, "robust": Robust(2)}, "rehearsed is 0.5; expected 0 with robust."),
         ({"rehearsed": 1.0}, "rehearsed is 1.0; expected a share of the iterations from 0 up, less than 1."),
         ({"rehearsed": 0.5, "method": "hybrid", "episodes": 32}, "push: it has no rehearsal; set rehearsed to 0."),
-        ({"seed": -1}, "seed is -1; expected a whole number from 0 up."),
+        ({"seed": -1}, "seed is -1; expected a whole number from 0 to 2^32 - 1."),
+        ({"seed": 2**32}, "seed is 4294967296; expected a whole number from 0 to 2^32 - 1."),
     ],
 )
 def test_settings_that_make_no_search_are_refused(wrong: dict, sentence: str) -> None:

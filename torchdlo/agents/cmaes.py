@@ -12,15 +12,20 @@ from torchdlo.agents.plan import Ask, Plan, Search, Told
 from torchdlo.agents.problem import Encoding
 from torchdlo.errors import InputError
 
-__all__ = ["cmaes", "drawn", "strategy"]
+__all__ = ["cmaes", "drawn", "package", "strategy"]
 
 
-def strategy(start: Tensor, sigma: float, population: int, rng: torch.Generator) -> Any:
-    """Return a `cma.CMAEvolutionStrategy` that draws from `rng` and writes nothing."""
+def package() -> Any:
+    """Return the module `cma`; says so if there is none."""
     try:
         import cma
     except ModuleNotFoundError:
         raise InputError("cmaes and hybrid need the package cma; pip install 'torchdlo[cmaes]', or use gd.") from None
+    return cma
+
+
+def strategy(start: Tensor, sigma: float, population: int, rng: torch.Generator) -> Any:
+    """Return a `cma.CMAEvolutionStrategy` that draws from `rng` and writes nothing."""
 
     def randn(*shape: int) -> Any:
         return torch.randn(*shape, generator=rng, dtype=torch.float64).numpy()
@@ -33,10 +38,12 @@ def strategy(start: Tensor, sigma: float, population: int, rng: torch.Generator)
         "verb_log": 0,
         # Returns may stay flat until something is touched; that is no reason to give up.
         "tolflatfitness": math.inf,
+        "tolfun": 0.0,
+        "tolfunhist": 0.0,
         "tolstagnation": math.inf,
         "maxiter": math.inf,
     }
-    return cma.CMAEvolutionStrategy(start.numpy(), sigma, options)
+    return package().CMAEvolutionStrategy(start.numpy(), sigma, options)
 
 
 def drawn(found: Any, encoding: Encoding, given: Tensor | None = None) -> Tensor:

@@ -7,9 +7,12 @@ same batches, and comes to where it was stopped by reading instead of playing: t
 from __future__ import annotations
 
 import ast
+import fcntl
 import functools
 import hashlib
+import io
 import json
+import os
 import shutil
 import zipfile
 from importlib.metadata import version
@@ -21,9 +24,9 @@ from torch import Tensor
 
 from torchdlo.envs import TASKS
 from torchdlo.errors import InputError
-from torchdlo.files import replacing, write_atomically
+from torchdlo.files import write_atomically
 
-__all__ = ["Journal", "program", "versions"]
+__all__ = ["Journal", "program", "remove", "versions"]
 
 _MARK = "journal.json"
 """The file that says what a journal belongs to."""
@@ -74,8 +77,15 @@ def _code(file: Path) -> bytes:
     return ast.dump(tree).encode()
 
 
+def remove(path: Path) -> None:
+    """Delete a journal, whose search is over and written down: its mark last, so that what is left of it is known."""
+    for file in path.glob("*.pt"):
+        file.unlink()
+    shutil.rmtree(path, ignore_errors=True)
+
+
 class Journal:
-    """A folder with one file per batch; None as folder keeps nothing."""
+    """A folder with one file per batch, for one search at a time; None as folder keeps nothing."""
 
     def __init__(self, path: Path | None, options: dict[str, Any], *, resume: bool = False) -> None:
         """Open the journal.
@@ -85,17 +95,32 @@ class Journal:
             options: all that the search depends on, as plain data.
             resume: go on from what is there.
         """
-        self.path, self.count = path, 0
+        self.path, self.count, self.resume, self._lock = path, 0, resume, None
         if path is None:
             return
+        try:
+            self._open(path, options, resume)
+        except BaseException:
+            self.close()
+            raise
+
+    def _open(self, path: Path, options: dict[str, Any], resume: bool) -> None:
         mark = {"generator": "torchdlo optimize", "options": options, "program": program(options["name"])}
         mark = json.loads(json.dumps(mark))
         found = self._found(path)
         if resume:
             self._check(path, found, mark)
+        path.mkdir(parents=True, exist_ok=True)
+        # Belongs to the process: it is free again however that ends.
+        self._lock = os.open(path, os.O_RDONLY)
+        try:
+            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise InputError(f"{path}: another search is writing here; choose another --out.") from None
+        if resume:
             return
-        if found is not None:
-            self.remove()
+        for file in path.glob("*.pt"):
+            file.unlink()
         write_atomically(path / _MARK, json.dumps(mark, indent=1) + "\n")
 
     @staticmethod
@@ -124,20 +149,18 @@ class Journal:
         if found.get("program") != mark["program"]:
             raise InputError(f"{path}: the journal was written by another version of torchdlo; leave out --resume.")
 
-    def remove(self) -> None:
-        """Delete the journal: the search is over."""
-        if self.path is not None:
-            shutil.rmtree(self.path, ignore_errors=True)
+    def close(self) -> None:
+        """Let others write here."""
+        if self._lock is not None:
+            os.close(self._lock)
+            self._lock = None
 
     def recall(self, points: Tensor) -> dict[str, Any] | None:
-        """Return what is written about the next batch, if these are its points; None if nothing is."""
-        file = None if self.path is None else self.path / f"{self.count:06d}.pt"
-        if file is None or not file.is_file():
+        """Return what is written about the next batch, if these are its points; None if nothing is that can be read."""
+        file = self.path / f"{self.count:06d}.pt" if self.path is not None and self.resume else None
+        found = None if file is None else _whole(file)
+        if found is None:
             return None
-        # A file that is renamed when complete is a whole archive, or was damaged later.
-        if not zipfile.is_zipfile(file):
-            raise InputError(f"{file}: expected the results of a batch, found something else; leave out --resume.")
-        found = torch.load(file, weights_only=True)
         if found["points"] != _digest(points):
             raise InputError(
                 f"{file}: expected the results of batch {self.count} of this search, found those of another one; "
@@ -149,9 +172,21 @@ class Journal:
     def keep(self, points: Tensor, content: dict[str, Any]) -> None:
         """Write down how the next batch went."""
         if self.path is not None:
-            with replacing(self.path / f"{self.count:06d}.pt") as file:
-                torch.save(content | {"points": _digest(points)}, file)
+            # Torch hides what the system says of a full disk.
+            written = io.BytesIO()
+            torch.save(content | {"points": _digest(points)}, written)
+            write_atomically(self.path / f"{self.count:06d}.pt", written.getvalue())
         self.count += 1
+
+
+def _whole(file: Path) -> dict[str, Any] | None:
+    """Return what is in a file; None if there is none, or if a bit of it is not what was written."""
+    try:
+        with zipfile.ZipFile(file) as archive:
+            whole = archive.testzip() is None
+    except (OSError, EOFError, ValueError, RuntimeError, zipfile.BadZipFile):
+        return None
+    return torch.load(file, weights_only=True) if whole else None
 
 
 def _digest(points: Tensor) -> str:

@@ -12,7 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchdlo.agents.cmaes import cmaes
+from torchdlo.agents.cmaes import cmaes, package
 from torchdlo.agents.descent import descent
 from torchdlo.agents.hybrid import hybrid
 from torchdlo.agents.journal import Journal
@@ -86,9 +86,11 @@ class Settings:
                 raise InputError(f"{name} is {getattr(self, name)!r}; expected {expected}.")
 
         need(self.method in METHODS, "method", f"one of {', '.join(METHODS)}")
+        if self.method != "gd":
+            package()
         least = 1 if self.method == "gd" else 4
         need(self.population >= least, "population", f"at least {least} for {self.method}")
-        need(self.seed >= 0, "seed", "a whole number from 0 up")
+        need(0 <= self.seed < 2**32, "seed", "a whole number from 0 to 2^32 - 1")
         need(self.chunk >= 1, "chunk", "at least 1")
         need(self.hold is None or 1 <= self.hold <= problem.horizon, "hold", f"1 to {problem.horizon} actions")
         for name in ("sigma", "rate", "steps"):
@@ -145,7 +147,8 @@ def optimize(
     Args:
         problem: what to solve.
         settings: how, and with which budget.
-        journal: folder that keeps the results of all batches; it is deleted when the search is over.
+        journal: folder that keeps the results of all batches; `journal.remove` deletes it, when what was found is
+            written down.
         resume: go on from what is in the journal.
         callback: told (stage, episodes done, all episodes, message) after every batch.
     """
@@ -178,17 +181,18 @@ def optimize(
         if not best.kept:
             raise
         interrupted, finalists = True, best.kept
+    finally:
+        player.journal.close()
     if not math.isfinite(finalists[0].returns):
         raise InputError(f"{problem.name}: none of {player.done} episodes had a finite return; nothing was found.")
     chosen, outcome, kept = _alone(problem, finalists, robust is not None)
-    if not interrupted:
-        player.journal.remove()
+    rehearsed = curve[-1]["rehearsed"]  # what it promised there, it does not promise here
     return Found(
         chosen.actions,
         outcome,
         kept,
-        chosen.returns,
-        best.highest,
+        -math.inf if rehearsed else chosen.returns,
+        -math.inf if rehearsed else best.highest,
         player.done,
         player.seconds,
         curve,

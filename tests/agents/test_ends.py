@@ -1,0 +1,56 @@
+"""What ends a search, or does not: missing packages, Ctrl-C in a rehearsal, worlds that get harder."""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+
+import pytest
+import torch
+
+from tests.agents.problems import Push, Rehearsed
+from torchdlo.agents.descent import descent
+from torchdlo.agents.plan import Plan, Told
+from torchdlo.agents.result import result_json
+from torchdlo.agents.search import Settings, optimize
+from torchdlo.errors import InputError
+
+
+@pytest.mark.parametrize("method", ["cmaes", "hybrid"])
+def test_a_package_that_is_missing_is_named_before_anything_is_played(
+    method: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "cma", None)
+    monkeypatch.setattr(Push, "evaluate", lambda *_: pytest.fail("it was played"))
+    with pytest.raises(InputError, match=r"need the package cma; pip install 'torchdlo\[cmaes\]'"):
+        optimize(Push(), Settings(method, episodes=4000, population=20))
+
+
+def test_what_a_rehearsal_promised_is_not_said_of_the_problem_itself() -> None:
+    settings = Settings("hybrid", episodes=160, population=16, hold=5, rehearsed=0.8)
+
+    def stop(_: str, done: int, *__: object) -> None:
+        if done >= 48:
+            raise KeyboardInterrupt
+
+    found = optimize(Rehearsed(), settings, callback=stop)
+    assert found.interrupted and found.curve[-1]["rehearsed"]
+    assert found.highest == found.searched == -math.inf and math.isfinite(float(found.outcome.returns[0]))
+    written = json.loads(result_json(found, Rehearsed(), settings))
+    assert written["highest"] is None and written["searched"] is None and written["return"] is not None
+
+
+@pytest.mark.parametrize(("kept", "iterations"), [({"drifts": 0.5}, 20), ({"rehearsals": 9}, 18), ({}, 9)])
+def test_descent_does_not_measure_by_milder_worlds(kept: dict, iterations: int) -> None:
+    plan = Plan(horizon=4, width=3, group=3, limit=0.01, population=1, iterations=40, hold=2, **kept)
+    search = descent(plan, torch.Generator().manual_seed(0))
+    ask, no = next(search), torch.zeros(1, dtype=torch.bool)
+    ways = []
+    for k in range(35):
+        loss, slope = torch.full((1,), float(k), dtype=torch.float64), torch.ones_like(ask.points)
+        before, ask = ask.points, search.send(Told(-loss, loss, 0 * loss, no, no, slope))
+        ways.append(float((ask.points - before).abs().max()))
+    # Returns fall from one iteration to the next; starts that are given up jump.
+    jump = next(k for k, way in enumerate(ways) if way > 1.5 * plan.rate)
+    assert jump >= iterations
