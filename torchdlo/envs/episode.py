@@ -18,18 +18,18 @@ from torch import Tensor
 
 from torchdlo import scene as scenes
 from torchdlo.coupling import grasp, ik
-from torchdlo.coupling.bodies import BodyTargets, turn_between, turn_by
+from torchdlo.coupling.bodies import turn_by
 from torchdlo.coupling.grasp import Grasp, Hands
 from torchdlo.coupling.pose import Pose
 from torchdlo.coupling.robot import Robot, panda
 from torchdlo.envs.crash import broken, inside
+from torchdlo.envs.frames import guarded, run, slipped
 from torchdlo.envs.stages import repeated
 from torchdlo.envs.task import Seen, Task, combined
 from torchdlo.errors import InputError
 from torchdlo.physics import tree
 from torchdlo.physics.numerics import safe_norm
-from torchdlo.physics.replay import rollout
-from torchdlo.physics.rotation import multiply, rotate
+from torchdlo.physics.rotation import multiply
 from torchdlo.scene import Control, Params, Scene, State
 
 __all__ = ["Episode", "Outcome", "World", "act", "begin", "normalized", "observe", "places", "play", "prepare"]
@@ -168,7 +168,7 @@ def _settled(episode: Episode, world: World) -> World:
     count = episode.task.settle
     if not count:
         return world
-    state = _run(episode, world, world.tool, world.grasp, count)
+    state = run(episode, world, world.tool, world.grasp, count)
     return tree.replace(world, state=state)
 
 
@@ -202,28 +202,6 @@ def prepare(
     return episode if not task.settle else replace(episode, start=_settled(episode, world))
 
 
-def _run(episode: Episode, world: World, tool: Pose, held: Grasp, count: int) -> State:
-    """Return the scenes after frames in which the tools move evenly to their poses."""
-    x = world.tool.pos
-    share = torch.linspace(0, 1, count + 1, dtype=x.dtype, device=x.device)[1:].reshape(-1, 1, 1, 1)
-    turn = turn_between(world.tool.quat, tool.quat)
-    last = world.tool.quat.expand(count, *world.tool.quat.shape)
-    poses = Pose(x + share * (tool.pos - x), multiply(turn_by(share * turn), last))
-    pos, director, grip = grasp.carry(episode.hands, held, repeated(poses, episode.task.schedule.room))
-    bodies: Any = ()
-    if episode.scene.bodies:
-        still = scenes.hold(episode.scene, world.state).bodies
-        bodies = BodyTargets(*(p.expand(count, *p.shape) for p in (still.pos, still.quat)))
-    grip = {name: g.expand(count, *g.shape) for name, g in grip.items()}
-    controls = Control(pos, director.expand(count, *director.shape[-3:]), grip, bodies)
-    # Nothing is kept; what has a history would be followed back to its start from every segment.
-    none = tree.leaves(world.state)[0].detach()[..., :0, :0]
-    state, _ = rollout(
-        episode.step, episode.params, world.state, controls, segment=episode.segment, keep=lambda _: none
-    )
-    return state
-
-
 def limited(task: Task, action: Tensor) -> tuple[Tensor, Tensor]:
     """Return the ways [m] and turns [rad] of the tools that an action (B, A) asks for, (B, R, 3) each.
 
@@ -251,32 +229,22 @@ def _aim(task: Task, world: World, action: Tensor) -> Pose:
     return Pose(torch.cat([pos[..., :2], height], -1), quat / quat.square().sum(-1, keepdim=True).sqrt())
 
 
-def _slipped(episode: Episode, state: State, tool: Pose, closed: Tensor) -> Tensor:
-    """Return how firmly hands still hold: those whose friction was not enough in the last frame are open."""
-    task = episode.task
-    if math.isinf(task.arms.squeeze):
-        return closed
-    tool = repeated(tool, task.schedule.room)
-    force, _ = grasp.felt(episode.scene, episode.hands, state, tool)
-    normal = rotate(tool.quat, force.new_tensor([0.0, 1.0, 0.0]).expand_as(force))
-    along = force - normal * (force * normal).sum(-1, keepdim=True)
-    return torch.where(safe_norm(along) > 2 * task.arms.mu * task.arms.squeeze, 0.0, closed)
-
-
 def act(episode: Episode, world: World, action: Tensor) -> World:
     """Return the world after an action, shape (B, A) in metres and degrees; see `Task.width`.
 
-    Scenes that are no longer finite stay as they were and have failed.
+    Scenes that are no longer finite stay as they were and have failed. Nothing has a slope through an action in which
+    a scene broke.
     """
-    task = episode.task
-    aim, held = _aim(task, world, action), world.grasp
+    task, lost = episode.task, []
+    before, action = guarded((world, action), len(world.failed), lost)
+    aim, held = _aim(task, before, action), before.grasp
     if len(task.schedule.stages) > 1:
-        aim, held = _staged(episode, world, aim)
-    found = _solve(task, aim, world.joints, FOLLOW)
-    state = _run(episode, world, found.pose, held, task.frames)
-    held = tree.replace(held, closed=_slipped(episode, state, found.pose, held.closed))
+        aim, held = _staged(episode, before, aim)
+    found = _solve(task, aim, before.joints, FOLLOW)
+    state = run(episode, before, found.pose, held, task.frames)
+    held = tree.replace(held, closed=slipped(episode, state, found.pose, held.closed))
     after = World(state, found.joints, found.handed, found.pose, held, world.notes, world.failed, world.count)
-    return tree.replace(_judged(episode, world, after), count=world.count + 1)
+    return tree.replace(_judged(episode, world, after, lost), count=world.count + 1)
 
 
 def _staged(episode: Episode, world: World, aim: Pose) -> tuple[Pose, Grasp]:
@@ -288,8 +256,11 @@ def _staged(episode: Episode, world: World, aim: Pose) -> tuple[Pose, Grasp]:
     return Pose(plan.steer(world.count, world.target.pos, aim.pos, x), aim.quat), held
 
 
-def _judged(episode: Episode, before: World, after: World) -> World:
-    """Return the new world with its notes and failures, and the old one where the new one is not finite."""
+def _judged(episode: Episode, before: World, after: World, lost: list[Tensor]) -> World:
+    """Return the new world with its notes and failures, and the old one where the new one is not finite.
+
+    `lost` gets which scenes broke, shape (B,).
+    """
     task, good = episode.task, scenes.finite(after.state)
     after = tree.where(good, after, before)
     notes = task.note(after.seen(task.arms.count))
@@ -297,8 +268,8 @@ def _judged(episode: Episode, before: World, after: World) -> World:
     seen = after.seen(task.arms.count)
     torn = task.rest(seen) > task.stretch * seen.notes["rest"]
     stuck = (inside(episode.scene, episode.params, after.state, after.tool.pos) & (seen.closed[..., 0] > 0)).any(-1)
-    lost = ~good | broken(episode.scene, episode.params, after.state)
-    return tree.replace(after, failed=before.failed | lost | torn | stuck | task.failed(seen))
+    lost.append(~good | broken(episode.scene, episode.params, after.state))
+    return tree.replace(after, failed=before.failed | lost[0] | torn | stuck | task.failed(seen))
 
 
 def finish(episode: Episode, world: World) -> World:
@@ -306,9 +277,11 @@ def finish(episode: Episode, world: World) -> World:
     task = episode.task
     if not task.release:
         return world
-    held = tree.replace(world.grasp, closed=torch.zeros_like(world.grasp.closed))
-    state = _run(episode, world, world.tool, held, task.release)
-    return _judged(episode, world, tree.replace(world, state=state, grasp=held))
+    lost: list[Tensor] = []
+    before = guarded(world, len(world.failed), lost)
+    held = tree.replace(before.grasp, closed=torch.zeros_like(world.grasp.closed))
+    state = run(episode, before, before.tool, held, task.release)
+    return _judged(episode, world, tree.replace(before, state=state, grasp=held, notes=world.notes), lost)
 
 
 def earned(episode: Episode, world: World) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
