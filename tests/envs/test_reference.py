@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from typing import ClassVar
 
 import pytest
 import torch
@@ -12,7 +13,7 @@ from torchdlo import scene as scenes
 from torchdlo.coupling.grasp import Hands
 from torchdlo.envs import TASKS, episode, geometry
 from torchdlo.envs.gathering import Rehearsal
-from torchdlo.envs.task import Task
+from torchdlo.envs.task import Task, through
 from torchdlo.physics import tree
 from torchdlo.physics.traced import record
 
@@ -51,6 +52,26 @@ def test_ways_by_hand_fit_into_the_episode_from_all_starts(name: str) -> None:
     want = ends[4] if task.anchored else ends[4] + tools - tools[4]
     # Starts are in single precision.
     torch.testing.assert_close(ends, want.expand_as(ends), atol=1e-6, rtol=0)
+
+
+def test_ways_by_hand_take_steps_as_long_as_the_task_allows() -> None:
+    @dataclasses.dataclass(frozen=True)
+    class Slow(TASKS["coiling"]):
+        """With half the reach."""
+
+        horizon: int = 200
+        reach: ClassVar[float] = 0.005
+
+    usual, slow = (task.reference().unflatten(-1, (2, 3))[:, 0] for task in (TASKS["coiling"](), Slow()))
+    assert 0.0045 < slow.norm(dim=-1).max() <= 0.005 + 1e-12
+    torch.testing.assert_close(slow.sum(0), usual.sum(0))
+
+
+def test_ways_by_hand_are_made_on_the_device_of_the_start() -> None:
+    off = torch.zeros(1, 3, device="cpu")
+    # What is made without a device lands elsewhere and cannot be added.
+    with torch.device("meta"):
+        assert through([[(0.03, 0.0, 0.0)]], 6, off).device.type == "cpu"
 
 
 @pytest.mark.parametrize("name", ["lifting", "separation", "wiring_post"])

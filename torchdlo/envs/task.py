@@ -199,7 +199,7 @@ class Task(ABC):
             self._strays(start) if start is not None else [torch.zeros(self.arms.count, 3)] * len(self.schedule.stages)
         )
         legs = zip(self.ways(), self.schedule.actions(self.horizon), off, strict=True)
-        return torch.cat([through(*leg) for leg in legs], -2)
+        return torch.cat([through(*leg, reach=self.reach) for leg in legs], -2)
 
     def _strays(self, start: State) -> list[Tensor]:
         """Return what each stage's way takes besides to lead to the same places from another start [m], (B, R, 3)."""
@@ -241,7 +241,9 @@ def straight(start: tuple[float, float, float], count: int, moved: Tensor) -> Te
     return line + moved.unsqueeze(-2)
 
 
-def through(points: Sequence[Sequence[tuple[float, float, float]]], horizon: int, off: Tensor) -> Tensor:
+def through(
+    points: Sequence[Sequence[tuple[float, float, float]]], horizon: int, off: Tensor, *, reach: float = Task.reach
+) -> Tensor:
     """Return actions that lead tools through points and then keep them there, shape (..., horizon, 6 arms).
 
     Every leg takes actions in proportion to the longest way of a tool on it.
@@ -250,16 +252,17 @@ def through(points: Sequence[Sequence[tuple[float, float, float]]], horizon: int
         points: how far the tools are from their starts [m], one row of points per leg, one point per tool.
         horizon: actions in all.
         off: what is added to all points [m], shape (..., arms, 3).
+        reach: greatest way of a tool in an action [m].
     """
     off = off.to(torch.float64).unsqueeze(-3)
-    way = torch.tensor(points, dtype=torch.float64).reshape(-1, *off.shape[-2:]) + off
+    way = off.new_tensor(points).reshape(-1, *off.shape[-2:]) + off
     legs = torch.cat([torch.zeros_like(off), way], -3).diff(dim=-3)
-    need = (legs.norm(dim=-1).amax(-1) / Task.reach - 1e-9).ceil().clamp(min=1)
+    need = (legs.norm(dim=-1).amax(-1) / reach - 1e-9).ceil().clamp(min=1)
     most = int(need.sum(-1).max())
     if most > horizon:
-        raise ValueError(f"way-points: they take {most} actions of {Task.reach} m; expected at most {horizon}")
+        raise ValueError(f"way-points: they take {most} actions of {reach} m; expected at most {horizon}")
     # Which share of each leg is behind the tools before and after each action.
-    done = torch.arange(horizon + 1, dtype=torch.float64).unsqueeze(-1) - (need.cumsum(-1) - need).unsqueeze(-2)
+    done = torch.arange(horizon + 1, dtype=off.dtype, device=off.device).unsqueeze(-1) - (need.cumsum(-1) - need).unsqueeze(-2)
     share = (done / need.unsqueeze(-2)).clamp(0, 1)
     xyz = (share @ legs.flatten(-2)).diff(dim=-2)
     return torch.cat([xyz, torch.zeros_like(xyz)], -1)
