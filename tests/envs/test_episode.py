@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from typing import ClassVar
 
 import pytest
 import torch
@@ -13,9 +14,10 @@ from torchdlo import scene as scenes
 from torchdlo.coupling.bodies import turn_by
 from torchdlo.coupling.robot import tool_pose
 from torchdlo.envs import TASKS, episode
-from torchdlo.envs.task import through
+from torchdlo.envs.task import RADIUS, Arms, Seen, Task, make, straight, through
 from torchdlo.physics import tree
 from torchdlo.physics.rotation import multiply
+from torchdlo.scene import Rope
 
 
 def led(name: str, rows: list[list[float]]) -> list[episode.World]:
@@ -152,6 +154,48 @@ def test_a_rope_torn_between_two_hands_has_failed():
         after = episode.act(made, torn, torch.zeros(2, 12, dtype=F64))
     assert after.failed.tolist() == [False, True]
     assert math.isclose(made.task.stretch, 1.05)
+
+
+@dataclasses.dataclass(frozen=True)
+class Side(Task):
+    """Two straight ropes side by side, of six vertices each."""
+
+    name: ClassVar[str] = "side"
+    arms: ClassVar[Arms] = Arms(base=((0.0, -0.5, 0.0), (0.1, -0.5, 0.0), (0.0, 0.5, 0.0)), vertex=(0, 5, 7))
+    stretch: ClassVar[float] = 1.1
+
+    def build(self, moved):
+        """Return the scene."""
+        lines = [straight((0.0, y, 0.012), 6, moved[:, 0]) for y in (0.0, 0.2)]
+        return make(self, [Rope(x, RADIUS, mass=0.005, youngs=1e4) for x in lines])
+
+    def rewards(self, seen):
+        """Return nothing."""
+        return {"none": 0 * seen.x[:, 0, 0]}
+
+    def success(self, seen):
+        """Return that nothing is reached."""
+        return seen.x[:, 0, 0] > 1
+
+
+@pytest.mark.parametrize(("vertex", "rest"), [((0, 5, 7), [0.1]), ((8, 1, 3), [0.04]), ((5, 2, 0), [0.04, 0.06])])
+def test_the_rope_between_hands_is_that_of_hands_on_one_rope(vertex: tuple[int, ...], rest: list[float]):
+    made = type("Placed", (Side,), {"arms": Arms(Side.arms.base, vertex), "__doc__": "With hands elsewhere."})()
+    scene, _, state = made.start(2, like=torch.zeros((), dtype=F64))
+    seen = Seen(state, None, None, {})
+    torch.testing.assert_close(made.rest(seen, scene.topology), torch.tensor([rest] * 2, dtype=F64))
+
+
+def test_hands_on_two_ropes_may_draw_apart():
+    class Apart(Side):
+        """With one hand for each rope."""
+
+        arms: ClassVar[Arms] = Arms(Side.arms.base[::2], (0, 7))
+
+    made = episode.prepare(Apart(frames=1), 1, like=torch.zeros((), dtype=F64), compiled=False)
+    with torch.no_grad():
+        after = episode.act(made, made.start, torch.zeros(1, 12, dtype=F64))
+    assert made.start.notes["rest"].shape == (1, 0) and not after.failed.any()
 
 
 def test_scores_are_0_for_doing_nothing_and_1_for_the_way_by_hand():

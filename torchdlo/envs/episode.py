@@ -155,7 +155,7 @@ def _begin(task: Task, scene: Scene, state: State, hands: Hands) -> World:
     held = grasp.weld(scene, hands, scenes.hold(scene, state), repeated(target, plan.room), closed)
     world = World(state, found.joints, target, target, held, {}, failed, none)
     seen = world.seen(task.arms.count)
-    return tree.replace(world, notes={"rest": task.rest(seen), **task.note(seen)})
+    return tree.replace(world, notes={"rest": task.rest(seen, scene.topology), **task.note(seen)})
 
 
 def begin(episode: Episode, state: State) -> World:
@@ -266,7 +266,7 @@ def _judged(episode: Episode, before: World, after: World, lost: list[Tensor]) -
     notes = task.note(after.seen(task.arms.count))
     after = tree.replace(after, notes={"rest": before.notes["rest"], **notes})
     seen = after.seen(task.arms.count)
-    torn = task.rest(seen) > task.stretch * seen.notes["rest"]
+    torn = (task.rest(seen, episode.scene.topology) > task.stretch * seen.notes["rest"]).any(-1)
     stuck = (inside(episode.scene, episode.params, after.state, after.tool.pos) & (seen.closed[..., 0] > 0)).any(-1)
     lost.append(~good | broken(episode.scene, episode.params, after.state))
     return tree.replace(after, failed=before.failed | lost[0] | torn | stuck | task.failed(seen))

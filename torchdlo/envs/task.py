@@ -6,6 +6,7 @@ A task is a frozen dataclass without tensors. `episode` runs it, `env` offers it
 from __future__ import annotations
 
 import functools
+import itertools
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
@@ -29,6 +30,7 @@ from torchdlo.physics.effect import Effect
 from torchdlo.physics.effects.elastic import Bend, BendFrame, Stretch
 from torchdlo.physics.effects.field import Damping, Gravity
 from torchdlo.physics.effects.table import Table, TableFriction
+from torchdlo.physics.topology import Topology
 from torchdlo.scene import Params, Rope, Scene, State
 
 __all__ = [
@@ -215,12 +217,17 @@ class Task(ABC):
             led |= {rope[v] for v in stage.vertex if v is not None}
         return found
 
-    def rest(self, seen: Seen) -> Tensor:
-        """Return the length of the rope between two hands [m], shape (B,); ones if there are not two on one rope."""
-        if self.arms.count < 2 or not math.isfinite(self.stretch):
-            return torch.ones_like(seen.x[:, 0, 0])
-        a, b = sorted(self.arms.vertex)
-        return geometry.length(seen.x[:, a : b + 1])
+    def rest(self, seen: Seen, topology: Topology) -> Tensor:
+        """Return the lengths of rope between neighbouring hands on one rope [m], shape (B, n).
+
+        There are none if `stretch` is infinite, and n = 0 if no rope has two hands.
+        """
+        if not math.isfinite(self.stretch):
+            return seen.x[:, 0, :0]
+        rope = [k for k, count in enumerate(topology.counts) for _ in range(count)]
+        pairs = [(a, b) for a, b in itertools.pairwise(sorted(self.arms.vertex)) if rope[a] == rope[b]]
+        lengths = [geometry.length(seen.x[:, a : b + 1]) for a, b in pairs]
+        return torch.stack(lengths, -1) if lengths else seen.x[:, 0, :0]
 
 
 @functools.cache
@@ -262,7 +269,9 @@ def through(
     if most > horizon:
         raise ValueError(f"way-points: they take {most} actions of {reach} m; expected at most {horizon}")
     # Which share of each leg is behind the tools before and after each action.
-    done = torch.arange(horizon + 1, dtype=off.dtype, device=off.device).unsqueeze(-1) - (need.cumsum(-1) - need).unsqueeze(-2)
+    done = torch.arange(horizon + 1, dtype=off.dtype, device=off.device).unsqueeze(-1) - (
+        need.cumsum(-1) - need
+    ).unsqueeze(-2)
     share = (done / need.unsqueeze(-2)).clamp(0, 1)
     xyz = (share @ legs.flatten(-2)).diff(dim=-2)
     return torch.cat([xyz, torch.zeros_like(xyz)], -1)
