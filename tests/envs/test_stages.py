@@ -92,6 +92,18 @@ def test_a_held_vertex_follows_and_one_that_was_let_go_does_not():
     assert moved[0, 2] < 0.5 * way[2]
 
 
+def test_turns_of_a_hand_on_its_way_count_for_nothing():
+    actions = torch.zeros(5, 12, dtype=F64)
+    plain = worlds(actions)
+    # Both hands travel in the first three of the actions that tell them to turn.
+    actions[1:5, 6:] = 0.1
+    turned = worlds(actions)
+    for a, b in zip(plain[:5], turned[:5], strict=True):
+        torch.testing.assert_close(b.target.quat, a.target.quat, rtol=0, atol=0)
+    # Half of a turn of 0.1 degrees about three axes is 1.5e-3 rad.
+    assert ((turned[5].target.quat - plain[5].target.quat).norm(dim=-1) > 1e-3).all()
+
+
 def test_a_hand_that_does_not_get_there_stays_open():
     made = episode.prepare(Passing(), 1, like=torch.zeros((), dtype=F64), compiled=False)
     world = tree.replace(made.start, count=made.start.count + 4)
@@ -176,8 +188,8 @@ def test_arms_can_go_the_way_by_hand_of_tasks_with_stages(name: str):
     world, plan = made.start, task.schedule
     with torch.no_grad():
         for action in task.reference().float()[:, None]:
-            aim = episode._aim(task, world, action).pos
-            want = plan.steer(world.count, world.target.pos, aim, world.state.rods.pos)
+            aim = episode._aim(task, world, action)
+            want = plan.steer(world.count, world.target, aim, world.state.rods.pos).pos
             world = episode.act(made, world, action)
             # What counts as there is 0.1 mm away at most.
             torch.testing.assert_close(world.tool.pos, want, atol=1.1e-4, rtol=0)

@@ -253,7 +253,7 @@ def _staged(episode: Episode, world: World, aim: Pose) -> tuple[Pose, Grasp]:
     closed = plan.closed(world.count, world.tool, x, world.grasp.closed)
     now = scenes.hold(episode.scene, world.state)
     held = grasp.weld(episode.scene, episode.hands, now, repeated(world.tool, plan.room), closed, world.grasp)
-    return Pose(plan.steer(world.count, world.target.pos, aim.pos, x), aim.quat), held
+    return plan.steer(world.count, world.target, aim, x), held
 
 
 def _judged(episode: Episode, before: World, after: World, lost: list[Tensor]) -> World:

@@ -145,13 +145,15 @@ class Schedule:
         there = (off <= NEAR).to(x.dtype)
         return wanted * torch.where(before > 0, last, there)
 
-    def steer(self, count: Tensor, now: Tensor, target: Tensor, x: Tensor) -> Tensor:
+    def steer(self, count: Tensor, now: Pose, target: Pose, x: Tensor) -> Pose:
         """Return the targets of the tools, with those of hands on their way in place of what actions ask for.
+
+        Hands do not turn on their way.
 
         Args:
             count: actions done, shape (B,).
-            now: targets until now [m], shape (B, R, 3).
-            target: what the action asks for [m], shape (B, R, 3).
+            now: targets until now, shapes (B, R, 3) and (B, R, 4).
+            target: what the action asks for, in the same shapes.
             x: all vertices [m], shape (B, V, 3).
         """
         _, rows, vertices = self._rows
@@ -163,6 +165,7 @@ class Schedule:
             share = left / self.travel
             return 4 * share * (1 - share) * up
 
-        line = now - rise(left)
+        line = now.pos - rise(left)
         there = line + (goal - line) / left.clamp(min=1) + rise(left - 1)
-        return torch.where(left > 0, there, target)
+        pos, quat = torch.where(left > 0, there, target.pos), torch.where(left > 0, now.quat, target.quat)
+        return Pose(pos, quat)
