@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import pytest
 import torch
 
 from torchdlo import scene as scenes
@@ -11,6 +12,7 @@ from torchdlo.coupling.bodies import Solid
 from torchdlo.coupling.rod_body import RodBody
 from torchdlo.envs.crash import broken, inside
 from torchdlo.physics import tree
+from torchdlo.physics.effects.material import AxialStiffness
 
 F64 = torch.float64
 POINTS = {
@@ -57,3 +59,14 @@ def test_inextensible_ropes_that_lost_their_lengths_are_broken():
         pos = torch.cat([line[:2].expand(4, 2, 3), ends[:, None]], 1)
         moved = tree.replace(state, rods=tree.replace(state.rods, pos=pos))
         assert broken(scene, params, moved).tolist() == expected
+
+
+@pytest.mark.parametrize(("stiffness", "expected"), [(1e3, False), (1e18, True)])
+def test_ropes_that_an_effect_makes_elastic_may_stretch(stiffness: float, expected: bool):
+    line = torch.tensor([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.2, 0.0, 0.0]], dtype=F64)
+    rope = scenes.Rope(line[None], 0.01, mass=0.01, bend=1e-4)
+    values = {"stretch": {"EA": stiffness}}
+    scene, params, state = scenes.make([rope], [AxialStiffness()], values, dt=1e-3, substeps=10)
+    longer = tree.replace(state, rods=tree.replace(state.rods, pos=1.2 * state.rods.pos))
+    # 1e18 N stands for inextensible.
+    assert broken(scene, params, longer).tolist() == [expected]

@@ -7,6 +7,7 @@ from torch import Tensor
 
 from torchdlo.coupling import shapes
 from torchdlo.coupling.bodies import conjugate
+from torchdlo.physics.effect import altered
 from torchdlo.physics.numerics import safe_norm
 from torchdlo.physics.rod import edge_vectors
 from torchdlo.physics.rotation import rotate
@@ -16,6 +17,9 @@ __all__ = ["broken", "inside"]
 
 _OFF = 0.1
 """Share by which the edges of inextensible ropes may miss their lengths; solved ones miss them by 1e-6."""
+
+_RIGID = 1e12
+"""Axial stiffness from which ropes are inextensible [N]: effects have large numbers where ropes have infinite ones."""
 
 
 def inside(scene: Scene, params: Params, state: State, points: Tensor) -> Tensor:
@@ -32,7 +36,8 @@ def inside(scene: Scene, params: Params, state: State, points: Tensor) -> Tensor
 
 def broken(scene: Scene, params: Params, state: State) -> Tensor:
     """Return where inextensible ropes lost their lengths: numbers, but no motion; bool, shape (B,)."""
-    rest, topology = params.rods.rest, scene.settings.topology
-    length = safe_norm(edge_vectors(topology, state.rods.pos, rest.edge_mask))
-    fixed = torch.isinf(params.rods.material.stretch) & (rest.edge_mask > 0)
+    rods = altered(scene.effects, scene.topology, params.rods, params.effects)
+    rest = rods.rest
+    length = safe_norm(edge_vectors(scene.topology, state.rods.pos, rest.edge_mask))
+    fixed = (rods.material.stretch >= _RIGID) & (rest.edge_mask > 0)
     return (fixed & ((length - rest.length).abs() > _OFF * rest.length)).any(-1).any(-1)
