@@ -118,6 +118,18 @@ def test_random_numbers_of_effects_stay_in_their_declared_range():
         made(randomize={"rod_contact.mu_k": 2.0})
 
 
+def test_scenes_settle_with_the_numbers_that_are_drawn_for_them():
+    task = dataclasses.replace(small("slingshot"), settle=5)
+    choices = {"num_envs": 2, "compiled": False, "variation": False, "dtype": F64}
+    env = envs.make(task, randomize={"gravity.acceleration": 0.5}, **choices)
+    env.reset()
+    fall = env.episode.params.effects["gravity"]["acceleration"][..., 2].flatten()
+    usual = env.episode.start.state.rods.vel[0, 3, 2] / env._usual.effects["gravity"]["acceleration"][..., 2].flatten()
+    # The band hardly resists yet: free vertices fall as fast as gravity has it.
+    torch.testing.assert_close(env.world.state.rods.vel[:, 3, 2], usual * fall, rtol=1e-2, atol=0)
+    assert (fall[0] - fall[1]).abs() > 0.1
+
+
 def test_transforms_and_collectors_work():
     env = TransformedEnv(made(horizon=2), RewardSum())
     env.append_transform(StepCounter())

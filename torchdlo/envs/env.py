@@ -112,10 +112,11 @@ class DloEnv(EnvBase):
 
     def _fresh(self) -> World:
         """Return the worlds of new episodes."""
-        if not self.variation:
+        # Scenes settle with their own numbers.
+        if not self.variation and not (self._randomize and self.task.settle):
             return self.episode.start
-        start = self.task.start(len(self.world.count), like=self._like, generator=self._generator, variation=True)
-        return episodes.begin(self.episode, start[2])
+        choices = {"like": self._like, "generator": self._generator, "variation": self.variation}
+        return episodes.begin(self.episode, self.task.start(len(self.world.count), **choices)[2])
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
         with torch.set_grad_enabled(self.gradients and torch.is_grad_enabled()):
