@@ -111,7 +111,8 @@ def test_random_numbers_of_effects_stay_in_their_declared_range():
     # A fifth of 0 to 2 about 0.25; the whole of 1e-3 to 50 about 30, by factors, cut off at 50.
     assert 0.05 <= float(mu.min()) < 0.12 and 0.38 < float(mu.max()) <= 0.45
     assert float(rate.max()) == pytest.approx(50) and float(rate.min()) < 5
-    assert numbers["rod_contact"]["mu_s"].unique().numel() == 1
+    # What slides rubs less than what sticks.
+    torch.testing.assert_close(numbers["rod_contact"]["mu_s"].flatten(), mu.clamp(min=0.3), rtol=0, atol=0)
     with pytest.raises(ValueError, match=r"there is no number 'rod_contact\.mu'"):
         made(randomize={"rod_contact.mu": 0.1})
     with pytest.raises(ValueError, match="a share of its declared range"):

@@ -161,7 +161,8 @@ def drawn_effects(
     """Return numbers of effects, those that are named drawn anew for each scene, shape (count, 1, C).
 
     A number is drawn evenly, on the scale on which it is declared, from an interval about its value: that share of the
-    whole declared range, cut off at the range's ends.
+    whole declared range, cut off at the range's ends. Static friction `mu_s` is raised to sliding friction `mu_k` where
+    it would be less.
     """
     found = {
         effect: {name: x.expand(count, 1, x.shape[-1]) for name, x in v.items()} for effect, v in params.effects.items()
@@ -174,4 +175,7 @@ def drawn_effects(
         random = torch.rand(value.shape, generator=generator, dtype=torch.float64).to(value)
         at = param.coordinate(value) + share * (high - low) * (random - 0.5)
         found[effect][number] = param.value(torch.minimum(torch.maximum(at, low), high))
+    for effect in {name.partition(".")[0] for name in shares}:
+        if {"mu_s", "mu_k"} <= found[effect].keys():
+            found[effect]["mu_s"] = torch.maximum(found[effect]["mu_s"], found[effect]["mu_k"])
     return found
