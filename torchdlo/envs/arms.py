@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
+
+from torchdlo.errors import InputError
 
 __all__ = ["DOWN", "Arms"]
 
@@ -27,6 +31,24 @@ class Arms:
     mu: float = 0.5
     """Coefficient of friction between fingers and rope [1]."""
 
+    def __post_init__(self) -> None:
+        if not self.base or not _rows(self.base, 3):
+            raise InputError(
+                f"arms: base is {self.base!r}; expected a place (x, y, z) [m] for each arm, such as "
+                "base=((0.0, -0.5, 0.0),) for one."
+            )
+        slots = isinstance(self.vertex, tuple) and all(isinstance(v, int) and v >= 0 for v in self.vertex)
+        if not slots or len(self.vertex) != self.count:
+            raise InputError(
+                f"arms: vertex is {self.vertex!r}; expected a tuple of {self.count} whole numbers from 0 on, one for "
+                "each arm, such as vertex=(0,) for one."
+            )
+        if not _rows(self.quat, 4) or len(self.quat) not in (0, self.count):
+            raise InputError(
+                f"arms: quat is {self.quat!r}; expected an orientation (w, x, y, z) for each of {self.count} arms, or "
+                "none: leave it out for tools that point straight down."
+            )
+
     @property
     def count(self) -> int:
         """How many arms there are."""
@@ -36,3 +58,9 @@ class Arms:
     def quats(self) -> tuple[tuple[float, float, float, float], ...]:
         """Orientations of all tools at the start."""
         return self.quat or (DOWN,) * self.count
+
+
+def _rows(given: Any, size: int) -> bool:
+    """Return whether something is a sequence of rows of so many numbers."""
+    rows = isinstance(given, Sequence) and all(isinstance(row, Sequence) and len(row) == size for row in given)
+    return rows and all(isinstance(x, int | float) and math.isfinite(x) for row in given for x in row)
