@@ -73,7 +73,7 @@ def test_the_reward_is_made_of_its_named_terms(name: str) -> None:
     outcome, _ = played(name)
     task = prepared(name).task
     for k in range(2):
-        whole = combined(task, {n: t[k] for n, t in outcome.terms.items()})
+        whole = combined(task, {n: t[k] for n, t in outcome.terms.items()}, 2)
         torch.testing.assert_close(torch.where(outcome.failed, outcome.rewards[k], whole), outcome.rewards[k])
     assert outcome.rewards.shape == (2, 2) and torch.isfinite(outcome.rewards).all()
     torch.testing.assert_close(outcome.returns, outcome.rewards.sum(0))

@@ -5,8 +5,12 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
+import torch
+from test_contract import F64, prepared, small
 
-from torchdlo.envs.task import Arms
+from torchdlo import envs
+from torchdlo.envs import TASKS, episode, find
+from torchdlo.envs.task import Arms, combined
 from torchdlo.errors import InputError
 
 ONE = ((0.0, -0.5, 0.0),)
@@ -32,3 +36,52 @@ def test_arms_that_are_not_one_entry_each_are_refused(given: dict[str, Any], wor
     with pytest.raises(InputError, match=words):
         Arms(**given)
     assert Arms(base=[[0, -0.5, 0]], vertex=(0,)).count == 1
+
+
+def test_what_is_no_cable_is_refused() -> None:
+    words = r"rope: it is 'model.json'; expected a torchdlo.envs.Cable; torchdlo.describe.cable\(path\) makes one"
+    for make in (lambda: envs.make("coiling", rope="model.json"), lambda: find("coiling", "model.json")):
+        with pytest.raises(InputError, match=words):
+            make()
+
+
+def test_what_is_no_task_is_refused() -> None:
+    pytest.importorskip("torchrl")
+    with pytest.raises(InputError, match=r"it is the class Coiling; .*; write Coiling\(\)\."):
+        envs.make(TASKS["coiling"])
+    with pytest.raises(InputError, match=r"task: it is 3; expected a name of `envs.TASKS` or an instance of a Task\."):
+        envs.make(3)
+
+
+@pytest.mark.parametrize("count", [0, -1, 2.0, True, "2"])
+def test_what_is_no_number_of_scenes_is_refused(count: Any) -> None:
+    pytest.importorskip("torchrl")
+    with pytest.raises(InputError, match=f"num_envs: it is {count!r}; expected how many"):
+        envs.make("coiling", num_envs=count, compiled=False)
+
+
+@pytest.mark.parametrize(
+    ("terms", "words"),
+    [
+        ({"near": torch.ones(2), "far": torch.ones(2, 1)}, r"rewards returned {'far': \(2, 1\)}; .* of shape \(2,\)"),
+        ({"near": torch.ones(1)}, r"{'near': \(1,\)}"),
+        ({"near": torch.ones(())}, r"{'near': \(\)}"),
+        ({"near": 1.0}, r"{'near': 1.0}"),
+        ({}, r"rewards returned {}; expected one or more terms"),
+    ],
+)
+def test_terms_that_are_not_a_number_for_each_scene_are_refused(terms: dict[str, Any], words: str) -> None:
+    with pytest.raises(InputError, match=words):
+        combined(find("coiling"), terms, 2)
+    kind = type("Other", (TASKS["coiling"],), {"rewards": lambda self, seen: terms, "__doc__": "With other terms."})
+    pytest.importorskip("torchrl")
+    with pytest.raises(InputError, match=words):
+        envs.make(kind(), num_envs=2, compiled=False)
+
+
+def test_choices_beside_an_episode_and_episodes_of_other_tasks_are_refused() -> None:
+    made, actions = prepared("coiling"), torch.zeros(2, 1, 6, dtype=F64)
+    with pytest.raises(InputError, match="coiling: segment beside an episode that is prepared already"):
+        episode.play(made.task, actions, episode=made, segment=3)
+    with pytest.raises(InputError, match=r"wiring_post: the episode is of Coiling\(horizon=2.*expected one of Wiring"):
+        episode.play(small("wiring_post"), actions, episode=made)

@@ -106,6 +106,10 @@ def make(
             f"environments need torchrl and tensordict ({error}); install them with pip install 'torchdlo[rl,robots]'."
         ) from None
     chosen = find(task) if isinstance(task, str) else task
+    if not isinstance(chosen, Task):
+        kind = f"the class {task.__name__}" if isinstance(task, type) else repr(task)
+        mend = f"; write {task.__name__}()" if isinstance(task, type) and issubclass(task, Task) else ""
+        raise InputError(f"task: it is {kind}; expected a name of `envs.TASKS` or an instance of a Task{mend}.")
     if rope is not None:
         chosen = dataclasses.replace(chosen, rope=rope)
     return DloEnv(

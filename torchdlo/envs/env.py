@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
+from numbers import Integral
 from typing import Any
 
 import torch
@@ -17,7 +18,8 @@ from torchrl.envs import EnvBase
 
 from torchdlo.envs import episode as episodes
 from torchdlo.envs.episode import World
-from torchdlo.envs.task import Task
+from torchdlo.envs.task import Task, combined
+from torchdlo.errors import InputError
 from torchdlo.physics import tree
 from torchdlo.scene import Params, Scene
 
@@ -43,6 +45,10 @@ class DloEnv(EnvBase):
         randomize: Mapping[str, float] | None = None,
     ) -> None:
         """Make the scenes; arguments as in `torchdlo.envs.make`."""
+        if not isinstance(num_envs, Integral) or isinstance(num_envs, bool) or num_envs < 1:
+            raise InputError(
+                f"num_envs: it is {num_envs!r}; expected how many scenes there are, a whole number from 1 on."
+            )
         super().__init__(device=device or "cpu", batch_size=torch.Size([num_envs]))
         self.task, self.gradients, self.variation = task, gradients, variation
         self._like = torch.zeros((), dtype=dtype, device=self.device)
@@ -61,6 +67,7 @@ class DloEnv(EnvBase):
         self.action_spec = Bounded(-limit, limit, (*shape, self.task.width), device=device, dtype=torch.float32)
         flag = Binary(1, (*shape, 1), device=device, dtype=torch.bool)
         names = self.task.rewards(self.world.seen(self.task.arms.count))
+        combined(self.task, names, len(self.world.failed))  # says what is wrong before the first step
         one = Unbounded((*shape, 1), device=device, dtype=torch.float32)
         self.observation_spec = Composite(
             observation=Unbounded((*shape, size), device=device, dtype=torch.float32),

@@ -288,7 +288,7 @@ def earned(episode: Episode, world: World) -> tuple[Tensor, Tensor, dict[str, Te
     """Return the reward of the last action, its loss, and the terms of the reward, shape (B,) each."""
     task, seen = episode.task, world.seen(episode.task.arms.count)
     terms = task.rewards(seen)
-    reward = combined(task, terms)
+    reward = combined(task, terms, len(world.failed))
     loss = sum(task.extra(seen).values(), -reward)
     return torch.where(world.failed, 0.0, reward), torch.where(world.failed, 0.0, loss), terms
 
@@ -336,6 +336,16 @@ def play(
     """
     if actions.dim() != 3 or 0 in actions.shape:
         raise ValueError(f"{task.name}: actions are {tuple(actions.shape)}; expected (scenes, actions, {task.width})")
+    if episode is not None and choices:
+        raise InputError(
+            f"{task.name}: {', '.join(choices)} beside an episode that is prepared already; give choices to `prepare`, "
+            "or leave the episode out."
+        )
+    if episode is not None and episode.task is not task and episode.task != task:
+        raise InputError(
+            f"{task.name}: the episode is of {episode.task}; expected one of {task}: play it with `episode.task`, or "
+            "prepare another."
+        )
     episode = episode or prepare(task, len(actions), like=actions.detach(), **choices)
     world, count, rows, path = episode.start, actions.shape[1], [], []
     if len(world.joints) != len(actions):

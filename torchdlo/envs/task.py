@@ -109,6 +109,13 @@ class Task(ABC):
     travel: ClassVar[int] = 10
     """Actions that a hand takes from what it held to what it holds in the next stage."""
 
+    def __post_init__(self) -> None:
+        if not isinstance(self.rope, Cable | None):
+            raise InputError(
+                f"rope: it is {self.rope!r}; expected a torchdlo.envs.Cable; torchdlo.describe.cable(path) makes one "
+                "of a model file."
+            )
+
     @property
     def schedule(self) -> Schedule:
         """The stages of the task, one at least."""
@@ -235,8 +242,15 @@ def _schedule(stages: tuple[Stage, ...], travel: int) -> Schedule:
     return Schedule(stages, travel)
 
 
-def combined(task: Task, terms: dict[str, Tensor]) -> Tensor:
-    """Return the one reward that terms make, shape (B,)."""
+def combined(task: Task, terms: dict[str, Tensor], count: int) -> Tensor:
+    """Return the one reward that the terms of `count` scenes make, shape (B,)."""
+    found = {name: tuple(x.shape) if isinstance(x, Tensor) else x for name, x in terms.items()}
+    wrong = {name: shape for name, shape in found.items() if shape != (count,)}
+    if wrong or not terms:
+        raise InputError(
+            f"{task.name}: rewards returned {wrong}; expected one or more terms, each a tensor of shape ({count},), a "
+            "number for each scene: keep the first axis, and sum or average over all others."
+        )
     parts = torch.stack(list(terms.values()))
     return parts.sum(0) if task.combine == "sum" else parts.prod(0)
 
