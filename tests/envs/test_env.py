@@ -150,6 +150,17 @@ def test_other_words_for_a_task_are_refused():
         envs.make("knot")
 
 
+def test_environments_stay_on_their_device_and_in_their_precision():
+    env = made()
+    assert env.to("cpu") is env and env.to(torch.device("cpu")) is env and env.to(torch.float32) is env
+    with pytest.raises(envs.InputError, match=r"made with device cpu and cannot go to meta; give device= to"):
+        env.to("meta")
+    with pytest.raises(envs.InputError, match=r"made with device cpu and cannot go to meta"):
+        TransformedEnv(env, RewardSum()).to("meta")
+    with pytest.raises(envs.InputError, match=r"made with dtype torch.float32 and cannot go to torch.float64"):
+        env.to(F64)
+
+
 def test_a_missing_extra_is_named():
     code = (
         "import sys\nsys.modules['torchrl'] = None\nfrom torchdlo import envs\n"

@@ -84,6 +84,24 @@ class DloEnv(EnvBase):
     def _set_seed(self, seed: int | None) -> None:
         self._generator.manual_seed(0 if seed is None else seed)
 
+    def to(self, device: torch.device | str | int | torch.dtype) -> DloEnv:
+        """Return the environment if it is on that device, or in that precision, already.
+
+        Raises:
+            InputError: It is not: steps are made for one of each.
+        """
+        if isinstance(device, torch.dtype):
+            what, now, there = "dtype", self._like.dtype, device == self._like.dtype
+        else:
+            what, now, asked = "device", self.device, torch.device(device)
+            there = (asked.type, asked.index or 0) == (now.type, now.index or 0)
+        if not there:
+            raise InputError(
+                f"to: scenes were made with {what} {now} and cannot go to {device}; "
+                f"give {what}= to `envs.make` instead."
+            )
+        return self
+
     def detach(self) -> None:
         """Cut the state from its gradient history, as one does between windows of a long episode."""
         self.world = tree.detach(self.world)
