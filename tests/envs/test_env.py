@@ -45,6 +45,17 @@ def test_the_seed_decides_starts_and_what_follows():
     assert (played(1) - played(2)).abs().max() > 1e-3
 
 
+def test_without_a_seed_torch_decides_starts():
+    def starts() -> list[torch.Tensor]:
+        torch.manual_seed(5)
+        return [made(seed=None).reset()["observation"] for _ in range(2)]
+
+    with torch.random.fork_rng():
+        first, again = starts(), starts()
+    torch.testing.assert_close(first, again, rtol=0, atol=0)
+    assert (first[0] - first[1]).abs().max() > 1e-3
+
+
 def test_scenes_are_reset_one_by_one():
     env = made(horizon=3)
     td = env.reset()
@@ -121,7 +132,7 @@ def test_random_numbers_of_effects_stay_in_their_declared_range():
 
 def test_scenes_settle_with_the_numbers_that_are_drawn_for_them():
     task = dataclasses.replace(small("slingshot"), settle=5)
-    choices = {"num_envs": 2, "compiled": False, "variation": False, "dtype": F64}
+    choices = {"num_envs": 2, "compiled": False, "variation": False, "dtype": F64, "seed": 0}
     env = envs.make(task, randomize={"gravity.acceleration": 0.5}, **choices)
     env.reset()
     fall = env.episode.params.effects["gravity"]["acceleration"][..., 2].flatten()

@@ -88,7 +88,7 @@ def make(
         num_envs: scenes in the batch.
         device: where they live.
         dtype: precision of the physics; observations and rewards are in single precision.
-        seed: of the starts and of what is randomised.
+        seed: of the starts and of what is randomised; None draws one from torch's generator (`torch.manual_seed`).
         gradients: whether rewards and observations carry gradients to actions.
         compiled: whether to compile steps: minutes at first, then about three times as fast, with gradients too.
         recorded: if not, whether to record them: seconds at first, then two to three times as fast without gradients.

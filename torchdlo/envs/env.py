@@ -58,7 +58,7 @@ class DloEnv(EnvBase):
         _check(self._randomize, made.scene)
         self.episode, self.world, self._usual = made, made.start, made.params
         self._make_specs()
-        self.set_seed(seed if seed is not None else 0)
+        self.set_seed(seed)
 
     def _make_specs(self) -> None:
         shape, device = self.batch_size, self.device
@@ -82,7 +82,8 @@ class DloEnv(EnvBase):
         )
 
     def _set_seed(self, seed: int | None) -> None:
-        self._generator.manual_seed(0 if seed is None else seed)
+        # Without a seed, torch's own generator decides, so that torch.manual_seed holds here too.
+        self._generator.manual_seed(int(torch.randint(2**31, (), device="cpu")) if seed is None else seed)
 
     def to(self, device: torch.device | str | int | torch.dtype) -> DloEnv:
         """Return the environment if it is on that device, or in that precision, already.
