@@ -75,7 +75,10 @@ class Outcome:
     returns: Tensor
     """Sums of rewards [1], shape (B,)."""
     loss: Tensor
-    """What gradients should descend: minus the return, and what the task adds to it [1], shape (B,)."""
+    """What gradients should descend: minus the return, and what the task adds to it [1], shape (B,).
+
+    That of an episode that failed has terms from before it did only, and may be small: mask it by `failed`.
+    """
     shortfall: Tensor
     """What the loss has for how far the end is from success, see `Task.shortfall` [1], shape (B,)."""
     success: Tensor
