@@ -14,6 +14,8 @@ pytest.importorskip("pytorch_kinematics", reason="arms need the extra robots")
 from test_tasks import Lead
 
 from torchdlo import cli, envs
+from torchdlo.agents.script import script
+from torchdlo.envs import episode
 from torchdlo.run import load_frames
 
 
@@ -69,6 +71,12 @@ def test_a_trajectory_comes_back_bit_by_bit(capsys):
     assert play("lead", "--trajectory", "found/trajectory.json", "--json") == 0
     went, kept = json.loads(capsys.readouterr().out), json.loads(Path("found/trajectory.json").read_text())
     assert went["return"] == kept["return"] and went["rewards"] == kept["rewards"]
+    # On another rope it shows how well it carries over.
+    rope = envs.Cable(line_density=0.05, bend=1e-4, damping=20.0)
+    same, other = (script("lead", Path("found/trajectory.json"), given) for given in (None, rope))
+    went, moved = (episode.play(s.task, s.actions[None], episode=s.episode) for s in (same, other))
+    assert same.actions.tolist() == other.actions.tolist() and went.returns.item() == kept["return"]
+    assert (went.world.state.rods.pos - moved.world.state.rods.pos).abs().max() > 1e-6
     # What was found for a rope of its own needs one.
     kept["choices"]["rope"] = {"bend": 1e-3}
     Path("other.json").write_text(json.dumps(kept))
