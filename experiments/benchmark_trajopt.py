@@ -16,7 +16,6 @@ from __future__ import annotations
 import json
 import math
 import os
-import shutil
 import subprocess
 import sys
 import time
@@ -111,7 +110,7 @@ class Case:
 
     def ready(self, choices: dict[str, Any], again: bool) -> None:
         """Say so before anything runs if the journal of a stopped search is of another one; `again` removes it."""
-        from torchdlo.agents.journal import program
+        from torchdlo.agents.journal import program, remove
         from torchdlo.errors import InputError
 
         journal = self.folder / "journal"
@@ -122,7 +121,7 @@ class Case:
         other = [name for name, value in wanted.items() if had["options"].get(name) != value]
         other += ["version"] if had["program"] != program(self.task) else []
         if other and again:
-            shutil.rmtree(journal)
+            remove(journal)
         elif other:
             raise InputError(
                 f"{journal}: a search was stopped here whose {', '.join(other)} differ; --again begins anew, or choose "

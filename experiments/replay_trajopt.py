@@ -23,7 +23,7 @@ EXAMPLES = """examples:
 """
 
 
-STEPS = ("double", "compiled")
+STEPS = ("double", "compiled", "recorded")
 """Choices of a problem that change how numbers are rounded."""
 
 

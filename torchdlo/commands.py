@@ -189,9 +189,9 @@ def optimize(
 ) -> None:
     """Search the trajectory of the tools that earns most in a task.
 
-    Budget, way-points and first steps that are not given are the published ones of the task: hours on one core, where
-    --episodes 600 takes minutes to an hour. Ctrl-C keeps the best so far; a search that was stopped or killed goes on
-    with --resume, and ends as if it had never stopped. Without it, a search begins anew and what was stopped is lost.
+    Budget, way-points and first steps that are not given are the published ones of the task: up to 20 000 episodes,
+    each of which may take some seconds. Ctrl-C keeps the best so far; a search that was stopped or killed goes on with
+    --resume, and ends as if it had never stopped. Without it, a search begins anew and what was stopped is lost.
 
     [bold]Examples:[/bold]
 

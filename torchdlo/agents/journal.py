@@ -117,6 +117,8 @@ class Journal:
             fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             raise InputError(f"{path}: another search is writing here; choose another --out.") from None
+        except OSError:
+            pass  # some network drives have no locks
         if resume:
             return
         for file in path.glob("*.pt"):
