@@ -14,6 +14,7 @@ import io
 import json
 import os
 import shutil
+import threading
 import zipfile
 from importlib.metadata import version
 from pathlib import Path
@@ -65,12 +66,17 @@ def program(name: str) -> str:
     return found.hexdigest()
 
 
+_PARSING = threading.Lock()
+"""Searches begin in threads, and Python 3.11 may fail where several parse at once (CPython issue 106905)."""
+
+
 @functools.cache
 def _code(file: Path) -> bytes:
     """Return what counts of a file: its syntax tree without docstrings, which depends on the version of Python."""
     if file.suffix != ".py":
         return file.read_bytes()
-    tree = ast.parse(file.read_bytes())
+    with _PARSING:
+        tree = ast.parse(file.read_bytes())
     for node in ast.walk(tree):
         if isinstance(node, (ast.Module, ast.ClassDef, ast.FunctionDef)):
             node.body = [s for s in node.body if not (isinstance(s, ast.Expr) and isinstance(s.value, ast.Constant))]
