@@ -78,3 +78,17 @@ def test_gradients_are_those_of_finite_differences_on_both_sides_of_the_limit() 
     still = torch.zeros_like(points).requires_grad_()
     (slope,) = torch.autograd.grad(encoding.decode(still).sum(), still)
     assert (slope == 1).all()
+
+
+@pytest.mark.parametrize("apart", [None, 0.2])
+def test_ways_inward_are_what_projection_leaves_of_them(apart: float | None) -> None:
+    encoding = Encoding(horizon=6, width=6, group=3, limit=0.01, hold=2, apart=apart)
+    rng = torch.Generator().manual_seed(0)
+    points = encoding.project(torch.randn(20, encoding.size, generator=rng, dtype=torch.float64) * 0.02)
+    ways = torch.randn(20, encoding.size, generator=rng, dtype=torch.float64)
+    left = encoding.inward(points, ways)
+    step = 1e-9
+    assert torch.allclose((encoding.project(points + step * ways) - points) / step, left, atol=1e-6)
+    assert not torch.allclose(left, ways)
+    inside = encoding.project(0.1 * points)
+    assert torch.allclose(encoding.inward(inside, ways), ways)

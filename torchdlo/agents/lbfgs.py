@@ -1,11 +1,14 @@
 """Descent by L-BFGS from several points at once (Nocedal and Wright 2006, algorithm 7.4).
 
-Several step lengths of each line are tried side by side, as a batch costs little more than one episode.
+Several step lengths of each line are tried side by side, as a batch costs little more than one episode. Where tools go
+as far as they can, as they do on most good ways, lines follow the limit: what leads beyond it is taken off slopes and
+directions, as it would hide what is left (the projection of Bertsekas 1982, doi:10.1137/0320018).
 """
 
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -36,19 +39,26 @@ class Descent:
         """Forget all lines."""
         empty = torch.zeros(0, self.encoding.size, dtype=torch.float64)
         self.x = self.slope = empty
+        self.halves = torch.zeros(0, dtype=torch.int)
         self.value = self.loss = self.step = empty[:, 0]
         # Steps and changes of slope, oldest first; zero where there are none.
         self.moved = self.turned = torch.zeros(_PAIRS, *empty.shape, dtype=torch.float64)
         self.best = (-math.inf, empty.new_zeros(self.encoding.size))
 
     def offer(self, x: Tensor, told: Told) -> None:
-        """Take what is better than the lines; told slopes are by actions, shape (P, T A), of the best at least."""
-        self._note(x, told)
+        """Take what is better than the lines; told slopes are by actions, shape (P, T A), of the best at least.
+
+        Points from where lines get on are better than all others: where episodes hold and have slopes by most actions.
+        """
+        halves = self._halves(told)
+        told = self._noted(x, told)
         value, loss = torch.cat([self.value, told.value]), torch.cat([self.loss, told.loss])
-        best = ranking(value, loss)[: self.count]
+        halves = torch.cat([self.halves, halves])
+        order = ranking(value, loss)
+        best = order[halves[order].argsort(descending=True, stable=True)][: self.count]
         none = torch.zeros(_PAIRS, *x.shape, dtype=x.dtype)
         self.x, self.slope = torch.cat([self.x, x])[best], torch.cat([self.slope, told.slope])[best]
-        self.value, self.loss = value[best], loss[best]
+        self.value, self.loss, self.halves = value[best], loss[best], halves[best]
         self.step = torch.cat([self.step, torch.full_like(told.loss, self.plan.rate)])[best]
         self.moved, self.turned = (torch.cat([old, none], 1)[:, best] for old in (self.moved, self.turned))
 
@@ -57,7 +67,7 @@ class Descent:
         factor = 4.0 ** torch.linspace(1, -2, self.tries, dtype=self.x.dtype)
         self.lengths = self.step[:, None] * factor
         self.over = (self.step < self.plan.last) | (self.slope == 0).all(-1)
-        down = _direction(self.slope, self.moved, self.turned)
+        down = self.encoding.inward(self.x, _direction(self.slope, self.moved, self.turned))
         # The first step is as long as Adam's: its largest component is the rate.
         unit = down / down.abs().amax(-1, keepdim=True).clamp(min=1e-300)
         tried = self.x[:, None] + self.lengths[..., None] * unit[:, None]
@@ -73,7 +83,8 @@ class Descent:
 
     def tell(self, x: Tensor, told: Told) -> None:
         """Take steps that went down, and shorten those that did not."""
-        self._note(x, told)
+        halves = self._halves(told)
+        told = self._noted(x, told)
         row, at = torch.arange(len(self.x)), self.pick(told)
         tried = at - row * self.tries
         down = ~self.over & (told.loss[at] < self.loss)
@@ -89,13 +100,21 @@ class Descent:
         self.value, self.loss = (
             torch.where(taken, new[at], was) for new, was in ((told.value, self.value), (told.loss, self.loss))
         )
+        self.halves = torch.where(taken, halves[at], self.halves)
         step = torch.where(down, self.lengths[row, tried], self.lengths[:, -1] / 16)
         self.step = torch.where(self.over, self.plan.rate, step)
 
-    def _note(self, x: Tensor, told: Told) -> None:
+    def _halves(self, told: Told) -> Tensor:
+        """Return over how many halves of an episode there are slopes, 0 of one that failed; shape (P,)."""
+        slopes = (told.slope.unflatten(-1, (self.plan.horizon, -1)) != 0).any(-1)
+        return torch.where(told.failed, 0, (2 * slopes.double().mean(-1)).ceil().int())
+
+    def _noted(self, x: Tensor, told: Told) -> Told:
+        """Note the best; return what was told without slopes that lead out of what can be reached."""
         best = int(told.value.argmax())
         if float(told.value[best]) > self.best[0]:
             self.best = float(told.value[best]), x[best]
+        return replace(told, slope=-self.encoding.inward(x, -told.slope))
 
 
 def _direction(slope: Tensor, moved: Tensor, turned: Tensor) -> Tensor:

@@ -59,8 +59,9 @@ class Told:
 
 
 def best(told: Told, count: int) -> Tensor:
-    """Return the indices of the best, shape (count,) or, if there are fewer, (P,)."""
-    return ranking(told.value, told.loss)[:count]
+    """Return the indices of the best, failed ones last, shape (count,) or, if there are fewer, (P,)."""
+    order = ranking(told.value, told.loss)
+    return order[told.failed[order].int().argsort(stable=True)][:count]
 
 
 @dataclass(frozen=True, eq=False)

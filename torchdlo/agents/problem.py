@@ -127,6 +127,15 @@ class Encoding:
         length = torch.linalg.vector_norm(moves, dim=-1, keepdim=True)
         return self.encode(moves * (most / length.clamp(min=most)))
 
+    def inward(self, points: Tensor, ways: Tensor) -> Tensor:
+        """Return ways from points without what leads out of what can be reached, (P, size): projection undoes that."""
+        moves, ahead = self._moves(points), self._moves(ways)
+        length = torch.linalg.vector_norm(moves, dim=-1, keepdim=True)
+        out = moves / length.clamp(min=1e-300)
+        beyond = (ahead * out).sum(-1, keepdim=True).clamp(min=0)
+        ends = length > _WITHIN**2 * self.reach
+        return self.encode(torch.where(ends, ahead - beyond * out, ahead))
+
     def pull(self, points: Tensor, slope: Tensor) -> Tensor:
         """Return slopes by the numbers of points from slopes by their actions, shape (P, T A)."""
         x = points.detach().requires_grad_()
