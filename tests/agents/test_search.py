@@ -13,8 +13,7 @@ import torch
 from torch import Tensor
 
 from tests.agents.problems import Drag, Peaks, Plain, Push, Reach, Rehearsed, signature
-from torchdlo.agents import hybrid
-from torchdlo.agents.plan import Told, ranking
+from torchdlo.agents.plan import ranking
 from torchdlo.agents.problem import Outcome
 from torchdlo.agents.search import METHODS, Found, Robust, Settings, optimize
 from torchdlo.errors import InputError
@@ -191,30 +190,9 @@ def test_the_hybrid_goes_where_it_succeeds_and_not_where_it_earns_most() -> None
     assert returned(blind) > returned(done) > 9.96
 
 
-def test_islands_know_nothing_of_each_other() -> None:
-    def asked(shift: float) -> list[Tensor]:
-        problem = Reach()
-        plan = Settings("hybrid", episodes=600, population=40, hold=5).plan(problem)
-        search, told, points = METHODS["hybrid"](plan, torch.Generator().manual_seed(0)), None, []
-        for _ in range(12):
-            ask = search.send(told)
-            points.append(ask.points)
-            x = ask.points.clone().requires_grad_()
-            went = problem.evaluate(ask.encoding.decode(x))
-            (slope,) = torch.autograd.grad(went.loss.sum(), x)
-            # The second island is told of another problem.
-            off = torch.where(torch.arange(len(x)) < 20, 0.0, shift * torch.arange(len(x)))
-            told = Told(went.returns.detach() - off, went.loss.detach() + off, 0 * off, *[off < 0] * 2, slope)
-        return points
-
-    same, other = asked(0.0), asked(1.0)
-    assert all(len(a) == 40 and torch.equal(a[:20], b[:20]) for a, b in zip(same, other, strict=True))
-    assert torch.equal(same[0], other[0]) and not torch.equal(same[-1][20:], other[-1][20:])
-
-
 @pytest.mark.parametrize("method", METHODS)
 def test_a_search_begins_with_a_rehearsal(method: str) -> None:
-    settings = Settings(method, episodes=160, population=16, hold=5, rehearsed=0.8)
+    settings = Settings(method, episodes=240, population=24, hold=5, rehearsed=0.8)
     problem = Rehearsed()
     found = optimize(problem, settings)
     # Eight iterations of ten.
@@ -222,7 +200,7 @@ def test_a_search_begins_with_a_rehearsal(method: str) -> None:
     assert [point["rehearsed"] for point in found.curve] == [True] * 8 + [False] * 2
     assert found.curve[7]["best"] == -math.inf and found.curve[7]["success"] == 0 and found.curve[7]["median"] is None
     assert returned(found) == pytest.approx(max(point["best"] for point in found.curve))
-    blind = optimize(Rehearsed(), replace(settings, episodes=32, rehearsed=0.0))
+    blind = optimize(Rehearsed(), replace(settings, episodes=48, rehearsed=0.0))
     if method == "hybrid":
         assert returned(found) > returned(blind) + 0.1, "two iterations alone do less"
     else:
@@ -327,51 +305,3 @@ def test_problems_of_any_width_are_searched() -> None:
     for method in METHODS:
         found = optimize(Line(), Settings(method, episodes=400, population=4))
         assert float(found.actions) == pytest.approx(0.3, abs=1e-3), method
-
-
-def test_the_hybrid_has_slopes_of_the_best_quarter() -> None:
-    played, graded = [], []
-
-    class Watched(Push):
-        def evaluate(self, actions: Tensor) -> Outcome:
-            outcome = super().evaluate(actions)
-            (graded if actions.requires_grad else played).append(outcome.returns.detach())
-            return outcome
-
-    optimize(Watched(), Settings("hybrid", episodes=80, population=40, hold=5))
-    # Two islands of 20; of the second iteration, which is the last, nothing is told. The best is played alone.
-    first, slopes = played[0].split(20), torch.cat(graded).split(5)
-    assert len(torch.cat(played)) == 81 and len(slopes) == 2
-    for island, chosen in zip(first, slopes, strict=True):
-        # No shortfall in this problem: value and return are the same.
-        assert sorted(chosen.tolist()) == pytest.approx(sorted(island.tolist())[-5:])
-
-
-def test_islands_that_are_behind_go_on_from_the_best_trajectory_of_all() -> None:
-    plan = Settings("hybrid", episodes=1200, population=60, hold=5).plan(Push())
-    search, told, away = METHODS["hybrid"](plan, torch.Generator().manual_seed(0)), None, []
-    none = torch.zeros(60, dtype=torch.bool)
-    for k in range(plan.iterations):
-        ask = search.send(told)
-        # The second island of three is ahead from the start, the first one follows, the third one is last.
-        value = torch.tensor([1.0, 2.0, 0.0], dtype=torch.float64).repeat_interleave(20)
-        if k == 0:
-            value[25] += 1
-            leading = ask.points[25]
-        away.append([float((part - leading).norm(dim=-1).median()) for part in ask.points.split(20)])
-        told = Told(value, -value, 0 * value, none, none, 0 * ask.points)
-    first, _, last = zip(*away, strict=True)
-    assert max(last[8], first[14]) < 0.3 * min(*first[:8], *last[:8])
-    assert first[8] > 0.9 * min(first[:8]), "the first island goes on until later"
-
-
-def test_slopes_that_grew_beyond_measure_are_cut() -> None:
-    # Back in time, from the last of thirty actions, slopes double with each.
-    growth = 2.0 ** torch.arange(29, -1, -1, dtype=torch.float64)
-    slope = torch.stack([growth, torch.ones_like(growth), torch.zeros_like(growth)])[..., None] * torch.ones(2)
-    tamed = hybrid._tame(slope.flatten(1), 30).unflatten(1, (30, 2))
-    size = torch.linalg.vector_norm(tamed, dim=-1)
-    most = 10 * math.sqrt(2) * 2**9
-    assert float(size.max()) <= most and float(size[0, 0]) < 1e-3 * most
-    kept = growth <= most / math.sqrt(2)
-    assert torch.equal(tamed[:, kept], slope[:, kept]) and torch.equal(tamed[1:], slope[1:])

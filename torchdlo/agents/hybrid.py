@@ -1,8 +1,9 @@
 """Gradients inside an evolution strategy, and descent beside it: for losses that are flat until something is touched.
 
-Large populations live on islands that know nothing of each other: whichever way round an obstacle a search goes, it
-seldom comes back, and another one may go the other way. On each of them, two parts share the budget, iteration by
-iteration, and both have the slopes of the best quarter of what they play:
+On a small island, one line descends from doing nothing, as plain gradient descent does. What else there is of the
+population lives on others, which know nothing of each other: whichever way round an obstacle a search goes, it seldom
+comes back, and another one may go the other way. On each of them, two parts share the budget, iteration by iteration,
+and both have the slopes of the best quarter of what they play:
 
 1. Straight sweeps over what can be reached find out what there is to touch; rounds about bodies, and drags over them by
    tools that draw nearer, find out what comes of it. CMA-ES searches way-points from the best of them. A part of each
@@ -35,7 +36,7 @@ from torchdlo.agents.problem import Encoding
 __all__ = ["hybrid"]
 
 _ISLAND = 20
-"""Trajectories that an island needs."""
+"""Trajectories of which another island is made."""
 _FRESH = 0.1
 """Share of the iterations that only try sweeps and rounds."""
 _COARSE = 0.3
@@ -44,6 +45,8 @@ _TURN = 5
 """Iterations of which each part has at least one."""
 _SURGE, _CUT = 3, 10.0
 """Slopes of all actions are believed up to so many times the largest one of the last third of them."""
+_WILD = 10.0
+"""Slopes of an action are dropped that promise to change the loss by so many times the largest loss in a first step."""
 _SHORT = 0.1
 """Share of the first step from which shorter ones are given up."""
 _GIVEN_UP = {0.4: 0.5, 0.7: 1.0}
@@ -59,9 +62,16 @@ _APART = 0.2
 def hybrid(plan: Plan, rng: torch.Generator) -> Search:
     """Search on islands, see above."""
     count = max(1, plan.population // _ISLAND)  # of islands
-    plans = [replace(plan, population=(plan.population + k) // count) for k in range(count)]
+    sizes = [(plan.population + k) // count for k in range(count)]
+    # Milder worlds are there to find ways that bear it; the slope of doing nothing would lead nowhere else.
+    plain = plan.drifts == 0 and sizes[0] >= 3 * TRIES
+    if plain:
+        sizes = [sizes[0] - TRIES, *sizes[1:], TRIES]
+        count += 1
+    plans = [replace(plan, population=size) for size in sizes]
     rngs = [torch.Generator().manual_seed(seed) for seed in torch.randint(2**31, (count,), generator=rng).tolist()]
-    islands = [_island(*each) for each in zip(plans, rngs, strict=True)]
+    kinds = [_island] * (count - plain) + [_line] * plain
+    islands = [kind(*each) for kind, *each in zip(kinds, plans, rngs, strict=True)]
     parts: list[Told | None] = [None] * count
     given_up = {math.ceil(when * plan.iterations): share for when, share in _GIVEN_UP.items()}
     # What was measured in a rehearsal or in milder worlds does not compare with what comes after.
@@ -74,7 +84,7 @@ def hybrid(plan: Plan, rng: torch.Generator) -> Search:
         value, leading = top[order[0]]
         for j in order[count - round(given_up.get(k, 0.0) * (count - 1)) :]:
             if top[j][0] < value - _BEHIND * abs(value):
-                islands[j], parts[j] = _island(plans[j], rngs[j], k, leading), None
+                islands[j], parts[j] = kinds[j](plans[j], rngs[j], k, leading), None
         asks = [island.send(told) for island, told in zip(islands, parts, strict=True)]
         counts = [len(ask.points) for ask in asks]
 
@@ -90,6 +100,25 @@ def hybrid(plan: Plan, rng: torch.Generator) -> Search:
             top[j] = max(top[j], (float(part.value[at]), ask.points[at]), key=lambda found: found[0])
 
 
+def _line(plan: Plan, rng: torch.Generator, first: int = 0, about: Tensor | None = None) -> Search:
+    """Descend on one line, from doing nothing or from actions that are given; arguments as of `_island`."""
+    encoding, line, tame = plan.encoding(1), Descent(plan, rng), _Tame(plan)
+    start = line.best[1] if about is None else about
+    for k in itertools.count(first):
+        if k in (first, plan.rehearsals):
+            # Nothing but the slope there is wanted; what is played beside it are ways about it.
+            away = plan.encoding(plan.hold).decode(walks(plan, rng)).flatten(1)
+            x = encoding.project(torch.cat([start[None], start + away[1:]]))
+            told = yield Ask(encoding, x, 1, lambda told, _: torch.zeros(1, dtype=torch.long))
+            line.clear()
+            line.offer(x[:1], tame(told).split([1, len(x) - 1])[0])
+        else:
+            x = line.ask()
+            told = yield Ask(encoding, x, line.count, line.pick)
+            line.tell(x, tame(told))
+        start = line.best[1]
+
+
 def _island(plan: Plan, rng: torch.Generator, first: int = 0, about: Tensor | None = None) -> Search:
     """Search with sweeps, rounds, CMA-ES and descent.
 
@@ -100,7 +129,7 @@ def _island(plan: Plan, rng: torch.Generator, first: int = 0, about: Tensor | No
         about: actions to begin with in place of sweeps and rounds [m], shape (T A,).
     """
     encoding, coarse, fine = plan.encoding(1), _Evolution(plan, rng, about), Descent(plan, rng)
-    graded = fine.count
+    graded, tame = fine.count, _Tame(plan)
     drifts = math.ceil(plan.drifts * plan.iterations)
     alone = max(drifts, first + 1 if first else math.ceil(_COARSE * plan.iterations))
     gain, last, top = {coarse: 0.0, fine: math.inf}, {coarse: first, fine: first}, -math.inf
@@ -109,7 +138,7 @@ def _island(plan: Plan, rng: torch.Generator, first: int = 0, about: Tensor | No
         if k == plan.rehearsals > 0:
             x = rehearsed.actions
             told = yield Ask(encoding, x, min(graded, len(x)))
-            told = replace(told, slope=_tame(told.slope, plan.horizon))
+            told = tame(told)
             coarse.lines = None
             fine.clear()
             fine.offer(x, told)
@@ -122,7 +151,7 @@ def _island(plan: Plan, rng: torch.Generator, first: int = 0, about: Tensor | No
         part = coarse if k < alone else max((coarse, fine), key=turn)
         x = part.ask()
         told = yield Ask(encoding, x, graded, best if part is coarse else fine.pick)
-        told = replace(told, slope=_tame(told.slope, plan.horizon))
+        told = tame(told)
         # What was measured in milder worlds does not compare.
         if k < drifts:
             coarse.lines = None
@@ -139,17 +168,29 @@ def _island(plan: Plan, rng: torch.Generator, first: int = 0, about: Tensor | No
         last[part], top = k, max(top, highest)
 
 
-def _tame(slope: Tensor, horizon: int) -> Tensor:
-    """Return slopes by actions, shape (P, T A), with those that grew beyond measure scaled down by the square of it.
+class _Tame:
+    """Drops or cuts slopes that grew beyond measure.
 
     Ropes may move chaotically: derivatives then grow from action to action, back in time, and hold for ways so short
     that they are of no use. Left alone, the largest would be all that steps go by.
     """
-    each = slope.unflatten(-1, (horizon, -1))
-    size = torch.linalg.vector_norm(each, dim=-1, keepdim=True)
-    most = _CUT * size[:, -math.ceil(horizon / _SURGE) :].amax(1, keepdim=True)
-    factor = torch.where((most > 0) & (size > most), most / size, 1.0)
-    return (each * factor.square()).flatten(1)
+
+    def __init__(self, plan: Plan) -> None:
+        self.plan, self.largest = plan, 0.0
+
+    def __call__(self, told: Told) -> Told:
+        """Return what was told, with slopes by actions, shape (P, T A), as far as they are believed.
+
+        What is left of them is scaled down by the square of how far it is beyond the later ones.
+        """
+        each = told.slope.unflatten(-1, (self.plan.horizon, -1))
+        size = torch.linalg.vector_norm(each, dim=-1, keepdim=True)
+        self.largest = max([self.largest, *told.loss[torch.isfinite(told.loss)].abs().tolist()])
+        held = self.plan.rate * size <= _WILD * self.largest
+        each, size = torch.where(held, each, 0.0), torch.where(held, size, 0.0)
+        most = _CUT * size[:, -math.ceil(self.plan.horizon / _SURGE) :].amax(1, keepdim=True)
+        factor = torch.where((most > 0) & (size > most), most / size, 1.0)
+        return replace(told, slope=(each * factor.square()).flatten(1))
 
 
 class _Evolution:
