@@ -14,7 +14,7 @@ from torch import Tensor
 from torchdlo import cli, envs
 from torchdlo.agents.presets import PUBLISHED, preset
 from torchdlo.agents.result import load_actions
-from torchdlo.agents.search import Robust
+from torchdlo.agents.search import METHODS, Robust
 from torchdlo.agents.tasks import TaskProblem, problem
 from torchdlo.coupling.robot import panda, tool_pose
 from torchdlo.envs.task import RADIUS, Arms, Seen, Task, make, straight
@@ -180,7 +180,8 @@ def test_presets_are_the_published_settings() -> None:
     assert preset("lifting", "cmaes").sigma == 0.005 and preset("lifting", "gd").rate == 1e-4
     assert preset("coiling", "cmaes").episodes // preset("coiling", "cmaes").population == 50
     # Small budgets leave room for as many iterations.
-    assert [preset("coiling", "cmaes", episodes=n).population for n in (2000, 100)] == [40, 20]
+    sizes = {m: [preset("coiling", m, episodes=n).population for n in (2000, 500, 100)] for m in METHODS}
+    assert sizes == {"cmaes": [40, 20, 20], "gd": [16, 10, 4], "hybrid": [40, 12, 12]}
     assert preset("coiling", "cmaes", episodes=20_000, robust=Robust(copies=8)).population == 50
     assert preset("coiling", "hybrid", episodes=2000, population=7).population == 7
     assert preset("coiling", "cmaes", seed=None, episodes=7).episodes == 7

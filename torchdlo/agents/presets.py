@@ -24,8 +24,10 @@ REHEARSED = {"gathering": 0.9}
 POPULATION = {"cmaes": 400, "gd": 16, "hybrid": 100}
 """Most trajectories per iteration. One start of gradient descent is published; more of them use up the same budget.
 Slopes need iterations more than numbers."""
-_ITERATIONS, _FEWEST = 50, 20
-"""Iterations that a small budget allows all the same, as long as populations have so many trajectories."""
+_ITERATIONS = 50
+"""Iterations that a small budget allows all the same, as long as populations have so many trajectories as below."""
+_FEWEST = {"cmaes": 20, "gd": 4, "hybrid": 12}
+"""The fewest by method: descents go far in many small steps, and hybrids need 12 for one line beside their search."""
 
 PUBLISHED = {
     "coiling": {"gd": (11.59, 1.0), "cmaes": (11.73, 1.0)},
@@ -48,7 +50,7 @@ def preset(task: str, method: str, **given: Any) -> Settings:
     found = Settings(
         method=method,
         episodes=episodes,
-        population=min(POPULATION.get(method, 400), max(_FEWEST, episodes // (copies * _ITERATIONS))),
+        population=min(POPULATION.get(method, 400), max(_FEWEST.get(method, 20), episodes // (copies * _ITERATIONS))),
         sigma=SIGMA.get(task, 0.05),
         rate=RATE.get(task, 1e-3),
     )
