@@ -147,7 +147,7 @@ def test_a_trajectory_that_cannot_be_trusted_says_so(
     [
         (["nothing"], "there is no task 'nothing'; expected one of"),
         (["lead", "--method", "luck"], "method is 'luck'; expected one of cmaes, gd, hybrid"),
-        (["lead", "--episodes", "10"], "episodes is 10; expected at least 20"),
+        (["lead", "--episodes", "10"], "episodes is 10; expected at least 12"),
         (["lead", "--resume"], "expected the journal of a search to resume, found none; leave out --resume"),
     ],
 )
