@@ -1,9 +1,9 @@
 """Gradients inside an evolution strategy, and descent beside it: for losses that are flat until something is touched.
 
-On a small island, one line descends from doing nothing, as plain gradient descent does. What else there is of the
-population lives on others, which know nothing of each other: whichever way round an obstacle a search goes, it seldom
-comes back, and another one may go the other way. On each of them, two parts share the budget, iteration by iteration,
-and both have the slopes of the best quarter of what they play:
+Where a population has room for it, one line descends from doing nothing on a small island, as plain gradient descent
+does. What else there is of the population lives on others, which know nothing of each other: whichever way round an
+obstacle a search goes, it seldom comes back, and another one may go the other way. On each of them, two parts share the
+budget, iteration by iteration, and both have the slopes of the best quarter of what they play:
 
 1. Straight sweeps over what can be reached find out what there is to touch; rounds about bodies, and drags over them by
    tools that draw nearer, find out what comes of it. CMA-ES searches way-points from the best of them. A part of each
@@ -63,7 +63,7 @@ def hybrid(plan: Plan, rng: torch.Generator) -> Search:
     """Search on islands, see above."""
     count = max(1, plan.population // _ISLAND)  # of islands
     sizes = [(plan.population + k) // count for k in range(count)]
-    # Milder worlds are there to find ways that bear it; the slope of doing nothing would lead nowhere else.
+    # A line has no use for losses that do not compare, as worlds get harder from one iteration to the next.
     plain = plan.drifts == 0 and sizes[0] >= 3 * TRIES
     if plain:
         sizes = [sizes[0] - TRIES, *sizes[1:], TRIES]

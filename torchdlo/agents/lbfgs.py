@@ -54,8 +54,7 @@ class Descent:
         told = self._noted(x, told)
         value, loss = torch.cat([self.value, told.value]), torch.cat([self.loss, told.loss])
         halves = torch.cat([self.halves, halves])
-        order = ranking(value, loss)
-        best = order[halves[order].argsort(descending=True, stable=True)][: self.count]
+        best = ranking(value, loss, halves)[: self.count]
         none = torch.zeros(_PAIRS, *x.shape, dtype=x.dtype)
         self.x, self.slope = torch.cat([self.x, x])[best], torch.cat([self.slope, told.slope])[best]
         self.value, self.loss, self.halves = value[best], loss[best], halves[best]

@@ -60,8 +60,7 @@ class Told:
 
 def best(told: Told, count: int) -> Tensor:
     """Return the indices of the best, failed ones last, shape (count,) or, if there are fewer, (P,)."""
-    order = ranking(told.value, told.loss)
-    return order[told.failed[order].int().argsort(stable=True)][:count]
+    return ranking(told.value, told.loss, ~told.failed)[:count]
 
 
 @dataclass(frozen=True, eq=False)
@@ -253,7 +252,7 @@ def rounds(plan: Plan, encoding: Encoding, rng: torch.Generator, count: int) -> 
     return encoding.project(encoding.encode(moves.unsqueeze(2).expand(-1, -1, tools, -1)))
 
 
-def ranking(returns: Tensor, loss: Tensor) -> Tensor:
+def ranking(returns: Tensor, loss: Tensor, tier: Tensor | None = None) -> Tensor:
     """Return indices, the best first: of the larger return; where returns are alike, of the smaller loss; shape (P,).
 
     Returns may be flat until something is touched, while the loss leads there.
@@ -261,9 +260,11 @@ def ranking(returns: Tensor, loss: Tensor) -> Tensor:
     Args:
         returns: shape (P,).
         loss: shape (P,).
+        tier: if given, all of a larger one come before all of a smaller one, shape (P,).
     """
     good = returns[torch.isfinite(returns)].abs()
     grain = _ALIKE * float(good.max()) if len(good) else 0.0
     coarse = (returns / grain).round() if grain else returns
     first = loss.argsort(stable=True)
-    return first[coarse[first].argsort(descending=True, stable=True)]
+    order = first[coarse[first].argsort(descending=True, stable=True)]
+    return order if tier is None else order[tier[order].int().argsort(descending=True, stable=True)]
