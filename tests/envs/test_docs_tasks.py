@@ -19,11 +19,12 @@ def test_examples_of_the_page_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     write(model, ("air_drag",))
     monkeypatch.chdir(tmp_path)
     blocks = re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.DOTALL)
-    assert len(blocks) == 4
+    assert len(blocks) == 5
     found: dict = {"__name__": "page"}
     for block in blocks:
         exec(compile(block, str(PAGE), "exec", dont_inherit=True), found)
     assert found["outcome"].returns.shape == (2,) and found["after"]["next", "reward"].shape == (2, 1, 1)
+    assert found["seen"]["observation"].ndim == 1  # Gymnasium users see no axis of the batch
 
 
 def test_every_task_is_on_the_page_with_a_picture() -> None:

@@ -197,19 +197,6 @@ def test_processes_hold_environments_of_their_own():
         env.close()
 
 
-def test_gymnasium_takes_environments_through_torchrl():
-    gymnasium = pytest.importorskip("gymnasium")
-    from torchdlo.envs.env import DloEnv
-
-    DloEnv.register_gym(
-        "torchdlo/unknotting-v0", entry_point=functools.partial(made, num_envs=1), to_numpy=True, backend="gymnasium"
-    )
-    env = gymnasium.make("torchdlo/unknotting-v0", disable_env_checker=True)
-    seen, _ = env.reset()
-    after = env.step(env.action_space.sample())
-    assert len(after) == 5 and seen is not None
-
-
 def test_arms_stand_still_without_a_way_by_hand():
     @dataclasses.dataclass(frozen=True)
     class Still(type(TASKS["gathering"]())):
