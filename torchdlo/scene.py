@@ -24,7 +24,6 @@ from torchdlo.physics.build import Rope
 from torchdlo.physics.effect import Effect, altered, default_values, numbers_of
 from torchdlo.physics.hold import Reaction, Targets, between, check_grip, unfelt
 from torchdlo.physics.integrate import INTEGRATORS, TWISTS, Settings, settle_twist, substep
-from torchdlo.physics.numerics import cross, normalize
 from torchdlo.physics.replay import alike, rollout
 from torchdlo.physics.rod import RodParams, RodState
 from torchdlo.physics.topology import Topology
@@ -246,11 +245,8 @@ def check_step(scene: Scene, params: Params) -> None:
 
 def hold(scene: Scene, state: State) -> Control:
     """Return the control that keeps held parts and kinematic bodies where they are, with a firm grip."""
-    rods, edges = state.rods, list(scene.held_edges)
-    e = rod.edge_vectors(scene.topology, rods.pos, rods.pos.new_tensor(scene.topology.edge_mask()).unsqueeze(-1))
-    tangent, twist, reference = normalize(e[..., edges, :]), rods.twist[..., edges, :], rods.director[..., edges, :]
-    director = torch.cos(twist) * reference + torch.sin(twist) * cross(tangent, reference)
-    pos = rods.pos[..., list(scene.held_vertices), :]
+    pos = tree.take_vertices(state.rods.pos, scene.held_vertices)
+    director = rod.directors(scene.topology, state.rods, scene.held_edges)
     return Control(pos, director, bodies=rigid.hold(scene.bodies, state.bodies) if scene.bodies else ())
 
 
@@ -317,8 +313,8 @@ def _step(scene: Scene, params: Params, state: State, control: Control, advance,
     state = tree.replace(state, reaction=state.reaction.sized(state.rods.pos, *scene.held))
     if any(e.reacts for e in scene.effects):
         params = survey(scene, params, state, start, control)
-    for k in range(scene.substeps):
-        share = start.pos.new_ones(1) * (k + 1) / scene.substeps
+    shares = torch.arange(1, scene.substeps + 1, dtype=start.pos.dtype, device=start.pos.device) / scene.substeps
+    for share in shares.split(1):
         state = advance(scene, params, state, start, control, share)
     return state
 
@@ -342,23 +338,28 @@ def stepper(scene: Scene, *, compiled: bool = True, recorded: bool = False):
         return (part(_step), advance) if once else (_step, part(advance))
 
     ways = {True: made(False), False: made(True)}
-    look, trusting = compile(survey), traced.Trusting()
+    look, trusting = compile(survey), traced.Trusting(_prepared)
 
     def run(params: Params, state: State, control: Control) -> State:
         _check_control(scene, control)
-        graded, state = torch.is_grad_enabled(), laid_out(state)
-        # Compilers tell numbers that need a gradient from others, also where none is taken: replays run both ways.
-        state = tree.replace(state, time=state.time.detach(), missed=state.missed.detach())
-        if graded:
-            moving = alike((state.rods, state.reaction, state.bodies, state.matter), (params, control))
-            state = tree.replace(state, **dict(zip(("rods", "reaction", "bodies", "matter"), moving, strict=True)))
-        else:
-            params, state, control = tree.detach((params, state, control))
+        graded = torch.is_grad_enabled()
         whole, part = ways[graded]
-        with trusting((params, state, control), graded, *control.grip):
-            return whole(scene, params, state, control, part, look)
+        with trusting((params, state, control), graded, *control.grip) as inputs:
+            return whole(scene, *inputs, part, look)
 
     return run
+
+
+def _prepared(inputs: tuple[Params, State, Control]) -> tuple[Params, State, Control]:
+    params, state, control = inputs
+    state = laid_out(state)
+    # Compilers tell numbers that need a gradient from others, also where none is taken: replays run both ways.
+    if not torch.is_grad_enabled():
+        return tree.detach((params, state, control))
+    moving = alike((state.rods, state.reaction, state.bodies, state.matter), (params, control))
+    names = ("rods", "reaction", "bodies", "matter")
+    fields = dict(zip(names, moving, strict=True)) | tree.detach({"time": state.time, "missed": state.missed})
+    return params, tree.replace(state, **fields), control
 
 
 def finite(state: State) -> Tensor:

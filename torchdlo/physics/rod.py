@@ -6,6 +6,7 @@ Bergou et al. 2008, doi:10.1145/1360612.1360662 (rods, frames); Bergou et al. 20
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import torch
@@ -131,6 +132,16 @@ def edge_vectors(topology: Topology, pos: Tensor, edge_mask: Tensor) -> Tensor:
         return e
     unit = pos.new_tensor([1.0, 0.0, 0.0])
     return torch.where(edge_mask > 0, e, unit)
+
+
+def directors(topology: Topology, state: RodState, edges: Sequence[int]) -> Tensor:
+    """Return the first material directors of some edges, shape (..., E, 3)."""
+    if not edges:
+        return tree.take_vertices(state.director, edges)
+    after = topology.successor()
+    begin, end = (tree.take_vertices(state.pos, slots) for slots in (edges, [after[k] for k in edges]))
+    twist, reference = tree.take_vertices(state.twist, edges), tree.take_vertices(state.director, edges)
+    return torch.cos(twist) * reference + torch.sin(twist) * cross(normalize(end - begin), reference)
 
 
 def hinge_length(topology: Topology, rest: RodRest) -> Tensor:
