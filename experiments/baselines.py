@@ -27,7 +27,8 @@ def measure(name: str, starts: int, seed: int, horizon: int | None) -> dict[str,
     """Return the row of a task: one batch of all episodes."""
     import torch
 
-    from torchdlo.envs import episode, find
+    from torchdlo.envs import find
+    from torchdlo.envs.core import episode
 
     task, rng = find(name), torch.Generator().manual_seed(seed)
     away = 2 * torch.rand(starts, len(task.spread), 2, generator=rng, dtype=torch.float64) - 1

@@ -34,7 +34,7 @@ def knotted(scenes: int, contact: bool) -> tuple[Any, Any, Any]:
     from torchdlo import scene
     from torchdlo.coupling import RodContact
     from torchdlo.physics.effects.elastic import Bend
-    from torchdlo.physics.effects.field import Damping, Gravity
+    from torchdlo.physics.effects.external import Damping, Gravity
 
     t = torch.linspace(-2.15, 2.15, 4001, dtype=torch.float64)
     x = 0.022 * torch.stack([t**3 - 3 * t, t**4 - 4 * t**2, 0.35 * (t**5 - 10 * t)], -1)
@@ -57,7 +57,7 @@ def pile(vertices: int) -> tuple[Any, Any, Any]:
     from torchdlo import scene
     from torchdlo.coupling import RodContact
     from torchdlo.physics.effects.elastic import Bend
-    from torchdlo.physics.effects.field import Damping, Gravity
+    from torchdlo.physics.effects.external import Damping, Gravity
     from torchdlo.physics.effects.table import Table
 
     r, edge = 0.005, 0.015

@@ -73,11 +73,11 @@ def build(case: Case, scenes: int) -> tuple[Any, Any, Any]:
 
     from torchdlo import scene
     from torchdlo.coupling import BodyContact, RodBody, RodContact, RodMatter
-    from torchdlo.coupling.laws import Plastic
-    from torchdlo.coupling.particles import Blob, Grid, assemble, fill_ball
+    from torchdlo.coupling.mpm.constitutive_models import Plastic
+    from torchdlo.coupling.mpm.particles import Blob, Grid, assemble, fill_ball
     from torchdlo.physics import tree
     from torchdlo.physics.effects.elastic import Bend
-    from torchdlo.physics.effects.field import Damping, Gravity
+    from torchdlo.physics.effects.external import Damping, Gravity
 
     dtype = getattr(torch, case.dtype)
     rope = {"radius": 0.01, "density": 0.001 / (0.02 * math.pi * 0.01**2)}

@@ -88,7 +88,7 @@ class Case:
         Raises:
             InputError: It is there, but of other settings.
         """
-        from torchdlo.agents.search import Settings
+        from torchdlo.agents.trajopt.search import Settings
         from torchdlo.errors import InputError
 
         def resolved(settings: dict[str, Any]) -> dict[str, Any]:
@@ -110,7 +110,7 @@ class Case:
 
     def ready(self, choices: dict[str, Any], again: bool) -> None:
         """Say so before anything runs if the journal of a stopped search is of another one; `again` removes it."""
-        from torchdlo.agents.journal import program, remove
+        from torchdlo.agents.trajopt.search_journal import program, remove
         from torchdlo.errors import InputError
 
         journal = self.folder / "journal"
@@ -130,9 +130,9 @@ class Case:
 
     def search(self, problem: Any, callback: Any, over: Callable[[], bool]) -> None:
         """Search, resumed if it was stopped, and write what was found; nothing if there was no time for anything."""
-        from torchdlo.agents.journal import remove
-        from torchdlo.agents.result import result_json, trajectory_json
-        from torchdlo.agents.search import optimize
+        from torchdlo.agents.trajopt.result import result_json, trajectory_json
+        from torchdlo.agents.trajopt.search import optimize
+        from torchdlo.agents.trajopt.search_journal import remove
         from torchdlo.files import write_atomically
 
         journal = self.folder / "journal"
@@ -155,7 +155,7 @@ class Case:
 
 def cases(task: str, args: Any) -> list[Case]:
     """All searches of a task."""
-    from torchdlo.agents.presets import preset
+    from torchdlo.agents.trajopt.presets import preset
 
     given = {"episodes": args.episodes or None, "population": args.population or None, "rehearsed": args.rehearsed}
     seeds = range(args.first, args.first + args.seeds)
@@ -168,9 +168,9 @@ def cases(task: str, args: Any) -> list[Case]:
 
 def solve(task: str, args: Any) -> list[tuple[Case, dict[str, Any]]]:
     """Run what is not there yet of a task, all at once, and return all results."""
-    from torchdlo.agents.tasks import problem
-    from torchdlo.agents.together import together
-    from torchdlo.progress import deferred_interrupt, progress
+    from torchdlo.agents.trajopt.batched_evaluation import together
+    from torchdlo.agents.trajopt.task_problem import problem
+    from torchdlo.cli.progress import deferred_interrupt, progress
 
     chosen, wanted = problem(task, double=args.double, compiled=args.compiled), cases(task, args)
     left = [case for case in wanted if case.found(chosen, args.again, args.minutes is not None) is None]
@@ -233,7 +233,7 @@ def side_by_side(args: Any) -> None:
 
 def arguments(words: list[str] | None = None) -> Any:
     """The options."""
-    from torchdlo.agents.search import METHODS
+    from torchdlo.agents.trajopt.search import METHODS
     from torchdlo.envs import TASKS
 
     parser = Parser("benchmark_trajopt.py", description=__doc__, epilog=EXAMPLES)

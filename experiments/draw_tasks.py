@@ -14,7 +14,7 @@ def outline(body, params, state, k: int) -> list[list[float]]:
     """Return the outline of a body from above: a circle or a rectangle about its middle."""
     import torch
 
-    from torchdlo.physics.rotation import rotate
+    from torchdlo.physics.linalg.rotation import rotate
 
     x, y, _ = state.pos[0, k].tolist()
     size = params.size.reshape(-1, params.size.shape[-2], 3)[0, k].tolist()

@@ -66,17 +66,17 @@ def jpeg(png: bytes) -> bytes:
 
 def show(name: str, out: Path, *, quick: bool, draw: bool, video: bool) -> dict[str, Any]:
     """Run one scene, write its files, and return what was measured."""
-    from torchdlo import describe
+    from torchdlo import scene_files
+    from torchdlo.cli.progress import progress
     from torchdlo.files import write_atomically
-    from torchdlo.progress import progress
-    from torchdlo.run import run, save_frames
+    from torchdlo.scene_files.run import run, save_frames
 
     here, one = out / name, GALLERY[name]
     description = one.scene(quick)
-    describe.save(description, here / "scene.json")
+    scene_files.save(description, here / "scene.json")
     begin = time.perf_counter()
     with progress() as callback:
-        frames = run(describe.read(here / "scene.json"), every=one.every, callback=callback)
+        frames = run(scene_files.read(here / "scene.json"), every=one.every, callback=callback)
     seconds = time.perf_counter() - begin
     save_frames(frames, here / "frames.npz", description)
     claims = {} if frames.problem else one.claims(frames, description)
@@ -84,11 +84,11 @@ def show(name: str, out: Path, *, quick: bool, draw: bool, video: bool) -> dict[
     if frames.problem:
         wrong.append(frames.problem)
     if draw:
-        from torchdlo.report.render import stills_png
+        from torchdlo.report.render.picture import stills_png
 
         write_atomically(here / f"{name}.jpg", jpeg(stills_png(frames, one.moments)))
     if video:
-        from torchdlo.report.video import write_video
+        from torchdlo.report.render.video import write_video
 
         with progress() as callback:
             write_video(frames, here / "motion.mp4", speed=min(1.0, frames.time[-1] / 3), callback=callback)

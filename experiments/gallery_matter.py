@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING
 from gallery_parts import HUGE, Claims, circle
 
 if TYPE_CHECKING:
-    from torchdlo.describe import Description
-    from torchdlo.run import Frames
+    from torchdlo.scene_files import Description
+    from torchdlo.scene_files.run import Frames
 
 
 def net(quick: bool) -> Description:
     """Crossed ropes, held at their ends, catch an elastic ball."""
-    from torchdlo.describe import Box, Description, Hold, Matter, Rope
+    from torchdlo.scene_files import Box, Description, Hold, Matter, Rope
 
     count, half, r = 15 if quick else 19, 0.12, 4e-3
     places = (-0.045, -0.015, 0.015, 0.045)
@@ -67,7 +67,7 @@ def net_claims(frames: Frames, d: Description) -> Claims:
 
 def pour(quick: bool) -> Description:
     """A floating ring on which more water is poured."""
-    from torchdlo.describe import Box, Description, Matter, Rope
+    from torchdlo.scene_files import Box, Description, Matter, Rope
 
     step = 0.008 if quick else 0.006
     water = {"bulk": 2e4, "viscosity": 0.05}
@@ -107,7 +107,7 @@ def pour_claims(frames: Frames, d: Description) -> Claims:
 
 def sand(quick: bool) -> Description:
     """Sand falls on a slack rope: some stays on it for a moment, most runs off and heaps up below."""
-    from torchdlo.describe import Box, Description, Hold, Matter, Rope
+    from torchdlo.scene_files import Box, Description, Hold, Matter, Rope
 
     count = 20 if quick else 25
     line = tuple((-0.13 + 0.26 * k / 24, 0.0, 0.1 - 0.025 * math.sin(math.pi * k / 24)) for k in range(25))

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from torchdlo.describe import Description
-    from torchdlo.run import Frames
+    from torchdlo.scene_files import Description
+    from torchdlo.scene_files.run import Frames
 
 Claims = dict[str, tuple[float, float, float]]
 """What has to happen: the measured value, and the least and the greatest that it may be."""

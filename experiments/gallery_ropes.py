@@ -8,15 +8,15 @@ from typing import TYPE_CHECKING, Any
 from gallery_parts import HUGE, Claims, circle, closest, linking, loop, rope_of
 
 if TYPE_CHECKING:
-    from torchdlo.describe import Description
-    from torchdlo.run import Frames
+    from torchdlo.scene_files import Description
+    from torchdlo.scene_files.run import Frames
 
 
 def knot(quick: bool) -> Description:
     """An overhand knot whose ends are pulled apart; the curve is the long trefoil of Shastri 1992."""
     import numpy as np
 
-    from torchdlo.describe import Description, Hold, Key, Rope
+    from torchdlo.scene_files import Description, Hold, Key, Rope
 
     t = np.linspace(-2.15, 2.15, 2001)
     x = 0.02 * np.stack([t**3 - 3 * t, t**4 - 4 * t**2, 0.35 * (t**5 - 10 * t)], 1)
@@ -60,7 +60,7 @@ def knot_claims(frames: Frames, d: Description) -> Claims:
 
 def chain(quick: bool) -> Description:
     """Two linked loops; the upper one is held at one place, the lower one falls into it."""
-    from torchdlo.describe import Description, Hold, Rope
+    from torchdlo.scene_files import Description, Hold, Rope
 
     count = 20 if quick else 28
     given = {"radius": 3e-3, "density": 2000.0, "bend": 5e-4, "closed": True, "rest": "as_placed"}
@@ -97,7 +97,7 @@ def chain_claims(frames: Frames, d: Description) -> Claims:
 
 def gripper(quick: bool) -> Description:
     """An arm reaches down, grips a rope on a table, and lifts it."""
-    from torchdlo.describe import Description, Hold, Key, Robot, Rope
+    from torchdlo.scene_files import Description, Hold, Key, Robot, Rope
 
     count = 31 if quick else 41
     middle = count // 2
@@ -153,7 +153,7 @@ def gripper_claims(frames: Frames, d: Description) -> Claims:
 
 def pulley(quick: bool) -> Description:
     """A smooth rope over a smooth pulley, with 40 g on one side and 60 g on the other."""
-    from torchdlo.describe import Body, Description, Rope, Weight
+    from torchdlo.scene_files import Body, Description, Rope, Weight
 
     radius, r, side, count = 0.05, 3e-3, 0.2, 48 if quick else 56
     edge = (2 * side + math.pi * (radius + r)) / count
@@ -196,7 +196,7 @@ def pulley_claims(frames: Frames, d: Description) -> Claims:
 
 def wire(quick: bool) -> Description:
     """A wire is bent over a post by its ends and let go: it springs back a little, and keeps the rest."""
-    from torchdlo.describe import Body, Description, Hold, Key, Rope
+    from torchdlo.scene_files import Body, Description, Hold, Key, Rope
 
     half, length, round_ = math.sqrt(0.5), 0.15, 0.0222
 
@@ -251,7 +251,7 @@ def wire_claims(frames: Frames, d: Description) -> Claims:
 
 def band(quick: bool) -> Description:
     """A rubber band round three posts that move apart."""
-    from torchdlo.describe import Body, Description, Key, Rope
+    from torchdlo.scene_files import Body, Description, Key, Rope
 
     post, r, start = 0.012, 2e-3, 0.03
     corners = circle(3, start, (0.0, 0.0, 0.0), turn=math.pi / 2)

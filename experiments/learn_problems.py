@@ -12,18 +12,18 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from torchdlo import describe, scene
+from torchdlo import scene, scene_files
 from torchdlo.coupling import BodyMatter, RodBody
-from torchdlo.coupling.bodies import BodyTargets, turn_by
-from torchdlo.coupling.rod_matter import Touched
-from torchdlo.describe import Body, Box, Description, Hold, Key, Matter, Rope
+from torchdlo.coupling.bodies.dynamics import BodyTargets, turn_by
+from torchdlo.coupling.mpm.rod_coupling_effect import Touched
 from torchdlo.physics import tree
-from torchdlo.physics.effect import Motion, Push, Values
-from torchdlo.physics.rod import View
-from torchdlo.physics.rotation import multiply
+from torchdlo.physics.effects.base import Motion, Push, Values
+from torchdlo.physics.linalg.rotation import multiply
+from torchdlo.physics.rod.kinematics import View
+from torchdlo.scene_files import Body, Box, Description, Hold, Key, Matter, Rope
 
 if TYPE_CHECKING:
-    from torchdlo.run import Frames
+    from torchdlo.scene_files.run import Frames
 
 LENGTH = 0.1
 """Moves are learned in this unit [m], turns in radians, so that one rate fits both."""
@@ -105,7 +105,7 @@ def described(problem: Problem, keys: Tensor) -> Description:
     return dataclasses.replace(d, holds=holds, bodies=bodies)
 
 
-def controls(d: Description, made: describe.Simulation, keys: Tensor) -> scene.Control:
+def controls(d: Description, made: scene_files.Simulation, keys: Tensor) -> scene.Control:
     """Return the controls of all steps, as `describe` makes them, with derivatives by keys (parts, keys, 6).
 
     Holds do not turn; all or none of them move.
@@ -157,7 +157,7 @@ def learn(
         callback: told (steps done, in all, message) after every step.
     """
     d = problem.scene()
-    made = describe.assemble(d)
+    made = scene_files.assemble(d)
     world = made.scene
     if cut:
         effects = tuple(CUT[type(e)](**vars(e)) if type(e) in CUT else e for e in world.effects)

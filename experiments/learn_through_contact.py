@@ -35,10 +35,10 @@ def one(name: str, args: Any, out: Path) -> dict[str, Any]:
     """Learn one problem with and without the gradient of contact, write its files, and return what was measured."""
     from learn_problems import PROBLEMS, described, learn, measured
 
-    from torchdlo import describe
+    from torchdlo import scene_files
+    from torchdlo.cli.progress import progress
     from torchdlo.files import write_atomically
-    from torchdlo.progress import progress
-    from torchdlo.run import run, save_frames
+    from torchdlo.scene_files.run import run, save_frames
 
     problem, begin = PROBLEMS[name], time.perf_counter()
     choices = {"iterations": args.iterations or problem.iterations, "seed": args.seed, "compiled": args.compiled}
@@ -46,16 +46,16 @@ def one(name: str, args: Any, out: Path) -> dict[str, Any]:
         cut = learn(problem, cut=True, callback=lambda *said: callback(f"{name}, cut", *said), **choices)
         found = learn(problem, cut=False, callback=lambda *said: callback(name, *said), **choices)
         description = described(problem, found.keys)
-        describe.save(description, out / "scene.json")
-        frames = run(describe.read(out / "scene.json"), every=5)
+        scene_files.save(description, out / "scene.json")
+        frames = run(scene_files.read(out / "scene.json"), every=5)
     save_frames(frames, out / "frames.npz", description)
     (first, _), (value, solved) = measured(problem, run(problem.scene(), every=5)), measured(problem, frames)
     if args.pictures:
-        from torchdlo.report.render import stills_png
+        from torchdlo.report.render.picture import stills_png
 
         write_atomically(out / f"{name}.png", stills_png(frames))
     if args.video:
-        from torchdlo.report.video import write_video
+        from torchdlo.report.render.video import write_video
 
         write_video(frames, out / "motion.mp4", speed=0.2)
     row = {

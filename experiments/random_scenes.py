@@ -76,7 +76,7 @@ def build(seed: int, scenes: int, step: tuple[float, int]) -> tuple[tuple[Any, A
     from torchdlo.coupling import BodyContact, RodBody, RodContact
     from torchdlo.physics import tree
     from torchdlo.physics.effects.elastic import Bend
-    from torchdlo.physics.effects.field import Damping, Gravity
+    from torchdlo.physics.effects.external import Damping, Gravity
 
     g = torch.Generator().manual_seed(seed)
     shapes = random.Random(seed).choices(sorted(SIZES), k=3)
@@ -156,9 +156,10 @@ def overlaps(made: tuple[Any, Any, Any], state: Any) -> tuple[Any, Any]:
     """Return how deep ropes are in bodies, and in themselves, over the radius, shape (scenes,) each."""
     import torch
 
-    from torchdlo.coupling import segments, shapes
-    from torchdlo.coupling.bodies import conjugate
-    from torchdlo.physics.rotation import rotate
+    from torchdlo.coupling.bodies import shape_sdf as shapes
+    from torchdlo.coupling.bodies.dynamics import conjugate
+    from torchdlo.coupling.rod_contact import closest_points
+    from torchdlo.physics.linalg.rotation import rotate
 
     choice, params, _ = made
     x = state.rods.pos
@@ -172,7 +173,7 @@ def overlaps(made: tuple[Any, Any, Any], state: Any) -> tuple[Any, Any]:
         nearest.append(shapes.distance(body.shape, size, rotate(conjugate(quat), points - at)).amin((-1, -2)))
     first, second = torch.triu_indices(VERTICES - 1, VERTICES - 1, 3)
     one, two = (tuple(e[:, rows] for e in ends) for rows in (first, second))
-    s, t = segments.closest(one, two)
+    s, t = closest_points.closest(one, two)
     between = torch.lerp(*one, s) - torch.lerp(*two, t)
     inside = 1 - torch.stack(nearest).amin(0) / RADIUS
     return inside.clamp(min=0), (2 - between.norm(dim=-1).amin(-1) / RADIUS).clamp(min=0)

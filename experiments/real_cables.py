@@ -4,7 +4,7 @@
     python experiments/real_cables.py RECORDING --plant time_delay tilted_gravity marker_offset point_mass
 
 RECORDING is a folder as `torchdlo import-deform` writes it. Without `--plant`, the cable is diagnosed as it is; errors
-are those published for the DEFORM cables (see `torchdlo.sysid.metrics`). `--blocks` makes the last fifth of the trials,
+are those published for the DEFORM cables (see `torchdlo.sysid.recordings.metrics`). `--blocks` makes the last fifth of the trials,
 by their numbers, the test trials: published splits interleave cuts of the same motions.
 
 Planted are: a delay of 20 ms (markers of the rope are taken from two hundredths of a second earlier than those of the
@@ -25,17 +25,17 @@ from typing import Any
 import numpy as np
 from options import Parser, count, save
 
+from torchdlo.cli.progress import progress
 from torchdlo.files import write_atomically
-from torchdlo.progress import progress
-from torchdlo.sysid import saved
-from torchdlo.sysid import start as starts
-from torchdlo.sysid.diagnose import BUDGETS, diagnose
-from torchdlo.sysid.findings import findings, model_json
-from torchdlo.sysid.metrics import average, mean_absolute_error
-from torchdlo.sysid.model import RopeModel
-from torchdlo.sysid.recording import Recording, Trial, load_recording
-from torchdlo.sysid.saved import Saved
-from torchdlo.sysid.verdict import Diagnosis
+from torchdlo.sysid.diagnosis.findings import findings, model_json
+from torchdlo.sysid.diagnosis.search import BUDGETS, diagnose
+from torchdlo.sysid.diagnosis.verdict import Diagnosis
+from torchdlo.sysid.model import initial_state as starts
+from torchdlo.sysid.model import model_file
+from torchdlo.sysid.model.model_file import Saved
+from torchdlo.sysid.model.rope_model import RopeModel
+from torchdlo.sysid.recordings.metrics import average, mean_absolute_error
+from torchdlo.sysid.recordings.recording import Recording, Trial, load_recording
 
 DELAY, TILT = 0.02, np.radians(2.0)
 
@@ -187,7 +187,7 @@ def main() -> None:
         if not args.plant:
             rows.append(plain)
         for plant in args.plant:
-            base = saved.load(out.with_name(f"{out.name}-model.json"))
+            base = model_file.load(out.with_name(f"{out.name}-model.json"))
             here = planted(recording, plant, base)
             rows.append(diagnosed(here, out.with_name(f"{out.name}-{plant}"), plant, base, choices))
     show(rows)

@@ -29,7 +29,7 @@ STEPS = ("double", "compiled", "recorded")
 
 def replay(file: Path, make: Callable[..., Any]) -> dict[str, Any]:
     """Play a trajectory in the problem that `make(task, **choices)` returns, and return how that went."""
-    from torchdlo.agents.result import load_actions, plain
+    from torchdlo.agents.trajopt.result import load_actions, plain
 
     had = json.loads(file.read_text(encoding="utf-8"))
     problem = make(had["task"], **{name: had["choices"][name] for name in STEPS if name in had["choices"]})
@@ -49,7 +49,7 @@ def shown(row: dict[str, Any]) -> str:
 
 def main() -> None:
     """Play all that is there."""
-    from torchdlo.agents.tasks import problem
+    from torchdlo.agents.trajopt.task_problem import problem
 
     parser = Parser("replay_trajopt.py", description=__doc__, epilog=EXAMPLES)
     parser.add_argument("--out", default="experiments/trajopt", help="folder of the searches; default: %(default)s")

@@ -12,7 +12,7 @@ from options import save
 
 def earlier(result: dict[str, Any]) -> bool:
     """Return whether a result is of another version of the program or of libraries."""
-    from torchdlo.agents.journal import program
+    from torchdlo.agents.trajopt.search_journal import program
 
     return result["program"] != program(result["task"])
 
@@ -31,7 +31,7 @@ def seen(runs: list[dict[str, Any]], episodes: float) -> float | None:
 
 def row(task: str, method: str, runs: list[dict[str, Any]], hybrid: list[dict[str, Any]]) -> dict[str, Any]:
     """One row of the table: mean and spread over the seeds, and what the hybrid saw of the same task."""
-    from torchdlo.agents.presets import PUBLISHED, preset
+    from torchdlo.agents.trajopt.presets import PUBLISHED, preset
 
     known = "cmaes" if method == "hybrid" else method
     goal, solved = PUBLISHED.get(task, {}).get(known, (None, None))
@@ -94,7 +94,7 @@ def table(rows: list[dict[str, Any]]) -> str:
 def report(runs: dict[tuple[str, str], list[dict[str, Any]]], out: Path) -> None:
     """Print and write the table and the curves of what is there so far."""
     from torchdlo.files import write_atomically
-    from torchdlo.report.learning import learning_png
+    from torchdlo.report.figures.learning_curve import learning_png
 
     rows = [row(task, method, found, runs.get((task, "hybrid"), [])) for (task, method), found in runs.items()]
     text = table(rows)

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 
 from torchdlo.sysid import Recording
-from torchdlo.sysid.baselines import BASELINES
-from torchdlo.sysid.metrics import average, free_marker_distance, mean_absolute_error
-from torchdlo.sysid.result import Calibration
+from torchdlo.sysid.estimation.result import Calibration
+from torchdlo.sysid.recordings.metrics import average, free_marker_distance, mean_absolute_error
+from torchdlo.sysid.recordings.trivial_predictors import BASELINES
 
 
 def fake_result(recording: Recording, *, share: float = 0.8, **fields: Any) -> Calibration:

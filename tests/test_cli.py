@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 
 from tests.fake_calibration import FakeFit
-from torchdlo import cli
+from torchdlo.cli import app
+from torchdlo.cli.progress import deferred_interrupt
 from torchdlo.files import replacing
-from torchdlo.progress import deferred_interrupt
 
 WRITTEN = ["calibration.json", "model.json", "report.html", "report.png"]
 
@@ -25,9 +25,9 @@ WRITTEN = ["calibration.json", "model.json", "report.html", "report.png"]
 def fit(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> FakeFit:
     """Replace the fit, and work in an empty folder."""
     fake = FakeFit()
-    module = types.ModuleType("torchdlo.sysid.calibrate")
+    module = types.ModuleType("torchdlo.sysid.calibration.calibrate")
     module.calibrate = fake  # type: ignore[attr-defined]
-    monkeypatch.setitem(sys.modules, "torchdlo.sysid.calibrate", module)
+    monkeypatch.setitem(sys.modules, "torchdlo.sysid.calibration.calibrate", module)
     (tmp_path / "work").mkdir()
     monkeypatch.chdir(tmp_path / "work")
     return fake
@@ -36,7 +36,7 @@ def fit(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> FakeFit:
 def run(*arguments: object) -> int:
     """Exit code of a command line."""
     with pytest.raises(SystemExit) as caught:
-        cli.main([str(a) for a in arguments])
+        app.main([str(a) for a in arguments])
     return int(caught.value.code or 0)
 
 
@@ -111,7 +111,7 @@ def test_options_reach_the_fit(folder: Path, fit: FakeFit) -> None:
     }
     run("calibrate", folder, "--quick", "--starts", 3)
     assert fit.options["starts"] == 3
-    assert fit.options["iterations"] == cli._QUICK["iterations"]
+    assert fit.options["iterations"] == app._QUICK["iterations"]
 
 
 def test_out_may_be_a_folder(folder: Path, fit: FakeFit) -> None:
@@ -209,7 +209,7 @@ def test_a_failed_fit_writes_nothing(folder: Path, fit: FakeFit) -> None:
 
     fit.during = fail
     with pytest.raises(RuntimeError, match="broken"):
-        cli.main(["calibrate", str(folder), "--out", "a"])
+        app.main(["calibrate", str(folder), "--out", "a"])
     assert not Path("a").exists()
 
 

@@ -10,10 +10,10 @@ import pytest
 from tests.report.fake_diagnosis import fake_diagnosis
 from tests.sysid.swaying import recording as swaying
 from tests.test_cli import run
-from torchdlo.sysid import diagnose as search
-from torchdlo.sysid.health import Fault
-from torchdlo.sysid.model import RopeModel
-from torchdlo.sysid.recording import save_recording
+from torchdlo.sysid.diagnosis import search
+from torchdlo.sysid.model.rope_model import RopeModel
+from torchdlo.sysid.recordings.data_quality import Fault
+from torchdlo.sysid.recordings.recording import save_recording
 
 
 @pytest.fixture

@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 import torch
 
-from torchdlo import cli, describe
-from torchdlo.describe import Body, Description, Hold, Key, Rope
-from torchdlo.describe.assembly import _rope
+from torchdlo import scene_files
+from torchdlo.cli import app
 from torchdlo.errors import InputError
 from torchdlo.physics import tree
 from torchdlo.scene import rollout, step
+from torchdlo.scene_files import Body, Description, Hold, Key, Rope
+from torchdlo.scene_files.assembly import _rope
 
 LIFT = Description(
     ropes=(
@@ -37,18 +38,18 @@ LIFT = Description(
 
 
 def test_a_file_reads_back_to_the_last_bit(tmp_path):
-    describe.save(LIFT, tmp_path / "scene.json")
-    assert describe.read(tmp_path / "scene.json") == LIFT
-    first, second = describe.build(LIFT), describe.load(tmp_path / "scene.json")
+    scene_files.save(LIFT, tmp_path / "scene.json")
+    assert scene_files.read(tmp_path / "scene.json") == LIFT
+    first, second = scene_files.build(LIFT), scene_files.load(tmp_path / "scene.json")
     assert first[0] == second[0]
     for a, b in zip(tree.leaves(first[1:]), tree.leaves(second[1:]), strict=True):
         assert torch.equal(a, b)
-    describe.save(describe.read(tmp_path / "scene.json"), tmp_path / "again.json")
+    scene_files.save(scene_files.read(tmp_path / "scene.json"), tmp_path / "again.json")
     assert (tmp_path / "again.json").read_bytes() == (tmp_path / "scene.json").read_bytes()
 
 
 def test_a_described_scene_runs_and_held_parts_go_where_keys_say():
-    scene, params, state, controls = describe.build(LIFT)
+    scene, params, state, controls = scene_files.build(LIFT)
     with torch.no_grad():
         last, seen = rollout(lambda *a: step(scene, *a), params, state, controls, keep=lambda s: s.rods.pos)
     assert torch.isfinite(last.rods.pos).all()
@@ -74,7 +75,7 @@ def test_a_line_is_cut_into_equal_parts():
 
 
 def test_single_precision_is_used_throughout():
-    made = describe.build(
+    made = scene_files.build(
         Description(LIFT.ropes, {"gravity": {}, "bend": {}}, precision="float32", integrator="implicit")
     )
     assert {x.dtype for x in tree.leaves(made[1:])} == {torch.float32}
@@ -82,7 +83,7 @@ def test_single_precision_is_used_throughout():
 
 def change(*path, to=None, drop=False):
     """The file with one entry changed, as text."""
-    content = {"format": describe.FORMAT} | json.loads(json.dumps(describe.plain(LIFT)))
+    content = {"format": scene_files.FORMAT} | json.loads(json.dumps(scene_files.plain(LIFT)))
     at = content
     for key in path[:-1]:
         at = at[key]
@@ -133,19 +134,19 @@ def test_wrong_files_are_refused_with_place_and_expectation(case, tmp_path):
     file = tmp_path / "scene.json"
     file.write_text(text)
     with pytest.raises(InputError, match=sentence) as caught:
-        describe.load(file)
+        scene_files.load(file)
     assert str(file) in str(caught.value)
 
 
 def test_a_missing_file_is_refused(tmp_path):
     with pytest.raises(InputError, match="expected a scene file, found none"):
-        describe.load(tmp_path / "no.json")
+        scene_files.load(tmp_path / "no.json")
 
 
 def simulate(*arguments: object) -> int:
     """Exit code of the command."""
     with pytest.raises(SystemExit) as caught:
-        cli.main(["simulate", *map(str, arguments)])
+        app.main(["simulate", *map(str, arguments)])
     return int(caught.value.code or 0)
 
 
@@ -153,7 +154,7 @@ def simulate(*arguments: object) -> int:
 def file(tmp_path):
     path = tmp_path / "hang.json"
     rope = Rope(points=((0.0, 0.0, 0.5), (0.4, 0.0, 0.5)), vertices=6, mass=0.03, bend=1e-3)
-    describe.save(Description((rope,), {"gravity": {}, "bend": {}}, holds=(Hold((0,)),), duration=0.03), path)
+    scene_files.save(Description((rope,), {"gravity": {}, "bend": {}}, holds=(Hold((0,)),), duration=0.03), path)
     return path
 
 
@@ -163,7 +164,7 @@ def test_the_command_keeps_frames_and_a_picture(file, tmp_path, capsys):
     assert summary["frames"] == 4 and summary["time"] == pytest.approx(0.03)
     kept = np.load(tmp_path / "run" / "frames.npz")
     assert kept["pos"].shape == (4, 6, 3) and kept["force"].shape == (4, 1, 3)
-    assert describe.parse(str(kept["torchdlo_scene"])) == describe.read(file)
+    assert scene_files.parse(str(kept["torchdlo_scene"])) == scene_files.read(file)
     assert (tmp_path / "run" / "shapes.png").read_bytes()[:4] == b"\x89PNG"
     # Its own files are replaced, those of others are not.
     assert simulate(file, "--out", tmp_path / "run") == 0
@@ -190,7 +191,7 @@ def test_the_command_draws_a_picture_and_a_video(file, tmp_path, capsys):
 
 
 def test_ctrl_c_keeps_frames_so_far(file, tmp_path, monkeypatch):
-    from torchdlo import commands
+    from torchdlo.cli import commands
 
     @contextlib.contextmanager
     def impatient(show):
@@ -234,4 +235,4 @@ def test_the_example_of_the_documentation_runs(repository, tmp_path, monkeypatch
     found: dict = {}
     exec(text.split("```python\n")[1].split("```")[0], found)
     assert found["controls"].pos.shape == (600, 3, 3)
-    assert describe.read("lift.json") == found["lift"]
+    assert scene_files.read("lift.json") == found["lift"]

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 import torch
 
-from torchdlo import describe
-from torchdlo.coupling.robot import panda, tool_pose
-from torchdlo.describe import Body, Box, Description, Hold, Key, Matter, Robot, Rope, Weight
-from torchdlo.describe.model import Modelled
+from torchdlo import scene_files
+from torchdlo.coupling.robot.kinematics import panda, tool_pose
 from torchdlo.errors import InputError
-from torchdlo.run import load_frames, run, save_frames
 from torchdlo.scene import rollout, step
+from torchdlo.scene_files import Body, Box, Description, Hold, Key, Matter, Robot, Rope, Weight
+from torchdlo.scene_files.rope_models import Modelled
+from torchdlo.scene_files.run import load_frames, run, save_frames
 
 LINE = Rope(((0.0, 0.0, 0.1), (0.3, 0.0, 0.1)), vertices=7, mass=0.03, bend=1e-3)
 FALL = Description((LINE,), {"gravity": {}, "bend": {}}, duration=0.06, substeps=2)
@@ -36,7 +36,7 @@ def test_bodies_touch_matter_where_the_effect_says_so():
     speed = {}
     for effects in ({}, {"body_matter": {"sweeps": 6}}):
         d = change(FALL, effects=effects, bodies=(plate,), matter=(ball,), box=room, duration=0.02, substeps=5)
-        scene, params, state, controls = describe.build(d)
+        scene, params, state, controls = scene_files.build(d)
         state, _ = rollout(lambda p, s, c, scene=scene: step(scene, p, s, c), params, state, controls)
         speed[bool(effects)] = float(state.bodies.vel[0, 2])
     assert speed[False] == 0.0 and speed[True] < -0.02
@@ -52,8 +52,8 @@ def test_all_parts_read_back_as_they_were_written(tmp_path):
         matter=(Matter("sand", (0.1,), 0.02, "ball", numbers={"youngs": 1e4 / 3}),),
         box=Box((0.0, 0.0, 0.0), (1.0, 1.0, 1.0), 0.1, ("slip",) * 6, window=(8, 8, 8)),
     )
-    describe.save(whole, tmp_path / "scene.json")
-    assert describe.read(tmp_path / "scene.json") == whole
+    scene_files.save(whole, tmp_path / "scene.json")
+    assert scene_files.read(tmp_path / "scene.json") == whole
 
 
 @pytest.fixture
@@ -69,9 +69,9 @@ def cube(tmp_path):
 def test_a_mesh_stands_where_its_file_says_and_weighs_its_volume(cube, monkeypatch, tmp_path):
     monkeypatch.setenv("TORCHDLO_CACHE", str(tmp_path / "cache"))
     body = Body("mesh", pos=(0.5, 0.0, 0.0), file="cube.stl", scale=0.01, cells=8, density=500.0)
-    describe.save(change(FALL, bodies=(body,)), cube.with_name("scene.json"))
+    scene_files.save(change(FALL, bodies=(body,)), cube.with_name("scene.json"))
     # Its file is found beside the scene file, not in the working folder.
-    _, params, state, _ = describe.load(cube.with_name("scene.json"))
+    _, params, state, _ = scene_files.load(cube.with_name("scene.json"))
     assert torch.allclose(state.bodies.pos[0], torch.tensor([0.51, 0.01, 0.01], dtype=torch.float64), atol=1e-12)
     assert float(params.bodies.mass) == pytest.approx(500 * 0.02**3, rel=1e-9)
 
@@ -82,7 +82,7 @@ def test_matter_fills_its_shape(tmp_path):
         Matter("elastic", (0.03,), 0.01, "ball", (0.0, 0.0, 0.3), numbers={"density": 200.0}),
     )
     box = Box((-0.2, -0.2, 0.0), (0.2, 0.2, 0.4), 0.02)
-    scene, params, state, _ = describe.build(change(FALL, matter=parts, box=box, substeps=5))
+    scene, params, state, _ = scene_files.build(change(FALL, matter=parts, box=box, substeps=5))
     first, second = (piece for _, piece in scene.matter.pieces())
     assert [g.law.name for g in scene.matter.groups] == ["liquid", "elastic"]
     assert float(params.matter.volume[first].sum()) == pytest.approx(0.2 * 0.1 * 0.04, rel=1e-9)
@@ -115,7 +115,7 @@ WRONG = {
     "weight's place": (change(FALL, ropes=(change(LINE, weights=(Weight(7, 1.0),)),)), r"vertex: expected -7 to 6"),
     "weight": (change(FALL, ropes=(change(LINE, weights=(Weight(0, 0.0),)),)), r"weights\[0\].mass: expected more"),
     "no robot": (change(FALL, holds=(Hold((0,), robot=0),)), r"holds\[0\].robot: there is no robot"),
-    "late": (change(FALL, holds=(Hold((0,), close=0.01),)), r"holds\[0\].close: .* use torchdlo.describe.assemble"),
+    "late": (change(FALL, holds=(Hold((0,), close=0.01),)), r"holds\[0\].close: .* use torchdlo.scene_files.assemble"),
     "early": (change(FALL, holds=(Hold((0,), close=-1.0),)), r"close: expected a time from 0 on"),
 }
 
@@ -123,9 +123,9 @@ WRONG = {
 @pytest.mark.parametrize("case", WRONG)
 def test_wrong_parts_are_refused_with_place_and_expectation(case, tmp_path):
     description, sentence = WRONG[case]
-    describe.save(description, tmp_path / "scene.json")
+    scene_files.save(description, tmp_path / "scene.json")
     with pytest.raises(InputError, match=sentence) as caught:
-        describe.load(tmp_path / "scene.json")
+        scene_files.load(tmp_path / "scene.json")
     assert "scene.json" in str(caught.value) or "no.stl" in str(caught.value)
 
 
@@ -163,12 +163,12 @@ def test_a_robot_brings_what_it_holds_along_its_keys(arm):
     lift = Description(
         (line,), {"bend": {}, "gravity": {}}, holds=(Hold((0, 1), robot=0),), robots=(arm,), duration=0.4, dt=4e-3
     )
-    scene, _, state, controls = describe.build(lift)
+    scene, _, state, controls = scene_files.build(lift)
     # Inverse kinematics counts as there within 0.1 mm.
     assert (controls.pos[-1, 0] - torch.tensor([0.0, 0.05, 0.25], dtype=torch.float64)).norm() < 1e-4
     assert state.rods.pos[0].tolist() == [0.0, 0.0, 0.2]
     # Links are bodies, in pictures too, and go with the joints.
-    made = describe.assemble(lift)
+    made = scene_files.assemble(lift)
     links = made.plan.controls.bodies.pos
     assert links.shape[:2] == (100, len(scene.bodies)) and len(scene.bodies) > 5
     assert float((links[-1] - links[0]).norm(dim=-1).max()) > 0.05
@@ -189,12 +189,12 @@ ARMS = {
 def test_robots_that_cannot_do_it_are_refused(case, arm):
     fields, sentence = ARMS[case]
     with pytest.raises(InputError, match=sentence):
-        describe.build(change(FALL, robots=(change(arm, **fields),), duration=0.4, dt=4e-3))
+        scene_files.build(change(FALL, robots=(change(arm, **fields),), duration=0.4, dt=4e-3))
 
 
 def test_two_robots_of_a_kind_have_names_of_their_own(arm):
     still = change(arm, pos=None, keys=())
-    scene, *_ = describe.build(change(FALL, robots=(still, change(still, base=(0.5, 0.0, 0.0)))))
+    scene, *_ = scene_files.build(change(FALL, robots=(still, change(still, base=(0.5, 0.0, 0.0)))))
     assert len({b.name for b in scene.bodies}) == len(scene.bodies)
     assert tool_pose(panda(), torch.tensor(POSTURE, dtype=torch.float64)).pos.shape == (3,)
 
@@ -205,7 +205,7 @@ def test_a_recorded_run_is_the_run_of_single_steps():
     )
     described = change(described, effects={**FALL.effects, "rod_body": {}})
     frames = run(described, every=1)
-    scene, params, state, controls = describe.build(described)
+    scene, params, state, controls = scene_files.build(described)
     with torch.no_grad():
         _, seen = rollout(lambda *a: step(scene, *a), params, state, controls, keep=lambda s: s.rods.pos)
     assert len(frames.time) == 61
@@ -216,9 +216,9 @@ def test_a_recorded_run_is_the_run_of_single_steps():
 @pytest.fixture
 def modelled(folder):
     """A function that writes a model file for the recording, with a given rest shape or a straight one."""
-    from torchdlo.sysid.model import RopeModel
-    from torchdlo.sysid.recording import load_recording
-    from torchdlo.sysid.saved import content
+    from torchdlo.sysid.model.model_file import content
+    from torchdlo.sysid.model.rope_model import RopeModel
+    from torchdlo.sysid.recordings.recording import load_recording
 
     def write(rest="straight", effects=("air_drag", "time_delay")):
         model = RopeModel(load_recording(folder), rest=rest, effects=effects)
@@ -239,7 +239,7 @@ def test_a_model_file_is_a_rope_of_a_scene(modelled):
     folder = modelled()
     rope = Rope(((0.0, 0.0, 0.5), (0.5, 0.0, 0.5), (0.5, 0.5, 0.5)), model="model.json")
     said = Description((rope,), {"damping": {"rate": 9.0}}, holds=(Hold((0,)),), duration=0.02, integrator="implicit")
-    scene, params, _, _ = describe.build(said, folder=folder)
+    scene, params, _, _ = scene_files.build(said, folder=folder)
     assert float(params.rods.material.bend.max()) == 2e-3
     assert float(params.rods.material.mass.sum()) == pytest.approx(0.05, rel=1e-12)
     assert float(params.rods.material.radius[0]) == 0.004
@@ -254,14 +254,14 @@ def test_a_model_file_is_a_rope_of_a_scene(modelled):
         (change(rope, model="no.json"), "expected a model file, found nothing there"),
     ):
         with pytest.raises(InputError, match=sentence):
-            describe.build(change(said, ropes=(wrong,)), folder=folder)
+            scene_files.build(change(said, ropes=(wrong,)), folder=folder)
     with pytest.raises(InputError, match="expected the same model for every rope"):
-        describe.build(change(said, ropes=(rope, LINE)), folder=folder)
+        scene_files.build(change(said, ropes=(rope, LINE)), folder=folder)
 
 
 def test_a_natural_shape_of_a_model_is_that_of_the_rope(modelled):
     folder = modelled("given", ())
-    made = describe.build(
+    made = scene_files.build(
         Description((Rope(((0.0, 0.0, 0.0), (1.0, 0.0, 0.0)), model="model.json"),), {}), folder=folder
     )
     assert [type(e).__name__ for e in made[0].effects] == ["Gravity", "BendFrame", "Twist", "Damping"]
@@ -294,9 +294,9 @@ def test_frames_read_back_and_others_are_refused(tmp_path):
 
 def test_the_files_shown_in_the_documentation_fit(repository):
     grip, model = (repository / "docs" / "scenes.md").read_text().split("```json\n")[1:]
-    assert describe.parse(model.split("```")[0]).ropes[0].model == "model.json"
+    assert scene_files.parse(model.split("```")[0]).ropes[0].model == "model.json"
     pytest.importorskip("pytorch_kinematics", reason="robots need the extra robots")
-    made = describe.assemble(describe.parse(grip.split("```")[0]))
+    made = scene_files.assemble(scene_files.parse(grip.split("```")[0]))
     # It grips where the rope lies.
     tool, middle = made.plan.tools.pos[300, 0], made.state.rods.pos[15]
     assert made.plan.closed[299:301, 0, 0].tolist() == [0.0, 1.0] and float((tool - middle).norm()) < 1e-4

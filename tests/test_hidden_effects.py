@@ -28,7 +28,7 @@ from laws import GRAVITY, Laws  # noqa: E402
 from simulate import Mesh, Rope, Simulator, at_rest, settle  # noqa: E402
 from vectors import exponential, logarithm, multiply, rotate  # noqa: E402
 
-from torchdlo.cli import main as torchdlo  # noqa: E402
+from torchdlo.cli.app import main as torchdlo  # noqa: E402
 
 BEAM = Rope(0.3, 0.004, 0.02, 0.01, 0.008, 0.0)
 DENSITY = BEAM.mass / BEAM.length

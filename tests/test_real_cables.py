@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from torchdlo.sysid.recording import load_recording
+from torchdlo.sysid.recordings.recording import load_recording
 
 ROOT = Path(__file__).parents[1]
 sys.path[:0] = [str(ROOT / "experiments")]

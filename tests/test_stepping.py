@@ -9,7 +9,7 @@ from torchdlo import scene
 from torchdlo.coupling import RodBody
 from torchdlo.physics import tree
 from torchdlo.physics.effects.elastic import Bend
-from torchdlo.physics.effects.field import Gravity
+from torchdlo.physics.effects.external import Gravity
 
 
 def hanging(scenes: int, held: tuple[int, ...] = (0, 1), **choices):

@@ -14,19 +14,25 @@ from functools import partial, reduce
 import torch
 from torch import Tensor
 
-from torchdlo.coupling import bodies as rigid
-from torchdlo.coupling import body_matter, mpm, rod_matter, watch
-from torchdlo.coupling.bodies import Body, BodyParams, BodyState, BodyTargets, Solid, place
-from torchdlo.coupling.particles import Matter, Medium, Particles, laid_out
-from torchdlo.coupling.watch import survey
-from torchdlo.physics import build, checks, rod, stability, traced, tree
-from torchdlo.physics.build import Rope
-from torchdlo.physics.effect import Effect, altered, default_values, numbers_of
-from torchdlo.physics.hold import Reaction, Targets, between, check_grip, unfelt
-from torchdlo.physics.integrate import INTEGRATORS, TWISTS, Settings, settle_twist, substep
-from torchdlo.physics.replay import alike, rollout
-from torchdlo.physics.rod import RodParams, RodState
-from torchdlo.physics.topology import Topology
+from torchdlo.coupling.bodies import dynamics as rigid
+from torchdlo.coupling.bodies.dynamics import Body, BodyParams, BodyState, BodyTargets, Solid, place
+from torchdlo.coupling.common import step_diagnostics
+from torchdlo.coupling.common.step_diagnostics import survey
+from torchdlo.coupling.mpm import body_coupling_effect, rod_coupling_effect
+from torchdlo.coupling.mpm import substep as mpm
+from torchdlo.coupling.mpm.particles import Matter, Medium, Particles, laid_out
+from torchdlo.physics import tree
+from torchdlo.physics.effects.base import Effect, altered, default_values, numbers_of
+from torchdlo.physics.execution import tracing
+from torchdlo.physics.execution.replay import alike, rollout
+from torchdlo.physics.integrators import stability
+from torchdlo.physics.integrators.rod_step import INTEGRATORS, TWISTS, Settings, settle_twist, substep
+from torchdlo.physics.rod import assembly, validation
+from torchdlo.physics.rod import kinematics as rod
+from torchdlo.physics.rod.assembly import Rope
+from torchdlo.physics.rod.kinematics import RodParams, RodState
+from torchdlo.physics.rod.prescribed import Reaction, Targets, between, check_grip, unfelt
+from torchdlo.physics.rod.topology import Topology
 
 
 @tree.struct
@@ -86,7 +92,7 @@ class Scene:
     substeps: int = 5
     """Substeps per step."""
     integrator: str = "explicit"
-    """"explicit", or "implicit" for stiff cables at steps of 1-10 ms; see `physics.integrate`."""
+    """"explicit", or "implicit" for stiff cables at steps of 1-10 ms; see `physics.integrators.rod_step`."""
     twist: str = "none"
     """"none", "dynamic" or "quasistatic"."""
     constrained: bool = True
@@ -190,21 +196,21 @@ def make(
         effects: what acts on them.
         values: numbers of effects that differ from their defaults, e.g. {"damping": {"rate": 0.6}}.
         bodies: rigid bodies; `RodBody` among the effects makes ropes touch them.
-        matter: what `coupling.particles.assemble` returned; `RodMatter` and `BodyMatter` let ropes and bodies touch it.
+        matter: what `coupling.mpm.particles.assemble` returned; `RodMatter` and `BodyMatter` let ropes and bodies touch it.
         check: whether to refuse what could not be stepped: laws that do not fit the ropes, ropes far from their length,
             unstable substeps. Scenes whose loads are only evaluated may be anything.
         choices: fields of `Scene`.
     """
-    checks.listed(effects, Effect, "effects")
-    topology, rods, state = build.assemble(ropes)
+    validation.listed(effects, Effect, "effects")
+    topology, rods, state = assembly.assemble(ropes)
     kinds, solid, placed = place(bodies, state.pos) if bodies else ((), (), ())
     if bodies:
         batch = torch.broadcast_shapes(state.pos.shape[:-2], placed.pos.shape[:-2])
         state, placed = tree.map(lambda x: tree.batch_innermost(x.expand(*batch, *x.shape[-2:])), (state, placed))
     medium, stuff, particles = matter or (None, (), ())
     if matter:
-        state, placed, particles = rod_matter.together(state, placed, particles)
-    effects = rod_matter.fitted(effects, medium, rods)
+        state, placed, particles = rod_coupling_effect.together(state, placed, particles)
+    effects = rod_coupling_effect.fitted(effects, medium, rods)
     scene = Scene(topology, effects, bodies=kinds, matter=medium, **choices)
     numbers = numbers_of(effects, values or {}, state.pos)
     blank = {e.name: state.pos.new_zeros(*state.pos.shape[:-1], e.memory) for e in effects if e.memory}
@@ -225,7 +231,7 @@ def make(
 
 
 def limits(scene: Scene, params: Params) -> dict[str, float]:
-    """Return the largest stable substep [s] by the term that limits it; see `physics.stability`."""
+    """Return the largest stable substep [s] by the term that limits it; see `physics.integrators.stability`."""
     return stability.limits(scene.settings, params.rods, params.effects)
 
 
@@ -269,18 +275,18 @@ def advance(scene: Scene, params: Params, state: State, start: Control, control:
         poses = rigid.between(start.bodies, control.bodies, share)
         foresee = partial(rigid.foresee, scene.bodies, params.bodies, state.bodies, poses, first=first, dt=settings.dt)
     if scene.matter:
-        matter = rod_matter.foresee(scene.matter, params.matter, state.matter, first, settings.dt)
+        matter = rod_coupling_effect.foresee(scene.matter, params.matter, state.matter, first, settings.dt)
     rods, reaction, (body, pool, push) = substep(
         settings, params.rods, params.effects, state.rods, targets, first, foresee, matter
     )
     # Over the substeps of this step; a sum set to zero outside would have no gradient at first.
     later = share * scene.substeps > 1.5
     mean = tree.map(lambda old, now: torch.where(later, old, 0.0) + now / scene.substeps, state.reaction, reaction)
-    missed = watch.missed(scene, params, rods, state.missed)
-    push = body_matter.meet(scene.effects, body, pool, push)
+    missed = step_diagnostics.missed(scene, params, rods, state.missed)
+    push = body_coupling_effect.meet(scene.effects, body, pool, push)
     moved, particles = rigid.advance(body, poses, push) if scene.bodies else (), ()
     if scene.matter:
-        particles, missed = rod_matter.finish(scene.matter, params.matter, pool, push, settings.dt, missed)
+        particles, missed = rod_coupling_effect.finish(scene.matter, params.matter, pool, push, settings.dt, missed)
     after = State(rods, state.time + settings.dt, missed, mean, moved, particles)
     return laid_out(after) if torch.compiler.is_compiling() else after
 
@@ -328,7 +334,7 @@ def stepper(scene: Scene, *, compiled: bool = True, recorded: bool = False):
     Compiled steps need a C++ compiler on the CPU.
     """
     if not compiled:
-        return traced.Recorded(partial(step, scene)) if recorded else partial(step, scene)
+        return tracing.Recorded(partial(step, scene)) if recorded else partial(step, scene)
     compile = partial(torch.compile, fullgraph=True, dynamic=False, isolate_recompiles=True)
     once = scene.substeps == 1 and not any(e.reacts for e in scene.effects)
 
@@ -338,7 +344,7 @@ def stepper(scene: Scene, *, compiled: bool = True, recorded: bool = False):
         return (part(_step), advance) if once else (_step, part(advance))
 
     ways = {True: made(False), False: made(True)}
-    look, trusting = compile(survey), traced.Trusting(_prepared)
+    look, trusting = compile(survey), tracing.Trusting(_prepared)
 
     def run(params: Params, state: State, control: Control) -> State:
         _check_control(scene, control)
@@ -376,7 +382,9 @@ def ok(state: State) -> Tensor:
 def check_state(state: State) -> None:
     """Raise a `RuntimeError` that says what went wrong, if something did."""
     if not bool(ok(state).all()):
-        raise RuntimeError(f"scene: {watch.explain(state.missed) or 'positions or velocities are not finite'}")
+        raise RuntimeError(
+            f"scene: {step_diagnostics.explain(state.missed) or 'positions or velocities are not finite'}"
+        )
 
 
 __all__ = [

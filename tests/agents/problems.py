@@ -10,11 +10,12 @@ import torch
 from torch import Tensor
 
 from torchdlo import scene
-from torchdlo.agents.problem import Outcome
-from torchdlo.physics import numerics, tree
+from torchdlo.agents.trajopt.problem import Outcome
+from torchdlo.physics import tree
 from torchdlo.physics.effects.elastic import Bend
-from torchdlo.physics.effects.field import Damping, Gravity
+from torchdlo.physics.effects.external import Damping, Gravity
 from torchdlo.physics.effects.table import Table, TableFriction
+from torchdlo.physics.linalg import numerics
 
 
 def judged(returns: Tensor, success: Tensor) -> Outcome:

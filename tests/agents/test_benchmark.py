@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from tests.agents.problems import Push
-from torchdlo.agents.search import Settings
+from torchdlo.agents.trajopt.search import Settings
 from torchdlo.errors import InputError
 
 pytest.importorskip("pytorch_kinematics", reason="arms need the extra robots")

@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from torchdlo.agents.problem import Encoding
+from torchdlo.agents.trajopt.problem import Encoding
 
 TWO_TOOLS = Encoding(horizon=7, width=6, group=3, limit=0.01, hold=3)
 

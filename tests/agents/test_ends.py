@@ -10,10 +10,10 @@ import pytest
 import torch
 
 from tests.agents.problems import Push, Rehearsed
-from torchdlo.agents.descent import descent
-from torchdlo.agents.plan import Plan, Told
-from torchdlo.agents.result import result_json
-from torchdlo.agents.search import Settings, optimize
+from torchdlo.agents.trajopt.gradient_descent import descent
+from torchdlo.agents.trajopt.proposals import Plan, Told
+from torchdlo.agents.trajopt.result import result_json
+from torchdlo.agents.trajopt.search import Settings, optimize
 from torchdlo.errors import InputError
 
 

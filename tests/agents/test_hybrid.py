@@ -10,11 +10,11 @@ import torch
 from torch import Tensor
 
 from tests.agents.problems import Push, Reach
-from torchdlo.agents import hybrid
-from torchdlo.agents.lbfgs import Descent
-from torchdlo.agents.plan import Plan, Told
-from torchdlo.agents.problem import Encoding, Outcome
-from torchdlo.agents.search import METHODS, Settings, optimize
+from torchdlo.agents.trajopt import hybrid
+from torchdlo.agents.trajopt.lbfgs import Descent
+from torchdlo.agents.trajopt.problem import Encoding, Outcome
+from torchdlo.agents.trajopt.proposals import Plan, Told
+from torchdlo.agents.trajopt.search import METHODS, Settings, optimize
 
 
 def test_islands_know_nothing_of_each_other() -> None:

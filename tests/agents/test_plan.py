@@ -8,9 +8,9 @@ import pytest
 import torch
 
 from tests.agents.problems import Plain, judged
-from torchdlo.agents.plan import drags, rounds
-from torchdlo.agents.search import Settings, optimize
-from torchdlo.agents.tasks import problem
+from torchdlo.agents.trajopt.proposals import drags, rounds
+from torchdlo.agents.trajopt.search import Settings, optimize
+from torchdlo.agents.trajopt.task_problem import problem
 
 
 @dataclass(frozen=True)

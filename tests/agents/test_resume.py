@@ -17,10 +17,10 @@ import torch
 from torch import Tensor
 
 from tests.agents.problems import Push, signature
-from torchdlo.agents.journal import _code, program, remove
-from torchdlo.agents.problem import Outcome
-from torchdlo.agents.result import result_json, trajectory_json
-from torchdlo.agents.search import METHODS, Found, Robust, Settings, optimize
+from torchdlo.agents.trajopt.problem import Outcome
+from torchdlo.agents.trajopt.result import result_json, trajectory_json
+from torchdlo.agents.trajopt.search import METHODS, Found, Robust, Settings, optimize
+from torchdlo.agents.trajopt.search_journal import _code, program, remove
 from torchdlo.errors import InputError
 
 SETTINGS = Settings(episodes=96, population=8, hold=5, chunk=5)
@@ -117,7 +117,7 @@ import sys, time
 from pathlib import Path
 from tests.agents.problems import Push
 from tests.agents.test_resume import SETTINGS
-from torchdlo.agents.search import optimize
+from torchdlo.agents.trajopt.search import optimize
 
 class Slow(Push):
     def evaluate(self, actions):
@@ -162,7 +162,7 @@ def test_only_the_same_search_goes_on(tmp_path: Path, monkeypatch: pytest.Monkey
         journal, replace(SETTINGS, method="gd", population=4)
     )
     with monkeypatch.context() as patch:
-        patch.setattr("torchdlo.agents.journal.program", lambda _: "another")
+        patch.setattr("torchdlo.agents.trajopt.search_journal.program", lambda _: "another")
         assert "another version of torchdlo" in refused(journal)
 
 

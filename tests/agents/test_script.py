@@ -13,10 +13,11 @@ pytest.importorskip("pytorch_kinematics", reason="arms need the extra robots")
 
 from test_tasks import Lead
 
-from torchdlo import cli, envs
-from torchdlo.agents.script import script
-from torchdlo.envs import episode
-from torchdlo.run import load_frames
+from torchdlo import envs
+from torchdlo.agents.trajopt.script import script
+from torchdlo.cli import app
+from torchdlo.envs.core import episode
+from torchdlo.scene_files.run import load_frames
 
 
 class Led(Lead):
@@ -37,7 +38,7 @@ def _tasks(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
 def play(*words: object) -> int:
     """Exit code of the command."""
     with pytest.raises(SystemExit) as caught:
-        cli.main(["play", *map(str, words)])
+        app.main(["play", *map(str, words)])
     return int(caught.value.code or 0)
 
 
@@ -66,7 +67,7 @@ def test_another_start_is_that_of_its_seed(capsys):
 def test_a_trajectory_comes_back_bit_by_bit(capsys):
     words = ["optimize", "lead", "--method", "cmaes", "--episodes", "8", "--population", "4", "--double"]
     with pytest.raises(SystemExit):
-        cli.main([*words, "--no-compiled", "--out", "found"])
+        app.main([*words, "--no-compiled", "--out", "found"])
     capsys.readouterr()
     assert play("lead", "--trajectory", "found/trajectory.json", "--json") == 0
     went, kept = json.loads(capsys.readouterr().out), json.loads(Path("found/trajectory.json").read_text())
@@ -100,7 +101,7 @@ def test_it_says_what_is_wrong(words, sentence, capsys):
 
 
 def test_ctrl_c_keeps_the_frames_so_far(monkeypatch, capsys):
-    from torchdlo import commands
+    from torchdlo.cli import commands
 
     @contextlib.contextmanager
     def impatient(show):

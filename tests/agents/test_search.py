@@ -13,9 +13,9 @@ import torch
 from torch import Tensor
 
 from tests.agents.problems import Drag, Peaks, Plain, Push, Reach, Rehearsed, signature
-from torchdlo.agents.plan import ranking
-from torchdlo.agents.problem import Outcome
-from torchdlo.agents.search import METHODS, Found, Robust, Settings, optimize
+from torchdlo.agents.trajopt.problem import Outcome
+from torchdlo.agents.trajopt.proposals import ranking
+from torchdlo.agents.trajopt.search import METHODS, Found, Robust, Settings, optimize
 from torchdlo.errors import InputError
 
 SMALL = Settings(episodes=64, population=8, hold=5)
@@ -226,7 +226,7 @@ class Narrow(Reach):
 
 
 def test_of_what_breaks_down_alone_the_next_is_chosen(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("torchdlo.agents.search._FINALISTS", 64)
+    monkeypatch.setattr("torchdlo.agents.trajopt.search._FINALISTS", 64)
     found = optimize(Narrow(), replace(SMALL, episodes=160, method="cmaes"))
     assert found.highest > -0.5 > returned(found) > -2
     assert found.searched == pytest.approx(returned(found))

@@ -11,13 +11,14 @@ import pytest
 import torch
 from torch import Tensor
 
-from torchdlo import cli, envs
-from torchdlo.agents.presets import PUBLISHED, preset
-from torchdlo.agents.result import load_actions
-from torchdlo.agents.search import METHODS, Robust
-from torchdlo.agents.tasks import TaskProblem, problem
-from torchdlo.coupling.robot import panda, tool_pose
-from torchdlo.envs.task import RADIUS, Arms, Seen, Task, make, straight
+from torchdlo import envs
+from torchdlo.agents.trajopt.presets import PUBLISHED, preset
+from torchdlo.agents.trajopt.result import load_actions
+from torchdlo.agents.trajopt.search import METHODS, Robust
+from torchdlo.agents.trajopt.task_problem import TaskProblem, problem
+from torchdlo.cli import app
+from torchdlo.coupling.robot.kinematics import panda, tool_pose
+from torchdlo.envs.core.task import RADIUS, Arms, Seen, Task, make, straight
 from torchdlo.errors import InputError
 from torchdlo.scene import Params, Rope, Scene, State
 
@@ -95,7 +96,7 @@ def test_the_command_finds_keeps_and_plays_again(
     out = tmp_path / "out"
     words = ["optimize", "lead", "--method", "hybrid", "--episodes", "16", "--population", "4", "--double"]
     with pytest.raises(SystemExit) as done:
-        cli.main([*words, "--no-compiled", "--out", str(out), "--json"])
+        app.main([*words, "--no-compiled", "--out", str(out), "--json"])
     assert done.value.code in (0, None)
     said = capsys.readouterr()
     result = json.loads(said.out)
@@ -135,7 +136,7 @@ def test_a_trajectory_that_cannot_be_trusted_says_so(
         found = ["--trajectory", str(out / "trajectory.json"), "--out", str(out / "play"), "--json"]
         for command in (["optimize", "lead", *words, "--out", str(out)], ["play", "lead", *found]):
             with pytest.raises(SystemExit):
-                cli.main(command)
+                app.main(command)
             said = capsys.readouterr()
             told = json.loads(said.out)["missed"]
             assert told.startswith(missed) and bool(told) == bool(missed)
@@ -161,7 +162,7 @@ def test_the_command_says_what_is_wrong(
     monkeypatch.chdir(tmp_path)
     monkeypatch.setitem(envs.TASKS, "lead", Lead)
     with pytest.raises(SystemExit) as done:
-        cli.main(["optimize", *words, "--no-compiled"])
+        app.main(["optimize", *words, "--no-compiled"])
     assert done.value.code == 2 and sentence in capsys.readouterr().err
     assert not list(tmp_path.rglob("*.pt"))
 

@@ -13,9 +13,9 @@ import torch
 from torch import Tensor
 
 from tests.agents.problems import Drag, Push, Rehearsed, signature
-from torchdlo.agents.problem import Outcome, Problem
-from torchdlo.agents.search import METHODS, Robust, Settings, optimize
-from torchdlo.agents.together import together
+from torchdlo.agents.trajopt.batched_evaluation import together
+from torchdlo.agents.trajopt.problem import Outcome, Problem
+from torchdlo.agents.trajopt.search import METHODS, Robust, Settings, optimize
 from torchdlo.errors import InputError
 
 SETTINGS = Settings(episodes=48, population=8, hold=5, chunk=5)

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import torch
 
-from torchdlo.physics import effect, rod, tree
+from torchdlo.physics import tree
 from torchdlo.physics.effects import EFFECTS
-from torchdlo.physics.effects.grip import GripperCompliance
-from torchdlo.physics.effects.measure import Track
+from torchdlo.physics.effects import base as effect
+from torchdlo.physics.effects.gripper_compliance import GripperCompliance
+from torchdlo.physics.effects.measurement import Track
+from torchdlo.physics.rod import kinematics as rod
 from torchdlo.scene import Rope, default_values, make
 
 F64 = torch.float64

@@ -9,9 +9,11 @@ import pytest
 import torch
 from contract import ACTIVE, F64, INSTANCES, default_values, respond, ropes, scene, track
 
-from torchdlo.physics import rod, rotation, tree
-from torchdlo.physics.effect import KINDS, LOADS, Effect, altered, observed
+from torchdlo.physics import tree
 from torchdlo.physics.effects import EFFECTS
+from torchdlo.physics.effects.base import KINDS, LOADS, Effect, altered, observed
+from torchdlo.physics.linalg import rotation
+from torchdlo.physics.rod import kinematics as rod
 from torchdlo.scene import Rope, hold, make, step
 
 each = pytest.mark.parametrize("name", EFFECTS)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchdlo.coupling import mpm
-from torchdlo.coupling.particles import Blob, Grid, Matter, Medium, Particles, assemble, fill_ball
+from torchdlo.coupling.mpm import substep as mpm
+from torchdlo.coupling.mpm.particles import Blob, Grid, Matter, Medium, Particles, assemble, fill_ball
 from torchdlo.physics import tree
 
 DOUBLE = torch.float64

@@ -5,10 +5,10 @@ from __future__ import annotations
 import torch
 from matter import DOUBLE, ONE, ball
 
-from torchdlo.coupling import mpm
-from torchdlo.coupling.bodies import Solid, foresee, hold, place
-from torchdlo.coupling.body_matter import exchange
-from torchdlo.coupling.laws import Elastic
+from torchdlo.coupling.bodies.dynamics import Solid, foresee, hold, place
+from torchdlo.coupling.mpm import substep as mpm
+from torchdlo.coupling.mpm.body_coupling_effect import exchange
+from torchdlo.coupling.mpm.constitutive_models import Elastic
 
 SHAPES = {
     "plane": ((), "kinematic"),

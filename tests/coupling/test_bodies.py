@@ -10,12 +10,13 @@ import pytest
 import torch
 from touching import F64, line
 
-from torchdlo.coupling import RodBody, bodies
-from torchdlo.coupling.bodies import Solid, conjugate
+from torchdlo.coupling import RodBody
+from torchdlo.coupling.bodies import dynamics as bodies
+from torchdlo.coupling.bodies.dynamics import Solid, conjugate
 from torchdlo.physics import tree
-from torchdlo.physics.effect import Effect, Push
-from torchdlo.physics.effects.field import Gravity
-from torchdlo.physics.rotation import multiply, rotate
+from torchdlo.physics.effects.base import Effect, Push
+from torchdlo.physics.effects.external import Gravity
+from torchdlo.physics.linalg.rotation import multiply, rotate
 from torchdlo.scene import Control, Rope, hold, make, rollout, step
 
 NONE = torch.zeros(1, 3, dtype=F64)

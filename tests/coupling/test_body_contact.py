@@ -9,9 +9,9 @@ import pytest
 import torch
 
 from tests.coupling.tumbling import F64, SHAPES, G, energy, ground, momenta, move, run
-from torchdlo.coupling import body_pairs
-from torchdlo.coupling.bodies import Solid, place
-from torchdlo.coupling.body_contact import BodyContact
+from torchdlo.coupling.bodies import contact_op
+from torchdlo.coupling.bodies.contact_effect import BodyContact
+from torchdlo.coupling.bodies.dynamics import Solid, place
 from torchdlo.physics import tree
 
 R = 0.05
@@ -210,7 +210,7 @@ def test_gradients_know_that_bodies_at_rest_are_held_by_friction(shape: str, ker
         [ground(**rub), Solid(shape, size, (0.0, 0.0, height), **rub)], torch.zeros(1, dtype=F64)
     )
     if not kernel:
-        monkeypatch.setattr(body_pairs, "fits", lambda _: False)
+        monkeypatch.setattr(contact_op, "fits", lambda _: False)
     gravity = torch.tensor([[0.0, 0.0, -G]], dtype=F64)
 
     def speeds(x: torch.Tensor, begun) -> torch.Tensor:
@@ -241,7 +241,7 @@ def test_gradients_hold_where_rounds_have_not_found_the_slip(kernel: bool, monke
     solids += [Solid("sphere", 0.03, (0.0, -0.0599, 0.035), **rub)]
     kinds, params, state = place(solids, torch.zeros(1, dtype=F64))
     if not kernel:
-        monkeypatch.setattr(body_pairs, "fits", lambda _: False)
+        monkeypatch.setattr(contact_op, "fits", lambda _: False)
     gravity = torch.tensor([[0.0, 0.0, -G]], dtype=F64)
 
     def speeds(x: torch.Tensor) -> torch.Tensor:

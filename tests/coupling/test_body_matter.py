@@ -11,14 +11,15 @@ from matter import DOUBLE, OPEN, momenta
 from meetings import SHAPES, meeting
 
 from torchdlo import scene
-from torchdlo.coupling import BodyMatter, mpm
-from torchdlo.coupling.bodies import Solid, conjugate
-from torchdlo.coupling.laws import Elastic, Liquid
-from torchdlo.coupling.particles import Blob, Grid, assemble, fill_box
-from torchdlo.coupling.rod_matter import RodMatter
+from torchdlo.coupling import BodyMatter
+from torchdlo.coupling.bodies.dynamics import Solid, conjugate
+from torchdlo.coupling.mpm import substep as mpm
+from torchdlo.coupling.mpm.constitutive_models import Elastic, Liquid
+from torchdlo.coupling.mpm.particles import Blob, Grid, assemble, fill_box
+from torchdlo.coupling.mpm.rod_coupling_effect import RodMatter
 from torchdlo.physics import tree
-from torchdlo.physics.effects.field import Gravity
-from torchdlo.physics.rotation import rotate
+from torchdlo.physics.effects.external import Gravity
+from torchdlo.physics.linalg.rotation import rotate
 
 SPACING, G = 0.01, 9.81
 

@@ -9,10 +9,12 @@ import torch
 from matter import DOUBLE
 from meetings import SHAPES, meeting
 
-from torchdlo.coupling import BodyMatter, body_matter, body_near, mpm
+from torchdlo.coupling import BodyMatter
+from torchdlo.coupling.mpm import body_broad_phase_op, body_coupling_effect
+from torchdlo.coupling.mpm import substep as mpm
 from torchdlo.physics import tree
 
-pytestmark = pytest.mark.skipif(not body_near.ready("cpu", DOUBLE), reason="there is no C++ compiler")
+pytestmark = pytest.mark.skipif(not body_broad_phase_op.ready("cpu", DOUBLE), reason="there is no C++ compiler")
 
 
 # Where there is too little room, two nodes as far from a torus as each other would be chosen between by rounding.
@@ -23,7 +25,7 @@ CASES = [(names, room) for room, kinds in ((600, [[n] for n in SHAPES]), (60, SC
 @pytest.mark.parametrize(("names", "room"), [*CASES, (["box", "sphere"], 600), (["box", "sphere"], 60)])
 def test_the_kernel_chooses_as_tensors_do(names, room, monkeypatch):
     found = meeting(names, BodyMatter(room=room, reach=0.7))
-    monkeypatch.setattr(body_near, "ready", lambda *_: False)
+    monkeypatch.setattr(body_broad_phase_op, "ready", lambda *_: False)
     again = meeting(names, BodyMatter(room=room, reach=0.7))
     for mine, theirs in zip((found[2].vel, *found[4]), (again[2].vel, *again[4]), strict=True):
         assert mine.shape == theirs.shape
@@ -34,10 +36,10 @@ def test_the_kernel_chooses_as_tensors_do(names, room, monkeypatch):
 
 def test_of_nodes_that_are_as_far_either_is_right():
     grid, nodes, _, motion, _ = meeting(["torus"], BodyMatter())
-    solids, points = body_matter._solids(motion, (2,)), mpm.places(grid, nodes)
-    off = body_matter._probe(motion, solids, points.unsqueeze(1))[0][:, 0, :, 0]
-    mine, lost = body_near.choose(motion, grid, nodes, (2,), 0.007, 60)
-    theirs, missed = body_matter._chosen(motion, solids, nodes, points, 0.007, 60)
+    solids, points = body_coupling_effect._solids(motion, (2,)), mpm.places(grid, nodes)
+    off = body_coupling_effect._probe(motion, solids, points.unsqueeze(1))[0][:, 0, :, 0]
+    mine, lost = body_broad_phase_op.choose(motion, grid, nodes, (2,), 0.007, 60)
+    theirs, missed = body_coupling_effect._chosen(motion, solids, nodes, points, 0.007, 60)
     assert torch.equal(lost.long(), missed.long()) and (lost > 0).any()
     far = [off.gather(1, chosen).sort(-1)[0] for chosen in (mine, theirs)]
     torch.testing.assert_close(*far, rtol=0, atol=1e-12)
@@ -46,14 +48,16 @@ def test_of_nodes_that_are_as_far_either_is_right():
 def test_the_kernel_chooses_every_node_once_and_none_without_mass():
     grid, nodes, _, motion, _ = meeting(["box", "sphere"], BodyMatter())
     reach = 0.01
-    near, lost = body_near.choose(motion, grid, nodes, (2,), reach, 700)
+    near, lost = body_broad_phase_op.choose(motion, grid, nodes, (2,), reach, 700)
     assert all(len(row.unique()) == 700 for row in near) and not lost.any()
-    off = body_matter._probe(motion, body_matter._solids(motion, (2,)), mpm.places(grid, nodes).unsqueeze(1))[0]
+    off = body_coupling_effect._probe(
+        motion, body_coupling_effect._solids(motion, (2,)), mpm.places(grid, nodes).unsqueeze(1)
+    )[0]
     wanted = (off.amin(1)[..., 0] < reach) & (nodes.mass > 0)
     for row, there in zip(near, wanted, strict=True):
         count = int(there.sum())
         assert row[:count].tolist() == there.nonzero()[:, 0].tolist() and 60 < count < 700
     state, params, nodes = (tree.map(lambda x: x.float(), y) for y in (motion.state, motion.params, nodes))
     single = dataclasses.replace(motion, state=state, params=params)
-    again, _ = body_near.choose(single, grid, nodes, (2,), reach, 700)
+    again, _ = body_broad_phase_op.choose(single, grid, nodes, (2,), reach, 700)
     assert all(set(a.tolist()) == set(b.tolist()) for a, b in zip(again, near, strict=True))

@@ -8,13 +8,13 @@ import pytest
 import torch
 
 from tests.coupling.tumbling import F64, SHAPES, ground
-from torchdlo.coupling import body_pairs
-from torchdlo.coupling.bodies import BodyMotion, Solid, foresee, hold, place
-from torchdlo.coupling.body_contact import BodyContact, resolve
-from torchdlo.envs.solids import pebble
+from torchdlo.coupling.bodies import contact_op
+from torchdlo.coupling.bodies.contact_effect import BodyContact, resolve
+from torchdlo.coupling.bodies.dynamics import BodyMotion, Solid, foresee, hold, place
+from torchdlo.envs.assets.rigid_objects import pebble
 from torchdlo.physics import tree
 
-pytestmark = pytest.mark.skipif(not body_pairs.ready("cpu", F64), reason="there is no C++ compiler")
+pytestmark = pytest.mark.skipif(not contact_op.ready("cpu", F64), reason="there is no C++ compiler")
 
 DT = 2e-3
 SCENES = 11
@@ -86,7 +86,7 @@ def test_the_kernel_and_tensor_operations_agree_with_their_gradients(case: str, 
     kinds, choices = CASES[case]
     solids, contact = thrown(kinds), BodyContact(**choices)
     found, gradient = answered(solids, contact)
-    monkeypatch.setattr(body_pairs, "ready", lambda *_: False)
+    monkeypatch.setattr(contact_op, "ready", lambda *_: False)
     wanted, expected = answered(solids, contact)
     assert int((wanted.abs().amax((-1, -2)) > 0).sum()) >= 3  # scenes with contact
     assert float((found - wanted).norm()) < 1e-9 * float(wanted.norm())
@@ -145,7 +145,7 @@ def test_a_mesh_that_is_nowhere_is_nowhere_for_the_kernel_too(monkeypatch) -> No
     state = tree.replace(state, pos=pos)
     motion = foresee(kinds, params, state, hold(kinds, state), 0.0, torch.zeros(1, 1, dtype=F64), DT)
     found = resolve(BodyContact(), motion)[0]
-    monkeypatch.setattr(body_pairs, "ready", lambda *_: False)
+    monkeypatch.setattr(contact_op, "ready", lambda *_: False)
     wanted = resolve(BodyContact(), motion)[0]
     good = torch.arange(SCENES) != 3
     assert bool(found[3].isnan().any()) and bool(found[good].isfinite().all())

@@ -7,11 +7,12 @@ import torch
 from touching import F64, line
 
 from torchdlo import scene
-from torchdlo.coupling import RodBody, body_sweeps
-from torchdlo.envs.solids import pebble
+from torchdlo.coupling import RodBody
+from torchdlo.coupling.rod_body import solver_op as body_sweeps
+from torchdlo.envs.assets.rigid_objects import pebble
 from torchdlo.physics import tree
 from torchdlo.physics.effects.elastic import Bend
-from torchdlo.physics.effects.field import Damping, Gravity
+from torchdlo.physics.effects.external import Damping, Gravity
 from torchdlo.scene import Rope, Solid, hold, make
 
 pytestmark = pytest.mark.skipif(not body_sweeps.ready("cpu", F64), reason="there is no C++ compiler")

@@ -8,12 +8,15 @@ import pytest
 import torch
 from touching import F64, distances, line, momenta, nearest, run, two, with_velocity
 
-from torchdlo.coupling import RodContact, rod_pairs
-from torchdlo.coupling.watch import survey
-from torchdlo.physics import effect, rod, tree
-from torchdlo.physics.effect import Motion
+from torchdlo.coupling import RodContact
+from torchdlo.coupling.common.step_diagnostics import survey
+from torchdlo.coupling.rod_contact import solver_op as rod_pairs
+from torchdlo.physics import tree
+from torchdlo.physics.effects import base as effect
+from torchdlo.physics.effects.base import Motion
 from torchdlo.physics.effects.elastic import Bend
-from torchdlo.physics.effects.field import Damping, Gravity
+from torchdlo.physics.effects.external import Damping, Gravity
+from torchdlo.physics.rod import kinematics as rod
 from torchdlo.scene import Rope, check_state, finite, hold, make, ok, step
 
 ANGLES = pytest.mark.parametrize("angle", [0.0, math.pi / 6, math.pi / 2], ids=["parallel", "inclined", "crossed"])

@@ -11,7 +11,7 @@ from touching import F64, line
 from torchdlo.coupling import RodContact
 from torchdlo.physics import tree
 from torchdlo.physics.effects.elastic import Bend
-from torchdlo.physics.effects.field import Gravity
+from torchdlo.physics.effects.external import Gravity
 from torchdlo.scene import Rope, hold, make, ok, rollout, step
 
 NAMES = ("drift", "approach", "bend", "radius", "mu", "restitution", "mass", "gravity", "handle")

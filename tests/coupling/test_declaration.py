@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from torchdlo.coupling import EFFECTS, RodContact
-from torchdlo.coupling.watch import explain
-from torchdlo.physics.effect import KINDS, Effect
+from torchdlo.coupling.common.step_diagnostics import explain
+from torchdlo.physics.effects.base import KINDS, Effect
 
 
 @pytest.mark.parametrize("name", EFFECTS)

@@ -10,13 +10,15 @@ import torch
 from matter import DOUBLE, ONE, OPEN, ball, derivative, momenta
 
 from torchdlo import scene
-from torchdlo.coupling import RodMatter, mpm, node_sweeps
-from torchdlo.coupling.exchange import Lines, Touch, block_size, exchange, near_size
-from torchdlo.coupling.laws import Elastic, Liquid
-from torchdlo.coupling.particles import Blob, Grid, assemble, fill_ball, fill_box
+from torchdlo.coupling import RodMatter
+from torchdlo.coupling.mpm import rod_coupling_op
+from torchdlo.coupling.mpm import substep as mpm
+from torchdlo.coupling.mpm.constitutive_models import Elastic, Liquid
+from torchdlo.coupling.mpm.particles import Blob, Grid, assemble, fill_ball, fill_box
+from torchdlo.coupling.mpm.rod_coupling_solver import Lines, Touch, block_size, exchange, near_size
 from torchdlo.physics import tree
 from torchdlo.physics.effects.elastic import Bend
-from torchdlo.physics.effects.field import Gravity
+from torchdlo.physics.effects.external import Gravity
 
 RADIUS, SPACING = 0.005, 0.01
 
@@ -44,7 +46,7 @@ def touch(room=14, sweeps=3):
 @pytest.fixture
 def by_tensors(monkeypatch):
     """No kernel: tensor operations, as on a GPU."""
-    monkeypatch.setattr(node_sweeps, "ready", lambda *_: False)
+    monkeypatch.setattr(rod_coupling_op, "ready", lambda *_: False)
 
 
 def sums(grid, nodes, lines, vel):
@@ -61,7 +63,7 @@ def sums(grid, nodes, lines, vel):
 @pytest.mark.parametrize("kernel", [True, False], ids=["kernel", "tensors"])
 def test_exchange_keeps_momentum_and_never_adds_energy(mu, sweeps, kernel, monkeypatch):
     if not kernel:
-        monkeypatch.setattr(node_sweeps, "ready", lambda *_: False)
+        monkeypatch.setattr(rod_coupling_op, "ready", lambda *_: False)
     grid, nodes, lines = lines_through_a_ball()
     friction = torch.full((1, 1, 1), mu, dtype=DOUBLE)
     impulse, after, lost = exchange(grid, nodes, lines, touch(sweeps=sweeps), friction)
@@ -90,12 +92,12 @@ def exchanged(friction, sweeps):
     return both.detach(), torch.autograd.grad((weight * both).sum(), leaves)
 
 
-@pytest.mark.skipif(not node_sweeps.ready("cpu", DOUBLE), reason="there is no C++ compiler")
+@pytest.mark.skipif(not rod_coupling_op.ready("cpu", DOUBLE), reason="there is no C++ compiler")
 @pytest.mark.parametrize("mu", [0.0, 0.05, 5.0])
 @pytest.mark.parametrize("sweeps", [1, 4])
 def test_the_kernel_and_tensor_operations_agree_with_their_gradients(mu, sweeps, monkeypatch):
     found, gradient = exchanged(mu, sweeps)
-    monkeypatch.setattr(node_sweeps, "ready", lambda *_: False)
+    monkeypatch.setattr(rod_coupling_op, "ready", lambda *_: False)
     wanted, expected = exchanged(mu, sweeps)
     torch.testing.assert_close(found, wanted, rtol=1e-12, atol=1e-14)
     assert all(float(g.abs().max()) > 0 for g in expected)

@@ -5,12 +5,14 @@ from __future__ import annotations
 import pytest
 import torch
 
-from torchdlo.coupling import grasp, ik, robot
-from torchdlo.coupling.grasp import Hands, carry, felt, weld
-from torchdlo.coupling.pose import Pose
+from torchdlo.coupling.common.pose import Pose
+from torchdlo.coupling.robot import attachment as grasp
+from torchdlo.coupling.robot import inverse_kinematics
+from torchdlo.coupling.robot import kinematics as robot
+from torchdlo.coupling.robot.attachment import Hands, carry, felt, weld
 from torchdlo.physics import tree
 from torchdlo.physics.effects import EFFECTS
-from torchdlo.physics.rotation import rotate
+from torchdlo.physics.linalg.rotation import rotate
 from torchdlo.scene import Control, Rope, hold, make, step, stepper
 
 F64 = torch.float64
@@ -253,15 +255,19 @@ def test_gradients_through_inverse_kinematics_and_weld_are_those_of_differences(
     hands, steps = Hands(1, (0, 0)), 200
     down = vec(0, 1, 0, 0)
     first = Pose(x[0], down)
-    seed = ik.solve(arm, first, 0.5 * (arm.lower + arm.upper), search=ik.Search(steps=60, polish=8))
+    seed = inverse_kinematics.solve(
+        arm, first, 0.5 * (arm.lower + arm.upper), search=inverse_kinematics.Search(steps=60, polish=8)
+    )
     assert bool(seed.settled)
     held = weld(scene, hands, hold(scene, state), tree.map(lambda q: q[None], first), torch.ones(1, 1, dtype=F64))
     weight, t = rand(8, 3, seed=3), torch.linspace(0, 1, steps, dtype=F64)[:, None]
-    many = ik.Search(steps=20, polish=6)
+    many = inverse_kinematics.Search(steps=20, polish=6)
 
     def shape(goal, bent):
         pos = first.pos + goal * (1 - torch.cos(torch.pi * t)) / 2
-        found = ik.solve(arm, Pose(pos, down.expand(steps, 4)), seed.joints.expand(steps, -1), search=many)
+        found = inverse_kinematics.solve(
+            arm, Pose(pos, down.expand(steps, 4)), seed.joints.expand(steps, -1), search=many
+        )
         assert bool(found.settled.all())
         tool = robot.tool_pose(arm, found.joints + bent * torch.sin(torch.pi * t))
         now = state

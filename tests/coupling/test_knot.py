@@ -11,7 +11,7 @@ from touching import distances, trefoil
 from torchdlo.coupling import RodContact
 from torchdlo.physics import tree
 from torchdlo.physics.effects.elastic import Bend
-from torchdlo.physics.effects.field import Damping
+from torchdlo.physics.effects.external import Damping
 from torchdlo.scene import Rope, check_state, hold, make, step, stepper
 
 BEND, RADIUS = 1.26e-4, 2e-3

@@ -8,9 +8,9 @@ import pytest
 import torch
 
 from tests.coupling.tumbling import F64, ground, run
-from torchdlo.coupling import mesh, shapes, triangles
+from torchdlo.coupling.bodies import mesh_sdf, shape_sdf, triangles
 from torchdlo.errors import InputError
-from torchdlo.physics.rotation import rotate
+from torchdlo.physics.linalg.rotation import rotate
 
 trimesh = pytest.importorskip("trimesh", reason="meshes need trimesh")
 
@@ -34,14 +34,14 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.parametrize("kind", MADE)
 def test_distances_mass_and_inertia_are_those_of_the_closed_form(kind: str, folder: Path) -> None:
-    sampled = mesh.sample_mesh(*parts(kind), cells=CELLS, cache=folder)
+    sampled = mesh_sdf.sample_mesh(*parts(kind), cells=CELLS, cache=folder)
     size = torch.nn.functional.pad(torch.tensor(MADE[kind][1], dtype=F64), (0, 3 - len(MADE[kind][1])), value=1.0)
     cells = tuple(n - 1 for n in sampled.grid.shape)
     spacing = float(2 * sampled.size[0] / cells[0])
     g = torch.Generator().manual_seed(0)
     points = (2 * torch.rand(3000, 3, generator=g, dtype=F64) - 1) * sampled.size
-    found = shapes.distance("mesh", sampled.size[None], points, sampled.grid.reshape(1, -1), cells)
-    known, normal = shapes.probe(kind, size[None], points)
+    found = shape_sdf.distance("mesh", sampled.size[None], points, sampled.grid.reshape(1, -1), cells)
+    known, normal = shape_sdf.probe(kind, size[None], points)
     # Trilinear interpolation of a function of slope 1 is off by less than half a diagonal where it has a crease, and
     # of second derivatives up to 1/r by h^2/8 per axis elsewhere; the triangles lie within the surface themselves.
     assert (found - known).abs().max() < 0.87 * spacing
@@ -49,17 +49,17 @@ def test_distances_mass_and_inertia_are_those_of_the_closed_form(kind: str, fold
     if kind != "box":
         radius = MADE[kind][1][-1] - spacing
         middles = sampled.vertices[sampled.faces].mean(1)
-        facets = shapes.distance(kind, size[None], middles).abs().max()
+        facets = shape_sdf.distance(kind, size[None], middles).abs().max()
         assert (found - known)[smooth].abs().max() < 3 * spacing**2 / (8 * radius) + facets
-        _, sloped = shapes.probe("mesh", sampled.size[None], points, sampled.grid.reshape(1, -1), cells)
+        _, sloped = shape_sdf.probe("mesh", sampled.size[None], points, sampled.grid.reshape(1, -1), cells)
         assert ((sloped - normal).norm(dim=-1)[smooth[:, 0]]).max() < 3 * spacing / radius
-    volume, moments = shapes.bulk(kind, size)
+    volume, moments = shape_sdf.bulk(kind, size)
     # Inscribed polygons of n sides: area less by (2 pi / n)^2 / 6, second moments by twice that. Of a torus, n is 24
     # and 48: 1.1 + 0.3 %. Triangles of the sphere are smaller.
     assert torch.allclose(sampled.volume, volume, rtol=0.015)
     assert torch.allclose(sampled.moments, moments, rtol=0.03)
     # Balls touch the surface from within.
-    balls = shapes.distance(kind, size[None], sampled.balls[:, :3])[:, 0] + sampled.balls[:, 3]
+    balls = shape_sdf.distance(kind, size[None], sampled.balls[:, :3])[:, 0] + sampled.balls[:, 3]
     assert balls.abs().max() < 0.3 * spacing
 
 
@@ -81,7 +81,7 @@ def test_a_moved_and_turned_mesh_keeps_its_place(folder: Path) -> None:
     angle = torch.tensor(0.6, dtype=F64)
     turn = torch.tensor([[angle.cos(), -angle.sin(), 0], [angle.sin(), angle.cos(), 0], [0, 0, 1]], dtype=F64)
     shifted = vertices @ turn.T + torch.tensor([0.3, -0.1, 0.2], dtype=F64)
-    sampled = mesh.sample_mesh(shifted, faces, cells=CELLS, cache=folder)
+    sampled = mesh_sdf.sample_mesh(shifted, faces, cells=CELLS, cache=folder)
     body = sampled.solid(density=700.0)
     assert torch.allclose(torch.as_tensor(body.pos), torch.tensor([0.3, -0.1, 0.2], dtype=F64), atol=1e-9)
     back = rotate(torch.as_tensor(body.quat).expand(len(vertices), 4), sampled.vertices)
@@ -93,7 +93,7 @@ def test_the_cache_returns_the_same_bits_and_mends_itself(tmp_path: Path) -> Non
     vertices, faces = parts("box")
 
     def sampled() -> dict[str, torch.Tensor]:
-        return vars(mesh.sample_mesh(vertices, faces, cells=8, cache=tmp_path))
+        return vars(mesh_sdf.sample_mesh(vertices, faces, cells=8, cache=tmp_path))
 
     first = sampled()
     (file,) = tmp_path.iterdir()
@@ -106,14 +106,14 @@ def test_the_cache_returns_the_same_bits_and_mends_itself(tmp_path: Path) -> Non
         file.write_bytes(broken)
         mended = sampled()
         assert all(torch.equal(first[k], mended[k]) for k in first)
-        assert mesh._read(file) is not None
-    mesh.sample_mesh(vertices, faces, cells=9, cache=tmp_path)
+        assert mesh_sdf._read(file) is not None
+    mesh_sdf.sample_mesh(vertices, faces, cells=9, cache=tmp_path)
     assert len(list(tmp_path.iterdir())) == 2
 
 
 def test_an_unwritable_cache_costs_only_time(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("in the way")
-    assert mesh.sample_mesh(*parts("box"), cells=8, cache=tmp_path / "file").volume > 0
+    assert mesh_sdf.sample_mesh(*parts("box"), cells=8, cache=tmp_path / "file").volume > 0
 
 
 def test_files_are_read_in_their_unit(tmp_path: Path) -> None:
@@ -121,8 +121,8 @@ def test_files_are_read_in_their_unit(tmp_path: Path) -> None:
     made.apply_scale(1000.0)
     made.export(tmp_path / "box.stl")
     with pytest.raises(InputError, match=r"100 m long.*scale=0.001"):
-        mesh.load_mesh(tmp_path / "box.stl", cache=tmp_path)
-    found = mesh.load_mesh(tmp_path / "box.stl", scale=1e-3, cells=8, cache=tmp_path)
+        mesh_sdf.load_mesh(tmp_path / "box.stl", cache=tmp_path)
+    found = mesh_sdf.load_mesh(tmp_path / "box.stl", scale=1e-3, cells=8, cache=tmp_path)
     assert torch.allclose(found.volume, torch.tensor([2.4e-4], dtype=F64))
 
 
@@ -134,23 +134,23 @@ def test_what_has_no_inside_is_refused(tmp_path: Path) -> None:
         (torch.cat([faces[:1].flip(-1), faces[1:]]), "fix_normals"),
     ):
         with pytest.raises(InputError, match=message):
-            mesh.sample_mesh(vertices, wrong, cache=tmp_path)
+            mesh_sdf.sample_mesh(vertices, wrong, cache=tmp_path)
     with pytest.raises(InputError, match="no such file"):
-        mesh.load_mesh(tmp_path / "none.stl")
+        mesh_sdf.load_mesh(tmp_path / "none.stl")
     (tmp_path / "text.stl").write_text("solid nothing")
     with pytest.raises(InputError, match=r"text\.stl"):
-        mesh.load_mesh(tmp_path / "text.stl")
+        mesh_sdf.load_mesh(tmp_path / "text.stl")
     with pytest.raises(ValueError, match="cells is 1"):
-        mesh.sample_mesh(vertices, faces, cells=1)
+        mesh_sdf.sample_mesh(vertices, faces, cells=1)
 
 
 def test_a_surface_that_is_inside_out_is_turned(tmp_path: Path) -> None:
     vertices, faces = parts("box")
-    assert mesh.sample_mesh(vertices, faces.flip(-1), cells=8, cache=tmp_path).volume > 0
+    assert mesh_sdf.sample_mesh(vertices, faces.flip(-1), cells=8, cache=tmp_path).volume > 0
 
 
 def test_a_mesh_lands_and_stands(folder: Path) -> None:
-    box = mesh.sample_mesh(*parts("box"), cells=CELLS, cache=folder)
+    box = mesh_sdf.sample_mesh(*parts("box"), cells=CELLS, cache=folder)
     _, _, end = run([ground(), box.solid((0, 0, 0.022), density=500.0), box.solid((0, 0, 0.065), mass=0.1)], 0.3, 5e-3)
     # Its balls are inside by less than a third of a cell of 5 mm.
     assert end.pos[1, 2] == pytest.approx(0.02, abs=2e-3)

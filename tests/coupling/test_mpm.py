@@ -8,9 +8,10 @@ import pytest
 import torch
 from matter import DOUBLE, ONE, OPEN, ball, derivative, momenta, run, with_number
 
-from torchdlo.coupling import mpm, transfer
-from torchdlo.coupling.laws import Elastic, Liquid, Plastic, Sand
-from torchdlo.coupling.particles import Blob, Grid, assemble, fill_box
+from torchdlo.coupling.mpm import p2g_g2p
+from torchdlo.coupling.mpm import substep as mpm
+from torchdlo.coupling.mpm.constitutive_models import Elastic, Liquid, Plastic, Sand
+from torchdlo.coupling.mpm.particles import Blob, Grid, assemble, fill_box
 from torchdlo.physics import tree
 
 LAWS = [Elastic(), Plastic(), Sand(), Liquid()]
@@ -28,14 +29,14 @@ def _transfer_case():
 def test_transfers_have_the_derivatives_that_they_say():
     size, *tensors = _transfer_case()
     at, value, slope, grid = (t.requires_grad_() for t in tensors)
-    assert torch.autograd.gradcheck(lambda a, v, s: transfer.spread(a, v, s, size), (at, value, slope))
-    assert torch.autograd.gradcheck(lambda a, g: transfer.collect(a, g, size), (at, grid))
+    assert torch.autograd.gradcheck(lambda a, v, s: p2g_g2p.spread(a, v, s, size), (at, value, slope))
+    assert torch.autograd.gradcheck(lambda a, g: p2g_g2p.collect(a, g, size), (at, grid))
     massive = grid.detach()[:, :40].clone()
     massive[..., 3] = massive[..., 3].abs() + 0.1
     massive[:, ::5] = 0.0  # no mass
     massive.requires_grad_()
     there = massive[..., 3:] > 0
-    assert torch.autograd.gradcheck(lambda g: transfer.divide(g * there), (massive,))
+    assert torch.autograd.gradcheck(lambda g: p2g_g2p.divide(g * there), (massive,))
 
 
 def test_the_kernel_does_what_tensor_operations_do(monkeypatch):
@@ -50,8 +51,8 @@ def test_the_kernel_does_what_tensor_operations_do(monkeypatch):
         return calls.spread(at, value, slope, size), *calls.collect(at, grid, size), *carried[0], carried[1]
 
     fast = everything()
-    monkeypatch.setattr(transfer, "_native", lambda *_: False)
-    monkeypatch.setattr(transfer, "_native_divide", lambda *_: False)
+    monkeypatch.setattr(p2g_g2p, "_native", lambda *_: False)
+    monkeypatch.setattr(p2g_g2p, "_native_divide", lambda *_: False)
     for a, b in zip(fast, everything(), strict=True):
         assert torch.allclose(a.nan_to_num(), b.nan_to_num(), rtol=1e-12, atol=1e-12)
         assert a.shape == b.shape

@@ -8,10 +8,10 @@ import pytest
 import torch
 from matter import DOUBLE, derivative, run
 
-from torchdlo.coupling import laws, symmetric
-from torchdlo.coupling.laws import Elastic, Liquid, Plastic, Sand
-from torchdlo.coupling.particles import Blob, Grid, assemble, fill_box
-from torchdlo.coupling.symmetric import deviator, eigen, from_hencky, full, hencky, squared, stretch, trace
+from torchdlo.coupling.mpm import constitutive_models, symmetric_tensors
+from torchdlo.coupling.mpm.constitutive_models import Elastic, Liquid, Plastic, Sand
+from torchdlo.coupling.mpm.particles import Blob, Grid, assemble, fill_box
+from torchdlo.coupling.mpm.symmetric_tensors import deviator, eigen, from_hencky, full, hencky, squared, stretch, trace
 
 YOUNGS, POISSON = 1e5, 0.3
 NUMBERS = {
@@ -79,7 +79,7 @@ def deformed(law, change, count=1, history=0.0, steps=1, dt=1e-3, **other):
 def test_elastic_matter_has_the_stress_of_its_energy():
     # Psi = mu |V - I|^2 + lambda/2 (J - 1)^2; tau = (dPsi/dF) F^T, here by central differences of F -> (I + x A) F.
     f = torch.eye(3, dtype=DOUBLE) + 0.2 * torch.randn(3, 3, generator=torch.Generator().manual_seed(2), dtype=DOUBLE)
-    lam, mu = (float(x) for x in laws.lame(numbers()))
+    lam, mu = (float(x) for x in constitutive_models.lame(numbers()))
 
     def energy(f):
         v = torch.linalg.svdvals(f)
@@ -98,7 +98,7 @@ def test_small_strains_give_hookes_law():
     for law in (Elastic(), Plastic(), Sand()):
         pressed = [[-1e-5, 0, 0], [0, -1e-5, 0], [0, 0, -1.2e-5]]  # within all yield surfaces
         stress, _, _ = deformed(law, pressed)
-        lam, mu = (float(x) for x in laws.lame(numbers()))
+        lam, mu = (float(x) for x in constitutive_models.lame(numbers()))
         expected = [2 * mu * pressed[i][i] - lam * 3.2e-5 for i in range(3)]
         assert torch.allclose(torch.cat(stress[:3]), torch.tensor(expected, dtype=DOUBLE), rtol=1e-4)
 
@@ -220,7 +220,7 @@ def test_a_heap_below_its_angle_stays_and_one_far_above_slides_until_it_is():
     assert slope < most * (1 + 0.01 / 0.036 + 0.01 / 0.14)
 
 
-@pytest.mark.skipif(not symmetric.ready("cpu", DOUBLE), reason="there is no C++ compiler")
+@pytest.mark.skipif(not symmetric_tensors.ready("cpu", DOUBLE), reason="there is no C++ compiler")
 @pytest.mark.parametrize("function", [stretch, hencky, from_hencky])
 @pytest.mark.parametrize("size", [1e-6, 1e-2, 0.15, 0.5])
 def test_the_kernel_and_tensor_operations_agree_with_their_derivatives(function, size, monkeypatch):
@@ -230,12 +230,12 @@ def test_the_kernel_and_tensor_operations_agree_with_their_derivatives(function,
         root = size * torch.randn(40, 3, 3, generator=torch.Generator().manual_seed(1), dtype=DOUBLE)
         root[:4] = 0.0
         e = root + root.mT + root @ root.mT  # (I + root)(I + root)^T - I: no eigenvalue is below -1
-        x = torch.stack([e[:, i, j] for i, j in symmetric.PAIRS]).requires_grad_()
+        x = torch.stack([e[:, i, j] for i, j in symmetric_tensors.PAIRS]).requires_grad_()
         found = torch.stack(function(tuple(x)))
         return found.detach(), torch.autograd.grad((weight * found).sum(), x)[0]
 
     mine = both()
-    monkeypatch.setattr(symmetric, "ready", lambda *_: False)
+    monkeypatch.setattr(symmetric_tensors, "ready", lambda *_: False)
     for found, wanted in zip(mine, both(), strict=True):
         # Tensors that are nearly crushed magnify rounding by up to the square of their stretch.
         torch.testing.assert_close(found, wanted, rtol=1e-10, atol=1e-12 * size)

@@ -8,8 +8,9 @@ import pytest
 import torch
 from touching import F64, distances, line, trefoil, two
 
-from torchdlo.coupling import RodContact, nearby, rod_near
-from torchdlo.coupling.watch import survey
+from torchdlo.coupling import RodContact
+from torchdlo.coupling.common.step_diagnostics import survey
+from torchdlo.coupling.rod_contact import broad_phase, broad_phase_op
 from torchdlo.physics import tree
 from torchdlo.physics.effects.elastic import Bend
 from torchdlo.scene import Rope, check_state, hold, make, ok, step
@@ -19,8 +20,8 @@ from torchdlo.scene import Rope, check_state, hold, make, ok, step
 def way(request, monkeypatch):
     """Pairs are found by the kernel, or by tensor operations."""
     if request.param == "tensors":
-        monkeypatch.setattr(rod_near, "ready", lambda *_: False)
-    elif not rod_near.ready("cpu", F64):
+        monkeypatch.setattr(broad_phase_op, "ready", lambda *_: False)
+    elif not broad_phase_op.ready("cpu", F64):
         pytest.skip("there is no C++ compiler")
 
 
@@ -89,7 +90,7 @@ def test_both_ways_give_the_same_list(way, monkeypatch):
         [Rope(walk(150, 5), radius=0.005, density=1000.0)], [RodContact(room=2000, row=200)], check=False
     )
     few, _ = listed(scene, params, state)
-    monkeypatch.setattr(nearby, "FEW", 1)
+    monkeypatch.setattr(broad_phase, "FEW", 1)
     assert listed(scene, params, state)[0] == few and few[0]
 
 
@@ -141,7 +142,7 @@ def test_a_full_list_and_fast_vertices_are_reported(way):
 
 @pytest.mark.parametrize("dtype", [torch.float32, F64], ids=["float32", "float64"])
 @pytest.mark.parametrize("n", [60, 300], ids=["all pairs", "cells"])
-@pytest.mark.skipif(not rod_near.ready("cpu", F64), reason="there is no C++ compiler")
+@pytest.mark.skipif(not broad_phase_op.ready("cpu", F64), reason="there is no C++ compiler")
 def test_the_kernel_finds_what_tensor_operations_find(n, dtype, monkeypatch):
     # Three ropes, one of them a loop, in eleven scenes that move differently, one vertex held and carried away.
     g = torch.Generator().manual_seed(3)
@@ -165,7 +166,7 @@ def test_the_kernel_finds_what_tensor_operations_find(n, dtype, monkeypatch):
     for there in (True, False):
         with monkeypatch.context() as patch:
             if not there:
-                patch.setattr(rod_near, "ready", lambda *_: False)
+                patch.setattr(broad_phase_op, "ready", lambda *_: False)
             values = survey(scene, params, state, start, aimed).effects["rod_contact"]
             moved = state.rods.pos + 0.03 * torch.sin(torch.arange(3 * n, dtype=dtype)).reshape(n, 3)
             found.append((listed(scene, params, state), values["reach"], contact.shortfall(moved, values)))
@@ -181,7 +182,7 @@ def test_the_kernel_finds_what_tensor_operations_find(n, dtype, monkeypatch):
 
 def test_a_crowded_row_of_cells_is_reported(monkeypatch):
     # Of tensor operations only: the kernel has room for any number of edges in a row.
-    monkeypatch.setattr(rod_near, "ready", lambda *_: False)
+    monkeypatch.setattr(broad_phase_op, "ready", lambda *_: False)
     x = torch.stack([walk(300, 1)])
     scene, params, state = make([Rope(x, radius=0.005, density=1000.0)], [RodContact(room=20000, row=2)], check=False)
     assert listed(scene, params, state)[1] > 0

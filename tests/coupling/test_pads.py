@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 import torch
 
-from torchdlo.coupling.bodies import Solid
-from torchdlo.coupling.pads import FingerPads
+from torchdlo.coupling.bodies.dynamics import Solid
+from torchdlo.coupling.rod_body.finger_pads import FingerPads
 from torchdlo.physics import tree
 from torchdlo.physics.effects import EFFECTS
 from torchdlo.scene import Rope, hold, make, step
@@ -90,9 +90,9 @@ def test_gradients_by_force_and_friction_are_those_of_differences():
 
 def test_the_hand_takes_the_opposite_force():
     scene, params, state = hanging(2 * LIMIT)
-    from torchdlo.coupling import bodies as rigid
-    from torchdlo.physics import rod
-    from torchdlo.physics.effect import Motion
+    from torchdlo.coupling.bodies import dynamics as rigid
+    from torchdlo.physics.effects.base import Motion
+    from torchdlo.physics.rod import kinematics as rod
 
     pads, view = scene.effects[-1], rod.view(scene.topology, params.rods, state.rods, 1e-3)
     gone = 1e-4 * torch.randn(11, 3, generator=torch.Generator().manual_seed(0), dtype=F64)

@@ -6,7 +6,7 @@ import pytest
 import torch
 from touching import F64
 
-from torchdlo.coupling.pairs import corners, drop, pick
+from torchdlo.coupling.rod_contact.gather_scatter import corners, drop, pick
 
 
 def sample(batch: tuple[int, ...], v: int = 7, k: int = 5):

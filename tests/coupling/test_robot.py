@@ -9,9 +9,10 @@ import torch
 
 pytest.importorskip("pytorch_kinematics")
 
-from torchdlo.coupling import robot, urdf
+from torchdlo.coupling.robot import kinematics as robot
+from torchdlo.coupling.robot import urdf
 from torchdlo.errors import InputError
-from torchdlo.physics.rotation import rotate
+from torchdlo.physics.linalg.rotation import rotate
 
 F64 = torch.float64
 

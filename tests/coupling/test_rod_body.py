@@ -8,12 +8,14 @@ import pytest
 import torch
 from touching import F64, line, run
 
-from torchdlo.coupling import RodBody, body_sweeps, shapes
-from torchdlo.coupling.bodies import conjugate
+from torchdlo.coupling import RodBody
+from torchdlo.coupling.bodies import shape_sdf
+from torchdlo.coupling.bodies.dynamics import conjugate
+from torchdlo.coupling.rod_body import solver_op as body_sweeps
 from torchdlo.physics import tree
 from torchdlo.physics.effects.elastic import Bend
-from torchdlo.physics.effects.field import Damping, Gravity
-from torchdlo.physics.rotation import rotate
+from torchdlo.physics.effects.external import Damping, Gravity
+from torchdlo.physics.linalg.rotation import rotate
 from torchdlo.scene import Params, Rope, Scene, Solid, State, check_state, finite, hold, make, step
 
 G = 9.81
@@ -27,7 +29,7 @@ def gap(scene: Scene, params: Params, state: State, body: int = 0, parts: int = 
     f = torch.linspace(0, 1, parts, dtype=x.dtype)[:, None, None]
     points = (x[:-1] + f * (x[1:] - x[:-1])).reshape(-1, 3)
     local = rotate(conjugate(state.bodies.quat[body]), points - state.bodies.pos[body])
-    distance = shapes.distance(scene.bodies[body].shape, params.bodies.size[body : body + 1], local)
+    distance = shape_sdf.distance(scene.bodies[body].shape, params.bodies.size[body : body + 1], local)
     return float(distance.min()) / radius - 1
 
 

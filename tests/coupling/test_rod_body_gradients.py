@@ -9,7 +9,7 @@ from touching import F64, line
 from torchdlo.coupling import RodBody
 from torchdlo.physics import tree
 from torchdlo.physics.effects.elastic import Bend
-from torchdlo.physics.effects.field import Gravity
+from torchdlo.physics.effects.external import Gravity
 from torchdlo.scene import Rope, Solid, hold, make, ok, step
 
 AT = {

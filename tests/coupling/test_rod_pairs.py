@@ -11,11 +11,16 @@ import pytest
 import torch
 from touching import F64, line
 
-from torchdlo.coupling import RodContact, rod_near, rod_pairs
-from torchdlo.coupling.watch import survey
-from torchdlo.physics import effect, rod, traced, tree
-from torchdlo.physics.effect import Motion
+from torchdlo.coupling import RodContact
+from torchdlo.coupling.common.step_diagnostics import survey
+from torchdlo.coupling.rod_contact import broad_phase_op
+from torchdlo.coupling.rod_contact import solver_op as rod_pairs
+from torchdlo.physics import tree
+from torchdlo.physics.effects import base as effect
+from torchdlo.physics.effects.base import Motion
 from torchdlo.physics.effects.elastic import Bend
+from torchdlo.physics.execution import tracing
+from torchdlo.physics.rod import kinematics as rod
 from torchdlo.scene import Rope, hold, make, step
 
 COMPILER = os.environ.get("CXX") or shutil.which("g++") or shutil.which("clang++")
@@ -93,8 +98,8 @@ def by_tensors(monkeypatch, *words):
 
 def test_the_kernels_are_built_where_there_is_a_compiler():
     for dtype in (F64, torch.float32):
-        assert rod_pairs.ready("cpu", dtype) and rod_near.ready("cpu", dtype)
-    assert not rod_pairs.ready("cuda", F64) and not rod_near.ready("cpu", torch.float16)
+        assert rod_pairs.ready("cpu", dtype) and broad_phase_op.ready("cpu", dtype)
+    assert not rod_pairs.ready("cuda", F64) and not broad_phase_op.ready("cpu", torch.float16)
 
 
 @pytest.mark.parametrize("count", [1, 11, 100])
@@ -208,7 +213,7 @@ def test_recorded_steps_do_what_steps_do():
     def both(params, state, control):
         return step(scene, params, state, control)
 
-    recorded = traced.record(both, params, state, control)
+    recorded = tracing.record(both, params, state, control)
     with torch.no_grad():
         for _ in range(2):
             wanted, state = both(params, state, control), recorded(params, state, control)

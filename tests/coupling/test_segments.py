@@ -6,7 +6,7 @@ import pytest
 import torch
 from touching import F64, distances
 
-from torchdlo.coupling.segments import PULL, closest
+from torchdlo.coupling.rod_contact.closest_points import PULL, closest
 
 
 def apart(x: torch.Tensor) -> torch.Tensor:

@@ -8,7 +8,7 @@ import math
 import pytest
 import torch
 
-from torchdlo.coupling import shapes
+from torchdlo.coupling.bodies import shape_sdf
 
 F64 = torch.float64
 SIZES = {
@@ -79,7 +79,7 @@ def surface(shape: str) -> torch.Tensor:
         end = torch.tensor([math.cos(c / 2), side * math.sin(c / 2), 0], dtype=F64)
         ahead = torch.tensor([-math.sin(c / 2), side * math.cos(c / 2), 0], dtype=F64)
         points.append((ball + a * end)[ball @ ahead >= 0])
-    centre = float(shapes.ring_centre(size_of("ring")))
+    centre = float(shape_sdf.ring_centre(size_of("ring")))
     return torch.cat(points) - torch.tensor([centre, 0, 0], dtype=F64)
 
 
@@ -94,7 +94,7 @@ def test_distances_are_those_to_the_surface(shape):
     # flat, and samples are never nearer than the surface.
     p, s = places(400), surface(shape)
     brute = torch.cdist(p, s).amin(-1)
-    found = shapes.distance(shape, size_of(shape), p)[:, 0].abs()
+    found = shape_sdf.distance(shape, size_of(shape), p)[:, 0].abs()
     h = 0.03
     assert bool((brute > found - 1e-12).all())
     assert bool((brute < (found.square() + h * h / 2).sqrt() + 1e-12).all()), float((brute - found).max())
@@ -105,10 +105,10 @@ def test_normals_are_the_slope_of_the_distance_and_have_length_one(shape):
     # Central differences with h = 1e-6: 1e-16 / h from rounding, h^2 from curvature, h / (4 R) where it jumps (at the
     # ends of a capsule, R > 0.1), and nothing at kinks, where one point in a million lies within h.
     p, size, h = places(2000), size_of(shape), 1e-6
-    _, normal = shapes.probe(shape, size, p)
+    _, normal = shape_sdf.probe(shape, size, p)
     d = h * torch.eye(3, dtype=F64)
     slope = torch.cat(
-        [shapes.distance(shape, size, p + e) - shapes.distance(shape, size, p - e) for e in d], -1
+        [shape_sdf.distance(shape, size, p + e) - shape_sdf.distance(shape, size, p - e) for e in d], -1
     ) / (2 * h)  # fmt: skip
     assert float((slope - normal).abs().max()) < h / (4 * 0.1)
     assert float((normal.norm(dim=-1) - 1).abs().max()) < 1e-12
@@ -118,9 +118,9 @@ def test_normals_are_the_slope_of_the_distance_and_have_length_one(shape):
 def test_volume_centre_and_moments_are_those_of_the_inside(shape):
     # Random points, n of them in the solid: standard errors of shares of 1 / sqrt(n) at most; four of them are allowed.
     p = places(1_000_000)
-    inside = p[shapes.distance(shape, size_of(shape), p)[:, 0] < 0]
+    inside = p[shape_sdf.distance(shape, size_of(shape), p)[:, 0] < 0]
     tolerance = 4 / math.sqrt(len(inside))
-    volume, moments = shapes.bulk(shape, size_of(shape)[0])
+    volume, moments = shape_sdf.bulk(shape, size_of(shape)[0])
     assert len(inside) / len(p) * 1.6**3 == pytest.approx(float(volume), rel=tolerance)
     x2 = inside.square().mean(0)
     found = x2.sum() - x2
@@ -134,7 +134,7 @@ def test_volume_centre_and_moments_are_those_of_the_inside(shape):
 def test_derivatives_by_points_and_sizes_are_exact(shape):
     p = places(24, 3).requires_grad_()
     size = size_of(shape).requires_grad_()
-    assert torch.autograd.gradcheck(lambda p, s: shapes.probe(shape, s, p), (p, size), atol=1e-6)
+    assert torch.autograd.gradcheck(lambda p, s: shape_sdf.probe(shape, s, p), (p, size), atol=1e-6)
 
 
 @EACH
@@ -144,7 +144,7 @@ def test_degenerate_points_have_unit_normals_and_finite_derivatives(shape, dtype
     p = [[0, 0, 0], [0, 0, 0.1], [a, 0, 0], [0, 0, 0.75 * b], [a, 0, -b / 4], [a, b, c], [a, 0, b], [-a, 0, 0]]
     p = torch.tensor(p, dtype=dtype).requires_grad_()
     size = size_of(shape).to(dtype).requires_grad_()
-    distance, normal = shapes.probe(shape, size, p)
+    distance, normal = shape_sdf.probe(shape, size, p)
     assert float((normal.detach().norm(dim=-1) - 1).abs().max()) < 1e-6
     found = torch.autograd.grad(
         distance.sum() + (normal * normal.new_tensor([1, 2, 3])).sum(), (p, size), allow_unused=True
@@ -159,7 +159,7 @@ def test_a_grid_of_distances_is_interpolated_and_goes_on_beyond_its_border():
     grid = (torch.stack(torch.meshgrid(*axes, indexing="ij"), -1).norm(dim=-1) - 0.3).reshape(1, -1)
     p = places(2000)
     p = p[p.norm(dim=-1) > 0.15]
-    distance, normal = shapes.probe("mesh", half, p, grid, cells)
+    distance, normal = shape_sdf.probe("mesh", half, p, grid, cells)
     bound = 3 * 0.025**2 / (8 * 0.15)
     inside = (p.abs() < half).all(-1)
     exact = p.norm(dim=-1) - 0.3

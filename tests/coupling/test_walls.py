@@ -9,10 +9,10 @@ import pytest
 import torch
 from matter import DOUBLE
 
-from torchdlo.coupling import walls
-from torchdlo.coupling.particles import WALLS, Grid
+from torchdlo.coupling.mpm import grid_boundaries
+from torchdlo.coupling.mpm.particles import WALLS, Grid
 
-pytestmark = pytest.mark.skipif(not walls.ready("cpu", DOUBLE), reason="there is no C++ compiler")
+pytestmark = pytest.mark.skipif(not grid_boundaries.ready("cpu", DOUBLE), reason="there is no C++ compiler")
 
 FACES = [("separate",) * 6, *(tuple(random.Random(k).choices(WALLS, k=6)) for k in range(8))]
 
@@ -28,7 +28,7 @@ def shaken(faces, window):
 
 
 def bounded(grid, origin, vel, friction):
-    found = walls.walls(grid, origin, vel, friction)
+    found = grid_boundaries.walls(grid, origin, vel, friction)
     weight = torch.sin(torch.arange(found.numel(), dtype=DOUBLE)).reshape(found.shape)
     # Walls that hold matter along their normals only need no friction.
     by = torch.autograd.grad((weight * found).sum(), (vel, friction), allow_unused=True)
@@ -39,7 +39,7 @@ def bounded(grid, origin, vel, friction):
 def test_the_kernel_and_tensor_operations_agree_with_their_gradients(faces, window, monkeypatch):
     given = shaken(faces, window)
     found = bounded(*given)
-    monkeypatch.setattr(walls, "ready", lambda *_: False)
+    monkeypatch.setattr(grid_boundaries, "ready", lambda *_: False)
     for mine, theirs in zip(found, bounded(*given), strict=True):
         torch.testing.assert_close(mine, theirs, rtol=1e-12, atol=1e-12)
     assert float((found[0][..., :3] - given[2].detach()).abs().max()) > 0
@@ -49,5 +49,5 @@ def test_what_is_not_a_number_stays_so():
     grid, origin, vel, friction = shaken(("separate",) * 6, None)
     broken = vel.detach().clone()
     broken[1, 500] = torch.nan
-    found = walls.walls(grid, origin, broken, friction.detach())
+    found = grid_boundaries.walls(grid, origin, broken, friction.detach())
     assert bool(found[1, 500, :3].isnan().all()) and int(found.isnan().sum()) == 3

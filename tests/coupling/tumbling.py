@@ -8,10 +8,20 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchdlo.coupling.bodies import Body, BodyParams, BodyState, Solid, advance, conjugate, foresee, hold, place
-from torchdlo.coupling.body_contact import BodyContact, resolve
-from torchdlo.physics.effect import Push
-from torchdlo.physics.rotation import rotate
+from torchdlo.coupling.bodies.contact_effect import BodyContact, resolve
+from torchdlo.coupling.bodies.dynamics import (
+    Body,
+    BodyParams,
+    BodyState,
+    Solid,
+    advance,
+    conjugate,
+    foresee,
+    hold,
+    place,
+)
+from torchdlo.physics.effects.base import Push
+from torchdlo.physics.linalg.rotation import rotate
 
 F64 = torch.float64
 G = 9.81

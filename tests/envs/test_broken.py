@@ -9,7 +9,7 @@ import torch
 from test_contract import F64, prepared, small, ways
 
 from torchdlo import envs
-from torchdlo.envs import episode
+from torchdlo.envs.core import episode
 from torchdlo.physics import tree
 
 pytest.importorskip("torchrl")

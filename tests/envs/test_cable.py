@@ -12,14 +12,15 @@ import torch
 from test_contract import F64, small, ways
 
 from torchdlo import scene as scenes
-from torchdlo.agents.tasks import problem
-from torchdlo.describe import cable
-from torchdlo.envs import TASKS, Cable, episode, find
+from torchdlo.agents.trajopt.task_problem import problem
+from torchdlo.envs import TASKS, Cable, find
+from torchdlo.envs.core import episode
 from torchdlo.errors import InputError
-from torchdlo.sysid import library
-from torchdlo.sysid.model import RopeModel
-from torchdlo.sysid.recording import load_recording
-from torchdlo.sysid.saved import content
+from torchdlo.scene_files import cable
+from torchdlo.sysid.diagnosis import effect_library
+from torchdlo.sysid.model.model_file import content
+from torchdlo.sysid.model.rope_model import RopeModel
+from torchdlo.sysid.recordings.recording import load_recording
 
 SAMPLE = Path(__file__).parents[2] / "torchdlo" / "data" / "sample_rope"
 STRONG = {
@@ -77,7 +78,7 @@ def test_a_rope_of_a_model_file_is_that_of_the_task(tmp_path: Path) -> None:
     assert find("separation").start(1)[2].rods.pos.double().sub(state.rods.pos).abs().max() < 1e-6
 
 
-@pytest.mark.parametrize("effect", library.LIBRARY)
+@pytest.mark.parametrize("effect", effect_library.LIBRARY)
 def test_effects_of_a_model_act_in_tasks(tmp_path: Path, effect: str) -> None:
     rope = cable(write(tmp_path / "model.json", (effect,)))
     plain = dataclasses.replace(rope, effects=())

@@ -9,8 +9,9 @@ import pytest
 import torch
 
 from torchdlo import scene as scenes
-from torchdlo.envs import TASKS, episode
-from torchdlo.envs.task import combined
+from torchdlo.envs import TASKS
+from torchdlo.envs.core import episode
+from torchdlo.envs.core.task import combined
 from torchdlo.physics import tree
 
 F64 = torch.float64

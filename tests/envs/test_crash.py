@@ -8,9 +8,9 @@ import pytest
 import torch
 
 from torchdlo import scene as scenes
-from torchdlo.coupling.bodies import Solid
-from torchdlo.coupling.rod_body import RodBody
-from torchdlo.envs.crash import broken, inside
+from torchdlo.coupling.bodies.dynamics import Solid
+from torchdlo.coupling.rod_body.effect import RodBody
+from torchdlo.envs.core.divergence import broken, inside
 from torchdlo.physics import tree
 from torchdlo.physics.effects.material import AxialStiffness
 

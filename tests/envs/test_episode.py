@@ -11,12 +11,13 @@ import torch
 from test_contract import F64, prepared, small, ways
 
 from torchdlo import scene as scenes
-from torchdlo.coupling.bodies import turn_by
-from torchdlo.coupling.robot import tool_pose
-from torchdlo.envs import TASKS, episode
-from torchdlo.envs.task import RADIUS, Arms, Seen, Task, make, straight, through
+from torchdlo.coupling.bodies.dynamics import turn_by
+from torchdlo.coupling.robot.kinematics import tool_pose
+from torchdlo.envs import TASKS
+from torchdlo.envs.core import episode
+from torchdlo.envs.core.task import RADIUS, Arms, Seen, Task, make, straight, through
 from torchdlo.physics import tree
-from torchdlo.physics.rotation import multiply
+from torchdlo.physics.linalg.rotation import multiply
 from torchdlo.scene import Rope
 
 

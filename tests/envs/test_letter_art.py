@@ -8,14 +8,14 @@ import pytest
 import torch
 
 from torchdlo import scene as scenes
-from torchdlo.coupling.bodies import Solid
+from torchdlo.coupling.bodies.dynamics import Solid
 from torchdlo.envs import TASKS
-from torchdlo.envs import letter_art as letters
-from torchdlo.envs.task import RADIUS, make
+from torchdlo.envs.core.task import RADIUS, make
+from torchdlo.envs.tasks import letter_art as letters
 from torchdlo.physics import tree
 from torchdlo.physics.effects.elastic import BendFrame
 from torchdlo.physics.effects.material import BendingPlasticity
-from torchdlo.physics.traced import record
+from torchdlo.physics.execution.tracing import record
 from torchdlo.scene import Rope
 
 HALF = 5

@@ -6,7 +6,7 @@ import json
 
 from typer.testing import CliRunner
 
-from torchdlo.cli import app
+from torchdlo.cli.app import app
 from torchdlo.envs import TASKS
 
 

@@ -10,12 +10,13 @@ import pytest
 import torch
 
 from torchdlo import scene as scenes
-from torchdlo.coupling.grasp import Hands
-from torchdlo.envs import TASKS, episode, geometry
-from torchdlo.envs.gathering import Rehearsal
-from torchdlo.envs.task import Task, through
+from torchdlo.coupling.robot.attachment import Hands
+from torchdlo.envs import TASKS
+from torchdlo.envs.core import curve_geometry, episode
+from torchdlo.envs.core.task import Task, through
+from torchdlo.envs.tasks.gathering import Rehearsal
 from torchdlo.physics import tree
-from torchdlo.physics.traced import record
+from torchdlo.physics.execution.tracing import record
 
 LED = [name for name in TASKS if TASKS[name]().waypoints()]
 TURNED = math.radians(45)
@@ -123,7 +124,7 @@ def test_the_way_by_hand_takes_an_end_out_of_the_knot() -> None:
     # After 32 actions the first hand is beyond the second strand; then what is left has crossings, but no knot.
     found = led(TASKS["unknotting"](), 32)
     assert not found.failed.any()
-    assert (geometry.determinant(found.world.state.rods.pos) == 1).all()
+    assert (curve_geometry.determinant(found.world.state.rods.pos) == 1).all()
 
 
 def test_the_way_by_hand_shoots_the_ball_at_the_cube() -> None:

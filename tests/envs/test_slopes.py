@@ -8,8 +8,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from torchdlo.envs import TASKS, episode
-from torchdlo.envs.task import Task
+from torchdlo.envs import TASKS
+from torchdlo.envs.core import episode
+from torchdlo.envs.core.task import Task
 from torchdlo.physics import tree
 
 pytestmark = pytest.mark.slow

@@ -9,9 +9,10 @@ from typing import ClassVar
 import pytest
 import torch
 
-from torchdlo.envs import TASKS, episode
-from torchdlo.envs.stages import ARCH, Schedule
-from torchdlo.envs.task import RADIUS, Arms, Stage, Task, make, straight
+from torchdlo.envs import TASKS
+from torchdlo.envs.core import episode
+from torchdlo.envs.core.stages import ARCH, Schedule
+from torchdlo.envs.core.task import RADIUS, Arms, Stage, Task, make, straight
 from torchdlo.errors import InputError
 from torchdlo.physics import tree
 from torchdlo.scene import Rope

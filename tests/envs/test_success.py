@@ -9,13 +9,14 @@ import math
 import pytest
 import torch
 
-from torchdlo.coupling.pose import Pose
-from torchdlo.envs import TASKS, geometry
-from torchdlo.envs import letter_art as letters
-from torchdlo.envs import wiring_post as wiring
-from torchdlo.envs.lifting import into
-from torchdlo.envs.solids import c_ring
-from torchdlo.envs.task import Seen, Task, even, straight
+from torchdlo.coupling.common.pose import Pose
+from torchdlo.envs import TASKS
+from torchdlo.envs.assets.rigid_objects import c_ring
+from torchdlo.envs.core import curve_geometry
+from torchdlo.envs.core.task import Seen, Task, even, straight
+from torchdlo.envs.tasks import letter_art as letters
+from torchdlo.envs.tasks import wiring_post as wiring
+from torchdlo.envs.tasks.lifting import into
 from torchdlo.physics import tree
 
 F64 = torch.float64
@@ -312,7 +313,7 @@ def test_letters_are_taken_in_their_places():
 def test_letters_are_rounded_where_posts_are():
     for corners, goal, count in zip(letters.CORNERS, letters.goals(), letters.COUNTS, strict=True):
         _, centres = letters.rounded(corners)
-        dense = geometry.distances(centres, letters.rounded(corners)[0])
+        dense = curve_geometry.distances(centres, letters.rounded(corners)[0])
         for away in dense:
             # A circle of that radius about the post touches the curve from within.
             assert float(away.min()) == pytest.approx(letters.ROUND, rel=1e-9)

@@ -9,8 +9,9 @@ import torch
 from test_contract import F64, prepared, small
 
 from torchdlo import envs
-from torchdlo.envs import TASKS, episode, find
-from torchdlo.envs.task import Arms, combined
+from torchdlo.envs import TASKS, find
+from torchdlo.envs.core import episode
+from torchdlo.envs.core.task import Arms, combined
 from torchdlo.errors import InputError
 
 ONE = ((0.0, -0.5, 0.0),)
@@ -39,7 +40,7 @@ def test_arms_that_are_not_one_entry_each_are_refused(given: dict[str, Any], wor
 
 
 def test_what_is_no_cable_is_refused() -> None:
-    words = r"rope: it is 'model.json'; expected a torchdlo.envs.Cable; torchdlo.describe.cable\(path\) makes one"
+    words = r"rope: it is 'model.json'; expected a torchdlo.envs.Cable; torchdlo.scene_files.cable\(path\) makes one"
     for make in (lambda: envs.make("coiling", rope="model.json"), lambda: find("coiling", "model.json")):
         with pytest.raises(InputError, match=words):
             make()

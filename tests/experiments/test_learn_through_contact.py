@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from torchdlo import describe
+from torchdlo import scene_files
 
 EXPERIMENTS = Path(__file__).parents[2] / "experiments"
 
@@ -29,7 +29,7 @@ def test_keys_are_commanded_as_the_scene_file_says(problems, name):
     first = problems.first_keys(problem.scene())
     keys = first + 0.1 * torch.tensor(problem.free) * torch.randn(first.shape, generator=generator, dtype=first.dtype)
     d = problems.described(problem, keys)
-    made = describe.assemble(d)
+    made = scene_files.assemble(d)
     found, expected = problems.controls(d, made, keys), made.plan.controls
     assert torch.allclose(found.pos, expected.pos, atol=1e-14)
     for part in ("pos", "quat"):

@@ -9,10 +9,12 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from torchdlo.physics import effect, rod, tree
+from torchdlo.physics import tree
 from torchdlo.physics.effects import EFFECTS
+from torchdlo.physics.effects import base as effect
 from torchdlo.physics.effects.elastic import Bend, BendFrame, Stretch, Twist
-from torchdlo.physics.topology import preceding
+from torchdlo.physics.rod import kinematics as rod
+from torchdlo.physics.rod.topology import preceding
 from torchdlo.scene import Control, Params, Scene, State, hold, step
 
 F64 = torch.float64

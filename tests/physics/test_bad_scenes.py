@@ -10,8 +10,8 @@ import torch
 from helpers import circle, effects, run, straight, vec
 
 from torchdlo.physics import tree
-from torchdlo.physics.effects.field import Gravity
-from torchdlo.physics.topology import Topology
+from torchdlo.physics.effects.external import Gravity
+from torchdlo.physics.rod.topology import Topology
 from torchdlo.scene import Control, Params, Rope, Scene, finite, hold, limits, make, rollout, step
 
 X = straight(6)

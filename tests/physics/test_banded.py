@@ -6,7 +6,7 @@ import pytest
 import torch
 from helpers import F64
 
-from torchdlo.physics import banded
+from torchdlo.physics.linalg import banded
 
 
 @pytest.mark.parametrize("batch", [1, 3, 8, 19])

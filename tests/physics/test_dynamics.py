@@ -10,7 +10,8 @@ import pytest
 import torch
 from helpers import F64, effects, run, straight, vec
 
-from torchdlo.physics import rotation, tree
+from torchdlo.physics import tree
+from torchdlo.physics.linalg import rotation
 from torchdlo.scene import Control, Rope, make
 
 G = 9.81

@@ -8,11 +8,13 @@ import pytest
 import torch
 from helpers import F64, effects, rand, run, straight, vec, view, wild
 
-from torchdlo.physics import effect, rod, tree
+from torchdlo.physics import tree
 from torchdlo.physics.effects import EFFECTS
-from torchdlo.physics.effects.grip import GripperCompliance
-from torchdlo.physics.integrate import _twist_matrix
-from torchdlo.physics.topology import preceding
+from torchdlo.physics.effects import base as effect
+from torchdlo.physics.effects.gripper_compliance import GripperCompliance
+from torchdlo.physics.integrators.rod_step import _twist_matrix
+from torchdlo.physics.rod import kinematics as rod
+from torchdlo.physics.rod.topology import preceding
 from torchdlo.scene import Control, Rope, hold, make, step, stepper
 
 H, G = 0.1, 9.81

@@ -8,8 +8,9 @@ import pytest
 import torch
 from helpers import ELASTIC, F64, circle, effects, energy, loads, rand, straight, vec, view, wild
 
-from torchdlo.physics import rotation, tree
+from torchdlo.physics import tree
 from torchdlo.physics.effects.elastic import Bend, BendFrame, Stretch, Twist, curvature
+from torchdlo.physics.linalg import rotation
 from torchdlo.scene import Rope, hold, make, step
 
 

@@ -6,10 +6,11 @@ import pytest
 import torch
 
 from torchdlo import scene as scenes
-from torchdlo.physics import banded, tree
+from torchdlo.physics import tree
 from torchdlo.physics.effects.elastic import Bend, BendFrame, Twist
-from torchdlo.physics.effects.field import AirDrag, Damping, Gravity
+from torchdlo.physics.effects.external import AirDrag, Damping, Gravity
 from torchdlo.physics.effects.table import Table, TableFriction
+from torchdlo.physics.linalg import banded
 
 pytestmark = [pytest.mark.gpu, pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")]
 

@@ -10,9 +10,10 @@ import pytest
 import torch
 from helpers import F64, circle, rand, vec, wild
 
-from torchdlo.physics import replay, tree
+from torchdlo.physics import tree
 from torchdlo.physics.effects import EFFECTS
-from torchdlo.physics.effects.grip import GripperCompliance
+from torchdlo.physics.effects.gripper_compliance import GripperCompliance
+from torchdlo.physics.execution import replay
 from torchdlo.scene import Control, Rope, hold, make, rollout, step, stepper
 
 STEPS = 200

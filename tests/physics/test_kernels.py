@@ -6,7 +6,9 @@ import pytest
 import torch
 from helpers import F64, circle, effects, run, straight, vec, wild
 
-from torchdlo.physics import lanes, traced, tree
+from torchdlo.physics import tree
+from torchdlo.physics.execution import tracing
+from torchdlo.physics.kernels import lanes
 from torchdlo.scene import Rope, hold, make, step
 
 GIVEN = {"mass": 0.1, "bend": 1e-3, "twist": 1e-3, "radius": 0.01}
@@ -154,6 +156,6 @@ def test_they_are_used_in_recorded_steps_only(monkeypatch):
     with torch.no_grad():
         plain = step(scene, params, state, control)
     assert not used
-    fast = traced.record(lambda *given: step(scene, *given), params, state, control)(params, state, control)
+    fast = tracing.record(lambda *given: step(scene, *given), params, state, control)(params, state, control)
     assert {"look", "bend", "balance"} <= set(used)
     torch.testing.assert_close(fast.rods.pos, plain.rods.pos, rtol=0, atol=1e-14)

@@ -9,7 +9,7 @@ import pytest
 import torch
 from helpers import F64, rand, vec
 
-from torchdlo.physics.effects.measure import MarkerOffset, TimeDelay, Track, interpolate
+from torchdlo.physics.effects.measurement import MarkerOffset, TimeDelay, Track, interpolate
 
 
 def recorded(count: int = 12, dt: float = 0.01, motion=None, batch: tuple[int, ...] = ()) -> Track:

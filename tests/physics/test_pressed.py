@@ -8,7 +8,7 @@ from helpers import F64, straight
 
 from torchdlo.physics import tree
 from torchdlo.physics.effects.elastic import Bend
-from torchdlo.physics.effects.field import Damping, Gravity
+from torchdlo.physics.effects.external import Damping, Gravity
 from torchdlo.scene import Rope, check_state, hold, make, ok, step
 
 LENGTH, SPEED = 0.5, 0.5

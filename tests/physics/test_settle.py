@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import torch
 
-from torchdlo.physics.constrain import Lengths, settle
-from torchdlo.physics.topology import Topology
+from torchdlo.physics.constraints.edge_lengths import Lengths, settle
+from torchdlo.physics.rod.topology import Topology
 
 
 def test_edges_that_are_far_too_short_get_their_lengths() -> None:

@@ -14,8 +14,8 @@ import pytest
 import torch
 from helpers import F64, effects, run
 
-from torchdlo.physics.effect import Effect, Param, Values
-from torchdlo.physics.rod import View
+from torchdlo.physics.effects.base import Effect, Param, Values
+from torchdlo.physics.rod.kinematics import View
 from torchdlo.scene import Rope, make
 
 G, ROUND, HARD, DT, EDGES = 9.81, 0.06, 800.0, 5e-4, 120

@@ -8,7 +8,7 @@ from helpers import F64
 
 from torchdlo.physics import tree
 from torchdlo.physics.effects.elastic import Bend
-from torchdlo.physics.effects.field import Damping, Gravity
+from torchdlo.physics.effects.external import Damping, Gravity
 from torchdlo.scene import Rope, hold, make, step
 
 LENGTH, FRAMES = 0.25, 50

@@ -7,8 +7,9 @@ import pytest
 import torch
 
 from torchdlo import scene as scenes
-from torchdlo.physics import traced, tree
+from torchdlo.physics import tree
 from torchdlo.physics.effects import EFFECTS
+from torchdlo.physics.execution import tracing
 
 
 def _rope(batch=2, vertices=8):
@@ -22,7 +23,7 @@ def test_a_recorded_step_does_what_the_step_does_with_other_numbers_too():
     scene, params, state = _rope()
     step = scenes.stepper(scene, compiled=False)
     control = scenes.hold(scene, state)
-    recorded = traced.record(step, params, state, control)
+    recorded = tracing.record(step, params, state, control)
     stiffer = tree.replace(params, rods=tree.map(lambda x: 1.5 * x, params.rods))
     for numbers in (params, stiffer):
         a = b = state
@@ -41,7 +42,7 @@ def test_recordings_are_found_again_by_key_and_shapes_and_the_oldest_goes():
         calls.append(x.shape)
         return (2 * x,)
 
-    known, x = traced.Recordings(2), torch.ones(3)
+    known, x = tracing.Recordings(2), torch.ones(3)
     first = known.find("double", step, x)
     assert known.find("double", step, 5 * x) is first and len(calls) == 1
     assert torch.equal(first(5 * x)[0], 10 * x)
@@ -62,7 +63,7 @@ def test_recordings_that_are_let_go_free_their_memory():
         return (x,)
 
     def use():
-        recorded = traced.record(step, torch.zeros(3))
+        recorded = tracing.record(step, torch.zeros(3))
         for _ in range(3):
             recorded(torch.zeros(3))
 
@@ -81,7 +82,7 @@ def test_steps_are_recorded_at_first_use_without_gradients_and_run_as_they_are_w
         calls.append(None)
         return (factor * x,)
 
-    recorded = traced.Recorded(step)
+    recorded = tracing.Recorded(step)
     factor, x = torch.tensor(2.0), torch.ones(3)
     for _ in range(3):
         assert torch.equal(recorded(factor, x)[0], 2 * x)
@@ -103,7 +104,7 @@ def test_a_step_that_cannot_be_recorded_runs_as_it_is():
             raise RuntimeError("the recorder does not know this operation")
         return (2 * x,)
 
-    recorded, x = traced.Recorded(step), torch.ones(3)
+    recorded, x = tracing.Recorded(step), torch.ones(3)
     for _ in range(2):
         assert torch.equal(recorded(x)[0], 2 * x)
     assert len(calls) == 3

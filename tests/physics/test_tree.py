@@ -9,7 +9,8 @@ import torch
 import torch.utils._pytree as pytree
 from helpers import circle, effects, straight, vec, wild
 
-from torchdlo.physics import rod, tree
+from torchdlo.physics import tree
+from torchdlo.physics.rod import kinematics as rod
 from torchdlo.scene import Rope, make
 
 

@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 
 from torchdlo.physics.effects import EFFECTS
-from torchdlo.sysid import floor as floors
-from torchdlo.sysid.fit import Point, Space
-from torchdlo.sysid.floor import Floor
-from torchdlo.sysid.jobs import Fitted
-from torchdlo.sysid.library import PARAMETERS
-from torchdlo.sysid.recording import Recording
-from torchdlo.sysid.verdict import Candidate, Diagnosis
+from torchdlo.sysid.diagnosis import error_floor as floors
+from torchdlo.sysid.diagnosis.effect_library import PARAMETERS
+from torchdlo.sysid.diagnosis.error_floor import Floor
+from torchdlo.sysid.diagnosis.verdict import Candidate, Diagnosis
+from torchdlo.sysid.estimation.jobs import Fitted
+from torchdlo.sysid.estimation.levenberg_marquardt import Point, Space
+from torchdlo.sysid.recordings.recording import Recording
 
 BASELINE = {"bending_stiffness": 2e-3, "twisting_stiffness": 1.5e-3, "damping_rate": 0.8}
 

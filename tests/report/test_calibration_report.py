@@ -13,8 +13,8 @@ import pytest
 
 from tests.fake_calibration import fake_result
 from torchdlo.report import write_report
-from torchdlo.report.calibration import calibration_html, verdict
-from torchdlo.report.figure import calibration_png
+from torchdlo.report.figures.calibration_figure import calibration_png
+from torchdlo.report.pages.calibration import calibration_html, verdict
 from torchdlo.sysid import Recording, load_recording
 
 

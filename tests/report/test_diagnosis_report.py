@@ -17,11 +17,11 @@ from matplotlib.image import imread
 from tests.report import browser
 from tests.report.fake_diagnosis import fake_diagnosis
 from tests.sysid.swaying import recording as swaying
-from torchdlo.report.chart import bars, scale
-from torchdlo.report.diagnosis import diagnosis_html, write_report
-from torchdlo.sysid.floor import Floor
-from torchdlo.sysid.health import Fault
-from torchdlo.sysid.recording import Recording
+from torchdlo.report.figures.chart import bars, scale
+from torchdlo.report.pages.diagnosis import diagnosis_html, write_report
+from torchdlo.sysid.diagnosis.error_floor import Floor
+from torchdlo.sysid.recordings.data_quality import Fault
+from torchdlo.sysid.recordings.recording import Recording
 
 
 @pytest.fixture(scope="module")

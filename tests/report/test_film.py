@@ -15,10 +15,11 @@ sys.path.append(str(Path(__file__).parents[1] / "agents"))
 from test_render import enclosed
 from test_tasks import Lead
 
-from torchdlo.coupling.robot import panda, tool_pose
-from torchdlo.envs import episode, find
-from torchdlo.report.episode import film, outcome_of, surfaces
-from torchdlo.report.surfaces import extent, pieces
+from torchdlo.coupling.robot.kinematics import panda, tool_pose
+from torchdlo.envs import find
+from torchdlo.envs.core import episode
+from torchdlo.report.render.episode_film import film, outcome_of, surfaces
+from torchdlo.report.render.surfaces import extent, pieces
 
 
 @pytest.fixture(scope="module")
@@ -64,12 +65,12 @@ def test_arms_are_drawn_where_their_joints_bring_them(made):
 @pytest.mark.parametrize(("name", "shape"), [("gathering", "pebble"), ("lifting", "c_ring")])
 def test_bodies_on_grids_are_drawn_with_their_volume(name, shape):
     pytest.importorskip("pyvista", reason="surfaces need the extra view")
-    from torchdlo.envs import solids
+    from torchdlo.envs.assets import rigid_objects
 
     scene, params, _ = find(name).start(1)
     found = surfaces(scene, params)
     assert set(found) == {k for k, body in enumerate(scene.bodies) if body.shape == "mesh"}
-    wanted = getattr(solids, shape)()
+    wanted = getattr(rigid_objects, shape)()
     for corners, faces in found.values():
         volume, centre = enclosed(corners.numpy(), faces.numpy())
         # Outwards, and on a grid of 4 mm.

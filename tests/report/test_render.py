@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 import torch
 
-from torchdlo.coupling import shapes
-from torchdlo.describe import Body, Box, Description, Hold, Key, Matter, Rope, Weight
+from torchdlo.coupling.bodies import shape_sdf
 from torchdlo.errors import InputError
-from torchdlo.report import surfaces
-from torchdlo.run import run
+from torchdlo.report.render import surfaces
+from torchdlo.scene_files import Body, Box, Description, Hold, Key, Matter, Rope, Weight
+from torchdlo.scene_files.run import run
 
 SIZES = {
     "sphere": (0.3,),
@@ -41,7 +41,7 @@ def test_surfaces_enclose_the_volume_of_the_solid_about_its_centre_of_mass(shape
     size = np.ones(3)
     size[: len(SIZES[shape])] = SIZES[shape]
     volume, centre = enclosed(*surfaces._solid(shape, size, 1.0))
-    wanted = float(shapes.bulk(shape, torch.as_tensor(size))[0])
+    wanted = float(shape_sdf.bulk(shape, torch.as_tensor(size))[0])
     # A polygon of n corners in a circle lacks 1 - sin(2 pi / n) n / (2 pi) of its area. Rings have 16 corners round the
     # tube, other shapes 24 along an arc at least.
     corners = 16 if shape == "ring" else 24
@@ -87,7 +87,7 @@ def drawing():
     pytest.importorskip("pyvista", reason="pictures need the extra view")
     if not any(map(ctypes.util.find_library, ("EGL", "OSMesa"))) and not os.environ.get("DISPLAY"):
         pytest.skip("pictures need libEGL, libOSMesa or a display")
-    from torchdlo.report import render
+    from torchdlo.report.render import picture as render
 
     return render
 
@@ -146,7 +146,7 @@ def test_stills_stand_side_by_side(drawing):
 
 def test_a_video_has_a_picture_for_every_thirtieth_of_a_second(drawing, tmp_path):
     av = pytest.importorskip("av", reason="videos need the extra view")
-    from torchdlo.report import video
+    from torchdlo.report.render import video
 
     frames = run(scene(effects={"gravity": {}, "bend": {}}, holds=(Hold((0,)),), duration=0.1))
     seen = []
@@ -168,7 +168,7 @@ def test_a_video_has_a_picture_for_every_thirtieth_of_a_second(drawing, tmp_path
 
 def test_a_video_that_is_stopped_leaves_nothing(drawing, tmp_path):
     pytest.importorskip("av", reason="videos need the extra view")
-    from torchdlo.report import video
+    from torchdlo.report.render import video
 
     def stop(*_):
         raise KeyboardInterrupt
@@ -182,7 +182,9 @@ def test_a_video_that_is_stopped_leaves_nothing(drawing, tmp_path):
 
 @pytest.mark.parametrize(("name", "what"), [("pyvista", "pictures"), ("av", "videos"), ("viser", "viewer")])
 def test_a_missing_package_is_named(name, what, monkeypatch, tmp_path):
-    from torchdlo.report import render, video, view
+    from torchdlo.report.render import picture as render
+    from torchdlo.report.render import video
+    from torchdlo.report.viewer import server as view
 
     monkeypatch.setitem(sys.modules, name, None)
     calls = {"pyvista": render.check_renderer, "av": lambda: video.check_video(tmp_path / "a"), "viser": view._viser}

@@ -8,11 +8,11 @@ import urllib.request
 import numpy as np
 import pytest
 
-from torchdlo.describe import Body, Box, Description, Hold, Key, Matter, Rope
-from torchdlo.run import run
+from torchdlo.scene_files import Body, Box, Description, Hold, Key, Matter, Rope
+from torchdlo.scene_files.run import run
 
 pytest.importorskip("viser", reason="the viewer needs the extra view")
-from torchdlo.report.view import Viewer
+from torchdlo.report.viewer.server import Viewer
 
 
 @pytest.fixture(scope="module")
@@ -79,9 +79,9 @@ def test_it_plays_from_where_it_is_starts_again_at_the_end_and_pauses(viewer):
 
 
 def test_the_command_serves_a_run_until_ctrl_c(tmp_path, monkeypatch, viewer):
-    from torchdlo import commands
-    from torchdlo.report import view
-    from torchdlo.run import save_frames
+    from torchdlo.cli import commands
+    from torchdlo.report.viewer import server as view
+    from torchdlo.scene_files.run import save_frames
 
     save_frames(viewer.frames, tmp_path / "frames.npz", Description((), {}))
     seen = []

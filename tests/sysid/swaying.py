@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from torchdlo.sysid.recording import Recording, Trial
+from torchdlo.sysid.recordings.recording import Recording, Trial
 
 LENGTH = 0.9
 NOISE = 3e-4

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from torchdlo import cli
+from torchdlo.cli import app
 from torchdlo.errors import InputError
 from torchdlo.sysid import load_recording
 
@@ -327,7 +327,7 @@ def test_command_says_one_line_and_writes_nothing(
     monkeypatch.chdir(work)
     before = {path: path.stat().st_mtime_ns for path in folder.iterdir()}
     with pytest.raises(SystemExit) as caught:
-        cli.main([command, str(folder)])
+        app.main([command, str(folder)])
     said = capsys.readouterr()
     assert caught.value.code == 2
     assert said.out == ""

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from torchdlo.sysid import Recording, load_recording
-from torchdlo.sysid.baselines import BASELINES, catenary, frozen_shape, hang
-from torchdlo.sysid.metrics import average, mean_absolute_error
+from torchdlo.sysid.recordings.metrics import average, mean_absolute_error
+from torchdlo.sysid.recordings.trivial_predictors import BASELINES, catenary, frozen_shape, hang
 
 DOWN = np.array([0.0, 0.0, -1.0])
 

@@ -9,13 +9,14 @@ import numpy as np
 import pytest
 
 from torchdlo.errors import InputError
-from torchdlo.physics.effect import Param
-from torchdlo.sysid import fit, start
-from torchdlo.sysid.calibrate import calibrate
-from torchdlo.sysid.library import PARAMETERS
-from torchdlo.sysid.model import RopeModel
-from torchdlo.sysid.motion import Start
-from torchdlo.sysid.recording import Recording, Trial, load_recording
+from torchdlo.physics.effects.base import Param
+from torchdlo.sysid.calibration.calibrate import calibrate
+from torchdlo.sysid.diagnosis.effect_library import PARAMETERS
+from torchdlo.sysid.estimation import levenberg_marquardt
+from torchdlo.sysid.model import initial_state
+from torchdlo.sysid.model.rope_model import RopeModel
+from torchdlo.sysid.model.trial_batch import Start
+from torchdlo.sysid.recordings.recording import Recording, Trial, load_recording
 
 SAMPLE = Path(__file__).parents[2] / "torchdlo" / "data" / "sample_rope"
 TRUE = np.array([2e-3, 1.2e-3, 0.8])  # bending, twisting stiffness [N m^2], damping rate [1/s]
@@ -45,7 +46,7 @@ def make_recording(path: Path, *, ends: int = 2, seed: int = 0, noise: float = 0
     )
     model = RopeModel(empty, vertices=OPTIONS["vertices"])
     motion = model.motion(trials)
-    begin = start.read_off(trials)
+    begin = initial_state.read_off(trials)
     sims = model.simulate(motion, Start(begin.pos, 0 * begin.vel), TRUE[None])[0] + noise * rng.normal(
         size=motion.markers.shape
     )
@@ -137,7 +138,7 @@ def test_a_trial_that_starts_with_a_mistracked_marker_is_simulated(tmp_path: Pat
     jumped = trial.markers.copy()
     jumped[:6, 3] += [0.05, 0.0, 0.08]  # its edges are tens of per cent longer than the rope's
     model = RopeModel(recording, vertices=13)
-    first = start.read_off([replace(trial, markers=jumped)])
+    first = initial_state.read_off([replace(trial, markers=jumped)])
     sim = model.simulate(model.motion([trial]), first, TRUE[None])[0, 0]
     edges = np.linalg.norm(np.diff(sim, axis=1), axis=-1)[:, 1:-1]  # the others are between gripped markers
     assert (edges <= np.diff(trial.marker_arclength)[1:-1] * (1 + 1e-3)).all()
@@ -146,7 +147,7 @@ def test_a_trial_that_starts_with_a_mistracked_marker_is_simulated(tmp_path: Pat
 def test_as_many_parameter_sets_as_vertices_are_still_one_per_scene(tmp_path: Path) -> None:
     recording = make_recording(tmp_path)
     model = RopeModel(recording, vertices=13)
-    motion, begin = model.motion(recording.train[:1]), start.read_off(recording.train[:1])
+    motion, begin = model.motion(recording.train[:1]), initial_state.read_off(recording.train[:1])
     many = TRUE * np.linspace(0.5, 2.0, len(model.arclength))[:, None]
     together = model.simulate(motion, begin, many, frames=8)
     np.testing.assert_allclose(together[[3]], model.simulate(motion, begin, many[[3]], frames=8), atol=1e-7)
@@ -158,8 +159,8 @@ def test_a_trial_that_fails_costs_much_and_not_everything() -> None:
     sims = measured + np.zeros((4, 1, 1, 1, 1))
     sims[1, 1], sims[2, 1, 3:] = np.nan, 1e3
     sims[3] = np.inf
-    costs = fit.costs(sims, measured)
-    assert costs[0] == 0.0 and costs[1] == pytest.approx(0.5 * fit._LOST) and np.isinf(costs[3])
+    costs = levenberg_marquardt.costs(sims, measured)
+    assert costs[0] == 0.0 and costs[1] == pytest.approx(0.5 * levenberg_marquardt._LOST) and np.isinf(costs[3])
     assert costs[2] == pytest.approx(0.5)  # as much as the markers move
 
 
@@ -169,7 +170,7 @@ def test_trials_that_go_astray_tell_nothing_about_slopes(far: float) -> None:
     time = np.linspace(0.0, 1.0, 5)[:, None, None] * np.ones((1, 4, 3))
     measured = np.stack([0.5 * time, time])
     params = (Param(1.0, -9.0, 9.0, "m/s", "linear", None, ""), Param(0.0, -9.0, 9.0, "m", "linear", None, ""))
-    space = fit.Space(("a", "b"), params, (0.1, 0.1))
+    space = levenberg_marquardt.Space(("a", "b"), params, (0.1, 0.1))
 
     def simulate(values: np.ndarray) -> np.ndarray:
         a, b = (values[:, k, None, None, None, None] for k in (0, 1))
@@ -177,7 +178,7 @@ def test_trials_that_go_astray_tell_nothing_about_slopes(far: float) -> None:
         sims[np.abs(values[:, 0] - 1.0) > 1e-9, 1, 3:] = far
         return sims
 
-    (point,) = fit.evaluate(simulate, measured, space, np.array([[10.0, 0.0]]))
+    (point,) = levenberg_marquardt.evaluate(simulate, measured, space, np.array([[10.0, 0.0]]))
     assert point.cost == pytest.approx(0.0, abs=1e-12)
     assert point.curvature[0].all() and not point.curvature[1].any() and not point.gradient[1].any()
 
@@ -191,7 +192,7 @@ def test_starts_use_nothing_after_the_first_tenth_of_a_second(tmp_path: Path) ->
     starts = []
     for markers in (trial.markers, later):
         changed = replace(trial, markers=markers)
-        starts.append(start.refine(model, model.motion([changed]), start.read_off([changed]), TRUE))
+        starts.append(initial_state.refine(model, model.motion([changed]), initial_state.read_off([changed]), TRUE))
     np.testing.assert_array_equal(starts[0].vel, starts[1].vel)
     np.testing.assert_array_equal(starts[0].pos, starts[1].pos)
 
@@ -204,7 +205,7 @@ def test_the_measured_rest_shape_turns_with_the_clamp(tmp_path: Path) -> None:
     still = replace(recording.train[0], markers=np.repeat(arc[None], 41, 0))
     flat = replace(recording, rest_positions=arc, gravity=np.zeros(3), train=(still,), test=(still,))
     model = RopeModel(flat, vertices=13, rest="given")
-    motion, begin = model.motion([still]), start.read_off([still])
+    motion, begin = model.motion([still]), initial_state.read_off([still])
     errors = []
     for roll in (0.0, np.pi):
         sim = model.simulate(motion, begin, np.array([[2e-3, 1.2e-3, 0.8, 1.0, roll]]))[0, 0]
@@ -213,7 +214,9 @@ def test_the_measured_rest_shape_turns_with_the_clamp(tmp_path: Path) -> None:
 
 
 def test_space_keeps_bounds_and_turns_angles_round() -> None:
-    space = fit.Space(("damping_rate", "rest_roll"), (PARAMETERS["damping_rate"], PARAMETERS["rest_roll"]))
+    space = levenberg_marquardt.Space(
+        ("damping_rate", "rest_roll"), (PARAMETERS["damping_rate"], PARAMETERS["rest_roll"])
+    )
     values = np.array([1e6, np.pi + 0.1])
     limited = space.to_values(space.clip(space.to_raw(values)))
     assert limited[0] == pytest.approx(PARAMETERS["damping_rate"].high)
@@ -221,7 +224,7 @@ def test_space_keeps_bounds_and_turns_angles_round() -> None:
 
 
 def test_levenberg_marquardt_finds_the_minimum_of_a_known_curve() -> None:
-    space = fit.Space(("damping_rate",), (PARAMETERS["damping_rate"],))
+    space = levenberg_marquardt.Space(("damping_rate",), (PARAMETERS["damping_rate"],))
     time = np.linspace(0, 1, 50)
 
     def decay(values: np.ndarray) -> np.ndarray:
@@ -229,14 +232,14 @@ def test_levenberg_marquardt_finds_the_minimum_of_a_known_curve() -> None:
         return np.broadcast_to(curve[:, None, :, None, None], (len(values), 2, 50, 1, 3))
 
     measured = np.array(decay(np.array([[1.7]]))[0])
-    points = fit.evaluate(decay, measured, space, space.to_raw(np.array([[0.3]])))
-    *_, last = fit.improve(decay, measured, space, points, iterations=30, tolerance=1e-9)
+    points = levenberg_marquardt.evaluate(decay, measured, space, space.to_raw(np.array([[0.3]])))
+    *_, last = levenberg_marquardt.improve(decay, measured, space, points, iterations=30, tolerance=1e-9)
     assert space.to_values(last[0].raw)[0] == pytest.approx(1.7, rel=1e-4)
 
 
 def test_large_errors_leave_less_curvature_and_what_is_not_seen_none() -> None:
-    space = fit.Space(("damping_rate",), (PARAMETERS["damping_rate"],))
-    look = fit.Look(space, space.to_raw(np.array([[0.8]])))
+    space = levenberg_marquardt.Space(("damping_rate",), (PARAMETERS["damping_rate"],))
+    look = levenberg_marquardt.Look(space, space.to_raw(np.array([[0.8]])))
     measured = np.linspace(0.0, 1.0, 20)[None, :, None, None] * np.ones((2, 1, 4, 3))
     measured[1, 5:] = np.nan  # a short trial
     off = np.array([0.0, 3e-3])[:, None, None, None] + 1e-4 * np.arange(len(look.values))[:, None, None, None, None]
@@ -247,19 +250,19 @@ def test_large_errors_leave_less_curvature_and_what_is_not_seen_none() -> None:
 
 @pytest.mark.slow
 def test_ranges_take_in_what_wrong_simulations_change() -> None:
-    space = fit.Space(("damping_rate",), (PARAMETERS["damping_rate"],))
+    space = levenberg_marquardt.Space(("damping_rate",), (PARAMETERS["damping_rate"],))
     time = np.linspace(0.0, 1.0, 20)[None, :, None, None] * np.ones((3, 1, 1, 3))
 
     def slide(values: np.ndarray) -> np.ndarray:  # 1 mm a second for each unit of the coordinate
         return 1e-3 * space.to_raw(values)[:, 0, None, None, None, None] * time
 
     raw = space.to_raw(np.array([[0.8]]))
-    look, measured = fit.Look(space, raw), slide(np.array([[0.8]]))[0]
+    look, measured = levenberg_marquardt.Look(space, raw), slide(np.array([[0.8]]))[0]
     (point,) = look.points(slide(look.values), measured)
-    drifts = fit.drift(look, slide(look.values), measured, [2e-5 * time, 0.0 * time])
+    drifts = levenberg_marquardt.drift(look, slide(look.values), measured, [2e-5 * time, 0.0 * time])
     # Simulations that run 2 % of a unit too fast make the fit find so much less.
     np.testing.assert_allclose(drifts, [[-0.02], [0.0]], atol=1e-5)
-    (low,), (high,) = fit.interval(point, space, drifts)
+    (low,), (high,) = levenberg_marquardt.interval(point, space, drifts)
     assert np.log([low, high]) == pytest.approx(np.log(0.8) + 1.645 * np.array([-0.02, 0.02]), abs=1e-4)
 
 

@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from torchdlo import cli
+from torchdlo.cli import app
 from torchdlo.errors import InputError
 from torchdlo.sysid import load_recording
-from torchdlo.sysid.deform import find_cables, read_cable, read_positions, suspect_frames
+from torchdlo.sysid.recordings.import_deform import find_cables, read_cable, read_positions, suspect_frames
 
 SPACING = np.array([0.02, 0.1, 0.11, 0.1, 0.09, 0.025])
 REST = np.stack([np.concatenate([[0], np.cumsum(SPACING)]), np.zeros(7), np.full(7, 0.015)], axis=1)
@@ -65,7 +65,7 @@ def checkout(tmp_path: Path) -> Path:
 
 def test_converts_a_cable(checkout: Path, tmp_path: Path) -> None:
     with pytest.raises(SystemExit) as caught:
-        cli.main(["import-deform", str(checkout), str(tmp_path / "out")])
+        app.main(["import-deform", str(checkout), str(tmp_path / "out")])
     assert not caught.value.code
     assert [p.name for p in (tmp_path / "out").iterdir()] == ["dlo1"]
     recording = load_recording(tmp_path / "out" / "dlo1")
@@ -186,7 +186,7 @@ def test_command_says_one_line_and_writes_nothing(
     before = sorted(checkout.rglob("*"))
     filled = [a.format(root=checkout, out=out) for a in arguments]
     with pytest.raises(SystemExit) as caught:
-        cli.main(["import-deform", *filled])
+        app.main(["import-deform", *filled])
     said = capsys.readouterr()
     assert caught.value.code == 2
     assert said.out == "" and words in said.err
@@ -199,6 +199,6 @@ def test_nothing_is_written_when_a_later_cable_is_bad(checkout: Path, tmp_path: 
     shutil.copytree(checkout / "data_set" / "DLO1", checkout / "data_set" / "DLO2")
     (checkout / "data_set" / "DLO2" / "eval" / "7.pkl").write_bytes(b"")
     with pytest.raises(SystemExit) as caught:
-        cli.main(["import-deform", str(checkout), str(tmp_path / "out")])
+        app.main(["import-deform", str(checkout), str(tmp_path / "out")])
     assert caught.value.code == 2
     assert not (tmp_path / "out").exists()

@@ -13,19 +13,21 @@ from scipy.spatial.transform import Rotation
 
 from tests.test_cli import run
 from torchdlo.errors import InputError
-from torchdlo.report import design as report
-from torchdlo.sysid import design as search
-from torchdlo.sysid import motions, plan, saved
-from torchdlo.sysid import start as starts
-from torchdlo.sysid.contest import size
-from torchdlo.sysid.design import Design, design_experiment, design_json
-from torchdlo.sysid.floor import gap
-from torchdlo.sysid.jobs import Fit, Simulation
-from torchdlo.sysid.journal import digest
-from torchdlo.sysid.model import RopeModel
-from torchdlo.sysid.motion import Start
-from torchdlo.sysid.pool import Pool
-from torchdlo.sysid.recording import Recording, Trial, save_recording
+from torchdlo.report.pages import design as report
+from torchdlo.sysid.diagnosis import budget
+from torchdlo.sysid.diagnosis.error_floor import gap
+from torchdlo.sysid.estimation.jobs import Fit, Simulation
+from torchdlo.sysid.estimation.result_cache import digest
+from torchdlo.sysid.estimation.worker_pool import Pool
+from torchdlo.sysid.experiment_design import design as search
+from torchdlo.sysid.experiment_design import excitation_motions
+from torchdlo.sysid.experiment_design.design import Design, design_experiment, design_json
+from torchdlo.sysid.experiment_design.model_discrimination import size
+from torchdlo.sysid.model import initial_state as starts
+from torchdlo.sysid.model import model_file
+from torchdlo.sysid.model.rope_model import RopeModel
+from torchdlo.sysid.model.trial_batch import Start
+from torchdlo.sysid.recordings.recording import Recording, Trial, save_recording
 
 S = np.array([0.0, 0.015, 0.06, 0.12, 0.18, 0.24, 0.3])
 GRIPPED = np.arange(len(S)) < 2
@@ -86,7 +88,7 @@ def write_findings(folder: Path, recording: Recording, ties: list[str]) -> Path:
     model = RopeModel(recording, effects=("tilted_gravity",), **OPTIONS)
     # The stiffness 10 % off: fits are not to start at the truth.
     values = TRUTH | {"bending_stiffness": 1.1 * TRUTH["bending_stiffness"]}
-    content = saved.content(model, np.array([values[n] for n in model.parameters]))
+    content = model_file.content(model, np.array([values[n] for n in model.parameters]))
     (folder / "model.json").write_text(json.dumps(content, default=lambda x: np.asarray(x).tolist()))
     findings = {
         "generator": "torchdlo diagnose",
@@ -107,7 +109,7 @@ def found(recording: Recording, tmp_path_factory: pytest.TempPathFactory) -> Pat
 def designed(recording: Recording, found: Path, *, resume: bool = False) -> Design:
     """A short search."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(plan, "BUDGETS", {"fast": plan.Budget(2, 2, 2, 1, 1)})
+        patch.setattr(budget, "BUDGETS", {"fast": budget.Budget(2, 2, 2, 1, 1)})
         for name, value in {"WIDTHS": (0.5,), "COUNT": 4, "LEADERS": 1, "ITERATIONS": 1}.items():
             patch.setattr(search, name, value)
         options = {"journal": found / "journal", "resume": resume}
@@ -141,7 +143,9 @@ def test_the_suggested_motion_separates_what_the_recording_cannot(design: Design
     # Both explain the slow motions; the suggested one sets them apart.
     assert design.reference < design.needed < design.separation
     best = design.options[0].gesture
-    (new,) = measured(recording, (replace(design.trial, name="train_2"),), motions.first_pose(design.rig, [best]), 2)
+    (new,) = measured(
+        recording, (replace(design.trial, name="train_2"),), excitation_motions.first_pose(design.rig, [best]), 2
+    )
     gaps = refitted(design, recording, new)
     # Of 51 x 5 x 3 noisy coordinates the root mean square scatters by 2.6 %; four times that.
     assert gaps["tilted_gravity"][1] == pytest.approx(NOISE, rel=0.1)
@@ -168,15 +172,15 @@ def test_the_report_tells_all(design: Design, tmp_path: Path) -> None:
 
 
 def test_motions_stay_within_what_was_recorded(tmp_path: Path) -> None:
-    rig = motions.make_rig(empty(tmp_path))
+    rig = excitation_motions.make_rig(empty(tmp_path))
     # 4 cm to and fro once a second: 2 cm to each side, 2 pi 2 cm/s; smoothing over 0.1 s takes 1 % off a sine.
     np.testing.assert_allclose(rig.reach, [0.02, 0.02, 0.0], atol=2e-5)
     assert rig.speed == pytest.approx(0.04 * np.pi, rel=0.02)
-    found = motions.menu(rig, 2.0, 9.81)
+    found = excitation_motions.menu(rig, 2.0, 9.81)
     assert {"hold", "swing", "ladder", "stop", "circle", "roll"} == {g.kind for g in found}
-    tried = [*found, *motions.near(found[4], np.random.default_rng(0), 8, 1.0, 2.0)]
+    tried = [*found, *excitation_motions.near(found[4], np.random.default_rng(0), 8, 1.0, 2.0)]
     for gesture in tried:
-        trial = motions.play(rig, gesture, 2.0, "motion")
+        trial = excitation_motions.play(rig, gesture, 2.0, "motion")
         centre = trial.markers[:, GRIPPED].mean(1)
         level = Rotation.from_rotvec([0.0, 0.0, -gesture.heading]).apply(centre - centre[0])
         speed = np.linalg.norm(np.gradient(centre, trial.time, axis=0), axis=-1)
@@ -188,8 +192,8 @@ def test_motions_stay_within_what_was_recorded(tmp_path: Path) -> None:
 
 
 def test_a_roll_turns_the_clamp_about_the_rope(tmp_path: Path) -> None:
-    rig = motions.make_rig(empty(tmp_path))
-    trial = motions.play(rig, motions.Gesture("roll", 0.5), 2.5, "motion")
+    rig = excitation_motions.make_rig(empty(tmp_path))
+    trial = excitation_motions.play(rig, excitation_motions.Gesture("roll", 0.5), 2.5, "motion")
     turn = Rotation.from_quat(trial.gripper_quaternion[:, 0], scalar_first=True)
     np.testing.assert_allclose(turn.apply([1.0, 0, 0]), np.tile([0, 0, -1.0], (len(turn), 1)), atol=1e-12)
     # Half a turn, from the clamp's y axis to its opposite.
@@ -206,10 +210,10 @@ def test_two_clamps_come_as_close_as_they_were(tmp_path: Path) -> None:
     markers[:, -1, 0] += 0.06
     both = GRIPPED | (np.arange(len(S)) >= len(S) - 2)
     trial = replace(trial, markers=markers, gripped=both, gripper_quaternion=None, gripper_marker=None)
-    rig = motions.make_rig(replace(bare, train=(trial,), test=()))
+    rig = excitation_motions.make_rig(replace(bare, train=(trial,), test=()))
     assert rig.closer == pytest.approx(0.05, rel=0.02)
-    gesture = next(g for g in motions.menu(rig, 2.0, 9.81) if g.kind == "against")
-    played = motions.play(rig, gesture, 2.0, "motion").markers
+    gesture = next(g for g in excitation_motions.menu(rig, 2.0, 9.81) if g.kind == "against")
+    played = excitation_motions.play(rig, gesture, 2.0, "motion").markers
     apart = np.linalg.norm(played[:, -2:].mean(1) - played[:, :2].mean(1), axis=-1)
     assert 0.005 < apart[0] - apart.min() <= rig.closer + 1e-9 and apart.max() <= apart[0] + 1e-12
     middle = played[:, both].mean(1)
@@ -217,9 +221,11 @@ def test_two_clamps_come_as_close_as_they_were(tmp_path: Path) -> None:
 
 
 def test_a_larger_scale_allows_larger_and_faster_motions(tmp_path: Path) -> None:
-    rig, wider = (motions.make_rig(empty(tmp_path), scale) for scale in (1.0, 3.0))
-    gesture = motions.Gesture("swing", 1.0)
-    assert motions.travel(wider, gesture, 2.0)[0] == pytest.approx(3 * motions.travel(rig, gesture, 2.0)[0])
+    rig, wider = (excitation_motions.make_rig(empty(tmp_path), scale) for scale in (1.0, 3.0))
+    gesture = excitation_motions.Gesture("swing", 1.0)
+    assert excitation_motions.travel(wider, gesture, 2.0)[0] == pytest.approx(
+        3 * excitation_motions.travel(rig, gesture, 2.0)[0]
+    )
 
 
 @pytest.mark.parametrize(

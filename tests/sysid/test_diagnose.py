@@ -13,24 +13,24 @@ from scipy.spatial.transform import Rotation
 
 from torchdlo.errors import InputError
 from torchdlo.physics.effects import EFFECTS
-from torchdlo.report import diagnosis as report
-from torchdlo.sysid import clamps, floor, library, settle
-from torchdlo.sysid import diagnose as search
-from torchdlo.sysid.bench import Bench
-from torchdlo.sysid.drive import drive
-from torchdlo.sysid.extend import extend
-from torchdlo.sysid.findings import findings, findings_json, model_json, sentence
-from torchdlo.sysid.fit import Point, Space, interval
-from torchdlo.sysid.jobs import Fitted
-from torchdlo.sysid.mesh import make_mesh
-from torchdlo.sysid.model import RopeModel
-from torchdlo.sysid.motion import Start
-from torchdlo.sysid.plan import BUDGETS
-from torchdlo.sysid.recording import Recording, Trial
-from torchdlo.sysid.revise import Found, Revision
-from torchdlo.sysid.screen import Score
-from torchdlo.sysid.start import read_off
-from torchdlo.sysid.verdict import word
+from torchdlo.report.pages import diagnosis as report
+from torchdlo.sysid.diagnosis import clamp_models, effect_library, error_floor, search
+from torchdlo.sysid.diagnosis.backward_elimination import Found, Revision
+from torchdlo.sysid.diagnosis.budget import BUDGETS
+from torchdlo.sysid.diagnosis.candidate_fits import extend
+from torchdlo.sysid.diagnosis.findings import findings, findings_json, model_json, sentence
+from torchdlo.sysid.diagnosis.score_test import Score
+from torchdlo.sysid.diagnosis.verdict import word
+from torchdlo.sysid.diagnosis.workspace import Bench
+from torchdlo.sysid.estimation.jobs import Fitted
+from torchdlo.sysid.estimation.levenberg_marquardt import Point, Space, interval
+from torchdlo.sysid.model import equilibrium
+from torchdlo.sysid.model.discretisation import make_mesh
+from torchdlo.sysid.model.gripper_motion import drive
+from torchdlo.sysid.model.initial_state import read_off
+from torchdlo.sysid.model.rope_model import RopeModel
+from torchdlo.sysid.model.trial_batch import Start
+from torchdlo.sysid.recordings.recording import Recording, Trial
 
 S = np.array([0.0, 0.02, 0.08, 0.16, 0.24, 0.32, 0.4, 0.48, 0.56, 0.6])
 GRIPPED = np.arange(10) < 2
@@ -73,13 +73,13 @@ def make_recording(path: Path, effects: dict[str, float], noise: float = 2e-4, g
     return replace(empty, train=tuple(made[:2]), test=tuple(made[2:]))
 
 
-@pytest.mark.parametrize("name", library.LIBRARY)
+@pytest.mark.parametrize("name", effect_library.LIBRARY)
 def test_the_library_knows_how_to_search_for_every_effect(name: str, tmp_path: Path) -> None:
     recording = replace(make_empty(tmp_path), table_height=0.0)
     mesh = make_mesh(recording.train[0], recording.length, 31)
-    numbers = {n.name: n for n in library.numbers(name, recording)}
-    doses = library.probes(name, recording, mesh, 10.0, {"bending_stiffness": 2e-3})
-    assert library.applicable(name, recording, mesh) and numbers and doses
+    numbers = {n.name: n for n in effect_library.numbers(name, recording)}
+    doses = effect_library.probes(name, recording, mesh, 10.0, {"bending_stiffness": 2e-3})
+    assert effect_library.applicable(name, recording, mesh) and numbers and doses
     for dose in doses:
         for key, value in dose.values.items():
             assert numbers[key].param.low <= value <= numbers[key].param.high
@@ -131,7 +131,7 @@ def test_a_clamp_holds_from_the_middle_of_its_markers(tmp_path: Path) -> None:
 def test_smooth_starts_are_explained_exactly(tmp_path: Path) -> None:
     recording = make_empty(tmp_path)
     mesh, free = make_mesh(recording.train[0], 0.6, 31), np.flatnonzero(~GRIPPED)
-    shapes = settle.smooth_shapes(mesh, free)
+    shapes = equilibrium.smooth_shapes(mesh, free)
     at = shapes[mesh.marker_vertex][free]
     np.testing.assert_allclose(at.T @ at, np.eye(at.shape[1]), atol=1e-9)
     assert np.abs(shapes[list(mesh.held)]).max() == 0.0
@@ -139,7 +139,7 @@ def test_smooth_starts_are_explained_exactly(tmp_path: Path) -> None:
     time = 0.01 * np.arange(11)
     gap = (at @ a)[:, None] + time[:, None, None] * (at @ b)[:, None]
     gap[:, 3, 2] = np.nan
-    shift, drift = settle.explain(gap, at, 0.01, shapes)
+    shift, drift = equilibrium.explain(gap, at, 0.01, shapes)
     np.testing.assert_allclose(shift, shapes @ a, atol=1e-9)
     np.testing.assert_allclose(drift, shapes @ b, atol=1e-7)
 
@@ -150,7 +150,7 @@ def test_noise_is_read_off_fourth_differences(tmp_path: Path) -> None:
     long = hanging("train_0", rng, frames=801)
     noisy = replace(long, markers=long.markers + 3e-4 * rng.normal(size=long.markers.shape))
     # Of 8 x 3 x 800 differences the median deviation is known to 1 %; what is smooth adds 0.02^4 of its fourth slope.
-    assert floor.noise(replace(recording, train=(noisy,))) == pytest.approx(3e-4, rel=0.05)
+    assert error_floor.noise(replace(recording, train=(noisy,))) == pytest.approx(3e-4, rel=0.05)
 
 
 def test_an_unknown_budget_is_refused(tmp_path: Path) -> None:
@@ -164,7 +164,7 @@ def test_a_hidden_effect_is_named_and_none_where_there_is_none(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, effects: dict[str, float], named: list[str]
 ) -> None:
     # Two names keep it short; the mesh and the steps are not those of the recording.
-    monkeypatch.setattr(library, "LIBRARY", ("air_drag", "point_mass"))
+    monkeypatch.setattr(effect_library, "LIBRARY", ("air_drag", "point_mass"))
     monkeypatch.setattr(search, "BUDGETS", {"fast": search.Budget(3, 2, 3, 3, 1)})
     recording = make_recording(tmp_path, effects)
     stages = []
@@ -192,7 +192,7 @@ def test_a_clamp_that_turns_is_told_from_one_in_which_the_rope_bends(
     monkeypatch.setattr(search, "BUDGETS", {"fast": search.Budget(3, 1, 3, 3, 1)})
     recording = make_recording(tmp_path, {"gripper_compliance.stiffness": 0.4}, grip=1.0)
     looked = {"gripper_compliance", "nonuniform_stiffness"}
-    without = [name for name in library.LIBRARY if name not in looked]
+    without = [name for name in effect_library.LIBRARY if name not in looked]
     result = search.diagnose(recording, vertices=31, workers=1, without=without)
     assert result.effects == ["gripper_compliance"]
     said = findings(result, recording)
@@ -214,12 +214,14 @@ def test_what_a_clamp_may_be_in_which_the_rope_bends_moves_alike(tmp_path: Path)
         # 1 cm of rope from the middle of the clamp to its end: 2e-3 / 0.01 N m/rad. The grippers do not twist the rope.
         numbers |= {"gripper_compliance.stiffness": 0.2} if effects else {}
         values = np.array([numbers[name] for name in model.parameters])
-        said.append(clamps.notes(model, SimpleNamespace(effects=effects, values=values)))
+        said.append(clamp_models.notes(model, SimpleNamespace(effects=effects, values=values)))
         motion = model.motion(recording.train)
         sims.append(model.simulate(motion, read_off(recording.train), values[None])[0])
     assert ["0.2 N m/rad (gripper compliance)" in note for note in said[0]] == [True] and not said[1]
     np.testing.assert_allclose(sims[0], sims[1], atol=1e-6)
-    assert not clamps.notes(RopeModel(recording, vertices=31, grip=1.0), SimpleNamespace(effects=(), values=values))
+    assert not clamp_models.notes(
+        RopeModel(recording, vertices=31, grip=1.0), SimpleNamespace(effects=(), values=values)
+    )
 
 
 @pytest.mark.parametrize(
@@ -289,7 +291,7 @@ def test_an_effect_is_left_out_once_only_from_the_same_model() -> None:
 def test_a_general_law_is_named_only_where_its_other_numbers_tell(
     speed: float, first: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    numbers = {name: library.numbers(name, make_empty(tmp_path)) for name in ("wind", "air_drag")}
+    numbers = {name: effect_library.numbers(name, make_empty(tmp_path)) for name in ("wind", "air_drag")}
     values = {"wind": [speed, -speed, 0.0, 1.6], "air_drag": [1.7]}
     slopes = 0.1 * np.random.default_rng(0).normal(size=(4, 4))
 

@@ -10,13 +10,13 @@ import pytest
 
 from tests.sysid.swaying import PLACES
 from tests.sysid.swaying import recording as swaying
-from torchdlo.sysid import floor
-from torchdlo.sysid.bench import Bench
-from torchdlo.sysid.fit import Point, Space
-from torchdlo.sysid.floor import Refinement
-from torchdlo.sysid.jobs import Fitted, Simulation
-from torchdlo.sysid.pool import Pool
-from torchdlo.sysid.recording import Recording, Trial
+from torchdlo.sysid.diagnosis import error_floor
+from torchdlo.sysid.diagnosis.error_floor import Refinement
+from torchdlo.sysid.diagnosis.workspace import Bench
+from torchdlo.sysid.estimation.jobs import Fitted, Simulation
+from torchdlo.sysid.estimation.levenberg_marquardt import Point, Space
+from torchdlo.sysid.estimation.worker_pool import Pool
+from torchdlo.sysid.recordings.recording import Recording, Trial
 
 OPTIONS = {"vertices": 33, "ahead": 0.0, "grip": 0.0}
 
@@ -73,7 +73,7 @@ def test_extrapolation_knows_the_order_of_the_steps() -> None:
 def test_trials_whose_finer_simulation_fails_are_not_corrected() -> None:
     step, grid = np.full((2, 3, 4, 3), 0.03), np.full((2, 3, 4, 3), 0.03)
     step[0], grid[1, 2, 1, 0] = 7.0, np.nan
-    found = Refinement(floor._tame(step), floor._tame(grid), 1e-4, 2, 0.02)
+    found = Refinement(error_floor._tame(step), error_floor._tame(grid), 1e-4, 2, 0.02)
     np.testing.assert_allclose(found.correction, np.full(step.shape, 0.04))
     # Where no test trial tells, the others do; where none does, nothing is known.
     assert found.floor(slice(1, None), np.ones(4, bool)).grid == pytest.approx(0.01)
@@ -107,7 +107,7 @@ def test_a_chain_is_corrected_by_what_its_links_do_not_explain(tmp_path: Path) -
             values = np.append(pool.local.model(()).guess(), links * edge)
             point = Point(np.empty(0), 0.0, np.empty(0), np.empty(0), np.empty(0))
             base = Fitted(("link_chain",), values, none, point)
-            assert floor.refine(pool, base, bench.starts["all"], "link_chain").wrong == pytest.approx(wrong)
+            assert error_floor.refine(pool, base, bench.starts["all"], "link_chain").wrong == pytest.approx(wrong)
 
 
 def test_trials_that_tell_nothing_of_their_errors_count_as_others_do() -> None:
@@ -124,5 +124,5 @@ def test_gaps_are_weighted_by_frame(tmp_path: Path) -> None:
     sims = np.stack([t.markers for t in trials]) + 1e-3
     trust = np.zeros((3, 10))
     trust[1], trust[2, :5] = 1.0, 2.0
-    np.testing.assert_allclose(floor.gap(sims, trials), 1e-3)
-    np.testing.assert_allclose(floor.gap(sims, trials, trust), [0.0, 1e-3, np.sqrt(2) * 1e-3])
+    np.testing.assert_allclose(error_floor.gap(sims, trials), 1e-3)
+    np.testing.assert_allclose(error_floor.gap(sims, trials, trust), [0.0, 1e-3, np.sqrt(2) * 1e-3])

@@ -13,8 +13,8 @@ from scipy.spatial.transform import Rotation
 
 from tests.sysid.swaying import recording as swaying
 from torchdlo.errors import InputError
-from torchdlo.sysid.health import Fault, check
-from torchdlo.sysid.recording import Recording, Trial, load_recording
+from torchdlo.sysid.recordings.data_quality import Fault, check
+from torchdlo.sysid.recordings.recording import Recording, Trial, load_recording
 
 RECORDINGS = ("hanging", "both ends", "sample")
 

@@ -12,18 +12,18 @@ import pytest
 
 from tests.sysid.swaying import recording as swaying
 from torchdlo.errors import InputError
-from torchdlo.sysid import diagnose as search
-from torchdlo.sysid import journal as journals
-from torchdlo.sysid import library, saved
-from torchdlo.sysid import pool as pools
-from torchdlo.sysid.findings import findings, model_json
-from torchdlo.sysid.fit import Point, Space
-from torchdlo.sysid.jobs import Fit, Fitted, Models, Simulation
-from torchdlo.sysid.journal import Journal, digest
-from torchdlo.sysid.library import PARAMETERS
-from torchdlo.sysid.motion import Start
-from torchdlo.sysid.pool import Pool
-from torchdlo.sysid.recording import Recording, load_recording
+from torchdlo.sysid.diagnosis import effect_library, search
+from torchdlo.sysid.diagnosis.effect_library import PARAMETERS
+from torchdlo.sysid.diagnosis.findings import findings, model_json
+from torchdlo.sysid.estimation import result_cache as journals
+from torchdlo.sysid.estimation import worker_pool as pools
+from torchdlo.sysid.estimation.jobs import Fit, Fitted, Models, Simulation
+from torchdlo.sysid.estimation.levenberg_marquardt import Point, Space
+from torchdlo.sysid.estimation.result_cache import Journal, digest
+from torchdlo.sysid.estimation.worker_pool import Pool
+from torchdlo.sysid.model import model_file
+from torchdlo.sysid.model.trial_batch import Start
+from torchdlo.sysid.recordings.recording import Recording, load_recording
 
 OPTIONS = {"seed": 0, "budget": "fast"}
 
@@ -175,7 +175,7 @@ def test_a_stopped_diagnosis_goes_on_and_its_model_starts_the_next(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(pools, "Models", FakeModels)
-    monkeypatch.setattr(library, "LIBRARY", ("air_drag", "point_mass", "time_delay"))
+    monkeypatch.setattr(effect_library, "LIBRARY", ("air_drag", "point_mass", "time_delay"))
     recording, computed = swaying(tmp_path, frames=60), FakeModels.computed
     options = {"vertices": 21, "workers": 1, "journal": tmp_path / "j"}
 
@@ -194,7 +194,7 @@ def test_a_stopped_diagnosis_goes_on_and_its_model_starts_the_next(
     keys = ("verdict", "effects", "gap", "candidates", "baseline")
     assert {k: findings(resumed, recording)[k] for k in keys} == {k: findings(whole, recording)[k] for k in keys}
     (tmp_path / "model.json").write_text(model_json(whole))
-    given = saved.load(tmp_path / "model.json")
+    given = model_file.load(tmp_path / "model.json")
     assert given.effects == whole.final.effects
     again = search.diagnose(recording, vertices=21, workers=1, given=given)
     assert again.baseline.effects == given.effects and again.options["vertices"] == 21

@@ -7,7 +7,7 @@ import torch
 
 from torchdlo import scene
 from torchdlo.physics.effects.elastic import Bend
-from torchdlo.sysid.lengths import agree, laid
+from torchdlo.sysid.model.length_projection import agree, laid
 
 F64 = torch.float64
 COUNT, EDGE = 41, 0.015

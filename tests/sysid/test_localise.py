@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from tests.sysid.swaying import LENGTH, NOISE, PLACES, recording
-from torchdlo.sysid.floor import Floor
-from torchdlo.sysid.localise import Localisation, localise, project, residuals
-from torchdlo.sysid.recording import Recording, Trial
+from torchdlo.sysid.diagnosis.error_floor import Floor
+from torchdlo.sysid.diagnosis.residual_analysis import Localisation, localise, project, residuals
+from torchdlo.sysid.recordings.recording import Recording, Trial
 
 FLOOR = Floor(NOISE, 0.0, 0.0)
 

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from tests.sysid.swaying import recording as swaying
-from torchdlo.sysid.bench import Bench, torn_apart
-from torchdlo.sysid.fit import Point, Space
-from torchdlo.sysid.jobs import Fitted, Models, Simulation
-from torchdlo.sysid.pool import Pool
+from torchdlo.sysid.diagnosis.workspace import Bench, torn_apart
+from torchdlo.sysid.estimation.jobs import Fitted, Models, Simulation
+from torchdlo.sysid.estimation.levenberg_marquardt import Point, Space
+from torchdlo.sysid.estimation.worker_pool import Pool
 
 ARC = np.array([0.0, 0.1, 0.2, 0.4])
 

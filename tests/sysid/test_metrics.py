@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from torchdlo.sysid import Trial, load_recording
-from torchdlo.sysid.metrics import average, free_marker_distance, mean_absolute_error, scored
+from torchdlo.sysid.recordings.metrics import average, free_marker_distance, mean_absolute_error, scored
 
 
 @pytest.fixture

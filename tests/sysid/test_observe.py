@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from tests.sysid.swaying import recording
-from torchdlo.sysid.model import RopeModel
-from torchdlo.sysid.motion import Start
-from torchdlo.sysid.recording import Recording
+from torchdlo.sysid.model.rope_model import RopeModel
+from torchdlo.sysid.model.trial_batch import Start
+from torchdlo.sysid.recordings.recording import Recording
 
 
 @pytest.fixture(scope="module")
@@ -52,7 +52,7 @@ def test_a_rope_whose_markers_sit_beside_it_begins_there(rope: Recording) -> Non
 
 
 def test_hinges_at_clamps_are_as_long_for_every_law(rope: Recording) -> None:
-    from torchdlo.physics import rod
+    from torchdlo.physics.rod import kinematics as rod
 
     model = RopeModel(rope, vertices=31, grip=1.0)
     scene, params, state = model.build(model.motion(rope.train), read(rope), np.repeat(model.guess()[None], 3, 0))

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from tests.sysid.swaying import recording as swaying
-from torchdlo.sysid import pool as pools
-from torchdlo.sysid import start as starts
-from torchdlo.sysid.bench import Bench
-from torchdlo.sysid.fit import Point, Space
-from torchdlo.sysid.jobs import Fit, Fitted, Simulation
-from torchdlo.sysid.pool import Pool
+from torchdlo.sysid.diagnosis.workspace import Bench
+from torchdlo.sysid.estimation import worker_pool as pools
+from torchdlo.sysid.estimation.jobs import Fit, Fitted, Simulation
+from torchdlo.sysid.estimation.levenberg_marquardt import Point, Space
+from torchdlo.sysid.estimation.worker_pool import Pool
+from torchdlo.sysid.model import initial_state as starts
 
 OPTIONS = {"vertices": 17, "ahead": 0.0, "grip": 0.0}
 BASE = ("bending_stiffness", "damping_rate")

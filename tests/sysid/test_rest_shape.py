@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 
 from tests.sysid.test_diagnose import S, hanging
-from torchdlo.sysid import baseline
-from torchdlo.sysid.bench import Bench
-from torchdlo.sysid.jobs import Fit
-from torchdlo.sysid.model import RopeModel
-from torchdlo.sysid.motion import Start
-from torchdlo.sysid.plan import options
-from torchdlo.sysid.pool import Pool
-from torchdlo.sysid.recording import Recording
+from torchdlo.sysid.diagnosis import baseline
+from torchdlo.sysid.diagnosis.budget import options
+from torchdlo.sysid.diagnosis.workspace import Bench
+from torchdlo.sysid.estimation.jobs import Fit
+from torchdlo.sysid.estimation.worker_pool import Pool
+from torchdlo.sysid.model.rope_model import RopeModel
+from torchdlo.sysid.model.trial_batch import Start
+from torchdlo.sysid.recordings.recording import Recording
 
 ARC = np.stack([0.12 * np.sin(S / 0.12), 0.12 * (1 - np.cos(S / 0.12)), 0 * S], -1)
 """Five radians of a circle."""

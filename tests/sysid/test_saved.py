@@ -11,11 +11,12 @@ import numpy as np
 import pytest
 
 from torchdlo.errors import InputError
-from torchdlo.sysid import judge, saved
-from torchdlo.sysid.calibrate import calibrate
-from torchdlo.sysid.model import RopeModel
-from torchdlo.sysid.recording import Recording, load_recording
-from torchdlo.sysid.result import dump
+from torchdlo.sysid.calibration.calibrate import calibrate
+from torchdlo.sysid.estimation import evaluation
+from torchdlo.sysid.estimation.result import dump
+from torchdlo.sysid.model import model_file
+from torchdlo.sysid.model.rope_model import RopeModel
+from torchdlo.sysid.recordings.recording import Recording, load_recording
 
 EFFECTS = ("wind", "point_mass", "stretch")
 
@@ -35,7 +36,7 @@ def numbers(model: RopeModel) -> np.ndarray:
 
 def write(path: Path, model: RopeModel, values: np.ndarray) -> Path:
     """Write a model file as commands do."""
-    path.write_text(dump({"generator": "torchdlo diagnose"} | saved.content(model, values)))
+    path.write_text(dump({"generator": "torchdlo diagnose"} | model_file.content(model, values)))
     return path
 
 
@@ -46,19 +47,19 @@ def test_a_model_comes_back_and_predicts_the_same(
     options = {"ahead": 0.0, "grip": 0.3, "substep": 4e-3}
     model = RopeModel(recording, vertices=vertices, rest=rest, effects=EFFECTS, **options)
     values = numbers(model)
-    given = saved.load(write(tmp_path / "model.json", model, values))
+    given = model_file.load(write(tmp_path / "model.json", model, values))
     again = given.model(recording)
     assert given.effects == EFFECTS and again.parameters == model.parameters and again.step == model.step
     assert (again.rest, again.ahead, again.grip) == (rest, 0.0, 0.3)
     np.testing.assert_array_equal(again.arclength, model.arclength)
     np.testing.assert_array_equal(given.start(again), values)
-    a, b = (judge.predict(m, recording.test[:1], values)["test_0"] for m in (model, again))
+    a, b = (evaluation.predict(m, recording.test[:1], values)["test_0"] for m in (model, again))
     np.testing.assert_array_equal(a, b)
 
 
 def test_numbers_that_are_off_stay_off(recording: Recording, tmp_path: Path) -> None:
     model = RopeModel(recording, vertices=15, effects=EFFECTS)
-    sizes = saved.load(write(tmp_path / "model.json", model, numbers(model))).sizes(model)
+    sizes = model_file.load(write(tmp_path / "model.json", model, numbers(model))).sizes(model)
     # The rope is inextensible; a place or a direction is fitted even where it is zero.
     assert set(sizes) == set(model.parameters) - {"stretch.EA"}
     assert sizes["wind.velocity.1"] == 1.5 and sizes["point_mass.mass"] == 0.004 and sizes["wind.velocity.0"] > 0
@@ -69,21 +70,24 @@ def test_calibration_goes_on_from_a_model_with_its_effects(recording: Recording,
     values = dict(zip(model.parameters, model.guess(), strict=True)) | {"air_drag.c_d": 1.0}
     path = write(tmp_path / "model.json", model, np.array([values[n] for n in model.parameters]))
     stages: list[str] = []
-    result = calibrate(recording, given=saved.load(path), iterations=1, callback=lambda stage, *_: stages.append(stage))
+    result = calibrate(
+        recording, given=model_file.load(path), iterations=1, callback=lambda stage, *_: stages.append(stage)
+    )
     assert not any("starts" in stage for stage in stages)
     assert set(result.parameters) == {*values}
     assert "air drag" in " ".join(result.notes)
     (tmp_path / "next.json").write_text(dump(result.model))
-    again = saved.load(tmp_path / "next.json")
+    again = model_file.load(tmp_path / "next.json")
     assert again.effects == ("air_drag",) and again.values == {k: v["value"] for k, v in result.parameters.items()}
     # What it started from is what the file says.
     trials = (*recording.train, *recording.test)
-    before = judge.errors(
-        recording, judge.predict(saved.load(path).model(recording), trials, saved.load(path).start(model))
+    before = evaluation.errors(
+        recording,
+        evaluation.predict(model_file.load(path).model(recording), trials, model_file.load(path).start(model)),
     )
     assert result.before == before and result.train_mae_mm <= before["train_mae_mm"] * (1 + 1e-9)
     with pytest.raises(InputError, match=r"rest is 'given'; expected auto or straight"):
-        calibrate(recording, given=saved.load(path), rest="given")
+        calibrate(recording, given=model_file.load(path), rest="given")
 
 
 @pytest.fixture
@@ -133,18 +137,18 @@ def edit(recording: Recording, tmp_path: Path) -> Callable[..., Path]:
 )
 def test_what_is_wrong_with_a_file_is_said(edit: Callable[..., Path], do: Callable[..., Any], message: str) -> None:
     with pytest.raises(InputError, match=message):
-        saved.load(edit(do))
+        model_file.load(edit(do))
 
 
 def test_files_that_are_no_models_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="found nothing there"):
-        saved.load(tmp_path / "model.json")
+        model_file.load(tmp_path / "model.json")
     with pytest.raises(InputError, match=r"found a folder; give the model.json in it"):
-        saved.load(tmp_path)
+        model_file.load(tmp_path)
     for text in ("{", "[]", '"x"', "\x00"):
         (tmp_path / "model.json").write_text(text)
         with pytest.raises(InputError, match="expected a model file"):
-            saved.load(tmp_path / "model.json")
+            model_file.load(tmp_path / "model.json")
 
 
 def test_a_model_that_cannot_act_in_a_recording_is_refused(
@@ -152,4 +156,4 @@ def test_a_model_that_cannot_act_in_a_recording_is_refused(
 ) -> None:
     path = edit(lambda c: c["effects"].update(table_friction={"mu": 0.3}))
     with pytest.raises(InputError, match="table_friction: expected a recording in which it can act"):
-        saved.load(path).model(recording)
+        model_file.load(path).model(recording)

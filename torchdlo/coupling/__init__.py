@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from torchdlo.coupling.body_contact import BodyContact
-from torchdlo.coupling.body_matter import BodyMatter
-from torchdlo.coupling.contact import RodContact
-from torchdlo.coupling.pads import FingerPads
-from torchdlo.coupling.rod_body import RodBody
-from torchdlo.coupling.rod_matter import RodMatter
-from torchdlo.physics.effect import Effect
+from torchdlo.coupling.bodies.contact_effect import BodyContact
+from torchdlo.coupling.mpm.body_coupling_effect import BodyMatter
+from torchdlo.coupling.mpm.rod_coupling_effect import RodMatter
+from torchdlo.coupling.rod_body.effect import RodBody
+from torchdlo.coupling.rod_body.finger_pads import FingerPads
+from torchdlo.coupling.rod_contact.effect import RodContact
+from torchdlo.physics.effects.base import Effect
 
 EFFECTS: dict[str, type[Effect]] = {
     "rod_contact": RodContact,

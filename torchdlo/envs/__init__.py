@@ -11,22 +11,22 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from torchdlo.envs.cable import Cable
-from torchdlo.envs.coiling import Coiling
-from torchdlo.envs.gathering import Gathering
-from torchdlo.envs.letter_art import LetterArt
-from torchdlo.envs.lifting import Lifting
-from torchdlo.envs.separation import Separation
-from torchdlo.envs.slingshot import Slingshot
-from torchdlo.envs.task import Task
-from torchdlo.envs.unknotting import Unknotting
-from torchdlo.envs.wiring_post import WiringPost
-from torchdlo.envs.wiring_ring import WiringRing
-from torchdlo.envs.wrapping import Wrapping
+from torchdlo.envs.assets.rope_material import Cable
+from torchdlo.envs.core.task import Task
+from torchdlo.envs.tasks.coiling import Coiling
+from torchdlo.envs.tasks.gathering import Gathering
+from torchdlo.envs.tasks.letter_art import LetterArt
+from torchdlo.envs.tasks.lifting import Lifting
+from torchdlo.envs.tasks.separation import Separation
+from torchdlo.envs.tasks.slingshot import Slingshot
+from torchdlo.envs.tasks.unknotting import Unknotting
+from torchdlo.envs.tasks.wiring_post import WiringPost
+from torchdlo.envs.tasks.wiring_ring import WiringRing
+from torchdlo.envs.tasks.wrapping import Wrapping
 from torchdlo.errors import InputError
 
 if TYPE_CHECKING:
-    from torchdlo.envs.env import DloEnv
+    from torchdlo.envs.core.env import DloEnv
 
 TASKS: dict[str, type[Task]] = {
     "coiling": Coiling,
@@ -96,11 +96,11 @@ def make(
         variation: whether starts differ, by as much as `Task.spread` says.
         randomize: numbers of effects that differ from scene to scene and are drawn at every reset, e.g.
             {"rod_contact.mu_k": 0.2}: a share of the range in which the number is declared, about its usual value.
-        rope: what ropes are made of, if not what the task says: `torchdlo.describe.cable("model.json")` reads what
+        rope: what ropes are made of, if not what the task says: `torchdlo.scene_files.cable("model.json")` reads what
             `torchdlo calibrate` or `diagnose` found.
     """
     try:
-        from torchdlo.envs.env import DloEnv
+        from torchdlo.envs.core.env import DloEnv
     except ImportError as error:
         raise InputError(
             f"environments need torchrl and tensordict ({error}); install them with pip install 'torchdlo[rl,robots]'."

@@ -2,6 +2,6 @@
 
 from __future__ import annotations
 
-from torchdlo.report.calibration import write_report
+from torchdlo.report.pages.calibration import write_report
 
 __all__ = ["write_report"]

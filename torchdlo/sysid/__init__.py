@@ -2,6 +2,6 @@
 
 from __future__ import annotations
 
-from torchdlo.sysid.recording import Recording, Trial, load_recording, save_recording, save_trial
+from torchdlo.sysid.recordings.recording import Recording, Trial, load_recording, save_recording, save_trial
 
 __all__ = ["Recording", "Trial", "load_recording", "save_recording", "save_trial"]

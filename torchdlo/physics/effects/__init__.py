@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from torchdlo.physics.effect import Effect
+from torchdlo.physics.effects.base import Effect
+from torchdlo.physics.effects.bending_models import AnisotropicBending, InternalFriction, StiffeningBending
 from torchdlo.physics.effects.elastic import Bend, BendFrame, Stretch, Twist
-from torchdlo.physics.effects.field import AirDrag, Damping, Gravity, TiltedGravity, Wind
-from torchdlo.physics.effects.grid import LinkChain
-from torchdlo.physics.effects.grip import GripperCompliance
-from torchdlo.physics.effects.hinge import AnisotropicBending, InternalFriction, StiffeningBending
+from torchdlo.physics.effects.external import AirDrag, Damping, Gravity, TiltedGravity, Wind
+from torchdlo.physics.effects.gripper_compliance import GripperCompliance
+from torchdlo.physics.effects.link_chain import LinkChain
 from torchdlo.physics.effects.material import (
     AxialStiffness,
     BendingDamping,
@@ -16,7 +16,7 @@ from torchdlo.physics.effects.material import (
     PointMass,
     RestCurvature,
 )
-from torchdlo.physics.effects.measure import MarkerOffset, TimeDelay
+from torchdlo.physics.effects.measurement import MarkerOffset, TimeDelay
 from torchdlo.physics.effects.table import Table, TableFriction
 
 EFFECTS: dict[str, type[Effect]] = {

@@ -11,10 +11,11 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from torchdlo.physics import lanes, tree
-from torchdlo.physics.effect import Effect, Values
-from torchdlo.physics.numerics import cross, dot
-from torchdlo.physics.rod import View
+from torchdlo.physics import tree
+from torchdlo.physics.effects.base import Effect, Values
+from torchdlo.physics.kernels import lanes
+from torchdlo.physics.linalg.numerics import cross, dot
+from torchdlo.physics.rod.kinematics import View
 
 
 @dataclass(frozen=True)

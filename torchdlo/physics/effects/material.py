@@ -9,11 +9,11 @@ import torch
 from torch import Tensor
 
 from torchdlo.physics import tree
-from torchdlo.physics.effect import Effect, Param, Values
+from torchdlo.physics.effects.base import Effect, Param, Values
 from torchdlo.physics.effects.elastic import Curvature, curvature
-from torchdlo.physics.numerics import dot
-from torchdlo.physics.rod import RodParams, View, hinge_length
-from torchdlo.physics.topology import Topology, preceding
+from torchdlo.physics.linalg.numerics import dot
+from torchdlo.physics.rod.kinematics import RodParams, View, hinge_length
+from torchdlo.physics.rod.topology import Topology, preceding
 
 
 def arclength(params: RodParams) -> tuple[Tensor, Tensor]:

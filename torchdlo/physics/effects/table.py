@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 
 from torchdlo.physics import tree
-from torchdlo.physics.effect import Effect, Param, Values
-from torchdlo.physics.numerics import total
-from torchdlo.physics.rod import View
+from torchdlo.physics.effects.base import Effect, Param, Values
+from torchdlo.physics.linalg.numerics import total
+from torchdlo.physics.rod.kinematics import View
 
 _HEIGHT = Param(0.0, -10.0, 10.0, "m", "linear", None, "Height of the table's surface.")
 _HARDNESS = Param(500.0, 50.0, 1e4, "rad/s", "log", None, "Frequency at which a vertex would bounce on it.")

@@ -1,0 +1,1 @@
+"""Trajectory optimisation on tasks: CMA-ES, gradient descent, hybrid."""

@@ -1,0 +1,96 @@
+"""The files of an optimisation: what it found, and the trajectory that can be played again."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchdlo.agents.trajopt.problem import Outcome, Problem
+from torchdlo.agents.trajopt.search import Found, Settings
+from torchdlo.agents.trajopt.search_journal import program, versions
+from torchdlo.errors import InputError
+
+__all__ = ["load_actions", "plain", "result_json", "summary", "trajectory_json"]
+
+
+def plain(outcome: Outcome) -> dict[str, Any]:
+    """Return how one trajectory went, as plain data; None for what is no number."""
+    return {
+        "return": _number(outcome.returns),
+        "loss": _number(outcome.loss),
+        "success": bool(outcome.success[0]),
+        "failed": bool(outcome.failed[0]),
+    }
+
+
+def _number(x: Tensor) -> float | None:
+    return float(x[0]) if math.isfinite(float(x[0])) else None
+
+
+def summary(found: Found, task: str) -> str:
+    """Return what was found as one sentence."""
+    went = plain(found.outcome)
+    value = "no finite number" if went["return"] is None else f"{went['return']:.4g}"
+    how = "failed" if went["failed"] else "success" if went["success"] else "no success"
+    stopped = "; stopped early" if found.interrupted else ""
+    missed = f"; do not trust it: {found.kept['missed']}" if found.kept.get("missed") else ""
+    return f"{task}: return {value} after {found.episodes} episodes, {how}{stopped}{missed}"
+
+
+def result_json(found: Found, problem: Problem, settings: Settings) -> str:
+    """Return what was found as JSON; `seconds` alone differs between equal searches."""
+    content = {
+        "generator": "torchdlo optimize",
+        "task": problem.name,
+        **plain(found.outcome),
+        "searched": _finite(found.searched),
+        "missed": found.kept.get("missed", ""),
+        "highest": _finite(found.highest),
+        "solved_after": next((p["episodes"] for p in found.curve if p["success"] > 0), None),
+        "episodes": found.episodes,
+        "seconds": round(found.seconds, 3),
+        "interrupted": found.interrupted,
+        "settings": asdict(settings) | problem.choices,
+        "versions": versions(),
+        "program": program(problem.name),
+        "curve": [{k: _finite(v) for k, v in point.items()} for point in found.curve],
+    }
+    return json.dumps(content, indent=1, allow_nan=False) + "\n"
+
+
+def _finite(value: Any) -> Any:
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def trajectory_json(found: Found, problem: Problem) -> str:
+    """Return the best trajectory as JSON. Numbers are written so that every bit of them comes back."""
+    content = {
+        "generator": "torchdlo optimize",
+        "task": problem.name,
+        "choices": problem.choices,
+        **plain(found.outcome),
+        "actions": found.actions.tolist(),
+        **found.kept,
+    }
+    return json.dumps(content, allow_nan=False) + "\n"
+
+
+def load_actions(path: Path, problem: Problem) -> Tensor:
+    """Return the actions of a trajectory file, shape (T, A); they fit the problem."""
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        task, actions = content["task"], torch.tensor(content["actions"], dtype=torch.float64)
+    except (OSError, ValueError, KeyError, TypeError):
+        raise InputError(f"{path}: expected a trajectory of torchdlo optimize, found something else.") from None
+    if task != problem.name or actions.shape != (problem.horizon, problem.width):
+        raise InputError(
+            f"{path}: expected {problem.horizon} actions of {problem.width} numbers for {problem.name}, found "
+            f"{tuple(actions.shape)} for {task}; give the trajectory of this task."
+        )
+    return actions

@@ -1,0 +1,84 @@
+"""What to play in a task: the way by hand, nothing, or a trajectory that was found."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchdlo.agents.trajopt.result import load_actions
+from torchdlo.agents.trajopt.task_problem import problem
+from torchdlo.envs import Cable, Task, find
+from torchdlo.envs.core import episode
+from torchdlo.errors import InputError
+
+__all__ = ["Script", "script"]
+
+
+_LONG = 10
+"""Actions of episodes that are worth recording their steps."""
+
+
+@dataclass(frozen=True, eq=False)
+class Script:
+    """An episode of one scene, and its actions."""
+
+    task: Task
+    episode: episode.Episode
+    actions: Tensor
+    """Shape (T, A)."""
+
+
+def script(
+    name: str,
+    trajectory: Path | None = None,
+    rope: Cable | None = None,
+    *,
+    idle: bool = False,
+    vary: int | None = None,
+    compiled: bool = False,
+) -> Script:
+    """Return what to play.
+
+    Args:
+        name: of the task.
+        trajectory: a file that `torchdlo optimize` wrote, played with the precision and the kind of steps with which it
+            was found, so that every bit of it comes back; the way by hand if not given.
+        rope: see `torchdlo.envs.make`; a trajectory that was found for another one shows how well it carries over.
+        idle: do nothing.
+        vary: seed of a start that differs from the usual one.
+        compiled: whether to compile steps.
+
+    Raises:
+        InputError: The trajectory is none, is one of another task, needs a rope, or there is no way by hand.
+    """
+    task = find(name, rope)
+    found = {"compiled": compiled, "recorded": task.horizon > _LONG} if trajectory is None else _choices(trajectory)
+    material = found.pop("rope", None)
+    chosen = problem(name, rope, **found)
+    if material is not None and rope is None:
+        raise InputError(f"{trajectory}: it was found for a rope of its own; give that one, or another, with --rope.")
+    seeded = torch.Generator().manual_seed(vary or 0)
+    start = {"generator": seeded, "variation": vary is not None}
+    steps = {"compiled": chosen.compiled, "recorded": chosen.recorded}
+    made = episode.prepare(task, 1, like=chosen.like, **steps, **start)
+    if trajectory is not None:
+        return Script(task, made, chosen.full(load_actions(trajectory, chosen)))
+    way = task.reference() if vary is None else task.reference(made.start.state)[0]
+    if not idle and not bool((way != 0).any()):
+        raise InputError(f"{name}: has no way by hand; give a --trajectory, or --idle.")
+    return Script(task, made, (0 * way if idle else way).to(chosen.like))
+
+
+def _choices(path: Path) -> dict[str, Any]:
+    """Return how a trajectory was found."""
+    try:
+        choices = json.loads(path.read_text(encoding="utf-8"))["choices"]
+        steps = {"compiled": bool(choices["compiled"]), "recorded": bool(choices.get("recorded"))}
+        return {"double": bool(choices["double"]), **steps, "rope": choices.get("rope")}
+    except (OSError, ValueError, KeyError, TypeError):
+        raise InputError(f"{path}: expected a trajectory of torchdlo optimize, found something else.") from None

@@ -1,0 +1,360 @@
+"""Trajectory optimisation: plays what an optimiser asks for, keeps the best, and can go on where it was stopped."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchdlo.agents.trajopt.cmaes import cmaes, package
+from torchdlo.agents.trajopt.gradient_descent import descent
+from torchdlo.agents.trajopt.hybrid import hybrid
+from torchdlo.agents.trajopt.problem import Encoding, Outcome, Problem
+from torchdlo.agents.trajopt.proposals import Ask, Plan, Search, Told, handed
+from torchdlo.agents.trajopt.search_journal import Journal
+from torchdlo.errors import InputError
+
+__all__ = ["METHODS", "Found", "Robust", "Settings", "optimize"]
+
+METHODS: dict[str, Callable[[Plan, torch.Generator], Search]] = {"cmaes": cmaes, "gd": descent, "hybrid": hybrid}
+"""Optimisers by name."""
+
+REHEARSING = ("hybrid",)
+"""Those that see to it themselves that what did well in a rehearsal is played in the problem itself."""
+
+Callback = Callable[[str, int, int, str], None]
+
+_FINALISTS = 8
+"""Best trajectories that may be played alone in the end."""
+_ALIKE = 0.01
+"""Share of a return by which rounding may change it."""
+
+
+@dataclass(frozen=True)
+class Robust:
+    """Trajectories that are to work in perturbed worlds, too; every copy counts as an episode."""
+
+    copies: int = 8
+    """Perturbed worlds in which each trajectory is played."""
+    warm: float = 0.5
+    """Share of the iterations over which the perturbations grow to their full size."""
+    finalists: int = 4
+    """Best trajectories that are judged once more in the end."""
+    trials: int = 16
+    """Perturbed worlds of that judgement, which no search has seen."""
+
+    @property
+    def final(self) -> int:
+        """Episodes of the judgement in the end."""
+        return self.finalists * self.trials
+
+    def scale(self, share: float) -> float:
+        """Return the size of the perturbations after a share of the iterations."""
+        return min(1.0, share / self.warm) if self.warm > 0 else 1.0
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How to search; what is None follows from the problem, see `Plan`."""
+
+    method: str = "cmaes"
+    episodes: int = 20_000
+    """Budget; an episode counts once, whether its slope is had or not."""
+    population: int = 400
+    seed: int = 0
+    hold: int | None = None
+    sigma: float | None = None
+    rate: float | None = None
+    steps: int | None = None
+    chunk: int = 100
+    """Most episodes that are played as one batch."""
+    robust: Robust | None = None
+    rehearsed: float = 0.0
+    """Share of the iterations that are played in the problem's rehearsal."""
+
+    def plan(self, problem: Problem) -> Plan:
+        """Return the plan for a problem; says so if the settings make none."""
+
+        def need(ok: bool, name: str, expected: str) -> None:
+            if not ok:
+                raise InputError(f"{name} is {getattr(self, name)!r}; expected {expected}.")
+
+        need(self.method in METHODS, "method", f"one of {', '.join(METHODS)}")
+        if self.method != "gd":
+            package()
+        least = 1 if self.method == "gd" else 4
+        need(self.population >= least, "population", f"at least {least} for {self.method}")
+        need(0 <= self.seed < 2**32, "seed", "a whole number from 0 to 2^32 - 1")
+        need(self.chunk >= 1, "chunk", "at least 1")
+        need(self.hold is None or 1 <= self.hold <= problem.horizon, "hold", f"1 to {problem.horizon} actions")
+        for name in ("sigma", "rate", "steps"):
+            value = getattr(self, name)
+            need(value is None or (math.isfinite(value) and value > 0), name, "a positive number")
+        need(0 <= self.rehearsed < 1, "rehearsed", "a share of the iterations from 0 up, less than 1")
+        need(self.rehearsed == 0 or self.robust is None, "rehearsed", "0 with robust")
+        per, spare = (self.robust.copies, self.robust.final) if self.robust else (1, 0)
+        least = self.population * per + spare
+        judged = f" and {spare} for the last judgement" if spare else ""
+        need(self.episodes >= least, "episodes", f"at least {least}: {least - spare} for an iteration{judged}")
+        given = {k: getattr(self, k) for k in ("hold", "sigma", "rate", "steps") if getattr(self, k) is not None}
+        iterations = (self.episodes - spare) // (self.population * per)
+        given["drifts"] = self.robust.warm if self.robust else 0.0
+        given["rehearsals"] = min(int(self.rehearsed * iterations), iterations - 1)
+        return Plan.of(problem, self.population, iterations, **given)
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """What an optimisation found."""
+
+    actions: Tensor
+    """Best trajectory, shape (T, A)."""
+    outcome: Outcome
+    """How it went when it was played alone, one entry."""
+    kept: dict[str, Any]
+    """What `Problem.record` keeps of it."""
+    searched: float
+    """Its return as the search saw it, in a batch and, if robust, in perturbed worlds."""
+    highest: float
+    """Largest return that the search saw, whether that trajectory succeeded or not."""
+    episodes: int
+    """Episodes played, without those that play the best alone."""
+    seconds: float
+    """Time spent on playing them [s]."""
+    curve: list[dict[str, Any]]
+    """One entry per iteration, see `_point`."""
+    interrupted: bool = False
+
+
+def optimize(
+    problem: Problem,
+    settings: Settings,
+    *,
+    journal: Path | None = None,
+    resume: bool = False,
+    callback: Callback | None = None,
+) -> Found:
+    """Search the trajectory with the largest return, if it can be had one that succeeds.
+
+    A `KeyboardInterrupt` that `callback` raises ends the search; the best so far is returned.
+
+    Args:
+        problem: what to solve.
+        settings: how, and with which budget.
+        journal: folder that keeps the results of all batches; `journal.remove` deletes it, when what was found is
+            written down.
+        resume: go on from what is in the journal.
+        callback: told (stage, episodes done, all episodes, message) after every batch.
+    """
+    plan, robust = settings.plan(problem), settings.robust
+    stand_in = problem.rehearsal() if plan.rehearsals else None
+    if plan.rehearsals and stand_in is None:
+        raise InputError(f"{problem.name}: it has no rehearsal; set rehearsed to 0.")
+    player = _Player(problem, settings, Journal(journal, _options(problem, settings), resume=resume), callback)
+    search = METHODS[settings.method](plan, torch.Generator().manual_seed(settings.seed))
+    if settings.method not in REHEARSING:
+        search = handed(search, plan)
+    told, curve, interrupted = None, [], False
+    best = _Best(robust.finalists if robust else _FINALISTS)
+    try:
+        for k in range(plan.iterations):
+            ask = search.send(told)
+            scale = robust.scale((k + 1) / plan.iterations) if robust else 0.0
+            rehearses = k < plan.rehearsals
+            last = k + 1 == plan.iterations  # nothing is told of it
+            told = player.batch(ask, scale, stand_in if rehearses else problem, slopes=not last)
+            if k == plan.rehearsals > 0:
+                best.clear()  # what did well in a rehearsal has to do so in earnest
+                player.highest = float(told.returns.max())
+            if robust and scale == 1 and curve and curve[-1]["scale"] < 1:
+                best.clear()  # what did well in milder worlds has to do so in these
+            best.offer(ask, told)
+            curve.append(_point(player, told, best.highest, scale, rehearses))
+        finalists = player.judge(best.kept)
+    except KeyboardInterrupt:
+        if not best.kept:
+            raise
+        interrupted, finalists = True, best.kept
+    finally:
+        player.journal.close()
+    if not math.isfinite(finalists[0].returns):
+        raise InputError(f"{problem.name}: none of {player.done} episodes had a finite return; nothing was found.")
+    chosen, outcome, kept = _alone(problem, finalists, robust is not None)
+    rehearsed = curve[-1]["rehearsed"]  # what it promised there, it does not promise here
+    return Found(
+        chosen.actions,
+        outcome,
+        kept,
+        -math.inf if rehearsed else chosen.returns,
+        -math.inf if rehearsed else best.highest,
+        player.done,
+        player.seconds,
+        curve,
+        interrupted,
+    )
+
+
+def _alone(problem: Problem, finalists: Sequence[_Finalist], robust: bool) -> tuple[_Finalist, Outcome, dict[str, Any]]:
+    """Return the one that does best alone, of those that promise more than any before them did there.
+
+    What rests on a narrow escape does not do alone what it did in a batch, where numbers are rounded otherwise. Returns
+    in several worlds do not compare with those in one: robust ones promise no more than success.
+    """
+    best, found = None, None
+    for each in finalists:
+        slack = math.inf if robust else _ALIKE * abs(each.returns)
+        if best is not None and best.rank >= (each.success, each.returns - slack):
+            break
+        with torch.no_grad():
+            outcome, kept = problem.record(each.actions)
+        value = float(outcome.returns[0])
+        went = _Finalist(bool(outcome.success[0]), value if math.isfinite(value) else -math.inf, each.actions)
+        if best is None or went.rank > best.rank:
+            best, found = went, (each, outcome, kept)
+    return found
+
+
+def _options(problem: Problem, settings: Settings) -> dict[str, Any]:
+    sizes = {k: getattr(problem, k) for k in ("name", "horizon", "width", "group", "limit")}
+    return sizes | problem.choices | asdict(settings)
+
+
+def _point(player: _Player, told: Told, best: float, scale: float, rehearsed: bool) -> dict[str, Any]:
+    """Return what a learning curve has about an iteration; of a rehearsal, it tells nothing of the problem itself."""
+    if rehearsed:
+        told, best = replace(told, returns=told.returns[:0], success=torch.zeros_like(told.success)), -math.inf
+    good = told.returns[torch.isfinite(told.returns)]
+    return {
+        "episodes": player.done,
+        "best": best,
+        "median": float(good.median()) if len(good) else None,
+        "success": float(told.success.double().mean()),
+        "failed": float(told.failed.double().mean()),
+        "without_slope": player.blind,
+        "scale": scale,
+        "rehearsed": rehearsed,
+    }
+
+
+@dataclass(frozen=True, eq=False)
+class _Finalist:
+    """A trajectory as a search saw it."""
+
+    success: bool
+    returns: float
+    actions: Tensor
+
+    @property
+    def rank(self) -> tuple[bool, float]:
+        """The larger, the better: success first."""
+        return self.success, self.returns
+
+
+class _Best:
+    """The best trajectories so far."""
+
+    def __init__(self, room: int) -> None:
+        self.room = room
+        self.clear()
+
+    def clear(self) -> None:
+        """Forget all."""
+        self.kept: list[_Finalist] = []
+        self.highest = -math.inf
+
+    def offer(self, ask: Ask, told: Told) -> None:
+        """Keep what is better than what there is; the earlier of equals stays."""
+        self.highest = max(self.highest, float(told.returns.max()))
+        order = sorted(range(len(told.returns)), key=lambda k: (not told.success[k], -float(told.returns[k])))
+        for k in order[: self.room]:
+            actions = ask.encoding.decode(ask.points[k : k + 1])[0]
+            self.kept.append(_Finalist(bool(told.success[k]), float(told.returns[k]), actions))
+        self.kept = sorted(self.kept, key=lambda f: f.rank, reverse=True)[: self.room]
+
+
+class _Player:
+    """Plays batches, or reads how they went."""
+
+    def __init__(self, problem: Problem, settings: Settings, journal: Journal, callback: Callback | None) -> None:
+        self.problem, self.settings, self.journal = problem, settings, journal
+        self.callback = callback or (lambda *_: None)
+        self.done, self.seconds, self.blind, self.highest = 0, 0.0, 0, -math.inf
+        self._copies = settings.robust.copies if settings.robust else 1
+
+    def _worlds(self, copies: int, scale: float, number: int) -> Problem:
+        return self.problem.varied(copies, scale, self.settings.seed * 1_000_003 + number)
+
+    def batch(self, ask: Ask, scale: float, problem: Problem, slopes: bool) -> Told:
+        """Play what is asked for in a problem or its rehearsal, and what needs slopes once more if not all do."""
+        if self.settings.robust:
+            problem = self._worlds(self._copies, scale, 1)
+        if not slopes or not 0 < ask.graded < len(ask.points):
+            return self._told(problem, ask, slopes and ask.graded > 0)
+        told = self._told(problem, ask, False)
+        rows, slope = ask.pick(told, ask.graded), torch.zeros_like(ask.points)
+        slope[rows] = self._told(problem, replace(ask, points=ask.points[rows]), True, again=True).slope
+        return replace(told, slope=slope)
+
+    def _told(self, problem: Problem, ask: Ask, graded: bool, again: bool = False) -> Told:
+        """Play trajectories in chunks."""
+        room = max(1, self.settings.chunk // self._copies)
+        parts = [self._chunk(problem, ask.encoding, x, graded, again) for x in ask.points.split(room)]
+        columns = zip(*parts, strict=True)
+        returns, loss, short, success, failed, slope = (torch.cat(column) for column in columns)
+        good = torch.isfinite(slope).all(-1)
+        self.blind = int((~good).sum())
+        returns = torch.where(torch.isfinite(returns), returns, -math.inf)
+        # An episode that broke down may have a small loss, as nothing is added up from then on.
+        loss = torch.where(torch.isfinite(loss) & ~failed, loss, math.inf)
+        return Told(returns, loss, short.nan_to_num(), success, failed, torch.where(good[:, None], slope, 0.0))
+
+    def _chunk(
+        self, problem: Problem, encoding: Encoding, points: Tensor, graded: bool, again: bool
+    ) -> tuple[Tensor, ...]:
+        names = ("returns", "loss", "shortfall", "success", "failed", "slope")
+        kept = self.journal.recall(points)
+        if kept is None:
+            began = time.perf_counter()
+            kept = dict(zip(names, _play(problem, encoding, points, graded), strict=True))
+            kept["seconds"] = time.perf_counter() - began
+            self.journal.keep(points, kept)
+        self.done += 0 if again else len(points) * self._copies
+        self.seconds += kept["seconds"]
+        self.highest = max([self.highest, *kept["returns"][torch.isfinite(kept["returns"])].tolist()])
+        self.callback("optimize", self.done, self.settings.episodes, f"best {self.highest:.4g}")
+        return tuple(kept[name] for name in names)
+
+    def judge(self, kept: Sequence[_Finalist]) -> Sequence[_Finalist]:
+        """Return the best first; those of a robust search as they do in worlds that it has not seen."""
+        robust = self.settings.robust
+        if robust is None:
+            return kept
+        with torch.no_grad():
+            worlds = self._worlds(robust.trials, 1.0, 0)
+            went = [worlds.evaluate(each.actions[None]) for each in kept]
+        self.done += robust.trials * len(kept)
+        seen = [
+            _Finalist(bool(w.success[0]), r if math.isfinite(r := float(w.returns[0])) else -math.inf, each.actions)
+            for each, w in zip(kept, went, strict=True)
+        ]
+        return sorted(seen, key=lambda f: f.rank, reverse=True)
+
+
+def _play(problem: Problem, encoding: Encoding, points: Tensor, graded: bool) -> tuple[Tensor, ...]:
+    """Return returns, losses, successes, failures and slopes, on the CPU."""
+    x = points.detach().clone().requires_grad_(graded)
+    with torch.set_grad_enabled(graded):
+        outcome = problem.evaluate(encoding.decode(x))
+        slope = x.new_zeros(len(x), 0)
+        if graded:
+            # Trajectories do not touch each other, so that the slope of the sum is that of each.
+            (slope,) = torch.autograd.grad(outcome.loss.sum(), x, allow_unused=True, materialize_grads=True)
+    numbers = (x.double() for x in (outcome.returns, outcome.loss, outcome.shortfall))
+    parts = (*numbers, outcome.success, outcome.failed)
+    return *(p.detach().cpu() for p in parts), slope

@@ -1,0 +1,172 @@
+"""Manipulation tasks as problems of trajectory optimisation: tools move, and keep their orientation."""
+
+from __future__ import annotations
+
+import functools
+import math
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchdlo.agents.trajopt.problem import Outcome
+from torchdlo.coupling.common import step_diagnostics
+from torchdlo.envs import Cable, find
+from torchdlo.envs.core import episode
+from torchdlo.envs.core.task import Task
+from torchdlo.errors import InputError
+from torchdlo.physics import tree
+
+__all__ = ["TaskProblem", "problem"]
+
+
+def problem(name: str, rope: Cable | None = None, **choices: Any) -> TaskProblem:
+    """Return the problem of a task by its name, with a rope of its own or a given one.
+
+    Args:
+        name: of the task.
+        rope: see `torchdlo.envs.make`.
+        choices: fields of `TaskProblem`.
+    """
+    return TaskProblem(find(name, rope), **choices)
+
+
+@dataclass(frozen=True, eq=False)
+class TaskProblem:
+    """A task from its one start, without variation."""
+
+    task: Task
+    double: bool = False
+    """Whether the physics runs in double precision."""
+    compiled: bool = True
+    """Whether steps are compiled."""
+    recorded: bool = False
+    """If not, whether they are recorded, see `torchdlo.scene.stepper`."""
+    device: str = "cpu"
+    _episodes: dict[int, episode.Episode] = field(default_factory=dict)
+    """Prepared once per size of batch."""
+
+    group = 3
+
+    @property
+    def name(self) -> str:
+        """The task's name."""
+        return self.task.name
+
+    @property
+    def horizon(self) -> int:
+        """Actions of an episode."""
+        return self.task.horizon
+
+    @property
+    def width(self) -> int:
+        """Ways of all tools: three numbers each."""
+        return 3 * self.task.arms.count
+
+    @property
+    def limit(self) -> float:
+        """Greatest way of a tool in an action [m]."""
+        return self.task.reach
+
+    @property
+    def touch(self) -> tuple[tuple[float, float, float], ...]:
+        """Where solids and matter are, from the middle of the tools [m]; planes are everywhere."""
+        return self._places[0]
+
+    @property
+    def tools(self) -> tuple[tuple[float, float, float], ...]:
+        """Where tools are at the start, from the middle of them all [m]."""
+        return self._places[1]
+
+    @functools.cached_property
+    def _places(self) -> tuple[tuple[tuple[float, float, float], ...], ...]:
+        scene, _, state = self.task.start(1, like=torch.zeros((), dtype=torch.float64))
+        things = [state.bodies.pos[0, k] for k, body in enumerate(scene.bodies) if body.shape != "plane"]
+        if state.matter:
+            things.append(state.matter.pos[0].mean(0))
+        tools = state.rods.pos[0, list(self.task.arms.vertex)]
+        return tuple(tuple(tuple((p - tools.mean(0)).tolist()) for p in places) for places in (things, tools))
+
+    @property
+    def choices(self) -> dict[str, Any]:
+        """What else results depend on."""
+        rope = {} if self.task.rope is None else {"rope": asdict(self.task.rope)}
+        steps = {"compiled": self.compiled, "recorded": self.recorded and not self.compiled}
+        return {"double": self.double, **steps, "device": self.device} | rope
+
+    @property
+    def like(self) -> Tensor:
+        """A tensor of the dtype and on the device of the physics."""
+        return torch.zeros((), dtype=torch.float64 if self.double else torch.float32, device=self.device)
+
+    def prepared(self, count: int) -> episode.Episode:
+        """Return the episode for a batch; gradients run five frames again at once."""
+        if count not in self._episodes:
+            choices = {"compiled": self.compiled, "recorded": self.recorded, "segment": 5}
+            self._episodes[count] = episode.prepare(self.task, count, like=self.like, **choices)
+        return self._episodes[count]
+
+    def full(self, actions: Tensor) -> Tensor:
+        """Return the task's actions, shape (P, T, 2 A): tools do not turn."""
+        return torch.cat([actions, torch.zeros_like(actions)], -1).to(self.like)
+
+    def evaluate(self, actions: Tensor) -> Outcome:
+        """Play actions from the one start."""
+        went = episode.play(self.task, self.full(actions), episode=self.prepared(len(actions)))
+        return _outcome(went)
+
+    def rehearsal(self) -> TaskProblem | None:
+        """Return the problem of the task's rehearsal, if it has one."""
+        found = self.task.rehearsal()
+        choices = (self.double, self.compiled, self.recorded, self.device)
+        return None if found is None else TaskProblem(found, *choices)
+
+    def varied(self, copies: int, scale: float, seed: int) -> Varied:
+        """Return the problem with `copies` starts that differ by `scale` times what the task calls its spread."""
+        if not any(value for pair in self.task.spread for value in pair):
+            raise InputError(f"{self.name}: its start does not vary; leave out --robust.")
+        return Varied(self, copies, scale, seed)
+
+    def record(self, actions: Tensor) -> tuple[Outcome, dict[str, Any]]:
+        """Play one trajectory alone.
+
+        Kept are joints and tools after every action, by arm, [rad or m] and [m], rewards, and what contact missed: ""
+        if all is well.
+        """
+        went = episode.play(self.task, self.full(actions[None]), episode=self.prepared(1), keep=episode.places)
+        kept = {name: went.path[name][:, 0].tolist() for name in ("joints", "tool")}
+        kept["rewards"] = went.rewards[:, 0].tolist()
+        kept["missed"] = step_diagnostics.explain(went.world.state.missed)
+        finite = all(math.isfinite(value) for value in kept["rewards"])
+        return _outcome(went), kept if finite else {}
+
+
+@dataclass(frozen=True, eq=False)
+class Varied:
+    """A task from several starts; every trajectory is played from all of them, and the means count."""
+
+    inner: TaskProblem
+    copies: int
+    scale: float
+    seed: int
+
+    def evaluate(self, actions: Tensor) -> Outcome:
+        """Return means of return and loss; success means from all starts, failure from any."""
+        task, like = self.inner.task, self.inner.like
+        count = len(actions) * self.copies
+        rng = torch.Generator().manual_seed(self.seed)
+        draw = torch.rand(self.copies, len(task.spread), 2, generator=rng, dtype=torch.float64)
+        away = self.scale * (2 * draw - 1) * torch.tensor(task.spread, dtype=torch.float64)
+        moved = torch.cat([away, torch.zeros_like(away[..., :1])], -1).to(like).repeat(len(actions), 1, 1)
+        _, params, state = task.build(moved)
+        base = self.inner.prepared(count)
+        base = replace(base, params=params, start=episode.begin(replace(base, params=params), state))
+        went = episode.play(task, self.inner.full(actions).repeat_interleave(self.copies, 0), episode=base)
+        went = tree.map(lambda x: x.reshape(len(actions), self.copies), _outcome(went))
+        means = (x.mean(-1) for x in (went.returns, went.loss, went.shortfall))
+        return Outcome(*means, went.success.all(-1), went.failed.any(-1))
+
+
+def _outcome(went: episode.Outcome) -> Outcome:
+    return Outcome(went.returns, went.loss, went.shortfall, went.success, went.failed)

@@ -1,0 +1,1 @@
+"""Rigid bodies: dynamics, signed distances, contact among them."""

@@ -1,0 +1,51 @@
+"""What all contacts have in common: no overlap, rebound, Coulomb friction."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from torchdlo.physics.linalg.numerics import safe_norm
+
+
+def parting(gap: Tensor, shallow: Tensor, recovery: float) -> Tensor:
+    """Return by how much surfaces have to part at least in a substep, negative if they may come closer [m].
+
+    Of an overlap, a share goes at once, and all of it that is not shallow: small shares let piles come to rest.
+
+    Args:
+        gap: distance of the surfaces, negative if they overlap [m].
+        shallow: overlap up to which only a share goes [m].
+        recovery: that share.
+    """
+    overlap = (-gap).clamp(min=0.0)
+    deep = (overlap - shallow).clamp(min=0.0)
+    return torch.where(gap > 0, -gap, recovery * overlap + (1 - recovery) * deep)
+
+
+def rebounding(
+    wanted: Tensor, pressed: Tensor, approach: Tensor, restitution: Tensor, slowest: float, dt: float
+) -> Tensor:
+    """Return `wanted` [m], or how far surfaces part if they rebound from their approach [m/s] within `dt` [s].
+
+    Args:
+        wanted: by how much they have to part at least.
+        pressed: 1 where they would touch.
+        approach: speed of approach.
+        restitution: speed of parting over speed of approach.
+        slowest: approach below which nothing rebounds.
+        dt: substep.
+    """
+    rebound = pressed * (approach > slowest) * restitution * approach * dt
+    return torch.maximum(wanted, torch.where(rebound > 0, rebound, wanted))
+
+
+def rub(trial: Tensor, normal: Tensor, mu_s: Tensor, mu_k: Tensor) -> Tensor:
+    """Return Coulomb friction [N], shape (..., 3): `trial`, which stops the slip, if static friction can be that much.
+
+    Else sliding friction, mu_k times the normal force in the direction of `trial`.
+    """
+    size = safe_norm(trial)
+    sticks = (normal > 0) & (size <= mu_s * normal)
+    sliding = mu_k * normal * trial / torch.where(size > 0, size, 1.0)
+    return torch.where(sticks, trial, sliding)

@@ -1,0 +1,136 @@
+"""Tensors as the C++ kernels want them that work on blocks of scenes: one array (rows, scenes) per number."""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from torchdlo.coupling.bodies import shape_sdf
+from torchdlo.coupling.bodies.dynamics import BodyMotion
+from torchdlo.physics.kernels import native
+
+_OPTIONS = ("-fno-math-errno", "-fno-trapping-math", "-Wno-psabi")
+_operators = torch.library.Library("torchdlo", "FRAGMENT")
+_KINDS = {torch.float32: "float", torch.float64: "double"}
+
+
+def kernel(name: str, *options: str) -> tuple[Callable, Callable[[str, torch.dtype], bool]]:
+    """Return what finds a function of a C++ kernel by its name and the dtype of its numbers, and `ready`.
+
+    Args:
+        name: of the source file, beside this one.
+        options: what the compiler is told besides the usual.
+    """
+
+    @functools.cache
+    def library() -> ctypes.CDLL | None:
+        return native.library(Path(__file__).with_name(f"{name}.cpp"), *_OPTIONS, *options)
+
+    def function(what: str, dtype: torch.dtype) -> Callable:
+        return getattr(library(), f"{name}_{_KINDS[dtype]}_{what}")
+
+    @torch.compiler.assume_constant_result
+    def ready(device: str, dtype: torch.dtype) -> bool:
+        """Return whether the kernel works for tensors of a kind of device and a dtype."""
+        return device == "cpu" and dtype in _KINDS and library() is not None
+
+    return function, ready
+
+
+def operator(schema: str, run: Callable, empty: Callable, save=None, backward=None) -> None:
+    """Register an operator `torch.ops.torchdlo.NAME` that runs a kernel on the CPU.
+
+    Args:
+        schema: its name, inputs and outputs; tensors come to it contiguous.
+        run: what it does.
+        empty: what makes outputs of the right shapes for the compiler.
+        save: see `setup_context` of `torch.library.register_autograd`.
+        backward: its derivative; None if it has none.
+    """
+    name = schema.partition("(")[0]
+    _operators.define(schema, tags=(torch.Tag.needs_contiguous_strides,))
+    _operators.impl(name, run, "CPU")
+    _operators.impl(name, empty, "Meta")
+    if backward is not None:
+        torch.library.register_autograd(f"torchdlo::{name}", backward, setup_context=save, lib=_operators)
+
+
+@functools.cache
+def integers(numbers: tuple[int, ...]) -> int:
+    """Return the address of whole numbers that stay in memory."""
+    return ctypes.addressof(_kept(numbers))
+
+
+@functools.cache
+def _kept(numbers: tuple[int, ...]) -> ctypes.Array:
+    return (ctypes.c_int64 * len(numbers))(*numbers)
+
+
+def fields(tensors: Sequence[Tensor]) -> ctypes.Array:
+    """Return the addresses of all fields of tensors (C, n, B)."""
+    at = [t.data_ptr() + k * (t.nbytes // t.shape[0]) for t in tensors for k in range(t.shape[0])]
+    return (ctypes.c_void_p * len(at))(*at)
+
+
+def stored(parts: Sequence[Tensor], batch: Sequence[int], count: int) -> list[Tensor]:
+    """Return tensors (..., n or 1, C) as (C, n, B) each."""
+    n = len(batch) + 2
+    wide = (x.expand(*batch, count, x.shape[-1]).permute(n - 1, n - 2, *range(n - 2)) for x in parts)
+    return [x.reshape(x.shape[0], count, batch.numel()).contiguous() for x in wide]
+
+
+def logical(x: Tensor, batch: Sequence[int]) -> Tensor:
+    """Return (C, n, B) as (..., n, C)."""
+    x = x.reshape(*x.shape[:2], *batch)
+    return x.permute(*range(2, x.dim()), 1, 0)
+
+
+def kinds(motion: BodyMotion) -> list[int]:
+    """Return the shapes of bodies by their numbers in the kernels."""
+    return [tuple(shape_sdf.SIZES).index(b.shape) for b in motion.bodies]
+
+
+def measures(motion: BodyMotion) -> tuple[Tensor, list[Tensor]]:
+    """Return how far in x shapes are from the centres of mass, and four numbers of their sizes, shape (..., K, C).
+
+    The size of a ring ends in cosine and sine of half its arc.
+    """
+    size = motion.params.size
+    ring = size.new_tensor([[float(b.shape == "ring")] for b in motion.bodies]) > 0
+    third, none = size[..., 2:], torch.zeros_like(size[..., 2:])
+    third, fourth = torch.where(ring, torch.cos(0.5 * third), third), torch.where(ring, torch.sin(0.5 * third), none)
+    return torch.where(ring, shape_sdf.ring_centre(size), none), [size[..., :2], third, fourth]
+
+
+def alike(motion: BodyMotion) -> bool:
+    """Return whether meshes are the same in all scenes, and not learned."""
+    meshed = any(b.shape == "mesh" for b in motion.bodies)
+    parts = (motion.params.grid, motion.params.balls)
+    return not meshed or all(x.shape[:-2].numel() == 1 and not x.requires_grad for x in parts)
+
+
+def sampled(motion: BodyMotion) -> tuple[Tensor, list[int]]:
+    """Return the grids of all bodies, shape (K, n), and the cells of each in x, y and z, 0 where there is none."""
+    return _rows(motion, motion.params.grid), [n for b in motion.bodies for n in (b.cells or (0, 0, 0))]
+
+
+def inscribed(motion: BodyMotion) -> tuple[Tensor, list[int]]:
+    """Return the balls within all bodies that stand for meshes, shape (K, 4 P), and how many each has."""
+    return _rows(motion, motion.params.balls), [b.balls for b in motion.bodies]
+
+
+def _rows(motion: BodyMotion, x: Tensor) -> Tensor:
+    """Return what is alike in all scenes, (..., K, n), as (K, n)."""
+    if not any(b.shape == "mesh" for b in motion.bodies):
+        return x.new_zeros(len(motion.bodies), 0)
+    return x.detach().reshape(x.shape[-2:]).contiguous()
+
+
+def once(ctx, *by) -> None:
+    """Refuse to differentiate a derivative: what stands in for the backward pass of an operator's backward pass."""
+    raise RuntimeError("contact and matter have no second derivative; do not ask for create_graph through them")

@@ -1,0 +1,95 @@
+"""What effects look up once per step and read in its substeps, and what they may have missed."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchdlo.physics import tree
+from torchdlo.physics.effects.base import altered
+from torchdlo.physics.linalg.numerics import safe_norm, tiny
+from torchdlo.physics.rod import kinematics as rod
+from torchdlo.physics.rod.kinematics import RodState
+
+SHORT = 0.05
+"""By what share of its length an edge may be too short before it counts; lengths are kept to 1e-5 and better."""
+
+
+def survey(scene: Any, params: Any, state: Any, start: Any, control: Any) -> Any:
+    """Return the parameters with what effects look up once per step among their numbers: which edges can touch.
+
+    Args:
+        scene: static choices, see `scene.Scene`.
+        params: the rods' parameters before effects alter them, and the effects' numbers.
+        state: the scene when the step begins.
+        start: where held parts are then.
+        control: where held parts are at the end of the step.
+    """
+    with torch.no_grad():
+        carried = (control.pos - start.pos) * control.grip.get("vertices", 1.0)
+        leaves = tree.leaves((params, state.rods, carried))
+        batch = torch.broadcast_shapes(*(x.shape[:-2] for x in leaves))
+        pos, vel = (x.expand(*batch, *x.shape[-2:]) for x in (state.rods.pos, state.rods.vel))
+        there = tree.replace(state.rods, pos=pos, vel=vel)
+        changed = altered(scene.effects, scene.topology, params.rods, params.effects)
+        view = rod.view(scene.topology, changed, there, scene.dt)
+        carried = carried.expand(*batch, -1, -1)
+        found = {e.name: e.survey(view, carried) for e in scene.effects if e.reacts}
+    return tree.replace(params, effects=params.effects | {n: params.effects[n] | given for n, given in found.items()})
+
+
+def missed(scene: Any, params: Any, rods: RodState, before: Tensor) -> Tensor:
+    """Return what was missed so far, shape (..., 1, 3).
+
+    Args:
+        scene: static choices, see `scene.Scene`.
+        params: the rods' parameters before effects alter them, and the effects' numbers with what they looked up.
+        rods: the rods after a substep.
+        before: what was missed before.
+    """
+    contact, short = before.split((2, 1), -1)
+    for e in scene.effects:
+        if e.reacts:
+            contact = torch.maximum(contact, e.shortfall(rods.pos, params.effects[e.name]))
+    if scene.constrained:
+        short = torch.maximum(short, _shortened(scene, params, rods))
+    # A state may have been given a batch in some of its parts only.
+    batch = torch.broadcast_shapes(contact.shape[:-2], short.shape[:-2])
+    return torch.cat([x.expand(*batch, *x.shape[-2:]) for x in (contact, short)], -1)
+
+
+@torch.no_grad()
+def _shortened(scene: Any, params: Any, rods: RodState) -> Tensor:
+    """Return by what share of its length an edge is too short, 0 where it is by less than `SHORT`, (..., 1, 1)."""
+    held, after = set(scene.held_vertices), scene.topology.successor()
+    # Hands that hold both ends of an edge set its length.
+    solved = [m * (not {k, after[k]} <= held) for k, m in enumerate(scene.topology.edge_mask())]
+    changed = altered(scene.effects, scene.topology, params.rods, params.effects)
+    edge = rod.edge_vectors(scene.topology, rods.pos, changed.rest.edge_mask)
+    wanted = changed.rest.length * (1 + rods.tension / changed.material.stretch)
+    short = (1 - safe_norm(edge) / wanted.clamp(min=tiny(wanted))) * wanted.new_tensor(solved).unsqueeze(-1)
+    most = short.amax(-2, keepdim=True)
+    return torch.where(most > SHORT, most, 0.0)
+
+
+def explain(missed: Tensor) -> str:
+    """Return what went wrong and how to mend it, "" if nothing did."""
+    room, beyond, short = (float(x) for x in missed.reshape(-1, 3).amax(0))
+    if room > 0:
+        return (
+            f"contact had no room for {room:.0f} pairs of edges, edges or nodes; give a larger `room` to RodContact, "
+            "RodMatter or BodyMatter, whichever has one"
+        )
+    if beyond > 0:
+        return (
+            f"vertices went {1e3 * beyond:.2g} mm further within a step than contact looked; give RodContact a larger "
+            "`burst`, or shorten dt"
+        )
+    if short > 0:
+        return (
+            f"an edge became {short:.0%} shorter than it has to be: a straight rope was pressed along its line, or "
+            "jerked; lay it in a slight bend, move what holds it more slowly, or give it a finite `stretch`"
+        )
+    return ""

@@ -1,0 +1,1 @@
+"""Material points, and their coupling to ropes and rigid bodies."""

@@ -1,0 +1,1 @@
+"""Robots: kinematics, inverse kinematics, attachment of ropes to tools."""

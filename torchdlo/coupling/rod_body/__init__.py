@@ -1,0 +1,1 @@
+"""Contact of ropes with rigid bodies and between finger pads."""

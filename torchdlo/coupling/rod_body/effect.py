@@ -1,0 +1,257 @@
+"""Contact of ropes with rigid bodies, along whole edges, in both directions.
+
+Per substep, for every edge and every body: the two ends of the edge and the point between them that is nearest to the
+body (several where bodies are not convex), see `edge_points`. A point of the centreline at the share s of an edge has
+the gap g = distance - radius and the unit normal n, out of the body. From then on contact is as among ropes (see
+`contact`): no overlap at the end of the substep, n . (d_rod - d_body) >= -g with the motions d that are foreseen;
+rebound; Coulomb friction; forces by projected Jacobi sweeps with row sums as inverse masses, held vertices counted as
+heavy ones; then the lengths of the edges. All edges are tried with all bodies in every substep, so nothing can be
+missed for lack of room; the sign of the gap comes from the start of the substep, so a fast edge does not get past a
+thin post.
+
+The body takes the opposite impulse at the same place, its torque included: linear and angular momentum are exact. The
+normal force acts along the normal through the centreline. Friction acts at the surface of the rope, r n off the
+centreline; the couple that this makes is exerted by the ends of the edge, but for its part about the edge, which a
+centreline cannot exert: ropes slide across a body and do not roll on it.
+
+The derivative is the one of the step as computed, of nearest points and normals too; it is finite everywhere, and
+one-sided where a point starts to touch or to slide.
+
+Stewart and Trinkle 1996, doi:10.1002/(SICI)1097-0207(19960815)39:15<2673::AID-NME972>3.0.CO;2-I (velocity-level time
+stepping); Tonge, Benevolenski, Voroshilov 2012, doi:10.1145/2185520.2185601 (Jacobi sweeps with split masses).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from torchdlo.coupling.bodies.dynamics import BodyMotion, conjugate
+from torchdlo.coupling.bodies.segment_distance import EdgePoints, families, find
+from torchdlo.coupling.common.coulomb_friction import parting, rebounding, rub
+from torchdlo.coupling.rod_body import solver_op as body_sweeps
+from torchdlo.physics.effects.base import Effect, Motion, Push, Values
+from torchdlo.physics.linalg.numerics import cross, dot
+from torchdlo.physics.linalg.rotation import rotate
+from torchdlo.physics.rod.kinematics import View
+
+
+@dataclass(frozen=True)
+class _Axes:
+    """How the V slots of the rods and the K bodies meet in the points: F per slot, on an axis in front of the slots."""
+
+    view: View
+    of: Tensor
+    """1 where points are those of a body [1], shape (F, K, 1)."""
+
+    def wide(self, x: Tensor) -> Tensor:
+        """Return values of slots (..., V, C) at the points, shape (..., 1, V, C)."""
+        return x.unsqueeze(-3)
+
+    def of_bodies(self, x: Tensor) -> Tensor:
+        """Return values of bodies (..., K, C) at the points, shape (..., F, 1, C)."""
+        return (self.of * x.unsqueeze(-3)).sum(-2, keepdim=True)
+
+    def bodies(self, x: Tensor) -> Tensor:
+        """Return the sum of values of points (..., F, V, C) over the points of each body, shape (..., K, C)."""
+        return (self.of * x.sum(-2, keepdim=True)).sum(-3)
+
+    def vertices(self, first: Tensor, second: Tensor) -> Tensor:
+        """Return what points give to the two ends of their edges (..., F, V, C), summed over vertices, (..., V, C)."""
+        return first.sum(-3) + self.view.prev(second.sum(-3))
+
+
+@dataclass(frozen=True)
+class _Points:
+    """Points at the start of a substep, and how forces there act on ends of edges and on bodies."""
+
+    axes: _Axes
+    at: EdgePoints
+    real: Tensor
+    """1 for points of real edges [1], shape (..., F, V, 1)."""
+    tangent: Tensor
+    """Directions of the edges [1], shape (..., F, V, 3)."""
+    lever: Tensor
+    """Radius over length of the edges [1], shape (..., F, V, 1)."""
+    radius: Tensor
+    """Radius of the edges [m], shape (..., F, V, 1)."""
+
+    def exerted(self, normal: Tensor, friction: Tensor) -> Push:
+        """Return what normal forces (..., F, V, 1) and friction (..., F, V, 3) on the points exert [N]."""
+        at, s = self.at, self.at.share
+        whole = normal * at.normal + friction
+        couple = -cross(at.normal, friction)
+        pair = self.lever * cross(couple, self.tangent)
+        across = self.radius * (couple - self.tangent * dot(self.tangent, couple))
+        return Push(
+            self.axes.vertices((1 - s) * whole - pair, s * whole + pair),
+            self.axes.bodies(-whole),
+            self.axes.bodies(-cross(at.arm, whole) - across),
+        )
+
+    def seen(self, change: Tensor, bodies: BodyMotion) -> tuple[Tensor, Tensor]:
+        """Return how far points part from their body [m], (..., F, V, 1), and slip on it, (..., F, V, 3).
+
+        Args:
+            change: displacements of the vertices [m], shape (..., V, 3).
+            bodies: the bodies, with their displacements.
+        """
+        at, axes, n = self.at, self.axes, self.at.normal
+        after = axes.view.next(change) - change
+        stretch, turn = axes.wide(after), axes.of_bodies(bodies.turn)
+        apart = axes.wide(change) + at.share * stretch - axes.of_bodies(bodies.change) - cross(turn, at.arm)
+        # The surface of the rope is r n off the centreline: it moves by the turn of the edge against the body's, too.
+        across = turn - self.tangent * dot(self.tangent, turn)
+        slip = apart - cross(self.lever * cross(self.tangent, stretch) - self.radius * across, n)
+        along = dot(n, apart)
+        return along, slip - n * dot(n, slip)
+
+
+def _points(view: View, bodies: BodyMotion, pieces: int) -> _Points:
+    at = find(view, bodies, pieces)
+    count = [families(b, pieces) for b in bodies.bodies]
+    of = [[[float(k == j)] for k in range(len(count))] for j, n in enumerate(count) for _ in range(n)]
+    axes = _Axes(view, at.share.new_tensor(of))
+    mask, radius = view.params.rest.edge_mask, view.params.material.radius
+    return _Points(
+        axes, at, axes.wide(mask), axes.wide(view.tangent), axes.wide(radius / view.length), axes.wide(radius)
+    )
+
+
+@dataclass(frozen=True)
+class _Softness:
+    """How far points part or slip under one newton on every active point: row sums, so that sweeps converge."""
+
+    points: _Points
+    first: Tensor
+    """By how much a force counts as moving the first vertices of the edges [m/N], shape (..., 1, V, 1)."""
+    second: Tensor
+    """The same for the second ones [m/N], shape (..., 1, V, 1)."""
+    mobility: Tensor
+    """By how much a force moves the bodies [m/N], shape (..., F, V, 1)."""
+    turning: Tensor
+    """By how much a normal force, by turning the body, moves its own point, its root [m/N], shape (..., F, V, 1)."""
+    sliding: Tensor
+    """The same at most for a force across the normal, its root [m/N], shape (..., F, V, 1)."""
+
+    def _whole(self, active: Tensor, lever: Tensor) -> Tensor:
+        axes, s = self.points.axes, self.points.at.share
+        load = axes.vertices(active * (1 - s), active * s)
+        rod = (1 - s) * axes.wide(load) * self.first + s * axes.wide(axes.view.next(load)) * self.second
+        # |a . J b| <= |J^1/2 a| |J^1/2 b| for the levers a, b of two points and the answer J to torques.
+        count, levers = axes.of_bodies(axes.bodies(torch.cat([active, active * lever], -1))).split(1, -1)
+        return rod + self.mobility * count + lever * levers
+
+    def normal(self, active: Tensor) -> Tensor:
+        """Return by how much active points part [m/N], shape (..., F, V, 1)."""
+        return self._whole(active, self.turning)
+
+    def friction(self, active: Tensor) -> Tensor:
+        """Return by how much active points slip at most [m/N], shape (..., F, V, 1)."""
+        # Couples of one edge add up; those of neighbouring edges cancel where friction is even.
+        many = self.points.axes.wide(active.sum(-3))
+        return self._whole(active, self.sliding) + self.points.lever.square() * (self.first + self.second) * many
+
+
+def _softness(points: _Points, give: Tensor, bodies: BodyMotion) -> _Softness:
+    """Return how points give way; `give` is that of `Motion`."""
+    axes, at = points.axes, points.at
+    agility = axes.of_bodies(bodies.agility)
+    local = rotate(conjugate(axes.of_bodies(bodies.state.quat)), cross(at.arm, at.normal))
+    turning, sliding = dot(agility * local, local), agility.amax(-1, keepdim=True) * dot(at.arm, at.arm)
+    turning, sliding = (
+        torch.where(square > 0, torch.where(square > 0, square, 1.0).sqrt(), 0.0) for square in (turning, sliding)
+    )
+    return _Softness(
+        points, axes.wide(give), axes.wide(axes.view.next(give)), axes.of_bodies(bodies.mobility), turning, sliding
+    )
+
+
+@dataclass(frozen=True)
+class RodBody(Effect):
+    """Ropes stay outside rigid bodies, rebound, and rub with Coulomb friction; bodies feel the opposite.
+
+    Coefficients belong to the bodies, see `bodies.BodyParams`.
+    """
+
+    sweeps: int = 6
+    """Sweeps per round; more of them for light bodies under long ropes, and for less creep of sticking ropes."""
+    rounds: int = 1
+    """Rounds of contact and lengths per substep; more of them for hits of taut ropes."""
+    friction: bool = True
+    """Whether ropes rub; False is cheaper than coefficients of 0."""
+    pieces: int = 2
+    """Pieces of an edge whose nearest points are found one by one where bodies are not convex."""
+    recovery: float = 0.2
+    """Share of a shallow overlap that a substep removes; a small one lets ropes come to rest."""
+    slowest: float = 0.02
+    """Approach below which nothing rebounds [m/s]."""
+
+    name: ClassVar[str] = "rod_body"
+    kind: ClassVar[str] = "force"
+    reacts: ClassVar[bool] = True
+
+    def __post_init__(self) -> None:
+        for name, least in (("sweeps", 1), ("rounds", 1), ("pieces", 1), ("slowest", 0)):
+            if not getattr(self, name) >= least:
+                raise ValueError(f"RodBody: {name} is {getattr(self, name)}; expected at least {least}")
+        if not 0 < self.recovery <= 1:
+            raise ValueError(f"RodBody: recovery is {self.recovery}; expected a share above 0, up to 1")
+
+    def react(self, view: View, motion: Motion, values: Values) -> Push:
+        """Return the forces that keep ropes outside of bodies and rub [N]."""
+        bodies = motion.bodies
+        if body_sweeps.fits(bodies):
+            pieces = [families(b, self.pieces) - 2 for b in bodies.bodies]
+            law = (self.recovery, self.slowest)
+            return body_sweeps.push(view, motion, pieces, sweeps=self.sweeps, friction=self.friction, law=law)
+        points = _points(view, bodies, self.pieces)
+        along, slip = points.seen(motion.change, bodies)
+        wanted = self._target(points, view, bodies, along)
+        softness = _softness(points, motion.give, bodies)
+        normal, friction = torch.zeros_like(along), torch.zeros_like(slip)
+        push = None
+        for _ in range(self.sweeps):
+            if push is not None:
+                along, slip = points.seen(motion.change + motion.answer * push.force, bodies.pushed(push))
+            normal, friction = self._sweep(points, (normal, friction), (along, slip), wanted, softness, bodies)
+            push = points.exerted(normal, friction)
+        return push
+
+    def _target(self, points: _Points, view: View, bodies: BodyMotion, along: Tensor) -> Tensor:
+        """Return by how much points have to part at least [m], shape (..., F, V, 1)."""
+        wanted = parting(points.at.distance - points.radius, 0.1 * points.radius, self.recovery)
+        pressed = points.real * (along < wanted)
+        now = dataclasses.replace(bodies, change=bodies.state.vel, turn=bodies.state.omega)
+        approach = -points.seen(view.state.vel, now)[0]
+        restitution = points.axes.of_bodies(bodies.params.restitution)
+        return rebounding(wanted, pressed, approach, restitution, self.slowest, view.dt)
+
+    def _sweep(
+        self,
+        points: _Points,
+        forces: tuple[Tensor, Tensor],
+        motion: tuple[Tensor, Tensor],
+        wanted: Tensor,
+        softness: _Softness,
+        bodies: BodyMotion,
+    ) -> tuple[Tensor, Tensor]:
+        """Return normal forces and friction after one projected Jacobi sweep."""
+        active = points.real * ((forces[0] > 0) | (motion[0] < wanted))
+        normal = (forces[0] + _step(wanted - motion[0], softness.normal(active), active)).clamp(min=0.0)
+        if not self.friction:
+            return normal, forces[1]
+        # Where nothing presses, nothing rubs: those points have no part in how far the others slip.
+        active = points.real * (normal > 0)
+        mu_s, mu_k = (points.axes.of_bodies(mu) for mu in (bodies.params.mu_s, bodies.params.mu_k))
+        return normal, rub(forces[1] - _step(motion[1], softness.friction(active), active), normal, mu_s, mu_k)
+
+
+def _step(miss: Tensor, softness: Tensor, active: Tensor) -> Tensor:
+    """Return the forces that would undo displacements at active points; where nothing can move there are none."""
+    mobile = active * (softness > 0)
+    return mobile * miss / torch.where(mobile > 0, softness, 1.0)

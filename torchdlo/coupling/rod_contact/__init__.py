@@ -1,0 +1,1 @@
+"""Contact of ropes with each other and with themselves."""

@@ -1,0 +1,1 @@
+"""Arms, rope materials and rigid objects of tasks."""

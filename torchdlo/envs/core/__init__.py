@@ -1,0 +1,1 @@
+"""What all tasks share: protocol, episodes, the TorchRL environment."""

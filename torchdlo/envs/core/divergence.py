@@ -1,0 +1,43 @@
+"""Hands that are led into what does not give way, and ropes that broke down."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from torchdlo.coupling.bodies import shape_sdf
+from torchdlo.coupling.bodies.dynamics import conjugate
+from torchdlo.physics.effects.base import altered
+from torchdlo.physics.linalg.numerics import safe_norm
+from torchdlo.physics.linalg.rotation import rotate
+from torchdlo.physics.rod.kinematics import edge_vectors
+from torchdlo.scene import Params, Scene, State
+
+__all__ = ["broken", "inside"]
+
+_OFF = 0.1
+"""Share by which the edges of inextensible ropes may miss their lengths; solved ones miss them by 1e-6."""
+
+_RIGID = 1e12
+"""Axial stiffness from which ropes are inextensible [N]: effects have large numbers where ropes have infinite ones."""
+
+
+def inside(scene: Scene, params: Params, state: State, points: Tensor) -> Tensor:
+    """Return which points [m], shape (B, N, 3), are inside a body that is not free, bool, shape (B, N)."""
+    found = torch.zeros(points.shape[:-1], dtype=torch.bool, device=points.device)
+    for k, body in enumerate(scene.bodies):
+        if body.motion != "free":
+            one = slice(k, k + 1)
+            away = rotate(conjugate(state.bodies.quat[:, one]), points - state.bodies.pos[:, one])
+            size, grid = (x[..., one, :] for x in (params.bodies.size, params.bodies.grid))
+            found = found | (shape_sdf.distance(body.shape, size, away, grid, body.cells)[..., 0] < 0)
+    return found
+
+
+def broken(scene: Scene, params: Params, state: State) -> Tensor:
+    """Return where inextensible ropes lost their lengths: numbers, but no motion; bool, shape (B,)."""
+    rods = altered(scene.effects, scene.topology, params.rods, params.effects)
+    rest = rods.rest
+    length = safe_norm(edge_vectors(scene.topology, state.rods.pos, rest.edge_mask))
+    fixed = (rods.material.stretch >= _RIGID) & (rest.edge_mask > 0)
+    return (fixed & ((length - rest.length).abs() > _OFF * rest.length)).any(-1).any(-1)

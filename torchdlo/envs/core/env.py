@@ -1,0 +1,207 @@
+"""Tasks as TorchRL environments: the only place where physics meets TensorDict.
+
+The environment keeps the state of its scenes itself; tensordicts hold actions, observations and rewards.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from numbers import Integral
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.data import Binary, Bounded, Composite, Unbounded
+from torchrl.envs import EnvBase
+
+from torchdlo.envs.core import episode as episodes
+from torchdlo.envs.core.episode import World
+from torchdlo.envs.core.task import Task, combined
+from torchdlo.errors import InputError
+from torchdlo.physics import tree
+from torchdlo.scene import Params, Scene
+
+__all__ = ["DloEnv"]
+
+
+class DloEnv(EnvBase):
+    """A batch of scenes of one task. See `torchdlo.envs.make`."""
+
+    def __init__(
+        self,
+        task: Task,
+        *,
+        num_envs: int = 1,
+        device: torch.device | str | None = None,
+        dtype: torch.dtype = torch.float32,
+        seed: int | None = None,
+        gradients: bool = False,
+        compiled: bool = True,
+        recorded: bool = False,
+        segment: int | None = 1,
+        variation: bool = True,
+        randomize: Mapping[str, float] | None = None,
+    ) -> None:
+        """Make the scenes; arguments as in `torchdlo.envs.make`."""
+        if not isinstance(num_envs, Integral) or isinstance(num_envs, bool) or num_envs < 1:
+            raise InputError(
+                f"num_envs: it is {num_envs!r}; expected how many scenes there are, a whole number from 1 on."
+            )
+        super().__init__(device=device or "cpu", batch_size=torch.Size([num_envs]))
+        self.task, self.gradients, self.variation = task, gradients, variation
+        self._like = torch.zeros((), dtype=dtype, device=self.device)
+        self._generator = torch.Generator()
+        self._randomize = dict(randomize or {})
+        made = episodes.prepare(task, num_envs, like=self._like, compiled=compiled, recorded=recorded, segment=segment)
+        _check(self._randomize, made.scene)
+        self.episode, self.world, self._usual = made, made.start, made.params
+        self._make_specs()
+        self.set_seed(seed)
+
+    def _make_specs(self) -> None:
+        shape, device = self.batch_size, self.device
+        size = episodes.observe(self.episode, self.world).shape[-1]
+        limit = torch.tensor(self.task.limit, device=device).expand(*shape, -1)
+        self.action_spec = Bounded(-limit, limit, (*shape, self.task.width), device=device, dtype=torch.float32)
+        flag = Binary(1, (*shape, 1), device=device, dtype=torch.bool)
+        names = self.task.rewards(self.world.seen(self.task.arms.count))
+        combined(self.task, names, len(self.world.failed))  # says what is wrong before the first step
+        one = Unbounded((*shape, 1), device=device, dtype=torch.float32)
+        self.observation_spec = Composite(
+            observation=Unbounded((*shape, size), device=device, dtype=torch.float32),
+            success=flag.clone(),
+            terms=Composite({name: one.clone() for name in names}, shape=shape, device=device),
+            shape=shape,
+            device=device,
+        )
+        self.reward_spec = one.clone()
+        self.done_spec = Composite(
+            done=flag.clone(), terminated=flag.clone(), truncated=flag.clone(), shape=shape, device=device
+        )
+
+    def _set_seed(self, seed: int | None) -> None:
+        # Without a seed, torch's own generator decides, so that torch.manual_seed holds here too.
+        self._generator.manual_seed(int(torch.randint(2**31, (), device="cpu")) if seed is None else seed)
+
+    def to(self, device: torch.device | str | int | torch.dtype) -> DloEnv:
+        """Return the environment if it is on that device, or in that precision, already.
+
+        Raises:
+            InputError: It is not: steps are made for one of each.
+        """
+        if isinstance(device, torch.dtype):
+            what, now, there = "dtype", self._like.dtype, device == self._like.dtype
+        else:
+            what, now, asked = "device", self.device, torch.device(device)
+            there = (asked.type, asked.index or 0) == (now.type, now.index or 0)
+        if not there:
+            raise InputError(
+                f"to: scenes were made with {what} {now} and cannot go to {device}; "
+                f"give {what}= to `envs.make` instead."
+            )
+        return self
+
+    def detach(self) -> None:
+        """Cut the state from its gradient history, as one does between windows of a long episode."""
+        self.world = tree.detach(self.world)
+
+    def _told(self, terms: dict[str, Tensor]) -> dict[str, Any]:
+        seen = self.world.seen(self.task.arms.count)
+        return {
+            "observation": episodes.observe(self.episode, self.world),
+            "success": (self.task.success(seen) & ~self.world.failed).unsqueeze(-1),
+            "terms": TensorDict({n: t.float().unsqueeze(-1) for n, t in terms.items()}, self.batch_size, self.device),
+        }
+
+    def _reset(self, tensordict: TensorDictBase | None, **_: Any) -> TensorDict:
+        mask = None if tensordict is None else tensordict.get("_reset", None)
+        again = torch.ones_like(self.world.failed) if mask is None else mask.reshape(self.batch_size)
+        with torch.no_grad():
+            self._draw(again)
+            fresh = self._fresh()
+        # Scenes that go on keep their gradient history.
+        with torch.set_grad_enabled(self.gradients and torch.is_grad_enabled()):
+            self.world = fresh if bool(again.all()) else tree.where(again, fresh, self.world)
+            terms = self.task.rewards(self.world.seen(self.task.arms.count))
+            ended = torch.zeros(*self.batch_size, 1, dtype=torch.bool, device=self.device)
+            flags = {name: ended.clone() for name in ("done", "terminated", "truncated")}
+            return TensorDict({**self._told(terms), **flags}, self.batch_size, self.device)
+
+    def _draw(self, again: Tensor) -> None:
+        """Draw the numbers of effects that are randomised, for the scenes that begin again."""
+        if self._randomize:
+            drawn = drawn_effects(self._usual, self.episode.scene, self._randomize, self._generator, len(again))
+            effects = tree.where(again, drawn, _wide(self.episode.params.effects, drawn))
+            self.episode = dataclasses.replace(self.episode, params=tree.replace(self.episode.params, effects=effects))
+
+    def _fresh(self) -> World:
+        """Return the worlds of new episodes."""
+        # Scenes settle with their own numbers.
+        if not self.variation and not (self._randomize and self.task.settle):
+            return self.episode.start
+        choices = {"like": self._like, "generator": self._generator, "variation": self.variation}
+        return episodes.begin(self.episode, self.task.start(len(self.world.count), **choices)[2])
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDict:
+        with torch.set_grad_enabled(self.gradients and torch.is_grad_enabled()):
+            return self._stepped(tensordict.get("action"))
+
+    def _stepped(self, action: Tensor) -> TensorDict:
+        world = episodes.act(self.episode, self.world, action.to(self._like.dtype))
+        over = world.count >= self.task.horizon
+        if self.task.release and bool(over.any()):
+            world = tree.where(over, episodes.finish(self.episode, world), world)
+        self.world = world
+        reward, _, terms = episodes.earned(self.episode, world)
+        failed, over = world.failed.unsqueeze(-1), over.unsqueeze(-1)
+        flags = {"terminated": failed, "truncated": over, "done": failed | over}
+        found = {**self._told(terms), "reward": reward.float().unsqueeze(-1), **flags}
+        return TensorDict(found, self.batch_size, self.device)
+
+
+def _wide(effects: dict[str, dict[str, Tensor]], like: dict[str, dict[str, Tensor]]) -> dict[str, dict[str, Tensor]]:
+    """Return numbers in the shapes that drawn ones have."""
+    return tree.map(lambda x, y: x.expand(y.shape), effects, like)
+
+
+def _declared(scene: Scene, name: str) -> Any:
+    effect, _, number = name.partition(".")
+    params = {e.name: e.params for e in scene.effects}.get(effect, {})
+    return params.get(number)
+
+
+def _check(shares: Mapping[str, float], scene: Scene) -> None:
+    known = sorted(f"{e.name}.{number}" for e in scene.effects for number in e.params)
+    for name, share in shares.items():
+        if _declared(scene, name) is None:
+            raise ValueError(f"randomize: there is no number {name!r} in this task; it has {', '.join(known)}")
+        if not 0 <= share <= 1:
+            raise ValueError(f"randomize: {name} is {share}; expected a share of its declared range, 0 to 1")
+
+
+def drawn_effects(
+    params: Params, scene: Scene, shares: Mapping[str, float], generator: torch.Generator, count: int
+) -> dict[str, dict[str, Tensor]]:
+    """Return numbers of effects, those that are named drawn anew for each scene, shape (count, 1, C).
+
+    A number is drawn evenly, on the scale on which it is declared, from an interval about its value: that share of the
+    whole declared range, cut off at the range's ends. Static friction `mu_s` is raised to sliding friction `mu_k` where
+    it would be less.
+    """
+    found = {
+        effect: {name: x.expand(count, 1, x.shape[-1]) for name, x in v.items()} for effect, v in params.effects.items()
+    }
+    for name, share in shares.items():
+        (effect, _, number), param = name.partition("."), _declared(scene, name)
+        value = found[effect][number]
+        ends = [param.coordinate(value.new_tensor(float(end))) for end in (param.low, param.high)]
+        low, high = min(ends), max(ends)
+        random = torch.rand(value.shape, generator=generator, dtype=torch.float64).to(value)
+        at = param.coordinate(value) + share * (high - low) * (random - 0.5)
+        found[effect][number] = param.value(torch.minimum(torch.maximum(at, low), high))
+    for effect in {name.partition(".")[0] for name in shares}:
+        if {"mu_s", "mu_k"} <= found[effect].keys():
+            found[effect]["mu_s"] = torch.maximum(found[effect]["mu_s"], found[effect]["mu_k"])
+    return found

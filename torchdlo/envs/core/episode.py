@@ -1,0 +1,389 @@
+"""Running tasks: from actions to joints, from joints to the ends that are held, and what an episode earned.
+
+Everything is a function of tensors, scenes of a batch first; nothing here knows of TensorDict. Actions move the target
+of each tool from the pose that was reached last, inverse kinematics says where the joints go, and in the frames of an
+action the tool moves evenly from pose to pose with what it holds. Links of arms pass through ropes and bodies.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchdlo import scene as scenes
+from torchdlo.coupling.bodies.dynamics import turn_by
+from torchdlo.coupling.common.pose import Pose
+from torchdlo.coupling.robot import attachment as grasp
+from torchdlo.coupling.robot import inverse_kinematics
+from torchdlo.coupling.robot.attachment import Grasp, Hands
+from torchdlo.coupling.robot.kinematics import Robot, panda
+from torchdlo.envs.core.divergence import broken, inside
+from torchdlo.envs.core.frames import guarded, run, slipped
+from torchdlo.envs.core.stages import repeated
+from torchdlo.envs.core.task import Seen, Task, combined
+from torchdlo.errors import InputError
+from torchdlo.physics import tree
+from torchdlo.physics.linalg.numerics import safe_norm
+from torchdlo.physics.linalg.rotation import multiply
+from torchdlo.scene import Control, Params, Scene, State
+
+__all__ = ["Episode", "Outcome", "World", "act", "begin", "normalized", "observe", "places", "play", "prepare"]
+
+POSTURE = (1.56, -0.72, -0.02, -2.09, 0.04, 1.33, 2.4, 0.0)
+"""Where joints would like to be [rad], and how far the fingers are open [m]."""
+FIND = inverse_kinematics.Search(starts=8)
+"""How hard to look for the joints of the start."""
+FOLLOW = inverse_kinematics.Search(steps=4, closing=2, polish=2)
+"""The same for those of an action, which are near the last ones."""
+ELBOWS = 7
+"""Joints of an arm that are observed."""
+
+
+@tree.struct
+class World:
+    """A running episode: scenes and the arms in them."""
+
+    state: State
+    joints: Tensor
+    """Joints of the arms [rad or m], shape (B, R, J)."""
+    target: Pose
+    """Pose to which the next action is added: the last target, or what was reached of it; (B, R, 3) and (B, R, 4)."""
+    tool: Pose
+    """Where the tools are, (B, R, 3) and (B, R, 4)."""
+    grasp: Grasp
+    notes: dict[str, Tensor]
+    """What the task remembers, shapes (B, ...)."""
+    failed: Tensor
+    """Whether the episode has failed [-], bool, shape (B,)."""
+    count: Tensor
+    """Actions done [1], whole, shape (B,)."""
+
+    def seen(self, hands: int) -> Seen:
+        """Return what a task judges."""
+        return Seen(self.state, self.tool, self.grasp.closed.unflatten(-2, (hands, -1)).amax(-2), self.notes)
+
+
+@tree.struct
+class Outcome:
+    """What episodes came to."""
+
+    returns: Tensor
+    """Sums of rewards [1], shape (B,)."""
+    loss: Tensor
+    """What gradients should descend: minus the return, and what the task adds to it [1], shape (B,).
+
+    That of an episode that failed has terms from before it did only, and may be small: mask it by `failed`.
+    """
+    shortfall: Tensor
+    """What the loss has for how far the end is from success, see `Task.shortfall` [1], shape (B,)."""
+    success: Tensor
+    """Which episodes reached the goal [-], bool, shape (B,)."""
+    failed: Tensor
+    """Which failed; they earn nothing from then on [-], bool, shape (B,)."""
+    rewards: Tensor
+    """Rewards of the actions [1], shape (T, B)."""
+    terms: dict[str, Tensor]
+    """Terms of the reward by name [1], shape (T, B) each."""
+    world: World
+    """The end."""
+    path: dict[str, Tensor] = field(default_factory=dict)
+    """What `keep` returned after every action, (T, ...) each."""
+
+
+@dataclass(frozen=True, eq=False)
+class Episode:
+    """A task with its scene, made for a batch; the parts that stay the same."""
+
+    task: Task
+    scene: Scene
+    params: Params
+    step: Callable[[Params, State, Control], State]
+    """What advances the scene by a frame."""
+    hands: Hands
+    start: World
+    segment: int | None = None
+    """Frames that gradients run again at once, None to keep all of them, see `physics.execution.replay`."""
+
+
+@functools.cache
+def _robot() -> Robot:
+    return panda()
+
+
+def _bases(task: Task, like: Tensor) -> Tensor:
+    return like.new_tensor(task.arms.base)
+
+
+def _solve(task: Task, target: Pose, joints: Tensor, search: inverse_kinematics.Search) -> inverse_kinematics.Solution:
+    """Return where joints bring the tools to their targets. All arms are alike, so they are one more batch axis."""
+    base = _bases(task, joints)
+    wanted = Pose(target.pos - base, target.quat)
+    found = inverse_kinematics.solve(_robot(), wanted, joints, search=search, posture=joints.new_tensor(POSTURE))
+    moved = [Pose(p.pos + base, p.quat) for p in (found.pose, found.handed)]
+    return tree.replace(found, pose=moved[0], handed=moved[1])
+
+
+def hands_of(task: Task, scene: Scene) -> Hands:
+    """Return which grips of the task's hands hold what; what no hand ever holds is fixed."""
+    plan = task.schedule
+    fixed = len(scene.held_vertices) - len(plan.held)
+    return Hands(task.arms.count * plan.room, (*plan.tools, *[-1] * fixed))
+
+
+def _begin(task: Task, scene: Scene, state: State, hands: Hands) -> World:
+    """Return the world before the first action: tools stand at what they hold."""
+    x = state.rods.pos
+    pos = x[:, list(task.arms.vertex)]
+    quat = x.new_tensor(task.arms.quats)
+    target = Pose(pos, (quat / quat.norm(dim=-1, keepdim=True)).expand(*pos.shape[:-1], 4))
+    # An arm that faces its tool has the most room to move; contorted ones may be nearer to the posture.
+    posture, off = x.new_tensor(POSTURE).expand(*pos.shape[:-1], -1), pos - _bases(task, x)
+    facing = torch.cat([torch.atan2(off[..., 1:2], off[..., :1]), posture[..., 1:]], -1)
+    plain, found = (
+        tree.detach(_solve(task, target, *guess)) for guess in ((facing, inverse_kinematics.Search()), (posture, FIND))
+    )
+    found = tree.where(plain.converged, plain, found)
+    if not bool(found.converged.all()):
+        far = found.missing.reshape(-1, 2).amax(0)
+        raise InputError(
+            f"{task.name}: an arm cannot reach the vertex that it is to hold, by {1e3 * far[0]:.0f} mm and "
+            f"{math.degrees(far[1]):.1f} degrees; place its base or the rope nearer to each other."
+        )
+    failed = torch.zeros(x.shape[0], dtype=torch.bool, device=x.device)
+    plan, none = task.schedule, torch.zeros_like(failed, dtype=torch.long)
+    closed = plan.closed(none, target, x)
+    held = grasp.weld(scene, hands, scenes.hold(scene, state), repeated(target, plan.room), closed)
+    world = World(state, found.joints, target, target, held, {}, failed, none)
+    seen = world.seen(task.arms.count)
+    return tree.replace(world, notes={"rest": task.rest(seen, scene.topology), **task.note(seen)})
+
+
+def begin(episode: Episode, state: State) -> World:
+    """Return the world of an episode whose scenes start in a state, shape (B, ...)."""
+    return _settled(episode, _begin(episode.task, episode.scene, state, episode.hands))
+
+
+def _settled(episode: Episode, world: World) -> World:
+    """Return the world after the frames before the first action."""
+    count = episode.task.settle
+    if not count:
+        return world
+    state = run(episode, world, world.tool, world.grasp, count)
+    return tree.replace(world, state=state)
+
+
+def prepare(
+    task: Task,
+    num: int,
+    *,
+    like: Tensor | None = None,
+    generator: torch.Generator | None = None,
+    variation: bool = False,
+    compiled: bool = True,
+    recorded: bool = False,
+    segment: int | None = None,
+) -> Episode:
+    """Return an episode of a task for a batch.
+
+    Args:
+        task: the task.
+        num: scenes in the batch.
+        like: a tensor of the dtype and device that they get; float32 on the CPU if not given.
+        generator: where random numbers come from.
+        variation: whether starts differ.
+        compiled: whether to compile steps; `recorded`: if not, whether to record them, see `scene.stepper`.
+        segment: frames that gradients run again at once; None keeps all of them in memory.
+    """
+    scene, params, state = task.start(num, like=like, generator=generator, variation=variation)
+    hands = hands_of(task, scene)
+    step = scenes.stepper(scene, compiled=compiled, recorded=recorded)
+    world = _begin(task, scene, state, hands)
+    episode = Episode(task, scene, params, step, hands, world, segment)
+    return episode if not task.settle else replace(episode, start=_settled(episode, world))
+
+
+def limited(task: Task, action: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the ways [m] and turns [rad] of the tools that an action (B, A) asks for, (B, R, 3) each.
+
+    Ways that are too long keep their direction.
+    """
+    if action.shape[-1] != task.width:
+        raise ValueError(
+            f"{task.name}: actions have {action.shape[-1]} components; expected {task.width}: ways of "
+            f"{task.arms.count} tools in x, y, z [m], then their turns about x, y, z [degrees]"
+        )
+    way, turn = action.unflatten(-1, (2, task.arms.count, 3)).unbind(-3)
+    far = safe_norm(way)
+    way = way * torch.where(far > task.reach, task.reach / torch.where(far > 0, far, 1.0), 1.0)
+    return way, torch.deg2rad(turn.clamp(-task.twist, task.twist))
+
+
+def _aim(task: Task, world: World, action: Tensor) -> Pose:
+    """Return the poses that an action asks the tools to take."""
+    way, turn = limited(task, action)
+    pos = world.target.pos + way
+    # A tool that starts lower is not lifted by the rule, but may not go down.
+    least = world.target.pos[..., 2:].detach().clamp(max=task.floor)
+    height = torch.where(pos[..., 2:] >= least, pos[..., 2:], least)
+    quat = multiply(world.target.quat, turn_by(turn))
+    return Pose(torch.cat([pos[..., :2], height], -1), quat / quat.square().sum(-1, keepdim=True).sqrt())
+
+
+def act(episode: Episode, world: World, action: Tensor) -> World:
+    """Return the world after an action, shape (B, A) in metres and degrees; see `Task.width`.
+
+    Scenes that are no longer finite stay as they were and have failed. Nothing has a slope through an action in which
+    a scene broke.
+    """
+    task, lost = episode.task, []
+    before, action = guarded((world, action), len(world.failed), lost)
+    aim, held = _aim(task, before, action), before.grasp
+    if len(task.schedule.stages) > 1:
+        aim, held = _staged(episode, before, aim)
+    found = _solve(task, aim, before.joints, FOLLOW)
+    state = run(episode, before, found.pose, held, task.frames)
+    held = tree.replace(held, closed=slipped(episode, state, found.pose, held.closed))
+    after = World(state, found.joints, found.handed, found.pose, held, world.notes, world.failed, world.count)
+    return tree.replace(_judged(episode, world, after, lost), count=world.count + 1)
+
+
+def _staged(episode: Episode, world: World, aim: Pose) -> tuple[Pose, Grasp]:
+    """Return where tools are to go and what they hold in an action: hands open, travel and close as stages say."""
+    plan, x = episode.task.schedule, world.state.rods.pos
+    closed = plan.closed(world.count, world.tool, x, world.grasp.closed)
+    now = scenes.hold(episode.scene, world.state)
+    held = grasp.weld(episode.scene, episode.hands, now, repeated(world.tool, plan.room), closed, world.grasp)
+    return plan.steer(world.count, world.target, aim, x), held
+
+
+def _judged(episode: Episode, before: World, after: World, lost: list[Tensor]) -> World:
+    """Return the new world with its notes and failures, and the old one where the new one is not finite.
+
+    `lost` gets which scenes broke, shape (B,).
+    """
+    task, good = episode.task, scenes.finite(after.state)
+    after = tree.where(good, after, before)
+    notes = task.note(after.seen(task.arms.count))
+    after = tree.replace(after, notes={"rest": before.notes["rest"], **notes})
+    seen = after.seen(task.arms.count)
+    torn = (task.rest(seen, episode.scene.topology) > task.stretch * seen.notes["rest"]).any(-1)
+    stuck = (inside(episode.scene, episode.params, after.state, after.tool.pos) & (seen.closed[..., 0] > 0)).any(-1)
+    lost.append(~good | broken(episode.scene, episode.params, after.state))
+    return tree.replace(after, failed=before.failed | lost[0] | torn | stuck | task.failed(seen))
+
+
+def finish(episode: Episode, world: World) -> World:
+    """Return the world after the hands have opened at the end, for tasks that ask for it."""
+    task = episode.task
+    if not task.release:
+        return world
+    lost: list[Tensor] = []
+    before = guarded(world, len(world.failed), lost)
+    held = tree.replace(before.grasp, closed=torch.zeros_like(world.grasp.closed))
+    state = run(episode, before, before.tool, held, task.release)
+    return _judged(episode, world, tree.replace(before, state=state, grasp=held, notes=world.notes), lost)
+
+
+def earned(episode: Episode, world: World) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
+    """Return the reward of the last action, its loss, and the terms of the reward, shape (B,) each."""
+    task, seen = episode.task, world.seen(episode.task.arms.count)
+    terms = task.rewards(seen)
+    reward = combined(task, terms, len(world.failed))
+    loss = sum(task.extra(seen).values(), -reward)
+    return torch.where(world.failed, 0.0, reward), torch.where(world.failed, 0.0, loss), terms
+
+
+def observe(episode: Episode, world: World) -> Tensor:
+    """Return observations in single precision, shape (B, O).
+
+    Positions and velocities of vertices, of free bodies and of the middle of matter; then positions, orientations and
+    joint angles of the arms.
+    """
+    state = world.state
+    parts = [state.rods.pos, state.rods.vel]
+    free = [k for k, body in enumerate(episode.scene.bodies) if body.motion == "free"]
+    if free:
+        parts += [state.bodies.pos[:, free], state.bodies.vel[:, free]]
+    if state.matter:
+        parts += [state.matter.pos.mean(-2, keepdim=True), state.matter.vel.mean(-2, keepdim=True)]
+    parts += [world.tool.pos, world.tool.quat, world.joints[..., :ELBOWS]]
+    return torch.cat([p.flatten(-2) for p in parts], -1).to(torch.float32)
+
+
+def places(world: World) -> dict[str, Tensor]:
+    """Return where things are: "pos" (B, V, 3) of the ropes, "tool" (B, R, 3) and "joints" (B, R, J)."""
+    return {"pos": world.state.rods.pos, "tool": world.tool.pos, "joints": world.joints}
+
+
+def play(
+    task: Task,
+    actions: Tensor,
+    *,
+    episode: Episode | None = None,
+    keep: Callable[[World], dict[str, Tensor]] = lambda _: {},
+    callback: Callable[[int, int], None] | None = None,
+    **choices: Any,
+) -> Outcome:
+    """Return what actions earn, with gradients with respect to them.
+
+    Args:
+        task: the task.
+        actions: shape (B, T, A), in metres and degrees; one sequence per scene, of any length.
+        episode: what `prepare` returned for B scenes; made if not given.
+        keep: what to keep of the world after every action, such as `places`.
+        callback: told (actions done, actions in all) after each.
+        choices: of `prepare`.
+    """
+    if actions.dim() != 3 or 0 in actions.shape:
+        raise ValueError(f"{task.name}: actions are {tuple(actions.shape)}; expected (scenes, actions, {task.width})")
+    if episode is not None and choices:
+        raise InputError(
+            f"{task.name}: {', '.join(choices)} beside an episode that is prepared already; give choices to `prepare`, "
+            "or leave the episode out."
+        )
+    if episode is not None and episode.task is not task and episode.task != task:
+        raise InputError(
+            f"{task.name}: the episode is of {episode.task}; expected one of {task}: play it with `episode.task`, or "
+            "prepare another."
+        )
+    episode = episode or prepare(task, len(actions), like=actions.detach(), **choices)
+    world, count, rows, path = episode.start, actions.shape[1], [], []
+    if len(world.joints) != len(actions):
+        raise ValueError(f"{task.name}: {len(actions)} sequences for an episode of {len(world.joints)} scenes")
+    for k in range(count):
+        world = act(episode, world, actions[:, k])
+        if k + 1 == count:
+            world = finish(episode, world)
+        rows.append(earned(episode, world))
+        path.append(keep(world))
+        if callback is not None:
+            callback(k + 1, count)
+    rewards, losses, terms = tree.stack(rows)
+    seen = world.seen(task.arms.count)
+    success, short = task.success(seen) & ~world.failed, task.shortfall(seen)
+    loss = losses.sum(0) + torch.where(world.failed, 0.0, short)
+    return Outcome(rewards.sum(0), loss, short, success, world.failed, rewards, terms, world, tree.stack(path))
+
+
+def normalized(task: Task, returns: Tensor, **choices: Any) -> Tensor:
+    """Return scores of episodes: 0 for doing nothing, 1 for the way by hand of `Task.reference`, shape of `returns`.
+
+    Both are played for it, which takes as long as an episode of two scenes.
+
+    Args:
+        task: the task.
+        returns: returns of episodes from its one start, without variation.
+        choices: of `prepare`.
+    """
+    way = task.reference().to(returns)
+    if not bool((way != 0).any()):
+        raise ValueError(f"{task.name}: has no way by hand to compare with; give it `waypoints`")
+    with torch.no_grad():
+        idle, best = play(task, torch.stack([torch.zeros_like(way), way]), **choices).returns.to(returns)
+    return (returns - idle) / (best - idle)

@@ -1,0 +1,389 @@
+"""What a manipulation task is: a scene, arms that hold ropes, a reward, and when it has succeeded or failed.
+
+A task is a frozen dataclass without tensors. `episode` runs it, `env` offers it to TorchRL.
+"""
+
+from __future__ import annotations
+
+import functools
+import itertools
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import ClassVar, Literal
+
+import torch
+from torch import Tensor
+
+from torchdlo import scene as scenes
+from torchdlo.coupling import BodyContact, RodBody, RodContact, RodMatter
+from torchdlo.coupling.bodies.dynamics import Solid
+from torchdlo.coupling.common.pose import Pose
+from torchdlo.envs.assets.arms import DOWN, Arms
+from torchdlo.envs.assets.rope_material import Cable
+from torchdlo.envs.core import curve_geometry
+from torchdlo.envs.core.stages import Schedule, Stage
+from torchdlo.errors import InputError
+from torchdlo.physics import tree
+from torchdlo.physics.effects.base import Effect
+from torchdlo.physics.effects.elastic import Bend, BendFrame, Stretch
+from torchdlo.physics.effects.external import Damping, Gravity
+from torchdlo.physics.effects.table import Table, TableFriction
+from torchdlo.physics.rod.topology import Topology
+from torchdlo.scene import Params, Rope, Scene, State
+
+__all__ = [
+    "DOWN",
+    "RADIUS",
+    "SPACING",
+    "Arms",
+    "Seen",
+    "Stage",
+    "Task",
+    "combined",
+    "even",
+    "make",
+    "raised",
+    "settled",
+    "straight",
+    "through",
+]
+
+RADIUS, SPACING = 0.01, 0.02
+"""Radius of all ropes and distance of their vertices [m]."""
+
+
+@tree.struct
+class Seen:
+    """What rewards, success and failure are judged by, after an action."""
+
+    state: State
+    tool: Pose
+    """Where the tools are: positions (B, R, 3) and orientations (B, R, 4)."""
+    closed: Tensor
+    """1 for hands that hold, 0 for those that are open or lost the rope [1], shape (B, R, 1)."""
+    notes: dict[str, Tensor]
+    """What the task remembers since the start, see `Task.note`; shapes (B, ...)."""
+
+    @property
+    def x(self) -> Tensor:
+        """Positions of all vertices [m], shape (B, V, 3)."""
+        return self.state.rods.pos
+
+
+@dataclass(frozen=True)
+class Task(ABC):
+    """A task. Subclasses are final; what they leave as it is here is a rule of all tasks."""
+
+    horizon: int = 100
+    """Actions in an episode."""
+    frames: int = 20
+    """Steps of the scene per action."""
+    settle: int = 0
+    """Steps before the first action."""
+    release: int = 0
+    """Steps after the last action with open hands; the last reward is the one after them."""
+    rope: Cable | None = None
+    """What all ropes are made of, if not what the task says."""
+
+    name: ClassVar[str]
+    """Its name in `envs.TASKS`."""
+    arms: ClassVar[Arms]
+    combine: ClassVar[Literal["sum", "product"]] = "sum"
+    """How the terms of `rewards` make the one reward."""
+    floor: ClassVar[float] = 0.03
+    """Height below which tools are not led [m]."""
+    reach: ClassVar[float] = 0.01
+    """Greatest way of a tool in an action [m]."""
+    twist: ClassVar[float] = 0.1
+    """Greatest turn of a tool in an action about each of its axes [degrees]."""
+    stretch: ClassVar[float] = math.inf
+    """Length of the rope between the hands over that at the start, above which an episode has failed [1]."""
+    spread: ClassVar[tuple[tuple[float, float], ...]] = ((0.0, 0.0),)
+    """By how much each of the things that `build` can move is moved in x and in y at most [m]."""
+    anchored: ClassVar[bool] = False
+    """Whether ways by hand lead to the same places wherever the rope starts, as what they lead to is fixed."""
+    stages: ClassVar[tuple[Stage, ...]] = ()
+    """What hands hold from which action on; if not given, they hold what they start at until the end."""
+    travel: ClassVar[int] = 10
+    """Actions that a hand takes from what it held to what it holds in the next stage."""
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.rope, Cable | None):
+            raise InputError(
+                f"rope: it is {self.rope!r}; expected a torchdlo.envs.Cable; torchdlo.scene_files.cable(path) makes one "
+                "of a model file."
+            )
+
+    @property
+    def schedule(self) -> Schedule:
+        """The stages of the task, one at least."""
+        return _schedule(self.stages or (Stage(0, self.arms.vertex),), self.travel)
+
+    @property
+    def width(self) -> int:
+        """Components of an action: ways of all tools (x, y, z in the world) [m], then their turns about x, y, z of the
+        tool [degrees]."""
+        return 6 * self.arms.count
+
+    @property
+    def limit(self) -> tuple[float, ...]:
+        """Greatest magnitude of each component of an action."""
+        return (self.reach,) * (3 * self.arms.count) + (self.twist,) * (3 * self.arms.count)
+
+    @abstractmethod
+    def build(self, moved: Tensor) -> tuple[Scene, Params, State]:
+        """Return the scene at its start, in the dtype and on the device of `moved`.
+
+        Args:
+            moved: how far the things of `spread` are off their places [m], shape (B, things, 3).
+        """
+
+    @abstractmethod
+    def rewards(self, seen: Seen) -> dict[str, Tensor]:
+        """Return the named terms of the reward of an action, shape (B,) each."""
+
+    @abstractmethod
+    def success(self, seen: Seen) -> Tensor:
+        """Return which episodes have reached the goal, judged at their end, bool, shape (B,)."""
+
+    def extra(self, seen: Seen) -> dict[str, Tensor]:
+        """Return what the loss of an action has beside the reward's negative, shape (B,) each."""
+        return {}
+
+    def shortfall(self, seen: Seen) -> Tensor:
+        """Return how far the end of an episode is from success, 0 if it is reached [return], shape (B,).
+
+        The loss has it after the last action, as the return need not be largest where the goal is reached.
+        """
+        return torch.zeros_like(seen.x[:, 0, 0])
+
+    def note(self, seen: Seen) -> dict[str, Tensor]:
+        """Return what is to be remembered, asked at the start (without notes) and after every action."""
+        return {}
+
+    def failed(self, seen: Seen) -> Tensor:
+        """Return which episodes have failed for good, bool, shape (B,)."""
+        return torch.zeros(seen.x.shape[0], dtype=torch.bool, device=seen.x.device)
+
+    def rehearsal(self) -> Task | None:
+        """Return a task that is much like this one and quicker to play, for searches to begin with, if there is one."""
+        return None
+
+    def waypoints(self) -> Sequence[Sequence[tuple[float, float, float]]]:
+        """Return a way to the goal by hand: per point, how far each tool is from its start [m]."""
+        return ()
+
+    def ways(self) -> Sequence[Sequence[Sequence[tuple[float, float, float]]]]:
+        """Return `waypoints` stage by stage, in a stage from where the tools are when it begins."""
+        return [self.waypoints()]
+
+    def start(
+        self, num: int, *, like: Tensor | None = None, generator: torch.Generator | None = None, variation: bool = False
+    ) -> tuple[Scene, Params, State]:
+        """Return the scene with `num` starts.
+
+        Args:
+            num: how many.
+            like: a tensor of the dtype and device that it gets; float32 on the CPU if not given.
+            generator: where random numbers come from.
+            variation: whether starts differ from each other, by as much as `spread` says.
+        """
+        like = torch.zeros(()) if like is None else like
+        moved = like.new_zeros(num, len(self.spread), 3)
+        if variation:
+            random = torch.rand(num, len(self.spread), 2, generator=generator, dtype=torch.float64)
+            away = (2 * random - 1).to(like) * like.new_tensor(self.spread)
+            moved = torch.cat([away, moved[..., 2:]], -1)
+        return self.build(moved)
+
+    def reference(self, start: State | None = None) -> Tensor:
+        """Return the actions that lead the tools along `ways`, evenly, shape (horizon, width).
+
+        Args:
+            start: where scenes start, for actions of shape (B, horizon, width); all alike if not given.
+        """
+        off = (
+            self._strays(start) if start is not None else [torch.zeros(self.arms.count, 3)] * len(self.schedule.stages)
+        )
+        legs = zip(self.ways(), self.schedule.actions(self.horizon), off, strict=True)
+        return torch.cat([through(*leg, reach=self.reach) for leg in legs], -2)
+
+    def _strays(self, start: State) -> list[Tensor]:
+        """Return what each stage's way takes besides to lead to the same places from another start [m], (B, R, 3)."""
+        scene, _, usual = self.start(1, like=start.rods.pos)
+        moved, counts = usual.rods.pos - start.rods.pos, scene.topology.counts
+        rope = [k for k, count in enumerate(counts) for _ in range(count)]
+        found, led = [], set()
+        for stage in self.schedule.stages:
+            hands = list(zip(stage.vertex, self.arms.vertex, strict=True))
+            # What has been led before is where it was led to.
+            first = [[float(self.anchored and v is not None and rope[v] not in led)] for v in stage.vertex]
+            found.append(moved[:, [h if v is None else v for v, h in hands]] * moved.new_tensor(first))
+            led |= {rope[v] for v in stage.vertex if v is not None}
+        return found
+
+    def rest(self, seen: Seen, topology: Topology) -> Tensor:
+        """Return the lengths of rope between neighbouring hands on one rope [m], shape (B, n).
+
+        There are none if `stretch` is infinite, and n = 0 if no rope has two hands.
+        """
+        if not math.isfinite(self.stretch):
+            return seen.x[:, 0, :0]
+        rope = [k for k, count in enumerate(topology.counts) for _ in range(count)]
+        pairs = [(a, b) for a, b in itertools.pairwise(sorted(self.arms.vertex)) if rope[a] == rope[b]]
+        lengths = [curve_geometry.length(seen.x[:, a : b + 1]) for a, b in pairs]
+        return torch.stack(lengths, -1) if lengths else seen.x[:, 0, :0]
+
+
+@functools.cache
+def _schedule(stages: tuple[Stage, ...], travel: int) -> Schedule:
+    return Schedule(stages, travel)
+
+
+def combined(task: Task, terms: dict[str, Tensor], count: int) -> Tensor:
+    """Return the one reward that the terms of `count` scenes make, shape (B,)."""
+    found = {name: tuple(x.shape) if isinstance(x, Tensor) else x for name, x in terms.items()}
+    wrong = {name: shape for name, shape in found.items() if shape != (count,)}
+    if wrong or not terms:
+        raise InputError(
+            f"{task.name}: rewards returned {wrong}; expected one or more terms, each a tensor of shape ({count},), a "
+            "number for each scene: keep the first axis, and sum or average over all others."
+        )
+    parts = torch.stack(list(terms.values()))
+    return parts.sum(0) if task.combine == "sum" else parts.prod(0)
+
+
+def straight(start: tuple[float, float, float], count: int, moved: Tensor) -> Tensor:
+    """Return vertices of a rope along +x, shape (B, count, 3); `moved` is how far off it is, shape (B, 3)."""
+    along = torch.arange(count, dtype=moved.dtype, device=moved.device) * SPACING
+    line = torch.stack([along, 0 * along, 0 * along], -1) + moved.new_tensor(start)
+    return line + moved.unsqueeze(-2)
+
+
+def through(
+    points: Sequence[Sequence[tuple[float, float, float]]], horizon: int, off: Tensor, *, reach: float = Task.reach
+) -> Tensor:
+    """Return actions that lead tools through points and then keep them there, shape (..., horizon, 6 arms).
+
+    Every leg takes actions in proportion to the longest way of a tool on it.
+
+    Args:
+        points: how far the tools are from their starts [m], one row of points per leg, one point per tool.
+        horizon: actions in all.
+        off: what is added to all points [m], shape (..., arms, 3).
+        reach: greatest way of a tool in an action [m].
+    """
+    off = off.to(torch.float64).unsqueeze(-3)
+    way = off.new_tensor(points).reshape(-1, *off.shape[-2:]) + off
+    legs = torch.cat([torch.zeros_like(off), way], -3).diff(dim=-3)
+    need = (legs.norm(dim=-1).amax(-1) / reach - 1e-9).ceil().clamp(min=1)
+    most = int(need.sum(-1).max())
+    if most > horizon:
+        raise ValueError(f"way-points: they take {most} actions of {reach} m; expected at most {horizon}")
+    # Which share of each leg is behind the tools before and after each action.
+    done = torch.arange(horizon + 1, dtype=off.dtype, device=off.device).unsqueeze(-1) - (
+        need.cumsum(-1) - need
+    ).unsqueeze(-2)
+    share = (done / need.unsqueeze(-2)).clamp(0, 1)
+    xyz = (share @ legs.flatten(-2)).diff(dim=-2)
+    return torch.cat([xyz, torch.zeros_like(xyz)], -1)
+
+
+def make(
+    task: Task,
+    ropes: Sequence[Rope],
+    effects: Sequence[Effect] = (),
+    values: dict[str, dict[str, float]] | None = None,
+    *,
+    solids: Sequence[Solid] = (),
+    fixed: Sequence[int] = (),
+    matter: tuple = (),
+    held: Sequence[int] | None = None,
+    burst: float = 1.0,
+) -> tuple[Scene, Params, State]:
+    """Return a scene with what all tasks share: 1 ms in five substeps, gravity, damping, friction, a floor at z = 0.
+
+    A scene without a plane among its solids has a table as its floor, which is cheaper. Velocities decay by 30 1/s and
+    ropes do not resist twisting: ropes with free ends that are held at points do not twist, and those of tasks have no
+    inertia about their axis. A `rope` of the task takes the place of what ropes are made of and how fast they come to
+    rest; its effects act beside the others.
+
+    Args:
+        task: the task.
+        ropes: its ropes; those with a finite stiffness in stretch are elastic, else they are inextensible.
+        effects: what acts on ropes beside elasticity, gravity, damping and contact.
+        values: numbers that differ from those of all tasks.
+        solids: its bodies.
+        fixed: vertices that stay in their places, beside those that arms hold.
+        matter: its matter, as `coupling.mpm.particles.assemble` returns it.
+        held: vertices that can be held at all, if others than those of the arms.
+        burst: by how much vertices may speed up within a step, beside half their speed [m/s].
+    """
+    elastic = all(isinstance(r.stretch, Tensor) or math.isfinite(r.stretch) for r in ropes)
+    floor = not any(s.shape == "plane" for s in solids)
+    room = 3 * sum(r.positions.shape[-2] for r in ropes)
+    own = [] if task.rope is None else task.rope.laws
+    effects = [*(e for e in effects if e.name not in {o.name for o in own}), *own]
+    acting: list[Effect] = [Gravity(), Damping(), RodContact(sweeps=5, room=room, burst=burst), *effects]
+    if not any(e.name == "bend" for e in effects):
+        framed = any(e.frame_bending for e in effects) or (task.rope is not None and task.rope.curvature)
+        acting.append(BendFrame() if framed else Bend())
+    numbers = {"damping": {"rate": 30.0, "twist_rate": 20.0}, "rod_contact": {"mu_s": 0.3, "mu_k": 0.25}}
+    if elastic:
+        acting.append(Stretch())
+    if floor:
+        acting += [Table(), TableFriction()]
+        numbers["table_friction"] = {"mu": 0.3}
+    if solids:
+        acting.append(RodBody())
+    if any(s.motion == "free" for s in solids):
+        acting.append(BodyContact())
+    if matter:
+        acting.append(RodMatter())
+    for name, given in (values or {}).items():
+        numbers[name] = numbers.get(name, {}) | given
+    if task.rope is not None:
+        ropes = task.rope.pieces(ropes)
+        for name, given in task.rope.values.items():
+            numbers[name] = numbers.get(name, {}) | given
+    at = (*(task.schedule.held if held is None else held), *fixed)
+    choices = {"held_vertices": at, "constrained": not elastic, "substeps": 5}
+    try:
+        return scenes.make(ropes, acting, numbers, bodies=solids, matter=matter, **choices)
+    except ValueError as error:
+        if task.rope is None:
+            raise
+        raise InputError(f"rope: {task.name} steps by 0.2 ms and cannot take it: {error}") from None
+
+
+def settled(made: tuple[Scene, Params, State], frames: int) -> Tensor:
+    """Return where vertices of a single scene, shape (1, V, 3), are after some frames with nothing held."""
+    scene, params, state = made
+    control = scenes.hold(scene, state)
+    control = tree.replace(control, grip={"vertices": torch.zeros_like(control.pos[..., :1])})
+    with torch.no_grad():
+        for _ in range(frames):
+            state = scenes.step(scene, params, state, control)
+    scenes.check_state(state)
+    return state.rods.pos[0].clone()
+
+
+def raised(flat: Tensor, places: Tensor, width: float = 1.7) -> Tensor:
+    """Return a curve that lies on the floor, shape (V, 3), and passes over others at places, counted in vertices.
+
+    There it rises by a little more than the diameter, over about `width` vertices on either side.
+    """
+    index = torch.arange(len(flat), dtype=flat.dtype)[:, None]
+    rise = torch.exp(-((index - places) / width).square()).sum(-1, keepdim=True)
+    return even(torch.cat([flat[:, :2], RADIUS * (1.05 + 2.6 * rise)], -1), len(flat))
+
+
+def even(curve: Tensor, count: int) -> Tensor:
+    """Return `count` vertices along a dense curve (n, 3), at even distances along it."""
+    along = torch.cat([curve.new_zeros(1), (curve[1:] - curve[:-1]).norm(dim=-1).cumsum(0)])
+    wanted = torch.linspace(0, 1, count, dtype=curve.dtype) * along[-1]
+    k = torch.searchsorted(along, wanted).clamp(1, len(along) - 1)
+    share = ((wanted - along[k - 1]) / (along[k] - along[k - 1]))[:, None]
+    return (1 - share) * curve[k - 1] + share * curve[k]

@@ -1,0 +1,1 @@
+"""Edge lengths as constraints, solved directly."""

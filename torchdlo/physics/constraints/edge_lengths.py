@@ -1,0 +1,391 @@
+"""Edges of given length: direct solution of the nonlinear system of one substep.
+
+Both solvers look for positions and tensions at the end of the substep such that the momentum balance holds and every
+edge has its length (or its strain times stiffness equals its tension). Newton's method runs without graph; one more
+Newton step, taken with graph, puts the derivative of the implicit function theorem on the result.
+
+The tension acts along the edge as it was at the start (SHAKE: Ryckaert, Ciccotti, Berendsen 1977,
+doi:10.1016/0021-9991(77)90098-5), so that linear and angular momentum are exact.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchdlo.physics.kernels import lanes
+from torchdlo.physics.linalg import banded
+from torchdlo.physics.linalg.numerics import dot, safe_norm, total
+from torchdlo.physics.rod.kinematics import edge_vectors
+from torchdlo.physics.rod.topology import Topology, elimination_order, following, parse, preceding
+
+
+@dataclass(frozen=True)
+class Lengths:
+    """What the lengths of the edges have to be."""
+
+    topology: Topology
+    rest: Tensor
+    """Rest lengths [m], shape (..., V, 1)."""
+    compliance: Tensor
+    """Rest length over axial stiffness, 0 for inextensible edges [m/N], shape (..., V or 1, 1)."""
+    active: Tensor
+    """1 where the edge is real and one of its ends is free [1], shape (..., V, 1)."""
+    edge_mask: Tensor
+    """1 for real edges [1], shape (V, 1)."""
+    give: Tensor | None = None
+    """How far a unit of force moves an end of the edge within the substep [m/N], shape (..., V, 1)."""
+    most: float = 0.25
+    """Tension at which edges give way, over the one at which explicit steps are not stable."""
+    least: float = 0.25
+    """Compression from which on that of the last substep is no first guess, likewise."""
+
+    @property
+    def shift(self) -> float:
+        """Relative shift of the systems [1], which matters only when a taut rope has no solution."""
+        return 1e-10 if self.rest.dtype == torch.float64 else 1e-6
+
+    def yielding(self, tension: Tensor) -> tuple[Tensor | float, Tensor | float]:
+        """Return how much an edge lengthens beyond the tension that steps can follow [m], and the slope of that [m/N].
+
+        A tension T makes transverse waves of w dt = 2 sqrt(T give / length); beyond a share of the stable T edges
+        give way, so that ropes pulled beyond their length stay finite.
+        """
+        if self.give is None:
+            return 0.0, 0.0
+        beyond = tension - self.most * self.rest / self.give
+        return self.give * beyond.clamp(min=0.0), torch.where(beyond > 0, self.give, 0.0)
+
+    def guess(self, tension: Tensor) -> Tensor:
+        """Return a first guess for the tensions [N], shape (..., V, 1): those of the last substep.
+
+        A straight rope pressed along its line has no tensions that keep its lengths, and leaves ones of any size. From
+        there Newton's method goes astray for good; from none it finds the bent shape as soon as there is one.
+        """
+        if self.give is None:
+            return tension * self.active
+        return torch.where(tension < -self.least * self.rest / self.give, 0.0, tension) * self.active
+
+    def error(self, pos: Tensor, tension: Tensor) -> tuple[Tensor, Tensor]:
+        """Return how much too long each edge is [m], shape (..., V, 1), and its direction, (..., V, 3)."""
+        edge = edge_vectors(self.topology, pos, self.edge_mask)
+        length = safe_norm(edge)
+        excess = length - self.rest - self.compliance * tension - self.yielding(tension)[0]
+        return excess * self.active, edge / length.clamp(min=1e-12)
+
+
+def _rows(*parts: Tensor) -> Tensor:
+    """Stack (..., V, C) tensors as the rows of an (m, batch) matrix, component by component."""
+    batch = torch.broadcast_shapes(*(p.shape[:-2] for p in parts))
+    rows = []
+    for part in parts:
+        part = part.expand(batch + part.shape[-2:])
+        n = part.dim()
+        rows.append(part.permute(n - 1, n - 2, *range(n - 2)).reshape(part.shape[-1] * part.shape[-2], -1))
+    return torch.cat(rows)
+
+
+def _vertices(rows: Tensor, batch: tuple[int, ...], components: int) -> Tensor:
+    """Turn (components V, batch) rows back into (..., V, components)."""
+    stored = rows.reshape(components, -1, *batch)
+    return stored.permute(*range(2, 2 + len(batch)), 1, 0)
+
+
+def solve_slots(topology: Topology, diagonal: Tensor, to_next: Tensor, to_prev: Tensor, rhs: Tensor) -> Tensor:
+    """Solve a system that couples neighbouring slots; arguments and result have shape (..., V, 1).
+
+    Differentiable in `rhs` only, see `banded.solve`.
+    """
+    with torch.no_grad():
+        entries = _rows(diagonal.expand_as(rhs), to_next.expand_as(rhs), to_prev.expand_as(rhs))
+    solution = banded.solve(entries, _rows(rhs), f"tridiagonal:{topology.name}")
+    return _vertices(solution, rhs.shape[:-2], 1)
+
+
+def project(
+    lengths: Lengths, moved: Tensor, answer: Tensor, direction: Tensor, tension: Tensor, steps: int
+) -> tuple[Tensor, Tensor]:
+    """Enforce lengths where every vertex moves by itself: a tridiagonal system for the tensions.
+
+    Args:
+        lengths: the constraint.
+        moved: positions after the substep without tension [m], shape (..., V, 3).
+        answer: how far a force moves a vertex along each axis [m/N], 0 if held, shape (..., V, 3).
+        direction: unit vectors along which tension acts, shape (..., V, 3).
+        tension: first guess [N], shape (..., V, 1).
+        steps: Newton steps before the last one.
+
+    Returns:
+        Positions (..., V, 3) and tensions (..., V, 1).
+    """
+    topology = lengths.topology
+
+    def place(tension: Tensor, moved: Tensor, answer: Tensor, direction: Tensor) -> Tensor:
+        pull = tension * direction
+        return moved + answer * (pull - preceding(topology, pull))
+
+    def newton(tension: Tensor, along: Tensor, excess: Tensor) -> Tensor:
+        both = answer + following(topology, answer)
+        active, off = lengths.active, 1 - lengths.active
+        soft = lengths.compliance + lengths.yielding(tension)[1]
+        diagonal = active * ((1 + lengths.shift) * total(along * direction * both) + soft) + off
+        to_next = -active * dot(along, following(topology, direction * answer))
+        to_prev = -active * total(along * answer * preceding(topology, direction))
+        return tension + solve_slots(topology, diagonal, to_next, to_prev, excess)
+
+    with torch.no_grad():
+        tension = lengths.guess(tension)
+        for _ in range(steps):
+            excess, along = lengths.error(place(tension, moved, answer, direction), tension)
+            tension = newton(tension, along, excess)
+    excess, along = lengths.error(place(tension, moved, answer, direction), tension)
+    tension = newton(tension, along, excess)
+    return place(tension, moved, answer, direction), tension
+
+
+@dataclass(frozen=True)
+class Inertia:
+    """Resistance of positions to change within a substep: masses, and stiffness taken as inertia.
+
+    Written for the change y of positions against unforced motion, it gives the impulse-like force
+    `vertex` y + K y, K the stiffness of a straight chain of hinges against turning of its edges.
+    """
+
+    vertex: Tensor
+    """Mass of the vertices along each axis [kg], shape (..., V, 3)."""
+    hinge: Tensor
+    """Weights of the hinges [kg m^2], shape (..., V, 1)."""
+    edge: Tensor
+    """Rest lengths of real edges, 1 for dummies [m], shape (..., V, 1)."""
+    edge_mask: Tensor
+    """1 for real edges [1], shape (V, 1)."""
+    turning: Tensor | None = None
+    """Inertia of edges against turning, beside that of their ends' masses [kg], shape (..., V, 1)."""
+
+    def swing(self, topology: Topology, y: Tensor) -> Tensor | float:
+        """Return the part of edges that resist turning, shape (..., V, 3); 0 if none do."""
+        if self.turning is None:
+            return 0.0
+        push = self.turning * (following(topology, y) - y)
+        return preceding(topology, push) - push
+
+    def bending(self, topology: Topology, y: Tensor) -> Tensor:
+        """Return K y, shape (..., V, 3)."""
+        turn = (following(topology, y) - y) * self.edge_mask / self.edge
+        moment = self.hinge * (turn - preceding(topology, turn))
+        push = (moment - following(topology, moment)) * self.edge_mask / self.edge
+        return preceding(topology, push) - push
+
+    def bands(self, topology: Topology) -> tuple[Tensor, Tensor, Tensor]:
+        """Return K's entries to the same, the next, and the next but one vertex, shape (..., V, 1) each."""
+        after = self.edge_mask / self.edge
+        before = preceding(topology, after)
+        centre = after + before
+        w = self.hinge
+        next_w, prev_w = following(topology, w), preceding(topology, w)
+        same = w * centre.square() + next_w * after.square() + prev_w * before.square()
+        one = -w * centre * after - next_w * after * following(topology, centre)
+        two = next_w * after * following(topology, after)
+        if self.turning is not None:
+            same, one = same + self.turning + preceding(topology, self.turning), one - self.turning
+        return same, one, two
+
+
+def _shortening(lengths: Lengths, change: Tensor) -> Tensor:
+    """Return the share of a Newton step to take, shape (..., 1, 1).
+
+    An edge may turn by about one radian; beyond that its linearisation means nothing.
+    """
+    with torch.no_grad():
+        turn = lengths.active * (following(lengths.topology, change) - change) / lengths.rest
+        most = total(turn.square()).amax(-2, keepdim=True).sqrt()
+        return (1 / most.clamp(min=1e-9)).clamp(max=1.0)
+
+
+def balance(
+    lengths: Lengths,
+    inertia: Inertia,
+    moved: Tensor,
+    free: Tensor,
+    force: Tensor,
+    scale: Tensor,
+    direction: Tensor,
+    ahead: Tensor,
+    tension: Tensor,
+    turning: float,
+    steps: int,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Enforce lengths where inertia couples the vertices: a banded saddle-point system for positions and tensions.
+
+    Args:
+        lengths: the constraint.
+        inertia: resistance to change.
+        moved: positions without any force, or where held vertices have to be [m], shape (..., V, 3).
+        free: 1 for free, 0 for held vertices, between for loosely held ones [1], shape (V, 1) or (..., V, 1).
+        force: force without tension [N], shape (..., V, 3).
+        scale: what turns force into inertia times displacement [s^2], shape (..., 1, 1).
+        direction: unit edges at the start, shape (..., V, 3).
+        ahead: what pulled edges lean towards beyond that [1], shape (..., V, 3).
+        tension: tension of the last substep [N], shape (..., V, 1).
+        turning: how much a pulled edge's direction follows the change of the positions.
+        steps: Newton steps before the last one.
+
+    Returns:
+        Positions (..., V, 3), tensions (..., V, 1), and what moves vertices of given mass: force with tension and with
+        the answer of the hinges [N], (..., V, 3).
+    """
+    topology = lengths.topology
+    if lanes.ready(force):
+        return _balanced(lengths, inertia, (free, tension), (moved, force, direction, ahead, scale), turning, steps)
+    pulled = lengths.active
+    lean, start = turning * pulled / lengths.rest, direction + pulled * ahead
+
+    def residual(pos: Tensor, impulse: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+        y = pos - moved
+        along_start = start + lean * (following(topology, y) - y)
+        pull = impulse * along_start
+        push = (
+            scale * force + pull - preceding(topology, pull) - inertia.bending(topology, y) - inertia.swing(topology, y)
+        )
+        excess, along = lengths.error(pos, impulse / scale)
+        return y, push, excess, along, along_start
+
+    def newton(pos: Tensor, impulse: Tensor) -> tuple[Tensor, Tensor]:
+        y, push, excess, along, along_start = residual(pos, impulse)
+        with torch.no_grad():
+            same, one, two = inertia.bands(topology)
+            string = impulse * lean
+
+            after, active = following(topology, free), lengths.active
+            soft = lengths.yielding(impulse / scale)[1] + lengths.shift * lengths.give
+            entries = _rows(
+                inertia.vertex + free * (same + string + preceding(topology, string)),
+                free * (one - string),
+                free * preceding(topology, one - string),
+                free * two,
+                free * preceding(topology, preceding(topology, two)),
+                -free * active * along_start,
+                after * active * along_start,
+                -active * along,
+                active * along,
+                -active * (lengths.compliance + soft) / scale + (active - 1),
+            )
+        rhs = -_rows(inertia.vertex * y - free * push, excess)
+        step = banded.solve(entries, rhs, f"saddle:{topology.name}")
+        batch, v3 = pos.shape[:-2], 3 * pos.shape[-2]
+        change, pull = _vertices(step[:v3], batch, 3), _vertices(step[v3:], batch, 1)
+        short = _shortening(lengths, change)
+        return pos + short * change, impulse + short * pull
+
+    with torch.no_grad():
+        pos, impulse = moved.detach(), lengths.guess(tension) * scale
+        for _ in range(steps):
+            pos, impulse = newton(pos, impulse)
+    pos = torch.where(free > 0, pos, moved)
+    pos, impulse = newton(pos, impulse)
+    return pos, impulse / scale, residual(pos, impulse)[1] / scale
+
+
+def _balanced(
+    lengths: Lengths,
+    inertia: Inertia,
+    scalars: Sequence[Tensor],
+    vectors: Sequence[Tensor],
+    turning: float,
+    steps: int,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return what `balance` does, by a kernel that reads its inputs in this order."""
+    swing = inertia.vertex.new_zeros(1, 1) if inertia.turning is None else inertia.turning
+    edges = lengths.rest, lengths.compliance, lengths.active, lengths.edge_mask, lengths.give, inertia.hinge, swing
+    inputs = *edges, *scalars, inertia.vertex, *vectors
+    law = turning, lengths.most, lengths.least, lengths.shift, steps
+    return tuple(lanes.apply("balance", lengths.topology.name, inputs, (3, 1, 3), "saddle", law))
+
+
+def _saddle(name: str) -> banded.Pattern:
+    """Pattern of `balance`: unknowns x, y, z of all vertices, then tensions; see its `entries` for the numbering."""
+    topology = parse(name)
+    v, after = topology.size, topology.successor()
+    order = elimination_order(topology)
+    rank = {slot: k for k, slot in enumerate(order)}
+    unknowns: list[int] = []
+    edges = sorted(range(v), key=lambda i: max(rank[i], rank[after[i]]) if _is_edge(topology, i) else rank[i])
+    for slot in order:
+        unknowns += [slot, v + slot, 2 * v + slot]
+        while (
+            edges
+            and (max(rank[edges[0]], rank[after[edges[0]]]) if _is_edge(topology, edges[0]) else rank[edges[0]])
+            <= rank[slot]
+        ):
+            unknowns.append(3 * v + edges.pop(0))
+    places: list[tuple[int, int, int]] = []
+    for i in range(v):
+        near, far = after[i], after[after[i]]
+        inside, further = _is_edge(topology, i), _is_edge(topology, i) and _is_edge(topology, near)
+        for c in range(3):
+            row = c * v
+            places.append((row + i, row + i, row + i))
+            if inside:
+                places += [(row + i, row + near, 3 * v + i), (row + near, row + i, 4 * v + near)]
+                places += [(row + i, 3 * v + i, 7 * v + row + i), (row + near, 3 * v + i, 10 * v + row + i)]
+                places += [(3 * v + i, row + i, 13 * v + row + i), (3 * v + i, row + near, 16 * v + row + i)]
+            if further:
+                places += [(row + i, row + far, 5 * v + i), (row + far, row + i, 6 * v + far)]
+        places.append((3 * v + i, 3 * v + i, 19 * v + i))
+    return banded.make_pattern(4 * v, places, unknowns)
+
+
+def _is_edge(topology: Topology, slot: int) -> bool:
+    return topology.edge_mask()[slot] > 0
+
+
+banded.register_pattern("saddle", functools.cache(_saddle))
+
+
+_PARTS = 16
+"""In how many parts lengths are put right that Newton's method does not reach at once, e.g. where measurements push
+edges together by a tenth of their length. At once is better where it works: it leaves fewer kinks."""
+
+_REACHED = 1e-6
+"""Share of its length by which an edge may miss it then."""
+
+
+def settle(lengths: Lengths, pos: Tensor, vel: Tensor, mobility: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the nearest positions and velocities that agree with fixed lengths, both shape (..., V, 3).
+
+    Args:
+        lengths: the constraint.
+        pos: positions that miss it a little, e.g. interpolated measurements [m].
+        vel: velocities that may stretch edges [m/s].
+        mobility: one over the mass of the vertices, 0 if held, shape (..., V, 1).
+    """
+    topology = lengths.topology
+    answer = mobility.expand_as(pos)
+    stiff = dataclasses.replace(lengths, compliance=torch.zeros_like(lengths.compliance))
+
+    def reach(pos: Tensor, parts: int) -> Tensor:
+        for left in range(parts, 0, -1):
+            edge = edge_vectors(topology, pos, lengths.edge_mask)
+            length = safe_norm(edge).clamp(min=1e-12)
+            aim = dataclasses.replace(stiff, rest=length + (lengths.rest - length) / left)
+            pos, _ = project(aim, pos, answer, edge / length, torch.zeros_like(lengths.active), 6 if left == 1 else 1)
+        return pos
+
+    near = reach(pos, 1)
+    missed = (safe_norm(edge_vectors(topology, near, lengths.edge_mask)) - lengths.rest).abs() * lengths.active
+    there = (missed < _REACHED * lengths.rest).all(-2, keepdim=True)
+    pos = near if bool(there.all()) else torch.where(there, near, reach(pos, _PARTS))
+    edge = edge_vectors(topology, pos, lengths.edge_mask)
+    along = edge / safe_norm(edge).clamp(min=1e-12)
+    stretching = dot(following(topology, vel) - vel, along) * lengths.active
+    both = answer + following(topology, answer)
+    diagonal = lengths.active * total(along.square() * both) * (1 + 1e-10) + 1 - lengths.active
+    coupling = -lengths.active * dot(along, following(topology, along * answer))
+    back = -lengths.active * total(along * answer * preceding(topology, along))
+    pull = solve_slots(topology, diagonal, coupling, back, stretching) * along
+    return pos, vel + answer * (pull - preceding(topology, pull))

@@ -1,0 +1,1 @@
+"""How steps run: replayed for gradients, or traced."""

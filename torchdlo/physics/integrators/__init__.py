@@ -1,0 +1,1 @@
+"""One substep of the rods, and how large it may be."""

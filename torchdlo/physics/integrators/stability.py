@@ -1,0 +1,82 @@
+"""Whether rods can be stepped: laws that fit them, and the longest stable substep."""
+
+from __future__ import annotations
+
+import torch
+
+from torchdlo.physics.effects.base import Values, altered
+from torchdlo.physics.integrators.rod_step import Settings
+from torchdlo.physics.rod import kinematics as rod
+from torchdlo.physics.rod.kinematics import RodParams, RodState
+
+
+def check_laws(settings: Settings, rods: RodParams, values: dict[str, Values], state: RodState) -> None:
+    """Raise a `ValueError` where the rods have what no effect of the scene acts on."""
+    for e in settings.effects:
+        e.check(settings.topology)
+    rest, material = rods.rest, altered(settings.effects, settings.topology, rods, values).material
+    kinds = {type(e).__name__ for e in settings.effects}
+    if "Bend" in kinds:
+        if rods.material.bend.shape[-1] == 2:
+            raise ValueError("scene: a rope has bend2, which Bend leaves out; use BendFrame")
+        if bool((rest.curvature != 0).any()):
+            raise ValueError(
+                "scene: a rope is curved at rest, which Bend leaves out; use BendFrame, or rest='straight'"
+            )
+        frames = sorted(type(e).__name__ for e in settings.effects if e.frame_bending)
+        if frames:
+            raise ValueError(
+                f"scene: {frames[0]} changes the natural curvature or the stiffness by direction, which Bend leaves "
+                "out; use BendFrame"
+            )
+    if not settings.constrained and "Stretch" not in kinds and bool(torch.isfinite(material.stretch).any()):
+        raise ValueError("scene: stretch is given, but lengths are not constrained and no Stretch effect acts; add it")
+    if "Stretch" in kinds and not bool(torch.isfinite(material.stretch).all()):
+        raise ValueError(
+            "scene: stretch is infinite, which no force can be; give EA [N], or keep constrained=True without Stretch"
+        )
+    if settings.constrained:
+        length = rod.edge_vectors(settings.topology, state.pos.detach(), rest.edge_mask).norm(dim=-1, keepdim=True)
+        strain = ((length / rest.length.detach() - 1) * rest.edge_mask).abs().max()
+        if float(strain) > 0.1:
+            raise ValueError(
+                f"scene: a rope is placed with edges {float(strain):.0%} off their length in its rest shape; place it "
+                "at its length, or use constrained=False with a Stretch effect"
+            )
+
+
+def limits(settings: Settings, rods: RodParams, values: dict[str, Values]) -> dict[str, float]:
+    """Return the largest stable substep [s] by the term that limits it.
+
+    Bending waves reach w = 4/l^2 sqrt(EI/m'), stretching waves w = 2/l sqrt(EA/m'), twist waves w = 2 sqrt(GJ/(l I));
+    Stoermer-Verlet is stable for w dt < 2. Bending damping takes its force from the velocities before, and damps the
+    shortest waves by r = 16 c/(m' l^4): both together are stable for (w dt)^2/4 + r dt/2 < 1. Implicit steps are
+    limited by none of them.
+    """
+    if settings.integrator == "implicit":
+        return {}
+    rods = altered(settings.effects, settings.topology, rods, values)
+    rest, material = rods.rest, rods.material
+    names = {e.name for e in settings.effects}
+    real = (rest.edge_mask > 0).expand_as(rest.length)
+    length = torch.where(real, rest.length, torch.inf)
+    inner = (rest.hinge_mask > 0).expand_as(rest.length)
+    mass = torch.where(inner, material.mass, torch.inf)
+    found = {}
+    if "bend" in names:
+        bend = material.bend[..., :2].amax(-1, keepdim=True) + material.bend[..., 2:].abs().sum(-1, keepdim=True)
+        if "internal_friction" in names:  # up to twice its first stiffness where bending turns back
+            friction = values["internal_friction"]
+            bend = bend + 2 * friction["moment"] / friction["kappa_c"]
+        heavy = mass * length.square().clamp(max=1e6) * length
+        found["bending"] = 0.5 * (heavy / bend).amin().sqrt()
+        if "bending_damping" in names:
+            wave, rate = 4 * bend / heavy, 8 * values["bending_damping"]["coefficient"] / heavy
+            found["bending damping"] = (2 / (rate + (rate.square() + 4 * wave).sqrt())).amin()
+    if "stretch_force" in names and not settings.constrained:
+        found["stretching"] = (mass * length / material.stretch).amin().sqrt()
+    if "twist" in names and settings.twist == "dynamic":
+        found["twisting"] = (torch.where(real, material.inertia, torch.inf) * length / material.twist).amin().sqrt()
+    if "table" in names:
+        found["table contact"] = 2 / values["table"]["hardness"].max()
+    return {name: float(value) for name, value in found.items()}

@@ -1,0 +1,1 @@
+"""C++ kernels of the rods and how kernels are built."""

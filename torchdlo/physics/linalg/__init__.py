@@ -1,0 +1,1 @@
+"""Banded systems, rotations and safe elementary functions."""

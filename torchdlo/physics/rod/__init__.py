@@ -1,0 +1,1 @@
+"""Ropes as tensors: topology, kinematics, assembly from what a person knows, prescribed motion."""

@@ -1,0 +1,1 @@
+"""Interactive view in the browser."""

@@ -1,0 +1,241 @@
+"""From a description to the scene, its numbers, its first state, and what is commanded."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from torchdlo import scene as scenes
+from torchdlo.coupling.bodies.dynamics import Solid
+from torchdlo.coupling.bodies.mesh_sdf import MeshShape, load_mesh
+from torchdlo.coupling.mpm import particles
+from torchdlo.coupling.mpm.constitutive_models import Elastic, Law, Liquid, Plastic, Sand
+from torchdlo.coupling.robot import kinematics as robots
+from torchdlo.errors import InputError
+from torchdlo.physics import tree
+from torchdlo.scene_files import motion
+from torchdlo.scene_files.json_files import EFFECTS, like, read
+from torchdlo.scene_files.rope_models import Modelled, with_models
+from torchdlo.scene_files.schema import Body, Description, Matter, Rope
+
+__all__ = ["Simulation", "assemble", "build", "load"]
+
+_LAWS: dict[str, type[Law]] = {law.name: law for law in (Elastic, Plastic, Liquid, Sand)}
+_OWN = ("points", "vertices", "model", "weights")
+"""Entries of a rope that are not fields of `scene.Rope`."""
+_BODY_OWN = ("keys", "path", "file", "scale", "cells")
+"""Entries of a body that are not fields of `Solid`."""
+
+
+@dataclass(frozen=True, eq=False)
+class Simulation:
+    """A scene that is ready to run."""
+
+    scene: scenes.Scene
+    params: scenes.Params
+    state: scenes.State
+    plan: motion.Plan
+    meshes: dict[int, MeshShape]
+    """Meshes of bodies, by the number of the body."""
+    weight: Tensor
+    """Masses that hang on vertices [kg], shape (V, 1)."""
+
+
+def load(path: str | Path) -> tuple[scenes.Scene, scenes.Params, scenes.State, scenes.Control]:
+    """Return the scene of a file, its parameters, its first state, and the controls of all steps."""
+    description = read(path)
+    try:
+        return build(description, folder=Path(path).parent)
+    except ValueError as error:
+        raise InputError(f"{path}: {error}") from None
+
+
+def build(
+    description: Description, *, folder: str | Path = "."
+) -> tuple[scenes.Scene, scenes.Params, scenes.State, scenes.Control]:
+    """Return the scene, its parameters, its first state, and the controls of all steps, with time as the first axis.
+
+    Args:
+        description: what to build.
+        folder: where the files that it names are looked for.
+    """
+    made = assemble(description, folder=folder)
+    if made.plan.hands is not None:
+        late = next(k for k, h in enumerate(description.holds) if h.close > 0)
+        raise InputError(
+            f"holds[{late}].close: how a hold sits that closes during the run depends on the run; use "
+            "torchdlo.scene_files.assemble(...).plan.follow(scene), or torchdlo.scene_files.run.run."
+        )
+    return made.scene, made.params, made.state, made.plan.controls
+
+
+def assemble(description: Description, *, folder: str | Path = ".") -> Simulation:
+    """Return what a description says, ready to run.
+
+    Args:
+        description: what to build.
+        folder: where the files that it names are looked for.
+    """
+    folder = Path(folder)
+    d, modelled = with_models(description, folder)
+    dtype = getattr(torch, d.precision)
+    ropes = [_rope(r, dtype, modelled) for r in d.ropes]
+    counts = [r.positions.shape[-2] for r in ropes]
+    effects, values = [], {}
+    for name, given in d.effects.items():
+        kind = EFFECTS[name]
+        choices = {k: tuple(v) if isinstance(v, (list, tuple)) else v for k, v in given.items() if k not in kind.params}
+        effects.append(kind(**choices))
+        values[kind.name] = {k: v for k, v in given.items() if k in kind.params}
+    meshes = {k: _mesh(b, k, folder) for k, b in enumerate(d.bodies) if b.shape == "mesh"}
+    bodies = [_body(b, k, meshes.get(k)) for k, b in enumerate(d.bodies)]
+    static = {name: getattr(d, name) for name in ("dt", "substeps", "integrator", "twist", "constrained")}
+    held = {f"held_{part}": _slots(d, counts, part) for part in ("vertices", "edges")}
+    _check_holds(d)
+    armed = motion.arms(d, folder)
+    for arm in armed:
+        bodies += robots.solids(arm.robot, arm.joints[0])
+    scene, params, state = scenes.make(
+        ropes, effects, values, bodies=bodies, matter=_matter(d, dtype), **held, **static
+    )
+    weight = _weights(d, counts, state.rods.pos)
+    material = tree.replace(params.rods.material, mass=params.rods.material.mass + weight)
+    params = tree.replace(params, rods=tree.replace(params.rods, material=material))
+    return Simulation(scene, params, state, motion.plan(d, scene, state, armed), meshes, weight)
+
+
+def _check_holds(d: Description) -> None:
+    for k, hold in enumerate(d.holds):
+        if hold.robot is not None and not 0 <= hold.robot < len(d.robots):
+            raise InputError(
+                f"holds[{k}].robot: expected the number of a robot, 0 to {len(d.robots) - 1}, given {hold.robot}."
+                if d.robots
+                else f"holds[{k}].robot: there is no robot in the scene."
+            )
+        if hold.robot is not None and hold.keys:
+            raise InputError(f"holds[{k}].keys: the robot moves what it holds; put the keys into the robot.")
+        if hold.close < 0:
+            raise InputError(f"holds[{k}].close: expected a time from 0 on, given {hold.close:g}.")
+
+
+def _slots(d: Description, counts: list[int], part: str) -> tuple[int, ...]:
+    """Return the scene's slots of held vertices or edges: ropes lie one after the other."""
+    slots = []
+    for k, held in enumerate(d.holds):
+        if not held.vertices:
+            raise InputError(f"holds[{k}].vertices: is empty; expected at least one.")
+        if not 0 <= held.rope < len(counts):
+            raise InputError(f"holds[{k}].rope: expected 0 to {len(counts) - 1}, given {held.rope}.")
+        count = counts[held.rope] - (part == "edges" and not d.ropes[held.rope].closed)
+        for number in getattr(held, part):
+            place = f"holds[{k}].{part}"
+            slots.append(sum(counts[: held.rope]) + _numbered(number, count, place))
+    return tuple(slots)
+
+
+def _numbered(number: int, count: int, place: str) -> int:
+    if not -count <= number < count:
+        raise InputError(f"{place}: expected {-count} to {count - 1}, given {number}.")
+    return number % count
+
+
+def _weights(d: Description, counts: list[int], like: Tensor) -> Tensor:
+    """Return the masses that hang on vertices [kg], shape (V, 1)."""
+    found = like.new_zeros(sum(counts), 1)
+    for k, rope in enumerate(d.ropes):
+        for j, weight in enumerate(rope.weights):
+            if weight.mass <= 0:
+                raise InputError(f"ropes[{k}].weights[{j}].mass: expected more than 0, given {weight.mass:g}.")
+            at = sum(counts[:k]) + _numbered(weight.vertex, counts[k], f"ropes[{k}].weights[{j}].vertex")
+            found[at] += weight.mass
+    return found
+
+
+def _rope(rope: Rope, dtype: torch.dtype, modelled: Modelled | None = None) -> scenes.Rope:
+    given = {k: v for k, v in vars(rope).items() if k not in _OWN and v is not None}
+    points = torch.tensor(rope.points, dtype=torch.float64).reshape(-1, 3)
+    if rope.vertices is not None:
+        points = _resampled(points, rope)
+    if modelled is not None:
+        given["rest_curvature"] = modelled.curvature(len(points)).to(dtype)
+        # The calibrated roll is measured from the normal that points up.
+        level = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+        first = points[1] - points[0]
+        steep = float(first[:2].norm()) < 1e-3 * float(first.norm())
+        given["director"] = (torch.tensor([1.0, 0.0, 0.0]) if steep else level).to(dtype)
+    return scenes.Rope(points.to(dtype), **given)
+
+
+def _resampled(points: Tensor, rope: Rope) -> Tensor:
+    if len(points) < 2 or rope.vertices < 3:
+        raise InputError(f"rope: {len(points)} points and {rope.vertices} vertices; expected at least 2 and 3.")
+    line = torch.cat([points, points[:1]]) if rope.closed else points
+    along = torch.cat([points.new_zeros(1), (line[1:] - line[:-1]).norm(dim=-1).cumsum(0)])
+    count = rope.vertices + rope.closed
+    at = torch.linspace(0, 1, count, dtype=points.dtype)[: rope.vertices] * along[-1]
+    k = (torch.searchsorted(along, at, right=True) - 1).clamp(0, len(line) - 2)
+    share = ((at - along[k]) / (along[k + 1] - along[k]).clamp(min=1e-30))[:, None]
+    return line[k] + share * (line[k + 1] - line[k])
+
+
+def _mesh(body: Body, k: int, folder: Path) -> MeshShape:
+    if body.file is None:
+        raise InputError(f"bodies[{k}].file: is missing; expected the file of the mesh (STL, OBJ, PLY, ...).")
+    if body.size:
+        raise InputError(f"bodies[{k}].size: a mesh is as large as its file says; use scale.")
+    if body.scale <= 0 or body.cells < 4:
+        raise InputError(
+            f"bodies[{k}]: expected a scale above 0 and at least 4 cells, given {body.scale:g} and {body.cells}."
+        )
+    return load_mesh(folder / body.file, scale=body.scale, cells=body.cells)
+
+
+def _body(body: Body, k: int, mesh: MeshShape | None) -> Solid:
+    given = {name: v for name, v in vars(body).items() if name not in _BODY_OWN}
+    if mesh is None:
+        if body.file is not None:
+            raise InputError(f'bodies[{k}].file: only a mesh has one; give "shape": "mesh".')
+        return Solid(**given)
+    one = body.mass is not None or body.density is not None
+    wanted = {name: v for name, v in given.items() if name not in ("shape", "size") and v is not None}
+    if not one and body.motion == "free":
+        raise InputError(f"bodies[{k}]: give a free body either mass or density.")
+    return mesh.solid(**wanted)
+
+
+def _matter(d: Description, dtype: torch.dtype) -> tuple:
+    """Return what `scene.make` wants as matter; () if there is none."""
+    if not d.matter:
+        if d.box is not None:
+            raise InputError("box: there is no matter in it; give matter, or leave out the box.")
+        return ()
+    if d.box is None:
+        raise InputError("box: is missing; expected the region in which matter may be, with low, high and spacing.")
+    zero = torch.zeros((), dtype=dtype)
+    blobs = [_blob(m, k, zero) for k, m in enumerate(d.matter)]
+    fields = {f.name: getattr(d.box, f.name) for f in dataclasses.fields(particles.Grid)}
+    return particles.assemble(blobs, particles.Grid(**fields), friction=d.box.friction)
+
+
+def _blob(m: Matter, k: int, zero: Tensor) -> particles.Blob:
+    here, law = f"matter[{k}]", _LAWS[m.law]()
+    count = {"box": 3, "ball": 1}[m.shape]
+    if len(m.size) != count or min(m.size) <= 0:
+        raise InputError(f"{here}.size: expected {count} numbers above 0 for a {m.shape}, given {list(m.size)}.")
+    if not 0 < m.spacing <= 2 * min(m.size):
+        raise InputError(f"{here}.spacing: expected more than 0, up to its own size, given {m.spacing:g}.")
+    known = [*law.params, "density"]
+    for name in m.numbers:
+        if name not in known:
+            raise InputError(f"{here}.numbers.{name}: there is no such number; {like(name, known)}.")
+    if m.shape == "box":
+        low, high = ([c + s * h for c, h in zip(m.pos, m.size, strict=True)] for s in (-1, 1))
+        points = particles.fill_box(low, high, m.spacing, zero)
+        volume = 8 * m.size[0] * m.size[1] * m.size[2] / len(points)
+    else:
+        points, volume = particles.fill_ball(m.pos, m.size[0], m.spacing, zero), m.spacing**3
+    return particles.Blob(points, law, volume, zero.new_tensor(m.vel), dict(m.numbers))

@@ -1,0 +1,196 @@
+"""Running a described scene from its start to its end, and the file that keeps what happened."""
+
+from __future__ import annotations
+
+import zipfile
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchdlo import scene as scenes
+from torchdlo import scene_files
+from torchdlo.errors import InputError
+from torchdlo.files import replacing
+
+__all__ = ["Frames", "appearance", "load_frames", "run", "save_frames"]
+
+
+@dataclass(frozen=True, eq=False)
+class Frames:
+    """What happened, F moments of it, and what one needs to draw it."""
+
+    time: np.ndarray
+    """Moments [s], shape (F,)."""
+    pos: np.ndarray
+    """Vertex positions [m], shape (F, V, 3)."""
+    twist: np.ndarray
+    """Twist of edges against their reference frames [rad], shape (F, V)."""
+    force: np.ndarray
+    """Forces that holds exert on held vertices [N], shape (F, H, 3)."""
+    body_pos: np.ndarray
+    """Positions of bodies, those of robots' links last [m], shape (F, K, 3)."""
+    body_quat: np.ndarray
+    """Orientations of bodies (w, x, y, z) [1], shape (F, K, 4)."""
+    matter: np.ndarray
+    """Points of matter [m], shape (F, P, 3)."""
+    rope: np.ndarray
+    """Number of the rope that each vertex belongs to, shape (V,)."""
+    closed: np.ndarray
+    """Whether ropes are closed, shape (R,)."""
+    radius: np.ndarray
+    """Radii of the edges after vertices [m], shape (V,)."""
+    weight: np.ndarray
+    """Masses that hang on vertices [kg], shape (V,)."""
+    body_shape: np.ndarray
+    """Shapes of bodies as in `shapes.SIZES`, shape (K,)."""
+    body_size: np.ndarray
+    """Their sizes, see there [m or rad], shape (K, 3)."""
+    body_motion: np.ndarray
+    """"free", "fixed", "kinematic", or "robot" for the links of one, shape (K,)."""
+    mesh_vertices: np.ndarray
+    """Vertices of all meshes, in the frames of their bodies [m], shape (M, 3)."""
+    mesh_faces: np.ndarray
+    """Their triangles, shape (T, 3)."""
+    mesh_body: np.ndarray
+    """The body of each triangle, shape (T,)."""
+    law: np.ndarray
+    """Law of each point of matter, shape (P,)."""
+    table: np.ndarray
+    """Heights of tables that effects hold [m], shape (0,) or (1,)."""
+    look: np.ndarray
+    """Direction from the scene to the camera, shape (3,)."""
+    interrupted: bool = False
+    """Whether it was stopped before its end."""
+    problem: str = ""
+    """What went wrong, "" if nothing did; frames end before it."""
+
+
+def _seen(state: scenes.State) -> list[np.ndarray]:
+    rods, none = state.rods, state.rods.pos.new_zeros(0, 4)
+    bodies = (state.bodies.pos, state.bodies.quat) if state.bodies else (none[:, :3], none)
+    # Pictures need no more digits, and there are many points.
+    matter = (state.matter.pos if state.matter else none[:, :3]).to(torch.float32)
+    found = (state.time[0, 0], rods.pos, rods.twist[:, 0], state.reaction.force, *bodies, matter)
+    return [x.cpu().numpy().copy() for x in found]
+
+
+def appearance(
+    scene: scenes.Scene, params: scenes.Params, meshes: Mapping[int, tuple[Tensor, Tensor]], robots: int = 0
+) -> dict[str, np.ndarray]:
+    """Return what stays the same in pictures, by the names of `Frames`; of a batch, of its first scene.
+
+    Args:
+        scene: the scene.
+        params: its parameters.
+        meshes: vertices [m] and triangles of bodies that are meshes, by the number of the body.
+        robots: how many of the bodies, the last ones, are links of robots.
+    """
+    counts, own = scene.topology.counts, len(scene.bodies) - robots
+    vertices, faces, owner, start = [np.zeros((0, 3))], [np.zeros((0, 3), int)], [np.zeros(0, int)], 0
+    for k, (corners, triangles) in meshes.items():
+        vertices.append(corners.numpy())
+        faces.append(triangles.numpy() + start)
+        owner.append(np.full(len(triangles), k))
+        start += len(corners)
+    groups = scene.matter.groups if scene.matter else ()
+    heights = [v["height"].reshape(-1)[:1].numpy() for n, v in params.effects.items() if n.startswith("table")]
+    radius = params.rods.material.radius
+    return {
+        "rope": np.repeat(np.arange(len(counts)), counts),
+        "closed": np.array(scene.topology.closed, bool),
+        "radius": radius.reshape(-1, radius.shape[-2])[0].numpy(),
+        "weight": np.zeros(sum(counts)),
+        "body_shape": np.array([b.shape for b in scene.bodies], str),
+        "body_size": params.bodies.size.reshape(-1, len(scene.bodies), 3)[0].numpy()
+        if scene.bodies
+        else np.zeros((0, 3)),
+        "body_motion": np.array([b.motion if k < own else "robot" for k, b in enumerate(scene.bodies)], str),
+        "mesh_vertices": np.concatenate(vertices),
+        "mesh_faces": np.concatenate(faces),
+        "mesh_body": np.concatenate(owner),
+        "law": np.repeat([g.law.name for g in groups] or np.zeros(0, str), [g.count for g in groups]),
+        "table": heights[0] if heights else np.zeros(0),
+    }
+
+
+def _looks(made: scene_files.Simulation, description: scene_files.Description) -> dict[str, np.ndarray]:
+    meshes = {k: (mesh.vertices, mesh.faces) for k, mesh in made.meshes.items()}
+    seen = appearance(made.scene, made.params, meshes, len(made.scene.bodies) - len(description.bodies))
+    return seen | {"weight": made.weight[:, 0].numpy(), "look": np.array(description.look)}
+
+
+def run(
+    description: scene_files.Description,
+    *,
+    folder: str | Path = ".",
+    every: int = 10,
+    compiled: bool = False,
+    callback: Callable[[str, int, int, str], None] | None = None,
+) -> Frames:
+    """Run a scene and keep a frame of its start and after every `every` steps.
+
+    A `KeyboardInterrupt` that `callback` raises ends the run, as does a state that is not sound; frames so far are
+    returned.
+
+    Args:
+        description: the scene.
+        folder: where the files that it names are looked for.
+        every: steps per frame.
+        compiled: whether to compile the step, worth it for long runs; else it is recorded.
+        callback: told (stage, steps done, steps in all, message) after every frame.
+    """
+    made = scene_files.assemble(description, folder=folder)
+    scene, params, state = made.scene, made.params, made.state
+    control = made.plan.follow(scene)
+    total = max(1, round(description.duration / description.dt))
+    step = scenes.stepper(scene, compiled=compiled, recorded=total > 50)
+    kept, interrupted, problem = [_seen(state)], False, ""
+    with torch.no_grad():
+        for k in range(total):
+            command = control(k, state)
+            state = step(params, state, command)
+            if (k + 1) % every and k + 1 < total:
+                continue
+            try:
+                scenes.check_state(state)
+            except RuntimeError as error:
+                problem = f"after {float(state.time):g} s: {error}"
+                break
+            kept.append(_seen(state))
+            try:
+                if callback is not None:
+                    callback("simulate", k + 1, total, f"{float(state.time):.3g} s")
+            except KeyboardInterrupt:
+                interrupted = True
+                break
+    moving = (np.stack(parts) for parts in zip(*kept, strict=True))
+    return Frames(*moving, **_looks(made, description), interrupted=interrupted, problem=problem)
+
+
+def save_frames(frames: Frames, path: Path, description: scene_files.Description | None = None) -> None:
+    """Write frames as .npz, with the scene itself as JSON text in "torchdlo_scene", "" if it is not given."""
+    arrays = {name: value for name, value in vars(frames).items() if isinstance(value, np.ndarray)}
+    text = "" if description is None else scene_files.text(description)
+    with replacing(path) as temporary:
+        np.savez_compressed(temporary, torchdlo_scene=np.array(text), **arrays)
+
+
+def load_frames(path: str | Path) -> Frames:
+    """Read what `save_frames` wrote; `path` may be the folder of the run."""
+    path = Path(path)
+    file = path / "frames.npz" if path.is_dir() else path
+    if not file.is_file():
+        raise InputError(f"{file}: expected the frames of a run, found none; torchdlo simulate --out writes them.")
+    names = [f.name for f in fields(Frames) if f.type == "np.ndarray"]
+    try:
+        with np.load(file, allow_pickle=False) as found:
+            missing = [name for name in names if name not in found.files]
+            if missing:
+                raise InputError(f"{file}: lacks {', '.join(missing)}; simulate the scene again with this version.")
+            return Frames(**{name: found[name] for name in names})
+    except (ValueError, EOFError, OSError, zipfile.BadZipFile) as error:
+        raise InputError(f"{file}: expected the frames of a run; reading failed: {error}.") from None

@@ -1,0 +1,193 @@
+"""What a scene file can say: plain data with the defaults of what it does not say."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+__all__ = ["Body", "Box", "Description", "Hold", "Key", "Matter", "Robot", "Rope", "Weight"]
+
+Vector = tuple[float, float, float]
+Quaternion = tuple[float, float, float, float]
+Wall = Literal["open", "separate", "slip", "stick"]
+
+
+@dataclass(frozen=True)
+class Weight:
+    """A point mass that hangs on a rope; drawn as a ball of steel, which touches nothing."""
+
+    vertex: int
+    """Number of the vertex; -1 is the last."""
+    mass: float
+    """Mass [kg]."""
+
+
+@dataclass(frozen=True)
+class Rope:
+    """A rope; fields without a comment are those of `scene.Rope`."""
+
+    points: tuple[Vector, ...]
+    """Corners of the line along which it lies [m]; its vertices, if `vertices` is not given."""
+    vertices: int | None = None
+    """How many vertices to place at equal distances along that line."""
+    radius: float = 0.005
+    mass: float | None = None
+    density: float | None = None
+    youngs: float | None = None
+    shear: float | None = None
+    bend: float | None = None
+    bend2: float | None = None
+    twist: float | None = None
+    stretch: float | None = None
+    closed: bool = False
+    rest: Literal["straight", "as_placed"] = "straight"
+    model: str | None = None
+    """Model file of `torchdlo calibrate` or `diagnose`, from which numbers and effects are taken."""
+    weights: tuple[Weight, ...] = ()
+    """What hangs on it."""
+
+
+@dataclass(frozen=True)
+class Key:
+    """Where something is at a time, from where it is at the start; between keys it moves by `path`."""
+
+    time: float
+    """When [s]."""
+    move: Vector = (0.0, 0.0, 0.0)
+    """How far it has moved [m]."""
+    turn: Vector = (0.0, 0.0, 0.0)
+    """By how much it has turned: axis times angle [rad]."""
+
+
+@dataclass(frozen=True)
+class Hold:
+    """Vertices of a rope that are held together as by one tool."""
+
+    vertices: tuple[int, ...]
+    """Numbers of vertices along the rope; -1 is the last."""
+    rope: int = 0
+    """Number of the rope."""
+    edges: tuple[int, ...] = ()
+    """Edges whose twist is held, too."""
+    keys: tuple[Key, ...] = ()
+    """Motion about the first vertex; none if empty."""
+    path: Literal["smooth", "linear"] = "smooth"
+    """Whether it starts and stops at each key without a jerk."""
+    robot: int | None = None
+    """Number of the robot whose tool holds them, in place of `keys`."""
+    close: float = 0.0
+    """When it grips [s]: from then on what it holds keeps its place in the tool."""
+    release: float | None = None
+    """When it is let go [s], if ever."""
+
+
+@dataclass(frozen=True)
+class Body:
+    """A rigid body; fields without a comment are those of `coupling.bodies.dynamics.Solid`."""
+
+    shape: Literal["plane", "sphere", "box", "capsule", "cylinder", "cone", "torus", "ring", "mesh"]
+    size: tuple[float, ...] = ()
+    pos: Vector = (0.0, 0.0, 0.0)
+    """Centre of mass; of a mesh, the origin of its file."""
+    quat: Quaternion = (1.0, 0.0, 0.0, 0.0)
+    vel: Vector = (0.0, 0.0, 0.0)
+    omega: Vector = (0.0, 0.0, 0.0)
+    motion: Literal["free", "fixed", "kinematic"] = "free"
+    density: float | None = None
+    mass: float | None = None
+    mu_s: float = 0.3
+    mu_k: float = 0.3
+    restitution: float = 0.0
+    damping: float = 0.0
+    name: str = ""
+    keys: tuple[Key, ...] = ()
+    """Motion of a kinematic body."""
+    path: Literal["smooth", "linear"] = "smooth"
+    file: str | None = None
+    """Of a mesh: any file that trimesh reads."""
+    scale: float = 1.0
+    """Of a mesh: metres per unit of the file."""
+    cells: int = 48
+    """Of a mesh: cells of its grid of distances along the longest side."""
+
+
+@dataclass(frozen=True)
+class Robot:
+    """A chain of links whose joints go where they bring its tool along `keys`."""
+
+    urdf: str = "panda"
+    """File, or "panda" for the arm in the package."""
+    tool: str | None = None
+    """Link whose pose is commanded; the last one if there is only one end."""
+    base: Vector = (0.0, 0.0, 0.0)
+    """Where the first link stands [m]."""
+    base_quat: Quaternion = (1.0, 0.0, 0.0, 0.0)
+    """How it is turned."""
+    joints: tuple[float, ...] = ()
+    """Joints at the start [rad or m]; the middle of their ranges if not given."""
+    pos: Vector | None = None
+    """Where the tool is at the start [m], if `joints` are only a posture near it."""
+    quat: Quaternion = (0.0, 1.0, 0.0, 0.0)
+    """How it is turned there; it points down if not given."""
+    keys: tuple[Key, ...] = ()
+    """Motion of the tool."""
+    path: Literal["smooth", "linear"] = "smooth"
+
+
+@dataclass(frozen=True)
+class Matter:
+    """A piece of matter, made of material points."""
+
+    law: Literal["elastic", "plastic", "liquid", "sand"]
+    size: tuple[float, ...]
+    """Half lengths of a box, or the radius of a ball [m]."""
+    spacing: float
+    """Distance of its points [m]; half a cell of the box is usual."""
+    shape: Literal["box", "ball"] = "box"
+    pos: Vector = (0.0, 0.0, 0.0)
+    """Its middle [m]."""
+    vel: Vector = (0.0, 0.0, 0.0)
+    """Velocity at the start [m/s]."""
+    numbers: dict[str, float] = field(default_factory=dict)
+    """Numbers of its law, and its density, that differ from their defaults."""
+
+
+@dataclass(frozen=True)
+class Box:
+    """Where matter may be; fields without a comment are those of `coupling.mpm.particles.Grid`."""
+
+    low: Vector
+    high: Vector
+    spacing: float
+    walls: tuple[Wall, Wall, Wall, Wall, Wall, Wall] = ("separate",) * 6
+    window: tuple[int, int, int] | None = None
+    friction: float = 0.3
+    """Coefficient of friction at walls that let go."""
+
+
+@dataclass(frozen=True)
+class Description:
+    """A simulation from its start to its end; fields without a comment are those of `scene.Scene`."""
+
+    ropes: tuple[Rope, ...]
+    effects: dict[str, dict[str, Any]]
+    """Effects by name, each with the numbers and choices that differ from its defaults."""
+    bodies: tuple[Body, ...] = ()
+    holds: tuple[Hold, ...] = ()
+    robots: tuple[Robot, ...] = ()
+    matter: tuple[Matter, ...] = ()
+    box: Box | None = None
+    """Where matter may be."""
+    duration: float = 1.0
+    """How long to simulate [s]."""
+    dt: float = 1e-3
+    substeps: int = 5
+    integrator: Literal["explicit", "implicit"] = "explicit"
+    twist: Literal["none", "dynamic", "quasistatic"] = "none"
+    constrained: bool = True
+    precision: Literal["float64", "float32"] = "float64"
+    """Type of all numbers."""
+    look: Vector = (0.5, -1.0, 0.45)
+    """From where pictures are taken: direction from the scene to the camera."""
+    notes: str = ""
+    """Anything."""

@@ -1,0 +1,1 @@
+"""Calibration of a rope model to a recording."""

@@ -1,0 +1,298 @@
+"""Calibration: the numbers of the baseline model with which it predicts the train trials best."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from torchdlo.errors import InputError
+from torchdlo.sysid.estimation import evaluation, levenberg_marquardt
+from torchdlo.sysid.estimation.checkpoint import Checkpoint
+from torchdlo.sysid.estimation.levenberg_marquardt import Point, Space
+from torchdlo.sysid.estimation.result import Calibration
+from torchdlo.sysid.estimation.worker_pool import Pool
+from torchdlo.sysid.model import initial_state as starts_of
+from torchdlo.sysid.model import model_file
+from torchdlo.sysid.model.model_file import Saved
+from torchdlo.sysid.model.rope_model import RopeModel
+from torchdlo.sysid.model.trial_batch import Motion, Start
+from torchdlo.sysid.recordings.recording import Recording, Trial
+
+Callback = Callable[[str, int, int, str], None]
+"""Called with stage, steps done, steps in all, and a word on how it goes."""
+
+_SCOUTS = 6
+"""Train trials that the many starts are tried on."""
+
+_LOOKS = 6
+"""Iterations that the best starts get on those."""
+
+
+@dataclass(eq=False)
+class _Job:
+    """One fit of one variant of the model."""
+
+    pool: Pool
+    options: tuple[tuple[str, Any], ...]
+    model: RopeModel
+    space: Space
+    motion: Motion
+    start: Start
+    first: np.ndarray
+    values: np.ndarray
+    given: bool = False
+    point: Point | None = None
+
+    @property
+    def columns(self) -> list[int]:
+        """Return where the numbers that are fitted stand among those of the model."""
+        return [self.model.parameters.index(name) for name in self.space.names]
+
+    def simulator(self, trials: Sequence[Trial]) -> starts_of.Simulator:
+        """Return what simulates trials, on all cores."""
+        return self.pool.simulator(self.model.effects, tuple(t.name for t in trials), self.options)
+
+    def full(self, values: np.ndarray) -> np.ndarray:
+        """Return all numbers of the model for fitted ones, both (..., K)."""
+        out = np.broadcast_to(self.first, (*values.shape[:-1], len(self.first))).copy()
+        out[..., self.columns] = values
+        return out
+
+
+def calibrate(
+    recording: Recording,
+    *,
+    starts: int = 48,
+    iterations: int = 20,
+    seed: int = 0,
+    vertices: int | None = None,
+    rest: str = "auto",
+    checkpoint: Path | None = None,
+    resume: bool = False,
+    given: Saved | None = None,
+    workers: int | None = 1,
+    callback: Callback | None = None,
+) -> Calibration:
+    """Fit the baseline model to the train trials and judge it on the test trials.
+
+    Stiffnesses and damping rate (and, with a given rest shape, how much of it is real and how it lies in the first
+    clamp) are fitted from several starts in one batch on a few trials, and from the best of them on all. Initial
+    velocities are estimated for each trial from its first 0.1 s.
+
+    Args:
+        recording: what was measured.
+        starts: number of starts.
+        iterations: most iterations of each of the two stages.
+        seed: of the random starts.
+        vertices: vertices of the simulated rope; about two per marker if not given.
+        rest: rest shape "straight", "given" (`rest_positions` of the recording), or "auto", whichever of the two
+            predicts the train trials better.
+        checkpoint: file that keeps the best so far.
+        resume: go on from it.
+        given: model to start from in place of many starts, with its effects; it says what the rest shape is.
+        workers: processes, one per core if None. More than one begin by importing the program's main module: a script
+            that asks for them has to guard what it does by `if __name__ == "__main__":`.
+        callback: see `Callback`; it may raise KeyboardInterrupt, which ends the fit with the best so far.
+
+    Raises:
+        InputError: the recording cannot be calibrated with these options.
+    """
+    begun = time.perf_counter()
+    if rest not in ("auto", "straight", "given"):
+        raise InputError(f"rest is {rest!r}; expected auto, straight or given.")
+    report = callback or (lambda stage, done, total, message: None)
+    if given is not None and rest not in ("auto", given.options["rest"]):
+        raise InputError(f"rest is {rest!r}; expected auto or {given.options['rest']}, as {given.path} has it.")
+    rest = rest if given is None else given.options["rest"]
+    kinds = [rest] if rest != "auto" else ["straight"] + (["given"] if recording.rest_positions is not None else [])
+    asked: dict[str, Any] = {"starts": starts, "seed": seed, "vertices": vertices, "rest": rest}
+    if given is not None:
+        asked |= {"values": given.values, "options": given.options}
+    memory = Checkpoint(checkpoint, recording, asked, resume)
+    best: _Job | None = None
+    interrupted = False
+    with Pool(recording, {"vertices": vertices} if given is None else given.options, workers) as pool:
+        try:
+            for kind in kinds:
+                job = _job(pool, kind, vertices, given)
+                best = best or job
+                for improved in _fit(job, starts, iterations, np.random.default_rng(seed), memory, report):
+                    if best.point is None or best is improved or improved.point.cost < best.point.cost:
+                        best = improved
+        except KeyboardInterrupt:
+            if best is None or best.point is None:
+                raise
+            interrupted = True
+        return _judge(best, seed, interrupted, begun, report)
+
+
+def _job(pool: Pool, rest: str, vertices: int | None, given: Saved | None) -> _Job:
+    recording = pool.recording
+    trials = _usable(recording)
+    if given is None:
+        options = {"rest": rest}
+        model = pool.local.model((), tuple(options.items()))
+        space, values = Space(tuple(model.parameters), tuple(model.params)), model.guess()
+    else:
+        options = {} if vertices is None else {"vertices": vertices}
+        model = given.model(recording, **options)
+        sizes, values = given.sizes(model), given.start(model)
+        params = tuple(p for name, p in zip(model.parameters, model.params, strict=True) if name in sizes)
+        space = Space(tuple(sizes), params, tuple(sizes.values()))
+    start, motion = starts_of.begin(model, trials), model.motion(trials)
+    return _Job(pool, tuple(options.items()), model, space, motion, start, values, values, given is not None)
+
+
+def _usable(recording: Recording) -> list[Trial]:
+    """Return the train trials that are not suspect from start to end."""
+    free = ~recording.train[0].gripped
+    usable = [t for t in recording.train if np.isfinite(t.markers[~t.suspect][:, free]).any()]
+    if not usable:
+        raise InputError(
+            f"{recording.path}: every frame of every train trial is marked suspect; expected some to fit on."
+        )
+    return usable
+
+
+def _fit(
+    job: _Job,
+    starts: int,
+    iterations: int,
+    rng: np.random.Generator,
+    memory: Checkpoint,
+    report: Callback,
+) -> Iterator[_Job]:
+    """Yield the job each time it got better."""
+    name = f"{job.model.rest} rest shape"
+    kept = memory.recall(job.model.rest)
+    if kept or job.given:
+        raw = job.space.to_raw(np.array(kept or job.first)[job.columns])
+    else:
+        raw = _scout(job, starts, rng, report, name)
+    stage = f"fitting {len(job.motion.names)} trials, {name}"
+    report(stage, 0, iterations + 1, "")
+    run = job.simulator(_usable(job.pool.recording))
+    job.start = starts_of.refine(job.model, job.motion, job.start, job.full(job.space.to_values(raw)), run)
+
+    def simulate(values: np.ndarray) -> np.ndarray:
+        return run(job.start, job.full(values), None)
+
+    points = levenberg_marquardt.evaluate(simulate, job.motion.markers, job.space, raw[None])
+    if not np.isfinite(points[0].cost):
+        raise InputError(
+            f"{job.pool.recording.path}: the simulation failed on the train trials from every start; check length, "
+            "mass and marker_arclength, or use fewer vertices."
+        )
+    job.point, job.values = points[0], job.full(job.space.to_values(points[0].raw))
+    yield job
+    report(stage, 1, iterations + 1, f"{1e3 * job.point.cost:.2f} mm")
+    for done, (point,) in enumerate(
+        levenberg_marquardt.improve(simulate, job.motion.markers, job.space, points, iterations=iterations)
+    ):
+        job.point, job.values = point, job.full(job.space.to_values(point.raw))
+        memory.keep(job.model.rest, job.values)
+        yield job
+        report(stage, done + 2, iterations + 1, f"{1e3 * point.cost:.2f} mm")
+    report(stage, iterations + 1, iterations + 1, f"{1e3 * job.point.cost:.2f} mm")
+
+
+def _scout(job: _Job, starts: int, rng: np.random.Generator, report: Callback, name: str) -> np.ndarray:
+    """Return coordinates to start the fit from: many starts on a few trials, fewer and fewer over longer times.
+
+    In its first second a rope has not forgotten where it began and the cost has few local minima; over a long horizon
+    small errors of phase make many.
+    """
+    trials = _usable(job.pool.recording)
+    scouts = [trials[i] for i in _pick(len(trials), _SCOUTS)]
+    motion, begin, run = job.model.motion(scouts), starts_of.begin(job.model, scouts), job.simulator(scouts)
+    begin = starts_of.refine(job.model, motion, begin, job.values, run)
+    stage, total = f"trying {starts} starts, {name}", 2 + _LOOKS
+
+    def over(share: float) -> tuple[levenberg_marquardt.Simulate, np.ndarray]:
+        frames = min(max(10, round(share * motion.markers.shape[1])), motion.markers.shape[1])
+        return lambda values: run(begin, values, frames), motion.markers[:, :frames]
+
+    raws = _spread(job, starts, rng)
+    report(stage, 0, total, "")
+    for look, (share, keep) in enumerate(((0.3, max(2, starts // 3)), (1.0, max(2, starts // 8)))):
+        simulate, measured = over(share)
+        costs = levenberg_marquardt.costs(simulate(job.space.to_values(raws)), measured)
+        raws = raws[np.argsort(costs, kind="stable")[:keep]]
+        report(stage, look + 1, total, f"{1e3 * costs.min():.2f} mm over {share:.0%} of the time")
+    simulate, measured = over(1.0)
+    points = levenberg_marquardt.evaluate(simulate, measured, job.space, raws)
+    for look, points in enumerate(
+        levenberg_marquardt.improve(simulate, measured, job.space, points, iterations=_LOOKS)
+    ):  # noqa: B020
+        report(stage, look + 3, total, f"{1e3 * min(p.cost for p in points):.2f} mm")
+    report(stage, total, total, "")
+    return min(points, key=lambda p: p.cost).raw
+
+
+def _pick(count: int, wanted: int) -> list[int]:
+    return sorted({round(i) for i in np.linspace(0, count - 1, min(count, wanted))})
+
+
+_REACH = {"bending_stiffness": np.log(40.0), "twisting_stiffness": np.log(4.0), "damping_rate": np.log(10.0)}
+"""How far starts go either way of the guess; the twisting stiffness relative to the bending stiffness."""
+
+
+def _spread(job: _Job, starts: int, rng: np.random.Generator) -> np.ndarray:
+    """Return starts (S, K) spread around the guess, evenly in every coordinate; the first is the guess itself."""
+    raws = np.repeat(job.space.to_raw(job.values)[None], starts, 0)
+    for k, (name, param) in enumerate(zip(job.space.names, job.space.params, strict=True)):
+        # A Latin hypercube: one start in each of `starts` slices of a coordinate, in a random order.
+        share = (rng.permutation(starts) + rng.uniform(size=starts)) / starts - 0.5
+        raws[1:, k] += (2 * _REACH[name] if name in _REACH else 1.0 if param.periodic else 0.4) * share[1:]
+    bend, twist = (job.space.names.index(name) for name in ("bending_stiffness", "twisting_stiffness"))
+    raws[1:, twist] += raws[1:, bend] - raws[0, bend]
+    return job.space.clip(raws)
+
+
+def _judge(job: _Job, seed: int, interrupted: bool, begun: float, report: Callback) -> Calibration:
+    """Predict all trials before and after, and compare."""
+    recording = job.pool.recording
+    trials = recording.trials("all")
+    simulate = job.simulator(trials)
+    report("predicting all trials", 0, 2, "")
+    before = evaluation.predict(job.model, trials, job.first, simulate)
+    report("predicting all trials", 1, 2, "")
+    after = evaluation.predict(job.model, trials, job.values, simulate)
+    report("predicting all trials", 2, 2, "")
+    low, high = levenberg_marquardt.interval(job.point, job.space)
+    return Calibration(
+        parameters={
+            name: {"value": float(v), "low": float(min(a, b)), "high": float(max(a, b)), "unit": param.unit}
+            for name, param, v, a, b in zip(
+                job.space.names, job.space.params, job.values[job.columns], low, high, strict=True
+            )
+        },
+        **evaluation.errors(recording, after),
+        before=evaluation.errors(recording, before),
+        baselines=evaluation.trivial(recording),
+        per_trial=evaluation.by_trial(recording, before, after),
+        seconds=time.perf_counter() - begun,
+        model=model_file.content(job.model, job.values),
+        predictions=after,
+        predictions_before=before,
+        seed=seed,
+        interrupted=interrupted,
+        notes=_notes(recording, job),
+    )
+
+
+def _notes(recording: Recording, job: _Job) -> list[str]:
+    notes = [f"Rest shape: {job.model.rest}."]
+    if job.model.effects:
+        notes.append(f"Effects of the given model: {', '.join(e.replace('_', ' ') for e in job.model.effects)}.")
+    unused = sorted({t.name for t in recording.train} - set(job.motion.names))
+    if unused:
+        notes.append(f"Not fitted because every frame is marked suspect: {', '.join(unused)}.")
+    if not job.model.measured_twist() and job.model.clamps:
+        notes.append("The grippers' rotation about the rope was not measured; it is taken to start without twist.")
+    return notes

@@ -1,0 +1,1 @@
+"""Diagnosis: which effect a recording shows and the model lacks."""

@@ -1,0 +1,163 @@
+"""Effects that were found earlier, looked at again when another one has been added: leave them out, or exchange them.
+
+What is added first has to make up for everything that is missing. Once the rest is known, it may be needless, a law
+with fewer numbers may do, or another effect may fit better (stepwise search with exchanges: Pudil et al. 1994,
+doi:10.1016/0167-8655(94)90127-9).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Sequence
+from dataclasses import dataclass, field
+
+from torchdlo.sysid.diagnosis import effect_library
+from torchdlo.sysid.diagnosis.budget import Budget
+from torchdlo.sysid.diagnosis.candidate_fits import extended
+from torchdlo.sysid.diagnosis.error_floor import rms
+from torchdlo.sysid.diagnosis.score_test import screen
+from torchdlo.sysid.diagnosis.workspace import SILENT, Bench, Callback
+from torchdlo.sysid.estimation.jobs import Fitted
+from torchdlo.sysid.model.trial_batch import Start
+
+MATTERS = 0.03
+"""Share of the baseline's excess gap that each effect has to close, whatever the others leave."""
+
+NEARLY_ALL = 0.8
+"""Share of what is left above the floor."""
+
+_TRIED = 2
+"""Effects that are tried in the place of another, besides those that do alike things."""
+
+_EXCHANGES = 3
+"""Most exchanges after an effect was added."""
+
+
+@dataclass
+class Found:
+    """Effects in the order in which they were found."""
+
+    shares: dict[str, float] = field(default_factory=dict)
+    """By effect: share of the gap above the floor that it closed on the test trials."""
+    ties: dict[str, list[str]] = field(default_factory=dict)
+    """By effect: others that the data cannot tell from it."""
+
+    def exchange(self, old: str, new: str, *, alike: bool) -> None:
+        """Put another effect in the place of one, which it is `alike` if the data cannot tell them apart."""
+        also = [n for n in (*self.ties.get(old, []), old) if n != new] if alike else []
+        self.shares = {new if n == old else n: share for n, share in self.shares.items()}
+        self.ties = {new if n == old else n: names for n, names in self.ties.items()} | {new: also}
+
+    def leave_out(self, name: str) -> None:
+        """Forget an effect that the last one makes needless; the last one takes over its share."""
+        del self.ties[name]
+        share = self.shares.pop(name)
+        self.shares[[*self.shares][-1]] += share
+
+
+class Revision:
+    """Second looks at the effects of a search."""
+
+    def __init__(self, bench: Bench, budget: Budget, plain: Sequence[Fitted], report: Callback) -> None:
+        """Prepare.
+
+        Args:
+            bench: the trials.
+            budget: how much work to do.
+            plain: the baseline, and what it became when it was fitted for longer.
+            report: told how it goes.
+        """
+        self.bench, self.budget, self.plain, self.report = bench, budget, plain, report
+        self._reductions: dict[Hashable, tuple[Start, Fitted]] = {}
+
+    def matters(self, less: Fitted, more: Fitted, split: str) -> bool:
+        """Return whether a model's gap is smaller by more than the floor, and by a share of the baseline's.
+
+        What takes away nearly all that the others leave matters, however small that is beside the baseline's gap.
+        """
+        # A baseline may go astray on a trial: then what it became when it was fitted further tells what a share is.
+        first = min(rms(self.bench.gaps(f, split)) for f in self.plain) ** 2
+        before, after = (rms(self.bench.gaps(f, split)) ** 2 for f in (less, more))
+        floor, closed = self.bench.level**2, before - after
+        enough = min(MATTERS * (first - self.bench.floor.noise**2), NEARLY_ALL * (before - floor))
+        return closed > max(floor, enough)
+
+    def pruned(self, fitted: Fitted, found: Found) -> Fitted:
+        """Return the model without the effects that the last one, or other numbers, have made needless."""
+        for name in [*found.shares][:-1]:
+            less = self._without(fitted, name)
+            if not self.matters(less, fitted, "train"):
+                fitted = less
+                found.leave_out(name)
+        return fitted
+
+    def plainer(self, fitted: Fitted, found: Found, possible: Sequence[str]) -> Fitted:
+        """Return the model with possible special laws in the place of general ones, where they fit as well.
+
+        What one effect alone cannot explain bends a law with more numbers than it needs; with the others it may do
+        without them.
+        """
+        for general, (special, _) in effect_library.CONTAINED.items():
+            if general not in found.shares or special in fitted.effects or special not in possible:
+                continue
+            less = self.bench.fit([self.bench.exchange(fitted, general, special, self.budget.more)])[0]
+            self.report(f"{special} in the place of {general}", 1, 1, f"{1e3 * less.point.cost:.2f} mm")
+            if less.point.cost - fitted.point.cost < self._tie(fitted):
+                fitted = less
+                found.exchange(general, special, alike=True)
+        return fitted
+
+    def exchanged(self, fitted: Fitted, found: Found, possible: Sequence[str]) -> Fitted:
+        """Return the model with other effects in the place of some, where they fit better beside the rest.
+
+        Where nothing is left to be explained, and of one effect alone, which was held against all others just now,
+        there is nothing to look for.
+        """
+        waiting, count = [*found.shares][:-1], 0
+        while waiting and count < _EXCHANGES and rms(self.bench.gaps(fitted, "all")) > SILENT * self.bench.level:
+            old = waiting.pop(0)
+            best = self._instead(fitted, old, [n for n in possible if n not in fitted.effects])
+            if not self._better(best, fitted) or self._astray(best, fitted):
+                continue
+            new, count = best.effects[-1], count + 1
+            alike = fitted.point.cost - best.point.cost < self._tie(fitted)
+            fitted = best
+            self.bench.pool.choose(**dict(best.options))
+            found.exchange(old, new, alike=alike)
+            waiting = [n for n in found.shares if n != new]
+        return fitted
+
+    def _tie(self, fitted: Fitted) -> float:
+        """Return the difference in cost up to which models are not told apart from one [m]."""
+        return self.bench.tie(self.plain[-1].point.cost, fitted.point.cost)
+
+    def _better(self, other: Fitted, fitted: Fitted) -> bool:
+        """Return whether another model fits better, or as well with fewer numbers."""
+        fewer = len(other.space.names) < len(fitted.space.names)
+        bar = fitted.point.cost + (1 if fewer else -1) * self._tie(fitted)
+        return other.point.cost < bar
+
+    def _astray(self, other: Fitted, fitted: Fitted) -> bool:
+        return self.bench.astray(other, self.bench.gaps(fitted, "all"))
+
+    def _without(self, fitted: Fitted, name: str) -> Fitted:
+        """Return the model without one of its effects; what was asked for before is not fitted again."""
+        start, key = self.bench.starts["train"], (fitted.effects, fitted.options, fitted.values.tobytes(), name)
+        at, less = self._reductions.get(key, (None, None))
+        if at is not start:
+            less = self.bench.fit([self.bench.reduction(fitted, name, self.plain[0], 2 * self.budget.more)])[0]
+            self.report(f"without {name}", 1, 1, f"{1e3 * less.point.cost:.2f} mm")
+            self._reductions[key] = start, less
+        return less
+
+    def _instead(self, fitted: Fitted, old: str, names: Sequence[str]) -> Fitted:
+        """Return the best model with one of several effects in the place of another."""
+        less, stage = self._without(fitted, old), f"in the place of {old}"
+        scores = screen(self.bench.pool, less, names, self.bench.starts["train"], lambda *_: None)
+        kin = {n for group in effect_library.KIN if old in group for n in group}
+        tried = [*scores[:_TRIED], *(s for s in scores[_TRIED:] if s.name in kin)]
+        first, more = self.budget.iterations, self.budget.more
+        fits, _ = extended(self.bench, less, tried, first, self.bench.fit)
+        lead = sorted(fits, key=lambda f: f.point.cost)[:_TRIED]
+        best = min(self.bench.fit([self.bench.further(f, more) for f in lead]), key=lambda f: f.point.cost)
+        self.report(f"{stage}: {best.effects[-1]}", 1, 1, f"{1e3 * best.point.cost:.2f} mm")
+        return best

@@ -1,0 +1,71 @@
+"""First fits of a model with one effect more."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+from torchdlo.sysid.diagnosis import clamp_models, effect_library
+from torchdlo.sysid.diagnosis.score_test import Score
+from torchdlo.sysid.diagnosis.workspace import Bench
+from torchdlo.sysid.estimation.jobs import Fit, Fitted
+
+_SHORT = 0.6
+"""Share of the trials that first fits see."""
+
+
+def extend(bench: Bench, base: Fitted, score: Score, iterations: int, frames: int | None) -> list[Fit]:
+    """Return the jobs of fitting a model with one effect more, from the doses that suit best.
+
+    Args:
+        bench: the trials.
+        base: the model without.
+        score: of the effect.
+        iterations: most iterations.
+        frames: how many frames to fit; all if None.
+    """
+    if score.name == clamp_models.NAME and clamp_models.loose(bench.pool.local.model(base.effects, base.options)):
+        return [clamp_models.stiff(bench, base, score, iterations, frames)]
+    # Numbers that no dose uses stay off, a slope where a spot fits better; but vectors are fitted whole.
+    kinds: dict[frozenset[str], list] = {}
+    for start in score.starts:
+        kinds.setdefault(frozenset(vector(name) for name in start[0]), []).append(start)
+    jobs = []
+    for vectors, starts in kinds.items():
+        used = [n.name for n in effect_library.numbers(score.name, bench.recording) if vector(n.name) in vectors]
+        jobs.append(bench.extension(base, replace(score, starts=tuple(starts)), used, iterations, frames))
+    return jobs
+
+
+def extended(
+    bench: Bench,
+    base: Fitted,
+    scores: Sequence[Score],
+    iterations: int,
+    fit: Callable[[Sequence[Fit]], Sequence[Fitted]],
+    others: Sequence[Fit] = (),
+) -> tuple[list[Fitted], list[Fitted]]:
+    """Return the best short fit of each of several effects, and those of other jobs.
+
+    Args:
+        bench: the trials.
+        base: the model without.
+        scores: of the effects.
+        iterations: most iterations.
+        fit: does jobs.
+        others: what to do besides.
+    """
+    jobs = [extend(bench, base, score, iterations, short(bench)) for score in scores]
+    found = list(fit([*(job for alike in jobs for job in alike), *others]))
+    best = [min((found.pop(0) for _ in alike), key=lambda f: f.point.cost) for alike in jobs]
+    return best, found
+
+
+def short(bench: Bench) -> int:
+    """Return how many frames the first fits see: late ones mislead as long as early ones do not fit."""
+    return max(10, int(_SHORT * bench.trials["train"][0].markers.shape[0]))
+
+
+def vector(name: str) -> str:
+    """Return the name of a number without that of its component."""
+    return ".".join(name.split(".")[:2])

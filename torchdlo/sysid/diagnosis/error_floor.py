@@ -1,0 +1,184 @@
+"""How well a perfect model could do on a recording: noise of the markers, and what steps and mesh get wrong."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from torchdlo.sysid.estimation.jobs import Fitted, Simulation
+from torchdlo.sysid.estimation.worker_pool import Pool
+from torchdlo.sysid.model.trial_batch import Start
+from torchdlo.sysid.recordings.recording import Recording, Trial
+
+
+@dataclass(frozen=True)
+class Floor:
+    """Parts of the error that no effect explains, root mean square per coordinate [m]."""
+
+    noise: float
+    """Noise of the markers."""
+    step: float
+    """What may be left of the error of the steps."""
+    grid: float
+    """The same of the mesh."""
+
+    @property
+    def total(self) -> float:
+        """All parts together."""
+        return float(np.sqrt(self.noise**2 + self.step**2 + self.grid**2))
+
+
+def noise(recording: Recording) -> float:
+    """Return the noise of the markers [m]: as given, or what fourth differences in time say."""
+    if recording.marker_noise_std is not None:
+        return recording.marker_noise_std
+    parts = []
+    for trial in recording.train:
+        fourth = np.diff(trial.markers[:, ~trial.gripped], n=4, axis=0)
+        # The variance of a fourth difference of white noise is 70 times the noise's; medians pass over jumps.
+        parts.append(1.4826 * np.nanmedian(np.abs(fourth)) / np.sqrt(70))
+    return float(np.median(parts))
+
+
+def gap(simulated: np.ndarray, trials: tuple[Trial, ...] | list[Trial], trust: np.ndarray | None = None) -> np.ndarray:
+    """Return the error of each trial [m], root mean square per coordinate of the free markers, shape (B,).
+
+    Args:
+        simulated: markers [m], shape (B, F, M, 3).
+        trials: B trials.
+        trust: what errors of frames are multiplied by [1], shape (B, F); 1 if not given.
+    """
+    out = []
+    for sim, trial, of_frame in zip(simulated, trials, [None] * len(trials) if trust is None else trust, strict=True):
+        free = ~trial.gripped
+        error = sim[: len(trial.time)][:, free] - np.where(trial.suspect[:, None, None], np.nan, trial.markers)[:, free]
+        error = error if of_frame is None else of_frame[: len(error), None, None] * error
+        known = np.isfinite(trial.markers[:, free]) & ~trial.suspect[:, None, None]
+        out.append(float("inf") if not np.isfinite(error[known]).all() else float(np.sqrt(np.mean(error[known] ** 2))))
+    return np.array(out)
+
+
+def rms(gaps: np.ndarray) -> float:
+    """Return the root mean square of the gaps of trials."""
+    return float(np.sqrt(np.mean(np.square(gaps))))
+
+
+_AHEAD = 1.5
+"""Order of steps that look ahead: they have errors of first and of second order."""
+
+_WILD = 0.05
+"""Change of a trial from which the finer simulation is not to be trusted [m]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Refinement:
+    """What finer steps and a finer mesh change of the markers of all trials [m], shape (B, F, M, 3) each."""
+
+    step: np.ndarray
+    grid: np.ndarray
+    noise: float
+    """Noise of the markers [m]."""
+    order: float
+    """Order of the simulation's errors in its steps; 2 in its mesh."""
+    edge: float
+    """Mean length of the mesh's edges [m]."""
+    links: float = 0.0
+    """Length of the links if the rope is taken for a chain of stiff ones [m]."""
+
+    @property
+    def wrong(self) -> float:
+        """Share of the mesh's error that is one.
+
+        It grows with the squared length of edges, and a chain's own difference to a rope with that of its links: a
+        mesh with edges as long as the links has none.
+        """
+        return max(1 - (self.links / self.edge) ** 2, -1.0)
+
+    @property
+    def _rest(self) -> tuple[float, float]:
+        """What halving leaves over, of the change that it makes."""
+        return 1 / (2**self.order - 1), 1 / 3
+
+    @property
+    def unsure(self) -> tuple[np.ndarray, np.ndarray]:
+        """What may be wrong with corrections [m], shape (B, F, M, 3) each: what was extrapolated.
+
+        How a chain's errors go with its links is not known that well.
+        """
+        step, grid = self._rest
+        return step * self.step, (1.0 if self.links else grid) * self.grid
+
+    @property
+    def correction(self) -> np.ndarray:
+        """What is to be added to simulations [m], shape (B, F, M, 3); nothing where that is not known.
+
+        Richardson's extrapolation (1911, doi:10.1098/rsta.1911.0009).
+        """
+        step, grid = ((1 + rest) * np.nan_to_num(x) for rest, x in zip(self._rest, (self.step, self.grid), strict=True))
+        return step + self.wrong * grid
+
+    @property
+    def lost(self) -> int:
+        """Trials of which a finer simulation failed, or differed too much."""
+        return int((~np.isfinite(self.step + self.grid)).any((1, 2, 3)).sum())
+
+    def floor(self, trials: slice, free: np.ndarray) -> Floor:
+        """Return the floor on some of the trials.
+
+        Args:
+            trials: which ones.
+            free: which markers are not held.
+        """
+        parts = []
+        for unsure in self.unsure:
+            known = np.isfinite(unsure).all((1, 2, 3))
+            chosen = unsure[trials][known[trials]] if known[trials].any() else unsure[known]
+            parts.append(float(np.sqrt(np.mean(chosen[:, :, free] ** 2))) if known.any() else float("inf"))
+        return Floor(self.noise, *parts)
+
+    def trust(self, free: np.ndarray) -> tuple[np.ndarray, float]:
+        """Return what errors of frames count [1], shape (B, F), and the gap that leaves a perfect model [m].
+
+        Where finer simulations differ much, as some motions magnify small errors, measurements tell little. Squares of
+        weights have a mean of 1.
+        """
+        with np.errstate(invalid="ignore"):
+            unsure = sum(np.mean(part[:, :, free] ** 2, (2, 3)) for part in self.unsure)
+        known = np.isfinite(unsure).all(1)
+        if not known.any():
+            return np.ones(unsure.shape), float("inf")
+        # Of trials that are not known, as much as of others.
+        variance = self.noise**2 + np.where(known[:, None], unsure, np.median(unsure[known], 0))
+        level = float(1 / np.sqrt(np.mean(1 / variance)))
+        return level / np.sqrt(variance), level
+
+
+def refine(pool: Pool, base: Fitted, start: Start, chain: str) -> Refinement:
+    """Return what half the steps, and with them twice the vertices, change of a calibrated model's markers.
+
+    Args:
+        pool: the simulations.
+        base: the model.
+        start: where all trials begin.
+        chain: effect that makes the rope a chain of links, by their length; it is left out.
+    """
+    model = pool.local.model(base.effects)
+    plain = tuple(e for e in base.effects if e != chain)
+    links = np.array([name.split(".")[0] == chain for name in model.parameters])
+    values = base.values[None, ~links]
+    edge, length = float(np.mean(np.diff(model.arclength))), float(np.abs(base.values[links]).sum())
+    half = ("substep", model.dt / (2 * model.substeps))
+    finer = ("vertices", 2 * len(model.arclength) - 1)
+    start = replace(start, finer=None)
+    jobs = [Simulation(plain, values, "all", start, options) for options in ((half, finer), (half,), ())]
+    sims = dict(pool.simulate(jobs))
+    step, grid = _tame(sims[1][0] - sims[2][0]), _tame(sims[0][0] - sims[1][0])
+    return Refinement(step, grid, noise(pool.recording), _AHEAD if model.ahead else 2, edge, length)
+
+
+def _tame(change: np.ndarray) -> np.ndarray:
+    """Return the changes (B, F, M, 3); NaN for trials in which a simulation failed."""
+    with np.errstate(invalid="ignore", over="ignore"):
+        size = np.sqrt(np.mean(change**2, (1, 2, 3)))
+    return np.where((size < _WILD)[:, None, None, None], change, np.nan)

@@ -1,0 +1,362 @@
+"""Find where a model and measurements disagree, name the effect that is missing, add it, and see the gap shrink.
+
+The baseline is calibrated; doses of every effect of the library are held against what it leaves over; the leading ones
+are fitted jointly with the baseline's numbers; the best is kept if it closes enough of the gap on every trial, and the
+search goes on from there. Test trials are used at the end only: to confirm, or to refuse, what the train trials said.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from torchdlo.errors import InputError
+from torchdlo.sysid.diagnosis import baseline as baselines
+from torchdlo.sysid.diagnosis import budget as plan
+from torchdlo.sysid.diagnosis import clamp_models, effect_library
+from torchdlo.sysid.diagnosis.backward_elimination import Found, Revision
+from torchdlo.sysid.diagnosis.budget import BUDGETS, Budget
+from torchdlo.sysid.diagnosis.candidate_fits import extended, short, vector
+from torchdlo.sysid.diagnosis.error_floor import gap, rms
+from torchdlo.sysid.diagnosis.score_test import Score, screen
+from torchdlo.sysid.diagnosis.verdict import UNKNOWN_FLOOR, Candidate, Diagnosis, through, word
+from torchdlo.sysid.diagnosis.workspace import CHAIN, SILENT, Bench, Callback
+from torchdlo.sysid.estimation.jobs import Fit, Fitted
+from torchdlo.sysid.estimation.levenberg_marquardt import interval
+from torchdlo.sysid.estimation.result_cache import Journal
+from torchdlo.sysid.estimation.worker_pool import Pool
+from torchdlo.sysid.model.model_file import Saved
+from torchdlo.sysid.recordings import data_quality
+from torchdlo.sysid.recordings.recording import Recording
+
+PAYS = 0.15
+"""Share of the excess gap that an effect has to close, on the train and on the test trials."""
+
+MORE = 2.5
+"""Times the floor that have to be left for another effect to be looked for: one of three times the floor leaves 3.2."""
+
+LEADERS = 2
+"""Effects that are fitted further in each round, besides those that are nearly as good."""
+
+_NEAR = 0.1
+"""Share of what the best short fit saves that makes others nearly as good."""
+
+
+def diagnose(
+    recording: Recording,
+    *,
+    budget: str = "fast",
+    seed: int = 0,
+    vertices: int | None = None,
+    trials: int | None = None,
+    workers: int | None = None,
+    callback: Callback | None = None,
+    journal: Path | None = None,
+    resume: bool = False,
+    given: Saved | None = None,
+    without: Sequence[str] = (),
+) -> Diagnosis:
+    """Name what a recording shows that the baseline model lacks.
+
+    Args:
+        recording: what was measured.
+        budget: "fast" or "full".
+        seed: of the random starts.
+        vertices: vertices of the rope; from the spacing of the markers if not given.
+        trials: most train trials to use; by the budget if not given.
+        workers: processes; one per core if not given.
+        callback: see `Callback`.
+        journal: folder that keeps what is done, so that a search which was stopped can go on.
+        resume: go on from it.
+        given: model to take as the baseline, with its effects, in place of many starts.
+        without: effects of the library that are not looked for.
+    """
+    if budget not in BUDGETS:
+        raise InputError(f"budget is {budget!r}; expected one of {', '.join(BUDGETS)}.")
+    for name in without:
+        effect_library.check_known("without", name)
+    begun, report = time.perf_counter(), callback or (lambda *_: None)
+    recording, faults = data_quality.check(recording)
+    whole = len(recording.train)
+    recording = plan.some(recording, trials or BUDGETS[budget].trials)
+    options = plan.options(recording, vertices)
+    if given is not None:
+        options |= given.options if vertices is None else given.options | {"vertices": vertices}
+    asked = {"budget": BUDGETS[budget], "seed": seed, "options": options, "first": given and given.values}
+    less = {"without": ", ".join(sorted(set(without)))} if without else {}
+    kept = None if journal is None else Journal(journal, recording, asked | less, resume=resume)
+    with Pool(recording, options, workers, kept) as pool:
+        search = _Search(pool, BUDGETS[budget], np.random.default_rng(seed), report, without)
+        found = search.run(given)
+    found.health, found.options = faults, {"budget": budget, "seed": seed, "vertices": options["vertices"]} | less
+    if len(recording.train) < whole:
+        found.notes.append(f"{len(recording.train)} of the {whole} train trials were used, evenly picked.")
+    found.seconds = time.perf_counter() - begun
+    return found
+
+
+class _Search:
+    """One diagnosis."""
+
+    def __init__(
+        self, pool: Pool, budget: Budget, rng: np.random.Generator, report: Callback, without: Sequence[str] = ()
+    ) -> None:
+        self.pool, self.budget, self.rng, self.report = pool, budget, rng, report
+        self.bench, self.recording, self.excluded = Bench(pool), pool.recording, without
+        self.baseline: Fitted | None = None
+        self.plain: list[Fitted] = []
+        """The baseline, and what it became when it was fitted for as long as the first candidates were."""
+        self.revision = Revision(self.bench, budget, self.plain, report)
+
+    def run(self, given: Saved | None = None) -> Diagnosis:
+        """Go through all stages."""
+        count, most = self.budget.starts, self.budget.more
+        if given is None:
+            base = baselines.calibrate(self.bench, count, most, self.rng, self.report)
+        else:
+            base = baselines.go_on(self.bench, given, most, self.report)
+        self.baseline, self.before = base, self.bench.prediction(base, "all")
+        self.plain.append(base)
+        self._say_floor()
+        rounds: list[list[Candidate]] = []
+        found = Found()
+        whole = self._excess(base)
+        while len(rounds) < self.budget.rounds + (len(found.shares) < len(rounds)):
+            if found.shares and rms(self.bench.gaps(base, "all")) < MORE * self.bench.level:
+                break
+            if not (names := [n for n in self._possible() if n not in base.effects]):
+                break
+            best, rival, candidates, rivals = self._round(base, names, f"round {len(rounds) + 1}")
+            rounds.append(candidates)
+            if best is None:
+                if not found.shares and (further := self._anew(rival)):
+                    base, whole = further, self._excess(further)
+                    if CHAIN in base.effects:
+                        continue
+                elif rival is not base and (found.shares or rival.options != base.options):
+                    base = rival
+                    self.pool.choose(**dict(base.options))
+                break
+            name, old = best.effects[-1], self._squared(base)
+            self.pool.choose(**dict(best.options))
+            found.shares[name], found.ties[name] = (old - self._squared(best)) / whole, rivals
+            base = baselines.go_further(self.bench, best, self.budget.more, self.report)
+            found.shares[name] += (self._squared(best) - self._squared(base)) / whole
+            base = self.revision.exchanged(self.revision.pruned(base, found), found, self._possible())
+            self._say_floor()
+        base = self.revision.plainer(self.revision.pruned(base, found), found, self._possible())
+        return self._conclude(base, found, rounds)
+
+    def _anew(self, base: Fitted) -> Fitted | None:
+        """Return a baseline that no effect explains, fitted further, as a chain of links if that is what it then is.
+
+        None where nothing is left to be explained, or it is known to be a chain.
+        """
+        if CHAIN in base.effects or rms(self.bench.gaps(base, "all")) < SILENT * self.bench.level:
+            return None
+        further = baselines.go_further(self.bench, base, self.budget.more, self.report)
+        self.baseline, self.before = further, self.bench.prediction(further, "all")
+        self.plain[:] = [further]
+        return further
+
+    def _excess(self, fitted: Fitted) -> float:
+        return max(self._squared(fitted) - self.bench.floor.noise**2, 1e-12)
+
+    def _squared(self, fitted: Fitted) -> float:
+        """Return the squared gap on the test trials [m^2]; all frames count the same, whatever is known of them.
+
+        Trials that the baseline does not get through are left out, as nothing can be compared with them.
+        """
+        trials = self.bench.trials["test"]
+        gaps, plain = (gap(s, trials) for s in (self.bench.prediction(fitted, "test"), self.before[-len(trials) :]))
+        return float(rms(gaps[through(plain)]) ** 2)
+
+    def _possible(self) -> list[str]:
+        mesh, names = self.pool.local.model(()).mesh, [n for n in effect_library.LIBRARY if n not in self.excluded]
+        return [n for n in names if effect_library.applicable(n, self.recording, mesh)]
+
+    def _say_floor(self) -> None:
+        self.report("measuring the floor", 1, 1, f"{1e3 * self.bench.floor.total:.2f} mm")
+
+    def _round(
+        self, base: Fitted, names: Sequence[str], stage: str
+    ) -> tuple[Fitted | None, Fitted, list[Candidate], list[str]]:
+        """Return the model with the best effect added, if one pays, that without, all candidates, and equal ones."""
+        scores = screen(
+            self.pool,
+            base,
+            names,
+            self.bench.starts["train"],
+            lambda k, n: self.report(f"{stage}: screening", k, n, ""),
+        )
+        soft = [
+            s
+            for s in scores[self.budget.candidates :]
+            if s.name == clamp_models.NAME and clamp_models.soft(self.bench, base)
+        ]
+        fits, led, rival, worst = self._fits(base, [*scores[: self.budget.candidates], *soft], stage)
+        self.bench.predict([base, rival, *fits.values()])
+        if base is self.baseline:
+            self.plain.append(rival)
+        first = min(led, key=lambda name: fits[name].point.cost)
+        if rms(self.bench.gaps(fits[first], "all")) > SILENT * self.bench.level:
+            # Something is left: one that does alike things may be right, however little its doses explain.
+            kin = [s for s in scores if s.name not in fits and any({s.name, first} <= k for k in effect_library.KIN)]
+            more, also = self._fits_of_kin(base, kin, worst, f"{stage}, effects like {first}") if kin else ({}, [])
+            self.bench.predict(list(more.values()))
+            fits, led = fits | more, led + also
+        return self._judged(scores, fits, sorted(led, key=lambda name: fits[name].point.cost), rival)
+
+    def _fits(
+        self, base: Fitted, scores: Sequence[Score], stage: str
+    ) -> tuple[dict[str, Fitted], list[str], Fitted, float]:
+        """Return fits of effects, and the names of those that lead and were fitted to whole trials.
+
+        Also return their fair rival, which is the baseline that was fitted for as long, and a cost of short fits that
+        does not close half as much as the best of them.
+        """
+        rivals = [self._further(base, base)]
+        if clamp_models.soft(self.bench, base):
+            rivals.append(clamp_models.firm(base, rivals[0]))
+        short, alone = self._extended(base, scores, stage, rivals)
+        alone = sorted(alone, key=lambda f: f.point.cost)
+        lead = self._leaders(short, alone[0])
+        worst = 0.5 * (alone[0].point.cost + min(f.point.cost for f in (*short, *alone)))
+        further = self._fitted([self._further(base, f) for f in (*(short[k] for k in lead), *alone)], stage)
+        further, rival = further[: len(lead)], min((base, *further[len(lead) :]), key=lambda f: f.point.cost)
+        fits = {s.name: f for s, f in zip(scores, short, strict=True)}
+        names = [scores[k].name for k in lead]
+        return fits | dict(zip(names, further, strict=True)), names, rival, worst
+
+    def _fits_of_kin(
+        self, base: Fitted, scores: Sequence[Score], worst: float, stage: str
+    ) -> tuple[dict[str, Fitted], list[str]]:
+        """Return fits of effects, and the names of those that were fitted to whole trials: better ones than `worst`."""
+        short, _ = self._extended(base, scores, stage)
+        fits = {s.name: f for s, f in zip(scores, short, strict=True)}
+        names = [name for name, fitted in fits.items() if fitted.point.cost < worst]
+        further = self._fitted([self._further(base, fits[name]) for name in names], stage) if names else []
+        return fits | dict(zip(names, further, strict=True)), names
+
+    def _judged(
+        self, scores: Sequence[Score], fits: dict[str, Fitted], order: Sequence[str], rival: Fitted
+    ) -> tuple[Fitted | None, Fitted, list[Candidate], list[str]]:
+        """Return what `_round` does, from fits; those in order lead, best first."""
+        refused = {name: self._refused(rival, fits[name]) for name in order}
+        fair = [name for name in order if refused[name] is None]
+        best, rivals = None, []
+        reasons = {name: refused.get(name) or "fits worse" for name in fits}
+        if fair:
+            lead = fits[fair[0]].point.cost
+            close = [n for n in order if fits[n].point.cost - lead < self.bench.tie(rival.point.cost, lead)]
+            special, numbers = effect_library.CONTAINED.get(fair[0], (None, {}))
+            if special in fair and special not in close and _may_be(fits[fair[0]], numbers):
+                close.append(special)
+            # Of laws that fit as well, the one with the fewest numbers: others may contain it.
+            first = min((n for n in fair if n in close), key=lambda n: len(fits[n].space.names))
+            reasons |= dict.fromkeys(close, "as good as the best") | {first: "taken"}
+            best, rivals = fits[first], [n for n in close if n != first]
+        gains, held = (
+            {name: self._gain(rival, fitted, split) for name, fitted in fits.items()} for split in ("train", "test")
+        )
+        candidates = [
+            Candidate(
+                s.name, s.share, gains.get(s.name), held.get(s.name), reasons.get(s.name, "its doses explain less")
+            )
+            for s in scores
+        ]
+        return best, rival, candidates, rivals
+
+    def _leaders(self, found: Sequence[Fitted], rival: Fitted) -> list[int]:
+        """Return which of the fits to short trials are worth more work."""
+        costs = [f.point.cost for f in found]
+        order, lead = sorted(range(len(costs)), key=costs.__getitem__), min(costs, default=0.0)
+        near = _NEAR * max(rival.point.cost - lead, 0.0)
+        return [k for n, k in enumerate(order) if n < LEADERS or costs[k] - lead < near]
+
+    def _refused(self, rival: Fitted, fitted: Fitted) -> str | None:
+        """Return why a fit is no better than its rival, None if it is."""
+        gain = self._gain(rival, fitted, "train")
+        if not self._on_most(rival, fitted):
+            return "helps on too few trials"
+        if gain < PAYS:
+            return f"closes {max(gain, 0):.0%} of the gap"
+        if self._gain(rival, fitted, "test") < PAYS:
+            return "does not help on the test trials"
+        if not all(self.revision.matters(rival, fitted, split) for split in ("train", "test")):
+            return "closes less than the floor leaves open"
+        return None
+
+    def _gain(self, base: Fitted, fitted: Fitted, split: str) -> float:
+        """Return the share of the excess gap (squared, above noise) that a fit closes."""
+        before, after = rms(self.bench.gaps(base, split)) ** 2, rms(self.bench.gaps(fitted, split)) ** 2
+        return float(
+            (before - after) / max(before - self.bench.floor.noise**2, (0.3 * self.bench.floor.noise) ** 2, 1e-12)
+        )
+
+    def _on_most(self, base: Fitted, fitted: Fitted) -> bool:
+        return float(np.mean(self.bench.gaps(fitted, "train") < self.bench.gaps(base, "train"))) > 0.6
+
+    def _extended(
+        self, base: Fitted, scores: Sequence[Score], stage: str, others: Sequence[Fit] = ()
+    ) -> tuple[list[Fitted], list[Fitted]]:
+        """Return first fits of effects, and those of other jobs."""
+        return extended(
+            self.bench, base, scores, self.budget.iterations, lambda jobs: self._fitted(jobs, stage), others
+        )
+
+    def _further(self, base: Fitted, fitted: Fitted) -> Fit:
+        """Return the job of fitting on."""
+        how = (self.budget.iterations, short(self.bench)) if fitted is base else (self.budget.more,)
+        return self.bench.further(fitted, *how)
+
+    def _fitted(self, jobs: Sequence[Fit], stage: str) -> list[Fitted]:
+        """Return the results of fits in their order, and say how they go."""
+        found: dict[int, Fitted] = {}
+        plain = max(len(job.effects) for job in jobs) - 1
+        self.report(f"{stage}: fitting", 0, len(jobs), "")
+        for k, fitted in self.pool.fit(jobs):
+            found[k] = fitted
+            last = fitted.effects[-1] if len(fitted.effects) > plain else "no effect"
+            self.report(f"{stage}: fitting", len(found), len(jobs), last)
+        return [found[k] for k in range(len(jobs))]
+
+    def _conclude(self, final: Fitted, found: Found, rounds: list[list[Candidate]]) -> Diagnosis:
+        effects = list(found.shares)
+        trials, train = self.bench.trials, len(self.bench.trials["train"])
+        simulated = {"before": self.before, "after": self.bench.prediction(final, "all")}
+        before, after = (gap(sims[train:], trials["test"]) for sims in simulated.values())
+        verdict = word(effects, rms(self.bench.gaps(final, "test")), self.bench.level, rms(after) / rms(before))
+        model = self.pool.local.model(final.effects, final.options)
+        said = [*baselines.notes(self.baseline), *clamp_models.notes(model, final), *self.bench.notes()]
+        predictions = {
+            when: {t.name: sim[: len(t.time)] for sim, t in zip(sims, trials["all"], strict=True)}
+            for when, sims in simulated.items()
+        }
+        return Diagnosis(
+            verdict,
+            effects,
+            {name: found.ties[name] for name in effects},
+            found.shares,
+            self.baseline,
+            final,
+            self.bench.floor,
+            before,
+            after,
+            rounds,
+            predictions,
+            model,
+            self.bench.drift(final),
+            notes=[*said, *([] if np.isfinite(self.bench.level) else [UNKNOWN_FLOOR])],
+        )
+
+
+def _may_be(fitted: Fitted, numbers: dict[str, float]) -> bool:
+    """Return whether the last effect's numbers may have these values, as far as their ranges tell."""
+    low, high = interval(fitted.point, fitted.space)
+    asked = {f"{fitted.effects[-1]}.{name}": value for name, value in numbers.items()}
+    ranges = [(asked.get(vector(name)), a, b) for name, a, b in zip(fitted.space.names, low, high, strict=True)]
+    return all(value is None or a <= value <= b for value, a, b in ranges)

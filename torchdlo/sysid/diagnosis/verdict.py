@@ -1,0 +1,112 @@
+"""What a diagnosis found."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from torchdlo.sysid.diagnosis.error_floor import Floor, rms
+from torchdlo.sysid.estimation.jobs import Fitted
+from torchdlo.sysid.model.rope_model import RopeModel
+from torchdlo.sysid.recordings.data_quality import Fault
+
+UNEXPLAINED = 3.0
+"""Times the floor: a gap beyond that is not explained."""
+
+_SHRUNK = 0.8
+"""Share of a gap that effects may leave at most if they are to explain it."""
+
+UNKNOWN_FLOOR = (
+    "Finer simulations of the calibrated model fail or differ from it by more than 5 cm: how well a perfect model "
+    "could do is not known, so nothing counts as explained. Look at the first frames, and at the rope's length and "
+    "mass, or give `--vertices`."
+)
+"""Note where nothing is known of the simulation's own errors."""
+
+
+def word(effects: Sequence[str], left: float, level: float, share: float = 0.0) -> str:
+    """Return the verdict on a gap [m] where a perfect model leaves `level`; where that is not known, none is small.
+
+    Args:
+        effects: what was found.
+        left: the gap, weighted by what frames tell.
+        level: the same of a perfect model.
+        share: share of the plain gap that is left.
+    """
+    explained = np.isfinite(level) and left <= UNEXPLAINED * level and not (effects and share > _SHRUNK)
+    return ("effects" if explained else "partial") if effects else ("none" if explained else "unknown")
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """What became of one effect in one round."""
+
+    name: str
+    """The effect."""
+    score: float
+    """Share of the residual that its doses explain."""
+    gain: float | None
+    """Share of the train trials' excess gap that it closes after the fit; None if it was not fitted."""
+    heldout_gain: float | None
+    """The same on the test trials."""
+    reason: str
+    """Why it was taken or left."""
+
+
+@dataclass(eq=False)
+class Diagnosis:
+    """What was found."""
+
+    verdict: str
+    """"none", "effects", "partial" or "unknown"."""
+    effects: list[str]
+    """Names of the missing effects, in the order in which they were found."""
+    ties: dict[str, list[str]]
+    """By effect: others that the data cannot tell from it."""
+    shares: dict[str, float]
+    """By effect: share of the gap above the floor that it closed on the test trials."""
+    baseline: Fitted
+    """The calibrated baseline."""
+    final: Fitted
+    """The model with the effects."""
+    floor: Floor
+    """What no effect explains, on the test trials."""
+    before: np.ndarray
+    """Gap of each test trial with the baseline [m]."""
+    after: np.ndarray
+    """Gap of each test trial with the effects [m]."""
+    candidates: list[list[Candidate]]
+    """By round."""
+    predictions: dict[str, dict[str, np.ndarray]]
+    """Simulated markers [m] of "before" and "after", by trial name, shape (F, M, 3)."""
+    model: RopeModel
+    """The model with the effects."""
+    drifts: np.ndarray
+    """What the simulation's own errors change of the final model's coordinates, shape (2, K): of steps, of the mesh."""
+    seconds: float = 0.0
+    """Time that it took."""
+    notes: list[str] = field(default_factory=list)
+    """Sentences that a reader should know."""
+    health: list[Fault] = field(default_factory=list)
+    """What is wrong with the data."""
+    options: dict[str, Any] = field(default_factory=dict)
+    """What was asked for."""
+
+    @property
+    def compared(self) -> np.ndarray:
+        """Which test trials both the baseline and the final model get through; all where that is none."""
+        return through(self.before, self.after)
+
+    @property
+    def gaps(self) -> tuple[float, float]:
+        """Root mean square gap [m] on these trials, with the baseline and with the effects."""
+        return rms(self.before[self.compared]), rms(self.after[self.compared])
+
+
+def through(*gaps: np.ndarray) -> np.ndarray:
+    """Return which trials have finite gaps (B,) [m] with all models, shape (B,); all trials where none have."""
+    finite = np.isfinite(gaps).all(0)
+    return finite if finite.any() else np.ones_like(finite)

@@ -1,0 +1,1 @@
+"""Estimation of parameters: least squares, worker processes, stored results."""

@@ -1,0 +1,245 @@
+"""Simulations of many models, shared out over processes: a single one would leave cores idle."""
+
+from __future__ import annotations
+
+import itertools
+import multiprocessing
+import os
+from collections.abc import Callable, Hashable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from dataclasses import replace
+from functools import partial
+from typing import Any, TypeVar
+
+import numpy as np
+
+from torchdlo.sysid.estimation.jobs import Fit, Fitted, Models, Search, Simulation
+from torchdlo.sysid.estimation.result_cache import Journal
+from torchdlo.sysid.model import initial_state as starts
+from torchdlo.sysid.model.trial_batch import Start
+from torchdlo.sysid.recordings.recording import Recording
+
+Job = TypeVar("Job")
+
+_FEW = 32
+"""Scenes that are not shared out: each step costs as much as they do, however few there are."""
+
+_MANY = 64
+"""Scenes from which the time of a step goes with their number."""
+
+_SMALL = 1000
+"""Frames of scenes, less than a tenth of a second, that no worker is asked for: they need seconds to begin."""
+
+
+def spread(kinds: Sequence[Hashable], parts: int) -> list[list[int]]:
+    """Return indices of jobs by their kinds, those of each kind in so many groups or less."""
+    alike: dict[Hashable, list[int]] = {}
+    for k, kind in enumerate(kinds):
+        alike.setdefault(kind, []).append(k)
+    return [some for group in alike.values() for n in range(parts) if (some := group[n::parts])]
+
+
+class Pool:
+    """Worker processes that keep their models."""
+
+    def __init__(
+        self,
+        recording: Recording,
+        options: dict[str, Any],
+        workers: int | None = None,
+        journal: Journal | None = None,
+    ) -> None:
+        """Start the workers.
+
+        Args:
+            recording: what is simulated.
+            options: options of every model.
+            workers: how many; one per core if not given. One means this process.
+            journal: keeps the results of jobs, and has those that need not be computed again.
+        """
+        self.workers = workers = workers or max(1, os.cpu_count() or 1)
+        self.journal = journal
+        self.recording, self.local = recording, Models(recording, options)
+        # Named in every job, so that what was found with them is not mixed up with what others find later.
+        self._chosen = {name: options[name] for name in ("ahead", "grip", "rest") if name in options}
+        context = multiprocessing.get_context("spawn")
+        # Each has a queue of its own: what was recorded for a model's steps is known to the process that did it.
+        self._queues = [
+            ProcessPoolExecutor(1, context, _begin, (recording, options)) for _ in range(workers if workers > 1 else 0)
+        ]
+
+    def __enter__(self) -> Pool:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        # After Ctrl-C nobody waits for fits that are still running; idle workers do not mind.
+        for queue in self._queues:
+            processes = list((queue._processes or {}).values())
+            queue.shutdown(wait=False, cancel_futures=True)
+            for process in processes:
+                process.terminate()
+
+    def choose(self, **options: Any) -> None:
+        """Give all models other options from now on."""
+        if not options.items() <= self._chosen.items():
+            self.local = Models(self.recording, self.local.options | options)
+            self._chosen |= options
+
+    def _whole(self, options: tuple[tuple[str, Any], ...]) -> tuple[tuple[str, Any], ...]:
+        return tuple((self._chosen | dict(options)).items())
+
+    def simulate(self, jobs: Sequence[Simulation]) -> Iterator[tuple[int, np.ndarray]]:
+        """Yield the index and the markers of every job as they get ready."""
+        return self._new(jobs, lambda new: self._led([_once(job) for job in new]))
+
+    def simulator(
+        self, effects: Sequence[str], split: str | tuple[str, ...], options: tuple[tuple[str, Any], ...] = ()
+    ) -> starts.Simulator:
+        """Return a function that simulates trials with one model."""
+
+        def simulate(start: Start, values: np.ndarray, frames: int | None = None) -> np.ndarray:
+            ((_, sims),) = self.simulate([Simulation(tuple(effects), values, split, start, options, frames)])
+            return sims
+
+        return simulate
+
+    def fit(self, jobs: Sequence[Fit]) -> Iterator[tuple[int, Fitted]]:
+        """Yield the index and the result of every fit as they get ready."""
+        return self._new(jobs, self._fitted)
+
+    def run(self, what: Callable[[Models, Job], Any], jobs: Sequence[Job]) -> Iterator[tuple[int, Any]]:
+        """Yield the index and the result of `what` for every job as they get ready.
+
+        Args:
+            what: a function of a module, of the models of a process and a job.
+            jobs: dataclasses with `options` of models.
+        """
+        return self._new(jobs, partial(self._done, what))
+
+    def _new(
+        self, jobs: Sequence[Job], compute: Callable[[Sequence[Job]], Iterator[tuple[int, Any]]]
+    ) -> Iterator[tuple[int, Any]]:
+        """Yield what is computed for jobs, or written down."""
+        jobs = [replace(job, options=self._whole(job.options)) for job in jobs]
+        yield from compute(jobs) if self.journal is None else self.journal.through(jobs, compute)
+
+    def _fitted(self, jobs: Sequence[Fit]) -> Iterator[tuple[int, Fitted]]:
+        groups = self.groups(jobs)
+        for n, found in self._led([self.local.search([jobs[k] for k in group]) for group in groups]):
+            yield from zip(groups[n], found, strict=True)
+
+    def groups(self, jobs: Sequence[Fit]) -> list[list[int]]:
+        """Return the indices of the fits that run together: alike ones, as long as few scenes come together.
+
+        A step of few scenes costs hardly more for more of them, but each effect of one costs in all scenes.
+        """
+        kinds = [(id(j.start), j.frames, self._whole(j.options), self.local.framed(j.effects)) for j in jobs]
+        scenes = sum(len(j.free) + 1 for j in jobs) * len(self.recording.train)
+        return spread(kinds, max(self.workers, scenes // _MANY))
+
+    def _done(self, what: Callable[[Models, Job], Any], jobs: Sequence[Job]) -> Iterator[tuple[int, Any]]:
+        if not self._queues:
+            yield from ((k, what(self.local, job)) for k, job in enumerate(jobs))
+            return
+        waiting: dict[Future, tuple[int, ProcessPoolExecutor]] = {}
+        left = enumerate(jobs)
+
+        def next_for(queue: ProcessPoolExecutor) -> None:
+            waiting.update({queue.submit(_do, what, job): (k, queue) for k, job in itertools.islice(left, 1)})
+
+        for queue in self._queues:
+            next_for(queue)
+        while waiting:
+            for future in wait(waiting, return_when=FIRST_COMPLETED).done:
+                k, queue = waiting.pop(future)
+                next_for(queue)
+                yield k, future.result()
+
+    def _led(self, searches: Sequence[Search]) -> Iterator[tuple[int, Any]]:
+        """Yield the index and the result of every search as they get ready; all workers simulate what they ask for."""
+        asked: dict[int, Simulation] = {}
+        waiting: dict[Future, tuple[int, int, int]] = {}
+        parts: dict[int, list[np.ndarray | None]] = {}
+        left, home = set(range(len(searches))), {n: n % self.workers for n in range(len(searches))}
+
+        def idlest(n: int) -> int:
+            """Return the worker for a search: the one it had last, unless that is busy and another one is idle."""
+            load = [0] * self.workers
+            for *_, worker in waiting.values():
+                load[worker] += 1
+            if load[home[n]] and 0 in load:
+                home[n] = load.index(0)
+            return home[n]
+
+        def go_on(n: int, sims: np.ndarray | None) -> Iterator[tuple[int, Any]]:
+            """Give a search what it asked for; yield its result, or have the next simulation done."""
+            try:
+                asked[n] = job = searches[n].send(sims)
+                while not (count := self._parts(job, len(left))):
+                    asked[n] = job = searches[n].send(self.local.simulate(job))
+            except StopIteration as end:
+                left.remove(n)
+                yield n, end.value
+                return
+            parts[n] = [None] * count
+            for p, worker in enumerate(range(count) if count > 1 else [idlest(n)]):
+                waiting[self._queues[worker].submit(_do, _simulated, (job, p, count))] = n, p, worker
+
+        for n in range(len(searches)):
+            yield from go_on(n, None)
+        while waiting:
+            for future in wait(waiting, return_when=FIRST_COMPLETED).done:
+                n, p, _ = waiting.pop(future)
+                parts[n][p] = future.result()
+                if all(part is not None for part in parts[n]):
+                    sims = np.concatenate(parts.pop(n))
+                    yield from go_on(n, sims.reshape(len(asked[n].values), -1, *sims.shape[-3:]))
+
+    def _parts(self, job: Simulation, searches: int) -> int:
+        """Return into how many parts a simulation is split for the workers, which others may keep busy as well.
+
+        0 if this process had better do it.
+        """
+        trials = self.recording.trials(job.split)
+        scenes, frames = len(job.values) * len(trials), job.frames or max(len(t.time) for t in trials)
+        if not self._queues or (searches == 1 and scenes * frames < _SMALL):
+            return 0
+        return max(1, min(-(-self.workers // searches), scenes // _FEW))
+
+
+def _once(job: Simulation) -> Search:
+    """Ask for one simulation and return it."""
+    return (yield job)
+
+
+_models: Models | None = None
+"""Those of a worker process."""
+
+
+def _begin(recording: Recording, options: dict[str, Any]) -> None:
+    import signal
+    import threading
+
+    import torch
+
+    global _models
+    torch.set_num_threads(1)
+    # Ctrl-C is the parent's to handle; and when the parent is gone, nobody wants the rest.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    _models = Models(recording, options)
+
+
+def _end_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
+
+
+def _do(what: Callable[[Models, Job], Any], job: Job) -> Any:
+    return what(_models, job)
+
+
+def _simulated(models: Models, asked: tuple[Simulation, int, int]) -> np.ndarray:
+    return models.simulate(*asked)

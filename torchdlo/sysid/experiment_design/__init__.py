@@ -1,0 +1,1 @@
+"""Design of the experiment that tells competing models apart."""

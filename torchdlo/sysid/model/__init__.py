@@ -1,0 +1,1 @@
+"""The simulated rope of a recording: discretisation, gripper motion, initial state, observation."""

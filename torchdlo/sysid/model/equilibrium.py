@@ -1,0 +1,95 @@
+"""Starts at rest: the balance of a rope whose grippers stand still, and how far a trial's start is from it."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+import torch
+
+from torchdlo import scene as scenes
+from torchdlo.physics import tree
+from torchdlo.sysid.model.cached_steps import recorded
+from torchdlo.sysid.model.discretisation import Mesh
+
+_SETTLING = 4.0
+"""Time that a rope gets to come to rest where a trial starts [s]."""
+
+_SETTLING_STEP = 0.1
+"""One step meanwhile [s]: implicit steps this long are nearly steps of Newton's method for the balance."""
+
+_SETTLING_RATE = 6.0
+"""Damping rate meanwhile [1/s]: a rope of a metre swings at 4 rad/s."""
+
+_SHAPES = 4
+"""Smooth shapes by which a rope may be off its balance at the start."""
+
+
+def come_to_rest(
+    scene: scenes.Scene, params: scenes.Params, state: scenes.State, control: scenes.Control
+) -> scenes.State:
+    """Return the state in balance, with the grippers as they are at the start.
+
+    Args:
+        scene: the ropes.
+        params: numbers of the scenes; their damping is raised meanwhile.
+        state: where they are.
+        control: where the grippers stay.
+    """
+    calm = dataclasses.replace(scene, dt=_SETTLING_STEP, substeps=1, ahead=1.0)
+    damping = dict(params.effects["damping"])
+    damping["rate"] = torch.full_like(damping["rate"], _SETTLING_RATE)
+    calmed = tree.replace(params, effects=params.effects | {"damping": damping})
+    rest = tree.replace(state, rods=tree.replace(state.rods, vel=torch.zeros_like(state.rods.vel)))
+    rest = scenes.step(calm, calmed, rest, control)
+    step = recorded(calm, calmed, rest, control)
+    for _ in range(math.ceil(_SETTLING / _SETTLING_STEP) - 1):
+        rest = step(calmed, rest, control)
+    zero = {name: torch.zeros_like(getattr(rest.rods, name)) for name in ("vel", "twist_rate")}
+    return tree.replace(rest, rods=tree.replace(rest.rods, **zero), time=state.time)
+
+
+def smooth_shapes(mesh: Mesh, free: np.ndarray) -> np.ndarray | None:
+    """Return smooth shapes that vanish where the rope is held, at the vertices, shape (V, J).
+
+    Args:
+        mesh: the rope.
+        free: markers that are not gripped.
+
+    Returns:
+        The shapes, orthonormal at the free markers; None where those are too few.
+    """
+    if len(free) < 2 * _SHAPES:
+        return None
+    x = mesh.arclength / mesh.arclength[-1]
+    held, ends = x[list(mesh.held)], x[mesh.marker_vertex[free[[0, -1]]]]
+    edge = np.ones_like(x)
+    before, after = held[held < ends[0]], held[held > ends[1]]
+    # A clamp keeps place and direction, a single gripped marker its place.
+    for side, wall in ((before, before.max(initial=0.0)), (after, after.min(initial=1.0))):
+        edge = edge * np.abs(x - wall) ** min(2, len(side))
+    edge[list(mesh.held)] = 0.0
+    shapes = edge[:, None] * np.vander(2 * x - 1, _SHAPES, increasing=True)
+    return shapes @ np.linalg.inv(np.linalg.qr(shapes[mesh.marker_vertex[free]])[1])
+
+
+def explain(gap: np.ndarray, at: np.ndarray, dt: float, shapes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return a displacement [m] and a velocity [m/s] of the vertices, (B, V, 3) each, that explain a gap best.
+
+    Args:
+        gap: measured minus simulated positions of markers, NaN where not seen [m], shape (B, F, M, 3).
+        at: shapes at the markers, shape (M, J).
+        dt: time between frames [s].
+        shapes: shapes at the vertices, shape (V, J).
+    """
+    batch, frames, markers, _ = gap.shape
+    time = np.arange(frames) * dt
+    columns = np.concatenate([np.ones((frames, 1, 1)) * at, time[:, None, None] * at], -1).reshape(frames * markers, -1)
+    found = np.zeros((batch, columns.shape[1], 3))
+    for k, each in enumerate(gap.reshape(batch, -1, 3)):
+        seen = np.isfinite(each).all(-1)
+        if seen.sum() >= 2 * columns.shape[1]:
+            found[k] = np.linalg.lstsq(columns[seen], each[seen], rcond=None)[0]
+    shift, drift = np.split(found, 2, axis=1)
+    return shapes @ shift, shapes @ drift

@@ -1,0 +1,1 @@
+"""Measured recordings: format, checks, data quality, metrics, trivial predictors."""

@@ -1,0 +1,273 @@
+"""What a recording folder must look like, and the sentence for each way in which it may not.
+
+Every message names the file and the entry, then what was expected, what was found and, where it
+is not obvious, how to mend it.
+"""
+
+from __future__ import annotations
+
+import difflib
+import json
+import math
+import zipfile
+import zlib
+from collections.abc import Collection
+from pathlib import Path
+from typing import Any, NoReturn
+
+import numpy as np
+
+from torchdlo.errors import InputError
+from torchdlo.sysid.recordings.trial_checks import check_clamps, check_markers, check_time
+
+__all__ = ["OPTIONAL", "REQUIRED", "check_arrays", "check_rope", "read_arrays", "trial_files"]
+
+REQUIRED = ("length", "radius", "mass", "gravity", "table_height", "marker_noise_std")
+"""Entries that every rope.json has."""
+OPTIONAL = ("rest_positions", "marker_mass", "closed", "notes")
+"""Entries that a rope.json may have."""
+
+_ARRAYS = ("time", "markers", "marker_arclength", "gripped")
+_OPTIONAL_ARRAYS = ("gripper_quaternion", "gripper_marker", "suspect")
+_VIDEO_ARRAYS = ("masks", "mask", "video", "frames", "images")
+_UNREADABLE = (
+    zipfile.BadZipFile,
+    zlib.error,
+    EOFError,
+    OSError,
+    ValueError,
+    MemoryError,
+    NotImplementedError,
+    RuntimeError,
+)
+"""What reading a damaged archive can raise."""
+_VIDEO_SUFFIXES = (".mp4", ".avi", ".mkv", ".mov", ".webm")
+
+
+def trial_files(path: Path) -> dict[str, list[Path]]:
+    """The trials of a recording folder by split."""
+    if not path.exists():
+        raise InputError(f"{path}: expected a recording folder, found nothing there.")
+    if not path.is_dir():
+        raise InputError(f"{path}: expected a recording folder with rope.json and .npz trials, found a file.")
+    if not (path / "rope.json").is_file():
+        raise InputError(
+            f"{path / 'rope.json'}: expected this file with the rope's length, mass and so on, "
+            "found none; is this a recording folder?"
+        )
+    for file in sorted(path.iterdir()):
+        if file.name.startswith(("train_", "test_")) and file.suffix.lower() in _VIDEO_SUFFIXES:
+            raise InputError(
+                f"{file}: video trials are not supported by this command yet; give marker positions in an .npz."
+            )
+    files = {split: sorted(path.glob(f"{split}_*.npz")) for split in ("train", "test")}
+    for split, purpose in (("train", "fit on"), ("test", "judge on")):
+        if not files[split]:
+            raise InputError(
+                f"{path}: expected at least one trial {split}_*.npz to {purpose}, found none; "
+                f"rename one of your trials to {split}_0.npz."
+            )
+    return files
+
+
+def check_rope(path: Path) -> dict[str, Any]:
+    """Read rope.json; what is absent or null becomes None (closed: False, notes: "")."""
+    rope = _read_object(path)
+    _check_names(path, rope, REQUIRED, OPTIONAL, "key")
+    checked: dict[str, Any] = {
+        "length": _number(path, rope, "length", "m", positive=True),
+        "mass": _number(path, rope, "mass", "kg", positive=True),
+        "radius": _number(path, rope, "radius", "m", positive=True, optional=True),
+        "table_height": _number(path, rope, "table_height", "m", optional=True),
+        "marker_mass": _number(path, rope, "marker_mass", "kg", low=0.0, optional=True),
+        "marker_noise_std": _number(path, rope, "marker_noise_std", "m", low=0.0, optional=True),
+        "gravity": _positions(path, rope, "gravity", (3,), "[gx, gy, gz] in m/s^2"),
+        "rest_positions": None,
+        "closed": rope.get("closed") or False,
+        "notes": rope.get("notes") or "",
+    }
+    if rope.get("rest_positions") is not None:
+        wanted = "a list of [x, y, z] in m, one for each marker"
+        checked["rest_positions"] = _positions(path, rope, "rest_positions", (-1, 3), wanted)
+    for name, kind, said in (("closed", bool, "true or false"), ("notes", str, "a text")):
+        if not isinstance(checked[name], kind):
+            _refuse(path, name, said, repr(checked[name]))
+    if checked["radius"] is not None and checked["radius"] > 0.5 * checked["length"]:
+        found = f"{checked['radius']:g} m for a rope of {checked['length']:g} m"
+        _refuse(path, "radius", "at most half the length", f"{found}; the unit is metres")
+    return checked
+
+
+def read_arrays(path: Path) -> dict[str, np.ndarray]:
+    """Read all arrays of an .npz without ever unpickling."""
+    try:
+        with path.open("rb") as file:
+            archive = np.load(file, allow_pickle=False)
+            if not isinstance(archive, np.lib.npyio.NpzFile):
+                raise InputError(f"{path}: expected an .npz archive, found a single array; use numpy.savez.")
+            return {name: _read_array(path, archive, name) for name in archive.files}
+    except InputError:
+        raise
+    except _UNREADABLE as error:
+        if "pickle" in str(error):
+            raise InputError(
+                f"{path}: expected an .npz archive, found a pickle or another kind of file; use numpy.savez."
+            ) from None
+        raise InputError(
+            f"{path}: expected a complete .npz archive, found one that cannot be read ({error}); "
+            "write or copy the file again."
+        ) from None
+
+
+def check_arrays(path: Path, arrays: dict[str, np.ndarray], length: float) -> dict[str, Any]:
+    """Check the arrays of one trial, and return them by the names of Trial's fields."""
+    for name in _VIDEO_ARRAYS:
+        if name in arrays:
+            raise InputError(
+                f"{path}: {name}: trials with video or masks are not supported by this command "
+                "yet; leave the array out and give marker positions."
+            )
+    _check_names(path, arrays, _ARRAYS, _OPTIONAL_ARRAYS, "array")
+    for name in ("time", "markers", "marker_arclength", "gripper_quaternion"):
+        if name in arrays:
+            arrays[name] = _as_float(path, name, arrays[name])
+    _check_shapes(path, arrays)
+    suspect = arrays.get("suspect", np.zeros(len(arrays["time"]), dtype=bool))
+    check_time(path, arrays["time"])
+    check_markers(path, arrays, suspect, length)
+    check_clamps(path, arrays)
+    optional = {name: arrays.get(name) for name in ("gripper_quaternion", "gripper_marker")}
+    return {name: arrays[name] for name in _ARRAYS} | optional | {"suspect": suspect}
+
+
+def _check_shapes(path: Path, arrays: dict[str, np.ndarray]) -> None:
+    markers, time = arrays["markers"], arrays["time"]
+    if markers.ndim != 3 or markers.shape[-1] != 3:
+        _refuse(path, "markers", "shape (frames, markers, 3)", f"{markers.shape}")
+    n_frames, n_markers = markers.shape[:2]
+    if time.shape != (n_frames,):
+        _refuse(path, "time", f"shape ({n_frames},), one for each frame", f"{time.shape}")
+    if n_frames < 3:
+        _refuse(path, "markers", "at least 3 frames", f"{n_frames}")
+    if n_markers < 3:
+        _refuse(path, "markers", "at least 3 markers", f"{n_markers}")
+    for name, size, each in (
+        ("marker_arclength", n_markers, "marker"),
+        ("gripped", n_markers, "marker"),
+        ("suspect", n_frames, "frame"),
+    ):
+        if name in arrays and arrays[name].shape != (size,):
+            _refuse(path, name, f"shape ({size},), one for each {each}", f"{arrays[name].shape}")
+    for name in ("gripped", "suspect"):
+        if name in arrays and arrays[name].dtype != bool:
+            _refuse(path, name, "dtype bool", f"{arrays[name].dtype}; use .astype(bool)")
+
+
+def _read_array(path: Path, archive: Any, name: str) -> np.ndarray:
+    try:
+        array = archive[name]
+    except ValueError as error:
+        if "pickle" in str(error) or "Object arrays" in str(error):
+            raise InputError(
+                f"{path}: {name}: expected an array of numbers, found pickled Python objects, "
+                "which are never loaded; convert the array to float or bool before saving."
+            ) from None
+        raise
+    if not isinstance(array, np.ndarray):
+        _refuse(path, name, "an array", "another kind of file in the archive")
+    return array
+
+
+def _as_float(path: Path, name: str, array: np.ndarray) -> np.ndarray:
+    if array.dtype.kind not in "fiu":
+        _refuse(path, name, "dtype float", f"{array.dtype}")
+    array = array.astype(np.float64)
+    if np.isinf(array).any():
+        place = ", ".join(str(int(i)) for i in np.argwhere(np.isinf(array))[0])
+        _refuse(path, name, "finite numbers", f"infinity at index ({place})")
+    if name != "markers" and np.isnan(array).any():
+        place = ", ".join(str(int(i)) for i in np.argwhere(np.isnan(array))[0])
+        _refuse(path, name, "finite numbers", f"NaN at index ({place})")
+    return array
+
+
+def _read_object(path: Path) -> dict[str, Any]:
+    try:
+        rope = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError) as error:
+        raise InputError(f"{path}: expected valid JSON, but reading failed: {error}.") from None
+    if not isinstance(rope, dict):
+        raise InputError(f"{path}: expected a JSON object with length, mass and so on, found {_kind(rope)}.")
+    return rope
+
+
+def _check_names(
+    path: Path,
+    given: Collection[str],
+    required: Collection[str],
+    optional: Collection[str],
+    kind: str,
+) -> None:
+    """Refuse unknown names, with a suggestion, and then missing ones."""
+    known = [*required, *optional]
+    for name in given:
+        if name not in known:
+            close = difflib.get_close_matches(name, known, n=1)
+            hint = f"did you mean {close[0]}?" if close else f"known are {', '.join(known)}."
+            raise InputError(f"{path}: {name}: unknown {kind}; {hint}")
+    missing = [name for name in required if name not in given]
+    if missing:
+        raise InputError(
+            f"{path}: {', '.join(missing)}: expected, but missing; {kind}s found: {', '.join(given) or 'none'}."
+        )
+
+
+def _number(
+    path: Path,
+    rope: dict[str, Any],
+    name: str,
+    unit: str,
+    *,
+    positive: bool = False,
+    low: float = -math.inf,
+    optional: bool = False,
+) -> float | None:
+    value = rope.get(name)
+    if value is None and optional:
+        return None
+    bound = " above 0" if positive else (f" of at least {low:g}" if low > -math.inf else "")
+    expected = f"a finite number{bound} in {unit}" + (" or null" if optional else "")
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        _refuse(path, name, expected, _kind(value))
+    try:
+        number = float(value)
+    except OverflowError:
+        number = math.inf
+    if not math.isfinite(number) or number < low or (positive and number <= 0):
+        _refuse(path, name, expected, f"{number:g}")
+    return number
+
+
+def _positions(path: Path, rope: dict[str, Any], name: str, shape: tuple[int, ...], expected: str) -> np.ndarray:
+    try:
+        array = np.array(rope[name])
+    except ValueError:
+        _refuse(path, name, expected, "rows of different lengths")
+    if array.dtype.kind not in "fiu":
+        _refuse(path, name, expected, _kind(rope[name]) if array.ndim == 0 else "other values")
+    if array.ndim != len(shape) or array.shape[-1] != shape[-1]:
+        _refuse(path, name, expected, f"shape {array.shape}")
+    if not np.isfinite(array).all():
+        _refuse(path, name, expected, "a number that is not finite")
+    return array.astype(np.float64)
+
+
+def _kind(value: object) -> str:
+    if isinstance(value, str):
+        return f"the text {value!r}"
+    names = {dict: "an object", list: "a list", bool: "true or false", type(None): "null"}
+    return names.get(type(value), f"{value!r}")
+
+
+def _refuse(path: Path, name: str, expected: str, found: str) -> NoReturn:
+    raise InputError(f"{path}: {name}: expected {expected}, found {found}.")
