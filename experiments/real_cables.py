@@ -4,8 +4,8 @@
     python experiments/real_cables.py RECORDING --plant time_delay tilted_gravity marker_offset point_mass
 
 RECORDING is a folder as `torchdlo import-deform` writes it. Without `--plant`, the cable is diagnosed as it is; errors
-are those published for the DEFORM cables (see `torchdlo.sysid.recordings.metrics`). `--blocks` makes the last fifth of the trials,
-by their numbers, the test trials: published splits interleave cuts of the same motions.
+are those published for the DEFORM cables (see `torchdlo.sysid.recordings.metrics`). `--blocks` makes the last
+fifth of the trials, by their numbers, the test trials: published splits interleave cuts of the same motions.
 
 Planted are: a delay of 20 ms (markers of the rope are taken from two hundredths of a second earlier than those of the
 grippers), a frame that is 2 degrees out of level (all markers turned about x), and, as differences of two simulations

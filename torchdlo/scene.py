@@ -196,7 +196,8 @@ def make(
         effects: what acts on them.
         values: numbers of effects that differ from their defaults, e.g. {"damping": {"rate": 0.6}}.
         bodies: rigid bodies; `RodBody` among the effects makes ropes touch them.
-        matter: what `coupling.mpm.particles.assemble` returned; `RodMatter` and `BodyMatter` let ropes and bodies touch it.
+        matter: what `coupling.mpm.particles.assemble` returned; `RodMatter` and `BodyMatter` let ropes and
+            bodies touch it.
         check: whether to refuse what could not be stepped: laws that do not fit the ropes, ropes far from their length,
             unstable substeps. Scenes whose loads are only evaluated may be anything.
         choices: fields of `Scene`.

@@ -56,9 +56,10 @@ def program(name: str) -> str:
     Other tasks do not belong to it, nor do presets: settings are written down themselves. Nor does what Python does not
     run, such as comments.
     """
-    root, others = Path(__file__).parents[1], {"presets.py", "journal.py", *(f"{t}.py" for t in TASKS if t != name)}
+    root = Path(__file__).parents[2]
+    others = {"presets.py", "search_journal.py", *(f"{t}.py" for t in TASKS if t != name)}
     found = hashlib.sha256(json.dumps(versions(), sort_keys=True).encode())
-    for part in ("physics", "coupling", "envs", "agents", "data/robots", "scene.py"):
+    for part in ("physics", "coupling", "envs", "agents/trajopt", "data/robots", "scene.py"):
         files = [root / part] if part.endswith(".py") else sorted((root / part).rglob("*"))
         for file in files:
             if file.suffix in (".py", ".cpp", ".h", ".urdf") and file.name not in others:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import ctypes
 import functools
 from collections.abc import Callable, Sequence
-from pathlib import Path
 
 import torch
 from torch import Tensor
@@ -29,7 +28,7 @@ def kernel(name: str, *options: str) -> tuple[Callable, Callable[[str, torch.dty
 
     @functools.cache
     def library() -> ctypes.CDLL | None:
-        return native.library(Path(__file__).with_name(f"{name}.cpp"), *_OPTIONS, *options)
+        return native.library(native.COUPLING / f"{name}.cpp", *_OPTIONS, *options)
 
     def function(what: str, dtype: torch.dtype) -> Callable:
         return getattr(library(), f"{name}_{_KINDS[dtype]}_{what}")

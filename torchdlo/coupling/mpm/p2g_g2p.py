@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Callable, Sequence
-from pathlib import Path
 
 import torch
 from torch import Tensor
@@ -26,7 +25,7 @@ _SPREAD, _COLLECT, _TILT = range(3)
 
 def _native(which: int, size: Sequence[int], *tensors: Tensor) -> bool:
     """Run the C++ kernel on (at, value, slope, grid, out); whether it could."""
-    library = native.library(Path(__file__).with_name("transfer.cpp"))
+    library = native.library(native.COUPLING / "transfer.cpp")
     at = tensors[0]
     if library is None or at.dtype not in (torch.float32, torch.float64):
         return False
@@ -129,7 +128,7 @@ def _divide_back(grid: Tensor, vel: Tensor, mass: Tensor) -> Tensor:
 
 def _native_divide(what: str, grid: Tensor, *tensors: Tensor) -> bool:
     """Run a C++ kernel on (grid, ...); whether it could."""
-    library = native.library(Path(__file__).with_name("transfer.cpp")) if grid.device.type == "cpu" else None
+    library = native.library(native.COUPLING / "transfer.cpp") if grid.device.type == "cpu" else None
     if library is None or grid.dtype not in (torch.float32, torch.float64):
         return False
     call = getattr(library, f"transfer_{what}_{'double' if grid.dtype == torch.float64 else 'float'}")

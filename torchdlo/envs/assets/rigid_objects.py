@@ -1,4 +1,4 @@
-"""Bodies of tasks that no closed form of `coupling.bodies.shape_sdf` describes: unions of such forms, sampled on a grid."""
+"""Bodies of tasks that no closed form of `bodies.shape_sdf` describes: unions of such forms, sampled on a grid."""
 
 from __future__ import annotations
 

@@ -112,8 +112,8 @@ class Task(ABC):
     def __post_init__(self) -> None:
         if not isinstance(self.rope, Cable | None):
             raise InputError(
-                f"rope: it is {self.rope!r}; expected a torchdlo.envs.Cable; torchdlo.scene_files.cable(path) makes one "
-                "of a model file."
+                f"rope: it is {self.rope!r}; expected a torchdlo.envs.Cable; "
+                "torchdlo.scene_files.cable(path) makes one of a model file."
             )
 
     @property

@@ -12,7 +12,6 @@ import itertools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import torch
 from torch import Tensor
@@ -40,7 +39,7 @@ class _Call(ctypes.Structure):
 
 @functools.cache
 def _library() -> ctypes.CDLL | None:
-    source = Path(__file__).with_name("rods.cpp")
+    source = native.RODS / "rods.cpp"
     return native.library(source, "-fno-math-errno", "-fno-trapping-math", "-Wno-psabi")
 
 

@@ -15,6 +15,11 @@ import subprocess
 import tempfile
 from pathlib import Path
 
+RODS = Path(__file__).parent
+"""Sources of the rods' kernels, and headers that others share."""
+COUPLING = Path(__file__).parents[2] / "coupling" / "kernels"
+"""Sources of the couplings' kernels."""
+
 _log = logging.getLogger(__name__)
 
 
@@ -32,7 +37,7 @@ def library(source: Path, *options: str) -> ctypes.CDLL | None:
         return None
     machine = Path("/proc/cpuinfo").read_bytes()[:2048] if Path("/proc/cpuinfo").exists() else b""
     flags = next((line for line in machine.splitlines() if line.startswith((b"model name", b"flags"))), b"")
-    folders = sorted({source.parent, Path(__file__).parent})
+    folders = sorted({source.parent, RODS})
     texts = [source, *(header for folder in folders for header in sorted(folder.glob("*.h")))]
     text = b"".join(each.read_bytes() for each in texts)
     key = hashlib.sha256(text + " ".join((compiler, *options)).encode() + flags).hexdigest()[:16]

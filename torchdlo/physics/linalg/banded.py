@@ -12,7 +12,6 @@ import ctypes
 import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import torch
 from torch import Tensor
@@ -83,7 +82,7 @@ def pattern(name: str) -> Pattern:
 @functools.lru_cache(maxsize=1)
 def kernel() -> ctypes.CDLL | None:
     """Return the compiled kernel, or None where no C++ compiler is at hand."""
-    library = native.library(Path(__file__).with_name("banded.cpp"), "-ffast-math", "-Wno-psabi")
+    library = native.library(native.RODS / "banded.cpp", "-ffast-math", "-Wno-psabi")
     if library is None:
         return None
     for name in ("solve_float", "solve_double"):

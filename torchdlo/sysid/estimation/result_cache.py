@@ -133,9 +133,9 @@ class Journal:
 
 def _program() -> str:
     """Return a hash of the program itself: its version alone does not change with every edit of a law."""
-    root, found = Path(__file__).parents[1], hashlib.sha256()
+    root, found = Path(__file__).parents[2], hashlib.sha256()
     parts = [root / "scene.py", *(f for name in ("physics", "coupling", "sysid") for f in (root / name).rglob("*.py"))]
-    for file in sorted([*parts, *(root / "physics").glob("*.cpp"), *(root / "physics").glob("*.h")]):
+    for file in sorted([*parts, *(root / "physics").rglob("*.cpp"), *(root / "physics").rglob("*.h")]):
         found.update(file.name.encode() + file.read_bytes())
     for library in ("numpy", "scipy", "torch"):
         found.update(importlib.metadata.version(library).encode())
