@@ -1,4 +1,4 @@
-"""What tasks are worth: returns and successes of doing nothing, of random actions, and of the ways by hand.
+"""What tasks are worth: returns and successes of doing nothing, of random actions, and of the scripted demonstrations.
 
 Every task is played from its one start and from starts that vary as they do in training. Random actions are drawn
 evenly within their limits. Beside returns of doing nothing stand those that DLO-Lab's figures amount to.
@@ -31,15 +31,16 @@ def measure(name: str, starts: int, seed: int, horizon: int | None) -> dict[str,
     from torchdlo.envs.core import episode
 
     task, rng = find(name), torch.Generator().manual_seed(seed)
-    away = 2 * torch.rand(starts, len(task.spread), 2, generator=rng, dtype=torch.float64) - 1
-    away = torch.nn.functional.pad(away * torch.tensor(task.spread, dtype=torch.float64), (0, 1)).float()
-    # From the one start: nothing and the way by hand; from all others: nothing, random actions and the way by hand.
+    away = 2 * torch.rand(starts, len(task.reset_noise), 2, generator=rng, dtype=torch.float64) - 1
+    away = torch.nn.functional.pad(away * torch.tensor(task.reset_noise, dtype=torch.float64), (0, 1)).float()
+    # From the one start: nothing and the scripted demonstration; from all others: nothing, random actions and the
+    # scripted demonstration.
     moved = torch.cat([torch.zeros(2, *away.shape[1:]), away, away, away])
     base = episode.prepare(task, len(moved), compiled=False, recorded=horizon is None)
     _, params, state = task.build(moved)
     base = replace(base, params=params)
     base = replace(base, start=episode.begin(base, state))
-    hand = task.reference(state)[:, :horizon]
+    hand = task.demonstration(state)[:, :horizon]
     random = 2 * torch.rand(starts, hand.shape[1], task.width, generator=rng, dtype=torch.float64) - 1
     actions = torch.zeros_like(hand)
     actions[1], actions[2 + 2 * starts :] = hand[1], hand[2 + 2 * starts :]

@@ -47,7 +47,7 @@ def knotted(scenes: int, contact: bool) -> tuple[Any, Any, Any]:
     turned = [a.cos() * x[:, 0] - a.sin() * x[:, 1], a.sin() * x[:, 0] + a.cos() * x[:, 1], x[:, 2].expand(scenes, 60)]
     rope = scene.Rope(torch.stack(turned, -1).float(), radius=0.004, density=1000.0, bend=1e-4)
     effects = [Bend(), Gravity(), Damping(), *([RodContact(room=64)] if contact else [])]
-    return scene.make([rope], effects, dt=1e-3, substeps=SUBSTEPS, held_vertices=(0, 59))
+    return scene.make([rope], effects, dt=1e-3, substeps=SUBSTEPS, prescribed_vertices=(0, 59))
 
 
 def pile(vertices: int) -> tuple[Any, Any, Any]:
@@ -69,7 +69,7 @@ def pile(vertices: int) -> tuple[Any, Any, Any]:
     choice, params, state = scene.make(ropes, effects, dt=1e-3, substeps=SUBSTEPS)
     with torch.no_grad():
         for _ in range(40):
-            state = scene.step(choice, params, state, scene.hold(choice, state))
+            state = scene.step(choice, params, state, scene.stationary_control(choice, state))
     return choice, params, state
 
 
@@ -82,7 +82,7 @@ def timed(made: tuple[Any, Any, Any], backward: bool, seconds: float, compiled: 
 
     torch.set_num_threads(1)
     choice, params, state = made
-    step, control = scene.stepper(choice, compiled=compiled), scene.hold(choice, state)
+    step, control = scene.stepper(choice, compiled=compiled), scene.stationary_control(choice, state)
 
     def forward(count: int) -> None:
         now = state
@@ -139,7 +139,7 @@ def contact_alone(made: tuple[Any, Any, Any], seconds: float) -> float:
     for name in parts:
         setattr(RodContact, name, watched(name))
     with torch.no_grad():
-        scene.step(choice, params, state, scene.hold(choice, state))
+        scene.step(choice, params, state, scene.stationary_control(choice, state))
         total = 0.0
         for name, often in parts.items():
             setattr(RodContact, name, plain[name])

@@ -72,9 +72,9 @@ def build(case: Case, scenes: int) -> tuple[Any, Any, Any]:
     import torch
 
     from torchdlo import scene
-    from torchdlo.coupling import BodyContact, RodBody, RodContact, RodMatter
+    from torchdlo.coupling import BodyContact, RodBody, RodContact, RodMpmCoupling
     from torchdlo.coupling.mpm.constitutive_models import Plastic
-    from torchdlo.coupling.mpm.particles import Blob, Grid, assemble, fill_ball
+    from torchdlo.coupling.mpm.particles import Grid, ParticleBlock, assemble, fill_ball
     from torchdlo.physics import tree
     from torchdlo.physics.effects.elastic import Bend
     from torchdlo.physics.effects.external import Damping, Gravity
@@ -84,23 +84,23 @@ def build(case: Case, scenes: int) -> tuple[Any, Any, Any]:
     effects, numbers = [Gravity(), Bend(), Damping(), RodContact()], {"damping": {"rate": 30.0}}
     choices = {"dt": 1e-3, "substeps": 5}
     if case.scenario == "coiling":
-        cone = scene.Solid("cone", (0.12, 0.3), (0, 0, 0.075), motion="fixed", mu_s=0.7, mu_k=0.7)
-        x, more = straight(scenes, 60, dtype, (-0.6, 0.105, 0.06)), {"bodies": [cone], "held_vertices": (0, 1)}
+        cone = scene.RigidBody("cone", (0.12, 0.3), (0, 0, 0.075), motion="fixed", mu_s=0.7, mu_k=0.7)
+        x, more = straight(scenes, 60, dtype, (-0.6, 0.105, 0.06)), {"bodies": [cone], "prescribed_vertices": (0, 1)}
         effects, stiff = [*effects, RodBody()], 1e3
     elif case.scenario == "lifting":
         like = {"quat": (0.5, 0.5, 0.5, 0.5), "density": 120.0, "mu_s": 0.6, "mu_k": 0.6}  # upright, open to -y
         size = (0.045, 0.012, 1.5 * math.pi)
-        rings = [scene.Solid("ring", size, (x, 0.11, 0.06), **like) for x in (0.53, 0.67)]
-        bodies = [*rings, scene.Solid("plane", motion="fixed", mu_s=0.6, mu_k=0.6)]
-        x, more = straight(scenes, 30, dtype, (0.3, 0.1, 0.06)), {"bodies": bodies, "held_vertices": (4, 25)}
+        rings = [scene.RigidBody("ring", size, (x, 0.11, 0.06), **like) for x in (0.53, 0.67)]
+        bodies = [*rings, scene.RigidBody("plane", motion="fixed", mu_s=0.6, mu_k=0.6)]
+        x, more = straight(scenes, 30, dtype, (0.3, 0.1, 0.06)), {"bodies": bodies, "prescribed_vertices": (4, 25)}
         effects, stiff = [*effects, RodBody(), BodyContact()], 5e3
     else:
         x = straight(scenes, 45, dtype, (-0.15, 0.02, 0.145))
         ball = fill_ball((0.25, 0.02, 0.07), 0.05, 0.0064, x)
-        blob = Blob(ball.expand(scenes, *ball.shape), Plastic(), 0.0064**3)
+        blob = ParticleBlock(ball.expand(scenes, *ball.shape), Plastic(), 0.0064**3)
         grid = Grid((-0.2, -0.2, 0.0), (0.8, 0.25, 0.3), 0.01, window=(20, 20, 20))
-        more = {"matter": assemble([blob], grid), "held_vertices": (1, 43)}
-        effects, stiff = [*effects, RodMatter(room=16)], 1e3
+        more = {"material_points": assemble([blob], grid), "prescribed_vertices": (1, 43)}
+        effects, stiff = [*effects, RodMpmCoupling(room=16)], 1e3
     made, params, state = scene.make([scene.Rope(x, youngs=stiff, **rope)], effects, numbers, **choices, **more)
     return made, tree.map(tree.batch_innermost, params) if case.scenario != "gathering" else params, state
 

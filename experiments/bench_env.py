@@ -98,7 +98,7 @@ def remember(task: str, actions: int, compiled: bool, go: Any, results: Any) -> 
     torch.set_num_threads(1)
     choices = {"gradients": True, "compiled": compiled, "variation": False, "segment": SEGMENT}
     env = envs.make(task, num_envs=10, **choices)
-    ways = [torch.full_like(env.action_spec.zero(), 1e-3).requires_grad_() for _ in range(actions)]
+    stage_waypoints = [torch.full_like(env.action_spec.zero(), 1e-3).requires_grad_() for _ in range(actions)]
 
     def gradient(chosen: list[Any]) -> None:
         td, earned = env.reset(), 0.0
@@ -107,9 +107,9 @@ def remember(task: str, actions: int, compiled: bool, go: Any, results: Any) -> 
             earned = earned + stepped["next", "reward"].sum()
         torch.autograd.grad(earned, chosen)
 
-    gradient(ways[:2])
+    gradient(stage_waypoints[:2])
     before = peak_mb(restart=True)
-    gradient(ways)
+    gradient(stage_waypoints)
     results.put({"frames": actions * env.task.frames, "before_mb": before, "peak_mb": peak_mb()})
 
 

@@ -78,7 +78,7 @@ def build(case: Case, scenes: int) -> tuple[Any, Any, Any]:
     rope = scene.Rope(x, radius=0.005, density=1000.0, youngs=1e6, shear=1e6 / 3)
     names = ("bend_frame", "twist", "gravity", "damping") if framed else ("bend", "gravity", "damping")
     step = {"dt": 1e-3, "substeps": 5} if case.integrator == "explicit" else {"dt": 5e-3, "substeps": 1}
-    held = {"held_vertices": (0, 1), "held_edges": (0,) if framed else ()}
+    held = {"prescribed_vertices": (0, 1), "prescribed_edges": (0,) if framed else ()}
     choices = {"integrator": case.integrator, "twist": case.twist, **step, **held}
     made, params, state = scene.make([rope], [EFFECTS[name]() for name in names], {"damping": {"rate": 0.5}}, **choices)
     return made, tree.map(tree.batch_innermost, params), state
@@ -96,7 +96,7 @@ def gradient(step: Callable, made: tuple[Any, Any, Any], frames: int, **replay: 
     bend, vel = (x.detach().clone().requires_grad_() for x in (rods.material.bend, state.rods.vel))
     params = tree.replace(params, rods=tree.replace(rods, material=tree.replace(rods.material, bend=bend)))
     state = tree.replace(state, rods=tree.replace(state.rods, vel=vel))
-    controls = tree.map(lambda c: c.expand(frames, *c.shape), scene.hold(choice, made[2]))
+    controls = tree.map(lambda c: c.expand(frames, *c.shape), scene.stationary_control(choice, made[2]))
     last, _ = scene.rollout(step, params, state, controls, keep=lambda s: s.time, **replay)
     found = torch.autograd.grad(last.rods.pos.square().sum(), [bend, vel])
     if not all(bool(torch.isfinite(g).all()) for g in found):
@@ -111,7 +111,7 @@ def forward(step: Callable, made: tuple[Any, Any, Any], frames: int) -> None:
 
     choice, params, state = made
     with torch.no_grad():
-        control = scene.hold(choice, state)
+        control = scene.stationary_control(choice, state)
         for _ in range(frames):
             state = step(params, state, control)
     if not bool(scene.finite(state).all()):

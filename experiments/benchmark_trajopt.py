@@ -1,7 +1,7 @@
 """Trajectory optimisation of the tasks: tasks by methods by seeds, beside published returns.
 
 All searches of a task run at the same time and share their batches, so that their seconds are shared ones; the best
-trajectories are played alone in the end, and returns are those. An episode counts once, with its slope or without.
+trajectories are played alone in the end, and returns are those. An episode counts once, with its gradient or without.
 Every search keeps a journal, so that a benchmark that was stopped goes on where it was; finished ones are read. Those
 of another version of the program or of libraries are marked with a star in the table, and run anew with --again. With
 --minutes, searches end with what they found by then; without it, the same command goes on with them. With --report,
@@ -35,7 +35,7 @@ EXAMPLES = """examples:
 """
 
 SHARE = {"cmaes": 0.0, "hybrid": 0.25}
-"""Of which share of the trajectories slopes are wanted, if not of all."""
+"""Of which share of the trajectories gradients are wanted, if not of all."""
 INTERRUPTED = 130
 """Exit status after Ctrl-C."""
 
@@ -56,9 +56,9 @@ class Timed:
             raise KeyboardInterrupt
         return self.inner.evaluate(actions)
 
-    def rehearsal(self) -> Any:
-        """Return the rehearsal, which ends at the same time."""
-        found = self.inner.rehearsal()
+    def surrogate(self) -> Any:
+        """Return the surrogate task, which ends at the same time."""
+        found = self.inner.surrogate()
         return None if found is None else Timed(found, self.over)
 
 
@@ -157,7 +157,11 @@ def cases(task: str, args: Any) -> list[Case]:
     """All searches of a task."""
     from torchdlo.agents.trajopt.presets import preset
 
-    given = {"episodes": args.episodes or None, "population": args.population or None, "rehearsed": args.rehearsed}
+    given = {
+        "episodes": args.episodes or None,
+        "population": args.population or None,
+        "surrogate_share": args.surrogate_share,
+    }
     seeds = range(args.first, args.first + args.seeds)
     return [
         Case(task, method, seed, preset(task, method, seed=seed, **given), Path(args.out) / f"{task}-{method}-{seed}")
@@ -192,8 +196,8 @@ def solve(task: str, args: Any) -> list[tuple[Case, dict[str, Any]]]:
             return lambda shared: case.search(shared, note, lambda: time.monotonic() > end)
 
         sizes = [min(case.settings.population, case.settings.chunk) for case in wanted]
-        graded = sum(int(size * SHARE.get(case.method, 1)) for size, case in zip(sizes, wanted, strict=True))
-        together(chosen, [searching(case) for case in left], sum(sizes), pulse, graded=graded)
+        with_gradient = sum(int(size * SHARE.get(case.method, 1)) for size, case in zip(sizes, wanted, strict=True))
+        together(chosen, [searching(case) for case in left], sum(sizes), pulse, with_gradient=with_gradient)
     return [(case, json.loads(case.result.read_text())) for case in wanted if case.result.is_file()]
 
 
@@ -203,7 +207,7 @@ def side_by_side(args: Any) -> None:
     common += ["--methods", ",".join(args.methods), "--first", str(args.first), "--seeds", str(args.seeds)]
     common += ["--jobs", "1", "--quiet", *(["--double"] if args.double else []), *(["--smoke"] if args.smoke else [])]
     common += ["--again"] if args.again else []
-    for name in ("rehearsed", "minutes"):
+    for name in ("surrogate_share", "minutes"):
         value = getattr(args, name)
         common += [] if value is None else [f"--{name}", str(value)]
 

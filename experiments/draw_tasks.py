@@ -63,8 +63,8 @@ def draw(name: str, target: Path) -> None:
     for k, body in enumerate(scene.bodies):
         if body.shape != "plane":
             axes.plot(*outline(body, params.bodies, state.bodies, k), color="0.4", lw=1.5)
-    if state.matter:
-        axes.plot(*state.matter.pos[0, :, :2].T.tolist(), ".", ms=1, color="#7570b3")
+    if state.material_points:
+        axes.plot(*state.material_points.pos[0, :, :2].T.tolist(), ".", ms=1, color="#7570b3")
     topology, x = scene.topology, state.rods.pos[0]
     for color, start, count, loop in zip(COLORS * 4, topology.starts, topology.counts, topology.closed, strict=False):
         line = x[[*range(start, start + count), *([start] if loop else [])]]

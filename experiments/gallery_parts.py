@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from torchdlo.scene_files import Description
+    from torchdlo.scene_files import SceneDescription
     from torchdlo.scene_files.run import Frames
 
 Claims = dict[str, tuple[float, float, float]]
@@ -21,9 +21,9 @@ class Show:
     """A scene of the gallery."""
 
     title: str
-    scene: Callable[[bool], Description]
+    scene: Callable[[bool], SceneDescription]
     """The scene; True asks for a coarse one."""
-    claims: Callable[[Frames, Description], Claims]
+    claims: Callable[[Frames, SceneDescription], Claims]
     every: int = 10
     moments: tuple[float, ...] | None = None
     """Moments in the picture [s]; start, middle and end if not given."""

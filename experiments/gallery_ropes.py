@@ -8,15 +8,15 @@ from typing import TYPE_CHECKING, Any
 from gallery_parts import HUGE, Claims, circle, closest, linking, loop, rope_of
 
 if TYPE_CHECKING:
-    from torchdlo.scene_files import Description
+    from torchdlo.scene_files import SceneDescription
     from torchdlo.scene_files.run import Frames
 
 
-def knot(quick: bool) -> Description:
+def knot(quick: bool) -> SceneDescription:
     """An overhand knot whose ends are pulled apart; the curve is the long trefoil of Shastri 1992."""
     import numpy as np
 
-    from torchdlo.scene_files import Description, Hold, Key, Rope
+    from torchdlo.scene_files import Attachment, Keyframe, RopeSpec, SceneDescription
 
     t = np.linspace(-2.15, 2.15, 2001)
     x = 0.02 * np.stack([t**3 - 3 * t, t**4 - 4 * t**2, 0.35 * (t**5 - 10 * t)], 1)
@@ -30,19 +30,23 @@ def knot(quick: bool) -> Description:
     side = np.cross(axis, [0.0, 0.0, 1.0])
     side /= np.linalg.norm(side)
     x = (x - x.mean(0)) @ np.stack([axis, side, np.cross(axis, side)], 1)
-    rope = Rope(tuple(map(tuple, x.tolist())), vertices=61 if quick else 81, radius=3e-3, density=1000.0, bend=1.26e-4)
+    rope = RopeSpec(
+        tuple(map(tuple, x.tolist())), vertices=61 if quick else 81, radius=3e-3, density=1000.0, bend=1.26e-4
+    )
     far = 0.16
-    return Description(
+    return SceneDescription(
         ropes=(rope,),
         effects={"bend": {}, "damping": {"rate": 8.0}, "rod_contact": {"mu_s": 0.2, "mu_k": 0.2, "burst": 2.0}},
-        holds=tuple(Hold((end,), keys=(Key(0.6, move=(sign * far, 0, 0)),)) for end, sign in ((0, -1), (-1, 1))),
+        holds=tuple(
+            Attachment((end,), keys=(Keyframe(0.6, move=(sign * far, 0, 0)),)) for end, sign in ((0, -1), (-1, 1))
+        ),
         duration=0.7,
         substeps=4,
         look=(0.15, -1.0, 0.5),
     )
 
 
-def knot_claims(frames: Frames, d: Description) -> Claims:
+def knot_claims(frames: Frames, d: SceneDescription) -> Claims:
     """Strands touch and do not pass through each other, and the knot takes up length."""
     import numpy as np
 
@@ -58,25 +62,25 @@ def knot_claims(frames: Frames, d: Description) -> Claims:
     }
 
 
-def chain(quick: bool) -> Description:
+def chain(quick: bool) -> SceneDescription:
     """Two linked loops; the upper one is held at one place, the lower one falls into it."""
-    from torchdlo.scene_files import Description, Hold, Rope
+    from torchdlo.scene_files import Attachment, RopeSpec, SceneDescription
 
     count = 20 if quick else 28
     given = {"radius": 3e-3, "density": 2000.0, "bend": 5e-4, "closed": True, "rest": "as_placed"}
     upper = circle(count, 0.05, (0.0, 0.0, 0.0), "xz", math.pi / 2)
     lower = circle(count, 0.05, (0.0, 0.0, -0.07), "yz", math.pi / 2)
-    return Description(
-        ropes=(Rope(upper, **given), Rope(lower, **given)),
+    return SceneDescription(
+        ropes=(RopeSpec(upper, **given), RopeSpec(lower, **given)),
         effects={"gravity": {}, "bend_frame": {}, "damping": {"rate": 2.0}, "rod_contact": {"mu_s": 0.2, "mu_k": 0.2}},
-        holds=(Hold((0,)),),
+        holds=(Attachment((0,)),),
         duration=0.6,
         substeps=8,
         look=(0.9, -1.0, 0.3),
     )
 
 
-def chain_claims(frames: Frames, d: Description) -> Claims:
+def chain_claims(frames: Frames, d: SceneDescription) -> Claims:
     """They stay linked, never pass through each other, and the holder bears the weight of both."""
     import numpy as np
 
@@ -95,22 +99,22 @@ def chain_claims(frames: Frames, d: Description) -> Claims:
     }
 
 
-def gripper(quick: bool) -> Description:
+def gripper(quick: bool) -> SceneDescription:
     """An arm reaches down, grips a rope on a table, and lifts it."""
-    from torchdlo.scene_files import Description, Hold, Key, Robot, Rope
+    from torchdlo.scene_files import Attachment, Keyframe, RobotSpec, RopeSpec, SceneDescription
 
     count = 31 if quick else 41
     middle = count // 2
-    arm = Robot(
+    arm = RobotSpec(
         base=(-0.5, 0.0, 0.0),
         joints=(0.0, 0.2, 0.0, -2.2, 0.0, 2.4, -0.785, 0.007),
         pos=(0.0, 0.0, 0.16),
         # Its pads are across the rope.
         quat=(0.0, math.sqrt(0.5), math.sqrt(0.5), 0.0),
-        keys=(Key(0.6, move=(0, 0, -0.154)), Key(0.8, move=(0, 0, -0.154)), Key(2.0, move=(0, 0, 0.06))),
+        keys=(Keyframe(0.6, move=(0, 0, -0.154)), Keyframe(0.8, move=(0, 0, -0.154)), Keyframe(2.0, move=(0, 0, 0.06))),
     )
-    return Description(
-        ropes=(Rope(((0.0, -0.35, 0.006), (0.0, 0.35, 0.006)), vertices=count, radius=6e-3, mass=0.08, bend=2e-3),),
+    return SceneDescription(
+        ropes=(RopeSpec(((0.0, -0.35, 0.006), (0.0, 0.35, 0.006)), vertices=count, radius=6e-3, mass=0.08, bend=2e-3),),
         effects={
             "gravity": {},
             "bend": {},
@@ -119,7 +123,7 @@ def gripper(quick: bool) -> Description:
             "table_friction": {"mu": 0.4, "height": 0.0},
         },
         robots=(arm,),
-        holds=(Hold((middle - 1, middle, middle + 1), robot=0, close=0.7),),
+        holds=(Attachment((middle - 1, middle, middle + 1), robot=0, close=0.7),),
         duration=2.2,
         dt=2e-3,
         substeps=1,
@@ -128,7 +132,7 @@ def gripper(quick: bool) -> Description:
     )
 
 
-def gripper_claims(frames: Frames, d: Description) -> Claims:
+def gripper_claims(frames: Frames, d: SceneDescription) -> Claims:
     """The middle goes up with the tool, the ends stay on the table, and the tool bears what is off the table.
 
     Without stiffness it bears all of that. A stiff beam that is flat in the tool and leaves the table without moment
@@ -151,9 +155,9 @@ def gripper_claims(frames: Frames, d: Description) -> Claims:
     }
 
 
-def pulley(quick: bool) -> Description:
+def pulley(quick: bool) -> SceneDescription:
     """A smooth rope over a smooth pulley, with 40 g on one side and 60 g on the other."""
-    from torchdlo.scene_files import Body, Description, Rope, Weight
+    from torchdlo.scene_files import BodySpec, HangingMass, RopeSpec, SceneDescription
 
     radius, r, side, count = 0.05, 3e-3, 0.2, 48 if quick else 56
     edge = (2 * side + math.pi * (radius + r)) / count
@@ -162,19 +166,19 @@ def pulley(quick: bool) -> Description:
     angles = [math.pi * k / 64 for k in range(65)]
     top = [(-wide * math.cos(a), 0.0, wide * math.sin(a)) for a in angles]
     points = ((-wide, 0.0, -side), *top, (wide, 0.0, -side))
-    weights = (Weight(0, 0.04), Weight(-1, 0.06))
+    weights = (HangingMass(0, 0.04), HangingMass(-1, 0.06))
     half = math.sqrt(0.5)
-    return Description(
-        ropes=(Rope(points, vertices=count, radius=r, mass=0.02, bend=1e-4, weights=weights),),
+    return SceneDescription(
+        ropes=(RopeSpec(points, vertices=count, radius=r, mass=0.02, bend=1e-4, weights=weights),),
         effects={"gravity": {}, "bend": {}, "rod_body": {}},
-        bodies=(Body("cylinder", (radius, 0.03), quat=(half, half, 0.0, 0.0), motion="fixed", mu_s=0.0, mu_k=0.0),),
+        bodies=(BodySpec("cylinder", (radius, 0.03), quat=(half, half, 0.0, 0.0), motion="fixed", mu_s=0.0, mu_k=0.0),),
         duration=0.3,
         substeps=4,
         look=(0.35, -1.0, 0.15),
     )
 
 
-def pulley_claims(frames: Frames, d: Description) -> Claims:
+def pulley_claims(frames: Frames, d: SceneDescription) -> Claims:
     """The heavier side sinks as Atwood's machine does, with the weight of the rope.
 
     M x'' = g (m2 - m1 + 2 l x), l the rope's mass per length: x = (m2 - m1) / (2 l) (cosh(k t) - 1), k^2 = 2 l g / M.
@@ -194,9 +198,9 @@ def pulley_claims(frames: Frames, d: Description) -> Claims:
     }
 
 
-def wire(quick: bool) -> Description:
+def wire(quick: bool) -> SceneDescription:
     """A wire is bent over a post by its ends and let go: it springs back a little, and keeps the rest."""
-    from torchdlo.scene_files import Body, Description, Hold, Key, Rope
+    from torchdlo.scene_files import Attachment, BodySpec, Keyframe, RopeSpec, SceneDescription
 
     half, length, round_ = math.sqrt(0.5), 0.15, 0.0222
 
@@ -210,9 +214,9 @@ def wire(quick: bool) -> Description:
     x, z = end(bow[-1], 0.0)
     line = ((-x, 0.0, z), *((round_ * math.sin(a), 0.0, round_ * math.cos(a)) for a in bow), (x, 0.0, z))
     goals = [(0.05 * k, *end(math.radians(10.0 + 5.0 * k), 1e-3)) for k in range(1, 11)]
-    way, other = (tuple(Key(t, move=(sign * (x - u), 0.0, w - z)) for t, u, w in goals) for sign in (1, -1))
-    return Description(
-        ropes=(Rope(line, vertices=31 if quick else 41, radius=2e-3, mass=0.02, bend=5e-4),),
+    way, other = (tuple(Keyframe(t, move=(sign * (x - u), 0.0, w - z)) for t, u, w in goals) for sign in (1, -1))
+    return SceneDescription(
+        ropes=(RopeSpec(line, vertices=31 if quick else 41, radius=2e-3, mass=0.02, bend=5e-4),),
         effects={
             "gravity": {},
             "bend_frame": {},
@@ -220,10 +224,10 @@ def wire(quick: bool) -> Description:
             "bending_plasticity": {"yield_curvature": 8.0, "rate": 200.0, "hardening": 0.05},
             "rod_body": {},
         },
-        bodies=(Body("cylinder", (0.02, 0.03), quat=(half, half, 0.0, 0.0), motion="fixed"),),
+        bodies=(BodySpec("cylinder", (0.02, 0.03), quat=(half, half, 0.0, 0.0), motion="fixed"),),
         holds=(
-            Hold((0,), keys=way, path="linear", release=0.6),
-            Hold((-1,), keys=other, path="linear", release=0.6),
+            Attachment((0,), keys=way, path="linear", release=0.6),
+            Attachment((-1,), keys=other, path="linear", release=0.6),
         ),
         duration=1.0,
         substeps=6,
@@ -238,7 +242,7 @@ def bent_by(x: Any) -> float:
     return math.degrees(math.acos(float(a @ b) / math.sqrt(float(a @ a) * float(b @ b))))
 
 
-def wire_claims(frames: Frames, d: Description) -> Claims:
+def wire_claims(frames: Frames, d: SceneDescription) -> Claims:
     """Springback takes the elastic part of the bend, and no more."""
     angle = [bent_by(x) for x in frames.pos]
     held = max(angle[k] for k in range(len(angle)) if frames.time[k] <= 0.6)
@@ -249,28 +253,28 @@ def wire_claims(frames: Frames, d: Description) -> Claims:
     }
 
 
-def band(quick: bool) -> Description:
+def band(quick: bool) -> SceneDescription:
     """A rubber band round three posts that move apart."""
-    from torchdlo.scene_files import Body, Description, Key, Rope
+    from torchdlo.scene_files import BodySpec, Keyframe, RopeSpec, SceneDescription
 
     post, r, start = 0.012, 2e-3, 0.03
     corners = circle(3, start, (0.0, 0.0, 0.0), turn=math.pi / 2)
     bodies = tuple(
-        Body(
+        BodySpec(
             "cylinder",
             (post, 0.03),
             pos=at,
             motion="kinematic",
             mu_s=0.05,
             mu_k=0.05,
-            keys=(Key(0.5, move=(at[0], at[1], 0.0)),),
+            keys=(Keyframe(0.5, move=(at[0], at[1], 0.0)),),
         )
         for at in corners
     )
     ring = circle(24, start + post + r + 1e-3, (0.0, 0.0, 0.0))
-    return Description(
+    return SceneDescription(
         ropes=(
-            Rope(ring, vertices=36 if quick else 48, radius=r, density=1000.0, bend=1e-6, stretch=3.0, closed=True),
+            RopeSpec(ring, vertices=36 if quick else 48, radius=r, density=1000.0, bend=1e-6, stretch=3.0, closed=True),
         ),
         effects={"bend": {}, "damping": {"rate": 10.0}, "rod_body": {}},
         bodies=bodies,
@@ -280,7 +284,7 @@ def band(quick: bool) -> Description:
     )
 
 
-def band_claims(frames: Frames, d: Description) -> Claims:
+def band_claims(frames: Frames, d: SceneDescription) -> Claims:
     """It lies along the shortest line round the posts: three sides and one turn, as long as that."""
     import numpy as np
 

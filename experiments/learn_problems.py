@@ -13,14 +13,14 @@ import torch
 from torch import Tensor
 
 from torchdlo import scene, scene_files
-from torchdlo.coupling import BodyMatter, RodBody
+from torchdlo.coupling import BodyMpmCoupling, RodBody
 from torchdlo.coupling.bodies.dynamics import BodyTargets, turn_by
-from torchdlo.coupling.mpm.rod_coupling_effect import Touched
+from torchdlo.coupling.mpm.rod_coupling_effect import TouchedParticles
 from torchdlo.physics import tree
-from torchdlo.physics.effects.base import Motion, Push, Values
+from torchdlo.physics.effects.base import ContactForces, PredictedMotion, Values
 from torchdlo.physics.linalg.rotation import multiply
 from torchdlo.physics.rod.kinematics import View
-from torchdlo.scene_files import Body, Box, Description, Hold, Key, Matter, Rope
+from torchdlo.scene_files import Attachment, BodySpec, GridSpec, Keyframe, ParticleBlockSpec, RopeSpec, SceneDescription
 
 if TYPE_CHECKING:
     from torchdlo.scene_files.run import Frames
@@ -33,25 +33,27 @@ LENGTH = 0.1
 class CutRodBody(RodBody):
     """`RodBody` whose forces on bodies have no derivative."""
 
-    def react(self, view: View, motion: Motion, values: Values) -> Push:
+    def solve_contact(self, view: View, motion: PredictedMotion, values: Values) -> ContactForces:
         """Return what `RodBody` does."""
-        push = super().react(view, motion, values)
-        return Push(push.force, push.body_force.detach(), push.body_torque.detach(), push.matter)
+        push = super().solve_contact(view, motion, values)
+        return ContactForces(push.force, push.body_force.detach(), push.body_torque.detach(), push.material_points)
 
 
 @dataclass(frozen=True)
-class CutBodyMatter(BodyMatter):
-    """`BodyMatter` whose impulses on matter have no derivative."""
+class CutBodyMatter(BodyMpmCoupling):
+    """`BodyMpmCoupling` whose impulses on matter have no derivative."""
 
-    def meet(self, motion: Any, matter: Any, push: Push) -> Push:
-        """Return what `BodyMatter` does."""
-        before = matter.nodes if push.matter == () else push.matter.nodes
-        push = super().meet(motion, matter, push)
-        vel = before.vel + (push.matter.nodes.vel - before.vel).detach()
-        return dataclasses.replace(push, matter=Touched(tree.replace(before, vel=vel), push.matter.lost))
+    def couple_bodies_to_particles(self, motion: Any, material_points: Any, push: ContactForces) -> ContactForces:
+        """Return what `BodyMpmCoupling` does."""
+        before = material_points.nodes if push.material_points == () else push.material_points.nodes
+        push = super().couple_bodies_to_particles(motion, material_points, push)
+        vel = before.vel + (push.material_points.nodes.vel - before.vel).detach()
+        return dataclasses.replace(
+            push, material_points=TouchedParticles(tree.replace(before, vel=vel), push.material_points.lost)
+        )
 
 
-CUT = {RodBody: CutRodBody, BodyMatter: CutBodyMatter}
+CUT = {RodBody: CutRodBody, BodyMpmCoupling: CutBodyMatter}
 
 
 SHAKE = 0.01
@@ -66,7 +68,7 @@ class Problem:
     """A scene whose keys are learned."""
 
     title: str
-    scene: Callable[[], Description]
+    scene: Callable[[], SceneDescription]
     """The scene with the first guess; keys of holds, then of kinematic bodies, are learned."""
     free: tuple[float, ...]
     """1 for what is learned of a key: three of its move, three of its turn."""
@@ -81,31 +83,31 @@ class Problem:
     """Rate of Adam at the start, in `LENGTH` or radians; it is halved whenever descent has gone too far."""
 
 
-def movers(d: Description) -> list[Any]:
+def movers(d: SceneDescription) -> list[Any]:
     """Return the parts whose keys are learned."""
     return [part for part in (*d.holds, *d.bodies) if part.keys]
 
 
-def first_keys(d: Description) -> Tensor:
+def first_keys(d: SceneDescription) -> Tensor:
     """Return what keys say, in the units in which it is learned, shape (parts, keys, 6)."""
     rows = [[(*k.move, *k.turn) for k in part.keys] for part in movers(d)]
     return torch.tensor(rows, dtype=torch.float64) / torch.tensor([LENGTH] * 3 + [1.0] * 3, dtype=torch.float64)
 
 
-def described(problem: Problem, keys: Tensor) -> Description:
+def described(problem: Problem, keys: Tensor) -> SceneDescription:
     """Return the problem's scene with other keys (parts, keys, 6)."""
     d = problem.scene()
     rows = iter((keys * keys.new_tensor([LENGTH] * 3 + [1.0] * 3)).tolist())
 
     def with_keys(part: Any) -> Any:
-        made = (Key(k.time, tuple(r[:3]), tuple(r[3:])) for k, r in zip(part.keys, next(rows), strict=True))
+        made = (Keyframe(k.time, tuple(r[:3]), tuple(r[3:])) for k, r in zip(part.keys, next(rows), strict=True))
         return dataclasses.replace(part, keys=tuple(made))
 
     holds, bodies = (tuple(with_keys(x) if x.keys else x for x in parts) for parts in (d.holds, d.bodies))
     return dataclasses.replace(d, holds=holds, bodies=bodies)
 
 
-def controls(d: Description, made: scene_files.Simulation, keys: Tensor) -> scene.Control:
+def controls(d: SceneDescription, made: scene_files.Simulation, keys: Tensor) -> scene.Control:
     """Return the controls of all steps, as `describe` makes them, with derivatives by keys (parts, keys, 6).
 
     Holds do not turn; all or none of them move.
@@ -117,7 +119,7 @@ def controls(d: Description, made: scene_files.Simulation, keys: Tensor) -> scen
     last = (torch.searchsorted(at, time, right=True) - 1).clamp(max=len(at) - 2)
     s = ((time - at[last]) / (at[last + 1] - at[last])).clamp(0, 1)[:, None]
     moved = rows[:, last] + s**3 * (10 - 15 * s + 6 * s**2) * (rows[:, last + 1] - rows[:, last])
-    still = scene.hold(made.scene, made.state)
+    still = scene.stationary_control(made.scene, made.state)
     owner = [k for k, h in enumerate(d.holds) for _ in h.vertices if h.keys]
     pos = still.pos + moved[owner, :, :3].transpose(0, 1) if owner else plain.pos
     body = moved[sum(bool(h.keys) for h in d.holds) :].transpose(0, 1)
@@ -131,7 +133,7 @@ class Learned:
 
     losses: list[float]
     """At the start and after every step [m^2]."""
-    slope: float
+    gradient: float
     """Size of the gradient at the start."""
     keys: Tensor
     """The best keys, shape (parts, keys, 6)."""
@@ -199,7 +201,7 @@ def descend(
         shaken: changes keys a little.
         tell: told the number of steps and the loss after each.
     """
-    losses, best, slope = [], keys, 0.0
+    losses, best, gradient = [], keys, 0.0
     for k in range(iterations + 1):
         if k == 0 or not keys.requires_grad:
             keys = keys.detach().clone().requires_grad_()
@@ -212,21 +214,21 @@ def descend(
         if k == iterations:
             break
         if losses[-1] > WORSE * min(losses):
-            # Where bodies begin or cease to touch, slopes change.
+            # Where bodies begin or cease to touch, gradients change.
             keys, rate = best, 0.5 * rate
             continue
         (found,) = torch.autograd.grad(loss, keys, allow_unused=True)
         keys.grad = torch.zeros_like(keys) if found is None else free * found
         size = float(keys.grad.norm())
-        slope = size if k == 0 else slope
+        gradient = size if k == 0 else gradient
         if size == 0:
             break  # Adam does not move without a gradient.
         if math.isfinite(size):
             optimiser.step()
         else:
-            # Slopes grow without bounds where contact begins and ends many times: look beside.
+            # Gradients grow without bounds where contact begins and ends many times: look beside.
             keys = shaken(best)
-    return Learned(losses, slope, best)
+    return Learned(losses, gradient, best)
 
 
 def measured(problem: Problem, frames: Frames) -> tuple[float, bool]:
@@ -235,19 +237,19 @@ def measured(problem: Problem, frames: Frames) -> tuple[float, bool]:
     return value, value < problem.limit
 
 
-def _slack(x: float, high: float, low: float) -> Rope:
+def _slack(x: float, high: float, low: float) -> RopeSpec:
     """Return a soft rope between two hands; where it is taut, one that cannot stretch has gradients without bounds."""
     line = ((x, -0.12, high), (x, 0.0, low), (x, 0.12, high))
-    return Rope(line, 13, 0.006, density=900.0, bend=1e-4, stretch=5.0)
+    return RopeSpec(line, 13, 0.006, density=900.0, bend=1e-4, stretch=5.0)
 
 
-def _held(rope: Rope, hands: tuple[Key, ...], **others: Any) -> Description:
+def _held(rope: RopeSpec, hands: tuple[Keyframe, ...], **others: Any) -> SceneDescription:
     """Return a scene of a soft rope whose ends both hands lead the same way."""
     effects = {name: {} for name in ("gravity", "bend", "stretch_force", "rod_body", "body_contact")}
-    return Description(
+    return SceneDescription(
         ropes=(rope,),
         effects=effects | {"damping": {"rate": 1.0}},
-        holds=(Hold((0,), keys=hands), Hold((-1,), keys=hands)),
+        holds=(Attachment((0,), keys=hands), Attachment((-1,), keys=hands)),
         duration=0.4,
         dt=2e-3,
         substeps=1,
@@ -259,15 +261,15 @@ def _held(rope: Rope, hands: tuple[Key, ...], **others: Any) -> Description:
 BALL_GOAL = (0.12, 0.03)
 
 
-def push() -> Description:
+def push() -> SceneDescription:
     """A ball on the ground, and a slack rope between two hands behind it."""
-    hands = tuple(Key(t, (0.25 * t, 0.0, 0.0)) for t in (0.15, 0.3, 0.4))
+    hands = tuple(Keyframe(t, (0.25 * t, 0.0, 0.0)) for t in (0.15, 0.3, 0.4))
     return _held(
         _slack(-0.05, 0.04, 0.012),
         hands,
         bodies=(
-            Body("sphere", (0.03,), (0.0, 0.0, 0.03), density=300.0, damping=1.0, name="ball"),
-            Body("plane", motion="fixed"),
+            BodySpec("sphere", (0.03,), (0.0, 0.0, 0.03), density=300.0, damping=1.0, name="ball"),
+            BodySpec("plane", motion="fixed"),
         ),
         look=(0.35, -0.6, 0.7),
     )
@@ -286,17 +288,17 @@ def push_value(frames: Frames) -> float:
 RING_GOAL = (0.06, 0.05, 0.12)
 
 
-def hook() -> Description:
+def hook() -> SceneDescription:
     """A ring that stands on the ground, and a slack rope between two hands that is led through it."""
-    hands = tuple(Key(t, (0.0, 0.0, 0.2 * t)) for t in (0.15, 0.3, 0.4))
+    hands = tuple(Keyframe(t, (0.0, 0.0, 0.2 * t)) for t in (0.15, 0.3, 0.4))
     return _held(
         _slack(0.0, 0.055, 0.04),
         hands,
         bodies=(
-            Body(
+            BodySpec(
                 "torus", (0.035, 0.008), (0.0, 0.0, 0.043), (0.5**0.5, 0.5**0.5, 0.0, 0.0), density=400.0, damping=1.0
             ),
-            Body("plane", motion="fixed"),
+            BodySpec("plane", motion="fixed"),
         ),
         look=(0.8, -0.6, 0.35),
     )
@@ -315,23 +317,27 @@ def hook_value(frames: Frames) -> float:
 TARGET, HALF = (0.16, 0.01), 0.04
 
 
-def pour() -> Description:
+def pour() -> SceneDescription:
     """Sand on a plate between two smooth walls, above the ground; a rope marks the far end of the target."""
     across = 0.025
-    keys = tuple(Key(t, (0.0, 0.0, 0.0), (0.0, 2.0 * t, 0.0)) for t in (0.15, 0.3, 0.4))
+    keys = tuple(Keyframe(t, (0.0, 0.0, 0.0), (0.0, 2.0 * t, 0.0)) for t in (0.15, 0.3, 0.4))
     numbers = {"youngs": 5e3, "density": 1000.0}
-    heap = Matter("sand", (0.03, across / 2, 0.0125), 0.00625, "box", (0.0, across / 2, 0.131), numbers=numbers)
-    return Description(
+    heap = ParticleBlockSpec(
+        "sand", (0.03, across / 2, 0.0125), 0.00625, "box", (0.0, across / 2, 0.131), numbers=numbers
+    )
+    return SceneDescription(
         ropes=(
-            Rope(
+            RopeSpec(
                 ((TARGET[0] + HALF, 0.0, 0.004), (TARGET[0] + HALF, across, 0.004)), 3, 0.004, density=900.0, bend=1e-5
             ),
         ),
-        effects={"gravity": {}, "body_matter": {"room": 300}},
-        bodies=(Body("box", (0.05, 0.05, 0.0125), (0.0, across / 2, 0.1), motion="kinematic", keys=keys, mu_k=0.1),),
-        holds=(Hold((0, 1, 2)),),
-        matter=(heap,),
-        box=Box(
+        effects={"gravity": {}, "body_mpm_coupling": {"room": 300}},
+        bodies=(
+            BodySpec("box", (0.05, 0.05, 0.0125), (0.0, across / 2, 0.1), motion="kinematic", keys=keys, mu_k=0.1),
+        ),
+        holds=(Attachment((0, 1, 2)),),
+        material_points=(heap,),
+        box=GridSpec(
             (-0.15, 0.0, 0.0), (0.35, across, 0.225), 0.0125, ("separate",) * 2 + ("slip",) * 2 + ("separate",) * 2
         ),
         duration=0.5,
@@ -343,12 +349,12 @@ def pour() -> Description:
 
 def pour_loss(state: scene.State) -> Tensor:
     """Mean square distance of the sand from its target [m^2]."""
-    return (state.matter.pos[:, [0, 2]] - state.matter.pos.new_tensor(TARGET)).square().sum(-1).mean()
+    return (state.material_points.pos[:, [0, 2]] - state.material_points.pos.new_tensor(TARGET)).square().sum(-1).mean()
 
 
 def pour_value(frames: Frames) -> float:
     """Share of the sand that is not on its target at the end [1]."""
-    x, z = frames.matter[-1, :, 0], frames.matter[-1, :, 2]
+    x, z = frames.material_points[-1, :, 0], frames.material_points[-1, :, 2]
     return float(1 - ((abs(x - TARGET[0]) < HALF) & (z < 0.05)).mean())
 
 

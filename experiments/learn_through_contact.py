@@ -63,8 +63,8 @@ def one(name: str, args: Any, out: Path) -> dict[str, Any]:
         "loss at start": found.losses[0],
         "loss with the gradient of contact": min(found.losses),
         "loss with contact cut": min(cut.losses),
-        "size of the first gradient": found.slope,
-        "size of the first gradient with contact cut": cut.slope,
+        "size of the first gradient": found.gradient,
+        "size of the first gradient with contact cut": cut.gradient,
         "measure": problem.measure,
         "value at start": first,
         "value": value,
@@ -77,7 +77,7 @@ def one(name: str, args: Any, out: Path) -> dict[str, Any]:
     print(
         f"{name}: {problem.title}: loss {row['loss at start']:.3g} at the start, "
         f"{row['loss with the gradient of contact']:.3g} with the gradient of contact, "
-        f"{row['loss with contact cut']:.3g} with contact cut (first gradient {found.slope:.3g} and {cut.slope:.3g})\n"
+        f"{row['loss with contact cut']:.3g} with contact cut (first gradient {found.gradient:.3g} and {cut.gradient:.3g})\n"
         f"  {'solved' if row['solved'] else 'NOT SOLVED'}: {problem.measure} {first:.3g} at the start, {value:.3g} at "
         f"the end (limit {problem.limit:g}) "
         f"after {row['iterations']} iterations, {row['seconds']:.0f} s",

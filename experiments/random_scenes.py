@@ -84,7 +84,7 @@ def build(seed: int, scenes: int, step: tuple[float, int]) -> tuple[tuple[Any, A
     def uniform(low: float, high: float, *shape: int) -> Any:
         return low + (high - low) * torch.rand(scenes, *shape, generator=g, dtype=torch.float64)
 
-    solids = [scene.Solid("plane", motion="fixed", mu_s=0.5, mu_k=0.4)]
+    solids = [scene.RigidBody("plane", motion="fixed", mu_s=0.5, mu_k=0.4)]
     for k, (shape, motion) in enumerate(zip(shapes, ("free", "fixed", "kinematic"), strict=True)):
         angle = 2 * math.pi * k / 3
         at = torch.tensor([0.16 * math.cos(angle), 0.16 * math.sin(angle), 0.11], dtype=torch.float64)
@@ -96,7 +96,7 @@ def build(seed: int, scenes: int, step: tuple[float, int]) -> tuple[tuple[Any, A
         moves = {"vel": uniform(-0.5, 0.5, 3), "omega": uniform(-5, 5, 3), "density": uniform(200, 2000)}
         rub = uniform(0, 0.8)
         solids.append(
-            scene.Solid(
+            scene.RigidBody(
                 shape, size, at + uniform(-0.02, 0.02, 3), turn / turn.norm(dim=-1, keepdim=True), motion=motion,
                 mu_s=rub, mu_k=0.9 * rub, restitution=uniform(0, 0.6), name=f"{shape} {k}", **(moves if free else {}),
             )
@@ -124,7 +124,7 @@ def run(made: tuple[Any, Any, Any], state: Any, seconds: float, first: int, last
     from torchdlo.physics import tree
 
     choice, params, placed = made
-    control = scene.hold(choice, placed)
+    control = scene.stationary_control(choice, placed)
     with torch.no_grad():
         for k in range(first, last):
             # It comes to rest at three quarters of the time.
@@ -209,7 +209,7 @@ def examine(seed: int, scenes: int, seconds: float, step: tuple[float, int]) -> 
         ]
         numbers = {"speed": speed[k], "strain": strain[k], "in_bodies": body[k], "in_itself": own[k]}
         row = {"kind": seed, "scene": k, "shapes": shapes, "at_rest": resting, "faults": faults}
-        row |= {name: float(x) for name, x in numbers.items()} | {"missed": state.missed[k, 0].tolist()}
+        row |= {name: float(x) for name, x in numbers.items()} | {"missed": state.diagnostics[k, 0].tolist()}
         rows.append(row | {"cpu_s": used / scenes})
     return rows
 

@@ -32,7 +32,7 @@ from torchdlo.sysid.diagnosis.search import BUDGETS, diagnose
 from torchdlo.sysid.diagnosis.verdict import Diagnosis
 from torchdlo.sysid.model import initial_state as starts
 from torchdlo.sysid.model import model_file
-from torchdlo.sysid.model.model_file import Saved
+from torchdlo.sysid.model.model_file import ModelFile
 from torchdlo.sysid.model.rope_model import RopeModel
 from torchdlo.sysid.recordings.metrics import average, mean_absolute_error
 from torchdlo.sysid.recordings.recording import Recording, Trial, load_recording
@@ -73,7 +73,7 @@ def tilted(trial: Trial) -> Trial:
     return replace(trial, markers=trial.markers @ np.array([[1, 0, 0], [0, c, -s], [0, s, c]]).T)
 
 
-def simulated(recording: Recording, name: str, base: Saved) -> Recording:
+def simulated(recording: Recording, name: str, base: ModelFile) -> Recording:
     """Return the recording with what an effect changes in a simulation added to the free markers."""
     if name in base.effects:
         raise SystemExit(f"{base.path}: {name} is there already; expected a cable without it to plant it.")
@@ -97,7 +97,7 @@ def simulated(recording: Recording, name: str, base: Saved) -> Recording:
     return replace(recording, train=tuple(made[:first]), test=tuple(made[first:]))
 
 
-def planted(recording: Recording, name: str, base: Saved) -> Recording:
+def planted(recording: Recording, name: str, base: ModelFile) -> Recording:
     """Return the recording with an effect planted."""
     if name in SIMULATED:
         return simulated(recording, name, base)
@@ -105,7 +105,7 @@ def planted(recording: Recording, name: str, base: Saved) -> Recording:
     return replace(recording, train=tuple(map(change, recording.train)), test=tuple(map(change, recording.test)))
 
 
-def diagnosed(recording: Recording, out: Path, plant: str, base: Saved | None, choices: dict[str, Any]) -> dict:
+def diagnosed(recording: Recording, out: Path, plant: str, base: ModelFile | None, choices: dict[str, Any]) -> dict:
     """Return the row of the table, from the file if it was written before; a search that was stopped goes on."""
     kept, model = out.with_suffix(".json"), out.with_name(f"{out.name}-model.json")
     if kept.exists():
@@ -119,7 +119,7 @@ def diagnosed(recording: Recording, out: Path, plant: str, base: Saved | None, c
     return json.loads(kept.read_text())
 
 
-def row(recording: Recording, found: Diagnosis, plant: str, base: Saved | None) -> dict:
+def row(recording: Recording, found: Diagnosis, plant: str, base: ModelFile | None) -> dict:
     """Return what a diagnosis found, for the table."""
     compared = [t for t, through in zip(recording.test, found.compared, strict=True) if through]
     errors = {

@@ -23,8 +23,8 @@ def verdicts(content: dict[str, Any], goals: dict[tuple[int, str], float]) -> li
     for entry in content["first_call_s"]:
         name = f"first call, {entry['case']}, {entry['mode']}, {entry['cache']} cache [s]"
         found.append((name, entry["seconds"], FIRST[entry["cache"]], False))
-    for scenes, slope in content.get("exponent", {}).items():
-        found.append((f"exponent of cost, 100 to 3000 vertices, {scenes} scenes", slope, 1.1, False))
+    for scenes, gradient in content.get("exponent", {}).items():
+        found.append((f"exponent of cost, 100 to 3000 vertices, {scenes} scenes", gradient, 1.1, False))
     if len(content["memory"]) == 2:
         short, long = (entry["peak_mb"] for entry in content["memory"])
         found.append(("peak memory of the gradient, 20,000 over 2,000 substeps", long / short, 1.2, False))

@@ -36,7 +36,7 @@ def row(task: str, method: str, runs: list[dict[str, Any]], hybrid: list[dict[st
     known = "cmaes" if method == "hybrid" else method
     goal, solved = PUBLISHED.get(task, {}).get(known, (None, None))
     episodes = statistics.mean(r["episodes"] for r in runs)
-    returns, largest = ([r[k] for r in runs if r[k] is not None] for k in ("return", "highest"))
+    returns, largest = ([r[k] for r in runs if r[k] is not None] for k in ("return", "max_return"))
     return {
         "task": task,
         "method": method,
@@ -44,7 +44,7 @@ def row(task: str, method: str, runs: list[dict[str, Any]], hybrid: list[dict[st
         "return": statistics.mean(returns) if returns else None,
         "spread": statistics.stdev(returns) if len(returns) > 1 else None,
         "lowest": min(returns, default=None),
-        "highest": max(returns, default=None),
+        "max_return": max(returns, default=None),
         # Published returns are the largest that a search saw.
         "seen": statistics.mean(largest) if largest else None,
         "hybrid": seen(hybrid, episodes),

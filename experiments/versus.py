@@ -49,14 +49,14 @@ def tips(count: int, clamp: tuple[float, float, float]) -> tuple[np.ndarray, flo
     rope = scene.Rope(x, radius=0.005, density=1000.0, youngs=1e6)
     effects = [EFFECTS[name]() for name in ("bend", "gravity")]
     choice, params, state = scene.make(
-        [rope], effects, dt=1 / count, substeps=1, integrator="implicit", held_vertices=(0, 1)
+        [rope], effects, dt=1 / count, substeps=1, integrator="implicit", prescribed_vertices=(0, 1)
     )
     scaled = torch.ones(60, 1)
     scaled[1] = stiff
     rods = params.rods
     material = tree.replace(rods.material, bend=rods.material.bend * scaled)
     params = tree.replace(params, rods=tree.replace(rods, material=material))
-    control, found, strain = scene.hold(choice, state), [], 0.0
+    control, found, strain = scene.stationary_control(choice, state), [], 0.0
     with torch.no_grad():
         for k in range(count):
             state = scene.step(choice, params, state, control)

@@ -12,7 +12,7 @@ from tests.sysid.swaying import recording as swaying
 from tests.test_cli import run
 from torchdlo.sysid.diagnosis import search
 from torchdlo.sysid.model.rope_model import RopeModel
-from torchdlo.sysid.recordings.data_quality import Fault
+from torchdlo.sysid.recordings.data_quality import DataIssue
 from torchdlo.sysid.recordings.recording import save_recording
 
 
@@ -33,7 +33,9 @@ def test_diagnose_writes_findings_model_and_page(
         asked.update(options)
         options["journal"].mkdir(parents=True)
         model = RopeModel(recording, vertices=21, effects=("air_drag",))
-        return fake_diagnosis(recording, model=model, health=[Fault("train_1", "swap", "markers 3 and 4 are swapped")])
+        return fake_diagnosis(
+            recording, model=model, health=[DataIssue("train_1", "swap", "markers 3 and 4 are swapped")]
+        )
 
     monkeypatch.setattr(search, "diagnose", fake)
     assert run("diagnose", "rope", "--seed", 3) == 0

@@ -14,22 +14,24 @@ from torchdlo.cli import app
 from torchdlo.errors import InputError
 from torchdlo.physics import tree
 from torchdlo.scene import rollout, step
-from torchdlo.scene_files import Body, Description, Hold, Key, Rope
+from torchdlo.scene_files import Attachment, BodySpec, Keyframe, RopeSpec, SceneDescription
 from torchdlo.scene_files.assembly import _rope
 
-LIFT = Description(
+LIFT = SceneDescription(
     ropes=(
-        Rope(points=((0.0, 0.0, 0.1), (0.4, 0.0, 0.1)), vertices=9, mass=0.03, bend=1e-3, twist=1e-3),
-        Rope(points=((0.0, 0.3, 0.2), (0.1 + 0.2, 0.3, 0.2), (0.3, 0.5, 0.2)), vertices=8, mass=0.02, bend=1e-3),
+        RopeSpec(points=((0.0, 0.0, 0.1), (0.4, 0.0, 0.1)), vertices=9, mass=0.03, bend=1e-3, twist=1e-3),
+        RopeSpec(points=((0.0, 0.3, 0.2), (0.1 + 0.2, 0.3, 0.2), (0.3, 0.5, 0.2)), vertices=8, mass=0.02, bend=1e-3),
     ),
     effects={"gravity": {}, "bend": {}, "damping": {"rate": 1 / 3}, "rod_body": {}},
     bodies=(
-        Body("box", (0.5, 0.5, 0.02), pos=(0.2, 0.2, -0.02), motion="fixed"),
-        Body("sphere", (0.03,), pos=(0.2, -0.2, 0.1), motion="kinematic", keys=(Key(0.02, move=(0.0, 0.1, 0.0)),)),
+        BodySpec("box", (0.5, 0.5, 0.02), pos=(0.2, 0.2, -0.02), motion="fixed"),
+        BodySpec(
+            "sphere", (0.03,), pos=(0.2, -0.2, 0.1), motion="kinematic", keys=(Keyframe(0.02, move=(0.0, 0.1, 0.0)),)
+        ),
     ),
     holds=(
-        Hold(vertices=(0, 1), keys=(Key(0.01, move=(0.0, 0.0, 0.01)), Key(0.02, turn=(0.0, 0.1, 0.0)))),
-        Hold(vertices=(-1,), rope=1, release=0.0105),
+        Attachment(vertices=(0, 1), keys=(Keyframe(0.01, move=(0.0, 0.0, 0.01)), Keyframe(0.02, turn=(0.0, 0.1, 0.0)))),
+        Attachment(vertices=(-1,), rope=1, release=0.0105),
     ),
     duration=0.02,
     integrator="implicit",
@@ -66,17 +68,19 @@ def test_a_described_scene_runs_and_held_parts_go_where_keys_say():
 
 
 def test_a_line_is_cut_into_equal_parts():
-    corner = Rope(points=((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), (1.0, 1.0, 0.0)), vertices=5, mass=1.0)
+    corner = RopeSpec(points=((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), (1.0, 1.0, 0.0)), vertices=5, mass=1.0)
     positions = _rope(corner, torch.float64).positions
     assert positions.tolist() == [[0, 0, 0], [0.5, 0, 0], [1, 0, 0], [1, 0.5, 0], [1, 1, 0]]
-    square = Rope(points=((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), (1.0, 1.0, 0.0), (0.0, 1.0, 0.0)), vertices=8, closed=True)
+    square = RopeSpec(
+        points=((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), (1.0, 1.0, 0.0), (0.0, 1.0, 0.0)), vertices=8, closed=True
+    )
     found = _rope(square, torch.float64).positions
     assert len(found) == 8 and found[-1].tolist() == [0, 0.5, 0]
 
 
 def test_single_precision_is_used_throughout():
     made = scene_files.build(
-        Description(LIFT.ropes, {"gravity": {}, "bend": {}}, precision="float32", integrator="implicit")
+        SceneDescription(LIFT.ropes, {"gravity": {}, "bend": {}}, precision="float32", integrator="implicit")
     )
     assert {x.dtype for x in tree.leaves(made[1:])} == {torch.float32}
 
@@ -153,8 +157,10 @@ def simulate(*arguments: object) -> int:
 @pytest.fixture
 def file(tmp_path):
     path = tmp_path / "hang.json"
-    rope = Rope(points=((0.0, 0.0, 0.5), (0.4, 0.0, 0.5)), vertices=6, mass=0.03, bend=1e-3)
-    scene_files.save(Description((rope,), {"gravity": {}, "bend": {}}, holds=(Hold((0,)),), duration=0.03), path)
+    rope = RopeSpec(points=((0.0, 0.0, 0.5), (0.4, 0.0, 0.5)), vertices=6, mass=0.03, bend=1e-3)
+    scene_files.save(
+        SceneDescription((rope,), {"gravity": {}, "bend": {}}, holds=(Attachment((0,)),), duration=0.03), path
+    )
     return path
 
 

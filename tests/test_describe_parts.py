@@ -14,28 +14,38 @@ from torchdlo import scene_files
 from torchdlo.coupling.robot.kinematics import panda, tool_pose
 from torchdlo.errors import InputError
 from torchdlo.scene import rollout, step
-from torchdlo.scene_files import Body, Box, Description, Hold, Key, Matter, Robot, Rope, Weight
+from torchdlo.scene_files import (
+    Attachment,
+    BodySpec,
+    GridSpec,
+    HangingMass,
+    Keyframe,
+    ParticleBlockSpec,
+    RobotSpec,
+    RopeSpec,
+    SceneDescription,
+)
 from torchdlo.scene_files.rope_models import Modelled
 from torchdlo.scene_files.run import load_frames, run, save_frames
 
-LINE = Rope(((0.0, 0.0, 0.1), (0.3, 0.0, 0.1)), vertices=7, mass=0.03, bend=1e-3)
-FALL = Description((LINE,), {"gravity": {}, "bend": {}}, duration=0.06, substeps=2)
+LINE = RopeSpec(((0.0, 0.0, 0.1), (0.3, 0.0, 0.1)), vertices=7, mass=0.03, bend=1e-3)
+FALL = SceneDescription((LINE,), {"gravity": {}, "bend": {}}, duration=0.06, substeps=2)
 POSTURE = (0.0, 0.2, 0.0, -2.2, 0.0, 2.4, 0.785, 0.012)
 
 
-def change(description: Description, **fields) -> Description:
+def change(description: SceneDescription, **fields) -> SceneDescription:
     return dataclasses.replace(description, **fields)
 
 
 def test_bodies_touch_matter_where_the_effect_says_so():
-    ball = Matter("elastic", (0.03,), 0.01, "ball", (0.0, 0.0, 0.3), vel=(0.0, 0.0, -1.0))
+    ball = ParticleBlockSpec("elastic", (0.03,), 0.01, "ball", (0.0, 0.0, 0.3), vel=(0.0, 0.0, -1.0))
     room, plate = (
-        Box((-0.06, -0.06, 0.2), (0.06, 0.06, 0.36), 0.02),
-        Body("box", (0.1, 0.1, 0.02), (0.0, 0.0, 0.24), mass=1.0),
+        GridSpec((-0.06, -0.06, 0.2), (0.06, 0.06, 0.36), 0.02),
+        BodySpec("box", (0.1, 0.1, 0.02), (0.0, 0.0, 0.24), mass=1.0),
     )
     speed = {}
-    for effects in ({}, {"body_matter": {"sweeps": 6}}):
-        d = change(FALL, effects=effects, bodies=(plate,), matter=(ball,), box=room, duration=0.02, substeps=5)
+    for effects in ({}, {"body_mpm_coupling": {"sweeps": 6}}):
+        d = change(FALL, effects=effects, bodies=(plate,), material_points=(ball,), box=room, duration=0.02, substeps=5)
         scene, params, state, controls = scene_files.build(d)
         state, _ = rollout(lambda p, s, c, scene=scene: step(scene, p, s, c), params, state, controls)
         speed[bool(effects)] = float(state.bodies.vel[0, 2])
@@ -43,14 +53,17 @@ def test_bodies_touch_matter_where_the_effect_says_so():
 
 
 def test_all_parts_read_back_as_they_were_written(tmp_path):
-    whole = Description(
-        (change(LINE, weights=(Weight(-1, 1 / 3),)), Rope(((0.0, 0.0, 0.0), (1.0, 0.0, 0.0)), model="model.json")),
-        {"gravity": {}, "rod_matter": {"mu": 0.1}},
-        bodies=(Body("mesh", file="cube.stl", scale=0.1 + 0.2, motion="fixed", cells=12),),
-        holds=(Hold((0,), robot=0, close=0.1, release=0.7),),
-        robots=(Robot(pos=(0.4, 0.0, 0.3), joints=POSTURE, keys=(Key(1.0, move=(0.1, 0.0, 0.0)),)),),
-        matter=(Matter("sand", (0.1,), 0.02, "ball", numbers={"youngs": 1e4 / 3}),),
-        box=Box((0.0, 0.0, 0.0), (1.0, 1.0, 1.0), 0.1, ("slip",) * 6, window=(8, 8, 8)),
+    whole = SceneDescription(
+        (
+            change(LINE, weights=(HangingMass(-1, 1 / 3),)),
+            RopeSpec(((0.0, 0.0, 0.0), (1.0, 0.0, 0.0)), model="model.json"),
+        ),
+        {"gravity": {}, "rod_mpm_coupling": {"mu": 0.1}},
+        bodies=(BodySpec("mesh", file="cube.stl", scale=0.1 + 0.2, motion="fixed", cells=12),),
+        holds=(Attachment((0,), robot=0, close=0.1, release=0.7),),
+        robots=(RobotSpec(pos=(0.4, 0.0, 0.3), joints=POSTURE, keys=(Keyframe(1.0, move=(0.1, 0.0, 0.0)),)),),
+        material_points=(ParticleBlockSpec("sand", (0.1,), 0.02, "ball", numbers={"youngs": 1e4 / 3}),),
+        box=GridSpec((0.0, 0.0, 0.0), (1.0, 1.0, 1.0), 0.1, ("slip",) * 6, window=(8, 8, 8)),
     )
     scene_files.save(whole, tmp_path / "scene.json")
     assert scene_files.read(tmp_path / "scene.json") == whole
@@ -68,7 +81,7 @@ def cube(tmp_path):
 
 def test_a_mesh_stands_where_its_file_says_and_weighs_its_volume(cube, monkeypatch, tmp_path):
     monkeypatch.setenv("TORCHDLO_CACHE", str(tmp_path / "cache"))
-    body = Body("mesh", pos=(0.5, 0.0, 0.0), file="cube.stl", scale=0.01, cells=8, density=500.0)
+    body = BodySpec("mesh", pos=(0.5, 0.0, 0.0), file="cube.stl", scale=0.01, cells=8, density=500.0)
     scene_files.save(change(FALL, bodies=(body,)), cube.with_name("scene.json"))
     # Its file is found beside the scene file, not in the working folder.
     _, params, state, _ = scene_files.load(cube.with_name("scene.json"))
@@ -78,45 +91,68 @@ def test_a_mesh_stands_where_its_file_says_and_weighs_its_volume(cube, monkeypat
 
 def test_matter_fills_its_shape(tmp_path):
     parts = (
-        Matter("liquid", (0.1, 0.05, 0.02), 0.01, pos=(0.0, 0.0, 0.1), vel=(1.0, 0.0, 0.0)),
-        Matter("elastic", (0.03,), 0.01, "ball", (0.0, 0.0, 0.3), numbers={"density": 200.0}),
+        ParticleBlockSpec("liquid", (0.1, 0.05, 0.02), 0.01, pos=(0.0, 0.0, 0.1), vel=(1.0, 0.0, 0.0)),
+        ParticleBlockSpec("elastic", (0.03,), 0.01, "ball", (0.0, 0.0, 0.3), numbers={"density": 200.0}),
     )
-    box = Box((-0.2, -0.2, 0.0), (0.2, 0.2, 0.4), 0.02)
-    scene, params, state, _ = scene_files.build(change(FALL, matter=parts, box=box, substeps=5))
-    first, second = (piece for _, piece in scene.matter.pieces())
-    assert [g.law.name for g in scene.matter.groups] == ["liquid", "elastic"]
-    assert float(params.matter.volume[first].sum()) == pytest.approx(0.2 * 0.1 * 0.04, rel=1e-9)
+    box = GridSpec((-0.2, -0.2, 0.0), (0.2, 0.2, 0.4), 0.02)
+    scene, params, state, _ = scene_files.build(change(FALL, material_points=parts, box=box, substeps=5))
+    first, second = (piece for _, piece in scene.material_points.pieces())
+    assert [g.law.name for g in scene.material_points.groups] == ["liquid", "elastic"]
+    assert float(params.material_points.volume[first].sum()) == pytest.approx(0.2 * 0.1 * 0.04, rel=1e-9)
     # A lattice misses a ball's volume by its surface times a fraction of a spacing.
     ball = 4 / 3 * math.pi * 0.03**3
-    assert abs(float(params.matter.volume[second].sum()) - ball) < 0.25 * 4 * math.pi * 0.03**2 * 0.01
-    assert float(params.matter.laws["elastic_1"]["density"]) == 200.0
-    assert torch.allclose(state.matter.pos[first].mean(0), torch.tensor([0.0, 0.0, 0.1], dtype=torch.float64))
-    assert bool((state.matter.vel[first, 0] == 1).all()) and bool((state.matter.vel[second] == 0).all())
+    assert abs(float(params.material_points.volume[second].sum()) - ball) < 0.25 * 4 * math.pi * 0.03**2 * 0.01
+    assert float(params.material_points.laws["elastic_1"]["density"]) == 200.0
+    assert torch.allclose(state.material_points.pos[first].mean(0), torch.tensor([0.0, 0.0, 0.1], dtype=torch.float64))
+    assert bool((state.material_points.vel[first, 0] == 1).all()) and bool(
+        (state.material_points.vel[second] == 0).all()
+    )
 
 
-BALL = Matter("elastic", (0.03,), 0.01, "ball", (0.0, 0.0, 0.3))
-ROOM = Box((-0.2, -0.2, 0.0), (0.2, 0.2, 0.4), 0.02)
+BALL = ParticleBlockSpec("elastic", (0.03,), 0.01, "ball", (0.0, 0.0, 0.3))
+ROOM = GridSpec((-0.2, -0.2, 0.0), (0.2, 0.2, 0.4), 0.02)
 WRONG = {
-    "mesh without file": (change(FALL, bodies=(Body("mesh", motion="fixed"),)), r"bodies\[0\].file: is missing"),
-    "no such mesh": (change(FALL, bodies=(Body("mesh", motion="fixed", file="no.stl"),)), "no.stl: there is no such"),
+    "mesh without file": (change(FALL, bodies=(BodySpec("mesh", motion="fixed"),)), r"bodies\[0\].file: is missing"),
+    "no such mesh": (
+        change(FALL, bodies=(BodySpec("mesh", motion="fixed", file="no.stl"),)),
+        "no.stl: there is no such",
+    ),
     "file of a sphere": (
-        change(FALL, bodies=(Body("sphere", (0.1,), file="a.stl"),)),
+        change(FALL, bodies=(BodySpec("sphere", (0.1,), file="a.stl"),)),
         r"bodies\[0\].file: only a mesh",
     ),
-    "no box": (change(FALL, matter=(BALL,)), "box: is missing"),
+    "no box": (change(FALL, material_points=(BALL,)), "box: is missing"),
     "empty box": (change(FALL, box=ROOM), "box: there is no matter in it"),
-    "outside": (change(FALL, matter=(change(BALL, pos=(9.0, 0.0, 0.0)),), box=ROOM), "expected all inside the box"),
+    "outside": (
+        change(FALL, material_points=(change(BALL, pos=(9.0, 0.0, 0.0)),), box=ROOM),
+        "expected all inside the box",
+    ),
     "law's number": (
-        change(FALL, matter=(change(BALL, numbers={"yongs": 1.0}),), box=ROOM),
+        change(FALL, material_points=(change(BALL, numbers={"yongs": 1.0}),), box=ROOM),
         r"matter\[0\].numbers.yongs: .* did you mean 'youngs'",
     ),
-    "size": (change(FALL, matter=(change(BALL, size=(1.0, 2.0)),), box=ROOM), r"size: expected 1 numbers above 0"),
-    "spacing": (change(FALL, matter=(change(BALL, spacing=0.0),), box=ROOM), r"matter\[0\].spacing: expected more"),
-    "weight's place": (change(FALL, ropes=(change(LINE, weights=(Weight(7, 1.0),)),)), r"vertex: expected -7 to 6"),
-    "weight": (change(FALL, ropes=(change(LINE, weights=(Weight(0, 0.0),)),)), r"weights\[0\].mass: expected more"),
-    "no robot": (change(FALL, holds=(Hold((0,), robot=0),)), r"holds\[0\].robot: there is no robot"),
-    "late": (change(FALL, holds=(Hold((0,), close=0.01),)), r"holds\[0\].close: .* use torchdlo.scene_files.assemble"),
-    "early": (change(FALL, holds=(Hold((0,), close=-1.0),)), r"close: expected a time from 0 on"),
+    "size": (
+        change(FALL, material_points=(change(BALL, size=(1.0, 2.0)),), box=ROOM),
+        r"size: expected 1 numbers above 0",
+    ),
+    "spacing": (
+        change(FALL, material_points=(change(BALL, spacing=0.0),), box=ROOM),
+        r"matter\[0\].spacing: expected more",
+    ),
+    "weight's place": (
+        change(FALL, ropes=(change(LINE, weights=(HangingMass(7, 1.0),)),)),
+        r"vertex: expected -7 to 6",
+    ),
+    "weight": (
+        change(FALL, ropes=(change(LINE, weights=(HangingMass(0, 0.0),)),)),
+        r"weights\[0\].mass: expected more",
+    ),
+    "no robot": (change(FALL, holds=(Attachment((0,), robot=0),)), r"holds\[0\].robot: there is no robot"),
+    "late": (
+        change(FALL, holds=(Attachment((0,), close=0.01),)),
+        r"holds\[0\].close: .* use torchdlo.scene_files.assemble",
+    ),
+    "early": (change(FALL, holds=(Attachment((0,), close=-1.0),)), r"close: expected a time from 0 on"),
 }
 
 
@@ -131,8 +167,10 @@ def test_wrong_parts_are_refused_with_place_and_expectation(case, tmp_path):
 
 def test_a_weight_hangs_with_its_weight():
     # The hold bears rope and weight. After many times 1 / rate the swing is gone: exp(-0.5 20 1) of it is left.
-    rope = Rope(((0.0, 0.0, 0.2), (0.0, 0.0, 0.1)), vertices=5, mass=0.01, bend=1e-5, weights=(Weight(-1, 0.05),))
-    still = Description((rope,), {"gravity": {}, "damping": {"rate": 20.0}, "bend": {}}, holds=(Hold((0,)),))
+    rope = RopeSpec(
+        ((0.0, 0.0, 0.2), (0.0, 0.0, 0.1)), vertices=5, mass=0.01, bend=1e-5, weights=(HangingMass(-1, 0.05),)
+    )
+    still = SceneDescription((rope,), {"gravity": {}, "damping": {"rate": 20.0}, "bend": {}}, holds=(Attachment((0,)),))
     frames = run(change(still, duration=0.2))
     assert frames.force[-1, 0, 2] == pytest.approx(0.06 * 9.81, rel=1e-6)
     assert frames.weight.tolist() == [0, 0, 0, 0, 0.05]
@@ -141,7 +179,10 @@ def test_a_weight_hangs_with_its_weight():
 def test_a_hold_that_closes_later_keeps_what_it_grips_then():
     free = run(FALL, every=1)
     held = run(
-        change(FALL, holds=(Hold((0,), close=0.03, keys=(Key(0.06, move=(0.0, 0.0, 0.06)),), path="linear"),)), every=1
+        change(
+            FALL, holds=(Attachment((0,), close=0.03, keys=(Keyframe(0.06, move=(0.0, 0.0, 0.06)),), path="linear"),)
+        ),
+        every=1,
     )
     # Open hands change nothing.
     assert np.array_equal(free.pos[:31], held.pos[:31])
@@ -155,13 +196,15 @@ def test_a_hold_that_closes_later_keeps_what_it_grips_then():
 @pytest.fixture
 def arm():
     pytest.importorskip("pytorch_kinematics", reason="robots need the extra robots")
-    return Robot(base=(-0.5, 0.0, 0.0), joints=POSTURE, pos=(0.0, 0.0, 0.2), keys=(Key(0.4, move=(0.0, 0.05, 0.05)),))
+    return RobotSpec(
+        base=(-0.5, 0.0, 0.0), joints=POSTURE, pos=(0.0, 0.0, 0.2), keys=(Keyframe(0.4, move=(0.0, 0.05, 0.05)),)
+    )
 
 
 def test_a_robot_brings_what_it_holds_along_its_keys(arm):
     line = change(LINE, points=((0.0, 0.0, 0.2), (0.0, 0.3, 0.2)))
-    lift = Description(
-        (line,), {"bend": {}, "gravity": {}}, holds=(Hold((0, 1), robot=0),), robots=(arm,), duration=0.4, dt=4e-3
+    lift = SceneDescription(
+        (line,), {"bend": {}, "gravity": {}}, holds=(Attachment((0, 1), robot=0),), robots=(arm,), duration=0.4, dt=4e-3
     )
     scene, _, state, controls = scene_files.build(lift)
     # Inverse kinematics counts as there within 0.1 mm.
@@ -177,9 +220,9 @@ def test_a_robot_brings_what_it_holds_along_its_keys(arm):
 
 
 ARMS = {
-    "far": ({"keys": (Key(0.4, move=(0.0, 0.0, 2.0)),)}, r"robots\[0\].keys: the tool cannot get there"),
+    "far": ({"keys": (Keyframe(0.4, move=(0.0, 0.0, 2.0)),)}, r"robots\[0\].keys: the tool cannot get there"),
     "start": ({"pos": (3.0, 0.0, 0.0)}, r"robots\[0\].pos: the tool cannot get there"),
-    "fast": ({"keys": (Key(0.02, move=(0.0, 0.1, 0.0)),)}, r"would have to move at .* it can at most"),
+    "fast": ({"keys": (Keyframe(0.02, move=(0.0, 0.1, 0.0)),)}, r"would have to move at .* it can at most"),
     "joints": ({"joints": (0.0,)}, r"robots\[0\].joints: expected 8 numbers"),
     "file": ({"urdf": "no.urdf"}, "no.urdf: expected a URDF file, found none"),
 }
@@ -201,7 +244,7 @@ def test_two_robots_of_a_kind_have_names_of_their_own(arm):
 
 def test_a_recorded_run_is_the_run_of_single_steps():
     described = change(
-        FALL, holds=(Hold((0,)),), bodies=(Body("sphere", (0.05,), pos=(0.15, 0.0, 0.04), motion="fixed"),)
+        FALL, holds=(Attachment((0,)),), bodies=(BodySpec("sphere", (0.05,), pos=(0.15, 0.0, 0.04), motion="fixed"),)
     )
     described = change(described, effects={**FALL.effects, "rod_body": {}})
     frames = run(described, every=1)
@@ -237,8 +280,10 @@ def modelled(folder):
 
 def test_a_model_file_is_a_rope_of_a_scene(modelled):
     folder = modelled()
-    rope = Rope(((0.0, 0.0, 0.5), (0.5, 0.0, 0.5), (0.5, 0.5, 0.5)), model="model.json")
-    said = Description((rope,), {"damping": {"rate": 9.0}}, holds=(Hold((0,)),), duration=0.02, integrator="implicit")
+    rope = RopeSpec(((0.0, 0.0, 0.5), (0.5, 0.0, 0.5), (0.5, 0.5, 0.5)), model="model.json")
+    said = SceneDescription(
+        (rope,), {"damping": {"rate": 9.0}}, holds=(Attachment((0,)),), duration=0.02, integrator="implicit"
+    )
     scene, params, _, _ = scene_files.build(said, folder=folder)
     assert float(params.rods.material.bend.max()) == 2e-3
     assert float(params.rods.material.mass.sum()) == pytest.approx(0.05, rel=1e-12)
@@ -262,7 +307,7 @@ def test_a_model_file_is_a_rope_of_a_scene(modelled):
 def test_a_natural_shape_of_a_model_is_that_of_the_rope(modelled):
     folder = modelled("given", ())
     made = scene_files.build(
-        Description((Rope(((0.0, 0.0, 0.0), (1.0, 0.0, 0.0)), model="model.json"),), {}), folder=folder
+        SceneDescription((RopeSpec(((0.0, 0.0, 0.0), (1.0, 0.0, 0.0)), model="model.json"),), {}), folder=folder
     )
     assert [type(e).__name__ for e in made[0].effects] == ["Gravity", "BendFrame", "Twist", "Damping"]
     # Points of a circle of 0.5 m: a curvature of 2 1/m times the share, turned by the roll from the second director.

@@ -71,12 +71,12 @@ def test_a_rotation_is_its_logarithms_exponential() -> None:
 def test_a_heavy_cantilever_bends_as_the_elastica() -> None:
     load = DENSITY * GRAVITY
 
-    def slope(s, y):  # y = angle below the horizontal, its rate; B angle'' = -load (L - s) cos(angle)
+    def gradient(s, y):  # y = angle below the horizontal, its rate; B angle'' = -load (L - s) cos(angle)
         return np.array([y[1], -load * (BEAM.length - s) / soft.bending * np.cos(y[0])])
 
     soft = replace(BEAM, bending=2e-3)
     s = np.linspace(0, soft.length, 400)
-    found = solve_bvp(slope, lambda a, b: np.array([a[0], b[1]]), s, np.zeros((2, 400)) + 0.5, tol=1e-8)
+    found = solve_bvp(gradient, lambda a, b: np.array([a[0], b[1]]), s, np.zeros((2, 400)) + 0.5, tol=1e-8)
     angle = found.sol(s)[0]
     tip = np.array([np.trapezoid(np.cos(angle), s), -np.trapezoid(np.sin(angle), s)])
     assert abs(tip[1]) > 0.3 * soft.length  # far from small deflections
@@ -175,12 +175,12 @@ def test_friction_and_flow_follow_their_laws() -> None:
     kappa, past, steps = np.zeros((3, 1, 1)), {}, 2000
     for k in range(steps + 1):
         kappa[1] = 4.0 * k / steps
-        past = laws.remember(friction, kappa.copy(), past, 1e-3)
+        past = laws.update_memory(friction, kappa.copy(), past, 1e-3)
     # z = 1 - exp(-kappa / kappa_c), to the first order of the step.
     assert past["dahl"][0, 0, 0] == pytest.approx(1 - np.exp(-2.0), abs=2.0 / steps)
     past = {}
     for _ in range(200):
-        past = laws.remember(flow, kappa, past, 1e-3)
+        past = laws.update_memory(flow, kappa, past, 1e-3)
     assert past["plastic"][0, 0, 0] == pytest.approx(3.0 * (1 - np.exp(-1.0)), rel=1e-9)
 
 

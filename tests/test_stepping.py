@@ -16,8 +16,8 @@ def hanging(scenes: int, held: tuple[int, ...] = (0, 1), **choices):
     """A rope of five vertices held at one end, with controls that move it."""
     x = torch.zeros(scenes, 5, 3, dtype=torch.float64)
     x[..., 0] = torch.linspace(0, 1, 5, dtype=torch.float64)
-    made = scene.make([scene.Rope(x, mass=0.1, bend=1e-3)], [Gravity(), Bend()], held_vertices=held, **choices)
-    start = scene.hold(made[0], made[2])
+    made = scene.make([scene.Rope(x, mass=0.1, bend=1e-3)], [Gravity(), Bend()], prescribed_vertices=held, **choices)
+    start = scene.stationary_control(made[0], made[2])
     shift = 1e-3 * torch.arange(1, 5, dtype=torch.float64).reshape(4, 1, 1, 1)
     return *made, tree.replace(tree.map(lambda c: c.expand(4, *c.shape).clone(), start), pos=start.pos + shift)
 
@@ -108,10 +108,12 @@ def test_a_rollout_with_bodies_and_gradients_compiles_one_graph_and_the_survey(g
     # Bodies have no gradient at first, and one as soon as a rope has touched them.
     x = torch.zeros(1, 5, 3, dtype=torch.float64)
     x[..., 0] = torch.linspace(0, 0.1, 5, dtype=torch.float64)
-    ball = scene.Solid("sphere", 0.02, (0.05, 0, -0.0245), density=500.0)
+    ball = scene.RigidBody("sphere", 0.02, (0.05, 0, -0.0245), density=500.0)
     rope = scene.Rope(x, mass=0.01, bend=1e-5, radius=0.005)
-    made, params, state = scene.make([rope], [Gravity(), RodBody()], held_vertices=(0,), substeps=2, bodies=[ball])
-    control = scene.hold(made, state)
+    made, params, state = scene.make(
+        [rope], [Gravity(), RodBody()], prescribed_vertices=(0,), substeps=2, bodies=[ball]
+    )
+    control = scene.stationary_control(made, state)
     vel = state.rods.vel.clone().requires_grad_()
     state = tree.replace(state, rods=tree.replace(state.rods, vel=vel))
     step = scene.stepper(made)

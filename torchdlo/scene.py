@@ -15,14 +15,14 @@ import torch
 from torch import Tensor
 
 from torchdlo.coupling.bodies import dynamics as rigid
-from torchdlo.coupling.bodies.dynamics import Body, BodyParams, BodyState, BodyTargets, Solid, place
+from torchdlo.coupling.bodies.dynamics import Body, BodyParams, BodyState, BodyTargets, RigidBody, place
 from torchdlo.coupling.common import step_diagnostics
-from torchdlo.coupling.common.step_diagnostics import survey
+from torchdlo.coupling.common.step_diagnostics import broad_phase
 from torchdlo.coupling.mpm import body_coupling_effect, rod_coupling_effect
 from torchdlo.coupling.mpm import substep as mpm
-from torchdlo.coupling.mpm.particles import Matter, Medium, Particles, laid_out
+from torchdlo.coupling.mpm.particles import MpmDomain, ParticleParams, Particles, laid_out
 from torchdlo.physics import tree
-from torchdlo.physics.effects.base import Effect, altered, default_values, numbers_of
+from torchdlo.physics.effects.base import Effect, altered, default_values, parameters_of
 from torchdlo.physics.execution import tracing
 from torchdlo.physics.execution.replay import alike, rollout
 from torchdlo.physics.integrators import stability
@@ -44,7 +44,7 @@ class Params:
     """Numbers of each effect by its name and theirs, shape (..., 1, C)."""
     bodies: BodyParams | tuple[()] = ()
     """Numbers of the rigid bodies, () if there are none."""
-    matter: Matter | tuple[()] = ()
+    material_points: ParticleParams | tuple[()] = ()
     """Numbers of the matter, () if there is none."""
 
 
@@ -55,14 +55,14 @@ class State:
     rods: RodState
     time: Tensor
     """Time since the start [s], shape (..., 1, 1)."""
-    missed: Tensor
+    diagnostics: Tensor
     """What steps missed since the start, zeros if all is well: contacts without room [1], by how much vertices were
     faster than foreseen [m], and by what share an edge was too short [1], shape (..., 1, 3)."""
     reaction: Reaction
     """What holds exerted on the ropes in the last step, its mean."""
     bodies: BodyState | tuple[()] = ()
     """Poses and velocities of the rigid bodies, () if there are none."""
-    matter: Particles | tuple[()] = ()
+    material_points: Particles | tuple[()] = ()
     """Particles of the matter, () if there is none."""
 
 
@@ -74,7 +74,7 @@ class Control:
     """Positions of the held vertices [m], shape (..., H, 3)."""
     director: Tensor
     """First material directors of the held edges [1], shape (..., G, 3)."""
-    grip: dict[str, Tensor] = field(default_factory=dict)
+    attachment_weight: dict[str, Tensor] = field(default_factory=dict)
     """How firmly the held "vertices" (..., H, 1) and "edges" (..., G, 1) are held during the step: 0 is let go, 1 is
     firm, between them the hold gives as if its parts were that much heavier; 1 for what is not said."""
     bodies: BodyTargets | tuple[()] = ()
@@ -97,19 +97,19 @@ class Scene:
     """"none", "dynamic" or "quasistatic"."""
     constrained: bool = True
     """Whether edge lengths are solved for; False leaves them to a `Stretch` effect."""
-    held_vertices: tuple[int, ...] = ()
-    held_edges: tuple[int, ...] = ()
-    newton: int = 3
+    prescribed_vertices: tuple[int, ...] = ()
+    prescribed_edges: tuple[int, ...] = ()
+    constraint_iterations: int = 3
     """Newton steps for edge lengths per substep."""
-    settling: int = 4
+    twist_iterations: int = 4
     """Newton steps for quasistatic twist per substep, where bending has a part in it; without, one is exact."""
-    gamma: float = 0.3
+    implicit_weight: float = 0.3
     """Share of dt^2 times stiffness that counts as inertia in implicit steps; at least 0.5 where twist is dynamic."""
-    ahead: float = 0.0
+    numerical_damping: float = 0.0
     """Share of a substep by which implicit steps look ahead: it damps fast modes and makes the step first order."""
     bodies: tuple[Body, ...] = ()
     """Rigid bodies."""
-    matter: Medium | None = None
+    material_points: MpmDomain | None = None
     """Elastic, plastic, liquid or granular matter."""
 
     def __post_init__(self) -> None:
@@ -121,20 +121,23 @@ class Scene:
         need(self.twist in TWISTS, f"twist is {self.twist!r}; expected one of {TWISTS}")
         need(isinstance(self.dt, int | float) and 0 < self.dt < math.inf, f"dt is {self.dt!r}; give seconds above 0")
         need(self.substeps in range(1, 10**6), f"substeps is {self.substeps!r}; expected a whole number from 1 up")
-        need(self.newton >= 1, f"newton is {self.newton}; expected at least 1 step")
-        need(self.settling >= 1, f"settling is {self.settling}; expected at least 1 step")
-        need(self.gamma >= 0.25, f"gamma is {self.gamma}; below 0.25 implicit steps are not stable")
-        need(0 <= self.ahead <= 1, f"ahead is {self.ahead}; expected a share of a substep, 0 to 1")
+        need(self.constraint_iterations >= 1, f"newton is {self.constraint_iterations}; expected at least 1 step")
+        need(self.twist_iterations >= 1, f"settling is {self.twist_iterations}; expected at least 1 step")
+        need(self.implicit_weight >= 0.25, f"gamma is {self.implicit_weight}; below 0.25 implicit steps are not stable")
+        need(
+            0 <= self.numerical_damping <= 1,
+            f"ahead is {self.numerical_damping}; expected a share of a substep, 0 to 1",
+        )
         size = self.topology.size
-        for name in ("held_vertices", "held_edges"):
+        for name in ("prescribed_vertices", "prescribed_edges"):
             slots = tuple(map(int, getattr(self, name)))  # lists are welcome, but a scene is hashable
             object.__setattr__(self, name, slots)
             wrong = [s for s in slots if not 0 <= s < size]
             need(not wrong, f"{name} names {wrong}; the scene has slots 0 to {size - 1}")
             need(len(set(slots)) == len(slots), f"{name} {list(slots)} names a slot twice")
-        seams = [s for s in self.held_edges if not self.topology.edge_mask()[s]]
+        seams = [s for s in self.prescribed_edges if not self.topology.edge_mask()[s]]
         need(not seams, f"held_edges names {seams}, the gap between the ends of an open rope")
-        free = not self.held_edges or self.twist != "none"
+        free = not self.prescribed_edges or self.twist != "none"
         need(free, "held_edges prescribe twist, but twist is 'none'; choose 'quasistatic' or 'dynamic'")
         names = [e.name for e in self.effects]
         twice = {n for n in names if names.count(n) > 1}
@@ -142,7 +145,7 @@ class Scene:
         solved = self.integrator == "explicit" or self.constrained
         need(solved, "implicit steps solve for edge lengths; keep constrained=True and give ropes a stretch stiffness")
         need(
-            bool(self.bodies) or not {"rod_body", "finger_pads", "body_matter"} & set(names),
+            bool(self.bodies) or not {"rod_body", "finger_pads", "body_mpm_coupling"} & set(names),
             "RodBody, BodyMatter or FingerPads needs bodies, but there are no bodies; give make(..., bodies=[Solid()])",
         )
         for effect in self.effects:
@@ -157,7 +160,7 @@ class Scene:
     @property
     def held(self) -> tuple[int, int]:
         """How many vertices and edges are held."""
-        return len(self.held_vertices), len(self.held_edges)
+        return len(self.prescribed_vertices), len(self.prescribed_edges)
 
     @property
     def settings(self) -> Settings:
@@ -169,13 +172,13 @@ class Scene:
             self.integrator,
             self.twist,
             self.constrained,
-            self.held_vertices,
-            self.held_edges,
-            self.newton,
-            self.settling,
+            self.prescribed_vertices,
+            self.prescribed_edges,
+            self.constraint_iterations,
+            self.twist_iterations,
             # Twist and bending answer to each other only in the next step: that costs stability.
-            max(self.gamma, 0.5) if self.twist == "dynamic" else self.gamma,
-            self.ahead,
+            max(self.implicit_weight, 0.5) if self.twist == "dynamic" else self.implicit_weight,
+            self.numerical_damping,
         )
 
 
@@ -184,8 +187,8 @@ def make(
     effects: Sequence[Effect],
     values: dict[str, dict[str, float | Sequence[float] | Tensor]] | None = None,
     *,
-    bodies: Sequence[Solid] = (),
-    matter: tuple[Medium, Matter, Particles] | tuple[()] = (),
+    bodies: Sequence[RigidBody] = (),
+    material_points: tuple[MpmDomain, ParticleParams, Particles] | tuple[()] = (),
     check: bool = True,
     **choices,
 ) -> tuple[Scene, Params, State]:
@@ -196,7 +199,7 @@ def make(
         effects: what acts on them.
         values: numbers of effects that differ from their defaults, e.g. {"damping": {"rate": 0.6}}.
         bodies: rigid bodies; `RodBody` among the effects makes ropes touch them.
-        matter: what `coupling.mpm.particles.assemble` returned; `RodMatter` and `BodyMatter` let ropes and
+        matter: what `coupling.mpm.particles.assemble` returned; `RodMpmCoupling` and `BodyMpmCoupling` let ropes and
             bodies touch it.
         check: whether to refuse what could not be stepped: laws that do not fit the ropes, ropes far from their length,
             unstable substeps. Scenes whose loads are only evaluated may be anything.
@@ -208,12 +211,12 @@ def make(
     if bodies:
         batch = torch.broadcast_shapes(state.pos.shape[:-2], placed.pos.shape[:-2])
         state, placed = tree.map(lambda x: tree.batch_innermost(x.expand(*batch, *x.shape[-2:])), (state, placed))
-    medium, stuff, particles = matter or (None, (), ())
-    if matter:
+    medium, stuff, particles = material_points or (None, (), ())
+    if material_points:
         state, placed, particles = rod_coupling_effect.together(state, placed, particles)
     effects = rod_coupling_effect.fitted(effects, medium, rods)
-    scene = Scene(topology, effects, bodies=kinds, matter=medium, **choices)
-    numbers = numbers_of(effects, values or {}, state.pos)
+    scene = Scene(topology, effects, bodies=kinds, material_points=medium, **choices)
+    numbers = parameters_of(effects, values or {}, state.pos)
     blank = {e.name: state.pos.new_zeros(*state.pos.shape[:-1], e.memory) for e in effects if e.memory}
     state = tree.replace(state, memory=tree.map(tree.batch_innermost, blank))
     params = Params(rods, numbers, solid, stuff)
@@ -223,7 +226,7 @@ def make(
     zero = state.pos.new_zeros(*state.pos.shape[:-2], 1, 3)
     first = State(state, zero[..., :1], zero, unfelt(state.pos, *scene.held), placed, particles)
     if scene.twist == "quasistatic":
-        held = hold(scene, first)
+        held = stationary_control(scene, first)
         changed = altered(scene.effects, topology, rods, numbers)
         settled, _ = settle_twist(scene.settings, changed, numbers, state, Targets(held.pos, held.director), 30)
         first = tree.replace(first, rods=tree.replace(settled, twist_rate=torch.zeros_like(settled.twist)))
@@ -239,8 +242,8 @@ def limits(scene: Scene, params: Params) -> dict[str, float]:
 def check_step(scene: Scene, params: Params) -> None:
     """Raise a `ValueError` that names the limiting term if the substep is not stable."""
     dt = scene.dt / scene.substeps
-    if scene.matter:
-        mpm.check_step(scene.matter, params.matter, dt)
+    if scene.material_points:
+        mpm.check_step(scene.material_points, params.material_points, dt)
     for term, bound in limits(scene, params).items():
         if not dt < bound:
             need = math.ceil(scene.dt / bound * 1.05)
@@ -250,11 +253,11 @@ def check_step(scene: Scene, params: Params) -> None:
             )
 
 
-def hold(scene: Scene, state: State) -> Control:
+def stationary_control(scene: Scene, state: State) -> Control:
     """Return the control that keeps held parts and kinematic bodies where they are, with a firm grip."""
-    pos = tree.take_vertices(state.rods.pos, scene.held_vertices)
-    director = rod.directors(scene.topology, state.rods, scene.held_edges)
-    return Control(pos, director, bodies=rigid.hold(scene.bodies, state.bodies) if scene.bodies else ())
+    pos = tree.take_vertices(state.rods.pos, scene.prescribed_vertices)
+    director = rod.directors(scene.topology, state.rods, scene.prescribed_edges)
+    return Control(pos, director, bodies=rigid.stationary_control(scene.bodies, state.bodies) if scene.bodies else ())
 
 
 def advance(scene: Scene, params: Params, state: State, start: Control, control: Control, share: Tensor) -> State:
@@ -271,28 +274,36 @@ def advance(scene: Scene, params: Params, state: State, start: Control, control:
     settings = scene.settings
     targets = between(start, control, share if scene.substeps > 1 else None)
     first = (state.time == 0).to(state.time.dtype)
-    foresee = poses = matter = None
+    predict_free_motion = poses = material_points = None
     if scene.bodies:
         poses = rigid.between(start.bodies, control.bodies, share)
-        foresee = partial(rigid.foresee, scene.bodies, params.bodies, state.bodies, poses, first=first, dt=settings.dt)
-    if scene.matter:
-        matter = rod_coupling_effect.foresee(scene.matter, params.matter, state.matter, first, settings.dt)
+        predict_free_motion = partial(
+            rigid.predict_free_motion, scene.bodies, params.bodies, state.bodies, poses, first=first, dt=settings.dt
+        )
+    if scene.material_points:
+        material_points = rod_coupling_effect.predict_free_motion(
+            scene.material_points, params.material_points, state.material_points, first, settings.dt
+        )
     rods, reaction, (body, pool, push) = substep(
-        settings, params.rods, params.effects, state.rods, targets, first, foresee, matter
+        settings, params.rods, params.effects, state.rods, targets, first, predict_free_motion, material_points
     )
     # Over the substeps of this step; a sum set to zero outside would have no gradient at first.
     later = share * scene.substeps > 1.5
     mean = tree.map(lambda old, now: torch.where(later, old, 0.0) + now / scene.substeps, state.reaction, reaction)
-    missed = step_diagnostics.missed(scene, params, rods, state.missed)
-    push = body_coupling_effect.meet(scene.effects, body, pool, push)
+    missed = step_diagnostics.missed(scene, params, rods, state.diagnostics)
+    push = body_coupling_effect.couple_bodies_to_particles(scene.effects, body, pool, push)
     moved, particles = rigid.advance(body, poses, push) if scene.bodies else (), ()
-    if scene.matter:
-        particles, missed = rod_coupling_effect.finish(scene.matter, params.matter, pool, push, settings.dt, missed)
+    if scene.material_points:
+        particles, missed = rod_coupling_effect.finish(
+            scene.material_points, params.material_points, pool, push, settings.dt, missed
+        )
     after = State(rods, state.time + settings.dt, missed, mean, moved, particles)
     return laid_out(after) if torch.compiler.is_compiling() else after
 
 
-def step(scene: Scene, params: Params, state: State, control: Control, *, advance=advance, survey=survey) -> State:
+def step(
+    scene: Scene, params: Params, state: State, control: Control, *, advance=advance, broad_phase=broad_phase
+) -> State:
     """Advance a scene by `scene.dt`; held parts move evenly to where `control` wants them.
 
     Args:
@@ -304,7 +315,7 @@ def step(scene: Scene, params: Params, state: State, control: Control, *, advanc
         survey: what looks up once per step what effects need to know; likewise.
     """
     _check_control(scene, control)
-    return _step(scene, params, state, control, advance, survey)
+    return _step(scene, params, state, control, advance, broad_phase)
 
 
 def _check_control(scene: Scene, control: Control) -> None:
@@ -312,14 +323,14 @@ def _check_control(scene: Scene, control: Control) -> None:
     if (given[0][-2], given[1][-2]) != (h, g):
         raise ValueError(f"control: pos and director are {given}; expected (..., {h}, 3) and (..., {g}, 3)")
     rigid.check_targets(scene.bodies, control.bodies)
-    check_grip(control.grip, scene.held)
+    check_grip(control.attachment_weight, scene.held)
 
 
-def _step(scene: Scene, params: Params, state: State, control: Control, advance, survey) -> State:
-    start = hold(scene, state)
+def _step(scene: Scene, params: Params, state: State, control: Control, advance, broad_phase) -> State:
+    start = stationary_control(scene, state)
     state = tree.replace(state, reaction=state.reaction.sized(state.rods.pos, *scene.held))
-    if any(e.reacts for e in scene.effects):
-        params = survey(scene, params, state, start, control)
+    if any(e.is_contact for e in scene.effects):
+        params = broad_phase(scene, params, state, start, control)
     shares = torch.arange(1, scene.substeps + 1, dtype=start.pos.dtype, device=start.pos.device) / scene.substeps
     for share in shares.split(1):
         state = advance(scene, params, state, start, control, share)
@@ -337,21 +348,21 @@ def stepper(scene: Scene, *, compiled: bool = True, recorded: bool = False):
     if not compiled:
         return tracing.Recorded(partial(step, scene)) if recorded else partial(step, scene)
     compile = partial(torch.compile, fullgraph=True, dynamic=False, isolate_recompiles=True)
-    once = scene.substeps == 1 and not any(e.reacts for e in scene.effects)
+    once = scene.substeps == 1 and not any(e.is_contact for e in scene.effects)
 
     def made(inline: bool):
         # Neighbours are best read where they are used, but with gradients and of much matter copies pay.
-        part = partial(compile, options={"force_pointwise_cat": inline and scene.matter is None})
+        part = partial(compile, options={"force_pointwise_cat": inline and scene.material_points is None})
         return (part(_step), advance) if once else (_step, part(advance))
 
     ways = {True: made(False), False: made(True)}
-    look, trusting = compile(survey), tracing.Trusting(_prepared)
+    look, trusting = compile(broad_phase), tracing.Trusting(_prepared)
 
     def run(params: Params, state: State, control: Control) -> State:
         _check_control(scene, control)
-        graded = torch.is_grad_enabled()
-        whole, part = ways[graded]
-        with trusting((params, state, control), graded, *control.grip) as inputs:
+        with_gradient = torch.is_grad_enabled()
+        whole, part = ways[with_gradient]
+        with trusting((params, state, control), with_gradient, *control.attachment_weight) as inputs:
             return whole(scene, *inputs, part, look)
 
     return run
@@ -363,47 +374,47 @@ def _prepared(inputs: tuple[Params, State, Control]) -> tuple[Params, State, Con
     # Compilers tell numbers that need a gradient from others, also where none is taken: replays run both ways.
     if not torch.is_grad_enabled():
         return tree.detach((params, state, control))
-    moving = alike((state.rods, state.reaction, state.bodies, state.matter), (params, control))
-    names = ("rods", "reaction", "bodies", "matter")
-    fields = dict(zip(names, moving, strict=True)) | tree.detach({"time": state.time, "missed": state.missed})
+    moving = alike((state.rods, state.reaction, state.bodies, state.material_points), (params, control))
+    names = ("rods", "reaction", "bodies", "material_points")
+    fields = dict(zip(names, moving, strict=True)) | tree.detach({"time": state.time, "missed": state.diagnostics})
     return params, tree.replace(state, **fields), control
 
 
 def finite(state: State) -> Tensor:
     """Return which scenes are made of numbers only, bool, shape (...)."""
-    moving = (state.rods.pos, state.rods.vel, *tree.leaves((state.bodies, state.matter)))
+    moving = (state.rods.pos, state.rods.vel, *tree.leaves((state.bodies, state.material_points)))
     return reduce(torch.logical_and, (torch.isfinite(x).all(-1).all(-1) for x in moving))
 
 
 def ok(state: State) -> Tensor:
     """Return which scenes are finite and missed nothing, bool, shape (...)."""
-    return finite(state) & (state.missed == 0).all(-1).all(-1)
+    return finite(state) & (state.diagnostics == 0).all(-1).all(-1)
 
 
 def check_state(state: State) -> None:
     """Raise a `RuntimeError` that says what went wrong, if something did."""
     if not bool(ok(state).all()):
         raise RuntimeError(
-            f"scene: {step_diagnostics.explain(state.missed) or 'positions or velocities are not finite'}"
+            f"scene: {step_diagnostics.explain(state.diagnostics) or 'positions or velocities are not finite'}"
         )
 
 
 __all__ = [
     "Control",
     "Params",
+    "RigidBody",
     "Rope",
     "Scene",
-    "Solid",
     "State",
     "check_state",
     "check_step",
     "default_values",
     "finite",
-    "hold",
     "limits",
     "make",
     "ok",
     "rollout",
+    "stationary_control",
     "step",
     "stepper",
 ]

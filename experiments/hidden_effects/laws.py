@@ -158,8 +158,8 @@ def stiffness(given: Laws, rope: Rope, mesh: Mesh, time: float) -> Array:
     at = 0.5 * (mesh.arclength[:-1] + mesh.arclength[1:]) / rope.length
     scale = rope.bending * given.get("baseline.bending")
     if given.on("nonuniform_stiffness"):
-        p, w, f, slope = (given.get(f"nonuniform_stiffness.{k}") for k in ("position", "width", "factor", "slope"))
-        scale = scale * np.exp(f * np.exp(-0.5 * ((at - p) / w) ** 2)) * (1 + slope * (at - 0.5))
+        p, w, f, gradient = (given.get(f"nonuniform_stiffness.{k}") for k in ("position", "width", "factor", "slope"))
+        scale = scale * np.exp(f * np.exp(-0.5 * ((at - p) / w) ** 2)) * (1 + gradient * (at - 0.5))
     if given.on("drifting_stiffness"):
         scale = scale * np.exp(given.get("drifting_stiffness.rate") * max(time, 0.0))
     return scale
@@ -214,7 +214,7 @@ def _dahl(given: Laws, kappa: Array, memory: dict[str, Array]) -> Array:
     return (memory["dahl"] + change) / (1 + np.sqrt((change * change).sum(0)))
 
 
-def remember(given: Laws, kappa: Array, memory: dict[str, Array], dt: float) -> dict[str, Array]:
+def update_memory(given: Laws, kappa: Array, memory: dict[str, Array], dt: float) -> dict[str, Array]:
     """Return what laws remember after a step."""
     out: dict[str, Array] = {}
     bend = kappa[1:]

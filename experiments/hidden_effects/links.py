@@ -168,7 +168,7 @@ class Links:
                 qs.append(np.concatenate([q[:, :1, k], d.xquat[self.bodies].T], 1))
             kappa = d.qpos[self.angles][:, None] / chain.length
             moment = self.soft * laws.moment(given, rope, chain, kappa, still, memory, float(time))
-            memory = laws.remember(given, kappa, memory, m.opt.timestep)
+            memory = laws.update_memory(given, kappa, memory, m.opt.timestep)
             rub, added = self._damping(given, rope, kappa, float(time), IMPLICIT if damping is None else 1.0)
             m.dof_damping[self.hinges] = rub + added
             # What is added is taken back with the velocities before the step, so that it damps nothing; a weld is not
@@ -184,13 +184,13 @@ class Links:
 
         That is a share of step times stiffness, of which a quarter is enough.
         """
-        slope = laws.stiffness(given, rope, self.chain, time) * np.sqrt(given.get("anisotropic_bending.ratio"))
-        slope = slope * (1 + 3 * given.get("stiffening_bending.c") * (kappa[1:] ** 2).sum(0))
-        slope = slope + given.get("internal_friction.moment") / given.get("internal_friction.kappa_c")
-        rub = np.zeros((3, len(slope[0])))
+        gradient = laws.stiffness(given, rope, self.chain, time) * np.sqrt(given.get("anisotropic_bending.ratio"))
+        gradient = gradient * (1 + 3 * given.get("stiffening_bending.c") * (kappa[1:] ** 2).sum(0))
+        gradient = gradient + given.get("internal_friction.moment") / given.get("internal_friction.kappa_c")
+        rub = np.zeros((3, len(gradient[0])))
         rub[1:] = given.get("bending_damping.coefficient")
-        slopes = np.stack([np.full_like(slope[0], rope.twisting), slope[0], slope[0]])
-        added = np.maximum(share * self.model.opt.timestep * slopes - rub, 0.0)
+        gradients = np.stack([np.full_like(gradient[0], rope.twisting), gradient[0], gradient[0]])
+        added = np.maximum(share * self.model.opt.timestep * gradients - rub, 0.0)
         return rub / self.chain.length, added / self.chain.length
 
     def _behind(self, x: Array, q: Array) -> Array:

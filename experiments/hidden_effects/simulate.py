@@ -148,8 +148,8 @@ class Simulator:
     ) -> None:
         self.rope, self.mesh, self.laws, self.poses, self.dt = rope, mesh, given, poses, dt
         self.am, self.af = (2 * spectral - 1) / (spectral + 1), spectral / (spectral + 1)
-        self.gamma = 0.5 + self.af - self.am
-        self.beta = 0.25 * (self.gamma + 0.5) ** 2
+        self.implicit_weight = 0.5 + self.af - self.am
+        self.beta = 0.25 * (self.implicit_weight + 0.5) ** 2
         nodes, rows = mesh.elements + 1, given.rows
         density, share = rope.mass / rope.length, mesh.share
         self.weight = density * share + laws.extra_mass(given, mesh.arclength)
@@ -186,7 +186,7 @@ class Simulator:
         """Return accelerations, velocities and their rates if nodes move by `move` (6, ..., B, N) [m, rad]."""
         h, old = self.dt, [k[:, None] if move.ndim == 4 else k for k in (state.a, state.v, state.dv)]
         a = ((move / h - old[1]) / h - (0.5 - self.beta) * old[0]) / self.beta
-        v = old[1] + h * ((1 - self.gamma) * old[0] + self.gamma * a)
+        v = old[1] + h * ((1 - self.implicit_weight) * old[0] + self.implicit_weight * a)
         dv = ((1 - self.am) * a + self.am * old[0] - self.af * old[2]) / (1 - self.af)
         return a, v, dv
 
@@ -237,9 +237,9 @@ class Simulator:
         # In the node's frame, as the residual.
         change = np.broadcast_to(self.colour * size, (6, 18, rows, nodes)).copy() * self.free[:, None]
         change[:3] = rotate(state.q[:, None], change[:3])
-        slope = (self.residual(state, move[:, None] + change, time, grips) - base[:, None]) / size
+        gradient = (self.residual(state, move[:, None] + change, time, grips) - base[:, None]) / size
         band = np.zeros((3 * WIDTH + 1, rows * nodes * 6))
-        band[self.target] = slope[self.source].reshape(len(self.target[0]), rows)
+        band[self.target] = gradient[self.source].reshape(len(self.target[0]), rows)
         fixed = np.broadcast_to(self.held.T[None], (rows, nodes, 6)).ravel()
         band[2 * WIDTH, fixed] = 1.0
         lu, pivots, info = lapack.dgbtrf(band, WIDTH, WIDTH)
@@ -292,7 +292,7 @@ class Simulator:
             if self.held[3, node]:
                 v[3:, :, node], dv[3:, :, node], a[3:, :, node] = grips[2][..., k], 0.0, 0.0
         kappa = logarithm(multiply(conjugate(q[..., :-1]), q[..., 1:])) / self.mesh.step
-        memory = laws.remember(self.laws, kappa, state.memory, self.dt)
+        memory = laws.update_memory(self.laws, kappa, state.memory, self.dt)
         return State(x, q, v, dv, a, memory)
 
     def grips(self, times: Array) -> tuple[Array, Array, Array]:

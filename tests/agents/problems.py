@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from torchdlo import scene
-from torchdlo.agents.trajopt.problem import Outcome
+from torchdlo.agents.trajopt.problem import Evaluation
 from torchdlo.physics import tree
 from torchdlo.physics.effects.elastic import Bend
 from torchdlo.physics.effects.external import Damping, Gravity
@@ -18,9 +18,9 @@ from torchdlo.physics.effects.table import Table, TableFriction
 from torchdlo.physics.linalg import numerics
 
 
-def judged(returns: Tensor, success: Tensor) -> Outcome:
+def judged(returns: Tensor, success: Tensor) -> Evaluation:
     """An outcome whose loss is the negative return."""
-    return Outcome(returns, -returns, 0 * returns, success, ~torch.isfinite(returns))
+    return Evaluation(returns, -returns, 0 * returns, success, ~torch.isfinite(returns))
 
 
 class Plain:
@@ -30,14 +30,14 @@ class Plain:
     touch: ClassVar[tuple[tuple[float, float, float], ...]] = ()
     tools: ClassVar[tuple[tuple[float, float, float], ...]] = ()
 
-    def rehearsal(self) -> Any:
+    def surrogate(self) -> Any:
         """There is none."""
 
     def varied(self, copies: int, scale: float, seed: int) -> Varied:
         """The same problem with its target moved."""
         return Varied(self, copies, scale, seed)
 
-    def record(self, actions: Tensor) -> tuple[Outcome, dict[str, Any]]:
+    def record(self, actions: Tensor) -> tuple[Evaluation, dict[str, Any]]:
         """How it went; nothing besides."""
         return self.evaluate(actions[None]), {"end": actions.sum(0).tolist()}
 
@@ -51,7 +51,7 @@ class Varied(Plain):
     scale: float
     seed: int
 
-    def evaluate(self, actions: Tensor) -> Outcome:
+    def evaluate(self, actions: Tensor) -> Evaluation:
         """Means over the copies."""
         rng = torch.Generator().manual_seed(self.seed)
         outcomes = []
@@ -60,9 +60,9 @@ class Varied(Plain):
             outcomes.append(
                 replace(self.inner, start=tuple((torch.tensor(self.inner.start) + shift).tolist())).evaluate(actions)
             )
-        names = ("returns", "loss", "shortfall")
+        names = ("returns", "loss", "terminal_cost")
         means = (torch.stack([getattr(o, n) for o in outcomes]).mean(0) for n in names)
-        return Outcome(
+        return Evaluation(
             *means,
             torch.stack([o.success for o in outcomes]).all(0),
             torch.stack([o.failed for o in outcomes]).any(0),
@@ -81,7 +81,7 @@ class Reach(Plain):
     start: tuple[float, float, float] = (0.0, 0.0, 0.0)
     goal: tuple[float, float, float] = (0.06, -0.08, 0.05)
 
-    def evaluate(self, actions: Tensor) -> Outcome:
+    def evaluate(self, actions: Tensor) -> Evaluation:
         """The optimum is 0: the straight path to the goal, half a centimetre and more below what the limit allows."""
         path = actions.new_tensor(self.start) + actions.cumsum(1)
         share = torch.linspace(0, 1, self.horizon + 1, dtype=actions.dtype)[1:, None]
@@ -103,7 +103,7 @@ class Peaks(Plain):
     narrow: tuple[float, float, float] = (0.03, 0.0, 0.0)
     broad: tuple[float, float, float] = (-0.03, 0.0, 0.0)
 
-    def evaluate(self, actions: Tensor) -> Outcome:
+    def evaluate(self, actions: Tensor) -> Evaluation:
         """One at the narrow peak, 0.8 at the broad one."""
         tip = actions.new_tensor(self.start) + actions.sum(1)
         away = [(tip - actions.new_tensor(p)).square().sum(-1) for p in (self.narrow, self.broad)]
@@ -113,7 +113,8 @@ class Peaks(Plain):
 
 @dataclass(frozen=True)
 class Push(Plain):
-    """A finger that may push a disc to a goal: nothing changes before it touches, so that slopes are zero at first."""
+    """A finger that may push a disc to a goal: nothing changes before it touches, so that gradients are zero at
+    first."""
 
     name: str = "push"
     horizon: int = 30
@@ -126,7 +127,7 @@ class Push(Plain):
     reach: float = 0.03
     """Distance at which finger and disc touch [m]."""
 
-    def evaluate(self, actions: Tensor) -> Outcome:
+    def evaluate(self, actions: Tensor) -> Evaluation:
         """The disc goes where it is pushed; the return is the mean closeness to the goal, 1 at most."""
         tips = actions.new_tensor(self.start)[:2] + actions[..., :2].cumsum(1)
         disc = actions.new_tensor(self.disc).expand(len(actions), 2)
@@ -142,19 +143,19 @@ class Push(Plain):
 
 
 @dataclass(frozen=True)
-class Rehearsed(Push):
-    """The same with a disc that is a little smaller than that of its rehearsal, and a note of what was played."""
+class SurrogateRound(Push):
+    """The same with a disc that is a little smaller than that of its surrogate task, and a note of what was played."""
 
-    name: str = "rehearsed"
+    name: str = "surrogate_share"
     reach: float = 0.028
     played: list[str] = field(default_factory=list, compare=False)
 
-    def evaluate(self, actions: Tensor) -> Outcome:
+    def evaluate(self, actions: Tensor) -> Evaluation:
         """Note that it was played."""
         self.played.append("earnest")
         return super().evaluate(actions)
 
-    def rehearsal(self) -> Any:
+    def surrogate(self) -> Any:
         """The plain one, with its disc of the usual size."""
         return _Rehearsal(played=self.played)
 
@@ -163,9 +164,9 @@ class Rehearsed(Push):
 class _Rehearsal(Push):
     played: list[str] = field(default_factory=list, compare=False)
 
-    def evaluate(self, actions: Tensor) -> Outcome:
+    def evaluate(self, actions: Tensor) -> Evaluation:
         """Note that it was played."""
-        self.played.append("rehearsal")
+        self.played.append("surrogate")
         return super().evaluate(actions)
 
 
@@ -180,7 +181,7 @@ class Drag(Plain):
     limit: float = 0.03
     start: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
-    def evaluate(self, actions: Tensor) -> Outcome:
+    def evaluate(self, actions: Tensor) -> Evaluation:
         """The loss is the mean squared distance of the vertices to the goal [m2]."""
         line = torch.zeros(10, 3, dtype=torch.float64)
         line[:, 0], line[:, 2] = 0.02 * torch.arange(10), 0.005
@@ -189,9 +190,9 @@ class Drag(Plain):
         effects = [Gravity(), Bend(), Damping(), Table(), TableFriction()]
         numbers = {"damping": {"rate": 10.0}}
         world, params, state = scene.make(
-            [rope], effects, numbers, dt=2e-2, substeps=4, integrator="implicit", held_vertices=(0,)
+            [rope], effects, numbers, dt=2e-2, substeps=4, integrator="implicit", prescribed_vertices=(0,)
         )
-        control = scene.hold(world, state)
+        control = scene.stationary_control(world, state)
         paths = control.pos[:, None] + (actions * actions.new_tensor([1.0, 1.0, 0.0])).cumsum(1)[:, :, None]
         controls = tree.map(lambda c: c.expand(self.horizon, *c.shape), control)
         controls = tree.replace(controls, pos=paths.transpose(0, 1))
@@ -199,7 +200,7 @@ class Drag(Plain):
         angle = torch.linspace(0, 3.0, 10, dtype=torch.float64)
         goal = 0.06 * torch.stack([1 - angle.cos(), angle.sin(), 0 * angle], -1) + torch.tensor([0.0, 0.05, 0.0])
         loss = (last.rods.pos - goal)[..., :2].square().sum(-1).mean(-1)
-        return Outcome(-loss, loss, 0 * loss, loss < 0.02**2, ~scene.finite(last))
+        return Evaluation(-loss, loss, 0 * loss, loss < 0.02**2, ~scene.finite(last))
 
 
 def signature(actions: Tensor) -> str:

@@ -45,7 +45,7 @@ def test_the_benchmark_writes_its_table_and_reads_finished_runs(tmp_path: Path) 
     result.write_text(json.dumps(content | {"return": 0.25}))
     assert "| wiring_post | cmaes | 1 | 0.25 |" in call(*words).stdout
     # What another version has written is marked, and found anew if that is asked for.
-    fewer = {name: value for name, value in content["settings"].items() if name != "rehearsed"}
+    fewer = {name: value for name, value in content["settings"].items() if name != "surrogate_share"}
     result.write_text(json.dumps(content | {"return": 0.25, "program": "another", "settings": fewer}))
     marked = call(*words).stdout
     assert "| wiring_post | cmaes | 1* | 0.25 |" in marked and "another version of the program" in marked
@@ -116,7 +116,7 @@ def test_a_report_shows_what_is_finished_beside_the_hybrid_at_as_many_episodes(t
         found = {
             "task": "lifting",
             "return": max(best.values()),
-            "highest": max(best.values()),
+            "max_return": max(best.values()),
             "success": seed == 0,
             "episodes": max(best),
             "seconds": 1.0,

@@ -59,16 +59,16 @@ def test_slopes_by_actions_become_slopes_by_points() -> None:
     def loss(x: torch.Tensor) -> torch.Tensor:
         return (encoding.decode(x).flatten(1) * weights).sum()
 
-    slope = torch.stack([(loss(points + 1e-7 * e) - loss(points - 1e-7 * e)) / 2e-7 for e in torch.eye(18).double()])
-    torch.testing.assert_close(encoding.pull(points, weights).sum(0), slope, rtol=1e-6, atol=1e-7)
+    gradient = torch.stack([(loss(points + 1e-7 * e) - loss(points - 1e-7 * e)) / 2e-7 for e in torch.eye(18).double()])
+    torch.testing.assert_close(encoding.pull(points, weights).sum(0), gradient, rtol=1e-6, atol=1e-7)
 
 
 def test_tools_at_their_limit_can_brake() -> None:
     points = torch.tensor([[0.05, 0.02, 0.0]], dtype=torch.float64)
     encoding = Encoding(horizon=2, width=3, group=3, limit=0.01, hold=2)
     at = encoding.project(points).requires_grad_()
-    (slope,) = torch.autograd.grad(encoding.decode(at).norm(dim=-1).sum(), at)
-    assert float((slope @ at[0] / at.norm()).detach()) == pytest.approx(1, rel=1e-6)
+    (gradient,) = torch.autograd.grad(encoding.decode(at).norm(dim=-1).sum(), at)
+    assert float((gradient @ at[0] / at.norm()).detach()) == pytest.approx(1, rel=1e-6)
 
 
 def test_gradients_are_those_of_finite_differences_on_both_sides_of_the_limit() -> None:
@@ -76,8 +76,8 @@ def test_gradients_are_those_of_finite_differences_on_both_sides_of_the_limit() 
     encoding = Encoding(horizon=4, width=3, group=3, limit=0.01, hold=2)
     assert torch.autograd.gradcheck(encoding.decode, points.requires_grad_(), eps=1e-7)
     still = torch.zeros_like(points).requires_grad_()
-    (slope,) = torch.autograd.grad(encoding.decode(still).sum(), still)
-    assert (slope == 1).all()
+    (gradient,) = torch.autograd.grad(encoding.decode(still).sum(), still)
+    assert (gradient == 1).all()
 
 
 @pytest.mark.parametrize("apart", [None, 0.2])
@@ -85,10 +85,10 @@ def test_ways_inward_are_what_projection_leaves_of_them(apart: float | None) -> 
     encoding = Encoding(horizon=6, width=6, group=3, limit=0.01, hold=2, apart=apart)
     rng = torch.Generator().manual_seed(0)
     points = encoding.project(torch.randn(20, encoding.size, generator=rng, dtype=torch.float64) * 0.02)
-    ways = torch.randn(20, encoding.size, generator=rng, dtype=torch.float64)
-    left = encoding.inward(points, ways)
+    stage_waypoints = torch.randn(20, encoding.size, generator=rng, dtype=torch.float64)
+    left = encoding.inward(points, stage_waypoints)
     step = 1e-9
-    assert torch.allclose((encoding.project(points + step * ways) - points) / step, left, atol=1e-6)
-    assert not torch.allclose(left, ways)
+    assert torch.allclose((encoding.project(points + step * stage_waypoints) - points) / step, left, atol=1e-6)
+    assert not torch.allclose(left, stage_waypoints)
     inside = encoding.project(0.1 * points)
-    assert torch.allclose(encoding.inward(inside, ways), ways)
+    assert torch.allclose(encoding.inward(inside, stage_waypoints), stage_waypoints)

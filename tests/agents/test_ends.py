@@ -1,4 +1,4 @@
-"""What ends a search, or does not: missing packages, Ctrl-C in a rehearsal, worlds that get harder."""
+"""What ends a search, or does not: missing packages, Ctrl-C in a surrogate task, worlds that get harder."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ import sys
 import pytest
 import torch
 
-from tests.agents.problems import Push, Rehearsed
+from tests.agents.problems import Push, SurrogateRound
 from torchdlo.agents.trajopt.gradient_descent import descent
-from torchdlo.agents.trajopt.proposals import Plan, Told
+from torchdlo.agents.trajopt.proposals import SearchPlan, Told
 from torchdlo.agents.trajopt.result import result_json
 from torchdlo.agents.trajopt.search import Settings, optimize
 from torchdlo.errors import InputError
@@ -28,29 +28,29 @@ def test_a_package_that_is_missing_is_named_before_anything_is_played(
 
 
 def test_what_a_rehearsal_promised_is_not_said_of_the_problem_itself() -> None:
-    settings = Settings("hybrid", episodes=160, population=16, hold=5, rehearsed=0.8)
+    settings = Settings("hybrid", episodes=160, population=16, hold=5, surrogate_share=0.8)
 
     def stop(_: str, done: int, *__: object) -> None:
         if done >= 48:
             raise KeyboardInterrupt
 
-    found = optimize(Rehearsed(), settings, callback=stop)
-    assert found.interrupted and found.curve[-1]["rehearsed"]
-    assert found.highest == found.searched == -math.inf and math.isfinite(float(found.outcome.returns[0]))
-    written = json.loads(result_json(found, Rehearsed(), settings))
-    assert written["highest"] is None and written["searched"] is None and written["return"] is not None
+    found = optimize(SurrogateRound(), settings, callback=stop)
+    assert found.interrupted and found.curve[-1]["surrogate_share"]
+    assert found.max_return == found.search_return == -math.inf and math.isfinite(float(found.outcome.returns[0]))
+    written = json.loads(result_json(found, SurrogateRound(), settings))
+    assert written["max_return"] is None and written["search_return"] is None and written["return"] is not None
 
 
-@pytest.mark.parametrize(("kept", "iterations"), [({"drifts": 0.5}, 20), ({"rehearsals": 9}, 18), ({}, 9)])
+@pytest.mark.parametrize(("kept", "iterations"), [({"drifts": 0.5}, 20), ({"surrogates": 9}, 18), ({}, 9)])
 def test_descent_does_not_measure_by_milder_worlds(kept: dict, iterations: int) -> None:
-    plan = Plan(horizon=4, width=3, group=3, limit=0.01, population=1, iterations=40, hold=2, **kept)
+    plan = SearchPlan(horizon=4, width=3, group=3, limit=0.01, population=1, iterations=40, hold=2, **kept)
     search = descent(plan, torch.Generator().manual_seed(0))
     ask, no = next(search), torch.zeros(1, dtype=torch.bool)
-    ways = []
+    stage_waypoints = []
     for k in range(35):
-        loss, slope = torch.full((1,), float(k), dtype=torch.float64), torch.ones_like(ask.points)
-        before, ask = ask.points, search.send(Told(-loss, loss, 0 * loss, no, no, slope))
-        ways.append(float((ask.points - before).abs().max()))
+        loss, gradient = torch.full((1,), float(k), dtype=torch.float64), torch.ones_like(ask.points)
+        before, ask = ask.points, search.send(Told(-loss, loss, 0 * loss, no, no, gradient))
+        stage_waypoints.append(float((ask.points - before).abs().max()))
     # Returns fall from one iteration to the next; starts that are given up jump.
-    jump = next(k for k, way in enumerate(ways) if way > 1.5 * plan.rate)
+    jump = next(k for k, way in enumerate(stage_waypoints) if way > 1.5 * plan.rate)
     assert jump >= iterations

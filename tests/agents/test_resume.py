@@ -17,9 +17,9 @@ import torch
 from torch import Tensor
 
 from tests.agents.problems import Push, signature
-from torchdlo.agents.trajopt.problem import Outcome
+from torchdlo.agents.trajopt.problem import Evaluation
 from torchdlo.agents.trajopt.result import result_json, trajectory_json
-from torchdlo.agents.trajopt.search import METHODS, Found, Robust, Settings, optimize
+from torchdlo.agents.trajopt.search import METHODS, Robust, SearchResult, Settings, optimize
 from torchdlo.agents.trajopt.search_journal import _code, program, remove
 from torchdlo.errors import InputError
 
@@ -27,7 +27,7 @@ SETTINGS = Settings(episodes=96, population=8, hold=5, chunk=5)
 REPOSITORY = Path(__file__).resolve().parents[2]
 
 
-def files(found: Found, settings: Settings) -> tuple[str, dict]:
+def files(found: SearchResult, settings: Settings) -> tuple[str, dict]:
     """What is written about a search, without the time it took."""
     result = json.loads(result_json(found, Push(), settings))
     del result["seconds"]
@@ -41,7 +41,7 @@ class Stopping(Push):
         super().__init__()
         object.__setattr__(self, "left", [after])
 
-    def evaluate(self, actions: Tensor) -> Outcome:
+    def evaluate(self, actions: Tensor) -> Evaluation:
         self.left[0] -= 1
         if self.left[0] < 0:
             raise MemoryError
@@ -65,7 +65,7 @@ def test_what_is_written_is_not_played_again(tmp_path: Path) -> None:
     played = []
 
     class Counting(Push):
-        def evaluate(self, actions: Tensor) -> Outcome:
+        def evaluate(self, actions: Tensor) -> Evaluation:
             played.append(len(actions))
             return super().evaluate(actions)
 
@@ -85,7 +85,7 @@ def test_ctrl_c_keeps_the_best_and_resume_goes_on(tmp_path: Path) -> None:
             raise KeyboardInterrupt
 
     found = optimize(Push(), SETTINGS, journal=tmp_path / "j", callback=stop)
-    assert found.interrupted and found.searched == whole.curve[3]["best"]
+    assert found.interrupted and found.search_return == whole.curve[3]["best"]
     assert found.curve == whole.curve[:4]
     assert files(optimize(Push(), SETTINGS, journal=tmp_path / "j", resume=True), SETTINGS) == files(whole, SETTINGS)
 

@@ -21,7 +21,7 @@ from torchdlo.scene_files.run import load_frames
 
 
 class Led(Lead):
-    """With a way by hand."""
+    """With a scripted demonstration."""
 
     def waypoints(self):
         """To the left."""
@@ -73,7 +73,7 @@ def test_a_trajectory_comes_back_bit_by_bit(capsys):
     went, kept = json.loads(capsys.readouterr().out), json.loads(Path("found/trajectory.json").read_text())
     assert went["return"] == kept["return"] and went["rewards"] == kept["rewards"]
     # On another rope it shows how well it carries over.
-    rope = envs.Cable(line_density=0.05, bend=1e-4, damping=20.0)
+    rope = envs.RopeMaterial(line_density=0.05, bend=1e-4, damping=20.0)
     same, other = (script("lead", Path("found/trajectory.json"), given) for given in (None, rope))
     went, moved = (episode.play(s.task, s.actions[None], episode=s.episode) for s in (same, other))
     assert same.actions.tolist() == other.actions.tolist() and went.returns.item() == kept["return"]

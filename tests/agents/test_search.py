@@ -12,16 +12,16 @@ import pytest
 import torch
 from torch import Tensor
 
-from tests.agents.problems import Drag, Peaks, Plain, Push, Reach, Rehearsed, signature
-from torchdlo.agents.trajopt.problem import Outcome
+from tests.agents.problems import Drag, Peaks, Plain, Push, Reach, SurrogateRound, signature
+from torchdlo.agents.trajopt.problem import Evaluation
 from torchdlo.agents.trajopt.proposals import ranking
-from torchdlo.agents.trajopt.search import METHODS, Found, Robust, Settings, optimize
+from torchdlo.agents.trajopt.search import METHODS, Robust, SearchResult, Settings, optimize
 from torchdlo.errors import InputError
 
 SMALL = Settings(episodes=64, population=8, hold=5)
 
 
-def returned(found: Found) -> float:
+def returned(found: SearchResult) -> float:
     return float(found.outcome.returns[0])
 
 
@@ -66,10 +66,10 @@ def test_the_budget_is_kept_and_the_best_is_the_best(method: str) -> None:
     sizes: list[int] = []
 
     class Watched(Push):
-        def evaluate(self, actions: Tensor) -> Outcome:
+        def evaluate(self, actions: Tensor) -> Evaluation:
             outcome = super().evaluate(actions)
             sizes.append(len(actions))
-            # The hybrid plays once more what it wants slopes of.
+            # The hybrid plays once more what it wants gradients of.
             if method != "hybrid" or not actions.requires_grad:
                 seen.append(outcome.returns.detach())
             return outcome
@@ -77,7 +77,7 @@ def test_the_budget_is_kept_and_the_best_is_the_best(method: str) -> None:
     found = optimize(Watched(), replace(SMALL, method=method, episodes=70, chunk=3))
     played = torch.cat(seen)
     assert found.episodes == 64 == len(played) - 1, "the best is played once more, alone"
-    assert found.searched == float(played[:-1].max()) == found.curve[-1]["best"]
+    assert found.search_return == float(played[:-1].max()) == found.curve[-1]["best"]
     assert max(sizes) <= 3
     best = [point["best"] for point in found.curve]
     assert best == sorted(best)
@@ -114,19 +114,19 @@ def test_the_hybrid_beats_both_on_a_rope_dragged_over_a_table() -> None:
 
 @dataclass(frozen=True)
 class Broken(Reach):
-    """Breaks down where the first action goes up, and has no slope where it goes left."""
+    """Breaks down where the first action goes up, and has no gradient where it goes left."""
 
     always: bool = False
 
-    def evaluate(self, actions: Tensor) -> Outcome:
+    def evaluate(self, actions: Tensor) -> Evaluation:
         outcome = super().evaluate(actions)
         up = (actions[:, 0, 2] > 0) | self.always
         left = torch.where(actions[:, 0, 0] < 0, torch.nan, 1.0)
         nan = torch.where(up, torch.nan, outcome.returns)
-        return Outcome(
+        return Evaluation(
             nan,
             outcome.loss * torch.where(left.isnan(), (actions.sum((1, 2)) * 0).sqrt() + 1, 1.0),
-            outcome.shortfall,
+            outcome.terminal_cost,
             outcome.success & ~up,
             up,
         )
@@ -136,7 +136,7 @@ class Broken(Reach):
 class Picky(Reach):
     """Counts as done only near the start, where little is earned; and not when it is played alone, at the left."""
 
-    def evaluate(self, actions: Tensor) -> Outcome:
+    def evaluate(self, actions: Tensor) -> Evaluation:
         outcome = super().evaluate(actions)
         end = actions.sum(1)
         return replace(outcome, success=(end.norm(dim=-1) < 0.05) & ((end[:, 0] > 0) | (len(actions) > 1)))
@@ -145,16 +145,16 @@ class Picky(Reach):
 def test_a_trajectory_that_succeeds_also_alone_is_chosen_before_one_that_earns_more() -> None:
     found = optimize(Picky(), replace(SMALL, episodes=160, method="cmaes"))
     assert bool(found.outcome.success[0]) and float(found.actions.sum(0)[0]) > 0
-    assert found.highest > found.searched == pytest.approx(returned(found))
+    assert found.max_return > found.search_return == pytest.approx(returned(found))
     # Those that did not succeed alone are not chosen, and had earned more.
-    assert found.highest == max(point["best"] for point in found.curve)
+    assert found.max_return == max(point["best"] for point in found.curve)
 
 
 @dataclass(frozen=True)
 class Latch(Reach):
     """Earns the same for all but a way once round a circle; the loss says how far a way is from that."""
 
-    def evaluate(self, actions: Tensor) -> Outcome:
+    def evaluate(self, actions: Tensor) -> Evaluation:
         turn = torch.linspace(0, 2 * torch.pi, self.horizon + 1, dtype=actions.dtype)[1:]
         circle = 0.025 * torch.stack([1 - turn.cos(), turn.sin(), 0 * turn], -1)
         far = (actions.cumsum(1) - circle).square().sum(-1).mean(-1)
@@ -175,12 +175,12 @@ class Lure(Reach):
 
     shown: bool = True
 
-    def evaluate(self, actions: Tensor) -> Outcome:
+    def evaluate(self, actions: Tensor) -> Evaluation:
         end, goal = actions.sum(1), actions.new_tensor(self.goal)
         returns = 10.0 - (end - goal).norm(dim=-1)
         far = (end - goal - actions.new_tensor([-0.02, 0.02, 0.0])).norm(dim=-1)
-        shortfall = self.shown * 5 * (far - 0.004).clamp(min=0)
-        return Outcome(returns, shortfall - returns, shortfall, far < 0.005, returns.isnan())
+        terminal_cost = self.shown * 5 * (far - 0.004).clamp(min=0)
+        return Evaluation(returns, terminal_cost - returns, terminal_cost, far < 0.005, returns.isnan())
 
 
 def test_the_hybrid_goes_where_it_succeeds_and_not_where_it_earns_most() -> None:
@@ -192,15 +192,15 @@ def test_the_hybrid_goes_where_it_succeeds_and_not_where_it_earns_most() -> None
 
 @pytest.mark.parametrize("method", METHODS)
 def test_a_search_begins_with_a_rehearsal(method: str) -> None:
-    settings = Settings(method, episodes=240, population=24, hold=5, rehearsed=0.8)
-    problem = Rehearsed()
+    settings = Settings(method, episodes=240, population=24, hold=5, surrogate_share=0.8)
+    problem = SurrogateRound()
     found = optimize(problem, settings)
     # Eight iterations of ten.
-    assert [played for played, _ in itertools.groupby(problem.played)] == ["rehearsal", "earnest"]
-    assert [point["rehearsed"] for point in found.curve] == [True] * 8 + [False] * 2
+    assert [played for played, _ in itertools.groupby(problem.played)] == ["surrogate", "earnest"]
+    assert [point["surrogate_share"] for point in found.curve] == [True] * 8 + [False] * 2
     assert found.curve[7]["best"] == -math.inf and found.curve[7]["success"] == 0 and found.curve[7]["median"] is None
     assert returned(found) == pytest.approx(max(point["best"] for point in found.curve))
-    blind = optimize(Rehearsed(), replace(settings, episodes=48, rehearsed=0.0))
+    blind = optimize(SurrogateRound(), replace(settings, episodes=48, surrogate_share=0.0))
     if method == "hybrid":
         assert returned(found) > returned(blind) + 0.1, "two iterations alone do less"
     else:
@@ -219,7 +219,7 @@ def test_trajectories_are_ranked_by_return_and_then_by_loss() -> None:
 class Narrow(Reach):
     """Trajectories that come near the goal break down alone; in a batch they do not."""
 
-    def evaluate(self, actions: Tensor) -> Outcome:
+    def evaluate(self, actions: Tensor) -> Evaluation:
         outcome = super().evaluate(actions)
         broken = (len(actions) == 1) & (outcome.returns > -0.5)
         return replace(outcome, returns=torch.where(broken, -100.0, outcome.returns), success=outcome.success & ~broken)
@@ -228,8 +228,8 @@ class Narrow(Reach):
 def test_of_what_breaks_down_alone_the_next_is_chosen(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("torchdlo.agents.trajopt.search._FINALISTS", 64)
     found = optimize(Narrow(), replace(SMALL, episodes=160, method="cmaes"))
-    assert found.highest > -0.5 > returned(found) > -2
-    assert found.searched == pytest.approx(returned(found))
+    assert found.max_return > -0.5 > returned(found) > -2
+    assert found.search_return == pytest.approx(returned(found))
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -276,9 +276,12 @@ def test_a_robust_search_counts_every_copy_and_grows_its_worlds() -> None:
         ({"sigma": float("nan")}, "sigma is nan; expected a positive number."),
         ({"rate": 0.0}, "rate is 0.0; expected a positive number."),
         ({"chunk": 0}, "chunk is 0; expected at least 1."),
-        ({"rehearsed": 0.5, "robust": Robust(2)}, "rehearsed is 0.5; expected 0 with robust."),
-        ({"rehearsed": 1.0}, "rehearsed is 1.0; expected a share of the iterations from 0 up, less than 1."),
-        ({"rehearsed": 0.5, "method": "hybrid", "episodes": 32}, "push: it has no rehearsal; set rehearsed to 0."),
+        ({"surrogate_share": 0.5, "robust": Robust(2)}, "rehearsed is 0.5; expected 0 with robust."),
+        ({"surrogate_share": 1.0}, "rehearsed is 1.0; expected a share of the iterations from 0 up, less than 1."),
+        (
+            {"surrogate_share": 0.5, "method": "hybrid", "episodes": 32},
+            "push: it has no rehearsal; set rehearsed to 0.",
+        ),
         ({"seed": -1}, "seed is -1; expected a whole number from 0 to 2^32 - 1."),
         ({"seed": 2**32}, "seed is 4294967296; expected a whole number from 0 to 2^32 - 1."),
     ],
@@ -298,9 +301,9 @@ def test_problems_of_any_width_are_searched() -> None:
         group: int = 1
         limit: float = 1.0
 
-        def evaluate(self, actions: Tensor) -> Outcome:
+        def evaluate(self, actions: Tensor) -> Evaluation:
             returns = -(actions[:, 0, 0] - 0.3).square()
-            return Outcome(returns, -returns, 0 * returns, returns > -1e-6, returns.isnan())
+            return Evaluation(returns, -returns, 0 * returns, returns > -1e-6, returns.isnan())
 
     for method in METHODS:
         found = optimize(Line(), Settings(method, episodes=400, population=4))

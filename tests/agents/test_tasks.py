@@ -18,7 +18,7 @@ from torchdlo.agents.trajopt.search import METHODS, Robust
 from torchdlo.agents.trajopt.task_problem import TaskProblem, problem
 from torchdlo.cli import app
 from torchdlo.coupling.robot.kinematics import panda, tool_pose
-from torchdlo.envs.core.task import RADIUS, Arms, Seen, Task, make, straight
+from torchdlo.envs.core.task import RADIUS, Arms, Task, TaskState, make, straight
 from torchdlo.errors import InputError
 from torchdlo.scene import Params, Rope, Scene, State
 
@@ -33,17 +33,17 @@ class Lead(Task):
     name: ClassVar[str] = "lead"
     arms: ClassVar[Arms] = Arms(base=((-0.2, -0.45, 0.0),), vertex=(1,))
     frames: ClassVar[int] = 2
-    spread: ClassVar[tuple[tuple[float, float], ...]] = ((0.02, 0.01),)
+    reset_noise: ClassVar[tuple[tuple[float, float], ...]] = ((0.02, 0.01),)
 
     def build(self, moved: Tensor) -> tuple[Scene, Params, State]:
         """The rope may be moved."""
         return make(self, [Rope(straight((0.0, 0.1, 0.05), 8, moved[:, 0]), RADIUS, mass=0.008, youngs=1e4)])
 
-    def rewards(self, seen: Seen) -> dict[str, Tensor]:
+    def rewards(self, seen: TaskState) -> dict[str, Tensor]:
         """How far the rope is to the left of y = 0.1."""
         return {"left": seen.x[:, 1, 1] - 0.1}
 
-    def success(self, seen: Seen) -> Tensor:
+    def success(self, seen: TaskState) -> Tensor:
         """Whether that is 2 cm."""
         return seen.x[:, 1, 1] > 0.12
 
@@ -62,10 +62,10 @@ def test_returns_and_slopes_are_those_of_the_way_of_the_tool(lead: TaskProblem) 
     # The vertex that is held goes where the tool goes: 5, 10, 15 mm, and three times 10 mm. The tool comes to the
     # target within the tolerance of inverse kinematics, 0.1 mm, at each action.
     torch.testing.assert_close(outcome.returns, torch.tensor([0.03, 0.03], dtype=torch.float64), atol=3e-4, rtol=0)
-    (slope,) = torch.autograd.grad(outcome.loss[0], actions)
+    (gradient,) = torch.autograd.grad(outcome.loss[0], actions)
     wanted = torch.tensor([-3.0, -2.0, -1.0], dtype=torch.float64)
-    torch.testing.assert_close(slope[0, :, 1], wanted, atol=1e-2, rtol=0)
-    assert (slope[1] == 0).all()
+    torch.testing.assert_close(gradient[0, :, 1], wanted, atol=1e-2, rtol=0)
+    assert (gradient[1] == 0).all()
 
 
 def test_varied_starts_are_the_same_for_all_trajectories(lead: TaskProblem) -> None:
@@ -81,7 +81,7 @@ def test_varied_starts_are_the_same_for_all_trajectories(lead: TaskProblem) -> N
 class Still(Lead):
     """The same from one start only."""
 
-    spread = ((0.0, 0.0),)
+    reset_noise = ((0.0, 0.0),)
 
 
 def test_a_task_without_spread_cannot_be_robust() -> None:
@@ -123,7 +123,7 @@ class Missing(Lead):
     def build(self, moved: Tensor) -> tuple[Scene, Params, State]:
         """As if an edge had become a fifth too short."""
         scene, params, state = super().build(moved)
-        return scene, params, replace(state, missed=state.missed + torch.tensor([0.0, 0.0, 0.2]))
+        return scene, params, replace(state, diagnostics=state.diagnostics + torch.tensor([0.0, 0.0, 0.2]))
 
 
 def test_a_trajectory_that_cannot_be_trusted_says_so(

@@ -12,9 +12,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from tests.agents.problems import Drag, Push, Rehearsed, signature
+from tests.agents.problems import Drag, Push, SurrogateRound, signature
 from torchdlo.agents.trajopt.batched_evaluation import together
-from torchdlo.agents.trajopt.problem import Outcome, Problem
+from torchdlo.agents.trajopt.problem import Evaluation, Problem
 from torchdlo.agents.trajopt.search import METHODS, Robust, Settings, optimize
 from torchdlo.errors import InputError
 
@@ -30,7 +30,7 @@ class Counting(Push):
         object.__setattr__(self, "sizes", [])
         object.__setattr__(self, "after", after)
 
-    def evaluate(self, actions: Tensor) -> Outcome:
+    def evaluate(self, actions: Tensor) -> Evaluation:
         """Play."""
         if len(self.sizes) == self.after:
             raise MemoryError
@@ -51,17 +51,19 @@ def test_searches_find_what_they_find_alone() -> None:
         # A batch of another size rounds in another order; what was found alone is played alone.
         assert each.outcome.returns == pytest.approx(alone.outcome.returns, rel=1e-6)
         assert each.episodes == alone.episodes == 48
-    # Those with slopes and those without are played in batches of their own; the best of each is played alone.
+    # Those with gradients and those without are played in batches of their own; the best of each is played alone.
     assert sorted(set(problem.sizes)) == [1, 30] and problem.sizes.count(30) < len(own.sizes) / 2
 
 
 def test_rehearsals_are_shared_as_well() -> None:
-    settings = [Settings("hybrid", episodes=48, population=8, hold=5, seed=seed, rehearsed=0.5) for seed in (0, 1)]
-    problem = Rehearsed()
+    settings = [
+        Settings("hybrid", episodes=48, population=8, hold=5, seed=seed, surrogate_share=0.5) for seed in (0, 1)
+    ]
+    problem = SurrogateRound()
     found = together(problem, [searching(each) for each in settings], room=16)
-    assert [played for played, _ in itertools.groupby(problem.played)] == ["rehearsal", "earnest"]
+    assert [played for played, _ in itertools.groupby(problem.played)] == ["surrogate", "earnest"]
     for each, alone in zip(found, settings, strict=True):
-        assert signature(each.actions) == signature(optimize(Rehearsed(), alone).actions)
+        assert signature(each.actions) == signature(optimize(SurrogateRound(), alone).actions)
 
 
 @pytest.mark.parametrize("kind", [Push, Drag])
@@ -69,22 +71,22 @@ def test_slopes_are_those_of_the_problem(kind: Any) -> None:
     inner = kind()
     actions = [0.01 * torch.randn(n, inner.horizon, 3, dtype=torch.float64) for n in (3, 1, 4)]
 
-    def slope(x: Tensor, problem: Problem) -> Tensor:
+    def gradient(x: Tensor, problem: Problem) -> Tensor:
         x = x.clone().requires_grad_()
         return torch.autograd.grad((problem.evaluate(x).loss * torch.arange(len(x)).exp()).sum(), x)[0]
 
-    found = together(inner, [partial(slope, x) for x in actions], room=5)
+    found = together(inner, [partial(gradient, x) for x in actions], room=5)
     for x, each in zip(actions, found, strict=True):
         # Rounding of a batch of another size grows through contact: the eighth digit differs between machines.
-        torch.testing.assert_close(each, slope(x, inner), rtol=1e-6, atol=1e-6)
+        torch.testing.assert_close(each, gradient(x, inner), rtol=1e-6, atol=1e-6)
 
 
 def test_one_that_wants_no_slope_gets_none() -> None:
     actions = torch.zeros(2, 30, 3, dtype=torch.float64)
     searches = [lambda p: p.evaluate(actions), lambda p: p.evaluate(actions.clone().requires_grad_())]
     problem = Counting()
-    plain, graded = together(problem, searches, room=5, graded=3)
-    assert not plain.loss.requires_grad and graded.loss.requires_grad
+    plain, with_gradient = together(problem, searches, room=5, with_gradient=3)
+    assert not plain.loss.requires_grad and with_gradient.loss.requires_grad
     assert problem.sizes == [5, 3]
 
 

@@ -91,8 +91,10 @@ def remembering(made, params, state, values):
     if not one.memory:
         return state
     earlier = tree.replace(r, pos=r.pos - 0.02 * r.vel, twist=r.twist - 0.1 * r.twist_rate, vel=0.9 * r.vel)
-    seen = one.remember(rod.view(made.topology, params.rods, earlier, made.dt), values)
-    seen = one.remember(rod.view(made.topology, params.rods, tree.replace(r, memory={one.name: seen}), made.dt), values)
+    seen = one.update_memory(rod.view(made.topology, params.rods, earlier, made.dt), values)
+    seen = one.update_memory(
+        rod.view(made.topology, params.rods, tree.replace(r, memory={one.name: seen}), made.dt), values
+    )
     pos, rate = r.pos + 0.02 * r.vel.flip(-2), r.twist + 0.1 * r.twist_rate.flip(-2)
     return tree.replace(state, rods=tree.replace(r, pos=pos, twist=rate, memory={one.name: seen}))
 
@@ -119,15 +121,15 @@ def respond(made, params, state, values=None) -> dict[str, torch.Tensor]:
     """Everything the effect does: loads, flow, what it remembers, shifts of markers, and the numbers it alters."""
     one = made.effects[0]
     values = params.effects[one.name] if values is None else values
-    altered = one.alter(made.topology, params.rods, values)
+    altered = one.modify_material(made.topology, params.rods, values)
     state = remembering(made, params, state, values)
     view = rod.view(made.topology, altered, state.rods, made.dt)
     found = dict(effect.total([one], view, {one.name: values}))
-    flow = one.flow(view, values)
+    flow = one.plastic_flow(view, values)
     if flow is not None:
         found["flow"] = flow
     if one.memory:
-        found["remembered"] = one.remember(view, values)
+        found["remembered"] = one.update_memory(view, values)
     if one.kind == "measurement":
         seen = track(view)
         found["observed"] = one.observe(seen, values) - seen.pos

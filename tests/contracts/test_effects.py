@@ -14,7 +14,7 @@ from torchdlo.physics.effects import EFFECTS
 from torchdlo.physics.effects.base import KINDS, LOADS, Effect, altered, observed
 from torchdlo.physics.linalg import rotation
 from torchdlo.physics.rod import kinematics as rod
-from torchdlo.scene import Rope, hold, make, step
+from torchdlo.scene import Rope, make, stationary_control, step
 
 each = pytest.mark.parametrize("name", EFFECTS)
 LAWS = {"stretch_force", "bend", "bend_frame", "twist"}
@@ -273,8 +273,8 @@ def ten_steps(names: list[str], values: dict, integrator: str) -> torch.Tensor:
     rope = Rope(x, mass=0.1, bend=1e-3, twist=2e-3, radius=0.01, rest="as_placed", velocities=x.flip(-1))
     made = [INSTANCES.get(n) or EFFECTS[n]() for n in names]
     choices = {"dt": 2e-3, "substeps": 1, "integrator": integrator, "twist": "quasistatic"}
-    built, params, state = make([rope], made, values, held_vertices=(0, 1), held_edges=(0,), **choices)
-    control = hold(built, state)
+    built, params, state = make([rope], made, values, prescribed_vertices=(0, 1), prescribed_edges=(0,), **choices)
+    control = stationary_control(built, state)
     for _ in range(10):
         state = step(built, params, state, control)
     return state.rods.pos

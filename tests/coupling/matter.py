@@ -6,7 +6,15 @@ import torch
 from torch import Tensor
 
 from torchdlo.coupling.mpm import substep as mpm
-from torchdlo.coupling.mpm.particles import Blob, Grid, Matter, Medium, Particles, assemble, fill_ball
+from torchdlo.coupling.mpm.particles import (
+    Grid,
+    MpmDomain,
+    ParticleBlock,
+    ParticleParams,
+    Particles,
+    assemble,
+    fill_ball,
+)
 from torchdlo.physics import tree
 
 DOUBLE = torch.float64
@@ -20,24 +28,32 @@ def ball(law, radius=0.03, spacing=0.0064, batch=(), dtype=DOUBLE, shake=0.0, gr
     x = x.expand(*batch, *x.shape)
     velocity = shake * torch.randn(x.shape, generator=torch.Generator().manual_seed(3), dtype=dtype)
     grid = grid or Grid((0.0,) * 3, (0.2,) * 3, 0.01, OPEN)
-    return assemble([Blob(x, law, spacing**3, velocity=velocity, numbers=numbers)], grid)
+    return assemble([ParticleBlock(x, law, spacing**3, velocity=velocity, numbers=numbers)], grid)
 
 
-def run(medium: Medium, matter: Matter, state: Particles, steps: int, dt: float, gravity=(0.0, 0.0, 0.0), keep=None):
+def run(
+    medium: MpmDomain,
+    material_points: ParticleParams,
+    state: Particles,
+    steps: int,
+    dt: float,
+    gravity=(0.0, 0.0, 0.0),
+    keep=None,
+):
     """Advance from rest at time 0; also return what `keep` says after each substep."""
     seen = []
     g = state.pos.new_tensor([list(gravity)])
     for k in range(steps):
         share = state.pos.new_full((1, 1), 0.5 if k == 0 else 1.0)
-        state = mpm.advance(medium, matter, state, g, dt, share)
+        state = mpm.advance(medium, material_points, state, g, dt, share)
         if keep:
             seen.append(keep(state))
     return (state, torch.stack(seen)) if keep else state
 
 
-def momenta(medium: Medium, matter: Matter, state: Particles) -> tuple[Tensor, Tensor]:
+def momenta(medium: MpmDomain, material_points: ParticleParams, state: Particles) -> tuple[Tensor, Tensor]:
     """Linear and angular momentum; an affine field C has the angular momentum m h^2/4 of its skew part."""
-    mass = mpm.density(medium, matter) * matter.volume
+    mass = mpm.density(medium, material_points) * material_points.volume
     c = state.affine * medium.grid.spacing**2 / 4
     spin = torch.stack([c[..., 7] - c[..., 5], c[..., 2] - c[..., 6], c[..., 3] - c[..., 1]], -1)
     turn = torch.linalg.cross(state.pos, state.vel) + spin
@@ -51,7 +67,7 @@ def derivative(value, number: Tensor, step: float) -> Tensor:
     return (8 * (f[1] - f[-1]) - (f[2] - f[-2])) / (12 * step)
 
 
-def with_number(matter: Matter, name: str, value: Tensor) -> Matter:
+def with_number(material_points: ParticleParams, name: str, value: Tensor) -> ParticleParams:
     """Matter of one group with one number of its law exchanged."""
-    ((group, numbers),) = matter.laws.items()
-    return tree.replace(matter, laws={group: {**numbers, name: value}})
+    ((group, numbers),) = material_points.laws.items()
+    return tree.replace(material_points, laws={group: {**numbers, name: value}})

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import torch
-from matter import DOUBLE, ONE, ball
+from material_points import DOUBLE, ONE, ball
 
-from torchdlo.coupling.bodies.dynamics import Solid, foresee, hold, place
+from torchdlo.coupling.bodies.dynamics import RigidBody, place, predict_free_motion, stationary_control
 from torchdlo.coupling.mpm import substep as mpm
 from torchdlo.coupling.mpm.body_coupling_effect import exchange
 from torchdlo.coupling.mpm.constitutive_models import Elastic
@@ -31,7 +31,7 @@ def a_mesh():
 
 def meeting(names, effect, mu=0.4):
     """Matter at random velocities and bodies that overlap it, before and after one exchange."""
-    medium, matter, state = ball(Elastic(), batch=(2,), shake=0.3)
+    medium, material_points, state = ball(Elastic(), batch=(2,), shake=0.3)
     generator, solids = torch.Generator().manual_seed(0), []
     for k, name in enumerate(names):
         size, motion = SHAPES[name]
@@ -41,7 +41,7 @@ def meeting(names, effect, mu=0.4):
         quat = torch.randn(4, generator=generator, dtype=DOUBLE)
         quat = quat if motion == "free" else (1.0, 0.0, 0.0, 0.0)
         solids.append(
-            Solid(
+            RigidBody(
                 name,
                 size,
                 (0.1, 0.105, 0.08 + 0.04 * k),
@@ -55,7 +55,7 @@ def meeting(names, effect, mu=0.4):
             )
         )
     bodies, params, placed = place(solids, state.pos)
-    motion = foresee(bodies, params, placed, hold(bodies, placed), 0.0, 0 * ONE, 2e-4)
-    nodes, _ = mpm.to_grid(medium, matter, state, 0 * ONE, 2e-4, ONE)
+    motion = predict_free_motion(bodies, params, placed, stationary_control(bodies, placed), 0.0, 0 * ONE, 2e-4)
+    nodes, _ = mpm.to_grid(medium, material_points, state, 0 * ONE, 2e-4, ONE)
     impulse, torque, after, lost = exchange(effect, medium.grid, nodes, motion, (2,))
     return medium.grid, nodes, after, motion, (impulse, torque, lost)

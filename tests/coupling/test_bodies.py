@@ -12,24 +12,26 @@ from touching import F64, line
 
 from torchdlo.coupling import RodBody
 from torchdlo.coupling.bodies import dynamics as bodies
-from torchdlo.coupling.bodies.dynamics import Solid, conjugate
+from torchdlo.coupling.bodies.dynamics import RigidBody, conjugate
 from torchdlo.physics import tree
-from torchdlo.physics.effects.base import Effect, Push
+from torchdlo.physics.effects.base import ContactForces, Effect
 from torchdlo.physics.effects.external import Gravity
 from torchdlo.physics.linalg.rotation import multiply, rotate
-from torchdlo.scene import Control, Rope, hold, make, rollout, step
+from torchdlo.scene import Control, Rope, make, rollout, stationary_control, step
 
 NONE = torch.zeros(1, 3, dtype=F64)
 
 
-def fly(solids: list[Solid], time: float, dt: float, gravity: float = 0.0):
+def fly(solids: list[RigidBody], time: float, dt: float, gravity: float = 0.0):
     """States of bodies under gravity alone, one per substep."""
     kinds, params, state = bodies.place(solids, NONE)
-    targets, seen = bodies.hold(kinds, state), [state]
+    targets, seen = bodies.stationary_control(kinds, state), [state]
     for k in range(round(time / dt)):
         first = torch.tensor([[float(k == 0)]], dtype=F64)
-        motion = bodies.foresee(kinds, params, state, targets, NONE.new_tensor([[0, 0, -gravity]]), first, dt)
-        state = bodies.advance(motion, targets, Push(NONE, NONE, NONE))
+        motion = bodies.predict_free_motion(
+            kinds, params, state, targets, NONE.new_tensor([[0, 0, -gravity]]), first, dt
+        )
+        state = bodies.advance(motion, targets, ContactForces(NONE, NONE, NONE))
         seen.append(state)
     return params, seen
 
@@ -40,7 +42,7 @@ def spin_of(params, state):
     return rotate(state.quat, params.inertia * local), 0.5 * (params.inertia * local.square()).sum(-1)
 
 
-TUMBLING = Solid("box", (0.1, 0.2, 0.3), density=1000.0, omega=(0.1, 6.0, 0.05))
+TUMBLING = RigidBody("box", (0.1, 0.2, 0.3), density=1000.0, omega=(0.1, 6.0, 0.05))
 """Turns about its middle axis, which is not stable."""
 
 
@@ -68,7 +70,7 @@ def test_spin_is_second_order():
 
 def test_a_symmetric_top_turns_as_in_closed_form():
     # Its axis turns about the angular momentum L at the rate L / I_1 (Landau and Lifshitz, Mechanics, section 33).
-    params, seen = fly([Solid("cylinder", (0.1, 0.02), mass=1.0, omega=(1.0, 0.0, 3.0))], 1.0, 1e-3)
+    params, seen = fly([RigidBody("cylinder", (0.1, 0.02), mass=1.0, omega=(1.0, 0.0, 3.0))], 1.0, 1e-3)
     momentum, _ = spin_of(params, seen[0])
     rate = momentum / params.inertia[..., :1]
     axis = rotate(bodies.turn_by(rate * 1.0), torch.tensor([[0.0, 0.0, 1.0]], dtype=F64))
@@ -78,9 +80,9 @@ def test_a_symmetric_top_turns_as_in_closed_form():
 
 def test_free_fall_is_exact_and_damping_is_exponential():
     # Stoermer-Verlet is exact under a constant force.
-    _, seen = fly([Solid("sphere", 0.1, mass=2.0, vel=(1.0, 0, 2.0))], 0.5, 5e-3, 9.81)
+    _, seen = fly([RigidBody("sphere", 0.1, mass=2.0, vel=(1.0, 0, 2.0))], 0.5, 5e-3, 9.81)
     assert float(seen[-1].pos[0, 2]) == pytest.approx(2.0 * 0.5 - 0.5 * 9.81 * 0.25, abs=1e-12)
-    _, seen = fly([Solid("sphere", 0.1, mass=2.0, vel=(1.0, 0, 0), omega=(0, 2.0, 0), damping=3.0)], 0.5, 5e-3)
+    _, seen = fly([RigidBody("sphere", 0.1, mass=2.0, vel=(1.0, 0, 0), omega=(0, 2.0, 0), damping=3.0)], 0.5, 5e-3)
     assert float(seen[-1].vel[0, 0]) == pytest.approx(math.exp(-1.5), rel=1e-9)
     assert float(seen[-1].omega[0, 1]) == pytest.approx(2 * math.exp(-1.5), rel=1e-9)
 
@@ -98,16 +100,17 @@ def test_rotation_vectors_lead_from_one_pose_to_another():
     )
 
 
-def scene_of(*solids: Solid, effects: Sequence[Effect] = (), **choices: Any):
+def scene_of(*solids: RigidBody, effects: Sequence[Effect] = (), **choices: Any):
     rope = Rope(line(4, 0.1), radius=0.005, density=1000.0)
     return make([rope], [Gravity(), *effects], bodies=solids, dt=1e-3, substeps=4, **choices)
 
 
 def test_kinematic_bodies_follow_control_evenly_and_fixed_ones_stay():
     scene, params, state = scene_of(
-        Solid("sphere", 0.02, motion="kinematic", pos=(0, 0, 1.0)), Solid("plane", pos=(0, 0, -1.0), motion="fixed")
+        RigidBody("sphere", 0.02, motion="kinematic", pos=(0, 0, 1.0)),
+        RigidBody("plane", pos=(0, 0, -1.0), motion="fixed"),
     )
-    control = hold(scene, state)
+    control = stationary_control(scene, state)
     turn = torch.tensor([[0.0, 0.0, 0.01]], dtype=F64)
     targets = tree.replace(
         control.bodies, pos=control.bodies.pos + 0.002, quat=multiply(bodies.turn_by(turn), control.bodies.quat)
@@ -123,36 +126,36 @@ def test_kinematic_bodies_follow_control_evenly_and_fixed_ones_stay():
 
 def test_bodies_run_in_batches_and_rollouts():
     pos = torch.tensor([[0.0, 0.0, 1.0], [0.0, 0.0, 2.0]], dtype=F64)
-    scene, params, state = scene_of(Solid("box", (0.1, 0.2, 0.3), pos=pos, mass=1.0, omega=(1.0, 2.0, 3.0)))
+    scene, params, state = scene_of(RigidBody("box", (0.1, 0.2, 0.3), pos=pos, mass=1.0, omega=(1.0, 2.0, 3.0)))
     assert state.rods.pos.shape == (2, 4, 3) and state.bodies.quat.shape == (2, 1, 4)
-    controls = tree.map(lambda c: c.expand(3, *c.shape), hold(scene, state))
+    controls = tree.map(lambda c: c.expand(3, *c.shape), stationary_control(scene, state))
     last, path = rollout(lambda *a: step(scene, *a), params, state, controls, keep=lambda s: s.bodies.pos)
     assert path.shape == (3, 2, 1, 3) and bool((last.bodies.quat[0] == last.bodies.quat[1]).all())
 
 
 def test_a_scene_without_bodies_has_none_in_its_trees():
     scene, params, state = make([Rope(line(4, 0.1), radius=0.005, density=1000.0)], [Gravity()], dt=1e-3)
-    assert params.bodies == state.bodies == hold(scene, state).bodies == ()
+    assert params.bodies == state.bodies == stationary_control(scene, state).bodies == ()
 
 
 @pytest.mark.parametrize(
     ("solid", "words"),
     [
-        (Solid("egg", 1.0), "expected one of"),
-        (Solid("sphere", (1.0, 2.0), mass=1.0), "expected (..., 1)"),
-        (Solid("sphere", 0.0, mass=1.0), "more than 0"),
-        (Solid("sphere", 0.1), "either mass or density"),
-        (Solid("sphere", 0.1, mass=1.0, density=1.0), "either mass or density"),
-        (Solid("sphere", 0.1, mass=-1.0), "more than 0"),
-        (Solid("plane"), "no mass"),
-        (Solid("sphere", 0.1, motion="fixed", vel=(1.0, 0, 0)), "only free bodies"),
-        (Solid("sphere", 0.1, motion="floating"), "expected one of"),
-        (Solid("torus", (0.1, 0.2), mass=1.0), "thicker"),
-        (Solid("ring", (0.2, 0.1, 7.0), mass=1.0), "whole turn"),
-        (Solid("sphere", 0.1, mass=1.0, quat=(0.0, 0.0, 0.0, 0.0)), "zero"),
-        (Solid("sphere", 0.1, mass=1.0, pos=(0.0, math.nan, 0.0)), "finite"),
-        (Solid("sphere", 0.1, mass=1.0, mu_k=-0.1), "0 or more"),
-        (Solid("mesh", (0.1, 0.1, 0.1), mass=1.0), "needs a grid"),
+        (RigidBody("egg", 1.0), "expected one of"),
+        (RigidBody("sphere", (1.0, 2.0), mass=1.0), "expected (..., 1)"),
+        (RigidBody("sphere", 0.0, mass=1.0), "more than 0"),
+        (RigidBody("sphere", 0.1), "either mass or density"),
+        (RigidBody("sphere", 0.1, mass=1.0, density=1.0), "either mass or density"),
+        (RigidBody("sphere", 0.1, mass=-1.0), "more than 0"),
+        (RigidBody("plane"), "no mass"),
+        (RigidBody("sphere", 0.1, motion="fixed", vel=(1.0, 0, 0)), "only free bodies"),
+        (RigidBody("sphere", 0.1, motion="floating"), "expected one of"),
+        (RigidBody("torus", (0.1, 0.2), mass=1.0), "thicker"),
+        (RigidBody("ring", (0.2, 0.1, 7.0), mass=1.0), "whole turn"),
+        (RigidBody("sphere", 0.1, mass=1.0, quat=(0.0, 0.0, 0.0, 0.0)), "zero"),
+        (RigidBody("sphere", 0.1, mass=1.0, pos=(0.0, math.nan, 0.0)), "finite"),
+        (RigidBody("sphere", 0.1, mass=1.0, mu_k=-0.1), "0 or more"),
+        (RigidBody("mesh", (0.1, 0.1, 0.1), mass=1.0), "needs a grid"),
     ],
     ids=lambda x: x if isinstance(x, str) else "",
 )
@@ -166,8 +169,8 @@ def test_bad_scenes_and_controls_are_refused():
     with pytest.raises(ValueError, match="no bodies"):
         scene_of(effects=(RodBody(),))
     with pytest.raises(ValueError, match="rename one"):
-        scene_of(Solid("plane", motion="fixed", name="a"), Solid("sphere", 0.1, motion="fixed", name="a"))
-    scene, params, state = scene_of(Solid("plane", motion="kinematic"))
-    control = hold(scene, state)
+        scene_of(RigidBody("plane", motion="fixed", name="a"), RigidBody("sphere", 0.1, motion="fixed", name="a"))
+    scene, params, state = scene_of(RigidBody("plane", motion="kinematic"))
+    control = stationary_control(scene, state)
     with pytest.raises(ValueError, match="poses of 1 kinematic"):
         step(scene, params, state, Control(control.pos, control.director))

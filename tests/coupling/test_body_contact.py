@@ -11,19 +11,19 @@ import torch
 from tests.coupling.tumbling import F64, SHAPES, G, energy, ground, momenta, move, run
 from torchdlo.coupling.bodies import contact_op
 from torchdlo.coupling.bodies.contact_effect import BodyContact
-from torchdlo.coupling.bodies.dynamics import Solid, place
+from torchdlo.coupling.bodies.dynamics import RigidBody, place
 from torchdlo.physics import tree
 
 R = 0.05
 
 
-def ball(x: float, v: float = 0.0, **numbers) -> Solid:
+def ball(x: float, v: float = 0.0, **numbers) -> RigidBody:
     given = {"mass": 1.0, "restitution": 1.0} | numbers
-    return Solid("sphere", R, (x, 0.0, 0.0), vel=(v, 0.0, 0.0), **given)
+    return RigidBody("sphere", R, (x, 0.0, 0.0), vel=(v, 0.0, 0.0), **given)
 
 
-def box(pos=(0.0, 0.0, R), half=(R, R, R), **numbers) -> Solid:
-    return Solid("box", half, pos, **({"density": 500.0} | numbers))
+def box(pos=(0.0, 0.0, R), half=(R, R, R), **numbers) -> RigidBody:
+    return RigidBody("box", half, pos, **({"density": 500.0} | numbers))
 
 
 def tilted(angle: float) -> tuple[float, float, float]:
@@ -54,8 +54,10 @@ def test_a_row_of_balls_hands_the_speed_on() -> None:
 def test_every_pair_collides_and_conserves_momentum(one: str, other: str) -> None:
     turn = (0.8, 0.3, -0.4, 0.33)
     solids = [
-        Solid(one, SHAPES[one], (0.0, 0.0, 0.0), turn, (0.6, 0.1, 0.0), (1.0, 2.0, -1.0), density=600.0),
-        Solid(other, SHAPES[other], (0.17, 0.01, 0.01), turn[::-1], (-0.6, 0.0, 0.1), (0.5, -1.0, 2.0), density=900.0),
+        RigidBody(one, SHAPES[one], (0.0, 0.0, 0.0), turn, (0.6, 0.1, 0.0), (1.0, 2.0, -1.0), density=600.0),
+        RigidBody(
+            other, SHAPES[other], (0.17, 0.01, 0.01), turn[::-1], (-0.6, 0.0, 0.1), (0.5, -1.0, 2.0), density=900.0
+        ),
     ]
     params, start, end = run(solids, 0.12, 2e-3, gravity=(0, 0, 0))
     assert (end.vel[0] - start.vel[0]).norm() > 0.1  # they met
@@ -124,7 +126,7 @@ def test_round_bodies_roll_without_slip_or_spin_as_they_slip(shape: str) -> None
     angle, time = 0.2, 0.2
     for mu in (0.3, 0.04):
         rough = {"mu_s": mu, "mu_k": mu}
-        rolling = Solid(shape, size, (0, 0, radius), turn, density=500.0, **rough)
+        rolling = RigidBody(shape, size, (0, 0, radius), turn, density=500.0, **rough)
         params, _, end = run([ground(**rough), rolling], time, 1e-3, gravity=tilted(angle))
         q = float(params.inertia[1, 0 if shape == "sphere" else 2] / (params.mass[1] * radius**2))
         assert share is None or q == pytest.approx(share)
@@ -143,7 +145,9 @@ def test_a_ball_bounces_with_the_restitution() -> None:
     e, h, dt = 0.8, 0.2, 5e-4
     fall = math.sqrt(2 * h / G)
     bouncing = {"restitution": e}
-    _, _, end = run([ground(**bouncing), Solid("sphere", R, (0, 0, R + h), mass=1.0, **bouncing)], fall * (1 + e), dt)
+    _, _, end = run(
+        [ground(**bouncing), RigidBody("sphere", R, (0, 0, R + h), mass=1.0, **bouncing)], fall * (1 + e), dt
+    )
     assert end.pos[1, 2] - R == pytest.approx(e * e * h, abs=2 * math.sqrt(2 * G * h) * dt)
 
 
@@ -153,7 +157,7 @@ def test_scenes_of_a_batch_do_not_touch() -> None:
     quat = (0.9, 0.1, 0.2, 0.3)
 
     def fallen(at) -> torch.Tensor:
-        bodies = [ground(), box(at, quat=quat), Solid("capsule", (0.02, 0.05), (0.02, 0.01, 0.2), mass=0.3)]
+        bodies = [ground(), box(at, quat=quat), RigidBody("capsule", (0.02, 0.05), (0.02, 0.01, 0.2), mass=0.3)]
         return run(bodies, 0.1, 2e-3)[2].pos
 
     together = fallen(pos)
@@ -167,7 +171,7 @@ def test_gradients_of_200_steps_agree_with_differences() -> None:
         ground(),
         box(half=(R, 0.03, 0.02), pos=(0, 0.3, 0.02), vel=(0.9, 0.0, 0.0), omega=(0, 0, 3.0), mu_s=0.2, mu_k=0.2),
         ball(0.0, 0.5, mu_s=0.2, mu_k=0.2, restitution=0.6),
-        Solid("sphere", 0.04, (0.12, 0.02, 0.01), mass=0.4, restitution=0.7),
+        RigidBody("sphere", 0.04, (0.12, 0.02, 0.01), mass=0.4, restitution=0.7),
     ]
     like = torch.zeros(1, dtype=F64)
     kinds, params, state = place(bodies, like)
@@ -207,7 +211,7 @@ def test_gradients_know_that_bodies_at_rest_are_held_by_friction(shape: str, ker
     height = {"box": 0.03, "cylinder": 0.05, "sphere": 0.05}[shape]
     rub = {"mu_s": 0.6, "mu_k": 0.6, "density": 120.0}
     kinds, params, state = place(
-        [ground(**rub), Solid(shape, size, (0.0, 0.0, height), **rub)], torch.zeros(1, dtype=F64)
+        [ground(**rub), RigidBody(shape, size, (0.0, 0.0, height), **rub)], torch.zeros(1, dtype=F64)
     )
     if not kernel:
         monkeypatch.setattr(contact_op, "fits", lambda _: False)
@@ -222,23 +226,23 @@ def test_gradients_know_that_bodies_at_rest_are_held_by_friction(shape: str, ker
 
     with torch.no_grad():
         rest = move(kinds, params, state, 100, 1e-3, gravity, BodyContact())
-    slopes = torch.autograd.functional.jacobian(lambda x: speeds(x, rest), torch.zeros(6, dtype=F64))
+    gradients = torch.autograd.functional.jacobian(lambda x: speeds(x, rest), torch.zeros(6, dtype=F64))
     with torch.no_grad():
         steps = 1e-7 * torch.eye(6, dtype=F64)
         differences = torch.stack([(speeds(x, rest) - speeds(-x, rest)) / 2e-7 for x in steps], -1)
     # Upwards it is another thing to push a body than downwards.
     across = [0, 1, 3, 4] if shape == "sphere" else [0, 1, 5]
-    torch.testing.assert_close(slopes[:, across], differences[:, across], atol=2e-3, rtol=1e-3)
+    torch.testing.assert_close(gradients[:, across], differences[:, across], atol=2e-3, rtol=1e-3)
     # Friction alone stops what slides; a ball is set rolling by 5/7 of what is left of both.
-    assert slopes[:2, :2].abs().max() < (0.8 if shape == "sphere" else 1e-3)
+    assert gradients[:2, :2].abs().max() < (0.8 if shape == "sphere" else 1e-3)
 
 
 @pytest.mark.parametrize("kernel", [True, False])
 def test_gradients_hold_where_rounds_have_not_found_the_slip(kernel: bool, monkeypatch) -> None:
     # A box slides and spins on the ground, hit by a ball that turns fast: six rounds are too few for both.
     rub = {"mu_s": 0.6, "mu_k": 0.5, "density": 120.0}
-    solids = [ground(**rub), Solid("box", (0.03, 0.03, 0.03), (0.0, 0.0, 0.03), **rub)]
-    solids += [Solid("sphere", 0.03, (0.0, -0.0599, 0.035), **rub)]
+    solids = [ground(**rub), RigidBody("box", (0.03, 0.03, 0.03), (0.0, 0.0, 0.03), **rub)]
+    solids += [RigidBody("sphere", 0.03, (0.0, -0.0599, 0.035), **rub)]
     kinds, params, state = place(solids, torch.zeros(1, dtype=F64))
     if not kernel:
         monkeypatch.setattr(contact_op, "fits", lambda _: False)
@@ -253,11 +257,11 @@ def test_gradients_hold_where_rounds_have_not_found_the_slip(kernel: bool, monke
         return torch.cat([end.vel[1:], end.omega[1:]], -1)
 
     x = torch.tensor([[0.8, 0.3, -0.01, 0.1, 0.2, 8.0], [0.3, 0.7, -0.02, -30.0, 3.0, 2.0]], dtype=F64)
-    slopes = torch.autograd.functional.jacobian(speeds, x).flatten(2).flatten(0, 1)
+    gradients = torch.autograd.functional.jacobian(speeds, x).flatten(2).flatten(0, 1)
     with torch.no_grad():
         steps = 1e-7 * torch.eye(12, dtype=F64).unflatten(-1, (2, 6))
         differences = torch.stack([(speeds(x + h) - speeds(x - h)).flatten() / 2e-7 for h in steps], -1)
-    torch.testing.assert_close(slopes, differences, atol=2e-3, rtol=1e-3)
+    torch.testing.assert_close(gradients, differences, atol=2e-3, rtol=1e-3)
 
 
 def test_single_precision_stands_too() -> None:

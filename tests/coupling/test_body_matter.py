@@ -7,16 +7,16 @@ from functools import partial
 
 import pytest
 import torch
-from matter import DOUBLE, OPEN, momenta
+from material_points import DOUBLE, OPEN, momenta
 from meetings import SHAPES, meeting
 
 from torchdlo import scene
-from torchdlo.coupling import BodyMatter
-from torchdlo.coupling.bodies.dynamics import Solid, conjugate
+from torchdlo.coupling import BodyMpmCoupling
+from torchdlo.coupling.bodies.dynamics import RigidBody, conjugate
 from torchdlo.coupling.mpm import substep as mpm
 from torchdlo.coupling.mpm.constitutive_models import Elastic, Liquid
-from torchdlo.coupling.mpm.particles import Blob, Grid, assemble, fill_box
-from torchdlo.coupling.mpm.rod_coupling_effect import RodMatter
+from torchdlo.coupling.mpm.particles import Grid, ParticleBlock, assemble, fill_box
+from torchdlo.coupling.mpm.rod_coupling_effect import RodMpmCoupling
 from torchdlo.physics import tree
 from torchdlo.physics.effects.external import Gravity
 from torchdlo.physics.linalg.rotation import rotate
@@ -24,14 +24,22 @@ from torchdlo.physics.linalg.rotation import rotate
 SPACING, G = 0.01, 9.81
 
 
-def world(matter, bodies, effects=(), gravity=True, dt=1e-3, substeps=5, batch=()):
+def world(material_points, bodies, effects=(), gravity=True, dt=1e-3, substeps=5, batch=()):
     """A scene of bodies and matter, with a short held rope far away."""
     x = torch.zeros(*batch, 3, 3, dtype=DOUBLE)
     x[..., 0], x[..., 2] = torch.linspace(0, 0.02, 3), 3.0
     rope = scene.Rope(x, radius=1e-3, density=1000.0, bend=1e-6)
-    acting = [*([Gravity()] if gravity else []), *(effects or [BodyMatter()])]
-    made = scene.make([rope], acting, bodies=bodies, matter=matter, dt=dt, substeps=substeps, held_vertices=(0, 1, 2))
-    return (*made, scene.hold(made[0], made[2]))
+    acting = [*([Gravity()] if gravity else []), *(effects or [BodyMpmCoupling()])]
+    made = scene.make(
+        [rope],
+        acting,
+        bodies=bodies,
+        material_points=material_points,
+        dt=dt,
+        substeps=substeps,
+        prescribed_vertices=(0, 1, 2),
+    )
+    return (*made, scene.stationary_control(made[0], made[2]))
 
 
 def go(made, steps, keep=None):
@@ -48,22 +56,22 @@ def go(made, steps, keep=None):
 def block(low, high, law=None, walls=OPEN, box=((0.0,) * 3, (0.2,) * 3), spacing=0.005, window=None, **numbers):
     x = fill_box(low, high, spacing, torch.zeros((), dtype=DOUBLE))
     volume = math.prod(b - a for a, b in zip(low, high, strict=True)) / len(x)
-    blob = Blob(x, law or Elastic(), volume, numbers=numbers)
+    blob = ParticleBlock(x, law or Elastic(), volume, numbers=numbers)
     return assemble([blob], Grid(*box, SPACING, walls, window), friction=0.0)
 
 
 def thrown(vel, mu=0.0, effect=None, batch=(), density=1500.0):
     """A spinning ball above a block that floats in space, at a speed towards it."""
-    solid = Solid(
+    solid = RigidBody(
         "sphere", 0.02, pos=(0.1, 0.1, 0.105), vel=vel, omega=(0.0, 3.0, 0.0), density=density, mu_s=mu, mu_k=mu
     )
-    matter = block((0.075, 0.075, 0.04), (0.125, 0.125, 0.08), window=(12, 12, 10), youngs=5e4)
-    return world(matter, [solid], [effect or BodyMatter()], gravity=False, batch=batch)
+    material_points = block((0.075, 0.075, 0.04), (0.125, 0.125, 0.08), window=(12, 12, 10), youngs=5e4)
+    return world(material_points, [solid], [effect or BodyMpmCoupling()], gravity=False, batch=batch)
 
 
 def whole(params, cable, state):
     """Momentum, angular momentum, and the momentum of the bodies."""
-    line, turn = momenta(cable.matter, params.matter, state.matter)
+    line, turn = momenta(cable.material_points, params.material_points, state.material_points)
     b, moved = state.bodies, params.bodies.mass * state.bodies.vel
     own = rotate(b.quat, params.bodies.inertia * rotate(conjugate(b.quat), b.omega))
     return line + moved.sum(-2), turn + (torch.linalg.cross(b.pos, moved) + own).sum(-2), moved.sum(-2)
@@ -99,7 +107,7 @@ def sums(grid, nodes, motion, impulse, torque):
 @pytest.mark.parametrize("sweeps", [1, 4, 30])
 @pytest.mark.parametrize("names", [*([n] for n in SHAPES if n != "plane"), ["box", "sphere"]], ids="-".join)
 def test_bodies_of_all_shapes_keep_momentum_and_never_add_energy(names, sweeps):
-    grid, nodes, after, motion, (impulse, torque, lost) = meeting(names, BodyMatter(sweeps=sweeps, recovery=0.0))
+    grid, nodes, after, motion, (impulse, torque, lost) = meeting(names, BodyMpmCoupling(sweeps=sweeps, recovery=0.0))
     assert float(impulse.norm()) > 1e-4 and float(lost.max()) == 0
     before = sums(grid, nodes, motion, torch.zeros_like(impulse), torch.zeros_like(torque))
     later = sums(grid, after, motion, impulse, torque)
@@ -111,21 +119,21 @@ def test_bodies_of_all_shapes_keep_momentum_and_never_add_energy(names, sweeps):
 
 
 def test_sweeps_converge():
-    found = [meeting(["box"], BodyMatter(sweeps=n))[4][0] for n in (4, 16, 64, 256)]
+    found = [meeting(["box"], BodyMpmCoupling(sweeps=n))[4][0] for n in (4, 16, 64, 256)]
     errors = [float((f - found[-1]).norm() / found[-1].norm()) for f in found[:-1]]
     assert errors[0] > 2 * errors[1] > 4 * errors[2]
 
 
 def test_nodes_far_from_bodies_need_no_room():
-    everything, some = (meeting(["box", "sphere"], BodyMatter(room=n)) for n in (0, 1000))
+    everything, some = (meeting(["box", "sphere"], BodyMpmCoupling(room=n)) for n in (0, 1000))
     assert float(some[4][2].max()) == 0
     assert torch.allclose(everything[4][0], some[4][0], atol=1e-16, rtol=0)
     assert torch.allclose(everything[2].vel, some[2].vel, atol=1e-13, rtol=0)
-    assert float(meeting(["box", "sphere"], BodyMatter(room=50))[4][2].min()) > 0
+    assert float(meeting(["box", "sphere"], BodyMpmCoupling(room=50))[4][2].min()) > 0
 
 
 def test_nodes_without_room_are_reported():
-    end = go(thrown((0.0, 0.0, -1.0), effect=BodyMatter(room=10)), 14)
+    end = go(thrown((0.0, 0.0, -1.0), effect=BodyMpmCoupling(room=10)), 14)
     assert not bool(scene.ok(end))
 
 
@@ -145,7 +153,7 @@ def test_a_box_comes_to_rest_on_a_block_at_the_depth_of_its_weight():
             poisson=0.0,
             density=density,
         ),
-        [Solid("box", (0.05, 0.05, 0.01), pos=(0.02, 0.02, 0.071), mass=mass, damping=60.0)],
+        [RigidBody("box", (0.05, 0.05, 0.01), pos=(0.02, 0.02, 0.071), mass=mass, damping=60.0)],
         substeps=1,
     )
     with torch.no_grad():
@@ -156,9 +164,9 @@ def test_a_box_comes_to_rest_on_a_block_at_the_depth_of_its_weight():
     assert abs(float(height_then[-1]) - 0.01 - (height - depth)) < 0.5 * SPACING
     # The virial of what is at rest: volume times stress is force times height, of plate and gravity. The plate's force
     # acts at nodes that are up to one spacing off it.
-    stretch = (1 + end.matter.strain[:, 2]).sqrt()
+    stretch = (1 + end.material_points.strain[:, 2]).sqrt()
     stress = youngs * (stretch.square() - stretch)  # Kirchhoff's
-    volume, z = made[1].matter.volume[:, 0], end.matter.pos[:, 2]
+    volume, z = made[1].material_points.volume[:, 0], end.material_points.pos[:, 2]
     pressed = -(volume * (stress + density * G * z)).sum() / (mass * G)
     assert abs(float(pressed) - (float(height_then[-1]) - 0.01)) < SPACING
 
@@ -171,8 +179,8 @@ def test_a_floating_cylinder_displaces_its_weight():
     at = 0.075
     x = x[(x[:, [0, 2]] - x.new_tensor([width / 2, at])).norm(dim=-1) > radius]
     grid = Grid((0.0,) * 3, (width, across, 0.14), SPACING, ("slip",) * 4 + ("separate",) * 2)
-    water = assemble([Blob(x, Liquid(), (SPACING / 2) ** 3, numbers={"bulk": 5e4, "viscosity": 10.0})], grid)
-    cylinder = Solid(
+    water = assemble([ParticleBlock(x, Liquid(), (SPACING / 2) ** 3, numbers={"bulk": 5e4, "viscosity": 10.0})], grid)
+    cylinder = RigidBody(
         "cylinder",
         (radius, 0.1),
         (width / 2, across / 2, at),
@@ -183,7 +191,7 @@ def test_a_floating_cylinder_displaces_its_weight():
         mu_s=0.0,
         mu_k=0.0,
     )
-    made = world(water, [cylinder], [BodyMatter(room=400)], dt=5e-4, substeps=1)
+    made = world(water, [cylinder], [BodyMpmCoupling(room=400)], dt=5e-4, substeps=1)
     with torch.no_grad():
         _, height = go(made, 800, keep=lambda s: s.bodies.pos[0, 2])
     height = float(height[-200:].mean())
@@ -204,19 +212,19 @@ def test_a_floating_cylinder_displaces_its_weight():
 def test_liquid_stays_in_a_box_of_bodies():
     thick, half, tall = 0.02, 0.03, 0.03
     middle = (0.07, 0.07)
-    walls = [Solid("box", (half + 2 * thick, half + 2 * thick, thick), (*middle, 0.04), motion="fixed")]
+    walls = [RigidBody("box", (half + 2 * thick, half + 2 * thick, thick), (*middle, 0.04), motion="fixed")]
     for axis in (0, 1):
         for side in (-1, 1):
             place_, size = [*middle, 0.06 + tall], [half + 2 * thick] * 2 + [tall]
             place_[axis] += side * (half + thick)
             size[axis] = thick
-            walls.append(Solid("box", tuple(size), tuple(place_), motion="fixed", mu_s=0.0, mu_k=0.0))
+            walls.append(RigidBody("box", tuple(size), tuple(place_), motion="fixed", mu_s=0.0, mu_k=0.0))
     water = block((0.045, 0.045, 0.06), (0.095, 0.095, 0.1), Liquid(), window=(12, 12, 10), bulk=2e4)
-    made = world(water, walls, [BodyMatter(sweeps=3, room=800)], substeps=1)
+    made = world(water, walls, [BodyMpmCoupling(sweeps=3, room=800)], substeps=1)
     with torch.no_grad():
         end = go(made, 250)
     scene.check_state(end)
-    x = end.matter.pos
+    x = end.material_points.pos
     assert float((x[:, :2] - x.new_tensor(middle)).abs().max()) < half + 0.5 * SPACING
     assert float(x[:, 2].min()) > 0.06 - 0.5 * SPACING
     # It has spread from wall to wall: 4 cm deep by 5^2 cm^2 are 2.8 cm by 6^2 cm^2.
@@ -230,10 +238,12 @@ def sliding(slope, mu, velocity, steps):
     down, up = x.new_tensor([c, 0.0, -s]), x.new_tensor([s, 0.0, c])
     x = x[:, :1] * down + x[:, 1:2] * x.new_tensor([0.0, 1.0, 0.0]) + (x[:, 2:] + 0.003) * up
     grid = Grid((-0.1, -0.05, -0.1), (0.2, 0.05, 0.1), SPACING, OPEN, window=(13, 9, 11))
-    stuff = assemble([Blob(x, Elastic(), 0.005**3, velocity * down, {"youngs": 5e4})], grid)
-    plane = Solid("plane", quat=(math.cos(slope / 2), 0.0, math.sin(slope / 2), 0.0), motion="fixed", mu_s=mu, mu_k=mu)
+    stuff = assemble([ParticleBlock(x, Elastic(), 0.005**3, velocity * down, {"youngs": 5e4})], grid)
+    plane = RigidBody(
+        "plane", quat=(math.cos(slope / 2), 0.0, math.sin(slope / 2), 0.0), motion="fixed", mu_s=mu, mu_k=mu
+    )
     with torch.no_grad():
-        return go(world(stuff, [plane]), steps, keep=lambda s: s.matter.vel.mean(0) @ down)[1]
+        return go(world(stuff, [plane]), steps, keep=lambda s: s.material_points.vel.mean(0) @ down)[1]
 
 
 def test_a_block_slides_with_coulomb_friction_and_sticks_below_its_angle():
@@ -249,10 +259,10 @@ def test_a_block_slides_with_coulomb_friction_and_sticks_below_its_angle():
 
 def test_matter_does_not_stay_inside():
     stuff = block((0.055,) * 3, (0.145,) * 3, Liquid(), spacing=SPACING, window=(14,) * 3, bulk=2e4)
-    made = world(stuff, [Solid("sphere", 0.04, (0.1,) * 3, motion="fixed")], gravity=False, substeps=1)
+    made = world(stuff, [RigidBody("sphere", 0.04, (0.1,) * 3, motion="fixed")], gravity=False, substeps=1)
 
     def depth(state):
-        return (0.04 - (state.matter.pos - 0.1).norm(dim=-1)).clamp(min=0.0).sum()
+        return (0.04 - (state.material_points.pos - 0.1).norm(dim=-1)).clamp(min=0.0).sum()
 
     with torch.no_grad():
         _, left = go(made, 150, keep=depth)
@@ -266,7 +276,7 @@ def test_a_scene_is_the_same_alone_and_in_a_batch():
     assert float((alone.bodies.vel - alone.bodies.vel.new_tensor([0.5, 0.0, -1.0])).norm()) > 0.1
     for now in range(3):
         assert torch.allclose(many.bodies.pos[now], alone.bodies.pos, atol=1e-13, rtol=0)
-        assert torch.allclose(many.matter.pos[now], alone.matter.pos, atol=1e-13, rtol=0)
+        assert torch.allclose(many.material_points.pos[now], alone.material_points.pos, atol=1e-13, rtol=0)
 
 
 def test_gradients_of_200_substeps_are_central_differences():
@@ -274,15 +284,15 @@ def test_gradients_of_200_substeps_are_central_differences():
 
     def values(speed, youngs):
         """One scene per speed of the ball and modulus of the block."""
-        cable, params, state, control = thrown((0.5, 0.0, -1.0), 0.3, BodyMatter(sweeps=2), batch=speed.shape)
-        ((group, law),) = params.matter.laws.items()
+        cable, params, state, control = thrown((0.5, 0.0, -1.0), 0.3, BodyMpmCoupling(sweeps=2), batch=speed.shape)
+        ((group, law),) = params.material_points.laws.items()
         laws = {group: {**law, "youngs": youngs.reshape(-1, 1, 1)}}
-        numbers = tree.replace(params, matter=tree.replace(params.matter, laws=laws))
+        numbers = tree.replace(params, material_points=tree.replace(params.material_points, laws=laws))
         vel = torch.cat([state.bodies.vel[..., :2], speed.reshape(-1, 1, 1)], -1)
         start = tree.replace(state, bodies=tree.replace(state.bodies, vel=vel))
         controls = tree.map(lambda c: c.expand(40, *c.shape), control)
         end, _ = scene.rollout(partial(scene.step, cable), numbers, start, controls, segment=5, keep=lambda s: s.time)
-        return (end.bodies.pos * weight[0]).sum((-1, -2)) + (end.matter.pos * weight).sum((-1, -2)) / 800
+        return (end.bodies.pos * weight[0]).sum((-1, -2)) + (end.material_points.pos * weight).sum((-1, -2)) / 800
 
     at = [torch.tensor([x], dtype=DOUBLE, requires_grad=True) for x in (-1.0, 5e4)]
     found = torch.autograd.grad(values(*at).sum(), at)
@@ -310,24 +320,24 @@ def test_compiled_steps_are_the_same(monkeypatch):
         )
         for _ in range(3):
             end = step(params, end, control)
-        found[compiled] = torch.autograd.grad(end.matter.pos.square().sum(), vel)[0]
+        found[compiled] = torch.autograd.grad(end.material_points.pos.square().sum(), vel)[0]
     assert float(found[False].abs().max()) > 0
     # The same operations in the same order.
     assert torch.allclose(found[True], found[False], rtol=1e-12, atol=1e-15)
 
 
 def test_a_body_and_a_rope_touch_the_same_matter():
-    solid = Solid("sphere", 0.02, pos=(0.1, 0.1, 0.105), vel=(0.0, 0.0, -1.0), density=1500.0)
-    matter = block((0.07, 0.07, 0.05), (0.13, 0.13, 0.08), box=((0.0,) * 3, (0.2, 0.2, 0.16)), youngs=5e4)
+    solid = RigidBody("sphere", 0.02, pos=(0.1, 0.1, 0.105), vel=(0.0, 0.0, -1.0), density=1500.0)
+    material_points = block((0.07, 0.07, 0.05), (0.13, 0.13, 0.08), box=((0.0,) * 3, (0.2, 0.2, 0.16)), youngs=5e4)
     x = torch.zeros(9, 3, dtype=DOUBLE)
     x[:, 0], x[:, 1], x[:, 2] = torch.linspace(0.02, 0.18, 9), 0.1, 0.032
     rope = scene.Rope(x, radius=0.005, density=1000.0, bend=1e-4)
-    made = scene.make([rope], [RodMatter(), BodyMatter()], bodies=[solid], matter=matter)
+    made = scene.make([rope], [RodMpmCoupling(), BodyMpmCoupling()], bodies=[solid], material_points=material_points)
     cable, params, state = made
     mass = params.rods.material.mass
     before = whole(params, cable, state)[0]
     with torch.no_grad():
-        end = go((*made, scene.hold(cable, state)), 30)
+        end = go((*made, scene.stationary_control(cable, state)), 30)
     felt = mass * end.rods.vel
     after = whole(params, cable, end)
     assert float(felt[:, 2].sum()) < -0.02 * float(before.norm())  # the ball pushes the block onto the rope
@@ -335,29 +345,29 @@ def test_a_body_and_a_rope_touch_the_same_matter():
 
 
 def test_planes_may_be_left_to_walls():
-    floor = Solid("plane", pos=(0.0, 0.0, 0.04), motion="fixed")
-    ball = Solid("sphere", 0.02, pos=(0.1, 0.1, 0.105), vel=(0.0, 0.0, -1.0), density=1500.0)
-    matter = block((0.075, 0.075, 0.04), (0.125, 0.125, 0.08), youngs=5e4)
+    floor = RigidBody("plane", pos=(0.0, 0.0, 0.04), motion="fixed")
+    ball = RigidBody("sphere", 0.02, pos=(0.1, 0.1, 0.105), vel=(0.0, 0.0, -1.0), density=1500.0)
+    material_points = block((0.075, 0.075, 0.04), (0.125, 0.125, 0.08), youngs=5e4)
 
     def met(solids, **choices):
-        return go(world(matter, solids, [BodyMatter(**choices)], gravity=False), 10)
+        return go(world(material_points, solids, [BodyMpmCoupling(**choices)], gravity=False), 10)
 
     alone, both, left = met([ball]), met([floor, ball]), met([floor, ball], planes=False)
-    assert torch.equal(left.matter.pos, alone.matter.pos)
+    assert torch.equal(left.material_points.pos, alone.material_points.pos)
     assert torch.equal(left.bodies.vel[1], alone.bodies.vel[0]) and not left.bodies.vel[0].any()
-    assert float((both.matter.pos - alone.matter.pos).abs().max()) > 1e-4
-    assert torch.equal(met([floor], planes=False).matter.pos, matter[2].pos)
+    assert float((both.material_points.pos - alone.material_points.pos).abs().max()) > 1e-4
+    assert torch.equal(met([floor], planes=False).material_points.pos, material_points[2].pos)
 
 
 def test_the_effect_needs_bodies_and_matter():
-    solid, matter = Solid("sphere", 0.02, density=100.0), block((0.07,) * 3, (0.1,) * 3)
+    solid, material_points = RigidBody("sphere", 0.02, density=100.0), block((0.07,) * 3, (0.1,) * 3)
     with pytest.raises(ValueError, match="BodyMatter is among the effects, but there is no matter"):
         world((), [solid])
     with pytest.raises(ValueError, match="BodyMatter or FingerPads needs bodies, but there are no bodies"):
-        world(matter, [])
+        world(material_points, [])
 
 
 @pytest.mark.parametrize("wrong", [{"sweeps": 0}, {"room": -1}, {"reach": -0.1}, {"recovery": -1.0}])
 def test_choices_that_make_no_sense_are_refused(wrong):
     with pytest.raises(ValueError, match=f"BodyMatter: {next(iter(wrong))} is"):
-        BodyMatter(**wrong)
+        BodyMpmCoupling(**wrong)

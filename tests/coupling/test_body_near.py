@@ -6,10 +6,10 @@ import dataclasses
 
 import pytest
 import torch
-from matter import DOUBLE
+from material_points import DOUBLE
 from meetings import SHAPES, meeting
 
-from torchdlo.coupling import BodyMatter
+from torchdlo.coupling import BodyMpmCoupling
 from torchdlo.coupling.mpm import body_broad_phase_op, body_coupling_effect
 from torchdlo.coupling.mpm import substep as mpm
 from torchdlo.physics import tree
@@ -24,9 +24,9 @@ CASES = [(names, room) for room, kinds in ((600, [[n] for n in SHAPES]), (60, SC
 
 @pytest.mark.parametrize(("names", "room"), [*CASES, (["box", "sphere"], 600), (["box", "sphere"], 60)])
 def test_the_kernel_chooses_as_tensors_do(names, room, monkeypatch):
-    found = meeting(names, BodyMatter(room=room, reach=0.7))
+    found = meeting(names, BodyMpmCoupling(room=room, reach=0.7))
     monkeypatch.setattr(body_broad_phase_op, "ready", lambda *_: False)
-    again = meeting(names, BodyMatter(room=room, reach=0.7))
+    again = meeting(names, BodyMpmCoupling(room=room, reach=0.7))
     for mine, theirs in zip((found[2].vel, *found[4]), (again[2].vel, *again[4]), strict=True):
         assert mine.shape == theirs.shape
         # Sums in another order; a node more or less would show in the third digit.
@@ -35,7 +35,7 @@ def test_the_kernel_chooses_as_tensors_do(names, room, monkeypatch):
 
 
 def test_of_nodes_that_are_as_far_either_is_right():
-    grid, nodes, _, motion, _ = meeting(["torus"], BodyMatter())
+    grid, nodes, _, motion, _ = meeting(["torus"], BodyMpmCoupling())
     solids, points = body_coupling_effect._solids(motion, (2,)), mpm.places(grid, nodes)
     off = body_coupling_effect._probe(motion, solids, points.unsqueeze(1))[0][:, 0, :, 0]
     mine, lost = body_broad_phase_op.choose(motion, grid, nodes, (2,), 0.007, 60)
@@ -46,7 +46,7 @@ def test_of_nodes_that_are_as_far_either_is_right():
 
 
 def test_the_kernel_chooses_every_node_once_and_none_without_mass():
-    grid, nodes, _, motion, _ = meeting(["box", "sphere"], BodyMatter())
+    grid, nodes, _, motion, _ = meeting(["box", "sphere"], BodyMpmCoupling())
     reach = 0.01
     near, lost = body_broad_phase_op.choose(motion, grid, nodes, (2,), reach, 700)
     assert all(len(row.unique()) == 700 for row in near) and not lost.any()

@@ -10,7 +10,13 @@ import torch
 from tests.coupling.tumbling import F64, SHAPES, ground
 from torchdlo.coupling.bodies import contact_op
 from torchdlo.coupling.bodies.contact_effect import BodyContact, resolve
-from torchdlo.coupling.bodies.dynamics import BodyMotion, Solid, foresee, hold, place
+from torchdlo.coupling.bodies.dynamics import (
+    PredictedBodyMotion,
+    RigidBody,
+    place,
+    predict_free_motion,
+    stationary_control,
+)
 from torchdlo.envs.assets.rigid_objects import pebble
 from torchdlo.physics import tree
 
@@ -21,7 +27,7 @@ SCENES = 11
 """Fill one block of lanes and a part of the next."""
 
 
-def thrown(kinds: tuple[str, ...], seed: int = 1) -> list[Solid]:
+def thrown(kinds: tuple[str, ...], seed: int = 1) -> list[RigidBody]:
     """Bodies that fly at each other, in another way in every scene; the first may be the ground."""
     g = torch.Generator().manual_seed(seed)
 
@@ -41,11 +47,11 @@ def thrown(kinds: tuple[str, ...], seed: int = 1) -> list[Solid]:
         if kind == "mesh":
             solids.append(pebble().solid(place, quat, name=f"mesh {k}", **numbers))
         else:
-            solids.append(Solid(kind, SHAPES[kind], place, quat, **numbers))
+            solids.append(RigidBody(kind, SHAPES[kind], place, quat, **numbers))
     return solids
 
 
-def answered(solids: list[Solid], contact: BodyContact, shift: float = 0.0):
+def answered(solids: list[RigidBody], contact: BodyContact, shift: float = 0.0):
     """Forces and torques, and the derivatives of a sum of them by all numbers, each of which is changed by a share."""
     kinds, params, state = place(solids, torch.zeros(SCENES, 1, 3, dtype=F64))
     leaves, build = tree.flatten((params, state))
@@ -57,7 +63,7 @@ def answered(solids: list[Solid], contact: BodyContact, shift: float = 0.0):
     leaves = [x.requires_grad_() for x in leaves if id(x) not in meshes]
     one = torch.zeros(1, 1, dtype=F64)
     pulled = torch.tensor([[0.0, 0.0, -9.81]], dtype=F64)
-    motion = foresee(kinds, params, state, hold(kinds, state), pulled, one, DT)
+    motion = predict_free_motion(kinds, params, state, stationary_control(kinds, state), pulled, one, DT)
     found = torch.cat([x.expand(SCENES, -1, -1) for x in resolve(contact, motion)], -1)
     weight = torch.sin(torch.arange(found.numel(), dtype=F64)).reshape(found.shape)
     gradient = torch.autograd.grad((weight * found).sum(), leaves, allow_unused=True)
@@ -102,22 +108,26 @@ def test_the_kernel_and_tensor_operations_agree_with_their_gradients(case: str, 
 def test_scenes_of_a_block_do_what_each_does_alone() -> None:
     solids = thrown(("plane", "box", "cylinder", "capsule"))
     kinds, params, state = place(solids, torch.zeros(SCENES, 1, 3, dtype=F64))
-    still, zero = hold(kinds, state), torch.zeros(1, 1, dtype=F64)
-    motion = foresee(kinds, params, state, still, 0.0, zero, DT)
+    still, zero = stationary_control(kinds, state), torch.zeros(1, 1, dtype=F64)
+    motion = predict_free_motion(kinds, params, state, still, 0.0, zero, DT)
     together = resolve(BodyContact(), motion)
     for k in (0, 7, 10):
         one = tree.map(lambda x, k=k: x[k : k + 1], state)
         own = params if params.mass.dim() == 2 else tree.map(lambda x, k=k: x[k : k + 1] if x.dim() == 3 else x, params)
-        alone = resolve(BodyContact(), foresee(kinds, own, one, hold(kinds, one), 0.0, zero, DT))
+        alone = resolve(
+            BodyContact(), predict_free_motion(kinds, own, one, stationary_control(kinds, one), 0.0, zero, DT)
+        )
         for whole, part in zip(together, alone, strict=True):
             assert torch.equal(whole[k : k + 1], part)
 
 
-def moving(pos: torch.Tensor, vel: tuple[float, float, float]) -> BodyMotion:
+def moving(pos: torch.Tensor, vel: tuple[float, float, float]) -> PredictedBodyMotion:
     """Two balls, the second one at rest at `pos`, (B, 3)."""
-    balls = [Solid("sphere", 0.05, vel=vel, mass=1.0), Solid("sphere", 0.05, pos, mass=1.0)]
+    balls = [RigidBody("sphere", 0.05, vel=vel, mass=1.0), RigidBody("sphere", 0.05, pos, mass=1.0)]
     kinds, params, state = place(balls, torch.zeros(len(pos), 1, 3, dtype=F64))
-    return foresee(kinds, params, state, hold(kinds, state), 0.0, torch.zeros(1, 1, dtype=F64), DT)
+    return predict_free_motion(
+        kinds, params, state, stationary_control(kinds, state), 0.0, torch.zeros(1, 1, dtype=F64), DT
+    )
 
 
 def test_pairs_are_skipped_only_where_they_cannot_meet() -> None:
@@ -143,7 +153,9 @@ def test_a_mesh_that_is_nowhere_is_nowhere_for_the_kernel_too(monkeypatch) -> No
     pos = state.pos.clone()
     pos[3, 0, 1] = torch.nan
     state = tree.replace(state, pos=pos)
-    motion = foresee(kinds, params, state, hold(kinds, state), 0.0, torch.zeros(1, 1, dtype=F64), DT)
+    motion = predict_free_motion(
+        kinds, params, state, stationary_control(kinds, state), 0.0, torch.zeros(1, 1, dtype=F64), DT
+    )
     found = resolve(BodyContact(), motion)[0]
     monkeypatch.setattr(contact_op, "ready", lambda *_: False)
     wanted = resolve(BodyContact(), motion)[0]

@@ -13,21 +13,21 @@ from torchdlo.envs.assets.rigid_objects import pebble
 from torchdlo.physics import tree
 from torchdlo.physics.effects.elastic import Bend
 from torchdlo.physics.effects.external import Damping, Gravity
-from torchdlo.scene import Rope, Solid, hold, make
+from torchdlo.scene import RigidBody, Rope, make, stationary_control
 
 pytestmark = pytest.mark.skipif(not body_sweeps.ready("cpu", F64), reason="there is no C++ compiler")
 
 SOLIDS = {
-    "plane": Solid("plane", pos=(0, 0, -0.0052), motion="fixed", mu_s=0.5, mu_k=0.3),
-    "box": Solid("box", (0.03, 0.02, 0.02), (-0.02, 0.01, 0.025), (0.95, 0.2, 0.1, 0.15), (0.2, 0.1, -1.0),
+    "plane": RigidBody("plane", pos=(0, 0, -0.0052), motion="fixed", mu_s=0.5, mu_k=0.3),
+    "box": RigidBody("box", (0.03, 0.02, 0.02), (-0.02, 0.01, 0.025), (0.95, 0.2, 0.1, 0.15), (0.2, 0.1, -1.0),
                  (3.0, 1.0, -2.0), density=300.0, restitution=0.3),
-    "sphere": Solid("sphere", 0.02, (0.06, 0.01, 0.024), vel=(0.0, 0.2, -1.0), density=300.0, restitution=0.2),
-    "cone": Solid("cone", (0.03, 0.05), (-0.09, 0.02, 0.016), (0.95, 0.2, 0.5, 0.15), (0.0, 0.2, -1.0), density=300.0),
-    "ring": Solid("ring", (0.03, 0.005, 4.0), (0.11, 0.01, 0.012), (0.8, 0.4, -0.3, 0.15), (0.0, 0.2, -1.0),
+    "sphere": RigidBody("sphere", 0.02, (0.06, 0.01, 0.024), vel=(0.0, 0.2, -1.0), density=300.0, restitution=0.2),
+    "cone": RigidBody("cone", (0.03, 0.05), (-0.09, 0.02, 0.016), (0.95, 0.2, 0.5, 0.15), (0.0, 0.2, -1.0), density=300.0),
+    "ring": RigidBody("ring", (0.03, 0.005, 4.0), (0.11, 0.01, 0.012), (0.8, 0.4, -0.3, 0.15), (0.0, 0.2, -1.0),
                   density=300.0),
-    "torus": Solid("torus", (0.03, 0.006), (0.02, 0.03, 0.018), (0.9, 0.3, 0.2, 0.15), (0.0, 0.2, -1.0), density=300.0),
-    "capsule": Solid("capsule", (0.01, 0.03), (-0.11, 0.03, 0.0125), (0.7, 0.7, 0.1, 0.0), motion="kinematic"),
-    "cylinder": Solid("cylinder", (0.01, 0.03), (0.14, 0.03, 0.017), (0.7, 0.6, 0.1, 0.0), (0.0, 0.0, -1.0),
+    "torus": RigidBody("torus", (0.03, 0.006), (0.02, 0.03, 0.018), (0.9, 0.3, 0.2, 0.15), (0.0, 0.2, -1.0), density=300.0),
+    "capsule": RigidBody("capsule", (0.01, 0.03), (-0.11, 0.03, 0.0125), (0.7, 0.7, 0.1, 0.0), motion="kinematic"),
+    "cylinder": RigidBody("cylinder", (0.01, 0.03), (0.14, 0.03, 0.017), (0.7, 0.6, 0.1, 0.0), (0.0, 0.0, -1.0),
                       density=200.0),
     "mesh": pebble().solid((-0.06, -0.02, 0.033), (0.9, 0.3, 0.2, 0.15), vel=(0.0, 0.2, -1.0), density=300.0),
 }  # fmt: skip
@@ -35,7 +35,7 @@ SOLIDS = {
 CHOICES = [{}, {"friction": False, "sweeps": 2}, {"rounds": 2, "pieces": 3}]
 
 
-def crossing(count: int, solids: list[Solid], **choices):
+def crossing(count: int, solids: list[RigidBody], **choices):
     """Two ropes in several scenes, a little higher in each, among bodies; the second one is a closed loop."""
     x = line(12, 0.3).expand(count, -1, -1).clone()
     x[..., 1] = 0.01 * torch.sin(9 * x[..., 0])
@@ -47,7 +47,7 @@ def crossing(count: int, solids: list[Solid], **choices):
         Rope(loop, radius=0.005, density=900.0, closed=True, bend=1e-4),
     ]
     effects = [Gravity(), Bend(), Damping(), RodBody(**choices)]
-    return make(ropes, effects, bodies=solids, dt=1e-3, substeps=2, held_vertices=(0,))
+    return make(ropes, effects, bodies=solids, dt=1e-3, substeps=2, prescribed_vertices=(0,))
 
 
 def rolled(made, frames: int) -> tuple[torch.Tensor, list[torch.Tensor]]:
@@ -60,7 +60,7 @@ def rolled(made, frames: int) -> tuple[torch.Tensor, list[torch.Tensor]]:
     learned = [x for x in leaves if x.requires_grad]
     bodies, material, now = build(leaves)
     params = tree.replace(params, bodies=bodies, rods=tree.replace(params.rods, material=material))
-    control = hold(choice, now)
+    control = stationary_control(choice, now)
     for _ in range(frames):
         now = scene.step(choice, params, now, control)
     moving = (now.rods.pos, now.rods.vel, now.bodies.pos, now.bodies.quat, now.bodies.vel, now.bodies.omega)
@@ -92,9 +92,9 @@ def test_edges_flat_on_a_surface_have_the_derivative_of_their_nearest_point(kern
     # It is the middle of each edge, and goes towards the end that is lowered.
     monkeypatch.setattr(body_sweeps, "ready", lambda *_, ready=body_sweeps.ready: kernel and ready(*_))
     x = line(4, 0.03)
-    table = Solid("box", (0.1, 0.1, 0.02), (0.0, 0.0, -0.0249), motion="fixed", mu_s=0.5, mu_k=0.3)
+    table = RigidBody("box", (0.1, 0.1, 0.02), (0.0, 0.0, -0.0249), motion="fixed", mu_s=0.5, mu_k=0.3)
     choice, params, state = make([Rope(x, radius=0.005, density=1e3)], [RodBody()], bodies=[table], dt=2e-4)
-    control = hold(choice, state)
+    control = stationary_control(choice, state)
 
     def turned(pos: torch.Tensor) -> torch.Tensor:
         now = tree.replace(state, rods=tree.replace(state.rods, pos=pos))
@@ -115,10 +115,10 @@ def test_what_is_pushed_on_to_a_body_that_was_far_touches_it(monkeypatch):
     x = line(12, 0.03).expand(3, -1, -1).clone()
     x[..., 2] -= 0.001 * torch.arange(3, dtype=F64)[:, None]
     rope = Rope(x, radius=0.005, density=1e3, bend=1e-4)
-    floor = Solid("plane", pos=(0, 0, 0.01), motion="fixed", mu_s=0.5, mu_k=0.3)
-    above = Solid("plane", pos=(0, 0, 0.0175), quat=(0, 1, 0, 0), motion="fixed", mu_s=0.5, mu_k=0.3)
+    floor = RigidBody("plane", pos=(0, 0, 0.01), motion="fixed", mu_s=0.5, mu_k=0.3)
+    above = RigidBody("plane", pos=(0, 0, 0.0175), quat=(0, 1, 0, 0), motion="fixed", mu_s=0.5, mu_k=0.3)
     alone, made = (make([rope], [RodBody()], bodies=[floor, *more], dt=1e-3, substeps=1) for more in ([], [above]))
-    moved = [scene.step(*each, hold(each[0], each[2])).rods.vel for each in (alone, made)]
+    moved = [scene.step(*each, stationary_control(each[0], each[2])).rods.vel for each in (alone, made)]
     assert bool(((moved[0] - moved[1]).norm(dim=-1).amax(-1) > 0.1).all()), "nothing was hit"
     found, gradient = rolled(made, 1)
     monkeypatch.setattr(body_sweeps, "ready", lambda *_: False)
@@ -136,7 +136,7 @@ def test_bodies_in_another_order_do_the_same():
         with torch.no_grad():
             state = made[2]
             for _ in range(4):
-                state = scene.step(*made[:2], state, hold(made[0], state))
+                state = scene.step(*made[:2], state, stationary_control(made[0], state))
         ends.append((state.rods.pos, state.bodies.pos[:, names.index("sphere")]))
     for one, other in zip(*ends, strict=True):
         assert torch.allclose(one, other, rtol=0, atol=1e-12)
@@ -162,7 +162,7 @@ def test_a_compiled_push_agrees_with_an_eager_one(monkeypatch):
         body_sweeps, "push", lambda *words, **named: given.append((words, named)) or push(*words, **named)
     )
     choice, params, state = crossing(2, [SOLIDS["plane"], SOLIDS["box"]])
-    scene.step(choice, params, state, hold(choice, state))
+    scene.step(choice, params, state, stationary_control(choice, state))
     (view, motion, *rest), named = given[-1]
 
     def pushed(change: torch.Tensor) -> torch.Tensor:

@@ -9,15 +9,15 @@ import torch
 from touching import F64, distances, line, momenta, nearest, run, two, with_velocity
 
 from torchdlo.coupling import RodContact
-from torchdlo.coupling.common.step_diagnostics import survey
+from torchdlo.coupling.common.step_diagnostics import broad_phase
 from torchdlo.coupling.rod_contact import solver_op as rod_pairs
 from torchdlo.physics import tree
 from torchdlo.physics.effects import base as effect
-from torchdlo.physics.effects.base import Motion
+from torchdlo.physics.effects.base import PredictedMotion
 from torchdlo.physics.effects.elastic import Bend
 from torchdlo.physics.effects.external import Damping, Gravity
 from torchdlo.physics.rod import kinematics as rod
-from torchdlo.scene import Rope, check_state, finite, hold, make, ok, step
+from torchdlo.scene import Rope, check_state, finite, make, ok, stationary_control, step
 
 ANGLES = pytest.mark.parametrize("angle", [0.0, math.pi / 6, math.pi / 2], ids=["parallel", "inclined", "crossed"])
 RUBBING = {"mu_s": 0.5, "mu_k": 0.4, "restitution": 0.3}
@@ -25,14 +25,14 @@ RUBBING = {"mu_s": 0.5, "mu_k": 0.4, "restitution": 0.3}
 
 def solved(scene, params, state, dt: float):
     """Contacts, their forces, and the forces on vertices, for free motion from a state."""
-    control = hold(scene, state)
-    values = survey(scene, params, state, control, control).effects["rod_contact"]
+    control = stationary_control(scene, state)
+    values = broad_phase(scene, params, state, control, control).effects["rod_contact"]
     rods = effect.altered(scene.effects, scene.topology, params.rods, params.effects)
     view = rod.view(scene.topology, rods, state.rods, dt)
     mobility = (dt * dt / rods.material.mass).expand_as(state.rods.pos)
-    motion = Motion(dt * state.rods.vel, mobility, mobility)
+    motion = PredictedMotion(dt * state.rods.vel, mobility, mobility)
     contact = next(e for e in scene.effects if e.name == "rod_contact")
-    return (*contact.solve(view, motion, values)[:2], contact.react(view, motion, values), values)
+    return (*contact.solve(view, motion, values)[:2], contact.solve_contact(view, motion, values), values)
 
 
 @ANGLES
@@ -169,7 +169,13 @@ def on_bars(tangent: float, mu_s: float, mu_k: float):
     for place in (-0.147, 0.153):
         ropes.append(Rope(line(3, 0.3, math.pi / 2, -2 * r) + torch.tensor([place, 0, 0]), radius=r, density=1000.0))
     values = {"gravity": {"acceleration": (0.0, 0.0, -G)}, "rod_contact": {"mu_s": mu_s, "mu_k": mu_k}}
-    choices = {"integrator": "implicit", "dt": 1e-3, "substeps": 1, "ahead": 0.5, "held_vertices": tuple(range(13, 19))}
+    choices = {
+        "integrator": "implicit",
+        "dt": 1e-3,
+        "substeps": 1,
+        "numerical_damping": 0.5,
+        "prescribed_vertices": tuple(range(13, 19)),
+    }
     scene, params, state = make(ropes, [Bend(), Gravity(), RodContact()], values, **choices)
     state = run(scene, params, state, 150)
     a = math.atan(tangent)
@@ -228,10 +234,13 @@ def test_batch_equals_loop_and_runs_repeat_bit_for_bit():
 def test_forward_motion_is_the_same_with_and_without_gradients():
     scene, params, state = two(0.5, 0.8, (0.3, 0.1, 0), RUBBING)
     plain = run(scene, params, state, 6)
-    control, graded = hold(scene, state), with_velocity(state, state.rods.vel.clone().requires_grad_())
+    control, with_gradient = (
+        stationary_control(scene, state),
+        with_velocity(state, state.rods.vel.clone().requires_grad_()),
+    )
     for _ in range(6):
-        graded = step(scene, params, graded, control)
-    assert torch.equal(plain.rods.pos, graded.rods.pos.detach())
+        with_gradient = step(scene, params, with_gradient, control)
+    assert torch.equal(plain.rods.pos, with_gradient.rods.pos.detach())
 
 
 def test_single_precision_is_close_to_double():
@@ -244,11 +253,11 @@ def test_single_precision_is_close_to_double():
 
 
 def test_a_held_rope_is_not_moved_and_pairs_of_held_edges_do_nothing():
-    scene, params, state = two(0.5, 0.8, (0.3, 0.1, 0), RUBBING, held_vertices=tuple(range(21, 42)))
+    scene, params, state = two(0.5, 0.8, (0.3, 0.1, 0), RUBBING, prescribed_vertices=tuple(range(21, 42)))
     after = run(scene, params, state, 10)
     assert torch.equal(after.rods.pos[21:], state.rods.pos[21:]) and bool(ok(after))
     assert nearest(after.rods.pos, (21, 21)) > 0.99 * 0.02
-    scene, params, state = two(0.5, 0.0, gap=-1e-3, held_vertices=tuple(range(42)))
+    scene, params, state = two(0.5, 0.0, gap=-1e-3, prescribed_vertices=tuple(range(42)))
     assert torch.equal(run(scene, params, state, 3).rods.pos, state.rods.pos)
 
 
@@ -273,7 +282,7 @@ def test_forces_and_gradients_are_finite_in_degenerate_states(case, dtype):
     leaves, rebuild = tree.flatten((params, state.rods))
     inputs = [p.detach().clone().requires_grad_() for p in leaves]
     given, rods = rebuild(inputs)
-    after = step(scene, given, tree.replace(state, rods=rods), hold(scene, state))
+    after = step(scene, given, tree.replace(state, rods=rods), stationary_control(scene, state))
     assert bool(finite(after))
     found = torch.autograd.grad(after.rods.pos.square().sum() + after.rods.vel.sum(), inputs, allow_unused=True)
     assert all(g is None or bool(torch.isfinite(g).all()) for g in found)
@@ -310,10 +319,10 @@ def test_held_vertices_that_overlap_do_not_throw_the_free_ends_of_their_edges(of
     ropes = [line(3, 0.04), line(3, 0.04, math.pi / 2, 0.02 - overlap) + torch.tensor([off, off, 0.0], dtype=F64)]
     ropes = [Rope(x, radius=0.01, mass=0.003) for x in ropes]
     rubbing = {"rod_contact": {"mu_s": 0.3, "mu_k": 0.3}}
-    made = make(ropes, [RodContact(), Damping()], rubbing, dt=dt, substeps=1, held_vertices=(1, 4))
+    made = make(ropes, [RodContact(), Damping()], rubbing, dt=dt, substeps=1, prescribed_vertices=(1, 4))
     scene, params, state = made
     fastest = []
     for _ in range(100):
-        state = step(scene, params, state, hold(scene, state))
+        state = step(scene, params, state, stationary_control(scene, state))
         fastest.append(float(state.rods.vel.norm(dim=-1).max()))
     assert max(fastest) < 2 * overlap / dt and fastest[-1] < 0.5

@@ -12,7 +12,7 @@ from torchdlo.coupling import RodContact
 from torchdlo.physics import tree
 from torchdlo.physics.effects.elastic import Bend
 from torchdlo.physics.effects.external import Gravity
-from torchdlo.scene import Rope, hold, make, ok, rollout, step
+from torchdlo.scene import Rope, make, ok, rollout, stationary_control, step
 
 NAMES = ("drift", "approach", "bend", "radius", "mu", "restitution", "mass", "gravity", "handle")
 AT = torch.tensor([0.3, 0.2, 1.0, 1.0, 0.3, 0.3, 1.0, 2.0, 0.0], dtype=F64)
@@ -28,7 +28,7 @@ def sliding(
     a, b = a + s[:, None] ** 2 * a.new_tensor([0, 0.3, 0]), b + s[:, None] ** 2 * a.new_tensor([0, 0, 0.2])
     v = torch.stack([theta[0], 0.05 + 0 * theta[1], -theta[1]]).expand(n, 3)
     ropes = [Rope(a, radius=r, density=1000.0, bend=1e-3), Rope(b, radius=r, density=1200.0, bend=2e-3)]
-    choices = {"dt": 1e-3, "substeps": 1, "held_vertices": (n, 2 * n - 1)} | choices
+    choices = {"dt": 1e-3, "substeps": 1, "prescribed_vertices": (n, 2 * n - 1)} | choices
     scene, params, state = make(ropes, [Bend(), Gravity(), RodContact()], **choices)
     other = torch.tensor([0.0, 0.0, 0.1], dtype=F64).expand(n, 3)
     state = tree.replace(state, rods=tree.replace(state.rods, vel=torch.cat([v, other])))
@@ -46,7 +46,7 @@ def sliding(
         "gravity": {"acceleration": torch.stack([zero, zero, -theta[7]]).reshape(1, 3)},
     }
     params = tree.replace(params, rods=tree.replace(params.rods, material=material), effects=effects)
-    control = hold(scene, state)
+    control = stationary_control(scene, state)
     control = tree.replace(control, pos=control.pos + theta[8] * a.new_tensor([[0, 0, 0.01], [0, 0.01, 0.01]]))
     controls = tree.map(lambda c: c.expand(count, *c.shape), control)
     last, _ = rollout(
@@ -59,7 +59,7 @@ def sliding(
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("count", "choices"),
-    [(200, {}), (60, {"integrator": "implicit", "dt": 2e-3, "newton": 6}), (12, {"substeps": 5})],
+    [(200, {}), (60, {"integrator": "implicit", "dt": 2e-3, "constraint_iterations": 6}), (12, {"substeps": 5})],
     ids=["200 substeps", "implicit", "5 substeps a step"],
 )
 def test_gradients_through_contact_and_sliding_agree_with_central_differences(count, choices):
@@ -101,7 +101,7 @@ def test_compiled_steps_equal_eager_ones_with_gradients():
     from torchdlo.scene import stepper
 
     scene, params, state = two(math.pi / 3, 0.8, (0.3, 0.1, 0), {"mu_s": 0.5, "mu_k": 0.4, "restitution": 0.3}, n=9)
-    control, results = hold(scene, state), []
+    control, results = stationary_control(scene, state), []
     for compiled in (False, True):
         run = stepper(scene, compiled=compiled)
         vel = state.rods.vel.clone().requires_grad_()

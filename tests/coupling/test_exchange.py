@@ -7,14 +7,14 @@ import math
 
 import pytest
 import torch
-from matter import DOUBLE, ONE, OPEN, ball, derivative, momenta
+from material_points import DOUBLE, ONE, OPEN, ball, derivative, momenta
 
 from torchdlo import scene
-from torchdlo.coupling import RodMatter
+from torchdlo.coupling import RodMpmCoupling
 from torchdlo.coupling.mpm import rod_coupling_op
 from torchdlo.coupling.mpm import substep as mpm
 from torchdlo.coupling.mpm.constitutive_models import Elastic, Liquid
-from torchdlo.coupling.mpm.particles import Blob, Grid, assemble, fill_ball, fill_box
+from torchdlo.coupling.mpm.particles import Grid, ParticleBlock, assemble, fill_ball, fill_box
 from torchdlo.coupling.mpm.rod_coupling_solver import Lines, Touch, block_size, exchange, near_size
 from torchdlo.physics import tree
 from torchdlo.physics.effects.elastic import Bend
@@ -25,7 +25,7 @@ RADIUS, SPACING = 0.005, 0.01
 
 def lines_through_a_ball(vertices=14):
     """Two scenes, in each a shaken ball that a crooked rope of masses of 1 g runs into."""
-    medium, matter, state = ball(Elastic(), batch=(2,), shake=0.3)
+    medium, material_points, state = ball(Elastic(), batch=(2,), shake=0.3)
     g = torch.Generator().manual_seed(0)
     pos = torch.zeros(2, vertices, 3, dtype=DOUBLE)
     pos[..., 0], pos[..., 1], pos[..., 2] = torch.linspace(0.0, 0.2, vertices), 0.1, 0.075
@@ -35,7 +35,7 @@ def lines_through_a_ball(vertices=14):
     real[-1] = 0.0
     after = torch.tensor([*range(1, vertices), 0])
     inverse = torch.full((2, vertices, 1), 1e3, dtype=DOUBLE)
-    nodes, _ = mpm.to_grid(medium, matter, state, 0 * ONE, 2e-4, ONE)
+    nodes, _ = mpm.to_grid(medium, material_points, state, 0 * ONE, 2e-4, ONE)
     return medium.grid, nodes, Lines(pos, vel, inverse, torch.full((1, 1, 1), RADIUS, dtype=DOUBLE), real, after)
 
 
@@ -153,13 +153,15 @@ def ball_on_rope(law=None, dtype=DOUBLE, gap=0.003, held=(0, 11), batch=(1,), ef
     rope = scene.Rope(x, radius=RADIUS, density=1000.0, youngs=1e5)
     points = fill_ball((0.1, 0.1, 0.1 + 0.02 + RADIUS + SPACING + gap), 0.02, 0.0064, x)
     velocity = torch.tensor([0.0, 0.0, -speed], dtype=dtype)
-    blob = Blob(points.expand(*batch, *points.shape), law or Elastic(), 0.0064**3, velocity, numbers)
-    matter = assemble([blob], Grid((0.0, 0.05, 0.05), (0.2, 0.15, 0.25), SPACING, OPEN, window=(11, 11, 11)))
-    return scene.make([rope], [*effects, Bend(), RodMatter()], matter=matter, held_vertices=held)
+    blob = ParticleBlock(points.expand(*batch, *points.shape), law or Elastic(), 0.0064**3, velocity, numbers)
+    material_points = assemble([blob], Grid((0.0, 0.05, 0.05), (0.2, 0.15, 0.25), SPACING, OPEN, window=(11, 11, 11)))
+    return scene.make(
+        [rope], [*effects, Bend(), RodMpmCoupling()], material_points=material_points, prescribed_vertices=held
+    )
 
 
 def go(cable, params, state, steps):
-    control = scene.hold(cable, state)
+    control = scene.stationary_control(cable, state)
     for _ in range(steps):
         state = scene.step(cable, params, state, control)
     return state
@@ -170,7 +172,7 @@ def test_a_ball_and_a_free_rope_keep_their_momentum():
     mass = params.rods.material.mass
 
     def whole(state):
-        line, turn = momenta(cable.matter, params.matter, state.matter)
+        line, turn = momenta(cable.material_points, params.material_points, state.material_points)
         moved = mass * state.rods.vel
         return line + moved.sum(-2), turn + torch.linalg.cross(state.rods.pos, moved).sum(-2), moved.sum(-2)
 
@@ -190,24 +192,24 @@ def test_a_ball_stays_on_a_rope():
     with torch.no_grad():
         end = go(cable, params, state, 120)
     scene.check_state(end)
-    low = float(end.matter.pos[..., 2].min())
+    low = float(end.material_points.pos[..., 2].min())
     assert low > float(end.rods.pos[..., 5:7, 2].mean()) + RADIUS
     # Without the rope it would have fallen by g t^2 / 2 = 7 cm.
-    assert float(end.matter.pos[..., 2].mean()) > 0.1
+    assert float(end.material_points.pos[..., 2].mean()) > 0.1
 
 
 def test_a_scene_is_the_same_alone_and_in_a_batch():
     alone, many = (go(*ball_on_rope(batch=b, effects=[Gravity()], speed=0.5), 10) for b in ((1,), (3, 2)))
-    assert many.matter.pos.shape[:2] == (3, 2)
-    assert torch.allclose(many.matter.pos[2, 1], alone.matter.pos[0], atol=1e-13, rtol=0)
+    assert many.material_points.pos.shape[:2] == (3, 2)
+    assert torch.allclose(many.material_points.pos[2, 1], alone.material_points.pos[0], atol=1e-13, rtol=0)
     assert torch.allclose(many.rods.pos[2, 1], alone.rods.pos[0], atol=1e-13, rtol=0)
 
 
 def test_single_precision_follows_double():
     single, double = (go(*ball_on_rope(dtype=d, effects=[Gravity()], speed=0.5), 10) for d in (torch.float32, DOUBLE))
-    assert single.matter.pos.dtype == torch.float32
+    assert single.material_points.pos.dtype == torch.float32
     # 50 substeps that round places of 0.2 m by 1e-8 m, which a grid of 0.01 m turns into speeds of 0.5 m/s times 1e-6.
-    assert float((single.matter.pos - double.matter.pos).abs().max()) < 1e-5
+    assert float((single.material_points.pos - double.material_points.pos).abs().max()) < 1e-5
 
 
 def test_a_rope_in_a_liquid_feels_the_weight_of_what_it_displaces():
@@ -218,8 +220,8 @@ def test_a_rope_in_a_liquid_feels_the_weight_of_what_it_displaces():
     x = fill_box((0.0,) * 3, (width, across, width), SPACING / 2, torch.zeros((), dtype=DOUBLE))
     off = (x[:, [0, 2]] - width / 2).norm(dim=-1)
     grid = Grid((0.0,) * 3, (width, across, 0.16), SPACING, ("slip",) * 4 + ("separate",) * 2)
-    blob = Blob(x[off > radius], Liquid(), (SPACING / 2) ** 3, numbers={"bulk": 5e4, "viscosity": 10.0})
-    medium, matter, state = assemble([blob], grid)
+    blob = ParticleBlock(x[off > radius], Liquid(), (SPACING / 2) ** 3, numbers={"bulk": 5e4, "viscosity": 10.0})
+    medium, material_points, state = assemble([blob], grid)
     pos = torch.full((1, 5, 3), width / 2, dtype=DOUBLE)
     pos[..., 1] = torch.linspace(-0.5 * across, 1.5 * across, 5)
     real = torch.tensor([1.0, 1, 1, 1, 0], dtype=DOUBLE)[:, None]
@@ -229,9 +231,9 @@ def test_a_rope_in_a_liquid_feels_the_weight_of_what_it_displaces():
     force = []
     with torch.no_grad():
         for _ in range(800):
-            nodes, strained = mpm.to_grid(medium, matter, state, ONE * pos.new_tensor([0, 0, -9.81]), dt, ONE)
+            nodes, strained = mpm.to_grid(medium, material_points, state, ONE * pos.new_tensor([0, 0, -9.81]), dt, ONE)
             impulse, nodes, _ = exchange(grid, nodes, lines, near, 0 * thick)
-            state = mpm.from_grid(medium, matter, strained, nodes, dt)
+            state = mpm.from_grid(medium, material_points, strained, nodes, dt)
             force.append(float(impulse[..., 2].sum()) / dt)
     lift = sum(force[400:]) / 400 / across
     assert 1000 * 9.81 * math.pi * radius**2 < lift < 1000 * 9.81 * math.pi * (radius + SPACING) ** 2
@@ -241,32 +243,33 @@ def _value(name):
     """What is asked for the derivative of, as a function of one number."""
     # A straight rope held at both ends could not be moved at all: its lengths would not fit.
     cable, params, state = ball_on_rope(effects=[Gravity()], gap=-0.002, speed=0.5, held=(0,))
-    control = scene.hold(cable, state)
+    control = scene.stationary_control(cable, state)
     weight = torch.randn(2, 400, 3, generator=torch.Generator().manual_seed(1), dtype=DOUBLE)
 
     def value(x):
         numbers, start = params, state
         if name == "mu":
-            numbers = tree.replace(params, effects={**params.effects, "rod_matter": {"mu": x.reshape(1, 1)}})
+            numbers = tree.replace(params, effects={**params.effects, "rod_mpm_coupling": {"mu": x.reshape(1, 1)}})
         elif name == "youngs":
-            ((group, law),) = params.matter.laws.items()
+            ((group, law),) = params.material_points.laws.items()
             laws = {group: {**law, "youngs": x.reshape(1, 1)}}
-            numbers = tree.replace(params, matter=tree.replace(params.matter, laws=laws))
+            numbers = tree.replace(params, material_points=tree.replace(params.material_points, laws=laws))
         elif name == "rope":
             start = tree.replace(state, rods=tree.replace(state.rods, pos=state.rods.pos + x * weight[1, :12]))
         else:
-            moved = state.matter.pos + x * weight[1, : state.matter.pos.shape[-2]]
-            start = tree.replace(state, matter=tree.replace(state.matter, pos=moved))
+            moved = state.material_points.pos + x * weight[1, : state.material_points.pos.shape[-2]]
+            start = tree.replace(state, material_points=tree.replace(state.material_points, pos=moved))
         for _ in range(10):
             start = scene.step(cable, numbers, start, control)
-        rope, some = start.rods.pos, start.matter.pos
+        rope, some = start.rods.pos, start.material_points.pos
         return (rope * weight[0, :12]).sum() + (some * weight[0, : some.shape[-2]]).sum()
 
     return value
 
 
 @pytest.mark.parametrize(
-    ("name", "number", "step"), [("mu", 0.1, 1e-5), ("youngs", 1e5, 10.0), ("rope", 0.0, 1e-8), ("matter", 0.0, 1e-8)]
+    ("name", "number", "step"),
+    [("mu", 0.1, 1e-5), ("youngs", 1e5, 10.0), ("rope", 0.0, 1e-8), ("material_points", 0.0, 1e-8)],
 )
 def test_gradients_through_the_exchange_are_central_differences(name, number, step):
     value = _value(name)
@@ -281,7 +284,7 @@ def test_the_effect_needs_matter():
     x = torch.zeros(5, 3)
     x[:, 0] = torch.linspace(0, 1, 5)
     with pytest.raises(ValueError, match="there is no matter"):
-        scene.make([scene.Rope(x, radius=0.01, density=1000.0)], [RodMatter()])
+        scene.make([scene.Rope(x, radius=0.01, density=1000.0)], [RodMpmCoupling()])
 
 
 def test_matter_that_is_too_stiff_for_the_step_is_refused():

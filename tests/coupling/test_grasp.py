@@ -13,7 +13,7 @@ from torchdlo.coupling.robot.attachment import Hands, carry, felt, weld
 from torchdlo.physics import tree
 from torchdlo.physics.effects import EFFECTS
 from torchdlo.physics.linalg.rotation import rotate
-from torchdlo.scene import Control, Rope, hold, make, step, stepper
+from torchdlo.scene import Control, Rope, make, stationary_control, step, stepper
 
 F64 = torch.float64
 MASS, G = 0.2, 9.81
@@ -65,11 +65,11 @@ def test_a_tool_feels_weight_and_acceleration_of_a_hanging_rope(integrator, twis
         integrator,
         twist,
         {"damping": {"rate": 0.0}},
-        held_vertices=(0, 1),
-        held_edges=edges,
+        prescribed_vertices=(0, 1),
+        prescribed_edges=edges,
     )
     hands = Hands(1, (0, 0), (0,) * len(edges))
-    held = weld(scene, hands, hold(scene, state), at(0.05, 0.02, 0.1), torch.ones(1, 1, dtype=F64))
+    held = weld(scene, hands, stationary_control(scene, state), at(0.05, 0.02, 0.1), torch.ones(1, 1, dtype=F64))
     with torch.no_grad():
         for k in range(20):
             t = (k + 1) * scene.dt
@@ -89,10 +89,10 @@ def test_what_a_tool_feels_is_the_momentum_that_a_swinging_rope_gets(integrator,
     edges = (0,) if twist != "none" else ()
     values = {"damping": {"rate": 0.0, "twist_rate": 0.0}}
     scene, params, state = rope_scene(
-        line(7, vec(1, 0, 0)), integrator, twist, values, held_vertices=(0, 1), held_edges=edges
+        line(7, vec(1, 0, 0)), integrator, twist, values, prescribed_vertices=(0, 1), prescribed_edges=edges
     )
     hands = Hands(1, (0, 0), (0,) * len(edges))
-    held = weld(scene, hands, hold(scene, state), at(0, 0, 0), torch.ones(1, 1, dtype=F64))
+    held = weld(scene, hands, stationary_control(scene, state), at(0, 0, 0), torch.ones(1, 1, dtype=F64))
     mass = params.rods.material.mass
     with torch.no_grad():
         for k in range(20):
@@ -113,11 +113,11 @@ def test_a_tool_that_turns_about_the_rope_feels_its_twist(twist):
     # Without weight, which would bend the rope; a bent one resists otherwise.
     values = {"gravity": {"acceleration": (0.0, 0.0, 0.0)}, "damping": {"rate": 5.0, "twist_rate": 60.0}}
     scene, params, state = rope_scene(
-        x, "implicit", twist, values, held_vertices=(0, 1, n - 2, n - 1), held_edges=(0, n - 2)
+        x, "implicit", twist, values, prescribed_vertices=(0, 1, n - 2, n - 1), prescribed_edges=(0, n - 2)
     )
     hands = Hands(2, (0, 0, 1, 1), (0, 1))
     ends = Pose(torch.stack([x[0], x[-1]]), vec(1, 0, 0, 0).expand(2, 4))
-    held = weld(scene, hands, hold(scene, state), ends, torch.ones(2, 1, dtype=F64))
+    held = weld(scene, hands, stationary_control(scene, state), ends, torch.ones(2, 1, dtype=F64))
     with torch.no_grad():
         for k in range(300):
             turn = torch.tensor([[0.0], [angle * min(1.0, (k + 1) / 100)]], dtype=F64)
@@ -133,16 +133,16 @@ def test_a_tool_that_turns_about_the_rope_feels_its_twist(twist):
 
 def test_parts_keep_their_place_in_the_tool():
     scene, params, state = rope_scene(
-        line(8, vec(1, 0, 0)), "implicit", "quasistatic", held_vertices=(2, 3), held_edges=(2,)
+        line(8, vec(1, 0, 0)), "implicit", "quasistatic", prescribed_vertices=(2, 3), prescribed_edges=(2,)
     )
     hands = Hands(1, (0, 0), (0,))
     first = Pose(vec(0.1, 0.05, 0.2)[None], turned(torch.tensor([[0.4]], dtype=F64)))
-    held = weld(scene, hands, hold(scene, state), first, torch.ones(1, 1, dtype=F64))
+    held = weld(scene, hands, stationary_control(scene, state), first, torch.ones(1, 1, dtype=F64))
     with torch.no_grad():
         for k in range(100):
             tool = Pose(first.pos + vec(0.0, 0.1, 0.05) * (k / 100), turned(torch.tensor([[0.4 + k / 100]], dtype=F64)))
             state = step(scene, params, state, control(hands, held, tool))
-    again = weld(scene, hands, hold(scene, state), tool, torch.ones(1, 1, dtype=F64))
+    again = weld(scene, hands, stationary_control(scene, state), tool, torch.ones(1, 1, dtype=F64))
     assert torch.allclose(again.offset, held.offset, atol=1e-12, rtol=0)
     assert torch.allclose(again.director, held.director, atol=1e-9)
 
@@ -158,7 +158,7 @@ def lifted(scene, params, state, closed, count=50):
     tool = Pose(vec(0.2, 0, 0)[None], vec(1, 0, 0, 0)[None])
     with torch.no_grad():
         for k in range(count):
-            held = weld(scene, hands, hold(scene, state), tool, closed(k), held)
+            held = weld(scene, hands, stationary_control(scene, state), tool, closed(k), held)
             tool = Pose(tool.pos + vec(-4e-4, 0, 4e-4), tool.quat)
             state = step(scene, params, state, control(hands, held, tool))
             seen.append(state)
@@ -170,10 +170,10 @@ def test_scenes_of_a_batch_are_grasped_and_released_each_at_its_own_time(integra
     # Not straight: a straight rope that is pushed together may bend to any side.
     x = line(9, vec(1, 0, 0))
     x = (x + 0.03 * torch.sin(8 * x[:, :1]) * vec(0, 0, 1)).expand(3, 9, 3)
-    scene, params, state = rope_scene(x, integrator, held_vertices=(4, 0))
+    scene, params, state = rope_scene(x, integrator, prescribed_vertices=(4, 0))
     together = lifted(scene, params, state, closing)
     for k in range(3):
-        alone = rope_scene(x[k], integrator, held_vertices=(4, 0))
+        alone = rope_scene(x[k], integrator, prescribed_vertices=(4, 0))
         seen = lifted(*alone, lambda step, k=k: closing(step)[k])
         for a, b in zip(together, seen, strict=True):
             assert torch.allclose(a.rods.pos[k], b.rods.pos, atol=1e-10, rtol=0)
@@ -193,17 +193,17 @@ def test_open_hands_leave_the_rope_alone_and_closed_ones_are_plain_holds(integra
     x = line(7, vec(1, 0, 0))
     edges = (3,) if twist != "none" else ()
     free = rope_scene(x, integrator, twist)
-    scene, params, state = rope_scene(x, integrator, twist, held_vertices=(3, 4), held_edges=edges)
+    scene, params, state = rope_scene(x, integrator, twist, prescribed_vertices=(3, 4), prescribed_edges=edges)
     one = {"vertices": torch.ones(2, 1, dtype=F64), "edges": torch.ones(len(edges), 1, dtype=F64)}
     states = {"none": free[2], "open": state, "closed": state, "held": state}
     with torch.no_grad():
         for k in range(10):
-            still = hold(scene, state)
+            still = stationary_control(scene, state)
             led = tree.replace(still, pos=still.pos + vec(0.0, 0.02, 0.01) * (k / 40))
             grips = {"open": tree.map(torch.zeros_like, one), "closed": one, "held": {}}
-            for name, grip in grips.items():
-                states[name] = step(scene, params, states[name], tree.replace(led, grip=grip))
-            states["none"] = step(free[0], free[1], states["none"], hold(free[0], states["none"]))
+            for name, attachment_weight in grips.items():
+                states[name] = step(scene, params, states[name], tree.replace(led, attachment_weight=attachment_weight))
+            states["none"] = step(free[0], free[1], states["none"], stationary_control(free[0], states["none"]))
     # Rounding, grown by Newton's stopping.
     assert torch.allclose(states["open"].rods.pos, states["none"].rods.pos, atol=1e-9)
     assert torch.allclose(states["open"].rods.twist, states["none"].rods.twist, atol=1e-7)
@@ -215,27 +215,27 @@ def test_a_loose_grip_adds_inertia():
     # tool at rest, a free mass falls g dt^2 / 2 in the first step of one substep.
     x = line(3, vec(1, 0, 0))
     scene, params, state = rope_scene(
-        x, held_vertices=(0, 1, 2), substeps=1, constrained=False, values={"damping": {"rate": 0.0}}
+        x, prescribed_vertices=(0, 1, 2), substeps=1, constrained=False, values={"damping": {"rate": 0.0}}
     )
-    led = hold(scene, state)
+    led = stationary_control(scene, state)
     for share in (0.0, 0.25, 1.0):
-        grip = {"vertices": torch.full((3, 1), share, dtype=F64)}
-        fallen = step(scene, params, state, tree.replace(led, grip=grip)).rods.pos[:, 2]
+        attachment_weight = {"vertices": torch.full((3, 1), share, dtype=F64)}
+        fallen = step(scene, params, state, tree.replace(led, attachment_weight=attachment_weight)).rods.pos[:, 2]
         assert torch.allclose(fallen, torch.full((3,), -(1 - share) * 0.5 * G * 1e-6, dtype=F64), rtol=1e-9)
 
 
 @pytest.mark.parametrize(("integrator", "twist"), WAYS)
 def test_the_gradient_of_a_grip_is_that_of_differences(integrator, twist):
-    scene, params, state = rope_scene(line(6, vec(1, 0, 0)), integrator, twist, held_vertices=(0, 3))
-    led = hold(scene, state)
+    scene, params, state = rope_scene(line(6, vec(1, 0, 0)), integrator, twist, prescribed_vertices=(0, 3))
+    led = stationary_control(scene, state)
     led = tree.replace(led, pos=led.pos + vec(0, 2e-4, 1e-4))
     weight = rand(6, 3, seed=1)
 
     def shape(share):
         now = state
-        grip = {"vertices": torch.stack([torch.ones_like(share), share])[:, None]}
+        attachment_weight = {"vertices": torch.stack([torch.ones_like(share), share])[:, None]}
         for _ in range(5):
-            now = step(scene, params, now, tree.replace(led, grip=grip))
+            now = step(scene, params, now, tree.replace(led, attachment_weight=attachment_weight))
         return (weight * now.rods.pos).sum()
 
     share = torch.tensor(0.6, dtype=F64, requires_grad=True)
@@ -251,17 +251,19 @@ def test_gradients_through_inverse_kinematics_and_weld_are_those_of_differences(
     pytest.importorskip("pytorch_kinematics")
     arm = robot.panda()
     x = line(8, vec(1, 0, 0), 0.28) + vec(0.45, -0.1, 0.4)
-    scene, params, state = rope_scene(x, "implicit", held_vertices=(0, 1), dt=2e-3)
+    scene, params, state = rope_scene(x, "implicit", prescribed_vertices=(0, 1), dt=2e-3)
     hands, steps = Hands(1, (0, 0)), 200
     down = vec(0, 1, 0, 0)
     first = Pose(x[0], down)
     seed = inverse_kinematics.solve(
-        arm, first, 0.5 * (arm.lower + arm.upper), search=inverse_kinematics.Search(steps=60, polish=8)
+        arm, first, 0.5 * (arm.lower + arm.upper), search=inverse_kinematics.IkSearch(steps=60, polish=8)
     )
     assert bool(seed.settled)
-    held = weld(scene, hands, hold(scene, state), tree.map(lambda q: q[None], first), torch.ones(1, 1, dtype=F64))
+    held = weld(
+        scene, hands, stationary_control(scene, state), tree.map(lambda q: q[None], first), torch.ones(1, 1, dtype=F64)
+    )
     weight, t = rand(8, 3, seed=3), torch.linspace(0, 1, steps, dtype=F64)[:, None]
-    many = inverse_kinematics.Search(steps=20, polish=6)
+    many = inverse_kinematics.IkSearch(steps=20, polish=6)
 
     def shape(goal, bent):
         pos = first.pos + goal * (1 - torch.cos(torch.pi * t)) / 2
@@ -289,27 +291,32 @@ def test_gradients_through_inverse_kinematics_and_weld_are_those_of_differences(
 
 
 def test_wrong_hands_are_refused_with_what_was_expected():
-    scene, _, state = rope_scene(line(5, vec(1, 0, 0)), held_vertices=(0, 4))
+    scene, _, state = rope_scene(line(5, vec(1, 0, 0)), prescribed_vertices=(0, 4))
     one = torch.ones(1, 1, dtype=F64)
     with pytest.raises(ValueError, match="1 vertices and 0 edges; the scene can hold 2 and 0"):
-        weld(scene, Hands(1, (0,)), hold(scene, state), at(0, 0, 0), one)
+        weld(scene, Hands(1, (0,)), stationary_control(scene, state), at(0, 0, 0), one)
     with pytest.raises(ValueError, match=r"expected \(..., 2, 3\)"):
-        weld(scene, Hands(2, (0, 1)), hold(scene, state), at(0, 0, 0), one)
+        weld(scene, Hands(2, (0, 1)), stationary_control(scene, state), at(0, 0, 0), one)
     with pytest.raises(ValueError, match="expected -1"):
         Hands(1, (0, 1))
 
 
 def test_a_grip_of_wrong_shape_is_refused():
-    scene, params, state = rope_scene(line(5, vec(1, 0, 0)), held_vertices=(0, 4))
-    for grip in ({"vertices": torch.ones(1, 1)}, {"vertex": torch.ones(2, 1)}):
+    scene, params, state = rope_scene(line(5, vec(1, 0, 0)), prescribed_vertices=(0, 4))
+    for attachment_weight in ({"vertices": torch.ones(1, 1)}, {"vertex": torch.ones(2, 1)}):
         with pytest.raises(ValueError, match="expected 'vertices' of shape"):
-            step(scene, params, state, tree.replace(hold(scene, state), grip=grip))
+            step(
+                scene,
+                params,
+                state,
+                tree.replace(stationary_control(scene, state), attachment_weight=attachment_weight),
+            )
 
 
 def test_tools_turn_what_they_hold():
-    scene, _, state = rope_scene(line(5, vec(1, 0, 0)), held_vertices=(1,))
+    scene, _, state = rope_scene(line(5, vec(1, 0, 0)), prescribed_vertices=(1,))
     hands = Hands(1, (0,))
-    held = weld(scene, hands, hold(scene, state), at(0.1, -0.2, 0.0), torch.ones(1, 1, dtype=F64))
+    held = weld(scene, hands, stationary_control(scene, state), at(0.1, -0.2, 0.0), torch.ones(1, 1, dtype=F64))
     quat = turned(torch.tensor([[0.5 * torch.pi]], dtype=F64))
     pos, _, _ = carry(hands, held, Pose(vec(0.1, -0.2, 0.0)[None], quat))
     assert torch.allclose(pos, vec(0.1, -0.2, 0.2)[None])
@@ -320,10 +327,10 @@ def test_tools_turn_what_they_hold():
 @pytest.mark.compile
 def test_a_compiled_step_with_grips_is_the_same():
     x = line(6, vec(1, 0, 0)).expand(2, 6, 3)
-    scene, params, state = rope_scene(x, held_vertices=(0, 3), substeps=1)
-    led = hold(scene, state)
+    scene, params, state = rope_scene(x, prescribed_vertices=(0, 3), substeps=1)
+    led = stationary_control(scene, state)
     share = torch.tensor([[1.0, 0.0], [1.0, 1.0]], dtype=F64)[..., None]
-    led = tree.replace(led, pos=led.pos + vec(0, 0, 1e-3), grip={"vertices": share})
+    led = tree.replace(led, pos=led.pos + vec(0, 0, 1e-3), attachment_weight={"vertices": share})
     with torch.no_grad():
         fast, slow = stepper(scene)(params, state, led), step(scene, params, state, led)
     assert torch.allclose(fast.rods.pos, slow.rods.pos, atol=1e-12, rtol=0)

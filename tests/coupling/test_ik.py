@@ -13,7 +13,7 @@ from torchdlo.coupling.bodies.dynamics import turn_between
 from torchdlo.coupling.common.pose import Pose
 from torchdlo.coupling.robot import inverse_kinematics
 from torchdlo.coupling.robot import kinematics as robot
-from torchdlo.coupling.robot.inverse_kinematics import Search
+from torchdlo.coupling.robot.inverse_kinematics import IkSearch
 from torchdlo.physics import tree
 
 F64 = torch.float64
@@ -35,7 +35,7 @@ def middle(count: int, dtype=F64) -> torch.Tensor:
 def test_random_poses_are_reached(dtype):
     # The bar is 98 %; 1000 poses measure a rate of 99.5 % to 0.2 % (one standard deviation).
     _, target = reachable(1000, dtype=dtype)
-    found = inverse_kinematics.solve(arm(), target, middle(1000, dtype), search=Search(starts=8))
+    found = inverse_kinematics.solve(arm(), target, middle(1000, dtype), search=IkSearch(starts=8))
     assert found.joints.dtype == dtype
     assert float(found.converged.double().mean()) >= 0.98
     good = found.converged
@@ -49,7 +49,7 @@ def test_near_poses_are_reached_in_few_steps():
     q, target = reachable(300)
     noise = 0.03 * torch.randn(300, 8, generator=torch.Generator().manual_seed(1), dtype=F64)
     start = torch.minimum(torch.maximum(q + noise, arm().lower), arm().upper)
-    found = inverse_kinematics.solve(arm(), target, start, search=Search(steps=3, polish=2))
+    found = inverse_kinematics.solve(arm(), target, start, search=IkSearch(steps=3, polish=2))
     assert float(found.converged.double().mean()) >= 0.98
 
 
@@ -75,7 +75,7 @@ def test_a_target_out_of_reach_is_reported_and_not_handed_on():
     assert torch.equal(found.handed.pos, found.pose.pos)
     assert float(found.pose.pos.norm()) < 1.3
     assert torch.isfinite(found.joints).all()
-    inside = inverse_kinematics.solve(arm(), near, joints, search=Search(steps=40))
+    inside = inverse_kinematics.solve(arm(), near, joints, search=IkSearch(steps=40))
     assert bool(inside.converged) and torch.equal(inside.handed.pos, near.pos)
 
 
@@ -87,7 +87,7 @@ def test_the_answer_does_not_depend_on_the_way_there():
         [torch.cos(angle), torch.sin(angle), 0.3 * torch.sin(angle)], -1
     )
     joints, first = (
-        inverse_kinematics.solve(arm(), Pose(path[0], down), middle(1)[0], search=Search(steps=60, polish=8)).joints,
+        inverse_kinematics.solve(arm(), Pose(path[0], down), middle(1)[0], search=IkSearch(steps=60, polish=8)).joints,
         None,
     )
     for pos in path:
@@ -114,7 +114,7 @@ def test_fingers_stay_where_they_are():
 def settled_poses(count: int) -> tuple[Pose, torch.Tensor]:
     """Poses at which the posture is settled, with one joint at a limit in some, and starts near the answers."""
     _, target = reachable(60, seed=4)
-    found = inverse_kinematics.solve(arm(), target, middle(60), search=Search(steps=60, polish=10))
+    found = inverse_kinematics.solve(arm(), target, middle(60), search=IkSearch(steps=60, polish=10))
     some = found.settled.nonzero()[:count, 0]
     assert len(some) == count
     return tree.map(lambda x: x[some], target), found.joints[some]
@@ -130,7 +130,7 @@ def turned(quat: torch.Tensor, vector: torch.Tensor) -> torch.Tensor:
 def test_derivatives_by_the_target_are_those_of_differences():
     target, start = settled_poses(12)
     weight = torch.randn(12, 8, generator=torch.Generator().manual_seed(2), dtype=F64)
-    search = Search(steps=6, polish=6)
+    search = IkSearch(steps=6, polish=6)
 
     def joints(shift):
         moved = Pose(target.pos + shift[:, :3], turned(target.quat, shift[:, 3:]))
@@ -168,7 +168,7 @@ def test_gradients_are_finite_where_the_target_is_out_of_reach():
 def test_joints_at_their_limits_leave_single_precision_all_its_digits():
     # Five free joints make a singular matrix, which had random digits in single precision, and sometimes no inverse:
     # so at the first of these poses, a turn of the wrist away from where the arm is.
-    search, limits = Search(steps=4, closing=2, polish=2), [0, 6]
+    search, limits = IkSearch(steps=4, closing=2, polish=2), [0, 6]
     posture = torch.tensor([1.56, -0.72, -0.02, -2.09, 0.04, 1.33, 2.4, 0.0])
     start = reachable(200)[0].float()
     start[:, limits] = arm().upper[limits].float()

@@ -12,7 +12,7 @@ from torchdlo.coupling import RodContact
 from torchdlo.physics import tree
 from torchdlo.physics.effects.elastic import Bend
 from torchdlo.physics.effects.external import Damping
-from torchdlo.scene import Rope, check_state, hold, make, step, stepper
+from torchdlo.scene import Rope, check_state, make, stationary_control, step, stepper
 
 BEND, RADIUS = 1.26e-4, 2e-3
 
@@ -21,7 +21,7 @@ def loose(n: int, scale: float, mu: float, **choices):
     """An overhand knot with held ends, damped so that it finds its rest."""
     x = trefoil(n, scale, 0.2)
     values = {"rod_contact": {"mu_s": mu, "mu_k": mu}, "damping": {"rate": 8.0}}
-    choices = {"dt": 1e-3, "substeps": 10, "held_vertices": (0, n - 1)} | choices
+    choices = {"dt": 1e-3, "substeps": 10, "prescribed_vertices": (0, n - 1)} | choices
     contact = RodContact(friction=mu > 0, burst=2.0)
     return make([Rope(x, radius=RADIUS, density=1000.0, bend=BEND)], [Bend(), Damping(), contact], values, **choices)
 
@@ -35,7 +35,7 @@ def pull(step, made, state, target: float, speed: float, rest: float):
         span = ends[1] - ends[0]
         axis, length = span / span.norm(), float(span.norm())
         count = max(1, round(abs(target - length) / speed / dt))
-        control = hold(scene, state)
+        control = stationary_control(scene, state)
         for k in range(count + round(rest / dt)):
             grown = (target - length) * min(1.0, (k + 1) / count) / 2
             state = step(params, state, tree.replace(control, pos=ends + torch.stack([-axis, axis]) * grown))

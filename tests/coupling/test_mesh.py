@@ -42,7 +42,7 @@ def test_distances_mass_and_inertia_are_those_of_the_closed_form(kind: str, fold
     points = (2 * torch.rand(3000, 3, generator=g, dtype=F64) - 1) * sampled.size
     found = shape_sdf.distance("mesh", sampled.size[None], points, sampled.grid.reshape(1, -1), cells)
     known, normal = shape_sdf.probe(kind, size[None], points)
-    # Trilinear interpolation of a function of slope 1 is off by less than half a diagonal where it has a crease, and
+    # Trilinear interpolation of a function of gradient 1 is off by less than half a diagonal where it has a crease, and
     # of second derivatives up to 1/r by h^2/8 per axis elsewhere; the triangles lie within the surface themselves.
     assert (found - known).abs().max() < 0.87 * spacing
     smooth = known.abs() < spacing

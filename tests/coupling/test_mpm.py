@@ -6,12 +6,12 @@ import math
 
 import pytest
 import torch
-from matter import DOUBLE, ONE, OPEN, ball, derivative, momenta, run, with_number
+from material_points import DOUBLE, ONE, OPEN, ball, derivative, momenta, run, with_number
 
 from torchdlo.coupling.mpm import p2g_g2p
 from torchdlo.coupling.mpm import substep as mpm
 from torchdlo.coupling.mpm.constitutive_models import Elastic, Liquid, Plastic, Sand
-from torchdlo.coupling.mpm.particles import Blob, Grid, assemble, fill_box
+from torchdlo.coupling.mpm.particles import Grid, ParticleBlock, assemble, fill_box
 from torchdlo.physics import tree
 
 LAWS = [Elastic(), Plastic(), Sand(), Liquid()]
@@ -28,8 +28,8 @@ def _transfer_case():
 
 def test_transfers_have_the_derivatives_that_they_say():
     size, *tensors = _transfer_case()
-    at, value, slope, grid = (t.requires_grad_() for t in tensors)
-    assert torch.autograd.gradcheck(lambda a, v, s: p2g_g2p.spread(a, v, s, size), (at, value, slope))
+    at, value, gradient, grid = (t.requires_grad_() for t in tensors)
+    assert torch.autograd.gradcheck(lambda a, v, s: p2g_g2p.spread(a, v, s, size), (at, value, gradient))
     assert torch.autograd.gradcheck(lambda a, g: p2g_g2p.collect(a, g, size), (at, grid))
     massive = grid.detach()[:, :40].clone()
     massive[..., 3] = massive[..., 3].abs() + 0.1
@@ -40,7 +40,7 @@ def test_transfers_have_the_derivatives_that_they_say():
 
 
 def test_the_kernel_does_what_tensor_operations_do(monkeypatch):
-    size, at, value, slope, grid = _transfer_case()
+    size, at, value, gradient, grid = _transfer_case()
     at[0, :, 0], at[1, 1, 1], at[1, 0, 2] = -5.0, 1e9, torch.nan  # lost particles, too
     calls = torch.ops.torchdlo
 
@@ -48,7 +48,7 @@ def test_the_kernel_does_what_tensor_operations_do(monkeypatch):
 
     def everything():
         carried = calls.divide(grid), calls.divide_back(grid, *calls.divide(grid + 1))
-        return calls.spread(at, value, slope, size), *calls.collect(at, grid, size), *carried[0], carried[1]
+        return calls.spread(at, value, gradient, size), *calls.collect(at, grid, size), *carried[0], carried[1]
 
     fast = everything()
     monkeypatch.setattr(p2g_g2p, "_native", lambda *_: False)
@@ -60,61 +60,63 @@ def test_the_kernel_does_what_tensor_operations_do(monkeypatch):
 
 def test_affine_fields_survive_the_way_to_the_grid_and_back():
     # APIC: v and C of a rigid turn and stretch are the same after both transfers (Jiang et al. 2015).
-    medium, matter, state = ball(Elastic())
+    medium, material_points, state = ball(Elastic())
     c = torch.tensor([[0.3, -1.0, 0.2], [1.0, 0.1, 0.5], [-0.4, 0.2, -0.7]], dtype=DOUBLE)
     state = tree.replace(state, vel=state.pos @ c.T, affine=c.reshape(9).expand(*state.pos.shape[:-1], 9))
-    nodes, strained = mpm.to_grid(medium, matter, tree.replace(state), 0 * ONE, 1e-30, ONE)
-    after = mpm.from_grid(medium, matter, strained, nodes, 1e-30)
+    nodes, strained = mpm.to_grid(medium, material_points, tree.replace(state), 0 * ONE, 1e-30, ONE)
+    after = mpm.from_grid(medium, material_points, strained, nodes, 1e-30)
     assert torch.allclose(after.vel, state.vel, atol=1e-12)
     assert torch.allclose(after.affine, state.affine, atol=1e-10)
 
 
 @pytest.mark.parametrize("law", LAWS, ids=lambda law: law.name)
 def test_a_block_falls_freely_on_a_parabola(law):
-    medium, matter, state = ball(law)
+    medium, material_points, state = ball(law)
     start = tree.replace(state, vel=torch.tensor([0.2, -0.1, 0.3], dtype=DOUBLE).expand_as(state.vel))
-    end, t = run(medium, matter, start, 100, 2e-4, (0.0, 0.0, -9.81)), 100 * 2e-4
+    end, t = run(medium, material_points, start, 100, 2e-4, (0.0, 0.0, -9.81)), 100 * 2e-4
     fallen = start.pos + start.vel * t + 0.5 * torch.tensor([0, 0, -9.81], dtype=DOUBLE) * t**2
     assert torch.allclose(end.pos, fallen, atol=1e-12)  # Stoermer-Verlet is exact for parabolas
 
 
 @pytest.mark.parametrize("law", LAWS, ids=lambda law: law.name)
 def test_momentum_is_exact(law):
-    medium, matter, state = ball(law, shake=0.3)
-    before = momenta(medium, matter, state)
-    after = momenta(medium, matter, run(medium, matter, state, 100, 2e-4))
-    size = (mpm.density(medium, matter) * matter.volume).sum() * 0.3
+    medium, material_points, state = ball(law, shake=0.3)
+    before = momenta(medium, material_points, state)
+    after = momenta(medium, material_points, run(medium, material_points, state, 100, 2e-4))
+    size = (mpm.density(medium, material_points) * material_points.volume).sum() * 0.3
     assert float((after[0] - before[0]).norm() / size) < 1e-12
     assert float((after[1] - before[1]).norm() / (size * 0.1)) < 1e-12
 
 
-def _energy(medium, matter, state):
+def _energy(medium, material_points, state):
     """Kinetic, with that of the affine fields, and elastic energy of small strains [J]."""
-    mass = mpm.density(medium, matter) * matter.volume
+    mass = mpm.density(medium, material_points) * material_points.volume
     inner = medium.grid.spacing**2 / 4 * state.affine.square().sum(-1, keepdim=True)
     kinetic = 0.5 * (mass * (state.vel.square().sum(-1, keepdim=True) + inner)).sum()
-    stress, deformed = mpm.deform(medium, matter, state, 1e-30)
+    stress, deformed = mpm.deform(medium, material_points, state, 1e-30)
     weight = state.pos.new_tensor([1, 1, 1, 2, 2, 2])
-    return kinetic + 0.25 * (matter.volume * stress * deformed.strain * weight).sum()
+    return kinetic + 0.25 * (material_points.volume * stress * deformed.strain * weight).sum()
 
 
 def _bar(spacing, grid_spacing, length=0.2):
     x = fill_box((0.05, 0.09, 0.09), (0.05 + length, 0.11, 0.11), spacing, torch.zeros((), dtype=DOUBLE))
     grid = Grid((0.0,) * 3, (0.3, 0.2, 0.2), grid_spacing, OPEN)
-    medium, matter, state = assemble([Blob(x, Elastic(), spacing**3, numbers={"youngs": 1e5, "poisson": 0.0})], grid)
+    medium, material_points, state = assemble(
+        [ParticleBlock(x, Elastic(), spacing**3, numbers={"youngs": 1e5, "poisson": 0.0})], grid
+    )
     mode = torch.cos(math.pi * (state.pos[..., :1] - 0.05) / length)
     along = torch.tensor([1.0, 0.0, 0.0], dtype=DOUBLE)
-    return medium, matter, tree.replace(state, vel=0.01 * mode * along), mode
+    return medium, material_points, tree.replace(state, vel=0.01 * mode * along), mode
 
 
 @pytest.mark.parametrize("spacing", [0.01, 0.005])
 def test_a_free_bar_rings_at_half_a_wavelength(spacing):
     # f = c / (2 L), c = sqrt(E / rho). The mass at each end is seen as up to half a node spacing further out or in, so
     # L is known to one node spacing.
-    medium, matter, state, mode = _bar(spacing / 2, spacing)
+    medium, material_points, state, mode = _bar(spacing / 2, spacing)
     c, length, dt = 10.0, 0.2, 0.25 * spacing / 10.0
     steps = round(2.2 * 2 * length / c / dt)
-    _, seen = run(medium, matter, state, steps, dt, keep=lambda s: (s.vel[..., :1] * mode).mean())
+    _, seen = run(medium, material_points, state, steps, dt, keep=lambda s: (s.vel[..., :1] * mode).mean())
     signs = torch.sign(seen)
     at = (signs[1:] != signs[:-1]).nonzero()[:, 0]
     crossings = at + seen[at] / (seen[at] - seen[at + 1])
@@ -124,9 +126,11 @@ def test_a_free_bar_rings_at_half_a_wavelength(spacing):
 
 
 def test_energy_does_not_grow():
-    medium, matter, state, _ = _bar(0.005, 0.01)
+    medium, material_points, state, _ = _bar(0.005, 0.01)
     dt, period = 5e-4, 2 * 0.2 / 10.0
-    _, seen = run(medium, matter, state, 5 * round(period / dt), dt, keep=lambda s: _energy(medium, matter, s))
+    _, seen = run(
+        medium, material_points, state, 5 * round(period / dt), dt, keep=lambda s: _energy(medium, material_points, s)
+    )
     # Velocities live half a substep earlier, so the sum swings by w dt / 2 twice per period; its means over periods do
     # so in second order only.
     means = seen.reshape(5, -1).mean(1)
@@ -153,9 +157,9 @@ def test_a_batch_is_its_scenes():
     scenes = ball(Plastic(), batch=(2, 3), shake=0.5)
     end = run(*scenes, 20, 2e-4)
     assert end.pos.shape[:2] == (2, 3)
-    medium, matter, state = scenes
+    medium, material_points, state = scenes
     alone = tree.map(lambda x: x[1, 2], state)
-    one = run(medium, tree.map(lambda x: x[1, 2] if x.shape[:2] == (2, 3) else x, matter), alone, 20, 2e-4)
+    one = run(medium, tree.map(lambda x: x[1, 2] if x.shape[:2] == (2, 3) else x, material_points), alone, 20, 2e-4)
     assert torch.allclose(end.pos[1, 2], one.pos, atol=1e-14)
 
 
@@ -169,20 +173,20 @@ def test_single_precision_follows_double(law):
 
 
 def test_unstable_substeps_are_refused_with_the_term_that_limits_them():
-    medium, matter, _ = ball(Elastic(), youngs=1e6)
+    medium, material_points, _ = ball(Elastic(), youngs=1e6)
     with pytest.raises(ValueError, match="sound in elastic_0"):
-        mpm.check_step(medium, matter, 2e-4)
-    medium, matter, _ = ball(Liquid(), viscosity=100.0)
+        mpm.check_step(medium, material_points, 2e-4)
+    medium, material_points, _ = ball(Liquid(), viscosity=100.0)
     with pytest.raises(ValueError, match="viscosity of liquid_0"):
-        mpm.check_step(medium, matter, 2e-4)
+        mpm.check_step(medium, material_points, 2e-4)
 
 
 @pytest.mark.parametrize("law", LAWS, ids=lambda law: law.name)
 def test_substeps_at_the_limit_are_stable(law):
-    medium, matter, state = ball(law, radius=0.025, shake=0.01)
-    dt = min(mpm.limits(medium, matter).values())
-    mpm.check_step(medium, matter, 0.999 * dt)
-    assert float(run(medium, matter, state, 300, dt).vel.norm(dim=-1).max()) < 0.05
+    medium, material_points, state = ball(law, radius=0.025, shake=0.01)
+    dt = min(mpm.limits(medium, material_points).values())
+    mpm.check_step(medium, material_points, 0.999 * dt)
+    assert float(run(medium, material_points, state, 300, dt).vel.norm(dim=-1).max()) < 0.05
 
 
 @pytest.mark.parametrize(
@@ -199,7 +203,7 @@ def test_substeps_at_the_limit_are_stable(law):
 def test_bad_matter_is_refused_with_a_sentence(given, sentence):
     fields = dict(positions=torch.full((4, 3), 0.1), law=Elastic(), volume=1e-6) | given
     with pytest.raises(ValueError, match=sentence):
-        assemble([Blob(**fields)], Grid((0.0,) * 3, (0.2,) * 3, 0.01))
+        assemble([ParticleBlock(**fields)], Grid((0.0,) * 3, (0.2,) * 3, 0.01))
 
 
 @pytest.mark.parametrize(
@@ -231,12 +235,12 @@ CASES = [
 def test_gradients_of_numbers_are_central_differences(law, name, number):
     # A ball falls on the floor of the box; 50 substeps.
     grid = Grid((0.0, 0.0, 0.07), (0.2, 0.2, 0.17), 0.01)
-    medium, matter, state = ball(law, radius=0.02, shake=0.1, grid=grid, **{name: number})
+    medium, material_points, state = ball(law, radius=0.02, shake=0.1, grid=grid, **{name: number})
     state = tree.replace(state, vel=state.vel + state.pos.new_tensor([0.2, 0.0, -1.0]))
     weight = torch.randn(state.pos.shape, generator=torch.Generator().manual_seed(1), dtype=DOUBLE)
 
     def value(x):
-        end = run(medium, with_number(matter, name, x), state, 50, 2e-4, (0.0, 0.0, -9.81))
+        end = run(medium, with_number(material_points, name, x), state, 50, 2e-4, (0.0, 0.0, -9.81))
         return (weight * end.pos).sum() + 1e-3 * (weight * end.vel).sum()
 
     x = torch.tensor([[number]], dtype=DOUBLE, requires_grad=True)
@@ -249,14 +253,14 @@ def test_gradients_of_numbers_are_central_differences(law, name, number):
 @pytest.mark.parametrize("law", LAWS, ids=lambda law: law.name)
 def test_gradients_of_the_start_are_central_differences(law):
     grid = Grid((0.0, 0.0, 0.07), (0.2, 0.2, 0.17), 0.01)
-    medium, matter, state = ball(law, radius=0.02, shake=0.1, grid=grid)
+    medium, material_points, state = ball(law, radius=0.02, shake=0.1, grid=grid)
     state = tree.replace(state, vel=state.vel + state.pos.new_tensor([0.2, 0.0, -1.0]))
     g = torch.Generator().manual_seed(1)
     weight, moved, sped = (torch.randn(state.pos.shape, generator=g, dtype=DOUBLE) for _ in range(3))
 
     def value(x):
         start = tree.replace(state, pos=state.pos + x * moved, vel=state.vel + 100 * x * sped)
-        return (weight * run(medium, matter, start, 100, 2e-4, (0.0, 0.0, -9.81)).pos).sum()
+        return (weight * run(medium, material_points, start, 100, 2e-4, (0.0, 0.0, -9.81)).pos).sum()
 
     x = torch.zeros((), dtype=DOUBLE, requires_grad=True)
     (found,) = torch.autograd.grad(value(x), x)

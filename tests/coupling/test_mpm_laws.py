@@ -6,11 +6,11 @@ import math
 
 import pytest
 import torch
-from matter import DOUBLE, derivative, run
+from material_points import DOUBLE, derivative, run
 
 from torchdlo.coupling.mpm import constitutive_models, symmetric_tensors
 from torchdlo.coupling.mpm.constitutive_models import Elastic, Liquid, Plastic, Sand
-from torchdlo.coupling.mpm.particles import Blob, Grid, assemble, fill_box
+from torchdlo.coupling.mpm.particles import Grid, ParticleBlock, assemble, fill_box
 from torchdlo.coupling.mpm.symmetric_tensors import deviator, eigen, from_hencky, full, hencky, squared, stretch, trace
 
 YOUNGS, POISSON = 1e5, 0.3
@@ -90,8 +90,8 @@ def test_elastic_matter_has_the_stress_of_its_energy():
         for j in range(3):
             a = torch.zeros(3, 3, dtype=DOUBLE)
             a[i, j] = 1.0
-            slope = derivative(lambda x, a=a: energy(f + x * a @ f), torch.zeros((), dtype=DOUBLE), 1e-4)
-            assert float(matrix(stress)[0, i, j]) == pytest.approx(float(slope), abs=1e-6 * YOUNGS)
+            gradient = derivative(lambda x, a=a: energy(f + x * a @ f), torch.zeros((), dtype=DOUBLE), 1e-4)
+            assert float(matrix(stress)[0, i, j]) == pytest.approx(float(gradient), abs=1e-6 * YOUNGS)
 
 
 def test_small_strains_give_hookes_law():
@@ -140,8 +140,8 @@ def test_sheared_sand_slides_at_the_friction_of_its_cone(angle):
     for _ in range(1500):
         stress, strain, past = law.answer(given, strain, past, shear, 1e-3)
     p = -float(trace(stress)) / 3
-    slope = 2 * math.sqrt(3) * math.sin(phi) / (3 - math.sin(phi))
-    assert float(stress[3]) / p == pytest.approx(slope, rel=1e-3)
+    gradient = 2 * math.sqrt(3) * math.sin(phi) / (3 - math.sin(phi))
+    assert float(stress[3]) / p == pytest.approx(gradient, rel=1e-3)
 
 
 def test_sand_does_not_pull_and_remembers_how_far_it_spread():
@@ -169,11 +169,13 @@ def _settled(law, size, walls, steps, dt, spacing=0.005, room=0.0, **given):
     """A column in the corner of a box, dropped at its own height; the mean of the last quarter of the run."""
     x = fill_box((0.0,) * 3, size, spacing, torch.zeros((), dtype=DOUBLE))
     high = (size[0] + room, size[1], round(1.5 * size[2], 2))
-    medium, matter, state = assemble([Blob(x, law, spacing**3, numbers=given)], Grid((0.0,) * 3, high, 0.01, walls))
-    end, seen = run(
-        medium, matter, state, steps, dt, (0.0, 0.0, -9.81), keep=lambda s: torch.cat([s.pos, s.history], -1)
+    medium, material_points, state = assemble(
+        [ParticleBlock(x, law, spacing**3, numbers=given)], Grid((0.0,) * 3, high, 0.01, walls)
     )
-    return medium, matter, state, end, seen[3 * steps // 4 :]
+    end, seen = run(
+        medium, material_points, state, steps, dt, (0.0, 0.0, -9.81), keep=lambda s: torch.cat([s.pos, s.history], -1)
+    )
+    return medium, material_points, state, end, seen[3 * steps // 4 :]
 
 
 def test_a_pool_carries_its_depth():
@@ -187,37 +189,38 @@ def test_a_pool_carries_its_depth():
     layers = first.pos[:, 2].unique()
     found = torch.stack([pressure[first.pos[:, 2] == z].mean() for z in layers])
     expected = 1000 * 9.81 * (height - layers)
-    # Walls and the surface are known to a node spacing: 0.01 m of 0.1 m. Inside, the slope is that of the weight.
+    # Walls and the surface are known to a node spacing: 0.01 m of 0.1 m. Inside, the gradient is that of the weight.
     inner = slice(4, -4)
     assert float((found - expected).abs()[inner].max()) < 1000 * 9.81 * 0.01
-    slope = (found[inner][-1] - found[inner][0]) / (layers[inner][-1] - layers[inner][0])
-    assert float(slope) == pytest.approx(-1000 * 9.81, rel=0.05)
+    gradient = (found[inner][-1] - found[inner][0]) / (layers[inner][-1] - layers[inner][0])
+    assert float(gradient) == pytest.approx(-1000 * 9.81, rel=0.05)
     # The level sinks by what the weight compresses, rho g H^2 / 2 K = 1 mm, less than a particle spacing.
     assert float((mean[:, 2].max() - first.pos[:, 2].max()).abs()) < 0.005
 
 
-def _heap(slope, base, degrees, steps=900, dt=5e-4):
-    """A wedge of sand against a wall on a rough floor: how far its centre moves over its length, and its slope then."""
-    x = fill_box((0.0,) * 3, (base, 0.02, base * slope), 0.005, torch.zeros((), dtype=DOUBLE))
-    x = x[x[:, 2] < slope * (base - x[:, 0])]
+def _heap(gradient, base, degrees, steps=900, dt=5e-4):
+    """A wedge of sand against a wall on a rough floor: how far its centre moves over its length, and its gradient
+    then."""
+    x = fill_box((0.0,) * 3, (base, 0.02, base * gradient), 0.005, torch.zeros((), dtype=DOUBLE))
+    x = x[x[:, 2] < gradient * (base - x[:, 0])]
     grid = Grid((0.0,) * 3, (0.3, 0.02, 0.12), 0.01, ("slip", "open", "slip", "slip", "stick", "separate"))
     given = dict(youngs=1e5, poisson=0.2, density=1600.0, friction_angle=math.radians(degrees))
-    medium, matter, state = assemble([Blob(x, Sand(), 0.005**3, numbers=given)], grid)
-    end = run(medium, matter, state, steps, dt, (0.0, 0.0, -9.81))
+    medium, material_points, state = assemble([ParticleBlock(x, Sand(), 0.005**3, numbers=given)], grid)
+    end = run(medium, material_points, state, steps, dt, (0.0, 0.0, -9.81))
     moved = (end.pos[:, 0].mean() - x[:, 0].mean()) / base
-    # A wedge whose centre lies as far out and as high has this slope: z / x of its centre of mass.
+    # A wedge whose centre lies as far out and as high has this gradient: z / x of its centre of mass.
     return float(moved), float(end.pos[:, 2].mean() / end.pos[:, 0].mean())
 
 
 def test_a_heap_below_its_angle_stays_and_one_far_above_slides_until_it_is():
-    # In a plane heap the cone holds slopes up to 2 sqrt(3) sin / (3 - sin), see above: 0.69 for 30 and 0.21 for 10
+    # In a plane heap the cone holds gradients up to 2 sqrt(3) sin / (3 - sin), see above: 0.69 for 30 and 0.21 for 10
     # degrees. The surface is known to a node spacing: 0.01 m of the 0.036 m and 0.14 m of the second heap at its end.
     moved, _ = _heap(0.35, 0.16, 30)
     assert abs(moved) < 0.02
-    moved, slope = _heap(0.8, 0.08, 10)
+    moved, gradient = _heap(0.8, 0.08, 10)
     most = 2 * math.sqrt(3) * math.sin(math.radians(10)) / (3 - math.sin(math.radians(10)))
     assert moved > 0.2
-    assert slope < most * (1 + 0.01 / 0.036 + 0.01 / 0.14)
+    assert gradient < most * (1 + 0.01 / 0.036 + 0.01 / 0.14)
 
 
 @pytest.mark.skipif(not symmetric_tensors.ready("cpu", DOUBLE), reason="there is no C++ compiler")

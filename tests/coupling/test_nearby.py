@@ -13,7 +13,7 @@ from torchdlo.coupling.common.step_diagnostics import survey
 from torchdlo.coupling.rod_contact import broad_phase, broad_phase_op
 from torchdlo.physics import tree
 from torchdlo.physics.effects.elastic import Bend
-from torchdlo.scene import Rope, check_state, hold, make, ok, step
+from torchdlo.scene import Rope, check_state, make, ok, stationary_control, step
 
 
 @pytest.fixture(params=["kernel", "tensors"])
@@ -38,7 +38,7 @@ def walk(n: int, seed: int, step_m: float = 0.015, box: float = 0.12) -> torch.T
 
 def listed(scene, params, state) -> tuple[list[set[tuple[int, int]]], float]:
     """Pairs on the list of each scene, and how many found no room."""
-    control = hold(scene, state)
+    control = stationary_control(scene, state)
     found = survey(scene, params, state, control, control).effects["rod_contact"]
     at, batch = found["corners"], found["corners"].shape[:-2]
     pairs = []
@@ -124,16 +124,16 @@ def test_a_closed_rope_is_not_near_itself_across_its_seam(way):
 
 def test_a_full_list_and_fast_vertices_are_reported(way):
     full = two(contact=RodContact(room=5))
-    state = step(*full, hold(full[0], full[2]))
-    assert not bool(ok(state)) and float(state.missed[..., 0]) > 0
+    state = step(*full, stationary_control(full[0], full[2]))
+    assert not bool(ok(state)) and float(state.diagnostics[..., 0]) > 0
     with pytest.raises(RuntimeError, match=r"no room for .* pairs of edges.*; give a larger `room` to RodContact"):
         check_state(state)
     scene, params, state = two(contact=RodContact(burst=0.0), speed=0.0)
-    check_state(step(scene, params, state, hold(scene, state)))
+    check_state(step(scene, params, state, stationary_control(scene, state)))
     shoved = tree.replace(
         state, rods=tree.replace(state.rods, vel=state.rods.vel.index_fill(0, torch.tensor([3]), 1.0))
     )
-    control = hold(scene, state)
+    control = stationary_control(scene, state)
     from_rest = survey(scene, params, state, control, control)
     late = step(scene, from_rest, shoved, control, survey=lambda scene, params, *others: params)
     with pytest.raises(RuntimeError, match="mm further within a step than contact looked"):
@@ -159,8 +159,8 @@ def test_the_kernel_finds_what_tensor_operations_find(n, dtype, monkeypatch):
         for k, p in enumerate(parts)
     ]
     contact = RodContact(room=60 * n, row=300, burst=0.5)
-    scene, params, state = make(ropes, [contact], dt=1e-3, held_vertices=(4,), check=False)
-    start = hold(scene, state)
+    scene, params, state = make(ropes, [contact], dt=1e-3, prescribed_vertices=(4,), check=False)
+    start = stationary_control(scene, state)
     aimed = tree.replace(start, pos=start.pos + 0.004)  # faster than all others
     found = []
     for there in (True, False):
@@ -169,7 +169,7 @@ def test_the_kernel_finds_what_tensor_operations_find(n, dtype, monkeypatch):
                 patch.setattr(broad_phase_op, "ready", lambda *_: False)
             values = survey(scene, params, state, start, aimed).effects["rod_contact"]
             moved = state.rods.pos + 0.03 * torch.sin(torch.arange(3 * n, dtype=dtype)).reshape(n, 3)
-            found.append((listed(scene, params, state), values["reach"], contact.shortfall(moved, values)))
+            found.append((listed(scene, params, state), values["reach"], contact.capacity_overflow(moved, values)))
     (pairs, lost), reach, short = found[0]
     (others, lost_too), reach_too, short_too = found[1]
     # Pairs whose distance is within rounding of the limit may be on one list only.

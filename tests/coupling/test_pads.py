@@ -5,11 +5,11 @@ from __future__ import annotations
 import pytest
 import torch
 
-from torchdlo.coupling.bodies.dynamics import Solid
+from torchdlo.coupling.bodies.dynamics import RigidBody
 from torchdlo.coupling.rod_body.finger_pads import FingerPads
 from torchdlo.physics import tree
 from torchdlo.physics.effects import EFFECTS
-from torchdlo.scene import Rope, hold, make, step
+from torchdlo.scene import Rope, make, stationary_control, step
 
 F64 = torch.float64
 MASS, G, MU = 0.1, 9.81, 0.4
@@ -25,7 +25,7 @@ def hanging(squeeze, integrator="explicit", **fields):
     """A rope that hangs from between two pads; the hand is a small box beside it."""
     n = 11
     x = torch.linspace(0.05, -0.35, n, dtype=F64)[:, None] * vec(0, 0, 1)
-    hand = Solid("box", (0.01, 0.01, 0.01), pos=(-0.1, 0.0, 0.0), motion="kinematic")
+    hand = RigidBody("box", (0.01, 0.01, 0.01), pos=(-0.1, 0.0, 0.0), motion="kinematic")
     pads = FingerPads(place=(0.1, 0.0, 0.0), reach=(0.02, 0.03, 0.06))
     effects = [EFFECTS["gravity"](), EFFECTS["bend"](), EFFECTS["damping"](), pads]
     values = {"finger_pads": {"squeeze": squeeze, "mu": MU}, "damping": {"rate": 1.0}}
@@ -38,7 +38,7 @@ def fallen(scene, params, state, count=150, lift=0.0):
     start = state.rods.pos[..., 0, 2]
     with torch.no_grad():
         for _ in range(count):
-            led = hold(scene, state)
+            led = stationary_control(scene, state)
             up = tree.replace(led.bodies, pos=led.bodies.pos + vec(0, 0, lift * scene.dt))
             state = step(scene, params, state, tree.replace(led, bodies=up))
     return start + lift * count * scene.dt - state.rods.pos[..., 0, 2], state
@@ -71,7 +71,7 @@ def test_pads_carry_the_rope_along_and_open_hands_do_not():
 
 def test_gradients_by_force_and_friction_are_those_of_differences():
     scene, params, state = hanging(0.5 * LIMIT)
-    led = hold(scene, state)
+    led = stationary_control(scene, state)
 
     def height(squeeze, mu):
         numbers = params.effects | {"finger_pads": {"squeeze": squeeze, "mu": mu}}
@@ -91,16 +91,22 @@ def test_gradients_by_force_and_friction_are_those_of_differences():
 def test_the_hand_takes_the_opposite_force():
     scene, params, state = hanging(2 * LIMIT)
     from torchdlo.coupling.bodies import dynamics as rigid
-    from torchdlo.physics.effects.base import Motion
+    from torchdlo.physics.effects.base import PredictedMotion
     from torchdlo.physics.rod import kinematics as rod
 
     pads, view = scene.effects[-1], rod.view(scene.topology, params.rods, state.rods, 1e-3)
     gone = 1e-4 * torch.randn(11, 3, generator=torch.Generator().manual_seed(0), dtype=F64)
     answer = (1e-6 / params.rods.material.mass).expand(11, 3)
-    motion = rigid.foresee(
-        scene.bodies, params.bodies, state.bodies, hold(scene, state).bodies, 0.0, first=torch.zeros(1, 1), dt=1e-3
+    motion = rigid.predict_free_motion(
+        scene.bodies,
+        params.bodies,
+        state.bodies,
+        stationary_control(scene, state).bodies,
+        0.0,
+        first=torch.zeros(1, 1),
+        dt=1e-3,
     )
-    push = pads.react(view, Motion(gone, answer, answer, motion), params.effects["finger_pads"])
+    push = pads.solve_contact(view, PredictedMotion(gone, answer, answer, motion), params.effects["finger_pads"])
     assert torch.allclose(push.force.sum(-2), -push.body_force[0], atol=1e-12)
     lever = state.rods.pos - state.bodies.pos
     assert torch.allclose(torch.linalg.cross(lever, push.force).sum(-2), -push.body_torque[0], atol=1e-12)

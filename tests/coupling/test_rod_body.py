@@ -16,7 +16,7 @@ from torchdlo.physics import tree
 from torchdlo.physics.effects.elastic import Bend
 from torchdlo.physics.effects.external import Damping, Gravity
 from torchdlo.physics.linalg.rotation import rotate
-from torchdlo.scene import Params, Rope, Scene, Solid, State, check_state, finite, hold, make, step
+from torchdlo.scene import Params, RigidBody, Rope, Scene, State, check_state, finite, make, stationary_control, step
 
 G = 9.81
 ON_Y = (math.sqrt(0.5), math.sqrt(0.5), 0.0, 0.0)
@@ -49,7 +49,7 @@ def test_free_rods_and_bodies_keep_momentum_and_angular_momentum(shape, angle):
     x = line(11, 0.3, angle)
     rope = Rope(x, radius=0.005, density=1000.0, bend=1e-4)
     size = 0.03 if shape == "sphere" else (0.03, 0.04, 0.02)
-    ball = Solid(
+    ball = RigidBody(
         shape, size, pos=(0.04, 0.01, 0.045), vel=(0.3, -0.2, -1.0), omega=(5.0, 3.0, -4.0), density=800.0,
         quat=(math.cos(angle / 2), math.sin(angle / 2), 0.0, 0.0), restitution=0.4,
     )  # fmt: skip
@@ -67,7 +67,7 @@ def test_free_rods_and_bodies_keep_momentum_and_angular_momentum(shape, angle):
 def test_two_way_impulse_of_a_central_hit_is_newtons():
     # A ball falls centrally on the middle vertex of three: v' of the contact point = -e v, all along z.
     x = line(3, 0.1)
-    ball = Solid("sphere", 0.02, pos=(0.0, 0.0, 0.026), vel=(0.0, 0.0, -1.0), mass=0.02, restitution=0.5)
+    ball = RigidBody("sphere", 0.02, pos=(0.0, 0.0, 0.026), vel=(0.0, 0.0, -1.0), mass=0.02, restitution=0.5)
     scene, params, state = make(
         [Rope(x, radius=0.005, mass=0.01)], [RodBody(sweeps=30)], bodies=[ball], dt=1e-3, substeps=1
     )
@@ -87,17 +87,17 @@ def capstan(mu: float, radius: float, count: int):
     arc = torch.stack([outer * torch.cos(phi), 0 * phi, outer * torch.sin(phi)], -1)
     down = torch.tensor([0, 0, -1.0], dtype=F64) * edge * torch.arange(1, tail + 1, dtype=F64)[:, None]
     x = torch.cat([(arc[0] + down).flip(0), arc, arc[-1] + down])
-    post = Solid("cylinder", (big, 0.1), motion="fixed", quat=ON_Y, mu_s=mu, mu_k=mu)
+    post = RigidBody("cylinder", (big, 0.1), motion="fixed", quat=ON_Y, mu_s=mu, mu_k=mu)
     scene, params, state = make(
         [Rope(x, radius=r, mass=len(x) * 3e-6, bend=1e-9)], [Gravity(), Bend(), Damping(), RodBody()],
-        {"damping": {"rate": 200.0}}, bodies=[post], dt=1e-3, substeps=10, held_vertices=(len(x) - 1,),
+        {"damping": {"rate": 200.0}}, bodies=[post], dt=1e-3, substeps=10, prescribed_vertices=(len(x) - 1,),
     )  # fmt: skip
     mass = params.rods.material.mass.clone()
     mass[0] = 0.01
     params = tree.replace(
         params, rods=tree.replace(params.rods, material=tree.replace(params.rods.material, mass=mass))
     )
-    control, seen = hold(scene, state), []
+    control, seen = stationary_control(scene, state), []
     with torch.no_grad():
         for k in range(40):
             pull = x.new_tensor([0, 0, -speed * scene.dt * (k + 1)])
@@ -128,7 +128,7 @@ def test_a_rope_on_a_tilted_plane_sticks_below_and_slides_above_the_friction_ang
     up = torch.tensor([math.sin(a), 0.0, math.cos(a)], dtype=F64)
     x = torch.linspace(-0.05, 0.05, 6, dtype=F64)[:, None] * (0.8 * down + 0.6 * down.new_tensor([0, 1.0, 0]))
     rope = Rope(x + 0.005 * up, radius=0.005, density=1000.0, bend=1e-4)
-    plane = Solid("plane", quat=(math.cos(a / 2), 0.0, math.sin(a / 2), 0.0), motion="fixed", mu_s=mu, mu_k=mu)
+    plane = RigidBody("plane", quat=(math.cos(a / 2), 0.0, math.sin(a / 2), 0.0), motion="fixed", mu_s=mu, mu_k=mu)
     scene, params, state = make([rope], [Gravity(), Bend(), RodBody()], bodies=[plane], dt=1e-3, substeps=1)
     early = run(scene, params, state, 50)
     late = run(scene, params, early, 100)
@@ -150,10 +150,10 @@ def test_a_ball_sits_in_a_taut_string_as_deep_as_its_length_allows_and_is_carrie
     s = torch.linspace(-1, 1, n, dtype=F64)
     x = torch.stack([a * s, 0 * s, -(1 - s.abs()) * a * math.tan(start)], -1)
     place = (0.0, 0.0, (big + r) / math.cos(start) - a * math.tan(start))
-    ball = Solid("sphere", big, pos=place, mass=mass, mu_s=0.0, mu_k=0.0, damping=30.0)
+    ball = RigidBody("sphere", big, pos=place, mass=mass, mu_s=0.0, mu_k=0.0, damping=30.0)
     scene, params, state = make(
         [Rope(x, radius=r, mass=0.004, bend=1e-7)], [Gravity(), Bend(), Damping(), RodBody(rounds=2)],
-        {"damping": {"rate": 30.0}}, bodies=[ball], dt=1e-3 / 3, substeps=1, held_vertices=(0, n - 1),
+        {"damping": {"rate": 30.0}}, bodies=[ball], dt=1e-3 / 3, substeps=1, prescribed_vertices=(0, n - 1),
     )  # fmt: skip
     state, pull, height = run(scene, params, state, 200), [], []
     first = float(state.bodies.vel[0, 2])
@@ -182,7 +182,7 @@ def test_a_long_edge_does_not_slip_past_a_thin_post(share):
     r, speed = 1e-3, 1.0
     x = line(6, 0.1, math.pi / 2) + torch.tensor([-0.01, 0.02 * (share - 0.5), 0.0], dtype=F64)
     rope = Rope(x, radius=r, density=1000.0, bend=1e-5, velocities=torch.tensor([speed, 0, 0], dtype=F64).expand(6, 3))
-    post = Solid("cylinder", (1e-3, 0.05), motion="fixed")
+    post = RigidBody("cylinder", (1e-3, 0.05), motion="fixed")
     scene, params, state = make([rope], [Bend(), RodBody()], bodies=[post], dt=1e-3, substeps=1)
     for _ in range(40):
         state = run(scene, params, state, 1)
@@ -200,11 +200,11 @@ RESTING = {"sphere": (0.06,), "box": (0.05, 0.06, 0.04), "torus": (0.06, 0.02)}
 @pytest.mark.parametrize("shape", RESTING)
 def test_a_rope_that_falls_on_a_body_stays_outside(shape):
     x = line(16, 0.24, 0.2, 0.1)
-    body = Solid(shape, RESTING[shape], motion="fixed", mu_s=0.6, mu_k=0.6)
+    body = RigidBody(shape, RESTING[shape], motion="fixed", mu_s=0.6, mu_k=0.6)
     effects = [Gravity(), Bend(), Damping(), RodBody()]
     scene, params, state = make(
         [Rope(x, radius=0.005, density=1000.0, bend=1e-5)], effects, {"damping": {"rate": 3.0}},
-        bodies=[body, Solid("plane", pos=(0, 0, -0.06), motion="fixed")], dt=1e-3, substeps=1,
+        bodies=[body, RigidBody("plane", pos=(0, 0, -0.06), motion="fixed")], dt=1e-3, substeps=1,
     )  # fmt: skip
     for _ in range(6):
         state = run(scene, params, state, 50)
@@ -219,9 +219,9 @@ def test_a_body_that_overlaps_a_held_vertex_does_not_throw_the_free_ends_of_its_
     # length / off times the overlap to bring that point out at once.
     monkeypatch.setattr(body_sweeps, "ready", lambda *_: not eager)
     x, overlap = line(3, 0.04), 0.003
-    ball = Solid("sphere", 0.03, pos=(off, 0.0, -0.035 + overlap), motion="fixed")
+    ball = RigidBody("sphere", 0.03, pos=(off, 0.0, -0.035 + overlap), motion="fixed")
     rope, effects = Rope(x, radius=0.005, mass=0.003), [RodBody(), Damping()]
-    made = make([rope], effects, bodies=[ball], dt=2e-4, substeps=1, held_vertices=(1,))
+    made = make([rope], effects, bodies=[ball], dt=2e-4, substeps=1, prescribed_vertices=(1,))
     after = run(*made, 1)
     assert torch.equal(after.rods.pos[1], made[2].rods.pos[1])
     speed = float(after.rods.vel.norm(dim=-1).max())
@@ -237,13 +237,13 @@ def test_a_body_that_is_far_too_fast_is_noticed_and_nothing_crashes(speed):
     x = torch.zeros(40, 3)
     x[:, 0], x[:, 2] = torch.linspace(-0.3, 0.3, 40), 0.16
     solids = [
-        Solid("plane", motion="fixed", mu_s=0.5, mu_k=0.4),
-        Solid("box", (0.04, 0.04, 0.08), pos=(0.1, 0, 0.04), motion="fixed"),
-        Solid("sphere", 0.03, pos=(0, 0, 0.3), density=200.0, vel=(0, 0, -speed)),
+        RigidBody("plane", motion="fixed", mu_s=0.5, mu_k=0.4),
+        RigidBody("box", (0.04, 0.04, 0.08), pos=(0.1, 0, 0.04), motion="fixed"),
+        RigidBody("sphere", 0.03, pos=(0, 0, 0.3), density=200.0, vel=(0, 0, -speed)),
     ]
     rope, effects = Rope(x, 0.005, density=1000.0, bend=1e-5), [Gravity(), Bend(), Damping(), RodBody()]
     scene, params, state = make([rope], effects, bodies=solids, dt=2e-3, substeps=2)
     for _ in range(20):
-        state = step(scene, params, state, hold(scene, state))
+        state = step(scene, params, state, stationary_control(scene, state))
     with pytest.raises(RuntimeError, match="scene: "):
         check_state(state)

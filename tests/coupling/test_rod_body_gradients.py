@@ -10,7 +10,7 @@ from torchdlo.coupling import RodBody
 from torchdlo.physics import tree
 from torchdlo.physics.effects.elastic import Bend
 from torchdlo.physics.effects.external import Gravity
-from torchdlo.scene import Rope, Solid, hold, make, ok, step
+from torchdlo.scene import RigidBody, Rope, make, ok, stationary_control, step
 
 AT = {
     "body speed": -1.0,
@@ -37,11 +37,11 @@ def rolled(theta: torch.Tensor, shape: str, count: int) -> torch.Tensor:
     size = {"sphere": 0.03, "box": (0.03, 0.025, 0.02), "torus": (0.03, 0.01)}[shape]
     high = 0.0357 if shape == "sphere" else 0.03
     turned = (0.9, 0.3, -0.2, 0.1) if shape == "torus" else (0.95, 0.2, 0.1, 0.15)
-    ball = Solid(shape, size, pos=(0.011, 0.006, high), quat=turned, density=300.0)
-    tool = Solid("cylinder", (0.004, 0.05), pos=(-0.06, 0.0, -0.012), quat=(0.7, 0.7, 0.1, 0.0), motion="kinematic")
+    ball = RigidBody(shape, size, pos=(0.011, 0.006, high), quat=turned, density=300.0)
+    tool = RigidBody("cylinder", (0.004, 0.05), pos=(-0.06, 0.0, -0.012), quat=(0.7, 0.7, 0.1, 0.0), motion="kinematic")
     scene, params, state = make(
         [Rope(x, radius=r, density=1000.0, bend=2e-4)], [Gravity(), Bend(), RodBody()], bodies=[ball, tool],
-        dt=2.5e-4, substeps=1, held_vertices=(0, n - 1),
+        dt=2.5e-4, substeps=1, prescribed_vertices=(0, n - 1),
     )  # fmt: skip
     one = torch.ones_like(v["mass"])
     zero = 0 * one
@@ -65,7 +65,7 @@ def rolled(theta: torch.Tensor, shape: str, count: int) -> torch.Tensor:
     state = tree.map(lambda x: x.expand(*theta.shape[:-1], *x.shape[-2:]), tree.replace(state, bodies=bodies))
     rise = torch.cat([zero, zero, one], -1) * state.rods.pos.new_ones(n, 1)
     state = tree.replace(state, rods=tree.replace(state.rods, vel=v["rope speed"] * rise))
-    control = hold(scene, state)
+    control = stationary_control(scene, state)
     for k in range(count):
         lift = (k + 1) / count * torch.cat([zero, 0.01 * one, 0.004 * one + v["tool"]], -1)
         told = tree.replace(control.bodies, pos=control.bodies.pos + lift)

@@ -12,16 +12,16 @@ import torch
 from touching import F64, line
 
 from torchdlo.coupling import RodContact
-from torchdlo.coupling.common.step_diagnostics import survey
+from torchdlo.coupling.common.step_diagnostics import broad_phase
 from torchdlo.coupling.rod_contact import broad_phase_op
 from torchdlo.coupling.rod_contact import solver_op as rod_pairs
 from torchdlo.physics import tree
 from torchdlo.physics.effects import base as effect
-from torchdlo.physics.effects.base import Motion
+from torchdlo.physics.effects.base import PredictedMotion
 from torchdlo.physics.effects.elastic import Bend
 from torchdlo.physics.execution import tracing
 from torchdlo.physics.rod import kinematics as rod
-from torchdlo.scene import Rope, hold, make, step
+from torchdlo.scene import Rope, make, stationary_control, step
 
 COMPILER = os.environ.get("CXX") or shutil.which("g++") or shutil.which("clang++")
 pytestmark = pytest.mark.skipif(COMPILER is None, reason="there is no C++ compiler")
@@ -60,8 +60,8 @@ def inputs(ropes: list[Rope], dtype: torch.dtype, numbers: dict[str, float] | No
     numbers = {"mu_s": 0.4, "mu_k": 0.3, "restitution": 0.4} | (numbers or {})
     scene, params, state = make(ropes, [contact], {"rod_contact": numbers}, dt=1e-3, substeps=5, check=False)
     params, state = tree.to(params, dtype), tree.to(state, dtype)
-    control = hold(scene, state)
-    values = survey(scene, params, state, control, control).effects["rod_contact"]
+    control = stationary_control(scene, state)
+    values = broad_phase(scene, params, state, control, control).effects["rod_contact"]
     rods = effect.altered(scene.effects, scene.topology, params.rods, params.effects)
     dt = 2e-4
     free = torch.ones_like(state.rods.pos[..., :1]).index_fill(-2, torch.tensor([0, 20]), 0.0)
@@ -75,7 +75,7 @@ def inputs(ropes: list[Rope], dtype: torch.dtype, numbers: dict[str, float] | No
         there = tree.replace(state.rods, pos=pos, vel=vel)
         made = tree.replace(rods, material=tree.replace(rods.material, radius=radius))
         known = values | dict(zip(("mu_s", "mu_k", "restitution"), laws.split(1, -1), strict=True))
-        return rod.view(scene.topology, made, there, dt), Motion(change, mobility, mobility * free), known
+        return rod.view(scene.topology, made, there, dt), PredictedMotion(change, mobility, mobility * free), known
 
     return contact, arguments, tuple(x.detach().clone() for x in given)
 
@@ -83,7 +83,7 @@ def inputs(ropes: list[Rope], dtype: torch.dtype, numbers: dict[str, float] | No
 def pushed(contact: RodContact, arguments, given) -> tuple[torch.Tensor, list[torch.Tensor]]:
     """Forces on vertices, and the derivative of a sum of them by all that they depend on."""
     leaves = [x.clone().requires_grad_() for x in given]
-    force = contact.react(*arguments(*leaves))
+    force = contact.solve_contact(*arguments(*leaves))
     weight = torch.sin(torch.arange(force.numel(), dtype=force.dtype)).reshape(force.shape)
     found = torch.autograd.grad((weight * force).sum(), leaves, allow_unused=True)
     return force.detach(), [torch.zeros_like(x) if g is None else g for x, g in zip(leaves, found, strict=True)]
@@ -169,7 +169,7 @@ def test_scenes_do_together_what_each_does_alone_on_any_number_of_threads():
             )
             alone = tree.map(lambda x, k=k: x[k] if x.dim() == 3 else x, motion)
             its = one[1](*one[2])
-            found = contact.react(its[0], alone, its[2])
+            found = contact.solve_contact(its[0], alone, its[2])
             # The same operations in the same order.
             assert torch.equal(found, force[k])
 
@@ -181,34 +181,36 @@ def test_values_without_scenes_and_several_axes_of_scenes_are_understood():
         for r in heap(6)
     ]
     contact, arguments, given = inputs(ropes, F64)
-    force = contact.react(*arguments(*given))
+    force = contact.solve_contact(*arguments(*given))
     flat = inputs(heap(6), F64)
     view, _, values = flat[1](*flat[2])
     assert force.shape == (2, 3, 37, 3)
     made = arguments(*given)
     motion = tree.map(lambda x: x.flatten(0, 1), made[1])
-    assert torch.equal(contact.react(view, motion, values), force.flatten(0, 1))
+    assert torch.equal(contact.solve_contact(view, motion, values), force.flatten(0, 1))
 
 
 def test_what_is_not_a_number_is_not_hidden():
     contact, arguments, given = inputs(heap(2), F64)
     change = given[2].clone()
     change[0, 16, 2] = math.nan  # where the second rope crosses the first
-    force = contact.react(*arguments(*given[:2], change, *given[3:]))
+    force = contact.solve_contact(*arguments(*given[:2], change, *given[3:]))
     assert not bool(torch.isfinite(force[0]).all()) and bool(torch.isfinite(force[1]).all())
 
 
 def test_a_second_derivative_is_refused():
     contact, arguments, given = inputs(heap(1), F64)
     leaves = [x.clone().requires_grad_() for x in given]
-    (slope,) = torch.autograd.grad(contact.react(*arguments(*leaves)).square().sum(), leaves[2], create_graph=True)
+    (slope,) = torch.autograd.grad(
+        contact.solve_contact(*arguments(*leaves)).square().sum(), leaves[2], create_graph=True
+    )
     with pytest.raises(RuntimeError, match="no second derivative"):
         slope.sum().backward()
 
 
 def test_recorded_steps_do_what_steps_do():
     scene, params, state = make(heap(3), [Bend(), RodContact()], dt=1e-3, substeps=2, check=False)
-    control = hold(scene, state)
+    control = stationary_control(scene, state)
 
     def both(params, state, control):
         return step(scene, params, state, control)
@@ -219,7 +221,7 @@ def test_recorded_steps_do_what_steps_do():
             wanted, state = both(params, state, control), recorded(params, state, control)
             # Recording may fuse operations of the step: rounding, 1e-16 of 0.4 m, times the stiffness of contact.
             assert float((wanted.rods.pos - state.rods.pos).abs().max()) < 1e-12
-            assert float((wanted.missed - state.missed).abs().max()) < 1e-12
+            assert float((wanted.diagnostics - state.diagnostics).abs().max()) < 1e-12
 
 
 @pytest.mark.compile
@@ -230,15 +232,15 @@ def test_a_compiled_reaction_and_survey_agree_with_eager_ones():
         view, motion, known = arguments(*given)
         carried = view.state.pos[..., :0, :]
         with torch.no_grad():
-            fresh = contact.survey(view, carried)
-        return contact.react(view, motion, known | {k: fresh[k] for k in ("corners", "real")}), fresh["reach"]
+            fresh = contact.broad_phase(view, carried)
+        return contact.solve_contact(view, motion, known | {k: fresh[k] for k in ("corners", "real")}), fresh["reach"]
 
     found = []
     for way in (reaction, torch.compile(reaction, backend="aot_eager", fullgraph=True)):
         leaves = [x.clone().requires_grad_() for x in given]
         force, reach = way(*leaves)
-        slopes = torch.autograd.grad(force.square().sum(), leaves)
-        found.append([force.detach(), reach, *slopes])
+        gradients = torch.autograd.grad(force.square().sum(), leaves)
+        found.append([force.detach(), reach, *gradients])
     for eager, other in zip(*found, strict=True):
         # The same operations: rounding at most.
         assert float(eager.norm()) > 0 and float((eager - other).norm()) <= 1e-12 * float(eager.norm())

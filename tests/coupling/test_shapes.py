@@ -1,4 +1,4 @@
-"""Signed distances: against sampled surfaces, slopes, volumes, and derivatives."""
+"""Signed distances: against sampled surfaces, gradients, volumes, and derivatives."""
 
 from __future__ import annotations
 
@@ -107,10 +107,10 @@ def test_normals_are_the_slope_of_the_distance_and_have_length_one(shape):
     p, size, h = places(2000), size_of(shape), 1e-6
     _, normal = shape_sdf.probe(shape, size, p)
     d = h * torch.eye(3, dtype=F64)
-    slope = torch.cat(
+    gradient = torch.cat(
         [shape_sdf.distance(shape, size, p + e) - shape_sdf.distance(shape, size, p - e) for e in d], -1
     ) / (2 * h)  # fmt: skip
-    assert float((slope - normal).abs().max()) < h / (4 * 0.1)
+    assert float((gradient - normal).abs().max()) < h / (4 * 0.1)
     assert float((normal.norm(dim=-1) - 1).abs().max()) < 1e-12
 
 

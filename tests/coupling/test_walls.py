@@ -7,7 +7,7 @@ import random
 
 import pytest
 import torch
-from matter import DOUBLE
+from material_points import DOUBLE
 
 from torchdlo.coupling.mpm import grid_boundaries
 from torchdlo.coupling.mpm.particles import WALLS, Grid

@@ -11,7 +11,7 @@ from torch import Tensor
 from torchdlo.coupling import RodContact
 from torchdlo.physics import tree
 from torchdlo.physics.effects.elastic import Bend
-from torchdlo.scene import Params, Rope, Scene, State, hold, make, step
+from torchdlo.scene import Params, Rope, Scene, State, make, stationary_control, step
 
 F64 = torch.float64
 
@@ -84,7 +84,7 @@ def momenta(params: Params, state: State) -> tuple[Tensor, Tensor]:
 
 def run(scene: Scene, params: Params, state: State, count: int) -> State:
     """Step without gradients, held parts at rest."""
-    control = hold(scene, state)
+    control = stationary_control(scene, state)
     with torch.no_grad():
         for _ in range(count):
             state = step(scene, params, state, control)

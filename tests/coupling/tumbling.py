@@ -13,14 +13,14 @@ from torchdlo.coupling.bodies.dynamics import (
     Body,
     BodyParams,
     BodyState,
-    Solid,
+    RigidBody,
     advance,
     conjugate,
-    foresee,
-    hold,
     place,
+    predict_free_motion,
+    stationary_control,
 )
-from torchdlo.physics.effects.base import Push
+from torchdlo.physics.effects.base import ContactForces
 from torchdlo.physics.linalg.rotation import rotate
 
 F64 = torch.float64
@@ -37,8 +37,8 @@ SHAPES = {
 """Sizes of one body of each shape."""
 
 
-def ground(**numbers: Any) -> Solid:
-    return Solid("plane", motion="fixed", **numbers)
+def ground(**numbers: Any) -> RigidBody:
+    return RigidBody("plane", motion="fixed", **numbers)
 
 
 def move(
@@ -51,16 +51,16 @@ def move(
     contact: BodyContact,
 ) -> BodyState:
     """Return the state after `count` substeps, held bodies at rest."""
-    targets, none = hold(bodies, state), gravity.new_zeros(1, 3)
+    targets, none = stationary_control(bodies, state), gravity.new_zeros(1, 3)
     for k in range(count):
         first = gravity.new_tensor([[float(k == 0)]])
-        motion = foresee(bodies, params, state, targets, gravity, first, dt)
-        state = advance(motion, targets, Push(none, *resolve(contact, motion)))
+        motion = predict_free_motion(bodies, params, state, targets, gravity, first, dt)
+        state = advance(motion, targets, ContactForces(none, *resolve(contact, motion)))
     return state
 
 
 def run(
-    solids: Sequence[Solid],
+    solids: Sequence[RigidBody],
     time: float,
     dt: float = 1e-3,
     gravity: Sequence[float] = (0.0, 0.0, -G),

@@ -6,7 +6,7 @@ import dataclasses
 
 import pytest
 import torch
-from test_contract import F64, prepared, small, ways
+from test_contract import F64, prepared, small, stage_waypoints
 
 from torchdlo import envs
 from torchdlo.envs.core import episode
@@ -15,7 +15,7 @@ from torchdlo.physics import tree
 pytest.importorskip("torchrl")
 
 
-def wild(world: episode.World) -> episode.World:
+def wild(world: episode.EpisodeState) -> episode.EpisodeState:
     """The world with so fast a rope in its second scene that squares overflow."""
     rods = world.state.rods
     fast = torch.tensor([0.0, torch.finfo(rods.vel.dtype).max ** 0.6], dtype=rods.vel.dtype).reshape(2, 1, 1)
@@ -47,7 +47,7 @@ def test_a_scene_that_breaks_when_hands_open_leaves_the_slope_of_what_all_share(
     made = dataclasses.replace(prepared("slingshot"), segment=1)
     slopes = []
     for breaks in (False, True):
-        shared = ways(made.task)[0, 0].requires_grad_()
+        shared = stage_waypoints(made.task)[0, 0].requires_grad_()
         world = episode.act(made, made.start, shared.expand(2, -1))
         after = episode.finish(made, wild(world) if breaks else world)
         assert after.failed.tolist() == [False, breaks]

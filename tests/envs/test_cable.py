@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from test_contract import F64, small, ways
+from test_contract import F64, small, stage_waypoints
 
 from torchdlo import scene as scenes
 from torchdlo.agents.trajopt.task_problem import problem
-from torchdlo.envs import TASKS, Cable, find
+from torchdlo.envs import TASKS, RopeMaterial, find
 from torchdlo.envs.core import episode
 from torchdlo.errors import InputError
 from torchdlo.scene_files import cable
@@ -50,13 +50,13 @@ def write(path: Path, effects: tuple[str, ...] = (), **numbers: float) -> Path:
     return path
 
 
-def play(name: str, rope: Cable | None, actions: int = 3) -> torch.Tensor:
+def play(name: str, rope: RopeMaterial | None, actions: int = 3) -> torch.Tensor:
     """Where the rope is after a few short actions."""
     task = dataclasses.replace(small(name, actions), rope=rope)
     made = episode.prepare(task, 2, like=torch.zeros((), dtype=F64), compiled=False)
     world = made.start
     with torch.no_grad():
-        for action in ways(task, actions).unbind(1):
+        for action in stage_waypoints(task, actions).unbind(1):
             world = episode.act(made, world, action)
     scenes.check_state(world.state)
     return world.state.rods.pos
@@ -96,7 +96,7 @@ def test_every_task_takes_a_rope(tmp_path: Path, name: str) -> None:
 
 
 def test_a_natural_shape_is_laid_along_the_rope() -> None:
-    bent = Cable(0.05, 2e-3, 4.0, curvature=((0.0, 0.0), (2.0, -1.0)))
+    bent = RopeMaterial(0.05, 2e-3, 4.0, curvature=((0.0, 0.0), (2.0, -1.0)))
     _, params, _ = find("coiling", bent).start(1, like=torch.zeros((), dtype=F64))
     middle = params.rods.rest.curvature.reshape(-1, 60, 2)[0, 30] / 0.02
     torch.testing.assert_close(middle, torch.tensor([2.0, -1.0], dtype=F64) * 30 / 59, rtol=1e-6, atol=1e-9)

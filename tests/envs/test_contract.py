@@ -22,7 +22,7 @@ def small(name: str, horizon: int = 2):
     """A task with short actions, settling and release."""
     task = TASKS[name]()
     return dataclasses.replace(
-        task, horizon=horizon, frames=FRAMES, settle=min(task.settle, 1), release=min(task.release, 1)
+        task, horizon=horizon, frames=FRAMES, settle_steps=min(task.settle_steps, 1), release=min(task.release, 1)
     )
 
 
@@ -34,7 +34,7 @@ def prepared(name: str) -> episode.Episode:
     return episode.prepare(small(name), 2, like=like, generator=generator, variation=True, compiled=False)
 
 
-def ways(task, count: int = 2) -> torch.Tensor:
+def stage_waypoints(task, count: int = 2) -> torch.Tensor:
     """Some actions that differ from scene to scene and from component to component, shape (2, count, A).
 
     They are as much shorter than the limit as they take less time, so that tools are not faster than in a full action.
@@ -45,13 +45,13 @@ def ways(task, count: int = 2) -> torch.Tensor:
 
 
 @functools.cache
-def played(name: str) -> tuple[episode.Outcome, torch.Tensor]:
+def played(name: str) -> tuple[episode.EpisodeResult, torch.Tensor]:
     """An episode of two actions with the gradient of its loss."""
     task = prepared(name).task
-    actions = ways(task).requires_grad_()
+    actions = stage_waypoints(task).requires_grad_()
     outcome = episode.play(task, actions, episode=prepared(name), keep=episode.places)
-    (slope,) = torch.autograd.grad(outcome.loss.sum(), actions, retain_graph=True)
-    return tree.detach(outcome), slope
+    (gradient,) = torch.autograd.grad(outcome.loss.sum(), actions, retain_graph=True)
+    return tree.detach(outcome), gradient
 
 
 @pytest.fixture(params=TASKS)
@@ -81,21 +81,23 @@ def test_the_reward_is_made_of_its_named_terms(name: str) -> None:
 
 
 def test_the_loss_follows_the_actions_as_finite_differences_say(name: str) -> None:
-    made, (_, slope) = prepared(name), played(name)
+    made, (_, gradient) = prepared(name), played(name)
     task = made.task
-    assert torch.isfinite(slope).all()
-    moves = slope[..., : 3 * task.arms.count]
+    assert torch.isfinite(gradient).all()
+    moves = gradient[..., : 3 * task.arms.count]
     assert (moves.abs().amax((1, 2)) > 0).all(), "an action has no influence on the loss"
     # Turns are seen by the loss only through what hangs on them: the direction is one of ways.
-    way = torch.zeros_like(slope)
+    way = torch.zeros_like(gradient)
     way[..., : 3 * task.arms.count] = torch.cos(torch.arange(moves.numel(), dtype=F64)).reshape(moves.shape)
     step = 1e-7
     with torch.no_grad():
-        up, down = (episode.play(task, ways(task) + s * step * way, episode=made).loss.sum() for s in (1, -1))
+        up, down = (
+            episode.play(task, stage_waypoints(task) + s * step * way, episode=made).loss.sum() for s in (1, -1)
+        )
     # Strands that lie on each other start and cease to press and to slip within a step, which makes an error in
     # proportion to it. Rounding of a loss L, some thousand operations deep, leaves 1e3 eps L / step.
     rounding = 1e3 * torch.finfo(F64).eps * float(up.abs() + 1) / step
-    torch.testing.assert_close((slope * way).sum(), (up - down) / (2 * step), rtol=1e-3, atol=rounding)
+    torch.testing.assert_close((gradient * way).sum(), (up - down) / (2 * step), rtol=1e-3, atol=rounding)
 
 
 def test_scenes_of_a_batch_do_not_touch_each_other(name: str) -> None:
@@ -105,7 +107,7 @@ def test_scenes_of_a_batch_do_not_touch_each_other(name: str) -> None:
     params = tree.map(lambda x: x.flip(0) if x.dim() > 2 and x.shape[0] == 2 else x, made.params)
     other = dataclasses.replace(made, start=swapped, params=params)
     with torch.no_grad():
-        again = episode.play(made.task, ways(made.task).flip(0), episode=other)
+        again = episode.play(made.task, stage_waypoints(made.task).flip(0), episode=other)
     # Equal but for the order of sums: rounding, which contact of bodies may amplify a thousandfold.
     torch.testing.assert_close(again.returns.flip(0), outcome.returns, rtol=1e-9, atol=1e-9)
 
@@ -117,7 +119,7 @@ def test_a_scene_that_is_not_finite_has_failed_and_earns_nothing(name: str) -> N
     state = tree.replace(made.start.state, rods=tree.replace(made.start.state.rods, vel=pos))
     broken = dataclasses.replace(made, start=tree.replace(made.start, state=state))
     with torch.no_grad():
-        outcome = episode.play(made.task, ways(made.task, 1), episode=broken)
+        outcome = episode.play(made.task, stage_waypoints(made.task, 1), episode=broken)
     assert outcome.failed.tolist() == [False, True]
     assert outcome.returns[1] == 0 and torch.isfinite(outcome.returns).all() and not outcome.success[1]
 
@@ -127,14 +129,14 @@ def test_observations_have_one_size_and_single_precision(name: str) -> None:
     task, start = made.task, made.start
     seen = episode.observe(made, start)
     bodies = sum(b.motion == "free" for b in made.scene.bodies)
-    blobs = 1 if start.state.matter else 0
+    blobs = 1 if start.state.material_points else 0
     v, r = start.state.rods.pos.shape[-2], task.arms.count
     assert seen.shape == (2, 6 * (v + bodies + blobs) + r * (3 + 4 + 7)) and seen.dtype == torch.float32
 
 
 def test_the_reference_keeps_the_limits_of_actions(name: str) -> None:
     task = TASKS[name]()
-    actions = task.reference()
+    actions = task.demonstration()
     assert actions.shape == (task.horizon, task.width)
     way, turn = episode.limited(task, actions)
     torch.testing.assert_close(torch.cat([way.flatten(1), torch.rad2deg(turn).flatten(1)], -1), actions)

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from torchdlo import scene as scenes
-from torchdlo.coupling.bodies.dynamics import Solid
+from torchdlo.coupling.bodies.dynamics import RigidBody
 from torchdlo.coupling.rod_body.effect import RodBody
 from torchdlo.envs.core.divergence import broken, inside
 from torchdlo.physics import tree
@@ -29,10 +29,10 @@ POINTS = {
 def test_points_are_inside_what_does_not_give_way():
     quarter = (math.cos(math.pi / 4), 0.0, 0.0, math.sin(math.pi / 4))
     solids = [
-        Solid("plane", motion="fixed"),
-        Solid("cylinder", (0.02, 0.05), (0.0, 0.0, 0.05), motion="fixed"),
-        Solid("sphere", (0.05,), (1.0, 0.0, 0.1), mass=1.0),
-        Solid("box", (0.1, 0.02, 0.02), (2.0, 0.0, 0.1), quarter, motion="kinematic"),
+        RigidBody("plane", motion="fixed"),
+        RigidBody("cylinder", (0.02, 0.05), (0.0, 0.0, 0.05), motion="fixed"),
+        RigidBody("sphere", (0.05,), (1.0, 0.0, 0.1), mass=1.0),
+        RigidBody("box", (0.1, 0.02, 0.02), (2.0, 0.0, 0.1), quarter, motion="kinematic"),
     ]
     line = torch.tensor([[0.0, 1.0, 0.5], [0.1, 1.0, 0.5], [0.2, 1.0, 0.5]], dtype=F64).expand(2, 3, 3)
     rope = scenes.Rope(line, 0.01, mass=0.01, bend=1e-4)

@@ -75,13 +75,13 @@ def test_rollouts_carry_gradients_to_actions():
     env = made(gradients=True, dtype=F64, variation=False)
     actions = torch.full((2, 12), 0.002, requires_grad=True)
     found = env.rollout(2, lambda td: td.set("action", actions))["next", "reward"]
-    (slope,) = torch.autograd.grad(found.sum(), actions)
+    (gradient,) = torch.autograd.grad(found.sum(), actions)
     made_ = envs.episode.prepare(task, 2, like=torch.zeros((), dtype=F64), compiled=False)
     other = actions.detach().double().requires_grad_()
     outcome = envs.episode.play(task, other[:, None].expand(-1, 2, -1), episode=made_)
     (wanted,) = torch.autograd.grad(outcome.returns.sum(), other)
     # Rewards and actions pass the border in single precision.
-    torch.testing.assert_close(slope.double(), wanted, rtol=1e-5, atol=1e-7)
+    torch.testing.assert_close(gradient.double(), wanted, rtol=1e-5, atol=1e-7)
 
 
 def test_scenes_that_go_on_keep_their_gradients_when_others_begin_again():
@@ -131,7 +131,7 @@ def test_random_numbers_of_effects_stay_in_their_declared_range():
 
 
 def test_scenes_settle_with_the_numbers_that_are_drawn_for_them():
-    task = dataclasses.replace(small("slingshot"), settle=5)
+    task = dataclasses.replace(small("slingshot"), settle_steps=5)
     choices = {"num_envs": 2, "compiled": False, "variation": False, "dtype": F64, "seed": 0}
     env = envs.make(task, randomize={"gravity.acceleration": 0.5}, **choices)
     env.reset()
@@ -206,11 +206,11 @@ def test_arms_stand_still_without_a_way_by_hand():
             """Return no way."""
             return ()
 
-    assert not Still(horizon=7).reference().any() and Still(horizon=7).reference().shape == (7, 12)
+    assert not Still(horizon=7).demonstration().any() and Still(horizon=7).demonstration().shape == (7, 12)
 
 
 def test_tasks_can_be_changed_field_by_field():
     short = dataclasses.replace(TASKS["coiling"](), horizon=7, frames=1)
     assert envs.make(short, compiled=False).task.horizon == 7
     with pytest.raises(ValueError, match=r"take 96 actions of 0\.01 m; expected at most 7"):
-        short.reference()
+        short.demonstration()

@@ -8,20 +8,20 @@ from typing import ClassVar
 
 import pytest
 import torch
-from test_contract import F64, prepared, small, ways
+from test_contract import F64, prepared, small, stage_waypoints
 
 from torchdlo import scene as scenes
 from torchdlo.coupling.bodies.dynamics import turn_by
 from torchdlo.coupling.robot.kinematics import tool_pose
 from torchdlo.envs import TASKS
 from torchdlo.envs.core import episode
-from torchdlo.envs.core.task import RADIUS, Arms, Seen, Task, make, straight, through
+from torchdlo.envs.core.task import RADIUS, Arms, Task, TaskState, make, straight, through
 from torchdlo.physics import tree
 from torchdlo.physics.linalg.rotation import multiply
 from torchdlo.scene import Rope
 
 
-def led(name: str, rows: list[list[float]]) -> list[episode.World]:
+def led(name: str, rows: list[list[float]]) -> list[episode.EpisodeState]:
     """The worlds after each of some actions, the same in both scenes."""
     made = prepared(name)
     world, found = made.start, []
@@ -91,28 +91,28 @@ def test_actions_of_a_wrong_size_are_refused():
 
 def test_replayed_gradients_are_those_of_the_recorded_graph():
     made = prepared("wiring_post")
-    slopes = []
+    gradients = []
     for segment in (None, 1):
         actions = torch.full((2, 2, 6), 0.003, dtype=F64, requires_grad=True)
         outcome = episode.play(made.task, actions, episode=dataclasses.replace(made, segment=segment))
-        slopes.append(torch.autograd.grad(outcome.loss.sum(), actions)[0])
-    torch.testing.assert_close(slopes[1], slopes[0], rtol=1e-10, atol=1e-12)
+        gradients.append(torch.autograd.grad(outcome.loss.sum(), actions)[0])
+    torch.testing.assert_close(gradients[1], gradients[0], rtol=1e-10, atol=1e-12)
 
 
 @pytest.mark.parametrize("name", ["wrapping"])
 def test_recorded_episodes_go_as_others_do(name: str) -> None:
     made = prepared(name)
     recorded = dataclasses.replace(made, step=scenes.stepper(made.scene, compiled=False, recorded=True))
-    actions = ways(made.task)
+    actions = stage_waypoints(made.task)
     plain, again = (episode.play(e.task, actions.clone(), episode=e, keep=episode.places) for e in (made, recorded))
     torch.testing.assert_close(again.returns, plain.returns, rtol=1e-9, atol=1e-9)
     torch.testing.assert_close(again.path["pos"], plain.path["pos"], rtol=0, atol=1e-9)
     # With gradients they are the same.
-    slopes = []
+    gradients = []
     for e in (made, recorded):
         asked = actions.clone().requires_grad_()
-        slopes.append(torch.autograd.grad(episode.play(e.task, asked, episode=e).loss.sum(), asked)[0])
-    assert torch.equal(*slopes)
+        gradients.append(torch.autograd.grad(episode.play(e.task, asked, episode=e).loss.sum(), asked)[0])
+    assert torch.equal(*gradients)
 
 
 def test_way_points_become_actions_of_the_greatest_length():
@@ -183,7 +183,7 @@ class Side(Task):
 def test_the_rope_between_hands_is_that_of_hands_on_one_rope(vertex: tuple[int, ...], rest: list[float]):
     made = type("Placed", (Side,), {"arms": Arms(Side.arms.base, vertex), "__doc__": "With hands elsewhere."})()
     scene, _, state = made.start(2, like=torch.zeros((), dtype=F64))
-    seen = Seen(state, None, None, {})
+    seen = TaskState(state, None, None, {})
     torch.testing.assert_close(made.rest(seen, scene.topology), torch.tensor([rest] * 2, dtype=F64))
 
 
@@ -204,7 +204,7 @@ def test_scores_are_0_for_doing_nothing_and_1_for_the_way_by_hand():
     way = [[(0.004, -0.003, 0.006)]]
     led_ = type("Led", (type(task),), {"waypoints": lambda self: way, "__doc__": "A task with a way of its own."})
     task = led_(horizon=1, frames=1)
-    actions = torch.stack([torch.zeros(1, 6, dtype=F64), task.reference(), 0.5 * task.reference()])
+    actions = torch.stack([torch.zeros(1, 6, dtype=F64), task.demonstration(), 0.5 * task.demonstration()])
     with torch.no_grad():
         returns = episode.play(task, actions, compiled=False).returns
     score = episode.normalized(task, returns, compiled=False)

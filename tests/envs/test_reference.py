@@ -14,7 +14,7 @@ from torchdlo.coupling.robot.attachment import Hands
 from torchdlo.envs import TASKS
 from torchdlo.envs.core import curve_geometry, episode
 from torchdlo.envs.core.task import Task, through
-from torchdlo.envs.tasks.gathering import Rehearsal
+from torchdlo.envs.tasks.gathering import GatheringSurrogate
 from torchdlo.physics import tree
 from torchdlo.physics.execution.tracing import record
 
@@ -26,9 +26,9 @@ TURNED = math.radians(45)
 def test_arms_can_go_the_way_by_hand(name: str) -> None:
     task = TASKS[name]()
     scene, _, state = task.start(1)
-    fixed = len(scene.held_vertices) - task.arms.count
+    fixed = len(scene.prescribed_vertices) - task.arms.count
     world = episode._begin(task, scene, state, Hands(task.arms.count, (*range(task.arms.count), *[-1] * fixed)))
-    actions, want = task.reference().float()[:, None], world.target.pos
+    actions, want = task.demonstration().float()[:, None], world.target.pos
     actions = actions[actions.any(-1).flatten()]  # without those that stay
     with torch.no_grad():
         for action in actions:
@@ -43,12 +43,12 @@ def test_arms_can_go_the_way_by_hand(name: str) -> None:
 @pytest.mark.parametrize("name", LED)
 def test_ways_by_hand_fit_into_the_episode_from_all_starts(name: str) -> None:
     task, sign = TASKS[name](), torch.tensor([[-1.0, -1.0], [-1.0, 1.0], [1.0, -1.0], [1.0, 1.0], [0.0, 0.0]])
-    moved = torch.nn.functional.pad(sign[:, None] * torch.tensor(task.spread), (0, 1))
+    moved = torch.nn.functional.pad(sign[:, None] * torch.tensor(task.reset_noise), (0, 1))
     start = task.build(moved)[2]
     tools = start.rods.pos[:, list(task.arms.vertex)].double()
-    actions = task.reference(start)
+    actions = task.demonstration(start)
     assert actions.shape == (5, task.horizon, task.width)
-    torch.testing.assert_close(actions[4], task.reference())
+    torch.testing.assert_close(actions[4], task.demonstration())
     ends = tools + actions.sum(-2).unflatten(-1, (2, -1, 3))[:, 0]
     want = ends[4] if task.anchored else ends[4] + tools - tools[4]
     # Starts are in single precision.
@@ -61,9 +61,9 @@ def test_ways_by_hand_take_steps_as_long_as_the_task_allows() -> None:
         """With half the reach."""
 
         horizon: int = 200
-        reach: ClassVar[float] = 0.005
+        max_translation: ClassVar[float] = 0.005
 
-    usual, slow = (task.reference().unflatten(-1, (2, 3))[:, 0] for task in (TASKS["coiling"](), Slow()))
+    usual, slow = (task.demonstration().unflatten(-1, (2, 3))[:, 0] for task in (TASKS["coiling"](), Slow()))
     assert 0.0045 < slow.norm(dim=-1).max() <= 0.005 + 1e-12
     torch.testing.assert_close(slow.sum(0), usual.sum(0))
 
@@ -87,23 +87,26 @@ def test_arms_begin_with_elbow_and_wrist_in_line(name: str) -> None:
 
 def test_the_rehearsal_of_gathering_has_objects_as_heavy_and_where_they_are() -> None:
     task = TASKS["gathering"]()
-    (_, real, start), (_, drums, begun) = task.start(1), task.rehearsal().start(1)
-    ball = float((real.matter.volume * next(iter(real.matter.laws.values()))["density"]).sum())
+    (_, real, start), (_, drums, begun) = task.start(1), task.surrogate().start(1)
+    ball = float((real.material_points.volume * next(iter(real.material_points.laws.values()))["density"]).sum())
     masses = [ball, *real.bodies.mass[..., 1:, 0].flatten().tolist()]
     assert drums.bodies.mass[..., 1:, 0].flatten().tolist() == pytest.approx(masses, rel=0.02)
-    places = torch.cat([start.matter.pos.mean(-2, keepdim=True), start.bodies.pos[:, 1:]], -2)
+    places = torch.cat([start.material_points.pos.mean(-2, keepdim=True), start.bodies.pos[:, 1:]], -2)
     torch.testing.assert_close(begun.bodies.pos[:, 1:, :2], places[..., :2], atol=4e-3, rtol=0)
-    assert task.rehearsal().rehearsal() is None and task.rehearsal().horizon == task.horizon
+    assert task.surrogate().surrogate() is None and task.surrogate().horizon == task.horizon
 
 
-def led(task: Task, count: int, moved: tuple[float, float] = (0.0, 0.0)) -> episode.Outcome:
-    """What the first actions of the way by hand come to, from a start that is moved in x and y."""
+def led(task: Task, count: int, moved: tuple[float, float] = (0.0, 0.0)) -> episode.EpisodeResult:
+    """What the first actions of the scripted demonstration come to, from a start that is moved in x and y."""
     made = episode.prepare(task, 1, compiled=False)
-    start = task.build(torch.tensor([*moved, 0.0]).expand(1, len(task.spread), 3))[2]
-    control = scenes.hold(made.scene, start)
-    grip = {"vertices": torch.ones_like(control.pos[..., :1]), "edges": torch.ones_like(control.director[..., :1])}
-    step = record(made.step, made.params, start, tree.replace(control, grip=grip))
-    actions = task.reference(start)[:, :count].float()
+    start = task.build(torch.tensor([*moved, 0.0]).expand(1, len(task.reset_noise), 3))[2]
+    control = scenes.stationary_control(made.scene, start)
+    attachment_weight = {
+        "vertices": torch.ones_like(control.pos[..., :1]),
+        "edges": torch.ones_like(control.director[..., :1]),
+    }
+    step = record(made.step, made.params, start, tree.replace(control, attachment_weight=attachment_weight))
+    actions = task.demonstration(start)[:, :count].float()
     with torch.no_grad():
         made = dataclasses.replace(made, step=step, start=episode.begin(made, start))
         return episode.play(task, actions, episode=made)
@@ -129,13 +132,13 @@ def test_the_way_by_hand_takes_an_end_out_of_the_knot() -> None:
 
 def test_the_way_by_hand_shoots_the_ball_at_the_cube() -> None:
     # The band slips out of the fingers in action 10; scenes lie still from the start, up to the sag of the band.
-    assert led(dataclasses.replace(TASKS["slingshot"](), settle=0), 10).success.all()
+    assert led(dataclasses.replace(TASKS["slingshot"](), settle_steps=0), 10).success.all()
 
 
 @pytest.mark.slow
 def test_the_way_by_hand_gathers_drums() -> None:
     # The way takes 72 actions; hands then wait.
-    assert led(Rehearsal(), 75).success.all()
+    assert led(GatheringSurrogate(), 75).success.all()
 
 
 @pytest.mark.slow
@@ -150,7 +153,7 @@ def test_the_way_by_hand_lifts_rings_by_their_arches() -> None:
     start = tree.replace(made.start.state, rods=tree.replace(rods, pos=x))
     with torch.no_grad():
         made = dataclasses.replace(made, start=episode.begin(made, start))
-        found = episode.play(task, task.reference()[None, 48:53].float(), episode=made)
+        found = episode.play(task, task.demonstration()[None, 48:53].float(), episode=made)
     # Of 5 cm, the rope's tension of 2 N lets it sag by 1 cm under the rings' 0.14 N each, and it lags behind the hands.
     rise = found.world.notes["heights"][:, -1] - made.start.notes["heights"][:, -1]
     assert not found.failed.any() and (rise > 0.01).all()

@@ -1,4 +1,4 @@
-"""Slopes of what tasks earn lead through contact: rewards tell hands where to draw, lift and push."""
+"""Gradients of what tasks earn lead through contact: rewards tell hands where to draw, lift and push."""
 
 from __future__ import annotations
 
@@ -26,9 +26,12 @@ class Played:
         if x is not None:
             state = tree.replace(state, rods=tree.replace(state.rods, pos=x.expand_as(state.rods.pos)))
         if lower:
-            matter = state.matter
+            material_points = state.material_points
             state = tree.replace(
-                state, matter=tree.replace(matter, pos=matter.pos - matter.pos.new_tensor([0, 0, lower]))
+                state,
+                material_points=tree.replace(
+                    material_points, pos=material_points.pos - material_points.pos.new_tensor([0, 0, lower])
+                ),
             )
         self.task, self.made = task, replace(made, start=episode.begin(made, state))
 
@@ -38,8 +41,8 @@ class Played:
         assert not outcome.failed.any()
         return outcome.terms[term][-1, 0]
 
-    def slope(self, actions: Tensor, term: str) -> Tensor:
-        """Return its slope by the ways of the hands, (T, R, 3); a step along that of the first action agrees."""
+    def gradient(self, actions: Tensor, term: str) -> Tensor:
+        """Return its gradient by the ways of the hands, (T, R, 3); a step along that of the first action agrees."""
         actions = actions.double().requires_grad_()
         (found,) = torch.autograd.grad(self.earned(actions, term), actions)
         step = torch.zeros_like(found)
@@ -51,26 +54,26 @@ class Played:
 
 
 def test_a_band_that_is_drawn_further_shoots_the_cube_further() -> None:
-    task = replace(TASKS["slingshot"](), settle=0, release=90)
+    task = replace(TASKS["slingshot"](), settle_steps=0, release=90)
     # Drawn by 4 cm already; vertices 1 and 10 are fixed, the fingers hold 6.
     k, straight = torch.arange(12), task.start(1)[2].rods.pos[0].double()
     share = torch.minimum((k - 1).clamp(min=0) / 5, (10 - k).clamp(min=0) / 4)
     played = Played(task, straight + share[:, None] * torch.tensor([0.0018, -0.0396, 0.0]))
-    ways = torch.zeros(3, task.width)
-    ways[:, 0], ways[:, 1] = 0.0008, -0.0099
-    ways[2, 0] = -0.01  # aside, so that the band slips out
-    found = played.slope(ways, "cube")
+    stage_waypoints = torch.zeros(3, task.width)
+    stage_waypoints[:, 0], stage_waypoints[:, 1] = 0.0008, -0.0099
+    stage_waypoints[2, 0] = -0.01  # aside, so that the band slips out
+    found = played.gradient(stage_waypoints, "cube")
     assert (found[:2, 0, 1] < 0).all()
 
 
 def test_hands_that_go_up_lift_rings() -> None:
     task = TASKS["lifting"]()
-    # The last leg of the way by hand goes up with the rope 3 mm below the arches, taut.
+    # The last leg of the scripted demonstration goes up with the rope 3 mm below the arches, taut.
     start, hands = task.start(1)[2].rods.pos[0].double(), list(task.arms.vertex)
     ends = start[hands] + torch.tensor(task.waypoints()[3]) + torch.tensor([0.0, 0.0, 0.02])
     share = (torch.arange(len(start)) - hands[0]) / (hands[1] - hands[0])
     played = Played(task, ends[:1] + share[:, None] * (ends[1:] - ends[:1]))
-    found = played.slope(task.reference()[48:51], "height")
+    found = played.gradient(task.demonstration()[48:51], "height")
     assert (found[:2, :, 2] > 0).all()
 
 
@@ -81,7 +84,7 @@ def test_hands_that_pull_a_bow_draw_the_ball_to_the_others() -> None:
     quarter = 0.5 * torch.pi * radius
     angle, legs = arc.clamp(-quarter, quarter) / radius, (arc.abs() - quarter).clamp(min=0)
     bow = torch.stack([0.25 + radius * angle.sin(), 0.02 + radius * angle.cos() - legs, torch.full_like(arc, 0.05)], -1)
-    ways = torch.zeros(3, task.width)
-    ways[:, [1, 4]] = -0.009
-    found = Played(task, bow, lower=0.02).slope(ways, "together")
+    stage_waypoints = torch.zeros(3, task.width)
+    stage_waypoints[:, [1, 4]] = -0.009
+    found = Played(task, bow, lower=0.02).gradient(stage_waypoints, "together")
     assert (found[0, :, 1] < -1e-3).all()

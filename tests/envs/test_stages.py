@@ -47,7 +47,7 @@ class Passing(Task):
         return seen.x[..., 2].amax(-1) > 0.1
 
 
-def worlds(actions: torch.Tensor) -> list[episode.World]:
+def worlds(actions: torch.Tensor) -> list[episode.EpisodeState]:
     """The worlds of a scene before and after each of some actions, shape (T, 12)."""
     made = episode.prepare(Passing(), 1, like=torch.zeros((), dtype=F64), compiled=False)
     found = [made.start]
@@ -134,17 +134,17 @@ def test_gradients_go_through_a_change_of_hands():
     made = episode.prepare(Passing(), 1, like=torch.zeros((), dtype=F64), compiled=False)
     actions = (led(7, 0, (0.0001, 0.0002, 0.0003)) + led(7, 1, (0.0, 0.0002, 0.0004)))[None].requires_grad_()
     outcome = episode.play(Passing(), actions, episode=made)
-    (slope,) = torch.autograd.grad(outcome.loss.sum(), actions)
+    (gradient,) = torch.autograd.grad(outcome.loss.sum(), actions)
     # On its way the hand is led by the rope, not by its actions.
-    assert (slope[0, 1:4, :3] == 0).all() and (slope[0, [0, 4, 5, 6], :3].abs().amax(-1) > 0).all()
-    way = torch.cos(torch.arange(slope.numel(), dtype=F64)).reshape(slope.shape)
+    assert (gradient[0, 1:4, :3] == 0).all() and (gradient[0, [0, 4, 5, 6], :3].abs().amax(-1) > 0).all()
+    way = torch.cos(torch.arange(gradient.numel(), dtype=F64)).reshape(gradient.shape)
     way[..., 6:] = 0.0
     step = 1e-7
     with torch.no_grad():
         up, down = (episode.play(Passing(), actions + sign * step * way, episode=made).loss.sum() for sign in (1, -1))
-    # Central differences: the error of the slope is step^2 of the third derivative, and rounding over the step.
+    # Central differences: the error of the gradient is step^2 of the third derivative, and rounding over the step.
     rounding = 1e3 * torch.finfo(F64).eps * float(up.abs() + 1) / step
-    torch.testing.assert_close((slope * way).sum(), (up - down) / (2 * step), rtol=1e-3, atol=rounding)
+    torch.testing.assert_close((gradient * way).sum(), (up - down) / (2 * step), rtol=1e-3, atol=rounding)
 
 
 def test_the_reference_of_a_task_with_stages_is_made_stage_by_stage():
@@ -152,11 +152,11 @@ def test_the_reference_of_a_task_with_stages_is_made_stage_by_stage():
     class Led(Passing):
         """With a way."""
 
-        def ways(self):
+        def stage_waypoints(self):
             """Return a way that only uses the second stage."""
             return [[], [[(0.02, 0.0, 0.0), (0.0, 0.0, 0.0)]], []]
 
-    actions = Led().reference()
+    actions = Led().demonstration()
     assert actions.shape == (8, 12)
     assert actions.any(-1).nonzero().flatten().tolist() == [4, 5]
 
@@ -188,7 +188,7 @@ def test_arms_can_go_the_way_by_hand_of_tasks_with_stages(name: str):
     made = dataclasses.replace(episode.prepare(task, 1, compiled=False), step=lambda params, state, control: state)
     world, plan = made.start, task.schedule
     with torch.no_grad():
-        for action in task.reference().float()[:, None]:
+        for action in task.demonstration().float()[:, None]:
             aim = episode._aim(task, world, action)
             want = plan.steer(world.count, world.target, aim, world.state.rods.pos).pos
             world = episode.act(made, world, action)

@@ -13,7 +13,7 @@ from torchdlo.coupling.common.pose import Pose
 from torchdlo.envs import TASKS
 from torchdlo.envs.assets.rigid_objects import c_ring
 from torchdlo.envs.core import curve_geometry
-from torchdlo.envs.core.task import Seen, Task, even, straight
+from torchdlo.envs.core.task import Task, TaskState, even, straight
 from torchdlo.envs.tasks import letter_art as letters
 from torchdlo.envs.tasks import wiring_post as wiring
 from torchdlo.envs.tasks.lifting import into
@@ -28,7 +28,9 @@ def first(name: str):
     return TASKS[name]().start(1, like=torch.zeros((), dtype=F64))[2]
 
 
-def judged(name: str, *shapes: torch.Tensor, notes: dict | None = None, bodies: list | None = None, matter=None):
+def judged(
+    name: str, *shapes: torch.Tensor, notes: dict | None = None, bodies: list | None = None, material_points=None
+):
     """Whether a task has succeeded with each of some shapes of its ropes (V, 3), and positions of its bodies."""
     state, task = first(name), TASKS[name]()
     count = max(len(shapes), len(bodies or ()))
@@ -37,15 +39,15 @@ def judged(name: str, *shapes: torch.Tensor, notes: dict | None = None, bodies: 
         state = tree.replace(state, rods=tree.replace(state.rods, pos=torch.stack(shapes)))
     if bodies:
         state = tree.replace(state, bodies=tree.replace(state.bodies, pos=torch.stack(bodies)))
-    if matter is not None:
-        state = tree.replace(state, matter=tree.replace(state.matter, pos=matter))
+    if material_points is not None:
+        state = tree.replace(state, material_points=tree.replace(state.material_points, pos=material_points))
     arms = task.arms.count
     tool = Pose(torch.zeros(count, arms, 3, dtype=F64), torch.zeros(count, arms, 4, dtype=F64))
-    seen = Seen(state, tool, torch.ones(count, arms, 1, dtype=F64), notes or {})
+    seen = TaskState(state, tool, torch.ones(count, arms, 1, dtype=F64), notes or {})
     if notes is None:
         seen = tree.replace(seen, notes=task.note(seen))
-    done, short = task.success(seen), task.shortfall(seen)
-    if type(task).shortfall is not Task.shortfall:
+    done, short = task.success(seen), task.terminal_cost(seen)
+    if type(task).terminal_cost is not Task.terminal_cost:
         assert (short >= 0).all() and (done | (short > 0)).all()
     return done.tolist()
 
@@ -117,11 +119,11 @@ def two_of_three() -> list[tuple[float, float]]:
 def test_the_further_from_success_the_more_is_lacking(name, good, worse):
     state = tree.map(lambda x: x.expand(len(worse) + 1, *x.shape[1:]).clone(), first(name))
     x = torch.stack([good, *worse]).requires_grad_()
-    seen = Seen(tree.replace(state, rods=tree.replace(state.rods, pos=x)), None, None, {})
-    short = TASKS[name]().shortfall(seen)
+    seen = TaskState(tree.replace(state, rods=tree.replace(state.rods, pos=x)), None, None, {})
+    short = TASKS[name]().terminal_cost(seen)
     assert short[0] == 0 and (short.diff() > 0).all()
-    (slope,) = torch.autograd.grad(short.sum(), x)
-    assert torch.isfinite(slope).all() and not slope[0].any() and slope[1:].flatten(1).any(1).all()
+    (gradient,) = torch.autograd.grad(short.sum(), x)
+    assert torch.isfinite(gradient).all() and not gradient[0].any() and gradient[1:].flatten(1).any(1).all()
 
 
 def test_the_goal_of_wiring_is_where_the_task_says():
@@ -151,8 +153,8 @@ def test_separation_takes_room_between_the_ropes():
     along = torch.arange(30, dtype=F64) * 0.02
     one = torch.stack([along, 0 * along, 0.01 + 0 * along], -1)
 
-    def other(gap: float, slope: float) -> torch.Tensor:
-        return torch.cat([one, one + torch.stack([0 * along, gap + slope * along, 0 * along], -1)])
+    def other(gap: float, gradient: float) -> torch.Tensor:
+        return torch.cat([one, one + torch.stack([0 * along, gap + gradient * along, 0 * along], -1)])
 
     shapes = [other(0.06, 0.0), other(0.04, 0.0), other(-0.06, 0.2), first("separation").rods.pos[0]]
     assert judged("separation", *shapes) == [True, False, False, False]
@@ -209,22 +211,26 @@ def test_lifting_lacks_less_in_front_of_the_gaps_than_behind_the_rings_and_nothi
     x[:, :, 2] += x.new_tensor([0.0, 0.0, 0.0, 0.023, 0.073])[:, None]
     bodies = state.bodies.pos.clone()
     bodies[4, 1:, 2] += 0.05
-    seen = Seen(tree.replace(state, rods=tree.replace(state.rods, pos=x)), None, None, {})
+    seen = TaskState(tree.replace(state, rods=tree.replace(state.rods, pos=x)), None, None, {})
     seen = tree.replace(seen, state=tree.replace(seen.state, bodies=tree.replace(state.bodies, pos=bodies)))
-    short = TASKS["lifting"]().shortfall(seen)
+    short = TASKS["lifting"]().terminal_cost(seen)
     assert (short.diff() < 0).all() and short[3:].tolist() == pytest.approx([40.0, 0.0])
 
 
 def test_gathering_takes_objects_together_and_hands_clear():
     state = first("gathering")
     shapes = [state.rods.pos[0]] * 3
-    ball = state.matter.pos[0] - state.matter.pos[0].mean(0) + state.rods.pos.new_tensor([0.2, 0.0, 0.05])
+    ball = (
+        state.material_points.pos[0]
+        - state.material_points.pos[0].mean(0)
+        + state.rods.pos.new_tensor([0.2, 0.0, 0.05])
+    )
     plane = state.bodies.pos[0, 0]
     close = torch.stack([plane, plane.new_tensor([0.3, 0.0, 0.03]), plane.new_tensor([0.2, 0.11, 0.03])])
     apart = torch.stack([plane, plane.new_tensor([0.3, 0.0, 0.03]), plane.new_tensor([0.2, 0.18, 0.03])])
     notes = {"closest": torch.tensor([0.07, 0.07, 0.05], dtype=F64)}
-    matter = ball.expand(3, *ball.shape)
-    assert judged("gathering", *shapes, notes=notes, bodies=[close, apart, close], matter=matter) == [
+    material_points = ball.expand(3, *ball.shape)
+    assert judged("gathering", *shapes, notes=notes, bodies=[close, apart, close], material_points=material_points) == [
         True,
         False,
         False,
@@ -233,16 +239,20 @@ def test_gathering_takes_objects_together_and_hands_clear():
 
 def test_the_further_objects_are_apart_and_the_nearer_hands_the_more_is_lacking():
     state = tree.map(lambda x: x.expand(4, *x.shape[1:]).clone(), first("gathering"))
-    ball = state.matter.pos[0] - state.matter.pos[0].mean(0) + state.rods.pos.new_tensor([0.2, 0.0, 0.05])
+    ball = (
+        state.material_points.pos[0]
+        - state.material_points.pos[0].mean(0)
+        + state.rods.pos.new_tensor([0.2, 0.0, 0.05])
+    )
     bodies = state.bodies.pos.clone()
     bodies[:, 1] = bodies.new_tensor([0.3, 0.0, 0.03])
     bodies[:, 2] = bodies.new_tensor([0.2, 0.11, 0.03])
     bodies[1:3, 2, 1] += bodies.new_tensor([0.03, 0.06])
     bodies.requires_grad_()
     state = tree.replace(state, bodies=tree.replace(state.bodies, pos=bodies))
-    state = tree.replace(state, matter=tree.replace(state.matter, pos=ball.expand(4, *ball.shape)))
+    state = tree.replace(state, material_points=tree.replace(state.material_points, pos=ball.expand(4, *ball.shape)))
     closest = torch.tensor([0.07, 0.07, 0.07, 0.05], dtype=F64, requires_grad=True)
-    short = TASKS["gathering"]().shortfall(Seen(state, None, None, {"closest": closest}))
+    short = TASKS["gathering"]().terminal_cost(TaskState(state, None, None, {"closest": closest}))
     assert short[0] == 0 and 0 < short[1] < short[2] and short[3] > 0
     moved, nearer = torch.autograd.grad(short.sum(), [bodies, closest])
     assert moved.flatten(1).any(1).tolist() == [False, True, True, False] and nearer.nonzero().tolist() == [[3]]
@@ -293,8 +303,8 @@ def test_a_hand_that_goes_through_a_ring_has_failed():
     after = before.clone()
     after[:, 1] = torch.tensor([[0.26, 0.0, 0.05], [0.26, 0.04, 0.05], [0.26, 0.0, 0.15]], dtype=F64)
     closed = torch.ones(3, 2, 1, dtype=F64)
-    seen = Seen(state, Pose(before, quat), closed, {})
-    seen = Seen(state, Pose(after, quat), closed, task.note(seen))
+    seen = TaskState(state, Pose(before, quat), closed, {})
+    seen = TaskState(state, Pose(after, quat), closed, task.note(seen))
     seen = tree.replace(seen, notes=task.note(seen))
     assert task.failed(seen).tolist() == [True, True, False]
 

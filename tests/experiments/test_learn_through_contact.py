@@ -40,6 +40,6 @@ def test_a_plate_learns_to_pour_and_not_with_contact_cut(problems):
     whole = problems.PROBLEMS["pour"]
     problem = dataclasses.replace(whole, scene=lambda: dataclasses.replace(whole.scene(), duration=0.2))
     found, cut = (problems.learn(problem, cut=c, iterations=2, seed=1) for c in (False, True))
-    assert found.losses[0] == cut.losses[0] and cut.slope == 0.0 and len(cut.losses) == 1
-    assert 0 < found.slope < math.inf
+    assert found.losses[0] == cut.losses[0] and cut.gradient == 0.0 and len(cut.losses) == 1
+    assert 0 < found.gradient < math.inf
     assert found.losses[0] > found.losses[1] > found.losses[2]

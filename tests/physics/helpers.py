@@ -15,7 +15,7 @@ from torchdlo.physics.effects import base as effect
 from torchdlo.physics.effects.elastic import Bend, BendFrame, Stretch, Twist
 from torchdlo.physics.rod import kinematics as rod
 from torchdlo.physics.rod.topology import preceding
-from torchdlo.scene import Control, Params, Scene, State, hold, step
+from torchdlo.scene import Control, Params, Scene, State, stationary_control, step
 
 F64 = torch.float64
 ELASTIC = (Stretch, Bend, BendFrame, Twist)
@@ -54,7 +54,7 @@ def altered(scene: Scene, params: Params) -> rod.RodParams:
     """The rods' parameters as the effects change them."""
     rods = params.rods
     for e in scene.effects:
-        rods = e.alter(scene.topology, rods, params.effects.get(e.name, {}))
+        rods = e.modify_material(scene.topology, rods, params.effects.get(e.name, {}))
     return rods
 
 
@@ -214,7 +214,7 @@ def run(
     """
     out = []
     with torch.no_grad():
-        given = hold(scene, state) if control is None else control
+        given = stationary_control(scene, state) if control is None else control
         for k in range(count):
             state = step(scene, params, state, given(k, state) if callable(given) else given)
             if seen is not None:

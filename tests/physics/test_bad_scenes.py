@@ -12,7 +12,7 @@ from helpers import circle, effects, run, straight, vec
 from torchdlo.physics import tree
 from torchdlo.physics.effects.external import Gravity
 from torchdlo.physics.rod.topology import Topology
-from torchdlo.scene import Control, Params, Rope, Scene, finite, hold, limits, make, rollout, step
+from torchdlo.scene import Control, Params, Rope, Scene, finite, limits, make, rollout, stationary_control, step
 
 X = straight(6)
 GOOD = {"mass": 0.1, "bend": 1e-3, "twist": 1e-3}
@@ -85,18 +85,18 @@ BAD = {
     "a word for dt": (lambda: make(rope(), [], dt="1ms"), "dt is '1ms'"),
     "no substep": (lambda: make(rope(), [], substeps=0), "substeps"),
     "half a substep": (lambda: make(rope(), [], substeps=2.5), "substeps"),
-    "no newton step": (lambda: make(rope(), [], newton=0), "newton"),
-    "small gamma": (lambda: make(rope(), [], gamma=0.1), "gamma"),
-    "negative ahead": (lambda: make(rope(), [], ahead=-0.5), "ahead"),
-    "held vertex outside": (lambda: make(rope(), [], held_vertices=(6,)), "held_vertices"),
-    "held vertex negative": (lambda: make(rope(), [], held_vertices=(-1,)), "held_vertices"),
-    "held vertex twice": (lambda: make(rope(), [], held_vertices=(1, 1)), "held_vertices"),
-    "held edge outside": (lambda: make(rope(), [], held_edges=(9,)), "held_edges"),
+    "no newton step": (lambda: make(rope(), [], constraint_iterations=0), "constraint_iterations"),
+    "small gamma": (lambda: make(rope(), [], implicit_weight=0.1), "implicit_weight"),
+    "negative ahead": (lambda: make(rope(), [], numerical_damping=-0.5), "numerical_damping"),
+    "held vertex outside": (lambda: make(rope(), [], prescribed_vertices=(6,)), "prescribed_vertices"),
+    "held vertex negative": (lambda: make(rope(), [], prescribed_vertices=(-1,)), "prescribed_vertices"),
+    "held vertex twice": (lambda: make(rope(), [], prescribed_vertices=(1, 1)), "prescribed_vertices"),
+    "held edge outside": (lambda: make(rope(), [], prescribed_edges=(9,)), "prescribed_edges"),
     "held edge is the seam of an open rope": (
-        lambda: make(rope(), effects("bend", "twist"), held_edges=(5,), twist="quasistatic"),
-        "held_edges",
+        lambda: make(rope(), effects("bend", "twist"), prescribed_edges=(5,), twist="quasistatic"),
+        "prescribed_edges",
     ),
-    "held edge without twist": (lambda: make(rope(), effects("bend"), held_edges=(0,)), "held_edges"),
+    "held edge without twist": (lambda: make(rope(), effects("bend"), prescribed_edges=(0,)), "prescribed_edges"),
     "effect twice": (lambda: make(rope(), effects("gravity", "gravity")), "gravity"),
     "both laws of bending": (lambda: make(rope(), effects("bend", "bend_frame")), "bend"),
     "implicit without lengths": (lambda: make(rope(), [], integrator="implicit", constrained=False), "constrained"),
@@ -144,20 +144,22 @@ BAD = {
 
 
 def wrong_control(count: int):
-    scene, params, state = make(rope(), effects("bend"), held_vertices=(0,), dt=1e-3)
+    scene, params, state = make(rope(), effects("bend"), prescribed_vertices=(0,), dt=1e-3)
     return step(scene, params, state, Control(X[:count], X[:0]))
 
 
 def uneven_controls():
-    scene, params, state = make(rope(), effects("bend", "twist"), held_vertices=(0,), held_edges=(0,), twist="dynamic")
-    control = hold(scene, state)
+    scene, params, state = make(
+        rope(), effects("bend", "twist"), prescribed_vertices=(0,), prescribed_edges=(0,), twist="dynamic"
+    )
+    control = stationary_control(scene, state)
     several = Control(control.pos.expand(5, *control.pos.shape), control.director.expand(7, *control.director.shape))
     return rollout(scene, params, state, several)
 
 
 def test_a_scene_with_lists_of_held_parts_is_hashable():
-    scene, _, _ = make(rope(), effects("bend"), held_vertices=[0, 1], dt=1e-3)
-    assert hash(scene) and scene.held_vertices == (0, 1)
+    scene, _, _ = make(rope(), effects("bend"), prescribed_vertices=[0, 1], dt=1e-3)
+    assert hash(scene) and scene.prescribed_vertices == (0, 1)
 
 
 @pytest.mark.parametrize("case", BAD)
@@ -208,7 +210,7 @@ def test_limits_are_those_of_the_discrete_rod(term):
         r = s.rods
         kick = 1e-6 * torch.tensor([1.0, -1.0] * 3, dtype=X.dtype)[:, None]
         s = tree.replace(s, rods=tree.replace(r, pos=r.pos + kick * vec(1.0, 0, 1.0), twist=r.twist + kick))
-        s, _ = run(fast, p, s, 60, hold(fast, s))
+        s, _ = run(fast, p, s, 60, stationary_control(fast, s))
         size = max(
             float((s.rods.pos - r.pos).abs().nan_to_num(1e9).max()), float(s.rods.twist.abs().nan_to_num(1e9).max())
         )

@@ -43,7 +43,7 @@ def ring_beam(n_edges: int, beta: float, count: int, **choices):
     scene, params, state = make(
         [Rope(x, mass=n_edges * h, bend=1.0, rest="straight")],
         effects("bend"),
-        held_vertices=(0, 1),
+        prescribed_vertices=(0, 1),
         substeps=1,
         **choices,
     )
@@ -65,11 +65,12 @@ def test_clamped_beam_vibrates_at_the_closed_form_frequency(integrator, mode, be
 
 
 def test_implicit_vibration_does_not_decay_without_looking_ahead():
-    # D1: amplitude of mode 1 over 5 periods, 1 % per 100 periods. With `ahead` the damping ratio is ahead dt w / 2.
+    # D1: amplitude of mode 1 over 5 periods, 1 % per 100 periods. With `numerical_damping` the damping ratio is ahead
+    # dt w / 2.
     beta, per = 1.875104, 40
     dt = 2 * math.pi / beta**2 / per
     for ahead, decay in ((0.0, 0.0), (0.1, math.pi * 0.1 * dt * beta**2)):
-        signal = np.array(ring_beam(10, beta, 6 * per, integrator="implicit", dt=dt, ahead=ahead))
+        signal = np.array(ring_beam(10, beta, 6 * per, integrator="implicit", dt=dt, numerical_damping=ahead))
         first, last = np.abs(signal[:per]).max(), np.abs(signal[5 * per :]).max()
         rate = math.log(first / last) / 5
         assert rate == pytest.approx(decay, rel=0.1, abs=1e-3)
@@ -86,7 +87,7 @@ def test_hanging_rope_swings_at_the_bessel_frequency(integrator):
     scene, params, state = make(
         [Rope(x, mass=1.0, bend=1e-9)],
         effects("bend", "gravity"),
-        held_vertices=(0,),
+        prescribed_vertices=(0,),
         substeps=1,
         dt=dt,
         integrator=integrator,
@@ -112,7 +113,7 @@ def test_bar_rings_at_the_speed_of_sound():
     rope = Rope(moved, mass=1.0, bend=1e-6, stretch=ea, rest=rest)
     dt = 0.01
     scene, params, state = make(
-        [rope], effects("stretch_force"), held_vertices=(0,), substeps=1, dt=dt, constrained=False
+        [rope], effects("stretch_force"), prescribed_vertices=(0,), substeps=1, dt=dt, constrained=False
     )
     _, signal = run(scene, params, state, 300, seen=lambda st: float(((st.rods.pos - rest)[:, 0] * mode).sum()))
     assert period(signal, dt) == pytest.approx(2 * math.pi / (0.5 * math.pi * math.sqrt(ea)), rel=5e-3)
@@ -131,8 +132,8 @@ def test_twist_waves_run_at_the_torsional_speed(integrator):
         [Rope(straight(n), mass=mass, bend=1e-3, twist=c, radius=r)],
         effects("bend", "twist"),
         twist="dynamic",
-        held_vertices=(0, 1),
-        held_edges=(0,),
+        prescribed_vertices=(0, 1),
+        prescribed_edges=(0,),
         substeps=1,
         dt=dt,
         integrator=integrator,
@@ -153,7 +154,7 @@ def test_stiff_pendulum_swings_like_a_rigid_bar():
     scene, params, state = make(
         [Rope(x, mass=1.0, bend=G * 1e3)],
         effects("bend", "gravity"),
-        held_vertices=(0,),
+        prescribed_vertices=(0,),
         substeps=1,
         dt=dt,
         integrator="implicit",
@@ -165,7 +166,7 @@ def test_stiff_pendulum_swings_like_a_rigid_bar():
 
 FALLS = {
     "explicit": {},
-    "implicit, nothing ahead": {"integrator": "implicit", "ahead": 0.0},
+    "implicit, nothing ahead": {"integrator": "implicit", "numerical_damping": 0.0},
     "implicit": {"integrator": "implicit"},
 }
 
@@ -182,7 +183,7 @@ def test_folded_chain_falls_faster_than_free_fall(name):
     length = h * (len(x) - 1)
     rope = Rope(x, mass=1.0, bend=1e-9, rest=straight(len(x), length))
     scene, params, state = make(
-        [rope], effects("bend", "gravity"), held_vertices=(0,), substeps=1, dt=dt, **FALLS[name]
+        [rope], effects("bend", "gravity"), prescribed_vertices=(0,), substeps=1, dt=dt, **FALLS[name]
     )
     _, seen = run(scene, params, state, 740, seen=lambda st: (float(-st.rods.pos[-1, 2]), float(-st.rods.vel[-1, 2])))
     fall, errors = np.array(seen), []
@@ -201,7 +202,9 @@ def hang(n_edges: int, dt: float, count: int, every: int, **choices):
     h = 1.0 / (n_edges - 0.5)
     x = straight(n_edges + 1, n_edges * h, start=-h / 2)
     rope = Rope(x, radius=0.005, density=1000.0, youngs=1e6)
-    scene, params, state = make([rope], effects("bend", "gravity"), held_vertices=(0, 1), substeps=1, dt=dt, **choices)
+    scene, params, state = make(
+        [rope], effects("bend", "gravity"), prescribed_vertices=(0, 1), substeps=1, dt=dt, **choices
+    )
     _, seen = run(scene, params, state, count, seen=lambda st: st.rods.pos)
     return torch.stack(seen)[every - 1 :: every].numpy(), (np.arange(n_edges + 1) - 0.5) * h
 
@@ -268,8 +271,8 @@ def recorded(name: str, dt: float, **choices):
         values,
         dt=dt,
         substeps=1,
-        held_vertices=(0, 1, n - 1, n),
-        held_edges=(0, n - 1),
+        prescribed_vertices=(0, 1, n - 1, n),
+        prescribed_edges=(0, n - 1),
         integrator="implicit",
         **choices,
     )
@@ -307,10 +310,10 @@ def test_twisted_arc_follows_the_reference(twist):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("dt", "choices"), [(2.5e-3, {}), (5e-3, {"ahead": 0.0})], ids=["2.5 ms", "5 ms, nothing ahead"]
+    ("dt", "choices"), [(2.5e-3, {}), (5e-3, {"numerical_damping": 0.0})], ids=["2.5 ms", "5 ms, nothing ahead"]
 )
 def test_rope_between_moving_clamps_follows_the_reference(dt, choices):
-    # Both clamps move and tilt for 2 s; first order in dt with `ahead`: 2 mm rms of a 700 mm rope at 2.5 ms, 1 mm
-    # without at 5 ms.
+    # Both clamps move and tilt for 2 s; first order in dt with `numerical_damping`: 2 mm rms of a 700 mm rope at 2.5
+    # ms, 1 mm without at 5 ms.
     apart, _d = recorded("held", dt, twist="quasistatic", **choices)
     assert float(apart.square().mean().sqrt()) < (1e-3 if choices else 2e-3)

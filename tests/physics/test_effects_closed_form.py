@@ -15,7 +15,7 @@ from torchdlo.physics.effects.gripper_compliance import GripperCompliance
 from torchdlo.physics.integrators.rod_step import _twist_matrix
 from torchdlo.physics.rod import kinematics as rod
 from torchdlo.physics.rod.topology import preceding
-from torchdlo.scene import Control, Rope, hold, make, step, stepper
+from torchdlo.scene import Control, Rope, make, stationary_control, step, stepper
 
 H, G = 0.1, 9.81
 
@@ -80,7 +80,7 @@ def test_a_hanging_rope_lengthens_by_its_weight_over_the_axial_stiffness(stretch
         integrator="implicit",
         dt=5e-3,
         substeps=1,
-        held_vertices=(0,),
+        prescribed_vertices=(0,),
     )
     state, _ = run(built, params, state, 1600)  # motion decays at 4/s: e^-32 of it is left
     below = G * params.rods.material.mass[:, 0].flip(0).cumsum(0).flip(0)[1:]
@@ -95,7 +95,7 @@ def corner(angle: float) -> torch.Tensor:
 
 def rubbing(kappa_c: float = 0.7, moment: float = 2e-3, n: torch.Tensor | None = None, **choices):
     """A hinge that is led by hand."""
-    choices = {"dt": 0.01, "substeps": 1, "held_vertices": (0, 1, 2)} | choices
+    choices = {"dt": 0.01, "substeps": 1, "prescribed_vertices": (0, 1, 2)} | choices
     rope = Rope(corner(0.0) if n is None else n, mass=0.1, bend=1e-3, director=choices.pop("director", None))
     return make(
         [rope],
@@ -230,7 +230,7 @@ def test_friction_in_bending_answers_to_twist_as_it_says():
     built, params, state = bent(["internal_friction"], {"internal_friction": {"moment": 2e-3, "kappa_c": 2.0}})
     one, values = built.effects[0], params.effects["internal_friction"]
     for k in range(3):  # a path that turns
-        memory = one.remember(view(built, params, state), values)
+        memory = one.update_memory(view(built, params, state), values)
         r = state.rods
         pos = r.pos + 0.01 * rand(*r.pos.shape, seed=20 + k, low=-1)
         state = tree.replace(state, rods=view(built, params, state, pos).state)
@@ -353,10 +353,10 @@ def test_compiled_steps_with_every_law_equal_eager_ones():
         twist="dynamic",
         dt=2e-3,
         substeps=1,
-        held_vertices=(0, 1),
-        held_edges=(0,),
+        prescribed_vertices=(0, 1),
+        prescribed_edges=(0,),
     )
-    control = hold(built, state)
+    control = stationary_control(built, state)
     compiled, eager = state, state
     fast = stepper(built)
     with torch.no_grad():

@@ -11,7 +11,7 @@ from helpers import ELASTIC, F64, circle, effects, energy, loads, rand, straight
 from torchdlo.physics import tree
 from torchdlo.physics.effects.elastic import Bend, BendFrame, Stretch, Twist, curvature
 from torchdlo.physics.linalg import rotation
-from torchdlo.scene import Rope, hold, make, step
+from torchdlo.scene import Rope, make, stationary_control, step
 
 
 def ropes(kind: str) -> list[Rope]:
@@ -224,7 +224,7 @@ def test_a_fold_opens_without_blowing_up():
         scene, params, state = make(
             [Rope(pos, mass=0.01, bend=1e-4)], [Bend()], integrator="implicit", dt=5e-3, substeps=1
         )
-        control = hold(scene, state)
+        control = stationary_control(scene, state)
         start = float(energy(scene, params, state))
         for _ in range(40):
             state = step(scene, params, state, control)
@@ -269,7 +269,7 @@ def test_loops_at_rest_as_placed_have_no_energy_and_stay(pos):
     assert float(force.abs().max()) < 1e-12 and float(torque.abs().max()) < 1e-14
     start = state.rods.pos
     for _ in range(20):
-        state = step(scene, params, state, hold(scene, state))
+        state = step(scene, params, state, stationary_control(scene, state))
     assert float((state.rods.pos - start).abs().max()) < 1e-11
     # Turned as a whole, it still feels nothing.
     q = vec(0.8, 0.1, -0.5, 0.3)

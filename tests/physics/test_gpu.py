@@ -22,7 +22,7 @@ def _scene(dtype: torch.dtype, closed: bool, **choices):
     rope = scenes.Rope(x, mass=0.05, bend=1e-3, twist=1e-3, closed=closed, rest="as_placed")
     effects = [Gravity(), BendFrame(), Twist(), Damping(), AirDrag(), Table(), TableFriction()]
     return scenes.make(
-        [rope], effects, {"table_friction": {"mu": 0.3}}, dt=2e-3, substeps=2, held_vertices=(0, 1), **choices
+        [rope], effects, {"table_friction": {"mu": 0.3}}, dt=2e-3, substeps=2, prescribed_vertices=(0, 1), **choices
     )
 
 
@@ -50,7 +50,7 @@ def test_gpu_rollout_and_gradient_equal_those_of_the_cpu(closed: bool, choices: 
         p, s = (tree.map(lambda x, d=device: x.to(d), t) for t in (params, state))
         bend = p.rods.material.bend.clone().requires_grad_()
         p = tree.replace(p, rods=tree.replace(p.rods, material=tree.replace(p.rods.material, bend=bend)))
-        control = tree.map(lambda c: c.expand(10, *c.shape), scenes.hold(scene, s))
+        control = tree.map(lambda c: c.expand(10, *c.shape), scenes.stationary_control(scene, s))
         last, _ = scenes.rollout(lambda p, s, c: scenes.step(scene, p, s, c), p, s, control, segment=3)
         last.rods.pos.square().sum().backward()
         found.append((last.rods.pos.detach().cpu(), bend.grad.cpu()))
@@ -65,7 +65,7 @@ def test_gpu_replay_keeps_states_in_cpu_memory() -> None:
         torch.cuda.reset_peak_memory_stats()
         vel = state.rods.vel.clone().requires_grad_()
         begin = tree.replace(state, rods=tree.replace(state.rods, vel=vel))
-        control = tree.map(lambda c: c.expand(frames, *c.shape), scenes.hold(scene, state))
+        control = tree.map(lambda c: c.expand(frames, *c.shape), scenes.stationary_control(scene, state))
         last, _ = scenes.rollout(
             lambda p, s, c: scenes.step(scene, p, s, c), params, begin, control, segment=5, keep=lambda s: s.time
         )
@@ -80,9 +80,9 @@ def test_bend_without_frames_runs_on_the_gpu() -> None:
     x = torch.zeros(3, 30, 3)
     x[..., 0] = torch.linspace(0, 1, 30)
     scene, params, state = scenes.make(
-        [scenes.Rope(x, density=1000.0, youngs=1e6)], [Gravity(), Bend()], held_vertices=(0, 1)
+        [scenes.Rope(x, density=1000.0, youngs=1e6)], [Gravity(), Bend()], prescribed_vertices=(0, 1)
     )
     params, state = (tree.map(lambda t: t.to("cuda"), part) for part in (params, state))
     for _ in range(20):
-        state = scenes.step(scene, params, state, scenes.hold(scene, state))
+        state = scenes.step(scene, params, state, scenes.stationary_control(scene, state))
     assert scenes.finite(state).all()

@@ -14,7 +14,7 @@ from torchdlo.physics import tree
 from torchdlo.physics.effects import EFFECTS
 from torchdlo.physics.effects.gripper_compliance import GripperCompliance
 from torchdlo.physics.execution import replay
-from torchdlo.scene import Control, Rope, hold, make, rollout, step, stepper
+from torchdlo.scene import Control, Rope, make, rollout, stationary_control, step, stepper
 
 STEPS = 200
 POINTS = ((-2.0, 1 / 12), (-1.0, -8 / 12), (1.0, 8 / 12), (2.0, -1 / 12))
@@ -119,7 +119,7 @@ def build(case: str):
     given = {"mass": 0.3, "bend": 2e-3, "radius": 0.02, "closed": closed} | extra
     if c.get("twist"):
         given |= {"bend2": 3e-3, "twist": 2e-3, "rest": "as_placed" if closed else like(x)}
-    held = {"held_vertices": (0,)} | ({"held_edges": (0,)} if c.get("twist") else {})
+    held = {"prescribed_vertices": (0,)} | ({"prescribed_edges": (0,)} if c.get("twist") else {})
     values = {k: w for k, w in VALUES.items() if k in names}
     made = [INSTANCES.get(name) or EFFECTS[name]() for name in names]
     scene, params, state = make([Rope(x, velocities=v, **given)], made, values, substeps=1, **held, **c)
@@ -127,13 +127,13 @@ def build(case: str):
         first = 0.2 * rand(n, 1, seed=4, low=-1) * params.rods.rest.edge_mask
         first[0] = 0
         state = tree.replace(state, rods=tree.replace(state.rods, twist=first))
-    start = hold(scene, state)
+    start = stationary_control(scene, state)
     t = torch.linspace(0, 1, STEPS, dtype=F64)[:, None, None]
     pos = start.pos + 0.05 * torch.sin(6 * t) * vec(0.3, 1.0, 0.5)
     controls = Control(
         pos,
         start.director + torch.sin(4 * t) * vec(0.1, 0.4, 0.6)
-        if held.get("held_edges")
+        if held.get("prescribed_edges")
         else start.director.expand(STEPS, 0, 3),
     )
     return scene, (params, state, controls)
@@ -292,12 +292,12 @@ def test_gradients_through_compiled_steps_equal_eager_ones(integrator):
     scene, params, state = make(
         [Rope(x, velocities=v, mass=0.3, bend=2e-3, radius=0.02)],
         [EFFECTS[name]() for name in ("bend", "gravity", "damping")],
-        held_vertices=(0,),
+        prescribed_vertices=(0,),
         integrator=integrator,
         dt=dt,
         substeps=1,
     )
-    controls = tree.map(lambda c: c.expand(5, *c.shape), hold(scene, state))
+    controls = tree.map(lambda c: c.expand(5, *c.shape), stationary_control(scene, state))
     trees = (params, state, controls)
     names = [*MATERIAL, "effects.gravity.acceleration", "effects.damping.rate", "state.pos", "state.vel"]
     found = {}
@@ -338,9 +338,9 @@ def test_replay_does_not_follow_outputs_that_nothing_depends_on():
             return x.clone()
 
         @staticmethod
-        def backward(ctx, slope):
+        def backward(ctx, gradient):
             Counted.asked += 1
-            return slope
+            return gradient
 
     x = rand(3).requires_grad_()
     used, unused = replay.replay(lambda t: (t.sin(), Counted.apply(t)), x)

@@ -9,7 +9,7 @@ import torch
 from helpers import F64, effects, energy
 
 from torchdlo.physics import tree
-from torchdlo.scene import Rope, finite, hold, make, step
+from torchdlo.scene import Rope, finite, make, stationary_control, step
 
 G = 9.81
 
@@ -24,8 +24,8 @@ def helix(edges: int = 40, **choices):
         effects("bend_frame", "twist", "gravity"),
         integrator="implicit",
         substeps=1,
-        held_vertices=(0, 1),
-        held_edges=(0,),
+        prescribed_vertices=(0, 1),
+        prescribed_edges=(0,),
         **choices,
     )
 
@@ -35,7 +35,7 @@ def energies(duration: float, every: int, **choices) -> tuple[torch.Tensor, floa
     scene, params, state = helix(**choices)
     mass, inertia = params.rods.material.mass, params.rods.material.inertia * params.rods.rest.edge_mask
     start = float((G * mass * state.rods.pos[:, 2:]).sum())
-    found, fall, control = [], 0.0, hold(scene, state)
+    found, fall, control = [], 0.0, stationary_control(scene, state)
     with torch.no_grad():
         for k in range(round(duration / scene.dt)):
             after = step(scene, params, state, control)
@@ -56,7 +56,7 @@ CASES = {
     "quasistatic": (10.0, {"twist": "quasistatic"}),
     # Positions and dynamic twists answer to stiffness separately; with the coupling of a curved rod between them left
     # out, a quadratic form is bounded by twice its diagonal blocks: steps are stable for gamma >= 1/2.
-    "dynamic": (4.0, {"twist": "dynamic", "gamma": 0.5}),
+    "dynamic": (4.0, {"twist": "dynamic", "implicit_weight": 0.5}),
 }
 
 

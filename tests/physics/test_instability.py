@@ -15,7 +15,7 @@ from scipy.integrate import solve_bvp
 from scipy.optimize import brentq
 
 from torchdlo.physics import tree
-from torchdlo.scene import Control, Rope, State, hold, make
+from torchdlo.scene import Control, Rope, State, make, stationary_control
 
 CLAMPED = [(v, a) for v in (0, 1) for a in range(3)]
 
@@ -124,8 +124,8 @@ def curled(weight: float, dt: float):
         integrator="implicit",
         dt=dt,
         substeps=1,
-        held_vertices=(0, 1),
-        held_edges=(0,),
+        prescribed_vertices=(0, 1),
+        prescribed_edges=(0,),
     )
 
 
@@ -201,10 +201,10 @@ def led(turned: float, x: torch.Tensor, rest) -> torch.Tensor:
         dt=1e-2,
         substeps=1,
         integrator="implicit",
-        held_vertices=tuple(range(n)),
-        held_edges=(0, n - 2),
+        prescribed_vertices=tuple(range(n)),
+        prescribed_edges=(0, n - 2),
     )
-    start = hold(scene, state)
+    start = stationary_control(scene, state)
     edge = x[-1] - x[-2]
     side = torch.linalg.cross(edge / edge.norm(), start.director[1])
 

@@ -9,12 +9,12 @@ from helpers import F64, circle, effects, run, straight, vec, wild
 from torchdlo.physics import tree
 from torchdlo.physics.execution import tracing
 from torchdlo.physics.kernels import lanes
-from torchdlo.scene import Rope, hold, make, step
+from torchdlo.scene import Rope, make, stationary_control, step
 
 GIVEN = {"mass": 0.1, "bend": 1e-3, "twist": 1e-3, "radius": 0.01}
 
 IMPLICIT = {"dt": 2e-3, "integrator": "implicit"}
-BALANCED = IMPLICIT | {"twist": "quasistatic", "held_vertices": (0, 1)}
+BALANCED = IMPLICIT | {"twist": "quasistatic", "prescribed_vertices": (0, 1)}
 
 
 def ropes(batch: tuple[int, ...], dtype: torch.dtype, *, loop: bool) -> list[Rope]:
@@ -63,20 +63,20 @@ def test_implicit_steps_are_the_same_for_any_batch(batch, loop, monkeypatch):
         effects("gravity", "bend_frame", "twist", "damping"),
         {"damping": {"rate": 0.5}},
         **BALANCED,
-        held_edges=(0, 9) if loop else (0,),
+        prescribed_edges=(0, 9) if loop else (0,),
     )
     assert_same(monkeypatch, built, 1e-9)
 
 
-@pytest.mark.parametrize("ahead", [0.0, 0.1])
+@pytest.mark.parametrize("numerical_damping", [0.0, 0.1])
 def test_drag_of_hinges_and_steps_that_look_ahead_are_the_same(ahead, monkeypatch):
     built = make(
         ropes((3,), F64, loop=False),
         effects("gravity", "bend", "bending_damping", "damping"),
         {"bending_damping": {"coefficient": 1e-4}},
         **IMPLICIT,
-        ahead=ahead,
-        held_vertices=(0, 8),
+        numerical_damping=ahead,
+        prescribed_vertices=(0, 8),
     )
     assert_same(monkeypatch, built, 1e-9, uses=("look", "bend", "curve", "pull", "carry", "balance"))
 
@@ -88,7 +88,7 @@ def test_chains_of_links_are_the_same(length, monkeypatch):
         effects("gravity", "bend_frame", "twist", "link_chain"),
         {"link_chain": {"length": length}},
         **BALANCED,
-        held_edges=(0,),
+        prescribed_edges=(0,),
     )
     assert_same(monkeypatch, built, 1e-9, uses=(*FRAMED, "joint", "spring"))
 
@@ -99,7 +99,7 @@ def test_single_precision_is_as_good_as_the_operations_are(monkeypatch):
             ropes((5,), dtype, loop=True),
             effects("gravity", "bend_frame", "twist"),
             **BALANCED,
-            held_edges=(0, 9),
+            prescribed_edges=(0, 9),
         )
         return stepped(monkeypatch, kernels, built, 5)[0].rods
 
@@ -118,7 +118,7 @@ def test_explicit_steps_carry_frames_the_same_way(monkeypatch):
         dt=5e-4,
         integrator="explicit",
         twist="dynamic",
-        held_vertices=(0,),
+        prescribed_vertices=(0,),
     )
     assert_same(monkeypatch, built, 1e-9, uses=("look", "carry", "curve", "pull", "answer", "twist"))
 
@@ -129,10 +129,10 @@ def test_a_rope_pulled_beyond_its_length_gives_way_the_same(monkeypatch):
         [Rope(pos, **GIVEN)],
         effects("gravity", "bend"),
         **IMPLICIT,
-        ahead=0.1,
-        held_vertices=(0, 7),
+        numerical_damping=0.1,
+        prescribed_vertices=(0, 7),
     )
-    still = hold(scene, state)
+    still = stationary_control(scene, state)
     pulled = tree.replace(still, pos=still.pos + torch.linspace(0, 0.02, 2, dtype=F64)[:, None] * vec(1, 0, 0))
     found = []
     for kernels in (True, False):
@@ -152,7 +152,7 @@ def test_they_are_used_in_recorded_steps_only(monkeypatch):
     scene, params, state = make(ropes((2,), F64, loop=False), effects("gravity", "bend"), **IMPLICIT)
     used, apply = [], lanes.apply
     monkeypatch.setattr(lanes, "apply", lambda kernel, *others: (used.append(kernel), apply(kernel, *others))[1])
-    control = hold(scene, state)
+    control = stationary_control(scene, state)
     with torch.no_grad():
         plain = step(scene, params, state, control)
     assert not used

@@ -39,7 +39,7 @@ def test_delayed_markers_of_a_cubic_motion_are_exact_and_grippers_are_not_delaye
 
 
 def test_interpolation_in_time_is_fourth_order_and_smooth():
-    # sin(9 t): halving the step divides the error by 16, but for the next order: 9 h is 0.09 and less. Slopes do not
+    # sin(9 t): halving the step divides the error by 16, but for the next order: 9 h is 0.09 and less. Gradients do not
     # jump at frames.
     errors = []
     for count in (201, 401, 801):
@@ -49,16 +49,16 @@ def test_interpolation_in_time_is_fourth_order_and_smooth():
         at = 2 / (count - 1) * frame
         errors.append(float((interpolate(x, frame)[..., 0, 0] - torch.sin(9 * at))[3:-3].abs().max()))
     assert all(3.9 < math.log2(a / b) < 4.1 for a, b in pairwise(errors)), errors
-    slopes = []
+    gradients = []
     for side in (-1e-9, 1e-9):
         frame = (torch.full((801,), 20.0, dtype=F64) + side).requires_grad_()
-        slopes.append(torch.autograd.grad(interpolate(x, frame)[0, 0, 0], frame)[0][0])
-    assert float(slopes[0]) == pytest.approx(float(slopes[1]), abs=1e-7)
+        gradients.append(torch.autograd.grad(interpolate(x, frame)[0, 0, 0], frame)[0][0])
+    assert float(gradients[0]) == pytest.approx(float(gradients[1]), abs=1e-7)
 
 
 @pytest.mark.parametrize("delay", [0.0137, -0.023])
 def test_gradient_by_the_delay_equals_central_differences(delay):
-    # Error of the difference h^2 20^2 / 6 = 7e-9 of the slope with h = 1e-5 s.
+    # Error of the difference h^2 20^2 / 6 = 7e-9 of the gradient with h = 1e-5 s.
     track = recorded(motion=lambda t: torch.sin(20 * t), batch=(2,))
     weights = rand(2, 12, 3, 3, seed=8, low=-1)
 

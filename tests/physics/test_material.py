@@ -10,7 +10,7 @@ import torch
 from helpers import F64, altered, effects, energy, loads, run, speed, straight, vec
 
 from torchdlo.physics import tree
-from torchdlo.scene import Control, Rope, hold, make, step
+from torchdlo.scene import Control, Rope, make, stationary_control, step
 
 YIELD, RATE, H = 2.0, 6.0, 0.1
 
@@ -26,7 +26,7 @@ def plastic(angle: float, held=(0, 1, 2), numbers=None, **choices):
         [Rope(corner(angle), mass=0.1, bend=1e-3)],
         effects("bend_frame", "bending_plasticity", "damping"),
         {"bending_plasticity": numbers, "damping": {"rate": 20.0}},
-        held_vertices=held,
+        prescribed_vertices=held,
         **choices,
     )
 
@@ -86,7 +86,7 @@ def test_a_bent_cantilever_keeps_its_shape_only_if_plastic():
             integrator="implicit",
             dt=1e-2,
             substeps=1,
-            held_vertices=(0, 1),
+            prescribed_vertices=(0, 1),
         )
         state, _ = run(scene, params, state, 200)
         peak = float(state.rods.pos[-1, 1])
@@ -112,7 +112,7 @@ def test_released_hinge_springs_back_by_the_yield_curvature():
     assert float(state.rods.plastic[1].norm()) == pytest.approx(k - YIELD * H, rel=1e-10)
     free, params, _fresh = plastic(angle, held=(0, 1), integrator="implicit")
     state = tree.replace(state, rods=tree.replace(state.rods, vel=torch.zeros_like(state.rods.vel)))
-    state, _ = run(free, params, state, 900, hold(free, state))
+    state, _ = run(free, params, state, 900, stationary_control(free, state))
     assert speed(state) < 1e-9
     edge = state.rods.pos[2] - state.rods.pos[1]
     left = 2 * math.tan(0.5 * math.atan2(float(edge[1]), float(edge[0])))
@@ -153,7 +153,7 @@ def test_natural_curvature_rolls_a_free_rod_into_an_arc():
         integrator="implicit",
         dt=2e-2,
         substeps=1,
-        held_vertices=(0, 1),
+        prescribed_vertices=(0, 1),
     )
     state, _ = run(scene, params, state, 500)
     assert speed(state) < 1e-8
@@ -183,7 +183,7 @@ def test_point_mass_adds_weight_where_it_is_said():
 
 
 def test_stiffness_varies_along_the_rope_as_declared():
-    # B(s) = B0 exp(factor exp(-((s/L - position)/width)^2 / 2)) (1 + slope (s/L - 1/2)).
+    # B(s) = B0 exp(factor exp(-((s/L - position)/width)^2 / 2)) (1 + gradient (s/L - 1/2)).
     numbers = {"position": 0.3, "width": 0.15, "factor": 0.8, "slope": 0.5}
     scene, params, _ = make(
         [Rope(straight(11), mass=0.2, bend=0.01)],
@@ -208,7 +208,7 @@ def test_bending_friction_decays_a_mode_at_the_kelvin_voigt_rate():
             effects("bend_frame", "bending_damping"),
             {"bending_damping": {"coefficient": c}},
             integrator=integrator,
-            ahead=0.0,
+            numerical_damping=0.0,
             dt=4e-3,
             substeps=1,
         )
@@ -240,8 +240,8 @@ def test_friction_of_a_strongly_bent_rope_converges_with_the_step():
             substeps=substeps,
             integrator="implicit",
             twist="quasistatic",
-            held_vertices=(0, 1),
-            held_edges=(0,),
+            prescribed_vertices=(0, 1),
+            prescribed_edges=(0,),
         )
         return run(scene, params, state, 50)[0].rods.pos
 

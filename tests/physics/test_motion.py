@@ -8,7 +8,7 @@ import pytest
 import torch
 from helpers import F64, circle, effects, energy, length_error, run, speed, straight, vec, wild
 
-from torchdlo.scene import Control, Rope, finite, hold, make, step
+from torchdlo.scene import Control, Rope, finite, make, stationary_control, step
 
 
 def momentum(params, state):
@@ -61,8 +61,8 @@ def test_implicit_steps_keep_linear_momentum_and_angular_to_second_order():
         p, m = momentum(params, state)
         assert float((p - p0).norm() / p0.norm()) < 1e-12
         found.append(float((m - m0).norm() / m0.norm()))
-    slope = math.log2(found[0] / found[-1]) / 2
-    assert found[0] < 0.02 and slope > 0.9, (found, slope)
+    gradient = math.log2(found[0] / found[-1]) / 2
+    assert found[0] < 0.02 and gradient > 0.9, (found, gradient)
 
 
 def total_energy(scene, params, before, after):
@@ -77,7 +77,7 @@ def total_energy(scene, params, before, after):
 def energies(scene, params, state, count):
     found = []
     with torch.no_grad():
-        control = hold(scene, state)
+        control = stationary_control(scene, state)
         state = step(scene, params, state, control)
         for _ in range(count):
             after = step(scene, params, state, control)
@@ -135,7 +135,7 @@ def test_uniform_damping_decays_momentum_exactly():
     for substeps in (2, 3):
         scene, params, state = thrown(False, dt=4e-3, substeps=substeps, effects=["bend", "damping"])
         params.effects["damping"]["rate"] = vec(3.0)[None]
-        first = step(scene, params, state, hold(scene, state))
+        first = step(scene, params, state, stationary_control(scene, state))
         later, _ = run(scene, params, first, 50)
         p, q = momentum(params, first)[0], momentum(params, later)[0]
         assert float((q - p * math.exp(-3.0 * 0.2)).norm() / p.norm()) < 1e-12
@@ -145,7 +145,7 @@ ORDERS = {
     "explicit": {"integrator": "explicit"},
     "explicit, forces": {"integrator": "explicit", "constrained": False},
     "implicit": {"integrator": "implicit"},
-    "implicit, nothing ahead": {"integrator": "implicit", "ahead": 0.0},
+    "implicit, nothing ahead": {"integrator": "implicit", "numerical_damping": 0.0},
 }
 
 
@@ -161,11 +161,11 @@ def orders(choices, names, duration=0.048, finest=64, **rope):
             effects(*names),
             dt=duration,
             substeps=substeps,
-            held_vertices=(0,),
-            held_edges=(0,) if choices.get("twist", "none") != "none" else (),
+            prescribed_vertices=(0,),
+            prescribed_edges=(0,) if choices.get("twist", "none") != "none" else (),
             **choices,
         )
-        state, _ = run(scene, params, state, 1, control=hold(scene, state))
+        state, _ = run(scene, params, state, 1, control=stationary_control(scene, state))
         last.append(torch.cat([state.rods.pos, state.rods.twist], -1))
     return math.log2(float((last[0] - last[1]).norm() / (last[1] - last[2]).norm()))
 
@@ -206,7 +206,7 @@ def test_inextensible_rods_keep_their_lengths(integrator, closed):
     x = circle(n, 0.15) if closed else straight(n, 1.0)
     rope = Rope(x, mass=0.05, bend=1e-4, closed=closed)
     scene, params, state = make(
-        [rope], effects("bend", "gravity"), integrator=integrator, dt=2e-3, substeps=1, held_vertices=(0,)
+        [rope], effects("bend", "gravity"), integrator=integrator, dt=2e-3, substeps=1, prescribed_vertices=(0,)
     )
     state, seen = run(scene, params, state, 200, seen=lambda s: length_error(scene, params, s))
     assert bool(finite(state))
@@ -225,9 +225,9 @@ def test_lengths_hold_while_held_ends_move():
             integrator=integrator,
             dt=2e-3,
             substeps=2,
-            held_vertices=(0, n - 1),
+            prescribed_vertices=(0, n - 1),
         )
-        start = hold(scene, state)
+        start = stationary_control(scene, state)
 
         def shake(k, state, start=start):
             t = 2e-3 * (k + 1)
@@ -246,12 +246,12 @@ def test_a_taut_rope_pulled_beyond_its_length_stays_finite(integrator):
         [Rope(straight(n), mass=0.05, bend=1e-5)],
         effects("bend", "gravity"),
         integrator=integrator,
-        ahead=0.1 if integrator == "implicit" else 0.0,
+        numerical_damping=0.1 if integrator == "implicit" else 0.0,
         dt=2e-3,
         substeps=2,
-        held_vertices=(0, n - 1),
+        prescribed_vertices=(0, n - 1),
     )
-    start = hold(scene, state)
+    start = stationary_control(scene, state)
 
     def pull(k, state):
         reach = 0.02 * min(k, 40, max(0, 100 - k)) / 40 - 0.05 * max(0, k - 100) / 100
@@ -267,7 +267,7 @@ def test_a_taut_rope_pulled_beyond_its_length_stays_finite(integrator):
     assert length_error(scene, params, state) < 1e-9
     # The bound is that of the explicit step: at its tensions of 98 to 129 N edges give way by 0.02 m, which stores
     # 2.3 J, and a vertex of 6.25 g with all of it runs at 27 m/s. Implicit steps allow 40 000 times the tension and
-    # shake much faster while the rope is pulled; `ahead` has calmed them by now.
+    # shake much faster while the rope is pulled; `numerical_damping` has calmed them by now.
     assert speed(state) < 27
 
 
@@ -288,7 +288,7 @@ def test_extensible_ropes_stretch_by_force_over_stiffness(choices):
         {"damping": {"rate": 10.0}},
         dt=0.01,
         substeps=1 if choices["integrator"] == "implicit" else 2,
-        held_vertices=(0,),
+        prescribed_vertices=(0,),
         **choices,
     )
     state, _ = run(scene, params, state, 400)
@@ -309,7 +309,7 @@ def test_held_vertices_are_where_the_control_wants_them():
             integrator=integrator,
             dt=2e-3,
             substeps=2,
-            held_vertices=(4, 0),
+            prescribed_vertices=(4, 0),
         )
         for k in range(10):
             target = torch.stack([vec(0.44 - 0.001 * k, 0.02 * k, 0.0), vec(0, 0.005 * k, 0.01 * k)])

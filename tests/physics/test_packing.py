@@ -7,7 +7,7 @@ import torch
 from helpers import F64, circle, effects, rand, run, straight, vec, wild
 
 from torchdlo.physics import tree
-from torchdlo.scene import Control, Rope, hold, make, rollout, step, stepper
+from torchdlo.scene import Control, Rope, make, rollout, stationary_control, step, stepper
 
 GIVEN = {"mass": 0.1, "bend": 1e-3, "twist": 1e-3, "stretch": 200.0, "radius": 0.02}
 KINDS = {
@@ -56,14 +56,16 @@ def test_ropes_in_one_scene_move_as_each_alone(kind):
     ropes = picked(shapes(), kind)
     spun = choices.get("twist") == "quasistatic"  # else a free rod may spin as a whole
     scene, params, state = make(
-        ropes, effects(*names), held_vertices=(0, 8), held_edges=(0, 7, 13) if spun else (), **choices
+        ropes, effects(*names), prescribed_vertices=(0, 8), prescribed_edges=(0, 7, 13) if spun else (), **choices
     )
     together, _ = run(scene, params, state, 60)
     start = 0
     for index, rope in enumerate(ropes):
         n = len(rope.positions)
         held = {0: (0,), 1: (1,), 2: ()}[index]
-        alone, p, s = make([rope], effects(*names), held_vertices=held, held_edges=(0,) if spun else (), **choices)
+        alone, p, s = make(
+            [rope], effects(*names), prescribed_vertices=held, prescribed_edges=(0,) if spun else (), **choices
+        )
         s, _ = run(alone, p, s, 60)
         for field in ("pos", "vel", "twist"):
             a, b = getattr(together.rods, field)[start : start + n], getattr(s.rods, field)
@@ -78,7 +80,7 @@ def test_batches_move_as_each_scene_alone(kind):
     ropes = picked(shapes((2, 2)), kind)
     spun = choices.get("twist") == "quasistatic"
     scene, params, state = make(
-        ropes, effects(*names), held_vertices=(0,), held_edges=(0, 7, 13) if spun else (), **choices
+        ropes, effects(*names), prescribed_vertices=(0,), prescribed_edges=(0, 7, 13) if spun else (), **choices
     )
     scale = rand(2, 2, 1, 1, seed=4, low=0.5, high=1.5)
     material = params.rods.material
@@ -121,9 +123,9 @@ def innermost(x: torch.Tensor) -> bool:
 def test_state_stays_batch_innermost_through_steps(kind):
     choices, names = KINDS[kind]
     ropes = [Rope(wild(6, 1, batch=(8,), rough=0.04), **GIVEN)]
-    scene, params, state = make(ropes, effects(*names), held_vertices=(0,), **choices)
+    scene, params, state = make(ropes, effects(*names), prescribed_vertices=(0,), **choices)
     assert all(innermost(x) for x in (state.rods.pos, state.rods.director, state.rods.ref_twist))
-    control = hold(scene, state)
+    control = stationary_control(scene, state)
     for _ in range(2):
         state = step(scene, params, state, control)
     wrong = [
@@ -141,8 +143,8 @@ def test_compiled_steps_equal_eager_ones():
     # The same operations reordered: 1e-12 of the positions after three steps; the batch stays innermost.
     choices, names = KINDS["explicit"]
     ropes = [Rope(wild(5, 1, batch=(8,), rough=0.04), **{k: v for k, v in GIVEN.items() if k != "twist"})]
-    scene, params, state = make(ropes, effects(*names[:2]), held_vertices=(0,), **choices)
-    control = hold(scene, state)
+    scene, params, state = make(ropes, effects(*names[:2]), prescribed_vertices=(0,), **choices)
+    control = stationary_control(scene, state)
     found = {}
     for compiled in (False, True):
         advance = stepper(scene, compiled=compiled)
@@ -162,7 +164,7 @@ def test_single_precision_follows_double(kind):
     found = {}
     for dtype in (torch.float32, F64):
         x = wild(6, 1, rough=0.04).to(dtype)
-        scene, params, state = make([Rope(x, **GIVEN)], effects(*names), held_vertices=(0,), **choices)
+        scene, params, state = make([Rope(x, **GIVEN)], effects(*names), prescribed_vertices=(0,), **choices)
         assert all(leaf.dtype == dtype for leaf in tree.leaves((params, state)))
         state, _ = run(scene, params, state, 20)
         assert all(leaf.dtype == dtype for leaf in tree.leaves(state))
@@ -174,7 +176,7 @@ def test_shared_controls_drive_every_scene_of_a_batch():
     # A control without batch axes holds all scenes of a batch, frames included.
     ropes = [Rope(wild(6, 1, batch=(3,), rough=0.02), **GIVEN)]
     scene, params, state = make(
-        ropes, effects("bend_frame", "twist"), held_vertices=(0,), held_edges=(0,), twist="dynamic", dt=1e-3
+        ropes, effects("bend_frame", "twist"), prescribed_vertices=(0,), prescribed_edges=(0,), twist="dynamic", dt=1e-3
     )
     control = Control(vec(0, 0, 0)[None], vec(0, 0, 1)[None])
     state = step(scene, params, state, control)
@@ -183,7 +185,7 @@ def test_shared_controls_drive_every_scene_of_a_batch():
 
 def test_rollout_keeps_what_is_asked_for():
     scene, params, state = make([Rope(straight(5), mass=0.1)], effects("gravity"), dt=1e-3)
-    controls = tree.map(lambda x: x.expand(4, *x.shape), hold(scene, state))
+    controls = tree.map(lambda x: x.expand(4, *x.shape), stationary_control(scene, state))
     last, kept = rollout(lambda *a: step(scene, *a), params, state, controls, keep=lambda s: {"z": s.rods.pos[..., 2]})
     assert kept["z"].shape == (4, 5)
     assert torch.equal(kept["z"][-1], last.rods.pos[..., 2])

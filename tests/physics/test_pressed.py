@@ -9,7 +9,7 @@ from helpers import F64, straight
 from torchdlo.physics import tree
 from torchdlo.physics.effects.elastic import Bend
 from torchdlo.physics.effects.external import Damping, Gravity
-from torchdlo.scene import Rope, check_state, hold, make, ok, step
+from torchdlo.scene import Rope, check_state, make, ok, stationary_control, step
 
 LENGTH, SPEED = 0.5, 0.5
 
@@ -20,8 +20,8 @@ def pressed(count: int, bow: float, frames: int, gravity: bool = False, **choice
     x[:, 1] = bow * torch.sin(torch.pi * x[:, 0] / LENGTH)
     acting = [Bend(), Damping(), *([Gravity()] if gravity else [])]
     rope = Rope(x, radius=0.005, density=1000.0, bend=1e-6, rest="straight")
-    scene, params, state = make([rope], acting, held_vertices=(0, count - 1), dt=2e-3, substeps=4, **choices)
-    first = hold(scene, state)
+    scene, params, state = make([rope], acting, prescribed_vertices=(0, count - 1), dt=2e-3, substeps=4, **choices)
+    first = stationary_control(scene, state)
     with torch.no_grad():
         for k in range(frames):
             way = 0.5 * SPEED * scene.dt * (k + 1)
@@ -53,7 +53,7 @@ def test_ropes_that_are_exactly_straight_say_that_they_were_pressed_short(integr
     _, state = pressed(11, 0.0, 1, integrator=integrator)
     check_state(state)  # 0.2 % on average
     _, state = pressed(11, 0.0, 50, integrator=integrator)
-    assert float(state.missed[..., 2]) >= 0.1 - 1e-9 and not bool(ok(state))
+    assert float(state.diagnostics[..., 2]) >= 0.1 - 1e-9 and not bool(ok(state))
     with pytest.raises(RuntimeError, match="shorter than it has to be: a straight rope was pressed"):
         check_state(state)
 
@@ -62,8 +62,8 @@ def test_ropes_that_may_shorten_say_nothing():
     # With EA = 4 N, a strain of 10 % takes 0.4 N: that is their law, not a fault.
     x = straight(11, LENGTH)
     rope = Rope(x, radius=0.005, density=1000.0, bend=1e-4, stretch=4.0)
-    scene, params, state = make([rope], [Bend(), Damping()], held_vertices=(0, 10), dt=2e-3, substeps=4)
-    first = hold(scene, state)
+    scene, params, state = make([rope], [Bend(), Damping()], prescribed_vertices=(0, 10), dt=2e-3, substeps=4)
+    first = stationary_control(scene, state)
     with torch.no_grad():
         for k in range(50):
             move = torch.tensor([[0.0, 0, 0], [-0.001 * (k + 1), 0, 0]], dtype=F64)

@@ -24,7 +24,7 @@ SMOOTH = 0.02
 
 
 @dataclass(frozen=True)
-class Solid(Effect):
+class RigidBody(Effect):
     """A round edge behind a level top at z = 0, x < 0; or, with `both`, a round peg whose top is there."""
 
     name: ClassVar[str] = "solid"
@@ -67,7 +67,7 @@ def drops(x: torch.Tensor, count: int, mu: float = 0.0, both: bool = False) -> t
     """Drops of the first and the last vertex below the top [m], shape (count + 1, 2), and the rope's length."""
     scene, params, state = make(
         [Rope(x, mass=1.0, bend=1e-9)],
-        [*effects("bend", "gravity"), Solid(both=both)],
+        [*effects("bend", "gravity"), RigidBody(both=both)],
         {"solid": {"mu": mu}},
         dt=DT,
         substeps=1,

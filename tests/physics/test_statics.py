@@ -73,7 +73,7 @@ def weighted(n_edges: int, gamma: float) -> tuple[Statics, State]:
 OWN_WEIGHT = [(0.1, 0.01250, 0.99991), (1.0, 0.12347, 0.99125), (10.0, 0.70020, 0.65635)]
 
 
-@pytest.mark.parametrize(("gamma", "drop", "reach"), OWN_WEIGHT)
+@pytest.mark.parametrize(("implicit_weight", "drop", "reach"), OWN_WEIGHT)
 def test_cantilever_under_its_own_weight_lies_on_the_master_curve(gamma, drop, reach):
     # S3 (Romero et al. 2021). 40 edges; gate 0.2 %, plus half a unit of the last digit of the table.
     _, state = weighted(40, gamma)
@@ -97,7 +97,7 @@ def test_equilibria_stand_still_in_the_simulator():
         x = straight(13, 12 * h, start=-h / 2)
         rope = Rope(x, mass=12 * h, bend=1.0)
         scene, params, state = make(
-            [rope], effects("bend", "gravity"), integrator=integrator, dt=2e-4, substeps=1, held_vertices=(0, 1)
+            [rope], effects("bend", "gravity"), integrator=integrator, dt=2e-4, substeps=1, prescribed_vertices=(0, 1)
         )
         mass = params.rods.material.mass
         rod = Statics(
@@ -122,7 +122,7 @@ def test_dynamic_relaxation_ends_at_the_elastica():
         integrator="implicit",
         dt=0.02,
         substeps=1,
-        held_vertices=(0, 1),
+        prescribed_vertices=(0, 1),
     )
     state, _ = run(scene, params, state, 600)
     assert speed(state) < 1e-8

@@ -46,7 +46,7 @@ def test_a_rope_comes_to_rest_on_the_table_at_the_height_of_its_radius(choices, 
 @pytest.mark.parametrize("integrator", ["explicit", "implicit"])
 def test_a_rope_on_an_incline_sticks_below_and_slides_above_the_friction_angle(integrator, toward):
     # C3: tan a < mu: only the declared creep, v = slip q / sqrt(1 - q^2) with q = tan a / mu; above: a = g (sin a -
-    # mu cos a). Four slopes in a batch.
+    # mu cos a). Four gradients in a batch.
     # Friction is mu N v_new / |v_old|, so too large by a dt / v, first order: the mean of dt / t over the times that
     # count, 0.2 s to 0.6 s, is dt ln 3 / 0.4 s = 2.7 dt / s, times mu g cos a / a_slide: 0.7 % at tan a = 0.6: 1 %.
     mu, dt, count, tangents = 0.5, 5e-4, 1200, (0.25, 0.45, 0.6, 0.9)

@@ -9,7 +9,7 @@ from helpers import F64
 from torchdlo.physics import tree
 from torchdlo.physics.effects.elastic import Bend
 from torchdlo.physics.effects.external import Damping, Gravity
-from torchdlo.scene import Rope, hold, make, step
+from torchdlo.scene import Rope, make, stationary_control, step
 
 LENGTH, FRAMES = 0.25, 50
 
@@ -21,13 +21,13 @@ def slack(**choices):
     x = torch.cat([torch.zeros(1, 3, dtype=F64), edges.cumsum(0)])
     rope = Rope(x, radius=0.005, density=1000.0, bend=1e-5, stretch=choices.pop("stretch", float("inf")))
     acting, damping = [Bend(), Damping(), Gravity()], {"damping": {"rate": 2.0}}
-    return make([rope], acting, damping, held_vertices=(0, 4), dt=2e-3, substeps=4, **choices)
+    return make([rope], acting, damping, prescribed_vertices=(0, 4), dt=2e-3, substeps=4, **choices)
 
 
 def middle(made, far: torch.Tensor) -> torch.Tensor:
     """Height of the middle after the hands have moved `far` rope lengths apart."""
     scene, params, state = made
-    first, x = hold(scene, state), state.rods.pos
+    first, x = stationary_control(scene, state), state.rods.pos
     gap = x[4, 0] - x[0, 0]
     for k in range(FRAMES):
         share = min(1.0, (k + 1) / (0.6 * FRAMES))
@@ -37,14 +37,14 @@ def middle(made, far: torch.Tensor) -> torch.Tensor:
 
 
 @pytest.mark.parametrize(
-    ("integrator", "stretch", "newton"),
+    ("integrator", "stretch", "constraint_iterations"),
     [("explicit", float("inf"), 8), ("explicit", 1e3, 3), ("implicit", 1e3, 3)],
 )
 def test_gradients_of_ropes_pulled_taut_are_those_of_differences(integrator, stretch, newton):
     # The adjoint is exact where Newton's method converges; three steps are too few where an inextensible rope snaps
     # taut. Differences: what that method leaves, some 1e-10 of a length of 1e-2 m, over a step that has to be far below
     # the 1e-4 lengths over which the motion after the snap changes: 1e-12 / 1e-7 = 1e-5, times what the snap amplifies.
-    made, h = slack(integrator=integrator, stretch=stretch, newton=newton), 1e-7
+    made, h = slack(integrator=integrator, stretch=stretch, constraint_iterations=newton), 1e-7
     far = torch.tensor(0.999, dtype=F64, requires_grad=True)
     (found,) = torch.autograd.grad(middle(made, far), far)
     with torch.no_grad():

@@ -16,13 +16,13 @@ def _rope(batch=2, vertices=8):
     x = torch.linspace(0, 0.5, vertices, dtype=torch.float64)
     points = torch.stack([x, torch.zeros_like(x), torch.zeros_like(x)], -1).expand(batch, -1, 3)
     rope = scenes.Rope(points, radius=0.005, mass=0.03, bend=1e-4)
-    return scenes.make([rope], [EFFECTS["gravity"](), EFFECTS["bend"]()], held_vertices=(0,))
+    return scenes.make([rope], [EFFECTS["gravity"](), EFFECTS["bend"]()], prescribed_vertices=(0,))
 
 
 def test_a_recorded_step_does_what_the_step_does_with_other_numbers_too():
     scene, params, state = _rope()
     step = scenes.stepper(scene, compiled=False)
-    control = scenes.hold(scene, state)
+    control = scenes.stationary_control(scene, state)
     recorded = tracing.record(step, params, state, control)
     stiffer = tree.replace(params, rods=tree.map(lambda x: 1.5 * x, params.rods))
     for numbers in (params, stiffer):

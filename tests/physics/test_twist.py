@@ -9,7 +9,7 @@ import torch
 from helpers import F64, Statics, effects, energy, loads, run, speed, straight, vec
 
 from torchdlo.physics import tree
-from torchdlo.scene import Control, Rope, hold, make, step
+from torchdlo.scene import Control, Rope, make, stationary_control, step
 
 
 def wound(angle: float) -> torch.Tensor:
@@ -27,8 +27,8 @@ def clamped(x: torch.Tensor, names=("bend", "twist", "damping"), rate: float = 5
         [Rope(x, director=vec(0, 1, 0), **given)],
         effects(*names),
         values,
-        held_vertices=(0, 1, n - 2, n - 1),
-        held_edges=(0, n - 2),
+        prescribed_vertices=(0, 1, n - 2, n - 1),
+        prescribed_edges=(0, n - 2),
         **choices,
     )
 
@@ -52,7 +52,7 @@ def test_a_straight_rod_wound_ten_turns_carries_ten_turns(twist):
     # T7. Ten turns at one clamp: the end twist is 20 pi exactly, twists linear, energy C Theta^2 / 2 (L - h).
     n, turns = 12, 10
     scene, params, state = clamped(straight(n), twist=twist, rate=30.0, rope={"bend": 0.2, "stretch": 1e5})
-    start = hold(scene, state)
+    start = stationary_control(scene, state)
     steps = 150
 
     def wind(k, _):
@@ -96,7 +96,7 @@ def test_linking_number_follows_the_clamp_while_the_rod_buckles(twist):
     n, turns, steps = 25, 2.0, 240
     x = arc(n, 0.85)
     scene, params, state = clamped(x, twist=twist, rate=4.0)
-    start = hold(scene, state)
+    start = stationary_control(scene, state)
     a = torch.linspace(0, math.pi, 12, dtype=F64)[1:-1]
     middle, half = 0.5 * float(x[-1, 0]), 0.5 * float(x[-1, 0]) + 2.0
     closure = torch.cat(
@@ -139,7 +139,7 @@ def test_quasistatic_twist_is_the_long_time_limit_of_dynamic_twist():
         scene, params, state = clamped(
             arc(16) * vec(1, 1, -1), names=("bend", "twist", "damping", "gravity"), twist=twist, rate=8.0
         )
-        start = hold(scene, state)
+        start = stationary_control(scene, state)
 
         def wind(k, _, start=start):
             return Control(start.pos, torch.stack([wound(0), wound(2.0 * min(1.0, (k + 1) / 100))]))
@@ -161,13 +161,13 @@ def test_held_frames_are_where_the_control_wants_them(integrator, twist):
     scene, params, state = clamped(
         arc(n), names=("bend_frame", "twist", "damping"), twist=twist, integrator=integrator, dt=2e-3, substeps=2
     )
-    start = hold(scene, state)
+    start = stationary_control(scene, state)
     for k in range(60):
         wanted = torch.stack([wound(0.1 * k), wound(-0.3 * k)])
         tilt = 0.02 * math.sin(0.2 * k)
         pos = start.pos + torch.stack([vec(0, 0, 0), vec(0, 0, 0), vec(0, tilt, 0), vec(0, tilt, 0)])
         state = step(scene, params, state, Control(pos, wanted))
-        assert float((hold(scene, state).director - wanted).abs().max()) < 1e-12
+        assert float((stationary_control(scene, state).director - wanted).abs().max()) < 1e-12
         assert bool(torch.isfinite(state.rods.pos).all())
     assert float(state.rods.twist[n - 2]) == pytest.approx(-0.3 * 59, abs=1e-9)
 
@@ -181,7 +181,7 @@ def test_held_frames_turn_evenly_within_a_step():
         scene, params, state = clamped(
             arc(n), twist="dynamic", dt=0.01 / steps, substeps=substeps, integrator="explicit", names=("bend", "twist")
         )
-        start = hold(scene, state)
+        start = stationary_control(scene, state)
         for k in range(steps):
             state = step(
                 scene, params, state, Control(start.pos, torch.stack([wound(0), wound(0.5 * (k + 1) / steps)]))
@@ -197,5 +197,5 @@ def test_twist_does_not_move_a_straight_isotropic_rod_at_rest():
     )
     twist = torch.linspace(0, 2, 9, dtype=F64)[:, None]
     state = tree.replace(state, rods=tree.replace(state.rods, twist=torch.cat([twist, torch.zeros(1, 1, dtype=F64)])))
-    state, _ = run(scene, params, state, 100, hold(scene, state))
+    state, _ = run(scene, params, state, 100, stationary_control(scene, state))
     assert float((state.rods.pos - straight(10)).abs().max()) < 1e-12

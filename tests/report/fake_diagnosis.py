@@ -10,10 +10,10 @@ import numpy as np
 from torchdlo.physics.effects import EFFECTS
 from torchdlo.sysid.diagnosis import error_floor as floors
 from torchdlo.sysid.diagnosis.effect_library import PARAMETERS
-from torchdlo.sysid.diagnosis.error_floor import Floor
+from torchdlo.sysid.diagnosis.error_floor import ErrorFloor
 from torchdlo.sysid.diagnosis.verdict import Candidate, Diagnosis
 from torchdlo.sysid.estimation.jobs import Fitted
-from torchdlo.sysid.estimation.levenberg_marquardt import Point, Space
+from torchdlo.sysid.estimation.levenberg_marquardt import ParameterSpace, Point
 from torchdlo.sysid.recordings.recording import Recording
 
 BASELINE = {"bending_stiffness": 2e-3, "twisting_stiffness": 1.5e-3, "damping_rate": 0.8}
@@ -22,7 +22,7 @@ BASELINE = {"bending_stiffness": 2e-3, "twisting_stiffness": 1.5e-3, "damping_ra
 def fitted(values: dict[str, float], effects: tuple[str, ...] = (), trials: int = 3) -> Fitted:
     """Numbers with some slope, so that they have ranges."""
     params = [PARAMETERS[n] if "." not in n else EFFECTS[n.split(".")[0]].params[n.split(".")[1]] for n in values]
-    space = Space(tuple(values), tuple(params), (1.0,) * len(values))
+    space = ParameterSpace(tuple(values), tuple(params), (1.0,) * len(values))
     rng, k = np.random.default_rng(0), len(values)
     curvature = np.tile(np.eye(k), (trials, 1, 1))
     point = Point(
@@ -61,7 +61,7 @@ def fake_diagnosis(recording: Recording, **fields: Any) -> Diagnosis:
             "baseline": fitted(BASELINE),
             "final": fitted(numbers, ("air_drag",)),
             "drifts": np.full((2, len(numbers)), 0.01),
-            "floor": Floor(3e-4, 1e-4, 2e-4),
+            "floor": ErrorFloor(3e-4, 1e-4, 2e-4),
             "before": gaps[0],
             "after": gaps[1],
             "candidates": [candidates],

@@ -19,8 +19,8 @@ from tests.report.fake_diagnosis import fake_diagnosis
 from tests.sysid.swaying import recording as swaying
 from torchdlo.report.figures.chart import bars, scale
 from torchdlo.report.pages.diagnosis import diagnosis_html, write_report
-from torchdlo.sysid.diagnosis.error_floor import Floor
-from torchdlo.sysid.recordings.data_quality import Fault
+from torchdlo.sysid.diagnosis.error_floor import ErrorFloor
+from torchdlo.sysid.recordings.data_quality import DataIssue
 from torchdlo.sysid.recordings.recording import Recording
 
 
@@ -33,7 +33,7 @@ def rope() -> Recording:
 @pytest.fixture(scope="module")
 def page(rope: Recording, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The page of a diagnosis, in a file."""
-    result = fake_diagnosis(rope, health=[Fault("train_1", "swap", "markers 3 and 4 are swapped")])
+    result = fake_diagnosis(rope, health=[DataIssue("train_1", "swap", "markers 3 and 4 are swapped")])
     return write_report(result, rope, tmp_path_factory.mktemp("page"), command="torchdlo diagnose 'a b'")
 
 
@@ -110,7 +110,7 @@ def test_failed_and_long_trials_do_not_break_the_page(rope: Recording) -> None:
         found,
         before=np.array([5e-3, np.inf]),
         predictions=found.predictions | {"before": broken},
-        floor=Floor(0, 0, np.inf),
+        floor=ErrorFloor(0, 0, np.inf),
     )
     assert "failed" in diagnosis_html(result, rope)
     long = swaying(Path("long"), frames=1200)

@@ -15,7 +15,16 @@ import torch
 from torchdlo.coupling.bodies import shape_sdf
 from torchdlo.errors import InputError
 from torchdlo.report.render import surfaces
-from torchdlo.scene_files import Body, Box, Description, Hold, Key, Matter, Rope, Weight
+from torchdlo.scene_files import (
+    Attachment,
+    BodySpec,
+    GridSpec,
+    HangingMass,
+    Keyframe,
+    ParticleBlockSpec,
+    RopeSpec,
+    SceneDescription,
+)
 from torchdlo.scene_files.run import run
 
 SIZES = {
@@ -51,16 +60,16 @@ def test_surfaces_enclose_the_volume_of_the_solid_about_its_centre_of_mass(shape
     assert np.abs(centre).max() < (lacking * 0.3 if shape == "ring" else 1e-9)
 
 
-def scene(**fields) -> Description:
-    rope = Rope(((0.0, 0.0, 0.5), (0.4, 0.0, 0.5)), vertices=9, radius=0.01, mass=0.03, bend=1e-3)
+def scene(**fields) -> SceneDescription:
+    rope = RopeSpec(((0.0, 0.0, 0.5), (0.4, 0.0, 0.5)), vertices=9, radius=0.01, mass=0.03, bend=1e-3)
     plain = {"ropes": (rope,), "effects": {"bend": {}}, "duration": 0.02, "look": (0.0, -1.0, 0.0)}
-    return Description(**plain | fields)
+    return SceneDescription(**plain | fields)
 
 
 def test_tubes_lie_round_their_ropes_and_are_closed():
     angle = np.linspace(0, 2 * np.pi, 24, endpoint=False)
     ring = tuple(map(tuple, np.stack([0.2 * np.cos(angle), 0.2 * np.sin(angle), 0 * angle], 1).tolist()))
-    frames = run(scene(ropes=(scene().ropes[0], Rope(ring, closed=True, radius=0.01, mass=0.01, bend=1e-3))))
+    frames = run(scene(ropes=(scene().ropes[0], RopeSpec(ring, closed=True, radius=0.01, mass=0.01, bend=1e-3))))
     straight, round_ = surfaces.pieces(frames)
     corners = straight.at(frames, 0)
     rings = corners[:-2]
@@ -75,8 +84,10 @@ def test_tubes_lie_round_their_ropes_and_are_closed():
 
 def test_the_camera_is_fitted_to_what_moves_and_not_to_large_bodies_that_stand():
     bodies = (
-        Body("box", (5.0, 5.0, 0.1), pos=(0.0, 0.0, -0.1), motion="fixed"),
-        Body("sphere", (0.05,), pos=(0.9, 0.0, 0.5), motion="kinematic", keys=(Key(0.02, move=(0.1, 0.0, 0.0)),)),
+        BodySpec("box", (5.0, 5.0, 0.1), pos=(0.0, 0.0, -0.1), motion="fixed"),
+        BodySpec(
+            "sphere", (0.05,), pos=(0.9, 0.0, 0.5), motion="kinematic", keys=(Keyframe(0.02, move=(0.1, 0.0, 0.0)),)
+        ),
     )
     low, high = surfaces.bounds(run(scene(bodies=bodies)))
     assert low[0] == pytest.approx(0.0, abs=1e-6) and high[0] == pytest.approx(1.05, abs=1e-6)
@@ -99,11 +110,17 @@ def drawn(image: np.ndarray) -> np.ndarray:
 
 def test_a_picture_shows_each_part_where_it_is(drawing):
     bodies = (
-        Body("sphere", (0.05,), pos=(0.2, 0.0, 0.2), motion="kinematic", keys=(Key(0.02, move=(0.2, 0.0, 0.0)),)),
+        BodySpec(
+            "sphere", (0.05,), pos=(0.2, 0.0, 0.2), motion="kinematic", keys=(Keyframe(0.02, move=(0.2, 0.0, 0.0)),)
+        ),
     )
-    matter = (Matter("liquid", (0.04,), 0.01, "ball", (0.0, 0.0, 0.0)),)
-    box = Box((-0.2, -0.2, -0.2), (0.2, 0.2, 0.2), 0.02)
-    frames = run(scene(bodies=bodies, matter=matter, box=box, holds=(Hold((0, -1)),), effects={"bend": {}}))
+    material_points = (ParticleBlockSpec("liquid", (0.04,), 0.01, "ball", (0.0, 0.0, 0.0)),)
+    box = GridSpec((-0.2, -0.2, -0.2), (0.2, 0.2, 0.2), 0.02)
+    frames = run(
+        scene(
+            bodies=bodies, material_points=material_points, box=box, holds=(Attachment((0, -1)),), effects={"bend": {}}
+        )
+    )
     with drawing.Picture(frames, size=(320, 240)) as picture:
         first, last = picture.image(0), picture.image(len(frames.time) - 1)
         again = picture.image(0)
@@ -122,10 +139,12 @@ def test_a_picture_shows_each_part_where_it_is(drawing):
 
 def test_a_rope_that_turns_is_lit_as_well_as_before(drawing):
     # Half a turn about z shows the same line again: with the shading of its other side it would be dark.
-    turn = Hold((0, 1), keys=(Key(0.06, move=(0.4, 0.0, 0.0), turn=(0.0, 0.0, 3.1415926)),))
-    rope = Rope(((0.0, 0.0, 0.5), (0.4, 0.0, 0.5)), vertices=3, radius=0.02, mass=0.03, bend=1e-3)
+    turn = Attachment((0, 1), keys=(Keyframe(0.06, move=(0.4, 0.0, 0.0), turn=(0.0, 0.0, 3.1415926)),))
+    rope = RopeSpec(((0.0, 0.0, 0.5), (0.4, 0.0, 0.5)), vertices=3, radius=0.02, mass=0.03, bend=1e-3)
     frames = run(
-        scene(ropes=(rope,), holds=(turn, Hold((2,), keys=(Key(0.06, move=(-0.4, 0.0, 0.0)),))), duration=0.06)
+        scene(
+            ropes=(rope,), holds=(turn, Attachment((2,), keys=(Keyframe(0.06, move=(-0.4, 0.0, 0.0)),))), duration=0.06
+        )
     )
     with drawing.Picture(frames, size=(160, 120)) as picture:
         first, last = picture.image(0), picture.image(len(frames.time) - 1)
@@ -137,7 +156,11 @@ def test_stills_stand_side_by_side(drawing):
     from matplotlib import image
 
     frames = run(
-        scene(ropes=(Rope(scene().ropes[0].points, vertices=5, mass=0.03, bend=1e-3, weights=(Weight(-1, 0.1),)),))
+        scene(
+            ropes=(
+                RopeSpec(scene().ropes[0].points, vertices=5, mass=0.03, bend=1e-3, weights=(HangingMass(-1, 0.1),)),
+            )
+        )
     )
     content = drawing.stills_png(frames, [0.0, 0.02], size=(160, 120))
     assert content[:4] == b"\x89PNG" and b"torchdlo" in content[:4096]
@@ -148,7 +171,7 @@ def test_a_video_has_a_picture_for_every_thirtieth_of_a_second(drawing, tmp_path
     av = pytest.importorskip("av", reason="videos need the extra view")
     from torchdlo.report.render import video
 
-    frames = run(scene(effects={"gravity": {}, "bend": {}}, holds=(Hold((0,)),), duration=0.1))
+    frames = run(scene(effects={"gravity": {}, "bend": {}}, holds=(Attachment((0,)),), duration=0.1))
     seen = []
     path = tmp_path / "motion.mp4"
     video.write_video(frames, path, speed=0.5, size=(160, 120), callback=lambda *a: seen.append(a))

@@ -8,7 +8,7 @@ import urllib.request
 import numpy as np
 import pytest
 
-from torchdlo.scene_files import Body, Box, Description, Hold, Key, Matter, Rope
+from torchdlo.scene_files import Attachment, BodySpec, GridSpec, Keyframe, ParticleBlockSpec, RopeSpec, SceneDescription
 from torchdlo.scene_files.run import run
 
 pytest.importorskip("viser", reason="the viewer needs the extra view")
@@ -17,21 +17,21 @@ from torchdlo.report.viewer.server import Viewer
 
 @pytest.fixture(scope="module")
 def viewer():
-    rope = Rope(((0.0, 0.0, 0.5), (0.4, 0.0, 0.5)), vertices=5, mass=0.03, bend=1e-3)
-    ball = Body(
+    rope = RopeSpec(((0.0, 0.0, 0.5), (0.4, 0.0, 0.5)), vertices=5, mass=0.03, bend=1e-3)
+    ball = BodySpec(
         "sphere",
         (0.05,),
         pos=(0.2, 0.0, 0.2),
         motion="kinematic",
-        keys=(Key(0.05, move=(0.2, 0.0, 0.0), turn=(0.0, 0.0, 1.0)),),
+        keys=(Keyframe(0.05, move=(0.2, 0.0, 0.0), turn=(0.0, 0.0, 1.0)),),
     )
-    described = Description(
+    described = SceneDescription(
         (rope,),
         {"bend": {}, "gravity": {}, "table": {"height": 0.0}},
         bodies=(ball,),
-        holds=(Hold((0,)),),
-        matter=(Matter("sand", (0.02,), 0.01, "ball", (0.0, 0.0, 0.1)),),
-        box=Box((-0.1, -0.1, 0.0), (0.1, 0.1, 0.2), 0.02),
+        holds=(Attachment((0,)),),
+        material_points=(ParticleBlockSpec("sand", (0.02,), 0.01, "ball", (0.0, 0.0, 0.1)),),
+        box=GridSpec((-0.1, -0.1, 0.0), (0.1, 0.1, 0.2), 0.02),
         duration=0.05,
     )
     made = Viewer(run(described), title="a run", port=18080)
@@ -61,7 +61,7 @@ def test_what_is_shown_follows_the_slider(viewer):
         assert np.abs(rope.vertices[-1] - frames.pos[k, -1]).max() < 1e-6
         assert np.abs(ball.position - frames.body_pos[k, 0]).max() < 1e-6
         assert min(np.abs(ball.wxyz - s * frames.body_quat[k, 0]).max() for s in (1, -1)) < 1e-6
-        assert np.abs(viewer._clouds[0].points - frames.matter[k]).max() < 1e-6
+        assert np.abs(viewer._clouds[0].points - frames.material_points[k]).max() < 1e-6
         assert viewer._label.value == f"{frames.time[k]:.3f} s"
 
 
@@ -83,7 +83,7 @@ def test_the_command_serves_a_run_until_ctrl_c(tmp_path, monkeypatch, viewer):
     from torchdlo.report.viewer import server as view
     from torchdlo.scene_files.run import save_frames
 
-    save_frames(viewer.frames, tmp_path / "frames.npz", Description((), {}))
+    save_frames(viewer.frames, tmp_path / "frames.npz", SceneDescription((), {}))
     seen = []
 
     def interrupt(self):

@@ -170,7 +170,7 @@ def test_trials_that_go_astray_tell_nothing_about_slopes(far: float) -> None:
     time = np.linspace(0.0, 1.0, 5)[:, None, None] * np.ones((1, 4, 3))
     measured = np.stack([0.5 * time, time])
     params = (Param(1.0, -9.0, 9.0, "m/s", "linear", None, ""), Param(0.0, -9.0, 9.0, "m", "linear", None, ""))
-    space = levenberg_marquardt.Space(("a", "b"), params, (0.1, 0.1))
+    space = levenberg_marquardt.ParameterSpace(("a", "b"), params, (0.1, 0.1))
 
     def simulate(values: np.ndarray) -> np.ndarray:
         a, b = (values[:, k, None, None, None, None] for k in (0, 1))
@@ -214,7 +214,7 @@ def test_the_measured_rest_shape_turns_with_the_clamp(tmp_path: Path) -> None:
 
 
 def test_space_keeps_bounds_and_turns_angles_round() -> None:
-    space = levenberg_marquardt.Space(
+    space = levenberg_marquardt.ParameterSpace(
         ("damping_rate", "rest_roll"), (PARAMETERS["damping_rate"], PARAMETERS["rest_roll"])
     )
     values = np.array([1e6, np.pi + 0.1])
@@ -224,7 +224,7 @@ def test_space_keeps_bounds_and_turns_angles_round() -> None:
 
 
 def test_levenberg_marquardt_finds_the_minimum_of_a_known_curve() -> None:
-    space = levenberg_marquardt.Space(("damping_rate",), (PARAMETERS["damping_rate"],))
+    space = levenberg_marquardt.ParameterSpace(("damping_rate",), (PARAMETERS["damping_rate"],))
     time = np.linspace(0, 1, 50)
 
     def decay(values: np.ndarray) -> np.ndarray:
@@ -238,7 +238,7 @@ def test_levenberg_marquardt_finds_the_minimum_of_a_known_curve() -> None:
 
 
 def test_large_errors_leave_less_curvature_and_what_is_not_seen_none() -> None:
-    space = levenberg_marquardt.Space(("damping_rate",), (PARAMETERS["damping_rate"],))
+    space = levenberg_marquardt.ParameterSpace(("damping_rate",), (PARAMETERS["damping_rate"],))
     look = levenberg_marquardt.Look(space, space.to_raw(np.array([[0.8]])))
     measured = np.linspace(0.0, 1.0, 20)[None, :, None, None] * np.ones((2, 1, 4, 3))
     measured[1, 5:] = np.nan  # a short trial
@@ -250,7 +250,7 @@ def test_large_errors_leave_less_curvature_and_what_is_not_seen_none() -> None:
 
 @pytest.mark.slow
 def test_ranges_take_in_what_wrong_simulations_change() -> None:
-    space = levenberg_marquardt.Space(("damping_rate",), (PARAMETERS["damping_rate"],))
+    space = levenberg_marquardt.ParameterSpace(("damping_rate",), (PARAMETERS["damping_rate"],))
     time = np.linspace(0.0, 1.0, 20)[None, :, None, None] * np.ones((3, 1, 1, 3))
 
     def slide(values: np.ndarray) -> np.ndarray:  # 1 mm a second for each unit of the coordinate

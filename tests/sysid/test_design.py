@@ -16,7 +16,7 @@ from torchdlo.errors import InputError
 from torchdlo.report.pages import design as report
 from torchdlo.sysid.diagnosis import budget
 from torchdlo.sysid.diagnosis.error_floor import gap
-from torchdlo.sysid.estimation.jobs import Fit, Simulation
+from torchdlo.sysid.estimation.jobs import FitJob, SimulationJob
 from torchdlo.sysid.estimation.result_cache import digest
 from torchdlo.sysid.estimation.worker_pool import Pool
 from torchdlo.sysid.experiment_design import design as search
@@ -32,7 +32,7 @@ from torchdlo.sysid.recordings.recording import Recording, Trial, save_recording
 S = np.array([0.0, 0.015, 0.06, 0.12, 0.18, 0.24, 0.3])
 GRIPPED = np.arange(len(S)) < 2
 NOISE = 5e-4
-OPTIONS = {"vertices": 21, "ahead": 0.0, "grip": 0.0, "substep": 1e-2}
+OPTIONS = {"vertices": 21, "numerical_damping": 0.0, "grip": 0.0, "substep": 1e-2}
 TRUTH = {
     "bending_stiffness": 5e-3,
     "twisting_stiffness": 4e-3,
@@ -129,9 +129,9 @@ def refitted(design: Design, recording: Recording, new: Trial) -> dict[str, tupl
     with Pool(joined, OPTIONS, workers=1) as pool:
         for name, rival in design.models.items():
             start = starts.begin(pool.local.model(rival.effects), joined.train)
-            job = Fit(rival.effects, rival.values[None], rival.space.names, tuple(rival.space.units), 3, start)
+            job = FitJob(rival.effects, rival.values[None], rival.space.names, tuple(rival.space.units), 3, start)
             ((_, fitted),) = pool.fit([job])
-            ((_, sims),) = pool.simulate([Simulation(rival.effects, fitted.values[None], "train", start)])
+            ((_, sims),) = pool.simulate([SimulationJob(rival.effects, fitted.values[None], "train", start)])
             gaps = gap(sims[0], joined.train)
             found[name] = float(np.sqrt(np.mean(gaps[:-1] ** 2))), float(gaps[-1])
     return found
@@ -193,7 +193,7 @@ def test_motions_stay_within_what_was_recorded(tmp_path: Path) -> None:
 
 def test_a_roll_turns_the_clamp_about_the_rope(tmp_path: Path) -> None:
     rig = excitation_motions.make_rig(empty(tmp_path))
-    trial = excitation_motions.play(rig, excitation_motions.Gesture("roll", 0.5), 2.5, "motion")
+    trial = excitation_motions.play(rig, excitation_motions.ExcitationMotion("roll", 0.5), 2.5, "motion")
     turn = Rotation.from_quat(trial.gripper_quaternion[:, 0], scalar_first=True)
     np.testing.assert_allclose(turn.apply([1.0, 0, 0]), np.tile([0, 0, -1.0], (len(turn), 1)), atol=1e-12)
     # Half a turn, from the clamp's y axis to its opposite.
@@ -222,7 +222,7 @@ def test_two_clamps_come_as_close_as_they_were(tmp_path: Path) -> None:
 
 def test_a_larger_scale_allows_larger_and_faster_motions(tmp_path: Path) -> None:
     rig, wider = (excitation_motions.make_rig(empty(tmp_path), scale) for scale in (1.0, 3.0))
-    gesture = excitation_motions.Gesture("swing", 1.0)
+    gesture = excitation_motions.ExcitationMotion("swing", 1.0)
     assert excitation_motions.travel(wider, gesture, 2.0)[0] == pytest.approx(
         3 * excitation_motions.travel(rig, gesture, 2.0)[0]
     )

@@ -15,15 +15,15 @@ from torchdlo.errors import InputError
 from torchdlo.physics.effects import EFFECTS
 from torchdlo.report.pages import diagnosis as report
 from torchdlo.sysid.diagnosis import clamp_models, effect_library, error_floor, search
-from torchdlo.sysid.diagnosis.backward_elimination import Found, Revision
+from torchdlo.sysid.diagnosis.backward_elimination import EliminationResult, Revision
 from torchdlo.sysid.diagnosis.budget import BUDGETS
 from torchdlo.sysid.diagnosis.candidate_fits import extend
-from torchdlo.sysid.diagnosis.findings import findings, findings_json, model_json, sentence
+from torchdlo.sysid.diagnosis.findings import findings, findings_json, model_json, summary
 from torchdlo.sysid.diagnosis.score_test import Score
 from torchdlo.sysid.diagnosis.verdict import word
-from torchdlo.sysid.diagnosis.workspace import Bench
+from torchdlo.sysid.diagnosis.workspace import Workspace
 from torchdlo.sysid.estimation.jobs import Fitted
-from torchdlo.sysid.estimation.levenberg_marquardt import Point, Space, interval
+from torchdlo.sysid.estimation.levenberg_marquardt import ParameterSpace, Point, interval
 from torchdlo.sysid.model import equilibrium
 from torchdlo.sysid.model.discretisation import make_mesh
 from torchdlo.sysid.model.gripper_motion import drive
@@ -58,7 +58,7 @@ def make_recording(path: Path, effects: dict[str, float], noise: float = 2e-4, g
     gravity = np.array([0, 0, -9.81])
     empty = Recording(path, 0.6, 0.005, 0.03, gravity, None, noise, None, None, False, "", trials[:2], trials[2:])
     names = sorted({key.split(".")[0] for key in effects})
-    model = RopeModel(empty, vertices=61, effects=names, substep=2.5e-3, ahead=0.0, grip=grip)
+    model = RopeModel(empty, vertices=61, effects=names, substep=2.5e-3, numerical_damping=0.0, grip=grip)
     values = dict(zip(model.parameters, model.guess(), strict=True))
     values |= {"bending_stiffness": 2e-3, "twisting_stiffness": 1.5e-3, "damping_rate": 0.5} | effects
     start = Start(np.stack([t.markers[0] for t in trials]), np.zeros((3, len(S), 3)), np.ones(3, bool))
@@ -96,7 +96,7 @@ def make_empty(path: Path) -> Recording:
 
 def test_reciprocal_numbers_are_searched_from_infinity() -> None:
     param = EFFECTS["stretch"].params["EA"]
-    space = Space(("stretch.EA",), (param,), (1e-3,))
+    space = ParameterSpace(("stretch.EA",), (param,), (1e-3,))
     raw = space.to_raw(np.array([[param.off], [500.0]]))
     assert raw[0, 0] == pytest.approx(0.0, abs=1e-12) and raw[1, 0] == pytest.approx(2.0)
     np.testing.assert_allclose(space.to_values(raw), [[param.off], [500.0]])
@@ -149,7 +149,8 @@ def test_noise_is_read_off_fourth_differences(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     long = hanging("train_0", rng, frames=801)
     noisy = replace(long, markers=long.markers + 3e-4 * rng.normal(size=long.markers.shape))
-    # Of 8 x 3 x 800 differences the median deviation is known to 1 %; what is smooth adds 0.02^4 of its fourth slope.
+    # Of 8 x 3 x 800 differences the median deviation is known to 1 %; what is smooth adds 0.02^4 of its fourth
+    # gradient.
     assert error_floor.noise(replace(recording, train=(noisy,))) == pytest.approx(3e-4, rel=0.05)
 
 
@@ -180,7 +181,7 @@ def test_a_hidden_effect_is_named_and_none_where_there_is_none(
     assert json.loads(findings_json(result, recording))["verdict"] == result.verdict
     assert set(json.loads(model_json(result))["effects"]) >= set(named)
     page = report.diagnosis_html(result, recording)
-    assert page.count("data:image/png") == 2 and "point mass" in page and sentence(result, recording)[:7] in page
+    assert page.count("data:image/png") == 2 and "point mass" in page and summary(result, recording)[:7] in page
     assert {stage[0] for stage in stages} >= {"calibrating the baseline", "measuring the floor"}
 
 
@@ -247,9 +248,11 @@ def test_a_slope_and_a_spot_are_fitted_side_by_side(tmp_path: Path) -> None:
         return [n.split(".")[1] for n in numbers], len(score.starts)
 
     bench = SimpleNamespace(recording=make_empty(tmp_path), extension=extension)
-    slope, spot = {"nonuniform_stiffness.slope": 0.1}, {"nonuniform_stiffness.factor": -1.0}
+    gradient, spot = {"nonuniform_stiffness.slope": 0.1}, {"nonuniform_stiffness.factor": -1.0}
     spot |= {"nonuniform_stiffness.position": 0.4, "nonuniform_stiffness.width": 0.1}
-    score = Score("nonuniform_stiffness", 0.5, slope, tuple((d, np.zeros(0)) for d in (slope, spot, slope)), {}, None)
+    score = Score(
+        "nonuniform_stiffness", 0.5, gradient, tuple((d, np.zeros(0)) for d in (gradient, spot, gradient)), {}, None
+    )
     jobs = extend(bench, None, score, 4, None)
     assert jobs == [(["slope"], 2), (["position", "width", "factor"], 1)]
 
@@ -262,11 +265,11 @@ def twentieth(worse: float, best: float) -> float:
 def test_fits_tie_by_what_they_save_and_by_what_they_leave() -> None:
     bench = SimpleNamespace(level=0.5e-3)
     # A twentieth of what is saved; noise of 0.5 mm costs sqrt(0.5^2 + 2^2) - 2 = 0.06 mm, and half of that is less.
-    assert Bench.tie(bench, 1.2e-3, 0.9e-3) == pytest.approx(0.05 * 0.3e-3)
-    assert Bench.tie(bench, 10e-3, 0.0) == pytest.approx(0.5 * (np.hypot(0.5, 2) - 2) * 1e-3)
-    assert Bench.tie(bench, 10e-3, 0.6e-3) == pytest.approx(0.3e-3)
+    assert Workspace.tie(bench, 1.2e-3, 0.9e-3) == pytest.approx(0.05 * 0.3e-3)
+    assert Workspace.tie(bench, 10e-3, 0.0) == pytest.approx(0.5 * (np.hypot(0.5, 2) - 2) * 1e-3)
+    assert Workspace.tie(bench, 10e-3, 0.6e-3) == pytest.approx(0.3e-3)
     bench.level = float("inf")
-    assert Bench.tie(bench, 10e-3, 0.0) == pytest.approx(0.5e-3)
+    assert Workspace.tie(bench, 10e-3, 0.0) == pytest.approx(0.5e-3)
 
 
 def test_an_effect_is_left_out_once_only_from_the_same_model() -> None:
@@ -293,14 +296,16 @@ def test_a_general_law_is_named_only_where_its_other_numbers_tell(
 ) -> None:
     numbers = {name: effect_library.numbers(name, make_empty(tmp_path)) for name in ("wind", "air_drag")}
     values = {"wind": [speed, -speed, 0.0, 1.6], "air_drag": [1.7]}
-    slopes = 0.1 * np.random.default_rng(0).normal(size=(4, 4))
+    gradients = 0.1 * np.random.default_rng(0).normal(size=(4, 4))
 
     def fitted(name: str, cost: float) -> Fitted:
         params = tuple(n.param for n in numbers[name])
-        space = Space(tuple(n.name for n in numbers[name]), params, (1.0,) * len(params))
+        space = ParameterSpace(tuple(n.name for n in numbers[name]), params, (1.0,) * len(params))
         k, raw = len(params), space.to_raw(np.array(values[name]))
         # By how much trials would have numbers differ: some hundredths.
-        return Fitted((name,), raw, space, Point(raw, cost, slopes[:, :k], np.tile(np.eye(k), (4, 1, 1)), np.ones(4)))
+        return Fitted(
+            (name,), raw, space, Point(raw, cost, gradients[:, :k], np.tile(np.eye(k), (4, 1, 1)), np.ones(4))
+        )
 
     fits = {"wind": fitted("wind", 0.8e-3), "air_drag": fitted("air_drag", 1e-3)}
     low, high = interval(fits["wind"].point, fits["wind"].space)
@@ -348,7 +353,7 @@ def test_a_special_law_takes_the_place_of_a_general_one_that_fits_no_better(cost
     plain = model(cost, "air_drag", "time_delay")
     bench = SimpleNamespace(exchange=lambda *job: job[1:3], fit=lambda jobs: [plain] * len(jobs), tie=twentieth)
     revision = Revision(bench, BUDGETS["fast"], [model(9e-3), model(6e-3)], lambda *_: None)
-    found = Found({"wind": 0.5, "time_delay": 0.4}, {"wind": ["tilted_gravity"], "time_delay": []})
+    found = EliminationResult({"wind": 0.5, "time_delay": 0.4}, {"wind": ["tilted_gravity"], "time_delay": []})
     wind = model(0.5e-3, "wind", "time_delay")
     assert revision.plainer(wind, found, ["wind", "time_delay"]) is wind, "air drag is not to be looked for"
     fitted = revision.plainer(wind, found, ["wind", "time_delay", "air_drag"])
@@ -371,10 +376,10 @@ def test_an_effect_gives_way_to_another_that_fits_better_beside_the_rest(cost: f
 
     monkeypatch.setattr(Revision, "_instead", instead)
     pool = SimpleNamespace(choose=lambda **_: None)
-    bench = SimpleNamespace(gaps=lambda f, _: np.array([5e-3]), level=1e-3, astray=lambda *_: False, pool=pool)
+    bench = SimpleNamespace(gaps=lambda f, _: np.array([5e-3]), level=1e-3, diverged=lambda *_: False, pool=pool)
     bench.tie = twentieth
     revision = Revision(bench, BUDGETS["fast"], [model(9e-3, 3), model(6e-3, 3)], lambda *_: None)
-    found = Found({"wind": 0.5, "point_mass": 0.3}, {"wind": ["rest_curvature"], "point_mass": []})
+    found = EliminationResult({"wind": 0.5, "point_mass": 0.3}, {"wind": ["rest_curvature"], "point_mass": []})
     # Of 4 mm that are explained, 0.2 mm are a tie: fewer numbers win that.
     fitted = revision.exchanged(model(2e-3, 5, "wind", "point_mass"), found, ["wind", "tilted_gravity", "air_drag"])
     assert set(fitted.effects) == {named, "point_mass"} and [*found.shares] == [named, "point_mass"]

@@ -15,10 +15,10 @@ from tests.sysid.swaying import recording as swaying
 from torchdlo.physics.effects import EFFECTS
 from torchdlo.sysid.diagnosis import effect_library
 from torchdlo.sysid.diagnosis.effect_equations import LAWS, MEANING, separating
-from torchdlo.sysid.diagnosis.error_floor import Floor
-from torchdlo.sysid.diagnosis.findings import absorbed, confidence, findings, findings_json, sentence
+from torchdlo.sysid.diagnosis.error_floor import ErrorFloor
+from torchdlo.sysid.diagnosis.findings import absorbed, confidence, findings, findings_json, summary
 from torchdlo.sysid.diagnosis.verdict import Diagnosis
-from torchdlo.sysid.recordings.data_quality import Fault
+from torchdlo.sysid.recordings.data_quality import DataIssue
 from torchdlo.sysid.recordings.recording import Recording
 
 
@@ -31,12 +31,14 @@ def rope() -> Recording:
 @pytest.fixture(scope="module")
 def found(rope: Recording) -> Diagnosis:
     """Air drag, or wind."""
-    return fake_diagnosis(rope, health=[Fault("train_1", "swap", "markers 3 and 4 are swapped")])
+    return fake_diagnosis(rope, health=[DataIssue("train_1", "swap", "markers 3 and 4 are swapped")])
 
 
 def test_the_sentence_has_number_range_gap_and_doubt(rope: Recording, found: Diagnosis) -> None:
-    result = replace(found, before=np.array([5e-3, 5e-3]), after=np.array([1e-3, 1e-3]), floor=Floor(6e-4, 0.0, 8e-4))
-    said = sentence(result, rope)
+    result = replace(
+        found, before=np.array([5e-3, 5e-3]), after=np.array([1e-3, 1e-3]), floor=ErrorFloor(6e-4, 0.0, 8e-4)
+    )
+    said = summary(result, rope)
     assert said.startswith("Missing: air drag (c_d 1.4 [")
     # (25 - 1) / (25 - 0.36) = 97.4 %.
     assert "not to be told from wind. Gap on trials that were not used: 5.0 → 1.0 mm (floor 1.0 mm), 97% of" in said
@@ -45,13 +47,13 @@ def test_the_sentence_has_number_range_gap_and_doubt(rope: Recording, found: Dia
 
 def test_trials_that_a_simulation_fails_on_are_left_out_and_said(rope: Recording, found: Diagnosis) -> None:
     failed = replace(found, before=np.array([5e-3, np.inf]), after=np.array([1e-3, 3e-3]))
-    said = sentence(failed, rope)
+    said = summary(failed, rope)
     assert "5.0 → 1.0 mm" in said and "Left out are 1 of 2 such trials, which a simulation fails on." in said
     gap = findings(failed, rope)["gap"]
     assert (gap["test_rmse_before_m"], gap["test_rmse_after_m"]) == (5e-3, 1e-3)
     unknown = replace(failed, verdict="unknown", effects=[], ties={}, final=found.baseline)
-    assert "Left out are 1 of 2" in sentence(unknown, rope)
-    assert "Left out" not in sentence(found, rope)
+    assert "Left out are 1 of 2" in summary(unknown, rope)
+    assert "Left out" not in summary(found, rope)
     nothing = replace(found, before=np.full(2, np.inf), after=np.full(2, np.inf))
     assert np.isinf(nothing.gaps).all()
 
@@ -61,11 +63,11 @@ def test_other_verdicts_compare_the_gap_with_the_floor(
     rope: Recording, found: Diagnosis, verdict: str, start: str
 ) -> None:
     none = replace(found, verdict=verdict, effects=[], ties={}, final=found.baseline, before=np.array([4e-3, 4e-3]))
-    said = sentence(replace(none, floor=Floor(1e-3, 0.0, 0.0)), rope)
+    said = summary(replace(none, floor=ErrorFloor(1e-3, 0.0, 0.0)), rope)
     assert said.startswith(start) and "4.0 mm" in said and "1.0 mm" in said
     assert confidence(none) is None
     partial = replace(found, verdict="partial")
-    assert "A part remains that no effect of the library explains" in sentence(partial, rope)
+    assert "A part remains that no effect of the library explains" in summary(partial, rope)
 
 
 def test_confidence_falls_with_every_doubt(found: Diagnosis) -> None:

@@ -12,13 +12,13 @@ from tests.sysid.swaying import PLACES
 from tests.sysid.swaying import recording as swaying
 from torchdlo.sysid.diagnosis import error_floor
 from torchdlo.sysid.diagnosis.error_floor import Refinement
-from torchdlo.sysid.diagnosis.workspace import Bench
-from torchdlo.sysid.estimation.jobs import Fitted, Simulation
-from torchdlo.sysid.estimation.levenberg_marquardt import Point, Space
+from torchdlo.sysid.diagnosis.workspace import Workspace
+from torchdlo.sysid.estimation.jobs import Fitted, SimulationJob
+from torchdlo.sysid.estimation.levenberg_marquardt import ParameterSpace, Point
 from torchdlo.sysid.estimation.worker_pool import Pool
 from torchdlo.sysid.recordings.recording import Recording, Trial
 
-OPTIONS = {"vertices": 33, "ahead": 0.0, "grip": 0.0}
+OPTIONS = {"vertices": 33, "numerical_damping": 0.0, "grip": 0.0}
 
 
 def carried(path: Path) -> Recording:
@@ -38,14 +38,14 @@ def carried(path: Path) -> Recording:
 
 def test_a_correction_leaves_little_of_the_error_of_steps_and_mesh(tmp_path: Path) -> None:
     with Pool(carried(tmp_path), OPTIONS, workers=1) as pool:
-        bench, model = Bench(pool), pool.local.model(())
+        bench, model = Workspace(pool), pool.local.model(())
         values = np.array([3e-3, 2e-3, 2.0])
         bench.begin(values, ())
-        none = Space((), ())
+        none = ParameterSpace((), ())
         fitted = Fitted((), values, none, Point(np.empty(0), 0.0, np.empty(0), np.empty(0), np.empty(0)))
         coarse, count = bench.prediction(fitted, "all"), len(model.arclength)
         fine = (("vertices", 4 * count - 3), ("substep", model.dt / (8 * model.substeps)))
-        exact = dict(pool.simulate([Simulation((), values[None], "all", bench.starts["all"], fine)]))[0][0]
+        exact = dict(pool.simulate([SimulationJob((), values[None], "all", bench.starts["all"], fine)]))[0][0]
         bench.correct(fitted)
         corrected = bench.prediction(fitted, "all")
     free = ~pool.recording.train[0].gripped
@@ -85,22 +85,22 @@ def test_motions_that_magnify_errors_count_less() -> None:
     step, grid = np.zeros((2, 4, 3, 3)), np.zeros((2, 4, 3, 3))
     grid[0, 2:, free] = 9e-3
     found = Refinement(step, grid, noise, 2, 0.02)
-    trust, level = found.trust(free)
+    frame_weights, level = found.frame_weights(free)
     # What is left of a change of 9 mm is a third of it.
     deviation = np.full((2, 4), noise)
     deviation[0, 2:] = np.hypot(noise, 3e-3)
-    np.testing.assert_allclose(trust * deviation, level)
-    assert np.mean(trust**2) == pytest.approx(1.0)
+    np.testing.assert_allclose(frame_weights * deviation, level)
+    assert np.mean(frame_weights**2) == pytest.approx(1.0)
     # The links of a chain are where vertices of the mesh are: nothing to correct, but all the more may be wrong.
     chain = replace(found, links=0.02)
     assert not chain.correction.any()
     assert chain.floor(slice(None), free).grid == pytest.approx(3 * found.floor(slice(None), free).grid)
-    assert chain.trust(free)[0][0, 2] < trust[0, 2]
+    assert chain.frame_weights(free)[0][0, 2] < frame_weights[0, 2]
 
 
 def test_a_chain_is_corrected_by_what_its_links_do_not_explain(tmp_path: Path) -> None:
     with Pool(swaying(tmp_path, frames=5), OPTIONS, workers=1) as pool:
-        bench, none = Bench(pool), Space((), ())
+        bench, none = Workspace(pool), ParameterSpace((), ())
         bench.begin(pool.local.model(()).guess(), ())
         edge = np.mean(np.diff(pool.local.model(()).arclength))
         for links, wrong in ((0.0, 1.0), (0.5, 0.75), (-1.0, 0.0), (4.0, -1.0)):
@@ -113,16 +113,16 @@ def test_a_chain_is_corrected_by_what_its_links_do_not_explain(tmp_path: Path) -
 def test_trials_that_tell_nothing_of_their_errors_count_as_others_do() -> None:
     step, grid = np.zeros((3, 2, 4, 3)), np.full((3, 2, 4, 3), 3e-3)
     grid[1] = np.nan
-    trust, level = Refinement(step, grid, 1e-3, 2, 0.02).trust(np.ones(4, bool))
-    np.testing.assert_allclose(trust, 1.0)
+    frame_weights, level = Refinement(step, grid, 1e-3, 2, 0.02).frame_weights(np.ones(4, bool))
+    np.testing.assert_allclose(frame_weights, 1.0)
     assert level == pytest.approx(np.hypot(1e-3, 1e-3))
-    assert Refinement(step, np.full_like(grid, np.nan), 1e-3, 2, 0.02).trust(np.ones(4, bool))[1] == np.inf
+    assert Refinement(step, np.full_like(grid, np.nan), 1e-3, 2, 0.02).frame_weights(np.ones(4, bool))[1] == np.inf
 
 
 def test_gaps_are_weighted_by_frame(tmp_path: Path) -> None:
     trials = swaying(tmp_path, frames=10).train
     sims = np.stack([t.markers for t in trials]) + 1e-3
-    trust = np.zeros((3, 10))
-    trust[1], trust[2, :5] = 1.0, 2.0
+    frame_weights = np.zeros((3, 10))
+    frame_weights[1], frame_weights[2, :5] = 1.0, 2.0
     np.testing.assert_allclose(error_floor.gap(sims, trials), 1e-3)
-    np.testing.assert_allclose(error_floor.gap(sims, trials, trust), [0.0, 1e-3, np.sqrt(2) * 1e-3])
+    np.testing.assert_allclose(error_floor.gap(sims, trials, frame_weights), [0.0, 1e-3, np.sqrt(2) * 1e-3])

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from tests.sysid.swaying import recording as swaying
 from torchdlo.errors import InputError
-from torchdlo.sysid.recordings.data_quality import Fault, check
+from torchdlo.sysid.recordings.data_quality import DataIssue, check
 from torchdlo.sysid.recordings.recording import Recording, Trial, load_recording
 
 RECORDINGS = ("hanging", "both ends", "sample")
@@ -42,7 +42,7 @@ def moved(trial: Trial, do: Callable[[np.ndarray], None]) -> Trial:
     return replace(trial, markers=markers)
 
 
-def found(recording: Recording) -> tuple[dict[str, Trial], list[Fault]]:
+def found(recording: Recording) -> tuple[dict[str, Trial], list[DataIssue]]:
     """Trials after the check by name, and the faults."""
     clean, faults = check(recording)
     return {t.name: t for t in (*clean.train, *clean.test)}, faults

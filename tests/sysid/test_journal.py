@@ -17,9 +17,9 @@ from torchdlo.sysid.diagnosis.effect_library import PARAMETERS
 from torchdlo.sysid.diagnosis.findings import findings, model_json
 from torchdlo.sysid.estimation import result_cache as journals
 from torchdlo.sysid.estimation import worker_pool as pools
-from torchdlo.sysid.estimation.jobs import Fit, Fitted, Models, Simulation
-from torchdlo.sysid.estimation.levenberg_marquardt import Point, Space
-from torchdlo.sysid.estimation.result_cache import Journal, digest
+from torchdlo.sysid.estimation.jobs import FitJob, Fitted, Models, SimulationJob
+from torchdlo.sysid.estimation.levenberg_marquardt import ParameterSpace, Point
+from torchdlo.sysid.estimation.result_cache import ResultCache, digest
 from torchdlo.sysid.estimation.worker_pool import Pool
 from torchdlo.sysid.model import model_file
 from torchdlo.sysid.model.trial_batch import Start
@@ -36,22 +36,22 @@ def recording(folder: Path) -> Recording:
 
 def fitted() -> Fitted:
     """A result with all kinds of content, numbers that are not finite among them."""
-    space = Space(("damping_rate",), (PARAMETERS["damping_rate"],), (1.0,))
+    space = ParameterSpace(("damping_rate",), (PARAMETERS["damping_rate"],), (1.0,))
     point = Point(np.array([0.3]), float("inf"), np.ones((2, 1)), np.full((2, 1, 1), np.nan), np.array([1.0, np.inf]))
     return Fitted(("air_drag",), np.linspace(0, 1, 4), space, point)
 
 
-def fit_job(value: float = 1.0) -> Fit:
+def fit_job(value: float = 1.0) -> FitJob:
     """A job."""
     start = Start(np.zeros((2, 9, 3)), np.ones((2, 9, 3)), np.array([True, False]))
-    return Fit(("air_drag",), np.full((2, 4), value), ("damping_rate",), (1.0,), 6, start)
+    return FitJob(("air_drag",), np.full((2, 4), value), ("damping_rate",), (1.0,), 6, start)
 
 
 def test_results_come_back_to_the_last_bit(recording: Recording, tmp_path: Path) -> None:
-    journal, job, result = Journal(tmp_path / "j", recording, OPTIONS), fit_job(), fitted()
+    journal, job, result = ResultCache(tmp_path / "j", recording, OPTIONS), fit_job(), fitted()
     assert journal.recall(job) is None
     journal.keep(job, result)
-    again = Journal(tmp_path / "j", recording, OPTIONS, resume=True).recall(fit_job())
+    again = ResultCache(tmp_path / "j", recording, OPTIONS, resume=True).recall(fit_job())
     assert digest(again) == digest(result) and again.space.params == result.space.params
     np.testing.assert_array_equal(again.point.curvature, result.point.curvature)
 
@@ -63,18 +63,18 @@ def test_other_content_is_another_job() -> None:
         replace(job, iterations=7),
         replace(job, start=None),
         replace(job, frames=3),
-        Simulation(job.effects, job.values),
+        SimulationJob(job.effects, job.values),
         replace(job, values=job.values.reshape(4, 2)),
     )
     assert len({digest(each) for each in (job, *others)}) == 1 + len(others)
 
 
 def test_only_what_is_missing_is_computed(recording: Recording, tmp_path: Path) -> None:
-    journal = Journal(tmp_path / "j", recording, OPTIONS)
+    journal = ResultCache(tmp_path / "j", recording, OPTIONS)
     jobs = [fit_job(v) for v in (1.0, 2.0, 3.0)]
     asked: list[Any] = []
 
-    def compute(rest: Sequence[Fit]) -> Iterator[tuple[int, np.ndarray]]:
+    def compute(rest: Sequence[FitJob]) -> Iterator[tuple[int, np.ndarray]]:
         asked.extend(rest)
         # Results come in any order.
         yield from ((k, 10 * rest[k].values) for k in reversed(range(len(rest))))
@@ -91,17 +91,17 @@ def test_only_what_is_missing_is_computed(recording: Recording, tmp_path: Path) 
 
 def test_a_pool_reads_what_another_one_computed(recording: Recording, tmp_path: Path) -> None:
     options = {"vertices": 15}
-    job = Simulation((), np.array([[1e-3, 1e-3, 0.5]]))
-    with Pool(recording, options, 1, Journal(tmp_path / "j", recording, OPTIONS)) as pool:
+    job = SimulationJob((), np.array([[1e-3, 1e-3, 0.5]]))
+    with Pool(recording, options, 1, ResultCache(tmp_path / "j", recording, OPTIONS)) as pool:
         ((_, computed),) = pool.simulate([job])
-    with Pool(recording, options, 1, Journal(tmp_path / "j", recording, OPTIONS, resume=True)) as pool:
+    with Pool(recording, options, 1, ResultCache(tmp_path / "j", recording, OPTIONS, resume=True)) as pool:
         pool.local.simulate = lambda job: pytest.fail("computed again")
         ((_, kept),) = pool.simulate([job])
     np.testing.assert_array_equal(kept, computed)
 
 
 def test_a_damaged_result_is_computed_again(recording: Recording, tmp_path: Path) -> None:
-    journal, job = Journal(tmp_path / "j", recording, OPTIONS), fit_job()
+    journal, job = ResultCache(tmp_path / "j", recording, OPTIONS), fit_job()
     journal.keep(job, fitted())
     (file,) = (tmp_path / "j").glob("*.npz")
     whole = file.read_bytes()
@@ -113,8 +113,8 @@ def test_a_damaged_result_is_computed_again(recording: Recording, tmp_path: Path
 def test_another_search_is_refused(recording: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "j"
     with pytest.raises(InputError, match=r"expected the journal of a search to resume, found none; leave out --resume"):
-        Journal(path, recording, OPTIONS, resume=True)
-    Journal(path, recording, OPTIONS).keep(fit_job(), fitted())
+        ResultCache(path, recording, OPTIONS, resume=True)
+    ResultCache(path, recording, OPTIONS).keep(fit_job(), fitted())
     shifted = replace(recording.test[0], markers=recording.test[0].markers + 1e-9)
     for other, options in (
         (replace(recording, test=(shifted, *recording.test[1:])), OPTIONS),
@@ -123,23 +123,23 @@ def test_another_search_is_refused(recording: Recording, tmp_path: Path, monkeyp
         (recording, OPTIONS | {"budget": "full"}),
     ):
         with pytest.raises(InputError, match="belongs to another recording or to other options"):
-            Journal(path, other, options, resume=True)
+            ResultCache(path, other, options, resume=True)
     # A copy of the folder elsewhere is the same recording.
-    Journal(path, replace(recording, path=tmp_path / "elsewhere"), OPTIONS, resume=True)
+    ResultCache(path, replace(recording, path=tmp_path / "elsewhere"), OPTIONS, resume=True)
     monkeypatch.setattr(journals, "_program", lambda: "newer")
     with pytest.raises(InputError, match="written by another version of torchdlo"):
-        Journal(path, recording, OPTIONS, resume=True)
+        ResultCache(path, recording, OPTIONS, resume=True)
 
 
 def test_a_new_search_begins_with_an_empty_journal(recording: Recording, tmp_path: Path) -> None:
-    Journal(tmp_path / "j", recording, OPTIONS).keep(fit_job(), fitted())
-    assert Journal(tmp_path / "j", recording, OPTIONS).recall(fit_job()) is None
+    ResultCache(tmp_path / "j", recording, OPTIONS).keep(fit_job(), fitted())
+    assert ResultCache(tmp_path / "j", recording, OPTIONS).recall(fit_job()) is None
 
 
 def test_foreign_folders_are_not_emptied(recording: Recording, tmp_path: Path) -> None:
     (tmp_path / "thesis.txt").write_text("years of work")
     with pytest.raises(InputError, match="expected a journal of torchdlo, found something else"):
-        Journal(tmp_path, recording, OPTIONS)
+        ResultCache(tmp_path, recording, OPTIONS)
     assert (tmp_path / "thesis.txt").exists()
 
 
@@ -148,27 +148,27 @@ class FakeModels(Models):
 
     computed: ClassVar[list[str]] = []
 
-    def simulate(self, job: Simulation, part: int = 0, parts: int = 1) -> np.ndarray:
+    def simulate(self, job: SimulationJob, part: int = 0, parts: int = 1) -> np.ndarray:
         """Return the measured markers, moved by what the numbers are."""
         self.computed.append(digest(job))
         trials = self.recording.trials(job.split)
         shift = 1e-3 * np.sin(1e3 * job.values.sum(1) + len(job.effects))
         return np.stack([t.markers[: job.frames] for t in trials])[None] + shift[:, None, None, None, None]
 
-    def search(self, jobs: Sequence[Fit]) -> Generator[Simulation, np.ndarray, tuple[Fitted, ...]]:
+    def search(self, jobs: Sequence[FitJob]) -> Generator[SimulationJob, np.ndarray, tuple[Fitted, ...]]:
         """Return the first start of every fit, a little changed."""
         self.computed += [digest(job) for job in jobs]
-        yield Simulation(jobs[0].effects, jobs[0].values)
+        yield SimulationJob(jobs[0].effects, jobs[0].values)
         return tuple(self._fitted(job) for job in jobs)
 
-    def _fitted(self, job: Fit) -> Fitted:
+    def _fitted(self, job: FitJob) -> Fitted:
         model = self.model(job.effects)
         params = tuple(model.params[model.parameters.index(n)] for n in job.free)
-        space, values = Space(job.free, params, job.sizes), job.values[0] * 1.01
+        space, values = ParameterSpace(job.free, params, job.sizes), job.values[0] * 1.01
         raw = space.to_raw(values[[model.parameters.index(n) for n in job.free]])
-        slopes = np.ones((len(self.recording.train), len(raw)))
-        curvature = np.tile(np.eye(len(raw)), (len(slopes), 1, 1))
-        return Fitted(job.effects, values, space, Point(raw, 1e-3, slopes, curvature, np.ones(len(slopes))))
+        gradients = np.ones((len(self.recording.train), len(raw)))
+        curvature = np.tile(np.eye(len(raw)), (len(gradients), 1, 1))
+        return Fitted(job.effects, values, space, Point(raw, 1e-3, gradients, curvature, np.ones(len(gradients))))
 
 
 def test_a_stopped_diagnosis_goes_on_and_its_model_starts_the_next(

@@ -23,7 +23,7 @@ def arch(size=1.0, turn=2.0):
 def started(pos, held):
     """A rope of the right length in a scene, and the state that was measured."""
     rope = scene.Rope(arch(), radius=0.005, mass=0.05, bend=1e-3)
-    made, params, state = scene.make([rope], [Bend()], check=False, held_vertices=held)
+    made, params, state = scene.make([rope], [Bend()], check=False, prescribed_vertices=held)
     state.rods.pos.copy_(pos)
     return made, params, state
 

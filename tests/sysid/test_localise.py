@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from tests.sysid.swaying import LENGTH, NOISE, PLACES, recording
-from torchdlo.sysid.diagnosis.error_floor import Floor
+from torchdlo.sysid.diagnosis.error_floor import ErrorFloor
 from torchdlo.sysid.diagnosis.residual_analysis import Localisation, localise, project, residuals
 from torchdlo.sysid.recordings.recording import Recording, Trial
 
-FLOOR = Floor(NOISE, 0.0, 0.0)
+FLOOR = ErrorFloor(NOISE, 0.0, 0.0)
 
 
 @pytest.fixture(scope="module")
@@ -54,8 +54,8 @@ def test_a_lag_is_told_with_its_size(swaying: Recording) -> None:
     noise = 2 * (0.012 * NOISE / 0.02) ** 2 * 3 / np.mean(np.sum((0.012 * velocity(swaying.train[0])) ** 2, -1)[:, 2:])
     assert here.parts_before["lag"] > 0.99 - noise
     assert any("speed" in s for s in here.words)
-    ahead = found(swaying, lambda t: 0.02 * velocity(t))
-    assert any(s.startswith("The measurement runs 20 ms ahead of") for s in ahead.words)
+    numerical_damping = found(swaying, lambda t: 0.02 * velocity(t))
+    assert any(s.startswith("The measurement runs 20 ms ahead of") for s in numerical_damping.words)
 
 
 def test_a_shift_is_told_with_its_direction(swaying: Recording) -> None:

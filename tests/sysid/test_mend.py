@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from tests.sysid.swaying import recording as swaying
-from torchdlo.sysid.diagnosis.workspace import Bench, torn_apart
-from torchdlo.sysid.estimation.jobs import Fitted, Models, Simulation
-from torchdlo.sysid.estimation.levenberg_marquardt import Point, Space
+from torchdlo.sysid.diagnosis.workspace import Workspace, torn_apart
+from torchdlo.sysid.estimation.jobs import Fitted, Models, SimulationJob
+from torchdlo.sysid.estimation.levenberg_marquardt import ParameterSpace, Point
 from torchdlo.sysid.estimation.worker_pool import Pool
 
 ARC = np.array([0.0, 0.1, 0.2, 0.4])
@@ -30,7 +30,7 @@ def test_a_rope_is_torn_where_markers_are_further_apart_than_along_it(place: lis
 class Tearing(Models):
     """Models whose rope is torn in one trial unless steps are fine."""
 
-    def simulate(self, job: Simulation, part: int = 0, parts: int = 1) -> np.ndarray:
+    def simulate(self, job: SimulationJob, part: int = 0, parts: int = 1) -> np.ndarray:
         """Tear the last trial."""
         sims = super().simulate(job, part, parts)
         if dict(job.options).get("substep", 1.0) > 2e-3:
@@ -42,14 +42,16 @@ def test_a_torn_trial_is_simulated_in_finer_steps(tmp_path: Path) -> None:
     options = {"vertices": 10}
     with Pool(swaying(tmp_path, frames=12), options, workers=1) as pool:
         pool.local, plain = Tearing(pool.recording, options), pool.local
-        bench, values = Bench(pool), np.array([3e-3, 2e-3, 2.0])
+        bench, values = Workspace(pool), np.array([3e-3, 2e-3, 2.0])
         bench.begin(values, ())
-        fitted = Fitted((), values, Space((), ()), Point(np.empty(0), 0.0, np.empty(0), np.empty(0), np.empty(0)))
+        fitted = Fitted(
+            (), values, ParameterSpace((), ()), Point(np.empty(0), 0.0, np.empty(0), np.empty(0), np.empty(0))
+        )
         got = bench.prediction(fitted, "all")
         start, last = bench.starts["all"], bench.trials["all"][-1].name
-        coarse = plain.simulate(Simulation((), values[None], "all", start))[0]
+        coarse = plain.simulate(SimulationJob((), values[None], "all", start))[0]
         step = ("substep", plain.model(()).dt / (4 * plain.model(()).substeps))
-        fine = plain.simulate(Simulation((), values[None], "all", start, (step,)))[0]
+        fine = plain.simulate(SimulationJob((), values[None], "all", start, (step,)))[0]
     assert step[1] < 2e-3
     np.testing.assert_allclose(got[:-1], coarse[:-1], rtol=0, atol=1e-9)
     np.testing.assert_allclose(got[-1], fine[-1], rtol=0, atol=1e-9)

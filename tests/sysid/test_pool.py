@@ -9,18 +9,18 @@ import numpy as np
 import pytest
 
 from tests.sysid.swaying import recording as swaying
-from torchdlo.sysid.diagnosis.workspace import Bench
+from torchdlo.sysid.diagnosis.workspace import Workspace
 from torchdlo.sysid.estimation import worker_pool as pools
-from torchdlo.sysid.estimation.jobs import Fit, Fitted, Simulation
-from torchdlo.sysid.estimation.levenberg_marquardt import Point, Space
+from torchdlo.sysid.estimation.jobs import FitJob, Fitted, SimulationJob
+from torchdlo.sysid.estimation.levenberg_marquardt import ParameterSpace, Point
 from torchdlo.sysid.estimation.worker_pool import Pool
 from torchdlo.sysid.model import initial_state as starts
 
-OPTIONS = {"vertices": 17, "ahead": 0.0, "grip": 0.0}
+OPTIONS = {"vertices": 17, "numerical_damping": 0.0, "grip": 0.0}
 BASE = ("bending_stiffness", "damping_rate")
 
 
-def fits(pool: Pool) -> list[Fit]:
+def fits(pool: Pool) -> list[FitJob]:
     """A model without effects, two with one each, one of them from several starts, and one that needs frames."""
     jobs = []
     for effects, number, begun in (
@@ -35,7 +35,7 @@ def fits(pool: Pool) -> list[Fit]:
         if number is not None:
             values[:, model.parameters.index(number)] = begun
             free, sizes = (*BASE, number), (1.0, 1.0, max(begun))
-        jobs.append(Fit(effects, values, free, sizes, 2, frames=40, keep=1 if len(begun) > 1 else None))
+        jobs.append(FitJob(effects, values, free, sizes, 2, frames=40, keep=1 if len(begun) > 1 else None))
     return jobs
 
 
@@ -79,17 +79,21 @@ def test_workers_share_the_scenes_of_a_fit(tmp_path: Path, monkeypatch: pytest.M
         np.testing.assert_allclose(both, whole, rtol=0, atol=1e-12)
 
 
-def simulation(pool: Pool, job: Fit) -> Simulation:
+def simulation(pool: Pool, job: FitJob) -> SimulationJob:
     """The simulation of the starts of a fit, where another estimate says that trials begin."""
     model = pool.local.model(job.effects)
     start = starts.begin(model, pool.recording.train)
-    finer = 1e-3 * np.random.default_rng(0).normal(size=(len(start.pos), 40, 1, 3)) * np.ones((model.count, 1))
-    return Simulation(job.effects, job.values, "train", replace(start, finer=finer), frames=30)
+    discretisation_correction = (
+        1e-3 * np.random.default_rng(0).normal(size=(len(start.pos), 40, 1, 3)) * np.ones((model.count, 1))
+    )
+    return SimulationJob(
+        job.effects, job.values, "train", replace(start, discretisation_correction=discretisation_correction), frames=30
+    )
 
 
 def test_a_special_law_takes_over_the_numbers_of_a_general_one(tmp_path: Path) -> None:
     with Pool(swaying(tmp_path, frames=10), OPTIONS, workers=1) as pool:
-        bench = Bench(pool)
+        bench = Workspace(pool)
         bench.starts = {"train": None}
         model = pool.local.model(("wind", "point_mass"))
         values = dict(zip(model.parameters, np.arange(10.0, 10.0 + len(model.parameters)), strict=True))
@@ -97,7 +101,7 @@ def test_a_special_law_takes_over_the_numbers_of_a_general_one(tmp_path: Path) -
         params = tuple(model.params[model.parameters.index(n)] for n in names)
         point = Point(np.zeros(4), 1.0, np.zeros((1, 4)), np.zeros((1, 4, 4)), np.ones(1))
         fitted = Fitted(
-            model.effects, np.array(list(values.values())), Space(names, params, (1.0, 2.0, 3.0, 4.0)), point
+            model.effects, np.array(list(values.values())), ParameterSpace(names, params, (1.0, 2.0, 3.0, 4.0)), point
         )
         job = bench.exchange(fitted, "wind", "air_drag", 5)
         assert job.effects == ("air_drag", "point_mass") and job.iterations == 5
@@ -108,15 +112,15 @@ def test_a_special_law_takes_over_the_numbers_of_a_general_one(tmp_path: Path) -
 
 def test_a_model_loses_an_effect_and_starts_from_several_baselines(tmp_path: Path) -> None:
     with Pool(swaying(tmp_path, frames=10), OPTIONS, workers=1) as pool:
-        bench = Bench(pool)
+        bench = Workspace(pool)
         bench.starts, bench.early = {"train": None}, np.array([1.0, 2.0, 3.0])
         model = pool.local.model(("air_drag", "point_mass"))
         values = np.arange(10.0, 10.0 + len(model.parameters))
         names = ("bending_stiffness", "air_drag.c_d", "point_mass.mass")
         params = tuple(model.params[model.parameters.index(n)] for n in names)
         point = Point(np.zeros(3), 1.0, np.zeros((1, 3)), np.zeros((1, 3, 3)), np.ones(1))
-        joint = Fitted(model.effects, values, Space(names, params, (1.0, 2.0, 3.0)), point)
-        plain = Fitted((), np.array([4.0, 5.0, 6.0]), Space((), ()), point)
+        joint = Fitted(model.effects, values, ParameterSpace(names, params, (1.0, 2.0, 3.0)), point)
+        plain = Fitted((), np.array([4.0, 5.0, 6.0]), ParameterSpace((), ()), point)
         job = bench.reduction(joint, "air_drag", plain, 5)
         assert job.effects == ("point_mass",) and job.free == (names[0], names[2]) and job.sizes == (1.0, 3.0)
         kept = dict(zip(pool.local.model(job.effects).parameters, job.values.T, strict=True))

@@ -11,8 +11,8 @@ import pytest
 from tests.sysid.test_diagnose import S, hanging
 from torchdlo.sysid.diagnosis import baseline
 from torchdlo.sysid.diagnosis.budget import options
-from torchdlo.sysid.diagnosis.workspace import Bench
-from torchdlo.sysid.estimation.jobs import Fit
+from torchdlo.sysid.diagnosis.workspace import Workspace
+from torchdlo.sysid.estimation.jobs import FitJob
 from torchdlo.sysid.estimation.worker_pool import Pool
 from torchdlo.sysid.model.rope_model import RopeModel
 from torchdlo.sysid.model.trial_batch import Start
@@ -27,7 +27,7 @@ def made(path: Path, share: float) -> Recording:
     trials = tuple(hanging(n, np.random.default_rng(k)) for k, n in enumerate(("train_0", "test_0")))
     gravity = np.array([0, 0, -9.81])
     empty = Recording(path, 0.6, 0.005, 0.03, gravity, None, 2e-4, ARC, None, False, "", trials[:1], trials[1:])
-    model = RopeModel(empty, vertices=41, rest="given", ahead=0.0)
+    model = RopeModel(empty, vertices=41, rest="given", numerical_damping=0.0)
     numbers = {"bending_stiffness": 1.5e-3, "twisting_stiffness": 1e-3, "damping_rate": 0.5, "rest_share": share}
     values = dict(zip(model.parameters, model.guess(), strict=True)) | numbers
     start = Start(np.stack([t.markers[0] for t in trials]), np.zeros((2, len(S), 3)), np.ones(2, bool))
@@ -44,7 +44,7 @@ def test_a_rest_shape_is_given_up_only_where_a_straight_rope_fits_better(
 ) -> None:
     recording = made(tmp_path, share)
     with Pool(recording, options(recording, 31), 1) as pool:
-        bench = Bench(pool)
+        bench = Workspace(pool)
         model = pool.local.model(())
         assert model.rest == "given"
         found = baseline.calibrate(bench, 12, 4, np.random.default_rng(0), lambda *_: None)
@@ -58,12 +58,12 @@ def test_a_rest_shape_is_given_up_only_where_a_straight_rope_fits_better(
 def test_a_rest_shape_that_was_given_up_is_tried_again_with_an_effect(tmp_path: Path) -> None:
     recording = made(tmp_path, 1.0)
     with Pool(recording, options(recording, 31), 1) as pool:
-        bench = Bench(pool)
+        bench = Workspace(pool)
         pool.choose(rest="straight")
         model = pool.local.model(())
         bench.begin(model.guess(), ())
         names, start = tuple(model.parameters), bench.starts["train"]
-        straight = bench.fit([Fit((), model.guess()[None], names, (1.0,) * len(names), 4, start)])[0]
+        straight = bench.fit([FitJob((), model.guess()[None], names, (1.0,) * len(names), 4, start)])[0]
         before = np.sqrt(np.mean(bench.gaps(straight, "test") ** 2))
         found = baseline.go_further(bench, straight, 6, lambda *_: None)
         assert pool.local.model(()).rest == "given" == dict(found.options)["rest"]

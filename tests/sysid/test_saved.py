@@ -44,13 +44,13 @@ def write(path: Path, model: RopeModel, values: np.ndarray) -> Path:
 def test_a_model_comes_back_and_predicts_the_same(
     recording: Recording, tmp_path: Path, rest: str, vertices: int
 ) -> None:
-    options = {"ahead": 0.0, "grip": 0.3, "substep": 4e-3}
+    options = {"numerical_damping": 0.0, "grip": 0.3, "substep": 4e-3}
     model = RopeModel(recording, vertices=vertices, rest=rest, effects=EFFECTS, **options)
     values = numbers(model)
     given = model_file.load(write(tmp_path / "model.json", model, values))
     again = given.model(recording)
     assert given.effects == EFFECTS and again.parameters == model.parameters and again.step == model.step
-    assert (again.rest, again.ahead, again.grip) == (rest, 0.0, 0.3)
+    assert (again.rest, again.numerical_damping, again.grip) == (rest, 0.0, 0.3)
     np.testing.assert_array_equal(again.arclength, model.arclength)
     np.testing.assert_array_equal(given.start(again), values)
     a, b = (evaluation.predict(m, recording.test[:1], values)["test_0"] for m in (model, again))

@@ -254,7 +254,7 @@ def diagnose(
     torchdlo diagnose my_rope --model runs/my_rope/model.json --out runs/my_rope_2
     """
     from torchdlo.report.pages import diagnosis as report
-    from torchdlo.sysid.diagnosis.findings import findings_json, model_json, sentence
+    from torchdlo.sysid.diagnosis.findings import findings_json, model_json, summary
     from torchdlo.sysid.diagnosis.search import diagnose as search
     from torchdlo.sysid.recordings.recording import load_recording
 
@@ -278,7 +278,7 @@ def diagnose(
     write_atomically(out / "model.json", model_json(result))
     page = report.write_report(result, loaded, out, command=shlex.join(["torchdlo", *sys.argv[1:]]))
     shutil.rmtree(journal, ignore_errors=True)
-    typer.echo(sentence(result, loaded), err=as_json)
+    typer.echo(summary(result, loaded), err=as_json)
     for fault in result.health:
         typer.echo(f"data: {fault.trial + ': ' if fault.trial else ''}{fault.said}", err=as_json)
     typer.echo(f"findings: {out / 'findings.json'}\nreport:   {page}", err=as_json)

@@ -392,8 +392,8 @@ def design_experiment(
         raise typer.Exit(_INTERRUPTED) from None
     report.write_design(design, out, command=shlex.join(["torchdlo", *sys.argv[1:]]))
     shutil.rmtree(journal, ignore_errors=True)
-    typer.echo(f"{designs.sentence(design)}\n", err=as_json)
-    typer.echo("\n".join(f"- {said}" for said in designs.why(design)), err=as_json)
+    typer.echo(f"{designs.summary(design)}\n", err=as_json)
+    typer.echo("\n".join(f"- {said}" for said in designs.rationale(design)), err=as_json)
     typer.echo(f"\n{report.design_table(design)}\n", err=as_json)
     typer.echo(f"motion: {out / 'motion.npz'}\nreport: {out / 'report.html'}", err=as_json)
     if as_json:

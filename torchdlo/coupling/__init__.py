@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from torchdlo.coupling.bodies.contact_effect import BodyContact
-from torchdlo.coupling.mpm.body_coupling_effect import BodyMatter
-from torchdlo.coupling.mpm.rod_coupling_effect import RodMatter
+from torchdlo.coupling.mpm.body_coupling_effect import BodyMpmCoupling
+from torchdlo.coupling.mpm.rod_coupling_effect import RodMpmCoupling
 from torchdlo.coupling.rod_body.effect import RodBody
 from torchdlo.coupling.rod_body.finger_pads import FingerPads
 from torchdlo.coupling.rod_contact.effect import RodContact
@@ -17,4 +17,4 @@ EFFECTS: dict[str, type[Effect]] = {
     "finger_pads": FingerPads,
 }
 
-__all__ = ["EFFECTS", "BodyContact", "BodyMatter", "FingerPads", "RodBody", "RodContact", "RodMatter"]
+__all__ = ["EFFECTS", "BodyContact", "BodyMpmCoupling", "FingerPads", "RodBody", "RodContact", "RodMpmCoupling"]

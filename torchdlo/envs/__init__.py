@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from torchdlo.envs.assets.rope_material import Cable
+from torchdlo.envs.assets.rope_material import RopeMaterial
 from torchdlo.envs.core.task import Task
 from torchdlo.envs.tasks.coiling import Coiling
 from torchdlo.envs.tasks.gathering import Gathering
@@ -41,10 +41,10 @@ TASKS: dict[str, type[Task]] = {
     "wrapping": Wrapping,
 }
 
-__all__ = ["TASKS", "Cable", "Task", "find", "listing", "make"]
+__all__ = ["TASKS", "RopeMaterial", "Task", "find", "listing", "make"]
 
 
-def find(name: str, rope: Cable | None = None) -> Task:
+def find(name: str, rope: RopeMaterial | None = None) -> Task:
     """Return a task by its name, with its ropes made of a cable if one is given."""
     if name not in TASKS:
         raise InputError(f"there is no task {name!r}; expected one of {', '.join(sorted(TASKS))}.")
@@ -79,7 +79,7 @@ def make(
     segment: int | None = 1,
     variation: bool = True,
     randomize: Mapping[str, float] | None = None,
-    rope: Cable | None = None,
+    rope: RopeMaterial | None = None,
 ) -> DloEnv:
     """Return a task as a TorchRL environment.
 
@@ -93,7 +93,7 @@ def make(
         compiled: whether to compile steps: minutes at first, then about three times as fast, with gradients too.
         recorded: if not, whether to record them: seconds at first, then two to three times as fast without gradients.
         segment: frames that gradients run again at once; None keeps all of them in memory.
-        variation: whether starts differ, by as much as `Task.spread` says.
+        variation: whether starts differ, by as much as `Task.reset_noise` says.
         randomize: numbers of effects that differ from scene to scene and are drawn at every reset, e.g.
             {"rod_contact.mu_k": 0.2}: a share of the range in which the number is declared, about its usual value.
         rope: what ropes are made of, if not what the task says: `torchdlo.scene_files.cable("model.json")` reads what

@@ -10,25 +10,25 @@ import torch
 from torch import Tensor
 
 from torchdlo import scene as scenes
-from torchdlo.coupling.bodies.dynamics import Solid
+from torchdlo.coupling.bodies.dynamics import RigidBody
 from torchdlo.coupling.bodies.mesh_sdf import MeshShape, load_mesh
 from torchdlo.coupling.mpm import particles
-from torchdlo.coupling.mpm.constitutive_models import Elastic, Law, Liquid, Plastic, Sand
+from torchdlo.coupling.mpm.constitutive_models import ConstitutiveModel, Elastic, Liquid, Plastic, Sand
 from torchdlo.coupling.robot import kinematics as robots
 from torchdlo.errors import InputError
 from torchdlo.physics import tree
 from torchdlo.scene_files import motion
 from torchdlo.scene_files.json_files import EFFECTS, like, read
 from torchdlo.scene_files.rope_models import Modelled, with_models
-from torchdlo.scene_files.schema import Body, Description, Matter, Rope
+from torchdlo.scene_files.schema import BodySpec, ParticleBlockSpec, RopeSpec, SceneDescription
 
 __all__ = ["Simulation", "assemble", "build", "load"]
 
-_LAWS: dict[str, type[Law]] = {law.name: law for law in (Elastic, Plastic, Liquid, Sand)}
+_LAWS: dict[str, type[ConstitutiveModel]] = {law.name: law for law in (Elastic, Plastic, Liquid, Sand)}
 _OWN = ("points", "vertices", "model", "weights")
-"""Entries of a rope that are not fields of `scene.Rope`."""
+"""Entries of a rope that are not fields of `scene.RopeSpec`."""
 _BODY_OWN = ("keys", "path", "file", "scale", "cells")
-"""Entries of a body that are not fields of `Solid`."""
+"""Entries of a body that are not fields of `RigidBody`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +38,7 @@ class Simulation:
     scene: scenes.Scene
     params: scenes.Params
     state: scenes.State
-    plan: motion.Plan
+    plan: motion.ControlPlan
     meshes: dict[int, MeshShape]
     """Meshes of bodies, by the number of the body."""
     weight: Tensor
@@ -55,7 +55,7 @@ def load(path: str | Path) -> tuple[scenes.Scene, scenes.Params, scenes.State, s
 
 
 def build(
-    description: Description, *, folder: str | Path = "."
+    description: SceneDescription, *, folder: str | Path = "."
 ) -> tuple[scenes.Scene, scenes.Params, scenes.State, scenes.Control]:
     """Return the scene, its parameters, its first state, and the controls of all steps, with time as the first axis.
 
@@ -73,7 +73,7 @@ def build(
     return made.scene, made.params, made.state, made.plan.controls
 
 
-def assemble(description: Description, *, folder: str | Path = ".") -> Simulation:
+def assemble(description: SceneDescription, *, folder: str | Path = ".") -> Simulation:
     """Return what a description says, ready to run.
 
     Args:
@@ -100,7 +100,7 @@ def assemble(description: Description, *, folder: str | Path = ".") -> Simulatio
     for arm in armed:
         bodies += robots.solids(arm.robot, arm.joints[0])
     scene, params, state = scenes.make(
-        ropes, effects, values, bodies=bodies, matter=_matter(d, dtype), **held, **static
+        ropes, effects, values, bodies=bodies, material_points=_matter(d, dtype), **held, **static
     )
     weight = _weights(d, counts, state.rods.pos)
     material = tree.replace(params.rods.material, mass=params.rods.material.mass + weight)
@@ -108,7 +108,7 @@ def assemble(description: Description, *, folder: str | Path = ".") -> Simulatio
     return Simulation(scene, params, state, motion.plan(d, scene, state, armed), meshes, weight)
 
 
-def _check_holds(d: Description) -> None:
+def _check_holds(d: SceneDescription) -> None:
     for k, hold in enumerate(d.holds):
         if hold.robot is not None and not 0 <= hold.robot < len(d.robots):
             raise InputError(
@@ -122,7 +122,7 @@ def _check_holds(d: Description) -> None:
             raise InputError(f"holds[{k}].close: expected a time from 0 on, given {hold.close:g}.")
 
 
-def _slots(d: Description, counts: list[int], part: str) -> tuple[int, ...]:
+def _slots(d: SceneDescription, counts: list[int], part: str) -> tuple[int, ...]:
     """Return the scene's slots of held vertices or edges: ropes lie one after the other."""
     slots = []
     for k, held in enumerate(d.holds):
@@ -143,7 +143,7 @@ def _numbered(number: int, count: int, place: str) -> int:
     return number % count
 
 
-def _weights(d: Description, counts: list[int], like: Tensor) -> Tensor:
+def _weights(d: SceneDescription, counts: list[int], like: Tensor) -> Tensor:
     """Return the masses that hang on vertices [kg], shape (V, 1)."""
     found = like.new_zeros(sum(counts), 1)
     for k, rope in enumerate(d.ropes):
@@ -155,7 +155,7 @@ def _weights(d: Description, counts: list[int], like: Tensor) -> Tensor:
     return found
 
 
-def _rope(rope: Rope, dtype: torch.dtype, modelled: Modelled | None = None) -> scenes.Rope:
+def _rope(rope: RopeSpec, dtype: torch.dtype, modelled: Modelled | None = None) -> scenes.Rope:
     given = {k: v for k, v in vars(rope).items() if k not in _OWN and v is not None}
     points = torch.tensor(rope.points, dtype=torch.float64).reshape(-1, 3)
     if rope.vertices is not None:
@@ -170,7 +170,7 @@ def _rope(rope: Rope, dtype: torch.dtype, modelled: Modelled | None = None) -> s
     return scenes.Rope(points.to(dtype), **given)
 
 
-def _resampled(points: Tensor, rope: Rope) -> Tensor:
+def _resampled(points: Tensor, rope: RopeSpec) -> Tensor:
     if len(points) < 2 or rope.vertices < 3:
         raise InputError(f"rope: {len(points)} points and {rope.vertices} vertices; expected at least 2 and 3.")
     line = torch.cat([points, points[:1]]) if rope.closed else points
@@ -182,7 +182,7 @@ def _resampled(points: Tensor, rope: Rope) -> Tensor:
     return line[k] + share * (line[k + 1] - line[k])
 
 
-def _mesh(body: Body, k: int, folder: Path) -> MeshShape:
+def _mesh(body: BodySpec, k: int, folder: Path) -> MeshShape:
     if body.file is None:
         raise InputError(f"bodies[{k}].file: is missing; expected the file of the mesh (STL, OBJ, PLY, ...).")
     if body.size:
@@ -194,12 +194,12 @@ def _mesh(body: Body, k: int, folder: Path) -> MeshShape:
     return load_mesh(folder / body.file, scale=body.scale, cells=body.cells)
 
 
-def _body(body: Body, k: int, mesh: MeshShape | None) -> Solid:
+def _body(body: BodySpec, k: int, mesh: MeshShape | None) -> RigidBody:
     given = {name: v for name, v in vars(body).items() if name not in _BODY_OWN}
     if mesh is None:
         if body.file is not None:
             raise InputError(f'bodies[{k}].file: only a mesh has one; give "shape": "mesh".')
-        return Solid(**given)
+        return RigidBody(**given)
     one = body.mass is not None or body.density is not None
     wanted = {name: v for name, v in given.items() if name not in ("shape", "size") and v is not None}
     if not one and body.motion == "free":
@@ -207,21 +207,21 @@ def _body(body: Body, k: int, mesh: MeshShape | None) -> Solid:
     return mesh.solid(**wanted)
 
 
-def _matter(d: Description, dtype: torch.dtype) -> tuple:
+def _matter(d: SceneDescription, dtype: torch.dtype) -> tuple:
     """Return what `scene.make` wants as matter; () if there is none."""
-    if not d.matter:
+    if not d.material_points:
         if d.box is not None:
             raise InputError("box: there is no matter in it; give matter, or leave out the box.")
         return ()
     if d.box is None:
         raise InputError("box: is missing; expected the region in which matter may be, with low, high and spacing.")
     zero = torch.zeros((), dtype=dtype)
-    blobs = [_blob(m, k, zero) for k, m in enumerate(d.matter)]
+    blobs = [_blob(m, k, zero) for k, m in enumerate(d.material_points)]
     fields = {f.name: getattr(d.box, f.name) for f in dataclasses.fields(particles.Grid)}
     return particles.assemble(blobs, particles.Grid(**fields), friction=d.box.friction)
 
 
-def _blob(m: Matter, k: int, zero: Tensor) -> particles.Blob:
+def _blob(m: ParticleBlockSpec, k: int, zero: Tensor) -> particles.ParticleBlock:
     here, law = f"matter[{k}]", _LAWS[m.law]()
     count = {"box": 3, "ball": 1}[m.shape]
     if len(m.size) != count or min(m.size) <= 0:
@@ -238,4 +238,4 @@ def _blob(m: Matter, k: int, zero: Tensor) -> particles.Blob:
         volume = 8 * m.size[0] * m.size[1] * m.size[2] / len(points)
     else:
         points, volume = particles.fill_ball(m.pos, m.size[0], m.spacing, zero), m.spacing**3
-    return particles.Blob(points, law, volume, zero.new_tensor(m.vel), dict(m.numbers))
+    return particles.ParticleBlock(points, law, volume, zero.new_tensor(m.vel), dict(m.numbers))

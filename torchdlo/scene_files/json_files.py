@@ -12,26 +12,26 @@ from pathlib import Path
 from typing import Any, Literal
 
 from torchdlo.coupling import EFFECTS as COUPLING
-from torchdlo.coupling.mpm.body_coupling_effect import BodyMatter
-from torchdlo.coupling.mpm.rod_coupling_effect import RodMatter
+from torchdlo.coupling.mpm.body_coupling_effect import BodyMpmCoupling
+from torchdlo.coupling.mpm.rod_coupling_effect import RodMpmCoupling
 from torchdlo.errors import InputError
 from torchdlo.files import write_atomically
 from torchdlo.physics.effects import EFFECTS as PHYSICS
-from torchdlo.scene_files.schema import Description
+from torchdlo.scene_files.schema import SceneDescription
 
 __all__ = ["EFFECTS", "FORMAT", "like", "parse", "plain", "read", "save", "text"]
 
-EFFECTS = PHYSICS | COUPLING | {e.name: e for e in (RodMatter, BodyMatter)}
+EFFECTS = PHYSICS | COUPLING | {e.name: e for e in (RodMpmCoupling, BodyMpmCoupling)}
 FORMAT = "torchdlo scene 1"
 """What the entry "format" of a file says."""
 
 
-def save(description: Description, path: str | Path) -> None:
+def save(description: SceneDescription, path: str | Path) -> None:
     """Write a description as JSON, without what has its default. Numbers read back as they were, to the last bit."""
     write_atomically(Path(path), text(description))
 
 
-def text(description: Description) -> str:
+def text(description: SceneDescription) -> str:
     """Return what `save` writes."""
     return json.dumps({"format": FORMAT} | plain(description), indent=1, allow_nan=False) + "\n"
 
@@ -50,7 +50,7 @@ def _default(one: dataclasses.Field) -> Any:
     return one.default if one.default_factory is dataclasses.MISSING else one.default_factory()
 
 
-def read(path: str | Path) -> Description:
+def read(path: str | Path) -> SceneDescription:
     """Read a scene file."""
     try:
         content = Path(path).read_text(encoding="utf-8")
@@ -61,7 +61,7 @@ def read(path: str | Path) -> Description:
     return parse(content, where=str(path))
 
 
-def parse(content: str, *, where: str = "scene") -> Description:
+def parse(content: str, *, where: str = "scene") -> SceneDescription:
     """Read the text of a scene file; `where` is what errors call it."""
     try:
         found = json.loads(content)
@@ -77,7 +77,7 @@ def parse(content: str, *, where: str = "scene") -> Description:
             hint = ' It is a model file: write a scene around it, {"model": "..."} in one of its ropes.'
         raise InputError(f'{where}: expected an object with "format": "{FORMAT}", given {given!r}.{hint}')
     del found["format"]
-    return _checked(Description, found, where, "")
+    return _checked(SceneDescription, found, where, "")
 
 
 def _wrong(where: str, place: str, expected: str, given: Any) -> InputError:

@@ -22,19 +22,19 @@ from torchdlo.coupling.robot.attachment import Grasp, Hands, carry, weld
 from torchdlo.errors import InputError
 from torchdlo.physics import tree
 from torchdlo.physics.linalg.rotation import multiply
-from torchdlo.scene_files.schema import Description, Key, Robot
+from torchdlo.scene_files.schema import Keyframe, RobotSpec, SceneDescription
 
 
-def times(d: Description) -> Tensor:
+def times(d: SceneDescription) -> Tensor:
     """Return the ends of all steps [s], shape (T,)."""
     return torch.arange(1, max(1, round(d.duration / d.dt)) + 1, dtype=torch.float64) * d.dt
 
 
-def motion(keys: tuple[Key, ...], path: str, time: Tensor) -> Pose:
+def motion(keys: tuple[Keyframe, ...], path: str, time: Tensor) -> Pose:
     """Return how far something has moved and turned at times (T,): shapes (T, 3) and (T, 4)."""
     keys = tuple(sorted(keys, key=lambda key: key.time))
     if not keys or keys[0].time > 0:
-        keys = (Key(0.0), *keys)
+        keys = (Keyframe(0.0), *keys)
     at, rows = time.new_tensor([k.time for k in keys]), time.new_tensor([(*k.move, *k.turn) for k in keys])
     k = (torch.searchsorted(at, time, right=True) - 1).clamp(0, len(keys) - 1)
     after = (k + 1).clamp(max=len(keys) - 1)
@@ -61,7 +61,7 @@ class Arm:
         return robots.tool_pose(self.robot, self.joints)
 
 
-def arms(d: Description, folder: Path) -> list[Arm]:
+def arms(d: SceneDescription, folder: Path) -> list[Arm]:
     """Return the robots of a description with the joints that bring their tools where its keys say."""
     found = [_arm(said, f"robots[{k}]", folder, d) for k, said in enumerate(d.robots)]
     names = [arm.robot.name for arm in found]
@@ -75,7 +75,7 @@ def _named(robot: robots.Robot, k: int) -> robots.Robot:
     return dataclasses.replace(robot, name=f"{robot.name} {k}")
 
 
-def _arm(said: Robot, here: str, folder: Path, d: Description) -> Arm:
+def _arm(said: RobotSpec, here: str, folder: Path, d: SceneDescription) -> Arm:
     stand: dict[str, Any] = {"base": said.base, "base_quat": said.base_quat}
     if said.urdf == "panda":
         robot = robots.panda(**stand)
@@ -92,7 +92,7 @@ def _arm(said: Robot, here: str, folder: Path, d: Description) -> Arm:
         quat = start.new_tensor(said.quat)
         target = Pose(start.new_tensor(said.pos), quat / quat.norm())
         found = inverse_kinematics.solve(
-            robot, target, start, search=inverse_kinematics.Search(starts=16), posture=start
+            robot, target, start, search=inverse_kinematics.IkSearch(starts=16), posture=start
         )
         _check_reach(f"{here}.pos", found, start.new_zeros(1))
         start = found.joints
@@ -127,7 +127,7 @@ def _check_reach(here: str, found: inverse_kinematics.Solution, time: Tensor) ->
 
 
 @dataclass(frozen=True, eq=False)
-class Plan:
+class ControlPlan:
     """What is commanded in every step."""
 
     controls: scenes.Control
@@ -147,21 +147,21 @@ class Plan:
 
         def control(k: int, state: scenes.State) -> scenes.Control:
             before, after = (tree.map(lambda x, n=n: x[n], self.tools) for n in (k, k + 1))
-            last[0] = weld(scene, self.hands, scenes.hold(scene, state), before, self.closed[k], last[0])
-            pos, director, grip = carry(self.hands, last[0], after)
+            last[0] = weld(scene, self.hands, scenes.stationary_control(scene, state), before, self.closed[k], last[0])
+            pos, director, attachment_weight = carry(self.hands, last[0], after)
             usual = tree.map(lambda c: c[k], self.controls)
-            return tree.replace(usual, pos=pos, director=director, grip=grip)
+            return tree.replace(usual, pos=pos, director=director, attachment_weight=attachment_weight)
 
         return control
 
 
-def plan(d: Description, scene: scenes.Scene, state: scenes.State, armed: list[Arm]) -> Plan:
+def plan(d: SceneDescription, scene: scenes.Scene, state: scenes.State, armed: list[Arm]) -> ControlPlan:
     """Return what is commanded in every step."""
-    time, still = times(d), scenes.hold(scene, state)
+    time, still = times(d), scenes.stationary_control(scene, state)
     bodies = _targets(d, still.bodies, time, state.rods.pos, armed)
     pos, director = (x.expand(len(time), -1, -1) for x in (still.pos, still.director))
     if not d.holds:
-        return Plan(scenes.Control(pos, director, {}, bodies))
+        return ControlPlan(scenes.Control(pos, director, {}, bodies))
     owners = {part: [k for k, h in enumerate(d.holds) for _ in getattr(h, part)] for part in ("vertices", "edges")}
     hands = Hands(len(d.holds), tuple(owners["vertices"]), tuple(owners["edges"]))
     tools = _tools(d, hands, still, time, armed)
@@ -171,15 +171,15 @@ def plan(d: Description, scene: scenes.Scene, state: scenes.State, armed: list[A
     # Half a step's slack: the sums of steps are not exactly the times that a person writes.
     closed = ((time[:, None] <= until) & (begin[:, None] >= since - 0.5 * d.dt)).to(still.pos)[..., None]
     if any(h.close > 0 for h in d.holds):
-        return Plan(scenes.Control(pos, director, {}, bodies), hands, tools, closed)
+        return ControlPlan(scenes.Control(pos, director, {}, bodies), hands, tools, closed)
     first, later = (tree.map(lambda x, part=part: x[part], tools) for part in (0, slice(1, None)))
     held = weld(scene, hands, still, first, torch.ones_like(closed[0]))
-    pos, director, grip = carry(hands, tree.replace(held, closed=closed), later)
-    grip = grip if any(h.release is not None for h in d.holds) else {}
-    return Plan(scenes.Control(pos, director, grip, bodies))
+    pos, director, attachment_weight = carry(hands, tree.replace(held, closed=closed), later)
+    attachment_weight = attachment_weight if any(h.release is not None for h in d.holds) else {}
+    return ControlPlan(scenes.Control(pos, director, attachment_weight, bodies))
 
 
-def _tools(d: Description, hands: Hands, still: scenes.Control, time: Tensor, armed: list[Arm]) -> Pose:
+def _tools(d: SceneDescription, hands: Hands, still: scenes.Control, time: Tensor, armed: list[Arm]) -> Pose:
     """Return where the holds' tools are at the start and after every step, shapes (T + 1, holds, .)."""
     found, with_start = [], torch.cat([time.new_zeros(1), time])
     for k, hold in enumerate(d.holds):
@@ -192,7 +192,7 @@ def _tools(d: Description, hands: Hands, still: scenes.Control, time: Tensor, ar
     return Pose(pos, quat)
 
 
-def _targets(d: Description, still: Any, time: Tensor, like: Tensor, armed: list[Arm]) -> Any:
+def _targets(d: SceneDescription, still: Any, time: Tensor, like: Tensor, armed: list[Arm]) -> Any:
     """Return poses of kinematic bodies and then of robots' links, shapes (T, L, 3) and (T, L, 4)."""
     if not still:
         return ()

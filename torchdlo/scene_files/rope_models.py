@@ -11,11 +11,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchdlo.envs.assets.rope_material import Cable
+from torchdlo.envs.assets.rope_material import RopeMaterial
 from torchdlo.errors import InputError
 from torchdlo.physics.rod.assembly import frame_curvature
 from torchdlo.physics.rod.topology import Topology
-from torchdlo.scene_files.schema import Description, Rope
+from torchdlo.scene_files.schema import RopeSpec, SceneDescription
 
 __all__ = ["Modelled", "cable", "with_models"]
 
@@ -53,7 +53,7 @@ class Modelled:
         return torch.stack([c * first - s * second, s * first + c * second], -1)
 
 
-def with_models(d: Description, folder: Path) -> tuple[Description, Modelled | None]:
+def with_models(d: SceneDescription, folder: Path) -> tuple[SceneDescription, Modelled | None]:
     """Return a description in which ropes with a model file have its numbers, and the scene its effects.
 
     What the description says itself wins. Effects act on all ropes, so all must have the same model.
@@ -75,7 +75,7 @@ def with_models(d: Description, folder: Path) -> tuple[Description, Modelled | N
     return dataclasses.replace(d, ropes=ropes, effects=effects, twist=twist), _shape(shape, model.values)
 
 
-def cable(path: str | Path) -> Cable:
+def cable(path: str | Path) -> RopeMaterial:
     """Return what a model file says of a rope, for a task: `envs.make("wiring_post", rope=cable("model.json"))`.
 
     Left out are twisting, which ropes of tasks do not resist, and what belongs to the recording or to its scene: delay,
@@ -95,7 +95,9 @@ def cable(path: str | Path) -> Cable:
         if name not in others
     )
     values = model.values
-    return Cable(rope["mass"] / rope["length"], values["bending_stiffness"], values["damping_rate"], effects, curvature)
+    return RopeMaterial(
+        rope["mass"] / rope["length"], values["bending_stiffness"], values["damping_rate"], effects, curvature
+    )
 
 
 def _read(path: Path) -> tuple[Any, dict[str, Any]]:
@@ -117,7 +119,9 @@ def _shape(points: Any, values: dict[str, float]) -> Modelled | None:
     return Modelled(_flat(torch.tensor(points, dtype=torch.float64)), share, roll)
 
 
-def _filled(r: Rope, k: int, path: Path, rope: dict[str, Any], values: dict[str, float], mesh: dict[str, Any]) -> Rope:
+def _filled(
+    r: RopeSpec, k: int, path: Path, rope: dict[str, Any], values: dict[str, float], mesh: dict[str, Any]
+) -> RopeSpec:
     points = torch.tensor(r.points, dtype=torch.float64).reshape(-1, 3)
     length = float((points[1:] - points[:-1]).norm(dim=-1).sum())
     if r.closed or abs(length - rope["length"]) > _SAME * rope["length"]:
@@ -132,7 +136,7 @@ def _filled(r: Rope, k: int, path: Path, rope: dict[str, Any], values: dict[str,
         "bend": values["bending_stiffness"],
         "twist": values["twisting_stiffness"],
     }
-    alone = {f.name: f.default for f in dataclasses.fields(Rope)}
+    alone = {f.name: f.default for f in dataclasses.fields(RopeSpec)}
     missing = {name: value for name, value in usual.items() if getattr(r, name) == alone[name]}
     if r.radius == alone["radius"] and rope["radius"]:
         missing["radius"] = rope["radius"]
@@ -143,7 +147,7 @@ def _filled(r: Rope, k: int, path: Path, rope: dict[str, Any], values: dict[str,
     return dataclasses.replace(r, points=tuple(map(tuple, scaled)), **missing)
 
 
-def _effects(d: Description, model: Any, rope: dict[str, Any], *, framed: bool) -> dict[str, dict[str, Any]]:
+def _effects(d: SceneDescription, model: Any, rope: dict[str, Any], *, framed: bool) -> dict[str, dict[str, Any]]:
     """Return the model's effects with those of the scene put over them."""
     found: dict[str, dict[str, Any]] = {
         "gravity": {"acceleration": rope["gravity"]},

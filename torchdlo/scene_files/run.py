@@ -35,7 +35,7 @@ class Frames:
     """Positions of bodies, those of robots' links last [m], shape (F, K, 3)."""
     body_quat: np.ndarray
     """Orientations of bodies (w, x, y, z) [1], shape (F, K, 4)."""
-    matter: np.ndarray
+    material_points: np.ndarray
     """Points of matter [m], shape (F, P, 3)."""
     rope: np.ndarray
     """Number of the rope that each vertex belongs to, shape (V,)."""
@@ -73,8 +73,8 @@ def _seen(state: scenes.State) -> list[np.ndarray]:
     rods, none = state.rods, state.rods.pos.new_zeros(0, 4)
     bodies = (state.bodies.pos, state.bodies.quat) if state.bodies else (none[:, :3], none)
     # Pictures need no more digits, and there are many points.
-    matter = (state.matter.pos if state.matter else none[:, :3]).to(torch.float32)
-    found = (state.time[0, 0], rods.pos, rods.twist[:, 0], state.reaction.force, *bodies, matter)
+    material_points = (state.material_points.pos if state.material_points else none[:, :3]).to(torch.float32)
+    found = (state.time[0, 0], rods.pos, rods.twist[:, 0], state.reaction.force, *bodies, material_points)
     return [x.cpu().numpy().copy() for x in found]
 
 
@@ -96,7 +96,7 @@ def appearance(
         faces.append(triangles.numpy() + start)
         owner.append(np.full(len(triangles), k))
         start += len(corners)
-    groups = scene.matter.groups if scene.matter else ()
+    groups = scene.material_points.groups if scene.material_points else ()
     heights = [v["height"].reshape(-1)[:1].numpy() for n, v in params.effects.items() if n.startswith("table")]
     radius = params.rods.material.radius
     return {
@@ -117,14 +117,14 @@ def appearance(
     }
 
 
-def _looks(made: scene_files.Simulation, description: scene_files.Description) -> dict[str, np.ndarray]:
+def _looks(made: scene_files.Simulation, description: scene_files.SceneDescription) -> dict[str, np.ndarray]:
     meshes = {k: (mesh.vertices, mesh.faces) for k, mesh in made.meshes.items()}
     seen = appearance(made.scene, made.params, meshes, len(made.scene.bodies) - len(description.bodies))
     return seen | {"weight": made.weight[:, 0].numpy(), "look": np.array(description.look)}
 
 
 def run(
-    description: scene_files.Description,
+    description: scene_files.SceneDescription,
     *,
     folder: str | Path = ".",
     every: int = 10,
@@ -171,7 +171,7 @@ def run(
     return Frames(*moving, **_looks(made, description), interrupted=interrupted, problem=problem)
 
 
-def save_frames(frames: Frames, path: Path, description: scene_files.Description | None = None) -> None:
+def save_frames(frames: Frames, path: Path, description: scene_files.SceneDescription | None = None) -> None:
     """Write frames as .npz, with the scene itself as JSON text in "torchdlo_scene", "" if it is not given."""
     arrays = {name: value for name, value in vars(frames).items() if isinstance(value, np.ndarray)}
     text = "" if description is None else scene_files.text(description)

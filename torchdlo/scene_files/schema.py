@@ -5,7 +5,17 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-__all__ = ["Body", "Box", "Description", "Hold", "Key", "Matter", "Robot", "Rope", "Weight"]
+__all__ = [
+    "Attachment",
+    "BodySpec",
+    "GridSpec",
+    "HangingMass",
+    "Keyframe",
+    "ParticleBlockSpec",
+    "RobotSpec",
+    "RopeSpec",
+    "SceneDescription",
+]
 
 Vector = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
@@ -13,7 +23,7 @@ Wall = Literal["open", "separate", "slip", "stick"]
 
 
 @dataclass(frozen=True)
-class Weight:
+class HangingMass:
     """A point mass that hangs on a rope; drawn as a ball of steel, which touches nothing."""
 
     vertex: int
@@ -23,8 +33,8 @@ class Weight:
 
 
 @dataclass(frozen=True)
-class Rope:
-    """A rope; fields without a comment are those of `scene.Rope`."""
+class RopeSpec:
+    """A rope; fields without a comment are those of `scene.RopeSpec`."""
 
     points: tuple[Vector, ...]
     """Corners of the line along which it lies [m]; its vertices, if `vertices` is not given."""
@@ -43,12 +53,12 @@ class Rope:
     rest: Literal["straight", "as_placed"] = "straight"
     model: str | None = None
     """Model file of `torchdlo calibrate` or `diagnose`, from which numbers and effects are taken."""
-    weights: tuple[Weight, ...] = ()
+    weights: tuple[HangingMass, ...] = ()
     """What hangs on it."""
 
 
 @dataclass(frozen=True)
-class Key:
+class Keyframe:
     """Where something is at a time, from where it is at the start; between keys it moves by `path`."""
 
     time: float
@@ -60,7 +70,7 @@ class Key:
 
 
 @dataclass(frozen=True)
-class Hold:
+class Attachment:
     """Vertices of a rope that are held together as by one tool."""
 
     vertices: tuple[int, ...]
@@ -69,7 +79,7 @@ class Hold:
     """Number of the rope."""
     edges: tuple[int, ...] = ()
     """Edges whose twist is held, too."""
-    keys: tuple[Key, ...] = ()
+    keys: tuple[Keyframe, ...] = ()
     """Motion about the first vertex; none if empty."""
     path: Literal["smooth", "linear"] = "smooth"
     """Whether it starts and stops at each key without a jerk."""
@@ -82,8 +92,8 @@ class Hold:
 
 
 @dataclass(frozen=True)
-class Body:
-    """A rigid body; fields without a comment are those of `coupling.bodies.dynamics.Solid`."""
+class BodySpec:
+    """A rigid body; fields without a comment are those of `coupling.bodies.dynamics.RigidBody`."""
 
     shape: Literal["plane", "sphere", "box", "capsule", "cylinder", "cone", "torus", "ring", "mesh"]
     size: tuple[float, ...] = ()
@@ -100,7 +110,7 @@ class Body:
     restitution: float = 0.0
     damping: float = 0.0
     name: str = ""
-    keys: tuple[Key, ...] = ()
+    keys: tuple[Keyframe, ...] = ()
     """Motion of a kinematic body."""
     path: Literal["smooth", "linear"] = "smooth"
     file: str | None = None
@@ -112,7 +122,7 @@ class Body:
 
 
 @dataclass(frozen=True)
-class Robot:
+class RobotSpec:
     """A chain of links whose joints go where they bring its tool along `keys`."""
 
     urdf: str = "panda"
@@ -129,13 +139,13 @@ class Robot:
     """Where the tool is at the start [m], if `joints` are only a posture near it."""
     quat: Quaternion = (0.0, 1.0, 0.0, 0.0)
     """How it is turned there; it points down if not given."""
-    keys: tuple[Key, ...] = ()
+    keys: tuple[Keyframe, ...] = ()
     """Motion of the tool."""
     path: Literal["smooth", "linear"] = "smooth"
 
 
 @dataclass(frozen=True)
-class Matter:
+class ParticleBlockSpec:
     """A piece of matter, made of material points."""
 
     law: Literal["elastic", "plastic", "liquid", "sand"]
@@ -153,7 +163,7 @@ class Matter:
 
 
 @dataclass(frozen=True)
-class Box:
+class GridSpec:
     """Where matter may be; fields without a comment are those of `coupling.mpm.particles.Grid`."""
 
     low: Vector
@@ -166,17 +176,17 @@ class Box:
 
 
 @dataclass(frozen=True)
-class Description:
+class SceneDescription:
     """A simulation from its start to its end; fields without a comment are those of `scene.Scene`."""
 
-    ropes: tuple[Rope, ...]
+    ropes: tuple[RopeSpec, ...]
     effects: dict[str, dict[str, Any]]
     """Effects by name, each with the numbers and choices that differ from its defaults."""
-    bodies: tuple[Body, ...] = ()
-    holds: tuple[Hold, ...] = ()
-    robots: tuple[Robot, ...] = ()
-    matter: tuple[Matter, ...] = ()
-    box: Box | None = None
+    bodies: tuple[BodySpec, ...] = ()
+    holds: tuple[Attachment, ...] = ()
+    robots: tuple[RobotSpec, ...] = ()
+    material_points: tuple[ParticleBlockSpec, ...] = ()
+    box: GridSpec | None = None
     """Where matter may be."""
     duration: float = 1.0
     """How long to simulate [s]."""

@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchdlo.agents.trajopt.problem import Outcome, Problem
+from torchdlo.agents.trajopt.problem import Evaluation, Problem
 from torchdlo.errors import InputError
 from torchdlo.physics import tree
 
@@ -27,7 +27,7 @@ def together(
     room: int,
     pulse: Callable[[], None] = lambda: None,
     *,
-    graded: int | None = None,
+    with_gradient: int | None = None,
 ) -> list[Any]:
     """Run searches at the same time, and play what they ask for in batches.
 
@@ -36,7 +36,7 @@ def together(
         searches: each is called with the problem that it is to search.
         room: episodes of a batch; short ones are filled up, as steps are compiled for every size.
         pulse: called after every batch; a `KeyboardInterrupt` that it raises ends all searches that ask for more.
-        graded: episodes of a batch with slopes; as many as without if not given.
+        graded: episodes of a batch with gradients; as many as without if not given.
 
     Returns:
         What the searches returned, in order.
@@ -44,9 +44,9 @@ def together(
     Raises:
         BaseException: what the first search that failed raised, when all have ended.
     """
-    rooms = {False: room, True: room if graded is None else graded}
+    rooms = {False: room, True: room if with_gradient is None else with_gradient}
     desk: SimpleQueue[_Wish | None] = SimpleQueue()
-    stand_in = problem.rehearsal()
+    stand_in = problem.surrogate()
     over: BaseException | None = None
     with ThreadPoolExecutor(max(1, len(searches))) as pool:
         running = [pool.submit(search, _Port(problem, stand_in, desk)) for search in searches]
@@ -100,17 +100,17 @@ class _Port:
         self._desk.put(wish)
         return wish.answer.result()
 
-    def evaluate(self, actions: Tensor) -> Outcome:
+    def evaluate(self, actions: Tensor) -> Evaluation:
         """Wait until the actions are played with those of the other searches."""
-        went, slope = self._ask(actions)
-        return went if slope is None else replace(went, loss=_Known.apply(actions, slope, went.loss))
+        went, gradient = self._ask(actions)
+        return went if gradient is None else replace(went, loss=_Known.apply(actions, gradient, went.loss))
 
-    def record(self, actions: Tensor) -> tuple[Outcome, dict[str, Any]]:
+    def record(self, actions: Tensor) -> tuple[Evaluation, dict[str, Any]]:
         """Wait until the trajectory is played alone."""
         return self._ask(actions)
 
-    def rehearsal(self) -> _Port | None:
-        """Return the rehearsal, which is shared as well."""
+    def surrogate(self) -> _Port | None:
+        """Return the surrogate task, which is shared as well."""
         return None if self._stand_in is None else _Port(self._stand_in, None, self._desk)
 
     def varied(self, copies: int, scale: float, seed: int) -> Problem:
@@ -119,44 +119,45 @@ class _Port:
 
 
 class _Known(torch.autograd.Function):
-    """Losses whose slopes are known."""
+    """Losses whose gradients are known."""
 
     @staticmethod
-    def forward(ctx: Any, actions: Tensor, slope: Tensor, loss: Tensor) -> Tensor:
+    def forward(ctx: Any, actions: Tensor, gradient: Tensor, loss: Tensor) -> Tensor:
         """Return the losses, shape (P,)."""
-        ctx.save_for_backward(slope)
+        ctx.save_for_backward(gradient)
         return loss.clone()
 
     @staticmethod
     def backward(ctx: Any, pull: Tensor) -> tuple[Tensor, None, None]:
-        """Return the slopes, shape (P, T, A)."""
+        """Return the gradients, shape (P, T, A)."""
         return pull[:, None, None] * ctx.saved_tensors[0], None, None
 
 
 def _play(problem: Problem, wishes: Sequence[_Wish], rooms: Mapping[bool, int]) -> None:
-    """Answer wishes: trajectories that are to be recorded one by one, all others in batches without or with slopes."""
+    """Answer wishes: trajectories that are to be recorded one by one, all others in batches without or with
+    gradients."""
     for wish in wishes:
         if wish.actions.dim() == 2:
             with torch.no_grad():
                 wish.answer.set_result(problem.record(wish.actions))
-    for graded, room in rooms.items():
-        alike = [wish for wish in wishes if wish.actions.dim() == 3 and wish.actions.requires_grad == graded]
+    for with_gradient, room in rooms.items():
+        alike = [wish for wish in wishes if wish.actions.dim() == 3 and wish.actions.requires_grad == with_gradient]
         if not alike:
             continue
         actions, sizes = torch.cat([wish.actions.detach() for wish in alike]), [len(wish.actions) for wish in alike]
-        parts = [_batch(problem, part, room, graded) for part in actions.split(room)]
+        parts = [_batch(problem, part, room, with_gradient) for part in actions.split(room)]
         columns = [torch.cat(column).split(sizes) for column in zip(*parts, strict=True)]
-        for wish, (*outcome, slope) in zip(alike, zip(*columns, strict=True), strict=True):
-            wish.answer.set_result((Outcome(*outcome), slope if graded else None))
+        for wish, (*outcome, gradient) in zip(alike, zip(*columns, strict=True), strict=True):
+            wish.answer.set_result((Evaluation(*outcome), gradient if with_gradient else None))
 
 
-def _batch(problem: Problem, actions: Tensor, room: int, graded: bool) -> tuple[Tensor, ...]:
-    """Return the parts of the outcome and the slopes of a batch that is filled up with its first trajectory."""
+def _batch(problem: Problem, actions: Tensor, room: int, with_gradient: bool) -> tuple[Tensor, ...]:
+    """Return the parts of the outcome and the gradients of a batch that is filled up with its first trajectory."""
     count = len(actions)
-    x = torch.cat([actions, actions[:1].expand(room - count, -1, -1)]).requires_grad_(graded)
-    with torch.set_grad_enabled(graded):
+    x = torch.cat([actions, actions[:1].expand(room - count, -1, -1)]).requires_grad_(with_gradient)
+    with torch.set_grad_enabled(with_gradient):
         went = problem.evaluate(x)
-        slope = torch.zeros_like(x)
-        if graded:
-            (slope,) = torch.autograd.grad(went.loss.sum(), x, allow_unused=True, materialize_grads=True)
-    return tuple(part.detach()[:count] for part in (*tree.leaves(went), slope))
+        gradient = torch.zeros_like(x)
+        if with_gradient:
+            (gradient,) = torch.autograd.grad(went.loss.sum(), x, allow_unused=True, materialize_grads=True)
+    return tuple(part.detach()[:count] for part in (*tree.leaves(went), gradient))

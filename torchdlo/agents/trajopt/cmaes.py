@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchdlo.agents.trajopt.problem import Encoding
-from torchdlo.agents.trajopt.proposals import Ask, Plan, Search, Told
+from torchdlo.agents.trajopt.proposals import Ask, Search, SearchPlan, Told
 from torchdlo.errors import InputError
 
 __all__ = ["cmaes", "drawn", "package", "strategy"]
@@ -59,7 +59,7 @@ def drawn(found: Any, encoding: Encoding, given: Tensor | None = None) -> Tensor
     return torch.cat([x[:count], encoding.project(x[count:])])
 
 
-def cmaes(plan: Plan, rng: torch.Generator) -> Search:
+def cmaes(plan: SearchPlan, rng: torch.Generator) -> Search:
     """Search way-points without gradients; starts again when the spread has shrunk to nothing."""
     encoding = plan.encoding(plan.hold)
     while True:

@@ -3,16 +3,16 @@
 Where a population has room for it, one line descends from doing nothing on a small island, as plain gradient descent
 does. What else there is of the population lives on others, which know nothing of each other: whichever way round an
 obstacle a search goes, it seldom comes back, and another one may go the other way. On each of them, two parts share the
-budget, iteration by iteration, and both have the slopes of the best quarter of what they play:
+budget, iteration by iteration, and both have the gradients of the best quarter of what they play:
 
 1. Straight sweeps over what can be reached find out what there is to touch; rounds about bodies, and drags over them by
    tools that draw nearer, find out what comes of it. CMA-ES searches way-points from the best of them. A part of each
-   population are the best points so far, moved down their slope in the metric of the strategy; they are handed over as
-   in Hansen 2011 (arXiv:1110.4181).
+   population are the best points so far, moved down their gradient in the metric of the strategy; they are handed over
+   as in Hansen 2011 (arXiv:1110.4181).
 2. The best points descend in all actions, see `lbfgs`.
 
-CMA-ES begins; then the part goes on that gained more lately, but each in its turn. Where both begin in a rehearsal, the
-best of its iterations are the first to be played in the problem itself.
+CMA-ES begins; then the part goes on that gained more lately, but each in its turn. Where both begin in a surrogate
+task, the best of its iterations are the first to be played in the problem itself.
 
 Islands that have fallen behind seldom catch up: they are given up in favour of the best one, half of them first. In
 their place, CMA-ES searches about the best trajectory of all, in small steps.
@@ -33,9 +33,9 @@ from torchdlo.agents.trajopt.lbfgs import TRIES, Descent
 from torchdlo.agents.trajopt.problem import Encoding
 from torchdlo.agents.trajopt.proposals import (
     Ask,
-    Plan,
-    Rehearsed,
     Search,
+    SearchPlan,
+    SurrogateRound,
     Told,
     best,
     drags,
@@ -56,9 +56,10 @@ _COARSE = 0.3
 _TURN = 5
 """Iterations of which each part has at least one."""
 _SURGE, _CUT = 3, 10.0
-"""Slopes of all actions are believed up to so many times the largest one of the last third of them."""
+"""Gradients of all actions are believed up to so many times the largest one of the last third of them."""
 _WILD = 10.0
-"""Slopes of an action are dropped that promise to change the loss by so many times the largest loss in a first step."""
+"""Gradients of an action are dropped that promise to change the loss by so many times the largest loss in a first
+step."""
 _SHORT = 0.1
 """Share of the first step from which shorter ones are given up."""
 _GIVEN_UP = {0.4: 0.5, 0.7: 1.0}
@@ -71,7 +72,7 @@ _APART = 0.2
 """How far tools go their own ways where they go 1 together: they hold on to the same things."""
 
 
-def hybrid(plan: Plan, rng: torch.Generator) -> Search:
+def hybrid(plan: SearchPlan, rng: torch.Generator) -> Search:
     """Search on islands, see above."""
     count = max(1, plan.population // _ISLAND)  # of islands
     sizes = [(plan.population + k) // count for k in range(count)]
@@ -86,8 +87,8 @@ def hybrid(plan: Plan, rng: torch.Generator) -> Search:
     islands = [kind(*each) for kind, *each in zip(kinds, plans, rngs, strict=True)]
     parts: list[Told | None] = [None] * count
     given_up = {math.ceil(when * plan.iterations): share for when, share in _GIVEN_UP.items()}
-    # What was measured in a rehearsal or in milder worlds does not compare with what comes after.
-    anew = {*range(math.ceil(plan.drifts * plan.iterations) + 1), plan.rehearsals}
+    # What was measured in a surrogate task or in milder worlds does not compare with what comes after.
+    anew = {*range(math.ceil(plan.drifts * plan.iterations) + 1), plan.surrogates}
     top: list[tuple[float, Tensor]] = []
     for k in itertools.count():
         if k in anew:
@@ -103,22 +104,24 @@ def hybrid(plan: Plan, rng: torch.Generator) -> Search:
         def pick(told: Told, _: int, asks: list[Ask] = asks, counts: list[int] = counts) -> Tensor:
             first = itertools.accumulate(counts, initial=0)
             own = zip(asks, told.split(counts), first, strict=False)
-            return torch.cat([ask.pick(part, ask.graded) + start for ask, part, start in own])
+            return torch.cat([ask.pick(part, ask.with_gradient) + start for ask, part, start in own])
 
-        told = yield Ask(asks[0].encoding, torch.cat([ask.points for ask in asks]), sum(a.graded for a in asks), pick)
+        told = yield Ask(
+            asks[0].encoding, torch.cat([ask.points for ask in asks]), sum(a.with_gradient for a in asks), pick
+        )
         parts = told.split(counts)
         for j, (ask, part) in enumerate(zip(asks, parts, strict=True)):
             at = int(part.value.argmax())
             top[j] = max(top[j], (float(part.value[at]), ask.points[at]), key=lambda found: found[0])
 
 
-def _line(plan: Plan, rng: torch.Generator, first: int = 0, about: Tensor | None = None) -> Search:
+def _line(plan: SearchPlan, rng: torch.Generator, first: int = 0, about: Tensor | None = None) -> Search:
     """Descend on one line, from doing nothing or from actions that are given; arguments as of `_island`."""
     encoding, line, tame = plan.encoding(1), Descent(plan, rng), _Tame(plan)
     start = line.best[1] if about is None else about
     for k in itertools.count(first):
-        if k in (first, plan.rehearsals):
-            # Nothing but the slope there is wanted; what is played beside it are ways about it.
+        if k in (first, plan.surrogates):
+            # Nothing but the gradient there is wanted; what is played beside it are ways about it.
             away = plan.encoding(plan.hold).decode(walks(plan, rng)).flatten(1)
             x = encoding.project(torch.cat([start[None], start + away[1:]]))
             told = yield Ask(encoding, x, 1, lambda told, _: torch.zeros(1, dtype=torch.long))
@@ -131,7 +134,7 @@ def _line(plan: Plan, rng: torch.Generator, first: int = 0, about: Tensor | None
         start = line.best[1]
 
 
-def _island(plan: Plan, rng: torch.Generator, first: int = 0, about: Tensor | None = None) -> Search:
+def _island(plan: SearchPlan, rng: torch.Generator, first: int = 0, about: Tensor | None = None) -> Search:
     """Search with sweeps, rounds, CMA-ES and descent.
 
     Args:
@@ -141,15 +144,15 @@ def _island(plan: Plan, rng: torch.Generator, first: int = 0, about: Tensor | No
         about: actions to begin with in place of sweeps and rounds [m], shape (T A,).
     """
     encoding, coarse, fine = plan.encoding(1), _Evolution(plan, rng, about), Descent(plan, rng)
-    graded, tame = fine.count, _Tame(plan)
+    with_gradient, tame = fine.count, _Tame(plan)
     drifts = math.ceil(plan.drifts * plan.iterations)
     alone = max(drifts, first + 1 if first else math.ceil(_COARSE * plan.iterations))
     gain, last, top = {coarse: 0.0, fine: math.inf}, {coarse: first, fine: first}, -math.inf
-    rehearsed = Rehearsed(plan)
+    surrogate_share = SurrogateRound(plan)
     for k in itertools.count(first):
-        if k == plan.rehearsals > 0:
-            x = rehearsed.actions
-            told = yield Ask(encoding, x, min(graded, len(x)))
+        if k == plan.surrogates > 0:
+            x = surrogate_share.actions
+            told = yield Ask(encoding, x, min(with_gradient, len(x)))
             told = tame(told)
             coarse.lines = None
             fine.clear()
@@ -162,47 +165,47 @@ def _island(plan: Plan, rng: torch.Generator, first: int = 0, about: Tensor | No
 
         part = coarse if k < alone else max((coarse, fine), key=turn)
         x = part.ask()
-        told = yield Ask(encoding, x, graded, best if part is coarse else fine.pick)
+        told = yield Ask(encoding, x, with_gradient, best if part is coarse else fine.pick)
         told = tame(told)
         # What was measured in milder worlds does not compare.
         if k < drifts:
             coarse.lines = None
             fine.clear()
             top = -math.inf
-        if k < plan.rehearsals:
-            rehearsed.note(x, told)
+        if k < plan.surrogates:
+            surrogate_share.note(x, told)
         part.tell(x, told)
         if part is coarse:
             fine.offer(x, told)
-        highest = float(told.value.max())
-        gained = max(0.0, highest - top) if math.isfinite(top) else 0.0
+        max_return = float(told.value.max())
+        gained = max(0.0, max_return - top) if math.isfinite(top) else 0.0
         gain[part] = gained if math.isinf(gain[part]) else 0.5 * (gain[part] + gained)
-        last[part], top = k, max(top, highest)
+        last[part], top = k, max(top, max_return)
 
 
 class _Tame:
-    """Drops or cuts slopes that grew beyond measure.
+    """Drops or cuts gradients that grew beyond measure.
 
     Ropes may move chaotically: derivatives then grow from action to action, back in time, and hold for ways so short
     that they are of no use. Left alone, the largest would be all that steps go by.
     """
 
-    def __init__(self, plan: Plan) -> None:
+    def __init__(self, plan: SearchPlan) -> None:
         self.plan, self.largest = plan, 0.0
 
     def __call__(self, told: Told) -> Told:
-        """Return what was told, with slopes by actions, shape (P, T A), as far as they are believed.
+        """Return what was told, with gradients by actions, shape (P, T A), as far as they are believed.
 
         What is left of them is scaled down by the square of how far it is beyond the later ones.
         """
-        each = told.slope.unflatten(-1, (self.plan.horizon, -1))
+        each = told.gradient.unflatten(-1, (self.plan.horizon, -1))
         size = torch.linalg.vector_norm(each, dim=-1, keepdim=True)
         self.largest = max([self.largest, *told.loss[torch.isfinite(told.loss)].abs().tolist()])
         held = self.plan.rate * size <= _WILD * self.largest
         each, size = torch.where(held, each, 0.0), torch.where(held, size, 0.0)
         most = _CUT * size[:, -math.ceil(self.plan.horizon / _SURGE) :].amax(1, keepdim=True)
         factor = torch.where((most > 0) & (size > most), most / size, 1.0)
-        return replace(told, slope=(each * factor.square()).flatten(1))
+        return replace(told, gradient=(each * factor.square()).flatten(1))
 
 
 class _Evolution:
@@ -211,7 +214,7 @@ class _Evolution:
     It begins with the best of sweeps and rounds, or adds its way-points to actions (T A,) that are given.
     """
 
-    def __init__(self, plan: Plan, rng: torch.Generator, about: Tensor | None = None) -> None:
+    def __init__(self, plan: SearchPlan, rng: torch.Generator, about: Tensor | None = None) -> None:
         self.plan, self.rng, self.encoding, self.about = plan, rng, plan.encoding(plan.hold, _APART), about
         self.fresh = max(1, round(_FRESH * plan.iterations))
         self.tried: list[tuple[Tensor, Told]] = []
@@ -234,7 +237,7 @@ class _Evolution:
 
     def tell(self, _: Tensor, told: Told) -> None:
         """Learn from how that went."""
-        told = replace(told, slope=self.encoding.pull(self.x, told.slope))
+        told = replace(told, gradient=self.encoding.pull(self.x, told.gradient))
         count = max(1, self.plan.population // TRIES)
         if self.found is None:
             self.tried.append((self.x, told))
@@ -252,7 +255,7 @@ class _Evolution:
             self.lines.learn(self.x, told)
 
 
-def _beginnings(plan: Plan, encoding: Encoding, rng: torch.Generator) -> Tensor:
+def _beginnings(plan: SearchPlan, encoding: Encoding, rng: torch.Generator) -> Tensor:
     """Return points of sweeps and of random walks.
 
     Half are rounds where there is something to touch; several tools drag what they hold over it in most others.
@@ -269,19 +272,19 @@ def _beginnings(plan: Plan, encoding: Encoding, rng: torch.Generator) -> Tensor:
 
 
 class _Lines:
-    """Points that go down their slopes within an evolution strategy, the best first at the start."""
+    """Points that go down their gradients within an evolution strategy, the best first at the start."""
 
     def __init__(self, x: Tensor, told: Told, count: int) -> None:
         rows = best(told, count)
-        self.x, self.value, self.loss, self.slope = x[rows], told.value[rows], told.loss[rows], told.slope[rows]
+        self.x, self.value, self.loss, self.gradient = x[rows], told.value[rows], told.loss[rows], told.gradient[rows]
         # A drawn point lies about the root of the dimension away from the mean; half of it is a step.
         self.first = 0.5 * math.sqrt(x.shape[1])
         self.length = torch.full_like(self.loss, self.first)
 
     def moved(self, found: Any) -> Tensor:
-        """Return the points after a step down; those without slope, or whose steps came to nothing, stay out."""
-        down = -self.slope @ torch.as_tensor(found.sm.covariance_matrix)
-        size = -(down * self.slope).sum(-1)
+        """Return the points after a step down; those without gradient, or whose steps came to nothing, stay out."""
+        down = -self.gradient @ torch.as_tensor(found.sm.covariance_matrix)
+        size = -(down * self.gradient).sum(-1)
         self.active = ((size > 0) & (self.length > _SHORT * self.first)).nonzero()[:, 0]
         scale = found.sigma * self.length[self.active] / size[self.active].sqrt()
         return self.x[self.active] + scale[:, None] * down[self.active]
@@ -293,7 +296,7 @@ class _Lines:
         self.length[active] *= torch.where(down, 2.0, 0.5)
         self._put(active[down], x, told, torch.arange(n)[down])
         fresh = ranking(told.value[n:], told.loss[n:])[: max(1, len(self.x) // 2)] + n
-        live = (self.length > _SHORT * self.first) & (self.slope != 0).any(-1)
+        live = (self.length > _SHORT * self.first) & (self.gradient != 0).any(-1)
         value = torch.where(live, self.value, -math.inf)
         worst = value.argsort(stable=True)[: len(fresh)]
         better = told.value[fresh] > value[worst]
@@ -301,5 +304,5 @@ class _Lines:
         self._put(worst[better], x, told, fresh[better])
 
     def _put(self, rows: Tensor, x: Tensor, told: Told, of: Tensor) -> None:
-        self.x[rows], self.slope[rows] = x[of], told.slope[of]
+        self.x[rows], self.gradient[rows] = x[of], told.gradient[of]
         self.value[rows], self.loss[rows] = told.value[of], told.loss[of]

@@ -19,11 +19,11 @@ HOLD = {"coiling": 5}
 """Actions per way-point of hybrids that differ from 10: ways of 10 cm are chords too long for a small circle."""
 SPREAD = {"lifting": 0.02}
 """First spreads of hybrids, if not the one that follows from `HOLD` [m]: hands that go far from a good way tear it."""
-REHEARSED = {"gathering": 0.9}
-"""Shares of iterations in which hybrids play the task's rehearsal, if not 0."""
+SURROGATE_SHARE = {"gathering": 0.9}
+"""Shares of iterations in which hybrids play the task's surrogate task, if not 0."""
 POPULATION = {"cmaes": 400, "gd": 16, "hybrid": 100}
 """Most trajectories per iteration. One start of gradient descent is published; more of them use up the same budget.
-Slopes need iterations more than numbers."""
+Gradients need iterations more than numbers."""
 _ITERATIONS = 50
 """Iterations that a small budget allows all the same, as long as populations have so many trajectories as below."""
 _FEWEST = {"cmaes": 20, "gd": 4, "hybrid": 12}
@@ -55,9 +55,9 @@ def preset(task: str, method: str, **given: Any) -> Settings:
         rate=RATE.get(task, 1e-3),
     )
     if method == "hybrid":
-        # Tools that go together, or down a slope, do not need the small steps that keep them from tearing a rope: the
-        # first spread is the one that follows from `hold`, most often.
+        # Tools that go together, or down a gradient, do not need the small steps that keep them from tearing a rope:
+        # the first spread is the one that follows from `hold`, most often.
         found = replace(found, hold=HOLD.get(task), sigma=SPREAD.get(task))
         if not given.get("robust"):
-            found = replace(found, rehearsed=REHEARSED.get(task, 0.0))
+            found = replace(found, surrogate_share=SURROGATE_SHARE.get(task, 0.0))
     return replace(found, **{name: value for name, value in given.items() if value is not None})

@@ -11,18 +11,18 @@ from torch import Tensor
 from torchdlo.physics import tree
 from torchdlo.physics.linalg import numerics
 
-__all__ = ["Encoding", "Outcome", "Problem"]
+__all__ = ["Encoding", "Evaluation", "Problem"]
 
 
 @tree.struct
-class Outcome:
+class Evaluation:
     """How trajectories went, one entry per trajectory."""
 
     returns: Tensor
     """Sum of the rewards, to be maximised [-], shape (P,)."""
     loss: Tensor
     """What gradients are taken of, to be minimised [-], shape (P,)."""
-    shortfall: Tensor
+    terminal_cost: Tensor
     """How far the ends are from what counts as success, in the units of the return [-], shape (P,)."""
     success: Tensor
     """Whether the task was done, bool [-], shape (P,)."""
@@ -49,11 +49,11 @@ class Problem(Protocol):
     choices: dict[str, Any]
     """What else its results depend on, as plain data."""
 
-    def evaluate(self, actions: Tensor) -> Outcome:
+    def evaluate(self, actions: Tensor) -> Evaluation:
         """Play actions, shape (P, T, A), float64 on the CPU, one episode each."""
         ...
 
-    def rehearsal(self) -> Problem | None:
+    def surrogate(self) -> Problem | None:
         """Return a problem of the same size that is much like this one and quicker to play, if there is one."""
         ...
 
@@ -67,7 +67,7 @@ class Problem(Protocol):
         """
         ...
 
-    def record(self, actions: Tensor) -> tuple[Outcome, dict[str, Any]]:
+    def record(self, actions: Tensor) -> tuple[Evaluation, dict[str, Any]]:
         """Play one trajectory alone, shape (T, A).
 
         Returns:
@@ -77,7 +77,8 @@ class Problem(Protocol):
 
 
 _WITHIN = 1 - 1e-6
-"""Share of the limit that projected ways reach: a way of just the limit, cut by rounding, has no slope along itself."""
+"""Share of the limit that projected ways reach: a way of just the limit, cut by rounding, has no gradient along
+itself."""
 
 
 @dataclass(frozen=True)
@@ -128,19 +129,19 @@ class Encoding:
         length = torch.linalg.vector_norm(moves, dim=-1, keepdim=True)
         return self.encode(moves * (most / length.clamp(min=most)))
 
-    def inward(self, points: Tensor, ways: Tensor) -> Tensor:
+    def inward(self, points: Tensor, stage_waypoints: Tensor) -> Tensor:
         """Return ways from points without what leads out of what can be reached, (P, size): projection undoes that."""
-        moves, ahead = self._moves(points), self._moves(ways)
+        moves, ahead = self._moves(points), self._moves(stage_waypoints)
         length = torch.linalg.vector_norm(moves, dim=-1, keepdim=True)
         out = moves / length.clamp(min=1e-300)
         beyond = (ahead * out).sum(-1, keepdim=True).clamp(min=0)
         ends = length > _WITHIN**2 * self.reach
         return self.encode(torch.where(ends, ahead - beyond * out, ahead))
 
-    def pull(self, points: Tensor, slope: Tensor) -> Tensor:
-        """Return slopes by the numbers of points from slopes by their actions, shape (P, T A)."""
+    def pull(self, points: Tensor, gradient: Tensor) -> Tensor:
+        """Return gradients by the numbers of points from gradients by their actions, shape (P, T A)."""
         x = points.detach().requires_grad_()
-        return torch.autograd.grad(self.decode(x).flatten(1), x, slope)[0]
+        return torch.autograd.grad(self.decode(x).flatten(1), x, gradient)[0]
 
     def _moves(self, points: Tensor) -> Tensor:
         """Return displacements [m], shape (P, knots, A / group, group)."""

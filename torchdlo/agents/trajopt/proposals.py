@@ -14,7 +14,7 @@ from torch import Tensor
 
 from torchdlo.agents.trajopt.problem import Encoding, Problem
 
-__all__ = ["Ask", "Plan", "Rehearsed", "Search", "Told", "best", "drags", "handed"]
+__all__ = ["Ask", "Search", "SearchPlan", "SurrogateRound", "Told", "best", "drags", "handed"]
 __all__ += ["ranking", "rounds", "sweeps", "walks"]
 
 _ALIKE = 1e-4
@@ -32,20 +32,20 @@ class Told:
     """Returns; -inf where there is no number [-], shape (P,)."""
     loss: Tensor
     """Losses; inf where there is no number [-], shape (P,)."""
-    shortfall: Tensor
+    terminal_cost: Tensor
     """How far the ends are from success, in the units of the return [-], shape (P,)."""
     success: Tensor
     """Whether the task was done, bool [-], shape (P,)."""
     failed: Tensor
     """Whether the episode broke down, bool [-], shape (P,)."""
-    slope: Tensor
-    """Slope of the loss [1/m], zero where there is no number and where it was not asked for, shape (P, size); (P, 0) if
-    it was asked for nowhere."""
+    gradient: Tensor
+    """Gradient of the loss [1/m], zero where there is no number and where it was not asked for, shape (P, size); (P, 0)
+    if it was asked for nowhere."""
 
     @property
     def value(self) -> Tensor:
         """Returns without what is missing to success; -inf where there is no number [-], shape (P,)."""
-        return self.returns - self.shortfall
+        return self.returns - self.terminal_cost
 
     def split(self, sizes: Sequence[int]) -> list[Told]:
         """Return the parts for so many trajectories each."""
@@ -70,11 +70,11 @@ class Ask:
     encoding: Encoding
     points: Tensor
     """Numbers of the way-points [m], shape (P, size)."""
-    graded: int = 0
-    """How many slopes of the loss are wanted."""
+    with_gradient: int = 0
+    """How many gradients of the loss are wanted."""
     pick: Callable[[Told, int], Tensor] = best
-    """Returns which ones, `graded` indices, from how all went. A slope costs several times what playing does: those of
-    a part are had by playing that part once more."""
+    """Returns which ones, `with_gradient` indices, from how all went. A gradient costs several times what playing does:
+    those of a part are had by playing that part once more."""
 
 
 Search = Generator[Ask, Told, None]
@@ -82,7 +82,7 @@ Search = Generator[Ask, Told, None]
 
 
 @dataclass(frozen=True)
-class Plan:
+class SearchPlan:
     """Size of a problem and of the search; lengths in metres."""
 
     horizon: int
@@ -108,7 +108,7 @@ class Plan:
     drifts: float = 0.0
     """Share of the iterations in which worlds get harder from one to the next: results of different ones do not compare
     until then."""
-    rehearsals: int = 0
+    surrogates: int = 0
     """Iterations that are played in a problem much like this one; their results do not compare with later ones."""
     touch: tuple[tuple[float, float, float], ...] = ()
     """Where there are things to touch, see `Problem.touch`."""
@@ -116,7 +116,7 @@ class Plan:
     """Where tools are at the start, see `Problem.tools`."""
 
     @classmethod
-    def of(cls, problem: Problem, population: int, iterations: int, **choices: Any) -> Plan:
+    def of(cls, problem: Problem, population: int, iterations: int, **choices: Any) -> SearchPlan:
         """Return the plan for a problem; lengths that are not given follow from its limit."""
         hold = choices.setdefault("hold", min(10, problem.horizon))
         # 0.05 m, 1 mm and 1 um where tools go 1 cm per action and way-points have ten.
@@ -130,16 +130,16 @@ class Plan:
         return Encoding(self.horizon, self.width, self.group, self.limit, hold, apart)
 
 
-class Rehearsed:
-    """The best of every iteration of a rehearsal: the first to be played in the problem itself."""
+class SurrogateRound:
+    """The best of every iteration of a surrogate task: the first to be played in the problem itself."""
 
-    def __init__(self, plan: Plan) -> None:
+    def __init__(self, plan: SearchPlan) -> None:
         self.plan = plan
         self.parts: list[Tensor] = []
 
     def note(self, actions: Tensor, told: Told) -> None:
         """Keep the best of an iteration; actions (P, T A) [m]."""
-        each = math.ceil(self.plan.population / self.plan.rehearsals)
+        each = math.ceil(self.plan.population / self.plan.surrogates)
         self.parts.append(actions[best(told, each)])
 
     @property
@@ -148,19 +148,20 @@ class Rehearsed:
         return torch.cat(self.parts[::-1])[: self.plan.population]
 
 
-def handed(search: Search, plan: Plan) -> Search:
-    """Search as `search` does; what did well in a rehearsal is played in the problem itself before that goes on."""
-    kept, told = Rehearsed(plan), None
+def handed(search: Search, plan: SearchPlan) -> Search:
+    """Search as `search` does; what did well in a surrogate task is played in the problem itself before that goes
+    on."""
+    kept, told = SurrogateRound(plan), None
     for k in itertools.count():
         ask = search.send(told)
-        if k == plan.rehearsals > 0:
+        if k == plan.surrogates > 0:
             yield Ask(plan.encoding(1), kept.actions)
         told = yield ask
-        if k < plan.rehearsals:
+        if k < plan.surrogates:
             kept.note(ask.encoding.decode(ask.points).flatten(1), told)
 
 
-def walks(plan: Plan, rng: torch.Generator, count: int | None = None) -> Tensor:
+def walks(plan: SearchPlan, rng: torch.Generator, count: int | None = None) -> Tensor:
     """Return random way-points [m], shape (count, size), as CMA-ES would draw them at first; a population if not given.
 
     They may reach further than tools do.
@@ -169,7 +170,7 @@ def walks(plan: Plan, rng: torch.Generator, count: int | None = None) -> Tensor:
     return plan.sigma * torch.randn(count or plan.population, size, generator=rng, dtype=torch.float64)
 
 
-def sweeps(plan: Plan, encoding: Encoding, rng: torch.Generator) -> Tensor:
+def sweeps(plan: SearchPlan, encoding: Encoding, rng: torch.Generator) -> Tensor:
     """Return points of straight sweeps in one to three legs, shape (population, size).
 
     Independent displacements walk as far as the root of their number; sweeps go as far as possible, and so meet things
@@ -180,14 +181,14 @@ def sweeps(plan: Plan, encoding: Encoding, rng: torch.Generator) -> Tensor:
     draw = torch.randn(count, 3, groups, plan.group, generator=rng, dtype=torch.float64)
     heading = draw / torch.linalg.vector_norm(draw, dim=-1, keepdim=True)
     length = encoding.reach * torch.rand(count, 3, groups, 1, generator=rng, dtype=torch.float64)
-    ways = heading * length
+    stage_waypoints = heading * length
     each = torch.arange(count)
-    ways = torch.where((each % 4 < 2)[:, None, None, None], ways, ways[:, :, :1])
-    moves = ways[each[:, None], _legs(knots, count)]
+    stage_waypoints = torch.where((each % 4 < 2)[:, None, None, None], stage_waypoints, stage_waypoints[:, :, :1])
+    moves = stage_waypoints[each[:, None], _legs(knots, count)]
     return encoding.project(encoding.encode(torch.cat([torch.zeros_like(moves[:1]), moves[1:]])))
 
 
-def drags(plan: Plan, encoding: Encoding, rng: torch.Generator, count: int) -> Tensor:
+def drags(plan: SearchPlan, encoding: Encoding, rng: torch.Generator, count: int) -> Tensor:
     """Return points of ways straight over a thing that can be touched, by tools that draw nearer, (count, size).
 
     What tools hold between them comes to lie about the things on its way, and is drawn together there. Ways have one to
@@ -210,7 +211,7 @@ def _legs(knots: int, count: int) -> Tensor:
     return torch.arange(knots)[None] * (1 + torch.arange(count) % 3)[:, None] // knots
 
 
-def _targets(plan: Plan) -> Tensor:
+def _targets(plan: SearchPlan) -> Tensor:
     """Return where things are, and the middle of several [m], shape (N, 3)."""
     if not plan.touch:
         raise ValueError("there is nothing to touch; expected a plan with touch")
@@ -218,7 +219,7 @@ def _targets(plan: Plan) -> Tensor:
     return torch.cat([things, things.mean(0, keepdim=True)]) if len(things) > 1 else things
 
 
-def rounds(plan: Plan, encoding: Encoding, rng: torch.Generator, count: int) -> Tensor:
+def rounds(plan: SearchPlan, encoding: Encoding, rng: torch.Generator, count: int) -> Tensor:
     """Return points of ways straight to a circle about a thing that can be touched, and on along it, (count, size).
 
     Ropes are put round and over things, and drawn round them. Every fourth circle is upright, in line with the way to

@@ -11,15 +11,15 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchdlo.agents.trajopt.problem import Outcome, Problem
-from torchdlo.agents.trajopt.search import Found, Settings
+from torchdlo.agents.trajopt.problem import Evaluation, Problem
+from torchdlo.agents.trajopt.search import SearchResult, Settings
 from torchdlo.agents.trajopt.search_journal import program, versions
 from torchdlo.errors import InputError
 
 __all__ = ["load_actions", "plain", "result_json", "summary", "trajectory_json"]
 
 
-def plain(outcome: Outcome) -> dict[str, Any]:
+def plain(outcome: Evaluation) -> dict[str, Any]:
     """Return how one trajectory went, as plain data; None for what is no number."""
     return {
         "return": _number(outcome.returns),
@@ -33,7 +33,7 @@ def _number(x: Tensor) -> float | None:
     return float(x[0]) if math.isfinite(float(x[0])) else None
 
 
-def summary(found: Found, task: str) -> str:
+def summary(found: SearchResult, task: str) -> str:
     """Return what was found as one sentence."""
     went = plain(found.outcome)
     value = "no finite number" if went["return"] is None else f"{went['return']:.4g}"
@@ -43,15 +43,15 @@ def summary(found: Found, task: str) -> str:
     return f"{task}: return {value} after {found.episodes} episodes, {how}{stopped}{missed}"
 
 
-def result_json(found: Found, problem: Problem, settings: Settings) -> str:
+def result_json(found: SearchResult, problem: Problem, settings: Settings) -> str:
     """Return what was found as JSON; `seconds` alone differs between equal searches."""
     content = {
         "generator": "torchdlo optimize",
         "task": problem.name,
         **plain(found.outcome),
-        "searched": _finite(found.searched),
+        "search_return": _finite(found.search_return),
         "missed": found.kept.get("missed", ""),
-        "highest": _finite(found.highest),
+        "max_return": _finite(found.max_return),
         "solved_after": next((p["episodes"] for p in found.curve if p["success"] > 0), None),
         "episodes": found.episodes,
         "seconds": round(found.seconds, 3),
@@ -68,7 +68,7 @@ def _finite(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def trajectory_json(found: Found, problem: Problem) -> str:
+def trajectory_json(found: SearchResult, problem: Problem) -> str:
     """Return the best trajectory as JSON. Numbers are written so that every bit of them comes back."""
     content = {
         "generator": "torchdlo optimize",

@@ -1,4 +1,4 @@
-"""What to play in a task: the way by hand, nothing, or a trajectory that was found."""
+"""What to play in a task: the scripted demonstration, nothing, or a trajectory that was found."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchdlo.agents.trajopt.result import load_actions
 from torchdlo.agents.trajopt.task_problem import problem
-from torchdlo.envs import Cable, Task, find
+from torchdlo.envs import RopeMaterial, Task, find
 from torchdlo.envs.core import episode
 from torchdlo.errors import InputError
 
@@ -36,7 +36,7 @@ class Script:
 def script(
     name: str,
     trajectory: Path | None = None,
-    rope: Cable | None = None,
+    rope: RopeMaterial | None = None,
     *,
     idle: bool = False,
     vary: int | None = None,
@@ -47,14 +47,14 @@ def script(
     Args:
         name: of the task.
         trajectory: a file that `torchdlo optimize` wrote, played with the precision and the kind of steps with which it
-            was found, so that every bit of it comes back; the way by hand if not given.
+            was found, so that every bit of it comes back; the scripted demonstration if not given.
         rope: see `torchdlo.envs.make`; a trajectory that was found for another one shows how well it carries over.
         idle: do nothing.
         vary: seed of a start that differs from the usual one.
         compiled: whether to compile steps.
 
     Raises:
-        InputError: The trajectory is none, is one of another task, needs a rope, or there is no way by hand.
+        InputError: The trajectory is none, is one of another task, needs a rope, or there is no scripted demonstration.
     """
     task = find(name, rope)
     found = {"compiled": compiled, "recorded": task.horizon > _LONG} if trajectory is None else _choices(trajectory)
@@ -68,7 +68,7 @@ def script(
     made = episode.prepare(task, 1, like=chosen.like, **steps, **start)
     if trajectory is not None:
         return Script(task, made, chosen.full(load_actions(trajectory, chosen)))
-    way = task.reference() if vary is None else task.reference(made.start.state)[0]
+    way = task.demonstration() if vary is None else task.demonstration(made.start.state)[0]
     if not idle and not bool((way != 0).any()):
         raise InputError(f"{name}: has no way by hand; give a --trajectory, or --idle.")
     return Script(task, made, (0 * way if idle else way).to(chosen.like))

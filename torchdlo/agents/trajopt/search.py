@@ -15,18 +15,18 @@ from torch import Tensor
 from torchdlo.agents.trajopt.cmaes import cmaes, package
 from torchdlo.agents.trajopt.gradient_descent import descent
 from torchdlo.agents.trajopt.hybrid import hybrid
-from torchdlo.agents.trajopt.problem import Encoding, Outcome, Problem
-from torchdlo.agents.trajopt.proposals import Ask, Plan, Search, Told, handed
-from torchdlo.agents.trajopt.search_journal import Journal
+from torchdlo.agents.trajopt.problem import Encoding, Evaluation, Problem
+from torchdlo.agents.trajopt.proposals import Ask, Search, SearchPlan, Told, handed
+from torchdlo.agents.trajopt.search_journal import SearchJournal
 from torchdlo.errors import InputError
 
-__all__ = ["METHODS", "Found", "Robust", "Settings", "optimize"]
+__all__ = ["METHODS", "Robust", "SearchResult", "Settings", "optimize"]
 
-METHODS: dict[str, Callable[[Plan, torch.Generator], Search]] = {"cmaes": cmaes, "gd": descent, "hybrid": hybrid}
+METHODS: dict[str, Callable[[SearchPlan, torch.Generator], Search]] = {"cmaes": cmaes, "gd": descent, "hybrid": hybrid}
 """Optimisers by name."""
 
-REHEARSING = ("hybrid",)
-"""Those that see to it themselves that what did well in a rehearsal is played in the problem itself."""
+SURROGATE_ROUND = ("hybrid",)
+"""Those that see to it themselves that what did well in a surrogate task is played in the problem itself."""
 
 Callback = Callable[[str, int, int, str], None]
 
@@ -61,11 +61,11 @@ class Robust:
 
 @dataclass(frozen=True)
 class Settings:
-    """How to search; what is None follows from the problem, see `Plan`."""
+    """How to search; what is None follows from the problem, see `SearchPlan`."""
 
     method: str = "cmaes"
     episodes: int = 20_000
-    """Budget; an episode counts once, whether its slope is had or not."""
+    """Budget; an episode counts once, whether its gradient is had or not."""
     population: int = 400
     seed: int = 0
     hold: int | None = None
@@ -75,10 +75,10 @@ class Settings:
     chunk: int = 100
     """Most episodes that are played as one batch."""
     robust: Robust | None = None
-    rehearsed: float = 0.0
-    """Share of the iterations that are played in the problem's rehearsal."""
+    surrogate_share: float = 0.0
+    """Share of the iterations that are played in the problem's surrogate task."""
 
-    def plan(self, problem: Problem) -> Plan:
+    def plan(self, problem: Problem) -> SearchPlan:
         """Return the plan for a problem; says so if the settings make none."""
 
         def need(ok: bool, name: str, expected: str) -> None:
@@ -96,8 +96,8 @@ class Settings:
         for name in ("sigma", "rate", "steps"):
             value = getattr(self, name)
             need(value is None or (math.isfinite(value) and value > 0), name, "a positive number")
-        need(0 <= self.rehearsed < 1, "rehearsed", "a share of the iterations from 0 up, less than 1")
-        need(self.rehearsed == 0 or self.robust is None, "rehearsed", "0 with robust")
+        need(0 <= self.surrogate_share < 1, "surrogate_share", "a share of the iterations from 0 up, less than 1")
+        need(self.surrogate_share == 0 or self.robust is None, "surrogate_share", "0 with robust")
         per, spare = (self.robust.copies, self.robust.final) if self.robust else (1, 0)
         least = self.population * per + spare
         judged = f" and {spare} for the last judgement" if spare else ""
@@ -105,23 +105,23 @@ class Settings:
         given = {k: getattr(self, k) for k in ("hold", "sigma", "rate", "steps") if getattr(self, k) is not None}
         iterations = (self.episodes - spare) // (self.population * per)
         given["drifts"] = self.robust.warm if self.robust else 0.0
-        given["rehearsals"] = min(int(self.rehearsed * iterations), iterations - 1)
-        return Plan.of(problem, self.population, iterations, **given)
+        given["surrogates"] = min(int(self.surrogate_share * iterations), iterations - 1)
+        return SearchPlan.of(problem, self.population, iterations, **given)
 
 
 @dataclass(frozen=True, eq=False)
-class Found:
+class SearchResult:
     """What an optimisation found."""
 
     actions: Tensor
     """Best trajectory, shape (T, A)."""
-    outcome: Outcome
+    outcome: Evaluation
     """How it went when it was played alone, one entry."""
     kept: dict[str, Any]
     """What `Problem.record` keeps of it."""
-    searched: float
+    search_return: float
     """Its return as the search saw it, in a batch and, if robust, in perturbed worlds."""
-    highest: float
+    max_return: float
     """Largest return that the search saw, whether that trajectory succeeded or not."""
     episodes: int
     """Episodes played, without those that play the best alone."""
@@ -139,7 +139,7 @@ def optimize(
     journal: Path | None = None,
     resume: bool = False,
     callback: Callback | None = None,
-) -> Found:
+) -> SearchResult:
     """Search the trajectory with the largest return, if it can be had one that succeeds.
 
     A `KeyboardInterrupt` that `callback` raises ends the search; the best so far is returned.
@@ -153,12 +153,12 @@ def optimize(
         callback: told (stage, episodes done, all episodes, message) after every batch.
     """
     plan, robust = settings.plan(problem), settings.robust
-    stand_in = problem.rehearsal() if plan.rehearsals else None
-    if plan.rehearsals and stand_in is None:
+    stand_in = problem.surrogate() if plan.surrogates else None
+    if plan.surrogates and stand_in is None:
         raise InputError(f"{problem.name}: it has no rehearsal; set rehearsed to 0.")
-    player = _Player(problem, settings, Journal(journal, _options(problem, settings), resume=resume), callback)
+    player = _Player(problem, settings, SearchJournal(journal, _options(problem, settings), resume=resume), callback)
     search = METHODS[settings.method](plan, torch.Generator().manual_seed(settings.seed))
-    if settings.method not in REHEARSING:
+    if settings.method not in SURROGATE_ROUND:
         search = handed(search, plan)
     told, curve, interrupted = None, [], False
     best = _Best(robust.finalists if robust else _FINALISTS)
@@ -166,16 +166,16 @@ def optimize(
         for k in range(plan.iterations):
             ask = search.send(told)
             scale = robust.scale((k + 1) / plan.iterations) if robust else 0.0
-            rehearses = k < plan.rehearsals
+            rehearses = k < plan.surrogates
             last = k + 1 == plan.iterations  # nothing is told of it
-            told = player.batch(ask, scale, stand_in if rehearses else problem, slopes=not last)
-            if k == plan.rehearsals > 0:
-                best.clear()  # what did well in a rehearsal has to do so in earnest
-                player.highest = float(told.returns.max())
+            told = player.batch(ask, scale, stand_in if rehearses else problem, gradients=not last)
+            if k == plan.surrogates > 0:
+                best.clear()  # what did well in a surrogate task has to do so in earnest
+                player.max_return = float(told.returns.max())
             if robust and scale == 1 and curve and curve[-1]["scale"] < 1:
                 best.clear()  # what did well in milder worlds has to do so in these
             best.offer(ask, told)
-            curve.append(_point(player, told, best.highest, scale, rehearses))
+            curve.append(_point(player, told, best.max_return, scale, rehearses))
         finalists = player.judge(best.kept)
     except KeyboardInterrupt:
         if not best.kept:
@@ -186,13 +186,13 @@ def optimize(
     if not math.isfinite(finalists[0].returns):
         raise InputError(f"{problem.name}: none of {player.done} episodes had a finite return; nothing was found.")
     chosen, outcome, kept = _alone(problem, finalists, robust is not None)
-    rehearsed = curve[-1]["rehearsed"]  # what it promised there, it does not promise here
-    return Found(
+    surrogate_share = curve[-1]["surrogate_share"]  # what it promised there, it does not promise here
+    return SearchResult(
         chosen.actions,
         outcome,
         kept,
-        -math.inf if rehearsed else chosen.returns,
-        -math.inf if rehearsed else best.highest,
+        -math.inf if surrogate_share else chosen.returns,
+        -math.inf if surrogate_share else best.max_return,
         player.done,
         player.seconds,
         curve,
@@ -200,7 +200,9 @@ def optimize(
     )
 
 
-def _alone(problem: Problem, finalists: Sequence[_Finalist], robust: bool) -> tuple[_Finalist, Outcome, dict[str, Any]]:
+def _alone(
+    problem: Problem, finalists: Sequence[_Finalist], robust: bool
+) -> tuple[_Finalist, Evaluation, dict[str, Any]]:
     """Return the one that does best alone, of those that promise more than any before them did there.
 
     What rests on a narrow escape does not do alone what it did in a batch, where numbers are rounded otherwise. Returns
@@ -225,9 +227,10 @@ def _options(problem: Problem, settings: Settings) -> dict[str, Any]:
     return sizes | problem.choices | asdict(settings)
 
 
-def _point(player: _Player, told: Told, best: float, scale: float, rehearsed: bool) -> dict[str, Any]:
-    """Return what a learning curve has about an iteration; of a rehearsal, it tells nothing of the problem itself."""
-    if rehearsed:
+def _point(player: _Player, told: Told, best: float, scale: float, surrogate_share: bool) -> dict[str, Any]:
+    """Return what a learning curve has about an iteration; of a surrogate task, it tells nothing of the problem
+    itself."""
+    if surrogate_share:
         told, best = replace(told, returns=told.returns[:0], success=torch.zeros_like(told.success)), -math.inf
     good = told.returns[torch.isfinite(told.returns)]
     return {
@@ -238,7 +241,7 @@ def _point(player: _Player, told: Told, best: float, scale: float, rehearsed: bo
         "failed": float(told.failed.double().mean()),
         "without_slope": player.blind,
         "scale": scale,
-        "rehearsed": rehearsed,
+        "surrogate_share": surrogate_share,
     }
 
 
@@ -266,11 +269,11 @@ class _Best:
     def clear(self) -> None:
         """Forget all."""
         self.kept: list[_Finalist] = []
-        self.highest = -math.inf
+        self.max_return = -math.inf
 
     def offer(self, ask: Ask, told: Told) -> None:
         """Keep what is better than what there is; the earlier of equals stays."""
-        self.highest = max(self.highest, float(told.returns.max()))
+        self.max_return = max(self.max_return, float(told.returns.max()))
         order = sorted(range(len(told.returns)), key=lambda k: (not told.success[k], -float(told.returns[k])))
         for k in order[: self.room]:
             actions = ask.encoding.decode(ask.points[k : k + 1])[0]
@@ -281,53 +284,54 @@ class _Best:
 class _Player:
     """Plays batches, or reads how they went."""
 
-    def __init__(self, problem: Problem, settings: Settings, journal: Journal, callback: Callback | None) -> None:
+    def __init__(self, problem: Problem, settings: Settings, journal: SearchJournal, callback: Callback | None) -> None:
         self.problem, self.settings, self.journal = problem, settings, journal
         self.callback = callback or (lambda *_: None)
-        self.done, self.seconds, self.blind, self.highest = 0, 0.0, 0, -math.inf
+        self.done, self.seconds, self.blind, self.max_return = 0, 0.0, 0, -math.inf
         self._copies = settings.robust.copies if settings.robust else 1
 
     def _worlds(self, copies: int, scale: float, number: int) -> Problem:
         return self.problem.varied(copies, scale, self.settings.seed * 1_000_003 + number)
 
-    def batch(self, ask: Ask, scale: float, problem: Problem, slopes: bool) -> Told:
-        """Play what is asked for in a problem or its rehearsal, and what needs slopes once more if not all do."""
+    def batch(self, ask: Ask, scale: float, problem: Problem, gradients: bool) -> Told:
+        """Play what is asked for in a problem or its surrogate task, and what needs gradients once more if not all
+        do."""
         if self.settings.robust:
             problem = self._worlds(self._copies, scale, 1)
-        if not slopes or not 0 < ask.graded < len(ask.points):
-            return self._told(problem, ask, slopes and ask.graded > 0)
+        if not gradients or not 0 < ask.with_gradient < len(ask.points):
+            return self._told(problem, ask, gradients and ask.with_gradient > 0)
         told = self._told(problem, ask, False)
-        rows, slope = ask.pick(told, ask.graded), torch.zeros_like(ask.points)
-        slope[rows] = self._told(problem, replace(ask, points=ask.points[rows]), True, again=True).slope
-        return replace(told, slope=slope)
+        rows, gradient = ask.pick(told, ask.with_gradient), torch.zeros_like(ask.points)
+        gradient[rows] = self._told(problem, replace(ask, points=ask.points[rows]), True, again=True).gradient
+        return replace(told, gradient=gradient)
 
-    def _told(self, problem: Problem, ask: Ask, graded: bool, again: bool = False) -> Told:
+    def _told(self, problem: Problem, ask: Ask, with_gradient: bool, again: bool = False) -> Told:
         """Play trajectories in chunks."""
         room = max(1, self.settings.chunk // self._copies)
-        parts = [self._chunk(problem, ask.encoding, x, graded, again) for x in ask.points.split(room)]
+        parts = [self._chunk(problem, ask.encoding, x, with_gradient, again) for x in ask.points.split(room)]
         columns = zip(*parts, strict=True)
-        returns, loss, short, success, failed, slope = (torch.cat(column) for column in columns)
-        good = torch.isfinite(slope).all(-1)
+        returns, loss, short, success, failed, gradient = (torch.cat(column) for column in columns)
+        good = torch.isfinite(gradient).all(-1)
         self.blind = int((~good).sum())
         returns = torch.where(torch.isfinite(returns), returns, -math.inf)
         # An episode that broke down may have a small loss, as nothing is added up from then on.
         loss = torch.where(torch.isfinite(loss) & ~failed, loss, math.inf)
-        return Told(returns, loss, short.nan_to_num(), success, failed, torch.where(good[:, None], slope, 0.0))
+        return Told(returns, loss, short.nan_to_num(), success, failed, torch.where(good[:, None], gradient, 0.0))
 
     def _chunk(
-        self, problem: Problem, encoding: Encoding, points: Tensor, graded: bool, again: bool
+        self, problem: Problem, encoding: Encoding, points: Tensor, with_gradient: bool, again: bool
     ) -> tuple[Tensor, ...]:
-        names = ("returns", "loss", "shortfall", "success", "failed", "slope")
+        names = ("returns", "loss", "terminal_cost", "success", "failed", "slope")
         kept = self.journal.recall(points)
         if kept is None:
             began = time.perf_counter()
-            kept = dict(zip(names, _play(problem, encoding, points, graded), strict=True))
+            kept = dict(zip(names, _play(problem, encoding, points, with_gradient), strict=True))
             kept["seconds"] = time.perf_counter() - began
             self.journal.keep(points, kept)
         self.done += 0 if again else len(points) * self._copies
         self.seconds += kept["seconds"]
-        self.highest = max([self.highest, *kept["returns"][torch.isfinite(kept["returns"])].tolist()])
-        self.callback("optimize", self.done, self.settings.episodes, f"best {self.highest:.4g}")
+        self.max_return = max([self.max_return, *kept["returns"][torch.isfinite(kept["returns"])].tolist()])
+        self.callback("optimize", self.done, self.settings.episodes, f"best {self.max_return:.4g}")
         return tuple(kept[name] for name in names)
 
     def judge(self, kept: Sequence[_Finalist]) -> Sequence[_Finalist]:
@@ -346,15 +350,15 @@ class _Player:
         return sorted(seen, key=lambda f: f.rank, reverse=True)
 
 
-def _play(problem: Problem, encoding: Encoding, points: Tensor, graded: bool) -> tuple[Tensor, ...]:
-    """Return returns, losses, successes, failures and slopes, on the CPU."""
-    x = points.detach().clone().requires_grad_(graded)
-    with torch.set_grad_enabled(graded):
+def _play(problem: Problem, encoding: Encoding, points: Tensor, with_gradient: bool) -> tuple[Tensor, ...]:
+    """Return returns, losses, successes, failures and gradients, on the CPU."""
+    x = points.detach().clone().requires_grad_(with_gradient)
+    with torch.set_grad_enabled(with_gradient):
         outcome = problem.evaluate(encoding.decode(x))
-        slope = x.new_zeros(len(x), 0)
-        if graded:
-            # Trajectories do not touch each other, so that the slope of the sum is that of each.
-            (slope,) = torch.autograd.grad(outcome.loss.sum(), x, allow_unused=True, materialize_grads=True)
-    numbers = (x.double() for x in (outcome.returns, outcome.loss, outcome.shortfall))
+        gradient = x.new_zeros(len(x), 0)
+        if with_gradient:
+            # Trajectories do not touch each other, so that the gradient of the sum is that of each.
+            (gradient,) = torch.autograd.grad(outcome.loss.sum(), x, allow_unused=True, materialize_grads=True)
+    numbers = (x.double() for x in (outcome.returns, outcome.loss, outcome.terminal_cost))
     parts = (*numbers, outcome.success, outcome.failed)
-    return *(p.detach().cpu() for p in parts), slope
+    return *(p.detach().cpu() for p in parts), gradient

@@ -27,7 +27,7 @@ from torchdlo.envs import TASKS
 from torchdlo.errors import InputError
 from torchdlo.files import write_atomically
 
-__all__ = ["Journal", "program", "remove", "versions"]
+__all__ = ["SearchJournal", "program", "remove", "versions"]
 
 _MARK = "journal.json"
 """The file that says what a journal belongs to."""
@@ -91,7 +91,7 @@ def remove(path: Path) -> None:
     shutil.rmtree(path, ignore_errors=True)
 
 
-class Journal:
+class SearchJournal:
     """A folder with one file per batch, for one search at a time; None as folder keeps nothing."""
 
     def __init__(self, path: Path | None, options: dict[str, Any], *, resume: bool = False) -> None:

@@ -10,9 +10,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchdlo.agents.trajopt.problem import Outcome
+from torchdlo.agents.trajopt.problem import Evaluation
 from torchdlo.coupling.common import step_diagnostics
-from torchdlo.envs import Cable, find
+from torchdlo.envs import RopeMaterial, find
 from torchdlo.envs.core import episode
 from torchdlo.envs.core.task import Task
 from torchdlo.errors import InputError
@@ -21,7 +21,7 @@ from torchdlo.physics import tree
 __all__ = ["TaskProblem", "problem"]
 
 
-def problem(name: str, rope: Cable | None = None, **choices: Any) -> TaskProblem:
+def problem(name: str, rope: RopeMaterial | None = None, **choices: Any) -> TaskProblem:
     """Return the problem of a task by its name, with a rope of its own or a given one.
 
     Args:
@@ -67,7 +67,7 @@ class TaskProblem:
     @property
     def limit(self) -> float:
         """Greatest way of a tool in an action [m]."""
-        return self.task.reach
+        return self.task.max_translation
 
     @property
     def touch(self) -> tuple[tuple[float, float, float], ...]:
@@ -83,8 +83,8 @@ class TaskProblem:
     def _places(self) -> tuple[tuple[tuple[float, float, float], ...], ...]:
         scene, _, state = self.task.start(1, like=torch.zeros((), dtype=torch.float64))
         things = [state.bodies.pos[0, k] for k, body in enumerate(scene.bodies) if body.shape != "plane"]
-        if state.matter:
-            things.append(state.matter.pos[0].mean(0))
+        if state.material_points:
+            things.append(state.material_points.pos[0].mean(0))
         tools = state.rods.pos[0, list(self.task.arms.vertex)]
         return tuple(tuple(tuple((p - tools.mean(0)).tolist()) for p in places) for places in (things, tools))
 
@@ -111,24 +111,24 @@ class TaskProblem:
         """Return the task's actions, shape (P, T, 2 A): tools do not turn."""
         return torch.cat([actions, torch.zeros_like(actions)], -1).to(self.like)
 
-    def evaluate(self, actions: Tensor) -> Outcome:
+    def evaluate(self, actions: Tensor) -> Evaluation:
         """Play actions from the one start."""
         went = episode.play(self.task, self.full(actions), episode=self.prepared(len(actions)))
         return _outcome(went)
 
-    def rehearsal(self) -> TaskProblem | None:
-        """Return the problem of the task's rehearsal, if it has one."""
-        found = self.task.rehearsal()
+    def surrogate(self) -> TaskProblem | None:
+        """Return the problem of the task's surrogate task, if it has one."""
+        found = self.task.surrogate()
         choices = (self.double, self.compiled, self.recorded, self.device)
         return None if found is None else TaskProblem(found, *choices)
 
     def varied(self, copies: int, scale: float, seed: int) -> Varied:
         """Return the problem with `copies` starts that differ by `scale` times what the task calls its spread."""
-        if not any(value for pair in self.task.spread for value in pair):
+        if not any(value for pair in self.task.reset_noise for value in pair):
             raise InputError(f"{self.name}: its start does not vary; leave out --robust.")
         return Varied(self, copies, scale, seed)
 
-    def record(self, actions: Tensor) -> tuple[Outcome, dict[str, Any]]:
+    def record(self, actions: Tensor) -> tuple[Evaluation, dict[str, Any]]:
         """Play one trajectory alone.
 
         Kept are joints and tools after every action, by arm, [rad or m] and [m], rewards, and what contact missed: ""
@@ -137,7 +137,7 @@ class TaskProblem:
         went = episode.play(self.task, self.full(actions[None]), episode=self.prepared(1), keep=episode.places)
         kept = {name: went.path[name][:, 0].tolist() for name in ("joints", "tool")}
         kept["rewards"] = went.rewards[:, 0].tolist()
-        kept["missed"] = step_diagnostics.explain(went.world.state.missed)
+        kept["missed"] = step_diagnostics.explain(went.world.state.diagnostics)
         finite = all(math.isfinite(value) for value in kept["rewards"])
         return _outcome(went), kept if finite else {}
 
@@ -151,22 +151,22 @@ class Varied:
     scale: float
     seed: int
 
-    def evaluate(self, actions: Tensor) -> Outcome:
+    def evaluate(self, actions: Tensor) -> Evaluation:
         """Return means of return and loss; success means from all starts, failure from any."""
         task, like = self.inner.task, self.inner.like
         count = len(actions) * self.copies
         rng = torch.Generator().manual_seed(self.seed)
-        draw = torch.rand(self.copies, len(task.spread), 2, generator=rng, dtype=torch.float64)
-        away = self.scale * (2 * draw - 1) * torch.tensor(task.spread, dtype=torch.float64)
+        draw = torch.rand(self.copies, len(task.reset_noise), 2, generator=rng, dtype=torch.float64)
+        away = self.scale * (2 * draw - 1) * torch.tensor(task.reset_noise, dtype=torch.float64)
         moved = torch.cat([away, torch.zeros_like(away[..., :1])], -1).to(like).repeat(len(actions), 1, 1)
         _, params, state = task.build(moved)
         base = self.inner.prepared(count)
         base = replace(base, params=params, start=episode.begin(replace(base, params=params), state))
         went = episode.play(task, self.inner.full(actions).repeat_interleave(self.copies, 0), episode=base)
         went = tree.map(lambda x: x.reshape(len(actions), self.copies), _outcome(went))
-        means = (x.mean(-1) for x in (went.returns, went.loss, went.shortfall))
-        return Outcome(*means, went.success.all(-1), went.failed.any(-1))
+        means = (x.mean(-1) for x in (went.returns, went.loss, went.terminal_cost))
+        return Evaluation(*means, went.success.all(-1), went.failed.any(-1))
 
 
-def _outcome(went: episode.Outcome) -> Outcome:
-    return Outcome(went.returns, went.loss, went.shortfall, went.success, went.failed)
+def _outcome(went: episode.EpisodeResult) -> Evaluation:
+    return Evaluation(went.returns, went.loss, went.terminal_cost, went.success, went.failed)

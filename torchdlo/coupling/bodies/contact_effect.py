@@ -11,8 +11,8 @@ Per substep, on a fixed number of points of each pair of bodies (see `balls`):
     scene are coupled through one linear system of six unknowns per body, so that stacks stand at once and need no
     warm start. Rounds choose which contacts press and which stick; sliding friction is taken as resistance
     mu_k p / |s| meanwhile, which cannot overshoot.
-5.  A step with the exact slope ends at the solution, as rounds may leave what slides a tenth of its friction away from
-    it; it is taken where that leaves less to do. One more gives q its derivative by the implicit function theorem.
+5.  A step with the exact gradient ends at the solution, as rounds may leave what slides a tenth of its friction away
+    from it; it is taken where that leaves less to do. One more gives q its derivative by the implicit function theorem.
     Forces are those of the contacts in the sets of the last round, none pulls and none rubs by more than Coulomb
     allows.
 6.  Rounds may end too early where many edges hit at once. Forces that would add energy are dropped then, and contacts
@@ -43,10 +43,10 @@ from torchdlo.coupling.bodies import contact_op
 from torchdlo.coupling.bodies.contact_op import FIT, HARD
 from torchdlo.coupling.bodies.contact_points import touches
 from torchdlo.coupling.bodies.contact_solver import Links, System, gather, inertia
-from torchdlo.coupling.bodies.dynamics import Body, BodyMotion
+from torchdlo.coupling.bodies.dynamics import Body, PredictedBodyMotion
 from torchdlo.coupling.common.coulomb_friction import parting, rebounding
 from torchdlo.physics import tree
-from torchdlo.physics.effects.base import Effect, Motion, Push, Values
+from torchdlo.physics.effects.base import ContactForces, Effect, PredictedMotion, Values
 from torchdlo.physics.linalg.numerics import dot, safe_norm
 from torchdlo.physics.rod.kinematics import View
 
@@ -58,7 +58,7 @@ def _combined(x: Tensor, pairs: tuple[tuple[int, int], ...], counts: tuple[int, 
     return 2 * a * b / torch.where(both > 0, both, 1.0)
 
 
-def _links(contact: BodyContact, motion: BodyMotion) -> Links:
+def _links(contact: BodyContact, motion: PredictedBodyMotion) -> Links:
     state, params, pairs = motion.state, motion.params, contact.chosen(motion.bodies)
     found, counts = touches(motion, pairs, contact.points)
     arms = tuple(found.point - gather(state.pos, pairs, counts, side) for side in (0, 1))
@@ -139,19 +139,19 @@ def _slopes(links: Links, sets: _Sets, load: Tensor | None, size: Tensor | None)
     Args:
         links: the contacts.
         sets: which of them press and slide.
-        load: normal forces [N], for the exact slope of sliding friction; None for its mean resistance.
+        load: normal forces [N], for the exact gradient of sliding friction; None for its mean resistance.
         size: slip [m], likewise.
     """
     n = links.normal.unsqueeze(-1)
     t = sets.slip.unsqueeze(-1)
     press, drag = (x.unsqueeze(-1) for x in (links.stiff * sets.press, sets.drag))
     across = torch.eye(3, dtype=n.dtype, device=n.device) - n @ n.mT
-    slope = press * (n @ n.mT) + drag * across
+    gradient = press * (n @ n.mT) + drag * across
     if load is None:
-        return slope
+        return gradient
     mu, slides = links.mu_k.unsqueeze(-1), sets.slides.unsqueeze(-1)
     turning = mu * load.unsqueeze(-1) / size.unsqueeze(-1).clamp(min=1e-30) * (across - t @ t.mT)
-    return slope + slides * (turning - drag * across - mu * press * (t @ n.mT))
+    return gradient + slides * (turning - drag * across - mu * press * (t @ n.mT))
 
 
 def _forces(links: Links, sets: _Sets, moved: Tensor) -> Tensor:
@@ -173,15 +173,17 @@ def _settled(system: System, dt: float, slowest: float, rounds: int) -> tuple[_S
     sets = _Sets(near, torch.ones_like(near), torch.zeros_like(near), torch.zeros_like(links.normal))
     q = None
     for _ in range(rounds):
-        slopes = _slopes(links, sets, None, None)
-        stays = links.stiff * sets.press * links.wanted * links.normal - (slopes @ links.free.unsqueeze(-1)).squeeze(-1)
-        q = system.solve(slopes, system.load(stays))
+        gradients = _slopes(links, sets, None, None)
+        stays = links.stiff * sets.press * links.wanted * links.normal - (gradients @ links.free.unsqueeze(-1)).squeeze(
+            -1
+        )
+        q = system.solve(gradients, system.load(stays))
         sets = _choose(links, sets, system.moved(q))
     return sets, q
 
 
 def _exact(system: System, sets: _Sets, q: Tensor) -> tuple[_Sets, Tensor]:
-    """Return the sets with the slip, and the slopes (..., C, 3, 3) of forces, at displacements q (..., F, 6)."""
+    """Return the sets with the slip, and the gradients (..., C, 3, 3) of forces, at displacements q (..., F, 6)."""
     links, moved = system.links, system.moved(q)
     load = (links.stiff * sets.press * (links.wanted - dot(links.normal, moved))).clamp(min=0.0)
     size, slip = _slip(links, moved)
@@ -200,7 +202,7 @@ def _detached(links: Links) -> Links:
     return Links(**{k: tree.detach(v) if isinstance(v, Tensor) or k == "arms" else v for k, v in found.items()})
 
 
-def resolve(contact: BodyContact, motion: BodyMotion) -> tuple[Tensor, Tensor]:
+def resolve(contact: BodyContact, motion: PredictedBodyMotion) -> tuple[Tensor, Tensor]:
     """Return forces [N] and torques about the centres of mass [N m] of contact on bodies, shape (..., K, 3) each."""
     if contact_op.fits(motion):
         law = (contact.recovery, contact.shallow, contact.slowest)
@@ -211,14 +213,14 @@ def resolve(contact: BodyContact, motion: BodyMotion) -> tuple[Tensor, Tensor]:
     with torch.no_grad():
         plain = System(_detached(links), free, system.inertia.detach())
         sets, q = _settled(plain, motion.dt, contact.slowest, contact.steps)
-        sets, slopes = _exact(plain, sets, q)
+        sets, gradients = _exact(plain, sets, q)
         excess = _excess(plain, sets, q)
-        ahead = q + plain.solve(slopes, excess)
+        ahead = q + plain.solve(gradients, excess)
         resisted = plain.inertia.diagonal(dim1=-2, dim2=-1)
         off, left = ((x.square() / resisted).sum((-1, -2), keepdim=True) for x in (excess, _excess(plain, sets, ahead)))
         q = torch.where(left < off, ahead, q)
-        sets, slopes = _exact(plain, sets, q)
-    q = q + plain.solve(slopes, _excess(system, sets, q))
+        sets, gradients = _exact(plain, sets, q)
+    q = q + plain.solve(gradients, _excess(system, sets, q))
     force = _forces(links, sets, system.moved(q))
     # Where rounds ended before contacts were found, all press along their normals, by as much as fits at best.
     simple = (links.wanted - dot(links.normal, links.free)).clamp(min=0.0) * links.stiff / HARD * links.normal
@@ -227,7 +229,7 @@ def resolve(contact: BodyContact, motion: BodyMotion) -> tuple[Tensor, Tensor]:
     return links.exerted(torch.where(found, force, simple))
 
 
-def _fitting(links: Links, motion: BodyMotion, force: Tensor) -> Tensor:
+def _fitting(links: Links, motion: PredictedBodyMotion, force: Tensor) -> Tensor:
     """Return the share of forces f at which f . (d0 + A f) = f . b n, shape (..., 1, 1).
 
     A f is by how much they make points move. The share is 1 for forces that solve contact without sliding, more for
@@ -260,7 +262,7 @@ class BodyContact(Effect):
 
     name: ClassVar[str] = "body_contact"
     kind: ClassVar[str] = "force"
-    reacts: ClassVar[bool] = True
+    is_contact: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         for name, least in (("points", 1), ("steps", 1), ("shallow", 0), ("slowest", 0)):
@@ -286,9 +288,9 @@ class BodyContact(Effect):
         every = itertools.combinations(range(len(bodies)), 2)
         return tuple(p for p in every if "free" in (bodies[p[0]].motion, bodies[p[1]].motion))
 
-    def react(self, view: View, motion: Motion, values: Values) -> Push:
+    def solve_contact(self, view: View, motion: PredictedMotion, values: Values) -> ContactForces:
         """Return the forces and torques on bodies."""
         none = view.state.pos.new_zeros(1, 3)
         if not self.chosen(motion.bodies.bodies):
-            return Push(none, none, none)
-        return Push(none, *resolve(self, motion.bodies))
+            return ContactForces(none, none, none)
+        return ContactForces(none, *resolve(self, motion.bodies))

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from torchdlo.coupling.bodies import contact_points
-from torchdlo.coupling.bodies.dynamics import BodyMotion
+from torchdlo.coupling.bodies.dynamics import PredictedBodyMotion
 from torchdlo.coupling.common import scene_packing
 from torchdlo.coupling.common.vector_components import axes
 
@@ -89,18 +89,22 @@ scene_packing.operator(
 )
 
 
-def _members(motion: BodyMotion) -> list[Tensor]:
+def _members(motion: PredictedBodyMotion) -> list[Tensor]:
     """Return the fields of bodies in the order of the kernel, shape (..., K, C) each."""
     state, params = motion.state, motion.params
     offset, numbers = scene_packing.measures(motion)
     numbers.append(params.size[..., 2:])
-    moves = [state.vel, state.omega, motion.change, motion.turn, motion.mobility, motion.agility]
+    moves = [state.vel, state.omega, motion.change, motion.turn, motion.mobility, motion.inverse_inertia]
     laws = [params.mu_s, params.mu_k, params.restitution]
     return [state.pos, *itertools.chain(*axes(state.quat)), offset, *numbers, *moves, *laws]
 
 
 def wrench(
-    motion: BodyMotion, pairs: Sequence[tuple[int, int]], points: int, steps: int, law: tuple[float, float, float]
+    motion: PredictedBodyMotion,
+    pairs: Sequence[tuple[int, int]],
+    points: int,
+    steps: int,
+    law: tuple[float, float, float],
 ) -> tuple[Tensor, Tensor]:
     """Return forces [N] and torques [N m] of contact on bodies, shape (..., K, 3) each; differentiable once.
 
@@ -133,7 +137,7 @@ def wrench(
     return force, torque
 
 
-def fits(motion: BodyMotion) -> bool:
+def fits(motion: PredictedBodyMotion) -> bool:
     """Return whether the kernel can do what these bodies need."""
     like = motion.state.pos
     return ready(like.device.type, like.dtype) and scene_packing.alike(motion)

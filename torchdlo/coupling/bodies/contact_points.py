@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from torchdlo.coupling.bodies import shape_sdf
-from torchdlo.coupling.bodies.dynamics import Body, BodyMotion, conjugate
+from torchdlo.coupling.bodies.dynamics import Body, PredictedBodyMotion, conjugate
 from torchdlo.coupling.bodies.segment_distance import _Line, _nearest
 from torchdlo.physics.linalg.numerics import safe_norm
 from torchdlo.physics.linalg.rotation import rotate
@@ -34,7 +34,8 @@ ARC = 17
 SPREAD = 0.05
 """How much deeper a point must be than one farther from the others, over how much farther that is."""
 FLAT = 0.05
-"""Slope of a circle against a surface below which its rolling ball is drawn to the middle, so that it is continuous."""
+"""Gradient of a circle against a surface below which its rolling ball is drawn to the middle, so that it is
+continuous."""
 EDGES = tuple(
     (a, b)
     for a, b in itertools.combinations(tuple(itertools.product((-1.0, 1.0), repeat=3)), 2)
@@ -93,7 +94,7 @@ def standing(body: Body, size: Tensor, balls: Tensor, edge: Tensor) -> Tensor:
     if body.shape == "cylinder":
         return torch.cat([_on_circle(z, a - edge, edge, FEET) for z in (edge - b, b - edge)], -2)
     if body.shape == "cone":
-        # The ball at the apex is as far below it as makes it touch the slope.
+        # The ball at the apex is as far below it as makes it touch the gradient.
         below = edge * (1 + (b / a).square()).sqrt()
         apex = _rows(zero, zero, 0.75 * b - below, edge)
         return torch.cat([_on_circle(edge - 0.25 * b, a - _slack(a, b) * edge, edge, FEET), apex], -2)
@@ -106,10 +107,10 @@ def standing(body: Body, size: Tensor, balls: Tensor, edge: Tensor) -> Tensor:
 
 
 def _slack(radius: Tensor, height: Tensor) -> Tensor:
-    """Return by how many radii a ball that touches base and slope of a cone is inside the rim, shape (..., 1, 1)."""
+    """Return by how many radii a ball that touches base and gradient of a cone is inside the rim, shape (..., 1, 1)."""
     # The corner at the rim has the angle atan2(height, radius); a ball in it is 1 / tan(half of it) from the rim.
-    slope = (radius.square() + height.square()).sqrt()
-    return (slope + radius) / height
+    gradient = (radius.square() + height.square()).sqrt()
+    return (gradient + radius) / height
 
 
 def circles(body: Body, size: Tensor, edge: Tensor) -> Tensor:
@@ -138,7 +139,7 @@ def segments(body: Body, size: Tensor, edge: Tensor) -> Tensor:
     return size.new_zeros(*size.shape[:-2], 0, 7)
 
 
-def _one_way(motion: BodyMotion, first: int, second: int) -> list[Tensor]:
+def _one_way(motion: PredictedBodyMotion, first: int, second: int) -> list[Tensor]:
     """Return normal, point, gap and rank of balls of one body in the field of another, (..., P, 8), in the world."""
     state, params, bodies = motion.state, motion.params, motion.bodies
     one, other = (slice(k, k + 1) for k in (first, second))
@@ -216,7 +217,9 @@ def _spread(rows: Tensor, count: int) -> Tensor:
     return torch.cat(chosen, -1)
 
 
-def touches(motion: BodyMotion, pairs: tuple[tuple[int, int], ...], most: int) -> tuple[Touches, tuple[int, ...]]:
+def touches(
+    motion: PredictedBodyMotion, pairs: tuple[tuple[int, int], ...], most: int
+) -> tuple[Touches, tuple[int, ...]]:
     """Return the deepest points of pairs of bodies, and how many each pair has.
 
     Args:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchdlo.coupling.bodies.dynamics import Body, BodyMotion
+from torchdlo.coupling.bodies.dynamics import Body, PredictedBodyMotion
 from torchdlo.physics.linalg import banded
 from torchdlo.physics.linalg.numerics import cross
 from torchdlo.physics.linalg.rotation import rotate
@@ -85,12 +85,12 @@ def _skew(r: Tensor) -> Tensor:
     return torch.stack(rows, -2)
 
 
-def inertia(motion: BodyMotion, free: list[int]) -> Tensor:
+def inertia(motion: PredictedBodyMotion, free: list[int]) -> Tensor:
     """Return by how much free bodies resist displacements and turns [N/m, N m/rad], shape (..., F, 6, 6)."""
     quat = motion.state.quat[..., free, :]
     axes = torch.eye(3, dtype=quat.dtype, device=quat.device)
     turn = torch.stack([rotate(quat, axis.expand(*quat.shape[:-1], 3)) for axis in axes], -1)
-    torque = (turn / motion.agility[..., free, :].unsqueeze(-2)) @ turn.mT
+    torque = (turn / motion.inverse_inertia[..., free, :].unsqueeze(-2)) @ turn.mT
     force = axes / motion.mobility[..., free, :].unsqueeze(-1)
     batch = torch.broadcast_shapes(force.shape[:-2], torque.shape[:-2])
     force, torque = (x.expand(*batch, 3, 3) for x in (force, torque))
@@ -103,11 +103,11 @@ def _coupled(links: Links, free: list[int]) -> list[tuple[int, int]]:
     return [(free.index(a), free.index(b)) for a, b in links.pairs if a in free and b in free]
 
 
-def _assembled(links: Links, inertia: Tensor, slopes: Tensor, free: list[int]) -> Tensor:
+def _assembled(links: Links, inertia: Tensor, gradients: Tensor, free: list[int]) -> Tensor:
     """Return the matrix of the displacements of free bodies as `bodies` patterns want it, shape (..., m)."""
-    unit = torch.eye(3, dtype=slopes.dtype, device=slopes.device).expand(*links.arms[0].shape, 3)
+    unit = torch.eye(3, dtype=gradients.dtype, device=gradients.device).expand(*links.arms[0].shape, 3)
     seen = torch.cat([unit, -_skew(links.arms[0]), -unit, _skew(links.arms[1])], -1)
-    pushed = slopes @ seen
+    pushed = gradients @ seen
     diagonal = list(inertia.unbind(-3))
     beside = []
     start = 0
@@ -155,10 +155,10 @@ class System:
     inertia: Tensor
     """Resistance of free bodies to displacements and turns [N/m, N m/rad], shape (..., F, 6, 6)."""
 
-    def solve(self, slopes: Tensor, load: Tensor) -> Tensor:
+    def solve(self, gradients: Tensor, load: Tensor) -> Tensor:
         """Return displacements and turns under forces that fall with the motion, shape (..., F, 6)."""
         name = f"bodies:{len(self.free)}:" + ",".join(f"{a}-{b}" for a, b in _coupled(self.links, self.free))
-        entries = _assembled(self.links, self.inertia, slopes, self.free)
+        entries = _assembled(self.links, self.inertia, gradients, self.free)
         load = load.flatten(-2)
         batch = torch.broadcast_shapes(entries.shape[:-1], load.shape[:-1])
         rows = [x.expand(*batch, x.shape[-1]).reshape(-1, x.shape[-1]).T for x in (entries.detach(), load)]

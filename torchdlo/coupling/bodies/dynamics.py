@@ -20,7 +20,7 @@ from torch import Tensor
 from torchdlo.coupling.bodies import shape_sdf
 from torchdlo.coupling.common.vector_components import axes, local, world
 from torchdlo.physics import tree
-from torchdlo.physics.effects.base import Push
+from torchdlo.physics.effects.base import ContactForces
 from torchdlo.physics.linalg.numerics import safe_norm
 from torchdlo.physics.linalg.rotation import multiply
 
@@ -95,7 +95,7 @@ class BodyTargets:
 
 
 @dataclass(frozen=True)
-class BodyMotion:
+class PredictedBodyMotion:
     """Where bodies are, and where they would go in a substep without contact."""
 
     bodies: tuple[Body, ...]
@@ -109,16 +109,18 @@ class BodyMotion:
     """By how much they would turn, as a rotation vector in the world [rad], shape (..., K, 3)."""
     mobility: Tensor
     """By how much a force moves them, 0 if they are not free [m/N], shape (..., K, 1)."""
-    agility: Tensor
+    inverse_inertia: Tensor
     """By how much a torque turns them about their principal axes, 0 if not free [rad/(N m)], shape (..., K, 3)."""
 
     def turned(self, torque: Tensor) -> Tensor:
         """Return by how much torques in the world turn the bodies [rad], shape (..., K, 3)."""
         columns = axes(self.state.quat)
         inside = local(columns, torque.split(1, -1))
-        return torch.cat(world(columns, [a * t for a, t in zip(self.agility.split(1, -1), inside, strict=True)]), -1)
+        return torch.cat(
+            world(columns, [a * t for a, t in zip(self.inverse_inertia.split(1, -1), inside, strict=True)]), -1
+        )
 
-    def pushed(self, push: Push) -> BodyMotion:
+    def pushed(self, push: ContactForces) -> PredictedBodyMotion:
         """Return the motion under what contact exerts as well."""
         return dataclasses.replace(
             self,
@@ -126,19 +128,19 @@ class BodyMotion:
             turn=self.turn + self.turned(push.body_torque),
         )
 
-    def only(self, part: Sequence[int]) -> BodyMotion:
+    def only(self, part: Sequence[int]) -> PredictedBodyMotion:
         """Return the motion of some of the bodies, by their numbers."""
 
         def cut(x: Tensor) -> Tensor:
             return torch.stack([x[..., k, :] for k in part], -2)
 
-        names = ("params", "state", "change", "turn", "mobility", "agility")
+        names = ("params", "state", "change", "turn", "mobility", "inverse_inertia")
         parts = {name: tree.map(cut, getattr(self, name)) for name in names}
         return dataclasses.replace(self, bodies=tuple(self.bodies[k] for k in part), **parts)
 
 
 @dataclass(frozen=True, eq=False)
-class Solid:
+class RigidBody:
     """One rigid body, as a person describes it. Numbers are floats, or tensors (...,) per scene."""
 
     shape: str
@@ -210,7 +212,7 @@ def _kinematic(bodies: tuple[Body, ...]) -> list[int]:
     return [k for k, b in enumerate(bodies) if b.motion == "kinematic"]
 
 
-def hold(bodies: tuple[Body, ...], state: BodyState) -> BodyTargets:
+def stationary_control(bodies: tuple[Body, ...], state: BodyState) -> BodyTargets:
     """Return the targets that keep kinematic bodies where they are."""
     slots = _kinematic(bodies)
     return BodyTargets(state.pos[..., slots, :], state.quat[..., slots, :])
@@ -245,7 +247,7 @@ def _spread(bodies: tuple[Body, ...], targets: Tensor, otherwise: Tensor) -> Ten
     return torch.cat([row[..., k : k + 1, :] for row, k in zip(rows, place, strict=True)], -2)
 
 
-def foresee(
+def predict_free_motion(
     bodies: tuple[Body, ...],
     params: BodyParams,
     state: BodyState,
@@ -253,7 +255,7 @@ def foresee(
     acceleration: Tensor | float,
     first: Tensor,
     dt: float,
-) -> BodyMotion:
+) -> PredictedBodyMotion:
     """Return where bodies would go in a substep without contact.
 
     Args:
@@ -275,7 +277,7 @@ def foresee(
         turn = turn + _is(bodies, "kinematic", state.pos) * turn_between(
             state.quat, _spread(bodies, targets.quat, state.quat)
         )
-    return BodyMotion(bodies, params, state, dt, change, turn, scale / params.mass, scale / params.inertia)
+    return PredictedBodyMotion(bodies, params, state, dt, change, turn, scale / params.mass, scale / params.inertia)
 
 
 def spin(quat: Tensor, inertia: Tensor, omega: Tensor, dt: float) -> tuple[Tensor, Tensor]:
@@ -301,11 +303,11 @@ def spin(quat: Tensor, inertia: Tensor, omega: Tensor, dt: float) -> tuple[Tenso
     return quat, torch.cat(world(axes(quat), [a / m for a, m in zip(p, moments, strict=True)]), -1)
 
 
-def advance(motion: BodyMotion, targets: BodyTargets, push: Push) -> BodyState:
+def advance(motion: PredictedBodyMotion, targets: BodyTargets, push: ContactForces) -> BodyState:
     """Advance bodies by a substep.
 
     Args:
-        motion: what `foresee` returned.
+        motion: what `predict_free_motion` returned.
         targets: where kinematic bodies are at the end of the substep.
         push: what contact exerts.
     """
@@ -323,7 +325,7 @@ def advance(motion: BodyMotion, targets: BodyTargets, push: Push) -> BodyState:
     return BodyState(pos, quat, change / dt * shared, free * half * omega + (1 - free) * motion.turn / dt)
 
 
-def place(solids: Sequence[Solid], like: Tensor) -> tuple[tuple[Body, ...], BodyParams, BodyState]:
+def place(solids: Sequence[RigidBody], like: Tensor) -> tuple[tuple[Body, ...], BodyParams, BodyState]:
     """Return the static side, the numbers and the state of bodies, of the dtype and device of `like`."""
     bodies, rows = [], []
     for k, solid in enumerate(solids):
@@ -347,7 +349,7 @@ def place(solids: Sequence[Solid], like: Tensor) -> tuple[tuple[Body, ...], Body
     return tuple(bodies), BodyParams(**packed), BodyState(**state)
 
 
-def _described(solid: Solid, name: str, like: Tensor) -> tuple[Body, dict[str, Tensor]]:
+def _described(solid: RigidBody, name: str, like: Tensor) -> tuple[Body, dict[str, Tensor]]:
     """Return the static side of a solid and its numbers, shape (..., C) each."""
 
     def need(ok: bool, sentence: str) -> None:

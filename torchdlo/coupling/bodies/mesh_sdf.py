@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from torchdlo.coupling.bodies import shape_sdf, triangles
-from torchdlo.coupling.bodies.dynamics import Solid
+from torchdlo.coupling.bodies.dynamics import RigidBody
 from torchdlo.errors import InputError
 from torchdlo.files import write_atomically
 from torchdlo.physics.linalg import rotation
@@ -59,13 +59,13 @@ class MeshShape:
     faces: Tensor
     """Vertices of the triangles, outwards oriented [-], int64, shape (F, 3)."""
 
-    def solid(self, pos: Any = (0.0, 0.0, 0.0), quat: Any = (1.0, 0.0, 0.0, 0.0), **fields: Any) -> Solid:
+    def solid(self, pos: Any = (0.0, 0.0, 0.0), quat: Any = (1.0, 0.0, 0.0, 0.0), **fields: Any) -> RigidBody:
         """Return a body of this shape.
 
         Args:
             pos: where the origin of the file stands [m], shape (..., 3).
             quat: how the axes of the file are turned, (w, x, y, z), shape (..., 4).
-            fields: other fields of `Solid`, such as density or mass.
+            fields: other fields of `RigidBody`, such as density or mass.
         """
         pos, quat = (torch.as_tensor(x, dtype=self.grid.dtype) for x in (pos, quat))
         quat = quat / quat.norm(dim=-1, keepdim=True)
@@ -76,7 +76,7 @@ class MeshShape:
             fields.setdefault("inertia", mass.unsqueeze(-1) * self.moments)
         stands = pos + rotation.rotate(quat, self.centre.expand_as(pos))
         turned = rotation.multiply(quat, self.axes.expand_as(quat))
-        return Solid("mesh", self.size, stands, turned, grid=self.grid, balls=self.balls, **fields)
+        return RigidBody("mesh", self.size, stands, turned, grid=self.grid, balls=self.balls, **fields)
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torchdlo.coupling.bodies import shape_sdf
-from torchdlo.coupling.bodies.dynamics import Body, BodyMotion, conjugate
+from torchdlo.coupling.bodies.dynamics import Body, PredictedBodyMotion, conjugate
 from torchdlo.physics import tree
 from torchdlo.physics.linalg.numerics import dot, safe_norm, tiny
 from torchdlo.physics.linalg.rotation import rotate
@@ -128,7 +128,7 @@ def _about_best(still: _Line, low: float, high: float) -> tuple[Tensor, Tensor]:
     return left.clamp(min=low), right.clamp(max=high)
 
 
-def find(view: View, motion: BodyMotion, pieces: int) -> EdgePoints:
+def find(view: View, motion: PredictedBodyMotion, pieces: int) -> EdgePoints:
     """Return the points of all edges that may touch each body.
 
     Args:

@@ -1,7 +1,7 @@
 """Signed distances of solids in closed form, their outward normals, volumes and moments of inertia.
 
 Every shape stands in the frame of its body: centre of mass at the origin, principal axes along x, y, z. Distances are
-exact (of length 1 in slope) outside and inside, negative inside. Sizes are tensors, so that they may be learned.
+exact (of length 1 in gradient) outside and inside, negative inside. Sizes are tensors, so that they may be learned.
 
 Round shapes are all points within a radius of a core (a point, a segment, a circle, an arc); their normal points away
 from the nearest point of the core. Box, cylinder and cone have faces: inside, the nearest face decides, outside the
@@ -79,17 +79,17 @@ def _cylinder(size: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
 def _cone(size: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
     radius, height = size[..., :1], size[..., 1:2]
     across, out = _unit(p[..., :2], 0)
-    # From the rim of the base: `side` is beyond the slope, `along` up the slope, `below` beyond the base.
-    slope = (radius.square() + height.square()).sqrt()
+    # From the rim of the base: `side` is beyond the gradient, `along` up the gradient, `below` beyond the base.
+    gradient = (radius.square() + height.square()).sqrt()
     x, z = across - radius, p[..., 2:] + height / 4
-    side, along, below = (x * height + z * radius) / slope, (z * height - x * radius) / slope, -z
+    side, along, below = (x * height + z * radius) / gradient, (z * height - x * radius) / gradient, -z
     to_apex, from_apex = _unit(torch.cat(torch.broadcast_tensors(across, z - height), -1), 1)
     to_rim, from_rim = _unit(torch.cat(torch.broadcast_tensors(x, z), -1), 0)
-    slanted = torch.cat([height, radius], -1) / slope
+    slanted = torch.cat([height, radius], -1) / gradient
     down = p.new_tensor([0.0, -1.0])
     outside = torch.maximum(side, below) > 0
     by_side = (side > 0) & (along >= 0)
-    at_apex, at_rim = by_side & (along > slope), outside & ~by_side & (x > 0)
+    at_apex, at_rim = by_side & (along > gradient), outside & ~by_side & (x > 0)
     face = torch.where(outside, by_side, side > below)
     distance = torch.where(at_apex, to_apex, torch.where(at_rim, to_rim, torch.where(face, side, below)))
     normal = torch.where(at_apex, from_apex, torch.where(at_rim, from_rim, torch.where(face, slanted, down)))

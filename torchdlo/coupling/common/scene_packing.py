@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from torchdlo.coupling.bodies import shape_sdf
-from torchdlo.coupling.bodies.dynamics import BodyMotion
+from torchdlo.coupling.bodies.dynamics import PredictedBodyMotion
 from torchdlo.physics.kernels import native
 
 _OPTIONS = ("-fno-math-errno", "-fno-trapping-math", "-Wno-psabi")
@@ -89,12 +89,12 @@ def logical(x: Tensor, batch: Sequence[int]) -> Tensor:
     return x.permute(*range(2, x.dim()), 1, 0)
 
 
-def kinds(motion: BodyMotion) -> list[int]:
+def kinds(motion: PredictedBodyMotion) -> list[int]:
     """Return the shapes of bodies by their numbers in the kernels."""
     return [tuple(shape_sdf.SIZES).index(b.shape) for b in motion.bodies]
 
 
-def measures(motion: BodyMotion) -> tuple[Tensor, list[Tensor]]:
+def measures(motion: PredictedBodyMotion) -> tuple[Tensor, list[Tensor]]:
     """Return how far in x shapes are from the centres of mass, and four numbers of their sizes, shape (..., K, C).
 
     The size of a ring ends in cosine and sine of half its arc.
@@ -106,24 +106,24 @@ def measures(motion: BodyMotion) -> tuple[Tensor, list[Tensor]]:
     return torch.where(ring, shape_sdf.ring_centre(size), none), [size[..., :2], third, fourth]
 
 
-def alike(motion: BodyMotion) -> bool:
+def alike(motion: PredictedBodyMotion) -> bool:
     """Return whether meshes are the same in all scenes, and not learned."""
     meshed = any(b.shape == "mesh" for b in motion.bodies)
     parts = (motion.params.grid, motion.params.balls)
     return not meshed or all(x.shape[:-2].numel() == 1 and not x.requires_grad for x in parts)
 
 
-def sampled(motion: BodyMotion) -> tuple[Tensor, list[int]]:
+def sampled(motion: PredictedBodyMotion) -> tuple[Tensor, list[int]]:
     """Return the grids of all bodies, shape (K, n), and the cells of each in x, y and z, 0 where there is none."""
     return _rows(motion, motion.params.grid), [n for b in motion.bodies for n in (b.cells or (0, 0, 0))]
 
 
-def inscribed(motion: BodyMotion) -> tuple[Tensor, list[int]]:
+def inscribed(motion: PredictedBodyMotion) -> tuple[Tensor, list[int]]:
     """Return the balls within all bodies that stand for meshes, shape (K, 4 P), and how many each has."""
     return _rows(motion, motion.params.balls), [b.balls for b in motion.bodies]
 
 
-def _rows(motion: BodyMotion, x: Tensor) -> Tensor:
+def _rows(motion: PredictedBodyMotion, x: Tensor) -> Tensor:
     """Return what is alike in all scenes, (..., K, n), as (K, n)."""
     if not any(b.shape == "mesh" for b in motion.bodies):
         return x.new_zeros(len(motion.bodies), 0)

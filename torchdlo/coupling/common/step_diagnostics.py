@@ -17,7 +17,7 @@ SHORT = 0.05
 """By what share of its length an edge may be too short before it counts; lengths are kept to 1e-5 and better."""
 
 
-def survey(scene: Any, params: Any, state: Any, start: Any, control: Any) -> Any:
+def broad_phase(scene: Any, params: Any, state: Any, start: Any, control: Any) -> Any:
     """Return the parameters with what effects look up once per step among their numbers: which edges can touch.
 
     Args:
@@ -28,7 +28,7 @@ def survey(scene: Any, params: Any, state: Any, start: Any, control: Any) -> Any
         control: where held parts are at the end of the step.
     """
     with torch.no_grad():
-        carried = (control.pos - start.pos) * control.grip.get("vertices", 1.0)
+        carried = (control.pos - start.pos) * control.attachment_weight.get("vertices", 1.0)
         leaves = tree.leaves((params, state.rods, carried))
         batch = torch.broadcast_shapes(*(x.shape[:-2] for x in leaves))
         pos, vel = (x.expand(*batch, *x.shape[-2:]) for x in (state.rods.pos, state.rods.vel))
@@ -36,7 +36,7 @@ def survey(scene: Any, params: Any, state: Any, start: Any, control: Any) -> Any
         changed = altered(scene.effects, scene.topology, params.rods, params.effects)
         view = rod.view(scene.topology, changed, there, scene.dt)
         carried = carried.expand(*batch, -1, -1)
-        found = {e.name: e.survey(view, carried) for e in scene.effects if e.reacts}
+        found = {e.name: e.broad_phase(view, carried) for e in scene.effects if e.is_contact}
     return tree.replace(params, effects=params.effects | {n: params.effects[n] | given for n, given in found.items()})
 
 
@@ -51,8 +51,8 @@ def missed(scene: Any, params: Any, rods: RodState, before: Tensor) -> Tensor:
     """
     contact, short = before.split((2, 1), -1)
     for e in scene.effects:
-        if e.reacts:
-            contact = torch.maximum(contact, e.shortfall(rods.pos, params.effects[e.name]))
+        if e.is_contact:
+            contact = torch.maximum(contact, e.capacity_overflow(rods.pos, params.effects[e.name]))
     if scene.constrained:
         short = torch.maximum(short, _shortened(scene, params, rods))
     # A state may have been given a batch in some of its parts only.
@@ -63,7 +63,7 @@ def missed(scene: Any, params: Any, rods: RodState, before: Tensor) -> Tensor:
 @torch.no_grad()
 def _shortened(scene: Any, params: Any, rods: RodState) -> Tensor:
     """Return by what share of its length an edge is too short, 0 where it is by less than `SHORT`, (..., 1, 1)."""
-    held, after = set(scene.held_vertices), scene.topology.successor()
+    held, after = set(scene.prescribed_vertices), scene.topology.successor()
     # Hands that hold both ends of an edge set its length.
     solved = [m * (not {k, after[k]} <= held) for k, m in enumerate(scene.topology.edge_mask())]
     changed = altered(scene.effects, scene.topology, params.rods, params.effects)

@@ -1,8 +1,8 @@
 """Which nodes of the grid are near rigid bodies as a C++ kernel.
 
-The same choice as tensor operations in `body_matter`, which are used on a GPU, where there is no C++ compiler, and for
-meshes that differ from scene to scene or are learned. The kernel passes over nodes without mass. It has no derivative,
-as no choice has.
+The same choice as tensor operations in `body_mpm_coupling`, which are used on a GPU, where there is no C++ compiler,
+and for meshes that differ from scene to scene or are learned. The kernel passes over nodes without mass. It has no
+derivative, as no choice has.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from torchdlo.coupling.bodies.dynamics import BodyMotion
+from torchdlo.coupling.bodies.dynamics import PredictedBodyMotion
 from torchdlo.coupling.common import scene_packing
 from torchdlo.coupling.common.vector_components import axes
 from torchdlo.coupling.mpm.particles import Grid
@@ -54,7 +54,7 @@ scene_packing.operator(
 )
 
 
-def fits(motion: BodyMotion) -> bool:
+def fits(motion: PredictedBodyMotion) -> bool:
     """Return whether the kernel can do what these bodies need."""
     like = motion.state.pos
     return ready(like.device.type, like.dtype) and scene_packing.alike(motion)
@@ -62,7 +62,7 @@ def fits(motion: BodyMotion) -> bool:
 
 @torch.no_grad()
 def choose(
-    motion: BodyMotion, grid: Grid, nodes: Nodes, batch: Sequence[int], reach: float, room: int
+    motion: PredictedBodyMotion, grid: Grid, nodes: Nodes, batch: Sequence[int], reach: float, room: int
 ) -> tuple[Tensor, Tensor]:
     """Return the numbers of the nodes nearest to bodies (B, R), and how many found no room (B, 1); no derivative.
 

@@ -40,14 +40,14 @@ import torch
 from torch import Tensor
 
 from torchdlo.coupling.bodies import shape_sdf
-from torchdlo.coupling.bodies.dynamics import BodyMotion, conjugate
+from torchdlo.coupling.bodies.dynamics import PredictedBodyMotion, conjugate
 from torchdlo.coupling.common.coulomb_friction import rub
 from torchdlo.coupling.mpm import body_broad_phase_op
 from torchdlo.coupling.mpm.particles import Grid
-from torchdlo.coupling.mpm.rod_coupling_effect import Foreseen, Touched
+from torchdlo.coupling.mpm.rod_coupling_effect import PredictedParticles, TouchedParticles
 from torchdlo.coupling.mpm.substep import Nodes, places
 from torchdlo.physics import tree
-from torchdlo.physics.effects.base import Effect, Push
+from torchdlo.physics.effects.base import ContactForces, Effect
 from torchdlo.physics.linalg.numerics import cross, dot, safe_norm
 from torchdlo.physics.linalg.rotation import rotate
 
@@ -56,7 +56,7 @@ RAMP = 0.5
 
 
 @dataclass(frozen=True)
-class BodyMatter(Effect):
+class BodyMpmCoupling(Effect):
     """Rigid bodies and matter push each other and rub with the bodies' Coulomb friction.
 
     It acts once per substep, after all other contact: on what ropes and other bodies have left of both.
@@ -73,7 +73,7 @@ class BodyMatter(Effect):
     planes: bool = True
     """Whether planes take part. Not where walls of the box stand for them, which cost less."""
 
-    name: ClassVar[str] = "body_matter"
+    name: ClassVar[str] = "body_mpm_coupling"
     kind: ClassVar[str] = "force"
 
     def __post_init__(self) -> None:
@@ -81,7 +81,9 @@ class BodyMatter(Effect):
             if not getattr(self, name) >= least:
                 raise ValueError(f"BodyMatter: {name} is {getattr(self, name)}; expected at least {least}")
 
-    def meet(self, motion: BodyMotion, matter: Foreseen, push: Push) -> Push:
+    def couple_bodies_to_particles(
+        self, motion: PredictedBodyMotion, material_points: PredictedParticles, push: ContactForces
+    ) -> ContactForces:
         """Return what is exerted with the forces of this effect.
 
         Args:
@@ -92,11 +94,11 @@ class BodyMatter(Effect):
         part = [k for k, body in enumerate(motion.bodies) if self.planes or body.shape != "plane"]
         if not part:
             return push
-        touched = Touched(matter.nodes, 0.0) if push.matter == () else push.matter
-        batch = matter.particles.pos.shape[:-2]
+        touched = TouchedParticles(material_points.nodes, 0.0) if push.material_points == () else push.material_points
+        batch = material_points.particles.pos.shape[:-2]
         met, some = motion.pushed(push), len(part) < len(motion.bodies)
         met = met.only(part) if some else met
-        impulse, torque, nodes, lost = exchange(self, matter.grid, touched.nodes, met, batch)
+        impulse, torque, nodes, lost = exchange(self, material_points.grid, touched.nodes, met, batch)
 
         def force(x: Tensor) -> Tensor:
             x = (x / motion.dt).reshape(*batch, len(part), 3)
@@ -109,7 +111,7 @@ class BodyMatter(Effect):
             push,
             body_force=push.body_force + force(impulse),
             body_torque=push.body_torque + force(torque),
-            matter=Touched(nodes, touched.lost + lost.to(impulse.dtype)),
+            material_points=TouchedParticles(nodes, touched.lost + lost.to(impulse.dtype)),
         )
 
 
@@ -161,17 +163,17 @@ class _Pairs:
     """Part of an impulse that acts on matter in this substep [1], shape (B or 1, 1, 1, 1)."""
 
 
-def _solids(motion: BodyMotion, batch: Sequence[int]) -> _Solids:
+def _solids(motion: PredictedBodyMotion, batch: Sequence[int]) -> _Solids:
     def wide(x: Tensor) -> Tensor:
         return x.expand(*batch, *x.shape[-2:]).reshape(math.prod(batch), x.shape[-2], 1, x.shape[-1])
 
     state, params, dt = motion.state, motion.params, motion.dt
-    rates = (motion.change / dt, motion.turn / dt, motion.mobility / dt**2, motion.agility / dt**2)
+    rates = (motion.change / dt, motion.turn / dt, motion.mobility / dt**2, motion.inverse_inertia / dt**2)
     fields = (state.pos, state.quat, *rates, params.size, params.grid, params.mu_s, params.mu_k)
     return _Solids(*(wide(x) for x in fields))
 
 
-def _probe(motion: BodyMotion, solids: _Solids, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _probe(motion: PredictedBodyMotion, solids: _Solids, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Return distances [m] (B, K, R, 1), normals and arms [m] (B, K, R, 3) of points (B, 1, R, 3) at bodies."""
     arm = points - solids.pos
     local = rotate(conjugate(solids.quat), arm)
@@ -182,7 +184,7 @@ def _probe(motion: BodyMotion, solids: _Solids, points: Tensor) -> tuple[Tensor,
     return distance, rotate(solids.quat, normal), arm
 
 
-def _chosen(motion: BodyMotion, solids: _Solids, nodes: Nodes, points: Tensor, reach: float, room: int):
+def _chosen(motion: PredictedBodyMotion, solids: _Solids, nodes: Nodes, points: Tensor, reach: float, room: int):
     """Return the numbers of the nodes nearest to bodies (B, R), and how many found no room (B, 1); no derivative."""
     with torch.no_grad():
         off = _probe(motion, solids, points.unsqueeze(1))[0].amin(1)[..., 0]
@@ -194,7 +196,7 @@ def _chosen(motion: BodyMotion, solids: _Solids, nodes: Nodes, points: Tensor, r
 
 
 def _pairs(
-    effect: BodyMatter, motion: BodyMotion, solids: _Solids, nodes: Nodes, points: Tensor, spacing: float
+    effect: BodyMpmCoupling, motion: PredictedBodyMotion, solids: _Solids, nodes: Nodes, points: Tensor, spacing: float
 ) -> _Pairs:
     distance, normal, arm = _probe(motion, solids, points.unsqueeze(1))
     mass = nodes.mass[:, None, :, None]
@@ -254,7 +256,7 @@ def _felt(pairs: _Pairs, u: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def exchange(
-    effect: BodyMatter, grid: Grid, nodes: Nodes, motion: BodyMotion, batch: Sequence[int]
+    effect: BodyMpmCoupling, grid: Grid, nodes: Nodes, motion: PredictedBodyMotion, batch: Sequence[int]
 ) -> tuple[Tensor, Tensor, Nodes, Tensor]:
     """Return impulses [N s] and angular impulses [N m s] on bodies (B, K, 3), the nodes after it, and what was lost.
 
@@ -283,9 +285,11 @@ def exchange(
     return push.squeeze(2), torque.squeeze(2), tree.replace(nodes, vel=vel), lost
 
 
-def meet(effects: Sequence[Effect], motion: BodyMotion, matter: Foreseen, push: Push) -> Push:
+def couple_bodies_to_particles(
+    effects: Sequence[Effect], motion: PredictedBodyMotion, material_points: PredictedParticles, push: ContactForces
+) -> ContactForces:
     """Return what is exerted once bodies and matter have met; `push` itself if no effect lets them do so."""
     for effect in effects:
-        if isinstance(effect, BodyMatter):
-            push = effect.meet(motion, matter, push)
+        if isinstance(effect, BodyMpmCoupling):
+            push = effect.couple_bodies_to_particles(motion, material_points, push)
     return push

@@ -43,7 +43,7 @@ _YOUNGS = Param(1e5, 1e2, 1e9, "Pa", "log", None, "Young's modulus.")
 _POISSON = Param(0.3, 0.0, 0.49, "1", "linear", None, "Poisson's ratio.")
 
 
-class Law(ABC):
+class ConstitutiveModel(ABC):
     """How matter answers to deformation. Subclasses are frozen dataclasses and final."""
 
     name: ClassVar[str]
@@ -92,7 +92,7 @@ def _hooke(first: Tensor, mu: Tensor, h: Symmetric) -> Symmetric:
 
 
 @dataclass(frozen=True)
-class Elastic(Law):
+class Elastic(ConstitutiveModel):
     """Fixed-corotated elasticity (Stomakhin et al. 2012, section 3.2, doi:10.2312/SCA/SCA12/025-032).
 
     tau = 2 mu (F - R) F^T + lambda J (J - 1) I. With the left stretch V, F = V R, the first term is 2 mu (V^2 - V):
@@ -117,7 +117,7 @@ class Elastic(Law):
 
 
 @dataclass(frozen=True)
-class Plastic(Law):
+class Plastic(ConstitutiveModel):
     """Hencky elasticity with von Mises yield and no hardening: putty, clay.
 
     tau = 2 mu dev(h) + K tr(h) I with h = log(V). Where |dev tau| > sqrt(2/3) yield_stress, dev(h) is scaled back
@@ -153,7 +153,7 @@ class Plastic(Law):
 
 
 @dataclass(frozen=True)
-class Sand(Law):
+class Sand(ConstitutiveModel):
     """Dry sand: Hencky elasticity with Drucker-Prager yield (Klar et al. 2016, doi:10.1145/2897824.2925906).
 
     |dev tau| <= -alpha (3 lambda + 2 mu) tr(h), alpha = sqrt(2/3) 2 sin(phi) / (3 - sin(phi)), and no tension. What it
@@ -172,14 +172,14 @@ class Sand(Law):
         """Return the stress on or inside the cone."""
         first, mu = lame(numbers)
         sine = torch.sin(numbers["friction_angle"])
-        slope = math.sqrt(2 / 3) * 2 * sine / (3 - sine)
+        gradient = math.sqrt(2 / 3) * 2 * sine / (3 - sine)
         trial = hencky(deform(strain, change))
         volume = trace(trial) + history
         h = add_diagonal(trial, history / 3)
         dev = deviator(h)
         size = _norm(dev)
         pressed = volume < 0
-        most = -slope * (3 * first + 2 * mu) / (2 * mu) * volume
+        most = -gradient * (3 * first + 2 * mu) / (2 * mu) * volume
         slides = size > most
         share = torch.where(pressed & slides, most / torch.where(slides, size, 1.0), 1.0)
         share = torch.where(pressed, share, 0.0)
@@ -193,7 +193,7 @@ class Sand(Law):
 
 
 @dataclass(frozen=True)
-class Liquid(Law):
+class Liquid(ConstitutiveModel):
     """Weakly compressible liquid: Tait's equation of state p = bulk / n (J^-n - 1), n = 7, and viscosity.
 
     Monaghan 1994, doi:10.1006/jcph.1994.1034. J, the volume over that at rest, is its history, less 1. Pressure may be

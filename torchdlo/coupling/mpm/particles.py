@@ -10,7 +10,7 @@ from typing import TypeVar
 import torch
 from torch import Tensor
 
-from torchdlo.coupling.mpm.constitutive_models import Law
+from torchdlo.coupling.mpm.constitutive_models import ConstitutiveModel
 from torchdlo.physics import tree
 from torchdlo.physics.effects.base import Values
 from torchdlo.physics.execution import replay
@@ -30,7 +30,7 @@ class Group:
     """Particles of one law, next to each other on the particle axis."""
 
     name: str
-    law: Law
+    law: ConstitutiveModel
     count: int
 
 
@@ -85,7 +85,7 @@ class Grid:
 
 
 @dataclass(frozen=True)
-class Medium:
+class MpmDomain:
     """The static side of all matter of a scene; hashable, without tensors."""
 
     grid: Grid
@@ -106,7 +106,7 @@ class Medium:
 
 
 @tree.struct
-class Matter:
+class ParticleParams:
     """Numbers of matter that stay the same along a rollout."""
 
     volume: Tensor
@@ -135,12 +135,12 @@ class Particles:
 
 
 @dataclass(frozen=True)
-class Blob:
+class ParticleBlock:
     """Some matter, as one hands it in."""
 
     positions: Tensor
     """Where particles are [m], shape (..., n, 3)."""
-    law: Law
+    law: ConstitutiveModel
     volume: float | Tensor
     """Volume of each particle [m^3], one number or shape (..., n)."""
     velocity: Tensor | None = None
@@ -178,11 +178,13 @@ def stored(x: Tensor) -> Tensor:
 
 def laid_out(state: T) -> T:
     """Return the state of a scene, stored to the last stride as compiled steps expect it; matter in its own order."""
-    particles = replay.laid_out(state.matter, rows_of, rows_of)
-    return tree.replace(replay.laid_out(tree.replace(state, matter=())), matter=particles)
+    particles = replay.laid_out(state.material_points, rows_of, rows_of)
+    return tree.replace(replay.laid_out(tree.replace(state, material_points=())), material_points=particles)
 
 
-def assemble(blobs: Sequence[Blob], grid: Grid, *, friction: float | Tensor = 0.3) -> tuple[Medium, Matter, Particles]:
+def assemble(
+    blobs: Sequence[ParticleBlock], grid: Grid, *, friction: float | Tensor = 0.3
+) -> tuple[MpmDomain, ParticleParams, Particles]:
     """Put matter on one particle axis.
 
     Args:
@@ -210,10 +212,10 @@ def assemble(blobs: Sequence[Blob], grid: Grid, *, friction: float | Tensor = 0.
     zero = pos.new_zeros(*batch, 9, pos.shape[-2]).mT
     particles = Particles(pos, vel, zero, zero[..., :6].mT.clone().mT, zero[..., :1].mT.clone().mT)
     rub = torch.as_tensor(friction, dtype=like.dtype, device=like.device)[..., None, None]
-    return Medium(grid, tuple(groups)), Matter(volume, rub, laws), particles
+    return MpmDomain(grid, tuple(groups)), ParticleParams(volume, rub, laws), particles
 
 
-def _numbers(blob: Blob, like: Tensor) -> Values:
+def _numbers(blob: ParticleBlock, like: Tensor) -> Values:
     declared = {**blob.law.params, "density": blob.law.density}
     given = {n: torch.as_tensor(v, dtype=like.dtype, device=like.device) for n, v in blob.numbers.items()}
     return {
@@ -222,7 +224,7 @@ def _numbers(blob: Blob, like: Tensor) -> Values:
     }
 
 
-def _check(name: str, blob: Blob, grid: Grid) -> None:
+def _check(name: str, blob: ParticleBlock, grid: Grid) -> None:
     x = blob.positions
     if x.dim() < 2 or x.shape[-1] != 3 or not x.is_floating_point():
         raise ValueError(f"{name}: positions are {tuple(x.shape)}; expected a float tensor (..., n, 3) in metres")

@@ -13,16 +13,16 @@ from torch import Tensor
 
 from torchdlo.coupling.bodies.dynamics import BodyState
 from torchdlo.coupling.mpm import substep as mpm
-from torchdlo.coupling.mpm.particles import Grid, Matter, Medium, Particles, stored
+from torchdlo.coupling.mpm.particles import Grid, MpmDomain, ParticleParams, Particles, stored
 from torchdlo.coupling.mpm.rod_coupling_solver import Lines, Touch, block_size, exchange, near_size
 from torchdlo.coupling.mpm.substep import Nodes
 from torchdlo.physics import tree
-from torchdlo.physics.effects.base import Effect, Motion, Param, Push, Values
+from torchdlo.physics.effects.base import ContactForces, Effect, Param, PredictedMotion, Values
 from torchdlo.physics.rod.kinematics import RodParams, RodState, View
 
 
 @dataclass(frozen=True)
-class Foreseen:
+class PredictedParticles:
     """Matter in the middle of a substep, before ropes touch it."""
 
     grid: Grid
@@ -31,7 +31,7 @@ class Foreseen:
 
 
 @tree.struct
-class Touched:
+class TouchedParticles:
     """What ropes leave of it."""
 
     nodes: Nodes
@@ -40,7 +40,7 @@ class Touched:
 
 
 @dataclass(frozen=True)
-class RodMatter(Effect):
+class RodMpmCoupling(Effect):
     """Ropes and matter push each other and rub with Coulomb friction, see `exchange`."""
 
     sweeps: int = 3
@@ -54,9 +54,9 @@ class RodMatter(Effect):
     near: int = 0
     """Nodes of them that there is room for where an edge is the nearest; 0: found likewise."""
 
-    name: ClassVar[str] = "rod_matter"
+    name: ClassVar[str] = "rod_mpm_coupling"
     kind: ClassVar[str] = "force"
-    reacts: ClassVar[bool] = True
+    is_contact: ClassVar[bool] = True
     params: ClassVar[dict[str, Param]] = {
         "mu": Param(0.3, 0.0, 2.0, "1", "linear", 0.0, "Coefficient of friction between ropes and matter."),
     }
@@ -66,10 +66,10 @@ class RodMatter(Effect):
             if not getattr(self, name) >= least:
                 raise ValueError(f"RodMatter: {name} is {getattr(self, name)}; expected at least {least}")
 
-    def react(self, view: View, motion: Motion, values: Values) -> Push:
+    def solve_contact(self, view: View, motion: PredictedMotion, values: Values) -> ContactForces:
         """Return the forces on vertices [N] and what they leave of the matter."""
         state, topology, dt = view.state, view.topology, view.dt
-        nodes = motion.matter.nodes
+        nodes = motion.material_points.nodes
         batch, size, count = state.pos.shape[:-2], topology.size, nodes.mass.shape[0]
 
         def all_scenes(x: Tensor) -> Tensor:
@@ -85,20 +85,22 @@ class RodMatter(Effect):
             after,
         )
         touch = Touch(self.block, self.room or size, self.sweeps, self.thickness, self.near)
-        impulse, nodes, lost = exchange(motion.matter.grid, nodes, lines, touch, all_scenes(values["mu"]))
+        impulse, nodes, lost = exchange(motion.material_points.grid, nodes, lines, touch, all_scenes(values["mu"]))
         none = impulse.new_zeros(1, 3)
-        return Push((impulse / dt).reshape(*batch, size, 3), none, none, Touched(nodes, lost.to(impulse.dtype)))
+        return ContactForces(
+            (impulse / dt).reshape(*batch, size, 3), none, none, TouchedParticles(nodes, lost.to(impulse.dtype))
+        )
 
 
-def fitted(effects: Sequence[Effect], medium: Medium | None, rods: RodParams) -> tuple[Effect, ...]:
-    """Return the effects with the block of nodes that `RodMatter` needs for these ropes."""
+def fitted(effects: Sequence[Effect], medium: MpmDomain | None, rods: RodParams) -> tuple[Effect, ...]:
+    """Return the effects with the block of nodes that `RodMpmCoupling` needs for these ropes."""
     found = []
     for e in effects:
-        if e.name in ("rod_matter", "body_matter") and medium is None:
+        if e.name in ("rod_mpm_coupling", "body_mpm_coupling") and medium is None:
             raise ValueError(
                 f"scene: {type(e).__name__} is among the effects, but there is no matter; give make(..., matter=...)"
             )
-        if isinstance(e, RodMatter) and not (e.block and e.near):
+        if isinstance(e, RodMpmCoupling) and not (e.block and e.near):
             longest = float((rods.rest.length * rods.rest.edge_mask).max())
             # Edges that stretch by more than a tenth are not seen to their ends.
             sizes = (1.1 * longest, float(rods.material.radius.max()), medium.grid.spacing, e.thickness)
@@ -107,15 +109,19 @@ def fitted(effects: Sequence[Effect], medium: Medium | None, rods: RodParams) ->
     return tuple(found)
 
 
-def _foresee(medium: Medium, matter: Matter, particles: Particles, first: Tensor, dt: float, acceleration) -> Foreseen:
+def _foresee(
+    medium: MpmDomain, material_points: ParticleParams, particles: Particles, first: Tensor, dt: float, acceleration
+) -> PredictedParticles:
     acceleration = torch.as_tensor(acceleration, dtype=particles.pos.dtype, device=particles.pos.device)
     if acceleration.dim() < 2:
         acceleration = acceleration.expand(1, 3)
-    nodes, strained = mpm.to_grid(medium, matter, particles, acceleration, dt, 1 - 0.5 * first)
-    return Foreseen(medium.grid, nodes, strained)
+    nodes, strained = mpm.to_grid(medium, material_points, particles, acceleration, dt, 1 - 0.5 * first)
+    return PredictedParticles(medium.grid, nodes, strained)
 
 
-def foresee(medium: Medium, matter: Matter, particles: Particles, first: Tensor, dt: float):
+def predict_free_motion(
+    medium: MpmDomain, material_points: ParticleParams, particles: Particles, first: Tensor, dt: float
+):
     """Return a function that turns an acceleration into where matter would go in a substep.
 
     Args:
@@ -125,19 +131,24 @@ def foresee(medium: Medium, matter: Matter, particles: Particles, first: Tensor,
         first: 1 in the very first substep, else 0, shape (..., 1, 1).
         dt: substep [s].
     """
-    return partial(_foresee, medium, matter, particles, first, dt)
+    return partial(_foresee, medium, material_points, particles, first, dt)
 
 
 def finish(
-    medium: Medium, matter: Matter, now: Foreseen, push: Push, dt: float, missed: Tensor
+    medium: MpmDomain,
+    material_points: ParticleParams,
+    now: PredictedParticles,
+    push: ContactForces,
+    dt: float,
+    missed: Tensor,
 ) -> tuple[Particles, Tensor]:
     """Return the particles after a substep and what was missed so far, shape (..., 1, 3)."""
     nodes = now.nodes
-    if push.matter != ():
-        nodes, lost = push.matter.nodes, push.matter.lost.detach()
+    if push.material_points != ():
+        nodes, lost = push.material_points.nodes, push.material_points.lost.detach()
         lost = lost.reshape(*missed.shape[:-2], 1, 1)
         missed = torch.maximum(missed, torch.cat([lost, torch.zeros_like(lost), torch.zeros_like(lost)], -1))
-    return mpm.from_grid(medium, matter, now.particles, nodes, dt), missed
+    return mpm.from_grid(medium, material_points, now.particles, nodes, dt), missed
 
 
 def together(

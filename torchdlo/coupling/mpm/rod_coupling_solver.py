@@ -288,9 +288,9 @@ def exchange(grid: Grid, nodes: Nodes, lines: Lines, touch: Touch, friction: Ten
         held = safe_norm(trial)
         rub = trial * torch.where(held > mu * normal, mu * normal / torch.where(held > 0, held, 1.0), 1.0)
         # What would spin the edge about itself, out of all its nodes.
-        hold = (normal * dot(around, around)).sum(2, keepdim=True)
-        spin = dot(rub, around).sum(2, keepdim=True) / torch.where(hold > 0, hold, 1.0)
-        rub = rub - torch.where(hold > 0, normal * spin * around, rub)
+        stationary_control = (normal * dot(around, around)).sum(2, keepdim=True)
+        spin = dot(rub, around).sum(2, keepdim=True) / torch.where(stationary_control > 0, stationary_control, 1.0)
+        rub = rub - torch.where(stationary_control > 0, normal * spin * around, rub)
         impulse = normal * pairs.normal + rub
         given = _exert(pairs, impulse, size)
         vel = nodes.vel + _give((pairs.inverse * impulse).flatten(1, 2), pairs.node, count)

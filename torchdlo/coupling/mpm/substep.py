@@ -17,7 +17,7 @@ from torch import Tensor
 
 from torchdlo.coupling.mpm import p2g_g2p
 from torchdlo.coupling.mpm.grid_boundaries import walls
-from torchdlo.coupling.mpm.particles import Grid, Matter, Medium, Particles, rows_of
+from torchdlo.coupling.mpm.particles import Grid, MpmDomain, ParticleParams, Particles, rows_of
 from torchdlo.physics import tree
 
 COURANT = 0.6
@@ -46,18 +46,20 @@ def flat(x: Tensor) -> Tensor:
     return x.mT.reshape(-1, x.shape[-1], x.shape[-2])
 
 
-def density(medium: Medium, matter: Matter) -> Tensor:
+def density(medium: MpmDomain, material_points: ParticleParams) -> Tensor:
     """Return the density of particles at rest [kg/m^3], shape (..., P, 1)."""
-    parts = [matter.laws[g.name]["density"] for g in medium.groups]
+    parts = [material_points.laws[g.name]["density"] for g in medium.groups]
     lead = torch.broadcast_shapes(*(p.shape[:-2] for p in parts))
     return torch.cat([p.expand(*lead, g.count, 1) for p, g in zip(parts, medium.groups, strict=True)], -2)
 
 
-def deform(medium: Medium, matter: Matter, particles: Particles, dt: float) -> tuple[Tensor, Particles]:
+def deform(
+    medium: MpmDomain, material_points: ParticleParams, particles: Particles, dt: float
+) -> tuple[Tensor, Particles]:
     """Return the Kirchhoff stress [Pa], shape (..., P, 6), and particles deformed by their velocity gradients."""
     stresses, strains, histories = [], [], []
     for group, here in medium.pieces():
-        numbers = {n: v[..., 0] for n, v in matter.laws[group.name].items()}
+        numbers = {n: v[..., 0] for n, v in material_points.laws[group.name].items()}
         # Component by component, as they are stored; so are the derivatives then.
         strain = rows_of(particles.strain)[..., here].unbind(-2)
         change = tuple(dt * row for row in rows_of(particles.affine)[..., here].unbind(-2))
@@ -91,7 +93,12 @@ def places(grid: Grid, nodes: Nodes, chosen: Tensor | None = None) -> Tensor:
 
 
 def to_grid(
-    medium: Medium, matter: Matter, particles: Particles, acceleration: Tensor, dt: float, share: Tensor
+    medium: MpmDomain,
+    material_points: ParticleParams,
+    particles: Particles,
+    acceleration: Tensor,
+    dt: float,
+    share: Tensor,
 ) -> tuple[Nodes, Particles]:
     """Return the grid after inner forces and gravity, and the particles with their new strain.
 
@@ -105,35 +112,42 @@ def to_grid(
     """
     grid, h = medium.grid, medium.grid.spacing
     at, origin = _locate(grid, particles.pos)
-    stress, particles = deform(medium, matter, particles, dt)
-    mass = density(medium, matter) * matter.volume
+    stress, particles = deform(medium, material_points, particles, dt)
+    mass = density(medium, material_points) * material_points.volume
     # Not by an index, whose derivative would be a sum over places.
     rows = rows_of(stress).unbind(-2)
     full = rows_of(torch.stack([rows[k] for k in (0, 3, 4, 3, 1, 5, 4, 5, 2)], -2))
-    # Slopes are per node spacing.
-    slope = h * mass * particles.affine - share * (4 * dt / h) * matter.volume * full
+    # Gradients are per node spacing.
+    gradient = h * mass * particles.affine - share * (4 * dt / h) * material_points.volume * full
     moved = particles.vel + share * dt * acceleration
     said = torch.cat([(mass * moved).mT, mass.expand(*moved.shape[:-1], 1).mT], -2)
-    vel, summed = p2g_g2p.divide(p2g_g2p.spread(at, said.reshape(-1, 4, said.shape[-1]), flat(slope), grid.size))
+    vel, summed = p2g_g2p.divide(p2g_g2p.spread(at, said.reshape(-1, 4, said.shape[-1]), flat(gradient), grid.size))
     return Nodes(at, origin, summed, vel, share.reshape(-1, 1, 1)), particles
 
 
-def from_grid(medium: Medium, matter: Matter, particles: Particles, nodes: Nodes, dt: float) -> Particles:
+def from_grid(
+    medium: MpmDomain, material_points: ParticleParams, particles: Particles, nodes: Nodes, dt: float
+) -> Particles:
     """Return the particles after the substep, moved with the nodes; walls act last."""
-    filled = walls(medium.grid, nodes.origin, nodes.vel, matter.friction)
-    value, slope = p2g_g2p.collect(nodes.at, filled, medium.grid.size)
+    filled = walls(medium.grid, nodes.origin, nodes.vel, material_points.friction)
+    value, gradient = p2g_g2p.collect(nodes.at, filled, medium.grid.size)
     batch = particles.pos.shape[:-2]
     vel = value[:, :3].reshape(*batch, 3, -1).mT
-    affine = (slope * (4 / medium.grid.spacing)).reshape(*batch, 9, -1).mT
+    affine = (gradient * (4 / medium.grid.spacing)).reshape(*batch, 9, -1).mT
     return tree.replace(particles, pos=particles.pos + dt * vel, vel=vel, affine=affine)
 
 
 def advance(
-    medium: Medium, matter: Matter, particles: Particles, acceleration: Tensor, dt: float, share: Tensor
+    medium: MpmDomain,
+    material_points: ParticleParams,
+    particles: Particles,
+    acceleration: Tensor,
+    dt: float,
+    share: Tensor,
 ) -> Particles:
     """Advance matter that touches nothing but the walls by one substep; arguments as in `to_grid`."""
-    nodes, strained = to_grid(medium, matter, particles, acceleration, dt, share)
-    return from_grid(medium, matter, strained, nodes, dt)
+    nodes, strained = to_grid(medium, material_points, particles, acceleration, dt, share)
+    return from_grid(medium, material_points, strained, nodes, dt)
 
 
 def outside(grid: Grid, pos: Tensor) -> Tensor:
@@ -144,11 +158,11 @@ def outside(grid: Grid, pos: Tensor) -> Tensor:
     return lost.sum(-1).to(pos.dtype).reshape(*pos.shape[:-2], 1, 1)
 
 
-def limits(medium: Medium, matter: Matter) -> dict[str, float]:
+def limits(medium: MpmDomain, material_points: ParticleParams) -> dict[str, float]:
     """Return the longest stable substep [s] by the group that limits it."""
     found = {}
     for group in medium.groups:
-        numbers = matter.laws[group.name]
+        numbers = material_points.laws[group.name]
         speed = (group.law.modulus(numbers) / numbers["density"]).max().sqrt()
         found[f"sound in {group.name} ({float(speed):.3g} m/s)"] = COURANT * medium.grid.spacing / float(speed)
         if "viscosity" in numbers and float(numbers["viscosity"].max()) > 0:
@@ -157,9 +171,9 @@ def limits(medium: Medium, matter: Matter) -> dict[str, float]:
     return found
 
 
-def check_step(medium: Medium, matter: Matter, dt: float) -> None:
+def check_step(medium: MpmDomain, material_points: ParticleParams, dt: float) -> None:
     """Raise a `ValueError` that names the limiting term if substeps of `dt` [s] are not stable."""
-    for term, bound in limits(medium, matter).items():
+    for term, bound in limits(medium, material_points).items():
         if not dt < bound:
             raise ValueError(
                 f"matter: a substep of {dt:.3g} s is not stable: {term} allows less than {bound:.3g} s on a grid of "

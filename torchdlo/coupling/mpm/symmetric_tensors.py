@@ -138,14 +138,14 @@ def _rotate(u: Square, s: Symmetric, back: bool) -> Symmetric:
 
 
 def _plainly(
-    e: Symmetric, value: Callable[[Tensor], Tensor], slope: Callable[[Tensor, Tensor], Tensor], least: float | None
+    e: Symmetric, value: Callable[[Tensor], Tensor], gradient: Callable[[Tensor, Tensor], Tensor], least: float | None
 ) -> Symmetric:
     """Return the function of a tensor that acts on its eigenvalues.
 
     Args:
         e: the tensor.
         value: the function of an eigenvalue.
-        slope: its divided difference (f(a) - f(b)) / (a - b), with the derivative where a = b.
+        gradient: its divided difference (f(a) - f(b)) / (a - b), with the derivative where a = b.
         least: eigenvalues below it count as it; None if the function takes all.
     """
     with torch.no_grad():
@@ -159,7 +159,7 @@ def _plainly(
         # x - x.detach() is zero and has the derivative of x.
         change = _rotate(u, tuple(x - y for x, y in zip(e, plain, strict=True)), back=False)
         with torch.no_grad():
-            factors = [slope(l[i], l[j]) for i, j in PAIRS]
+            factors = [gradient(l[i], l[j]) for i, j in PAIRS]
         found = tuple(f + k * c for f, k, c in zip(found, factors, change, strict=True))
     return _rotate(u, found, back=True)
 
@@ -211,16 +211,16 @@ def _isotropic(e: Symmetric, which: str, *formulas) -> Symmetric:
 def stretch(e: Symmetric) -> Symmetric:
     """Return sqrt(I + e) - I."""
 
-    def slope(a: Tensor, b: Tensor) -> Tensor:
+    def gradient(a: Tensor, b: Tensor) -> Tensor:
         return 1 / ((1 + a).sqrt() + (1 + b).sqrt())
 
-    return _isotropic(e, "stretch", lambda l: l / (1 + (1 + l).sqrt()), slope, CRUSHED - 1)
+    return _isotropic(e, "stretch", lambda l: l / (1 + (1 + l).sqrt()), gradient, CRUSHED - 1)
 
 
 def hencky(e: Symmetric) -> Symmetric:
     """Return log(I + e) / 2."""
 
-    def slope(a: Tensor, b: Tensor) -> Tensor:
+    def gradient(a: Tensor, b: Tensor) -> Tensor:
         # log((1+a)/(1+b)) = 2 atanh(z); the quotient atanh(z) / z by its series where z is small.
         z = (a - b) / (2 + a + b)
         z2 = z * z
@@ -228,17 +228,17 @@ def hencky(e: Symmetric) -> Symmetric:
         direct = torch.atanh(torch.where(small, 0.5, z)) / torch.where(small, 0.5, z)
         return torch.where(small, 1 + z2 * (1 / 3 + z2 * (1 / 5 + z2 * (1 / 7 + z2 / 9))), direct) / (2 + a + b)
 
-    return _isotropic(e, "hencky", lambda l: 0.5 * torch.log1p(l), slope, CRUSHED - 1)
+    return _isotropic(e, "hencky", lambda l: 0.5 * torch.log1p(l), gradient, CRUSHED - 1)
 
 
 def from_hencky(h: Symmetric) -> Symmetric:
     """Return exp(2 h) - I."""
 
-    def slope(a: Tensor, b: Tensor) -> Tensor:
+    def gradient(a: Tensor, b: Tensor) -> Tensor:
         d = a - b
         small = d.abs() < 1e-2
         d2 = d * d
         direct = torch.sinh(d) / torch.where(small, 1.0, d)
         return 2 * torch.exp(a + b) * torch.where(small, 1 + d2 * (1 / 6 + d2 * (1 / 120 + d2 / 5040)), direct)
 
-    return _isotropic(h, "from_hencky", lambda l: torch.expm1(2 * l), slope, None)
+    return _isotropic(h, "from_hencky", lambda l: torch.expm1(2 * l), gradient, None)

@@ -1,8 +1,8 @@
 """Grasps: vertices and edges of ropes that follow tools from a moment on, until they are let go.
 
 A welded part keeps its place in the frame of its tool, as it was when the hand closed. Which parts can be held at all
-is static, `Scene.held_vertices` and `Scene.held_edges`; which are, may differ from scene to scene and change at any
-step.
+is static, `Scene.prescribed_vertices` and `Scene.prescribed_edges`; which are, may differ from scene to scene and
+change at any step.
 Holding an edge as well as its two vertices prescribes twist.
 """
 
@@ -59,7 +59,10 @@ def _with_world(tools: Pose) -> Pose:
 
 
 def _check(scene: Any, hands: Hands, tools: Pose) -> None:
-    wanted, given = (len(scene.held_vertices), len(scene.held_edges)), (len(hands.vertices), len(hands.edges))
+    wanted, given = (
+        (len(scene.prescribed_vertices), len(scene.prescribed_edges)),
+        (len(hands.vertices), len(hands.edges)),
+    )
     if given != wanted:
         raise ValueError(
             f"hands: tools are given for {given[0]} vertices and {given[1]} edges; the scene can hold {wanted[0]} and "
@@ -122,10 +125,10 @@ def felt(scene: Any, hands: Hands, state: Any, tools: Pose) -> tuple[Tensor, Ten
         Means over the step, shape (..., T, 3) each. They are the opposite of the momentum that held parts were given
         beyond what all other loads give.
     """
-    rods, slots = state.rods, list(scene.held_edges)
+    rods, slots = state.rods, list(scene.prescribed_edges)
     frames = _with_world(tools)
     push = -state.reaction.force
-    lever = rods.pos[..., list(scene.held_vertices), :] - frames.pos[..., list(hands.vertices), :]
+    lever = rods.pos[..., list(scene.prescribed_vertices), :] - frames.pos[..., list(hands.vertices), :]
     mask = rods.pos.new_tensor(scene.topology.edge_mask()).unsqueeze(-1)
     along = rod.edge_vectors(scene.topology, rods.pos, mask)[..., slots, :]
     couple = -state.reaction.couple * along / along.norm(dim=-1, keepdim=True)

@@ -41,7 +41,7 @@ STILL = 1e-9
 
 
 @dataclass(frozen=True)
-class Search:
+class IkSearch:
     """How hard to look; static."""
 
     steps: int = 20
@@ -223,7 +223,7 @@ def _newton(problem: _Problem, joints: Tensor, here: _Here) -> tuple[Tensor, Ten
     return parts(_stopped(problem, joints, change))
 
 
-def _descend(problem: _Problem, joints: Tensor, search: Search) -> Tensor:
+def _descend(problem: _Problem, joints: Tensor, search: IkSearch) -> Tensor:
     """Return joint positions after all steps, shape (B, J)."""
 
     for pull in [search.pull] * search.steps + [0.0] * search.closing:
@@ -253,7 +253,7 @@ def _spread(problem: _Problem, start: Tensor, count: int) -> Tensor:
     return _bounded(problem, whole).reshape(-1, n)
 
 
-def _best(problem: _Problem, found: Tensor, search: Search) -> Tensor:
+def _best(problem: _Problem, found: Tensor, search: IkSearch) -> Tensor:
     """Return of several answers (S, B, J) the one that is there and nearest to the posture, or else nearest to it."""
     repeated = _repeated(problem, len(found))
     missing = _missing(_look(repeated, found.flatten(0, 1)).error).reshape(*found.shape[:2], 2)
@@ -269,7 +269,7 @@ def _missing(error: Tensor) -> Tensor:
     return torch.cat([safe_norm(error[..., :3]), safe_norm(error[..., 3:]) / LEVER], -1)
 
 
-def _reached(missing: Tensor, search: Search) -> Tensor:
+def _reached(missing: Tensor, search: IkSearch) -> Tensor:
     return (missing[..., 0] <= search.near) & (missing[..., 1] <= search.aligned)
 
 
@@ -287,7 +287,7 @@ def solve(
     target: Pose,
     start: Tensor,
     *,
-    search: Search = Search(),
+    search: IkSearch = IkSearch(),
     posture: Tensor | None = None,
     within_time: float | None = None,
 ) -> Solution:

@@ -16,7 +16,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchdlo.coupling.bodies.dynamics import BodyTargets, Solid
+from torchdlo.coupling.bodies.dynamics import BodyTargets, RigidBody
 from torchdlo.coupling.common.pose import Pose, compose, from_matrix
 from torchdlo.coupling.robot import urdf
 from torchdlo.errors import InputError
@@ -226,17 +226,17 @@ def jacobian(robot: Robot, found: Tensor) -> Tensor:
     return torch.cat([linear, turning * axis], -1).transpose(-1, -2)
 
 
-def solids(robot: Robot, joints: Tensor, **fields: Any) -> list[Solid]:
+def solids(robot: Robot, joints: Tensor, **fields: Any) -> list[RigidBody]:
     """Return a kinematic solid for every collision shape.
 
     Args:
         robot: the robot.
         joints: where it is at the start [rad or m], shape (..., J).
-        fields: other fields of `Solid`, such as the coefficients of friction.
+        fields: other fields of `RigidBody`, such as the coefficients of friction.
     """
     at = body_targets(robot, joints)
     return [
-        Solid(
+        RigidBody(
             shape.kind,
             shape.size,
             pos=at.pos[..., k, :],

@@ -63,7 +63,7 @@ class Shape:
 
 
 @dataclass(frozen=True)
-class Description:
+class UrdfModel:
     """What a file says, parents before children."""
 
     name: str
@@ -78,7 +78,7 @@ def near(name: str, known: tuple[str, ...] | list[str]) -> str:
     return f"did you mean {like[0]!r}?" if like else f"known are {', '.join(known)}"
 
 
-def read(source: str | Path) -> Description:
+def read(source: str | Path) -> UrdfModel:
     """Read a URDF file, or URDF text that begins with "<"."""
     inline = isinstance(source, str) and source.lstrip().startswith("<")
     where = "urdf" if inline else str(source)
@@ -99,7 +99,7 @@ def read(source: str | Path) -> Description:
             raise InputError(f"{where}: {what} {twice[0]!r} is there twice; give each {what} its own name.")
     _check_mimics(where, joints)
     shapes = [s for e in root.findall("link") for s in _shapes(where, e)]
-    return Description(root.get("name", "robot"), links, _ordered(where, links, joints), tuple(shapes))
+    return UrdfModel(root.get("name", "robot"), links, _ordered(where, links, joints), tuple(shapes))
 
 
 def _named(where: str, element: xml.Element) -> str:

@@ -30,11 +30,11 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from torchdlo.coupling.bodies.dynamics import BodyMotion, conjugate
+from torchdlo.coupling.bodies.dynamics import PredictedBodyMotion, conjugate
 from torchdlo.coupling.bodies.segment_distance import EdgePoints, families, find
 from torchdlo.coupling.common.coulomb_friction import parting, rebounding, rub
 from torchdlo.coupling.rod_body import solver_op as body_sweeps
-from torchdlo.physics.effects.base import Effect, Motion, Push, Values
+from torchdlo.physics.effects.base import ContactForces, Effect, PredictedMotion, Values
 from torchdlo.physics.linalg.numerics import cross, dot
 from torchdlo.physics.linalg.rotation import rotate
 from torchdlo.physics.rod.kinematics import View
@@ -80,20 +80,20 @@ class _Points:
     radius: Tensor
     """Radius of the edges [m], shape (..., F, V, 1)."""
 
-    def exerted(self, normal: Tensor, friction: Tensor) -> Push:
+    def exerted(self, normal: Tensor, friction: Tensor) -> ContactForces:
         """Return what normal forces (..., F, V, 1) and friction (..., F, V, 3) on the points exert [N]."""
         at, s = self.at, self.at.share
         whole = normal * at.normal + friction
         couple = -cross(at.normal, friction)
         pair = self.lever * cross(couple, self.tangent)
         across = self.radius * (couple - self.tangent * dot(self.tangent, couple))
-        return Push(
+        return ContactForces(
             self.axes.vertices((1 - s) * whole - pair, s * whole + pair),
             self.axes.bodies(-whole),
             self.axes.bodies(-cross(at.arm, whole) - across),
         )
 
-    def seen(self, change: Tensor, bodies: BodyMotion) -> tuple[Tensor, Tensor]:
+    def seen(self, change: Tensor, bodies: PredictedBodyMotion) -> tuple[Tensor, Tensor]:
         """Return how far points part from their body [m], (..., F, V, 1), and slip on it, (..., F, V, 3).
 
         Args:
@@ -111,7 +111,7 @@ class _Points:
         return along, slip - n * dot(n, slip)
 
 
-def _points(view: View, bodies: BodyMotion, pieces: int) -> _Points:
+def _points(view: View, bodies: PredictedBodyMotion, pieces: int) -> _Points:
     at = find(view, bodies, pieces)
     count = [families(b, pieces) for b in bodies.bodies]
     of = [[[float(k == j)] for k in range(len(count))] for j, n in enumerate(count) for _ in range(n)]
@@ -157,12 +157,12 @@ class _Softness:
         return self._whole(active, self.sliding) + self.points.lever.square() * (self.first + self.second) * many
 
 
-def _softness(points: _Points, give: Tensor, bodies: BodyMotion) -> _Softness:
-    """Return how points give way; `give` is that of `Motion`."""
+def _softness(points: _Points, give: Tensor, bodies: PredictedBodyMotion) -> _Softness:
+    """Return how points give way; `give` is that of `PredictedMotion`."""
     axes, at = points.axes, points.at
-    agility = axes.of_bodies(bodies.agility)
+    inverse_inertia = axes.of_bodies(bodies.inverse_inertia)
     local = rotate(conjugate(axes.of_bodies(bodies.state.quat)), cross(at.arm, at.normal))
-    turning, sliding = dot(agility * local, local), agility.amax(-1, keepdim=True) * dot(at.arm, at.arm)
+    turning, sliding = dot(inverse_inertia * local, local), inverse_inertia.amax(-1, keepdim=True) * dot(at.arm, at.arm)
     turning, sliding = (
         torch.where(square > 0, torch.where(square > 0, square, 1.0).sqrt(), 0.0) for square in (turning, sliding)
     )
@@ -193,7 +193,7 @@ class RodBody(Effect):
 
     name: ClassVar[str] = "rod_body"
     kind: ClassVar[str] = "force"
-    reacts: ClassVar[bool] = True
+    is_contact: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         for name, least in (("sweeps", 1), ("rounds", 1), ("pieces", 1), ("slowest", 0)):
@@ -202,7 +202,7 @@ class RodBody(Effect):
         if not 0 < self.recovery <= 1:
             raise ValueError(f"RodBody: recovery is {self.recovery}; expected a share above 0, up to 1")
 
-    def react(self, view: View, motion: Motion, values: Values) -> Push:
+    def solve_contact(self, view: View, motion: PredictedMotion, values: Values) -> ContactForces:
         """Return the forces that keep ropes outside of bodies and rub [N]."""
         bodies = motion.bodies
         if body_sweeps.fits(bodies):
@@ -222,7 +222,7 @@ class RodBody(Effect):
             push = points.exerted(normal, friction)
         return push
 
-    def _target(self, points: _Points, view: View, bodies: BodyMotion, along: Tensor) -> Tensor:
+    def _target(self, points: _Points, view: View, bodies: PredictedBodyMotion, along: Tensor) -> Tensor:
         """Return by how much points have to part at least [m], shape (..., F, V, 1)."""
         wanted = parting(points.at.distance - points.radius, 0.1 * points.radius, self.recovery)
         pressed = points.real * (along < wanted)
@@ -238,7 +238,7 @@ class RodBody(Effect):
         motion: tuple[Tensor, Tensor],
         wanted: Tensor,
         softness: _Softness,
-        bodies: BodyMotion,
+        bodies: PredictedBodyMotion,
     ) -> tuple[Tensor, Tensor]:
         """Return normal forces and friction after one projected Jacobi sweep."""
         active = points.real * ((forces[0] > 0) | (motion[0] < wanted))

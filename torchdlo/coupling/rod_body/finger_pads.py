@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from torchdlo.coupling.bodies.dynamics import conjugate
-from torchdlo.physics.effects.base import Effect, Motion, Param, Push, Values
+from torchdlo.physics.effects.base import ContactForces, Effect, Param, PredictedMotion, Values
 from torchdlo.physics.linalg.numerics import cross, dot, safe_norm
 from torchdlo.physics.linalg.rotation import rotate
 from torchdlo.physics.rod.kinematics import View
@@ -34,7 +34,7 @@ class FingerPads(Effect):
 
     name: ClassVar[str] = "finger_pads"
     kind: ClassVar[str] = "boundary"
-    reacts: ClassVar[bool] = True
+    is_contact: ClassVar[bool] = True
     params: ClassVar[dict[str, Param]] = {
         "squeeze": Param(0.0, 0.0, 100.0, "N", "linear", 0.0, "Force of each finger on the rope."),
         "mu": Param(0.5, 0.0, 2.0, "1", "linear", 0.0, "Coefficient of friction between pads and rope."),
@@ -46,7 +46,7 @@ class FingerPads(Effect):
         depth = (half - at.abs()).amin(-1, keepdim=True)
         return (0.5 + 0.5 * depth / view.params.material.radius).clamp(0.0, 1.0)
 
-    def react(self, view: View, motion: Motion, values: Values) -> Push:
+    def solve_contact(self, view: View, motion: PredictedMotion, values: Values) -> ContactForces:
         """Return the forces that take vertices along [N], and their opposite on the hand."""
         hand, k = motion.bodies.state, slice(self.hand, self.hand + 1)
         pos, quat = hand.pos[..., k, :], hand.quat[..., k, :]
@@ -69,4 +69,4 @@ class FingerPads(Effect):
         force = held + closed * inside * across
         own = force.new_tensor([[float(j == self.hand)] for j in range(hand.pos.shape[-2])])
         torque = cross(lever, force).sum(-2, keepdim=True)
-        return Push(force, -own * force.sum(-2, keepdim=True), -own * torque)
+        return ContactForces(force, -own * force.sum(-2, keepdim=True), -own * torque)

@@ -16,10 +16,10 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from torchdlo.coupling.bodies.dynamics import BodyMotion
+from torchdlo.coupling.bodies.dynamics import PredictedBodyMotion
 from torchdlo.coupling.common import scene_packing
 from torchdlo.coupling.common.vector_components import axes
-from torchdlo.physics.effects.base import Motion, Push
+from torchdlo.physics.effects.base import ContactForces, PredictedMotion
 from torchdlo.physics.rod.kinematics import View
 
 _INPUTS = "Tensor[] edges, Tensor[] vertices, Tensor[] bodies, Tensor grids"
@@ -104,10 +104,10 @@ scene_packing.operator(
 )
 
 
-def _solids(bodies: BodyMotion) -> list[Tensor]:
+def _solids(bodies: PredictedBodyMotion) -> list[Tensor]:
     """Return the fields of bodies in the order of the kernel, shape (..., K, C) each."""
-    state, params, agility = bodies.state, bodies.params, bodies.agility
-    columns, turning = axes(state.quat), agility.split(1, -1)
+    state, params, inverse_inertia = bodies.state, bodies.params, bodies.inverse_inertia
+    columns, turning = axes(state.quat), inverse_inertia.split(1, -1)
     answers = [
         sum(a * c[i] * c[j] for a, c in zip(turning, columns, strict=True))
         for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
@@ -115,19 +115,19 @@ def _solids(bodies: BodyMotion) -> list[Tensor]:
     offset, numbers = scene_packing.measures(bodies)
     zero = torch.zeros_like(offset)
     moves = [state.vel, state.omega, bodies.change, bodies.turn, bodies.mobility]
-    laws = [agility.amax(-1, keepdim=True), params.mu_s, params.mu_k, params.restitution]
+    laws = [inverse_inertia.amax(-1, keepdim=True), params.mu_s, params.mu_k, params.restitution]
     return [state.pos, *itertools.chain(*columns), offset, zero, zero, *numbers, *moves, *answers, *laws]
 
 
 def push(
     view: View,
-    motion: Motion,
+    motion: PredictedMotion,
     pieces: Sequence[int],
     *,
     sweeps: int,
     friction: bool,
     law: tuple[float, float],
-) -> Push:
+) -> ContactForces:
     """Return what contact exerts; differentiable once.
 
     Args:
@@ -156,10 +156,10 @@ def push(
         friction,
         [*law, view.dt],
     )
-    return Push(scene_packing.logical(force, batch), *scene_packing.logical(wrench, batch).split(3, -1))
+    return ContactForces(scene_packing.logical(force, batch), *scene_packing.logical(wrench, batch).split(3, -1))
 
 
-def fits(bodies: BodyMotion) -> bool:
+def fits(bodies: PredictedBodyMotion) -> bool:
     """Return whether the kernel can do what these bodies need."""
     like = bodies.state.pos
     return ready(like.device.type, like.dtype) and scene_packing.alike(bodies)

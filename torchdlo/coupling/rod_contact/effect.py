@@ -12,7 +12,7 @@ An edge is a capsule: the points within a radius of a segment. Per substep, on a
     slides with mu_k times it, against the slip.
 5.  Forces that do so are found by projected Jacobi sweeps. A pair answers with the inverse mass sum w_i W_i / m_i,
     W_i the sum of the shares of all pairs that press vertex i: the row sum of the matrix of the problem, so that sweeps
-    converge for every pile and treat all pairs alike. Held vertices count as heavy ones, see `Motion.give`.
+    converge for every pile and treat all pairs alike. Held vertices count as heavy ones, see `PredictedMotion.give`.
 6.  The forces join the other loads; then the lengths of the edges are solved for as ever.
 
 Contact comes before the lengths and not after them: lengths stay exact, and the tension that presses ropes together is
@@ -49,7 +49,7 @@ from torchdlo.coupling.rod_contact.closest_points import closest
 from torchdlo.coupling.rod_contact.gather_scatter import Four, columns, corners, drop, pick
 from torchdlo.coupling.rod_contact.solver_op import WEAK
 from torchdlo.physics import tree
-from torchdlo.physics.effects.base import Effect, Motion, Param, Values
+from torchdlo.physics.effects.base import Effect, Param, PredictedMotion, Values
 from torchdlo.physics.linalg.numerics import cross, dot, safe_norm
 from torchdlo.physics.rod.kinematics import View
 
@@ -88,7 +88,7 @@ def find_contacts(found: Values, pos: Four, radius: Four) -> Contacts:
     """Return the geometry of pairs.
 
     Args:
-        found: what `RodContact.survey` returned.
+        found: what `RodContact.broad_phase` returned.
         pos: positions of the corners [m], shape (..., K, 3) each.
         radius: radii of the edges that start at the corners [m], shape (..., K, 1) each.
     """
@@ -180,13 +180,14 @@ class RodContact(Effect):
     recovery: float = 0.2
     """Share of a shallow overlap that a substep removes; a small one lets piles come to rest."""
     burst: float = 1.0
-    """By how much vertices may speed up within a step, beside half their speed [m/s]; `State.missed` tells if more."""
+    """By how much vertices may speed up within a step, beside half their speed [m/s]; `State.diagnostics` tells if
+    more."""
     slowest: float = 0.02
     """Approach below which nothing rebounds [m/s]."""
 
     name: ClassVar[str] = "rod_contact"
     kind: ClassVar[str] = "force"
-    reacts: ClassVar[bool] = True
+    is_contact: ClassVar[bool] = True
     params: ClassVar[dict[str, Param]] = {
         "mu_s": Param(0.3, 0.0, 2.0, "1", "linear", 0.0, "Coefficient of static friction among ropes."),
         "mu_k": Param(0.3, 0.0, 2.0, "1", "linear", 0.0, "Coefficient of sliding friction among ropes."),
@@ -200,7 +201,7 @@ class RodContact(Effect):
         if not 0 < self.recovery <= 1:
             raise ValueError(f"RodContact: recovery is {self.recovery}; expected a share above 0, up to 1")
 
-    def survey(self, view: View, carried: Tensor) -> Values:
+    def broad_phase(self, view: View, carried: Tensor) -> Values:
         """Return the pairs that can touch within the step, and how far vertices may move until they miss some.
 
         Args:
@@ -210,7 +211,7 @@ class RodContact(Effect):
         topology, pos, params = view.topology, view.state.pos, view.params
         room = self.room or max(64, 2 * topology.size)
         if broad_phase_op.ready(pos.device.type, pos.dtype):
-            return broad_phase_op.survey(view, carried, room, self.burst)
+            return broad_phase_op.broad_phase(view, carried, room, self.burst)
         mean = view.state.vel.mean(-2, keepdim=True)
         fastest = safe_norm(view.state.vel - mean).amax(-2, keepdim=True)
         if carried.shape[-2]:
@@ -227,7 +228,7 @@ class RodContact(Effect):
             "lost": lost.to(pos.dtype).unsqueeze(-1),
         }
 
-    def shortfall(self, pos: Tensor, values: Values) -> Tensor:
+    def capacity_overflow(self, pos: Tensor, values: Values) -> Tensor:
         """Return how many pairs found no room, and by how much vertices outran the survey [m], shape (..., 1, 2)."""
         if broad_phase_op.ready(pos.device.type, pos.dtype):
             return torch.cat([values["lost"], broad_phase_op.beyond(pos, values)], -1).detach()
@@ -235,7 +236,7 @@ class RodContact(Effect):
         far = safe_norm(moved - moved.mean(-2, keepdim=True)).amax(-2, keepdim=True)
         return torch.cat([values["lost"], (far - values["reach"]).clamp(min=0.0)], -1).detach()
 
-    def react(self, view: View, motion: Motion, values: Values) -> Tensor:
+    def solve_contact(self, view: View, motion: PredictedMotion, values: Values) -> Tensor:
         """Return the forces on vertices that keep ropes apart and rub [N], shape (..., V, 3)."""
         like = view.state.pos
         if rod_pairs.ready(like.device.type, like.dtype):
@@ -244,7 +245,7 @@ class RodContact(Effect):
         _, forces, spread = self.solve(view, motion, values)
         return drop(spread(forces), values["corners"], view.topology.size)
 
-    def solve(self, view: View, motion: Motion, values: Values):
+    def solve(self, view: View, motion: PredictedMotion, values: Values):
         """Return the contacts, their forces, and a function that turns forces into those on the four corners."""
         at, size = values["corners"], view.topology.size
         batch = at.shape[:-2]
@@ -316,7 +317,7 @@ def _softness(
     Args:
         contacts: the pairs.
         pressed: 1 where a pair would touch, shape (..., K, 1).
-        give: that of `Motion`.
+        give: that of `PredictedMotion`.
         free: the same as if none were held.
         at: corners of the pairs.
         size: number of vertices.

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from torchdlo.coupling.common import scene_packing
 from torchdlo.coupling.rod_contact import closest_points
-from torchdlo.physics.effects.base import Motion, Values
+from torchdlo.physics.effects.base import PredictedMotion, Values
 from torchdlo.physics.rod.kinematics import View
 
 WEAK = 0.01
@@ -84,14 +84,14 @@ scene_packing.operator(
 
 
 def push(
-    view: View, motion: Motion, values: Values, *, sweeps: int, friction: bool, law: tuple[float, float]
+    view: View, motion: PredictedMotion, values: Values, *, sweeps: int, friction: bool, law: tuple[float, float]
 ) -> Tensor:
     """Return the forces of contact on vertices [N], shape (..., V, 3); differentiable once.
 
     Args:
         view: the rods.
         motion: where vertices would go.
-        values: numbers of the effect, and the pairs that `RodContact.survey` returned.
+        values: numbers of the effect, and the pairs that `RodContact.broad_phase` returned.
         sweeps: projected Jacobi sweeps.
         friction: whether ropes rub.
         law: share of a shallow overlap that a substep removes, and approach below which nothing rebounds [m/s].

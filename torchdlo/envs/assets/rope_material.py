@@ -14,11 +14,11 @@ from torchdlo.physics.effects import EFFECTS
 from torchdlo.physics.effects.base import Effect
 from torchdlo.scene import Rope
 
-__all__ = ["Cable"]
+__all__ = ["RopeMaterial"]
 
 
 @dataclass(frozen=True)
-class Cable:
+class RopeMaterial:
     """What a rope is made of, whatever its length: the ropes of a task become pieces of it, as thick as before.
 
     `torchdlo.scene_files.cable` reads one from the model file of a calibration or a diagnosis.

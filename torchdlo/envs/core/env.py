@@ -17,7 +17,7 @@ from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from torchdlo.envs.core import episode as episodes
-from torchdlo.envs.core.episode import World
+from torchdlo.envs.core.episode import EpisodeState
 from torchdlo.envs.core.task import Task, combined
 from torchdlo.errors import InputError
 from torchdlo.physics import tree
@@ -136,10 +136,10 @@ class DloEnv(EnvBase):
             effects = tree.where(again, drawn, _wide(self.episode.params.effects, drawn))
             self.episode = dataclasses.replace(self.episode, params=tree.replace(self.episode.params, effects=effects))
 
-    def _fresh(self) -> World:
+    def _fresh(self) -> EpisodeState:
         """Return the worlds of new episodes."""
         # Scenes settle with their own numbers.
-        if not self.variation and not (self._randomize and self.task.settle):
+        if not self.variation and not (self._randomize and self.task.settle_steps):
             return self.episode.start
         choices = {"like": self._like, "generator": self._generator, "variation": self.variation}
         return episodes.begin(self.episode, self.task.start(len(self.world.count), **choices)[2])

@@ -26,27 +26,38 @@ from torchdlo.coupling.robot.kinematics import Robot, panda
 from torchdlo.envs.core.divergence import broken, inside
 from torchdlo.envs.core.frames import guarded, run, slipped
 from torchdlo.envs.core.stages import repeated
-from torchdlo.envs.core.task import Seen, Task, combined
+from torchdlo.envs.core.task import Task, TaskState, combined
 from torchdlo.errors import InputError
 from torchdlo.physics import tree
 from torchdlo.physics.linalg.numerics import safe_norm
 from torchdlo.physics.linalg.rotation import multiply
 from torchdlo.scene import Control, Params, Scene, State
 
-__all__ = ["Episode", "Outcome", "World", "act", "begin", "normalized", "observe", "places", "play", "prepare"]
+__all__ = [
+    "Episode",
+    "EpisodeResult",
+    "EpisodeState",
+    "act",
+    "begin",
+    "normalized",
+    "observe",
+    "places",
+    "play",
+    "prepare",
+]
 
 POSTURE = (1.56, -0.72, -0.02, -2.09, 0.04, 1.33, 2.4, 0.0)
 """Where joints would like to be [rad], and how far the fingers are open [m]."""
-FIND = inverse_kinematics.Search(starts=8)
+FIND = inverse_kinematics.IkSearch(starts=8)
 """How hard to look for the joints of the start."""
-FOLLOW = inverse_kinematics.Search(steps=4, closing=2, polish=2)
+FOLLOW = inverse_kinematics.IkSearch(steps=4, closing=2, polish=2)
 """The same for those of an action, which are near the last ones."""
 ELBOWS = 7
 """Joints of an arm that are observed."""
 
 
 @tree.struct
-class World:
+class EpisodeState:
     """A running episode: scenes and the arms in them."""
 
     state: State
@@ -64,13 +75,13 @@ class World:
     count: Tensor
     """Actions done [1], whole, shape (B,)."""
 
-    def seen(self, hands: int) -> Seen:
+    def seen(self, hands: int) -> TaskState:
         """Return what a task judges."""
-        return Seen(self.state, self.tool, self.grasp.closed.unflatten(-2, (hands, -1)).amax(-2), self.notes)
+        return TaskState(self.state, self.tool, self.grasp.closed.unflatten(-2, (hands, -1)).amax(-2), self.notes)
 
 
 @tree.struct
-class Outcome:
+class EpisodeResult:
     """What episodes came to."""
 
     returns: Tensor
@@ -80,8 +91,8 @@ class Outcome:
 
     That of an episode that failed has terms from before it did only, and may be small: mask it by `failed`.
     """
-    shortfall: Tensor
-    """What the loss has for how far the end is from success, see `Task.shortfall` [1], shape (B,)."""
+    terminal_cost: Tensor
+    """What the loss has for how far the end is from success, see `Task.terminal_cost` [1], shape (B,)."""
     success: Tensor
     """Which episodes reached the goal [-], bool, shape (B,)."""
     failed: Tensor
@@ -90,7 +101,7 @@ class Outcome:
     """Rewards of the actions [1], shape (T, B)."""
     terms: dict[str, Tensor]
     """Terms of the reward by name [1], shape (T, B) each."""
-    world: World
+    world: EpisodeState
     """The end."""
     path: dict[str, Tensor] = field(default_factory=dict)
     """What `keep` returned after every action, (T, ...) each."""
@@ -106,7 +117,7 @@ class Episode:
     step: Callable[[Params, State, Control], State]
     """What advances the scene by a frame."""
     hands: Hands
-    start: World
+    start: EpisodeState
     segment: int | None = None
     """Frames that gradients run again at once, None to keep all of them, see `physics.execution.replay`."""
 
@@ -120,7 +131,9 @@ def _bases(task: Task, like: Tensor) -> Tensor:
     return like.new_tensor(task.arms.base)
 
 
-def _solve(task: Task, target: Pose, joints: Tensor, search: inverse_kinematics.Search) -> inverse_kinematics.Solution:
+def _solve(
+    task: Task, target: Pose, joints: Tensor, search: inverse_kinematics.IkSearch
+) -> inverse_kinematics.Solution:
     """Return where joints bring the tools to their targets. All arms are alike, so they are one more batch axis."""
     base = _bases(task, joints)
     wanted = Pose(target.pos - base, target.quat)
@@ -132,11 +145,11 @@ def _solve(task: Task, target: Pose, joints: Tensor, search: inverse_kinematics.
 def hands_of(task: Task, scene: Scene) -> Hands:
     """Return which grips of the task's hands hold what; what no hand ever holds is fixed."""
     plan = task.schedule
-    fixed = len(scene.held_vertices) - len(plan.held)
+    fixed = len(scene.prescribed_vertices) - len(plan.held)
     return Hands(task.arms.count * plan.room, (*plan.tools, *[-1] * fixed))
 
 
-def _begin(task: Task, scene: Scene, state: State, hands: Hands) -> World:
+def _begin(task: Task, scene: Scene, state: State, hands: Hands) -> EpisodeState:
     """Return the world before the first action: tools stand at what they hold."""
     x = state.rods.pos
     pos = x[:, list(task.arms.vertex)]
@@ -146,7 +159,8 @@ def _begin(task: Task, scene: Scene, state: State, hands: Hands) -> World:
     posture, off = x.new_tensor(POSTURE).expand(*pos.shape[:-1], -1), pos - _bases(task, x)
     facing = torch.cat([torch.atan2(off[..., 1:2], off[..., :1]), posture[..., 1:]], -1)
     plain, found = (
-        tree.detach(_solve(task, target, *guess)) for guess in ((facing, inverse_kinematics.Search()), (posture, FIND))
+        tree.detach(_solve(task, target, *guess))
+        for guess in ((facing, inverse_kinematics.IkSearch()), (posture, FIND))
     )
     found = tree.where(plain.converged, plain, found)
     if not bool(found.converged.all()):
@@ -158,20 +172,20 @@ def _begin(task: Task, scene: Scene, state: State, hands: Hands) -> World:
     failed = torch.zeros(x.shape[0], dtype=torch.bool, device=x.device)
     plan, none = task.schedule, torch.zeros_like(failed, dtype=torch.long)
     closed = plan.closed(none, target, x)
-    held = grasp.weld(scene, hands, scenes.hold(scene, state), repeated(target, plan.room), closed)
-    world = World(state, found.joints, target, target, held, {}, failed, none)
+    held = grasp.weld(scene, hands, scenes.stationary_control(scene, state), repeated(target, plan.room), closed)
+    world = EpisodeState(state, found.joints, target, target, held, {}, failed, none)
     seen = world.seen(task.arms.count)
     return tree.replace(world, notes={"rest": task.rest(seen, scene.topology), **task.note(seen)})
 
 
-def begin(episode: Episode, state: State) -> World:
+def begin(episode: Episode, state: State) -> EpisodeState:
     """Return the world of an episode whose scenes start in a state, shape (B, ...)."""
     return _settled(episode, _begin(episode.task, episode.scene, state, episode.hands))
 
 
-def _settled(episode: Episode, world: World) -> World:
+def _settled(episode: Episode, world: EpisodeState) -> EpisodeState:
     """Return the world after the frames before the first action."""
-    count = episode.task.settle
+    count = episode.task.settle_steps
     if not count:
         return world
     state = run(episode, world, world.tool, world.grasp, count)
@@ -205,7 +219,7 @@ def prepare(
     step = scenes.stepper(scene, compiled=compiled, recorded=recorded)
     world = _begin(task, scene, state, hands)
     episode = Episode(task, scene, params, step, hands, world, segment)
-    return episode if not task.settle else replace(episode, start=_settled(episode, world))
+    return episode if not task.settle_steps else replace(episode, start=_settled(episode, world))
 
 
 def limited(task: Task, action: Tensor) -> tuple[Tensor, Tensor]:
@@ -220,11 +234,11 @@ def limited(task: Task, action: Tensor) -> tuple[Tensor, Tensor]:
         )
     way, turn = action.unflatten(-1, (2, task.arms.count, 3)).unbind(-3)
     far = safe_norm(way)
-    way = way * torch.where(far > task.reach, task.reach / torch.where(far > 0, far, 1.0), 1.0)
+    way = way * torch.where(far > task.max_translation, task.max_translation / torch.where(far > 0, far, 1.0), 1.0)
     return way, torch.deg2rad(turn.clamp(-task.twist, task.twist))
 
 
-def _aim(task: Task, world: World, action: Tensor) -> Pose:
+def _aim(task: Task, world: EpisodeState, action: Tensor) -> Pose:
     """Return the poses that an action asks the tools to take."""
     way, turn = limited(task, action)
     pos = world.target.pos + way
@@ -235,11 +249,11 @@ def _aim(task: Task, world: World, action: Tensor) -> Pose:
     return Pose(torch.cat([pos[..., :2], height], -1), quat / quat.square().sum(-1, keepdim=True).sqrt())
 
 
-def act(episode: Episode, world: World, action: Tensor) -> World:
+def act(episode: Episode, world: EpisodeState, action: Tensor) -> EpisodeState:
     """Return the world after an action, shape (B, A) in metres and degrees; see `Task.width`.
 
-    Scenes that are no longer finite stay as they were and have failed. Nothing has a slope through an action in which
-    a scene broke.
+    Scenes that are no longer finite stay as they were and have failed. Nothing has a gradient through an action in
+    which a scene broke.
     """
     task, lost = episode.task, []
     before, action = guarded((world, action), len(world.failed), lost)
@@ -249,20 +263,20 @@ def act(episode: Episode, world: World, action: Tensor) -> World:
     found = _solve(task, aim, before.joints, FOLLOW)
     state = run(episode, before, found.pose, held, task.frames)
     held = tree.replace(held, closed=slipped(episode, state, found.pose, held.closed))
-    after = World(state, found.joints, found.handed, found.pose, held, world.notes, world.failed, world.count)
+    after = EpisodeState(state, found.joints, found.handed, found.pose, held, world.notes, world.failed, world.count)
     return tree.replace(_judged(episode, world, after, lost), count=world.count + 1)
 
 
-def _staged(episode: Episode, world: World, aim: Pose) -> tuple[Pose, Grasp]:
+def _staged(episode: Episode, world: EpisodeState, aim: Pose) -> tuple[Pose, Grasp]:
     """Return where tools are to go and what they hold in an action: hands open, travel and close as stages say."""
     plan, x = episode.task.schedule, world.state.rods.pos
     closed = plan.closed(world.count, world.tool, x, world.grasp.closed)
-    now = scenes.hold(episode.scene, world.state)
+    now = scenes.stationary_control(episode.scene, world.state)
     held = grasp.weld(episode.scene, episode.hands, now, repeated(world.tool, plan.room), closed, world.grasp)
     return plan.steer(world.count, world.target, aim, x), held
 
 
-def _judged(episode: Episode, before: World, after: World, lost: list[Tensor]) -> World:
+def _judged(episode: Episode, before: EpisodeState, after: EpisodeState, lost: list[Tensor]) -> EpisodeState:
     """Return the new world with its notes and failures, and the old one where the new one is not finite.
 
     `lost` gets which scenes broke, shape (B,).
@@ -278,7 +292,7 @@ def _judged(episode: Episode, before: World, after: World, lost: list[Tensor]) -
     return tree.replace(after, failed=before.failed | lost[0] | torn | stuck | task.failed(seen))
 
 
-def finish(episode: Episode, world: World) -> World:
+def finish(episode: Episode, world: EpisodeState) -> EpisodeState:
     """Return the world after the hands have opened at the end, for tasks that ask for it."""
     task = episode.task
     if not task.release:
@@ -290,16 +304,16 @@ def finish(episode: Episode, world: World) -> World:
     return _judged(episode, world, tree.replace(before, state=state, grasp=held, notes=world.notes), lost)
 
 
-def earned(episode: Episode, world: World) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
+def earned(episode: Episode, world: EpisodeState) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
     """Return the reward of the last action, its loss, and the terms of the reward, shape (B,) each."""
     task, seen = episode.task, world.seen(episode.task.arms.count)
     terms = task.rewards(seen)
     reward = combined(task, terms, len(world.failed))
-    loss = sum(task.extra(seen).values(), -reward)
+    loss = sum(task.auxiliary_loss(seen).values(), -reward)
     return torch.where(world.failed, 0.0, reward), torch.where(world.failed, 0.0, loss), terms
 
 
-def observe(episode: Episode, world: World) -> Tensor:
+def observe(episode: Episode, world: EpisodeState) -> Tensor:
     """Return observations in single precision, shape (B, O).
 
     Positions and velocities of vertices, of free bodies and of the middle of matter; then positions, orientations and
@@ -310,13 +324,13 @@ def observe(episode: Episode, world: World) -> Tensor:
     free = [k for k, body in enumerate(episode.scene.bodies) if body.motion == "free"]
     if free:
         parts += [state.bodies.pos[:, free], state.bodies.vel[:, free]]
-    if state.matter:
-        parts += [state.matter.pos.mean(-2, keepdim=True), state.matter.vel.mean(-2, keepdim=True)]
+    if state.material_points:
+        parts += [state.material_points.pos.mean(-2, keepdim=True), state.material_points.vel.mean(-2, keepdim=True)]
     parts += [world.tool.pos, world.tool.quat, world.joints[..., :ELBOWS]]
     return torch.cat([p.flatten(-2) for p in parts], -1).to(torch.float32)
 
 
-def places(world: World) -> dict[str, Tensor]:
+def places(world: EpisodeState) -> dict[str, Tensor]:
     """Return where things are: "pos" (B, V, 3) of the ropes, "tool" (B, R, 3) and "joints" (B, R, J)."""
     return {"pos": world.state.rods.pos, "tool": world.tool.pos, "joints": world.joints}
 
@@ -326,10 +340,10 @@ def play(
     actions: Tensor,
     *,
     episode: Episode | None = None,
-    keep: Callable[[World], dict[str, Tensor]] = lambda _: {},
+    keep: Callable[[EpisodeState], dict[str, Tensor]] = lambda _: {},
     callback: Callable[[int, int], None] | None = None,
     **choices: Any,
-) -> Outcome:
+) -> EpisodeResult:
     """Return what actions earn, with gradients with respect to them.
 
     Args:
@@ -366,13 +380,14 @@ def play(
             callback(k + 1, count)
     rewards, losses, terms = tree.stack(rows)
     seen = world.seen(task.arms.count)
-    success, short = task.success(seen) & ~world.failed, task.shortfall(seen)
+    success, short = task.success(seen) & ~world.failed, task.terminal_cost(seen)
     loss = losses.sum(0) + torch.where(world.failed, 0.0, short)
-    return Outcome(rewards.sum(0), loss, short, success, world.failed, rewards, terms, world, tree.stack(path))
+    return EpisodeResult(rewards.sum(0), loss, short, success, world.failed, rewards, terms, world, tree.stack(path))
 
 
 def normalized(task: Task, returns: Tensor, **choices: Any) -> Tensor:
-    """Return scores of episodes: 0 for doing nothing, 1 for the way by hand of `Task.reference`, shape of `returns`.
+    """Return scores of episodes: 0 for doing nothing, 1 for the scripted demonstration of `Task.demonstration`, shape
+    of `returns`.
 
     Both are played for it, which takes as long as an episode of two scenes.
 
@@ -381,7 +396,7 @@ def normalized(task: Task, returns: Tensor, **choices: Any) -> Tensor:
         returns: returns of episodes from its one start, without variation.
         choices: of `prepare`.
     """
-    way = task.reference().to(returns)
+    way = task.demonstration().to(returns)
     if not bool((way != 0).any()):
         raise ValueError(f"{task.name}: has no way by hand to compare with; give it `waypoints`")
     with torch.no_grad():

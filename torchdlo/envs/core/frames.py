@@ -21,7 +21,7 @@ from torchdlo.physics.linalg.rotation import multiply, rotate
 from torchdlo.scene import Control, State
 
 if TYPE_CHECKING:
-    from torchdlo.envs.core.episode import Episode, World
+    from torchdlo.envs.core.episode import Episode, EpisodeState
 
 __all__ = ["guarded", "run", "slipped"]
 
@@ -40,9 +40,11 @@ def guarded(inputs: T, count: int, lost: list[Tensor]) -> T:
         lost: gets which scenes broke, bool, shape (B,), before gradients are asked for.
     """
 
-    def sound(slope: Tensor | None) -> Tensor | None:
+    def sound(gradient: Tensor | None) -> Tensor | None:
         # There is none where a function has no use for an input.
-        return None if slope is None else torch.where(lost[0].reshape(-1, *[1] * (slope.dim() - 1)), 0.0, slope)
+        return (
+            None if gradient is None else torch.where(lost[0].reshape(-1, *[1] * (gradient.dim() - 1)), 0.0, gradient)
+        )
 
     def guard(x: Tensor) -> Tensor:
         if not x.requires_grad:
@@ -55,20 +57,20 @@ def guarded(inputs: T, count: int, lost: list[Tensor]) -> T:
     return tree.map(guard, inputs)
 
 
-def run(episode: Episode, world: World, tool: Pose, held: Grasp, count: int) -> State:
+def run(episode: Episode, world: EpisodeState, tool: Pose, held: Grasp, count: int) -> State:
     """Return the scenes after frames in which the tools move evenly to their poses."""
     x = world.tool.pos
     share = torch.linspace(0, 1, count + 1, dtype=x.dtype, device=x.device)[1:].reshape(-1, 1, 1, 1)
     turn = turn_between(world.tool.quat, tool.quat)
     last = world.tool.quat.expand(count, *world.tool.quat.shape)
     poses = Pose(x + share * (tool.pos - x), multiply(turn_by(share * turn), last))
-    pos, director, grip = grasp.carry(episode.hands, held, repeated(poses, episode.task.schedule.room))
+    pos, director, attachment_weight = grasp.carry(episode.hands, held, repeated(poses, episode.task.schedule.room))
     bodies: Any = ()
     if episode.scene.bodies:
-        still = scenes.hold(episode.scene, world.state).bodies
+        still = scenes.stationary_control(episode.scene, world.state).bodies
         bodies = BodyTargets(*(p.expand(count, *p.shape) for p in (still.pos, still.quat)))
-    grip = {name: g.expand(count, *g.shape) for name, g in grip.items()}
-    controls = Control(pos, director.expand(count, *director.shape[-3:]), grip, bodies)
+    attachment_weight = {name: g.expand(count, *g.shape) for name, g in attachment_weight.items()}
+    controls = Control(pos, director.expand(count, *director.shape[-3:]), attachment_weight, bodies)
     # Nothing is kept; what has a history would be followed back to its start from every segment.
     none = tree.leaves(world.state)[0].detach()[..., :0, :0]
     state, _ = rollout(

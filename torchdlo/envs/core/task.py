@@ -17,11 +17,11 @@ import torch
 from torch import Tensor
 
 from torchdlo import scene as scenes
-from torchdlo.coupling import BodyContact, RodBody, RodContact, RodMatter
-from torchdlo.coupling.bodies.dynamics import Solid
+from torchdlo.coupling import BodyContact, RodBody, RodContact, RodMpmCoupling
+from torchdlo.coupling.bodies.dynamics import RigidBody
 from torchdlo.coupling.common.pose import Pose
 from torchdlo.envs.assets.arms import DOWN, Arms
-from torchdlo.envs.assets.rope_material import Cable
+from torchdlo.envs.assets.rope_material import RopeMaterial
 from torchdlo.envs.core import curve_geometry
 from torchdlo.envs.core.stages import Schedule, Stage
 from torchdlo.errors import InputError
@@ -38,9 +38,9 @@ __all__ = [
     "RADIUS",
     "SPACING",
     "Arms",
-    "Seen",
     "Stage",
     "Task",
+    "TaskState",
     "combined",
     "even",
     "make",
@@ -55,7 +55,7 @@ RADIUS, SPACING = 0.01, 0.02
 
 
 @tree.struct
-class Seen:
+class TaskState:
     """What rewards, success and failure are judged by, after an action."""
 
     state: State
@@ -80,11 +80,11 @@ class Task(ABC):
     """Actions in an episode."""
     frames: int = 20
     """Steps of the scene per action."""
-    settle: int = 0
+    settle_steps: int = 0
     """Steps before the first action."""
     release: int = 0
     """Steps after the last action with open hands; the last reward is the one after them."""
-    rope: Cable | None = None
+    rope: RopeMaterial | None = None
     """What all ropes are made of, if not what the task says."""
 
     name: ClassVar[str]
@@ -94,23 +94,24 @@ class Task(ABC):
     """How the terms of `rewards` make the one reward."""
     floor: ClassVar[float] = 0.03
     """Height below which tools are not led [m]."""
-    reach: ClassVar[float] = 0.01
+    max_translation: ClassVar[float] = 0.01
     """Greatest way of a tool in an action [m]."""
     twist: ClassVar[float] = 0.1
     """Greatest turn of a tool in an action about each of its axes [degrees]."""
     stretch: ClassVar[float] = math.inf
     """Length of the rope between the hands over that at the start, above which an episode has failed [1]."""
-    spread: ClassVar[tuple[tuple[float, float], ...]] = ((0.0, 0.0),)
+    reset_noise: ClassVar[tuple[tuple[float, float], ...]] = ((0.0, 0.0),)
     """By how much each of the things that `build` can move is moved in x and in y at most [m]."""
     anchored: ClassVar[bool] = False
-    """Whether ways by hand lead to the same places wherever the rope starts, as what they lead to is fixed."""
+    """Whether scripted demonstrations lead to the same places wherever the rope starts, as what they lead to is
+    fixed."""
     stages: ClassVar[tuple[Stage, ...]] = ()
     """What hands hold from which action on; if not given, they hold what they start at until the end."""
     travel: ClassVar[int] = 10
     """Actions that a hand takes from what it held to what it holds in the next stage."""
 
     def __post_init__(self) -> None:
-        if not isinstance(self.rope, Cable | None):
+        if not isinstance(self.rope, RopeMaterial | None):
             raise InputError(
                 f"rope: it is {self.rope!r}; expected a torchdlo.envs.Cable; "
                 "torchdlo.scene_files.cable(path) makes one of a model file."
@@ -130,44 +131,44 @@ class Task(ABC):
     @property
     def limit(self) -> tuple[float, ...]:
         """Greatest magnitude of each component of an action."""
-        return (self.reach,) * (3 * self.arms.count) + (self.twist,) * (3 * self.arms.count)
+        return (self.max_translation,) * (3 * self.arms.count) + (self.twist,) * (3 * self.arms.count)
 
     @abstractmethod
     def build(self, moved: Tensor) -> tuple[Scene, Params, State]:
         """Return the scene at its start, in the dtype and on the device of `moved`.
 
         Args:
-            moved: how far the things of `spread` are off their places [m], shape (B, things, 3).
+            moved: how far the things of `reset_noise` are off their places [m], shape (B, things, 3).
         """
 
     @abstractmethod
-    def rewards(self, seen: Seen) -> dict[str, Tensor]:
+    def rewards(self, seen: TaskState) -> dict[str, Tensor]:
         """Return the named terms of the reward of an action, shape (B,) each."""
 
     @abstractmethod
-    def success(self, seen: Seen) -> Tensor:
+    def success(self, seen: TaskState) -> Tensor:
         """Return which episodes have reached the goal, judged at their end, bool, shape (B,)."""
 
-    def extra(self, seen: Seen) -> dict[str, Tensor]:
+    def auxiliary_loss(self, seen: TaskState) -> dict[str, Tensor]:
         """Return what the loss of an action has beside the reward's negative, shape (B,) each."""
         return {}
 
-    def shortfall(self, seen: Seen) -> Tensor:
+    def terminal_cost(self, seen: TaskState) -> Tensor:
         """Return how far the end of an episode is from success, 0 if it is reached [return], shape (B,).
 
         The loss has it after the last action, as the return need not be largest where the goal is reached.
         """
         return torch.zeros_like(seen.x[:, 0, 0])
 
-    def note(self, seen: Seen) -> dict[str, Tensor]:
+    def note(self, seen: TaskState) -> dict[str, Tensor]:
         """Return what is to be remembered, asked at the start (without notes) and after every action."""
         return {}
 
-    def failed(self, seen: Seen) -> Tensor:
+    def failed(self, seen: TaskState) -> Tensor:
         """Return which episodes have failed for good, bool, shape (B,)."""
         return torch.zeros(seen.x.shape[0], dtype=torch.bool, device=seen.x.device)
 
-    def rehearsal(self) -> Task | None:
+    def surrogate(self) -> Task | None:
         """Return a task that is much like this one and quicker to play, for searches to begin with, if there is one."""
         return None
 
@@ -175,7 +176,7 @@ class Task(ABC):
         """Return a way to the goal by hand: per point, how far each tool is from its start [m]."""
         return ()
 
-    def ways(self) -> Sequence[Sequence[Sequence[tuple[float, float, float]]]]:
+    def stage_waypoints(self) -> Sequence[Sequence[Sequence[tuple[float, float, float]]]]:
         """Return `waypoints` stage by stage, in a stage from where the tools are when it begins."""
         return [self.waypoints()]
 
@@ -188,18 +189,18 @@ class Task(ABC):
             num: how many.
             like: a tensor of the dtype and device that it gets; float32 on the CPU if not given.
             generator: where random numbers come from.
-            variation: whether starts differ from each other, by as much as `spread` says.
+            variation: whether starts differ from each other, by as much as `reset_noise` says.
         """
         like = torch.zeros(()) if like is None else like
-        moved = like.new_zeros(num, len(self.spread), 3)
+        moved = like.new_zeros(num, len(self.reset_noise), 3)
         if variation:
-            random = torch.rand(num, len(self.spread), 2, generator=generator, dtype=torch.float64)
-            away = (2 * random - 1).to(like) * like.new_tensor(self.spread)
+            random = torch.rand(num, len(self.reset_noise), 2, generator=generator, dtype=torch.float64)
+            away = (2 * random - 1).to(like) * like.new_tensor(self.reset_noise)
             moved = torch.cat([away, moved[..., 2:]], -1)
         return self.build(moved)
 
-    def reference(self, start: State | None = None) -> Tensor:
-        """Return the actions that lead the tools along `ways`, evenly, shape (horizon, width).
+    def demonstration(self, start: State | None = None) -> Tensor:
+        """Return the actions that lead the tools along `stage_waypoints`, evenly, shape (horizon, width).
 
         Args:
             start: where scenes start, for actions of shape (B, horizon, width); all alike if not given.
@@ -207,8 +208,8 @@ class Task(ABC):
         off = (
             self._strays(start) if start is not None else [torch.zeros(self.arms.count, 3)] * len(self.schedule.stages)
         )
-        legs = zip(self.ways(), self.schedule.actions(self.horizon), off, strict=True)
-        return torch.cat([through(*leg, reach=self.reach) for leg in legs], -2)
+        legs = zip(self.stage_waypoints(), self.schedule.actions(self.horizon), off, strict=True)
+        return torch.cat([through(*leg, max_translation=self.max_translation) for leg in legs], -2)
 
     def _strays(self, start: State) -> list[Tensor]:
         """Return what each stage's way takes besides to lead to the same places from another start [m], (B, R, 3)."""
@@ -224,7 +225,7 @@ class Task(ABC):
             led |= {rope[v] for v in stage.vertex if v is not None}
         return found
 
-    def rest(self, seen: Seen, topology: Topology) -> Tensor:
+    def rest(self, seen: TaskState, topology: Topology) -> Tensor:
         """Return the lengths of rope between neighbouring hands on one rope [m], shape (B, n).
 
         There are none if `stretch` is infinite, and n = 0 if no rope has two hands.
@@ -263,7 +264,11 @@ def straight(start: tuple[float, float, float], count: int, moved: Tensor) -> Te
 
 
 def through(
-    points: Sequence[Sequence[tuple[float, float, float]]], horizon: int, off: Tensor, *, reach: float = Task.reach
+    points: Sequence[Sequence[tuple[float, float, float]]],
+    horizon: int,
+    off: Tensor,
+    *,
+    max_translation: float = Task.max_translation,
 ) -> Tensor:
     """Return actions that lead tools through points and then keep them there, shape (..., horizon, 6 arms).
 
@@ -278,10 +283,10 @@ def through(
     off = off.to(torch.float64).unsqueeze(-3)
     way = off.new_tensor(points).reshape(-1, *off.shape[-2:]) + off
     legs = torch.cat([torch.zeros_like(off), way], -3).diff(dim=-3)
-    need = (legs.norm(dim=-1).amax(-1) / reach - 1e-9).ceil().clamp(min=1)
+    need = (legs.norm(dim=-1).amax(-1) / max_translation - 1e-9).ceil().clamp(min=1)
     most = int(need.sum(-1).max())
     if most > horizon:
-        raise ValueError(f"way-points: they take {most} actions of {reach} m; expected at most {horizon}")
+        raise ValueError(f"way-points: they take {most} actions of {max_translation} m; expected at most {horizon}")
     # Which share of each leg is behind the tools before and after each action.
     done = torch.arange(horizon + 1, dtype=off.dtype, device=off.device).unsqueeze(-1) - (
         need.cumsum(-1) - need
@@ -297,9 +302,9 @@ def make(
     effects: Sequence[Effect] = (),
     values: dict[str, dict[str, float]] | None = None,
     *,
-    solids: Sequence[Solid] = (),
+    solids: Sequence[RigidBody] = (),
     fixed: Sequence[int] = (),
-    matter: tuple = (),
+    material_points: tuple = (),
     held: Sequence[int] | None = None,
     burst: float = 1.0,
 ) -> tuple[Scene, Params, State]:
@@ -340,8 +345,8 @@ def make(
         acting.append(RodBody())
     if any(s.motion == "free" for s in solids):
         acting.append(BodyContact())
-    if matter:
-        acting.append(RodMatter())
+    if material_points:
+        acting.append(RodMpmCoupling())
     for name, given in (values or {}).items():
         numbers[name] = numbers.get(name, {}) | given
     if task.rope is not None:
@@ -349,9 +354,9 @@ def make(
         for name, given in task.rope.values.items():
             numbers[name] = numbers.get(name, {}) | given
     at = (*(task.schedule.held if held is None else held), *fixed)
-    choices = {"held_vertices": at, "constrained": not elastic, "substeps": 5}
+    choices = {"prescribed_vertices": at, "constrained": not elastic, "substeps": 5}
     try:
-        return scenes.make(ropes, acting, numbers, bodies=solids, matter=matter, **choices)
+        return scenes.make(ropes, acting, numbers, bodies=solids, material_points=material_points, **choices)
     except ValueError as error:
         if task.rope is None:
             raise
@@ -361,8 +366,8 @@ def make(
 def settled(made: tuple[Scene, Params, State], frames: int) -> Tensor:
     """Return where vertices of a single scene, shape (1, V, 3), are after some frames with nothing held."""
     scene, params, state = made
-    control = scenes.hold(scene, state)
-    control = tree.replace(control, grip={"vertices": torch.zeros_like(control.pos[..., :1])})
+    control = scenes.stationary_control(scene, state)
+    control = tree.replace(control, attachment_weight={"vertices": torch.zeros_like(control.pos[..., :1])})
     with torch.no_grad():
         for _ in range(frames):
             state = scenes.step(scene, params, state, control)

@@ -13,9 +13,9 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from torchdlo.coupling.bodies.dynamics import Solid
+from torchdlo.coupling.bodies.dynamics import RigidBody
 from torchdlo.envs.core import curve_geometry
-from torchdlo.envs.core.task import RADIUS, Arms, Seen, Task, make, straight
+from torchdlo.envs.core.task import RADIUS, Arms, Task, TaskState, make, straight
 from torchdlo.physics.linalg.numerics import safe_norm
 from torchdlo.scene import Params, Rope, Scene, State
 
@@ -39,31 +39,31 @@ class Coiling(Task):
     name: ClassVar[str] = "coiling"
     arms: ClassVar[Arms] = Arms(base=((-0.25, -0.4, 0.0),), vertex=(1,))
     anchored: ClassVar[bool] = True
-    spread: ClassVar[tuple[tuple[float, float], ...]] = ((0.05, 0.01),)
+    reset_noise: ClassVar[tuple[tuple[float, float], ...]] = ((0.05, 0.01),)
 
     def build(self, moved: Tensor) -> tuple[Scene, Params, State]:
         """Return the scene; the rope may be moved."""
         x = straight((-0.6, 0.265, 0.012), 60, moved[:, 0])
-        cone = Solid("cone", (BASE, HEIGHT), (0.0, 0.0, HEIGHT / 4), motion="fixed", mu_s=0.7, mu_k=0.7)
+        cone = RigidBody("cone", (BASE, HEIGHT), (0.0, 0.0, HEIGHT / 4), motion="fixed", mu_s=0.7, mu_k=0.7)
         return make(self, [Rope(x, RADIUS, mass=0.059, youngs=1e3)], solids=[cone])
 
-    def _missing(self, seen: Seen) -> Tensor:
+    def _missing(self, seen: TaskState) -> Tensor:
         """Return the sum of the vertices' distances to the middle of the cone [m]."""
         return safe_norm(seen.x - seen.x.new_tensor([0.0, 0.0, HEIGHT / 2])).sum((-1, -2))
 
-    def rewards(self, seen: Seen) -> dict[str, Tensor]:
+    def rewards(self, seen: TaskState) -> dict[str, Tensor]:
         """Return 1 for a rope in the middle of the cone, less the further its vertices are from it."""
         return {"near": torch.exp(-0.1 * self._missing(seen))}
 
-    def extra(self, seen: Seen) -> dict[str, Tensor]:
+    def auxiliary_loss(self, seen: TaskState) -> dict[str, Tensor]:
         """Return the exponent: the exponential is flat far from the goal."""
         return {"distance": 0.1 * self._missing(seen)}
 
-    def success(self, seen: Seen) -> Tensor:
+    def success(self, seen: TaskState) -> Tensor:
         """Return whether the rope turns by a whole turn within 6 cm of the cone."""
         return wound(seen.x).abs() >= 2 * math.pi
 
-    def shortfall(self, seen: Seen) -> Tensor:
+    def terminal_cost(self, seen: TaskState) -> Tensor:
         """Return what a whole turn that is missing counts: coils that are wide and loose may earn as much.
 
         Half of it counts what turns further out, too, by less the further: the other half does not say how to get near.

@@ -13,17 +13,17 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from torchdlo.coupling import BodyMatter
-from torchdlo.coupling.bodies.dynamics import Solid
+from torchdlo.coupling import BodyMpmCoupling
+from torchdlo.coupling.bodies.dynamics import RigidBody
 from torchdlo.coupling.mpm.constitutive_models import Plastic
-from torchdlo.coupling.mpm.particles import Blob, Grid, assemble, fill_ball
+from torchdlo.coupling.mpm.particles import Grid, ParticleBlock, assemble, fill_ball
 from torchdlo.envs.assets.rigid_objects import pebble
 from torchdlo.envs.core import curve_geometry
-from torchdlo.envs.core.task import RADIUS, Arms, Seen, Task, make, straight
+from torchdlo.envs.core.task import RADIUS, Arms, Task, TaskState, make, straight
 from torchdlo.physics.linalg.numerics import safe_norm
 from torchdlo.scene import Params, Rope, Scene, State
 
-__all__ = ["Gathering", "Rehearsal"]
+__all__ = ["Gathering", "GatheringSurrogate"]
 
 FINE, CELL = 0.0064, 0.01
 """Distance of particles and spacing of the grid [m]."""
@@ -51,41 +51,44 @@ class Gathering(Task):
     arms: ClassVar[Arms] = Arms(base=((-0.2, -0.63, 0.0), (0.5, -0.63, 0.0)), vertex=(1, 43), squeeze=10.0)
     combine: ClassVar[str] = "product"
     stretch: ClassVar[float] = 1.1
-    spread: ClassVar[tuple[tuple[float, float], ...]] = ((0.025, 0.0),) * 3
+    reset_noise: ClassVar[tuple[tuple[float, float], ...]] = ((0.025, 0.0),) * 3
 
     def build(self, moved: Tensor) -> tuple[Scene, Params, State]:
         """Return the scene; each of the objects may be moved."""
         rub = {"mu_s": 0.3, "mu_k": 0.3, "density": 600.0}
         at = [moved[:, k] + moved.new_tensor(p) for k, p in enumerate((BALL, PEBBLE, CYLINDER))]
-        solids = [pebble().solid(at[1].double(), name="pebble", **rub), Solid("cylinder", (0.05, 0.025), at[2], **rub)]
+        solids = [
+            pebble().solid(at[1].double(), name="pebble", **rub),
+            RigidBody("cylinder", (0.05, 0.025), at[2], **rub),
+        ]
         points = fill_ball((0.0, 0.0, 0.0), 0.05, FINE, moved) + at[0][:, None]
         numbers = {"youngs": 1e5, "poisson": 0.3, "yield_stress": 1e3, "density": 1000.0}
-        return self._made(moved, solids, assemble([Blob(points, Plastic(), FINE**3, numbers=numbers)], BOX))
+        return self._made(moved, solids, assemble([ParticleBlock(points, Plastic(), FINE**3, numbers=numbers)], BOX))
 
-    def _made(self, like: Tensor, solids: list[Solid], matter: tuple = ()) -> tuple[Scene, Params, State]:
+    def _made(self, like: Tensor, solids: list[RigidBody], material_points: tuple = ()) -> tuple[Scene, Params, State]:
         """Return the scene of some objects, on a plane, with the rope beside them."""
         x = straight((-0.15, 0.1, 0.012), 45, like.new_zeros(len(like), 3))
         rope = Rope(x, RADIUS, mass=0.44, youngs=1e3, stretch=1e5 * math.pi * RADIUS**2)
-        floor = Solid("plane", motion="fixed", mu_s=0.3, mu_k=0.3)
+        floor = RigidBody("plane", motion="fixed", mu_s=0.3, mu_k=0.3)
         values = {"damping": {"rate": 15.0, "twist_rate": 10.0}}
         # A wall of the box is the floor for matter.
-        meet = [BodyMatter(room=ROOM, planes=False)] if matter else []
-        return make(self, [rope], meet, values, solids=[floor, *solids], matter=matter)
+        meet = [BodyMpmCoupling(room=ROOM, planes=False)] if material_points else []
+        return make(self, [rope], meet, values, solids=[floor, *solids], material_points=material_points)
 
-    def _objects(self, seen: Seen) -> Tensor:
+    def _objects(self, seen: TaskState) -> Tensor:
         """Return the centres of the objects [m], shape (B, 3, 3)."""
-        return torch.cat([seen.state.matter.pos.mean(-2, keepdim=True), seen.state.bodies.pos[:, 1:]], -2)
+        return torch.cat([seen.state.material_points.pos.mean(-2, keepdim=True), seen.state.bodies.pos[:, 1:]], -2)
 
-    def _apart(self, seen: Seen) -> Tensor:
+    def _apart(self, seen: TaskState) -> Tensor:
         """Return how far each two objects are from each other [m], shape (B, 3)."""
         objects = self._objects(seen)
         return curve_geometry.distances(objects, objects.roll(1, -2)).diagonal(dim1=-2, dim2=-1)
 
-    def _hands(self, seen: Seen) -> Tensor:
+    def _hands(self, seen: TaskState) -> Tensor:
         """Return the distances of the hands to their nearest objects [m], shape (B, 2)."""
         return curve_geometry.nearest(seen.tool.pos, self._objects(seen))
 
-    def rewards(self, seen: Seen) -> dict[str, Tensor]:
+    def rewards(self, seen: TaskState) -> dict[str, Tensor]:
         """Return exponentials of how far objects are from each other and from the rope, and of hands too close."""
         return {
             "together": torch.exp(-self._apart(seen).sum(-1)),
@@ -93,33 +96,33 @@ class Gathering(Task):
             "clear": torch.exp(-100 * (0.1 - self._hands(seen)).clamp(min=0).sum(-1)),
         }
 
-    def extra(self, seen: Seen) -> dict[str, Tensor]:
+    def auxiliary_loss(self, seen: TaskState) -> dict[str, Tensor]:
         """Return how far the hands are from each other: far from the objects, nothing else tells the way."""
         return {"span": 0.1 * safe_norm(seen.tool.pos[:, 0] - seen.tool.pos[:, 1]).squeeze(-1)}
 
-    def note(self, seen: Seen) -> dict[str, Tensor]:
+    def note(self, seen: TaskState) -> dict[str, Tensor]:
         """Return how close hands came to objects so far [m], shape (B,)."""
         now = self._hands(seen).amin(-1)
         return {"closest": torch.minimum(now, seen.notes.get("closest", now))}
 
-    def failed(self, seen: Seen) -> Tensor:
+    def failed(self, seen: TaskState) -> Tensor:
         """Return whether a hand has lost the rope."""
         return (seen.closed == 0).any(-1).any(-1)
 
-    def success(self, seen: Seen) -> Tensor:
+    def success(self, seen: TaskState) -> Tensor:
         """Return whether the objects are together and no hand came too close."""
         return (self._apart(seen) <= NEAR).all(-1) & (seen.notes["closest"] >= CLEAR)
 
-    def shortfall(self, seen: Seen) -> Tensor:
+    def terminal_cost(self, seen: TaskState) -> Tensor:
         """Return what is missing of each condition of success: of each two objects, and of the nearer hand."""
         apart = self._apart(seen) / (1 - SPARE) / NEAR - 1
         clear = 1 - seen.notes["closest"] / (1 + SPARE) / CLEAR
         missing = torch.cat([apart, clear[:, None]], -1).clamp(min=0)
         return SHORT * (missing / (1 + missing)).sum(-1)
 
-    def rehearsal(self) -> Rehearsal | None:
+    def surrogate(self) -> GatheringSurrogate | None:
         """Return the task with rigid objects only."""
-        return Rehearsal(self.horizon, self.frames, self.settle, self.release, self.rope)
+        return GatheringSurrogate(self.horizon, self.frames, self.settle_steps, self.release, self.rope)
 
     def waypoints(self) -> list[list[tuple[float, float, float]]]:
         """Return a way by which the hands draw the rope round the objects, until it is a narrow bow about them."""
@@ -127,7 +130,7 @@ class Gathering(Task):
 
 
 @dataclass(frozen=True)
-class Rehearsal(Gathering):
+class GatheringSurrogate(Gathering):
     """Upright cylinders in place of the soft ball and the pebble, as wide, high and heavy as they are at rest."""
 
     def build(self, moved: Tensor) -> tuple[Scene, Params, State]:
@@ -135,11 +138,11 @@ class Rehearsal(Gathering):
         solids = []
         for k, (place, (radius, half), mass) in enumerate(zip((BALL, PEBBLE, CYLINDER), DRUMS, MASSES, strict=True)):
             at = moved[:, k] + moved.new_tensor([*place[:2], half])
-            solids.append(Solid("cylinder", (radius, half), at, mass=mass, mu_s=0.3, mu_k=0.3))
+            solids.append(RigidBody("cylinder", (radius, half), at, mass=mass, mu_s=0.3, mu_k=0.3))
         return self._made(moved, solids)
 
-    def rehearsal(self) -> None:
+    def surrogate(self) -> None:
         """Return nothing: this is it."""
 
-    def _objects(self, seen: Seen) -> Tensor:
+    def _objects(self, seen: TaskState) -> Tensor:
         return seen.state.bodies.pos[:, 1:]

@@ -15,9 +15,9 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from torchdlo.coupling.bodies.dynamics import Solid
+from torchdlo.coupling.bodies.dynamics import RigidBody
 from torchdlo.envs.core import curve_geometry
-from torchdlo.envs.core.task import RADIUS, SPACING, Arms, Seen, Stage, Task, make
+from torchdlo.envs.core.task import RADIUS, SPACING, Arms, Stage, Task, TaskState, make
 from torchdlo.physics.effects.elastic import BendFrame
 from torchdlo.physics.effects.material import BendingPlasticity
 from torchdlo.scene import Params, Rope, Scene, State
@@ -99,7 +99,7 @@ class LetterArt(Task):
 
     name: ClassVar[str] = "letter_art"
     arms: ClassVar[Arms] = Arms(base=((0.1, 0.65, 0.0), (0.1, -0.75, 0.0)), vertex=(24, 53))
-    spread: ClassVar[tuple[tuple[float, float], ...]] = ((0.005, 0.01),) * 3
+    reset_noise: ClassVar[tuple[tuple[float, float], ...]] = ((0.005, 0.01),) * 3
     anchored: ClassVar[bool] = True
     stages: ClassVar[tuple[Stage, ...]] = (Stage(0, (24, 53)), Stage(54, (0, 23)), Stage(80, (54, 78)))
 
@@ -112,12 +112,12 @@ class LetterArt(Task):
             line = torch.stack([0 * along, -along, 0 * along], -1) + moved.new_tensor([*start, RADIUS])
             x = line + moved[:, k : k + 1]
             wires.append(Rope(x, RADIUS, mass=1e-3 * (count - 1), youngs=stiffness, stretch=1e5 * area))
-        solids = [Solid("cylinder", (POST, TOP / 2), (*p, TOP / 2), motion="fixed") for p in posts()]
-        solids.append(Solid("torus", (RING, RADIUS), (*MIDDLE, RADIUS), motion="fixed", name="O"))
+        solids = [RigidBody("cylinder", (POST, TOP / 2), (*p, TOP / 2), motion="fixed") for p in posts()]
+        solids.append(RigidBody("torus", (RING, RADIUS), (*MIDDLE, RADIUS), motion="fixed", name="O"))
         values = {"bending_plasticity": PLASTIC}
         return make(self, wires, [BendFrame(), BendingPlasticity()], values, solids=solids)
 
-    def missing(self, seen: Seen) -> tuple[Tensor, Tensor]:
+    def missing(self, seen: TaskState) -> tuple[Tensor, Tensor]:
         """Return how far the D and the L are from their goals [m], shape (B,) each."""
         stem, bow, ell = seen.x.split(COUNTS, -2)
         goal = [g.to(seen.x).expand(len(seen.x), -1, -1) for g in goals()]
@@ -125,21 +125,21 @@ class LetterArt(Task):
             ell, goal[2]
         )
 
-    def rewards(self, seen: Seen) -> dict[str, Tensor]:
+    def rewards(self, seen: TaskState) -> dict[str, Tensor]:
         """Return exponentials of how far either letter is from its goal."""
         d, ell = self.missing(seen)
         return {"d": torch.exp(-10 * d), "l": torch.exp(-10 * ell)}
 
-    def failed(self, seen: Seen) -> Tensor:
+    def failed(self, seen: TaskState) -> Tensor:
         """Return whether a wire is stretched by more than a tenth."""
         lengths = [curve_geometry.length(x) / (SPACING * (x.shape[-2] - 1)) for x in seen.x.split(COUNTS, -2)]
         return torch.stack(lengths).amax(0) > 1.1
 
-    def success(self, seen: Seen) -> Tensor:
+    def success(self, seen: TaskState) -> Tensor:
         """Return whether both letters are near their goals."""
         return torch.stack(self.missing(seen)).amax(0) <= CLOSE
 
-    def ways(self) -> list[list[list[tuple[float, float, float]]]]:
+    def stage_waypoints(self) -> list[list[list[tuple[float, float, float]]]]:
         """Return a way of three stages: hands draw one wire after the other taut round its posts, and wait."""
         bow = [(-0.09, -0.005), (-0.1785, -0.0814)]
         ell = [((0.035, 0.004), (0.135, 0.01)), ((0.035, 0.004), (0.21, 0.09)), ((0.035, 0.004), (0.232, 0.18))]

@@ -13,10 +13,10 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from torchdlo.coupling.bodies.dynamics import Solid
+from torchdlo.coupling.bodies.dynamics import RigidBody
 from torchdlo.envs.assets.rigid_objects import GAP, RING, TUBE, c_ring, origin
 from torchdlo.envs.core import curve_geometry
-from torchdlo.envs.core.task import RADIUS, Arms, Seen, Task, make, straight
+from torchdlo.envs.core.task import RADIUS, Arms, Task, TaskState, make, straight
 from torchdlo.physics.linalg.numerics import safe_norm
 from torchdlo.scene import Params, Rope, Scene, State
 
@@ -43,7 +43,7 @@ class Lifting(Task):
     arms: ClassVar[Arms] = Arms(base=((0.25, -0.4, 0.0), (0.95, -0.4, 0.0)), vertex=(4, 25))
     stretch: ClassVar[float] = 1.1
     anchored: ClassVar[bool] = True
-    spread: ClassVar[tuple[tuple[float, float], ...]] = ((0.05, 0.025),)
+    reset_noise: ClassVar[tuple[tuple[float, float], ...]] = ((0.05, 0.025),)
 
     def build(self, moved: Tensor) -> tuple[Scene, Params, State]:
         """Return the scene; the rope may be moved."""
@@ -51,13 +51,13 @@ class Lifting(Task):
         rope = Rope(x, RADIUS, mass=0.029, youngs=5e3, stretch=1e5 * math.pi * RADIUS**2)
         rub = {"mu_s": 0.6, "mu_k": 0.6}
         rings = [c_ring().solid(p, density=120.0, name=f"ring {k}", **rub) for k, p in enumerate(CENTRES)]
-        return make(self, [rope], solids=[Solid("plane", motion="fixed", **rub), *rings])
+        return make(self, [rope], solids=[RigidBody("plane", motion="fixed", **rub), *rings])
 
-    def _rings(self, seen: Seen) -> Tensor:
+    def _rings(self, seen: TaskState) -> Tensor:
         """Return the centres of the rings [m], shape (B, 2, 3)."""
         return torch.stack([origin(c_ring(), seen.state.bodies, k) for k in (1, 2)], -2)
 
-    def rewards(self, seen: Seen) -> dict[str, Tensor]:
+    def rewards(self, seen: TaskState) -> dict[str, Tensor]:
         """Return how high the rings are, how near and how far below the rope is, and how close hands come to them."""
         rings = self._rings(seen)
         apart = curve_geometry.distances(rings, seen.x)
@@ -72,18 +72,18 @@ class Lifting(Task):
             "clear": -100.0 * close.sum(-1),
         }
 
-    def note(self, seen: Seen) -> dict[str, Tensor]:
+    def note(self, seen: TaskState) -> dict[str, Tensor]:
         """Return the heights of the rings after the last actions, shape (B, 5, 2)."""
         now = self._rings(seen)[:, None, :, 2]
         last = seen.notes.get("heights", now.expand(-1, LATE, -1))
         return {"heights": torch.cat([last[:, 1:], now], 1)}
 
-    def success(self, seen: Seen) -> Tensor:
+    def success(self, seen: TaskState) -> Tensor:
         """Return whether both rings stayed up for the last 0.1 s."""
         start = seen.x.new_tensor([c[2] for c in CENTRES])
         return (seen.notes["heights"] >= start + LIFT).all(-1).all(-1)
 
-    def shortfall(self, seen: Seen) -> Tensor:
+    def terminal_cost(self, seen: TaskState) -> Tensor:
         """Return how far the rope has to go into the rings, and by how much they are too low.
 
         Behind a ring the rope is as near to its centre as in front of its gap, but has the whole way round to go.

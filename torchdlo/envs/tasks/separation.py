@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from torchdlo.envs.core import curve_geometry
-from torchdlo.envs.core.task import RADIUS, SPACING, Arms, Seen, Task, even, make, raised, settled
+from torchdlo.envs.core.task import RADIUS, SPACING, Arms, Task, TaskState, even, make, raised, settled
 from torchdlo.scene import Params, Rope, Scene, State
 
 __all__ = ["Separation"]
@@ -62,19 +62,19 @@ class Separation(Task):
 
     name: ClassVar[str] = "separation"
     arms: ClassVar[Arms] = Arms(base=((0.8, -0.5, 0.0), (-0.2, -0.5, 0.0)), vertex=(27, 32))
-    spread: ClassVar[tuple[tuple[float, float], ...]] = ((0.05, 0.025),)
+    reset_noise: ClassVar[tuple[tuple[float, float], ...]] = ((0.05, 0.025),)
 
     def build(self, moved: Tensor) -> tuple[Scene, Params, State]:
         """Return the scene; both ropes may be moved together."""
         return _made(self, lying().to(moved) + moved[:, :1])
 
-    def rewards(self, seen: Seen) -> dict[str, Tensor]:
+    def rewards(self, seen: TaskState) -> dict[str, Tensor]:
         """Return the mean distances of the vertices of either rope to the other."""
         first, second = seen.x.split(COUNT, -2)
         apart = curve_geometry.distances(first, second)
         return {"first": apart.amin(-1).mean(-1), "second": apart.amin(-2).mean(-1)}
 
-    def success(self, seen: Seen) -> Tensor:
+    def success(self, seen: TaskState) -> Tensor:
         """Return whether the ropes do not cross and are apart."""
         first, second = seen.x.split(COUNT, -2)
         return (curve_geometry.crossings(first, second) == 0) & (

@@ -12,8 +12,8 @@ from typing import ClassVar
 
 from torch import Tensor
 
-from torchdlo.coupling.bodies.dynamics import Solid
-from torchdlo.envs.core.task import RADIUS, Arms, Seen, Task, make, straight
+from torchdlo.coupling.bodies.dynamics import RigidBody
+from torchdlo.envs.core.task import RADIUS, Arms, Task, TaskState, make, straight
 from torchdlo.physics.linalg.numerics import safe_norm
 from torchdlo.scene import Params, Rope, Scene, State
 
@@ -36,12 +36,12 @@ class Slingshot(Task):
     """Shoot a ball at a cube with a slingshot."""
 
     horizon: int = 30
-    settle: int = 100
+    settle_steps: int = 100
     release: int = 200
 
     name: ClassVar[str] = "slingshot"
     arms: ClassVar[Arms] = Arms(base=((-0.33, -0.65, 0.0),), vertex=(6,), squeeze=3.0)
-    spread: ClassVar[tuple[tuple[float, float], ...]] = ((0.03, 0.0),)
+    reset_noise: ClassVar[tuple[tuple[float, float], ...]] = ((0.03, 0.0),)
 
     def build(self, moved: Tensor) -> tuple[Scene, Params, State]:
         """Return the scene; ball and cube may be moved together."""
@@ -52,21 +52,21 @@ class Slingshot(Task):
         ball = moved[:, 0] + moved.new_tensor([0.12, BALL_Y, 0.2])
         cube = moved[:, 0] + moved.new_tensor([0.12, CUBE_Y, 0.22])
         solids = [
-            Solid("box", (0.4, 0.95, 0.09), (0.12, 1.0, 0.09), motion="fixed", mu_s=table, mu_k=table),
-            Solid("sphere", 0.02, ball, density=200.0, mu_s=1.0, mu_k=1.0),
-            Solid("box", (0.04, 0.04, 0.04), cube, density=20.0, mu_s=1.0, mu_k=1.0),
+            RigidBody("box", (0.4, 0.95, 0.09), (0.12, 1.0, 0.09), motion="fixed", mu_s=table, mu_k=table),
+            RigidBody("sphere", 0.02, ball, density=200.0, mu_s=1.0, mu_k=1.0),
+            RigidBody("box", (0.04, 0.04, 0.04), cube, density=20.0, mu_s=1.0, mu_k=1.0),
         ]
         return make(self, [band], solids=solids, fixed=(0, 1, 10, 11), burst=SNAP)
 
-    def rewards(self, seen: Seen) -> dict[str, Tensor]:
+    def rewards(self, seen: TaskState) -> dict[str, Tensor]:
         """Return how far away the cube is."""
         return {"cube": seen.state.bodies.pos[:, CUBE, 1].clamp(0.0, 5.0)}
 
-    def extra(self, seen: Seen) -> dict[str, Tensor]:
+    def auxiliary_loss(self, seen: TaskState) -> dict[str, Tensor]:
         """Return how far the middle of the band is from a point behind it: the ball tells only at the end."""
         return {"draw": safe_norm(seen.x[:, 6] - seen.x.new_tensor([0.12, -DRAW, 0.21])).squeeze(-1)}
 
-    def success(self, seen: Seen) -> Tensor:
+    def success(self, seen: TaskState) -> Tensor:
         """Return whether the cube is further away and the ball left its place, which has nothing else to push it."""
         y = seen.state.bodies.pos[..., 1]
         return (y[:, CUBE] >= CUBE_Y + 0.05) & (y[:, BALL] >= BALL_Y + 0.05)

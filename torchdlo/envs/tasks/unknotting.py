@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from torchdlo.envs.core import curve_geometry
-from torchdlo.envs.core.task import RADIUS, SPACING, Arms, Seen, Task, even, make, raised, settled
+from torchdlo.envs.core.task import RADIUS, SPACING, Arms, Task, TaskState, even, make, raised, settled
 from torchdlo.scene import Params, Rope, Scene, State
 
 __all__ = ["Unknotting"]
@@ -60,20 +60,20 @@ class Unknotting(Task):
     arms: ClassVar[Arms] = Arms(base=((0.25, -0.5, 0.0), (1.1, 0.2, 0.0)), vertex=(2, 37), quat=(SIDEWAYS, SIDEWAYS))
     combine: ClassVar[str] = "product"
     stretch: ClassVar[float] = 1.05
-    spread: ClassVar[tuple[tuple[float, float], ...]] = ((0.05, 0.025),)
+    reset_noise: ClassVar[tuple[tuple[float, float], ...]] = ((0.05, 0.025),)
 
     def build(self, moved: Tensor) -> tuple[Scene, Params, State]:
         """Return the scene; the rope may be moved."""
         return _made(self, lying().to(moved) + moved[:, :1])
 
-    def rewards(self, seen: Seen) -> dict[str, Tensor]:
+    def rewards(self, seen: TaskState) -> dict[str, Tensor]:
         """Return exponentials of minus the average crossing number and of how closely the rope lies to itself."""
         return {
             "crossings": torch.exp(-curve_geometry.crossing_number(seen.x)),
             "clear": torch.exp(-100 * curve_geometry.crowding(seen.x, 0.04)),
         }
 
-    def success(self, seen: Seen) -> Tensor:
+    def success(self, seen: TaskState) -> Tensor:
         """Return whether the rope is not knotted and does not cross itself."""
         return (curve_geometry.crossings(seen.x) == 0) & (curve_geometry.determinant(seen.x) == 1)
 

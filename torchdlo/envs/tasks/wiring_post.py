@@ -14,9 +14,9 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from torchdlo.coupling.bodies.dynamics import Solid
+from torchdlo.coupling.bodies.dynamics import RigidBody
 from torchdlo.envs.core import curve_geometry
-from torchdlo.envs.core.task import RADIUS, SPACING, Arms, Seen, Task, make, straight
+from torchdlo.envs.core.task import RADIUS, SPACING, Arms, Task, TaskState, make, straight
 from torchdlo.physics.linalg.numerics import safe_norm
 from torchdlo.scene import Params, Rope, Scene, State
 
@@ -84,16 +84,16 @@ class WiringPost(Task):
     arms: ClassVar[Arms] = Arms(base=((-0.2, -0.25, 0.0),), vertex=(3,))
     combine: ClassVar[str] = "product"
     anchored: ClassVar[bool] = True
-    spread: ClassVar[tuple[tuple[float, float], ...]] = ((0.05, 0.025),)
+    reset_noise: ClassVar[tuple[tuple[float, float], ...]] = ((0.05, 0.025),)
 
     def build(self, moved: Tensor) -> tuple[Scene, Params, State]:
         """Return the scene; the rope may be moved."""
         x = straight((0.3, 0.05, 0.012), COUNT, moved[:, 0])
         rub = {"mu_s": 0.7, "mu_k": 0.7}
-        posts = [Solid("cylinder", (0.02, 0.02), (*p, 0.02), motion="fixed", **rub) for p in POSTS]
+        posts = [RigidBody("cylinder", (0.02, 0.02), (*p, 0.02), motion="fixed", **rub) for p in POSTS]
         return make(self, [Rope(x, RADIUS, mass=0.029, youngs=1e4)], solids=posts)
 
-    def rewards(self, seen: Seen) -> dict[str, Tensor]:
+    def rewards(self, seen: TaskState) -> dict[str, Tensor]:
         """Return exponentials of minus the distance to the goal, the height, and how far the middle is off."""
         x = seen.x
         off = safe_norm(x[:, 15, :2] - x.new_tensor(MIDDLE)).squeeze(-1)
@@ -103,12 +103,12 @@ class WiringPost(Task):
             "middle": torch.exp(-5 * (off - 0.02).clamp(min=0)),
         }
 
-    def success(self, seen: Seen) -> Tensor:
+    def success(self, seen: TaskState) -> Tensor:
         """Return whether the rope passes each post on its side, turns round it, and is near the goal."""
         beside, turn, off = self._judged(seen.x)
         return (off <= NEAR) & (beside > 0).all(-1) & (turn >= TURN).all(-1)
 
-    def shortfall(self, seen: Seen) -> Tensor:
+    def terminal_cost(self, seen: TaskState) -> Tensor:
         """Return what is missing of each condition of success, 1 at most each: ropes that are near need not be bent."""
         beside, turn, off = self._judged(seen.x)
         off = (off / (1 - SPARE) - NEAR).clamp(min=0) / NEAR
@@ -142,7 +142,7 @@ class WiringPost(Task):
         return [[point] for point in way]
 
 
-def bent(x: Tensor, near: Tensor, reach: float = 0.08) -> Tensor:
+def bent(x: Tensor, near: Tensor, max_translation: float = 0.08) -> Tensor:
     """Return by how much curves change their direction in the top view within reach of a post [rad], shape (...).
 
     Args:
@@ -152,4 +152,4 @@ def bent(x: Tensor, near: Tensor, reach: float = 0.08) -> Tensor:
     edge = x[..., 1:, :2] - x[..., :-1, :2]
     a, b = edge[..., :-1, :], edge[..., 1:, :]
     turn = torch.atan2(a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0], (a * b).sum(-1))
-    return (turn * (near[..., 1:-1] <= reach)).sum(-1)
+    return (turn * (near[..., 1:-1] <= max_translation)).sum(-1)

@@ -14,9 +14,9 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from torchdlo.coupling.bodies.dynamics import Solid
+from torchdlo.coupling.bodies.dynamics import RigidBody
 from torchdlo.envs.core import curve_geometry
-from torchdlo.envs.core.task import RADIUS, SPACING, Arms, Seen, Stage, Task, make, straight
+from torchdlo.envs.core.task import RADIUS, SPACING, Arms, Stage, Task, TaskState, make, straight
 from torchdlo.physics.linalg.numerics import safe_norm
 from torchdlo.scene import Params, Rope, Scene, State
 
@@ -42,7 +42,7 @@ class WiringRing(Task):
 
     name: ClassVar[str] = "wiring_ring"
     arms: ClassVar[Arms] = Arms(base=((0.3, -0.6, 0.0), (-0.35, -0.1, 0.0)), vertex=(2, 0))
-    spread: ClassVar[tuple[tuple[float, float], ...]] = ((0.01, 0.01),)
+    reset_noise: ClassVar[tuple[tuple[float, float], ...]] = ((0.01, 0.01),)
     anchored: ClassVar[bool] = True
     stages: ClassVar[tuple[Stage, ...]] = (
         Stage(0, (2, None)),
@@ -60,7 +60,7 @@ class WiringRing(Task):
         size = (INNER + TUBE, TUBE)
         # A torus has its axis along z: a quarter turn about y lays it along x, one about x along y.
         quats = ((HALF, 0.0, HALF, 0.0), (HALF, HALF, 0.0, 0.0))
-        rings = [Solid("torus", size, p, q, motion="fixed") for p, q in zip(RINGS, quats, strict=True)]
+        rings = [RigidBody("torus", size, p, q, motion="fixed") for p, q in zip(RINGS, quats, strict=True)]
         return make(self, [rope], solids=rings)
 
     def _passes(self, x: Tensor) -> Tensor:
@@ -69,7 +69,7 @@ class WiringRing(Task):
             [curve_geometry.pierced(x, x.new_tensor(p), x.new_tensor(n), INNER) for p, n in _discs()], -2
         )
 
-    def rewards(self, seen: Seen) -> dict[str, Tensor]:
+    def rewards(self, seen: TaskState) -> dict[str, Tensor]:
         """Return how near the rope is to both rings, how near its lead end is to its place, and rings passed."""
         x = seen.x
         centres = x.new_tensor(RINGS).expand(len(x), -1, -1)
@@ -80,18 +80,18 @@ class WiringRing(Task):
             "passed": (self._passes(x).sum(-1) % 2).to(x.dtype).sum(-1),
         }
 
-    def note(self, seen: Seen) -> dict[str, Tensor]:
+    def note(self, seen: TaskState) -> dict[str, Tensor]:
         """Return where tools are (B, R, 3), and whether one went through a ring in the action before (B,)."""
         now = seen.tool.pos
         way = torch.stack([seen.notes.get("tool", now), now], -2)
         through = [curve_geometry.pierced(way, way.new_tensor(p), way.new_tensor(n), OUTER) for p, n in _discs()]
         return {"tool": now, "through": torch.stack(through).any(0).flatten(1).any(-1)}
 
-    def failed(self, seen: Seen) -> Tensor:
+    def failed(self, seen: TaskState) -> Tensor:
         """Return whether the rope is stretched by more than a tenth, or a hand went through a ring."""
         return (curve_geometry.length(seen.x) > 1.1 * SPACING * (COUNT - 1)) | seen.notes["through"]
 
-    def success(self, seen: Seen) -> Tensor:
+    def success(self, seen: TaskState) -> Tensor:
         """Return whether the rope passes both rings an odd number of times, the first one first, and ends behind."""
         passes = self._passes(seen.x)
         odd = passes.sum(-1) % 2 == 1
@@ -102,7 +102,7 @@ class WiringRing(Task):
         out = ((seen.x[:, 0] - seen.x.new_tensor(RINGS[1])) * seen.x.new_tensor(ALONG[1])).sum(-1)
         return odd.all(-1) & (last <= first) & (out >= BEYOND)
 
-    def ways(self) -> list[list[list[tuple[float, float, float]]]]:
+    def stage_waypoints(self) -> list[list[list[tuple[float, float, float]]]]:
         """Return a way of six stages: push the end through, draw it to the other ring, and the same there."""
         stay = (0.0, 0.0, 0.0)
         return [

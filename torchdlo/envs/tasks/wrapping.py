@@ -12,9 +12,9 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from torchdlo.coupling.bodies.dynamics import Solid
+from torchdlo.coupling.bodies.dynamics import RigidBody
 from torchdlo.envs.core import curve_geometry
-from torchdlo.envs.core.task import RADIUS, Arms, Seen, Task, make
+from torchdlo.envs.core.task import RADIUS, Arms, Task, TaskState, make
 from torchdlo.scene import Params, Rope, Scene, State
 
 __all__ = ["Wrapping"]
@@ -47,7 +47,7 @@ class Wrapping(Task):
     floor: ClassVar[float] = 0.04
     stretch: ClassVar[float] = 1.2
     anchored: ClassVar[bool] = True
-    spread: ClassVar[tuple[tuple[float, float], ...]] = ((0.025, 0.01),)
+    reset_noise: ClassVar[tuple[tuple[float, float], ...]] = ((0.025, 0.01),)
 
     def build(self, moved: Tensor) -> tuple[Scene, Params, State]:
         """Return the scene; the loop may be moved."""
@@ -57,7 +57,7 @@ class Wrapping(Task):
         stiff = 1e5 * math.pi * RADIUS**2
         loop = Rope(x, RADIUS, mass=0.05, youngs=1e4, stretch=stiff, closed=True)
         rub = {"mu_s": 0.7, "mu_k": 0.7}
-        posts = [Solid("cylinder", (POST, TOP / 2), (*p, TOP / 2), motion="fixed", **rub) for p in POSTS]
+        posts = [RigidBody("cylinder", (POST, TOP / 2), (*p, TOP / 2), motion="fixed", **rub) for p in POSTS]
         return make(self, [loop], solids=posts)
 
     def _posts(self, x: Tensor) -> Tensor:
@@ -67,20 +67,20 @@ class Wrapping(Task):
         """Return how often the loop goes round each post, shape (B, 3)."""
         return torch.stack([curve_geometry.winding(x, post[:2]) for post in self._posts(x)], -1)
 
-    def rewards(self, seen: Seen) -> dict[str, Tensor]:
+    def rewards(self, seen: TaskState) -> dict[str, Tensor]:
         """Return 1, how many posts the loop goes round, and how far it is off each."""
         posts = self._posts(seen.x).expand(len(seen.x), -1, -1)
         off = (curve_geometry.nearest(posts, seen.x) - POST).clamp(min=0).sum(-1)
         once = (self._wound(seen.x).abs() - 1).square().mean(-1)
         return {"present": torch.ones_like(off), "round": 1 - once, "near": -off}
 
-    def success(self, seen: Seen) -> Tensor:
+    def success(self, seen: TaskState) -> Tensor:
         """Return whether the loop goes round every post once, and touches each within 5 mm below its top."""
         apart = self._apart(seen.x)
         near = torch.where((seen.x[..., 2] <= LOW).unsqueeze(-2), apart, math.inf).amin(-1) <= NEAR
         return (self._around(seen.x) & near).all(-1)
 
-    def shortfall(self, seen: Seen) -> Tensor:
+    def terminal_cost(self, seen: TaskState) -> Tensor:
         """Return how far the loop has to go up and over posts, and then down beside them."""
         apart, height = self._apart(seen.x), seen.x[..., 2].unsqueeze(-2)
         over = (apart + (LOW + SPARE - height).clamp(min=0)).amin(-1)

@@ -51,7 +51,8 @@ class Lengths:
         return 1e-10 if self.rest.dtype == torch.float64 else 1e-6
 
     def yielding(self, tension: Tensor) -> tuple[Tensor | float, Tensor | float]:
-        """Return how much an edge lengthens beyond the tension that steps can follow [m], and the slope of that [m/N].
+        """Return how much an edge lengthens beyond the tension that steps can follow [m], and the gradient of that
+        [m/N].
 
         A tension T makes transverse waves of w dt = 2 sqrt(T give / length); beyond a share of the stable T edges
         give way, so that ropes pulled beyond their length stay finite.

@@ -88,11 +88,11 @@ class Param:
 
 
 _HELD = 0.1
-"""Share of its mobility with which a held vertex counts in `Motion.give`."""
+"""Share of its mobility with which a held vertex counts in `PredictedMotion.give`."""
 
 
 @tree.struct
-class Motion:
+class PredictedMotion:
     """Where vertices would go in a substep."""
 
     change: Tensor
@@ -102,9 +102,9 @@ class Motion:
     answer: Tensor
     """The same, 0 if it is held [m/N], shape (..., V, 3)."""
     bodies: Any = None
-    """Where rigid bodies would go, see `coupling.bodies.dynamics.BodyMotion`; None in a scene without."""
-    matter: Any = None
-    """Where matter would go, see `coupling.mpm.rod_coupling_effect.Foreseen`; None in a scene without."""
+    """Where rigid bodies would go, see `coupling.bodies.dynamics.PredictedBodyMotion`; None in a scene without."""
+    material_points: Any = None
+    """Where matter would go, see `coupling.mpm.rod_coupling_effect.PredictedParticles`; None in a scene without."""
 
     @property
     def give(self) -> Tensor:
@@ -117,7 +117,7 @@ class Motion:
 
 
 @tree.struct
-class Push:
+class ContactForces:
     """What an effect exerts on rods and on rigid bodies."""
 
     force: Tensor
@@ -126,13 +126,13 @@ class Push:
     """Force on bodies [N], shape (..., K or 1, 3)."""
     body_torque: Tensor
     """Torque on bodies about their centres of mass [N m], shape (..., K or 1, 3)."""
-    matter: Any = ()
-    """What is left of matter, see `coupling.mpm.rod_coupling_effect.Touched`; () if it is not touched."""
+    material_points: Any = ()
+    """What is left of matter, see `coupling.mpm.rod_coupling_effect.TouchedParticles`; () if it is not touched."""
 
-    def plus(self, other: Push) -> Push:
+    def plus(self, other: ContactForces) -> ContactForces:
         """Return what both exert together; no more than one effect touches matter."""
         sums = [getattr(self, n) + getattr(other, n) for n in ("force", "body_force", "body_torque")]
-        return Push(*sums, self.matter if self.matter != () else other.matter)
+        return ContactForces(*sums, self.material_points if self.material_points != () else other.material_points)
 
 
 class Effect(ABC):
@@ -151,12 +151,12 @@ class Effect(ABC):
     """Whether it reads the material frames or exerts torques about the edges' axes."""
     frame_bending: ClassVar[bool] = False
     """Whether it changes what only `BendFrame` reads: natural curvature, or stiffness by direction."""
-    settles: ClassVar[bool] = False
+    is_quasistatic: ClassVar[bool] = False
     """Whether its torques take part in quasistatic twist."""
     memory: ClassVar[int] = 0
     """How many numbers per slot it remembers from substep to substep. They are 0 at the start."""
-    reacts: ClassVar[bool] = False
-    """Whether it has `react`, and with it `survey` and `shortfall`."""
+    is_contact: ClassVar[bool] = False
+    """Whether it has `solve_contact`, and with it `broad_phase` and `capacity_overflow`."""
     rounds: int = 1
     """How often per substep it reacts, each time to the motion that the lengths of the edges leave."""
     last: ClassVar[bool] = False
@@ -166,7 +166,7 @@ class Effect(ABC):
         """Raise a `ValueError` if its static choices do not fit the rods."""
         return
 
-    def alter(self, topology: Topology, params: RodParams, values: Values) -> RodParams:
+    def modify_material(self, topology: Topology, params: RodParams, values: Values) -> RodParams:
         """Return the rods' parameters as this effect changes them: rest shape, stiffness, mass."""
         return params
 
@@ -174,11 +174,11 @@ class Effect(ABC):
         """Return loads by name, see `LOADS`."""
         return {}
 
-    def flow(self, view: View, values: Values) -> Tensor | None:
+    def plastic_flow(self, view: View, values: Values) -> Tensor | None:
         """Return the change of `RodState.plastic` over the substep, shape (..., V, 2), if the effect causes one."""
         return None
 
-    def remember(self, view: View, values: Values) -> Tensor:
+    def update_memory(self, view: View, values: Values) -> Tensor:
         """Return what it remembers of the view, shape (..., V, memory); asked only if `memory` is not 0."""
         return view.state.memory[self.name]
 
@@ -186,7 +186,7 @@ class Effect(ABC):
         """Return where markers are seen [m], shape (..., F, M, 3)."""
         return track.pos
 
-    def survey(self, view: View, carried: Tensor) -> Values:
+    def broad_phase(self, view: View, carried: Tensor) -> Values:
         """Return what it looks up once per step and finds among its numbers in every substep of it.
 
         Args:
@@ -195,11 +195,11 @@ class Effect(ABC):
         """
         return {}
 
-    def shortfall(self, pos: Tensor, values: Values) -> Tensor:
+    def capacity_overflow(self, pos: Tensor, values: Values) -> Tensor:
         """Return what the survey had no room for [1] and by how much it was outrun [m], shape (..., 1, 2)."""
         return pos.new_zeros(1, 2)
 
-    def react(self, view: View, motion: Motion, values: Values) -> Tensor | Push:
+    def solve_contact(self, view: View, motion: PredictedMotion, values: Values) -> Tensor | ContactForces:
         """Return forces on vertices that answer to where they would go [N], shape (..., V, 3), or on bodies too."""
         return view.state.pos.new_zeros(1, 3)
 
@@ -217,7 +217,7 @@ def default_values(effect: Effect | type[Effect], like: Tensor) -> Values:
     }
 
 
-def numbers_of(
+def parameters_of(
     effects: Iterable[Effect], values: dict[str, dict[str, float | Sequence[float] | Tensor]], like: Tensor
 ) -> dict[str, Values]:
     """Return the numbers of effects by their names: the given ones, and defaults for those that are not given.
@@ -258,7 +258,7 @@ def numbers_of(
 def altered(effects: Iterable[Effect], topology: Topology, params: RodParams, values: dict[str, Values]) -> RodParams:
     """Return the rods' parameters as all effects together change them."""
     for effect in _in_order(effects):
-        params = effect.alter(topology, params, values.get(effect.name, {}))
+        params = effect.modify_material(topology, params, values.get(effect.name, {}))
     return params
 
 

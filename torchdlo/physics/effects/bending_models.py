@@ -43,7 +43,7 @@ class InternalFriction(Effect):
     name: ClassVar[str] = "internal_friction"
     kind: ClassVar[str] = "material"
     frames: ClassVar[bool] = True
-    settles: ClassVar[bool] = True
+    is_quasistatic: ClassVar[bool] = True
     memory: ClassVar[int] = 5
     params: ClassVar[dict[str, Param]] = {
         "moment": Param(0.0, 0.0, 0.2, "N m", "linear", 0.0, "Moment at which it saturates."),
@@ -67,7 +67,7 @@ class InternalFriction(Effect):
         before, real = view.state.memory[self.name][..., :2], view.params.rest.hinge_mask
         moment = values["moment"] * (before * decay + change * mean) * real
         # dM/dk = M' (mean 1 + w u^T), w = change dmean/da - z0 exp(-a), u = change / a.
-        slope = values["moment"] / (values["kappa_c"] * view.hinge_length) * real
+        gradient = values["moment"] / (values["kappa_c"] * view.hinge_length) * real
         small = size < 1e-3
         safe = torch.where(small, 1.0, size)
         w = change * torch.where(small, -0.5 + size / 3, (decay - mean) / safe) - before * decay
@@ -78,13 +78,13 @@ class InternalFriction(Effect):
         odd = 0.5 * (w[..., :1] * u[..., 1:] - w[..., 1:] * u[..., :1])
         return {
             **hinge.pull_back(view, moment),
-            **answers(view, hinge, moment, slope * started * (even + _outer(w, u))),
-            "twist_skew": slope * started * odd * (b1 * a2 - b2 * a1),
+            **answers(view, hinge, moment, gradient * started * (even + _outer(w, u))),
+            "twist_skew": gradient * started * odd * (b1 * a2 - b2 * a1),
             # Turning back, friction is up to twice as stiff.
-            "hinge_stiffness": closing(slope * (1 + safe_norm(before)), dot(hinge.binormal, hinge.binormal) / 4),
+            "hinge_stiffness": closing(gradient * (1 + safe_norm(before)), dot(hinge.binormal, hinge.binormal) / 4),
         }
 
-    def remember(self, view: View, values: Values) -> Tensor:
+    def update_memory(self, view: View, values: Values) -> Tensor:
         """Return z, the curvature of the view, and 1."""
         kappa = curvature(view).kappa
         change, _, decay, mean = self._change(view, values, kappa)
@@ -102,7 +102,7 @@ class StiffeningBending(Effect):
     name: ClassVar[str] = "stiffening_bending"
     kind: ClassVar[str] = "material"
     frames: ClassVar[bool] = True
-    settles: ClassVar[bool] = True
+    is_quasistatic: ClassVar[bool] = True
     params: ClassVar[dict[str, Param]] = {
         "c": Param(0.0, 0.0, 0.1, "m^2", "linear", 0.0, "Relative growth of the moment per squared curvature.")
     }
@@ -123,12 +123,12 @@ class StiffeningBending(Effect):
         moment = share * (square * linear + work * strain)
         s1, s2 = stiffness[..., :1], stiffness[..., 1:2] if stiffness.shape[-1] > 1 else stiffness
         coupling = stiffness[..., 2:] if stiffness.shape[-1] == 3 else torch.zeros_like(s1)
-        slope = square * tree.cat_components([s1, s2, coupling]) + 4 * _outer(linear, strain)
-        slope = share * (slope + tree.cat_components([work, work, torch.zeros_like(work)]))
+        gradient = square * tree.cat_components([s1, s2, coupling]) + 4 * _outer(linear, strain)
+        gradient = share * (gradient + tree.cat_components([work, work, torch.zeros_like(work)]))
         curved = dot(hinge.binormal, hinge.binormal) / 4
         return {
             **hinge.pull_back(view, moment),
-            **answers(view, hinge, moment, slope),
+            **answers(view, hinge, moment, gradient),
             # 3 c k^2 B along the curvature, the stiffest direction.
             "hinge_stiffness": closing(6 * share * square * greatest(stiffness), curved),
         }
@@ -160,7 +160,7 @@ class AnisotropicBending(Effect):
         ),
     }
 
-    def alter(self, topology: Topology, params: RodParams, values: Values) -> RodParams:
+    def modify_material(self, topology: Topology, params: RodParams, values: Values) -> RodParams:
         """Make the stiffness a matrix."""
         bend = params.material.bend
         b11, b22 = bend[..., :1], bend[..., 1:2] if bend.shape[-1] > 1 else bend

@@ -199,7 +199,7 @@ class BendFrame(Effect):
     name: ClassVar[str] = "bend"
     kind: ClassVar[str] = "material"
     frames: ClassVar[bool] = True
-    settles: ClassVar[bool] = True
+    is_quasistatic: ClassVar[bool] = True
 
     def energy(self, view: View, values: Values) -> Tensor:
         """Return the energy per hinge [J], shape (..., V, 1)."""
@@ -227,7 +227,7 @@ class Twist(Effect):
     name: ClassVar[str] = "twist"
     kind: ClassVar[str] = "material"
     frames: ClassVar[bool] = True
-    settles: ClassVar[bool] = True
+    is_quasistatic: ClassVar[bool] = True
 
     def strain(self, view: View) -> Tensor:
         """Return the twist across each hinge beyond its rest value [rad], shape (..., V, 1)."""

@@ -56,7 +56,7 @@ class GripperCompliance(Effect):
                 "inside the ropes, where clamps end"
             )
 
-    def alter(self, topology: Topology, params: RodParams, values: Values) -> RodParams:
+    def modify_material(self, topology: Topology, params: RodParams, values: Values) -> RodParams:
         """Soften the hinges."""
         length, material = hinge_length(topology, params.rest), params.material
         here = length.new_tensor([[float(slot in self.hinges)] for slot in range(topology.size)]) > 0

@@ -29,7 +29,7 @@ class LinkChain(Effect):
     name: ClassVar[str] = "link_chain"
     kind: ClassVar[str] = "material"
     frames: ClassVar[bool] = True
-    settles: ClassVar[bool] = True
+    is_quasistatic: ClassVar[bool] = True
     params: ClassVar[dict[str, Param]] = {
         "length": Param(0.0, -0.1, 0.1, "m", "linear", 0.0, "Length of a link, signed by the order of the axes.")
     }
@@ -106,7 +106,7 @@ class _Joint:
             some, angles = self.some.to(self.x.dtype), (self.x, self.y, self.z)
             inputs = *self.own, self.bending, self.twisting, some, self.links, *hinge.by_twist, *angles
             return tuple(lanes.apply("spring", self.view.topology.name, inputs, (2, 1, 3, 2)))
-        by_kappa, moment = self.slopes()
+        by_kappa, moment = self.gradients()
         stiffness, share = self.twisting, -0.5 * self.links
         k1, k2 = hinge.kappa[..., :1], hinge.kappa[..., 1:]
         b1, b2, a1, a2 = hinge.by_twist
@@ -118,7 +118,7 @@ class _Joint:
         hessian = stiffness * tree.cat_components(direct) + f * tree.cat_components(crossed)
         return by_kappa, moment, hessian, f * tree.cat_components([k2 * b2 - k1 * b1, k2 * a2 - k1 * a1])
 
-    def slopes(self) -> tuple[torch.Tensor, torch.Tensor]:
+    def gradients(self) -> tuple[torch.Tensor, torch.Tensor]:
         """Return the derivatives of the energy by curvatures (..., V, 2) and by twist (..., V, 1)."""
         p, q, c, s = self.p, self.q, self.c, self.s
         nx, dx = self.x_of

@@ -37,7 +37,7 @@ class RestCurvature(Effect):
         "curvature": Param((0.0, 0.0), -30.0, 30.0, "1/m", "linear", 0.0, "Curvature about the two material directors.")
     }
 
-    def alter(self, topology: Topology, params: RodParams, values: Values) -> RodParams:
+    def modify_material(self, topology: Topology, params: RodParams, values: Values) -> RodParams:
         """Add the curvature to the rest shape."""
         hinge = hinge_length(topology, params.rest) * params.rest.hinge_mask
         rest = tree.replace(params.rest, curvature=params.rest.curvature + hinge * values["curvature"])
@@ -46,7 +46,7 @@ class RestCurvature(Effect):
 
 @dataclass(frozen=True)
 class NonuniformStiffness(Effect):
-    """Bending stiffness times 1 + slope (s/L - 1/2) and times a soft or stiff spot (factor at its centre)."""
+    """Bending stiffness times 1 + gradient (s/L - 1/2) and times a soft or stiff spot (factor at its centre)."""
 
     name: ClassVar[str] = "nonuniform_stiffness"
     kind: ClassVar[str] = "material"
@@ -57,7 +57,7 @@ class NonuniformStiffness(Effect):
         "slope": Param(0.0, -1.8, 1.8, "1", "linear", 0.0, "Relative change of stiffness from end to end."),
     }
 
-    def alter(self, topology: Topology, params: RodParams, values: Values) -> RodParams:
+    def modify_material(self, topology: Topology, params: RodParams, values: Values) -> RodParams:
         """Scale the bending stiffness of the hinges."""
         s, length = arclength(params)
         at = s / length
@@ -78,7 +78,7 @@ class PointMass(Effect):
         "mass": Param(0.0, 0.0, 1.0, "kg", "linear", 0.0, "The extra mass."),
     }
 
-    def alter(self, topology: Topology, params: RodParams, values: Values) -> RodParams:
+    def modify_material(self, topology: Topology, params: RodParams, values: Values) -> RodParams:
         """Add the mass to the vertices."""
         s, length = arclength(params)
         real = params.rest.length * params.rest.edge_mask
@@ -101,7 +101,7 @@ class AxialStiffness(Effect):
         "EA": Param(1e18, 1.0, 1e18, "N", "reciprocal", 1e18, "Axial stiffness; 1e18 stands for inextensible.")
     }
 
-    def alter(self, topology: Topology, params: RodParams, values: Values) -> RodParams:
+    def modify_material(self, topology: Topology, params: RodParams, values: Values) -> RodParams:
         """Soften the edges."""
         stretch, stiffness = params.material.stretch, values["EA"]
         fixed = torch.isinf(stretch)
@@ -117,7 +117,7 @@ class BendingDamping(Effect):
     name: ClassVar[str] = "bending_damping"
     kind: ClassVar[str] = "material"
     frames: ClassVar[bool] = True
-    settles: ClassVar[bool] = True
+    is_quasistatic: ClassVar[bool] = True
     params: ClassVar[dict[str, Param]] = {
         "coefficient": Param(0.0, 0.0, 1.0, "N m^2 s", "linear", 0.0, "Bending moment per rate of curvature.")
     }
@@ -188,7 +188,7 @@ class BendingPlasticity(Effect):
         "hardening": Param(0.0, 0.0, 100.0, "1", "linear", None, "Growth of yield per plastic curvature."),
     }
 
-    def flow(self, view: View, values: Values) -> Tensor:
+    def plastic_flow(self, view: View, values: Values) -> Tensor:
         """Return the change of the plastic curvature."""
         plastic, hardening = view.state.plastic, values["hardening"]
         natural = view.params.rest.curvature + plastic

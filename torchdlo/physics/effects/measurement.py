@@ -57,10 +57,10 @@ def interpolate(x: Tensor, frame: Tensor) -> Tensor:
     over = (asked - frame)[..., None, None]
     index = frame.detach().floor().clamp(max=count - 2).long()
     s = (frame - index)[..., None, None]
-    slopes = _slopes(x)
-    start = (1 + 2 * s) * (1 - s).square() * _at(x, index) + s * (1 - s).square() * _at(slopes, index)
-    end = s.square() * (3 - 2 * s) * _at(x, index + 1) - s.square() * (1 - s) * _at(slopes, index + 1)
-    return start + end + over.clamp(max=0) * slopes[..., :1, :, :] + over.clamp(min=0) * slopes[..., -1:, :, :]
+    gradients = _slopes(x)
+    start = (1 + 2 * s) * (1 - s).square() * _at(x, index) + s * (1 - s).square() * _at(gradients, index)
+    end = s.square() * (3 - 2 * s) * _at(x, index + 1) - s.square() * (1 - s) * _at(gradients, index + 1)
+    return start + end + over.clamp(max=0) * gradients[..., :1, :, :] + over.clamp(min=0) * gradients[..., -1:, :, :]
 
 
 @dataclass(frozen=True)

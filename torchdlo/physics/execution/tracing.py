@@ -141,8 +141,8 @@ class Recorded:
 
     def __call__(self, *inputs: Any) -> Any:
         """Do the step."""
-        graded = torch.is_grad_enabled() and any(x.requires_grad for x in tree.leaves(inputs))
-        if graded or not self._known:
+        with_gradient = torch.is_grad_enabled() and any(x.requires_grad for x in tree.leaves(inputs))
+        if with_gradient or not self._known:
             return self._step(*inputs)
         try:
             recorded = self._recordings.find((), self._step, *inputs)

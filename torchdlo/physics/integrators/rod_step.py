@@ -5,7 +5,7 @@ substep and free of numerical damping. "explicit" divides forces by masses. "imp
 dt^2/4 or more of the bending stiffness of a straight chain: with a constant inertia M + g dt^2 K the frequency w of
 a mode becomes w / sqrt(1 + g dt^2 w^2), which is below the stability limit 2/dt for every g >= 1/4; g = 1/4 is the
 trapezoidal rule. Two choices are first order: finite stretch of edges whose length is solved for (tension follows the
-strain at the end of the substep, which damps axial waves), and `ahead` above zero.
+strain at the end of the substep, which damps axial waves), and `numerical_damping` above zero.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from torch import Tensor
 from torchdlo.physics import tree
 from torchdlo.physics.constraints.edge_lengths import Inertia, Lengths, balance, project, solve_slots
 from torchdlo.physics.effects import base as effect
-from torchdlo.physics.effects.base import Effect, Motion, Push, Values
+from torchdlo.physics.effects.base import ContactForces, Effect, PredictedMotion, Values
 from torchdlo.physics.kernels import lanes
 from torchdlo.physics.linalg import rotation
 from torchdlo.physics.linalg.numerics import normalize, wrap
@@ -49,16 +49,16 @@ class Settings:
     """"dynamic" (edges have rotational inertia), "quasistatic" (twist is in balance at all times) or "none"."""
     constrained: bool = True
     """Whether edge lengths are solved for (inextensible, or stiff) instead of left to forces."""
-    held_vertices: tuple[int, ...] = ()
-    held_edges: tuple[int, ...] = ()
+    prescribed_vertices: tuple[int, ...] = ()
+    prescribed_edges: tuple[int, ...] = ()
     """Edges whose material frame is prescribed."""
-    newton: int = 3
+    constraint_iterations: int = 3
     """Newton steps for lengths."""
-    settling: int = 4
+    twist_iterations: int = 4
     """Newton steps for quasistatic twist."""
-    gamma: float = 0.3
+    implicit_weight: float = 0.3
     """Share of dt^2 times stiffness that counts as inertia in "implicit"."""
-    ahead: float = 0.0
+    numerical_damping: float = 0.0
     """In "implicit", stiff forces are taken this share of a substep ahead: damps fast modes, first order if not 0."""
 
     @property
@@ -69,7 +69,7 @@ class Settings:
 
 def _placed(settings: Settings, targets: Targets, pos: Tensor) -> Tensor:
     """Return positions with held vertices where they are told to be, shape (..., V, 3)."""
-    return put(targets.pos, settings.held_vertices, targets.grip.get("vertices"), pos)
+    return put(targets.pos, settings.prescribed_vertices, targets.attachment_weight.get("vertices"), pos)
 
 
 def substep(
@@ -79,9 +79,9 @@ def substep(
     state: RodState,
     targets: Targets,
     first: Tensor,
-    foresee: Callable[[Tensor | float], Any] | None = None,
-    matter: Callable[[Tensor | float], Any] | None = None,
-) -> tuple[RodState, Reaction, tuple[Any, Any, Push]]:
+    predict_free_motion: Callable[[Tensor | float], Any] | None = None,
+    material_points: Callable[[Tensor | float], Any] | None = None,
+) -> tuple[RodState, Reaction, tuple[Any, Any, ContactForces]]:
     """Advance the rods by one substep.
 
     Args:
@@ -103,24 +103,24 @@ def substep(
     now = rod.view(topology, params, state, dt)
     loads = effect.total(settings.effects, now, values)
     kick = _kick(settings, now, loads, first, targets)
-    others = [f(loads.get("acceleration", 0.0)) if f else None for f in (foresee, matter)]
+    others = [f(loads.get("acceleration", 0.0)) if f else None for f in (predict_free_motion, material_points)]
     pos, tension, push, contact = _answered(settings, now, loads, values, kick, targets, *others)
-    held = list(settings.held_vertices)
+    held = list(settings.prescribed_vertices)
     force = (kick.vertex * (pos - kick.drift) / kick.scale - push)[..., held, :]
     fields: dict[str, Tensor] = {"pos": pos, "tension": tension}
     half = torch.exp(-0.5 * dt * loads["rate"]) if "rate" in loads else 1.0
     fields["vel"] = (pos - state.pos) / dt * half
     for each in settings.effects:
-        change = each.flow(now, values.get(each.name, {}))
+        change = each.plastic_flow(now, values.get(each.name, {}))
         if change is not None:
             fields["plastic"] = fields.get("plastic", state.plastic) + change
     remembering = [e for e in settings.effects if e.memory]
     if remembering:
-        fields["memory"] = {e.name: e.remember(now, values.get(e.name, {})) for e in remembering}
+        fields["memory"] = {e.name: e.update_memory(now, values.get(e.name, {})) for e in remembering}
     if settings.frames:
         fields["director"], fields["ref_twist"] = rod.advance_frames(topology, params, now, pos)
     moved = tree.replace(state, **fields)
-    couple = force.new_zeros(*force.shape[:-2], len(settings.held_edges), 1)
+    couple = force.new_zeros(*force.shape[:-2], len(settings.prescribed_edges), 1)
     if settings.twist == "dynamic":
         moved, couple = _turn(settings, now, loads, moved, targets, first)
     if settings.twist == "quasistatic":
@@ -169,7 +169,9 @@ def _kick(settings: Settings, now: View, loads: Values, first: Tensor, targets: 
         state.pos + dt * half * state.vel,
         dt * dt * half * (1 - 0.5 * first),
         vertex,
-        free_slots(settings.held_vertices, targets.grip.get("vertices"), state.pos, settings.topology.size),
+        free_slots(
+            settings.prescribed_vertices, targets.attachment_weight.get("vertices"), state.pos, settings.topology.size
+        ),
     )
 
 
@@ -181,35 +183,37 @@ def _answered(
     kick: _Kick,
     targets: Targets,
     bodies: Any = None,
-    matter: Any = None,
-) -> tuple[Tensor, Tensor, Tensor, Push]:
+    material_points: Any = None,
+) -> tuple[Tensor, Tensor, Tensor, ContactForces]:
     """Return what `_translate` does where effects answer to the motion, and what they exert.
 
     The motion is foreseen with the last tension, then found. Each effect answers to what the others exert.
     """
-    reacting = [e for e in settings.effects if e.reacts]
+    reacting = [e for e in settings.effects if e.is_contact]
     none = kick.force.new_zeros(1, 3)
-    total = Push(none, none, none)
+    total = ContactForces(none, none, none)
     if not reacting:
         return *_translate(settings, now, loads, kick, targets, now.state.tension), total
     firm, tension = kick.vertex, now.state.tension
     if settings.integrator == "implicit" and "stiffness" in loads:
-        firm = firm + settings.gamma * settings.dt**2 * loads["stiffness"]
+        firm = firm + settings.implicit_weight * settings.dt**2 * loads["stiffness"]
     mobility = (kick.scale / firm).expand_as(firm)
     answer = mobility * kick.free
     pull = tension * now.params.rest.edge_mask * now.tangent
     aimed = kick.drift + answer * (kick.force + pull - now.prev(pull))
     aimed = _placed(settings, targets, aimed)
-    pushes: dict[str, Push] = {}
+    pushes: dict[str, ContactForces] = {}
     for _ in range(max(e.rounds for e in reacting)):
         for e in reacting:
-            motion = Motion(aimed - now.state.pos, mobility, answer, bodies, matter)
+            motion = PredictedMotion(aimed - now.state.pos, mobility, answer, bodies, material_points)
             for other in (push for name, push in pushes.items() if name != e.name):
                 change = motion.change + answer * other.force
-                motion = Motion(change, mobility, answer, bodies and motion.bodies.pushed(other), matter)
-            found = e.react(now, motion, values[e.name])
-            pushes[e.name] = found if isinstance(found, Push) else Push(found, none, none)
-        total = Push(none, none, none)
+                motion = PredictedMotion(
+                    change, mobility, answer, bodies and motion.bodies.pushed(other), material_points
+                )
+            found = e.solve_contact(now, motion, values[e.name])
+            pushes[e.name] = found if isinstance(found, ContactForces) else ContactForces(found, none, none)
+        total = ContactForces(none, none, none)
         for push in pushes.values():
             total = total.plus(push)
         pushed = dataclasses.replace(kick, force=kick.force + total.force)
@@ -245,7 +249,7 @@ def _translate(
     moved = _placed(settings, targets, kick.drift + kick.scale / kick.vertex * kick.force)
     if not settings.constrained:
         return moved, state.tension, kick.force
-    pos, tension = project(lengths, moved, answer, now.tangent, tension, settings.newton - 1)
+    pos, tension = project(lengths, moved, answer, now.tangent, tension, settings.constraint_iterations - 1)
     pull = tension * now.tangent
     return pos, tension, kick.force + pull - now.prev(pull)
 
@@ -262,9 +266,12 @@ def _balance(
     """Return what `_translate` does for an implicit substep; arguments as in `constrain.balance`."""
     topology, dt, rest, vertex = settings.topology, settings.dt, now.params.rest, kick.vertex
     if "stiffness" in loads:
-        vertex = vertex + settings.gamma * dt * dt * loads["stiffness"]
+        vertex = vertex + settings.implicit_weight * dt * dt * loads["stiffness"]
     # Stiff forces are taken at x + ahead dt v; `share` is their answer to the change of v.
-    share, lead = settings.gamma + 0.5 * settings.ahead, settings.ahead * dt * now.state.vel
+    share, lead = (
+        settings.implicit_weight + 0.5 * settings.numerical_damping,
+        settings.numerical_damping * dt * now.state.vel,
+    )
     stiff = loads.get("hinge_stiffness", torch.zeros_like(now.length)) * rest.hinge_mask
     hinge = share * dt * dt * stiff
     if "hinge_drag" in loads:
@@ -276,7 +283,17 @@ def _balance(
     if inertia.turning is not None:  # held vertices do not move freely either
         force = force - inertia.swing(topology, (1 - kick.free) * (moved - kick.drift)) / scale
     return balance(
-        lengths, inertia, moved, kick.free, force, scale, now.tangent, ahead, tension, share, settings.newton - 1
+        lengths,
+        inertia,
+        moved,
+        kick.free,
+        force,
+        scale,
+        now.tangent,
+        ahead,
+        tension,
+        share,
+        settings.constraint_iterations - 1,
     )
 
 
@@ -288,14 +305,14 @@ def _twist_matrix(now: View, loads: Values) -> tuple[Tensor, Tensor]:
 
 def _prescribed(settings: Settings, params: RodParams, state: RodState, targets: Targets, angle: Tensor) -> Tensor:
     """Return twists with those of held edges set so that their first material director is the target."""
-    if not settings.held_edges:
+    if not settings.prescribed_edges:
         return angle
     e = rod.edge_vectors(settings.topology, state.pos, params.rest.edge_mask)
-    slots = list(settings.held_edges)
+    slots = list(settings.prescribed_edges)
     tangent = normalize(e[..., slots, :])
     last = state.twist[..., slots, :]
     held = last + wrap(rotation.signed_angle(state.director[..., slots, :], targets.director, tangent) - last)
-    return put(held, settings.held_edges, targets.grip.get("edges"), angle)
+    return put(held, settings.prescribed_edges, targets.attachment_weight.get("edges"), angle)
 
 
 def _turn(
@@ -308,11 +325,12 @@ def _turn(
     span = dt * (1 - 0.5 * first)
     kick = span * torque
     free = (
-        free_slots(settings.held_edges, targets.grip.get("edges"), state.pos, settings.topology.size) * rest.edge_mask
+        free_slots(settings.prescribed_edges, targets.attachment_weight.get("edges"), state.pos, settings.topology.size)
+        * rest.edge_mask
     )
     if settings.integrator == "implicit" and "twist_hessian" in loads:
         same, after = _twist_matrix(now, loads)
-        same, after = settings.gamma * dt * dt * same, settings.gamma * dt * dt * after
+        same, after = settings.implicit_weight * dt * dt * same, settings.implicit_weight * dt * dt * after
 
         def newton(change: Tensor) -> Tensor:
             coupled = after * now.next(change) + now.prev(after * change)
@@ -330,7 +348,7 @@ def _turn(
     angle = _prescribed(settings, now.params, moved, targets, state.twist + dt * rate * rest.edge_mask)
     rate = (angle - state.twist) / dt
     couple = inertia * (rate / half - half * state.twist_rate) / span - torque
-    return tree.replace(moved, twist=angle, twist_rate=rate), couple[..., list(settings.held_edges), :]
+    return tree.replace(moved, twist=angle, twist_rate=rate), couple[..., list(settings.prescribed_edges), :]
 
 
 _SETTLED, _NEAR = 1e-12, 1e-4
@@ -354,14 +372,17 @@ def settle_twist(
     topology, patient = settings.topology, steps is not None
     # Given all the time there is, twists come to rest against what resists their rate, too.
     span = math.inf if patient else settings.dt
-    effects = [e for e in settings.effects if e.settles]
+    effects = [e for e in settings.effects if e.is_quasistatic]
     if all(e.name == "twist" for e in effects):
         # Its torque is linear in the twists: one step is exact.
         steps = 1
     elif steps is None:
         # What depends on the path answers to the direction of a small change: Newton's method begins to converge later.
-        steps = settings.settling + (2 if any(e.memory for e in effects) else 0)
-    free = free_slots(settings.held_edges, targets.grip.get("edges"), state.pos, topology.size) * params.rest.edge_mask
+        steps = settings.twist_iterations + (2 if any(e.memory for e in effects) else 0)
+    free = (
+        free_slots(settings.prescribed_edges, targets.attachment_weight.get("edges"), state.pos, topology.size)
+        * params.rest.edge_mask
+    )
 
     def newton(angle: Tensor, exact: bool) -> tuple[Tensor, Tensor]:
         turning = tree.replace(state, twist=angle, twist_rate=(angle - state.twist) / span)
@@ -373,7 +394,7 @@ def settle_twist(
             bent = bent if exact else bent.clamp(min=0.0)
             inputs = free, loads["twist_hessian"], loads["torque"], bent, loads.get("twist_skew", none)
             change, left = lanes.apply("settle", topology.name, inputs, (1, 1), "tridiagonal")
-            return angle + change, -left[..., list(settings.held_edges), :]
+            return angle + change, -left[..., list(settings.prescribed_edges), :]
         with torch.no_grad():
             same, after = _twist_matrix(here, loads)
             if "twist_geometry" in loads:
@@ -388,7 +409,7 @@ def settle_twist(
         torque = loads["torque"]
         change = solve_slots(topology, free * same + 1 - free, free * onward, free * back, torque * free)
         left = torque - same * change - onward * here.next(change) - back * here.prev(change)
-        return angle + change, -left[..., list(settings.held_edges), :]
+        return angle + change, -left[..., list(settings.prescribed_edges), :]
 
     angle = _prescribed(settings, params, state, targets, state.twist)
     with torch.no_grad():

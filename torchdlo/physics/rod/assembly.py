@@ -44,9 +44,9 @@ class Rope:
 
     Of ropes that hands or bodies pull taut, give the true stiffness, or one that keeps strains small. An inextensible
     rope snaps: what follows depends on where the hands are to within 1e-4 of its length, so that gradients are steep
-    and soon of either sign. They are right in explicit steps if `Scene.newton` is 8; with 3, the one of a rope of four
-    edges was off by a fifth. In implicit steps it shakes without end, and its gradients mean nothing. With a finite EA
-    of 1 kN they agreed with differences to four digits in both.
+    and soon of either sign. They are right in explicit steps if `Scene.constraint_iterations` is 8; with 3, the one of
+    a rope of four edges was off by a fifth. In implicit steps it shakes without end, and its gradients mean nothing.
+    With a finite EA of 1 kN they agreed with differences to four digits in both.
     """
     closed: bool = False
     """Whether the last vertex is joined to the first."""

@@ -20,7 +20,7 @@ class Targets:
     """Positions of the held vertices [m], shape (..., H, 3)."""
     director: Tensor
     """First material directors of the held edges [1], shape (..., G, 3)."""
-    grip: dict[str, Tensor] = field(default_factory=dict)
+    attachment_weight: dict[str, Tensor] = field(default_factory=dict)
     """How firmly the held "vertices" (..., H, 1) and "edges" (..., G, 1) are held, 0 to 1; 1 if not said."""
 
 
@@ -33,9 +33,9 @@ def between(start: Any, control: Any, share: Tensor | None) -> Targets:
         share: part of the step that is over then, shape (1,); None at its end.
     """
     if share is None:
-        return Targets(control.pos, control.director, control.grip)
+        return Targets(control.pos, control.director, control.attachment_weight)
     director = rotation.turn_towards(start.director, control.director, share)
-    return Targets(start.pos + share * (control.pos - start.pos), director, control.grip)
+    return Targets(start.pos + share * (control.pos - start.pos), director, control.attachment_weight)
 
 
 @tree.struct
@@ -77,23 +77,23 @@ def spread(values: Tensor, slots: tuple[int, ...], size: int, otherwise: Tensor)
     return tree.cat_vertices(pieces)
 
 
-def free(slots: tuple[int, ...], grip: Tensor | None, like: Tensor, size: int) -> Tensor:
+def free(slots: tuple[int, ...], attachment_weight: Tensor | None, like: Tensor, size: int) -> Tensor:
     """Return 1 for free slots and 1 less the grip for held ones, shape (V, 1) or (..., V, 1)."""
-    if grip is None or not slots:
+    if attachment_weight is None or not slots:
         return like.new_tensor([[0.0] if slot in slots else [1.0] for slot in range(size)])
-    return spread(1 - grip, slots, size, like.new_ones(*grip.shape[:-2], size, 1))
+    return spread(1 - attachment_weight, slots, size, like.new_ones(*attachment_weight.shape[:-2], size, 1))
 
 
-def put(values: Tensor, slots: tuple[int, ...], grip: Tensor | None, otherwise: Tensor) -> Tensor:
+def put(values: Tensor, slots: tuple[int, ...], attachment_weight: Tensor | None, otherwise: Tensor) -> Tensor:
     """Return `otherwise` (..., V, C) with held slots moved to `values` (..., H, C) by the share of their grip."""
-    if grip is not None and slots:
-        values = torch.lerp(*torch.broadcast_tensors(otherwise[..., list(slots), :], values, grip))
+    if attachment_weight is not None and slots:
+        values = torch.lerp(*torch.broadcast_tensors(otherwise[..., list(slots), :], values, attachment_weight))
     return spread(values, slots, otherwise.shape[-2], otherwise)
 
 
-def check_grip(grip: dict[str, Tensor], counts: tuple[int, int]) -> None:
+def check_grip(attachment_weight: dict[str, Tensor], counts: tuple[int, int]) -> None:
     """Raise a `ValueError` if the shares do not fit the numbers of held vertices and edges."""
-    for part, share in grip.items():
+    for part, share in attachment_weight.items():
         if share.shape[-2:] != (dict(zip(("vertices", "edges"), counts, strict=True)).get(part), 1):
             raise ValueError(
                 f"control: grip {part!r} is {tuple(share.shape)}; expected 'vertices' of shape (..., {counts[0]}, 1) "

@@ -41,13 +41,13 @@ def write_report(result: Calibration, recording: Recording, folder: Path, *, com
 def verdict(result: Calibration, recording: Recording) -> str:
     """The result in one sentence."""
     others = ", ".join(f"{words(name)} {_mm(values['test_mae_mm'])}" for name, values in result.baselines.items())
-    sentence = (
+    summary = (
         f"Calibrated on {_trials(len(recording.train))}; error on unseen trials "
         f"{_mm(result.before['test_mae_mm'])} → {_mm(result.test_mae_mm)}"
     )
-    sentence += f" ({others})." if others else "."
+    summary += f" ({others})." if others else "."
     if result.interrupted:
-        sentence += " The fit was interrupted: this is the best it had found."
+        summary += " The fit was interrupted: this is the best it had found."
     better = {
         name: values["test_mae_mm"]
         for name, values in result.baselines.items()
@@ -56,10 +56,10 @@ def verdict(result: Calibration, recording: Recording) -> str:
     }
     if better:
         name = min(better, key=lambda key: better[key])
-        sentence += f" The {words(name)}, which has no parameter, is not worse: do not use this."
+        summary += f" The {words(name)}, which has no parameter, is not worse: do not use this."
     elif result.test_mae_mm >= result.before["test_mae_mm"]:
-        sentence += " Calibration did not help on the unseen trials."
-    return sentence
+        summary += " Calibration did not help on the unseen trials."
+    return summary
 
 
 def calibration_html(result: Calibration, recording: Recording, png: bytes, *, command: str = "") -> str:

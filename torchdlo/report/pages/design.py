@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 
 from torchdlo.files import write_atomically
 from torchdlo.report.pages.page import STYLE, listed, number, page, table
-from torchdlo.sysid.experiment_design.design import Design, called, design_json, sentence, why
+from torchdlo.sysid.experiment_design.design import Design, called, design_json, rationale, summary
 from torchdlo.sysid.experiment_design.model_discrimination import size
 from torchdlo.sysid.recordings.recording import save_trial
 
@@ -61,9 +61,9 @@ def _html(design: Design, picture: bytes, command: str) -> str:
     misfit = [(n.replace("_", " "), f"{1e3 * m:.3g} mm") for n, m in design.misfit.items()]
     body = [
         f"<h1>{html.escape(name)}: the next experiment</h1>",
-        f'<p class="verdict">{html.escape(sentence(design))}</p>',
+        f'<p class="verdict">{html.escape(summary(design))}</p>',
         "<h2>Why</h2>",
-        listed(why(design)),
+        listed(rationale(design)),
         "<h2>The motion, and what it would show</h2>",
         f'<img alt="motion and difference" src="data:image/png;base64,{data}">',
         "<h2>All motions that were tried</h2>",

@@ -14,7 +14,7 @@ from torchdlo.report.figures import chart
 from torchdlo.report.pages import player
 from torchdlo.report.pages.page import STYLE, listed, number, page, percent, table, words
 from torchdlo.sysid.diagnosis.effect_equations import MEANING, law, separating
-from torchdlo.sysid.diagnosis.findings import absorbed, findings, sentence
+from torchdlo.sysid.diagnosis.findings import absorbed, findings, summary
 from torchdlo.sysid.diagnosis.residual_analysis import PARTS, Localisation, localise
 from torchdlo.sysid.diagnosis.residual_text import STATES
 from torchdlo.sysid.diagnosis.verdict import Diagnosis
@@ -43,7 +43,7 @@ def diagnosis_html(
     order = [recording.test[k] for k in np.argsort(-np.nan_to_num(result.before, nan=np.inf))]
     sections = [
         f"<h1>{html.escape(name)}</h1>",
-        f'<p class="verdict">{html.escape(sentence(result, recording))}</p>',
+        f'<p class="verdict">{html.escape(summary(result, recording))}</p>',
         listed(result.notes),
         _section("The gap on trials that were not used", _bars(result, recording)),
         _section("Replay, worst trial first", player.replay(recording, result.predictions, order)),

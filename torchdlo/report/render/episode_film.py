@@ -21,7 +21,7 @@ from torchdlo.scene_files.run import Frames, appearance
 __all__ = ["film", "outcome_of"]
 
 _STEEP = 0.9
-"""Slope at which the camera looks down."""
+"""Gradient at which the camera looks down."""
 _ASIDE = np.radians(25)
 """By how much it is beside the direction in which arms reach."""
 
@@ -38,7 +38,7 @@ def film(
     arms: bool = True,
     callback: Callable[[str, int, int, str], None] | None = None,
     **choices: Any,
-) -> tuple[Frames, episode.Outcome | None]:
+) -> tuple[Frames, episode.EpisodeResult | None]:
     """Play an episode; return a frame of its start and after every action, and what it came to.
 
     A `KeyboardInterrupt` that `callback` raises ends it; the frames so far are returned, and None for what it came to.
@@ -62,7 +62,7 @@ def film(
 
     seen, went = [_seen(made.start)], None
 
-    def keep(world: episode.World) -> dict[str, Tensor]:
+    def keep(world: episode.EpisodeState) -> dict[str, Tensor]:
         seen.append(_seen(world))
         return {}
 
@@ -80,7 +80,7 @@ def film(
     return Frames(**moving, **looks, look=_look(task, made.start), interrupted=went is None), went
 
 
-def _look(task: Task, start: episode.World) -> np.ndarray:
+def _look(task: Task, start: episode.EpisodeState) -> np.ndarray:
     """Return the direction to a camera that faces the arms, so that they do not stand before what they do."""
     way = start.tool.pos[0, :, :2].double().numpy() - np.array(task.arms.base)[:, :2]
     ahead = way.mean(0)
@@ -93,7 +93,7 @@ def _look(task: Task, start: episode.World) -> np.ndarray:
     return np.array([cos * x - sin * y, sin * x + cos * y, _STEEP])
 
 
-def outcome_of(went: episode.Outcome | None) -> dict[str, Any]:
+def outcome_of(went: episode.EpisodeResult | None) -> dict[str, Any]:
     """Return what an episode of one scene came to, as plain data; None stands for one that was interrupted."""
     if went is None:
         return dict.fromkeys(("return", "success", "failed", "missed", "rewards")) | {"interrupted": True}
@@ -101,13 +101,13 @@ def outcome_of(went: episode.Outcome | None) -> dict[str, Any]:
         "return": float(went.returns[0]),
         "success": bool(went.success[0]),
         "failed": bool(went.failed[0]),
-        "missed": step_diagnostics.explain(went.world.state.missed),
+        "missed": step_diagnostics.explain(went.world.state.diagnostics),
         "rewards": went.rewards[:, 0].tolist(),
         "interrupted": False,
     }
 
 
-def _seen(world: episode.World) -> dict[str, Tensor]:
+def _seen(world: episode.EpisodeState) -> dict[str, Tensor]:
     """Return what moves, by the names of `Frames`, and the joints of the arms."""
     state, batch = world.state, len(world.failed)
     none = state.rods.pos.new_zeros(batch, 0, 4)
@@ -118,7 +118,7 @@ def _seen(world: episode.World) -> dict[str, Tensor]:
         "force": state.reaction.force,
         "body_pos": state.bodies.pos if state.bodies else none[..., :3],
         "body_quat": state.bodies.quat if state.bodies else none,
-        "matter": state.matter.pos.to(torch.float32) if state.matter else none[..., :3],
+        "material_points": state.material_points.pos.to(torch.float32) if state.material_points else none[..., :3],
         "joints": world.joints,
     }
 

@@ -75,8 +75,8 @@ class Picture:
             self._drawn.append(mesh)
         self._matter = []
         for law, slots in points_of(frames).items():
-            cloud = pv.PolyData(frames.matter[0, slots].astype(float))
-            size_px = float(np.clip(0.9 * spacing(frames.matter[0, slots]) / span * size[1] * 1.4, 2, 30))
+            cloud = pv.PolyData(frames.material_points[0, slots].astype(float))
+            size_px = float(np.clip(0.9 * spacing(frames.material_points[0, slots]) / span * size[1] * 1.4, 2, 30))
             self._plotter.add_mesh(cloud, color=COLORS[law], point_size=size_px, render_points_as_spheres=True)
             self._matter.append((cloud, slots))
         for height in frames.table:
@@ -122,7 +122,7 @@ class Picture:
             mesh.points = piece.at(self.frames, k)
             _shade(mesh, piece.faces)
         for cloud, slots in self._matter:
-            cloud.points = self.frames.matter[k, slots].astype(float)
+            cloud.points = self.frames.material_points[k, slots].astype(float)
         label = f"{self.frames.time[k]:.2f} s" + (f"  {note}" if note else "")
         self._label.set_text("lower_left", label)
         self._plotter.render()

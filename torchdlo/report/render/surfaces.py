@@ -198,8 +198,8 @@ def extent(frames: Frames) -> np.ndarray:
 
     Links of robots count where they are near.
     """
-    thin = max(1, frames.matter.size // 300_000)
-    moving = [frames.pos.reshape(-1, 3), frames.matter.reshape(-1, 3)[::thin]]
+    thin = max(1, frames.material_points.size // 300_000)
+    moving = [frames.pos.reshape(-1, 3), frames.material_points.reshape(-1, 3)[::thin]]
     points = np.concatenate(moving)
     span, middle = float(np.linalg.norm(np.ptp(points, axis=0))), 0.5 * (points.min(0) + points.max(0))
     for k, shape in enumerate(frames.body_shape):

@@ -76,10 +76,10 @@ class Viewer:
         self._clouds = [
             scene.add_point_cloud(
                 f"/{law}",
-                frames.matter[0, slots],
+                frames.material_points[0, slots],
                 _rgb(COLORS[law]),
                 precision="float32",
-                point_size=spacing(frames.matter[0, slots]),
+                point_size=spacing(frames.material_points[0, slots]),
                 point_shape="circle",
             )
             for law, slots in self._points.items()
@@ -104,7 +104,7 @@ class Viewer:
                     pos, turn = piece.pose(self.frames, k)
                     drawn.position, drawn.wxyz = pos, np.roll(Rotation.from_matrix(turn).as_quat(), 1)
             for slots, cloud in zip(self._points.values(), self._clouds, strict=True):
-                cloud.points = self.frames.matter[k, slots]
+                cloud.points = self.frames.material_points[k, slots]
             self._label.value = f"{self.frames.time[k]:.3f} s"
             self.frame = k
 

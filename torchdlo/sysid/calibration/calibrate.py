@@ -13,14 +13,14 @@ import numpy as np
 from torchdlo.errors import InputError
 from torchdlo.sysid.estimation import evaluation, levenberg_marquardt
 from torchdlo.sysid.estimation.checkpoint import Checkpoint
-from torchdlo.sysid.estimation.levenberg_marquardt import Point, Space
+from torchdlo.sysid.estimation.levenberg_marquardt import ParameterSpace, Point
 from torchdlo.sysid.estimation.result import Calibration
 from torchdlo.sysid.estimation.worker_pool import Pool
 from torchdlo.sysid.model import initial_state as starts_of
 from torchdlo.sysid.model import model_file
-from torchdlo.sysid.model.model_file import Saved
+from torchdlo.sysid.model.model_file import ModelFile
 from torchdlo.sysid.model.rope_model import RopeModel
-from torchdlo.sysid.model.trial_batch import Motion, Start
+from torchdlo.sysid.model.trial_batch import Start, TrialBatch
 from torchdlo.sysid.recordings.recording import Recording, Trial
 
 Callback = Callable[[str, int, int, str], None]
@@ -40,8 +40,8 @@ class _Job:
     pool: Pool
     options: tuple[tuple[str, Any], ...]
     model: RopeModel
-    space: Space
-    motion: Motion
+    space: ParameterSpace
+    motion: TrialBatch
     start: Start
     first: np.ndarray
     values: np.ndarray
@@ -74,7 +74,7 @@ def calibrate(
     rest: str = "auto",
     checkpoint: Path | None = None,
     resume: bool = False,
-    given: Saved | None = None,
+    given: ModelFile | None = None,
     workers: int | None = 1,
     callback: Callback | None = None,
 ) -> Calibration:
@@ -131,19 +131,19 @@ def calibrate(
         return _judge(best, seed, interrupted, begun, report)
 
 
-def _job(pool: Pool, rest: str, vertices: int | None, given: Saved | None) -> _Job:
+def _job(pool: Pool, rest: str, vertices: int | None, given: ModelFile | None) -> _Job:
     recording = pool.recording
     trials = _usable(recording)
     if given is None:
         options = {"rest": rest}
         model = pool.local.model((), tuple(options.items()))
-        space, values = Space(tuple(model.parameters), tuple(model.params)), model.guess()
+        space, values = ParameterSpace(tuple(model.parameters), tuple(model.params)), model.guess()
     else:
         options = {} if vertices is None else {"vertices": vertices}
         model = given.model(recording, **options)
         sizes, values = given.sizes(model), given.start(model)
         params = tuple(p for name, p in zip(model.parameters, model.params, strict=True) if name in sizes)
-        space = Space(tuple(sizes), params, tuple(sizes.values()))
+        space = ParameterSpace(tuple(sizes), params, tuple(sizes.values()))
     start, motion = starts_of.begin(model, trials), model.motion(trials)
     return _Job(pool, tuple(options.items()), model, space, motion, start, values, values, given is not None)
 
@@ -228,7 +228,7 @@ def _scout(job: _Job, starts: int, rng: np.random.Generator, report: Callback, n
     points = levenberg_marquardt.evaluate(simulate, measured, job.space, raws)
     for look, points in enumerate(
         levenberg_marquardt.improve(simulate, measured, job.space, points, iterations=_LOOKS)
-    ):  # noqa: B020
+    ):
         report(stage, look + 3, total, f"{1e3 * min(p.cost for p in points):.2f} mm")
     report(stage, total, total, "")
     return min(points, key=lambda p: p.cost).raw

@@ -15,7 +15,7 @@ from torchdlo.sysid.diagnosis.budget import Budget
 from torchdlo.sysid.diagnosis.candidate_fits import extended
 from torchdlo.sysid.diagnosis.error_floor import rms
 from torchdlo.sysid.diagnosis.score_test import screen
-from torchdlo.sysid.diagnosis.workspace import SILENT, Bench, Callback
+from torchdlo.sysid.diagnosis.workspace import SILENT, Callback, Workspace
 from torchdlo.sysid.estimation.jobs import Fitted
 from torchdlo.sysid.model.trial_batch import Start
 
@@ -33,7 +33,7 @@ _EXCHANGES = 3
 
 
 @dataclass
-class Found:
+class EliminationResult:
     """Effects in the order in which they were found."""
 
     shares: dict[str, float] = field(default_factory=dict)
@@ -57,7 +57,7 @@ class Found:
 class Revision:
     """Second looks at the effects of a search."""
 
-    def __init__(self, bench: Bench, budget: Budget, plain: Sequence[Fitted], report: Callback) -> None:
+    def __init__(self, bench: Workspace, budget: Budget, plain: Sequence[Fitted], report: Callback) -> None:
         """Prepare.
 
         Args:
@@ -81,7 +81,7 @@ class Revision:
         enough = min(MATTERS * (first - self.bench.floor.noise**2), NEARLY_ALL * (before - floor))
         return closed > max(floor, enough)
 
-    def pruned(self, fitted: Fitted, found: Found) -> Fitted:
+    def pruned(self, fitted: Fitted, found: EliminationResult) -> Fitted:
         """Return the model without the effects that the last one, or other numbers, have made needless."""
         for name in [*found.shares][:-1]:
             less = self._without(fitted, name)
@@ -90,7 +90,7 @@ class Revision:
                 found.leave_out(name)
         return fitted
 
-    def plainer(self, fitted: Fitted, found: Found, possible: Sequence[str]) -> Fitted:
+    def plainer(self, fitted: Fitted, found: EliminationResult, possible: Sequence[str]) -> Fitted:
         """Return the model with possible special laws in the place of general ones, where they fit as well.
 
         What one effect alone cannot explain bends a law with more numbers than it needs; with the others it may do
@@ -106,7 +106,7 @@ class Revision:
                 found.exchange(general, special, alike=True)
         return fitted
 
-    def exchanged(self, fitted: Fitted, found: Found, possible: Sequence[str]) -> Fitted:
+    def exchanged(self, fitted: Fitted, found: EliminationResult, possible: Sequence[str]) -> Fitted:
         """Return the model with other effects in the place of some, where they fit better beside the rest.
 
         Where nothing is left to be explained, and of one effect alone, which was held against all others just now,
@@ -137,7 +137,7 @@ class Revision:
         return other.point.cost < bar
 
     def _astray(self, other: Fitted, fitted: Fitted) -> bool:
-        return self.bench.astray(other, self.bench.gaps(fitted, "all"))
+        return self.bench.diverged(other, self.bench.gaps(fitted, "all"))
 
     def _without(self, fitted: Fitted, name: str) -> Fitted:
         """Return the model without one of its effects; what was asked for before is not fitted again."""

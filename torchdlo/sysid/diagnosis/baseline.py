@@ -10,9 +10,9 @@ import numpy as np
 
 from torchdlo.sysid.diagnosis import clamp_models
 from torchdlo.sysid.diagnosis.error_floor import Refinement, gap, rms
-from torchdlo.sysid.diagnosis.workspace import CHAIN, SILENT, Bench, Callback
-from torchdlo.sysid.estimation.jobs import Fit, Fitted
-from torchdlo.sysid.model.model_file import Saved
+from torchdlo.sysid.diagnosis.workspace import CHAIN, SILENT, Callback, Workspace
+from torchdlo.sysid.estimation.jobs import FitJob, Fitted
+from torchdlo.sysid.model.model_file import ModelFile
 from torchdlo.sysid.model.rope_model import RopeModel
 
 _SPREAD = np.log([100.0, 4.0, 6.0])
@@ -46,7 +46,7 @@ _FAR = np.log(8.0)
 """How far, in logarithms, a rope may be from that before the fit is thought to have run away."""
 
 
-def calibrate(bench: Bench, count: int, iterations: int, rng: np.random.Generator, report: Callback) -> Fitted:
+def calibrate(bench: Workspace, count: int, iterations: int, rng: np.random.Generator, report: Callback) -> Fitted:
     """Return the fitted baseline, straight if a given rest shape fits worse, a chain or in firm clamps if that helps.
 
     Args:
@@ -64,14 +64,14 @@ def calibrate(bench: Bench, count: int, iterations: int, rng: np.random.Generato
     ones, link = (1.0,) * len(names), float(np.diff(model.arclength).min())
     free, sizes = (*names, f"{CHAIN}.length"), (*ones, 0.5 * link)
 
-    def plain(values: np.ndarray, most: int, frames: int | None, **options: float) -> Fit:
+    def plain(values: np.ndarray, most: int, frames: int | None, **options: float) -> FitJob:
         start, keep = bench.starts["train"], math.ceil(_KEPT * len(values)) if len(values) > 1 else None
-        return Fit((), values, names, ones, most, start, frames, keep, tuple(options.items()))
+        return FitJob((), values, names, ones, most, start, frames, keep, tuple(options.items()))
 
-    def chain(values: np.ndarray, most: int, frames: int | None) -> Fit:
-        return Fit((CHAIN,), values, free, sizes, most, bench.starts["train"], frames)
+    def chain(values: np.ndarray, most: int, frames: int | None) -> FitJob:
+        return FitJob((CHAIN,), values, free, sizes, most, bench.starts["train"], frames)
 
-    def fit(jobs: list[Fit], done: int) -> list[Fitted]:
+    def fit(jobs: list[FitJob], done: int) -> list[Fitted]:
         found = bench.fit(jobs)
         report(stage, done, 4, f"{1e3 * min(f.point.cost for f in found):.2f} mm")
         return found
@@ -103,16 +103,16 @@ def calibrate(bench: Bench, count: int, iterations: int, rng: np.random.Generato
     return better
 
 
-def _straight(bench: Bench, values: np.ndarray, given: np.ndarray, frames: int) -> np.ndarray | None:
+def _straight(bench: Workspace, values: np.ndarray, given: np.ndarray, frames: int) -> np.ndarray | None:
     """Return the numbers of a rope without rest shape if it fits better, and give up the shape; None if it does not.
 
     Such a rope is one whose share of the rest shape is 0, which searches that begin with the shape do not always find.
     """
 
-    def job(values: np.ndarray, most: int, frames: int, rest: str = "straight") -> Fit:
+    def job(values: np.ndarray, most: int, frames: int, rest: str = "straight") -> FitJob:
         names, keep = _names(bench, rest), math.ceil(_KEPT * len(values)) if len(values) > 1 else None
         start, ones = bench.starts["train"], (1.0,) * len(names)
-        return Fit((), values[:, : len(names)], names, ones, most, start, frames, keep, (("rest", rest),))
+        return FitJob((), values[:, : len(names)], names, ones, most, start, frames, keep, (("rest", rest),))
 
     found = bench.fit([job(values[k::2], 4, frames // 3) for k in range(2)])
     best = min(found, key=lambda f: f.point.cost).values
@@ -124,11 +124,11 @@ def _straight(bench: Bench, values: np.ndarray, given: np.ndarray, frames: int) 
     return straight.values
 
 
-def _names(bench: Bench, rest: str) -> tuple[str, ...]:
+def _names(bench: Workspace, rest: str) -> tuple[str, ...]:
     return tuple(bench.pool.local.model((), (("rest", rest),)).parameters)
 
 
-def _held(bench: Bench, firm: Fitted, smooth: Fitted, side: Fitted) -> tuple[Fitted, Fitted]:
+def _held(bench: Workspace, firm: Fitted, smooth: Fitted, side: Fitted) -> tuple[Fitted, Fitted]:
     """Return a smooth rope and a chain in the clamps that fit better: those that hold it to their ends, or others."""
     least = min(smooth.point.cost, side.point.cost)
     if firm.point.cost >= _BETTER * least:
@@ -156,7 +156,7 @@ def _random(model: RopeModel, count: int, rng: np.random.Generator) -> np.ndarra
     return values
 
 
-def go_further(bench: Bench, base: Fitted, iterations: int, report: Callback) -> Fitted:
+def go_further(bench: Workspace, base: Fitted, iterations: int, report: Callback) -> Fitted:
     """Return a model that took up an effect, with what the lack of that effect kept the baseline from finding.
 
     That is the law of a chain, a given rest shape, and a twisting stiffness that hardly shows and ran away.
@@ -171,7 +171,7 @@ def go_further(bench: Bench, base: Fitted, iterations: int, report: Callback) ->
         values = np.stack([base.values, back])
     stage, effects, start = "fitting all numbers again", (*base.effects, CHAIN), bench.starts["train"]
     report(stage, 0, 3, "")
-    jobs = [Fit(base.effects, values, base.space.names, tuple(base.space.units), iterations, start)]
+    jobs = [FitJob(base.effects, values, base.space.names, tuple(base.space.units), iterations, start)]
     if clamp_models.loose(model):
         jobs.append(clamp_models.firm(base, jobs[0]))
     if model.rest == "straight" and bench.recording.rest_positions is not None:
@@ -186,7 +186,7 @@ def go_further(bench: Bench, base: Fitted, iterations: int, report: Callback) ->
     report(stage, 1, 3, f"{1e3 * rms(bench.gaps(base, 'train')):.2f} mm")
     if bench.linked and CHAIN not in base.effects and rms(bench.gaps(base, "train")) > SILENT * bench.level:
         rows = [np.append(base.values, length)[None] for length in (link, -link)]
-        sides = [Fit(effects, r, free, (*sizes, 0.5 * link), iterations, bench.starts["train"]) for r in rows]
+        sides = [FitJob(effects, r, free, (*sizes, 0.5 * link), iterations, bench.starts["train"]) for r in rows]
         base = _chain_or(bench, base, rope, sides)
     report(stage, 2, 3, f"{1e3 * rms(bench.gaps(base, 'train')):.2f} mm")
     # Corrections of another motion are wrong where motions part.
@@ -196,7 +196,7 @@ def go_further(bench: Bench, base: Fitted, iterations: int, report: Callback) ->
     return base
 
 
-def _shaped(bench: Bench, base: Fitted, job: Fit) -> Fit:
+def _shaped(bench: Workspace, base: Fitted, job: FitJob) -> FitJob:
     """Return the job of fitting the model without, likewise with half of the given rest shape, rolled to any side."""
     options = (*base.options, ("rest", "given"))
     model, before = bench.pool.local.model(base.effects, options), bench.pool.local.model(base.effects)
@@ -208,14 +208,14 @@ def _shaped(bench: Bench, base: Fitted, job: Fit) -> Fit:
     return replace(job, values=values, free=free, sizes=sizes, keep=2, options=options)
 
 
-def _begin_anew(bench: Bench, base: Fitted) -> Refinement:
+def _begin_anew(bench: Workspace, base: Fitted) -> Refinement:
     """Begin trials as a model says, and correct simulations by what finer ones of it change; return that."""
     if not bench.starts["train"].still.all():
         bench.begin(base.values, base.effects)
     return bench.correct(base)
 
 
-def _chain_or(bench: Bench, smooth: Fitted, rope: Refinement, sides: Sequence[Fit]) -> Fitted:
+def _chain_or(bench: Workspace, smooth: Fitted, rope: Refinement, sides: Sequence[FitJob]) -> Fitted:
     """Return the best fit of a chain, if it is better than that of a smooth rope, else the latter.
 
     Args:
@@ -224,10 +224,10 @@ def _chain_or(bench: Bench, smooth: Fitted, rope: Refinement, sides: Sequence[Fi
         rope: how simulations were corrected for it.
         sides: fits of the chain.
     """
-    level, before, trust = bench.level, bench.gaps(smooth, "all"), bench.starts["train"].trust
+    level, before, frame_weights = bench.level, bench.gaps(smooth, "all"), bench.starts["train"].frame_weights
 
     def left(fitted: Fitted) -> float:
-        return rms(gap(bench.prediction(fitted, "train"), bench.trials["train"], trust))
+        return rms(gap(bench.prediction(fitted, "train"), bench.trials["train"], frame_weights))
 
     smoothly = left(smooth)
     bench.use(replace(rope, links=abs(float(sides[0].values[0, -1]))))
@@ -239,13 +239,13 @@ def _chain_or(bench: Bench, smooth: Fitted, rope: Refinement, sides: Sequence[Fi
         best = bench.fit([bench.further(best, most - _LOOK)])[0]
     # Less is known of a chain: that alone does not make it better where much more is left than can be known.
     better = best.point.cost / bench.level < _BETTER * smooth.point.cost / level and left(best) < _BETTER * smoothly
-    if better and not bench.astray(best, before):
+    if better and not bench.diverged(best, before):
         return best
     bench.use(rope)
     return smooth
 
 
-def go_on(bench: Bench, given: Saved, iterations: int, report: Callback) -> Fitted:
+def go_on(bench: Workspace, given: ModelFile, iterations: int, report: Callback) -> Fitted:
     """Return a given model, fitted to this recording."""
     model = given.model(bench.recording, **bench.pool.local.options)
     sizes, values = given.sizes(model), given.start(model)
@@ -253,7 +253,7 @@ def go_on(bench: Bench, given: Saved, iterations: int, report: Callback) -> Fitt
 
     def fit(values: np.ndarray, most: int) -> Fitted:
         start = bench.starts["train"]
-        return bench.fit([Fit(given.effects, values[None], tuple(sizes), tuple(sizes.values()), most, start)])[0]
+        return bench.fit([FitJob(given.effects, values[None], tuple(sizes), tuple(sizes.values()), most, start)])[0]
 
     found = fit(values, iterations // 2)
     bench.correct(found)

@@ -54,7 +54,7 @@ def options(recording: Recording, vertices: int | None) -> dict[str, Any]:
     return {
         "vertices": vertices or _vertices(recording),
         "rest": "straight" if recording.rest_positions is None else "given",
-        "ahead": AHEAD if taut else _AHEAD,
+        "numerical_damping": AHEAD if taut else _AHEAD,
         "grip": 0.0,
     }
 

@@ -7,14 +7,14 @@ from dataclasses import replace
 
 from torchdlo.sysid.diagnosis import clamp_models, effect_library
 from torchdlo.sysid.diagnosis.score_test import Score
-from torchdlo.sysid.diagnosis.workspace import Bench
-from torchdlo.sysid.estimation.jobs import Fit, Fitted
+from torchdlo.sysid.diagnosis.workspace import Workspace
+from torchdlo.sysid.estimation.jobs import FitJob, Fitted
 
 _SHORT = 0.6
 """Share of the trials that first fits see."""
 
 
-def extend(bench: Bench, base: Fitted, score: Score, iterations: int, frames: int | None) -> list[Fit]:
+def extend(bench: Workspace, base: Fitted, score: Score, iterations: int, frames: int | None) -> list[FitJob]:
     """Return the jobs of fitting a model with one effect more, from the doses that suit best.
 
     Args:
@@ -26,7 +26,7 @@ def extend(bench: Bench, base: Fitted, score: Score, iterations: int, frames: in
     """
     if score.name == clamp_models.NAME and clamp_models.loose(bench.pool.local.model(base.effects, base.options)):
         return [clamp_models.stiff(bench, base, score, iterations, frames)]
-    # Numbers that no dose uses stay off, a slope where a spot fits better; but vectors are fitted whole.
+    # Numbers that no dose uses stay off, a gradient where a spot fits better; but vectors are fitted whole.
     kinds: dict[frozenset[str], list] = {}
     for start in score.starts:
         kinds.setdefault(frozenset(vector(name) for name in start[0]), []).append(start)
@@ -38,12 +38,12 @@ def extend(bench: Bench, base: Fitted, score: Score, iterations: int, frames: in
 
 
 def extended(
-    bench: Bench,
+    bench: Workspace,
     base: Fitted,
     scores: Sequence[Score],
     iterations: int,
-    fit: Callable[[Sequence[Fit]], Sequence[Fitted]],
-    others: Sequence[Fit] = (),
+    fit: Callable[[Sequence[FitJob]], Sequence[Fitted]],
+    others: Sequence[FitJob] = (),
 ) -> tuple[list[Fitted], list[Fitted]]:
     """Return the best short fit of each of several effects, and those of other jobs.
 
@@ -61,7 +61,7 @@ def extended(
     return best, found
 
 
-def short(bench: Bench) -> int:
+def short(bench: Workspace) -> int:
     """Return how many frames the first fits see: late ones mislead as long as early ones do not fit."""
     return max(10, int(_SHORT * bench.trials["train"][0].markers.shape[0]))
 

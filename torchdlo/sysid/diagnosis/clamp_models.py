@@ -13,8 +13,8 @@ import numpy as np
 
 from torchdlo.sysid.diagnosis.error_floor import rms
 from torchdlo.sysid.diagnosis.score_test import Score
-from torchdlo.sysid.diagnosis.workspace import SILENT, Bench
-from torchdlo.sysid.estimation.jobs import Fit, Fitted
+from torchdlo.sysid.diagnosis.workspace import SILENT, Workspace
+from torchdlo.sysid.estimation.jobs import FitJob, Fitted
 from torchdlo.sysid.model.rope_model import RopeModel
 
 NAME = "gripper_compliance"
@@ -28,13 +28,13 @@ def loose(model: RopeModel) -> bool:
     return bool(model.mesh.clamps) and model.grip < 1
 
 
-def soft(bench: Bench, base: Fitted) -> bool:
+def soft(bench: Workspace, base: Fitted) -> bool:
     """Return whether clamps may be stiff that are not in a model which leaves something to be explained."""
     bends = loose(bench.pool.local.model(base.effects, base.options))
     return bends and NAME not in base.effects and rms(bench.gaps(base, "all")) > SILENT * bench.level
 
 
-def firm(base: Fitted, job: Fit) -> Fit:
+def firm(base: Fitted, job: FitJob) -> FitJob:
     """Return the job of fitting the model without, likewise with clamps that hold the rope up to their last marker."""
     return replace(job, options=(*base.options, ("grip", 1.0)))
 
@@ -57,7 +57,7 @@ def _apart(model: RopeModel) -> float:
     return min(float(np.diff(model.mesh.marker_arclength[run]).min()) for run in model.mesh.runs)
 
 
-def stiff(bench: Bench, base: Fitted, score: Score, iterations: int, frames: int | None) -> Fit:
+def stiff(bench: Workspace, base: Fitted, score: Score, iterations: int, frames: int | None) -> FitJob:
     """Return the job of fitting elastic clamps that hold the rope stiffly up to their last marker, see `extend`."""
     model, number = bench.pool.local.model(base.effects), f"{NAME}.stiffness"
     bend = base.values[model.parameters.index("bending_stiffness")]

@@ -138,7 +138,7 @@ def numbers(name: str, recording: Recording) -> list[Number]:
 
 
 @dataclass(frozen=True, eq=False)
-class Probe:
+class Perturbation:
     """A small dose of an effect: where its search begins."""
 
     values: dict[str, float]
@@ -147,7 +147,9 @@ class Probe:
     """Whether the opposite dose is possible too."""
 
 
-def probes(name: str, recording: Recording, mesh: Mesh, curved: float, baseline: dict[str, float]) -> list[Probe]:
+def probes(
+    name: str, recording: Recording, mesh: Mesh, curved: float, baseline: dict[str, float]
+) -> list[Perturbation]:
     """Return doses of an effect that together show what it can do.
 
     Args:
@@ -187,4 +189,4 @@ def probes(name: str, recording: Recording, mesh: Mesh, curved: float, baseline:
         "gripper_compliance": [{"stiffness": 100 * bend / length}],
     }
     doses = signed.get(name) or positive[name]
-    return [Probe({f"{name}.{key}": float(v) for key, v in dose.items()}, name in signed) for dose in doses]
+    return [Perturbation({f"{name}.{key}": float(v) for key, v in dose.items()}, name in signed) for dose in doses]

@@ -6,14 +6,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from torchdlo.sysid.estimation.jobs import Fitted, Simulation
+from torchdlo.sysid.estimation.jobs import Fitted, SimulationJob
 from torchdlo.sysid.estimation.worker_pool import Pool
 from torchdlo.sysid.model.trial_batch import Start
 from torchdlo.sysid.recordings.recording import Recording, Trial
 
 
 @dataclass(frozen=True)
-class Floor:
+class ErrorFloor:
     """Parts of the error that no effect explains, root mean square per coordinate [m]."""
 
     noise: float
@@ -41,7 +41,9 @@ def noise(recording: Recording) -> float:
     return float(np.median(parts))
 
 
-def gap(simulated: np.ndarray, trials: tuple[Trial, ...] | list[Trial], trust: np.ndarray | None = None) -> np.ndarray:
+def gap(
+    simulated: np.ndarray, trials: tuple[Trial, ...] | list[Trial], frame_weights: np.ndarray | None = None
+) -> np.ndarray:
     """Return the error of each trial [m], root mean square per coordinate of the free markers, shape (B,).
 
     Args:
@@ -50,7 +52,9 @@ def gap(simulated: np.ndarray, trials: tuple[Trial, ...] | list[Trial], trust: n
         trust: what errors of frames are multiplied by [1], shape (B, F); 1 if not given.
     """
     out = []
-    for sim, trial, of_frame in zip(simulated, trials, [None] * len(trials) if trust is None else trust, strict=True):
+    for sim, trial, of_frame in zip(
+        simulated, trials, [None] * len(trials) if frame_weights is None else frame_weights, strict=True
+    ):
         free = ~trial.gripped
         error = sim[: len(trial.time)][:, free] - np.where(trial.suspect[:, None, None], np.nan, trial.markers)[:, free]
         error = error if of_frame is None else of_frame[: len(error), None, None] * error
@@ -123,7 +127,7 @@ class Refinement:
         """Trials of which a finer simulation failed, or differed too much."""
         return int((~np.isfinite(self.step + self.grid)).any((1, 2, 3)).sum())
 
-    def floor(self, trials: slice, free: np.ndarray) -> Floor:
+    def floor(self, trials: slice, free: np.ndarray) -> ErrorFloor:
         """Return the floor on some of the trials.
 
         Args:
@@ -135,9 +139,9 @@ class Refinement:
             known = np.isfinite(unsure).all((1, 2, 3))
             chosen = unsure[trials][known[trials]] if known[trials].any() else unsure[known]
             parts.append(float(np.sqrt(np.mean(chosen[:, :, free] ** 2))) if known.any() else float("inf"))
-        return Floor(self.noise, *parts)
+        return ErrorFloor(self.noise, *parts)
 
-    def trust(self, free: np.ndarray) -> tuple[np.ndarray, float]:
+    def frame_weights(self, free: np.ndarray) -> tuple[np.ndarray, float]:
         """Return what errors of frames count [1], shape (B, F), and the gap that leaves a perfect model [m].
 
         Where finer simulations differ much, as some motions magnify small errors, measurements tell little. Squares of
@@ -169,12 +173,15 @@ def refine(pool: Pool, base: Fitted, start: Start, chain: str) -> Refinement:
     values = base.values[None, ~links]
     edge, length = float(np.mean(np.diff(model.arclength))), float(np.abs(base.values[links]).sum())
     half = ("substep", model.dt / (2 * model.substeps))
-    finer = ("vertices", 2 * len(model.arclength) - 1)
-    start = replace(start, finer=None)
-    jobs = [Simulation(plain, values, "all", start, options) for options in ((half, finer), (half,), ())]
+    discretisation_correction = ("vertices", 2 * len(model.arclength) - 1)
+    start = replace(start, discretisation_correction=None)
+    jobs = [
+        SimulationJob(plain, values, "all", start, options)
+        for options in ((half, discretisation_correction), (half,), ())
+    ]
     sims = dict(pool.simulate(jobs))
     step, grid = _tame(sims[1][0] - sims[2][0]), _tame(sims[0][0] - sims[1][0])
-    return Refinement(step, grid, noise(pool.recording), _AHEAD if model.ahead else 2, edge, length)
+    return Refinement(step, grid, noise(pool.recording), _AHEAD if model.numerical_damping else 2, edge, length)
 
 
 def _tame(change: np.ndarray) -> np.ndarray:

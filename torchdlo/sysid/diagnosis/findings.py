@@ -15,7 +15,7 @@ from torchdlo.sysid.estimation.result_cache import digest
 from torchdlo.sysid.model import model_file
 from torchdlo.sysid.recordings.recording import Recording
 
-__all__ = ["absorbed", "confidence", "findings", "findings_json", "model_json", "sentence"]
+__all__ = ["absorbed", "confidence", "findings", "findings_json", "model_json", "summary"]
 
 
 def findings(result: Diagnosis, recording: Recording) -> dict[str, Any]:
@@ -153,7 +153,7 @@ def model_json(result: Diagnosis) -> str:
     return dump({"generator": "torchdlo diagnose"} | model_file.content(result.model, result.final.values))
 
 
-def sentence(result: Diagnosis, recording: Recording) -> str:
+def summary(result: Diagnosis, recording: Recording) -> str:
     """Return the verdict in words."""
     before, after, floor = (1e3 * x for x in (*result.gaps, result.floor.total))
     failed, count = int((~result.compared).sum()), len(result.before)

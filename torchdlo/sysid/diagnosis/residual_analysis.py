@@ -18,7 +18,7 @@ from torchdlo.sysid.diagnosis.residual_text import STATES, Residual, by_marker, 
 from torchdlo.sysid.recordings.recording import Recording, Trial
 
 if TYPE_CHECKING:
-    from torchdlo.sysid.diagnosis.error_floor import Floor
+    from torchdlo.sysid.diagnosis.error_floor import ErrorFloor
 
 __all__ = ["PARTS", "Against", "Localisation", "localise", "project", "residuals"]
 
@@ -112,7 +112,7 @@ def project(found: Sequence[Residual], tangents: Mapping[str, np.ndarray]) -> li
 def localise(
     recording: Recording,
     predictions: Mapping[str, Predictions],
-    floor: Floor,
+    floor: ErrorFloor,
     *,
     tangents: Mapping[str, np.ndarray] | None = None,
 ) -> Localisation:

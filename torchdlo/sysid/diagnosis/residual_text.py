@@ -12,7 +12,7 @@ from scipy.stats import rankdata
 from torchdlo.sysid.recordings.recording import Recording, Trial
 
 if TYPE_CHECKING:
-    from torchdlo.sysid.diagnosis.error_floor import Floor
+    from torchdlo.sysid.diagnosis.error_floor import ErrorFloor
 
 __all__ = ["STATES", "Residual", "by_marker", "describe"]
 
@@ -60,7 +60,7 @@ def describe(
     found: Sequence[Residual],
     against: Sequence[tuple[str, float, np.ndarray, np.ndarray]],
     parts: Mapping[str, tuple[float, np.ndarray]],
-    floor: Floor,
+    floor: ErrorFloor,
 ) -> list[str]:
     """Return sentences on a residual.
 
@@ -145,7 +145,7 @@ def _called(trial: Trial, low: float, high: float) -> str:
     return f"between {100 * low:.0f} and {100 * high:.0f} cm along the rope"
 
 
-def _shape(recording: Recording, found: Sequence[Residual], floor: Floor) -> list[str]:
+def _shape(recording: Recording, found: Sequence[Residual], floor: ErrorFloor) -> list[str]:
     """Return where the curvature itself is wrong: positions sum up what is wrong before them, curvatures do not."""
     trial = (recording.train + recording.test)[0]
     s = trial.marker_arclength
@@ -153,14 +153,19 @@ def _shape(recording: Recording, found: Sequence[Residual], floor: Floor) -> lis
     bend = np.concatenate([np.diff(x, axis=1) / (0.5 * (s[2:] - s[:-2]))[:, None] for x in slope])
     with np.errstate(invalid="ignore"):
         energy = np.nanmean((bend**2).sum(-1), 0)
-    ahead, behind = 1 / np.diff(s)[1:], 1 / np.diff(s)[:-1]
-    noise = 3 * floor.noise**2 * (ahead**2 + behind**2 + (ahead + behind) ** 2) / (0.5 * (s[2:] - s[:-2])) ** 2
+    numerical_damping, behind = 1 / np.diff(s)[1:], 1 / np.diff(s)[:-1]
+    noise = (
+        3
+        * floor.noise**2
+        * (numerical_damping**2 + behind**2 + (numerical_damping + behind) ** 2)
+        / (0.5 * (s[2:] - s[:-2])) ** 2
+    )
     energy = np.clip(np.nan_to_num(energy) - noise, 0, None)
     # The mean over all frames tells it from noise whose size is known to some 10 %.
     if not (energy > 0.3 * noise).any():
         return []
-    sentence = _concentrated(recording, trial, s[1:-1], energy, "Its curvature is wrong most")
-    return [sentence] if sentence else []
+    summary = _concentrated(recording, trial, s[1:-1], energy, "Its curvature is wrong most")
+    return [summary] if summary else []
 
 
 def _when(found: Sequence[Residual]) -> str:

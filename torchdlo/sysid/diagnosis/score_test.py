@@ -14,8 +14,8 @@ import numpy as np
 from scipy.optimize import lsq_linear
 
 from torchdlo.sysid.diagnosis import effect_library
-from torchdlo.sysid.diagnosis.effect_library import Probe
-from torchdlo.sysid.estimation.jobs import Fitted, Simulation
+from torchdlo.sysid.diagnosis.effect_library import Perturbation
+from torchdlo.sysid.estimation.jobs import Fitted, SimulationJob
 from torchdlo.sysid.estimation.worker_pool import Pool
 from torchdlo.sysid.model.rope_model import RopeModel
 from torchdlo.sysid.model.trial_batch import Start
@@ -84,7 +84,7 @@ def screen(
     doses = {n: effect_library.probes(n, recording, model.mesh, curved, known) for n in names}
     groups, nudge = _groups(names, doses), base.space.nudges()
     jobs = [_job(pool, base, group, doses) for group in groups]
-    jobs.append(Simulation(base.effects, _nudged(model, base, nudge)))
+    jobs.append(SimulationJob(base.effects, _nudged(model, base, nudge)))
     frames = min(max(10, int(_HORIZON * motion.markers.shape[1])), motion.markers.shape[1])
     jobs = [replace(job, start=start, frames=frames) for job in jobs]
     sims_of: dict[int, np.ndarray] = {}
@@ -100,9 +100,13 @@ def screen(
     own = sims_of[len(groups)]
     residual = pick(motion.markers) - pick(own[0])
     good = np.isfinite(residual) & np.isfinite(pick(own)).all(0)
-    trust = 1.0 if start.trust is None else pick(np.broadcast_to(start.trust[..., None, None], motion.markers.shape))
-    size = np.nan_to_num(trust * residual)
-    weight = np.where(good, trust / (size**2 + _KNEE**2) ** 0.25, 0.0)
+    frame_weights = (
+        1.0
+        if start.frame_weights is None
+        else pick(np.broadcast_to(start.frame_weights[..., None, None], motion.markers.shape))
+    )
+    size = np.nan_to_num(frame_weights * residual)
+    weight = np.where(good, frame_weights / (size**2 + _KNEE**2) ** 0.25, 0.0)
     residual = np.nan_to_num(residual) * weight
     jacobian = np.stack([np.nan_to_num(pick(sim - own[0])) * weight for sim in own[1:]], 1)
     q, r = np.linalg.qr(jacobian / nudge)
@@ -137,7 +141,7 @@ def _nudged(model: RopeModel, base: Fitted, nudge: np.ndarray) -> np.ndarray:
     return rows
 
 
-def _groups(names: Sequence[str], doses: dict[str, list[Probe]]) -> list[list[str]]:
+def _groups(names: Sequence[str], doses: dict[str, list[Perturbation]]) -> list[list[str]]:
     """Return effects that are simulated together: a scene of many effects is slow, one scene per effect wasteful."""
     groups: list[list[str]] = []
     for name in sorted(names, key=lambda n: -len(doses[n])):
@@ -151,7 +155,7 @@ def _groups(names: Sequence[str], doses: dict[str, list[Probe]]) -> list[list[st
     return groups
 
 
-def _job(pool: Pool, base: Fitted, group: Sequence[str], doses: dict[str, list[Probe]]) -> Simulation:
+def _job(pool: Pool, base: Fitted, group: Sequence[str], doses: dict[str, list[Perturbation]]) -> SimulationJob:
     effects = (*base.effects, *group)
     model = pool.local.model(effects)
     first = model.guess()
@@ -163,7 +167,7 @@ def _job(pool: Pool, base: Fitted, group: Sequence[str], doses: dict[str, list[P
             for key, value in probe.values.items():
                 row[model.parameters.index(key)] = value
             rows.append(row)
-    return Simulation(effects, np.stack(rows))
+    return SimulationJob(effects, np.stack(rows))
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,7 +180,7 @@ class _Mixture:
     direction: np.ndarray
 
 
-def _mixtures(doses: list[Probe], answers: np.ndarray, left: np.ndarray) -> list[_Mixture]:
+def _mixtures(doses: list[Perturbation], answers: np.ndarray, left: np.ndarray) -> list[_Mixture]:
     """Return the mixtures of doses, whose answers have shape (R, J), that explain a residual; best first.
 
     Doses that exclude each other are taken one at a time.
@@ -197,7 +201,7 @@ def _mixtures(doses: list[Probe], answers: np.ndarray, left: np.ndarray) -> list
     return sorted(found, key=lambda m: -m.share)
 
 
-def _additive(doses: list[Probe]) -> bool:
+def _additive(doses: list[Perturbation]) -> bool:
     """Return whether doses are of different numbers, so that they may be mixed."""
     keys = [tuple(d.values) for d in doses]
     return len(keys) > 1 and all(len(k) == 1 for k in keys) and len(set(keys)) == len(keys)
@@ -214,7 +218,7 @@ _STRENGTH = {
 """The number of an effect that grows with the dose; the others say where or how. Default: all."""
 
 
-def _mixture(name: str, doses: list[Probe], amounts: np.ndarray) -> dict[str, float]:
+def _mixture(name: str, doses: list[Perturbation], amounts: np.ndarray) -> dict[str, float]:
     """Return numbers for amounts of doses, kept within reason."""
     found: dict[str, float] = {}
     additive = _additive(doses)
@@ -237,7 +241,7 @@ def _mixture(name: str, doses: list[Probe], amounts: np.ndarray) -> dict[str, fl
     return found
 
 
-def _sizes(name: str, doses: list[Probe]) -> dict[str, float]:
+def _sizes(name: str, doses: list[Perturbation]) -> dict[str, float]:
     """Return what counts as much of each number: the dose of strengths, a share of the range of places."""
     sizes: dict[str, float] = {}
     for dose in doses:

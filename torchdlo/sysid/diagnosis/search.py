@@ -17,18 +17,18 @@ from torchdlo.errors import InputError
 from torchdlo.sysid.diagnosis import baseline as baselines
 from torchdlo.sysid.diagnosis import budget as plan
 from torchdlo.sysid.diagnosis import clamp_models, effect_library
-from torchdlo.sysid.diagnosis.backward_elimination import Found, Revision
+from torchdlo.sysid.diagnosis.backward_elimination import EliminationResult, Revision
 from torchdlo.sysid.diagnosis.budget import BUDGETS, Budget
 from torchdlo.sysid.diagnosis.candidate_fits import extended, short, vector
 from torchdlo.sysid.diagnosis.error_floor import gap, rms
 from torchdlo.sysid.diagnosis.score_test import Score, screen
 from torchdlo.sysid.diagnosis.verdict import UNKNOWN_FLOOR, Candidate, Diagnosis, through, word
-from torchdlo.sysid.diagnosis.workspace import CHAIN, SILENT, Bench, Callback
-from torchdlo.sysid.estimation.jobs import Fit, Fitted
+from torchdlo.sysid.diagnosis.workspace import CHAIN, SILENT, Callback, Workspace
+from torchdlo.sysid.estimation.jobs import FitJob, Fitted
 from torchdlo.sysid.estimation.levenberg_marquardt import interval
-from torchdlo.sysid.estimation.result_cache import Journal
+from torchdlo.sysid.estimation.result_cache import ResultCache
 from torchdlo.sysid.estimation.worker_pool import Pool
-from torchdlo.sysid.model.model_file import Saved
+from torchdlo.sysid.model.model_file import ModelFile
 from torchdlo.sysid.recordings import data_quality
 from torchdlo.sysid.recordings.recording import Recording
 
@@ -56,7 +56,7 @@ def diagnose(
     callback: Callback | None = None,
     journal: Path | None = None,
     resume: bool = False,
-    given: Saved | None = None,
+    given: ModelFile | None = None,
     without: Sequence[str] = (),
 ) -> Diagnosis:
     """Name what a recording shows that the baseline model lacks.
@@ -87,7 +87,7 @@ def diagnose(
         options |= given.options if vertices is None else given.options | {"vertices": vertices}
     asked = {"budget": BUDGETS[budget], "seed": seed, "options": options, "first": given and given.values}
     less = {"without": ", ".join(sorted(set(without)))} if without else {}
-    kept = None if journal is None else Journal(journal, recording, asked | less, resume=resume)
+    kept = None if journal is None else ResultCache(journal, recording, asked | less, resume=resume)
     with Pool(recording, options, workers, kept) as pool:
         search = _Search(pool, BUDGETS[budget], np.random.default_rng(seed), report, without)
         found = search.run(given)
@@ -105,13 +105,13 @@ class _Search:
         self, pool: Pool, budget: Budget, rng: np.random.Generator, report: Callback, without: Sequence[str] = ()
     ) -> None:
         self.pool, self.budget, self.rng, self.report = pool, budget, rng, report
-        self.bench, self.recording, self.excluded = Bench(pool), pool.recording, without
+        self.bench, self.recording, self.excluded = Workspace(pool), pool.recording, without
         self.baseline: Fitted | None = None
         self.plain: list[Fitted] = []
         """The baseline, and what it became when it was fitted for as long as the first candidates were."""
         self.revision = Revision(self.bench, budget, self.plain, report)
 
-    def run(self, given: Saved | None = None) -> Diagnosis:
+    def run(self, given: ModelFile | None = None) -> Diagnosis:
         """Go through all stages."""
         count, most = self.budget.starts, self.budget.more
         if given is None:
@@ -122,7 +122,7 @@ class _Search:
         self.plain.append(base)
         self._say_floor()
         rounds: list[list[Candidate]] = []
-        found = Found()
+        found = EliminationResult()
         whole = self._excess(base)
         while len(rounds) < self.budget.rounds + (len(found.shares) < len(rounds)):
             if found.shares and rms(self.bench.gaps(base, "all")) < MORE * self.bench.level:
@@ -301,19 +301,19 @@ class _Search:
         return float(np.mean(self.bench.gaps(fitted, "train") < self.bench.gaps(base, "train"))) > 0.6
 
     def _extended(
-        self, base: Fitted, scores: Sequence[Score], stage: str, others: Sequence[Fit] = ()
+        self, base: Fitted, scores: Sequence[Score], stage: str, others: Sequence[FitJob] = ()
     ) -> tuple[list[Fitted], list[Fitted]]:
         """Return first fits of effects, and those of other jobs."""
         return extended(
             self.bench, base, scores, self.budget.iterations, lambda jobs: self._fitted(jobs, stage), others
         )
 
-    def _further(self, base: Fitted, fitted: Fitted) -> Fit:
+    def _further(self, base: Fitted, fitted: Fitted) -> FitJob:
         """Return the job of fitting on."""
         how = (self.budget.iterations, short(self.bench)) if fitted is base else (self.budget.more,)
         return self.bench.further(fitted, *how)
 
-    def _fitted(self, jobs: Sequence[Fit], stage: str) -> list[Fitted]:
+    def _fitted(self, jobs: Sequence[FitJob], stage: str) -> list[Fitted]:
         """Return the results of fits in their order, and say how they go."""
         found: dict[int, Fitted] = {}
         plain = max(len(job.effects) for job in jobs) - 1
@@ -324,7 +324,7 @@ class _Search:
             self.report(f"{stage}: fitting", len(found), len(jobs), last)
         return [found[k] for k in range(len(jobs))]
 
-    def _conclude(self, final: Fitted, found: Found, rounds: list[list[Candidate]]) -> Diagnosis:
+    def _conclude(self, final: Fitted, found: EliminationResult, rounds: list[list[Candidate]]) -> Diagnosis:
         effects = list(found.shares)
         trials, train = self.bench.trials, len(self.bench.trials["train"])
         simulated = {"before": self.before, "after": self.bench.prediction(final, "all")}

@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from torchdlo.sysid.diagnosis.error_floor import Floor, rms
+from torchdlo.sysid.diagnosis.error_floor import ErrorFloor, rms
 from torchdlo.sysid.estimation.jobs import Fitted
 from torchdlo.sysid.model.rope_model import RopeModel
-from torchdlo.sysid.recordings.data_quality import Fault
+from torchdlo.sysid.recordings.data_quality import DataIssue
 
 UNEXPLAINED = 3.0
 """Times the floor: a gap beyond that is not explained."""
@@ -72,7 +72,7 @@ class Diagnosis:
     """The calibrated baseline."""
     final: Fitted
     """The model with the effects."""
-    floor: Floor
+    floor: ErrorFloor
     """What no effect explains, on the test trials."""
     before: np.ndarray
     """Gap of each test trial with the baseline [m]."""
@@ -90,7 +90,7 @@ class Diagnosis:
     """Time that it took."""
     notes: list[str] = field(default_factory=list)
     """Sentences that a reader should know."""
-    health: list[Fault] = field(default_factory=list)
+    health: list[DataIssue] = field(default_factory=list)
     """What is wrong with the data."""
     options: dict[str, Any] = field(default_factory=dict)
     """What was asked for."""

@@ -10,7 +10,7 @@ import numpy as np
 from torchdlo.errors import InputError
 from torchdlo.sysid.diagnosis import error_floor as floors
 from torchdlo.sysid.diagnosis.score_test import Score
-from torchdlo.sysid.estimation.jobs import Fit, Fitted, Simulation
+from torchdlo.sysid.estimation.jobs import FitJob, Fitted, SimulationJob
 from torchdlo.sysid.estimation.levenberg_marquardt import Look, cost_of, drift
 from torchdlo.sysid.estimation.worker_pool import Pool, spread
 from torchdlo.sysid.model import initial_state as starts
@@ -52,7 +52,7 @@ def torn_apart(sims: np.ndarray, arclength: np.ndarray) -> np.ndarray:
     return ~(apart <= _TORN * (arclength[-1] - arclength[0])).all((1, 2))
 
 
-class Bench:
+class Workspace:
     """Trials, their starts and the predictions that were asked for."""
 
     def __init__(self, pool: Pool) -> None:
@@ -63,7 +63,7 @@ class Bench:
         """The baseline's numbers that fit the beginning of the trials, as far as they are known."""
         self.linked = True
         """Whether the rope may move like a chain of links, as far as the baseline tells."""
-        self.floor = floors.Floor(floors.noise(self.recording), float("inf"), float("inf"))
+        self.floor = floors.ErrorFloor(floors.noise(self.recording), float("inf"), float("inf"))
         """What no effect explains, on the test trials, as far as it is known."""
         self.level = float("inf")
         """What `gaps` are for a perfect model [m]."""
@@ -92,8 +92,8 @@ class Bench:
         """Correct simulations from now on by this."""
         train, free = len(self.trials["train"]), ~self.trials["all"][0].gripped
         self.floor, self._finer = found.floor(slice(train, None), free), found
-        trust, self.level = found.trust(free)
-        start = replace(self.starts["all"], finer=found.correction, trust=trust)
+        frame_weights, self.level = found.frame_weights(free)
+        start = replace(self.starts["all"], discretisation_correction=found.correction, frame_weights=frame_weights)
         rows = np.arange(len(start.pos))
         self.starts = {"all": start, "train": start.pick(rows[:train]), "test": start.pick(rows[train:])}
         self._known.clear()
@@ -117,8 +117,8 @@ class Bench:
             return
         options = dict(fitted.options) | {"substep": model.dt / (_FINER * model.substeps)}
         names = tuple(self.trials["all"][k].name for k in torn)
-        start = replace(self.starts["all"].pick(torn), finer=None)
-        job = Simulation(fitted.effects, fitted.values[None], names, start, tuple(options.items()))
+        start = replace(self.starts["all"].pick(torn), discretisation_correction=None)
+        job = SimulationJob(fitted.effects, fitted.values[None], names, start, tuple(options.items()))
         ((_, again),) = self.pool.simulate([job])
         sims[torn, : again.shape[2]] = again[0]
         self.mended |= set(names)
@@ -140,9 +140,9 @@ class Bench:
 
     def gaps(self, fitted: Fitted, split: str) -> np.ndarray:
         """Return the gap of each trial of a split [m], frames weighted by what they tell."""
-        return floors.gap(self.prediction(fitted, split), self.trials[split], self.starts[split].trust)
+        return floors.gap(self.prediction(fitted, split), self.trials[split], self.starts[split].frame_weights)
 
-    def astray(self, fitted: Fitted, before: np.ndarray) -> bool:
+    def diverged(self, fitted: Fitted, before: np.ndarray) -> bool:
         """Return whether a model goes astray in a trial whose gap another one kept as small as `before` [m], (B,)."""
         return not bool((self.gaps(fitted, "all") < _ASTRAY * np.maximum(before, self.level)).all())
 
@@ -156,7 +156,9 @@ class Bench:
         noise = cost_of(self.level) if np.isfinite(self.level) else np.inf
         return max(min(_TIE * (worse - best), _CLOSE * max(noise, best)), 1e-12)
 
-    def extension(self, base: Fitted, score: Score, numbers: Sequence[str], iterations: int, frames: int | None) -> Fit:
+    def extension(
+        self, base: Fitted, score: Score, numbers: Sequence[str], iterations: int, frames: int | None
+    ) -> FitJob:
         """Return the job of fitting a model with one effect more, from the best of several starts.
 
         Args:
@@ -178,9 +180,9 @@ class Bench:
             for name, value in dose.items():
                 values[k::count, model.parameters.index(name)] = value
         free, sizes = (*space.names, *numbers), (*space.units, *(score.sizes[n] for n in numbers))
-        return Fit(effects, values, free, sizes, iterations, self.starts["train"], frames, 1, base.options)
+        return FitJob(effects, values, free, sizes, iterations, self.starts["train"], frames, 1, base.options)
 
-    def reduction(self, fitted: Fitted, name: str, plain: Fitted, iterations: int) -> Fit:
+    def reduction(self, fitted: Fitted, name: str, plain: Fitted, iterations: int) -> FitJob:
         """Return the job of fitting a model without one of its effects, from the best of several starts.
 
         Args:
@@ -195,9 +197,9 @@ class Bench:
         effects, values = tuple(e for e in fitted.effects if e != name), np.repeat(fitted.values[None, left], 3, 0)
         for row, numbers in zip(values[1:], (plain.values, self.early), strict=True):
             row[: len(self.early)] = numbers[: len(self.early)]
-        return Fit(effects, values, names, sizes, iterations, self.starts["train"], keep=2)
+        return FitJob(effects, values, names, sizes, iterations, self.starts["train"], keep=2)
 
-    def exchange(self, fitted: Fitted, general: str, special: str, iterations: int) -> Fit:
+    def exchange(self, fitted: Fitted, general: str, special: str, iterations: int) -> FitJob:
         """Return the job of fitting a model in which a special law takes the place of one that contains it.
 
         Args:
@@ -217,13 +219,13 @@ class Bench:
         units = dict(zip(map(named, fitted.space.names), fitted.space.units, strict=True))
         names, first = tuple(n for n in units if n in model.parameters), [values[n] for n in model.parameters]
         sizes, start = tuple(units[n] for n in names), self.starts["train"]
-        return Fit(effects, np.array([first]), names, sizes, iterations, start, options=fitted.options)
+        return FitJob(effects, np.array([first]), names, sizes, iterations, start, options=fitted.options)
 
-    def further(self, found: Fitted, iterations: int, frames: int | None = None) -> Fit:
+    def further(self, found: Fitted, iterations: int, frames: int | None = None) -> FitJob:
         """Return the job of fitting on."""
         space, start = found.space, self.starts["train"]
         values, sizes = found.values[None], tuple(space.units)
-        return Fit(found.effects, values, space.names, sizes, iterations, start, frames, None, found.options)
+        return FitJob(found.effects, values, space.names, sizes, iterations, start, frames, None, found.options)
 
     def drift(self, fitted: Fitted) -> np.ndarray:
         """Return what simulations get wrong by their steps and by their mesh in a fit's coordinates, shape (2, K)."""
@@ -231,14 +233,14 @@ class Bench:
         model = self.pool.local.model(fitted.effects)
         rows = np.repeat(fitted.values[None], len(look.values), 0)
         rows[:, [model.parameters.index(n) for n in fitted.space.names]] = look.values
-        ((_, sims),) = self.pool.simulate([Simulation(fitted.effects, rows, "train", start, fitted.options)])
-        trust = 1.0 if start.trust is None else start.trust[..., None, None]
+        ((_, sims),) = self.pool.simulate([SimulationJob(fitted.effects, rows, "train", start, fitted.options)])
+        frame_weights = 1.0 if start.frame_weights is None else start.frame_weights[..., None, None]
         measured = self.pool.local.motion(model, "train").markers
-        step, grid = (trust * np.nan_to_num(e[: len(measured)]) for e in self._finer.unsure)
+        step, grid = (frame_weights * np.nan_to_num(e[: len(measured)]) for e in self._finer.unsure)
         # Next to clamps the mesh's error may be of first order: extrapolating to that would change twice as much.
-        return drift(look, trust * sims, trust * measured, (step, 2 * grid))
+        return drift(look, frame_weights * sims, frame_weights * measured, (step, 2 * grid))
 
-    def fit(self, jobs: Sequence[Fit]) -> list[Fitted]:
+    def fit(self, jobs: Sequence[FitJob]) -> list[Fitted]:
         """Return the results of fits in their order.
 
         Raises:

@@ -10,15 +10,15 @@ import numpy as np
 
 from torchdlo.sysid.diagnosis import effect_library
 from torchdlo.sysid.estimation import levenberg_marquardt
-from torchdlo.sysid.estimation.levenberg_marquardt import Point, Space
+from torchdlo.sysid.estimation.levenberg_marquardt import ParameterSpace, Point
 from torchdlo.sysid.model import initial_state as starts
 from torchdlo.sysid.model.rope_model import RopeModel
-from torchdlo.sysid.model.trial_batch import Motion, Start
+from torchdlo.sysid.model.trial_batch import Start, TrialBatch
 from torchdlo.sysid.recordings.recording import Recording
 
 
 @dataclass(frozen=True, eq=False)
-class Simulation:
+class SimulationJob:
     """Parameter sets to simulate."""
 
     effects: tuple[str, ...]
@@ -36,7 +36,7 @@ class Simulation:
 
 
 @dataclass(frozen=True, eq=False)
-class Fit:
+class FitJob:
     """Numbers to fit to the train trials."""
 
     effects: tuple[str, ...]
@@ -46,7 +46,7 @@ class Fit:
     free: tuple[str, ...]
     """Numbers to fit; the others stay as they are in the first start."""
     sizes: tuple[float, ...]
-    """What counts as much of each of them, see `Space`."""
+    """What counts as much of each of them, see `ParameterSpace`."""
     iterations: int
     """Most iterations."""
     start: Start | None = None
@@ -67,10 +67,10 @@ class Fitted:
     """Effects of the model."""
     values: np.ndarray
     """Best numbers, in the order of the model's, shape (K,)."""
-    space: Space
+    space: ParameterSpace
     """The numbers that were fitted."""
     point: Point
-    """Their coordinates, with costs and slopes."""
+    """Their coordinates, with costs and gradients."""
     options: tuple[tuple[str, Any], ...] = ()
     """Options of `RopeModel` that differ from those of the pool."""
 
@@ -78,7 +78,7 @@ class Fitted:
 _Search = Generator[np.ndarray, np.ndarray, Fitted]
 """Yields parameter sets (P, K) of its model, takes their simulations (P, B, F, M, 3)."""
 
-Search = Generator[Simulation, np.ndarray, Any]
+Search = Generator[SimulationJob, np.ndarray, Any]
 """Yields simulations, takes their markers."""
 
 
@@ -88,7 +88,7 @@ class Models:
     def __init__(self, recording: Recording, options: dict[str, Any]) -> None:
         self.recording, self.options = recording, options
         self._models: dict[Any, RopeModel] = {}
-        self._motions: dict[Any, Motion] = {}
+        self._motions: dict[Any, TrialBatch] = {}
 
     def model(self, effects: Sequence[str], options: tuple[tuple[str, Any], ...] = ()) -> RopeModel:
         """Return the model with these effects."""
@@ -97,14 +97,14 @@ class Models:
             self._models[key] = RopeModel(self.recording, effects=effects, **(self.options | dict(options)))
         return self._models[key]
 
-    def motion(self, model: RopeModel, split: str | tuple[str, ...]) -> Motion:
+    def motion(self, model: RopeModel, split: str | tuple[str, ...]) -> TrialBatch:
         """Return the motion of the trials of a split."""
         key = (split, model.substeps, len(model.arclength))
         if key not in self._motions:
             self._motions[key] = model.motion(self.recording.trials(split))
         return self._motions[key]
 
-    def simulate(self, job: Simulation, part: int = 0, parts: int = 1) -> np.ndarray:
+    def simulate(self, job: SimulationJob, part: int = 0, parts: int = 1) -> np.ndarray:
         """Return markers [m], shape (P, B, F, M, 3); of one of several parts, those of its P B / parts scenes."""
         model = self.model(job.effects, job.options)
         start = job.start or starts.begin(model, self.recording.trials(job.split))
@@ -114,25 +114,25 @@ class Models:
         rows = np.array_split(np.arange(len(job.values) * len(motion.names)), parts)[part]
         return model.scenes(motion, start, job.values, rows, frames=job.frames)
 
-    def search(self, jobs: Sequence[Fit]) -> Search:
+    def search(self, jobs: Sequence[FitJob]) -> Search:
         """Ask for what several fits with the same start, frames and options need, together; return their results."""
         effects, options = tuple(dict.fromkeys(e for job in jobs for e in job.effects)), jobs[0].options
         model = self.model(effects, options)
         measured = self.motion(model, "train").markers[:, : jobs[0].frames]
         start = jobs[0].start or starts.begin(model, self.recording.train)
-        trust = 1.0 if start.trust is None else start.trust[:, : jobs[0].frames, None, None]
+        frame_weights = 1.0 if start.frame_weights is None else start.frame_weights[:, : jobs[0].frames, None, None]
         searches, places = [], []
         for job in jobs:
             own = self.model(job.effects, options)
             columns = [own.parameters.index(name) for name in job.free]
-            space = Space(job.free, tuple(own.params[k] for k in columns), job.sizes)
-            searches.append(_search(job, space, columns, measured, trust))
+            space = ParameterSpace(job.free, tuple(own.params[k] for k in columns), job.sizes)
+            searches.append(_search(job, space, columns, measured, frame_weights))
             places.append(_places(model, own))
         found: dict[int, Fitted] = {}
         asked = {k: next(search) for k, search in enumerate(searches)}
         while asked:
             rows = [_filled(model.guess(), places[k], values) for k, values in asked.items()]
-            sims = yield Simulation(effects, np.concatenate(rows), "train", start, options, jobs[0].frames)
+            sims = yield SimulationJob(effects, np.concatenate(rows), "train", start, options, jobs[0].frames)
             ends = np.cumsum([len(r) for r in rows])[:-1]
             for k, sim in zip(list(asked), np.split(sims, ends), strict=True):
                 try:
@@ -145,15 +145,15 @@ class Models:
     def framed(self, effects: Sequence[str]) -> bool:
         """Return whether twists have to be searched for in a model with these effects, which takes longer."""
         laws = [effect_library.instance(e, self.model(()).mesh) for e in effects]
-        return any(law.frame_bending or law.settles for law in laws)
+        return any(law.frame_bending or law.is_quasistatic for law in laws)
 
-    def joined(self, fits: Sequence[Fitted], split: str, start: Start) -> Simulation:
+    def joined(self, fits: Sequence[Fitted], split: str, start: Start) -> SimulationJob:
         """Return one job that simulates several fits with the same options, by a model that has the effects of all."""
         options = fits[0].options
         model = self.model(tuple(dict.fromkeys(e for f in fits for e in f.effects)), options)
         owns = [_places(model, self.model(f.effects, options)) for f in fits]
         rows = [_filled(model.guess(), own, f.values[None]) for own, f in zip(owns, fits, strict=True)]
-        return Simulation(model.effects, np.concatenate(rows), split, start, options)
+        return SimulationJob(model.effects, np.concatenate(rows), split, start, options)
 
 
 def _places(model: RopeModel, own: RopeModel) -> list[int]:
@@ -168,27 +168,29 @@ def _filled(guess: np.ndarray, places: Sequence[int], values: np.ndarray) -> np.
     return full
 
 
-def _search(job: Fit, space: Space, columns: Sequence[int], measured: np.ndarray, trust: np.ndarray | float) -> _Search:
+def _search(
+    job: FitJob, space: ParameterSpace, columns: Sequence[int], measured: np.ndarray, frame_weights: np.ndarray | float
+) -> _Search:
     """Fit: yield parameter sets (P, K) of the job's model, take their simulations, return the best.
 
     Markers (..., B, F, M, 3), measured and simulated, are multiplied by what they are trusted, (B, F, 1, 1).
     """
-    measured = trust * measured
+    measured = frame_weights * measured
 
     def full(values: np.ndarray) -> np.ndarray:
         return _filled(job.values[0], columns, values)
 
     raws = space.clip(space.to_raw(job.values[:, columns]))
     if job.keep is not None:
-        costs = levenberg_marquardt.costs(trust * (yield full(space.to_values(raws))), measured)
+        costs = levenberg_marquardt.costs(frame_weights * (yield full(space.to_values(raws))), measured)
         raws = raws[np.argsort(costs)[: job.keep]]
     look = levenberg_marquardt.Look(space, raws)
-    climb = levenberg_marquardt.Climb(space, look.points(trust * (yield full(look.values)), measured))
+    climb = levenberg_marquardt.Climb(space, look.points(frame_weights * (yield full(look.values)), measured))
     for _ in range(job.iterations):
         tries = climb.tries()
         if not len(tries):
             break
         look = levenberg_marquardt.Look(space, tries)
-        climb.take(look.points(trust * (yield full(look.values)), measured))
+        climb.take(look.points(frame_weights * (yield full(look.values)), measured))
     best = min(climb.points, key=lambda p: p.cost)
     return Fitted(job.effects, full(space.to_values(best.raw)[None])[0], space, best)

@@ -17,22 +17,22 @@ _KNEE = 2e-3
 """Error [m] from which the cost grows linearly."""
 
 _FIRM = 5e-3
-"""Share of the cost that a number has to save per squared coordinate to be followed as far as its slope says."""
+"""Share of the cost that a number has to save per squared coordinate to be followed as far as its gradient says."""
 
 _LOST = 0.3
 """What a trial costs whose simulation fails while others run through, as a share of what is measured there: so that
 numbers may lead away from there."""
 
 _WILD = 0.1
-"""Mean change of a trial by a step of finite differences, likewise, from which it is no slope: what grows without end
-may stay finite, but small changes of numbers change all of it."""
+"""Mean change of a trial by a step of finite differences, likewise, from which it is no gradient: what grows without
+end may stay finite, but small changes of numbers change all of it."""
 
 Simulate = Callable[[np.ndarray], np.ndarray]
 """Maps parameter sets (P, K) to simulated markers (P, B, F, M, 3) [m]."""
 
 
 @dataclass(frozen=True, eq=False)
-class Space:
+class ParameterSpace:
     """Declared numbers as coordinates without units: logarithms, or shares of a size."""
 
     names: tuple[str, ...]
@@ -127,9 +127,9 @@ def _together(of_trial: np.ndarray, lost: float) -> np.ndarray:
 
 
 class Look:
-    """What it takes to know costs and their slopes at S points (S, K): S (K + 1) simulations of each trial."""
+    """What it takes to know costs and their gradients at S points (S, K): S (K + 1) simulations of each trial."""
 
-    def __init__(self, space: Space, raws: np.ndarray) -> None:
+    def __init__(self, space: ParameterSpace, raws: np.ndarray) -> None:
         """Prepare to look at these coordinates."""
         self.raws, k = raws, raws.shape[1]
         nudge = np.diag(space.nudges())
@@ -152,15 +152,17 @@ class Look:
             cost, weight = _robust(residual)
             of_trial = cost.sum(1) / per_trial
             change = np.where(seen, sims[s, 1:] - sims[s, 0], 0.0).reshape(k, len(measured), -1)
-            # A trial that ran at the point but failed beside it tells nothing about slopes.
+            # A trial that ran at the point but failed beside it tells nothing about gradients.
             useless = ~(np.isfinite(of_trial) & (np.abs(change).sum(-1) < _WILD * whole * per_trial).all(0))
             # Nor does what it costs where it is far off, if a little beside it is quite another motion.
             of_trial = np.where(useless & (of_trial > _LOST * whole), np.inf, of_trial)
-            slope = change / self._sign[s][:, None, None]
-            slope, weight = np.where(useless[None, :, None], 0.0, slope), np.where(useless[:, None], 0.0, weight)
+            jacobian = change / self._sign[s][:, None, None]
+            jacobian, weight = np.where(useless[None, :, None], 0.0, jacobian), np.where(useless[:, None], 0.0, weight)
             residual = np.where(useless[:, None], 0.0, residual)
-            gradient = np.einsum("kbr,br,br->bk", slope, weight, residual, optimize=True) / per_trial[:, None]
-            curvature = np.einsum("kbr,br,lbr->bkl", slope, weight, slope, optimize=True) / per_trial[:, None, None]
+            gradient = np.einsum("kbr,br,br->bk", jacobian, weight, residual, optimize=True) / per_trial[:, None]
+            curvature = (
+                np.einsum("kbr,br,lbr->bkl", jacobian, weight, jacobian, optimize=True) / per_trial[:, None, None]
+            )
             # The second derivative of the cost is knee^2 / size^3, where Gauss-Newton takes 1 / size.
             weight = np.where(seen.reshape(weight.shape), weight, 0.0)
             flatter = (weight**3 * _KNEE**2).sum(-1) / np.maximum(weight.sum(-1), 1e-300)
@@ -169,8 +171,8 @@ class Look:
         return points
 
 
-def evaluate(simulate: Simulate, measured: np.ndarray, space: Space, raws: np.ndarray) -> list[Point]:
-    """Return costs and their slopes at S parameter sets, shape (S, K)."""
+def evaluate(simulate: Simulate, measured: np.ndarray, space: ParameterSpace, raws: np.ndarray) -> list[Point]:
+    """Return costs and their gradients at S parameter sets, shape (S, K)."""
     look = Look(space, raws)
     return look.points(simulate(look.values), measured)
 
@@ -178,7 +180,7 @@ def evaluate(simulate: Simulate, measured: np.ndarray, space: Space, raws: np.nd
 class Climb:
     """Levenberg-Marquardt from several points at once, until each stands still."""
 
-    def __init__(self, space: Space, points: Sequence[Point], tolerance: float = 2e-3) -> None:
+    def __init__(self, space: ParameterSpace, points: Sequence[Point], tolerance: float = 2e-3) -> None:
         """Begin.
 
         Args:
@@ -212,7 +214,7 @@ class Climb:
 def improve(
     simulate: Simulate,
     measured: np.ndarray,
-    space: Space,
+    space: ParameterSpace,
     points: Sequence[Point],
     *,
     iterations: int,
@@ -237,7 +239,7 @@ def improve(
         yield list(climb.points)
 
 
-def _step(point: Point, damping: float, space: Space) -> np.ndarray:
+def _step(point: Point, damping: float, space: ParameterSpace) -> np.ndarray:
     curvature, gradient = point.curvature.mean(0), point.gradient.mean(0)
     scale = np.diag(curvature) + 1e-9 * np.trace(curvature) + 1e-12
     # Numbers that hardly matter stay where they are instead of following noise far away.
@@ -265,7 +267,7 @@ def _firm(curvature: np.ndarray) -> np.ndarray:
     return curvature + (1e-9 * np.trace(curvature) + 1e-12) * np.eye(len(curvature))
 
 
-def interval(point: Point, space: Space, drifts: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+def interval(point: Point, space: ParameterSpace, drifts: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
     """Return 90 % limits of the values, shape (K,) each.
 
     How trials differ says how far the minimum may be off (linearised jackknife, leaving out one trial at a time). What

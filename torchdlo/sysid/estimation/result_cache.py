@@ -23,7 +23,7 @@ from torchdlo.files import replacing, write_atomically
 from torchdlo.sysid.recordings.recording import Recording
 from torchdlo.sysid.recordings.rope_schema import read_arrays
 
-__all__ = ["Journal", "digest"]
+__all__ = ["ResultCache", "digest"]
 
 _MARK = "journal.json"
 """The file that says what a journal belongs to."""
@@ -45,7 +45,7 @@ def digest(*things: Any) -> str:
     return found.hexdigest()
 
 
-class Journal:
+class ResultCache:
     """A folder with the results of finished jobs."""
 
     def __init__(self, path: Path, recording: Recording, options: dict[str, Any], *, resume: bool = False) -> None:

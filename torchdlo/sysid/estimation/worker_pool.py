@@ -13,8 +13,8 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from torchdlo.sysid.estimation.jobs import Fit, Fitted, Models, Search, Simulation
-from torchdlo.sysid.estimation.result_cache import Journal
+from torchdlo.sysid.estimation.jobs import FitJob, Fitted, Models, Search, SimulationJob
+from torchdlo.sysid.estimation.result_cache import ResultCache
 from torchdlo.sysid.model import initial_state as starts
 from torchdlo.sysid.model.trial_batch import Start
 from torchdlo.sysid.recordings.recording import Recording
@@ -47,7 +47,7 @@ class Pool:
         recording: Recording,
         options: dict[str, Any],
         workers: int | None = None,
-        journal: Journal | None = None,
+        journal: ResultCache | None = None,
     ) -> None:
         """Start the workers.
 
@@ -61,7 +61,7 @@ class Pool:
         self.journal = journal
         self.recording, self.local = recording, Models(recording, options)
         # Named in every job, so that what was found with them is not mixed up with what others find later.
-        self._chosen = {name: options[name] for name in ("ahead", "grip", "rest") if name in options}
+        self._chosen = {name: options[name] for name in ("numerical_damping", "grip", "rest") if name in options}
         context = multiprocessing.get_context("spawn")
         # Each has a queue of its own: what was recorded for a model's steps is known to the process that did it.
         self._queues = [
@@ -88,7 +88,7 @@ class Pool:
     def _whole(self, options: tuple[tuple[str, Any], ...]) -> tuple[tuple[str, Any], ...]:
         return tuple((self._chosen | dict(options)).items())
 
-    def simulate(self, jobs: Sequence[Simulation]) -> Iterator[tuple[int, np.ndarray]]:
+    def simulate(self, jobs: Sequence[SimulationJob]) -> Iterator[tuple[int, np.ndarray]]:
         """Yield the index and the markers of every job as they get ready."""
         return self._new(jobs, lambda new: self._led([_once(job) for job in new]))
 
@@ -98,12 +98,12 @@ class Pool:
         """Return a function that simulates trials with one model."""
 
         def simulate(start: Start, values: np.ndarray, frames: int | None = None) -> np.ndarray:
-            ((_, sims),) = self.simulate([Simulation(tuple(effects), values, split, start, options, frames)])
+            ((_, sims),) = self.simulate([SimulationJob(tuple(effects), values, split, start, options, frames)])
             return sims
 
         return simulate
 
-    def fit(self, jobs: Sequence[Fit]) -> Iterator[tuple[int, Fitted]]:
+    def fit(self, jobs: Sequence[FitJob]) -> Iterator[tuple[int, Fitted]]:
         """Yield the index and the result of every fit as they get ready."""
         return self._new(jobs, self._fitted)
 
@@ -123,12 +123,12 @@ class Pool:
         jobs = [replace(job, options=self._whole(job.options)) for job in jobs]
         yield from compute(jobs) if self.journal is None else self.journal.through(jobs, compute)
 
-    def _fitted(self, jobs: Sequence[Fit]) -> Iterator[tuple[int, Fitted]]:
+    def _fitted(self, jobs: Sequence[FitJob]) -> Iterator[tuple[int, Fitted]]:
         groups = self.groups(jobs)
         for n, found in self._led([self.local.search([jobs[k] for k in group]) for group in groups]):
             yield from zip(groups[n], found, strict=True)
 
-    def groups(self, jobs: Sequence[Fit]) -> list[list[int]]:
+    def groups(self, jobs: Sequence[FitJob]) -> list[list[int]]:
         """Return the indices of the fits that run together: alike ones, as long as few scenes come together.
 
         A step of few scenes costs hardly more for more of them, but each effect of one costs in all scenes.
@@ -157,7 +157,7 @@ class Pool:
 
     def _led(self, searches: Sequence[Search]) -> Iterator[tuple[int, Any]]:
         """Yield the index and the result of every search as they get ready; all workers simulate what they ask for."""
-        asked: dict[int, Simulation] = {}
+        asked: dict[int, SimulationJob] = {}
         waiting: dict[Future, tuple[int, int, int]] = {}
         parts: dict[int, list[np.ndarray | None]] = {}
         left, home = set(range(len(searches))), {n: n % self.workers for n in range(len(searches))}
@@ -195,7 +195,7 @@ class Pool:
                     sims = np.concatenate(parts.pop(n))
                     yield from go_on(n, sims.reshape(len(asked[n].values), -1, *sims.shape[-3:]))
 
-    def _parts(self, job: Simulation, searches: int) -> int:
+    def _parts(self, job: SimulationJob, searches: int) -> int:
         """Return into how many parts a simulation is split for the workers, which others may keep busy as well.
 
         0 if this process had better do it.
@@ -207,7 +207,7 @@ class Pool:
         return max(1, min(-(-self.workers // searches), scenes // _FEW))
 
 
-def _once(job: Simulation) -> Search:
+def _once(job: SimulationJob) -> Search:
     """Ask for one simulation and return it."""
     return (yield job)
 
@@ -241,5 +241,5 @@ def _do(what: Callable[[Models, Job], Any], job: Job) -> Any:
     return what(_models, job)
 
 
-def _simulated(models: Models, asked: tuple[Simulation, int, int]) -> np.ndarray:
+def _simulated(models: Models, asked: tuple[SimulationJob, int, int]) -> np.ndarray:
     return models.simulate(*asked)

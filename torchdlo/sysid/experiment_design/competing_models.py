@@ -15,17 +15,17 @@ from torchdlo.sysid.diagnosis import baseline as baselines
 from torchdlo.sysid.diagnosis import budget as plan
 from torchdlo.sysid.diagnosis import effect_library
 from torchdlo.sysid.diagnosis.score_test import Score, screen
-from torchdlo.sysid.diagnosis.workspace import Bench, Callback
-from torchdlo.sysid.estimation.jobs import Fit, Fitted
+from torchdlo.sysid.diagnosis.workspace import Callback, Workspace
+from torchdlo.sysid.estimation.jobs import FitJob, Fitted
 from torchdlo.sysid.estimation.result_cache import digest
 from torchdlo.sysid.model import model_file
-from torchdlo.sysid.model.model_file import Saved
+from torchdlo.sysid.model.model_file import ModelFile
 from torchdlo.sysid.recordings.recording import Recording
 
 __all__ = ["check_names", "diagnosed", "fit_rivals"]
 
 
-def diagnosed(folder: Path, recording: Recording) -> tuple[list[list[str]], Saved]:
+def diagnosed(folder: Path, recording: Recording) -> tuple[list[list[str]], ModelFile]:
     """Return sets of effects that a finished diagnosis could not tell apart, and its model.
 
     Args:
@@ -61,7 +61,7 @@ def _digests(recording: Recording) -> set[str]:
     return {digest({f.name: getattr(p, f.name) for f in dataclasses.fields(p)[1:]}) for p in parts}
 
 
-def check_names(names: Sequence[str], ties: list[list[str]] | None, bench: Bench) -> tuple[str, ...]:
+def check_names(names: Sequence[str], ties: list[list[str]] | None, bench: Workspace) -> tuple[str, ...]:
     """Return the effects to tell apart: those asked for, or the first ones that tie.
 
     Raises:
@@ -88,7 +88,7 @@ def check_names(names: Sequence[str], ties: list[list[str]] | None, bench: Bench
 
 
 def fit_rivals(
-    bench: Bench, names: Sequence[str], given: Saved | None, seed: int, report: Callback
+    bench: Workspace, names: Sequence[str], given: ModelFile | None, seed: int, report: Callback
 ) -> dict[str, Fitted]:
     """Return the model of each name, fitted to the train trials.
 
@@ -111,7 +111,7 @@ def fit_rivals(
     if given is not None:
         model = given.model(bench.recording, **bench.pool.local.options)
         sizes = given.sizes(model)
-        own = Fit(
+        own = FitJob(
             given.effects, given.start(model)[None], tuple(sizes), tuple(sizes.values()), budget.iterations, start
         )
         jobs |= {n: own for n in names if n in given.effects and not set(given.effects) & ({*names} - {n})}
@@ -124,13 +124,13 @@ def fit_rivals(
     return found
 
 
-def _without(given: Saved, names: Sequence[str]) -> Saved:
+def _without(given: ModelFile, names: Sequence[str]) -> ModelFile:
     """Return a model without some of its effects."""
     values = {k: v for k, v in given.values.items() if k.split(".")[0] not in names}
     return replace(given, effects=tuple(e for e in given.effects if e not in names), values=values)
 
 
-def _job(bench: Bench, base: Fitted, score: Score, iterations: int) -> Fit:
+def _job(bench: Workspace, base: Fitted, score: Score, iterations: int) -> FitJob:
     """Return the job of fitting the baseline with one effect more, from the doses that suit best."""
     # All that any dose uses: a wind may turn from where the best dose blows.
     used = [n.name for n in effect_library.numbers(score.name, bench.recording) if n.name in score.sizes]

@@ -21,18 +21,18 @@ from torchdlo.sysid.diagnosis import budget
 from torchdlo.sysid.diagnosis import error_floor as floors
 from torchdlo.sysid.diagnosis.effect_equations import separating
 from torchdlo.sysid.diagnosis.score_test import curvature_scale
-from torchdlo.sysid.diagnosis.workspace import Bench, Callback
+from torchdlo.sysid.diagnosis.workspace import Callback, Workspace
 from torchdlo.sysid.estimation.jobs import Fitted
 from torchdlo.sysid.estimation.result import dump, versions
-from torchdlo.sysid.estimation.result_cache import Journal
+from torchdlo.sysid.estimation.result_cache import ResultCache
 from torchdlo.sysid.estimation.worker_pool import Pool
 from torchdlo.sysid.experiment_design import competing_models, excitation_motions
-from torchdlo.sysid.experiment_design.excitation_motions import KINDS, Gesture, Rig
-from torchdlo.sysid.experiment_design.model_discrimination import Contest, Pair, measured_misfit, size
+from torchdlo.sysid.experiment_design.excitation_motions import KINDS, ExcitationMotion, GripperLimits
+from torchdlo.sysid.experiment_design.model_discrimination import ModelDiscrimination, Pair, measured_misfit, size
 from torchdlo.sysid.recordings import data_quality
 from torchdlo.sysid.recordings.recording import Recording, Trial
 
-__all__ = ["Design", "Option", "design_experiment", "design_json", "sentence", "why"]
+__all__ = ["Design", "Option", "design_experiment", "design_json", "rationale", "summary"]
 
 TRIALS = 4
 """Most train trials that rivals have to keep explaining."""
@@ -57,7 +57,7 @@ LEAST_NOISE = 1e-5
 class Option:
     """One motion and what it would tell."""
 
-    gesture: Gesture
+    gesture: ExcitationMotion
     """The motion."""
     amplitude: float
     """Its amplitude, in `unit`."""
@@ -85,7 +85,7 @@ class Design:
     """How far each is from the train trials, root mean square per coordinate [m]."""
     noise: float
     """Noise of the markers per coordinate [m], the unit of separations."""
-    rig: Rig
+    rig: GripperLimits
     """What the grippers can do."""
     seconds: float
     """How long the motion lasts."""
@@ -166,14 +166,14 @@ def design_experiment(
     rig, noise = excitation_motions.make_rig(recording, scale), max(floors.noise(recording), LEAST_NOISE)
     asked = {"design": list(names), "seconds": seconds, "scale": scale, "mass": mass, "seed": seed, "options": options}
     asked |= {"ties": ties, "first": given and given.values}
-    kept = None if journal is None else Journal(journal, recording, asked, resume=resume)
+    kept = None if journal is None else ResultCache(journal, recording, asked, resume=resume)
     with Pool(recording, options, workers, kept) as pool:
-        bench = Bench(pool)
+        bench = Workspace(pool)
         names = competing_models.check_names(names, ties, bench)
         if mass and "point_mass" in (*names, *(given.effects if given else ())):
             raise InputError("mass: a known mass on the rope cannot be told from point_mass; leave out one of them.")
         models = competing_models.fit_rivals(bench, names, given, seed, report)
-        contest = Contest(bench, models, rig, seconds, noise)
+        contest = ModelDiscrimination(bench, models, rig, seconds, noise)
         contest.prepare(report)
         options_tried = _search(contest, mass, np.random.default_rng(seed), report)
         chosen, confirmed = _confirm(contest, options_tried, report)
@@ -211,7 +211,7 @@ def _check(
         raise InputError(f"mass: expected kilograms, up to twice the rope's {recording.mass:g}, found {mass:g}.")
 
 
-def _search(contest: Contest, mass: float, rng: np.random.Generator, report: Callback) -> list[Option]:
+def _search(contest: ModelDiscrimination, mass: float, rng: np.random.Generator, report: Callback) -> list[Option]:
     """Return the motions of the menu, best first, and before them the best of them improved."""
     gravity = float(np.linalg.norm(contest.bench.recording.gravity))
     gestures = excitation_motions.menu(contest.rig, contest.seconds, gravity, mass)
@@ -228,7 +228,7 @@ def _search(contest: Contest, mass: float, rng: np.random.Generator, report: Cal
 
 
 def _judged(
-    contest: Contest, gestures: list[Gesture], report: Callback, stage: str, improved: bool = False
+    contest: ModelDiscrimination, gestures: list[ExcitationMotion], report: Callback, stage: str, improved: bool = False
 ) -> list[Option]:
     found = []
     for gesture, pairs in zip(gestures, contest.judge(gestures, 0, report, stage), strict=True):
@@ -244,7 +244,7 @@ def _rank(option: Option) -> float:
 
 
 def _confirm(
-    contest: Contest, options: list[Option], report: Callback
+    contest: ModelDiscrimination, options: list[Option], report: Callback
 ) -> tuple[list[Option], tuple[list[Pair], list[Pair]]]:
     """Return the options, best after full fits first, and the pairs of the trials at hand and of the best."""
     lead = [o for o in options if np.isfinite(o.estimate)][: LEADERS + any(o.improved for o in options)]
@@ -262,7 +262,7 @@ def _confirm(
     return [judged[best], *rest, *(o for o in options if o not in lead)], (present, pairs[best])
 
 
-def called(gesture: Gesture, amplitude: float, unit: str) -> str:
+def called(gesture: ExcitationMotion, amplitude: float, unit: str) -> str:
     """Return a motion in words."""
     said = KINDS[gesture.kind]
     if gesture.kind != "hold":
@@ -275,7 +275,7 @@ def called(gesture: Gesture, amplitude: float, unit: str) -> str:
     return said + (f", {1e3 * gesture.mass:.3g} g on the rope" if gesture.mass else "")
 
 
-def sentence(design: Design) -> str:
+def summary(design: Design) -> str:
     """Return the outcome in words."""
     best = design.options[0]
     names = " and ".join(n.replace("_", " ") for n in design.models)
@@ -294,7 +294,7 @@ def sentence(design: Design) -> str:
     return f"{said}; {design.needed:.1f} are needed."
 
 
-def why(design: Design) -> list[str]:
+def rationale(design: Design) -> list[str]:
     """Return why the suggested motion separates, in sentences."""
     said = [f"It {w}." for w in _more(design)]
     place = design.trial.marker_arclength
@@ -371,7 +371,7 @@ def design_json(design: Design) -> str:
         "separation": design.separation,
         "separation_of_recording": design.reference,
         "motion": _option(design.options[0]),
-        "why": why(design),
+        "why": rationale(design),
         "pairs": listed(design.pairs),
         "pairs_of_recording": listed(design.present),
         "motions": [_option(o) for o in design.options],

@@ -14,7 +14,7 @@ from torchdlo.sysid.model import initial_state as starts
 from torchdlo.sysid.model.trial_batch import Start
 from torchdlo.sysid.recordings.recording import Recording, Trial
 
-__all__ = ["KINDS", "Gesture", "Rig", "first_pose", "make_rig", "menu", "near", "play", "travel"]
+__all__ = ["KINDS", "ExcitationMotion", "GripperLimits", "first_pose", "make_rig", "menu", "near", "play", "travel"]
 
 KINDS = {
     "hold": "holds still",
@@ -43,7 +43,7 @@ _WINDOW = 0.1
 
 
 @dataclass(frozen=True)
-class Gesture:
+class ExcitationMotion:
     """One motion of all grippers."""
 
     kind: str
@@ -65,7 +65,7 @@ class Gesture:
 
 
 @dataclass(frozen=True, eq=False)
-class Rig:
+class GripperLimits:
     """Where the grippers start, and how far and how fast they may go."""
 
     trial: Trial
@@ -90,7 +90,7 @@ class Rig:
     """Largest rate at which a clamp turns [rad/s]."""
 
 
-def make_rig(recording: Recording, scale: float = 1.0) -> Rig:
+def make_rig(recording: Recording, scale: float = 1.0) -> GripperLimits:
     """Return what the grippers of a recording can do.
 
     Args:
@@ -118,7 +118,7 @@ def make_rig(recording: Recording, scale: float = 1.0) -> Rig:
     turns = [_turns(t, g, dt) for t in trials for g in groups if len(g) > 1]
     apart = [np.linalg.norm(c[:, 0] - c[:, -1], axis=-1) for c in centres]
     first = np.linalg.norm(markers[groups[0]].mean(0) - markers[groups[-1]].mean(0))
-    return Rig(
+    return GripperLimits(
         trial,
         markers + shift,
         groups,
@@ -158,7 +158,7 @@ def _turns(trial: Trial, group: np.ndarray, dt: float) -> tuple[float, float]:
     return float(np.percentile(angle, 99)), float(np.percentile(rate, 99))
 
 
-def menu(rig: Rig, seconds: float, gravity: float, mass: float = 0.0) -> list[Gesture]:
+def menu(rig: GripperLimits, seconds: float, gravity: float, mass: float = 0.0) -> list[ExcitationMotion]:
     """Return motions that are worth a try, those that limits leave too small left out.
 
     Args:
@@ -174,19 +174,19 @@ def menu(rig: Rig, seconds: float, gravity: float, mass: float = 0.0) -> list[Ge
     # Where the limits of speed and of acceleration meet.
     fast = float(np.clip(rig.acceleration / (2 * np.pi * max(rig.speed, 1e-6)), swinging, 4.0))
     quarter, half = 0.5 * np.pi, np.pi
-    found = [Gesture("hold", heading=h) for h in (0.0, quarter, half)]
-    found += [Gesture("swing", f, d) for f in (slow, swinging, fast) for d in (0.0, quarter)]
-    found += [Gesture("swing", swinging, 0.0, h) for h in (quarter, half)]
-    found += [Gesture("ladder", swinging, d) for d in (0.0, quarter)]
-    found += [Gesture("stop", fast, d) for d in (0.0, quarter)]
-    found += [Gesture("pump", f) for f in (swinging, fast)]
-    found += [Gesture("circle", f) for f in (slow, swinging)]
-    found += [Gesture("against", f) for f in (slow, swinging)] if len(rig.groups) == 2 else []
-    found += [Gesture("nod", f) for f in (slow, swinging, fast)]
+    found = [ExcitationMotion("hold", heading=h) for h in (0.0, quarter, half)]
+    found += [ExcitationMotion("swing", f, d) for f in (slow, swinging, fast) for d in (0.0, quarter)]
+    found += [ExcitationMotion("swing", swinging, 0.0, h) for h in (quarter, half)]
+    found += [ExcitationMotion("ladder", swinging, d) for d in (0.0, quarter)]
+    found += [ExcitationMotion("stop", fast, d) for d in (0.0, quarter)]
+    found += [ExcitationMotion("pump", f) for f in (swinging, fast)]
+    found += [ExcitationMotion("circle", f) for f in (slow, swinging)]
+    found += [ExcitationMotion("against", f) for f in (slow, swinging)] if len(rig.groups) == 2 else []
+    found += [ExcitationMotion("nod", f) for f in (slow, swinging, fast)]
     if rig.trial.gripper_quaternion is not None:
         # Measured rotations only: else nobody knows how the rope lies in the clamp.
         # The peak of `_rise` is 15/8 of its mean rate.
-        found += [Gesture("roll", min(rig.turning / (1.876 * np.pi), 1.0), heading=h) for h in (0.0, quarter)]
+        found += [ExcitationMotion("roll", min(rig.turning / (1.876 * np.pi), 1.0), heading=h) for h in (0.0, quarter)]
     if mass:
         found += [replace(g, mass=mass) for g in found if g.kind in ("hold", "swing") and g.heading == 0.0]
     return [g for g in found if g.kind == "hold" or _worth(*travel(rig, g, seconds))]
@@ -202,7 +202,7 @@ def _rise(x: np.ndarray) -> np.ndarray:
     return x**3 * (10 - 15 * x + 6 * x**2)
 
 
-def _profile(gesture: Gesture, time: np.ndarray) -> tuple[np.ndarray, str]:
+def _profile(gesture: ExcitationMotion, time: np.ndarray) -> tuple[np.ndarray, str]:
     """Return the motion of amplitude 1 and its channel.
 
     Channels are "level" and "up", shape (F, 2) along and across and (F, 1), and "apart", "nod" and "roll", (F, 1).
@@ -232,13 +232,13 @@ def _profile(gesture: Gesture, time: np.ndarray) -> tuple[np.ndarray, str]:
     return single[:, None], channel
 
 
-def _axes(gesture: Gesture, channel: str) -> np.ndarray:
+def _axes(gesture: ExcitationMotion, channel: str) -> np.ndarray:
     """Return the directions of a channel's columns in the rig, shape (C, 3)."""
     c, s = np.cos(gesture.direction), np.sin(gesture.direction)
     return np.array([[c, s, 0.0], [-s, c, 0.0]]) if channel == "level" else np.array([[0.0, 0.0, 1.0]])
 
 
-def travel(rig: Rig, gesture: Gesture, seconds: float) -> tuple[float, str]:
+def travel(rig: GripperLimits, gesture: ExcitationMotion, seconds: float) -> tuple[float, str]:
     """Return the amplitude of a motion and its unit, "m" or "rad": as large as all limits allow, times its share."""
     time = np.linspace(0, seconds, 4 * round(seconds / (rig.trial.time[1] - rig.trial.time[0])) + 1)
     unit, channel = _profile(gesture, time)
@@ -256,7 +256,7 @@ def travel(rig: Rig, gesture: Gesture, seconds: float) -> tuple[float, str]:
     return gesture.share * float(amplitude), "rad" if channel in ("nod", "roll") else "m"
 
 
-def play(rig: Rig, gesture: Gesture, seconds: float, name: str) -> Trial:
+def play(rig: GripperLimits, gesture: ExcitationMotion, seconds: float, name: str) -> Trial:
     """Return the motion as a trial; where the free markers will be is not known, NaN."""
     trial = rig.trial
     dt = float(trial.time[1] - trial.time[0])
@@ -297,7 +297,9 @@ def play(rig: Rig, gesture: Gesture, seconds: float, name: str) -> Trial:
     )
 
 
-def _clamp_turn(rig: Rig, group: np.ndarray, gesture: Gesture, channel: str, amount: np.ndarray) -> Rotation:
+def _clamp_turn(
+    rig: GripperLimits, group: np.ndarray, gesture: ExcitationMotion, channel: str, amount: np.ndarray
+) -> Rotation:
     """Return how a clamp is turned at each frame."""
     axis = rig.markers[group[-1]] - rig.markers[group[0]]
     if channel == "nod":
@@ -307,20 +309,22 @@ def _clamp_turn(rig: Rig, group: np.ndarray, gesture: Gesture, channel: str, amo
     return Rotation.from_rotvec(amount * axis / np.linalg.norm(axis))
 
 
-def _about(rig: Rig, turn: Rotation, points: np.ndarray) -> np.ndarray:
+def _about(rig: GripperLimits, turn: Rotation, points: np.ndarray) -> np.ndarray:
     """Turn points (..., 3) about the vertical through the middle of the grippers."""
     pivot = _middle(rig.markers, rig.groups)
     return pivot + turn.apply((points - pivot).reshape(-1, 3)).reshape(points.shape)
 
 
-def first_pose(rig: Rig, gestures: Sequence[Gesture]) -> Start:
+def first_pose(rig: GripperLimits, gestures: Sequence[ExcitationMotion]) -> Start:
     """Return where the rope is when motions begin, before it comes to rest."""
     turns = [Rotation.from_rotvec([0.0, 0.0, g.heading]) for g in gestures]
     pos = np.stack([_about(rig, turn, rig.markers) for turn in turns])
     return Start(pos, np.zeros_like(pos), np.full(len(pos), rig.still))
 
 
-def near(gesture: Gesture, rng: np.random.Generator, count: int, wide: float, seconds: float) -> list[Gesture]:
+def near(
+    gesture: ExcitationMotion, rng: np.random.Generator, count: int, wide: float, seconds: float
+) -> list[ExcitationMotion]:
     """Return motions like a given one, with other amplitude, frequency, direction and timing.
 
     Args:

@@ -16,16 +16,16 @@ import numpy as np
 from scipy.optimize import lsq_linear
 
 from torchdlo.sysid.diagnosis import effect_library
-from torchdlo.sysid.diagnosis.workspace import Bench, Callback
-from torchdlo.sysid.estimation.jobs import Fitted, Models, Simulation
-from torchdlo.sysid.estimation.levenberg_marquardt import Space
+from torchdlo.sysid.diagnosis.workspace import Callback, Workspace
+from torchdlo.sysid.estimation.jobs import Fitted, Models, SimulationJob
+from torchdlo.sysid.estimation.levenberg_marquardt import ParameterSpace
 from torchdlo.sysid.experiment_design import excitation_motions
-from torchdlo.sysid.experiment_design.excitation_motions import Gesture, Rig
+from torchdlo.sysid.experiment_design.excitation_motions import ExcitationMotion, GripperLimits
 from torchdlo.sysid.model.rope_model import RopeModel
 from torchdlo.sysid.model.trial_batch import Start
 from torchdlo.sysid.recordings.recording import Trial
 
-__all__ = ["Contest", "Pair", "measured_misfit", "size"]
+__all__ = ["ModelDiscrimination", "Pair", "measured_misfit", "size"]
 
 _LOAD = "point_mass"
 """The effect by which a known mass hangs on the rope."""
@@ -141,36 +141,36 @@ class _Chase:
             past, new = self.simulate(raws, k == 0)
             for c in range(count):
                 old_slope, old_left = self._linear(raws[c], past[c], job.past)
-                slope, gap = (old_slope, old_left) if new is None else self._linear(raws[c], new[c], self.shown[c])
+                gradient, gap = (old_slope, old_left) if new is None else self._linear(raws[c], new[c], self.shown[c])
                 total = float(np.nansum(gap**2) + (0.0 if new is None else np.nansum(old_left**2)))
                 if not np.isfinite(gap[..., self.free, :]).all() or total >= cost[c]:
                     reach[c] *= 0.3
                     raws[c] = self.space.clip(best[c] + reach[c] * steps[c])
                     continue
                 cost[c], best[c], left[c], reach[c] = total, raws[c], gap, 1.0
-                rows = [x.reshape(-1, x.shape[-1]) for x in ((old_slope,) if new is None else (old_slope, slope))]
+                rows = [x.reshape(-1, x.shape[-1]) for x in ((old_slope,) if new is None else (old_slope, gradient))]
                 gaps = [x.ravel() for x in ((old_left,) if new is None else (old_left, gap))]
                 steps[c] = self._step(best[c], np.concatenate(rows), np.concatenate(gaps))
                 raws[c] = self.space.clip(best[c] + steps[c])
                 if not job.iterations:
-                    left[c], best[c] = gap + slope @ steps[c], raws[c]
+                    left[c], best[c] = gap + gradient @ steps[c], raws[c]
         values = np.repeat(self.rival.values[None], count, 0)
         values[:, self.columns] = self.space.to_values(best)
         return values, left
 
     def _linear(self, raw: np.ndarray, sims: np.ndarray, shown: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return slopes (B, F, M, 3, K) and differences (B, F, M, 3) [m], NaN at grippers."""
+        """Return gradients (B, F, M, 3, K) and differences (B, F, M, 3) [m], NaN at grippers."""
         change = self.rows(raw)[1]
         left = np.where(self.free[:, None], sims[0] - shown, np.nan)
         return np.moveaxis(sims[1:] - sims[0], 0, -1) / change, left
 
-    def _step(self, raw: np.ndarray, slope: np.ndarray, left: np.ndarray) -> np.ndarray:
+    def _step(self, raw: np.ndarray, gradient: np.ndarray, left: np.ndarray) -> np.ndarray:
         """Return by how much numbers move to follow, within their bounds."""
-        good = np.isfinite(left) & np.isfinite(slope).all(1)
+        good = np.isfinite(left) & np.isfinite(gradient).all(1)
         low, high = (self.space.clip(raw + s * self.space.limits()) - raw for s in (-1, 1))
         turning = np.array([p.periodic for p in self.space.params])
         low, high = np.where(turning, -1.0, low), np.where(turning, 1.0, high)
-        q, r = np.linalg.qr(slope[good])
+        q, r = np.linalg.qr(gradient[good])
         return lsq_linear(r, -(q.T @ left[good]), bounds=(np.minimum(low, -1e-9), np.maximum(high, 1e-9))).x
 
 
@@ -178,10 +178,12 @@ def _follow(models: Models, job: _Follow) -> tuple[np.ndarray, np.ndarray]:
     return _Chase(models, job).run()
 
 
-class Contest:
+class ModelDiscrimination:
     """Rival models of one recording."""
 
-    def __init__(self, bench: Bench, models: dict[str, Fitted], rig: Rig, seconds: float, noise: float) -> None:
+    def __init__(
+        self, bench: Workspace, models: dict[str, Fitted], rig: GripperLimits, seconds: float, noise: float
+    ) -> None:
         """Prepare.
 
         Args:
@@ -203,7 +205,7 @@ class Contest:
             raw = model.space.to_raw(model.values[columns])
             rows = np.repeat(model.values[None], len(raw) + 1, 0)
             rows[1:, columns] = model.space.to_values(_moved(model.space, raw))
-            jobs.append(Simulation(model.effects, rows, "train", self.bench.starts["train"]))
+            jobs.append(SimulationJob(model.effects, rows, "train", self.bench.starts["train"]))
         for done, (k, sims) in enumerate(self.bench.pool.simulate(jobs), 1):
             self._past[names[k]] = sims
             report(stage, done, len(jobs), "")
@@ -216,7 +218,7 @@ class Contest:
         place = {"position": recording.length * (0.5 if recording.train[0].gripped[-1] else 1.0), "mass": mass}
         return tuple(place[n.name.split(".")[1]] for n in effect_library.numbers(_LOAD, recording))
 
-    def _trials(self, gestures: Sequence[Gesture], shown: np.ndarray | None = None) -> tuple[Trial, ...]:
+    def _trials(self, gestures: Sequence[ExcitationMotion], shown: np.ndarray | None = None) -> tuple[Trial, ...]:
         """Return motions as trials, with markers as given."""
         trials = [excitation_motions.play(self.rig, g, self.seconds, f"train_{k}") for k, g in enumerate(gestures)]
         if shown is None:
@@ -224,14 +226,16 @@ class Contest:
         free = ~self.rig.trial.gripped[:, None]
         return tuple(replace(t, markers=np.where(free, x, t.markers)) for t, x in zip(trials, shown, strict=True))
 
-    def _showing(self, gestures: Sequence[Gesture], name: str) -> _Play:
+    def _showing(self, gestures: Sequence[ExcitationMotion], name: str) -> _Play:
         """Return the job of simulating motions with a model; all have the same mass."""
         model, load = self.models[name], self._load(gestures[0].mass)
         effects = (*model.effects, *((_LOAD,) if load else ()))
         values = np.concatenate([model.values, load])[None]
         return _Play(self._trials(gestures), effects, values, excitation_motions.first_pose(self.rig, gestures))
 
-    def judge(self, gestures: Sequence[Gesture], iterations: int, report: Callback, stage: str) -> list[list[Pair]]:
+    def judge(
+        self, gestures: Sequence[ExcitationMotion], iterations: int, report: Callback, stage: str
+    ) -> list[list[Pair]]:
         """Return what is left between each pair in each motion.
 
         Args:
@@ -285,7 +289,7 @@ class Contest:
         return float(np.min([size(p.left) for p in pairs])) / self.noise
 
 
-def _moved(space: Space, raw: np.ndarray) -> np.ndarray:
+def _moved(space: ParameterSpace, raw: np.ndarray) -> np.ndarray:
     """Return coordinates with each one a little changed, inwards where it stands at a bound, shape (K, K)."""
     nudge = np.diag(space.nudges())
     upward = space.clip(raw + nudge)
@@ -297,7 +301,7 @@ def size(left: np.ndarray) -> float:
     return float(np.sqrt(np.nanmean(np.square(left)))) if np.isfinite(left).any() else float("nan")
 
 
-def measured_misfit(models: dict[str, Fitted], bench: Bench) -> dict[str, float]:
+def measured_misfit(models: dict[str, Fitted], bench: Workspace) -> dict[str, float]:
     """Return how far each model is from the train trials, root mean square per coordinate [m]."""
     bench.predict(list(models.values()))
     return {n: float(np.sqrt(np.mean(bench.gaps(m, "train") ** 2))) for n, m in models.items()}

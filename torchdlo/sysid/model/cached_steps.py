@@ -21,7 +21,7 @@ _RECORDINGS = tracing.Recordings(32)
 
 def _moved(scene: scenes.Scene, params: scenes.Params, state: scenes.State, control: scenes.Control) -> scenes.State:
     after = scenes.step(scene, params, state, control)
-    return tree.replace(after, missed=state.missed, reaction=state.reaction)
+    return tree.replace(after, diagnostics=state.diagnostics, reaction=state.reaction)
 
 
 def recorded(scene: scenes.Scene, params: scenes.Params, state: scenes.State, control: scenes.Control) -> Step:

@@ -37,7 +37,7 @@ def come_to_rest(
         state: where they are.
         control: where the grippers stay.
     """
-    calm = dataclasses.replace(scene, dt=_SETTLING_STEP, substeps=1, ahead=1.0)
+    calm = dataclasses.replace(scene, dt=_SETTLING_STEP, substeps=1, numerical_damping=1.0)
     damping = dict(params.effects["damping"])
     damping["rate"] = torch.full_like(damping["rate"], _SETTLING_RATE)
     calmed = tree.replace(params, effects=params.effects | {"damping": damping})

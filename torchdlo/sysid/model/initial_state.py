@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from torchdlo.sysid.model.rope_model import RopeModel
-from torchdlo.sysid.model.trial_batch import WINDOW, Motion, Start
+from torchdlo.sysid.model.trial_batch import WINDOW, Start, TrialBatch
 from torchdlo.sysid.recordings.recording import Recording, Trial
 
 Simulator = Callable[[Start, np.ndarray, int | None], np.ndarray]
@@ -58,12 +58,12 @@ def calm(recording: Recording, trials: Sequence[Trial]) -> np.ndarray:
         frames = max(4, int(np.searchsorted(trial.time, WINDOW + 1e-9)))
         seen, time = trial.markers[:frames], trial.time[:frames]
         good = np.isfinite(seen).all((0, 2))
-        slope = np.tensordot(time - time.mean(), seen[:, good], axes=(0, 0)) / ((time - time.mean()) ** 2).sum()
+        gradient = np.tensordot(time - time.mean(), seen[:, good], axes=(0, 0)) / ((time - time.mean()) ** 2).sum()
         low = np.nanmin(trial.markers[:frames, ~trial.gripped, 2])
         lying = recording.table_height is not None and low < recording.table_height + 3 * (recording.radius or 0.005)
         enough = good.sum() >= 0.5 * len(good)
-        # Of noise of 1 mm the slope over eleven frames would be 1 cm/s.
-        out.append(bool(enough and not lying and np.sqrt((slope**2).sum(-1)).mean() < _CALM))
+        # Of noise of 1 mm the gradient over eleven frames would be 1 cm/s.
+        out.append(bool(enough and not lying and np.sqrt((gradient**2).sum(-1)).mean() < _CALM))
     return np.array(out)
 
 
@@ -79,13 +79,13 @@ def _fill(values: np.ndarray, arclength: np.ndarray) -> np.ndarray:
     return np.stack([np.interp(arclength, arclength[known], values[known, c]) for c in range(3)], -1)
 
 
-def simulator(model: RopeModel, motion: Motion) -> Simulator:
+def simulator(model: RopeModel, motion: TrialBatch) -> Simulator:
     """Return a function that simulates trials with a model, in this process."""
     return lambda start, values, frames: model.simulate(motion, start, values, frames=frames)
 
 
 def refine(
-    model: RopeModel, motion: Motion, start: Start, values: np.ndarray, simulate: Simulator | None = None
+    model: RopeModel, motion: TrialBatch, start: Start, values: np.ndarray, simulate: Simulator | None = None
 ) -> Start:
     """Return positions and velocities with which the simulation follows the markers best through the window.
 
@@ -116,11 +116,11 @@ def refine(
     measured = motion.markers[:, :frames]
     seen = np.isfinite(measured).reshape(trials, -1)
     residual = np.where(seen, (measured - sim[0]).reshape(trials, -1), 0.0)
-    slope = (sim[1:] - sim[0]).reshape(2 * half, trials, -1).transpose(1, 2, 0) / nudge
-    slope = np.where(seen[..., None], slope, 0.0)
+    gradient = (sim[1:] - sim[0]).reshape(2 * half, trials, -1).transpose(1, 2, 0) / nudge
+    gradient = np.where(seen[..., None], gradient, 0.0)
     prior = np.repeat([1 / _POSITION**2, 1 / _VELOCITY**2], half)
-    normal = slope.transpose(0, 2, 1) @ slope / _NOISE**2 + np.diag(prior)
-    step = np.linalg.solve(normal, (slope.transpose(0, 2, 1) @ residual[..., None]) / _NOISE**2)[..., 0]
+    normal = gradient.transpose(0, 2, 1) @ gradient / _NOISE**2 + np.diag(prior)
+    step = np.linalg.solve(normal, (gradient.transpose(0, 2, 1) @ residual[..., None]) / _NOISE**2)[..., 0]
     step = np.nan_to_num(step).reshape(trials, 2, len(free), 3)
     better = Start(start.pos.copy(), start.vel.copy(), start.still)
     better.pos[:, free] += step[:, 0]

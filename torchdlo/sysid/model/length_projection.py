@@ -32,7 +32,7 @@ def agree(scene: scenes.Scene, params: scenes.Params, state: scenes.State) -> sc
     """
     rest, rods = params.rods.rest, state.rods
     free = torch.ones(scene.topology.size, 1)
-    free[list(scene.held_vertices)] = 0.0
+    free[list(scene.prescribed_vertices)] = 0.0
     free = free.to(rods.pos)
     active = rest.edge_mask * (1 - (1 - free) * (1 - torch.roll(free, -1, -2)))
     lengths = edge_lengths.Lengths(scene.topology, rest.length, torch.zeros_like(rest.length), active, rest.edge_mask)
@@ -44,11 +44,11 @@ def agree(scene: scenes.Scene, params: scenes.Params, state: scenes.State) -> sc
         return pos, vel, missed.nan_to_num(torch.inf)
 
     pos, vel, missed = settled(rods.pos)
-    astray = missed > _MISSED
-    if bool(astray.any()):
-        other = settled(laid(rods.pos, rest.length, scene.held_vertices or (0,), scene.topology.closed[0]))
+    diverged = missed > _MISSED
+    if bool(diverged.any()):
+        other = settled(laid(rods.pos, rest.length, scene.prescribed_vertices or (0,), scene.topology.closed[0]))
         # Only there: elsewhere both agree with the lengths, but they are not the same.
-        better = astray & (other[2] < missed)
+        better = diverged & (other[2] < missed)
         pos, vel, missed = (torch.where(better, b, a) for a, b in zip((pos, vel, missed), other, strict=True))
     lost = ~torch.isfinite(pos).all(-1).all(-1)[:, None, None]
     pos, vel = torch.where(lost, rods.pos, pos), torch.where(lost, rods.vel, vel)

@@ -21,7 +21,7 @@ from torchdlo.sysid.model.discretisation import make_mesh
 from torchdlo.sysid.model.rope_model import RopeModel
 from torchdlo.sysid.recordings.recording import Recording
 
-__all__ = ["FORMAT", "VERSION", "Saved", "content", "load"]
+__all__ = ["FORMAT", "VERSION", "ModelFile", "content", "load"]
 
 FORMAT = "torchdlo-model"
 """What a model file says it is."""
@@ -29,14 +29,14 @@ FORMAT = "torchdlo-model"
 VERSION = 2
 """Version of the format."""
 
-_OPTIONS = {"vertices": int, "rest": str, "ahead": float, "grip": float, "substep": float}
+_OPTIONS = {"vertices": int, "rest": str, "numerical_damping": float, "grip": float, "substep": float}
 """How the model is built, see `RopeModel`."""
 
 _BASELINE = ("bending_stiffness", "twisting_stiffness", "damping_rate")
 
 
 @dataclass(frozen=True)
-class Saved:
+class ModelFile:
     """A model that was read from a file."""
 
     path: Path
@@ -70,7 +70,7 @@ class Saved:
         return np.array([self.values.get(name, guess[name]) for name in model.parameters], dtype=float)
 
     def sizes(self, model: RopeModel) -> dict[str, float]:
-        """Return the numbers that are worth fitting, with what counts as much of each, see `fit.Space`.
+        """Return the numbers that are worth fitting, with what counts as much of each, see `fit.ParameterSpace`.
 
         Those of effects at which they are off stay off.
         """
@@ -104,7 +104,7 @@ def content(model: RopeModel, values: np.ndarray) -> dict[str, Any]:
         "options": {
             "vertices": _asked(model),
             "rest": model.rest,
-            "ahead": model.ahead,
+            "numerical_damping": model.numerical_damping,
             "grip": model.grip,
             "substep": model.dt / model.substeps,
         },
@@ -122,7 +122,7 @@ def _asked(model: RopeModel) -> int:
     return count
 
 
-def load(path: str | Path) -> Saved:
+def load(path: str | Path) -> ModelFile:
     """Read a model file.
 
     Raises:
@@ -148,7 +148,7 @@ def load(path: str | Path) -> Saved:
         for key, value in numbers.items():
             _check_number(path, name, key)
             values[f"{name}.{key}"] = _number(path, f"effects.{name}.{key}", value)
-    return Saved(path, tuple(effects), values, _options(path, options))
+    return ModelFile(path, tuple(effects), values, _options(path, options))
 
 
 def _read(path: Path) -> dict[str, Any]:

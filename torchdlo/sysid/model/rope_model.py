@@ -32,7 +32,7 @@ from torchdlo.sysid.model.cached_steps import recorded
 from torchdlo.sysid.model.discretisation import make_mesh
 from torchdlo.sysid.model.gripper_motion import drive
 from torchdlo.sysid.model.marker_observation import Markers
-from torchdlo.sysid.model.trial_batch import WINDOW, Motion, Start
+from torchdlo.sysid.model.trial_batch import WINDOW, Start, TrialBatch
 from torchdlo.sysid.recordings.recording import Recording, Trial
 
 MAX_SUBSTEP = 5e-3
@@ -62,7 +62,7 @@ class RopeModel:
         rest: str = "straight",
         effects: Sequence[str] = (),
         substep: float = MAX_SUBSTEP,
-        ahead: float = AHEAD,
+        numerical_damping: float = AHEAD,
         grip: float = 1.0,
     ) -> None:
         """Prepare the model.
@@ -83,7 +83,7 @@ class RopeModel:
         self.arclength, self.marker_vertex = self.mesh.arclength, self.mesh.marker_vertex
         self.held, self.clamps = self.mesh.held, self.mesh.clamps
         self.gripped = np.flatnonzero(trial.gripped)
-        self.ahead, self.grip = ahead, grip
+        self.numerical_damping, self.grip = numerical_damping, grip
         for other in (*recording.train, *recording.test):
             same = np.array_equal(other.gripped, trial.gripped)
             if not same or not np.allclose(other.marker_arclength, trial.marker_arclength):
@@ -130,7 +130,7 @@ class RopeModel:
         first = {"bending_stiffness": bend, "twisting_stiffness": 0.7 * bend}
         return np.array([first.get(n.name, n.off) for n in self.numbers], dtype=float)
 
-    def motion(self, trials: Sequence[Trial]) -> Motion:
+    def motion(self, trials: Sequence[Trial]) -> TrialBatch:
         """Return the grippers' motion of trials, and what was measured."""
         longest = max(len(t.time) for t in trials)
         held, director, measured = [], [], []
@@ -142,7 +142,7 @@ class RopeModel:
             held.append(np.pad(vertices, (fine, (0, 0), (0, 0)), mode="edge"))
             director.append(np.pad(turns, (fine, (0, 0), (0, 0)), mode="edge"))
             measured.append(np.pad(markers, (pad, (0, 0), (0, 0)), constant_values=np.nan))
-        return Motion(
+        return TrialBatch(
             tuple(t.name for t in trials),
             torch.as_tensor(np.stack(held)),
             torch.as_tensor(np.stack(director)),
@@ -155,7 +155,7 @@ class RopeModel:
         return all(t.gripper_quaternion is not None for t in self.recording.train)
 
     def build(
-        self, motion: Motion, start: Start, values: np.ndarray
+        self, motion: TrialBatch, start: Start, values: np.ndarray
     ) -> tuple[scenes.Scene, scenes.Params, scenes.State]:
         """Build scenes, one per row of `values` (N, K), `motion` and `start`; all have N trials.
 
@@ -175,7 +175,7 @@ class RopeModel:
         return found
 
     def _assembled(
-        self, motion: Motion, markers: Tensor, speed: Tensor, number: dict[str, Tensor]
+        self, motion: TrialBatch, markers: Tensor, speed: Tensor, number: dict[str, Tensor]
     ) -> tuple[scenes.Scene, scenes.Params, scenes.State]:
         """Build scenes that begin with the rope's axis in places (N, M, 3) and with velocities at the markers."""
         pos, vel = (
@@ -207,12 +207,12 @@ class RopeModel:
             substeps=1,
             integrator="implicit",
             twist="quasistatic",
-            held_vertices=self.held,
-            held_edges=tuple(edge for edge, _ in self.clamps),
-            ahead=self.ahead,
+            prescribed_vertices=self.held,
+            prescribed_edges=tuple(edge for edge, _ in self.clamps),
+            numerical_damping=self.numerical_damping,
             # Ropes that are jerked taut need more; others do as well with less.
-            newton=3 if self.ahead >= AHEAD else 2,
-            settling=4 if self.ahead >= AHEAD else 2,
+            constraint_iterations=3 if self.numerical_damping >= AHEAD else 2,
+            twist_iterations=4 if self.numerical_damping >= AHEAD else 2,
         )
         params = self._measured_lengths(params, number)
         return scene, params, length_projection.agree(scene, params, state)
@@ -251,20 +251,20 @@ class RopeModel:
         shape = CubicSpline(self.mesh.marker_arclength, flat, axis=0)(self.arclength)
         return torch.as_tensor(np.pad(shape, ((0, 0), (0, 1))))
 
-    def _first_director(self, motion: Motion) -> Tensor | None:
+    def _first_director(self, motion: TrialBatch) -> Tensor | None:
         """Return the director of the first edge: that of a clamp, if one holds it, else none."""
         edge = self.clamps[0][0] if self.clamps else len(self.held)
         clamped = edge < len(self.held) and self.held[edge] == edge
         return motion.director[:, 0, 0] if clamped else None
 
-    def _commands(self, scene: scenes.Scene, state: scenes.State, motion: Motion) -> Tensor:
+    def _commands(self, scene: scenes.Scene, state: scenes.State, motion: TrialBatch) -> Tensor:
         """Return directors of the held edges, shape (N, S, G, 3).
 
         Where the grippers' rotation was not measured, the rope is taken to be without twist at the start.
         """
         if self.measured_twist() or not self.clamps:
             return motion.director
-        first = scenes.hold(scene, state).director
+        first = scenes.stationary_control(scene, state).director
         place = {vertex: k for k, vertex in enumerate(self.held)}
         edges = [(place[edge], place[edge + 1]) for edge, _ in self.clamps]
         tangent = normalize(torch.stack([motion.held[:, :, b] - motion.held[:, :, a] for a, b in edges], 2))
@@ -288,7 +288,9 @@ class RopeModel:
             rest = tree.replace(rest, curvature=_turned(rods.rest.curvature, number))
         return tree.replace(params, rods=tree.replace(rods, rest=rest, material=material))
 
-    def simulate(self, motion: Motion, start: Start, values: np.ndarray, *, frames: int | None = None) -> np.ndarray:
+    def simulate(
+        self, motion: TrialBatch, start: Start, values: np.ndarray, *, frames: int | None = None
+    ) -> np.ndarray:
         """Return simulated markers [m] for every parameter set and trial.
 
         Args:
@@ -305,7 +307,7 @@ class RopeModel:
         return out.reshape(sets, trials, *out.shape[1:])
 
     def scenes(
-        self, motion: Motion, start: Start, values: np.ndarray, wanted: np.ndarray, *, frames: int | None = None
+        self, motion: TrialBatch, start: Start, values: np.ndarray, wanted: np.ndarray, *, frames: int | None = None
     ) -> np.ndarray:
         """Return simulated markers [m] of some of the (P B) pairs of parameter sets and trials.
 
@@ -326,12 +328,12 @@ class RopeModel:
             trial = filled % trials
             begin = start.pick(trial if len(start.pos) == trials else filled)
             out[rows] = self._run(motion.pick(trial), begin, values[filled // trials], total)[: len(rows)]
-            if start.finer is not None:
-                out[rows] += begin.finer[: len(rows), :total]
+            if start.discretisation_correction is not None:
+                out[rows] += begin.discretisation_correction[: len(rows), :total]
         return out
 
     @torch.no_grad()
-    def _run(self, motion: Motion, start: Start, values: np.ndarray, frames: int) -> np.ndarray:
+    def _run(self, motion: TrialBatch, start: Start, values: np.ndarray, frames: int) -> np.ndarray:
         scene, params, state = self.build(motion, start, values)
         params = tree.map(tree.batch_innermost, params)
         director = self._commands(scene, state, motion)
@@ -358,7 +360,7 @@ class RopeModel:
         params: scenes.Params,
         state: scenes.State,
         controls: Sequence[scenes.Control],
-        motion: Motion,
+        motion: TrialBatch,
     ) -> scenes.State:
         """Return a resting state moved, and set in motion, as the markers say in the first tenth of a second."""
         free = np.setdiff1d(np.arange(self.count), self.gripped)

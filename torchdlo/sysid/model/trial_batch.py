@@ -12,7 +12,7 @@ WINDOW = 0.1
 
 
 @dataclass(frozen=True, eq=False)
-class Motion:
+class TrialBatch:
     """Trials of one recording as inputs of the simulation, stacked; short trials are padded with their last frame."""
 
     names: tuple[str, ...]
@@ -25,10 +25,10 @@ class Motion:
     frames: tuple[int, ...]
     """True number of frames of each trial."""
 
-    def pick(self, rows: np.ndarray) -> Motion:
+    def pick(self, rows: np.ndarray) -> TrialBatch:
         """Return the motion with these trials, in their order, repeated as given."""
         names = tuple(self.names[i] for i in rows)
-        return Motion(
+        return TrialBatch(
             names, self.held[rows], self.director[rows], self.markers[rows], tuple(self.frames[i] for i in rows)
         )
 
@@ -43,14 +43,17 @@ class Start:
     """Marker velocities at time 0 [m/s], shape (B, M, 3)."""
     still: np.ndarray | None = None
     """Which trials begin almost in balance, at rest: they start near where the model comes to rest, (B,) bool."""
-    finer: np.ndarray | None = None
+    discretisation_correction: np.ndarray | None = None
     """What finer steps on a finer mesh would change of the markers of simulations that begin here, to be added to them
     [m], shape (B, F, M, 3)."""
-    trust: np.ndarray | None = None
+    frame_weights: np.ndarray | None = None
     """What errors of frames are multiplied by in fits [1], shape (B, F); 1 if not given."""
 
     def pick(self, rows: np.ndarray) -> Start:
         """Return the starts of these trials."""
         return Start(
-            *(None if x is None else x[rows] for x in (self.pos, self.vel, self.still, self.finer, self.trust))
+            *(
+                None if x is None else x[rows]
+                for x in (self.pos, self.vel, self.still, self.discretisation_correction, self.frame_weights)
+            )
         )

@@ -16,7 +16,7 @@ from torchdlo.sysid.diagnosis.error_floor import noise as noise_of
 from torchdlo.sysid.recordings.marker_spacing import spacing_faults
 from torchdlo.sysid.recordings.recording import Recording, Trial
 
-__all__ = ["Fault", "check"]
+__all__ = ["DataIssue", "check"]
 
 _DENSITY = (20.0, 23_000.0)
 """Of a rope, over its whole cross-section [kg/m^3]: light foam and osmium."""
@@ -35,7 +35,7 @@ _FADES = 0.5
 
 
 @dataclass(frozen=True)
-class Fault:
+class DataIssue:
     """One thing that is wrong with the data."""
 
     trial: str
@@ -46,7 +46,7 @@ class Fault:
     """What was found, and what was done about it."""
 
 
-def check(recording: Recording) -> tuple[Recording, list[Fault]]:
+def check(recording: Recording) -> tuple[Recording, list[DataIssue]]:
     """Return the recording without what cannot be trusted, and what that was.
 
     Raises:
@@ -69,11 +69,13 @@ def check(recording: Recording) -> tuple[Recording, list[Fault]]:
         train=tuple(mended[t.name] for t in recording.train),
         test=tuple(mended[t.name] for t in recording.test),
     )
-    faults += [Fault(*f) for f in spacing_faults(clean, noise)]
+    faults += [DataIssue(*f) for f in spacing_faults(clean, noise)]
     usual = float(np.median([t.time[-1] for t in trials]))
     for t in trials:
         if t.time[-1] < 0.5 * usual:
-            faults.append(Fault(t.name, "cut", f"it lasts {t.time[-1]:.2f} s, the others {usual:.2f} s: was it cut?"))
+            faults.append(
+                DataIssue(t.name, "cut", f"it lasts {t.time[-1]:.2f} s, the others {usual:.2f} s: was it cut?")
+            )
     return clean, faults
 
 
@@ -107,13 +109,13 @@ def _check_clocks(recording: Recording, trials: Sequence[Trial]) -> None:
             )
 
 
-def _mend(trial: Trial, noise: float) -> tuple[Trial, list[Fault]]:
+def _mend(trial: Trial, noise: float) -> tuple[Trial, list[DataIssue]]:
     """Return a trial without frames and markers that cannot be trusted, and why."""
     markers, suspect, faults = trial.markers.copy(), trial.suspect.copy(), []
     stalled = _stalls(trial, noise)
     if stalled.any():
         suspect |= stalled
-        faults.append(Fault(trial.name, "stall", f"{_frames(stalled)} repeat the frame before: left out"))
+        faults.append(DataIssue(trial.name, "stall", f"{_frames(stalled)} repeat the frame before: left out"))
     seen = np.where(suspect[:, None, None], np.nan, markers)
     steps, frame = _steps(seen), trial.time[1] - trial.time[0]
     size = np.linalg.norm(steps, axis=-1)
@@ -177,7 +179,7 @@ def _events(size: np.ndarray, noise: float, frame: float) -> np.ndarray:
     return (known > bound) & (known >= 0.8 * near)
 
 
-def _all_at_once(trial: Trial, x: np.ndarray, steps: np.ndarray, f: int) -> Fault | None:
+def _all_at_once(trial: Trial, x: np.ndarray, steps: np.ndarray, f: int) -> DataIssue | None:
     """Return what happened when all markers stepped together, None if they did not do so as a whole."""
     good = np.isfinite(steps[f]).all(-1)
     place, step = x[f - 1][good], steps[f][good]
@@ -200,7 +202,7 @@ def _all_at_once(trial: Trial, x: np.ndarray, steps: np.ndarray, f: int) -> Faul
     when = f"at {trial.time[f]:.2f} s (frame {f})"
     if along > 0.85 and count > 0.6 and along > rigid - 0.1:
         lost = "a frame is" if round(count) <= 1 else f"about {round(count)} frames are"
-        return Fault(trial.name, "clock", f"{lost} missing {when}: the {_FADES:g} s after it are left out")
+        return DataIssue(trial.name, "clock", f"{lost} missing {when}: the {_FADES:g} s after it are left out")
     after = "what comes after is left out"
     held = np.linalg.norm(step[trial.gripped[good]], axis=-1)
     if rigid > 0.85 and held.min(initial=np.inf) > 0.3 * np.sqrt(whole / len(step)):
@@ -208,11 +210,11 @@ def _all_at_once(trial: Trial, x: np.ndarray, steps: np.ndarray, f: int) -> Faul
         said = (
             f"all markers, held ones too, step by {size:.0f} mm at once {when}, as if the camera had slipped: {after}"
         )
-        return Fault(trial.name, "camera", said)
+        return DataIssue(trial.name, "camera", said)
     return None
 
 
-def _labels(trial: Trial, x: np.ndarray, events: np.ndarray, size: np.ndarray) -> tuple[np.ndarray, list[Fault]]:
+def _labels(trial: Trial, x: np.ndarray, events: np.ndarray, size: np.ndarray) -> tuple[np.ndarray, list[DataIssue]]:
     """Return where single markers are not where they belong, (F, M) bool, and what happened."""
     wrong, faults = np.zeros(x.shape[:2], bool), []
     swaps: dict[tuple[int, int], list[int]] = {}
@@ -228,7 +230,7 @@ def _labels(trial: Trial, x: np.ndarray, events: np.ndarray, size: np.ndarray) -
         rows = _swapped(trial, x, pair, at)
         wrong[np.ix_(rows, pair)] = True
         faults.append(
-            Fault(trial.name, "swap", f"markers {pair[0]} and {pair[1]} are swapped in {_frames(rows)}: left out")
+            DataIssue(trial.name, "swap", f"markers {pair[0]} and {pair[1]} are swapped in {_frames(rows)}: left out")
         )
     jumped = []
     for m in np.flatnonzero(single.any(0)):
@@ -237,7 +239,7 @@ def _labels(trial: Trial, x: np.ndarray, events: np.ndarray, size: np.ndarray) -
         jumped.append(f"marker {m} in {_frames(rows)}")
     if jumped:
         shown = "; ".join(jumped[:4]) + (f" and {len(jumped) - 4} more" if len(jumped) > 4 else "")
-        faults.append(Fault(trial.name, "jump", f"markers jump away and are left out there: {shown}"))
+        faults.append(DataIssue(trial.name, "jump", f"markers jump away and are left out there: {shown}"))
     return wrong, faults
 
 

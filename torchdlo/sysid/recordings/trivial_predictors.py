@@ -120,8 +120,8 @@ def _inverse_sinhc(log_ratio: np.ndarray) -> np.ndarray:
             x**2 / 6 - x**4 / 180,
             safe + np.log1p(-np.exp(-2 * safe)) - np.log(2 * safe),
         )
-        slope = np.where(small, x / 3 - x**3 / 45, 1 / np.tanh(safe) - 1 / safe)
-        step = (value - log_ratio) / slope
+        gradient = np.where(small, x / 3 - x**3 / 45, 1 / np.tanh(safe) - 1 / safe)
+        step = (value - log_ratio) / gradient
         x = np.maximum(x - step, 1e-9)
         if np.all(np.abs(step) <= 1e-13 * x):
             break
