@@ -130,7 +130,7 @@ def contact_alone(made: tuple[Any, Any, Any], seconds: float) -> float:
 
     choice, params, state = made
     contact = next(e for e in choice.effects if e.name == "rod_contact")
-    parts = {"survey": 1, "react": SUBSTEPS, "shortfall": SUBSTEPS}
+    parts = {"broad_phase": 1, "solve_contact": SUBSTEPS, "capacity_overflow": SUBSTEPS}
     plain, given = {name: getattr(RodContact, name) for name in parts}, {}
 
     def watched(name: str):

@@ -77,7 +77,8 @@ def one(name: str, args: Any, out: Path) -> dict[str, Any]:
     print(
         f"{name}: {problem.title}: loss {row['loss at start']:.3g} at the start, "
         f"{row['loss with the gradient of contact']:.3g} with the gradient of contact, "
-        f"{row['loss with contact cut']:.3g} with contact cut (first gradient {found.gradient:.3g} and {cut.gradient:.3g})\n"
+        f"{row['loss with contact cut']:.3g} with contact cut "
+        f"(first gradient {found.gradient:.3g} and {cut.gradient:.3g})\n"
         f"  {'solved' if row['solved'] else 'NOT SOLVED'}: {problem.measure} {first:.3g} at the start, {value:.3g} at "
         f"the end (limit {problem.limit:g}) "
         f"after {row['iterations']} iterations, {row['seconds']:.0f} s",

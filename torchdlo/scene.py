@@ -121,12 +121,18 @@ class Scene:
         need(self.twist in TWISTS, f"twist is {self.twist!r}; expected one of {TWISTS}")
         need(isinstance(self.dt, int | float) and 0 < self.dt < math.inf, f"dt is {self.dt!r}; give seconds above 0")
         need(self.substeps in range(1, 10**6), f"substeps is {self.substeps!r}; expected a whole number from 1 up")
-        need(self.constraint_iterations >= 1, f"newton is {self.constraint_iterations}; expected at least 1 step")
-        need(self.twist_iterations >= 1, f"settling is {self.twist_iterations}; expected at least 1 step")
-        need(self.implicit_weight >= 0.25, f"gamma is {self.implicit_weight}; below 0.25 implicit steps are not stable")
+        need(
+            self.constraint_iterations >= 1,
+            f"constraint_iterations is {self.constraint_iterations}; expected at least 1 step",
+        )
+        need(self.twist_iterations >= 1, f"twist_iterations is {self.twist_iterations}; expected at least 1 step")
+        need(
+            self.implicit_weight >= 0.25,
+            f"implicit_weight is {self.implicit_weight}; expected at least 0.25, below which steps are unstable",
+        )
         need(
             0 <= self.numerical_damping <= 1,
-            f"ahead is {self.numerical_damping}; expected a share of a substep, 0 to 1",
+            f"numerical_damping is {self.numerical_damping}; expected a share of a substep, 0 to 1",
         )
         size = self.topology.size
         for name in ("prescribed_vertices", "prescribed_edges"):
@@ -312,7 +318,7 @@ def step(
         state: the scene now.
         control: where held parts are at the end.
         advance: what does a substep; `stepper` puts a compiled one here.
-        survey: what looks up once per step what effects need to know; likewise.
+        broad_phase: what looks up once per step what effects need to know; likewise.
     """
     _check_control(scene, control)
     return _step(scene, params, state, control, advance, broad_phase)

@@ -9,7 +9,7 @@ import torch
 from touching import F64, distances, line, trefoil, two
 
 from torchdlo.coupling import RodContact
-from torchdlo.coupling.common.step_diagnostics import survey
+from torchdlo.coupling.common.step_diagnostics import broad_phase as find
 from torchdlo.coupling.rod_contact import broad_phase, broad_phase_op
 from torchdlo.physics import tree
 from torchdlo.physics.effects.elastic import Bend
@@ -39,7 +39,7 @@ def walk(n: int, seed: int, step_m: float = 0.015, box: float = 0.12) -> torch.T
 def listed(scene, params, state) -> tuple[list[set[tuple[int, int]]], float]:
     """Pairs on the list of each scene, and how many found no room."""
     control = stationary_control(scene, state)
-    found = survey(scene, params, state, control, control).effects["rod_contact"]
+    found = find(scene, params, state, control, control).effects["rod_contact"]
     at, batch = found["corners"], found["corners"].shape[:-2]
     pairs = []
     for b in range(batch.numel()):
@@ -134,8 +134,8 @@ def test_a_full_list_and_fast_vertices_are_reported(way):
         state, rods=tree.replace(state.rods, vel=state.rods.vel.index_fill(0, torch.tensor([3]), 1.0))
     )
     control = stationary_control(scene, state)
-    from_rest = survey(scene, params, state, control, control)
-    late = step(scene, from_rest, shoved, control, survey=lambda scene, params, *others: params)
+    from_rest = find(scene, params, state, control, control)
+    late = step(scene, from_rest, shoved, control, broad_phase=lambda scene, params, *others: params)
     with pytest.raises(RuntimeError, match="mm further within a step than contact looked"):
         check_state(late)
 
@@ -167,7 +167,7 @@ def test_the_kernel_finds_what_tensor_operations_find(n, dtype, monkeypatch):
         with monkeypatch.context() as patch:
             if not there:
                 patch.setattr(broad_phase_op, "ready", lambda *_: False)
-            values = survey(scene, params, state, start, aimed).effects["rod_contact"]
+            values = find(scene, params, state, start, aimed).effects["rod_contact"]
             moved = state.rods.pos + 0.03 * torch.sin(torch.arange(3 * n, dtype=dtype)).reshape(n, 3)
             found.append((listed(scene, params, state), values["reach"], contact.capacity_overflow(moved, values)))
     (pairs, lost), reach, short = found[0]

@@ -68,8 +68,8 @@ scene_packing.operator(
 scene_packing.operator("rod_outrun(Tensor pos, Tensor origin, Tensor reach) -> Tensor", _outrun, _outrun_meta)
 
 
-def survey(view: View, carried: Tensor, room: int, burst: float) -> Values:
-    """Return what `RodContact.survey` does.
+def find_candidates(view: View, carried: Tensor, room: int, burst: float) -> Values:
+    """Return what `RodContact.find_candidates` does.
 
     Args:
         view: the rods when the step begins; its dt is the whole step.
@@ -95,7 +95,7 @@ def survey(view: View, carried: Tensor, room: int, burst: float) -> Values:
 
 
 def beyond(pos: Tensor, values: Values) -> Tensor:
-    """Return by how much vertices outran the survey [m], shape (..., 1, 1), without derivative."""
+    """Return by how much vertices outran the find_candidates [m], shape (..., 1, 1), without derivative."""
     batch, size = values["corners"].shape[:-2], pos.shape[-2]
     both = scene_packing.stored([pos.detach(), values["origin"].detach()], batch, size)
     (reach,) = scene_packing.stored([values["reach"].detach()], batch, 1)

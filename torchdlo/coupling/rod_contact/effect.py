@@ -211,7 +211,7 @@ class RodContact(Effect):
         topology, pos, params = view.topology, view.state.pos, view.params
         room = self.room or max(64, 2 * topology.size)
         if broad_phase_op.ready(pos.device.type, pos.dtype):
-            return broad_phase_op.broad_phase(view, carried, room, self.burst)
+            return broad_phase_op.find_candidates(view, carried, room, self.burst)
         mean = view.state.vel.mean(-2, keepdim=True)
         fastest = safe_norm(view.state.vel - mean).amax(-2, keepdim=True)
         if carried.shape[-2]:
@@ -229,7 +229,7 @@ class RodContact(Effect):
         }
 
     def capacity_overflow(self, pos: Tensor, values: Values) -> Tensor:
-        """Return how many pairs found no room, and by how much vertices outran the survey [m], shape (..., 1, 2)."""
+        """Return how many pairs found no room, and by how much vertices outran the broad phase [m], shape (..., 1, 2)."""
         if broad_phase_op.ready(pos.device.type, pos.dtype):
             return torch.cat([values["lost"], broad_phase_op.beyond(pos, values)], -1).detach()
         moved = pos - values["origin"]

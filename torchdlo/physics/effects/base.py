@@ -196,7 +196,7 @@ class Effect(ABC):
         return {}
 
     def capacity_overflow(self, pos: Tensor, values: Values) -> Tensor:
-        """Return what the survey had no room for [1] and by how much it was outrun [m], shape (..., 1, 2)."""
+        """Return what the broad phase had no room for [1] and by how much it was outrun [m], shape (..., 1, 2)."""
         return pos.new_zeros(1, 2)
 
     def solve_contact(self, view: View, motion: PredictedMotion, values: Values) -> Tensor | ContactForces:

@@ -226,7 +226,7 @@ def _scout(job: _Job, starts: int, rng: np.random.Generator, report: Callback, n
         report(stage, look + 1, total, f"{1e3 * costs.min():.2f} mm over {share:.0%} of the time")
     simulate, measured = over(1.0)
     points = levenberg_marquardt.evaluate(simulate, measured, job.space, raws)
-    for look, points in enumerate(
+    for look, points in enumerate(  # noqa: B020
         levenberg_marquardt.improve(simulate, measured, job.space, points, iterations=_LOOKS)
     ):
         report(stage, look + 3, total, f"{1e3 * min(p.cost for p in points):.2f} mm")
