@@ -229,7 +229,7 @@ class RodContact(Effect):
         }
 
     def capacity_overflow(self, pos: Tensor, values: Values) -> Tensor:
-        """Return how many pairs found no room, and by how much vertices outran the broad phase [m], shape (..., 1, 2)."""
+        """Return how many pairs found no room, and by how much vertices outran the broad phase [m], (..., 1, 2)."""
         if broad_phase_op.ready(pos.device.type, pos.dtype):
             return torch.cat([values["lost"], broad_phase_op.beyond(pos, values)], -1).detach()
         moved = pos - values["origin"]
