@@ -68,7 +68,7 @@ def test_implicit_steps_are_the_same_for_any_batch(batch, loop, monkeypatch):
     assert_same(monkeypatch, built, 1e-9)
 
 
-@pytest.mark.parametrize("numerical_damping", [0.0, 0.1])
+@pytest.mark.parametrize("ahead", [0.0, 0.1])
 def test_drag_of_hinges_and_steps_that_look_ahead_are_the_same(ahead, monkeypatch):
     built = make(
         ropes((3,), F64, loop=False),

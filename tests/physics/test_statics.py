@@ -73,7 +73,7 @@ def weighted(n_edges: int, gamma: float) -> tuple[Statics, State]:
 OWN_WEIGHT = [(0.1, 0.01250, 0.99991), (1.0, 0.12347, 0.99125), (10.0, 0.70020, 0.65635)]
 
 
-@pytest.mark.parametrize(("implicit_weight", "drop", "reach"), OWN_WEIGHT)
+@pytest.mark.parametrize(("gamma", "drop", "reach"), OWN_WEIGHT)
 def test_cantilever_under_its_own_weight_lies_on_the_master_curve(gamma, drop, reach):
     # S3 (Romero et al. 2021). 40 edges; gate 0.2 %, plus half a unit of the last digit of the table.
     _, state = weighted(40, gamma)
