@@ -21,6 +21,7 @@ SCRIPTS = [
     "baselines.py",
     "bench_contact.py",
     "bench_coupled.py",
+    "bench_gpu.py",
     "bench_env.py",
     "bench_rod.py",
     "draw_tasks.py",
