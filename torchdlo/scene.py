@@ -382,7 +382,7 @@ def _prepared(inputs: tuple[Params, State, Control]) -> tuple[Params, State, Con
         return tree.detach((params, state, control))
     moving = alike((state.rods, state.reaction, state.bodies, state.material_points), (params, control))
     names = ("rods", "reaction", "bodies", "material_points")
-    fields = dict(zip(names, moving, strict=True)) | tree.detach({"time": state.time, "missed": state.diagnostics})
+    fields = dict(zip(names, moving, strict=True)) | tree.detach({"time": state.time, "diagnostics": state.diagnostics})
     return params, tree.replace(state, **fields), control
 
 

@@ -103,7 +103,8 @@ def substep(
     now = rod.view(topology, params, state, dt)
     loads = effect.total(settings.effects, now, values)
     kick = _kick(settings, now, loads, first, targets)
-    others = [f(loads.get("acceleration", 0.0)) if f else None for f in (predict_free_motion, material_points)]
+    falling = loads.get("acceleration", 0.0)
+    others = [None if f is None else f(falling) for f in (predict_free_motion, material_points)]
     pos, tension, push, contact = _answered(settings, now, loads, values, kick, targets, *others)
     held = list(settings.prescribed_vertices)
     force = (kick.vertex * (pos - kick.drift) / kick.scale - push)[..., held, :]
