@@ -26,11 +26,17 @@ LIFT = SceneDescription(
     bodies=(
         BodySpec("box", (0.5, 0.5, 0.02), pos=(0.2, 0.2, -0.02), motion="fixed"),
         BodySpec(
-            "sphere", (0.03,), pos=(0.2, -0.2, 0.1), motion="kinematic", keys=(Keyframe(0.02, move=(0.0, 0.1, 0.0)),)
+            "sphere",
+            (0.03,),
+            pos=(0.2, -0.2, 0.1),
+            motion="kinematic",
+            keyframes=(Keyframe(0.02, move=(0.0, 0.1, 0.0)),),
         ),
     ),
-    holds=(
-        Attachment(vertices=(0, 1), keys=(Keyframe(0.01, move=(0.0, 0.0, 0.01)), Keyframe(0.02, turn=(0.0, 0.1, 0.0)))),
+    attachments=(
+        Attachment(
+            vertices=(0, 1), keyframes=(Keyframe(0.01, move=(0.0, 0.0, 0.01)), Keyframe(0.02, turn=(0.0, 0.1, 0.0)))
+        ),
         Attachment(vertices=(-1,), rope=1, release=0.0105),
     ),
     duration=0.02,
@@ -100,7 +106,7 @@ def change(*path, to=None, drop=False):
 
 WRONG = {
     "cut": (change("notes", to="x")[:200], r"line 1, column \d+: is not JSON"),
-    "no format": (change("format", drop=True), "torchdlo scene 1"),
+    "no format": (change("format", drop=True), "torchdlo scene 2"),
     "wrong entry": (
         change("ropes", 0, "radios", to=1.0),
         r"ropes\[0\].radios: there is no such entry; did you mean 'radius'",
@@ -124,9 +130,9 @@ WRONG = {
     "effect's vector": (change("effects", "gravity", to={"acceleration": [1, 2]}), "expected a list of 3 numbers"),
     "list": (change("ropes", to={}), "ropes: expected a list"),
     "object": (change("ropes", 0, to=3), r"ropes\[0\]: expected an object"),
-    "vertex": (change("holds", 0, "vertices", to=[99]), r"holds\[0\].vertices: expected -9 to 8, given 99"),
-    "rope": (change("holds", 1, "rope", to=7), r"holds\[1\].rope: expected 0 to 1, given 7"),
-    "nothing held": (change("holds", 1, "vertices", to=[]), r"holds\[1\].vertices: is empty"),
+    "vertex": (change("attachments", 0, "vertices", to=[99]), r"attachments\[0\].vertices: expected -9 to 8, given 99"),
+    "rope": (change("attachments", 1, "rope", to=7), r"attachments\[1\].rope: expected 0 to 1, given 7"),
+    "nothing held": (change("attachments", 1, "vertices", to=[]), r"attachments\[1\].vertices: is empty"),
     "physics": (change("ropes", 0, "mass", to=-1.0), "mass"),
     "step": (change("dt", to=0.0), "dt is 0"),
 }
@@ -159,13 +165,13 @@ def file(tmp_path):
     path = tmp_path / "hang.json"
     rope = RopeSpec(points=((0.0, 0.0, 0.5), (0.4, 0.0, 0.5)), vertices=6, mass=0.03, bend=1e-3)
     scene_files.save(
-        SceneDescription((rope,), {"gravity": {}, "bend": {}}, holds=(Attachment((0,)),), duration=0.03), path
+        SceneDescription((rope,), {"gravity": {}, "bend": {}}, attachments=(Attachment((0,)),), duration=0.03), path
     )
     return path
 
 
 def test_the_command_keeps_frames_and_a_picture(file, tmp_path, capsys):
-    assert simulate(file, "--out", tmp_path / "run", "--every", 10, "--json") == 0
+    assert simulate(file, "--out", tmp_path / "run", "--frame-stride", 10, "--json") == 0
     summary = json.loads(capsys.readouterr().out)
     assert summary["frames"] == 4 and summary["time"] == pytest.approx(0.03)
     kept = np.load(tmp_path / "run" / "frames.npz")
@@ -197,7 +203,7 @@ def test_the_command_draws_a_picture_and_a_video(file, tmp_path, capsys):
 
 
 def test_ctrl_c_keeps_frames_so_far(file, tmp_path, monkeypatch):
-    from torchdlo.cli import commands
+    from torchdlo.cli import scenes as commands
 
     @contextlib.contextmanager
     def impatient(show):
