@@ -248,3 +248,45 @@ def test_the_example_of_the_documentation_runs(repository, tmp_path, monkeypatch
     exec(text.split("```python\n")[1].split("```")[0], found)
     assert found["controls"].pos.shape == (600, 3, 3)
     assert scene_files.read("lift.json") == found["lift"]
+
+
+OLD = """{
+ "format": "torchdlo scene 1",
+ "ropes": [{"points": [[0, 0, 0.5], [0.4, 0, 0.5]], "vertices": 6, "mass": 0.03, 
+  "weights": [{"vertex": -1, "mass": 1}]}],
+ "effects": {"gravity": {}, "rod_matter": {"mu": 0.1}, "body_matter": {}},
+ "robots": [{"base": [-0.5, 0, 0], "keys": [{"time": 0.6, "move": [0, 0, -0.145]}]}],
+ "bodies": [{"shape": "sphere", "size": [0.1], "motion": "kinematic", "keys": [{"time": 1, "turn": [0, 0, 1]}]}],
+ "matter": [{"law": "sand", "size": [0.1], "spacing": 0.02, "shape": "ball", "numbers": {"youngs": 1e4}}],
+ "box": {"low": [-1, -1, -1], "high": [1, 1, 1], "spacing": 0.1},
+ "holds": [{"vertices": [2], "robot": 0, "close": 0.6}],
+ "look": [1, 0, 0.5]
+}"""
+"""A file as version 0.1 wrote it, with every entry that has another name today."""
+
+
+def test_files_of_version_1_are_read():
+    found = scene_files.parse(OLD)
+    assert found.attachments == (Attachment((2,), robot=0, close=0.6),)
+    assert found.robots[0].keyframes == (Keyframe(0.6, move=(0.0, 0.0, -0.145)),)
+    assert found.bodies[0].keyframes == (Keyframe(1.0, turn=(0.0, 0.0, 1.0)),)
+    assert list(found.effects) == ["gravity", "rod_mpm_coupling", "body_mpm_coupling"]
+    assert found.material_points[0].constitutive_model == "sand"
+    assert found.material_points[0].parameters == {"youngs": 1e4}
+    assert found.camera_direction == (1.0, 0.0, 0.5) and found.ropes[0].point_masses[0].mass == 1.0
+    # What is written again is of today.
+    assert scene_files.parse(scene_files.text(found)) == found and '"torchdlo scene 2"' in scene_files.text(found)
+    # An entry of today does not belong into a file of then, nor the other way round.
+    with pytest.raises(InputError, match="there is no such entry"):
+        scene_files.parse(OLD.replace("scene 1", "scene 2"))
+
+
+def test_frames_of_version_0_1_are_read(file, tmp_path):
+    from torchdlo.scene_files.run import load_frames
+
+    assert simulate(file, "--out", tmp_path / "run") == 0
+    older = {"material_points": "matter", "constitutive_model": "law", "camera_direction": "look"}
+    with np.load(tmp_path / "run" / "frames.npz") as kept:
+        np.savez(tmp_path / "old.npz", **{older.get(name, name): kept[name] for name in kept.files})
+    now, then = load_frames(tmp_path / "run"), load_frames(tmp_path / "old.npz")
+    assert np.array_equal(now.camera_direction, then.camera_direction) and np.array_equal(now.pos, then.pos)
