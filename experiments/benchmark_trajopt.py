@@ -209,7 +209,7 @@ def side_by_side(args: Any) -> None:
     common += ["--again"] if args.again else []
     for name in ("surrogate_share", "minutes"):
         value = getattr(args, name)
-        common += [] if value is None else [f"--{name}", str(value)]
+        common += [] if value is None else [f"--{name.replace('_', '-')}", str(value)]
 
     def one(task: str) -> None:
         file = Path(args.out) / f"{task}.log"
@@ -249,9 +249,9 @@ def arguments(words: list[str] | None = None) -> Any:
     parser.add_argument("--episodes", type=int, default=0, help="budget; default: the published one of each task")
     parser.add_argument("--population", type=int, default=0, help="default: that of each method")
     parser.add_argument(
-        "--rehearsed",
+        "--surrogate-share",
         type=float,
-        help="share of the iterations that all methods play in the task's rehearsal; default: that of each method",
+        help="share of the iterations that all methods play in the surrogate task; default: that of each method",
     )
     parser.add_argument("--minutes", type=float, help="time for the searches of a task; default: as long as it takes")
     parser.add_argument("--out", help="folder; default: runs/trajopt, with --smoke runs/smoke")

@@ -40,13 +40,13 @@ def net(quick: bool) -> SceneDescription:
             "rod_contact": {"mu_s": 0.3, "mu_k": 0.3},
             "rod_mpm_coupling": {},
         },
-        holds=tuple(Attachment((0, -1), rope=k) for k in range(len(ropes))),
+        attachments=tuple(Attachment((0, -1), rope=k) for k in range(len(ropes))),
         material_points=(ball,),
         box=GridSpec(low, high, 0.01, ("open",) * 6, window=(16, 16, 16)),
         duration=0.25,
         substeps=5,
         precision="float32",
-        look=(0.6, -1.0, 0.45),
+        camera_direction=(0.6, -1.0, 0.45),
     )
 
 
@@ -71,7 +71,7 @@ def pour(quick: bool) -> SceneDescription:
 
     step = 0.008 if quick else 0.006
     water = {"bulk": 2e4, "viscosity": 0.05}
-    pool = ParticleBlockSpec("liquid", (0.1, 0.1, 0.025), step, "box", (0.0, 0.0, 0.025), numbers=water)
+    pool = ParticleBlockSpec("liquid", (0.1, 0.1, 0.025), step, "box", (0.0, 0.0, 0.025), parameters=water)
     jet = ParticleBlockSpec("liquid", (0.02, 0.02, 0.03), step, "box", (0.0, 0.0, 0.125), (0.0, 0.0, -0.5), water)
     ring = circle(32, 0.05, (0.0, 0.0, 0.058))
     return SceneDescription(
@@ -82,7 +82,7 @@ def pour(quick: bool) -> SceneDescription:
         duration=0.5,
         substeps=3,
         precision="float32",
-        look=(0.5, -1.0, 0.6),
+        camera_direction=(0.5, -1.0, 0.6),
     )
 
 
@@ -117,18 +117,18 @@ def sand(quick: bool) -> SceneDescription:
         0.0065 if quick else 0.005,
         "box",
         (0.0, 0.0, 0.14),
-        numbers={"youngs": 3e4, "density": 1600.0},
+        parameters={"youngs": 3e4, "density": 1600.0},
     )
     return SceneDescription(
         ropes=(RopeSpec(line, vertices=count, radius=6e-3, density=1000.0, bend=1e-4),),
         effects={"gravity": {}, "bend": {}, "damping": {"rate": 2.0}, "rod_mpm_coupling": {"mu": 0.5}},
-        holds=(Attachment((0, -1)),),
+        attachments=(Attachment((0, -1)),),
         material_points=(heap,),
         box=GridSpec((-0.14, -0.07, 0.0), (0.14, 0.07, 0.18), 0.01),
         duration=0.4,
         substeps=3,
         precision="float32",
-        look=(0.4, -1.0, 0.35),
+        camera_direction=(0.4, -1.0, 0.35),
     )
 
 

@@ -24,7 +24,7 @@ class Show:
     scene: Callable[[bool], SceneDescription]
     """The scene; True asks for a coarse one."""
     claims: Callable[[Frames, SceneDescription], Claims]
-    every: int = 10
+    frame_stride: int = 10
     moments: tuple[float, ...] | None = None
     """Moments in the picture [s]; start, middle and end if not given."""
 

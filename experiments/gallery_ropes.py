@@ -37,12 +37,12 @@ def knot(quick: bool) -> SceneDescription:
     return SceneDescription(
         ropes=(rope,),
         effects={"bend": {}, "damping": {"rate": 8.0}, "rod_contact": {"mu_s": 0.2, "mu_k": 0.2, "burst": 2.0}},
-        holds=tuple(
-            Attachment((end,), keys=(Keyframe(0.6, move=(sign * far, 0, 0)),)) for end, sign in ((0, -1), (-1, 1))
+        attachments=tuple(
+            Attachment((end,), keyframes=(Keyframe(0.6, move=(sign * far, 0, 0)),)) for end, sign in ((0, -1), (-1, 1))
         ),
         duration=0.7,
         substeps=4,
-        look=(0.15, -1.0, 0.5),
+        camera_direction=(0.15, -1.0, 0.5),
     )
 
 
@@ -73,10 +73,10 @@ def chain(quick: bool) -> SceneDescription:
     return SceneDescription(
         ropes=(RopeSpec(upper, **given), RopeSpec(lower, **given)),
         effects={"gravity": {}, "bend_frame": {}, "damping": {"rate": 2.0}, "rod_contact": {"mu_s": 0.2, "mu_k": 0.2}},
-        holds=(Attachment((0,)),),
+        attachments=(Attachment((0,)),),
         duration=0.6,
         substeps=8,
-        look=(0.9, -1.0, 0.3),
+        camera_direction=(0.9, -1.0, 0.3),
     )
 
 
@@ -111,7 +111,11 @@ def gripper(quick: bool) -> SceneDescription:
         pos=(0.0, 0.0, 0.16),
         # Its pads are across the rope.
         quat=(0.0, math.sqrt(0.5), math.sqrt(0.5), 0.0),
-        keys=(Keyframe(0.6, move=(0, 0, -0.154)), Keyframe(0.8, move=(0, 0, -0.154)), Keyframe(2.0, move=(0, 0, 0.06))),
+        keyframes=(
+            Keyframe(0.6, move=(0, 0, -0.154)),
+            Keyframe(0.8, move=(0, 0, -0.154)),
+            Keyframe(2.0, move=(0, 0, 0.06)),
+        ),
     )
     return SceneDescription(
         ropes=(RopeSpec(((0.0, -0.35, 0.006), (0.0, 0.35, 0.006)), vertices=count, radius=6e-3, mass=0.08, bend=2e-3),),
@@ -123,12 +127,12 @@ def gripper(quick: bool) -> SceneDescription:
             "table_friction": {"mu": 0.4, "height": 0.0},
         },
         robots=(arm,),
-        holds=(Attachment((middle - 1, middle, middle + 1), robot=0, close=0.7),),
+        attachments=(Attachment((middle - 1, middle, middle + 1), robot=0, close=0.7),),
         duration=2.2,
         dt=2e-3,
         substeps=1,
         integrator="implicit",
-        look=(0.9, -0.75, 0.45),
+        camera_direction=(0.9, -0.75, 0.45),
     )
 
 
@@ -157,7 +161,7 @@ def gripper_claims(frames: Frames, d: SceneDescription) -> Claims:
 
 def pulley(quick: bool) -> SceneDescription:
     """A smooth rope over a smooth pulley, with 40 g on one side and 60 g on the other."""
-    from torchdlo.scene_files import BodySpec, HangingMass, RopeSpec, SceneDescription
+    from torchdlo.scene_files import BodySpec, PointMass, RopeSpec, SceneDescription
 
     radius, r, side, count = 0.05, 3e-3, 0.2, 48 if quick else 56
     edge = (2 * side + math.pi * (radius + r)) / count
@@ -166,15 +170,15 @@ def pulley(quick: bool) -> SceneDescription:
     angles = [math.pi * k / 64 for k in range(65)]
     top = [(-wide * math.cos(a), 0.0, wide * math.sin(a)) for a in angles]
     points = ((-wide, 0.0, -side), *top, (wide, 0.0, -side))
-    weights = (HangingMass(0, 0.04), HangingMass(-1, 0.06))
+    weights = (PointMass(0, 0.04), PointMass(-1, 0.06))
     half = math.sqrt(0.5)
     return SceneDescription(
-        ropes=(RopeSpec(points, vertices=count, radius=r, mass=0.02, bend=1e-4, weights=weights),),
+        ropes=(RopeSpec(points, vertices=count, radius=r, mass=0.02, bend=1e-4, point_masses=weights),),
         effects={"gravity": {}, "bend": {}, "rod_body": {}},
         bodies=(BodySpec("cylinder", (radius, 0.03), quat=(half, half, 0.0, 0.0), motion="fixed", mu_s=0.0, mu_k=0.0),),
         duration=0.3,
         substeps=4,
-        look=(0.35, -1.0, 0.15),
+        camera_direction=(0.35, -1.0, 0.15),
     )
 
 
@@ -225,13 +229,13 @@ def wire(quick: bool) -> SceneDescription:
             "rod_body": {},
         },
         bodies=(BodySpec("cylinder", (0.02, 0.03), quat=(half, half, 0.0, 0.0), motion="fixed"),),
-        holds=(
-            Attachment((0,), keys=way, path="linear", release=0.6),
-            Attachment((-1,), keys=other, path="linear", release=0.6),
+        attachments=(
+            Attachment((0,), keyframes=way, path="linear", release=0.6),
+            Attachment((-1,), keyframes=other, path="linear", release=0.6),
         ),
         duration=1.0,
         substeps=6,
-        look=(0.35, -1.0, 0.3),
+        camera_direction=(0.35, -1.0, 0.3),
     )
 
 
@@ -267,7 +271,7 @@ def band(quick: bool) -> SceneDescription:
             motion="kinematic",
             mu_s=0.05,
             mu_k=0.05,
-            keys=(Keyframe(0.5, move=(at[0], at[1], 0.0)),),
+            keyframes=(Keyframe(0.5, move=(at[0], at[1], 0.0)),),
         )
         for at in corners
     )
@@ -280,7 +284,7 @@ def band(quick: bool) -> SceneDescription:
         bodies=bodies,
         duration=0.7,
         substeps=4,
-        look=(0.3, -0.8, 1.0),
+        camera_direction=(0.3, -0.8, 1.0),
     )
 
 

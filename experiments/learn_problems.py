@@ -85,12 +85,12 @@ class Problem:
 
 def movers(d: SceneDescription) -> list[Any]:
     """Return the parts whose keys are learned."""
-    return [part for part in (*d.holds, *d.bodies) if part.keys]
+    return [part for part in (*d.attachments, *d.bodies) if part.keyframes]
 
 
 def first_keys(d: SceneDescription) -> Tensor:
     """Return what keys say, in the units in which it is learned, shape (parts, keys, 6)."""
-    rows = [[(*k.move, *k.turn) for k in part.keys] for part in movers(d)]
+    rows = [[(*k.move, *k.turn) for k in part.keyframes] for part in movers(d)]
     return torch.tensor(rows, dtype=torch.float64) / torch.tensor([LENGTH] * 3 + [1.0] * 3, dtype=torch.float64)
 
 
@@ -100,11 +100,11 @@ def described(problem: Problem, keys: Tensor) -> SceneDescription:
     rows = iter((keys * keys.new_tensor([LENGTH] * 3 + [1.0] * 3)).tolist())
 
     def with_keys(part: Any) -> Any:
-        made = (Keyframe(k.time, tuple(r[:3]), tuple(r[3:])) for k, r in zip(part.keys, next(rows), strict=True))
-        return dataclasses.replace(part, keys=tuple(made))
+        made = (Keyframe(k.time, tuple(r[:3]), tuple(r[3:])) for k, r in zip(part.keyframes, next(rows), strict=True))
+        return dataclasses.replace(part, keyframes=tuple(made))
 
-    holds, bodies = (tuple(with_keys(x) if x.keys else x for x in parts) for parts in (d.holds, d.bodies))
-    return dataclasses.replace(d, holds=holds, bodies=bodies)
+    holds, bodies = (tuple(with_keys(x) if x.keyframes else x for x in parts) for parts in (d.attachments, d.bodies))
+    return dataclasses.replace(d, attachments=holds, bodies=bodies)
 
 
 def controls(d: SceneDescription, made: scene_files.Simulation, keys: Tensor) -> scene.Control:
@@ -114,15 +114,15 @@ def controls(d: SceneDescription, made: scene_files.Simulation, keys: Tensor) ->
     """
     plain = made.plan.controls
     time = torch.arange(1, len(plain.pos) + 1, dtype=keys.dtype) * d.dt
-    at = keys.new_tensor([0.0, *(k.time for k in movers(d)[0].keys)])
+    at = keys.new_tensor([0.0, *(k.time for k in movers(d)[0].keyframes)])
     rows = torch.cat([torch.zeros_like(keys[:, :1]), keys], 1) * keys.new_tensor([LENGTH] * 3 + [1.0] * 3)
     last = (torch.searchsorted(at, time, right=True) - 1).clamp(max=len(at) - 2)
     s = ((time - at[last]) / (at[last + 1] - at[last])).clamp(0, 1)[:, None]
     moved = rows[:, last] + s**3 * (10 - 15 * s + 6 * s**2) * (rows[:, last + 1] - rows[:, last])
     still = scene.stationary_control(made.scene, made.state)
-    owner = [k for k, h in enumerate(d.holds) for _ in h.vertices if h.keys]
+    owner = [k for k, h in enumerate(d.attachments) for _ in h.vertices if h.keyframes]
     pos = still.pos + moved[owner, :, :3].transpose(0, 1) if owner else plain.pos
-    body = moved[sum(bool(h.keys) for h in d.holds) :].transpose(0, 1)
+    body = moved[sum(bool(h.keyframes) for h in d.attachments) :].transpose(0, 1)
     targets = BodyTargets(still.bodies.pos + body[..., :3], multiply(turn_by(body[..., 3:]), still.bodies.quat))
     return tree.replace(plain, pos=pos, bodies=targets)
 
@@ -249,7 +249,7 @@ def _held(rope: RopeSpec, hands: tuple[Keyframe, ...], **others: Any) -> SceneDe
     return SceneDescription(
         ropes=(rope,),
         effects=effects | {"damping": {"rate": 1.0}},
-        holds=(Attachment((0,), keys=hands), Attachment((-1,), keys=hands)),
+        attachments=(Attachment((0,), keyframes=hands), Attachment((-1,), keyframes=hands)),
         duration=0.4,
         dt=2e-3,
         substeps=1,
@@ -271,7 +271,7 @@ def push() -> SceneDescription:
             BodySpec("sphere", (0.03,), (0.0, 0.0, 0.03), density=300.0, damping=1.0, name="ball"),
             BodySpec("plane", motion="fixed"),
         ),
-        look=(0.35, -0.6, 0.7),
+        camera_direction=(0.35, -0.6, 0.7),
     )
 
 
@@ -300,7 +300,7 @@ def hook() -> SceneDescription:
             ),
             BodySpec("plane", motion="fixed"),
         ),
-        look=(0.8, -0.6, 0.35),
+        camera_direction=(0.8, -0.6, 0.35),
     )
 
 
@@ -323,7 +323,7 @@ def pour() -> SceneDescription:
     keys = tuple(Keyframe(t, (0.0, 0.0, 0.0), (0.0, 2.0 * t, 0.0)) for t in (0.15, 0.3, 0.4))
     numbers = {"youngs": 5e3, "density": 1000.0}
     heap = ParticleBlockSpec(
-        "sand", (0.03, across / 2, 0.0125), 0.00625, "box", (0.0, across / 2, 0.131), numbers=numbers
+        "sand", (0.03, across / 2, 0.0125), 0.00625, "box", (0.0, across / 2, 0.131), parameters=numbers
     )
     return SceneDescription(
         ropes=(
@@ -333,9 +333,9 @@ def pour() -> SceneDescription:
         ),
         effects={"gravity": {}, "body_mpm_coupling": {"room": 300}},
         bodies=(
-            BodySpec("box", (0.05, 0.05, 0.0125), (0.0, across / 2, 0.1), motion="kinematic", keys=keys, mu_k=0.1),
+            BodySpec("box", (0.05, 0.05, 0.0125), (0.0, across / 2, 0.1), motion="kinematic", keyframes=keys, mu_k=0.1),
         ),
-        holds=(Attachment((0, 1, 2)),),
+        attachments=(Attachment((0, 1, 2)),),
         material_points=(heap,),
         box=GridSpec(
             (-0.15, 0.0, 0.0), (0.35, across, 0.225), 0.0125, ("separate",) * 2 + ("slip",) * 2 + ("separate",) * 2
@@ -343,7 +343,7 @@ def pour() -> SceneDescription:
         duration=0.5,
         dt=2e-3,
         substeps=1,
-        look=(0.1, -1.0, 0.25),
+        camera_direction=(0.1, -1.0, 0.25),
     )
 
 

@@ -45,11 +45,11 @@ def one(name: str, args: Any, out: Path) -> dict[str, Any]:
     with progress() as callback:
         cut = learn(problem, cut=True, callback=lambda *said: callback(f"{name}, cut", *said), **choices)
         found = learn(problem, cut=False, callback=lambda *said: callback(name, *said), **choices)
-        description = described(problem, found.keys)
+        description = described(problem, found.keyframes)
         scene_files.save(description, out / "scene.json")
-        frames = run(scene_files.read(out / "scene.json"), every=5)
+        frames = run(scene_files.read(out / "scene.json"), frame_stride=5)
     save_frames(frames, out / "frames.npz", description)
-    (first, _), (value, solved) = measured(problem, run(problem.scene(), every=5)), measured(problem, frames)
+    (first, _), (value, solved) = measured(problem, run(problem.scene(), frame_stride=5)), measured(problem, frames)
     if args.pictures:
         from torchdlo.report.render.picture import stills_png
 

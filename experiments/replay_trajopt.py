@@ -1,8 +1,8 @@
 """Play trajectories that were found once more, and put what they earn now beside what they earned.
 
-Every `trajectory.json` in the subfolders of --out is played alone, with the precision and the kind of steps with which
-it was found. On the machine and with the versions of the search every bit comes back; what changes with others shows
-how far a result rests on rounding.
+Every trajectory of the archive of --out, or of its subfolders, is played alone, with the precision and the kind of steps
+with which it was found. On the machine and with the versions of the search every bit comes back; what changes with
+others shows how far a result rests on rounding.
 """
 
 from __future__ import annotations
@@ -27,15 +27,25 @@ STEPS = ("double", "compiled", "recorded")
 """Choices of a problem that change how numbers are rounded."""
 
 
-def replay(file: Path, make: Callable[..., Any]) -> dict[str, Any]:
-    """Play a trajectory in the problem that `make(task, **choices)` returns, and return how that went."""
-    from torchdlo.agents.trajopt.result import load_actions, plain
+def trajectories(out: Path) -> dict[str, dict[str, Any]]:
+    """Return the contents of all trajectories below a folder, by the names of their searches."""
+    from torchdlo.agents.trajopt.stored import NAME, read_searches
 
-    had = json.loads(file.read_text(encoding="utf-8"))
+    found = {name: content for name, _, content in read_searches(out / NAME)} if (out / NAME).is_file() else {}
+    loose = sorted(out.glob("*/trajectory.json"))
+    return found | {file.parent.name: json.loads(file.read_text(encoding="utf-8")) for file in loose}
+
+
+def replay(name: str, had: dict[str, Any], make: Callable[..., Any]) -> dict[str, Any]:
+    """Play a trajectory in the problem that `make(task, **choices)` returns, and return how that went."""
+    import torch
+
+    from torchdlo.agents.trajopt.result import plain
+
     problem = make(had["task"], **{name: had["choices"][name] for name in STEPS if name in had["choices"]})
-    outcome, kept = problem.record(load_actions(file, problem))
+    outcome, kept = problem.record(torch.as_tensor(had["actions"], dtype=torch.float64))
     now = plain(outcome)
-    row = {"search": file.parent.name, "missed": kept.get("missed", "")}
+    row = {"search": name, "missed": kept.get("missed", "")}
     return row | {name: [had[name], now[name]] for name in ("return", "success")}
 
 
@@ -53,20 +63,20 @@ def main() -> None:
 
     parser = Parser("replay_trajopt.py", description=__doc__, epilog=EXAMPLES)
     parser.add_argument("--out", default="experiments/trajopt", help="folder of the searches; default: %(default)s")
-    parser.add_argument("--searches", default="", help="names of its subfolders, separated by commas; default: all")
+    parser.add_argument("--searches", default="", help="names of searches, separated by commas; default: all")
     parser.add_argument("--json", default="", help="file for the rows")
     args = parser.parse_args()
-    files = sorted(Path(args.out).glob("*/trajectory.json"))
+    found = trajectories(Path(args.out))
     wanted = [name for name in args.searches.split(",") if name]
-    wrong = sorted(set(wanted) - {file.parent.name for file in files})
-    if wrong or not files:
+    wrong = sorted(set(wanted) - set(found))
+    if wrong or not found:
         sys.exit(
             f"error: {args.out}: expected the trajectories {', '.join(wrong) or 'of searches'}, found none of them."
         )
     rows, make = [], functools.cache(problem)
-    for file in files:
-        if not wanted or file.parent.name in wanted:
-            rows.append(replay(file, make))
+    for name, content in found.items():
+        if not wanted or name in wanted:
+            rows.append(replay(name, content, make))
             print(shown(rows[-1]), flush=True)
             save(args.json, {"generator": "torchdlo replay_trajopt", "rows": rows})
     before, now = (sum(row["success"][k] for row in rows) for k in (0, 1))

@@ -19,8 +19,15 @@ def earlier(result: dict[str, Any]) -> bool:
 
 def finished(task: str, method: str, out: Path) -> list[dict[str, Any]]:
     """All results of a task by a method that are there, of any settings, by seed."""
-    found = [json.loads(file.read_text()) for file in out.glob(f"{task}-{method}-*/result.json")]
-    return sorted(found, key=lambda run: run["settings"]["seed"])
+    from torchdlo.agents.trajopt.result import upgraded
+    from torchdlo.agents.trajopt.stored import NAME, read_searches
+
+    found, archive, start = {}, out / NAME, f"{task}-{method}-"
+    if archive.is_file():
+        found = {name: result for name, result, _ in read_searches(archive) if name.startswith(start)}
+    # What was searched since the archive was written counts more.
+    found |= {file.parent.name: upgraded(json.loads(file.read_text())) for file in out.glob(f"{start}*/result.json")}
+    return sorted(found.values(), key=lambda run: run["settings"]["seed"])
 
 
 def seen(runs: list[dict[str, Any]], episodes: float) -> float | None:
@@ -53,7 +60,7 @@ def row(task: str, method: str, runs: list[dict[str, Any]], hybrid: list[dict[st
         "published_episodes": None if goal is None else preset(task, known).episodes,
         "success": statistics.mean(float(r["success"]) for r in runs),
         "episodes": episodes,
-        "solved_after": [r["solved_after"] for r in runs],
+        "episodes_to_success": [r["episodes_to_success"] for r in runs],
         "seconds": statistics.mean(r["seconds"] for r in runs),
         "earlier": any(earlier(r) for r in runs),
         "missed": any(r.get("missed") for r in runs),

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from tests.fake_calibration import FakeFit
-from torchdlo.cli import app
+from torchdlo.cli import app, identification
 from torchdlo.cli.progress import deferred_interrupt
 from torchdlo.files import replacing
 
@@ -111,7 +111,7 @@ def test_options_reach_the_fit(folder: Path, fit: FakeFit) -> None:
     }
     run("calibrate", folder, "--quick", "--starts", 3)
     assert fit.options["starts"] == 3
-    assert fit.options["iterations"] == app._QUICK["iterations"]
+    assert fit.options["iterations"] == identification._QUICK["iterations"]
 
 
 def test_out_may_be_a_folder(folder: Path, fit: FakeFit) -> None:

@@ -26,11 +26,17 @@ LIFT = SceneDescription(
     bodies=(
         BodySpec("box", (0.5, 0.5, 0.02), pos=(0.2, 0.2, -0.02), motion="fixed"),
         BodySpec(
-            "sphere", (0.03,), pos=(0.2, -0.2, 0.1), motion="kinematic", keys=(Keyframe(0.02, move=(0.0, 0.1, 0.0)),)
+            "sphere",
+            (0.03,),
+            pos=(0.2, -0.2, 0.1),
+            motion="kinematic",
+            keyframes=(Keyframe(0.02, move=(0.0, 0.1, 0.0)),),
         ),
     ),
-    holds=(
-        Attachment(vertices=(0, 1), keys=(Keyframe(0.01, move=(0.0, 0.0, 0.01)), Keyframe(0.02, turn=(0.0, 0.1, 0.0)))),
+    attachments=(
+        Attachment(
+            vertices=(0, 1), keyframes=(Keyframe(0.01, move=(0.0, 0.0, 0.01)), Keyframe(0.02, turn=(0.0, 0.1, 0.0)))
+        ),
         Attachment(vertices=(-1,), rope=1, release=0.0105),
     ),
     duration=0.02,
@@ -100,7 +106,7 @@ def change(*path, to=None, drop=False):
 
 WRONG = {
     "cut": (change("notes", to="x")[:200], r"line 1, column \d+: is not JSON"),
-    "no format": (change("format", drop=True), "torchdlo scene 1"),
+    "no format": (change("format", drop=True), "torchdlo scene 2"),
     "wrong entry": (
         change("ropes", 0, "radios", to=1.0),
         r"ropes\[0\].radios: there is no such entry; did you mean 'radius'",
@@ -124,9 +130,9 @@ WRONG = {
     "effect's vector": (change("effects", "gravity", to={"acceleration": [1, 2]}), "expected a list of 3 numbers"),
     "list": (change("ropes", to={}), "ropes: expected a list"),
     "object": (change("ropes", 0, to=3), r"ropes\[0\]: expected an object"),
-    "vertex": (change("holds", 0, "vertices", to=[99]), r"holds\[0\].vertices: expected -9 to 8, given 99"),
-    "rope": (change("holds", 1, "rope", to=7), r"holds\[1\].rope: expected 0 to 1, given 7"),
-    "nothing held": (change("holds", 1, "vertices", to=[]), r"holds\[1\].vertices: is empty"),
+    "vertex": (change("attachments", 0, "vertices", to=[99]), r"attachments\[0\].vertices: expected -9 to 8, given 99"),
+    "rope": (change("attachments", 1, "rope", to=7), r"attachments\[1\].rope: expected 0 to 1, given 7"),
+    "nothing held": (change("attachments", 1, "vertices", to=[]), r"attachments\[1\].vertices: is empty"),
     "physics": (change("ropes", 0, "mass", to=-1.0), "mass"),
     "step": (change("dt", to=0.0), "dt is 0"),
 }
@@ -159,13 +165,13 @@ def file(tmp_path):
     path = tmp_path / "hang.json"
     rope = RopeSpec(points=((0.0, 0.0, 0.5), (0.4, 0.0, 0.5)), vertices=6, mass=0.03, bend=1e-3)
     scene_files.save(
-        SceneDescription((rope,), {"gravity": {}, "bend": {}}, holds=(Attachment((0,)),), duration=0.03), path
+        SceneDescription((rope,), {"gravity": {}, "bend": {}}, attachments=(Attachment((0,)),), duration=0.03), path
     )
     return path
 
 
 def test_the_command_keeps_frames_and_a_picture(file, tmp_path, capsys):
-    assert simulate(file, "--out", tmp_path / "run", "--every", 10, "--json") == 0
+    assert simulate(file, "--out", tmp_path / "run", "--frame-stride", 10, "--json") == 0
     summary = json.loads(capsys.readouterr().out)
     assert summary["frames"] == 4 and summary["time"] == pytest.approx(0.03)
     kept = np.load(tmp_path / "run" / "frames.npz")
@@ -197,7 +203,7 @@ def test_the_command_draws_a_picture_and_a_video(file, tmp_path, capsys):
 
 
 def test_ctrl_c_keeps_frames_so_far(file, tmp_path, monkeypatch):
-    from torchdlo.cli import commands
+    from torchdlo.cli import scenes as commands
 
     @contextlib.contextmanager
     def impatient(show):
@@ -242,3 +248,45 @@ def test_the_example_of_the_documentation_runs(repository, tmp_path, monkeypatch
     exec(text.split("```python\n")[1].split("```")[0], found)
     assert found["controls"].pos.shape == (600, 3, 3)
     assert scene_files.read("lift.json") == found["lift"]
+
+
+OLD = """{
+ "format": "torchdlo scene 1",
+ "ropes": [{"points": [[0, 0, 0.5], [0.4, 0, 0.5]], "vertices": 6, "mass": 0.03, 
+  "weights": [{"vertex": -1, "mass": 1}]}],
+ "effects": {"gravity": {}, "rod_matter": {"mu": 0.1}, "body_matter": {}},
+ "robots": [{"base": [-0.5, 0, 0], "keys": [{"time": 0.6, "move": [0, 0, -0.145]}]}],
+ "bodies": [{"shape": "sphere", "size": [0.1], "motion": "kinematic", "keys": [{"time": 1, "turn": [0, 0, 1]}]}],
+ "matter": [{"law": "sand", "size": [0.1], "spacing": 0.02, "shape": "ball", "numbers": {"youngs": 1e4}}],
+ "box": {"low": [-1, -1, -1], "high": [1, 1, 1], "spacing": 0.1},
+ "holds": [{"vertices": [2], "robot": 0, "close": 0.6}],
+ "look": [1, 0, 0.5]
+}"""
+"""A file as version 0.1 wrote it, with every entry that has another name today."""
+
+
+def test_files_of_version_1_are_read():
+    found = scene_files.parse(OLD)
+    assert found.attachments == (Attachment((2,), robot=0, close=0.6),)
+    assert found.robots[0].keyframes == (Keyframe(0.6, move=(0.0, 0.0, -0.145)),)
+    assert found.bodies[0].keyframes == (Keyframe(1.0, turn=(0.0, 0.0, 1.0)),)
+    assert list(found.effects) == ["gravity", "rod_mpm_coupling", "body_mpm_coupling"]
+    assert found.material_points[0].constitutive_model == "sand"
+    assert found.material_points[0].parameters == {"youngs": 1e4}
+    assert found.camera_direction == (1.0, 0.0, 0.5) and found.ropes[0].point_masses[0].mass == 1.0
+    # What is written again is of today.
+    assert scene_files.parse(scene_files.text(found)) == found and '"torchdlo scene 2"' in scene_files.text(found)
+    # An entry of today does not belong into a file of then, nor the other way round.
+    with pytest.raises(InputError, match="there is no such entry"):
+        scene_files.parse(OLD.replace("scene 1", "scene 2"))
+
+
+def test_frames_of_version_0_1_are_read(file, tmp_path):
+    from torchdlo.scene_files.run import load_frames
+
+    assert simulate(file, "--out", tmp_path / "run") == 0
+    older = {"material_points": "matter", "constitutive_model": "law", "camera_direction": "look"}
+    with np.load(tmp_path / "run" / "frames.npz") as kept:
+        np.savez(tmp_path / "old.npz", **{older.get(name, name): kept[name] for name in kept.files})
+    now, then = load_frames(tmp_path / "run"), load_frames(tmp_path / "old.npz")
+    assert np.array_equal(now.camera_direction, then.camera_direction) and np.array_equal(now.pos, then.pos)

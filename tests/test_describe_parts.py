@@ -18,9 +18,9 @@ from torchdlo.scene_files import (
     Attachment,
     BodySpec,
     GridSpec,
-    HangingMass,
     Keyframe,
     ParticleBlockSpec,
+    PointMass,
     RobotSpec,
     RopeSpec,
     SceneDescription,
@@ -55,14 +55,14 @@ def test_bodies_touch_matter_where_the_effect_says_so():
 def test_all_parts_read_back_as_they_were_written(tmp_path):
     whole = SceneDescription(
         (
-            change(LINE, weights=(HangingMass(-1, 1 / 3),)),
+            change(LINE, point_masses=(PointMass(-1, 1 / 3),)),
             RopeSpec(((0.0, 0.0, 0.0), (1.0, 0.0, 0.0)), model="model.json"),
         ),
         {"gravity": {}, "rod_mpm_coupling": {"mu": 0.1}},
         bodies=(BodySpec("mesh", file="cube.stl", scale=0.1 + 0.2, motion="fixed", cells=12),),
-        holds=(Attachment((0,), robot=0, close=0.1, release=0.7),),
-        robots=(RobotSpec(pos=(0.4, 0.0, 0.3), joints=POSTURE, keys=(Keyframe(1.0, move=(0.1, 0.0, 0.0)),)),),
-        material_points=(ParticleBlockSpec("sand", (0.1,), 0.02, "ball", numbers={"youngs": 1e4 / 3}),),
+        attachments=(Attachment((0,), robot=0, close=0.1, release=0.7),),
+        robots=(RobotSpec(pos=(0.4, 0.0, 0.3), joints=POSTURE, keyframes=(Keyframe(1.0, move=(0.1, 0.0, 0.0)),)),),
+        material_points=(ParticleBlockSpec("sand", (0.1,), 0.02, "ball", parameters={"youngs": 1e4 / 3}),),
         box=GridSpec((0.0, 0.0, 0.0), (1.0, 1.0, 1.0), 0.1, ("slip",) * 6, window=(8, 8, 8)),
     )
     scene_files.save(whole, tmp_path / "scene.json")
@@ -92,7 +92,7 @@ def test_a_mesh_stands_where_its_file_says_and_weighs_its_volume(cube, monkeypat
 def test_matter_fills_its_shape(tmp_path):
     parts = (
         ParticleBlockSpec("liquid", (0.1, 0.05, 0.02), 0.01, pos=(0.0, 0.0, 0.1), vel=(1.0, 0.0, 0.0)),
-        ParticleBlockSpec("elastic", (0.03,), 0.01, "ball", (0.0, 0.0, 0.3), numbers={"density": 200.0}),
+        ParticleBlockSpec("elastic", (0.03,), 0.01, "ball", (0.0, 0.0, 0.3), parameters={"density": 200.0}),
     )
     box = GridSpec((-0.2, -0.2, 0.0), (0.2, 0.2, 0.4), 0.02)
     scene, params, state, _ = scene_files.build(change(FALL, material_points=parts, box=box, substeps=5))
@@ -122,14 +122,14 @@ WRONG = {
         r"bodies\[0\].file: only a mesh",
     ),
     "no box": (change(FALL, material_points=(BALL,)), "box: is missing"),
-    "empty box": (change(FALL, box=ROOM), "box: there is no matter in it"),
+    "empty box": (change(FALL, box=ROOM), "box: there are no material points in it"),
     "outside": (
         change(FALL, material_points=(change(BALL, pos=(9.0, 0.0, 0.0)),), box=ROOM),
         "expected all inside the box",
     ),
-    "law's number": (
-        change(FALL, material_points=(change(BALL, numbers={"yongs": 1.0}),), box=ROOM),
-        r"matter\[0\].numbers.yongs: .* did you mean 'youngs'",
+    "model's parameter": (
+        change(FALL, material_points=(change(BALL, parameters={"yongs": 1.0}),), box=ROOM),
+        r"material_points\[0\].parameters.yongs: .* did you mean 'youngs'",
     ),
     "size": (
         change(FALL, material_points=(change(BALL, size=(1.0, 2.0)),), box=ROOM),
@@ -137,22 +137,22 @@ WRONG = {
     ),
     "spacing": (
         change(FALL, material_points=(change(BALL, spacing=0.0),), box=ROOM),
-        r"matter\[0\].spacing: expected more",
+        r"material_points\[0\].spacing: expected more",
     ),
     "weight's place": (
-        change(FALL, ropes=(change(LINE, weights=(HangingMass(7, 1.0),)),)),
+        change(FALL, ropes=(change(LINE, point_masses=(PointMass(7, 1.0),)),)),
         r"vertex: expected -7 to 6",
     ),
     "weight": (
-        change(FALL, ropes=(change(LINE, weights=(HangingMass(0, 0.0),)),)),
-        r"weights\[0\].mass: expected more",
+        change(FALL, ropes=(change(LINE, point_masses=(PointMass(0, 0.0),)),)),
+        r"point_masses\[0\].mass: expected more",
     ),
-    "no robot": (change(FALL, holds=(Attachment((0,), robot=0),)), r"holds\[0\].robot: there is no robot"),
+    "no robot": (change(FALL, attachments=(Attachment((0,), robot=0),)), r"attachments\[0\].robot: there is no robot"),
     "late": (
-        change(FALL, holds=(Attachment((0,), close=0.01),)),
-        r"holds\[0\].close: .* use torchdlo.scene_files.assemble",
+        change(FALL, attachments=(Attachment((0,), close=0.01),)),
+        r"attachments\[0\].close: .* use torchdlo.scene_files.assemble",
     ),
-    "early": (change(FALL, holds=(Attachment((0,), close=-1.0),)), r"close: expected a time from 0 on"),
+    "early": (change(FALL, attachments=(Attachment((0,), close=-1.0),)), r"close: expected a time from 0 on"),
 }
 
 
@@ -168,21 +168,26 @@ def test_wrong_parts_are_refused_with_place_and_expectation(case, tmp_path):
 def test_a_weight_hangs_with_its_weight():
     # The hold bears rope and weight. After many times 1 / rate the swing is gone: exp(-0.5 20 1) of it is left.
     rope = RopeSpec(
-        ((0.0, 0.0, 0.2), (0.0, 0.0, 0.1)), vertices=5, mass=0.01, bend=1e-5, weights=(HangingMass(-1, 0.05),)
+        ((0.0, 0.0, 0.2), (0.0, 0.0, 0.1)), vertices=5, mass=0.01, bend=1e-5, point_masses=(PointMass(-1, 0.05),)
     )
-    still = SceneDescription((rope,), {"gravity": {}, "damping": {"rate": 20.0}, "bend": {}}, holds=(Attachment((0,)),))
+    still = SceneDescription(
+        (rope,), {"gravity": {}, "damping": {"rate": 20.0}, "bend": {}}, attachments=(Attachment((0,)),)
+    )
     frames = run(change(still, duration=0.2))
     assert frames.force[-1, 0, 2] == pytest.approx(0.06 * 9.81, rel=1e-6)
     assert frames.weight.tolist() == [0, 0, 0, 0, 0.05]
 
 
 def test_a_hold_that_closes_later_keeps_what_it_grips_then():
-    free = run(FALL, every=1)
+    free = run(FALL, frame_stride=1)
     held = run(
         change(
-            FALL, holds=(Attachment((0,), close=0.03, keys=(Keyframe(0.06, move=(0.0, 0.0, 0.06)),), path="linear"),)
+            FALL,
+            attachments=(
+                Attachment((0,), close=0.03, keyframes=(Keyframe(0.06, move=(0.0, 0.0, 0.06)),), path="linear"),
+            ),
         ),
-        every=1,
+        frame_stride=1,
     )
     # Open hands change nothing.
     assert np.array_equal(free.pos[:31], held.pos[:31])
@@ -197,14 +202,19 @@ def test_a_hold_that_closes_later_keeps_what_it_grips_then():
 def arm():
     pytest.importorskip("pytorch_kinematics", reason="robots need the extra robots")
     return RobotSpec(
-        base=(-0.5, 0.0, 0.0), joints=POSTURE, pos=(0.0, 0.0, 0.2), keys=(Keyframe(0.4, move=(0.0, 0.05, 0.05)),)
+        base=(-0.5, 0.0, 0.0), joints=POSTURE, pos=(0.0, 0.0, 0.2), keyframes=(Keyframe(0.4, move=(0.0, 0.05, 0.05)),)
     )
 
 
 def test_a_robot_brings_what_it_holds_along_its_keys(arm):
     line = change(LINE, points=((0.0, 0.0, 0.2), (0.0, 0.3, 0.2)))
     lift = SceneDescription(
-        (line,), {"bend": {}, "gravity": {}}, holds=(Attachment((0, 1), robot=0),), robots=(arm,), duration=0.4, dt=4e-3
+        (line,),
+        {"bend": {}, "gravity": {}},
+        attachments=(Attachment((0, 1), robot=0),),
+        robots=(arm,),
+        duration=0.4,
+        dt=4e-3,
     )
     scene, _, state, controls = scene_files.build(lift)
     # Inverse kinematics counts as there within 0.1 mm.
@@ -220,9 +230,9 @@ def test_a_robot_brings_what_it_holds_along_its_keys(arm):
 
 
 ARMS = {
-    "far": ({"keys": (Keyframe(0.4, move=(0.0, 0.0, 2.0)),)}, r"robots\[0\].keys: the tool cannot get there"),
+    "far": ({"keyframes": (Keyframe(0.4, move=(0.0, 0.0, 2.0)),)}, r"robots\[0\].keyframes: the tool cannot get there"),
     "start": ({"pos": (3.0, 0.0, 0.0)}, r"robots\[0\].pos: the tool cannot get there"),
-    "fast": ({"keys": (Keyframe(0.02, move=(0.0, 0.1, 0.0)),)}, r"would have to move at .* it can at most"),
+    "fast": ({"keyframes": (Keyframe(0.02, move=(0.0, 0.1, 0.0)),)}, r"would have to move at .* it can at most"),
     "joints": ({"joints": (0.0,)}, r"robots\[0\].joints: expected 8 numbers"),
     "file": ({"urdf": "no.urdf"}, "no.urdf: expected a URDF file, found none"),
 }
@@ -236,7 +246,7 @@ def test_robots_that_cannot_do_it_are_refused(case, arm):
 
 
 def test_two_robots_of_a_kind_have_names_of_their_own(arm):
-    still = change(arm, pos=None, keys=())
+    still = change(arm, pos=None, keyframes=())
     scene, *_ = scene_files.build(change(FALL, robots=(still, change(still, base=(0.5, 0.0, 0.0)))))
     assert len({b.name for b in scene.bodies}) == len(scene.bodies)
     assert tool_pose(panda(), torch.tensor(POSTURE, dtype=torch.float64)).pos.shape == (3,)
@@ -244,10 +254,12 @@ def test_two_robots_of_a_kind_have_names_of_their_own(arm):
 
 def test_a_recorded_run_is_the_run_of_single_steps():
     described = change(
-        FALL, holds=(Attachment((0,)),), bodies=(BodySpec("sphere", (0.05,), pos=(0.15, 0.0, 0.04), motion="fixed"),)
+        FALL,
+        attachments=(Attachment((0,)),),
+        bodies=(BodySpec("sphere", (0.05,), pos=(0.15, 0.0, 0.04), motion="fixed"),),
     )
     described = change(described, effects={**FALL.effects, "rod_body": {}})
-    frames = run(described, every=1)
+    frames = run(described, frame_stride=1)
     scene, params, state, controls = scene_files.build(described)
     with torch.no_grad():
         _, seen = rollout(lambda *a: step(scene, *a), params, state, controls, keep=lambda s: s.rods.pos)
@@ -282,7 +294,7 @@ def test_a_model_file_is_a_rope_of_a_scene(modelled):
     folder = modelled()
     rope = RopeSpec(((0.0, 0.0, 0.5), (0.5, 0.0, 0.5), (0.5, 0.5, 0.5)), model="model.json")
     said = SceneDescription(
-        (rope,), {"damping": {"rate": 9.0}}, holds=(Attachment((0,)),), duration=0.02, integrator="implicit"
+        (rope,), {"damping": {"rate": 9.0}}, attachments=(Attachment((0,)),), duration=0.02, integrator="implicit"
     )
     scene, params, _, _ = scene_files.build(said, folder=folder)
     assert float(params.rods.material.bend.max()) == 2e-3

@@ -57,7 +57,7 @@ def test_the_check_finds_fields() -> None:
 
 
 def test_recordings_say_shape() -> None:
-    found = list(array_fields(PACKAGE / "sysid" / "recording.py"))
+    found = list(array_fields(PACKAGE / "sysid" / "recordings" / "recording.py"))
     assert len(found) > 5
     for where, doc in found:
         assert "shape (" in doc, where

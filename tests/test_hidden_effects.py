@@ -356,7 +356,7 @@ def test_what_is_hidden_is_left_out_of_the_library(tmp_path: Path, monkeypatch: 
     words = ["--recordings", str(tmp_path / "recordings"), "--answers", str(tmp_path), "--out", str(tmp_path / "out")]
     monkeypatch.setattr(sys, "argv", ["score.py", *words, "--subset", "there", "--removed"])
     score.main()
-    assert len(ran) == 1 and ran[0][-2:] == ["--without", "air_drag"]
+    assert len(ran) == 1 and ran[0][-2:] == ["--exclude-effect", "air_drag"]
     rates = json.loads((tmp_path / "out" / "removed" / "score.json").read_text())["rates"]
     assert rates["taken out of the library, abstained"] == {"yes": 1, "of": 1}
 

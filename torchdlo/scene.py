@@ -142,9 +142,9 @@ class Scene:
             need(not wrong, f"{name} names {wrong}; the scene has slots 0 to {size - 1}")
             need(len(set(slots)) == len(slots), f"{name} {list(slots)} names a slot twice")
         seams = [s for s in self.prescribed_edges if not self.topology.edge_mask()[s]]
-        need(not seams, f"held_edges names {seams}, the gap between the ends of an open rope")
+        need(not seams, f"prescribed_edges names {seams}, the gap between the ends of an open rope")
         free = not self.prescribed_edges or self.twist != "none"
-        need(free, "held_edges prescribe twist, but twist is 'none'; choose 'quasistatic' or 'dynamic'")
+        need(free, "prescribed_edges prescribe twist, but twist is 'none'; choose 'quasistatic' or 'dynamic'")
         names = [e.name for e in self.effects]
         twice = {n for n in names if names.count(n) > 1}
         need(not twice, f"effects {sorted(twice)} are listed twice")

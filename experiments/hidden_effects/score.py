@@ -62,7 +62,7 @@ def diagnose(recording: Path, out: Path, config: Config, without: Sequence[str] 
     """Diagnose one recording with a library without some effects; return why that failed, or nothing."""
     command = [sys.executable, "-c", COMMAND, "diagnose", str(recording), "--json", "-o", str(out)]
     command += ["--budget", config.budget, "--workers", str(config.workers)]
-    command += [word for effect in without for word in ("--without", effect)]
+    command += [word for effect in without for word in ("--exclude-effect", effect)]
     if (out / "journal").exists():
         command.append("--resume")
     try:

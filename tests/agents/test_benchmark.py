@@ -101,12 +101,12 @@ def test_a_trajectory_is_played_again(tmp_path: Path, monkeypatch: pytest.Monkey
     benchmark, replays = (importlib.import_module(name) for name in ("benchmark_trajopt", "replay_trajopt"))
     settings = Settings("cmaes", episodes=80, population=8, hold=5)
     benchmark.Case("push", "cmaes", 0, settings, tmp_path / "push").search(Push(), lambda *_: None, lambda: False)
-    row = replays.replay(tmp_path / "push" / "trajectory.json", lambda task, **_: Push(name=task))
+    row = replays.replay("push", replays.trajectories(tmp_path)["push"], lambda task, **_: Push(name=task))
     before, now = row["return"]
     assert row["search"] == "push" and before == now and row["success"][0] == row["success"][1]
     content = json.loads((tmp_path / "push" / "trajectory.json").read_text())
     (tmp_path / "push" / "trajectory.json").write_text(json.dumps(content | {"return": before + 1}))
-    other = replays.replay(tmp_path / "push" / "trajectory.json", lambda task, **_: Push(name=task))
+    other = replays.replay("push", replays.trajectories(tmp_path)["push"], lambda task, **_: Push(name=task))
     assert other["return"] == [before + 1, now] and f"now {now:10.4f}" in replays.shown(other)
 
 
@@ -120,7 +120,7 @@ def test_a_report_shows_what_is_finished_beside_the_hybrid_at_as_many_episodes(t
             "success": seed == 0,
             "episodes": max(best),
             "seconds": 1.0,
-            "solved_after": None,
+            "episodes_to_success": None,
             "settings": {"seed": seed, "episodes": max(best)},
             "program": "another",
             "curve": [point | {"median": 0.0} for point in curve],

@@ -35,7 +35,7 @@ def test_what_a_rehearsal_promised_is_not_said_of_the_problem_itself() -> None:
             raise KeyboardInterrupt
 
     found = optimize(SurrogateRound(), settings, callback=stop)
-    assert found.interrupted and found.curve[-1]["surrogate_share"]
+    assert found.interrupted and found.curve[-1]["surrogate"]
     assert found.max_return == found.search_return == -math.inf and math.isfinite(float(found.outcome.returns[0]))
     written = json.loads(result_json(found, SurrogateRound(), settings))
     assert written["max_return"] is None and written["search_return"] is None and written["return"] is not None

@@ -51,21 +51,21 @@ def test_the_way_by_hand_is_played_and_kept(capsys):
     frames = load_frames("runs/play/led")
     assert len(frames.time) == 4 and frames.pos[-1, 1, 1] - frames.pos[0, 1, 1] == pytest.approx(0.03, abs=3e-4)
     # Its own files are replaced.
-    assert play("led", "--idle", "--json") == 0
+    assert play("led", "--no-op", "--json") == 0
     assert not json.loads(capsys.readouterr().out)["success"]
 
 
 def test_another_start_is_that_of_its_seed(capsys):
     starts = []
     for seed in (1, 1, 2):
-        assert play("led", "--vary", seed, "--json") == 0
+        assert play("led", "--reset-seed", seed, "--json") == 0
         capsys.readouterr()
         starts.append(load_frames("runs/play/led").pos[0])
     assert np.array_equal(starts[0], starts[1]) and not np.allclose(starts[0], starts[2], atol=1e-4)
 
 
 def test_a_trajectory_comes_back_bit_by_bit(capsys):
-    words = ["optimize", "lead", "--method", "cmaes", "--episodes", "8", "--population", "4", "--double"]
+    words = ["optimize", "lead", "--method", "cmaes", "--episodes", "8", "--population", "4", "--dtype", "float64"]
     with pytest.raises(SystemExit):
         app.main([*words, "--no-compiled", "--out", "found"])
     capsys.readouterr()
@@ -82,15 +82,15 @@ def test_a_trajectory_comes_back_bit_by_bit(capsys):
     kept["choices"]["rope"] = {"bend": 1e-3}
     Path("other.json").write_text(json.dumps(kept))
     assert play("lead", "--trajectory", "other.json") == 2
-    assert "found for a rope of its own; give that one, or another, with --rope" in capsys.readouterr().err
+    assert "found for its own rope; give that one, or another, with --rope-model" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
         (["nothing"], "there is no task 'nothing'; expected one of"),
-        (["lead"], "lead: has no way by hand; give a --trajectory, or --idle"),
-        (["lead", "--idle", "--trajectory", "x.json"], "--idle and --trajectory: expected one of them"),
+        (["lead"], "lead: has no scripted demonstration; give a --trajectory, or --no-op"),
+        (["lead", "--no-op", "--trajectory", "x.json"], "--no-op and --trajectory: expected one of them"),
         (["lead", "--trajectory", "x.json"], "x.json: expected a trajectory of torchdlo optimize"),
     ],
 )
@@ -101,7 +101,7 @@ def test_it_says_what_is_wrong(words, sentence, capsys):
 
 
 def test_ctrl_c_keeps_the_frames_so_far(monkeypatch, capsys):
-    from torchdlo.cli import commands
+    from torchdlo.cli import tasks as commands
 
     @contextlib.contextmanager
     def impatient(show):

@@ -197,7 +197,7 @@ def test_a_search_begins_with_a_rehearsal(method: str) -> None:
     found = optimize(problem, settings)
     # Eight iterations of ten.
     assert [played for played, _ in itertools.groupby(problem.played)] == ["surrogate", "earnest"]
-    assert [point["surrogate_share"] for point in found.curve] == [True] * 8 + [False] * 2
+    assert [point["surrogate"] for point in found.curve] == [True] * 8 + [False] * 2
     assert found.curve[7]["best"] == -math.inf and found.curve[7]["success"] == 0 and found.curve[7]["median"] is None
     assert returned(found) == pytest.approx(max(point["best"] for point in found.curve))
     blind = optimize(SurrogateRound(), replace(settings, episodes=48, surrogate_share=0.0))
@@ -238,7 +238,7 @@ def test_what_has_no_number_is_never_chosen_and_hides_nothing(method: str) -> No
     assert not bool(found.outcome.failed[0]) and np.isfinite(returned(found))
     assert sum(point["failed"] for point in found.curve) > 0
     if method != "cmaes":
-        assert sum(point["without_slope"] for point in found.curve) > 0
+        assert sum(point["without_gradient"] for point in found.curve) > 0
     with pytest.raises(InputError, match=r"reach: none of 160 episodes had a finite return"):
         optimize(Broken(always=True), replace(SMALL, method=method, episodes=160))
 
@@ -280,7 +280,7 @@ def test_a_robust_search_counts_every_copy_and_grows_its_worlds() -> None:
         ({"surrogate_share": 1.0}, "rehearsed is 1.0; expected a share of the iterations from 0 up, less than 1."),
         (
             {"surrogate_share": 0.5, "method": "hybrid", "episodes": 32},
-            "push: it has no rehearsal; set rehearsed to 0.",
+            "push: it has no surrogate task; set surrogate_share to 0.",
         ),
         ({"seed": -1}, "seed is -1; expected a whole number from 0 to 2^32 - 1."),
         ({"seed": 2**32}, "seed is 4294967296; expected a whole number from 0 to 2^32 - 1."),

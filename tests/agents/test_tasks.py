@@ -94,7 +94,7 @@ def test_the_command_finds_keeps_and_plays_again(
 ) -> None:
     monkeypatch.setitem(envs.TASKS, "lead", Lead)
     out = tmp_path / "out"
-    words = ["optimize", "lead", "--method", "hybrid", "--episodes", "16", "--population", "4", "--double"]
+    words = ["optimize", "lead", "--method", "hybrid", "--episodes", "16", "--population", "4", "--dtype", "float64"]
     with pytest.raises(SystemExit) as done:
         app.main([*words, "--no-compiled", "--out", str(out), "--json"])
     assert done.value.code in (0, None)

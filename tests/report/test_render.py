@@ -19,9 +19,9 @@ from torchdlo.scene_files import (
     Attachment,
     BodySpec,
     GridSpec,
-    HangingMass,
     Keyframe,
     ParticleBlockSpec,
+    PointMass,
     RopeSpec,
     SceneDescription,
 )
@@ -62,7 +62,7 @@ def test_surfaces_enclose_the_volume_of_the_solid_about_its_centre_of_mass(shape
 
 def scene(**fields) -> SceneDescription:
     rope = RopeSpec(((0.0, 0.0, 0.5), (0.4, 0.0, 0.5)), vertices=9, radius=0.01, mass=0.03, bend=1e-3)
-    plain = {"ropes": (rope,), "effects": {"bend": {}}, "duration": 0.02, "look": (0.0, -1.0, 0.0)}
+    plain = {"ropes": (rope,), "effects": {"bend": {}}, "duration": 0.02, "camera_direction": (0.0, -1.0, 0.0)}
     return SceneDescription(**plain | fields)
 
 
@@ -86,7 +86,11 @@ def test_the_camera_is_fitted_to_what_moves_and_not_to_large_bodies_that_stand()
     bodies = (
         BodySpec("box", (5.0, 5.0, 0.1), pos=(0.0, 0.0, -0.1), motion="fixed"),
         BodySpec(
-            "sphere", (0.05,), pos=(0.9, 0.0, 0.5), motion="kinematic", keys=(Keyframe(0.02, move=(0.1, 0.0, 0.0)),)
+            "sphere",
+            (0.05,),
+            pos=(0.9, 0.0, 0.5),
+            motion="kinematic",
+            keyframes=(Keyframe(0.02, move=(0.1, 0.0, 0.0)),),
         ),
     )
     low, high = surfaces.bounds(run(scene(bodies=bodies)))
@@ -111,14 +115,22 @@ def drawn(image: np.ndarray) -> np.ndarray:
 def test_a_picture_shows_each_part_where_it_is(drawing):
     bodies = (
         BodySpec(
-            "sphere", (0.05,), pos=(0.2, 0.0, 0.2), motion="kinematic", keys=(Keyframe(0.02, move=(0.2, 0.0, 0.0)),)
+            "sphere",
+            (0.05,),
+            pos=(0.2, 0.0, 0.2),
+            motion="kinematic",
+            keyframes=(Keyframe(0.02, move=(0.2, 0.0, 0.0)),),
         ),
     )
     material_points = (ParticleBlockSpec("liquid", (0.04,), 0.01, "ball", (0.0, 0.0, 0.0)),)
     box = GridSpec((-0.2, -0.2, -0.2), (0.2, 0.2, 0.2), 0.02)
     frames = run(
         scene(
-            bodies=bodies, material_points=material_points, box=box, holds=(Attachment((0, -1)),), effects={"bend": {}}
+            bodies=bodies,
+            material_points=material_points,
+            box=box,
+            attachments=(Attachment((0, -1)),),
+            effects={"bend": {}},
         )
     )
     with drawing.Picture(frames, size=(320, 240)) as picture:
@@ -139,11 +151,13 @@ def test_a_picture_shows_each_part_where_it_is(drawing):
 
 def test_a_rope_that_turns_is_lit_as_well_as_before(drawing):
     # Half a turn about z shows the same line again: with the shading of its other side it would be dark.
-    turn = Attachment((0, 1), keys=(Keyframe(0.06, move=(0.4, 0.0, 0.0), turn=(0.0, 0.0, 3.1415926)),))
+    turn = Attachment((0, 1), keyframes=(Keyframe(0.06, move=(0.4, 0.0, 0.0), turn=(0.0, 0.0, 3.1415926)),))
     rope = RopeSpec(((0.0, 0.0, 0.5), (0.4, 0.0, 0.5)), vertices=3, radius=0.02, mass=0.03, bend=1e-3)
     frames = run(
         scene(
-            ropes=(rope,), holds=(turn, Attachment((2,), keys=(Keyframe(0.06, move=(-0.4, 0.0, 0.0)),))), duration=0.06
+            ropes=(rope,),
+            attachments=(turn, Attachment((2,), keyframes=(Keyframe(0.06, move=(-0.4, 0.0, 0.0)),))),
+            duration=0.06,
         )
     )
     with drawing.Picture(frames, size=(160, 120)) as picture:
@@ -158,7 +172,7 @@ def test_stills_stand_side_by_side(drawing):
     frames = run(
         scene(
             ropes=(
-                RopeSpec(scene().ropes[0].points, vertices=5, mass=0.03, bend=1e-3, weights=(HangingMass(-1, 0.1),)),
+                RopeSpec(scene().ropes[0].points, vertices=5, mass=0.03, bend=1e-3, point_masses=(PointMass(-1, 0.1),)),
             )
         )
     )
@@ -171,7 +185,7 @@ def test_a_video_has_a_picture_for_every_thirtieth_of_a_second(drawing, tmp_path
     av = pytest.importorskip("av", reason="videos need the extra view")
     from torchdlo.report.render import video
 
-    frames = run(scene(effects={"gravity": {}, "bend": {}}, holds=(Attachment((0,)),), duration=0.1))
+    frames = run(scene(effects={"gravity": {}, "bend": {}}, attachments=(Attachment((0,)),), duration=0.1))
     seen = []
     path = tmp_path / "motion.mp4"
     video.write_video(frames, path, speed=0.5, size=(160, 120), callback=lambda *a: seen.append(a))

@@ -23,13 +23,13 @@ def viewer():
         (0.05,),
         pos=(0.2, 0.0, 0.2),
         motion="kinematic",
-        keys=(Keyframe(0.05, move=(0.2, 0.0, 0.0), turn=(0.0, 0.0, 1.0)),),
+        keyframes=(Keyframe(0.05, move=(0.2, 0.0, 0.0), turn=(0.0, 0.0, 1.0)),),
     )
     described = SceneDescription(
         (rope,),
         {"bend": {}, "gravity": {}, "table": {"height": 0.0}},
         bodies=(ball,),
-        holds=(Attachment((0,)),),
+        attachments=(Attachment((0,)),),
         material_points=(ParticleBlockSpec("sand", (0.02,), 0.01, "ball", (0.0, 0.0, 0.1)),),
         box=GridSpec((-0.1, -0.1, 0.0), (0.1, 0.1, 0.2), 0.02),
         duration=0.05,
@@ -79,7 +79,7 @@ def test_it_plays_from_where_it_is_starts_again_at_the_end_and_pauses(viewer):
 
 
 def test_the_command_serves_a_run_until_ctrl_c(tmp_path, monkeypatch, viewer):
-    from torchdlo.cli import commands
+    from torchdlo.cli import scenes as commands
     from torchdlo.report.viewer import server as view
     from torchdlo.scene_files.run import save_frames
 

@@ -286,7 +286,7 @@ def test_the_command_writes_the_suggestion(
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(search, "design_experiment", fake)
     save_recording(recording, tmp_path / "rope")
-    assert run("design-experiment", "rope", "--names", "rest_curvature, tilted_gravity", "--seed", 3) == 0
+    assert run("design-experiment", "rope", "--effects", "rest_curvature, tilted_gravity", "--seed", 3) == 0
     assert asked["names"] == ["rest_curvature", "tilted_gravity"] and asked["findings"] is None and asked["seed"] == 3
     said = capsys.readouterr().out
     assert said.startswith("To tell tilted gravity and rest curvature apart") and "the recording at hand" in said
@@ -305,12 +305,12 @@ def test_the_command_says_why_it_stops(
     assert "runs/diagnose/rope/findings.json: expected the findings" in capsys.readouterr().err
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "motion.npz").write_bytes(b"of somebody else")
-    assert run("design-experiment", "rope", "--names", "wind,time_delay", "--out", "out") == 2
+    assert run("design-experiment", "rope", "--effects", "wind,time_delay", "--out", "out") == 2
     assert "motion.npz: exists without design.json" in capsys.readouterr().err
 
     def stopped(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
     monkeypatch.setattr(search, "design_experiment", stopped)
-    assert run("design-experiment", "rope", "--names", "wind,time_delay") == 130
+    assert run("design-experiment", "rope", "--effects", "wind,time_delay") == 130
     assert "--resume goes on from runs/design/rope/journal" in capsys.readouterr().err

@@ -1,4 +1,4 @@
-"""From a description to the scene, its numbers, its first state, and what is commanded."""
+"""From a description to the scene, its parameters, its first state, and what is commanded."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ from torchdlo.scene_files.schema import BodySpec, ParticleBlockSpec, RopeSpec, S
 __all__ = ["Simulation", "assemble", "build", "load"]
 
 _LAWS: dict[str, type[ConstitutiveModel]] = {law.name: law for law in (Elastic, Plastic, Liquid, Sand)}
-_OWN = ("points", "vertices", "model", "weights")
+_OWN = ("points", "vertices", "model", "point_masses")
 """Entries of a rope that are not fields of `scene.RopeSpec`."""
-_BODY_OWN = ("keys", "path", "file", "scale", "cells")
+_BODY_OWN = ("keyframes", "path", "file", "scale", "cells")
 """Entries of a body that are not fields of `RigidBody`."""
 
 
@@ -65,9 +65,9 @@ def build(
     """
     made = assemble(description, folder=folder)
     if made.plan.hands is not None:
-        late = next(k for k, h in enumerate(description.holds) if h.close > 0)
+        late = next(k for k, h in enumerate(description.attachments) if h.close > 0)
         raise InputError(
-            f"holds[{late}].close: how a hold sits that closes during the run depends on the run; use "
+            f"attachments[{late}].close: how a hold sits that closes during the run depends on the run; use "
             "torchdlo.scene_files.assemble(...).plan.follow(scene), or torchdlo.scene_files.run.run."
         )
     return made.scene, made.params, made.state, made.plan.controls
@@ -94,7 +94,7 @@ def assemble(description: SceneDescription, *, folder: str | Path = ".") -> Simu
     meshes = {k: _mesh(b, k, folder) for k, b in enumerate(d.bodies) if b.shape == "mesh"}
     bodies = [_body(b, k, meshes.get(k)) for k, b in enumerate(d.bodies)]
     static = {name: getattr(d, name) for name in ("dt", "substeps", "integrator", "twist", "constrained")}
-    held = {f"held_{part}": _slots(d, counts, part) for part in ("vertices", "edges")}
+    held = {f"prescribed_{part}": _slots(d, counts, part) for part in ("vertices", "edges")}
     _check_holds(d)
     armed = motion.arms(d, folder)
     for arm in armed:
@@ -109,30 +109,32 @@ def assemble(description: SceneDescription, *, folder: str | Path = ".") -> Simu
 
 
 def _check_holds(d: SceneDescription) -> None:
-    for k, hold in enumerate(d.holds):
+    for k, hold in enumerate(d.attachments):
         if hold.robot is not None and not 0 <= hold.robot < len(d.robots):
             raise InputError(
-                f"holds[{k}].robot: expected the number of a robot, 0 to {len(d.robots) - 1}, given {hold.robot}."
+                f"attachments[{k}].robot: expected the number of a robot, 0 to {len(d.robots) - 1}, given {hold.robot}."
                 if d.robots
-                else f"holds[{k}].robot: there is no robot in the scene."
+                else f"attachments[{k}].robot: there is no robot in the scene."
             )
-        if hold.robot is not None and hold.keys:
-            raise InputError(f"holds[{k}].keys: the robot moves what it holds; put the keys into the robot.")
+        if hold.robot is not None and hold.keyframes:
+            raise InputError(
+                f"attachments[{k}].keyframes: the robot moves what it holds; put the keyframes into the robot."
+            )
         if hold.close < 0:
-            raise InputError(f"holds[{k}].close: expected a time from 0 on, given {hold.close:g}.")
+            raise InputError(f"attachments[{k}].close: expected a time from 0 on, given {hold.close:g}.")
 
 
 def _slots(d: SceneDescription, counts: list[int], part: str) -> tuple[int, ...]:
     """Return the scene's slots of held vertices or edges: ropes lie one after the other."""
     slots = []
-    for k, held in enumerate(d.holds):
+    for k, held in enumerate(d.attachments):
         if not held.vertices:
-            raise InputError(f"holds[{k}].vertices: is empty; expected at least one.")
+            raise InputError(f"attachments[{k}].vertices: is empty; expected at least one.")
         if not 0 <= held.rope < len(counts):
-            raise InputError(f"holds[{k}].rope: expected 0 to {len(counts) - 1}, given {held.rope}.")
+            raise InputError(f"attachments[{k}].rope: expected 0 to {len(counts) - 1}, given {held.rope}.")
         count = counts[held.rope] - (part == "edges" and not d.ropes[held.rope].closed)
         for number in getattr(held, part):
-            place = f"holds[{k}].{part}"
+            place = f"attachments[{k}].{part}"
             slots.append(sum(counts[: held.rope]) + _numbered(number, count, place))
     return tuple(slots)
 
@@ -147,10 +149,10 @@ def _weights(d: SceneDescription, counts: list[int], like: Tensor) -> Tensor:
     """Return the masses that hang on vertices [kg], shape (V, 1)."""
     found = like.new_zeros(sum(counts), 1)
     for k, rope in enumerate(d.ropes):
-        for j, weight in enumerate(rope.weights):
+        for j, weight in enumerate(rope.point_masses):
             if weight.mass <= 0:
-                raise InputError(f"ropes[{k}].weights[{j}].mass: expected more than 0, given {weight.mass:g}.")
-            at = sum(counts[:k]) + _numbered(weight.vertex, counts[k], f"ropes[{k}].weights[{j}].vertex")
+                raise InputError(f"ropes[{k}].point_masses[{j}].mass: expected more than 0, given {weight.mass:g}.")
+            at = sum(counts[:k]) + _numbered(weight.vertex, counts[k], f"ropes[{k}].point_masses[{j}].vertex")
             found[at] += weight.mass
     return found
 
@@ -208,13 +210,15 @@ def _body(body: BodySpec, k: int, mesh: MeshShape | None) -> RigidBody:
 
 
 def _matter(d: SceneDescription, dtype: torch.dtype) -> tuple:
-    """Return what `scene.make` wants as matter; () if there is none."""
+    """Return what `scene.make` wants as material points; () if there is none."""
     if not d.material_points:
         if d.box is not None:
-            raise InputError("box: there is no matter in it; give matter, or leave out the box.")
+            raise InputError("box: there are no material points in it; give material_points, or leave out the box.")
         return ()
     if d.box is None:
-        raise InputError("box: is missing; expected the region in which matter may be, with low, high and spacing.")
+        raise InputError(
+            "box: is missing; expected the region in which material points may be, with low, high and spacing."
+        )
     zero = torch.zeros((), dtype=dtype)
     blobs = [_blob(m, k, zero) for k, m in enumerate(d.material_points)]
     fields = {f.name: getattr(d.box, f.name) for f in dataclasses.fields(particles.Grid)}
@@ -222,20 +226,20 @@ def _matter(d: SceneDescription, dtype: torch.dtype) -> tuple:
 
 
 def _blob(m: ParticleBlockSpec, k: int, zero: Tensor) -> particles.ParticleBlock:
-    here, law = f"matter[{k}]", _LAWS[m.law]()
+    here, law = f"material_points[{k}]", _LAWS[m.constitutive_model]()
     count = {"box": 3, "ball": 1}[m.shape]
     if len(m.size) != count or min(m.size) <= 0:
         raise InputError(f"{here}.size: expected {count} numbers above 0 for a {m.shape}, given {list(m.size)}.")
     if not 0 < m.spacing <= 2 * min(m.size):
         raise InputError(f"{here}.spacing: expected more than 0, up to its own size, given {m.spacing:g}.")
     known = [*law.params, "density"]
-    for name in m.numbers:
+    for name in m.parameters:
         if name not in known:
-            raise InputError(f"{here}.numbers.{name}: there is no such number; {like(name, known)}.")
+            raise InputError(f"{here}.parameters.{name}: there is no such parameter; {like(name, known)}.")
     if m.shape == "box":
         low, high = ([c + s * h for c, h in zip(m.pos, m.size, strict=True)] for s in (-1, 1))
         points = particles.fill_box(low, high, m.spacing, zero)
         volume = 8 * m.size[0] * m.size[1] * m.size[2] / len(points)
     else:
         points, volume = particles.fill_ball(m.pos, m.size[0], m.spacing, zero), m.spacing**3
-    return particles.ParticleBlock(points, law, volume, zero.new_tensor(m.vel), dict(m.numbers))
+    return particles.ParticleBlock(points, law, volume, zero.new_tensor(m.vel), dict(m.parameters))

@@ -17,13 +17,14 @@ from torchdlo.coupling.mpm.rod_coupling_effect import RodMpmCoupling
 from torchdlo.errors import InputError
 from torchdlo.files import write_atomically
 from torchdlo.physics.effects import EFFECTS as PHYSICS
+from torchdlo.scene_files.older import OLDER, upgraded
 from torchdlo.scene_files.schema import SceneDescription
 
 __all__ = ["EFFECTS", "FORMAT", "like", "parse", "plain", "read", "save", "text"]
 
 EFFECTS = PHYSICS | COUPLING | {e.name: e for e in (RodMpmCoupling, BodyMpmCoupling)}
-FORMAT = "torchdlo scene 1"
-"""What the entry "format" of a file says."""
+FORMAT = "torchdlo scene 2"
+"""What the entry "format" of a file that is written says; files of version 1 are read, too."""
 
 
 def save(description: SceneDescription, path: str | Path) -> None:
@@ -70,13 +71,14 @@ def parse(content: str, *, where: str = "scene") -> SceneDescription:
             f"{where}: line {error.lineno}, column {error.colno}: is not JSON ({error.msg}); is the file cut, or is a "
             "comma missing or too many?"
         ) from None
-    if not isinstance(found, dict) or found.get("format") != FORMAT:
+    if not isinstance(found, dict) or found.get("format") not in (FORMAT, OLDER):
         given = found.get("format") if isinstance(found, dict) else type(found).__name__
         hint = ""
         if given == "torchdlo-model":
             hint = ' It is a model file: write a scene around it, {"model": "..."} in one of its ropes.'
         raise InputError(f'{where}: expected an object with "format": "{FORMAT}", given {given!r}.{hint}')
-    del found["format"]
+    if found.pop("format") == OLDER:
+        found = upgraded(found)
     return _checked(SceneDescription, found, where, "")
 
 
@@ -148,14 +150,14 @@ def _effects(given: Any, where: str, place: str) -> dict[str, dict[str, Any]]:
         if name not in EFFECTS:
             raise InputError(f"{where}: {here}: there is no such effect; {like(name, EFFECTS)}.")
         if not isinstance(numbers, dict):
-            raise _wrong(where, here, "an object with its numbers, {} for the defaults", numbers)
+            raise _wrong(where, here, "an object with its parameters, {} for the defaults", numbers)
         params = EFFECTS[name].params
         choices = {f.name for f in dataclasses.fields(EFFECTS[name])}
         for key, value in numbers.items():
             if key not in params and key not in choices:
                 known = [*params, *sorted(choices)]
                 hint = like(key, known) if known else "it has none"
-                raise InputError(f"{where}: {here}.{key}: there is no such number; {hint}.")
+                raise InputError(f"{where}: {here}.{key}: there is no such parameter; {hint}.")
             if key in params:
                 size = params[key].size
                 kind = float if size == 1 else tuple[(float,) * size]

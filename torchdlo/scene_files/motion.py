@@ -96,19 +96,19 @@ def _arm(said: RobotSpec, here: str, folder: Path, d: SceneDescription) -> Arm:
         )
         _check_reach(f"{here}.pos", found, start.new_zeros(1))
         start = found.joints
-    if not said.keys:
+    if not said.keyframes:
         return Arm(robot, start.expand(len(times(d)) + 1, -1))
     time = times(d)
-    shift, first = motion(said.keys, said.path, time), robots.tool_pose(robot, start)
+    shift, first = motion(said.keyframes, said.path, time), robots.tool_pose(robot, start)
     target = Pose(first.pos + shift.pos, multiply(shift.quat, first.quat.expand_as(shift.quat)))
     found = inverse_kinematics.solve(robot, target, start.expand(len(time), -1), posture=start)
-    _check_reach(f"{here}.keys", found, time)
+    _check_reach(f"{here}.keyframes", found, time)
     joints = torch.cat([start[None], found.joints])
     speed = (joints[1:] - joints[:-1]).abs() / d.dt
     if bool((speed > robot.velocity * (1 + 1e-3)).any()):
         step, joint = divmod(int((speed / robot.velocity).argmax()), len(robot.joints))
         raise InputError(
-            f"{here}.keys: {robot.joints[joint]} would have to move at {speed[step, joint]:.3g} rad/s (m/s if it "
+            f"{here}.keyframes: {robot.joints[joint]} would have to move at {speed[step, joint]:.3g} rad/s (m/s if it "
             f"slides) after {time[step]:.3g} s; it can at most {robot.velocity[joint]:g}. Give it more time, or start "
             "from other joints."
         )
@@ -160,33 +160,35 @@ def plan(d: SceneDescription, scene: scenes.Scene, state: scenes.State, armed: l
     time, still = times(d), scenes.stationary_control(scene, state)
     bodies = _targets(d, still.bodies, time, state.rods.pos, armed)
     pos, director = (x.expand(len(time), -1, -1) for x in (still.pos, still.director))
-    if not d.holds:
+    if not d.attachments:
         return ControlPlan(scenes.Control(pos, director, {}, bodies))
-    owners = {part: [k for k, h in enumerate(d.holds) for _ in getattr(h, part)] for part in ("vertices", "edges")}
-    hands = Hands(len(d.holds), tuple(owners["vertices"]), tuple(owners["edges"]))
+    owners = {
+        part: [k for k, h in enumerate(d.attachments) for _ in getattr(h, part)] for part in ("vertices", "edges")
+    }
+    hands = Hands(len(d.attachments), tuple(owners["vertices"]), tuple(owners["edges"]))
     tools = _tools(d, hands, still, time, armed)
     begin = time - d.dt
-    until = time.new_tensor([math.inf if h.release is None else h.release for h in d.holds])
-    since = time.new_tensor([h.close for h in d.holds])
+    until = time.new_tensor([math.inf if h.release is None else h.release for h in d.attachments])
+    since = time.new_tensor([h.close for h in d.attachments])
     # Half a step's slack: the sums of steps are not exactly the times that a person writes.
     closed = ((time[:, None] <= until) & (begin[:, None] >= since - 0.5 * d.dt)).to(still.pos)[..., None]
-    if any(h.close > 0 for h in d.holds):
+    if any(h.close > 0 for h in d.attachments):
         return ControlPlan(scenes.Control(pos, director, {}, bodies), hands, tools, closed)
     first, later = (tree.map(lambda x, part=part: x[part], tools) for part in (0, slice(1, None)))
     held = weld(scene, hands, still, first, torch.ones_like(closed[0]))
     pos, director, attachment_weight = carry(hands, tree.replace(held, closed=closed), later)
-    attachment_weight = attachment_weight if any(h.release is not None for h in d.holds) else {}
+    attachment_weight = attachment_weight if any(h.release is not None for h in d.attachments) else {}
     return ControlPlan(scenes.Control(pos, director, attachment_weight, bodies))
 
 
 def _tools(d: SceneDescription, hands: Hands, still: scenes.Control, time: Tensor, armed: list[Arm]) -> Pose:
     """Return where the holds' tools are at the start and after every step, shapes (T + 1, holds, .)."""
     found, with_start = [], torch.cat([time.new_zeros(1), time])
-    for k, hold in enumerate(d.holds):
+    for k, hold in enumerate(d.attachments):
         if hold.robot is not None:
             found.append(armed[hold.robot].tool)
             continue
-        moved = motion(hold.keys, hold.path, with_start)
+        moved = motion(hold.keyframes, hold.path, with_start)
         found.append(Pose(still.pos[hands.vertices.index(k)].to(moved.pos) + moved.pos, moved.quat))
     pos, quat = (torch.stack([getattr(p, part) for p in found], 1).to(still.pos) for part in ("pos", "quat"))
     return Pose(pos, quat)
@@ -196,7 +198,7 @@ def _targets(d: SceneDescription, still: Any, time: Tensor, like: Tensor, armed:
     """Return poses of kinematic bodies and then of robots' links, shapes (T, L, 3) and (T, L, 4)."""
     if not still:
         return ()
-    moved = [motion(b.keys, b.path, time) for b in d.bodies if b.motion == "kinematic"]
+    moved = [motion(b.keyframes, b.path, time) for b in d.bodies if b.motion == "kinematic"]
     rows = []
     for k, m in enumerate(moved):
         pos, quat = still.pos[k] + m.pos.to(like), m.quat.to(like)

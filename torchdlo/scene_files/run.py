@@ -18,6 +18,9 @@ from torchdlo.files import replacing
 
 __all__ = ["Frames", "appearance", "load_frames", "run", "save_frames"]
 
+_OLDER = {"material_points": "matter", "constitutive_model": "law", "camera_direction": "look"}
+"""What arrays were called in files of version 0.1."""
+
 
 @dataclass(frozen=True, eq=False)
 class Frames:
@@ -36,7 +39,7 @@ class Frames:
     body_quat: np.ndarray
     """Orientations of bodies (w, x, y, z) [1], shape (F, K, 4)."""
     material_points: np.ndarray
-    """Points of matter [m], shape (F, P, 3)."""
+    """Material points [m], shape (F, P, 3)."""
     rope: np.ndarray
     """Number of the rope that each vertex belongs to, shape (V,)."""
     closed: np.ndarray
@@ -57,11 +60,11 @@ class Frames:
     """Their triangles, shape (T, 3)."""
     mesh_body: np.ndarray
     """The body of each triangle, shape (T,)."""
-    law: np.ndarray
-    """Law of each point of matter, shape (P,)."""
+    constitutive_model: np.ndarray
+    """Constitutive model of each material point, shape (P,)."""
     table: np.ndarray
     """Heights of tables that effects hold [m], shape (0,) or (1,)."""
-    look: np.ndarray
+    camera_direction: np.ndarray
     """Direction from the scene to the camera, shape (3,)."""
     interrupted: bool = False
     """Whether it was stopped before its end."""
@@ -112,7 +115,7 @@ def appearance(
         "mesh_vertices": np.concatenate(vertices),
         "mesh_faces": np.concatenate(faces),
         "mesh_body": np.concatenate(owner),
-        "law": np.repeat([g.law.name for g in groups] or np.zeros(0, str), [g.count for g in groups]),
+        "constitutive_model": np.repeat([g.law.name for g in groups] or np.zeros(0, str), [g.count for g in groups]),
         "table": heights[0] if heights else np.zeros(0),
     }
 
@@ -120,18 +123,18 @@ def appearance(
 def _looks(made: scene_files.Simulation, description: scene_files.SceneDescription) -> dict[str, np.ndarray]:
     meshes = {k: (mesh.vertices, mesh.faces) for k, mesh in made.meshes.items()}
     seen = appearance(made.scene, made.params, meshes, len(made.scene.bodies) - len(description.bodies))
-    return seen | {"weight": made.weight[:, 0].numpy(), "look": np.array(description.look)}
+    return seen | {"weight": made.weight[:, 0].numpy(), "camera_direction": np.array(description.camera_direction)}
 
 
 def run(
     description: scene_files.SceneDescription,
     *,
     folder: str | Path = ".",
-    every: int = 10,
+    frame_stride: int = 10,
     compiled: bool = False,
     callback: Callable[[str, int, int, str], None] | None = None,
 ) -> Frames:
-    """Run a scene and keep a frame of its start and after every `every` steps.
+    """Run a scene and keep a frame of its start and after every `frame_stride` steps.
 
     A `KeyboardInterrupt` that `callback` raises ends the run, as does a state that is not sound; frames so far are
     returned.
@@ -139,7 +142,7 @@ def run(
     Args:
         description: the scene.
         folder: where the files that it names are looked for.
-        every: steps per frame.
+        frame_stride: steps per frame.
         compiled: whether to compile the step, worth it for long runs; else it is recorded.
         callback: told (stage, steps done, steps in all, message) after every frame.
     """
@@ -153,7 +156,7 @@ def run(
         for k in range(total):
             command = control(k, state)
             state = step(params, state, command)
-            if (k + 1) % every and k + 1 < total:
+            if (k + 1) % frame_stride and k + 1 < total:
                 continue
             try:
                 scenes.check_state(state)
@@ -188,9 +191,11 @@ def load_frames(path: str | Path) -> Frames:
     names = [f.name for f in fields(Frames) if f.type == "np.ndarray"]
     try:
         with np.load(file, allow_pickle=False) as found:
-            missing = [name for name in names if name not in found.files]
+            stored = {name: _OLDER.get(name, name) for name in names}
+            stored = {name: name if name in found.files else older for name, older in stored.items()}
+            missing = [name for name in names if stored[name] not in found.files]
             if missing:
                 raise InputError(f"{file}: lacks {', '.join(missing)}; simulate the scene again with this version.")
-            return Frames(**{name: found[name] for name in names})
+            return Frames(**{name: found[stored[name]] for name in names})
     except (ValueError, EOFError, OSError, zipfile.BadZipFile) as error:
         raise InputError(f"{file}: expected the frames of a run; reading failed: {error}.") from None

@@ -9,9 +9,9 @@ __all__ = [
     "Attachment",
     "BodySpec",
     "GridSpec",
-    "HangingMass",
     "Keyframe",
     "ParticleBlockSpec",
+    "PointMass",
     "RobotSpec",
     "RopeSpec",
     "SceneDescription",
@@ -23,7 +23,7 @@ Wall = Literal["open", "separate", "slip", "stick"]
 
 
 @dataclass(frozen=True)
-class HangingMass:
+class PointMass:
     """A point mass that hangs on a rope; drawn as a ball of steel, which touches nothing."""
 
     vertex: int
@@ -52,14 +52,14 @@ class RopeSpec:
     closed: bool = False
     rest: Literal["straight", "as_placed"] = "straight"
     model: str | None = None
-    """Model file of `torchdlo calibrate` or `diagnose`, from which numbers and effects are taken."""
-    weights: tuple[HangingMass, ...] = ()
+    """Model file of `torchdlo calibrate` or `diagnose`, from which parameters and effects are taken."""
+    point_masses: tuple[PointMass, ...] = ()
     """What hangs on it."""
 
 
 @dataclass(frozen=True)
 class Keyframe:
-    """Where something is at a time, from where it is at the start; between keys it moves by `path`."""
+    """Where something is at a time, from where it is at the start; between keyframes it moves by `path`."""
 
     time: float
     """When [s]."""
@@ -79,12 +79,12 @@ class Attachment:
     """Number of the rope."""
     edges: tuple[int, ...] = ()
     """Edges whose twist is held, too."""
-    keys: tuple[Keyframe, ...] = ()
+    keyframes: tuple[Keyframe, ...] = ()
     """Motion about the first vertex; none if empty."""
     path: Literal["smooth", "linear"] = "smooth"
-    """Whether it starts and stops at each key without a jerk."""
+    """Whether it starts and stops at each keyframe without a jerk."""
     robot: int | None = None
-    """Number of the robot whose tool holds them, in place of `keys`."""
+    """Number of the robot whose tool holds them, in place of `keyframes`."""
     close: float = 0.0
     """When it grips [s]: from then on what it holds keeps its place in the tool."""
     release: float | None = None
@@ -110,7 +110,7 @@ class BodySpec:
     restitution: float = 0.0
     damping: float = 0.0
     name: str = ""
-    keys: tuple[Keyframe, ...] = ()
+    keyframes: tuple[Keyframe, ...] = ()
     """Motion of a kinematic body."""
     path: Literal["smooth", "linear"] = "smooth"
     file: str | None = None
@@ -123,7 +123,7 @@ class BodySpec:
 
 @dataclass(frozen=True)
 class RobotSpec:
-    """A chain of links whose joints go where they bring its tool along `keys`."""
+    """A chain of links whose joints go where they bring its tool along `keyframes`."""
 
     urdf: str = "panda"
     """File, or "panda" for the arm in the package."""
@@ -139,16 +139,16 @@ class RobotSpec:
     """Where the tool is at the start [m], if `joints` are only a posture near it."""
     quat: Quaternion = (0.0, 1.0, 0.0, 0.0)
     """How it is turned there; it points down if not given."""
-    keys: tuple[Keyframe, ...] = ()
+    keyframes: tuple[Keyframe, ...] = ()
     """Motion of the tool."""
     path: Literal["smooth", "linear"] = "smooth"
 
 
 @dataclass(frozen=True)
 class ParticleBlockSpec:
-    """A piece of matter, made of material points."""
+    """A block of a material, made of material points."""
 
-    law: Literal["elastic", "plastic", "liquid", "sand"]
+    constitutive_model: Literal["elastic", "plastic", "liquid", "sand"]
     size: tuple[float, ...]
     """Half lengths of a box, or the radius of a ball [m]."""
     spacing: float
@@ -158,13 +158,13 @@ class ParticleBlockSpec:
     """Its middle [m]."""
     vel: Vector = (0.0, 0.0, 0.0)
     """Velocity at the start [m/s]."""
-    numbers: dict[str, float] = field(default_factory=dict)
-    """Numbers of its law, and its density, that differ from their defaults."""
+    parameters: dict[str, float] = field(default_factory=dict)
+    """Parameters of its constitutive model, and its density, that differ from their defaults."""
 
 
 @dataclass(frozen=True)
 class GridSpec:
-    """Where matter may be; fields without a comment are those of `coupling.mpm.particles.Grid`."""
+    """Where material points may be; fields without a comment are those of `coupling.mpm.particles.Grid`."""
 
     low: Vector
     high: Vector
@@ -181,13 +181,13 @@ class SceneDescription:
 
     ropes: tuple[RopeSpec, ...]
     effects: dict[str, dict[str, Any]]
-    """Effects by name, each with the numbers and choices that differ from its defaults."""
+    """Effects by name, each with the parameters and choices that differ from its defaults."""
     bodies: tuple[BodySpec, ...] = ()
-    holds: tuple[Attachment, ...] = ()
+    attachments: tuple[Attachment, ...] = ()
     robots: tuple[RobotSpec, ...] = ()
     material_points: tuple[ParticleBlockSpec, ...] = ()
     box: GridSpec | None = None
-    """Where matter may be."""
+    """Where material points may be."""
     duration: float = 1.0
     """How long to simulate [s]."""
     dt: float = 1e-3
@@ -197,7 +197,7 @@ class SceneDescription:
     constrained: bool = True
     precision: Literal["float64", "float32"] = "float64"
     """Type of all numbers."""
-    look: Vector = (0.5, -1.0, 0.45)
+    camera_direction: Vector = (0.5, -1.0, 0.45)
     """From where pictures are taken: direction from the scene to the camera."""
     notes: str = ""
     """Anything."""

@@ -16,7 +16,29 @@ from torchdlo.agents.trajopt.search import SearchResult, Settings
 from torchdlo.agents.trajopt.search_journal import program, versions
 from torchdlo.errors import InputError
 
-__all__ = ["load_actions", "plain", "result_json", "summary", "trajectory_json"]
+__all__ = ["load_actions", "plain", "result_json", "summary", "trajectory_json", "upgraded"]
+
+_OLDER = {
+    "searched": "search_return",
+    "highest": "max_return",
+    "solved_after": "episodes_to_success",
+    "shortfall": "terminal_cost",
+}
+"""Entries of results and trajectories of version 0.1."""
+_OLDER_CURVE = {"rehearsed": "surrogate", "without_slope": "without_gradient"}
+"""Entries of their learning curves."""
+_SETTINGS = {"rehearsed": "surrogate_share"}
+"""Entries of their settings."""
+
+
+def upgraded(content: dict[str, Any]) -> dict[str, Any]:
+    """Return a result or a trajectory of version 0.1 by the names of today; others as they are."""
+    found = {_OLDER.get(name, name): value for name, value in content.items()}
+    if "settings" in found:
+        found["settings"] = {_SETTINGS.get(name, name): value for name, value in found["settings"].items()}
+    if "curve" in found:
+        found["curve"] = [{_OLDER_CURVE.get(name, name): value for name, value in p.items()} for p in found["curve"]]
+    return found
 
 
 def plain(outcome: Evaluation) -> dict[str, Any]:
@@ -52,7 +74,7 @@ def result_json(found: SearchResult, problem: Problem, settings: Settings) -> st
         "search_return": _finite(found.search_return),
         "missed": found.kept.get("missed", ""),
         "max_return": _finite(found.max_return),
-        "solved_after": next((p["episodes"] for p in found.curve if p["success"] > 0), None),
+        "episodes_to_success": next((p["episodes"] for p in found.curve if p["success"] > 0), None),
         "episodes": found.episodes,
         "seconds": round(found.seconds, 3),
         "interrupted": found.interrupted,

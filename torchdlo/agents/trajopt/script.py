@@ -38,8 +38,8 @@ def script(
     trajectory: Path | None = None,
     rope: RopeMaterial | None = None,
     *,
-    idle: bool = False,
-    vary: int | None = None,
+    no_op: bool = False,
+    reset_seed: int | None = None,
     compiled: bool = False,
 ) -> Script:
     """Return what to play.
@@ -49,8 +49,8 @@ def script(
         trajectory: a file that `torchdlo optimize` wrote, played with the precision and the kind of steps with which it
             was found, so that every bit of it comes back; the scripted demonstration if not given.
         rope: see `torchdlo.envs.make`; a trajectory that was found for another one shows how well it carries over.
-        idle: do nothing.
-        vary: seed of a start that differs from the usual one.
+        no_op: do nothing.
+        reset_seed: seed of a start with noise; without it, the nominal start.
         compiled: whether to compile steps.
 
     Raises:
@@ -61,17 +61,17 @@ def script(
     material = found.pop("rope", None)
     chosen = problem(name, rope, **found)
     if material is not None and rope is None:
-        raise InputError(f"{trajectory}: it was found for a rope of its own; give that one, or another, with --rope.")
-    seeded = torch.Generator().manual_seed(vary or 0)
-    start = {"generator": seeded, "variation": vary is not None}
+        raise InputError(f"{trajectory}: it was found for its own rope; give that one, or another, with --rope-model.")
+    seeded = torch.Generator().manual_seed(reset_seed or 0)
+    start = {"generator": seeded, "variation": reset_seed is not None}
     steps = {"compiled": chosen.compiled, "recorded": chosen.recorded}
     made = episode.prepare(task, 1, like=chosen.like, **steps, **start)
     if trajectory is not None:
         return Script(task, made, chosen.full(load_actions(trajectory, chosen)))
-    way = task.demonstration() if vary is None else task.demonstration(made.start.state)[0]
-    if not idle and not bool((way != 0).any()):
-        raise InputError(f"{name}: has no way by hand; give a --trajectory, or --idle.")
-    return Script(task, made, (0 * way if idle else way).to(chosen.like))
+    way = task.demonstration() if reset_seed is None else task.demonstration(made.start.state)[0]
+    if not no_op and not bool((way != 0).any()):
+        raise InputError(f"{name}: has no scripted demonstration; give a --trajectory, or --no-op.")
+    return Script(task, made, (0 * way if no_op else way).to(chosen.like))
 
 
 def _choices(path: Path) -> dict[str, Any]:

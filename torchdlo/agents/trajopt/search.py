@@ -155,7 +155,7 @@ def optimize(
     plan, robust = settings.plan(problem), settings.robust
     stand_in = problem.surrogate() if plan.surrogates else None
     if plan.surrogates and stand_in is None:
-        raise InputError(f"{problem.name}: it has no rehearsal; set rehearsed to 0.")
+        raise InputError(f"{problem.name}: it has no surrogate task; set surrogate_share to 0.")
     player = _Player(problem, settings, SearchJournal(journal, _options(problem, settings), resume=resume), callback)
     search = METHODS[settings.method](plan, torch.Generator().manual_seed(settings.seed))
     if settings.method not in SURROGATE_ROUND:
@@ -166,16 +166,16 @@ def optimize(
         for k in range(plan.iterations):
             ask = search.send(told)
             scale = robust.scale((k + 1) / plan.iterations) if robust else 0.0
-            rehearses = k < plan.surrogates
+            on_surrogate = k < plan.surrogates
             last = k + 1 == plan.iterations  # nothing is told of it
-            told = player.batch(ask, scale, stand_in if rehearses else problem, gradients=not last)
+            told = player.batch(ask, scale, stand_in if on_surrogate else problem, gradients=not last)
             if k == plan.surrogates > 0:
                 best.clear()  # what did well in a surrogate task has to do so in earnest
                 player.max_return = float(told.returns.max())
             if robust and scale == 1 and curve and curve[-1]["scale"] < 1:
                 best.clear()  # what did well in milder worlds has to do so in these
             best.offer(ask, told)
-            curve.append(_point(player, told, best.max_return, scale, rehearses))
+            curve.append(_point(player, told, best.max_return, scale, on_surrogate))
         finalists = player.judge(best.kept)
     except KeyboardInterrupt:
         if not best.kept:
@@ -186,13 +186,13 @@ def optimize(
     if not math.isfinite(finalists[0].returns):
         raise InputError(f"{problem.name}: none of {player.done} episodes had a finite return; nothing was found.")
     chosen, outcome, kept = _alone(problem, finalists, robust is not None)
-    surrogate_share = curve[-1]["surrogate_share"]  # what it promised there, it does not promise here
+    surrogate = curve[-1]["surrogate"]  # what it promised there, it does not promise here
     return SearchResult(
         chosen.actions,
         outcome,
         kept,
-        -math.inf if surrogate_share else chosen.returns,
-        -math.inf if surrogate_share else best.max_return,
+        -math.inf if surrogate else chosen.returns,
+        -math.inf if surrogate else best.max_return,
         player.done,
         player.seconds,
         curve,
@@ -227,10 +227,10 @@ def _options(problem: Problem, settings: Settings) -> dict[str, Any]:
     return sizes | problem.choices | asdict(settings)
 
 
-def _point(player: _Player, told: Told, best: float, scale: float, surrogate_share: bool) -> dict[str, Any]:
+def _point(player: _Player, told: Told, best: float, scale: float, surrogate: bool) -> dict[str, Any]:
     """Return what a learning curve has about an iteration; of a surrogate task, it tells nothing of the problem
     itself."""
-    if surrogate_share:
+    if surrogate:
         told, best = replace(told, returns=told.returns[:0], success=torch.zeros_like(told.success)), -math.inf
     good = told.returns[torch.isfinite(told.returns)]
     return {
@@ -239,9 +239,9 @@ def _point(player: _Player, told: Told, best: float, scale: float, surrogate_sha
         "median": float(good.median()) if len(good) else None,
         "success": float(told.success.double().mean()),
         "failed": float(told.failed.double().mean()),
-        "without_slope": player.blind,
+        "without_gradient": player.blind,
         "scale": scale,
-        "surrogate_share": surrogate_share,
+        "surrogate": surrogate,
     }
 
 

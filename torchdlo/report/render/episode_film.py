@@ -77,7 +77,7 @@ def film(
         moving["body_pos"] = np.concatenate([moving["body_pos"], pos], 1)
         moving["body_quat"] = np.concatenate([moving["body_quat"], quat], 1)
         looks = looks | {name: np.concatenate([looks[name], value]) for name, value in shapes.items()}
-    return Frames(**moving, **looks, look=_look(task, made.start), interrupted=went is None), went
+    return Frames(**moving, **looks, camera_direction=_look(task, made.start), interrupted=went is None), went
 
 
 def _look(task: Task, start: episode.EpisodeState) -> np.ndarray:

@@ -88,7 +88,7 @@ class Picture:
 
     def _aim(self, pv: Any, low: np.ndarray, high: np.ndarray) -> None:
         """Put camera and lights so that the whole motion fills the picture."""
-        ahead = -np.asarray(self.frames.look, float)
+        ahead = -np.asarray(self.frames.camera_direction, float)
         ahead = ahead / np.linalg.norm(ahead)
         up = np.array([0.0, 0.0, 1.0]) if abs(ahead[2]) < 0.99 else np.array([0.0, 1.0, 0.0])
         right = np.cross(ahead, up)

@@ -228,7 +228,7 @@ def _local(frames: Frames, k: int, reach: float) -> Surface:
 
 def points_of(frames: Frames) -> dict[str, np.ndarray]:
     """Return the numbers of the points of matter by their law."""
-    return {str(law): np.flatnonzero(frames.law == law) for law in np.unique(frames.law)}
+    return {str(law): np.flatnonzero(frames.constitutive_model == law) for law in np.unique(frames.constitutive_model)}
 
 
 def pieces(frames: Frames) -> list[Piece]:

@@ -89,7 +89,7 @@ class Viewer:
         for k, height in enumerate(frames.table):
             at = (*middle[:2], float(height))
             scene.add_grid(f"/table {k}", width=3 * span, height=3 * span, cell_size=0.1, position=at)
-        look = frames.look / np.linalg.norm(frames.look)
+        look = frames.camera_direction / np.linalg.norm(frames.camera_direction)
         camera = self.server.initial_camera
         camera.look_at, camera.position = middle, middle + 1.6 * span * look
 

@@ -40,7 +40,7 @@ def diagnosed(folder: Path, recording: Recording) -> tuple[list[list[str]], Mode
         found = json.loads(file.read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise InputError(
-            f"{file}: expected the findings of torchdlo diagnose, found none; run it first, or give --names."
+            f"{file}: expected the findings of torchdlo diagnose, found none; run it first, or give --effects."
         ) from None
     except (OSError, ValueError) as error:
         raise InputError(f"{file}: expected findings in JSON, but reading failed: {error}.") from None
@@ -80,7 +80,7 @@ def check_names(names: Sequence[str], ties: list[list[str]] | None, bench: Works
             found = ", ".join(tie[0] for tie in ties or []) or "no effect"
             raise InputError(
                 f"{recording.path}: there is nothing to separate: the diagnosis names {found}, and nothing ties with "
-                "it; give --names with two effects to tell apart."
+                "it; give --effects with two effects to tell apart."
             )
     if len(set(names)) < 2:
         raise InputError(f"names: expected two or more effects to tell apart, found {', '.join(names)}.")

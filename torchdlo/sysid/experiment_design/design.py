@@ -201,7 +201,7 @@ def _check(
     if not names and findings is None:
         raise InputError(
             f"{recording.path}: expected the folder of a diagnosis or names of effects to tell apart, found neither; "
-            "run torchdlo diagnose first, or give --names."
+            "run torchdlo diagnose first, or give --effects."
         )
     if not (math.isfinite(seconds) and 1.0 <= seconds <= 60.0):
         raise InputError(f"seconds: expected 1 to 60, found {seconds:g}.")

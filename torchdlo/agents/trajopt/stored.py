@@ -1,0 +1,139 @@
+"""Finished searches in one archive: what each found, and its trajectory to the last bit.
+
+The archive is a compressed .npz. "index" is JSON text, one entry per search: name, task, method, seed, budget, version,
+return, success. "NAME/result" is the text of its result.json, "NAME/trajectory" that of its trajectory.json without the
+arrays, which are entries of their own: "NAME/actions", "NAME/joints", "NAME/tool", "NAME/rewards".
+"""
+
+from __future__ import annotations
+
+import json
+import zipfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from torchdlo.agents.trajopt.result import upgraded
+from torchdlo.errors import InputError
+from torchdlo.files import replacing
+
+__all__ = ["ARCHIVE", "NAME", "load_trajectory", "pack", "read_index", "read_searches", "unpack"]
+
+NAME = "searches.npz"
+"""What an archive is called in the folder of a benchmark."""
+ARCHIVE = Path(__file__).resolve().parents[3] / "experiments" / "trajopt" / NAME
+"""The archive of the benchmark in a checkout of the repository."""
+
+
+def load_trajectory(task: str, method: str, seed: int, archive: str | Path = ARCHIVE) -> dict[str, Any]:
+    """Return a stored trajectory, as its trajectory.json has it, with arrays in the place of lists.
+
+    Args:
+        task: name of the task.
+        method: "cmaes", "gd" or "hybrid".
+        seed: of the search.
+        archive: file that `pack` wrote; by default that of the repository's benchmark.
+
+    Returns:
+        "actions" of shape (T, A) [m, degrees], "rewards" (T,), "return", "success", "choices" (precision and kind of
+        steps with which it was found), and the rest of the file.
+    """
+    name = f"{task}-{method}-{seed}"
+    with _opened(archive) as found:
+        if f"{name}/trajectory" not in found.files:
+            known = ", ".join(entry["name"] for entry in json.loads(str(found["index"])))
+            raise InputError(f"{archive}: expected a search of {known}; asked for {name}.")
+        return _trajectory(found, name)
+
+
+def read_index(archive: str | Path = ARCHIVE) -> list[dict[str, Any]]:
+    """Return what is in an archive: name, task, method, seed, budget, version, return and success of each search."""
+    with _opened(archive) as found:
+        return json.loads(str(found["index"]))
+
+
+def read_searches(archive: str | Path) -> Iterator[tuple[str, dict[str, Any], dict[str, Any]]]:
+    """Yield the name, the result and the trajectory of each search in an archive."""
+    with _opened(archive) as found:
+        for entry in json.loads(str(found["index"])):
+            name = entry["name"]
+            yield name, upgraded(json.loads(str(found[f"{name}/result"]))), _trajectory(found, name)
+
+
+def pack(folder: str | Path, archive: str | Path) -> int:
+    """Write all finished searches in the subfolders of a folder into an archive; return how many there are."""
+    arrays: dict[str, np.ndarray] = {}
+    index = []
+    for file in sorted(Path(folder).glob("*/result.json")):
+        name, result = file.parent.name, upgraded(json.loads(file.read_text(encoding="utf-8")))
+        settings, text = result["settings"], {}
+        for key, value in upgraded(json.loads(file.with_name("trajectory.json").read_text(encoding="utf-8"))).items():
+            if isinstance(value, list):
+                arrays[f"{name}/{key}"] = _exact(value)
+            else:
+                text[key] = value
+        arrays[f"{name}/result"] = np.array(json.dumps(result, separators=(",", ":")))
+        arrays[f"{name}/trajectory"] = np.array(json.dumps(text, separators=(",", ":")))
+        index.append(
+            {"name": name, "task": result["task"], "method": settings["method"], "seed": settings["seed"]}
+            | {"budget": settings["episodes"], "version": result["versions"]["torchdlo"]}
+            | {"return": result["return"], "success": result["success"]}
+        )
+    # Text is kept as bytes of UTF-8: an array of characters would take four bytes for each.
+    packed = {k: np.frombuffer(str(v).encode(), np.uint8) if v.dtype.kind == "U" else v for k, v in arrays.items()}
+    with replacing(Path(archive)) as temporary:
+        np.savez_compressed(temporary, index=np.frombuffer(json.dumps(index).encode(), np.uint8), **packed)
+    return len(index)
+
+
+def unpack(archive: str | Path, folder: str | Path) -> None:
+    """Write result.json and trajectory.json of each search in an archive into a subfolder of its name."""
+    for name, result, trajectory in read_searches(archive):
+        plain = {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in trajectory.items()}
+        target = Path(folder) / name
+        target.mkdir(parents=True, exist_ok=True)
+        (target / "result.json").write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+        (target / "trajectory.json").write_text(json.dumps(plain) + "\n", encoding="utf-8")
+
+
+def _exact(value: list[Any]) -> np.ndarray:
+    """Return numbers in single precision where that keeps every bit, else in double."""
+    wide = np.array(value, dtype=np.float64)
+    narrow = wide.astype(np.float32)
+    return narrow if np.array_equal(narrow.astype(np.float64), wide, equal_nan=True) else wide
+
+
+def _trajectory(found: Any, name: str) -> dict[str, Any]:
+    content = json.loads(str(found[f"{name}/trajectory"]))
+    own = [
+        key for key in found.files if key.startswith(f"{name}/") and key.split("/")[1] not in ("result", "trajectory")
+    ]
+    return content | {key.split("/")[1]: found[key].astype(np.float64) for key in own}
+
+
+class _Archive:
+    """An opened archive, whose texts are text."""
+
+    def __init__(self, inner: Any) -> None:
+        self.inner, self.files = inner, inner.files
+
+    def __enter__(self) -> _Archive:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.inner.close()
+
+    def __getitem__(self, key: str) -> Any:
+        value = self.inner[key]
+        return value.tobytes().decode() if value.dtype == np.uint8 else value
+
+
+def _opened(archive: str | Path) -> _Archive:
+    try:
+        return _Archive(np.load(archive, allow_pickle=False))
+    except FileNotFoundError:
+        raise InputError(f"{archive}: expected an archive of searches, found none.") from None
+    except (ValueError, OSError, EOFError, zipfile.BadZipFile) as error:
+        raise InputError(f"{archive}: expected an archive of searches, but reading failed: {error}.") from None

@@ -1,0 +1,284 @@
+"""Commands of identification: calibrate, diagnose, design the next experiment; slow imports wait until they run."""
+
+from __future__ import annotations
+
+import shlex
+import shutil
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from torchdlo.cli.options import INTERRUPTED, ModelOption, RecordingArgument, ResumeOption
+from torchdlo.cli.progress import deferred_interrupt, progress
+from torchdlo.errors import InputError
+from torchdlo.files import check_writable, write_atomically
+
+if TYPE_CHECKING:
+    from torchdlo.sysid.estimation.result import Calibration
+    from torchdlo.sysid.recordings.recording import Recording
+
+__all__ = ["calibrate", "design_experiment", "diagnose"]
+
+_QUICK = {"starts": 12, "iterations": 5}
+"""What --quick sets unless the options say otherwise."""
+
+
+def calibrate(
+    recording: RecordingArgument,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            help="Model file to write; calibration.json, report.html and report.png go beside it. "
+            "Default: runs/calibrate/NAME/model.json.",
+            metavar="DIR/model.json",
+        ),
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the random starts.")] = 0,
+    starts: Annotated[int | None, typer.Option(min=1, help="Number of starts, run as one batch.")] = None,
+    iterations: Annotated[int | None, typer.Option(min=1, help="Iterations of the fit.")] = None,
+    vertices: Annotated[int | None, typer.Option(min=3, help="Vertices of the simulated rope.")] = None,
+    rest: Annotated[
+        str,
+        typer.Option(
+            help="Rest shape: straight, given (rest_positions of rope.json), or auto: whichever predicts the train "
+            "trials better.",
+            metavar="auto|straight|given",
+        ),
+    ] = "auto",
+    model: ModelOption = None,
+    quick: Annotated[bool, typer.Option("--quick", help="A rough fit in a fraction of the time.")] = False,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on from the checkpoint beside the model file.")] = False,
+) -> None:
+    """Fit a rope model to the train trials and judge it on the test trials.
+
+    Ctrl-C stops after the running iteration and keeps the best found so far.
+
+    [bold]Examples:[/bold]
+
+    torchdlo calibrate my_rope
+
+    torchdlo calibrate my_rope --out runs/my_rope/model.json --starts 16 --seed 1
+
+    torchdlo calibrate my_rope --quick --json | jq .test_mae_mm
+
+    torchdlo calibrate my_rope --model runs/diagnose/my_rope/model.json
+    """
+    from torchdlo.sysid.recordings.recording import load_recording
+
+    loaded = load_recording(recording)
+    if out is None:
+        out = Path("runs") / "calibrate" / recording.resolve().name / "model.json"
+    elif out.is_dir() or out.suffix != ".json":
+        out = out / "model.json"
+    _check_outputs(out, resume)
+    options: dict[str, Any] = {"starts": starts, "iterations": iterations, "vertices": vertices}
+    if quick:
+        options = {name: value or _QUICK.get(name) for name, value in options.items()}
+    options = {name: value for name, value in options.items() if value is not None} | _given(model)
+    result = _run_calibration(
+        loaded, seed=seed, rest=rest, checkpoint=out.with_name("checkpoint.json"), resume=resume, **options
+    )
+    _write_outputs(result, loaded, recording, out, quiet=as_json)
+    if as_json:
+        from torchdlo.sysid.estimation.result import summary_json
+
+        typer.echo(summary_json(result, recording), nl=False)
+    if result.interrupted:
+        raise typer.Exit(INTERRUPTED)
+
+
+def diagnose(
+    recording: RecordingArgument,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out",
+            "-o",
+            help="Folder for findings.json, model.json and report.html. Default: runs/diagnose/NAME.",
+            metavar="DIR",
+        ),
+    ] = None,
+    budget: Annotated[str, typer.Option(help="How much work to do.", metavar="fast|full")] = "fast",
+    as_json: Annotated[bool, typer.Option("--json", help="Print the findings as JSON.")] = False,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the random starts.")] = 0,
+    vertices: Annotated[int | None, typer.Option(min=3, help="Vertices of the simulated rope.")] = None,
+    trials: Annotated[
+        int | None, typer.Option(min=1, help="Most train trials to use, evenly picked; fast takes 8, full 16.")
+    ] = None,
+    workers: Annotated[int | None, typer.Option(min=1, help="Processes; one per core if not given.")] = None,
+    model: ModelOption = None,
+    exclude_effect: Annotated[
+        list[str] | None, typer.Option(help="An effect not to look for; may be repeated.", metavar="EFFECT")
+    ] = None,
+    resume: ResumeOption = False,
+) -> None:
+    """Find what the model lacks: name the missing effect, add it, and show the gap shrink.
+
+    The baseline is calibrated first; every effect of the library is then tried on what it leaves over, and kept only if
+    it closes the gap on trials that were not used. Ctrl-C stops after the running step; --resume goes on from there.
+
+    [bold]Examples:[/bold]
+
+    torchdlo diagnose my_rope
+
+    torchdlo diagnose my_rope --out runs/my_rope --resume
+
+    torchdlo diagnose my_rope --model runs/my_rope/model.json --out runs/my_rope_2
+    """
+    from torchdlo.report.pages import diagnosis as report
+    from torchdlo.sysid.diagnosis.findings import findings_json, model_json, summary
+    from torchdlo.sysid.diagnosis.search import diagnose as search
+    from torchdlo.sysid.recordings.recording import load_recording
+
+    loaded = load_recording(recording)
+    out = out or Path("runs") / "diagnose" / recording.resolve().name
+    names = ("findings.json", "model.json", report.PAGE)
+    for name in names:
+        check_writable(out / name)
+    options = {"budget": budget, "seed": seed, "vertices": vertices, "trials": trials, "workers": workers}
+    options |= _given(model) | {"without": exclude_effect or ()}
+    journal = out / "journal"
+    try:
+        with progress() as show, deferred_interrupt(show) as callback:
+            result = search(loaded, **options, callback=callback, journal=journal, resume=resume)
+    except KeyboardInterrupt:
+        typer.echo(f"interrupted before there was a verdict; --resume goes on from {journal}", err=True)
+        raise SystemExit(INTERRUPTED) from None
+    # What cannot be trusted was taken out of it.
+    loaded = result.model.recording
+    write_atomically(out / "findings.json", findings_json(result, loaded))
+    write_atomically(out / "model.json", model_json(result))
+    page = report.write_report(result, loaded, out, command=shlex.join(["torchdlo", *sys.argv[1:]]))
+    shutil.rmtree(journal, ignore_errors=True)
+    typer.echo(summary(result, loaded), err=as_json)
+    for fault in result.health:
+        typer.echo(f"data: {fault.trial + ': ' if fault.trial else ''}{fault.said}", err=as_json)
+    typer.echo(f"findings: {out / 'findings.json'}\nreport:   {page}", err=as_json)
+    if as_json:
+        typer.echo(findings_json(result, loaded), nl=False)
+
+
+def design_experiment(
+    recording: RecordingArgument,
+    findings: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder of a finished diagnosis. Default: runs/diagnose/NAME, unless --effects are given.",
+            metavar="DIR",
+        ),
+    ] = None,
+    effects: Annotated[
+        str, typer.Option(help="Effects to tell apart, with commas. Default: those that tie in the findings.")
+    ] = "",
+    seconds: Annotated[float, typer.Option(help="How long the motion lasts.")] = 3.0,
+    scale: Annotated[
+        float, typer.Option(help="Factor by which it may leave the workspace, and exceed the speeds, of the recording.")
+    ] = 1.0,
+    tip_mass: Annotated[
+        float, typer.Option(help="Known mass in kg that can be hung on the rope's free end, or its middle.")
+    ] = 0.0,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out",
+            "-o",
+            help="Folder for design.json, motion.npz, report.html and design.png. Default: runs/design/NAME.",
+            metavar="DIR",
+        ),
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the search.")] = 0,
+    vertices: Annotated[int | None, typer.Option(min=3, help="Vertices of the simulated rope.")] = None,
+    workers: Annotated[int | None, typer.Option(min=1, help="Processes; one per core if not given.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the design as JSON.")] = False,
+    resume: ResumeOption = False,
+) -> None:
+    """Find the motion of the grippers that tells apart effects which a recording cannot.
+
+    Ctrl-C stops after the running step; --resume goes on from there.
+
+    [bold]Examples:[/bold]
+
+    torchdlo design-experiment my_rope
+
+    torchdlo design-experiment my_rope --effects wind,tilted_gravity --seconds 4
+    """
+    from torchdlo.report.pages import design as report
+    from torchdlo.sysid.experiment_design import design as designs
+    from torchdlo.sysid.recordings.recording import load_recording
+
+    loaded = load_recording(recording)
+    asked, name = [n.strip() for n in effects.split(",") if n.strip()], recording.resolve().name
+    if findings is None and not asked:
+        findings = Path("runs") / "diagnose" / name
+    out = out or Path("runs") / "design" / name
+    for file in report.FILES[:-1]:
+        check_writable(out / file)
+    if (out / "motion.npz").exists() and not (out / "design.json").exists():
+        raise InputError(f"{out / 'motion.npz'}: exists without design.json; move it away or choose another --out.")
+    options = {"seconds": seconds, "scale": scale, "mass": tip_mass, "seed": seed}
+    journal = out / "journal"
+    options |= {"vertices": vertices, "workers": workers, "journal": journal, "resume": resume}
+    try:
+        with progress() as show, deferred_interrupt(show) as callback:
+            design = designs.design_experiment(loaded, asked, findings=findings, callback=callback, **options)
+    except KeyboardInterrupt:
+        typer.echo(f"interrupted before there was a result; --resume goes on from {journal}", err=True)
+        raise typer.Exit(INTERRUPTED) from None
+    report.write_design(design, out, command=shlex.join(["torchdlo", *sys.argv[1:]]))
+    shutil.rmtree(journal, ignore_errors=True)
+    typer.echo(f"{designs.summary(design)}\n", err=as_json)
+    typer.echo("\n".join(f"- {said}" for said in designs.rationale(design)), err=as_json)
+    typer.echo(f"\n{report.design_table(design)}\n", err=as_json)
+    typer.echo(f"motion: {out / 'motion.npz'}\nreport: {out / 'report.html'}", err=as_json)
+    if as_json:
+        typer.echo(designs.design_json(design), nl=False)
+
+
+def _run_calibration(recording: Recording, **options: Any) -> Calibration:
+    # Imported before the bar starts: a first import of torch takes seconds.
+    from torchdlo.sysid.calibration.calibrate import calibrate as fit
+
+    try:
+        with progress() as show, deferred_interrupt(show) as callback:
+            return fit(recording, workers=None, callback=callback, **options)
+    except KeyboardInterrupt:
+        typer.echo("interrupted before there was a result; nothing was written", err=True)
+        raise SystemExit(INTERRUPTED) from None
+
+
+def _given(model: Path | None) -> dict[str, Any]:
+    """Return the option of a search that starts from a model file."""
+    if model is None:
+        return {}
+    from torchdlo.sysid.model import model_file
+
+    return {"given": model_file.load(model)}
+
+
+def _check_outputs(out: Path, resume: bool) -> None:
+    """Refuse before the work what could not be written after it."""
+    from torchdlo.report.pages import calibration as report
+
+    for name in (out.name, "calibration.json", "checkpoint.json", report.PAGE, report.PICTURE):
+        check_writable(out.with_name(name))
+    checkpoint = out.with_name("checkpoint.json")
+    if resume and not checkpoint.is_file():
+        raise InputError(
+            f"{checkpoint}: expected the checkpoint of an earlier calibration to resume, "
+            "found none; leave out --resume."
+        )
+
+
+def _write_outputs(result: Calibration, recording: Recording, given: Path, out: Path, *, quiet: bool) -> None:
+    from torchdlo.report.pages import calibration as report
+    from torchdlo.sysid.estimation.result import model_json, summary_json
+
+    command = shlex.join(["torchdlo", *sys.argv[1:]])
+    write_atomically(out, model_json(result))
+    write_atomically(out.with_name("calibration.json"), summary_json(result, given))
+    page, _ = report.write_report(result, recording, out.parent, command=command)
+    typer.echo(report.verdict(result, recording), err=quiet)
+    typer.echo(f"model:  {out}\nreport: {page}", err=quiet)

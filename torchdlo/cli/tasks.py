@@ -1,0 +1,200 @@
+"""Commands of the manipulation tasks: list, play, optimise; what is slow to import is imported when they run."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from torchdlo.cli.options import INTERRUPTED, ResumeOption, RopeModelOption
+from torchdlo.cli.progress import deferred_interrupt, progress
+from torchdlo.cli.scenes import check_files, draw
+from torchdlo.errors import InputError
+from torchdlo.files import check_writable, write_atomically
+
+__all__ = ["optimize", "play", "tasks"]
+
+
+def tasks(as_json: Annotated[bool, typer.Option("--json", help="Print the list as JSON.")] = False) -> None:
+    """List the manipulation tasks: what there is to do, with how many arms, in how many actions.
+
+    [bold]Example:[/bold] torchdlo tasks --json
+    """
+    from torchdlo.envs import listing
+
+    rows = listing()
+    if as_json:
+        typer.echo(json.dumps(rows, indent=1))
+        return
+    for row in rows:
+        arms = "1 arm" if row["arms"] == 1 else f"{row['arms']} arms"
+        typer.echo(f"{row['name']:<12} {row['what']} ({arms}, {row['actions']} actions of {row['seconds']:g} s)")
+
+
+def play(
+    task: Annotated[str, typer.Argument(help="Name of the task.", metavar="TASK")],
+    trajectory: Annotated[
+        Path | None,
+        typer.Option(help="What optimize found. Default: the scripted demonstration.", metavar="FILE"),
+    ] = None,
+    no_op: Annotated[bool, typer.Option("--no-op", help="Do nothing: all actions are zero.")] = False,
+    reset_seed: Annotated[
+        int | None,
+        typer.Option(min=0, help="Seed of a reset with noise; without it, the nominal start.", metavar="SEED"),
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", "-o", help="Folder for frames.npz and pictures. Default: runs/play/TASK.", metavar="DIR"),
+    ] = None,
+    video: Annotated[bool, typer.Option("--video", help="Write motion.mp4, too.")] = False,
+    picture: Annotated[bool, typer.Option("--picture", help="Write picture.png, too: start, middle and end.")] = False,
+    speed: Annotated[float, typer.Option(min=0.001, help="Seconds of the episode per second of the video.")] = 0.5,
+    arms: Annotated[bool, typer.Option(help="Show the arms.")] = True,
+    rope_model: RopeModelOption = None,
+    compiled: Annotated[
+        bool,
+        typer.Option(
+            "--compiled",
+            help="Compile the step instead of recording it: minutes at first. "
+            "A trajectory is played with the steps with which it was found.",
+        ),
+    ] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print how it went as JSON.")] = False,
+) -> None:
+    """Play an episode of a task, say what it earns, and keep frames to look at. Ctrl-C stops and keeps those so far.
+
+    [bold]Examples:[/bold]
+
+    torchdlo play wrapping --video
+
+    torchdlo play coiling --trajectory runs/optimize/coiling-hybrid/trajectory.json --picture
+
+    torchdlo view runs/play/wrapping
+    """
+    from torchdlo.agents.trajopt.script import script
+    from torchdlo.report.render.episode_film import film, outcome_of
+    from torchdlo.scene_files import cable
+    from torchdlo.scene_files.run import save_frames
+
+    if no_op and trajectory is not None:
+        raise InputError("--no-op and --trajectory: expected one of them, or neither for the scripted demonstration.")
+    files = check_files(out or Path("runs") / "play" / task, video=video, picture=picture)
+    played = script(
+        task,
+        trajectory,
+        None if rope_model is None else cable(rope_model),
+        no_op=no_op,
+        reset_seed=reset_seed,
+        compiled=compiled,
+    )
+    with progress() as show, deferred_interrupt(show) as callback:
+        frames, went = film(played.task, played.actions, made=played.episode, arms=arms, callback=callback)
+    save_frames(frames, files["frames"])
+    drawn = draw(frames, files, task, speed) and went is not None
+    said = outcome_of(went) | {"files": [str(file) for file in files.values() if file.exists()]}
+    how = "failed" if said["failed"] else "success" if said["success"] else "no success"
+    earned = "interrupted" if went is None else f"return {said['return']:.4g}, {how}"
+    missed = f"; do not trust it: {said['missed']}" if said["missed"] else ""
+    typer.echo(f"{task}: {earned}{missed}", err=as_json)
+    typer.echo("\n".join(said["files"]), err=as_json)
+    if as_json:
+        typer.echo(json.dumps(said, indent=1))
+    if not drawn:
+        raise typer.Exit(INTERRUPTED)
+
+
+def optimize(
+    task: Annotated[str, typer.Argument(help="Name of the task.", metavar="TASK")],
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out",
+            "-o",
+            help="Folder for result.json, trajectory.json and curve.png. Default: runs/optimize/TASK-METHOD, "
+            "and -SEED if that is not 0.",
+            metavar="DIR",
+        ),
+    ] = None,
+    method: Annotated[
+        str,
+        typer.Option(help="CMA-ES, gradient descent, or both with a search for contact.", metavar="cmaes|gd|hybrid"),
+    ] = "hybrid",
+    episodes: Annotated[
+        int | None, typer.Option(min=1, help="Budget; an episode counts once, with its gradient or without.")
+    ] = None,
+    population: Annotated[int | None, typer.Option(min=1, help="Trajectories per iteration.")] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the search.")] = 0,
+    robust: Annotated[
+        bool, typer.Option("--robust", help="Play each trajectory from several starts that grow apart.")
+    ] = False,
+    rope_model: RopeModelOption = None,
+    dtype: Annotated[str, typer.Option(help="Precision of the physics.", metavar="float32|float64")] = "float32",
+    compiled: Annotated[bool, typer.Option(help="Compile the step: slow at first, then many times faster.")] = True,
+    recorded: Annotated[
+        bool,
+        typer.Option(
+            "--recorded", help="Trace the step instead of compiling it: takes seconds, helps where cmaes searches."
+        ),
+    ] = False,
+    resume: ResumeOption = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
+) -> None:
+    """Search the trajectory of the tools that earns most in a task.
+
+    Budget, way-points and first steps that are not given are the published ones of the task: up to 20 000 episodes,
+    each of which may take some seconds. Ctrl-C keeps the best so far; a search that was stopped or killed goes on with
+    --resume, and ends as if it had never stopped. Without it, a search begins anew and what was stopped is lost.
+
+    [bold]Examples:[/bold]
+
+    torchdlo optimize coiling --episodes 600 --out runs/coil
+
+    torchdlo optimize wiring_post --method cmaes --seed 1 --episodes 4000 --population 100
+
+    torchdlo optimize wiring_post --robust --resume
+    """
+    from torchdlo.agents.trajopt.presets import preset
+    from torchdlo.agents.trajopt.result import result_json, summary, trajectory_json
+    from torchdlo.agents.trajopt.search import Robust
+    from torchdlo.agents.trajopt.search import optimize as search
+    from torchdlo.agents.trajopt.search_journal import remove
+    from torchdlo.agents.trajopt.task_problem import problem
+    from torchdlo.report.figures.learning_curve import learning_png
+    from torchdlo.scene_files import cable
+
+    out = out or Path("runs") / "optimize" / f"{task}-{method}{f'-{seed}' if seed else ''}"
+    for name in ("result.json", "trajectory.json", "curve.png"):
+        check_writable(out / name)
+    steps = {"compiled": compiled and not recorded, "recorded": recorded}
+    chosen = problem(task, None if rope_model is None else cable(rope_model), double=_is_double(dtype), **steps)
+    given = {"episodes": episodes, "population": population, "robust": Robust() if robust else None, "seed": seed}
+    settings = preset(task, method, **given)
+    try:
+        with progress() as show, deferred_interrupt(show) as callback:
+            found = search(chosen, settings, journal=out / "journal", resume=resume, callback=callback)
+    except KeyboardInterrupt:
+        typer.echo(f"interrupted before there was a result; --resume goes on from {out / 'journal'}", err=True)
+        raise typer.Exit(INTERRUPTED) from None
+    result = result_json(found, chosen, settings)
+    write_atomically(out / "trajectory.json", trajectory_json(found, chosen))
+    write_atomically(out / "result.json", result)
+    write_atomically(out / "curve.png", learning_png({f"{task}, seed {seed}": {method: [found.curve]}}))
+    if not found.interrupted:
+        remove(out / "journal")
+    typer.echo(summary(found, task), err=as_json)
+    typer.echo(f"result:     {out / 'result.json'}\ntrajectory: {out / 'trajectory.json'}", err=as_json)
+    typer.echo(f"curve:      {out / 'curve.png'}", err=as_json)
+    if as_json:
+        typer.echo(result, nl=False)
+    if found.interrupted:
+        typer.echo(f"--resume goes on from {out / 'journal'}", err=True)
+        raise typer.Exit(INTERRUPTED)
+
+
+def _is_double(dtype: str) -> bool:
+    """Return whether a name is that of double precision, and refuse one that is of none."""
+    if dtype not in ("float32", "float64"):
+        raise InputError(f"--dtype: expected float32 or float64, given {dtype!r}.")
+    return dtype == "float64"
