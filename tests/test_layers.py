@@ -14,6 +14,9 @@ PACKAGE = ROOT / "torchdlo"
 
 FLOORS = {
     "errors": 0,
+    "lazy": 0,
+    "notices": 0,
+    "cache": 1,
     "files": 1,
     "physics": 2,
     "coupling": 3,
@@ -33,6 +36,9 @@ ARRAYS = TORCH | {"numpy", "scipy"}
 LEARNING = TORCH | {"tensordict", "torchrl"}
 ALLOWED = {
     "errors": set(),
+    "lazy": set(),
+    "notices": set(),
+    "cache": set(),
     "files": set(),
     "physics": TORCH | {"triton"},  # comes with the CUDA builds of torch
     "coupling": TORCH | {"pytorch_kinematics", "trimesh"},

@@ -27,6 +27,7 @@ from torchdlo.physics.execution import tracing
 from torchdlo.physics.execution.replay import alike, rollout
 from torchdlo.physics.integrators import stability
 from torchdlo.physics.integrators.rod_step import INTEGRATORS, TWISTS, Settings, settle_twist, substep
+from torchdlo.physics.kernels import native
 from torchdlo.physics.rod import assembly, validation
 from torchdlo.physics.rod import kinematics as rod
 from torchdlo.physics.rod.assembly import Rope
@@ -349,9 +350,9 @@ def stepper(scene: Scene, *, compiled: bool = True, recorded: bool = False):
     Recorded steps take seconds at the first call, and then, without gradients, half to a third of the time. Compiled
     ones take ten seconds to minutes at first, with and without gradients, and are many times faster then. A step of one
     substep is compiled as a whole; of more, the substep is, so that their number does not matter.
-    Compiled steps need a C++ compiler on the CPU.
+    Compiled steps need a C++ compiler; without one they are not compiled, with one warning.
     """
-    if not compiled:
+    if not compiled or not native.prepare_torch_compile():
         return tracing.Recorded(partial(step, scene)) if recorded else partial(step, scene)
     compile = partial(torch.compile, fullgraph=True, dynamic=False, isolate_recompiles=True)
     once = scene.substeps == 1 and not any(e.is_contact for e in scene.effects)

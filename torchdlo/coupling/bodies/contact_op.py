@@ -32,7 +32,7 @@ _NUMBERS = {"HARD": HARD, "FIT": FIT} | {
     n: getattr(contact_points, n) for n in ("ROUND", "FEET", "ARC", "SPREAD", "FLAT")
 }
 _OPTIONS = tuple(f"-D{name}={value}" for name, value in _NUMBERS.items())
-_function, ready = scene_packing.kernel("body_pairs", *_OPTIONS)
+_function, ready = scene_packing.kernel("body_pairs", "BodyContact, the forces of contact", *_OPTIONS)
 
 
 class _Sizes(ctypes.Structure):

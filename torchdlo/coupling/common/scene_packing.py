@@ -18,11 +18,21 @@ _operators = torch.library.Library("torchdlo", "FRAGMENT")
 _KINDS = {torch.float32: "float", torch.float64: "double"}
 
 
-def kernel(name: str, *options: str) -> tuple[Callable, Callable[[str, torch.dtype], bool]]:
+def _constant(ask: Callable) -> Callable:
+    """Let compilers take what a function returns as a constant: `torch.compiler.assume_constant_result`.
+
+    That one imports the compiler, which takes a second and is of no use in steps that are not compiled.
+    """
+    ask._dynamo_marked_constant = True
+    return ask
+
+
+def kernel(name: str, what: str, *options: str) -> tuple[Callable, Callable[[str, torch.dtype], bool]]:
     """Return what finds a function of a C++ kernel by its name and the dtype of its numbers, and `ready`.
 
     Args:
         name: of the source file, beside this one.
+        what: what it does, in words of the user.
         options: what the compiler is told besides the usual.
     """
 
@@ -33,10 +43,10 @@ def kernel(name: str, *options: str) -> tuple[Callable, Callable[[str, torch.dty
     def function(what: str, dtype: torch.dtype) -> Callable:
         return getattr(library(), f"{name}_{_KINDS[dtype]}_{what}")
 
-    @torch.compiler.assume_constant_result
+    @_constant
     def ready(device: str, dtype: torch.dtype) -> bool:
         """Return whether the kernel works for tensors of a kind of device and a dtype."""
-        return device == "cpu" and dtype in _KINDS and library() is not None
+        return native.works_on(device, what) and dtype in _KINDS and library() is not None
 
     return function, ready
 

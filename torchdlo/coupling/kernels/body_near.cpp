@@ -2,6 +2,7 @@
 //
 // mass (scenes, nodes), origin (scenes, 3), solids (scenes, bodies, 17), chosen (scenes, room), lost (scenes).
 #include "edge_points.h"
+#include "flush.h"
 
 #include <algorithm>
 #include <limits>
@@ -79,7 +80,8 @@ static void scene(const T* mass, const T* origin, const T* solids, int64_t* chos
                                          int64_t* lost, const Sizes* n, int threads) {                            \
     const int64_t count = n->size[0] * n->size[1] * n->size[2];                                                   \
     _Pragma("omp parallel for num_threads(threads)") for (int64_t b = 0; b < n->scenes; ++b)                      \
-        scene<T>(mass + b * count, origin + 3 * b, solids + 17 * b * n->bodies, chosen + b * n->room, lost + b, *n); \
+        if (const FlushTiny flush; true)                                                                          \
+            scene<T>(mass + b * count, origin + 3 * b, solids + 17 * b * n->bodies, chosen + b * n->room, lost + b, *n); \
   }
 ENTRY(float)
 ENTRY(double)

@@ -5,6 +5,7 @@
 // A block of scenes is worked on side by side; pairs that are far apart in all of them cost next to nothing.
 #include "body_links.h"
 #include "elimination.h"
+#include "flush.h"
 
 #include <memory>
 
@@ -342,7 +343,8 @@ static Block<T>& working(const Sizes& n) {
   return *kept;
 }
 
-#define BLOCKS _Pragma("omp parallel for num_threads(threads)") for (int64_t b = 0; b < n.scenes; b += WIDTH<T>)
+#define BLOCKS _Pragma("omp parallel for num_threads(threads)") \
+  for (int64_t b = 0; b < n.scenes; b += WIDTH<T>) if (const FlushTiny flush; true)
 
 template <typename T>
 static void exert(const T* const* in, T* const* out, const Sizes& n, int threads) {

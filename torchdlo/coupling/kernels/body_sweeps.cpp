@@ -5,6 +5,7 @@
 //
 // A block of scenes is worked on side by side; points that are active in none of them cost next to nothing.
 #include "body_points.h"
+#include "flush.h"
 
 #include <memory>
 #include <vector>
@@ -261,7 +262,8 @@ static Block<T>& working(const Sizes& n) {
   return *kept;
 }
 
-#define BLOCKS _Pragma("omp parallel for num_threads(threads)") for (int64_t b = 0; b < n.scenes; b += WIDTH<T>)
+#define BLOCKS _Pragma("omp parallel for num_threads(threads)") \
+  for (int64_t b = 0; b < n.scenes; b += WIDTH<T>) if (const FlushTiny flush; true)
 
 // Fields of edges, of vertices and of bodies.
 template <typename T>

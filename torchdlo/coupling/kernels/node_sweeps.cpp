@@ -8,6 +8,8 @@
 #include <limits>
 #include <vector>
 
+#include "flush.h"
+
 struct Sizes {
   int64_t scenes, nodes, vertices, sweeps;
   const int64_t *size, *after;  // nodes along each axis; next vertices, -1 where there is no edge
@@ -391,6 +393,7 @@ template <typename T>
 static void sweep(T* const* from, V3<T>* given, V3<T>* vel, const Sizes& n, int threads) {
 #pragma omp parallel num_threads(threads)
   {
+    const FlushTiny flush;
     Scene<T> scene(n);
     SCENES {
       const Inputs<T> in(from, b, n);
@@ -407,6 +410,7 @@ template <typename T>
 static void back(T* const* from, const V3<T>* by, T* const* out, const Sizes& n, int threads) {
 #pragma omp parallel num_threads(threads)
   {
+    const FlushTiny flush;
     Scene<T> scene(n);
     std::vector<V3<T>> given;
     SCENES {

@@ -6,6 +6,7 @@
 #include <algorithm>
 #include <memory>
 
+#include "flush.h"
 #include "segments.h"
 
 struct Sizes {
@@ -200,7 +201,7 @@ struct Scene {
 
 #define SCENES                                                            \
   _Pragma("omp parallel for schedule(static, 8) num_threads(threads)") \
-  for (int64_t b = 0; b < n.scenes; ++b)
+  for (int64_t b = 0; b < n.scenes; ++b) if (const FlushTiny flush; true)
 
 template <typename T>
 static void look(const T* const* rods, const T* const* carried, int64_t* at, T* real, T* lost, T* reach,

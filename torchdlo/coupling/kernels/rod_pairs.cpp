@@ -7,6 +7,7 @@
 #include <algorithm>
 #include <memory>
 
+#include "flush.h"
 #include "rod_pairs.h"
 
 struct Sizes {
@@ -328,7 +329,7 @@ static Work<T>& working(const Sizes& n) {
 // Neighbouring scenes share lines of memory.
 #define SCENES                                                            \
   _Pragma("omp parallel for schedule(static, 8) num_threads(threads)") \
-  for (int64_t b = 0; b < n.scenes; ++b)
+  for (int64_t b = 0; b < n.scenes; ++b) if (const FlushTiny flush; true)
 
 template <typename T>
 static void sweep(const T* const* in, const T* const* laws, const int64_t* at, const T* real, T* const* out,

@@ -6,6 +6,8 @@
 #include <cstdint>
 #include <limits>
 
+#include "flush.h"
+
 static const int W = 16;  // tensors side by side
 
 template <typename T>
@@ -148,6 +150,7 @@ template <typename T, int WHICH>
 static void act(const T* tensors, const T* by, T* out, int64_t count, int threads) {
 #pragma omp parallel for num_threads(threads)
   for (int64_t first = 0; first < count; first += W) {
+    const FlushTiny flush;
     const int lanes = count - first < W ? int(count - first) : W;
     Basis<T> b;
     b.find(tensors + first, count, lanes);

@@ -7,6 +7,8 @@
 #include <cmath>
 #include <cstdint>
 
+#include "flush.h"
+
 template <typename T>
 struct Lanes;
 template <>
@@ -151,7 +153,8 @@ static void divide_back(const T* grid, const T* by, const T* mass_by, T* out, in
   }
 }
 
-#define SCENES _Pragma("omp parallel for num_threads(threads)") for (int64_t b = 0; b < scenes; ++b)
+#define SCENES _Pragma("omp parallel for num_threads(threads)") \
+  for (int64_t b = 0; b < scenes; ++b) if (const FlushTiny flush; true)
 
 template <typename T>
 static void run(int which, const T* at, T* value, T* slope, T* grid, T* out, int64_t scenes, int64_t count,

@@ -5,6 +5,8 @@
 #include <cmath>
 #include <cstdint>
 
+#include "flush.h"
+
 enum Kind { OPEN, SEPARATE, SLIP, STICK };
 
 struct Sizes {
@@ -64,7 +66,8 @@ static void each(const T* origin, const Sizes& n, F call) {
   }
 }
 
-#define SCENES _Pragma("omp parallel for num_threads(threads)") for (int64_t b = 0; b < n.scenes; ++b)
+#define SCENES _Pragma("omp parallel for num_threads(threads)") \
+  for (int64_t b = 0; b < n.scenes; ++b) if (const FlushTiny flush; true)
 
 template <typename T>
 static void act(const T* vel, const T* origin, const T* friction, T* out, const Sizes& n, int threads) {

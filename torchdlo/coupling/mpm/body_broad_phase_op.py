@@ -20,7 +20,7 @@ from torchdlo.coupling.common.vector_components import axes
 from torchdlo.coupling.mpm.particles import Grid
 from torchdlo.coupling.mpm.substep import Nodes
 
-_function, ready = scene_packing.kernel("body_near")
+_function, ready = scene_packing.kernel("body_near", "BodyMatter, which bodies are near particles")
 
 
 class _Sizes(ctypes.Structure):

@@ -18,7 +18,7 @@ from torchdlo.physics.linalg.numerics import safe_norm
 
 _INPUTS = "Tensor vel, Tensor origin, Tensor friction"
 _STATIC = "int[] size, int[] nodes, int[] kinds"
-_function, ready = scene_packing.kernel("walls")
+_function, ready = scene_packing.kernel("walls", "material points, the walls of their box")
 
 
 class _Sizes(ctypes.Structure):

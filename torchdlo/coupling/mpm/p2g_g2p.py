@@ -23,10 +23,16 @@ from torchdlo.physics.kernels import native
 _SPREAD, _COLLECT, _TILT = range(3)
 
 
+def _library_for(like: Tensor) -> ctypes.CDLL | None:
+    if not native.works_on(like.device.type, "material points, the transfer between particles and grid"):
+        return None
+    return native.library(native.COUPLING / "transfer.cpp")
+
+
 def _native(which: int, size: Sequence[int], *tensors: Tensor) -> bool:
     """Run the C++ kernel on (at, value, slope, grid, out); whether it could."""
-    library = native.library(native.COUPLING / "transfer.cpp")
     at = tensors[0]
+    library = _library_for(at)
     if library is None or at.dtype not in (torch.float32, torch.float64):
         return False
     call = library.transfer_double if at.dtype == torch.float64 else library.transfer_float
@@ -74,7 +80,7 @@ def _reach(grid: Tensor, nodes: Tensor) -> Tensor:
 
 def _spread(at: Tensor, value: Tensor, slope: Tensor, size: Sequence[int]) -> Tensor:
     grid = at.new_zeros(at.shape[0], size[0] * size[1] * size[2], 4)
-    if at.device.type == "cpu" and _native(_SPREAD, size, at, value, slope, grid, grid):
+    if _native(_SPREAD, size, at, value, slope, grid, grid):
         return grid
     nodes, distance, weight, _ = _stencil(at, size)
     said = (weight[:, None] * _said(value, slope, distance)).flatten(2)
@@ -84,7 +90,7 @@ def _spread(at: Tensor, value: Tensor, slope: Tensor, size: Sequence[int]) -> Te
 
 def _collect(at: Tensor, grid: Tensor, size: Sequence[int]) -> tuple[Tensor, Tensor]:
     value, slope = at.new_empty(at.shape[0], 4, at.shape[2]), at.new_empty(at.shape[0], 9, at.shape[2])
-    if at.device.type == "cpu" and _native(_COLLECT, size, at, value, slope, grid, grid):
+    if _native(_COLLECT, size, at, value, slope, grid, grid):
         return value, slope
     nodes, distance, weight, _ = _stencil(at, size)
     seen = weight[:, None] * _reach(grid, nodes)
@@ -93,7 +99,7 @@ def _collect(at: Tensor, grid: Tensor, size: Sequence[int]) -> tuple[Tensor, Ten
 
 def _tilt(at: Tensor, value: Tensor, slope: Tensor, grid: Tensor, size: Sequence[int]) -> Tensor:
     out = torch.empty_like(at)
-    if at.device.type == "cpu" and _native(_TILT, size, at, value, slope, grid, out):
+    if _native(_TILT, size, at, value, slope, grid, out):
         return out
     nodes, distance, weight, along = _stencil(at, size)
     seen = _reach(grid, nodes)
@@ -128,7 +134,7 @@ def _divide_back(grid: Tensor, vel: Tensor, mass: Tensor) -> Tensor:
 
 def _native_divide(what: str, grid: Tensor, *tensors: Tensor) -> bool:
     """Run a C++ kernel on (grid, ...); whether it could."""
-    library = native.library(native.COUPLING / "transfer.cpp") if grid.device.type == "cpu" else None
+    library = _library_for(grid)
     if library is None or grid.dtype not in (torch.float32, torch.float64):
         return False
     call = getattr(library, f"transfer_{what}_{'double' if grid.dtype == torch.float64 else 'float'}")

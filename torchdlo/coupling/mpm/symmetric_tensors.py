@@ -165,7 +165,7 @@ def _plainly(
 
 
 _FUNCTIONS = ("stretch", "hencky", "from_hencky")
-_function, ready = scene_packing.kernel("symmetric")
+_function, ready = scene_packing.kernel("symmetric", "material points, their elastic laws")
 
 
 def _run(tensors: Tensor, by: Tensor | None, which: str) -> Tensor:

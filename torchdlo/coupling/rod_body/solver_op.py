@@ -24,7 +24,7 @@ from torchdlo.physics.rod.kinematics import View
 
 _INPUTS = "Tensor[] edges, Tensor[] vertices, Tensor[] bodies, Tensor grids"
 _STATIC = "int[] cells, int[] shapes, int[] pieces, int[] after, int sweeps, bool friction, float[] law"
-_function, ready = scene_packing.kernel("body_sweeps")
+_function, ready = scene_packing.kernel("body_sweeps", "RodBody, the forces of contact")
 
 
 class _Sizes(ctypes.Structure):

@@ -18,7 +18,7 @@ from torchdlo.physics.effects.base import Values
 from torchdlo.physics.rod.kinematics import View
 
 _OPTIONS = (f"-DPULL={closest_points.PULL}",)
-_function, ready = scene_packing.kernel("rod_near", *_OPTIONS)
+_function, ready = scene_packing.kernel("rod_near", "RodContact, which parts of ropes are near each other", *_OPTIONS)
 
 
 class _Sizes(ctypes.Structure):

@@ -23,7 +23,7 @@ WEAK = 0.01
 _OPTIONS = (f"-DWEAK={WEAK}", f"-DPULL={closest_points.PULL}")
 _INPUTS = "Tensor[] vertices, Tensor laws, Tensor at, Tensor real"
 _STATIC = "int sweeps, bool friction, float[] rule"
-_function, ready = scene_packing.kernel("rod_pairs", *_OPTIONS)
+_function, ready = scene_packing.kernel("rod_pairs", "RodContact, the forces of contact", *_OPTIONS)
 
 
 class _Sizes(ctypes.Structure):

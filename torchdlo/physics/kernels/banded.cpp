@@ -2,6 +2,7 @@
 #include <cstdlib>
 
 #include "banded.h"
+#include "flush.h"
 #include "lanes.h"
 
 template <typename T, class L, int K>
@@ -11,6 +12,7 @@ static void solve_all(const T* entries, const int32_t* places, int count, const 
   const int64_t blocks = (batch + W - 1) / W;
 #pragma omp parallel num_threads(threads) if (threads > 1 && blocks > 1)
   {
+    const FlushTiny flush;
     void* memory = nullptr;
     if (posix_memalign(&memory, 64, sizeof(L) * (size_t)(n + k) * (2 * k + 2))) std::abort();
 #pragma omp for schedule(static)

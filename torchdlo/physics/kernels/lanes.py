@@ -45,7 +45,8 @@ def _library() -> ctypes.CDLL | None:
 
 def available(like: Tensor) -> bool:
     """Return whether there are kernels for tensors like this one."""
-    return like.device.type == "cpu" and like.dtype in _DTYPES and _library() is not None
+    here = native.works_on(like.device.type, "ropes in recorded steps, their forces and constraints")
+    return here and like.dtype in _DTYPES and _library() is not None
 
 
 def ready(like: Tensor) -> bool:

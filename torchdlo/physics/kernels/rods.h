@@ -3,6 +3,7 @@
 #include <vector>
 
 #include "banded.h"
+#include "flush.h"
 #include "lanes.h"
 
 // Where a component of an input stands.
@@ -84,6 +85,7 @@ static void blocks(const T* const* from, T* to, const Call& call, int threads) {
   const int64_t count = (call.scenes + WIDTH<T> - 1) / WIDTH<T>, own = sizeof(typename Kernel::In) / sizeof(Lanes<T>);
 #pragma omp parallel num_threads(threads) if (threads > 1 && count > 1)
   {
+    const FlushTiny flush;
     Scratch<T> scratch;
     typename Kernel::In* slot = scratch.template take<typename Kernel::In>(call.slots);
     Kernel kernel(call, scratch);

@@ -82,7 +82,7 @@ def pattern(name: str) -> Pattern:
 @functools.lru_cache(maxsize=1)
 def kernel() -> ctypes.CDLL | None:
     """Return the compiled kernel, or None where no C++ compiler is at hand."""
-    library = native.library(native.RODS / "banded.cpp", "-ffast-math", "-Wno-psabi")
+    library = native.library(native.RODS / "banded.cpp", *native.FAST_MATH, "-Wno-psabi")
     if library is None:
         return None
     for name in ("solve_float", "solve_double"):
@@ -124,10 +124,17 @@ def _solve_cpu(entries: Tensor, rhs: Tensor, name: str, transpose: bool) -> Tens
 
 
 def _solve_cuda(entries: Tensor, rhs: Tensor, name: str, transpose: bool) -> Tensor:
-    # Triton comes with the CUDA builds of torch only.
-    from torchdlo.physics.linalg.banded_cuda import solve_cuda
-
+    # Triton comes with most CUDA builds of torch only.
+    try:
+        from torchdlo.physics.linalg.banded_cuda import solve_cuda
+    except ImportError:
+        return _solve_elsewhere(entries, rhs, name, transpose)
     return solve_cuda(entries.contiguous(), rhs.contiguous(), pattern(name), transpose)
+
+
+def _solve_elsewhere(entries: Tensor, rhs: Tensor, name: str, transpose: bool) -> Tensor:
+    native.works_on(rhs.device.type, "banded systems of ropes (edge lengths, twist, implicit steps)")
+    return solve_dense(entries, rhs, name, transpose)
 
 
 def dense_matrix(entries: Tensor, name: str) -> Tensor:
@@ -163,6 +170,7 @@ for _op in ("solve_banded", "solve_banded_plain"):
     )
     _library.impl(_op, _solve_cpu, "CPU")
     _library.impl(_op, _solve_cuda, "CUDA")
+    _library.impl(_op, _solve_elsewhere, "CompositeExplicitAutograd")
     _library.impl(_op, lambda entries, rhs, pattern, transpose: rhs.new_empty(rhs.shape), "Meta")
 
 
