@@ -10,8 +10,8 @@ from typing import Any
 __all__ = ["attach"]
 
 
-def attach(package: str, places: Mapping[str, str]) -> tuple[Callable[[str], Any], Callable[[], list[str]], list[str]]:
-    """Return `__getattr__`, `__dir__` and `__all__` of a package.
+def attach(package: str, places: Mapping[str, str]) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
+    """Return `__getattr__` and `__dir__` of a package.
 
     Args:
         package: its name.
@@ -28,4 +28,4 @@ def attach(package: str, places: Mapping[str, str]) -> tuple[Callable[[str], Any
         setattr(sys.modules[package], name, value)
         return value
 
-    return get, lambda: sorted({*vars(sys.modules[package]), *places}), sorted(places)
+    return get, lambda: sorted({*vars(sys.modules[package]), *places})

@@ -1,1 +1,25 @@
 """Learning agents and trajectory optimisation."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from torchdlo import lazy
+
+if TYPE_CHECKING:
+    from torchdlo.agents.trajopt.presets import preset
+    from torchdlo.agents.trajopt.problem import Problem
+    from torchdlo.agents.trajopt.search import SearchResult, Settings, optimize
+
+__getattr__, __dir__ = lazy.attach(
+    __name__,
+    {
+        "Found": "torchdlo.agents.trajopt.search",
+        "Problem": "torchdlo.agents.trajopt.problem",
+        "Settings": "torchdlo.agents.trajopt.search",
+        "optimize": "torchdlo.agents.trajopt.search",
+        "preset": "torchdlo.agents.trajopt.presets",
+    },
+)
+
+__all__ = ["Problem", "SearchResult", "Settings", "optimize", "preset"]

@@ -46,4 +46,30 @@ EFFECTS: dict[str, type[Effect]] = {
     "marker_offset": MarkerOffset,
 }
 
-__all__ = ["EFFECTS"]
+__all__ = [
+    "EFFECTS",
+    "AirDrag",
+    "AnisotropicBending",
+    "AxialStiffness",
+    "Bend",
+    "BendFrame",
+    "BendingDamping",
+    "BendingPlasticity",
+    "Damping",
+    "Gravity",
+    "GripperCompliance",
+    "InternalFriction",
+    "LinkChain",
+    "MarkerOffset",
+    "NonuniformStiffness",
+    "PointMass",
+    "RestCurvature",
+    "StiffeningBending",
+    "Stretch",
+    "Table",
+    "TableFriction",
+    "TiltedGravity",
+    "TimeDelay",
+    "Twist",
+    "Wind",
+]
