@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 FILLED := $(VENV)/.filled
 export OMP_NUM_THREADS := 1
 
-.PHONY: demo test bench lint clean
+.PHONY: demo test quick bench lint wheel clean
 
 demo: $(FILLED)  ## calibrate a rope to the recording in the package
 	$(BIN)/torchdlo calibrate torchdlo/data/sample_rope --out demo/model.json
@@ -13,6 +13,12 @@ demo: $(FILLED)  ## calibrate a rope to the recording in the package
 
 test: $(FILLED)
 	$(BIN)/python -m pytest -n 2
+
+quick: $(FILLED)  ## the tests that say most in less than three minutes
+	$(BIN)/python -m pytest -n 2 -m quick
+
+wheel:  ## build it, install it elsewhere, and use it there
+	PYTHON=$(PYTHON) .ci/wheel
 
 bench: $(FILLED)
 	$(BIN)/python experiments/bench_rod.py --quick
@@ -29,5 +35,5 @@ clean:
 $(FILLED): setup.cfg pyproject.toml constraints.txt
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "torchdlo needs Python 3.11 or newer: make PYTHON=python3.11")'
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[dev,robots,cmaes,view,rl]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[all,dev]'
 	touch $(FILLED)

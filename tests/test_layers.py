@@ -26,6 +26,8 @@ FLOORS = {
     "sysid": 5,
     "agents": 6,
     "report": 8,
+    "sample": 9,
+    "doctor": 9,
     "cli": 10,
     "__main__": 11,
 }
@@ -48,6 +50,8 @@ ALLOWED = {
     "envs": LEARNING | {"pytorch_kinematics", "trimesh"},
     "agents": LEARNING | {"cma"},
     "report": ARRAYS | {"matplotlib", "pyvista", "vtk", "av", "viser"},
+    "sample": {"typer"},
+    "doctor": TORCH | {"av", "packaging", "typer"},
     "cli": ARRAYS | {"rich", "typer"},
     "__main__": set(),
     "": TORCH,  # torchdlo/__init__.py

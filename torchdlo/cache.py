@@ -19,7 +19,7 @@ from pathlib import Path
 
 from torchdlo import notices
 
-__all__ = ["folder", "is_sound", "keep_for_torch", "locked", "problem", "sealed"]
+__all__ = ["folder", "is_sound", "keep_for_torch", "locked", "problem", "sealed", "wished"]
 
 _OTHERS = stat.S_IWGRP | stat.S_IWOTH
 
@@ -29,14 +29,17 @@ def folder() -> Path | None:
 
     It is `TORCHDLO_CACHE` if that is set, else `torchdlo` in `XDG_CACHE_HOME` or in `~/.cache`.
     """
-    given = os.environ.get("TORCHDLO_CACHE")
+    return _private(wished())
+
+
+def wished() -> Path:
+    """Return where the folder is to be, private or not."""
     base = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
-    return _private(given or os.path.join(base, "torchdlo"))
+    return Path(os.environ.get("TORCHDLO_CACHE") or Path(base) / "torchdlo").expanduser()
 
 
 @functools.cache
-def _private(wished: str) -> Path | None:
-    path = Path(os.path.expanduser(wished))
+def _private(path: Path) -> Path | None:
     wrong = problem(path)
     if not wrong:
         return path

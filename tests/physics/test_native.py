@@ -39,7 +39,7 @@ bodies = [scene.Solid("sphere", 0.015, motion="fixed"), scene.Solid("sphere", 0.
 effects = [Gravity(), Bend(), RodContact(), RodBody(), BodyContact()]
 made, params, now = scene.make(ropes, effects, bodies=bodies, dt=2e-3, substeps=4)
 step = scene.stepper(made, compiled="compiled" in sys.argv)
-for _ in range(15):
+for _ in range(6):
     now = step(params, now, scene.hold(made, now))
 print(*now.rods.pos.flatten().tolist(), *now.bodies.pos.flatten().tolist())
 """
@@ -246,11 +246,11 @@ def test_a_folder_that_others_can_write_is_not_used(tmp_path, folder, monkeypatc
     folder.mkdir(mode=0o700)
     folder.chmod(0o770)
     monkeypatch.setattr(cache.tempfile, "gettempdir", lambda: str(tmp_path))
-    used = cache._private.__wrapped__(str(folder))
+    used = cache._private.__wrapped__(folder)
     assert used != folder and used.parent == tmp_path and stat.S_IMODE(used.stat().st_mode) == 0o700
     (said,) = caplog.messages
     assert "other users can write there" in said and str(used) in said
-    assert cache._private.__wrapped__(str(folder)) == used  # again: it is kept
+    assert cache._private.__wrapped__(folder) == used  # again: it is kept
 
 
 def test_a_folder_below_one_that_anybody_can_rename_is_not_used(tmp_path):
@@ -271,7 +271,7 @@ def test_a_folder_of_another_user_is_not_used(tmp_path):
 def test_where_no_folder_can_be_made_another_is_used_or_none(tmp_path, folder, monkeypatch, caplog):
     (tmp_path / "file").write_text("")
     monkeypatch.setattr(cache.tempfile, "gettempdir", lambda: str(tmp_path / "file"))
-    assert cache._private.__wrapped__(str(tmp_path / "file" / "cache")) is None
+    assert cache._private.__wrapped__(tmp_path / "file" / "cache") is None
     assert "cannot be written" in caplog.text
 
 

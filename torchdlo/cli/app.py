@@ -13,7 +13,9 @@ from torchdlo.cli.identification import calibrate, design_experiment, diagnose
 from torchdlo.cli.recordings import check, import_deform
 from torchdlo.cli.scenes import simulate, view
 from torchdlo.cli.tasks import optimize, play, tasks
+from torchdlo.doctor import doctor
 from torchdlo.errors import InputError
+from torchdlo.sample import sample
 
 __all__ = ["app", "main"]
 
@@ -61,6 +63,8 @@ app.command()(view)
 app.command()(optimize)
 app.command()(play)
 app.command()(tasks)
+app.command()(sample)
+app.command()(doctor)
 
 
 if __name__ == "__main__":

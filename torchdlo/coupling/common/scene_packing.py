@@ -40,6 +40,8 @@ def kernel(name: str, what: str, *options: str) -> tuple[Callable, Callable[[str
     def library() -> ctypes.CDLL | None:
         return native.library(native.COUPLING / f"{name}.cpp", *_OPTIONS, *options)
 
+    native.KERNELS[name] = library
+
     def function(what: str, dtype: torch.dtype) -> Callable:
         return getattr(library(), f"{name}_{_KINDS[dtype]}_{what}")
 

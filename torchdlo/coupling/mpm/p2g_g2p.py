@@ -12,6 +12,7 @@ compiler, tensor operations do; on a GPU their sums come in the order in which t
 from __future__ import annotations
 
 import ctypes
+import functools
 from collections.abc import Callable, Sequence
 
 import torch
@@ -23,10 +24,18 @@ from torchdlo.physics.kernels import native
 _SPREAD, _COLLECT, _TILT = range(3)
 
 
+@functools.cache
+def _kernel() -> ctypes.CDLL | None:
+    return native.library(native.COUPLING / "transfer.cpp")
+
+
+native.KERNELS["transfer"] = _kernel
+
+
 def _library_for(like: Tensor) -> ctypes.CDLL | None:
     if not native.works_on(like.device.type, "material points, the transfer between particles and grid"):
         return None
-    return native.library(native.COUPLING / "transfer.cpp")
+    return _kernel()
 
 
 def _native(which: int, size: Sequence[int], *tensors: Tensor) -> bool:

@@ -43,6 +43,9 @@ def _library() -> ctypes.CDLL | None:
     return native.library(source, "-fno-math-errno", "-fno-trapping-math", "-Wno-psabi")
 
 
+native.KERNELS["rods"] = _library
+
+
 def available(like: Tensor) -> bool:
     """Return whether there are kernels for tensors like this one."""
     here = native.works_on(like.device.type, "ropes in recorded steps, their forces and constraints")

@@ -13,7 +13,9 @@ import os
 import shlex
 import shutil
 import subprocess
+import sysconfig
 import tempfile
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -35,6 +37,9 @@ FAST_MATH = (
 )
 """What -ffast-math stands for, but for the start-up code that it links: that would let the whole process take numbers
 below 1e-308 for zero."""
+
+KERNELS: dict[str, Callable[[], ctypes.CDLL | None]] = {}
+"""What loads each library, by its name; modules that use one put it here."""
 
 _USUAL = ("-O3", "-march=native", "-fopenmp", "-shared", "-fPIC", "-std=c++17")
 _WRAPPERS = ("ccache", "sccache", "distcc", "icecc")
@@ -151,10 +156,18 @@ def _build(command: list[str], target: Path) -> None:
         cache.sealed(fresh, target)
 
 
+def python_header() -> Path:
+    """Return where the header is that compiled steps need."""
+    return Path(sysconfig.get_paths()["include"]) / "Python.h"
+
+
 def prepare_torch_compile() -> bool:
     """Return whether `torch.compile` has a compiler; let it use the one that kernels use, and the private folder."""
     found = compiler()
     if found is None:
+        return False
+    if not python_header().is_file():
+        notices.once("compile", f"{python_header()} is missing, so that steps are not compiled: install python3-dev.")
         return False
     cache.keep_for_torch()
     if len(found.words) > 1:

@@ -94,6 +94,9 @@ def kernel() -> ctypes.CDLL | None:
     return library
 
 
+native.KERNELS["banded"] = kernel
+
+
 @functools.lru_cache(maxsize=1024)
 def _prepared(name: str, transpose: bool, double: bool) -> Callable[..., None] | None:
     """Return the kernel for a pattern as a function of addresses (entries, rhs, out), batch and threads."""

@@ -14,11 +14,12 @@ from torchdlo.files import check_writable, replacing
 from torchdlo.report.render.picture import Picture
 from torchdlo.scene_files.run import Frames
 
-__all__ = ["check_video", "write_video"]
+__all__ = ["CODECS", "check_video", "write_video"]
 
 RATE = 30
 """Pictures per second."""
-_CODECS = ("libx264", "libopenh264", "h264")
+CODECS = ("libx264", "libopenh264", "h264")
+"""Encoders of H.264, the best one first."""
 _MARK = b"torchdlo"
 """Stands in the comment of our videos, which is at the end of the file."""
 
@@ -62,7 +63,7 @@ def write_video(
     if not speed > 0:
         raise InputError(f"speed: expected a number above 0, given {speed:g}.")
     av = _av()
-    codec = next((name for name in _CODECS if name in av.codecs_available), None)
+    codec = next((name for name in CODECS if name in av.codecs_available), None)
     if codec is None:
         raise InputError("videos need a build of the package av with H.264; pip install av has it.")
     count = max(1, round(float(frames.time[-1]) / speed * RATE) + 1)

@@ -1,0 +1,28 @@
+"""The recording in the package, for those who have none yet: `torchdlo sample`."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+__all__ = ["FOLDER", "sample"]
+
+FOLDER = Path(__file__).parent / "data" / "sample_rope"
+"""A recording of a rope with five trials, made by another simulator."""
+
+
+def sample(
+    out: Annotated[Path, typer.Argument(help="New folder for the recording.", metavar="DIR")],
+) -> None:
+    """Copy the recording in the package to a folder, to try the other commands and to see the format.
+
+    [bold]Example:[/bold] torchdlo sample rope && torchdlo calibrate rope
+    """
+    from torchdlo.sysid.recordings.recording import check_new_folder
+
+    check_new_folder(out)
+    shutil.copytree(FOLDER, out, dirs_exist_ok=True)
+    typer.echo(f"{out}: a recording with {len(list(out.glob('*.npz')))} trials; next: torchdlo calibrate {out}")
