@@ -6,6 +6,7 @@ Where there is no compiler, or it fails, tensor operations take the place of all
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import functools
 import hashlib
@@ -15,6 +16,7 @@ import shutil
 import subprocess
 import sysconfig
 import tempfile
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -42,7 +44,7 @@ KERNELS: dict[str, Callable[[], ctypes.CDLL | None]] = {}
 """What loads each library, by its name; modules that use one put it here."""
 
 _USUAL = ("-O3", "-march=native", "-fopenmp", "-shared", "-fPIC", "-std=c++17")
-_WRAPPERS = ("ccache", "sccache", "distcc", "icecc")
+_WRAPPERS = ("ccache", "sccache", "distcc", "icecc", "env")
 
 
 @dataclass(frozen=True)
@@ -85,8 +87,8 @@ def _compiler(given: str, path: str) -> Compiler | None:
     # Preprocessing nothing tells all of it in a hundredth of a second.
     command = [*words, "-march=native", "-dM", "-E", "-x", "c++", os.devnull]
     try:
-        told = subprocess.run(command, capture_output=True, text=True, errors="replace")
-    except OSError as error:
+        told = subprocess.run(command, capture_output=True, text=True, errors="replace", timeout=60)
+    except (OSError, subprocess.TimeoutExpired) as error:
         return _without(f"the C++ compiler {shlex.join(words)} does not run ({error})")
     if told.returncode:
         return _without(f"the C++ compiler {shlex.join(words)} does not work ({_last_line(told.stderr)})")
@@ -150,6 +152,10 @@ def library(source: Path, *options: str) -> ctypes.CDLL | None:
 
 
 def _build(command: list[str], target: Path) -> None:
+    for stray in target.parent.glob("build-*"):  # of a process that was killed while it built
+        with contextlib.suppress(OSError):
+            if time.time() - stray.stat().st_mtime > 86400:
+                shutil.rmtree(stray)
     with tempfile.TemporaryDirectory(dir=target.parent, prefix="build-") as build:
         fresh = Path(build) / target.name
         subprocess.run([*command, "-o", str(fresh)], capture_output=True, text=True, errors="replace", check=True)
