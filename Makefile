@@ -15,7 +15,7 @@ test: $(FILLED)
 	$(BIN)/python -m pytest -n 2
 
 quick: $(FILLED)  ## the tests that say most in less than three minutes
-	$(BIN)/python -m pytest -n 2 -m quick
+	$(BIN)/python -m pytest -n 2 -m "quick and not slow and not compile"
 
 wheel:  ## build it, install it elsewhere, and use it there
 	PYTHON=$(PYTHON) .ci/wheel

@@ -15,6 +15,8 @@ from torchdlo import cache, doctor
 from torchdlo.cli import app
 from torchdlo.physics.kernels import native
 
+pytestmark = pytest.mark.quick
+
 ROOT = Path(__file__).parents[1]
 
 

@@ -7,6 +7,8 @@ import sys
 
 import pytest
 
+pytestmark = pytest.mark.quick
+
 OPTIONAL = (
     "matplotlib",
     "scipy",

@@ -12,6 +12,8 @@ import pytest
 
 import torchdlo
 
+pytestmark = pytest.mark.quick
+
 PACKAGE = Path(torchdlo.__file__).parent
 PACKAGES = sorted({file.parent for file in PACKAGE.rglob("*.py")})
 

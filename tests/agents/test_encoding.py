@@ -9,6 +9,8 @@ import torch
 
 from torchdlo.agents.trajopt.problem import Encoding
 
+pytestmark = pytest.mark.quick
+
 TWO_TOOLS = Encoding(horizon=7, width=6, group=3, limit=0.01, hold=3)
 
 

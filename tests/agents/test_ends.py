@@ -16,6 +16,8 @@ from torchdlo.agents.trajopt.result import result_json
 from torchdlo.agents.trajopt.search import Settings, optimize
 from torchdlo.errors import InputError
 
+pytestmark = pytest.mark.quick
+
 
 @pytest.mark.parametrize("method", ["cmaes", "hybrid"])
 def test_a_package_that_is_missing_is_named_before_anything_is_played(

@@ -16,6 +16,8 @@ from torchdlo.agents.trajopt.problem import Encoding, Evaluation
 from torchdlo.agents.trajopt.proposals import SearchPlan, Told
 from torchdlo.agents.trajopt.search import METHODS, Settings, optimize
 
+pytestmark = pytest.mark.quick
+
 
 def test_islands_know_nothing_of_each_other() -> None:
     def asked(shift: float) -> list[Tensor]:

@@ -12,6 +12,8 @@ from torchdlo.agents.trajopt.proposals import drags, rounds
 from torchdlo.agents.trajopt.search import Settings, optimize
 from torchdlo.agents.trajopt.task_problem import problem
 
+pytestmark = pytest.mark.quick
+
 
 @dataclass(frozen=True)
 class Orbit(Plain):

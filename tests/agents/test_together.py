@@ -18,6 +18,8 @@ from torchdlo.agents.trajopt.problem import Evaluation, Problem
 from torchdlo.agents.trajopt.search import METHODS, Robust, Settings, optimize
 from torchdlo.errors import InputError
 
+pytestmark = pytest.mark.quick
+
 SETTINGS = Settings(episodes=48, population=8, hold=5, chunk=5)
 ALL = [replace(SETTINGS, method=method, seed=seed) for method in METHODS for seed in (0, 1)]
 

@@ -19,6 +19,8 @@ from torchdlo.physics.effects.external import Gravity
 from torchdlo.physics.linalg.rotation import multiply, rotate
 from torchdlo.scene import Control, Rope, make, rollout, stationary_control, step
 
+pytestmark = pytest.mark.quick
+
 NONE = torch.zeros(1, 3, dtype=F64)
 
 

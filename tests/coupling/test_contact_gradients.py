@@ -14,6 +14,8 @@ from torchdlo.physics.effects.elastic import Bend
 from torchdlo.physics.effects.external import Gravity
 from torchdlo.scene import Rope, make, ok, rollout, stationary_control, step
 
+pytestmark = pytest.mark.quick
+
 NAMES = ("drift", "approach", "bend", "radius", "mu", "restitution", "mass", "gravity", "handle")
 AT = torch.tensor([0.3, 0.2, 1.0, 1.0, 0.3, 0.3, 1.0, 2.0, 0.0], dtype=F64)
 

@@ -11,6 +11,8 @@ from torchdlo.coupling import EFFECTS, RodContact
 from torchdlo.coupling.common.step_diagnostics import explain
 from torchdlo.physics.effects.base import KINDS, Effect
 
+pytestmark = pytest.mark.quick
+
 
 @pytest.mark.parametrize("name", EFFECTS)
 def test_effect_declares_its_numbers_completely(name):

@@ -14,6 +14,8 @@ from torchdlo.physics.effects.elastic import Bend
 from torchdlo.physics.effects.external import Damping
 from torchdlo.scene import Rope, check_state, make, stationary_control, step, stepper
 
+pytestmark = pytest.mark.quick
+
 BEND, RADIUS = 1.26e-4, 2e-3
 
 

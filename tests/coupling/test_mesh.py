@@ -12,6 +12,8 @@ from torchdlo.coupling.bodies import mesh_sdf, shape_sdf, triangles
 from torchdlo.errors import InputError
 from torchdlo.physics.linalg.rotation import rotate
 
+pytestmark = pytest.mark.quick
+
 trimesh = pytest.importorskip("trimesh", reason="meshes need trimesh")
 
 CELLS = 20

@@ -15,6 +15,8 @@ from torchdlo.physics import tree
 from torchdlo.physics.effects.elastic import Bend
 from torchdlo.scene import Rope, check_state, make, ok, stationary_control, step
 
+pytestmark = pytest.mark.quick
+
 
 @pytest.fixture(params=["kernel", "tensors"])
 def way(request, monkeypatch):

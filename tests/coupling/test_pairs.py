@@ -8,6 +8,8 @@ from touching import F64
 
 from torchdlo.coupling.rod_contact.gather_scatter import corners, drop, pick
 
+pytestmark = pytest.mark.quick
+
 
 def sample(batch: tuple[int, ...], v: int = 7, k: int = 5):
     g = torch.Generator().manual_seed(1)

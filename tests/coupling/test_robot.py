@@ -14,6 +14,8 @@ from torchdlo.coupling.robot import urdf
 from torchdlo.errors import InputError
 from torchdlo.physics.linalg.rotation import rotate
 
+pytestmark = pytest.mark.quick
+
 F64 = torch.float64
 
 # Craig's Denavit-Hartenberg parameters a, d, alpha of the Panda as its maker publishes them, with the flange last.

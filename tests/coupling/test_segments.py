@@ -8,6 +8,8 @@ from touching import F64, distances
 
 from torchdlo.coupling.rod_contact.closest_points import PULL, closest
 
+pytestmark = pytest.mark.quick
+
 
 def apart(x: torch.Tensor) -> torch.Tensor:
     """Distances that `closest` finds for segments (n, 4, 3)."""

@@ -10,6 +10,8 @@ import torch
 
 from torchdlo.coupling.bodies import shape_sdf
 
+pytestmark = pytest.mark.quick
+
 F64 = torch.float64
 SIZES = {
     "plane": (1.0, 1.0, 1.0),

@@ -12,6 +12,8 @@ from torchdlo import envs
 from torchdlo.envs.core import episode
 from torchdlo.physics import tree
 
+pytestmark = pytest.mark.quick
+
 pytest.importorskip("torchrl")
 
 

@@ -14,6 +14,8 @@ from torchdlo.envs.core.divergence import broken, inside
 from torchdlo.physics import tree
 from torchdlo.physics.effects.material import AxialStiffness
 
+pytestmark = pytest.mark.quick
+
 F64 = torch.float64
 POINTS = {
     "in the post": (0.0, 0.0, 0.05),

@@ -9,6 +9,8 @@ import torch
 
 from torchdlo.envs.core import curve_geometry
 
+pytestmark = pytest.mark.quick
+
 F64 = torch.float64
 
 

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import json
 
+import pytest
 from typer.testing import CliRunner
 
 from torchdlo.cli.app import app
 from torchdlo.envs import TASKS
+
+pytestmark = pytest.mark.quick
 
 
 def test_tasks_are_listed_for_people_and_for_scripts():

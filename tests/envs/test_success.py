@@ -19,6 +19,8 @@ from torchdlo.envs.tasks import wiring_post as wiring
 from torchdlo.envs.tasks.lifting import into
 from torchdlo.physics import tree
 
+pytestmark = pytest.mark.quick
+
 F64 = torch.float64
 
 

@@ -14,6 +14,8 @@ from torchdlo.envs.core import episode
 from torchdlo.envs.core.task import Arms, combined
 from torchdlo.errors import InputError
 
+pytestmark = pytest.mark.quick
+
 ONE = ((0.0, -0.5, 0.0),)
 
 

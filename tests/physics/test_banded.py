@@ -8,6 +8,8 @@ from helpers import F64
 
 from torchdlo.physics.linalg import banded
 
+pytestmark = pytest.mark.quick
+
 
 @pytest.mark.parametrize("batch", [1, 3, 8, 19])
 @pytest.mark.parametrize("name", ["tridiagonal:o7", "tridiagonal:o8", "tridiagonal:c6", "saddle:o9", "saddle:c8,o5"])

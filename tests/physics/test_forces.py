@@ -13,6 +13,8 @@ from torchdlo.physics.effects.elastic import Bend, BendFrame, Stretch, Twist, cu
 from torchdlo.physics.linalg import rotation
 from torchdlo.scene import Rope, make, stationary_control, step
 
+pytestmark = pytest.mark.quick
+
 
 def ropes(kind: str) -> list[Rope]:
     """Heterogeneous, anisotropic ropes in random shapes with random rest shapes."""

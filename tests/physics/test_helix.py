@@ -11,6 +11,8 @@ from helpers import F64, effects, energy
 from torchdlo.physics import tree
 from torchdlo.scene import Rope, finite, make, stationary_control, step
 
+pytestmark = pytest.mark.quick
+
 G = 9.81
 
 

@@ -11,6 +11,8 @@ from torchdlo.physics.execution import tracing
 from torchdlo.physics.kernels import lanes
 from torchdlo.scene import Rope, make, stationary_control, step
 
+pytestmark = pytest.mark.quick
+
 GIVEN = {"mass": 0.1, "bend": 1e-3, "twist": 1e-3, "radius": 0.01}
 
 IMPLICIT = {"dt": 2e-3, "integrator": "implicit"}

@@ -11,6 +11,8 @@ from helpers import F64, rand, vec
 
 from torchdlo.physics.effects.measurement import MarkerOffset, TimeDelay, Track, interpolate
 
+pytestmark = pytest.mark.quick
+
 
 def recorded(count: int = 12, dt: float = 0.01, motion=None, batch: tuple[int, ...] = ()) -> Track:
     """A track of three markers, the first of which is gripped, on a motion t -> (F, 1, 3)."""

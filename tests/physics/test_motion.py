@@ -10,6 +10,8 @@ from helpers import F64, circle, effects, energy, length_error, run, speed, stra
 
 from torchdlo.scene import Control, Rope, finite, make, stationary_control, step
 
+pytestmark = pytest.mark.quick
+
 
 def momentum(params, state):
     """Linear and angular momentum of the vertices; v stands half a step before x, x cross v = x_before cross v."""

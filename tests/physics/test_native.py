@@ -20,6 +20,8 @@ from torchdlo.physics.kernels import native
 from torchdlo.physics.linalg import banded
 from torchdlo.physics.rod import topology  # noqa: F401 (topology names the systems)
 
+pytestmark = pytest.mark.quick
+
 ROOT = Path(__file__).parents[2]
 needs_compiler = pytest.mark.skipif(native.compiler() is None, reason="needs a C++ compiler")
 

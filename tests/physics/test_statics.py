@@ -16,6 +16,8 @@ from helpers import F64, Statics, circle, effects, energy, length_error, run, sp
 from torchdlo.physics import tree
 from torchdlo.scene import Rope, State, make
 
+pytestmark = pytest.mark.quick
+
 G = 9.81
 CLAMPED = [(v, a) for v in (0, 1) for a in range(3)]
 

@@ -11,6 +11,8 @@ from helpers import effects, run, speed, straight, vec
 from torchdlo.physics import tree
 from torchdlo.scene import Rope, make
 
+pytestmark = pytest.mark.quick
+
 G, R = 9.81, 0.01
 
 

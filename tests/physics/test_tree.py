@@ -13,6 +13,8 @@ from torchdlo.physics import tree
 from torchdlo.physics.rod import kinematics as rod
 from torchdlo.scene import Rope, make
 
+pytestmark = pytest.mark.quick
+
 
 class Pair(NamedTuple):
     """A kind of tree that only torch knows."""

@@ -11,6 +11,8 @@ from helpers import F64, Statics, effects, energy, loads, run, speed, straight, 
 from torchdlo.physics import tree
 from torchdlo.scene import Control, Rope, make, stationary_control, step
 
+pytestmark = pytest.mark.quick
+
 
 def wound(angle: float) -> torch.Tensor:
     """Director of an edge along x turned by an angle [rad] from y."""

@@ -15,6 +15,8 @@ from torchdlo.cli import app
 from torchdlo.errors import InputError
 from torchdlo.sysid import load_recording
 
+pytestmark = pytest.mark.quick
+
 TRIAL = "train_1.npz"
 
 

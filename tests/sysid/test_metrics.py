@@ -11,6 +11,8 @@ import pytest
 from torchdlo.sysid import Trial, load_recording
 from torchdlo.sysid.recordings.metrics import average, free_marker_distance, mean_absolute_error, scored
 
+pytestmark = pytest.mark.quick
+
 
 @pytest.fixture
 def trial(template: Path) -> Trial:

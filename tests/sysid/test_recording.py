@@ -12,6 +12,8 @@ import pytest
 from torchdlo.errors import InputError
 from torchdlo.sysid import Recording, Trial, load_recording, save_recording, save_trial
 
+pytestmark = pytest.mark.quick
+
 
 def assert_same(a: object, b: object, *, skip: tuple[str, ...] = ()) -> None:
     for field in dataclasses.fields(a):  # type: ignore[arg-type]
