@@ -50,7 +50,7 @@ ALLOWED = {
     "scene_files": ARRAYS,
     "sysid": ARRAYS,
     "envs": LEARNING | {"pytorch_kinematics", "trimesh"},
-    "agents": LEARNING | {"cma"},
+    "agents": LEARNING | {"cma", "numpy"},
     "report": ARRAYS | {"matplotlib", "pyvista", "vtk", "av", "viser"},
     "sample": {"typer"},
     "doctor": TORCH | {"av", "packaging", "typer"},

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 __getattr__, __dir__ = lazy.attach(
     __name__,
     {
-        "Found": "torchdlo.agents.trajopt.search",
+        "SearchResult": "torchdlo.agents.trajopt.search",
         "Problem": "torchdlo.agents.trajopt.problem",
         "Settings": "torchdlo.agents.trajopt.search",
         "optimize": "torchdlo.agents.trajopt.search",

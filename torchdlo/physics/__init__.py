@@ -19,7 +19,7 @@ __getattr__, __dir__ = lazy.attach(
     {
         "Effect": "torchdlo.physics.effects.base",
         "Material": "torchdlo.physics.rod.kinematics",
-        "Motion": "torchdlo.physics.effects.base",
+        "PredictedMotion": "torchdlo.physics.effects.base",
         "RodParams": "torchdlo.physics.rod.kinematics",
         "RodState": "torchdlo.physics.rod.kinematics",
         "Rope": "torchdlo.physics.rod.assembly",
