@@ -62,7 +62,7 @@ print(*[name for name in ("torch._dynamo", "torch._inductor") if name in sys.mod
 def test_packages_say_their_public_names(folder: Path):
     assert (folder / "__init__.py").is_file(), f"{folder}: no __init__.py, so that no wheel has it"
     package = importlib.import_module(named(folder))
-    if not hasattr(package, "__all__"):  # inner packages stationary_control modules, whose names are theirs
+    if not hasattr(package, "__all__"):  # inner packages hold modules, whose names are theirs
         assert named(folder).count(".") > 1 and package.__doc__
         return
     assert package.__all__ and len(set(package.__all__)) == len(package.__all__)
