@@ -80,6 +80,7 @@ def make(
     variation: bool = True,
     randomize: Mapping[str, float] | None = None,
     rope: RopeMaterial | None = None,
+    pixels: bool | Mapping[str, Any] = False,
 ) -> DloEnv:
     """Return a task as a TorchRL environment.
 
@@ -98,6 +99,9 @@ def make(
             {"rod_contact.mu_k": 0.2}: a share of the range in which the number is declared, about its usual value.
         rope: what ropes are made of, if not what the task says: `torchdlo.scene_files.cable("model.json")` reads what
             `torchdlo calibrate` or `diagnose` found.
+        pixels: whether observations have pictures, ("pixels", camera) uint8 (..., H, W, 3), or what else cameras give:
+            {"size": 128, "cameras": ("front",), "samples": 4, "masks": True, "depth": True, "points": True,
+            "looks": "random"}, see `observations.sensor`.
     """
     try:
         from torchdlo.envs.core.env import DloEnv
@@ -124,4 +128,5 @@ def make(
         segment=segment,
         variation=variation,
         randomize=randomize,
+        pixels=pixels,
     )

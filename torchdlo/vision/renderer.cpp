@@ -19,21 +19,21 @@ struct Call {
     // Rigid pieces.
     const float *vertex, *normal;
     const int32_t *face, *piece_vertex, *piece_face, *piece_flags;
-    const uint16_t* piece_id;
+    const int16_t* piece_id;
     const float *piece_sphere, *piece_pose, *piece_material;
     // Ropes.
     const int32_t *rope_start, *rope_closed;
-    const uint16_t* rope_id;
+    const int16_t* rope_id;
     const float *rope_pos, *rope_radius, *rope_material;
     // Particles.
     const float *particle_pos, *particle_radius;
     const int32_t* particle_group;
-    const uint16_t* group_id;
+    const int16_t* group_id;
     const float* group_material;
     const float *camera, *light;
     uint8_t* rgb;
     float* depth;
-    uint16_t* ids;
+    int16_t* ids;
 };
 
 constexpr int POSE = 12, MATERIAL = 12, CAMERA = 16, LIGHT = 32;
@@ -431,7 +431,11 @@ struct Shadow {
         float radius = std::min(limit, std::max(0.8f, softness * (blocked / total) * deep * scale));
         float sum = 0;
         for (const auto& d : AROUND) sum += filtered(c.x + radius * d[0], c.y + radius * d[1], own);
-        return 1 - sum / 12;
+        if (radius < 1.5f) return 1 - sum / 12;
+        // A wide penumbra needs more places.
+        for (const auto& d : AROUND) sum += filtered(c.x - radius * d[1], c.y + radius * d[0], own);
+        for (const auto& d : AROUND) sum += filtered(c.x - radius * d[0], c.y - radius * d[1], own);
+        return 1 - sum / 36;
     }
 
   private:
@@ -645,7 +649,7 @@ struct Eye {
         }
     }
 
-    uint16_t id(uint32_t number) const {
+    int16_t id(uint32_t number) const {
         if (number == NONE) return 0;
         if (number >= mesh.owner.size()) return call.group_id[call.particle_group[number - mesh.owner.size()]];
         int32_t owner = mesh.owner[number];
@@ -741,7 +745,7 @@ struct Eye {
 
     // The number that most samples see, the first of equals, and its mean depth.
     void masks(const uint32_t* number, const float* near, int count, size_t pixel) const {
-        uint16_t all[4];
+        int16_t all[4];
         for (int k = 0; k < count; ++k) all[k] = id(number[k]);
         int best = 0, most = 0;
         for (int k = 0; k < count; ++k) {

@@ -44,7 +44,7 @@ __all__ = [
     "shifted",
 ]
 
-NOTHING, TABLE, ROPE, BODY, ARM, PARTICLES = 0, 1, 100, 200, 300, 400
+NOTHING, TABLE, ROPE, BODY, ARM, PARTICLES = 0, 1, 1000, 2000, 3000, 4000
 """Numbers in masks: of what is behind all else, of tables and floors; those of the first rope, the first body, the
 first arm and the first group of particles; others count on from there."""
 
@@ -129,7 +129,7 @@ class Images:
     depth: Tensor | None
     """Depths along z of the camera, infinite where there is nothing [m], float32, shape (B, C, H, W)."""
     ids: Tensor | None
-    """Numbers of what is seen, see `TABLE` and the others [-], int32, shape (B, C, H, W)."""
+    """Numbers of what is seen, see `TABLE` and the others [-], int16, shape (B, C, H, W)."""
 
 
 def looking_at(
@@ -241,7 +241,7 @@ def packed(model: Model) -> dict[str, np.ndarray]:
         "group_id": [PARTICLES + k for k in range(groups)],
     }
     found = {k: v if v.dtype == np.float32 else v.astype(np.int32) for k, v in found.items()}
-    found |= {k: np.array(v).astype(np.uint16) for k, v in numbers.items()}
+    found |= {k: np.array(v).astype(np.int16) for k, v in numbers.items()}
     return {k: np.ascontiguousarray(v) for k, v in found.items()}
 
 
@@ -336,7 +336,7 @@ def render(
     out = {
         "rgb": np.empty((*shape, 3), np.uint8) if rgb else None,
         "depth": np.empty(shape, np.float32) if depth else None,
-        "ids": np.empty(shape, np.uint16) if ids else None,
+        "ids": np.empty(shape, np.int16) if ids else None,
     }
     settings = {"width": width, "height": height, "samples": samples, "shadow": shadow, "detail": int(detail)}
     library = _library()
@@ -349,9 +349,7 @@ def render(
         for name, value in {**given, **out}.items():
             setattr(call, name, None if value is None else value.ctypes.data)
         library.render(ctypes.addressof(call), torch.get_num_threads())
-    seen = None if out["ids"] is None else torch.from_numpy(out["ids"].astype(np.int32))
-    pictures = (None if out[n] is None else torch.from_numpy(out[n]) for n in ("rgb", "depth"))
-    return Images(*pictures, seen)
+    return Images(*(None if x is None else torch.from_numpy(x) for x in out.values()))
 
 
 def _counts(given: dict[str, np.ndarray]) -> dict[str, int]:

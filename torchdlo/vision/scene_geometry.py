@@ -100,11 +100,11 @@ def _at_vertices(edges: np.ndarray, counts: Sequence[int], closed: Sequence[bool
 
 
 def _ball_radii(scene: Scene, params: Params) -> np.ndarray:
-    """Return radii of balls of the particles' volumes [m], a little larger so that they close."""
+    """Return radii of balls of the particles' volumes [m], larger so that they close."""
     volume = (
         params.material_points.volume.reshape(-1, params.material_points.volume.shape[-2])[0].double().cpu().numpy()
     )
-    return 0.62 * 1.2 * np.cbrt(volume)
+    return 0.62 * 1.6 * np.cbrt(volume)
 
 
 def arm_frame(scene: Scene, arms: Sequence[Robot], arm: int, link: str) -> int:

@@ -19,9 +19,11 @@ from torchrl.envs import EnvBase
 from torchdlo.envs.core import episode as episodes
 from torchdlo.envs.core.episode import EpisodeState
 from torchdlo.envs.core.task import Task, combined
+from torchdlo.envs.observations.sensor import sensor_of
 from torchdlo.errors import InputError
 from torchdlo.physics import tree
 from torchdlo.scene import Params, Scene
+from torchdlo.vision.look import Look, draw_look
 
 __all__ = ["DloEnv"]
 
@@ -43,6 +45,7 @@ class DloEnv(EnvBase):
         segment: int | None = 1,
         variation: bool = True,
         randomize: Mapping[str, float] | None = None,
+        pixels: bool | Mapping[str, Any] = False,
     ) -> None:
         """Make the scenes; arguments as in `torchdlo.envs.make`."""
         if not isinstance(num_envs, Integral) or isinstance(num_envs, bool) or num_envs < 1:
@@ -57,6 +60,8 @@ class DloEnv(EnvBase):
         made = episodes.prepare(task, num_envs, like=self._like, compiled=compiled, recorded=recorded, segment=segment)
         _check(self._randomize, made.scene)
         self.episode, self.world, self._usual = made, made.start, made.params
+        self._sensor = None if pixels is False else sensor_of(made, {} if pixels is True else pixels)
+        self._looks, self._look_generator = (Look(),) * num_envs, torch.Generator()
         self._make_specs()
         self.set_seed(seed)
 
@@ -73,6 +78,7 @@ class DloEnv(EnvBase):
             observation=Unbounded((*shape, size), device=device, dtype=torch.float32),
             success=flag.clone(),
             terms=Composite({name: one.clone() for name in names}, shape=shape, device=device),
+            **self._image_specs(),
             shape=shape,
             device=device,
         )
@@ -81,9 +87,25 @@ class DloEnv(EnvBase):
             done=flag.clone(), terminated=flag.clone(), truncated=flag.clone(), shape=shape, device=device
         )
 
+    def _image_specs(self) -> dict[str, Composite]:
+        if self._sensor is None:
+            return {}
+        found = {}
+        for kind, (names, shape, dtype) in self._sensor.shapes().items():
+            whole = (*self.batch_size, *shape)
+            spec = Unbounded(whole, device=self.device, dtype=dtype)
+            if dtype == torch.uint8:
+                spec = Bounded(0, 255, whole, device=self.device, dtype=dtype)
+            rows = {name: spec.clone() for name in names}
+            found[kind] = Composite(rows, shape=self.batch_size, device=self.device) if names else spec
+        return found
+
     def _set_seed(self, seed: int | None) -> None:
         # Without a seed, torch's own generator decides, so that torch.manual_seed holds here too.
-        self._generator.manual_seed(int(torch.randint(2**31, (), device="cpu")) if seed is None else seed)
+        chosen = int(torch.randint(2**31, (), device="cpu")) if seed is None else seed
+        self._generator.manual_seed(chosen)
+        # Looks have random numbers of their own: starts are the same with and without pictures.
+        self._look_generator.manual_seed(chosen)
 
     def to(self, device: torch.device | str | int | torch.dtype) -> DloEnv:
         """Return the environment if it is on that device, or in that precision, already.
@@ -113,6 +135,18 @@ class DloEnv(EnvBase):
             "observation": episodes.observe(self.episode, self.world),
             "success": (self.task.success(seen) & ~self.world.failed).unsqueeze(-1),
             "terms": TensorDict({n: t.float().unsqueeze(-1) for n, t in terms.items()}, self.batch_size, self.device),
+            **self._images(),
+        }
+
+    def _images(self) -> dict[str, Any]:
+        if self._sensor is None:
+            return {}
+        found = self._sensor.observe(self.world, self._looks)
+        return {
+            kind: TensorDict({n: x.to(self.device) for n, x in value.items()}, self.batch_size, self.device)
+            if isinstance(value, dict)
+            else value.to(self.device)
+            for kind, value in found.items()
         }
 
     def _reset(self, tensordict: TensorDictBase | None, **_: Any) -> TensorDict:
@@ -120,6 +154,9 @@ class DloEnv(EnvBase):
         again = torch.ones_like(self.world.failed) if mask is None else mask.reshape(self.batch_size)
         with torch.no_grad():
             self._draw(again)
+            if self._sensor is not None and self._sensor.random:
+                drawn = zip(self._looks, again.tolist(), strict=True)
+                self._looks = tuple(draw_look(self._look_generator) if new else look for look, new in drawn)
             fresh = self._fresh()
         # Scenes that go on keep their gradient history.
         with torch.set_grad_enabled(self.gradients and torch.is_grad_enabled()):

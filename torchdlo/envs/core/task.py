@@ -24,6 +24,7 @@ from torchdlo.envs.assets.arms import DOWN, Arms
 from torchdlo.envs.assets.rope_material import RopeMaterial
 from torchdlo.envs.core import curve_geometry
 from torchdlo.envs.core.stages import Schedule, Stage
+from torchdlo.envs.observations.cameras import TaskCamera
 from torchdlo.errors import InputError
 from torchdlo.physics import tree
 from torchdlo.physics.effects.base import Effect
@@ -107,6 +108,9 @@ class Task(ABC):
     fixed."""
     stages: ClassVar[tuple[Stage, ...]] = ()
     """What hands hold from which action on; if not given, they hold what they start at until the end."""
+    cameras: ClassVar[tuple[TaskCamera, ...]] = ()
+    """Cameras beside or instead of the usual ones, "front" and "wrist_right" or "wrist_left" on each arm, see
+    `observations.pixels.cameras_of`."""
     travel: ClassVar[int] = 10
     """Actions that a hand takes from what it held to what it holds in the next stage."""
 

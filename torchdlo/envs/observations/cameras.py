@@ -1,0 +1,93 @@
+"""Cameras of tasks: in front of the arms, and one at the wrist of each arm."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchdlo.errors import InputError
+
+__all__ = ["WRIST_EYE", "WRIST_TARGET", "TaskCamera", "front_camera", "wrist_names"]
+
+WRIST_EYE, WRIST_TARGET = (0.135, 0.0, -0.03), (0.045, 0.0, 0.125)
+"""Where a camera at the wrist is and what it looks at, in the frame of the hand [m]: 13 cm beside it, tilted inwards,
+so that the fingers are in the picture and the hand does not fill it."""
+
+
+@dataclass(frozen=True)
+class TaskCamera:
+    """A camera of a task, in the world or on the hand of an arm."""
+
+    name: str
+    """Its name: "front", "wrist_right", "wrist_left", or another."""
+    eye: tuple[float, float, float]
+    """Where it is, in the frame of the hand if it is on one [m]."""
+    target: tuple[float, float, float]
+    """What is in the middle of its picture [m]."""
+    opening: float = 0.75
+    """Angle that its picture covers from top to bottom [rad]."""
+    arm: int | None = None
+    """The arm that carries it; None for the world."""
+
+    def __post_init__(self) -> None:
+        if not self.name.isidentifier():
+            raise InputError(f"camera: its name is {self.name!r}; expected a word of letters, digits and underscores.")
+        if not 0.05 < self.opening < 3.0 or self.eye == self.target:
+            raise InputError(
+                f"camera {self.name}: it opens by {self.opening:g} rad from {self.eye} towards {self.target}; expected "
+                "0.05 to 3 rad, and two different places."
+            )
+
+
+_ASIDE, _STEEP, _OPENING = math.radians(20), 0.8, 0.75
+"""By how much the camera in front is beside the direction in which arms reach [rad], its rise per way, and its opening
+[rad]."""
+
+
+def front_camera(bases: Tensor, tools: Tensor, things: Tensor, *, name: str = "front") -> TaskCamera:
+    """Return a camera that faces the arms and sees all that is to be handled.
+
+    Args:
+        bases: where arms stand [m], shape (R, 3).
+        tools: where their tools start [m], shape (R, 3).
+        things: points of ropes and bodies at the start [m], shape (N, 3).
+        name: its name.
+    """
+    bases, tools, things = bases.double().cpu(), tools.double().cpu(), things.double().cpu()
+    way = (tools - bases)[:, :2]
+    ahead = way.mean(0)
+    if float(ahead.norm()) < 0.5 * float(way.norm(dim=1).mean()):
+        # They reach from two sides: look from the third.
+        side = torch.stack([way[0, 1], -way[0, 0]])
+        ahead = side if float(side @ ahead) >= 0 else -side
+    x, y = (ahead / ahead.norm()).tolist()
+    cos, sin = math.cos(_ASIDE), math.sin(_ASIDE)
+    to_eye = torch.tensor([cos * x - sin * y, sin * x + cos * y, _STEEP], dtype=torch.float64)
+    to_eye = to_eye / to_eye.norm()
+    # Room above for the hands.
+    seen = torch.cat([things, tools + torch.tensor([0.0, 0.0, 0.12], dtype=torch.float64)])
+    middle = 0.5 * (seen.amin(0) + seen.amax(0))
+    right = torch.linalg.cross(torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64), to_eye)
+    right = right / right.norm()
+    up = torch.linalg.cross(to_eye, right)
+    off = seen - middle
+    half = math.tan(0.5 * _OPENING)
+    spread = torch.stack([(off @ right).abs(), (off @ up).abs()]).amax(0)
+    away = float((spread / half + off @ to_eye).amax())
+    eye = middle + max(1.3 * away, 0.4) * to_eye
+    return TaskCamera(name, tuple(eye.tolist()), tuple(middle.tolist()), _OPENING)
+
+
+def wrist_names(bases: Tensor, front: TaskCamera) -> tuple[str, ...]:
+    """Return names of the cameras of arms: left and right as the arms have them, which face the camera in front."""
+    if len(bases) == 1:
+        return ("wrist_right",)
+    to_eye = torch.tensor(front.eye).double() - torch.tensor(front.target).double()
+    # An arm that looks at the camera has its right hand at the left side of the picture.
+    across = bases[:, :2].double() @ torch.stack([to_eye[1], -to_eye[0]])
+    if len(bases) == 2:
+        return ("wrist_right", "wrist_left") if float(across[0]) >= float(across[1]) else ("wrist_left", "wrist_right")
+    return tuple(f"wrist_{k}" for k in range(len(bases)))
