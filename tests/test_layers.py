@@ -23,6 +23,7 @@ FLOORS = {
     "physics": 2,
     "coupling": 3,
     "scene": 4,
+    "vision": 4.5,
     "scene_files": 6,
     "envs": 5,
     "sysid": 5,
@@ -47,6 +48,7 @@ ALLOWED = {
     "physics": TORCH | {"triton"},  # comes with the CUDA builds of torch
     "coupling": TORCH | {"pytorch_kinematics", "trimesh"},
     "scene": TORCH,
+    "vision": ARRAYS | {"kornia", "cv2", "av"},
     "scene_files": ARRAYS,
     "sysid": ARRAYS,
     "envs": LEARNING | {"pytorch_kinematics", "trimesh"},

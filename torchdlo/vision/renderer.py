@@ -4,8 +4,8 @@ Triangles go into a z-buffer with one or four samples per pixel, each surface in
 light casts soft shadows. It is done by `renderer.cpp`, or in array operations where no compiler is at hand; nothing has
 a gradient. The same input makes the same bytes, whatever the batch and the number of threads.
 
-Cameras are those of OpenCV without distortion: x right, y down, z forward, pixel (0, 0) is the centre of the top left
-one.
+Cameras are those of OpenCV without distortion: x right, y down, z forward, pixel (0, 0) is the centre of the one at the
+top left.
 """
 
 from __future__ import annotations

@@ -1,2 +1,1 @@
-"""What environments see besides numbers: cameras of tasks, and the pictures, depths, masks and points that they
-give."""
+"""What environments see besides numbers: cameras of tasks, and pictures, depths, masks and points from them."""

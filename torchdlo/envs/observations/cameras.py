@@ -69,15 +69,19 @@ def front_camera(bases: Tensor, tools: Tensor, things: Tensor, *, name: str = "f
     to_eye = to_eye / to_eye.norm()
     # Room above for the hands.
     seen = torch.cat([things, tools + torch.tensor([0.0, 0.0, 0.12], dtype=torch.float64)])
-    middle = 0.5 * (seen.amin(0) + seen.amax(0))
     right = torch.linalg.cross(torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64), to_eye)
     right = right / right.norm()
-    up = torch.linalg.cross(to_eye, right)
-    off = seen - middle
-    half = math.tan(0.5 * _OPENING)
-    spread = torch.stack([(off @ right).abs(), (off @ up).abs()]).amax(0)
-    away = float((spread / half + off @ to_eye).amax())
-    eye = middle + max(1.3 * away, 0.4) * to_eye
+    axes = torch.stack([right, torch.linalg.cross(to_eye, right)])
+    half, away = math.tan(0.5 * _OPENING), 0.4
+    middle = 0.5 * (seen.amin(0) + seen.amax(0))
+    for _ in range(8):
+        # The least distance at which all is within the picture; then aim at the middle of what is seen.
+        off = (seen - middle) @ axes.T
+        nearer = (seen - middle) @ to_eye
+        away = max(float((off.abs().amax(1) / half + nearer).amax()), 0.3)
+        place = off / (away - nearer)[:, None]
+        middle = middle + away * 0.5 * (place.amin(0) + place.amax(0)) @ axes
+    eye = middle + 1.12 * away * to_eye
     return TaskCamera(name, tuple(eye.tolist()), tuple(middle.tolist()), _OPENING)
 
 

@@ -91,21 +91,15 @@ def camera_rig(
     if not chosen or len({c.name for c in chosen}) < len(chosen):
         raise InputError(f"cameras: given {[c.name for c in chosen]}; expected one or more, each once.")
     width, height = (size, size) if isinstance(size, int) else size
-    if not (
-        isinstance(width, int) and isinstance(height, int) and 8 <= min(width, height) <= max(width, height) <= 4096
-    ):
+    if not all(isinstance(n, int) and 8 <= n <= 4096 for n in (width, height)):
         raise InputError(f"size: it is {size!r}; expected 8 to 4096 pixels, or a width and a height of so many.")
     task, x = episode.task, episode.start.state.rods.pos[0].detach()
     arms, bases = (_robot(),) * task.arms.count, torch.tensor(task.arms.base)
     corners = torch.cat([bases[:, :2], x[:, :2].to(bases)])
     low, high = (corners.amin(0) - MARGIN).tolist(), (corners.amax(0) + MARGIN).tolist()
+    fine = 0.02 if max(width, height) <= 160 else 0.014
     model = model_of(
-        episode.scene,
-        episode.params,
-        arms=arms,
-        low=tuple(low),
-        high=tuple(high),
-        spacing=0.02 if max(width, height) <= 160 else 0.014,
+        episode.scene, episode.params, arms=arms, low=(low[0], low[1]), high=(high[0], high[1]), spacing=fine
     )
     frames, parts = [], []
     for camera in chosen:
@@ -122,8 +116,7 @@ def camera_rig(
 
 
 def _upright(view: Pinhole, eye: Tensor) -> Pinhole:
-    """Return a camera turned about its axis so that the z axis of the hand, to the fingers, points up in its
-    picture."""
+    """Return a camera turned about its axis so that the z axis of the hand, to the fingers, is up in its picture."""
     ahead = view.rotation[2]
     down = -torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
     down = down - (down @ ahead) * ahead
@@ -192,14 +185,8 @@ def rope_points(images: Images, view: Pinhole, *, count: int = CLOUD) -> Tensor:
     height, width = depth.shape[-2:]
     y, x = torch.meshgrid(torch.arange(height).double(), torch.arange(width).double(), indexing="ij")
     matrix = view.intrinsics[..., None, None, :, :]
-    ray = torch.stack(
-        [
-            (x - matrix[..., 0, 2]) / matrix[..., 0, 0],
-            (y - matrix[..., 1, 2]) / matrix[..., 1, 1],
-            torch.ones_like(x).expand(depth.shape),
-        ],
-        -1,
-    )
+    across = (x - matrix[..., 0, 2]) / matrix[..., 0, 0]
+    ray = torch.stack([across, (y - matrix[..., 1, 2]) / matrix[..., 1, 1], torch.ones_like(across)], -1)
     local = ray * torch.where(rope, depth, 0.0).double()[..., None] - view.translation[..., None, None, :]
     world = (local.flatten(-3, -2) @ view.rotation).flatten(1, 2)
     seen, found = rope.flatten(1), []

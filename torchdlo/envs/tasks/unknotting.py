@@ -16,6 +16,7 @@ from torch import Tensor
 
 from torchdlo.envs.core import curve_geometry
 from torchdlo.envs.core.task import RADIUS, SPACING, Arms, Task, TaskState, even, make, raised, settled
+from torchdlo.envs.observations.cameras import TaskCamera
 from torchdlo.scene import Params, Rope, Scene, State
 
 __all__ = ["Unknotting"]
@@ -58,6 +59,7 @@ class Unknotting(Task):
 
     name: ClassVar[str] = "unknotting"
     arms: ClassVar[Arms] = Arms(base=((0.25, -0.5, 0.0), (1.1, 0.2, 0.0)), vertex=(2, 37), quat=(SIDEWAYS, SIDEWAYS))
+    cameras: ClassVar[tuple[TaskCamera, ...]] = (TaskCamera("front", (1.1, -0.6, 0.7), (0.68, -0.09, 0.03)),)
     combine: ClassVar[str] = "product"
     stretch: ClassVar[float] = 1.05
     reset_noise: ClassVar[tuple[tuple[float, float], ...]] = ((0.05, 0.025),)

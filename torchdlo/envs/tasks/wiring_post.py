@@ -17,6 +17,7 @@ from torch import Tensor
 from torchdlo.coupling.bodies.dynamics import RigidBody
 from torchdlo.envs.core import curve_geometry
 from torchdlo.envs.core.task import RADIUS, SPACING, Arms, Task, TaskState, make, straight
+from torchdlo.envs.observations.cameras import TaskCamera
 from torchdlo.physics.linalg.numerics import safe_norm
 from torchdlo.scene import Params, Rope, Scene, State
 
@@ -82,6 +83,7 @@ class WiringPost(Task):
 
     name: ClassVar[str] = "wiring_post"
     arms: ClassVar[Arms] = Arms(base=((-0.2, -0.25, 0.0),), vertex=(3,))
+    cameras: ClassVar[tuple[TaskCamera, ...]] = (TaskCamera("front", (0.8, 0.75, 0.75), (0.4, 0.13, 0.02)),)
     combine: ClassVar[str] = "product"
     anchored: ClassVar[bool] = True
     reset_noise: ClassVar[tuple[tuple[float, float], ...]] = ((0.05, 0.025),)

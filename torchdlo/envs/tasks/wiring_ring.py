@@ -17,6 +17,7 @@ from torch import Tensor
 from torchdlo.coupling.bodies.dynamics import RigidBody
 from torchdlo.envs.core import curve_geometry
 from torchdlo.envs.core.task import RADIUS, SPACING, Arms, Stage, Task, TaskState, make, straight
+from torchdlo.envs.observations.cameras import TaskCamera
 from torchdlo.physics.linalg.numerics import safe_norm
 from torchdlo.scene import Params, Rope, Scene, State
 
@@ -42,6 +43,7 @@ class WiringRing(Task):
 
     name: ClassVar[str] = "wiring_ring"
     arms: ClassVar[Arms] = Arms(base=((0.3, -0.6, 0.0), (-0.35, -0.1, 0.0)), vertex=(2, 0))
+    cameras: ClassVar[tuple[TaskCamera, ...]] = (TaskCamera("front", (0.2, 0.75, 0.75), (0.35, -0.08, 0.03)),)
     reset_noise: ClassVar[tuple[tuple[float, float], ...]] = ((0.01, 0.01),)
     anchored: ClassVar[bool] = True
     stages: ClassVar[tuple[Stage, ...]] = (

@@ -15,6 +15,7 @@ from torch import Tensor
 from torchdlo.coupling.bodies.dynamics import RigidBody
 from torchdlo.envs.core import curve_geometry
 from torchdlo.envs.core.task import RADIUS, Arms, Task, TaskState, make
+from torchdlo.envs.observations.cameras import TaskCamera
 from torchdlo.scene import Params, Rope, Scene, State
 
 __all__ = ["Wrapping"]
@@ -44,6 +45,7 @@ class Wrapping(Task):
         vertex=(17, 33),
         quat=((0.0, 0.9239, 0.3827, 0.0), (0.0, 0.3827, 0.9239, 0.0)),
     )
+    cameras: ClassVar[tuple[TaskCamera, ...]] = (TaskCamera("front", (1.15, 0.15, 0.75), (0.47, 0.0, 0.02)),)
     floor: ClassVar[float] = 0.04
     stretch: ClassVar[float] = 1.2
     anchored: ClassVar[bool] = True
