@@ -37,7 +37,7 @@ struct Call {
 };
 
 constexpr int POSE = 12, MATERIAL = 12, CAMERA = 16, LIGHT = 32;
-constexpr float NEAR = 0.01f, PI = 3.14159265f;
+constexpr float NEAR = 0.01f, FAR = -1e30f;
 constexpr uint32_t NONE = 0xffffffffu;
 enum { CASTS = 1, TWO_SIDED = 2 };
 
@@ -268,17 +268,18 @@ inline void draw(const Corner& a, const Corner& b, const Corner& c, uint32_t num
     int x0 = int(std::ceil(std::max(0.0f, low_x))), x1 = int(std::floor(std::min(float(width - 1), high_x)));
     int y0 = int(std::ceil(std::max(0.0f, low_y))), y1 = int(std::floor(std::min(float(height - 1), high_y)));
     if (x0 > x1 || y0 > y1) return;
-    const float over = 1.0f / area;
-    // Barycentric coordinates of b and c are linear: u = ux x + uy y + u0.
-    const float ux = over * (c.y - a.y), uy = -over * (c.x - a.x), vx = -over * (b.y - a.y), vy = over * (b.x - a.x);
-    const float wu = b.w - a.w, wv = c.w - a.w;
-    const float wx = wu * ux + wv * vx;
+    // Barycentric coordinates of b and c are linear in x. Triangles may reach far beyond the picture: rows start in double
+    // precision.
+    const double over = 1.0 / (double(b.x - a.x) * (c.y - a.y) - double(b.y - a.y) * (c.x - a.x));
+    const double dux = over * (c.y - a.y), duy = -over * (c.x - a.x), dvx = -over * (b.y - a.y), dvy = over * (b.x - a.x);
+    const double wu = double(b.w) - a.w, wv = double(c.w) - a.w;
+    const float ux = float(dux), vx = float(dvx), wx = float(wu * dux + wv * dvx);
     constexpr float EDGE = -1e-6f;
     for (int y = y0; y <= y1; ++y) {
-        const float dy = float(y) - a.y;
-        const float u0 = uy * dy - ux * a.x, v0 = vy * dy - vx * a.x;
+        const double dx = double(x0) - a.x, dy = double(y) - a.y, du = duy * dy + dux * dx, dv = dvy * dy + dvx * dx;
+        const float u0 = float(du), v0 = float(dv), w0 = float(a.w + wu * du + wv * dv);
         // Where the row is inside: all three of u, v, 1 - u - v are not negative.
-        float from = float(x0), to = float(x1);
+        float from = 0, to = float(x1 - x0);
         auto cut = [&](float slope, float start) {
             if (slope > 1e-12f) from = std::max(from, (EDGE - start) / slope - 1);
             else if (slope < -1e-12f) to = std::min(to, (EDGE - start) / slope + 1);
@@ -287,10 +288,9 @@ inline void draw(const Corner& a, const Corner& b, const Corner& c, uint32_t num
             cut(ux, u0), cut(vx, v0), cut(-ux - vx, 1 - u0 - v0);
             if (!(from <= to)) continue;
         }
-        const int begin = std::max(x0, int(from)), end = std::min(x1, int(to));
-        const float w0 = a.w + wu * u0 + wv * v0;
-        float* line = near + size_t(y) * width;
-        uint32_t* row = NUMBERED ? numbers + size_t(y) * width : nullptr;
+        const int begin = std::max(0, int(from)), end = std::min(x1 - x0, int(to));
+        float* line = near + size_t(y) * width + x0;
+        uint32_t* row = NUMBERED ? numbers + size_t(y) * width + x0 : nullptr;
 #pragma GCC ivdep
         for (int x = begin; x <= end; ++x) {
             float fx = float(x), u = u0 + ux * fx, v = v0 + vx * fx, w = w0 + wx * fx;
@@ -328,14 +328,14 @@ struct Camera {
     }
 };
 
-// The scene as the key light sees it: 1 is at the light, 0 as far as anything that casts a shadow.
+// The scene as the key light sees it: 1 is nearest to the light, 0 as far as anything that casts a shadow, FAR is nothing.
 struct Shadow {
     int size = 0;
     Vec right, up, ahead;  // axes; ahead points away from the light
     float x0, y0, z0, scale, deep;
     std::vector<float> near, coarse;  // nearest surface per texel, and the nearest of blocks of texels and their neighbours
     int blocks = 0;
-    static constexpr int BLOCK = 8;
+    static constexpr int BLOCK = 12;
 
     void draw_all(const Call& call, int64_t b, const Mesh& mesh, const std::vector<Span>& spans, Vec to_light) {
         size = int(call.shadow);
@@ -358,10 +358,10 @@ struct Shadow {
             size = 0;
             return;
         }
-        float wide = 1.04f * std::max(std::max(high.x - low.x, high.y - low.y), 1e-3f);
+        float wide = 1.04f * std::max(std::max(high.x - low.x, high.y - low.y), 0.8f);
         x0 = 0.5f * (low.x + high.x - wide), y0 = 0.5f * (low.y + high.y - wide), z0 = high.z;
         deep = std::max(high.z - low.z, 1e-3f), scale = float(size) / wide;
-        near.assign(size_t(size) * size, -1.0f);
+        near.assign(size_t(size) * size, FAR);
         std::vector<Corner> at(mesh.pos.size());
         for (const Span& s : spans) {
             if (!(s.flags & CASTS)) continue;
@@ -382,13 +382,13 @@ struct Shadow {
                 }
         }
         blocks = (size + BLOCK - 1) / BLOCK;
-        std::vector<float> own(size_t(blocks) * blocks, -1.0f);
+        std::vector<float> own(size_t(blocks) * blocks, FAR);
         for (int y = 0; y < size; ++y)
             for (int x = 0; x < size; ++x) {
                 float& c = own[size_t(y / BLOCK) * blocks + x / BLOCK];
                 c = std::max(c, near[size_t(y) * size + x]);
             }
-        coarse.assign(own.size(), -1.0f);
+        coarse.assign(own.size(), FAR);
         for (int y = 0; y < blocks; ++y)
             for (int x = 0; x < blocks; ++x)
                 for (int j = std::max(0, y - 1); j <= std::min(blocks - 1, y + 1); ++j)
@@ -440,7 +440,7 @@ struct Shadow {
 
   private:
     float texel_at(int x, int y) const {
-        return x < 0 || y < 0 || x >= size || y >= size ? -1.0f : near[size_t(y) * size + x];
+        return x < 0 || y < 0 || x >= size || y >= size ? FAR : near[size_t(y) * size + x];
     }
     // Share of the four texels about a place that are in front.
     float filtered(float x, float y, float own) const {
