@@ -104,14 +104,11 @@ def test_penumbras_grow_with_the_size_of_the_light():
     between = []
     for softness in (0.0, 0.2):
         look = Look(key_direction=(1.0, 0.0, 1.0), softness=softness, table=Paint((0.8, 0.8, 0.8), gloss=0.0))
-        rgb = (
-            drawn(only(table(), ball()), at((0.0, 0.0, 0.4)), view, (241, 241), looks=[look]).rgb[0, 0].float().mean(-1)
-        )
-        lit, dark = rgb[20:220, 20:220].mode().values.mode().values, rgb[60:180, 60:180].min()
-        between.append(
-            int(((rgb > dark + 0.15 * (lit - dark)) & (rgb < lit - 0.15 * (lit - dark)))[60:180, 60:180].sum())
-        )
-    assert between[1] > 1.5 * between[0]
+        rgb = drawn(only(table(), ball()), at((0.0, 0.0, 0.4)), view, (241, 241), looks=[look]).rgb[0, 0]
+        # Along the row through the shadow, beside the ball.
+        row = rgb[120, 20:100].float().mean(-1) if rgb[120, 73].sum() < 450 else rgb[120, 140:220].float().mean(-1)
+        between.append(int(((row > 140) & (row < 184)).sum()))
+    assert between[0] <= 2 and between[1] >= 6
 
 
 def test_what_is_behind_the_camera_is_not_drawn():
