@@ -86,8 +86,8 @@ def test_arms_are_closed_and_as_large_as_their_links():
 def test_other_robots_look_as_their_contact_shapes_do():
     text = (
         '<robot name="one"><link name="a"/><link name="b"><collision><origin xyz="0 0 1"/><geometry>'
-        '<sphere radius="0.1"/></geometry></collision></link><joint name="j" type="revolute"><parent link="a"/><child link="b"/>'
-        '<axis xyz="0 0 1"/><limit lower="-1" upper="1" velocity="1" effort="1"/></joint></robot>'
+        '<sphere radius="0.1"/></geometry></collision></link><joint name="j" type="revolute"><parent link="a"/>'
+        '<child link="b"/><axis xyz="0 0 1"/><limit lower="-1" upper="1" velocity="1" effort="1"/></joint></robot>'
     )
     from torchdlo.coupling.robot.kinematics import load
 

@@ -90,9 +90,10 @@ def camera_rig(
         chosen.append(camera if isinstance(camera, TaskCamera) else usual[camera])
     if not chosen or len({c.name for c in chosen}) < len(chosen):
         raise InputError(f"cameras: given {[c.name for c in chosen]}; expected one or more, each once.")
-    width, height = (size, size) if isinstance(size, int) else size
-    if not all(isinstance(n, int) and 8 <= n <= 4096 for n in (width, height)):
+    both = (size, size) if isinstance(size, int) else size
+    if not isinstance(both, tuple) or len(both) != 2 or not all(isinstance(n, int) and 8 <= n <= 4096 for n in both):
         raise InputError(f"size: it is {size!r}; expected 8 to 4096 pixels, or a width and a height of so many.")
+    width, height = both
     task, x = episode.task, episode.start.state.rods.pos[0].detach()
     arms, bases = (_robot(),) * task.arms.count, torch.tensor(task.arms.base)
     corners = torch.cat([bases[:, :2], x[:, :2].to(bases)])
