@@ -14,7 +14,7 @@ import numpy as np
 from torchdlo.coupling.robot.kinematics import Robot
 from torchdlo.vision.surfaces import Surface, blended, joined, moved, solid
 
-__all__ = ["LinkSurface", "link_surfaces"]
+__all__ = ["LinkSurface", "link_surfaces", "panda_surfaces"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,7 +146,8 @@ def _disc(axis: int, at: float, across: tuple[float, float], radius: float, half
 
 
 @functools.cache
-def _shells(spacing: float) -> tuple[LinkSurface, ...]:
+def panda_surfaces(spacing: float = 0.015) -> tuple[LinkSurface, ...]:
+    """Return the surfaces of the seven-joint arm and its gripper; `spacing` as in `link_surfaces`."""
     found = [LinkSurface(link, "shell", _shell(*shell, spacing)) for link, shell in _SHELLS.items()]
     for link in dict.fromkeys(row[0] for row in _RINGS):
         found.append(LinkSurface(link, "joint", joined([_disc(*row[1:]) for row in _RINGS if row[0] == link])))
@@ -163,7 +164,7 @@ def link_surfaces(robot: Robot, spacing: float = 0.015) -> tuple[LinkSurface, ..
         spacing: about how far corners of shells are apart [m].
     """
     if {*_SHELLS, "left_finger", "right_finger"} <= set(robot.links):
-        return _shells(spacing)
+        return panda_surfaces(spacing)
     found = []
     for shape in robot.shapes:
         size, origin = np.zeros(3), shape.origin.numpy()

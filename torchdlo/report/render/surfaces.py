@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
+from importlib import resources
 
 import numpy as np
 import torch
@@ -11,7 +13,9 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from torchdlo.coupling.bodies import shape_sdf
+from torchdlo.coupling.robot import urdf
 from torchdlo.scene_files.run import Frames
+from torchdlo.vision.arm_surfaces import panda_surfaces
 
 __all__ = ["COLORS", "Piece", "bounds", "extent", "pieces", "points_of", "rotations", "spacing"]
 
@@ -27,6 +31,8 @@ COLORS = {
     "fixed": "#9aa3ab",
     "kinematic": "#7f8fa0",
     "robot": "#e6e3dc",
+    "joint": "#4b5158",
+    "finger": "#2e3236",
     "weight": "#5c6670",
     "table": "#e9e5dd",
     "elastic": "#c4584a",
@@ -244,10 +250,52 @@ def pieces(frames: Frames) -> list[Piece]:
         radius = (0.75 * frames.weight[slot] / (np.pi * _STEEL)) ** (1 / 3)
         corners, faces = _solid("sphere", np.array([radius, 0.0, 0.0]), reach)
         found.append(Piece(f"weight {slot}", COLORS["weight"], faces, corners, np.array([slot]), "weight"))
+    arms = _arms(frames)
+    for first in arms:
+        found += _arm(first)
+    drawn = {first + k for first in arms for k in range(len(_panda_shapes()))}
     for k, shape in enumerate(frames.body_shape):
+        if k in drawn:
+            continue
         corners, faces = _local(frames, k, reach)
         motion = "table" if shape == "plane" else str(frames.body_motion[k])
         found.append(Piece(f"body {k}", COLORS[motion], faces, corners, np.array([k]), "body"))
+    return found
+
+
+@functools.cache
+def _panda_shapes() -> tuple[urdf.Shape, ...]:
+    """Return the shapes that stand for the links of the arm that comes with the package."""
+    text = resources.files("torchdlo").joinpath("data/robots/panda.urdf").read_text(encoding="utf-8")
+    return urdf.read(text).shapes
+
+
+def _arms(frames: Frames) -> list[int]:
+    """Return the number of the first body of each arm of that kind."""
+    said, found, k = _panda_shapes(), [], 0
+    size = np.zeros((len(said), 3))
+    for row, shape in zip(size, said, strict=True):
+        row[: len(shape.size)] = shape.size
+    while k + len(said) <= len(frames.body_shape):
+        own = slice(k, k + len(said))
+        alike = list(frames.body_shape[own]) == [s.kind for s in said] and set(frames.body_motion[own]) == {"robot"}
+        if alike and np.allclose(frames.body_size[own], size, atol=1e-5):
+            found.append(k)
+        k += len(said) if found and found[-1] == k else 1
+    return found
+
+
+def _arm(first: int) -> list[Piece]:
+    """Return how an arm looks, whose links' bodies begin with a number."""
+    said, found = _panda_shapes(), []
+    for part in panda_surfaces(0.02):
+        k = next(k for k, shape in enumerate(said) if shape.link == part.link)
+        # Bodies stand in the middles of their shapes.
+        back = np.linalg.inv(said[k].origin.numpy())
+        corners = part.surface.vertices @ back[:3, :3].T + back[:3, 3]
+        color = COLORS["robot" if part.part == "shell" else part.part]
+        name = f"body {first + k} {part.part}"
+        found.append(Piece(name, color, part.surface.faces, corners, np.array([first + k]), "body"))
     return found
 
 
