@@ -53,7 +53,7 @@ ALLOWED = {
     "sysid": ARRAYS,
     "envs": LEARNING | {"pytorch_kinematics", "trimesh"},
     "agents": LEARNING | {"cma", "numpy"},
-    "report": ARRAYS | {"matplotlib", "pyvista", "vtk", "av", "viser"},
+    "report": ARRAYS | {"matplotlib", "pyvista", "vtk", "av", "viser", "mitsuba", "pyoidn"},
     "sample": {"typer"},
     "doctor": TORCH | {"av", "packaging", "typer"},
     "cli": ARRAYS | {"rich", "typer"},

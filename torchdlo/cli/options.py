@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-__all__ = ["INTERRUPTED", "ModelOption", "RecordingArgument", "ResumeOption", "RopeModelOption"]
+__all__ = ["INTERRUPTED", "ModelOption", "PhotoOption", "RecordingArgument", "ResumeOption", "RopeModelOption"]
 
 INTERRUPTED = 130
 """Exit code after Ctrl-C, as shells have it."""
@@ -28,6 +28,13 @@ RopeModelOption = Annotated[
     Path | None,
     typer.Option(
         "--rope-model", help="What ropes are made of: model.json of a calibration or diagnosis.", metavar="MODEL"
+    ),
+]
+PhotoOption = Annotated[
+    bool,
+    typer.Option(
+        "--photo",
+        help="Draw picture.png, and motion.mp4 with --video, as photographs, which take minutes each.",
     ),
 ]
 ResumeOption = Annotated[bool, typer.Option("--resume", help="Go on from the journal of a search that was stopped.")]

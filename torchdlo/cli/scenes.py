@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from torchdlo.cli.options import INTERRUPTED
+from torchdlo.cli.options import INTERRUPTED, PhotoOption
 from torchdlo.cli.progress import deferred_interrupt, progress
 from torchdlo.errors import InputError
 from torchdlo.files import check_writable, write_atomically
@@ -29,6 +29,7 @@ def simulate(
     frame_stride: Annotated[int, typer.Option(min=1, help="Steps per kept frame.")] = 10,
     video: Annotated[bool, typer.Option("--video", help="Write motion.mp4, too.")] = False,
     picture: Annotated[bool, typer.Option("--picture", help="Write picture.png, too: start, middle and end.")] = False,
+    photo: PhotoOption = False,
     speed: Annotated[float, typer.Option(min=0.001, help="Seconds of the run per second of the video.")] = 1.0,
     compiled: Annotated[
         bool, typer.Option("--compiled", help="Compile the step: a minute at first, then many times faster.")
@@ -50,7 +51,7 @@ def simulate(
 
     described = read(scene)
     out = out or Path("runs") / "simulate" / scene.stem
-    files = check_files(out, video=video, picture=picture)
+    files = check_files(out, video=video, picture=picture, photo=photo)
     try:
         with progress() as show, deferred_interrupt(show) as callback:
             frames = run(
@@ -62,7 +63,7 @@ def simulate(
     except ValueError as error:
         raise InputError(f"{scene}: {error}") from None
     save_frames(frames, files["frames"], described)
-    made = draw(frames, files, scene.stem, speed)
+    made = draw(frames, files, scene.stem, speed, photo)
     typer.echo(f"{scene}: {len(frames.time)} frames, {frames.time[-1]:g} s", err=as_json)
     for name, file in files.items():
         typer.echo(f"{name + ':':9}{file}" if file.exists() else f"{name + ':':9}none", err=as_json)
@@ -82,10 +83,10 @@ def simulate(
         raise typer.Exit(INTERRUPTED)
 
 
-def check_files(out: Path, *, video: bool, picture: bool) -> dict[str, Path]:
+def check_files(out: Path, *, video: bool, picture: bool, photo: bool) -> dict[str, Path]:
     """Return what is to be written, and refuse before the work what could not be written after it."""
     files = {"frames": out / "frames.npz", "shapes": out / "shapes.png"}
-    if picture:
+    if picture or photo:
         files["picture"] = out / "picture.png"
     for file in files.values():
         check_writable(file)
@@ -94,14 +95,18 @@ def check_files(out: Path, *, video: bool, picture: bool) -> dict[str, Path]:
 
         files["video"] = out / "motion.mp4"
         check_video(files["video"])
-    if video or picture:
+    if photo:
+        from torchdlo.report.render.photo import check_photo
+
+        check_photo()
+    elif video or picture:
         from torchdlo.report.render.picture import check_renderer
 
         check_renderer()
     return files
 
 
-def draw(frames: Frames, files: dict[str, Path], title: str, speed: float) -> bool:
+def draw(frames: Frames, files: dict[str, Path], title: str, speed: float, photo: bool) -> bool:
     """Write pictures and video; return whether they all were."""
     from torchdlo.report.figures.motion_figure import motion_png
 
@@ -110,12 +115,12 @@ def draw(frames: Frames, files: dict[str, Path], title: str, speed: float) -> bo
     if "picture" in files:
         from torchdlo.report.render.picture import stills_png
 
-        write_atomically(files["picture"], stills_png(frames))
+        write_atomically(files["picture"], stills_png(frames, photo=photo))
     if "video" not in files:
         return True
     from torchdlo.report.render.video import write_video
 
-    return _finished(lambda callback: write_video(frames, files["video"], speed=speed, callback=callback))
+    return _finished(lambda callback: write_video(frames, files["video"], speed=speed, photo=photo, callback=callback))
 
 
 def _finished(work: Callable[[Callable[[str, int, int, str], None]], None]) -> bool:

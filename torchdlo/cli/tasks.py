@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from torchdlo.cli.options import INTERRUPTED, ResumeOption, RopeModelOption
+from torchdlo.cli.options import INTERRUPTED, PhotoOption, ResumeOption, RopeModelOption
 from torchdlo.cli.progress import deferred_interrupt, progress
 from torchdlo.cli.scenes import check_files, draw
 from torchdlo.errors import InputError
@@ -50,6 +50,7 @@ def play(
     ] = None,
     video: Annotated[bool, typer.Option("--video", help="Write motion.mp4, too.")] = False,
     picture: Annotated[bool, typer.Option("--picture", help="Write picture.png, too: start, middle and end.")] = False,
+    photo: PhotoOption = False,
     speed: Annotated[float, typer.Option(min=0.001, help="Seconds of the episode per second of the video.")] = 0.5,
     arms: Annotated[bool, typer.Option(help="Show the arms.")] = True,
     rope_model: RopeModelOption = None,
@@ -80,7 +81,7 @@ def play(
 
     if no_op and trajectory is not None:
         raise InputError("--no-op and --trajectory: expected one of them, or neither for the scripted demonstration.")
-    files = check_files(out or Path("runs") / "play" / task, video=video, picture=picture)
+    files = check_files(out or Path("runs") / "play" / task, video=video, picture=picture, photo=photo)
     played = script(
         task,
         trajectory,
@@ -92,7 +93,7 @@ def play(
     with progress() as show, deferred_interrupt(show) as callback:
         frames, went = film(played.task, played.actions, made=played.episode, arms=arms, callback=callback)
     save_frames(frames, files["frames"])
-    drawn = draw(frames, files, task, speed) and went is not None
+    drawn = draw(frames, files, task, speed, photo) and went is not None
     said = outcome_of(went) | {"files": [str(file) for file in files.values() if file.exists()]}
     how = "failed" if said["failed"] else "success" if said["success"] else "no success"
     earned = "interrupted" if went is None else f"return {said['return']:.4g}, {how}"

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-__all__ = ["draw"]
+__all__ = ["draw", "painted", "tube"]
 
 NEAR, FAR, EDGE, BLOCK = np.float32(0.01), np.float32(-1e30), np.float32(-1e-6), 12
 PLAIN, WOOD, SPECKLED, CHECKED, WOVEN, TWISTED = range(6)
@@ -115,17 +115,28 @@ def _mesh(scene: dict[str, Array], pixels: float) -> _Mesh:
             thick, long = radius.max() * pixels, edge * pixels
             sides = 6 if thick < 2 else 8 if thick < 5 else 12 if thick < 14 else 16
             parts = 1 if long < 4 else 2 if long < 12 else 3 if long < 40 else 4
-        tube = _tube(x, radius, bool(closed), sides, parts)
-        for kept, made in zip((pos, normal, uv, face), (*tube[:3], tube[3] + start), strict=True):
+        found = tube(x, radius, bool(closed), sides, parts)
+        for kept, made in zip((pos, normal, uv, face), (*found[:3], found[3] + start), strict=True):
             kept.append(made)
-        owner.append(np.full(len(tube[3]), pieces + rope))
-        casts.append(np.ones(len(tube[3]), bool))
-        start += len(tube[0])
+        owner.append(np.full(len(found[3]), pieces + rope))
+        casts.append(np.ones(len(found[3]), bool))
+        start += len(found[0])
     parts_ = [np.concatenate(x) for x in (pos, normal, uv, face, owner, casts)]
     return _Mesh(*(x.astype(np.float32) for x in parts_[:3]), parts_[3].astype(int), *parts_[4:])
 
 
-def _tube(x: Array, radius: Array, closed: bool, sides: int, parts: int) -> tuple[Array, Array, Array, Array]:
+def tube(x: Array, radius: Array, closed: bool, sides: int, parts: int) -> tuple[Array, Array, Array, Array]:
+    """Return a tube about a smooth curve: corners [m] and normals (N, 3), places (N, 2), triangles (T, 3).
+
+    A place is how far round the tube a corner is, 0 to 1, and how far along the curve [m].
+
+    Args:
+        x: vertices of the curve [m], shape (V, 3).
+        radius: of the tube there [m], shape (V,).
+        closed: whether it is a loop.
+        sides: corners round it.
+        parts: rings for each edge.
+    """
     count = len(x)
     edges = count if closed else count - 1
     if closed:
@@ -288,7 +299,7 @@ def _wave(x: Array) -> Array:
     return _smooth(np.where(f < 0.5, 2 * f, 2 - 2 * f))
 
 
-def _painted(m: Array, p: Array, uv: Array, blur: Array) -> Array:
+def painted(m: Array, p: Array, uv: Array, blur: Array) -> Array:
     """Return colours before light falls on them; materials (n, 12), points (n, 3)."""
     one, two, kind, scale = m[:, :3], m[:, 3:6], m[:, 7].astype(int), m[:, 8]
     sharp, seed = np.clip(1.5 - blur * scale, 0, 1), m[:, 11].astype(np.int64)
@@ -470,5 +481,5 @@ def _color(
     blur = away / camera.focal[0] / np.maximum(0.15, np.abs(_dot(n, to_eye)))
     m = np.concatenate([scene["piece_material"], scene["rope_material"]])[owner]
     rope = (owner >= pieces)[:, None]
-    found[flat] = _lit(light, shadow, p, n, to_eye, _painted(m, p, np.where(rope, uv, 0), blur), m[:, 6])
+    found[flat] = _lit(light, shadow, p, n, to_eye, painted(m, p, np.where(rope, uv, 0), blur), m[:, 6])
     return found

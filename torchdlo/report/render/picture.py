@@ -18,7 +18,7 @@ from torchdlo.scene_files.run import Frames
 from torchdlo.vision import renderer as vision
 from torchdlo.vision.surfaces import smoothed
 
-__all__ = ["Picture", "check_renderer", "stills_png"]
+__all__ = ["ANGLE", "Picture", "camera_of", "check_renderer", "drawing", "stills_png"]
 
 ANGLE = 30.0
 """Opening of the camera, from top to bottom [deg]."""
@@ -250,19 +250,35 @@ class Picture:
         self.close()
 
 
-def stills_png(frames: Frames, moments: Sequence[float] | None = None, *, size: tuple[int, int] = (480, 420)) -> bytes:
+def drawing(frames: Frames, *, size: tuple[int, int], photo: bool = False) -> Any:
+    """Return what draws a run: a `Picture`, or a `photo.Photo`."""
+    if not photo:
+        return Picture(frames, size=size)
+    from torchdlo.report.render.photo import Photo
+
+    return Photo(frames, size=size)
+
+
+def stills_png(
+    frames: Frames,
+    moments: Sequence[float] | None = None,
+    *,
+    size: tuple[int, int] = (480, 420),
+    photo: bool = False,
+) -> bytes:
     """Return pictures of several moments side by side, as a PNG file.
 
     Args:
         frames: the run.
         moments: which moments [s]; start, middle and end if not given.
         size: width and height of each in pixels.
+        photo: whether they are photographs, which take minutes.
     """
     from matplotlib import image
 
     wanted = frames.time[-1] * np.array([0.0, 0.5, 1.0]) if moments is None else np.asarray(moments)
     chosen = dict.fromkeys(np.abs(frames.time[:, None] - wanted).argmin(0).tolist())
-    with Picture(frames, size=size) as picture:
+    with drawing(frames, size=size, photo=photo) as picture:
         whole = np.concatenate([picture.image(k) for k in chosen], 1)
     content = io.BytesIO()
     image.imsave(content, whole, format="png", metadata={"Software": "torchdlo"})

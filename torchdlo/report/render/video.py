@@ -11,7 +11,7 @@ import numpy as np
 
 from torchdlo.errors import InputError
 from torchdlo.files import check_writable, replacing
-from torchdlo.report.render.picture import Picture
+from torchdlo.report.render.picture import drawing
 from torchdlo.scene_files.run import Frames
 
 __all__ = ["CODECS", "check_video", "write_video"]
@@ -49,6 +49,7 @@ def write_video(
     *,
     speed: float = 1.0,
     size: tuple[int, int] = (960, 720),
+    photo: bool = False,
     callback: Callable[[str, int, int, str], None] | None = None,
 ) -> None:
     """Write a run as a video; nothing is left behind if it is stopped.
@@ -58,6 +59,7 @@ def write_video(
         path: the file, ending in .mp4.
         speed: seconds of the run per second of the video.
         size: width and height in pixels, even numbers.
+        photo: whether its pictures are photographs, which take minutes each.
         callback: told (stage, pictures done, in all, message) after every picture.
     """
     if not speed > 0:
@@ -70,7 +72,7 @@ def write_video(
     # The frame nearest in time: what is shown was computed.
     at = np.abs(frames.time[:, None] - np.arange(count) * speed / RATE).argmin(0)
     note = "" if speed == 1 else f"(speed {speed:g})"
-    with replacing(path) as temporary, Picture(frames, size=size) as picture:
+    with replacing(path) as temporary, drawing(frames, size=size, photo=photo) as picture:
         with av.open(str(temporary), "w", format="mp4") as container:
             container.metadata["comment"] = _MARK.decode()
             stream = container.add_stream(codec, rate=Fraction(RATE))
