@@ -44,7 +44,7 @@ def test_scenes_that_are_not_compiled_do_not_import_the_compiler():
 import sys, torch
 before = set(sys.modules)
 from torchdlo import Rope, stationary_control, make_scene, step
-from torchdlo.coupling import BodyContact, RodBody, RodContact, RodMatter
+from torchdlo.coupling import BodyContact, RodBody, RodContact, RodMpmCoupling
 from torchdlo.physics.effects import Bend, Gravity
 x = torch.zeros(8, 3)
 x[:, 0] = torch.linspace(0, 0.3, 8)
