@@ -25,6 +25,7 @@ from torchdlo.physics import tree
 from torchdlo.physics.effects.base import Effect, altered, default_values, parameters_of
 from torchdlo.physics.execution import tracing
 from torchdlo.physics.execution.replay import alike, rollout
+from torchdlo.physics.gradient_check import GradientCheck, check_gradients
 from torchdlo.physics.integrators import stability
 from torchdlo.physics.integrators.rod_step import INTEGRATORS, TWISTS, Settings, settle_twist, substep
 from torchdlo.physics.kernels import native
@@ -82,6 +83,10 @@ class Control:
     """Poses of the kinematic bodies, () if the scene has no bodies."""
 
 
+_NEWTON = {"explicit": 3, "implicit": 12}
+"""Newton steps for edge lengths, by integrator, where a scene says nothing."""
+
+
 @dataclass(frozen=True)
 class Scene:
     """The static side of a simulation; hashable, without tensors."""
@@ -100,8 +105,9 @@ class Scene:
     """Whether edge lengths are solved for; False leaves them to a `Stretch` effect."""
     prescribed_vertices: tuple[int, ...] = ()
     prescribed_edges: tuple[int, ...] = ()
-    constraint_iterations: int = 3
-    """Newton steps for edge lengths per substep."""
+    constraint_iterations: int | None = None
+    """Newton steps for edge lengths per substep: in explicit steps as many, 3 if None; in implicit ones at most, 12 if
+    None, as each scene ends when it is solved."""
     twist_iterations: int = 4
     """Newton steps for quasistatic twist per substep, where bending has a part in it; without, one is exact."""
     implicit_weight: float = 0.3
@@ -123,8 +129,8 @@ class Scene:
         need(isinstance(self.dt, int | float) and 0 < self.dt < math.inf, f"dt is {self.dt!r}; give seconds above 0")
         need(self.substeps in range(1, 10**6), f"substeps is {self.substeps!r}; expected a whole number from 1 up")
         need(
-            self.constraint_iterations >= 1,
-            f"constraint_iterations is {self.constraint_iterations}; expected at least 1 step",
+            self.constraint_iterations is None or self.constraint_iterations >= 1,
+            f"constraint_iterations is {self.constraint_iterations}; expected at least 1 step, or None",
         )
         need(self.twist_iterations >= 1, f"twist_iterations is {self.twist_iterations}; expected at least 1 step")
         need(
@@ -181,7 +187,7 @@ class Scene:
             self.constrained,
             self.prescribed_vertices,
             self.prescribed_edges,
-            self.constraint_iterations,
+            self.constraint_iterations or _NEWTON[self.integrator],
             self.twist_iterations,
             # Twist and bending answer to each other only in the next step: that costs stability.
             max(self.implicit_weight, 0.5) if self.twist == "dynamic" else self.implicit_weight,
@@ -408,11 +414,13 @@ def check_state(state: State) -> None:
 
 __all__ = [
     "Control",
+    "GradientCheck",
     "Params",
     "RigidBody",
     "Rope",
     "Scene",
     "State",
+    "check_gradients",
     "check_state",
     "check_step",
     "default_values",

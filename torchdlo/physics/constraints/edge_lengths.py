@@ -1,8 +1,9 @@
 """Edges of given length: direct solution of the nonlinear system of one substep.
 
 Both solvers look for positions and tensions at the end of the substep such that the momentum balance holds and every
-edge has its length (or its strain times stiffness equals its tension). Newton's method runs without graph; one more
-Newton step, taken with graph, puts the derivative of the implicit function theorem on the result.
+edge has its length (or its strain times stiffness equals its tension). Newton's method runs without graph, in implicit
+steps until each scene is solved; one more Newton step, taken with graph, puts the derivative of the implicit function
+theorem on the result. That is the derivative of the step as computed where Newton's method has converged.
 
 The tension acts along the edge as it was at the start (SHAKE: Ryckaert, Ciccotti, Berendsen 1977,
 doi:10.1016/0021-9991(77)90098-5), so that linear and angular momentum are exact.
@@ -18,6 +19,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from torchdlo.physics import tree
 from torchdlo.physics.kernels import lanes
 from torchdlo.physics.linalg import banded
 from torchdlo.physics.linalg.numerics import dot, safe_norm, total
@@ -197,17 +199,6 @@ class Inertia:
         return same, one, two
 
 
-def _shortening(lengths: Lengths, change: Tensor) -> Tensor:
-    """Return the share of a Newton step to take, shape (..., 1, 1).
-
-    An edge may turn by about one radian; beyond that its linearisation means nothing.
-    """
-    with torch.no_grad():
-        turn = lengths.active * (following(lengths.topology, change) - change) / lengths.rest
-        most = total(turn.square()).amax(-2, keepdim=True).sqrt()
-        return (1 / most.clamp(min=1e-9)).clamp(max=1.0)
-
-
 def balance(
     lengths: Lengths,
     inertia: Inertia,
@@ -234,34 +225,66 @@ def balance(
         ahead: what pulled edges lean towards beyond that [1], shape (..., V, 3).
         tension: tension of the last substep [N], shape (..., V, 1).
         turning: how much a pulled edge's direction follows the change of the positions.
-        steps: Newton steps before the last one.
+        steps: Newton steps before the last one, at most: a scene takes no more than it needs.
 
     Returns:
         Positions (..., V, 3), tensions (..., V, 1), and what moves vertices of given mass: force with tension and with
         the answer of the hinges [N], (..., V, 3).
     """
-    topology = lengths.topology
     if lanes.ready(force):
         return _balanced(lengths, inertia, (free, tension), (moved, force, direction, ahead, scale), turning, steps)
-    pulled = lengths.active
-    lean, start = turning * pulled / lengths.rest, direction + pulled * ahead
+    system = _System(lengths, inertia, moved, free, force, scale, direction, ahead, turning)
+    with torch.no_grad():
+        pos, impulse = _found(system, tension, steps)
+    pos = torch.where(free > 0, pos, moved)
+    pos, impulse, _ = system.newton(pos, impulse)
+    return pos, impulse / scale, system.residual(pos, impulse)[1] / scale
 
-    def residual(pos: Tensor, impulse: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-        y = pos - moved
-        along_start = start + lean * (following(topology, y) - y)
+
+@dataclass(frozen=True)
+class _System:
+    """The equations of `balance`, whose arguments these are."""
+
+    lengths: Lengths
+    inertia: Inertia
+    moved: Tensor
+    free: Tensor
+    force: Tensor
+    scale: Tensor
+    direction: Tensor
+    numerical_damping: Tensor
+    turning: float
+
+    def residual(self, pos: Tensor, impulse: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+        """Return displacements, what pushes, excess of lengths, and directions of edges at the end and of tensions."""
+        lengths, inertia, topology = self.lengths, self.inertia, self.lengths.topology
+        y = pos - self.moved
+        start = self.direction + lengths.active * self.numerical_damping
+        along_start = start + self.lean * (following(topology, y) - y)
         pull = impulse * along_start
-        push = (
-            scale * force + pull - preceding(topology, pull) - inertia.bending(topology, y) - inertia.swing(topology, y)
-        )
-        excess, along = lengths.error(pos, impulse / scale)
+        given = self.scale * self.force + pull - preceding(topology, pull)
+        push = given - inertia.bending(topology, y) - inertia.swing(topology, y)
+        excess, along = lengths.error(pos, impulse / self.scale)
         return y, push, excess, along, along_start
 
-    def newton(pos: Tensor, impulse: Tensor) -> tuple[Tensor, Tensor]:
-        y, push, excess, along, along_start = residual(pos, impulse)
+    @property
+    def lean(self) -> Tensor:
+        """How much directions of tensions follow the change of positions [1/m]."""
+        return self.turning * self.lengths.active / self.lengths.rest
+
+    def newton(self, pos: Tensor, impulse: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return positions and impulses after a step of Newton's method, and what it changed [1], (..., 1, 1)."""
+        lengths, inertia, free, scale, topology = (
+            self.lengths,
+            self.inertia,
+            self.free,
+            self.scale,
+            self.lengths.topology,
+        )
+        y, push, excess, along, along_start = self.residual(pos, impulse)
         with torch.no_grad():
             same, one, two = inertia.bands(topology)
-            string = impulse * lean
-
+            string = impulse * self.lean
             after, active = following(topology, free), lengths.active
             soft = lengths.yielding(impulse / scale)[1] + lengths.shift * lengths.give
             entries = _rows(
@@ -280,16 +303,72 @@ def balance(
         step = banded.solve(entries, rhs, f"saddle:{topology.name}")
         batch, v3 = pos.shape[:-2], 3 * pos.shape[-2]
         change, pull = _vertices(step[:v3], batch, 3), _vertices(step[v3:], batch, 1)
-        short = _shortening(lengths, change)
-        return pos + short * change, impulse + short * pull
+        with torch.no_grad():
+            turn = lengths.active * (following(topology, change) - change) / lengths.rest
+            most = total(turn.square()).amax(-2, keepdim=True).sqrt()
+            # An edge may turn by about one radian; beyond that its linearisation means nothing.
+            short = (1 / most.clamp(min=1e-9)).clamp(max=1.0)
+            firm = inertia.vertex[..., :1] + string.abs()
+            changed = torch.maximum(most, (pull * self.lean / firm).abs().amax(-2, keepdim=True))
+        return pos + short * change, impulse + short * pull, changed
 
-    with torch.no_grad():
-        pos, impulse = moved.detach(), lengths.guess(tension) * scale
-        for _ in range(steps):
-            pos, impulse = newton(pos, impulse)
-    pos = torch.where(free > 0, pos, moved)
-    pos, impulse = newton(pos, impulse)
-    return pos, impulse / scale, residual(pos, impulse)[1] / scale
+
+def _done(like: Tensor) -> float:
+    """Return the change of directions and tensions below which one more step of Newton's method ends at rounding."""
+    return 1e-6 if like.dtype == torch.float64 else 3e-4
+
+
+def _inputs(system: _System, tension: Tensor) -> tuple[list[Tensor], list[float]]:
+    """Return what the kernel reads, in its order, and its numbers but for how many steps it takes."""
+    lengths, inertia = system.lengths, system.inertia
+    swing = inertia.vertex.new_zeros(1, 1) if inertia.turning is None else inertia.turning
+    edges = lengths.rest, lengths.compliance, lengths.active, lengths.edge_mask, lengths.give, inertia.hinge, swing
+    vectors = inertia.vertex, system.moved, system.force, system.direction, system.numerical_damping
+    law = [system.turning, lengths.most, lengths.least, lengths.shift]
+    return [*edges, system.free, tension, *vectors, system.scale], law
+
+
+def _found(system: _System, tension: Tensor, steps: int) -> tuple[Tensor, Tensor]:
+    """Return positions and impulses that Newton's method finds in so many steps at most, without gradient."""
+    inputs, law = _inputs(system, tension)
+    found = torch.ops.torchdlo.balanced(inputs, system.lengths.topology.name, law, steps)
+    return tree.logical(found[:3]), tree.logical(found[3:]) * system.scale
+
+
+def _newton(inputs: list[Tensor], topology: str, law: list[float], steps: int) -> Tensor:
+    """Return positions and tensions, stored as (4, V, ...); each scene until it is done."""
+    if lanes.available(inputs[0]):
+        numbers = [*law, steps, _done(inputs[0]), 0.0]
+        found = lanes.run(inputs, "balance", topology, [3, 1, 3], "saddle", numbers)
+        return torch.cat([tree.stored(x) for x in found[:2]])
+    rest, compliance, active, mask, give, hinge, swing, free, tension, vertex, moved, *others, scale = inputs
+    lengths = Lengths(parse(topology), rest, compliance, active, mask, give, *law[1:3])
+    inertia = Inertia(vertex, hinge, rest, mask, swing)
+    force, direction, ahead = others
+    system = _System(lengths, inertia, moved, free, force, scale, direction, ahead, law[0])
+    batch = torch.broadcast_shapes(*(x.shape[:-2] for x in inputs))
+    pos, impulse = moved.expand(*batch, *moved.shape[-2:]), lengths.guess(tension) * scale
+    impulse = impulse.expand(*batch, *impulse.shape[-2:])
+    open = torch.ones_like(pos[..., :1, :1], dtype=torch.bool)
+    for _ in range(steps):
+        *better, changed = system.newton(pos, impulse)
+        pos, impulse = (torch.where(open, new, old) for new, old in zip(better, (pos, impulse), strict=True))
+        open = open & ~(changed < _done(pos))
+        if not bool(open.any()):
+            break
+    return torch.cat([tree.stored(pos), tree.stored(impulse / scale)]).contiguous()
+
+
+def _newton_meta(inputs: list[Tensor], topology: str, law: list[float], steps: int) -> Tensor:
+    batch = torch.broadcast_shapes(*(x.shape[:-2] for x in inputs))
+    return inputs[0].new_empty(4, max(x.shape[-2] for x in inputs), *batch)
+
+
+_operators = torch.library.Library("torchdlo", "FRAGMENT")
+_operators.define("balanced(Tensor[] inputs, str topology, float[] law, int steps) -> Tensor")
+for _device in ("CPU", "CUDA"):
+    _operators.impl("balanced", _newton, _device)
+_operators.impl("balanced", _newton_meta, "Meta")
 
 
 def _balanced(
@@ -300,11 +379,11 @@ def _balanced(
     turning: float,
     steps: int,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return what `balance` does, by a kernel that reads its inputs in this order."""
-    swing = inertia.vertex.new_zeros(1, 1) if inertia.turning is None else inertia.turning
-    edges = lengths.rest, lengths.compliance, lengths.active, lengths.edge_mask, lengths.give, inertia.hinge, swing
-    inputs = *edges, *scalars, inertia.vertex, *vectors
-    law = turning, lengths.most, lengths.least, lengths.shift, steps
+    """Return what `balance` does, by a kernel."""
+    (free, tension), (moved, force, direction, ahead, scale) = scalars, vectors
+    system = _System(lengths, inertia, moved, free, force, scale, direction, ahead, turning)
+    inputs, law = _inputs(system, tension)
+    law = (*law, steps, _done(force), 1.0)
     return tuple(lanes.apply("balance", lengths.topology.name, inputs, (3, 1, 3), "saddle", law))
 
 

@@ -53,7 +53,7 @@ class Settings:
     prescribed_edges: tuple[int, ...] = ()
     """Edges whose material frame is prescribed."""
     constraint_iterations: int = 3
-    """Newton steps for lengths."""
+    """Newton steps for lengths; in "implicit" at most."""
     twist_iterations: int = 4
     """Newton steps for quasistatic twist."""
     implicit_weight: float = 0.3

@@ -30,18 +30,28 @@ class Balance {
     slot = given;
     scale = slot[0].scale;
     begin_with();
-    for (int64_t k = 0; k < s.numbers[4]; ++k) newton();
+    const Lanes<T> zero{};
+    open = zero + T(1);
+    for (int64_t k = 0; k < s.numbers[4]; ++k) {
+      newton();
+      // Scenes are done one by one: what they find does not depend on those beside them.
+      open = changed < T(s.numbers[5]) ? zero : open;
+      bool any = false;
+      for (int j = 0; j < WIDTH<T>; ++j) any |= open[j] != T(0);
+      if (!any) break;
+    }
+    open = zero + T(1);
+    const bool whole = s.numbers[6] != 0;
     for (int64_t i = 0; i < v; ++i)
       for (int c = 0; c < 3; ++c) {
         Lanes<T>& x = part(pos[i], c);
         x = slot[i].free > T(0) ? x : part(slot[i].moved, c);
       }
-    newton();
-    residual();
+    if (whole) newton(), residual();
     for (int64_t i = 0; i < v; ++i) {
       out.put(0, i, pos[i]);
       out.put(3, i, impulse[i] / scale);
-      out.put(4, i, push[i] * (T(1) / scale));
+      if (whole) out.put(4, i, push[i] * (T(1) / scale));
     }
   }
 
@@ -131,9 +141,14 @@ class Balance {
       rhs[3 * v + i] = -excess[i];
     }
     eliminate();
-    Lanes<T> most{};
+    Lanes<T> most{}, stiffest{};
     for (int64_t i = 0; i < v; ++i) {
       const int64_t n = s.after[i];
+      // How much the string's part of the matrix changes, over what it is.
+      const Lanes<T> pulled = lean[i] * found[3 * v + i], string_now = lean[i] * impulse[i];
+      const Lanes<T> firm = slot[i].vertex.x + (string_now < T(0) ? -string_now : string_now);
+      const Lanes<T> ratio = (pulled < T(0) ? -pulled : pulled) / firm;
+      stiffest = ratio > stiffest ? ratio : stiffest;
       Lanes<T> squared{};
       for (int c = 0; c < 3; ++c) {
         const Lanes<T> turned = slot[i].active * (found[c * v + n] - found[c * v + i]) / slot[i].rest;
@@ -143,7 +158,8 @@ class Balance {
     }
     most = root<T>(most);
     // An edge may turn by about one radian at a time.
-    const Lanes<T> share = most > T(1) ? T(1) / most : zero + T(1);
+    const Lanes<T> share = open * (most > T(1) ? T(1) / most : zero + T(1));
+    changed = most > stiffest ? most : stiffest;
     for (int64_t i = 0; i < v; ++i) {
       for (int c = 0; c < 3; ++c) part(pos[i], c) += share * found[c * v + i];
       impulse[i] += share * found[3 * v + i];
@@ -165,7 +181,7 @@ class Balance {
   const In* slot = nullptr;
   Vec<T> *pos, *y, *along, *begin, *start, *push, *pull, *turn, *moment, *resist;
   Lanes<T> *lean, *centre, *same, *one, *two, *string, *impulse, *excess, *entries, *rhs, *found, *work;
-  Lanes<T> scale;
+  Lanes<T> scale, open, changed;
 };
 
 }  // namespace

@@ -135,7 +135,7 @@ def _stored(x: Tensor, batch: Sequence[int], dtype: torch.dtype) -> Tensor:
     return tree.batch_innermost(x.to(dtype).expand(*batch, *x.shape[-2:]).reshape(-1, *x.shape[-2:]))
 
 
-def _apply(
+def run(
     inputs: list[Tensor],
     kernel: str,
     topology: str,
@@ -143,6 +143,7 @@ def _apply(
     system: str,
     numbers: list[float],
 ) -> list[Tensor]:
+    """Return what `apply` does, also where nothing is recorded; only where kernels are `available`."""
     layout = tuple([(x.shape, x.stride(), x.dtype) for x in inputs])
     plan = _plan(kernel, topology, tuple(components), system, tuple(numbers), layout)
     out = inputs[0].new_empty(plan.size)
@@ -157,7 +158,7 @@ _operators = torch.library.Library("torchdlo", "FRAGMENT")
 _operators.define(
     "rods(Tensor[] inputs, str kernel, str topology, int[] components, str system, float[] numbers) -> Tensor[]"
 )
-_operators.impl("rods", _apply, "CPU")
+_operators.impl("rods", run, "CPU")
 
 
 def apply(
