@@ -49,7 +49,13 @@ def tips(count: int, clamp: tuple[float, float, float]) -> tuple[np.ndarray, flo
     rope = scene.Rope(x, radius=0.005, density=1000.0, youngs=1e6)
     effects = [EFFECTS[name]() for name in ("bend", "gravity")]
     choice, params, state = scene.make(
-        [rope], effects, dt=1 / count, substeps=1, integrator="implicit", prescribed_vertices=(0, 1)
+        [rope],
+        effects,
+        dt=1 / count,
+        substeps=1,
+        integrator="implicit",
+        implicit_weight=0.3,
+        prescribed_vertices=(0, 1),
     )
     scaled = torch.ones(60, 1)
     scaled[1] = stiff

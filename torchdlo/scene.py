@@ -110,8 +110,10 @@ class Scene:
     None, as each scene ends when it is solved."""
     twist_iterations: int = 4
     """Newton steps for quasistatic twist per substep, where bending has a part in it; without, one is exact."""
-    implicit_weight: float = 0.3
-    """Share of dt^2 times stiffness that counts as inertia in implicit steps; at least 0.5 where twist is dynamic."""
+    implicit_weight: float = 0.5
+    """Share of dt^2 times stiffness that counts as inertia in implicit steps, and of a step's turn by which tensions
+    follow their edges. At 0.5 tensions do no work; below, slack and loaded ropes may gain energy, and above pulled
+    ropes are damped. 0.3 is more exact for calm, taut ropes at long steps; at least 0.5 where twist is dynamic."""
     numerical_damping: float = 0.0
     """Share of a substep by which implicit steps look ahead: it damps fast modes and makes the step first order."""
     bodies: tuple[Body, ...] = ()

@@ -56,8 +56,10 @@ class Settings:
     """Newton steps for lengths; in "implicit" at most."""
     twist_iterations: int = 4
     """Newton steps for quasistatic twist."""
-    implicit_weight: float = 0.3
-    """Share of dt^2 times stiffness that counts as inertia in "implicit"."""
+    implicit_weight: float = 0.5
+    """In "implicit", share of dt^2 times stiffness that counts as inertia, and of a substep's turn by which tensions
+    follow their edges. Tension T of an edge of length l that turns by a works (1 - 2 gamma) T l (1 - cos a): nothing at
+    1/2, whatever T does from step to step."""
     numerical_damping: float = 0.0
     """In "implicit", stiff forces are taken this share of a substep ahead: damps fast modes, first order if not 0."""
 
