@@ -59,7 +59,7 @@ class State:
     """Time since the start [s], shape (..., 1, 1)."""
     diagnostics: Tensor
     """What steps missed since the start, zeros if all is well: contacts without room [1], by how much vertices were
-    faster than foreseen [m], and by what share an edge was too short [1], shape (..., 1, 3)."""
+    faster than foreseen [m], and by what share an edge was too short and too long [1], shape (..., 1, 4)."""
     reaction: Reaction
     """What holds exerted on the ropes in the last step, its mean."""
     bodies: BodyState | tuple[()] = ()
@@ -239,7 +239,14 @@ def make(
         stability.check_laws(scene.settings, rods, numbers, state)
         check_step(scene, params)
     zero = state.pos.new_zeros(*state.pos.shape[:-2], 1, 3)
-    first = State(state, zero[..., :1], zero, unfelt(state.pos, *scene.held), placed, particles)
+    first = State(
+        state,
+        zero[..., :1],
+        state.pos.new_zeros(*state.pos.shape[:-2], 1, step_diagnostics.WIDTH),
+        unfelt(state.pos, *scene.held),
+        placed,
+        particles,
+    )
     if scene.twist == "quasistatic":
         held = stationary_control(scene, first)
         changed = altered(scene.effects, topology, rods, numbers)

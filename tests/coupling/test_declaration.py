@@ -33,7 +33,8 @@ def test_what_was_missed_is_explained():
     assert explain(torch.zeros(3, 1, 3)) == ""
     assert "12 pairs" in explain(torch.tensor([[[0.0, 0.0, 0.0]], [[12.0, 0.0, 0.0]]]))
     assert "1.5 mm" in explain(torch.tensor([[[0.0, 1.5e-3, 0.0]]]))
-    assert "7% shorter" in explain(torch.tensor([[[0.0, 0.0, 0.07]]]))
+    assert "7% shorter" in explain(torch.tensor([[[0.0, 0.0, 0.07, 0.0]]]))
+    assert "9% longer" in explain(torch.tensor([[[0.0, 0.0, 0.0, 0.09]]]))
 
 
 @pytest.mark.parametrize("wrong", [{"sweeps": 0}, {"rounds": 0}, {"room": -1}, {"recovery": 0.0}, {"recovery": 1.5}])

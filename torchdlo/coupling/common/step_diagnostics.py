@@ -13,8 +13,11 @@ from torchdlo.physics.linalg.numerics import safe_norm, tiny
 from torchdlo.physics.rod import kinematics as rod
 from torchdlo.physics.rod.kinematics import RodState
 
-SHORT = 0.05
-"""By what share of its length an edge may be too short before it counts; lengths are kept to 1e-5 and better."""
+STRAIN = 0.05
+"""By what share of its length an edge may be too short or too long before it counts; lengths are kept to 1e-5 and
+better."""
+WIDTH = 4
+"""How many numbers tell what was missed: see `diagnostics`."""
 
 
 def broad_phase(scene: Any, params: Any, state: Any, start: Any, control: Any) -> Any:
@@ -41,7 +44,7 @@ def broad_phase(scene: Any, params: Any, state: Any, start: Any, control: Any) -
 
 
 def missed(scene: Any, params: Any, rods: RodState, before: Tensor) -> Tensor:
-    """Return what was missed so far, shape (..., 1, 3).
+    """Return what was missed so far: room, reach, what is too short and what is too long, shape (..., 1, 4).
 
     Args:
         scene: static choices, see `scene.Scene`.
@@ -49,34 +52,34 @@ def missed(scene: Any, params: Any, rods: RodState, before: Tensor) -> Tensor:
         rods: the rods after a substep.
         before: what was missed before.
     """
-    contact, short = before.split((2, 1), -1)
+    contact, strained = before.split((2, WIDTH - 2), -1)
     for e in scene.effects:
         if e.is_contact:
             contact = torch.maximum(contact, e.capacity_overflow(rods.pos, params.effects[e.name]))
     if scene.constrained:
-        short = torch.maximum(short, _shortened(scene, params, rods))
+        strained = torch.maximum(strained, _strained(scene, params, rods))
     # A state may have been given a batch in some of its parts only.
-    batch = torch.broadcast_shapes(contact.shape[:-2], short.shape[:-2])
-    return torch.cat([x.expand(*batch, *x.shape[-2:]) for x in (contact, short)], -1)
+    batch = torch.broadcast_shapes(contact.shape[:-2], strained.shape[:-2])
+    return torch.cat([x.expand(*batch, *x.shape[-2:]) for x in (contact, strained)], -1)
 
 
 @torch.no_grad()
-def _shortened(scene: Any, params: Any, rods: RodState) -> Tensor:
-    """Return by what share of its length an edge is too short, 0 where it is by less than `SHORT`, (..., 1, 1)."""
+def _strained(scene: Any, params: Any, rods: RodState) -> Tensor:
+    """Return by what share an edge is too short and too long, 0 where it is by less than `STRAIN`, (..., 1, 2)."""
     held, after = set(scene.prescribed_vertices), scene.topology.successor()
     # Hands that hold both ends of an edge set its length.
     solved = [m * (not {k, after[k]} <= held) for k, m in enumerate(scene.topology.edge_mask())]
     changed = altered(scene.effects, scene.topology, params.rods, params.effects)
     edge = rod.edge_vectors(scene.topology, rods.pos, changed.rest.edge_mask)
     wanted = changed.rest.length * (1 + rods.tension / changed.material.stretch)
-    short = (1 - safe_norm(edge) / wanted.clamp(min=tiny(wanted))) * wanted.new_tensor(solved).unsqueeze(-1)
-    most = short.amax(-2, keepdim=True)
-    return torch.where(most > SHORT, most, 0.0)
+    long = (safe_norm(edge) / wanted.clamp(min=tiny(wanted)) - 1) * wanted.new_tensor(solved).unsqueeze(-1)
+    most = torch.cat([(-long).amax(-2, keepdim=True), long.amax(-2, keepdim=True)], -1)
+    return torch.where(most > STRAIN, most, 0.0)
 
 
 def explain(missed: Tensor) -> str:
     """Return what went wrong and how to mend it, "" if nothing did."""
-    room, beyond, short = (float(x) for x in missed.reshape(-1, 3).amax(0))
+    room, beyond, short, *others = (float(x) for x in missed.reshape(-1, missed.shape[-1]).amax(0))
     if room > 0:
         return (
             f"contact had no room for {room:.0f} pairs of edges, edges or nodes; give a larger `room` to RodContact, "
@@ -91,5 +94,11 @@ def explain(missed: Tensor) -> str:
         return (
             f"an edge became {short:.0%} shorter than it has to be: a straight rope was pressed along its line, or "
             "jerked; lay it in a slight bend, move what holds it more slowly, or give it a finite `stretch`"
+        )
+    if others and others[0] > 0:
+        return (
+            f"an edge became {others[0]:.0%} longer than it has to be: a rope was pulled beyond its length, moved too far "
+            "within a step, or carries more than its steps can hold; move what holds it more slowly, take shorter substeps "
+            "or integrator='implicit', or give it a finite `stretch`"
         )
     return ""

@@ -142,12 +142,12 @@ def finish(
     dt: float,
     missed: Tensor,
 ) -> tuple[Particles, Tensor]:
-    """Return the particles after a substep and what was missed so far, shape (..., 1, 3)."""
+    """Return the particles after a substep and what was missed so far, see `watch.diagnostics`."""
     nodes = now.nodes
     if push.material_points != ():
         nodes, lost = push.material_points.nodes, push.material_points.lost.detach()
         lost = lost.reshape(*missed.shape[:-2], 1, 1)
-        missed = torch.maximum(missed, torch.cat([lost, torch.zeros_like(lost), torch.zeros_like(lost)], -1))
+        missed = torch.maximum(missed, torch.nn.functional.pad(lost, (0, missed.shape[-1] - 1)))
     return mpm.from_grid(medium, material_points, now.particles, nodes, dt), missed
 
 

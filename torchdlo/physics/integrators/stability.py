@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import torch
+from torch import Tensor
 
 from torchdlo.physics.effects.base import Values, altered
 from torchdlo.physics.integrators.rod_step import Settings
 from torchdlo.physics.rod import kinematics as rod
 from torchdlo.physics.rod.kinematics import RodParams, RodState
+from torchdlo.physics.rod.topology import following
 
 
 def check_laws(settings: Settings, rods: RodParams, values: dict[str, Values], state: RodState) -> None:
@@ -45,13 +47,23 @@ def check_laws(settings: Settings, rods: RodParams, values: dict[str, Values], s
             )
 
 
+def _weights(settings: Settings, mass: Tensor) -> Tensor:
+    """Return at each slot the mass of its rope [kg], 0 if that is not held, shape (..., V, 1)."""
+    parts = []
+    for start, count in zip(settings.topology.starts, settings.topology.counts, strict=True):
+        whole = mass[..., start : start + count, :].sum(-2, keepdim=True)
+        held = any(start <= k < start + count for k in settings.prescribed_vertices)
+        parts.append((whole if held else 0 * whole).expand(*whole.shape[:-2], count, 1))
+    return torch.cat(parts, -2)
+
+
 def limits(settings: Settings, rods: RodParams, values: dict[str, Values]) -> dict[str, float]:
     """Return the largest stable substep [s] by the term that limits it.
 
     Bending waves reach w = 4/l^2 sqrt(EI/m'), stretching waves w = 2/l sqrt(EA/m'), twist waves w = 2 sqrt(GJ/(l I));
     Stoermer-Verlet is stable for w dt < 2. Bending damping takes its force from the velocities before, and damps the
-    shortest waves by r = 16 c/(m' l^4): both together are stable for (w dt)^2/4 + r dt/2 < 1. Implicit steps are
-    limited by none of them.
+    shortest waves by r = 16 c/(m' l^4): both together are stable for (w dt)^2/4 + r dt/2 < 1. The weight of a rope that
+    is held may pull as much as steps keep its length: T < l m / 4 dt^2. Implicit steps are limited by none of them.
     """
     if settings.integrator == "implicit":
         return {}
@@ -77,6 +89,13 @@ def limits(settings: Settings, rods: RodParams, values: dict[str, Values]) -> di
         found["stretching"] = (mass * length / material.stretch).amin().sqrt()
     if "twist" in names and settings.twist == "dynamic":
         found["twisting"] = (torch.where(real, material.inertia, torch.inf) * length / material.twist).amin().sqrt()
+    if settings.constrained and settings.prescribed_vertices and "gravity" in names:
+        # What hangs from a hold pulls with its weight. Tensions above a quarter of l m / dt^2 are not held: edges give
+        # way, see `constrain.Lengths.yielding`.
+        lightest = torch.minimum(material.mass, following(settings.topology, material.mass))
+        pull = values["gravity"]["acceleration"].norm(dim=-1, keepdim=True) * _weights(settings, material.mass)
+        firm = (0.25 * length * lightest.expand_as(length) / pull).sqrt()
+        found["hanging weight"] = torch.where(real & (pull > 0), firm, torch.inf).amin()
     if "table" in names:
         found["table contact"] = 2 / values["table"]["hardness"].max()
     return {name: float(value) for name, value in found.items()}
