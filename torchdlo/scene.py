@@ -59,7 +59,8 @@ class State:
     """Time since the start [s], shape (..., 1, 1)."""
     diagnostics: Tensor
     """What steps missed since the start, zeros if all is well: contacts without room [1], by how much vertices were
-    faster than foreseen [m], and by what share an edge was too short and too long [1], shape (..., 1, 4)."""
+    faster than foreseen [m], by what share an edge was too short and too long [1], and what
+    share of its forces an implicit step with contact left unbalanced [1], shape (..., 1, 5)."""
     reaction: Reaction
     """What holds exerted on the ropes in the last step, its mean."""
     bodies: BodyState | tuple[()] = ()
@@ -312,7 +313,7 @@ def advance(scene: Scene, params: Params, state: State, start: Control, control:
     # Over the substeps of this step; a sum set to zero outside would have no gradient at first.
     later = share * scene.substeps > 1.5
     mean = tree.map(lambda old, now: torch.where(later, old, 0.0) + now / scene.substeps, state.reaction, reaction)
-    missed = step_diagnostics.missed(scene, params, rods, state.diagnostics)
+    missed = step_diagnostics.missed(scene, params, rods, state.diagnostics, push.unsolved)
     push = body_coupling_effect.couple_bodies_to_particles(scene.effects, body, pool, push)
     moved, particles = rigid.advance(body, poses, push) if scene.bodies else (), ()
     if scene.material_points:

@@ -123,7 +123,7 @@ class Missing(Lead):
     def build(self, moved: Tensor) -> tuple[Scene, Params, State]:
         """As if an edge had become a fifth too short."""
         scene, params, state = super().build(moved)
-        return scene, params, replace(state, diagnostics=state.diagnostics + torch.tensor([0.0, 0.0, 0.2, 0.0]))
+        return scene, params, replace(state, diagnostics=state.diagnostics + torch.tensor([0.0, 0.0, 0.2, 0.0, 0.0]))
 
 
 def test_a_trajectory_that_cannot_be_trusted_says_so(

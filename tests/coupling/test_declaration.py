@@ -34,7 +34,7 @@ def test_what_was_missed_is_explained():
     assert "12 pairs" in explain(torch.tensor([[[0.0, 0.0, 0.0]], [[12.0, 0.0, 0.0]]]))
     assert "1.5 mm" in explain(torch.tensor([[[0.0, 1.5e-3, 0.0]]]))
     assert "7% shorter" in explain(torch.tensor([[[0.0, 0.0, 0.07, 0.0]]]))
-    assert "9% longer" in explain(torch.tensor([[[0.0, 0.0, 0.0, 0.09]]]))
+    assert "9% longer" in explain(torch.tensor([[[0.0, 0.0, 0.0, 0.09, 0.0]]]))
 
 
 @pytest.mark.parametrize("wrong", [{"sweeps": 0}, {"rounds": 0}, {"room": -1}, {"recovery": 0.0}, {"recovery": 1.5}])

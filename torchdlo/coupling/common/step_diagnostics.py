@@ -16,7 +16,9 @@ from torchdlo.physics.rod.kinematics import RodState
 STRAIN = 0.05
 """By what share of its length an edge may be too short or too long before it counts; lengths are kept to 1e-5 and
 better."""
-WIDTH = 4
+UNSOLVED = 0.02
+"""What share of the forces an implicit step with contact may leave unbalanced before it counts."""
+WIDTH = 5
 """How many numbers tell what was missed: see `diagnostics`."""
 
 
@@ -43,24 +45,27 @@ def broad_phase(scene: Any, params: Any, state: Any, start: Any, control: Any) -
     return tree.replace(params, effects=params.effects | {n: params.effects[n] | given for n, given in found.items()})
 
 
-def missed(scene: Any, params: Any, rods: RodState, before: Tensor) -> Tensor:
-    """Return what was missed so far: room, reach, what is too short and what is too long, shape (..., 1, 4).
+def missed(scene: Any, params: Any, rods: RodState, before: Tensor, unsolved: Any = ()) -> Tensor:
+    """Return what was missed so far: room, reach, what is too short and too long, unsolved steps, shape (..., 1, 5).
 
     Args:
         scene: static choices, see `scene.Scene`.
         params: the rods' parameters before effects alter them, and the effects' numbers with what they looked up.
         rods: the rods after a substep.
         before: what was missed before.
+        unsolved: share of the forces that the substep left unbalanced, (..., 1, 1); () if it was not looked at.
     """
-    contact, strained = before.split((2, WIDTH - 2), -1)
+    contact, strained, left = before.split((2, 2, 1), -1)
     for e in scene.effects:
         if e.is_contact:
             contact = torch.maximum(contact, e.capacity_overflow(rods.pos, params.effects[e.name]))
     if scene.constrained:
         strained = torch.maximum(strained, _strained(scene, params, rods))
+    if isinstance(unsolved, Tensor):
+        left = torch.maximum(left, torch.where(unsolved > UNSOLVED, unsolved, 0.0).detach())
     # A state may have been given a batch in some of its parts only.
-    batch = torch.broadcast_shapes(contact.shape[:-2], strained.shape[:-2])
-    return torch.cat([x.expand(*batch, *x.shape[-2:]) for x in (contact, strained)], -1)
+    batch = torch.broadcast_shapes(*(x.shape[:-2] for x in (contact, strained, left)))
+    return torch.cat([x.expand(*batch, *x.shape[-2:]) for x in (contact, strained, left)], -1)
 
 
 @torch.no_grad()
@@ -101,4 +106,6 @@ def explain(missed: Tensor) -> str:
             "within a step, or carries more than its steps can hold; move what holds it more slowly, take shorter substeps "
             "or integrator='implicit', or give it a finite `stretch`"
         )
+    if others[1:] and others[1] > 0:
+        return f"an implicit step with contact left {others[1]:.0%} of its forces unbalanced; shorten dt, or take explicit steps"
     return ""

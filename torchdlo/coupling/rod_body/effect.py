@@ -30,14 +30,16 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
+from torchdlo.coupling.bodies.contact_solver import inertia
 from torchdlo.coupling.bodies.dynamics import PredictedBodyMotion, conjugate
 from torchdlo.coupling.bodies.segment_distance import EdgePoints, families, find
 from torchdlo.coupling.common.coulomb_friction import parting, rebounding, rub
 from torchdlo.coupling.rod_body import solver_op as body_sweeps
 from torchdlo.physics.effects.base import ContactForces, Effect, PredictedMotion, Values
-from torchdlo.physics.linalg.numerics import cross, dot
+from torchdlo.physics.linalg.numerics import cross, dot, safe_norm
 from torchdlo.physics.linalg.rotation import rotate
 from torchdlo.physics.rod.kinematics import View
+from torchdlo.physics.touch import Touch
 
 
 @dataclass(frozen=True)
@@ -194,6 +196,7 @@ class RodBody(Effect):
     name: ClassVar[str] = "rod_body"
     kind: ClassVar[str] = "force"
     is_contact: ClassVar[bool] = True
+    engages: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         for name, least in (("sweeps", 1), ("rounds", 1), ("pieces", 1), ("slowest", 0)):
@@ -201,6 +204,32 @@ class RodBody(Effect):
                 raise ValueError(f"RodBody: {name} is {getattr(self, name)}; expected at least {least}")
         if not 0 < self.recovery <= 1:
             raise ValueError(f"RodBody: recovery is {self.recovery}; expected a share above 0, up to 1")
+
+    def engage(self, view: View, motion: PredictedMotion, values: Values) -> Touch:
+        """Return the points of edges that may touch bodies in an implicit substep."""
+        bodies = motion.bodies
+        points, state = _points(view, bodies, self.pieces), bodies.state
+        at, axes = points.at, points.axes
+        none = torch.zeros_like(motion.change)
+        still, slip = points.seen(none, bodies)
+        wanted = self._target(points, view, bodies, points.seen(motion.change, bodies)[0])
+        now = dataclasses.replace(bodies, change=state.vel, turn=state.omega)
+        slides = safe_norm(points.seen(view.state.vel, now)[1]).detach() > self.slowest
+        mu_s, mu_k = (axes.of_bodies(mu) for mu in (bodies.params.mu_s, bodies.params.mu_k))
+        rubs = 1.0 if self.friction else 0.0
+        shape = torch.broadcast_shapes(at.share.shape, wanted.shape)
+        free = [k for k, b in enumerate(bodies.bodies) if b.motion == "free"]
+        place = at.share.new_zeros(len(bodies.bodies), len(free))
+        for j, k in enumerate(free):
+            place[k, j] = 1.0
+
+        def wide(x: Tensor) -> Tensor:
+            return x.expand(*shape[:-1], x.shape[-1])
+
+        resist = inertia(bodies, free) if free else at.share.new_zeros(0, 6, 6)
+        each = points.real, at.share, at.normal, points.tangent, points.radius, rubs * points.lever, wanted
+        given, mu = still * at.normal + slip, rubs * torch.where(slides, mu_k, mu_s)
+        return Touch(*(wide(x) for x in (*each, given, mu, at.arm)), axes.of[..., 0][:, free], resist, place)
 
     def solve_contact(self, view: View, motion: PredictedMotion, values: Values) -> ContactForces:
         """Return the forces that keep ropes outside of bodies and rub [N]."""

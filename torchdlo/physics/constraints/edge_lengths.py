@@ -233,7 +233,7 @@ def balance(
     """
     if lanes.ready(force):
         return _balanced(lengths, inertia, (free, tension), (moved, force, direction, ahead, scale), turning, steps)
-    system = _System(lengths, inertia, moved, free, force, scale, direction, ahead, turning)
+    system = System(lengths, inertia, moved, free, force, scale, direction, ahead, turning)
     with torch.no_grad():
         pos, impulse = _found(system, tension, steps)
     pos = torch.where(free > 0, pos, moved)
@@ -242,7 +242,7 @@ def balance(
 
 
 @dataclass(frozen=True)
-class _System:
+class System:
     """The equations of `balance`, whose arguments these are."""
 
     lengths: Lengths
@@ -271,6 +271,15 @@ class _System:
     def lean(self) -> Tensor:
         """How much directions of tensions follow the change of positions [1/m]."""
         return self.turning * self.lengths.active / self.lengths.rest
+
+    def inputs(self, tension: Tensor) -> tuple[list[Tensor], list[float]]:
+        """Return what the kernel reads, in its order, and its numbers but for how many steps it takes."""
+        lengths, inertia = self.lengths, self.inertia
+        swing = inertia.vertex.new_zeros(1, 1) if inertia.turning is None else inertia.turning
+        edges = lengths.rest, lengths.compliance, lengths.active, lengths.edge_mask, lengths.give, inertia.hinge, swing
+        vectors = inertia.vertex, self.moved, self.force, self.direction, self.numerical_damping
+        law = [self.turning, lengths.most, lengths.least, lengths.shift]
+        return [*edges, self.free, tension, *vectors, self.scale], law
 
     def newton(self, pos: Tensor, impulse: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return positions and impulses after a step of Newton's method, and what it changed [1], (..., 1, 1)."""
@@ -318,19 +327,9 @@ def _done(like: Tensor) -> float:
     return 1e-6 if like.dtype == torch.float64 else 3e-4
 
 
-def _inputs(system: _System, tension: Tensor) -> tuple[list[Tensor], list[float]]:
-    """Return what the kernel reads, in its order, and its numbers but for how many steps it takes."""
-    lengths, inertia = system.lengths, system.inertia
-    swing = inertia.vertex.new_zeros(1, 1) if inertia.turning is None else inertia.turning
-    edges = lengths.rest, lengths.compliance, lengths.active, lengths.edge_mask, lengths.give, inertia.hinge, swing
-    vectors = inertia.vertex, system.moved, system.force, system.direction, system.numerical_damping
-    law = [system.turning, lengths.most, lengths.least, lengths.shift]
-    return [*edges, system.free, tension, *vectors, system.scale], law
-
-
-def _found(system: _System, tension: Tensor, steps: int) -> tuple[Tensor, Tensor]:
+def _found(system: System, tension: Tensor, steps: int) -> tuple[Tensor, Tensor]:
     """Return positions and impulses that Newton's method finds in so many steps at most, without gradient."""
-    inputs, law = _inputs(system, tension)
+    inputs, law = system.inputs(tension)
     found = torch.ops.torchdlo.balanced(inputs, system.lengths.topology.name, law, steps)
     return tree.logical(found[:3]), tree.logical(found[3:]) * system.scale
 
@@ -345,7 +344,7 @@ def _newton(inputs: list[Tensor], topology: str, law: list[float], steps: int) -
     lengths = Lengths(parse(topology), rest, compliance, active, mask, give, *law[1:3])
     inertia = Inertia(vertex, hinge, rest, mask, swing)
     force, direction, ahead = others
-    system = _System(lengths, inertia, moved, free, force, scale, direction, ahead, law[0])
+    system = System(lengths, inertia, moved, free, force, scale, direction, ahead, law[0])
     batch = torch.broadcast_shapes(*(x.shape[:-2] for x in inputs))
     pos, impulse = moved.expand(*batch, *moved.shape[-2:]), lengths.guess(tension) * scale
     impulse = impulse.expand(*batch, *impulse.shape[-2:])
@@ -381,28 +380,31 @@ def _balanced(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return what `balance` does, by a kernel."""
     (free, tension), (moved, force, direction, ahead, scale) = scalars, vectors
-    system = _System(lengths, inertia, moved, free, force, scale, direction, ahead, turning)
-    inputs, law = _inputs(system, tension)
+    system = System(lengths, inertia, moved, free, force, scale, direction, ahead, turning)
+    inputs, law = system.inputs(tension)
     law = (*law, steps, _done(force), 1.0)
     return tuple(lanes.apply("balance", lengths.topology.name, inputs, (3, 1, 3), "saddle", law))
+
+
+def saddle_order(topology: Topology) -> list[int]:
+    """Return the elimination order of x, y, z of all vertices, then tensions: along the ropes."""
+    v, after = topology.size, topology.successor()
+    order = elimination_order(topology)
+    rank = {slot: k for k, slot in enumerate(order)}
+    last = [max(rank[i], rank[after[i]]) if _is_edge(topology, i) else rank[i] for i in range(v)]
+    unknowns: list[int] = []
+    edges = sorted(range(v), key=last.__getitem__)
+    for slot in order:
+        unknowns += [slot, v + slot, 2 * v + slot]
+        while edges and last[edges[0]] <= rank[slot]:
+            unknowns.append(3 * v + edges.pop(0))
+    return unknowns
 
 
 def _saddle(name: str) -> banded.Pattern:
     """Pattern of `balance`: unknowns x, y, z of all vertices, then tensions; see its `entries` for the numbering."""
     topology = parse(name)
-    v, after = topology.size, topology.successor()
-    order = elimination_order(topology)
-    rank = {slot: k for k, slot in enumerate(order)}
-    unknowns: list[int] = []
-    edges = sorted(range(v), key=lambda i: max(rank[i], rank[after[i]]) if _is_edge(topology, i) else rank[i])
-    for slot in order:
-        unknowns += [slot, v + slot, 2 * v + slot]
-        while (
-            edges
-            and (max(rank[edges[0]], rank[after[edges[0]]]) if _is_edge(topology, edges[0]) else rank[edges[0]])
-            <= rank[slot]
-        ):
-            unknowns.append(3 * v + edges.pop(0))
+    v, after, unknowns = topology.size, topology.successor(), saddle_order(topology)
     places: list[tuple[int, int, int]] = []
     for i in range(v):
         near, far = after[i], after[after[i]]

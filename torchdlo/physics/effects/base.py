@@ -16,6 +16,7 @@ from torchdlo.physics.rod.topology import Topology
 
 if TYPE_CHECKING:
     from torchdlo.physics.effects.measurement import Track
+    from torchdlo.physics.touch import Touch
 
 KINDS = ("force", "material", "boundary", "measurement")
 """What an effect can be: a load from outside, a law of the rope, of how it is held, or of how it is measured."""
@@ -128,11 +129,14 @@ class ContactForces:
     """Torque on bodies about their centres of mass [N m], shape (..., K or 1, 3)."""
     material_points: Any = ()
     """What is left of matter, see `coupling.mpm.rod_coupling_effect.TouchedParticles`; () if it is not touched."""
+    unsolved: Any = ()
+    """Share of the forces that an implicit substep left unbalanced [1], shape (..., 1, 1); () if none was looked at."""
 
     def plus(self, other: ContactForces) -> ContactForces:
         """Return what both exert together; no more than one effect touches matter."""
         sums = [getattr(self, n) + getattr(other, n) for n in ("force", "body_force", "body_torque")]
-        return ContactForces(*sums, self.material_points if self.material_points != () else other.material_points)
+        material_points = self.material_points if self.material_points != () else other.material_points
+        return ContactForces(*sums, material_points, self.unsolved if self.unsolved != () else other.unsolved)
 
 
 class Effect(ABC):
@@ -157,6 +161,8 @@ class Effect(ABC):
     """How many numbers per slot it remembers from substep to substep. They are 0 at the start."""
     is_contact: ClassVar[bool] = False
     """Whether it has `solve_contact`, and with it `broad_phase` and `capacity_overflow`."""
+    engages: ClassVar[bool] = False
+    """Whether it has `engage`, which takes the place of `solve_contact` in implicit steps."""
     rounds: int = 1
     """How often per substep it reacts, each time to the motion that the lengths of the edges leave."""
     last: ClassVar[bool] = False
@@ -198,6 +204,10 @@ class Effect(ABC):
     def capacity_overflow(self, pos: Tensor, values: Values) -> Tensor:
         """Return what the broad phase had no room for [1] and by how much it was outrun [m], shape (..., 1, 2)."""
         return pos.new_zeros(1, 2)
+
+    def engage(self, view: View, motion: PredictedMotion, values: Values) -> Touch:
+        """Return the points that may touch in an implicit substep, whose forces are found with the lengths."""
+        raise NotImplementedError
 
     def solve_contact(self, view: View, motion: PredictedMotion, values: Values) -> Tensor | ContactForces:
         """Return forces on vertices that answer to where they would go [N], shape (..., V, 3), or on bodies too."""

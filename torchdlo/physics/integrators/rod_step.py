@@ -19,8 +19,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchdlo.physics import tree
-from torchdlo.physics.constraints.edge_lengths import Inertia, Lengths, balance, project, solve_slots
+from torchdlo.physics import engage, tree
+from torchdlo.physics.constraints.edge_lengths import Inertia, Lengths, System, balance, project, solve_slots
 from torchdlo.physics.effects import base as effect
 from torchdlo.physics.effects.base import ContactForces, Effect, PredictedMotion, Values
 from torchdlo.physics.kernels import lanes
@@ -31,6 +31,7 @@ from torchdlo.physics.rod.kinematics import RodParams, RodState, View
 from torchdlo.physics.rod.prescribed import Reaction, Targets, put
 from torchdlo.physics.rod.prescribed import free as free_slots
 from torchdlo.physics.rod.topology import Topology, following
+from torchdlo.physics.touch import Touch
 
 INTEGRATORS = ("explicit", "implicit")
 TWISTS = ("none", "dynamic", "quasistatic")
@@ -192,10 +193,11 @@ def _answered(
 
     The motion is foreseen with the last tension, then found. Each effect answers to what the others exert.
     """
-    reacting = [e for e in settings.effects if e.is_contact]
+    engaged = [e for e in settings.effects if e.engages and settings.integrator == "implicit"]
+    reacting = [e for e in settings.effects if e.is_contact and e not in engaged]
     none = kick.force.new_zeros(1, 3)
     total = ContactForces(none, none, none)
-    if not reacting:
+    if not reacting and not engaged:
         return *_translate(settings, now, loads, kick, targets, now.state.tension), total
     firm, tension = kick.vertex, now.state.tension
     if settings.integrator == "implicit" and "stiffness" in loads:
@@ -206,7 +208,7 @@ def _answered(
     aimed = kick.drift + answer * (kick.force + pull - now.prev(pull))
     aimed = _placed(settings, targets, aimed)
     pushes: dict[str, ContactForces] = {}
-    for _ in range(max(e.rounds for e in reacting)):
+    for _ in range(max((e.rounds for e in reacting), default=1)):
         for e in reacting:
             motion = PredictedMotion(aimed - now.state.pos, mobility, answer, bodies, material_points)
             for other in (push for name, push in pushes.items() if name != e.name):
@@ -220,15 +222,32 @@ def _answered(
         for push in pushes.values():
             total = total.plus(push)
         pushed = dataclasses.replace(kick, force=kick.force + total.force)
-        pos, tension, held = _translate(settings, now, loads, pushed, targets, tension)
+        if engaged:
+            change = aimed - now.state.pos + answer * total.force
+            motion = PredictedMotion(change, mobility, answer, bodies and bodies.pushed(total), material_points)
+            points = engaged[0].engage(now, motion, values[engaged[0].name])
+            pos, tension, held, push = _translate(settings, now, loads, pushed, targets, tension, points)
+            pushes[engaged[0].name] = push
+            total = total.plus(push)
+        else:
+            pos, tension, held = _translate(settings, now, loads, pushed, targets, tension)
         aimed = pos - answer * total.force
     return pos, tension, held, total
 
 
 def _translate(
-    settings: Settings, now: View, loads: Values, kick: _Kick, targets: Targets, tension: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Return positions after the substep, tensions, whose first guess is given, and the force with them [N]."""
+    settings: Settings,
+    now: View,
+    loads: Values,
+    kick: _Kick,
+    targets: Targets,
+    tension: Tensor,
+    touch: Touch | None = None,
+) -> tuple[Any, ...]:
+    """Return positions after the substep, tensions, whose first guess is given, and the force with them [N].
+
+    With points that may touch, also return what these exert.
+    """
     topology, dt, state = settings.topology, settings.dt, now.state
     rest, material, free = now.params.rest, now.params.material, kick.free
     fixed = (1 - free) * (1 - following(topology, free)) >= 1
@@ -247,7 +266,7 @@ def _translate(
     )
     if settings.integrator == "implicit":
         moved = _placed(settings, targets, kick.drift)
-        return _balance(settings, now, loads, lengths, kick, moved, tension)
+        return _balance(settings, now, loads, lengths, kick, moved, tension, touch)
     answer = kick.scale / kick.vertex * free
     moved = _placed(settings, targets, kick.drift + kick.scale / kick.vertex * kick.force)
     if not settings.constrained:
@@ -265,7 +284,8 @@ def _balance(
     kick: _Kick,
     moved: Tensor,
     tension: Tensor,
-) -> tuple[Tensor, Tensor, Tensor]:
+    touch: Touch | None,
+) -> tuple[Any, ...]:
     """Return what `_translate` does for an implicit substep; arguments as in `constrain.balance`."""
     topology, dt, rest, vertex = settings.topology, settings.dt, now.params.rest, kick.vertex
     if "stiffness" in loads:
@@ -285,6 +305,11 @@ def _balance(
     scale = kick.scale.expand_as(now.length[..., :1, :])
     if inertia.turning is not None:  # held vertices do not move freely either
         force = force - inertia.swing(topology, (1 - kick.free) * (moved - kick.drift)) / scale
+    if touch is not None:
+        system = System(lengths, inertia, moved, kick.free, force, scale, now.tangent, ahead, share)
+        touching = engage.Touching(system, touch, now.state.pos)
+        pos, tension, whole, exerted, wrench, left = engage.solve(touching, tension)
+        return pos, tension, whole, ContactForces(exerted, *touch.spread(wrench), unsolved=left)
     return balance(
         lengths,
         inertia,

@@ -1,0 +1,283 @@
+"""One implicit substep of ropes that touch: positions, tensions, free bodies and forces of contact in one solve.
+
+The equations are those of `constrain.balance` with the forces of `touch` among them. Points on fixed and driven
+surfaces fill blocks of 3 x 3 on and beside the diagonal, within the band that bending needs; free bodies add a border
+of six unknowns each, which their Schur complement takes out. Newton's method runs without graph until each scene is
+solved; scenes that are not are tried again with softer contact. One more step, with graph, gives the derivative of the
+implicit function theorem, and what is left of the equations is reported.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchdlo.physics import touch, tree
+from torchdlo.physics.constraints.edge_lengths import Inertia, Lengths, System, saddle_order
+from torchdlo.physics.linalg import banded
+from torchdlo.physics.linalg.numerics import dot
+from torchdlo.physics.rod.topology import Topology, following, parse, preceding
+from torchdlo.physics.touch import HARD, Touch
+
+TRIES = ((HARD, 10), (0.1 * HARD, 24), (0.01 * HARD, 24))
+"""How hard contact is, and Newton steps at most, of what is tried one after the other."""
+_FIELDS = tuple(field.name for field in dataclasses.fields(Touch))
+
+
+def _solved(like: Tensor) -> float:
+    """Return what may be left of the equations, as a share of the forces, before the last steps."""
+    return 1e-6 if like.dtype == torch.float64 else 1e-3
+
+
+@dataclass(frozen=True)
+class Unknowns:
+    """What Newton's method looks for."""
+
+    pos: Tensor
+    """Positions [m], shape (..., V, 3)."""
+    impulse: Tensor
+    """Tensions times `scale`, shape (..., V, 1)."""
+    bodies: Tensor
+    """By how much contact moves and turns free bodies [m, rad], shape (..., J, 6)."""
+
+
+@dataclass(frozen=True)
+class Touching:
+    """The equations."""
+
+    system: System
+    touch: Touch
+    origin: Tensor
+    """Positions at the start of the substep [m], shape (..., V, 3)."""
+
+    def firm(self, tension: Tensor, hard: Tensor) -> Tensor:
+        """Return the stiffness of points times `scale` [kg], (..., 1, V, 1), for a hardness (..., 1, 1)."""
+        system = self.system
+        topology, inertia = system.lengths.topology, system.inertia
+        pulled = (system.lengths.guess(tension) * system.scale).clamp(min=0.0) * system.lean
+        mass = inertia.vertex.amin(-1, keepdim=True) + inertia.bands(topology)[0]
+        mass = mass + pulled + preceding(topology, pulled)
+        mobile = torch.where(system.free > 0, mass, torch.inf)
+        least = torch.minimum(mobile, following(topology, mobile))
+        least = torch.where(least < torch.inf, least, mass)
+        return (hard * least).unsqueeze(-3)
+
+    def newton(self, now: Unknowns, firm: Tensor, linear: tuple[Tensor, ...], exact: bool) -> tuple[Unknowns, Tensor]:
+        """Return the unknowns after a step, and what was left of the equations before it [1], shape (..., 1, 1)."""
+        system, lengths, inertia = self.system, self.system.lengths, self.system.inertia
+        topology, free, scale, count = lengths.topology, system.free, system.scale, self.touch.of.shape[-1]
+        y, push, excess, along, along_start = system.residual(now.pos, now.impulse)
+        felt = touch.feel(topology, self.touch, linear, firm, now.pos - self.origin, now.bodies)
+        forces = inertia.vertex * y - free * (push + felt.force)
+        resist = self.touch.resist * scale.unsqueeze(-1)
+        wrenches = (resist @ now.bodies.unsqueeze(-1)).squeeze(-1) - felt.wrench
+        batch = torch.broadcast_shapes(forces.shape[:-2], excess.shape[:-2], resist.shape[:-3], firm.shape[:-3])
+        v = topology.size
+        with torch.no_grad():
+            gradient = touch.gradients(topology, self.touch, linear, felt, exact)
+            same, one, two = inertia.bands(topology)
+            string = now.impulse * system.lean
+            after, active = following(topology, free), lengths.active
+            soft = lengths.yielding(now.impulse / scale)[1] + lengths.shift * lengths.give
+            unit = torch.eye(3, dtype=y.dtype, device=y.device)
+            own = (same + string + preceding(topology, string)).unsqueeze(-1) * unit + gradient.same
+            beside = (one - string).unsqueeze(-1) * unit
+            own = torch.diag_embed(inertia.vertex) + free.unsqueeze(-1) * own
+            onward = free.unsqueeze(-1) * (beside + gradient.after)
+            back = free.unsqueeze(-1) * touch.moved(topology, beside + gradient.before)
+            entries = _stacked(
+                batch,
+                own.flatten(-2),
+                onward.flatten(-2),
+                back.flatten(-2),
+                free * two,
+                free * preceding(topology, preceding(topology, two)),
+                -free * active * along_start,
+                after * active * along_start,
+                -active * along,
+                active * along,
+                -active * (lengths.compliance + soft) / scale + (active - 1),
+            )
+            answer, row, schur = _bordered(
+                batch, entries, free.unsqueeze(-1) * gradient.border, gradient, resist, topology
+            )
+        step = banded.solve(entries, -_stacked(batch, forces, excess), f"touching:{topology.name}")
+        bodies = now.bodies.expand(*batch, count, 6)
+        turned = torch.zeros_like(bodies)
+        if count:
+            load = -wrenches.expand(*batch, count, 6).reshape(-1, 6 * count, 1) - row @ step[: 3 * v].T.unsqueeze(-1)
+            moved = torch.linalg.solve(schur, load)
+            step = step - (answer @ moved).squeeze(-1).T
+            turned = moved.reshape(*batch, count, 6)
+        change, pull = _slots(step[: 3 * v], batch, 3), _slots(step[3 * v :], batch, 1)
+        with torch.no_grad():
+            turn = active * (following(topology, change) - change) / lengths.rest
+            most = dot(turn, turn).amax(-2, keepdim=True).sqrt()
+            short = (1 / most.clamp(min=1e-9)).clamp(max=1.0)
+            size = (inertia.vertex * y).abs() + (scale * system.force).abs() + felt.force.abs()
+            size = size + (now.impulse * along_start).abs()
+            left = forces.abs().amax((-2, -1), keepdim=True) / size.amax((-2, -1), keepdim=True).clamp(min=1e-30)
+            left = torch.maximum(left, (excess.abs() / lengths.rest).amax(-2, keepdim=True))
+            left = left.expand(*batch, 1, 1)
+        return Unknowns(now.pos + short * change, now.impulse + short * pull, bodies + short * turned), left
+
+    def start(self, tension: Tensor) -> Unknowns:
+        """Return the first guess: no forces but the last tensions."""
+        system, count = self.system, self.touch.of.shape[-1]
+        parts = (system.moved, tension, self.touch.resist.new_zeros(1, 1), self.touch.wanted[..., 0, :, :])
+        batch = torch.broadcast_shapes(*(x.shape[:-2] for x in parts))
+        impulse = (system.lengths.guess(tension) * system.scale).detach()
+        return Unknowns(
+            system.moved.detach().expand(*batch, *system.moved.shape[-2:]),
+            impulse.expand(*batch, *impulse.shape[-2:]),
+            system.moved.new_zeros(*batch, count, 6),
+        )
+
+
+def _bordered(
+    batch: tuple[int, ...], entries: Tensor, border: Tensor, gradient: touch.Slopes, resist: Tensor, topology: Topology
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return how vertices answer to bodies (N, 4 V, 6 J), how bodies feel vertices, and the bodies' own matrix."""
+    v, count = topology.size, gradient.corner.shape[-1]
+    if count == 0:
+        return border, border, border
+    border = border.expand(*batch, v, 3, count).permute(-2, -3, -1, *range(len(batch))).reshape(3 * v, -1)
+    border = torch.cat([border, border.new_zeros(v, border.shape[1])])
+    answer = banded.solve(entries.repeat(1, count), border, f"touching:{topology.name}")
+    answer = answer.reshape(4 * v, count, -1).permute(2, 0, 1)
+    row = gradient.back.expand(*batch, v, count, 3).permute(*range(len(batch)), -2, -1, -3).reshape(-1, count, 3 * v)
+    own = (touch.blocks(resist) + gradient.corner).expand(*batch, count, count).reshape(-1, count, count)
+    return answer, row, own - row @ answer[:, : 3 * v]
+
+
+def _stacked(batch: tuple[int, ...], *parts: Tensor) -> Tensor:
+    """Stack (..., V, C) tensors as the rows of an (m, batch) matrix, component by component."""
+    n = len(batch) + 2
+    wide = (x.expand(*batch, *x.shape[-2:]).permute(n - 1, n - 2, *range(n - 2)) for x in parts)
+    return torch.cat([x.reshape(x.shape[0] * x.shape[1], -1) for x in wide])
+
+
+def _slots(rows: Tensor, batch: tuple[int, ...], components: int) -> Tensor:
+    return tree.logical(rows.reshape(components, -1, *batch))
+
+
+def solve(touching: Touching, tension: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """Return positions, tensions, forces, forces of contact, wrenches on free bodies, and what is left unsolved.
+
+    Args:
+        touching: the equations.
+        tension: those of the last substep [N], shape (..., V, 1).
+
+    Returns:
+        Positions (..., V, 3) [m], tensions (..., V, 1) [N], forces on vertices with tension, hinges and contact
+        (..., V, 3) [N], those of contact alone (..., V, 3) [N], forces and torques on free bodies (..., J, 6), and the
+        share of the forces that is not in balance, shape (..., 1, 1).
+    """
+    system = touching.system
+    with torch.no_grad():
+        pos, found, bodies, hard = _searched(touching, tension)
+    firm = touching.firm(tension, hard)
+    linear = touch.maps(touching.touch)
+    pos = torch.where(system.free > 0, pos, system.moved)
+    now, _ = touching.newton(Unknowns(pos, found * system.scale, bodies), firm, linear, True)
+    topology, scale = system.lengths.topology, system.scale
+    felt = touch.feel(topology, touching.touch, linear, firm, now.pos - touching.origin, now.bodies)
+    push = system.residual(now.pos, now.impulse)[1]
+    with torch.no_grad():
+        still = tree.detach((now.pos, now.impulse, now.bodies))
+        _, left = touching.newton(Unknowns(*still), firm, tuple(x.detach() for x in linear), True)
+    wrench = (touching.touch.resist @ now.bodies.unsqueeze(-1)).squeeze(-1)
+    return now.pos, now.impulse / scale, (push + felt.force) / scale, felt.force / scale, wrench, left
+
+
+def _searched(touching: Touching, tension: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    system = touching.system
+    inputs, law = system.inputs(tension)
+    parts = [getattr(touching.touch, name) for name in _FIELDS]
+    found = torch.ops.torchdlo.engaged(inputs, parts, touching.origin, system.lengths.topology.name, law)
+    return tuple(found)
+
+
+def _engaged(
+    inputs: list[Tensor], parts: list[Tensor], origin: Tensor, topology: str, law: list[float]
+) -> list[Tensor]:
+    """Return positions, tensions, displacements of bodies, and how hard contact was."""
+    rest, compliance, active, mask, give, hinge, swing, free, tension, vertex, moved, *others, scale = inputs
+    lengths = Lengths(parse(topology), rest, compliance, active, mask, give, *law[1:3])
+    system = System(
+        lengths, Inertia(vertex, hinge, rest, mask, swing), moved, free, others[0], scale, *others[1:], law[0]
+    )
+    touching = Touching(system, Touch(*parts), origin)
+    linear = touch.maps(touching.touch)
+    first = touching.start(tension)
+    best, open = first, first.pos.new_ones(*first.pos.shape[:-2], 1, 1) > 0
+    chosen = torch.full_like(open, HARD, dtype=first.pos.dtype)
+    for hard, steps in TRIES:
+        # Scenes that are not solved begin again.
+        chosen = torch.where(open, hard, chosen)
+        firm, now = touching.firm(tension, chosen), _chosen(open, first, best)
+        for k in range(steps):
+            new, left = touching.newton(now, firm, linear, k >= 2)
+            now = _chosen(open, new, now)
+            open = open & ~(left < _solved(left))
+            if not bool(open.any()):
+                break
+        best = now
+        if not bool(open.any()):
+            break
+    return [x.contiguous() for x in (best.pos, best.impulse / scale, best.bodies, chosen)]
+
+
+def _chosen(condition: Tensor, one: Unknowns, other: Unknowns) -> Unknowns:
+    pairs = zip((one.pos, one.impulse, one.bodies), (other.pos, other.impulse, other.bodies), strict=True)
+    return Unknowns(*(torch.where(condition, a, b) for a, b in pairs))
+
+
+def _engaged_meta(
+    inputs: list[Tensor], parts: list[Tensor], origin: Tensor, topology: str, law: list[float]
+) -> list[Tensor]:
+    tension, moved, wanted, of = inputs[8], inputs[10], parts[_FIELDS.index("wanted")], parts[_FIELDS.index("of")]
+    batch = torch.broadcast_shapes(moved.shape[:-2], tension.shape[:-2], wanted.shape[:-3])
+    like = moved.new_empty
+    v = parse(topology).size
+    return [like(*batch, v, 3), like(*batch, v, 1), like(*batch, of.shape[-1], 6), like(*batch, 1, 1)]
+
+
+_operators = torch.library.Library("torchdlo", "FRAGMENT")
+_operators.define("engaged(Tensor[] inputs, Tensor[] parts, Tensor origin, str topology, float[] law) -> Tensor[]")
+for _device in ("CPU", "CUDA"):
+    _operators.impl("engaged", _engaged, _device)
+_operators.impl("engaged", _engaged_meta, "Meta")
+
+
+def _pattern(name: str) -> banded.Pattern:
+    """Pattern of `Touching.constraint_iterations`: as that of `balance`, with blocks of 3 x 3; see its `entries` for
+    the numbering."""
+    topology = parse(name)
+    v, after, mask = topology.size, topology.successor(), topology.edge_mask()
+    places: list[tuple[int, int, int]] = []
+    for i in range(v):
+        near, far = after[i], after[after[i]]
+        inside = mask[i] > 0
+        further = inside and mask[near] > 0
+        for a in range(3):
+            for b in range(3):
+                entry = (3 * a + b) * v
+                places.append((a * v + i, b * v + i, entry + i))
+                if inside:
+                    places += [(a * v + i, b * v + near, 9 * v + entry + i)]
+                    places += [(a * v + near, b * v + i, 18 * v + entry + near)]
+            if further:
+                places += [(a * v + i, a * v + far, 27 * v + i), (a * v + far, a * v + i, 28 * v + far)]
+            if inside:
+                places += [(a * v + i, 3 * v + i, (29 + a) * v + i), (a * v + near, 3 * v + i, (32 + a) * v + i)]
+                places += [(3 * v + i, a * v + i, (35 + a) * v + i), (3 * v + i, a * v + near, (38 + a) * v + i)]
+        places.append((3 * v + i, 3 * v + i, 41 * v + i))
+    return banded.make_pattern(4 * v, places, saddle_order(topology))
+
+
+banded.register_pattern("touching", functools.cache(_pattern))
