@@ -84,7 +84,7 @@ class Control:
     """Poses of the kinematic bodies, () if the scene has no bodies."""
 
 
-_NEWTON = {"explicit": 3, "implicit": 12}
+_NEWTON = {"explicit": 3, "implicit": 8}
 """Newton steps for edge lengths, by integrator, where a scene says nothing."""
 
 
@@ -107,7 +107,7 @@ class Scene:
     prescribed_vertices: tuple[int, ...] = ()
     prescribed_edges: tuple[int, ...] = ()
     constraint_iterations: int | None = None
-    """Newton steps for edge lengths per substep: in explicit steps as many, 3 if None; in implicit ones at most, 12 if
+    """Newton steps for edge lengths per substep: in explicit steps as many, 3 if None; in implicit ones at most, 8 if
     None, as each scene ends when it is solved."""
     twist_iterations: int = 4
     """Newton steps for quasistatic twist per substep, where bending has a part in it; without, one is exact."""

@@ -1,5 +1,4 @@
-"""Contact of ropes with surfaces inside of an implicit step: a stiff law of the end of the step, solved with the
-lengths.
+"""Contact of ropes with surfaces inside of an implicit step: a stiff law of its end, solved with the lengths.
 
 At each point of an edge that may touch, with m by how much it misses where it has to be at the end of the step, the
 normal force is k/2 (m + sqrt(m^2 + w^2)), a spring that is rounded over a length w much smaller than the radius, less

@@ -102,10 +102,11 @@ def explain(missed: Tensor) -> str:
         )
     if others and others[0] > 0:
         return (
-            f"an edge became {others[0]:.0%} longer than it has to be: a rope was pulled beyond its length, moved too far "
-            "within a step, or carries more than its steps can hold; move what holds it more slowly, take shorter substeps "
-            "or integrator='implicit', or give it a finite `stretch`"
+            f"an edge became {others[0]:.0%} longer than it has to be: a rope was pulled beyond its length, moved too "
+            "far within a step, or carries more than its steps can hold; move what holds it more slowly, take shorter "
+            "substeps or integrator='implicit', or give it a finite `stretch`"
         )
     if others[1:] and others[1] > 0:
-        return f"an implicit step with contact left {others[1]:.0%} of its forces unbalanced; shorten dt, or take explicit steps"
+        left = f"{others[1]:.0%} of its forces unbalanced"
+        return f"an implicit step with contact left {left}; shorten dt, or take explicit steps"
     return ""

@@ -14,6 +14,9 @@ normal force acts along the normal through the centreline. Friction acts at the 
 centreline; the couple that this makes is exerted by the ends of the edge, but for its part about the edge, which a
 centreline cannot exert: ropes slide across a body and do not roll on it.
 
+Implicit steps find these forces together with the lengths, by a stiff law of the end of the step, see `physics.touch`
+and `physics.engage`; `sweeps`, `rounds` and the kernel belong to explicit ones.
+
 The derivative is the one of the step as computed, of nearest points and normals too; it is finite everywhere, and
 one-sided where a point starts to touch or to slide.
 
