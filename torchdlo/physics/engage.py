@@ -2,8 +2,8 @@
 
 The equations are those of `constrain.balance` with the forces of `touch` among them. Points on fixed and driven
 surfaces fill blocks of 3 x 3 on and beside the diagonal, within the band that bending needs; free bodies add a border
-of six unknowns each, which their Schur complement takes out. Newton's method runs without graph until each scene
-is solved; scenes that are not are tried again with softer contact. One more step, with graph, gives the derivative of
+of six unknowns each, which their Schur complement takes out. Newton's method runs without graph until each scene is
+solved; scenes that are not are tried again with softer contact. One more step, with graph, gives the derivative of
 the implicit function theorem, and what is left of the equations is reported.
 """
 

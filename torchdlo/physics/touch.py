@@ -3,9 +3,9 @@
 At each point of an edge that may touch, with m by how much it misses where it has to be at the end of the step, the
 normal force is k/2 (m + sqrt(m^2 + w^2)), a spring that is rounded over a length w much smaller than the radius, less
 its value 100 w outside of contact, where it ends. Friction is mu f s / sqrt(s^2 + (mu f / k)^2) against the slip s:
-never more than Coulomb allows, and opposed to the slip at the end of the step, so that it takes energy away. Forces and
-their derivatives by the displacements of the ends of the edge and of the body are exact; surfaces are taken as they
-are, to first order, at the start of the step.
+never more than Coulomb allows, and opposed to the slip at the end of the step, so that it takes energy away. Forces
+and their derivatives by the displacements of the ends of the edge and of the body are exact; surfaces are taken as
+they are, to first order, at the start of the step.
 """
 
 from __future__ import annotations
