@@ -126,7 +126,7 @@ def test_single_precision_is_close_to_double(count):
     ropes = heap(count, gap=-1e-4)
     double, single = (pushed(*inputs(ropes, dtype)) for dtype in (F64, torch.float32))
     assert single[0].dtype == torch.float32
-    assert float((single[0] - double[0]).norm()) <= 1e-3 * float(double[0].norm())
+    assert float((single[0] - double[0]).norm()) <= 3e-3 * float(double[0].norm())
     for name, one, other in zip(GIVEN, single[1], double[1], strict=True):
         assert float((one - other).norm()) <= 3e-3 * float(other.norm()), name
 
