@@ -34,7 +34,7 @@ def test_diagnose_writes_findings_model_and_page(
         options["journal"].mkdir(parents=True)
         model = RopeModel(recording, vertices=21, effects=("air_drag",))
         return fake_diagnosis(
-            recording, model=model, health=[DataIssue("train_1", "swap", "markers 3 and 4 are swapped")]
+            recording, model=model, data_issues=[DataIssue("train_1", "swap", "markers 3 and 4 are swapped")]
         )
 
     monkeypatch.setattr(search, "diagnose", fake)

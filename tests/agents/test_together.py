@@ -15,10 +15,10 @@ from torch import Tensor
 from tests.agents.problems import Drag, Push, SurrogateRound, signature
 from torchdlo.agents.trajopt.batched_evaluation import together
 from torchdlo.agents.trajopt.problem import Evaluation, Problem
-from torchdlo.agents.trajopt.search import METHODS, Robust, Settings, optimize
+from torchdlo.agents.trajopt.search import METHODS, Robust, SearchSettings, optimize
 from torchdlo.errors import InputError
 
-SETTINGS = Settings(episodes=48, population=8, hold=5, chunk=5)
+SETTINGS = SearchSettings(episodes=48, population=8, hold=5, chunk=5)
 ALL = [replace(SETTINGS, method=method, seed=seed) for method in METHODS for seed in (0, 1)]
 
 
@@ -38,7 +38,7 @@ class Counting(Push):
         return super().evaluate(actions)
 
 
-def searching(settings: Settings, **choices: Any) -> Any:
+def searching(settings: SearchSettings, **choices: Any) -> Any:
     return lambda shared: optimize(shared, settings, **choices)
 
 
@@ -57,7 +57,7 @@ def test_searches_find_what_they_find_alone() -> None:
 
 def test_rehearsals_are_shared_as_well() -> None:
     settings = [
-        Settings("hybrid", episodes=48, population=8, hold=5, seed=seed, surrogate_share=0.5) for seed in (0, 1)
+        SearchSettings("hybrid", episodes=48, population=8, hold=5, seed=seed, surrogate_share=0.5) for seed in (0, 1)
     ]
     problem = SurrogateRound()
     found = together(problem, [searching(each) for each in settings], room=16)

@@ -91,7 +91,7 @@ def diagnose(
     with Pool(recording, options, workers, kept) as pool:
         search = _Search(pool, BUDGETS[budget], np.random.default_rng(seed), report, without)
         found = search.run(given)
-    found.health, found.options = faults, {"budget": budget, "seed": seed, "vertices": options["vertices"]} | less
+    found.data_issues, found.options = faults, {"budget": budget, "seed": seed, "vertices": options["vertices"]} | less
     if len(recording.train) < whole:
         found.notes.append(f"{len(recording.train)} of the {whole} train trials were used, evenly picked.")
     found.seconds = time.perf_counter() - begun

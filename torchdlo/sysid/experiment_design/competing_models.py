@@ -30,7 +30,7 @@ def diagnosed(folder: Path, recording: Recording) -> tuple[list[list[str]], Mode
 
     Args:
         folder: what `torchdlo diagnose` wrote.
-        recording: without what cannot be trusted, see `health.check`.
+        recording: without what cannot be trusted, see `data_quality.check`.
 
     Raises:
         InputError: The folder is not one of a diagnosis, or one of another recording.
