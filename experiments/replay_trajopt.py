@@ -1,8 +1,8 @@
 """Play trajectories that were found once more, and put what they earn now beside what they earned.
 
-Every trajectory of the archive of --out, or of its subfolders, is played alone, with the precision and the kind of steps
-with which it was found. On the machine and with the versions of the search every bit comes back; what changes with
-others shows how far a result rests on rounding.
+Every trajectory of the archive of --out, or of its subfolders, is played alone, with the precision and the kind of
+steps with which it was found. On the machine and with the versions of the search every bit comes back; what changes
+with others shows how far a result rests on rounding.
 """
 
 from __future__ import annotations

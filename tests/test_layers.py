@@ -40,7 +40,7 @@ ALLOWED = {
     "scene_files": ARRAYS,
     "sysid": ARRAYS,
     "envs": LEARNING | {"pytorch_kinematics", "trimesh"},
-    "agents": LEARNING | {"cma"},
+    "agents": LEARNING | {"cma", "numpy"},
     "report": ARRAYS | {"matplotlib", "pyvista", "vtk", "av", "viser"},
     "cli": ARRAYS | {"rich", "typer"},
     "__main__": set(),

@@ -144,7 +144,7 @@ def edit(recording: Recording, tmp_path: Path) -> Callable[..., Path]:
         (lambda c: c["options"].update(rest="bent"), r"options.rest: expected straight or given, found 'bent'"),
         (lambda c: c["options"].update(substep=0), r"options.substep: expected a number of at least 1e-09, found 0"),
         (lambda c: c["options"].pop("clamp_fraction"), r"options.clamp_fraction: expected this entry, found none"),
-        (lambda c: c["options"].update(grid=1), r"options: unknown name grid; did you mean grip\?"),
+        (lambda c: c["options"].update(clamp_fractions=1), r"did you mean clamp_fraction\?"),
     ],
 )
 def test_what_is_wrong_with_a_file_is_said(edit: Callable[..., Path], do: Callable[..., Any], message: str) -> None:

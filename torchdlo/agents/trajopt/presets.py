@@ -1,4 +1,4 @@
-"""SearchSettings of trajectory optimisation by task: those that were published for the tasks, and ours for the hybrid."""
+"""Settings of trajectory optimisation by task: those that were published for the tasks, and ours for the hybrid."""
 
 from __future__ import annotations
 

@@ -46,8 +46,9 @@ class Mesh:
         """Return what the hinges at clamps stand for, over what hinges between their edges do, shape (V,).
 
         A clamp's direction is that of the chord between its two markers next to the free rope. A rope that bends
-        between them has that direction in their middle (`clamp_fraction` 0), one that is held stiffly up to the last of them
-        has it there (`clamp_fraction` 1). The hinge stands for the rope from that point to the middle of the first free edge.
+        between them has that direction in their middle (`clamp_fraction` 0), one that is held stiffly up to the last of
+        them has it there (`clamp_fraction` 1). The hinge stands for the rope from that point to the middle of the first
+        free edge.
         """
         share, length = np.ones(len(self.arclength)), np.diff(self.arclength)
         for (edge, _), markers, vertex in zip(self.clamps, self.runs, self.clamp_hinges, strict=True):
