@@ -1,4 +1,4 @@
-"""Public names and JSON keys are words of the field, each class has a name of its own, and functions say what they do."""
+"""Public names and JSON keys are words of the field, and each class has a name of its own."""
 
 from __future__ import annotations
 
