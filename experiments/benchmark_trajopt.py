@@ -174,7 +174,7 @@ def cases(task: str, args: Any) -> list[Case]:
 
 def solve(task: str, args: Any) -> list[tuple[Case, dict[str, Any]]]:
     """Run what is not there yet of a task, all at once, and return all results."""
-    from torchdlo.agents.trajopt.batched_evaluation import together
+    from torchdlo.agents.trajopt.batched_evaluation import evaluate_batched
     from torchdlo.agents.trajopt.task_problem import problem
     from torchdlo.cli.progress import deferred_interrupt, progress
 
@@ -199,7 +199,7 @@ def solve(task: str, args: Any) -> list[tuple[Case, dict[str, Any]]]:
 
         sizes = [min(case.settings.population, case.settings.chunk) for case in wanted]
         with_gradient = sum(int(size * SHARE.get(case.method, 1)) for size, case in zip(sizes, wanted, strict=True))
-        together(chosen, [searching(case) for case in left], sum(sizes), pulse, with_gradient=with_gradient)
+        evaluate_batched(chosen, [searching(case) for case in left], sum(sizes), pulse, with_gradient=with_gradient)
     return [(case, json.loads(case.result.read_text())) for case in wanted if case.result.is_file()]
 
 
