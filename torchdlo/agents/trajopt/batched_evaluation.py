@@ -1,6 +1,6 @@
 """Several searches of one problem that share their batches, as one of many episodes costs little more than one of few.
 
-Every search runs in a thread of its own and waits for what it asked for; the thread that calls `evaluate_batched` plays.
+Every search runs in a thread of its own and waits for what it asked for; the one that calls `evaluate_batched` plays.
 """
 
 from __future__ import annotations
