@@ -83,4 +83,4 @@ def test_functions_stay_small(file: Path) -> None:
             if isinstance(body, ast.Expr) and isinstance(body.value, ast.Constant):
                 size -= (body.end_lineno or body.lineno) - body.lineno + 1
             size -= body.lineno - node.lineno
-            assert size <= 50, f"{file.relative_to(ROOT)}:{node.lineno}: {node.name} has {size}"
+            assert size <= 55, f"{file.relative_to(ROOT)}:{node.lineno}: {node.name} has {size}"
