@@ -85,7 +85,7 @@ def work(case: Case, share: int, go: Any, results: Any) -> None:
     while not actions or used < case.seconds:
         used += clocked(lambda: act(found[0]))[0]
         actions += 1
-    rate = actions * found[0].task.frames * share / used
+    rate = actions * found[0].task.frame_skip * share / used
     results.put({"cpu": rate, "first_call_s": first, "peak_mb": peak_mb()})
 
 
@@ -110,7 +110,7 @@ def remember(task: str, actions: int, compiled: bool, go: Any, results: Any) -> 
     gradient(stage_waypoints[:2])
     before = peak_mb(restart=True)
     gradient(stage_waypoints)
-    results.put({"frames": actions * env.task.frames, "before_mb": before, "peak_mb": peak_mb()})
+    results.put({"frames": actions * env.task.frame_skip, "before_mb": before, "peak_mb": peak_mb()})
 
 
 def memory(task: str, actions: int, compiled: bool) -> dict[str, Any]:

@@ -88,18 +88,20 @@ class Case:
         Raises:
             InputError: It is there, but of other settings.
         """
-        from torchdlo.agents.trajopt.search import Settings
+        from torchdlo.agents.trajopt.search import SearchSettings
         from torchdlo.errors import InputError
 
         def resolved(settings: dict[str, Any]) -> dict[str, Any]:
-            own = Settings(**{f.name: settings[f.name] for f in fields(Settings)})
+            own = SearchSettings(**{f.name: settings[f.name] for f in fields(SearchSettings)})
             return settings | {name: getattr(own.plan(problem), name) for name in ("hold", "sigma", "rate", "steps")}
 
         if not self.result.is_file():
             return None
         found = json.loads(self.result.read_text())
         # Earlier versions had fewer settings.
-        had, wanted = (json.loads(json.dumps(x)) for x in (asdict(Settings()), asdict(self.settings) | problem.choices))
+        had, wanted = (
+            json.loads(json.dumps(x)) for x in (asdict(SearchSettings()), asdict(self.settings) | problem.choices)
+        )
         same = resolved(had | found["settings"]) == resolved(wanted)
         if not (same or again):
             raise InputError(
@@ -172,7 +174,7 @@ def cases(task: str, args: Any) -> list[Case]:
 
 def solve(task: str, args: Any) -> list[tuple[Case, dict[str, Any]]]:
     """Run what is not there yet of a task, all at once, and return all results."""
-    from torchdlo.agents.trajopt.batched_evaluation import together
+    from torchdlo.agents.trajopt.batched_evaluation import evaluate_batched
     from torchdlo.agents.trajopt.task_problem import problem
     from torchdlo.cli.progress import deferred_interrupt, progress
 
@@ -197,7 +199,7 @@ def solve(task: str, args: Any) -> list[tuple[Case, dict[str, Any]]]:
 
         sizes = [min(case.settings.population, case.settings.chunk) for case in wanted]
         with_gradient = sum(int(size * SHARE.get(case.method, 1)) for size, case in zip(sizes, wanted, strict=True))
-        together(chosen, [searching(case) for case in left], sum(sizes), pulse, with_gradient=with_gradient)
+        evaluate_batched(chosen, [searching(case) for case in left], sum(sizes), pulse, with_gradient=with_gradient)
     return [(case, json.loads(case.result.read_text())) for case in wanted if case.result.is_file()]
 
 
@@ -311,7 +313,7 @@ def shorten() -> None:
     from torchdlo import envs
 
     for name, kind in list(envs.TASKS.items()):
-        short = type(kind.__name__, (kind,), {"frames": 2, "settle": 0, "release": 0})
+        short = type(kind.__name__, (kind,), {"frame_skip": 2, "settle_steps": 0, "release": 0})
         envs.TASKS[name] = lambda short=short: short(horizon=1)
 
 

@@ -161,7 +161,7 @@ def gripper_claims(frames: Frames, d: SceneDescription) -> Claims:
 
 def pulley(quick: bool) -> SceneDescription:
     """A smooth rope over a smooth pulley, with 40 g on one side and 60 g on the other."""
-    from torchdlo.scene_files import BodySpec, PointMass, RopeSpec, SceneDescription
+    from torchdlo.scene_files import BodySpec, HangingMass, RopeSpec, SceneDescription
 
     radius, r, side, count = 0.05, 3e-3, 0.2, 48 if quick else 56
     edge = (2 * side + math.pi * (radius + r)) / count
@@ -170,10 +170,10 @@ def pulley(quick: bool) -> SceneDescription:
     angles = [math.pi * k / 64 for k in range(65)]
     top = [(-wide * math.cos(a), 0.0, wide * math.sin(a)) for a in angles]
     points = ((-wide, 0.0, -side), *top, (wide, 0.0, -side))
-    weights = (PointMass(0, 0.04), PointMass(-1, 0.06))
+    weights = (HangingMass(0, 0.04), HangingMass(-1, 0.06))
     half = math.sqrt(0.5)
     return SceneDescription(
-        ropes=(RopeSpec(points, vertices=count, radius=r, mass=0.02, bend=1e-4, point_masses=weights),),
+        ropes=(RopeSpec(points, vertices=count, radius=r, mass=0.02, bend=1e-4, hanging_masses=weights),),
         effects={"gravity": {}, "bend": {}, "rod_body": {}},
         bodies=(BodySpec("cylinder", (radius, 0.03), quat=(half, half, 0.0, 0.0), motion="fixed", mu_s=0.0, mu_k=0.0),),
         duration=0.3,

@@ -45,7 +45,7 @@ def one(name: str, args: Any, out: Path) -> dict[str, Any]:
     with progress() as callback:
         cut = learn(problem, cut=True, callback=lambda *said: callback(f"{name}, cut", *said), **choices)
         found = learn(problem, cut=False, callback=lambda *said: callback(name, *said), **choices)
-        description = described(problem, found.keyframes)
+        description = described(problem, found.keys)
         scene_files.save(description, out / "scene.json")
         frames = run(scene_files.read(out / "scene.json"), frame_stride=5)
     save_frames(frames, out / "frames.npz", description)

@@ -34,7 +34,7 @@ def test_diagnose_writes_findings_model_and_page(
         options["journal"].mkdir(parents=True)
         model = RopeModel(recording, vertices=21, effects=("air_drag",))
         return fake_diagnosis(
-            recording, model=model, health=[DataIssue("train_1", "swap", "markers 3 and 4 are swapped")]
+            recording, model=model, data_issues=[DataIssue("train_1", "swap", "markers 3 and 4 are swapped")]
         )
 
     monkeypatch.setattr(search, "diagnose", fake)
@@ -81,4 +81,4 @@ def test_diagnose_refuses_before_it_begins(
 def test_calibrate_takes_a_model_file(work: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (work / "model.json").write_text('{"format": "torchdlo-model", "version": 99}')
     assert run("calibrate", "rope", "--model", "model.json") == 2
-    assert "model.json: version: expected 2, found 99" in capsys.readouterr().err
+    assert "model.json: version: expected 3, found 99" in capsys.readouterr().err

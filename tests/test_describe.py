@@ -273,7 +273,7 @@ def test_files_of_version_1_are_read():
     assert list(found.effects) == ["gravity", "rod_mpm_coupling", "body_mpm_coupling"]
     assert found.material_points[0].constitutive_model == "sand"
     assert found.material_points[0].parameters == {"youngs": 1e4}
-    assert found.camera_direction == (1.0, 0.0, 0.5) and found.ropes[0].point_masses[0].mass == 1.0
+    assert found.camera_direction == (1.0, 0.0, 0.5) and found.ropes[0].hanging_masses[0].mass == 1.0
     # What is written again is of today.
     assert scene_files.parse(scene_files.text(found)) == found and '"torchdlo scene 2"' in scene_files.text(found)
     # An entry of today does not belong into a file of then, nor the other way round.

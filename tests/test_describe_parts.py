@@ -18,9 +18,9 @@ from torchdlo.scene_files import (
     Attachment,
     BodySpec,
     GridSpec,
+    HangingMass,
     Keyframe,
     ParticleBlockSpec,
-    PointMass,
     RobotSpec,
     RopeSpec,
     SceneDescription,
@@ -55,7 +55,7 @@ def test_bodies_touch_matter_where_the_effect_says_so():
 def test_all_parts_read_back_as_they_were_written(tmp_path):
     whole = SceneDescription(
         (
-            change(LINE, point_masses=(PointMass(-1, 1 / 3),)),
+            change(LINE, hanging_masses=(HangingMass(-1, 1 / 3),)),
             RopeSpec(((0.0, 0.0, 0.0), (1.0, 0.0, 0.0)), model="model.json"),
         ),
         {"gravity": {}, "rod_mpm_coupling": {"mu": 0.1}},
@@ -140,12 +140,12 @@ WRONG = {
         r"material_points\[0\].spacing: expected more",
     ),
     "weight's place": (
-        change(FALL, ropes=(change(LINE, point_masses=(PointMass(7, 1.0),)),)),
+        change(FALL, ropes=(change(LINE, hanging_masses=(HangingMass(7, 1.0),)),)),
         r"vertex: expected -7 to 6",
     ),
     "weight": (
-        change(FALL, ropes=(change(LINE, point_masses=(PointMass(0, 0.0),)),)),
-        r"point_masses\[0\].mass: expected more",
+        change(FALL, ropes=(change(LINE, hanging_masses=(HangingMass(0, 0.0),)),)),
+        r"hanging_masses\[0\].mass: expected more",
     ),
     "no robot": (change(FALL, attachments=(Attachment((0,), robot=0),)), r"attachments\[0\].robot: there is no robot"),
     "late": (
@@ -168,7 +168,7 @@ def test_wrong_parts_are_refused_with_place_and_expectation(case, tmp_path):
 def test_a_weight_hangs_with_its_weight():
     # The hold bears rope and weight. After many times 1 / rate the swing is gone: exp(-0.5 20 1) of it is left.
     rope = RopeSpec(
-        ((0.0, 0.0, 0.2), (0.0, 0.0, 0.1)), vertices=5, mass=0.01, bend=1e-5, point_masses=(PointMass(-1, 0.05),)
+        ((0.0, 0.0, 0.2), (0.0, 0.0, 0.1)), vertices=5, mass=0.01, bend=1e-5, hanging_masses=(HangingMass(-1, 0.05),)
     )
     still = SceneDescription(
         (rope,), {"gravity": {}, "damping": {"rate": 20.0}, "bend": {}}, attachments=(Attachment((0,)),)

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from tests.agents.problems import Push
-from torchdlo.agents.trajopt.search import Settings
+from torchdlo.agents.trajopt.search import SearchSettings
 from torchdlo.errors import InputError
 
 pytest.importorskip("pytorch_kinematics", reason="arms need the extra robots")
@@ -72,7 +72,7 @@ def test_a_search_ends_when_time_is_over_and_keeps_what_it_has(
 ) -> None:
     monkeypatch.syspath_prepend(SCRIPT.parent)
     benchmark = importlib.import_module("benchmark_trajopt")
-    settings = Settings("cmaes", episodes=80, population=8, hold=5)
+    settings = SearchSettings("cmaes", episodes=80, population=8, hold=5)
     case, calls = benchmark.Case("push", "cmaes", 0, settings, tmp_path), []
 
     def over() -> bool:
@@ -99,7 +99,7 @@ def test_a_search_ends_when_time_is_over_and_keeps_what_it_has(
 def test_a_trajectory_is_played_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(SCRIPT.parent)
     benchmark, replays = (importlib.import_module(name) for name in ("benchmark_trajopt", "replay_trajopt"))
-    settings = Settings("cmaes", episodes=80, population=8, hold=5)
+    settings = SearchSettings("cmaes", episodes=80, population=8, hold=5)
     benchmark.Case("push", "cmaes", 0, settings, tmp_path / "push").search(Push(), lambda *_: None, lambda: False)
     row = replays.replay("push", replays.trajectories(tmp_path)["push"], lambda task, **_: Push(name=task))
     before, now = row["return"]

@@ -13,7 +13,7 @@ from tests.agents.problems import Push, SurrogateRound
 from torchdlo.agents.trajopt.gradient_descent import descent
 from torchdlo.agents.trajopt.proposals import SearchPlan, Told
 from torchdlo.agents.trajopt.result import result_json
-from torchdlo.agents.trajopt.search import Settings, optimize
+from torchdlo.agents.trajopt.search import SearchSettings, optimize
 from torchdlo.errors import InputError
 
 pytestmark = pytest.mark.quick
@@ -26,11 +26,11 @@ def test_a_package_that_is_missing_is_named_before_anything_is_played(
     monkeypatch.setitem(sys.modules, "cma", None)
     monkeypatch.setattr(Push, "evaluate", lambda *_: pytest.fail("it was played"))
     with pytest.raises(InputError, match=r"need the package cma; pip install 'torchdlo\[cmaes\]'"):
-        optimize(Push(), Settings(method, episodes=4000, population=20))
+        optimize(Push(), SearchSettings(method, episodes=4000, population=20))
 
 
 def test_what_a_rehearsal_promised_is_not_said_of_the_problem_itself() -> None:
-    settings = Settings("hybrid", episodes=160, population=16, hold=5, surrogate_share=0.8)
+    settings = SearchSettings("hybrid", episodes=160, population=16, hold=5, surrogate_share=0.8)
 
     def stop(_: str, done: int, *__: object) -> None:
         if done >= 48:

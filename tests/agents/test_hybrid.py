@@ -14,7 +14,7 @@ from torchdlo.agents.trajopt import hybrid
 from torchdlo.agents.trajopt.lbfgs import Descent
 from torchdlo.agents.trajopt.problem import Encoding, Evaluation
 from torchdlo.agents.trajopt.proposals import SearchPlan, Told
-from torchdlo.agents.trajopt.search import METHODS, Settings, optimize
+from torchdlo.agents.trajopt.search import METHODS, SearchSettings, optimize
 
 pytestmark = pytest.mark.quick
 
@@ -22,7 +22,7 @@ pytestmark = pytest.mark.quick
 def test_islands_know_nothing_of_each_other() -> None:
     def asked(shift: float) -> list[Tensor]:
         problem = Reach()
-        plan = Settings("hybrid", episodes=600, population=40, hold=5).plan(problem)
+        plan = SearchSettings("hybrid", episodes=600, population=40, hold=5).plan(problem)
         search, told, points = METHODS["hybrid"](plan, torch.Generator().manual_seed(0)), None, []
         for _ in range(12):
             ask = search.send(told)
@@ -43,7 +43,7 @@ def test_islands_know_nothing_of_each_other() -> None:
 
 
 def test_one_line_of_the_hybrid_descends_from_doing_nothing() -> None:
-    plan, problem = Settings("hybrid", episodes=240, population=24, hold=5).plan(Reach()), Reach()
+    plan, problem = SearchSettings("hybrid", episodes=240, population=24, hold=5).plan(Reach()), Reach()
 
     def ends(plan: SearchPlan, count: int) -> list[float]:
         search, told, found = METHODS["hybrid"](plan, torch.Generator().manual_seed(0)), None, []
@@ -79,7 +79,7 @@ def test_the_hybrid_has_slopes_of_the_best_quarter() -> None:
             (with_gradient if actions.requires_grad else played).append(outcome.returns.detach())
             return outcome
 
-    optimize(Watched(), Settings("hybrid", episodes=80, population=40, hold=5))
+    optimize(Watched(), SearchSettings("hybrid", episodes=80, population=40, hold=5))
     # Islands of 16 and 20, and 4 of which the first does nothing. Nothing is told of the second iteration, which is the
     # last. The best is played alone.
     first, gradients = played[0].split([16, 20, 4]), torch.cat(with_gradient).split([4, 5, 1])
@@ -91,7 +91,7 @@ def test_the_hybrid_has_slopes_of_the_best_quarter() -> None:
 
 
 def test_islands_that_are_behind_go_on_from_the_best_trajectory_of_all() -> None:
-    plan = Settings("hybrid", episodes=1200, population=60, hold=5).plan(Push())
+    plan = SearchSettings("hybrid", episodes=1200, population=60, hold=5).plan(Push())
     search, told, away = METHODS["hybrid"](plan, torch.Generator().manual_seed(0)), None, []
     none = torch.zeros(60, dtype=torch.bool)
     for k in range(plan.iterations):

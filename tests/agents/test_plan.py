@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from tests.agents.problems import Plain, judged
-from torchdlo.agents.trajopt.proposals import drags, rounds
-from torchdlo.agents.trajopt.search import Settings, optimize
+from torchdlo.agents.trajopt.proposals import circular_proposals, drag_proposals
+from torchdlo.agents.trajopt.search import SearchSettings, optimize
 from torchdlo.agents.trajopt.task_problem import problem
 
 pytestmark = pytest.mark.quick
@@ -39,9 +39,9 @@ class Orbit(Plain):
 
 def test_rounds_go_straight_to_a_circle_about_a_thing_and_on_along_it():
     orbit = Orbit(touch=((0.3, 0.4, 0.1),))
-    plan = Settings(method="hybrid", episodes=40, population=20, hold=1).plan(orbit)
+    plan = SearchSettings(method="hybrid", episodes=40, population=20, hold=1).plan(orbit)
     encoding = plan.encoding(1)
-    points = rounds(plan, encoding, torch.Generator().manual_seed(0), 40)
+    points = circular_proposals(plan, encoding, torch.Generator().manual_seed(0), 40)
     path = encoding.decode(points).cumsum(1)
     assert points.shape == (40, encoding.size) and path.diff(dim=1).norm(dim=-1).max() <= 0.01
     # Those that are fast enough end on a circle of 2 to 20 cm about its axis, at an even height up to 20 cm above it.
@@ -61,9 +61,9 @@ def test_rounds_go_straight_to_a_circle_about_a_thing_and_on_along_it():
 def test_drags_go_straight_over_a_thing_and_tools_draw_nearer():
     aim, tools = torch.tensor([0.3, 0.4, 0.0]), torch.tensor([[-0.3, 0.0, 0.0], [0.2, 0.1, 0.0], [0.1, -0.1, 0.0]])
     pulled = Orbit(width=9, touch=(tuple(aim.tolist()),), tools=tuple(map(tuple, tools.tolist())))
-    plan = Settings(method="hybrid", episodes=60, population=60, hold=10).plan(pulled)
+    plan = SearchSettings(method="hybrid", episodes=60, population=60, hold=10).plan(pulled)
     encoding = plan.encoding(10, 0.2)
-    points = drags(plan, encoding, torch.Generator().manual_seed(0), 60)
+    points = drag_proposals(plan, encoding, torch.Generator().manual_seed(0), 60)
     actions = encoding.decode(points).unflatten(-1, (3, 3))
     path = actions.cumsum(1)
     assert actions.norm(dim=-1).max() <= 0.01
@@ -80,16 +80,16 @@ def test_drags_go_straight_over_a_thing_and_tools_draw_nearer():
     assert share[:, -1].min() < 0.2 and share[:, -1].max() > 0.8
 
 
-@pytest.mark.parametrize("kind", [rounds, drags])
+@pytest.mark.parametrize("kind", [circular_proposals, drag_proposals])
 def test_rounds_and_drags_need_something_to_touch(kind):
-    plan = Settings(method="hybrid", episodes=40, population=20).plan(Orbit(touch=()))
+    plan = SearchSettings(method="hybrid", episodes=40, population=20).plan(Orbit(touch=()))
     with pytest.raises(ValueError, match="nothing to touch"):
         kind(plan, plan.encoding(10), torch.Generator(), 3)
 
 
 @pytest.mark.parametrize("touch", [(), ((0.3, 0.4, 0.0),)])
 def test_a_hybrid_goes_round_what_it_is_told_of(touch):
-    settings = [Settings(method="hybrid", episodes=40, population=40, seed=seed) for seed in range(4)]
+    settings = [SearchSettings(method="hybrid", episodes=40, population=40, seed=seed) for seed in range(4)]
     done = [bool(optimize(Orbit(touch=touch), s).outcome.success) for s in settings]
     assert done == [bool(touch)] * 4
 

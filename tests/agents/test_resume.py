@@ -19,15 +19,15 @@ from torch import Tensor
 from tests.agents.problems import Push, signature
 from torchdlo.agents.trajopt.problem import Evaluation
 from torchdlo.agents.trajopt.result import result_json, trajectory_json
-from torchdlo.agents.trajopt.search import METHODS, Robust, SearchResult, Settings, optimize
+from torchdlo.agents.trajopt.search import METHODS, Robust, SearchResult, SearchSettings, optimize
 from torchdlo.agents.trajopt.search_journal import _code, program, remove
 from torchdlo.errors import InputError
 
-SETTINGS = Settings(episodes=96, population=8, hold=5, chunk=5)
+SETTINGS = SearchSettings(episodes=96, population=8, hold=5, chunk=5)
 REPOSITORY = Path(__file__).resolve().parents[2]
 
 
-def files(found: SearchResult, settings: Settings) -> tuple[str, dict]:
+def files(found: SearchResult, settings: SearchSettings) -> tuple[str, dict]:
     """What is written about a search, without the time it took."""
     result = json.loads(result_json(found, Push(), settings))
     del result["seconds"]
@@ -147,7 +147,7 @@ def stopped(journal: Path) -> None:
         optimize(Stopping(3), SETTINGS, journal=journal)
 
 
-def refused(journal: Path, settings: Settings = SETTINGS) -> str:
+def refused(journal: Path, settings: SearchSettings = SETTINGS) -> str:
     with pytest.raises(InputError) as error:
         optimize(Push(), settings, journal=journal, resume=True)
     return str(error.value)

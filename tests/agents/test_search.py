@@ -15,10 +15,10 @@ from torch import Tensor
 from tests.agents.problems import Drag, Peaks, Plain, Push, Reach, SurrogateRound, signature
 from torchdlo.agents.trajopt.problem import Evaluation
 from torchdlo.agents.trajopt.proposals import ranking
-from torchdlo.agents.trajopt.search import METHODS, Robust, SearchResult, Settings, optimize
+from torchdlo.agents.trajopt.search import METHODS, Robust, SearchResult, SearchSettings, optimize
 from torchdlo.errors import InputError
 
-SMALL = Settings(episodes=64, population=8, hold=5)
+SMALL = SearchSettings(episodes=64, population=8, hold=5)
 
 
 def returned(found: SearchResult) -> float:
@@ -28,7 +28,7 @@ def returned(found: SearchResult) -> float:
 @pytest.mark.parametrize(("method", "episodes"), [("cmaes", 2400), ("gd", 800), ("hybrid", 400)])
 def test_the_known_optimum_is_found(method: str, episodes: int) -> None:
     problem = Reach()
-    found = optimize(problem, Settings(method, episodes=episodes, population=16, hold=5))
+    found = optimize(problem, SearchSettings(method, episodes=episodes, population=16, hold=5))
     # 0 is the best there is. Success asks that the tip ends within one action's way, 1 cm, of the goal; a path that is
     # nowhere further off than that loses at most 100 * 20 * 0.01^2.
     assert bool(found.outcome.success[0])
@@ -38,7 +38,7 @@ def test_the_known_optimum_is_found(method: str, episodes: int) -> None:
 def test_descent_in_the_hybrid_converges_on_a_quadratic() -> None:
     # The residual of L-BFGS on a convex quadratic falls at least linearly; Adam's last steps leave an error of about a
     # thousandth of its first ones, 1e-3 m * 1e-3, per number: 100 * 60 * (1e-6)^2 * 20 / 2 of the return.
-    found = optimize(Reach(), Settings("hybrid", episodes=1600, population=16, hold=5))
+    found = optimize(Reach(), SearchSettings("hybrid", episodes=1600, population=16, hold=5))
     assert returned(found) > -100 * 60 * 1e-12 * 10
 
 
@@ -98,7 +98,7 @@ def test_slopes_are_zero_before_contact() -> None:
 
 def test_the_hybrid_beats_both_where_slopes_begin_at_contact() -> None:
     results = {
-        method: [returned(optimize(Push(), Settings(method, 320, 16, seed, hold=5))) for seed in range(6)]
+        method: [returned(optimize(Push(), SearchSettings(method, 320, 16, seed, hold=5))) for seed in range(6)]
         for method in METHODS
     }
     mean = {method: sum(values) / 6 for method, values in results.items()}
@@ -108,7 +108,7 @@ def test_the_hybrid_beats_both_where_slopes_begin_at_contact() -> None:
 
 @pytest.mark.slow
 def test_the_hybrid_beats_both_on_a_rope_dragged_over_a_table() -> None:
-    results = {m: returned(optimize(Drag(), Settings(m, 48, 8, 1, hold=2))) for m in METHODS}
+    results = {m: returned(optimize(Drag(), SearchSettings(m, 48, 8, 1, hold=2))) for m in METHODS}
     assert results["hybrid"] >= max(results["cmaes"], results["gd"]), results
 
 
@@ -164,7 +164,7 @@ class Latch(Reach):
 
 
 def test_where_all_earn_the_same_the_hybrid_follows_the_loss() -> None:
-    found = optimize(Latch(), Settings("hybrid", episodes=256, population=16, hold=5))
+    found = optimize(Latch(), SearchSettings("hybrid", episodes=256, population=16, hold=5))
     assert bool(found.outcome.success[0]) and returned(found) == 2
     assert found.curve[0]["best"] == 1, "it is not met by chance"
 
@@ -184,7 +184,7 @@ class Lure(Reach):
 
 
 def test_the_hybrid_goes_where_it_succeeds_and_not_where_it_earns_most() -> None:
-    settings = Settings("hybrid", episodes=384, population=16, hold=5)
+    settings = SearchSettings("hybrid", episodes=384, population=16, hold=5)
     done, blind = (optimize(Lure(shown=shown), settings) for shown in (True, False))
     assert bool(done.outcome.success[0]) and not bool(blind.outcome.success[0])
     assert returned(blind) > returned(done) > 9.96
@@ -192,7 +192,7 @@ def test_the_hybrid_goes_where_it_succeeds_and_not_where_it_earns_most() -> None
 
 @pytest.mark.parametrize("method", METHODS)
 def test_a_search_begins_with_a_rehearsal(method: str) -> None:
-    settings = Settings(method, episodes=240, population=24, hold=5, surrogate_share=0.8)
+    settings = SearchSettings(method, episodes=240, population=24, hold=5, surrogate_share=0.8)
     problem = SurrogateRound()
     found = optimize(problem, settings)
     # Eight iterations of ten.
@@ -246,7 +246,7 @@ def test_what_has_no_number_is_never_chosen_and_hides_nothing(method: str) -> No
 def test_robust_trajectories_hold_in_worlds_that_no_search_has_seen() -> None:
     best = torch.tensor(Peaks().narrow, dtype=torch.float64).expand(4, 3) / 4
     assert float(Peaks().evaluate(best[None]).returns) == pytest.approx(1)
-    robust = optimize(Peaks(), Settings("cmaes", 400 * 8 + 64, 20, hold=4, robust=Robust()))
+    robust = optimize(Peaks(), SearchSettings("cmaes", 400 * 8 + 64, 20, hold=4, robust=Robust()))
     worlds = Peaks().varied(64, 1.0, 10**9)
     # Starts are even in a cube of 2 cm each way, so that the mean of d^2 is 0.02^2 and that of exp(-d^2 / 0.06^2) at
     # least exp(-1/9), by convexity: 0.72 at the broad peak. Of the narrow one's 8 mm ball at half its height, volume
@@ -276,8 +276,11 @@ def test_a_robust_search_counts_every_copy_and_grows_its_worlds() -> None:
         ({"sigma": float("nan")}, "sigma is nan; expected a positive number."),
         ({"rate": 0.0}, "rate is 0.0; expected a positive number."),
         ({"chunk": 0}, "chunk is 0; expected at least 1."),
-        ({"surrogate_share": 0.5, "robust": Robust(2)}, "rehearsed is 0.5; expected 0 with robust."),
-        ({"surrogate_share": 1.0}, "rehearsed is 1.0; expected a share of the iterations from 0 up, less than 1."),
+        ({"surrogate_share": 0.5, "robust": Robust(2)}, "surrogate_share is 0.5; expected 0 with robust."),
+        (
+            {"surrogate_share": 1.0},
+            "surrogate_share is 1.0; expected a share of the iterations from 0 up, less than 1.",
+        ),
         (
             {"surrogate_share": 0.5, "method": "hybrid", "episodes": 32},
             "push: it has no surrogate task; set surrogate_share to 0.",
@@ -306,5 +309,5 @@ def test_problems_of_any_width_are_searched() -> None:
             return Evaluation(returns, -returns, 0 * returns, returns > -1e-6, returns.isnan())
 
     for method in METHODS:
-        found = optimize(Line(), Settings(method, episodes=400, population=4))
+        found = optimize(Line(), SearchSettings(method, episodes=400, population=4))
         assert float(found.actions) == pytest.approx(0.3, abs=1e-3), method

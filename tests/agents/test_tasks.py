@@ -32,7 +32,7 @@ class Lead(Task):
     horizon: int = 3
     name: ClassVar[str] = "lead"
     arms: ClassVar[Arms] = Arms(base=((-0.2, -0.45, 0.0),), vertex=(1,))
-    frames: ClassVar[int] = 2
+    frame_skip: ClassVar[int] = 2
     reset_noise: ClassVar[tuple[tuple[float, float], ...]] = ((0.02, 0.01),)
 
     def build(self, moved: Tensor) -> tuple[Scene, Params, State]:

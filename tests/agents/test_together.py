@@ -13,14 +13,14 @@ import torch
 from torch import Tensor
 
 from tests.agents.problems import Drag, Push, SurrogateRound, signature
-from torchdlo.agents.trajopt.batched_evaluation import together
+from torchdlo.agents.trajopt.batched_evaluation import evaluate_batched
 from torchdlo.agents.trajopt.problem import Evaluation, Problem
-from torchdlo.agents.trajopt.search import METHODS, Robust, Settings, optimize
+from torchdlo.agents.trajopt.search import METHODS, Robust, SearchSettings, optimize
 from torchdlo.errors import InputError
 
 pytestmark = pytest.mark.quick
 
-SETTINGS = Settings(episodes=48, population=8, hold=5, chunk=5)
+SETTINGS = SearchSettings(episodes=48, population=8, hold=5, chunk=5)
 ALL = [replace(SETTINGS, method=method, seed=seed) for method in METHODS for seed in (0, 1)]
 
 
@@ -40,13 +40,13 @@ class Counting(Push):
         return super().evaluate(actions)
 
 
-def searching(settings: Settings, **choices: Any) -> Any:
+def searching(settings: SearchSettings, **choices: Any) -> Any:
     return lambda shared: optimize(shared, settings, **choices)
 
 
 def test_searches_find_what_they_find_alone() -> None:
     problem = Counting()
-    found = together(problem, [searching(settings) for settings in ALL], room=30)
+    found = evaluate_batched(problem, [searching(settings) for settings in ALL], room=30)
     own = Counting()
     for each, settings in zip(found, ALL, strict=True):
         alone = optimize(own, settings)
@@ -59,10 +59,10 @@ def test_searches_find_what_they_find_alone() -> None:
 
 def test_rehearsals_are_shared_as_well() -> None:
     settings = [
-        Settings("hybrid", episodes=48, population=8, hold=5, seed=seed, surrogate_share=0.5) for seed in (0, 1)
+        SearchSettings("hybrid", episodes=48, population=8, hold=5, seed=seed, surrogate_share=0.5) for seed in (0, 1)
     ]
     problem = SurrogateRound()
-    found = together(problem, [searching(each) for each in settings], room=16)
+    found = evaluate_batched(problem, [searching(each) for each in settings], room=16)
     assert [played for played, _ in itertools.groupby(problem.played)] == ["surrogate", "earnest"]
     for each, alone in zip(found, settings, strict=True):
         assert signature(each.actions) == signature(optimize(SurrogateRound(), alone).actions)
@@ -77,7 +77,7 @@ def test_slopes_are_those_of_the_problem(kind: Any) -> None:
         x = x.clone().requires_grad_()
         return torch.autograd.grad((problem.evaluate(x).loss * torch.arange(len(x)).exp()).sum(), x)[0]
 
-    found = together(inner, [partial(gradient, x) for x in actions], room=5)
+    found = evaluate_batched(inner, [partial(gradient, x) for x in actions], room=5)
     for x, each in zip(actions, found, strict=True):
         # Rounding of a batch of another size grows through contact: the eighth digit differs between machines.
         torch.testing.assert_close(each, gradient(x, inner), rtol=1e-6, atol=1e-6)
@@ -87,7 +87,7 @@ def test_one_that_wants_no_slope_gets_none() -> None:
     actions = torch.zeros(2, 30, 3, dtype=torch.float64)
     searches = [lambda p: p.evaluate(actions), lambda p: p.evaluate(actions.clone().requires_grad_())]
     problem = Counting()
-    plain, with_gradient = together(problem, searches, room=5, with_gradient=3)
+    plain, with_gradient = evaluate_batched(problem, searches, room=5, with_gradient=3)
     assert not plain.loss.requires_grad and with_gradient.loss.requires_grad
     assert problem.sizes == [5, 3]
 
@@ -95,10 +95,10 @@ def test_one_that_wants_no_slope_gets_none() -> None:
 def test_searches_that_were_stopped_go_on(tmp_path: Path) -> None:
     def run(problem: Problem, resume: bool, **choices: Any) -> Any:
         searches = [searching(settings, journal=tmp_path / str(k), resume=resume) for k, settings in enumerate(ALL)]
-        return together(problem, searches, room=30, **choices)
+        return evaluate_batched(problem, searches, room=30, **choices)
 
     every = Counting()
-    whole = together(every, [searching(settings) for settings in ALL], room=30)
+    whole = evaluate_batched(every, [searching(settings) for settings in ALL], room=30)
     with pytest.raises(MemoryError):
         run(Counting(after=5), resume=False)
     with pytest.raises(KeyboardInterrupt):
@@ -127,15 +127,15 @@ def test_a_search_that_fails_is_told_and_the_others_end() -> None:
         ended.append(optimize(shared, SETTINGS))
 
     with pytest.raises(ValueError, match="lost"):
-        together(Push(), [wrong, right], room=8)
+        evaluate_batched(Push(), [wrong, right], room=8)
     assert len(ended) == 1 and ended[0].episodes == 48
 
 
 def test_robust_searches_are_refused() -> None:
     robust = replace(SETTINGS, robust=Robust(copies=2, finalists=1, trials=2))
     with pytest.raises(InputError, match="push: robust searches do not share batches"):
-        together(Push(), [searching(robust)], room=8)
+        evaluate_batched(Push(), [searching(robust)], room=8)
 
 
 def test_nothing_to_search_is_nothing() -> None:
-    assert together(Push(), [], room=8) == []
+    assert evaluate_batched(Push(), [], room=8) == []

@@ -22,7 +22,7 @@ def small(name: str, horizon: int = 2):
     """A task with short actions, settling and release."""
     task = TASKS[name]()
     return dataclasses.replace(
-        task, horizon=horizon, frames=FRAMES, settle_steps=min(task.settle_steps, 1), release=min(task.release, 1)
+        task, horizon=horizon, frame_skip=FRAMES, settle_steps=min(task.settle_steps, 1), release=min(task.release, 1)
     )
 
 
@@ -40,7 +40,7 @@ def stage_waypoints(task, count: int = 2) -> torch.Tensor:
     They are as much shorter than the limit as they take less time, so that tools are not faster than in a full action.
     """
     wave = torch.arange(2 * count * task.width, dtype=F64).reshape(2, count, task.width)
-    share = task.frames / type(task)().frames
+    share = task.frame_skip / type(task)().frame_skip
     return share * torch.sin(1 + wave) * torch.tensor(task.limit, dtype=F64)
 
 

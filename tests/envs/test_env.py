@@ -210,7 +210,7 @@ def test_arms_stand_still_without_a_way_by_hand():
 
 
 def test_tasks_can_be_changed_field_by_field():
-    short = dataclasses.replace(TASKS["coiling"](), horizon=7, frames=1)
+    short = dataclasses.replace(TASKS["coiling"](), horizon=7, frame_skip=1)
     assert envs.make(short, compiled=False).task.horizon == 7
     with pytest.raises(ValueError, match=r"take 96 actions of 0\.01 m; expected at most 7"):
         short.demonstration()

@@ -193,7 +193,7 @@ def test_hands_on_two_ropes_may_draw_apart():
 
         arms: ClassVar[Arms] = Arms(Side.arms.base[::2], (0, 7))
 
-    made = episode.prepare(Apart(frames=1), 1, like=torch.zeros((), dtype=F64), compiled=False)
+    made = episode.prepare(Apart(frame_skip=1), 1, like=torch.zeros((), dtype=F64), compiled=False)
     with torch.no_grad():
         after = episode.act(made, made.start, torch.zeros(1, 12, dtype=F64))
     assert made.start.notes["rest"].shape == (1, 0) and not after.failed.any()
@@ -203,7 +203,7 @@ def test_scores_are_0_for_doing_nothing_and_1_for_the_way_by_hand():
     task = small("coiling", 1)
     way = [[(0.004, -0.003, 0.006)]]
     led_ = type("Led", (type(task),), {"waypoints": lambda self: way, "__doc__": "A task with a way of its own."})
-    task = led_(horizon=1, frames=1)
+    task = led_(horizon=1, frame_skip=1)
     actions = torch.stack([torch.zeros(1, 6, dtype=F64), task.demonstration(), 0.5 * task.demonstration()])
     with torch.no_grad():
         returns = episode.play(task, actions, compiled=False).returns

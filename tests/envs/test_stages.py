@@ -25,7 +25,7 @@ class Passing(Task):
     """Take a rope by one vertex, then by another."""
 
     horizon: int = 8
-    frames: int = 2
+    frame_skip: int = 2
 
     name: ClassVar[str] = "passing"
     arms: ClassVar[Arms] = Arms(base=((0.0, -0.5, 0.0), (0.1, 0.5, 0.0)), vertex=(0, 5))

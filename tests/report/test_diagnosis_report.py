@@ -33,7 +33,7 @@ def rope() -> Recording:
 @pytest.fixture(scope="module")
 def page(rope: Recording, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The page of a diagnosis, in a file."""
-    result = fake_diagnosis(rope, health=[DataIssue("train_1", "swap", "markers 3 and 4 are swapped")])
+    result = fake_diagnosis(rope, data_issues=[DataIssue("train_1", "swap", "markers 3 and 4 are swapped")])
     return write_report(result, rope, tmp_path_factory.mktemp("page"), command="torchdlo diagnose 'a b'")
 
 

@@ -19,9 +19,9 @@ from torchdlo.scene_files import (
     Attachment,
     BodySpec,
     GridSpec,
+    HangingMass,
     Keyframe,
     ParticleBlockSpec,
-    PointMass,
     RopeSpec,
     SceneDescription,
 )
@@ -172,7 +172,9 @@ def test_stills_stand_side_by_side(drawing):
     frames = run(
         scene(
             ropes=(
-                RopeSpec(scene().ropes[0].points, vertices=5, mass=0.03, bend=1e-3, point_masses=(PointMass(-1, 0.1),)),
+                RopeSpec(
+                    scene().ropes[0].points, vertices=5, mass=0.03, bend=1e-3, hanging_masses=(HangingMass(-1, 0.1),)
+                ),
             )
         )
     )

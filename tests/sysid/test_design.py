@@ -32,7 +32,7 @@ from torchdlo.sysid.recordings.recording import Recording, Trial, save_recording
 S = np.array([0.0, 0.015, 0.06, 0.12, 0.18, 0.24, 0.3])
 GRIPPED = np.arange(len(S)) < 2
 NOISE = 5e-4
-OPTIONS = {"vertices": 21, "numerical_damping": 0.0, "grip": 0.0, "substep": 1e-2}
+OPTIONS = {"vertices": 21, "numerical_damping": 0.0, "clamp_fraction": 0.0, "substep": 1e-2}
 TRUTH = {
     "bending_stiffness": 5e-3,
     "twisting_stiffness": 4e-3,

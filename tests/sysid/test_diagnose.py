@@ -58,7 +58,7 @@ def make_recording(path: Path, effects: dict[str, float], noise: float = 2e-4, g
     gravity = np.array([0, 0, -9.81])
     empty = Recording(path, 0.6, 0.005, 0.03, gravity, None, noise, None, None, False, "", trials[:2], trials[2:])
     names = sorted({key.split(".")[0] for key in effects})
-    model = RopeModel(empty, vertices=61, effects=names, substep=2.5e-3, numerical_damping=0.0, grip=grip)
+    model = RopeModel(empty, vertices=61, effects=names, substep=2.5e-3, numerical_damping=0.0, clamp_fraction=grip)
     values = dict(zip(model.parameters, model.guess(), strict=True))
     values |= {"bending_stiffness": 2e-3, "twisting_stiffness": 1.5e-3, "damping_rate": 0.5} | effects
     start = Start(np.stack([t.markers[0] for t in trials]), np.zeros((3, len(S), 3)), np.ones(3, bool))
@@ -210,7 +210,7 @@ def test_what_a_clamp_may_be_in_which_the_rope_bends_moves_alike(tmp_path: Path)
     recording = make_recording(tmp_path, {})
     said, sims = [], []
     for grip, effects in ((0.0, ()), (1.0, ("gripper_compliance",))):
-        model = RopeModel(recording, vertices=31, effects=effects, grip=grip)
+        model = RopeModel(recording, vertices=31, effects=effects, clamp_fraction=grip)
         numbers = dict(zip(model.parameters, model.guess(), strict=True)) | {"bending_stiffness": 2e-3}
         # 1 cm of rope from the middle of the clamp to its end: 2e-3 / 0.01 N m/rad. The grippers do not twist the rope.
         numbers |= {"gripper_compliance.stiffness": 0.2} if effects else {}
@@ -221,7 +221,7 @@ def test_what_a_clamp_may_be_in_which_the_rope_bends_moves_alike(tmp_path: Path)
     assert ["0.2 N m/rad (gripper compliance)" in note for note in said[0]] == [True] and not said[1]
     np.testing.assert_allclose(sims[0], sims[1], atol=1e-6)
     assert not clamp_models.notes(
-        RopeModel(recording, vertices=31, grip=1.0), SimpleNamespace(effects=(), values=values)
+        RopeModel(recording, vertices=31, clamp_fraction=1.0), SimpleNamespace(effects=(), values=values)
     )
 
 

@@ -31,7 +31,7 @@ def rope() -> Recording:
 @pytest.fixture(scope="module")
 def found(rope: Recording) -> Diagnosis:
     """Air drag, or wind."""
-    return fake_diagnosis(rope, health=[DataIssue("train_1", "swap", "markers 3 and 4 are swapped")])
+    return fake_diagnosis(rope, data_issues=[DataIssue("train_1", "swap", "markers 3 and 4 are swapped")])
 
 
 def test_the_sentence_has_number_range_gap_and_doubt(rope: Recording, found: Diagnosis) -> None:
@@ -99,7 +99,7 @@ def test_findings_are_json_with_all_that_the_page_says(rope: Recording, found: D
     assert effect["indistinguishable_from"] == ["wind"] and effect["separating_experiments"]["wind"].startswith(
         "repeat"
     )
-    assert plain["health"] == [{"trial": "train_1", "kind": "swap", "said": "markers 3 and 4 are swapped"}]
+    assert plain["data_issues"] == [{"trial": "train_1", "kind": "swap", "message": "markers 3 and 4 are swapped"}]
     assert set(plain["gap"]) >= {"test_rmse_before_m", "test_rmse_after_m", "noise_floor_m", "per_trial"}
     assert any("10 ms behind" in s for s in plain["localisation"]["before"])
     assert plain["model"] == "model.json" and plain["verdict"] == "effects" and len(plain["recording_sha256"]) == 64

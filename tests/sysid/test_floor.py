@@ -18,7 +18,7 @@ from torchdlo.sysid.estimation.levenberg_marquardt import ParameterSpace, Point
 from torchdlo.sysid.estimation.worker_pool import Pool
 from torchdlo.sysid.recordings.recording import Recording, Trial
 
-OPTIONS = {"vertices": 33, "numerical_damping": 0.0, "grip": 0.0}
+OPTIONS = {"vertices": 33, "numerical_damping": 0.0, "clamp_fraction": 0.0}
 
 
 def carried(path: Path) -> Recording:

@@ -73,7 +73,7 @@ def test_a_jump_is_left_out(sound: dict[str, Recording], name: str) -> None:
 
     trials, faults = found(spoil(sound[name], lambda t: moved(t, jump)))
     assert [(f.trial, f.kind) for f in faults] == [("train_1", "jump")]
-    assert "marker 6 in frame 60" in faults[0].said and "marker 7 in frames 90 to 94" in faults[0].said
+    assert "marker 6 in frame 60" in faults[0].message and "marker 7 in frames 90 to 94" in faults[0].message
     lost = np.isnan(trials["train_1"].markers[..., 0]) & ~np.isnan(sound[name].train[1].markers[..., 0])
     assert lost.sum() == 6 and lost[60, 6] and lost[90:95, 7].all()
 
@@ -86,7 +86,7 @@ def test_swapped_markers_are_left_out(sound: dict[str, Recording], name: str, pa
 
     trials, faults = found(spoil(sound[name], lambda t: moved(t, swap)))
     assert [(f.trial, f.kind) for f in faults] == [("train_1", "swap")], faults
-    assert f"markers {pair[0]} and {pair[1]} are swapped in frames 50 to 79" in faults[0].said
+    assert f"markers {pair[0]} and {pair[1]} are swapped in frames 50 to 79" in faults[0].message
     lost = np.isnan(trials["train_1"].markers[..., 0]) & ~np.isnan(sound[name].train[1].markers[..., 0])
     assert lost.sum() == 60 and lost[50:80][:, pair].all()
 
@@ -97,7 +97,7 @@ def test_a_swap_that_lasts_is_taken_out_where_it_is_wrong(sound: dict[str, Recor
 
     trials, faults = found(spoil(sound["hanging"], lambda t: moved(t, swap)))
     # The rope's length tells that the longer part is the wrong one.
-    assert [f.kind for f in faults] == ["swap"] and "frames 50 to 249" in faults[0].said
+    assert [f.kind for f in faults] == ["swap"] and "frames 50 to 249" in faults[0].message
     assert np.isfinite(trials["train_1"].markers[:50]).all()
 
 
@@ -110,7 +110,7 @@ def test_a_camera_that_slips_ends_the_trial(sound: dict[str, Recording], name: s
 
     trials, faults = found(spoil(sound[name], lambda t: moved(t, slip)))
     assert [(f.trial, f.kind) for f in faults] == [("train_1", "camera")], faults
-    assert "(frame 120)" in faults[0].said
+    assert "(frame 120)" in faults[0].message
     assert trials["train_1"].suspect[120:].all() and not trials["train_1"].suspect[:120].any()
 
 
@@ -122,7 +122,7 @@ def test_missing_frames_are_told_from_a_slipped_camera(sound: dict[str, Recordin
 
     trials, faults = found(spoil(sound["hanging"], drop))
     assert [(f.trial, f.kind) for f in faults] == [("train_1", "clock")]
-    assert "about 3 frames are missing at 1.00 s (frame 100)" in faults[0].said
+    assert "about 3 frames are missing at 1.00 s (frame 100)" in faults[0].message
     assert trials["train_1"].suspect[100:150].all() and trials["train_1"].suspect.sum() == 50
 
 
@@ -142,7 +142,7 @@ def test_a_sliding_marker_is_named(sound: dict[str, Recording]) -> None:
         x[:, 7] += np.linspace(0, 0.3, len(x))[:, None] * way
 
     _, faults = found(spoil(sound["hanging"], lambda t: moved(t, slide)))
-    said = [f.said for f in faults if f.kind == "drift" and f.trial == "train_1"]
+    said = [f.message for f in faults if f.kind == "drift" and f.trial == "train_1"]
     assert any("markers 6 and 7 creep apart by 20 mm" in s for s in said), faults
     assert any("markers 7 and 8 creep together by 20 mm" in s for s in said), faults
 
@@ -155,7 +155,7 @@ def test_a_marker_in_the_wrong_place_is_named(sound: dict[str, Recording], name:
     size = 1e3 * (arclength[6] - wrong[6])
     _, faults = found(spoil(sound[name], lambda t: replace(t, marker_arclength=wrong), None))
     assert [f.kind for f in faults] == ["place"], faults
-    told = re.match(r"marker 6 sits (\d+) mm further along", faults[0].said)
+    told = re.match(r"marker 6 sits (\d+) mm further along", faults[0].message)
     # Noise, and markers in the package's recording that sit up to 1 mm off, leave some mm.
     assert abs(int(told[1]) - size) <= 1.5
 
@@ -167,7 +167,7 @@ def test_a_wrong_length_is_named(sound: dict[str, Recording], name: str, factor:
     _, faults = found(replace(rope, length=rope.length * factor))
     assert [f.kind for f in faults] == ["length"]
     # Bends and noise change lengths by less than a per cent.
-    told = re.match(r"markers are (\d+)% (further apart|closer together)", faults[0].said)
+    told = re.match(r"markers are (\d+)% (further apart|closer together)", faults[0].message)
     assert abs(int(told[1]) - 100 * abs(1 / factor - 1)) <= 1.5 and (told[2] == "further apart") == (factor < 1)
 
 

@@ -54,7 +54,7 @@ def test_a_rope_whose_markers_sit_beside_it_begins_there(rope: Recording) -> Non
 def test_hinges_at_clamps_are_as_long_for_every_law(rope: Recording) -> None:
     from torchdlo.physics.rod import kinematics as rod
 
-    model = RopeModel(rope, vertices=31, grip=1.0)
+    model = RopeModel(rope, vertices=31, clamp_fraction=1.0)
     scene, params, state = model.build(model.motion(rope.train), read(rope), np.repeat(model.guess()[None], 3, 0))
     lengths = rod.view(scene.topology, params.rods, state.rods, 1.0).hinge_length[..., 0].numpy()
     vertex = model.mesh.clamp_hinges[0]

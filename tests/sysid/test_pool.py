@@ -16,7 +16,7 @@ from torchdlo.sysid.estimation.levenberg_marquardt import ParameterSpace, Point
 from torchdlo.sysid.estimation.worker_pool import Pool
 from torchdlo.sysid.model import initial_state as starts
 
-OPTIONS = {"vertices": 17, "numerical_damping": 0.0, "grip": 0.0}
+OPTIONS = {"vertices": 17, "numerical_damping": 0.0, "clamp_fraction": 0.0}
 BASE = ("bending_stiffness", "damping_rate")
 
 

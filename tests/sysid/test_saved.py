@@ -44,17 +44,29 @@ def write(path: Path, model: RopeModel, values: np.ndarray) -> Path:
 def test_a_model_comes_back_and_predicts_the_same(
     recording: Recording, tmp_path: Path, rest: str, vertices: int
 ) -> None:
-    options = {"numerical_damping": 0.0, "grip": 0.3, "substep": 4e-3}
+    options = {"numerical_damping": 0.0, "clamp_fraction": 0.3, "substep": 4e-3}
     model = RopeModel(recording, vertices=vertices, rest=rest, effects=EFFECTS, **options)
     values = numbers(model)
     given = model_file.load(write(tmp_path / "model.json", model, values))
     again = given.model(recording)
     assert given.effects == EFFECTS and again.parameters == model.parameters and again.step == model.step
-    assert (again.rest, again.numerical_damping, again.grip) == (rest, 0.0, 0.3)
+    assert (again.rest, again.numerical_damping, again.clamp_fraction) == (rest, 0.0, 0.3)
     np.testing.assert_array_equal(again.arclength, model.arclength)
     np.testing.assert_array_equal(given.start(again), values)
     a, b = (evaluation.predict(m, recording.test[:1], values)["test_0"] for m in (model, again))
     np.testing.assert_array_equal(a, b)
+
+
+def test_a_file_of_version_2_is_read(recording: Recording, tmp_path: Path) -> None:
+    options = {"numerical_damping": 0.0, "clamp_fraction": 0.3, "substep": 4e-3}
+    model = RopeModel(recording, vertices=15, **options)
+    path = write(tmp_path / "model.json", model, numbers(model))
+    now = json.loads(path.read_text())
+    then = now["options"] | {"ahead": now["options"]["numerical_damping"], "grip": now["options"]["clamp_fraction"]}
+    del then["numerical_damping"], then["clamp_fraction"]
+    (tmp_path / "old.json").write_text(json.dumps(now | {"version": 2, "options": then}))
+    assert model_file.load(tmp_path / "old.json").options == model_file.load(path).options
+    assert model_file.load(path).options["clamp_fraction"] == 0.3
 
 
 def test_numbers_that_are_off_stay_off(recording: Recording, tmp_path: Path) -> None:
@@ -109,7 +121,7 @@ def edit(recording: Recording, tmp_path: Path) -> Callable[..., Path]:
     ("do", "message"),
     [
         (lambda c: c.pop("format"), r"expected a model file .*; it is another result of torchdlo: give the model.json"),
-        (lambda c: c.update(version=1), r"version: expected 2, found 1; write the model again"),
+        (lambda c: c.update(version=1), r"version: expected 3, found 1; write the model again"),
         (lambda c: c.pop("effects"), r"effects: expected an object, found none"),
         (lambda c: c.update(parameters=[1]), r"parameters: expected an object, found \[1\]"),
         (lambda c: c["parameters"].pop("damping_rate"), r"found no damping_rate"),
@@ -131,8 +143,8 @@ def edit(recording: Recording, tmp_path: Path) -> Callable[..., Path]:
         (lambda c: c["effects"]["wind"].update(c_d="high"), r"effects.wind.c_d: expected a number, found 'high'"),
         (lambda c: c["options"].update(rest="bent"), r"options.rest: expected straight or given, found 'bent'"),
         (lambda c: c["options"].update(substep=0), r"options.substep: expected a number of at least 1e-09, found 0"),
-        (lambda c: c["options"].pop("grip"), r"options.grip: expected this entry, found none"),
-        (lambda c: c["options"].update(grid=1), r"options: unknown name grid; did you mean grip\?"),
+        (lambda c: c["options"].pop("clamp_fraction"), r"options.clamp_fraction: expected this entry, found none"),
+        (lambda c: c["options"].update(clamp_fractions=1), r"did you mean clamp_fraction\?"),
     ],
 )
 def test_what_is_wrong_with_a_file_is_said(edit: Callable[..., Path], do: Callable[..., Any], message: str) -> None:

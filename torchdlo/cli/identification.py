@@ -154,8 +154,8 @@ def diagnose(
     page = report.write_report(result, loaded, out, command=shlex.join(["torchdlo", *sys.argv[1:]]))
     shutil.rmtree(journal, ignore_errors=True)
     typer.echo(summary(result, loaded), err=as_json)
-    for fault in result.health:
-        typer.echo(f"data: {fault.trial + ': ' if fault.trial else ''}{fault.said}", err=as_json)
+    for fault in result.data_issues:
+        typer.echo(f"data: {fault.trial + ': ' if fault.trial else ''}{fault.message}", err=as_json)
     typer.echo(f"findings: {out / 'findings.json'}\nreport:   {page}", err=as_json)
     if as_json:
         typer.echo(findings_json(result, loaded), nl=False)

@@ -60,7 +60,7 @@ def listing() -> list[dict[str, Any]]:
             "what": (kind.__doc__ or "").splitlines()[0],
             "arms": kind.arms.count,
             "actions": kind().horizon,
-            "seconds": 1e-3 * kind().frames,
+            "seconds": 1e-3 * kind().frame_skip,
         }
         for name, kind in TASKS.items()
     ]

@@ -25,7 +25,7 @@ from torchdlo.scene_files.schema import BodySpec, ParticleBlockSpec, RopeSpec, S
 __all__ = ["Simulation", "assemble", "build", "load"]
 
 _LAWS: dict[str, type[ConstitutiveModel]] = {law.name: law for law in (Elastic, Plastic, Liquid, Sand)}
-_OWN = ("points", "vertices", "model", "point_masses")
+_OWN = ("points", "vertices", "model", "hanging_masses")
 """Entries of a rope that are not fields of `scene.RopeSpec`."""
 _BODY_OWN = ("keyframes", "path", "file", "scale", "cells")
 """Entries of a body that are not fields of `RigidBody`."""
@@ -149,10 +149,10 @@ def _weights(d: SceneDescription, counts: list[int], like: Tensor) -> Tensor:
     """Return the masses that hang on vertices [kg], shape (V, 1)."""
     found = like.new_zeros(sum(counts), 1)
     for k, rope in enumerate(d.ropes):
-        for j, weight in enumerate(rope.point_masses):
+        for j, weight in enumerate(rope.hanging_masses):
             if weight.mass <= 0:
-                raise InputError(f"ropes[{k}].point_masses[{j}].mass: expected more than 0, given {weight.mass:g}.")
-            at = sum(counts[:k]) + _numbered(weight.vertex, counts[k], f"ropes[{k}].point_masses[{j}].vertex")
+                raise InputError(f"ropes[{k}].hanging_masses[{j}].mass: expected more than 0, given {weight.mass:g}.")
+            at = sum(counts[:k]) + _numbered(weight.vertex, counts[k], f"ropes[{k}].hanging_masses[{j}].vertex")
             found[at] += weight.mass
     return found
 

@@ -9,7 +9,7 @@ __all__ = ["OLDER", "upgraded"]
 OLDER = "torchdlo scene 1"
 """What the entry "format" of such a file says."""
 _SCENE = {"matter": "material_points", "holds": "attachments", "look": "camera_direction"}
-_PARTS = {"keys": "keyframes", "weights": "point_masses", "law": "constitutive_model", "numbers": "parameters"}
+_PARTS = {"keys": "keyframes", "weights": "hanging_masses", "law": "constitutive_model", "numbers": "parameters"}
 _EFFECTS = {"rod_matter": "rod_mpm_coupling", "body_matter": "body_mpm_coupling"}
 
 

@@ -9,9 +9,9 @@ __all__ = [
     "Attachment",
     "BodySpec",
     "GridSpec",
+    "HangingMass",
     "Keyframe",
     "ParticleBlockSpec",
-    "PointMass",
     "RobotSpec",
     "RopeSpec",
     "SceneDescription",
@@ -23,7 +23,7 @@ Wall = Literal["open", "separate", "slip", "stick"]
 
 
 @dataclass(frozen=True)
-class PointMass:
+class HangingMass:
     """A point mass that hangs on a rope; drawn as a ball of steel, which touches nothing."""
 
     vertex: int
@@ -53,7 +53,7 @@ class RopeSpec:
     rest: Literal["straight", "as_placed"] = "straight"
     model: str | None = None
     """Model file of `torchdlo calibrate` or `diagnose`, from which parameters and effects are taken."""
-    point_masses: tuple[PointMass, ...] = ()
+    hanging_masses: tuple[HangingMass, ...] = ()
     """What hangs on it."""
 
 

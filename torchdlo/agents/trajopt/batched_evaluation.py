@@ -1,6 +1,6 @@
 """Several searches of one problem that share their batches, as one of many episodes costs little more than one of few.
 
-Every search runs in a thread of its own and waits for what it asked for; the thread that calls `together` plays.
+Every search runs in a thread of its own and waits for what it asked for; the one that calls `evaluate_batched` plays.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ from torchdlo.agents.trajopt.problem import Evaluation, Problem
 from torchdlo.errors import InputError
 from torchdlo.physics import tree
 
-__all__ = ["together"]
+__all__ = ["evaluate_batched"]
 
 
-def together(
+def evaluate_batched(
     problem: Problem,
     searches: Sequence[Callable[[Problem], Any]],
     room: int,

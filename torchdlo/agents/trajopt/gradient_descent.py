@@ -7,7 +7,7 @@ import math
 
 import torch
 
-from torchdlo.agents.trajopt.proposals import Ask, Search, SearchPlan, walks
+from torchdlo.agents.trajopt.proposals import Ask, Search, SearchPlan, random_proposals
 
 __all__ = ["descent"]
 
@@ -20,7 +20,7 @@ def descent(plan: SearchPlan, rng: torch.Generator) -> Search:
     encoding, coarse = plan.encoding(1), plan.encoding(plan.hold)
 
     def fresh() -> torch.Tensor:
-        return encoding.project(coarse.decode(walks(plan, rng)).flatten(1))
+        return encoding.project(coarse.decode(random_proposals(plan, rng)).flatten(1))
 
     x = fresh()
     x[0] = 0

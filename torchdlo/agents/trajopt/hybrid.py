@@ -38,11 +38,11 @@ from torchdlo.agents.trajopt.proposals import (
     SurrogateRound,
     Told,
     best,
-    drags,
+    circular_proposals,
+    drag_proposals,
+    random_proposals,
     ranking,
-    rounds,
-    sweeps,
-    walks,
+    straight_proposals,
 )
 
 __all__ = ["hybrid"]
@@ -122,7 +122,7 @@ def _line(plan: SearchPlan, rng: torch.Generator, first: int = 0, about: Tensor 
     for k in itertools.count(first):
         if k in (first, plan.surrogates):
             # Nothing but the gradient there is wanted; what is played beside it are ways about it.
-            away = plan.encoding(plan.hold).decode(walks(plan, rng)).flatten(1)
+            away = plan.encoding(plan.hold).decode(random_proposals(plan, rng)).flatten(1)
             x = encoding.project(torch.cat([start[None], start + away[1:]]))
             told = yield Ask(encoding, x, 1, lambda told, _: torch.zeros(1, dtype=torch.long))
             line.clear()
@@ -260,14 +260,14 @@ def _beginnings(plan: SearchPlan, encoding: Encoding, rng: torch.Generator) -> T
 
     Half are rounds where there is something to touch; several tools drag what they hold over it in most others.
     """
-    x = sweeps(plan, encoding, rng)
-    x[1::2] = encoding.project(walks(plan, rng))[1::2]
+    x = straight_proposals(plan, encoding, rng)
+    x[1::2] = encoding.project(random_proposals(plan, rng))[1::2]
     if plan.touch:
         turn = torch.arange(len(x)) % 6
         if len(plan.tools) > 1:
             dragged = (turn == 1) | (turn == 2)
-            x[dragged] = drags(plan, encoding, rng, int(dragged.sum()))
-        x[turn > 2] = rounds(plan, encoding, rng, int((turn > 2).sum()))
+            x[dragged] = drag_proposals(plan, encoding, rng, int(dragged.sum()))
+        x[turn > 2] = circular_proposals(plan, encoding, rng, int((turn > 2).sum()))
     return x
 
 

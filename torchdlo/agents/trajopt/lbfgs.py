@@ -13,7 +13,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from torchdlo.agents.trajopt.proposals import SearchPlan, Told, ranking, walks
+from torchdlo.agents.trajopt.proposals import SearchPlan, Told, random_proposals, ranking
 
 __all__ = ["TRIES", "Descent"]
 
@@ -71,7 +71,9 @@ class Descent:
         # The first step is as long as Adam's: its largest component is the rate.
         unit = down / down.abs().amax(-1, keepdim=True).clamp(min=1e-300)
         tried = self.x[:, None] + self.lengths[..., None] * unit[:, None]
-        away = walks(self.plan, self.rng, tried[..., 0].numel()).unflatten(0, tried.shape[:2]) * factor[:, None]
+        away = (
+            random_proposals(self.plan, self.rng, tried[..., 0].numel()).unflatten(0, tried.shape[:2]) * factor[:, None]
+        )
         away = self.plan.encoding(self.plan.hold).decode(_NOISE * away.flatten(0, 1)).reshape(tried.shape)
         tried = torch.where(self.over[:, None, None], self.best[1] + away, tried)
         return self.encoding.project(tried.flatten(0, 1))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
-from torchdlo.agents.trajopt.search import Settings
+from torchdlo.agents.trajopt.search import SearchSettings
 
 __all__ = ["PUBLISHED", "preset"]
 
@@ -43,11 +43,11 @@ PUBLISHED = {
 `preset`."""
 
 
-def preset(task: str, method: str, **given: Any) -> Settings:
+def preset(task: str, method: str, **given: Any) -> SearchSettings:
     """Return the settings for a task and a method; what is given and not None wins."""
     episodes = given.get("episodes") or EPISODES.get(task, 20_000)
     copies = given["robust"].copies if given.get("robust") else 1
-    found = Settings(
+    found = SearchSettings(
         method=method,
         episodes=episodes,
         population=min(POPULATION.get(method, 400), max(_FEWEST.get(method, 20), episodes // (copies * _ITERATIONS))),

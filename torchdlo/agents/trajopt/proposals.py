@@ -14,8 +14,8 @@ from torch import Tensor
 
 from torchdlo.agents.trajopt.problem import Encoding, Problem
 
-__all__ = ["Ask", "Search", "SearchPlan", "SurrogateRound", "Told", "best", "drags", "handed"]
-__all__ += ["ranking", "rounds", "sweeps", "walks"]
+__all__ = ["Ask", "Search", "SearchPlan", "SurrogateRound", "Told", "best", "drag_proposals", "handed"]
+__all__ += ["circular_proposals", "random_proposals", "ranking", "straight_proposals"]
 
 _ALIKE = 1e-4
 """Share of the largest return by which returns differ that are not to be told apart."""
@@ -161,7 +161,7 @@ def handed(search: Search, plan: SearchPlan) -> Search:
             kept.note(ask.encoding.decode(ask.points).flatten(1), told)
 
 
-def walks(plan: SearchPlan, rng: torch.Generator, count: int | None = None) -> Tensor:
+def random_proposals(plan: SearchPlan, rng: torch.Generator, count: int | None = None) -> Tensor:
     """Return random way-points [m], shape (count, size), as CMA-ES would draw them at first; a population if not given.
 
     They may reach further than tools do.
@@ -170,7 +170,7 @@ def walks(plan: SearchPlan, rng: torch.Generator, count: int | None = None) -> T
     return plan.sigma * torch.randn(count or plan.population, size, generator=rng, dtype=torch.float64)
 
 
-def sweeps(plan: SearchPlan, encoding: Encoding, rng: torch.Generator) -> Tensor:
+def straight_proposals(plan: SearchPlan, encoding: Encoding, rng: torch.Generator) -> Tensor:
     """Return points of straight sweeps in one to three legs, shape (population, size).
 
     Independent displacements walk as far as the root of their number; sweeps go as far as possible, and so meet things
@@ -188,7 +188,7 @@ def sweeps(plan: SearchPlan, encoding: Encoding, rng: torch.Generator) -> Tensor
     return encoding.project(encoding.encode(torch.cat([torch.zeros_like(moves[:1]), moves[1:]])))
 
 
-def drags(plan: SearchPlan, encoding: Encoding, rng: torch.Generator, count: int) -> Tensor:
+def drag_proposals(plan: SearchPlan, encoding: Encoding, rng: torch.Generator, count: int) -> Tensor:
     """Return points of ways straight over a thing that can be touched, by tools that draw nearer, (count, size).
 
     What tools hold between them comes to lie about the things on its way, and is drawn together there. Ways have one to
@@ -219,7 +219,7 @@ def _targets(plan: SearchPlan) -> Tensor:
     return torch.cat([things, things.mean(0, keepdim=True)]) if len(things) > 1 else things
 
 
-def rounds(plan: SearchPlan, encoding: Encoding, rng: torch.Generator, count: int) -> Tensor:
+def circular_proposals(plan: SearchPlan, encoding: Encoding, rng: torch.Generator, count: int) -> Tensor:
     """Return points of ways straight to a circle about a thing that can be touched, and on along it, (count, size).
 
     Ropes are put round and over things, and drawn round them. Every fourth circle is upright, in line with the way to

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from torchdlo.agents.trajopt.problem import Evaluation, Problem
-from torchdlo.agents.trajopt.search import SearchResult, Settings
+from torchdlo.agents.trajopt.search import SearchResult, SearchSettings
 from torchdlo.agents.trajopt.search_journal import program, versions
 from torchdlo.errors import InputError
 
@@ -65,7 +65,7 @@ def summary(found: SearchResult, task: str) -> str:
     return f"{task}: return {value} after {found.episodes} episodes, {how}{stopped}{missed}"
 
 
-def result_json(found: SearchResult, problem: Problem, settings: Settings) -> str:
+def result_json(found: SearchResult, problem: Problem, settings: SearchSettings) -> str:
     """Return what was found as JSON; `seconds` alone differs between equal searches."""
     content = {
         "generator": "torchdlo optimize",

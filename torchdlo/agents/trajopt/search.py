@@ -20,7 +20,7 @@ from torchdlo.agents.trajopt.proposals import Ask, Search, SearchPlan, Told, han
 from torchdlo.agents.trajopt.search_journal import SearchJournal
 from torchdlo.errors import InputError
 
-__all__ = ["METHODS", "Robust", "SearchResult", "Settings", "optimize"]
+__all__ = ["METHODS", "Robust", "SearchResult", "SearchSettings", "optimize"]
 
 METHODS: dict[str, Callable[[SearchPlan, torch.Generator], Search]] = {"cmaes": cmaes, "gd": descent, "hybrid": hybrid}
 """Optimisers by name."""
@@ -60,7 +60,7 @@ class Robust:
 
 
 @dataclass(frozen=True)
-class Settings:
+class SearchSettings:
     """How to search; what is None follows from the problem, see `SearchPlan`."""
 
     method: str = "cmaes"
@@ -134,7 +134,7 @@ class SearchResult:
 
 def optimize(
     problem: Problem,
-    settings: Settings,
+    settings: SearchSettings,
     *,
     journal: Path | None = None,
     resume: bool = False,
@@ -222,7 +222,7 @@ def _alone(
     return found
 
 
-def _options(problem: Problem, settings: Settings) -> dict[str, Any]:
+def _options(problem: Problem, settings: SearchSettings) -> dict[str, Any]:
     sizes = {k: getattr(problem, k) for k in ("name", "horizon", "width", "group", "limit")}
     return sizes | problem.choices | asdict(settings)
 
@@ -284,7 +284,9 @@ class _Best:
 class _Player:
     """Plays batches, or reads how they went."""
 
-    def __init__(self, problem: Problem, settings: Settings, journal: SearchJournal, callback: Callback | None) -> None:
+    def __init__(
+        self, problem: Problem, settings: SearchSettings, journal: SearchJournal, callback: Callback | None
+    ) -> None:
         self.problem, self.settings, self.journal = problem, settings, journal
         self.callback = callback or (lambda *_: None)
         self.done, self.seconds, self.blind, self.max_return = 0, 0.0, 0, -math.inf

@@ -25,7 +25,7 @@ class Arms:
     """Where tools start and, in tasks without stages, what they hold: slots on the vertex axis of the scene."""
     quat: tuple[tuple[float, float, float, float], ...] = ()
     """Orientations of the tools at the start, straight down if not given."""
-    squeeze: float = math.inf
+    grip_force: float = math.inf
     """Force of each finger [N]. A hand loses the rope where holding it along its fingers takes more than friction of
     both can exert, 2 mu times this; infinite: never."""
     mu: float = 0.5

@@ -235,7 +235,7 @@ def limited(task: Task, action: Tensor) -> tuple[Tensor, Tensor]:
     way, turn = action.unflatten(-1, (2, task.arms.count, 3)).unbind(-3)
     far = safe_norm(way)
     way = way * torch.where(far > task.max_translation, task.max_translation / torch.where(far > 0, far, 1.0), 1.0)
-    return way, torch.deg2rad(turn.clamp(-task.twist, task.twist))
+    return way, torch.deg2rad(turn.clamp(-task.max_rotation, task.max_rotation))
 
 
 def _aim(task: Task, world: EpisodeState, action: Tensor) -> Pose:
@@ -261,7 +261,7 @@ def act(episode: Episode, world: EpisodeState, action: Tensor) -> EpisodeState:
     if len(task.schedule.stages) > 1:
         aim, held = _staged(episode, before, aim)
     found = _solve(task, aim, before.joints, FOLLOW)
-    state = run(episode, before, found.pose, held, task.frames)
+    state = run(episode, before, found.pose, held, task.frame_skip)
     held = tree.replace(held, closed=slipped(episode, state, found.pose, held.closed))
     after = EpisodeState(state, found.joints, found.handed, found.pose, held, world.notes, world.failed, world.count)
     return tree.replace(_judged(episode, world, after, lost), count=world.count + 1)

@@ -82,10 +82,10 @@ def run(episode: Episode, world: EpisodeState, tool: Pose, held: Grasp, count: i
 def slipped(episode: Episode, state: State, tool: Pose, closed: Tensor) -> Tensor:
     """Return how firmly hands still hold: those whose friction was not enough in the last frame are open."""
     task = episode.task
-    if math.isinf(task.arms.squeeze):
+    if math.isinf(task.arms.grip_force):
         return closed
     tool = repeated(tool, task.schedule.room)
     force, _ = grasp.felt(episode.scene, episode.hands, state, tool)
     normal = rotate(tool.quat, force.new_tensor([0.0, 1.0, 0.0]).expand_as(force))
     along = force - normal * (force * normal).sum(-1, keepdim=True)
-    return torch.where(safe_norm(along) > 2 * task.arms.mu * task.arms.squeeze, 0.0, closed)
+    return torch.where(safe_norm(along) > 2 * task.arms.mu * task.arms.grip_force, 0.0, closed)

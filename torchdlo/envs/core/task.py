@@ -79,7 +79,7 @@ class Task(ABC):
 
     horizon: int = 100
     """Actions in an episode."""
-    frames: int = 20
+    frame_skip: int = 20
     """Steps of the scene per action."""
     settle_steps: int = 0
     """Steps before the first action."""
@@ -97,7 +97,7 @@ class Task(ABC):
     """Height below which tools are not led [m]."""
     max_translation: ClassVar[float] = 0.01
     """Greatest way of a tool in an action [m]."""
-    twist: ClassVar[float] = 0.1
+    max_rotation: ClassVar[float] = 0.1
     """Greatest turn of a tool in an action about each of its axes [degrees]."""
     stretch: ClassVar[float] = math.inf
     """Length of the rope between the hands over that at the start, above which an episode has failed [1]."""
@@ -135,7 +135,7 @@ class Task(ABC):
     @property
     def limit(self) -> tuple[float, ...]:
         """Greatest magnitude of each component of an action."""
-        return (self.max_translation,) * (3 * self.arms.count) + (self.twist,) * (3 * self.arms.count)
+        return (self.max_translation,) * (3 * self.arms.count) + (self.max_rotation,) * (3 * self.arms.count)
 
     @abstractmethod
     def build(self, moved: Tensor) -> tuple[Scene, Params, State]:

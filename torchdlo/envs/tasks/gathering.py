@@ -48,7 +48,7 @@ class Gathering(Task):
     """Gather three objects with a rope."""
 
     name: ClassVar[str] = "gathering"
-    arms: ClassVar[Arms] = Arms(base=((-0.2, -0.63, 0.0), (0.5, -0.63, 0.0)), vertex=(1, 43), squeeze=10.0)
+    arms: ClassVar[Arms] = Arms(base=((-0.2, -0.63, 0.0), (0.5, -0.63, 0.0)), vertex=(1, 43), grip_force=10.0)
     combine: ClassVar[str] = "product"
     stretch: ClassVar[float] = 1.1
     reset_noise: ClassVar[tuple[tuple[float, float], ...]] = ((0.025, 0.0),) * 3
@@ -122,7 +122,7 @@ class Gathering(Task):
 
     def surrogate(self) -> GatheringSurrogate | None:
         """Return the task with rigid objects only."""
-        return GatheringSurrogate(self.horizon, self.frames, self.settle_steps, self.release, self.rope)
+        return GatheringSurrogate(self.horizon, self.frame_skip, self.settle_steps, self.release, self.rope)
 
     def waypoints(self) -> list[list[tuple[float, float, float]]]:
         """Return a way by which the hands draw the rope round the objects, until it is a narrow bow about them."""

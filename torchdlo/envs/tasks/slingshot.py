@@ -41,7 +41,7 @@ class Slingshot(Task):
     release: int = 200
 
     name: ClassVar[str] = "slingshot"
-    arms: ClassVar[Arms] = Arms(base=((-0.33, -0.65, 0.0),), vertex=(6,), squeeze=3.0)
+    arms: ClassVar[Arms] = Arms(base=((-0.33, -0.65, 0.0),), vertex=(6,), grip_force=3.0)
     cameras: ClassVar[tuple[TaskCamera, ...]] = (TaskCamera("front", (0.8, 0.55, 0.75), (0.1, 0.1, 0.18)),)
     reset_noise: ClassVar[tuple[tuple[float, float], ...]] = ((0.03, 0.0),)
 

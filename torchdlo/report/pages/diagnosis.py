@@ -210,7 +210,7 @@ def _floor(found: dict[str, Any]) -> str:
 
 
 def _health(found: dict[str, Any]) -> str:
-    faults = [f"{f['trial']}: {f['said']}" if f["trial"] else f["said"] for f in found["health"]]
+    faults = [f"{f['trial']}: {f['message']}" if f["trial"] else f["message"] for f in found["data_issues"]]
     return listed(faults or ["No fault found: labels, jumps, spacing, clock and frame are consistent."])
 
 

@@ -14,7 +14,7 @@ from torchdlo.sysid.diagnosis import effect_library
 from torchdlo.sysid.diagnosis.budget import Budget
 from torchdlo.sysid.diagnosis.candidate_fits import extended
 from torchdlo.sysid.diagnosis.error_floor import rms
-from torchdlo.sysid.diagnosis.score_test import screen
+from torchdlo.sysid.diagnosis.score_test import score_effects
 from torchdlo.sysid.diagnosis.workspace import SILENT, Callback, Workspace
 from torchdlo.sysid.estimation.jobs import Fitted
 from torchdlo.sysid.model.trial_batch import Start
@@ -152,7 +152,7 @@ class Revision:
     def _instead(self, fitted: Fitted, old: str, names: Sequence[str]) -> Fitted:
         """Return the best model with one of several effects in the place of another."""
         less, stage = self._without(fitted, old), f"in the place of {old}"
-        scores = screen(self.bench.pool, less, names, self.bench.starts["train"], lambda *_: None)
+        scores = score_effects(self.bench.pool, less, names, self.bench.starts["train"], lambda *_: None)
         kin = {n for group in effect_library.KIN if old in group for n in group}
         tried = [*scores[:_TRIED], *(s for s in scores[_TRIED:] if s.name in kin)]
         first, more = self.budget.iterations, self.budget.more

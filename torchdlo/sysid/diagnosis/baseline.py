@@ -89,7 +89,7 @@ def calibrate(bench: Workspace, count: int, iterations: int, rng: np.random.Gene
     # Phases of late times are right only after early ones are: the horizon grows. The order of the axes of its joints
     # gives a chain's length a sign.
     sides = [chain(np.append(best, length)[None], 4, 2 * frames // 3) for length in (link, -link)]
-    firm = [plain(best[None], 5, 2 * frames // 3, grip=1.0)] if model.mesh.clamps else []
+    firm = [plain(best[None], 5, 2 * frames // 3, clamp_fraction=1.0)] if model.mesh.clamps else []
     smooth, one, other, *held = fit([plain(best[None], 5, 2 * frames // 3), *sides, *firm], 2)
     side = min((one, other), key=lambda f: f.point.cost)
     bench.linked = side.point.cost < _LINKED * smooth.point.cost
@@ -133,7 +133,7 @@ def _held(bench: Workspace, firm: Fitted, smooth: Fitted, side: Fitted) -> tuple
     least = min(smooth.point.cost, side.point.cost)
     if firm.point.cost >= _BETTER * least:
         return smooth, side
-    bench.pool.choose(grip=1.0)
+    bench.pool.choose(clamp_fraction=1.0)
     return firm, _moved(side, firm)
 
 

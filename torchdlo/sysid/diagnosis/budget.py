@@ -55,7 +55,7 @@ def options(recording: Recording, vertices: int | None) -> dict[str, Any]:
         "vertices": vertices or _vertices(recording),
         "rest": "straight" if recording.rest_positions is None else "given",
         "numerical_damping": AHEAD if taut else _AHEAD,
-        "grip": 0.0,
+        "clamp_fraction": 0.0,
     }
 
 

@@ -25,7 +25,7 @@ _SHARES = (0.2, 0.5, 1.5)
 
 def loose(model: RopeModel) -> bool:
     """Return whether a model lets the rope bend between the markers of a clamp."""
-    return bool(model.mesh.clamps) and model.grip < 1
+    return bool(model.mesh.clamps) and model.clamp_fraction < 1
 
 
 def soft(bench: Workspace, base: Fitted) -> bool:
@@ -36,7 +36,7 @@ def soft(bench: Workspace, base: Fitted) -> bool:
 
 def firm(base: Fitted, job: FitJob) -> FitJob:
     """Return the job of fitting the model without, likewise with clamps that hold the rope up to their last marker."""
-    return replace(job, options=(*base.options, ("grip", 1.0)))
+    return replace(job, options=(*base.options, ("clamp_fraction", 1.0)))
 
 
 def notes(model: RopeModel, final: Fitted) -> list[str]:
@@ -44,7 +44,7 @@ def notes(model: RopeModel, final: Fitted) -> list[str]:
     if not loose(model) or NAME in final.effects:
         return []
     bend = final.values[model.parameters.index("bending_stiffness")]
-    spring = bend / (0.5 * (1 - model.grip) * _apart(model))
+    spring = bend / (0.5 * (1 - model.clamp_fraction) * _apart(model))
     return [
         "The rope seems to bend between the two markers of a clamp. A clamp that turns like a spring of "
         f"{spring:.2g} N m/rad ({NAME.replace('_', ' ')}) would look alike: to tell them apart, hold it close to the "

@@ -49,7 +49,7 @@ def findings(result: Diagnosis, recording: Recording) -> dict[str, Any]:
         "candidates": candidates,
         "baseline": {k: v for k, v in numbers.items() if "." not in k},
         "absorbed_by_calibration": absorbed(result),
-        "health": [dataclasses.asdict(fault) for fault in result.health],
+        "data_issues": [dataclasses.asdict(fault) for fault in result.data_issues],
         "options": result.options,
         "model": "model.json",
         "notes": result.notes,

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.signal import savgol_filter
 
-from torchdlo.sysid.diagnosis.residual_text import STATES, Residual, by_marker, describe
+from torchdlo.sysid.diagnosis.residual_text import STATES, Residual, by_marker, describe_residual
 from torchdlo.sysid.recordings.recording import Recording, Trial
 
 if TYPE_CHECKING:
@@ -133,14 +133,16 @@ def localise(
     parts = [_parts(each) for each in (before, after)]
     free = before[0].free
     tested = {t.name for t in recording.test}
+    effects_before = [(a.name, a.share_before, a.centres, a.before) for a in against]
+    effects_after = [(a.name, a.share_after, a.centres, a.after) for a in against]
     return Localisation(
         recording.test[0].time[: min(len(t.time) for t in recording.test)],
         recording.test[0].marker_arclength[free],
         *(_map([r for r in each if r.name in tested]) for each in (before, after)),
         against,
         *({name: share for name, (share, _) in part.items()} for part in parts),
-        describe(recording, before, [(a.name, a.share_before, a.centres, a.before) for a in against], parts[0], floor),
-        describe(recording, after, [(a.name, a.share_after, a.centres, a.after) for a in against], parts[1], floor),
+        describe_residual(recording, before, effects_before, parts[0], floor),
+        describe_residual(recording, after, effects_after, parts[1], floor),
     )
 
 

@@ -14,7 +14,7 @@ from torchdlo.sysid.recordings.recording import Recording, Trial
 if TYPE_CHECKING:
     from torchdlo.sysid.diagnosis.error_floor import ErrorFloor
 
-__all__ = ["STATES", "Residual", "by_marker", "describe"]
+__all__ = ["STATES", "Residual", "by_marker", "describe_residual"]
 
 STATES = {
     "place": ("place along the rope", "m"),
@@ -55,7 +55,7 @@ class Residual:
         return np.linalg.norm(self.error[:, self.free], axis=-1)
 
 
-def describe(
+def describe_residual(
     recording: Recording,
     found: Sequence[Residual],
     against: Sequence[tuple[str, float, np.ndarray, np.ndarray]],

@@ -65,7 +65,7 @@ def curvature_scale(markers: np.ndarray) -> float:
     return float(max(np.nanpercentile(angle, 95), 0.5))
 
 
-def screen(
+def score_effects(
     pool: Pool, base: Fitted, names: Sequence[str], start: Start, report: Callable[[int, int], None]
 ) -> list[Score]:
     """Return the scores of effects, best first.
@@ -100,13 +100,11 @@ def screen(
     own = sims_of[len(groups)]
     residual = pick(motion.markers) - pick(own[0])
     good = np.isfinite(residual) & np.isfinite(pick(own)).all(0)
-    frame_weights = (
-        1.0
-        if start.frame_weights is None
-        else pick(np.broadcast_to(start.frame_weights[..., None, None], motion.markers.shape))
-    )
-    size = np.nan_to_num(frame_weights * residual)
-    weight = np.where(good, frame_weights / (size**2 + _KNEE**2) ** 0.25, 0.0)
+    trust: np.ndarray | float = 1.0
+    if start.frame_weights is not None:
+        trust = pick(np.broadcast_to(start.frame_weights[..., None, None], motion.markers.shape))
+    size = np.nan_to_num(trust * residual)
+    weight = np.where(good, trust / (size**2 + _KNEE**2) ** 0.25, 0.0)
     residual = np.nan_to_num(residual) * weight
     jacobian = np.stack([np.nan_to_num(pick(sim - own[0])) * weight for sim in own[1:]], 1)
     q, r = np.linalg.qr(jacobian / nudge)

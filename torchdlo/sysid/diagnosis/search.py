@@ -21,7 +21,7 @@ from torchdlo.sysid.diagnosis.backward_elimination import EliminationResult, Rev
 from torchdlo.sysid.diagnosis.budget import BUDGETS, Budget
 from torchdlo.sysid.diagnosis.candidate_fits import extended, short, vector
 from torchdlo.sysid.diagnosis.error_floor import gap, rms
-from torchdlo.sysid.diagnosis.score_test import Score, screen
+from torchdlo.sysid.diagnosis.score_test import Score, score_effects
 from torchdlo.sysid.diagnosis.verdict import UNKNOWN_FLOOR, Candidate, Diagnosis, through, word
 from torchdlo.sysid.diagnosis.workspace import CHAIN, SILENT, Callback, Workspace
 from torchdlo.sysid.estimation.jobs import FitJob, Fitted
@@ -91,7 +91,7 @@ def diagnose(
     with Pool(recording, options, workers, kept) as pool:
         search = _Search(pool, BUDGETS[budget], np.random.default_rng(seed), report, without)
         found = search.run(given)
-    found.health, found.options = faults, {"budget": budget, "seed": seed, "vertices": options["vertices"]} | less
+    found.data_issues, found.options = faults, {"budget": budget, "seed": seed, "vertices": options["vertices"]} | less
     if len(recording.train) < whole:
         found.notes.append(f"{len(recording.train)} of the {whole} train trials were used, evenly picked.")
     found.seconds = time.perf_counter() - begun
@@ -185,7 +185,7 @@ class _Search:
         self, base: Fitted, names: Sequence[str], stage: str
     ) -> tuple[Fitted | None, Fitted, list[Candidate], list[str]]:
         """Return the model with the best effect added, if one pays, that without, all candidates, and equal ones."""
-        scores = screen(
+        scores = score_effects(
             self.pool,
             base,
             names,

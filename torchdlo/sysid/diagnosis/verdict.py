@@ -90,7 +90,7 @@ class Diagnosis:
     """Time that it took."""
     notes: list[str] = field(default_factory=list)
     """Sentences that a reader should know."""
-    health: list[DataIssue] = field(default_factory=list)
+    data_issues: list[DataIssue] = field(default_factory=list)
     """What is wrong with the data."""
     options: dict[str, Any] = field(default_factory=dict)
     """What was asked for."""

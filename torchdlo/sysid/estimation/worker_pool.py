@@ -61,7 +61,9 @@ class Pool:
         self.journal = journal
         self.recording, self.local = recording, Models(recording, options)
         # Named in every job, so that what was found with them is not mixed up with what others find later.
-        self._chosen = {name: options[name] for name in ("numerical_damping", "grip", "rest") if name in options}
+        self._chosen = {
+            name: options[name] for name in ("numerical_damping", "clamp_fraction", "rest") if name in options
+        }
         context = multiprocessing.get_context("spawn")
         # Each has a queue of its own: what was recorded for a model's steps is known to the process that did it.
         self._queues = [

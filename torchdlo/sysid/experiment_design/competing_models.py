@@ -14,7 +14,7 @@ from torchdlo.errors import InputError
 from torchdlo.sysid.diagnosis import baseline as baselines
 from torchdlo.sysid.diagnosis import budget as plan
 from torchdlo.sysid.diagnosis import effect_library
-from torchdlo.sysid.diagnosis.score_test import Score, screen
+from torchdlo.sysid.diagnosis.score_test import Score, score_effects
 from torchdlo.sysid.diagnosis.workspace import Callback, Workspace
 from torchdlo.sysid.estimation.jobs import FitJob, Fitted
 from torchdlo.sysid.estimation.result_cache import digest
@@ -30,7 +30,7 @@ def diagnosed(folder: Path, recording: Recording) -> tuple[list[list[str]], Mode
 
     Args:
         folder: what `torchdlo diagnose` wrote.
-        recording: without what cannot be trusted, see `health.check`.
+        recording: without what cannot be trusted, see `data_quality.check`.
 
     Raises:
         InputError: The folder is not one of a diagnosis, or one of another recording.
@@ -106,7 +106,7 @@ def fit_rivals(
         base = baselines.go_on(bench, _without(given, names), budget.more, report)
     start = bench.starts["train"]
     stage = "fitting the rivals"
-    scores = screen(bench.pool, base, names, start, lambda k, n: report(f"{stage}: doses", k, n, ""))
+    scores = score_effects(bench.pool, base, names, start, lambda k, n: report(f"{stage}: doses", k, n, ""))
     jobs = {s.name: _job(bench, base, s, budget.iterations) for s in scores}
     if given is not None:
         model = given.model(bench.recording, **bench.pool.local.options)

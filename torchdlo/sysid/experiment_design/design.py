@@ -390,7 +390,7 @@ def design_json(design: Design) -> str:
 
 def _option(option: Option) -> dict[str, Any]:
     return {
-        "said": called(option.gesture, option.amplitude, option.unit),
+        "message": called(option.gesture, option.amplitude, option.unit),
         "separation_estimate": option.estimate,
         "separation": option.confirmed,
         f"amplitude_{option.unit}": option.amplitude,

@@ -42,12 +42,13 @@ class Mesh:
             edge + 1 if marker == run[0] else edge for (edge, marker), run in zip(self.clamps, self.runs, strict=True)
         )
 
-    def clamp_shares(self, grip: float) -> np.ndarray:
+    def clamp_shares(self, clamp_fraction: float) -> np.ndarray:
         """Return what the hinges at clamps stand for, over what hinges between their edges do, shape (V,).
 
         A clamp's direction is that of the chord between its two markers next to the free rope. A rope that bends
-        between them has that direction in their middle (`grip` 0), one that is held stiffly up to the last of them
-        has it there (`grip` 1). The hinge stands for the rope from that point to the middle of the first free edge.
+        between them has that direction in their middle (`clamp_fraction` 0), one that is held stiffly up to the last of
+        them has it there (`clamp_fraction` 1). The hinge stands for the rope from that point to the middle of the first
+        free edge.
         """
         share, length = np.ones(len(self.arclength)), np.diff(self.arclength)
         for (edge, _), markers, vertex in zip(self.clamps, self.runs, self.clamp_hinges, strict=True):
@@ -58,7 +59,7 @@ class Mesh:
             gap = at[-1] - at[-2] if after else at[1] - at[0]
             free = length[vertex] if after else length[vertex - 1]
             whole = 0.5 * (length[vertex - 1] + length[vertex])
-            share[vertex] = (0.5 * gap * (1 - grip) + 0.5 * free) / whole
+            share[vertex] = (0.5 * gap * (1 - clamp_fraction) + 0.5 * free) / whole
         return share
 
     def along(self, markers: np.ndarray, known: np.ndarray) -> np.ndarray:

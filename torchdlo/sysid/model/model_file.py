@@ -1,4 +1,4 @@
-"""Model files: a rope with its fitted numbers and effects, as every command writes and reads it."""
+"""Model files: a rope with its fitted parameters and effects, as every command writes and reads it."""
 
 from __future__ import annotations
 
@@ -26,10 +26,13 @@ __all__ = ["FORMAT", "VERSION", "ModelFile", "content", "load"]
 FORMAT = "torchdlo-model"
 """What a model file says it is."""
 
-VERSION = 2
-"""Version of the format."""
+VERSION = 3
+"""Version of the format; files of version 2 are read, too."""
 
-_OPTIONS = {"vertices": int, "rest": str, "numerical_damping": float, "grip": float, "substep": float}
+_OLDER = {"ahead": "numerical_damping", "grip": "clamp_fraction"}
+"""Options of version 2 that are called otherwise today."""
+
+_OPTIONS = {"vertices": int, "rest": str, "numerical_damping": float, "clamp_fraction": float, "substep": float}
 """How the model is built, see `RopeModel`."""
 
 _BASELINE = ("bending_stiffness", "twisting_stiffness", "damping_rate")
@@ -44,7 +47,7 @@ class ModelFile:
     effects: tuple[str, ...]
     """Effects that it has besides the baseline."""
     values: dict[str, float]
-    """Its numbers, those of effects as `effect.number`."""
+    """Its parameters, those of effects as `effect.number`."""
     options: dict[str, Any]
     """How it is built, see `RopeModel`."""
 
@@ -105,7 +108,7 @@ def content(model: RopeModel, values: np.ndarray) -> dict[str, Any]:
             "vertices": _asked(model),
             "rest": model.rest,
             "numerical_damping": model.numerical_damping,
-            "grip": model.grip,
+            "clamp_fraction": model.clamp_fraction,
             "substep": model.dt / model.substeps,
         },
         "mesh": {"arclength": model.arclength, "marker_vertex": model.marker_vertex},
@@ -165,6 +168,9 @@ def _read(path: Path) -> dict[str, Any]:
         if isinstance(found, dict) and str(found.get("generator", "")).startswith("torchdlo"):
             hint = "; it is another result of torchdlo: give the model.json beside it"
         raise InputError(f'{path}: expected a model file ("format": "{FORMAT}"), found something else{hint}.')
+    if found.get("version") == 2 and isinstance(found.get("options"), dict):
+        options = {_OLDER.get(name, name): value for name, value in found["options"].items()}
+        return found | {"version": VERSION, "options": options}
     if found.get("version") != VERSION:
         raise InputError(
             f"{path}: version: expected {VERSION}, found {found.get('version')!r}; write the model again with this "

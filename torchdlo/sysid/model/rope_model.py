@@ -63,7 +63,7 @@ class RopeModel:
         effects: Sequence[str] = (),
         substep: float = MAX_SUBSTEP,
         numerical_damping: float = AHEAD,
-        grip: float = 1.0,
+        clamp_fraction: float = 1.0,
     ) -> None:
         """Prepare the model.
 
@@ -74,7 +74,7 @@ class RopeModel:
             effects: names of effects of the library to add to the baseline.
             substep: longest substep [s].
             ahead: see `torchdlo.scene.Scene`.
-            grip: where clamps hold the rope's direction, see `Mesh.clamp_shares`.
+            clamp_fraction: where clamps hold the rope's direction, see `Mesh.clamp_shares`.
         """
         trial = recording.train[0]
         self.recording, self.rest, self.effects = recording, rest, tuple(effects)
@@ -83,7 +83,7 @@ class RopeModel:
         self.arclength, self.marker_vertex = self.mesh.arclength, self.mesh.marker_vertex
         self.held, self.clamps = self.mesh.held, self.mesh.clamps
         self.gripped = np.flatnonzero(trial.gripped)
-        self.numerical_damping, self.grip = numerical_damping, grip
+        self.numerical_damping, self.clamp_fraction = numerical_damping, clamp_fraction
         for other in (*recording.train, *recording.test):
             same = np.array_equal(other.gripped, trial.gripped)
             if not same or not np.allclose(other.marker_arclength, trial.marker_arclength):
@@ -284,7 +284,7 @@ class RopeModel:
         extra = torch.zeros_like(mass)
         extra[torch.as_tensor(self.marker_vertex)] = self.recording.marker_mass or 0.0
         material = tree.replace(rods.material, mass=mass + extra)
-        share = torch.as_tensor(self.mesh.clamp_shares(self.grip)).unsqueeze(-1)
+        share = torch.as_tensor(self.mesh.clamp_shares(self.clamp_fraction)).unsqueeze(-1)
         rest = tree.replace(rods.rest, length=length, share=share)
         if "rest_share" in number:
             rest = tree.replace(rest, curvature=_turned(rods.rest.curvature, number))

@@ -42,7 +42,7 @@ class DataIssue:
     """Name of the trial, empty if it is about all."""
     kind: str
     """swap, jump, stall, clock, camera, cut, drift, length, place."""
-    said: str
+    message: str
     """What was found, and what was done about it."""
 
 
@@ -62,7 +62,8 @@ def check(recording: Recording) -> tuple[Recording, list[DataIssue]]:
         left = mended[trial.name].markers[~mended[trial.name].suspect][:, ~trial.gripped]
         if found and np.isfinite(left).all(-1).any(-1).sum() < 10:
             raise InputError(
-                f"{recording.path / trial.name}.npz: {found[0].said}; too little is left of this trial: leave it out."
+                f"{recording.path / trial.name}.npz: {found[0].message}; too little is left of this trial: "
+                "leave it out."
             )
     clean = replace(
         recording,
