@@ -20,6 +20,7 @@ EXPERIMENTS = Path(__file__).parents[1] / "experiments"
 SCRIPTS = [
     "baselines.py",
     "bench_contact.py",
+    "bench_render.py",
     "bench_coupled.py",
     "bench_gpu.py",
     "bench_env.py",
