@@ -6,10 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-__all__ = ["draw", "painted", "tube"]
+from torchdlo.vision.shading_reference import behind, dot, encoded, lit, painted, unit
+
+__all__ = ["draw", "tube"]
 
 NEAR, FAR, EDGE, BLOCK = np.float32(0.01), np.float32(-1e30), np.float32(-1e-6), 12
-PLAIN, WOOD, SPECKLED, CHECKED, WOVEN, TWISTED = range(6)
 _X = (-0.33, -0.84, -0.70, -0.20, 0.96, 0.47, 0.52, 0.19, 0.51, 0.90, -0.32, -0.05)
 _Y = (-0.41, -0.07, 0.46, 0.62, -0.19, -0.48, 0.77, -0.89, 0.06, 0.41, -0.93, 0.15)
 AROUND = np.stack([np.array(_X, np.float32), np.array(_Y, np.float32)], -1)
@@ -57,25 +58,6 @@ _MOVING = {
     "group_material",
     "light",
 }
-
-
-def _dot(a: Array, b: Array) -> Array:
-    return (a * b).sum(-1)
-
-
-def _unit(a: Array) -> Array:
-    size = _dot(a, a)[..., None]
-    up = np.array([0, 0, 1], np.float32)
-    return np.where(size > 1e-30, a / np.sqrt(np.where(size > 1e-30, size, 1)), up).astype(np.float32)
-
-
-def _mix(a: Array, b: Array, share: Array) -> Array:
-    return a + np.asarray(share, np.float32)[..., None] * (b - a)
-
-
-def _smooth(x: Array) -> Array:
-    x = np.clip(x, 0, 1)
-    return x * x * (3 - 2 * x)
 
 
 class _Camera:
@@ -153,11 +135,11 @@ def tube(x: Array, radius: Array, closed: bool, sides: int, parts: int) -> tuple
     before, after = np.concatenate([middle[:1], middle[:-1]]), np.concatenate([middle[1:], middle[-1:]])
     if closed:
         before[0], after[-1] = middle[-2], middle[1]
-    ahead = _unit(after - before)
+    ahead = unit(after - before)
     other = np.array([1, 0, 0] if abs(ahead[0, 0]) < 0.6 else [0, 1, 0], np.float32)
     side, v = np.empty_like(middle), other
     for k, tangent in enumerate(ahead):
-        side[k] = v = _unit(v - _dot(v, tangent) * tangent)
+        side[k] = v = unit(v - dot(v, tangent) * tangent)
     along = np.concatenate([[0], np.linalg.norm(np.diff(middle, axis=0), axis=1).cumsum()])
     gradient = np.zeros(len(middle))
     if not closed:
@@ -173,7 +155,7 @@ def tube(x: Array, radius: Array, closed: bool, sides: int, parts: int) -> tuple
     third = np.cross(ahead, side)
     away = np.cos(angle)[:, None] * side[:, None] + np.sin(angle)[:, None] * third[:, None]
     pos = middle[:, None] + r[:, None, None] * away
-    normal = _unit(away + gradient[:, None, None] * ahead[:, None])
+    normal = unit(away + gradient[:, None, None] * ahead[:, None])
     uv = np.stack(np.broadcast_arrays(np.arange(sides + 1) / sides, along[:, None]), -1)
     i, k = np.meshgrid(np.arange(len(middle) - 1), np.arange(sides), indexing="ij")
     p, q = i * (sides + 1) + k, (i + 1) * (sides + 1) + k
@@ -251,9 +233,9 @@ class _Shadow:
 
 
 def _shadow(scene: dict[str, Array], mesh: _Mesh, size: int) -> _Shadow | None:
-    ahead = -_unit(scene["light"][:3])
+    ahead = -unit(scene["light"][:3])
     other = np.array([0, 0, 1] if abs(ahead[2]) < 0.9 else [0, 1, 0], np.float32)
-    right = _unit(np.cross(ahead, other))
+    right = unit(np.cross(ahead, other))
     axes = np.stack([right, np.cross(right, ahead), ahead])
     used = mesh.pos[np.unique(mesh.face[mesh.casts])] @ axes.T
     points, radius = scene["particle_pos"] @ axes.T, scene["particle_radius"][:, None]
@@ -273,82 +255,6 @@ def _shadow(scene: dict[str, Array], mesh: _Mesh, size: int) -> _Shadow | None:
         inside = (x - cx) ** 2 + (y - cy) ** 2 <= (r * made.scale) ** 2
         near[inside] = np.maximum(near[inside], w)
     return made
-
-
-def _hashed(x: Array, y: Array, seed: Array) -> Array:
-    with np.errstate(over="ignore"):
-        x, y = x.astype(np.int64).astype(np.uint32), y.astype(np.int64).astype(np.uint32)
-        h = x * np.uint32(0x8DA6B343) ^ y * np.uint32(0xD8163841) ^ seed.astype(np.uint32) * np.uint32(0xCB1AB31F)
-        h ^= h >> np.uint32(13)
-        h *= np.uint32(0x5BD1E995)
-        h ^= h >> np.uint32(15)
-        h *= np.uint32(0x27D4EB2D)
-        h ^= h >> np.uint32(13)
-    return ((h >> np.uint32(8)) * (1 / 16777216)).astype(np.float32)
-
-
-def _noise(x: Array, y: Array, seed: Array) -> Array:
-    i, j = np.floor(x), np.floor(y)
-    s, t = _smooth(x - i), _smooth(y - j)
-    a, b, c, d = (_hashed(i + k % 2, j + k // 2, seed) for k in range(4))
-    return (1 - t) * ((1 - s) * a + s * b) + t * ((1 - s) * c + s * d)
-
-
-def _wave(x: Array) -> Array:
-    f = x - np.floor(x)
-    return _smooth(np.where(f < 0.5, 2 * f, 2 - 2 * f))
-
-
-def painted(m: Array, p: Array, uv: Array, blur: Array) -> Array:
-    """Return colours before light falls on them; materials (n, 12), points (n, 3)."""
-    one, two, kind, scale = m[:, :3], m[:, 3:6], m[:, 7].astype(int), m[:, 8]
-    sharp, seed = np.clip(1.5 - blur * scale, 0, 1), m[:, 11].astype(np.int64)
-    x, y = (m[:, 9] * p[:, 0] + m[:, 10] * p[:, 1]) * scale, (m[:, 9] * p[:, 1] - m[:, 10] * p[:, 0]) * scale
-    board = np.floor(y)
-    off = _hashed(board, np.full_like(board, 7), seed)
-    grain = _noise(0.6 * x + 9 * off, 9 * (y - board) + 37 * off, seed)
-    fine = _noise(3 * x + 5 * off, 40 * (y - board), seed + 1)
-    edge = np.minimum(y - board, board + 1 - y)
-    wood = 0.2 + 0.35 * off + 0.3 * grain + 0.25 * sharp * fine + sharp * 0.35 * np.clip(1 - edge / 0.025, 0, 1)
-    finest = sharp * _noise(11 * x, 11 * y, seed + 2) + (1 - sharp) * 0.5
-    speckled = 0.5 * _noise(x, y, seed) + 0.3 * _noise(3.1 * x, 3.1 * y, seed + 1) + 0.2 * finest
-    checked = (1 - sharp) * 0.5 + sharp * ((np.floor(x) + np.floor(y)).astype(int) & 1)
-    woven = 0.5 + sharp * (0.5 * (_wave(x) + _wave(y)) - 0.5) * 0.7 + 0.4 * (_noise(0.13 * x, 0.13 * y, seed) - 0.5)
-    share = np.select([kind == k for k in (WOOD, SPECKLED, CHECKED, WOVEN)], [wood, speckled, checked, woven], 0.0)
-    found = _mix(one, two, np.clip(share, 0, 1))
-    strands = _mix(one, two, _wave(uv[:, 0] * m[:, 9] + uv[:, 1] * scale))
-    twisted = _mix(_mix(one, two, np.full(len(m), 0.35)), strands, np.clip(1.3 - 0.7 * blur * scale, 0, 1))
-    return np.where((kind == TWISTED)[:, None], twisted, found)
-
-
-def _lit(light: Array, shadow: _Shadow | None, p: Array, n: Array, to_eye: Array, color: Array, gloss: Array) -> Array:
-    off = _dot(n, to_eye)[:, None]
-    n = np.where(off < 0, _unit(n - 1.02 * off * to_eye), n)
-    to_key, key, to_fill, fill = _unit(light[:3]), light[3:6], _unit(light[6:9]), light[9:12]
-    facing = _dot(n, to_key)
-    open_ = np.ones(len(p)) if shadow is None else shadow.lit(p, n, facing, float(light[28]))
-    direct = np.where(facing > 0, facing * open_, 0)[:, None]
-    aside = np.maximum(0, 0.75 * _dot(n, to_fill) + 0.25)[:, None]
-    around = _mix(light[15:18], light[12:15], 0.5 + 0.5 * n[:, 2])
-    shine = np.maximum(0, _dot(n, _unit(to_key + to_eye)))[:, None] ** 32
-    rim = (1 - np.maximum(0, _dot(n, to_eye)))[:, None] ** 4
-    bright = direct / np.maximum(facing, 0.2)[:, None] * shine * key + 0.3 * rim * light[12:15]
-    return color * (direct * key + aside * fill + around) + gloss[:, None] * bright
-
-
-def _behind(light: Array, eye: Array, ray: Array) -> Array:
-    wall = _mix(light[21:24], light[18:21], _smooth(0.5 + 1.2 * ray[:, 2]))
-    down = (ray[:, 2] < -1e-4) & (eye[2] > light[27])
-    away = (light[27] - eye[2]) / np.where(down, ray[:, 2], 1)
-    flat = np.hypot(ray[:, 0], ray[:, 1]) * away
-    return np.where(down[:, None], _mix(light[24:27], wall, _smooth(flat / light[29])), wall)
-
-
-def _encoded(x: Array) -> Array:
-    x = np.minimum(np.floor(np.maximum(x, 0) * 2048 + 0.5), 4096) / 4096 * 2
-    x = np.minimum(1, x * (1 + 0.15 * x) / (1 + 0.72 * x))
-    y = np.where(x > 0.0031308, 1.055 * x ** (1 / 2.4) - 0.055, 12.92 * x)
-    return np.clip(255 * y + 0.5, 0, 255).astype(np.uint8)
 
 
 def _picture(
@@ -409,7 +315,7 @@ def _picture(
             scene, mesh, camera, shadow, balls, number[..., k][at], xx + px, yy + py
         )
         done |= alike
-    out["rgb"][...] = _encoded(total / count)
+    out["rgb"][...] = encoded(total / count)
 
 
 def _clipped(triangle: Array) -> list[Array]:
@@ -454,32 +360,32 @@ def _color(
     ray = np.concatenate([(at - camera.middle) / camera.focal, np.ones((len(at), 1))], -1).astype(np.float32)
     found, pieces, light = np.empty((len(at), 3), np.float32), len(scene["piece_id"]), scene["light"]
     nothing, ball = number < 0, number >= len(mesh.face)
-    found[nothing] = _behind(light, camera.eye, _unit(ray[nothing] @ camera.turn))
+    found[nothing] = behind(light, camera.eye, unit(ray[nothing] @ camera.turn))
     if ball.any():
         k = number[ball] - len(mesh.face)
         c, r = balls[k], scene["particle_radius"][k][:, None]
         d = (ray[ball, :2] - c[:, :2] / c[:, 2:]) * c[:, 2:] / r
-        n = _unit(np.concatenate([d, -np.sqrt(1 - np.minimum(0.98, (d * d).sum(-1, keepdims=True)))], -1)) @ camera.turn
+        n = unit(np.concatenate([d, -np.sqrt(1 - np.minimum(0.98, (d * d).sum(-1, keepdims=True)))], -1)) @ camera.turn
         p = (c - camera.shift) @ camera.turn + r * n
         m = scene["group_material"][scene["particle_group"][k]]
-        found[ball] = _lit(light, shadow, p, n, _unit(camera.eye - p), m[:, :3], m[:, 6])
+        found[ball] = lit(light, shadow, p, n, unit(camera.eye - p), m[:, :3], m[:, 6])
     flat = ~nothing & ~ball
     if not flat.any():
         return found
     face, owner, ray = mesh.face[number[flat]], mesh.owner[number[flat]], ray[flat]
     a, b, c = (camera.local(mesh.pos[face[:, k]]) for k in range(3))
     h, q = np.cross(ray, c - a), np.cross(-a, b - a)
-    det = _dot(b - a, h)
+    det = dot(b - a, h)
     over = np.where(det != 0, 1 / np.where(det != 0, det, 1), 0)
-    u, v = np.clip(_dot(-a, h) * over, 0, 1), np.clip(_dot(ray, q) * over, 0, 1)
+    u, v = np.clip(dot(-a, h) * over, 0, 1), np.clip(dot(ray, q) * over, 0, 1)
     share = np.stack([1 - u - v, u, v], -1)
     share = np.where((u + v > 1)[:, None], np.stack([0 * u, u, v], -1) / np.maximum(u + v, 1e-9)[:, None], share)
     p, n, uv = ((share[..., None] * w[face]).sum(1) for w in (mesh.pos, mesh.normal, mesh.uv))
-    n, out = _unit(n), camera.eye - p
-    away = np.sqrt(_dot(out, out))
+    n, out = unit(n), camera.eye - p
+    away = np.sqrt(dot(out, out))
     to_eye = out / np.maximum(away, 1e-9)[:, None]
-    blur = away / camera.focal[0] / np.maximum(0.15, np.abs(_dot(n, to_eye)))
+    blur = away / camera.focal[0] / np.maximum(0.15, np.abs(dot(n, to_eye)))
     m = np.concatenate([scene["piece_material"], scene["rope_material"]])[owner]
     rope = (owner >= pieces)[:, None]
-    found[flat] = _lit(light, shadow, p, n, to_eye, painted(m, p, np.where(rope, uv, 0), blur), m[:, 6])
+    found[flat] = lit(light, shadow, p, n, to_eye, painted(m, p, np.where(rope, uv, 0), blur), m[:, 6])
     return found

@@ -20,7 +20,8 @@ from torchdlo.report.render.picture import ANGLE, camera_of
 from torchdlo.report.render.surfaces import COLORS, Piece, bounds, pieces, spacing
 from torchdlo.scene_files.run import Frames
 from torchdlo.vision.look import linear
-from torchdlo.vision.renderer_reference import painted, tube
+from torchdlo.vision.renderer_reference import tube
+from torchdlo.vision.shading_reference import painted
 from torchdlo.vision.surfaces import smoothed
 
 __all__ = ["Photo", "check_photo"]

@@ -24,8 +24,12 @@ ANGLE = 30.0
 """Opening of the camera, from top to bottom [deg]."""
 
 
-def check_renderer() -> Any:
-    """Return the renderer, or say what is missing for it."""
+def check_renderer(*, photo: bool = False) -> Any:
+    """Return the renderer, or say what is missing for it, or for photographs."""
+    if photo:
+        from torchdlo.report.photo import check_photo
+
+        return check_photo()
     try:
         import pyvista
         import vtk
