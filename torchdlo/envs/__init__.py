@@ -13,6 +13,7 @@ import torch
 
 from torchdlo.envs.assets.rope_material import RopeMaterial
 from torchdlo.envs.core.task import Task
+from torchdlo.envs.fidelity import PUBLISHED, Fidelity, parse_fidelity
 from torchdlo.envs.tasks.coiling import Coiling
 from torchdlo.envs.tasks.gathering import Gathering
 from torchdlo.envs.tasks.letter_art import LetterArt
@@ -41,7 +42,18 @@ TASKS: dict[str, type[Task]] = {
     "wrapping": Wrapping,
 }
 
-__all__ = ["TASKS", "RopeMaterial", "Task", "find", "listing", "make"]
+__all__ = [
+    "PUBLISHED",
+    "TASKS",
+    "Fidelity",
+    "RopeMaterial",
+    "Task",
+    "find",
+    "listing",
+    "make",
+    "parse_fidelity",
+    "simulated",
+]
 
 
 def find(name: str, rope: RopeMaterial | None = None) -> Task:
@@ -50,6 +62,12 @@ def find(name: str, rope: RopeMaterial | None = None) -> Task:
         raise InputError(f"there is no task {name!r}; expected one of {', '.join(sorted(TASKS))}.")
     task = TASKS[name]()
     return task if rope is None else dataclasses.replace(task, rope=rope)
+
+
+def simulated(task: Task, how: Fidelity | str) -> Task:
+    """Return a task in another fidelity; "coarse" is the task's cheaper one."""
+    chosen = (task.coarse if how == "coarse" else parse_fidelity(how)) if isinstance(how, str) else how
+    return dataclasses.replace(task, fidelity=chosen)
 
 
 def listing() -> list[dict[str, Any]]:
@@ -81,6 +99,7 @@ def make(
     randomize: Mapping[str, float] | None = None,
     rope: RopeMaterial | None = None,
     pixels: bool | Mapping[str, Any] = False,
+    fidelity: Fidelity | str | None = None,
 ) -> DloEnv:
     """Return a task as a TorchRL environment.
 
@@ -102,6 +121,8 @@ def make(
         pixels: whether observations have pictures, ("pixels", camera) uint8 (..., H, W, 3), or what else cameras give:
             {"size": 128, "cameras": ("front",), "samples": 4, "masks": True, "depth": True, "points": True,
             "looks": "random"}, see `observations.sensor`.
+        fidelity: how the task is simulated, if not as it says: a `Fidelity`, "published", "coarse" (the task's cheaper
+            one), or such as "1ms/2"; `env.task.fidelity` says which it is.
     """
     try:
         from torchdlo.envs.core.env import DloEnv
@@ -116,6 +137,8 @@ def make(
         raise InputError(f"task: it is {kind}; expected a name of `envs.TASKS` or an instance of a Task{mend}.")
     if rope is not None:
         chosen = dataclasses.replace(chosen, rope=rope)
+    if fidelity is not None:
+        chosen = simulated(chosen, fidelity)
     return DloEnv(
         chosen,
         num_envs=num_envs,

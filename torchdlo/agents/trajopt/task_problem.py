@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchdlo.agents.trajopt.problem import Evaluation
 from torchdlo.coupling.common import step_diagnostics
-from torchdlo.envs import RopeMaterial, find
+from torchdlo.envs import PUBLISHED, RopeMaterial, find
 from torchdlo.envs.core import episode
 from torchdlo.envs.core.task import Task
 from torchdlo.errors import InputError
@@ -93,7 +93,9 @@ class TaskProblem:
         """What else results depend on."""
         rope = {} if self.task.rope is None else {"rope": asdict(self.task.rope)}
         steps = {"compiled": self.compiled, "recorded": self.recorded and not self.compiled}
-        return {"double": self.double, **steps, "device": self.device} | rope
+        # Files from before it could be chosen are of the published one, and do not name it.
+        how = {} if self.task.fidelity == PUBLISHED else {"fidelity": self.task.fidelity.plain()}
+        return {"double": self.double, **steps, "device": self.device} | rope | how
 
     @property
     def like(self) -> Tensor:

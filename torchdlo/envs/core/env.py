@@ -55,13 +55,15 @@ class DloEnv(EnvBase):
         super().__init__(device=device or "cpu", batch_size=torch.Size([num_envs]))
         self.task, self.gradients, self.variation = task, gradients, variation
         self._like = torch.zeros((), dtype=dtype, device=self.device)
-        self._generator = torch.Generator()
+        self.generator = torch.Generator()
         self._randomize = dict(randomize or {})
         made = episodes.prepare(task, num_envs, like=self._like, compiled=compiled, recorded=recorded, segment=segment)
         _check(self._randomize, made.scene)
         self.episode, self.world, self._usual = made, made.start, made.params
         self._sensor = None if pixels is False else sensor_of(made, {} if pixels is True else pixels)
         self._looks, self._look_generator = (Look(),) * num_envs, torch.Generator()
+        self.moved = task.moved(num_envs, like=self._like, variation=False)
+        """How far things are off their places at the start [m], shape (num_envs, things, 3)."""
         self._make_specs()
         self.set_seed(seed)
 
@@ -76,6 +78,7 @@ class DloEnv(EnvBase):
         one = Unbounded((*shape, 1), device=device, dtype=torch.float32)
         self.observation_spec = Composite(
             observation=Unbounded((*shape, size), device=device, dtype=torch.float32),
+            progress=one.clone(),
             success=flag.clone(),
             terms=Composite({name: one.clone() for name in names}, shape=shape, device=device),
             **self._image_specs(),
@@ -103,7 +106,7 @@ class DloEnv(EnvBase):
     def _set_seed(self, seed: int | None) -> None:
         # Without a seed, torch's own generator decides, so that torch.manual_seed holds here too.
         chosen = int(torch.randint(2**31, (), device="cpu")) if seed is None else seed
-        self._generator.manual_seed(chosen)
+        self.generator.manual_seed(chosen)
         # Looks have random numbers of their own: starts are the same with and without pictures.
         self._look_generator.manual_seed(chosen)
 
@@ -133,6 +136,7 @@ class DloEnv(EnvBase):
         seen = self.world.seen(self.task.arms.count)
         return {
             "observation": episodes.observe(self.episode, self.world),
+            "progress": (self.world.count / self.task.horizon).float().unsqueeze(-1),
             "success": (self.task.success(seen) & ~self.world.failed).unsqueeze(-1),
             "terms": TensorDict({n: t.float().unsqueeze(-1) for n, t in terms.items()}, self.batch_size, self.device),
             **self._images(),
@@ -157,10 +161,9 @@ class DloEnv(EnvBase):
             if self._sensor is not None and self._sensor.random:
                 drawn = zip(self._looks, again.tolist(), strict=True)
                 self._looks = tuple(draw_look(self._look_generator) if new else look for look, new in drawn)
-            fresh = self._fresh()
         # Scenes that go on keep their gradient history.
         with torch.set_grad_enabled(self.gradients and torch.is_grad_enabled()):
-            self.world = fresh if bool(again.all()) else tree.where(again, fresh, self.world)
+            self.world = self._begun(again)
             terms = self.task.rewards(self.world.seen(self.task.arms.count))
             ended = torch.zeros(*self.batch_size, 1, dtype=torch.bool, device=self.device)
             flags = {name: ended.clone() for name in ("done", "terminated", "truncated")}
@@ -169,17 +172,28 @@ class DloEnv(EnvBase):
     def _draw(self, again: Tensor) -> None:
         """Draw the numbers of effects that are randomised, for the scenes that begin again."""
         if self._randomize:
-            drawn = drawn_effects(self._usual, self.episode.scene, self._randomize, self._generator, len(again))
+            drawn = drawn_effects(self._usual, self.episode.scene, self._randomize, self.generator, len(again))
             effects = tree.where(again, drawn, _wide(self.episode.params.effects, drawn))
             self.episode = dataclasses.replace(self.episode, params=tree.replace(self.episode.params, effects=effects))
 
-    def _fresh(self) -> EpisodeState:
-        """Return the worlds of new episodes."""
+    def _begun(self, again: Tensor) -> EpisodeState:
+        """Return the worlds, new ones where episodes begin again."""
         # Scenes settle with their own numbers.
         if not self.variation and not (self._randomize and self.task.settle_steps):
-            return self.episode.start
-        choices = {"like": self._like, "generator": self._generator, "variation": self.variation}
-        return episodes.begin(self.episode, self.task.start(len(self.world.count), **choices)[2])
+            return self.episode.start if bool(again.all()) else tree.where(again, self.episode.start, self.world)
+        choices = {"like": self._like, "generator": self.generator, "variation": self.variation}
+        rows = again.nonzero().squeeze(-1)
+        # Steps are made for one size of the batch, so that settling takes all scenes.
+        count = len(again) if self.task.settle_steps else len(rows)
+        with torch.no_grad():
+            moved = self.task.moved(count, **choices)
+            fresh = episodes.begin(self.episode, self.task.build(moved)[2])
+        self.moved = self.moved.index_copy(0, rows, moved[rows] if self.task.settle_steps else moved)
+        if bool(again.all()):
+            return fresh
+        if self.task.settle_steps:
+            return tree.where(again, fresh, self.world)
+        return tree.map(lambda old, new: old.index_copy(0, rows, new), self.world, fresh)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
         with torch.set_grad_enabled(self.gradients and torch.is_grad_enabled()):

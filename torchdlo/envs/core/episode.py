@@ -188,7 +188,7 @@ def _settled(episode: Episode, world: EpisodeState) -> EpisodeState:
     count = episode.task.settle_steps
     if not count:
         return world
-    state = run(episode, world, world.tool, world.grasp, count)
+    state = run(episode, world, world.tool, world.grasp, episode.task.fidelity.steps(count))
     return tree.replace(world, state=state)
 
 
@@ -261,7 +261,7 @@ def act(episode: Episode, world: EpisodeState, action: Tensor) -> EpisodeState:
     if len(task.schedule.stages) > 1:
         aim, held = _staged(episode, before, aim)
     found = _solve(task, aim, before.joints, FOLLOW)
-    state = run(episode, before, found.pose, held, task.frame_skip)
+    state = run(episode, before, found.pose, held, task.fidelity.steps(task.frame_skip))
     held = tree.replace(held, closed=slipped(episode, state, found.pose, held.closed))
     after = EpisodeState(state, found.joints, found.handed, found.pose, held, world.notes, world.failed, world.count)
     return tree.replace(_judged(episode, world, after, lost), count=world.count + 1)
@@ -300,7 +300,7 @@ def finish(episode: Episode, world: EpisodeState) -> EpisodeState:
     lost: list[Tensor] = []
     before = guarded(world, len(world.failed), lost)
     held = tree.replace(before.grasp, closed=torch.zeros_like(world.grasp.closed))
-    state = run(episode, before, before.tool, held, task.release)
+    state = run(episode, before, before.tool, held, task.fidelity.steps(task.release))
     return _judged(episode, world, tree.replace(before, state=state, grasp=held, notes=world.notes), lost)
 
 

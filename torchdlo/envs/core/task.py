@@ -24,6 +24,7 @@ from torchdlo.envs.assets.arms import DOWN, Arms
 from torchdlo.envs.assets.rope_material import RopeMaterial
 from torchdlo.envs.core import curve_geometry
 from torchdlo.envs.core.stages import Schedule, Stage
+from torchdlo.envs.fidelity import PUBLISHED, Fidelity
 from torchdlo.envs.observations.cameras import TaskCamera
 from torchdlo.errors import InputError
 from torchdlo.physics import tree
@@ -87,6 +88,8 @@ class Task(ABC):
     """Steps after the last action with open hands; the last reward is the one after them."""
     rope: RopeMaterial | None = None
     """What all ropes are made of, if not what the task says."""
+    fidelity: Fidelity = PUBLISHED
+    """How it is simulated; results are judged at the published fidelity."""
 
     name: ClassVar[str]
     """Its name in `envs.TASKS`."""
@@ -103,6 +106,8 @@ class Task(ABC):
     """Length of the rope between the hands over that at the start, above which an episode has failed [1]."""
     reset_noise: ClassVar[tuple[tuple[float, float], ...]] = ((0.0, 0.0),)
     """By how much each of the things that `build` can move is moved in x and in y at most [m]."""
+    coarse: ClassVar[Fidelity] = Fidelity(substeps=2)
+    """A cheaper fidelity that keeps what episodes earn, for training."""
     anchored: ClassVar[bool] = False
     """Whether scripted demonstrations lead to the same places wherever the rope starts, as what they lead to is
     fixed."""
@@ -120,6 +125,12 @@ class Task(ABC):
                 f"rope: it is {self.rope!r}; expected a torchdlo.envs.Cable; "
                 "torchdlo.scene_files.cable(path) makes one of a model file."
             )
+        if not isinstance(self.fidelity, Fidelity):
+            raise InputError(
+                f"fidelity: it is {self.fidelity!r}; expected a torchdlo.envs.Fidelity, such as Fidelity(substeps=2)."
+            )
+        for frames in (self.frame_skip, self.settle_steps, self.release):
+            self.fidelity.steps(frames)
 
     @property
     def schedule(self) -> Schedule:
@@ -195,13 +206,19 @@ class Task(ABC):
             generator: where random numbers come from.
             variation: whether starts differ from each other, by as much as `reset_noise` says.
         """
+        return self.build(self.moved(num, like=like, generator=generator, variation=variation))
+
+    def moved(
+        self, num: int, *, like: Tensor | None = None, generator: torch.Generator | None = None, variation: bool = True
+    ) -> Tensor:
+        """Return how far the things of `reset_noise` are off their places [m], shape (num, things, 3); see `start`."""
         like = torch.zeros(()) if like is None else like
         moved = like.new_zeros(num, len(self.reset_noise), 3)
-        if variation:
-            random = torch.rand(num, len(self.reset_noise), 2, generator=generator, dtype=torch.float64)
-            away = (2 * random - 1).to(like) * like.new_tensor(self.reset_noise)
-            moved = torch.cat([away, moved[..., 2:]], -1)
-        return self.build(moved)
+        if not variation:
+            return moved
+        random = torch.rand(num, len(self.reset_noise), 2, generator=generator, dtype=torch.float64)
+        away = (2 * random - 1).to(like) * like.new_tensor(self.reset_noise)
+        return torch.cat([away, moved[..., 2:]], -1)
 
     def demonstration(self, start: State | None = None) -> Tensor:
         """Return the actions that lead the tools along `stage_waypoints`, evenly, shape (horizon, width).
@@ -312,7 +329,7 @@ def make(
     held: Sequence[int] | None = None,
     burst: float = 1.0,
 ) -> tuple[Scene, Params, State]:
-    """Return a scene with what all tasks share: 1 ms in five substeps, gravity, damping, friction, a floor at z = 0.
+    """Return a scene with what all tasks share: its fidelity, gravity, damping, friction, a floor at z = 0.
 
     A scene without a plane among its solids has a table as its floor, which is cheaper. Velocities decay by 30 1/s and
     ropes do not resist twisting: ropes with free ends that are held at points do not twist, and those of tasks have no
@@ -358,10 +375,13 @@ def make(
         for name, given in task.rope.values.items():
             numbers[name] = numbers.get(name, {}) | given
     at = (*(task.schedule.held if held is None else held), *fixed)
-    choices = {"prescribed_vertices": at, "constrained": not elastic, "substeps": 5}
+    choices = {"prescribed_vertices": at, "constrained": not elastic}
+    choices |= {"dt": task.fidelity.step, "substeps": task.fidelity.substeps, "integrator": task.fidelity.integrator}
     try:
         return scenes.make(ropes, acting, numbers, bodies=solids, material_points=material_points, **choices)
     except ValueError as error:
+        if task.fidelity != PUBLISHED:
+            raise InputError(f"fidelity: {task.name} cannot be simulated by {task.fidelity.text}: {error}") from None
         if task.rope is None:
             raise
         raise InputError(f"rope: {task.name} steps by 0.2 ms and cannot take it: {error}") from None

@@ -122,7 +122,9 @@ class Gathering(Task):
 
     def surrogate(self) -> GatheringSurrogate | None:
         """Return the task with rigid objects only."""
-        return GatheringSurrogate(self.horizon, self.frame_skip, self.settle_steps, self.release, self.rope)
+        return GatheringSurrogate(
+            self.horizon, self.frame_skip, self.settle_steps, self.release, self.rope, self.fidelity
+        )
 
     def waypoints(self) -> list[list[tuple[float, float, float]]]:
         """Return a way by which the hands draw the rope round the objects, until it is a narrow bow about them."""

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from torchdlo.coupling.bodies.dynamics import RigidBody
 from torchdlo.envs.core.task import RADIUS, Arms, Task, TaskState, make, straight
+from torchdlo.envs.fidelity import Fidelity
 from torchdlo.envs.observations.cameras import TaskCamera
 from torchdlo.physics.linalg.numerics import safe_norm
 from torchdlo.scene import Params, Rope, Scene, State
@@ -43,6 +44,7 @@ class Slingshot(Task):
     name: ClassVar[str] = "slingshot"
     arms: ClassVar[Arms] = Arms(base=((-0.33, -0.65, 0.0),), vertex=(6,), grip_force=3.0)
     cameras: ClassVar[tuple[TaskCamera, ...]] = (TaskCamera("front", (0.8, 0.55, 0.75), (0.1, 0.1, 0.18)),)
+    coarse: ClassVar[Fidelity] = Fidelity(substeps=4)
     reset_noise: ClassVar[tuple[tuple[float, float], ...]] = ((0.03, 0.0),)
 
     def build(self, moved: Tensor) -> tuple[Scene, Params, State]:

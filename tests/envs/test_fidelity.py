@@ -1,0 +1,74 @@
+"""Fidelity: what it changes, what it must not change, and what it refuses."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from test_contract import small
+
+from torchdlo import envs
+from torchdlo.agents.trajopt.task_problem import TaskProblem
+from torchdlo.envs import PUBLISHED, TASKS, Fidelity, parse_fidelity, simulated
+from torchdlo.envs.core import episode
+from torchdlo.errors import InputError
+
+
+def test_the_published_fidelity_is_1_ms_in_5_explicit_substeps():
+    assert PUBLISHED == Fidelity(1e-3, 5, "explicit") == parse_fidelity("published")
+    assert envs.find("coiling").fidelity == PUBLISHED
+    scene, _, _ = envs.find("coiling").start(1)
+    assert (scene.dt, scene.substeps, scene.integrator) == (1e-3, 5, "explicit")
+
+
+@pytest.mark.parametrize("text", ["1ms/2", "2ms/1/implicit", "5ms/3"])
+def test_texts_and_fidelities_are_the_same(text: str):
+    assert parse_fidelity(text).text == text
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_the_cheaper_fidelity_of_every_task_is_stable_and_reaches_the_scene(name: str):
+    task = simulated(envs.find(name), "coarse")
+    scene, _, _ = task.start(1)
+    assert scene.substeps == task.coarse.substeps < PUBLISHED.substeps
+
+
+def test_an_action_takes_equally_long_in_steps_of_2_ms():
+    task = simulated(small("wiring_post", 2), "2ms/1/implicit")
+    world = episode.play(task, torch.zeros(1, 2, 6), compiled=False).world
+    # 2 actions of 20 ms.
+    torch.testing.assert_close(world.state.time.flatten(), torch.tensor([0.04]))
+
+
+def test_a_cheaper_fidelity_is_near_the_published_one():
+    actions = torch.zeros(1, 10, 6)
+    actions[..., 0], actions[..., 2] = 0.01, 0.005
+    ends = [
+        episode.play(simulated(small("wiring_post", 10), how), actions, compiled=False).world.state.rods.pos
+        for how in ("published", "1ms/2")
+    ]
+    # A tool went 10 cm; ropes differ by less than a hundredth of that, but do differ.
+    assert 0 < float((ends[0] - ends[1]).abs().max()) < 1e-3
+
+
+def test_environments_and_results_name_it():
+    env = envs.make(small("wiring_post", 2), compiled=False, fidelity="1ms/2")
+    assert env.task.fidelity.text == "1ms/2"
+    assert TaskProblem(env.task).choices["fidelity"] == {"step": 1e-3, "substeps": 2, "integrator": "explicit"}
+    assert "fidelity" not in TaskProblem(envs.find("wiring_post")).choices
+
+
+@pytest.mark.parametrize(
+    ("made", "said"),
+    [
+        (lambda: parse_fidelity("fast"), "it is 'fast'"),
+        (lambda: parse_fidelity("1ms/0"), "substeps is 0"),
+        (lambda: parse_fidelity("1ms/2/midpoint"), "integrator is 'midpoint'"),
+        (lambda: Fidelity(step=0.0015), "step is 0.0015"),
+        (lambda: simulated(envs.find("coiling"), Fidelity(3e-3)), "do not divide 20 ms"),
+        (lambda: simulated(envs.find("slingshot"), "1ms/2").start(1), "slingshot cannot be simulated by 1ms/2"),
+        (lambda: simulated(envs.find("lifting"), "2ms/1/implicit").start(1), "lifting cannot be simulated"),
+    ],
+)
+def test_what_is_wrong_is_said(made, said: str):
+    with pytest.raises(InputError, match=said):
+        made()
