@@ -44,6 +44,7 @@ __all__ = [
     "places",
     "play",
     "prepare",
+    "prepare_at",
 ]
 
 POSTURE = (1.56, -0.72, -0.02, -2.09, 0.04, 1.33, 2.4, 0.0)
@@ -214,7 +215,23 @@ def prepare(
         compiled: whether to compile steps; `recorded`: if not, whether to record them, see `scene.stepper`.
         segment: frames that gradients run again at once; None keeps all of them in memory.
     """
-    scene, params, state = task.start(num, like=like, generator=generator, variation=variation)
+    moved = task.moved(num, like=like, generator=generator, variation=variation)
+    return prepare_at(task, moved, compiled=compiled, recorded=recorded, segment=segment)
+
+
+def prepare_at(
+    task: Task, moved: Tensor, *, compiled: bool = True, recorded: bool = False, segment: int | None = None
+) -> Episode:
+    """Return an episode whose things are that far off their places at the start [m], shape (B, things, 3).
+
+    Args:
+        task: the task.
+        moved: see `Task.build`.
+        compiled: see `prepare`.
+        recorded: see `prepare`.
+        segment: see `prepare`.
+    """
+    scene, params, state = task.build(moved)
     hands = hands_of(task, scene)
     step = scenes.stepper(scene, compiled=compiled, recorded=recorded)
     world = _begin(task, scene, state, hands)

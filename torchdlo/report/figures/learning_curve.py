@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-__all__ = ["learning_png"]
+__all__ = ["learning_png", "training_png"]
 
 _COLORS = {"cmaes": "#3d348b", "gd": "#e09f3e", "hybrid": "#00798c"}
 _OTHER = "#1f2933"
@@ -55,3 +55,29 @@ def _draw(axes: Axes, method: str, curves: Sequence[Sequence[Mapping[str, Any]]]
         return
     median = np.array([np.nan if p["median"] is None else p["median"] for p in curves[0]])
     axes.plot(episodes, median, color=color, lw=1, ls=":", label="median of the population")
+
+
+def training_png(runs: Mapping[str, Sequence[Mapping[str, Any]]]) -> bytes:
+    """The picture of training as PNG: returns and shares of successes over episodes.
+
+    Args:
+        runs: by name, one entry per batch with `episodes`, `return`, `success` and `failed`.
+    """
+    figure = Figure(figsize=(10.8, 3.8), dpi=120, facecolor="white", layout="constrained")
+    FigureCanvasAgg(figure)
+    left, right = figure.subplots(1, 2)
+    for name, rows in runs.items():
+        episodes = [row["episodes"] for row in rows]
+        left.plot(episodes, [row["return"] for row in rows], lw=2, label=name)
+        (line,) = right.plot(episodes, [100 * row["success"] for row in rows], lw=2, label="success")
+        failed = [100 * row["failed"] for row in rows]
+        right.plot(episodes, failed, color=line.get_color(), lw=1, ls=":", label="failed")
+    left.set(xlabel="episodes", ylabel="mean return of a batch")
+    right.set(xlabel="episodes", ylabel="share of a batch [%]", ylim=(-2, 102))
+    for axes in (left, right):
+        axes.grid(alpha=0.3)
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.legend(frameon=False, fontsize=8)
+    content = io.BytesIO()
+    figure.savefig(content, format="png", metadata={"Software": "torchdlo"})
+    return content.getvalue()

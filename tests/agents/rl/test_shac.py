@@ -1,0 +1,92 @@
+"""Gradients of SHAC's actor: through the simulation, the policy's input and the critic."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+pytest.importorskip("torchrl")
+
+from springs import move, pusher, springs
+
+from torchdlo.agents.rl.rollout import progress
+from torchdlo.agents.rl.settings import preset
+from torchdlo.agents.rl.shac import Sapo, Shac, actor_loss
+
+F64 = torch.float64
+
+
+def trainer(kind=Shac, **choices):
+    torch.manual_seed(3)
+    settings = preset("", "shac", **({"count": 4, "episodes": 400, "window": 6, "tame": 0.0} | choices))
+    policy = pusher(state_sigma=kind is Sapo).double()
+    return kind(policy, settings), springs(4, 1, F64)
+
+
+def loss_of(made: Shac, episodes, seed: int = 5) -> torch.Tensor:
+    episodes.generator.manual_seed(7)
+    seen = episodes.reset()
+    torch.manual_seed(seed)
+    window, _ = made.play(episodes, seen, 0, torch.zeros(4, dtype=torch.bool))
+    value = made.bootstrap(window.features[-1])
+    return actor_loss(window, value, gamma=made.settings.gamma, temperature=made.temperature)
+
+
+@pytest.mark.parametrize("kind", [Shac, Sapo])
+def test_the_gradient_is_that_of_central_differences(kind):
+    made, episodes = trainer(kind)
+    made.critic.double()
+    made.target.double()
+    if kind is Sapo:
+        made.log_temperature.data.fill_(-1.0)
+    grads = torch.autograd.grad(loss_of(made, episodes), list(made.policy.parameters()), allow_unused=True)
+    rng = torch.Generator().manual_seed(0)
+    for p, g in zip(made.policy.parameters(), grads, strict=True):
+        away = torch.randn(p.shape, generator=rng, dtype=F64)
+        values = []
+        for sign in (1, -1):
+            with torch.no_grad():
+                p.add_(sign * 1e-5 * away)
+                values.append(float(loss_of(made, episodes)))
+                p.sub_(sign * 1e-5 * away)
+        numeric = (values[0] - values[1]) / 2e-5
+        assert float((g * away).sum()) == pytest.approx(numeric, rel=1e-4, abs=1e-9)
+
+
+def test_the_gradient_is_that_of_a_loop_by_hand():
+    made, episodes = trainer()
+    made.critic.double()
+    made.target.double()
+    params = list(made.policy.parameters())
+    found = torch.autograd.grad(loss_of(made, episodes), params)
+    episodes.generator.manual_seed(7)
+    x, v = (2 * torch.rand(4, 2, generator=episodes.generator, dtype=F64) - 1).unbind(-1)
+    torch.manual_seed(5)
+    policy, total = made.policy, 0.0
+    for k in range(6):
+        seen = torch.stack([x, v], -1)
+        loc, sigma = policy(policy.features(seen, progress(episodes, k, seen)))
+        u = (loc + sigma * torch.randn_like(loc)).tanh()[:, 0]
+        x, v = move(x, v, u)
+        total = total - made.settings.gamma**k * (x.square() + 0.1 * v.square())
+    seen = torch.stack([x, v], -1)
+    after = made.target[0](policy.features(seen, progress(episodes, 6, seen)))[:, 0]
+    loss = -(total + made.settings.gamma**6 * after).sum() / (6 * 4)
+    for a, b in zip(found, torch.autograd.grad(loss, params), strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-10, atol=1e-12)
+
+
+def test_wild_scenes_are_tamed_before_scenes_are_averaged():
+    """A gradient with respect to an action is no longer than `tame` / (window times batch)."""
+    made, episodes = trainer(tame=1e-3)
+    made.critic.double()
+    made.target.double()
+    plain, other = trainer()
+    plain.critic.load_state_dict(made.critic.state_dict())
+    plain.policy.load_state_dict(made.policy.state_dict())
+    plain.target.double()
+    params = list(made.policy.parameters())
+    small = torch.autograd.grad(loss_of(made, episodes), params)
+    large = torch.autograd.grad(loss_of(plain, other), list(plain.policy.parameters()))
+    assert sum(g.square().sum() for g in small) < 0.01 * sum(g.square().sum() for g in large)
+    assert float(torch.stack(made.lost).max()) > 0 == float(torch.stack(plain.lost).max())

@@ -1,0 +1,119 @@
+"""The loop: seeds, resuming bit by bit, what is left after Ctrl-C and after kill -9."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import torch
+
+pytest.importorskip("torchrl")
+
+from springs import pusher, springs
+
+from torchdlo.agents.policies import load
+from torchdlo.agents.rl.ppo import Ppo
+from torchdlo.agents.rl.sac import Sac
+from torchdlo.agents.rl.settings import preset
+from torchdlo.agents.rl.shac import Sapo, Shac
+from torchdlo.agents.rl.training import Trained, train
+from torchdlo.errors import InputError
+
+pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::FutureWarning")
+
+KINDS = {"ppo": Ppo, "sac": Sac, "shac": Shac, "sapo": Sapo}
+SMALL = {"count": 8, "batch": 64, "warm": 1, "replay": 1000, "passes": 2, "critic_passes": 2, "window": 10}
+
+
+def run(name: str, batches: int, folder: Path | None = None, **choices) -> Trained:
+    choices = dict(choices)
+    kept = {k: choices.pop(k) for k in ("resume", "callback") if k in choices}
+    torch.manual_seed(11)
+    settings = preset("", name, hidden=(16,), critic=(16,), episodes=8 * batches, **(SMALL | choices))
+    policy = pusher(hidden=(16,), state_sigma=name in ("sac", "sapo"))
+    return train(KINDS[name](policy, settings), springs(8), settings, folder=folder, **kept)
+
+
+def bits(found: Trained) -> list:
+    rows = [{k: v for k, v in row.items() if k != "seconds"} for row in found.rows]
+    return [rows, found.best, {k: v.tolist() for k, v in found.policy.state_dict().items()}]
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_the_same_seed_gives_the_same_bits_and_another_does_not(name: str):
+    assert bits(run(name, 3)) == bits(run(name, 3))
+    assert bits(run(name, 3)) != bits(run(name, 3, seed=1))
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_a_run_that_was_resumed_ends_as_if_never_stopped(name: str, tmp_path: Path):
+    run(name, 2, tmp_path)
+    assert bits(run(name, 5, tmp_path, resume=True)) == bits(run(name, 5))
+
+
+def test_training_leaves_torchs_generator_as_it_was():
+    torch.manual_seed(1)
+    before = torch.get_rng_state()
+    settings = preset("", "ppo", hidden=(16,), critic=(16,), episodes=8, **SMALL)
+    trainer = Ppo(pusher(hidden=(16,)), settings)
+    torch.set_rng_state(before)
+    train(trainer, springs(8), settings)
+    assert torch.equal(torch.get_rng_state(), before)
+
+
+def test_ctrl_c_keeps_the_best(tmp_path: Path):
+    def stop(stage: str, done: int, total: int, message: str) -> None:
+        if done >= 16:
+            raise KeyboardInterrupt
+
+    found = run("ppo", 100, tmp_path, callback=stop)
+    assert found.interrupted
+    assert found.episodes == 16
+    kept = load(tmp_path / "policy.pt")
+    assert all(torch.equal(a, b) for a, b in zip(kept.parameters(), found.policy.parameters(), strict=True))
+    log = (tmp_path / "log.csv").read_text().splitlines()
+    assert len(log) == 3
+    assert log[0].startswith("episodes,seconds,return,success,failed")
+
+
+def test_other_settings_are_refused_by_what_differs(tmp_path: Path):
+    run("ppo", 1, tmp_path)
+    with pytest.raises(InputError, match=r"clip 0.2 \(now 0.1\)"):
+        run("ppo", 2, tmp_path, resume=True, clip=0.1)
+    with pytest.raises(InputError, match="found none"):
+        run("ppo", 2, tmp_path / "other", resume=True)
+
+
+def test_minutes_are_a_budget_too():
+    assert run("ppo", 1000, minutes=1e-9).episodes == 8
+
+
+def test_a_killed_run_loses_one_interval_at_most(tmp_path: Path):
+    here = Path(__file__)
+    code = (
+        f"import sys; sys.path[:0] = [{str(here.parent)!r}]\n"
+        "import torch; torch.set_num_threads(1)\n"
+        "import pathlib, test_training as t\n"
+        f"t.run('ppo', 100000, pathlib.Path({str(tmp_path)!r}), interval=0.0)\n"
+    )
+    process = subprocess.Popen([sys.executable, "-W", "ignore", "-c", code], env=os.environ | {"OMP_NUM_THREADS": "1"})
+    checkpoint, end = tmp_path / "checkpoint.pt", time.monotonic() + 120
+    while not checkpoint.exists() and time.monotonic() < end:
+        time.sleep(0.05)
+    time.sleep(0.5)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    done = torch.load(checkpoint, weights_only=True)["episodes"]
+    assert done >= 8
+    batches = done // 8 + 2
+    assert bits(run("ppo", batches, tmp_path, resume=True, interval=0.0)) == bits(run("ppo", batches, interval=0.0))
+
+
+def test_interval_and_budget_may_change_on_resuming(tmp_path: Path):
+    run("ppo", 1, tmp_path)
+    assert run("ppo", 2, tmp_path, resume=True, interval=5.0).episodes == 16

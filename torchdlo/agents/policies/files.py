@@ -1,0 +1,81 @@
+"""Policies as files: plain data and tensors, without code, and as modules of TorchRL."""
+
+from __future__ import annotations
+
+import io
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from torchdlo.agents.policies.policy import Policy, PolicySpec
+from torchdlo.errors import InputError
+from torchdlo.files import write_atomically
+
+__all__ = ["load", "module", "save"]
+
+_GENERATOR = "torchdlo train"
+
+
+def save(policy: Policy, path: Path, notes: dict[str, Any] | None = None) -> None:
+    """Write a policy, and plain data about it, to one file."""
+    content = {
+        "generator": _GENERATOR,
+        "spec": policy.spec.plain(),
+        "state": {k: v.detach().cpu().clone() for k, v in policy.state_dict().items()},
+        "notes": notes or {},
+    }
+    written = io.BytesIO()
+    torch.save(content, written)
+    write_atomically(path, written.getvalue())
+
+
+def load(path: Path | str, notes: bool = False) -> Any:
+    """Return the policy of a file, or (policy, plain data about it)."""
+    path = Path(path)
+    wrong = InputError(f"{path}: expected a policy of torchdlo train, found something else.")
+    if path.is_dir():
+        path = path / "policy.pt"
+    try:
+        content = torch.load(path, weights_only=True)
+        if content["generator"] != _GENERATOR:
+            raise wrong
+        policy = Policy(PolicySpec.of(content["spec"]))
+        policy.load_state_dict(content["state"])
+    except FileNotFoundError:
+        raise InputError(f"{path}: there is no such file; expected a policy of torchdlo train.") from None
+    except (OSError, KeyError, TypeError, ValueError, RuntimeError, EOFError, zipfile.BadZipFile) as error:
+        if isinstance(error, InputError):
+            raise
+        raise wrong from None
+    except Exception as error:  # what torch's reader of plain data refuses, it names by an error of its own
+        if type(error).__name__ != "UnpicklingError":
+            raise
+        raise wrong from None
+    policy.eval()
+    return (policy, content["notes"]) if notes else policy
+
+
+def module(policy: Policy) -> Any:
+    """Return a policy as a TensorDictModule from "observation" and "progress" to "action".
+
+    It draws actions at random where TorchRL's exploration type is RANDOM, and takes their middle otherwise.
+    """
+    from tensordict.nn import TensorDictModule
+    from torchrl.envs.utils import ExplorationType, exploration_type
+
+    def act(observation: torch.Tensor, progress: torch.Tensor) -> torch.Tensor:
+        features = policy.features(observation, progress)
+        random = exploration_type() == ExplorationType.RANDOM
+        return policy.command(policy.draw(features)[0] if random else policy.mean(features))
+
+    class _Acts(torch.nn.Module):
+        def __init__(self) -> None:
+            super().__init__()
+            self.policy = policy
+
+        def forward(self, observation: torch.Tensor, progress: torch.Tensor) -> torch.Tensor:
+            return act(observation, progress)
+
+    return TensorDictModule(_Acts(), in_keys=["observation", "progress"], out_keys=["action"])

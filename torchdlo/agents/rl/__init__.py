@@ -1,0 +1,1 @@
+"""Reinforcement learning: trainers, their loop, and policies made out of trajectories."""

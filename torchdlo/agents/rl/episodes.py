@@ -1,0 +1,175 @@
+"""Episodes in batches, all of the same length and in step: what every trainer here plays.
+
+An episode that fails goes on without earning, so that batches stay in step; what comes after is not learned from. The
+end of the time is an end: the share of the episode that is over is part of what policies see, so that there is nothing
+to bootstrap there.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import torch
+from torch import Tensor
+
+from torchdlo.envs import Task
+
+__all__ = ["EnvEpisodes", "Episodes", "Step", "TaskEpisodes"]
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """What an action led to."""
+
+    observation: Tensor
+    """Shape (N, O)."""
+    reward: Tensor
+    """Shape (N,); 0 for episodes that failed."""
+    failed: Tensor
+    """Whether episodes have failed, bool, shape (N,)."""
+    success: Tensor
+    """Whether the goal is reached now, bool, shape (N,)."""
+
+
+class Episodes(Protocol):
+    """A batch of episodes that are played in step."""
+
+    count: int
+    """Episodes in the batch, N."""
+    horizon: int
+    """Actions of an episode, T."""
+    generator: torch.Generator
+    """Where starts come from."""
+
+    def reset(self) -> Tensor:
+        """Begin anew; return observations (N, O)."""
+
+    def step(self, action: Tensor) -> Step:
+        """Do actions (N, A) of the environment."""
+
+    def detach(self) -> None:
+        """Cut the history of gradients."""
+
+
+class EnvEpisodes:
+    """Episodes of any TorchRL environment with one axis of the batch, of which `keys` are seen."""
+
+    def __init__(self, env: Any, horizon: int, keys: tuple[str, ...] = ("observation",)) -> None:
+        """Wrap an environment, which keeps its random numbers in `env.generator`."""
+        self.env, self.horizon, self.keys = env, horizon, keys
+        self.count = env.batch_size[0]
+        self.generator: torch.Generator = env.generator
+        self._td: Any = None
+        self._failed = torch.zeros(self.count, dtype=torch.bool)
+
+    def _seen(self, td: Any) -> Tensor:
+        return torch.cat([td.get(key).reshape(self.count, -1) for key in self.keys], -1)
+
+    def reset(self) -> Tensor:
+        """Begin anew; return observations (N, O)."""
+        self._td = self.env.reset()
+        self._failed = torch.zeros(self.count, dtype=torch.bool)
+        return self._seen(self._td)
+
+    def step(self, action: Tensor) -> Step:
+        """Do actions (N, A)."""
+        from torchrl.envs.utils import step_mdp
+
+        td = self.env.step(self._td.set("action", action))
+        after = td.get("next")
+        self._td = step_mdp(td)
+        before = self._failed
+        self._failed = before | after.get("terminated").reshape(self.count)
+        reward = torch.where(before, 0.0, after.get("reward").reshape(self.count))
+        success = after.get("success", None)
+        success = torch.zeros_like(before) if success is None else success.reshape(self.count)
+        return Step(self._seen(after), reward, self._failed, success)
+
+    def detach(self) -> None:
+        """Cut the history of gradients."""
+        self._td = self._td.detach()
+        if hasattr(self.env, "detach"):
+            self.env.detach()
+
+
+class TaskEpisodes:
+    """Episodes of a task."""
+
+    def __init__(
+        self,
+        task: Task,
+        count: int,
+        *,
+        seed: int = 0,
+        variation: bool = True,
+        gradients: bool = False,
+        compiled: bool = False,
+        dtype: torch.dtype = torch.float32,
+        ends: bool = True,
+        scale: float = 1.0,
+        bonus: float = 0.0,
+        randomize: dict[str, float] | None = None,
+    ) -> None:
+        """Make the scenes.
+
+        Args:
+            task: the task, in the fidelity in which it is to be played.
+            count: episodes in the batch.
+            seed: of the starts.
+            variation: whether starts differ.
+            gradients: whether rewards carry gradients to actions.
+            compiled: whether steps are compiled; they are recorded otherwise, which has no gradients.
+            dtype: of the physics.
+            ends: whether what an end lacks to success is subtracted from the last reward.
+            scale: what rewards are multiplied by.
+            bonus: what success earns at the end, after scaling.
+            randomize: see `torchdlo.envs.make`.
+        """
+        from torchdlo.envs.core.env import DloEnv
+
+        self.env = DloEnv(
+            task,
+            num_envs=count,
+            dtype=dtype,
+            seed=seed,
+            gradients=gradients,
+            compiled=compiled,
+            recorded=not compiled and not gradients,
+            segment=5,
+            variation=variation,
+            randomize=randomize,
+        )
+        self.task, self.count, self.horizon = task, count, task.horizon
+        self.generator = self.env.generator
+        self.ends, self.scale, self.bonus = ends, scale, bonus
+        self._over = 0
+        self.returns = torch.zeros(count)
+        """What the task itself pays, without the rest."""
+
+    def reset(self) -> Tensor:
+        """Begin anew; return observations (N, O)."""
+        self._over = 0
+        self.returns = torch.zeros(self.count)
+        return self.env.reset()["observation"]
+
+    def step(self, action: Tensor) -> Step:
+        """Do actions (N, 6 R) in metres and degrees."""
+        from tensordict import TensorDict
+
+        td = self.env.step(TensorDict({"action": action}, self.env.batch_size)).get("next")
+        self._over += 1
+        plain, world = td["reward"][:, 0], self.env.world
+        self.returns = self.returns + plain.detach()
+        reward, success = self.scale * plain, td["success"][:, 0]
+        if self._over == self.horizon:
+            seen = world.seen(self.task.arms.count)
+            if self.ends:
+                missing = self.task.terminal_cost(seen).float()
+                reward = reward - self.scale * torch.where(world.failed, 0.0, missing)
+            reward = reward + self.bonus * success
+        return Step(td["observation"], reward, world.failed, success)
+
+    def detach(self) -> None:
+        """Cut the history of gradients."""
+        self.env.detach()

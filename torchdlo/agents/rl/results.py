@@ -1,0 +1,109 @@
+"""Training by name: from a task and an algorithm to what a run is made of, and the results as plain data."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from torchdlo.agents.policies import Policy, load
+from torchdlo.agents.rl.episodes import TaskEpisodes
+from torchdlo.agents.rl.hybrid import task_policy
+from torchdlo.agents.rl.settings import Settings
+from torchdlo.agents.rl.training import Trained, Trainer
+from torchdlo.envs import Task, simulated
+from torchdlo.errors import InputError
+
+__all__ = ["load_policies", "prepared", "summary", "train_json"]
+
+
+def prepared(task: Task, settings: Settings, *, compiled: bool = False) -> tuple[Trainer, TaskEpisodes]:
+    """Return the trainer with a new policy, and its episodes, for an algorithm without stages."""
+    from torchdlo.agents.rl.ppo import Ppo
+    from torchdlo.agents.rl.sac import Sac
+    from torchdlo.agents.rl.shac import Sapo, Shac
+
+    kinds = {"ppo": Ppo, "sac": Sac, "shac": Shac, "sapo": Sapo}
+    if settings.algorithm not in kinds:
+        raise InputError(f"algorithm is {settings.algorithm!r}; expected one of {', '.join(kinds)}.")
+    task = simulated(task, settings.fidelity)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(settings.seed)
+        soft = settings.algorithm in ("sac", "sapo")
+        policy = task_policy(task, settings, state_sigma=soft, squash=settings.algorithm != "ppo")
+        trainer = kinds[settings.algorithm](policy, settings)
+    episodes = TaskEpisodes(
+        task,
+        settings.count,
+        seed=settings.seed,
+        variation=settings.variation,
+        gradients=settings.algorithm in ("shac", "sapo"),
+        compiled=compiled,
+        ends=settings.ends,
+        scale=_scale(task),
+        bonus=settings.bonus,
+    )
+    return trainer, episodes
+
+
+_RETURNS = {
+    "coiling": 12.0,
+    "gathering": 50.0,
+    "letter_art": 170.0,
+    "lifting": 300.0,
+    "separation": 100.0,
+    "slingshot": 12.0,
+    "unknotting": 50.0,
+    "wiring_post": 60.0,
+    "wiring_ring": 200.0,
+    "wrapping": 160.0,
+}
+"""Orders of the returns of successful episodes; rewards are scaled so that they would be 10."""
+
+
+def _scale(task: Task) -> float:
+    return 10.0 / _RETURNS.get(task.name, 10.0)
+
+
+def train_json(task: Task, settings: Settings, found: Trained) -> str:
+    """Return what training came to as JSON."""
+    content = {
+        "generator": "torchdlo train",
+        "task": task.name,
+        "algorithm": settings.algorithm,
+        "fidelity": simulated(task, settings.fidelity).fidelity.text,
+        "episodes": found.episodes,
+        "seconds": round(found.seconds, 1),
+        "best_batch": {"success": found.best[0], "return": found.best[1]} if found.rows else None,
+        "interrupted": found.interrupted,
+        "settings": asdict(settings),
+        "torch": torch.__version__,
+        "curve": found.rows,
+    }
+    return json.dumps(content, indent=1) + "\n"
+
+
+def load_policies(paths: list[Path]) -> tuple[list[Policy], str]:
+    """Return the policies of files or folders, and the name of their one task."""
+    found = [load(path) for path in paths]
+    names = sorted({policy.spec.task for policy in found})
+    if len(names) != 1 or not names[0]:
+        raise InputError(f"policies: they are for {', '.join(names) or 'no task'}; expected policies of one task.")
+    return found, names[0]
+
+
+def summary(results: dict[str, Any]) -> str:
+    """Return an evaluation in one line per protocol."""
+    lines = []
+    for name in ("one", "varied", "disturbed"):
+        if name in results:
+            row = results[name]
+            low, high = row["interval"]
+            lines.append(
+                f"{results['task']}, {name}: success {row['success']:.0%} of {row['episodes']} episodes (95 % interval "
+                f"{low:.0%} to {high:.0%}), return {row['return']:.4g}, failed {row['failed']:.0%}"
+            )
+    return "\n".join(lines)

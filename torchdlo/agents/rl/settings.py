@@ -1,0 +1,133 @@
+"""Settings of training by task and algorithm: the published ones as they are, ours for the hybrid."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from typing import Any
+
+from torchdlo.errors import InputError
+
+__all__ = ["ALGORITHMS", "EPISODES", "PUBLISHED", "Settings", "preset"]
+
+ALGORITHMS = ("ppo", "sac", "shac", "sapo", "hybrid")
+"""Names of all ways to train."""
+EPISODES = {"gathering": 8_000, "lifting": 10_000, "unknotting": 10_000}
+"""Published budgets that differ from 20 000 episodes."""
+
+PUBLISHED = {
+    "coiling": {"ppo": (9.40, 0.67), "sac": (8.28, 0.0), "shac": (11.55, 0.93), "sapo": (11.57, 1.0)},
+    "gathering": {"ppo": (39.76, 0.0), "sac": (40.76, 0.0), "shac": (40.48, 0.0), "sapo": (40.29, 0.0)},
+    "lifting": {"ppo": (247.38, 0.0), "sac": (250.29, 0.0), "shac": (214.24, 0.0), "sapo": (204.54, 0.0)},
+    "separation": {"ppo": (114.31, 1.0), "sac": (134.71, 1.0), "shac": (96.29, 1.0), "sapo": (105.27, 1.0)},
+    "slingshot": {"ppo": (6.90, 0.0), "sac": (7.23, 0.33), "shac": (6.90, 0.0), "sapo": (6.90, 0.0)},
+    "unknotting": {"ppo": (3.29, 0.0), "sac": (2.95, 0.0), "shac": (45.88, 0.73), "sapo": (46.30, 0.80)},
+    "wiring_post": {"ppo": (62.17, 0.67), "sac": (62.07, 0.0), "shac": (36.42, 0.0), "sapo": (36.13, 0.0)},
+    "wrapping": {"ppo": (131.08, 0.0), "sac": (161.85, 0.0), "shac": (129.90, 0.0), "sapo": (144.36, 0.0)},
+}
+"""Published returns, mean of three seeds, and shares of successes, from the one start."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How to train. What does not belong to an algorithm has no effect there."""
+
+    algorithm: str = "ppo"
+    episodes: int = 20_000
+    """Budget."""
+    minutes: float = 60.0
+    """Budget of the clock; what comes first ends it."""
+    seed: int = 0
+    count: int = 100
+    """Episodes that are played at once."""
+    hidden: tuple[int, ...] = (256, 128, 64)
+    """Layers of the policy."""
+    critic: tuple[int, ...] = (256, 256)
+    """Layers of the critics."""
+    activation: str = "elu"
+    layer_norm: bool = False
+    sigma: float = 0.3
+    """First deviation of actions, in units of the greatest way of a tool."""
+    rate: float = 5e-4
+    """Step of the policy."""
+    critic_rate: float = 5e-4
+    """Step of the critics."""
+    gamma: float = 0.99
+    lmbda: float = 0.95
+    clip_norm: float = 0.5
+    """Greatest norm of a gradient."""
+    batch: int = 2048
+    """Actions of which a step of PPO and SAC is made."""
+    passes: int = 5
+    """How often PPO goes over what it played."""
+    clip: float = 0.2
+    """By how much PPO lets the density of an action change."""
+    entropy: float = 5e-3
+    """What PPO pays for entropy."""
+    replay: int = 200_000
+    """Actions that SAC remembers."""
+    updates: int = 1
+    """Steps of SAC for each action of the batch."""
+    warm: int = 5
+    """Batches of episodes that SAC plays at random first."""
+    polyak: float = 0.995
+    """Share that target networks keep in each step."""
+    window: int = 20
+    """Actions through which SHAC and SAPO send gradients."""
+    critic_passes: int = 16
+    """How often their critics go over a window."""
+    parts: int = 4
+    """Minibatches of these passes."""
+    entropy_rate: float = 5e-3
+    """Step of SAPO's temperature."""
+    tame: float = 10.0
+    """Greatest norm of a scene's gradient with respect to one action, times the size of the batch and the window; 0:
+    none is cut. Contact makes a few that dwarf all others."""
+    bonus: float = 0.0
+    """What success earns beside the reward, where the sum of an episode's rewards is about 10."""
+    ends: bool = True
+    """Whether what the end lacks to success is subtracted from the return."""
+    fidelity: str = "published"
+    """Fidelity of training; results are judged at the published one."""
+    variation: bool = True
+    """Whether starts vary."""
+    interval: float = 60.0
+    """Seconds between checkpoints at most, as far as iterations allow."""
+
+    def __post_init__(self) -> None:
+        def need(ok: bool, name: str, expected: str) -> None:
+            if not ok:
+                raise InputError(f"{name} is {getattr(self, name)!r}; expected {expected}.")
+
+        need(self.algorithm in ALGORITHMS, "algorithm", f"one of {', '.join(ALGORITHMS)}")
+        need(self.count >= 1, "count", "at least 1 episode at once")
+        need(self.episodes >= self.count, "episodes", f"at least {self.count}, which are played at once")
+        need(self.minutes > 0, "minutes", "a positive number")
+        need(0 <= self.seed < 2**32, "seed", "a whole number from 0 to 2^32 - 1")
+        need(0 < self.gamma <= 1, "gamma", "a discount above 0, at most 1")
+        need(self.window >= 1, "window", "at least 1 action")
+        need(self.sigma > 0, "sigma", "a positive number")
+
+
+_ALGORITHM: dict[str, dict[str, Any]] = {
+    "ppo": {},
+    "sac": {"polyak": 0.995, "sigma": 0.5},
+    "shac": {"rate": 2e-3, "polyak": 0.8},
+    "sapo": {"rate": 2e-3, "activation": "silu", "layer_norm": True, "sigma": 0.3},
+    "hybrid": {"episodes": 4_000, "count": 128, "hidden": (256, 128, 64), "sigma": 0.15, "rate": 1e-4, "bonus": 5.0},
+}
+
+
+def preset(task: str, algorithm: str, **given: Any) -> Settings:
+    """Return the settings for a task and an algorithm; what is given and not None wins."""
+    if algorithm not in ALGORITHMS:
+        raise InputError(f"algorithm is {algorithm!r}; expected one of {', '.join(ALGORITHMS)}.")
+    base = {"algorithm": algorithm, "episodes": EPISODES.get(task, 20_000)} | _ALGORITHM[algorithm]
+    wanted = {name: value for name, value in given.items() if value is not None}
+    names = {f.name for f in dataclasses.fields(Settings)}
+    other = sorted(set(wanted) - names)
+    if other:
+        raise InputError(f"settings: there is no {', '.join(other)}; expected some of {', '.join(sorted(names))}.")
+    if wanted.get("episodes", base["episodes"]) < base.get("count", 100):
+        wanted.setdefault("count", wanted["episodes"])
+    return Settings(**(base | wanted))

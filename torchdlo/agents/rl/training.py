@@ -1,0 +1,210 @@
+"""The loop around all trainers: budget, seeds, logs, checkpoints that a killed run goes on from bit by bit.
+
+A checkpoint is written between batches of episodes: policy, critics, optimisers, normaliser, memory, both generators of
+random numbers, the best policy so far and the log.
+"""
+
+from __future__ import annotations
+
+import copy
+import io
+import json
+import math
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, Protocol
+
+import torch
+
+from torchdlo.agents.policies import Policy, save
+from torchdlo.agents.rl.episodes import Episodes
+from torchdlo.agents.rl.rollout import Batch
+from torchdlo.agents.rl.settings import Settings
+from torchdlo.errors import InputError
+from torchdlo.files import write_atomically
+
+__all__ = ["Trained", "Trainer", "train"]
+
+Callback = Callable[[str, int, int, str], None]
+_CHECKPOINT = "checkpoint.pt"
+
+
+class Trainer(Protocol):
+    """An algorithm."""
+
+    policy: Policy
+
+    def iterate(self, episodes: Episodes) -> tuple[Batch, dict[str, float]]:
+        """Play one batch of episodes and learn."""
+
+    def parts(self) -> dict[str, Any]:
+        """Return what has a `state_dict` and belongs into checkpoints."""
+
+
+@dataclass(eq=False)
+class Trained:
+    """What training came to, so far."""
+
+    policy: Policy
+    """The best one by what its batch earned, success first."""
+    best: tuple[float, float]
+    """Share of successes and mean return of that batch."""
+    episodes: int = 0
+    seconds: float = 0.0
+    rows: list[dict[str, Any]] = field(default_factory=list)
+    """One entry per batch: episodes, seconds, return, success, failed, and what the algorithm says."""
+    interrupted: bool = False
+
+
+def train(
+    trainer: Trainer,
+    episodes: Episodes,
+    settings: Settings,
+    *,
+    folder: Path | None = None,
+    resume: bool = False,
+    callback: Callback | None = None,
+    stage: str = "train",
+    notes: dict[str, Any] | None = None,
+) -> Trained:
+    """Train until the budget of episodes or of minutes is used up.
+
+    A `KeyboardInterrupt` that `callback` raises ends it and keeps the best so far. All random numbers are those of
+    torch's generator, which belongs to the run as long as it lasts and is given back as it was.
+
+    Args:
+        trainer: the algorithm with its policy.
+        episodes: what it plays.
+        settings: budget, seed and interval of checkpoints.
+        folder: gets policy.pt (the best), checkpoint.pt, log.csv and, if there is the package, TensorBoard's files.
+        resume: go on from the checkpoint.
+        callback: told (stage, episodes done, all episodes, message) after every batch.
+        stage: what to call it.
+        notes: plain data to keep in policy.pt.
+    """
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(settings.seed)
+        done = Trained(copy.deepcopy(trainer.policy), (-math.inf, -math.inf))
+        if resume:
+            _restore(trainer, episodes, settings, done, folder)
+        try:
+            _loop(trainer, episodes, settings, done, folder, callback or (lambda *_: None), stage, notes or {})
+        except KeyboardInterrupt:
+            done.interrupted = True
+        if folder is not None:
+            _write(trainer, episodes, settings, done, folder, notes or {})
+    return done
+
+
+def _loop(
+    trainer: Trainer,
+    episodes: Episodes,
+    settings: Settings,
+    done: Trained,
+    folder: Path | None,
+    callback: Callback,
+    stage: str,
+    notes: dict[str, Any],
+) -> None:
+    writer = _writer(folder)
+    last = time.monotonic()
+    while done.episodes + episodes.count <= settings.episodes and done.seconds < 60 * settings.minutes:
+        began = time.monotonic()
+        # What is judged is the policy that played, not the one that has learned from it.
+        acting = copy.deepcopy(trainer.policy.state_dict())
+        batch, told = trainer.iterate(episodes)
+        done.episodes += episodes.count
+        done.seconds += time.monotonic() - began
+        row = _row(done, episodes, batch) | told
+        done.rows.append(row)
+        mark = (row["success"], row["return"])
+        if mark > done.best:
+            done.best = mark
+            done.policy.load_state_dict(acting)
+        if writer is not None:
+            for name, value in row.items():
+                writer.add_scalar(f"{stage}/{name}", value, done.episodes)
+        if folder is not None and time.monotonic() - last > settings.interval:
+            _write(trainer, episodes, settings, done, folder, notes)
+            last = time.monotonic()
+        callback(stage, done.episodes, settings.episodes, _said(done, settings))
+    if writer is not None:
+        writer.close()
+
+
+def _said(done: Trained, settings: Settings) -> str:
+    row = done.rows[-1]
+    share = max(done.episodes / settings.episodes, done.seconds / (60 * settings.minutes))
+    left = done.seconds * (1 / share - 1) if share > 0 else math.inf
+    return f"return {row['return']:.4g}, success {row['success']:.0%}, {max(0.0, left) / 60:.0f} min left"
+
+
+def _row(done: Trained, episodes: Episodes, batch: Batch) -> dict[str, Any]:
+    returns = getattr(episodes, "returns", None)
+    plain = batch.reward.sum(0) if returns is None else returns
+    return {
+        "episodes": done.episodes,
+        "seconds": round(done.seconds, 3),
+        "return": float(plain.mean()),
+        "success": float(batch.success.float().mean()),
+        "failed": float(batch.failed[-1].float().mean()),
+    }
+
+
+def _writer(folder: Path | None) -> Any:
+    if folder is None:
+        return None
+    try:
+        from torch.utils.tensorboard import SummaryWriter
+    except ImportError:
+        return None
+    return SummaryWriter(str(folder / "tensorboard"))
+
+
+def log_csv(rows: list[dict[str, Any]]) -> str:
+    """Return a log as text with commas; what an entry does not have is empty."""
+    names = list(dict.fromkeys(name for row in rows for name in row))
+    lines = [",".join(str(row.get(name, "")) for name in names) for row in rows]
+    return "\n".join([",".join(names), *lines]) + "\n"
+
+
+def _write(
+    trainer: Trainer, episodes: Episodes, settings: Settings, done: Trained, folder: Path, notes: dict[str, Any]
+) -> None:
+    content = {
+        "generator": "torchdlo train",
+        "settings": json.dumps(asdict(settings), sort_keys=True),
+        "parts": {name: part.state_dict() for name, part in trainer.parts().items()},
+        "torch": torch.get_rng_state(),
+        "starts": episodes.generator.get_state(),
+        "best": {"policy": done.policy.state_dict(), "mark": done.best},
+        "episodes": done.episodes,
+        "seconds": done.seconds,
+        "rows": done.rows,
+    }
+    written = io.BytesIO()
+    torch.save(content, written)
+    write_atomically(folder / _CHECKPOINT, written.getvalue())
+    write_atomically(folder / "log.csv", log_csv(done.rows))
+    save(done.policy, folder / "policy.pt", notes | {"episodes": done.episodes, "seconds": round(done.seconds, 1)})
+
+
+def _restore(trainer: Trainer, episodes: Episodes, settings: Settings, done: Trained, folder: Path | None) -> None:
+    path = None if folder is None else folder / _CHECKPOINT
+    if path is None or not path.is_file():
+        raise InputError(f"{path}: expected the checkpoint of a run to resume, found none; leave out --resume.")
+    content = torch.load(path, weights_only=True)
+    was, now = json.loads(content["settings"]), json.loads(json.dumps(asdict(settings)))
+    free = ("episodes", "minutes", "interval")  # how long to go on may change
+    other = [f"{k} {was.get(k)} (now {now[k]})" for k in now if k not in free and was.get(k) != now[k]]
+    if other:
+        raise InputError(f"{path}: it belongs to a run with {', '.join(other)}; give the same, or leave out --resume.")
+    for name, part in trainer.parts().items():
+        part.load_state_dict(content["parts"][name])
+    torch.set_rng_state(content["torch"])
+    episodes.generator.set_state(content["starts"])
+    done.policy.load_state_dict(content["best"]["policy"])
+    done.best = tuple(content["best"]["mark"])
+    done.episodes, done.seconds, done.rows = content["episodes"], content["seconds"], content["rows"]
