@@ -22,6 +22,14 @@ class Labels:
     features: list[Tensor] = field(default_factory=list)
     actions: list[Tensor] = field(default_factory=list)
 
+    def state_dict(self) -> dict[str, Tensor]:
+        """Return all of it."""
+        return {"features": torch.cat(self.features), "actions": torch.cat(self.actions)}
+
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        """Take back what `state_dict` returned."""
+        self.features, self.actions = [state["features"]], [state["actions"]]
+
     def __len__(self) -> int:
         return sum(map(len, self.features))
 

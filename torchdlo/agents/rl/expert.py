@@ -116,6 +116,29 @@ def candidates(task: Task, trajectories: list[Path]) -> list[Expert]:
     return found
 
 
+class _Journal:
+    """A file of scores, batch after batch: a search asks for the same ones again when it is run again."""
+
+    def __init__(self, path: Path | None, choices: list[Any]) -> None:
+        self.path, self.choices, self.rows = path, choices, []
+        self.ahead: list[list[list[float]]] = []
+        if path is not None and path.is_file():
+            found = json.loads(path.read_text(encoding="utf-8"))
+            if found["choices"] == choices:
+                self.ahead = found["rows"]
+
+    def recall(self) -> list[Score] | None:
+        """Return how the next batch went, if that is known."""
+        return [Score(*row) for row in self.ahead.pop(0)] if self.ahead else None
+
+    def keep(self, scores: list[Score]) -> None:
+        """Write down how a batch went."""
+        self.rows.append([list(vars(s).values()) for s in scores])
+        if self.path is not None and not self.ahead:
+            content = {"generator": "torchdlo train", "choices": self.choices, "rows": self.rows}
+            write_atomically(self.path, json.dumps(content) + "\n")
+
+
 @torch.no_grad()
 def follow(experts: list[Expert], episodes: TaskEpisodes, *, noise: float, generator: torch.Generator) -> list[Score]:
     """Play experts, each in an equal share of the batch and from the same starts; return how they did.
@@ -167,14 +190,20 @@ def _spread(knots: Tensor, horizon: int) -> Tensor:
     return ((1 - share) * flat[low] + share * flat[low + 1]).reshape(horizon, *knots.shape[1:])
 
 
-def _changed(expert: Expert, numbers: Tensor, moving: list[tuple[int, int]], scale: Tensor) -> Expert:
+def _moving(task: Task) -> list[tuple[int, int]]:
+    """Return which things of a task are moved at the start, and along which axis."""
+    return [(k, axis) for k, pair in enumerate(task.spread) for axis in range(2) if pair[axis] > 0]
+
+
+def _changed(expert: Expert, numbers: Tensor, task: Task) -> Expert:
     """Return an expert with changes of its path [m] and of its gains, which act per unit of the things' spread."""
     horizon, arms = expert.path.shape[:2]
+    moving = _moving(task)
     parts = numbers.reshape(1 + len(moving), _KNOTS, arms, 3)
     path = expert.path + _spread(parts[0], horizon).to(expert.path)
     gain = expert.gain.clone()
-    for k, (thing, axis) in enumerate(moving):
-        gain[..., thing, axis] += _spread(parts[1 + k], horizon).to(gain) / float(scale[thing, axis])
+    for part, (thing, axis) in zip(parts[1:], moving, strict=True):
+        gain[..., thing, axis] += _spread(part, horizon).to(gain) / task.spread[thing][axis]
     return replace(expert, path=path, gain=gain)
 
 
@@ -190,6 +219,7 @@ def improve(
     noise: float = 0.0015,
     enough: float = 0.99,
     minutes: float = math.inf,
+    journal: Path | None = None,
     callback: Callback | None = None,
 ) -> tuple[Expert, list[dict[str, Any]], int]:
     """Return the best expert after a search, a log of it and how many episodes it took.
@@ -208,54 +238,70 @@ def improve(
         noise: of actions [m].
         enough: see above.
         minutes: budget of the clock.
+        journal: file that keeps how candidates did; a search that finds one of the same choices goes on from there.
         callback: told (stage, generations done, all, message).
     """
-    try:
-        import cma
-    except ImportError:
-        raise InputError("robust paths need the package cma; install it with pip install 'torchdlo[cmaes]'.") from None
-
     began, told = time.monotonic(), callback or (lambda *_: None)
     if not experts:
         raise InputError(f"{task.name}: there is no trajectory that succeeds; search one with torchdlo optimize first.")
-    rng = torch.Generator().manual_seed(seed)
-    log: list[dict[str, Any]] = []
-    first = TaskEpisodes(task, len(experts) * 2 * starts, seed=seed)
-    scores = follow(experts, first, noise=noise, generator=rng)
-    played = first.count
+    choices = [task.name, task.fidelity.text, seed, starts, population, sigma, noise]
+    arena = _Arena(task, seed, noise, _Journal(journal, choices))
+    scores = arena.scores(experts, 2 * starts, 0)
     scale = max(abs(s.returns) for s in scores) or 1.0
     best = max(range(len(experts)), key=lambda k: scores[k].value(scale))
-    log += [{"source": e.source, **vars(s)} for e, s in zip(experts, scores, strict=True)]
-    base, mark = experts[best], scores[best]
-    told("robust", 0, generations, f"{base.source}: success {mark.success:.0%}")
-    del first
-    spread = torch.tensor(task.spread)
-    moving = [(int(t), int(a)) for t, a in (spread > 0).nonzero().tolist()]
-    size = (1 + len(moving)) * _KNOTS * task.arms.count * 3
-    options = {"popsize": population, "seed": seed + 1, "CMA_diagonal": True, "verbose": -9}
-    search = cma.CMAEvolutionStrategy([0.0] * size, sigma, options)
-    episodes = TaskEpisodes(task, (population + 1) * starts, seed=seed + 1)
-    good, mean = 0, base
+    log: list[dict[str, Any]] = [{"source": e.source, **vars(s)} for e, s in zip(experts, scores, strict=True)]
+    base, good = experts[best], 0
+    mean = base
+    told("robust", 0, generations, f"{base.source}: success {scores[best].success:.0%}")
+    search = _strategy(task, population, sigma, seed) if generations else None
     for k in range(generations):
-        if time.monotonic() - began > 60 * minutes:
+        if time.monotonic() - began > 60 * minutes or good >= 3:
             break
         asked = search.ask()
-        mean = _changed(base, torch.tensor(search.mean), moving, spread)
-        tried = [mean, *(_changed(base, torch.tensor(x), moving, spread) for x in asked)]
-        scores = follow(tried, episodes, noise=noise, generator=rng)
-        played += episodes.count
+        mean = _changed(base, torch.tensor(search.mean), task)
+        scores = arena.scores([mean, *(_changed(base, torch.tensor(x), task) for x in asked)], starts, 1 + k)
         search.tell(asked, [-s.value(scale) for s in scores[1:]])
         log.append({"generation": k, **vars(scores[0]), "best": max(s.success for s in scores[1:])})
         good = good + 1 if scores[0].success >= enough else 0
         told("robust", k + 1, generations, f"success {scores[0].success:.0%}, best {log[-1]['best']:.0%}")
-        if good >= 3:
-            break
-    else:
-        mean = _changed(base, torch.tensor(search.mean), moving, spread)
     if mean is base:
-        return base, log, played
+        return base, log, arena.played
+    if good < 3:
+        mean = _changed(base, torch.tensor(search.mean), task)
     # A search may lose its way: the path that it began with is the one to beat, from starts that neither has seen.
-    last = TaskEpisodes(task, 2 * 4 * starts, seed=seed + 2)
-    scores = follow([base, mean], last, noise=noise, generator=rng)
+    scores = arena.scores([base, mean], 4 * starts, 100_000)
     log += [{"playoff": name, **vars(s)} for name, s in zip(("before", "after"), scores, strict=True)]
-    return (mean if scores[1].value(scale) >= scores[0].value(scale) else base), log, played + last.count
+    return (mean if scores[1].value(scale) >= scores[0].value(scale) else base), log, arena.played
+
+
+class _Arena:
+    """Plays candidates from starts that only the number of a batch decides, or reads how they did."""
+
+    def __init__(self, task: Task, seed: int, noise: float, journal: _Journal) -> None:
+        self.task, self.seed, self.noise, self.journal = task, 1_000_003 * seed, noise, journal
+        self.played = 0
+        self._made: TaskEpisodes | None = None
+
+    def scores(self, experts: list[Expert], starts: int, number: int) -> list[Score]:
+        """Return how each candidate did from as many starts, which are the same for all."""
+        count = starts * len(experts)
+        self.played += count
+        found = self.journal.recall()
+        if found is None:
+            if self._made is None or self._made.count != count:
+                self._made = TaskEpisodes(self.task, count)
+            self._made.generator.manual_seed(self.seed + number)
+            random = torch.Generator().manual_seed(self.seed + 500_000 + number)
+            found = follow(experts, self._made, noise=self.noise, generator=random)
+        self.journal.keep(found)
+        return found
+
+
+def _strategy(task: Task, population: int, sigma: float, seed: int) -> Any:
+    try:
+        import cma
+    except ImportError:
+        raise InputError("robust paths need the package cma; install it with pip install 'torchdlo[cmaes]'.") from None
+    size = (1 + len(_moving(task))) * _KNOTS * task.arms.count * 3
+    options = {"popsize": population, "seed": seed + 1, "CMA_diagonal": True, "verbose": -9}
+    return cma.CMAEvolutionStrategy([0.0] * size, sigma, options)

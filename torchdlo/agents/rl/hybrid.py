@@ -11,6 +11,7 @@ validation starts; those of `evaluate` are never played here.
 from __future__ import annotations
 
 import copy
+import io
 import json
 import math
 import time
@@ -49,15 +50,15 @@ class Hybrid:
     """Of the search for a robust path, at most; 0 takes the best of the given ones."""
     population: int = 12
     starts: int = 16
-    rounds: int = 3
+    rounds: int = 2
     """Rounds of DAgger after the first, in cheap steps."""
-    count: int = 64
+    count: int = 128
     """Episodes of a round."""
     noise: float = 0.001
     """Deviation of what is added to actions while labels are collected [m]."""
     updates: int = 3000
     """Steps of learning after each round."""
-    final: int = 2
+    final: int = 1
     """Rounds at the published fidelity."""
     validation: int = 64
     """Starts from which policies are compared."""
@@ -118,9 +119,11 @@ def hybrid(
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(settings.seed)
         chosen = _robust(task, trajectories, settings, plan, folder, stages, expert, resume, notes, told)
+        _note(folder, notes)
         policy = _clone(task, chosen, settings, plan, folder, stages, resume, notes, told)
+        _note(folder, notes)
         if "tune" in stages:
-            policy = _tune(task, policy, settings, plan, folder, notes, told)
+            policy = _tune(task, policy, settings, plan, folder, resume, notes, told)
     _finish(policy, folder, notes)
     return policy, notes
 
@@ -132,8 +135,12 @@ def _notes(folder: Path) -> dict[str, Any]:
         return {}
 
 
-def _finish(policy: Policy, folder: Path, notes: dict[str, Any]) -> None:
+def _note(folder: Path, notes: dict[str, Any]) -> None:
     write_atomically(folder / "stages.json", json.dumps({"generator": "torchdlo train", **notes}, indent=1) + "\n")
+
+
+def _finish(policy: Policy, folder: Path, notes: dict[str, Any]) -> None:
+    _note(folder, notes)
     save(policy, folder / "policy.pt", {"algorithm": "hybrid", "episodes": _episodes(notes)})
 
 
@@ -167,6 +174,7 @@ def _robust(
         starts=plan.starts,
         population=plan.population,
         generations=generations,
+        journal=folder / "robust.json",
         callback=told,
     )
     notes["robust"] = {"episodes": played, "cpu_seconds": round(time.process_time() - began, 1), "log": log}
@@ -194,22 +202,64 @@ def _clone(
     if expert is None:
         raise InputError(f"{folder / 'expert.json'}: there is no expert to clone; run the stage robust first.")
     began, labels, rng = time.process_time(), Labels(), torch.Generator().manual_seed(settings.seed)
+    torch.manual_seed(settings.seed)
     coarse = TaskEpisodes(simulated(task, task.coarse), plan.count, seed=settings.seed + 11)
-    rounds = [(coarse, k == 0) for k in range(1 + plan.rounds)]
-    fine = None
+    rounds = [coarse] * (1 + plan.rounds)
     if plan.final:
-        fine = TaskEpisodes(simulated(task, PUBLISHED), plan.count, seed=settings.seed + 12)
-        rounds += [(fine, False)] * plan.final
-    log, played = [], 0
-    for k, (episodes, driven) in enumerate(rounds):
-        success, failed = labelled(labels, policy, expert, episodes, driven=driven, noise=plan.noise, generator=rng)
+        rounds += [TaskEpisodes(simulated(task, PUBLISHED), plan.count, seed=settings.seed + 12)] * plan.final
+    keeper = _Keeper(folder / "clone.part", {"policy": policy, "labels": labels}, [rng, *_generators(rounds)])
+    log, played = keeper.restore() if resume else [], 0
+    for k, episodes in enumerate(rounds):
         played += episodes.count
+        if k < len(log):
+            continue
+        choices = {"driven": k == 0, "noise": plan.noise, "generator": rng}
+        success, failed = labelled(labels, policy, expert, episodes, **choices)
         error = fit(policy, labels, updates=plan.updates)
-        log.append({"round": k, "fine": episodes is fine, "success": success, "failed": failed, "error": error})
+        fine = episodes.task.fidelity.text
+        log.append({"round": k, "fidelity": fine, "success": success, "failed": failed, "error": error})
+        keeper.keep(log)
         told("clone", k + 1, len(rounds), f"success {success:.0%} in the round, error {error:.2g}")
     notes["clone"] = {"episodes": played, "cpu_seconds": round(time.process_time() - began, 1), "log": log}
     save(policy, file, {"stage": "clone", "log": log})
+    keeper.remove()
     return policy
+
+
+def _generators(rounds: Sequence[TaskEpisodes]) -> list[torch.Generator]:
+    """Return those of different batches of episodes, once each."""
+    return list({id(e): e.generator for e in rounds}.values())
+
+
+class _Keeper:
+    """What a stage needs to go on: parts with a `state_dict`, generators of random numbers, and its log."""
+
+    def __init__(self, path: Path, parts: dict[str, Any], generators: list[torch.Generator]) -> None:
+        self.path, self.parts, self.generators = path, parts, generators
+
+    def keep(self, log: list[dict[str, Any]]) -> None:
+        """Write all down."""
+        states = {name: part.state_dict() for name, part in self.parts.items()}
+        random = [torch.get_rng_state(), *(g.get_state() for g in self.generators)]
+        written = io.BytesIO()
+        torch.save({"parts": states, "random": random, "log": log}, written)
+        write_atomically(self.path, written.getvalue())
+
+    def restore(self) -> list[dict[str, Any]]:
+        """Go back to what was written down, if anything was; return the log."""
+        if not self.path.is_file():
+            return []
+        content = torch.load(self.path, weights_only=True)
+        for name, part in self.parts.items():
+            part.load_state_dict(content["parts"][name])
+        torch.set_rng_state(content["random"][0])
+        for generator, state in zip(self.generators, content["random"][1:], strict=True):
+            generator.set_state(state)
+        return content["log"]
+
+    def remove(self) -> None:
+        """Delete it."""
+        self.path.unlink(missing_ok=True)
 
 
 def _tune(
@@ -218,6 +268,7 @@ def _tune(
     settings: Settings,
     plan: Hybrid,
     folder: Path,
+    resume: bool,
     notes: dict[str, Any],
     told: Callback,
 ) -> Policy:
@@ -231,31 +282,37 @@ def _tune(
         found = collect(policy, judge, random=False)
         return float(found.success.float().mean()), float(judge.returns.mean())
 
-    mark = success(policy)
-    best, log, played = copy.deepcopy(policy), [{"episodes": 0, "success": mark[0], "return": mark[1]}], judge.count
-    told("tune", 0, plan.tune_episodes, f"success {mark[0]:.0%} before")
-    if mark[0] < plan.enough and plan.tune_episodes >= settings.count:
-        scale = 10.0 / max(1e-6, abs(mark[1]))
-        episodes = TaskEpisodes(fine, settings.count, seed=settings.seed + 13, scale=scale, bonus=settings.bonus)
+    best = copy.deepcopy(policy)
+    episodes = TaskEpisodes(fine, settings.count, seed=settings.seed + 13, bonus=settings.bonus)
+    ppo = Ppo(policy, settings, fixed=True)
+    torch.manual_seed(settings.seed)
+    keeper = _Keeper(folder / "tune.part", ppo.parts() | {"best": best}, [episodes.generator])
+    log = keeper.restore() if resume else []
+    if not log:
+        mark = success(policy)
+        log = [{"episodes": 0, "success": mark[0], "return": mark[1], "best": mark}]
         with torch.no_grad():
             policy.log_sigma.fill_(math.log(settings.sigma))
-        ppo = Ppo(policy, settings, fixed=True)
-        done = 0
-        while done + settings.count <= plan.tune_episodes and mark[0] < plan.enough:
-            batch = collect(policy, episodes)
-            ppo.learn(batch, freeze=done == 0)
-            done += settings.count
-            if done == settings.count:
-                continue
-            now = success(policy)
-            played += judge.count
-            share = float(batch.success.float().mean())
-            log.append({"episodes": done, "success": now[0], "return": now[1], "noisy": share})
-            told("tune", done, plan.tune_episodes, f"success {now[0]:.0%}, with noise {share:.0%}, best {mark[0]:.0%}")
-            if now > mark:
-                mark, best = now, copy.deepcopy(policy)
-            elif now[0] < mark[0] - 0.15:
-                policy.load_state_dict(best.state_dict())
-        played += done
+        keeper.keep(log)
+    mark = tuple(log[-1]["best"])
+    episodes.scale = 10.0 / max(1e-6, abs(log[0]["return"]))
+    told("tune", log[-1]["episodes"], plan.tune_episodes, f"success {mark[0]:.0%}")
+    while log[-1]["episodes"] + settings.count <= plan.tune_episodes and mark[0] < plan.enough:
+        batch, first = collect(policy, episodes), len(log) == 1
+        ppo.learn(batch, freeze=first)
+        # The first batch teaches the critic alone.
+        now = mark if first else success(policy)
+        share = float(batch.success.float().mean())
+        if now > mark:
+            mark = now
+            best.load_state_dict(policy.state_dict())
+        elif now[0] < mark[0] - 0.15:
+            policy.load_state_dict(best.state_dict())
+        done = log[-1]["episodes"] + settings.count
+        log.append({"episodes": done, "success": now[0], "return": now[1], "noisy": share, "best": mark})
+        keeper.keep(log)
+        told("tune", done, plan.tune_episodes, f"success {now[0]:.0%}, with noise {share:.0%}, best {mark[0]:.0%}")
+    played = log[-1]["episodes"] + judge.count * max(1, len(log) - 1)
+    keeper.remove()
     notes["tune"] = {"episodes": played, "cpu_seconds": round(time.process_time() - began, 1), "log": log}
     return best

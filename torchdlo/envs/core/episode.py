@@ -27,6 +27,7 @@ from torchdlo.envs.core.divergence import broken, inside
 from torchdlo.envs.core.frames import guarded, run, slipped
 from torchdlo.envs.core.stages import repeated
 from torchdlo.envs.core.task import Task, TaskState, combined
+from torchdlo.envs.observation import observe, places
 from torchdlo.errors import InputError
 from torchdlo.physics import tree
 from torchdlo.physics.linalg.numerics import safe_norm
@@ -53,8 +54,6 @@ FIND = inverse_kinematics.IkSearch(starts=8)
 """How hard to look for the joints of the start."""
 FOLLOW = inverse_kinematics.IkSearch(steps=4, closing=2, polish=2)
 """The same for those of an action, which are near the last ones."""
-ELBOWS = 7
-"""Joints of an arm that are observed."""
 
 
 @tree.struct
@@ -328,28 +327,6 @@ def earned(episode: Episode, world: EpisodeState) -> tuple[Tensor, Tensor, dict[
     reward = combined(task, terms, len(world.failed))
     loss = sum(task.auxiliary_loss(seen).values(), -reward)
     return torch.where(world.failed, 0.0, reward), torch.where(world.failed, 0.0, loss), terms
-
-
-def observe(episode: Episode, world: EpisodeState) -> Tensor:
-    """Return observations in single precision, shape (B, O).
-
-    Positions and velocities of vertices, of free bodies and of the middle of matter; then positions, orientations and
-    joint angles of the arms.
-    """
-    state = world.state
-    parts = [state.rods.pos, state.rods.vel]
-    free = [k for k, body in enumerate(episode.scene.bodies) if body.motion == "free"]
-    if free:
-        parts += [state.bodies.pos[:, free], state.bodies.vel[:, free]]
-    if state.material_points:
-        parts += [state.material_points.pos.mean(-2, keepdim=True), state.material_points.vel.mean(-2, keepdim=True)]
-    parts += [world.tool.pos, world.tool.quat, world.joints[..., :ELBOWS]]
-    return torch.cat([p.flatten(-2) for p in parts], -1).to(torch.float32)
-
-
-def places(world: EpisodeState) -> dict[str, Tensor]:
-    """Return where things are: "pos" (B, V, 3) of the ropes, "tool" (B, R, 3) and "joints" (B, R, J)."""
-    return {"pos": world.state.rods.pos, "tool": world.tool.pos, "joints": world.joints}
 
 
 def play(
