@@ -1,0 +1,198 @@
+"""Policies out of trajectories: experts, clones, stages that go on, and the judgement."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+
+pytest.importorskip("torchrl")
+pytest.importorskip("cma")
+
+from lead import Lead, found
+
+from torchdlo import envs
+from torchdlo.agents.policies import load
+from torchdlo.agents.rl import hybrid as stages
+from torchdlo.agents.rl.episodes import TaskEpisodes
+from torchdlo.agents.rl.evaluate import evaluate, judged, wilson
+from torchdlo.agents.rl.expert import Expert, _spread, candidates, follow, improve
+from torchdlo.agents.rl.hybrid import Hybrid, hybrid
+from torchdlo.agents.rl.rollout import collect
+from torchdlo.agents.rl.settings import preset
+from torchdlo.cli import app
+from torchdlo.errors import InputError
+
+pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::FutureWarning")
+
+PLAN = Hybrid(
+    generations=2, population=4, starts=4, rounds=1, count=16, updates=200, final=1, validation=8, tune_episodes=32
+)
+
+
+def settings(**choices):
+    return preset("lead", "hybrid", hidden=(32,), critic=(32,), count=16, **choices)
+
+
+def test_an_expert_follows_a_path_that_moves_with_the_start():
+    path, gain = torch.zeros(2, 1, 3), torch.zeros(2, 1, 3, 1, 2)
+    path[:, 0, 0], gain[1, 0, 1, 0, 0] = torch.tensor([0.1, 0.2]), 2.0
+    expert = Expert(path, gain)
+    moved = torch.tensor([[[0.03, 0.0, 0.0]]])
+    # The second place is (0.2, 2 * 0.03, 0); the tool is 4 mm beside it, ways are 1 cm at most.
+    tool = torch.tensor([[[0.2, 0.056, 0.0]]])
+    torch.testing.assert_close(expert.act(1, moved, tool, 0.01), torch.tensor([[0.0, 0.4, 0.0]]))
+    torch.testing.assert_close(expert.act(0, moved, torch.zeros(1, 1, 3), 0.01), torch.tensor([[1.0, 0.0, 0.0]]))
+
+
+def test_changes_of_a_path_begin_with_nothing_and_are_linear_between_knots():
+    knots = torch.tensor([[1.0], [3.0]])
+    torch.testing.assert_close(_spread(knots, 4), torch.tensor([[0.5], [1.0], [2.0], [3.0]]))
+
+
+def test_following_a_path_in_the_world_succeeds_where_replaying_it_does_not(tmp_path: Path):
+    experts = candidates(Lead(), [found(tmp_path)])
+    assert [e.source for e in experts] == ["lead, same places", "lead, moved along"]
+    scores = follow(experts, TaskEpisodes(Lead(), 32), noise=0.0, generator=torch.Generator().manual_seed(0))
+    # Ropes are up to 10 mm off, 4 mm count as success.
+    assert scores[0].success == 1
+    assert scores[1].success < 0.7
+
+
+def test_a_search_for_a_robust_path_is_repeatable_and_goes_on(tmp_path: Path):
+    experts = candidates(Lead(), [found(tmp_path)])
+    choices = {"seed": 0, "starts": 4, "population": 4, "generations": 2, "enough": 2.0}
+    first, log, played = improve(Lead(), experts, **choices)
+    # Both candidates from 8 starts, two generations of 5 from 4, and the last comparison of 2 from 16.
+    assert played == 2 * 8 + 2 * 5 * 4 + 2 * 16
+    journal = tmp_path / "robust.json"
+
+    def stop(stage: str, done: int, *_) -> None:
+        if done == 1:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        improve(Lead(), experts, **choices, journal=journal, callback=stop)
+    assert len(json.loads(journal.read_text())["rows"]) == 2
+    again, told, count = improve(Lead(), experts, **choices, journal=journal)
+    assert torch.equal(first.path, again.path) and torch.equal(first.gain, again.gain)
+    assert (told, count) == (log, played)
+
+
+def test_a_clone_does_what_its_expert_does(tmp_path: Path):
+    policy, notes = hybrid(Lead(), [found(tmp_path)], settings(), folder=tmp_path, plan=PLAN)
+    assert notes["clone"]["episodes"] == 3 * 16
+    assert [row["fidelity"] for row in notes["clone"]["log"]] == ["1ms/2", "1ms/2", "1ms/5"]
+    result, plays = evaluate([policy], Lead(), protocols=("one", "varied"))
+    assert result["varied"]["success"] >= 0.9 and result["one"]["success"] == 1
+    assert plays["varied"][0]["actions"].shape == (15, 6, 6)
+    # All starts of the first protocol are alike, those of the second are not.
+    assert float(plays["one"][0]["moved"].abs().max()) == 0 < float(plays["varied"][0]["moved"].std())
+
+
+def test_stages_that_are_done_are_not_run_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    undisturbed, _ = hybrid(Lead(), [found(tmp_path)], settings(), folder=tmp_path / "a", plan=PLAN)
+    told = []
+
+    def stop(stage: str, done: int, *_) -> None:
+        told.append((stage, done))
+        if (stage, done) == ("clone", 2):
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        hybrid(Lead(), [found(tmp_path)], settings(), folder=tmp_path / "b", plan=PLAN, callback=stop)
+    monkeypatch.setattr(stages, "improve", None)
+    policy, _ = hybrid(Lead(), [], settings(), folder=tmp_path / "b", plan=PLAN, resume=True)
+    for name, value in policy.state_dict().items():
+        assert torch.equal(value, undisturbed.state_dict()[name]), name
+
+
+def test_each_stage_can_be_left_out(tmp_path: Path):
+    file = found(tmp_path)
+    _, notes = hybrid(Lead(), [file], settings(), folder=tmp_path, plan=PLAN, stages=("clone",))
+    assert "tune" not in notes and "generation" not in notes["robust"]["log"][-1]
+    with pytest.raises(InputError, match="there is no search"):
+        hybrid(Lead(), [file], settings(), folder=tmp_path, plan=PLAN, stages=("search",))
+
+
+def test_tuning_keeps_the_best(tmp_path: Path):
+    """A policy that knows nothing is not made worse, whatever PPO does in two batches."""
+    policy, notes = hybrid(Lead(), [found(tmp_path)], settings(), folder=tmp_path, plan=PLAN, stages=("robust", "tune"))
+    rows = notes["tune"]["log"]
+    assert len(rows) == 3
+    assert tuple(rows[-1]["best"]) == max((row["success"], row["return"]) for row in rows)
+    assert policy.spec.task == "lead"
+
+
+def test_judgements_are_at_the_published_fidelity_and_repeatable(tmp_path: Path):
+    policy, _ = hybrid(Lead(), [found(tmp_path)], settings(), folder=tmp_path, plan=PLAN, stages=("clone",))
+    rough = envs.simulated(Lead(), "1ms/2")
+    first, second, third = (judged(policy, task) for task in (Lead(), rough, Lead()))
+    assert torch.equal(first["returns"], second["returns"]) and torch.equal(first["returns"], third["returns"])
+    other = judged(policy, Lead(), protocol="disturbed")
+    assert not torch.equal(first["actions"], other["actions"])
+    # Training starts are not those of the judgement.
+    train = TaskEpisodes(Lead(), 15, seed=0)
+    collect(policy, train, random=False)
+    assert not torch.equal(first["moved"], train.env.moved)
+
+
+def test_the_interval_of_a_share_is_wilsons():
+    # 8 of 10: 0.490 to 0.943.
+    assert wilson(8, 10) == pytest.approx((0.4902, 0.9433), abs=1e-3)
+    assert wilson(0, 10)[0] == 0
+
+
+def test_commands_train_and_judge(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
+    monkeypatch.setitem(envs.TASKS, "lead", Lead)
+
+    def run(*words: str) -> str:
+        with pytest.raises(SystemExit) as done:
+            app.main(list(words))
+        assert done.value.code in (0, None), capsys.readouterr().err
+        return capsys.readouterr().out
+
+    out = tmp_path / "ppo"
+    small = ["--count", "8", "--set", "hidden=[16]", "--set", "critic=[16]", "--set", "passes=1"]
+    words = ["train", "lead", "--algo", "ppo", "--out", str(out), *small]
+    result = json.loads(run(*words, "--episodes", "16", "--fidelity", "coarse", "--json"))
+    assert (result["episodes"], result["fidelity"], len(result["curve"])) == (16, "1ms/2", 2)
+    assert (out / "curve.png").read_bytes().startswith(b"\x89PNG")
+    run(*words, "--episodes", "24", "--fidelity", "coarse", "--resume")
+    assert len((out / "log.csv").read_text().splitlines()) == 4
+    assert load(out).spec.task == "lead"
+    result = json.loads(run("evaluate", str(out), str(out), "--starts", "4", "--json"))
+    assert (result["policies"], result["varied"]["episodes"], result["fidelity"]) == (2, 8, "1ms/5")
+    assert json.loads((out / "evaluation.json").read_text()) == result
+    monkeypatch.setattr(stages, "Hybrid", lambda: PLAN)
+    words = ["train", "lead", "--out", str(tmp_path / "hybrid"), "--trajectory", str(found(tmp_path)), *small]
+    notes = json.loads(run(*words, "--without", "tune", "--json"))
+    assert "clone" in notes and "tune" not in notes
+    for wrong, said in (
+        (["train", "lead", "--algo", "ppo", "--set", "rate"], "expected NAME=VALUE"),
+        (["train", "lead", "--algo", "ppo", "--set", "speed=1"], "there is no speed"),
+        (["train", "lead", "--algo", "trpo"], "algorithm is 'trpo'"),
+        (["train", "lead", "--without", "search"], "--without search"),
+        (["evaluate", str(out), "--protocol", "blind"], "--protocol blind"),
+    ):
+        with pytest.raises(SystemExit) as done:
+            app.main([*wrong, *([] if "--out" in wrong or wrong[0] == "evaluate" else ["--out", str(tmp_path / "x")])])
+        assert done.value.code == 2
+        assert said in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", ["shac", "sac"])
+def test_other_algorithms_play_tasks(name: str):
+    from torchdlo.agents.rl.results import prepared
+    from torchdlo.agents.rl.training import train
+
+    choices = {"hidden": (16,), "critic": (16,), "count": 4, "episodes": 8, "window": 3, "warm": 1, "batch": 8}
+    chosen = preset("lead", name, critic_passes=1, **choices)
+    trainer, played = prepared(Lead(), chosen)
+    before = {k: v.clone() for k, v in trainer.policy.named_parameters()}
+    found = train(trainer, played, chosen)
+    assert found.episodes == 8
+    assert all(torch.isfinite(p).all() for p in trainer.policy.parameters())
+    assert any((before[k] != v).any() for k, v in trainer.policy.named_parameters())
