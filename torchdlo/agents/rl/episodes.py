@@ -17,6 +17,9 @@ from torchdlo.envs import Task
 
 __all__ = ["EnvEpisodes", "Episodes", "Step", "TaskEpisodes"]
 
+_LONG = 10
+"""Actions of episodes that are worth recording their steps."""
+
 
 @dataclass(frozen=True, eq=False)
 class Step:
@@ -135,7 +138,7 @@ class TaskEpisodes:
             seed=seed,
             gradients=gradients,
             compiled=compiled,
-            recorded=not compiled and not gradients,
+            recorded=not compiled and not gradients and task.horizon > _LONG,
             segment=5,
             variation=variation,
             randomize=randomize,

@@ -1,0 +1,200 @@
+"""Train policies on tasks by algorithms and seeds, judge them from unseen starts, and pack what was found.
+
+    python experiments/benchmark_policies.py --algos hybrid --seeds 0,1,2      # goes on where it was stopped
+    python experiments/benchmark_policies.py --pack experiments/policies.zip   # what is there, as one archive
+    python experiments/benchmark_policies.py --table experiments/policies.zip  # the table of docs/policies.md
+
+A run leaves TASK-ALGO-SEED with its policy, its log and evaluation.json: 15 unseen starts, and 15 times the one start.
+The hybrid begins with the trajectories in experiments/trajopt; with --source scripted, it begins with the scripted
+demonstrations of tasks, and runs are called TASK-scripted-SEED.
+"""
+
+from __future__ import annotations
+
+import json
+import statistics
+import sys
+import time
+import zipfile
+from pathlib import Path
+from typing import Any
+
+from options import Parser, save
+
+ROOT = Path(__file__).parent
+TASKS = ("coiling", "gathering", "lifting", "separation", "slingshot", "unknotting", "wiring_post", "wrapping")
+KEPT = ("policy.pt", "evaluation.json", "stages.json", "expert.json", "result.json")
+
+
+def options() -> Any:
+    """Read the options."""
+    parser = Parser(__file__, description=__doc__)
+    parser.add_argument("--tasks", default=",".join(TASKS), help="names, with commas")
+    parser.add_argument("--algos", default="hybrid", help="ppo, sac, shac, sapo, hybrid, with commas")
+    parser.add_argument("--seeds", default="0", help="seeds, with commas")
+    parser.add_argument("--episodes", type=int, default=None, help="budget; default: the published one")
+    parser.add_argument("--minutes", type=float, default=None, help="budget of the clock of each run")
+    parser.add_argument("--fidelity", default=None, help="of training, for algorithms without stages")
+    parser.add_argument("--without", default="", help="stages of the hybrid to leave out, with commas")
+    parser.add_argument("--source", default="found", choices=("found", "scripted"), help="what the hybrid begins with")
+    parser.add_argument("--starts", type=int, default=15, help="episodes of each judgement")
+    parser.add_argument("--out", default="runs/policies", help="folder of the runs")
+    parser.add_argument("--pack", default="", help="write an archive of what is in --out, and end")
+    parser.add_argument("--table", default="", help="print the table of an archive, and end")
+    return parser.parse_args()
+
+
+def scripted(name: str, folder: Path) -> Path:
+    """Write the tools' path of a scripted demonstration as a trajectory."""
+    import torch
+
+    from torchdlo.envs import find
+    from torchdlo.envs.core import episode
+
+    file = folder / f"{name}-scripted" / "trajectory.json"
+    if not file.exists():
+        task = find(name)
+        with torch.no_grad():
+            actions = task.reference().float()[None]
+            went = episode.play(task, actions, keep=episode.places, compiled=False, recorded=True)
+        content = {"generator": "torchdlo optimize", "task": name, "success": bool(went.success[0])}
+        save(str(file), content | {"tool": went.path["tool"][:, 0].tolist()})
+    return file
+
+
+def run(name: str, algo: str, seed: int, chosen: Any) -> None:
+    """Train one policy and judge it; what is done is not done again."""
+    from torchdlo.agents.policies import load
+    from torchdlo.agents.rl.evaluate import evaluate
+    from torchdlo.agents.rl.hybrid import STAGES, hybrid
+    from torchdlo.agents.rl.results import prepared, train_json
+    from torchdlo.agents.rl.settings import preset
+    from torchdlo.agents.rl.training import train
+    from torchdlo.envs import find
+
+    label = "scripted" if algo == "hybrid" and chosen.source == "scripted" else algo
+    folder, task, began = Path(chosen.out) / f"{name}-{label}-{seed}", find(name), time.process_time()
+
+    def told(stage: str, done: int, total: int, message: str) -> None:
+        print(f"{time.process_time() - began:7.0f} CPU s  {folder.name} {stage} {done}/{total} {message}", flush=True)
+
+    if (folder / "evaluation.json").exists():
+        return
+    given = {"seed": seed, "minutes": chosen.minutes}
+    if algo == "hybrid":
+        files = [ROOT / "trajopt" / f"{name}-hybrid-{k}" / "trajectory.json" for k in range(3)]
+        if label == "scripted":
+            files = [scripted(name, Path(chosen.out))]
+        # The path is searched once for all seeds: policies differ in what is learned.
+        first = folder.with_name(f"{name}-{label}-0") / "expert.json"
+        expert = first if seed and first.exists() else None
+        stages = [s for s in STAGES if s not in chosen.without.split(",")]
+        choices = {"folder": folder, "stages": stages, "expert": expert, "resume": True, "callback": told}
+        hybrid(task, files, preset(name, algo, **given), **choices)
+    else:
+        settings = preset(name, algo, episodes=chosen.episodes, fidelity=chosen.fidelity, **given)
+        trainer, played = prepared(task, settings)
+        resume = (folder / "checkpoint.pt").exists()
+        found = train(trainer, played, settings, folder=folder, resume=resume, callback=told)
+        (folder / "result.json").write_text(train_json(task, settings, found))
+    results, _ = evaluate([load(folder)], task, starts=chosen.starts)
+    results |= {"generator": "torchdlo evaluate", "algorithm": label, "seed": seed}
+    save(str(folder / "evaluation.json"), results)
+    told("judged", 1, 1, f"success {results['varied']['success']:.0%} from unseen starts")
+
+
+def pack(out: Path, file: Path) -> None:
+    """Write what is to be kept of all finished runs to one archive."""
+    from torchdlo.files import replacing
+
+    with replacing(file) as scratch, zipfile.ZipFile(scratch, "w", zipfile.ZIP_DEFLATED) as archive:
+        for folder in sorted(p.parent for p in out.glob("*/evaluation.json")):
+            for name in KEPT:
+                if (folder / name).exists():
+                    archive.write(folder / name, f"{folder.name}/{name}")
+
+
+def rows(file: Path) -> list[dict[str, Any]]:
+    """Return a row for each task and algorithm of an archive: means over the seeds."""
+    groups: dict[tuple[str, str], list[dict[str, Any]]] = {}
+    with zipfile.ZipFile(file) as archive:
+        names = set(archive.namelist())
+        for name in sorted(names):
+            folder, _, last = name.partition("/")
+            if last != "evaluation.json":
+                continue
+            found = json.loads(archive.read(name))
+            spent = {}
+            for other in ("stages.json", "result.json"):
+                if f"{folder}/{other}" in names:
+                    spent[other] = json.loads(archive.read(f"{folder}/{other}"))
+            groups.setdefault((found["task"], found["algorithm"]), []).append(found | {"spent": spent})
+    return [_row(task, algo, runs) for (task, algo), runs in groups.items()]
+
+
+def _episodes(run: dict[str, Any]) -> int:
+    stages = run["spent"].get("stages.json")
+    if stages:
+        return sum(stages[s]["episodes"] for s in ("robust", "clone", "tune") if s in stages)
+    return run["spent"]["result.json"]["episodes"]
+
+
+def _row(task: str, algo: str, runs: list[dict[str, Any]]) -> dict[str, Any]:
+    from torchdlo.agents.rl.evaluate import wilson
+    from torchdlo.agents.rl.settings import PUBLISHED
+
+    count = sum(r["varied"]["episodes"] for r in runs)
+    hits = round(sum(r["varied"]["success"] * r["varied"]["episodes"] for r in runs))
+    return {
+        "task": task,
+        "algorithm": algo,
+        "seeds": len(runs),
+        "success": hits / count,
+        "interval": wilson(hits, count),
+        "return": statistics.mean(r["varied"]["return"] for r in runs),
+        "one_success": statistics.mean(r["one"]["success"] for r in runs),
+        "one_return": statistics.mean(r["one"]["return"] for r in runs),
+        "episodes": max(_episodes(r) for r in runs),
+        "published": PUBLISHED.get(task, {}).get(algo),
+    }
+
+
+def table(found: list[dict[str, Any]]) -> str:
+    """Return rows as a table of Markdown."""
+    lines = [
+        "| task | algorithm | seeds | unseen starts: success | 95 % | return | one start: success | return | episodes | "
+        "published: return, success |",
+        "|---|---|---|---|---|---|---|---|---|---|",
+    ]
+    for r in sorted(found, key=lambda r: (r["algorithm"], r["task"])):
+        low, high = r["interval"]
+        known = "" if r["published"] is None else f"{r['published'][0]:.2f}, {r['published'][1]:.0%}"
+        cells = [r["task"], r["algorithm"], str(r["seeds"]), f"{r['success']:.0%}", f"{low:.0%} to {high:.0%}"]
+        cells += [f"{r['return']:.2f}", f"{r['one_success']:.0%}", f"{r['one_return']:.2f}", str(r["episodes"]), known]
+        lines.append(f"| {' | '.join(cells)} |")
+    for algo in sorted({r["algorithm"] for r in found}):
+        own = [r["success"] for r in found if r["algorithm"] == algo]
+        lines.append(f"\n{algo}: mean success from unseen starts over {len(own)} tasks {statistics.mean(own):.0%}.")
+    return "\n".join(lines) + "\n"
+
+
+def main() -> None:
+    """Run what is asked for."""
+    chosen = options()
+    if chosen.table:
+        sys.stdout.write(table(rows(Path(chosen.table))))
+        return
+    if chosen.pack:
+        pack(Path(chosen.out), Path(chosen.pack))
+        return
+    import torch
+
+    torch.set_num_threads(1)
+    for seed in chosen.seeds.split(","):
+        for algo in chosen.algos.split(","):
+            for name in chosen.tasks.split(","):
+                run(name, algo, int(seed), chosen)
+
+
+if __name__ == "__main__":
+    main()
