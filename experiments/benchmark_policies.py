@@ -4,7 +4,7 @@
     python experiments/benchmark_policies.py --pack experiments/policies.zip   # what is there, as one archive
     python experiments/benchmark_policies.py --table experiments/policies.zip  # the table of docs/policies.md
 
-A run leaves TASK-ALGO-SEED with its policy, its log and evaluation.json: 15 unseen starts, and 15 times the one start.
+A run leaves TASK-ALGO-SEED with its policy, its log and evaluation.json: 15 unseen starts, and the one start.
 The hybrid begins with the trajectories in experiments/trajopt; with --source scripted, it begins with the scripted
 demonstrations of tasks, and runs are called TASK-scripted-SEED.
 """
@@ -162,8 +162,8 @@ def _row(task: str, algo: str, runs: list[dict[str, Any]]) -> dict[str, Any]:
 def table(found: list[dict[str, Any]]) -> str:
     """Return rows as a table of Markdown."""
     lines = [
-        "| task | algorithm | seeds | unseen starts: success | 95 % | return | one start: success | return | episodes | "
-        "published: return, success |",
+        "| task | algorithm | seeds | success, unseen starts | 95 % | return | success, one start | return | episodes | "
+        "published |",
         "|---|---|---|---|---|---|---|---|---|---|",
     ]
     for r in sorted(found, key=lambda r: (r["algorithm"], r["task"])):

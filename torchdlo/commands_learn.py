@@ -13,7 +13,6 @@ from torchdlo.errors import InputError
 from torchdlo.files import check_writable, write_atomically
 
 if TYPE_CHECKING:
-    from torchdlo.agents.policies import Policy
     from torchdlo.agents.rl.settings import Settings
     from torchdlo.envs import Task
 
@@ -259,13 +258,13 @@ def evaluate(
     typer.echo(summary(results), err=as_json)
     typer.echo(f"results: {out / 'evaluation.json'}", err=as_json)
     if film:
-        for file in _films(found, task, plays[names[-1]], out):
+        for file in _films(task, plays[names[-1]], out):
             typer.echo(f"film:    {file}", err=as_json)
     if as_json:
         typer.echo(content)
 
 
-def _films(policies: list[Policy], task: Task, plays: list[dict[str, Any]], out: Path) -> list[Path]:
+def _films(task: Task, plays: dict[str, Any], out: Path) -> list[Path]:
     """Film the best and the worst episode; each is played again alone, with the actions that were taken."""
     import torch
 
@@ -273,17 +272,14 @@ def _films(policies: list[Policy], task: Task, plays: list[dict[str, Any]], out:
     from torchdlo.report.render.episode_film import film
     from torchdlo.report.render.video import write_video
 
-    rows = [
-        (bool(row["success"][k]), float(row["returns"][k]), row["actions"][k], row["moved"][k : k + 1])
-        for row in plays
-        for k in range(len(row["success"]))
-    ]
-    rows.sort(key=lambda row: row[:2])
+    success, returns = plays["success"].flatten(), plays["returns"].flatten()
+    order = sorted(range(len(success)), key=lambda k: (bool(success[k]), float(returns[k])))
+    actions, moved = plays["actions"].flatten(0, 1), plays["moved"].flatten(0, 1)
     files = []
-    for name, (_, _, actions, moved) in {"best.mp4": rows[-1], "worst.mp4": rows[0]}.items():
+    for name, k in {"best.mp4": order[-1], "worst.mp4": order[0]}.items():
         with torch.no_grad():
-            made = episode.prepare_at(task, moved, compiled=False, recorded=True)
-            frames, _ = film(task, actions, made=made)
+            made = episode.prepare_at(task, moved[k : k + 1], compiled=False, recorded=True)
+            frames, _ = film(task, actions[k], made=made)
         with progress() as show, deferred_interrupt(show) as callback:
             write_video(frames, out / name, speed=0.5, callback=callback)
         files.append(out / name)

@@ -87,9 +87,9 @@ def test_a_clone_does_what_its_expert_does(tmp_path: Path):
     assert [row["fidelity"] for row in notes["clone"]["log"]] == ["1ms/2", "1ms/2", "1ms/5"]
     result, plays = evaluate([policy], Lead(), protocols=("one", "varied"))
     assert result["varied"]["success"] >= 0.9 and result["one"]["success"] == 1
-    assert plays["varied"][0]["actions"].shape == (15, 6, 6)
+    assert plays["varied"]["actions"].shape == (1, 15, 6, 6)
     # All starts of the first protocol are alike, those of the second are not.
-    assert float(plays["one"][0]["moved"].abs().max()) == 0 < float(plays["varied"][0]["moved"].std())
+    assert float(plays["one"]["moved"].abs().max()) == 0 < float(plays["varied"]["moved"].std())
 
 
 def test_stages_that_are_done_are_not_run_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -129,14 +129,20 @@ def test_tuning_keeps_the_best(tmp_path: Path):
 def test_judgements_are_at_the_published_fidelity_and_repeatable(tmp_path: Path):
     policy, _ = hybrid(Lead(), [found(tmp_path)], settings(), folder=tmp_path, plan=PLAN, stages=("clone",))
     rough = envs.simulated(Lead(), "1ms/2")
-    first, second, third = (judged(policy, task) for task in (Lead(), rough, Lead()))
-    assert torch.equal(first["returns"], second["returns"]) and torch.equal(first["returns"], third["returns"])
-    other = judged(policy, Lead(), protocol="disturbed")
-    assert not torch.equal(first["actions"], other["actions"])
+    other = stages.task_policy(Lead(), settings(seed=1), squash=False)
+    first, second = (judged([policy, other], task, starts=4)["varied"] for task in (Lead(), rough))
+    assert torch.equal(first["returns"], second["returns"])
+    # Both have the same starts, and each does in one batch with the other what it does alone.
+    assert torch.equal(first["moved"][0], first["moved"][1])
+    assert not torch.equal(first["actions"][0], first["actions"][1])
+    alone = judged([policy], Lead(), starts=4, protocols=("varied",))["varied"]
+    torch.testing.assert_close(alone["returns"][0], first["returns"][0], rtol=0, atol=1e-3)
+    disturbed = judged([policy], Lead(), starts=4, protocols=("disturbed",))["disturbed"]
+    assert not torch.equal(alone["actions"], disturbed["actions"])
     # Training starts are not those of the judgement.
-    train = TaskEpisodes(Lead(), 15, seed=0)
+    train = TaskEpisodes(Lead(), 4, seed=0)
     collect(policy, train, random=False)
-    assert not torch.equal(first["moved"], train.env.moved)
+    assert not torch.equal(alone["moved"][0], train.env.moved)
 
 
 def test_the_interval_of_a_share_is_wilsons():

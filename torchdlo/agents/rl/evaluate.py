@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -13,6 +14,8 @@ from torchdlo.agents.policies import Policy
 from torchdlo.agents.rl.episodes import TaskEpisodes
 from torchdlo.agents.rl.rollout import progress
 from torchdlo.envs import PUBLISHED, Task, simulated
+from torchdlo.envs.observation import observe
+from torchdlo.physics import tree
 
 __all__ = ["PROTOCOLS", "evaluate", "judged", "wilson"]
 
@@ -38,58 +41,90 @@ def wilson(successes: int, count: int) -> tuple[float, float]:
 
 @torch.no_grad()
 def judged(
-    policy: Policy,
+    policies: Sequence[Policy],
     task: Task,
     *,
     starts: int = 15,
-    protocol: str = "varied",
+    protocols: Sequence[str] = ("one", "varied"),
     seed: int = 0,
     callback: Callable[[str, int, int, str], None] | None = None,
     compiled: bool = False,
-) -> dict[str, Any]:
-    """Return how a policy does: success, failure and return of every episode, and its actions.
+) -> dict[str, dict[str, Tensor]]:
+    """Return how policies do, all in one batch: by protocol what became of all episodes, (policies, starts, ...).
+
+    Policies take the middle of what they could do. From the one start, each has one episode: others would be the same.
 
     Args:
-        policy: it takes the middle of what it could do.
+        policies: of one task.
         task: played at the published fidelity whatever it says.
-        starts: how many episodes.
-        protocol: of `PROTOCOLS`.
+        starts: how many episodes of each policy, the same starts for all.
+        protocols: "disturbed" alone, or of the others.
         seed: of starts and noise.
         callback: told (stage, actions done, all, message).
         compiled: whether steps are compiled.
     """
-    how = PROTOCOLS[protocol]
+    how = PROTOCOLS[protocols[-1]]
     fine = simulated(task, PUBLISHED)
-    share = how.get("randomize", 0.0)
-    randomize = None
-    if share:
-        scene = fine.start(1)[0]
-        known = {f"{e.name}.{number}" for e in scene.effects for number in e.params}
-        randomize = {name: share for name in _RANDOM if name in known}
+    many = starts if how["variation"] else 0
+    one = int("one" in protocols)
     episodes = TaskEpisodes(
-        fine, starts, seed=_UNSEEN + seed, variation=how["variation"], compiled=compiled, randomize=randomize
+        fine,
+        len(policies) * (many + one),
+        seed=_UNSEEN + seed,
+        compiled=compiled,
+        randomize=_randomized(fine, how.get("randomize", 0.0)),
     )
     rng = torch.Generator().manual_seed(_UNSEEN + seed + 1)
-    seen = episodes.reset()
+    seen = _shared(episodes, len(policies), many, one)
     actions: list[Tensor] = []
     step: Any = None
     for k in range(episodes.horizon):
-        action = policy.mean(policy.features(seen, progress(episodes, k, seen)))
+        rows = zip(policies, seen.chunk(len(policies)), strict=True)
+        share = progress(episodes, k, seen)[: many + one]
+        stage_waypoints = torch.stack([p.mean(p.features(part, share)) for p, part in rows])
         if how.get("noise"):
-            action = action + torch.randn(action.shape, generator=rng) * (how["noise"] / policy.spec.reach)
-        command = policy.command(action)
-        actions.append(command)
-        step = episodes.step(command)
+            stage_waypoints = stage_waypoints + torch.randn(stage_waypoints.shape[1:], generator=rng) * (
+                how["noise"] / task.reach
+            )
+        actions.append(policies[0].command(stage_waypoints.flatten(0, 1)))
+        step = episodes.step(actions[-1])
         seen = torch.nan_to_num(step.observation)
         if callback is not None:
-            callback("evaluate", k + 1, episodes.horizon, protocol)
-    return {
+            callback("evaluate", k + 1, episodes.horizon, ", ".join(protocols))
+    found = {
         "success": step.success & ~step.failed,
         "failed": step.failed,
         "returns": episodes.returns,
         "actions": torch.stack(actions, 1),
         "moved": episodes.env.moved,
     }
+    parts = {name: x.unflatten(0, (len(policies), many + one)) for name, x in found.items()}
+    plays = {protocols[-1]: {name: x[:, :many] for name, x in parts.items()}} if many else {}
+    return plays | ({"one": {name: x[:, many:] for name, x in parts.items()}} if one else {})
+
+
+def _randomized(task: Task, share: float) -> dict[str, float] | None:
+    """Return which numbers are drawn anew, of those that the task has."""
+    if not share:
+        return None
+    scene = task.start(1)[0]
+    known = {f"{e.name}.{number}" for e in scene.effects for number in e.params}
+    return {name: share for name in _RANDOM if name in known}
+
+
+def _shared(episodes: TaskEpisodes, policies: int, starts: int, one: int) -> Tensor:
+    """Begin so that all policies have the same starts, and the one start at last; return what is seen."""
+    episodes.reset()
+    env = episodes.env
+    usual = tree.map(torch.clone, env.episode.start)
+    index = torch.arange(starts + one).clamp(max=max(0, starts - 1)).repeat(policies)
+    last = (torch.arange(starts + one) >= starts).repeat(policies)
+    env.world = tree.where(last, usual, tree.map(lambda x: x[index], env.world))
+    env.moved = torch.where(last[:, None, None], 0.0, env.moved[index])
+    count = env.batch_size[0]
+    effects = tree.map(lambda x: x[index] if len(x) == count else x, env.episode.params.effects)
+    env.episode = replace(env.episode, params=tree.replace(env.episode.params, effects=effects))
+    return observe(env.episode, env.world)
 
 
 def evaluate(
@@ -100,8 +135,8 @@ def evaluate(
     protocols: Sequence[str] = ("one", "varied"),
     callback: Callable[[str, int, int, str], None] | None = None,
     compiled: bool = False,
-) -> tuple[dict[str, Any], dict[str, list[dict[str, Any]]]]:
-    """Return results as plain data, and all episodes by protocol and policy.
+) -> tuple[dict[str, Any], dict[str, dict[str, Tensor]]]:
+    """Return results as plain data, and what became of all episodes by protocol, see `judged`.
 
     Args:
         policies: of one task, one for each seed of training; all are judged from the same starts.
@@ -112,19 +147,21 @@ def evaluate(
         compiled: whether steps are compiled.
     """
     found: dict[str, Any] = {}
-    plays: dict[str, list[dict[str, Any]]] = {}
-    for name in protocols:
-        rows = [judged(p, task, starts=starts, protocol=name, callback=callback, compiled=compiled) for p in policies]
-        plays[name] = rows
-        success = torch.stack([r["success"] for r in rows])
+    plays: dict[str, dict[str, Tensor]] = {}
+    calm = [name for name in ("one", "varied") if name in protocols]
+    for names in (calm, ["disturbed"] if "disturbed" in protocols else []):
+        if names:
+            plays |= judged(policies, task, starts=starts, protocols=names, callback=callback, compiled=compiled)
+    for name, rows in plays.items():
+        success, returns = rows["success"], rows["returns"]
         low, high = wilson(int(success.sum()), success.numel())
         found[name] = {
             "episodes": success.numel(),
             "success": float(success.float().mean()),
             "interval": [low, high],
             "success_by_policy": success.float().mean(1).tolist(),
-            "return": float(torch.stack([r["returns"] for r in rows]).mean()),
-            "return_by_policy": [float(r["returns"].mean()) for r in rows],
-            "failed": float(torch.stack([r["failed"] for r in rows]).float().mean()),
+            "return": float(returns.mean()),
+            "return_by_policy": returns.mean(1).tolist(),
+            "failed": float(rows["failed"].float().mean()),
         }
     return {"task": task.name, "fidelity": PUBLISHED.text, "starts": starts, "policies": len(policies)} | found, plays
