@@ -162,7 +162,7 @@ def _row(task: str, algo: str, runs: list[dict[str, Any]]) -> dict[str, Any]:
 def table(found: list[dict[str, Any]]) -> str:
     """Return rows as a table of Markdown."""
     lines = [
-        "| task | algorithm | seeds | success, unseen starts | 95 % | return | success, one start | return | episodes | "
+        "| task | algorithm | seeds | success, unseen starts | 95 % | return | one start | return | episodes | "
         "published |",
         "|---|---|---|---|---|---|---|---|---|---|",
     ]

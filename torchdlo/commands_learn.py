@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from torchdlo.agents.rl.settings import Settings
     from torchdlo.envs import Task
 
-__all__ = ["evaluate", "train"]
+__all__ = ["deploy", "evaluate", "train"]
 
 _INTERRUPTED = 130
 """Exit code after Ctrl-C, as shells have it."""
@@ -284,3 +284,88 @@ def _films(task: Task, plays: dict[str, Any], out: Path) -> list[Path]:
             write_video(frames, out / name, speed=0.5, callback=callback)
         files.append(out / name)
     return files
+
+
+def deploy(
+    source: Annotated[
+        Path, typer.Argument(help="What optimize or train found: trajectory.json, policy.pt or its folder.")
+    ],
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="File to write. Default: beside the source.")] = None,
+    kind: Annotated[
+        str, typer.Option("--format", help="ros2 has the shape of trajectory_msgs.", metavar="csv|json|ros2")
+    ] = "csv",
+    vary: Annotated[
+        int | None, typer.Option(min=0, help="Seed of a start that differs from the usual one.", metavar="SEED")
+    ] = None,
+    urdf: Annotated[
+        Path | None, typer.Option(help="Arms of another kind, which follow the tools' path.", metavar="FILE")
+    ] = None,
+    tool: Annotated[str | None, typer.Option(help="Link of that arm that is the tool.", metavar="LINK")] = None,
+    speed: Annotated[float, typer.Option(help="Share of the joints' greatest speeds to use.")] = 1.0,
+    acceleration: Annotated[float, typer.Option(help="Greatest acceleration of a joint in rad/s^2.")] = 10.0,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Play the file in the simulator.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print what it came to as JSON.")] = False,
+) -> None:
+    """Write joint positions and velocities for real arms.
+
+    Positions are checked against the limits of the joints; the motion is slowed down evenly where speeds are too great.
+    Of a policy, it is what it does in one simulated episode.
+
+    [bold]Examples:[/bold]
+
+    torchdlo deploy runs/optimize/coiling-hybrid/trajectory.json --format ros2 --dry-run
+
+    torchdlo deploy runs/train/lifting-hybrid --vary 3 --speed 0.5
+    """
+    import torch
+
+    from torchdlo.agents import deployment
+    from torchdlo.agents.policies import Policy
+
+    if kind not in deployment.FORMATS:
+        raise InputError(f"--format {kind}: expected one of {', '.join(deployment.FORMATS)}.")
+    task, what = _source(source)
+    folder = source if source.is_dir() else source.parent
+    out = out or folder / ("joints.csv" if kind == "csv" else f"joints-{kind}.json")
+    marks = {"csv": b"time,", "json": b"torchdlo", "ros2": b"joint_names"}
+    check_writable(out, mark=marks[kind])
+    robots = deployment.arms_of(task, urdf, tool)
+    seeded = torch.Generator().manual_seed(vary or 0)
+    moved = task.moved(1, generator=seeded, variation=vary is not None)
+    path, good = deployment.played(task, what, moved)
+    motion = deployment.timed(task, robots, path, same=urdf is None, share=speed, acceleration=acceleration)
+    said: dict[str, Any] = {"task": task.name, "success": good, "slower": motion.slower}
+    said |= {"seconds": float(motion.time[-1]), "points": len(motion.time), "vary": vary}
+    write_atomically(out, deployment.text(motion, kind, said))
+    if dry_run:
+        said["dry_run_success"] = deployment.replayed(task, robots, motion.position, moved)
+    what_for = "policy" if isinstance(what, Policy) else "trajectory"
+    how = "success" if good else "no success"
+    typer.echo(
+        f"{task.name}: {how} of the {what_for} in the simulation; {said['seconds']:.2f} s, {motion.slower:.2f} times "
+        "as long as there",
+        err=as_json,
+    )
+    if dry_run:
+        typer.echo(f"dry run: {'success' if said['dry_run_success'] else 'no success'}", err=as_json)
+    typer.echo(f"joints: {out}", err=as_json)
+    if as_json:
+        typer.echo(json.dumps(said | {"file": str(out)}, indent=1))
+
+
+def _source(path: Path) -> tuple[Task, Any]:
+    """Return the task, and the actions of a trajectory (T, A) or a policy."""
+    from torchdlo.agents.policies import load
+    from torchdlo.agents.trajopt.result import load_actions
+    from torchdlo.agents.trajopt.task_problem import TaskProblem
+    from torchdlo.envs import find
+
+    if path.is_dir() or path.suffix != ".json":
+        policy = load(path)
+        return find(policy.spec.task), policy
+    try:
+        name = json.loads(path.read_text(encoding="utf-8"))["task"]
+    except (OSError, ValueError, KeyError, TypeError):
+        raise InputError(f"{path}: expected a trajectory of torchdlo optimize, found something else.") from None
+    problem = TaskProblem(find(name), compiled=False)
+    return problem.task, problem.full(load_actions(path, problem))
