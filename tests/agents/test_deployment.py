@@ -1,0 +1,126 @@
+"""Joint targets for real arms: limits, time, files, and a dry run."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+pytest.importorskip("pytorch_kinematics", reason="arms need the extra robots")
+
+sys.path.insert(0, str(Path(__file__).parent / "rl"))
+from lead import Lead
+
+from torchdlo import envs
+from torchdlo.agents import deployment
+from torchdlo.agents.deployment import PredictedMotion, arms_of, played, replayed, text, timed
+from torchdlo.cli import app
+from torchdlo.coupling.robot.kinematics import panda, tool_pose
+from torchdlo.errors import InputError
+
+HERE = torch.zeros(1, 1, 3)
+
+
+def actions() -> torch.Tensor:
+    made = torch.zeros(6, 6)
+    made[:, 1] = 0.025 / 6
+    return made
+
+
+@pytest.fixture(scope="module")
+def path() -> dict[str, torch.Tensor]:
+    found, good = played(Lead(), actions(), HERE)
+    assert good
+    return found
+
+
+def test_joints_bring_the_tool_along_the_path(path):
+    motion = timed(Lead(), arms_of(Lead()), path, same=True)
+    assert motion.position.shape == (7, 7)
+    full = torch.cat([motion.position, torch.zeros(7, 1, dtype=torch.float64)], -1)
+    tool = tool_pose(panda(base=Lead.arms.base[0]), full).pos
+    # 25 mm to the left, as the actions say.
+    torch.testing.assert_close((tool[-1] - tool[0])[1], torch.tensor(0.025, dtype=torch.float64), atol=2e-4, rtol=0)
+
+
+def test_speeds_and_accelerations_stay_within_their_limits(path):
+    robots = arms_of(Lead())
+    limit = robots[0].velocity[robots[0].arm]
+    motion = timed(Lead(), robots, path, same=True, share=0.5, acceleration=10.0)
+    # 4 mm in 2 ms is far too fast for an arm.
+    assert motion.slower > 1
+    steps = motion.position.diff(dim=0) / motion.time.diff()[:, None]
+    assert (steps.abs() <= 0.5 * limit * (1 + 1e-9)).all()
+    assert (motion.velocity.abs() <= 0.5 * limit * (1 + 1e-9)).all()
+    assert float(motion.acceleration.abs().max()) <= 10.0 * (1 + 1e-9)
+    assert (motion.velocity[0] == 0).all() and (motion.velocity[-1] == 0).all()
+    assert float(motion.time[-1]) == pytest.approx(6 * 0.002 * motion.slower)
+
+
+def test_velocities_are_central_differences():
+    x = torch.tensor([[0.0], [1.0], [4.0], [9.0]], dtype=torch.float64)
+    velocity, bend = deployment._derivatives(x, 1.0)
+    assert velocity.flatten().tolist() == [0, 2, 4, 0]
+    # 1 - 0, second differences of squares, and back to rest.
+    assert bend.flatten().tolist() == [1, 2, 2, -5]
+
+
+def test_joints_beyond_their_limits_are_named(path):
+    wrong = path | {"joints": path["joints"] + torch.tensor([0.0, 0, 0, 5.0, 0, 0, 0, 0])}
+    with pytest.raises(InputError, match=r"joint .*4.* would be .* beyond its limit at point"):
+        timed(Lead(), arms_of(Lead()), wrong, same=True)
+
+
+def test_another_arm_follows_the_tools_path(path):
+    """The same arm, but found by inverse kinematics alone."""
+    motion = timed(Lead(), arms_of(Lead()), path, same=False)
+    full = torch.cat([motion.position, torch.zeros(7, 1, dtype=torch.float64)], -1)
+    tool = tool_pose(panda(base=Lead.arms.base[0]), full).pos
+    torch.testing.assert_close(tool, path["pos"][:, 0], atol=1e-3, rtol=0)
+
+
+def test_a_path_out_of_reach_is_refused(path):
+    far = path | {"pos": path["pos"] + 3}
+    with pytest.raises(InputError, match="cannot get to point 0"):
+        timed(Lead(), arms_of(Lead()), far, same=False)
+
+
+def test_the_simulator_plays_what_was_written(path):
+    motion = timed(Lead(), arms_of(Lead()), path, same=True)
+    assert replayed(Lead(), arms_of(Lead()), motion.position, HERE)
+    assert not replayed(Lead(), arms_of(Lead()), motion.position[:1].expand(7, -1), HERE)
+
+
+def test_files_say_the_same():
+    time = torch.tensor([0.0, 1.25], dtype=torch.float64)
+    numbers = [torch.tensor([[a], [b]], dtype=torch.float64) for a, b in ((0.1, 0.2), (0.0, 0.5), (0.3, -0.3))]
+    motion = PredictedMotion(("elbow",), time, *numbers, 2.0)
+    rows = list(csv.DictReader(text(motion, "csv", {}).splitlines()))
+    assert rows[1] == {"time": "1.25", "elbow": "0.2", "elbow_velocity": "0.5"}
+    plain = json.loads(text(motion, "json", {"task": "lead"}))
+    assert (plain["task"], plain["joints"], plain["position"]) == ("lead", ["elbow"], [[0.1], [0.2]])
+    ros = json.loads(text(motion, "ros2", {}))
+    assert ros["joint_names"] == ["elbow"]
+    assert ros["points"][1]["time_from_start"] == {"sec": 1, "nanosec": 250_000_000}
+    assert ros["points"][1]["velocities"] == [0.5]
+
+
+def test_the_command_writes_a_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys):
+    monkeypatch.setitem(envs.TASKS, "lead", Lead)
+    file = tmp_path / "trajectory.json"
+    file.write_text(json.dumps({"task": "lead", "actions": actions()[:, :3].tolist()}))
+    with pytest.raises(SystemExit) as done:
+        app.main(["deploy", str(file), "--format", "ros2", "--dry-run", "--json"])
+    assert done.value.code in (0, None)
+    said = json.loads(capsys.readouterr().out)
+    assert said["success"] and said["dry_run_success"] and said["points"] == 7
+    written = json.loads((tmp_path / "joints-ros2.json").read_text())
+    assert len(written["points"]) == 7 and math.isfinite(written["points"][3]["positions"][0])
+    with pytest.raises(SystemExit) as done:
+        app.main(["deploy", str(file), "--format", "yaml"])
+    assert done.value.code == 2
