@@ -1,0 +1,44 @@
+"""The table of policies is made of what is stored."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import sys
+from pathlib import Path
+
+import pytest
+
+EXPERIMENTS = Path(__file__).parents[2] / "experiments"
+
+
+@pytest.fixture
+def script(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.syspath_prepend(str(EXPERIMENTS))
+    yield importlib.import_module("benchmark_policies")
+    sys.modules.pop("benchmark_policies", None)
+
+
+def stored(folder: Path, success: float, seed: int) -> None:
+    folder.mkdir(parents=True)
+    varied = {"episodes": 15, "success": success, "return": 60.0 + seed}
+    found = {"task": "wiring_post", "algorithm": "ppo", "seed": seed, "varied": varied}
+    (folder / "evaluation.json").write_text(json.dumps(found | {"one": {"success": 1.0, "return": 65.0}}))
+    (folder / "result.json").write_text(json.dumps({"episodes": 100 + seed}))
+    (folder / "checkpoint.pt").write_text("large")
+
+
+def test_rows_are_means_over_seeds_and_the_archive_has_no_checkpoints(script, tmp_path: Path):
+    stored(tmp_path / "wiring_post-ppo-0", 9 / 15, 0)
+    stored(tmp_path / "wiring_post-ppo-1", 12 / 15, 1)
+    (tmp_path / "wiring_post-ppo-2").mkdir()  # not finished
+    file = tmp_path / "all.zip"
+    script.pack(tmp_path, file)
+    (row,) = script.rows(file)
+    assert (row["seeds"], row["success"], row["return"], row["episodes"]) == (2, 21 / 30, 60.5, 101)
+    # Wilson's interval of 21 in 30.
+    assert row["interval"] == pytest.approx((0.5212, 0.8333), abs=1e-3)
+    text = script.table([row])
+    assert "| wiring_post | ppo | 2 | 70% | 52% to 83% | 60.50 | 100% | 65.00 | 101 | 62.17, 67% |" in text
+    assert "ppo: mean success from unseen starts over 1 tasks 70%." in text
+    assert file.stat().st_size < 2000
