@@ -75,7 +75,7 @@ def played(task: Task, what: Tensor | Policy, moved: Tensor) -> tuple[dict[str, 
     for k in range(task.horizon):
         if isinstance(what, Policy):
             share = torch.full((1, 1), k / task.horizon)
-            action = what.act(observe(made, world), share)
+            action = what.act(observe(made, world), share, observe(made, made.start))
         else:
             action = what[k : k + 1]
         world = episode.act(made, world, action.to(moved))

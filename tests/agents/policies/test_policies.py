@@ -30,6 +30,14 @@ def test_features_are_places_and_places_relative_to_tools():
     assert spec.width == len(wanted)
 
 
+def test_points_of_the_start_are_remembered():
+    spec = FeatureSpec(6, (0, 3), ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0)), memory=(1,))
+    now, start = torch.zeros(1, 6), torch.tensor([[7.0, 7, 7, 4, 5, 6]])
+    assert Features(spec)(now, torch.zeros(1, 1), start)[0, 6:].tolist() == [3, 4, 5]
+    with pytest.raises(ValueError, match="remembers the start"):
+        Features(spec)(now, torch.zeros(1, 1))
+
+
 def test_the_share_of_the_episode_is_told_in_waves():
     spec = FeatureSpec(1, waves=2)
     seen = Features(spec)(torch.zeros(1, 1), torch.full((1, 1), 0.25))[0, 1:]
@@ -42,7 +50,8 @@ def test_task_features_find_ropes_bodies_and_tools_without_velocities(name: str)
     task = envs.find(name)
     spec = task_features(task)
     start = episode.prepare(task, 1, compiled=False).start
-    points = Features(spec)(episode.observe(episode.prepare(task, 1, compiled=False), start), torch.zeros(1, 1))
+    seen = episode.observe(episode.prepare(task, 1, compiled=False), start)
+    points = Features(spec)(seen, torch.zeros(1, 1), seen)
     # At the usual start, all points are where they usually are.
     count = 3 * len(spec.points)
     torch.testing.assert_close(points[0, :count], torch.zeros(count), rtol=0, atol=1e-6)
@@ -129,7 +138,7 @@ def test_a_policy_acts_in_torchrls_rollouts():
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         found = env.rollout(3, module(policy))
     first = found[:, 0]
-    wanted = policy.act(first["observation"], first["progress"])
+    wanted = policy.act(first["observation"], first["progress"], first["start"])
     torch.testing.assert_close(first["action"], wanted)
     torch.testing.assert_close(found["progress"][0, :, 0], torch.tensor([0, 1 / 3, 2 / 3]))
     with set_exploration_type(ExplorationType.RANDOM):

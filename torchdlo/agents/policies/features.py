@@ -1,7 +1,8 @@
 """What policies see of an observation: places of points, relative to tools as well, and the share of the episode.
 
 Velocities are left out, as sensors of a real cell do not have them. So are joint angles and orientations: tools hardly
-turn. All is a fixed linear map of the observation and some waves of the episode's share, so that gradients pass.
+turn. Where tools and free bodies were at the start is remembered: a rope that has moved does not tell any more where
+it lay. All is a fixed linear map of the observation and some waves of the episode's share, so that gradients pass.
 """
 
 from __future__ import annotations
@@ -35,13 +36,15 @@ class FeatureSpec:
     """Where these points are in the usual start [m]."""
     tools: tuple[int, ...] = ()
     """Which of the points are tools."""
+    memory: tuple[int, ...] = ()
+    """Which of the points are remembered as they were at the start."""
     waves: int = 0
     """Sines and cosines of the episode's share, each twice as many as one more half turn; 0: no share at all."""
 
     @property
     def width(self) -> int:
         """How many features there are."""
-        plain = 3 * len(self.points) * (1 + len(self.tools)) if self.points else self.size
+        plain = 3 * (len(self.points) * (1 + len(self.tools)) + len(self.memory)) if self.points else self.size
         return plain + (1 + 2 * self.waves if self.waves else 0)
 
     @classmethod
@@ -52,6 +55,7 @@ class FeatureSpec:
             tuple(plain["points"]),
             tuple(map(tuple, plain["centers"])),
             tuple(plain["tools"]),
+            tuple(plain.get("memory", ())),
             plain["waves"],
         )
 
@@ -67,14 +71,24 @@ class Features(nn.Module):
         self.register_buffer("_centers", torch.tensor(spec.centers).reshape(-1, 3), persistent=False)
         self.register_buffer("_wave", math.pi * torch.arange(1.0, spec.waves + 1), persistent=False)
 
-    def forward(self, observation: Tensor, progress: Tensor) -> Tensor:
-        """Return features."""
+    def _points(self, observation: Tensor) -> Tensor:
+        index = (self._at[:, None] + torch.arange(3, device=observation.device)).flatten()
+        return observation[..., index].unflatten(-1, (-1, 3))
+
+    def forward(self, observation: Tensor, progress: Tensor, start: Tensor | None = None) -> Tensor:
+        """Return features; `start` are observations at the start (N, O), where points of it are remembered."""
         parts = [observation]
         if self.spec.points:
-            index = (self._at[:, None] + torch.arange(3, device=observation.device)).flatten()
-            points = observation[..., index].unflatten(-1, (-1, 3))
+            points = self._points(observation)
             parts = [(points - self._centers).flatten(-2)]
             parts += [(points - points[..., k : k + 1, :]).flatten(-2) for k in self.spec.tools]
+        if self.spec.memory:
+            if start is None:
+                raise ValueError("features: this policy remembers the start; give what was observed there, too")
+            kept = list(self.spec.memory)
+            parts.append(
+                (self._points(start)[..., kept, :] - self._centers[kept]).flatten(-2).expand(*points.shape[:-2], -1)
+            )
         if self.spec.waves:
             angle = progress * self._wave
             parts += [progress, angle.sin(), angle.cos()]
@@ -117,8 +131,14 @@ class Normaliser(nn.Module):
         return ((features - self.mean.to(features)) / spread.to(features)).clamp(-10, 10)
 
 
-def task_features(task: Task, waves: int = 8) -> FeatureSpec:
-    """Return what a policy for a task sees: rope, free bodies, the middle of matter and tools."""
+def task_features(task: Task, waves: int = 24, *, memory: bool = True) -> FeatureSpec:
+    """Return what a policy for a task sees: rope, free bodies, the middle of matter and tools.
+
+    Args:
+        task: the task.
+        waves: see `FeatureSpec`.
+        memory: whether all but the rope is remembered as it was at the start.
+    """
     from torchdlo.envs.core import episode
 
     made = episode.prepare(task, 1, compiled=False)
@@ -133,7 +153,9 @@ def task_features(task: Task, waves: int = 8) -> FeatureSpec:
     points += range(begins[2], begins[3], 3)
     points += range(begins[4], begins[5], 3)
     tools = range(len(points), len(points) + task.arms.count)
+    ropes = len(range(begins[0], begins[1], 3 * step))
     points += range(begins[6], begins[6] + 3 * task.arms.count, 3)
     seen = episode.observe(made, world)[0].tolist()
     centers = tuple((seen[k], seen[k + 1], seen[k + 2]) for k in points)
-    return FeatureSpec(len(seen), tuple(points), centers, tuple(tools), waves)
+    kept = tuple(range(ropes, len(points))) if memory else ()
+    return FeatureSpec(len(seen), tuple(points), centers, tuple(tools), kept, waves)

@@ -58,24 +58,21 @@ def load(path: Path | str, notes: bool = False) -> Any:
 
 
 def module(policy: Policy) -> Any:
-    """Return a policy as a TensorDictModule from "observation" and "progress" to "action".
+    """Return a policy as a TensorDictModule from "observation", "progress" and "start" to "action".
 
     It draws actions at random where TorchRL's exploration type is RANDOM, and takes their middle otherwise.
     """
     from tensordict.nn import TensorDictModule
     from torchrl.envs.utils import ExplorationType, exploration_type
 
-    def act(observation: torch.Tensor, progress: torch.Tensor) -> torch.Tensor:
-        features = policy.features(observation, progress)
-        random = exploration_type() == ExplorationType.RANDOM
-        return policy.command(policy.draw(features)[0] if random else policy.mean(features))
-
     class _Acts(torch.nn.Module):
         def __init__(self) -> None:
             super().__init__()
             self.policy = policy
 
-        def forward(self, observation: torch.Tensor, progress: torch.Tensor) -> torch.Tensor:
-            return act(observation, progress)
+        def forward(self, observation: torch.Tensor, progress: torch.Tensor, start: torch.Tensor) -> torch.Tensor:
+            features = self.policy.features(observation, progress, start)
+            random = exploration_type() == ExplorationType.RANDOM
+            return self.policy.command(self.policy.draw(features)[0] if random else self.policy.mean(features))
 
-    return TensorDictModule(_Acts(), in_keys=["observation", "progress"], out_keys=["action"])
+    return TensorDictModule(_Acts(), in_keys=["observation", "progress", "start"], out_keys=["action"])

@@ -121,7 +121,9 @@ class Policy(nn.Module):
         )
 
     @torch.no_grad()
-    def act(self, observation: Tensor, progress: Tensor, *, random: bool = False) -> Tensor:
-        """Return the environment's actions for observations (N, O) and shares of the episode (N, 1)."""
-        features = self.features(observation, progress)
+    def act(
+        self, observation: Tensor, progress: Tensor, start: Tensor | None = None, *, random: bool = False
+    ) -> Tensor:
+        """Return the environment's actions for observations (N, O), now and at the start, and shares of the episode."""
+        features = self.features(observation, progress, start)
         return self.command(self.draw(features)[0] if random else self.mean(features))

@@ -10,7 +10,7 @@ from torch import Tensor
 from torchdlo.agents.policies import Policy
 from torchdlo.agents.rl.episodes import TaskEpisodes
 from torchdlo.agents.rl.expert import Expert
-from torchdlo.agents.rl.rollout import progress
+from torchdlo.agents.rl.rollout import look
 
 __all__ = ["Labels", "fit", "labelled"]
 
@@ -59,7 +59,7 @@ def labelled(
     seen, env, reach = episodes.reset(), episodes.env, episodes.task.reach
     alive = torch.ones(episodes.count, dtype=torch.bool)
     for k in range(episodes.horizon):
-        features = policy.features(seen, progress(episodes, k, seen))
+        features = look(policy, episodes, k, seen)
         right = expert.act(k, env.moved, env.world.tool.pos.float(), reach)
         labels.features.append(features[alive])
         labels.actions.append(right[alive])

@@ -44,6 +44,8 @@ class Episodes(Protocol):
     """Actions of an episode, T."""
     generator: torch.Generator
     """Where starts come from."""
+    first: Tensor
+    """What was seen at the start, shape (N, O)."""
 
     def reset(self) -> Tensor:
         """Begin anew; return observations (N, O)."""
@@ -73,7 +75,8 @@ class EnvEpisodes:
         """Begin anew; return observations (N, O)."""
         self._td = self.env.reset()
         self._failed = torch.zeros(self.count, dtype=torch.bool)
-        return self._seen(self._td)
+        self.first = self._seen(self._td).detach()
+        return self.first
 
     def step(self, action: Tensor) -> Step:
         """Do actions (N, A)."""
@@ -154,7 +157,8 @@ class TaskEpisodes:
         """Begin anew; return observations (N, O)."""
         self._over = 0
         self.returns = torch.zeros(self.count)
-        return self.env.reset()["observation"]
+        self.first = self.env.reset()["observation"].detach()
+        return self.first
 
     def step(self, action: Tensor) -> Step:
         """Do actions (N, 6 R) in metres and degrees."""

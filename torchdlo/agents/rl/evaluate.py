@@ -80,8 +80,8 @@ def judged(
     step: Any = None
     for k in range(episodes.horizon):
         rows = zip(policies, seen.chunk(len(policies)), strict=True)
-        share = progress(episodes, k, seen)[: many + one]
-        stage_waypoints = torch.stack([p.mean(p.features(part, share)) for p, part in rows])
+        share, first = progress(episodes, k, seen)[: many + one], episodes.first[: many + one]
+        stage_waypoints = torch.stack([p.mean(p.features(part, share, first)) for p, part in rows])
         if how.get("noise"):
             stage_waypoints = stage_waypoints + torch.randn(stage_waypoints.shape[1:], generator=rng) * (
                 how["noise"] / task.reach
@@ -124,7 +124,8 @@ def _shared(episodes: TaskEpisodes, policies: int, starts: int, one: int) -> Ten
     count = env.batch_size[0]
     effects = tree.map(lambda x: x[index] if len(x) == count else x, env.episode.params.effects)
     env.episode = replace(env.episode, params=tree.replace(env.episode.params, effects=effects))
-    return observe(env.episode, env.world)
+    episodes.first = observe(env.episode, env.world)
+    return episodes.first
 
 
 def evaluate(

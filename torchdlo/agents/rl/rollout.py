@@ -11,7 +11,7 @@ from torch import Tensor
 from torchdlo.agents.policies import Policy
 from torchdlo.agents.rl.episodes import Episodes
 
-__all__ = ["Batch", "advantages", "collect", "progress", "targets"]
+__all__ = ["Batch", "advantages", "collect", "look", "progress", "targets"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,12 +49,17 @@ def progress(episodes: Episodes, done: int, like: Tensor) -> Tensor:
     return like.new_full((episodes.count, 1), done / episodes.horizon)
 
 
+def look(policy: Policy, episodes: Episodes, done: int, seen: Tensor) -> Tensor:
+    """Return a policy's features (N, F) of what is seen (N, O) after so many actions."""
+    return policy.features(seen, progress(episodes, done, seen), episodes.first)
+
+
 @torch.no_grad()
 def collect(policy: Policy, episodes: Episodes, *, random: bool = True) -> Batch:
     """Play whole episodes without gradients; `random` draws actions, else they are the middle of what could be."""
     seen = episodes.reset()
     rows: list[dict[str, Tensor]] = []
-    features = [policy.features(seen, progress(episodes, 0, seen))]
+    features = [look(policy, episodes, 0, seen)]
     step: Any = None
     for k in range(episodes.horizon):
         if random:
@@ -64,7 +69,7 @@ def collect(policy: Policy, episodes: Episodes, *, random: bool = True) -> Batch
             density = torch.zeros_like(action[:, 0])
         step = episodes.step(policy.command(action))
         finite = torch.nan_to_num(step.observation)
-        features.append(policy.features(finite, progress(episodes, k + 1, finite)))
+        features.append(look(policy, episodes, k + 1, finite))
         rows.append({"action": action, "log_prob": density, "reward": step.reward, "failed": step.failed})
     kept = {name: torch.stack([row[name] for row in rows]) for name in rows[0]}
     return Batch(torch.stack(features), **kept, success=step.success & ~step.failed)

@@ -14,7 +14,7 @@ from torchrl.objectives import SACLoss, SoftUpdate
 from torchdlo.agents.policies import Policy
 from torchdlo.agents.rl.episodes import Episodes
 from torchdlo.agents.rl.ppo import Critic, actor
-from torchdlo.agents.rl.rollout import Batch, progress
+from torchdlo.agents.rl.rollout import Batch, look
 from torchdlo.agents.rl.settings import Settings
 
 __all__ = ["Sac"]
@@ -82,7 +82,7 @@ class Sac:
         """Play and learn; return what was played and how learning went."""
         s, policy = self.settings, self.policy
         seen = episodes.reset()
-        features = [policy.features(seen, progress(episodes, 0, seen))]
+        features = [look(policy, episodes, 0, seen)]
         rows: list[dict[str, Tensor]] = []
         told: list[dict[str, Tensor]] = []
         step: Any = None
@@ -96,7 +96,7 @@ class Sac:
                     action, density = policy.draw(features[-1])
                 step = episodes.step(policy.command(action))
                 finite = torch.nan_to_num(step.observation)
-                features.append(policy.features(finite, progress(episodes, k + 1, finite)))
+                features.append(look(policy, episodes, k + 1, finite))
             self._remember(features[-2:], action, step, alive, last=k + 1 == episodes.horizon)
             alive = ~step.failed
             rows.append({"action": action, "log_prob": density, "reward": step.reward, "failed": step.failed})

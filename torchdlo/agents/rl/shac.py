@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from torchdlo.agents.policies import Policy
 from torchdlo.agents.rl.episodes import Episodes
 from torchdlo.agents.rl.ppo import Critic
-from torchdlo.agents.rl.rollout import Batch, progress, targets
+from torchdlo.agents.rl.rollout import Batch, look, targets
 from torchdlo.agents.rl.settings import Settings
 
 __all__ = ["Sapo", "Shac", "Window", "actor_loss"]
@@ -140,7 +140,7 @@ class Shac:
         s, policy = self.settings, self.policy
         count = min(s.window, episodes.horizon - done)
         limit = s.tame / (count * episodes.count) if s.tame else 0.0
-        features = [policy.features(_bounded(seen), progress(episodes, done, seen))]
+        features = [look(policy, episodes, done, _bounded(seen))]
         rows: list[dict[str, Tensor]] = []
         step: Any = None
         for k in range(count):
@@ -149,7 +149,7 @@ class Shac:
                 action.register_hook(_tamed(limit, self.lost))
             step = episodes.step(policy.command(action))
             seen = _bounded(step.observation)
-            features.append(policy.features(seen, progress(episodes, done + k + 1, seen)))
+            features.append(look(policy, episodes, done + k + 1, seen))
             rows.append({"action": action, "log_prob": density, "reward": step.reward, "failed": step.failed})
         kept = {name: torch.stack([row[name] for row in rows]) for name in rows[0]}
         ends = done + count == episodes.horizon
@@ -170,7 +170,7 @@ class Shac:
         windows: list[Window] = []
         told: list[dict[str, Tensor]] = []
         if not bool(self.policy.normaliser.count > 0):
-            self.policy.normaliser.update(self.policy.features(seen, progress(episodes, 0, seen)))
+            self.policy.normaliser.update(look(self.policy, episodes, 0, seen))
         self.lost.clear()
         while done < episodes.horizon:
             window, seen = self.play(episodes, seen, done, failed)

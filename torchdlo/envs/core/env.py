@@ -64,6 +64,8 @@ class DloEnv(EnvBase):
         self._looks, self._look_generator = (Look(),) * num_envs, torch.Generator()
         self.moved = task.moved(num_envs, like=self._like, variation=False)
         """How far things are off their places at the start [m], shape (num_envs, things, 3)."""
+        self.first = episodes.observe(made, made.start)
+        """What was observed at the start, shape (num_envs, O)."""
         self._make_specs()
         self.set_seed(seed)
 
@@ -79,6 +81,7 @@ class DloEnv(EnvBase):
         self.observation_spec = Composite(
             observation=Unbounded((*shape, size), device=device, dtype=torch.float32),
             progress=one.clone(),
+            start=Unbounded((*shape, size), device=device, dtype=torch.float32),
             success=flag.clone(),
             terms=Composite({name: one.clone() for name in names}, shape=shape, device=device),
             **self._image_specs(),
@@ -136,6 +139,7 @@ class DloEnv(EnvBase):
         seen = self.world.seen(self.task.arms.count)
         return {
             "observation": episodes.observe(self.episode, self.world),
+            "start": self.first,
             "progress": (self.world.count / self.task.horizon).float().unsqueeze(-1),
             "success": (self.task.success(seen) & ~self.world.failed).unsqueeze(-1),
             "terms": TensorDict({n: t.float().unsqueeze(-1) for n, t in terms.items()}, self.batch_size, self.device),
@@ -164,6 +168,8 @@ class DloEnv(EnvBase):
         # Scenes that go on keep their gradient history.
         with torch.set_grad_enabled(self.gradients and torch.is_grad_enabled()):
             self.world = self._begun(again)
+            now = episodes.observe(self.episode, self.world).detach()
+            self.first = torch.where(again.unsqueeze(-1), now, self.first)
             terms = self.task.rewards(self.world.seen(self.task.arms.count))
             ended = torch.zeros(*self.batch_size, 1, dtype=torch.bool, device=self.device)
             flags = {name: ended.clone() for name in ("done", "terminated", "truncated")}
