@@ -29,8 +29,6 @@ FLOORS = {
     "sysid": 5,
     "agents": 6,
     "report": 8,
-    "sample": 9,
-    "doctor": 9,
     "cli": 10,
     "__main__": 11,
 }
@@ -54,9 +52,7 @@ ALLOWED = {
     "envs": LEARNING | {"pytorch_kinematics", "trimesh"},
     "agents": LEARNING | {"cma", "numpy"},
     "report": ARRAYS | {"matplotlib", "pyvista", "vtk", "av", "viser", "mitsuba", "pyoidn"},
-    "sample": {"typer"},
-    "doctor": TORCH | {"av", "packaging", "typer"},
-    "cli": ARRAYS | {"rich", "typer"},
+    "cli": LEARNING | ARRAYS | {"rich", "typer", "av", "packaging"},
     "__main__": set(),
     "": TORCH,  # torchdlo/__init__.py
 }

@@ -25,7 +25,7 @@ from torchdlo.coupling.robot import inverse_kinematics
 from torchdlo.coupling.robot.kinematics import Robot, load, panda, tool_pose
 from torchdlo.envs import Task
 from torchdlo.envs.core import episode
-from torchdlo.envs.observation import observe
+from torchdlo.envs.observations.state import observe
 from torchdlo.errors import InputError
 
 __all__ = ["FORMATS", "PredictedMotion", "arms_of", "played", "replayed", "text", "timed"]

@@ -9,13 +9,14 @@ from typing import Annotated
 
 import typer
 
+from torchdlo.cli.doctor import doctor
 from torchdlo.cli.identification import calibrate, design_experiment, diagnose
+from torchdlo.cli.policies import deploy, evaluate, train
 from torchdlo.cli.recordings import check, import_deform
+from torchdlo.cli.sample import sample
 from torchdlo.cli.scenes import simulate, view
 from torchdlo.cli.tasks import optimize, play, tasks
-from torchdlo.doctor import doctor
 from torchdlo.errors import InputError
-from torchdlo.sample import sample
 
 __all__ = ["app", "main"]
 
@@ -63,6 +64,9 @@ app.command()(view)
 app.command()(optimize)
 app.command()(play)
 app.command()(tasks)
+app.command()(train)
+app.command()(evaluate)
+app.command()(deploy)
 app.command()(sample)
 app.command()(doctor)
 

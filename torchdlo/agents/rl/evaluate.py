@@ -14,7 +14,7 @@ from torchdlo.agents.policies import Policy
 from torchdlo.agents.rl.episodes import TaskEpisodes
 from torchdlo.agents.rl.rollout import progress
 from torchdlo.envs import PUBLISHED, Task, simulated
-from torchdlo.envs.observation import observe
+from torchdlo.envs.observations.state import observe
 from torchdlo.physics import tree
 
 __all__ = ["PROTOCOLS", "evaluate", "judged", "wilson"]

@@ -62,11 +62,7 @@ def program(name: str) -> str:
     for part in ("physics", "coupling", "envs", "agents/trajopt", "data/robots", "scene.py"):
         files = [root / part] if part.endswith(".py") else sorted((root / part).rglob("*"))
         for file in files:
-            if (
-                file.suffix in (".py", ".cpp", ".h", ".urdf")
-                and file.name not in others
-                and file.parent.name not in apart
-            ):
+            if file.suffix in (".py", ".cpp", ".h", ".urdf") and file.name not in others:
                 found.update(file.name.encode() + _code(file))
     return found.hexdigest()
 

@@ -27,7 +27,7 @@ from torchdlo.envs.core.divergence import broken, inside
 from torchdlo.envs.core.frames import guarded, run, slipped
 from torchdlo.envs.core.stages import repeated
 from torchdlo.envs.core.task import Task, TaskState, combined
-from torchdlo.envs.observation import observe, places
+from torchdlo.envs.observations.state import observe, places
 from torchdlo.errors import InputError
 from torchdlo.physics import tree
 from torchdlo.physics.linalg.numerics import safe_norm

@@ -23,10 +23,10 @@ from torchdlo.coupling.common.pose import Pose
 from torchdlo.envs.assets.arms import DOWN, Arms
 from torchdlo.envs.assets.rope_material import RopeMaterial
 from torchdlo.envs.core import curve_geometry
+from torchdlo.envs.core.fidelity import PUBLISHED, Fidelity
 from torchdlo.envs.core.stages import Schedule, Stage
-from torchdlo.envs.fidelity import PUBLISHED, Fidelity
+from torchdlo.envs.core.waypoints import through
 from torchdlo.envs.observations.cameras import TaskCamera
-from torchdlo.envs.waypoints import through
 from torchdlo.errors import InputError
 from torchdlo.physics import tree
 from torchdlo.physics.effects.base import Effect

@@ -13,8 +13,8 @@ from typing import ClassVar
 from torch import Tensor
 
 from torchdlo.coupling.bodies.dynamics import RigidBody
+from torchdlo.envs.core.fidelity import Fidelity
 from torchdlo.envs.core.task import RADIUS, Arms, Task, TaskState, make, straight
-from torchdlo.envs.fidelity import Fidelity
 from torchdlo.envs.observations.cameras import TaskCamera
 from torchdlo.physics.linalg.numerics import safe_norm
 from torchdlo.scene import Params, Rope, Scene, State
