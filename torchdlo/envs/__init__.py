@@ -6,7 +6,7 @@ Importing this package needs torch only. Arms need the extra `robots`, `make` ne
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -56,12 +56,13 @@ __all__ = [
 ]
 
 
-def find(name: str, rope: RopeMaterial | None = None) -> Task:
-    """Return a task by its name, with its ropes made of a cable if one is given."""
+def find(name: str, rope: RopeMaterial | None = None, grasps: Sequence[int | None] | None = None) -> Task:
+    """Return a task by its name, with its ropes made of a cable and held at other vertices if these are given."""
     if name not in TASKS:
         raise InputError(f"there is no task {name!r}; expected one of {', '.join(sorted(TASKS))}.")
     task = TASKS[name]()
-    return task if rope is None else dataclasses.replace(task, rope=rope)
+    task = task if rope is None else dataclasses.replace(task, rope=rope)
+    return task if grasps is None else dataclasses.replace(task, grasps=tuple(grasps))
 
 
 def simulated(task: Task, how: Fidelity | str) -> Task:
@@ -100,6 +101,7 @@ def make(
     rope: RopeMaterial | None = None,
     pixels: bool | Mapping[str, Any] = False,
     fidelity: Fidelity | str | None = None,
+    grasps: Sequence[int | None] | None = None,
 ) -> DloEnv:
     """Return a task as a TorchRL environment.
 
@@ -123,6 +125,8 @@ def make(
             "looks": "random"}, see `observations.sensor`.
         fidelity: how the task is simulated, if not as it says: a `Fidelity`, "published", "coarse" (the task's cheaper
             one), or such as "1ms/2"; `env.task.fidelity` says which it is.
+        grasps: what each hand holds until the end, slots on the vertex axis of the scene, if not what the task says;
+            None for a hand that stays open. Stages of the task are left out.
     """
     try:
         from torchdlo.envs.core.env import DloEnv
@@ -139,6 +143,8 @@ def make(
         chosen = dataclasses.replace(chosen, rope=rope)
     if fidelity is not None:
         chosen = simulated(chosen, fidelity)
+    if grasps is not None:
+        chosen = dataclasses.replace(chosen, grasps=tuple(grasps))
     return DloEnv(
         chosen,
         num_envs=num_envs,

@@ -5,13 +5,14 @@ A task is a frozen dataclass without tensors. `episode` runs it, `env` offers it
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import itertools
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import torch
 from torch import Tensor
@@ -91,6 +92,9 @@ class Task(ABC):
     """What all ropes are made of, if not what the task says."""
     fidelity: Fidelity = PUBLISHED
     """How it is simulated; results are judged at the published fidelity."""
+    grasps: tuple[int | None, ...] | None = None
+    """What each hand holds until the end, slots on the vertex axis of the scene, if not what the task says; None for a
+    hand that stays open."""
 
     name: ClassVar[str]
     """Its name in `envs.TASKS`."""
@@ -132,6 +136,22 @@ class Task(ABC):
             )
         for frames in (self.frame_skip, self.settle_steps, self.release):
             self.fidelity.steps(frames)
+        if self.grasps is not None:
+            self._regrasp(self.grasps)
+
+    def _regrasp(self, grasps: tuple[int | None, ...]) -> None:
+        """Let hands hold other vertices than the task's own; those that stay open start where they do in the task."""
+        own = type(self).arms
+        slots = isinstance(grasps, tuple) and all(v is None or (type(v) is int and v >= 0) for v in grasps)
+        held = [v for v in grasps if v is not None] if slots else []
+        if not slots or len(grasps) != own.count or not held or len(set(held)) < len(held):
+            raise InputError(
+                f"grasps: they are {grasps!r}; expected a tuple with a vertex for each of {own.count} hands, all "
+                "different, or None for a hand that stays open; one has to hold."
+            )
+        starts = tuple(v if g is None else g for g, v in zip(grasps, own.vertex, strict=True))
+        object.__setattr__(self, "arms", dataclasses.replace(own, vertex=starts))
+        object.__setattr__(self, "stages", (Stage(0, grasps),))
 
     @property
     def schedule(self) -> Schedule:
@@ -184,6 +204,21 @@ class Task(ABC):
         """Return which episodes have failed for good, bool, shape (B,)."""
         return torch.zeros(seen.x.shape[0], dtype=torch.bool, device=seen.x.device)
 
+    def measures(self, seen: TaskState) -> dict[str, Tensor]:
+        """Return what expressions can name of this task beside its ropes, tools and bodies; shapes (B,) to (B, N, 3).
+
+        Where a name is that of a body, such as "ring_0", this one counts.
+        """
+        return {}
+
+    def measured(self) -> dict[str, str]:
+        """Return what each of `measures` is, with its unit."""
+        return {}
+
+    def carried(self) -> Any:
+        """Return the world, `episode.EpisodeState` of one scene, that episodes go on from; None if they begin anew."""
+        return None
+
     def surrogate(self) -> Task | None:
         """Return a task that is much like this one and quicker to play, for searches to begin with, if there is one."""
         return None
@@ -230,7 +265,10 @@ class Task(ABC):
         off = (
             self._strays(start) if start is not None else [torch.zeros(self.arms.count, 3)] * len(self.schedule.stages)
         )
-        legs = zip(self.stage_waypoints(), self.schedule.actions(self.horizon), off, strict=True)
+        stage_waypoints = self.stage_waypoints()
+        if len(stage_waypoints) != len(off):
+            raise InputError(f"{self.name}: its demonstration is one for its own grasps; leave other grasps out.")
+        legs = zip(stage_waypoints, self.schedule.actions(self.horizon), off, strict=True)
         return torch.cat([through(*leg, max_translation=self.max_translation) for leg in legs], -2)
 
     def _strays(self, start: State) -> list[Tensor]:
@@ -255,7 +293,8 @@ class Task(ABC):
         if not math.isfinite(self.stretch):
             return seen.x[:, 0, :0]
         rope = [k for k, count in enumerate(topology.counts) for _ in range(count)]
-        pairs = [(a, b) for a, b in itertools.pairwise(sorted(self.arms.vertex)) if rope[a] == rope[b]]
+        held = sorted(v for v in self.grasps or self.arms.vertex if v is not None)
+        pairs = [(a, b) for a, b in itertools.pairwise(held) if rope[a] == rope[b]]
         lengths = [curve_geometry.length(seen.x[:, a : b + 1]) for a, b in pairs]
         return torch.stack(lengths, -1) if lengths else seen.x[:, 0, :0]
 
@@ -317,7 +356,11 @@ def make(
     """
     elastic = all(isinstance(r.stretch, Tensor) or math.isfinite(r.stretch) for r in ropes)
     floor = not any(s.shape == "plane" for s in solids)
-    room = 3 * sum(r.positions.shape[-2] for r in ropes)
+    count = sum(r.positions.shape[-2] for r in ropes)
+    beyond = [v for v in task.grasps or () if v is not None and v >= count]
+    if beyond:
+        raise InputError(f"grasps: {task.name} has vertices 0 to {count - 1}, and a hand is to hold {beyond[0]}.")
+    room = 3 * count
     own = [] if task.rope is None else task.rope.laws
     effects = [*(e for e in effects if e.name not in {o.name for o in own}), *own]
     acting: list[Effect] = [Gravity(), Damping(), RodContact(sweeps=5, room=room, burst=burst), *effects]
