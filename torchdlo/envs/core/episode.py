@@ -150,8 +150,10 @@ def hands_of(task: Task, scene: Scene) -> Hands:
 
 
 def _begin(task: Task, scene: Scene, state: State, hands: Hands) -> EpisodeState:
-    """Return the world before the first action: tools stand at what they hold."""
-    x = state.rods.pos
+    """Return the world before the first action: tools stand at what they hold, or where they were left."""
+    x, before = state.rods.pos, task.carried()
+    if before is not None:
+        return _continued(task, scene, state, hands, before)
     pos = x[:, list(task.arms.vertex)]
     quat = x.new_tensor(task.arms.quats)
     target = Pose(pos, (quat / quat.norm(dim=-1, keepdim=True)).expand(*pos.shape[:-1], 4))
@@ -176,6 +178,21 @@ def _begin(task: Task, scene: Scene, state: State, hands: Hands) -> EpisodeState
     world = EpisodeState(state, found.joints, target, target, held, {}, failed, none)
     seen = world.seen(task.arms.count)
     return tree.replace(world, notes={"rest": task.rest(seen, scene.topology), **task.note(seen)})
+
+
+def _continued(task: Task, scene: Scene, state: State, hands: Hands, before: EpisodeState) -> EpisodeState:
+    """Return the world that goes on from one of a single scene: hands that hold on are welded anew as they are."""
+    x, plan = state.rods.pos, task.schedule
+    count = len(x)
+    joints, target, tool, failed = tree.map(
+        lambda t: t.expand(count, *t.shape[1:]).to(x) if t.is_floating_point() else t.expand(count, *t.shape[1:]),
+        (before.joints, before.target, before.tool, before.failed),
+    )
+    none = torch.zeros_like(failed, dtype=torch.long)
+    closed = plan.closed(none, tool, x)
+    held = grasp.weld(scene, hands, scenes.stationary_control(scene, state), repeated(tool, plan.room), closed)
+    notes = {name: t.expand(count, *t.shape[1:]) for name, t in before.notes.items()}
+    return EpisodeState(state, joints, target, tool, held, notes, failed, none)
 
 
 def begin(episode: Episode, state: State) -> EpisodeState:

@@ -63,6 +63,14 @@ class Coiling(Task):
         """Return whether the rope turns by a whole turn within 6 cm of the cone."""
         return wound(seen.x).abs() >= 2 * math.pi
 
+    def measures(self, seen: TaskState) -> dict[str, Tensor]:
+        """Return by how many turns the rope goes round the cone."""
+        return {"turns": wound(seen.x) / (2 * math.pi)}
+
+    def measured(self) -> dict[str, str]:
+        """Return what it is."""
+        return {"turns": "turns of the rope round the cone, with a sign, where it is within 6 cm of it"}
+
     def terminal_cost(self, seen: TaskState) -> Tensor:
         """Return what a whole turn that is missing counts: coils that are wide and loose may earn as much.
 

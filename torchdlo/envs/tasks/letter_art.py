@@ -130,6 +130,15 @@ class LetterArt(Task):
         d, ell = self.missing(seen)
         return {"d": torch.exp(-10 * d), "l": torch.exp(-10 * ell)}
 
+    def measures(self, seen: TaskState) -> dict[str, Tensor]:
+        """Return where the wires belong."""
+        return {f"goal_{k}": g.to(seen.x).expand(len(seen.x), -1, -1) for k, g in enumerate(goals())}
+
+    def measured(self) -> dict[str, str]:
+        """Return what they are."""
+        wires = ("stem of the D", "bow of the D", "L")
+        return {f"goal_{k}": f"where the vertices of rope_{k} belong, the {wire} [m]" for k, wire in enumerate(wires)}
+
     def failed(self, seen: TaskState) -> Tensor:
         """Return whether a wire is stretched by more than a tenth."""
         lengths = [curve_geometry.length(x) / (SPACING * (x.shape[-2] - 1)) for x in seen.x.split(COUNTS, -2)]

@@ -72,6 +72,15 @@ class Lifting(Task):
             "clear": -100.0 * close.sum(-1),
         }
 
+    def measures(self, seen: TaskState) -> dict[str, Tensor]:
+        """Return the centres of the rings, which are not their centres of mass."""
+        rings = self._rings(seen)
+        return {"ring_0": rings[:, 0], "ring_1": rings[:, 1]}
+
+    def measured(self) -> dict[str, str]:
+        """Return what they are."""
+        return {f"ring_{k}": "centre of the upright open ring, whose axis is along x and gap at -y [m]" for k in (0, 1)}
+
     def note(self, seen: TaskState) -> dict[str, Tensor]:
         """Return the heights of the rings after the last actions, shape (B, 5, 2)."""
         now = self._rings(seen)[:, None, :, 2]

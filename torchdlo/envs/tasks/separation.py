@@ -74,6 +74,15 @@ class Separation(Task):
         apart = curve_geometry.distances(first, second)
         return {"first": apart.amin(-1).mean(-1), "second": apart.amin(-2).mean(-1)}
 
+    def measures(self, seen: TaskState) -> dict[str, Tensor]:
+        """Return how often the ropes cross each other."""
+        first, second = seen.x.split(COUNT, -2)
+        return {"crossings": curve_geometry.crossings(first, second).to(seen.x.dtype)}
+
+    def measured(self) -> dict[str, str]:
+        """Return what it is."""
+        return {"crossings": "how often the ropes cross in the top view; no gradient"}
+
     def success(self, seen: TaskState) -> Tensor:
         """Return whether the ropes do not cross and are apart."""
         first, second = seen.x.split(COUNT, -2)

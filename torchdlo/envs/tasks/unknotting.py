@@ -75,6 +75,22 @@ class Unknotting(Task):
             "clear": torch.exp(-100 * curve_geometry.crowding(seen.x, 0.04)),
         }
 
+    def measures(self, seen: TaskState) -> dict[str, Tensor]:
+        """Return how often the rope crosses itself, and how closely it lies to itself."""
+        return {
+            "crossings": curve_geometry.crossings(seen.x).to(seen.x.dtype),
+            "crossing_number": curve_geometry.crossing_number(seen.x),
+            "crowding": curve_geometry.crowding(seen.x, 0.04),
+        }
+
+    def measured(self) -> dict[str, str]:
+        """Return what they are."""
+        return {
+            "crossings": "how often the rope crosses itself in the top view; no gradient",
+            "crossing_number": "average crossing number over all views, with gradient",
+            "crowding": "sum of max(0, 0.04 - r)^2 over pairs of edges r apart that are no neighbours [m^2]",
+        }
+
     def success(self, seen: TaskState) -> Tensor:
         """Return whether the rope is not knotted and does not cross itself."""
         return (curve_geometry.crossings(seen.x) == 0) & (curve_geometry.determinant(seen.x) == 1)

@@ -105,6 +105,14 @@ class WiringPost(Task):
             "middle": torch.exp(-5 * (off - 0.02).clamp(min=0)),
         }
 
+    def measures(self, seen: TaskState) -> dict[str, Tensor]:
+        """Return the goal curve."""
+        return {"goal": goal().to(seen.x).expand(len(seen.x), -1, -1)}
+
+    def measured(self) -> dict[str, str]:
+        """Return what it is."""
+        return {"goal": "the curve along which the rope is to lie [m]"}
+
     def success(self, seen: TaskState) -> Tensor:
         """Return whether the rope passes each post on its side, turns round it, and is near the goal."""
         beside, turn, off = self._judged(seen.x)

@@ -93,6 +93,20 @@ class WiringRing(Task):
         """Return whether the rope is stretched by more than a tenth, or a hand went through a ring."""
         return (curve_geometry.length(seen.x) > 1.1 * SPACING * (COUNT - 1)) | seen.notes["through"]
 
+    def measures(self, seen: TaskState) -> dict[str, Tensor]:
+        """Return how often the rope passes the rings, and where its lead end belongs."""
+        passes = self._passes(seen.x).sum(-1).to(seen.x.dtype)
+        place = seen.x.new_tensor(RINGS[1]) + 2 * BEYOND * seen.x.new_tensor(ALONG[1])
+        return {"passes_0": passes[:, 0], "passes_1": passes[:, 1], "goal": place.expand(len(seen.x), 3)}
+
+    def measured(self) -> dict[str, str]:
+        """Return what they are."""
+        return {
+            "passes_0": "how often the rope passes through ring_0, whose axis is along x; no gradient",
+            "passes_1": "how often the rope passes through ring_1, whose axis is along y; no gradient",
+            "goal": "where vertex 0 belongs in the end, behind ring_1 [m]",
+        }
+
     def success(self, seen: TaskState) -> Tensor:
         """Return whether the rope passes both rings an odd number of times, the first one first, and ends behind."""
         passes = self._passes(seen.x)

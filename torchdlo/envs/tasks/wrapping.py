@@ -76,6 +76,15 @@ class Wrapping(Task):
         once = (self._wound(seen.x).abs() - 1).square().mean(-1)
         return {"present": torch.ones_like(off), "round": 1 - once, "near": -off}
 
+    def measures(self, seen: TaskState) -> dict[str, Tensor]:
+        """Return how often the loop goes round each post."""
+        wound = self._wound(seen.x)
+        return {f"winding_{k}": wound[:, k] for k in range(len(POSTS))}
+
+    def measured(self) -> dict[str, str]:
+        """Return what they are."""
+        return {f"winding_{k}": f"how often the loop goes round post_{k}, 1 or -1 is once" for k in range(len(POSTS))}
+
     def success(self, seen: TaskState) -> Tensor:
         """Return whether the loop goes round every post once, and touches each within 5 mm below its top."""
         apart = self._apart(seen.x)

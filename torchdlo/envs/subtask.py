@@ -1,0 +1,212 @@
+"""A part of a task, or a task with another reward: the same scene, judged by expressions, from where hands are now.
+
+`continue_from` makes a task of its own of what is left to do: it begins with the state, the joints and the notes that
+another episode left, and hands that are to hold something else open and travel there first. Physics and failures are
+those of the task.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, cast
+
+import torch
+from torch import Tensor
+
+from torchdlo.envs import scene_names
+from torchdlo.envs.core.episode import Episode, EpisodeState, finish
+from torchdlo.envs.core.stages import Stage
+from torchdlo.envs.core.task import Task, TaskState
+from torchdlo.errors import InputError
+from torchdlo.physics import tree
+from torchdlo.reward_language import Reward
+from torchdlo.scene import Params, Scene, State
+
+__all__ = ["SubTask", "concluded", "continue_from", "rewarded"]
+
+_SAME = ("name", "arms", "floor", "reach", "twist", "stretch", "travel", "anchored")
+"""What a part has from its task."""
+
+
+@dataclass(frozen=True, eq=False)
+class SubTask(Task):
+    """A part of a task. `continue_from` and `rewarded` make it."""
+
+    inner: Task = cast(Task, None)
+    """The task, with what hands hold here."""
+    before: EpisodeState | None = None
+    """The world of one scene from which it goes on; None: it begins as the task does."""
+    reward: Reward | None = None
+    """What it is judged by; as the task if not given."""
+    kept: tuple[int | None, ...] = ()
+    """What hands hold from before."""
+
+    def __post_init__(self) -> None:
+        for name in _SAME:
+            object.__setattr__(self, name, getattr(self.inner, name))
+        object.__setattr__(self, "combine", "sum" if self.reward else self.inner.combine)
+        object.__setattr__(self, "spread", ((0.0, 0.0),) if self.before is not None else self.inner.reset_noise)
+        stages = self.inner.stages
+        if self.before is not None and self.kept != self.inner.grasps:
+            stages = (Stage(0, self.kept), Stage(self.travel, cast(Any, self.inner.grasps)))
+        object.__setattr__(self, "stages", stages)
+        object.__setattr__(self, "grasps", self.inner.grasps)
+        if self.reward is not None:
+            self._check(self.reward)
+
+    @property
+    def travels(self) -> int:
+        """Actions at the start in which hands go to what they hold next."""
+        return self.stages[1].first if self.before is not None and len(self.stages) > 1 else 0
+
+    @functools.cached_property
+    def layout(self) -> scene_names.Layout:
+        """What there is in the scene."""
+        return scene_names.layout(self.inner.start(1)[0])
+
+    def _check(self, reward: Reward) -> None:
+        """Refuse expressions that this scene has no values for, with a scene as it is at the start."""
+        scene, _, state = self.start(1, like=torch.zeros((), dtype=torch.float64))
+        seen = _seen_at_start(self, state)
+        values = scene_names.named(self.inner, scene_names.layout(scene), seen)
+        reward.evaluate(values)
+        reward.succeeded(values)
+
+    def build(self, moved: Tensor) -> tuple[Scene, Params, State]:
+        """Return the scene, in the state that was left."""
+        scene, params, fresh = self.inner.build(moved)
+        if self.before is None:
+            return scene, params, fresh
+
+        def carried(new: Tensor, old: Tensor) -> Tensor:
+            return torch.empty_like(new).copy_(old.to(new).expand_as(new))
+
+        # What holds exert has as many rows as there are vertices to hold.
+        old = tree.replace(self.before.state, reaction=fresh.reaction)
+        return scene, params, tree.map(carried, fresh, old)
+
+    def carried(self) -> EpisodeState | None:
+        """Return the world from which it goes on."""
+        return self.before
+
+    def _values(self, seen: TaskState, names: frozenset[str]) -> dict[str, Tensor]:
+        return scene_names.named(self.inner, self.layout, seen, names)
+
+    def rewards(self, seen: TaskState) -> dict[str, Tensor]:
+        """Return the terms of the reward."""
+        if self.reward is None:
+            return self.inner.rewards(seen)
+        names = frozenset().union(*(term.names for _, term in self.reward.terms))
+        return self.reward.evaluate(self._values(seen, names))
+
+    def success(self, seen: TaskState) -> Tensor:
+        """Return where the condition holds; that of the task if there is none."""
+        if self.reward is None or self.reward.success is None:
+            return self.inner.success(seen)
+        return cast(Tensor, self.reward.succeeded(self._values(seen, self.reward.success.names)))
+
+    def auxiliary_loss(self, seen: TaskState) -> dict[str, Tensor]:
+        """Return nothing unless the reward is the task's."""
+        return self.inner.auxiliary_loss(seen) if self.reward is None else {}
+
+    def terminal_cost(self, seen: TaskState) -> Tensor:
+        """Return nothing unless the reward is the task's."""
+        return self.inner.terminal_cost(seen) if self.reward is None else super().terminal_cost(seen)
+
+    def note(self, seen: TaskState) -> dict[str, Tensor]:
+        """Return what the task remembers."""
+        return self.inner.note(seen)
+
+    def failed(self, seen: TaskState) -> Tensor:
+        """Return where the task has failed."""
+        return self.inner.failed(seen)
+
+    def measures(self, seen: TaskState) -> dict[str, Tensor]:
+        """Return those of the task."""
+        return self.inner.measures(seen)
+
+    def measured(self) -> dict[str, str]:
+        """Return those of the task."""
+        return self.inner.measured()
+
+    def stage_waypoints(self) -> Sequence[Sequence[Sequence[tuple[float, float, float]]]]:
+        """Return the demonstration of the task, none if it goes on from somewhere."""
+        return self.inner.stage_waypoints() if self.before is None else [()] * len(self.schedule.stages)
+
+
+def _seen_at_start(task: SubTask, state: State) -> TaskState:
+    """Return what is seen before the first action, without inverse kinematics."""
+    before, x = task.before, state.rods.pos
+    if before is not None:
+        seen = before.seen(task.arms.count)
+        return tree.map(lambda t: t.to(x.dtype) if t.is_floating_point() else t, tree.replace(seen, state=state))
+    from torchdlo.coupling.common.pose import Pose
+
+    pos = x[:, list(task.arms.vertex)]
+    quat = x.new_tensor(task.arms.quats).expand(1, -1, -1)
+    seen = TaskState(state, Pose(pos, quat), torch.ones_like(pos[..., :1]), {})
+    return tree.replace(seen, notes=task.inner.note(seen))
+
+
+def rewarded(task: Task, reward: Reward) -> SubTask:
+    """Return a task with another reward, and another condition of success if the reward has one."""
+    return SubTask(**_fields(task), inner=task, reward=reward)
+
+
+def _fields(task: Task) -> dict[str, Any]:
+    return {name: getattr(task, name) for name in ("horizon", "frames", "settle", "release", "rope")}
+
+
+def continue_from(
+    task: Task,
+    world: EpisodeState,
+    grasps: Sequence[int | None],
+    *,
+    holds: Sequence[int | None],
+    horizon: int,
+    reward: Reward | None = None,
+) -> SubTask:
+    """Return what is left of a task as a task of its own.
+
+    Hands that are to hold what they do not hold yet open and travel there in the first `Task.travel` actions, which are
+    added to the horizon.
+
+    Args:
+        task: the task, as `envs.find` returns it.
+        world: where an episode of one scene is.
+        grasps: what each hand is to hold, None for one that is to be open.
+        holds: what each hand holds in that world; see `SubTask.inner.grasps` of the part that led there.
+        horizon: actions after the hands have travelled.
+        reward: what it is judged by, and its success.
+    """
+    if len(world.failed) != 1 or bool(world.failed[0]):
+        raise InputError(f"{task.name}: a part can go on from one scene that has not failed, and from no other.")
+    firm = world.seen(task.arms.count).closed[0, :, 0] > 0
+    kept = tuple(h if h == g and bool(f) else None for h, g, f in zip(holds, grasps, firm, strict=True))
+    inner = dataclasses.replace(task, grasps=tuple(grasps))
+    scene, _, state = inner.start(1, like=world.state.rods.pos)
+    usual = tree.replace(world, state=state).seen(task.arms.count)
+    before = tree.detach(
+        tree.replace(world, notes={**world.notes, "rest": inner.rest(usual, scene.topology)}, grasp=world.grasp)
+    )
+    fields = _fields(task) | {"settle": 0, "release": 0}
+    moves = task.travel if kept != tuple(grasps) and any(g is not None for g in grasps) else 0
+    fields["horizon"] = horizon + moves
+    return SubTask(**fields, inner=inner, before=before, reward=reward, kept=kept)
+
+
+def concluded(episode: Episode, world: EpisodeState, task: Task) -> tuple[Tensor, EpisodeState]:
+    """Return where the task itself is done, bool, shape (B,), and the world after hands have opened if it has them do
+    so.
+
+    Args:
+        episode: of the last part.
+        world: its end.
+        task: the task.
+    """
+    last = dataclasses.replace(episode, task=dataclasses.replace(episode.task, release=task.release))
+    world = finish(last, world)
+    return task.success(world.seen(task.arms.count)) & ~world.failed, world
