@@ -35,7 +35,7 @@ _SAME = ("name", "arms", "floor", "reach", "twist", "stretch", "travel", "anchor
 class SubTask(Task):
     """A part of a task. `continue_from` and `rewarded` make it."""
 
-    inner: Task = cast(Task, None)
+    inner: Task = None  # type: ignore[assignment]
     """The task, with what hands hold here."""
     before: EpisodeState | None = None
     """The world of one scene from which it goes on; None: it begins as the task does."""
@@ -199,8 +199,7 @@ def continue_from(
 
 
 def concluded(episode: Episode, world: EpisodeState, task: Task) -> tuple[Tensor, EpisodeState]:
-    """Return where the task itself is done, bool, shape (B,), and the world after hands have opened if it has them do
-    so.
+    """Return where the task itself is done, bool, shape (B,), and the world in which that was judged.
 
     Args:
         episode: of the last part.

@@ -46,6 +46,7 @@ __all__ = [
     "play",
     "prepare",
     "prepare_at",
+    "reachable",
 ]
 
 POSTURE = (1.56, -0.72, -0.02, -2.09, 0.04, 1.33, 2.4, 0.0)
@@ -157,14 +158,7 @@ def _begin(task: Task, scene: Scene, state: State, hands: Hands) -> EpisodeState
     pos = x[:, list(task.arms.vertex)]
     quat = x.new_tensor(task.arms.quats)
     target = Pose(pos, (quat / quat.norm(dim=-1, keepdim=True)).expand(*pos.shape[:-1], 4))
-    # An arm that faces its tool has the most room to move; contorted ones may be nearer to the posture.
-    posture, off = x.new_tensor(POSTURE).expand(*pos.shape[:-1], -1), pos - _bases(task, x)
-    facing = torch.cat([torch.atan2(off[..., 1:2], off[..., :1]), posture[..., 1:]], -1)
-    plain, found = (
-        tree.detach(_solve(task, target, *guess))
-        for guess in ((facing, inverse_kinematics.IkSearch()), (posture, FIND))
-    )
-    found = tree.where(plain.converged, plain, found)
+    found = _standing(task, target)
     if not bool(found.converged.all()):
         far = found.missing.reshape(-1, 2).amax(0)
         raise InputError(
@@ -178,6 +172,33 @@ def _begin(task: Task, scene: Scene, state: State, hands: Hands) -> EpisodeState
     world = EpisodeState(state, found.joints, target, target, held, {}, failed, none)
     seen = world.seen(task.arms.count)
     return tree.replace(world, notes={"rest": task.rest(seen, scene.topology), **task.note(seen)})
+
+
+def _standing(task: Task, target: Pose) -> inverse_kinematics.Solution:
+    """Return how arms stand whose tools are at poses, found from nothing."""
+    # An arm that faces its tool has the most room to move; contorted ones may be nearer to the posture.
+    posture = target.pos.new_tensor(POSTURE).expand(*target.pos.shape[:-1], -1)
+    off = target.pos - _bases(task, target.pos)
+    facing = torch.cat([torch.atan2(off[..., 1:2], off[..., :1]), posture[..., 1:]], -1)
+    plain, found = (
+        tree.detach(_solve(task, target, *guess))
+        for guess in ((facing, inverse_kinematics.IkSearch()), (posture, FIND))
+    )
+    return tree.where(plain.converged, plain, found)
+
+
+def reachable(task: Task, pos: Tensor) -> Tensor:
+    """Return which hands reach places with their tools oriented as at the start, bool, shape (N, R).
+
+    Args:
+        task: the task.
+        pos: places, such as those of vertices [m], shape (N, 3).
+    """
+    quat = pos.new_tensor(task.arms.quats)
+    where = pos.unsqueeze(1).expand(-1, task.arms.count, -1)
+    target = Pose(where, (quat / quat.norm(dim=-1, keepdim=True)).expand(*where.shape[:-1], 4))
+    with torch.no_grad():
+        return _standing(task, target).converged
 
 
 def _continued(task: Task, scene: Scene, state: State, hands: Hands, before: EpisodeState) -> EpisodeState:

@@ -1,0 +1,16 @@
+"""The texts that models are sent; they are files beside this one."""
+
+from __future__ import annotations
+
+from importlib.resources import files
+
+__all__ = ["prompt"]
+
+
+def prompt(name: str, **parts: str) -> str:
+    """Return a text with its parts filled in."""
+    text = (files("torchdlo.agents.vlm") / "prompts" / f"{name}.md").read_text(encoding="utf-8")
+    for key, part in parts.items():
+        # Nothing in a part may end the data.
+        text = text.replace("{" + key + "}", part.replace("<", "(").replace(">", ")"))
+    return text
