@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -131,6 +131,14 @@ def optimize(
         bool, typer.Option("--robust", help="Play each trajectory from several starts that grow apart.")
     ] = False,
     rope_model: RopeModelOption = None,
+    grasps: Annotated[
+        Path | None,
+        typer.Option(help="What hands hold: proposal.json of propose, if not what the task says.", metavar="FILE"),
+    ] = None,
+    reward: Annotated[
+        Path | None,
+        typer.Option(help="Reward of expressions, if not the task's; see docs/reward_language.md.", metavar="FILE"),
+    ] = None,
     dtype: Annotated[str, typer.Option(help="Precision of the physics.", metavar="float32|float64")] = "float32",
     compiled: Annotated[bool, typer.Option(help="Compile the step: slow at first, then many times faster.")] = True,
     recorded: Annotated[
@@ -155,6 +163,8 @@ def optimize(
     torchdlo optimize wiring_post --method cmaes --seed 1 --episodes 4000 --population 100
 
     torchdlo optimize wiring_post --robust --resume
+
+    torchdlo optimize lifting --grasps runs/propose/lifting/proposal.json --reward reward.json
     """
     from torchdlo.agents.trajopt.presets import preset
     from torchdlo.agents.trajopt.result import result_json, summary, trajectory_json
@@ -169,7 +179,8 @@ def optimize(
     for name in ("result.json", "trajectory.json", "curve.png"):
         check_writable(out / name)
     steps = {"compiled": compiled and not recorded, "recorded": recorded}
-    chosen = problem(task, None if rope_model is None else cable(rope_model), double=_is_double(dtype), **steps)
+    steps |= {"double": _is_double(dtype)} | _judged(task, grasps, reward)
+    chosen = problem(task, None if rope_model is None else cable(rope_model), **steps)
     given = {"episodes": episodes, "population": population, "robust": Robust() if robust else None, "seed": seed}
     settings = preset(task, method, **given)
     try:
@@ -192,6 +203,20 @@ def optimize(
     if found.interrupted:
         typer.echo(f"--resume goes on from {out / 'journal'}", err=True)
         raise typer.Exit(INTERRUPTED)
+
+
+def _judged(task: str, grasps: Path | None, reward: Path | None) -> dict[str, Any]:
+    """Return what hands hold and what earns, as files say."""
+    found: dict[str, Any] = {}
+    if grasps is not None:
+        from torchdlo.agents.vlm.grasp_proposal import load_grasps
+
+        found["grasps"] = load_grasps(grasps, task)
+    if reward is not None:
+        from torchdlo.reward_language import load_reward
+
+        found["reward"] = load_reward(reward)
+    return found
 
 
 def _is_double(dtype: str) -> bool:

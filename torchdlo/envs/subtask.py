@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, cast
@@ -61,6 +62,17 @@ class SubTask(Task):
     def travels(self) -> int:
         """Actions at the start in which hands go to what they hold next."""
         return self.stages[1].first if self.before is not None and len(self.stages) > 1 else 0
+
+    @functools.cached_property
+    def identity(self) -> dict[str, Any]:
+        """What results depend on beside the task's name, as plain data: reward, and a hash of where it begins."""
+        found: dict[str, Any] = {} if self.reward is None else {"reward": self.reward.plain()}
+        if self.before is not None:
+            digest = hashlib.sha256()
+            for leaf in tree.leaves(self.before):
+                digest.update(leaf.detach().cpu().contiguous().numpy().tobytes())
+            found["part"] = {"from": digest.hexdigest(), "kept": list(self.kept), "horizon": self.horizon}
+        return found
 
     @functools.cached_property
     def layout(self) -> scene_names.Layout:

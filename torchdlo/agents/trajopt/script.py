@@ -56,10 +56,12 @@ def script(
     Raises:
         InputError: The trajectory is none, is one of another task, needs a rope, or there is no scripted demonstration.
     """
-    task = find(name, rope)
-    found = {"compiled": compiled, "recorded": task.horizon > _LONG} if trajectory is None else _choices(trajectory)
+    found = (
+        {"compiled": compiled, "recorded": find(name).horizon > _LONG} if trajectory is None else _choices(trajectory)
+    )
     material = found.pop("rope", None)
     chosen = problem(name, rope, **found)
+    task = chosen.task
     if material is not None and rope is None:
         raise InputError(f"{trajectory}: it was found for its own rope; give that one, or another, with --rope-model.")
     seeded = torch.Generator().manual_seed(reset_seed or 0)
@@ -79,6 +81,9 @@ def _choices(path: Path) -> dict[str, Any]:
     try:
         choices = json.loads(path.read_text(encoding="utf-8"))["choices"]
         steps = {"compiled": bool(choices["compiled"]), "recorded": bool(choices.get("recorded"))}
+        grasps = choices.get("grasps")
+        if grasps is not None:
+            steps["grasps"] = tuple(grasps)
         return {"double": bool(choices["double"]), **steps, "rope": choices.get("rope")}
     except (OSError, ValueError, KeyError, TypeError):
         raise InputError(f"{path}: expected a trajectory of torchdlo optimize, found something else.") from None

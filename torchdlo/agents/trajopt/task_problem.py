@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
@@ -15,21 +16,33 @@ from torchdlo.coupling.common import step_diagnostics
 from torchdlo.envs import PUBLISHED, RopeMaterial, find
 from torchdlo.envs.core import episode
 from torchdlo.envs.core.task import Task
+from torchdlo.envs.subtask import SubTask, rewarded
 from torchdlo.errors import InputError
 from torchdlo.physics import tree
+from torchdlo.reward_language import Reward
 
 __all__ = ["TaskProblem", "problem"]
 
 
-def problem(name: str, rope: RopeMaterial | None = None, **choices: Any) -> TaskProblem:
+def problem(
+    name: str,
+    rope: RopeMaterial | None = None,
+    *,
+    grasps: Sequence[int | None] | None = None,
+    reward: Reward | None = None,
+    **choices: Any,
+) -> TaskProblem:
     """Return the problem of a task by its name, with a rope of its own or a given one.
 
     Args:
         name: of the task.
         rope: see `torchdlo.envs.make`.
+        grasps: see there.
+        reward: what it is judged by, if not what the task says.
         choices: fields of `TaskProblem`.
     """
-    return TaskProblem(find(name, rope), **choices)
+    task = find(name, rope, grasps)
+    return TaskProblem(task if reward is None else rewarded(task, reward), **choices)
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,9 +106,11 @@ class TaskProblem:
         """What else results depend on."""
         rope = {} if self.task.rope is None else {"rope": asdict(self.task.rope)}
         steps = {"compiled": self.compiled, "recorded": self.recorded and not self.compiled}
+        grasps = {} if self.task.grasps is None else {"grasps": list(self.task.grasps)}
+        part = self.task.identity if isinstance(self.task, SubTask) else {}
         # Files from before it could be chosen are of the published one, and do not name it.
         how = {} if self.task.fidelity == PUBLISHED else {"fidelity": self.task.fidelity.plain()}
-        return {"double": self.double, **steps, "device": self.device} | rope | how
+        return {"double": self.double, **steps, "device": self.device} | rope | grasps | part | how
 
     @property
     def like(self) -> Tensor:

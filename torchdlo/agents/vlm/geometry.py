@@ -154,8 +154,11 @@ def _opened(places: Places) -> list[int]:
 def _lead(places: Places, count: int) -> int:
     """Return a vertex behind the end that is next to a body, or to a hand if there is none."""
     aims = places.bodies if len(places.bodies) else places.x.new_tensor(places.task.arms.base)
-    ends = [(places.x[k] - aims).norm(dim=-1).min() for k in (0, count - 1)]
-    return END if ends[0] <= ends[1] else count - 1 - END
+    near = [
+        (not bool(places.reach[k].any()), float((places.x[k] - aims).norm(dim=-1).min()), k)
+        for k in (END, count - 1 - END)
+    ]
+    return min(near)[2]
 
 
 def _farthest(places: Places, fixed: Sequence[int]) -> int:

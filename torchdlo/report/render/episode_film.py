@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -18,7 +18,7 @@ from torchdlo.errors import InputError
 from torchdlo.scene import Params, Scene
 from torchdlo.scene_files.run import Frames, appearance
 
-__all__ = ["film", "outcome_of"]
+__all__ = ["film", "outcome_of", "stills"]
 
 _STEEP = 0.9
 """Gradient at which the camera looks down."""
@@ -68,6 +68,17 @@ def film(
 
     with torch.no_grad(), contextlib.suppress(_Stopped):
         went = episode.play(task, actions[None], episode=made, keep=keep, callback=told)
+    return _frames(task, made, seen, arms=arms, interrupted=went is None), went
+
+
+def stills(made: episode.Episode, worlds: Sequence[episode.EpisodeState], *, arms: bool = True) -> Frames:
+    """Return moments of an episode of one scene as frames."""
+    return _frames(made.task, made, [_seen(world) for world in worlds], arms=arms)
+
+
+def _frames(
+    task: Task, made: episode.Episode, seen: list[dict[str, Tensor]], *, arms: bool, interrupted: bool = False
+) -> Frames:
     kept = {name: torch.cat([frame[name] for frame in seen]) for name in seen[0]}
     joints = kept.pop("joints")
     looks = appearance(made.scene, made.params, surfaces(made.scene, made.params))
@@ -77,7 +88,7 @@ def film(
         moving["body_pos"] = np.concatenate([moving["body_pos"], pos], 1)
         moving["body_quat"] = np.concatenate([moving["body_quat"], quat], 1)
         looks = looks | {name: np.concatenate([looks[name], value]) for name, value in shapes.items()}
-    return Frames(**moving, **looks, camera_direction=_look(task, made.start), interrupted=went is None), went
+    return Frames(**moving, **looks, camera_direction=_look(task, made.start), interrupted=interrupted)
 
 
 def _look(task: Task, start: episode.EpisodeState) -> np.ndarray:

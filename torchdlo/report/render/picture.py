@@ -243,6 +243,31 @@ class Picture:
         self._plotter.render()
         return np.array(self._plotter.screenshot(None, return_img=True))[..., :3]
 
+    @property
+    def eye(self) -> np.ndarray:
+        """Where the camera is [m], shape (3,)."""
+        return np.asarray(self._plotter.camera.position, float)
+
+    def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return where points (N, 3) are seen, in pixels from the upper left (N, 2), and how far ahead [m] (N,)."""
+        camera = self._plotter.camera
+        eye = np.asarray(camera.position)
+        ahead = np.asarray(camera.focal_point) - eye
+        ahead = ahead / np.linalg.norm(ahead)
+        right = np.cross(ahead, np.asarray(camera.up))
+        right = right / np.linalg.norm(right)
+        away = points - eye
+        depth = away @ ahead
+        width, height = self._plotter.window_size
+        scale = 0.5 * height / np.tan(np.radians(_ANGLE / 2)) / depth
+        u = 0.5 * width + scale * (away @ right)
+        v = 0.5 * height - scale * (away @ np.cross(right, ahead))
+        return np.stack([u, v], -1), depth
+
+    def depth(self) -> np.ndarray:
+        """Return how far ahead of the camera is what each pixel of the last picture shows [m], NaN where nothing is."""
+        return -np.asarray(self._plotter.get_image_depth(fill_value=np.nan))
+
     def close(self) -> None:
         """Free what the renderer holds."""
         self._plotter.close()
