@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import json
+import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -13,7 +15,13 @@ from torchdlo.files import check_writable, write_atomically
 if TYPE_CHECKING:
     from torchdlo.agents.vlm.conversation import Conversation
 
-__all__ = ["propose"]
+__all__ = ["plan", "propose"]
+
+_INTERRUPTED = 130
+"""Exit code after Ctrl-C, as shells have it."""
+
+_KEPT = {"exchanges": "[0-9][0-9][0-9]", "steps": "[0-9][0-9]"}
+"""What a run keeps, by the folder, and how it is named there."""
 
 _Out = Annotated[Path | None, typer.Option("--out", "-o", help="Folder for what is made.", metavar="DIR")]
 _Endpoint = Annotated[
@@ -70,10 +78,14 @@ def _conversation(
 
 
 def clear(folder: Path) -> None:
-    """Delete exchanges of an earlier run."""
-    for file in [*(folder / "exchanges").glob("[0-9][0-9][0-9].json"), *(folder / "pictures").glob("*.png")]:
-        check_writable(file, mark=b"torchdlo" if file.suffix == ".json" else b"PNG")
+    """Delete what is kept of an earlier run."""
+    kept = [(folder / part).glob(f"{digits}.json") for part, digits in _KEPT.items()]
+    for file in itertools.chain(*kept):
+        check_writable(file)
         file.unlink()
+    for file in (folder / "pictures").glob("*.png"):
+        if re.fullmatch("[0-9a-f]{16}", file.stem):
+            file.unlink()
 
 
 def propose(
@@ -97,7 +109,7 @@ def propose(
 ) -> None:
     """Propose what the hands are to hold at the start of a task.
 
-    A model sees a picture and says where to hold the rope: by the number of a mark, by a share of the rope's length, or
+    A model sees a picture and says where to hold the rope: by the number of a mark, by a share of its length, or
     by a place in the picture. What hands do not reach is refused with the reason and asked for again. Pictures and
     texts go to the endpoint that is given and nowhere else; its key is read from OPENAI_API_KEY. All that was said is
     kept.
@@ -138,3 +150,79 @@ def propose(
     typer.echo(f"proposal: {out / 'proposal.json'}", err=as_json)
     if as_json:
         typer.echo(json.dumps(json.loads(found.json()), indent=1))
+
+
+def plan(
+    task: Annotated[str, typer.Argument(help="Name of the task.", metavar="TASK")],
+    out: _Out = None,
+    endpoint: _Endpoint = None,
+    model: _Model = None,
+    recorded: _Recorded = None,
+    geometry: _Geometry = False,
+    update: Annotated[bool, typer.Option(help="Ask again after every step.")] = True,
+    method: Annotated[str, typer.Option(help="How steps are searched.", metavar="hybrid|cmaes")] = "hybrid",
+    episodes: Annotated[int, typer.Option(min=4, help="Budget of a step.")] = 240,
+    population: Annotated[int, typer.Option(min=4, help="Trajectories per iteration.")] = 24,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the searches.")] = 0,
+    vary: Annotated[
+        int | None, typer.Option(min=0, help="Seed of a start that differs from the usual one.", metavar="SEED")
+    ] = None,
+    pictures: Annotated[bool, typer.Option(help="Draw pictures, and show them to the model.")] = True,
+    calls: _Calls = 60,
+    tokens: _Tokens = 2_000_000,
+    seconds: _Seconds = 120.0,
+    resume: _Resume = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print what came of it as JSON.")] = False,
+) -> None:
+    """Split a task into steps with a model, search each, look at what came of it, and plan anew.
+
+    The model says what hands hold in a step, what earns, and when the step is done, in a language that is interpreted
+    and never run. After each step it sees stills and values and says what is left. The task's own condition decides
+    whether it is done. Nothing is sent unless an endpoint is given. --no-update carries out the first plan as it is.
+
+    [bold]Examples:[/bold]
+
+    torchdlo plan wiring_ring --endpoint http://localhost:8000/v1 --model qwen-vl
+
+    torchdlo plan wiring_ring --recorded runs/plan/wiring_ring --no-update --out runs/plan/again
+
+    torchdlo plan lifting --geometry --episodes 480
+    """
+    from torchdlo.agents.vlm.decomposition import Options, carry_out
+    from torchdlo.cli.progress import deferred_interrupt, progress
+    from torchdlo.envs import find
+    from torchdlo.errors import InputError
+    from torchdlo.report.plan_page import plan_html
+
+    if method not in ("hybrid", "cmaes"):
+        raise InputError(f"method: it is {method!r}; expected hybrid or cmaes.")
+    chosen = find(task)
+    out = out or Path("runs") / "plan" / task
+    for name in ("plan.json", "report.html"):
+        check_writable(out / name)
+    limits = {"calls": calls, "tokens": tokens, "seconds": seconds, "resume": resume}
+    said = _conversation(out, endpoint, model, recorded, geometry, **limits)
+    look: Any = None
+    if pictures:
+        from torchdlo.report.marks import Camera
+        from torchdlo.report.render.picture import check_renderer
+
+        check_renderer()
+        look = Camera()
+    options = Options(update=update, method=method, episodes=episodes, population=population, seed=seed, vary=vary)
+    try:
+        with progress() as show, deferred_interrupt(show) as callback:
+            found = carry_out(chosen, said, options, look=look, folder=out, callback=callback)
+    except KeyboardInterrupt:
+        typer.echo(f"interrupted; --resume goes on with what is in {out}", err=True)
+        raise typer.Exit(_INTERRUPTED) from None
+    content = found.json(options)
+    shown = {p.stem: p.read_bytes() for p in (out / "pictures").glob("*.png")}
+    write_atomically(out / "plan.json", content)
+    write_atomically(out / "report.html", plan_html(json.loads(content), said.exchanges, shown))
+    typer.echo(
+        f"{task}: {found.ended} ({len(found.carried)} steps, {found.updates} updates, {found.source})", err=as_json
+    )
+    typer.echo(f"plan:   {out / 'plan.json'}\nreport: {out / 'report.html'}", err=as_json)
+    if as_json:
+        typer.echo(content, nl=False)

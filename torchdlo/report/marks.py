@@ -8,10 +8,12 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
+from torchdlo.envs.core import episode
+from torchdlo.report.render.episode_film import stills
 from torchdlo.report.render.picture import Picture
 from torchdlo.scene_files.run import Frames
 
-__all__ = ["MarkedView", "marked_view"]
+__all__ = ["Camera", "MarkedView", "marked_view", "spaced"]
 
 _SLACK = 0.004
 """How much nearer than a rope's surface something has to be to hide it [m]."""
@@ -72,3 +74,36 @@ def marked_view(frames: Frames, k: int = -1, *, size: tuple[int, int] = (960, 72
     seen[inside] = depth[row[inside], column[inside]]
     hidden = seen < ahead - _before(frames, picture.eye, k) - _SLACK
     return MarkedView(image, pixels, inside & ~hidden)
+
+
+class Camera:
+    """Draws worlds of an episode for plans."""
+
+    def now(self, made: episode.Episode, world: episode.EpisodeState) -> bytes:
+        """Return the scene without arms, with numbers on vertices, as PNG."""
+        view = marked_view(stills(made, [world], arms=False))
+        return view.marked(spaced(view))
+
+    def stills(self, made: episode.Episode, worlds: Sequence[episode.EpisodeState]) -> bytes:
+        """Return moments in rows of four, with arms, as PNG."""
+        from PIL import Image
+
+        frames = stills(made, worlds)
+        with Picture(frames, size=(480, 360)) as picture:
+            images = [Image.fromarray(np.ascontiguousarray(picture.image(k))) for k in range(len(frames.time))]
+        wide = min(4, len(images))
+        sheet = Image.new("RGB", (480 * wide, 360 * -(-len(images) // wide)), "#ffffff")
+        for k, image in enumerate(images):
+            sheet.paste(image, (480 * (k % wide), 360 * (k // wide)))
+        content = io.BytesIO()
+        sheet.save(content, format="PNG")
+        return content.getvalue()
+
+
+def spaced(view: MarkedView, apart: float = 26.0) -> list[int]:
+    """Return vertices that are seen and that are so far apart in a picture [pixels]."""
+    chosen: list[int] = []
+    for slot in view.visible.nonzero()[:, 0].tolist():
+        if all(float((view.pixels[slot] - view.pixels[other]).norm()) >= apart for other in chosen):
+            chosen.append(slot)
+    return chosen

@@ -15,6 +15,10 @@ from torchdlo.errors import InputError
 __all__ = ["cmaes", "drawn", "package", "strategy"]
 
 
+_NEAR = 0.2
+"""First spread about a trajectory that is given, over that of other beginnings."""
+
+
 def package() -> Any:
     """Return the module `cma`; says so if there is none."""
     try:
@@ -60,14 +64,31 @@ def drawn(found: Any, encoding: Encoding, given: Tensor | None = None) -> Tensor
 
 
 def cmaes(plan: SearchPlan, rng: torch.Generator) -> Search:
-    """Search way-points without gradients; starts again when the spread has shrunk to nothing."""
+    """Search way-points without gradients; starts again when the spread has shrunk to nothing.
+
+    Where there are trajectories to begin with, a first strategy searches what is best to add to one of them.
+    """
     encoding = plan.encoding(plan.hold)
+    if plan.first is not None:
+        yield from _about(plan, plan.first[0], rng)
     while True:
         found = strategy(torch.zeros(encoding.size, dtype=torch.float64), plan.sigma, plan.population, rng)
         while not found.stop():
             x = drawn(found, encoding)
             told = yield Ask(encoding, x)
             found.tell(list(x.numpy()), _costs(told).tolist())
+
+
+def _about(plan: SearchPlan, first: Tensor, rng: torch.Generator) -> Search:
+    """Search way-points that are added to actions (T A,)."""
+    encoding, whole = plan.encoding(plan.hold), plan.encoding(1)
+    zero = torch.zeros(1, encoding.size, dtype=torch.float64)
+    found, given = strategy(zero[0], _NEAR * plan.sigma, plan.population, rng), zero
+    while not found.stop():
+        x = drawn(found, encoding, given)
+        given = None
+        told = yield Ask(whole, whole.project(first + encoding.decode(x).flatten(1)))
+        found.tell(list(x.numpy()), _costs(told).tolist())
 
 
 def _costs(told: Told) -> Tensor:

@@ -85,6 +85,10 @@ def hybrid(plan: SearchPlan, rng: torch.Generator) -> Search:
     rngs = [torch.Generator().manual_seed(seed) for seed in torch.randint(2**31, (count,), generator=rng).tolist()]
     kinds = [_island] * (count - plain) + [_line] * plain
     islands = [kind(*each) for kind, *each in zip(kinds, plans, rngs, strict=True)]
+    if plan.first is not None:
+        # What is given may be wrong: every other island begins as without it.
+        for j in range(0, count, 2):
+            islands[j] = kinds[j](plans[j], rngs[j], 0, plan.first[j // 2 % len(plan.first)])
     parts: list[Told | None] = [None] * count
     given_up = {math.ceil(when * plan.iterations): share for when, share in _GIVEN_UP.items()}
     # What was measured in a surrogate task or in milder worlds does not compare with what comes after.
@@ -143,7 +147,8 @@ def _island(plan: SearchPlan, rng: torch.Generator, first: int = 0, about: Tenso
         first: iterations that are over.
         about: actions to begin with in place of sweeps and rounds [m], shape (T A,).
     """
-    encoding, coarse, fine = plan.encoding(1), _Evolution(plan, rng, about), Descent(plan, rng)
+    given = about is not None and first == 0
+    encoding, coarse, fine = plan.encoding(1), _Evolution(plan, rng, about, given=given), Descent(plan, rng)
     with_gradient, tame = fine.count, _Tame(plan)
     drifts = math.ceil(plan.drifts * plan.iterations)
     alone = max(drifts, first + 1 if first else math.ceil(_COARSE * plan.iterations))
@@ -214,8 +219,11 @@ class _Evolution:
     It begins with the best of sweeps and rounds, or adds its way-points to actions (T A,) that are given.
     """
 
-    def __init__(self, plan: SearchPlan, rng: torch.Generator, about: Tensor | None = None) -> None:
+    def __init__(
+        self, plan: SearchPlan, rng: torch.Generator, about: Tensor | None = None, *, given: bool = False
+    ) -> None:
         self.plan, self.rng, self.encoding, self.about = plan, rng, plan.encoding(plan.hold, _APART), about
+        self.unplayed = given  # nobody has played these actions yet
         self.fresh = max(1, round(_FRESH * plan.iterations))
         self.tried: list[tuple[Tensor, Told]] = []
         self.x = torch.zeros(0, self.encoding.size, dtype=torch.float64)
@@ -231,6 +239,8 @@ class _Evolution:
             self.x = _beginnings(self.plan, self.encoding, self.rng)
         else:
             moved = self.x[:0] if self.lines is None else self.encoding.project(self.lines.moved(self.found))
+            if self.unplayed:
+                moved, self.unplayed = torch.zeros(1, self.encoding.size, dtype=torch.float64), False
             self.x = drawn(self.found, self.encoding, moved)
         actions = self.encoding.decode(self.x).flatten(1)
         return actions if self.about is None else self.plan.encoding(1).project(self.about + actions)

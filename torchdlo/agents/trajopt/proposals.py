@@ -114,6 +114,8 @@ class SearchPlan:
     """Where there are things to touch, see `Problem.touch`."""
     tools: tuple[tuple[float, float, float], ...] = ()
     """Where tools are at the start, see `Problem.tools`."""
+    first: Tensor | None = None
+    """Trajectories to begin with, if there are any [m], shape (K, T A)."""
 
     @classmethod
     def of(cls, problem: Problem, population: int, iterations: int, **choices: Any) -> SearchPlan:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
 import time
 from collections.abc import Callable, Sequence
@@ -139,6 +140,7 @@ def optimize(
     journal: Path | None = None,
     resume: bool = False,
     callback: Callback | None = None,
+    first: Tensor | None = None,
 ) -> SearchResult:
     """Search the trajectory with the largest return, if it can be had one that succeeds.
 
@@ -151,12 +153,19 @@ def optimize(
             written down.
         resume: go on from what is in the journal.
         callback: told (stage, episodes done, all episodes, message) after every batch.
+        first: trajectories to begin with, shape (K, T, A).
     """
     plan, robust = settings.plan(problem), settings.robust
+    options = _options(problem, settings)
+    if first is not None:
+        if settings.method == "gd":
+            raise InputError("gd begins with nothing that is given; use cmaes or hybrid.")
+        plan = replace(plan, first=first.to(torch.float64).flatten(1))
+        options["first"] = hashlib.sha256(first.double().contiguous().numpy().tobytes()).hexdigest()
     stand_in = problem.surrogate() if plan.surrogates else None
     if plan.surrogates and stand_in is None:
         raise InputError(f"{problem.name}: it has no surrogate task; set surrogate_share to 0.")
-    player = _Player(problem, settings, SearchJournal(journal, _options(problem, settings), resume=resume), callback)
+    player = _Player(problem, settings, SearchJournal(journal, options, resume=resume), callback)
     search = METHODS[settings.method](plan, torch.Generator().manual_seed(settings.seed))
     if settings.method not in SURROGATE_ROUND:
         search = handed(search, plan)

@@ -10,13 +10,15 @@ from __future__ import annotations
 import itertools
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
 
 from torchdlo.agents.vlm.conversation import Question, Reply
 from torchdlo.agents.vlm.grasp_proposal import APART, Places, View
+from torchdlo.agents.vlm.schema import HORIZON
+from torchdlo.envs import scene_names
 from torchdlo.envs.core import curve_geometry
 from torchdlo.errors import InputError
 
@@ -40,7 +42,7 @@ class Geometry:
             raise InputError(f"geometry, no model: its answer for {question.kind} will not do, and it has no other.")
         if question.kind == "grasps":
             return Reply(json.dumps(_grasps(*question.facts)))
-        raise InputError(f"geometry, no model: it has no answer to a question for {question.kind}; give a model.")
+        return Reply(json.dumps({"steps": [_step(*question.facts)]}))
 
     def skip(self, count: int) -> None:
         """Do nothing."""
@@ -175,3 +177,48 @@ def _one_each(places: Places) -> tuple[int | None, ...]:
         apart = (own[[END, count - 1 - END], None] - others).norm(dim=-1).amin(-1)
         ends.append(first + (END if float(apart[0]) >= float(apart[1]) else count - 1 - END))
     return _deal(places, ends[: places.hands])
+
+
+def _step(places: Places, values: Mapping[str, torch.Tensor]) -> dict[str, Any]:
+    """Return one step for the whole of a task, from what there is to name in its scene."""
+    terms, success = _aim(places, values)
+    grasps = {f"robot_{k + 1}": slot for k, slot in enumerate(chosen(places))}
+    return {
+        "id": 1,
+        "description": "all at once, from the geometry of the scene",
+        "grasps": grasps,
+        "waypoints": None,
+        "reward": terms,
+        "reward_description": "what is likely to be wanted in such a scene",
+        "success": success,
+        "horizon": min(HORIZON, places.task.horizon),
+    }
+
+
+def _aim(places: Places, values: Mapping[str, torch.Tensor]) -> tuple[dict[str, str], str]:
+    """Return terms of a reward, and a condition."""
+    free = [n for n, k, _ in scene_names.layout(places.scene).bodies if places.scene.bodies[k].motion == "free"]
+    wound = sorted(n for n in values if n.startswith("winding_"))
+    goals = sorted(n for n in values if n == "goal" or n.startswith("goal_"))
+    if "crossing_number" in values:
+        return {"open": "exp(-crossing_number)"}, "crossings < 0.5"
+    if wound:
+        posts = [n.replace("winding", "post") for n in wound]
+        terms = {f"round_{k}": f"-(abs({n}) - 1) ** 2" for k, n in enumerate(wound)}
+        terms |= {f"near_{k}": f"-nearest(rope, {p})" for k, p in enumerate(posts)}
+        return terms, " and ".join(f"abs({n}) > 0.5" for n in wound)
+    if free:
+        now = {n: float(values[n][0, 2]) for n in free}
+        terms = {f"up_{k}": f"5 * z({n})" for k, n in enumerate(free)}
+        terms |= {f"near_{k}": f"-nearest(rope, {n})" for k, n in enumerate(free)}
+        return terms, " and ".join(f"z({n}) > {now[n] + 0.05:.3f}" for n in free)
+    if goals and values[goals[0]].dim() == 3:
+        ropes = ["rope"] if len(goals) == 1 else [n.replace("goal", "rope") for n in goals]
+        terms = {f"goal_{k}": f"-chamfer({r}, {g})" for k, (r, g) in enumerate(zip(ropes, goals, strict=True))}
+        return terms, " and ".join(f"chamfer({r}, {g}) < 0.03" for r, g in zip(ropes, goals, strict=True))
+    if goals:
+        return {"lead": f"-dist(rope[0], {goals[0]})"}, f"dist(rope[0], {goals[0]}) < 0.03"
+    if len(places.ropes) > 1:
+        return {"apart": "mean(nearest(rope_0, rope_1))"}, "min(nearest(rope_0, rope_1)) > 0.05"
+    body = next(n for n in values if n.startswith(("body_", "ring_", "post_")))
+    return {"near": f"-mean(dist(rope, {body}))"}, f"max(dist(rope, {body})) < 0.1"

@@ -17,7 +17,7 @@ from torchdlo.agents.vlm.schema import MODES, grasps_model
 from torchdlo.envs import Task, scene_names
 from torchdlo.envs.core.episode import reachable
 from torchdlo.errors import InputError
-from torchdlo.scene import Scene
+from torchdlo.scene import Scene, State
 
 __all__ = [
     "Places",
@@ -29,6 +29,7 @@ __all__ = [
     "places_of",
     "propose",
     "random_grasps",
+    "reach_text",
 ]
 
 APART = 0.05
@@ -81,10 +82,10 @@ class Places:
         return next(k for k, (first, count) in enumerate(self.ropes) if first <= slot < first + count)
 
 
-def places_of(task: Task, world: Any = None) -> Places:
-    """Return the vertices of a task at its start, or in a world of one scene."""
-    scene, _, state = task.start(1, like=torch.zeros((), dtype=torch.float64))
-    state = state if world is None else world.state
+def places_of(task: Task, state: State | None = None) -> Places:
+    """Return the vertices of a task at its start, or in another state of one scene."""
+    scene, _, usual = task.start(1, like=torch.zeros((), dtype=torch.float64))
+    state = usual if state is None else state
     x = state.rods.pos[0].double()
     reach = reachable(task, x)
     bodies = [k for k, body in enumerate(scene.bodies) if body.shape != "plane"]
@@ -238,16 +239,16 @@ def _snapped(places: Places, mode: str, view: View, marks: list[int], said: Any)
     slot = int(far.argmin())
     if float(far[slot]) > CLOSE:
         raise InputError(
-            f"({said.u:.0f}, {said.v:.0f}) is {float(far[slot]):.0f} pixels from the rope; choose a place on it, such as "
-            f"({float(view.pixels[slot, 0]):.0f}, {float(view.pixels[slot, 1]):.0f})."
+            f"({said.u:.0f}, {said.v:.0f}) is {float(far[slot]):.0f} pixels from the rope; choose a place on it, "
+            f"such as ({float(view.pixels[slot, 0]):.0f}, {float(view.pixels[slot, 1]):.0f})."
         )
     return slot
 
 
-def _scene_text(places: Places, mode: str, marks: list[int]) -> str:
-    """Return what a model is told of the scene."""
+def reach_text(places: Places) -> str:
+    """Return where robots stand, what they reach, and what ropes there are."""
     task = places.task
-    lines = [f"Task: {task.name}. {(type(task).__doc__ or '').splitlines()[0]}"]
+    lines = []
     for k, base in enumerate(task.arms.base):
         lines.append(
             f"robot_{k + 1} stands at ({base[0]:.2f}, {base[1]:.2f}) and reaches vertices {_ranges(places, k)}."
@@ -255,9 +256,15 @@ def _scene_text(places: Places, mode: str, marks: list[int]) -> str:
     for k, (first, count) in enumerate(places.ropes):
         how = "closed" if places.scene.topology.closed[k] else "open"
         lines.append(f"rope {k}: {how}, vertices {first} to {first + count - 1}.")
+    return "\n".join(lines)
+
+
+def _scene_text(places: Places, mode: str, marks: list[int]) -> str:
+    """Return what a model is told of the scene."""
+    task = places.task
+    lines = [f"Task: {task.name}. {(type(task).__doc__ or '').splitlines()[0]}", reach_text(places)]
     here = scene_names.layout(places.scene)
-    kept = [row for row in here.bodies]
-    for (name, _, doc), pos in zip(kept, places.bodies, strict=True):
+    for (name, _, doc), pos in zip(here.bodies, places.bodies, strict=True):
         lines.append(f"{name}: {doc} at ({', '.join(f'{float(p):.3f}' for p in pos)}).")
     shown = marks or range(0, len(places.x), max(1, len(places.x) // 16))
     lines.append("Marks:" if mode == "candidate" else "Some vertices:")

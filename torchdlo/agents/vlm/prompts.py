@@ -11,6 +11,6 @@ def prompt(name: str, **parts: str) -> str:
     """Return a text with its parts filled in."""
     text = (files("torchdlo.agents.vlm") / "prompts" / f"{name}.md").read_text(encoding="utf-8")
     for key, part in parts.items():
-        # Nothing in a part may end the data.
-        text = text.replace("{" + key + "}", part.replace("<", "(").replace(">", ")"))
+        # Nothing in a part may end the data; comparisons may stay.
+        text = text.replace("{" + key + "}", part.replace("</", "< /").replace("<data", "< data"))
     return text

@@ -84,8 +84,8 @@ def load_recorded(path: Path) -> Recorded:
             raise ValueError
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
         raise InputError(
-            f'{path}: expected a conversation, {{"source": "...", "exchanges": [{{"kind": "plan", "response": ...}}]}}, '
-            "or the folder of a run."
+            f'{path}: expected a conversation, {{"source": "...", "exchanges": '
+            '[{"kind": "plan", "response": "..."}]}, or the folder of a run.'
         ) from None
     label = plain_text(source, 120)
     return Recorded(label if label.startswith("recorded: ") else f"recorded: {label}", answers, str(path))

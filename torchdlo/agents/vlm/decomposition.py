@@ -1,0 +1,453 @@
+"""Long tasks in steps: a plan of a model, each step searched as a task of its own, and the plan updated by what came.
+
+A model is asked once for a plan. A step says what hands hold, what earns, and when it is done; it becomes a task that
+goes on from where the last one ended. After it, stills and values go back, and the model says what is left to do. The
+task's own condition decides whether all is done, not the model. Without updates the first plan is carried out as it is.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import json
+import math
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any, Protocol
+
+import torch
+from torch import Tensor
+
+from torchdlo.agents.trajopt.problem import Evaluation
+from torchdlo.agents.trajopt.search import Settings, optimize
+from torchdlo.agents.trajopt.task_problem import TaskProblem
+from torchdlo.agents.vlm.conversation import Conversation, Picture, Question, plain_text
+from torchdlo.agents.vlm.grasp_proposal import Places, check_grasps, places_of
+from torchdlo.agents.vlm.prompts import prompt
+from torchdlo.agents.vlm.scene_text import language_text, scene_text, seen_of
+from torchdlo.agents.vlm.schema import step_models
+from torchdlo.agents.vlm.waypoints import led
+from torchdlo.coupling.common import step_diagnostics
+from torchdlo.envs import Task, scene_names
+from torchdlo.envs.core import episode
+from torchdlo.envs.subtask import SubTask, concluded, continue_from
+from torchdlo.errors import InputError
+from torchdlo.files import write_atomically
+from torchdlo.reward_language import Reward, reward
+from torchdlo.scene import State
+
+__all__ = ["Carried", "Look", "Options", "Result", "carry_out"]
+
+
+class Look(Protocol):
+    """What draws pictures of worlds."""
+
+    def now(self, made: episode.Episode, world: episode.EpisodeState) -> bytes:
+        """Return the scene with numbers on the vertices, as PNG."""
+        ...
+
+    def stills(self, made: episode.Episode, worlds: Sequence[episode.EpisodeState]) -> bytes:
+        """Return moments of a step side by side, as PNG."""
+        ...
+
+
+@dataclass(frozen=True)
+class Options:
+    """How plans are carried out."""
+
+    update: bool = True
+    """Whether the model is asked again after every step."""
+    steps: int = 8
+    """Most steps that are carried out and not taken back."""
+    patience: int = 3
+    """Updates without progress after which a run ends."""
+    method: str = "hybrid"
+    episodes: int = 240
+    """Budget of a step."""
+    population: int = 24
+    seed: int = 0
+    vary: int | None = None
+    """Seed of a start that differs from the usual one."""
+    enough: bool = True
+    """Whether a search ends with the first trajectory that reaches the success of its step."""
+    compiled: bool = False
+    recorded: bool = True
+    """If not compiled, whether steps of the scene are recorded."""
+
+
+@dataclass(frozen=True, eq=False)
+class Carried:
+    """What came of a step."""
+
+    step: dict[str, Any]
+    """As the model gave it."""
+    success: bool
+    """Whether its own condition held at its end."""
+    failed: str
+    """Why it was taken back, "" if it was not."""
+    returns: float | None
+    terms: dict[str, float]
+    """Terms of its reward at its end."""
+    episodes: int
+    seconds: float
+    task_success: bool
+    """Whether the task's own condition holds now."""
+    actions: Tensor | None = None
+    """What was played, shape (T, 3 R)."""
+    pictures: tuple[Picture, ...] = ()
+
+    def plain(self) -> dict[str, Any]:
+        """Return it as plain data, without what was played."""
+        kept = ("step", "success", "failed", "returns", "terms", "episodes", "seconds", "task_success")
+        return {name: getattr(self, name) for name in kept} | {"pictures": [p.digest[:16] for p in self.pictures]}
+
+
+@dataclass(frozen=True, eq=False)
+class Result:
+    """What came of a run."""
+
+    task: str
+    source: str
+    success: bool
+    """Whether the task's own condition holds at the end."""
+    ended: str
+    """Why it ended, a sentence."""
+    plans: list[dict[str, Any]]
+    """The first plan and every update, as they were given."""
+    carried: list[Carried]
+    updates: int
+    calls: int
+    tokens: int
+    seconds: float
+    world: episode.EpisodeState = field(repr=False)
+
+    def json(self, options: Options) -> str:
+        """Return the content of a file."""
+        content = {
+            "generator": "torchdlo plan",
+            "task": self.task,
+            "source": self.source,
+            "success": self.success,
+            "ended": self.ended,
+            "updates": self.updates,
+            "calls": self.calls,
+            "tokens": self.tokens,
+            "seconds": round(self.seconds, 3),
+            "episodes": sum(c.episodes for c in self.carried),
+            "options": asdict(options),
+            "plans": self.plans,
+            "steps": [c.plain() for c in self.carried],
+        }
+        return json.dumps(content, indent=1, allow_nan=False) + "\n"
+
+
+@dataclass(eq=False)
+class _Run:
+    """A run so far."""
+
+    task: Task
+    talk: Conversation
+    options: Options
+    look: Look | None
+    folder: Path | None
+    callback: Callable[[str, int, int, str], None]
+    like: Tensor
+    world: episode.EpisodeState | None = None
+    made: episode.Episode | None = None
+    holds: tuple[int | None, ...] = ()
+    carried: list[Carried] = field(default_factory=list)
+    plans: list[dict[str, Any]] = field(default_factory=list)
+    done: bool = False
+
+    # -- asking ------------------------------------------------------------------------------------------------------
+
+    @functools.cached_property
+    def opening(self) -> State:
+        """Where it begins."""
+        return self.task.start(1, like=self.like, **self.start())[2]
+
+    def places(self) -> Places:
+        """Return the vertices as they are now."""
+        return places_of(self.task, self.opening if self.world is None else self.world.state)
+
+    def ask(self, kind: str, left: Sequence[Any] = (), note: str = "") -> tuple[bool, list[Any]]:
+        """Return whether the model says that all is done, and the steps that are left; a note ends what it is told."""
+        plan, update = step_models(self.task.arms.count)
+        places = self.places()
+        seen = seen_of(self.task, self.opening, self.world)
+        text = scene_text(places, seen, [c.plain() for c in self.carried], [_plain(s) for s in left])
+        text = f"{text}\n{note}" if note else text
+        question = Question(
+            kind=kind,
+            system=prompt("system"),
+            text=prompt(kind, language=language_text(), scene=text),
+            pictures=self.pictures(),
+            answer=plan if kind == "plan" else update,
+            facts=(places, scene_names.named(self.task, scene_names.layout(places.scene), seen)),
+        )
+
+        def check(answer: Any) -> Any:
+            if kind == "update" and answer.complete == bool(answer.steps):
+                raise InputError('say {"complete": true, "reason": ...}, or give the steps that are left, not both.')
+            for number, step in enumerate(answer.steps):
+                self.check_step(step, places if number == 0 else None)
+            return answer
+
+        answer = self.talk.ask(question, check)
+        self.plans.append(answer.model_dump())
+        return bool(getattr(answer, "complete", False)), list(answer.steps)
+
+    def pictures(self) -> tuple[Picture, ...]:
+        """Return what is shown: the last step, and the scene as it is."""
+        if self.look is None:
+            return ()
+        made, world = self.made, self.world
+        if made is None or world is None:
+            made = episode.prepare(self.task, 1, like=self.like, compiled=False, **self.start())
+            world = made.start
+        now = Picture("the scene now, vertices with their numbers", self.look.now(made, world))
+        return (*(self.carried[-1].pictures if self.carried else ()), now)
+
+    def start(self) -> dict[str, Any]:
+        """Return how starts are drawn."""
+        seeded = torch.Generator().manual_seed(self.options.vary or 0)
+        return {"generator": seeded, "variation": self.options.vary is not None}
+
+    def check_step(self, step: Any, places: Places | None) -> None:
+        """Refuse a step whose expressions, grasps or way-points cannot be; of later ones grasps are not known yet."""
+        where = f"step {step.id}"
+        try:
+            part = _judged(step)
+            SubTask(inner=self.task, reward=part)
+            if places is not None:
+                grasps = check_grasps(places, _grasps(step))
+                led(step, places, grasps, self.world, self.task)
+        except InputError as error:
+            raise InputError(f"{where}: {error}") from None
+
+    # -- carrying out ------------------------------------------------------------------------------------------------
+
+    def part_of(self, step: Any) -> SubTask:
+        """Return the task of a step; before the first one, hands stand at what they hold."""
+        grasps = check_grasps(self.places(), _grasps(step))
+        world, holds = self.world, self.holds
+        if world is None:
+            first = replace(self.task, grasps=grasps)
+            made = episode.prepare(first, 1, like=self.like, compiled=False, **self.start())
+            world, holds = made.start, grasps
+        return continue_from(self.task, world, grasps, holds=holds, horizon=step.horizon, reward=_judged(step))
+
+    def step(self, step: Any, number: int) -> None:
+        """Search a step, play the best, and go on from its end if it did not fail."""
+        begun = time.monotonic()
+        content = _plain(step)
+        try:
+            part = self.part_of(step)
+            actions, episodes = self.search(step, part, number)
+        except InputError as error:
+            why = plain_text(str(error))
+            self.carried.append(Carried(content, False, why, None, {}, 0, time.monotonic() - begun, False))
+            return
+        problem = self.problem(part)
+        made, worlds = problem.prepared(1), []
+
+        def keep(world: episode.EpisodeState) -> dict[str, Tensor]:
+            worlds.append(world)
+            return {}
+
+        with torch.no_grad():
+            went = episode.play(part, problem.full(actions[None]), episode=made, keep=keep)
+        failed, missed = bool(went.failed[0]), step_diagnostics.explain(went.world.state.diagnostics)
+        if missed or not math.isfinite(float(went.returns[0])):
+            failed = True
+        why = missed or "the rope was torn, a hand was led where it may not go, or the scene broke" if failed else ""
+        # Hands of tasks that release at the end are opened to look, and are still closed when it goes on.
+        own = False
+        if not failed:
+            with torch.no_grad():
+                own = bool(concluded(made, went.world, self.task)[0][0])
+        pictures: tuple[Picture, ...] = ()
+        if self.look is not None:
+            moments = [worlds[round(k)] for k in torch.linspace(0, len(worlds) - 1, min(8, len(worlds))).tolist()]
+            pictures = (Picture(f"step {step.id}, from its start to its end", self.look.stills(made, moments)),)
+        terms = {name: float(x[-1, 0]) for name, x in went.terms.items()}
+        found = Carried(
+            content,
+            bool(went.success[0]) and not failed,
+            why,
+            float(went.returns[0]) if math.isfinite(float(went.returns[0])) else None,
+            {name: x for name, x in terms.items() if math.isfinite(x)},
+            episodes,
+            time.monotonic() - begun,
+            own,
+            actions,
+            pictures,
+        )
+        self.carried.append(found)
+        self.keep(number, found, part)
+        if not failed:
+            self.world, self.made, self.holds, self.done = went.world, made, _grasps(step), own
+
+    def problem(self, part: SubTask) -> TaskProblem:
+        """Return the problem of a step."""
+        return TaskProblem(part, compiled=self.options.compiled, recorded=self.options.recorded)
+
+    def search(self, step: Any, part: SubTask, number: int) -> tuple[Tensor, int]:
+        """Return the best trajectory (T, 3 R) and how many episodes it took; read if this was searched before."""
+        kept = self.recall(number, part)
+        if kept is not None:
+            return kept
+        options = self.options
+        settings = Settings(
+            method=options.method,
+            episodes=max(options.episodes, options.population),
+            population=options.population,
+            seed=options.seed,
+            chunk=options.population,
+        )
+        first = led(step, self.places(), _grasps(step), self.world, self.task, travels=part.travels)
+        problem = _Watched(self.problem(part))
+
+        def told(stage: str, done: int, total: int, message: str) -> None:
+            self.callback(f"step {number}", done, total, message)
+            if options.enough and problem.reached:
+                raise KeyboardInterrupt
+
+        found = optimize(problem, settings, callback=told, first=None if first is None else first[None])
+        if found.interrupted and not problem.reached:
+            raise KeyboardInterrupt
+        return found.actions, found.episodes
+
+    def file(self, number: int) -> Path | None:
+        """Return where a step is kept."""
+        return None if self.folder is None else self.folder / "steps" / f"{number:02d}.json"
+
+    def key(self, part: SubTask) -> str:
+        """Return a hash of all that the search of a step depends on."""
+        content = {"part": part.identity, "options": asdict(self.options), "grasps": part.grasps}
+        return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+
+    def keep(self, number: int, found: Carried, part: SubTask) -> None:
+        """Write down a step that was carried out."""
+        file = self.file(number)
+        if file is None or found.actions is None or self.folder is None:
+            return
+        for picture in found.pictures:
+            write_atomically(self.folder / "pictures" / f"{picture.digest[:16]}.png", picture.png)
+        content = {"generator": "torchdlo plan", "key": self.key(part), **found.plain()}
+        write_atomically(file, json.dumps(content | {"actions": found.actions.tolist()}) + "\n")
+
+    def recall(self, number: int, part: SubTask) -> tuple[Tensor, int] | None:
+        """Return what was found for a step in a run that goes on."""
+        file = self.file(number)
+        if file is None or not self.talk.resume or not file.is_file():
+            return None
+        try:
+            content = json.loads(file.read_text(encoding="utf-8"))
+            actions = torch.tensor(content["actions"], dtype=torch.float64)
+            fits = content["key"] == self.key(part) and actions.shape == (part.horizon, 3 * part.arms.count)
+            return (actions, int(content["episodes"])) if fits else None
+        except (OSError, ValueError, KeyError, TypeError):
+            return None
+
+
+class _Watched:
+    """A problem that notes whether any trajectory reached its success."""
+
+    def __init__(self, inner: TaskProblem) -> None:
+        self.inner, self.reached = inner, False
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.inner, name)
+
+    def evaluate(self, actions: Tensor) -> Evaluation:
+        """Play actions."""
+        went = self.inner.evaluate(actions)
+        self.reached = self.reached or bool((went.success & ~went.failed).any())
+        return went
+
+
+def _plain(step: Any) -> dict[str, Any]:
+    return step.model_dump()
+
+
+def _grasps(step: Any) -> tuple[int | None, ...]:
+    return tuple(step.grasps.model_dump().values())
+
+
+def _judged(step: Any) -> Reward:
+    return reward(step.reward, step.success, "reward")
+
+
+def carry_out(
+    task: Task,
+    talk: Conversation,
+    options: Options,
+    *,
+    look: Look | None = None,
+    folder: Path | None = None,
+    callback: Callable[[str, int, int, str], None] = lambda *_: None,
+) -> Result:
+    """Plan a task and carry the plan out.
+
+    Args:
+        task: the task.
+        talk: the conversation with the model.
+        options: how.
+        look: what draws pictures for the model and the report; none are shown if not given.
+        folder: where steps are kept, so that a run can go on.
+        callback: told (stage, episodes done, episodes in all, message).
+    """
+    begun = time.monotonic()
+    like = torch.zeros((), dtype=torch.float32)
+    run = _Run(task, talk, options, look, folder, callback, like)
+    _, left = run.ask("plan")
+    updates = idle = 0
+    ended = ""
+    while not ended:
+        if not left:
+            ended = "the plan was carried out, and the task is not done"
+            break
+        before = sum(c.success for c in run.carried)
+        run.step(left.pop(0), len(run.carried) + 1)
+        last = run.carried[-1]
+        if run.done:
+            ended = "the task is done"
+        elif sum(not c.failed for c in run.carried) >= options.steps:
+            ended = f"{options.steps} steps were carried out, and the task is not done"
+        elif not options.update:
+            if last.failed:
+                ended = f"step {last.step['id']} failed: {last.failed}"
+        else:
+            idle = 0 if sum(c.success for c in run.carried) > before else idle + 1
+            complete = False
+            while not ended:
+                if idle > options.patience:
+                    ended = f"{options.patience} updates made no progress"
+                    break
+                note = "You said that all is done, but the task's own condition does not hold." if complete else ""
+                complete, steps = run.ask("update", left, note)
+                updates += 1
+                if not complete:
+                    left = steps
+                    break
+                # The task's own condition decides.
+                idle += 1
+    if run.world is None:
+        made = episode.prepare(task, 1, like=like, compiled=False, **run.start())
+        run.world = made.start
+    return Result(
+        task.name,
+        talk.model.source,
+        run.done,
+        ended,
+        run.plans,
+        run.carried,
+        updates,
+        talk.calls,
+        talk.tokens,
+        time.monotonic() - begun,
+        run.world,
+    )
