@@ -114,10 +114,16 @@ class Endpoint:
             except openai.APITimeoutError:
                 return None, f"it did not answer within {self.seconds:g} s", None, None
             except openai.APIConnectionError as error:
-                cause = error.__cause__
+                cause = error.__cause__ or error
                 if isinstance(cause, _TooMuch):
                     return 413, str(cause), None, None
-                return None, f"there is no connection ({plain_text(str(cause or error), 120)})", None, None
+                return None, f"there is no connection ({plain_text(str(cause), 120)})", None, None
+            except _TooMuch as error:
+                return 413, str(error), None, None
+            except httpx.TimeoutException:
+                return None, f"it did not answer within {self.seconds:g} s", None, None
+            except httpx.HTTPError as error:
+                return None, f"there is no connection ({plain_text(str(error), 120)})", None, None
             except (openai.OpenAIError, ValueError) as error:
                 return 0, f"its answer cannot be read ({plain_text(str(error), 120)})", None, None
 
