@@ -17,6 +17,7 @@ from typing import Any, cast
 import torch
 from torch import Tensor
 
+from torchdlo.coupling.common.pose import Pose
 from torchdlo.envs import scene_names
 from torchdlo.envs.core.episode import Episode, EpisodeState, finish
 from torchdlo.envs.core.stages import Stage
@@ -26,7 +27,7 @@ from torchdlo.physics import tree
 from torchdlo.reward_language import Reward
 from torchdlo.scene import Params, Scene, State
 
-__all__ = ["SubTask", "concluded", "continue_from", "rewarded"]
+__all__ = ["SubTask", "concluded", "continue_from", "opening", "rewarded"]
 
 _SAME = ("name", "arms", "floor", "reach", "twist", "stretch", "travel", "anchored")
 """What a part has from its task."""
@@ -81,9 +82,8 @@ class SubTask(Task):
 
     def _check(self, reward: Reward) -> None:
         """Refuse expressions that this scene has no values for, with a scene as it is at the start."""
-        scene, _, state = self.start(1, like=torch.zeros((), dtype=torch.float64))
-        seen = _seen_at_start(self, state)
-        values = scene_names.named(self.inner, scene_names.layout(scene), seen)
+        here, seen = opening(self)
+        values = scene_names.named(self.inner, here, seen)
         reward.evaluate(values)
         reward.succeeded(values)
 
@@ -149,18 +149,25 @@ class SubTask(Task):
         return self.inner.stage_waypoints() if self.before is None else [()] * len(self.schedule.stages)
 
 
-def _seen_at_start(task: SubTask, state: State) -> TaskState:
-    """Return what is seen before the first action, without inverse kinematics."""
-    before, x = task.before, state.rods.pos
-    if before is not None:
-        seen = before.seen(task.arms.count)
-        return tree.map(lambda t: t.to(x.dtype) if t.is_floating_point() else t, tree.replace(seen, state=state))
-    from torchdlo.coupling.common.pose import Pose
+def opening(task: Task, state: State | None = None) -> tuple[scene_names.Layout, TaskState]:
+    """Return what there is in the scene of a task, and what is seen of it before the first action.
 
-    pos = x[:, list(task.arms.vertex)]
-    quat = x.new_tensor(task.arms.quats).expand(1, -1, -1)
-    seen = TaskState(state, Pose(pos, quat), torch.ones_like(pos[..., :1]), {})
-    return tree.replace(seen, notes=task.inner.note(seen))
+    Hands stand where they take hold; no inverse kinematics is done for it.
+
+    Args:
+        task: the task.
+        state: of one scene, that of the usual start if not given.
+    """
+    scene, _, usual = task.start(1, like=torch.zeros((), dtype=torch.float64))
+    here, before = scene_names.layout(scene), task.carried()
+    if before is not None:
+        return here, before.seen(task.arms.count)
+    state = usual if state is None else state
+    pos = state.rods.pos[:, list(task.arms.vertex)]
+    seen = TaskState(
+        state, Pose(pos, pos.new_tensor(task.arms.quats).expand(1, -1, -1)), torch.ones_like(pos[..., :1]), {}
+    )
+    return here, tree.replace(seen, notes=task.note(seen))
 
 
 def rewarded(task: Task, reward: Reward) -> SubTask:

@@ -31,7 +31,7 @@ def plan_html(result: Mapping[str, Any], exchanges: Sequence[Mapping[str, Any]],
         f"<h1>{html.escape(result['task'])}</h1>",
         f'<p class="verdict {"good" if done else "bad"}">{html.escape(verdict)}</p>',
         f"<p>Planned by: <b>{html.escape(result['source'])}</b>. The task's own condition decided whether it is done. "
-        f"{'The plan was updated after every step.' if result['options']['update'] else 'The plan was not updated.'}</p>",
+        f"The plan was {'' if result['options']['update'] else 'not '}updated after every step.</p>",
         table(("steps", "updates", "requests", "tokens", "episodes", "seconds"), [_cost(result)]),
     ]
     for place, carried in enumerate(result["steps"], 1):

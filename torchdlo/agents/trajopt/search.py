@@ -141,6 +141,7 @@ def optimize(
     resume: bool = False,
     callback: Callback | None = None,
     first: Tensor | None = None,
+    until_success: bool = False,
 ) -> SearchResult:
     """Search the trajectory with the largest return, if it can be had one that succeeds.
 
@@ -154,6 +155,7 @@ def optimize(
         resume: go on from what is in the journal.
         callback: told (stage, episodes done, all episodes, message) after every batch.
         first: trajectories to begin with, shape (K, T, A).
+        until_success: whether the first iteration in which a trajectory succeeds is the last one.
     """
     plan, robust = settings.plan(problem), settings.robust
     options = _options(problem, settings)
@@ -185,6 +187,8 @@ def optimize(
                 best.clear()  # what did well in milder worlds has to do so in these
             best.offer(ask, told)
             curve.append(_point(player, told, best.max_return, scale, on_surrogate))
+            if until_success and not on_surrogate and bool((told.success & ~told.failed).any()):
+                break
         finalists = player.judge(best.kept)
     except KeyboardInterrupt:
         if not best.kept:

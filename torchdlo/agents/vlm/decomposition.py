@@ -20,19 +20,18 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
-from torchdlo.agents.trajopt.problem import Evaluation
 from torchdlo.agents.trajopt.search import Settings, optimize
 from torchdlo.agents.trajopt.task_problem import TaskProblem
 from torchdlo.agents.vlm.conversation import Conversation, Picture, Question, plain_text
 from torchdlo.agents.vlm.grasp_proposal import Places, check_grasps, places_of
 from torchdlo.agents.vlm.prompts import prompt
-from torchdlo.agents.vlm.scene_text import language_text, scene_text, seen_of
+from torchdlo.agents.vlm.scene_text import language_text, scene_text
 from torchdlo.agents.vlm.schema import step_models
 from torchdlo.agents.vlm.waypoints import led
 from torchdlo.coupling.common import step_diagnostics
 from torchdlo.envs import Task, scene_names
 from torchdlo.envs.core import episode
-from torchdlo.envs.subtask import SubTask, concluded, continue_from
+from torchdlo.envs.subtask import SubTask, concluded, continue_from, opening
 from torchdlo.errors import InputError
 from torchdlo.files import write_atomically
 from torchdlo.reward_language import Reward, reward
@@ -176,7 +175,7 @@ class _Run:
         """Return whether the model says that all is done, and the steps that are left; a note ends what it is told."""
         plan, update = step_models(self.task.arms.count)
         places = self.places()
-        seen = seen_of(self.task, self.opening, self.world)
+        seen = opening(self.task, self.opening)[1] if self.world is None else self.world.seen(self.task.arms.count)
         text = scene_text(places, seen, [c.plain() for c in self.carried], [_plain(s) for s in left])
         text = f"{text}\n{note}" if note else text
         question = Question(
@@ -308,15 +307,13 @@ class _Run:
             chunk=options.population,
         )
         first = led(step, self.places(), _grasps(step), self.world, self.task, travels=part.travels)
-        problem = _Watched(self.problem(part))
 
         def told(stage: str, done: int, total: int, message: str) -> None:
             self.callback(f"step {number}", done, total, message)
-            if options.enough and problem.reached:
-                raise KeyboardInterrupt
 
-        found = optimize(problem, settings, callback=told, first=None if first is None else first[None])
-        if found.interrupted and not problem.reached:
+        begin = None if first is None else first[None]
+        found = optimize(self.problem(part), settings, callback=told, first=begin, until_success=options.enough)
+        if found.interrupted:
             raise KeyboardInterrupt
         return found.actions, found.episodes
 
@@ -351,22 +348,6 @@ class _Run:
             return (actions, int(content["episodes"])) if fits else None
         except (OSError, ValueError, KeyError, TypeError):
             return None
-
-
-class _Watched:
-    """A problem that notes whether any trajectory reached its success."""
-
-    def __init__(self, inner: TaskProblem) -> None:
-        self.inner, self.reached = inner, False
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self.inner, name)
-
-    def evaluate(self, actions: Tensor) -> Evaluation:
-        """Play actions."""
-        went = self.inner.evaluate(actions)
-        self.reached = self.reached or bool((went.success & ~went.failed).any())
-        return went
 
 
 def _plain(step: Any) -> dict[str, Any]:

@@ -9,14 +9,11 @@ from typing import Any
 
 from torchdlo.agents.vlm.conversation import plain_text
 from torchdlo.agents.vlm.grasp_proposal import Places, reach_text
-from torchdlo.coupling.common.pose import Pose
 from torchdlo.envs import scene_names
 from torchdlo.envs.core.task import Task, TaskState
-from torchdlo.physics import tree
 from torchdlo.reward_language import FUNCTIONS
-from torchdlo.scene import State
 
-__all__ = ["about", "language_text", "scene_text", "seen_of"]
+__all__ = ["about", "language_text", "scene_text"]
 
 
 def about(task: Task) -> str:
@@ -38,16 +35,6 @@ def language_text() -> str:
 
 
 _SAID = {"N": "number", "P": "point", "C": "condition", "A": "value"}
-
-
-def seen_of(task: Task, opening: State, world: Any) -> TaskState:
-    """Return what there is to see of one scene; of its opening, before hands have taken hold, if there is no world."""
-    if world is not None:
-        return world.seen(task.arms.count)
-    state = opening
-    pos = state.rods.pos[:, list(task.arms.vertex)]
-    seen = TaskState(state, Pose(pos, pos.new_tensor(task.arms.quats).expand(1, -1, -1)), 0 * pos[..., :1], {})
-    return tree.replace(seen, notes=task.note(seen))
 
 
 def scene_text(

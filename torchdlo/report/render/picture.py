@@ -259,7 +259,7 @@ class Picture:
         away = points - eye
         depth = away @ ahead
         width, height = self._plotter.window_size
-        scale = 0.5 * height / np.tan(np.radians(_ANGLE / 2)) / depth
+        scale = 0.5 * height / np.tan(np.radians(ANGLE / 2)) / depth
         u = 0.5 * width + scale * (away @ right)
         v = 0.5 * height - scale * (away @ np.cross(right, ahead))
         return np.stack([u, v], -1), depth
