@@ -20,6 +20,7 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
+from torchdlo.agents.trajopt.problem import Evaluation
 from torchdlo.agents.trajopt.search import Settings, optimize
 from torchdlo.agents.trajopt.task_problem import TaskProblem
 from torchdlo.agents.vlm.conversation import Conversation, Picture, Question, plain_text
@@ -244,20 +245,14 @@ class _Run:
         content = _plain(step)
         try:
             part = self.part_of(step)
-            actions, episodes = self.search(step, part, number)
+            problem = _Part(part, compiled=self.options.compiled, recorded=self.options.recorded)
+            actions, episodes = self.search(step, problem, number)
         except InputError as error:
             why = plain_text(str(error))
             self.carried.append(Carried(content, False, why, None, {}, 0, time.monotonic() - begun, False))
             return
-        problem = self.problem(part)
-        made, worlds = problem.prepared(1), []
-
-        def keep(world: episode.EpisodeState) -> dict[str, Tensor]:
-            worlds.append(world)
-            return {}
-
-        with torch.no_grad():
-            went = episode.play(part, problem.full(actions[None]), episode=made, keep=keep)
+        made = problem.prepared(1)
+        went, worlds = problem.played(actions)
         failed, missed = bool(went.failed[0]), step_diagnostics.explain(went.world.state.diagnostics)
         if missed or not math.isfinite(float(went.returns[0])):
             failed = True
@@ -289,12 +284,9 @@ class _Run:
         if not failed:
             self.world, self.made, self.holds, self.done = went.world, made, _grasps(step), own
 
-    def problem(self, part: SubTask) -> TaskProblem:
-        """Return the problem of a step."""
-        return TaskProblem(part, compiled=self.options.compiled, recorded=self.options.recorded)
-
-    def search(self, step: Any, part: SubTask, number: int) -> tuple[Tensor, int]:
+    def search(self, step: Any, problem: _Part, number: int) -> tuple[Tensor, int]:
         """Return the best trajectory (T, 3 R) and how many episodes it took; read if this was searched before."""
+        part = problem.task
         kept = self.recall(number, part)
         if kept is not None:
             return kept
@@ -312,7 +304,7 @@ class _Run:
             self.callback(f"step {number}", done, total, message)
 
         begin = None if first is None else first[None]
-        found = optimize(self.problem(part), settings, callback=told, first=begin, until_success=options.enough)
+        found = optimize(problem, settings, callback=told, first=begin, until_success=options.enough)
         if found.interrupted:
             raise KeyboardInterrupt
         return found.actions, found.episodes
@@ -348,6 +340,32 @@ class _Run:
             return (actions, int(content["episodes"])) if fits else None
         except (OSError, ValueError, KeyError, TypeError):
             return None
+
+
+@dataclass(frozen=True, eq=False)
+class _Part(TaskProblem):
+    """The problem of a step, which remembers what it played alone."""
+
+    _alone: dict[bytes, tuple[episode.EpisodeResult, list[episode.EpisodeState]]] = field(default_factory=dict)
+
+    def played(self, actions: Tensor) -> tuple[episode.EpisodeResult, list[episode.EpisodeState]]:
+        """Return how a trajectory (T, 3 R) went alone, and the world after each of its actions."""
+        key, worlds = actions.double().contiguous().numpy().tobytes(), []
+        if key not in self._alone:
+
+            def keep(world: episode.EpisodeState) -> dict[str, Tensor]:
+                worlds.append(world)
+                return {}
+
+            with torch.no_grad():
+                went = episode.play(self.task, self.full(actions[None]), episode=self.prepared(1), keep=keep)
+            self._alone[key] = (went, worlds)
+        return self._alone[key]
+
+    def record(self, actions: Tensor) -> tuple[Evaluation, dict[str, Any]]:
+        """Play one trajectory alone; nothing more is kept of it here."""
+        went, _ = self.played(actions)
+        return Evaluation(went.returns, went.loss, went.terminal_cost, went.success, went.failed), {}
 
 
 def _plain(step: Any) -> dict[str, Any]:

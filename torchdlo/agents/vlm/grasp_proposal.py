@@ -32,7 +32,7 @@ __all__ = [
     "reach_text",
 ]
 
-APART = 0.05
+APART = 0.03
 """Least distance of two hands [m]."""
 CLOSE = 40.0
 """How far a place in a picture may be from a vertex [pixels]."""
