@@ -36,6 +36,7 @@ class Carry(Task):
     """Carry the end of a short rope 5 cm along x."""
 
     horizon: int = 12
+    frames: int = 4
     name: ClassVar[str] = "carry"
     arms: ClassVar[Arms] = Arms(base=((0.0, -0.4, 0.0), (0.7, -0.4, 0.0)), vertex=(1, 4))
     reset_noise: ClassVar[tuple[tuple[float, float], ...]] = ((0.005, 0.005),)
@@ -54,7 +55,7 @@ class Carry(Task):
         return seen.x[:, 0, 0] > 0.35
 
 
-def step(number: int, to: float, hold: Sequence[int | None] = (1, None), success: str = "", horizon: int = 5) -> dict:
+def step(number: int, to: float, hold: Sequence[int | None] = (1, None), success: str = "", horizon: int = 8) -> dict:
     """A step that leads the hands along x."""
     stage_waypoints = {f"robot_{k + 1}": None if h is None else [[to + 0.02 * h, 0, 0.04]] for k, h in enumerate(hold)}
     return {

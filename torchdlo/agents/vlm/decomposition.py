@@ -160,6 +160,7 @@ class _Run:
     carried: list[Carried] = field(default_factory=list)
     plans: list[dict[str, Any]] = field(default_factory=list)
     done: bool = False
+    _places: tuple[Any, Places] | None = None
 
     # -- asking ------------------------------------------------------------------------------------------------------
 
@@ -170,7 +171,10 @@ class _Run:
 
     def places(self) -> Places:
         """Return the vertices as they are now."""
-        return places_of(self.task, self.opening if self.world is None else self.world.state)
+        if self._places is None or self._places[0] is not self.world:
+            state = self.opening if self.world is None else self.world.state
+            self._places = (self.world, places_of(self.task, state))
+        return self._places[1]
 
     def ask(self, kind: str, left: Sequence[Any] = (), note: str = "") -> tuple[bool, list[Any]]:
         """Return whether the model says that all is done, and the steps that are left; a note ends what it is told."""
@@ -403,13 +407,12 @@ def carry_out(
     like = torch.zeros((), dtype=torch.float32)
     run = _Run(task, talk, options, look, folder, callback, like)
     _, left = run.ask("plan")
-    updates = idle = 0
+    updates = fruitless = 0
     ended = ""
     while not ended:
         if not left:
             ended = "the plan was carried out, and the task is not done"
             break
-        before = sum(c.success for c in run.carried)
         run.step(left.pop(0), len(run.carried) + 1)
         last = run.carried[-1]
         if run.done:
@@ -420,20 +423,18 @@ def carry_out(
             if last.failed:
                 ended = f"step {last.step['id']} failed: {last.failed}"
         else:
-            idle = 0 if sum(c.success for c in run.carried) > before else idle + 1
+            fruitless = 0 if last.success else fruitless
             complete = False
             while not ended:
-                if idle > options.patience:
+                if fruitless >= options.patience:
                     ended = f"{options.patience} updates made no progress"
                     break
                 note = "You said that all is done, but the task's own condition does not hold." if complete else ""
                 complete, steps = run.ask("update", left, note)
-                updates += 1
+                updates, fruitless = updates + 1, fruitless + 1
                 if not complete:
                     left = steps
                     break
-                # The task's own condition decides.
-                idle += 1
     if run.world is None:
         made = episode.prepare(task, 1, like=like, compiled=False, **run.start())
         run.world = made.start

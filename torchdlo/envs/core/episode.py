@@ -180,10 +180,10 @@ def _standing(task: Task, target: Pose) -> inverse_kinematics.Solution:
     posture = target.pos.new_tensor(POSTURE).expand(*target.pos.shape[:-1], -1)
     off = target.pos - _bases(task, target.pos)
     facing = torch.cat([torch.atan2(off[..., 1:2], off[..., :1]), posture[..., 1:]], -1)
-    plain, found = (
-        tree.detach(_solve(task, target, *guess))
-        for guess in ((facing, inverse_kinematics.IkSearch()), (posture, FIND))
-    )
+    plain = tree.detach(_solve(task, target, facing, inverse_kinematics.IkSearch()))
+    if bool(plain.converged.all()):
+        return plain
+    found = tree.detach(_solve(task, target, posture, FIND))
     return tree.where(plain.converged, plain, found)
 
 
