@@ -244,3 +244,9 @@ def test_magnitudes_end() -> None:
     assert found.item() == pytest.approx(1e12)
     (slope,) = torch.autograd.grad(found.sum(), x)
     assert math.isfinite(slope.item())
+
+
+def test_the_page_has_all_functions() -> None:
+    page = (Path(__file__).parents[2] / "docs" / "reward_language.md").read_text()
+    for name, function in FUNCTIONS.items():
+        assert f"| `{name}(" in page and f"| {function.doc} |" in page, name
