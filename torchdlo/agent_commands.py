@@ -1,7 +1,8 @@
-"""Commands of `torchdlo` for agents on vision-language models; they import what is slow only when they run."""
+"""Commands of `torchdlo` for agents that search or ask models; they import what is slow only when they run."""
 
 from __future__ import annotations
 
+import importlib.util
 import itertools
 import json
 import re
@@ -10,15 +11,21 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from torchdlo.cli.progress import deferred_interrupt, progress
 from torchdlo.files import check_writable, write_atomically
 
 if TYPE_CHECKING:
     from torchdlo.agents.vlm.conversation import Conversation
 
-__all__ = ["plan", "propose"]
+__all__ = ["optimize", "plan", "propose"]
 
 _INTERRUPTED = 130
 """Exit code after Ctrl-C, as shells have it."""
+
+_Rope = Annotated[
+    Path | None,
+    typer.Option(help="What ropes are made of: model.json of a calibration or diagnosis.", metavar="MODEL"),
+]
 
 _KEPT = {"exchanges": "[0-9][0-9][0-9]", "steps": "[0-9][0-9]"}
 """What a run keeps, by the folder, and how it is named there."""
@@ -37,7 +44,7 @@ _Geometry = Annotated[bool, typer.Option("--geometry", help="Decide by geometry,
 _Calls = Annotated[int, typer.Option(min=1, help="Most requests.")]
 _Tokens = Annotated[int, typer.Option(min=1, help="Most tokens of all requests and answers.")]
 _Seconds = Annotated[float, typer.Option(min=0.1, help="Time for a request.")]
-_Resume = Annotated[bool, typer.Option("--resume", help="Go on with a run that was stopped, without asking anew.")]
+_Resume = Annotated[bool, typer.Option("--resume", help="Go on with a run that was stopped, and repeat nothing.")]
 
 
 def _conversation(
@@ -57,10 +64,8 @@ def _conversation(
 
     if sum([endpoint is not None, recorded is not None, geometry]) != 1 or (endpoint is None) != (model is None):
         raise InputError("who is asked: expected one of --endpoint URL with --model NAME, --recorded PATH, --geometry.")
-    try:
-        import pydantic  # noqa: F401
-    except ImportError:
-        raise InputError("models need the package pydantic; install it with pip install 'torchdlo[vlm]'.") from None
+    if importlib.util.find_spec("pydantic") is None:
+        raise InputError("models need the package pydantic; install it with pip install 'torchdlo[vlm]'.")
     from torchdlo.agents.vlm.conversation import Budget, Conversation
     from torchdlo.agents.vlm.endpoint import Endpoint
     from torchdlo.agents.vlm.geometry import Geometry
@@ -189,7 +194,6 @@ def plan(
     torchdlo plan lifting --geometry --episodes 480
     """
     from torchdlo.agents.vlm.decomposition import Options, carry_out
-    from torchdlo.cli.progress import deferred_interrupt, progress
     from torchdlo.envs import find
     from torchdlo.errors import InputError
     from torchdlo.report.plan_page import plan_html
@@ -226,3 +230,114 @@ def plan(
     typer.echo(f"plan:   {out / 'plan.json'}\nreport: {out / 'report.html'}", err=as_json)
     if as_json:
         typer.echo(content, nl=False)
+
+
+def optimize(
+    task: Annotated[str, typer.Argument(help="Name of the task.", metavar="TASK")],
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out",
+            "-o",
+            help="Folder for result.json, trajectory.json and curve.png. Default: runs/optimize/TASK-METHOD, "
+            "and -SEED if that is not 0.",
+            metavar="DIR",
+        ),
+    ] = None,
+    method: Annotated[
+        str,
+        typer.Option(help="CMA-ES, gradient descent, or both with a search for contact.", metavar="cmaes|gd|hybrid"),
+    ] = "hybrid",
+    episodes: Annotated[
+        int | None, typer.Option(min=1, help="Budget; an episode counts once, with its slope or without.")
+    ] = None,
+    population: Annotated[int | None, typer.Option(min=1, help="Trajectories per iteration.")] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the search.")] = 0,
+    robust: Annotated[
+        bool, typer.Option("--robust", help="Play each trajectory from several starts that grow apart.")
+    ] = False,
+    rope: _Rope = None,
+    grasps: Annotated[
+        Path | None,
+        typer.Option(help="What hands hold: proposal.json of propose, if not what the task says.", metavar="FILE"),
+    ] = None,
+    reward: Annotated[
+        Path | None,
+        typer.Option(help="Reward of expressions, if not the task's; see docs/reward_language.md.", metavar="FILE"),
+    ] = None,
+    double: Annotated[bool, typer.Option("--double", help="Physics in double precision.")] = False,
+    compiled: Annotated[bool, typer.Option(help="Compile the step: slow at first, then many times faster.")] = True,
+    recorded: Annotated[
+        bool, typer.Option("--recorded", help="Record the step instead: takes seconds, helps where cmaes searches.")
+    ] = False,
+    resume: _Resume = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
+) -> None:
+    """Search the trajectory of the tools that earns most in a task.
+
+    Budget, way-points and first steps that are not given are the published ones of the task: up to 20 000 episodes,
+    each of which may take some seconds. Ctrl-C keeps the best so far; a search that was stopped or killed goes on with
+    --resume, and ends as if it had never stopped. Without it, a search begins anew and what was stopped is lost.
+
+    [bold]Examples:[/bold]
+
+    torchdlo optimize coiling --episodes 600 --out runs/coil
+
+    torchdlo optimize wiring_post --method cmaes --seed 1 --episodes 4000 --population 100
+
+    torchdlo optimize wiring_post --robust --resume
+
+    torchdlo optimize lifting --grasps runs/propose/lifting/proposal.json --reward reward.json
+    """
+    from torchdlo.agents.trajopt.presets import preset
+    from torchdlo.agents.trajopt.result import result_json, summary, trajectory_json
+    from torchdlo.agents.trajopt.search import Robust
+    from torchdlo.agents.trajopt.search import optimize as search
+    from torchdlo.agents.trajopt.search_journal import remove
+    from torchdlo.agents.trajopt.task_problem import problem
+    from torchdlo.report.figures.learning_curve import learning_png
+    from torchdlo.scene_files import cable
+
+    out = out or Path("runs") / "optimize" / f"{task}-{method}{f'-{seed}' if seed else ''}"
+    for name in ("result.json", "trajectory.json", "curve.png"):
+        check_writable(out / name)
+    steps = {"compiled": compiled and not recorded, "recorded": recorded}
+    chosen = problem(
+        task, None if rope is None else cable(rope), double=double, **_judged(task, grasps, reward), **steps
+    )
+    given = {"episodes": episodes, "population": population, "robust": Robust() if robust else None, "seed": seed}
+    settings = preset(task, method, **given)
+    try:
+        with progress() as show, deferred_interrupt(show) as callback:
+            found = search(chosen, settings, journal=out / "journal", resume=resume, callback=callback)
+    except KeyboardInterrupt:
+        typer.echo(f"interrupted before there was a result; --resume goes on from {out / 'journal'}", err=True)
+        raise typer.Exit(_INTERRUPTED) from None
+    result = result_json(found, chosen, settings)
+    write_atomically(out / "trajectory.json", trajectory_json(found, chosen))
+    write_atomically(out / "result.json", result)
+    write_atomically(out / "curve.png", learning_png({f"{task}, seed {seed}": {method: [found.curve]}}))
+    if not found.interrupted:
+        remove(out / "journal")
+    typer.echo(summary(found, task), err=as_json)
+    typer.echo(f"result:     {out / 'result.json'}\ntrajectory: {out / 'trajectory.json'}", err=as_json)
+    typer.echo(f"curve:      {out / 'curve.png'}", err=as_json)
+    if as_json:
+        typer.echo(result, nl=False)
+    if found.interrupted:
+        typer.echo(f"--resume goes on from {out / 'journal'}", err=True)
+        raise typer.Exit(_INTERRUPTED)
+
+
+def _judged(task: str, grasps: Path | None, reward: Path | None) -> dict[str, Any]:
+    """Return what hands hold and what earns, as files say."""
+    found: dict[str, Any] = {}
+    if grasps is not None:
+        from torchdlo.agents.vlm.grasp_proposal import load_grasps
+
+        found["grasps"] = load_grasps(grasps, task)
+    if reward is not None:
+        from torchdlo.reward_language import load_reward
+
+        found["reward"] = load_reward(reward)
+    return found

@@ -108,8 +108,8 @@ def test_the_reason_is_told(server: Server) -> None:
     assert json.loads(server.requests[1]["messages"][-2]["content"]) == {"vertex": 30}
 
 
-BODIES = [b"", b"<html>busy</html>", b"null", b"[]", b"{}", b'{"choices": []}', b'{"choices": [{"message": 3}]}', b"\xff\xfe",
-          b"[" * 100_000, completion(None, refusal="I cannot help with ropes.")]  # fmt: skip
+BODIES = [b"", b"<html>busy</html>", b"null", b"[]", b"{}", b'{"choices": []}', b'{"choices": [{"message": 3}]}',
+          b"\xff\xfe", b"[" * 100_000, completion(None, refusal="I cannot help with ropes.")]  # fmt: skip
 
 
 @pytest.mark.parametrize("body", BODIES, ids=range(len(BODIES)))

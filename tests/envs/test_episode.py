@@ -13,7 +13,7 @@ from test_contract import F64, prepared, small, stage_waypoints
 from torchdlo import scene as scenes
 from torchdlo.coupling.bodies.dynamics import turn_by
 from torchdlo.coupling.robot.kinematics import tool_pose
-from torchdlo.envs import TASKS
+from torchdlo.envs import TASKS, reach
 from torchdlo.envs.core import episode
 from torchdlo.envs.core.task import RADIUS, Arms, Task, TaskState, make, straight, through
 from torchdlo.physics import tree
@@ -46,7 +46,7 @@ def test_joints_are_those_of_the_tool():
     made = prepared("wrapping")
     (after,) = led("wrapping", [[0.0, 0.0, 0.006, 0.005, 0, 0, 0, 0, 0, 0, 0, 0]])
     base = torch.tensor(made.task.arms.base, dtype=F64)
-    found = tool_pose(episode._robot(), after.joints)
+    found = tool_pose(reach._robot(), after.joints)
     torch.testing.assert_close(found.pos + base, after.tool.pos, atol=1e-9, rtol=0)
 
 

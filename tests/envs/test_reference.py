@@ -11,7 +11,7 @@ import torch
 
 from torchdlo import scene as scenes
 from torchdlo.coupling.robot.attachment import Hands
-from torchdlo.envs import TASKS
+from torchdlo.envs import TASKS, reach
 from torchdlo.envs.core import curve_geometry, episode
 from torchdlo.envs.core.task import Task, through
 from torchdlo.envs.tasks.gathering import GatheringSurrogate
@@ -33,7 +33,7 @@ def test_arms_can_go_the_way_by_hand(name: str) -> None:
     with torch.no_grad():
         for action in actions:
             want = want + episode.limited(task, action)[0]
-            found = episode._solve(task, episode._aim(task, world, action), world.joints, episode.FOLLOW)
+            found = reach.solve(task, episode._aim(task, world, action), world.joints, reach.FOLLOW)
             assert found.converged.all()
             world = tree.replace(world, joints=found.joints, target=found.handed, tool=found.pose)
     # What counts as there is 0.1 mm away at most; targets add up in single precision.

@@ -160,10 +160,7 @@ def optimize(
     plan, robust = settings.plan(problem), settings.robust
     options = _options(problem, settings)
     if first is not None:
-        if settings.method == "gd":
-            raise InputError("gd begins with nothing that is given; use cmaes or hybrid.")
-        plan = replace(plan, first=first.to(torch.float64).flatten(1))
-        options["first"] = hashlib.sha256(first.double().contiguous().numpy().tobytes()).hexdigest()
+        plan, options["first"] = _begun(plan, settings, first)
     stand_in = problem.surrogate() if plan.surrogates else None
     if plan.surrogates and stand_in is None:
         raise InputError(f"{problem.name}: it has no surrogate task; set surrogate_share to 0.")
@@ -211,6 +208,14 @@ def optimize(
         curve,
         interrupted,
     )
+
+
+def _begun(plan: SearchPlan, settings: Settings, first: Tensor) -> tuple[SearchPlan, str]:
+    """Return the plan of a search that begins with trajectories (K, T, A), and their hash."""
+    if settings.method == "gd":
+        raise InputError("gd begins with nothing that is given; use cmaes or hybrid.")
+    first = first.to(torch.float64).contiguous()
+    return replace(plan, first=first.flatten(1)), hashlib.sha256(first.numpy().tobytes()).hexdigest()
 
 
 def _alone(

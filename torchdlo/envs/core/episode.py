@@ -7,7 +7,6 @@ action the tool moves evenly from pose to pose with what it holds. Links of arms
 
 from __future__ import annotations
 
-import functools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -20,14 +19,13 @@ from torchdlo import scene as scenes
 from torchdlo.coupling.bodies.dynamics import turn_by
 from torchdlo.coupling.common.pose import Pose
 from torchdlo.coupling.robot import attachment as grasp
-from torchdlo.coupling.robot import inverse_kinematics
 from torchdlo.coupling.robot.attachment import Grasp, Hands
-from torchdlo.coupling.robot.kinematics import Robot, panda
 from torchdlo.envs.core.divergence import broken, inside
 from torchdlo.envs.core.frames import guarded, run, slipped
 from torchdlo.envs.core.stages import repeated
 from torchdlo.envs.core.task import Task, TaskState, combined
 from torchdlo.envs.observations.state import observe, places
+from torchdlo.envs.reach import FOLLOW, reachable, solve, standing
 from torchdlo.errors import InputError
 from torchdlo.physics import tree
 from torchdlo.physics.linalg.numerics import safe_norm
@@ -48,13 +46,6 @@ __all__ = [
     "prepare_at",
     "reachable",
 ]
-
-POSTURE = (1.56, -0.72, -0.02, -2.09, 0.04, 1.33, 2.4, 0.0)
-"""Where joints would like to be [rad], and how far the fingers are open [m]."""
-FIND = inverse_kinematics.IkSearch(starts=8)
-"""How hard to look for the joints of the start."""
-FOLLOW = inverse_kinematics.IkSearch(steps=4, closing=2, polish=2)
-"""The same for those of an action, which are near the last ones."""
 
 
 @tree.struct
@@ -123,26 +114,6 @@ class Episode:
     """Frames that gradients run again at once, None to keep all of them, see `physics.execution.replay`."""
 
 
-@functools.cache
-def _robot() -> Robot:
-    return panda()
-
-
-def _bases(task: Task, like: Tensor) -> Tensor:
-    return like.new_tensor(task.arms.base)
-
-
-def _solve(
-    task: Task, target: Pose, joints: Tensor, search: inverse_kinematics.IkSearch
-) -> inverse_kinematics.Solution:
-    """Return where joints bring the tools to their targets. All arms are alike, so they are one more batch axis."""
-    base = _bases(task, joints)
-    wanted = Pose(target.pos - base, target.quat)
-    found = inverse_kinematics.solve(_robot(), wanted, joints, search=search, posture=joints.new_tensor(POSTURE))
-    moved = [Pose(p.pos + base, p.quat) for p in (found.pose, found.handed)]
-    return tree.replace(found, pose=moved[0], handed=moved[1])
-
-
 def hands_of(task: Task, scene: Scene) -> Hands:
     """Return which grips of the task's hands hold what; what no hand ever holds is fixed."""
     plan = task.schedule
@@ -158,7 +129,7 @@ def _begin(task: Task, scene: Scene, state: State, hands: Hands) -> EpisodeState
     pos = x[:, list(task.arms.vertex)]
     quat = x.new_tensor(task.arms.quats)
     target = Pose(pos, (quat / quat.norm(dim=-1, keepdim=True)).expand(*pos.shape[:-1], 4))
-    found = _standing(task, target)
+    found = standing(task, target)
     if not bool(found.converged.all()):
         far = found.missing.reshape(-1, 2).amax(0)
         raise InputError(
@@ -172,33 +143,6 @@ def _begin(task: Task, scene: Scene, state: State, hands: Hands) -> EpisodeState
     world = EpisodeState(state, found.joints, target, target, held, {}, failed, none)
     seen = world.seen(task.arms.count)
     return tree.replace(world, notes={"rest": task.rest(seen, scene.topology), **task.note(seen)})
-
-
-def _standing(task: Task, target: Pose) -> inverse_kinematics.Solution:
-    """Return how arms stand whose tools are at poses, found from nothing."""
-    # An arm that faces its tool has the most room to move; contorted ones may be nearer to the posture.
-    posture = target.pos.new_tensor(POSTURE).expand(*target.pos.shape[:-1], -1)
-    off = target.pos - _bases(task, target.pos)
-    facing = torch.cat([torch.atan2(off[..., 1:2], off[..., :1]), posture[..., 1:]], -1)
-    plain = tree.detach(_solve(task, target, facing, inverse_kinematics.IkSearch()))
-    if bool(plain.converged.all()):
-        return plain
-    found = tree.detach(_solve(task, target, posture, FIND))
-    return tree.where(plain.converged, plain, found)
-
-
-def reachable(task: Task, pos: Tensor) -> Tensor:
-    """Return which hands reach places with their tools oriented as at the start, bool, shape (N, R).
-
-    Args:
-        task: the task.
-        pos: places, such as those of vertices [m], shape (N, 3).
-    """
-    quat = pos.new_tensor(task.arms.quats)
-    where = pos.unsqueeze(1).expand(-1, task.arms.count, -1)
-    target = Pose(where, (quat / quat.norm(dim=-1, keepdim=True)).expand(*where.shape[:-1], 4))
-    with torch.no_grad():
-        return _standing(task, target).converged
 
 
 def _continued(task: Task, scene: Scene, state: State, hands: Hands, before: EpisodeState) -> EpisodeState:
@@ -314,7 +258,7 @@ def act(episode: Episode, world: EpisodeState, action: Tensor) -> EpisodeState:
     aim, held = _aim(task, before, action), before.grasp
     if len(task.schedule.stages) > 1:
         aim, held = _staged(episode, before, aim)
-    found = _solve(task, aim, before.joints, FOLLOW)
+    found = solve(task, aim, before.joints, FOLLOW)
     state = run(episode, before, found.pose, held, task.fidelity.steps(task.frame_skip))
     held = tree.replace(held, closed=slipped(episode, state, found.pose, held.closed))
     after = EpisodeState(state, found.joints, found.handed, found.pose, held, world.notes, world.failed, world.count)

@@ -26,7 +26,7 @@ from torchdlo.envs.assets.rope_material import RopeMaterial
 from torchdlo.envs.core import curve_geometry
 from torchdlo.envs.core.fidelity import PUBLISHED, Fidelity
 from torchdlo.envs.core.stages import Schedule, Stage
-from torchdlo.envs.core.waypoints import through
+from torchdlo.envs.core.waypoints import even, through
 from torchdlo.envs.observations.cameras import TaskCamera
 from torchdlo.errors import InputError
 from torchdlo.physics import tree
@@ -418,12 +418,3 @@ def raised(flat: Tensor, places: Tensor, width: float = 1.7) -> Tensor:
     index = torch.arange(len(flat), dtype=flat.dtype)[:, None]
     rise = torch.exp(-((index - places) / width).square()).sum(-1, keepdim=True)
     return even(torch.cat([flat[:, :2], RADIUS * (1.05 + 2.6 * rise)], -1), len(flat))
-
-
-def even(curve: Tensor, count: int) -> Tensor:
-    """Return `count` vertices along a dense curve (n, 3), at even distances along it."""
-    along = torch.cat([curve.new_zeros(1), (curve[1:] - curve[:-1]).norm(dim=-1).cumsum(0)])
-    wanted = torch.linspace(0, 1, count, dtype=curve.dtype) * along[-1]
-    k = torch.searchsorted(along, wanted).clamp(1, len(along) - 1)
-    share = ((wanted - along[k - 1]) / (along[k] - along[k - 1]))[:, None]
-    return (1 - share) * curve[k - 1] + share * curve[k]

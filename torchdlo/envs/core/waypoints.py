@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-__all__ = ["through"]
+__all__ = ["even", "through"]
 
 
 def through(
@@ -37,3 +37,12 @@ def through(
     share = (done / need.unsqueeze(-2)).clamp(0, 1)
     xyz = (share @ legs.flatten(-2)).diff(dim=-2)
     return torch.cat([xyz, torch.zeros_like(xyz)], -1)
+
+
+def even(curve: Tensor, count: int) -> Tensor:
+    """Return `count` vertices along a dense curve (n, 3), at even distances along it."""
+    along = torch.cat([curve.new_zeros(1), (curve[1:] - curve[:-1]).norm(dim=-1).cumsum(0)])
+    wanted = torch.linspace(0, 1, count, dtype=curve.dtype) * along[-1]
+    k = torch.searchsorted(along, wanted).clamp(1, len(along) - 1)
+    share = ((wanted - along[k - 1]) / (along[k] - along[k - 1]))[:, None]
+    return (1 - share) * curve[k - 1] + share * curve[k]
