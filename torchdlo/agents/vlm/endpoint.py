@@ -68,14 +68,16 @@ class Endpoint:
         del digest
         content = [_message(m) for m in messages]
         schema = {"name": question.kind, "schema": question.answer.model_json_schema(), "strict": False}
-        wanted: dict[str, Any] = {"response_format": {"type": "json_schema", "json_schema": schema}}
+        form = {"response_format": {"type": "json_schema", "json_schema": schema}}
+        # Some servers do not know all of it; answers are checked anyway.
+        wanted: list[dict[str, Any]] = [{**form, "temperature": 0, "max_tokens": self.answer_tokens}, form, {}]
         waits = [self.backoff * 2**k for k in range(self.retries)]
         while True:
-            status, why, wait, text = self._send(content, wanted)
+            status, why, wait, text = self._send(content, wanted[0])
             if text is not None:
                 return self._read(text)
-            if status in (400, 422) and wanted:
-                wanted = {}  # some servers know no schemas, and answers are checked anyway
+            if status in (400, 422) and len(wanted) > 1:
+                wanted = wanted[1:]
                 continue
             if not waits or (status is not None and status not in _AGAIN):
                 raise InputError(f"{self.source}: {why}; check the server, then go on with --resume.")
@@ -93,15 +95,11 @@ class Endpoint:
         key = os.environ.get(KEY) or "none"
         transport = _Capped(httpx, self.size, self.seconds)
         with httpx.Client(transport=transport, follow_redirects=False, timeout=self.seconds) as http:
-            client = openai.OpenAI(
-                api_key=key, base_url=self.url, http_client=http, max_retries=0, organization="", project=""
-            )
+            client = openai.OpenAI(api_key=key, base_url=self.url, http_client=http, max_retries=0)
             try:
                 raw = client.chat.completions.with_raw_response.create(
                     model=self.model,
                     messages=content,
-                    temperature=0,
-                    max_tokens=self.answer_tokens,
                     extra_headers={"Accept-Encoding": "identity"},
                     **wanted,
                 )
