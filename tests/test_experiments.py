@@ -18,6 +18,7 @@ from torchdlo.physics import tree
 
 EXPERIMENTS = Path(__file__).parents[1] / "experiments"
 SCRIPTS = [
+    "agent_benchmark.py",
     "baselines.py",
     "bench_contact.py",
     "bench_render.py",
