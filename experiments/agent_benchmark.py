@@ -51,7 +51,12 @@ def parsed(arguments: list[str] | None = None) -> Any:
     parser.add_argument("--task", default="wiring_ring", help="task of plans")
     parser.add_argument("--endpoint", default="", help="server of a model that proposes grasps")
     parser.add_argument("--model", default="", help="its name")
-    return parser.parse_args(arguments)
+    parser.flag("smoke", "a single task with next to no budget")
+    found = parser.parse_args(arguments)
+    if found.smoke:
+        found.tasks, found.draws, found.starts, found.method = found.tasks[-1:], 1, 1, "cmaes"
+        found.episodes = found.population = 4
+    return found
 
 
 def proposers(task: envs.Task, options: Any) -> dict[str, Callable[[], tuple[int | None, ...]]]:
