@@ -75,8 +75,8 @@ def proposers(task: envs.Task, options: Any) -> dict[str, Callable[[], tuple[int
 
 def asked(task: envs.Task, model: Any, mode: str) -> tuple[int | None, ...]:
     """Return what a model proposes on a picture."""
-    from torchdlo.report.marks import marked_view
     from torchdlo.report.render.episode_film import stills
+    from torchdlo.report.render.marks import marked_view
 
     made = episode.prepare(task, 1, compiled=False)
     view = marked_view(stills(made, [made.start], arms=False))

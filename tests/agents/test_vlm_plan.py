@@ -25,7 +25,7 @@ from torchdlo.cli import app
 from torchdlo.envs import Task
 from torchdlo.envs.core.task import RADIUS, Arms, TaskState, make, straight
 from torchdlo.errors import InputError
-from torchdlo.report.plan_page import plan_html
+from torchdlo.report.pages.plan import plan_html
 from torchdlo.scene import Params, Rope, Scene, State
 
 HAND = "written by hand, not by a model"
@@ -245,8 +245,8 @@ def test_the_stand_in_plans_one_step_and_says_what_it_is() -> None:
 def test_the_stand_in_has_a_plan_for_every_task(name: str) -> None:
     from torchdlo.agents.vlm.geometry import _step
     from torchdlo.agents.vlm.grasp_proposal import check_grasps, places_of
-    from torchdlo.envs import scene_names
-    from torchdlo.envs.subtask import opening, rewarded
+    from torchdlo.envs.core import scene_names
+    from torchdlo.envs.core.subtask import opening, rewarded
     from torchdlo.reward_language import reward
 
     task = envs.find(name)

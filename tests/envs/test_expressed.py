@@ -10,9 +10,8 @@ import torch
 from torch import Tensor
 
 from torchdlo import envs
-from torchdlo.envs import scene_names
-from torchdlo.envs.core import episode
-from torchdlo.envs.subtask import concluded, continue_from, rewarded
+from torchdlo.envs.core import episode, scene_names
+from torchdlo.envs.core.subtask import concluded, continue_from, rewarded
 from torchdlo.errors import InputError
 from torchdlo.physics import tree
 from torchdlo.reward_language import reward

@@ -9,6 +9,7 @@ from typing import Annotated
 
 import typer
 
+from torchdlo.cli.agent import plan, propose
 from torchdlo.cli.doctor import doctor
 from torchdlo.cli.identification import calibrate, design_experiment, diagnose
 from torchdlo.cli.policies import deploy, evaluate, train
@@ -64,6 +65,8 @@ app.command()(view)
 app.command()(optimize)
 app.command()(play)
 app.command()(tasks)
+app.command()(propose)
+app.command()(plan)
 app.command()(train)
 app.command()(evaluate)
 app.command()(deploy)

@@ -15,8 +15,8 @@ from torchdlo.agents.trajopt.problem import Evaluation
 from torchdlo.coupling.common import step_diagnostics
 from torchdlo.envs import PUBLISHED, RopeMaterial, find
 from torchdlo.envs.core import episode
+from torchdlo.envs.core.subtask import SubTask, rewarded
 from torchdlo.envs.core.task import Task
-from torchdlo.envs.subtask import SubTask, rewarded
 from torchdlo.errors import InputError
 from torchdlo.physics import tree
 from torchdlo.reward_language import Reward

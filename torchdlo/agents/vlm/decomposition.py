@@ -33,7 +33,7 @@ from torchdlo.agents.vlm.waypoints import led
 from torchdlo.coupling.common import step_diagnostics
 from torchdlo.envs import Task, scene_names
 from torchdlo.envs.core import episode
-from torchdlo.envs.subtask import SubTask, concluded, continue_from, opening
+from torchdlo.envs.core.subtask import SubTask, concluded, continue_from, opening
 from torchdlo.errors import InputError
 from torchdlo.files import write_atomically
 from torchdlo.reward_language import Reward, reward

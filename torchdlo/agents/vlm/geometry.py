@@ -18,8 +18,7 @@ import torch
 from torchdlo.agents.vlm.conversation import Question, Reply
 from torchdlo.agents.vlm.grasp_proposal import APART, Places, View
 from torchdlo.agents.vlm.schema import HORIZON
-from torchdlo.envs import scene_names
-from torchdlo.envs.core import curve_geometry
+from torchdlo.envs.core import curve_geometry, scene_names
 from torchdlo.errors import InputError
 
 __all__ = ["Geometry", "chosen"]

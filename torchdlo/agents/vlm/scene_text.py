@@ -9,7 +9,7 @@ from typing import Any
 
 from torchdlo.agents.vlm.conversation import plain_text
 from torchdlo.agents.vlm.grasp_proposal import Places, reach_text
-from torchdlo.envs import scene_names
+from torchdlo.envs.core import scene_names
 from torchdlo.envs.core.task import Task, TaskState
 from torchdlo.reward_language import FUNCTIONS
 

@@ -22,10 +22,10 @@ from torchdlo.coupling.robot import attachment as grasp
 from torchdlo.coupling.robot.attachment import Grasp, Hands
 from torchdlo.envs.core.divergence import broken, inside
 from torchdlo.envs.core.frames import guarded, run, slipped
+from torchdlo.envs.core.reach import FOLLOW, reachable, solve, standing
 from torchdlo.envs.core.stages import repeated
 from torchdlo.envs.core.task import Task, TaskState, combined
 from torchdlo.envs.observations.state import observe, places
-from torchdlo.envs.reach import FOLLOW, reachable, solve, standing
 from torchdlo.errors import InputError
 from torchdlo.physics import tree
 from torchdlo.physics.linalg.numerics import safe_norm

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from torchdlo.coupling.common.pose import Pose
-from torchdlo.envs import scene_names
+from torchdlo.envs.core import scene_names
 from torchdlo.envs.core.episode import Episode, EpisodeState, finish
 from torchdlo.envs.core.stages import Stage
 from torchdlo.envs.core.task import Task, TaskState

@@ -144,8 +144,8 @@ def propose(
     else:
         limits = {"calls": calls, "tokens": tokens, "seconds": seconds, "resume": resume}
         said = _conversation(out, endpoint, model, recorded, geometry, **limits)
-        from torchdlo.report.marks import marked_view
         from torchdlo.report.render.episode_film import stills
+        from torchdlo.report.render.marks import marked_view
 
         made = episode.prepare(chosen, 1, compiled=False)
         found = ask(chosen, mode, said, marked_view(stills(made, [made.start], arms=False)))
@@ -196,7 +196,7 @@ def plan(
     from torchdlo.agents.vlm.decomposition import Options, carry_out
     from torchdlo.envs import find
     from torchdlo.errors import InputError
-    from torchdlo.report.plan_page import plan_html
+    from torchdlo.report.pages.plan import plan_html
 
     if method not in ("hybrid", "cmaes"):
         raise InputError(f"method: it is {method!r}; expected hybrid or cmaes.")
@@ -208,7 +208,7 @@ def plan(
     said = _conversation(out, endpoint, model, recorded, geometry, **limits)
     look: Any = None
     if pictures:
-        from torchdlo.report.marks import Camera
+        from torchdlo.report.render.marks import Camera
         from torchdlo.report.render.picture import check_renderer
 
         check_renderer()
