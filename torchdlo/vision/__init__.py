@@ -1,1 +1,1 @@
-"""Cameras and pictures: what scenes look like, below everything that learns from it."""
+"""Cameras and pictures: what scenes look like, masks of ropes, and a differentiable rasteriser."""

@@ -1,0 +1,118 @@
+"""Films as arrays: read and written through PyAV, with a sentence for each way in which a file cannot be used."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from torchdlo.errors import InputError
+from torchdlo.files import replacing
+
+__all__ = ["CODECS", "frame_rate", "read_video", "write_video"]
+
+CODECS = ("libx264", "libopenh264", "h264")
+"""Encoders, the first that is there is used."""
+
+_UNEVEN = 0.25
+"""Deviation of a time between pictures from the usual one, as a share, from which the frame rate varies."""
+
+_MOST = 20_000
+"""Pictures that a film may have."""
+
+
+def av() -> Any:
+    """Return PyAV, which films need."""
+    try:
+        import av
+    except ImportError:
+        raise InputError("films need the package av; install it with pip install 'torchdlo[video]'.") from None
+    return av
+
+
+def read_video(path: str | Path, *, most: int = _MOST) -> tuple[np.ndarray, float]:
+    """Return the pictures of a film, RGB (F, H, W, 3) uint8, and pictures per second [1/s].
+
+    Raises:
+        InputError: It cannot be read, or its pictures are turned or not evenly spaced in time.
+    """
+    path = Path(path)
+    pictures, times = [], []
+    for picture, time in _decoded(path):
+        if len(pictures) == most:
+            raise InputError(f"{path}: expected at most {most} pictures, found more; cut the film.")
+        pictures.append(picture)
+        times.append(time)
+    if not pictures:
+        raise InputError(f"{path}: expected a film, found no picture in it; record or copy the file again.")
+    return np.stack(pictures), frame_rate(path, times)
+
+
+def frame_rate(path: Path, times: Sequence[float | None]) -> float:
+    """Return pictures per second [1/s] of pictures at these times [s]; refuse uneven ones."""
+    known = np.array([np.nan if t is None else t for t in times], dtype=float)
+    steps = np.diff(known)
+    if len(steps) == 0 or not np.isfinite(steps).all():
+        return 30.0
+    usual = float(np.median(steps))
+    if usual <= 0:
+        raise InputError(f"{path}: expected rising times of its pictures, found others; encode the film again.")
+    # A picture that was dropped leaves a whole gap, which health of masks handles; a varying rate does not.
+    share = steps / usual
+    uneven = np.abs(share - np.round(share)) > _UNEVEN
+    if uneven.mean() > 0.02 or (np.round(share) != 1).mean() > 0.2:
+        k = int(np.argmax(np.abs(share - 1)))
+        raise InputError(
+            f"{path}: expected a constant frame rate, found times between pictures of {1e3 * usual:.1f} ms and of "
+            f"{1e3 * steps[k]:.1f} ms (picture {k + 1}); encode it again at a constant rate (ffmpeg -vsync cfr)."
+        )
+    return 1 / usual
+
+
+def _decoded(path: Path) -> Iterator[tuple[np.ndarray, float | None]]:
+    if not path.is_file():
+        raise InputError(f"{path}: expected a film, found nothing there.")
+    if path.stat().st_size == 0:
+        raise InputError(f"{path}: expected a film, found an empty file; copy it again.")
+    package = av()
+    try:
+        with package.open(str(path)) as container:
+            if not container.streams.video:
+                raise InputError(f"{path}: expected a film, found a file without pictures.")
+            stream = container.streams.video[0]
+            stream.thread_type = "AUTO"
+            for frame in container.decode(stream):
+                turned = int(getattr(frame, "rotation", 0) or 0)
+                if turned % 360:
+                    raise InputError(
+                        f"{path}: expected pictures as the sensor took them, found a tag that turns them by "
+                        f"{abs(turned)} degrees; film with the phone held level, or encode the film again."
+                    )
+                yield frame.to_ndarray(format="rgb24"), frame.time
+    except package.error.FFmpegError as error:
+        raise InputError(
+            f"{path}: expected a film that can be decoded, but reading failed ({error.strerror or error}); "
+            "encode it as H.264."
+        ) from None
+
+
+def write_video(path: Path, pictures: np.ndarray, fps: float, *, quality: int = 18) -> None:
+    """Write pictures, RGB (F, H, W, 3) or grey (F, H, W) uint8, as an MP4 that appears complete or not at all."""
+    package = av()
+    codec = next((name for name in CODECS if name in package.codecs_available), None)
+    if codec is None:
+        raise InputError("films need a build of the package av with H.264; pip install av has it.")
+    layout = "rgb24" if pictures.ndim == 4 else "gray"
+    height, width = (side // 2 * 2 for side in pictures.shape[1:3])
+    with replacing(path) as temporary, package.open(str(temporary), "w", format="mp4") as container:
+        container.metadata["comment"] = "torchdlo"
+        stream = container.add_stream(codec, rate=Fraction(fps).limit_denominator(1001))
+        stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
+        stream.options = {"crf": str(quality), "preset": "medium"} if codec == "libx264" else {}
+        for picture in pictures:
+            frame = package.VideoFrame.from_ndarray(np.ascontiguousarray(picture[:height, :width]), format=layout)
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
