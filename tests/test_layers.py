@@ -22,6 +22,7 @@ FLOORS = {
     "files": 1,
     "physics": 2,
     "coupling": 3,
+    "vision": 3,
     "scene": 4,
     "vision": 4.5,
     "reward_language": 4,
@@ -46,6 +47,7 @@ ALLOWED = {
     "files": set(),
     "physics": TORCH | {"triton"},  # comes with the CUDA builds of torch
     "coupling": TORCH | {"pytorch_kinematics", "trimesh"},
+    "vision": ARRAYS | {"kornia", "cv2", "av", "matplotlib"},
     "scene": TORCH,
     "vision": ARRAYS | {"kornia", "cv2", "av"},
     "reward_language": TORCH,

@@ -1,0 +1,55 @@
+"""Boards that were drawn with a known camera give that camera again."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from torchdlo.errors import InputError
+from torchdlo.vision.calibrate_camera import Board, board_picture, calibrate_camera, error_picture
+from torchdlo.vision.video_file import read_video, write_video
+
+MATRIX = np.array([[520.0, 0, 310], [0, 525.0, 235], [0, 0, 1]])
+BOARDS = [Board(8, 6, 0.03), Board(8, 6, 0.03, 0.022)]
+
+
+def filmed(board: Board, path: Path, frames: int = 14) -> None:
+    """A film of the board, turned this way and that."""
+    rng = np.random.default_rng(0)
+    flat = board_picture(board, 80)
+    pictures = []
+    for k in range(frames):
+        turn = cv2.Rodrigues(np.array([np.pi, 0, 0]))[0]  # its z axis towards the camera
+        turn = cv2.Rodrigues(rng.uniform(-0.45, 0.45, 3) * (k > 0))[0] @ turn
+        centre = np.array([0.03 * 4, -0.03 * 3, 0.0])
+        shift = np.array([*rng.uniform(-0.06, 0.06, 2), 0.42 + 0.1 * rng.random()]) - turn @ centre
+        # A pixel of the board's picture is a place on the board: its first inner corner is the origin.
+        scale = 0.03 / 80
+        place = np.array([[scale, 0, -1.5 * 0.03 + scale / 2], [0, -scale, 1.5 * 0.03 - scale / 2], [0, 0, 1]])
+        homography = MATRIX @ np.column_stack([turn[:, 0], turn[:, 1], shift]) @ place
+        shown = cv2.warpPerspective(flat, homography, (640, 480), flags=cv2.INTER_AREA, borderValue=150)
+        pictures.append(np.repeat(cv2.GaussianBlur(shown, (0, 0), 0.7)[..., None], 3, 2))
+    write_video(path, np.stack(pictures), 30.0, quality=10)
+
+
+@pytest.mark.parametrize("board", BOARDS, ids=["checkerboard", "charuco"])
+def test_a_known_camera_is_found_again(board: Board, tmp_path: Path) -> None:
+    filmed(board, tmp_path / "board.mp4")
+    found = calibrate_camera(tmp_path / "board.mp4", board, name="left")
+    camera = found.camera
+    assert found.error < 0.3 and camera.name == "left" and (camera.width, camera.height) == (640, 480)
+    assert camera.fx == pytest.approx(520, rel=0.01) and camera.fy == pytest.approx(525, rel=0.01)
+    assert camera.cx == pytest.approx(310, abs=5) and camera.cy == pytest.approx(235, abs=5)
+    # In the first picture the board faces the camera: its z axis points to it.
+    assert camera.rotation[2][2] < -0.99 and 0.3 < camera.translation[2] < 0.6
+    picture = read_video(tmp_path / "board.mp4")[0][found.pictures[0]]
+    assert error_picture(found, picture).startswith(b"\x89PNG")
+
+
+def test_a_film_without_a_board_is_refused(tmp_path: Path) -> None:
+    write_video(tmp_path / "grey.mp4", np.full((10, 120, 160), 128, np.uint8), 30.0)
+    with pytest.raises(InputError, match="found it in 0 of 10"):
+        calibrate_camera(tmp_path / "grey.mp4", BOARDS[0])

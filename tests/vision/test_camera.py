@@ -1,0 +1,98 @@
+"""Projection is OpenCV's, goes both ways, has gradients, and says what is behind; cameras.json is refused in
+sentences."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from tests.vision.scenes import front, hanging
+from torchdlo.errors import InputError
+from torchdlo.vision.camera import back_project, lens, load_cameras, project, save_cameras
+
+
+def test_projection_is_that_of_opencv() -> None:
+    camera, points = front(), hanging()
+    pixel, depth = project(lens([camera]), torch.as_tensor(points)[None])
+    turn, _ = cv2.Rodrigues(np.array(camera.rotation))
+    matrix = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
+    expected, _ = cv2.projectPoints(
+        points[:, None], turn, np.array(camera.translation), matrix, np.array(camera.distortion)
+    )
+    np.testing.assert_allclose(pixel[0].numpy(), expected[:, 0], atol=1e-9)
+    assert (depth > 1).all()
+
+
+def test_points_are_found_again_from_pixels_and_depths() -> None:
+    view, points = lens([front()]), torch.as_tensor(hanging())[None]
+    pixel, depth = project(view, points)
+    torch.testing.assert_close(back_project(view, pixel, depth), points, atol=1e-6, rtol=0)
+
+
+def test_points_behind_the_camera_have_finite_pixels_gradients_and_negative_depths() -> None:
+    points = torch.tensor(
+        [[[0.0, 0.0, 0.0], [0.0, -5.0, 0.0], [0.1, -1.2, 0.1]]], dtype=torch.float64, requires_grad=True
+    )
+    pixel, depth = project(lens([front()]), points)
+    (gradient,) = torch.autograd.grad(pixel.sum(), points)
+    assert depth[0, 0] > 0 > depth[0, 1] and torch.isfinite(pixel).all() and torch.isfinite(gradient).all()
+    assert not gradient[0, 1:].any()
+
+
+def test_gradients_with_respect_to_points_and_pose() -> None:
+    view, points = lens([front()]), torch.as_tensor(hanging(5))[None].requires_grad_()
+    turn, shift = (torch.full((1, 3), 0.01, dtype=torch.float64, requires_grad=True) for _ in range(2))
+    zoom = torch.full((1,), 0.01, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(lambda p, a, b, c: project(view.moved(a, b, c), p)[0], (points, turn, shift, zoom))
+
+
+def test_what_is_written_is_read(tmp_path: Path) -> None:
+    cameras = (front(fps=60.0, start=-0.01),)
+    save_cameras(cameras, tmp_path / "cameras.json")
+    assert load_cameras(tmp_path / "cameras.json") == cameras
+
+
+def _without(name: str) -> Callable[[dict], None]:
+    return lambda entry: entry.pop(name)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (_without("fx"), "cameras\\[0\\].fx: expected this entry"),
+        (lambda e: e.update(fx=-1), "above 0"),
+        (lambda e: e.update(width="wide"), "finite number"),
+        (lambda e: e.update(rotation=[[1, 0, 0], [0, 1, 0], [0, 0, 2]]), "rotation matrix"),
+        (lambda e: e.update(rotation=[[1, 0], [0, 1]]), "3 rows"),
+        (lambda e: e.update(distortion=[0.1]), "0, 4, 5, 8"),
+        (lambda e: e.update(translation=[0, 0]), "3 numbers"),
+        (lambda e: e.update(zoom=1), "unknown key"),
+        (lambda e: e.update(name="../x"), "letters"),
+    ],
+)
+def test_wrong_files_are_refused_in_a_sentence(tmp_path: Path, change: Callable[[dict], None], message: str) -> None:
+    path = tmp_path / "cameras.json"
+    save_cameras([front()], path)
+    content = json.loads(path.read_text())
+    change(content["cameras"][0])
+    path.write_text(json.dumps(content))
+    with pytest.raises(InputError, match=message) as caught:
+        load_cameras(path)
+    assert str(caught.value).startswith(str(path)) and str(caught.value).endswith(".")
+
+
+@pytest.mark.parametrize(
+    ("text", "message"), [("{", "valid JSON"), ("[]", "at least one camera"), (None, "found none")]
+)
+def test_files_that_are_none(tmp_path: Path, text: str | None, message: str) -> None:
+    path = tmp_path / "cameras.json"
+    if text is not None:
+        path.write_text(text)
+    with pytest.raises(InputError, match=message):
+        load_cameras(path)

@@ -1,0 +1,230 @@
+"""A calibrated camera from a film of a printed board: checkerboard or ChArUco, detected and fitted by OpenCV.
+
+The board in the first picture in which it is found gives the world: its origin is the board's first corner, x runs
+along the rows of the board, y up along its columns, z out of the board.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from torchdlo.errors import InputError
+from torchdlo.vision.camera import Camera
+from torchdlo.vision.video_file import read_video
+
+__all__ = ["Board", "Calibrated", "board_picture", "calibrate_camera", "error_picture"]
+
+_MOST = 40
+"""Pictures that are used."""
+
+_FEWEST = 4
+"""Pictures that are needed."""
+
+
+@dataclass(frozen=True)
+class Board:
+    """A printed board."""
+
+    columns: int
+    """Squares along a row."""
+    rows: int
+    """Squares along a column."""
+    square: float
+    """Side of a square [m]."""
+    marker: float | None = None
+    """Side of a marker [m], of ChArUco; None for a checkerboard."""
+    dictionary: str = "DICT_4X4_50"
+    """Markers of ChArUco, as OpenCV calls them."""
+
+    def charuco(self):
+        """Return OpenCV's board of markers."""
+        import cv2
+
+        if not hasattr(cv2.aruco, self.dictionary):
+            raise InputError(
+                f"dictionary: expected a name that OpenCV knows, such as DICT_4X4_50, found {self.dictionary}."
+            )
+        words = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, self.dictionary))
+        return cv2.aruco.CharucoBoard((self.columns, self.rows), self.square, self.marker, words)
+
+    def corners(self) -> np.ndarray:
+        """Return the inner corners, row by row as OpenCV orders them, with y up [m], shape (N, 3)."""
+        x, y = np.meshgrid(np.arange(self.columns - 1), np.arange(self.rows - 1))
+        return np.stack([x.ravel() * self.square, -y.ravel() * self.square, 0.0 * x.ravel()], 1)
+
+
+@dataclass(frozen=True, eq=False)
+class Calibrated:
+    """A camera and how well it explains the film."""
+
+    camera: Camera
+    error: float
+    """Root mean square distance of corners from where the camera has them [px]."""
+    pictures: tuple[int, ...]
+    """Pictures of the film that were used; the first one gives the world."""
+    found: tuple[np.ndarray, ...]
+    """Corners in those [px], shape (N, 2) each."""
+    modelled: tuple[np.ndarray, ...]
+    """Where the camera has them [px], likewise."""
+    notes: tuple[str, ...]
+    """What a reader should know."""
+
+
+def calibrate_camera(
+    path: Path, board: Board, *, name: str = "a", callback: Callable[[str, int, int, str], None] | None = None
+) -> Calibrated:
+    """Fit a camera to a film of a board.
+
+    Args:
+        path: the film.
+        board: what was printed.
+        name: of the camera.
+        callback: told (stage, pictures done, in all, message).
+
+    Raises:
+        InputError: The film cannot be read, or shows the board too rarely.
+    """
+    import cv2
+
+    report = callback or (lambda *_: None)
+    pictures, fps = read_video(path)
+    height, width = pictures.shape[1:3]
+    find = _charuco_finder(board) if board.marker is not None else _checkerboard_finder(board)
+    tried = np.unique(np.linspace(0, len(pictures) - 1, min(len(pictures), 3 * _MOST)).round().astype(int))
+    seen: list[tuple[int, np.ndarray, np.ndarray]] = []
+    for done, k in enumerate(tried):
+        at, corners = find(cv2.cvtColor(pictures[k], cv2.COLOR_RGB2GRAY))
+        if len(at) >= 6:
+            seen.append((int(k), at, corners))
+        report("finding the board", done + 1, len(tried), f"in {len(seen)} pictures")
+    if len(seen) < _FEWEST:
+        kind = "checkerboard" if board.marker is None else f"ChArUco board ({board.dictionary})"
+        raise InputError(
+            f"{path}: expected a {kind} of {board.columns} x {board.rows} squares in at least {_FEWEST} pictures, found it "
+            f"in {len(seen)} of {len(tried)}; check the numbers of squares, and film it large, sharp and from several sides."
+        )
+    if len(seen) > _MOST:
+        seen = [seen[k] for k in np.linspace(0, len(seen) - 1, _MOST).round().astype(int)]
+    model = board.corners()
+    objects = [model[at].astype(np.float32)[:, None] for _, at, _ in seen]
+    images = [corners.astype(np.float32)[:, None] for *_, corners in seen]
+    error, matrix, lens, turns, shifts = cv2.calibrateCamera(objects, images, (width, height), None, None)
+    report("fitting the camera", 1, 1, f"{error:.2f} px")
+    modelled = tuple(
+        cv2.projectPoints(o, r, t, matrix, lens)[0][:, 0] for o, r, t in zip(objects, turns, shifts, strict=True)
+    )
+    rotation = cv2.Rodrigues(turns[0])[0]
+    camera = Camera(
+        name,
+        width,
+        height,
+        *(float(matrix[place]) for place in ((0, 0), (1, 1), (0, 2), (1, 2))),
+        tuple(tuple(map(float, row)) for row in rotation),
+        tuple(map(float, shifts[0].ravel())),
+        tuple(map(float, lens.ravel()[:5])),
+        fps,
+    )
+    normals = np.array([cv2.Rodrigues(r)[0][:, 2] for r in turns])
+    return Calibrated(
+        camera,
+        float(error),
+        tuple(k for k, *_ in seen),
+        tuple(i[:, 0] for i in images),
+        modelled,
+        tuple(_notes(float(error), normals, images, width, height)),
+    )
+
+
+def _notes(error: float, normals: np.ndarray, images: list[np.ndarray], width: int, height: int) -> list[str]:
+    notes = []
+    if error > 1.0:
+        notes.append(f"The error of {error:.1f} px is large: is the board flat, and is its size right?")
+    spread = np.degrees(np.arccos(np.clip((normals @ normals.mean(0)) / np.linalg.norm(normals.mean(0)), -1, 1)).max())
+    if spread < 10:
+        notes.append(
+            f"The board was never tilted by more than {spread:.0f} degrees: the focal length is uncertain; film it tilted."
+        )
+    every = np.concatenate([i[:, 0] for i in images])
+    share = np.ptp(every[:, 0]) * np.ptp(every[:, 1]) / (width * height)
+    if share < 0.4:
+        notes.append(f"The board was seen in {share:.0%} of the picture only: distortion at its edges is uncertain.")
+    return notes
+
+
+def _checkerboard_finder(board: Board) -> Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]:
+    import cv2
+
+    inner = (board.columns - 1, board.rows - 1)
+    if min(inner) < 3:
+        raise InputError(f"board: expected at least 4 x 4 squares, found {board.columns} x {board.rows}.")
+
+    def find(grey: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        flags = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_FAST_CHECK
+        found, corners = cv2.findChessboardCorners(grey, inner, flags=flags)
+        if not found:
+            return np.zeros(0, int), np.zeros((0, 2))
+        stop = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 30, 1e-3)
+        steps = np.linalg.norm(np.diff(corners.reshape(inner[1], inner[0], 2), axis=1), axis=-1)
+        reach = max(2, min(11, int(steps.min() / 3)))
+        corners = cv2.cornerSubPix(grey, corners, (reach, reach), (-1, -1), stop).reshape(-1, 2)
+        # A board turned by half a circle looks the same to the finder: the one that is upright is meant.
+        if corners[0, 1] > corners[-1, 1]:
+            corners = corners[::-1]
+        return np.arange(len(corners)), corners
+
+    return find
+
+
+def _charuco_finder(board: Board) -> Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]:
+    import cv2
+
+    detector = cv2.aruco.CharucoDetector(board.charuco())
+
+    def find(grey: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        corners, ids, *_ = detector.detectBoard(grey)
+        if ids is None or len(ids) == 0:
+            return np.zeros(0, int), np.zeros((0, 2))
+        return np.asarray(ids).reshape(-1), np.asarray(corners).reshape(-1, 2)
+
+    return find
+
+
+def board_picture(board: Board, dots: int = 100) -> np.ndarray:
+    """Return a board to print, grey uint8, with `dots` pixels per square and a white margin of half a square."""
+    margin = dots // 2
+    if board.marker is not None:
+        size = (board.columns * dots, board.rows * dots)
+        inner = board.charuco().generateImage(size)
+    else:
+        y, x = np.indices((board.rows * dots, board.columns * dots)) // dots
+        inner = (255 * ((x + y) % 2)).astype(np.uint8)
+    return np.pad(inner, margin, constant_values=255)
+
+
+def error_picture(found: Calibrated, picture: np.ndarray) -> bytes:
+    """Return a PNG of where corners were found and how far off the camera has them, over a picture RGB (H, W, 3)."""
+    import io
+
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(11, 4.4), layout="constrained")
+    left, right = figure.subplots(1, 2, width_ratios=(1.5, 1))
+    left.imshow(picture, alpha=0.35)
+    off = np.concatenate([m - f for m, f in zip(found.modelled, found.found, strict=True)])
+    every = np.concatenate(found.found)
+    left.scatter(every[:, 0], every[:, 1], s=4, c="#00798c", alpha=0.5, linewidths=0)
+    left.quiver(*every.T, *off.T, angles="xy", scale_units="xy", scale=0.05, width=1.5e-3, color="#c4472f")
+    left.set(title=f"corners in {len(found.pictures)} pictures; errors 20 times enlarged", xticks=[], yticks=[])
+    right.axhline(0, lw=0.5, c="#8592a0")
+    right.axvline(0, lw=0.5, c="#8592a0")
+    right.scatter(*off.T, s=4, alpha=0.4, c="#c4472f", linewidths=0)
+    far = max(0.5, float(np.percentile(np.abs(off), 99.5)))
+    right.set(xlim=(-far, far), ylim=(-far, far), aspect="equal", xlabel="error in x [px]", ylabel="error in y [px]")
+    right.set_title(f"reprojection error {found.error:.3f} px (root mean square)")
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=130, metadata={"Software": "torchdlo"})
+    return buffer.getvalue()

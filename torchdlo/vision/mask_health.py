@@ -1,0 +1,188 @@
+"""Whether masks can be trusted: frames that are wrong are taken out and said; what leaves too little is refused."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from torchdlo.errors import InputError
+
+__all__ = ["Issue", "check_masks", "frames_text"]
+
+_JUMP = 0.35
+"""Change of area from the frames around, as a share, that a rope does not show."""
+
+_FEW = 0.5
+"""Share of frames that have to be left."""
+
+_SLIP = 6.0
+"""Shift of the still background from which the camera has slipped [px]."""
+
+
+@dataclass(frozen=True)
+class Issue:
+    """One thing that is wrong with the masks of one camera."""
+
+    kind: str
+    """empty, area, frozen, elsewhere, edge, slip, dropped, blobs."""
+    text: str
+    """What was found, and what was done about it."""
+
+
+def frames_text(rows: np.ndarray) -> str:
+    """Return frames (F,) bool in words."""
+    at = np.flatnonzero(rows)
+    runs = np.split(at, np.flatnonzero(np.diff(at) > 1) + 1)
+    told = [str(r[0]) if len(r) == 1 else f"{r[0]} to {r[-1]}" for r in runs[:4]]
+    more = f" and {len(runs) - 4} more stretches" if len(runs) > 4 else ""
+    return f"frame{'s' if len(at) > 1 else ''} {', '.join(told)}{more}"
+
+
+def check_masks(
+    masks: np.ndarray, where: str, *, pictures: np.ndarray | None = None, moving: bool = True
+) -> tuple[np.ndarray, list[Issue]]:
+    """Return which frames can be trusted, (F,) bool, and what is wrong with others.
+
+    Args:
+        masks: shape (F, H, W) bool.
+        where: name of the file, which sentences begin with.
+        pictures: what they were made from, RGB (F, H, W, 3) uint8, for the background, if at hand.
+        moving: whether the grippers move all the time, so that equal masks are repeated ones.
+
+    Raises:
+        InputError: Too little is left.
+    """
+    count = len(masks)
+    good, issues = np.ones(count, bool), []
+
+    def leave(rows: np.ndarray, kind: str, text: str) -> None:
+        rows = rows & good
+        if rows.any():
+            good[rows] = False
+            issues.append(Issue(kind, f"{text} in {frames_text(rows)}: left out"))
+
+    area = masks.reshape(count, -1).sum(1).astype(float)
+    if not area.any():
+        raise InputError(
+            f"{where}: the rope is never visible: all masks are black; set its colour with torchdlo segment, or check "
+            "that it stands out from what is behind it."
+        )
+    if np.median(area) > 0.25 * masks[0].size:
+        raise InputError(
+            f"{where}: masks cover {np.median(area) / masks[0].size:.0%} of the picture: the background has the rope's "
+            "colour; set its ranges with torchdlo segment, or hang a sheet of another colour behind it."
+        )
+    leave(area < 0.1 * np.median(area[area > 0]), "empty", "the rope is not seen")
+    usual = _smooth(np.where(good, area, np.nan))
+    leave(np.abs(area / np.maximum(usual, 1.0) - 1) > _JUMP, "area", "the area of the mask jumps")
+    leave(_elsewhere(masks, good), "elsewhere", "the mask jumps away and back")
+    if moving:
+        same = np.zeros(count, bool)
+        same[1:] = [np.array_equal(a, b) for a, b in zip(masks[1:], masks[:-1], strict=True)]
+        leave(same, "frozen", "the picture is the one before")
+    blobs = _blobs(masks, good)
+    if blobs:
+        issues.append(Issue("blobs", blobs))
+    edge = good & (masks[:, [0, -1]].any((1, 2)) | masks[:, :, [0, -1]].any((1, 2)))
+    if edge.any():
+        text = f"the rope leaves the picture in {frames_text(edge)}: what is out of it does not count"
+        issues.append(Issue("edge", text))
+    if pictures is not None:
+        slipped = _slip(pictures, masks)
+        if slipped is not None:
+            at, far = slipped
+            rows = np.arange(count) >= at
+            leave(rows, "slip", f"the background has shifted by {far:.0f} px, as if the camera had slipped,")
+    if good.sum() < max(5, _FEW * count):
+        kinds = ", ".join(dict.fromkeys(i.text for i in issues if i.kind not in ("edge", "blobs")))
+        raise InputError(
+            f"{where}: expected at least half of its {count} frames to be usable, found {int(good.sum())} ({kinds}); "
+            "film again or set the colour with torchdlo segment."
+        )
+    return good, issues
+
+
+def _smooth(values: np.ndarray, reach: int = 4) -> np.ndarray:
+    """Return running medians of values (F,), NaN left out."""
+    padded = np.pad(values, reach, constant_values=np.nan)
+    windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * reach + 1)
+    known = np.isfinite(windows).any(1)
+    out = np.full(len(values), np.nanmedian(values) if np.isfinite(values).any() else 0.0)
+    out[known] = np.nanmedian(windows[known], 1)
+    return out
+
+
+def _elsewhere(masks: np.ndarray, good: np.ndarray) -> np.ndarray:
+    """Return frames whose mask lies far from where those before and after lie, which agree, (F,) bool."""
+    out = np.zeros(len(masks), bool)
+    trusted = np.flatnonzero(good)
+    if len(trusted) < 5:
+        return out
+    centre = np.array([[c.mean() for c in np.nonzero(masks[k])] for k in trusted])
+    step = np.linalg.norm(centre[1:-1] - 0.5 * (centre[:-2] + centre[2:]), axis=1)
+    apart = np.linalg.norm(centre[2:] - centre[:-2], axis=1)
+    usual = max(3.0, 8 * float(np.median(step)))
+    out[trusted[1:-1][(step > usual) & (step > 1.5 * apart)]] = True
+    return out
+
+
+def _blobs(masks: np.ndarray, good: np.ndarray) -> str:
+    """Return what is to be said of second blobs, "" if there are none."""
+    import cv2
+
+    rows = np.flatnonzero(good)
+    if not len(rows):
+        return ""
+    second = []
+    for k in rows[:: max(1, len(rows) // 12)]:
+        kernel = np.ones((9, 9), np.uint8)
+        joined = cv2.dilate(masks[k].astype(np.uint8), kernel)
+        count, label = cv2.connectedComponents(joined)
+        area = np.bincount(label[masks[k]], minlength=count)[1:] if count > 1 else np.zeros(1)
+        area = np.sort(area)[::-1]
+        second.append(area[1] / area[0] if len(area) > 1 else 0.0)
+    share = float(np.median(second))
+    if share > 0.05:
+        return (
+            f"a second blob has {share:.0%} of the area of the first: a part of the rope may be hidden, or two are seen"
+        )
+    return ""
+
+
+def _slip(pictures: np.ndarray, masks: np.ndarray) -> tuple[int, float] | None:
+    """Return from which frame on the still background is shifted, and by how many pixels; None if it is not."""
+    import cv2
+
+    def grey(k: int) -> np.ndarray:
+        small = cv2.resize(pictures[k], None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+        return cv2.cvtColor(small, cv2.COLOR_RGB2GRAY).astype(np.float32)
+
+    still = ~cv2.dilate(masks.any(0).astype(np.uint8), np.ones((25, 25), np.uint8)).astype(bool)
+    still = still[::2, ::2][: grey(0).shape[0], : grey(0).shape[1]]
+    if still.mean() < 0.2:
+        return None
+    window = cv2.GaussianBlur(still.astype(np.float32), (0, 0), 4)
+    first = grey(0)
+    texture = float((first - cv2.GaussianBlur(first, (0, 0), 6))[still].std())
+
+    def shift(k: int) -> float:
+        (dx, dy), response = cv2.phaseCorrelate((first - first.mean()) * window, (grey(k) - first.mean()) * window)
+        return 2 * float(np.hypot(dx, dy)) if response > 0.05 else 0.0
+
+    last = len(pictures) - 1
+    if texture < 1.0 or shift(last) < _SLIP or shift(last - 2) < _SLIP:
+        return None
+    low, high = 0, last
+    while high - low > 1:
+        middle = (low + high) // 2
+        low, high = (low, middle) if shift(middle) >= _SLIP else (middle, high)
+    return high, shift(last)
+
+
+def dropped(count: int, expected: float) -> Sequence[str]:
+    """Return what is to be said of a film that is shorter than its trial by more than a few frames."""
+    if count < expected - 3:
+        return [f"{count} pictures, {expected:.0f} expected for the time of the trial: the end is not judged"]
+    return []

@@ -1,0 +1,229 @@
+"""Masks of ropes: by ranges of colour, by difference from an empty background, or made elsewhere.
+
+Ranges are in degrees of hue and in shares of saturation and value. They come from a person (`torchdlo segment`), or
+from the colour that is written down in `rope.json`.
+"""
+
+from __future__ import annotations
+
+import colorsys
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from torchdlo.errors import InputError
+from torchdlo.files import write_atomically
+from torchdlo.vision.video_file import read_video
+
+__all__ = [
+    "Ranges",
+    "background_masks",
+    "color_masks",
+    "load_film",
+    "load_ranges",
+    "ranges_of",
+    "save_masks",
+    "save_ranges",
+    "tidy",
+]
+
+
+@dataclass(frozen=True)
+class Ranges:
+    """Colours that belong to a rope, and how masks are tidied."""
+
+    hue: tuple[float, float] = (0.0, 360.0)
+    """Lowest and highest hue [degrees]; the lowest may be the larger one: through 0, for reds."""
+    saturation: tuple[float, float] = (0.0, 1.0)
+    """Lowest and highest saturation [1]."""
+    value: tuple[float, float] = (0.0, 1.0)
+    """Lowest and highest value [1]."""
+    close: int = 3
+    """Gaps up to so many pixels are closed [px]."""
+    smallest: int = 25
+    """Blobs of fewer pixels are left out [px]."""
+
+
+def ranges_of(rgb: Sequence[float]) -> Ranges:
+    """Return ranges for a colour (R, G, B from 0 to 255) in uneven light.
+
+    Raises:
+        InputError: The colour is grey: light and shade have the same.
+    """
+    hue, saturation, value = colorsys.rgb_to_hsv(*(c / 255 for c in rgb))
+    if saturation < 0.25 or value < 0.15:
+        raise InputError(
+            f"color: expected one that stands out from grey surroundings, found {[round(c) for c in rgb]}; set ranges "
+            "with torchdlo segment, or paint the rope."
+        )
+    degrees = 360 * hue
+    wide = 22.0
+    return Ranges(
+        ((degrees - wide) % 360, (degrees + wide) % 360), (max(0.2, 0.45 * saturation), 1.0), (max(0.1, 0.2 * value), 1)
+    )
+
+
+def color_masks(pictures: np.ndarray, ranges: Ranges) -> np.ndarray:
+    """Return the masks of pictures, RGB (F, H, W, 3) uint8, tidied; shape (F, H, W) bool."""
+    import cv2
+
+    out = np.zeros(pictures.shape[:3], bool)
+    low, high = (h / 2 for h in ranges.hue)  # OpenCV's hue goes up to 180
+    rest_low, rest_high = ([255 * r[k] for r in (ranges.saturation, ranges.value)] for k in (0, 1))
+    spans = [(low, high)] if low <= high else [(low, 180.0), (0.0, high)]
+    for k, picture in enumerate(pictures):
+        hsv = cv2.cvtColor(picture, cv2.COLOR_RGB2HSV)
+        found = np.zeros(hsv.shape[:2], np.uint8)
+        for a, b in spans:
+            lower, upper = (np.array([np.round(v) for v in ends]) for ends in ((a, *rest_low), (b, *rest_high)))
+            found |= cv2.inRange(hsv, lower, upper)
+        out[k] = tidy(found > 0, ranges)
+    return out
+
+
+def background_masks(pictures: np.ndarray, background: np.ndarray, least: float, ranges: Ranges) -> np.ndarray:
+    """Return where pictures (F, H, W, 3) differ from the background (H, W, 3) by at least `least`, (F, H, W) bool.
+
+    Args:
+        pictures: RGB uint8.
+        background: RGB uint8, the same view without the rope.
+        least: largest difference of a channel [1], from 0 to 255.
+        ranges: how masks are tidied.
+    """
+    import cv2
+
+    return np.stack([tidy(cv2.absdiff(p, background).max(-1) >= least, ranges) for p in pictures])
+
+
+def tidy(mask: np.ndarray, ranges: Ranges) -> np.ndarray:
+    """Return a mask (H, W) bool with small gaps closed and small blobs left out."""
+    import cv2
+
+    here = mask.astype(np.uint8)
+    if ranges.close > 1:
+        kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (ranges.close, ranges.close))
+        here = cv2.morphologyEx(here, cv2.MORPH_CLOSE, kernel)
+    count, label, stats, _ = cv2.connectedComponentsWithStats(here, connectivity=8)
+    if count <= 1:
+        return here.astype(bool)
+    area = stats[1:, cv2.CC_STAT_AREA]
+    keep = np.concatenate([[False], area >= max(ranges.smallest, 0.02 * area.max())])
+    return keep[label]
+
+
+def save_ranges(ranges: Ranges, path: Path) -> None:
+    """Write ranges as JSON."""
+    write_atomically(path, json.dumps({"generator": "torchdlo segment", **asdict(ranges)}, indent=1) + "\n")
+
+
+def load_ranges(path: str | Path) -> Ranges:
+    """Read what `save_ranges` wrote."""
+    path = Path(path)
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError) as error:
+        raise InputError(f"{path}: expected ranges of colour in JSON, but reading failed: {error}.") from None
+    return ranges_from(content, str(path))
+
+
+_LIMITS = {"hue": 360.0, "saturation": 1.0, "value": 1.0}
+
+
+def ranges_from(content: Any, where: str) -> Ranges:
+    """Return ranges from plain objects; `where` begins the sentence if they are wrong."""
+    if not isinstance(content, dict):
+        raise InputError(f"{where}: expected an object with hue, saturation and value, found something else.")
+    given: dict[str, Any] = {}
+    for name, value in content.items():
+        if name == "generator":
+            continue
+        if name in _LIMITS:
+            pair = value if isinstance(value, (list, tuple)) and len(value) == 2 else (None, None)
+            good = all(isinstance(v, (int, float)) and not isinstance(v, bool) and math.isfinite(v) for v in pair)
+            if not good or not all(0 <= v <= _LIMITS[name] for v in pair):
+                limit = f"{_LIMITS[name]:g}"
+                raise InputError(f"{where}: {name}: expected [lowest, highest] from 0 to {limit}, found {value!r}.")
+            given[name] = (float(pair[0]), float(pair[1]))
+        elif name in ("close", "smallest"):
+            if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value <= 10_000:
+                raise InputError(f"{where}: {name}: expected a whole number from 0 to 10000, found {value!r}.")
+            given[name] = value
+        else:
+            raise InputError(f"{where}: {name}: unknown; known are hue, saturation, value, close, smallest.")
+    return Ranges(**given)
+
+
+def load_film(path: Path) -> tuple[np.ndarray, float | None]:
+    """Return a film as pictures, RGB (F, H, W, 3) uint8, or as masks (F, H, W) bool, and its frame rate if it says it.
+
+    A film of masks is black and white. `path` is an .npz with an array `masks`, a folder of PNG files, or a film.
+
+    Raises:
+        InputError: It cannot be read.
+    """
+    if path.is_dir():
+        return _from_folder(path), None
+    if path.suffix == ".npz":
+        return _from_archive(path), None
+    pictures, fps = read_video(path)
+    return _maybe_masks(pictures), fps
+
+
+def _maybe_masks(pictures: np.ndarray) -> np.ndarray:
+    """Return black and white pictures (F, H, W, 3) as masks, others as they are."""
+    some = pictures[:: max(1, len(pictures) // 8)].astype(np.int16)
+    grey = np.ptp(some, axis=-1)
+    extreme = (some[..., 1] < 40) | (some[..., 1] > 215)
+    if (grey > 12).mean() > 1e-3 or extreme.mean() < 0.97:
+        return pictures
+    return pictures[..., 1] > 127
+
+
+def _from_archive(path: Path) -> np.ndarray:
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            if "masks" not in archive.files:
+                raise InputError(f"{path}: masks: expected this array, found {', '.join(archive.files) or 'none'}.")
+            masks = archive["masks"]
+    except InputError:
+        raise
+    except Exception as error:  # a damaged archive can raise nearly anything
+        raise InputError(f"{path}: expected an .npz archive with masks, but reading failed ({error}).") from None
+    if masks.ndim != 3 or masks.dtype.kind not in "bui":
+        raise InputError(
+            f"{path}: masks: expected bool of shape (frames, height, width), found {masks.dtype} of shape {masks.shape}."
+        )
+    return masks > (0 if masks.dtype == bool or masks.max(initial=0) <= 1 else 127)
+
+
+def _from_folder(path: Path) -> np.ndarray:
+    import cv2
+
+    files = sorted(path.glob("*.png"))
+    if not files:
+        raise InputError(f"{path}: expected PNG files, one for each frame, found none.")
+    pictures = []
+    for file in files:
+        picture = cv2.imread(str(file), cv2.IMREAD_COLOR)
+        if picture is None:
+            raise InputError(f"{file}: expected a PNG picture, but it cannot be read.")
+        if pictures and picture.shape != pictures[0].shape:
+            raise InputError(
+                f"{file}: expected {pictures[0].shape[1]} x {pictures[0].shape[0]} pixels as {files[0].name} has, found "
+                f"{picture.shape[1]} x {picture.shape[0]}."
+            )
+        pictures.append(picture[..., ::-1])
+    return _maybe_masks(np.stack(pictures))
+
+
+def save_masks(masks: np.ndarray, path: Path) -> None:
+    """Write masks (F, H, W) bool as .npz."""
+    from torchdlo.files import replacing
+
+    with replacing(path) as temporary:
+        np.savez_compressed(temporary, masks=masks, torchdlo=np.array("torchdlo"))

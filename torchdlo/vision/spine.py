@@ -1,0 +1,146 @@
+"""The centre line of a mask, exact distance fields, and distances between curves in pictures.
+
+Thinning is Zhang and Suen's (1984, doi:10.1145/357994.358023) by table look-up; the pixels that are left are moved to
+the centroid of the mask around them, which is a tenth of a pixel from the middle of a straight tube.
+"""
+
+from __future__ import annotations
+
+import functools
+
+import numpy as np
+import torch
+from torch import Tensor
+
+__all__ = ["curve_vectors", "distance_field", "half_width", "sample_field", "spine", "thin"]
+
+
+@functools.cache
+def _tables() -> tuple[np.ndarray, np.ndarray]:
+    """Return which pixels the two halves of a pass remove, by the code of their eight neighbours; (256,) uint8 each."""
+    tables = np.zeros((2, 256), np.uint8)
+    for code in range(256):
+        p = [(code >> k) & 1 for k in range(8)]  # north, north-east, ... clockwise
+        changes = sum(p[k] == 0 and p[(k + 1) % 8] == 1 for k in range(8))
+        if not 2 <= sum(p) <= 6 or changes != 1:
+            continue
+        n, e, s, w = p[0], p[2], p[4], p[6]
+        tables[0, code] = 255 * (n * e * s == 0 and e * s * w == 0)
+        tables[1, code] = 255 * (n * e * w == 0 and n * s * w == 0)
+    return tables[0], tables[1]
+
+
+_CODE = np.array([[128, 1, 2], [64, 0, 4], [32, 16, 8]], np.float32)
+
+
+def thin(mask: np.ndarray) -> np.ndarray:
+    """Return the skeleton of a mask, both (H, W) bool."""
+    import cv2
+
+    left = np.pad(mask, 1).astype(np.uint8)
+    while True:
+        removed = 0
+        for table in _tables():
+            code = cv2.filter2D(left, cv2.CV_8U, _CODE, borderType=cv2.BORDER_CONSTANT)
+            gone = cv2.LUT(code, table) & (left * 255)
+            removed += cv2.countNonZero(gone)
+            left[gone > 0] = 0
+        if not removed:
+            return left[1:-1, 1:-1].astype(bool)
+
+
+def half_width(mask: np.ndarray) -> float:
+    """Return the usual half width of what a mask (H, W) shows [px], 0 where it shows nothing."""
+    import cv2
+
+    area = int(mask.sum())
+    if not area:
+        return 0.0
+    inside = cv2.distanceTransform(np.pad(mask, 1).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    # Distances from the edge are even from 0 to the half width: their mean is half of that.
+    return float(2 * inside[inside > 0].mean() - 0.5)
+
+
+def spine(mask: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return points of the centre line of a mask and its unit tangents there, evenly spread.
+
+    Args:
+        mask: what a picture shows of a rope, shape (H, W) bool.
+        count: how many points, S.
+
+    Returns:
+        Places [px], (S, 2), and tangents [1], (S, 2); NaN where the line is too short for so many.
+    """
+    import cv2
+
+    places, tangents = (np.full((count, 2), np.nan) for _ in range(2))
+    rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
+    if not len(rows):
+        return places, tangents
+    y0, x0 = rows[0], columns[0]
+    cut = np.ascontiguousarray(mask[y0 : rows[-1] + 1, x0 : columns[-1] + 1])
+    y, x = np.nonzero(thin(cut))
+    if len(y) > count:
+        # One pixel per cell of a grid, then evenly among those.
+        cell = max(1.0, 0.9 * len(y) / count)
+        _, first = np.unique((y // cell).astype(int) * 100_000 + (x // cell).astype(int), return_index=True)
+        first = first[np.linspace(0, len(first) - 1, min(count, len(first))).round().astype(int)]
+        y, x = y[first], x[first]
+    reach = int(np.ceil(half_width(cut))) + 1
+    grid_y, grid_x = np.mgrid[: cut.shape[0], : cut.shape[1]].astype(np.float64)
+    white = cut.astype(np.float64)
+
+    def sums(part: np.ndarray, far: int) -> np.ndarray:
+        side = (2 * far + 1, 2 * far + 1)
+        return cv2.boxFilter(part, -1, side, normalize=False, borderType=cv2.BORDER_CONSTANT)[y, x]
+
+    mass = np.maximum(sums(white, reach), 1.0)
+    near = np.stack([sums(white * grid_x, reach), sums(white * grid_y, reach)], 1) / mass[:, None]
+    far = 2 * reach
+    mass = np.maximum(sums(white, far), 1.0)
+    mx, my = sums(white * grid_x, far) / mass, sums(white * grid_y, far) / mass
+    xx = sums(white * grid_x**2, far) / mass - mx**2
+    yy = sums(white * grid_y**2, far) / mass - my**2
+    xy = sums(white * grid_x * grid_y, far) / mass - mx * my
+    angle = 0.5 * np.arctan2(2 * xy, xx - yy)
+    places[: len(y)] = near + [x0, y0]
+    tangents[: len(y)] = np.stack([np.cos(angle), np.sin(angle)], 1)
+    return places, tangents
+
+
+def distance_field(mask: np.ndarray) -> np.ndarray:
+    """Return the exact distance of every pixel from a mask (H, W) [px], 0 on it; far away where it is empty."""
+    import cv2
+
+    if not mask.any():
+        return np.full(mask.shape, float(np.hypot(*mask.shape)), np.float32)
+    return cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+
+
+def sample_field(field: Tensor, pixel: Tensor) -> Tensor:
+    """Return the values of fields (N, H, W) at places (N, P, 2) [px], bilinear; those next to it beyond the edge."""
+    height, width = field.shape[-2:]
+    size = pixel.new_tensor([width - 1, height - 1])
+    grid = (2 * pixel / size - 1)[:, None]
+    options = {"mode": "bilinear", "padding_mode": "border", "align_corners": True}
+    return torch.nn.functional.grid_sample(field[:, None].to(pixel), grid, **options)[:, 0, 0]
+
+
+def curve_vectors(curve: Tensor, places: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the vectors from places to the nearest points of a polyline, and where those are along it.
+
+    Args:
+        curve: vertices [px], shape (..., V, 2).
+        places: shape (..., S, 2) [px].
+
+    Returns:
+        Vectors [px], (..., S, 2), and places along the curve in edges [1], (..., S).
+    """
+    a, d = curve[..., :-1, :], curve[..., 1:, :] - curve[..., :-1, :]
+    off = places[..., :, None, :] - a[..., None, :, :]
+    t = (off * d[..., None, :, :]).sum(-1) / d.square().sum(-1).clamp(min=1e-18)[..., None, :]
+    t = t.clamp(0.0, 1.0)
+    vector = t[..., None] * d[..., None, :, :] - off
+    best = vector.square().sum(-1).nan_to_num(torch.inf).argmin(-1, keepdim=True)
+    found = torch.gather(vector, -2, best[..., None].expand(*best.shape, 2))[..., 0, :]
+    return found, (best + torch.gather(t, -1, best))[..., 0]
