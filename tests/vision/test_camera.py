@@ -1,5 +1,4 @@
-"""Projection is OpenCV's, goes both ways, has gradients, and says what is behind; cameras.json is refused in
-sentences."""
+"""Projection is OpenCV's, goes both ways, has gradients, says what is behind; wrong files are refused in sentences."""
 
 from __future__ import annotations
 

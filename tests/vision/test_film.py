@@ -1,5 +1,4 @@
-"""Films are what was asked for: moments, wrong frames, bars and blocks, and cameras that are off by no more than
-said."""
+"""Films are what was asked for: moments, wrong frames, bars, blocks, and cameras that are off by no more than said."""
 
 from __future__ import annotations
 

@@ -101,7 +101,7 @@ def test_views_frames_and_scenes_are_one_batch_and_occluders_hide() -> None:
 
 
 def test_a_rope_behind_the_camera_leaves_no_trace() -> None:
-    points = torch.as_tensor(hanging(11) + [0.0, -3.0, 0.0])[None].requires_grad_()
+    points = torch.as_tensor(hanging(11) + np.array([0.0, -3.0, 0.0]))[None].requires_grad_()
     out = rope_masks(lens([front()]), points, 0.006, (480, 640))
     (gradient,) = torch.autograd.grad(out.sum(), points)
     assert not out.any() and not gradient.any()

@@ -104,8 +104,8 @@ def calibrate_camera(
     if len(seen) < _FEWEST:
         kind = "checkerboard" if board.marker is None else f"ChArUco board ({board.dictionary})"
         raise InputError(
-            f"{path}: expected a {kind} of {board.columns} x {board.rows} squares in at least {_FEWEST} pictures, found it "
-            f"in {len(seen)} of {len(tried)}; check the numbers of squares, and film it large, sharp and from several sides."
+            f"{path}: expected a {kind} of {board.columns} x {board.rows} squares in at least {_FEWEST} pictures, found "
+            f"it in {len(seen)} of {len(tried)}; check the numbers of squares, and film it large, sharp and tilted."
         )
     if len(seen) > _MOST:
         seen = [seen[k] for k in np.linspace(0, len(seen) - 1, _MOST).round().astype(int)]
@@ -145,9 +145,7 @@ def _notes(error: float, normals: np.ndarray, images: list[np.ndarray], width: i
         notes.append(f"The error of {error:.1f} px is large: is the board flat, and is its size right?")
     spread = np.degrees(np.arccos(np.clip((normals @ normals.mean(0)) / np.linalg.norm(normals.mean(0)), -1, 1)).max())
     if spread < 10:
-        notes.append(
-            f"The board was never tilted by more than {spread:.0f} degrees: the focal length is uncertain; film it tilted."
-        )
+        notes.append(f"The board was never tilted by more than {spread:.0f} degrees: the focal length is uncertain.")
     every = np.concatenate([i[:, 0] for i in images])
     share = np.ptp(every[:, 0]) * np.ptp(every[:, 1]) / (width * height)
     if share < 0.4:

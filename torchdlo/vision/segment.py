@@ -196,7 +196,7 @@ def _from_archive(path: Path) -> np.ndarray:
         raise InputError(f"{path}: expected an .npz archive with masks, but reading failed ({error}).") from None
     if masks.ndim != 3 or masks.dtype.kind not in "bui":
         raise InputError(
-            f"{path}: masks: expected bool of shape (frames, height, width), found {masks.dtype} of shape {masks.shape}."
+            f"{path}: masks: expected bool of shape (frames, height, width), found {masks.dtype}, {masks.shape}."
         )
     return masks > (0 if masks.dtype == bool or masks.max(initial=0) <= 1 else 127)
 

@@ -1,7 +1,7 @@
 """The centre line of a mask, exact distance fields, and distances between curves in pictures.
 
 Thinning is Zhang and Suen's (1984, doi:10.1145/357994.358023) by table look-up; the pixels that are left are moved to
-the centroid of the mask around them, which is a tenth of a pixel from the middle of a straight tube.
+the centroid of the mask around them.
 """
 
 from __future__ import annotations
@@ -103,7 +103,7 @@ def spine(mask: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
     yy = sums(white * grid_y**2, far) / mass - my**2
     xy = sums(white * grid_x * grid_y, far) / mass - mx * my
     angle = 0.5 * np.arctan2(2 * xy, xx - yy)
-    places[: len(y)] = near + [x0, y0]
+    places[: len(y)] = near + np.array([x0, y0])
     tangents[: len(y)] = np.stack([np.cos(angle), np.sin(angle)], 1)
     return places, tangents
 
