@@ -104,8 +104,8 @@ def calibrate_camera(
     if len(seen) < _FEWEST:
         kind = "checkerboard" if board.marker is None else f"ChArUco board ({board.dictionary})"
         raise InputError(
-            f"{path}: expected a {kind} of {board.columns} x {board.rows} squares in at least {_FEWEST} pictures, found "
-            f"it in {len(seen)} of {len(tried)}; check the numbers of squares, and film it large, sharp and tilted."
+            f"{path}: expected a {kind} of {board.columns} x {board.rows} squares in at least {_FEWEST} pictures, "
+            f"found it in {len(seen)} of {len(tried)}; check the numbers of squares, and film it large, sharp and tilted."
         )
     if len(seen) > _MOST:
         seen = [seen[k] for k in np.linspace(0, len(seen) - 1, _MOST).round().astype(int)]

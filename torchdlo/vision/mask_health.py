@@ -41,7 +41,7 @@ def frames_text(rows: np.ndarray) -> str:
 
 
 def check_masks(
-    masks: np.ndarray, where: str, *, pictures: np.ndarray | None = None, moving: bool = True
+    masks: np.ndarray, where: str, *, pictures: np.ndarray | None = None, moving: np.ndarray | None = None
 ) -> tuple[np.ndarray, list[Issue]]:
     """Return which frames can be trusted, (F,) bool, and what is wrong with others.
 
@@ -49,7 +49,8 @@ def check_masks(
         masks: shape (F, H, W) bool.
         where: name of the file, which sentences begin with.
         pictures: what they were made from, RGB (F, H, W, 3) uint8, for the background, if at hand.
-        moving: whether the grippers move all the time, so that equal masks are repeated ones.
+        moving: frames before which the grippers have moved, so that equal masks are repeated ones, shape (F,) bool;
+            all if not given.
 
     Raises:
         InputError: Too little is left.
@@ -78,10 +79,9 @@ def check_masks(
     usual = _smooth(np.where(good, area, np.nan))
     leave(np.abs(area / np.maximum(usual, 1.0) - 1) > _JUMP, "area", "the area of the mask jumps")
     leave(_elsewhere(masks, good), "elsewhere", "the mask jumps away and back")
-    if moving:
-        same = np.zeros(count, bool)
-        same[1:] = [np.array_equal(a, b) for a, b in zip(masks[1:], masks[:-1], strict=True)]
-        leave(same, "frozen", "the picture is the one before")
+    same = np.zeros(count, bool)
+    same[1:] = [np.array_equal(a, b) for a, b in zip(masks[1:], masks[:-1], strict=True)]
+    leave(same if moving is None else same & moving, "frozen", "the picture is the one before")
     blobs = _blobs(masks, good)
     if blobs:
         issues.append(Issue("blobs", blobs))

@@ -214,8 +214,8 @@ def _from_folder(path: Path) -> np.ndarray:
             raise InputError(f"{file}: expected a PNG picture, but it cannot be read.")
         if pictures and picture.shape != pictures[0].shape:
             raise InputError(
-                f"{file}: expected {pictures[0].shape[1]} x {pictures[0].shape[0]} pixels as {files[0].name} has, found "
-                f"{picture.shape[1]} x {picture.shape[0]}."
+                f"{file}: expected {pictures[0].shape[1]} x {pictures[0].shape[0]} pixels as {files[0].name} has, "
+                f"found {picture.shape[1]} x {picture.shape[0]}."
             )
         pictures.append(picture[..., ::-1])
     return _maybe_masks(np.stack(pictures))

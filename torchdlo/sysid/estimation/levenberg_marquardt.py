@@ -106,12 +106,12 @@ def cost_of(error: float) -> float:
     return float(_robust(np.array(error))[0])
 
 
-def costs(sims: np.ndarray, measured: np.ndarray) -> np.ndarray:
-    """Return the cost [m] of simulations (S, B, F, M, 3), shape (S,)."""
+def costs(sims: np.ndarray, measured: np.ndarray, whole: float | None = None) -> np.ndarray:
+    """Return the cost [m] of simulations (S, B, F, M, 3), shape (S,); `whole` as in `Look.points`."""
     seen = np.isfinite(measured)
     residual = np.where(seen, sims - measured, 0.0).reshape(len(sims), len(measured), -1)
     mean = _robust(residual)[0].sum(-1) / seen.reshape(len(measured), -1).sum(1)
-    whole = extent(measured)
+    whole = extent(measured) if whole is None else whole
     return _together(np.where(np.isfinite(mean), np.minimum(mean, whole), np.inf), _LOST * whole)
 
 
@@ -140,12 +140,19 @@ class Look:
         self.values = space.to_values(np.concatenate([raws[:, None], moved], 1).reshape(-1, k))
         """What to simulate, shape (S (K + 1), K)."""
 
-    def points(self, sims: np.ndarray, measured: np.ndarray) -> list[Point]:
-        """Return the points, from simulations of `values`."""
+    def points(self, sims: np.ndarray, measured: np.ndarray, whole: float | None = None) -> list[Point]:
+        """Return the points, from simulations of `values`.
+
+        Args:
+            sims: what is simulated, shape (S (K + 1), B, F, M, C) [m].
+            measured: the same as measured, NaN where it was not, shape (B, F, M, C) [m].
+            whole: how far what is measured moves [m]; the largest range of a coordinate in a trial if not given.
+        """
         count, k = self.raws.shape
         sims = sims.reshape(count, k + 1, *measured.shape)
         seen = np.isfinite(measured)
-        per_trial, whole = seen.reshape(len(measured), -1).sum(1), extent(measured)
+        per_trial = seen.reshape(len(measured), -1).sum(1)
+        whole = extent(measured) if whole is None else whole
         points = []
         for s in range(count):
             residual = np.where(seen, sims[s, 0] - measured, 0.0).reshape(len(measured), -1)
@@ -171,10 +178,12 @@ class Look:
         return points
 
 
-def evaluate(simulate: Simulate, measured: np.ndarray, space: ParameterSpace, raws: np.ndarray) -> list[Point]:
-    """Return costs and their gradients at S parameter sets, shape (S, K)."""
+def evaluate(
+    simulate: Simulate, measured: np.ndarray, space: ParameterSpace, raws: np.ndarray, whole: float | None = None
+) -> list[Point]:
+    """Return costs and their gradients at S parameter sets, shape (S, K); `whole` as in `Look.points`."""
     look = Look(space, raws)
-    return look.points(simulate(look.values), measured)
+    return look.points(simulate(look.values), measured, whole)
 
 
 class Climb:
@@ -219,6 +228,7 @@ def improve(
     *,
     iterations: int,
     tolerance: float = 2e-3,
+    whole: float | None = None,
 ) -> Iterator[list[Point]]:
     """Improve every point until it stands still; yield all of them after each iteration.
 
@@ -229,13 +239,14 @@ def improve(
         points: where to start, see `evaluate`.
         iterations: at most so many.
         tolerance: a point stands still when its cost falls by less than this share.
+        whole: see `Look.points`.
     """
     climb = Climb(space, points, tolerance)
     for _ in range(iterations):
         tries = climb.tries()
         if not len(tries):
             return
-        climb.take(evaluate(simulate, measured, space, tries))
+        climb.take(evaluate(simulate, measured, space, tries, whole))
         yield list(climb.points)
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import shutil
 import tempfile
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,6 +17,7 @@ import numpy as np
 
 from torchdlo.errors import InputError
 from torchdlo.files import replacing
+from torchdlo.sysid.films import FilmFile, film_files, with_stations
 from torchdlo.sysid.recordings import rope_schema
 
 __all__ = [
@@ -48,6 +50,8 @@ class Trial:
     """Index of the outermost marker of each clamp, shape (G,) int, given with the quaternions."""
     suspect: np.ndarray
     """Frames not to trust, shape (F,) bool."""
+    films: tuple[FilmFile, ...] = ()
+    """Films of it, if cameras saw the rope instead of markers: then free markers are places that were not seen."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,6 +84,13 @@ class Recording:
     """Trials to fit on."""
     test: tuple[Trial, ...]
     """Trials to judge on, never to fit on."""
+    color: tuple[float, float, float] | None = None
+    """Colour of the rope, RGB from 0 to 255, None where not known."""
+
+    @property
+    def filmed(self) -> bool:
+        """Whether cameras saw the rope, not markers on it."""
+        return bool(self.train[0].films)
 
     def trials(self, split: str | tuple[str, ...]) -> tuple[Trial, ...]:
         """Return the trials of a split: "train", "test", or "all", those to fit on first; or those of these names."""
@@ -99,7 +110,8 @@ def load_recording(path: str | Path) -> Recording:
     path = Path(path)
     files = rope_schema.trial_files(path)
     rope = rope_schema.check_rope(path / "rope.json")
-    trials = {split: tuple(_load_trial(f, rope["length"]) for f in files[split]) for split in files}
+    films = film_files(path, [f.stem for split in files.values() for f in split])
+    trials = {split: tuple(_load_trial(f, rope["length"], films) for f in files[split]) for split in files}
     _check_together(path, rope, trials["train"] + trials["test"])
     return Recording(path=path, **rope, **trials)
 
@@ -148,10 +160,12 @@ def save_trial(path: str | Path, trial: Trial) -> None:
         np.savez_compressed(temporary, **arrays)
 
 
-def _load_trial(path: Path, length: float) -> Trial:
+def _load_trial(path: Path, length: float, films: Mapping[str, tuple[FilmFile, ...]]) -> Trial:
     arrays = rope_schema.read_arrays(path)
-    arrays = rope_schema.check_arrays(path, arrays, length)
-    return Trial(name=path.stem, **arrays)
+    own = films.get(path.stem, ())
+    arrays = rope_schema.check_arrays(path, arrays, length, filmed=bool(own))
+    trial = Trial(name=path.stem, **arrays, films=own)
+    return with_stations(trial, length) if own else trial
 
 
 def _check_together(path: Path, rope: dict, trials: tuple[Trial, ...]) -> None:

@@ -24,7 +24,7 @@ __all__ = ["OPTIONAL", "REQUIRED", "check_arrays", "check_rope", "read_arrays", 
 
 REQUIRED = ("length", "radius", "mass", "gravity", "table_height", "marker_noise_std")
 """Entries that every rope.json has."""
-OPTIONAL = ("rest_positions", "marker_mass", "closed", "notes")
+OPTIONAL = ("rest_positions", "marker_mass", "closed", "notes", "color")
 """Entries that a rope.json may have."""
 
 _ARRAYS = ("time", "markers", "marker_arclength", "gripped")
@@ -41,7 +41,6 @@ _UNREADABLE = (
     RuntimeError,
 )
 """What reading a damaged archive can raise."""
-_VIDEO_SUFFIXES = (".mp4", ".avi", ".mkv", ".mov", ".webm")
 
 
 def trial_files(path: Path) -> dict[str, list[Path]]:
@@ -55,12 +54,8 @@ def trial_files(path: Path) -> dict[str, list[Path]]:
             f"{path / 'rope.json'}: expected this file with the rope's length, mass and so on, "
             "found none; is this a recording folder?"
         )
-    for file in sorted(path.iterdir()):
-        if file.name.startswith(("train_", "test_")) and file.suffix.lower() in _VIDEO_SUFFIXES:
-            raise InputError(
-                f"{file}: video trials are not supported by this command yet; give marker positions in an .npz."
-            )
-    files = {split: sorted(path.glob(f"{split}_*.npz")) for split in ("train", "test")}
+    # Those with a second part in their names are masks of a camera.
+    files = {split: sorted(f for f in path.glob(f"{split}_*.npz") if "." not in f.stem) for split in ("train", "test")}
     for split, purpose in (("train", "fit on"), ("test", "judge on")):
         if not files[split]:
             raise InputError(
@@ -89,6 +84,7 @@ def check_rope(path: Path) -> dict[str, Any]:
     if rope.get("rest_positions") is not None:
         wanted = "a list of [x, y, z] in m, one for each marker"
         checked["rest_positions"] = _positions(path, rope, "rest_positions", (-1, 3), wanted)
+    checked["color"] = _color(path, rope.get("color"))
     for name, kind, said in (("closed", bool, "true or false"), ("notes", str, "a text")):
         if not isinstance(checked[name], kind):
             _refuse(path, name, said, repr(checked[name]))
@@ -96,6 +92,18 @@ def check_rope(path: Path) -> dict[str, Any]:
         found = f"{checked['radius']:g} m for a rope of {checked['length']:g} m"
         _refuse(path, "radius", "at most half the length", f"{found}; the unit is metres")
     return checked
+
+
+def _color(path: Path, value: Any) -> tuple[float, float, float] | None:
+    """Return a colour given as [r, g, b] or as an object with `rgb`."""
+    if value is None:
+        return None
+    rgb = value.get("rgb") if isinstance(value, dict) else value
+    good = isinstance(rgb, list) and len(rgb) == 3
+    good = good and all(isinstance(c, (int, float)) and not isinstance(c, bool) and 0 <= c <= 255 for c in rgb)
+    if not good:
+        _refuse(path, "color", "[r, g, b] from 0 to 255", repr(value)[:60])
+    return float(rgb[0]), float(rgb[1]), float(rgb[2])
 
 
 def read_arrays(path: Path) -> dict[str, np.ndarray]:
@@ -119,28 +127,35 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
         ) from None
 
 
-def check_arrays(path: Path, arrays: dict[str, np.ndarray], length: float) -> dict[str, Any]:
-    """Check the arrays of one trial, and return them by the names of Trial's fields."""
+def check_arrays(path: Path, arrays: dict[str, np.ndarray], length: float, *, filmed: bool = False) -> dict[str, Any]:
+    """Check the arrays of one trial, and return them by the names of Trial's fields.
+
+    Args:
+        path: the file.
+        arrays: by their names.
+        length: of the rope [m].
+        filmed: whether cameras saw the rope: then markers are those at the grippers only.
+    """
     for name in _VIDEO_ARRAYS:
         if name in arrays:
             raise InputError(
-                f"{path}: {name}: trials with video or masks are not supported by this command "
-                "yet; leave the array out and give marker positions."
+                f"{path}: {name}: expected films and masks beside the trial, as {path.stem}.CAMERA.mp4, .npz or a "
+                "folder of PNG files, with cameras.json, found them in it."
             )
     _check_names(path, arrays, _ARRAYS, _OPTIONAL_ARRAYS, "array")
     for name in ("time", "markers", "marker_arclength", "gripper_quaternion"):
         if name in arrays:
             arrays[name] = _as_float(path, name, arrays[name])
-    _check_shapes(path, arrays)
+    _check_shapes(path, arrays, 1 if filmed else 3)
     suspect = arrays.get("suspect", np.zeros(len(arrays["time"]), dtype=bool))
     check_time(path, arrays["time"])
-    check_markers(path, arrays, suspect, length)
+    check_markers(path, arrays, suspect, length, filmed=filmed)
     check_clamps(path, arrays)
     optional = {name: arrays.get(name) for name in ("gripper_quaternion", "gripper_marker")}
     return {name: arrays[name] for name in _ARRAYS} | optional | {"suspect": suspect}
 
 
-def _check_shapes(path: Path, arrays: dict[str, np.ndarray]) -> None:
+def _check_shapes(path: Path, arrays: dict[str, np.ndarray], fewest: int) -> None:
     markers, time = arrays["markers"], arrays["time"]
     if markers.ndim != 3 or markers.shape[-1] != 3:
         _refuse(path, "markers", "shape (frames, markers, 3)", f"{markers.shape}")
@@ -149,8 +164,8 @@ def _check_shapes(path: Path, arrays: dict[str, np.ndarray]) -> None:
         _refuse(path, "time", f"shape ({n_frames},), one for each frame", f"{time.shape}")
     if n_frames < 3:
         _refuse(path, "markers", "at least 3 frames", f"{n_frames}")
-    if n_markers < 3:
-        _refuse(path, "markers", "at least 3 markers", f"{n_markers}")
+    if n_markers < fewest:
+        _refuse(path, "markers", f"at least {fewest} marker{'s' if fewest > 1 else ''}", f"{n_markers}")
     for name, size, each in (
         ("marker_arclength", n_markers, "marker"),
         ("gripped", n_markers, "marker"),

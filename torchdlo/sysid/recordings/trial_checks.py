@@ -49,7 +49,9 @@ def check_time(path: Path, time: np.ndarray) -> None:
         )
 
 
-def check_markers(path: Path, arrays: dict[str, np.ndarray], suspect: np.ndarray, length: float) -> None:
+def check_markers(
+    path: Path, arrays: dict[str, np.ndarray], suspect: np.ndarray, length: float, *, filmed: bool = False
+) -> None:
     """Places along the rope and positions [m] must fit each other and the rope's length [m]."""
     markers, arclength, gripped = arrays["markers"], arrays["marker_arclength"], arrays["gripped"]
     _check_arclength(path, arclength, length)
@@ -58,7 +60,11 @@ def check_markers(path: Path, arrays: dict[str, np.ndarray], suspect: np.ndarray
             f"{path}: gripped: expected at least one marker held by a gripper, found none; "
             "without one nothing moves the rope."
         )
-    if gripped.all():
+    if filmed and not gripped.all():
+        raise InputError(
+            f"{path}: gripped: expected markers at the grippers only beside films, found {int((~gripped).sum())} free ones."
+        )
+    if gripped.all() and not filmed:
         raise InputError(f"{path}: gripped: expected at least one free marker, found all {len(gripped)} gripped.")
     _check_seen(path, markers, gripped)
     _check_extent(path, markers, length)

@@ -1,0 +1,165 @@
+"""Films of a recording as views: read, segmented, checked, and reduced to what observations need."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from torchdlo.errors import InputError
+from torchdlo.sysid.films import FilmFile
+from torchdlo.sysid.observation import View
+from torchdlo.sysid.recordings.recording import Recording, Trial
+from torchdlo.vision.mask_health import check_masks
+from torchdlo.vision.segment import Ranges, color_masks, load_film, load_ranges, ranges_of
+from torchdlo.vision.spine import half_width, spine
+
+__all__ = ["RANGES", "masks_of", "views_of"]
+
+RANGES = "segment.json"
+"""File of a recording folder that says which colours belong to the rope."""
+
+_POINTS = 48
+"""Points of a centre line."""
+
+_STILL = 5e-4
+"""Motion of a gripper between two pictures that shows [m]."""
+
+
+def views_of(
+    recording: Recording, trials: Sequence[Trial], callback: Callable[[str, int, int, str], None] | None = None
+) -> tuple[list[View], list[str]]:
+    """Return what each camera saw of trials, and sentences on what was wrong with it.
+
+    Raises:
+        InputError: A film cannot be used.
+    """
+    report = callback or (lambda *_: None)
+    names = [f.camera.name for f in trials[0].films]
+    for trial in trials[1:]:
+        if [f.camera.name for f in trial.films] != names:
+            raise InputError(
+                f"{recording.path / trial.name}.npz: expected films of the cameras {', '.join(names)} as "
+                f"{trials[0].name} has, found {', '.join(f.camera.name for f in trial.films)}."
+            )
+    views, notes, done, total = [], [], 0, len(trials) * len(names)
+    for k, name in enumerate(names):
+        parts = []
+        for trial in trials:
+            parts.append(_reduced(recording, trial, trial.films[k], notes))
+            done += 1
+            report("reading films", done, total, f"{trial.name}, camera {name}")
+        frames = max(len(p[0]) for p in parts)
+
+        def stack(which: int, fill: float, frames: int = frames, parts: list = parts) -> np.ndarray:
+            return np.stack(
+                [
+                    np.pad(
+                        p[which],
+                        [(0, frames - len(p[which]))] + [(0, 0)] * (p[which].ndim - 1),
+                        constant_values=fill,
+                    )
+                    for p in parts
+                ]
+            )
+
+        wide = float(np.median([p[4] for p in parts]))
+        views.append(
+            View(
+                trials[0].films[k].camera,
+                stack(0, 0).astype(bool),
+                stack(1, np.nan),
+                stack(2, np.nan),
+                stack(3, 0.0),
+                wide,
+            )
+        )
+    return views, notes
+
+
+def masks_of(recording: Recording, film: FilmFile) -> tuple[np.ndarray, np.ndarray | None, float | None]:
+    """Return the masks of a film, (F, H, W) bool, its pictures if they have colours, and its frame rate if known."""
+    found, fps = load_film(film.path)
+    size = (film.camera.height, film.camera.width)
+    if found.shape[1:3] != size:
+        raise InputError(
+            f"{film.path}: expected pictures of {size[1]} x {size[0]} pixels as camera {film.camera.name} has, found "
+            f"{found.shape[2]} x {found.shape[1]}."
+        )
+    if fps is not None and abs(fps / film.camera.fps - 1) > 0.02:
+        raise InputError(
+            f"{film.path}: expected {film.camera.fps:g} pictures per second as cameras.json says, found {fps:.4g}."
+        )
+    if found.dtype == bool:
+        return found, None, fps
+    return color_masks(found, _ranges(recording, film.path)), found, fps
+
+
+def _ranges(recording: Recording, film: Path) -> Ranges:
+    own = recording.path / RANGES
+    if own.is_file():
+        return load_ranges(own)
+    if recording.color is None:
+        raise InputError(
+            f"{film}: expected the rope's colour, found neither {RANGES} nor color in rope.json; set it with torchdlo "
+            f"segment {film} --out {own}."
+        )
+    try:
+        return ranges_of(recording.color)
+    except InputError as error:
+        raise InputError(f"{recording.path / 'rope.json'}: {error}") from None
+
+
+def _reduced(
+    recording: Recording, trial: Trial, film: FilmFile, notes: list[str]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, float]:
+    """Return which frames are good, centre lines with tangents, small masks and the half width, of one film."""
+    masks, pictures, _ = masks_of(recording, film)
+    time = film.camera.start + np.arange(len(masks)) / film.camera.fps
+    lasts = trial.time[-1]
+    inside = (time > -0.75 / film.camera.fps) & (time < lasts + 0.25 / film.camera.fps)
+    if inside.sum() < 5:
+        raise InputError(
+            f"{film.path}: expected pictures of the {lasts:g} s of {trial.name}.npz, found {int(inside.sum())} in that "
+            "time; check start in cameras.json."
+        )
+    masks, pictures = masks[inside], None if pictures is None else pictures[inside]
+    if not inside[0]:
+        raise InputError(f"{film.path}: expected the film to start with its trial; cut what is before it.")
+    count, expected = len(masks), (lasts - max(time[0], 0.0)) * film.camera.fps
+    if count < 0.6 * expected:
+        raise InputError(
+            f"{film.path}: expected about {expected:.0f} pictures for the {lasts:g} s of {trial.name}.npz, found {count}; "
+            "were pictures dropped, or is fps in cameras.json wrong?"
+        )
+    held = trial.markers[:, trial.gripped]
+    where = np.array(
+        [[np.interp(time[inside], trial.time, held[:, m, c]) for c in range(3)] for m in range(held.shape[1])]
+    )
+    moving = np.zeros(count, bool)
+    moving[1:] = np.abs(np.diff(where, axis=-1)).max((0, 1)) > _STILL
+    good, issues = check_masks(masks, str(film.path), pictures=pictures, moving=moving)
+    notes += [f"{trial.name}, camera {film.camera.name}: {i.text}." for i in issues]
+    suspect = np.interp(time[inside], trial.time, trial.suspect.astype(float)) > 0
+    good &= ~suspect
+    lines = [
+        spine(m, _POINTS) if ok else (np.full((_POINTS, 2), np.nan),) * 2 for m, ok in zip(masks, good, strict=True)
+    ]
+    places, tangents = (np.stack(part) for part in zip(*lines, strict=True))
+    wide = float(np.median([half_width(m) for m in masks[good][::10]]))
+    return good, places, tangents, _quarter(masks), wide
+
+
+def _quarter(masks: np.ndarray) -> np.ndarray:
+    """Return masks (F, H, W) at a quarter of their size, shares that are covered, float32."""
+    import cv2
+
+    frames, height, width = masks.shape
+    size = (-(-width // 32) * 8, -(-height // 32) * 8)
+    out = np.zeros((frames, size[1], size[0]), np.float32)
+    for k, mask in enumerate(masks):
+        padded = np.zeros((4 * size[1], 4 * size[0]), np.float32)
+        padded[:height, :width] = mask
+        out[k] = cv2.resize(padded, size, interpolation=cv2.INTER_AREA)
+    return out

@@ -1,0 +1,295 @@
+"""What is measured of a simulated rope, as lengths: markers themselves, or what films show of it.
+
+An observation reads simulated places of the rope and numbers of its own that need no simulation, and says what the
+readings should be. A reading is a length in metres whatever it comes from, so that knees, floors and intervals mean the
+same for all of them. A film's readings are distances in the picture between the centre line of a mask and the projected
+rope, both ways, or differences of blurred masks over their gradient; times depth over focal length, with target 0.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchdlo.physics.effects.base import Param
+from torchdlo.sysid.estimation.levenberg_marquardt import ParameterSpace
+from torchdlo.vision.camera import NEAR, Camera, Lens, lens, project
+from torchdlo.vision.rasterizer import coverage, pyramid, successors
+from torchdlo.vision.spine import curve_vectors
+
+__all__ = ["BlurredMasks", "MarkerObservation", "Observation", "Spines", "View", "nuisances", "over_time"]
+
+
+class Observation(Protocol):
+    """Something that is measured of the rope."""
+
+    target: np.ndarray
+    """What readings should be [m], NaN where nothing was measured; shape (B, F, R, C)."""
+    extent: float
+    """How far what is measured moves [m]."""
+    nuisances: ParameterSpace
+    """Numbers of its own, which need no simulation: a camera's pose for instance."""
+
+    def read(self, sims: np.ndarray, numbers: np.ndarray) -> np.ndarray:
+        """Return readings [m], shape (P, B, F, R, C).
+
+        Args:
+            sims: simulated places of the rope [m], shape (P, B, T, M, 3).
+            numbers: values of the nuisances, shape (P, Q).
+        """
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class MarkerObservation:
+    """Markers: what is simulated is what is measured."""
+
+    target: np.ndarray
+    """Measured markers [m], NaN where not seen, shape (B, F, M, 3)."""
+    extent: float
+    """Largest range of a coordinate [m]."""
+    nuisances: ParameterSpace = ParameterSpace((), (), ())
+    """None."""
+
+    def read(self, sims: np.ndarray, numbers: np.ndarray) -> np.ndarray:
+        """Return the simulated markers."""
+        del numbers
+        return sims
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """What one camera saw of all trials."""
+
+    camera: Camera
+    """The camera as given."""
+    good: np.ndarray
+    """Frames that can be trusted, shape (B, F) bool."""
+    places: np.ndarray
+    """Points of the masks' centre lines [px], NaN where there are fewer, shape (B, F, S, 2)."""
+    tangents: np.ndarray
+    """Unit tangents there, shape (B, F, S, 2)."""
+    masks: np.ndarray
+    """The masks themselves at a quarter of their size, shares that are covered [1], float32, shape (B, F, h, w)."""
+    half_width: float
+    """Usual half width of the rope in the masks [px]."""
+
+    @property
+    def time(self) -> np.ndarray:
+        """Middles of exposures, as the camera's clock has them [s], shape (F,)."""
+        return self.camera.start + np.arange(self.good.shape[1]) / self.camera.fps
+
+
+_PRIORS = (
+    *((f"turn_{axis}", np.radians(1.0), "rad") for axis in "xyz"),
+    *((f"shift_{axis}", 1e-2, "m") for axis in "xyz"),
+    ("zoom", 1e-2, "1"),
+)
+"""Numbers of a camera, and how far calibrations are usually off: standard deviations."""
+
+
+def nuisances(views: Sequence[View]) -> ParameterSpace:
+    """Return pose, focal length and clock of every camera as coordinates, in units of how far off they may be."""
+    names, params, sizes = [], [], []
+    for view in views:
+        for name, size, unit in (*_PRIORS, ("clock", 0.5 / view.camera.fps, "s")):
+            names.append(f"camera_{view.camera.name}.{name}")
+            params.append(Param(0.0, -5 * size, 5 * size, unit, "linear", None, "off what the calibration says"))
+            sizes.append(size)
+    return ParameterSpace(tuple(names), tuple(params), tuple(sizes))
+
+
+PER_CAMERA = len(_PRIORS) + 1
+"""Numbers of a camera."""
+
+
+def over_time(sims: Tensor, step: float, time: Tensor) -> Tensor:
+    """Return positions (P, B, T, M, 3), evenly in time by `step` [s], at times (P, F), cubic; shape (P, B, F, M, 3)."""
+    last = sims.shape[2] - 1
+    at = (time / step).clamp(0.0, last)
+    first = at.floor().clamp(max=last - 1)
+    x = (at - first)[:, None, :, None, None]
+    index = first.long()
+    rows = torch.arange(len(sims))[:, None]
+    a, b, c, d = (sims[rows, :, (index + k).clamp(0, last)].transpose(1, 2) for k in (-1, 0, 1, 2))
+    # Catmull and Rom's spline.
+    return b + 0.5 * x * (c - a + x * (2 * a - 5 * b + 4 * c - d + x * (3 * (b - c) + d - a)))
+
+
+def seen_by(view: View, sims: Tensor, numbers: Tensor, step: float) -> tuple[Tensor, Tensor, Tensor]:
+    """Return pixels (P, B, F, M, 2), depths (P, B, F, M) [m], and focal lengths (P,) [px], of a rope in a view.
+
+    Args:
+        view: the camera and its clock.
+        sims: positions [m], shape (P, B, T, M, 3).
+        numbers: those of the camera, shape (P, 8).
+        step: time between simulated frames [s].
+    """
+    time = torch.as_tensor(view.time, dtype=sims.dtype) + numbers[:, 7:8]
+    points = over_time(sims, step, time)
+    given = lens([view.camera], sims.dtype)
+    given = Lens(*(x.expand(len(sims), *x.shape[1:]) for x in vars(given).values()))
+    moved = given.moved(numbers[:, :3], numbers[:, 3:6], numbers[:, 6])
+    pixel, depth = project(moved, points.flatten(1, 3))
+    focal = 0.5 * (moved.intrinsics[:, 0, 0] + moved.intrinsics[:, 1, 1])
+    return pixel.reshape(*points.shape[:-1], 2), depth.reshape(points.shape[:-1]), focal
+
+
+_ALONG = 12.0
+"""Distance along the centre line from which places of the rope count less that it does not reach [px]."""
+
+_COPIES = 16
+"""How often a prior is read, so that each reading of it stays small."""
+
+_SURE = 5e-4
+"""What independent readings get wrong [m], against which priors are weighed."""
+
+_INDEPENDENT = 2.0
+"""Readings of a picture that tell something of their own."""
+
+
+class _Filmed:
+    """What observations of films have in common: views, priors, and the target 0."""
+
+    def __init__(self, views: Sequence[View], step: float, extent: float) -> None:
+        self.views, self.step, self.extent = tuple(views), step, extent
+        self.nuisances = nuisances(views)
+        self.target = np.empty(0)
+
+    def _finish(self, shape: tuple[int, ...], known: list[np.ndarray]) -> None:
+        """Set the target: 0 where something was measured, and one reading of the priors per trial."""
+        trials, frames = shape
+        target = np.concatenate([np.where(k, 0.0, np.nan) for k in known], 2)
+        count = np.isfinite(target).sum((1, 2, 3))
+        pictures = sum(v.good.sum(1) for v in self.views)
+        # A squared reading counts one of `count`; a trial tells as much as `_INDEPENDENT` readings per picture.
+        share = count / np.maximum(_INDEPENDENT * pictures * trials, 1)
+        self._weight = _SURE * np.sqrt(share / _COPIES)
+        prior = np.full((trials, frames, _COPIES * len(self.nuisances.names), 1), np.nan)
+        prior[:, 0] = 0.0
+        self.target = np.concatenate([target, prior], 2)
+
+    def _priors(self, numbers: np.ndarray, frames: int) -> np.ndarray:
+        """Return readings of the priors, shape (P, B, F, R, 1)."""
+        own = np.tile(numbers / self.nuisances.units, _COPIES)
+        out = self._weight[None, :, None] * own[:, None]
+        return np.broadcast_to(out[:, :, None, :, None], (*out.shape[:2], frames, out.shape[2], 1))
+
+    def read(self, sims: np.ndarray, numbers: np.ndarray) -> np.ndarray:
+        """Return readings [m], see `Observation`."""
+        out = []
+        for row, own in zip(sims, numbers, strict=True):  # one at a time: they are large
+            parts = []
+            for k, view in enumerate(self.views):
+                camera = torch.as_tensor(own[None, PER_CAMERA * k : PER_CAMERA * (k + 1)], dtype=torch.float32)
+                with torch.no_grad():
+                    parts.append(self._view(k, view, torch.as_tensor(row[None], dtype=torch.float32), camera))
+            frames = self.target.shape[1]
+            short = [np.pad(p, ((0, 0), (0, 0), (0, frames - p.shape[2]), (0, 0), (0, 0))) for p in parts]
+            out.append(np.concatenate([*short, self._priors(own[None], frames)], 3)[0])
+        return np.stack(out)
+
+    def _view(self, k: int, view: View, sims: Tensor, numbers: Tensor) -> np.ndarray:
+        raise NotImplementedError
+
+
+class Spines(_Filmed):
+    """Distances between centre lines and the projected rope, both ways."""
+
+    def __init__(self, views: Sequence[View], step: float, extent: float, free: np.ndarray) -> None:
+        """Prepare.
+
+        Args:
+            views: what cameras saw.
+            step: time between simulated frames [s].
+            extent: how far the rope moves [m].
+            free: which of the simulated places may be visible, shape (M,) bool.
+        """
+        super().__init__(views, step, extent)
+        self._free = torch.as_tensor(free)
+        frames = max(v.good.shape[1] for v in views)
+        known = []
+        for view in views:
+            seen = np.isfinite(view.places) & view.good[:, :, None, None]
+            rope = np.broadcast_to(
+                (view.good & np.isfinite(view.places).any((2, 3)))[:, :, None, None], (*view.good.shape, free.sum(), 1)
+            )
+            each = np.concatenate([seen.reshape(*seen.shape[:2], -1, 1), rope], 2)
+            known.append(np.pad(each, ((0, 0), (0, frames - each.shape[1]), (0, 0), (0, 0))))
+        self._finish((len(views[0].good), frames), known)
+
+    def _view(self, k: int, view: View, sims: Tensor, numbers: Tensor) -> np.ndarray:
+        pixel, depth, focal = seen_by(view, sims, numbers, self.step)
+        scale = depth.clamp(min=NEAR).mean(-1, keepdim=True) / focal.reshape(-1, 1, 1, 1)
+        places = torch.as_tensor(view.places, dtype=sims.dtype).nan_to_num(1e6)[None]
+        away, _ = curve_vectors(pixel, places)
+        away = torch.where(torch.as_tensor(np.isfinite(view.places))[None], away, 0.0) * scale[..., None]
+        rope = pixel[..., self._free, :]
+        gap = rope[..., :, None, :] - places[..., None, :, :]
+        best = gap.square().sum(-1).argmin(-1)[..., None]
+        gap = torch.gather(gap, -2, best[..., None].expand(*best.shape, 2))[..., 0, :]
+        tangents = torch.as_tensor(view.tangents, dtype=sims.dtype).nan_to_num(0.0)[None, ..., None, :, :]
+        along = torch.gather(
+            tangents.expand(*best.shape[:-1], *tangents.shape[-2:]), -2, best[..., None].expand(*best.shape, 2)
+        )[..., 0, :]
+        lengthways = (gap * along).sum(-1)
+        across = gap[..., 0] * along[..., 1] - gap[..., 1] * along[..., 0]
+        across = (across / (1 + (lengthways / _ALONG) ** 2)).clamp(-1e5, 1e5) * scale
+        out = torch.cat([away.flatten(-2), across], -1)[..., None]
+        return out.numpy().astype(np.float64)
+
+
+class BlurredMasks(_Filmed):
+    """Differences of blurred masks over the gradient that a rope as thin as this one leaves in them."""
+
+    SIGMA = 2.0
+    """Blur of every level of the pyramid [px of the level]."""
+
+    def __init__(
+        self, views: Sequence[View], step: float, extent: float, visible: np.ndarray, radius: float, level: int
+    ) -> None:
+        """Prepare.
+
+        Args:
+            views: what cameras saw.
+            step: time between simulated frames [s].
+            extent: how far the rope moves [m].
+            visible: which of the simulated places are drawn, shape (M,) bool; the longest run of them counts.
+            radius: of the rope [m].
+            level: how often masks are halved once more.
+        """
+        super().__init__(views, step, extent)
+        self._visible, self._radius, self._level = torch.as_tensor(visible), radius, level
+        self._blurred, known = [], []
+        frames = max(v.good.shape[1] for v in views)
+        for view in views:
+            small = torch.as_tensor(view.masks)
+            for _ in range(level):
+                small = torch.nn.functional.avg_pool2d(small, 2)
+            blurred = pyramid(small, 1, self.SIGMA)[0]
+            self._blurred.append(blurred)
+            each = np.broadcast_to(view.good[:, :, None, None], (*blurred.shape[:2], blurred[0, 0].numel(), 1))
+            known.append(np.pad(each, ((0, 0), (0, frames - each.shape[1]), (0, 0), (0, 0))))
+        self._finish((len(views[0].good), frames), known)
+
+    def _view(self, k: int, view: View, sims: Tensor, numbers: Tensor) -> np.ndarray:
+        pixel, depth, focal = seen_by(view, sims, numbers, self.step)
+        shrink = 0.25 / 2**self._level
+        place = (pixel + 0.5) * shrink - 0.5
+        near = depth.clamp(min=NEAR)
+        radius = self._radius * focal.reshape(-1, 1, 1, 1) / near * shrink
+        real = (depth >= NEAR) & self._visible
+        goal = self._blurred[k]
+        drawn = coverage(place, radius, real, successors([pixel.shape[-2]]), tuple(goal.shape[-2:]))
+        blurred = pyramid(drawn, 1, self.SIGMA)[0]
+        # A thin line of width w blurred by s has gradients of up to w exp(-1/2) / (s^2 sqrt(2 pi)).
+        wide = (2 * radius).mean(-1)[..., None]
+        steep = wide * np.exp(-0.5) / (self.SIGMA**2 * np.sqrt(2 * np.pi))
+        metres = near.mean(-1)[..., None] / (focal.reshape(-1, 1, 1, 1) * shrink)
+        out = (blurred - goal).flatten(-2) / steep * metres
+        return out[..., None].numpy().astype(np.float64)
