@@ -12,6 +12,7 @@ from torchdlo.sysid.films import FilmFile
 from torchdlo.sysid.observation import View
 from torchdlo.sysid.recordings.recording import Recording, Trial
 from torchdlo.vision.mask_health import check_masks
+from torchdlo.vision.pictures import quarter
 from torchdlo.vision.segment import Ranges, color_masks, load_film, load_ranges, ranges_of
 from torchdlo.vision.spine import half_width, spine
 
@@ -138,7 +139,7 @@ def _reduced(
         [[np.interp(time[inside], trial.time, held[:, m, c]) for c in range(3)] for m in range(held.shape[1])]
     )
     moving = np.zeros(count, bool)
-    moving[1:] = np.abs(np.diff(where, axis=-1)).max((0, 1)) > _STILL
+    moving[1:] = np.abs(np.diff(where, axis=0)).max(1) > _STILL
     good, issues = check_masks(masks, str(film.path), pictures=pictures, moving=moving)
     notes += [f"{trial.name}, camera {film.camera.name}: {i.text}." for i in issues]
     suspect = np.interp(time[inside], trial.time, trial.suspect.astype(float)) > 0
@@ -148,18 +149,4 @@ def _reduced(
     ]
     places, tangents = (np.stack(part) for part in zip(*lines, strict=True))
     wide = float(np.median([half_width(m) for m in masks[good][::10]]))
-    return good, places, tangents, _quarter(masks), wide
-
-
-def _quarter(masks: np.ndarray) -> np.ndarray:
-    """Return masks (F, H, W) at a quarter of their size, shares that are covered, float32."""
-    import cv2
-
-    frames, height, width = masks.shape
-    size = (-(-width // 32) * 8, -(-height // 32) * 8)
-    out = np.zeros((frames, size[1], size[0]), np.float32)
-    for k, mask in enumerate(masks):
-        padded = np.zeros((4 * size[1], 4 * size[0]), np.float32)
-        padded[:height, :width] = mask
-        out[k] = cv2.resize(padded, size, interpolation=cv2.INTER_AREA)
-    return out
+    return good, places, tangents, quarter(masks), wide

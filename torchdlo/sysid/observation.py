@@ -9,7 +9,7 @@ rope, both ways, or differences of blurred masks over their gradient; times dept
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
@@ -19,7 +19,8 @@ from torch import Tensor
 from torchdlo.physics.effects.base import Param
 from torchdlo.sysid.estimation.levenberg_marquardt import ParameterSpace
 from torchdlo.vision.camera import NEAR, Camera, Lens, lens, project
-from torchdlo.vision.rasterizer import coverage, pyramid, successors
+from torchdlo.vision.pictures import blur
+from torchdlo.vision.rasterizer import coverage, successors
 from torchdlo.vision.spine import curve_vectors
 
 __all__ = ["BlurredMasks", "MarkerObservation", "Observation", "Spines", "View", "nuisances", "over_time"]
@@ -53,7 +54,7 @@ class MarkerObservation:
     """Measured markers [m], NaN where not seen, shape (B, F, M, 3)."""
     extent: float
     """Largest range of a coordinate [m]."""
-    nuisances: ParameterSpace = ParameterSpace((), (), ())
+    nuisances: ParameterSpace = field(default_factory=lambda: ParameterSpace((), (), ()))
     """None."""
 
     def read(self, sims: np.ndarray, numbers: np.ndarray) -> np.ndarray:
@@ -244,8 +245,16 @@ class Spines(_Filmed):
         return out.numpy().astype(np.float64)
 
 
+_PIXEL = 1e-3
+"""What a pixel of blurred masks counts as [m]: where a mask and the rope are far apart readings stay below the knee of
+fits, so that all that there is of the mask pulls."""
+
+
 class BlurredMasks(_Filmed):
-    """Differences of blurred masks over the gradient that a rope as thin as this one leaves in them."""
+    """Differences of blurred masks over the gradient that a rope as thin as this one leaves in them.
+
+    They find the basin in which centre lines fit on: their readings are lengths in pixels of the level.
+    """
 
     SIGMA = 2.0
     """Blur of every level of the pyramid [px of the level]."""
@@ -271,9 +280,9 @@ class BlurredMasks(_Filmed):
             small = torch.as_tensor(view.masks)
             for _ in range(level):
                 small = torch.nn.functional.avg_pool2d(small, 2)
-            blurred = pyramid(small, 1, self.SIGMA)[0]
+            blurred = blur(small.numpy(), self.SIGMA)
             self._blurred.append(blurred)
-            each = np.broadcast_to(view.good[:, :, None, None], (*blurred.shape[:2], blurred[0, 0].numel(), 1))
+            each = np.broadcast_to(view.good[:, :, None, None], (*blurred.shape[:2], blurred[0, 0].size, 1))
             known.append(np.pad(each, ((0, 0), (0, frames - each.shape[1]), (0, 0), (0, 0))))
         self._finish((len(views[0].good), frames), known)
 
@@ -286,10 +295,9 @@ class BlurredMasks(_Filmed):
         real = (depth >= NEAR) & self._visible
         goal = self._blurred[k]
         drawn = coverage(place, radius, real, successors([pixel.shape[-2]]), tuple(goal.shape[-2:]))
-        blurred = pyramid(drawn, 1, self.SIGMA)[0]
+        blurred = torch.as_tensor(blur(drawn.numpy(), self.SIGMA))
         # A thin line of width w blurred by s has gradients of up to w exp(-1/2) / (s^2 sqrt(2 pi)).
         wide = (2 * radius).mean(-1)[..., None]
-        steep = wide * np.exp(-0.5) / (self.SIGMA**2 * np.sqrt(2 * np.pi))
-        metres = near.mean(-1)[..., None] / (focal.reshape(-1, 1, 1, 1) * shrink)
-        out = (blurred - goal).flatten(-2) / steep * metres
+        steep = wide.clamp(min=1e-3) * np.exp(-0.5) / (self.SIGMA**2 * np.sqrt(2 * np.pi))
+        out = _PIXEL * (blurred - torch.as_tensor(goal)).flatten(-2) / steep
         return out[..., None].numpy().astype(np.float64)

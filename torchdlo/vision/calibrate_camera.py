@@ -105,7 +105,7 @@ def calibrate_camera(
         kind = "checkerboard" if board.marker is None else f"ChArUco board ({board.dictionary})"
         raise InputError(
             f"{path}: expected a {kind} of {board.columns} x {board.rows} squares in at least {_FEWEST} pictures, "
-            f"found it in {len(seen)} of {len(tried)}; check the numbers of squares, and film it large, sharp and tilted."
+            f"found it in {len(seen)} of {len(tried)}; check the numbers of squares, and film it large and sharp."
         )
     if len(seen) > _MOST:
         seen = [seen[k] for k in np.linspace(0, len(seen) - 1, _MOST).round().astype(int)]

@@ -62,7 +62,7 @@ def check_markers(
         )
     if filmed and not gripped.all():
         raise InputError(
-            f"{path}: gripped: expected markers at the grippers only beside films, found {int((~gripped).sum())} free ones."
+            f"{path}: gripped: expected markers at the grippers only beside films, found {int((~gripped).sum())} free."
         )
     if gripped.all() and not filmed:
         raise InputError(f"{path}: gripped: expected at least one free marker, found all {len(gripped)} gripped.")
