@@ -135,18 +135,16 @@ def _reduced(
             "were pictures dropped, or is fps in cameras.json wrong?"
         )
     held = trial.markers[:, trial.gripped]
-    where = np.array(
-        [[np.interp(time[inside], trial.time, held[:, m, c]) for c in range(3)] for m in range(held.shape[1])]
-    )
+    flat = held.reshape(len(held), -1)
+    where = np.stack([np.interp(time[inside], trial.time, column) for column in flat.T], 1)
     moving = np.zeros(count, bool)
     moving[1:] = np.abs(np.diff(where, axis=0)).max(1) > _STILL
     good, issues = check_masks(masks, str(film.path), pictures=pictures, moving=moving)
     notes += [f"{trial.name}, camera {film.camera.name}: {i.text}." for i in issues]
     suspect = np.interp(time[inside], trial.time, trial.suspect.astype(float)) > 0
     good &= ~suspect
-    lines = [
-        spine(m, _POINTS) if ok else (np.full((_POINTS, 2), np.nan),) * 2 for m, ok in zip(masks, good, strict=True)
-    ]
+    none = (np.full((_POINTS, 2), np.nan),) * 2
+    lines = [spine(m, _POINTS) if ok else none for m, ok in zip(masks, good, strict=True)]
     places, tangents = (np.stack(part) for part in zip(*lines, strict=True))
     wide = float(np.median([half_width(m) for m in masks[good][::10]]))
     return good, places, tangents, quarter(masks), wide

@@ -212,6 +212,7 @@ class Spines(_Filmed):
             free: which of the simulated places may be visible, shape (M,) bool.
         """
         super().__init__(views, step, extent)
+        self.free, self.count_free = free, int(free.sum())
         self._free = torch.as_tensor(free)
         frames = max(v.good.shape[1] for v in views)
         known = []

@@ -92,9 +92,19 @@ def rope_coverage(
     import cv2
 
     pixel, depth = _projected(camera, points)
-    canvas = np.zeros((camera.height * fine, camera.width * fine), np.uint8)
+    out = np.zeros((camera.height, camera.width), np.float32)
+    # Only the part of the picture where the rope is, at a larger size.
+    margin = 2 + radius * 0.5 * (camera.fx + camera.fy) / np.maximum(depth, 1e-2)[:, None]
+    front, size = depth >= 1e-2, np.array([camera.width, camera.height])
+    if not front.any():
+        return out
+    low = np.clip(np.floor((pixel - margin)[front].min(0)), 0, size).astype(int)
+    high = np.clip(np.ceil((pixel + margin)[front].max(0)) + 1, 0, size).astype(int)
+    if (high <= low).any():
+        return out
+    canvas = np.zeros(((high - low)[::-1] * fine), np.uint8)
     # The centre of the top left pixel is at (fine - 1) / 2 of the larger picture.
-    place = (pixel + 0.5) * fine - 0.5
+    place = (pixel - low + 0.5) * fine - 0.5
     # OpenCV fills the pixels on a polygon's border, too: half a pixel of the larger picture.
     wide = np.maximum(fine * radius * 0.5 * (camera.fx + camera.fy) / np.maximum(depth, 1e-2) - 0.5, 0.0)
     one = 1 << _SHIFT
@@ -116,10 +126,12 @@ def rope_coverage(
             middle = np.round(place[j] * one).astype(int)
             cv2.circle(canvas, middle.tolist(), round(float(wide[j]) * one), 1, -1, cv2.LINE_8, _SHIFT)
     for polygon in hidden:
-        corners = np.round(((polygon + 0.5) * fine - 0.5) * one).astype(np.int32)
+        corners = np.round(((polygon - low + 0.5) * fine - 0.5) * one).astype(np.int32)
         cv2.fillConvexPoly(canvas, cv2.convexHull(corners), 0, cv2.LINE_8, _SHIFT)
-    shrunk = canvas.reshape(camera.height, fine, camera.width, fine).mean((1, 3), dtype=np.float32)
-    return shrunk
+    width, height = high - low
+    shrunk = cv2.resize(canvas.astype(np.float32), (int(width), int(height)), interpolation=cv2.INTER_AREA)
+    out[low[1] : high[1], low[0] : high[0]] = shrunk
+    return out
 
 
 def _texture(camera: Camera, look: Look, rng: np.random.Generator) -> np.ndarray:

@@ -1,0 +1,561 @@
+"""Calibration to films: the rope's numbers, with cameras and clocks as numbers of their own, from distances in
+pictures.
+
+Where films begin at rest, so does the simulation; else the shape and the motion at the start are estimated from the
+first frames. Many starts are tried on the beginning of the trials, where a cost has few local minima; the best go on
+over all of their time. Frames that stay far from the rope while others are near are wrong ones, and are left out.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from torchdlo.errors import InputError
+from torchdlo.sysid.diagnosis.budget import options as suited
+from torchdlo.sysid.estimation import levenberg_marquardt
+from torchdlo.sysid.estimation.levenberg_marquardt import ParameterSpace, Point
+from torchdlo.sysid.estimation.result import Calibration
+from torchdlo.sysid.footage import views_of
+from torchdlo.sysid.model import equilibrium, model_file
+from torchdlo.sysid.model.model_file import ModelFile
+from torchdlo.sysid.model.rope_model import RopeModel
+from torchdlo.sysid.model.trial_batch import Start, TrialBatch
+from torchdlo.sysid.observation import PER_CAMERA, Spines, View
+from torchdlo.sysid.recordings.recording import Recording, Trial
+from torchdlo.sysid.recordings.trivial_predictors import catenary
+
+__all__ = ["Problem", "calibrate_filmed", "picture_errors", "problem", "start_of"]
+
+Callback = Callable[[str, int, int, str], None]
+
+_WINDOW = 0.2
+"""Seconds of a film that a start in motion is estimated from."""
+
+_CALM = 0.03
+"""Speed of a gripper below which it is at rest [m/s]."""
+
+_SHIFT, _DRIFT = 0.03, 0.5
+"""How far shapes [m] and speeds [m/s] at the start may be from those of a rope at rest that is carried along."""
+
+_REACH = (np.log(40.0), np.log(4.0), np.log(10.0))
+"""How far starts go either way of the guess."""
+
+_BLOCK = 0.5
+"""Time over which what simulations get wrong is one and the same error [s]."""
+
+_GATE = 3.0
+"""Times the usual distance in a picture from which it is a wrong one."""
+
+_NEAR = 4e-3
+"""Distance that is never taken for that of a wrong picture [m]."""
+
+
+@dataclass(eq=False)
+class Problem:
+    """A model, trials, and what films show of them."""
+
+    model: RopeModel
+    trials: tuple[Trial, ...]
+    motion: TrialBatch
+    spines: Spines
+    start: Start
+    free: tuple[int, ...]
+    """Columns of the model's numbers that are fitted."""
+    fixed: np.ndarray
+    """All of the model's numbers, shape (K,)."""
+    dropped: dict[str, list[int]]
+    """Wrong frames by trial and camera."""
+
+    @property
+    def space(self) -> ParameterSpace:
+        """Numbers of the rope, then those of the cameras."""
+        names, params = self.model.parameters, self.model.params
+        own, other = [names[k] for k in self.free], self.spines.nuisances
+        sizes = []
+        for k in self.free:
+            p = params[k]
+            sizes.append(1.0 if p.scale == "log" else abs(self.fixed[k]) or _usual(names[k], p.low, p.high, self.model))
+        return ParameterSpace(
+            (*own, *other.names), (*[params[k] for k in self.free], *other.params), (*sizes, *other.units.tolist())
+        )
+
+    @property
+    def extent(self) -> float:
+        """How far the rope moves [m]."""
+        return self.spines.extent
+
+    def full(self, values: np.ndarray) -> np.ndarray:
+        """Return all numbers of the model, (P, K), for fitted ones, (P, K + Q)."""
+        out = np.repeat(self.fixed[None], len(values), 0)
+        out[:, list(self.free)] = values[:, : len(self.free)]
+        return out
+
+    def simulate(self, values: np.ndarray, frames: int | None = None) -> np.ndarray:
+        """Return simulated places (P, B, T, M, 3); rows that differ in their cameras only are simulated once."""
+        rows, back = np.unique(self.full(values), axis=0, return_inverse=True)
+        return self.model.simulate(self.motion, self.start, rows, frames=frames)[back.ravel()]
+
+    def readings(self, seconds: float | None = None) -> tuple[levenberg_marquardt.Simulate, np.ndarray]:
+        """Return what maps numbers to readings, and their targets, over the first seconds."""
+        target, frames = self.spines.target, None
+        if seconds is not None:
+            frames = min(self.motion.markers.shape[1], int(np.ceil(seconds / self.model.dt)) + 4)
+            target = target.copy()
+            late = np.arange(target.shape[1]) / self.spines.views[0].camera.fps > seconds
+            target[:, late] = np.nan
+
+        def read(values: np.ndarray) -> np.ndarray:
+            return self.spines.read(self.simulate(values, frames), values[:, len(self.free) :])
+
+        return read, target
+
+
+def _usual(name: str, low: float, high: float, model: RopeModel) -> float:
+    """Return what counts as much of a number that is 0 when its effect is off."""
+    del name, model
+    return 0.1 * (high - low)
+
+
+def start_of(model: RopeModel, trials: Sequence[Trial], views: Sequence[View]) -> Start:
+    """Return where trials begin: hanging between the grippers, at rest if those are and pictures do not change."""
+    pos, vel, still = [], [], []
+    recording = model.recording
+    for b, trial in enumerate(trials):
+        shape = catenary(trial, recording)
+        pos.append(_placed(shape[0], trial, recording))
+        frames = max(3, min(len(trial.time), round(0.05 / model.dt) + 1))
+        speed = (shape[frames - 1] - shape[0]) / (trial.time[frames - 1] - trial.time[0])
+        held = trial.markers[:frames, trial.gripped]
+        quick = np.linalg.norm(held[-1] - held[0], axis=-1).max() / (trial.time[frames - 1] - trial.time[0])
+        calm = quick < _CALM and all(_unchanged(view, b) for view in views)
+        vel.append(0 * speed if calm else speed)
+        still.append(calm)
+    return Start(np.stack(pos), np.stack(vel), np.array(still))
+
+
+def _unchanged(view: View, b: int) -> bool:
+    """Return whether the centre line stays where it is in the first good pictures of a trial."""
+    rows = np.flatnonzero(view.good[b])[:3]
+    if len(rows) < 2:
+        return False
+    first, later = (view.places[b, k] for k in (rows[0], rows[-1]))
+    first, later = (p[np.isfinite(p).all(1)] for p in (first, later))
+    if not len(first) or not len(later):
+        return False
+    away = np.linalg.norm(first[:, None] - later[None], axis=-1).min(1)
+    return bool(np.median(away) < 3.0)
+
+
+def _placed(shape: np.ndarray, trial: Trial, recording: Recording) -> np.ndarray:
+    """Return places (M, 3) of a rope that may lie on a table: a free end is laid out along its gripper's direction."""
+    if recording.table_height is None:
+        return shape
+    floor = recording.table_height + (recording.radius or 0.005)
+    held = np.flatnonzero(trial.gripped)
+    at, out = trial.marker_arclength, shape.copy()
+    for last, inner, free in (
+        (held[-1], held[-2:][0], slice(held[-1] + 1, None)),
+        (held[0], held[:2][-1], slice(0, held[0])),
+    ):
+        if last == inner or not len(out[free]):
+            continue
+        way = trial.markers[0, last] - trial.markers[0, inner]
+        way = way / np.linalg.norm(way)
+        out[free] = trial.markers[0, last] + np.abs(at[free] - at[last])[:, None] * way
+    out[:, 2] = np.maximum(out[:, 2], floor)
+    return out
+
+
+def problem(
+    recording: Recording,
+    trials: Sequence[Trial],
+    views: Sequence[View],
+    *,
+    effects: Sequence[str] = (),
+    values: np.ndarray | None = None,
+    fitted: Sequence[str] | None = None,
+    options: dict[str, Any] | None = None,
+) -> Problem:
+    """Return the problem of fitting a model to films.
+
+    Args:
+        recording: the rope.
+        trials: which of its trials.
+        views: what cameras saw of those.
+        effects: besides the baseline.
+        values: numbers to start from, shape (K,); the model's guess if not given.
+        fitted: numbers to fit; all if not given.
+        options: of the model.
+    """
+    model = RopeModel(recording, effects=effects, **(options or {}))
+    free = np.ones(model.count, bool)
+    free[model.gripped] = False
+    spines = Spines(views, model.dt, recording.length, free)
+    names = model.parameters if fitted is None else fitted
+    columns = tuple(k for k, n in enumerate(model.parameters) if n in names)
+    first = model.guess() if values is None else np.asarray(values, dtype=float)
+    begin = start_of(model, trials, views)
+    return Problem(model, tuple(trials), model.motion(trials), spines, begin, columns, first, {})
+
+
+def refine_start(own: Problem, values: np.ndarray, passes: int = 2) -> None:
+    """Estimate shapes and motions at the start of trials that do not begin at rest, from their first frames.
+
+    Args:
+        own: the problem; its start is replaced.
+        values: numbers of the rope and the cameras, shape (K + Q,).
+        passes: steps of Gauss and Newton.
+    """
+    start, model = own.start, own.model
+    moving = np.flatnonzero(~start.still)
+    if not len(moving):
+        return
+    spots = np.setdiff1d(np.arange(model.count), model.gripped)
+    shapes = equilibrium.smooth_shapes(model.mesh, spots)
+    if shapes is None:
+        return
+    at = shapes[list(model.marker_vertex)] * np.sqrt(len(spots))  # of size one
+    count = at.shape[1]
+    frames = min(own.motion.markers.shape[1], round(_WINDOW / model.dt) + 3)
+    target = own.spines.target.copy()
+    priors = PER_CAMERA * len(own.spines.views) * 16
+    target[:, :, -priors:] = np.nan
+    late = np.arange(target.shape[1]) / own.spines.views[0].camera.fps > _WINDOW
+    target[:, late] = np.nan
+    seen = np.isfinite(target)
+    rows, sizes = 6 * count + 1, np.repeat([_SHIFT, _DRIFT], 3 * count)
+    offset = np.zeros((len(start.pos), 6 * count))
+    base = start
+    for _ in range(passes):
+        pos, vel = (np.repeat(x[None], rows, 0) for x in (base.pos, base.vel))
+        nudge = np.concatenate([np.zeros((1, 6 * count)), 0.05 * np.diag(sizes)])
+        whole = offset[None] + nudge[:, None]  # (rows, B, 6J)
+        mode = whole.reshape(rows, len(start.pos), 2, count, 3)
+        pos = pos + np.einsum("mj,rbjc->rbmc", at, mode[:, :, 0])
+        vel = vel + np.einsum("mj,rbjc->rbmc", at, mode[:, :, 1])
+        still = np.tile(start.still, rows)
+        varied = Start(pos.reshape(-1, *base.pos.shape[1:]), vel.reshape(-1, *base.vel.shape[1:]), still)
+        full = own.full(np.repeat(values[None], rows, 0))
+        sims = model.simulate(own.motion, varied, full, frames=frames)
+        numbers = np.repeat(values[None, len(own.free) :], rows, 0)
+        read = own.spines.read(sims, numbers)
+        for b in moving:
+            residual = np.where(seen[b], read[0, b], 0.0).ravel()
+            slope = np.where(seen[b], (read[1:, b] - read[:1, b]), 0.0).reshape(6 * count, -1) / (0.05 * sizes[:, None])
+            if not np.isfinite(slope).all() or not np.isfinite(residual).all():
+                continue
+            weight = 1 / np.sqrt(residual**2 + 4e-6)
+            # The information of a few independent readings per frame, against the prior.
+            share = 16.0 * 2 / max(seen[b].sum(), 1) / 2e-3
+            normal = share * (slope * weight) @ slope.T + np.diag(1 / sizes**2) * 2e-3
+            pull = -share * (slope * weight) @ residual - 2e-3 * offset[b] / sizes**2
+            step = np.linalg.solve(normal, pull)
+            offset[b] += np.clip(step / sizes, -3, 3) * sizes
+    mode = offset.reshape(len(start.pos), 2, count, 3)
+    own.start = replace(
+        base,
+        pos=base.pos + np.einsum("mj,bjc->bmc", at, mode[:, 0]),
+        vel=base.vel + np.einsum("mj,bjc->bmc", at, mode[:, 1]),
+    )
+
+
+def solve(
+    own: Problem, raws: np.ndarray, iterations: int, *, seconds: float | None = None, tolerance: float = 2e-3
+) -> list[Point]:
+    """Improve coordinates (S, K + Q) on the readings of the first seconds; return where they end."""
+    simulate, target = own.readings(seconds)
+    points = levenberg_marquardt.evaluate(simulate, target, own.space, raws, own.extent)
+    limits: dict[str, Any] = {"iterations": iterations, "tolerance": tolerance, "whole": own.extent}
+    for points in levenberg_marquardt.improve(simulate, target, own.space, points, **limits):  # noqa: B020
+        pass
+    return points
+
+
+def scout(own: Problem, starts: int, rng: np.random.Generator, report: Callback) -> np.ndarray:
+    """Return coordinates (K + Q,) in the basin of the best fit."""
+    space, count, total = own.space, len(own.free), 4
+    lasts = float(own.motion.markers.shape[1] - 1) * own.model.dt
+    first = np.concatenate([own.fixed[list(own.free)], np.zeros(len(own.spines.nuisances.names))])
+    raws = np.repeat(space.to_raw(first)[None], starts, 0)
+    for k in range(min(count, 3)):
+        share = (rng.permutation(starts) + rng.uniform(size=starts)) / starts - 0.5
+        raws[1:, k] += 2 * _REACH[k] * share[1:]
+    raws[1:, 1] += raws[1:, 0] - raws[0, 0]
+    raws = space.clip(raws)
+    report("trying starts", 0, total, "")
+    simulate, target = own.readings(0.35 * lasts)
+    cost = levenberg_marquardt.costs(simulate(space.to_values(raws)), target, own.extent)
+    raws = raws[np.argsort(cost, kind="stable")[: max(2, starts // 4)]]
+    report("trying starts", 1, total, f"{1e3 * cost.min():.2f} mm")
+    points = solve(own, raws, 4, seconds=0.35 * lasts, tolerance=1e-2)
+    points = _different(points, max(2, starts // 9))
+    report("trying starts", 2, total, f"{1e3 * points[0].cost:.2f} mm over 35 % of the time")
+    points = solve(own, np.array([p.raw for p in points]), 3, seconds=0.7 * lasts, tolerance=1e-2)
+    points = _different(points, 2)
+    report("trying starts", 3, total, f"{1e3 * points[0].cost:.2f} mm over 70 % of the time")
+    points = solve(own, np.array([p.raw for p in points]), 4, tolerance=1e-2)
+    best = min(points, key=lambda p: p.cost)
+    report("trying starts", total, total, f"{1e3 * best.cost:.2f} mm")
+    return best.raw
+
+
+def _different(points: Sequence[Point], most: int) -> list[Point]:
+    """Return the best points that are not in the same place."""
+    kept: list[Point] = []
+    for p in sorted(points, key=lambda p: p.cost):
+        if np.isfinite(p.cost) and all(np.abs(p.raw[:3] - o.raw[:3]).max() > 0.02 for o in kept):
+            kept.append(p)
+    return kept[:most] or [min(points, key=lambda p: p.cost)]
+
+
+def gate(own: Problem, values: np.ndarray) -> int:
+    """Take out frames in which films stay far from the rope while others are near; return how many."""
+    found, target = own.readings()[0](values[None])[0], own.spines.target
+    lost, start = 0, 0
+    for view in own.spines.views:
+        width = 2 * view.places.shape[2]
+        part = slice(start, start + width)
+        start += width + int(own.spines.count_free)
+        with np.errstate(invalid="ignore"):
+            known = np.isfinite(target[:, :, part, 0])
+            size = np.where(known, np.abs(found[:, :, part, 0]), np.nan)
+            distance = np.full(known.shape[:2], np.nan)
+            some = known.any(2)
+            distance[some] = np.nanmean(size[some], 1)
+        for b, trial in enumerate(own.trials):
+            rows = np.flatnonzero(some[b])
+            around = np.array([np.median(distance[b, rows[max(0, k - 4) : k + 5]]) for k in range(len(rows))])
+            bad = rows[distance[b, rows] > np.maximum(_GATE * around, _NEAR)]
+            if len(bad):
+                view.good[b, bad] = False
+                lost += len(bad)
+                own.dropped.setdefault(f"{trial.name}, camera {view.camera.name}", []).extend(bad.tolist())
+    if lost:
+        free = np.ones(own.model.count, bool)
+        free[own.model.gripped] = False
+        own.spines = Spines(own.spines.views, own.model.dt, own.extent, free)
+    return lost
+
+
+def _blocks(own: Problem, raw: np.ndarray) -> Point:
+    """Return the point at coordinates, with stretches of time in the place of trials: they scatter independently."""
+    simulate, target = own.readings()
+    look = levenberg_marquardt.Look(own.space, raw[None])
+    sims = simulate(look.values)
+    frames = target.shape[1]
+    length = max(3, round(_BLOCK * own.spines.views[0].camera.fps))
+    priors = np.zeros(target.shape[2], bool)
+    priors[-16 * len(own.spines.nuisances.names) :] = True
+    parts, reads = [], []
+    for b in range(len(target)):
+        for k in range(0, frames, length):
+            part = target[b, k : k + length].copy()
+            part[:, priors] = np.nan
+            if np.isfinite(part).sum() < 0.3 * np.isfinite(target[b]).sum() * length / frames:
+                continue
+            pad = [(0, length - len(part)), (0, 0), (0, 0)]
+            parts.append(np.pad(part, pad, constant_values=np.nan))
+            reads.append(np.pad(sims[:, b, k : k + length], [(0, 0), *pad]))
+    data, read = np.stack(parts), np.stack(reads, 1)
+    return look.points(read, data, own.extent)[0]
+
+
+def intervals(own: Problem, raw: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return 90 % limits of the fitted numbers, and how much their range is of what it may be [1], shape (K + Q,) each.
+
+    Stretches of time scatter; what cameras may be off shifts all of them in the same way.
+    """
+    point, space = _blocks(own, raw), own.space
+    count, blocks = len(own.free), len(point.gradient)
+    # Priors: a standard deviation of one coordinate, weighed as a few independent readings of each picture are.
+    pictures = sum(float(v.good.sum()) for v in own.spines.views)
+    precision = 2 * (5e-4) ** 2 / (2e-3) / (2.0 * pictures)
+    prior = np.diag(np.concatenate([np.zeros(count), np.full(len(space.names) - count, 0.5 * precision)]))
+    whole = replace(point, curvature=point.curvature + prior[None])
+    curvature = whole.curvature.sum(0)
+    drifts = np.linalg.solve(levenberg_marquardt._firm(curvature), blocks * prior)[count:]
+    low, high = levenberg_marquardt.interval(whole, space, drifts=drifts)
+    ratio = np.abs(space.to_raw(high) - space.to_raw(low))
+    return np.minimum(low, high), np.maximum(low, high), ratio
+
+
+def picture_errors(own: Problem, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the mean distance of the films' centre lines from the rope by trial [m] and [px], (B,) each."""
+    sims = own.simulate(values[None])
+    read = own.spines.read(sims, values[None, len(own.free) :])[0]
+    metres, start = [], 0
+    for view in own.spines.views:
+        width = 2 * view.places.shape[2]
+        part = np.where(np.isfinite(own.spines.target), read, np.nan)[:, :, start : start + width, 0]
+        pairs = part.reshape(*part.shape[:2], -1, 2)
+        metres.append(np.nanmean(np.linalg.norm(pairs, axis=-1), (1, 2)))
+        start += width + int(own.spines.count_free)
+    focal = np.mean([v.camera.fx for v in own.spines.views])
+    depth = np.mean([_depth(own, v) for v in own.spines.views])
+    mean = np.mean(metres, 0)
+    return mean, mean * focal / depth
+
+
+def _depth(own: Problem, view: View) -> float:
+    held = np.concatenate([t.markers[:, t.gripped].reshape(-1, 3) for t in own.trials])
+    return float(np.mean(held @ np.array(view.camera.rotation)[2] + view.camera.translation[2]))
+
+
+def calibrate_filmed(
+    recording: Recording,
+    *,
+    starts: int = 36,
+    iterations: int = 15,
+    seed: int = 0,
+    vertices: int | None = None,
+    given: ModelFile | None = None,
+    callback: Callback | None = None,
+) -> Calibration:
+    """Fit the baseline model to the films of the train trials and judge it on those of the test trials.
+
+    Args:
+        recording: with films.
+        starts: number of starts.
+        iterations: most iterations of the last stage.
+        seed: of the random starts.
+        vertices: vertices of the simulated rope.
+        given: model to start from in place of many starts, with its effects.
+        callback: told (stage, steps done, in all, message).
+    """
+    begun = time.perf_counter()
+    report = callback or (lambda *_: None)
+    views, notes = views_of(recording, recording.train, report)
+    options = suited(recording, vertices) if given is None else dict(given.options)
+    options |= {"rest": "straight"} if given is None else {}
+    if given is None:
+        own = problem(recording, recording.train, views, options=options)
+    else:
+        model = given.model(recording)
+        sizes = given.sizes(model)
+        own = problem(
+            recording,
+            recording.train,
+            views,
+            effects=given.effects,
+            values=given.start(model),
+            fitted=tuple(sizes),
+            options=options,
+        )
+    count, space = len(own.free), own.space
+    first = np.concatenate([own.fixed[list(own.free)], np.zeros(len(own.spines.nuisances.names))])
+    refine_start(own, first)
+    raw = space.to_raw(first) if given is not None else scout(own, starts, np.random.default_rng(seed), report)
+    stage = f"fitting {len(own.trials)} filmed trials"
+    report(stage, 0, 3, "")
+    for k, most in enumerate((4, 6, iterations)):
+        values = space.to_values(raw)
+        if k:
+            gate(own, values)
+        refine_start(own, values)
+        best = min(solve(own, raw[None], most), key=lambda p: p.cost)
+        raw = best.raw
+        report(stage, k + 1, 3, f"{1e3 * best.cost:.2f} mm")
+    if not np.isfinite(best.cost):
+        raise InputError(
+            f"{recording.path}: the simulation failed on the train trials from every start; check length, mass, cameras and "
+            "marker_arclength."
+        )
+    values = space.to_values(raw)
+    low, high, _ = intervals(own, raw)
+    for where, frames in own.dropped.items():
+        notes.append(f"{where}: frames {', '.join(map(str, sorted(frames)))} stay far from the rope: left out.")
+    report("judging", 0, 1, "")
+    result = _judged(recording, own, first, values, low, high, notes, seed, begun, report)
+    report("judging", 1, 1, "")
+    del count
+    return result
+
+
+def _judged(
+    recording: Recording,
+    own: Problem,
+    first: np.ndarray,
+    values: np.ndarray,
+    low: np.ndarray,
+    high: np.ndarray,
+    notes: list[str],
+    seed: int,
+    begun: float,
+    report: Callback,
+) -> Calibration:
+    from torchdlo.sysid.overlay import overlaps
+
+    space, per_trial, predictions, before = own.space, [], {}, {}
+    errors: dict[str, dict[str, list[float]]] = {}
+    numbers = len(own.free)
+    for split, trials in (("train", recording.train), ("test", recording.test)):
+        if split == "train":
+            here = own
+        else:
+            views, said = views_of(recording, trials, report)
+            notes += said
+            here = replace(
+                own,
+                trials=tuple(trials),
+                motion=own.model.motion(trials),
+                spines=Spines(views, own.model.dt, own.extent, own.spines.free),
+                start=start_of(own.model, trials, views),
+                dropped={},
+            )
+            gate(here, values)
+            refine_start(here, values)
+        old, _ = picture_errors(here, first)
+        new, pixels = picture_errors(here, values)
+        sims = here.simulate(np.stack([first, values]))
+        share = overlaps(recording, here, sims[1], values[numbers:])
+        for b, trial in enumerate(trials):
+            frames = len(trial.time)
+            predictions[trial.name], before[trial.name] = sims[1, b, :frames], sims[0, b, :frames]
+            per_trial.append(
+                {
+                    "name": trial.name,
+                    "split": split,
+                    "mae_mm": 1e3 * float(new[b]),
+                    "before_mae_mm": 1e3 * float(old[b]),
+                    "distance_px": float(pixels[b]),
+                    "iou": share[b],
+                }
+            )
+        errors[split] = {"new": (1e3 * new).tolist(), "old": (1e3 * old).tolist()}
+    return Calibration(
+        parameters={
+            name: {"value": float(v), "low": float(a), "high": float(b), "unit": p.unit}
+            for name, p, v, a, b in zip(space.names, space.params, values, low, high, strict=True)
+        },
+        train_mae_mm=float(np.mean(errors["train"]["new"])),
+        test_mae_mm=float(np.mean(errors["test"]["new"])),
+        before={f"{s}_mae_mm": float(np.mean(errors[s]["old"])) for s in errors},
+        baselines={},
+        per_trial=per_trial,
+        seconds=time.perf_counter() - begun,
+        model=model_file.content(own.model, own.full(values[None])[0]),
+        predictions=predictions,
+        predictions_before=before,
+        seed=seed,
+        notes=[*notes, *_remarks(own, values, low, high)],
+    )
+
+
+def _remarks(own: Problem, values: np.ndarray, low: np.ndarray, high: np.ndarray) -> list[str]:
+    """Return what these views cannot test."""
+    out = []
+    for name, p, v, a, b in zip(own.space.names, own.space.params, values, low, high, strict=True):
+        if not name.startswith("camera_") and p.scale == "log" and b / max(a, 1e-300) > 4:
+            out.append(
+                f"{name.replace('_', ' ')} is not testable from these views: it may be {a:.2g} to {b:.2g} {p.unit}."
+            )
+        elif name.startswith("camera_") and abs(v) > 3 * own.space.units[own.space.names.index(name)]:
+            out.append(
+                f"{name.replace('_', ' ')} is off by {v:.3g} {p.unit}: was the camera moved after its calibration?"
+            )
+    return out
