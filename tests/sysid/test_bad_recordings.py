@@ -169,7 +169,8 @@ CASES: dict[str, tuple[Callable[[Path], None], tuple[str, ...]]] = {
     # files
     "no train trial": (drop("train_*"), ("train_*.npz", "found none")),
     "no test trial": (drop("test_*"), ("test_*.npz", "found none")),
-    "video trial": (make_file("test_7.mp4"), ("test_7.mp4", "not supported by this command yet")),
+    "film without a camera": (make_file("test_7.mp4"), ("test_7.mp4", "expected the camera's name")),
+    "film without cameras": (make_file("test_1.a.mp4"), ("cameras.json", "expected the file of the cameras")),
     "empty file": (trial_bytes(lambda data: b""), (TRIAL, "cannot be read")),
     "truncated file": (trial_bytes(lambda data: data[: len(data) // 2]), (TRIAL, ".npz archive")),
     "damaged bytes": (
@@ -196,7 +197,7 @@ CASES: dict[str, tuple[Callable[[Path], None], tuple[str, ...]]] = {
     ),
     "masks": (
         add("masks", np.zeros((40, 1, 8, 8), dtype=bool)),
-        (TRIAL, "masks", "not supported by this command yet"),
+        (TRIAL, "masks", "beside the trial"),
     ),
     "markers are texts": (array("markers", lambda a: a.astype(str)), (TRIAL, "markers", "float")),
     "markers are complex": (array("markers", lambda a: a + 0j), (TRIAL, "markers", "complex128")),

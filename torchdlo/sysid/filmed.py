@@ -1,22 +1,23 @@
-"""Calibration to films: the rope's numbers, with cameras and clocks as numbers of their own, from distances in
-pictures.
+"""Calibration to films: the rope's numbers, with cameras and clocks as numbers of their own.
 
 Where films begin at rest, so does the simulation; else the shape and the motion at the start are estimated from the
 first frames. Many starts are tried on the beginning of the trials, where a cost has few local minima; the best go on
-over all of their time. Frames that stay far from the rope while others are near are wrong ones, and are left out.
+over all of their time. Frames that stay far from the rope while others are near are wrong ones, and are left out. What
+finer steps and a finer mesh change is computed once near the best fit, and added to simulations from then on.
 """
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
 from torchdlo.errors import InputError
 from torchdlo.sysid.diagnosis.budget import options as suited
+from torchdlo.sysid.diagnosis.error_floor import Refinement, refinement
 from torchdlo.sysid.estimation import levenberg_marquardt
 from torchdlo.sysid.estimation.levenberg_marquardt import ParameterSpace, Point
 from torchdlo.sysid.estimation.result import Calibration
@@ -70,6 +71,10 @@ class Problem:
     """All of the model's numbers, shape (K,)."""
     dropped: dict[str, list[int]]
     """Wrong frames by trial and camera."""
+    options: dict[str, Any] = field(default_factory=dict)
+    """Of the model."""
+    discretisation_correction: Refinement | None = None
+    """What finer simulations change, if it is known."""
 
     @property
     def space(self) -> ParameterSpace:
@@ -200,7 +205,8 @@ def problem(
     columns = tuple(k for k, n in enumerate(model.parameters) if n in names)
     first = model.guess() if values is None else np.asarray(values, dtype=float)
     begin = start_of(model, trials, views)
-    return Problem(model, tuple(trials), model.motion(trials), spines, begin, columns, first, {})
+    known = dict(options or {})
+    return Problem(model, tuple(trials), model.motion(trials), spines, begin, columns, first, {}, known)
 
 
 def refine_start(own: Problem, values: np.ndarray, passes: int = 2) -> None:
@@ -271,7 +277,7 @@ def solve(
     simulate, target = own.readings(seconds)
     points = levenberg_marquardt.evaluate(simulate, target, own.space, raws, own.extent)
     limits: dict[str, Any] = {"iterations": iterations, "tolerance": tolerance, "whole": own.extent}
-    for points in levenberg_marquardt.improve(simulate, target, own.space, points, **limits):  # noqa: B020
+    for points in levenberg_marquardt.improve(simulate, target, own.space, points, **limits):  # noqa: B007, B020
         pass
     return points
 
@@ -342,6 +348,20 @@ def gate(own: Problem, values: np.ndarray) -> int:
     return lost
 
 
+def correct(own: Problem, values: np.ndarray) -> None:
+    """Add to simulations from now on what finer steps and a finer mesh change at these numbers (K + Q,)."""
+    model, begin = own.model, replace(own.start, discretisation_correction=None)
+    half = {"substep": model.dt / (2 * model.substeps)}
+    fine = half | {"vertices": 2 * len(model.arclength) - 1}
+    row, sims = own.full(values[None]), []
+    for more in (fine, half, {}):
+        each = RopeModel(model.recording, effects=model.effects, **(own.options | more)) if more else model
+        sims.append(each.simulate(each.motion(own.trials), begin, row)[0])
+    edge = float(np.mean(np.diff(model.arclength)))
+    own.discretisation_correction = refinement(sims[0], sims[1], sims[2], model.numerical_damping, edge)
+    own.start = replace(own.start, discretisation_correction=own.discretisation_correction.correction)
+
+
 def _blocks(own: Problem, raw: np.ndarray) -> Point:
     """Return the point at coordinates, with stretches of time in the place of trials: they scatter independently."""
     simulate, target = own.readings()
@@ -378,7 +398,18 @@ def intervals(own: Problem, raw: np.ndarray) -> tuple[np.ndarray, np.ndarray, np
     prior = np.diag(np.concatenate([np.zeros(count), np.full(len(space.names) - count, 0.5 * precision)]))
     whole = replace(point, curvature=point.curvature + prior[None])
     curvature = whole.curvature.sum(0)
-    drifts = np.linalg.solve(levenberg_marquardt._firm(curvature), blocks * prior)[count:]
+    drifts = np.linalg.solve(levenberg_marquardt.firm(curvature), blocks * prior)[count:]
+    if own.discretisation_correction is not None:
+        look, target = levenberg_marquardt.Look(space, raw[None]), own.spines.target
+        read = own.readings()[0](look.values)
+        sims, numbers = own.simulate(look.values[:1]), look.values[:1, count:]
+        # Next to clamps the mesh's error may be of first order: extrapolating to that would change twice as much.
+        parts = [
+            factor * np.nan_to_num(e)
+            for factor, e in zip((1.0, 2.0), own.discretisation_correction.unsure, strict=True)
+        ]
+        wrong = [own.spines.read(sims + e[None], numbers)[0] - read[0] for e in parts]
+        drifts = np.concatenate([drifts, levenberg_marquardt.drift(look, read, target, wrong, own.extent)])
     low, high = levenberg_marquardt.interval(whole, space, drifts=drifts)
     ratio = np.abs(space.to_raw(high) - space.to_raw(low))
     return np.minimum(low, high), np.maximum(low, high), ratio
@@ -457,13 +488,15 @@ def calibrate_filmed(
         if k:
             gate(own, values)
         refine_start(own, values)
+        if k:
+            correct(own, values)
         best = min(solve(own, raw[None], most), key=lambda p: p.cost)
         raw = best.raw
         report(stage, k + 1, 3, f"{1e3 * best.cost:.2f} mm")
     if not np.isfinite(best.cost):
         raise InputError(
-            f"{recording.path}: the simulation failed on the train trials from every start; check length, mass, cameras and "
-            "marker_arclength."
+            f"{recording.path}: the simulation failed on the train trials from every start; check length, mass, "
+            "cameras and marker_arclength."
         )
     values = space.to_values(raw)
     low, high, _ = intervals(own, raw)
@@ -488,11 +521,11 @@ def _judged(
     begun: float,
     report: Callback,
 ) -> Calibration:
-    from torchdlo.sysid.overlay import overlaps
+    from torchdlo.sysid.overlay import overlaps, overlays
 
     space, per_trial, predictions, before = own.space, [], {}, {}
     errors: dict[str, dict[str, list[float]]] = {}
-    numbers = len(own.free)
+    numbers, shown = len(own.free), []
     for split, trials in (("train", recording.train), ("test", recording.test)):
         if split == "train":
             here = own
@@ -509,10 +542,12 @@ def _judged(
             )
             gate(here, values)
             refine_start(here, values)
+            correct(here, values)
         old, _ = picture_errors(here, first)
         new, pixels = picture_errors(here, values)
         sims = here.simulate(np.stack([first, values]))
         share = overlaps(recording, here, sims[1], values[numbers:])
+        shown += overlays(recording, here, split, sims, np.stack([first, values])[:, numbers:])
         for b, trial in enumerate(trials):
             frames = len(trial.time)
             predictions[trial.name], before[trial.name] = sims[1, b, :frames], sims[0, b, :frames]
@@ -543,6 +578,7 @@ def _judged(
         predictions_before=before,
         seed=seed,
         notes=[*notes, *_remarks(own, values, low, high)],
+        overlays=shown,
     )
 
 

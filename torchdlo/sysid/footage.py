@@ -131,8 +131,8 @@ def _reduced(
     count, expected = len(masks), (lasts - max(time[0], 0.0)) * film.camera.fps
     if count < 0.6 * expected:
         raise InputError(
-            f"{film.path}: expected about {expected:.0f} pictures for the {lasts:g} s of {trial.name}.npz, found {count}; "
-            "were pictures dropped, or is fps in cameras.json wrong?"
+            f"{film.path}: expected about {expected:.0f} pictures for the {lasts:g} s of {trial.name}.npz, found "
+            f"{count}; were pictures dropped, or is fps in cameras.json wrong?"
         )
     held = trial.markers[:, trial.gripped]
     flat = held.reshape(len(held), -1)

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
+from torchdlo.sysid.estimation.result import Overlay
 from torchdlo.sysid.footage import masks_of
 from torchdlo.sysid.observation import PER_CAMERA, seen_by
 from torchdlo.sysid.recordings.recording import Recording
@@ -16,7 +17,7 @@ from torchdlo.vision.rasterizer import coverage, successors
 if TYPE_CHECKING:
     from torchdlo.sysid.filmed import Problem
 
-__all__ = ["drawn", "overlaps"]
+__all__ = ["drawn", "overlaps", "overlays"]
 
 
 def drawn(
@@ -67,4 +68,34 @@ def overlaps(recording: Recording, own: Problem, sims: np.ndarray, numbers: np.n
             both, either = (model & measured).sum((1, 2)), (model | measured).sum((1, 2))
             parts.append(float(np.mean(both / np.maximum(either, 1))))
         out.append(float(np.mean(parts)))
+    return out
+
+
+_SHOWN = 3
+"""Pictures per film."""
+
+
+def overlays(recording: Recording, own: Problem, split: str, sims: np.ndarray, numbers: np.ndarray) -> list[Overlay]:
+    """Return some pictures of each film with the rope before and after.
+
+    Args:
+        recording: the rope.
+        own: the problem.
+        split: train or test.
+        sims: places of the rope before and after [m], shape (2, B, T, M, 3).
+        numbers: those of all cameras, before and after, shape (2, Q).
+    """
+    out = []
+    for k, view in enumerate(own.spines.views):
+        with torch.no_grad():
+            both = torch.as_tensor(sims, dtype=torch.float32)
+            cameras = torch.as_tensor(numbers[:, PER_CAMERA * k : PER_CAMERA * (k + 1)], dtype=torch.float32)
+            pixel = seen_by(view, both, cameras, own.spines.step)[0].numpy()
+        for b, trial in enumerate(own.trials):
+            masks, pictures, _ = masks_of(recording, trial.films[k])
+            good = np.flatnonzero(view.good[b])
+            for frame in good[np.linspace(0, len(good) - 1, _SHOWN + 1).round().astype(int)[1:]]:
+                shown = 255 - 160 * masks[frame] if pictures is None else pictures[frame].mean(-1)
+                title = f"{trial.name}, camera {view.camera.name}, {view.time[frame]:.2f} s"
+                out.append(Overlay(title, split, shown.astype(np.uint8), pixel[0, b, frame], pixel[1, b, frame]))
     return out

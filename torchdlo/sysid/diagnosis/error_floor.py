@@ -180,8 +180,23 @@ def refine(pool: Pool, base: Fitted, start: Start, chain: str) -> Refinement:
         for options in ((half, discretisation_correction), (half,), ())
     ]
     sims = dict(pool.simulate(jobs))
-    step, grid = _tame(sims[1][0] - sims[2][0]), _tame(sims[0][0] - sims[1][0])
-    return Refinement(step, grid, noise(pool.recording), _AHEAD if model.numerical_damping else 2, edge, length)
+    found = refinement(*(sims[k][0] for k in range(3)), model.numerical_damping, edge)
+    return replace(found, noise=noise(pool.recording), links=length)
+
+
+def refinement(
+    fine: np.ndarray, half: np.ndarray, plain: np.ndarray, numerical_damping: float, edge: float
+) -> Refinement:
+    """Return what refining changes, of simulated markers (B, F, M, 3) [m].
+
+    Args:
+        fine: with half the steps and twice the vertices.
+        half: with half the steps.
+        plain: as they are.
+        ahead: how far steps look ahead, see `torchdlo.scene.Scene`.
+        edge: mean length of the mesh's edges [m].
+    """
+    return Refinement(_tame(half - plain), _tame(fine - half), 0.0, _AHEAD if numerical_damping else 2, edge)
 
 
 def _tame(change: np.ndarray) -> np.ndarray:

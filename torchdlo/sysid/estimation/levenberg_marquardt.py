@@ -259,7 +259,9 @@ def _step(point: Point, damping: float, space: ParameterSpace) -> np.ndarray:
     return space.clip(point.raw + step / max(1.0, float(np.abs(step / space.limits()).max())))
 
 
-def drift(look: Look, sims: np.ndarray, measured: np.ndarray, errors: Sequence[np.ndarray]) -> np.ndarray:
+def drift(
+    look: Look, sims: np.ndarray, measured: np.ndarray, errors: Sequence[np.ndarray], whole: float | None = None
+) -> np.ndarray:
     """Return how far the minimum moves when simulations are wrong, shape (E, K): one step of Gauss-Newton.
 
     Args:
@@ -267,13 +269,14 @@ def drift(look: Look, sims: np.ndarray, measured: np.ndarray, errors: Sequence[n
         sims: simulations of its values, shape (K + 1, B, F, M, 3) [m].
         measured: markers, shape (B, F, M, 3) [m].
         errors: E ways in which simulations may be wrong, shape (B, F, M, 3) each [m].
+        whole: see `Look.points`.
     """
-    here, *others = (look.points(sims, measured - e)[0] for e in (0.0, *errors))
-    curvature = _firm(here.curvature.sum(0))
+    here, *others = (look.points(sims, measured - e, whole)[0] for e in (0.0, *errors))
+    curvature = firm(here.curvature.sum(0))
     return np.array([np.linalg.solve(curvature, (here.gradient - p.gradient).sum(0)) for p in others])
 
 
-def _firm(curvature: np.ndarray) -> np.ndarray:
+def firm(curvature: np.ndarray) -> np.ndarray:
     """Return a curvature (K, K) that can be inverted."""
     return curvature + (1e-9 * np.trace(curvature) + 1e-12) * np.eye(len(curvature))
 
@@ -296,7 +299,7 @@ def interval(point: Point, space: ParameterSpace, drifts: np.ndarray | None = No
         return np.array([p.low for p in space.params]), np.array([p.high for p in space.params])
     flatter = np.ones(len(ran)) if point.flatter is None else point.flatter
     curvature = (flatter[:, None, None] * point.curvature)[ran].sum(0)
-    moves = np.linalg.solve(_firm(curvature), point.gradient[ran].T).T
+    moves = np.linalg.solve(firm(curvature), point.gradient[ran].T).T
     # Without trial b the minimum moves by moves[b] n / (n - 1); their scatter times (n - 1)^2 / n is the variance.
     deviation = np.sqrt(trials / (trials - 1) * ((moves - moves.mean(0)) ** 2).sum(0))
     quantile = _STUDENT_95[min(trials - 1, len(_STUDENT_95)) - 1]

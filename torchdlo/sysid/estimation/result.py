@@ -11,7 +11,23 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["Calibration", "dump", "model_json", "summary", "summary_json", "versions"]
+__all__ = ["Calibration", "Overlay", "dump", "model_json", "summary", "summary_json", "versions"]
+
+
+@dataclass(frozen=True, eq=False)
+class Overlay:
+    """A picture of a film and where the simulated rope is in it."""
+
+    title: str
+    """Trial, camera and time."""
+    split: str
+    """train or test."""
+    picture: np.ndarray
+    """Grey, shape (H, W) uint8."""
+    before: np.ndarray
+    """The rope before the fit [px], shape (M, 2)."""
+    after: np.ndarray
+    """The rope after the fit [px], shape (M, 2)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,6 +60,8 @@ class Calibration:
     """Whether the user stopped the fit, so that this is the best until then."""
     notes: list[str] = field(default_factory=list)
     """Sentences that a reader of the result should know."""
+    overlays: list[Overlay] = field(default_factory=list)
+    """Pictures of films with the rope before and after, if there are films."""
 
 
 def summary(result: Calibration, recording: str | Path) -> dict[str, Any]:

@@ -1,0 +1,135 @@
+"""The report of a calibration to films: verdict first, the rope over the pictures before and after, and the numbers."""
+
+from __future__ import annotations
+
+import base64
+import html
+import io
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from torchdlo.files import write_atomically
+from torchdlo.report.pages.page import STYLE, listed, number, page, table, words
+from torchdlo.sysid.estimation.result import Calibration, Overlay, versions
+from torchdlo.sysid.recordings.recording import Recording
+
+__all__ = ["PAGE", "PICTURE", "filmed_html", "overlay_png", "verdict", "write_report"]
+
+PAGE = "report.html"
+PICTURE = "report.png"
+
+_MOST = 12
+"""Pictures that are shown."""
+
+
+def write_report(result: Calibration, recording: Recording, folder: Path, *, command: str = "") -> tuple[Path, Path]:
+    """Write the page and the picture; return their paths."""
+    png = overlay_png(result.overlays)
+    write_atomically(folder / PICTURE, png)
+    write_atomically(folder / PAGE, filmed_html(result, recording, png, command=command))
+    return folder / PAGE, folder / PICTURE
+
+
+def verdict(result: Calibration, recording: Recording) -> str:
+    """The result in one sentence."""
+    tests = [t for t in result.per_trial if t["split"] == "test"]
+    pixels = float(np.mean([t["distance_px"] for t in tests]))
+    share = float(np.mean([t["iou"] for t in tests]))
+    films = sum(len(t.films) for t in recording.train)
+    better = result.test_mae_mm < result.before["test_mae_mm"]
+    summary = (
+        f"Calibrated on {films} film{'s' if films != 1 else ''}; on unseen films the rope's centre line is "
+        f"{_mm(result.before['test_mae_mm'])} → {_mm(result.test_mae_mm)} ({pixels:.1f} px) from the simulated one, "
+        f"and masks overlap by {share:.0%}."
+    )
+    return summary if better else summary + " Calibration did not help on the unseen films: do not use this."
+
+
+def overlay_png(overlays: list[Overlay]) -> bytes:
+    """Return a PNG of pictures with the rope before and after; test trials first."""
+    from matplotlib.figure import Figure
+
+    chosen = sorted(overlays, key=lambda o: o.split != "test")
+    if len(chosen) > _MOST:
+        chosen = [chosen[k] for k in np.linspace(0, len(chosen) - 1, _MOST).round().astype(int)]
+    columns = min(3, max(1, len(chosen)))
+    rows = max(1, math.ceil(len(chosen) / columns))
+    figure = Figure(figsize=(4.6 * columns, 3.6 * rows + 0.5), layout="constrained")
+    axes = np.atleast_1d(figure.subplots(rows, columns, squeeze=False)).ravel()
+    for axis in axes[len(chosen) :]:
+        axis.axis("off")
+    for axis, each in zip(axes, chosen, strict=False):
+        axis.imshow(each.picture, cmap="gray", vmin=0, vmax=255, alpha=0.9)
+        axis.plot(*each.before.T, color="#e0552f", lw=1.2, ls="--", label="before")
+        axis.plot(*each.after.T, color="#00c2d6", lw=1.2, label="calibrated")
+        height, width = each.picture.shape
+        axis.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), xticks=[], yticks=[])
+        axis.set_title(each.title, fontsize=10)
+    if chosen:
+        figure.legend(*axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=2, frameon=False)
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=110, metadata={"Software": "torchdlo"})
+    return buffer.getvalue()
+
+
+def filmed_html(result: Calibration, recording: Recording, png: bytes, *, command: str = "") -> str:
+    """The page, with the picture inside."""
+    name = html.escape(recording.path.resolve().name)
+    picture = base64.b64encode(png).decode("ascii")
+    rope = {k: v for k, v in result.parameters.items() if not k.startswith("camera_")}
+    camera = {k: v for k, v in result.parameters.items() if k.startswith("camera_")}
+    tools = ", ".join(f"{tool} {version}" for tool, version in versions().items())
+    sections = [
+        f"<h1>{name}</h1>",
+        f'<p class="verdict">{html.escape(verdict(result, recording))}</p>',
+        f'<img alt="Pictures of the films with the simulated rope before and after" '
+        f'src="data:image/png;base64,{picture}">',
+        "<h2>Parameters</h2>",
+        "<p>Ranges are meant to hold the true value in 90 of 100 cases. They include what the cameras and the clock "
+        "may be off, and what finer steps and a finer mesh would change.</p>",
+        _parameters(rope),
+        "<h2>What is said of the data</h2>" if result.notes else "",
+        listed(result.notes),
+        "<h2>Trials</h2>",
+        "<p>Distance of the films' centre lines from the simulated rope, and intersection over union of the masks. The "
+        "test trials were not used for the fit.</p>",
+        _trials(result),
+        "<h2>Cameras and clock</h2>",
+        "<p>How far they seem to be off what cameras.json says; fitted with the rope, under priors of 1 degree, 10 mm, "
+        "1 % and half a frame.</p>",
+        _parameters(camera),
+        "<h2>Made by</h2>",
+        f"<pre>{html.escape(command)}</pre>" if command else "",
+        f"<p>{html.escape(f'{result.seconds:.0f} s, seed {result.seed}; {tools}.')}</p>",
+    ]
+    return page(name, STYLE, "\n".join(s for s in sections if s))
+
+
+def _parameters(entries: dict[str, dict[str, Any]]) -> str:
+    rows = [
+        (words(name), number(e["value"], 4), f"{number(e['low'], 4)} to {number(e['high'], 4)}", str(e["unit"]))
+        for name, e in entries.items()
+    ]
+    return table(("parameter", "value", "range", "unit"), rows)
+
+
+def _trials(result: Calibration) -> str:
+    rows = [
+        (
+            str(t["name"]),
+            str(t["split"]),
+            number(t["before_mae_mm"]),
+            number(t["mae_mm"]),
+            number(t["distance_px"]),
+            f"{t['iou']:.2f}",
+        )
+        for t in sorted(result.per_trial, key=lambda t: str(t["split"]))
+    ]
+    return table(("trial", "split", "before [mm]", "calibrated [mm]", "[px]", "overlap"), rows)
+
+
+def _mm(value: float) -> str:
+    return f"{value:.1f} mm" if math.isfinite(value) else "not finite"
