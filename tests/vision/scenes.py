@@ -15,5 +15,5 @@ def hanging(vertices: int = 61, span: float = 0.5, sag: float = 0.3) -> np.ndarr
 
 def front(**others) -> Camera:
     """A camera 1.2 m in front of it, with a lens that bends lines."""
-    options = {"distortion": (-0.15, 0.05, 1e-3, -5e-4, 0.0)} | others
-    return looking_at("a", [0.1, -1.2, 0.1], [0.0, 0.0, -0.15], focal=650.0, **options)
+    options = {"distortion": (-0.15, 0.05, 1e-3, -5e-4, 0.0), "focal": 650.0} | others
+    return looking_at("a", [0.1, -1.2, 0.1], [0.0, 0.0, -0.15], **options)

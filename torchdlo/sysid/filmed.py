@@ -26,7 +26,7 @@ from torchdlo.sysid.model import equilibrium, model_file
 from torchdlo.sysid.model.model_file import ModelFile
 from torchdlo.sysid.model.rope_model import RopeModel
 from torchdlo.sysid.model.trial_batch import Start, TrialBatch
-from torchdlo.sysid.observation import PER_CAMERA, Spines, View
+from torchdlo.sysid.observation import Spines, View
 from torchdlo.sysid.recordings.recording import Recording, Trial
 from torchdlo.sysid.recordings.trivial_predictors import catenary
 
@@ -40,7 +40,7 @@ _WINDOW = 0.2
 _CALM = 0.03
 """Speed of a gripper below which it is at rest [m/s]."""
 
-_SHIFT, _DRIFT = 0.03, 0.5
+_SHIFT, _DRIFT = 0.05, 0.5
 """How far shapes [m] and speeds [m/s] at the start may be from those of a rope at rest that is carried along."""
 
 _REACH = (np.log(40.0), np.log(4.0), np.log(10.0))
@@ -75,6 +75,8 @@ class Problem:
     """Of the model."""
     discretisation_correction: Refinement | None = None
     """What finer simulations change, if it is known."""
+    offset: np.ndarray | None = None
+    """How starts differ from balance, by trial, see `refine_start`."""
 
     @property
     def space(self) -> ParameterSpace:
@@ -209,65 +211,87 @@ def problem(
     return Problem(model, tuple(trials), model.motion(trials), spines, begin, columns, first, {}, known)
 
 
-def refine_start(own: Problem, values: np.ndarray, passes: int = 2) -> None:
+def refine_start(own: Problem, values: np.ndarray, passes: int = 3) -> None:
     """Estimate shapes and motions at the start of trials that do not begin at rest, from their first frames.
+
+    They are those of the rope in balance between the grippers, plus smooth shapes, by Levenberg-Marquardt.
 
     Args:
         own: the problem; its start is replaced.
         values: numbers of the rope and the cameras, shape (K + Q,).
-        passes: steps of Gauss and Newton.
+        passes: most steps.
     """
     start, model = own.start, own.model
     moving = np.flatnonzero(~start.still)
-    if not len(moving):
-        return
     spots = np.setdiff1d(np.arange(model.count), model.gripped)
     shapes = equilibrium.smooth_shapes(model.mesh, spots)
-    if shapes is None:
+    if not len(moving) or shapes is None:
         return
     at = shapes[list(model.marker_vertex)] * np.sqrt(len(spots))  # of size one
-    count = at.shape[1]
+    count = 6 * at.shape[1]
+    plain = start_of(model, own.trials, own.spines.views)
+    row = own.full(values[None])
+    resting = Start(plain.pos, 0 * plain.vel, np.ones(len(plain.pos), bool))
+    balance = model.simulate(own.motion, resting, row, frames=1)[0, :, 0]
+    sound = np.isfinite(balance).all((1, 2))[:, None, None] & ~start.still[:, None, None]
+    pos, vel = np.where(sound, balance, plain.pos), plain.vel
     frames = min(own.motion.markers.shape[1], round(_WINDOW / model.dt) + 3)
     target = own.spines.target.copy()
-    priors = PER_CAMERA * len(own.spines.views) * 16
-    target[:, :, -priors:] = np.nan
-    late = np.arange(target.shape[1]) / own.spines.views[0].camera.fps > _WINDOW
-    target[:, late] = np.nan
-    seen = np.isfinite(target)
-    rows, sizes = 6 * count + 1, np.repeat([_SHIFT, _DRIFT], 3 * count)
-    offset = np.zeros((len(start.pos), 6 * count))
-    base = start
+    target[:, :, -16 * len(own.spines.nuisances.names) :] = np.nan
+    target[:, np.arange(target.shape[1]) / own.spines.views[0].camera.fps > _WINDOW] = np.nan
+    seen, sizes = np.isfinite(target), np.repeat([_SHIFT, _DRIFT], count // 2)
+
+    def begin(offsets: np.ndarray) -> Start:
+        """Return starts of (R, B, 6 J) offsets, for R B simulations."""
+        mode = offsets.reshape(*offsets.shape[:2], 2, -1, 3)
+        p, v = (x[None] + np.einsum("mj,rbjc->rbmc", at, mode[:, :, k]) for k, x in enumerate((pos, vel)))
+        return Start(p.reshape(-1, *pos.shape[1:]), v.reshape(-1, *vel.shape[1:]), np.tile(start.still, len(offsets)))
+
+    def read(offsets: np.ndarray) -> np.ndarray:
+        """Return readings (R, B, F, X, 1)."""
+        sims = model.simulate(own.motion, begin(offsets), np.repeat(row, len(offsets), 0), frames=frames)
+        return own.spines.read(sims, np.repeat(values[None, len(own.free) :], len(offsets), 0))
+
+    def cost(found: np.ndarray, offset: np.ndarray) -> np.ndarray:
+        """Return the cost of trials [m], (B,)."""
+        mean = [
+            levenberg_marquardt.robust(found[b][seen[b]])[0].mean() if seen[b].any() else 0.0 for b in range(len(found))
+        ]
+        return np.nan_to_num(np.array(mean), nan=np.inf) + 0.5 * _PRIOR * ((offset / sizes) ** 2).sum(1)
+
+    offset = own.offset if own.offset is not None else np.zeros((len(pos), count))
+    nudges = np.concatenate([np.zeros((1, count)), np.diag(0.05 * sizes)])
+    damping = np.full(len(pos), 1e-2)
     for _ in range(passes):
-        pos, vel = (np.repeat(x[None], rows, 0) for x in (base.pos, base.vel))
-        nudge = np.concatenate([np.zeros((1, 6 * count)), 0.05 * np.diag(sizes)])
-        whole = offset[None] + nudge[:, None]  # (rows, B, 6J)
-        mode = whole.reshape(rows, len(start.pos), 2, count, 3)
-        pos = pos + np.einsum("mj,rbjc->rbmc", at, mode[:, :, 0])
-        vel = vel + np.einsum("mj,rbjc->rbmc", at, mode[:, :, 1])
-        still = np.tile(start.still, rows)
-        varied = Start(pos.reshape(-1, *base.pos.shape[1:]), vel.reshape(-1, *base.vel.shape[1:]), still)
-        full = own.full(np.repeat(values[None], rows, 0))
-        sims = model.simulate(own.motion, varied, full, frames=frames)
-        numbers = np.repeat(values[None, len(own.free) :], rows, 0)
-        read = own.spines.read(sims, numbers)
+        found = read(offset[None] + nudges[:, None])
+        now, steps = cost(found[0], offset), np.zeros_like(offset)
         for b in moving:
-            residual = np.where(seen[b], read[0, b], 0.0).ravel()
-            slope = np.where(seen[b], (read[1:, b] - read[:1, b]), 0.0).reshape(6 * count, -1) / (0.05 * sizes[:, None])
-            if not np.isfinite(slope).all() or not np.isfinite(residual).all():
+            residual = found[0, b][seen[b]]
+            slope = (found[1:, b] - found[:1, b])[:, seen[b]] / (0.05 * sizes[:, None])
+            if not len(residual) or not np.isfinite(slope).all():
                 continue
-            weight = 1 / np.sqrt(residual**2 + 4e-6)
-            # The information of a few independent readings per frame, against the prior.
-            share = 16.0 * 2 / max(seen[b].sum(), 1) / 2e-3
-            normal = share * (slope * weight) @ slope.T + np.diag(1 / sizes**2) * 2e-3
-            pull = -share * (slope * weight) @ residual - 2e-3 * offset[b] / sizes**2
-            step = np.linalg.solve(normal, pull)
-            offset[b] += np.clip(step / sizes, -3, 3) * sizes
-    mode = offset.reshape(len(start.pos), 2, count, 3)
-    own.start = replace(
-        base,
-        pos=base.pos + np.einsum("mj,bjc->bmc", at, mode[:, 0]),
-        vel=base.vel + np.einsum("mj,bjc->bmc", at, mode[:, 1]),
-    )
+            weight = levenberg_marquardt.robust(residual)[1]
+            normal = (slope * weight) @ slope.T / len(residual) + _PRIOR * np.diag(1 / sizes**2)
+            pull = (slope * weight) @ residual / len(residual) + _PRIOR * offset[b] / sizes**2
+            step = -np.linalg.solve(normal + damping[b] * np.diag(np.diag(normal)), pull)
+            steps[b] = step / max(1.0, float(np.abs(step / sizes).max()))
+        # Whole steps, or shorter ones where those lead astray.
+        tries = offset[None] + np.array([1.0, 0.3, 0.1])[:, None, None] * steps
+        costs = np.stack([cost(f, o) for f, o in zip(read(tries), tries, strict=True)])
+        best = costs.argmin(0)
+        better = costs.min(0) < now
+        rows = np.arange(len(offset))
+        offset = np.where(better[:, None], tries[best, rows], offset)
+        damping = np.where(better, damping / 3, damping * 10)
+        if not (costs.min(0) < 0.98 * now)[moving].any():
+            break
+    own.offset = offset
+    fresh = begin(offset[None])
+    own.start = replace(fresh, discretisation_correction=start.discretisation_correction)
+
+
+_PRIOR = 2e-5
+"""What a squared standard deviation of a start costs [m], against the mean cost of readings."""
 
 
 def solve(
@@ -301,9 +325,11 @@ def scout(own: Problem, starts: int, rng: np.random.Generator, report: Callback)
     points = solve(own, raws, 4, seconds=0.35 * lasts, tolerance=1e-2)
     points = _different(points, max(2, starts // 9))
     report("trying starts", 2, total, f"{1e3 * points[0].cost:.2f} mm over 35 % of the time")
+    refine_start(own, space.to_values(points[0].raw))
     points = solve(own, np.array([p.raw for p in points]), 3, seconds=0.7 * lasts, tolerance=1e-2)
     points = _different(points, 2)
     report("trying starts", 3, total, f"{1e3 * points[0].cost:.2f} mm over 70 % of the time")
+    refine_start(own, space.to_values(points[0].raw))
     points = solve(own, np.array([p.raw for p in points]), 4, tolerance=1e-2)
     best = min(points, key=lambda p: p.cost)
     report("trying starts", total, total, f"{1e3 * best.cost:.2f} mm")
@@ -539,6 +565,8 @@ def _judged(
                 spines=Spines(views, own.model.dt, own.extent, own.spines.free),
                 start=start_of(own.model, trials, views),
                 dropped={},
+                discretisation_correction=None,
+                offset=None,
             )
             gate(here, values)
             refine_start(here, values)

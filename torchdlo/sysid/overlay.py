@@ -63,8 +63,11 @@ def overlaps(recording: Recording, own: Problem, sims: np.ndarray, numbers: np.n
             frames = np.flatnonzero(view.good[b])
             frames = frames[:: max(1, len(frames) // 24)]
             radius = recording.radius or view.half_width * 1.2 / view.camera.fx
-            model = drawn(own, k, sims[b], numbers, frames, radius) > 0.5
             measured = masks[frames]
+            model = drawn(own, k, sims[b], numbers, frames, radius) > 0.5
+            # How thick a mask is depends on where its colours were cut off: ropes are drawn as thick as it is.
+            thick = float(np.clip(measured.sum() / max(model.sum(), 1), 0.6, 1.6))
+            model = drawn(own, k, sims[b], numbers, frames, thick * radius) > 0.5
             both, either = (model & measured).sum((1, 2)), (model | measured).sum((1, 2))
             parts.append(float(np.mean(both / np.maximum(either, 1))))
         out.append(float(np.mean(parts)))

@@ -95,7 +95,7 @@ class Point:
     all of it if not given."""
 
 
-def _robust(residual: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def robust(residual: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return cost and weight of each residual [m]: cost ~ r^2 / (2 knee) near zero, |r| - knee/2 beyond."""
     size = np.sqrt(residual**2 + _KNEE**2)
     return size - _KNEE, 1 / size
@@ -103,14 +103,14 @@ def _robust(residual: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def cost_of(error: float) -> float:
     """Return the cost [m] of an error of a coordinate [m]."""
-    return float(_robust(np.array(error))[0])
+    return float(robust(np.array(error))[0])
 
 
 def costs(sims: np.ndarray, measured: np.ndarray, whole: float | None = None) -> np.ndarray:
     """Return the cost [m] of simulations (S, B, F, M, 3), shape (S,); `whole` as in `Look.points`."""
     seen = np.isfinite(measured)
     residual = np.where(seen, sims - measured, 0.0).reshape(len(sims), len(measured), -1)
-    mean = _robust(residual)[0].sum(-1) / seen.reshape(len(measured), -1).sum(1)
+    mean = robust(residual)[0].sum(-1) / seen.reshape(len(measured), -1).sum(1)
     whole = extent(measured) if whole is None else whole
     return _together(np.where(np.isfinite(mean), np.minimum(mean, whole), np.inf), _LOST * whole)
 
@@ -156,7 +156,7 @@ class Look:
         points = []
         for s in range(count):
             residual = np.where(seen, sims[s, 0] - measured, 0.0).reshape(len(measured), -1)
-            cost, weight = _robust(residual)
+            cost, weight = robust(residual)
             of_trial = cost.sum(1) / per_trial
             change = np.where(seen, sims[s, 1:] - sims[s, 0], 0.0).reshape(k, len(measured), -1)
             # A trial that ran at the point but failed beside it tells nothing about gradients.

@@ -1,0 +1,119 @@
+"""Folders with films: what belongs together is found, what does not is refused in a sentence, and trials get places."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.vision.scenes import front
+from torchdlo.errors import InputError
+from torchdlo.sysid.filming import film_recording
+from torchdlo.sysid.footage import views_of
+from torchdlo.sysid.recordings.recording import load_recording
+from torchdlo.vision.camera import looking_at, save_cameras
+from torchdlo.vision.film import Look
+from torchdlo.vision.segment import save_masks
+
+SAMPLE = Path(__file__).parents[2] / "torchdlo" / "data" / "sample_rope"
+
+
+def view_of_sample(**others):
+    """A camera in front of the sample rope."""
+    return looking_at("a", [0.15, -1.35, 1.0], [0.0, 0.0, 0.88], focal=650.0, **others)
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The sample recording, filmed for half a second; read only."""
+    out = tmp_path_factory.mktemp("films") / "rope"
+    film_recording(load_recording(SAMPLE), [view_of_sample()], out, Look(noise=1.0), trials=1, seconds=0.5)
+    return out
+
+
+@pytest.fixture
+def filmed(made: Path, tmp_path: Path) -> Path:
+    """One of one's own."""
+    import shutil
+
+    return Path(shutil.copytree(made, tmp_path / "rope"))
+
+
+def test_films_are_read_with_their_cameras_and_places(filmed: Path) -> None:
+    recording = load_recording(filmed)
+    trial = recording.train[0]
+    assert recording.filmed and trial.films[0].camera.name == "a" and recording.color == (25, 150, 60)
+    assert len(trial.marker_arclength) > 35 and (np.diff(trial.marker_arclength) > 0).all()
+    assert trial.gripped.sum() == 4 and np.isfinite(trial.markers[:, trial.gripped]).all()
+    assert np.isnan(trial.markers[:, ~trial.gripped]).all()
+    assert trial.gripped[list(trial.gripper_marker)].all()
+    views, notes = views_of(recording, recording.train)
+    assert views[0].good.all() and not notes and np.isfinite(views[0].places).mean() > 0.5
+
+
+def _cameras(filmed: Path) -> None:
+    (filmed / "cameras.json").unlink()
+
+
+def _two(filmed: Path) -> None:
+    save_masks(np.zeros((15, 480, 640), bool), filmed / "train_0.a.npz")
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (_cameras, "expected the file of the cameras"),
+        (lambda f: (f / "train_0.a.mp4").rename(f / "train_0.b.mp4"), "name of a camera"),
+        (lambda f: (f / "train_0.a.mp4").rename(f / "train_7.a.mp4"), "train_7.npz with the motion"),
+        (lambda f: (f / "train_0.a.mp4").rename(f / "train_0.mp4"), "camera's name in the film's"),
+        (lambda f: (f / "test_0.a.mp4").unlink(), "expected a film test_0.a.mp4"),
+        (_two, "found two"),
+    ],
+)
+def test_what_does_not_belong_together_is_refused(filmed: Path, spoil, message: str) -> None:
+    spoil(filmed)
+    with pytest.raises(InputError, match=message):
+        load_recording(filmed)
+
+
+def test_free_markers_beside_films_are_refused(filmed: Path) -> None:
+    with np.load(SAMPLE / "train_0.npz") as archive:
+        np.savez(filmed / "train_0.npz", **archive)
+    with pytest.raises(InputError, match="grippers only"):
+        load_recording(filmed)
+
+
+def _masks(filmed: Path, masks: np.ndarray) -> None:
+    (filmed / "train_0.a.mp4").unlink()
+    save_masks(masks, filmed / "train_0.a.npz")
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (lambda f: (f / "train_0.a.mp4").write_bytes(b""), "empty file"),
+        (lambda f: _masks(f, np.zeros((15, 480, 640), bool)), "never visible"),
+        (lambda f: _masks(f, np.zeros((15, 120, 160), bool)), "640 x 480"),
+        (lambda f: _masks(f, np.ones((6, 480, 640), bool)), "about 15 pictures"),
+        (lambda f: save_cameras([view_of_sample(fps=60.0)], f / "cameras.json"), "60 pictures per second"),
+        (lambda f: save_cameras([view_of_sample(start=-0.2)], f / "cameras.json"), "start with its trial"),
+        (lambda f: save_cameras([front(size=(320, 240))], f / "cameras.json"), "320 x 240"),
+        (lambda f: _color(f, None), "the rope's colour"),
+        (lambda f: _color(f, [220, 220, 220]), "stands out"),
+    ],
+)
+def test_films_that_cannot_be_used_are_refused(filmed: Path, spoil, message: str) -> None:
+    spoil(filmed)
+    recording = load_recording(filmed)
+    with pytest.raises(InputError, match=message) as caught:
+        views_of(recording, recording.train)
+    assert str(caught.value).startswith(str(filmed)) and "\n" not in str(caught.value)
+
+
+def _color(filmed: Path, color: list[int] | None) -> None:
+    import json
+
+    rope = json.loads((filmed / "rope.json").read_text())
+    rope["color"] = color
+    (filmed / "rope.json").write_text(json.dumps(rope))

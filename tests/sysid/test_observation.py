@@ -1,0 +1,123 @@
+"""Readings of films are lengths: none at the truth, as long as a rope is moved, and undone by the camera's numbers."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from tests.vision.scenes import front, hanging
+from torchdlo.sysid.estimation import levenberg_marquardt
+from torchdlo.sysid.observation import BlurredMasks, MarkerObservation, Spines, View, nuisances, over_time
+from torchdlo.vision.film import Look, film, off_camera
+from torchdlo.vision.pictures import quarter
+from torchdlo.vision.spine import spine
+
+STEP, PLACES = 0.02, 41
+
+
+def motion() -> np.ndarray:
+    """Places of a rope that swings, (1, 1, T, M, 3) [m]."""
+    time = np.arange(26) * STEP
+    swing = (
+        0.12
+        * np.sin(6 * time)[:, None, None]
+        * np.array([0.6, 0.2, 0.5])
+        * np.sin(np.linspace(0, np.pi, PLACES))[:, None]
+    )
+    return (hanging(PLACES) + swing)[None, None]
+
+
+def seen(camera, sims: np.ndarray) -> View:
+    """What a camera sees of it."""
+    masks = film(camera, np.arange(26) * STEP, sims[0, 0], 0.006, Look(exposure=0.0), frames=14).masks
+    lines = [spine(m, 48) for m in masks]
+    places, tangents = (np.stack(part)[None] for part in zip(*lines, strict=True))
+    return View(camera, np.ones((1, 14), bool), places, tangents, quarter(masks)[None], 3.2)
+
+
+@pytest.fixture(scope="module")
+def filmed() -> tuple[np.ndarray, View]:
+    sims = motion()
+    return sims, seen(front(), sims)
+
+
+def size(found: np.ndarray, target: np.ndarray) -> float:
+    """Root mean square of readings that were made [m]."""
+    return float(np.sqrt(np.mean(found[np.broadcast_to(np.isfinite(target), found.shape)] ** 2)))
+
+
+def none(observation) -> np.ndarray:
+    return np.zeros((1, len(observation.nuisances.names)))
+
+
+def test_readings_of_the_truth_are_parts_of_a_pixel(filmed: tuple[np.ndarray, View]) -> None:
+    sims, view = filmed
+    spines = Spines([view], STEP, 0.7, np.ones(PLACES, bool))
+    assert size(spines.read(sims, none(spines)), spines.target) < 4e-4  # a pixel is 1.9 mm
+
+
+@pytest.mark.parametrize("far", [2e-3, 2e-2])
+def test_readings_are_as_long_as_the_rope_is_moved(filmed: tuple[np.ndarray, View], far: float) -> None:
+    sims, view = filmed
+    spines = Spines([view], STEP, 0.7, np.ones(PLACES, bool))
+    # The middle of the rope is level: moved up, it is that far away.
+    moved = sims + np.array([0.0, 0.0, far])
+    found = np.where(np.isfinite(spines.target), spines.read(moved, none(spines))[0], np.nan)
+    across = found[0, 0, 96 + PLACES // 2, 0]
+    assert abs(abs(across) - far) < 0.12 * far + 3e-4
+
+
+def test_what_a_camera_is_off_is_undone_by_its_numbers(filmed: tuple[np.ndarray, View]) -> None:
+    sims, view = filmed
+    spines = Spines(
+        [replace(view, camera=off_camera(view.camera, np.random.default_rng(3)))], STEP, 0.7, np.ones(PLACES, bool)
+    )
+    space = spines.nuisances
+
+    def simulate(values: np.ndarray) -> np.ndarray:
+        return spines.read(np.repeat(sims, len(values), 0), values)
+
+    points = levenberg_marquardt.evaluate(simulate, spines.target, space, np.zeros((1, 8)), 0.7)
+    before = points[0].cost
+    for points in levenberg_marquardt.improve(simulate, spines.target, space, points, iterations=12, whole=0.7):  # noqa: B007, B020
+        pass
+    assert points[0].cost < 0.03 * before
+    true, found = view.camera.start, spines.views[0].camera.start + space.to_values(points[0].raw)[7]
+    assert abs(found - true) < 2e-3  # half a frame is 17 ms
+
+
+def test_priors_pull_where_nothing_else_does(filmed: tuple[np.ndarray, View]) -> None:
+    _, view = filmed
+    space = nuisances([view])
+    assert len(space.names) == 8 and space.names[-1] == "camera_a.clock" and space.units[-1] == pytest.approx(1 / 60)
+    spines = Spines([view], STEP, 0.7, np.ones(PLACES, bool))
+    found = spines.read(motion(), space.units[None])
+    priors = found[0, 0, 0, -16 * 8 :, 0]
+    assert (priors > 0).all() and np.allclose(priors, priors[0])
+
+
+def test_blurred_masks_still_pull_where_masks_do_not_overlap(filmed: tuple[np.ndarray, View]) -> None:
+    sims, view = filmed
+    blurred = BlurredMasks([view], STEP, 0.7, np.ones(PLACES, bool), 0.006, 2)
+    shifts = np.array([0.0, 0.01, 0.03, 0.06, 0.1])
+    moved = sims + shifts[:, None, None, None, None] * np.array([0.0, 0.0, 1.0])
+    cost = levenberg_marquardt.costs(blurred.read(moved, np.zeros((5, 8))), blurred.target, 0.7)
+    assert (np.diff(cost) > 0).all()
+
+
+def test_markers_are_an_observation_too() -> None:
+    markers = MarkerObservation(np.zeros((1, 2, 3, 3)), 1.0)
+    sims = np.ones((2, 1, 2, 3, 3))
+    assert markers.read(sims, np.zeros((2, 0))) is sims and not markers.nuisances.names
+
+
+def test_interpolation_in_time_is_cubic_and_stays_within_the_motion() -> None:
+    time = torch.arange(11, dtype=torch.float64) * 0.1
+    sims = (time**2)[None, None, :, None, None].expand(1, 1, 11, 2, 3)
+    at = torch.tensor([[0.0, 0.23, 0.5, 0.77, -1.0, 9.0]], dtype=torch.float64)
+    found = over_time(sims, 0.1, at)[0, 0, :, 0, 0]
+    torch.testing.assert_close(found[1:4], at[0, 1:4] ** 2)
+    assert float(found[4]) == 0.0 and float(found[5]) == pytest.approx(1.0)
