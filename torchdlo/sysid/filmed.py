@@ -290,6 +290,9 @@ def refine_start(own: Problem, values: np.ndarray, passes: int = 3) -> None:
     own.start = replace(fresh, discretisation_correction=start.discretisation_correction)
 
 
+_TURNS = 8
+"""How often starts in motion and numbers are improved in turns."""
+
 _PRIOR = 2e-5
 """What a squared standard deviation of a start costs [m], against the mean cost of readings."""
 
@@ -508,17 +511,22 @@ def calibrate_filmed(
     refine_start(own, first)
     raw = space.to_raw(first) if given is not None else scout(own, starts, np.random.default_rng(seed), report)
     stage = f"fitting {len(own.trials)} filmed trials"
-    report(stage, 0, 3, "")
-    for k, most in enumerate((4, 6, iterations)):
+    still = bool(own.start.still.all())
+    # Starts in motion and numbers of the rope are improved in turns.
+    rounds = 3 if still else _TURNS
+    report(stage, 0, rounds, "")
+    for k in range(rounds):
         values = space.to_values(raw)
-        if k:
+        late = k >= rounds - 2
+        if late:
             gate(own, values)
         refine_start(own, values)
-        if k:
+        if late:
             correct(own, values)
+        most = iterations if k == rounds - 1 else 5
         best = min(solve(own, raw[None], most), key=lambda p: p.cost)
         raw = best.raw
-        report(stage, k + 1, 3, f"{1e3 * best.cost:.2f} mm")
+        report(stage, k + 1, rounds, f"{1e3 * best.cost:.2f} mm")
     if not np.isfinite(best.cost):
         raise InputError(
             f"{recording.path}: the simulation failed on the train trials from every start; check length, mass, "
