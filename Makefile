@@ -11,6 +11,10 @@ demo: $(FILLED)  ## calibrate a rope to the recording in the package
 	$(BIN)/torchdlo calibrate torchdlo/data/sample_rope --out demo/model.json
 	@echo "Look at demo/report.html (its picture alone: demo/report.png)."
 
+demo-video: $(FILLED)  ## calibrate a rope to films of it
+	$(BIN)/torchdlo calibrate torchdlo/data/sample_film --out demo-video/model.json
+	@echo "Look at demo-video/report.html (its picture alone: demo-video/report.png)."
+
 test: $(FILLED)
 	$(BIN)/python -m pytest -n 2
 
@@ -28,7 +32,7 @@ lint: $(FILLED)
 	$(BIN)/ruff format --check .
 
 clean:
-	rm -rf $(VENV) demo build dist *.egg-info .pytest_cache .ruff_cache
+	rm -rf $(VENV) demo demo-video build dist *.egg-info .pytest_cache .ruff_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # Filled again when what it holds changes.

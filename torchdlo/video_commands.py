@@ -227,6 +227,7 @@ def film(
     ] = 0.0,
     trials: Annotated[int | None, typer.Option(min=1, help="Most trials of each split.")] = None,
     seconds: Annotated[float | None, typer.Option(min=0.1, help="Most seconds of each trial.")] = None,
+    quality: Annotated[int, typer.Option(min=0, max=51, help="Of H.264: 0 is lossless, 51 the smallest file.")] = 18,
     seed: Annotated[int, typer.Option(min=0, help="Of noise and faults.")] = 0,
 ) -> None:
     """Film a recording or a run through given cameras, by a rasteriser of its own: test data for what reads films.
@@ -252,6 +253,7 @@ def film(
                 from torchdlo.sysid.recordings.recording import load_recording
 
                 options: dict[str, Any] = {"masks": masks, "off": off, "trials": trials, "seconds": seconds}
+                options |= {"quality": quality}
                 said = film_recording(
                     load_recording(source), shown, out, look, radius=radius, **options, callback=callback
                 )

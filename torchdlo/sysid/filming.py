@@ -55,6 +55,7 @@ def film_recording(
     off: float = 0.0,
     trials: int | None = None,
     seconds: float | None = None,
+    quality: int = 18,
     callback: Callback | None = None,
 ) -> list[str]:
     """Write a recording whose trials have grippers and films; return sentences on what was made.
@@ -69,6 +70,7 @@ def film_recording(
         off: how far the cameras that are written down are off, see `vision.film.off_camera`.
         trials: most trials of each split.
         seconds: most seconds of each trial.
+        quality: of H.264, from 0 (lossless) to 51.
         callback: told (stage, films done, in all, message).
     """
     if recording.filmed:
@@ -108,7 +110,7 @@ def film_recording(
                 check_inside(camera, line)
                 own = replace(look, seed=look.seed + 1000 * k + j)
                 seen = film_rope(camera, trial.time, line, wide, own, held=held[0])
-                _write(seen, folder / f"{trial.name}.{camera.name}", camera, masks)
+                _write(seen, folder / f"{trial.name}.{camera.name}", camera, masks, quality)
                 done += 1
                 report("filming", done, len(chosen) * len(cameras), trial.name)
                 bad = zip(np.flatnonzero(seen.wrong), seen.kinds, strict=True)
@@ -186,12 +188,12 @@ def film_run(
     return said
 
 
-def _write(seen: Film, stem: Path, camera: Camera, masks: bool) -> Path:
+def _write(seen: Film, stem: Path, camera: Camera, masks: bool, quality: int = 18) -> Path:
     file = stem.with_name(stem.name + (".npz" if masks else ".mp4"))
     if masks:
         save_masks(seen.masks, file)
     else:
-        write_video(file, seen.pictures, camera.fps)
+        write_video(file, seen.pictures, camera.fps, quality=quality)
     return file
 
 

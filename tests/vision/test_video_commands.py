@@ -1,0 +1,77 @@
+"""The commands about cameras and films, as a person uses them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from tests.vision.scenes import front
+from tests.vision.test_calibrate_camera import BOARDS, filmed
+from tests.vision.test_segment import COLORS, swinging
+from torchdlo.cli.app import app
+from torchdlo.errors import InputError
+from torchdlo.sysid.recordings.recording import load_recording
+from torchdlo.vision.camera import load_cameras, looking_at, save_cameras
+from torchdlo.vision.segment import load_ranges, ranges_of
+from torchdlo.vision.video_file import write_video
+
+DATA = Path(__file__).parents[2] / "torchdlo" / "data"
+
+
+def run(*args: object) -> str:
+    done = CliRunner().invoke(app, [str(a) for a in args], catch_exceptions=False)
+    assert done.exit_code == 0, done.output
+    return done.output
+
+
+def test_a_camera_is_calibrated_and_added_to_others(tmp_path: Path) -> None:
+    filmed(BOARDS[0], tmp_path / "board.mp4", 8)
+    out = tmp_path / "cameras.json"
+    save_cameras([front()], out)
+    said = run(
+        "calibrate-camera", tmp_path / "board.mp4", "--board", "8x6", "--square", 0.03, "--name", "c", "--out", out
+    )
+    assert "reprojection error" in said and [c.name for c in load_cameras(out)] == ["a", "c"]
+    assert (tmp_path / "cameras_c.png").read_bytes().startswith(b"\x89PNG")
+    run("calibrate-camera", "-", "--board", "8x6", "--print-board", tmp_path / "board.png")
+    assert (tmp_path / "board.png").exists()
+    with pytest.raises(InputError, match="COLUMNSxROWS"):
+        run("calibrate-camera", tmp_path / "board.mp4", "--board", "8by6")
+
+
+def test_masks_are_made_by_a_colour(tmp_path: Path) -> None:
+    write_video(tmp_path / "film.mp4", swinging(8).pictures, 30.0)
+    color = ",".join(map(str, COLORS[0]))
+    where = ("--out", tmp_path / "segment.json", "--masks", tmp_path / "masks.npz")
+    said = run("segment", tmp_path / "film.mp4", "--color", color, *where)
+    assert "8 of 8 frames" in said and load_ranges(tmp_path / "segment.json") == ranges_of(COLORS[0])
+    with np.load(tmp_path / "masks.npz") as archive:
+        assert archive["masks"].shape == (8, 480, 640)
+    with pytest.raises(InputError, match="R,G,B"):
+        run("segment", tmp_path / "film.mp4", "--color", "green", "--out", tmp_path / "segment.json")
+
+
+def test_a_recording_is_filmed_and_checked(tmp_path: Path) -> None:
+    camera = looking_at("a", [0.15, -1.35, 1.0], [0.0, 0.0, 0.88], focal=650.0)
+    save_cameras([camera], tmp_path / "cameras.json")
+    common = ("film", DATA / "sample_rope", tmp_path / "cameras.json", "--trials", 1, "--seconds", 0.4)
+    said = run(*common, "--out", tmp_path / "filmed", "--wrong", 0.1, "--off", 1)
+    assert "wrong:" in said and load_recording(tmp_path / "filmed").filmed
+    assert load_cameras(tmp_path / "filmed" / "cameras.json")[0].fx != camera.fx
+    assert "can be used" in run("check", tmp_path / "filmed")
+    with pytest.raises(InputError, match="not an empty folder"):
+        run(*common, "--out", tmp_path / "filmed")
+    with pytest.raises(InputError, match="--bar"):
+        run(*common, "--out", tmp_path / "other", "--bar", "1,2")
+    assert not (tmp_path / "other").exists()
+
+
+def test_the_film_in_the_package_is_small_and_sound() -> None:
+    folder = DATA / "sample_film"
+    assert sum(f.stat().st_size for f in folder.iterdir()) < 300_000
+    assert load_recording(folder).filmed
+    with pytest.raises(InputError, match="does not"):
+        run("diagnose", folder)
