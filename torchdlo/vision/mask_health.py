@@ -20,6 +20,9 @@ _FEW = 0.5
 _SLIP = 6.0
 """Shift of the still background from which the camera has slipped [px]."""
 
+_CLEAR = 0.1
+"""Response of a phase correlation from which a shift is taken for one."""
+
 
 @dataclass(frozen=True)
 class Issue:
@@ -167,18 +170,22 @@ def _slip(pictures: np.ndarray, masks: np.ndarray) -> tuple[int, float] | None:
     first = grey(0)
     texture = float((first - cv2.GaussianBlur(first, (0, 0), 6))[still].std())
 
-    def shift(k: int) -> float:
+    def shift(k: int) -> np.ndarray:
+        """Return by how much a picture is shifted against the first [px], NaN where that is not clear."""
         (dx, dy), response = cv2.phaseCorrelate((first - first.mean()) * window, (grey(k) - first.mean()) * window)
-        return 2 * float(np.hypot(dx, dy)) if response > 0.05 else 0.0
+        return 2 * np.array([dx, dy]) if response > _CLEAR else np.full(2, np.nan)
 
     last = len(pictures) - 1
-    if texture < 1.0 or shift(last) < _SLIP or shift(last - 2) < _SLIP:
+    ends = np.array([shift(k) for k in (last, last - 1, last - 2)])
+    # A camera that has slipped stays where it is: all pictures at the end agree.
+    same = np.isfinite(ends).all() and np.abs(ends - ends[0]).max() < 2.0
+    if texture < 1.0 or not same or np.linalg.norm(ends[0]) < _SLIP:
         return None
     low, high = 0, last
     while high - low > 1:
         middle = (low + high) // 2
-        low, high = (low, middle) if shift(middle) >= _SLIP else (middle, high)
-    return high, shift(last)
+        low, high = (low, middle) if np.linalg.norm(shift(middle)) >= _SLIP else (middle, high)
+    return high, float(np.linalg.norm(ends[0]))
 
 
 def dropped(count: int, expected: float) -> Sequence[str]:
