@@ -506,7 +506,7 @@ def calibrate_filmed(
             fitted=tuple(sizes),
             options=options,
         )
-    count, space = len(own.free), own.space
+    space = own.space
     first = np.concatenate([own.fixed[list(own.free)], np.zeros(len(own.spines.nuisances.names))])
     refine_start(own, first)
     raw = space.to_raw(first) if given is not None else scout(own, starts, np.random.default_rng(seed), report)
@@ -514,19 +514,33 @@ def calibrate_filmed(
     still = bool(own.start.still.all())
     # Starts in motion and numbers of the rope are improved in turns.
     rounds = 3 if still else _TURNS
+    best, kept = None, (own.start, own.offset)
     report(stage, 0, rounds, "")
     for k in range(rounds):
         values = space.to_values(raw)
-        late = k >= rounds - 2
+        late = still and k >= rounds - 2
         if late:
             gate(own, values)
         refine_start(own, values)
         if late:
             correct(own, values)
         most = iterations if k == rounds - 1 else 5
-        best = min(solve(own, raw[None], most), key=lambda p: p.cost)
-        raw = best.raw
+        found = min(solve(own, raw[None], most), key=lambda p: p.cost)
+        if not still and best is not None and found.cost > 0.98 * best.cost:
+            # Starts that suit the first frames better do not suit the rest: those before were better.
+            own.start, own.offset = kept
+            break
+        best, raw, kept = found, found.raw, (own.start, own.offset)
         report(stage, k + 1, rounds, f"{1e3 * best.cost:.2f} mm")
+    if not still:
+        # With the starts that did best, wrong frames are taken out and finer simulations added.
+        for _ in range(2):
+            values = space.to_values(raw)
+            gate(own, values)
+            correct(own, values)
+            best = min(solve(own, raw[None], iterations), key=lambda p: p.cost)
+            raw = best.raw
+        report(stage, rounds, rounds, f"{1e3 * best.cost:.2f} mm")
     if not np.isfinite(best.cost):
         raise InputError(
             f"{recording.path}: the simulation failed on the train trials from every start; check length, mass, "
@@ -539,7 +553,6 @@ def calibrate_filmed(
     report("judging", 0, 1, "")
     result = _judged(recording, own, first, values, low, high, notes, seed, begun, report)
     report("judging", 1, 1, "")
-    del count
     return result
 
 
