@@ -634,6 +634,12 @@ def _judged(
 def _remarks(own: Problem, values: np.ndarray, low: np.ndarray, high: np.ndarray) -> list[str]:
     """Return what these views cannot test."""
     out = []
+    moving = [t.name for t, calm in zip(own.trials, own.start.still, strict=True) if not calm]
+    if moving:
+        out.append(
+            f"{', '.join(moving)} begin in motion, which is estimated from the first {_WINDOW:g} s alone: ranges do not "
+            "include what is wrong with that; film from rest where you can."
+        )
     for name, p, v, a, b in zip(own.space.names, own.space.params, values, low, high, strict=True):
         if not name.startswith("camera_") and p.scale == "log" and b / max(a, 1e-300) > 4:
             out.append(
