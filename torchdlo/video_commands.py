@@ -13,10 +13,11 @@ from torchdlo.errors import InputError
 from torchdlo.files import check_writable, write_atomically
 
 if TYPE_CHECKING:
+    from torchdlo.sysid.recordings.recording import Recording
     from torchdlo.vision.film import Look
     from torchdlo.vision.segment import Ranges
 
-__all__ = ["calibrate_camera", "film", "segment"]
+__all__ = ["calibrate_camera", "film", "print_films", "segment"]
 
 _INTERRUPTED = 130
 """Exit code after Ctrl-C, as shells have it."""
@@ -285,3 +286,18 @@ def _look(color: str, noise: float, blur: float, exposure: float, bar: str | Non
             raise InputError(f"--bar: expected 0 <= left < right <= 1 and 0 <= top < bottom <= 1, found {bar!r}.")
         place = (left, top, right, bottom)
     return Look((red, green, blue), noise=noise, blur=blur, exposure=exposure, bar=place, wrong=wrong, seed=seed)
+
+
+def print_films(recording: Recording) -> None:
+    """Say which pictures of a recording can be used."""
+    from torchdlo.sysid.footage import views_of
+
+    for split, trials in (("train", recording.train), ("test", recording.test)):
+        with progress() as callback:
+            views, notes = views_of(recording, trials, callback)
+        for view in views:
+            usable = f"{int(view.good.sum())} pictures of {len(trials)} trials can be used"
+            wide = f"the rope is {2 * view.half_width:.1f} px wide"
+            typer.echo(f"{split}, camera {view.camera.name}: {usable}, {wide}")
+        for note in notes:
+            typer.echo(note)

@@ -161,6 +161,7 @@ class _Filmed:
         self.views, self.step, self.extent = tuple(views), step, extent
         self.nuisances = nuisances(views)
         self.target = np.empty(0)
+        self.priors = slice(0, 0)
 
     def _finish(self, shape: tuple[int, ...], known: list[np.ndarray]) -> None:
         """Set the target: 0 where something was measured, and one reading of the priors per trial."""
@@ -170,6 +171,7 @@ class _Filmed:
         pictures = sum(v.good.sum(1) for v in self.views)
         # A squared reading counts one of `count`; a trial tells as much as `_INDEPENDENT` readings per picture.
         share = count / np.maximum(_INDEPENDENT * pictures * trials, 1)
+        self.priors = slice(target.shape[2], None)
         self._weight = _SURE * np.sqrt(share / _COPIES)
         prior = np.full((trials, frames, _COPIES * len(self.nuisances.names), 1), np.nan)
         prior[:, 0] = 0.0

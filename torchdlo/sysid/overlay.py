@@ -15,7 +15,7 @@ from torchdlo.vision.camera import NEAR
 from torchdlo.vision.rasterizer import coverage, successors
 
 if TYPE_CHECKING:
-    from torchdlo.sysid.filmed import Problem
+    from torchdlo.sysid.filmed_problem import Problem
 
 __all__ = ["drawn", "overlaps", "overlays"]
 

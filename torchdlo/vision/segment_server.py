@@ -26,8 +26,25 @@ _LARGEST = 10_000
 """Bytes of a request."""
 
 
-def segment_server(pictures: np.ndarray, ranges: Ranges, out: Path, *, port: int = 0) -> ThreadingHTTPServer:
-    """Return a server of the page; `serve_forever` runs it, its attribute `address` is what to open.
+class SegmentServer(ThreadingHTTPServer):
+    """Serves the page; `serve_forever` runs it."""
+
+    daemon_threads = True
+
+    def __init__(self, pictures: np.ndarray, ranges: Ranges, out: Path, port: int) -> None:
+        """Listen; see `segment_server`."""
+        super().__init__(("127.0.0.1", port), _Handler)
+        self.pictures, self.ranges, self.out = pictures, ranges, out
+        self.page = resources.files("torchdlo.vision").joinpath("segment_page.html").read_bytes()
+
+    @property
+    def address(self) -> str:
+        """What to open."""
+        return f"http://127.0.0.1:{self.server_port}/"
+
+
+def segment_server(pictures: np.ndarray, ranges: Ranges, out: Path, *, port: int = 0) -> SegmentServer:
+    """Return a server of the page.
 
     Args:
         pictures: RGB (F, H, W, 3) uint8.
@@ -35,96 +52,95 @@ def segment_server(pictures: np.ndarray, ranges: Ranges, out: Path, *, port: int
         out: file that Save writes.
         port: of the server; a free one if 0.
     """
-    page = resources.files("torchdlo.vision").joinpath("segment_page.html").read_bytes()
-
-    class Handler(BaseHTTPRequestHandler):
-        server_version = "torchdlo"
-        sys_version = ""
-
-        def log_message(self, *_: Any) -> None:
-            """Stay quiet."""
-
-        def do_GET(self) -> None:
-            if not self._trusted(False):
-                return
-            if self.path == "/":
-                self._send(page, "text/html; charset=utf-8")
-            elif self.path == "/state":
-                self._json({"frames": len(pictures), "ranges": asdict(ranges)})
-            else:
-                self._json({"error": "nothing here"}, HTTPStatus.NOT_FOUND)
-
-        def do_POST(self) -> None:
-            if not self._trusted(True):
-                return
-            try:
-                length = int(self.headers.get("Content-Length", ""))
-                if not 0 < length <= _LARGEST:
-                    raise ValueError("length")
-                content = json.loads(self.rfile.read(length))
-                answer = {"/mask": self._mask, "/pick": self._pick, "/save": self._save}[self.path](content)
-            except InputError as error:
-                self._json({"error": str(error)}, HTTPStatus.BAD_REQUEST)
-            except (KeyError, TypeError, ValueError, RecursionError):
-                self._json({"error": "not understood"}, HTTPStatus.BAD_REQUEST)
-            else:
-                self._json(answer)
-
-        def _mask(self, content: dict[str, Any]) -> dict[str, Any]:
-            picture = self._picture(content)
-            mask = color_masks(picture[None], ranges_from(content["ranges"], "ranges"))[0]
-            return {"picture": _jpeg(_marked(picture, mask)), "text": f"{int(mask.sum())} pixels marked"}
-
-        def _pick(self, content: dict[str, Any]) -> dict[str, Any]:
-            picture = self._picture(content)
-            x, y = (int(float(content[k]) * n) for k, n in (("x", picture.shape[1]), ("y", picture.shape[0])))
-            patch = picture[max(0, y - 2) : y + 3, max(0, x - 2) : x + 3].reshape(-1, 3)
-            if not len(patch):
-                return {"text": "outside"}
-            # The most colourful pixel: ropes are thin, and their edges mix with what is behind.
-            color = patch[np.ptp(patch.astype(int), axis=1).argmax()]
-            try:
-                return {"ranges": asdict(ranges_of(color.tolist()))}
-            except InputError:
-                return {"text": "this is grey: choose a place with colour"}
-
-        def _save(self, content: dict[str, Any]) -> dict[str, Any]:
-            save_ranges(ranges_from(content["ranges"], "ranges"), out)
-            return {"text": f"saved to {out}"}
-
-        def _picture(self, content: dict[str, Any]) -> np.ndarray:
-            return pictures[min(max(int(content["frame"]), 0), len(pictures) - 1)]
-
-        def _trusted(self, changes: bool) -> bool:
-            hosts = {f"{name}:{self.server.server_port}" for name in ("127.0.0.1", "localhost")}
-            origin = self.headers.get("Origin")
-            if self.headers.get("Host") in hosts and (
-                (origin is None and not changes) or origin in {f"http://{h}" for h in hosts}
-            ):
-                return True
-            self._json({"error": "only this machine's own page may ask"}, HTTPStatus.FORBIDDEN)
-            return False
-
-        def _json(self, content: dict[str, Any], status: HTTPStatus = HTTPStatus.OK) -> None:
-            self._send(json.dumps(content).encode(), "application/json", status)
-
-        def _send(self, body: bytes, kind: str, status: HTTPStatus = HTTPStatus.OK) -> None:
-            self.send_response(status)
-            self.send_header("Content-Type", kind)
-            self.send_header("Content-Length", str(len(body)))
-            self.send_header("Cache-Control", "no-store")
-            self.send_header("X-Content-Type-Options", "nosniff")
-            policy = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'"
-            self.send_header("Content-Security-Policy", policy + "; connect-src 'self'; frame-ancestors 'none'")
-            self.end_headers()
-            self.wfile.write(body)
-
     try:
-        server = ThreadingHTTPServer(("127.0.0.1", port), Handler)
+        return SegmentServer(pictures, ranges, out, port)
     except OSError as error:
         raise InputError(f"port {port}: expected a free one, but it cannot be used ({error.strerror}).") from None
-    server.address = f"http://127.0.0.1:{server.server_port}/"
-    return server
+
+
+class _Handler(BaseHTTPRequestHandler):
+    server: SegmentServer
+    server_version = "torchdlo"
+    sys_version = ""
+
+    def log_message(self, *_: Any) -> None:
+        """Stay quiet."""
+
+    def do_GET(self) -> None:
+        if not self._trusted(False):
+            return
+        if self.path == "/":
+            self._send(self.server.page, "text/html; charset=utf-8")
+        elif self.path == "/state":
+            self._json({"frames": len(self.server.pictures), "ranges": asdict(self.server.ranges)})
+        else:
+            self._json({"error": "nothing here"}, HTTPStatus.NOT_FOUND)
+
+    def do_POST(self) -> None:
+        if not self._trusted(True):
+            return
+        try:
+            length = int(self.headers.get("Content-Length", ""))
+            if not 0 < length <= _LARGEST:
+                raise ValueError("length")
+            content = json.loads(self.rfile.read(length))
+            answer = {"/mask": self._mask, "/pick": self._pick, "/save": self._save}[self.path](content)
+        except InputError as error:
+            self._json({"error": str(error)}, HTTPStatus.BAD_REQUEST)
+        except (KeyError, TypeError, ValueError, RecursionError):
+            self._json({"error": "not understood"}, HTTPStatus.BAD_REQUEST)
+        else:
+            self._json(answer)
+
+    def _mask(self, content: dict[str, Any]) -> dict[str, Any]:
+        picture = self._picture(content)
+        mask = color_masks(picture[None], ranges_from(content["ranges"], "ranges"))[0]
+        return {"picture": _jpeg(_marked(picture, mask)), "text": f"{int(mask.sum())} pixels marked"}
+
+    def _pick(self, content: dict[str, Any]) -> dict[str, Any]:
+        picture = self._picture(content)
+        x, y = (int(float(content[k]) * n) for k, n in (("x", picture.shape[1]), ("y", picture.shape[0])))
+        patch = picture[max(0, y - 2) : y + 3, max(0, x - 2) : x + 3].reshape(-1, 3)
+        if not len(patch):
+            return {"text": "outside"}
+        # The most colourful pixel: ropes are thin, and their edges mix with what is behind.
+        color = patch[np.ptp(patch.astype(int), axis=1).argmax()]
+        try:
+            return {"ranges": asdict(ranges_of(color.tolist()))}
+        except InputError:
+            return {"text": "this is grey: choose a place with colour"}
+
+    def _save(self, content: dict[str, Any]) -> dict[str, Any]:
+        save_ranges(ranges_from(content["ranges"], "ranges"), self.server.out)
+        return {"text": f"saved to {self.server.out}"}
+
+    def _picture(self, content: dict[str, Any]) -> np.ndarray:
+        pictures = self.server.pictures
+        return pictures[min(max(int(content["frame"]), 0), len(pictures) - 1)]
+
+    def _trusted(self, changes: bool) -> bool:
+        """Return whether it was this page that asked, for something that changes nothing or also for that."""
+        hosts = {f"{name}:{self.server.server_port}" for name in ("127.0.0.1", "localhost")}
+        origin = self.headers.get("Origin")
+        own = origin in {f"http://{h}" for h in hosts} or (origin is None and not changes)
+        if self.headers.get("Host") in hosts and own:
+            return True
+        self._json({"error": "only this machine's own page may ask"}, HTTPStatus.FORBIDDEN)
+        return False
+
+    def _json(self, content: dict[str, Any], status: HTTPStatus = HTTPStatus.OK) -> None:
+        self._send(json.dumps(content).encode(), "application/json", status)
+
+    def _send(self, body: bytes, kind: str, status: HTTPStatus = HTTPStatus.OK) -> None:
+        self.send_response(status)
+        self.send_header("Content-Type", kind)
+        self.send_header("Content-Length", str(len(body)))
+        self.send_header("Cache-Control", "no-store")
+        self.send_header("X-Content-Type-Options", "nosniff")
+        policy = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'"
+        self.send_header("Content-Security-Policy", policy + "; connect-src 'self'; frame-ancestors 'none'")
+        self.end_headers()
+        self.wfile.write(body)
 
 
 def _marked(picture: np.ndarray, mask: np.ndarray) -> np.ndarray:

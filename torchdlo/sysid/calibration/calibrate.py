@@ -16,6 +16,7 @@ from torchdlo.sysid.estimation.checkpoint import Checkpoint
 from torchdlo.sysid.estimation.levenberg_marquardt import ParameterSpace, Point
 from torchdlo.sysid.estimation.result import Calibration
 from torchdlo.sysid.estimation.worker_pool import Pool
+from torchdlo.sysid.filmed import FILMED_STARTS, calibrate_filmed
 from torchdlo.sysid.model import initial_state as starts_of
 from torchdlo.sysid.model import model_file
 from torchdlo.sysid.model.model_file import ModelFile
@@ -102,6 +103,11 @@ def calibrate(
     Raises:
         InputError: the recording cannot be calibrated with these options.
     """
+    if recording.filmed:
+        if rest == "given" or resume:
+            raise InputError(f"{recording.path}: expected neither --rest given nor --resume for films.")
+        options: dict[str, Any] = {"seed": seed, "vertices": vertices, "given": given, "callback": callback}
+        return calibrate_filmed(recording, starts=min(starts, FILMED_STARTS), iterations=iterations, **options)
     begun = time.perf_counter()
     if rest not in ("auto", "straight", "given"):
         raise InputError(f"rest is {rest!r}; expected auto, straight or given.")

@@ -101,8 +101,12 @@ class Recording:
         return tuple(named[name] for name in split)
 
 
-def load_recording(path: str | Path) -> Recording:
+def load_recording(path: str | Path, *, films: bool = True) -> Recording:
     """Read and check a recording folder.
+
+    Args:
+        path: the folder.
+        films: whether films will do in the place of markers.
 
     Raises:
         InputError: The folder or a file in it is not as the format says.
@@ -110,8 +114,12 @@ def load_recording(path: str | Path) -> Recording:
     path = Path(path)
     files = rope_schema.trial_files(path)
     rope = rope_schema.check_rope(path / "rope.json")
-    films = film_files(path, [f.stem for split in files.values() for f in split])
-    trials = {split: tuple(_load_trial(f, rope["length"], films) for f in files[split]) for split in files}
+    found = film_files(path, [f.stem for split in files.values() for f in split])
+    if found and not films:
+        raise InputError(
+            f"{path}: expected markers, found films; this command does not take those yet, calibrate does."
+        )
+    trials = {split: tuple(_load_trial(f, rope["length"], found) for f in files[split]) for split in files}
     _check_together(path, rope, trials["train"] + trials["test"])
     return Recording(path=path, **rope, **trials)
 

@@ -1,0 +1,186 @@
+"""The problem of fitting a model to films: what is simulated, where it begins, and what is read of it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from torchdlo.sysid.diagnosis.error_floor import Refinement, refinement
+from torchdlo.sysid.estimation import levenberg_marquardt
+from torchdlo.sysid.estimation.levenberg_marquardt import ParameterSpace
+from torchdlo.sysid.model.rope_model import RopeModel
+from torchdlo.sysid.model.trial_batch import Start, TrialBatch
+from torchdlo.sysid.observation import Spines, View
+from torchdlo.sysid.recordings.recording import Recording, Trial
+from torchdlo.sysid.recordings.trivial_predictors import catenary
+
+__all__ = ["Problem", "correct", "problem", "start_of"]
+
+_CALM = 0.03
+"""Speed of a gripper below which it is at rest [m/s]."""
+
+
+@dataclass(eq=False)
+class Problem:
+    """A model, trials, and what films show of them."""
+
+    model: RopeModel
+    trials: tuple[Trial, ...]
+    motion: TrialBatch
+    spines: Spines
+    start: Start
+    free: tuple[int, ...]
+    """Columns of the model's numbers that are fitted."""
+    fixed: np.ndarray
+    """All of the model's numbers, shape (K,)."""
+    dropped: dict[str, list[int]]
+    """Wrong frames by trial and camera."""
+    options: dict[str, Any] = field(default_factory=dict)
+    """Of the model."""
+    discretisation_correction: Refinement | None = None
+    """What finer simulations change, if it is known."""
+    offset: np.ndarray | None = None
+    """How starts differ from balance, by trial, see `refine_start`."""
+
+    @property
+    def space(self) -> ParameterSpace:
+        """Numbers of the rope, then those of the cameras."""
+        names, params = self.model.parameters, self.model.params
+        own, other = [names[k] for k in self.free], self.spines.nuisances
+        sizes = []
+        for k in self.free:
+            p = params[k]
+            sizes.append(1.0 if p.scale == "log" else abs(self.fixed[k]) or 0.1 * (p.high - p.low))
+        return ParameterSpace(
+            (*own, *other.names), (*[params[k] for k in self.free], *other.params), (*sizes, *other.units.tolist())
+        )
+
+    @property
+    def extent(self) -> float:
+        """How far the rope moves [m]."""
+        return self.spines.extent
+
+    def full(self, values: np.ndarray) -> np.ndarray:
+        """Return all numbers of the model, (P, K), for fitted ones, (P, K + Q)."""
+        out = np.repeat(self.fixed[None], len(values), 0)
+        out[:, list(self.free)] = values[:, : len(self.free)]
+        return out
+
+    def simulate(self, values: np.ndarray, frames: int | None = None) -> np.ndarray:
+        """Return simulated places (P, B, T, M, 3); rows that differ in their cameras only are simulated once."""
+        rows, back = np.unique(self.full(values), axis=0, return_inverse=True)
+        return self.model.simulate(self.motion, self.start, rows, frames=frames)[back.ravel()]
+
+    def readings(self, seconds: float | None = None) -> tuple[levenberg_marquardt.Simulate, np.ndarray]:
+        """Return what maps numbers to readings, and their targets, over the first seconds."""
+        target, frames = self.spines.target, None
+        if seconds is not None:
+            frames = min(self.motion.markers.shape[1], int(np.ceil(seconds / self.model.dt)) + 4)
+            target = target.copy()
+            late = np.arange(target.shape[1]) / self.spines.views[0].camera.fps > seconds
+            target[:, late] = np.nan
+
+        def read(values: np.ndarray) -> np.ndarray:
+            return self.spines.read(self.simulate(values, frames), values[:, len(self.free) :])
+
+        return read, target
+
+
+def start_of(model: RopeModel, trials: Sequence[Trial], views: Sequence[View]) -> Start:
+    """Return where trials begin: hanging between the grippers, at rest if those are and pictures do not change."""
+    pos, vel, still = [], [], []
+    recording = model.recording
+    for b, trial in enumerate(trials):
+        shape = catenary(trial, recording)
+        pos.append(_placed(shape[0], trial, recording))
+        frames = max(3, min(len(trial.time), round(0.05 / model.dt) + 1))
+        speed = (shape[frames - 1] - shape[0]) / (trial.time[frames - 1] - trial.time[0])
+        held = trial.markers[:frames, trial.gripped]
+        quick = np.linalg.norm(held[-1] - held[0], axis=-1).max() / (trial.time[frames - 1] - trial.time[0])
+        calm = quick < _CALM and all(_unchanged(view, b) for view in views)
+        vel.append(0 * speed if calm else speed)
+        still.append(calm)
+    return Start(np.stack(pos), np.stack(vel), np.array(still))
+
+
+def _unchanged(view: View, b: int) -> bool:
+    """Return whether the centre line stays where it is in the first good pictures of a trial."""
+    rows = np.flatnonzero(view.good[b])[:3]
+    if len(rows) < 2:
+        return False
+    first, later = (view.places[b, k] for k in (rows[0], rows[-1]))
+    first, later = (p[np.isfinite(p).all(1)] for p in (first, later))
+    if not len(first) or not len(later):
+        return False
+    away = np.linalg.norm(first[:, None] - later[None], axis=-1).min(1)
+    return bool(np.median(away) < 3.0)
+
+
+def _placed(shape: np.ndarray, trial: Trial, recording: Recording) -> np.ndarray:
+    """Return places (M, 3) of a rope that may lie on a table: a free end is laid out along its gripper's direction."""
+    if recording.table_height is None:
+        return shape
+    floor = recording.table_height + (recording.radius or 0.005)
+    held = np.flatnonzero(trial.gripped)
+    at, out = trial.marker_arclength, shape.copy()
+    for last, inner, free in (
+        (held[-1], held[-2:][0], slice(held[-1] + 1, None)),
+        (held[0], held[:2][-1], slice(0, held[0])),
+    ):
+        if last == inner or not len(out[free]):
+            continue
+        way = trial.markers[0, last] - trial.markers[0, inner]
+        way = way / np.linalg.norm(way)
+        out[free] = trial.markers[0, last] + np.abs(at[free] - at[last])[:, None] * way
+    out[:, 2] = np.maximum(out[:, 2], floor)
+    return out
+
+
+def problem(
+    recording: Recording,
+    trials: Sequence[Trial],
+    views: Sequence[View],
+    *,
+    effects: Sequence[str] = (),
+    values: np.ndarray | None = None,
+    fitted: Sequence[str] | None = None,
+    options: dict[str, Any] | None = None,
+) -> Problem:
+    """Return the problem of fitting a model to films.
+
+    Args:
+        recording: the rope.
+        trials: which of its trials.
+        views: what cameras saw of those.
+        effects: besides the baseline.
+        values: numbers to start from, shape (K,); the model's guess if not given.
+        fitted: numbers to fit; all if not given.
+        options: of the model.
+    """
+    model = RopeModel(recording, effects=effects, **(options or {}))
+    free = np.ones(model.count, bool)
+    free[model.gripped] = False
+    spines = Spines(views, model.dt, recording.length, free)
+    names = model.parameters if fitted is None else fitted
+    columns = tuple(k for k, n in enumerate(model.parameters) if n in names)
+    first = model.guess() if values is None else np.asarray(values, dtype=float)
+    begin = start_of(model, trials, views)
+    known = dict(options or {})
+    return Problem(model, tuple(trials), model.motion(trials), spines, begin, columns, first, {}, known)
+
+
+def correct(own: Problem, values: np.ndarray) -> None:
+    """Add to simulations from now on what finer steps and a finer mesh change at these numbers (K + Q,)."""
+    model, begin = own.model, replace(own.start, discretisation_correction=None)
+    half = {"substep": model.dt / (2 * model.substeps)}
+    fine = half | {"vertices": 2 * len(model.arclength) - 1}
+    row, sims = own.full(values[None]), []
+    for more in (fine, half, {}):
+        each = RopeModel(model.recording, effects=model.effects, **(own.options | more)) if more else model
+        sims.append(each.simulate(each.motion(own.trials), begin, row)[0])
+    edge = float(np.mean(np.diff(model.arclength)))
+    own.discretisation_correction = refinement(sims[0], sims[1], sims[2], model.numerical_damping, edge)
+    own.start = replace(own.start, discretisation_correction=own.discretisation_correction.correction)
