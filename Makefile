@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 FILLED := $(VENV)/.filled
 export OMP_NUM_THREADS := 1
 
-.PHONY: demo test quick bench lint wheel clean
+.PHONY: demo demo-video test quick bench lint wheel clean
 
 demo: $(FILLED)  ## calibrate a rope to the recording in the package
 	$(BIN)/torchdlo calibrate torchdlo/data/sample_rope --out demo/model.json

@@ -9,9 +9,9 @@ import pytest
 
 from tests.vision.scenes import front
 from torchdlo.errors import InputError
-from torchdlo.sysid.filming import film_recording
-from torchdlo.sysid.footage import views_of
 from torchdlo.sysid.recordings.recording import load_recording
+from torchdlo.sysid.video.filming import film_recording
+from torchdlo.sysid.video.footage import views_of
 from torchdlo.vision.camera import looking_at, save_cameras
 from torchdlo.vision.film import Look
 from torchdlo.vision.segment import save_masks

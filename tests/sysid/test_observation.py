@@ -10,7 +10,7 @@ import torch
 
 from tests.vision.scenes import front, hanging
 from torchdlo.sysid.estimation import levenberg_marquardt
-from torchdlo.sysid.observation import BlurredMasks, MarkerObservation, Spines, View, nuisances, over_time
+from torchdlo.sysid.estimation.observation import BlurredMasks, MarkerObservation, Spines, View, nuisances, over_time
 from torchdlo.vision.film import Look, film, off_camera
 from torchdlo.vision.pictures import quarter
 from torchdlo.vision.spine import spine

@@ -17,6 +17,7 @@ from torchdlo.cli.recordings import check, import_deform
 from torchdlo.cli.sample import sample
 from torchdlo.cli.scenes import simulate, view
 from torchdlo.cli.tasks import optimize, play, tasks
+from torchdlo.cli.video import calibrate_camera, film, segment
 from torchdlo.errors import InputError
 
 __all__ = ["app", "main"]
@@ -70,6 +71,9 @@ app.command()(plan)
 app.command()(train)
 app.command()(evaluate)
 app.command()(deploy)
+app.command("calibrate-camera")(calibrate_camera)
+app.command()(segment)
+app.command()(film)
 app.command()(sample)
 app.command()(doctor)
 

@@ -133,7 +133,7 @@ def diagnose(
     from torchdlo.sysid.diagnosis.search import diagnose as search
     from torchdlo.sysid.recordings.recording import load_recording
 
-    loaded = load_recording(recording)
+    loaded = load_recording(recording, films=False)
     out = out or Path("runs") / "diagnose" / recording.resolve().name
     names = ("findings.json", "model.json", report.PAGE)
     for name in names:
@@ -209,7 +209,7 @@ def design_experiment(
     from torchdlo.sysid.experiment_design import design as designs
     from torchdlo.sysid.recordings.recording import load_recording
 
-    loaded = load_recording(recording)
+    loaded = load_recording(recording, films=False)
     asked, name = [n.strip() for n in effects.split(",") if n.strip()], recording.resolve().name
     if findings is None and not asked:
         findings = Path("runs") / "diagnose" / name

@@ -10,6 +10,7 @@ import typer
 
 from torchdlo.cli.options import RecordingArgument
 from torchdlo.cli.progress import progress
+from torchdlo.cli.video import print_films
 from torchdlo.errors import InputError
 
 if TYPE_CHECKING:
@@ -33,7 +34,10 @@ def check(recording: RecordingArgument) -> None:
     loaded = load_recording(recording)
     console = Console(soft_wrap=True)
     console.print(_rope_line(loaded), highlight=False, markup=False)
-    console.print(_trial_table(loaded))
+    if loaded.filmed:
+        print_films(loaded)
+    else:
+        console.print(_trial_table(loaded))
 
 
 def import_deform(

@@ -210,7 +210,7 @@ def optimize(
     )
 
 
-def _begun(plan: SearchPlan, settings: Settings, first: Tensor) -> tuple[SearchPlan, str]:
+def _begun(plan: SearchPlan, settings: SearchSettings, first: Tensor) -> tuple[SearchPlan, str]:
     """Return the plan of a search that begins with trajectories (K, T, A), and their hash."""
     if settings.method == "gd":
         raise InputError("gd begins with nothing that is given; use cmaes or hybrid.")

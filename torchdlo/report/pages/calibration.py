@@ -8,7 +8,6 @@ import math
 from pathlib import Path
 
 from torchdlo.files import write_atomically
-from torchdlo.report import filmed
 from torchdlo.report.figures.calibration_figure import calibration_png
 from torchdlo.report.pages.page import STYLE, number, page, table, words
 from torchdlo.sysid.estimation.result import Calibration, versions

@@ -16,13 +16,13 @@ from torchdlo.sysid.estimation.checkpoint import Checkpoint
 from torchdlo.sysid.estimation.levenberg_marquardt import ParameterSpace, Point
 from torchdlo.sysid.estimation.result import Calibration
 from torchdlo.sysid.estimation.worker_pool import Pool
-from torchdlo.sysid.filmed import FILMED_STARTS, calibrate_filmed
 from torchdlo.sysid.model import initial_state as starts_of
 from torchdlo.sysid.model import model_file
 from torchdlo.sysid.model.model_file import ModelFile
 from torchdlo.sysid.model.rope_model import RopeModel
 from torchdlo.sysid.model.trial_batch import Start, TrialBatch
 from torchdlo.sysid.recordings.recording import Recording, Trial
+from torchdlo.sysid.video.filmed import FILMED_STARTS, calibrate_filmed
 
 Callback = Callable[[str, int, int, str], None]
 """Called with stage, steps done, steps in all, and a word on how it goes."""

@@ -17,8 +17,8 @@ import numpy as np
 
 from torchdlo.errors import InputError
 from torchdlo.files import replacing
-from torchdlo.sysid.films import FilmFile, film_files, with_stations
 from torchdlo.sysid.recordings import rope_schema
+from torchdlo.sysid.video.films import FilmFile, film_files, with_stations
 
 __all__ = [
     "Recording",

@@ -7,15 +7,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
+from torchdlo.sysid.estimation.observation import PER_CAMERA, seen_by
 from torchdlo.sysid.estimation.result import Overlay
-from torchdlo.sysid.footage import masks_of
-from torchdlo.sysid.observation import PER_CAMERA, seen_by
 from torchdlo.sysid.recordings.recording import Recording
+from torchdlo.sysid.video.footage import masks_of
 from torchdlo.vision.camera import NEAR
 from torchdlo.vision.rasterizer import coverage, successors
 
 if TYPE_CHECKING:
-    from torchdlo.sysid.filmed_problem import Problem
+    from torchdlo.sysid.video.filmed_problem import Problem
 
 __all__ = ["drawn", "overlaps", "overlays"]
 

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 
 from torchdlo.errors import InputError
-from torchdlo.sysid.films import FilmFile
-from torchdlo.sysid.observation import View
+from torchdlo.sysid.estimation.observation import View
 from torchdlo.sysid.recordings.recording import Recording, Trial
+from torchdlo.sysid.video.films import FilmFile
 from torchdlo.vision.mask_health import check_masks
 from torchdlo.vision.pictures import quarter
 from torchdlo.vision.segment import Ranges, color_masks, load_film, load_ranges, ranges_of

@@ -10,9 +10,9 @@ import numpy as np
 
 from torchdlo.sysid.estimation import levenberg_marquardt
 from torchdlo.sysid.estimation.levenberg_marquardt import Point
-from torchdlo.sysid.filmed_problem import Problem
-from torchdlo.sysid.filmed_start import refine_start
-from torchdlo.sysid.observation import Spines, View
+from torchdlo.sysid.estimation.observation import Spines, View
+from torchdlo.sysid.video.filmed_problem import Problem
+from torchdlo.sysid.video.filmed_start import refine_start
 
 __all__ = ["gate", "intervals", "picture_errors", "scout", "solve"]
 

@@ -241,8 +241,8 @@ def film(
 
     torchdlo film runs/lift cameras.json --out films --masks
     """
-    from torchdlo.sysid.filming import film_recording, film_run
     from torchdlo.sysid.recordings.recording import check_new_folder
+    from torchdlo.sysid.video.filming import film_recording, film_run
     from torchdlo.vision.camera import load_cameras
 
     shown = load_cameras(cameras)
@@ -290,7 +290,7 @@ def _look(color: str, noise: float, blur: float, exposure: float, bar: str | Non
 
 def print_films(recording: Recording) -> None:
     """Say which pictures of a recording can be used."""
-    from torchdlo.sysid.footage import views_of
+    from torchdlo.sysid.video.footage import views_of
 
     for split, trials in (("train", recording.train), ("test", recording.test)):
         with progress() as callback:

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 
 from torchdlo.sysid.estimation import levenberg_marquardt
-from torchdlo.sysid.filmed_problem import Problem, start_of
 from torchdlo.sysid.model import equilibrium
 from torchdlo.sysid.model.trial_batch import Start
+from torchdlo.sysid.video.filmed_problem import Problem, start_of
 
 __all__ = ["WINDOW", "refine_start"]
 

@@ -11,9 +11,9 @@ import numpy as np
 from torchdlo.sysid.diagnosis.error_floor import Refinement, refinement
 from torchdlo.sysid.estimation import levenberg_marquardt
 from torchdlo.sysid.estimation.levenberg_marquardt import ParameterSpace
+from torchdlo.sysid.estimation.observation import Spines, View
 from torchdlo.sysid.model.rope_model import RopeModel
 from torchdlo.sysid.model.trial_batch import Start, TrialBatch
-from torchdlo.sysid.observation import Spines, View
 from torchdlo.sysid.recordings.recording import Recording, Trial
 from torchdlo.sysid.recordings.trivial_predictors import catenary
 

@@ -18,16 +18,16 @@ import numpy as np
 from torchdlo.errors import InputError
 from torchdlo.sysid.diagnosis.budget import options as suited
 from torchdlo.sysid.estimation.levenberg_marquardt import Point
+from torchdlo.sysid.estimation.observation import Spines, View
 from torchdlo.sysid.estimation.result import Calibration, Overlay
-from torchdlo.sysid.filmed_problem import Problem, correct, problem, start_of
-from torchdlo.sysid.filmed_search import gate, intervals, picture_errors, scout, solve
-from torchdlo.sysid.filmed_start import WINDOW, refine_start
-from torchdlo.sysid.footage import views_of
 from torchdlo.sysid.model import model_file
 from torchdlo.sysid.model.model_file import ModelFile
-from torchdlo.sysid.observation import Spines, View
-from torchdlo.sysid.overlay import overlaps, overlays
 from torchdlo.sysid.recordings.recording import Recording
+from torchdlo.sysid.video.filmed_problem import Problem, correct, problem, start_of
+from torchdlo.sysid.video.filmed_search import gate, intervals, picture_errors, scout, solve
+from torchdlo.sysid.video.filmed_start import WINDOW, refine_start
+from torchdlo.sysid.video.footage import views_of
+from torchdlo.sysid.video.overlay import overlaps, overlays
 
 __all__ = ["FILMED_STARTS", "calibrate_filmed"]
 

@@ -1,0 +1,1 @@
+"""Calibration from films: readings of pictures, starts, cameras and clocks as nuisances."""
