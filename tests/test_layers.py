@@ -22,7 +22,6 @@ FLOORS = {
     "files": 1,
     "physics": 2,
     "coupling": 3,
-    "vision": 3,
     "scene": 4,
     "vision": 4.5,
     "reward_language": 4,
@@ -47,16 +46,15 @@ ALLOWED = {
     "files": set(),
     "physics": TORCH | {"triton"},  # comes with the CUDA builds of torch
     "coupling": TORCH | {"pytorch_kinematics", "trimesh"},
-    "vision": ARRAYS | {"kornia", "cv2", "av", "matplotlib"},
     "scene": TORCH,
-    "vision": ARRAYS | {"kornia", "cv2", "av"},
+    "vision": ARRAYS | {"kornia", "cv2", "av", "matplotlib"},
     "reward_language": TORCH,
     "scene_files": ARRAYS,
     "sysid": ARRAYS,
     "envs": LEARNING | {"pytorch_kinematics", "trimesh"},
     "agents": LEARNING | {"cma", "numpy", "scipy", "openai", "httpx", "httpx2", "pydantic", "pyarrow", "av"},
-    "report": ARRAYS | {"matplotlib", "pyvista", "vtk", "av", "viser", "mitsuba", "pyoidn"},
-    "cli": LEARNING | ARRAYS | {"rich", "typer", "av", "packaging"},
+    "report": ARRAYS | {"matplotlib", "pyvista", "vtk", "av", "viser", "mitsuba", "pyoidn", "PIL"},
+    "cli": LEARNING | ARRAYS | {"rich", "typer", "av", "cv2", "packaging"},
     "__main__": set(),
     "": TORCH,  # torchdlo/__init__.py
 }

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from torchdlo.files import write_atomically
 from torchdlo.report.figures.calibration_figure import calibration_png
+from torchdlo.report.pages import films
 from torchdlo.report.pages.page import STYLE, number, page, table, words
 from torchdlo.sysid.estimation.result import Calibration, versions
 from torchdlo.sysid.recordings.recording import Recording
@@ -32,7 +33,7 @@ def write_report(result: Calibration, recording: Recording, folder: Path, *, com
         Paths of the page and of the picture.
     """
     if recording.filmed:
-        return filmed.write_report(result, recording, folder, command=command)
+        return films.write_report(result, recording, folder, command=command)
     png = calibration_png(result, recording)
     page = calibration_html(result, recording, png, command=command)
     write_atomically(folder / PICTURE, png)
@@ -43,7 +44,7 @@ def write_report(result: Calibration, recording: Recording, folder: Path, *, com
 def verdict(result: Calibration, recording: Recording) -> str:
     """The result in one sentence."""
     if recording.filmed:
-        return filmed.verdict(result, recording)
+        return films.verdict(result, recording)
     others = ", ".join(f"{words(name)} {_mm(values['test_mae_mm'])}" for name, values in result.baselines.items())
     summary = (
         f"Calibrated on {_trials(len(recording.train))}; error on unseen trials "
