@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from torchdlo.envs.assets.rope_material import RopeMaterial
+from torchdlo.envs.coiling_about import CoilingLeft, CoilingRight
 from torchdlo.envs.core.fidelity import PUBLISHED, Fidelity, parse_fidelity
 from torchdlo.envs.core.task import Task
 from torchdlo.envs.tasks.coiling import Coiling
@@ -42,7 +43,11 @@ TASKS: dict[str, type[Task]] = {
     "wrapping": Wrapping,
 }
 
+PAIRED_TASKS: dict[str, type[Task]] = {"coiling_left": CoilingLeft, "coiling_right": CoilingRight}
+"""Tasks beside the benchmark's that share a scene: only words tell which of them is meant."""
+
 __all__ = [
+    "PAIRED_TASKS",
     "PUBLISHED",
     "TASKS",
     "Fidelity",
@@ -58,9 +63,10 @@ __all__ = [
 
 def find(name: str, rope: RopeMaterial | None = None, grasps: Sequence[int | None] | None = None) -> Task:
     """Return a task by its name, with its ropes made of a cable and held at other vertices if these are given."""
-    if name not in TASKS:
-        raise InputError(f"there is no task {name!r}; expected one of {', '.join(sorted(TASKS))}.")
-    task = TASKS[name]()
+    known = TASKS | PAIRED_TASKS
+    if name not in known:
+        raise InputError(f"there is no task {name!r}; expected one of {', '.join(sorted(known))}.")
+    task = known[name]()
     task = task if rope is None else dataclasses.replace(task, rope=rope)
     return task if grasps is None else dataclasses.replace(task, grasps=tuple(grasps))
 

@@ -38,6 +38,7 @@ __all__ = [
     "EpisodeState",
     "act",
     "begin",
+    "follow",
     "normalized",
     "observe",
     "places",
@@ -245,6 +246,12 @@ def _aim(task: Task, world: EpisodeState, action: Tensor) -> Pose:
     height = torch.where(pos[..., 2:] >= least, pos[..., 2:], least)
     quat = multiply(world.target.quat, turn_by(turn))
     return Pose(torch.cat([pos[..., :2], height], -1), quat / quat.square().sum(-1, keepdim=True).sqrt())
+
+
+def follow(task: Task, world: EpisodeState, action: Tensor) -> tuple[Pose, Tensor]:
+    """Return the poses that an action asks the tools to take, and joints that bring them there, shape (B, R, J)."""
+    aim = _aim(task, world, action)
+    return aim, solve(task, aim, world.joints, FOLLOW).joints
 
 
 def act(episode: Episode, world: EpisodeState, action: Tensor) -> EpisodeState:

@@ -1,0 +1,248 @@
+"""Recording demonstrations: episodes are played in batches, and each becomes the frames of a data set."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchdlo.agents.data import sentences
+from torchdlo.agents.data.demonstrators import Demonstrator
+from torchdlo.agents.data.schema import JOINTS, Schema
+from torchdlo.envs import Task
+from torchdlo.envs.core import episode
+from torchdlo.envs.core.task import RADIUS
+from torchdlo.physics import tree
+
+__all__ = ["Noise", "Painter", "Recording", "Start", "acted", "arm_state", "play_batch", "record", "seed_of", "starts"]
+
+OPEN = 0.08
+"""Distance of fingers that hold nothing [m]."""
+
+
+class Painter(Protocol):
+    """Draws what the cameras of a task see."""
+
+    def __call__(
+        self, made: episode.Episode, world: episode.EpisodeState, looks: Sequence[int], size: int
+    ) -> dict[str, Tensor]:
+        """Return pictures by camera, 8 bits of red, green and blue, shape (B, size, size, 3).
+
+        Args:
+            made: the episode that scenes belong to.
+            world: B scenes.
+            looks: for each the seed of its colours, lights, and where its cameras stand exactly.
+            size: width and height [px].
+        """
+        ...
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Disturbance of what hands do, so that demonstrations show how to get back from mistakes."""
+
+    size: float = 0.002
+    """Standard deviation per axis [m]; 0 for none."""
+    memory: float = 0.8
+    """Correlation of one action with the next [1]."""
+
+    def drawn(self, seed: int, horizon: int, arms: int) -> Tensor:
+        """Return disturbances [m], shape (horizon, arms, 3)."""
+        generator = torch.Generator().manual_seed(seed)
+        fresh = torch.randn(horizon, arms, 3, generator=generator, dtype=torch.float64)
+        found = [fresh[0]]
+        for x in fresh[1:]:
+            found.append(self.memory * found[-1] + (1 - self.memory**2) ** 0.5 * x)
+        return self.size * torch.stack(found)
+
+
+@dataclass(frozen=True)
+class Start:
+    """One attempt at a task: everything random in it comes from its seed."""
+
+    number: int
+    """Which attempt it is, counted from 0."""
+    seed: int
+    told: str
+    """The instruction."""
+
+    def part(self, what: str) -> int:
+        """Return the seed of a part of it."""
+        return seed_of(self.seed, what)
+
+
+def seed_of(*parts: object) -> int:
+    """Return a seed that depends on all parts."""
+    text = "/".join(map(str, parts))
+    return int.from_bytes(hashlib.sha256(text.encode()).digest()[:8], "little") >> 2
+
+
+def starts(task: Task, seed: int, numbers: Sequence[int], told: Sequence[str] | None = None) -> list[Start]:
+    """Return the attempts with these numbers; `told` are instructions in turn, drawn from a seed if not given."""
+    found = []
+    for k in numbers:
+        own = seed_of(seed, task.name, k)
+        text = told[k % len(told)] if told else sentences.drawn(task.name, seed_of(own, "told"))
+        found.append(Start(k, own, text))
+    return found
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """An episode as it is kept."""
+
+    start: Start
+    offsets: list[list[float]]
+    """How far the things that the task varies were off their places [m]."""
+    success: bool
+    failed: bool
+    returned: float
+    """Sum of the rewards [1]."""
+    columns: dict[str, np.ndarray]
+    """Frames by column, shape (T, D) or (T,); empty if the episode did not succeed."""
+    pictures: dict[str, np.ndarray]
+    """Pictures by column, shape (T, H, W, 3), 8 bits."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Step:
+    """What a batch did in one action."""
+
+    before: episode.EpisodeState
+    action: Tensor
+    executed: Tensor
+    target: Tensor
+    """Places of tools and their orientations, shape (B, R, 7)."""
+    joints: Tensor
+    reward: Tensor
+    success: Tensor
+
+
+def arm_state(world: episode.EpisodeState) -> Tensor:
+    """Return what is known of the arms, shape (B, R, 15), see `schema.STATE`."""
+    closed = world.seen(world.tool.pos.shape[1]).closed
+    opening = closed * 2 * RADIUS + (1 - closed) * OPEN
+    return torch.cat([world.joints[..., :JOINTS], opening, world.tool.pos, world.tool.quat], -1)
+
+
+def acted(task: Task, world: episode.EpisodeState, target: Tensor) -> Tensor:
+    """Return the action that leads tools towards places (B, R, 3), as far as they reach, shape (B, A)."""
+    way = (target - world.target.pos).flatten(1)
+    action = torch.cat([way, torch.zeros_like(way)], -1)
+    return torch.cat([episode.limited(task, action)[0].flatten(1), torch.zeros_like(way)], -1)
+
+
+def play_batch(
+    made: episode.Episode,
+    attempts: Sequence[Start],
+    actor: Demonstrator,
+    noise: Noise,
+    painter: Painter | None,
+    size: int,
+) -> tuple[list[_Step], episode.EpisodeState, Tensor]:
+    """Play attempts, as many as the episode has scenes; return the steps, the end, and how starts were off [m]."""
+    task, like = made.task, made.start.tool.pos
+    offsets = [task.moved(1, like=like, generator=torch.Generator().manual_seed(start.part("start"))) for start in attempts]
+    moved = torch.cat(offsets)
+    shakes = [noise.drawn(start.part("noise"), task.horizon, task.arms.count) for start in attempts]
+    shake = torch.stack(shakes, 1).to(like)
+    world = episode.begin(made, task.build(moved)[2])
+    memory, steps = actor.begin(made, world, [start.told for start in attempts]), []
+    looks = [start.part("look") for start in attempts]
+    for k in range(task.horizon):
+        seen = painter(made, world, looks, size) if actor.sees and painter is not None else {}
+        target, memory = actor.target(world, memory, seen)
+        action = acted(task, world, target)
+        executed = acted(task, world, world.target.pos + action[:, : target[0].numel()].view_as(target) + shake[k])
+        aim, joints = episode.follow(task, world, action)
+        before, world = world, episode.act(made, world, executed)
+        if k == task.horizon - 1:
+            world = episode.finish(made, world)
+        reward = episode.earned(made, world)[0]
+        success = task.success(world.seen(task.arms.count)) & ~world.failed
+        pose = torch.cat([target, aim.quat], -1)
+        steps.append(_Step(before, action, executed, pose, joints[..., :JOINTS], reward, success))
+    return steps, world, moved
+
+
+def record(
+    made: episode.Episode,
+    attempts: Sequence[Start],
+    actor: Demonstrator,
+    schema: Schema,
+    painter: Painter | None = None,
+    noise: Noise | None = None,
+) -> list[Recording]:
+    """Return attempts as they are kept; those without success without their frames.
+
+    A batch is filled up with its first attempt, as steps are made for one size.
+    """
+    count = len(made.start.failed)
+    if len(attempts) < count:
+        filled = [*attempts, *[attempts[0]] * (count - len(attempts))]
+        return record(made, filled, actor, schema, painter, noise)[: len(attempts)]
+    with torch.no_grad():
+        steps, end, moved = play_batch(made, attempts, actor, noise or Noise(), painter, schema.size)
+        found = []
+        for k, start in enumerate(attempts):
+            rewards = torch.stack([step.reward[k] for step in steps])
+            success = bool(steps[-1].success[k])
+            columns = _columns(schema, steps, k) if success else {}
+            worlds = _line([step.before for step in steps], k)
+            pictures = _pictures(made, worlds, start, schema, painter) if success and painter is not None else {}
+            sums = float(rewards.double().sum())
+            found.append(Recording(start, moved[k].tolist(), success, bool(end.failed[k]), sums, columns, pictures))
+    return found
+
+
+def _line(worlds: Sequence[episode.EpisodeState], k: int) -> episode.EpisodeState:
+    """Return the scene k of many moments as a batch of them."""
+
+    def row(*parts: Tensor) -> Tensor:
+        # What scenes share has an axis of size 1, or none.
+        return torch.cat([p[k : k + 1] if p.shape[0] > k else p[:1] for p in parts]) if parts[0].dim() else parts[0]
+
+    return tree.map(row, *worlds)
+
+
+def _wide(x: Tensor, arms: int) -> Tensor:
+    """Return what is known of arms (R, D) with zeros for those that are not there."""
+    return torch.cat([x, x.new_zeros(arms - len(x), x.shape[-1])])
+
+
+def _action(x: Tensor, arms: int) -> Tensor:
+    """Return an action (6 R,) as wide as that of a task with so many arms."""
+    parts = x.unflatten(-1, (2, -1, 3))
+    return torch.stack([_wide(part, arms) for part in parts]).flatten()
+
+
+def _columns(schema: Schema, steps: Sequence[_Step], k: int) -> dict[str, np.ndarray]:
+    arms, last = schema.arms, len(steps) - 1
+    rows = {
+        "observation.state": [_wide(arm_state(step.before)[k], arms).flatten() for step in steps],
+        "action": [_action(step.action[k], arms) for step in steps],
+        "torchdlo.executed": [_action(step.executed[k], arms) for step in steps],
+        "torchdlo.target": [_wide(step.target[k], arms).flatten() for step in steps],
+        "torchdlo.joint_target": [_wide(step.joints[k], arms).flatten() for step in steps],
+        "next.reward": [step.reward[k] for step in steps],
+        "next.success": [step.success[k] for step in steps],
+    }
+    found = {name: torch.stack(row).numpy() for name, row in rows.items()}
+    found = {name: x.astype(bool if x.dtype == bool else np.float32) for name, x in found.items()}
+    return found | {"next.done": np.arange(last + 1) == last}
+
+
+def _pictures(
+    made: episode.Episode, worlds: episode.EpisodeState, start: Start, schema: Schema, painter: Painter
+) -> dict[str, np.ndarray]:
+    if not schema.size:
+        return {}
+    count = len(worlds.failed)
+    drawn = painter(made, worlds, [start.part("look")] * count, schema.size)
+    black = torch.zeros(count, schema.size, schema.size, 3, dtype=torch.uint8)
+    return {key: drawn.get(key.rpartition(".")[2], black).numpy() for key in schema.pictures}

@@ -1,0 +1,5 @@
+"""The same work in processes of this machine or, through Ray, on several."""
+
+from torchdlo.agents.distributed.executors import Executor, LocalProcesses, Serial, executor
+
+__all__ = ["Executor", "LocalProcesses", "Serial", "executor"]
