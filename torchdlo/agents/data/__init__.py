@@ -1,0 +1,22 @@
+"""Demonstrations as data sets in LeRobot's format, v3.0: made, checked, merged, filtered and read.
+
+Writing needs pyarrow and, with pictures, av; LeRobot itself is not needed.
+"""
+
+from torchdlo.agents.data.checking import check
+from torchdlo.agents.data.editing import Choice, merge, select
+from torchdlo.agents.data.make import SearchPlan, make
+from torchdlo.agents.data.reading import DataSet, FrameData, open_set, to_tensordict
+
+__all__ = [
+    "Choice",
+    "DataSet",
+    "FrameData",
+    "SearchPlan",
+    "check",
+    "make",
+    "merge",
+    "open_set",
+    "select",
+    "to_tensordict",
+]

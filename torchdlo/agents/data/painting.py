@@ -1,0 +1,47 @@
+"""What the cameras of a task see, by the renderer of `torchdlo.vision`: the one place that knows it."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchdlo.agents.data.schema import SIDES
+from torchdlo.envs.core import episode
+from torchdlo.envs.observations.pixels import CameraRig, camera_rig, rendered
+from torchdlo.vision.look import Look, draw_look
+
+__all__ = ["TaskPainter"]
+
+
+@functools.lru_cache(maxsize=4)
+def _rig(made: episode.Episode, size: int) -> CameraRig:
+    return camera_rig(made, size=size)
+
+
+@functools.lru_cache(maxsize=256)
+def _look(seed: int) -> Look:
+    return draw_look(torch.Generator().manual_seed(seed))
+
+
+@dataclass(frozen=True)
+class TaskPainter:
+    """Draws what the cameras of a task see, with colours, lights and cameras drawn from seeds."""
+
+    samples: int = 4
+    """Per pixel, 1 or 4."""
+    shadow: int = 512
+    """Texels of the map of shadows along each side; 0 for no shadows."""
+
+    def __call__(
+        self, made: episode.Episode, world: episode.EpisodeState, looks: Sequence[int], size: int
+    ) -> dict[str, Tensor]:
+        """Return pictures by camera, see `record.Painter`; the first arm has the right wrist."""
+        rig = _rig(made, size)
+        quality = {"samples": self.samples, "shadow": self.shadow}
+        seen = rendered(rig, world.state, world.joints, looks=[_look(seed) for seed in looks], **quality).rgb
+        names = [camera.name if camera.arm is None else f"wrist_{SIDES[camera.arm]}" for camera in rig.cameras]
+        return {name: seen[:, k] for k, name in enumerate(names)}

@@ -1,0 +1,209 @@
+"""Commands `torchdlo dataset ...`; what is slow to import is imported when they run."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from torchdlo.cli.progress import deferred_interrupt, progress
+from torchdlo.errors import InputError
+from torchdlo.files import check_writable
+
+__all__ = ["dataset"]
+
+dataset = typer.Typer(
+    name="dataset",
+    help="Demonstrations as data sets in LeRobot's format: make, check, look at, merge, filter.",
+    no_args_is_help=True,
+    rich_markup_mode="rich",
+)
+
+_INTERRUPTED = 130
+
+SetArgument = Annotated[Path, typer.Argument(help="Folder of a data set.", metavar="DATASET")]
+OutOption = Annotated[Path, typer.Option("--out", "-o", help="New folder.", metavar="DIR")]
+Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
+Workers = Annotated[
+    int | None, typer.Option(min=0, help="Processes; one per core if not given, 0 for none beside this one.")
+]
+Address = Annotated[
+    str | None,
+    typer.Option(help="Work on a Ray cluster: its address, auto, or local for one of its own.", metavar="ADDRESS"),
+]
+
+
+def _watched(work: Callable[[Callable[[str, int, int, str], None]], Any], kept: str) -> Any:
+    """Do work that shows its progress; Ctrl-C ends it with a sentence."""
+    try:
+        with progress() as show, deferred_interrupt(show) as callback:
+            return work(callback)
+    except KeyboardInterrupt:
+        typer.echo(f"interrupted; {kept}", err=True)
+        raise SystemExit(_INTERRUPTED) from None
+
+
+@dataset.command()
+def make(
+    tasks: Annotated[list[str], typer.Argument(help="Names of tasks, see torchdlo tasks.", metavar="TASKS...")],
+    out: OutOption,
+    episodes: Annotated[int, typer.Option(min=1, help="Successful episodes of each task.")] = 200,
+    actor: Annotated[
+        str,
+        typer.Option(
+            help="Who acts: scripted, a trajectory.json of torchdlo optimize, a folder of such, or a policy.pt.",
+            metavar="scripted|FILE|DIR",
+        ),
+    ] = "scripted",
+    noise: Annotated[float, typer.Option(help="Disturbance of the hands, standard deviation in m.")] = 0.002,
+    size: Annotated[int, typer.Option(help="Width and height of pictures in pixels; 0 for none.")] = 128,
+    codec: Annotated[str, typer.Option(help="How pictures are encoded.", metavar="h264|av1")] = "h264",
+    seed: Annotated[int, typer.Option(min=0, help="Seed of starts, looks, words and noise.")] = 0,
+    batch: Annotated[int, typer.Option(min=1, help="Attempts that are played at once.")] = 16,
+    workers: Workers = None,
+    address: Address = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on with what was begun there.")] = False,
+    as_json: Json = False,
+) -> None:
+    """Make a data set of demonstrations: starts, looks and words vary, and only successes are kept.
+
+    A run that was stopped, by Ctrl-C or by force, goes on with --resume, and the set is the same byte for byte.
+
+    [bold]Examples:[/bold]
+
+    torchdlo dataset make coiling separation slingshot wiring_post --episodes 200 --out sets/dlo4
+
+    torchdlo dataset make wiring_post --actor experiments/trajopt --episodes 20 --out sets/found
+    """
+    from torchdlo.agents.data.make import Plan
+    from torchdlo.agents.data.make import make as run
+    from torchdlo.agents.distributed import executor
+
+    plan = Plan(tuple(tasks), episodes, seed=seed, size=size, codec=codec, actor=actor, noise=noise, batch=batch)
+    painter = _painter() if size else None
+
+    def work(callback: Callable[[str, int, int, str], None]) -> dict[str, Any]:
+        with executor(workers, address) as where:
+            return run(plan, out, painter=painter, executor=where, resume=resume, callback=callback)
+
+    found = _watched(work, f"what is finished stays in {out}, and --resume goes on with it")
+    if as_json:
+        typer.echo(json.dumps({"path": str(out), "tasks": found}, indent=1))
+    for task, count in found.items():
+        typer.echo(f"{task}: {count['attempts']} attempts, {count['failed']} failed", err=as_json)
+    typer.echo(f"data set: {out}", err=as_json)
+
+
+def _painter() -> Any:
+    from torchdlo.agents.data.painting import TaskPainter
+
+    return TaskPainter()
+
+
+@dataset.command()
+def check(path: SetArgument, as_json: Json = False) -> None:
+    """Read and decode every frame of a data set, and compute again all that it says of itself.
+
+    Exit code 0 means that nothing is wrong.
+    """
+    from torchdlo.agents.data import check as run
+
+    found = _watched(lambda show: run(path, lambda k, n: show("check", k, n, "")), "nothing is said of the rest")
+    if as_json:
+        typer.echo(json.dumps({"path": str(path), "problems": found}, indent=1))
+    for sentence in found:
+        typer.echo(sentence, err=as_json)
+    if found:
+        typer.echo(f"error: {path}: {len(found)} {'problem' if len(found) == 1 else 'problems'}", err=True)
+        raise typer.Exit(1)
+    typer.echo(f"{path}: sound", err=as_json)
+
+
+@dataset.command()
+def info(path: SetArgument, as_json: Json = False) -> None:
+    """Say what is in a data set."""
+    from torchdlo.agents.data import open_set
+    from torchdlo.report.dataset import summary
+
+    found = summary(open_set(path))
+    if as_json:
+        typer.echo(json.dumps(found, indent=1, ensure_ascii=False))
+        return
+    typer.echo(
+        f"{path}: {found['episodes']} episodes, {found['frames']} frames at {found['fps']} per second, "
+        f"{found['bytes'] / 1e6:.1f} MB, format {found['version']}"
+    )
+    for name, task in found["tasks"].items():
+        failed = "" if task["failed"] is None else f", {task['failed']} of {task['attempts']} attempts failed"
+        typer.echo(f"  {name}: {task['episodes']} episodes, {task['told']} sentences{failed}")
+    shapes = {**found["features"], **found["cameras"]}
+    for name, shape in shapes.items():
+        typer.echo(f"  {name}: {' x '.join(map(str, shape))}")
+
+
+@dataset.command()
+def merge(
+    paths: Annotated[list[Path], typer.Argument(help="Folders of data sets.", metavar="DATASETS...")], out: OutOption
+) -> None:
+    """Make one data set of several that are alike."""
+    from torchdlo.agents.data import merge as run
+
+    count = _watched(
+        lambda show: run(paths, out, lambda k, n: show("merge", k, n, "")), "there is nothing left of the new data set"
+    )
+    typer.echo(f"data set: {out}, {count} episodes")
+
+
+@dataset.command("filter")
+def select(
+    path: SetArgument,
+    out: OutOption,
+    task: Annotated[
+        list[str] | None, typer.Option(help="Keep this task or instruction; may be repeated.", metavar="NAME")
+    ] = None,
+    episode: Annotated[list[int] | None, typer.Option(help="Keep this episode; may be repeated.")] = None,
+    least_return: Annotated[float | None, typer.Option(help="Keep episodes that earned so much.")] = None,
+    limit: Annotated[int | None, typer.Option(min=1, help="Keep the first so many of each task.")] = None,
+) -> None:
+    """Make a data set of some episodes of another.
+
+    [bold]Example:[/bold] torchdlo dataset filter sets/dlo4 --task coiling --limit 50 --out sets/coiling50
+    """
+    from torchdlo.agents.data import Choice
+    from torchdlo.agents.data import select as run
+
+    choice = Choice(tuple(task or ()), tuple(episode or ()), least_return, limit)
+    count = _watched(
+        lambda show: run(path, out, choice, lambda k, n: show("filter", k, n, "")),
+        "there is nothing left of the new data set",
+    )
+    typer.echo(f"data set: {out}, {count} episodes")
+
+
+@dataset.command()
+def view(
+    path: SetArgument,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Page to write. Default: runs/dataset/NAME.html.")
+    ] = None,
+    episode: Annotated[list[int] | None, typer.Option(help="Show this episode; may be repeated.")] = None,
+    count: Annotated[int, typer.Option(min=1, help="Show so many, evenly picked, if none is named.")] = 12,
+) -> None:
+    """Write a page with some episodes of a data set and their videos; it needs nothing but itself."""
+    from torchdlo.agents.data import open_set
+    from torchdlo.report.dataset import write_page
+
+    data = open_set(path)
+    total = len(data.episodes)
+    wrong = [k for k in episode or [] if not 0 <= k < total]
+    if wrong:
+        raise InputError(f"{path}: has no episode {wrong[0]}; it has 0 to {total - 1}.")
+    count = min(count, total)
+    chosen = episode or [round(k * (total - 1) / max(count - 1, 1)) for k in range(count)]
+    out = out or Path("runs") / "dataset" / f"{path.resolve().name}.html"
+    check_writable(out)
+    write_page(data, out, chosen)
+    typer.echo(f"page: {out}")
