@@ -34,13 +34,15 @@ def check(path: Path, callback: Callable[[int, int], None] | None = None) -> lis
     if found:
         return found
     try:
-        columns = data.columns()
+        columns, stats = data.columns(), data.stats
     except InputError as error:
         return [str(error)]
     found = [*_numbers(data, columns), *_finite(columns)]
     if not found:
-        found += _statistics(data, columns)
-        found += _pictures(data, callback)
+        for name, values in columns.items():
+            if values.dtype.kind in "fib":
+                found += _compared(name, stats.get(name), column_statistics(values))
+        found += _pictures(data, stats, callback)
     return found
 
 
@@ -127,17 +129,6 @@ def _finite(columns: dict[str, np.ndarray]) -> Iterator[str]:
             yield f"the column {name} is not finite in frame {frame}."
 
 
-def _statistics(data: DataSet, columns: dict[str, np.ndarray]) -> Iterator[str]:
-    try:
-        stats = data.stats
-    except InputError as error:
-        yield str(error)
-        return
-    for name, values in columns.items():
-        if values.dtype.kind in "fib":
-            yield from _compared(name, stats.get(name), column_statistics(values))
-
-
 def _compared(name: str, said: Any, computed: dict[str, Any]) -> Iterator[str]:
     if said is None:
         yield f"meta/stats.json: has nothing on {name}."
@@ -154,7 +145,7 @@ def _short(values: Any) -> str:
     return f"[{', '.join(f'{x:.6g}' for x in flat[:3])}{', ...' if len(flat) > 3 else ''}]"
 
 
-def _pictures(data: DataSet, callback: Callable[[int, int], None] | None) -> Iterator[str]:
+def _pictures(data: DataSet, stats: dict[str, Any], callback: Callable[[int, int], None] | None) -> Iterator[str]:
     """Decode all pictures; say which cannot be, are not at their times, or have other statistics."""
     counts = {camera: np.zeros((3, 256), np.int64) for camera in data.cameras}
     broken = False
@@ -179,5 +170,4 @@ def _pictures(data: DataSet, callback: Callable[[int, int], None] | None) -> Ite
             callback(k + 1, len(data.episodes))
     for camera, found in counts.items():
         if not broken:
-            said = data.stats.get(camera)
-            yield from _compared(camera, said, picture_statistics(found, data.info["total_frames"]))
+            yield from _compared(camera, stats.get(camera), picture_statistics(found, data.info["total_frames"]))

@@ -36,6 +36,8 @@ __all__ = ["UNFINISHED", "SearchPlan", "make", "report_of"]
 UNFINISHED = "unfinished"
 """Folder within a set for what is under way."""
 PLAN = "torchdlo-plan.json"
+_LONG = 10
+"""Actions of episodes whose steps are worth recording."""
 
 
 @dataclass(frozen=True)
@@ -66,6 +68,7 @@ class SearchPlan:
             raise InputError(f"the task {', '.join(sorted(twice))} is named twice.")
         if not 0 <= self.noise <= 0.01:
             raise InputError(f"noise: expected 0 to 0.01 m, given {self.noise:g}.")
+        assert self.schema  # says what is wrong with names, size or codec
 
     @property
     def schema(self) -> Schema:
@@ -91,7 +94,8 @@ class _Job:
 @functools.lru_cache(maxsize=2)
 def _prepared(task: str, batch: int) -> episode.Episode:
     # Recorded steps take seconds to begin with; compiled ones take minutes and gain little in a batch.
-    return episode.prepare(find(task), batch, compiled=False, recorded=True)
+    found = find(task)
+    return episode.prepare(found, batch, compiled=False, recorded=found.horizon > _LONG)
 
 
 @functools.lru_cache(maxsize=8)

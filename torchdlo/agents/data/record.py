@@ -14,10 +14,14 @@ from torch import Tensor
 from torchdlo.agents.data import sentences
 from torchdlo.agents.data.demonstrators import Demonstrator
 from torchdlo.agents.data.schema import JOINTS, Schema
+from torchdlo.coupling.bodies.dynamics import conjugate
+from torchdlo.coupling.common.pose import Pose
 from torchdlo.envs import Task
 from torchdlo.envs.core import episode
 from torchdlo.envs.core.task import RADIUS
 from torchdlo.physics import tree
+from torchdlo.physics.linalg.numerics import safe_norm
+from torchdlo.physics.linalg.rotation import multiply
 
 __all__ = ["Noise", "Painter", "Recording", "Start", "acted", "arm_state", "play_batch", "record", "seed_of", "starts"]
 
@@ -48,17 +52,19 @@ class Noise:
 
     size: float = 0.002
     """Standard deviation per axis [m]; 0 for none."""
+    turn: float = 0.02
+    """The same of turns [degrees]."""
     memory: float = 0.8
     """Correlation of one action with the next [1]."""
 
     def drawn(self, seed: int, horizon: int, arms: int) -> Tensor:
-        """Return disturbances [m], shape (horizon, arms, 3)."""
+        """Return disturbances of ways [m] and turns [degrees], shape (horizon, arms, 6)."""
         generator = torch.Generator().manual_seed(seed)
-        fresh = torch.randn(horizon, arms, 3, generator=generator, dtype=torch.float64)
+        fresh = torch.randn(horizon, arms, 6, generator=generator, dtype=torch.float64)
         found = [fresh[0]]
         for x in fresh[1:]:
             found.append(self.memory * found[-1] + (1 - self.memory**2) ** 0.5 * x)
-        return self.size * torch.stack(found)
+        return torch.stack(found) * torch.tensor([self.size] * 3 + [self.turn * bool(self.size)] * 3)
 
 
 @dataclass(frozen=True)
@@ -130,11 +136,27 @@ def arm_state(world: episode.EpisodeState) -> Tensor:
     return torch.cat([world.joints[..., :JOINTS], opening, world.tool.pos, world.tool.quat], -1)
 
 
-def acted(task: Task, world: episode.EpisodeState, target: Tensor) -> Tensor:
-    """Return the action that leads tools towards places (B, R, 3), as far as they reach, shape (B, A)."""
-    way = (target - world.target.pos).flatten(1)
-    action = torch.cat([way, torch.zeros_like(way)], -1)
-    return torch.cat([episode.limited(task, action)[0].flatten(1), torch.zeros_like(way)], -1)
+def acted(task: Task, world: episode.EpisodeState, target: Pose, shake: Tensor | None = None) -> Tensor:
+    """Return the action that leads tools towards poses, as far as they reach, shape (B, A).
+
+    Args:
+        task: the task.
+        world: the scenes.
+        target: poses in the world, shapes (B, R, 3) and (B, R, 4).
+        shake: what is added to ways [m] and turns [degrees], shape (B, R, 6).
+    """
+    way = target.pos - world.target.pos
+    # Small turns are twice the vector of the quaternion that leads there, in the frame of the tool.
+    off = multiply(conjugate(world.target.quat), target.quat)
+    turn = torch.rad2deg(2 * off[..., 1:] * off[..., :1].sign())
+    if shake is not None:
+        way, turn = _cut(task, way) + shake[..., :3], turn.clamp(-task.twist, task.twist) + shake[..., 3:]
+    return torch.cat([_cut(task, way).flatten(1), turn.clamp(-task.twist, task.twist).flatten(1)], -1)
+
+
+def _cut(task: Task, way: Tensor) -> Tensor:
+    """Return ways (B, R, 3) as far as tools reach, in the same directions."""
+    return way * (task.reach / safe_norm(way).clamp(min=task.reach))
 
 
 def play_batch(
@@ -152,13 +174,14 @@ def play_batch(
     shakes = [noise.drawn(start.part("noise"), task.horizon, task.arms.count) for start in attempts]
     shake = torch.stack(shakes, 1).to(like)
     world = episode.begin(made, task.build(moved)[2])
+    upright = world.target.quat  # no demonstration turns its tools
     memory, steps = actor.begin(made, world, [start.told for start in attempts]), []
     looks = [start.part("look") for start in attempts]
     for k in range(task.horizon):
         seen = painter(made, world, looks, size) if actor.sees and painter is not None else {}
         target, memory = actor.target(world, memory, seen)
-        action = acted(task, world, target)
-        executed = acted(task, world, world.target.pos + action[:, : target[0].numel()].view_as(target) + shake[k])
+        goal = Pose(target, upright)
+        action, executed = acted(task, world, goal), acted(task, world, goal, shake[k])
         aim, joints = episode.follow(task, world, action)
         before, world = world, episode.act(made, world, executed)
         if k == task.horizon - 1:
