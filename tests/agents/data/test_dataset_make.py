@@ -147,10 +147,11 @@ def test_a_stopped_run_keeps_what_is_finished_and_goes_on(made: Path, tmp_path: 
 @pytest.mark.slow
 def test_runs_that_are_killed_at_any_moment_end_with_the_same_bytes(tmp_path: Path) -> None:
     command = [sys.executable, str(HERE / "short_task.py"), str(tmp_path / "set"), "0.15", "12"]
-    subprocess.run([*command[:2], str(tmp_path / "whole"), "0", "12"], check=True)
+    path = os.environ | {"PYTHONPATH": str(HERE.parents[2])}
+    subprocess.run([*command[:2], str(tmp_path / "whole"), "0", "12"], check=True, env=path)
     drawn, killed = random.Random(5), 0
     for _ in range(40):
-        process = subprocess.Popen([*command, "--resume"], stderr=subprocess.DEVNULL)
+        process = subprocess.Popen([*command, "--resume"], stderr=subprocess.DEVNULL, env=path)
         begun = time.monotonic()
         # Most of the time goes into starting; moments are counted from when there is something.
         while not (tmp_path / "set").exists() and process.poll() is None and time.monotonic() < begun + 60:

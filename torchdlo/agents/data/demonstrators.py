@@ -32,8 +32,10 @@ class Demonstrator(Protocol):
 
     source: str
     """What it is, for the record."""
-    sees: bool
-    """Whether it needs pictures."""
+
+    def sees(self, memory: Any) -> int:
+        """Return the width and height of the pictures that it needs for the next action [px]; 0 for none."""
+        ...
 
     def begin(self, made: episode.Episode, world: episode.EpisodeState, told: Sequence[str]) -> Any:
         """Return what it remembers when episodes begin, in which it is told what to do."""
@@ -70,7 +72,10 @@ class FollowPath:
     source: str
     stored: tuple[tuple[tuple[float, ...], ...], ...] | None = field(default=None, repr=False)
     """Places of the tools after every action [m], as T rows of R points; the task's own script if not given."""
-    sees = False
+
+    def sees(self, memory: _Progress) -> int:
+        """Return 0: it knows its way."""
+        return 0
 
     def begin(self, made: episode.Episode, world: episode.EpisodeState, told: Sequence[str]) -> _Progress:
         """Return the path from where tools start."""

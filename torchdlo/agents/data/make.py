@@ -68,7 +68,7 @@ class SearchPlan:
             raise InputError(f"the task {', '.join(sorted(twice))} is named twice.")
         if not 0 <= self.noise <= 0.01:
             raise InputError(f"noise: expected 0 to 0.01 m, given {self.noise:g}.")
-        assert self.schema  # says what is wrong with names, size or codec
+        _ = self.schema  # says what is wrong with names, size or codec
 
     @property
     def schema(self) -> Schema:
@@ -108,7 +108,7 @@ def _played(job: _Job) -> list[dict[str, bytes]]:
     plan, actor = job.plan, _actor(job.task, job.plan.actor)
     made = _prepared(job.task, plan.batch)
     tries = starts(made.task, plan.seed, range(job.first, job.first + plan.batch))
-    recordings = record(made, tries, actor, plan.schema, job.painter if plan.size else None, Noise(plan.noise))
+    recordings = record(made, tries, actor, plan.schema, job.painter, Noise(plan.noise))
     return [attempts.packed(each, job.task, actor.source, plan.schema) for each in recordings]
 
 

@@ -88,7 +88,7 @@ def seed_of(*parts: object) -> int:
     return int.from_bytes(hashlib.sha256(text.encode()).digest()[:8], "little") >> 2
 
 
-def starts(task: Task, seed: int, numbers: Sequence[int], told: Sequence[str] | None = None) -> list[Start]:
+def starts(task: Task, seed: int | str, numbers: Sequence[int], told: Sequence[str] | None = None) -> list[Start]:
     """Return the attempts with these numbers; `told` are instructions in turn, drawn from a seed if not given."""
     found = []
     for k in numbers:
@@ -165,7 +165,6 @@ def play_batch(
     actor: Demonstrator,
     noise: Noise,
     painter: Painter | None,
-    size: int,
 ) -> tuple[list[_Step], episode.EpisodeState, Tensor]:
     """Play attempts, as many as the episode has scenes; return the steps, the end, and how starts were off [m]."""
     task, like = made.task, made.start.tool.pos
@@ -178,7 +177,8 @@ def play_batch(
     memory, steps = actor.begin(made, world, [start.told for start in attempts]), []
     looks = [start.part("look") for start in attempts]
     for k in range(task.horizon):
-        seen = painter(made, world, looks, size) if actor.sees and painter is not None else {}
+        size = actor.sees(memory) if painter is not None else 0
+        seen = painter(made, world, looks, size) if painter is not None and size else {}
         target, memory = actor.target(world, memory, seen)
         goal = Pose(target, upright)
         action, executed = acted(task, world, goal), acted(task, world, goal, shake[k])
@@ -210,7 +210,7 @@ def record(
         filled = [*attempts, *[attempts[0]] * (count - len(attempts))]
         return record(made, filled, actor, schema, painter, noise)[: len(attempts)]
     with torch.no_grad():
-        steps, end, moved = play_batch(made, attempts, actor, noise or Noise(), painter, schema.size)
+        steps, end, moved = play_batch(made, attempts, actor, noise or Noise(), painter)
         found = []
         for k, start in enumerate(attempts):
             rewards = torch.stack([step.reward[k] for step in steps])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Iterator, Sequence
 from fractions import Fraction
 from pathlib import Path
@@ -17,8 +18,15 @@ __all__ = ["Clip", "decode", "encode", "join", "library"]
 TICKS = 256
 """Units of time per frame: time stamps are whole numbers of them."""
 _OPTIONS = {
-    # One thread and no scene cuts: the same pictures give the same bytes, and joined episodes the same headers.
-    "libx264": {"crf": "20", "preset": "veryfast", "bf": "0", "sc_threshold": "0", "threads": "1"},
+    # One thread, no scene cuts, nothing that looks ahead: joined episodes have the same headers.
+    "libx264": {
+        "qp": "20",
+        "preset": "veryfast",
+        "bf": "0",
+        "sc_threshold": "0",
+        "threads": "1",
+        "x264-params": "mbtree=0:rc-lookahead=0:weightp=0",
+    },
     "libsvtav1": {"crf": "30", "preset": "10", "svtav1-params": "lp=1"},
 }
 
@@ -33,21 +41,36 @@ def library() -> Any:
 
 
 def encode(path: Path, frames: np.ndarray, *, fps: int, codec: str) -> None:
-    """Write pictures (T, H, W, 3), 8 bits, as a video."""
-    av = library()
+    """Write pictures (T, H, W, 3), 8 bits, as a video; the same pictures make the same bytes."""
     name = CODECS[codec][0]
+    av = library()
     if name not in av.codecs_available:
         others = [other for other, (encoder, _) in CODECS.items() if encoder in av.codecs_available]
-        raise InputError(
-            f"this build of av cannot write {codec}; choose --codec {' or '.join(others) or 'of another'}."
-        )
-    with av.open(str(path), "w", format="mp4", options={"fflags": "+bitexact"}) as container:
+        known = " or ".join(others) or "of another"
+        raise InputError(f"this build of av cannot write {codec}; choose --codec {known}.")
+    seen: set[bytes] = set()
+    # In about one of a hundred first calls after heavy arithmetic x264 makes other bytes of the same pictures: what has
+    # come out twice is kept.
+    for _ in range(8):
+        content = _encoded(frames, fps, name)
+        if content in seen:
+            break
+        seen.add(content)
+    path.write_bytes(content)
+
+
+def _encoded(frames: np.ndarray, fps: int, name: str) -> bytes:
+    av = library()
+    file = io.BytesIO()
+    with av.open(file, "w", format="mp4", options={"fflags": "+bitexact"}) as container:
         stream = container.add_stream(name, rate=Fraction(fps), options={"g": str(GROUP), **_OPTIONS[name]})
         stream.height, stream.width = frames.shape[1:3]
         stream.pix_fmt = "yuv420p"
+        stream.codec_context.thread_count = 1
         for image in frames:
             container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
         container.mux(stream.encode())
+    return file.getvalue()
 
 
 class Clip:

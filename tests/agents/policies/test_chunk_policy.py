@@ -1,0 +1,197 @@
+"""The policy: sentences, the network, training from a set, closed loop. Its success on tasks is in docs/datasets.md."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+pytest.importorskip("pyarrow", reason="data sets need the extra dataset")
+pytest.importorskip("av", reason="data sets need the extra dataset")
+pytest.importorskip("pytorch_kinematics", reason="arms need the extra robots")
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "data"))
+
+from short_task import SHORT, Dots, plan
+
+from torchdlo import envs
+from torchdlo.agents.data import check, open_set
+from torchdlo.agents.data.make import make
+from torchdlo.agents.data.record import Noise, play_batch, starts
+from torchdlo.agents.policies import language
+from torchdlo.agents.policies.chunk_policy import ChunkPolicy, Shape, load_policy, save_policy
+from torchdlo.agents.policies.rollout import PolicyDemonstrator, evaluate
+from torchdlo.agents.policies.training import Training, learn
+from torchdlo.cli import app
+from torchdlo.envs.core import episode
+from torchdlo.errors import InputError
+
+SHAPE = Shape(arms=2, cameras=("front", "wrist_right", "wrist_left"), size=32, state=30, chunk=5, width=32, heads=2)
+
+
+@pytest.fixture(autouse=True)
+def _short_tasks(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, kind in SHORT.items():
+        monkeypatch.setitem(envs.TASKS, name, kind)
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Eight episodes with pictures."""
+    out = tmp_path_factory.mktemp("sets") / "small"
+    envs.TASKS.update(SHORT)
+    make(plan(episodes=8), out, painter=Dots())
+    return out
+
+
+@pytest.fixture(scope="module")
+def learned(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A policy that was trained for a while."""
+    out = tmp_path_factory.mktemp("policies") / "policy.pt"
+    learn(data, out, Training(epochs=60, batch=8, rate=2e-3, chunk=4, language="hashed"))
+    return out
+
+
+def test_sentences_that_mean_the_same_are_near_each_other() -> None:
+    if language.default_encoder() != "minilm":
+        pytest.skip("the language model is not installed")
+    near, far = (
+        ("Coil the rope around the cone.", "Wind the cord about the cone."),
+        ("Coil the rope around the cone.", "Shoot the ball at the cube."),
+    )
+    a, b = (language.encode(pair, "minilm") for pair in (near, far))
+    assert torch.allclose(a.norm(dim=1), torch.ones(2)) and float(a[0] @ a[1]) > 0.6 > 0.4 > float(b[0] @ b[1])
+
+
+def test_the_language_model_gives_the_vectors_of_its_authors() -> None:
+    if language.default_encoder() != "minilm":
+        pytest.skip("the language model is not installed")
+    # The first numbers of model.encode("This is an example sentence") as its model card's example prints them.
+    (found,) = language.encode(["This is an example sentence"], "minilm")
+    assert torch.allclose(found[:3], torch.tensor([0.06765693, 0.06349581, 0.0487131]), atol=2e-5)
+
+
+def test_hashed_sentences_share_what_their_words_share() -> None:
+    a, b, c = language.encode(["Coil the rope left!", "coil the ROPE, left", "lift both rings"], "hashed")
+    assert torch.allclose(a, b) and abs(float(a @ c)) < 0.3 and float(a.norm()) == pytest.approx(1)
+    with pytest.raises(InputError, match="expected one of minilm, hashed, given 'clip'"):
+        language.encode(["x"], "clip")
+
+
+def test_targets_depend_on_pictures_state_and_words() -> None:
+    torch.manual_seed(0)
+    policy = ChunkPolicy(SHAPE)
+    for eye in policy.eyes.values():
+        torch.nn.init.normal_(eye.films[0].weight, std=0.1)
+    given = {
+        "pictures": {name: torch.randint(256, (3, 3, 32, 32), dtype=torch.uint8) for name in SHAPE.cameras},
+        "state": torch.randn(3, 30),
+        "sentence": torch.randn(3, 384),
+    }
+    usual = policy(**given)
+    assert usual.shape == (3, 5, 2, 3)
+    # One of a batch is as alone.
+    alone = policy({n: x[1:2] for n, x in given["pictures"].items()}, given["state"][1:2], given["sentence"][1:2])
+    assert torch.allclose(usual[1:2], alone, atol=1e-5)
+    for name in SHAPE.cameras:
+        black = given["pictures"] | {name: torch.zeros(3, 3, 32, 32, dtype=torch.uint8)}
+        assert not torch.allclose(policy(**given | {"pictures": black}), usual, atol=1e-4)
+    assert not torch.allclose(policy(**given | {"state": given["state"] + 1}), usual, atol=1e-4)
+    assert not torch.allclose(policy(**given | {"sentence": -given["sentence"]}), usual, atol=1e-4)
+
+
+def test_files_of_policies_come_back_and_others_are_refused(tmp_path: Path) -> None:
+    policy = ChunkPolicy(SHAPE)
+    save_policy(tmp_path / "policy.pt", policy, {"tasks": ["short"]})
+    again, about = load_policy(tmp_path / "policy.pt")
+    assert again.shape == SHAPE and about == {"tasks": ["short"]}
+    assert all(torch.equal(a, b) for a, b in zip(policy.parameters(), again.parameters(), strict=True))
+    (tmp_path / "other.pt").write_bytes(b"something")
+    torch.save({"weights": 1}, tmp_path / "third.pt")
+    for name in ("other.pt", "third.pt"):
+        with pytest.raises(InputError, match="expected a policy of torchdlo learn, found something else"):
+            load_policy(tmp_path / name)
+    with pytest.raises(InputError, match="there is no such file"):
+        load_policy(tmp_path / "none.pt")
+
+
+def test_training_reads_the_set_and_learns_its_targets(data: Path, learned: Path) -> None:
+    policy, about = load_policy(learned)
+    assert about["tasks"] == ["short"] and about["loss"][-1] < 0.25 * about["loss"][0]
+    assert not list(learned.parent.glob("*checkpoint*")) and not list(learned.parent.glob(".frames*"))
+    found = open_set(data)
+    columns = found.columns()
+    shots = {
+        c.rpartition(".")[2]: np.stack([next(found.pictures(k, c, 1, 1)) for k in range(8)]) for c in found.cameras
+    }
+    at = 4 * np.arange(8) + 1
+    state = torch.as_tensor(columns["observation.state"][at])
+    words = language.encode(found.tasks, "hashed").expand(8, -1)
+    with torch.no_grad():
+        seen = {name: torch.as_tensor(x).movedim(-1, 1) for name, x in shots.items()}
+        ahead = policy(seen, state, words)
+    wanted = columns["torchdlo.target"].reshape(8, 4, 7)[..., :3]
+    # The chunk begins with the target of the same frame; after the end it keeps the last one.
+    assert np.abs(ahead[:, 0, 0].numpy() - wanted[:, 1]).mean() < 2e-3
+    assert np.abs(ahead[:, 3, 0].numpy() - wanted[:, 3]).mean() < 2e-3
+
+
+def test_training_that_was_stopped_comes_to_the_same(data: Path, tmp_path: Path) -> None:
+    training = Training(epochs=3, batch=16, chunk=4, language="hashed")
+    learn(data, tmp_path / "whole.pt", training)
+
+    def stop(stage: str, done: int, total: int, message: str) -> None:
+        if stage == "learn" and done == 5:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        learn(data, tmp_path / "parts.pt", training, callback=stop)
+    with pytest.raises(InputError, match="it is of another data set or training"):
+        learn(data, tmp_path / "parts.pt", Training(epochs=3, batch=8, chunk=4, language="hashed"), resume=True)
+    learn(data, tmp_path / "parts.pt", training, resume=True)
+    (a, one), (b, other) = (load_policy(tmp_path / f"{name}.pt") for name in ("whole", "parts"))
+    assert one["loss"] == other["loss"]
+    assert all(torch.equal(x, y) for x, y in zip(a.parameters(), b.parameters(), strict=True))
+    with pytest.raises(InputError, match="there is no checkpoint to resume"):
+        learn(data, tmp_path / "parts.pt", training, resume=True)
+
+
+def test_a_policy_acts_in_closed_loop_and_makes_a_set(learned: Path, tmp_path: Path, monkeypatch, capsys) -> None:
+    found = evaluate(learned, ["short"], Dots(), episodes=6, conditions=("usual", "blank_pictures"))
+    rows = found["tasks"]["short"]
+    # Starts on the left are done, those on the right cannot be.
+    assert 0.3 <= rows["usual"]["success"] <= 1 and found["mean"]["usual"] == rows["usual"]["success"]
+    assert len(rows["usual"]["episodes"]) == 6
+    again = evaluate(learned, ["short"], Dots(), episodes=6)
+    assert again["tasks"]["short"]["usual"] == rows["usual"]
+    make(plan(episodes=2, actor=str(learned), size=16), tmp_path / "set", painter=Dots())
+    assert check(tmp_path / "set") == []
+    assert open_set(tmp_path / "set").provenance["episodes"][0]["actions_from"] == "policy policy.pt"
+    monkeypatch.setattr("torchdlo.dataset_commands._painter", Dots)
+    with pytest.raises(SystemExit):
+        app.main(["dataset", "evaluate", str(learned), "--episodes", "2", "--json"])
+    assert '"success"' in capsys.readouterr().out
+    with pytest.raises(InputError, match="swapped_words needs another task"):
+        evaluate(learned, ["short"], Dots(), episodes=2, conditions=("swapped_words",))
+    with pytest.raises(InputError, match="it moves 1 arm, and pair has 2"):
+        evaluate(learned, ["pair"], Dots(), episodes=2)
+
+
+def test_a_policy_looks_again_after_some_actions_and_follows_its_chunk_between() -> None:
+    policy = ChunkPolicy(Shape(arms=1, cameras=("front",), size=32, state=15, chunk=8, width=32, heads=2))
+    seen: list[int] = []
+
+    class Counting(Dots):
+        def __call__(self, made, world, looks, size):
+            seen.append(int(world.count[0]))
+            return super().__call__(made, world, looks, size)
+
+    task = SHORT["short"](horizon=10)
+    made = episode.prepare(task, 2, compiled=False)
+    actor = PolicyDemonstrator(policy.eval(), "hashed", "policy")
+    with torch.no_grad():
+        play_batch(made, starts(task, 0, range(2)), actor, Noise(0.0), Counting())
+    assert seen == [0, 4, 8]

@@ -1,0 +1,255 @@
+"""Training the chunk policy from an exported data set, through its own reader."""
+
+from __future__ import annotations
+
+import copy
+import math
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchdlo.agents.data.reading import DataSet, open_set
+from torchdlo.agents.policies import language
+from torchdlo.agents.policies.chunk_policy import ChunkPolicy, Shape, save_policy
+from torchdlo.agents.trajopt.search_journal import versions
+from torchdlo.errors import InputError
+from torchdlo.files import replacing
+
+__all__ = ["Training", "learn"]
+
+IMAGES = "observation.images."
+LEAST = 1e-3
+"""Least scale of states and targets: what hardly varies is not blown up."""
+
+
+@dataclass(frozen=True)
+class Training:
+    """How to train."""
+
+    epochs: int = 40
+    batch: int = 64
+    rate: float = 5e-4
+    """Largest learning rate."""
+    decay: float = 1e-2
+    """Weight decay."""
+    average: float = 0.995
+    """How much of the averaged weights a step keeps; these are what is saved."""
+    chunk: int = 20
+    seed: int = 0
+    language: str = "auto"
+    """"minilm", "hashed", or the better one that is installed."""
+
+    def __post_init__(self) -> None:
+        if min(self.epochs, self.batch, self.chunk) < 1 or not 0 < self.rate < 1:
+            raise InputError(
+                "training: epochs, batch and chunk are 1 or more, and the learning rate is between 0 and 1."
+            )
+
+
+@dataclass(frozen=True, eq=False)
+class _Frames:
+    """A set in memory, its pictures in a file that is mapped."""
+
+    state: Tensor
+    target: Tensor
+    """Shape (N, 3 R)."""
+    last: Tensor
+    """Number of the last frame of each frame's episode, shape (N,)."""
+    sentence: Tensor
+    """Vectors of the instructions, shape (tasks, 384)."""
+    told: Tensor
+    """Instruction of each frame, shape (N,)."""
+    pictures: dict[str, np.ndarray]
+    """Shape (N, 3, H, W), 8 bits."""
+
+    def batch(self, at: Tensor, chunk: int) -> tuple[dict[str, Tensor], Tensor, Tensor, Tensor]:
+        """Return pictures, states, sentences and targets; after the end tools stay."""
+        ahead = torch.minimum(at[:, None] + torch.arange(chunk), self.last[at][:, None])
+        shots = {name: torch.from_numpy(x[at.numpy()]) for name, x in self.pictures.items()}
+        return shots, self.state[at], self.sentence[self.told[at]], self.target[ahead]
+
+
+def _read(data: DataSet, encoder: str, folder: Path, callback: Callable[[str, int, int, str], None]) -> _Frames:
+    if not data.cameras:
+        raise InputError(f"{data.path}: has no pictures; the policy learns from what it sees.")
+    columns, count = data.columns(), data.info["total_frames"]
+    missing = {"observation.state", "torchdlo.target"} - columns.keys()
+    if missing:
+        raise InputError(
+            f"{data.path}: has no column {', '.join(sorted(missing))}; make it with torchdlo dataset make."
+        )
+    last = np.zeros(count, np.int64)
+    pictures = {}
+    for camera in data.cameras:
+        height, width, _ = data.features[camera]["shape"]
+        file = folder / f"{camera}.u8"
+        pictures[camera.removeprefix(IMAGES)] = np.memmap(file, np.uint8, "w+", shape=(count, 3, height, width))
+    for k, row in enumerate(data.episodes):
+        start, end = row["dataset_from_index"], row["dataset_to_index"]
+        last[start:end] = end - 1
+        for camera in data.cameras:
+            shots = np.stack(list(data.pictures(k, camera)))
+            pictures[camera.removeprefix(IMAGES)][start:end] = shots.transpose(0, 3, 1, 2)
+        callback("read", k + 1, len(data.episodes), "")
+    target = columns["torchdlo.target"].reshape(count, -1, 7)[..., :3].reshape(count, -1)
+    return _Frames(
+        torch.from_numpy(columns["observation.state"].copy()),
+        torch.from_numpy(np.ascontiguousarray(target)),
+        torch.from_numpy(last),
+        language.encode(data.tasks, encoder),
+        torch.from_numpy(columns["task_index"].copy()),
+        pictures,
+    )
+
+
+def learn(
+    path: Path,
+    out: Path,
+    training: Training | None = None,
+    *,
+    resume: bool = False,
+    callback: Callable[[str, int, int, str], None] | None = None,
+) -> dict[str, Any]:
+    """Train a policy and write it to a file after every epoch; return how it went.
+
+    Args:
+        path: a data set of `torchdlo dataset make`.
+        out: the policy's file; a checkpoint lies beside it until training is over.
+        training: how to train.
+        resume: go on from the checkpoint; with the same number of threads the policy comes out the same.
+        callback: told (stage, done, in all, message); may raise KeyboardInterrupt.
+    """
+    training, told = training or Training(), callback or (lambda *_: None)
+    data = open_set(path)
+    encoder = language.default_encoder() if training.language == "auto" else training.language
+    checkpoint = out.with_name(f"{out.stem}.checkpoint.pt")
+    if resume and not checkpoint.is_file():
+        raise InputError(f"{checkpoint}: there is no checkpoint to resume; leave out --resume.")
+    begun = time.monotonic()
+    with tempfile.TemporaryDirectory(prefix=".frames-", dir=_parent(out)) as folder:
+        frames = _read(data, encoder, Path(folder), told)
+        run = _Run(data, frames, training, encoder)
+        if resume:
+            run.load(checkpoint)
+        while run.epoch < training.epochs:
+            run.train(told)
+            run.save(checkpoint)
+            save_policy(out, run.averaged, run.about())
+    checkpoint.unlink(missing_ok=True)
+    return run.about() | {"seconds": round(time.monotonic() - begun, 1)}
+
+
+def _parent(out: Path) -> Path:
+    out.parent.mkdir(parents=True, exist_ok=True)
+    return out.parent
+
+
+class _Run:
+    """A training under way."""
+
+    def __init__(self, data: DataSet, frames: _Frames, training: Training, encoder: str) -> None:
+        self.data, self.frames, self.training, self.encoder = data, frames, training, encoder
+        cameras = tuple(frames.pictures)
+        shape = Shape(
+            arms=frames.target.shape[1] // 3,
+            cameras=cameras,
+            size=frames.pictures[cameras[0]].shape[-1],
+            state=frames.state.shape[1],
+            chunk=training.chunk,
+        )
+        with torch.random.fork_rng(devices=()):
+            torch.manual_seed(training.seed)
+            self.policy = ChunkPolicy(shape)
+        for name, x in (("state", frames.state), ("target", frames.target)):
+            getattr(self.policy, f"{name}_mean").copy_(x.mean(0))
+            getattr(self.policy, f"{name}_std").copy_(x.std(0, correction=0).clamp(min=LEAST))
+        self.averaged = copy.deepcopy(self.policy).eval()
+        self.optimizer = torch.optim.AdamW(self.policy.parameters(), training.rate, weight_decay=training.decay)
+        self.epoch, self.curve = 0, list[float]()
+        self.steps = -(-len(frames.state) // training.batch)
+
+    def train(self, told: Callable[[str, int, int, str], None]) -> None:
+        """Go once through all frames, in an order that the number of the epoch decides."""
+        generator = torch.Generator().manual_seed(self.training.seed * 100_003 + self.epoch)
+        order = torch.randperm(len(self.frames.state), generator=generator)
+        total, all_steps = 0.0, self.steps * self.training.epochs
+        self.policy.train()
+        for k, at in enumerate(order.split(self.training.batch)):
+            done = self.epoch * self.steps + k
+            for group in self.optimizer.param_groups:
+                group["lr"] = self.training.rate * _schedule(done, all_steps)
+            shots, state, sentence, target = self.frames.batch(at, self.training.chunk)
+            wanted = (target - self.policy.target_mean) / self.policy.target_std
+            loss = (self.policy.scaled(shots, state, sentence) - wanted).abs().mean()
+            self.optimizer.zero_grad()
+            loss.backward()
+            torch.nn.utils.clip_grad_norm_(self.policy.parameters(), 1.0)
+            self.optimizer.step()
+            self._average(min(self.training.average, (1 + done) / (10 + done)))
+            total += float(loss.detach()) * len(at)
+            told("learn", done + 1, all_steps, f"loss {total / (len(at) * (k + 1)):.4f}")
+        self.epoch += 1
+        self.curve.append(total / len(order))
+
+    def _average(self, keep: float) -> None:
+        with torch.no_grad():
+            for mean, own in zip(self.averaged.parameters(), self.policy.parameters(), strict=True):
+                mean.lerp_(own, 1 - keep)
+
+    def about(self) -> dict[str, Any]:
+        """Return what is to be known of the policy."""
+        rows = self.data.provenance.get("episodes") or []
+        return {
+            "tasks": sorted({row["task"] for row in rows if row.get("task")}),
+            "sentences": list(self.data.tasks),
+            "language": self.encoder,
+            "dataset": self.data.path.resolve().name,
+            "episodes": len(self.data.episodes),
+            "frames": len(self.frames.state),
+            "parameters": sum(p.numel() for p in self.policy.parameters()),
+            "training": asdict(self.training),
+            "epochs": self.epoch,
+            "loss": [round(x, 6) for x in self.curve],
+            "versions": {name: str(value) for name, value in versions().items()},
+        }
+
+    def _same(self) -> dict[str, Any]:
+        return {"training": asdict(self.training), "frames": len(self.frames.state), "language": self.encoder}
+
+    def save(self, path: Path) -> None:
+        """Write all that is needed to go on."""
+        content = {
+            "same": self._same(),
+            "epoch": self.epoch,
+            "curve": self.curve,
+            "policy": self.policy.state_dict(),
+            "averaged": self.averaged.state_dict(),
+            "optimizer": self.optimizer.state_dict(),
+        }
+        with replacing(path) as temporary:
+            torch.save(content, temporary)
+
+    def load(self, path: Path) -> None:
+        """Go on from a checkpoint."""
+        try:
+            content = torch.load(path, weights_only=True)
+        except (OSError, RuntimeError, ValueError, EOFError):
+            raise InputError(f"{path}: the checkpoint is damaged; leave out --resume.") from None
+        if content["same"] != self._same():
+            raise InputError(f"{path}: it is of another data set or training; give the same, or leave out --resume.")
+        self.epoch, self.curve = content["epoch"], content["curve"]
+        for name in ("policy", "averaged", "optimizer"):
+            getattr(self, name).load_state_dict(content[name])
+
+
+def _schedule(done: int, total: int) -> float:
+    """Return the share of the learning rate: up within a twentieth of the steps, then down as a cosine."""
+    rise = max(1, total // 20)
+    return min((done + 1) / rise, 0.5 * (1 + math.cos(math.pi * done / total)) + 0.01)
