@@ -51,7 +51,7 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def learned(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A policy that was trained for a while."""
     out = tmp_path_factory.mktemp("policies") / "policy.pt"
-    learn(data, out, Training(epochs=60, batch=8, rate=2e-3, chunk=4, language="hashed"))
+    learn(data, out, Training(epochs=60, batch=8, rate=2e-3, chunk=4, width=32, language="hashed"))
     return out
 
 
@@ -140,7 +140,7 @@ def test_training_reads_the_set_and_learns_its_targets(data: Path, learned: Path
 
 
 def test_training_that_was_stopped_comes_to_the_same(data: Path, tmp_path: Path) -> None:
-    training = Training(epochs=3, batch=16, chunk=4, language="hashed")
+    training = Training(epochs=3, batch=16, chunk=4, width=32, language="hashed")
     learn(data, tmp_path / "whole.pt", training)
 
     def stop(stage: str, done: int, total: int, message: str) -> None:
@@ -150,7 +150,9 @@ def test_training_that_was_stopped_comes_to_the_same(data: Path, tmp_path: Path)
     with pytest.raises(KeyboardInterrupt):
         learn(data, tmp_path / "parts.pt", training, callback=stop)
     with pytest.raises(InputError, match="it is of another data set or training"):
-        learn(data, tmp_path / "parts.pt", Training(epochs=3, batch=8, chunk=4, language="hashed"), resume=True)
+        learn(
+            data, tmp_path / "parts.pt", Training(epochs=3, batch=8, chunk=4, width=32, language="hashed"), resume=True
+        )
     learn(data, tmp_path / "parts.pt", training, resume=True)
     (a, one), (b, other) = (load_policy(tmp_path / f"{name}.pt") for name in ("whole", "parts"))
     assert one["loss"] == other["loss"]

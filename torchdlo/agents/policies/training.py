@@ -42,6 +42,9 @@ class Training:
     average: float = 0.995
     """How much of the averaged weights a step keeps; these are what is saved."""
     chunk: int = 20
+    """Actions that the policy looks ahead."""
+    width: int = 128
+    """Numbers of a token of the network."""
     seed: int = 0
     language: str = "auto"
     """"minilm", "hashed", or the better one that is installed."""
@@ -163,6 +166,7 @@ class _Run:
             size=frames.pictures[cameras[0]].shape[-1],
             state=frames.state.shape[1],
             chunk=training.chunk,
+            width=training.width,
         )
         with torch.random.fork_rng(devices=()):
             torch.manual_seed(training.seed)
