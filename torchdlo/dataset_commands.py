@@ -13,7 +13,7 @@ from torchdlo.cli.progress import deferred_interrupt, progress
 from torchdlo.errors import InputError
 from torchdlo.files import check_writable
 
-__all__ = ["dataset", "learn"]
+__all__ = ["dataset", "learn", "sweep"]
 
 dataset = typer.Typer(
     name="dataset",
@@ -290,3 +290,62 @@ def learn(
         f"policy: {out}, {found['parameters']} parameters, loss {found['loss'][-1]:.4f} after {found['epochs']} epochs",
         err=as_json,
     )
+
+
+def sweep(
+    kind: Annotated[str, typer.Argument(help="What to run.", metavar="optimize|train|diagnose|dataset")],
+    subjects: Annotated[
+        list[str], typer.Argument(help="Tasks or recordings; behind -- further options of the command.")
+    ],
+    out: OutOption,
+    seeds: Annotated[str, typer.Option(help="Such as 0-4 or 0,3,7.")] = "0",
+    workers: Workers = None,
+    address: Address = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on; what failed is tried again.")] = False,
+    as_json: Json = False,
+) -> None:
+    """Run a command for several tasks or recordings and seeds, on all cores or on the machines of a Ray cluster.
+
+    What is finished stays; --resume goes on after a stop, also within commands that can.
+
+    [bold]Examples:[/bold]
+
+    torchdlo sweep optimize coiling wrapping --seeds 0-2 --out runs/sweep -- --episodes 600
+
+    torchdlo sweep diagnose recordings/a recordings/b --out runs/diagnoses --address auto
+    """
+    from torchdlo.agents.distributed import executor
+    from torchdlo.agents.distributed.sweep import Sweep
+    from torchdlo.agents.distributed.sweep import run as start
+
+    first = next((k for k, word in enumerate(subjects) if word.startswith("-")), len(subjects))
+    plan = Sweep(kind, tuple(subjects[:first]), _seeds(seeds), tuple(subjects[first:]))
+    plan.jobs  # noqa: B018, says what is wrong
+
+    def work(callback: Callable[[str, int, int, str], None]) -> dict[str, Any]:
+        with executor(workers, address) as where:
+            return start(plan, out, where, away=address is not None, resume=resume, callback=callback)
+
+    found = _watched(work, f"what is finished stays in {out}, and --resume goes on with it")
+    bad = {name: row for name, row in found.items() if not row["done"]}
+    if as_json:
+        typer.echo(json.dumps(found, indent=1))
+    typer.echo(f"{out}: {len(found) - len(bad)} of {len(plan.jobs)} done", err=as_json)
+    for name, row in bad.items():
+        typer.echo(f"{name} failed: {row['said']}", err=True)
+    if bad:
+        raise typer.Exit(1)
+
+
+def _seeds(text: str) -> tuple[int, ...]:
+    """Return the seeds of a text such as 0-4 or 0,3,7."""
+    found: list[int] = []
+    try:
+        for part in text.split(","):
+            low, dash, high = part.partition("-")
+            found += range(int(low), int(high) + 1) if dash else [int(low)]
+    except ValueError:
+        raise InputError(f"--seeds: expected numbers such as 0-4 or 0,3,7, given {text!r}.") from None
+    if not found or len(set(found)) < len(found):
+        raise InputError(f"--seeds: expected one or more numbers, each once, given {text!r}.")
+    return tuple(found)

@@ -4,6 +4,10 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import signal
+import subprocess
+import threading
+import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
@@ -115,14 +119,30 @@ class LocalProcesses(_Closing):
             process.join()
 
 
-def _prepare() -> None:
-    """Let each worker use one core, and leave Ctrl-C to the process that started it."""
-    import signal
+CHILDREN: set[subprocess.Popen[bytes]] = set()
+"""Programs that a worker has begun; they end with it."""
 
+
+def _prepare() -> None:
+    """Let each worker use one core, leave Ctrl-C to the process that started it, and end when that is gone."""
     import torch
 
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
     torch.set_num_threads(1)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, lambda *_: _leave())
+    threading.Thread(target=_watch, args=(os.getppid(),), daemon=True).start()
+
+
+def _watch(parent: int) -> None:
+    while os.getppid() == parent:
+        time.sleep(0.5)
+    _leave()
+
+
+def _leave() -> None:
+    for child in CHILDREN:
+        child.terminate()
+    os._exit(1)
 
 
 def executor(workers: int | None = None, address: str | None = None) -> Any:
