@@ -78,8 +78,8 @@ def make(
 
     torchdlo dataset make wiring_post --actor experiments/trajopt --episodes 20 --out sets/found
     """
-    from torchdlo.agents.data.make import Plan
-    from torchdlo.agents.data.make import make as run
+    from torchdlo.agents.data.making import Plan
+    from torchdlo.agents.data.making import make as run
     from torchdlo.agents.distributed import executor
 
     plan = Plan(tuple(tasks), episodes, seed=seed, size=size, codec=codec, actor=actor, noise=noise, batch=batch)

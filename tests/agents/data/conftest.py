@@ -14,7 +14,7 @@ pytest.importorskip("pytorch_kinematics", reason="arms need the extra robots")
 from short_task import SHORT, Dots, plan
 
 from torchdlo import envs
-from torchdlo.agents.data.make import make
+from torchdlo.agents.data.making import make
 
 
 @pytest.fixture(autouse=True)

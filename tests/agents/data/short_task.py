@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from torchdlo import envs
-from torchdlo.agents.data.make import SearchPlan, make
+from torchdlo.agents.data.making import SearchPlan, make
 from torchdlo.envs.core import episode
 from torchdlo.envs.core.task import RADIUS, Arms, Task, TaskState, straight
 from torchdlo.envs.core.task import make as scene

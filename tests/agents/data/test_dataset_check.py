@@ -13,7 +13,7 @@ import torch
 from short_task import Dots, plan
 
 from torchdlo.agents.data import Choice, FrameData, check, merge, open_set, select, to_tensordict
-from torchdlo.agents.data.make import make
+from torchdlo.agents.data.making import make
 from torchdlo.cli import app
 from torchdlo.errors import InputError
 

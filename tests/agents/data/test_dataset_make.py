@@ -18,7 +18,7 @@ import torch
 from short_task import Dots, Pair, Short, plan
 
 from torchdlo.agents.data import attempts, check, open_set
-from torchdlo.agents.data.make import UNFINISHED, make
+from torchdlo.agents.data.making import UNFINISHED, make
 from torchdlo.agents.distributed import LocalProcesses
 from torchdlo.cli import app
 from torchdlo.envs.core import episode

@@ -19,7 +19,7 @@ from short_task import SHORT, Dots, plan
 
 from torchdlo import envs
 from torchdlo.agents.data import check, open_set
-from torchdlo.agents.data.make import make
+from torchdlo.agents.data.making import make
 from torchdlo.agents.data.record import Noise, play_batch, starts
 from torchdlo.agents.policies import language
 from torchdlo.agents.policies.chunk_policy import ChunkPolicy, Shape, load_policy, save_policy
