@@ -52,7 +52,7 @@ ALLOWED = {
     "scene_files": ARRAYS,
     "sysid": ARRAYS,
     "envs": LEARNING | {"pytorch_kinematics", "trimesh"},
-    "agents": LEARNING | {"cma", "numpy", "scipy", "openai", "httpx", "httpx2", "pydantic", "pyarrow", "av"},
+    "agents": LEARNING | {"cma", "numpy", "scipy", "openai", "httpx", "httpx2", "pydantic", "pyarrow", "av", "ray", "safetensors", "tokenizers"},
     "report": ARRAYS | {"matplotlib", "pyvista", "vtk", "av", "viser", "mitsuba", "pyoidn", "PIL"},
     "cli": LEARNING | ARRAYS | {"rich", "typer", "av", "cv2", "packaging"},
     "__main__": set(),

@@ -10,6 +10,7 @@ from typing import Annotated
 import typer
 
 from torchdlo.cli.agent import plan, propose
+from torchdlo.cli.datasets import dataset, learn, sweep
 from torchdlo.cli.doctor import doctor
 from torchdlo.cli.identification import calibrate, design_experiment, diagnose
 from torchdlo.cli.policies import deploy, evaluate, train
@@ -71,6 +72,9 @@ app.command()(plan)
 app.command()(train)
 app.command()(evaluate)
 app.command()(deploy)
+app.add_typer(dataset)
+app.command()(learn)
+app.command()(sweep)
 app.command("calibrate-camera")(calibrate_camera)
 app.command()(segment)
 app.command()(film)

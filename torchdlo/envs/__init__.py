@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from torchdlo.envs.assets.rope_material import RopeMaterial
-from torchdlo.envs.coiling_about import CoilingLeft, CoilingRight
 from torchdlo.envs.core.fidelity import PUBLISHED, Fidelity, parse_fidelity
 from torchdlo.envs.core.task import Task
 from torchdlo.envs.tasks.coiling import Coiling
+from torchdlo.envs.tasks.coiling_about import CoilingLeft, CoilingRight
 from torchdlo.envs.tasks.gathering import Gathering
 from torchdlo.envs.tasks.letter_art import LetterArt
 from torchdlo.envs.tasks.lifting import Lifting

@@ -198,7 +198,7 @@ def run(*words: object) -> int:
 
 
 def test_wrong_requests_are_one_sentence(tmp_path: Path, capsys, monkeypatch) -> None:
-    monkeypatch.setattr("torchdlo.dataset_commands._painter", Dots)
+    monkeypatch.setattr("torchdlo.cli.datasets._painter", Dots)
     cases = {
         ("make", "sweeping"): "there is no task 'sweeping'; expected one of",
         ("make", "short", "short"): "the task short is named twice",

@@ -172,7 +172,7 @@ def test_a_policy_acts_in_closed_loop_and_makes_a_set(learned: Path, tmp_path: P
     make(plan(episodes=2, actor=str(learned), size=16), tmp_path / "set", painter=Dots())
     assert check(tmp_path / "set") == []
     assert open_set(tmp_path / "set").provenance["episodes"][0]["actions_from"] == "policy policy.pt"
-    monkeypatch.setattr("torchdlo.dataset_commands._painter", Dots)
+    monkeypatch.setattr("torchdlo.cli.datasets._painter", Dots)
     with pytest.raises(SystemExit):
         app.main(["dataset", "evaluate", str(learned), "--episodes", "2", "--json"])
     assert '"success"' in capsys.readouterr().out

@@ -168,7 +168,9 @@ def play_batch(
 ) -> tuple[list[_Step], episode.EpisodeState, Tensor]:
     """Play attempts, as many as the episode has scenes; return the steps, the end, and how starts were off [m]."""
     task, like = made.task, made.start.tool.pos
-    offsets = [task.moved(1, like=like, generator=torch.Generator().manual_seed(start.part("start"))) for start in attempts]
+    offsets = [
+        task.moved(1, like=like, generator=torch.Generator().manual_seed(start.part("start"))) for start in attempts
+    ]
     moved = torch.cat(offsets)
     shakes = [noise.drawn(start.part("noise"), task.horizon, task.arms.count) for start in attempts]
     shake = torch.stack(shakes, 1).to(like)
