@@ -12,9 +12,9 @@ Per substep, on a fixed number of points of each pair of bodies (see `balls`):
     warm start. Rounds choose which contacts press and which stick; sliding friction is taken as resistance
     mu_k p / |s| meanwhile, which cannot overshoot.
 5.  A step with the exact gradient ends at the solution, as rounds may leave what slides a tenth of its friction away
-    from it; it is taken where that leaves less to do, or next to nothing. One more gives q its derivative by the implicit function theorem.
-    Forces are those of the contacts in the sets of the last round, none pulls and none rubs by more than Coulomb
-    allows.
+    from it; it is taken where that leaves less to do, or next to nothing. One more gives q its derivative by the
+    implicit function theorem. Forces are those of the contacts in the sets of the last round, none pulls and none rubs
+    by more than Coulomb allows.
 6.  Rounds may end too early where many edges hit at once. Forces that would add energy are dropped then, and contacts
     press in proportion to how fast they approach, as much as fits in the mean: safe, but they may overlap a little.
 
