@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import json
 
 import numpy as np
@@ -82,6 +83,16 @@ def test_a_line_is_cut_into_equal_parts():
     )
     found = _rope(square, torch.float64).positions
     assert len(found) == 8 and found[-1].tolist() == [0, 0.5, 0]
+
+
+def test_steps_are_solved_as_a_file_says(tmp_path):
+    chosen = {"constraint_iterations": 5, "implicit_weight": 0.3, "numerical_damping": 0.1}
+    scene_files.save(dataclasses.replace(LIFT, **chosen), tmp_path / "scene.json")
+    made = scene_files.load(tmp_path / "scene.json")[0]
+    assert {name: getattr(made, name) for name in chosen} == chosen
+    (tmp_path / "scene.json").write_text(change("implicit_weight", to=0.1))
+    with pytest.raises(ValueError, match=r"implicit_weight is 0.1; expected at least 0.25"):
+        scene_files.load(tmp_path / "scene.json")
 
 
 def test_single_precision_is_used_throughout():

@@ -24,8 +24,8 @@ from torchdlo.coupling.mpm.particles import MpmDomain, ParticleParams, Particles
 from torchdlo.physics import tree
 from torchdlo.physics.effects.base import Effect, altered, default_values, parameters_of
 from torchdlo.physics.execution import tracing
+from torchdlo.physics.execution.gradient_check import GradientCheck, check_gradients
 from torchdlo.physics.execution.replay import alike, rollout
-from torchdlo.physics.gradient_check import GradientCheck, check_gradients
 from torchdlo.physics.integrators import stability
 from torchdlo.physics.integrators.rod_step import INTEGRATORS, TWISTS, Settings, settle_twist, substep
 from torchdlo.physics.kernels import native

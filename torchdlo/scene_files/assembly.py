@@ -73,6 +73,13 @@ def build(
     return made.scene, made.params, made.state, made.plan.controls
 
 
+_STEPPING = (
+    *("dt", "substeps", "integrator", "twist", "constrained"),
+    *("constraint_iterations", "implicit_weight", "numerical_damping"),
+)
+"""What a description says of steps, in the words of `scene.Scene`."""
+
+
 def assemble(description: SceneDescription, *, folder: str | Path = ".") -> Simulation:
     """Return what a description says, ready to run.
 
@@ -93,7 +100,7 @@ def assemble(description: SceneDescription, *, folder: str | Path = ".") -> Simu
         values[kind.name] = {k: v for k, v in given.items() if k in kind.params}
     meshes = {k: _mesh(b, k, folder) for k, b in enumerate(d.bodies) if b.shape == "mesh"}
     bodies = [_body(b, k, meshes.get(k)) for k, b in enumerate(d.bodies)]
-    static = {name: getattr(d, name) for name in ("dt", "substeps", "integrator", "twist", "constrained")}
+    static = {name: getattr(d, name) for name in _STEPPING}
     held = {f"prescribed_{part}": _slots(d, counts, part) for part in ("vertices", "edges")}
     _check_holds(d)
     armed = motion.arms(d, folder)

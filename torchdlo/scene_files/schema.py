@@ -195,6 +195,12 @@ class SceneDescription:
     integrator: Literal["explicit", "implicit"] = "explicit"
     twist: Literal["none", "dynamic", "quasistatic"] = "none"
     constrained: bool = True
+    constraint_iterations: int | None = None
+    """Newton steps for edge lengths per substep, in implicit steps at most; if null, 3 explicit and 8 implicit ones."""
+    implicit_weight: float = 0.5
+    """Share of a substep's change at which implicit steps take stiff forces and tensions."""
+    numerical_damping: float = 0.0
+    """Share of a substep by which implicit steps look ahead, 0 to 1: it damps fast modes."""
     precision: Literal["float64", "float32"] = "float64"
     """Type of all numbers."""
     camera_direction: Vector = (0.5, -1.0, 0.45)

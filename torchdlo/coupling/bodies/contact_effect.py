@@ -12,9 +12,9 @@ Per substep, on a fixed number of points of each pair of bodies (see `balls`):
     warm start. Rounds choose which contacts press and which stick; sliding friction is taken as resistance
     mu_k p / |s| meanwhile, which cannot overshoot.
 5.  A step with the exact gradient ends at the solution, as rounds may leave what slides a tenth of its friction away
-    from it; it is taken where that leaves less to do. One more gives q its derivative by the implicit function theorem.
-    Forces are those of the contacts in the sets of the last round, none pulls and none rubs by more than Coulomb
-    allows.
+    from it; it is taken where that leaves less to do, or next to nothing. One more gives q its derivative by the
+    implicit function theorem. Forces are those of the contacts in the sets of the last round, none pulls and none rubs
+    by more than Coulomb allows.
 6.  Rounds may end too early where many edges hit at once. Forces that would add energy are dropped then, and contacts
     press in proportion to how fast they approach, as much as fits in the mean: safe, but they may overlap a little.
 
@@ -217,8 +217,12 @@ def resolve(contact: BodyContact, motion: PredictedBodyMotion) -> tuple[Tensor, 
         excess = _excess(plain, sets, q)
         ahead = q + plain.solve(gradients, excess)
         resisted = plain.inertia.diagonal(dim1=-2, dim2=-1)
-        off, left = ((x.square() / resisted).sum((-1, -2), keepdim=True) for x in (excess, _excess(plain, sets, ahead)))
-        q = torch.where(left < off, ahead, q)
+        whole = plain.load(_forces(plain.links, sets, plain.moved(q)))
+        off, left, most = (
+            (x.square() / resisted).sum((-1, -2), keepdim=True) for x in (excess, _excess(plain, sets, ahead), whole)
+        )
+        # Where both are at rounding, it is taken too: else derivatives jump with the last bit of what is given.
+        q = torch.where(left < off + torch.finfo(q.dtype).eps * most, ahead, q)
         sets, gradients = _exact(plain, sets, q)
     q = q + plain.solve(gradients, _excess(system, sets, q))
     force = _forces(links, sets, system.moved(q))

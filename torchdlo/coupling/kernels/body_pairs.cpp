@@ -7,6 +7,7 @@
 #include "elimination.h"
 #include "flush.h"
 
+#include <limits>
 #include <memory>
 
 template <typename T>
@@ -208,7 +209,10 @@ struct Block : Linked<T> {
     for (int i = 0; i < system.n; ++i) ahead[i] = more[i].x;
     system.solve(ahead);
     for (int i = 0; i < system.n; ++i) ahead[i] += motion[i];
-    const auto better = weight(excess<0>(bodies, links, constants<0>(ahead))) < weight(more);
+    // Where both are at rounding, the step is taken too: else derivatives jump with the last bit of what is given.
+    const L whole = weight(gathered(this->exerted(links, pressed(links, constants<0>(motion)))));
+    const L little = weight(more) + std::numeric_limits<T>::epsilon() * whole;
+    const auto better = weight(excess<0>(bodies, links, constants<0>(ahead))) < little;
     for (int i = 0; i < system.n; ++i) motion[i] = better ? ahead[i] : motion[i];
     linearize();
     return true;

@@ -14,8 +14,9 @@ normal force acts along the normal through the centreline. Friction acts at the 
 centreline; the couple that this makes is exerted by the ends of the edge, but for its part about the edge, which a
 centreline cannot exert: ropes slide across a body and do not roll on it.
 
-Implicit steps find these forces together with the lengths, by a stiff law of the end of the step, see `physics.touch`
-and `physics.engage`; `sweeps`, `rounds` and the kernel belong to explicit ones.
+Implicit steps find these forces together with the lengths, by a stiff law of the end of the step, see
+`physics.constraints.contact_penalty` and `physics.integrators.contact_step`; `sweeps`, `rounds` and the kernel belong
+to explicit ones.
 
 The derivative is the one of the step as computed, of nearest points and normals too; it is finite everywhere, and
 one-sided where a point starts to touch or to slide.
@@ -38,11 +39,11 @@ from torchdlo.coupling.bodies.dynamics import PredictedBodyMotion, conjugate
 from torchdlo.coupling.bodies.segment_distance import EdgePoints, families, find
 from torchdlo.coupling.common.coulomb_friction import parting, rebounding, rub
 from torchdlo.coupling.rod_body import solver_op as body_sweeps
+from torchdlo.physics.constraints.contact_penalty import Touch
 from torchdlo.physics.effects.base import ContactForces, Effect, PredictedMotion, Values
 from torchdlo.physics.linalg.numerics import cross, dot, safe_norm
 from torchdlo.physics.linalg.rotation import rotate
 from torchdlo.physics.rod.kinematics import View
-from torchdlo.physics.touch import Touch
 
 
 @dataclass(frozen=True)

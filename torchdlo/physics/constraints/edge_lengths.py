@@ -252,14 +252,14 @@ class System:
     force: Tensor
     scale: Tensor
     direction: Tensor
-    numerical_damping: Tensor
+    ahead: Tensor
     turning: float
 
     def residual(self, pos: Tensor, impulse: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
         """Return displacements, what pushes, excess of lengths, and directions of edges at the end and of tensions."""
         lengths, inertia, topology = self.lengths, self.inertia, self.lengths.topology
         y = pos - self.moved
-        start = self.direction + lengths.active * self.numerical_damping
+        start = self.direction + lengths.active * self.ahead
         along_start = start + self.lean * (following(topology, y) - y)
         pull = impulse * along_start
         given = self.scale * self.force + pull - preceding(topology, pull)
@@ -277,7 +277,7 @@ class System:
         lengths, inertia = self.lengths, self.inertia
         swing = inertia.vertex.new_zeros(1, 1) if inertia.turning is None else inertia.turning
         edges = lengths.rest, lengths.compliance, lengths.active, lengths.edge_mask, lengths.give, inertia.hinge, swing
-        vectors = inertia.vertex, self.moved, self.force, self.direction, self.numerical_damping
+        vectors = inertia.vertex, self.moved, self.force, self.direction, self.ahead
         law = [self.turning, lengths.most, lengths.least, lengths.shift]
         return [*edges, self.free, tension, *vectors, self.scale], law
 

@@ -15,8 +15,8 @@ from torchdlo.physics.rod.kinematics import RodParams, View
 from torchdlo.physics.rod.topology import Topology
 
 if TYPE_CHECKING:
+    from torchdlo.physics.constraints.contact_penalty import Touch
     from torchdlo.physics.effects.measurement import Track
-    from torchdlo.physics.touch import Touch
 
 KINDS = ("force", "material", "boundary", "measurement")
 """What an effect can be: a load from outside, a law of the rope, of how it is held, or of how it is measured."""

@@ -19,10 +19,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchdlo.physics import engage, tree
+from torchdlo.physics import tree
+from torchdlo.physics.constraints.contact_penalty import Touch
 from torchdlo.physics.constraints.edge_lengths import Inertia, Lengths, System, balance, project, solve_slots
 from torchdlo.physics.effects import base as effect
 from torchdlo.physics.effects.base import ContactForces, Effect, PredictedMotion, Values
+from torchdlo.physics.integrators import contact_step
 from torchdlo.physics.kernels import lanes
 from torchdlo.physics.linalg import rotation
 from torchdlo.physics.linalg.numerics import normalize, wrap
@@ -31,7 +33,6 @@ from torchdlo.physics.rod.kinematics import RodParams, RodState, View
 from torchdlo.physics.rod.prescribed import Reaction, Targets, put
 from torchdlo.physics.rod.prescribed import free as free_slots
 from torchdlo.physics.rod.topology import Topology, following
-from torchdlo.physics.touch import Touch
 
 INTEGRATORS = ("explicit", "implicit")
 TWISTS = ("none", "dynamic", "quasistatic")
@@ -307,8 +308,8 @@ def _balance(
         force = force - inertia.swing(topology, (1 - kick.free) * (moved - kick.drift)) / scale
     if touch is not None:
         system = System(lengths, inertia, moved, kick.free, force, scale, now.tangent, ahead, share)
-        touching = engage.Touching(system, touch, now.state.pos)
-        pos, tension, whole, exerted, wrench, left = engage.solve(touching, tension)
+        touching = contact_step.Touching(system, touch, now.state.pos)
+        pos, tension, whole, exerted, wrench, left = contact_step.solve(touching, tension)
         return pos, tension, whole, ContactForces(exerted, *touch.spread(wrench), unsolved=left)
     return balance(
         lengths,

@@ -1,9 +1,9 @@
 """One implicit substep of ropes that touch: positions, tensions, free bodies and forces of contact in one solve.
 
-The equations are those of `constrain.balance` with the forces of `touch` among them. Points on fixed and driven
-surfaces fill blocks of 3 x 3 on and beside the diagonal, within the band that bending needs; free bodies add a border
-of six unknowns each, which their Schur complement takes out. Newton's method runs without graph until each scene is
-solved; scenes that are not are tried again with softer contact. One more step, with graph, gives the derivative of
+The equations are those of `edge_lengths.balance` with the forces of `contact_penalty` among them. Points on fixed and
+driven surfaces fill blocks of 3 x 3 on and beside the diagonal, within the band that bending needs; free bodies add a
+border of six unknowns each, which their Schur complement takes out. Newton's method runs without graph until each scene
+is solved; scenes that are not are tried again with softer contact. One more step, with graph, gives the derivative of
 the implicit function theorem, and what is left of the equations is reported.
 """
 
@@ -16,12 +16,13 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchdlo.physics import touch, tree
+from torchdlo.physics import tree
+from torchdlo.physics.constraints import contact_penalty as penalty
+from torchdlo.physics.constraints.contact_penalty import HARD, Touch
 from torchdlo.physics.constraints.edge_lengths import Inertia, Lengths, System, saddle_order
 from torchdlo.physics.linalg import banded
 from torchdlo.physics.linalg.numerics import dot
 from torchdlo.physics.rod.topology import Topology, following, parse, preceding
-from torchdlo.physics.touch import HARD, Touch
 
 TRIES = ((HARD, 10), (0.1 * HARD, 24), (0.01 * HARD, 24))
 """How hard contact is, and Newton steps at most, of what is tried one after the other."""
@@ -71,14 +72,14 @@ class Touching:
         system, lengths, inertia = self.system, self.system.lengths, self.system.inertia
         topology, free, scale, count = lengths.topology, system.free, system.scale, self.touch.of.shape[-1]
         y, push, excess, along, along_start = system.residual(now.pos, now.impulse)
-        felt = touch.feel(topology, self.touch, linear, firm, now.pos - self.origin, now.bodies)
+        felt = penalty.feel(topology, self.touch, linear, firm, now.pos - self.origin, now.bodies)
         forces = inertia.vertex * y - free * (push + felt.force)
         resist = self.touch.resist * scale.unsqueeze(-1)
         wrenches = (resist @ now.bodies.unsqueeze(-1)).squeeze(-1) - felt.wrench
         batch = torch.broadcast_shapes(forces.shape[:-2], excess.shape[:-2], resist.shape[:-3], firm.shape[:-3])
         v = topology.size
         with torch.no_grad():
-            gradient = touch.gradients(topology, self.touch, linear, felt, exact)
+            gradient = penalty.gradients(topology, self.touch, linear, felt, exact)
             same, one, two = inertia.bands(topology)
             string = now.impulse * system.lean
             after, active = following(topology, free), lengths.active
@@ -88,7 +89,7 @@ class Touching:
             beside = (one - string).unsqueeze(-1) * unit
             own = torch.diag_embed(inertia.vertex) + free.unsqueeze(-1) * own
             onward = free.unsqueeze(-1) * (beside + gradient.after)
-            back = free.unsqueeze(-1) * touch.moved(topology, beside + gradient.before)
+            back = free.unsqueeze(-1) * penalty.moved(topology, beside + gradient.before)
             entries = _stacked(
                 batch,
                 own.flatten(-2),
@@ -139,7 +140,12 @@ class Touching:
 
 
 def _bordered(
-    batch: tuple[int, ...], entries: Tensor, border: Tensor, gradient: touch.Slopes, resist: Tensor, topology: Topology
+    batch: tuple[int, ...],
+    entries: Tensor,
+    border: Tensor,
+    gradient: penalty.Slopes,
+    resist: Tensor,
+    topology: Topology,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return how vertices answer to bodies (N, 4 V, 6 J), how bodies feel vertices, and the bodies' own matrix."""
     v, count = topology.size, gradient.corner.shape[-1]
@@ -150,7 +156,7 @@ def _bordered(
     answer = banded.solve(entries.repeat(1, count), border, f"touching:{topology.name}")
     answer = answer.reshape(4 * v, count, -1).permute(2, 0, 1)
     row = gradient.back.expand(*batch, v, count, 3).permute(*range(len(batch)), -2, -1, -3).reshape(-1, count, 3 * v)
-    own = (touch.blocks(resist) + gradient.corner).expand(*batch, count, count).reshape(-1, count, count)
+    own = (penalty.blocks(resist) + gradient.corner).expand(*batch, count, count).reshape(-1, count, count)
     return answer, row, own - row @ answer[:, : 3 * v]
 
 
@@ -181,11 +187,11 @@ def solve(touching: Touching, tension: Tensor) -> tuple[Tensor, Tensor, Tensor, 
     with torch.no_grad():
         pos, found, bodies, hard = _searched(touching, tension)
     firm = touching.firm(tension, hard)
-    linear = touch.maps(touching.touch)
+    linear = penalty.maps(touching.touch)
     pos = torch.where(system.free > 0, pos, system.moved)
     now, _ = touching.newton(Unknowns(pos, found * system.scale, bodies), firm, linear, True)
     topology, scale = system.lengths.topology, system.scale
-    felt = touch.feel(topology, touching.touch, linear, firm, now.pos - touching.origin, now.bodies)
+    felt = penalty.feel(topology, touching.touch, linear, firm, now.pos - touching.origin, now.bodies)
     push = system.residual(now.pos, now.impulse)[1]
     with torch.no_grad():
         still = tree.detach((now.pos, now.impulse, now.bodies))
@@ -212,7 +218,7 @@ def _engaged(
         lengths, Inertia(vertex, hinge, rest, mask, swing), moved, free, others[0], scale, *others[1:], law[0]
     )
     touching = Touching(system, Touch(*parts), origin)
-    linear = touch.maps(touching.touch)
+    linear = penalty.maps(touching.touch)
     first = touching.start(tension)
     best, open = first, first.pos.new_ones(*first.pos.shape[:-2], 1, 1) > 0
     chosen = torch.full_like(open, HARD, dtype=first.pos.dtype)
@@ -255,7 +261,7 @@ _operators.impl("engaged", _engaged_meta, "Meta")
 
 
 def _pattern(name: str) -> banded.Pattern:
-    """Pattern of `Touching.constraint_iterations`: as that of `balance`, with blocks of 3 x 3; see its `entries` for
+    """Pattern of `Touching.newton`: as that of `balance`, with blocks of 3 x 3; see its `entries` for
     the numbering."""
     topology = parse(name)
     v, after, mask = topology.size, topology.successor(), topology.edge_mask()
