@@ -1,5 +1,9 @@
+<<<<<<< ours
 """A data set out of formulas, which LeRobot has read, trained on and merged (`make lerobot`): its bytes are
 recorded."""
+=======
+"""A data set out of formulas that LeRobot has read, trained on and merged (`make lerobot`): its bytes are recorded."""
+>>>>>>> theirs
 
 from __future__ import annotations
 
@@ -17,7 +21,7 @@ from torchdlo.agents.data.schema import Schema
 from torchdlo.agents.data.statistics import histogram
 
 RECORD = Path(__file__).with_name("lerobot_case.json")
-LENGTH, SIZE = 60, 96
+LENGTH, SIZE = 100, 128
 
 
 def make(out: Path) -> None:
@@ -40,7 +44,7 @@ def _episode(schema: Schema, k: int, folder: Path) -> Episode:
     clips, counts = {}, {}
     for c, key in enumerate(schema.pictures):
         frames = np.zeros((LENGTH, SIZE, SIZE, 3), np.uint8)
-        frames[..., 0] = 2 * np.arange(SIZE)
+        frames[..., 0] = np.arange(SIZE)
         frames[..., 1] = 40 * k + 30 * c
         for t in range(LENGTH):
             frames[t, 16:32, t : t + 16] = (230, 200, 40)
