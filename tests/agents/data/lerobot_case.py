@@ -1,9 +1,4 @@
-<<<<<<< ours
-"""A data set out of formulas, which LeRobot has read, trained on and merged (`make lerobot`): its bytes are
-recorded."""
-=======
 """A data set out of formulas that LeRobot has read, trained on and merged (`make lerobot`): its bytes are recorded."""
->>>>>>> theirs
 
 from __future__ import annotations
 
