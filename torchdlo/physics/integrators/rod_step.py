@@ -209,7 +209,7 @@ def _answered(
     aimed = kick.drift + answer * (kick.force + pull - now.prev(pull))
     aimed = _placed(settings, targets, aimed)
     pushes: dict[str, ContactForces] = {}
-    for _ in range(max((e.rounds for e in reacting), default=1)):
+    for _ in range(max([1, *[e.rounds for e in reacting]])):
         for e in reacting:
             motion = PredictedMotion(aimed - now.state.pos, mobility, answer, bodies, material_points)
             for other in (push for name, push in pushes.items() if name != e.name):
