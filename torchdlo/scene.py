@@ -14,6 +14,7 @@ from functools import partial, reduce
 import torch
 from torch import Tensor
 
+from torchdlo import notices
 from torchdlo.coupling.bodies import dynamics as rigid
 from torchdlo.coupling.bodies.dynamics import Body, BodyParams, BodyState, BodyTargets, RigidBody, place
 from torchdlo.coupling.common import step_diagnostics
@@ -239,6 +240,7 @@ def make(
     if check:
         stability.check_laws(scene.settings, rods, numbers, state)
         check_step(scene, params)
+        _mention(scene, state)
     zero = state.pos.new_zeros(*state.pos.shape[:-2], 1, 3)
     first = State(
         state,
@@ -255,6 +257,33 @@ def make(
         first = tree.replace(first, rods=tree.replace(settled, twist_rate=torch.zeros_like(settled.twist)))
     # No two leaves share memory: steps are compiled for which of them do, and later states have none.
     return scene, params, tree.map(torch.clone, first)
+
+
+def _mention(scene: Scene, state: RodState) -> None:
+    """Say once which things of a scene go through each other because no effect keeps them apart."""
+    names, topology = {e.name for e in scene.effects}, scene.topology
+    if scene.bodies and not names & {"rod_body", "finger_pads"}:
+        notices.once("rod_body", "scene: ropes go through its bodies; add RodBody if they are to touch.")
+    if "rod_contact" in names or len(topology.counts) < 2:
+        return
+    pos = state.pos.detach().reshape(-1, *state.pos.shape[-2:])[0]
+    ropes = [pos[start : start + count] for start, count in zip(topology.starts, topology.counts, strict=True)]
+    low, high, length = (
+        torch.stack([reduced(x) for x in ropes])
+        for reduced in (
+            lambda x: x.amin(0),
+            lambda x: x.amax(0),
+            lambda x: (x[1:] - x[:-1]).norm(dim=-1).sum(),
+        )
+    )
+    apart = torch.maximum(low[:, None] - high, low - high[:, None]).clamp(min=0.0).norm(dim=-1)
+    near = (apart < 0.5 * torch.minimum(length[:, None], length)).triu(1)
+    if bool(near.any()):
+        one, other = near.nonzero()[0].tolist()
+        notices.once(
+            "rod_contact",
+            f"scene: ropes {one} and {other} go through each other; add RodContact if they are to touch.",
+        )
 
 
 def limits(scene: Scene, params: Params) -> dict[str, float]:

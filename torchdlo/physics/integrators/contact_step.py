@@ -220,22 +220,32 @@ def _engaged(
     touching = Touching(system, Touch(*parts), origin)
     linear = penalty.maps(touching.touch)
     first = touching.start(tension)
-    best, open = first, first.pos.new_ones(*first.pos.shape[:-2], 1, 1) > 0
-    chosen = torch.full_like(open, HARD, dtype=first.pos.dtype)
+    found = best = first
+    open = first.pos.new_ones(*first.pos.shape[:-2], 1, 1) > 0
+    chosen = kept = torch.full_like(open, HARD, dtype=first.pos.dtype)
+    least = torch.full_like(chosen, torch.inf)
     for hard, steps in TRIES:
         # Scenes that are not solved begin again.
         chosen = torch.where(open, hard, chosen)
-        firm, now = touching.firm(tension, chosen), _chosen(open, first, best)
+        firm, now = touching.firm(tension, chosen), _chosen(open, first, found)
+        before = now
         for k in range(steps):
             new, left = touching.newton(now, firm, linear, k >= 2)
-            now = _chosen(open, new, now)
+            if k >= 3:  # the step from the one before is the exact one, which is taken again with graph
+                better = open & (left < least)
+                best, kept = _chosen(better, before, best), torch.where(better, chosen, kept)
+                least = torch.where(better, left, least)
+            before, now = now, _chosen(open, new, now)
             open = open & ~(left < _solved(left))
             if not bool(open.any()):
                 break
-        best = now
+        found = now
         if not bool(open.any()):
             break
-    return [x.contiguous() for x in (best.pos, best.impulse / scale, best.bodies, chosen)]
+    # What stays unsolved ends where least was left, not where the last step happened to go.
+    lost = open & (least < torch.inf)
+    found, chosen = _chosen(lost, best, found), torch.where(lost, kept, chosen)
+    return [x.contiguous() for x in (found.pos, found.impulse / scale, found.bodies, chosen)]
 
 
 def _chosen(condition: Tensor, one: Unknowns, other: Unknowns) -> Unknowns:

@@ -209,7 +209,7 @@ def _answered(
     aimed = kick.drift + answer * (kick.force + pull - now.prev(pull))
     aimed = _placed(settings, targets, aimed)
     pushes: dict[str, ContactForces] = {}
-    for _ in range(max((e.rounds for e in reacting), default=1)):
+    for _ in range(max([1, *[e.rounds for e in reacting]])):
         for e in reacting:
             motion = PredictedMotion(aimed - now.state.pos, mobility, answer, bodies, material_points)
             for other in (push for name, push in pushes.items() if name != e.name):
@@ -253,7 +253,10 @@ def _translate(
     rest, material, free = now.params.rest, now.params.material, kick.free
     fixed = (1 - free) * (1 - following(topology, free)) >= 1
     active = rest.edge_mask * (1 - fixed.to(free.dtype))
-    lightest = torch.minimum(material.mass, following(topology, material.mass)).detach()
+    # What is held does not move, whatever its mass is.
+    mobile = torch.where(free > 0, material.mass, torch.inf).detach()
+    lightest = torch.minimum(mobile, following(topology, mobile))
+    lightest = torch.where(lightest < torch.inf, lightest, material.mass.detach())
     most, least = (1e4, 10.0) if settings.integrator == "implicit" else (0.25, 0.25)
     lengths = Lengths(
         topology,

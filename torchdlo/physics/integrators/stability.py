@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from torchdlo import notices
 from torchdlo.physics.effects.base import Values, altered
 from torchdlo.physics.integrators.rod_step import Settings
 from torchdlo.physics.rod import kinematics as rod
@@ -31,6 +32,11 @@ def check_laws(settings: Settings, rods: RodParams, values: dict[str, Values], s
                 f"scene: {frames[0]} changes the natural curvature or the stiffness by direction, which Bend leaves "
                 "out; use BendFrame"
             )
+    stiff = bool((material.bend.detach() != 0).any())
+    if "Bend" in kinds and not stiff:
+        notices.once("bend", "scene: Bend acts, but no rope has a stiffness: give Rope bend [N m^2] or youngs [Pa].")
+    if stiff and "bend" not in {e.name for e in settings.effects}:
+        notices.once("stiffness", "scene: a rope has a bending stiffness, but nothing bends: add Bend or BendFrame.")
     if not settings.constrained and "Stretch" not in kinds and bool(torch.isfinite(material.stretch).any()):
         raise ValueError("scene: stretch is given, but lengths are not constrained and no Stretch effect acts; add it")
     if "Stretch" in kinds and not bool(torch.isfinite(material.stretch).all()):
@@ -48,12 +54,20 @@ def check_laws(settings: Settings, rods: RodParams, values: dict[str, Values], s
 
 
 def _weights(settings: Settings, mass: Tensor) -> Tensor:
-    """Return at each slot the mass of its rope [kg], 0 if that is not held, shape (..., V, 1)."""
-    parts = []
-    for start, count in zip(settings.topology.starts, settings.topology.counts, strict=True):
-        whole = mass[..., start : start + count, :].sum(-2, keepdim=True)
-        held = any(start <= k < start + count for k in settings.prescribed_vertices)
-        parts.append((whole if held else 0 * whole).expand(*whole.shape[:-2], count, 1))
+    """Return at each slot the mass that its edge may carry [kg], shape (..., V, 1).
+
+    That is the mass of its rope, of its own end if that is a free one, and 0 if the rope is not held.
+    """
+    topology, parts = settings.topology, []
+    for start, count, closed in zip(topology.starts, topology.counts, topology.closed, strict=True):
+        own = mass[..., start : start + count, :]
+        held = [k - start for k in settings.prescribed_vertices if start <= k < start + count]
+        carried = (own.sum(-2, keepdim=True) * bool(held)).expand_as(own).clone()
+        if held and not closed:
+            for edge, end in ((0, 0), (count - 2, count - 1)):
+                if end not in held:
+                    carried[..., edge, :] = own[..., end, :]
+        parts.append(carried)
     return torch.cat(parts, -2)
 
 
@@ -92,7 +106,10 @@ def limits(settings: Settings, rods: RodParams, values: dict[str, Values]) -> di
     if settings.constrained and settings.prescribed_vertices and "gravity" in names:
         # What hangs from a hold pulls with its weight. Tensions above a quarter of l m / dt^2 are not held: edges give
         # way, see `constrain.Lengths.yielding`.
-        lightest = torch.minimum(material.mass, following(settings.topology, material.mass))
+        held = material.mass.new_zeros(settings.topology.size, 1)
+        held[list(settings.prescribed_vertices)] = 1.0
+        mobile = torch.where(held > 0, torch.inf, material.mass)
+        lightest = torch.minimum(mobile, following(settings.topology, mobile))
         pull = values["gravity"]["acceleration"].norm(dim=-1, keepdim=True) * _weights(settings, material.mass)
         firm = (0.25 * length * lightest.expand_as(length) / pull).sqrt()
         found["hanging weight"] = torch.where(real & (pull > 0), firm, torch.inf).amin()
