@@ -5,7 +5,7 @@
     python experiments/benchmark_policies.py --table experiments/policies.zip  # the table of docs/policies.md
 
 A run leaves TASK-ALGO-SEED with its policy, its log and evaluation.json: 15 unseen starts, and the one start.
-The hybrid begins with the trajectories in experiments/trajopt; with --source scripted, it begins with the scripted
+The hybrid begins with the trajectories in experiments/trajopt/searches.npz; with --source scripted, it begins with the scripted
 demonstrations of tasks, and runs are called TASK-scripted-SEED.
 """
 
@@ -55,7 +55,7 @@ def scripted(name: str, folder: Path) -> Path:
     if not file.exists():
         task = find(name)
         with torch.no_grad():
-            actions = task.reference().float()[None]
+            actions = task.demonstration().float()[None]
             went = episode.play(task, actions, keep=episode.places, compiled=False, recorded=True)
         content = {"generator": "torchdlo optimize", "task": name, "success": bool(went.success[0])}
         save(str(file), content | {"tool": went.path["tool"][:, 0].tolist()})
@@ -70,6 +70,7 @@ def run(name: str, algo: str, seed: int, chosen: Any) -> None:
     from torchdlo.agents.rl.results import prepared, train_json
     from torchdlo.agents.rl.settings import preset
     from torchdlo.agents.rl.training import train
+    from torchdlo.agents.trajopt.stored import ARCHIVE, unpack
     from torchdlo.envs import find
 
     label = "scripted" if algo == "hybrid" and chosen.source == "scripted" else algo
@@ -82,7 +83,10 @@ def run(name: str, algo: str, seed: int, chosen: Any) -> None:
         return
     given = {"seed": seed, "minutes": chosen.minutes}
     if algo == "hybrid":
-        files = [ROOT / "trajopt" / f"{name}-hybrid-{k}" / "trajectory.json" for k in range(3)]
+        searches = Path(chosen.out) / "searches"
+        if not searches.exists():
+            unpack(ARCHIVE, searches)
+        files = [searches / f"{name}-hybrid-{k}" / "trajectory.json" for k in range(3)]
         if label == "scripted":
             files = [scripted(name, Path(chosen.out))]
         # The path is searched once for all seeds: policies differ in what is learned.

@@ -76,7 +76,7 @@ def make(
 
     torchdlo dataset make coiling separation slingshot wiring_post --episodes 200 --out sets/dlo4
 
-    torchdlo dataset make wiring_post --actor experiments/trajopt --episodes 20 --out sets/found
+    torchdlo dataset make wiring_post --actor runs/searches --episodes 20 --out sets/found
     """
     from torchdlo.agents.data.making import Plan
     from torchdlo.agents.data.making import make as run
