@@ -5,8 +5,8 @@
     python experiments/benchmark_policies.py --table experiments/policies.zip  # the table of docs/policies.md
 
 A run leaves TASK-ALGO-SEED with its policy, its log and evaluation.json: 15 unseen starts, and the one start.
-The hybrid begins with the trajectories in experiments/trajopt/searches.npz; with --source scripted, it begins with the scripted
-demonstrations of tasks, and runs are called TASK-scripted-SEED.
+The hybrid begins with the trajectories in experiments/trajopt/searches.npz; with --source scripted, it begins with the
+scripted demonstrations of tasks, and runs are called TASK-scripted-SEED.
 """
 
 from __future__ import annotations
