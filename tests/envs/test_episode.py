@@ -13,8 +13,8 @@ from test_contract import F64, prepared, small, stage_waypoints
 from torchdlo import scene as scenes
 from torchdlo.coupling.bodies.dynamics import turn_by
 from torchdlo.coupling.robot.kinematics import tool_pose
-from torchdlo.envs import TASKS, reach
-from torchdlo.envs.core import episode
+from torchdlo.envs import TASKS
+from torchdlo.envs.core import episode, reach
 from torchdlo.envs.core.task import RADIUS, Arms, Task, TaskState, make, straight, through
 from torchdlo.physics import tree
 from torchdlo.physics.linalg.rotation import multiply

@@ -44,7 +44,7 @@ def test_an_action_takes_equally_long_in_steps_of_2_ms():
 def test_a_cheaper_fidelity_is_near_the_published_one():
     actions = torch.zeros(1, 4, 6)
     actions[..., 1], actions[..., 2] = -0.002, 0.001
-    task = replace(envs.find("wiring_post"), horizon=4, frames=5)
+    task = replace(envs.find("wiring_post"), horizon=4, frame_skip=5)
     ends = [
         episode.play(simulated(task, how), actions, compiled=False).world.state.rods.pos
         for how in ("published", "1ms/2")

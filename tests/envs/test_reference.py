@@ -11,8 +11,8 @@ import torch
 
 from torchdlo import scene as scenes
 from torchdlo.coupling.robot.attachment import Hands
-from torchdlo.envs import TASKS, reach
-from torchdlo.envs.core import curve_geometry, episode
+from torchdlo.envs import TASKS
+from torchdlo.envs.core import curve_geometry, episode, reach
 from torchdlo.envs.core.task import Task, through
 from torchdlo.envs.tasks.gathering import GatheringSurrogate
 from torchdlo.physics import tree

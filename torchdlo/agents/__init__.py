@@ -9,17 +9,17 @@ from torchdlo import lazy
 if TYPE_CHECKING:
     from torchdlo.agents.trajopt.presets import preset
     from torchdlo.agents.trajopt.problem import Problem
-    from torchdlo.agents.trajopt.search import SearchResult, Settings, optimize
+    from torchdlo.agents.trajopt.search import SearchResult, SearchSettings, optimize
 
 __getattr__, __dir__ = lazy.attach(
     __name__,
     {
         "SearchResult": "torchdlo.agents.trajopt.search",
         "Problem": "torchdlo.agents.trajopt.problem",
-        "Settings": "torchdlo.agents.trajopt.search",
+        "SearchSettings": "torchdlo.agents.trajopt.search",
         "optimize": "torchdlo.agents.trajopt.search",
         "preset": "torchdlo.agents.trajopt.presets",
     },
 )
 
-__all__ = ["Problem", "SearchResult", "Settings", "optimize", "preset"]
+__all__ = ["Problem", "SearchResult", "SearchSettings", "optimize", "preset"]

@@ -141,7 +141,7 @@ def timed(
         columns.append(found)
         limits.append(share * robot.velocity[robot.arm])
     position, limit = torch.cat(columns, -1), torch.cat(limits)
-    step = 1e-3 * task.frames
+    step = 1e-3 * task.frame_skip
     velocity, bend = _derivatives(position, step)
     # Between points joints move evenly: the speed there counts as well.
     fastest = torch.maximum(velocity.abs().amax(0), (position.diff(dim=0) / step).abs().amax(0))

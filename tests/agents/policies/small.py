@@ -9,5 +9,5 @@ from torchdlo.envs import Task, find
 
 def small(name: str, horizon: int) -> Task:
     task = find(name)
-    settle, release = min(task.settle, 1), min(task.release, 1)
-    return dataclasses.replace(task, horizon=horizon, frames=1, settle=settle, release=release)
+    settle, release = min(task.settle_steps, 1), min(task.release, 1)
+    return dataclasses.replace(task, horizon=horizon, frame_skip=1, settle_steps=settle, release=release)

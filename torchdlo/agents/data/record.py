@@ -150,13 +150,13 @@ def acted(task: Task, world: episode.EpisodeState, target: Pose, shake: Tensor |
     off = multiply(conjugate(world.target.quat), target.quat)
     turn = torch.rad2deg(2 * off[..., 1:] * off[..., :1].sign())
     if shake is not None:
-        way, turn = _cut(task, way) + shake[..., :3], turn.clamp(-task.twist, task.twist) + shake[..., 3:]
-    return torch.cat([_cut(task, way).flatten(1), turn.clamp(-task.twist, task.twist).flatten(1)], -1)
+        way, turn = _cut(task, way) + shake[..., :3], turn.clamp(-task.max_rotation, task.max_rotation) + shake[..., 3:]
+    return torch.cat([_cut(task, way).flatten(1), turn.clamp(-task.max_rotation, task.max_rotation).flatten(1)], -1)
 
 
 def _cut(task: Task, way: Tensor) -> Tensor:
     """Return ways (B, R, 3) as far as tools reach, in the same directions."""
-    return way * (task.reach / safe_norm(way).clamp(min=task.reach))
+    return way * (task.max_translation / safe_norm(way).clamp(min=task.max_translation))
 
 
 def play_batch(

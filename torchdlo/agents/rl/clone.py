@@ -56,7 +56,7 @@ def labelled(
         noise: deviation of what is added to actions [m].
         generator: of the noise.
     """
-    seen, env, reach = episodes.reset(), episodes.env, episodes.task.reach
+    seen, env, reach = episodes.reset(), episodes.env, episodes.task.max_translation
     alive = torch.ones(episodes.count, dtype=torch.bool)
     for k in range(episodes.horizon):
         features = look(policy, episodes, k, seen)

@@ -84,7 +84,7 @@ def judged(
         stage_waypoints = torch.stack([p.mean(p.features(part, share, first)) for p, part in rows])
         if how.get("noise"):
             stage_waypoints = stage_waypoints + torch.randn(stage_waypoints.shape[1:], generator=rng) * (
-                how["noise"] / task.reach
+                how["noise"] / task.max_translation
             )
         actions.append(policies[0].command(stage_waypoints.flatten(0, 1)))
         step = episodes.step(actions[-1])

@@ -98,7 +98,7 @@ def load_expert(path: Path, task: Task) -> Expert:
 def candidates(task: Task, trajectories: list[Path]) -> list[Expert]:
     """Return the paths of found trajectories that succeeded: at the same places, and moved with the first thing."""
     found = []
-    shape = (task.horizon, task.arms.count, 3, len(task.spread), 2)
+    shape = (task.horizon, task.arms.count, 3, len(task.reset_noise), 2)
     still = torch.zeros(shape)
     along = still.clone()
     for axis in range(2):
@@ -149,7 +149,7 @@ def follow(experts: list[Expert], episodes: TaskEpisodes, *, noise: float, gener
         noise: deviation of what is added to actions [m].
         generator: of the noise, the same for all experts.
     """
-    each, reach = episodes.count // len(experts), episodes.task.reach
+    each, reach = episodes.count // len(experts), episodes.task.max_translation
     episodes.reset()
     same(episodes, each)
     env = episodes.env
@@ -192,7 +192,7 @@ def _spread(knots: Tensor, horizon: int) -> Tensor:
 
 def _moving(task: Task) -> list[tuple[int, int]]:
     """Return which things of a task are moved at the start, and along which axis."""
-    return [(k, axis) for k, pair in enumerate(task.spread) for axis in range(2) if pair[axis] > 0]
+    return [(k, axis) for k, pair in enumerate(task.reset_noise) for axis in range(2) if pair[axis] > 0]
 
 
 def _changed(expert: Expert, numbers: Tensor, task: Task) -> Expert:
@@ -203,7 +203,7 @@ def _changed(expert: Expert, numbers: Tensor, task: Task) -> Expert:
     path = expert.path + _spread(parts[0], horizon).to(expert.path)
     gain = expert.gain.clone()
     for part, (thing, axis) in zip(parts[1:], moving, strict=True):
-        gain[..., thing, axis] += _spread(part, horizon).to(gain) / task.spread[thing][axis]
+        gain[..., thing, axis] += _spread(part, horizon).to(gain) / task.reset_noise[thing][axis]
     return replace(expert, path=path, gain=gain)
 
 

@@ -79,7 +79,7 @@ def task_policy(task: Task, settings: Settings, **choices: Any) -> Policy:
         layer_norm=settings.layer_norm,
         sigma=settings.sigma,
         task=task.name,
-        reach=task.reach,
+        reach=task.max_translation,
         turns=3 * arms,
     )
     return Policy(replace(spec, **choices))

@@ -31,8 +31,8 @@ from torchdlo.agents.vlm.scene_text import language_text, scene_text
 from torchdlo.agents.vlm.schema import step_models
 from torchdlo.agents.vlm.waypoints import led
 from torchdlo.coupling.common import step_diagnostics
-from torchdlo.envs import Task, scene_names
-from torchdlo.envs.core import episode
+from torchdlo.envs import Task
+from torchdlo.envs.core import episode, scene_names
 from torchdlo.envs.core.subtask import SubTask, concluded, continue_from, opening
 from torchdlo.errors import InputError
 from torchdlo.files import write_atomically

@@ -14,7 +14,8 @@ from torch import Tensor
 from torchdlo.agents.vlm.conversation import Conversation, Picture, Question, plain_text
 from torchdlo.agents.vlm.prompts import prompt
 from torchdlo.agents.vlm.schema import MODES, grasps_model
-from torchdlo.envs import Task, scene_names
+from torchdlo.envs import Task
+from torchdlo.envs.core import scene_names
 from torchdlo.envs.core.episode import reachable
 from torchdlo.errors import InputError
 from torchdlo.scene import Scene, State

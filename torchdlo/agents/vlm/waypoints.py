@@ -43,7 +43,7 @@ def led(
         slot = grasps[hand]
         slot = task.arms.vertex[hand] if slot is None and world is None else slot
         start = places.x[slot] if slot is not None else world.tool.pos[0, hand].double()
-        columns.append(_column(start, points, step.horizon, task.reach, hand))
+        columns.append(_column(start, points, step.horizon, task.max_translation, hand))
     return torch.cat([torch.zeros(travels, 3 * task.arms.count, dtype=torch.float64), torch.cat(columns, -1)])
 
 

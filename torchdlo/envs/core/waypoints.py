@@ -11,7 +11,7 @@ __all__ = ["even", "through"]
 
 
 def through(
-    points: Sequence[Sequence[tuple[float, float, float]]], horizon: int, off: Tensor, *, reach: float = 0.01
+    points: Sequence[Sequence[tuple[float, float, float]]], horizon: int, off: Tensor, *, max_translation: float = 0.01
 ) -> Tensor:
     """Return actions that lead tools through points and then keep them there, shape (..., horizon, 6 arms).
 
@@ -21,15 +21,15 @@ def through(
         points: how far the tools are from their starts [m], one row of points per leg, one point per tool.
         horizon: actions in all.
         off: what is added to all points [m], shape (..., arms, 3).
-        reach: greatest way of a tool in an action [m].
+        max_translation: greatest way of a tool in an action [m].
     """
     off = off.to(torch.float64).unsqueeze(-3)
     way = off.new_tensor(points).reshape(-1, *off.shape[-2:]) + off
     legs = torch.cat([torch.zeros_like(off), way], -3).diff(dim=-3)
-    need = (legs.norm(dim=-1).amax(-1) / reach - 1e-9).ceil().clamp(min=1)
+    need = (legs.norm(dim=-1).amax(-1) / max_translation - 1e-9).ceil().clamp(min=1)
     most = int(need.sum(-1).max())
     if most > horizon:
-        raise ValueError(f"way-points: they take {most} actions of {reach} m; expected at most {horizon}")
+        raise ValueError(f"way-points: they take {most} actions of {max_translation} m; expected at most {horizon}")
     # Which share of each leg is behind the tools before and after each action.
     done = torch.arange(horizon + 1, dtype=off.dtype, device=off.device).unsqueeze(-1) - (
         need.cumsum(-1) - need

@@ -136,7 +136,7 @@ class Photo:
                 frames.material_points[k].astype(float),
                 np.array(0.6 * spacing(frames.material_points[k])),
             )
-            given["grain_colors"] = np.stack([_rgb(COLORS[str(law)]) for law in frames.law])
+            given["grain_colors"] = np.stack([_rgb(COLORS[str(law)]) for law in frames.constitutive_model])
         with tempfile.TemporaryDirectory() as folder:
             source, target_ = Path(folder) / "scene.npz", Path(folder) / "image.npy"
             np.savez(source, **given)
