@@ -253,10 +253,7 @@ def _translate(
     rest, material, free = now.params.rest, now.params.material, kick.free
     fixed = (1 - free) * (1 - following(topology, free)) >= 1
     active = rest.edge_mask * (1 - fixed.to(free.dtype))
-    # What is held does not move, whatever its mass is.
-    mobile = torch.where(free > 0, material.mass, torch.inf).detach()
-    lightest = torch.minimum(mobile, following(topology, mobile))
-    lightest = torch.where(lightest < torch.inf, lightest, material.mass.detach())
+    lightest = torch.minimum(material.mass, following(topology, material.mass)).detach()
     most, least = (1e4, 10.0) if settings.integrator == "implicit" else (0.25, 0.25)
     lengths = Lengths(
         topology,
