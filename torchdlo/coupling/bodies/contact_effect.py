@@ -78,7 +78,7 @@ def _links(contact: BodyContact, motion: PredictedBodyMotion) -> Links:
     )
     free = links.seen(motion.change, motion.turn)
     approach = -dot(found.normal, links.seen(state.vel, state.omega))
-    wanted = parting(found.gap, like.new_tensor(contact.shallow), contact.recovery, motion.dt)
+    wanted = parting(found.gap, like.new_tensor(contact.shallow), contact.recovery)
     pressed = (dot(found.normal, free) < wanted).to(like.dtype)
     bouncing = _combined(params.restitution, pairs, counts)
     wanted = rebounding(wanted, pressed, approach, bouncing, contact.slowest, motion.dt)

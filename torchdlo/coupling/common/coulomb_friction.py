@@ -7,27 +7,20 @@ from torch import Tensor
 
 from torchdlo.physics.linalg.numerics import safe_norm
 
-FASTEST = 0.1
-"""Speed at which overlaps are undone at most [m/s]: what parts in a substep keeps that speed. It stands in
-`fastest.h`, too."""
 
-
-def parting(gap: Tensor, shallow: Tensor, recovery: float, dt: float) -> Tensor:
+def parting(gap: Tensor, shallow: Tensor, recovery: float) -> Tensor:
     """Return by how much surfaces have to part at least in a substep, negative if they may come closer [m].
 
-    Of an overlap, a share goes at once, and all of it that is not shallow, but never as fast as `FASTEST`: small shares
-    let piles come to rest, and deep overlaps are not thrown apart.
+    Of an overlap, a share goes at once, and all of it that is not shallow: small shares let piles come to rest.
 
     Args:
         gap: distance of the surfaces, negative if they overlap [m].
         shallow: overlap up to which only a share goes [m].
         recovery: that share.
-        dt: substep [s].
     """
     overlap = (-gap).clamp(min=0.0)
     deep = (overlap - shallow).clamp(min=0.0)
-    asked, most = recovery * overlap + (1 - recovery) * deep, FASTEST * dt
-    return torch.where(gap > 0, -gap, asked * most / (asked + most))
+    return torch.where(gap > 0, -gap, recovery * overlap + (1 - recovery) * deep)
 
 
 def rebounding(

@@ -1,6 +1,5 @@
 // Contacts of bodies: how their points move, what forces on them exert, and the law of the forces; see body_contact.py.
 #pragma once
-#include "fastest.h"
 #include "body_touches.h"
 
 template <typename T>
@@ -77,8 +76,7 @@ struct Linked : Pairs<T> {
       // By how much they have to part at least; see coulomb.py.
       const S gap = contacts[c].gap, overlap = larger(-gap, none), deep = larger(overlap - S(T(n.shallow)), none);
       const S shared = S(T(n.recovery)) * overlap + S(T(1 - n.recovery)) * deep;
-      const S most(T(FASTEST * n.dt)), asked = shared * most / (shared + most);
-      const S simple = select(gap.x > T(0), -gap, asked), approach = -dot(l.normal, seen(l, speeds));
+      const S simple = select(gap.x > T(0), -gap, shared), approach = -dot(l.normal, seen(l, speeds));
       const auto hits = (dot(l.normal, l.free).x < simple.x) & (approach.x > T(n.slowest));
       const S back = combined(one.restitution, two.restitution) * approach * S(T(n.dt));
       l.wanted = select(hits & (back.x > T(0)) & (back.x > simple.x), back, simple);

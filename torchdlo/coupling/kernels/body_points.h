@@ -2,7 +2,6 @@
 // and what forces on them exert, with the derivatives of all three.
 #pragma once
 #include "edge_points.h"
-#include "fastest.h"
 
 #include <algorithm>
 #include <vector>
@@ -265,10 +264,9 @@ struct Geometry : Inputs<T> {
   // By how much a point has to part at least; see coulomb.py.
   L overlap(int p) const { return edges[edge(p)].radius - distance[p]; }
   L deep(int p) const { return overlap(p) - T(0.1) * edges[edge(p)].radius; }
-  L calm(const L& asked) const { return T(FASTEST * n.dt) / (asked + T(FASTEST * n.dt)); }
   L simple(int p) const {
     const L over = overlap(p), more = deep(p), rest = T(1 - n.recovery) * (more > T(0) ? more : L{});
-    return over < T(0) ? over : (T(n.recovery) * over + rest) * calm(T(n.recovery) * over + rest);
+    return over < T(0) ? over : T(n.recovery) * over + rest;
   }
   L approach(int p) const { return -dot(points[p].normal, apart(p, vel, spin)); }
   L rebound(int p) const {
@@ -303,10 +301,8 @@ struct Geometry : Inputs<T> {
     db.restitution += bounced * approach(p);
     exert(p, -bounced * b.restitution, R{}, dvel, dspin);
     tilt(p, -bounced * b.restitution, R{}, vel, spin, to);
-    const L asked = T(n.recovery) * overlap(p) + (deep(p) > T(0) ? T(1 - n.recovery) * deep(p) : zero);
-    const L less = calm(asked), slow = kept * less * less;
-    const L more = deep(p) > T(0) ? slow * T(1 - n.recovery) : zero;
-    const L dover = overlap(p) < T(0) ? kept : slow * T(n.recovery) + more;
+    const L more = deep(p) > T(0) ? kept * T(1 - n.recovery) : zero;
+    const L dover = overlap(p) < T(0) ? kept : kept * T(n.recovery) + more;
     to.edges[v].radius += dover - (overlap(p) < T(0) ? zero : T(0.1) * more);
     const R way = vertices[w].pos - vertices[v].pos, from = vertices[v].pos - b.pos;
     d.share += dot(d.arm, way);

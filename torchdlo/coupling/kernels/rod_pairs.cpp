@@ -104,7 +104,7 @@ struct Work {
   void prepare() {
     std::fill(load.begin(), load.end(), T(0));
     for (Group& g : groups) {
-      g.pair = pair(corners(g), n.friction, T(n.recovery), T(FASTEST * n.dt));
+      g.pair = pair(corners(g), n.friction, T(n.recovery));
       for (int i = 0; i < W; ++i) g.real[i] = T(i < g.count);
       // What is not a number stays so.
       g.real = dot(g.pair.between, g.pair.between).x <= TINY<T> * TINY<T> ? L{} : g.real;
@@ -294,7 +294,7 @@ struct Work {
     }
     Corners<T> to;
     for (int i = 0; i < int(sizeof(to) / sizeof(P)); ++i) ((P*)&to)[i] = zero;
-    pair_back(corners(g), g.pair, n.friction, T(n.recovery), T(FASTEST * n.dt), d, to);
+    pair_back(corners(g), g.pair, n.friction, T(n.recovery), d, to);
     for (int i = 0; i < 4; ++i) {
       for (int j = 0; j < 3; ++j) drop(to.pos[i][j], &by[(POS + j) * size], g.corner[i], g.count);
       drop(to.free[i], &by[FREE * size], g.corner[i], g.count);

@@ -1,7 +1,6 @@
 // Pairs of edges of ropes side by side: where they touch, how they move, and what forces between them exert, with the
 // derivatives of all three. Formulas and names as in contact.py and segments.py.
 #pragma once
-#include "fastest.h"
 #include "segments.h"
 
 // A pair as its corners make it, or derivatives by it. Of the corners, 0 and 1 are the ends of the first edge, 2 and 3
@@ -124,32 +123,28 @@ struct Brace {
 };
 
 template <typename T>
-static Pair<T> pair(const Corners<T>& c, bool friction, T recovery, T most) {
+static Pair<T> pair(const Corners<T>& c, bool friction, T recovery) {
   typedef Num<T, 0> P;
   Pair<T> a;
   closest(c.pos, a.s, a.t);
   a.between = c.pos[0] + (c.pos[1] - c.pos[0]) * a.s - c.pos[2] - (c.pos[3] - c.pos[2]) * a.t;
   const P distance = measured(a.between, a.normal), thick = c.radius[0] + c.radius[1], over = thick - distance;
   const P deep = P(T(1) - recovery) * positive(over - P(T(0.05)) * thick);
-  const P asked = P(recovery) * over + deep;
-  a.wanted = select(over.x < T(0), over, asked * P(most) / (asked + P(most)));
+  a.wanted = select(over.x < T(0), over, P(recovery) * over + deep);
   if (friction) Brace<T>(c).apply(distance, a);
   return a;
 }
 // Adds the derivative by the corners of a pair that is apart.
 template <typename T>
-static void pair_back(const Corners<T>& c, const Pair<T>& a, bool friction, T recovery, T most, Pair<T> d,
-                      Corners<T>& to) {
+static void pair_back(const Corners<T>& c, const Pair<T>& a, bool friction, T recovery, Pair<T> d, Corners<T>& to) {
   typedef Num<T, 0> P;
   typedef Three<T, 0> V;
   V normal;
   const P zero(T(0)), one(T(1)), distance = measured(a.between, normal), thick = c.radius[0] + c.radius[1];
   const P over = thick - distance, shallow = P(T(0.05)) * thick;
+  const P deep = select(over.x - shallow.x < T(0), zero, P(T(1) - recovery) * d.wanted);
   const auto free = over.x < T(0);
-  const P sought = P(recovery) * over + P(T(1) - recovery) * positive(over - shallow);
-  const P less = P(most) / (select(free, zero, sought) + P(most)), asked = d.wanted * less * less;
-  const P deep = select(over.x - shallow.x < T(0), zero, P(T(1) - recovery) * asked);
-  const P by_over = select(free, d.wanted, P(recovery) * asked + deep);
+  const P by_over = select(free, d.wanted, P(recovery) * d.wanted + deep);
   const P by_radius = by_over - select(free, zero, P(T(0.05)) * deep);
   for (int k = 0; k < 2; ++k) to.radius[k] = to.radius[k] + by_radius;
   P by_distance = -by_over;

@@ -257,7 +257,7 @@ class RodBody(Effect):
 
     def _target(self, points: _Points, view: View, bodies: PredictedBodyMotion, along: Tensor) -> Tensor:
         """Return by how much points have to part at least [m], shape (..., F, V, 1)."""
-        wanted = parting(points.at.distance - points.radius, 0.1 * points.radius, self.recovery, view.dt)
+        wanted = parting(points.at.distance - points.radius, 0.1 * points.radius, self.recovery)
         pressed = points.real * (along < wanted)
         now = dataclasses.replace(bodies, change=bodies.state.vel, turn=bodies.state.omega)
         approach = -points.seen(view.state.vel, now)[0]

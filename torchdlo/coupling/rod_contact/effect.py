@@ -280,7 +280,7 @@ class RodContact(Effect):
     def _target(self, contacts: Contacts, change: Four, vel: Four, values: Values, dt: float) -> tuple[Tensor, Tensor]:
         """Return by how much pairs have to part at least [m], and which of them would touch, shape (..., K, 1) each."""
         # Overlaps are shallow up to a tenth of the radius.
-        wanted = parting(contacts.gap, 0.05 * (contacts.distance - contacts.gap), self.recovery, dt)
+        wanted = parting(contacts.gap, 0.05 * (contacts.distance - contacts.gap), self.recovery)
         pressed = contacts.real * (dot(contacts.normal, _sum(contacts.weight, change)) < wanted)
         approach = -dot(contacts.normal, _sum(contacts.weight, vel))
         return rebounding(wanted, pressed, approach, values["restitution"], self.slowest, dt), pressed

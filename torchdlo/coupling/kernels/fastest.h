@@ -1,4 +1,0 @@
-// Speed at which overlaps are undone at most [m/s]; see coulomb.py.
-#pragma once
-
-constexpr double FASTEST = 0.1;
