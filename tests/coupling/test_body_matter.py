@@ -361,7 +361,7 @@ def test_planes_may_be_left_to_walls():
 
 def test_the_effect_needs_bodies_and_matter():
     solid, material_points = RigidBody("sphere", 0.02, density=100.0), block((0.07,) * 3, (0.1,) * 3)
-    with pytest.raises(ValueError, match="BodyMatter is among the effects, but there is no matter"):
+    with pytest.raises(ValueError, match="BodyMpmCoupling is among the effects, but there is no matter"):
         world((), [solid])
     with pytest.raises(ValueError, match="BodyMatter or FingerPads needs bodies, but there are no bodies"):
         world(material_points, [])

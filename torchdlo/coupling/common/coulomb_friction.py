@@ -7,6 +7,9 @@ from torch import Tensor
 
 from torchdlo.physics.linalg.numerics import safe_norm
 
+FASTEST = 0.1
+"""Speed at which implicit steps undo overlaps at most [m/s]: what parts in a step keeps that speed."""
+
 
 def parting(gap: Tensor, shallow: Tensor, recovery: float) -> Tensor:
     """Return by how much surfaces have to part at least in a substep, negative if they may come closer [m].
@@ -21,6 +24,17 @@ def parting(gap: Tensor, shallow: Tensor, recovery: float) -> Tensor:
     overlap = (-gap).clamp(min=0.0)
     deep = (overlap - shallow).clamp(min=0.0)
     return torch.where(gap > 0, -gap, recovery * overlap + (1 - recovery) * deep)
+
+
+def slowly(wanted: Tensor, dt: float) -> Tensor:
+    """Return how far overlaps part in a substep where they keep the speed with which they do [m]: at most `FASTEST`.
+
+    Args:
+        wanted: by how much surfaces should part, negative if they may come closer [m].
+        dt: substep [s].
+    """
+    asked, most = wanted.clamp(min=0.0), FASTEST * dt
+    return torch.where(wanted > 0, asked * most / (asked + most), wanted)
 
 
 def rebounding(

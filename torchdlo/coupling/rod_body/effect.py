@@ -37,7 +37,7 @@ from torch import Tensor
 from torchdlo.coupling.bodies.contact_solver import inertia
 from torchdlo.coupling.bodies.dynamics import PredictedBodyMotion, conjugate
 from torchdlo.coupling.bodies.segment_distance import EdgePoints, families, find
-from torchdlo.coupling.common.coulomb_friction import parting, rebounding, rub
+from torchdlo.coupling.common.coulomb_friction import parting, rebounding, rub, slowly
 from torchdlo.coupling.rod_body import solver_op as body_sweeps
 from torchdlo.physics.constraints.contact_penalty import Touch
 from torchdlo.physics.effects.base import ContactForces, Effect, PredictedMotion, Values
@@ -216,7 +216,7 @@ class RodBody(Effect):
         at, axes = points.at, points.axes
         none = torch.zeros_like(motion.change)
         still, slip = points.seen(none, bodies)
-        wanted = self._target(points, view, bodies, points.seen(motion.change, bodies)[0])
+        wanted = self._target(points, view, bodies, points.seen(motion.change, bodies)[0], calm=True)
         now = dataclasses.replace(bodies, change=state.vel, turn=state.omega)
         slides = safe_norm(points.seen(view.state.vel, now)[1]).detach() > self.slowest
         mu_s, mu_k = (axes.of_bodies(mu) for mu in (bodies.params.mu_s, bodies.params.mu_k))
@@ -255,9 +255,12 @@ class RodBody(Effect):
             push = points.exerted(normal, friction)
         return push
 
-    def _target(self, points: _Points, view: View, bodies: PredictedBodyMotion, along: Tensor) -> Tensor:
-        """Return by how much points have to part at least [m], shape (..., F, V, 1)."""
+    def _target(
+        self, points: _Points, view: View, bodies: PredictedBodyMotion, along: Tensor, calm: bool = False
+    ) -> Tensor:
+        """Return by how much points have to part at least [m], shape (..., F, V, 1); slowly, if that is asked for."""
         wanted = parting(points.at.distance - points.radius, 0.1 * points.radius, self.recovery)
+        wanted = slowly(wanted, view.dt) if calm else wanted
         pressed = points.real * (along < wanted)
         now = dataclasses.replace(bodies, change=bodies.state.vel, turn=bodies.state.omega)
         approach = -points.seen(view.state.vel, now)[0]

@@ -176,7 +176,7 @@ def rewarded(task: Task, reward: Reward) -> SubTask:
 
 
 def _fields(task: Task) -> dict[str, Any]:
-    return {name: getattr(task, name) for name in ("horizon", "frames", "settle", "release", "rope")}
+    return {name: getattr(task, name) for name in ("horizon", "frame_skip", "settle_steps", "release", "rope", "fidelity")}
 
 
 def continue_from(
