@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from torchdlo import envs
-from torchdlo.agents.trajopt.search import Settings, optimize
+from torchdlo.agents.trajopt.search import SearchSettings, optimize
 from torchdlo.agents.trajopt.task_problem import TaskProblem
 from torchdlo.agents.vlm.conversation import Conversation
 from torchdlo.agents.vlm.decomposition import Options, Result, carry_out
@@ -270,14 +270,14 @@ def test_first_trajectories_are_played_as_they_are() -> None:
     first = torch.zeros(1, 12, 6, dtype=torch.float64)
     first[0, :6, [0, 3]] = 0.009
     for method in ("cmaes", "hybrid"):
-        settings = Settings(method=method, episodes=4, population=4, seed=0, chunk=4)
+        settings = SearchSettings(method=method, episodes=4, population=4, seed=0, chunk=4)
         found = optimize(problem, settings, first=first)
         with torch.no_grad():
             alone = problem.evaluate(first)
         assert found.max_return >= float(alone.returns[0]) - 1e-6
         assert bool(found.outcome.success[0])
     with pytest.raises(InputError, match="use cmaes or hybrid"):
-        optimize(problem, Settings(method="gd", episodes=4, population=1), first=first)
+        optimize(problem, SearchSettings(method="gd", episodes=4, population=1), first=first)
 
 
 def test_the_command_refuses_what_it_cannot_do(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

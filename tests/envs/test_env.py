@@ -13,6 +13,7 @@ from test_contract import F64, small
 
 from torchdlo import envs
 from torchdlo.envs import TASKS
+from torchdlo.envs.core import episode
 
 pytest.importorskip("torchrl")
 
@@ -76,9 +77,9 @@ def test_rollouts_carry_gradients_to_actions():
     actions = torch.full((2, 12), 0.002, requires_grad=True)
     found = env.rollout(2, lambda td: td.set("action", actions))["next", "reward"]
     (gradient,) = torch.autograd.grad(found.sum(), actions)
-    made_ = envs.episode.prepare(task, 2, like=torch.zeros((), dtype=F64), compiled=False)
+    made_ = episode.prepare(task, 2, like=torch.zeros((), dtype=F64), compiled=False)
     other = actions.detach().double().requires_grad_()
-    outcome = envs.episode.play(task, other[:, None].expand(-1, 2, -1), episode=made_)
+    outcome = episode.play(task, other[:, None].expand(-1, 2, -1), episode=made_)
     (wanted,) = torch.autograd.grad(outcome.returns.sum(), other)
     # Rewards and actions pass the border in single precision.
     torch.testing.assert_close(gradient.double(), wanted, rtol=1e-5, atol=1e-7)

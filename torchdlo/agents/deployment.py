@@ -32,7 +32,7 @@ __all__ = ["FORMATS", "PredictedMotion", "arms_of", "played", "replayed", "text"
 
 FORMATS = ("csv", "json", "ros2")
 """Names of the kinds of files."""
-_SEARCH = inverse_kinematics.Search(starts=8)
+_SEARCH = inverse_kinematics.IkSearch(starts=8)
 _NEAR = 1e-3
 """How far a tool may be from where it should be [m]."""
 
@@ -97,7 +97,9 @@ def _joints(robot: Robot, tools: Pose, known: Tensor | None) -> Tensor:
     last, rows = middle[None], []
     for k in range(len(tools.pos)):
         target = Pose(tools.pos[k : k + 1], tools.quat[k : k + 1])
-        found = inverse_kinematics.solve(robot, target, last, search=_SEARCH if k == 0 else inverse_kinematics.Search())
+        found = inverse_kinematics.solve(
+            robot, target, last, search=_SEARCH if k == 0 else inverse_kinematics.IkSearch()
+        )
         last = found.joints
         off = float((tool_pose(robot, last).pos - target.pos).norm())
         if off > _NEAR:

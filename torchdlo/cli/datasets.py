@@ -78,11 +78,11 @@ def make(
 
     torchdlo dataset make wiring_post --actor runs/searches --episodes 20 --out sets/found
     """
-    from torchdlo.agents.data.making import Plan
+    from torchdlo.agents.data.making import DatasetPlan
     from torchdlo.agents.data.making import make as run
     from torchdlo.agents.distributed import executor
 
-    plan = Plan(tuple(tasks), episodes, seed=seed, size=size, codec=codec, actor=actor, noise=noise, batch=batch)
+    plan = DatasetPlan(tuple(tasks), episodes, seed=seed, size=size, codec=codec, actor=actor, noise=noise, batch=batch)
     painter = _painter() if size else None
 
     def work(callback: Callable[[str, int, int, str], None]) -> dict[str, Any]:

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from torchdlo import envs
-from torchdlo.agents.data.making import SearchPlan, make
+from torchdlo.agents.data.making import DatasetPlan, make
 from torchdlo.envs.core import episode
 from torchdlo.envs.core.task import RADIUS, Arms, Task, TaskState, straight
 from torchdlo.envs.core.task import make as scene
@@ -99,10 +99,10 @@ class Dots:
         return found
 
 
-def plan(**given: object) -> SearchPlan:
+def plan(**given: object) -> DatasetPlan:
     """A small plan."""
     usual = {"tasks": ("short",), "episodes": 5, "size": 32, "batch": 4, "noise": 0.0005}
-    return SearchPlan(**(usual | given))
+    return DatasetPlan(**(usual | given))
 
 
 def main() -> None:

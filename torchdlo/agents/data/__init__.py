@@ -5,14 +5,14 @@ Writing needs pyarrow and, with pictures, av; LeRobot itself is not needed.
 
 from torchdlo.agents.data.checking import check
 from torchdlo.agents.data.editing import Choice, merge, select
-from torchdlo.agents.data.making import SearchPlan, make
+from torchdlo.agents.data.making import DatasetPlan, make
 from torchdlo.agents.data.reading import DataSet, FrameData, open_set, to_tensordict
 
 __all__ = [
     "Choice",
     "DataSet",
+    "DatasetPlan",
     "FrameData",
-    "SearchPlan",
     "check",
     "make",
     "merge",

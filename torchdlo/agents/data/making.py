@@ -31,7 +31,7 @@ from torchdlo.envs.core import episode
 from torchdlo.errors import InputError
 from torchdlo.files import write_atomically
 
-__all__ = ["UNFINISHED", "SearchPlan", "make", "report_of"]
+__all__ = ["UNFINISHED", "DatasetPlan", "make", "report_of"]
 
 UNFINISHED = "unfinished"
 """Folder within a set for what is under way."""
@@ -41,7 +41,7 @@ _LONG = 10
 
 
 @dataclass(frozen=True)
-class SearchPlan:
+class DatasetPlan:
     """What a data set is made of."""
 
     tasks: tuple[str, ...]
@@ -85,7 +85,7 @@ class SearchPlan:
 class _Job:
     """A batch of attempts, to be played by a worker."""
 
-    plan: SearchPlan
+    plan: DatasetPlan
     task: str
     first: int
     painter: Painter | None
@@ -113,7 +113,7 @@ def _played(job: _Job) -> list[dict[str, bytes]]:
 
 
 def make(
-    plan: SearchPlan,
+    plan: DatasetPlan,
     out: Path,
     *,
     painter: Painter | None = None,
@@ -150,7 +150,7 @@ def make(
 
 
 @contextmanager
-def _begun(plan: SearchPlan, out: Path, resume: bool) -> Iterator[Path]:
+def _begun(plan: DatasetPlan, out: Path, resume: bool) -> Iterator[Path]:
     """Yield the folder for what is under way; no other run may have it meanwhile."""
     folder = out / UNFINISHED
     said = json.dumps(asdict(plan) | {"versions": versions()}, indent=1) + "\n"
@@ -176,7 +176,7 @@ def _begun(plan: SearchPlan, out: Path, resume: bool) -> Iterator[Path]:
 
 
 def _gather(
-    plan: SearchPlan,
+    plan: DatasetPlan,
     task: str,
     folder: Path,
     painter: Painter | None,
@@ -214,7 +214,7 @@ def _gather(
     return line
 
 
-def _batches(plan: SearchPlan, known: Container[int], good: int) -> list[int]:
+def _batches(plan: DatasetPlan, known: Container[int], good: int) -> list[int]:
     """Return the first attempts of the batches to play next: gaps, and as many more as seem to be needed."""
     firsts = range(0, plan.most, plan.batch)
     todo = [first for first in firsts if any(n not in known for n in range(first, first + plan.batch))]
@@ -238,7 +238,7 @@ def _needed(known: dict[int, attempts.Attempt], count: int) -> list[attempts.Att
 
 
 def _finish(
-    plan: SearchPlan,
+    plan: DatasetPlan,
     out: Path,
     done: dict[str, list[attempts.Attempt]],
     callback: Callable[[str, int, int, str], None] | None,

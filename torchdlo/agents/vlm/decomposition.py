@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 
 from torchdlo.agents.trajopt.problem import Evaluation
-from torchdlo.agents.trajopt.search import Settings, optimize
+from torchdlo.agents.trajopt.search import SearchSettings, optimize
 from torchdlo.agents.trajopt.task_problem import TaskProblem
 from torchdlo.agents.vlm.carried import Carried, Look, Options, Result
 from torchdlo.agents.vlm.conversation import Conversation, Picture, Question, plain_text
@@ -194,7 +194,7 @@ class _Run:
         if kept is not None:
             return kept
         options = self.options
-        settings = Settings(
+        settings = SearchSettings(
             method=options.method,
             episodes=max(options.episodes, options.population),
             population=options.population,

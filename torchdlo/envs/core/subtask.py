@@ -29,7 +29,7 @@ from torchdlo.scene import Params, Scene, State
 
 __all__ = ["SubTask", "concluded", "continue_from", "opening", "rewarded"]
 
-_SAME = ("name", "arms", "floor", "reach", "twist", "stretch", "travel", "anchored")
+_SAME = ("name", "arms", "floor", "max_translation", "max_rotation", "stretch", "travel", "anchored")
 """What a part has from its task."""
 
 
@@ -50,7 +50,7 @@ class SubTask(Task):
         for name in _SAME:
             object.__setattr__(self, name, getattr(self.inner, name))
         object.__setattr__(self, "combine", "sum" if self.reward else self.inner.combine)
-        object.__setattr__(self, "spread", ((0.0, 0.0),) if self.before is not None else self.inner.reset_noise)
+        object.__setattr__(self, "reset_noise", ((0.0, 0.0),) if self.before is not None else self.inner.reset_noise)
         stages = self.inner.stages
         if self.before is not None and self.kept != self.inner.grasps:
             stages = (Stage(0, self.kept), Stage(self.travel, cast(Any, self.inner.grasps)))
@@ -176,7 +176,9 @@ def rewarded(task: Task, reward: Reward) -> SubTask:
 
 
 def _fields(task: Task) -> dict[str, Any]:
-    return {name: getattr(task, name) for name in ("horizon", "frame_skip", "settle_steps", "release", "rope", "fidelity")}
+    return {
+        name: getattr(task, name) for name in ("horizon", "frame_skip", "settle_steps", "release", "rope", "fidelity")
+    }
 
 
 def continue_from(
@@ -211,7 +213,7 @@ def continue_from(
     before = tree.detach(
         tree.replace(world, notes={**world.notes, "rest": inner.rest(usual, scene.topology)}, grasp=world.grasp)
     )
-    fields = _fields(task) | {"settle": 0, "release": 0}
+    fields = _fields(task) | {"settle_steps": 0, "release": 0}
     moves = task.travel if kept != tuple(grasps) and any(g is not None for g in grasps) else 0
     fields["horizon"] = horizon + moves
     return SubTask(**fields, inner=inner, before=before, reward=reward, kept=kept)
