@@ -97,9 +97,8 @@ def _joints(robot: Robot, tools: Pose, known: Tensor | None) -> Tensor:
     last, rows = middle[None], []
     for k in range(len(tools.pos)):
         target = Pose(tools.pos[k : k + 1], tools.quat[k : k + 1])
-        found = inverse_kinematics.solve(
-            robot, target, last, search=_SEARCH if k == 0 else inverse_kinematics.IkSearch()
-        )
+        search = _SEARCH if k == 0 else inverse_kinematics.IkSearch()
+        found = inverse_kinematics.solve(robot, target, last, search=search)
         last = found.joints
         off = float((tool_pose(robot, last).pos - target.pos).norm())
         if off > _NEAR:

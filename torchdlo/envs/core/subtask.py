@@ -176,9 +176,8 @@ def rewarded(task: Task, reward: Reward) -> SubTask:
 
 
 def _fields(task: Task) -> dict[str, Any]:
-    return {
-        name: getattr(task, name) for name in ("horizon", "frame_skip", "settle_steps", "release", "rope", "fidelity")
-    }
+    names = ("horizon", "frame_skip", "settle_steps", "release", "rope", "fidelity")
+    return {name: getattr(task, name) for name in names}
 
 
 def continue_from(
