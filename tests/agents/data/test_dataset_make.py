@@ -67,7 +67,7 @@ def test_sets_are_as_wide_as_the_task_with_the_most_arms(tmp_path: Path) -> None
     assert check(tmp_path / "set") == []
     data = open_set(tmp_path / "set")
     columns = data.columns()
-    one = columns["episode_index"] < 2
+    one = columns["episode_index"] % 2 == 0  # tasks take turns
     assert columns["action"].shape[1] == 12 and columns["observation.state"].shape[1] == 30
     names = data.features["action"]["names"]
     assert names == [f"{s}_d{a}" for g in ("xyz", ("roll", "pitch", "yaw")) for s in ("right", "left") for a in g]

@@ -245,7 +245,9 @@ def _finish(
 ) -> dict[str, Any]:
     """Build the set of finished attempts, put it into its place, and remove what is not needed any more."""
     schema, folder = plan.schema, out / UNFINISHED
-    episodes = [_episode(each, schema) for tries in done.values() for each in tries if each.success]
+    # Tasks take turns, so that any stretch of the set has something of each.
+    turns = zip(*([each for each in tries if each.success] for tries in done.values()), strict=True)
+    episodes = [_episode(each, schema) for turn in turns for each in turn]
     header = {
         "generator": "torchdlo dataset make",
         "versions": versions(),
