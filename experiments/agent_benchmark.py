@@ -96,7 +96,7 @@ def planned(name: str, file: str, update: bool, vary: int, options: Any) -> dict
     """Return what a plan from a start comes to."""
     choices = {"method": options.method, "episodes": options.episodes, "population": options.population}
     talk = Conversation(load_recorded(Path(file)))
-    found = carry_out(envs.find(name), talk, Options(update=update, vary=vary, **choices))
+    found = carry_out(envs.find(name), talk, Options(update=update, reset_seed=vary, **choices))
     return {"success": found.success, "ended": found.ended, "steps": len(found.carried), "source": found.source}
 
 

@@ -18,7 +18,7 @@ from lead import Lead
 
 from torchdlo import envs
 from torchdlo.agents import deployment
-from torchdlo.agents.deployment import PredictedMotion, arms_of, played, replayed, text, timed
+from torchdlo.agents.deployment import JointMotion, arms_of, played, replayed, text, timed
 from torchdlo.cli import app
 from torchdlo.coupling.robot.kinematics import panda, tool_pose
 from torchdlo.errors import InputError
@@ -99,7 +99,7 @@ def test_the_simulator_plays_what_was_written(path):
 def test_files_say_the_same():
     time = torch.tensor([0.0, 1.25], dtype=torch.float64)
     numbers = [torch.tensor([[a], [b]], dtype=torch.float64) for a, b in ((0.1, 0.2), (0.0, 0.5), (0.3, -0.3))]
-    motion = PredictedMotion(("elbow",), time, *numbers, 2.0)
+    motion = JointMotion(("elbow",), time, *numbers, 2.0)
     rows = list(csv.DictReader(text(motion, "csv", {}).splitlines()))
     assert rows[1] == {"time": "1.25", "elbow": "0.2", "elbow_velocity": "0.5"}
     plain = json.loads(text(motion, "json", {"task": "lead"}))

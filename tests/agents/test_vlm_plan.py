@@ -216,7 +216,7 @@ def test_a_run_goes_on_where_it_was_stopped(tmp_path: Path, monkeypatch: pytest.
 
 
 def test_starts_can_vary() -> None:
-    found = [carried_out(answers(("plan", FAR[:1])), update=False, vary=vary) for vary in (None, 1, 2)]
+    found = [carried_out(answers(("plan", FAR[:1])), update=False, reset_seed=vary) for vary in (None, 1, 2)]
     ends = [float(r.world.state.rods.pos[0, 5, 1]) for r in found]
     assert len({round(y, 4) for y in ends}) == 3
 

@@ -28,7 +28,7 @@ from torchdlo.envs.core import episode
 from torchdlo.envs.observations.state import observe
 from torchdlo.errors import InputError
 
-__all__ = ["FORMATS", "PredictedMotion", "arms_of", "played", "replayed", "text", "timed"]
+__all__ = ["FORMATS", "JointMotion", "arms_of", "played", "replayed", "text", "timed"]
 
 FORMATS = ("csv", "json", "ros2")
 """Names of the kinds of files."""
@@ -38,7 +38,7 @@ _NEAR = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
-class PredictedMotion:
+class JointMotion:
     """How the joints of all arms move, point after point."""
 
     names: tuple[str, ...]
@@ -118,7 +118,7 @@ def timed(
     same: bool,
     share: float = 1.0,
     acceleration: float = 10.0,
-) -> PredictedMotion:
+) -> JointMotion:
     """Return how joints move, slowed down evenly until all speeds are within the limits.
 
     Args:
@@ -148,7 +148,7 @@ def timed(
     fastest = torch.maximum(velocity.abs().amax(0), (position.diff(dim=0) / step).abs().amax(0))
     slower = max(1.0, float((fastest / limit).max()), math.sqrt(float(bend.abs().max()) / acceleration))
     time = slower * step * torch.arange(len(position), dtype=position.dtype)
-    return PredictedMotion(tuple(names), time, position, velocity / slower, bend / slower**2, slower)
+    return JointMotion(tuple(names), time, position, velocity / slower, bend / slower**2, slower)
 
 
 def _derivatives(x: Tensor, step: float) -> tuple[Tensor, Tensor]:
@@ -171,7 +171,7 @@ def _check(robot: Robot, joints: Tensor) -> None:
         )
 
 
-def text(motion: PredictedMotion, kind: str, notes: dict[str, Any]) -> str:
+def text(motion: JointMotion, kind: str, notes: dict[str, Any]) -> str:
     """Return a motion as a file of a kind of `FORMATS`; "ros2" has the shape of trajectory_msgs/JointTrajectory."""
     rows = zip(motion.time.tolist(), motion.position, motion.velocity, motion.acceleration, strict=True)
     if kind == "csv":

@@ -169,7 +169,7 @@ def plan(
     episodes: Annotated[int, typer.Option(min=4, help="Budget of a step.")] = 240,
     population: Annotated[int, typer.Option(min=4, help="Trajectories per iteration.")] = 24,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the searches.")] = 0,
-    vary: Annotated[
+    reset_seed: Annotated[
         int | None, typer.Option(min=0, help="Seed of a start that differs from the usual one.", metavar="SEED")
     ] = None,
     pictures: Annotated[bool, typer.Option(help="Draw pictures, and show them to the model.")] = True,
@@ -213,7 +213,9 @@ def plan(
 
         check_renderer()
         look = Camera()
-    options = Options(update=update, method=method, episodes=episodes, population=population, seed=seed, vary=vary)
+    options = Options(
+        update=update, method=method, episodes=episodes, population=population, seed=seed, reset_seed=reset_seed
+    )
     try:
         with progress() as show, deferred_interrupt(show) as callback:
             found = carry_out(chosen, said, options, look=look, folder=out, callback=callback)

@@ -332,7 +332,7 @@ def sweep(
         typer.echo(json.dumps(found, indent=1))
     typer.echo(f"{out}: {len(found) - len(bad)} of {len(plan.jobs)} done", err=as_json)
     for name, row in bad.items():
-        typer.echo(f"{name} failed: {row['said']}", err=True)
+        typer.echo(f"{name} failed: {row['message']}", err=True)
     if bad:
         raise typer.Exit(1)
 

@@ -294,7 +294,7 @@ def deploy(
     kind: Annotated[
         str, typer.Option("--format", help="ros2 has the shape of trajectory_msgs.", metavar="csv|json|ros2")
     ] = "csv",
-    vary: Annotated[
+    reset_seed: Annotated[
         int | None, typer.Option(min=0, help="Seed of a start that differs from the usual one.", metavar="SEED")
     ] = None,
     urdf: Annotated[
@@ -315,7 +315,7 @@ def deploy(
 
     torchdlo deploy runs/optimize/coiling-hybrid/trajectory.json --format ros2 --dry-run
 
-    torchdlo deploy runs/train/lifting-hybrid --vary 3 --speed 0.5
+    torchdlo deploy runs/train/lifting-hybrid --reset-seed 3 --speed 0.5
     """
     import torch
 
@@ -330,12 +330,12 @@ def deploy(
     marks = {"csv": b"time,", "json": b"torchdlo", "ros2": b"joint_names"}
     check_writable(out, mark=marks[kind])
     robots = deployment.arms_of(task, urdf, tool)
-    seeded = torch.Generator().manual_seed(vary or 0)
-    moved = task.moved(1, generator=seeded, variation=vary is not None)
+    seeded = torch.Generator().manual_seed(reset_seed or 0)
+    moved = task.moved(1, generator=seeded, variation=reset_seed is not None)
     path, good = deployment.played(task, what, moved)
     motion = deployment.timed(task, robots, path, same=urdf is None, share=speed, acceleration=acceleration)
     said: dict[str, Any] = {"task": task.name, "success": good, "slower": motion.slower}
-    said |= {"seconds": float(motion.time[-1]), "points": len(motion.time), "vary": vary}
+    said |= {"seconds": float(motion.time[-1]), "points": len(motion.time), "reset_seed": reset_seed}
     write_atomically(out, deployment.text(motion, kind, said))
     if dry_run:
         said["dry_run_success"] = deployment.replayed(task, robots, motion.position, moved)

@@ -131,7 +131,7 @@ def test_a_sweep_runs_all_jobs_and_goes_on_with_what_failed(monkeypatch, tmp_pat
     assert {name: row["done"] for name, row in found.items()} == {
         "coiling-0": True, "wrapping-0": True, "coiling-1": True, "wrapping-1": False,
     }  # fmt: skip
-    assert found["wrapping-1"]["said"] == "error: it did not work"
+    assert found["wrapping-1"]["message"] == "error: it did not work"
     assert (out / "coiling-1/result.json").read_text() == "1"
     with pytest.raises(InputError, match="a sweep was begun there; --resume goes on with it"):
         run(plan, out, Serial())

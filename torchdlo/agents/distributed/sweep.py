@@ -187,7 +187,7 @@ def run(
 
 def _noted(out: Path, job: Job, went: _Outcome) -> bool:
     """Write down how a job ended; return whether it did well."""
-    note = {"command": list(job.command), "seconds": went.seconds, "code": went.code, "said": went.said}
+    note = {"command": list(job.command), "seconds": went.seconds, "code": went.code, "message": went.said}
     good = went.code == 0
     if good and went.files is not None:
         _unpack(went.files, out / job.name)
@@ -204,6 +204,6 @@ def _report(out: Path, jobs: Sequence[Job]) -> dict[str, Any]:
             file = out / folder / f"{job.name}.json"
             if file.is_file():
                 note = json.loads(file.read_text(encoding="utf-8"))
-                found[job.name] = {"done": folder == DONE, "seconds": note["seconds"], "said": note["said"]}
+                found[job.name] = {"done": folder == DONE, "seconds": note["seconds"], "message": note["message"]}
                 break
     return found

@@ -42,7 +42,7 @@ class Options:
     """Budget of a step."""
     population: int = 24
     seed: int = 0
-    vary: int | None = None
+    reset_seed: int | None = None
     """Seed of a start that differs from the usual one."""
     enough: bool = True
     """Whether a search ends with the first trajectory that reaches the success of its step."""

@@ -115,8 +115,8 @@ class _Run:
 
     def start(self) -> dict[str, Any]:
         """Return how starts are drawn."""
-        seeded = torch.Generator().manual_seed(self.options.vary or 0)
-        return {"generator": seeded, "variation": self.options.vary is not None}
+        seeded = torch.Generator().manual_seed(self.options.reset_seed or 0)
+        return {"generator": seeded, "variation": self.options.reset_seed is not None}
 
     def check_step(self, step: Any, places: Places | None) -> None:
         """Refuse a step whose expressions, grasps or way-points cannot be; of later ones grasps are not known yet."""

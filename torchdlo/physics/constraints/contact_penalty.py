@@ -46,7 +46,7 @@ class Touch:
     wanted: Tensor
     """By how much points have to part from their bodies at least [m], shape (..., F, V, 1)."""
     given: Tensor
-    """By how much they part from and slip on bodies that nothing touches if their edges stay [m], (..., F, V, 3)."""
+    """By how much they part from and slip on bodies that nothing touches if edges stay [m], shape (..., F, V, 3)."""
     mu: Tensor
     """Coefficients of friction [1], shape (..., F, V, 1)."""
     arm: Tensor

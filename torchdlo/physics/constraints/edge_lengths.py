@@ -237,7 +237,7 @@ def balance(
     with torch.no_grad():
         pos, impulse = _found(system, tension, steps)
     pos = torch.where(free > 0, pos, moved)
-    pos, impulse, _ = system.newton(pos, impulse)
+    pos, impulse, _ = system.newton_step(pos, impulse)
     return pos, impulse / scale, system.residual(pos, impulse)[1] / scale
 
 
@@ -248,11 +248,17 @@ class System:
     lengths: Lengths
     inertia: Inertia
     moved: Tensor
+    """Positions with held vertices in their places [m], shape (..., V, 3)."""
     free: Tensor
+    """1 for free vertices [1], shape (..., V, 1)."""
     force: Tensor
+    """Force on vertices [N], shape (..., V, 3)."""
     scale: Tensor
+    """What turns force into mass times displacement [s^2], shape (..., V, 1)."""
     direction: Tensor
+    """Directions in which tensions act [1], shape (..., V, 3)."""
     ahead: Tensor
+    """What pulled edges lean towards beyond that [1], shape (..., V, 3)."""
     turning: float
 
     def residual(self, pos: Tensor, impulse: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
@@ -281,7 +287,7 @@ class System:
         law = [self.turning, lengths.most, lengths.least, lengths.shift]
         return [*edges, self.free, tension, *vectors, self.scale], law
 
-    def newton(self, pos: Tensor, impulse: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def newton_step(self, pos: Tensor, impulse: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return positions and impulses after a step of Newton's method, and what it changed [1], (..., 1, 1)."""
         lengths, inertia, free, scale, topology = (
             self.lengths,
@@ -350,7 +356,7 @@ def _newton(inputs: list[Tensor], topology: str, law: list[float], steps: int) -
     impulse = impulse.expand(*batch, *impulse.shape[-2:])
     open = torch.ones_like(pos[..., :1, :1], dtype=torch.bool)
     for _ in range(steps):
-        *better, changed = system.newton(pos, impulse)
+        *better, changed = system.newton_step(pos, impulse)
         pos, impulse = (torch.where(open, new, old) for new, old in zip(better, (pos, impulse), strict=True))
         open = open & ~(changed < _done(pos))
         if not bool(open.any()):

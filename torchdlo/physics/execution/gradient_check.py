@@ -17,9 +17,9 @@ class GradientCheck:
     """What reverse mode and differences say about some directions."""
 
     adjoint: Tensor
-    """Directional derivatives by reverse mode, in units of the result per unit of `direction`, shape (D,)."""
+    """Directional derivatives by reverse mode, in units of the result per unit of `direction` [-], shape (D,)."""
     differences: Tensor
-    """The same by central differences, extrapolated from two spans, shape (D,)."""
+    """The same by central differences, extrapolated from two spans [-], shape (D,)."""
     uncertainty: Tensor
     """By how much the two spans disagree, likewise: smaller errors than that cannot be seen, shape (D,)."""
 

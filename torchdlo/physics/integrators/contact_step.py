@@ -41,7 +41,7 @@ class Unknowns:
     pos: Tensor
     """Positions [m], shape (..., V, 3)."""
     impulse: Tensor
-    """Tensions times `scale`, shape (..., V, 1)."""
+    """Tensions times `scale` [N s^2], shape (..., V, 1)."""
     bodies: Tensor
     """By how much contact moves and turns free bodies [m, rad], shape (..., J, 6)."""
 
@@ -67,7 +67,9 @@ class Touching:
         least = torch.where(least < torch.inf, least, mass)
         return (hard * least).unsqueeze(-3)
 
-    def newton(self, now: Unknowns, firm: Tensor, linear: tuple[Tensor, ...], exact: bool) -> tuple[Unknowns, Tensor]:
+    def newton_step(
+        self, now: Unknowns, firm: Tensor, linear: tuple[Tensor, ...], exact: bool
+    ) -> tuple[Unknowns, Tensor]:
         """Return the unknowns after a step, and what was left of the equations before it [1], shape (..., 1, 1)."""
         system, lengths, inertia = self.system, self.system.lengths, self.system.inertia
         topology, free, scale, count = lengths.topology, system.free, system.scale, self.touch.of.shape[-1]
@@ -77,7 +79,6 @@ class Touching:
         resist = self.touch.resist * scale.unsqueeze(-1)
         wrenches = (resist @ now.bodies.unsqueeze(-1)).squeeze(-1) - felt.wrench
         batch = torch.broadcast_shapes(forces.shape[:-2], excess.shape[:-2], resist.shape[:-3], firm.shape[:-3])
-        v = topology.size
         with torch.no_grad():
             gradient = penalty.gradients(topology, self.touch, linear, felt, exact)
             same, one, two = inertia.bands(topology)
@@ -110,17 +111,19 @@ class Touching:
         bodies = now.bodies.expand(*batch, count, 6)
         turned = torch.zeros_like(bodies)
         if count:
-            load = -wrenches.expand(*batch, count, 6).reshape(-1, 6 * count, 1) - row @ step[: 3 * v].T.unsqueeze(-1)
+            load = -wrenches.expand(*batch, count, 6).reshape(-1, 6 * count, 1) - row @ step[
+                : 3 * topology.size
+            ].T.unsqueeze(-1)
             moved = torch.linalg.solve(schur, load)
             step = step - (answer @ moved).squeeze(-1).T
             turned = moved.reshape(*batch, count, 6)
-        change, pull = _slots(step[: 3 * v], batch, 3), _slots(step[3 * v :], batch, 1)
+        change, pull = _slots(step[: 3 * topology.size], batch, 3), _slots(step[3 * topology.size :], batch, 1)
         with torch.no_grad():
             turn = active * (following(topology, change) - change) / lengths.rest
             most = dot(turn, turn).amax(-2, keepdim=True).sqrt()
             short = (1 / most.clamp(min=1e-9)).clamp(max=1.0)
-            size = (inertia.vertex * y).abs() + (scale * system.force).abs() + felt.force.abs()
-            size = size + (now.impulse * along_start).abs()
+            sizes = (inertia.vertex * y, scale * system.force, felt.force, now.impulse * along_start)
+            size = sum(x.abs() for x in sizes)
             left = forces.abs().amax((-2, -1), keepdim=True) / size.amax((-2, -1), keepdim=True).clamp(min=1e-30)
             left = torch.maximum(left, (excess.abs() / lengths.rest).amax(-2, keepdim=True))
             left = left.expand(*batch, 1, 1)
@@ -189,13 +192,13 @@ def solve(touching: Touching, tension: Tensor) -> tuple[Tensor, Tensor, Tensor, 
     firm = touching.firm(tension, hard)
     linear = penalty.maps(touching.touch)
     pos = torch.where(system.free > 0, pos, system.moved)
-    now, _ = touching.newton(Unknowns(pos, found * system.scale, bodies), firm, linear, True)
+    now, _ = touching.newton_step(Unknowns(pos, found * system.scale, bodies), firm, linear, True)
     topology, scale = system.lengths.topology, system.scale
     felt = penalty.feel(topology, touching.touch, linear, firm, now.pos - touching.origin, now.bodies)
     push = system.residual(now.pos, now.impulse)[1]
     with torch.no_grad():
         still = tree.detach((now.pos, now.impulse, now.bodies))
-        _, left = touching.newton(Unknowns(*still), firm, tuple(x.detach() for x in linear), True)
+        _, left = touching.newton_step(Unknowns(*still), firm, tuple(x.detach() for x in linear), True)
     wrench = (touching.touch.resist @ now.bodies.unsqueeze(-1)).squeeze(-1)
     return now.pos, now.impulse / scale, (push + felt.force) / scale, felt.force / scale, wrench, left
 
@@ -230,7 +233,7 @@ def _engaged(
         firm, now = touching.firm(tension, chosen), _chosen(open, first, found)
         before = now
         for k in range(steps):
-            new, left = touching.newton(now, firm, linear, k >= 2)
+            new, left = touching.newton_step(now, firm, linear, k >= 2)
             if k >= 3:  # the step from the one before is the exact one, which is taken again with graph
                 better = open & (left < least)
                 best, kept = _chosen(better, before, best), torch.where(better, chosen, kept)
