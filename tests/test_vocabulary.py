@@ -23,20 +23,12 @@ OLD = set(
 """What names of version 0.1 were called that have a word of the field today."""
 OLD_FILES = {"scene_files/older.py", "agents/trajopt/result.py", "sysid/model/model_file.py", "scene_files/run.py"}
 """Where files of version 0.1 are read, so that their keys are named."""
-TWICE = {
-    "design",
-    "result",
-    "search",
-    "kinematics",
-    "effect",
-    "solver_op",
-    "assembly",
-    "files",
-    "rollout",
-    "training",
-    "hybrid",
-}
-TWICE |= {"schema", "video", "waypoints", "surfaces", "films"}
+TWICE = set(
+    """
+    design result search kinematics effect solver_op assembly files rollout training hybrid schema video waypoints surfaces
+    films
+    """.split()
+)
 """Modules of one name in several folders, which say what they are of."""
 
 

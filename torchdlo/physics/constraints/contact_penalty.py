@@ -64,21 +64,21 @@ class Touch:
 
 
 @dataclass(frozen=True)
-class Slopes:
+class ContactGradients:
     """How what contact does falls with displacements, times `scale`."""
 
     same: Tensor
-    """Force on vertices with their own, shape (..., V, 3, 3)."""
+    """Force on vertices with their own [kg], shape (..., V, 3, 3)."""
     after: Tensor
-    """Force on vertices with the following one's, shape (..., V, 3, 3)."""
+    """Force on vertices with the following one's [kg], shape (..., V, 3, 3)."""
     before: Tensor
-    """Force on the following vertices with this one's, shape (..., V, 3, 3)."""
+    """Force on the following vertices with this one's [kg], shape (..., V, 3, 3)."""
     border: Tensor
-    """Force on vertices with those of bodies, shape (..., V, 3, 6 J)."""
+    """Force on vertices with those of bodies [kg], shape (..., V, 3, 6 J)."""
     back: Tensor
-    """Wrenches with those of vertices, shape (..., V, 6 J, 3)."""
+    """Wrenches with those of vertices [kg], shape (..., V, 6 J, 3)."""
     corner: Tensor
-    """Wrenches with those of bodies, shape (..., 6 J, 6 J)."""
+    """Wrenches with those of bodies [kg], shape (..., 6 J, 6 J)."""
 
 
 @dataclass(frozen=True)
@@ -164,7 +164,7 @@ def feel(
 
 def gradients(
     topology: Topology, touch: Touch, linear: tuple[Tensor, Tensor, Tensor], felt: Felt, exact: bool
-) -> Slopes:
+) -> ContactGradients:
     """Return how that falls; without the turning of friction unless `exact`, which is safer far from the solution."""
     steep, drag, ahead, stuck = felt.parts
     n, of = touch.normal, touch.of
@@ -179,7 +179,7 @@ def gradients(
     border = [torch.einsum("...fvij,fk->...vikj", x.mT @ kc, of).flatten(-2) for x in (a, b)]
     back = [torch.einsum("...fvij,fk->...vkij", c.mT @ x, of).flatten(-3, -2) for x in (ka, kb)]
     corner = torch.einsum("...fvij,fk->...kij", c.mT @ kc, of)
-    return Slopes(
+    return ContactGradients(
         (a.mT @ ka).sum(-4) + moved(topology, ending),
         (a.mT @ kb).sum(-4),
         (b.mT @ ka).sum(-4),

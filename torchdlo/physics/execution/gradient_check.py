@@ -21,7 +21,7 @@ class GradientCheck:
     differences: Tensor
     """The same by central differences, extrapolated from two spans [-], shape (D,)."""
     uncertainty: Tensor
-    """By how much the two spans disagree, likewise: smaller errors than that cannot be seen, shape (D,)."""
+    """By how much the two spans disagree, likewise: smaller errors than that cannot be seen [-], shape (D,)."""
 
     @property
     def error(self) -> float:

@@ -117,16 +117,14 @@ class Touching:
             moved = torch.linalg.solve(schur, load)
             step = step - (answer @ moved).squeeze(-1).T
             turned = moved.reshape(*batch, count, 6)
-        change, pull = _slots(step[: 3 * topology.size], batch, 3), _slots(step[3 * topology.size :], batch, 1)
+        cut = 3 * topology.size
+        change, pull = _slots(step[:cut], batch, 3), _slots(step[cut:], batch, 1)
         with torch.no_grad():
             turn = active * (following(topology, change) - change) / lengths.rest
             most = dot(turn, turn).amax(-2, keepdim=True).sqrt()
             short = (1 / most.clamp(min=1e-9)).clamp(max=1.0)
             sizes = (inertia.vertex * y, scale * system.force, felt.force, now.impulse * along_start)
-            size = sum(x.abs() for x in sizes)
-            left = forces.abs().amax((-2, -1), keepdim=True) / size.amax((-2, -1), keepdim=True).clamp(min=1e-30)
-            left = torch.maximum(left, (excess.abs() / lengths.rest).amax(-2, keepdim=True))
-            left = left.expand(*batch, 1, 1)
+            left = _left(forces, sizes, excess, lengths.rest).expand(*batch, 1, 1)
         return Unknowns(now.pos + short * change, now.impulse + short * pull, bodies + short * turned), left
 
     def start(self, tension: Tensor) -> Unknowns:
@@ -140,6 +138,13 @@ class Touching:
             impulse.expand(*batch, *impulse.shape[-2:]),
             system.moved.new_zeros(*batch, count, 6),
         )
+
+
+def _left(forces: Tensor, sizes: tuple[Tensor, ...], excess: Tensor, rest: Tensor) -> Tensor:
+    """Return what is left of the equations over what is in them, and of lengths over lengths [1], shape (..., 1, 1)."""
+    size = sum(x.abs() for x in sizes)
+    left = forces.abs().amax((-2, -1), keepdim=True) / size.amax((-2, -1), keepdim=True).clamp(min=1e-30)
+    return torch.maximum(left, (excess.abs() / rest).amax(-2, keepdim=True))
 
 
 def _bordered(
