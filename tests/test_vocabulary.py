@@ -25,7 +25,8 @@ OLD_FILES = {"scene_files/older.py", "agents/trajopt/result.py", "sysid/model/mo
 """Where files of version 0.1 are read, so that their keys are named."""
 TWICE = set(
     """
-    design result search kinematics effect solver_op assembly files rollout training hybrid schema video waypoints surfaces
+    design result search kinematics effect solver_op assembly files rollout training hybrid schema video waypoints
+    surfaces
     films
     """.split()
 )

@@ -26,14 +26,14 @@ def test_unsolved_steps_end_where_least_is_left(monkeypatch: pytest.MonkeyPatch)
         [rope], [Gravity(), Bend(), RodBody()], bodies=[ball], integrator="implicit", dt=5e-3, substeps=1
     )
     seen: list[float] = []
-    newton = contact_step.Touching.newton
+    newton = contact_step.Touching.newton_step
 
     def watched(self, *given):
         found, left = newton(self, *given)
         seen.append(float(left))
         return found, left
 
-    monkeypatch.setattr(contact_step.Touching, "newton", watched)
+    monkeypatch.setattr(contact_step.Touching, "newton_step", watched)
     monkeypatch.setattr(contact_step, "_solved", lambda like: 0.0)
     monkeypatch.setattr(contact_step, "TRIES", ((100.0, 7), (10.0, 7)))
     with torch.no_grad():

@@ -86,7 +86,7 @@ class Felt:
     """What contact does at some displacements, times `scale`."""
 
     force: Tensor
-    """Force on vertices, shape (..., V, 3)."""
+    """Force on vertices [N s^2], shape (..., V, 3)."""
     wrench: Tensor
     """Force and torque on free bodies, shape (..., J, 6)."""
     parts: tuple[Tensor, ...]

@@ -151,7 +151,7 @@ def _bordered(
     batch: tuple[int, ...],
     entries: Tensor,
     border: Tensor,
-    gradient: penalty.Slopes,
+    gradient: penalty.ContactGradients,
     resist: Tensor,
     topology: Topology,
 ) -> tuple[Tensor, Tensor, Tensor]:
