@@ -88,9 +88,9 @@ class Felt:
     force: Tensor
     """Force on vertices [N s^2], shape (..., V, 3)."""
     wrench: Tensor
-    """Force and torque on free bodies, shape (..., J, 6)."""
+    """Force and torque on free bodies [N s^2, N m s^2], shape (..., J, 6)."""
     parts: tuple[Tensor, ...]
-    """Numbers of points that `gradients` reads."""
+    """Numbers of points [-] that `gradients` reads, shapes (...)."""
 
 
 def _column(x: Tensor) -> Tensor:
