@@ -49,7 +49,8 @@ def test_arms_are_drawn_where_their_joints_bring_them(made):
     frames, went = film(made.task, way(), made=made)
     links = len(panda().shapes)
     assert frames.body_pos.shape[1] - bare.body_pos.shape[1] == links == (frames.body_motion == "robot").sum()
-    assert len(pieces(frames)) == len(pieces(bare)) + links
+    # Links that look like those of arms have parts of several colours.
+    assert len(pieces(frames)) >= len(pieces(bare)) + links
     # The middle of a finger is within 6 cm of where both end.
     middles = frames.body_pos[-1, frames.body_motion == "robot"]
     tool = went.world.tool.pos[0, 0].numpy()

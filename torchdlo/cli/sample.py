@@ -10,7 +10,7 @@ import typer
 
 __all__ = ["FOLDER", "sample"]
 
-FOLDER = Path(__file__).parent / "data" / "sample_rope"
+FOLDER = Path(__file__).parents[1] / "data" / "sample_rope"
 """A recording of a rope with five trials, made by another simulator."""
 
 
