@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from torchdlo import cache, doctor
-from torchdlo.cli import app
+from torchdlo import cache
+from torchdlo.cli import app, doctor
 from torchdlo.physics.kernels import native
 
 pytestmark = pytest.mark.quick

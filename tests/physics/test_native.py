@@ -197,7 +197,7 @@ def test_two_processes_that_build_at_once_build_once(source, tmp_path):
     own = native.compiler().program
     slow.write_text(f'#!/bin/sh\ncase "$*" in *-shared*) echo built >> {log}; sleep 1;; esac\nexec {own} "$@"\n')
     slow.chmod(0o755)
-    code = "import sys, pathlib; from torchdlo.physics import native as n"
+    code = "import sys, pathlib; from torchdlo.physics.kernels import native as n"
     code += "; print(n.library(pathlib.Path(sys.argv[1])).answer())"
     kept = os.environ | {"PYTHONPATH": str(ROOT), "CXX": str(slow), "TORCHDLO_CACHE": str(tmp_path / "cache")}
     command = [sys.executable, "-c", code, str(source)]
@@ -209,7 +209,9 @@ def test_two_processes_that_build_at_once_build_once(source, tmp_path):
 def test_kernels_leave_small_numbers_of_others_alone_and_have_none_themselves():
     code = """
 import numpy, torch
-from torchdlo.physics import banded, lanes, topology
+from torchdlo.physics.kernels import lanes
+from torchdlo.physics.linalg import banded
+from torchdlo.physics.rod import topology
 assert (banded.kernel() is None) == (lanes._library() is None)
 entries, rhs = torch.full((180, 3), 0.1), torch.zeros(60, 3)
 entries[:60], rhs[0] = 3.0, 1e-6

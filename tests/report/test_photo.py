@@ -9,7 +9,7 @@ import pytest
 from test_render import scene
 
 from torchdlo.errors import InputError
-from torchdlo.report import photo
+from torchdlo.report.render import photo
 from torchdlo.report.render import picture as render
 from torchdlo.report.render.surfaces import pieces
 from torchdlo.scene_files.run import run
