@@ -217,11 +217,13 @@ def _health(found: dict[str, Any]) -> str:
 def snippet(recording: Recording, model: Path) -> str:
     """Return a script that predicts the test trials with the model again."""
     return (
-        "from torchdlo.sysid import judge, load_recording, saved\n\n"
+        "from torchdlo.sysid import load_recording\n"
+        "from torchdlo.sysid.estimation import evaluation\n"
+        "from torchdlo.sysid.model import model_file\n\n"
         f"recording = load_recording({str(recording.path)!r})\n"
-        f"given = saved.load({str(model)!r})\n"
+        f"given = model_file.load({str(model)!r})\n"
         "model = given.model(recording)\n"
-        "markers = judge.predict(model, recording.test, given.start(model))  # [m], by trial\n"
+        "markers = evaluation.predict(model, recording.test, given.start(model))  # [m], by trial\n"
     )
 
 

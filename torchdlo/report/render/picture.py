@@ -27,7 +27,7 @@ ANGLE = 30.0
 def check_renderer(*, photo: bool = False) -> Any:
     """Return the renderer, or say what is missing for it, or for photographs."""
     if photo:
-        from torchdlo.report.photo import check_photo
+        from torchdlo.report.render.photo import check_photo
 
         return check_photo()
     try:
