@@ -76,7 +76,7 @@ def show(name: str, out: Path, *, quick: bool, draw: bool, video: bool) -> dict[
     scene_files.save(description, here / "scene.json")
     begin = time.perf_counter()
     with progress() as callback:
-        frames = run(scene_files.read(here / "scene.json"), frame_stride=one.every, callback=callback)
+        frames = run(scene_files.read(here / "scene.json"), frame_stride=one.frame_stride, callback=callback)
     seconds = time.perf_counter() - begin
     save_frames(frames, here / "frames.npz", description)
     claims = {} if frames.problem else one.claims(frames, description)

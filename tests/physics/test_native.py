@@ -37,7 +37,10 @@ line = torch.zeros(2, 12, 3, dtype=torch.float64)
 line[0, :, 0], line[0, :, 2] = torch.linspace(-0.1, 0.1, 12), 0.021
 line[1, :, 1], line[1, :, 2] = torch.linspace(-0.1, 0.1, 12), 0.0315
 ropes = [scene.Rope(x, radius=0.005, density=1000.0, bend=1e-5) for x in line]
-bodies = [scene.RigidBody("sphere", 0.015, motion="fixed"), scene.RigidBody("sphere", 0.01, pos=(0.05, 0, 0), density=500.0)]
+bodies = [
+    scene.RigidBody("sphere", 0.015, motion="fixed"),
+    scene.RigidBody("sphere", 0.01, pos=(0.05, 0, 0), density=500.0),
+]
 effects = [Gravity(), Bend(), RodContact(), RodBody(), BodyContact()]
 made, params, now = scene.make(ropes, effects, bodies=bodies, dt=2e-3, substeps=4)
 step = scene.stepper(made, compiled="compiled" in sys.argv)

@@ -49,7 +49,7 @@ def test_the_page_tells_the_whole_story(page: Path) -> None:
         "does not help on the test trials",
         "vₙ: velocity across the rope",
         "train_1: markers 3 and 4 are swapped",
-        "saved.load(",
+        "model_file.load(",
         "torchdlo diagnose &#x27;a b&#x27;",
         "my &lt;rope&gt;",
     ):
