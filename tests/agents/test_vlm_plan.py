@@ -36,7 +36,7 @@ class Carry(Task):
     """Carry the end of a short rope 5 cm along x."""
 
     horizon: int = 12
-    frames: int = 4
+    frame_skip: int = 4
     name: ClassVar[str] = "carry"
     arms: ClassVar[Arms] = Arms(base=((0.0, -0.4, 0.0), (0.7, -0.4, 0.0)), vertex=(1, 4))
     reset_noise: ClassVar[tuple[tuple[float, float], ...]] = ((0.005, 0.005),)

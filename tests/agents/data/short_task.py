@@ -26,7 +26,7 @@ class Short(Task):
     """Lead the first end of a short rope to the left of a place."""
 
     horizon: int = 4
-    frames: int = 1
+    frame_skip: int = 1
     name: ClassVar[str] = "short"
     arms: ClassVar[Arms] = Arms(base=((-0.2, -0.45, 0.0),), vertex=(1,))
     reset_noise: ClassVar[tuple[tuple[float, float], ...]] = ((0.02, 0.01),)

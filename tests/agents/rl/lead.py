@@ -21,7 +21,7 @@ class Lead(Task):
     """Lead the first end of a short rope to y = 0.125."""
 
     horizon: int = 6
-    frames: int = 2
+    frame_skip: int = 2
     name: ClassVar[str] = "lead"
     coarse: ClassVar[Fidelity] = Fidelity(substeps=2)
     arms: ClassVar[Arms] = Arms(base=((-0.2, -0.45, 0.0),), vertex=(1,))
