@@ -51,7 +51,10 @@ def main() -> None:
     parser = Parser(__file__, description=__doc__)
     parser.add_argument("--repeats", type=count, default=20, help="repeats of each")
     parser.add_argument("--out", default="", help="JSON file for the numbers")
+    parser.flag("smoke", "one repeat: does the script run?")
     options = parser.parse_args()
+    if options.smoke:
+        options.repeats = 1
     import torch
 
     from torchdlo.envs.observations.pixels import camera_rig, rendered
