@@ -24,22 +24,6 @@ quick: $(FILLED)  ## the tests that say most in less than three minutes
 wheel:  ## build it, install it elsewhere, and use it there
 	PYTHON=$(PYTHON) .ci/wheel
 
-# LeRobot excludes our version of torch, so it gets an environment of its own: 5.4 GB, Python 3.12. Not a part of CI.
-LEROBOT_PYTHON ?= python3.12
-LEROBOT := .venv-lerobot
-
-lerobot: $(FILLED) $(LEROBOT)/.filled  ## read and train on a data set of ours with LeRobot itself
-	rm -rf runs/lerobot
-	PYTHONPATH=. $(BIN)/python tests/agents/data/lerobot_case.py runs/lerobot/case
-	$(LEROBOT)/bin/python experiments/lerobot/accept.py runs/lerobot/case
-	$(LEROBOT)/bin/lerobot-doctor check runs/lerobot/case
-	PYTHONPATH=. $(BIN)/python tests/agents/data/lerobot_case.py runs/lerobot/again --record "lerobot 0.6.1"
-
-$(LEROBOT)/.filled:
-	$(LEROBOT_PYTHON) -m venv $(LEROBOT)
-	$(LEROBOT)/bin/python -m pip install --quiet --disable-pip-version-check 'lerobot[dataset,training]==0.6.1' lerobot-doctor==0.2.0
-	touch $@
-
 bench: $(FILLED)
 	$(BIN)/python experiments/bench_rod.py --quick
 
