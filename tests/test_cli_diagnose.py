@@ -65,7 +65,7 @@ def test_a_stopped_search_says_how_to_go_on(
     ("options", "said"),
     [
         (("--resume",), "runs/diagnose/rope/journal: expected the journal of a search to resume, found none"),
-        (("--model", "none.json"), "none.json: expected a model file, found nothing there"),
+        (("--model", "none.json"), "none.json: expected a model file, found none"),
         (("--model", "rope/rope.json"), "rope/rope.json: expected a model file"),
         (("--budget", "huge"), "budget is 'huge'; expected one of fast, full"),
     ],

@@ -116,7 +116,7 @@ def change(*path, to=None, drop=False):
 
 
 WRONG = {
-    "cut": (change("notes", to="x")[:200], r"line 1, column \d+: is not JSON"),
+    "cut": (change("notes", to="x")[:200], r"line 1, column \d+ is not JSON"),
     "no format": (change("format", drop=True), "torchdlo scene 2"),
     "wrong entry": (
         change("ropes", 0, "radios", to=1.0),

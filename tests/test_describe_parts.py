@@ -308,7 +308,7 @@ def test_a_model_file_is_a_rope_of_a_scene(modelled):
     assert run(said, folder=folder).problem == ""
     for wrong, sentence in (
         (change(rope, points=((0.0, 0.0, 0.0), (0.9, 0.0, 0.0))), "as long as the rope .* 1 m, given 0.9 m"),
-        (change(rope, model="no.json"), "expected a model file, found nothing there"),
+        (change(rope, model="no.json"), "expected a model file, found none"),
     ):
         with pytest.raises(InputError, match=sentence):
             scene_files.build(change(said, ropes=(wrong,)), folder=folder)
@@ -345,7 +345,7 @@ def test_frames_read_back_and_others_are_refused(tmp_path):
     with pytest.raises(InputError, match="lacks pos, "):
         load_frames(tmp_path / "other.npz")
     (tmp_path / "text.npz").write_text("no")
-    with pytest.raises(InputError, match="reading failed"):
+    with pytest.raises(InputError, match="expected the frames of a run, an .npz archive, found|cannot be read"):
         load_frames(tmp_path / "text.npz")
 
 

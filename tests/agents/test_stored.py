@@ -66,6 +66,9 @@ def test_what_is_not_there_is_said(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"no\.npz: expected an archive of searches, found none"):
         read_index(tmp_path / "no.npz")
     (tmp_path / "text.npz").write_text("no")
-    with pytest.raises(InputError, match=r"text\.npz: expected an archive of searches, but reading failed"):
+    with pytest.raises(
+        InputError,
+        match=r"text\.npz: expected an archive of searches.*cannot be read",
+    ):
         read_index(tmp_path / "text.npz")
     assert ARCHIVE.is_file()

@@ -108,7 +108,7 @@ def test_a_mass_beyond_the_rope_is_refused(tmp_path: Path) -> None:
     rope = cable(write(tmp_path / "model.json", ("point_mass",), **{"point_mass.position": 0.5}))
     with pytest.raises(InputError, match=r"point mass sits at 0.5 m; .*this task's has 0.22 m"):
         find("slingshot", rope).start(1)
-    with pytest.raises(InputError, match="expected a model file, found nothing there"):
+    with pytest.raises(InputError, match="expected a model file, found none"):
         cable(tmp_path / "none.json")
 
 

@@ -121,10 +121,10 @@ def nan_json(value: str) -> Callable[[Path], None]:
 CASES: dict[str, tuple[Callable[[Path], None], tuple[str, ...]]] = {
     # rope.json
     "no rope.json": (drop("rope.json"), ("rope.json", "found none")),
-    "rope.json is not JSON": (text("{length: 1}"), ("rope.json", "valid JSON")),
+    "rope.json is not JSON": (text("{length: 1}"), ("rope.json", "line 1, column 2 is not JSON")),
     "rope.json is binary": (
         lambda folder: (folder / "rope.json").write_bytes(b"\xff\xfe\x00") and None,
-        ("rope.json", "valid JSON"),
+        ("rope.json", "as text in UTF-8, found byte 0xff at position 0"),
     ),
     "rope.json is a list": (text("[1, 2]"), ("rope.json", "JSON object", "a list")),
     "missing key": (rope(mass=...), ("rope.json", "mass", "missing")),
@@ -138,9 +138,17 @@ CASES: dict[str, tuple[Callable[[Path], None], tuple[str, ...]]] = {
     "length is true": (rope(length=True), ("rope.json", "length", "number")),
     "mass is negative": (rope(mass=-0.05), ("rope.json", "mass", "above 0 in kg", "-0.05")),
     "mass is null": (rope(mass=None), ("rope.json", "mass", "number", "null")),
-    "mass is NaN": (nan_json("NaN"), ("rope.json", "mass", "finite", "nan")),
-    "mass is huge": (nan_json("1" + "0" * 400), ("rope.json", "mass", "finite", "inf")),
-    "mass has too many digits": (nan_json("1" * 5000), ("rope.json", "valid JSON")),
+    "mass is NaN": (nan_json("NaN"), ("rope.json: mass: line ", "finite", "NaN")),
+    "mass is huge": (nan_json("1" + "0" * 400), ("rope.json: mass: line ", "with 401 letters")),
+    "mass has too many digits": (nan_json("1" * 5000), ("rope.json: mass: line ", "with 5000 letters")),
+    "mass is 1e308": (rope(mass=1e308), ("rope.json", "mass", "at most 100000 in kg", "1e+308")),
+    "length is 1e308": (rope(length=1e308), ("rope.json", "length", "at most 10000 in m", "1e+308")),
+    "gravity is 1e308": (rope(gravity=[0, 0, -1e308]), ("rope.json", "gravity", "at most 1000", "1e+308")),
+    "noise is 1e308": (rope(marker_noise_std=1e308), ("rope.json", "marker_noise_std", "at most 1 in m", "1e+308")),
+    "a key twice": (
+        text('{"length": 1.0, "length": 2.0}'),
+        ("rope.json: line 1, column 17", "found length twice"),
+    ),
     "radius is zero": (rope(radius=0.0), ("rope.json", "radius", "above 0", "or null")),
     "radius in mm": (rope(radius=4.0), ("rope.json", "radius", "metres")),
     "noise is negative": (

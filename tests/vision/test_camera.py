@@ -87,7 +87,7 @@ def test_wrong_files_are_refused_in_a_sentence(tmp_path: Path, change: Callable[
 
 
 @pytest.mark.parametrize(
-    ("text", "message"), [("{", "valid JSON"), ("[]", "at least one camera"), (None, "found none")]
+    ("text", "message"), [("{", "is not JSON"), ("[]", "at least one camera"), (None, "found none")]
 )
 def test_files_that_are_none(tmp_path: Path, text: str | None, message: str) -> None:
     path = tmp_path / "cameras.json"

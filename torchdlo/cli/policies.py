@@ -356,16 +356,13 @@ def deploy(
 def _source(path: Path) -> tuple[Task, Any]:
     """Return the task, and the actions of a trajectory (T, A) or a policy."""
     from torchdlo.agents.policies import load
-    from torchdlo.agents.trajopt.result import load_actions
+    from torchdlo.agents.trajopt.result import load_actions, read_trajectory
     from torchdlo.agents.trajopt.task_problem import TaskProblem
     from torchdlo.envs import find
 
     if path.is_dir() or path.suffix != ".json":
         policy = load(path)
         return find(policy.spec.task), policy
-    try:
-        name = json.loads(path.read_text(encoding="utf-8"))["task"]
-    except (OSError, ValueError, KeyError, TypeError):
-        raise InputError(f"{path}: expected a trajectory of torchdlo optimize, found something else.") from None
+    name = read_trajectory(path)["task"].text()
     problem = TaskProblem(find(name), compiled=False)
     return problem.task, problem.full(load_actions(path, problem))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +12,7 @@ from torch import Tensor
 
 from torchdlo.errors import InputError
 from torchdlo.reward_language.expression import Expression, parse
+from torchdlo.untrusted import read_json
 
 __all__ = ["Reward", "load_reward", "reward"]
 
@@ -69,12 +69,7 @@ def reward(terms: Mapping[str, str], success: str | None = None, where: str = "r
 
 def load_reward(path: Path) -> Reward:
     """Return the reward of a file: {"reward": {name: expression}, "success": condition}, the latter if wanted."""
-    try:
-        if path.stat().st_size > _FILE:
-            raise InputError(f"{path}: it has {path.stat().st_size} bytes; expected {_FILE} at most.")
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (ValueError, RecursionError):
-        raise InputError(f'{path}: expected JSON such as {{"reward": {{"near": "-dist(tool_0, ring_0)"}}}}.') from None
+    content = read_json(path, 'JSON such as {"reward": {"near": "-dist(tool_0, ring_0)"}}', most=_FILE)
     if not isinstance(content, dict) or "reward" not in content or content.keys() - {"reward", "success"}:
         raise InputError(f'{path}: expected an object with "reward" and, if wanted, "success", and nothing else.')
     return reward(content["reward"], content.get("success"), str(path))

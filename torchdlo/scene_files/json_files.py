@@ -19,6 +19,8 @@ from torchdlo.files import write_atomically
 from torchdlo.physics.effects import EFFECTS as PHYSICS
 from torchdlo.scene_files.older import OLDER, upgraded
 from torchdlo.scene_files.schema import SceneDescription
+from torchdlo.untrusted import parse_json, read_text
+from torchdlo.untrusted.json_file import MOST
 
 __all__ = ["EFFECTS", "FORMAT", "like", "parse", "plain", "read", "save", "text"]
 
@@ -53,24 +55,12 @@ def _default(one: dataclasses.Field) -> Any:
 
 def read(path: str | Path) -> SceneDescription:
     """Read a scene file."""
-    try:
-        content = Path(path).read_text(encoding="utf-8")
-    except (FileNotFoundError, IsADirectoryError):
-        raise InputError(f"{path}: expected a scene file, found none.") from None
-    except UnicodeDecodeError:
-        raise InputError(f"{path}: expected JSON, found something that is not text.") from None
-    return parse(content, where=str(path))
+    return parse(read_text(path, "a scene file", most=MOST), where=str(path))
 
 
 def parse(content: str, *, where: str = "scene") -> SceneDescription:
     """Read the text of a scene file; `where` is what errors call it."""
-    try:
-        found = json.loads(content)
-    except json.JSONDecodeError as error:
-        raise InputError(
-            f"{where}: line {error.lineno}, column {error.colno}: is not JSON ({error.msg}); is the file cut, or is a "
-            "comma missing or too many?"
-        ) from None
+    found = parse_json(content, where=where, what="a scene in JSON")
     if not isinstance(found, dict) or found.get("format") not in (FORMAT, OLDER):
         given = found.get("format") if isinstance(found, dict) else type(found).__name__
         hint = ""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,6 +15,7 @@ from torchdlo.errors import InputError
 from torchdlo.physics.rod.assembly import frame_curvature
 from torchdlo.physics.rod.topology import Topology
 from torchdlo.scene_files.schema import RopeSpec, SceneDescription
+from torchdlo.untrusted import read_json
 
 __all__ = ["Modelled", "cable", "with_models"]
 
@@ -105,7 +105,7 @@ def _read(path: Path) -> tuple[Any, dict[str, Any]]:
     from torchdlo.sysid.model import model_file
 
     model = model_file.load(path)
-    said = json.loads(path.read_text(encoding="utf-8"))
+    said = read_json(path, "a model file")
     if model.options["rest"] == "given" and said["rope"].get("rest_positions") is None:
         raise InputError(f"{path}: rope.rest_positions: is missing; expected the natural shape of the rope.")
     return model, said

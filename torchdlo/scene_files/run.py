@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import zipfile
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -15,9 +14,13 @@ from torchdlo import scene as scenes
 from torchdlo import scene_files
 from torchdlo.errors import InputError
 from torchdlo.files import replacing
+from torchdlo.scene_files import frames_checks
+from torchdlo.untrusted.array_file import ArrayFile
 
 __all__ = ["Frames", "appearance", "load_frames", "run", "save_frames"]
 
+MOST = 2 * 2**30
+"""Most that the frames of a run take [bytes]."""
 _OLDER = {"material_points": "matter", "constitutive_model": "law", "camera_direction": "look"}
 """What arrays were called in files of version 0.1."""
 
@@ -186,16 +189,16 @@ def load_frames(path: str | Path) -> Frames:
     """Read what `save_frames` wrote; `path` may be the folder of the run."""
     path = Path(path)
     file = path / "frames.npz" if path.is_dir() else path
-    if not file.is_file():
-        raise InputError(f"{file}: expected the frames of a run, found none; torchdlo simulate --out writes them.")
     names = [f.name for f in fields(Frames) if f.type == "np.ndarray"]
-    try:
-        with np.load(file, allow_pickle=False) as found:
-            stored = {name: _OLDER.get(name, name) for name in names}
-            stored = {name: name if name in found.files else older for name, older in stored.items()}
-            missing = [name for name in names if stored[name] not in found.files]
-            if missing:
-                raise InputError(f"{file}: lacks {', '.join(missing)}; simulate the scene again with this version.")
-            return Frames(**{name: found[stored[name]] for name in names})
-    except (ValueError, EOFError, OSError, zipfile.BadZipFile) as error:
-        raise InputError(f"{file}: expected the frames of a run; reading failed: {error}.") from None
+    cure = "torchdlo simulate --out writes them"
+    with ArrayFile(file, "the frames of a run", most=MOST, cure=cure) as found:
+        stored = {name: _OLDER.get(name, name) for name in names}
+        stored = {name: name if name in found.headers else older for name, older in stored.items()}
+        missing = [name for name in names if stored[name] not in found.headers]
+        if missing:
+            raise InputError(f"{file}: lacks {', '.join(missing)}; simulate the scene again with this version.")
+        frames_checks.check_headers(file, found.headers, stored)
+        found.check_size(stored.values())
+        arrays = {name: found[stored[name]] for name in names}
+    frames_checks.check_values(file, arrays)
+    return Frames(**arrays)

@@ -18,6 +18,7 @@ from torch import Tensor
 
 from torchdlo.errors import InputError
 from torchdlo.files import write_atomically
+from torchdlo.untrusted import read_json
 
 __all__ = ["NEAR", "Camera", "Lens", "back_project", "lens", "load_cameras", "looking_at", "project", "save_cameras"]
 
@@ -173,16 +174,11 @@ def load_cameras(path: str | Path) -> tuple[Camera, ...]:
         InputError: It is missing, or not as it should be.
     """
     path = Path(path)
-    if not path.is_file():
-        raise InputError(
-            f"{path}: expected the file of the cameras that filmed, found none; torchdlo calibrate-camera writes one."
-        )
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError) as error:
-        raise InputError(f"{path}: expected valid JSON, but reading failed: {error}.") from None
+    content = read_json(
+        path, "the file of the cameras that filmed", cure="torchdlo calibrate-camera writes one", most=2**20
+    )
     entries = content.get("cameras") if isinstance(content, dict) else None
-    if not isinstance(entries, list) or not entries:
+    if not isinstance(entries, list) or not 0 < len(entries) <= 100:
         raise InputError(f'{path}: expected {{"cameras": [...]}} with at least one camera, found something else.')
     cameras = tuple(_camera(path, k, entry) for k, entry in enumerate(entries))
     names = [c.name for c in cameras]

@@ -9,7 +9,7 @@ from __future__ import annotations
 import colorsys
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,8 @@ import numpy as np
 
 from torchdlo.errors import InputError
 from torchdlo.files import write_atomically
+from torchdlo.untrusted import one_line, read_json
+from torchdlo.untrusted.array_file import Header, read_arrays
 from torchdlo.vision.video_file import read_video
 
 __all__ = [
@@ -123,14 +125,11 @@ def save_ranges(ranges: Ranges, path: Path) -> None:
 
 def load_ranges(path: str | Path) -> Ranges:
     """Read what `save_ranges` wrote."""
-    path = Path(path)
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError) as error:
-        raise InputError(f"{path}: expected ranges of colour in JSON, but reading failed: {error}.") from None
-    return ranges_from(content, str(path))
+    return ranges_from(read_json(path, "ranges of colour", most=2**20), str(path))
 
 
+_MASKS = 2 * 2**30
+"""Most that the masks of a film take [bytes]."""
 _LIMITS = {"hue": 360.0, "saturation": 1.0, "value": 1.0}
 
 
@@ -185,19 +184,15 @@ def _maybe_masks(pictures: np.ndarray) -> np.ndarray:
 
 
 def _from_archive(path: Path) -> np.ndarray:
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            if "masks" not in archive.files:
-                raise InputError(f"{path}: masks: expected this array, found {', '.join(archive.files) or 'none'}.")
-            masks = archive["masks"]
-    except InputError:
-        raise
-    except Exception as error:  # a damaged archive can raise nearly anything
-        raise InputError(f"{path}: expected an .npz archive with masks, but reading failed ({error}).") from None
-    if masks.ndim != 3 or masks.dtype.kind not in "bui":
-        raise InputError(
-            f"{path}: masks: expected bool of shape (frames, height, width), found {masks.dtype}, {masks.shape}."
-        )
+    def check(headers: Mapping[str, Header]) -> None:
+        if "masks" not in headers:
+            found = one_line(", ".join(headers)) or "none"
+            raise InputError(f"{path}: masks: expected this array, found {found}.")
+        shape, dtype = headers["masks"].shape, headers["masks"].dtype
+        if len(shape) != 3 or dtype.kind not in "bui":
+            raise InputError(f"{path}: masks: expected bool of shape (frames, height, width), found {dtype}, {shape}.")
+
+    masks = read_arrays(path, "masks", names=("masks",), check=check, most=_MASKS)["masks"]
     return masks > (0 if masks.dtype == bool or masks.max(initial=0) <= 1 else 127)
 
 

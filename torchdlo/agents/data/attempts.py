@@ -19,6 +19,7 @@ from torchdlo.agents.data.record import Recording
 from torchdlo.agents.data.schema import Schema
 from torchdlo.agents.data.statistics import histogram
 from torchdlo.errors import InputError
+from torchdlo.untrusted import MissingFile, read_entry
 
 __all__ = ["Attempt", "keep", "load", "packed", "sweep"]
 
@@ -102,8 +103,8 @@ def load(folder: Path) -> Attempt | None:
     """Return the attempt in a folder, or None if there is none."""
     file = folder / RECORD
     try:
-        return Attempt(folder, json.loads(file.read_text(encoding="utf-8")))
-    except FileNotFoundError:
+        return Attempt(folder, read_entry(file, "the record of an attempt").object())
+    except MissingFile:
         return None
-    except (OSError, ValueError) as error:
-        raise InputError(f"{file}: it is damaged ({error}); remove {folder} and --resume.") from None
+    except InputError as error:
+        raise InputError(f"{error} Remove {folder} and --resume.") from None

@@ -6,7 +6,6 @@ or the arm's reach took off is then made up for, and whoever learns from it lear
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,9 +14,11 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
+from torchdlo.agents.trajopt.result import read_trajectory
 from torchdlo.envs import Task
 from torchdlo.envs.core import episode
 from torchdlo.errors import InputError
+from torchdlo.untrusted import one_line
 
 __all__ = ["Demonstrator", "FollowPath", "demonstrator", "scripted", "stored"]
 
@@ -126,11 +127,9 @@ def scripted(task: Task) -> FollowPath:
 
 def stored(task: Task, path: Path) -> FollowPath:
     """Return who follows a trajectory that `torchdlo optimize` found."""
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-        name, places = content["task"], torch.tensor(content["tool"], dtype=torch.float64)
-    except (OSError, ValueError, KeyError, TypeError):
-        raise InputError(f"{path}: expected a trajectory of torchdlo optimize, found something else.") from None
+    content = read_trajectory(path)
+    name = one_line(content["task"].text(), 60)
+    places = torch.tensor(content["tool"].numbers(None, None, 3, most=1e6), dtype=torch.float64)
     if name != task.name or places.dim() != 3 or places.shape[1:] != (task.arms.count, 3):
         raise InputError(
             f"{path}: it is a trajectory of {name} with places {tuple(places.shape)}; expected one of {task.name} with "
@@ -167,10 +166,10 @@ def _best(task: Task, folder: Path) -> Path:
     found = []
     for file in sorted(folder.glob("*/trajectory.json")):
         try:
-            content = json.loads(file.read_text(encoding="utf-8"))
-            if content["task"] == task.name and content["success"]:
-                found.append((float(content["return"]), file))
-        except (OSError, ValueError, KeyError, TypeError):
+            content = read_trajectory(file)
+            if content["task"].text() == task.name and content["success"].flag():
+                found.append((content["return"].number(), file))
+        except InputError:
             continue
     if not found:
         raise InputError(f"{folder}: holds no trajectory of {task.name} that succeeded; give another --actor.")

@@ -30,6 +30,7 @@ from torchdlo.envs import find
 from torchdlo.envs.core import episode
 from torchdlo.errors import InputError
 from torchdlo.files import write_atomically
+from torchdlo.untrusted import read_json
 
 __all__ = ["UNFINISHED", "DatasetPlan", "make", "report_of"]
 
@@ -143,7 +144,7 @@ def make(
         video.library()
     if resume and (out / "meta/info.json").is_file() and not (out / UNFINISHED / PLAN).exists():
         shutil.rmtree(out / UNFINISHED, ignore_errors=True)
-        return report_of(json.loads((out / build.PROVENANCE).read_text(encoding="utf-8")))
+        return report_of(read_json(out / build.PROVENANCE, "what is known of a finished data set"))
     with _begun(plan, out, resume) as folder:
         done = {task: _gather(plan, task, folder, painter, executor or Serial(), callback) for task in plan.tasks}
         return _finish(plan, out, done, callback)

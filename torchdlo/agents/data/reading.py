@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,6 +16,7 @@ from torchdlo.agents.data import parquet, video
 from torchdlo.agents.data.build import PROVENANCE
 from torchdlo.agents.data.schema import FORMAT, data_path, video_path
 from torchdlo.errors import InputError
+from torchdlo.untrusted import read_json
 
 __all__ = ["DataSet", "FrameData", "open_set", "to_tensordict"]
 
@@ -84,12 +84,7 @@ class DataSet:
 
 def json_file(file: Path) -> dict[str, Any]:
     """Return the object in a JSON file."""
-    try:
-        content = json.loads(file.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise InputError(f"{file}: the file is missing; is {file.parent.parent} a LeRobot data set?") from None
-    except (OSError, ValueError) as error:
-        raise InputError(f"{file}: it is damaged ({error}).") from None
+    content = read_json(file, "a file of a LeRobot data set", cure=f"is {file.parent.parent} a data set?", finite=False)
     if not isinstance(content, dict):
         raise InputError(f"{file}: expected an object, found {type(content).__name__}.")
     return content

@@ -26,6 +26,7 @@ from typing import Any
 from torchdlo.agents.distributed import executors
 from torchdlo.errors import InputError
 from torchdlo.files import write_atomically
+from torchdlo.untrusted import read_json
 
 __all__ = ["KINDS", "Job", "Sweep", "run"]
 
@@ -203,7 +204,7 @@ def _report(out: Path, jobs: Sequence[Job]) -> dict[str, Any]:
         for folder in (DONE, FAILED):
             file = out / folder / f"{job.name}.json"
             if file.is_file():
-                note = json.loads(file.read_text(encoding="utf-8"))
+                note = read_json(file, "the note of a job", finite=False)
                 found[job.name] = {"done": folder == DONE, "seconds": note["seconds"], "message": note["message"]}
                 break
     return found

@@ -9,8 +9,6 @@ world: what one action did not reach the next one still leads to, so mistakes do
 from __future__ import annotations
 
 import itertools
-import pickle
-import zipfile
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -22,6 +20,7 @@ from torch.nn import functional as F
 from torchdlo.agents.policies.language import WIDTH
 from torchdlo.errors import InputError
 from torchdlo.files import replacing
+from torchdlo.untrusted.tensor_file import check_shapes, read_tensors
 
 __all__ = ["ChunkPolicy", "Shape", "load_policy", "save_policy"]
 
@@ -135,18 +134,20 @@ def save_policy(path: Path, policy: ChunkPolicy, about: dict[str, Any]) -> None:
 
 def load_policy(path: Path) -> tuple[ChunkPolicy, dict[str, Any]]:
     """Return a policy and what is known of it; files cannot run code."""
+    what = "a policy of torchdlo learn"
+    content = read_tensors(path, what)
     try:
-        # Only archives are of use, and what else there is would go through the reader of old files.
-        if path.is_file() and not zipfile.is_zipfile(path):
-            raise ValueError
-        content = torch.load(path, map_location="cpu", weights_only=True)
         if content["generator"] != GENERATOR:
             raise ValueError
-        shape = {k: tuple(v) if isinstance(v, list) else v for k, v in content["shape"].items()}
-        policy = ChunkPolicy(Shape(**shape))
+        shape = Shape(**{k: tuple(v) if isinstance(v, list) else v for k, v in content["shape"].items()})
+        if max(shape.arms, len(shape.cameras), shape.layers, len(shape.channels)) > 100:
+            raise ValueError
+        with torch.device("meta"):  # what the file says of itself may be of any size
+            check_shapes(ChunkPolicy(shape), content["weights"], str(path), what)
+        policy = ChunkPolicy(shape)
         policy.load_state_dict(content["weights"])
-    except FileNotFoundError:
-        raise InputError(f"{path}: there is no such file; expected a policy of torchdlo learn.") from None
-    except (OSError, RuntimeError, ValueError, KeyError, TypeError, EOFError, pickle.UnpicklingError):
-        raise InputError(f"{path}: expected a policy of torchdlo learn, found something else.") from None
+    except InputError:
+        raise
+    except (RuntimeError, ValueError, KeyError, TypeError, AttributeError, IndexError, ArithmeticError):
+        raise InputError(f"{path}: expected {what}, found something else.") from None
     return policy.eval(), content["about"]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +11,7 @@ import torch
 from torchdlo.agents.policies.policy import Policy, PolicySpec
 from torchdlo.errors import InputError
 from torchdlo.files import write_atomically
+from torchdlo.untrusted.tensor_file import check_shapes, read_tensors
 
 __all__ = ["load", "module", "save"]
 
@@ -34,24 +34,22 @@ def save(policy: Policy, path: Path, notes: dict[str, Any] | None = None) -> Non
 def load(path: Path | str, notes: bool = False) -> Any:
     """Return the policy of a file, or (policy, plain data about it)."""
     path = Path(path)
-    wrong = InputError(f"{path}: expected a policy of torchdlo train, found something else.")
+    what = "a policy of torchdlo train"
+    wrong = InputError(f"{path}: expected {what}, found something else.")
     if path.is_dir():
         path = path / "policy.pt"
+    content = read_tensors(path, what)
     try:
-        content = torch.load(path, weights_only=True)
         if content["generator"] != _GENERATOR:
             raise wrong
-        policy = Policy(PolicySpec.of(content["spec"]))
+        spec = PolicySpec.of(content["spec"])
+        with torch.device("meta"):  # what the file says of itself may be of any size
+            check_shapes(Policy(spec), content["state"], str(path), what)
+        policy = Policy(spec)
         policy.load_state_dict(content["state"])
-    except FileNotFoundError:
-        raise InputError(f"{path}: there is no such file; expected a policy of torchdlo train.") from None
-    except (OSError, KeyError, TypeError, ValueError, RuntimeError, EOFError, zipfile.BadZipFile) as error:
-        if isinstance(error, InputError):
-            raise
-        raise wrong from None
-    except Exception as error:  # what torch's reader of plain data refuses, it names by an error of its own
-        if type(error).__name__ != "UnpicklingError":
-            raise
+    except InputError:
+        raise
+    except (KeyError, TypeError, ValueError, RuntimeError, AttributeError, IndexError):
         raise wrong from None
     policy.eval()
     return (policy, content["notes"]) if notes else policy

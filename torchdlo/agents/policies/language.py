@@ -10,7 +10,6 @@ import functools
 import hashlib
 import importlib.util
 import itertools
-import json
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -20,6 +19,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from torchdlo.errors import InputError
+from torchdlo.untrusted import read_entry
 
 __all__ = ["ENCODERS", "WIDTH", "default_encoder", "encode"]
 
@@ -89,7 +89,7 @@ def _model(folder: Path) -> tuple[object, dict[str, Tensor], int]:
 
     tokenizer = Tokenizer.from_file(str(folder / "tokenizer.json"))
     tokenizer.no_padding()
-    heads = json.loads((folder / "config.json").read_text(encoding="utf-8"))["num_attention_heads"]
+    heads = read_entry(folder / "config.json", "the settings of a language model")["num_attention_heads"].whole(1, 1000)
     return tokenizer, load_file(folder / "model.safetensors"), heads
 
 

@@ -21,6 +21,7 @@ from torchdlo.agents.policies.chunk_policy import ChunkPolicy, Shape, save_polic
 from torchdlo.agents.trajopt.search_journal import versions
 from torchdlo.errors import InputError
 from torchdlo.files import replacing
+from torchdlo.untrusted.tensor_file import read_tensors
 
 __all__ = ["Training", "learn"]
 
@@ -242,10 +243,7 @@ class _Run:
 
     def load(self, path: Path) -> None:
         """Go on from a checkpoint."""
-        try:
-            content = torch.load(path, weights_only=True)
-        except (OSError, RuntimeError, ValueError, EOFError):
-            raise InputError(f"{path}: the checkpoint is damaged; leave out --resume.") from None
+        content = read_tensors(path, "a checkpoint of torchdlo learn", cure="leave out --resume")
         if content["same"] != self._same():
             raise InputError(f"{path}: it is of another data set or training; give the same, or leave out --resume.")
         self.epoch, self.curve = content["epoch"], content["curve"]

@@ -20,9 +20,11 @@ import torch
 from torch import Tensor
 
 from torchdlo.agents.rl.episodes import TaskEpisodes
+from torchdlo.agents.trajopt.result import read_trajectory
 from torchdlo.envs import Task
 from torchdlo.errors import InputError
 from torchdlo.files import write_atomically
+from torchdlo.untrusted import one_line, read_entry, read_json
 
 __all__ = ["Expert", "Score", "candidates", "follow", "improve", "load_expert", "save_expert"]
 
@@ -84,15 +86,15 @@ def save_expert(expert: Expert, path: Path, task: Task, notes: dict[str, Any]) -
 
 def load_expert(path: Path, task: Task) -> Expert:
     """Return the expert of a file that `save_expert` wrote."""
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-        found = Expert(torch.tensor(content["path"]), torch.tensor(content["gain"]), content["source"])
-        fits = content["task"] == task.name and found.path.shape == (task.horizon, task.arms.count, 3)
-    except (OSError, ValueError, KeyError, TypeError):
-        raise InputError(f"{path}: expected an expert of torchdlo train, found something else.") from None
-    if not fits:
-        raise InputError(f"{path}: expected an expert for {task.name}, found one for {content['task']}.")
-    return found
+    content = read_entry(path, "an expert of torchdlo train")
+    if content["task"].text() != task.name:
+        raise InputError(
+            f"{path}: expected an expert for {task.name}, found one for {one_line(content['task'].value)}."
+        )
+    shape = (task.horizon, task.arms.count, 3)
+    places = torch.tensor(content["path"].numbers(*shape, most=1e6))
+    gain = torch.tensor(content["gain"].numbers(*shape, len(task.reset_noise), 2, most=1e6))
+    return Expert(places, gain, content["source"].text())
 
 
 def candidates(task: Task, trajectories: list[Path]) -> list[Expert]:
@@ -104,12 +106,9 @@ def candidates(task: Task, trajectories: list[Path]) -> list[Expert]:
     for axis in range(2):
         along[:, :, axis, 0, axis] = 1.0
     for file in trajectories:
-        try:
-            content = json.loads(file.read_text(encoding="utf-8"))
-            path = torch.tensor(content["tool"], dtype=torch.float32)
-            good = content["success"] and content["task"] == task.name and path.shape == shape[:3]
-        except (OSError, ValueError, KeyError, TypeError):
-            raise InputError(f"{file}: expected a trajectory of torchdlo optimize, found something else.") from None
+        content = read_trajectory(file)
+        path = torch.tensor(content["tool"].numbers(None, None, 3, most=1e6), dtype=torch.float32)
+        good = content["success"].flag() and content["task"].value == task.name and path.shape == shape[:3]
         if good:
             found.append(Expert(path, still, f"{file.parent.name}, same places"))
             found.append(Expert(path, along, f"{file.parent.name}, moved along"))
@@ -123,8 +122,8 @@ class _Journal:
         self.path, self.choices, self.rows = path, choices, []
         self.ahead: list[list[list[float]]] = []
         if path is not None and path.is_file():
-            found = json.loads(path.read_text(encoding="utf-8"))
-            if found["choices"] == choices:
+            found = read_json(path, "the scores of experts", finite=False, cure="remove it")
+            if isinstance(found, dict) and found.get("choices") == choices:
                 self.ahead = found["rows"]
 
     def recall(self) -> list[Score] | None:

@@ -32,6 +32,8 @@ from torchdlo.agents.rl.settings import Settings
 from torchdlo.envs import PUBLISHED, Task, simulated
 from torchdlo.errors import InputError
 from torchdlo.files import write_atomically
+from torchdlo.untrusted import MissingFile, read_json
+from torchdlo.untrusted.tensor_file import read_tensors
 
 __all__ = ["STAGES", "Hybrid", "hybrid", "task_policy"]
 
@@ -130,8 +132,8 @@ def hybrid(
 
 def _notes(folder: Path) -> dict[str, Any]:
     try:
-        return json.loads((folder / "stages.json").read_text(encoding="utf-8"))
-    except OSError:
+        return read_json(folder / "stages.json", "the notes of a training", finite=False)
+    except MissingFile:
         return {}
 
 
@@ -249,7 +251,7 @@ class _Keeper:
         """Go back to what was written down, if anything was; return the log."""
         if not self.path.is_file():
             return []
-        content = torch.load(self.path, weights_only=True)
+        content = read_tensors(self.path, "a checkpoint of torchdlo train", cure="leave out --resume")
         for name, part in self.parts.items():
             part.load_state_dict(content["parts"][name])
         torch.set_rng_state(content["random"][0])

@@ -24,6 +24,7 @@ from torchdlo.agents.rl.rollout import Batch
 from torchdlo.agents.rl.settings import Settings
 from torchdlo.errors import InputError
 from torchdlo.files import write_atomically
+from torchdlo.untrusted.tensor_file import read_tensors
 
 __all__ = ["Trained", "Trainer", "train"]
 
@@ -195,7 +196,7 @@ def _restore(trainer: Trainer, episodes: Episodes, settings: Settings, done: Tra
     path = None if folder is None else folder / _CHECKPOINT
     if path is None or not path.is_file():
         raise InputError(f"{path}: expected the checkpoint of a run to resume, found none; leave out --resume.")
-    content = torch.load(path, weights_only=True)
+    content = read_tensors(path, "a checkpoint of torchdlo train", cure="leave out --resume")
     was, now = json.loads(content["settings"]), json.loads(json.dumps(asdict(settings)))
     free = ("episodes", "minutes", "interval")  # how long to go on may change
     other = [f"{k} {was.get(k)} (now {now[k]})" for k in now if k not in free and was.get(k) != now[k]]

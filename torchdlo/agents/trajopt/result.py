@@ -15,8 +15,9 @@ from torchdlo.agents.trajopt.problem import Evaluation, Problem
 from torchdlo.agents.trajopt.search import SearchResult, SearchSettings
 from torchdlo.agents.trajopt.search_journal import program, versions
 from torchdlo.errors import InputError
+from torchdlo.untrusted import Entry, one_line, read_entry
 
-__all__ = ["load_actions", "plain", "result_json", "summary", "trajectory_json", "upgraded"]
+__all__ = ["load_actions", "plain", "read_trajectory", "result_json", "summary", "trajectory_json", "upgraded"]
 
 _OLDER = {
     "searched": "search_return",
@@ -27,6 +28,8 @@ _OLDER = {
 """Entries of results and trajectories of version 0.1."""
 _OLDER_CURVE = {"rehearsed": "surrogate", "without_slope": "without_gradient"}
 """Entries of their learning curves."""
+_LARGEST = 1e6
+"""Largest action of a trajectory [m, degrees]."""
 _SETTINGS = {"rehearsed": "surrogate_share"}
 """Entries of their settings."""
 
@@ -103,16 +106,21 @@ def trajectory_json(found: SearchResult, problem: Problem) -> str:
     return json.dumps(content, allow_nan=False) + "\n"
 
 
+def read_trajectory(path: Path) -> Entry:
+    """Return what a trajectory file says; its entries are checked where they are asked for."""
+    found = read_entry(path, "a trajectory of torchdlo optimize")
+    found["task"].text(most=1000)
+    return found
+
+
 def load_actions(path: Path, problem: Problem) -> Tensor:
     """Return the actions of a trajectory file, shape (T, A); they fit the problem."""
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-        task, actions = content["task"], torch.tensor(content["actions"], dtype=torch.float64)
-    except (OSError, ValueError, KeyError, TypeError):
-        raise InputError(f"{path}: expected a trajectory of torchdlo optimize, found something else.") from None
+    content = read_trajectory(path)
+    task = content["task"].text()
+    actions = torch.tensor(content["actions"].numbers(None, None, most=_LARGEST), dtype=torch.float64)
     if task != problem.name or actions.shape != (problem.horizon, problem.width):
         raise InputError(
             f"{path}: expected {problem.horizon} actions of {problem.width} numbers for {problem.name}, found "
-            f"{tuple(actions.shape)} for {task}; give the trajectory of this task."
+            f"{tuple(actions.shape)} for {one_line(task, 60)}; give the trajectory of this task."
         )
     return actions

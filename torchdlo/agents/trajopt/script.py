@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchdlo.agents.trajopt.result import load_actions
+from torchdlo.agents.trajopt.result import load_actions, read_trajectory
 from torchdlo.agents.trajopt.task_problem import problem
 from torchdlo.envs import RopeMaterial, Task, find
 from torchdlo.envs.core import episode
@@ -78,12 +77,12 @@ def script(
 
 def _choices(path: Path) -> dict[str, Any]:
     """Return how a trajectory was found."""
-    try:
-        choices = json.loads(path.read_text(encoding="utf-8"))["choices"]
-        steps = {"compiled": bool(choices["compiled"]), "recorded": bool(choices.get("recorded"))}
-        grasps = choices.get("grasps")
-        if grasps is not None:
-            steps["grasps"] = tuple(grasps)
-        return {"double": bool(choices["double"]), **steps, "rope": choices.get("rope")}
-    except (OSError, ValueError, KeyError, TypeError):
-        raise InputError(f"{path}: expected a trajectory of torchdlo optimize, found something else.") from None
+    choices = read_trajectory(path)["choices"]
+    steps: dict[str, Any] = {
+        "compiled": choices["compiled"].flag(),
+        "recorded": choices.get("recorded", False).flag(),
+    }
+    if "grasps" in choices:
+        hands = choices["grasps"].items(100)
+        steps["grasps"] = tuple(None if hand.value is None else hand.whole(0, 10**6) for hand in hands)
+    return {"double": choices["double"].flag(), **steps, "rope": choices.get("rope").value}

@@ -8,7 +8,6 @@ arrays, which are entries of their own: "NAME/actions", "NAME/joints", "NAME/too
 from __future__ import annotations
 
 import json
-import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -18,6 +17,8 @@ import numpy as np
 from torchdlo.agents.trajopt.result import upgraded
 from torchdlo.errors import InputError
 from torchdlo.files import replacing
+from torchdlo.untrusted import parse_json, read_json
+from torchdlo.untrusted.array_file import ArrayFile
 
 __all__ = ["ARCHIVE", "NAME", "load_trajectory", "pack", "read_index", "read_searches", "unpack"]
 
@@ -41,25 +42,25 @@ def load_trajectory(task: str, method: str, seed: int, archive: str | Path = ARC
         steps with which it was found), and the rest of the file.
     """
     name = f"{task}-{method}-{seed}"
-    with _opened(archive) as found:
+    with _Archive(archive) as found:
         if f"{name}/trajectory" not in found.files:
-            known = ", ".join(entry["name"] for entry in json.loads(str(found["index"])))
+            known = ", ".join(entry["name"] for entry in found.index())
             raise InputError(f"{archive}: expected a search of {known}; asked for {name}.")
         return _trajectory(found, name)
 
 
 def read_index(archive: str | Path = ARCHIVE) -> list[dict[str, Any]]:
     """Return what is in an archive: name, task, method, seed, budget, version, return and success of each search."""
-    with _opened(archive) as found:
-        return json.loads(str(found["index"]))
+    with _Archive(archive) as found:
+        return found.index()
 
 
 def read_searches(archive: str | Path) -> Iterator[tuple[str, dict[str, Any], dict[str, Any]]]:
     """Yield the name, the result and the trajectory of each search in an archive."""
-    with _opened(archive) as found:
-        for entry in json.loads(str(found["index"])):
+    with _Archive(archive) as found:
+        for entry in found.index():
             name = entry["name"]
-            yield name, upgraded(json.loads(str(found[f"{name}/result"]))), _trajectory(found, name)
+            yield name, upgraded(found.json(f"{name}/result")), _trajectory(found, name)
 
 
 def pack(folder: str | Path, archive: str | Path) -> int:
@@ -67,9 +68,9 @@ def pack(folder: str | Path, archive: str | Path) -> int:
     arrays: dict[str, np.ndarray] = {}
     index = []
     for file in sorted(Path(folder).glob("*/result.json")):
-        name, result = file.parent.name, upgraded(json.loads(file.read_text(encoding="utf-8")))
+        name, result = file.parent.name, upgraded(read_json(file, "the result of a search", finite=False))
         settings, text = result["settings"], {}
-        for key, value in upgraded(json.loads(file.with_name("trajectory.json").read_text(encoding="utf-8"))).items():
+        for key, value in upgraded(read_json(file.with_name("trajectory.json"), "a trajectory", finite=False)).items():
             if isinstance(value, list):
                 arrays[f"{name}/{key}"] = _exact(value)
             else:
@@ -105,8 +106,8 @@ def _exact(value: list[Any]) -> np.ndarray:
     return narrow if np.array_equal(narrow.astype(np.float64), wide, equal_nan=True) else wide
 
 
-def _trajectory(found: Any, name: str) -> dict[str, Any]:
-    content = json.loads(str(found[f"{name}/trajectory"]))
+def _trajectory(found: _Archive, name: str) -> dict[str, Any]:
+    content = found.json(f"{name}/trajectory")
     own = [
         key for key in found.files if key.startswith(f"{name}/") and key.split("/")[1] not in ("result", "trajectory")
     ]
@@ -116,8 +117,9 @@ def _trajectory(found: Any, name: str) -> dict[str, Any]:
 class _Archive:
     """An opened archive, whose texts are text."""
 
-    def __init__(self, inner: Any) -> None:
-        self.inner, self.files = inner, inner.files
+    def __init__(self, path: str | Path) -> None:
+        self.inner = ArrayFile(path, "an archive of searches")
+        self.files = self.inner.files
 
     def __enter__(self) -> _Archive:
         return self
@@ -127,13 +129,17 @@ class _Archive:
 
     def __getitem__(self, key: str) -> Any:
         value = self.inner[key]
-        return value.tobytes().decode() if value.dtype == np.uint8 else value
+        return value.tobytes().decode(errors="replace") if value.dtype == np.uint8 else value
 
+    def json(self, key: str) -> Any:
+        """Return the value of a text of JSON."""
+        return parse_json(str(self[key]), where=f"{self.inner.where}: {key}", finite=False)
 
-def _opened(archive: str | Path) -> _Archive:
-    try:
-        return _Archive(np.load(archive, allow_pickle=False))
-    except FileNotFoundError:
-        raise InputError(f"{archive}: expected an archive of searches, found none.") from None
-    except (ValueError, OSError, EOFError, zipfile.BadZipFile) as error:
-        raise InputError(f"{archive}: expected an archive of searches, but reading failed: {error}.") from None
+    def index(self) -> list[dict[str, Any]]:
+        """Return what there is, an entry for each search."""
+        found = self.json("index")
+        if not isinstance(found, list) or not all(
+            isinstance(e, dict) and isinstance(e.get("name"), str) for e in found
+        ):
+            raise InputError(f"{self.inner.where}: index: expected a list of searches, found something else.")
+        return found

@@ -17,6 +17,7 @@ from typing import Any, Protocol, TypeVar
 
 from torchdlo.errors import InputError
 from torchdlo.files import write_atomically
+from torchdlo.untrusted import read_json
 
 __all__ = ["Budget", "Conversation", "Model", "Picture", "Question", "Reply", "plain_text"]
 
@@ -200,7 +201,7 @@ class Conversation:
         if not self.resume or file is None or not file.is_file():
             return None
         try:
-            found = json.loads(file.read_text(encoding="utf-8"))
+            found = read_json(file, "an exchange", finite=False)
             fits = found["request_sha256"] == digest and isinstance(found["response"], str)
             return found if fits and isinstance(found["tokens"], int) else None
         except (OSError, ValueError, KeyError, TypeError):

@@ -38,6 +38,7 @@ from torchdlo.errors import InputError
 from torchdlo.files import write_atomically
 from torchdlo.reward_language import Reward, reward
 from torchdlo.scene import State
+from torchdlo.untrusted import read_entry
 
 __all__ = ["Carried", "Look", "Options", "Result", "carry_out"]
 
@@ -237,11 +238,11 @@ class _Run:
         if file is None or not self.talk.resume or not file.is_file():
             return None
         try:
-            content = json.loads(file.read_text(encoding="utf-8"))
-            actions = torch.tensor(content["actions"], dtype=torch.float64)
-            fits = content["key"] == self.key(part) and actions.shape == (part.horizon, 3 * part.arms.count)
-            return (actions, int(content["episodes"])) if fits else None
-        except (OSError, ValueError, KeyError, TypeError):
+            content = read_entry(file, "a step that was carried out")
+            numbers = content["actions"].numbers(part.horizon, 3 * part.arms.count, most=1e6)
+            fits = content["key"].value == self.key(part)
+            return (torch.tensor(numbers, dtype=torch.float64), content["episodes"].whole(0)) if fits else None
+        except InputError:
             return None
 
 

@@ -19,6 +19,7 @@ from torchdlo.envs.core import scene_names
 from torchdlo.envs.core.episode import reachable
 from torchdlo.errors import InputError
 from torchdlo.scene import Scene, State
+from torchdlo.untrusted import read_json
 
 __all__ = [
     "Places",
@@ -125,10 +126,8 @@ class Proposal:
 
 def load_grasps(path: Path, task: str) -> tuple[int | None, ...]:
     """Return the grasps of a proposal's file for a task."""
+    content = read_json(path, "grasps of torchdlo propose", most=100_000)
     try:
-        if path.stat().st_size > 100_000:
-            raise ValueError
-        content = json.loads(path.read_text(encoding="utf-8"))
         grasps, other = content["grasps"], content.get("task", task)
         if not isinstance(grasps, list) or not all(g is None or type(g) is int for g in grasps):
             raise ValueError

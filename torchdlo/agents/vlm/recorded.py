@@ -9,6 +9,7 @@ from typing import Any
 
 from torchdlo.agents.vlm.conversation import Question, Reply, plain_text
 from torchdlo.errors import InputError
+from torchdlo.untrusted import read_json
 
 __all__ = ["Recorded", "load_recorded"]
 
@@ -82,7 +83,9 @@ def load_recorded(path: Path) -> Recorded:
         ]
         if not answers or not isinstance(source, str):
             raise ValueError
-    except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
+    except InputError:
+        raise
+    except (ValueError, KeyError, TypeError, AttributeError, OverflowError):
         raise InputError(
             f'{path}: expected a conversation, {{"source": "...", "exchanges": '
             '[{"kind": "plan", "response": "..."}]}, or the folder of a run.'
@@ -92,6 +95,4 @@ def load_recorded(path: Path) -> Recorded:
 
 
 def _read(file: Path) -> Any:
-    if file.stat().st_size > _SIZE:
-        raise ValueError
-    return json.loads(file.read_text(encoding="utf-8"))
+    return read_json(file, "a conversation", most=_SIZE)

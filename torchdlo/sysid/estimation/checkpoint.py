@@ -13,6 +13,7 @@ from torchdlo.errors import InputError
 from torchdlo.files import write_atomically
 from torchdlo.sysid.estimation.result_cache import digest
 from torchdlo.sysid.recordings.recording import Recording
+from torchdlo.untrusted import read_entry
 
 
 class Checkpoint:
@@ -26,18 +27,18 @@ class Checkpoint:
             return
         if path is None or not path.exists():
             raise InputError(f"{path}: there is no checkpoint to resume from; run without --resume first.")
-        try:
-            found = json.loads(path.read_text())
-            same = found["key"] == self.content["key"]
-        except (ValueError, KeyError, TypeError):
+        found = read_entry(path, "a checkpoint of torchdlo calibrate")
+        if found.object().keys() != self.content.keys():
             raise InputError(
                 f"{path}: expected a checkpoint of torchdlo calibrate, found something else; run without --resume."
-            ) from None
-        if not same:
+            )
+        for name in found["best"].object():
+            found["best"][name].numbers(None)
+        if found["key"].text() != self.content["key"]:
             raise InputError(
                 f"{path}: the checkpoint belongs to another recording or other options; run without --resume."
             )
-        self.content = found
+        self.content = found.object()
 
     def recall(self, rest: str) -> list[float] | None:
         """Return the numbers kept for a variant."""

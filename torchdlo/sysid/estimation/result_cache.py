@@ -21,7 +21,8 @@ import numpy as np
 from torchdlo.errors import InputError
 from torchdlo.files import replacing, write_atomically
 from torchdlo.sysid.recordings.recording import Recording
-from torchdlo.sysid.recordings.rope_schema import read_arrays
+from torchdlo.untrusted import parse_json
+from torchdlo.untrusted.array_file import read_arrays
 
 __all__ = ["ResultCache", "digest"]
 
@@ -121,8 +122,8 @@ class ResultCache:
         if not file.exists():
             return None
         try:
-            arrays = read_arrays(file)
-            return _decode(json.loads(str(arrays["plain"])), arrays)
+            arrays = read_arrays(file, "a result")
+            return _decode(parse_json(str(arrays["plain"]), where=str(file), finite=False), arrays)
         except (InputError, ValueError, KeyError, TypeError, AttributeError, ImportError):
             # A damaged file costs the time of its job, no more.
             return None

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -21,6 +20,7 @@ from torchdlo.sysid.estimation.result_cache import digest
 from torchdlo.sysid.model import model_file
 from torchdlo.sysid.model.model_file import ModelFile
 from torchdlo.sysid.recordings.recording import Recording
+from torchdlo.untrusted import one_line, read_entry
 
 __all__ = ["check_names", "diagnosed", "fit_rivals"]
 
@@ -36,22 +36,19 @@ def diagnosed(folder: Path, recording: Recording) -> tuple[list[list[str]], Mode
         InputError: The folder is not one of a diagnosis, or one of another recording.
     """
     file = folder / "findings.json"
-    try:
-        found = json.loads(file.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise InputError(
-            f"{file}: expected the findings of torchdlo diagnose, found none; run it first, or give --effects."
-        ) from None
-    except (OSError, ValueError) as error:
-        raise InputError(f"{file}: expected findings in JSON, but reading failed: {error}.") from None
-    if not isinstance(found, dict) or found.get("generator") != "torchdlo diagnose":
+    found = read_entry(file, "the findings of torchdlo diagnose", cure="run it first, or give --effects")
+    if found.object().get("generator") != "torchdlo diagnose":
         raise InputError(f"{file}: expected the findings of torchdlo diagnose, found something else.")
-    if found.get("recording_sha256") not in _digests(recording):
+    if found.object().get("recording_sha256") not in _digests(recording):
+        other = one_line(found.object().get("recording"), 80)
         raise InputError(
-            f"{file}: expected the diagnosis of {recording.path}, found that of another recording "
-            f"({found.get('recording')}), or of an earlier content of it; run torchdlo diagnose again."
+            f"{file}: expected the diagnosis of {recording.path}, found that of another recording ({other}), or of an "
+            "earlier content of it; run torchdlo diagnose again."
         )
-    ties = [[e["name"], *e["indistinguishable_from"]] for e in found["effects"]]
+    ties = [
+        [e["name"].text(), *(name.text() for name in e["indistinguishable_from"].items())]
+        for e in found["effects"].items()
+    ]
     return ties, model_file.load(folder / "model.json")
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import difflib
-import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -20,6 +19,7 @@ from torchdlo.sysid.estimation.evaluation import rope
 from torchdlo.sysid.model.discretisation import make_mesh
 from torchdlo.sysid.model.rope_model import RopeModel
 from torchdlo.sysid.recordings.recording import Recording
+from torchdlo.untrusted import read_json
 
 __all__ = ["FORMAT", "VERSION", "ModelFile", "content", "load"]
 
@@ -157,12 +157,7 @@ def load(path: str | Path) -> ModelFile:
 def _read(path: Path) -> dict[str, Any]:
     if path.is_dir():
         raise InputError(f"{path}: expected a model file, found a folder; give the model.json in it.")
-    try:
-        found = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise InputError(f"{path}: expected a model file, found nothing there.") from None
-    except (OSError, ValueError, RecursionError) as error:
-        raise InputError(f"{path}: expected a model file in JSON, but reading failed: {error}.") from None
+    found = read_json(path, "a model file", cure="torchdlo calibrate and diagnose write one")
     if not isinstance(found, dict) or found.get("format") != FORMAT:
         hint = ""
         if isinstance(found, dict) and str(found.get("generator", "")).startswith("torchdlo"):

@@ -9,7 +9,9 @@ licence, so they are converted from the user's own checkout: `data_set/DLO1/trai
 from __future__ import annotations
 
 import ast
+import io
 import pickle
+import pickletools
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NoReturn
@@ -18,6 +20,7 @@ import numpy as np
 
 from torchdlo.errors import InputError
 from torchdlo.sysid.recordings.recording import Recording, Trial
+from torchdlo.untrusted import read_bytes
 
 __all__ = ["find_cables", "read_cable", "read_positions", "read_rest_shape", "suspect_frames"]
 
@@ -104,11 +107,10 @@ def read_cable(
 
 def read_positions(path: Path) -> np.ndarray:
     """Marker positions of one pickle of plain lists [m], shape (F, M, 3); code is never run."""
-    if path.stat().st_size > _LARGEST_FILE:
-        raise InputError(f"{path}: expected a pickle of at most 64 MiB, found a larger file.")
+    pickled = read_bytes(path, "a pickle of lists of numbers", most=_LARGEST_FILE)
     try:
-        with path.open("rb") as file:
-            content = _PlainUnpickler(file, path).load()
+        _check_memo(path, pickled)
+        content = _PlainUnpickler(io.BytesIO(pickled), path).load()
     except InputError:
         raise
     except _UNREADABLE as error:
@@ -116,7 +118,7 @@ def read_positions(path: Path) -> np.ndarray:
             f"{path}: expected a pickle of lists of numbers, found one that cannot be read "
             f"({error}); is the checkout complete?"
         ) from None
-    return _as_positions(path, content)
+    return _as_positions(path, content, len(pickled))
 
 
 def read_rest_shape(folder: Path, cable: str, n_markers: int) -> np.ndarray | None:
@@ -191,7 +193,40 @@ class _PlainUnpickler(pickle.Unpickler):
         )
 
 
-def _as_positions(path: Path, content: object) -> np.ndarray:
+def _check_memo(path: Path, pickled: bytes) -> None:
+    """Refuse places of remembered objects that are far beyond what there is: room would be made for them."""
+    if not any(op in pickled for op in (b"r", b"p")):  # LONG_BINPUT and PUT, which say a place
+        return
+    for op, arg, _ in pickletools.genops(pickled):
+        if op.name in ("LONG_BINPUT", "PUT") and int(arg) > len(pickled):
+            raise InputError(f"{path}: expected a pickle of lists of numbers, found one that is not sound.")
+
+
+def _check_nesting(path: Path, content: object, size: int) -> None:
+    """Refuse what is not lists of lists of numbers, or holds more of them than its file has bytes.
+
+    A small file may hold the same list over and over, in itself, too; it is counted before it is looked at.
+    """
+    wrong = InputError(f"{path}: expected lists of numbers of one size, found something else.")
+    count = 0
+
+    def rows(value: object) -> list | tuple:
+        nonlocal count
+        if not isinstance(value, (list, tuple)):
+            raise wrong
+        count += len(value)
+        if count > size:
+            raise InputError(f"{path}: expected as many numbers as fit into the file, found the same over and over.")
+        return value
+
+    for frame in rows(content):
+        for row in rows(frame):
+            if not all(isinstance(x, (int, float)) for x in rows(row)):
+                raise wrong
+
+
+def _as_positions(path: Path, content: object, size: int) -> np.ndarray:
+    _check_nesting(path, content, size)
     try:
         array = np.array(content, dtype=float)
     except (TypeError, ValueError, OverflowError):

@@ -169,8 +169,8 @@ def save_trial(path: str | Path, trial: Trial) -> None:
 
 
 def _load_trial(path: Path, length: float, films: Mapping[str, tuple[FilmFile, ...]]) -> Trial:
-    arrays = rope_schema.read_arrays(path)
     own = films.get(path.stem, ())
+    arrays = rope_schema.read_arrays(path, filmed=bool(own))
     arrays = rope_schema.check_arrays(path, arrays, length, filmed=bool(own))
     trial = Trial(name=path.stem, **arrays, films=own)
     return with_stations(trial, length) if own else trial

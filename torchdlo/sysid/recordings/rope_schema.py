@@ -7,11 +7,8 @@ is not obvious, how to mend it.
 from __future__ import annotations
 
 import difflib
-import json
 import math
-import zipfile
-import zlib
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -19,6 +16,9 @@ import numpy as np
 
 from torchdlo.errors import InputError
 from torchdlo.sysid.recordings.trial_checks import check_clamps, check_markers, check_time
+from torchdlo.untrusted import check_path, read_json
+from torchdlo.untrusted.array_file import Header
+from torchdlo.untrusted.array_file import read_arrays as untrusted_arrays
 
 __all__ = ["OPTIONAL", "REQUIRED", "check_arrays", "check_rope", "read_arrays", "trial_files"]
 
@@ -30,17 +30,7 @@ OPTIONAL = ("rest_positions", "marker_mass", "closed", "notes", "color")
 _ARRAYS = ("time", "markers", "marker_arclength", "gripped")
 _OPTIONAL_ARRAYS = ("gripper_quaternion", "gripper_marker", "suspect")
 _VIDEO_ARRAYS = ("masks", "mask", "video", "frames", "images")
-_UNREADABLE = (
-    zipfile.BadZipFile,
-    zlib.error,
-    EOFError,
-    OSError,
-    ValueError,
-    MemoryError,
-    NotImplementedError,
-    RuntimeError,
-)
-"""What reading a damaged archive can raise."""
+_FLOATS = ("time", "markers", "marker_arclength", "gripper_quaternion")
 
 
 def trial_files(path: Path) -> dict[str, list[Path]]:
@@ -56,6 +46,8 @@ def trial_files(path: Path) -> dict[str, list[Path]]:
         )
     # Those with a second part in their names are masks of a camera.
     files = {split: sorted(f for f in path.glob(f"{split}_*.npz") if "." not in f.stem) for split in ("train", "test")}
+    for file in (f for split in files.values() for f in split):
+        check_path(file.name, "name of a trial")
     for split, purpose in (("train", "fit on"), ("test", "judge on")):
         if not files[split]:
             raise InputError(
@@ -70,13 +62,13 @@ def check_rope(path: Path) -> dict[str, Any]:
     rope = _read_object(path)
     _check_names(path, rope, REQUIRED, OPTIONAL, "key")
     checked: dict[str, Any] = {
-        "length": _number(path, rope, "length", "m", positive=True),
-        "mass": _number(path, rope, "mass", "kg", positive=True),
-        "radius": _number(path, rope, "radius", "m", positive=True, optional=True),
-        "table_height": _number(path, rope, "table_height", "m", optional=True),
-        "marker_mass": _number(path, rope, "marker_mass", "kg", low=0.0, optional=True),
-        "marker_noise_std": _number(path, rope, "marker_noise_std", "m", low=0.0, optional=True),
-        "gravity": _positions(path, rope, "gravity", (3,), "[gx, gy, gz] in m/s^2"),
+        "length": _number(path, rope, "length", "m", positive=True, high=1e4),
+        "mass": _number(path, rope, "mass", "kg", positive=True, high=1e5),
+        "radius": _number(path, rope, "radius", "m", positive=True, high=1e3, optional=True),
+        "table_height": _number(path, rope, "table_height", "m", low=-1e4, high=1e4, optional=True),
+        "marker_mass": _number(path, rope, "marker_mass", "kg", low=0.0, high=1e3, optional=True),
+        "marker_noise_std": _number(path, rope, "marker_noise_std", "m", low=0.0, high=1.0, optional=True),
+        "gravity": _positions(path, rope, "gravity", (3,), "[gx, gy, gz] in m/s^2", most=1e3),
         "rest_positions": None,
         "closed": rope.get("closed") or False,
         "notes": rope.get("notes") or "",
@@ -106,25 +98,28 @@ def _color(path: Path, value: Any) -> tuple[float, float, float] | None:
     return float(rgb[0]), float(rgb[1]), float(rgb[2])
 
 
-def read_arrays(path: Path) -> dict[str, np.ndarray]:
-    """Read all arrays of an .npz without ever unpickling."""
-    try:
-        with path.open("rb") as file:
-            archive = np.load(file, allow_pickle=False)
-            if not isinstance(archive, np.lib.npyio.NpzFile):
-                raise InputError(f"{path}: expected an .npz archive, found a single array; use numpy.savez.")
-            return {name: _read_array(path, archive, name) for name in archive.files}
-    except InputError:
-        raise
-    except _UNREADABLE as error:
-        if "pickle" in str(error):
-            raise InputError(
-                f"{path}: expected an .npz archive, found a pickle or another kind of file; use numpy.savez."
-            ) from None
-        raise InputError(
-            f"{path}: expected a complete .npz archive, found one that cannot be read ({error}); "
-            "write or copy the file again."
-        ) from None
+def read_arrays(path: Path, *, filmed: bool = False) -> dict[str, np.ndarray]:
+    """Read the arrays of a trial; names and shapes are checked before anything is inflated.
+
+    Args:
+        path: the file.
+        filmed: whether cameras saw the rope: then markers are those at the grippers only.
+    """
+
+    def check(headers: Mapping[str, Header]) -> None:
+        for name in _VIDEO_ARRAYS:
+            if name in headers:
+                raise InputError(
+                    f"{path}: {name}: expected films and masks beside the trial, as {path.stem}.CAMERA.mp4, .npz or a "
+                    "folder of PNG files, with cameras.json, found them in it."
+                )
+        _check_names(path, headers, _ARRAYS, _OPTIONAL_ARRAYS, "array")
+        for name in _FLOATS:
+            if name in headers and headers[name].dtype.kind not in "fiu":
+                _refuse(path, name, "dtype float", f"{headers[name].dtype}")
+        _check_shapes(path, headers, 1 if filmed else 3)
+
+    return untrusted_arrays(path, "a trial", check=check)
 
 
 def check_arrays(path: Path, arrays: dict[str, np.ndarray], length: float, *, filmed: bool = False) -> dict[str, Any]:
@@ -136,17 +131,9 @@ def check_arrays(path: Path, arrays: dict[str, np.ndarray], length: float, *, fi
         length: of the rope [m].
         filmed: whether cameras saw the rope: then markers are those at the grippers only.
     """
-    for name in _VIDEO_ARRAYS:
-        if name in arrays:
-            raise InputError(
-                f"{path}: {name}: expected films and masks beside the trial, as {path.stem}.CAMERA.mp4, .npz or a "
-                "folder of PNG files, with cameras.json, found them in it."
-            )
-    _check_names(path, arrays, _ARRAYS, _OPTIONAL_ARRAYS, "array")
-    for name in ("time", "markers", "marker_arclength", "gripper_quaternion"):
+    for name in _FLOATS:
         if name in arrays:
             arrays[name] = _as_float(path, name, arrays[name])
-    _check_shapes(path, arrays, 1 if filmed else 3)
     suspect = arrays.get("suspect", np.zeros(len(arrays["time"]), dtype=bool))
     check_time(path, arrays["time"])
     check_markers(path, arrays, suspect, length, filmed=filmed)
@@ -155,9 +142,9 @@ def check_arrays(path: Path, arrays: dict[str, np.ndarray], length: float, *, fi
     return {name: arrays[name] for name in _ARRAYS} | optional | {"suspect": suspect}
 
 
-def _check_shapes(path: Path, arrays: dict[str, np.ndarray], fewest: int) -> None:
+def _check_shapes(path: Path, arrays: Mapping[str, Header], fewest: int) -> None:
     markers, time = arrays["markers"], arrays["time"]
-    if markers.ndim != 3 or markers.shape[-1] != 3:
+    if len(markers.shape) != 3 or markers.shape[-1] != 3:
         _refuse(path, "markers", "shape (frames, markers, 3)", f"{markers.shape}")
     n_frames, n_markers = markers.shape[:2]
     if time.shape != (n_frames,):
@@ -178,24 +165,7 @@ def _check_shapes(path: Path, arrays: dict[str, np.ndarray], fewest: int) -> Non
             _refuse(path, name, "dtype bool", f"{arrays[name].dtype}; use .astype(bool)")
 
 
-def _read_array(path: Path, archive: Any, name: str) -> np.ndarray:
-    try:
-        array = archive[name]
-    except ValueError as error:
-        if "pickle" in str(error) or "Object arrays" in str(error):
-            raise InputError(
-                f"{path}: {name}: expected an array of numbers, found pickled Python objects, "
-                "which are never loaded; convert the array to float or bool before saving."
-            ) from None
-        raise
-    if not isinstance(array, np.ndarray):
-        _refuse(path, name, "an array", "another kind of file in the archive")
-    return array
-
-
 def _as_float(path: Path, name: str, array: np.ndarray) -> np.ndarray:
-    if array.dtype.kind not in "fiu":
-        _refuse(path, name, "dtype float", f"{array.dtype}")
     array = array.astype(np.float64)
     if np.isinf(array).any():
         place = ", ".join(str(int(i)) for i in np.argwhere(np.isinf(array))[0])
@@ -207,10 +177,7 @@ def _as_float(path: Path, name: str, array: np.ndarray) -> np.ndarray:
 
 
 def _read_object(path: Path) -> dict[str, Any]:
-    try:
-        rope = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError) as error:
-        raise InputError(f"{path}: expected valid JSON, but reading failed: {error}.") from None
+    rope = read_json(path, "length, mass and so on of a rope")
     if not isinstance(rope, dict):
         raise InputError(f"{path}: expected a JSON object with length, mass and so on, found {_kind(rope)}.")
     return rope
@@ -245,25 +212,27 @@ def _number(
     *,
     positive: bool = False,
     low: float = -math.inf,
+    high: float = math.inf,
     optional: bool = False,
 ) -> float | None:
     value = rope.get(name)
     if value is None and optional:
         return None
     bound = " above 0" if positive else (f" of at least {low:g}" if low > -math.inf else "")
-    expected = f"a finite number{bound} in {unit}" + (" or null" if optional else "")
+    above = isinstance(value, (int, float)) and value > high
+    limit = f" and at most {high:g}" if above and bound else f" of at most {high:g}" if above else ""
+    expected = f"a finite number{bound}{limit} in {unit}" + (" or null" if optional else "")
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         _refuse(path, name, expected, _kind(value))
-    try:
-        number = float(value)
-    except OverflowError:
-        number = math.inf
-    if not math.isfinite(number) or number < low or (positive and number <= 0):
+    number = float(value)
+    if not math.isfinite(number) or not low <= number <= high or (positive and number <= 0):
         _refuse(path, name, expected, f"{number:g}")
     return number
 
 
-def _positions(path: Path, rope: dict[str, Any], name: str, shape: tuple[int, ...], expected: str) -> np.ndarray:
+def _positions(
+    path: Path, rope: dict[str, Any], name: str, shape: tuple[int, ...], expected: str, *, most: float = 1e9
+) -> np.ndarray:
     try:
         array = np.array(rope[name])
     except ValueError:
@@ -274,6 +243,8 @@ def _positions(path: Path, rope: dict[str, Any], name: str, shape: tuple[int, ..
         _refuse(path, name, expected, f"shape {array.shape}")
     if not np.isfinite(array).all():
         _refuse(path, name, expected, "a number that is not finite")
+    if np.abs(array.astype(float)).max(initial=0.0) > most:
+        _refuse(path, name, f"{expected}, at most {most:g}", f"{np.abs(array.astype(float)).max():g}")
     return array.astype(np.float64)
 
 

@@ -1,0 +1,28 @@
+"""What comes from strangers: files of JSON and of arrays, and names that are shown.
+
+Every reader returns a value or raises `InputError`, whatever is in the file.
+"""
+
+from __future__ import annotations
+
+from torchdlo.untrusted.json_file import Entry, locate, parse_json, read_entry, read_json
+from torchdlo.untrusted.names import check_path, for_html, for_plot, for_terminal, json_in_html, one_line
+from torchdlo.untrusted.regular_file import MissingFile, open_regular, read_bytes, read_text
+
+__all__ = [
+    "Entry",
+    "MissingFile",
+    "check_path",
+    "for_html",
+    "for_plot",
+    "for_terminal",
+    "json_in_html",
+    "locate",
+    "one_line",
+    "open_regular",
+    "parse_json",
+    "read_bytes",
+    "read_entry",
+    "read_json",
+    "read_text",
+]

@@ -1,0 +1,58 @@
+"""Names and texts that may hold anything, made fit for where they are shown: a terminal, a plot, a page, a script."""
+
+from __future__ import annotations
+
+import html
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+from torchdlo.errors import InputError
+
+__all__ = ["check_path", "for_html", "for_plot", "for_terminal", "json_in_html", "one_line"]
+
+_MOST = 400
+"""Most letters of a name in a sentence."""
+
+
+def for_terminal(text: object) -> str:
+    r"""Return text in which what a terminal would obey, or cannot show, is spelt out, as \x1b; lines stay."""
+    return "".join(c if c in "\n\t" else _visible(c) for c in str(text))
+
+
+def one_line(text: object, most: int = _MOST) -> str:
+    """Return one printable line of at most `most` letters, for sentences."""
+    line = "".join(map(_visible, " ".join(str(text).split())))
+    return line if len(line) <= most else line[: most - 3] + "..."
+
+
+def for_plot(text: object) -> str:
+    r"""Return text that matplotlib draws as it stands: dollars, which begin formulas, are escaped."""
+    return one_line(text).replace("$", r"\$")
+
+
+def for_html(text: object) -> str:
+    """Return text for a page: nothing in it is markup, and all of it can be encoded. To be used once."""
+    return html.escape(for_terminal(text))
+
+
+def json_in_html(value: Any) -> str:
+    r"""Return JSON for the inside of a <script>: no letter in it begins markup, a comment or another script."""
+    written = json.dumps(value, allow_nan=False)
+    return written.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
+
+
+def check_path(path: str | Path, what: str = "name") -> None:
+    """Refuse a path that is not text in UTF-8 or holds control characters, before work that would write it down."""
+    if any(_visible(c) != c for c in os.fspath(path)):
+        raise InputError(f"{one_line(path)}: expected a {what} of printable letters in UTF-8, found others; rename it.")
+
+
+def _visible(c: str) -> str:
+    if c.isprintable():
+        return c
+    code = ord(c)
+    if 0xDC80 <= code <= 0xDCFF:  # a byte of a file name that is not UTF-8
+        return f"\\x{code - 0xDC00:02x}"
+    return f"\\x{code:02x}" if code < 0x100 else f"\\u{code:04x}" if code < 0x10000 else f"\\U{code:08x}"
