@@ -153,7 +153,7 @@ def test_what_is_wrong_with_a_file_is_said(edit: Callable[..., Path], do: Callab
 
 
 def test_files_that_are_no_models_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="found nothing there"):
+    with pytest.raises(InputError, match="found none"):
         model_file.load(tmp_path / "model.json")
     with pytest.raises(InputError, match=r"found a folder; give the model.json in it"):
         model_file.load(tmp_path)

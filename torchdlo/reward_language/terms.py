@@ -69,7 +69,7 @@ def reward(terms: Mapping[str, str], success: str | None = None, where: str = "r
 
 def load_reward(path: Path) -> Reward:
     """Return the reward of a file: {"reward": {name: expression}, "success": condition}, the latter if wanted."""
-    content = read_json(path, 'JSON such as {"reward": {"near": "-dist(tool_0, ring_0)"}}', most=_FILE)
+    content = read_json(path, 'a reward such as {"reward": {"near": "-dist(tool_0, ring_0)"}}', most=_FILE)
     if not isinstance(content, dict) or "reward" not in content or content.keys() - {"reward", "success"}:
         raise InputError(f'{path}: expected an object with "reward" and, if wanted, "success", and nothing else.')
     return reward(content["reward"], content.get("success"), str(path))

@@ -76,7 +76,7 @@ class ArrayFile:
             cure: what to do about a file that is not there.
         """
         self.where, self.what, self.most = one_line(path), what, most
-        self._file = open_regular(path, f"{what}, an .npz archive", most=most, cure=cure)
+        self._file = open_regular(path, what, most=most, cure=cure)
         try:
             self._check_start(self._file)
             self._archive = zipfile.ZipFile(self._file)

@@ -71,8 +71,8 @@ def parse_json(text: str, *, where: str, what: str = "JSON", finite: bool = True
         )
     except json.JSONDecodeError as error:
         raise InputError(
-            f"{where}: expected {what}, but line {error.lineno}, column {error.colno} is not JSON ({error.msg}); is "
-            "the file cut, or is a comma missing or too many?"
+            f"{where}: expected {what}, but line {error.lineno}, column {error.colno} is not JSON ({error.msg}); mend "
+            "that place, or copy the file again if it is cut."
         ) from None
     except (_Refused, RecursionError):
         _explain(text, where, what, finite)

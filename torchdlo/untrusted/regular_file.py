@@ -40,7 +40,7 @@ def open_regular(path: str | Path, what: str, *, most: int, cure: str = "") -> B
         # A pipe without a writer would wait for one.
         handle = os.open(path, os.O_RDONLY | os.O_CLOEXEC | getattr(os, "O_NONBLOCK", 0))
     except (FileNotFoundError, NotADirectoryError):
-        raise MissingFile(f"{where}: expected {what}, found none{hint}.") from None
+        raise MissingFile(f"{where}: expected {what}, found none{hint}" + "." * (not hint.endswith("?"))) from None
     except (OSError, ValueError) as error:
         said = getattr(error, "strerror", None) or error
         raise InputError(f"{where}: expected {what}, but it cannot be opened ({said}){hint}.") from None

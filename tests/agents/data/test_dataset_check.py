@@ -41,7 +41,7 @@ def test_a_sound_set_has_no_faults(made: Path) -> None:
 
 def test_each_fault_is_named(own: Path) -> None:
     (problem,) = check(own / "nowhere")
-    assert "info.json: the file is missing" in problem
+    assert "info.json: expected a file of a LeRobot data set, found none" in problem
     frames(own, index=np.arange(1, 21))
     assert "the column index has 1 in frame 0; expected no gaps" in check(own)[0]
     frames(own, index=np.arange(20), timestamp=np.float32(np.arange(20) / 50))
@@ -105,7 +105,7 @@ def test_commands_say_what_is_in_a_set(made: Path, own: Path, capsys) -> None:
     (own / "meta/stats.json").unlink()
     assert cli_code("check", own) == 1
     said = capsys.readouterr()
-    assert "stats.json: the file is missing" in said.out and "1 problem" in said.err
+    assert "stats.json: expected a file of a LeRobot data set, found none" in said.out and "1 problem" in said.err
 
 
 def test_merged_and_filtered_sets_hold_the_same_frames(made: Path, tmp_path: Path) -> None:

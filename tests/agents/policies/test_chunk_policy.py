@@ -114,7 +114,7 @@ def test_files_of_policies_come_back_and_others_are_refused(tmp_path: Path) -> N
     for name in ("other.pt", "third.pt"):
         with pytest.raises(InputError, match="expected a policy of torchdlo learn, found something else"):
             load_policy(tmp_path / name)
-    with pytest.raises(InputError, match="there is no such file"):
+    with pytest.raises(InputError, match="expected a policy of torchdlo learn, found none"):
         load_policy(tmp_path / "none.pt")
 
 

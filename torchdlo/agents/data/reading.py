@@ -84,7 +84,7 @@ class DataSet:
 
 def json_file(file: Path) -> dict[str, Any]:
     """Return the object in a JSON file."""
-    content = read_json(file, "a file of a LeRobot data set", cure=f"is {file.parent.parent} a data set?", finite=False)
+    content = read_json(file, "a file of a LeRobot data set", cure=f"is {file.parent.parent} one?", finite=False)
     if not isinstance(content, dict):
         raise InputError(f"{file}: expected an object, found {type(content).__name__}.")
     return content

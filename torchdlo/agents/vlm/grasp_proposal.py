@@ -126,7 +126,7 @@ class Proposal:
 
 def load_grasps(path: Path, task: str) -> tuple[int | None, ...]:
     """Return the grasps of a proposal's file for a task."""
-    content = read_json(path, "grasps of torchdlo propose", most=100_000)
+    content = read_json(path, "grasps as torchdlo propose writes them", most=100_000)
     try:
         grasps, other = content["grasps"], content.get("task", task)
         if not isinstance(grasps, list) or not all(g is None or type(g) is int for g in grasps):
