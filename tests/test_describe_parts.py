@@ -345,7 +345,7 @@ def test_frames_read_back_and_others_are_refused(tmp_path):
     with pytest.raises(InputError, match="lacks pos, "):
         load_frames(tmp_path / "other.npz")
     (tmp_path / "text.npz").write_text("no")
-    with pytest.raises(InputError, match="expected the frames of a run, an .npz archive, found|cannot be read"):
+    with pytest.raises(InputError, match=r"expected the frames of a run, .* cannot be read"):
         load_frames(tmp_path / "text.npz")
 
 

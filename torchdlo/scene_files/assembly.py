@@ -17,7 +17,7 @@ from torchdlo.coupling.mpm.constitutive_models import ConstitutiveModel, Elastic
 from torchdlo.coupling.robot import kinematics as robots
 from torchdlo.errors import InputError
 from torchdlo.physics import tree
-from torchdlo.scene_files import motion
+from torchdlo.scene_files import limits, motion
 from torchdlo.scene_files.json_files import EFFECTS, like, read
 from torchdlo.scene_files.rope_models import Modelled, with_models
 from torchdlo.scene_files.schema import BodySpec, ParticleBlockSpec, RopeSpec, SceneDescription
@@ -88,6 +88,8 @@ def assemble(description: SceneDescription, *, folder: str | Path = ".") -> Simu
         folder: where the files that it names are looked for.
     """
     folder = Path(folder)
+    limits.check_ranges(description, EFFECTS)
+    limits.check_memory(description)
     d, modelled = with_models(description, folder)
     dtype = getattr(torch, d.precision)
     ropes = [_rope(r, dtype, modelled) for r in d.ropes]

@@ -17,6 +17,7 @@ from torchdlo.coupling.mpm.rod_coupling_effect import RodMpmCoupling
 from torchdlo.errors import InputError
 from torchdlo.files import write_atomically
 from torchdlo.physics.effects import EFFECTS as PHYSICS
+from torchdlo.scene_files import limits
 from torchdlo.scene_files.older import OLDER, upgraded
 from torchdlo.scene_files.schema import SceneDescription
 from torchdlo.untrusted import parse_json, read_text
@@ -31,6 +32,7 @@ FORMAT = "torchdlo scene 2"
 
 def save(description: SceneDescription, path: str | Path) -> None:
     """Write a description as JSON, without what has its default. Numbers read back as they were, to the last bit."""
+    limits.check_ranges(description, EFFECTS)
     write_atomically(Path(path), text(description))
 
 
@@ -69,7 +71,9 @@ def parse(content: str, *, where: str = "scene") -> SceneDescription:
         raise InputError(f'{where}: expected an object with "format": "{FORMAT}", given {given!r}.{hint}')
     if found.pop("format") == OLDER:
         found = upgraded(found)
-    return _checked(SceneDescription, found, where, "")
+    description = _checked(SceneDescription, found, where, "")
+    limits.check_ranges(description, EFFECTS, where)
+    return description
 
 
 def _wrong(where: str, place: str, expected: str, given: Any) -> InputError:
@@ -152,4 +156,6 @@ def _effects(given: Any, where: str, place: str) -> dict[str, dict[str, Any]]:
                 size = params[key].size
                 kind = float if size == 1 else tuple[(float,) * size]
                 _checked(kind, value, where, f"{here}.{key}")
+            else:
+                _checked(typing.get_type_hints(EFFECTS[name])[key], value, where, f"{here}.{key}")
     return given

@@ -15,7 +15,7 @@ from torchdlo.errors import InputError
 from torchdlo.physics.rod.assembly import frame_curvature
 from torchdlo.physics.rod.topology import Topology
 from torchdlo.scene_files.schema import RopeSpec, SceneDescription
-from torchdlo.untrusted import read_json
+from torchdlo.untrusted import read_entry
 
 __all__ = ["Modelled", "cable", "with_models"]
 
@@ -105,10 +105,27 @@ def _read(path: Path) -> tuple[Any, dict[str, Any]]:
     from torchdlo.sysid.model import model_file
 
     model = model_file.load(path)
-    said = read_json(path, "a model file")
+    said = _rope(path)
     if model.options["rest"] == "given" and said["rope"].get("rest_positions") is None:
         raise InputError(f"{path}: rope.rest_positions: is missing; expected the natural shape of the rope.")
     return model, said
+
+
+def _rope(path: Path) -> dict[str, Any]:
+    """Return what a file says of the rope and its mesh, checked."""
+    found = read_entry(path, "a model file")
+    rope, mesh = found["rope"], found["mesh"]
+    rope["length"].number(1e-6, 1e4, "m")
+    rope["mass"].number(1e-12, 1e5, "kg")
+    rope["gravity"].numbers(3, most=1e3)
+    if "radius" in rope:
+        rope["radius"].number(1e-9, 1e3, "m")
+    if "rest_positions" in rope:
+        rope["rest_positions"].numbers(None, 3, most=1e4)
+        if len(rope["rest_positions"].value) < 3:
+            raise rope["rest_positions"].wrong("at least 3 positions")
+    mesh["arclength"].numbers(None, most=1e4)
+    return found.object()
 
 
 def _shape(points: Any, values: dict[str, float]) -> Modelled | None:

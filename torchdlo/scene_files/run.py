@@ -14,7 +14,8 @@ from torchdlo import scene as scenes
 from torchdlo import scene_files
 from torchdlo.errors import InputError
 from torchdlo.files import replacing
-from torchdlo.scene_files import frames_checks
+from torchdlo.scene_files import frames_checks, limits
+from torchdlo.scene_files.json_files import EFFECTS
 from torchdlo.untrusted.array_file import ArrayFile
 
 __all__ = ["Frames", "appearance", "load_frames", "run", "save_frames"]
@@ -149,6 +150,9 @@ def run(
         compiled: whether to compile the step, worth it for long runs; else it is recorded.
         callback: told (stage, steps done, steps in all, message) after every frame.
     """
+    limits.check_ranges(description, EFFECTS)
+    limits.check_memory(description, frame_stride=frame_stride)
+    limits.check_time(description, compiled=compiled)
     made = scene_files.assemble(description, folder=folder)
     scene, params, state = made.scene, made.params, made.state
     control = made.plan.follow(scene)

@@ -18,6 +18,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torchdlo import budget
 from torchdlo.coupling.bodies import shape_sdf, triangles
 from torchdlo.coupling.bodies.dynamics import RigidBody
 from torchdlo.errors import InputError
@@ -25,9 +26,12 @@ from torchdlo.files import write_atomically
 from torchdlo.physics.linalg import rotation
 from torchdlo.physics.linalg.numerics import normalize
 from torchdlo.physics.tree import replace, struct
+from torchdlo.untrusted import one_line, open_regular
 
 VERSION = 1
 """Counts up when sampling gives other numbers, so that old files of the cache are not read."""
+_LARGEST_FILE = 512 * 2**20
+"""Largest file of a mesh [bytes]."""
 SMALLEST, LARGEST = 1e-3, 10.0
 """Lengths of meshes [m] outside of which the unit is taken to be wrong."""
 MARGIN = 3
@@ -107,14 +111,30 @@ def load_mesh(path: str | Path, *, scale: float = 1.0, cache: Path | None = None
     path = Path(path)
     if not path.is_file():
         raise InputError(f"{path}: there is no such file; expected a mesh (STL, OBJ, PLY, GLB, OFF, ...).")
+    open_regular(path, "a mesh", most=_LARGEST_FILE).close()
     try:
         mesh = trimesh.load_mesh(path)
-    except (ValueError, NotImplementedError, KeyError, IndexError) as error:
+    except ImportError as error:
+        missing = (
+            f" needs the package {error.name}, which is not there" if error.name else f" lacks a package ({error})"
+        )
         raise InputError(
-            f"{path}: trimesh cannot read it as a mesh ({error}); convert it to STL, PLY or OBJ."
+            f"{path}: the reader of {path.suffix or 'such files'}{missing}; install it, or convert the mesh to STL, "
+            "PLY or OBJ."
         ) from None
-    if not len(getattr(mesh, "faces", ())):
+    except Exception as error:  # readers of many formats meet damage in as many ways
+        said = one_line(str(error) or type(error).__name__, 120)
+        raise InputError(
+            f"{path}: trimesh cannot read it as a mesh ({said}); is it complete? If so, convert it to STL, PLY or OBJ."
+        ) from None
+    if not len(getattr(mesh, "faces", ())) or not len(mesh.vertices):
         raise InputError(f"{path}: holds no triangles; expected a closed surface.")
+    low, high = int(mesh.faces.min()), int(mesh.faces.max())
+    if low < 0 or high >= len(mesh.vertices):
+        wrong = low if low < 0 else high
+        raise InputError(
+            f"{path}: has a triangle with vertex {wrong}; expected 0 to {len(mesh.vertices) - 1}: mend the mesh."
+        )
     vertices, faces = torch.tensor(mesh.vertices), torch.tensor(mesh.faces)
     return sample_mesh(vertices, faces, scale=scale, cache=cache, name=str(path), **sampling)
 
@@ -149,7 +169,7 @@ def sample_mesh(
     known = _read(file)
     if known is not None:
         return MeshShape(**known)
-    made = _sampled(vertices, faces, options)
+    made = _sampled(vertices, faces, options, name)
     _write(file, vars(made))
     return made
 
@@ -194,7 +214,7 @@ def _checked(vertices: Tensor, faces: Tensor, name: str) -> Tensor:
     return faces if volume > 0 else faces.flip(-1)
 
 
-def _sampled(vertices: Tensor, faces: Tensor, options: Sampling) -> MeshShape:
+def _sampled(vertices: Tensor, faces: Tensor, options: Sampling, name: str) -> MeshShape:
     solid = _trimesh().Trimesh(vertices.numpy(), faces.numpy(), process=False)
     centre, inertia = torch.tensor(solid.center_mass), torch.tensor(solid.moment_inertia)
     volume = torch.tensor([float(solid.volume)], dtype=torch.float64)
@@ -203,6 +223,9 @@ def _sampled(vertices: Tensor, faces: Tensor, options: Sampling) -> MeshShape:
     corners = vertices[faces]
     half, step = vertices.abs().amax(0), float((vertices.amax(0) - vertices.amin(0)).amax()) / options.cells
     cells = [2 * math.ceil(float(h) / step + MARGIN) for h in half]
+    nodes = float(math.prod(n + 1 for n in cells))
+    work = f"{options.cells} cells along the longest side, {nodes:.4g} in all,"
+    budget.check(name, work, memory=30 * nodes, seconds=2e-5 * nodes, cure="use fewer cells")
     size = torch.tensor([0.5 * n * step for n in cells], dtype=torch.float64)
     axes = tuple(
         torch.linspace(-float(s), float(s), n + 1, dtype=torch.float64) for s, n in zip(size, cells, strict=True)

@@ -17,7 +17,15 @@ import torch
 from torch import Tensor
 
 from torchdlo.errors import InputError
+from torchdlo.untrusted import one_line, read_text
 
+_LARGEST_FILE = 16 * 2**20
+"""Largest file [bytes]."""
+_CURE = "give its path, or its text"
+_MOST_JOINTS = 500
+"""Most joints of a robot."""
+_LARGEST = 1e6
+"""Largest number of a file [m or rad]."""
 MOVING = {"revolute": "revolute", "continuous": "revolute", "prismatic": "prismatic"}
 """Kinds of joints that move, and how."""
 
@@ -83,14 +91,19 @@ def read(source: str | Path) -> UrdfModel:
     inline = isinstance(source, str) and source.lstrip().startswith("<")
     where = "urdf" if inline else str(source)
     try:
-        text = source if inline else Path(source).read_text(encoding="utf-8")
+        text = (
+            source
+            if inline
+            else read_text(source, "a URDF file", most=_LARGEST_FILE, cure="give its path, or its text")
+        )
         root = xml.fromstring(re.sub(r"<\?xml.*?\?>", "", text))
-    except FileNotFoundError:
-        raise InputError(f"{where}: expected a URDF file, found none; give its path, or its text.") from None
-    except (xml.ParseError, UnicodeDecodeError) as error:
+    except (xml.ParseError, UnicodeEncodeError) as error:
         raise InputError(f"{where}: is not complete XML ({error}); is the file cut, or a xacro macro?") from None
     if root.tag != "robot":
         raise InputError(f"{where}: expected <robot> around everything, found <{root.tag}>; is it a URDF file?")
+    count = len(root.findall("joint"))
+    if count > _MOST_JOINTS or len(root.findall("link")) > _MOST_JOINTS + 1:
+        raise InputError(f"{where}: has {count} joints; expected at most {_MOST_JOINTS}, in one tree of links.")
     links = tuple(_named(where, e) for e in root.findall("link"))
     joints = [_joint(where, e, links) for e in root.findall("joint")]
     for what, names in (("link", links), ("joint", [j.name for j in joints])):
@@ -118,8 +131,9 @@ def _numbers(where: str, element: xml.Element | None, key: str, count: int, defa
         values = [float(x) for x in (text or "").split()]
     except ValueError:
         values = []
-    if len(values) != count or not all(map(math.isfinite, values)):
-        raise InputError(f"{where}: {key} is {text!r}; expected {count} finite number(s).")
+    if len(values) != count or not all(abs(value) <= _LARGEST for value in values):
+        said = one_line(repr(text), 60)
+        raise InputError(f"{where}: {key} is {said}; expected {count} finite number(s) up to {_LARGEST:g}.")
     return values
 
 

@@ -35,6 +35,9 @@ _OLDER = {"ahead": "numerical_damping", "grip": "clamp_fraction"}
 _OPTIONS = {"vertices": int, "rest": str, "numerical_damping": float, "clamp_fraction": float, "substep": float}
 """How the model is built, see `RopeModel`."""
 
+_OPTION_RANGES = {"vertices": (2, 100_000), "substep": (1e-9, 1.0)}
+"""Least and greatest values, 0 and 1 where nothing is said."""
+
 _BASELINE = ("bending_stiffness", "twisting_stiffness", "damping_rate")
 
 
@@ -150,7 +153,8 @@ def load(path: str | Path) -> ModelFile:
             _refuse(path, f"effects.{name}", "an object with its numbers", repr(numbers))
         for key, value in numbers.items():
             _check_number(path, name, key)
-            values[f"{name}.{key}"] = _number(path, f"effects.{name}.{key}", value)
+            limit = 10 * max(1.0, *(abs(v) for v in _bounds(name, key)))
+            values[f"{name}.{key}"] = _number(path, f"effects.{name}.{key}", value, -limit, limit)
     return ModelFile(path, tuple(effects), values, _options(path, options))
 
 
@@ -185,8 +189,10 @@ def _options(path: Path, given: dict[str, Any]) -> dict[str, Any]:
                 _refuse(path, f"options.{name}", "straight or given", repr(value))
             options[name] = value
         else:
-            low = {"vertices": 2, "substep": 1e-9}.get(name, 0.0)
-            options[name] = kind(_number(path, f"options.{name}", value, low))
+            low, high = _OPTION_RANGES.get(name, (0.0, 1.0))
+            if kind is int and type(value) is not int:
+                _refuse(path, f"options.{name}", f"a whole number from {low:g} to {high:g}", repr(value)[:40])
+            options[name] = kind(_number(path, f"options.{name}", value, low, high))
     # A quotient of frame times by substeps may round down: one substep more would be another model.
     options["substep"] *= 1 + 1e-9
     for name in given:
@@ -216,6 +222,11 @@ def _check_number(path: Path, effect: str, key: str) -> None:
     if (size > 1) != bool(part) or (part and not (part.isdigit() and int(part) < size)):
         parts = ", ".join(f"{name}.{k}" for k in range(size)) if size > 1 else name
         _refuse(path, f"effects.{effect}", parts, key)
+
+
+def _bounds(effect: str, key: str) -> tuple[float, ...]:
+    param = EFFECTS[effect].params[key.partition(".")[0]]
+    return param.low, param.high, param.off or 0.0
 
 
 def _number(path: Path, name: str, value: Any, low: float = -math.inf, high: float = math.inf) -> float:
