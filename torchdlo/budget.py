@@ -52,6 +52,7 @@ def check(where: str, work: str, *, memory: float = 0.0, seconds: float = 0.0, c
         seconds: how long it takes about [s].
         cure: what to change.
     """
+    where = "".join(c if c.isprintable() else "?" for c in where)
     has = available_memory() if memory > 2**26 else float("inf")
     if memory > has:
         raise InputError(

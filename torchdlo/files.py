@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from torchdlo.errors import InputError
+from torchdlo.untrusted.names import check_path
 
 __all__ = ["check_writable", "replacing", "write_atomically"]
 
@@ -44,6 +45,7 @@ def check_writable(path: Path, *, mark: bytes = b"torchdlo") -> None:
         path: The file about to be written.
         mark: Bytes that every file written by torchdlo has near its start.
     """
+    check_path(path.absolute(), "path to write to")
     for parent in path.parents:
         if parent.exists():
             if not parent.is_dir():

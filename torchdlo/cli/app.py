@@ -5,6 +5,7 @@ Everything slow to import is imported inside the command that needs it, so that 
 
 from __future__ import annotations
 
+import sys
 from typing import Annotated
 
 import typer
@@ -20,6 +21,7 @@ from torchdlo.cli.scenes import simulate, view
 from torchdlo.cli.tasks import optimize, play, tasks
 from torchdlo.cli.video import calibrate_camera, film, segment
 from torchdlo.errors import InputError
+from torchdlo.untrusted.names import check_path, for_terminal
 
 __all__ = ["app", "main"]
 
@@ -36,12 +38,14 @@ app = typer.Typer(
 def main(args: list[str] | None = None) -> None:
     """Run the command line; what is wrong with the input is one line on stderr and exit code 2."""
     try:
+        for argument in sys.argv[1:] if args is None else args:
+            check_path(argument, "name or option")
         app(args=args)
     except InputError as error:
-        typer.echo("error: " + " ".join(str(error).splitlines()), err=True)
+        typer.echo("error: " + for_terminal(" ".join(str(error).splitlines())), err=True)
         raise SystemExit(2) from None
     except OSError as error:
-        typer.echo(f"error: {error}", err=True)
+        typer.echo(f"error: {for_terminal(error)}", err=True)
         raise SystemExit(1) from None
 
 

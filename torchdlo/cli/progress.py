@@ -40,7 +40,7 @@ def progress() -> Iterator[Callable[[str, int, int, str], None]]:
         TimeElapsedColumn(),
         TextColumn("left"),
         TimeRemainingColumn(),
-        TextColumn("{task.fields[message]}"),
+        TextColumn("{task.fields[message]}", markup=False),
     )
     with Progress(*columns, console=console) as bar:
         tasks: dict[str, Any] = {}

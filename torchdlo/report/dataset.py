@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import html
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
@@ -15,6 +14,7 @@ from torchdlo.agents.data import video
 from torchdlo.agents.data.reading import DataSet, json_file
 from torchdlo.files import write_atomically
 from torchdlo.report.pages.page import STYLE, number, page, table
+from torchdlo.untrusted import for_html
 
 __all__ = ["dataset_page", "summary", "write_page"]
 
@@ -87,7 +87,7 @@ def dataset_page(data: DataSet, episodes: Sequence[int]) -> str:
         for name, t in found["tasks"].items()
     ]
     heads = ("task", "episodes", "frames", "sentences", "attempts", "failed")
-    name = html.escape(data.path.resolve().name)
+    name = for_html(data.path.resolve().name)
     body = [
         f"<h1>{name}</h1><p class='verdict'>{found['episodes']} episodes, {found['frames']} frames at {data.fps} per "
         f"second, {found['bytes'] / 1e6:.1f} MB.</p>",
@@ -122,7 +122,7 @@ def _episode(data: DataSet, k: int, columns: dict[str, np.ndarray]) -> str:
             content = base64.b64encode(file.read_bytes()).decode()
         shots.append(
             f'<figure><video controls muted loop playsinline src="data:video/mp4;base64,{content}"></video>'
-            f"<figcaption>{html.escape(camera.rpartition('.')[2])}</figcaption></figure>"
+            f"<figcaption>{for_html(camera.rpartition('.')[2])}</figcaption></figure>"
         )
     part = slice(row["dataset_from_index"], row["dataset_to_index"])
     curves = ""
@@ -132,8 +132,8 @@ def _episode(data: DataSet, k: int, columns: dict[str, np.ndarray]) -> str:
     facts += [f"return {number(own['return'])}"] if own.get("return") is not None else []
     facts += [str(own[key]) for key in ("task", "actions_from") if own.get(key)]
     return (
-        f'<div class="episode"><h3>{k}: {html.escape(" / ".join(row["tasks"]))}</h3>'
-        f'<p class="soft">{html.escape(", ".join(facts))}</p><div class="shots">{"".join(shots)}</div>{curves}</div>'
+        f'<div class="episode"><h3>{k}: {for_html(" / ".join(row["tasks"]))}</h3>'
+        f'<p class="soft">{for_html(", ".join(facts))}</p><div class="shots">{"".join(shots)}</div>{curves}</div>'
     )
 
 
@@ -147,7 +147,7 @@ def _curves(values: np.ndarray, names: Sequence[str] | None) -> str:
         points = " ".join(f"{a:.1f},{50 - 45 * b / top:.1f}" for a, b in zip(x, values[:, c], strict=True))
         lines.append(f'<polyline fill="none" stroke="{color}" stroke-width="1.5" points="{points}"/>')
         name = names[c] if names else str(c)
-        said.append(f'<span style="color:{color}">{html.escape(str(name))}</span>')
+        said.append(f'<span style="color:{color}">{for_html(str(name))}</span>')
     drawn = f'<svg viewBox="0 0 1000 100" preserveAspectRatio="none">{"".join(lines)}</svg>'
     return f'{drawn}<p class="soft">action, up to {top:.2g}: {" ".join(said)}</p>'
 

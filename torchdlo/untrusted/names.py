@@ -7,6 +7,7 @@ import json
 import os
 from pathlib import Path
 from typing import Any
+from unicodedata import category
 
 from torchdlo.errors import InputError
 
@@ -45,12 +46,12 @@ def json_in_html(value: Any) -> str:
 
 def check_path(path: str | Path, what: str = "name") -> None:
     """Refuse a path that is not text in UTF-8 or holds control characters, before work that would write it down."""
-    if any(_visible(c) != c for c in os.fspath(path)):
+    if any(not c.isprintable() and category(c) in ("Cc", "Cs", "Cf") for c in os.fspath(path)):
         raise InputError(f"{one_line(path)}: expected a {what} of printable letters in UTF-8, found others; rename it.")
 
 
 def _visible(c: str) -> str:
-    if c.isprintable():
+    if c.isprintable() or category(c) == "Zs":  # spaces of any width
         return c
     code = ord(c)
     if 0xDC80 <= code <= 0xDCFF:  # a byte of a file name that is not UTF-8

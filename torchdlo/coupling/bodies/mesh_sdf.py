@@ -115,9 +115,7 @@ def load_mesh(path: str | Path, *, scale: float = 1.0, cache: Path | None = None
     try:
         mesh = trimesh.load_mesh(path)
     except ImportError as error:
-        missing = (
-            f" needs the package {error.name}, which is not there" if error.name else f" lacks a package ({error})"
-        )
+        missing = f" needs the package {error.name}, which is not there" if error.name else f" lacks one ({error})"
         raise InputError(
             f"{path}: the reader of {path.suffix or 'such files'}{missing}; install it, or convert the mesh to STL, "
             "PLY or OBJ."

@@ -15,6 +15,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torchdlo import budget
 from torchdlo import scene as scenes
 from torchdlo.coupling.bodies.dynamics import turn_by
 from torchdlo.coupling.common.pose import Pose
@@ -98,6 +99,10 @@ class EpisodeResult:
     """The end."""
     path: dict[str, Tensor] = field(default_factory=dict)
     """What `keep` returned after every action, (T, ...) each."""
+
+
+_SCENE_BYTES = 1e5
+"""What the state of a scene takes at least [bytes]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -197,6 +202,8 @@ def prepare(
         compiled: whether to compile steps; `recorded`: if not, whether to record them, see `scene.stepper`.
         segment: frames that gradients run again at once; None keeps all of them in memory.
     """
+    if like is None or like.device.type == "cpu":
+        budget.check(task.name, f"{num} scenes at once", memory=_SCENE_BYTES * num, cure="use fewer at once")
     moved = task.moved(num, like=like, generator=generator, variation=variation)
     return prepare_at(task, moved, compiled=compiled, recorded=recorded, segment=segment)
 

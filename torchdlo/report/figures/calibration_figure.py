@@ -16,6 +16,7 @@ from matplotlib.lines import Line2D
 from torchdlo.sysid.estimation.result import Calibration
 from torchdlo.sysid.recordings.metrics import mean_absolute_error, scored
 from torchdlo.sysid.recordings.recording import Recording, Trial
+from torchdlo.untrusted import for_plot
 
 __all__ = ["calibration_png"]
 
@@ -43,7 +44,7 @@ def calibration_png(result: Calibration, recording: Recording) -> bytes:
     _error_over_time(middle, result, recording.test)
     _bars(right, result)
     shapes.suptitle(
-        f"{recording.path.resolve().name}: measured (dots) and simulated (lines), test trials",
+        f"{for_plot(recording.path.resolve().name)}: measured (dots) and simulated (lines), test trials",
         fontsize=14,
         color=_INK,
         fontweight="bold",
@@ -80,7 +81,7 @@ def _overlay(
         axes.axhline(recording.table_height, color=_OTHER, lw=1.2, ls="--", zorder=0)
     error = mean_absolute_error(predicted, trial) * 1e3
     said = f"{error:.1f} mm" if np.isfinite(error) else "not finite"
-    axes.set_title(f"{trial.name}, {when}: {said}", fontsize=11, color=color, loc="left")
+    axes.set_title(f"{for_plot(trial.name)}, {when}: {said}", fontsize=11, color=color, loc="left")
     _frame(axes, trial.markers[frames] @ across, trial.markers[frames] @ up)
     _style(axes, "along the main direction [m]", up_label)
     handles = [

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import base64
-import html
 import io
 from collections.abc import Sequence
 
 import numpy as np
 from matplotlib import colormaps
 from matplotlib.image import imsave
+
+from torchdlo.untrusted import for_html
 
 __all__ = ["STYLE", "bars", "heat", "legend", "lines", "ramp", "scale"]
 
@@ -53,7 +54,7 @@ def bars(rows: Sequence[tuple[str, float, float]], floor: float) -> str:
     most = max([*shown, floor, 1e-12])
     out = []
     for k, (name, *pair) in enumerate(rows):
-        out.append(f'<div class="name{"" if k else " all"}">{html.escape(name)}</div><div>')
+        out.append(f'<div class="name{"" if k else " all"}">{for_html(name)}</div><div>')
         for kind, value in zip(("before", "after"), pair, strict=True):
             width = 100 * min(value / most, 1.0) if np.isfinite(value) else 100
             text = f"{value:.2f} mm" if np.isfinite(value) else "failed"
@@ -87,7 +88,7 @@ def lines(
     for v, anchor in ((low, "start"), (0.5 * (low + high), "middle"), (high, "end")):
         parts.append(f'<text x="{px(v):.1f}" y="{height - bottom + 14}" text-anchor="{anchor}">{v:.3g}</text>')
     parts.append(
-        f'<text x="{(left + width - right) / 2}" y="{height - 4}" text-anchor="middle">{html.escape(unit)}</text>'
+        f'<text x="{(left + width - right) / 2}" y="{height - 4}" text-anchor="middle">{for_html(unit)}</text>'
     )
     if floor is not None and floor <= most:
         parts.append(f'<path class="floor" d="M{left} {py(floor):.1f}H{width - right}"/>')
@@ -140,7 +141,7 @@ def ramp(most: float, unit: str) -> str:
         "#" + "".join(f"{round(255 * c):02x}" for c in colormaps[_MAP](s)[:3]) for s in np.linspace(0, 1, 9)
     )
     bar = f'<span style="background:linear-gradient(90deg,{stops})"></span>'
-    return f'<div class="ramp">0 {bar} {most:.3g} {html.escape(unit)}</div>'
+    return f'<div class="ramp">0 {bar} {most:.3g} {for_html(unit)}</div>'
 
 
 def scale(most: float) -> list[float]:
@@ -155,6 +156,6 @@ def scale(most: float) -> list[float]:
 
 def _figure(title: str, box: str, parts: list[str]) -> str:
     return (
-        f'<figure><figcaption>{html.escape(title)}</figcaption><svg viewBox="{box}" role="img" '
-        f'aria-label="{html.escape(title)}">{"".join(parts)}</svg></figure>'
+        f'<figure><figcaption>{for_html(title)}</figcaption><svg viewBox="{box}" role="img" '
+        f'aria-label="{for_html(title)}">{"".join(parts)}</svg></figure>'
     )

@@ -11,6 +11,8 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from torchdlo.untrusted import for_plot
+
 __all__ = ["learning_png", "training_png"]
 
 _COLORS = {"cmaes": "#3d348b", "gd": "#e09f3e", "hybrid": "#00798c"}
@@ -33,7 +35,7 @@ def learning_png(panels: Mapping[str, Mapping[str, Sequence[Sequence[Mapping[str
     for axes, (title, methods) in zip(grid, panels.items(), strict=False):
         for method, curves in methods.items():
             _draw(axes, method, curves)
-        axes.set(title=title, xlabel="episodes", ylabel="best return so far")
+        axes.set(title=for_plot(title), xlabel="episodes", ylabel="best return so far")
         axes.grid(alpha=0.3)
         axes.spines[["top", "right"]].set_visible(False)
         axes.legend(frameon=False, fontsize=8)
@@ -49,7 +51,7 @@ def _draw(axes: Axes, method: str, curves: Sequence[Sequence[Mapping[str, Any]]]
     count = min(len(curve) for curve in curves)
     episodes = [point["episodes"] for point in curves[0][:count]]
     best = np.array([[np.nan if p["best"] is None else p["best"] for p in curve[:count]] for curve in curves])
-    axes.plot(episodes, np.median(best, 0), color=color, lw=2, label=method)
+    axes.plot(episodes, np.median(best, 0), color=color, lw=2, label=for_plot(method))
     if len(curves) > 1:
         axes.fill_between(episodes, best.min(0), best.max(0), color=color, alpha=0.15, lw=0)
         return
@@ -68,7 +70,7 @@ def training_png(runs: Mapping[str, Sequence[Mapping[str, Any]]]) -> bytes:
     left, right = figure.subplots(1, 2)
     for name, rows in runs.items():
         episodes = [row["episodes"] for row in rows]
-        left.plot(episodes, [row["return"] for row in rows], lw=2, label=name)
+        left.plot(episodes, [row["return"] for row in rows], lw=2, label=for_plot(name))
         (line,) = right.plot(episodes, [100 * row["success"] for row in rows], lw=2, label="success")
         failed = [100 * row["failed"] for row in rows]
         right.plot(episodes, failed, color=line.get_color(), lw=1, ls=":", label="failed")

@@ -9,6 +9,8 @@ from matplotlib import colormaps
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from torchdlo.untrusted import for_plot
+
 __all__ = ["motion_png"]
 
 _VIEWS = (("x", "z", "from the side"), ("x", "y", "from above"))
@@ -40,7 +42,7 @@ def motion_png(time: np.ndarray, pos: np.ndarray, rope: np.ndarray, body_pos: np
         axes.grid(alpha=0.3)
         axes.spines[["top", "right"]].set_visible(False)
     figure.axes[0].legend(title="after", fontsize=8, frameon=False)
-    figure.suptitle(title)
+    figure.suptitle(for_plot(title))
     content = io.BytesIO()
     figure.savefig(content, format="png", metadata={"Software": "torchdlo"})
     return content.getvalue()

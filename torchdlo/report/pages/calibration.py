@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import html
 import math
 from pathlib import Path
 
@@ -13,6 +12,7 @@ from torchdlo.report.pages import films
 from torchdlo.report.pages.page import STYLE, number, page, table, words
 from torchdlo.sysid.estimation.result import Calibration, versions
 from torchdlo.sysid.recordings.recording import Recording
+from torchdlo.untrusted import for_html
 
 __all__ = ["PAGE", "PICTURE", "calibration_html", "verdict", "write_report"]
 
@@ -69,12 +69,12 @@ def verdict(result: Calibration, recording: Recording) -> str:
 
 def calibration_html(result: Calibration, recording: Recording, png: bytes, *, command: str = "") -> str:
     """The page, with the picture inside."""
-    name = html.escape(recording.path.resolve().name)
+    name = for_html(recording.path.resolve().name)
     picture = base64.b64encode(png).decode("ascii")
-    notes = "".join(f"<li>{html.escape(note)}</li>" for note in result.notes)
+    notes = "".join(f"<li>{for_html(note)}</li>" for note in result.notes)
     sections = [
         f"<h1>{name}</h1>",
-        f'<p class="verdict">{html.escape(verdict(result, recording))}</p>',
+        f'<p class="verdict">{for_html(verdict(result, recording))}</p>',
         f"<ul>{notes}</ul>" if notes else "",
         f'<img alt="Measured and simulated shapes, errors along the rope and over time, and a '
         f'comparison with trivial predictions" src="data:image/png;base64,{picture}">',
@@ -87,10 +87,10 @@ def calibration_html(result: Calibration, recording: Recording, png: bytes, *, c
         "<h2>Trials</h2>",
         _trial_table(result),
         "<h2>Made by</h2>",
-        f"<pre>{html.escape(command)}</pre>" if command else "",
-        f"<p>{html.escape(_made_by(result))}</p>",
+        f"<pre>{for_html(command)}</pre>" if command else "",
+        f"<p>{for_html(_made_by(result))}</p>",
     ]
-    return page(name, STYLE, "\n".join(s for s in sections if s))
+    return page(recording.path.resolve().name, STYLE, "\n".join(s for s in sections if s))
 
 
 def _error_table(result: Calibration) -> str:

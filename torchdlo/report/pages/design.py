@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import html
 import io
 from pathlib import Path
 from typing import Any
@@ -18,6 +17,7 @@ from torchdlo.report.pages.page import STYLE, listed, number, page, table
 from torchdlo.sysid.experiment_design.design import Design, called, design_json, rationale, summary
 from torchdlo.sysid.experiment_design.model_discrimination import size
 from torchdlo.sysid.recordings.recording import save_trial
+from torchdlo.untrusted import for_html
 
 __all__ = ["FILES", "design_png", "design_table", "write_design"]
 
@@ -60,8 +60,8 @@ def _html(design: Design, picture: bytes, command: str) -> str:
     )
     misfit = [(n.replace("_", " "), f"{1e3 * m:.3g} mm") for n, m in design.misfit.items()]
     body = [
-        f"<h1>{html.escape(name)}: the next experiment</h1>",
-        f'<p class="verdict">{html.escape(summary(design))}</p>',
+        f"<h1>{for_html(name)}: the next experiment</h1>",
+        f'<p class="verdict">{for_html(summary(design))}</p>',
         "<h2>Why</h2>",
         listed(rationale(design)),
         "<h2>The motion, and what it would show</h2>",
@@ -72,7 +72,7 @@ def _html(design: Design, picture: bytes, command: str) -> str:
         "<h2>The rivals</h2>",
         table(("effect", "off the recording by"), misfit),
         "<h2>Made by</h2>",
-        f"<pre>{html.escape(command)}</pre>" if command else "",
+        f"<pre>{for_html(command)}</pre>" if command else "",
         f"<p class=soft>{design.duration:.0f} s, seed {design.seed}. motion.npz holds times, the positions of the "
         "gripped markers and the orientations of the clamps in the format of a trial; free markers are NaN.</p>",
     ]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import html
 import shlex
 from pathlib import Path
 from typing import Any
@@ -19,6 +18,7 @@ from torchdlo.sysid.diagnosis.residual_analysis import PARTS, Localisation, loca
 from torchdlo.sysid.diagnosis.residual_text import STATES
 from torchdlo.sysid.diagnosis.verdict import Diagnosis
 from torchdlo.sysid.recordings.recording import Recording
+from torchdlo.untrusted import for_html
 
 __all__ = ["PAGE", "diagnosis_html", "snippet", "write_report"]
 
@@ -42,8 +42,8 @@ def diagnosis_html(
     name = recording.path.resolve().name
     order = [recording.test[k] for k in np.argsort(-np.nan_to_num(result.before, nan=np.inf))]
     sections = [
-        f"<h1>{html.escape(name)}</h1>",
-        f'<p class="verdict">{html.escape(summary(result, recording))}</p>',
+        f"<h1>{for_html(name)}</h1>",
+        f'<p class="verdict">{for_html(summary(result, recording))}</p>',
         listed(result.notes),
         _section("The gap on trials that were not used", _bars(result, recording)),
         _section("Replay, worst trial first", player.replay(recording, result.predictions, order)),
@@ -56,7 +56,7 @@ def diagnosis_html(
         _section("The floor", _floor(found)),
         _section("Health of the data", _health(found)),
         _section("The model again", _again(recording, model)),
-        _section("Limits", f"<p>{html.escape(_LIMITS)}</p>"),
+        _section("Limits", f"<p>{for_html(_LIMITS)}</p>"),
         _section("Made by", _made_by(found, command)),
     ]
     return page(name, STYLE + chart.STYLE + player.STYLE, "\n".join(s for s in sections if s))
@@ -70,7 +70,7 @@ _LIMITS = (
 
 
 def _section(title: str, content: str) -> str:
-    return f"<h2>{html.escape(title)}</h2>\n{content}" if content else ""
+    return f"<h2>{for_html(title)}</h2>\n{content}" if content else ""
 
 
 def _bars(result: Diagnosis, recording: Recording) -> str:
@@ -128,8 +128,8 @@ def _effects(found: dict[str, Any]) -> str:
         ]
         share = percent(effect["share_of_gap"])
         parts.append(
-            f"<h3>{html.escape(words(effect['name']))}</h3><p>{MEANING[effect['kind']].capitalize()}; it closes "
-            f"{share} of the gap above the floor on the test trials.</p><pre>{html.escape(law(effect['name']))}</pre>"
+            f"<h3>{for_html(words(effect['name']))}</h3><p>{MEANING[effect['kind']].capitalize()}; it closes "
+            f"{share} of the gap above the floor on the test trials.</p><pre>{for_html(law(effect['name']))}</pre>"
             + (table(("number", "value", "90 % range", "unit"), rows) if rows else "")
         )
     return "".join(parts)
@@ -230,8 +230,8 @@ def snippet(recording: Recording, model: Path) -> str:
 def _again(recording: Recording, model: Path) -> str:
     path = shlex.quote(str(recording.path))
     return (
-        f"<pre>{html.escape(snippet(recording, model))}</pre><p>Or go on from it:</p>"
-        f"<pre>torchdlo calibrate {html.escape(path)} --model {html.escape(shlex.quote(str(model)))}</pre>"
+        f"<pre>{for_html(snippet(recording, model))}</pre><p>Or go on from it:</p>"
+        f"<pre>torchdlo calibrate {for_html(path)} --model {for_html(shlex.quote(str(model)))}</pre>"
     )
 
 
@@ -240,5 +240,5 @@ def _made_by(found: dict[str, Any], command: str) -> str:
     asked = ", ".join(f"{k} {v}" for k, v in found["options"].items() if v is not None)
     lines = [f"{found['seconds']:.0f} s; {versions}.", f"Options: {asked}." if asked else ""]
     lines.append(f"Content of the recording: sha256 {found['recording_sha256'][:16]}.")
-    told = "".join(f"<p class=soft>{html.escape(line)}</p>" for line in lines if line)
-    return (f"<pre>{html.escape(command)}</pre>" if command else "") + told
+    told = "".join(f"<p class=soft>{for_html(line)}</p>" for line in lines if line)
+    return (f"<pre>{for_html(command)}</pre>" if command else "") + told

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import html
 import io
 import math
 from pathlib import Path
@@ -15,6 +14,7 @@ from torchdlo.files import write_atomically
 from torchdlo.report.pages.page import STYLE, listed, number, page, table, words
 from torchdlo.sysid.estimation.result import Calibration, Overlay, versions
 from torchdlo.sysid.recordings.recording import Recording
+from torchdlo.untrusted import for_html, for_plot
 
 __all__ = ["PAGE", "PICTURE", "filmed_html", "overlay_png", "verdict", "write_report"]
 
@@ -67,7 +67,7 @@ def overlay_png(overlays: list[Overlay]) -> bytes:
         axis.plot(*each.after.T, color="#00c2d6", lw=1.2, label="calibrated")
         height, width = each.picture.shape
         axis.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), xticks=[], yticks=[])
-        axis.set_title(each.title, fontsize=10)
+        axis.set_title(for_plot(each.title), fontsize=10)
     if chosen:
         figure.legend(*axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=2, frameon=False)
     buffer = io.BytesIO()
@@ -77,14 +77,14 @@ def overlay_png(overlays: list[Overlay]) -> bytes:
 
 def filmed_html(result: Calibration, recording: Recording, png: bytes, *, command: str = "") -> str:
     """The page, with the picture inside."""
-    name = html.escape(recording.path.resolve().name)
+    name = for_html(recording.path.resolve().name)
     picture = base64.b64encode(png).decode("ascii")
     rope = {k: v for k, v in result.parameters.items() if not k.startswith("camera_")}
     camera = {k: v for k, v in result.parameters.items() if k.startswith("camera_")}
     tools = ", ".join(f"{tool} {version}" for tool, version in versions().items())
     sections = [
         f"<h1>{name}</h1>",
-        f'<p class="verdict">{html.escape(verdict(result, recording))}</p>',
+        f'<p class="verdict">{for_html(verdict(result, recording))}</p>',
         f'<img alt="Pictures of the films with the simulated rope before and after" '
         f'src="data:image/png;base64,{picture}">',
         "<h2>Parameters</h2>",
@@ -102,10 +102,10 @@ def filmed_html(result: Calibration, recording: Recording, png: bytes, *, comman
         "1 % and half a frame.</p>",
         _parameters(camera),
         "<h2>Made by</h2>",
-        f"<pre>{html.escape(command)}</pre>" if command else "",
-        f"<p>{html.escape(f'{result.seconds:.0f} s, seed {result.seed}; {tools}.')}</p>",
+        f"<pre>{for_html(command)}</pre>" if command else "",
+        f"<p>{for_html(f'{result.seconds:.0f} s, seed {result.seed}; {tools}.')}</p>",
     ]
-    return page(name, STYLE, "\n".join(s for s in sections if s))
+    return page(recording.path.resolve().name, STYLE, "\n".join(s for s in sections if s))
 
 
 def _parameters(entries: dict[str, dict[str, Any]]) -> str:

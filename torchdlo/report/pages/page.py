@@ -2,30 +2,31 @@
 
 from __future__ import annotations
 
-import html
 import math
 from typing import Any
+
+from torchdlo.untrusted import for_html
 
 
 def page(title: str, style: str, body: str) -> str:
     """The whole page."""
-    return _FRAME.format(title=html.escape(title), style=style, body=body)
+    return _FRAME.format(title=for_html(title), style=style, body=body)
 
 
 def table(heads: tuple[str, ...], rows: list[tuple[str, ...]], *, last_is_ours: bool = False) -> str:
     """A table; its last row may be marked as ours."""
-    lines = ['<div class="wide"><table><thead><tr>', *(f"<th>{html.escape(h)}</th>" for h in heads)]
+    lines = ['<div class="wide"><table><thead><tr>', *(f"<th>{for_html(h)}</th>" for h in heads)]
     lines.append("</tr></thead><tbody>")
     for index, row in enumerate(rows):
         ours = ' class="ours"' if last_is_ours and index == len(rows) - 1 else ""
-        cells = "".join(f"<td>{html.escape(cell)}</td>" for cell in row)
+        cells = "".join(f"<td>{for_html(cell)}</td>" for cell in row)
         lines.append(f"<tr{ours}>{cells}</tr>")
     return "".join(lines) + "</tbody></table></div>"
 
 
 def listed(sentences: list[str]) -> str:
     """Sentences as a list, nothing for none."""
-    items = "".join(f"<li>{html.escape(s)}</li>" for s in sentences)
+    items = "".join(f"<li>{for_html(s)}</li>" for s in sentences)
     return f"<ul>{items}</ul>" if items else ""
 
 

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import base64
-import html
 import json
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 from torchdlo.report.pages.page import STYLE, number, page, table
+from torchdlo.untrusted import for_html
 
 __all__ = ["plan_html"]
 
@@ -28,9 +28,9 @@ def plan_html(result: Mapping[str, Any], exchanges: Sequence[Mapping[str, Any]],
     done = result["success"]
     verdict = "The task is done." if done else f"The task is not done: {result['ended']}."
     parts = [
-        f"<h1>{html.escape(result['task'])}</h1>",
-        f'<p class="verdict {"good" if done else "bad"}">{html.escape(verdict)}</p>',
-        f"<p>Planned by: <b>{html.escape(result['source'])}</b>. The task's own condition decided whether it is done. "
+        f"<h1>{for_html(result['task'])}</h1>",
+        f'<p class="verdict {"good" if done else "bad"}">{for_html(verdict)}</p>',
+        f"<p>Planned by: <b>{for_html(result['source'])}</b>. The task's own condition decided whether it is done. "
         f"The plan was {'' if result['options']['update'] else 'not '}updated after every step.</p>",
         table(("steps", "updates", "requests", "tokens", "episodes", "seconds"), [_cost(result)]),
     ]
@@ -55,35 +55,35 @@ def _step(place: int, carried: Mapping[str, Any], pictures: Mapping[str, bytes])
     rows = [(name, text, number(carried["terms"].get(name))) for name, text in step["reward"].items()]
     rows.append(("success", step["success"], "yes" if carried["success"] else "no"))
     found = [
-        f"<h2>{place}. {html.escape(step['description'])}</h2>",
+        f"<h2>{place}. {for_html(step['description'])}</h2>",
         f'<p class="{"good" if carried["success"] else "bad"}">{how}</p>',
-        f"<p>{html.escape(held)}; {step['horizon']} actions; {carried['episodes']} episodes in "
-        f"{number(carried['seconds'])} s. {html.escape(step['reward_description'])}</p>",
+        f"<p>{for_html(held)}; {step['horizon']} actions; {carried['episodes']} episodes in "
+        f"{number(carried['seconds'])} s. {for_html(step['reward_description'])}</p>",
         f'<div class="text">{table(("term", "expression", "at the end"), rows)}</div>',
     ]
     if carried["failed"]:
-        found.append(f"<p>{html.escape(carried['failed'])}</p>")
+        found.append(f"<p>{for_html(carried['failed'])}</p>")
     return [*found, *(_image(pictures, digest) for digest in carried["pictures"])]
 
 
 def _image(pictures: Mapping[str, bytes], digest: str) -> str:
     content = pictures.get(digest)
     if content is None:
-        return f'<p class="soft">picture {html.escape(digest)}</p>'
+        return f'<p class="soft">picture {for_html(digest)}</p>'
     return f'<img alt="" src="data:image/png;base64,{base64.b64encode(content).decode()}">'
 
 
 def _exchange(each: Mapping[str, Any], pictures: Mapping[str, bytes]) -> list[str]:
     request = each["request"]
     head = f"{each['number']}. {request['kind']}: {each['tokens']} tokens, {number(each['seconds'])} s"
-    found = [f"<details><summary>{html.escape(head)}</summary>"]
+    found = [f"<details><summary>{for_html(head)}</summary>"]
     for message in request["messages"]:
-        found.append(f"<h3>{html.escape(message['role'])}</h3>")
-        found.append(f'<pre class="said">{html.escape(message["text"][:_SHOWN])}</pre>')
+        found.append(f"<h3>{for_html(message['role'])}</h3>")
+        found.append(f'<pre class="said">{for_html(message["text"][:_SHOWN])}</pre>')
         found += [_image(pictures, digest[:16]) for digest in message["pictures"]]
     found += [
-        f"<h3>{html.escape(each['source'])}</h3>",
-        f'<pre class="said">{html.escape(_pretty(each))}</pre></details>',
+        f"<h3>{for_html(each['source'])}</h3>",
+        f'<pre class="said">{for_html(_pretty(each))}</pre></details>',
     ]
     return found
 

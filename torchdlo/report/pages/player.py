@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import base64
-import html
-import json
 from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from torchdlo.sysid.recordings.recording import Recording, Trial
+from torchdlo.untrusted import for_html, json_in_html
 
 __all__ = ["STYLE", "replay"]
 
@@ -31,8 +30,8 @@ def replay(recording: Recording, predictions: Mapping[str, Mapping[str, np.ndarr
         "gripped": [int(g) for g in order[0].gripped],
         "table": recording.table_height,
     }
-    options = "".join(f'<option value="{k}">{html.escape(t["name"])}</option>' for k, t in enumerate(trials))
-    data = json.dumps(content).replace("</", "<\\/")
+    options = "".join(f'<option value="{k}">{for_html(t["name"])}</option>' for k, t in enumerate(trials))
+    data = json_in_html(content)
     return _HTML.format(options=options, data=data, script=_SCRIPT)
 
 

@@ -19,6 +19,7 @@ from torchdlo.errors import InputError
 from torchdlo.files import replacing
 from torchdlo.sysid.recordings import rope_schema
 from torchdlo.sysid.video.films import FilmFile, film_files, with_stations
+from torchdlo.untrusted import check_path
 
 __all__ = [
     "Recording",
@@ -147,7 +148,8 @@ def save_recording(recording: Recording, path: str | Path) -> None:
 
 
 def check_new_folder(path: Path) -> None:
-    """Refuse a path at which something is already."""
+    """Refuse a path at which something is already, or that could not be written down."""
+    check_path(path.absolute(), "path to write to")
     if path.exists() and (not path.is_dir() or any(path.iterdir())):
         raise InputError(f"{path}: exists and is not an empty folder; choose a new one.")
 
@@ -170,7 +172,7 @@ def save_trial(path: str | Path, trial: Trial) -> None:
 
 def _load_trial(path: Path, length: float, films: Mapping[str, tuple[FilmFile, ...]]) -> Trial:
     own = films.get(path.stem, ())
-    arrays = rope_schema.read_arrays(path, filmed=bool(own))
+    arrays = rope_schema.read_trial(path, filmed=bool(own))
     arrays = rope_schema.check_arrays(path, arrays, length, filmed=bool(own))
     trial = Trial(name=path.stem, **arrays, films=own)
     return with_stations(trial, length) if own else trial

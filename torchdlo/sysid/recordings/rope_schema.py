@@ -17,10 +17,9 @@ import numpy as np
 from torchdlo.errors import InputError
 from torchdlo.sysid.recordings.trial_checks import check_clamps, check_markers, check_time
 from torchdlo.untrusted import check_path, read_json
-from torchdlo.untrusted.array_file import Header
-from torchdlo.untrusted.array_file import read_arrays as untrusted_arrays
+from torchdlo.untrusted.array_file import Header, read_arrays
 
-__all__ = ["OPTIONAL", "REQUIRED", "check_arrays", "check_rope", "read_arrays", "trial_files"]
+__all__ = ["OPTIONAL", "REQUIRED", "check_arrays", "check_rope", "read_trial", "trial_files"]
 
 REQUIRED = ("length", "radius", "mass", "gravity", "table_height", "marker_noise_std")
 """Entries that every rope.json has."""
@@ -98,7 +97,7 @@ def _color(path: Path, value: Any) -> tuple[float, float, float] | None:
     return float(rgb[0]), float(rgb[1]), float(rgb[2])
 
 
-def read_arrays(path: Path, *, filmed: bool = False) -> dict[str, np.ndarray]:
+def read_trial(path: Path, *, filmed: bool = False) -> dict[str, np.ndarray]:
     """Read the arrays of a trial; names and shapes are checked before anything is inflated.
 
     Args:
@@ -119,7 +118,7 @@ def read_arrays(path: Path, *, filmed: bool = False) -> dict[str, np.ndarray]:
                 _refuse(path, name, "dtype float", f"{headers[name].dtype}")
         _check_shapes(path, headers, 1 if filmed else 3)
 
-    return untrusted_arrays(path, "a trial", check=check)
+    return read_arrays(path, "a trial", check=check)
 
 
 def check_arrays(path: Path, arrays: dict[str, np.ndarray], length: float, *, filmed: bool = False) -> dict[str, Any]:
