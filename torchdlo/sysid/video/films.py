@@ -47,7 +47,7 @@ def film_files(path: Path, trials: Sequence[str]) -> dict[str, tuple[FilmFile, .
     found = [
         f
         for f in sorted(path.iterdir())
-        if f.name.startswith(("train_", "test_")) and "." in f.name.removesuffix(f.suffix if f.is_file() else "")
+        if f.name.startswith(("train_", "test_")) and "." in f.name.removesuffix("" if f.is_dir() else f.suffix)
         if f.is_dir() or f.suffix.lower() in _SUFFIXES
     ]
     bare = [
