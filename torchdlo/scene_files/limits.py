@@ -6,7 +6,7 @@ import dataclasses
 import math
 from typing import Any
 
-from torchdlo import budget
+from torchdlo import work_budget
 from torchdlo.errors import InputError
 from torchdlo.scene_files.schema import ParticleBlockSpec, SceneDescription
 
@@ -122,12 +122,12 @@ def check_memory(d: SceneDescription, where: str = "scene", frame_stride: int | 
     parts = [f"{vertices:.4g} vertices", f"{steps:.4g} steps"]
     parts += [f"{points:.4g} material points", f"{nodes:.4g} cells"] if points else []
     cure = "use fewer vertices, a shorter duration, a longer dt" + (", or a larger spacing" if points else "")
-    budget.check(where, ", ".join(parts), memory=state + commands, cure=cure)
+    work_budget.check(where, ", ".join(parts), memory=state + commands, cure=cure)
     if frame_stride is not None:
         each = 32.0 * vertices + 24 * held + 56 * (len(d.bodies) + moved) + 12 * points
         frames = (steps / frame_stride + 1) * each
         work, cure = f"{steps / frame_stride:.4g} frames", "keep fewer with a larger --frame-stride"
-        budget.check(where, work, memory=2 * frames, cure=cure)
+        work_budget.check(where, work, memory=2 * frames, cure=cure)
 
 
 def check_time(d: SceneDescription, where: str = "scene", *, compiled: bool = False) -> None:
@@ -138,7 +138,7 @@ def check_time(d: SceneDescription, where: str = "scene", *, compiled: bool = Fa
     steps, share = steps_of(d), _COMPILED if compiled else 1.0
     work = f"{steps:.4g} steps of {d.substeps} substeps with {vertices:.4g} vertices"
     work += f" and {points:.4g} material points" if points else ""
-    budget.check(
+    work_budget.check(
         where, work, seconds=steps * d.substeps * substep * share, cure="use fewer vertices, steps or substeps"
     )
 

@@ -14,10 +14,10 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from torchdlo.budget import size_text
 from torchdlo.errors import InputError
 from torchdlo.untrusted.names import one_line
 from torchdlo.untrusted.regular_file import open_regular
+from torchdlo.work_budget import size_text
 
 __all__ = ["MOST", "ArrayFile", "Header", "read_arrays"]
 

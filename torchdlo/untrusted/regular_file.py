@@ -7,9 +7,9 @@ import stat
 from pathlib import Path
 from typing import BinaryIO
 
-from torchdlo.budget import size_text
 from torchdlo.errors import InputError
 from torchdlo.untrusted.names import one_line
+from torchdlo.work_budget import size_text
 
 __all__ = ["MissingFile", "open_regular", "read_bytes", "read_text"]
 

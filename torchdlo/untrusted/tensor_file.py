@@ -7,10 +7,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from torchdlo.budget import size_text
 from torchdlo.errors import InputError
 from torchdlo.untrusted.names import one_line
 from torchdlo.untrusted.regular_file import open_regular
+from torchdlo.work_budget import size_text
 
 if TYPE_CHECKING:
     import torch

@@ -18,7 +18,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchdlo import budget
+from torchdlo import work_budget
 from torchdlo.coupling.bodies import shape_sdf, triangles
 from torchdlo.coupling.bodies.dynamics import RigidBody
 from torchdlo.errors import InputError
@@ -223,7 +223,7 @@ def _sampled(vertices: Tensor, faces: Tensor, options: Sampling, name: str) -> M
     cells = [2 * math.ceil(float(h) / step + MARGIN) for h in half]
     nodes = float(math.prod(n + 1 for n in cells))
     work = f"{options.cells} cells along the longest side, {nodes:.4g} in all,"
-    budget.check(name, work, memory=30 * nodes, seconds=2e-5 * nodes, cure="use fewer cells")
+    work_budget.check(name, work, memory=30 * nodes, seconds=2e-5 * nodes, cure="use fewer cells")
     size = torch.tensor([0.5 * n * step for n in cells], dtype=torch.float64)
     axes = tuple(
         torch.linspace(-float(s), float(s), n + 1, dtype=torch.float64) for s, n in zip(size, cells, strict=True)

@@ -15,8 +15,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchdlo import budget
 from torchdlo import scene as scenes
+from torchdlo import work_budget
 from torchdlo.coupling.bodies.dynamics import turn_by
 from torchdlo.coupling.common.pose import Pose
 from torchdlo.coupling.robot import attachment as grasp
@@ -203,7 +203,7 @@ def prepare(
         segment: frames that gradients run again at once; None keeps all of them in memory.
     """
     if like is None or like.device.type == "cpu":
-        budget.check(task.name, f"{num} scenes at once", memory=_SCENE_BYTES * num, cure="use fewer at once")
+        work_budget.check(task.name, f"{num} scenes at once", memory=_SCENE_BYTES * num, cure="use fewer at once")
     moved = task.moved(num, like=like, generator=generator, variation=variation)
     return prepare_at(task, moved, compiled=compiled, recorded=recorded, segment=segment)
 

@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from torchdlo import budget, notices, scene_files
+from torchdlo import notices, scene_files, work_budget
 from torchdlo.cli import app
 from torchdlo.errors import InputError
 from torchdlo.scene_files import limits
@@ -42,7 +42,7 @@ LARGE = {
 def test_scenes_beyond_the_machine_are_refused_before_the_work(
     case: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(budget, "available_memory", lambda: 20e9)
+    monkeypatch.setattr(work_budget, "available_memory", lambda: 20e9)
     change, sentence = LARGE[case]
     (tmp_path / "scene.json").write_text(json.dumps(SCENE | change))
     before, begun = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, time.process_time()
@@ -59,7 +59,7 @@ def test_the_cells_of_a_mesh_are_counted_before_they_are_made(tmp_path: Path, mo
     trimesh = pytest.importorskip("trimesh")
     from torchdlo.coupling.bodies.mesh_sdf import load_mesh
 
-    monkeypatch.setattr(budget, "available_memory", lambda: 20e9)
+    monkeypatch.setattr(work_budget, "available_memory", lambda: 20e9)
     trimesh.creation.box((0.1, 0.1, 0.1)).export(tmp_path / "box.stl")
     with pytest.raises(InputError, match=r"box.stl: 100000 cells .* need about .* TB of mem"):
         load_mesh(tmp_path / "box.stl", cells=100_000, cache=tmp_path)
@@ -94,10 +94,10 @@ def test_the_estimate_of_time_is_of_the_right_size() -> None:
 
 
 def test_sizes_and_times_are_for_people() -> None:
-    assert budget.size_text(4.98e12) == "4.98 TB" and budget.size_text(12) == "12 bytes"
-    assert budget.duration_text(90) == "1.5 minutes" and budget.duration_text(3e9) == "95 years"
-    assert budget.duration_text(59) == "59 s"
-    assert 1e8 < budget.available_memory() < 1e15
+    assert work_budget.size_text(4.98e12) == "4.98 TB" and work_budget.size_text(12) == "12 bytes"
+    assert work_budget.duration_text(90) == "1.5 minutes" and work_budget.duration_text(3e9) == "95 years"
+    assert work_budget.duration_text(59) == "59 s"
+    assert 1e8 < work_budget.available_memory() < 1e15
 
 
 def test_batches_beyond_the_machine_are_refused() -> None:
