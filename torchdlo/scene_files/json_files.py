@@ -20,7 +20,7 @@ from torchdlo.physics.effects import EFFECTS as PHYSICS
 from torchdlo.scene_files import limits
 from torchdlo.scene_files.older import OLDER, upgraded
 from torchdlo.scene_files.schema import SceneDescription
-from torchdlo.untrusted import parse_json, read_text
+from torchdlo.untrusted import one_line, parse_json, read_text
 from torchdlo.untrusted.json_file import MOST
 
 __all__ = ["EFFECTS", "FORMAT", "like", "parse", "plain", "read", "save", "text"]
@@ -68,7 +68,9 @@ def parse(content: str, *, where: str = "scene") -> SceneDescription:
         hint = ""
         if given == "torchdlo-model":
             hint = ' It is a model file: write a scene around it, {"model": "..."} in one of its ropes.'
-        raise InputError(f'{where}: expected an object with "format": "{FORMAT}", given {given!r}.{hint}')
+        raise InputError(
+            f'{where}: expected an object with "format": "{FORMAT}", given {one_line(repr(given), 60)}.{hint}'
+        )
     if found.pop("format") == OLDER:
         found = upgraded(found)
     description = _checked(SceneDescription, found, where, "")

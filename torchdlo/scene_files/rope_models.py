@@ -155,7 +155,7 @@ def _filled(
     }
     alone = {f.name: f.default for f in dataclasses.fields(RopeSpec)}
     missing = {name: value for name, value in usual.items() if getattr(r, name) == alone[name]}
-    if r.radius == alone["radius"] and rope["radius"]:
+    if r.radius == alone["radius"] and rope.get("radius"):
         missing["radius"] = rope["radius"]
     if r.density is not None:
         missing.pop("mass", None)

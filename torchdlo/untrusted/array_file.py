@@ -117,6 +117,9 @@ class ArrayFile:
 
     def __getitem__(self, name: str) -> np.ndarray:
         """Return an array."""
+        if name not in self.headers:
+            found = one_line(", ".join(self.headers), 200) or "none"
+            raise InputError(f"{self.where}: {one_line(name, 60)}: expected this array in {self.what}, found {found}.")
         self.check_size([name])
         try:
             with self._archive.open(f"{name}.npy") as member:

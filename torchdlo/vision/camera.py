@@ -18,7 +18,7 @@ from torch import Tensor
 
 from torchdlo.errors import InputError
 from torchdlo.files import write_atomically
-from torchdlo.untrusted import read_json
+from torchdlo.untrusted import one_line, read_json
 
 __all__ = ["NEAR", "Camera", "Lens", "back_project", "lens", "load_cameras", "looking_at", "project", "save_cameras"]
 
@@ -238,4 +238,4 @@ def _number(path: Path, where: str, value: Any, above: float) -> float:
 
 
 def _refuse(path: Path, where: str, expected: str, found: str) -> NoReturn:
-    raise InputError(f"{path}: {where}: expected {expected}, found {found}.")
+    raise InputError(f"{path}: {where}: expected {expected}, found {one_line(found, 100)}.")

@@ -146,11 +146,15 @@ def ranges_from(content: Any, where: str) -> Ranges:
             good = all(isinstance(v, (int, float)) and not isinstance(v, bool) and math.isfinite(v) for v in pair)
             if not good or not all(0 <= v <= _LIMITS[name] for v in pair):
                 limit = f"{_LIMITS[name]:g}"
-                raise InputError(f"{where}: {name}: expected [lowest, highest] from 0 to {limit}, found {value!r}.")
+                raise InputError(
+                    f"{where}: {name}: expected [lowest, highest] from 0 to {limit}, found {one_line(repr(value), 60)}."
+                )
             given[name] = (float(pair[0]), float(pair[1]))
         elif name in ("close", "smallest"):
             if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value <= 10_000:
-                raise InputError(f"{where}: {name}: expected a whole number from 0 to 10000, found {value!r}.")
+                raise InputError(
+                    f"{where}: {name}: expected a whole number from 0 to 10000, found {one_line(repr(value), 60)}."
+                )
             given[name] = value
         else:
             raise InputError(f"{where}: {name}: unknown; known are hue, saturation, value, close, smallest.")

@@ -19,7 +19,7 @@ from torchdlo.sysid.estimation.evaluation import rope
 from torchdlo.sysid.model.discretisation import make_mesh
 from torchdlo.sysid.model.rope_model import RopeModel
 from torchdlo.sysid.recordings.recording import Recording
-from torchdlo.untrusted import read_json
+from torchdlo.untrusted import one_line, read_json
 
 __all__ = ["FORMAT", "VERSION", "ModelFile", "content", "load"]
 
@@ -239,4 +239,4 @@ def _number(path: Path, name: str, value: Any, low: float = -math.inf, high: flo
 
 
 def _refuse(path: Path, name: str, expected: str, found: str) -> NoReturn:
-    raise InputError(f"{path}: {name}: expected {expected}, found {found}.")
+    raise InputError(f"{path}: {name}: expected {expected}, found {one_line(found, 100)}.")

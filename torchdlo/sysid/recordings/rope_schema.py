@@ -16,7 +16,7 @@ import numpy as np
 
 from torchdlo.errors import InputError
 from torchdlo.sysid.recordings.trial_checks import check_clamps, check_markers, check_time
-from torchdlo.untrusted import check_path, read_json
+from torchdlo.untrusted import check_path, one_line, read_json
 from torchdlo.untrusted.array_file import Header, read_arrays
 
 __all__ = ["OPTIONAL", "REQUIRED", "check_arrays", "check_rope", "read_trial", "trial_files"]
@@ -255,4 +255,4 @@ def _kind(value: object) -> str:
 
 
 def _refuse(path: Path, name: str, expected: str, found: str) -> NoReturn:
-    raise InputError(f"{path}: {name}: expected {expected}, found {found}.")
+    raise InputError(f"{path}: {name}: expected {expected}, found {one_line(found, 100)}.")
