@@ -491,6 +491,37 @@ def _read_policy(folder: Path) -> Any:
     return load(folder / "policy.pt", notes=True)
 
 
+def _chunk_policy(folder: Path) -> None:
+    from torchdlo.agents.policies.chunk_policy import ChunkPolicy, Shape, save_policy
+
+    torch.manual_seed(0)
+    shape = Shape(1, ("a",), 8, 3, chunk=2, width=8, channels=(8,), layers=1, heads=1)
+    save_policy(folder / "chunk.pt", ChunkPolicy(shape), {"tasks": ["lifting"]})
+
+
+def _read_chunk_policy(folder: Path) -> Any:
+    from torchdlo.agents.policies.chunk_policy import load_policy
+
+    return load_policy(folder / "chunk.pt")
+
+
+def _expert(folder: Path) -> None:
+    from torchdlo.agents.rl.expert import Expert, save_expert
+    from torchdlo.envs import find
+
+    task = find("lifting")
+    shape = (task.horizon, task.arms.count, 3)
+    gain = torch.zeros(*shape, len(task.reset_noise), 2)
+    save_expert(Expert(torch.zeros(shape), gain, "here"), folder / "expert.json", task, {})
+
+
+def _read_expert(folder: Path) -> Any:
+    from torchdlo.agents.rl.expert import load_expert
+    from torchdlo.envs import find
+
+    return load_expert(folder / "expert.json", find("lifting"))
+
+
 def _pickle(folder: Path) -> None:
     frames = [[[0.1 * k + 0.01 * t + axis for k in range(6)] for axis in range(3)] for t in range(5)]
     (folder / "0.pkl").write_bytes(pickle.dumps(frames))
@@ -558,11 +589,15 @@ KINDS: dict[str, Kind] = {
         "masks.npz", lambda f: np.savez_compressed(f / "masks.npz", masks=np.zeros((3, 8, 9), bool)), _read_masks
     ),
     "policy": Kind("policy.pt", _policy, _read_policy),
+    "policy of pictures": Kind("chunk.pt", _chunk_policy, _read_chunk_policy),
+    "expert": Kind("expert.json", _expert, _read_expert),
     "DEFORM pickle": Kind("0.pkl", _pickle, _read_pickle),
     "URDF": Kind("r.urdf", _text("r.urdf", ROBOT), _read_robot),
     "mesh .stl": Kind("m.stl", _mesh("m.stl"), _read_mesh("m.stl")),
     "mesh .obj": Kind("m.obj", _mesh("m.obj"), _read_mesh("m.obj")),
     "mesh .ply": Kind("m.ply", _mesh("m.ply"), _read_mesh("m.ply")),
+    "mesh .off": Kind("m.off", _mesh("m.off"), _read_mesh("m.off")),
+    "mesh .glb": Kind("m.glb", _mesh("m.glb"), _read_mesh("m.glb")),
 }
 
 

@@ -17,7 +17,7 @@ import numpy as np
 from torchdlo.agents.trajopt.result import upgraded
 from torchdlo.errors import InputError
 from torchdlo.files import replacing
-from torchdlo.untrusted import parse_json, read_json
+from torchdlo.untrusted import one_line, parse_json, read_json
 from torchdlo.untrusted.array_file import ArrayFile
 
 __all__ = ["ARCHIVE", "NAME", "load_trajectory", "pack", "read_index", "read_searches", "unpack"]
@@ -60,7 +60,7 @@ def read_searches(archive: str | Path) -> Iterator[tuple[str, dict[str, Any], di
     with _Archive(archive) as found:
         for entry in found.index():
             name = entry["name"]
-            yield name, upgraded(found.json(f"{name}/result")), _trajectory(found, name)
+            yield name, found.result(name), _trajectory(found, name)
 
 
 def pack(folder: str | Path, archive: str | Path) -> int:
@@ -108,10 +108,17 @@ def _exact(value: list[Any]) -> np.ndarray:
 
 def _trajectory(found: _Archive, name: str) -> dict[str, Any]:
     content = found.json(f"{name}/trajectory")
-    own = [
-        key for key in found.files if key.startswith(f"{name}/") and key.split("/")[1] not in ("result", "trajectory")
-    ]
-    return content | {key.split("/")[1]: found[key].astype(np.float64) for key in own}
+    if not isinstance(content, dict):
+        raise InputError(
+            f"{found.inner.where}: {one_line(name, 60)}/trajectory: expected an object, found another value."
+        )
+    for key in found.files:
+        if key.startswith(f"{name}/") and key.split("/")[1] not in ("result", "trajectory"):
+            value = found[key]
+            if not isinstance(value, np.ndarray) or value.dtype.kind not in "fiu":
+                raise InputError(f"{found.inner.where}: {one_line(key, 60)}: expected numbers, found something else.")
+            content[key.split("/")[1]] = value.astype(np.float64)
+    return content
 
 
 class _Archive:
@@ -134,6 +141,17 @@ class _Archive:
     def json(self, key: str) -> Any:
         """Return the value of a text of JSON."""
         return parse_json(str(self[key]), where=f"{self.inner.where}: {key}", finite=False)
+
+    def result(self, name: str) -> dict[str, Any]:
+        """Return what a result.json said."""
+        try:
+            return upgraded(self.json(f"{name}/result"))
+        except (AttributeError, TypeError, ValueError) as error:
+            if isinstance(error, InputError):
+                raise
+            raise InputError(
+                f"{self.inner.where}: {one_line(name, 60)}/result: expected a result of a search."
+            ) from None
 
     def index(self) -> list[dict[str, Any]]:
         """Return what there is, an entry for each search."""
