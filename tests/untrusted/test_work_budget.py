@@ -108,6 +108,24 @@ def test_batches_beyond_the_machine_are_refused() -> None:
         episode.prepare(find("lifting"), 10**9)
 
 
+def test_searches_and_calibrations_beyond_the_machine_are_refused(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(work_budget, "available_memory", lambda: 20e9)
+    many = ("optimize", "lifting", "--method", "gd", "--population", "1000000000", "--episodes", "2000000000")
+    for words, sentence in (
+        (many, r"population: 1e.09 trajectories at once need about .* TB of memory"),
+        (
+            ("calibrate", str(folder), "--vertices", "1000000000"),
+            r"vertices: expected 2 to 100000 for a rope, given 1e.09",
+        ),
+    ):
+        with pytest.raises(SystemExit) as caught:
+            app.main(list(words))
+        assert caught.value.code == 2 and re.search(sentence, capsys.readouterr().err)
+
+
 def test_models_of_broken_meshes_are_refused(folder: Path) -> None:
     content = {
         "format": model_file.FORMAT,

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import html
-import json
 import os
 from pathlib import Path
 from typing import Any
-from unicodedata import category
 
 from torchdlo.errors import InputError
 
 __all__ = ["check_path", "for_html", "for_plot", "for_terminal", "json_in_html", "one_line"]
 
+_SPACES = "\u00a0\u1680\u2000\u2001\u2002\u2003\u2004\u2005\u2006\u2007\u2008\u2009\u200a\u202f\u205f\u3000"
+"""Spaces of other widths, which are not called printable, and harm nobody."""
 _MOST = 400
 """Most letters of a name in a sentence."""
 
@@ -35,23 +34,28 @@ def for_plot(text: object) -> str:
 
 def for_html(text: object) -> str:
     """Return text for a page: nothing in it is markup, and all of it can be encoded. To be used once."""
+    import html
+
     return html.escape(for_terminal(text))
 
 
 def json_in_html(value: Any) -> str:
     r"""Return JSON for the inside of a <script>: no letter in it begins markup, a comment or another script."""
+    import json
+
     written = json.dumps(value, allow_nan=False)
     return written.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
 
 
 def check_path(path: str | Path, what: str = "name") -> None:
     """Refuse a path that is not text in UTF-8 or holds control characters, before work that would write it down."""
-    if any(not c.isprintable() and category(c) in ("Cc", "Cs", "Cf") for c in os.fspath(path)):
+    text = os.fspath(path)
+    if not text.isprintable() and any(_visible(c) != c for c in text):
         raise InputError(f"{one_line(path)}: expected a {what} of printable letters in UTF-8, found others; rename it.")
 
 
 def _visible(c: str) -> str:
-    if c.isprintable() or category(c) == "Zs":  # spaces of any width
+    if c.isprintable() or c in _SPACES:
         return c
     code = ord(c)
     if 0xDC80 <= code <= 0xDCFF:  # a byte of a file name that is not UTF-8

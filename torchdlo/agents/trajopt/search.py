@@ -13,6 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torchdlo import work_budget
 from torchdlo.agents.trajopt.cmaes import cmaes, package
 from torchdlo.agents.trajopt.gradient_descent import descent
 from torchdlo.agents.trajopt.hybrid import hybrid
@@ -91,6 +92,9 @@ class SearchSettings:
             package()
         least = 1 if self.method == "gd" else 4
         need(self.population >= least, "population", f"at least {least} for {self.method}")
+        numbers = self.population * problem.horizon * problem.width
+        work, cure = f"{self.population:.4g} trajectories at once", "give a smaller population"
+        work_budget.check("population", work, memory=64.0 * numbers, cure=cure)
         need(0 <= self.seed < 2**32, "seed", "a whole number from 0 to 2^32 - 1")
         need(self.chunk >= 1, "chunk", "at least 1")
         need(self.hold is None or 1 <= self.hold <= problem.horizon, "hold", f"1 to {problem.horizon} actions")

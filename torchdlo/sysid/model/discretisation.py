@@ -9,9 +9,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchdlo.errors import InputError
 from torchdlo.physics.linalg import rotation
 from torchdlo.physics.linalg.numerics import normalize
 from torchdlo.sysid.recordings.recording import Trial
+
+_MOST = 100_000
+"""Most vertices of a rope."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,6 +98,8 @@ class Mesh:
 
 def make_mesh(trial: Trial, length: float, vertices: int | None) -> Mesh:
     """Return a mesh with a vertex at every marker of a trial, and about `vertices` evenly spaced ones in all."""
+    if vertices is not None and not 2 <= vertices <= _MOST:
+        raise InputError(f"vertices: expected 2 to {_MOST} for a rope, given {vertices:g}.")
     markers = trial.marker_arclength
     stations = list(markers)
     if length > markers[-1] * 1.01:
