@@ -9,6 +9,7 @@ from typing import Annotated
 
 import typer
 
+from torchdlo.cli import ending
 from torchdlo.cli.agent import plan, propose
 from torchdlo.cli.datasets import dataset, learn, sweep
 from torchdlo.cli.doctor import doctor
@@ -34,14 +35,18 @@ app = typer.Typer(
 
 
 def main(args: list[str] | None = None) -> None:
-    """Run the command line; what is wrong with the input is one line on stderr and exit code 2."""
+    """Run the command line.
+
+    What is wrong with the input is one line on stderr and exit code 2; Ctrl-C ends it with 130, SIGTERM with 143.
+    """
     try:
-        app(args=args)
+        with ending.caught(args):
+            app(args=args)
     except InputError as error:
         typer.echo("error: " + " ".join(str(error).splitlines()), err=True)
         raise SystemExit(2) from None
     except OSError as error:
-        typer.echo(f"error: {error}", err=True)
+        typer.echo(f"error: {ending.failed(error)}", err=True)
         raise SystemExit(1) from None
 
 

@@ -23,6 +23,7 @@ from torchdlo.agents.rl.episodes import TaskEpisodes
 from torchdlo.envs import Task
 from torchdlo.errors import InputError
 from torchdlo.files import write_atomically
+from torchdlo.journal import read_json, write_json
 
 __all__ = ["Expert", "Score", "candidates", "follow", "improve", "load_expert", "save_expert"]
 
@@ -122,10 +123,9 @@ class _Journal:
     def __init__(self, path: Path | None, choices: list[Any]) -> None:
         self.path, self.choices, self.rows = path, choices, []
         self.ahead: list[list[list[float]]] = []
-        if path is not None and path.is_file():
-            found = json.loads(path.read_text(encoding="utf-8"))
-            if found["choices"] == choices:
-                self.ahead = found["rows"]
+        found = None if path is None else read_json(path)
+        if found is not None and found.get("choices") == choices:
+            self.ahead = found["rows"]
 
     def recall(self) -> list[Score] | None:
         """Return how the next batch went, if that is known."""
@@ -136,7 +136,7 @@ class _Journal:
         self.rows.append([list(vars(s).values()) for s in scores])
         if self.path is not None and not self.ahead:
             content = {"generator": "torchdlo train", "choices": self.choices, "rows": self.rows}
-            write_atomically(self.path, json.dumps(content) + "\n")
+            write_json(self.path, content, indent=None)
 
 
 @torch.no_grad()

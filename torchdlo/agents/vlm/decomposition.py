@@ -36,6 +36,7 @@ from torchdlo.envs.core import episode, scene_names
 from torchdlo.envs.core.subtask import SubTask, concluded, continue_from, opening
 from torchdlo.errors import InputError
 from torchdlo.files import write_atomically
+from torchdlo.journal import read_json, write_json
 from torchdlo.reward_language import Reward, reward
 from torchdlo.scene import State
 
@@ -229,19 +230,21 @@ class _Run:
         for picture in found.pictures:
             write_atomically(self.folder / "pictures" / f"{picture.digest[:16]}.png", picture.png)
         content = {"generator": "torchdlo plan", "key": self.key(part), **found.plain()}
-        write_atomically(file, json.dumps(content | {"actions": found.actions.tolist()}) + "\n")
+        write_json(file, content | {"actions": found.actions.tolist()}, indent=None)
 
     def recall(self, number: int, part: SubTask) -> tuple[Tensor, int] | None:
         """Return what was found for a step in a run that goes on."""
         file = self.file(number)
         if file is None or not self.talk.resume or not file.is_file():
             return None
+        content = read_json(file)
+        if content is None:
+            return None
         try:
-            content = json.loads(file.read_text(encoding="utf-8"))
             actions = torch.tensor(content["actions"], dtype=torch.float64)
             fits = content["key"] == self.key(part) and actions.shape == (part.horizon, 3 * part.arms.count)
             return (actions, int(content["episodes"])) if fits else None
-        except (OSError, ValueError, KeyError, TypeError):
+        except (ValueError, KeyError, TypeError):
             return None
 
 

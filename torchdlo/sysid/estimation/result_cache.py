@@ -9,8 +9,10 @@ from __future__ import annotations
 import hashlib
 import importlib
 import importlib.metadata
+import io
 import json
-import shutil
+import zipfile
+import zlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import fields, is_dataclass
 from pathlib import Path
@@ -18,15 +20,22 @@ from typing import Any
 
 import numpy as np
 
-from torchdlo.errors import InputError
-from torchdlo.files import replacing, write_atomically
+from torchdlo.journal import Journal
 from torchdlo.sysid.recordings.recording import Recording
-from torchdlo.sysid.recordings.rope_schema import read_arrays
 
 __all__ = ["ResultCache", "digest"]
 
-_MARK = "journal.json"
-"""The file that says what a journal belongs to."""
+_DAMAGED = (
+    OSError,
+    EOFError,
+    ValueError,
+    KeyError,
+    TypeError,
+    AttributeError,
+    ImportError,
+    zipfile.BadZipFile,
+    zlib.error,
+)
 
 _LARGEST = 2**28
 """Results of more bytes are computed again: a disk is not to be filled by a search."""
@@ -48,7 +57,15 @@ def digest(*things: Any) -> str:
 class ResultCache:
     """A folder with the results of finished jobs."""
 
-    def __init__(self, path: Path, recording: Recording, options: dict[str, Any], *, resume: bool = False) -> None:
+    def __init__(
+        self,
+        path: Path,
+        recording: Recording,
+        options: dict[str, Any],
+        *,
+        resume: bool = False,
+        command: str = "diagnose",
+    ) -> None:
         """Open the journal.
 
         Args:
@@ -56,40 +73,32 @@ class ResultCache:
             recording: what the search is about.
             options: all that it depends on besides.
             resume: go on from what is there.
+            command: what it is a journal of.
         """
         self.path = path
         key = digest({f.name: getattr(recording, f.name) for f in fields(recording) if f.name != "path"}, options)
-        mark = {"generator": "torchdlo diagnose", "key": key, "program": _program()}
-        found = self._found()
-        if resume and found is None:
-            raise InputError(f"{path}: expected the journal of a search to resume, found none; leave out --resume.")
-        if resume and found.get("key") != key:
-            raise InputError(
-                f"{path}: the journal belongs to another recording or to other options (budget, seed, vertices, "
-                "model); give the same ones, or leave out --resume."
-            )
-        if resume and found.get("program") != mark["program"]:
-            raise InputError(f"{path}: the journal was written by another version of torchdlo; leave out --resume.")
-        if found is not None and not resume:
-            self.remove()
-        if not resume:
-            write_atomically(path / _MARK, json.dumps(mark) + "\n")
+        mark = {"generator": f"torchdlo {command}", "key": key, "program": _program()}
 
-    def _found(self) -> dict[str, Any] | None:
-        """Return what a journal that is there belongs to, None if there is none; refuse what is not one."""
-        if not self.path.exists() or (self.path.is_dir() and not any(self.path.iterdir())):
-            return None
-        try:
-            found = json.loads((self.path / _MARK).read_text(encoding="utf-8"))
-            if found["generator"] == "torchdlo diagnose":
-                return found
-        except (OSError, ValueError, KeyError, TypeError):
-            pass
-        raise InputError(f"{self.path}: expected a journal of torchdlo, found something else; choose another --out.")
+        def other(found: dict[str, Any]) -> str:
+            if found.get("key") != key:
+                return (
+                    "the journal belongs to another recording or to other options (budget, seed, vertices, model); "
+                    "give the same ones, or leave out --resume."
+                )
+            if found.get("program") != mark["program"]:
+                return "the journal was written by another version of torchdlo; leave out --resume."
+            return ""
+
+        # Archives of numpy begin like this; earlier versions wrote them without a hash.
+        self._journal = Journal(path, mark, suffix=".npz", other=other, resume=resume, old=(b"PK",))
+
+    def close(self) -> None:
+        """Let others write here."""
+        self._journal.close()
 
     def remove(self) -> None:
         """Delete the journal: the search is over."""
-        shutil.rmtree(self.path, ignore_errors=True)
+        self._journal.remove()
 
     def through(
         self, jobs: Sequence[Any], compute: Callable[[Sequence[Any]], Iterator[tuple[int, Any]]]
@@ -112,23 +121,26 @@ class ResultCache:
         plain = json.dumps(_encode(result, arrays))
         if sum(a.nbytes for a in arrays) > _LARGEST:
             return
-        with replacing(self._file(job)) as temporary:
-            np.savez(temporary, plain=np.array(plain), **{f"a{k}": a for k, a in enumerate(arrays)})
+        written = io.BytesIO()
+        np.savez(written, plain=np.array(plain), **{f"a{k}": a for k, a in enumerate(arrays)})
+        self._journal.write(_name(job), written.getvalue())
 
     def recall(self, job: Any) -> Any:
         """Return the result of a job, None if it is not written down whole."""
-        file = self._file(job)
-        if not file.exists():
+        content = self._journal.read(_name(job))
+        if content is None:
             return None
         try:
-            arrays = read_arrays(file)
+            with np.load(io.BytesIO(content), allow_pickle=False) as found:
+                arrays = dict(found)
             return _decode(json.loads(str(arrays["plain"])), arrays)
-        except (InputError, ValueError, KeyError, TypeError, AttributeError, ImportError):
+        except _DAMAGED:
             # A damaged file costs the time of its job, no more.
             return None
 
-    def _file(self, job: Any) -> Path:
-        return self.path / f"{digest(job)[:32]}.npz"
+
+def _name(job: Any) -> str:
+    return digest(job)[:32]
 
 
 def _program() -> str:

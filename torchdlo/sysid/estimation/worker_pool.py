@@ -74,6 +74,8 @@ class Pool:
         return self
 
     def __exit__(self, *_: object) -> None:
+        if self.journal is not None:
+            self.journal.close()
         # After Ctrl-C nobody waits for fits that are still running; idle workers do not mind.
         for queue in self._queues:
             processes = list((queue._processes or {}).values())
