@@ -127,7 +127,7 @@ def test_another_search_is_refused(recording: Recording, tmp_path: Path, monkeyp
             ResultCache(path, other, options, resume=True)
     # A copy of the folder elsewhere is the same recording.
     ResultCache(path, replace(recording, path=tmp_path / "elsewhere"), OPTIONS, resume=True).close()
-    monkeypatch.setattr(journals, "_program", lambda: "newer")
+    monkeypatch.setattr(journals, "program", lambda: "newer")
     with pytest.raises(InputError, match="written by another version of torchdlo"):
         ResultCache(path, recording, OPTIONS, resume=True)
 

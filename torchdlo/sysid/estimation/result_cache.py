@@ -23,7 +23,7 @@ import numpy as np
 from torchdlo.journal import Journal
 from torchdlo.sysid.recordings.recording import Recording
 
-__all__ = ["ResultCache", "digest"]
+__all__ = ["ResultCache", "decode", "digest", "encode", "program"]
 
 _DAMAGED = (
     OSError,
@@ -48,7 +48,7 @@ def digest(*things: Any) -> str:
     found = hashlib.sha256()
     for thing in things:
         arrays: list[np.ndarray] = []
-        found.update(json.dumps(_encode(thing, arrays), sort_keys=True).encode())
+        found.update(json.dumps(encode(thing, arrays), sort_keys=True).encode())
         for array in arrays:
             found.update(f"{array.dtype.str}{array.shape}".encode() + np.ascontiguousarray(array).tobytes())
     return found.hexdigest()
@@ -77,7 +77,7 @@ class ResultCache:
         """
         self.path = path
         key = digest({f.name: getattr(recording, f.name) for f in fields(recording) if f.name != "path"}, options)
-        mark = {"generator": f"torchdlo {command}", "key": key, "program": _program()}
+        mark = {"generator": f"torchdlo {command}", "key": key, "program": program()}
 
         def other(found: dict[str, Any]) -> str:
             if found.get("key") != key:
@@ -118,7 +118,7 @@ class ResultCache:
     def keep(self, job: Any, result: Any) -> None:
         """Write a result down."""
         arrays: list[np.ndarray] = []
-        plain = json.dumps(_encode(result, arrays))
+        plain = json.dumps(encode(result, arrays))
         if sum(a.nbytes for a in arrays) > _LARGEST:
             return
         written = io.BytesIO()
@@ -133,7 +133,7 @@ class ResultCache:
         try:
             with np.load(io.BytesIO(content), allow_pickle=False) as found:
                 arrays = dict(found)
-            return _decode(json.loads(str(arrays["plain"])), arrays)
+            return decode(json.loads(str(arrays["plain"])), arrays)
         except _DAMAGED:
             # A damaged file costs the time of its job, no more.
             return None
@@ -143,7 +143,7 @@ def _name(job: Any) -> str:
     return digest(job)[:32]
 
 
-def _program() -> str:
+def program() -> str:
     """Return a hash of the program itself: its version alone does not change with every edit of a law."""
     root, found = Path(__file__).parents[2], hashlib.sha256()
     parts = [root / "scene.py", *(f for name in ("physics", "coupling", "sysid") for f in (root / name).rglob("*.py"))]
@@ -154,7 +154,7 @@ def _program() -> str:
     return found.hexdigest()
 
 
-def _encode(value: Any, arrays: list[np.ndarray]) -> Any:
+def encode(value: Any, arrays: list[np.ndarray]) -> Any:
     """Return a value as objects of JSON; arrays are put aside."""
     if isinstance(value, np.ndarray):
         if value.dtype == object:
@@ -165,19 +165,19 @@ def _encode(value: Any, arrays: list[np.ndarray]) -> Any:
         return value.item()
     if is_dataclass(value) and not isinstance(value, type):
         kind = type(value)
-        inner = {f.name: _encode(getattr(value, f.name), arrays) for f in fields(value)}
+        inner = {f.name: encode(getattr(value, f.name), arrays) for f in fields(value)}
         return {"kind": [kind.__module__, kind.__qualname__], "fields": inner}
     if isinstance(value, (tuple, list)):
-        return {type(value).__name__: [_encode(item, arrays) for item in value]}
+        return {type(value).__name__: [encode(item, arrays) for item in value]}
     if isinstance(value, dict):
-        return {"dict": [[_encode(k, arrays), _encode(v, arrays)] for k, v in value.items()]}
+        return {"dict": [[encode(k, arrays), encode(v, arrays)] for k, v in value.items()]}
     if value is None or isinstance(value, (bool, int, float, str)):
         return value
     raise TypeError(f"a journal cannot keep a {type(value).__name__}")
 
 
-def _decode(value: Any, arrays: dict[str, np.ndarray]) -> Any:
-    """Undo `_encode`."""
+def decode(value: Any, arrays: dict[str, np.ndarray]) -> Any:
+    """Undo `encode`."""
     if not isinstance(value, dict):
         return value
     if "array" in value:
@@ -187,8 +187,8 @@ def _decode(value: Any, arrays: dict[str, np.ndarray]) -> Any:
         kind = getattr(importlib.import_module(module), name) if module.split(".")[0] == _PACKAGE else None
         if not is_dataclass(kind):
             raise TypeError(f"{module}.{name} is not ours")
-        return kind(**{k: _decode(v, arrays) for k, v in value["fields"].items()})
+        return kind(**{k: decode(v, arrays) for k, v in value["fields"].items()})
     if "dict" in value:
-        return {_decode(k, arrays): _decode(v, arrays) for k, v in value["dict"]}
+        return {decode(k, arrays): decode(v, arrays) for k, v in value["dict"]}
     ((name, items),) = value.items()
-    return {"tuple": tuple, "list": list}[name](_decode(item, arrays) for item in items)
+    return {"tuple": tuple, "list": list}[name](decode(item, arrays) for item in items)
