@@ -104,8 +104,8 @@ def sweep(folder: Path) -> None:
             shutil.rmtree(file, ignore_errors=True)
 
 
-def load(folder: Path, plan: str = "") -> Attempt | None:
-    """Return the attempt at a plan in a folder, None if there is none that is whole."""
+def load(folder: Path, plan: str | None = None) -> Attempt | None:
+    """Return the attempt at a plan, or at any, in a folder, None if there is none that is whole."""
     record = read_json(folder / RECORD)
     if record is None or "success" not in record:
         return None
@@ -113,7 +113,7 @@ def load(folder: Path, plan: str = "") -> Attempt | None:
         return Attempt(folder, record)
     sums = read_json(folder / SUMS)
     try:
-        whole = sums is not None and sums["plan"] == plan and RECORD in sums["files"]
+        whole = sums is not None and plan in (None, sums["plan"]) and RECORD in sums["files"]
         whole = whole and all(_hash(folder / name) == seal for name, seal in sums["files"].items())
     except (KeyError, TypeError, AttributeError, OSError):
         return None

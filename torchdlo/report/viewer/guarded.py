@@ -63,6 +63,8 @@ def checked(raw: Any, bounds: Bounds) -> bytes | None:
     try:
         said = msgspec.msgpack.decode(raw)
         kind = said["type"]
+        if not isinstance(kind, str):
+            raise ValueError
         if kind == "ViewerCameraMessage":
             _check_camera(said)
             return raw
