@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from torchdlo.physics.effects.base import Param
 from torchdlo.sysid.calibration.calibrate import calibrate
 from torchdlo.sysid.diagnosis.effect_library import PARAMETERS
 from torchdlo.sysid.estimation import levenberg_marquardt
+from torchdlo.sysid.estimation.levenberg_marquardt import Point
 from torchdlo.sysid.model import initial_state
 from torchdlo.sysid.model.rope_model import RopeModel
 from torchdlo.sysid.model.trial_batch import Start
@@ -77,21 +79,46 @@ def test_same_seed_same_numbers(tmp_path: Path) -> None:
     assert one.parameters == two.parameters and one.test_mae_mm == two.test_mae_mm
 
 
-def test_interruption_keeps_the_best_and_resume_goes_on(tmp_path: Path) -> None:
+def test_interruption_keeps_the_best_and_resume_ends_as_if_never_stopped(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     recording, checkpoint = make_recording(tmp_path), tmp_path / "checkpoint.json"
+    few: dict[str, Any] = {"starts": 4, "iterations": 2, "vertices": 13}
+    looked: list[int] = []
+    evaluate = levenberg_marquardt.evaluate
+
+    def counted(*given: Any) -> list[Point]:
+        looked.append(1)
+        return evaluate(*given)
+
+    monkeypatch.setattr(levenberg_marquardt, "evaluate", counted)
+    whole = calibrate(recording, **few)
+    count = len(looked)
+    looked.clear()
 
     def stop(stage: str, done: int, total: int, message: str) -> None:
         if stage.startswith("fitting") and done == 2:
             raise KeyboardInterrupt
 
-    first = calibrate(recording, checkpoint=checkpoint, callback=stop, **OPTIONS)
+    first = calibrate(recording, checkpoint=checkpoint, callback=stop, **few)
     assert first.interrupted and np.isfinite(first.test_mae_mm) and checkpoint.exists()
-    stages = []
-    second = calibrate(
-        recording, checkpoint=checkpoint, resume=True, callback=lambda s, *_: stages.append(s), **OPTIONS
-    )
-    assert not second.interrupted and not any("trying" in s for s in stages)
-    assert second.train_mae_mm <= first.train_mae_mm * 1.001
+    second = calibrate(recording, checkpoint=checkpoint, resume=True, **few)
+    assert not second.interrupted and second.parameters == whole.parameters
+    assert second.test_mae_mm == whole.test_mae_mm
+    assert len(looked) == count, "nothing is computed twice"
+
+
+def test_interruption_while_starts_are_tried_keeps_the_best_that_was_shown(tmp_path: Path) -> None:
+    shown: list[float] = []
+
+    def stop(stage: str, done: int, total: int, message: str) -> None:
+        if stage.startswith("trying") and done == 2:
+            shown.append(float(message.split()[0]))
+            raise KeyboardInterrupt
+
+    found = calibrate(make_recording(tmp_path), callback=stop, starts=4, iterations=1, vertices=13)
+    assert found.interrupted and found.train_mae_mm < 3 * shown[0]
+    assert found.train_mae_mm < found.before["train_mae_mm"]
 
 
 def test_interruption_before_any_result_is_passed_on(tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
+from torchdlo.cli.ending import stopped
 from torchdlo.cli.progress import deferred_interrupt, progress
 from torchdlo.errors import InputError
 from torchdlo.files import check_writable
@@ -22,8 +23,6 @@ dataset = typer.Typer(
     rich_markup_mode="rich",
 )
 
-_INTERRUPTED = 130
-
 SetArgument = Annotated[Path, typer.Argument(help="Folder of a data set.", metavar="DATASET")]
 OutOption = Annotated[Path, typer.Option("--out", "-o", help="New folder.", metavar="DIR")]
 Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
@@ -36,14 +35,13 @@ Address = Annotated[
 ]
 
 
-def _watched(work: Callable[[Callable[[str, int, int, str], None]], Any], kept: str) -> Any:
+def _watched(work: Callable[[Callable[[str, int, int, str], None]], Any], kept: str, resume: bool = False) -> Any:
     """Do work that shows its progress; Ctrl-C ends it with a sentence."""
     try:
         with progress() as show, deferred_interrupt(show) as callback:
             return work(callback)
     except KeyboardInterrupt:
-        typer.echo(f"interrupted; {kept}", err=True)
-        raise SystemExit(_INTERRUPTED) from None
+        raise stopped(kept, resume) from None
 
 
 @dataset.command()
@@ -89,7 +87,7 @@ def make(
         with executor(workers, address) as where:
             return run(plan, out, painter=painter, executor=where, resume=resume, callback=callback)
 
-    found = _watched(work, f"what is finished stays in {out}, and --resume goes on with it")
+    found = _watched(work, f"what is finished stays in {out}", resume=True)
     if as_json:
         typer.echo(json.dumps({"path": str(out), "tasks": found}, indent=1))
     for task, count in found.items():
@@ -276,8 +274,7 @@ def learn(
         raise InputError(f"--out: expected a file that ends in .pt, given {out}.")
     torch.set_num_threads(threads)
     training = Training(epochs=epochs, batch=batch, rate=rate, seed=seed, language=language)
-    kept = f"what was learned until the last epoch stays in {out}, and --resume goes on with it"
-    found = _watched(lambda show: run(path, out, training, resume=resume, callback=show), kept)
+    found = _learned(lambda show: run(path, out, training, resume=resume, callback=show), out)
     if found["language"] == "hashed":
         typer.echo(
             "sentences are hashed word by word, and others that mean the same may not be understood; pip install "
@@ -290,6 +287,17 @@ def learn(
         f"policy: {out}, {found['parameters']} parameters, loss {found['loss'][-1]:.4f} after {found['epochs']} epochs",
         err=as_json,
     )
+
+
+def _learned(work: Callable[[Callable[[str, int, int, str], None]], dict[str, Any]], out: Path) -> dict[str, Any]:
+    """Do the work of `learn`, and say what is left of it if it is stopped."""
+    try:
+        with progress() as show, deferred_interrupt(show) as callback:
+            return work(callback)
+    except KeyboardInterrupt:
+        if out.with_name(f"{out.stem}.checkpoint.pt").exists():
+            raise stopped(f"what was learned until the last epoch stays in {out}", resume=True) from None
+        raise stopped("no epoch was over yet, and nothing was written") from None
 
 
 def sweep(
@@ -326,7 +334,7 @@ def sweep(
         with executor(workers, address) as where:
             return start(plan, out, where, away=address is not None, resume=resume, callback=callback)
 
-    found = _watched(work, f"what is finished stays in {out}, and --resume goes on with it")
+    found = _watched(work, f"what is finished stays in {out}", resume=True)
     bad = {name: row for name, row in found.items() if not row["done"]}
     if as_json:
         typer.echo(json.dumps(found, indent=1))

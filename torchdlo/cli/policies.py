@@ -8,9 +8,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from torchdlo.cli.ending import stopped
 from torchdlo.cli.progress import deferred_interrupt, progress
 from torchdlo.errors import InputError
 from torchdlo.files import check_writable, write_atomically
+from torchdlo.journal import at_work
 
 if TYPE_CHECKING:
     from torchdlo.agents.rl.settings import Settings
@@ -18,8 +20,10 @@ if TYPE_CHECKING:
 
 __all__ = ["deploy", "evaluate", "train"]
 
-_INTERRUPTED = 130
-"""Exit code after Ctrl-C, as shells have it."""
+
+_WRITTEN = ("result.json", "log.csv", "curve.png", "policy.pt", "checkpoint.pt")
+_WRITTEN += ("robust.json", "expert.json", "clone.part", "clone.pt", "tune.part", "stages.json")
+"""What training writes."""
 
 
 def _quiet() -> None:
@@ -100,12 +104,13 @@ def train(
     given = {"episodes": episodes, "minutes": minutes, "seed": seed, "count": count, "fidelity": fidelity}
     chosen = preset(task, algo, variation=variation, **given, **_read(settings or []))
     made = find(task)
-    if algo == "hybrid":
-        _hybrid(made, chosen, out, trajectory or [], without or [], resume, as_json)
-        return
-    if trajectory or without:
+    if algo != "hybrid" and (trajectory or without):
         raise InputError(f"--trajectory and --without: they belong to hybrid, not to {algo}; leave them out.")
-    _train(made, chosen, out, resume, compiled, as_json)
+    with at_work(out, *_WRITTEN):
+        if algo == "hybrid":
+            _hybrid(made, chosen, out, trajectory or [], without or [], resume, as_json)
+        else:
+            _train(made, chosen, out, resume, compiled, as_json)
 
 
 def _read(pairs: list[str]) -> dict[str, Any]:
@@ -142,8 +147,7 @@ def _train(task: Task, settings: Settings, out: Path, resume: bool, compiled: bo
     if as_json:
         typer.echo(result, nl=False)
     if found.interrupted:
-        typer.echo("--resume goes on from the checkpoint", err=True)
-        raise typer.Exit(_INTERRUPTED)
+        raise stopped("the best so far is kept", resume=True)
 
 
 def _hybrid(
@@ -170,8 +174,7 @@ def _hybrid(
                 task, trajectories, settings, folder=out, plan=plan, stages=stages, resume=resume, callback=callback
             )
     except KeyboardInterrupt:
-        typer.echo(f"interrupted; --resume goes on from the stages in {out}", err=True)
-        raise typer.Exit(_INTERRUPTED) from None
+        raise stopped(f"what is done is kept in {out}", resume=True) from None
     for name in STAGES:
         if name in notes:
             spent = f"{notes[name]['episodes']} episodes, {notes[name]['cpu_seconds']:.0f} CPU s"

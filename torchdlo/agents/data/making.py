@@ -6,8 +6,8 @@ how often the run was stopped and resumed, makes no difference to any byte of th
 
 from __future__ import annotations
 
-import fcntl
 import functools
+import hashlib
 import json
 import os
 import shutil
@@ -29,8 +29,7 @@ from torchdlo.agents.trajopt.search_journal import versions
 from torchdlo.envs import find
 from torchdlo.envs.core import episode
 from torchdlo.errors import InputError
-from torchdlo.files import write_atomically
-from torchdlo.untrusted import read_json
+from torchdlo.journal import locked, read_json, write_json
 
 __all__ = ["UNFINISHED", "DatasetPlan", "make", "report_of"]
 
@@ -154,26 +153,32 @@ def make(
 def _begun(plan: DatasetPlan, out: Path, resume: bool) -> Iterator[Path]:
     """Yield the folder for what is under way; no other run may have it meanwhile."""
     folder = out / UNFINISHED
-    said = json.dumps(asdict(plan) | {"versions": versions()}, indent=1) + "\n"
+    said = _said(plan)
     if (folder / PLAN).is_file():
         if not resume:
             raise InputError(f"{out}: a run was begun there; --resume goes on with it, or choose another --out.")
-        if (folder / PLAN).read_text(encoding="utf-8") != said:
+        # Attempts say themselves which plan they belong to, should it be damaged.
+        if (read_json(folder / PLAN) or said) != said:
             raise InputError(
                 f"{out}: what was begun there has other options or versions, see {folder / PLAN}; give the same, or "
                 "choose another --out."
             )
     elif out.exists() and (not out.is_dir() or any(p.name != UNFINISHED for p in out.iterdir())):
         raise InputError(f"{out}: it exists already; choose another --out.")
-    folder.mkdir(parents=True, exist_ok=True)
-    with (folder / ".lock").open("w") as lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise InputError(f"{out}: another run is at work there; wait for it, or choose another --out.") from None
-        write_atomically(folder / PLAN, said)
+    with locked(folder):
+        write_json(folder / PLAN, said)
         attempts.sweep(folder)
         yield folder
+
+
+def _said(plan: DatasetPlan) -> dict[str, Any]:
+    """Return what the attempts at a plan depend on, as it is written down."""
+    return json.loads(json.dumps(asdict(plan) | {"versions": versions()}))
+
+
+def _key(plan: DatasetPlan) -> str:
+    """Return a hash of it."""
+    return hashlib.sha256(json.dumps(_said(plan), sort_keys=True).encode()).hexdigest()
 
 
 def _gather(
@@ -188,8 +193,10 @@ def _gather(
     place = folder / task
     known: dict[int, attempts.Attempt] = {}
     for each in sorted(place.glob("[0-9]*")):
-        if (found := attempts.load(each)) is not None:
+        if (found := attempts.load(each, _key(plan))) is not None:
             known[int(each.name)] = found
+        else:
+            shutil.rmtree(each, ignore_errors=True)  # it is played again
 
     def good() -> int:
         return sum(each.success for each in known.values())
@@ -209,7 +216,7 @@ def _gather(
         for k, files in executor.map(_played, jobs):
             for number, content in enumerate(files, jobs[k].first):
                 if number not in known:
-                    attempts.keep(place / f"{number:06d}", content)
+                    attempts.keep(place / f"{number:06d}", content, _key(plan))
                     known[number] = attempts.Attempt(place / f"{number:06d}", json.loads(content[attempts.RECORD]))
             told()
     return line

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
+import shutil
 import tempfile
 import time
 from collections.abc import Callable
@@ -15,13 +16,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchdlo.agents.checkpoint import load_checkpoint, save_checkpoint
 from torchdlo.agents.data.reading import DataSet, open_set
 from torchdlo.agents.policies import language
 from torchdlo.agents.policies.chunk_policy import ChunkPolicy, Shape, save_policy
 from torchdlo.agents.trajopt.search_journal import versions
 from torchdlo.errors import InputError
-from torchdlo.files import replacing
-from torchdlo.untrusted.tensor_file import read_tensors
+from torchdlo.journal import locked, sweep
 
 __all__ = ["Training", "learn"]
 
@@ -137,7 +138,10 @@ def learn(
     if resume and not checkpoint.is_file():
         raise InputError(f"{checkpoint}: there is no checkpoint to resume; leave out --resume.")
     begun = time.monotonic()
-    with tempfile.TemporaryDirectory(prefix=".frames-", dir=_parent(out)) as folder:
+    with (
+        locked(out.parent, f".{out.name}.lock"),
+        tempfile.TemporaryDirectory(prefix=_swept(out), dir=out.parent) as folder,
+    ):
         frames = _read(data, encoder, Path(folder), told)
         run = _Run(data, frames, training, encoder)
         if resume:
@@ -150,9 +154,13 @@ def learn(
     return run.about() | {"seconds": round(time.monotonic() - begun, 1)}
 
 
-def _parent(out: Path) -> Path:
-    out.parent.mkdir(parents=True, exist_ok=True)
-    return out.parent
+def _swept(out: Path) -> str:
+    """Remove what a run that was killed left half done; return how the name of the folder of pictures begins."""
+    prefix = f".frames-{out.stem}-"
+    for left in out.parent.glob(f"{prefix}*"):
+        shutil.rmtree(left, ignore_errors=True)
+    sweep(out.parent, out.name, f"{out.stem}.checkpoint.pt")
+    return prefix
 
 
 class _Run:
@@ -238,12 +246,13 @@ class _Run:
             "averaged": self.averaged.state_dict(),
             "optimizer": self.optimizer.state_dict(),
         }
-        with replacing(path) as temporary:
-            torch.save(content, temporary)
+        save_checkpoint(path, content)
 
     def load(self, path: Path) -> None:
         """Go on from a checkpoint."""
-        content = read_tensors(path, "a checkpoint of torchdlo learn", cure="leave out --resume")
+        content = load_checkpoint(path)
+        if content is None:
+            raise InputError(f"{path}: the checkpoint is damaged; leave out --resume.")
         if content["same"] != self._same():
             raise InputError(f"{path}: it is of another data set or training; give the same, or leave out --resume.")
         self.epoch, self.curve = content["epoch"], content["curve"]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -48,6 +49,8 @@ class _Job:
     values: np.ndarray
     given: bool = False
     point: Point | None = None
+    scouted: np.ndarray | None = None
+    """Coordinates of the best start so far."""
 
     @property
     def columns(self) -> list[int]:
@@ -131,7 +134,7 @@ def calibrate(
                     if best.point is None or best is improved or improved.point.cost < best.point.cost:
                         best = improved
         except KeyboardInterrupt:
-            if best is None or best.point is None:
+            if best is None or (best.point is None and not _settled(best)):
                 raise
             interrupted = True
         return _judge(best, seed, interrupted, begun, report)
@@ -179,16 +182,10 @@ def _fit(
     if kept or job.given:
         raw = job.space.to_raw(np.array(kept or job.first)[job.columns])
     else:
-        raw = _scout(job, starts, rng, report, name)
+        raw = _scout(job, starts, rng, memory, report, name)
     stage = f"fitting {len(job.motion.names)} trials, {name}"
     report(stage, 0, iterations + 1, "")
-    run = job.simulator(_usable(job.pool.recording))
-    job.start = starts_of.refine(job.model, job.motion, job.start, job.full(job.space.to_values(raw)), run)
-
-    def simulate(values: np.ndarray) -> np.ndarray:
-        return run(job.start, job.full(values), None)
-
-    points = levenberg_marquardt.evaluate(simulate, job.motion.markers, job.space, raw[None])
+    simulate, points = _begin(job, raw, memory.once)
     if not np.isfinite(points[0].cost):
         raise InputError(
             f"{job.pool.recording.path}: the simulation failed on the train trials from every start; check length, "
@@ -197,9 +194,8 @@ def _fit(
     job.point, job.values = points[0], job.full(job.space.to_values(points[0].raw))
     yield job
     report(stage, 1, iterations + 1, f"{1e3 * job.point.cost:.2f} mm")
-    for done, (point,) in enumerate(
-        levenberg_marquardt.improve(simulate, job.motion.markers, job.space, points, iterations=iterations)
-    ):
+    climbing = _climb(job, "fit", simulate, job.motion.markers, points, iterations, memory)
+    for done, (point,) in enumerate(climbing):
         job.point, job.values = point, job.full(job.space.to_values(point.raw))
         memory.keep(job.model.rest, job.values)
         yield job
@@ -207,7 +203,59 @@ def _fit(
     report(stage, iterations + 1, iterations + 1, f"{1e3 * job.point.cost:.2f} mm")
 
 
-def _scout(job: _Job, starts: int, rng: np.random.Generator, report: Callback, name: str) -> np.ndarray:
+Once = Callable[[str, str, Callable[[], Any]], Any]
+"""Called with a variant, the name of a step and what computes it; see `Checkpoint.once`."""
+
+
+def _begin(job: _Job, raw: np.ndarray, once: Once) -> tuple[levenberg_marquardt.Simulate, list[Point]]:
+    """Return what simulates all trials, and the point at some coordinates; sets where the trials begin."""
+    run, values = job.simulator(_usable(job.pool.recording)), job.full(job.space.to_values(raw))
+    start = job.start
+    job.start = once(job.model.rest, "start", lambda: starts_of.refine(job.model, job.motion, start, values, run))
+
+    def simulate(values: np.ndarray) -> np.ndarray:
+        return run(job.start, job.full(values), None)
+
+    def points() -> list[Point]:
+        return levenberg_marquardt.evaluate(simulate, job.motion.markers, job.space, raw[None])
+
+    return simulate, once(job.model.rest, "points", points)
+
+
+def _settled(job: _Job) -> bool:
+    """Let a job that was stopped while starts were tried have the best of them; return whether there is one."""
+    if job.scouted is None:
+        return False
+    _, (point,) = _begin(job, job.scouted, lambda rest, step, compute: compute())
+    if not np.isfinite(point.cost):
+        return False
+    job.point, job.values = point, job.full(job.space.to_values(point.raw))
+    return True
+
+
+def _climb(
+    job: _Job,
+    name: str,
+    simulate: levenberg_marquardt.Simulate,
+    measured: np.ndarray,
+    points: Sequence[Point],
+    iterations: int,
+    memory: Checkpoint,
+) -> Iterator[list[Point]]:
+    """Yield points as `levenberg_marquardt.improve` does; what is found is written down."""
+    climb = levenberg_marquardt.Climb(job.space, points)
+    for k in range(iterations):
+        tries = climb.tries()
+        if not len(tries):
+            return
+        look = partial(levenberg_marquardt.evaluate, simulate, measured, job.space, tries)
+        climb.take(memory.once(job.model.rest, f"{name} {k}", look))
+        yield list(climb.points)
+
+
+def _scout(
+    job: _Job, starts: int, rng: np.random.Generator, memory: Checkpoint, report: Callback, name: str
+) -> np.ndarray:
     """Return coordinates to start the fit from: many starts on a few trials, fewer and fewer over longer times.
 
     In its first second a rope has not forgotten where it began and the cost has few local minima; over a long horizon
@@ -215,26 +263,32 @@ def _scout(job: _Job, starts: int, rng: np.random.Generator, report: Callback, n
     """
     trials = _usable(job.pool.recording)
     scouts = [trials[i] for i in _pick(len(trials), _SCOUTS)]
-    motion, begin, run = job.model.motion(scouts), starts_of.begin(job.model, scouts), job.simulator(scouts)
-    begin = starts_of.refine(job.model, motion, begin, job.values, run)
+    motion, first, run = job.model.motion(scouts), starts_of.begin(job.model, scouts), job.simulator(scouts)
+    once = partial(memory.once, job.model.rest)
+    begin = once("scouts' start", lambda: starts_of.refine(job.model, motion, first, job.values, run))
     stage, total = f"trying {starts} starts, {name}", 2 + _LOOKS
 
     def over(share: float) -> tuple[levenberg_marquardt.Simulate, np.ndarray]:
         frames = min(max(10, round(share * motion.markers.shape[1])), motion.markers.shape[1])
         return lambda values: run(begin, values, frames), motion.markers[:, :frames]
 
+    def costs(share: float, raws: np.ndarray) -> np.ndarray:
+        simulate, measured = over(share)
+        return levenberg_marquardt.costs(simulate(job.space.to_values(raws)), measured)
+
     raws = _spread(job, starts, rng)
     report(stage, 0, total, "")
     for look, (share, keep) in enumerate(((0.3, max(2, starts // 3)), (1.0, max(2, starts // 8)))):
-        simulate, measured = over(share)
-        costs = levenberg_marquardt.costs(simulate(job.space.to_values(raws)), measured)
-        raws = raws[np.argsort(costs, kind="stable")[:keep]]
-        report(stage, look + 1, total, f"{1e3 * costs.min():.2f} mm over {share:.0%} of the time")
+        found = once(f"costs {look}", partial(costs, share, raws))
+        raws = raws[np.argsort(found, kind="stable")[:keep]]
+        job.scouted = raws[0]
+        report(stage, look + 1, total, f"{1e3 * found.min():.2f} mm over {share:.0%} of the time")
     simulate, measured = over(1.0)
-    points = levenberg_marquardt.evaluate(simulate, measured, job.space, raws)
+    points = once("scouts", partial(levenberg_marquardt.evaluate, simulate, measured, job.space, raws))
     for look, points in enumerate(  # noqa: B020
-        levenberg_marquardt.improve(simulate, measured, job.space, points, iterations=_LOOKS)
+        _climb(job, "scouts", simulate, measured, points, _LOOKS, memory)
     ):
+        job.scouted = min(points, key=lambda p: p.cost).raw
         report(stage, look + 3, total, f"{1e3 * min(p.cost for p in points):.2f} mm")
     report(stage, total, total, "")
     return min(points, key=lambda p: p.cost).raw
