@@ -59,7 +59,7 @@ ALLOWED = {
     "reward_language": TORCH,
     "scene_files": ARRAYS,
     "sysid": ARRAYS,
-    "envs": LEARNING | {"pytorch_kinematics", "trimesh"},
+    "envs": LEARNING | {"numpy", "gymnasium", "pytorch_kinematics", "trimesh"},
     "agents": LEARNING
     | {
         "cma",

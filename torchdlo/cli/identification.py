@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 __all__ = ["calibrate", "design_experiment", "diagnose"]
 
-_QUICK = {"starts": 12, "iterations": 5}
+_QUICK: dict[str, Any] = {"starts": 12, "iterations": 5}
 """What --quick sets unless the options say otherwise."""
 
 
@@ -78,7 +78,7 @@ def calibrate(
     _check_outputs(out, resume)
     options: dict[str, Any] = {"starts": starts, "iterations": iterations, "vertices": vertices}
     if quick:
-        options = {name: value or _QUICK.get(name) for name, value in options.items()}
+        options = {name: value or _QUICK.get(name) for name, value in options.items()} | {"refined": False}
     options = {name: value for name, value in options.items() if value is not None} | _given(model)
     with at_work(out.parent, *_written(out)):
         result = _run_calibration(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -12,8 +12,11 @@ from typing import Any
 import numpy as np
 
 from torchdlo.errors import InputError
+from torchdlo.sysid.calibration import refinement
+from torchdlo.sysid.diagnosis.error_floor import noise
 from torchdlo.sysid.estimation import evaluation, levenberg_marquardt
 from torchdlo.sysid.estimation.checkpoint import Checkpoint
+from torchdlo.sysid.estimation.jobs import FitJob
 from torchdlo.sysid.estimation.levenberg_marquardt import ParameterSpace, Point
 from torchdlo.sysid.estimation.result import Calibration
 from torchdlo.sysid.estimation.worker_pool import Pool
@@ -22,6 +25,7 @@ from torchdlo.sysid.model import model_file
 from torchdlo.sysid.model.model_file import ModelFile
 from torchdlo.sysid.model.rope_model import RopeModel
 from torchdlo.sysid.model.trial_batch import Start, TrialBatch
+from torchdlo.sysid.recordings.metrics import average, mean_absolute_error
 from torchdlo.sysid.recordings.recording import Recording, Trial
 from torchdlo.sysid.video.filmed import FILMED_STARTS, calibrate_filmed
 
@@ -51,6 +55,8 @@ class _Job:
     point: Point | None = None
     scouted: np.ndarray | None = None
     """Coordinates of the best start so far."""
+    drifts: np.ndarray | None = None
+    """What all trials get wrong in the same way, in coordinates, see `levenberg_marquardt.interval`."""
 
     @property
     def columns(self) -> list[int]:
@@ -79,6 +85,7 @@ def calibrate(
     checkpoint: Path | None = None,
     resume: bool = False,
     given: ModelFile | None = None,
+    refined: bool = True,
     workers: int | None = 1,
     callback: Callback | None = None,
 ) -> Calibration:
@@ -99,6 +106,7 @@ def calibrate(
         checkpoint: file that keeps the best so far.
         resume: go on from it.
         given: model to start from in place of many starts, with its effects; it says what the rest shape is.
+        refined: whether to fit on with a finer mesh, and to find out what steps and mesh do to the numbers.
         workers: processes, one per core if None. More than one begin by importing the program's main module: a script
             that asks for them has to guard what it does by `if __name__ == "__main__":`.
         callback: see `Callback`; it may raise KeyboardInterrupt, which ends the fit with the best so far.
@@ -133,6 +141,7 @@ def calibrate(
                 for improved in _fit(job, starts, iterations, np.random.default_rng(seed), memory, report):
                     if best.point is None or best is improved or improved.point.cost < best.point.cost:
                         best = improved
+            best = _refined(best, iterations, vertices, report) if refined else best
         except KeyboardInterrupt:
             if best is None or (best.point is None and not _settled(best)):
                 raise
@@ -294,9 +303,53 @@ def _scout(
     return min(points, key=lambda p: p.cost).raw
 
 
+def _refined(job: _Job, iterations: int, vertices: int | None, report: Callback) -> _Job:
+    """Return the job on a finer mesh, corrected, or as it was where that predicts the train trials worse.
+
+    A mesh that was asked for stays, with numbers that suit it; it then is only found out how wrong they may be.
+    """
+    pool, trials = job.pool, job.pool.recording.train
+    if len(_usable(pool.recording)) < len(trials):
+        return job
+    finer = {} if job.given or vertices is not None else refinement.finer_options(pool.recording)
+    sizes = tuple(job.space.units) if job.space.sizes else (1.0,) * len(job.columns)
+    options = tuple((dict(job.options) | finer).items())
+    names = job.space.names
+    first = FitJob(job.model.effects, job.values[None], names, sizes, iterations, options=options)
+    clamps = _CLAMPS if finer and job.model.mesh.clamps else ()
+    model = job.model
+    own = {"numerical_damping": model.numerical_damping, "clamp_fraction": model.clamp_fraction}
+    own |= {"vertices": pool.local.options.get("vertices"), "substep": (1 + 1e-9) * model.dt / model.substeps}
+    job = replace(job, options=tuple((own | dict(job.options)).items()))
+    try:
+        found = refinement.refine(pool, first, clamps, iterations, vertices is None, report)
+    except InputError:
+        # Not every rope can be simulated on a finer mesh.
+        return job
+    fitted = found.fitted
+    if not found.corrected:
+        return replace(job, drifts=found.drifts)
+    model = pool.local.model(fitted.effects)
+    better = replace(job, options=(), model=model, space=fitted.space, motion=model.motion(trials))
+    better.values, better.point, better.drifts = fitted.values, fitted.point, found.drifts
+    errors = []
+    for each in (job, better):
+        predicted = evaluation.predict(each.model, trials, each.values, each.simulator(trials))
+        errors.append(average(mean_absolute_error, [predicted[t.name] for t in trials], trials))
+    # Exact numbers predict as well with their mesh, up to what noise tells; else those that suit a coarse one count.
+    if errors[1] <= errors[0] + 0.5 * noise(pool.recording):
+        return better
+    apart = job.space.to_raw(fitted.values[job.columns]) - job.point.raw
+    scale = found.drifts * fitted.space.units / job.space.units
+    return replace(job, drifts=np.concatenate([scale, apart[None]]))
+
+
 def _pick(count: int, wanted: int) -> list[int]:
     return sorted({round(i) for i in np.linspace(0, count - 1, min(count, wanted))})
 
+
+_CLAMPS = (1.0, 0.0)
+"""Where clamps may hold the rope, see `Mesh.clamp_shares`."""
 
 _REACH = {"bending_stiffness": np.log(40.0), "twisting_stiffness": np.log(4.0), "damping_rate": np.log(10.0)}
 """How far starts go either way of the guess; the twisting stiffness relative to the bending stiffness."""
@@ -324,7 +377,10 @@ def _judge(job: _Job, seed: int, interrupted: bool, begun: float, report: Callba
     report("predicting all trials", 1, 2, "")
     after = evaluation.predict(job.model, trials, job.values, simulate)
     report("predicting all trials", 2, 2, "")
-    low, high = levenberg_marquardt.interval(job.point, job.space)
+    ends = levenberg_marquardt.interval(job.point, job.space, job.drifts)
+    least, most = (np.array([getattr(p, end) for p in job.space.params]) for end in ("low", "high"))
+    turns = np.array([p.periodic for p in job.space.params])
+    low, high = (np.where(turns, end, np.clip(end, least, most)) for end in ends)
     return Calibration(
         parameters={
             name: {"value": float(v), "low": float(min(a, b)), "high": float(max(a, b)), "unit": param.unit}
@@ -342,14 +398,29 @@ def _judge(job: _Job, seed: int, interrupted: bool, begun: float, report: Callba
         predictions_before=before,
         seed=seed,
         interrupted=interrupted,
-        notes=_notes(recording, job),
+        notes=_notes(recording, job, low, high),
     )
 
 
-def _notes(recording: Recording, job: _Job) -> list[str]:
+_VAGUE = 5.0
+"""Upper over lower end of a range from which a number counts as unknown."""
+
+_RANGES = (
+    "Ranges are 90 % intervals: nine of ten hold the true number of a rope that is like the model. They take in how "
+    "far the train trials pull apart (jackknife), noise, and what steps, mesh, the place where clamps begin to hold, "
+    "and shear may do."
+)
+_NARROW = "Ranges say how far the train trials pull apart (jackknife), not what all of them get wrong alike."
+
+
+def _notes(recording: Recording, job: _Job, low: np.ndarray, high: np.ndarray) -> list[str]:
     notes = [f"Rest shape: {job.model.rest}."]
     if job.model.effects:
         notes.append(f"Effects of the given model: {', '.join(e.replace('_', ' ') for e in job.model.effects)}.")
+    notes.append(_RANGES if job.drifts is not None else _NARROW)
+    logs = [p.scale == "log" for p in job.space.params]
+    for name in (n for n, a, b, log in zip(job.space.names, low, high, logs, strict=True) if log and b > _VAGUE * a):
+        notes.append(f"The recording says little of the {name.replace('_', ' ')}: see its range.")
     unused = sorted({t.name for t in recording.train} - set(job.motion.names))
     if unused:
         notes.append(f"Not fitted because every frame is marked suspect: {', '.join(unused)}.")

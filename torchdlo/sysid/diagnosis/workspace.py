@@ -227,8 +227,17 @@ class Workspace:
         values, sizes = found.values[None], tuple(space.units)
         return FitJob(found.effects, values, space.names, sizes, iterations, start, frames, None, found.options)
 
-    def drift(self, fitted: Fitted) -> np.ndarray:
-        """Return what simulations get wrong by their steps and by their mesh in a fit's coordinates, shape (2, K)."""
+    def drift(
+        self, fitted: Fitted, others: Sequence[np.ndarray] = (), shares: tuple[float, float] = (1.0, 2.0)
+    ) -> np.ndarray:
+        """Return what simulations get wrong by their steps and by their mesh in a fit's coordinates, shape (2 + E, K).
+
+        Args:
+            fitted: the fit.
+            others: further ways in which simulations of the train trials may be wrong [m], shape (B, F, M, 3) each.
+            shares: how much of what was extrapolated for steps and mesh may be wrong. Next to clamps the mesh's error
+                may be of first order: extrapolating to that would change twice as much.
+        """
         look, start = Look(fitted.space, fitted.point.raw[None]), self.starts["train"]
         model = self.pool.local.model(fitted.effects)
         rows = np.repeat(fitted.values[None], len(look.values), 0)
@@ -237,8 +246,8 @@ class Workspace:
         frame_weights = 1.0 if start.frame_weights is None else start.frame_weights[..., None, None]
         measured = self.pool.local.motion(model, "train").markers
         step, grid = (frame_weights * np.nan_to_num(e[: len(measured)]) for e in self._finer.unsure)
-        # Next to clamps the mesh's error may be of first order: extrapolating to that would change twice as much.
-        return drift(look, frame_weights * sims, frame_weights * measured, (step, 2 * grid))
+        errors = (shares[0] * step, shares[1] * grid, *(frame_weights * np.nan_to_num(e) for e in others))
+        return drift(look, frame_weights * sims, frame_weights * measured, errors)
 
     def fit(self, jobs: Sequence[FitJob]) -> list[Fitted]:
         """Return the results of fits in their order.
