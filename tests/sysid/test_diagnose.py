@@ -283,10 +283,10 @@ def test_an_effect_is_left_out_once_only_from_the_same_model() -> None:
     revision = Revision(bench, BUDGETS["fast"], ["plain"], lambda *_: None)
     fitted = SimpleNamespace(effects=("wind", "stretch"), options=(), values=np.ones(3))
     again = SimpleNamespace(effects=("wind", "stretch"), options=(), values=np.ones(3))
-    assert revision._without(fitted, "wind") is revision._without(again, "wind") and len(asked) == 1
-    assert revision._without(fitted, "stretch").of == (fitted, "stretch")
+    assert revision.without(fitted, "wind") is revision.without(again, "wind") and len(asked) == 1
+    assert revision.without(fitted, "stretch").of == (fitted, "stretch")
     bench.starts = {"train": object()}
-    revision._without(fitted, "wind")
+    revision.without(fitted, "wind")
     assert len(asked) == 3
 
 

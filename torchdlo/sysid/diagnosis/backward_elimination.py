@@ -40,16 +40,20 @@ class EliminationResult:
     """By effect: share of the gap above the floor that it closed on the test trials."""
     ties: dict[str, list[str]] = field(default_factory=dict)
     """By effect: others that the data cannot tell from it."""
+    rivals: dict[str, Fitted] = field(default_factory=dict)
+    """By effect: the model without it that it was held against."""
 
     def exchange(self, old: str, new: str, *, alike: bool) -> None:
         """Put another effect in the place of one, which it is `alike` if the data cannot tell them apart."""
         also = [n for n in (*self.ties.get(old, []), old) if n != new] if alike else []
         self.shares = {new if n == old else n: share for n, share in self.shares.items()}
         self.ties = {new if n == old else n: names for n, names in self.ties.items()} | {new: also}
+        self.rivals = {new if n == old else n: rival for n, rival in self.rivals.items()}
 
     def leave_out(self, name: str) -> None:
         """Forget an effect that the last one makes needless; the last one takes over its share."""
         del self.ties[name]
+        self.rivals.pop(name, None)
         share = self.shares.pop(name)
         self.shares[[*self.shares][-1]] += share
 
@@ -84,7 +88,7 @@ class Revision:
     def pruned(self, fitted: Fitted, found: EliminationResult) -> Fitted:
         """Return the model without the effects that the last one, or other numbers, have made needless."""
         for name in [*found.shares][:-1]:
-            less = self._without(fitted, name)
+            less = self.without(fitted, name)
             if not self.matters(less, fitted, "train"):
                 fitted = less
                 found.leave_out(name)
@@ -139,7 +143,7 @@ class Revision:
     def _astray(self, other: Fitted, fitted: Fitted) -> bool:
         return self.bench.diverged(other, self.bench.gaps(fitted, "all"))
 
-    def _without(self, fitted: Fitted, name: str) -> Fitted:
+    def without(self, fitted: Fitted, name: str) -> Fitted:
         """Return the model without one of its effects; what was asked for before is not fitted again."""
         start, key = self.bench.starts["train"], (fitted.effects, fitted.options, fitted.values.tobytes(), name)
         at, less = self._reductions.get(key, (None, None))
@@ -149,9 +153,14 @@ class Revision:
             self._reductions[key] = start, less
         return less
 
+    def known_without(self, fitted: Fitted, name: str) -> Fitted | None:
+        """Return the model without one of its effects if it was fitted before, None if it was not."""
+        key = (fitted.effects, fitted.options, fitted.values.tobytes(), name)
+        return self._reductions.get(key, (None, None))[1]
+
     def _instead(self, fitted: Fitted, old: str, names: Sequence[str]) -> Fitted:
         """Return the best model with one of several effects in the place of another."""
-        less, stage = self._without(fitted, old), f"in the place of {old}"
+        less, stage = self.without(fitted, old), f"in the place of {old}"
         scores = score_effects(self.bench.pool, less, names, self.bench.starts["train"], lambda *_: None)
         kin = {n for group in effect_library.KIN if old in group for n in group}
         tried = [*scores[:_TRIED], *(s for s in scores[_TRIED:] if s.name in kin)]
