@@ -20,7 +20,16 @@ from torchdlo.sysid.model import model_file
 from torchdlo.sysid.recordings.metrics import mean_absolute_error
 from torchdlo.sysid.recordings.recording import Recording
 
-__all__ = ["absorbed", "confidence", "findings", "findings_json", "mean_absolute_errors", "model_json", "summary"]
+__all__ = [
+    "absorbed",
+    "confidence",
+    "findings",
+    "findings_json",
+    "limits_text",
+    "mean_absolute_errors",
+    "model_json",
+    "summary",
+]
 
 
 def findings(result: Diagnosis, recording: Recording) -> dict[str, Any]:
@@ -236,6 +245,16 @@ def summary(result: Diagnosis, recording: Recording) -> str:
         said += f" A part remains that no effect of the library explains.{_best(result)}"
     sure = confidence(result)
     return said + f" Confidence: {sure['word']}" + (f" ({'; '.join(sure['doubts'])})." if sure["doubts"] else ".")
+
+
+def limits_text(result: Diagnosis) -> str:
+    """Return in a sentence how large effects would have to be to be named; nothing where that is not known."""
+    said = []
+    for limit in result.limits:
+        ends = sorted({f"{limit.easiest:.2g}", f"{limit.hardest:.2g}"}, key=float)
+        unit = "" if limit.unit == "1" else f" {limit.unit}"
+        said.append(f"{limit.name.replace('_', ' ')} ({limit.number} {' to '.join(ends)}{unit})")
+    return f"Would be named from this size on, by place or direction: {', '.join(said)}." if said else ""
 
 
 def _tested(name: str, result: Diagnosis) -> str:

@@ -39,8 +39,8 @@ from torchdlo.sysid.recordings.recording import Recording
 PAYS = 0.15
 """Share of the excess gap that an effect has to close, on the train and on the test trials."""
 
-MUCH = 0.3
-"""Share of it from which an effect that is not named is spoken of."""
+MUCH = 0.15
+"""Share of it on the test trials from which an effect that is not named is spoken of, if it is not chance."""
 
 MORE = 2.5
 """Times the floor that have to be left for another effect to be looked for: one of three times the floor leaves 3.2."""
@@ -121,6 +121,8 @@ class _Search:
         """Of all effects, beside the baseline."""
         self.misleading: list[MisleadingTrial] = []
         """Train trials that count up to a frame only."""
+        self.small = ""
+        """What was not named because it is as small as what steps do, in a sentence."""
         self.leading: BestCandidate | None = None
         """What came closest in the last round, if it was not taken."""
 
@@ -313,6 +315,10 @@ class _Search:
             why = unresolved(fitted, name, self.pool.local.model(fitted.effects, fitted.options))
             if refused[name] is None and why is not None:
                 found[name] = why
+                self.small = (
+                    f"A {name.replace('_', ' ')} that closes {self._gain(rival, fitted, 'test'):.0%} of the gap"
+                )
+                self.small += f" above noise on the test trials is not named: it {why}."
                 bar = fitted.point.cost - self.bench.tie(rival.point.cost, fitted.point.cost)
                 others = [n for n in order if n != name and refused[n] is None and fits[n].point.cost > bar]
                 found |= dict.fromkeys(others, f"explains no more than a {name.replace('_', ' ')} as small as of steps")
@@ -320,7 +326,9 @@ class _Search:
 
     def _closest(self, fits: dict[str, Fitted], candidates: Sequence[Candidate]) -> BestCandidate | None:
         """Return the candidate that closes most of the gap on the test trials if that is much, None if it is not."""
-        tested = [c for c in candidates if c.name in fits and c.heldout_gain is not None and c.heldout_gain >= MUCH]
+        rates = benjamini_hochberg([c.test.p for c in candidates if c.test is not None], len(candidates))
+        sure = {c.name for c, rate in zip([c for c in candidates if c.test], rates, strict=True) if rate <= RATE}
+        tested = [c for c in candidates if c.name in sure and (c.heldout_gain or 0.0) >= MUCH]
         if not tested:
             return None
         # Of those that close nearly as much, the one that fits better.
@@ -462,7 +470,11 @@ class _Search:
             predictions,
             model,
             drifts,
-            notes=[*said, *([] if np.isfinite(self.bench.level) else [UNKNOWN_FLOOR])],
+            notes=[
+                *said,
+                *([self.small] if self.small else []),
+                *([] if np.isfinite(self.bench.level) else [UNKNOWN_FLOOR]),
+            ],
             tests=tests,
             limits=detection_limits(self.scores, limit),
             leading=self.leading if verdict in ("unknown", "partial") else None,
