@@ -9,6 +9,7 @@ import numpy as np
 
 from torchdlo.physics.effects import EFFECTS
 from torchdlo.sysid.diagnosis.effect_equations import law, separating
+from torchdlo.sysid.diagnosis.error_floor import gap, rms
 from torchdlo.sysid.diagnosis.plausibility import implausible
 from torchdlo.sysid.diagnosis.residual_analysis import localise
 from torchdlo.sysid.diagnosis.significance import RATE, Agreement
@@ -127,6 +128,7 @@ def _gap(result: Diagnosis, recording: Recording) -> dict[str, Any]:
         "test_rmse_before_m": result.gaps[0],
         "test_rmse_after_m": result.gaps[1],
         **{f"test_mae_{when}_m": mae for when, mae in mean_absolute_errors(result, recording).items()},
+        **{f"train_rmse_{when}_m": _train_gap(result, recording, when) for when in maes},
         "noise_floor_m": floor.total,
         "floor_parts_m": {"marker_noise": floor.noise, "step": floor.step, "grid": floor.grid},
         "per_trial": [
@@ -135,6 +137,11 @@ def _gap(result: Diagnosis, recording: Recording) -> dict[str, Any]:
             for t, b, a in trials
         ],
     }
+
+
+def _train_gap(result: Diagnosis, recording: Recording, when: str) -> float:
+    """Return the root mean square gap of the train trials [m]."""
+    return rms(gap([result.predictions[when][t.name] for t in recording.train], recording.train))
 
 
 def mean_absolute_errors(result: Diagnosis, recording: Recording) -> dict[str, float]:
