@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, field
 
-from torchdlo.sysid.diagnosis import effect_library
+from torchdlo.sysid.diagnosis import effect_library, selection
 from torchdlo.sysid.diagnosis.budget import Budget
 from torchdlo.sysid.diagnosis.candidate_fits import extended
 from torchdlo.sysid.diagnosis.error_floor import rms
@@ -18,12 +18,6 @@ from torchdlo.sysid.diagnosis.score_test import score_effects
 from torchdlo.sysid.diagnosis.workspace import SILENT, Callback, Workspace
 from torchdlo.sysid.estimation.jobs import Fitted
 from torchdlo.sysid.model.trial_batch import Start
-
-MATTERS = 0.03
-"""Share of the baseline's excess gap that each effect has to close, whatever the others leave."""
-
-NEARLY_ALL = 0.8
-"""Share of what is left above the floor."""
 
 _TRIED = 2
 """Effects that are tried in the place of another, besides those that do alike things."""
@@ -79,11 +73,9 @@ class Revision:
         What takes away nearly all that the others leave matters, however small that is beside the baseline's gap.
         """
         # A baseline may go astray on a trial: then what it became when it was fitted further tells what a share is.
-        first = min(rms(self.bench.gaps(f, split)) for f in self.plain) ** 2
-        before, after = (rms(self.bench.gaps(f, split)) ** 2 for f in (less, more))
-        floor, closed = self.bench.level**2, before - after
-        enough = min(MATTERS * (first - self.bench.floor.noise**2), NEARLY_ALL * (before - floor))
-        return closed > max(floor, enough)
+        first = min(rms(self.bench.gaps(f, split)) for f in self.plain)
+        before, after = (rms(self.bench.gaps(f, split)) for f in (less, more))
+        return selection.matters(first, before, after, self.bench.floor.noise, self.bench.level)
 
     def pruned(self, fitted: Fitted, found: EliminationResult) -> Fitted:
         """Return the model without the effects that the last one, or other numbers, have made needless."""

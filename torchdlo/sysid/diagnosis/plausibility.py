@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from torchdlo.physics.effects import EFFECTS
 from torchdlo.sysid.estimation.jobs import Fitted
 from torchdlo.sysid.estimation.levenberg_marquardt import reach
 from torchdlo.sysid.model.rope_model import RopeModel
@@ -42,7 +41,7 @@ def implausible(fitted: Fitted, name: str, drifts: np.ndarray | None = None) -> 
         effect, _, number = key.partition(".")
         if effect != name:
             continue
-        param = EFFECTS[name].params[number.split(".")[0]]
+        param = space.params[k]
         ends = space.to_raw(np.array([[p.low for p in space.params], [p.high for p in space.params]]))[:, k]
         low, high = float(ends.min()), float(ends.max())
         at, width = float(point.raw[k]), float(far[k])

@@ -16,7 +16,7 @@ import numpy as np
 from torchdlo.errors import InputError
 from torchdlo.sysid.diagnosis import baseline as baselines
 from torchdlo.sysid.diagnosis import budget as plan
-from torchdlo.sysid.diagnosis import clamp_models, effect_library
+from torchdlo.sysid.diagnosis import clamp_models, effect_library, selection
 from torchdlo.sysid.diagnosis.backward_elimination import EliminationResult, Revision
 from torchdlo.sysid.diagnosis.budget import BUDGETS, Budget
 from torchdlo.sysid.diagnosis.candidate_fits import extended, short, vector
@@ -25,6 +25,7 @@ from torchdlo.sysid.diagnosis.error_floor import gap, rms
 from torchdlo.sysid.diagnosis.misleading_trials import MisleadingTrial, errors_by_frame, misleading_trials
 from torchdlo.sysid.diagnosis.plausibility import implausible, unresolved
 from torchdlo.sysid.diagnosis.score_test import Score, score_effects
+from torchdlo.sysid.diagnosis.selection import PAYS
 from torchdlo.sysid.diagnosis.significance import RATE, Agreement, agreement, benjamini_hochberg
 from torchdlo.sysid.diagnosis.verdict import UNKNOWN_FLOOR, BestCandidate, Candidate, Diagnosis, through, word
 from torchdlo.sysid.diagnosis.workspace import CHAIN, SILENT, Callback, Workspace
@@ -36,11 +37,8 @@ from torchdlo.sysid.model.model_file import ModelFile
 from torchdlo.sysid.recordings import data_quality
 from torchdlo.sysid.recordings.recording import Recording
 
-PAYS = 0.15
-"""Share of the excess gap that an effect has to close, on the train and on the test trials."""
-
 MUCH = 0.15
-"""Share of it on the test trials from which an effect that is not named is spoken of, if it is not chance."""
+"""Share of the excess gap of the test trials from which an effect that is not named is spoken of, unless by chance."""
 
 MORE = 2.5
 """Times the floor that have to be left for another effect to be looked for: one of three times the floor leaves 3.2."""
@@ -379,15 +377,11 @@ class _Search:
 
     def _refused(self, rival: Fitted, fitted: Fitted) -> str | None:
         """Return why a fit is no better than its rival, None if it is."""
-        gain = self._gain(rival, fitted, "train")
-        if not self._on_most(rival, fitted):
-            return "helps on too few trials"
-        if gain < PAYS:
-            return f"closes {max(gain, 0):.0%} of the gap"
-        if self._gain(rival, fitted, "test") < PAYS:
-            return "does not help on the test trials"
-        if not all(self.revision.matters(rival, fitted, split) for split in ("train", "test")):
-            return "closes less than the floor leaves open"
+        train, test = (tuple(self.bench.gaps(f, split) for f in (rival, fitted)) for split in ("train", "test"))
+        enough = all(self.revision.matters(rival, fitted, split) for split in ("train", "test"))
+        why = selection.refused(train, test, self.bench.floor.noise, enough)
+        if why is not None:
+            return why
         return implausible(fitted, fitted.effects[-1])
 
     def _agreement(self, less: Fitted, more: Fitted) -> Agreement:
@@ -407,13 +401,7 @@ class _Search:
 
     def _gain(self, base: Fitted, fitted: Fitted, split: str) -> float:
         """Return the share of the excess gap (squared, above noise) that a fit closes."""
-        before, after = rms(self.bench.gaps(base, split)) ** 2, rms(self.bench.gaps(fitted, split)) ** 2
-        return float(
-            (before - after) / max(before - self.bench.floor.noise**2, (0.3 * self.bench.floor.noise) ** 2, 1e-12)
-        )
-
-    def _on_most(self, base: Fitted, fitted: Fitted) -> bool:
-        return float(np.mean(self.bench.gaps(fitted, "train") < self.bench.gaps(base, "train"))) > 0.6
+        return selection.gain(self.bench.gaps(base, split), self.bench.gaps(fitted, split), self.bench.floor.noise)
 
     def _extended(
         self, base: Fitted, scores: Sequence[Score], stage: str, others: Sequence[FitJob] = ()
