@@ -132,7 +132,7 @@ def diagnose(
     torchdlo diagnose my_rope --model runs/my_rope/model.json --out runs/my_rope_2
     """
     from torchdlo.report.pages import diagnosis as report
-    from torchdlo.sysid.diagnosis.findings import findings_json, model_json, summary
+    from torchdlo.sysid.diagnosis.findings import findings_json, limits_text, model_json, summary
     from torchdlo.sysid.diagnosis.search import diagnose as search
     from torchdlo.sysid.recordings.recording import load_recording
 
@@ -157,6 +157,10 @@ def diagnose(
         page = report.write_report(result, loaded, out, command=shlex.join(["torchdlo", *sys.argv[1:]]))
         shutil.rmtree(journal, ignore_errors=True)
     typer.echo(summary(result, loaded), err=as_json)
+    if limits := limits_text(result):
+        typer.echo(limits, err=as_json)
+    for trial in result.misleading:
+        typer.echo(f"{trial.name} counts up to {trial.time:.2f} s only: {trial.why}", err=as_json)
     for fault in result.data_issues:
         typer.echo(f"data: {fault.trial + ': ' if fault.trial else ''}{fault.message}", err=as_json)
     typer.echo(f"findings: {out / 'findings.json'}\nreport:   {page}", err=as_json)

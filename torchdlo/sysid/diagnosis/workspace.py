@@ -69,6 +69,8 @@ class Workspace:
         """What `gaps` are for a perfect model [m]."""
         self.mended: set[str] = set()
         """Trials that were simulated once more in finer steps."""
+        self.discounted: dict[str, int] = {}
+        """Train trials that count up to a frame only."""
         self._finer: floors.Refinement | None = None
         self._known: dict[Hashable, np.ndarray] = {}
 
@@ -93,10 +95,26 @@ class Workspace:
         train, free = len(self.trials["train"]), ~self.trials["all"][0].gripped
         self.floor, self._finer = found.floor(slice(train, None), free), found
         frame_weights, self.level = found.frame_weights(free)
+        frame_weights = self._discounted(frame_weights)
         start = replace(self.starts["all"], discretisation_correction=found.correction, frame_weights=frame_weights)
         rows = np.arange(len(start.pos))
         self.starts = {"all": start, "train": start.pick(rows[:train]), "test": start.pick(rows[train:])}
         self._known.clear()
+
+    def discount(self, frames: dict[str, int]) -> None:
+        """Let train trials count up to a frame only, by their names, from now on."""
+        self.discounted |= frames
+        frame_weights = self._discounted(self.starts["all"].frame_weights)
+        rows, train = np.arange(len(self.trials["all"])), len(self.trials["train"])
+        start = replace(self.starts["all"], frame_weights=frame_weights)
+        self.starts = {"all": start, "train": start.pick(rows[:train]), "test": start.pick(rows[train:])}
+
+    def _discounted(self, frame_weights: np.ndarray) -> np.ndarray:
+        """Return what errors of frames count (B, F), nothing of what is discounted."""
+        found = frame_weights.copy()
+        for k, trial in enumerate(self.trials["train"]):
+            found[k, self.discounted.get(trial.name, found.shape[1]) :] = 0.0
+        return found
 
     def predict(self, fits: Sequence[Fitted]) -> None:
         """Simulate all trials with several models at once, for `gaps` and `prediction` to look up."""
