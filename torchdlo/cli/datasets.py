@@ -58,7 +58,13 @@ def make(
             metavar="scripted|FILE|DIR",
         ),
     ] = "scripted",
-    noise: Annotated[float, typer.Option(help="Disturbance of the hands, standard deviation in m.")] = 0.002,
+    noise: Annotated[
+        float | None,
+        typer.Option(help="Disturbance of the hands, standard deviation in m; what each task says if not given."),
+    ] = None,
+    fidelity: Annotated[
+        str, typer.Option(help="How tasks are simulated: published, coarse, or such as 1ms/2.", metavar="NAME")
+    ] = "published",
     size: Annotated[int, typer.Option(help="Width and height of pictures in pixels; 0 for none.")] = 128,
     codec: Annotated[str, typer.Option(help="How pictures are encoded.", metavar="h264|av1")] = "h264",
     seed: Annotated[int, typer.Option(min=0, help="Seed of starts, looks, words and noise.")] = 0,
@@ -82,7 +88,8 @@ def make(
     from torchdlo.agents.data.making import make as run
     from torchdlo.agents.distributed import executor
 
-    plan = DatasetPlan(tuple(tasks), episodes, seed=seed, size=size, codec=codec, actor=actor, noise=noise, batch=batch)
+    options = {"size": size, "codec": codec, "actor": actor, "noise": noise, "batch": batch, "fidelity": fidelity}
+    plan = DatasetPlan(tuple(tasks), episodes, seed=seed, **options)
     painter = _painter() if size else None
 
     def work(callback: Callable[[str, int, int, str], None]) -> dict[str, Any]:

@@ -113,6 +113,8 @@ class Task(ABC):
     """By how much each of the things that `build` can move is moved in x and in y at most [m]."""
     coarse: ClassVar[Fidelity] = Fidelity(substeps=2)
     """A cheaper fidelity that keeps what episodes earn, for training."""
+    demonstration_noise: ClassVar[float] = 0.002
+    """Disturbance of the hands that its scripted demonstration mostly copes with, standard deviation per axis [m]."""
     anchored: ClassVar[bool] = False
     """Whether scripted demonstrations lead to the same places wherever the rope starts, as what they lead to is
     fixed."""
