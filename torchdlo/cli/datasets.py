@@ -67,6 +67,9 @@ def make(
     ] = "published",
     size: Annotated[int, typer.Option(help="Width and height of pictures in pixels; 0 for none.")] = 128,
     codec: Annotated[str, typer.Option(help="How pictures are encoded.", metavar="h264|av1")] = "h264",
+    arms: Annotated[
+        int, typer.Option(min=1, max=2, help="Arms that the set has room for; sets of as many can be merged.")
+    ] = 1,
     seed: Annotated[int, typer.Option(min=0, help="Seed of starts, looks, words and noise.")] = 0,
     batch: Annotated[int, typer.Option(min=1, help="Attempts that are played at once.")] = 16,
     workers: Workers = None,
@@ -88,8 +91,8 @@ def make(
     from torchdlo.agents.data.making import make as run
     from torchdlo.agents.distributed import executor
 
-    options = {"size": size, "codec": codec, "actor": actor, "noise": noise, "batch": batch, "fidelity": fidelity}
-    plan = DatasetPlan(tuple(tasks), episodes, seed=seed, **options)
+    options = {"size": size, "codec": codec, "actor": actor, "noise": noise, "fidelity": fidelity, "arms": arms}
+    plan = DatasetPlan(tuple(tasks), episodes, seed=seed, batch=batch, **options)
     painter = _painter() if size else None
 
     def work(callback: Callable[[str, int, int, str], None]) -> dict[str, Any]:

@@ -57,6 +57,8 @@ class DatasetPlan:
     """See `Noise.size` [m]; what each task says (`Task.demonstration_noise`) if None."""
     fidelity: str = "published"
     """How tasks are simulated: "published", "coarse" (each task's own cheaper one), or such as "1ms/2"."""
+    arms: int = 1
+    """Arms that the set has room for, if not more by its tasks: sets of as many arms can be merged."""
     batch: int = 16
     """Attempts that are played at once."""
     tries: int = 8
@@ -77,7 +79,7 @@ class DatasetPlan:
     @property
     def schema(self) -> Schema:
         """What frames are like."""
-        return Schema(arms=max(find(name).arms.count for name in self.tasks), size=self.size, codec=self.codec)
+        return Schema(arms=max(self.arms, *(find(name).arms.count for name in self.tasks)), size=self.size, codec=self.codec)
 
     def task(self, name: str) -> Task:
         """Return a task in the fidelity of the plan."""
