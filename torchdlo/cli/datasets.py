@@ -219,45 +219,6 @@ def view(
     typer.echo(f"page: {out}")
 
 
-@dataset.command()
-def evaluate(
-    policy: Annotated[Path, typer.Argument(help="Policy file of torchdlo learn.", metavar="POLICY")],
-    tasks: Annotated[
-        list[str] | None, typer.Argument(help="Names of tasks; those that it has learned if not given.")
-    ] = None,
-    episodes: Annotated[int, typer.Option(min=1, help="Episodes per task and condition.")] = 15,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the starts; no data set has them.")] = 0,
-    condition: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="usual, unseen_words, swapped_words or blank_pictures; may be repeated.",
-            metavar="NAME",
-        ),
-    ] = None,
-    out: Annotated[Path | None, typer.Option("--out", "-o", help="Also write the result to this file.")] = None,
-    as_json: Json = False,
-) -> None:
-    """Let a policy act in closed loop, from starts and with looks that it has not seen, and say how often it succeeds.
-
-    [bold]Example:[/bold] torchdlo dataset evaluate policy.pt --condition usual --condition swapped_words
-    """
-    from torchdlo.agents.policies.rollout import evaluate as run
-    from torchdlo.files import write_atomically
-
-    options = {"episodes": episodes, "seed": seed, "conditions": condition or ["usual"]}
-    found = _watched(lambda show: run(policy, tasks or (), _painter(), **options, callback=show), "nothing was written")
-    content = json.dumps({"generator": "torchdlo dataset evaluate"} | found, indent=1) + "\n"
-    if out is not None:
-        check_writable(out)
-        write_atomically(out, content)
-    if as_json:
-        typer.echo(content, nl=False)
-    for name, conditions in found["tasks"].items():
-        said = ", ".join(f"{kind} {row['success']:.0%}" for kind, row in conditions.items())
-        typer.echo(f"{name}: {said}", err=as_json)
-    typer.echo("mean: " + ", ".join(f"{kind} {x:.0%}" for kind, x in found["mean"].items()), err=as_json)
-
-
 def learn(
     path: SetArgument,
     out: Annotated[

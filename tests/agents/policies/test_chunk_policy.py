@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import sys
 from pathlib import Path
 
@@ -51,7 +52,7 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def learned(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A policy that was trained for a while."""
     out = tmp_path_factory.mktemp("policies") / "policy.pt"
-    learn(data, out, Training(epochs=60, batch=8, rate=2e-3, chunk=4, width=32, language="hashed"))
+    learn(data, out, Training(epochs=60, batch=8, rate=2e-3, chunk=4, width=32, language="hashed", recolor=0.0))
     return out
 
 
@@ -162,22 +163,27 @@ def test_training_that_was_stopped_comes_to_the_same(data: Path, tmp_path: Path)
 
 
 def test_a_policy_acts_in_closed_loop_and_makes_a_set(learned: Path, tmp_path: Path, monkeypatch, capsys) -> None:
-    found = evaluate(learned, ["short"], Dots(), episodes=6, conditions=("usual", "blank_pictures"))
+    found = evaluate(learned, ["short"], Dots(), episodes=6, conditions=("varied", "blanked"))
     rows = found["tasks"]["short"]
     # Starts on the left are done, those on the right cannot be.
-    assert 0.3 <= rows["usual"]["success"] <= 1 and found["mean"]["usual"] == rows["usual"]["success"]
-    assert len(rows["usual"]["episodes"]) == 6
+    assert 0.3 <= rows["varied"]["success"] <= 1 and found["mean"]["varied"] == rows["varied"]["success"]
+    assert len(rows["varied"]["episodes"]) == 6
     again = evaluate(learned, ["short"], Dots(), episodes=6)
-    assert again["tasks"]["short"]["usual"] == rows["usual"]
+    assert again["tasks"]["short"]["varied"] == rows["varied"]
     make(plan(episodes=2, actor=str(learned), size=16), tmp_path / "set", painter=Dots())
     assert check(tmp_path / "set") == []
     assert open_set(tmp_path / "set").provenance["episodes"][0]["actions_from"] == "policy policy.pt"
-    monkeypatch.setattr("torchdlo.cli.datasets._painter", Dots)
-    with pytest.raises(SystemExit):
-        app.main(["dataset", "evaluate", str(learned), "--episodes", "2", "--json"])
-    assert '"success"' in capsys.readouterr().out
-    with pytest.raises(InputError, match="swapped_words needs another task"):
-        evaluate(learned, ["short"], Dots(), episodes=2, conditions=("swapped_words",))
+    monkeypatch.setattr("torchdlo.agents.data.painting.TaskPainter", Dots)
+    words = ["evaluate", str(learned), "--starts", "2", "--out", str(tmp_path), "--json"]
+    with pytest.raises(SystemExit) as done:
+        app.main(words)
+    assert not done.value.code and '"success"' in capsys.readouterr().out
+    assert json.loads((tmp_path / "evaluation.json").read_text())["episodes"] == 2
+    with pytest.raises(SystemExit) as wrong:
+        app.main([*words, "--film"])
+    assert wrong.value.code == 2 and "it is a policy of learn" in capsys.readouterr().err
+    with pytest.raises(InputError, match="swapped needs another task"):
+        evaluate(learned, ["short"], Dots(), episodes=2, conditions=("swapped",))
     with pytest.raises(InputError, match="it moves 1 arm, and pair has 2"):
         evaluate(learned, ["pair"], Dots(), episodes=2)
 
@@ -196,4 +202,4 @@ def test_a_policy_looks_again_after_some_actions_and_follows_its_chunk_between()
     actor = PolicyDemonstrator(policy.eval(), "hashed", "policy")
     with torch.no_grad():
         play_batch(made, starts(task, 0, range(2)), actor, Noise(0.0), Counting())
-    assert seen == [0, 4, 8]
+    assert seen == [0, 8]

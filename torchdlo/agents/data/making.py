@@ -79,7 +79,9 @@ class DatasetPlan:
     @property
     def schema(self) -> Schema:
         """What frames are like."""
-        return Schema(arms=max(self.arms, *(find(name).arms.count for name in self.tasks)), size=self.size, codec=self.codec)
+        return Schema(
+            arms=max(self.arms, *(find(name).arms.count for name in self.tasks)), size=self.size, codec=self.codec
+        )
 
     def task(self, name: str) -> Task:
         """Return a task in the fidelity of the plan."""

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchdlo.agents.data.schema import SIDES
 from torchdlo.envs.core import episode
 from torchdlo.envs.observations.pixels import CameraRig, camera_rig, rendered
 from torchdlo.vision.look import Look, draw_look
@@ -44,6 +43,7 @@ class TaskPainter:
         """Return pictures by camera, see `record.Painter`; the first arm has the right wrist."""
         rig = _rig(made, size)
         quality = {"samples": self.samples, "shadow": self.shadow}
-        seen = rendered(rig, world.state, world.joints, looks=[_look(seed, self.jitter) for seed in looks], **quality).rgb
-        names = [camera.name if camera.arm is None else f"wrist_{SIDES[camera.arm]}" for camera in rig.cameras]
-        return {name: seen[:, k] for k, name in enumerate(names)}
+        seen = rendered(
+            rig, world.state, world.joints, looks=[_look(seed, self.jitter) for seed in looks], **quality
+        ).rgb
+        return {camera.name: seen[:, k] for k, camera in enumerate(rig.cameras)}

@@ -26,7 +26,7 @@ from torchdlo.agents.policies.language import WIDTH
 from torchdlo.errors import InputError
 from torchdlo.files import replacing
 
-__all__ = ["ChunkPolicy", "Shape", "load_policy", "save_policy"]
+__all__ = ["ChunkPolicy", "Shape", "is_chunk_policy", "load_policy", "save_policy"]
 
 GENERATOR = "torchdlo learn"
 
@@ -159,6 +159,15 @@ def save_policy(path: Path, policy: ChunkPolicy, about: dict[str, Any]) -> None:
     content = {"generator": GENERATOR, "shape": asdict(policy.shape), "about": about, "weights": policy.state_dict()}
     with replacing(path) as temporary:
         torch.save(content, temporary)
+
+
+def is_chunk_policy(path: Path) -> bool:
+    """Return whether a file is a policy that sees."""
+    try:
+        load_policy(path)
+    except InputError:
+        return False
+    return True
 
 
 def load_policy(path: Path) -> tuple[ChunkPolicy, dict[str, Any]]:

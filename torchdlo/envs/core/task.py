@@ -120,6 +120,8 @@ class Task(ABC):
     fixed."""
     stages: ClassVar[tuple[Stage, ...]] = ()
     """What hands hold from which action on; if not given, they hold what they start at until the end."""
+    counterpart: ClassVar[str] = ""
+    """Name of a task that looks the same at the start, so that only the instruction tells which one is meant."""
     cameras: ClassVar[tuple[TaskCamera, ...]] = ()
     """Cameras beside or instead of the usual ones, "front" and "wrist_right" or "wrist_left" on each arm, see
     `observations.pixels.cameras_of`."""
