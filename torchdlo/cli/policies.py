@@ -213,8 +213,8 @@ def evaluate(
         list[str] | None,
         typer.Option(
             help="one: from the one start; varied: from unseen starts; disturbed: those with other friction. Of "
-            "policies of learn: varied, paraphrased (instructions that no data set has), swapped (those of another task) "
-            "or blanked (black pictures). May be repeated.",
+            "policies of learn: varied, paraphrased (instructions that no data set has), swapped (those of another "
+            "task) or blanked (black pictures). May be repeated.",
             metavar="NAME",
         ),
     ] = None,
