@@ -119,6 +119,21 @@ def test_files_of_policies_come_back_and_others_are_refused(tmp_path: Path) -> N
         load_policy(tmp_path / "none.pt")
 
 
+def test_small_files_hold_nearly_the_same_policy(tmp_path: Path) -> None:
+    torch.manual_seed(0)
+    shape = Shape(arms=2, cameras=("front",), size=96)
+    policy = ChunkPolicy(shape).eval()
+    for name, small in (("whole", False), ("small", True)):
+        save_policy(tmp_path / f"{name}.pt", policy, {}, small=small)
+    sizes = [(tmp_path / f"{name}.pt").stat().st_size for name in ("whole", "small")]
+    assert sizes[1] < 0.4 * sizes[0]
+    again, _ = load_policy(tmp_path / "small.pt")
+    picture, words = torch.randint(256, (8, 3, 96, 96), dtype=torch.uint8), torch.randn(8, 384)
+    with torch.no_grad():
+        a, b = (one({"front": picture}, words, words) for one in (policy, again))
+    assert 0 < float((a - b).abs().max()) < 0.01 * float(a.std())
+
+
 def test_training_reads_the_set_and_learns_its_targets(data: Path, learned: Path) -> None:
     policy, about = load_policy(learned)
     assert about["tasks"] == ["short"] and about["loss"][-1] < 0.25 * about["loss"][0]

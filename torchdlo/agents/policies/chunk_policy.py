@@ -148,17 +148,37 @@ def _kind(camera: str) -> str:
     return camera.partition("_")[0]
 
 
-def save_policy(path: Path, policy: ChunkPolicy, about: dict[str, Any]) -> None:
+_LARGE = 1 << 18
+"""Weights from which on a matrix is large."""
+
+
+def save_policy(path: Path, policy: ChunkPolicy, about: dict[str, Any], *, small: bool = False) -> None:
     """Write a policy to a file.
 
     Args:
         path: the file.
         policy: the policy.
         about: what else is to be known of it, as plain data.
+        small: whether to round weights, to 16 bits, those of large matrices to 8 with a scale for each row: a third of
+            the size.
     """
-    content = {"generator": GENERATOR, "shape": asdict(policy.shape), "about": about, "weights": policy.state_dict()}
+    weights: dict[str, Any] = policy.state_dict()
+    if small:
+        weights = {name: _rounded(x) if name.endswith("weight") else x for name, x in weights.items()}
+    content = {"generator": GENERATOR, "shape": asdict(policy.shape), "about": about, "weights": weights}
     with replacing(path) as temporary:
         torch.save(content, temporary)
+
+
+def _rounded(x: Tensor) -> Tensor | dict[str, Tensor]:
+    if x.numel() < _LARGE:
+        return x.half()
+    scale = x.abs().amax(1, keepdim=True).clamp(min=1e-12) / 127
+    return {"whole": (x / scale).round().to(torch.int8), "scale": scale}
+
+
+def _exact(x: Tensor | dict[str, Tensor]) -> Tensor:
+    return x["whole"] * x["scale"] if isinstance(x, dict) else x
 
 
 def is_chunk_policy(path: Path) -> bool:
@@ -181,7 +201,7 @@ def load_policy(path: Path) -> tuple[ChunkPolicy, dict[str, Any]]:
             raise ValueError
         shape = {k: tuple(v) if isinstance(v, list) else v for k, v in content["shape"].items()}
         policy = ChunkPolicy(Shape(**shape))
-        policy.load_state_dict(content["weights"])
+        policy.load_state_dict({name: _exact(x) for name, x in content["weights"].items()})
     except FileNotFoundError:
         raise InputError(f"{path}: there is no such file; expected a policy of torchdlo learn.") from None
     except (OSError, RuntimeError, ValueError, KeyError, TypeError, EOFError, pickle.UnpicklingError):
