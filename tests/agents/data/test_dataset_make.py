@@ -218,6 +218,8 @@ def test_wrong_requests_are_one_sentence(tmp_path: Path, capsys, monkeypatch) ->
     monkeypatch.setattr("torchdlo.cli.datasets._painter", Dots)
     cases = {
         ("make", "sweeping"): "there is no task 'sweeping'; expected one of",
+        ("make", "../short"): "there is no task '../short'; expected one of",
+        ("make", "<b>short</b>"): "there is no task '<b>short</b>'; expected one of",
         ("make", "short", "short"): "the task short is named twice",
         ("make", "short", "--noise", "0.5"): "noise: expected 0 to 0.01 m, given 0.5",
         ("make", "short", "--fidelity", "fast"): "fidelity: it is 'fast'; expected published, or step and substeps",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import sys
 from pathlib import Path
 
@@ -175,6 +176,17 @@ def test_training_that_was_stopped_comes_to_the_same(data: Path, tmp_path: Path)
     assert all(torch.equal(x, y) for x, y in zip(a.parameters(), b.parameters(), strict=True))
     with pytest.raises(InputError, match="there is no checkpoint to resume"):
         learn(data, tmp_path / "parts.pt", training, resume=True)
+
+
+def test_learning_from_a_damaged_set_is_one_sentence(data: Path, tmp_path: Path) -> None:
+    for part, said in (("data", "damaged and cannot be read"), ("videos", "file-000.mp4")):
+        own = tmp_path / part
+        shutil.copytree(data, own)
+        file = next(f for f in sorted((own / part).rglob("file-*")))
+        file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
+        with pytest.raises(InputError, match=said) as caught:
+            learn(own, tmp_path / "policy.pt", Training(epochs=1, chunk=4, width=32, language="hashed"))
+        assert len(str(caught.value).splitlines()) == 1 and not list(tmp_path.glob(".frames*"))
 
 
 def test_a_policy_acts_in_closed_loop_and_makes_a_set(learned: Path, tmp_path: Path, monkeypatch, capsys) -> None:
