@@ -56,9 +56,18 @@ def make(
             metavar="scripted|FILE|DIR",
         ),
     ] = "scripted",
-    noise: Annotated[float, typer.Option(help="Disturbance of the hands, standard deviation in m.")] = 0.002,
+    noise: Annotated[
+        float | None,
+        typer.Option(help="Disturbance of the hands, standard deviation in m; what each task says if not given."),
+    ] = None,
+    fidelity: Annotated[
+        str, typer.Option(help="How tasks are simulated: published, coarse, or such as 1ms/2.", metavar="NAME")
+    ] = "published",
     size: Annotated[int, typer.Option(help="Width and height of pictures in pixels; 0 for none.")] = 128,
     codec: Annotated[str, typer.Option(help="How pictures are encoded.", metavar="h264|av1")] = "h264",
+    arms: Annotated[
+        int, typer.Option(min=1, max=2, help="Arms that the set has room for; sets of as many can be merged.")
+    ] = 1,
     seed: Annotated[int, typer.Option(min=0, help="Seed of starts, looks, words and noise.")] = 0,
     batch: Annotated[int, typer.Option(min=1, help="Attempts that are played at once.")] = 16,
     workers: Workers = None,
@@ -80,7 +89,8 @@ def make(
     from torchdlo.agents.data.making import make as run
     from torchdlo.agents.distributed import executor
 
-    plan = DatasetPlan(tuple(tasks), episodes, seed=seed, size=size, codec=codec, actor=actor, noise=noise, batch=batch)
+    options = {"size": size, "codec": codec, "actor": actor, "noise": noise, "fidelity": fidelity, "arms": arms}
+    plan = DatasetPlan(tuple(tasks), episodes, seed=seed, batch=batch, **options)
     painter = _painter() if size else None
 
     def work(callback: Callable[[str, int, int, str], None]) -> dict[str, Any]:
@@ -205,45 +215,6 @@ def view(
     check_writable(out)
     write_page(data, out, chosen)
     typer.echo(f"page: {out}")
-
-
-@dataset.command()
-def evaluate(
-    policy: Annotated[Path, typer.Argument(help="Policy file of torchdlo learn.", metavar="POLICY")],
-    tasks: Annotated[
-        list[str] | None, typer.Argument(help="Names of tasks; those that it has learned if not given.")
-    ] = None,
-    episodes: Annotated[int, typer.Option(min=1, help="Episodes per task and condition.")] = 15,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the starts; no data set has them.")] = 0,
-    condition: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="usual, unseen_words, swapped_words or blank_pictures; may be repeated.",
-            metavar="NAME",
-        ),
-    ] = None,
-    out: Annotated[Path | None, typer.Option("--out", "-o", help="Also write the result to this file.")] = None,
-    as_json: Json = False,
-) -> None:
-    """Let a policy act in closed loop, from starts and with looks that it has not seen, and say how often it succeeds.
-
-    [bold]Example:[/bold] torchdlo dataset evaluate policy.pt --condition usual --condition swapped_words
-    """
-    from torchdlo.agents.policies.rollout import evaluate as run
-    from torchdlo.files import write_atomically
-
-    options = {"episodes": episodes, "seed": seed, "conditions": condition or ["usual"]}
-    found = _watched(lambda show: run(policy, tasks or (), _painter(), **options, callback=show), "nothing was written")
-    content = json.dumps({"generator": "torchdlo dataset evaluate"} | found, indent=1) + "\n"
-    if out is not None:
-        check_writable(out)
-        write_atomically(out, content)
-    if as_json:
-        typer.echo(content, nl=False)
-    for name, conditions in found["tasks"].items():
-        said = ", ".join(f"{kind} {row['success']:.0%}" for kind, row in conditions.items())
-        typer.echo(f"{name}: {said}", err=as_json)
-    typer.echo("mean: " + ", ".join(f"{kind} {x:.0%}" for kind, x in found["mean"].items()), err=as_json)
 
 
 def learn(

@@ -215,9 +215,15 @@ def evaluate(
     protocol: Annotated[
         list[str] | None,
         typer.Option(
-            help="one: from the one start; varied: from unseen starts; disturbed: those with other friction.",
-            metavar="one|varied|disturbed",
+            help="one: from the one start; varied: from unseen starts; disturbed: those with other friction. Of "
+            "policies of learn: varied, paraphrased (instructions that no data set has), swapped (those of another "
+            "task) or blanked (black pictures). May be repeated.",
+            metavar="NAME",
         ),
+    ] = None,
+    task: Annotated[
+        list[str] | None,
+        typer.Option(help="Of policies of learn: a task; all that it has learned if none is named.", metavar="NAME"),
     ] = None,
     film: Annotated[bool, typer.Option("--film", help="Write best.mp4 and worst.mp4 of the last protocol.")] = False,
     out: Annotated[
@@ -228,9 +234,13 @@ def evaluate(
 ) -> None:
     """Judge policies at the published fidelity, from starts that no training has seen.
 
+    Policies of learn, which see, are judged with looks that they have not seen either.
+
     [bold]Examples:[/bold]
 
     torchdlo evaluate runs/train/lifting-hybrid
+
+    torchdlo evaluate runs/dlo4/policy.pt --protocol varied --protocol paraphrased
 
     torchdlo evaluate runs/train/lifting-hybrid runs/train/lifting-hybrid-1 --protocol disturbed --film
     """
@@ -240,6 +250,18 @@ def evaluate(
     from torchdlo.envs import find
 
     _quiet()
+    if len(policies) == 1 and policies[0].suffix == ".pt":
+        from torchdlo.agents.policies.chunk_policy import is_chunk_policy
+
+        if is_chunk_policy(policies[0]):
+            if film or compiled:
+                raise InputError(
+                    f"{policies[0]}: it is a policy of learn; --film and --compiled are for those of train."
+                )
+            _evaluate_seeing(policies[0], task or [], starts, protocol or ["varied"], out, as_json)
+            return
+    if task:
+        raise InputError("--task: policies of train have one task of their own; leave it out.")
     names = protocol or ["one", "varied"]
     other = sorted(set(names) - set(PROTOCOLS))
     if other:
@@ -253,16 +275,37 @@ def evaluate(
         for name in ("best.mp4", "worst.mp4"):
             check_video(out / name)
     found, name = load_policies(policies)
-    task = find(name)
+    own = find(name)
     with progress() as show, deferred_interrupt(show) as callback:
-        results, plays = judge(found, task, starts=starts, protocols=names, callback=callback, compiled=compiled)
+        results, plays = judge(found, own, starts=starts, protocols=names, callback=callback, compiled=compiled)
     content = json.dumps({"generator": "torchdlo evaluate", "files": [str(p) for p in policies]} | results, indent=1)
     write_atomically(out / "evaluation.json", content + "\n")
     typer.echo(summary(results), err=as_json)
     typer.echo(f"results: {out / 'evaluation.json'}", err=as_json)
     if film:
-        for file in _films(task, plays[names[-1]], out):
+        for file in _films(own, plays[names[-1]], out):
             typer.echo(f"film:    {file}", err=as_json)
+    if as_json:
+        typer.echo(content)
+
+
+def _evaluate_seeing(
+    policy: Path, tasks: list[str], starts: int, protocols: list[str], out: Path | None, as_json: bool
+) -> None:
+    """Judge a policy that sees, and write what it came to beside it."""
+    from torchdlo.agents.data.painting import TaskPainter
+    from torchdlo.agents.policies.rollout import evaluate as judge
+
+    file = (out or policy.parent) / "evaluation.json"
+    check_writable(file)
+    with progress() as show, deferred_interrupt(show) as callback:
+        found = judge(policy, tasks, TaskPainter(), episodes=starts, conditions=protocols, callback=callback)
+    content = json.dumps({"generator": "torchdlo evaluate"} | found, indent=1)
+    write_atomically(file, content + "\n")
+    for name, rows in found["tasks"].items():
+        typer.echo(f"{name}: " + ", ".join(f"{kind} {row['success']:.0%}" for kind, row in rows.items()), err=as_json)
+    typer.echo("mean: " + ", ".join(f"{kind} {x:.0%}" for kind, x in found["mean"].items()), err=as_json)
+    typer.echo(f"results: {file}", err=as_json)
     if as_json:
         typer.echo(content)
 

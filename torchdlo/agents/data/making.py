@@ -26,7 +26,7 @@ from torchdlo.agents.data.record import Noise, Painter, record, starts
 from torchdlo.agents.data.schema import Schema
 from torchdlo.agents.distributed import Executor, Serial
 from torchdlo.agents.trajopt.search_journal import versions
-from torchdlo.envs import find
+from torchdlo.envs import Task, find, simulated
 from torchdlo.envs.core import episode
 from torchdlo.errors import InputError
 from torchdlo.journal import locked, read_json, write_json
@@ -53,8 +53,12 @@ class DatasetPlan:
     codec: str = "h264"
     actor: str = "scripted"
     """Who acts, see `demonstrators.demonstrator`."""
-    noise: float = 0.002
-    """See `Noise.size` [m]."""
+    noise: float | None = None
+    """See `Noise.size` [m]; what each task says (`Task.demonstration_noise`) if None."""
+    fidelity: str = "published"
+    """How tasks are simulated: "published", "coarse" (each task's own cheaper one), or such as "1ms/2"."""
+    arms: int = 1
+    """Arms that the set has room for, if not more by its tasks: sets of as many arms can be merged."""
     batch: int = 16
     """Attempts that are played at once."""
     tries: int = 8
@@ -66,14 +70,26 @@ class DatasetPlan:
         twice = {name for name in self.tasks if self.tasks.count(name) > 1}
         if twice:
             raise InputError(f"the task {', '.join(sorted(twice))} is named twice.")
-        if not 0 <= self.noise <= 0.01:
+        if self.noise is not None and not 0 <= self.noise <= 0.01:
             raise InputError(f"noise: expected 0 to 0.01 m, given {self.noise:g}.")
         _ = self.schema  # says what is wrong with names, size or codec
+        for name in self.tasks:
+            self.task(name)
 
     @property
     def schema(self) -> Schema:
         """What frames are like."""
-        return Schema(arms=max(find(name).arms.count for name in self.tasks), size=self.size, codec=self.codec)
+        return Schema(
+            arms=max(self.arms, *(find(name).arms.count for name in self.tasks)), size=self.size, codec=self.codec
+        )
+
+    def task(self, name: str) -> Task:
+        """Return a task in the fidelity of the plan."""
+        return simulated(find(name), self.fidelity)
+
+    def shake(self, name: str) -> Noise:
+        """Return the disturbance of the hands in a task."""
+        return Noise(find(name).demonstration_noise if self.noise is None else self.noise)
 
     @property
     def most(self) -> int:
@@ -92,9 +108,8 @@ class _Job:
 
 
 @functools.lru_cache(maxsize=2)
-def _prepared(task: str, batch: int) -> episode.Episode:
+def _prepared(found: Task, batch: int) -> episode.Episode:
     # Recorded steps take seconds to begin with; compiled ones take minutes and gain little in a batch.
-    found = find(task)
     return episode.prepare(found, batch, compiled=False, recorded=found.horizon > _LONG)
 
 
@@ -106,9 +121,9 @@ def _actor(task: str, actor: str) -> Demonstrator:
 def _played(job: _Job) -> list[dict[str, bytes]]:
     """Return the files of the attempts of a batch."""
     plan, actor = job.plan, _actor(job.task, job.plan.actor)
-    made = _prepared(job.task, plan.batch)
+    made = _prepared(plan.task(job.task), plan.batch)
     tries = starts(made.task, plan.seed, range(job.first, job.first + plan.batch))
-    recordings = record(made, tries, actor, plan.schema, job.painter, Noise(plan.noise))
+    recordings = record(made, tries, actor, plan.schema, job.painter, plan.shake(job.task))
     return [attempts.packed(each, job.task, actor.source, plan.schema) for each in recordings]
 
 

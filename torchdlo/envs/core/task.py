@@ -113,11 +113,15 @@ class Task(ABC):
     """By how much each of the things that `build` can move is moved in x and in y at most [m]."""
     coarse: ClassVar[Fidelity] = Fidelity(substeps=2)
     """A cheaper fidelity that keeps what episodes earn, for training."""
+    demonstration_noise: ClassVar[float] = 0.002
+    """Disturbance of the hands that its scripted demonstration mostly copes with, standard deviation per axis [m]."""
     anchored: ClassVar[bool] = False
     """Whether scripted demonstrations lead to the same places wherever the rope starts, as what they lead to is
     fixed."""
     stages: ClassVar[tuple[Stage, ...]] = ()
     """What hands hold from which action on; if not given, they hold what they start at until the end."""
+    counterpart: ClassVar[str] = ""
+    """Name of a task that looks the same at the start, so that only the instruction tells which one is meant."""
     cameras: ClassVar[tuple[TaskCamera, ...]] = ()
     """Cameras beside or instead of the usual ones, "front" and "wrist_right" or "wrist_left" on each arm, see
     `observations.pixels.cameras_of`."""
