@@ -155,7 +155,7 @@ def _hybrid(
     resume: bool,
     as_json: bool,
 ) -> None:
-    from torchdlo.agents.rl.hybrid import STAGES, Hybrid, hybrid
+    from torchdlo.agents.rl.hybrid import STAGES, hybrid, plan_of
 
     other = sorted(set(without) - set(STAGES))
     if other:
@@ -163,7 +163,7 @@ def _hybrid(
     if not trajectories and not (resume and (out / "expert.json").exists()):
         trajectories = [_searched(task, settings.seed, out)]
     stages = [name for name in STAGES if name not in without]
-    plan = Hybrid()
+    plan = plan_of(task.name)
     try:
         with progress() as show, deferred_interrupt(show) as callback:
             _, notes = hybrid(

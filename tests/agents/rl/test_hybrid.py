@@ -172,7 +172,7 @@ def test_commands_train_and_judge(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     result = json.loads(run("evaluate", str(out), str(out), "--starts", "4", "--json"))
     assert (result["policies"], result["varied"]["episodes"], result["fidelity"]) == (2, 8, "1ms/5")
     assert json.loads((out / "evaluation.json").read_text()) == result
-    monkeypatch.setattr(stages, "Hybrid", lambda: PLAN)
+    monkeypatch.setattr(stages, "plan_of", lambda _: PLAN)
     words = ["train", "lead", "--out", str(tmp_path / "hybrid"), "--trajectory", str(found(tmp_path)), *small]
     notes = json.loads(run(*words, "--without", "tune", "--json"))
     assert "clone" in notes and "tune" not in notes
