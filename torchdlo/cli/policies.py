@@ -216,6 +216,20 @@ def evaluate(
             metavar="one|varied|disturbed",
         ),
     ] = None,
+    reset_seed: Annotated[
+        int, typer.Option(min=0, help="Seed of the unseen starts: another one for starts that no judgement has seen.")
+    ] = 0,
+    perturb: Annotated[
+        bool,
+        typer.Option(
+            "--perturb",
+            help="Write robustness.json instead: success under other friction, stiffness and starts, and under noise.",
+        ),
+    ] = False,
+    trajectory: Annotated[
+        Path | None,
+        typer.Option(help="With --perturb: what optimize found, replayed and followed beside them.", metavar="FILE"),
+    ] = None,
     film: Annotated[bool, typer.Option("--film", help="Write best.mp4 and worst.mp4 of the last protocol.")] = False,
     out: Annotated[
         Path | None, typer.Option("--out", "-o", help="Folder for evaluation.json and films.", metavar="DIR")
@@ -230,6 +244,8 @@ def evaluate(
     torchdlo evaluate runs/train/lifting-hybrid
 
     torchdlo evaluate runs/train/lifting-hybrid runs/train/lifting-hybrid-1 --protocol disturbed --film
+
+    torchdlo evaluate runs/train/lifting-hybrid --perturb --trajectory runs/searches/lifting-hybrid-0/trajectory.json
     """
     from torchdlo.agents.rl.evaluate import PROTOCOLS
     from torchdlo.agents.rl.evaluate import evaluate as judge
@@ -243,6 +259,11 @@ def evaluate(
         raise InputError(f"--protocol {', '.join(other)}: expected some of {', '.join(PROTOCOLS)}.")
     first = policies[0] if policies[0].is_dir() else policies[0].parent
     out = out or first
+    if trajectory and not perturb:
+        raise InputError("--trajectory: it is compared with policies under perturbations; give --perturb as well.")
+    if perturb:
+        _perturb(policies, trajectory, starts, reset_seed, out, as_json)
+        return
     check_writable(out / "evaluation.json")
     if film:
         from torchdlo.report.render.video import check_video
@@ -252,7 +273,9 @@ def evaluate(
     found, name = load_policies(policies)
     task = find(name)
     with progress() as show, deferred_interrupt(show) as callback:
-        results, plays = judge(found, task, starts=starts, protocols=names, callback=callback, compiled=compiled)
+        results, plays = judge(
+            found, task, starts=starts, protocols=names, seed=reset_seed, callback=callback, compiled=compiled
+        )
     content = json.dumps({"generator": "torchdlo evaluate", "files": [str(p) for p in policies]} | results, indent=1)
     write_atomically(out / "evaluation.json", content + "\n")
     typer.echo(summary(results), err=as_json)
@@ -260,6 +283,38 @@ def evaluate(
     if film:
         for file in _films(task, plays[names[-1]], out):
             typer.echo(f"film:    {file}", err=as_json)
+    if as_json:
+        typer.echo(content)
+
+
+def _perturb(policies: list[Path], trajectory: Path | None, starts: int, seed: int, out: Path, as_json: bool) -> None:
+    """Judge policies, and the trajectory and the experts behind them, under perturbations."""
+    from torchdlo.agents.rl import robustness
+    from torchdlo.agents.rl.expert import candidates, load_expert
+    from torchdlo.agents.rl.results import load_policies
+    from torchdlo.agents.trajopt.result import load_actions
+    from torchdlo.agents.trajopt.task_problem import TaskProblem
+    from torchdlo.envs import find
+
+    check_writable(out / "robustness.json")
+    found, name = load_policies(policies)
+    task, actors = find(name), {}
+    if trajectory is not None:
+        problem = TaskProblem(task, compiled=False)
+        actors["trajectory replayed"] = robustness.replaying(problem.full(load_actions(trajectory, problem)))
+        for expert in candidates(task, [trajectory])[:1]:
+            actors["its path followed"] = robustness.following(expert)
+    for policy, path in zip(found, policies, strict=True):
+        folder = path if path.is_dir() else path.parent
+        if (folder / "expert.json").exists():
+            actors[f"expert of {folder.name}"] = robustness.following(load_expert(folder / "expert.json", task))
+        actors[f"policy {folder.name}"] = robustness.policy_acting(policy)
+    with progress() as show, deferred_interrupt(show) as callback:
+        results = robustness.perturbed(actors, task, starts=starts, seed=seed, callback=callback)
+    content = json.dumps({"generator": "torchdlo evaluate", "files": [str(p) for p in policies]} | results, indent=1)
+    write_atomically(out / "robustness.json", content + "\n")
+    typer.echo(robustness.table(results), err=as_json)
+    typer.echo(f"results: {out / 'robustness.json'}", err=as_json)
     if as_json:
         typer.echo(content)
 

@@ -17,9 +17,9 @@ from torchdlo.envs import PUBLISHED, Task, simulated
 from torchdlo.envs.observations.state import observe
 from torchdlo.physics import tree
 
-__all__ = ["PROTOCOLS", "evaluate", "judged", "wilson"]
+__all__ = ["PROTOCOLS", "UNSEEN", "evaluate", "judged", "wilson"]
 
-_UNSEEN = 777_000_000
+UNSEEN = 777_000_000
 """Seed of the starts of the judgement; trainers add less than this to theirs."""
 PROTOCOLS = {
     "one": {"variation": False},
@@ -70,11 +70,11 @@ def judged(
     episodes = TaskEpisodes(
         fine,
         len(policies) * (many + one),
-        seed=_UNSEEN + 1000 * seed,
+        seed=UNSEEN + 1000 * seed,
         compiled=compiled,
         randomize=_randomized(fine, how.get("randomize", 0.0)),
     )
-    rng = torch.Generator().manual_seed(_UNSEEN + 1000 * seed + 1)
+    rng = torch.Generator().manual_seed(UNSEEN + 1000 * seed + 1)
     seen = _shared(episodes, len(policies), many, one)
     actions: list[Tensor] = []
     step: Any = None
