@@ -9,6 +9,7 @@ from typing import Any
 
 import torch
 
+from torchdlo.agents.policies.cloud_policy import CloudPolicy, CloudSpec
 from torchdlo.agents.policies.policy import Policy, PolicySpec
 from torchdlo.errors import InputError
 from torchdlo.files import write_atomically
@@ -18,10 +19,11 @@ __all__ = ["load", "module", "save"]
 _GENERATOR = "torchdlo train"
 
 
-def save(policy: Policy, path: Path, notes: dict[str, Any] | None = None) -> None:
+def save(policy: Policy | CloudPolicy, path: Path, notes: dict[str, Any] | None = None) -> None:
     """Write a policy, and plain data about it, to one file."""
     content = {
         "generator": _GENERATOR,
+        "kind": "cloud" if isinstance(policy, CloudPolicy) else "state",
         "spec": policy.spec.plain(),
         "state": {k: v.detach().cpu().clone() for k, v in policy.state_dict().items()},
         "notes": notes or {},
@@ -41,7 +43,10 @@ def load(path: Path | str, notes: bool = False) -> Any:
         content = torch.load(path, weights_only=True)
         if content["generator"] != _GENERATOR:
             raise wrong
-        policy = Policy(PolicySpec.of(content["spec"]))
+        if content.get("kind") == "cloud":
+            policy = CloudPolicy(CloudSpec.of(content["spec"]))
+        else:
+            policy = Policy(PolicySpec.of(content["spec"]))
         policy.load_state_dict(content["state"])
     except FileNotFoundError:
         raise InputError(f"{path}: there is no such file; expected a policy of torchdlo train.") from None
