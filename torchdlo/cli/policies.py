@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from torchdlo.agents.rl.settings import Settings
     from torchdlo.envs import Task
 
-__all__ = ["deploy", "evaluate", "train"]
+__all__ = ["deploy", "distill", "evaluate", "train"]
 
 _INTERRUPTED = 130
 """Exit code after Ctrl-C, as shells have it."""
@@ -247,6 +247,7 @@ def evaluate(
 
     torchdlo evaluate runs/train/lifting-hybrid --perturb --trajectory runs/searches/lifting-hybrid-0/trajectory.json
     """
+    from torchdlo.agents.policies import CloudPolicy
     from torchdlo.agents.rl.evaluate import PROTOCOLS
     from torchdlo.agents.rl.evaluate import evaluate as judge
     from torchdlo.agents.rl.results import load_policies, summary
@@ -272,6 +273,9 @@ def evaluate(
             check_video(out / name)
     found, name = load_policies(policies)
     task = find(name)
+    if any(isinstance(policy, CloudPolicy) for policy in found):
+        _judge_student(policies, found, task, starts, reset_seed, out, film or bool(protocol), as_json)
+        return
     with progress() as show, deferred_interrupt(show) as callback:
         results, plays = judge(
             found, task, starts=starts, protocols=names, seed=reset_seed, callback=callback, compiled=compiled
@@ -285,6 +289,88 @@ def evaluate(
             typer.echo(f"film:    {file}", err=as_json)
     if as_json:
         typer.echo(content)
+
+
+def _judge_student(
+    paths: list[Path],
+    found: list[Any],
+    task: Task,
+    starts: int,
+    seed: int,
+    out: Path,
+    other: bool,
+    as_json: bool,
+) -> None:
+    """Judge a policy of clouds by cameras."""
+    from torchdlo.agents.rl.student import judge_student
+
+    if len(found) > 1 or other:
+        raise InputError(
+            f"{paths[0]}: it sees clouds of points, and is judged alone, from unseen starts, by cameras; leave out other "
+            "policies, --protocol and --film."
+        )
+    with progress() as show, deferred_interrupt(show) as callback:
+        results = judge_student(found[0], task, starts=starts, seed=seed, callback=callback)
+    content = json.dumps({"generator": "torchdlo evaluate", "files": [str(p) for p in paths]} | results, indent=1)
+    write_atomically(out / "evaluation.json", content + "\n")
+    for name, row in results["conditions"].items():
+        low, high = row["interval"]
+        typer.echo(
+            f"{task.name}, {name}: success {row['success']:.0%} of {row['episodes']} episodes (95 % interval {low:.0%} to "
+            f"{high:.0%})",
+            err=as_json,
+        )
+    typer.echo(f"results: {out / 'evaluation.json'}", err=as_json)
+    if as_json:
+        typer.echo(content)
+
+
+def distill(
+    teacher: Annotated[Path, typer.Argument(help="A policy of train, or its folder.", metavar="POLICY")],
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", "-o", help="Folder. Default: that of the policy, with -cloud.", metavar="DIR"),
+    ] = None,
+    count: Annotated[int | None, typer.Option(min=1, help="Episodes of a round. Default: 64.")] = None,
+    updates: Annotated[int | None, typer.Option(min=1, help="Steps of learning after a round. Default: 1000.")] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of everything.")] = 0,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on after the last round that is there.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print how it went as JSON.")] = False,
+) -> None:
+    """Teach a policy that sees 384 points of the rope to do what a policy that sees the state does.
+
+    The points are those of a noisy depth camera that stands elsewhere in each episode.
+
+    [bold]Examples:[/bold]
+
+    torchdlo distill runs/train/wiring_post-hybrid
+
+    torchdlo evaluate runs/train/wiring_post-hybrid-cloud
+    """
+    from torchdlo.agents.policies import CloudPolicy, load
+    from torchdlo.agents.rl.student import Student, teach
+    from torchdlo.envs import find
+
+    _quiet()
+    policy = load(teacher)
+    if isinstance(policy, CloudPolicy) or not policy.spec.task:
+        raise InputError(f"{teacher}: expected a policy of a task that sees the state, found another one.")
+    folder = teacher if teacher.is_dir() else teacher.parent
+    out = out or folder.with_name(f"{folder.name}-cloud")
+    check_writable(out / "student.json")
+    given = {"count": count, "updates": updates, "seed": seed}
+    plan = Student(**{name: value for name, value in given.items() if value is not None})
+    try:
+        with progress() as show, deferred_interrupt(show) as callback:
+            _, notes = teach(find(policy.spec.task), policy, folder=out, plan=plan, resume=resume, callback=callback)
+    except KeyboardInterrupt:
+        typer.echo(f"interrupted; --resume goes on from the rounds in {out}", err=True)
+        raise typer.Exit(_INTERRUPTED) from None
+    for row in notes["log"]:
+        typer.echo(f"round {row['round']}: success {row['success']:.0%} at {row['fidelity']}", err=as_json)
+    typer.echo(f"policy: {out / 'policy.pt'}", err=as_json)
+    if as_json:
+        typer.echo(json.dumps(notes, indent=1))
 
 
 def _perturb(policies: list[Path], trajectory: Path | None, starts: int, seed: int, out: Path, as_json: bool) -> None:
