@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from torchdlo.agents.rl.settings import Settings
     from torchdlo.envs import Task
 
-__all__ = ["deploy", "distill", "evaluate", "train"]
+__all__ = ["deploy", "distill", "evaluate", "export", "train"]
 
 _INTERRUPTED = 130
 """Exit code after Ctrl-C, as shells have it."""
@@ -306,8 +306,8 @@ def _judge_student(
 
     if len(found) > 1 or other:
         raise InputError(
-            f"{paths[0]}: it sees clouds of points, and is judged alone, from unseen starts, by cameras; leave out other "
-            "policies, --protocol and --film."
+            f"{paths[0]}: it sees clouds of points, and is judged alone, from unseen starts, by cameras; leave out "
+            "other policies, --protocol and --film."
         )
     with progress() as show, deferred_interrupt(show) as callback:
         results = judge_student(found[0], task, starts=starts, seed=seed, callback=callback)
@@ -316,8 +316,8 @@ def _judge_student(
     for name, row in results["conditions"].items():
         low, high = row["interval"]
         typer.echo(
-            f"{task.name}, {name}: success {row['success']:.0%} of {row['episodes']} episodes (95 % interval {low:.0%} to "
-            f"{high:.0%})",
+            f"{task.name}, {name}: success {row['success']:.0%} of {row['episodes']} episodes (95 % interval {low:.0%} "
+            f"to {high:.0%})",
             err=as_json,
         )
     typer.echo(f"results: {out / 'evaluation.json'}", err=as_json)
@@ -375,6 +375,7 @@ def distill(
 
 def _perturb(policies: list[Path], trajectory: Path | None, starts: int, seed: int, out: Path, as_json: bool) -> None:
     """Judge policies, and the trajectory and the experts behind them, under perturbations."""
+    from torchdlo.agents.policies import CloudPolicy
     from torchdlo.agents.rl import robustness
     from torchdlo.agents.rl.expert import candidates, load_expert
     from torchdlo.agents.rl.results import load_policies
@@ -384,6 +385,8 @@ def _perturb(policies: list[Path], trajectory: Path | None, starts: int, seed: i
 
     check_writable(out / "robustness.json")
     found, name = load_policies(policies)
+    if any(isinstance(policy, CloudPolicy) for policy in found):
+        raise InputError(f"{policies[0]}: it sees clouds of points; leave out --perturb, cameras are what is varied.")
     task, actors = find(name), {}
     if trajectory is not None:
         problem = TaskProblem(task, compiled=False)
@@ -425,6 +428,31 @@ def _films(task: Task, plays: dict[str, Any], out: Path) -> list[Path]:
             write_video(frames, out / name, speed=0.5, callback=callback)
         files.append(out / name)
     return files
+
+
+def export(
+    policy: Annotated[Path, typer.Argument(help="A policy of train, or its folder.", metavar="POLICY")],
+    kind: Annotated[
+        str, typer.Option("--format", help="ONNX needs the package onnx.", metavar="torchscript|onnx")
+    ] = "torchscript",
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="File to write. Default: beside the policy.")] = None,
+) -> None:
+    """Write a policy for other programs, from what an environment observes to actions.
+
+    [bold]Example:[/bold]
+
+    torchdlo export runs/train/lifting-hybrid --format onnx
+    """
+    from torchdlo.agents.policies import CloudPolicy, load
+    from torchdlo.agents.policies.export import export as write
+
+    found = load(policy)
+    if isinstance(found, CloudPolicy):
+        raise InputError(f"{policy}: it sees clouds of points; export takes policies that see the state.")
+    out = out or (policy / "policy.pt" if policy.is_dir() else policy).with_suffix(f".{kind}")
+    check_writable(out, mark=b"")
+    write(found, out, kind)
+    typer.echo(f"policy: {out}")
 
 
 def deploy(
@@ -496,13 +524,15 @@ def deploy(
 
 def _source(path: Path) -> tuple[Task, Any]:
     """Return the task, and the actions of a trajectory (T, A) or a policy."""
-    from torchdlo.agents.policies import load
+    from torchdlo.agents.policies import CloudPolicy, load
     from torchdlo.agents.trajopt.result import load_actions
     from torchdlo.agents.trajopt.task_problem import TaskProblem
     from torchdlo.envs import find
 
     if path.is_dir() or path.suffix != ".json":
         policy = load(path)
+        if isinstance(policy, CloudPolicy):
+            raise InputError(f"{path}: it sees clouds of points; deploy the policy of the state that taught it.")
         return find(policy.spec.task), policy
     try:
         name = json.loads(path.read_text(encoding="utf-8"))["task"]
