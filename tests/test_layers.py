@@ -60,6 +60,7 @@ ALLOWED = {
         "openai",
         "httpx",
         "httpx2",
+        "onnx",
         "pydantic",
         "pyarrow",
         "av",
