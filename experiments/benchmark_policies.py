@@ -38,6 +38,9 @@ def options() -> Any:
     parser.add_argument("--without", default="", help="stages of the hybrid to leave out, with commas")
     parser.add_argument("--source", default="found", choices=("found", "scripted"), help="what the hybrid begins with")
     parser.add_argument("--starts", type=int, default=15, help="episodes of each judgement")
+    parser.add_argument("--reset-seed", type=int, default=1, help="seed of the starts of the judgement")
+    parser.add_argument("--plan", default="{}", help="other sizes of the hybrid's stages, as JSON")
+    parser.add_argument("--judge", action="store_true", help="judge policies that are there, and train none")
     parser.add_argument("--out", default="runs/policies", help="folder of the runs")
     parser.add_argument("--pack", default="", help="write an archive of what is in --out, and end")
     parser.add_argument("--table", default="", help="print the table of an archive, and end")
@@ -66,7 +69,7 @@ def run(name: str, algo: str, seed: int, chosen: Any) -> None:
     """Train one policy and judge it; what is done is not done again."""
     from torchdlo.agents.policies import load
     from torchdlo.agents.rl.evaluate import evaluate
-    from torchdlo.agents.rl.hybrid import STAGES, hybrid
+    from torchdlo.agents.rl.hybrid import STAGES, hybrid, plan_of
     from torchdlo.agents.rl.results import prepared, train_json
     from torchdlo.agents.rl.settings import preset
     from torchdlo.agents.rl.training import train
@@ -79,10 +82,12 @@ def run(name: str, algo: str, seed: int, chosen: Any) -> None:
     def told(stage: str, done: int, total: int, message: str) -> None:
         print(f"{time.process_time() - began:7.0f} CPU s  {folder.name} {stage} {done}/{total} {message}", flush=True)
 
-    if (folder / "evaluation.json").exists():
+    if (folder / "evaluation.json").exists() or (chosen.judge and not (folder / "policy.pt").exists()):
         return
     given = {"seed": seed, "minutes": chosen.minutes}
-    if algo == "hybrid":
+    if chosen.judge:
+        pass
+    elif algo == "hybrid":
         searches = Path(chosen.out) / "searches"
         if not searches.exists():
             unpack(ARCHIVE, searches)
@@ -93,7 +98,9 @@ def run(name: str, algo: str, seed: int, chosen: Any) -> None:
         first = folder.with_name(f"{name}-{label}-0") / "expert.json"
         expert = first if seed and first.exists() else None
         stages = [s for s in STAGES if s not in chosen.without.split(",")]
-        choices = {"folder": folder, "stages": stages, "expert": expert, "resume": True, "callback": told}
+        plan = plan_of(name, **json.loads(chosen.plan))
+        choices = {"folder": folder, "plan": plan, "stages": stages, "expert": expert}
+        choices |= {"resume": True, "callback": told}
         hybrid(task, files, preset(name, algo, **given), **choices)
     else:
         settings = preset(name, algo, episodes=chosen.episodes, fidelity=chosen.fidelity, **given)
@@ -101,7 +108,7 @@ def run(name: str, algo: str, seed: int, chosen: Any) -> None:
         resume = (folder / "checkpoint.pt").exists()
         found = train(trainer, played, settings, folder=folder, resume=resume, callback=told)
         (folder / "result.json").write_text(train_json(task, settings, found))
-    results, _ = evaluate([load(folder)], task, starts=chosen.starts)
+    results, _ = evaluate([load(folder)], task, starts=chosen.starts, seed=chosen.reset_seed)
     results |= {"generator": "torchdlo evaluate", "algorithm": label, "seed": seed}
     save(str(folder / "evaluation.json"), results)
     told("judged", 1, 1, f"success {results['varied']['success']:.0%} from unseen starts")

@@ -68,6 +68,7 @@ ALLOWED = {
         "openai",
         "httpx",
         "httpx2",
+        "onnx",
         "pydantic",
         "pyarrow",
         "av",

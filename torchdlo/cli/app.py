@@ -15,7 +15,7 @@ from torchdlo.cli.agent import plan, propose
 from torchdlo.cli.datasets import dataset, learn, sweep
 from torchdlo.cli.doctor import doctor
 from torchdlo.cli.identification import calibrate, design_experiment, diagnose
-from torchdlo.cli.policies import deploy, evaluate, train
+from torchdlo.cli.policies import deploy, distill, evaluate, export, train
 from torchdlo.cli.recordings import check, import_deform
 from torchdlo.cli.sample import sample
 from torchdlo.cli.scenes import simulate, view
@@ -80,6 +80,8 @@ app.command()(propose)
 app.command()(plan)
 app.command()(train)
 app.command()(evaluate)
+app.command()(distill)
+app.command()(export)
 app.command()(deploy)
 app.add_typer(dataset)
 app.command()(learn)

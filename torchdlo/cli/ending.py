@@ -18,7 +18,7 @@ __all__ = ["SIGNALS", "caught", "failed", "note", "stopped"]
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
-_RESUMABLE = ("calibrate", "diagnose", "design-experiment", "optimize", "plan", "train", "learn", "sweep")
+_RESUMABLE = ("calibrate", "diagnose", "design-experiment", "optimize", "plan", "train", "distill", "learn", "sweep")
 
 _by: signal.Signals | None = None
 """What stopped the command, if anything did."""

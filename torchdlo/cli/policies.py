@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from torchdlo.agents.rl.settings import Settings
     from torchdlo.envs import Task
 
-__all__ = ["deploy", "evaluate", "train"]
+__all__ = ["deploy", "distill", "evaluate", "export", "train"]
 
 
 _WRITTEN = ("result.json", "log.csv", "curve.png", "policy.pt", "checkpoint.pt")
@@ -159,7 +159,7 @@ def _hybrid(
     resume: bool,
     as_json: bool,
 ) -> None:
-    from torchdlo.agents.rl.hybrid import STAGES, Hybrid, hybrid
+    from torchdlo.agents.rl.hybrid import STAGES, hybrid, plan_of
 
     other = sorted(set(without) - set(STAGES))
     if other:
@@ -167,7 +167,7 @@ def _hybrid(
     if not trajectories and not (resume and (out / "expert.json").exists()):
         trajectories = [_searched(task, settings.seed, out)]
     stages = [name for name in STAGES if name not in without]
-    plan = Hybrid()
+    plan = plan_of(task.name)
     try:
         with progress() as show, deferred_interrupt(show) as callback:
             _, notes = hybrid(
@@ -225,6 +225,20 @@ def evaluate(
         list[str] | None,
         typer.Option(help="Of policies of learn: a task; all that it has learned if none is named.", metavar="NAME"),
     ] = None,
+    reset_seed: Annotated[
+        int, typer.Option(min=0, help="Seed of the unseen starts: another one for starts that no judgement has seen.")
+    ] = 0,
+    perturb: Annotated[
+        bool,
+        typer.Option(
+            "--perturb",
+            help="Write robustness.json instead: success under other friction, stiffness and starts, and under noise.",
+        ),
+    ] = False,
+    trajectory: Annotated[
+        Path | None,
+        typer.Option(help="With --perturb: what optimize found, replayed and followed beside them.", metavar="FILE"),
+    ] = None,
     film: Annotated[bool, typer.Option("--film", help="Write best.mp4 and worst.mp4 of the last protocol.")] = False,
     out: Annotated[
         Path | None, typer.Option("--out", "-o", help="Folder for evaluation.json and films.", metavar="DIR")
@@ -243,7 +257,10 @@ def evaluate(
     torchdlo evaluate runs/dlo4/policy.pt --protocol varied --protocol paraphrased
 
     torchdlo evaluate runs/train/lifting-hybrid runs/train/lifting-hybrid-1 --protocol disturbed --film
+
+    torchdlo evaluate runs/train/lifting-hybrid --perturb --trajectory runs/searches/lifting-hybrid-0/trajectory.json
     """
+    from torchdlo.agents.policies import CloudPolicy
     from torchdlo.agents.rl.evaluate import PROTOCOLS
     from torchdlo.agents.rl.evaluate import evaluate as judge
     from torchdlo.agents.rl.results import load_policies, summary
@@ -268,6 +285,11 @@ def evaluate(
         raise InputError(f"--protocol {', '.join(other)}: expected some of {', '.join(PROTOCOLS)}.")
     first = policies[0] if policies[0].is_dir() else policies[0].parent
     out = out or first
+    if trajectory and not perturb:
+        raise InputError("--trajectory: it is compared with policies under perturbations; give --perturb as well.")
+    if perturb:
+        _perturb(policies, trajectory, starts, reset_seed, out, as_json)
+        return
     check_writable(out / "evaluation.json")
     if film:
         from torchdlo.report.render.video import check_video
@@ -276,8 +298,13 @@ def evaluate(
             check_video(out / name)
     found, name = load_policies(policies)
     own = find(name)
+    if any(isinstance(policy, CloudPolicy) for policy in found):
+        _judge_student(policies, found, own, starts, reset_seed, out, film or bool(protocol), as_json)
+        return
     with progress() as show, deferred_interrupt(show) as callback:
-        results, plays = judge(found, own, starts=starts, protocols=names, callback=callback, compiled=compiled)
+        results, plays = judge(
+            found, own, starts=starts, protocols=names, seed=reset_seed, callback=callback, compiled=compiled
+        )
     content = json.dumps({"generator": "torchdlo evaluate", "files": [str(p) for p in policies]} | results, indent=1)
     write_atomically(out / "evaluation.json", content + "\n")
     typer.echo(summary(results), err=as_json)
@@ -310,6 +337,122 @@ def _evaluate_seeing(
         typer.echo(content)
 
 
+def _judge_student(
+    paths: list[Path],
+    found: list[Any],
+    task: Task,
+    starts: int,
+    seed: int,
+    out: Path,
+    other: bool,
+    as_json: bool,
+) -> None:
+    """Judge a policy of clouds by cameras."""
+    from torchdlo.agents.rl.student import judge_student
+
+    if len(found) > 1 or other:
+        raise InputError(
+            f"{paths[0]}: it sees clouds of points, and is judged alone, from unseen starts, by cameras; leave out "
+            "other policies, --protocol and --film."
+        )
+    with progress() as show, deferred_interrupt(show) as callback:
+        results = judge_student(found[0], task, starts=starts, seed=seed, callback=callback)
+    content = json.dumps({"generator": "torchdlo evaluate", "files": [str(p) for p in paths]} | results, indent=1)
+    write_atomically(out / "evaluation.json", content + "\n")
+    for name, row in results["conditions"].items():
+        low, high = row["interval"]
+        typer.echo(
+            f"{task.name}, {name}: success {row['success']:.0%} of {row['episodes']} episodes (95 % interval {low:.0%} "
+            f"to {high:.0%})",
+            err=as_json,
+        )
+    typer.echo(f"results: {out / 'evaluation.json'}", err=as_json)
+    if as_json:
+        typer.echo(content)
+
+
+def distill(
+    teacher: Annotated[Path, typer.Argument(help="A policy of train, or its folder.", metavar="POLICY")],
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", "-o", help="Folder. Default: that of the policy, with -cloud.", metavar="DIR"),
+    ] = None,
+    count: Annotated[int | None, typer.Option(min=1, help="Episodes of a round. Default: 64.")] = None,
+    updates: Annotated[int | None, typer.Option(min=1, help="Steps of learning after a round. Default: 1000.")] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of everything.")] = 0,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on after the last round that is there.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print how it went as JSON.")] = False,
+) -> None:
+    """Teach a policy that sees 384 points of the rope to do what a policy that sees the state does.
+
+    The points are those of a noisy depth camera that stands elsewhere in each episode.
+
+    [bold]Examples:[/bold]
+
+    torchdlo distill runs/train/wiring_post-hybrid
+
+    torchdlo evaluate runs/train/wiring_post-hybrid-cloud
+    """
+    from torchdlo.agents.policies import CloudPolicy, load
+    from torchdlo.agents.rl.student import Student, teach
+    from torchdlo.envs import find
+
+    _quiet()
+    policy = load(teacher)
+    if isinstance(policy, CloudPolicy) or not policy.spec.task:
+        raise InputError(f"{teacher}: expected a policy of a task that sees the state, found another one.")
+    folder = teacher if teacher.is_dir() else teacher.parent
+    out = out or folder.with_name(f"{folder.name}-cloud")
+    check_writable(out / "student.json")
+    given = {"count": count, "updates": updates, "seed": seed}
+    plan = Student(**{name: value for name, value in given.items() if value is not None})
+    try:
+        with progress() as show, deferred_interrupt(show) as callback:
+            _, notes = teach(find(policy.spec.task), policy, folder=out, plan=plan, resume=resume, callback=callback)
+    except KeyboardInterrupt:
+        raise stopped(f"the rounds that are finished are in {out}", resume=True) from None
+    for row in notes["log"]:
+        typer.echo(f"round {row['round']}: success {row['success']:.0%} at {row['fidelity']}", err=as_json)
+    typer.echo(f"policy: {out / 'policy.pt'}", err=as_json)
+    if as_json:
+        typer.echo(json.dumps(notes, indent=1))
+
+
+def _perturb(policies: list[Path], trajectory: Path | None, starts: int, seed: int, out: Path, as_json: bool) -> None:
+    """Judge policies, and the trajectory and the experts behind them, under perturbations."""
+    from torchdlo.agents.policies import CloudPolicy
+    from torchdlo.agents.rl import robustness
+    from torchdlo.agents.rl.expert import candidates, load_expert
+    from torchdlo.agents.rl.results import load_policies
+    from torchdlo.agents.trajopt.result import load_actions
+    from torchdlo.agents.trajopt.task_problem import TaskProblem
+    from torchdlo.envs import find
+
+    check_writable(out / "robustness.json")
+    found, name = load_policies(policies)
+    if any(isinstance(policy, CloudPolicy) for policy in found):
+        raise InputError(f"{policies[0]}: it sees clouds of points; leave out --perturb, cameras are what is varied.")
+    task, actors = find(name), {}
+    if trajectory is not None:
+        problem = TaskProblem(task, compiled=False)
+        actors["trajectory replayed"] = robustness.replaying(problem.full(load_actions(trajectory, problem)))
+        for expert in candidates(task, [trajectory])[:1]:
+            actors["its path followed"] = robustness.following(expert)
+    for policy, path in zip(found, policies, strict=True):
+        folder = path if path.is_dir() else path.parent
+        if (folder / "expert.json").exists():
+            actors[f"expert of {folder.name}"] = robustness.following(load_expert(folder / "expert.json", task))
+        actors[f"policy {folder.name}"] = robustness.policy_acting(policy)
+    with progress() as show, deferred_interrupt(show) as callback:
+        results = robustness.perturbed(actors, task, starts=starts, seed=seed, callback=callback)
+    content = json.dumps({"generator": "torchdlo evaluate", "files": [str(p) for p in policies]} | results, indent=1)
+    write_atomically(out / "robustness.json", content + "\n")
+    typer.echo(robustness.table(results), err=as_json)
+    typer.echo(f"results: {out / 'robustness.json'}", err=as_json)
+    if as_json:
+        typer.echo(content)
+
+
 def _films(task: Task, plays: dict[str, Any], out: Path) -> list[Path]:
     """Film the best and the worst episode; each is played again alone, with the actions that were taken."""
     import torch
@@ -330,6 +473,31 @@ def _films(task: Task, plays: dict[str, Any], out: Path) -> list[Path]:
             write_video(frames, out / name, speed=0.5, callback=callback)
         files.append(out / name)
     return files
+
+
+def export(
+    policy: Annotated[Path, typer.Argument(help="A policy of train, or its folder.", metavar="POLICY")],
+    kind: Annotated[
+        str, typer.Option("--format", help="ONNX needs the package onnx.", metavar="torchscript|onnx")
+    ] = "torchscript",
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="File to write. Default: beside the policy.")] = None,
+) -> None:
+    """Write a policy for other programs, from what an environment observes to actions.
+
+    [bold]Example:[/bold]
+
+    torchdlo export runs/train/lifting-hybrid --format onnx
+    """
+    from torchdlo.agents.policies import CloudPolicy, load
+    from torchdlo.agents.policies.export import export as write
+
+    found = load(policy)
+    if isinstance(found, CloudPolicy):
+        raise InputError(f"{policy}: it sees clouds of points; export takes policies that see the state.")
+    out = out or (policy / "policy.pt" if policy.is_dir() else policy).with_suffix(f".{kind}")
+    check_writable(out, mark=b"")
+    write(found, out, kind)
+    typer.echo(f"policy: {out}")
 
 
 def deploy(
@@ -401,13 +569,15 @@ def deploy(
 
 def _source(path: Path) -> tuple[Task, Any]:
     """Return the task, and the actions of a trajectory (T, A) or a policy."""
-    from torchdlo.agents.policies import load
+    from torchdlo.agents.policies import CloudPolicy, load
     from torchdlo.agents.trajopt.result import load_actions, read_trajectory
     from torchdlo.agents.trajopt.task_problem import TaskProblem
     from torchdlo.envs import find
 
     if path.is_dir() or path.suffix != ".json":
         policy = load(path)
+        if isinstance(policy, CloudPolicy):
+            raise InputError(f"{path}: it sees clouds of points; deploy the policy of the state that taught it.")
         return find(policy.spec.task), policy
     name = read_trajectory(path)["task"].text()
     problem = TaskProblem(find(name), compiled=False)

@@ -145,6 +145,21 @@ def test_judgements_are_at_the_published_fidelity_and_repeatable(tmp_path: Path)
     assert not torch.equal(alone["moved"][0], train.env.moved)
 
 
+def test_a_task_says_what_noise_it_takes_and_what_is_given_wins():
+    assert stages.plan_of("slingshot").noise == 1e-4 < stages.plan_of("wrapping").noise == Hybrid().noise
+    assert stages.plan_of("slingshot", noise=0.002, count=None) == Hybrid(
+        noise=0.002, search_noise=2e-4, search_sigma=5e-4
+    )
+    with pytest.raises(InputError, match="there is no speed"):
+        stages.plan_of("coiling", speed=1)
+
+
+def test_another_seed_judges_from_other_starts():
+    policy = stages.task_policy(Lead(), settings(), squash=False)
+    first, again, other = (judged([policy], Lead(), starts=3, seed=k)["varied"]["moved"] for k in (0, 0, 1))
+    assert torch.equal(first, again) and not torch.equal(first, other)
+
+
 def test_the_interval_of_a_share_is_wilsons():
     # 8 of 10: 0.490 to 0.943.
     assert wilson(8, 10) == pytest.approx((0.4902, 0.9433), abs=1e-3)
@@ -172,7 +187,7 @@ def test_commands_train_and_judge(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     result = json.loads(run("evaluate", str(out), str(out), "--starts", "4", "--json"))
     assert (result["policies"], result["varied"]["episodes"], result["fidelity"]) == (2, 8, "1ms/5")
     assert json.loads((out / "evaluation.json").read_text()) == result
-    monkeypatch.setattr(stages, "Hybrid", lambda: PLAN)
+    monkeypatch.setattr(stages, "plan_of", lambda _: PLAN)
     words = ["train", "lead", "--out", str(tmp_path / "hybrid"), "--trajectory", str(found(tmp_path)), *small]
     notes = json.loads(run(*words, "--without", "tune", "--json"))
     assert "clone" in notes and "tune" not in notes

@@ -86,9 +86,10 @@ class Features(nn.Module):
             if start is None:
                 raise ValueError("features: this policy remembers the start; give what was observed there, too")
             kept = list(self.spec.memory)
-            parts.append(
-                (self._points(start)[..., kept, :] - self._centers[kept]).flatten(-2).expand(*points.shape[:-2], -1)
-            )
+            remembered = (self._points(start)[..., kept, :] - self._centers[kept]).flatten(-2)
+            if remembered.shape[:-1] != points.shape[:-2]:
+                remembered = remembered.expand(*points.shape[:-2], -1)
+            parts.append(remembered)
         if self.spec.waves:
             angle = progress * self._wave
             parts += [progress, angle.sin(), angle.cos()]

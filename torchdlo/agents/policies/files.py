@@ -8,6 +8,7 @@ from typing import Any
 
 import torch
 
+from torchdlo.agents.policies.cloud_policy import CloudPolicy, CloudSpec
 from torchdlo.agents.policies.policy import Policy, PolicySpec
 from torchdlo.errors import InputError
 from torchdlo.files import write_atomically
@@ -18,10 +19,11 @@ __all__ = ["load", "module", "save"]
 _GENERATOR = "torchdlo train"
 
 
-def save(policy: Policy, path: Path, notes: dict[str, Any] | None = None) -> None:
+def save(policy: Policy | CloudPolicy, path: Path, notes: dict[str, Any] | None = None) -> None:
     """Write a policy, and plain data about it, to one file."""
     content = {
         "generator": _GENERATOR,
+        "kind": "cloud" if isinstance(policy, CloudPolicy) else "state",
         "spec": policy.spec.plain(),
         "state": {k: v.detach().cpu().clone() for k, v in policy.state_dict().items()},
         "notes": notes or {},
@@ -42,10 +44,13 @@ def load(path: Path | str, notes: bool = False) -> Any:
     try:
         if content["generator"] != _GENERATOR:
             raise wrong
-        spec = PolicySpec.of(content["spec"])
+        if content.get("kind") == "cloud":
+            made, spec = CloudPolicy, CloudSpec.of(content["spec"])
+        else:
+            made, spec = Policy, PolicySpec.of(content["spec"])
         with torch.device("meta"):  # what the file says of itself may be of any size
-            check_shapes(Policy(spec), content["state"], str(path), what)
-        policy = Policy(spec)
+            check_shapes(made(spec), content["state"], str(path), what)
+        policy = made(spec)
         policy.load_state_dict(content["state"])
     except InputError:
         raise

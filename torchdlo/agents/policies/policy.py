@@ -113,12 +113,7 @@ class Policy(nn.Module):
 
     def command(self, action: Tensor) -> Tensor:
         """Return the environment's action, shape (..., A + turns), of a policy's."""
-        stage_waypoints = self.spec.reach * action
-        return (
-            torch.cat([stage_waypoints, stage_waypoints.new_zeros(*stage_waypoints.shape[:-1], self.spec.turns)], -1)
-            if self.spec.turns
-            else stage_waypoints
-        )
+        return nn.functional.pad(self.spec.reach * action, (0, self.spec.turns))
 
     @torch.no_grad()
     def act(

@@ -160,6 +160,17 @@ class TaskEpisodes:
         self.first = self.env.reset()["observation"].detach()
         return self.first
 
+    def begin(self, moved: Tensor) -> Tensor:
+        """Begin anew with things that far off their places [m], shape (N, things, 3); return observations (N, O)."""
+        from torchdlo.envs.core import episode
+
+        self.reset()
+        env = self.env
+        with torch.no_grad():
+            env.world, env.moved = episode.begin(env.episode, self.task.build(moved)[2]), moved
+            self.first = episode.observe(env.episode, env.world)
+        return self.first
+
     def step(self, action: Tensor) -> Step:
         """Do actions (N, 6 R) in metres and degrees."""
         from tensordict import TensorDict

@@ -17,9 +17,9 @@ from torchdlo.envs import PUBLISHED, Task, simulated
 from torchdlo.envs.observations.state import observe
 from torchdlo.physics import tree
 
-__all__ = ["PROTOCOLS", "evaluate", "judged", "wilson"]
+__all__ = ["PROTOCOLS", "UNSEEN", "evaluate", "judged", "wilson"]
 
-_UNSEEN = 777_000_000
+UNSEEN = 777_000_000
 """Seed of the starts of the judgement; trainers add less than this to theirs."""
 PROTOCOLS = {
     "one": {"variation": False},
@@ -70,11 +70,11 @@ def judged(
     episodes = TaskEpisodes(
         fine,
         len(policies) * (many + one),
-        seed=_UNSEEN + seed,
+        seed=UNSEEN + 1000 * seed,
         compiled=compiled,
         randomize=_randomized(fine, how.get("randomize", 0.0)),
     )
-    rng = torch.Generator().manual_seed(_UNSEEN + seed + 1)
+    rng = torch.Generator().manual_seed(UNSEEN + 1000 * seed + 1)
     seen = _shared(episodes, len(policies), many, one)
     actions: list[Tensor] = []
     step: Any = None
@@ -134,6 +134,7 @@ def evaluate(
     *,
     starts: int = 15,
     protocols: Sequence[str] = ("one", "varied"),
+    seed: int = 0,
     callback: Callable[[str, int, int, str], None] | None = None,
     compiled: bool = False,
 ) -> tuple[dict[str, Any], dict[str, dict[str, Tensor]]]:
@@ -144,6 +145,7 @@ def evaluate(
         task: theirs.
         starts: episodes of each policy in each protocol.
         protocols: of `PROTOCOLS`.
+        seed: of starts and noise; another one is for starts that no earlier judgement has seen.
         callback: told (stage, actions done, all, message).
         compiled: whether steps are compiled.
     """
@@ -152,7 +154,9 @@ def evaluate(
     calm = [name for name in ("one", "varied") if name in protocols]
     for names in (calm, ["disturbed"] if "disturbed" in protocols else []):
         if names:
-            plays |= judged(policies, task, starts=starts, protocols=names, callback=callback, compiled=compiled)
+            plays |= judged(
+                policies, task, starts=starts, protocols=names, seed=seed, callback=callback, compiled=compiled
+            )
     for name, rows in plays.items():
         success, returns = rows["success"], rows["returns"]
         low, high = wilson(int(success.sum()), success.numel())
@@ -165,4 +169,5 @@ def evaluate(
             "return_by_policy": returns.mean(1).tolist(),
             "failed": float(rows["failed"].float().mean()),
         }
-    return {"task": task.name, "fidelity": PUBLISHED.text, "starts": starts, "policies": len(policies)} | found, plays
+    about = {"task": task.name, "fidelity": PUBLISHED.text, "starts": starts, "reset_seed": seed}
+    return about | {"policies": len(policies)} | found, plays

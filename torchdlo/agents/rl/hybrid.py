@@ -14,7 +14,7 @@ import copy
 import math
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +32,7 @@ from torchdlo.envs import PUBLISHED, Task, simulated
 from torchdlo.errors import InputError
 from torchdlo.journal import read_json, write_json
 
-__all__ = ["STAGES", "Hybrid", "hybrid", "task_policy"]
+__all__ = ["STAGES", "Hybrid", "hybrid", "plan_of", "task_policy"]
 
 Callback = Callable[[str, int, int, str], None]
 STAGES = ("robust", "clone", "tune")
@@ -53,6 +53,10 @@ class Hybrid:
     """Rounds of DAgger after the first, in cheap steps."""
     count: int = 128
     """Episodes of a round."""
+    search_noise: float = 0.0015
+    """Deviation of what is added to actions while a robust path is searched [m]."""
+    search_sigma: float = 0.004
+    """First deviation of the places of that search [m]."""
     noise: float = 0.001
     """Deviation of what is added to actions while labels are collected [m]."""
     updates: int = 3000
@@ -65,6 +69,25 @@ class Hybrid:
     """Share of successes on validation starts from which there is nothing to tune."""
     tune_episodes: int = 1280
     """Budget of the last stage."""
+
+
+_PLANS: dict[str, dict[str, float]] = {
+    # The hand goes round the cone at less than a millimetre from its surface: noise of 1 mm makes it touch.
+    "coiling": {"search_noise": 5e-4, "search_sigma": 1e-3, "noise": 3e-4},
+    # Fingers hold the band by friction: it slips out where its halves pull unevenly, by 0.7 mm of way.
+    "slingshot": {"search_noise": 2e-4, "search_sigma": 5e-4, "noise": 1e-4},
+    "unknotting": {"search_noise": 1e-3, "search_sigma": 3e-3, "noise": 5e-4},
+}
+"""What differs by task: noise that the task itself takes."""
+
+
+def plan_of(task: str, **given: Any) -> Hybrid:
+    """Return the plan for a task; what is given and not None wins."""
+    wanted = {name: value for name, value in given.items() if value is not None}
+    other = sorted(set(wanted) - {f.name for f in fields(Hybrid)})
+    if other:
+        raise InputError(f"plan: there is no {', '.join(other)}; expected fields of Hybrid, such as generations.")
+    return Hybrid(**(_PLANS.get(task, {}) | wanted))
 
 
 def task_policy(task: Task, settings: Settings, **choices: Any) -> Policy:
@@ -112,7 +135,7 @@ def hybrid(
     other = sorted(set(stages) - set(STAGES))
     if other:
         raise InputError(f"stages: there is no {', '.join(other)}; expected some of {', '.join(STAGES)}.")
-    plan, told = plan or Hybrid(), callback or (lambda *_: None)
+    plan, told = plan or plan_of(task.name), callback or (lambda *_: None)
     notes: dict[str, Any] = _notes(folder) if resume else {}
     notes |= {"plan": asdict(plan), "settings": asdict(settings), "coarse": task.coarse.plain()}
     with torch.random.fork_rng(devices=[]):
@@ -170,6 +193,8 @@ def _robust(
         starts=plan.starts,
         population=plan.population,
         generations=generations,
+        sigma=plan.search_sigma,
+        noise=plan.search_noise,
         journal=folder / "robust.json",
         callback=told,
     )

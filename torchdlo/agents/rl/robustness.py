@@ -1,0 +1,211 @@
+"""How much success is left under disturbances: other friction, stiffness and starts, and noise on what is commanded.
+
+Policies are compared with what they were made from: a trajectory that is replayed, its path that is followed in the
+world, and the expert that was made robust. All see the same starts and the same noise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchdlo import scene as scenes
+from torchdlo.agents.policies import Policy
+from torchdlo.agents.rl.episodes import TaskEpisodes
+from torchdlo.agents.rl.evaluate import UNSEEN, wilson
+from torchdlo.agents.rl.expert import Expert
+from torchdlo.agents.rl.rollout import look
+from torchdlo.envs import PUBLISHED, Task, simulated
+from torchdlo.errors import InputError
+from torchdlo.physics import tree
+from torchdlo.scene import Params
+
+__all__ = ["PERTURBATIONS", "Actor", "Perturbation", "following", "perturbed", "policy_acting", "replaying", "table"]
+
+Actor = Callable[[int, TaskEpisodes, Tensor, slice], Tensor]
+"""Says what to do after so many actions in the episodes of a slice, in units of the greatest way of a tool (N, 3 R)."""
+
+
+@dataclass(frozen=True)
+class Perturbation:
+    """What is not as it was in training."""
+
+    friction: float = 1.0
+    """Factor of all friction of ropes: with themselves, the table and bodies, and of bodies with each other."""
+    stiffness: float = 1.0
+    """Factor of the ropes' stiffness in bending and torsion."""
+    start: float = 1.0
+    """Factor of how far starts vary."""
+    noise: float = 0.0
+    """Deviation of what is added to each action [m]."""
+
+
+PERTURBATIONS = {
+    "none": Perturbation(),
+    "friction x 0.5": Perturbation(friction=0.5),
+    "friction x 1.5": Perturbation(friction=1.5),
+    "stiffness x 0.5": Perturbation(stiffness=0.5),
+    "stiffness x 1.5": Perturbation(stiffness=1.5),
+    "starts x 1.5": Perturbation(start=1.5),
+    "noise 1 mm": Perturbation(noise=0.001),
+    "noise 2 mm": Perturbation(noise=0.002),
+    "noise 4 mm": Perturbation(noise=0.004),
+}
+"""What policies are tried under."""
+
+
+def policy_acting(policy: Policy) -> Actor:
+    """Return what a policy does, in the middle of what it could."""
+
+    def act(done: int, episodes: TaskEpisodes, seen: Tensor, rows: slice) -> Tensor:
+        return policy.mean(look(policy, episodes, done, seen)[rows])
+
+    return act
+
+
+def following(expert: Expert) -> Actor:
+    """Return what following a path in the world does."""
+
+    def act(done: int, episodes: TaskEpisodes, seen: Tensor, rows: slice) -> Tensor:
+        env = episodes.env
+        return expert.act(done, env.moved[rows], env.world.tool.pos[rows].float(), episodes.task.max_translation)
+
+    return act
+
+
+def replaying(actions: Tensor) -> Actor:
+    """Return what the actions (T, A) of a trajectory do, whatever happens."""
+
+    def act(done: int, episodes: TaskEpisodes, seen: Tensor, rows: slice) -> Tensor:
+        way = actions[done, : 3 * episodes.task.arms.count] / episodes.task.max_translation
+        return way.float().expand(rows.stop - rows.start, -1)
+
+    return act
+
+
+@torch.no_grad()
+def perturbed(
+    actors: Mapping[str, Actor],
+    task: Task,
+    *,
+    starts: int = 15,
+    perturbations: Mapping[str, Perturbation] = PERTURBATIONS,
+    seed: int = 0,
+    callback: Callable[[str, int, int, str], None] | None = None,
+) -> dict[str, Any]:
+    """Return how often each actor succeeds under each perturbation, at the published fidelity, as plain data.
+
+    Args:
+        actors: by name.
+        task: theirs.
+        starts: episodes of each actor under each perturbation; no training has seen them.
+        perturbations: by name.
+        seed: of starts and noise, as in `evaluate`.
+        callback: told (stage, actions done, all, message).
+    """
+    fine = simulated(task, PUBLISHED)
+    groups: dict[tuple[float, float], list[str]] = {}
+    for name, p in perturbations.items():
+        groups.setdefault((p.friction, p.stiffness), []).append(name)
+    found: dict[str, dict[str, Any]] = {actor: {} for actor in actors}
+    done = 0
+    for names in groups.values():
+        chosen = {name: perturbations[name] for name in names}
+
+        def told(k: int, before: int = done, names: list[str] = names) -> None:
+            if callback is not None:
+                callback("perturb", before + k, len(groups) * fine.horizon, ", ".join(names))
+
+        played = _played(actors, fine, starts, chosen, seed, told)
+        for actor, rows in played.items():
+            found[actor] |= rows
+        done += fine.horizon
+    return {
+        "task": task.name,
+        "fidelity": PUBLISHED.text,
+        "starts": starts,
+        "reset_seed": seed,
+        "perturbations": {name: asdict(p) for name, p in perturbations.items()},
+        "actors": {actor: {name: found[actor][name] for name in perturbations} for actor in actors},
+    }
+
+
+def _played(
+    actors: Mapping[str, Actor],
+    task: Task,
+    starts: int,
+    chosen: Mapping[str, Perturbation],
+    seed: int,
+    told: Callable[[int], None],
+) -> dict[str, dict[str, Any]]:
+    """Return how actors did under perturbations that share friction and stiffness, all in one batch."""
+    each = starts * len(chosen)
+    episodes = TaskEpisodes(task, each * len(actors), seed=UNSEEN + 1000 * seed)
+    first = next(iter(chosen.values()))
+    env = episodes.env
+    env.episode = replace(env.episode, params=_changed(env.episode.params, first, env.episode.scene, task))
+    drawn = task.moved(starts, generator=torch.Generator().manual_seed(UNSEEN + 1000 * seed))
+    moved = torch.cat([drawn * p.start for p in chosen.values()]).repeat(len(actors), 1, 1)
+    seen = episodes.begin(moved)
+    rng = torch.Generator().manual_seed(UNSEEN + 1000 * seed + 1)
+    sizes = torch.tensor([p.noise for p in chosen.values()]).repeat_interleave(starts)[:, None] / task.max_translation
+    step: Any = None
+    for k in range(episodes.horizon):
+        rows = [slice(n * each, (n + 1) * each) for n in range(len(actors))]
+        ways = torch.stack([act(k, episodes, seen, r) for act, r in zip(actors.values(), rows, strict=True)])
+        random = torch.randn(starts, ways.shape[-1], generator=rng).repeat(len(chosen), 1)
+        commanded = task.max_translation * (ways + sizes * random).flatten(0, 1)
+        step = episodes.step(torch.cat([commanded, torch.zeros_like(commanded)], -1))
+        seen = torch.nan_to_num(step.observation)
+        told(k + 1)
+    good = (step.success & ~step.failed).reshape(len(actors), len(chosen), starts)
+    returns, failed = (x.reshape(good.shape) for x in (episodes.returns, step.failed))
+    return {
+        actor: {name: _row(good[a, c], returns[a, c], failed[a, c]) for c, name in enumerate(chosen)}
+        for a, actor in enumerate(actors)
+    }
+
+
+def _row(good: Tensor, returns: Tensor, failed: Tensor) -> dict[str, Any]:
+    return {
+        "success": float(good.float().mean()),
+        "interval": list(wilson(int(good.sum()), len(good))),
+        "return": float(returns.mean()),
+        "failed": float(failed.float().mean()),
+    }
+
+
+_FRICTION = (("rod_contact", "mu_s"), ("rod_contact", "mu_k"), ("table_friction", "mu"))
+
+
+def _changed(params: Params, how: Perturbation, scene: scenes.Scene, task: Task) -> Params:
+    """Return parameters with other friction and stiffness."""
+    effects = {name: dict(values) for name, values in params.effects.items()}
+    for effect, number in _FRICTION:
+        if number in effects.get(effect, {}):
+            effects[effect][number] = effects[effect][number] * how.friction
+    material = params.rods.material
+    material = tree.replace(material, bend=material.bend * how.stiffness, twist=material.twist * how.stiffness)
+    bodies = params.bodies
+    if scene.bodies:
+        bodies = tree.replace(bodies, mu_s=bodies.mu_s * how.friction, mu_k=bodies.mu_k * how.friction)
+    changed = tree.replace(params, effects=effects, rods=tree.replace(params.rods, material=material), bodies=bodies)
+    try:
+        scenes.check_step(scene, changed)
+    except ValueError as error:
+        raise InputError(f"perturbation: {task.name} cannot be played with {how}: {error}") from None
+    return changed
+
+
+def table(results: Mapping[str, Any]) -> str:
+    """Return results of `perturbed` as a table of Markdown: a row for each perturbation, a column for each actor."""
+    actors = results["actors"]
+    lines = [f"| perturbation | {' | '.join(actors)} |", "|---" * (1 + len(actors)) + "|"]
+    for name in results["perturbations"]:
+        shares = [f"{actors[actor][name]['success']:.0%}" for actor in actors]
+        lines.append(f"| {name} | {' | '.join(shares)} |")
+    return "\n".join(lines)
