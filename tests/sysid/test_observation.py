@@ -108,8 +108,9 @@ def test_changes_are_those_of_readings(filmed: tuple[np.ndarray, View]) -> None:
     exact, fast = (np.where(known, x, 0.0) for x in (spines.read(moved, numbers), spines.changes(moved, numbers)))
     assert np.allclose(fast[0], exact[0], atol=1e-7)
     for k in (1, 2):
-        exact_change, fast_change = (x[k] - x[0] for x in (exact, fast))
-        assert np.linalg.norm(fast_change - exact_change) < 0.05 * np.linalg.norm(exact_change)
+        exact_change, fast_change = ((x[k] - x[0])[known] for x in (exact, fast))
+        # But for the few points whose neighbour changes, which jump.
+        assert np.quantile(np.abs(fast_change - exact_change), 0.95) < 0.02 * np.abs(exact_change).max()
 
 
 def test_markers_are_an_observation_too() -> None:

@@ -270,7 +270,8 @@ class Spines(_Filmed):
         away = torch.where(torch.as_tensor(np.isfinite(view.places))[None], away, 0.0) * scale[..., None]
         rope = pixel[..., self._free, :]
         if pairs is None:
-            best = torch.cdist(rope, places.expand(*rope.shape[:3], *places.shape[-2:])).argmin(-1)[..., None]
+            spots, exact = places.expand(*rope.shape[:3], *places.shape[-2:]), "donot_use_mm_for_euclid_dist"
+            best = torch.cdist(rope, spots, compute_mode=exact).argmin(-1)[..., None]
         else:
             best = pairs[1]
         both = best.expand(*best.shape[:-1], 2)
