@@ -13,7 +13,7 @@ import numpy as np
 
 from torchdlo.physics.effects.base import Param
 
-_KNEE = 2e-3
+KNEE = 2e-3
 """Error [m] from which the cost grows linearly."""
 
 _FIRM = 5e-3
@@ -97,8 +97,8 @@ class Point:
 
 def robust(residual: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return cost and weight of each residual [m]: cost ~ r^2 / (2 knee) near zero, |r| - knee/2 beyond."""
-    size = np.sqrt(residual**2 + _KNEE**2)
-    return size - _KNEE, 1 / size
+    size = np.sqrt(residual**2 + KNEE**2)
+    return size - KNEE, 1 / size
 
 
 def cost_of(error: float) -> float:
@@ -136,7 +136,8 @@ class Look:
         # Difference inwards where a number stands at its upper bound.
         upward = space.clip(raws[:, None] + nudge)
         moved = np.where(np.isclose(upward, raws[:, None] + nudge), upward, raws[:, None] - nudge)
-        self._sign = np.einsum("skk->sk", moved - raws[:, None])
+        self.steps = np.einsum("skk->sk", moved - raws[:, None])
+        """Steps of finite differences, shape (S, K)."""
         self.values = space.to_values(np.concatenate([raws[:, None], moved], 1).reshape(-1, k))
         """What to simulate, shape (S (K + 1), K)."""
 
@@ -163,7 +164,7 @@ class Look:
             useless = ~(np.isfinite(of_trial) & (np.abs(change).sum(-1) < _WILD * whole * per_trial).all(0))
             # Nor does what it costs where it is far off, if a little beside it is quite another motion.
             of_trial = np.where(useless & (of_trial > _LOST * whole), np.inf, of_trial)
-            jacobian = change / self._sign[s][:, None, None]
+            jacobian = change / self.steps[s][:, None, None]
             jacobian, weight = np.where(useless[None, :, None], 0.0, jacobian), np.where(useless[:, None], 0.0, weight)
             residual = np.where(useless[:, None], 0.0, residual)
             gradient = np.einsum("kbr,br,br->bk", jacobian, weight, residual, optimize=True) / per_trial[:, None]
@@ -172,7 +173,7 @@ class Look:
             )
             # The second derivative of the cost is knee^2 / size^3, where Gauss-Newton takes 1 / size.
             weight = np.where(seen.reshape(weight.shape), weight, 0.0)
-            flatter = (weight**3 * _KNEE**2).sum(-1) / np.maximum(weight.sum(-1), 1e-300)
+            flatter = (weight**3 * KNEE**2).sum(-1) / np.maximum(weight.sum(-1), 1e-300)
             cost = float(_together(of_trial, _LOST * whole))
             points.append(Point(self.raws[s], cost, gradient, curvature, of_trial, flatter))
         return points

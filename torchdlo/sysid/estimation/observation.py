@@ -3,7 +3,7 @@
 An observation reads simulated places of the rope and numbers of its own that need no simulation, and says what the
 readings should be. A reading is a length in metres whatever it comes from, so that knees, floors and intervals mean the
 same for all of them. A film's readings are distances in the picture between the centre line of a mask and the projected
-rope, both ways, or differences of blurred masks over their gradient; times depth over focal length, with target 0.
+rope, both ways, times depth over focal length, with target 0.
 """
 
 from __future__ import annotations
@@ -19,11 +19,9 @@ from torch import Tensor
 from torchdlo.physics.effects.base import Param
 from torchdlo.sysid.estimation.levenberg_marquardt import ParameterSpace
 from torchdlo.vision.camera import NEAR, Camera, Lens, lens, project
-from torchdlo.vision.pictures import blur
-from torchdlo.vision.rasterizer import coverage, successors
 from torchdlo.vision.spine import curve_vectors
 
-__all__ = ["BlurredMasks", "MarkerObservation", "Observation", "Spines", "View", "nuisances", "over_time"]
+__all__ = ["MarkerObservation", "Observation", "Spines", "View", "nuisances", "over_time"]
 
 
 class Observation(Protocol):
@@ -75,10 +73,18 @@ class View:
     """Points of the masks' centre lines [px], NaN where there are fewer, shape (B, F, S, 2)."""
     tangents: np.ndarray
     """Unit tangents there, shape (B, F, S, 2)."""
-    masks: np.ndarray
-    """The masks themselves at a quarter of their size, shares that are covered [1], float32, shape (B, F, h, w)."""
     half_width: float
     """Usual half width of the rope in the masks [px]."""
+    packed: tuple[np.ndarray, ...] = ()
+    """By trial: masks, eight pixels a byte, shape (F, H W / 8) uint8."""
+    shown: tuple[dict[int, np.ndarray], ...] = ()
+    """By trial: some pictures by their frames, grey, (H, W) uint8 each."""
+
+    def masks(self, trial: int, frames: np.ndarray) -> np.ndarray:
+        """Return the masks of frames (N,) of a trial, shape (N, H, W) bool."""
+        height, width = self.camera.height, self.camera.width
+        bits = np.unpackbits(self.packed[trial][frames], axis=1, count=height * width)
+        return bits.reshape(len(frames), height, width).astype(bool)
 
     @property
     def time(self) -> np.ndarray:
@@ -147,10 +153,10 @@ _ALONG = 12.0
 _COPIES = 16
 """How often a prior is read, so that each reading of it stays small."""
 
-_SURE = 5e-4
+SURE = 5e-4
 """What independent readings get wrong [m], against which priors are weighed."""
 
-_INDEPENDENT = 2.0
+INDEPENDENT = 2.0
 """Readings of a picture that tell something of their own."""
 
 
@@ -169,10 +175,10 @@ class _Filmed:
         target = np.concatenate([np.where(k, 0.0, np.nan) for k in known], 2)
         count = np.isfinite(target).sum((1, 2, 3))
         pictures = sum(v.good.sum(1) for v in self.views)
-        # A squared reading counts one of `count`; a trial tells as much as `_INDEPENDENT` readings per picture.
-        share = count / np.maximum(_INDEPENDENT * pictures * trials, 1)
+        # A squared reading counts one of `count`; a trial tells as much as `INDEPENDENT` readings per picture.
+        share = count / np.maximum(INDEPENDENT * pictures * trials, 1)
         self.priors = slice(target.shape[2], None)
-        self._weight = _SURE * np.sqrt(share / _COPIES)
+        self._weight = SURE * np.sqrt(share / _COPIES)
         prior = np.full((trials, frames, _COPIES * len(self.nuisances.names), 1), np.nan)
         prior[:, 0] = 0.0
         self.target = np.concatenate([target, prior], 2)
@@ -228,79 +234,61 @@ class Spines(_Filmed):
         self._finish((len(views[0].good), frames), known)
 
     def _view(self, k: int, view: View, sims: Tensor, numbers: Tensor) -> np.ndarray:
+        return self._pairs(view, sims, numbers)[0]
+
+    def changes(self, sims: np.ndarray, numbers: np.ndarray) -> np.ndarray:
+        """Return readings of several motions near the first one, as `read` does, shape (P, B, F, R, 1).
+
+        Which points belong together is found for the first one and kept for the others: their differences to it are
+        those of finite differences, at a tenth of the time.
+        """
+        parts = []
+        for k, view in enumerate(self.views):
+            own = torch.as_tensor(numbers[:, PER_CAMERA * k : PER_CAMERA * (k + 1)], dtype=torch.float32)
+            rope = torch.as_tensor(sims, dtype=torch.float32)
+            with torch.no_grad():
+                first, pairs = self._pairs(view, rope[:1], own[:1])
+                others = [self._pairs(view, r[None], o[None], pairs)[0] for r, o in zip(rope[1:], own[1:], strict=True)]
+            each = np.concatenate([first, *others])
+            gap = self.target.shape[1] - each.shape[2]
+            parts.append(np.pad(each, ((0, 0), (0, 0), (0, gap), (0, 0), (0, 0))))
+        return np.concatenate([*parts, self._priors(numbers, self.target.shape[1])], 3)
+
+    def _pairs(
+        self, view: View, sims: Tensor, numbers: Tensor, pairs: tuple[Tensor, Tensor] | None = None
+    ) -> tuple[np.ndarray, tuple[Tensor, Tensor]]:
+        """Return readings (P, B, F, R, 1) of a view, and which edges and points belong together, or use given ones."""
         pixel, depth, focal = seen_by(view, sims, numbers, self.step)
         scale = depth.clamp(min=NEAR).mean(-1, keepdim=True) / focal.reshape(-1, 1, 1, 1)
         places = torch.as_tensor(view.places, dtype=sims.dtype).nan_to_num(1e6)[None]
-        away, _ = curve_vectors(pixel, places)
+        if pairs is None:
+            away, along = curve_vectors(pixel, places)
+            edge = along.floor().long().clamp(max=pixel.shape[-2] - 2)
+        else:
+            edge = pairs[0]
+            away = _to_edges(pixel, places, edge)
         away = torch.where(torch.as_tensor(np.isfinite(view.places))[None], away, 0.0) * scale[..., None]
         rope = pixel[..., self._free, :]
-        gap = rope[..., :, None, :] - places[..., None, :, :]
-        best = gap.square().sum(-1).argmin(-1)[..., None]
-        gap = torch.gather(gap, -2, best[..., None].expand(*best.shape, 2))[..., 0, :]
-        tangents = torch.as_tensor(view.tangents, dtype=sims.dtype).nan_to_num(0.0)[None, ..., None, :, :]
-        along = torch.gather(
-            tangents.expand(*best.shape[:-1], *tangents.shape[-2:]), -2, best[..., None].expand(*best.shape, 2)
-        )[..., 0, :]
+        if pairs is None:
+            spots, exact = places.expand(*rope.shape[:3], *places.shape[-2:]), "donot_use_mm_for_euclid_dist"
+            best = torch.cdist(rope, spots, compute_mode=exact).argmin(-1)[..., None]
+        else:
+            best = pairs[1]
+        both = best.expand(*best.shape[:-1], 2)
+        gap = rope - torch.gather(places.expand(*both.shape[:3], *places.shape[-2:]), -2, both)
+        tangents = torch.as_tensor(view.tangents, dtype=sims.dtype).nan_to_num(0.0)[None]
+        along = torch.gather(tangents.expand(*both.shape[:3], *tangents.shape[-2:]), -2, both)
         lengthways = (gap * along).sum(-1)
         across = gap[..., 0] * along[..., 1] - gap[..., 1] * along[..., 0]
         across = (across / (1 + (lengthways / _ALONG) ** 2)).clamp(-1e5, 1e5) * scale
         out = torch.cat([away.flatten(-2), across], -1)[..., None]
-        return out.numpy().astype(np.float64)
+        return out.numpy().astype(np.float64), (edge, best)
 
 
-_PIXEL = 1e-3
-"""What a pixel of blurred masks counts as [m]: where a mask and the rope are far apart readings stay below the knee of
-fits, so that all that there is of the mask pulls."""
-
-
-class BlurredMasks(_Filmed):
-    """Differences of blurred masks over the gradient that a rope as thin as this one leaves in them.
-
-    They find the basin in which centre lines fit on: their readings are lengths in pixels of the level.
-    """
-
-    SIGMA = 2.0
-    """Blur of every level of the pyramid [px of the level]."""
-
-    def __init__(
-        self, views: Sequence[View], step: float, extent: float, visible: np.ndarray, radius: float, level: int
-    ) -> None:
-        """Prepare.
-
-        Args:
-            views: what cameras saw.
-            step: time between simulated frames [s].
-            extent: how far the rope moves [m].
-            visible: which of the simulated places are drawn, shape (M,) bool; the longest run of them counts.
-            radius: of the rope [m].
-            level: how often masks are halved once more.
-        """
-        super().__init__(views, step, extent)
-        self._visible, self._radius, self._level = torch.as_tensor(visible), radius, level
-        self._blurred, known = [], []
-        frames = max(v.good.shape[1] for v in views)
-        for view in views:
-            small = torch.as_tensor(view.masks)
-            for _ in range(level):
-                small = torch.nn.functional.avg_pool2d(small, 2)
-            blurred = blur(small.numpy(), self.SIGMA)
-            self._blurred.append(blurred)
-            each = np.broadcast_to(view.good[:, :, None, None], (*blurred.shape[:2], blurred[0, 0].size, 1))
-            known.append(np.pad(each, ((0, 0), (0, frames - each.shape[1]), (0, 0), (0, 0))))
-        self._finish((len(views[0].good), frames), known)
-
-    def _view(self, k: int, view: View, sims: Tensor, numbers: Tensor) -> np.ndarray:
-        pixel, depth, focal = seen_by(view, sims, numbers, self.step)
-        shrink = 0.25 / 2**self._level
-        place = (pixel + 0.5) * shrink - 0.5
-        near = depth.clamp(min=NEAR)
-        radius = self._radius * focal.reshape(-1, 1, 1, 1) / near * shrink
-        real = (depth >= NEAR) & self._visible
-        goal = self._blurred[k]
-        drawn = coverage(place, radius, real, successors([pixel.shape[-2]]), tuple(goal.shape[-2:]))
-        blurred = torch.as_tensor(blur(drawn.numpy(), self.SIGMA))
-        # A thin line of width w blurred by s has gradients of up to w exp(-1/2) / (s^2 sqrt(2 pi)).
-        wide = (2 * radius).mean(-1)[..., None]
-        steep = wide.clamp(min=1e-3) * np.exp(-0.5) / (self.SIGMA**2 * np.sqrt(2 * np.pi))
-        out = _PIXEL * (blurred - torch.as_tensor(goal)).flatten(-2) / steep
-        return out[..., None].numpy().astype(np.float64)
+def _to_edges(curve: Tensor, places: Tensor, edge: Tensor) -> Tensor:
+    """Return vectors (..., S, 2) from places (..., S, 2) to the nearest points of given edges (..., S) of a curve."""
+    both = edge[..., None].expand(*edge.shape, 2)
+    a, b = (torch.gather(curve, -2, both + k) for k in (0, 1))
+    d, off = b - a, places - a
+    t = ((off * d).sum(-1) / d.square().sum(-1).clamp(min=1e-18)).clamp(0.0, 1.0)
+    return t[..., None] * d - off

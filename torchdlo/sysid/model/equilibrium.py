@@ -19,6 +19,9 @@ _SETTLING = 4.0
 _SETTLING_STEP = 0.1
 """One step meanwhile [s]: implicit steps this long are nearly steps of Newton's method for the balance."""
 
+_LYING_STEP, _LYING = 0.005, 0.6
+"""One step where a table carries the rope, off which long steps would bounce, and how long it takes to rest [s]."""
+
 _SETTLING_RATE = 6.0
 """Damping rate meanwhile [1/s]: a rope of a metre swings at 4 rad/s."""
 
@@ -37,14 +40,16 @@ def come_to_rest(
         state: where they are.
         control: where the grippers stay.
     """
-    calm = dataclasses.replace(scene, dt=_SETTLING_STEP, substeps=1, numerical_damping=1.0)
+    table = any(effect.name == "table" for effect in scene.effects)
+    length, lasts = (_LYING_STEP, _LYING) if table else (_SETTLING_STEP, _SETTLING)
+    calm = dataclasses.replace(scene, dt=length, substeps=1, numerical_damping=1.0)
     damping = dict(params.effects["damping"])
     damping["rate"] = torch.full_like(damping["rate"], _SETTLING_RATE)
     calmed = tree.replace(params, effects=params.effects | {"damping": damping})
     rest = tree.replace(state, rods=tree.replace(state.rods, vel=torch.zeros_like(state.rods.vel)))
     rest = scenes.step(calm, calmed, rest, control)
     step = recorded(calm, calmed, rest, control)
-    for _ in range(math.ceil(_SETTLING / _SETTLING_STEP) - 1):
+    for _ in range(math.ceil(lasts / length) - 1):
         rest = step(calmed, rest, control)
     zero = {name: torch.zeros_like(getattr(rest.rods, name)) for name in ("vel", "twist_rate")}
     return tree.replace(rest, rods=tree.replace(rest.rods, **zero), time=state.time)

@@ -17,15 +17,13 @@ import numpy as np
 
 from torchdlo.errors import InputError
 from torchdlo.sysid.diagnosis.budget import options as suited
-from torchdlo.sysid.estimation.levenberg_marquardt import Point
 from torchdlo.sysid.estimation.observation import Spines, View
 from torchdlo.sysid.estimation.result import Calibration, Overlay
 from torchdlo.sysid.model import model_file
 from torchdlo.sysid.model.model_file import ModelFile
 from torchdlo.sysid.recordings.recording import Recording
-from torchdlo.sysid.video.filmed_problem import Problem, correct, problem, start_of
-from torchdlo.sysid.video.filmed_search import gate, intervals, picture_errors, scout, solve
-from torchdlo.sysid.video.filmed_start import WINDOW, refine_start
+from torchdlo.sysid.video.filmed_fit import START_WINDOW, Fit, fit, gate, intervals, picture_errors, refine_start, scout
+from torchdlo.sysid.video.filmed_problem import Problem, begin_from_balance, correct, problem
 from torchdlo.sysid.video.footage import views_of
 from torchdlo.sysid.video.overlay import overlaps, overlays
 
@@ -35,9 +33,6 @@ Callback = Callable[[str, int, int, str], None]
 
 FILMED_STARTS = 36
 """Starts that are enough."""
-
-_TURNS = 8
-"""How often starts in motion and numbers are improved in turns."""
 
 
 def calibrate_filmed(
@@ -67,16 +62,15 @@ def calibrate_filmed(
     own = _problem(recording, views, vertices, given)
     space = own.space
     first = np.concatenate([own.fixed[list(own.free)], np.zeros(len(own.spines.nuisances.names))])
-    refine_start(own, first)
     raw = space.to_raw(first) if given is not None else scout(own, starts, np.random.default_rng(seed), report)
-    best = (_from_rest if own.start.still.all() else _in_turns)(own, raw, iterations, report)
+    best = _fitted(own, raw, iterations, report)
     if not np.isfinite(best.cost):
         raise InputError(
             f"{recording.path}: the simulation failed on the train trials from every start; check length, mass, "
             "cameras and marker_arclength."
         )
     values = space.to_values(best.raw)
-    low, high, _ = intervals(own, best.raw)
+    low, high = intervals(own, best)
     for where, frames in own.dropped.items():
         notes.append(f"{where}: frames {', '.join(map(str, sorted(frames)))} stay far from the rope: left out.")
     report("judging", 0, 1, "")
@@ -118,38 +112,35 @@ def _problem(recording: Recording, views: Sequence[View], vertices: int | None, 
     return problem(recording, recording.train, views, options=options, **more)
 
 
-def _from_rest(own: Problem, raw: np.ndarray, iterations: int, report: Callback) -> Point:
-    """Return the best fit of trials that begin at rest."""
-    best = None
-    for k, most in enumerate((5, 5, iterations)):
-        if best is not None:
-            values = own.space.to_values(best.raw)
-            gate(own, values)
-            correct(own, values)
-        (best,) = solve(own, (raw if best is None else best.raw)[None], most)
-        report(f"fitting {len(own.trials)} filmed trials", k + 1, 3, f"{1e3 * best.cost:.2f} mm")
+def _fitted(own: Problem, raw: np.ndarray, iterations: int, report: Callback) -> Fit:
+    """Return the best fit of all trials, without wrong frames and with what finer simulations change."""
+    stage, values = f"fitting {len(own.trials)} filmed trials", own.space.to_values(raw)
+    best = _in_motion(own, raw)
+    if own.model.mesh.clamps and "clamp_fraction" in own.options and not own.model.effects:
+        # The rope may be held up to the last marker of a clamp, or bend between its markers.
+        other = own.with_options(clamp_fraction=1.0 - own.model.clamp_fraction)
+        found = _in_motion(other, best.raw)
+        if found.cost < best.cost:
+            own.take(other)
+            best = found
+    report(stage, 1, 3, f"{1e3 * best.cost:.2f} mm")
+    best = fit(own, best.raw, iterations)
+    report(stage, 2, 3, f"{1e3 * best.cost:.2f} mm")
+    values = own.space.to_values(best.raw)
+    gate(own, values)
+    correct(own, values)
+    best = fit(own, best.raw, iterations)
+    report(stage, 3, 3, f"{1e3 * best.cost:.2f} mm")
     return best
 
 
-def _in_turns(own: Problem, raw: np.ndarray, iterations: int, report: Callback) -> Point:
-    """Return the best fit of trials that begin in motion: starts and numbers are improved in turns."""
-    stage, best, kept = f"fitting {len(own.trials)} filmed trials", None, (own.start, own.offset)
-    for k in range(_TURNS):
-        refine_start(own, own.space.to_values(raw if best is None else best.raw))
-        (found,) = solve(own, (raw if best is None else best.raw)[None], 5)
-        if best is not None and found.cost > 0.98 * best.cost:
-            # Starts that suit the first frames better do not suit the rest: those before were better.
-            own.start, own.offset = kept
-            break
-        best, kept = found, (own.start, own.offset)
-        report(stage, k + 1, _TURNS + 2, f"{1e3 * best.cost:.2f} mm")
-    for k in range(2):
-        values = own.space.to_values(best.raw)
-        gate(own, values)
-        correct(own, values)
-        (best,) = solve(own, best.raw[None], iterations)
-        report(stage, _TURNS + 1 + k, _TURNS + 2, f"{1e3 * best.cost:.2f} mm")
-    return best
+def _in_motion(own: Problem, raw: np.ndarray) -> Fit:
+    """Return a first fit of most of the time, with starts anew."""
+    values = own.space.to_values(raw)
+    if own.offset.shape[1]:
+        begin_from_balance(own, own.full(values[None])[0])
+        refine_start(own, values)
+    return fit(own, raw, 6, seconds=0.7 * own.lasts)
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,11 +170,11 @@ def _judged(
         views, said = views_of(recording, recording.test, report)
         notes += said
         spines = Spines(views, own.model.dt, own.extent, own.spines.free)
-        begin, motion = start_of(own.model, recording.test, views), own.model.motion(recording.test)
-        parts: dict[str, Any] = {"trials": recording.test, "motion": motion, "spines": spines, "start": begin}
-        here = replace(own, **parts, dropped={}, discretisation_correction=None, offset=None)
-        gate(here, values)
+        parts: dict[str, Any] = {"trials": recording.test, "motion": own.model.motion(recording.test), "spines": spines}
+        here = replace(own, **parts, dropped={}, discretisation_correction=None)
+        begin_from_balance(here, own.full(values[None])[0])
         refine_start(here, values)
+        gate(here, values)
         correct(here, values)
     old, _ = picture_errors(here, first)
     new, pixels = picture_errors(here, values)
@@ -201,7 +192,7 @@ def _judged(
         for b, trial in enumerate(here.trials)
     ]
     predictions = {trial.name: sims[:, b, : len(trial.time)] for b, trial in enumerate(here.trials)}
-    shown = overlays(recording, here, split, sims, np.stack([first, values])[:, numbers:])
+    shown = overlays(here, split, sims, np.stack([first, values])[:, numbers:])
     return _Judged(trials, predictions, shown)
 
 
@@ -211,8 +202,8 @@ def _remarks(own: Problem, values: np.ndarray, low: np.ndarray, high: np.ndarray
     moving = [t.name for t, calm in zip(own.trials, own.start.still, strict=True) if not calm]
     if moving:
         out.append(
-            f"{', '.join(moving)} begin in motion, which is estimated from the first {WINDOW:g} s alone: ranges do "
-            "not include what is wrong with that; film from rest where you can."
+            f"{', '.join(moving)} begin in motion: shape and velocities there were fitted, too; those of test trials "
+            f"are taken from their first {START_WINDOW:g} s."
         )
     for name, p, v, a, b in zip(own.space.names, own.space.params, values, low, high, strict=True):
         if not name.startswith("camera_") and p.scale == "log" and b / max(a, 1e-300) > 4:

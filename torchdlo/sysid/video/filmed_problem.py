@@ -10,17 +10,21 @@ import numpy as np
 
 from torchdlo.sysid.diagnosis.error_floor import Refinement, refinement
 from torchdlo.sysid.estimation import levenberg_marquardt
-from torchdlo.sysid.estimation.levenberg_marquardt import ParameterSpace
-from torchdlo.sysid.estimation.observation import Spines, View
+from torchdlo.sysid.estimation.levenberg_marquardt import KNEE, ParameterSpace
+from torchdlo.sysid.estimation.observation import INDEPENDENT, SURE, Spines, View
+from torchdlo.sysid.model import equilibrium
 from torchdlo.sysid.model.rope_model import RopeModel
 from torchdlo.sysid.model.trial_batch import Start, TrialBatch
 from torchdlo.sysid.recordings.recording import Recording, Trial
 from torchdlo.sysid.recordings.trivial_predictors import catenary
 
-__all__ = ["Problem", "correct", "problem", "start_of"]
+__all__ = ["Problem", "begin_from_balance", "correct", "problem", "start_of"]
 
 _CALM = 0.03
 """Speed of a gripper below which it is at rest [m/s]."""
+
+_SHIFT, _DRIFT = 0.03, 0.3
+"""How far shapes [m] and speeds [m/s] at the start usually are from those of a rope at rest that is carried along."""
 
 
 @dataclass(eq=False)
@@ -42,8 +46,32 @@ class Problem:
     """Of the model."""
     discretisation_correction: Refinement | None = None
     """What finer simulations change, if it is known."""
-    offset: np.ndarray | None = None
-    """How starts differ from balance, by trial, see `refine_start`."""
+    offset: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
+    """How starts differ from `start`, in standard deviations of what is expected of that: coefficients of smooth shapes
+    of positions and velocities, shape (B, J); no columns where all trials begin at rest."""
+    shapes: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
+    """Those smooth shapes at the places of the rope, of size one, shape (M, J / 6)."""
+
+    @property
+    def lasts(self) -> float:
+        """Length of the longest trial [s]."""
+        return float(self.motion.markers.shape[1] - 1) * self.model.dt
+
+    @property
+    def prior(self) -> np.ndarray:
+        """What half a squared standard deviation of a start costs [m], by trial, shape (B,)."""
+        pictures = np.sum([v.good.sum(1) for v in self.spines.views], 0)
+        return SURE**2 / KNEE / (INDEPENDENT * np.maximum(pictures, 1))
+
+    def with_options(self, **options: Any) -> Problem:
+        """Return the problem with a model that has other options."""
+        known = self.options | options
+        model = RopeModel(self.model.recording, effects=self.model.effects, **known)
+        return replace(self, model=model, motion=model.motion(self.trials), options=known)
+
+    def take(self, other: Problem) -> None:
+        """Become another problem."""
+        vars(self).update(vars(other))
 
     @property
     def space(self) -> ParameterSpace:
@@ -69,24 +97,54 @@ class Problem:
         out[:, list(self.free)] = values[:, : len(self.free)]
         return out
 
-    def simulate(self, values: np.ndarray, frames: int | None = None) -> np.ndarray:
-        """Return simulated places (P, B, T, M, 3); rows that differ in their cameras only are simulated once."""
-        rows, back = np.unique(self.full(values), axis=0, return_inverse=True)
-        return self.model.simulate(self.motion, self.start, rows, frames=frames)[back.ravel()]
+    def simulate(self, values: np.ndarray, frames: int | None = None, offsets: np.ndarray | None = None) -> np.ndarray:
+        """Return simulated places (P, B, T, M, 3); rows that differ in their cameras only are simulated once.
+
+        Args:
+            values: numbers of rope and cameras, shape (P, N).
+            frames: how many to simulate; all if not given.
+            offsets: of starts, shape (P, B, J); those of the problem if not given.
+        """
+        full = self.full(values)
+        if offsets is None or not offsets.shape[-1]:
+            rows, back = np.unique(full, axis=0, return_inverse=True)
+            begin = self.begin(self.offset[None]) if self.offset.shape[1] else self.start
+            return self.model.simulate(self.motion, begin, rows, frames=frames)[back.ravel()]
+        return self.model.simulate(self.motion, self.begin(offsets), full, frames=frames)
+
+    def begin(self, offsets: np.ndarray) -> Start:
+        """Return starts for P B simulations with offsets (P, B, J)."""
+        mode = offsets.reshape(*offsets.shape[:2], 2, -1, 3)
+        parts = (
+            x[None] + size * np.einsum("mj,pbjc->pbmc", self.shapes, mode[:, :, k])
+            for k, (x, size) in enumerate(((self.start.pos, _SHIFT), (self.start.vel, _DRIFT)))
+        )
+        pos, vel = (p.reshape(-1, *self.start.pos.shape[1:]) for p in parts)
+        known = self.start.discretisation_correction
+        more = None if known is None else np.tile(known, (len(offsets), 1, 1, 1))
+        return Start(pos, vel, np.tile(self.start.still, len(offsets)), more)
+
+    def frames(self, seconds: float | None) -> int | None:
+        """Return how many frames have to be simulated for readings of the first seconds."""
+        if seconds is None:
+            return None
+        return min(self.motion.markers.shape[1], int(np.ceil(seconds / self.model.dt)) + 4)
+
+    def target(self, seconds: float | None) -> np.ndarray:
+        """Return what readings (B, F, R) of the first seconds should be [m], NaN where there are none."""
+        target = self.spines.target[..., 0].copy()
+        if seconds is not None:
+            target[:, np.arange(target.shape[1]) / self.spines.views[0].camera.fps > seconds] = np.nan
+        return target
 
     def readings(self, seconds: float | None = None) -> tuple[levenberg_marquardt.Simulate, np.ndarray]:
         """Return what maps numbers to readings, and their targets, over the first seconds."""
-        target, frames = self.spines.target, None
-        if seconds is not None:
-            frames = min(self.motion.markers.shape[1], int(np.ceil(seconds / self.model.dt)) + 4)
-            target = target.copy()
-            late = np.arange(target.shape[1]) / self.spines.views[0].camera.fps > seconds
-            target[:, late] = np.nan
+        frames = self.frames(seconds)
 
         def read(values: np.ndarray) -> np.ndarray:
             return self.spines.read(self.simulate(values, frames), values[:, len(self.free) :])
 
-        return read, target
+        return read, self.target(seconds)[..., None]
 
 
 def start_of(model: RopeModel, trials: Sequence[Trial], views: Sequence[View]) -> Start:
@@ -169,12 +227,32 @@ def problem(
     first = model.guess() if values is None else np.asarray(values, dtype=float)
     begin = start_of(model, trials, views)
     known = dict(options or {})
-    return Problem(model, tuple(trials), model.motion(trials), spines, begin, columns, first, {}, known)
+    own = Problem(model, tuple(trials), model.motion(trials), spines, begin, columns, first, {}, known)
+    begin_from_balance(own, first)
+    return own
+
+
+def begin_from_balance(own: Problem, numbers: np.ndarray) -> None:
+    """Let trials in motion begin, until more is known, in balance with numbers (K,), carried along by the grippers."""
+    model, plain = own.model, start_of(own.model, own.trials, own.spines.views)
+    spots = np.setdiff1d(np.arange(model.count), model.gripped)
+    shapes = equilibrium.smooth_shapes(model.mesh, spots)
+    if plain.still.all() or shapes is None:
+        own.start, own.offset = plain, np.zeros((len(own.trials), 0))
+        return
+    own.shapes = shapes[list(model.marker_vertex)] * np.sqrt(len(spots))
+    resting = Start(plain.pos, 0 * plain.vel, np.ones(len(plain.pos), bool))
+    balance = model.simulate(own.motion, resting, numbers[None], frames=1)[0, :, 0]
+    sound = np.isfinite(balance).all((1, 2))[:, None, None] & ~plain.still[:, None, None]
+    own.start = replace(plain, pos=np.where(sound, balance, plain.pos))
+    own.offset = np.zeros((len(own.trials), 6 * own.shapes.shape[1]))
 
 
 def correct(own: Problem, values: np.ndarray) -> None:
     """Add to simulations from now on what finer steps and a finer mesh change at these numbers (K + Q,)."""
-    model, begin = own.model, replace(own.start, discretisation_correction=None)
+    model = own.model
+    own.start = replace(own.start, discretisation_correction=None)
+    begin = own.begin(own.offset[None]) if own.offset.shape[1] else own.start
     half = {"substep": model.dt / (2 * model.substeps)}
     fine = half | {"vertices": 2 * len(model.arclength) - 1}
     row, sims = own.full(values[None]), []

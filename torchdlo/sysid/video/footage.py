@@ -12,7 +12,6 @@ from torchdlo.sysid.estimation.observation import View
 from torchdlo.sysid.recordings.recording import Recording, Trial
 from torchdlo.sysid.video.films import FilmFile
 from torchdlo.vision.mask_health import check_masks
-from torchdlo.vision.pictures import quarter
 from torchdlo.vision.segment import Ranges, color_masks, load_film, load_ranges, ranges_of
 from torchdlo.vision.spine import half_width, spine
 
@@ -20,6 +19,9 @@ __all__ = ["RANGES", "masks_of", "views_of"]
 
 RANGES = "segment.json"
 """File of a recording folder that says which colours belong to the rope."""
+
+SHOWN = 3
+"""Pictures of a film that reports show."""
 
 _POINTS = 48
 """Points of a centre line."""
@@ -65,17 +67,9 @@ def views_of(
                 ]
             )
 
-        wide = float(np.median([p[4] for p in parts]))
-        views.append(
-            View(
-                trials[0].films[k].camera,
-                stack(0, 0).astype(bool),
-                stack(1, np.nan),
-                stack(2, np.nan),
-                stack(3, 0.0),
-                wide,
-            )
-        )
+        lines = (stack(0, 0).astype(bool), stack(1, np.nan), stack(2, np.nan))
+        wide, packed, shown = float(np.median([p[3] for p in parts])), *(tuple(p[n] for p in parts) for n in (4, 5))
+        views.append(View(trials[0].films[k].camera, *lines, wide, packed, shown))
     return views, notes
 
 
@@ -114,8 +108,8 @@ def _ranges(recording: Recording, film: Path) -> Ranges:
 
 def _reduced(
     recording: Recording, trial: Trial, film: FilmFile, notes: list[str]
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, float]:
-    """Return which frames are good, centre lines with tangents, small masks and the half width, of one film."""
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, float, np.ndarray, dict[int, np.ndarray]]:
+    """Return good frames, centre lines with tangents, half width, packed masks and some pictures of a film."""
     masks, pictures, _ = masks_of(recording, film)
     time = film.camera.start + np.arange(len(masks)) / film.camera.fps
     lasts = trial.time[-1]
@@ -147,4 +141,8 @@ def _reduced(
     lines = [spine(m, _POINTS) if ok else none for m, ok in zip(masks, good, strict=True)]
     places, tangents = (np.stack(part) for part in zip(*lines, strict=True))
     wide = float(np.median([half_width(m) for m in masks[good][::10]]))
-    return good, places, tangents, quarter(masks), wide
+    some = np.flatnonzero(good)[np.linspace(0, good.sum() - 1, SHOWN + 1).round().astype(int)[1:]]
+    shown = {
+        int(k): (255 - 160 * masks[k] if pictures is None else pictures[k].mean(-1)).astype(np.uint8) for k in some
+    }
+    return good, places, tangents, wide, np.packbits(masks.reshape(count, -1), axis=1), shown

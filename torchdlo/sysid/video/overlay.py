@@ -10,7 +10,6 @@ import torch
 from torchdlo.sysid.estimation.observation import PER_CAMERA, seen_by
 from torchdlo.sysid.estimation.result import Overlay
 from torchdlo.sysid.recordings.recording import Recording
-from torchdlo.sysid.video.footage import masks_of
 from torchdlo.vision.camera import NEAR
 from torchdlo.vision.rasterizer import coverage, successors
 
@@ -56,14 +55,13 @@ def overlaps(recording: Recording, own: Problem, sims: np.ndarray, numbers: np.n
         numbers: those of all cameras, shape (Q,).
     """
     out = []
-    for b, trial in enumerate(own.trials):
+    for b in range(len(own.trials)):
         parts = []
         for k, view in enumerate(own.spines.views):
-            masks, _, _ = masks_of(recording, trial.films[k])
             frames = np.flatnonzero(view.good[b])
             frames = frames[:: max(1, len(frames) // 24)]
             radius = recording.radius or view.half_width * 1.2 / view.camera.fx
-            measured = masks[frames]
+            measured = view.masks(b, frames)
             model = drawn(own, k, sims[b], numbers, frames, radius) > 0.5
             # How thick a mask is depends on where its colours were cut off: ropes are drawn as thick as it is.
             thick = float(np.clip(measured.sum() / max(model.sum(), 1), 0.6, 1.6))
@@ -74,15 +72,10 @@ def overlaps(recording: Recording, own: Problem, sims: np.ndarray, numbers: np.n
     return out
 
 
-_SHOWN = 3
-"""Pictures per film."""
-
-
-def overlays(recording: Recording, own: Problem, split: str, sims: np.ndarray, numbers: np.ndarray) -> list[Overlay]:
+def overlays(own: Problem, split: str, sims: np.ndarray, numbers: np.ndarray) -> list[Overlay]:
     """Return some pictures of each film with the rope before and after.
 
     Args:
-        recording: the rope.
         own: the problem.
         split: train or test.
         sims: places of the rope before and after [m], shape (2, B, T, M, 3).
@@ -95,10 +88,7 @@ def overlays(recording: Recording, own: Problem, split: str, sims: np.ndarray, n
             cameras = torch.as_tensor(numbers[:, PER_CAMERA * k : PER_CAMERA * (k + 1)], dtype=torch.float32)
             pixel = seen_by(view, both, cameras, own.spines.step)[0].numpy()
         for b, trial in enumerate(own.trials):
-            masks, pictures, _ = masks_of(recording, trial.films[k])
-            good = np.flatnonzero(view.good[b])
-            for frame in good[np.linspace(0, len(good) - 1, _SHOWN + 1).round().astype(int)[1:]]:
-                shown = 255 - 160 * masks[frame] if pictures is None else pictures[frame].mean(-1)
+            for frame, shown in view.shown[b].items():
                 title = f"{trial.name}, camera {view.camera.name}, {view.time[frame]:.2f} s"
-                out.append(Overlay(title, split, shown.astype(np.uint8), pixel[0, b, frame], pixel[1, b, frame]))
+                out.append(Overlay(title, split, shown, pixel[0, b, frame], pixel[1, b, frame]))
     return out

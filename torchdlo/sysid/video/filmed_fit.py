@@ -1,0 +1,374 @@
+"""Fits of rope, cameras and starts in motion to films, all at once, by Levenberg-Marquardt.
+
+A trial that begins in motion has numbers of its own: how far its first shape and velocities are from those of a rope in
+balance that is carried along, in a few smooth shapes. They matter to this trial alone, so they are eliminated from its
+normal equations (Schur complement), and what is left is a problem of the numbers that all trials share.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from torchdlo.sysid.estimation import levenberg_marquardt
+from torchdlo.sysid.estimation.levenberg_marquardt import ParameterSpace, Point
+from torchdlo.sysid.estimation.observation import INDEPENDENT, SURE, Spines, View
+from torchdlo.sysid.video.filmed_problem import Problem
+
+__all__ = ["Fit", "fit", "gate", "intervals", "look", "picture_errors", "refine_start", "scout"]
+
+Callback = Callable[[str, int, int, str], None]
+
+START_WINDOW = 0.4
+"""Seconds of a film that a start in motion is first estimated from."""
+
+_REACH = (np.log(40.0), np.log(4.0), np.log(10.0))
+"""How far starts go either way of the guess."""
+
+_BLOCK = 0.5
+"""Time over which what simulations get wrong is one and the same error [s]."""
+
+_GATE = 3.0
+"""Times the usual distance in a picture from which it is a wrong one."""
+
+_NEAR = 4e-3
+"""Distance that is never taken for that of a wrong picture [m]."""
+
+_FIRM = 5e-3
+"""Share of the cost that a number has to save per squared coordinate to be followed as far as its gradient says."""
+
+_NUDGE = 0.02
+"""Steps of finite differences of starts, in standard deviations of their priors."""
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """Numbers and starts, and what is known of the readings there."""
+
+    raw: np.ndarray
+    """Coordinates of the numbers of rope and cameras, shape (N,)."""
+    offset: np.ndarray
+    """Starts in standard deviations of their priors, shape (B, J); no columns where all trials begin at rest."""
+    costs: np.ndarray
+    """Cost by trial [m], shape (B,); infinite where the simulation failed."""
+    residual: np.ndarray
+    """Readings [m], NaN where there are none, shape (B, F, R)."""
+    jacobian: np.ndarray
+    """What they change with, of numbers and starts, float32, shape (B, N + J, F, R)."""
+
+    @property
+    def cost(self) -> float:
+        """Mean over trials [m]."""
+        return float(np.mean(self.costs))
+
+    def normal(self, prior: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return gradients (B, N + J) and curvatures (B, N + J, N + J) of the cost, with priors of starts (B,)."""
+        return normal(self.residual, self.jacobian, self.offset, prior)
+
+
+def normal(
+    residual: np.ndarray, jacobian: np.ndarray, offset: np.ndarray, prior: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return gradients and curvatures of the robust cost by trial, see `Fit.normal`."""
+    trials, size = jacobian.shape[:2]
+    gradient, curvature = np.zeros((trials, size)), np.zeros((trials, size, size))
+    count = offset.shape[1]
+    for b in range(trials):
+        seen = np.isfinite(residual[b])
+        if not seen.any():
+            continue
+        r, j = residual[b][seen], jacobian[b][:, seen]
+        weight = levenberg_marquardt.robust(r)[1]
+        gradient[b] = j @ (weight * r) / len(r)
+        curvature[b] = (j * weight) @ j.T / len(r)
+        gradient[b, size - count :] += prior[b] * offset[b]
+        curvature[b, size - count :, size - count :] += prior[b] * np.eye(count)
+    return gradient, curvature
+
+
+def eliminated(gradient: np.ndarray, curvature: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return gradients (B, N) and curvatures (B, N, N) of shared numbers; starts, the last `count`, follow them."""
+    if not count:
+        return gradient, curvature
+    a, b, c = curvature[:, :-count, :-count], curvature[:, :-count, -count:], curvature[:, -count:, -count:]
+    c = c + 1e-12 * np.eye(count)
+    solved = np.linalg.solve(c, np.concatenate([b.transpose(0, 2, 1), gradient[:, -count:, None]], 2))
+    return gradient[:, :-count] - (b @ solved[..., -1:])[..., 0], a - b @ solved[..., :-1]
+
+
+def look(own: Problem, raw: np.ndarray, offset: np.ndarray, seconds: float | None = None) -> Fit:
+    """Return readings and their derivatives at coordinates (N,) and starts (B, J), over the first seconds."""
+    space, numbers, moving = own.space, len(own.free), offset.shape[1]
+    step = levenberg_marquardt.Look(space, raw[None])
+    values = step.values
+    # What cameras are off needs no simulation of its own.
+    rows = np.concatenate([values[: numbers + 1], np.repeat(values[:1], moving, 0)])
+    offsets = np.repeat(offset[None], len(rows), 0)
+    for k in range(moving):
+        offsets[numbers + 1 + k, :, k] += _NUDGE
+    sims = own.simulate(rows, own.frames(seconds), offsets)
+    cameras = np.concatenate([rows[:, numbers:], values[numbers + 1 :, numbers:]])
+    motions = np.concatenate([sims, np.repeat(sims[:1], len(values) - numbers - 1, 0)])
+    target = own.target(seconds)
+    found = own.spines.changes(motions, cameras)[..., 0]
+    residual = np.where(np.isfinite(target), found[0], np.nan)
+    good = np.isfinite(sims).all((0, 2, 3, 4)) & np.isfinite(np.where(np.isfinite(target), found, 0.0)).all((0, 2, 3))
+    change = (found[1:] - found[:1]).astype(np.float32)
+    order = [*range(numbers), *range(numbers + moving, len(change)), *range(numbers, numbers + moving)]
+    width = np.concatenate([step.steps[0], np.full(moving, _NUDGE)])
+    jacobian = (change[order] / width[:, None, None, None]).transpose(1, 0, 2, 3)
+    jacobian[:, :, ~np.isfinite(residual).any(0)] = 0.0
+    jacobian[~good] = 0.0
+    if moving:
+        jacobian[own.start.still, -moving:] = 0.0
+    costs = np.full(len(residual), np.inf)
+    for b in np.flatnonzero(good):
+        seen = np.isfinite(residual[b])
+        costs[b] = levenberg_marquardt.robust(residual[b][seen])[0].mean() + 0.5 * own.prior[b] * (offset[b] ** 2).sum()
+    return Fit(raw, offset, costs, residual, jacobian)
+
+
+def fit(
+    own: Problem,
+    raw: np.ndarray,
+    iterations: int,
+    *,
+    seconds: float | None = None,
+    tolerance: float = 2e-3,
+    fixed: bool = False,
+) -> Fit:
+    """Improve numbers (N,) and the starts of the problem, which are set to what is found.
+
+    Args:
+        own: the problem.
+        raw: coordinates to start from.
+        iterations: most steps.
+        seconds: how much of the trials to look at; all of them if not given.
+        tolerance: share of the cost that a step has to save for another one to be worth while.
+        fixed: whether numbers stay as they are, so that starts alone are fitted.
+    """
+    now = look(own, raw, own.offset, seconds)
+    damping = 1e-2
+    for _ in range(iterations):
+        if not np.isfinite(now.costs).any():
+            break
+        raw_step, offset_step = _step(own, now, damping, fixed)
+        tried = look(own, own.space.clip(now.raw + raw_step), now.offset + offset_step, seconds)
+        if _total(tried) < _total(now):
+            done = _total(now) - _total(tried) < tolerance * _total(now)
+            now, damping = tried, max(damping / 5, 1e-6)
+            if done:
+                break
+        else:
+            damping *= 8
+            if damping > 1e3:
+                break
+    own.offset = now.offset
+    return now
+
+
+def _total(found: Fit) -> float:
+    """Return the mean cost, of which trials that failed have a large one."""
+    ran = np.isfinite(found.costs)
+    return float(np.where(ran, found.costs, 1.0).mean()) if ran.any() else np.inf
+
+
+def _step(own: Problem, now: Fit, damping: float, fixed: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Return a step of numbers (N,) and one of starts (B, J)."""
+    gradient, curvature = now.normal(own.prior)
+    count, size = now.offset.shape[1], len(now.raw)
+    inner = np.arange(size, size + count)
+    damped = curvature.copy()
+    damped[:, inner, inner] *= 1 + damping
+    damped[:, inner, inner] += 1e-12
+    cost = float(np.mean(now.costs[np.isfinite(now.costs)]))
+    step = np.zeros(size)
+    if not fixed:
+        g, h = eliminated(gradient, damped, count)
+        scale = np.diag(curvature.mean(0))[:size]
+        firm = damping * (scale + 1e-9 * scale.sum() + 1e-12) + _FIRM * cost
+        step = -np.linalg.solve(h.mean(0) + np.diag(firm), g.mean(0))
+        step = step / max(1.0, float(np.abs(step / own.space.limits()).max()))
+        step = own.space.clip(now.raw + step) - now.raw
+    if not count:
+        return step, np.zeros_like(now.offset)
+    right = gradient[:, size:] + (damped[:, size:, :size] @ step)
+    moves = -np.linalg.solve(damped[:, size:, size:], right[..., None])[..., 0]
+    longest = np.maximum(1.0, np.abs(moves).max(1, keepdims=True))
+    return step, moves / longest
+
+
+def refine_start(own: Problem, values: np.ndarray, passes: int = 6) -> None:
+    """Estimate the starts of trials in motion from their first seconds, with numbers (N,) as they are."""
+    if own.offset.shape[1]:
+        for share in (0.5, 1.0):
+            fit(own, own.space.to_raw(values), passes, seconds=share * START_WINDOW, tolerance=1e-2, fixed=True)
+
+
+def scout(own: Problem, starts: int, rng: np.random.Generator, report: Callback) -> np.ndarray:
+    """Return coordinates (N,) in the basin of the best fit: of the rope alone, cameras being where they are said to be.
+
+    Many starts are tried on the beginning of the trials, where a cost has few local minima; the best go on.
+    """
+    whole, count = own.space, len(own.free)
+    space = ParameterSpace(whole.names[:count], whole.params[:count], whole.sizes[:count])
+    zero, lasts, total = np.zeros(len(whole.names) - count), own.lasts, 3
+    raws = np.repeat(space.to_raw(own.fixed[list(own.free)])[None], starts, 0)
+    for k in range(min(count, 3)):
+        share = (rng.permutation(starts) + rng.uniform(size=starts)) / starts - 0.5
+        raws[1:, k] += 2 * _REACH[k] * share[1:]
+    raws[1:, 1] += raws[1:, 0] - raws[0, 0]
+    raws = space.clip(raws)
+
+    def full(raw: np.ndarray) -> np.ndarray:
+        return whole.to_raw(np.concatenate([space.to_values(raw), zero]))
+
+    def over(share: float) -> tuple[levenberg_marquardt.Simulate, np.ndarray]:
+        simulate, target = own.readings(share * lasts)
+        return lambda v: simulate(np.concatenate([v, np.zeros((len(v), len(zero)))], 1)), target
+
+    report("trying starts", 0, total, "")
+    refine_start(own, whole.to_values(full(raws[0])), passes=3)
+    simulate, target = over(0.35)
+    cost = levenberg_marquardt.costs(simulate(space.to_values(raws)), target, own.extent)
+    raws = raws[np.argsort(cost, kind="stable")[: max(2, starts // 4)]]
+    report("trying starts", 1, total, f"{1e3 * cost.min():.2f} mm")
+    points: list[Point] = levenberg_marquardt.evaluate(simulate, target, space, raws, own.extent)
+    limits: dict[str, Any] = {"iterations": 4, "tolerance": 1e-2, "whole": own.extent}
+    for points in levenberg_marquardt.improve(simulate, target, space, points, **limits):  # noqa: B007, B020
+        pass
+    points = _different(points, 3)
+    report("trying starts", 2, total, f"{1e3 * points[0].cost:.2f} mm over 35 % of the time")
+    begun, found = own.offset, []
+    for p in points:
+        own.offset = begun
+        found.append((fit(own, full(p.raw), 4, seconds=0.7 * lasts, tolerance=2e-2), own.offset))
+    best, own.offset = min(found, key=lambda pair: _total(pair[0]))
+    report("trying starts", total, total, f"{1e3 * best.cost:.2f} mm over 70 % of the time")
+    return best.raw
+
+
+def _different(points: Sequence[Point], most: int) -> list[Point]:
+    """Return the best points that are not in the same place."""
+    kept: list[Point] = []
+    for p in sorted(points, key=lambda p: p.cost):
+        if np.isfinite(p.cost) and all(np.abs(p.raw[:3] - o.raw[:3]).max() > 0.1 for o in kept):
+            kept.append(p)
+    return [p for p in kept[:most] if p.cost < 2 * kept[0].cost] or [min(points, key=lambda p: p.cost)]
+
+
+def gate(own: Problem, values: np.ndarray) -> int:
+    """Take out frames in which films stay far from the rope while others are near; return how many."""
+    found, target = own.readings()[0](values[None])[0], own.spines.target
+    lost, start = 0, 0
+    for view in own.spines.views:
+        width = 2 * view.places.shape[2]
+        part = slice(start, start + width)
+        start += width + int(own.spines.count_free)
+        with np.errstate(invalid="ignore"):
+            known = np.isfinite(target[:, :, part, 0])
+            size = np.where(known, np.abs(found[:, :, part, 0]), np.nan)
+            distance = np.full(known.shape[:2], np.nan)
+            some = known.any(2)
+            distance[some] = np.nanmean(size[some], 1)
+        for b, trial in enumerate(own.trials):
+            rows = np.flatnonzero(some[b])
+            around = np.array([np.median(distance[b, rows[max(0, k - 4) : k + 5]]) for k in range(len(rows))])
+            bad = rows[distance[b, rows] > np.maximum(_GATE * around, _NEAR)]
+            if len(bad):
+                view.good[b, bad] = False
+                lost += len(bad)
+                own.dropped.setdefault(f"{trial.name}, camera {view.camera.name}", []).extend(bad.tolist())
+    if lost:
+        free = np.ones(own.model.count, bool)
+        free[own.model.gripped] = False
+        own.spines = Spines(own.spines.views, own.model.dt, own.extent, free)
+    return lost
+
+
+def intervals(own: Problem, found: Fit) -> tuple[np.ndarray, np.ndarray]:
+    """Return 90 % limits of the fitted numbers, shape (N,) each.
+
+    Stretches of time scatter; what cameras may be off shifts all of them in the same way, and starts in motion follow.
+    """
+    space, numbers = own.space, len(own.free)
+    gradient, curvature = _blocks(own, found)
+    blocks = len(gradient)
+    # Priors: a standard deviation of one coordinate, weighed as a few independent readings of each picture are.
+    pictures = sum(float(v.good.sum()) for v in own.spines.views)
+    precision = SURE**2 / levenberg_marquardt.KNEE / (INDEPENDENT * pictures)
+    prior = np.diag(np.concatenate([np.zeros(numbers), np.full(len(space.names) - numbers, precision)]))
+    curvature = curvature + prior[None]
+    gradient = gradient + found.raw * np.diag(prior)
+    point = Point(found.raw, found.cost, gradient, curvature, np.zeros(blocks))
+    drifts = np.linalg.solve(levenberg_marquardt.firm(curvature.sum(0)), blocks * prior)[numbers:]
+    if own.discretisation_correction is not None:
+        values = space.to_values(found.raw)[None]
+        sims = own.simulate(values)
+        read = own.spines.changes(sims, values[:, numbers:])
+        # Next to clamps the mesh's error may be of first order: extrapolating to that would change twice as much.
+        for factor, wrong in zip((1.0, 2.0), own.discretisation_correction.unsure, strict=True):
+            moved = np.concatenate([sims, sims + factor * np.nan_to_num(wrong)[None]])
+            change = own.spines.changes(moved, np.repeat(values[:, numbers:], 2, 0))[1, ..., 0] - read[0, ..., 0]
+            weighted = replace(found, residual=found.residual + change)
+            g, h = (x.sum(0) for x in eliminated(*_difference(own, found, weighted), found.offset.shape[1]))
+            drifts = np.concatenate([drifts, np.linalg.solve(levenberg_marquardt.firm(h), g)[None]])
+    low, high = levenberg_marquardt.interval(point, space, drifts=drifts)
+    return np.minimum(low, high), np.maximum(low, high)
+
+
+def _difference(own: Problem, found: Fit, moved: Fit) -> tuple[np.ndarray, np.ndarray]:
+    """Return what another residual changes of gradients, and the curvatures as they are."""
+    before, curvature = found.normal(own.prior)
+    after, _ = moved.normal(own.prior)
+    return after - before, curvature
+
+
+def _blocks(own: Problem, found: Fit) -> tuple[np.ndarray, np.ndarray]:
+    """Return gradients (E, N) and curvatures (E, N, N) of stretches of time of all trials, starts being eliminated."""
+    count, length = found.offset.shape[1], max(3, round(_BLOCK * own.spines.views[0].camera.fps))
+    size, frames = found.raw.size, found.residual.shape[1]
+    data = found.residual[:, :, : own.spines.priors.start]
+    gradients, curvatures = [], []
+    for b in range(len(data)):
+        whole = np.isfinite(data[b]).sum()
+        single = slice(b, b + 1)
+        jacobian = found.jacobian[single][..., : own.spines.priors.start]
+        _, h = normal(data[single], jacobian, found.offset[single], own.prior[single])
+        follow = np.zeros((size, count))
+        if count:
+            inner = h[0, size:, size:] + 1e-12 * np.eye(count)
+            follow = np.linalg.solve(inner, h[0, size:, :size]).T
+        for k in range(0, frames, length):
+            rows = slice(k, k + length)
+            share = np.isfinite(data[b, rows]).sum() / max(whole, 1)
+            if share < 0.3 * length / frames:
+                continue
+            g, c = normal(data[single, rows], jacobian[:, :, rows], found.offset[single], 0 * own.prior[single])
+            gradients.append(g[0, :size] - follow @ g[0, size:])
+            reduced = np.concatenate([np.eye(size), -follow], 1)
+            curvatures.append(reduced @ c[0] @ reduced.T)
+    return np.stack(gradients), np.stack(curvatures)
+
+
+def picture_errors(own: Problem, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the mean distance of the films' centre lines from the rope by trial [m] and [px], (B,) each."""
+    sims = own.simulate(values[None])
+    read = own.spines.read(sims, values[None, len(own.free) :])[0]
+    metres, pixels, start = [], [], 0
+    for view in own.spines.views:
+        width = 2 * view.places.shape[2]
+        part = np.where(np.isfinite(own.spines.target), read, np.nan)[:, :, start : start + width, 0]
+        pairs = part.reshape(*part.shape[:2], -1, 2)
+        metres.append(np.nanmean(np.linalg.norm(pairs, axis=-1), (1, 2)))
+        pixels.append(metres[-1] * view.camera.fx / _depth(own, view))
+        start += width + int(own.spines.count_free)
+    return np.mean(metres, 0), np.mean(pixels, 0)
+
+
+def _depth(own: Problem, view: View) -> float:
+    held = np.concatenate([t.markers[:, t.gripped].reshape(-1, 3) for t in own.trials])
+    return float(np.mean(held @ np.array(view.camera.rotation)[2] + view.camera.translation[2]))
