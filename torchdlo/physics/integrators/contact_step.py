@@ -21,6 +21,8 @@ from torchdlo.physics import tree
 from torchdlo.physics.constraints import contact_penalty as penalty
 from torchdlo.physics.constraints.contact_penalty import HARD, Pairs, Touch
 from torchdlo.physics.constraints.edge_lengths import Inertia, Lengths, System, saddle_order
+from torchdlo.physics.integrators import contact_kernel
+from torchdlo.physics.kernels import lanes
 from torchdlo.physics.linalg import banded, gather_scatter, low_rank
 from torchdlo.physics.linalg.numerics import dot
 from torchdlo.physics.rod.topology import Topology, following, parse, preceding
@@ -239,6 +241,8 @@ def solve(touching: Touching, tension: Tensor) -> tuple[Tensor, Tensor, Tensor, 
         share of the forces that is not in balance, shape (..., 1, 1).
     """
     system = touching.system
+    if lanes.ready(system.force) and contact_kernel.available(system.force):
+        return tuple(_searched(touching, tension, True)[4:])
     with torch.no_grad():
         pos, found, bodies, hard = _searched(touching, tension)
     firm = touching.firm(tension, hard)
@@ -256,27 +260,50 @@ def solve(touching: Touching, tension: Tensor) -> tuple[Tensor, Tensor, Tensor, 
     return now.pos, now.impulse / scale, (push + exerted) / scale, exerted / scale, wrench, left
 
 
-def _searched(touching: Touching, tension: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def _searched(touching: Touching, tension: Tensor, whole: bool = False) -> tuple[Tensor, ...]:
     system = touching.system
     inputs, law = system.inputs(tension)
     parts = [getattr(touching.touch, name) for name in _FIELDS]
     pairs = [] if touching.pairs is None else tree.leaves(touching.pairs)
     law = [*law, touching.dt]
-    found = torch.ops.torchdlo.engaged(inputs, parts, pairs, touching.origin, system.lengths.topology.name, law)
-    return tuple(found)
+    operator = torch.ops.torchdlo.engaged_whole if whole else torch.ops.torchdlo.engaged
+    return tuple(operator(inputs, parts, pairs, touching.origin, system.lengths.topology.name, law))
 
 
-def _engaged(
+def _equations(
     inputs: list[Tensor], parts: list[Tensor], pairs: list[Tensor], origin: Tensor, topology: str, law: list[float]
-) -> list[Tensor]:
-    """Return positions, tensions, displacements of bodies, and how hard contact was."""
+) -> tuple[Touching, Tensor]:
     rest, compliance, active, mask, give, hinge, swing, free, tension, vertex, moved, *others, scale = inputs
     lengths = Lengths(parse(topology), rest, compliance, active, mask, give, *law[1:3])
     system = System(
         lengths, Inertia(vertex, hinge, rest, mask, swing), moved, free, others[0], scale, *others[1:], law[0]
     )
     between = Pairs(*pairs[:6], tuple(pairs[6:])) if pairs else None
-    touching = Touching(system, Touch(*parts), origin, between, law[-1])
+    return Touching(system, Touch(*parts), origin, between, law[-1]), tension
+
+
+def _by_kernel(*given) -> list[Tensor]:
+    touching, tension = _equations(*given)
+    others = touching.touch, touching.pairs, touching.origin, touching.dt
+    return contact_kernel.solve(touching.system, tension, *others, TRIES, _solved(tension))
+
+
+def _whole(*given) -> list[Tensor]:
+    return [x.contiguous() for x in _by_kernel(*given)]
+
+
+def _engaged(
+    inputs: list[Tensor], parts: list[Tensor], pairs: list[Tensor], origin: Tensor, topology: str, law: list[float]
+) -> list[Tensor]:
+    """Return positions, tensions, displacements of bodies, and how hard contact was."""
+    if contact_kernel.available(origin):
+        return [x.contiguous() for x in _by_kernel(inputs, parts, pairs, origin, topology, law)[:4]]
+    return _by_tensors(*_equations(inputs, parts, pairs, origin, topology, law))
+
+
+def _by_tensors(touching: Touching, tension: Tensor) -> list[Tensor]:
+    """Return what `_engaged` does, by tensor operations."""
+    system = touching.system
     linear = penalty.maps(touching.touch)
     first = touching.start(tension)
     found = best = first
@@ -304,7 +331,7 @@ def _engaged(
     # What stays unsolved ends where least was left, not where the last step happened to go.
     lost = open & (least < torch.inf)
     found, chosen = _chosen(lost, best, found), torch.where(lost, kept, chosen)
-    return [x.contiguous() for x in (found.pos, found.impulse / scale, found.bodies, chosen)]
+    return [x.contiguous() for x in (found.pos, found.impulse / system.scale, found.bodies, chosen)]
 
 
 def _chosen(condition: Tensor, one: Unknowns, other: Unknowns) -> Unknowns:
@@ -324,13 +351,19 @@ def _engaged_meta(
     return [like(*batch, v, 3), like(*batch, v, 1), like(*batch, of.shape[-1], 6), like(*batch, 1, 1)]
 
 
+def _whole_meta(*given) -> list[Tensor]:
+    pos, tension, bodies, hard = _engaged_meta(*given)
+    later = (pos, tension, pos, pos, bodies, hard)
+    return [pos, tension, bodies, hard, *(torch.empty_like(x) for x in later)]
+
+
+_ARGUMENTS = "Tensor[] inputs, Tensor[] parts, Tensor[] pairs, Tensor origin, str topology, float[] law"
 _operators = torch.library.Library("torchdlo", "FRAGMENT")
-_operators.define(
-    "engaged(Tensor[] inputs, Tensor[] parts, Tensor[] pairs, Tensor origin, str topology, float[] law) -> Tensor[]"
-)
-for _device in ("CPU", "CUDA"):
-    _operators.impl("engaged", _engaged, _device)
-_operators.impl("engaged", _engaged_meta, "Meta")
+for _name, _run, _shapes in (("engaged", _engaged, _engaged_meta), ("engaged_whole", _whole, _whole_meta)):
+    _operators.define(f"{_name}({_ARGUMENTS}) -> Tensor[]")
+    for _device in ("CPU", "CUDA"):
+        _operators.impl(_name, _run, _device)
+    _operators.impl(_name, _shapes, "Meta")
 
 
 def _pattern(name: str) -> banded.Pattern:
