@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from torchdlo import notices
+from torchdlo.coupling import start_overlaps
 from torchdlo.coupling.bodies import dynamics as rigid
 from torchdlo.coupling.bodies.dynamics import Body, BodyParams, BodyState, BodyTargets, RigidBody, place
 from torchdlo.coupling.common import step_diagnostics
@@ -219,7 +220,8 @@ def make(
         matter: what `coupling.mpm.particles.assemble` returned; `RodMpmCoupling` and `BodyMpmCoupling` let ropes and
             bodies touch it.
         check: whether to refuse what could not be stepped: laws that do not fit the ropes, ropes far from their length,
-            unstable substeps. Scenes whose loads are only evaluated may be anything.
+            unstable substeps; and to move ropes that start inside of what they touch out of it. Scenes whose loads are
+            only evaluated may be anything.
         choices: fields of `Scene`.
     """
     validation.listed(effects, Effect, "effects")
@@ -241,6 +243,15 @@ def make(
         stability.check_laws(scene.settings, rods, numbers, state)
         check_step(scene, params)
         _mention(scene, state)
+        state = start_overlaps.part(
+            topology,
+            effects,
+            altered(scene.effects, topology, rods, numbers),
+            state,
+            (kinds, solid, placed) if bodies else None,
+            scene.prescribed_vertices,
+            scene.constrained,
+        )
     zero = state.pos.new_zeros(*state.pos.shape[:-2], 1, 3)
     first = State(
         state,

@@ -6,7 +6,7 @@ import pytest
 import torch
 from touching import F64
 
-from torchdlo.coupling.rod_contact.gather_scatter import corners, drop, pick
+from torchdlo.physics.linalg.gather_scatter import corners, drop, pick
 
 pytestmark = pytest.mark.quick
 

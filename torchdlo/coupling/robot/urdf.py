@@ -161,7 +161,9 @@ def _joint(where: str, element: xml.Element, links: tuple[str, ...]) -> Joint:
             raise InputError(f"{here} has the {role} link {link!r}, which is not defined; {near(link, links)}.")
         ends.append(link)
     limit, mimic, axis = element.find("limit"), element.find("mimic"), element.find("axis")
-    direction = [1.0, 0.0, 0.0] if axis is None else _numbers(here, axis, "xyz", 3, None)
+    direction = [1.0, 0.0, 0.0] if axis is None or kind == "fixed" else _numbers(here, axis, "xyz", 3, None)
+    if kind == "fixed":  # files write the axis 0 0 0, limits upside down and the like, which mean nothing
+        limit = None
     size = math.hypot(*direction)
     if size == 0:
         raise InputError(f"{here} has the axis 0 0 0; expected a direction.")
@@ -233,6 +235,8 @@ def _shapes(where: str, link: xml.Element) -> list[Shape]:
                 size = (radius, 0.5 * length)
             else:
                 continue
+            if max(size) == 0:
+                continue  # stands for no shape
             if min(size) <= 0:
                 raise InputError(f"{here}: <{element.tag}> has a size of {min(size):g}; expected positive numbers.")
             out.append(Shape(link.get("name", ""), element.tag, size, _origin(here, collision)))

@@ -15,6 +15,9 @@ An edge is a capsule: the points within a radius of a segment. Per substep, on a
     converge for every pile and treat all pairs alike. Held vertices count as heavy ones, see `PredictedMotion.give`.
 6.  The forces join the other loads; then the lengths of the edges are solved for as ever.
 
+Implicit steps find these forces together with the lengths, by the stiff law of `physics.constraints.contact_penalty`
+with the same points, directions and couples; `sweeps`, `rounds` and the kernel of forces belong to explicit ones.
+
 Contact comes before the lengths and not after them: lengths stay exact, and the tension that presses ropes together is
 in the prediction of the next substep, so a knot at rest has no overlap and does not creep. Nothing about a pair is
 kept from one substep to the next.
@@ -41,15 +44,16 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from torchdlo.coupling.common.coulomb_friction import parting, rebounding, rub
+from torchdlo.coupling.common.coulomb_friction import parting, rebounding, rub, slowly
 from torchdlo.coupling.rod_contact import broad_phase_op
 from torchdlo.coupling.rod_contact import solver_op as rod_pairs
 from torchdlo.coupling.rod_contact.broad_phase import near_pairs
 from torchdlo.coupling.rod_contact.closest_points import closest
-from torchdlo.coupling.rod_contact.gather_scatter import Four, columns, corners, drop, pick
 from torchdlo.coupling.rod_contact.solver_op import WEAK
 from torchdlo.physics import tree
+from torchdlo.physics.constraints.contact_penalty import Pairs
 from torchdlo.physics.effects.base import Effect, Param, PredictedMotion, Values
+from torchdlo.physics.linalg.gather_scatter import Four, columns, corners, drop, pick
 from torchdlo.physics.linalg.numerics import cross, dot, safe_norm
 from torchdlo.physics.rod.kinematics import View
 
@@ -188,6 +192,7 @@ class RodContact(Effect):
     name: ClassVar[str] = "rod_contact"
     kind: ClassVar[str] = "force"
     is_contact: ClassVar[bool] = True
+    engages: ClassVar[bool] = True
     params: ClassVar[dict[str, Param]] = {
         "mu_s": Param(0.3, 0.0, 2.0, "1", "linear", 0.0, "Coefficient of static friction among ropes."),
         "mu_k": Param(0.3, 0.0, 2.0, "1", "linear", 0.0, "Coefficient of sliding friction among ropes."),
@@ -245,6 +250,33 @@ class RodContact(Effect):
         _, forces, spread = self.solve(view, motion, values)
         return drop(spread(forces), values["corners"], view.topology.size)
 
+    def engage(self, view: View, motion: PredictedMotion, values: Values) -> Pairs:
+        """Return the pairs of edges that may touch in an implicit substep."""
+        at, like = values["corners"], view.state.pos
+        batch, size = at.shape[:-2], view.topology.size
+        mass = 1 / motion.mobility.amax(-1, keepdim=True)
+        parts = [like, motion.change, view.state.vel, view.params.material.radius, mass]
+        widths = [p.shape[-1] for p in parts]
+        picked = pick(columns([p.expand(*batch, size, p.shape[-1]) for p in parts]), at)
+        pos, change, vel, radius, mass4 = zip(*(p.split(widths, -1) for p in picked), strict=True)
+        contacts = find_contacts(values, pos, radius)
+        wanted, _ = self._target(contacts, change, vel, values, view.dt, calm=True)
+        n = contacts.normal
+        unit = torch.eye(3, dtype=n.dtype, device=n.device)
+        along = n.unsqueeze(-1) * n.unsqueeze(-2)
+        linear = [w.unsqueeze(-1) * unit for w in contacts.weight]
+        mu = torch.zeros_like(contacts.gap)
+        if self.friction:
+            couple = _couple(pos, mass4)
+            # Couples of friction are exerted by the corners, and slip is measured without the turn of both edges.
+            turn = (unit - along) @ _skew(contacts.distance * n) @ torch.stack(couple.inverse, -2)
+            linear = [m + turn @ _skew(arm) for m, arm in zip(linear, couple.arm, strict=True)]
+            slip = _sum(contacts.weight, vel)
+            slip = slip - cross(couple.seen(vel), contacts.distance * n)
+            slides = safe_norm(slip - n * dot(n, slip)).detach() > self.slowest
+            mu = torch.where(slides, values["mu_k"], values["mu_s"])
+        return Pairs(at, contacts.real, n, 0.5 * (radius[0] + radius[2]), wanted, mu, tuple(linear))
+
     def solve(self, view: View, motion: PredictedMotion, values: Values):
         """Return the contacts, their forces, and a function that turns forces into those on the four corners."""
         at, size = values["corners"], view.topology.size
@@ -277,10 +309,16 @@ class RodContact(Effect):
             forces = self._sweep(contacts, couple, forces, change, wanted, softness, values)
         return contacts, forces, spread
 
-    def _target(self, contacts: Contacts, change: Four, vel: Four, values: Values, dt: float) -> tuple[Tensor, Tensor]:
-        """Return by how much pairs have to part at least [m], and which of them would touch, shape (..., K, 1) each."""
+    def _target(
+        self, contacts: Contacts, change: Four, vel: Four, values: Values, dt: float, calm: bool = False
+    ) -> tuple[Tensor, Tensor]:
+        """Return by how much pairs have to part at least [m], and which of them would touch, shape (..., K, 1) each.
+
+        Slowly, if that is asked for.
+        """
         # Overlaps are shallow up to a tenth of the radius.
         wanted = parting(contacts.gap, 0.05 * (contacts.distance - contacts.gap), self.recovery)
+        wanted = slowly(wanted, dt) if calm else wanted
         pressed = contacts.real * (dot(contacts.normal, _sum(contacts.weight, change)) < wanted)
         approach = -dot(contacts.normal, _sum(contacts.weight, vel))
         return rebounding(wanted, pressed, approach, values["restitution"], self.slowest, dt), pressed
@@ -307,6 +345,13 @@ class RodContact(Effect):
         slip = slip - contacts.normal * dot(contacts.normal, slip)
         trial = forces.friction - contacts.real * slip / torch.where(contacts.real > 0, softness[1], 1.0)
         return Forces(normal, rub(trial, normal, values["mu_s"], values["mu_k"]))
+
+
+def _skew(r: Tensor) -> Tensor:
+    """Return the matrices of r x, shape (..., 3, 3)."""
+    x, y, z = r.unbind(-1)
+    none = torch.zeros_like(x)
+    return torch.stack([none, -z, y, z, none, -x, -y, x, none], -1).unflatten(-1, (3, 3))
 
 
 def _softness(

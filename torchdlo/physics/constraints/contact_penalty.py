@@ -1,8 +1,10 @@
-"""Contact of ropes with surfaces inside of an implicit step: a stiff law of its end, solved with the lengths.
+"""Contact of ropes with surfaces and ropes inside of an implicit step: a stiff law of its end, solved with the lengths.
 
 At each point of an edge that may touch, with m by how much it misses where it has to be at the end of the step, the
 normal force is k/2 (m + sqrt(m^2 + w^2)), a spring that is rounded over a length w much smaller than the radius, less
-its value 100 w outside of contact, where it ends. Friction is mu f s / sqrt(s^2 + (mu f / k)^2) against the slip s:
+its value 100 w outside of contact, where it ends. That is times 1 - tanh(s / s0), s by how much the point parts more
+than it is asked to and s0 the way at the speed sqrt(g r / 3): surfaces take energy out of what leaves them, and things
+come to rest. Friction is mu f s / sqrt(s^2 + (mu f / k)^2) against the slip s:
 never more than Coulomb allows, and opposed to the slip at the end of the step, so that it takes energy away. Forces
 and their derivatives by the displacements of the ends of the edge and of the body are exact; surfaces are taken as
 they are, to first order, at the start of the step.
@@ -25,6 +27,60 @@ ROUND = 1 / 300
 """Length over which contacts set in, over the radius."""
 FAR = 100.0
 """Distance at which they begin to be felt, over that length."""
+_G = 9.81
+
+
+@tree.struct
+class Pairs:
+    """Pairs of edges of ropes that may touch, K of them."""
+
+    at: Tensor
+    """Their four corners, see `corners` in `physics.linalg.gather_scatter` [1], shape (..., 4, K)."""
+    real: Tensor
+    """1 for pairs, 0 where the list has room left [1], shape (..., K, 1)."""
+    normal: Tensor
+    """Unit vectors from the second edge to the first [1], shape (..., K, 3)."""
+    radius: Tensor
+    """Mean radius of the two edges [m], shape (..., K, 1)."""
+    wanted: Tensor
+    """By how much they have to part at least [m], shape (..., K, 1)."""
+    mu: Tensor
+    """Coefficients of friction [1], shape (..., K, 1)."""
+    linear: tuple[Tensor, Tensor, Tensor, Tensor]
+    """How they move against each other with their corners [1], shape (..., K, 3, 3) each."""
+
+
+@dataclass(frozen=True)
+class PairsFelt:
+    """What pairs do at some displacements, times `scale`."""
+
+    forces: tuple[Tensor, Tensor, Tensor, Tensor]
+    """Forces on their corners [N s^2], shape (..., K, 3) each."""
+    parts: tuple[Tensor, ...]
+    """Numbers of pairs [-] that `pair_gradient` reads, shapes (...)."""
+
+
+def feel_pairs(pairs: Pairs, firm: Tensor, ends: tuple[Tensor, ...], dt: float) -> PairsFelt:
+    """Return what pairs do.
+
+    Args:
+        pairs: the pairs.
+        firm: their stiffness, times `scale` [kg], shape (..., K, 1).
+        ends: displacements of their corners since the start of the step [m], shape (..., K, 3) each.
+        dt: substep [s].
+    """
+    n = pairs.normal
+    moved = sum(_times(m, y) for m, y in zip(pairs.linear, ends, strict=True))
+    along = dot(n, moved)
+    slip = moved - n * along
+    normal, drag, parts = _law(pairs.wanted, along, slip, firm, pairs.radius, pairs.mu, pairs.real, dt)
+    force = normal * n - drag * slip
+    return PairsFelt(tuple(_times(m.mT, force) for m in pairs.linear), parts)
+
+
+def pair_gradient(pairs: Pairs, felt: PairsFelt, exact: bool) -> Tensor:
+    """Return how the force between the edges of pairs falls with their motion, times `scale`, shape (..., K, 3, 3)."""
+    return _gradient(pairs.normal, pairs.mu, felt.parts, exact)
 
 
 @tree.struct
@@ -61,6 +117,14 @@ class Touch:
     def spread(self, wrench: Tensor) -> tuple[Tensor, Tensor]:
         """Return forces and torques on the bodies of the scene, (..., K, 3) each, of those on the free ones."""
         return (self.place @ wrench).split(3, -1)
+
+
+def untouched(like: Tensor) -> Touch:
+    """Return that no bodies are there; vertices are (..., V, 3)."""
+    v = like.shape[-2]
+    widths = (1, 1, 3, 3, 1, 1, 1, 3, 1, 3)
+    none = (like.new_zeros(0, v, width) for width in widths)
+    return Touch(*none, like.new_zeros(0, 0), like.new_zeros(0, 6, 6), like.new_zeros(1, 0))
 
 
 @dataclass(frozen=True)
@@ -126,7 +190,13 @@ def maps(touch: Touch) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def feel(
-    topology: Topology, touch: Touch, linear: tuple[Tensor, Tensor, Tensor], firm: Tensor, y: Tensor, q: Tensor
+    topology: Topology,
+    touch: Touch,
+    linear: tuple[Tensor, Tensor, Tensor],
+    firm: Tensor,
+    y: Tensor,
+    q: Tensor,
+    dt: float,
 ) -> Felt:
     """Return what contact does.
 
@@ -137,6 +207,7 @@ def feel(
         firm: stiffness of points, times `scale` [kg], shape (..., F, V, 1).
         y: displacements of vertices since the start of the step [m], shape (..., V, 3).
         q: displacements and turns of free bodies by contact [m, rad], shape (..., J, 6).
+        dt: substep [s].
     """
     first, second, body = linear
     n = touch.normal
@@ -146,33 +217,50 @@ def feel(
         moved = moved + _times(body, torch.einsum("fj,...jc->...fc", touch.of, q).unsqueeze(-2))
     along = dot(n, moved)
     slip = moved - n * along
-    miss, width = touch.wanted - along, ROUND * touch.radius
-    root = (miss.square() + width.square()).sqrt()
-    push = 0.5 * (miss + root) - 0.5 * width * ((1 + FAR**2) ** 0.5 - FAR)
-    on = touch.real * (push > 0)
-    normal, steep = firm * push * on, firm * 0.5 * (1 + miss / root) * on
-    # Rubbing sets in over the slip that a stuck point has.
-    limit = touch.mu * normal
-    little = limit / firm
-    size = (slip.square().sum(-1, keepdim=True) + little.square() + (1e-9 * touch.radius).square()).sqrt()
-    drag = limit / size
+    normal, drag, parts = _law(touch.wanted, along, slip, firm, touch.radius, touch.mu, touch.real, dt)
     force = normal * n - drag * slip
     exerted = preceding(topology, _times(second.mT, force).sum(-3))
     wrench = torch.einsum("...fvi,fj->...ji", _times(body.mT, force), touch.of)
-    return Felt(_times(first.mT, force).sum(-3) + exerted, wrench, (steep, drag, slip / size, little / size))
+    return Felt(_times(first.mT, force).sum(-3) + exerted, wrench, parts)
+
+
+def _law(
+    wanted: Tensor, along: Tensor, slip: Tensor, firm: Tensor, radius: Tensor, mu: Tensor, real: Tensor, dt: float
+) -> tuple[Tensor, Tensor, tuple[Tensor, ...]]:
+    """Return normal forces, friction over the slip, and what `_gradient` reads; shapes of numbers of points (...)."""
+    miss, width = wanted - along, ROUND * radius
+    root = (miss.square() + width.square()).sqrt()
+    push = 0.5 * (miss + root) - 0.5 * width * ((1 + FAR**2) ** 0.5 - FAR)
+    leave = dt * (_G / 3 * radius).sqrt()
+    left = torch.tanh((along - wanted.clamp(min=0.0)) / leave)
+    fade, on = 1 - left, real * (push > 0)
+    normal = firm * push * fade * on
+    steep = firm * (0.5 * (1 + miss / root) * fade + push * (1 - left.square()) / leave) * on
+    # Rubbing sets in over the slip that a stuck point has.
+    limit = mu * normal
+    little = limit / firm
+    size = (slip.square().sum(-1, keepdim=True) + little.square() + (1e-9 * radius).square()).sqrt()
+    drag = limit / size
+    return normal, drag, (steep, drag, slip / size, little / size)
+
+
+def _gradient(n: Tensor, mu: Tensor, parts: tuple[Tensor, ...], exact: bool) -> Tensor:
+    """Return how forces fall with motions, (..., 3, 3); without the turning of friction unless `exact`."""
+    steep, drag, ahead, stuck = parts
+    unit = torch.eye(3, dtype=n.dtype, device=n.device)
+    gradient = _column(steep) * _outer(n, n) + _column(drag) * (unit - _outer(n, n))
+    if exact:
+        gradient = gradient - _column(drag) * _outer(ahead, ahead)
+        gradient = gradient - _column(mu * steep * (1 - stuck.square())) * _outer(ahead, n)
+    return gradient
 
 
 def gradients(
     topology: Topology, touch: Touch, linear: tuple[Tensor, Tensor, Tensor], felt: Felt, exact: bool
 ) -> ContactGradients:
     """Return how that falls; without the turning of friction unless `exact`, which is safer far from the solution."""
-    steep, drag, ahead, stuck = felt.parts
-    n, of = touch.normal, touch.of
-    unit = torch.eye(3, dtype=n.dtype, device=n.device)
-    gradient = _column(steep) * _outer(n, n) + _column(drag) * (unit - _outer(n, n))
-    if exact:
-        gradient = gradient - _column(drag) * _outer(ahead, ahead)
-        gradient = gradient - _column(touch.mu * steep * (1 - stuck.square())) * _outer(ahead, n)
+    of = touch.of
+    gradient = _gradient(touch.normal, touch.mu, felt.parts, exact)
     a, b, c = linear
     ka, kb, kc = gradient @ a, gradient @ b, gradient @ c
     ending = (b.mT @ kb).sum(-4)

@@ -15,7 +15,7 @@ from torchdlo.physics.rod.kinematics import RodParams, View
 from torchdlo.physics.rod.topology import Topology
 
 if TYPE_CHECKING:
-    from torchdlo.physics.constraints.contact_penalty import Touch
+    from torchdlo.physics.constraints.contact_penalty import Pairs, Touch
     from torchdlo.physics.effects.measurement import Track
 
 KINDS = ("force", "material", "boundary", "measurement")
@@ -205,8 +205,10 @@ class Effect(ABC):
         """Return what the broad phase had no room for [1] and by how much it was outrun [m], shape (..., 1, 2)."""
         return pos.new_zeros(1, 2)
 
-    def engage(self, view: View, motion: PredictedMotion, values: Values) -> Touch:
-        """Return the points that may touch in an implicit substep, whose forces are found with the lengths."""
+    def engage(self, view: View, motion: PredictedMotion, values: Values) -> Touch | Pairs:
+        """Return the points on bodies, or the pairs of edges, that may touch in an implicit substep.
+
+        Their forces are found with the lengths."""
         raise NotImplementedError
 
     def solve_contact(self, view: View, motion: PredictedMotion, values: Values) -> Tensor | ContactForces:

@@ -2,7 +2,8 @@
 
 The equations are those of `edge_lengths.balance` with the forces of `contact_penalty` among them. Points on fixed and
 driven surfaces fill blocks of 3 x 3 on and beside the diagonal, within the band that bending needs; free bodies add a
-border of six unknowns each, which their Schur complement takes out. Newton's method runs without graph until each scene
+border of six unknowns each, which their Schur complement takes out; pairs of edges that touch add three each, which
+`linalg.low_rank` takes out by Woodbury's formula. Newton's method runs without graph until each scene
 is solved; scenes that are not are tried again with softer contact. One more step, with graph, gives the derivative of
 the implicit function theorem, and what is left of the equations is reported.
 """
@@ -18,9 +19,11 @@ from torch import Tensor
 
 from torchdlo.physics import tree
 from torchdlo.physics.constraints import contact_penalty as penalty
-from torchdlo.physics.constraints.contact_penalty import HARD, Touch
+from torchdlo.physics.constraints.contact_penalty import HARD, Pairs, Touch
 from torchdlo.physics.constraints.edge_lengths import Inertia, Lengths, System, saddle_order
-from torchdlo.physics.linalg import banded
+from torchdlo.physics.integrators import contact_kernel
+from torchdlo.physics.kernels import lanes
+from torchdlo.physics.linalg import banded, gather_scatter, low_rank
 from torchdlo.physics.linalg.numerics import dot
 from torchdlo.physics.rod.topology import Topology, following, parse, preceding
 
@@ -54,6 +57,10 @@ class Touching:
     touch: Touch
     origin: Tensor
     """Positions at the start of the substep [m], shape (..., V, 3)."""
+    pairs: Pairs | None
+    """Edges of ropes that may touch each other."""
+    dt: float
+    """Substep [s]."""
 
     def firm(self, tension: Tensor, hard: Tensor) -> Tensor:
         """Return the stiffness of points times `scale` [kg], (..., 1, V, 1), for a hardness (..., 1, 1)."""
@@ -67,6 +74,17 @@ class Touching:
         least = torch.where(least < torch.inf, least, mass)
         return (hard * least).unsqueeze(-3)
 
+    def feel_pairs(self, pos: Tensor, firm: Tensor) -> tuple[Tensor | float, penalty.PairsFelt | None]:
+        """Return what pairs exert on vertices at positions, times `scale` [N s^2], (..., V, 3), and what they feel."""
+        if self.pairs is None:
+            return 0.0, None
+        at, size = self.pairs.at, self.system.lengths.topology.size
+        one, _, other, _ = gather_scatter.pick(firm.squeeze(-3), at)
+        felt = penalty.feel_pairs(
+            self.pairs, torch.minimum(one, other), gather_scatter.pick(pos - self.origin, at), self.dt
+        )
+        return gather_scatter.drop(felt.forces, at, size), felt
+
     def newton_step(
         self, now: Unknowns, firm: Tensor, linear: tuple[Tensor, ...], exact: bool
     ) -> tuple[Unknowns, Tensor]:
@@ -74,8 +92,9 @@ class Touching:
         system, lengths, inertia = self.system, self.system.lengths, self.system.inertia
         topology, free, scale, count = lengths.topology, system.free, system.scale, self.touch.of.shape[-1]
         y, push, excess, along, along_start = system.residual(now.pos, now.impulse)
-        felt = penalty.feel(topology, self.touch, linear, firm, now.pos - self.origin, now.bodies)
-        forces = inertia.vertex * y - free * (push + felt.force)
+        felt = penalty.feel(topology, self.touch, linear, firm, now.pos - self.origin, now.bodies, self.dt)
+        between, pairs = self.feel_pairs(now.pos, firm)
+        forces = inertia.vertex * y - free * (push + felt.force + between)
         resist = self.touch.resist * scale.unsqueeze(-1)
         wrenches = (resist @ now.bodies.unsqueeze(-1)).squeeze(-1) - felt.wrench
         batch = torch.broadcast_shapes(forces.shape[:-2], excess.shape[:-2], resist.shape[:-3], firm.shape[:-3])
@@ -104,10 +123,11 @@ class Touching:
                 active * along,
                 -active * (lengths.compliance + soft) / scale + (active - 1),
             )
+            rank = None if pairs is None else self._rank(batch, pairs, exact)
             answer, row, schur = _bordered(
-                batch, entries, free.unsqueeze(-1) * gradient.border, gradient, resist, topology
+                batch, entries, rank, free.unsqueeze(-1) * gradient.border, gradient, resist, topology
             )
-        step = banded.solve(entries, -_stacked(batch, forces, excess), f"touching:{topology.name}")
+        step = _solve(entries, rank, -_stacked(batch, forces, excess), topology)
         bodies = now.bodies.expand(*batch, count, 6)
         turned = torch.zeros_like(bodies)
         if count:
@@ -124,14 +144,36 @@ class Touching:
             most = dot(turn, turn).amax(-2, keepdim=True).sqrt()
             short = (1 / most.clamp(min=1e-9)).clamp(max=1.0)
             sizes = (inertia.vertex * y, scale * system.force, felt.force, now.impulse * along_start)
+            sizes = sizes if pairs is None else (*sizes, between)
+            # Far from contact and loads, what is left is small beside the momentum.
+            carried = 1e-3 * (system.moved - self.origin) + 1e-9 * lengths.rest
+            sizes = (*sizes, inertia.vertex * carried)
             left = _left(forces, sizes, excess, lengths.rest).expand(*batch, 1, 1)
         return Unknowns(now.pos + short * change, now.impulse + short * pull, bodies + short * turned), left
+
+    def _rank(self, batch: tuple[int, ...], felt: penalty.PairsFelt, exact: bool) -> low_rank.LowRank:
+        """Return what pairs add to the matrix."""
+        pairs = self.pairs
+        assert pairs is not None
+        gradient = penalty.pair_gradient(pairs, felt, exact)
+        free = gather_scatter.pick(self.system.free, pairs.at)
+        shape = (*batch, pairs.at.shape[-1])
+
+        def flat(x: Tensor) -> Tensor:
+            return tree.stored(x.flatten(-2).expand(*shape, 9)).reshape(3, 3, shape[-1], -1)
+
+        at = tree.stored(pairs.at.expand(*batch, *pairs.at.shape[-2:])).transpose(0, 1)
+        scenes = pairs.at.shape[:-2].numel()
+        vertex = torch.div(at.reshape(4, shape[-1], -1), scenes, rounding_mode="floor")
+        left = torch.stack([flat(f.unsqueeze(-1) * m.mT) for f, m in zip(free, pairs.linear, strict=True)])
+        right = torch.stack([flat(gradient @ m) for m in pairs.linear])
+        return low_rank.LowRank(vertex.contiguous(), left, right)
 
     def start(self, tension: Tensor) -> Unknowns:
         """Return the first guess: no forces but the last tensions."""
         system, count = self.system, self.touch.of.shape[-1]
-        parts = (system.moved, tension, self.touch.resist.new_zeros(1, 1), self.touch.wanted[..., 0, :, :])
-        batch = torch.broadcast_shapes(*(x.shape[:-2] for x in parts))
+        parts = [system.moved.shape[:-2], tension.shape[:-2], self.touch.wanted.shape[:-3]]
+        batch = torch.broadcast_shapes(*parts, *([] if self.pairs is None else [self.pairs.at.shape[:-2]]))
         impulse = (system.lengths.guess(tension) * system.scale).detach()
         return Unknowns(
             system.moved.detach().expand(*batch, *system.moved.shape[-2:]),
@@ -150,6 +192,7 @@ def _left(forces: Tensor, sizes: tuple[Tensor, ...], excess: Tensor, rest: Tenso
 def _bordered(
     batch: tuple[int, ...],
     entries: Tensor,
+    rank: low_rank.LowRank | None,
     border: Tensor,
     gradient: penalty.ContactGradients,
     resist: Tensor,
@@ -161,11 +204,17 @@ def _bordered(
         return border, border, border
     border = border.expand(*batch, v, 3, count).permute(-2, -3, -1, *range(len(batch))).reshape(3 * v, -1)
     border = torch.cat([border, border.new_zeros(v, border.shape[1])])
-    answer = banded.solve(entries.repeat(1, count), border, f"touching:{topology.name}")
+    many = None if rank is None else rank.repeat(count)
+    answer = _solve(entries.repeat(1, count), many, border, topology)
     answer = answer.reshape(4 * v, count, -1).permute(2, 0, 1)
     row = gradient.back.expand(*batch, v, count, 3).permute(*range(len(batch)), -2, -1, -3).reshape(-1, count, 3 * v)
     own = (penalty.blocks(resist) + gradient.corner).expand(*batch, count, count).reshape(-1, count, count)
     return answer, row, own - row @ answer[:, : 3 * v]
+
+
+def _solve(entries: Tensor, rank: low_rank.LowRank | None, rhs: Tensor, topology: Topology) -> Tensor:
+    name = f"touching:{topology.name}"
+    return banded.solve(entries, rhs, name) if rank is None else low_rank.solve(entries, rank, rhs, name)
 
 
 def _stacked(batch: tuple[int, ...], *parts: Tensor) -> Tensor:
@@ -192,6 +241,8 @@ def solve(touching: Touching, tension: Tensor) -> tuple[Tensor, Tensor, Tensor, 
         share of the forces that is not in balance, shape (..., 1, 1).
     """
     system = touching.system
+    if lanes.ready(system.force) and contact_kernel.available(system.force):
+        return tuple(_searched(touching, tension, True)[4:])
     with torch.no_grad():
         pos, found, bodies, hard = _searched(touching, tension)
     firm = touching.firm(tension, hard)
@@ -199,33 +250,60 @@ def solve(touching: Touching, tension: Tensor) -> tuple[Tensor, Tensor, Tensor, 
     pos = torch.where(system.free > 0, pos, system.moved)
     now, _ = touching.newton_step(Unknowns(pos, found * system.scale, bodies), firm, linear, True)
     topology, scale = system.lengths.topology, system.scale
-    felt = penalty.feel(topology, touching.touch, linear, firm, now.pos - touching.origin, now.bodies)
+    felt = penalty.feel(topology, touching.touch, linear, firm, now.pos - touching.origin, now.bodies, touching.dt)
+    exerted = felt.force + touching.feel_pairs(now.pos, firm)[0]
     push = system.residual(now.pos, now.impulse)[1]
     with torch.no_grad():
         still = tree.detach((now.pos, now.impulse, now.bodies))
         _, left = touching.newton_step(Unknowns(*still), firm, tuple(x.detach() for x in linear), True)
     wrench = (touching.touch.resist @ now.bodies.unsqueeze(-1)).squeeze(-1)
-    return now.pos, now.impulse / scale, (push + felt.force) / scale, felt.force / scale, wrench, left
+    return now.pos, now.impulse / scale, (push + exerted) / scale, exerted / scale, wrench, left
 
 
-def _searched(touching: Touching, tension: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def _searched(touching: Touching, tension: Tensor, whole: bool = False) -> tuple[Tensor, ...]:
     system = touching.system
     inputs, law = system.inputs(tension)
     parts = [getattr(touching.touch, name) for name in _FIELDS]
-    found = torch.ops.torchdlo.engaged(inputs, parts, touching.origin, system.lengths.topology.name, law)
-    return tuple(found)
+    pairs = [] if touching.pairs is None else tree.leaves(touching.pairs)
+    law = [*law, touching.dt]
+    operator = torch.ops.torchdlo.engaged_whole if whole else torch.ops.torchdlo.engaged
+    return tuple(operator(inputs, parts, pairs, touching.origin, system.lengths.topology.name, law))
 
 
-def _engaged(
-    inputs: list[Tensor], parts: list[Tensor], origin: Tensor, topology: str, law: list[float]
-) -> list[Tensor]:
-    """Return positions, tensions, displacements of bodies, and how hard contact was."""
+def _equations(
+    inputs: list[Tensor], parts: list[Tensor], pairs: list[Tensor], origin: Tensor, topology: str, law: list[float]
+) -> tuple[Touching, Tensor]:
     rest, compliance, active, mask, give, hinge, swing, free, tension, vertex, moved, *others, scale = inputs
     lengths = Lengths(parse(topology), rest, compliance, active, mask, give, *law[1:3])
     system = System(
         lengths, Inertia(vertex, hinge, rest, mask, swing), moved, free, others[0], scale, *others[1:], law[0]
     )
-    touching = Touching(system, Touch(*parts), origin)
+    between = Pairs(*pairs[:6], tuple(pairs[6:])) if pairs else None
+    return Touching(system, Touch(*parts), origin, between, law[-1]), tension
+
+
+def _by_kernel(*given) -> list[Tensor]:
+    touching, tension = _equations(*given)
+    others = touching.touch, touching.pairs, touching.origin, touching.dt
+    return contact_kernel.solve(touching.system, tension, *others, TRIES, _solved(tension))
+
+
+def _whole(*given) -> list[Tensor]:
+    return [x.contiguous() for x in _by_kernel(*given)]
+
+
+def _engaged(
+    inputs: list[Tensor], parts: list[Tensor], pairs: list[Tensor], origin: Tensor, topology: str, law: list[float]
+) -> list[Tensor]:
+    """Return positions, tensions, displacements of bodies, and how hard contact was."""
+    if contact_kernel.available(origin):
+        return [x.contiguous() for x in _by_kernel(inputs, parts, pairs, origin, topology, law)[:4]]
+    return _by_tensors(*_equations(inputs, parts, pairs, origin, topology, law))
+
+
+def _by_tensors(touching: Touching, tension: Tensor) -> list[Tensor]:
+    """Return what `_engaged` does, by tensor operations."""
+    system = touching.system
     linear = penalty.maps(touching.touch)
     first = touching.start(tension)
     found = best = first
@@ -253,7 +331,7 @@ def _engaged(
     # What stays unsolved ends where least was left, not where the last step happened to go.
     lost = open & (least < torch.inf)
     found, chosen = _chosen(lost, best, found), torch.where(lost, kept, chosen)
-    return [x.contiguous() for x in (found.pos, found.impulse / scale, found.bodies, chosen)]
+    return [x.contiguous() for x in (found.pos, found.impulse / system.scale, found.bodies, chosen)]
 
 
 def _chosen(condition: Tensor, one: Unknowns, other: Unknowns) -> Unknowns:
@@ -262,20 +340,30 @@ def _chosen(condition: Tensor, one: Unknowns, other: Unknowns) -> Unknowns:
 
 
 def _engaged_meta(
-    inputs: list[Tensor], parts: list[Tensor], origin: Tensor, topology: str, law: list[float]
+    inputs: list[Tensor], parts: list[Tensor], pairs: list[Tensor], origin: Tensor, topology: str, law: list[float]
 ) -> list[Tensor]:
     tension, moved, wanted, of = inputs[8], inputs[10], parts[_FIELDS.index("wanted")], parts[_FIELDS.index("of")]
-    batch = torch.broadcast_shapes(moved.shape[:-2], tension.shape[:-2], wanted.shape[:-3])
+    batch = torch.broadcast_shapes(
+        moved.shape[:-2], tension.shape[:-2], wanted.shape[:-3], *(x.shape[:-2] for x in pairs[:1])
+    )
     like = moved.new_empty
     v = parse(topology).size
     return [like(*batch, v, 3), like(*batch, v, 1), like(*batch, of.shape[-1], 6), like(*batch, 1, 1)]
 
 
+def _whole_meta(*given) -> list[Tensor]:
+    pos, tension, bodies, hard = _engaged_meta(*given)
+    later = (pos, tension, pos, pos, bodies, hard)
+    return [pos, tension, bodies, hard, *(torch.empty_like(x) for x in later)]
+
+
+_ARGUMENTS = "Tensor[] inputs, Tensor[] parts, Tensor[] pairs, Tensor origin, str topology, float[] law"
 _operators = torch.library.Library("torchdlo", "FRAGMENT")
-_operators.define("engaged(Tensor[] inputs, Tensor[] parts, Tensor origin, str topology, float[] law) -> Tensor[]")
-for _device in ("CPU", "CUDA"):
-    _operators.impl("engaged", _engaged, _device)
-_operators.impl("engaged", _engaged_meta, "Meta")
+for _name, _run, _shapes in (("engaged", _engaged, _engaged_meta), ("engaged_whole", _whole, _whole_meta)):
+    _operators.define(f"{_name}({_ARGUMENTS}) -> Tensor[]")
+    for _device in ("CPU", "CUDA"):
+        _operators.impl(_name, _run, _device)
+    _operators.impl(_name, _shapes, "Meta")
 
 
 def _pattern(name: str) -> banded.Pattern:

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from torchdlo.physics import tree
-from torchdlo.physics.constraints.contact_penalty import Touch
+from torchdlo.physics.constraints.contact_penalty import Pairs, Touch, untouched
 from torchdlo.physics.constraints.edge_lengths import Inertia, Lengths, System, balance, project, solve_slots
 from torchdlo.physics.effects import base as effect
 from torchdlo.physics.effects.base import ContactForces, Effect, PredictedMotion, Values
@@ -226,9 +226,9 @@ def _answered(
         if engaged:
             change = aimed - now.state.pos + answer * total.force
             motion = PredictedMotion(change, mobility, answer, bodies and bodies.pushed(total), material_points)
-            points = engaged[0].engage(now, motion, values[engaged[0].name])
-            pos, tension, held, push = _translate(settings, now, loads, pushed, targets, tension, points)
-            pushes[engaged[0].name] = push
+            found = [e.engage(now, motion, values[e.name]) for e in engaged]
+            pos, tension, held, push = _translate(settings, now, loads, pushed, targets, tension, found)
+            pushes["in the solve"] = push
             total = total.plus(push)
         else:
             pos, tension, held = _translate(settings, now, loads, pushed, targets, tension)
@@ -243,11 +243,11 @@ def _translate(
     kick: _Kick,
     targets: Targets,
     tension: Tensor,
-    touch: Touch | None = None,
+    touch: Sequence[Touch | Pairs] = (),
 ) -> tuple[Any, ...]:
     """Return positions after the substep, tensions, whose first guess is given, and the force with them [N].
 
-    With points that may touch, also return what these exert.
+    With points and pairs of edges that may touch, also return what these exert.
     """
     topology, dt, state = settings.topology, settings.dt, now.state
     rest, material, free = now.params.rest, now.params.material, kick.free
@@ -285,7 +285,7 @@ def _balance(
     kick: _Kick,
     moved: Tensor,
     tension: Tensor,
-    touch: Touch | None,
+    touch: Sequence[Touch | Pairs],
 ) -> tuple[Any, ...]:
     """Return what `_translate` does for an implicit substep; arguments as in `constrain.balance`."""
     topology, dt, rest, vertex = settings.topology, settings.dt, now.params.rest, kick.vertex
@@ -306,11 +306,13 @@ def _balance(
     scale = kick.scale.expand_as(now.length[..., :1, :])
     if inertia.turning is not None:  # held vertices do not move freely either
         force = force - inertia.swing(topology, (1 - kick.free) * (moved - kick.drift)) / scale
-    if touch is not None:
+    if touch:
+        pairs = next((x for x in touch if isinstance(x, Pairs)), None)
+        points = next((x for x in touch if isinstance(x, Touch)), None) or untouched(now.state.pos)
         system = System(lengths, inertia, moved, kick.free, force, scale, now.tangent, ahead, share)
-        touching = contact_step.Touching(system, touch, now.state.pos)
+        touching = contact_step.Touching(system, points, now.state.pos, pairs, dt)
         pos, tension, whole, exerted, wrench, left = contact_step.solve(touching, tension)
-        return pos, tension, whole, ContactForces(exerted, *touch.spread(wrench), unsolved=left)
+        return pos, tension, whole, ContactForces(exerted, *points.spread(wrench), unsolved=left)
     return balance(
         lengths,
         inertia,

@@ -53,7 +53,8 @@ class Rope:
     rest: Literal["straight", "as_placed"] | Tensor = "straight"
     """Undeformed shape: straight, as placed, or vertex positions (..., n, 3) of it [m]."""
     rest_curvature: Tensor | None = None
-    """Natural curvature about the two material directors, in place of `rest`'s [1/m], shape (..., n, 2)."""
+    """Natural curvature towards the first and towards the second material director [1/m], in place of `rest`'s, shape
+    (..., n, 2)."""
     rest_twist: Number | None = None
     """Natural twist, in place of `rest`'s [rad/m]."""
     velocities: Tensor | None = None
@@ -63,7 +64,7 @@ class Rope:
     rest_director: Tensor | None = None
     """The same in the rest shape [1], shape (..., 3); `director` if not given."""
     bend2: Number | None = None
-    """Bending stiffness [N m^2] about the second material director if it differs from `bend`."""
+    """Bending stiffness [N m^2] against bending towards the second material director if it differs from `bend`."""
 
 
 def bishop(topology: Topology, pos: Tensor, edge_mask: Tensor, first: Sequence[Tensor | None]) -> Tensor:

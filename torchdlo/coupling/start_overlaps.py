@@ -1,0 +1,272 @@
+"""Ropes that start inside of bodies, or of ropes: moved out before the first step, without any speed.
+
+A step that parted them would leave them the speed with which it did. Here ropes that nothing holds move as they are,
+out of what they are deepest in, until nothing overlaps. Where that does not part them, vertices move, each by the mean
+of what its points need, and edges get their lengths back, and so on. What cannot be parted like that, or would be bent
+so much that it jumps, such as a rope that is held on both sides of a solid, is refused.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchdlo import notices
+from torchdlo.coupling.bodies.dynamics import Body, BodyParams, BodyState, PredictedBodyMotion
+from torchdlo.coupling.bodies.segment_distance import families, find
+from torchdlo.coupling.rod_contact.broad_phase import near_pairs
+from torchdlo.coupling.rod_contact.closest_points import closest
+from torchdlo.physics import tree
+from torchdlo.physics.constraints.edge_lengths import Lengths, settle
+from torchdlo.physics.effects.base import Effect
+from torchdlo.physics.linalg.numerics import cross, safe_norm
+from torchdlo.physics.rod import kinematics as rod
+from torchdlo.physics.rod.kinematics import RodParams, RodState
+from torchdlo.physics.rod.topology import Topology, following
+
+SHALLOW = 0.1
+"""Overlap over the radius up to which steps part things slowly by themselves: it is left as it is."""
+_DONE = 1e-3
+"""Overlap over the radius at which things have parted."""
+_ROUNDS = 200
+_SLIDES = 50
+_G = 9.81
+"""Ropes may be bent by what lifts them by their radius at this acceleration [m/s^2], and no more."""
+
+
+@dataclass(frozen=True)
+class _Overlaps:
+    """What is too deep: one entry for each end of each edge that has to move."""
+
+    slot: Tensor
+    """First vertices of the edges [1], shape (..., N)."""
+    share: Tensor
+    """Where along them, 0 to 1 [1], shape (..., N)."""
+    depth: Tensor
+    """By how much they overlap, 0 or less if they do not [m], shape (..., N)."""
+    out: Tensor
+    """In which direction they part [1], shape (..., N, 3)."""
+    part: Tensor
+    """Which share of it they have to go themselves [1], shape (..., N)."""
+    other: Tensor
+    """With which body they overlap, or -1 - k for the rope of slot k [1], shape (..., N)."""
+    radius: Tensor
+    """Radius of the edges [m], shape (..., N)."""
+
+
+def _column(x: Tensor, slot: Tensor) -> Tensor:
+    return torch.gather(x.expand(*slot.shape[:-1], x.shape[-1]), -1, slot)
+
+
+def _among_bodies(view: rod.View, bodies: PredictedBodyMotion, pieces: int) -> _Overlaps:
+    at = find(view, bodies, pieces)
+    shape = at.share.shape[:-1]
+    radius = view.params.material.radius[..., 0].unsqueeze(-2).expand(shape)
+    slots = torch.arange(shape[-1], device=radius.device).expand(shape)
+    real = (view.params.rest.edge_mask[..., 0] > 0).expand(shape)
+    depth = torch.where(real, radius - at.distance[..., 0], -1.0)
+    which = [k for k, body in enumerate(bodies.bodies) for _ in range(families(body, pieces))]
+    other = torch.tensor(which, device=radius.device)[:, None].expand(shape)
+    flat = (x.flatten(-2) for x in (slots, at.share[..., 0], depth))
+    return _Overlaps(*flat, at.normal.flatten(-3, -2), torch.ones_like(depth).flatten(-2), other.flatten(-2),
+                     radius.flatten(-2))  # fmt: skip
+
+
+def _among_ropes(view: rod.View, free: Tensor) -> _Overlaps:
+    topology, pos = view.topology, view.state.pos
+    reach = pos.new_zeros(*pos.shape[:-2], 1, 1)
+    first, second, there, _ = near_pairs(topology, view.params, pos, reach, max(64, 8 * topology.size), 64)
+    after = following(topology, pos)
+
+    def points(x: Tensor, slot: Tensor) -> Tensor:
+        return torch.gather(x, -2, slot.unsqueeze(-1).expand(*slot.shape, 3))
+
+    a, b = (points(pos, first), points(after, first)), (points(pos, second), points(after, second))
+    s, t = closest(a, b)
+    between = a[0] + s * (a[1] - a[0]) - b[0] - t * (b[1] - b[0])
+    distance = safe_norm(between)
+    radius = view.params.material.radius[..., 0]
+    thick = _column(radius, first) + _column(radius, second)
+    across = cross(a[1] - a[0], b[1] - b[0])  # where centrelines meet
+    out = torch.where(distance > 0.01 * thick.unsqueeze(-1), between, across)
+    out = out / safe_norm(out).clamp(min=1e-30)
+    depth = torch.where(there > 0, thick - distance[..., 0], -1.0)
+    mobile = torch.maximum(free, following(topology, free))[..., 0]
+    one, two = _column(mobile, first), _column(mobile, second)
+    share = one / (one + two).clamp(min=1e-9), two / (one + two).clamp(min=1e-9)
+    both = (
+        (first, second), (s[..., 0], t[..., 0]), (depth, depth), (out, -out), share, (-1 - second, -1 - first),
+        (_column(radius, first), _column(radius, second)),
+    )  # fmt: skip
+    return _Overlaps(*(torch.cat(x, -2 if x[0].dim() > depth.dim() else -1) for x in both))
+
+
+def _joined(parts: Sequence[_Overlaps]) -> _Overlaps:
+    names = ("slot", "share", "depth", "out", "part", "other", "radius")
+    joined = []
+    for name in names:
+        xs = [getattr(p, name) for p in parts]
+        axes = 2 if name == "out" else 1
+        batch = torch.broadcast_shapes(*(x.shape[:-axes] for x in xs))
+        joined.append(torch.cat([x.expand(*batch, *x.shape[-axes:]) for x in xs], -axes))
+    return _Overlaps(*joined)
+
+
+def _shift(topology: Topology, found: _Overlaps) -> Tensor:
+    """Return by how much vertices move out [m], shape (..., V, 3)."""
+    after = torch.tensor(topology.successor(), device=found.slot.device)
+    active = (found.depth > 0).to(found.depth.dtype)
+    wish = (found.depth * found.part * active).unsqueeze(-1) * found.out
+    weights = torch.cat([(1 - found.share) * active, found.share * active], -1)
+    slots = torch.cat([found.slot, after[found.slot]], -1)
+    whole = torch.zeros(*weights.shape[:-1], topology.size, 4, dtype=wish.dtype, device=wish.device)
+    rows = torch.cat([weights.unsqueeze(-1) * torch.cat([wish, wish], -2), weights.unsqueeze(-1)], -1)
+    whole = whole.scatter_add(-2, slots.unsqueeze(-1).expand(rows.shape), rows)
+    return whole[..., :3] / whole[..., 3:].clamp(min=1e-12)
+
+
+def _slide(topology: Topology, found: _Overlaps, free: Tensor) -> Tensor:
+    """Return by how much ropes that nothing holds move out of what they are deepest in [m], shape (..., V, 3)."""
+    parts = []
+    for start, count in zip(topology.starts, topology.counts, strict=True):
+        loose = bool((free[start : start + count] > 0).all())
+        own = (found.slot >= start) & (found.slot < start + count)
+        depth, at = torch.where(own, found.depth, -1.0).max(-1, keepdim=True)
+        out = torch.take_along_dim(found.out, at.unsqueeze(-1), -2)
+        # Where two ropes part, the one that is held does not.
+        share = torch.take_along_dim(found.part, at, -1)
+        way = (depth.clamp(min=0.0) * share).unsqueeze(-1) * out * float(loose)
+        parts.append(way.expand(*way.shape[:-2], count, 3))
+    return torch.cat(parts, -2)
+
+
+def _bent(topology: Topology, rods: RodParams, state: RodState, pos: Tensor) -> bool:
+    """Return whether a rope was bent by more energy than lifts it by its radius."""
+    before, now = (rod.view(topology, rods, tree.replace(state, pos=x), 1.0) for x in (state.pos, pos))
+    turned = (now.binormal() - before.binormal()).square().sum(-1, keepdim=True)
+    work = 0.5 * rods.material.bend[..., :1] / now.hinge_length * turned * rods.rest.hinge_mask
+    lift = _G * rods.material.mass * rods.material.radius
+    batch = torch.broadcast_shapes(work.shape[:-2], lift.shape[:-2])
+    work, lift = (x.expand(*batch, topology.size, 1) for x in (work, lift))
+    return any(
+        bool((work[..., k : k + n, 0].sum(-1) > lift[..., k : k + n, 0].sum(-1)).any())
+        for k, n in zip(topology.starts, topology.counts, strict=True)
+    )
+
+
+def part(
+    topology: Topology,
+    effects: Sequence[Effect],
+    rods: RodParams,
+    state: RodState,
+    bodies: tuple[tuple[Body, ...], BodyParams, BodyState] | None,
+    held: Sequence[int],
+    constrained: bool,
+) -> RodState:
+    """Return the ropes moved out of what they start in, with one notice; the same if they start in nothing.
+
+    Args:
+        topology: the ropes.
+        effects: those of the scene; only what its contacts keep apart is parted.
+        rods: rest shape and material, as effects alter them.
+        state: the ropes.
+        bodies: the bodies with their numbers and states, None if there are none.
+        held: vertices that stay where they are.
+        constrained: whether edges keep their lengths.
+
+    Raises:
+        ValueError: names what overlaps, and by how much, where it could not be parted.
+    """
+    names = {e.name: e for e in effects}
+    touching = "rod_body" in names and bodies is not None, "rod_contact" in names
+    if not any(touching):
+        return state
+    with torch.no_grad():
+        return _part(topology, names, rods, state, bodies, held, constrained)
+
+
+def _part(topology, names, rods, state, bodies, held, constrained) -> RodState:
+    start = state.pos.detach()
+    free = start.new_ones(topology.size, 1)
+    free[list(held)] = 0.0
+    # What is held is where it was put, and so are the edges beside it.
+    mobile = (free * following(topology, free))[..., 0] > 0
+
+    def look(pos: Tensor) -> _Overlaps:
+        view = rod.view(topology, rods, tree.replace(state, pos=pos), 1.0)
+        parts = []
+        if "rod_body" in names and bodies is not None:
+            kinds, params, placed = bodies
+            none = torch.zeros_like(placed.pos)
+            motion = PredictedBodyMotion(kinds, params, placed, 1.0, none, none, none[..., :1], none)
+            parts.append(_among_bodies(view, motion, names["rod_body"].pieces))
+        if "rod_contact" in names:
+            parts.append(_among_ropes(view, free))
+        found = _joined(parts)
+        own = mobile.expand(*found.slot.shape[:-1], -1)
+        depth = torch.where(_column(own, found.slot) > 0, found.depth, -1.0)
+        return _Overlaps(found.slot, found.share, depth, found.out, found.part, found.other, found.radius)
+
+    found = look(start)
+    over = (found.depth / found.radius).amax(-1, keepdim=True)
+    wrong = (over > SHALLOW).unsqueeze(-1)
+    if not bool(wrong.any()):
+        return state
+    deepest, what = _deepest(topology, found, bodies)
+    length = rods.rest.length.detach()
+    active = rods.rest.edge_mask * (1 - (1 - free) * (1 - following(topology, free)))
+    lengths = Lengths(topology, length, torch.zeros_like(length), active, rods.rest.edge_mask)
+    answer = free / rods.material.mass.detach()
+
+    def left(found: _Overlaps) -> Tensor:
+        return (found.depth / found.radius).amax(-1, keepdim=True).unsqueeze(-1)
+
+    def slide(pos: Tensor, found: _Overlaps) -> Tensor:
+        return pos + _slide(topology, found, free)
+
+    def bend(pos: Tensor, found: _Overlaps) -> Tensor:
+        moved = pos + free * _shift(topology, found)
+        return settle(lengths, moved, torch.zeros_like(moved), answer)[0] if constrained else moved
+
+    there, first = start, found
+    for way, rounds in ((slide, _SLIDES), (bend, _ROUNDS)):
+        found = first
+        there = torch.where(wrong, start, there)
+        for _ in range(rounds):
+            there = torch.where(wrong, way(there, found), there)
+            found = look(there)
+            if not bool((wrong & ~(left(found) < _DONE)).any()):
+                break
+        wrong = wrong & ~(left(found) < SHALLOW)
+        if not bool(wrong.any()):
+            break
+    pos = there
+    edge = rod.edge_vectors(topology, pos, rods.rest.edge_mask).norm(dim=-1, keepdim=True)
+    strained = bool(((edge / length - 1) * active).abs().amax() > 1e-4) if constrained else False
+    if bool(wrong.any()) or strained or _bent(topology, rods, state, pos):
+        raise ValueError(
+            f"scene: {what} starts {1e3 * deepest:.3g} mm deep, and cannot be moved out along its normals; place it "
+            "outside, or leave out the effect that keeps them apart"
+        )
+    most = float(safe_norm(pos - start).amax())
+    notices.once(
+        "start overlap",
+        f"scene: {what} starts {1e3 * deepest:.3g} mm deep; it was moved out, without speed, by {1e3 * most:.3g} mm at "
+        "most.",
+    )
+    there = state.pos + (pos - start)
+    view = rod.view(topology, rods, state, 1.0)
+    director, ref_twist = rod.advance_frames(topology, rods, view, there)
+    return tree.replace(state, pos=tree.batch_innermost(there), director=director, ref_twist=ref_twist)
+
+
+def _deepest(topology: Topology, found: _Overlaps, bodies) -> tuple[float, str]:
+    """Return how deep the deepest overlap is [m], and what overlaps there."""
+    at = int(found.depth.argmax())
+    slot, other = (int(x.flatten()[at]) for x in (found.slot, found.other))
+    ropes = [k for k, n in enumerate(topology.counts) for _ in range(n)]
+    it = f"body {bodies[0][other].name!r}" if other >= 0 else f"rope {ropes[-1 - other]}"
+    return float(found.depth.flatten()[at]), f"rope {ropes[slot]} in {it}"

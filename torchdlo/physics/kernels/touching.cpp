@@ -1,0 +1,561 @@
+// One implicit substep of ropes that touch by Newton's method, one scene after the other.
+//
+// The formulas stand in contact_step.py, contact_penalty.py and edge_lengths.py, as tensor operations.
+#include <algorithm>
+#include <cmath>
+#include <cstdint>
+#include <cstring>
+#include <limits>
+#include <vector>
+
+#include "flush.h"
+
+namespace {
+
+struct Sizes {
+  int64_t slots, scenes, families, bodies, pairs, half, tries;
+  const int64_t *after, *of, *steps;  // next slots; body of each family of points or -1; Newton steps of each try
+  const int32_t* order;
+  const double *hardness, *law;  // law: turning, most, least, shift, dt, solved, round, far
+};
+
+// Numbers of a vertex and its edge.
+template <typename T>
+struct Slot {
+  T rest, compliance, active, mask, give, hinge, swing, free, tension;
+  T vertex[3], moved[3], force[3], start[3], lead[3], origin[3], scale;
+};
+template <typename T>
+struct Point {
+  T real, normal[3], radius, wanted, given[3], mu, first[9], second[9], body[18];
+};
+template <typename T>
+struct Pair {
+  T real, normal[3], radius, wanted, mu, corner[4][9];
+};
+
+template <typename T>
+struct Felt {
+  T force[3], gradient[9];
+};
+
+template <typename T>
+void times(const T* m, const T* x, T* y, int columns) {
+  for (int i = 0; i < 3; ++i)
+    for (int j = 0; j < columns; ++j) y[i] += m[columns * i + j] * x[j];
+}
+// y += m^T x
+template <typename T>
+void back(const T* m, const T* x, T* y, int columns) {
+  for (int i = 0; i < 3; ++i)
+    for (int j = 0; j < columns; ++j) y[j] += m[columns * i + j] * x[i];
+}
+
+template <typename T>
+struct State {
+  std::vector<T> pos, impulse, bodies;
+};
+
+template <typename T>
+class Scene {
+ public:
+  explicit Scene(const Sizes& sizes)
+      : s(sizes), v(s.slots), n(4 * v), k(s.half), before(v), rank(n), y(3 * v), begin(3 * v), along(3 * v),
+        push(3 * v), pull(3 * v), turn(3 * v), resist(3 * v), touch(3 * v), between(3 * v), residual(3 * v),
+        excess(v), lean(v), one(v), two(v), same(v), firm(v), least(v), wrench(6 * s.bodies), step(n) {
+    for (int64_t i = 0; i < v; ++i) before[s.after[i]] = i;
+    for (int64_t j = 0; j < n; ++j) rank[s.order[j]] = j;
+  }
+
+  const Slot<T>* slot;
+  const Point<T>* points;
+  const Pair<T>* pairs;
+  const int64_t* corners;  // of pairs
+  const T* inertia;        // how bodies resist displacements, 6 x 6 each
+
+  // Results: positions, tensions, bodies, hardness; then those of an exact step from there: positions, tensions,
+  // forces, forces of contact, wrenches, what is left.
+  void operator()(T* pos, T* tension, T* bodies, T* hard, T* pos2, T* tension2, T* whole, T* exerted, T* held, T* left) {
+    prepare();
+    State<T> first{std::vector<T>(3 * v), std::vector<T>(v), std::vector<T>(6 * s.bodies)}, found, best, now, last;
+    for (int64_t i = 0; i < v; ++i) {
+      for (int c = 0; c < 3; ++c) first.pos[3 * i + c] = slot[i].moved[c];
+      first.impulse[i] = guess(i) * scale;
+    }
+    found = best = first;
+    T chosen = T(s.hardness[0]), kept = chosen, smallest = std::numeric_limits<T>::infinity();
+    bool open = true;
+    for (int64_t t = 0; t < s.tries && open; ++t) {
+      chosen = T(s.hardness[t]);
+      harden(chosen);
+      now = last = first;
+      for (int64_t j = 0; j < s.steps[t]; ++j) {
+        const State<T> here = now;
+        const T rest = newton(now, j >= 2);
+        if (j >= 3 && rest < smallest) best = last, kept = chosen, smallest = rest;
+        last = here;
+        if (rest < T(s.law[5])) {
+          open = false;
+          break;
+        }
+      }
+      found = now;
+    }
+    if (open && smallest < std::numeric_limits<T>::infinity()) found = best, chosen = kept;
+    for (int64_t i = 0; i < v; ++i) {
+      for (int c = 0; c < 3; ++c) pos[c * v + i] = found.pos[3 * i + c];
+      tension[i] = found.impulse[i] / scale;
+    }
+    std::copy(found.bodies.begin(), found.bodies.end(), bodies);
+    *hard = chosen;
+    harden(chosen);
+    for (int64_t i = 0; i < v; ++i)
+      for (int c = 0; c < 3; ++c)
+        if (!(slot[i].free > T(0))) found.pos[3 * i + c] = slot[i].moved[c];
+    newton(found, true);
+    *left = evaluate(found, true, false);
+    for (int64_t i = 0; i < v; ++i) {
+      for (int c = 0; c < 3; ++c) {
+        const T contact = touch[3 * i + c] + between[3 * i + c];
+        pos2[c * v + i] = found.pos[3 * i + c];
+        whole[c * v + i] = (push[3 * i + c] + contact) / scale;
+        exerted[c * v + i] = contact / scale;
+      }
+      tension2[i] = found.impulse[i] / scale;
+    }
+    for (int64_t b = 0; b < s.bodies; ++b)
+      for (int i = 0; i < 6; ++i) {
+        T sum = 0;
+        for (int j = 0; j < 6; ++j) sum += inertia[36 * b + 6 * i + j] * found.bodies[6 * b + j];
+        held[6 * b + i] = sum;
+      }
+  }
+
+ private:
+  T guess(int64_t i) const {
+    const T pressed = -T(s.law[2]) * slot[i].rest / slot[i].give;
+    return slot[i].tension < pressed ? T(0) : slot[i].tension * slot[i].active;
+  }
+
+  void prepare() {
+    scale = slot[0].scale;
+    std::vector<T> mass(v), pulled(v);
+    const auto centre = [&](int64_t i) { return slot[i].mask / slot[i].rest + slot[before[i]].mask / slot[before[i]].rest; };
+    for (int64_t i = 0; i < v; ++i) {
+      const int64_t n = s.after[i], p = before[i];
+      const T after = slot[i].mask / slot[i].rest, next = slot[n].mask / slot[n].rest, last = slot[p].mask / slot[p].rest;
+      one[i] = -slot[i].hinge * centre(i) * after - slot[n].hinge * after * centre(n) - slot[i].swing;
+      two[i] = slot[n].hinge * after * next;
+      same[i] = slot[i].hinge * centre(i) * centre(i) + slot[n].hinge * after * after + slot[p].hinge * last * last +
+                slot[i].swing + slot[p].swing;
+      lean[i] = T(s.law[0]) * slot[i].active / slot[i].rest;
+      pulled[i] = std::max(guess(i) * scale, T(0)) * lean[i];
+    }
+    for (int64_t i = 0; i < v; ++i)
+      mass[i] = std::min({slot[i].vertex[0], slot[i].vertex[1], slot[i].vertex[2]}) + same[i] + pulled[i] + pulled[before[i]];
+    for (int64_t i = 0; i < v; ++i) {
+      const int64_t n = s.after[i];
+      const bool here = slot[i].free > T(0), there = slot[n].free > T(0);
+      least[i] = here && there ? std::min(mass[i], mass[n]) : here ? mass[i] : there ? mass[n] : mass[i];
+    }
+  }
+  void harden(T hard) {
+    for (int64_t i = 0; i < v; ++i) firm[i] = hard * least[i];
+  }
+
+  // Whether it pushes; the force, and how it falls with the motion.
+  bool law(const T* normal, T radius, T wanted, T mu, T stiff, const T* moved, bool exact, Felt<T>& out) const {
+    const T along = normal[0] * moved[0] + normal[1] * moved[1] + normal[2] * moved[2];
+    const T miss = wanted - along, width = T(s.law[6]) * radius, far = T(s.law[7]);
+    const T rooted = std::sqrt(miss * miss + width * width);
+    const T shut = T(0.5) * (miss + rooted) - T(0.5) * width * (std::sqrt(1 + far * far) - far);
+    if (!(shut > T(0))) return false;
+    const T leave = T(s.law[4]) * std::sqrt(T(9.81) / 3 * radius);
+    const T gone = std::tanh((along - std::max(wanted, T(0))) / leave), fade = 1 - gone;
+    const T force = stiff * shut * fade;
+    const T steep = stiff * (T(0.5) * (1 + miss / rooted) * fade + shut * (1 - gone * gone) / leave);
+    T slip[3], squared = 0;
+    for (int c = 0; c < 3; ++c) slip[c] = moved[c] - normal[c] * along, squared += slip[c] * slip[c];
+    const T limit = mu * force, little = limit / stiff, tiny = T(1e-9) * radius;
+    const T size = std::sqrt(squared + little * little + tiny * tiny), drag = limit / size, stuck = little / size;
+    for (int a = 0; a < 3; ++a) {
+      out.force[a] = force * normal[a] - drag * slip[a];
+      for (int b = 0; b < 3; ++b) {
+        T g = steep * normal[a] * normal[b] + drag * (T(a == b) - normal[a] * normal[b]);
+        if (exact) {
+          g -= drag * slip[a] * slip[b] / (size * size);
+          g -= mu * steep * (1 - stuck * stuck) * slip[a] / size * normal[b];
+        }
+        out.gradient[3 * a + b] = g;
+      }
+    }
+    return true;
+  }
+
+  T& at(int64_t row, int64_t column) {
+    const int64_t r = rank[row], c = rank[column];
+    return band[r * (2 * k + 1) + c - r + k];
+  }
+  // (x^T g z) of 3 x 3 matrices, times a factor, at the components of two vertices.
+  void block(int64_t i, int64_t j, const T* left, const T* right, const T* g, T factor) {
+    if (factor == T(0)) return;
+    T half[9] = {};
+    for (int a = 0; a < 3; ++a)
+      for (int b = 0; b < 3; ++b)
+        for (int c = 0; c < 3; ++c) half[3 * a + b] += g[3 * a + c] * right[3 * c + b];
+    for (int a = 0; a < 3; ++a)
+      for (int b = 0; b < 3; ++b) {
+        T sum = 0;
+        for (int c = 0; c < 3; ++c) sum += left[3 * c + a] * half[3 * c + b];
+        at(a * v + i, b * v + j) += factor * sum;
+      }
+  }
+
+  struct Acting {
+    int64_t pair;
+    Felt<T> felt;
+  };
+
+  // Forces at a state and what is left of the equations; with the matrix, if that is asked for.
+  T evaluate(const State<T>& now, bool exact, bool matrix) {
+    for (int64_t i = 0; i < 3 * v; ++i) touch[i] = between[i] = 0;
+    std::fill(wrench.begin(), wrench.end(), T(0));
+    for (int64_t i = 0; i < v; ++i)
+      for (int c = 0; c < 3; ++c) y[3 * i + c] = now.pos[3 * i + c] - slot[i].moved[c];
+    for (int64_t i = 0; i < v; ++i) {
+      const Slot<T>& p = slot[i];
+      const int64_t n = s.after[i];
+      T size = 0, e[3];
+      for (int c = 0; c < 3; ++c) {
+        const T turned = y[3 * n + c] - y[3 * i + c];
+        begin[3 * i + c] = p.start[c] + p.active * p.lead[c] + lean[i] * turned;
+        pull[3 * i + c] = now.impulse[i] * begin[3 * i + c] + p.swing * turned;
+        turn[3 * i + c] = turned * p.mask / p.rest;
+        e[c] = p.mask > T(0) ? now.pos[3 * n + c] - now.pos[3 * i + c] : T(c == 0);
+        size += e[c] * e[c];
+      }
+      size = std::sqrt(size);
+      for (int c = 0; c < 3; ++c) along[3 * i + c] = e[c] / std::max(size, T(1e-12));
+      const T tension = now.impulse[i] / scale, beyond = tension - yielding(i);
+      excess[i] = (size - p.rest - p.compliance * tension - p.give * std::max(beyond, T(0))) * p.active;
+    }
+    const auto moment = [&](int64_t i, int c) { return (turn[3 * i + c] - turn[3 * before[i] + c]) * slot[i].hinge; };
+    for (int64_t i = 0; i < v; ++i)
+      for (int c = 0; c < 3; ++c)
+        resist[3 * i + c] = (moment(i, c) - moment(s.after[i], c)) * slot[i].mask / slot[i].rest;
+    for (int64_t i = 0; i < v; ++i)
+      for (int c = 0; c < 3; ++c) {
+        const int64_t p = 3 * before[i] + c;
+        push[3 * i + c] = slot[i].force[c] * scale + pull[3 * i + c] - pull[p] - resist[p] + resist[3 * i + c];
+      }
+    if (matrix) assemble(now);
+    touch_bodies(now, exact, matrix);
+    touch_ropes(now, exact, matrix);
+    T worst = 0, size = 0, strain = 0;
+    for (int64_t i = 0; i < v; ++i) {
+      const Slot<T>& p = slot[i];
+      strain = std::max(strain, std::abs(excess[i]) / p.rest);
+      for (int c = 0; c < 3; ++c) {
+        const int64_t j = 3 * i + c;
+        residual[j] = p.vertex[c] * y[j] - p.free * (push[j] + touch[j] + between[j]);
+        const T carried = T(1e-3) * (p.moved[c] - p.origin[c]) + T(1e-9) * p.rest;
+        const T whole = std::abs(p.vertex[c] * y[j]) + std::abs(scale * p.force[c]) + std::abs(touch[j]) +
+                        std::abs(now.impulse[i] * begin[j]) + std::abs(between[j]) + std::abs(p.vertex[c] * carried);
+        worst = std::max(worst, std::abs(residual[j]));
+        size = std::max(size, whole);
+      }
+    }
+    return std::max(worst / std::max(size, T(1e-30)), strain);
+  }
+  T yielding(int64_t i) const { return T(s.law[1]) * slot[i].rest / slot[i].give; }
+
+  void assemble(const State<T>& now) {
+    band.assign((n + k) * (2 * k + 1), T(0));
+    border.assign(n * 6 * s.bodies, T(0));
+    row.assign(n * 6 * s.bodies, T(0));
+    corner.assign(36 * s.bodies, T(0));
+    for (int64_t i = 0; i < v; ++i) {
+      const Slot<T>& p = slot[i];
+      const int64_t next = s.after[i], b = before[i], far = s.after[next];
+      const bool inside = p.mask > T(0), further = inside && slot[next].mask > T(0);
+      const T string = now.impulse[i] * lean[i], own = same[i] + string + now.impulse[b] * lean[b];
+      for (int c = 0; c < 3; ++c) {
+        at(c * v + i, c * v + i) += p.vertex[c] + p.free * own;
+        if (inside) {
+          at(c * v + i, c * v + next) += p.free * (one[i] - string);
+          at(c * v + next, c * v + i) += slot[next].free * (one[i] - string);
+          at(c * v + i, 3 * v + i) += -p.free * p.active * begin[3 * i + c];
+          at(c * v + next, 3 * v + i) += slot[next].free * p.active * begin[3 * i + c];
+          at(3 * v + i, c * v + i) += -p.active * along[3 * i + c];
+          at(3 * v + i, c * v + next) += p.active * along[3 * i + c];
+        }
+        if (further) {
+          at(c * v + i, c * v + far) += p.free * two[i];
+          at(c * v + far, c * v + i) += slot[far].free * two[i];
+        }
+      }
+      const T soft = (now.impulse[i] / scale > yielding(i) ? p.give : T(0)) + T(s.law[3]) * p.give;
+      at(3 * v + i, 3 * v + i) += -p.active * (p.compliance + soft) / scale + (p.active - 1);
+    }
+  }
+
+  void touch_bodies(const State<T>& now, bool exact, bool matrix) {
+    for (int64_t f = 0; f < s.families; ++f) {
+      const int64_t body = s.of[f];
+      for (int64_t i = 0; i < v; ++i) {
+        const Point<T>& p = points[f * v + i];
+        if (!(p.real > T(0))) continue;
+        const int64_t n = s.after[i];
+        T moved[3] = {p.given[0], p.given[1], p.given[2]}, one[3], two[3];
+        for (int c = 0; c < 3; ++c) {
+          one[c] = now.pos[3 * i + c] - slot[i].origin[c];
+          two[c] = now.pos[3 * n + c] - slot[n].origin[c];
+        }
+        times(p.first, one, moved, 3);
+        times(p.second, two, moved, 3);
+        if (body >= 0) times(p.body, &now.bodies[6 * body], moved, 6);
+        Felt<T> felt;
+        if (!law(p.normal, p.radius, p.wanted, p.mu, firm[i], moved, exact, felt)) continue;
+        back(p.first, felt.force, &touch[3 * i], 3);
+        back(p.second, felt.force, &touch[3 * n], 3);
+        if (body >= 0) back(p.body, felt.force, &wrench[6 * body], 6);
+        if (!matrix) continue;
+        block(i, i, p.first, p.first, felt.gradient, slot[i].free);
+        block(i, n, p.first, p.second, felt.gradient, slot[i].free);
+        block(n, i, p.second, p.first, felt.gradient, slot[n].free);
+        block(n, n, p.second, p.second, felt.gradient, slot[n].free);
+        if (body >= 0) edge_of_body(p, felt.gradient, i, n, body);
+      }
+    }
+  }
+
+  void edge_of_body(const Point<T>& p, const T* g, int64_t i, int64_t n, int64_t body) {
+    T kc[18] = {}, ka[9] = {}, kb[9] = {};
+    for (int a = 0; a < 3; ++a) {
+      for (int j = 0; j < 6; ++j)
+        for (int c = 0; c < 3; ++c) kc[6 * a + j] += g[3 * a + c] * p.body[6 * c + j];
+      for (int j = 0; j < 3; ++j)
+        for (int c = 0; c < 3; ++c) {
+          ka[3 * a + j] += g[3 * a + c] * p.first[3 * c + j];
+          kb[3 * a + j] += g[3 * a + c] * p.second[3 * c + j];
+        }
+    }
+    const int64_t wide = 6 * s.bodies, first = 6 * body;
+    for (int a = 0; a < 3; ++a)
+      for (int j = 0; j < 6; ++j) {
+        T one = 0, two = 0, three = 0, four = 0;
+        for (int c = 0; c < 3; ++c) {
+          one += p.first[3 * c + a] * kc[6 * c + j];
+          two += p.second[3 * c + a] * kc[6 * c + j];
+          three += p.body[6 * c + j] * ka[3 * c + a];
+          four += p.body[6 * c + j] * kb[3 * c + a];
+        }
+        border[(a * v + i) * wide + first + j] += slot[i].free * one;
+        border[(a * v + n) * wide + first + j] += slot[n].free * two;
+        row[(a * v + i) * wide + first + j] += three;
+        row[(a * v + n) * wide + first + j] += four;
+      }
+    for (int a = 0; a < 6; ++a)
+      for (int j = 0; j < 6; ++j)
+        for (int c = 0; c < 3; ++c) corner[36 * body + 6 * a + j] += p.body[6 * c + a] * kc[6 * c + j];
+  }
+
+  void touch_ropes(const State<T>& now, bool exact, bool matrix) {
+    acting.clear();
+    for (int64_t q = 0; q < s.pairs; ++q) {
+      const Pair<T>& p = pairs[q];
+      if (!(p.real > T(0))) continue;
+      const int64_t* at = corners + 4 * q;
+      T moved[3] = {};
+      for (int m = 0; m < 4; ++m) {
+        T d[3];
+        for (int c = 0; c < 3; ++c) d[c] = now.pos[3 * at[m] + c] - slot[at[m]].origin[c];
+        times(p.corner[m], d, moved, 3);
+      }
+      Felt<T> felt;
+      const T stiff = std::min(firm[at[0]], firm[at[2]]);
+      if (!law(p.normal, p.radius, p.wanted, p.mu, stiff, moved, exact, felt)) continue;
+      for (int m = 0; m < 4; ++m) back(p.corner[m], felt.force, &between[3 * at[m]], 3);
+      if (matrix) acting.push_back({q, felt});
+    }
+  }
+
+  // Takes a step; returns what was left before it.
+  T newton(State<T>& now, bool exact) {
+    const T left = evaluate(now, exact, true);
+    solve(now);
+    T most = 0;
+    for (int64_t i = 0; i < v; ++i) {
+      T squared = 0;
+      for (int c = 0; c < 3; ++c) {
+        const T turned = slot[i].active * (step[c * v + s.after[i]] - step[c * v + i]) / slot[i].rest;
+        squared += turned * turned;
+      }
+      most = std::max(most, squared);
+    }
+    most = std::sqrt(most);
+    const T share = most > T(1) ? 1 / most : T(1);
+    for (int64_t i = 0; i < v; ++i) {
+      for (int c = 0; c < 3; ++c) now.pos[3 * i + c] += share * step[c * v + i];
+      now.impulse[i] += share * step[3 * v + i];
+    }
+    for (int64_t b = 0; b < 6 * s.bodies; ++b) now.bodies[b] += share * turned[b];
+    return left;
+  }
+
+  void solve(const State<T>& now) {
+    const int64_t own = 6 * s.bodies, extra = own + 3 * (int64_t)acting.size(), m = 1 + extra, width = 2 * k + 1;
+    side.assign((n + k) * m, T(0));  // by rank
+    for (int64_t i = 0; i < v; ++i) {
+      for (int c = 0; c < 3; ++c) side[rank[c * v + i] * m] = -residual[3 * i + c];
+      side[rank[3 * v + i] * m] = -excess[i];
+    }
+    for (int64_t u = 0; u < 3 * v; ++u)
+      for (int64_t j = 0; j < own; ++j) side[rank[u] * m + 1 + j] = border[u * own + j];
+    for (size_t a = 0; a < acting.size(); ++a) {
+      const Pair<T>& p = pairs[acting[a].pair];
+      const int64_t* at = corners + 4 * acting[a].pair;
+      for (int q = 0; q < 4; ++q)
+        for (int c = 0; c < 3; ++c)
+          for (int f = 0; f < 3; ++f)
+            side[rank[c * v + at[q]] * m + 1 + own + 3 * a + f] += slot[at[q]].free * p.corner[q][3 * f + c];
+    }
+    for (int64_t i = 0; i < n; ++i) {
+      T* pivot = &band[i * width + k];
+      const T inverse = *pivot = 1 / *pivot;
+      const T* mine = &side[i * m];
+      for (int64_t l = 1; l <= k; ++l) {
+        T* below = &band[(i + l) * width + k - l];
+        const T factor = *below * inverse;
+        if (factor == T(0)) continue;
+        for (int64_t u = 1; u <= k; ++u) below[u] -= factor * pivot[u];
+        T* theirs = &side[(i + l) * m];
+        for (int64_t j = 0; j < m; ++j) theirs[j] -= factor * mine[j];
+      }
+    }
+    for (int64_t i = n - 1; i >= 0; --i) {
+      const T* pivot = &band[i * width + k];
+      T* mine = &side[i * m];
+      for (int64_t u = 1; u <= k && i + u < n; ++u) {
+        const T factor = pivot[u];
+        if (factor == T(0)) continue;
+        const T* theirs = &side[(i + u) * m];
+        for (int64_t j = 0; j < m; ++j) mine[j] -= factor * theirs[j];
+      }
+      for (int64_t j = 0; j < m; ++j) mine[j] *= *pivot;
+    }
+    turned.assign(own, T(0));
+    if (extra) border_out(now, own, extra, m);
+    for (int64_t u = 0; u < n; ++u) step[u] = side[rank[u] * m];
+  }
+
+  // Takes bodies and pairs out by their Schur complement.
+  void border_out(const State<T>& now, int64_t own, int64_t extra, int64_t m) {
+    std::vector<T> small(extra * (extra + 1), T(0));  // with its right-hand side behind
+    const auto entry = [&](int64_t i, int64_t j) -> T& { return small[i * (extra + 1) + j]; };
+    const auto minus = [&](int64_t i, T factor, int64_t unknown) {
+      const T* x = &side[rank[unknown] * m];
+      for (int64_t j = 0; j < extra; ++j) entry(i, j) -= factor * x[1 + j];
+      entry(i, extra) -= factor * x[0];
+    };
+    for (int64_t b = 0; b < s.bodies; ++b)
+      for (int i = 0; i < 6; ++i) {
+        T sum = wrench[6 * b + i];
+        for (int j = 0; j < 6; ++j) {
+          const T own = scale * inertia[36 * b + 6 * i + j];
+          entry(6 * b + i, 6 * b + j) = own + corner[36 * b + 6 * i + j];
+          sum -= own * now.bodies[6 * b + j];
+        }
+        entry(6 * b + i, extra) = sum;
+      }
+    for (int64_t u = 0; u < 3 * v; ++u)
+      for (int64_t i = 0; i < own; ++i)
+        if (row[u * own + i] != T(0)) minus(i, row[u * own + i], u);
+    for (size_t a = 0; a < acting.size(); ++a) {
+      const Pair<T>& p = pairs[acting[a].pair];
+      const int64_t* at = corners + 4 * acting[a].pair;
+      for (int f = 0; f < 3; ++f) {
+        const int64_t i = own + 3 * a + f;
+        entry(i, i) += 1;
+        for (int q = 0; q < 4; ++q)
+          for (int c = 0; c < 3; ++c) {
+            T right = 0;
+            for (int g = 0; g < 3; ++g) right += acting[a].felt.gradient[3 * f + g] * p.corner[q][3 * g + c];
+            minus(i, -right, c * v + at[q]);
+          }
+      }
+    }
+    for (int64_t i = 0; i < extra; ++i) {
+      int64_t best = i;
+      for (int64_t l = i + 1; l < extra; ++l)
+        if (std::abs(entry(l, i)) > std::abs(entry(best, i))) best = l;
+      if (best != i)
+        for (int64_t j = i; j <= extra; ++j) std::swap(entry(i, j), entry(best, j));
+      const T inverse = 1 / entry(i, i);
+      for (int64_t l = i + 1; l < extra; ++l) {
+        const T factor = entry(l, i) * inverse;
+        if (factor == T(0)) continue;
+        for (int64_t j = i; j <= extra; ++j) entry(l, j) -= factor * entry(i, j);
+      }
+    }
+    std::vector<T> found(extra);
+    for (int64_t i = extra - 1; i >= 0; --i) {
+      T sum = entry(i, extra);
+      for (int64_t j = i + 1; j < extra; ++j) sum -= entry(i, j) * found[j];
+      found[i] = sum / entry(i, i);
+    }
+    std::copy(found.begin(), found.begin() + own, turned.begin());
+    for (int64_t r = 0; r < n; ++r) {
+      T* x = &side[r * m];
+      for (int64_t j = 0; j < extra; ++j) x[0] -= x[1 + j] * found[j];
+    }
+  }
+
+  const Sizes& s;
+  const int64_t v, n, k;
+  std::vector<int64_t> before, rank;
+  std::vector<T> y, begin, along, push, pull, turn, resist, touch, between, residual, excess, lean, one, two, same, firm,
+      least, wrench, step, band, border, row, corner, side, turned;
+  std::vector<Acting> acting;
+  T scale;
+};
+
+// Batches stand innermost in what comes out, as in all storage.
+template <typename T>
+void run(const T* slots, const T* points, const T* pairs, const int64_t* corners, const T* inertia, T* const* out,
+         const Sizes& s, int threads) {
+  const int64_t v = s.slots, scenes = s.scenes, counts[10] = {3 * v, v, 6 * s.bodies, 1, 3 * v, v, 3 * v, 3 * v, 6 * s.bodies, 1};
+#pragma omp parallel num_threads(threads) if (threads > 1 && scenes > 1)
+  {
+    const FlushTiny flush;
+    Scene<T> scene(s);
+    std::vector<T> found[10];
+    for (int r = 0; r < 10; ++r) found[r].resize(counts[r] + 1);
+#pragma omp for schedule(dynamic)
+    for (int64_t b = 0; b < scenes; ++b) {
+      scene.slot = (const Slot<T>*)slots + b * v;
+      scene.points = (const Point<T>*)points + b * s.families * v;
+      scene.pairs = (const Pair<T>*)pairs + b * s.pairs;
+      scene.corners = corners + b * s.pairs * 4;
+      scene.inertia = inertia + b * s.bodies * 36;
+      T* f[10];
+      for (int r = 0; r < 10; ++r) f[r] = found[r].data();
+      scene(f[0], f[1], f[2], f[3], f[4], f[5], f[6], f[7], f[8], f[9]);
+      for (int r = 0; r < 10; ++r)
+        for (int64_t i = 0; i < counts[r]; ++i) out[r][i * scenes + b] = found[r][i];
+    }
+  }
+}
+
+}  // namespace
+
+extern "C" {
+void touching_float(const float* a, const float* b, const float* c, const int64_t* d, const float* e, float* const* out,
+                    const Sizes* s, int threads) {
+  run<float>(a, b, c, d, e, out, *s, threads);
+}
+void touching_double(const double* a, const double* b, const double* c, const int64_t* d, const double* e,
+                     double* const* out, const Sizes* s, int threads) {
+  run<double>(a, b, c, d, e, out, *s, threads);
+}
+}
