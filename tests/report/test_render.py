@@ -226,7 +226,11 @@ def test_a_missing_package_is_named(name, what, monkeypatch, tmp_path):
     from torchdlo.report.viewer import server as view
 
     monkeypatch.setitem(sys.modules, name, None)
-    calls = {"pyvista": render.check_renderer, "av": lambda: video.check_video(tmp_path / "a"), "viser": view._viser}
+    calls = {
+        "pyvista": render.check_renderer,
+        "av": lambda: video.check_video(tmp_path / "a"),
+        "viser": view._check_viser,
+    }
     with pytest.raises(InputError, match=rf"{what}.* needs? the package {name}; install it with .*torchdlo\[view\]"):
         calls[name]()
 

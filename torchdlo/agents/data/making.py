@@ -158,7 +158,10 @@ def make(
         video.library()
     if resume and (out / "meta/info.json").is_file() and not (out / UNFINISHED / PLAN).exists():
         shutil.rmtree(out / UNFINISHED, ignore_errors=True)
-        return report_of(read_json(out / build.PROVENANCE, "what is known of a finished data set"))
+        found = read_json(out / build.PROVENANCE)
+        if found is None:
+            raise InputError(f"{out / build.PROVENANCE}: it is damaged or gone; choose another --out.")
+        return report_of(found)
     with _begun(plan, out, resume) as folder:
         done = {task: _gather(plan, task, folder, painter, executor or Serial(), callback) for task in plan.tasks}
         return _finish(plan, out, done, callback)
