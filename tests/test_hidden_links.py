@@ -94,7 +94,7 @@ def test_a_chain_of_many_links_in_two_clamps_moves_as_an_exact_rod() -> None:
 def test_a_step_that_is_too_long_is_taken_in_shorter_ones(monkeypatch) -> None:
     scene, tried = replace(scenes.draw(7, grippers=1), duration=0.05), []
 
-    def fails_at_first(scene, trials, given, count, dt):
+    def fails_at_first(scene, trials, given, count, dt, variant):
         tried.append(dt)
         if len(tried) < 3:
             raise links.Diverged("too long")

@@ -22,6 +22,8 @@ FLOORS = {
     "cache": 1,
     "untrusted": 0.8,
     "files": 1,
+    "local_server": 1,
+    "journal": 1.5,
     "physics": 2,
     "coupling": 3,
     "scene": 4,
@@ -48,6 +50,8 @@ ALLOWED = {
     "cache": set(),
     "untrusted": {"numpy", "torch"},
     "files": set(),
+    "local_server": set(),
+    "journal": set(),
     "physics": TORCH | {"triton"},  # comes with the CUDA builds of torch
     "coupling": TORCH | {"pytorch_kinematics", "trimesh"},
     "scene": TORCH,
@@ -55,7 +59,7 @@ ALLOWED = {
     "reward_language": TORCH,
     "scene_files": ARRAYS,
     "sysid": ARRAYS,
-    "envs": LEARNING | {"pytorch_kinematics", "trimesh"},
+    "envs": LEARNING | {"numpy", "gymnasium", "pytorch_kinematics", "trimesh"},
     "agents": LEARNING
     | {
         "cma",
@@ -71,7 +75,9 @@ ALLOWED = {
         "safetensors",
         "tokenizers",
     },
-    "report": ARRAYS | {"matplotlib", "pyvista", "vtk", "av", "viser", "mitsuba", "pyoidn", "PIL"},
+    "report": ARRAYS
+    | {"matplotlib", "pyvista", "vtk", "av", "viser", "mitsuba", "pyoidn", "PIL"}
+    | {"websockets", "msgspec"},  # come with viser
     "cli": LEARNING | ARRAYS | {"rich", "typer", "av", "cv2", "packaging"},
     "__main__": set(),
     "": TORCH,  # torchdlo/__init__.py

@@ -21,8 +21,26 @@ ABSORBED = {"baseline.bending": 1.05, "baseline.twisting": 1.3, "baseline.dampin
 
 MEASUREMENT = ("time_delay", "marker_offset")
 """Effects of the measurement, not of the rope."""
-PARTS = ("first", "ci", "singles", "nulls", "compounds", "outside", "ties", "all", "fresh", "links")
-"""Parts of the benchmark; what is fresh, and what is made of links, is not in all."""
+PARTS = ("first", "ci", "singles", "nulls", "compounds", "outside", "ties", "all", "fresh", "links", "mismatch")
+"""Parts of the benchmark; what is fresh, made of links, or differs only in how it is made is not in all."""
+MISMATCH = (
+    ("implicit", "links"),
+    ("table", "links"),
+    ("joints", "links"),
+    ("dropouts", ""),
+    ("quantised", ""),
+    ("coloured", "links"),
+    ("grid", ""),
+    ("table", ""),
+    ("dropouts", "links"),
+    ("quantised", "links"),
+    ("coloured", ""),
+    ("", "links"),
+    ("", ""),
+)
+"""Kinds of recordings that hide nothing but differ in how they are made, and what they are made with."""
+REPEATS = 5
+"""Recordings of each of these kinds."""
 LINKS = (40, 61)
 """Least number of links in a chain, with those that clamps hold, and one more than the greatest."""
 TIES = {"wind": ["tilted_gravity"], "tilted_gravity": ["wind"]}
@@ -59,7 +77,8 @@ class Case:
     seed: int
     """Seed of rope and motions."""
     variant: str = ""
-    """How a null differs from a plain one: grid, coloured; how a tie does: slow."""
+    """How a null differs from a plain one: grid, coloured, table, dropouts, quantised, joints (hinges that each lose
+    energy by themselves) and implicit (all of them alike, as by an implicit step); how a tie does: slow."""
     simulator: str = ""
     """What the recording is made with if not with exact rods: links."""
 
@@ -249,6 +268,9 @@ def subset(name: str) -> list[Case]:
         return other_cases(600, ("", "grid", "coloured", "table"), PAIRS[::3], "")
     if name == "links":
         return other_cases(1100, ("", "", "coloured", "table"), PAIRS[1::3], "links")
+    if name == "mismatch":
+        made = [(k, i, v, by) for i in range(REPEATS) for k, (v, by) in enumerate(MISMATCH)]
+        return [Case("null", (), 0.0, 2000 + 10 * k + i, v, by) for k, i, v, by in made]
     cases = all_cases()
     if name == "all":
         return cases

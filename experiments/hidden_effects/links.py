@@ -25,6 +25,8 @@ STEP = 4e-4
 """Step to make recordings with [s]; a quarter of it changes them by 0.01 to 0.03 mm."""
 IMPLICIT = 0.5
 """Implicit damping of a spring's joint, over step times stiffness."""
+LOSS = 5e-4
+"""Loss time of hinges that lose energy by themselves [s]: that of an implicit step of 1 ms."""
 HALVINGS = 3
 """How often the step is halved where the simulation fails."""
 KEPT = 4
@@ -82,8 +84,9 @@ mujoco.set_mju_user_warning(lambda _: None)
 class Links:
     """One rope as a chain of links, with laws of its own."""
 
-    def __init__(self, rope: Rope, chain: Chain, given: Laws, dt: float) -> None:
-        self.rope, self.chain, self.given = rope, chain, given
+    def __init__(self, rope: Rope, chain: Chain, given: Laws, dt: float, loss: Array | float = 0.0) -> None:
+        """Make a chain; its hinges lose energy by themselves with a loss time [s], (N - 1,), or the same for all."""
+        self.rope, self.chain, self.given, self.loss = rope, chain, given, loss
         self.stretches = given.on("stretch")
         self.model = mujoco.MjModel.from_xml_string(self._describe(dt))
         self.data = mujoco.MjData(self.model)
@@ -190,6 +193,7 @@ class Links:
         rub = np.zeros((3, len(gradient[0])))
         rub[1:] = given.get("bending_damping.coefficient")
         gradients = np.stack([np.full_like(gradient[0], rope.twisting), gradient[0], gradient[0]])
+        rub = rub + self.loss * gradients
         added = np.maximum(share * self.model.opt.timestep * gradients - rub, 0.0)
         return rub / self.chain.length, added / self.chain.length
 
@@ -239,10 +243,19 @@ def settle(links: Links, poses: Poses, dt: float) -> None:
     links.run(there, np.arange(round(SETTLE / dt) + 1) * dt, 10**9, DAMPED)
 
 
-def run(scene: Scene, trials: list[str], numbers: list[dict], links: int, dt: float) -> tuple[Track, Chain]:
+def losses(variant: str, seed: int, links: int) -> Array | float:
+    """Return the loss time of each hinge [s], (N,), by how a recording that hides nothing differs from a plain one."""
+    if variant == "joints":
+        return np.random.default_rng([seed, 16]).uniform(0.0, 2 * LOSS, links)
+    return LOSS if variant == "implicit" else 0.0
+
+
+def run(
+    scene: Scene, trials: list[str], numbers: list[dict], links: int, dt: float, variant: str = ""
+) -> tuple[Track, Chain]:
     """Simulate trials of one rope with the same laws, with steps of about `dt` [s]; time 0 is the first frame.
 
-    A clamp that welds a strongly damped rope takes shorter steps than others do.
+    A clamp that welds a strongly damped rope takes shorter steps than others do. Variants are those of `losses`.
     """
     if any(row != numbers[0] for row in numbers):
         raise ValueError("the trials' laws differ; expected the same numbers for all")
@@ -251,17 +264,17 @@ def run(scene: Scene, trials: list[str], numbers: list[dict], links: int, dt: fl
         dt *= 0.25  # what is slow enough to stick would chatter
     for _ in range(HALVINGS):
         try:
-            return _run(scene, trials, given, links, dt)
+            return _run(scene, trials, given, links, dt, variant)
         except Diverged:
             dt *= 0.5
-    return _run(scene, trials, given, links, dt)
+    return _run(scene, trials, given, links, dt, variant)
 
 
-def _run(scene: Scene, trials: list[str], given: Laws, links: int, dt: float) -> tuple[Track, Chain]:
+def _run(scene: Scene, trials: list[str], given: Laws, links: int, dt: float, variant: str) -> tuple[Track, Chain]:
     drive, chain = Drive(scene, trials), Chain(links, scene.grip, scene.free_end, scene.grippers == 2)
     each = int(np.ceil(1 / scene.rate / dt - 1e-9))
     step = 1 / scene.rate / each
-    rope = Links(scene.rope, chain, given, step)
+    rope = Links(scene.rope, chain, given, step, losses(variant, scene.seed, len(chain.step)))
     settle(rope, drive, step)
     begin = rope.data.qpos.copy()
     before = round(LEAD / step)

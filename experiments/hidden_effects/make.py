@@ -32,6 +32,10 @@ HELD = 0.1
 """Noise of gripped markers, relative to that of free ones."""
 DROPOUT = 0.01
 """Share of free markers that are not seen."""
+LOST, TOGETHER = 0.15, 6
+"""The same of a recording with many gaps, and frames that are lost together."""
+GRID = 1e-3
+"""Steps in which a recording is written whose places are coarse [m]."""
 MEMORY = 0.8
 """Correlation of coloured noise from frame to frame."""
 
@@ -76,6 +80,16 @@ def coloured(rng: np.random.Generator, shape: tuple[int, ...], memory: float) ->
     return white
 
 
+def gaps(rng: np.random.Generator, shape: tuple[int, int]) -> Array:
+    """Return which markers are lost in which frames (F, M), in stretches; all are seen in the first frame."""
+    begun = rng.random(shape) < LOST / TOGETHER
+    lost = np.zeros(shape, bool)
+    for k in range(TOGETHER):
+        lost[k:] |= begun[: len(begun) - k]
+    lost[0] = False
+    return lost
+
+
 def simulate(case: Case, scene: Scene, rows: list[dict], fine: tuple[int, float]) -> tuple[Track, Mesh | Chain]:
     """Return the rope's motion in all trials, by the case's simulator."""
     if case.simulator != "links":
@@ -84,7 +98,8 @@ def simulate(case: Case, scene: Scene, rows: list[dict], fine: tuple[int, float]
         import links
     except ImportError as e:
         raise SystemExit(f"{e.name} is not installed; chains of links need it: pip install mujoco") from e
-    return links.run(scene, TRIALS, rows, round((scene.free_end - scene.grip) / scene.grip), links.STEP)
+    count = round((scene.free_end - scene.grip) / scene.grip)
+    return links.run(scene, TRIALS, rows, count, links.STEP, case.variant)
 
 
 def record(case: Case, scene: Scene, numbers: dict[str, float], fine: tuple[int, float], salt: str) -> list[dict]:
@@ -106,7 +121,11 @@ def record(case: Case, scene: Scene, numbers: dict[str, float], fine: tuple[int,
             off = exponential(0.002 * rng.standard_normal((3, 1, 1)))
             turn = multiply(off, turn.transpose(2, 0, 1)).transpose(1, 2, 0)
         dirty = clean + level * noise
+        if case.variant == "quantised":
+            dirty[:, ~scene.gripped] = GRID * np.round(dirty[:, ~scene.gripped] / GRID)
         dirty[(rng.random(dirty.shape[:2]) < DROPOUT) & ~scene.gripped] = np.nan
+        if case.variant == "dropouts":
+            dirty[gaps(rng, dirty.shape[:2]) & ~scene.gripped] = np.nan
         last = [0, scene.markers - 1][: scene.grippers]
         out.append(
             {

@@ -23,6 +23,7 @@ from cases import PARTS, subset
 from make import Config as Made
 from make import identity
 from options import Parser, count, save
+from seal import kept, seal
 from table import judge, markdown, summary, without_it
 
 COMMAND = "from torchdlo.cli import main; main()"
@@ -145,6 +146,7 @@ def score(config: Config, names: list[str], failed: dict[str, str]) -> list[dict
             continue
         answer = answer_of(config, name)
         rows.append(judge(name, without_it(answer) if config.removed else answer, found))
+        rows[-1]["sealed"] = kept(Path(config.answers), Path(config.out), name)
         if found is None:
             rows[-1]["why"] = failed[name]
     return sorted(rows, key=lambda row: row["case"])
@@ -167,6 +169,8 @@ def main() -> None:
     names = chosen(config)
     if config.removed:
         config = replace(config, out=str(Path(config.out) / "removed"))
+    if not config.ready:
+        print(f"answers are sealed: {seal(Path(config.answers), Path(config.out), names)}", flush=True)
     rows = score(config, names, run(config, names))
     page = markdown(rows, f"Hidden effects: {len(rows)} of {len(names)} recordings")
     machine = {"cores": os.cpu_count(), "python": platform.python_version()}

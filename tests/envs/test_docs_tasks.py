@@ -24,7 +24,8 @@ def test_examples_of_the_page_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     for block in blocks:
         exec(compile(block, str(PAGE), "exec", dont_inherit=True), found)
     assert found["outcome"].returns.shape == (2,) and found["after"]["next", "reward"].shape == (2, 1, 1)
-    assert found["seen"]["observation"].ndim == 1  # Gymnasium users see no axis of the batch
+    assert found["seen"].ndim == 1  # Gymnasium users see no axis of the batch
+    assert isinstance(found["reward"], float) and found["many"].shape == (2, *found["seen"].shape)
 
 
 def test_every_task_is_on_the_page_with_a_picture() -> None:

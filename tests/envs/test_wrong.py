@@ -88,3 +88,57 @@ def test_choices_beside_an_episode_and_episodes_of_other_tasks_are_refused() -> 
         episode.play(made.task, actions, episode=made, segment=3)
     with pytest.raises(InputError, match=r"wiring_post: the episode is of Coiling\(horizon=2.*expected one of Wiring"):
         episode.play(small("wiring_post"), actions, episode=made)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "words"),
+    [
+        ("horizon", 0, "horizon: it is 0; expected a whole number from 1 on"),
+        ("horizon", 2.5, "horizon: it is 2.5"),
+        ("frame_skip", 0, "frame_skip: it is 0"),
+        ("release", -1, "release: it is -1; expected a whole number from 0 on"),
+    ],
+)
+def test_numbers_of_actions_that_are_none_are_refused(name: str, value: Any, words: str) -> None:
+    with pytest.raises(InputError, match=words):
+        TASKS["coiling"](**{name: value})
+
+
+@pytest.mark.parametrize(
+    ("method", "value", "words"),
+    [
+        ("rewards", torch.ones(1), r"rewards returned a tensor of shape \(1,\); expected a dictionary"),
+        ("rewards", 1.0, r"rewards returned 1.0; expected a dictionary"),
+        ("success", 0.7, r"success returned 0.7; expected a tensor of bool of shape \(1,\)"),
+        ("success", torch.ones(1), r"success returned a tensor of torch.float32, \(1,\)"),
+        ("success", torch.ones(1, 1, dtype=torch.bool), r"torch.bool, \(1, 1\)"),
+    ],
+)
+def test_rewards_and_success_of_another_kind_are_refused(method: str, value: Any, words: str) -> None:
+    pytest.importorskip("torchrl")
+    kind = type("Other", (TASKS["coiling"],), {method: lambda self, seen: value, "__doc__": "Says something else."})
+    with pytest.raises(InputError, match=words):
+        envs.make(kind(), compiled=False)
+
+
+def test_actions_and_rewards_that_are_not_finite_are_said_once(caplog: pytest.LogCaptureFixture) -> None:
+    pytest.importorskip("torchrl")
+    from torchdlo import notices
+
+    notices._said -= {"nan actions", "nan rewards of unknotting"}
+    kind = type(small("unknotting"))
+    bad = type(
+        "Odd",
+        (kind,),
+        {"rewards": lambda self, seen: {"far": 0 / seen.x[:, 0, 0].mul(0)}, "__doc__": "Divides by zero."},
+    )
+    env = envs.make(bad(horizon=5), compiled=False)
+    seen = env.reset()
+    for _ in range(2):
+        env.step(seen.set("action", torch.zeros(1, 12)))
+    assert [r.message for r in caplog.records if "reward is not finite" in r.message] == [
+        "unknotting: a reward is not finite although its scene is; check the task's `rewards`."
+    ]
+    after = env.step(seen.set("action", torch.full((1, 12), torch.nan)))
+    assert after["next", "terminated"].all()
+    assert sum("an action is not finite" in r.message for r in caplog.records) == 1

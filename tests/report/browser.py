@@ -7,11 +7,12 @@ import fcntl
 import json
 import os
 import shutil
+import signal
 import subprocess
 import tempfile
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -57,8 +58,8 @@ class Page:
         assert "exceptionDetails" not in found, found["exceptionDetails"]
         return found["result"].get("value")
 
-    def wait(self, condition: str, seconds: float = 20.0) -> None:
-        """Wait until an expression is true."""
+    def wait(self, condition: str, seconds: float = 120.0) -> None:
+        """Wait until an expression is true; machines may be busy."""
         end = time.monotonic() + seconds
         while not self.run(condition):
             assert time.monotonic() < end, f"never came true: {condition}"
@@ -121,7 +122,7 @@ def _pipe() -> tuple[int, int]:
 def launch(program: str) -> Iterator[Page]:
     """Start a browser with a profile of its own, and end it."""
     to_browser, from_browser = _pipe(), _pipe()
-    with tempfile.TemporaryDirectory() as profile:
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile:
         # The browser reads from descriptor 3 and writes to descriptor 4.
         options = ("--headless", "--no-sandbox", "--disable-gpu", "--hide-scrollbars", "--no-first-run")
         command = [program, *options, "--remote-debugging-pipe", f"--user-data-dir={profile}", "about:blank"]
@@ -131,13 +132,33 @@ def launch(program: str) -> Iterator[Page]:
             os.dup2(from_browser[1], 4)
 
         quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-        process = subprocess.Popen(command, pass_fds=(3, 4), preexec_fn=connect, **quiet)
+        process = subprocess.Popen(command, pass_fds=(3, 4), preexec_fn=connect, start_new_session=True, **quiet)
         os.close(to_browser[0])
         os.close(from_browser[1])
         try:
             yield Page(to_browser[1], from_browser[0])
         finally:
-            process.kill()
-            process.wait()
+            end(process)
             os.close(to_browser[1])
             os.close(from_browser[0])
+
+
+def end(process: subprocess.Popen[bytes], seconds: float = 120.0) -> None:
+    """Kill a process that leads a group with all its children, and wait until none is left that could still write."""
+    with suppress(ProcessLookupError):
+        os.killpg(process.pid, signal.SIGKILL)
+    process.wait()
+    until = time.monotonic() + seconds
+    while _lives(process.pid):
+        assert time.monotonic() < until, f"the process group {process.pid} does not end"
+        time.sleep(0.01)
+
+
+def _lives(group: int) -> bool:
+    """Return whether a process group has a member that runs; dead ones that nobody asked about write nothing."""
+    for entry in Path("/proc").glob("[0-9]*/stat"):
+        with suppress(OSError):
+            state, _, leader = entry.read_text().rpartition(")")[2].split()[:3]
+            if int(leader) == group and state != "Z":
+                return True
+    return False

@@ -92,5 +92,6 @@ def test_the_command_serves_a_run_until_ctrl_c(tmp_path, monkeypatch, viewer):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(view.Viewer, "_until_interrupted", interrupt)
-    commands.view(tmp_path, port=18090)
-    assert seen == [200]
+    with pytest.raises(SystemExit) as ended:
+        commands.view(tmp_path, port=18090)
+    assert seen == [200] and ended.value.code == 130

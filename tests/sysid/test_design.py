@@ -313,4 +313,4 @@ def test_the_command_says_why_it_stops(
 
     monkeypatch.setattr(search, "design_experiment", stopped)
     assert run("design-experiment", "rope", "--effects", "wind,time_delay") == 130
-    assert "--resume goes on from runs/design/rope/journal" in capsys.readouterr().err
+    assert "interrupted; there was no result yet, and nothing was written" in capsys.readouterr().err

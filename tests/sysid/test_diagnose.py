@@ -20,6 +20,7 @@ from torchdlo.sysid.diagnosis.budget import BUDGETS
 from torchdlo.sysid.diagnosis.candidate_fits import extend
 from torchdlo.sysid.diagnosis.findings import findings, findings_json, model_json, summary
 from torchdlo.sysid.diagnosis.score_test import Score
+from torchdlo.sysid.diagnosis.significance import Agreement
 from torchdlo.sysid.diagnosis.verdict import word
 from torchdlo.sysid.diagnosis.workspace import Workspace
 from torchdlo.sysid.estimation.jobs import Fitted
@@ -283,11 +284,49 @@ def test_an_effect_is_left_out_once_only_from_the_same_model() -> None:
     revision = Revision(bench, BUDGETS["fast"], ["plain"], lambda *_: None)
     fitted = SimpleNamespace(effects=("wind", "stretch"), options=(), values=np.ones(3))
     again = SimpleNamespace(effects=("wind", "stretch"), options=(), values=np.ones(3))
-    assert revision._without(fitted, "wind") is revision._without(again, "wind") and len(asked) == 1
-    assert revision._without(fitted, "stretch").of == (fitted, "stretch")
+    assert revision.without(fitted, "wind") is revision.without(again, "wind") and len(asked) == 1
+    assert revision.without(fitted, "stretch").of == (fitted, "stretch")
     bench.starts = {"train": object()}
-    revision._without(fitted, "wind")
+    revision.without(fitted, "wind")
     assert len(asked) == 3
+
+
+SURE = Agreement(1e-4, "block", 16, np.ones(2), 0.01)
+"""A test that leaves no doubt."""
+
+
+@pytest.mark.parametrize(
+    ("loss", "better", "named"), [(0.5e-3, 0.0, None), (0.5e-3, 0.3e-3, "other"), (9e-3, 0.0, "bd")]
+)
+def test_what_steps_may_do_is_no_finding_nor_what_explains_no_more(
+    loss: float, better: float, named: str | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    names = ["bending_stiffness", "bending_damping.coefficient"]
+    model = SimpleNamespace(parameters=names, numerical_damping=0.05, dt=0.01, substeps=2)
+    costs = {"internal_friction": 1.0e-3 - better, "bending_damping": 0.98e-3}
+    fits = {
+        name: SimpleNamespace(
+            point=SimpleNamespace(cost=cost), values=np.array([2e-3, 2e-3 * loss]), effects=(name,), options=()
+        )
+        for name, cost in costs.items()
+    }
+    judge = object.__new__(search._Search)
+    judge.bench, judge.pool = SimpleNamespace(tie=twentieth), SimpleNamespace(local=SimpleNamespace())
+    judge.pool.local.model = lambda *_: model
+    judge._gain = lambda *_: 0.6
+    order = sorted(fits, key=lambda name: costs[name])
+    rival = SimpleNamespace(point=SimpleNamespace(cost=2e-3))
+    said = judge._below_steps(fits, order, dict.fromkeys(order), rival)
+    left = [name for name in order if name not in said]
+    assert left == {None: [], "other": ["internal_friction"], "bd": order}[named]
+    if named != "bd":
+        assert "no larger than the damping of the steps" in said["bending_damping"]
+
+
+@pytest.mark.parametrize(("p", "units", "refused"), [(1e-4, 16, False), (0.02, 16, True), (0.25, 2, False)])
+def test_what_may_be_chance_is_refused_where_that_can_be_told(p: float, units: int, refused: bool) -> None:
+    tests = {"air_drag": replace(SURE, p=p, units=units)}
+    assert bool(object.__new__(search._Search)._chance(tests, 16)) == refused
 
 
 @pytest.mark.parametrize(("speed", "first"), [(0.02, "air_drag"), (0.4, "wind")])
@@ -312,7 +351,8 @@ def test_a_general_law_is_named_only_where_its_other_numbers_tell(
     assert (low[0] < 0) == (first == "air_drag") and high[0] < 1.0
     judge = object.__new__(search._Search)
     judge.bench = SimpleNamespace(tie=twentieth)
-    for name, value in {"_refused": None, "_gain": 0.5}.items():
+    asked = {"_refused": None, "_gain": 0.5, "_agreement": SURE, "_below_steps": {}, "_closest": None}
+    for name, value in asked.items():
         monkeypatch.setattr(judge, name, lambda *_, value=value: value, raising=False)
     # Wind fits better than drag, by more than a tie.
     best, _, _, also = judge._judged([], fits, ["wind", "air_drag"], fitted("air_drag", 2e-3))

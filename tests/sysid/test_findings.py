@@ -78,7 +78,7 @@ def test_confidence_falls_with_every_doubt(found: Diagnosis) -> None:
     both = replace(worse, ties={"air_drag": ["wind", "tilted_gravity"]})
     assert confidence(both)["word"] == "low" and "tilted gravity or wind would do as well" in confidence(both)["doubts"]
     off = replace(sure, final=fitted(BASELINE | {"air_drag.c_d": 1e-4}, ("air_drag",)))
-    assert "the range of air drag reaches the value at which it does nothing" in confidence(off)["doubts"]
+    assert "air drag has a range that holds the value at which it does nothing" in confidence(off)["doubts"]
     few = replace(sure, final=fitted(BASELINE | {"air_drag.c_d": 1.4}, ("air_drag",), trials=2))
     assert "there are fewer than three train trials" in confidence(few)["doubts"]
 

@@ -51,6 +51,7 @@ def test_results_come_back_to_the_last_bit(recording: Recording, tmp_path: Path)
     journal, job, result = ResultCache(tmp_path / "j", recording, OPTIONS), fit_job(), fitted()
     assert journal.recall(job) is None
     journal.keep(job, result)
+    journal.close()
     again = ResultCache(tmp_path / "j", recording, OPTIONS, resume=True).recall(fit_job())
     assert digest(again) == digest(result) and again.space.params == result.space.params
     np.testing.assert_array_equal(again.point.curvature, result.point.curvature)
@@ -125,8 +126,8 @@ def test_another_search_is_refused(recording: Recording, tmp_path: Path, monkeyp
         with pytest.raises(InputError, match="belongs to another recording or to other options"):
             ResultCache(path, other, options, resume=True)
     # A copy of the folder elsewhere is the same recording.
-    ResultCache(path, replace(recording, path=tmp_path / "elsewhere"), OPTIONS, resume=True)
-    monkeypatch.setattr(journals, "_program", lambda: "newer")
+    ResultCache(path, replace(recording, path=tmp_path / "elsewhere"), OPTIONS, resume=True).close()
+    monkeypatch.setattr(journals, "program", lambda: "newer")
     with pytest.raises(InputError, match="written by another version of torchdlo"):
         ResultCache(path, recording, OPTIONS, resume=True)
 

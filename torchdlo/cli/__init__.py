@@ -7,6 +7,10 @@ __all__ = ["main"]
 
 def main(args: list[str] | None = None) -> None:
     """Run the command line; see `torchdlo.cli.app.main`."""
-    from torchdlo.cli.app import main as run
+    from torchdlo.cli import ending
 
-    run(args)
+    # Importing the commands takes a moment, in which somebody may stop them.
+    with ending.caught(args):
+        from torchdlo.cli.app import main as run
+
+        run(args)

@@ -11,16 +11,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from torchdlo.cli.ending import stopped
 from torchdlo.cli.progress import deferred_interrupt, progress
 from torchdlo.files import check_writable, write_atomically
+from torchdlo.journal import at_work
 
 if TYPE_CHECKING:
     from torchdlo.agents.vlm.conversation import Conversation
 
 __all__ = ["plan", "propose"]
-
-_INTERRUPTED = 130
-"""Exit code after Ctrl-C, as shells have it."""
 
 _Rope = Annotated[
     Path | None,
@@ -205,7 +204,6 @@ def plan(
     for name in ("plan.json", "report.html"):
         check_writable(out / name)
     limits = {"calls": calls, "tokens": tokens, "seconds": seconds, "resume": resume}
-    said = _conversation(out, endpoint, model, recorded, geometry, **limits)
     look: Any = None
     if pictures:
         from torchdlo.report.render.marks import Camera
@@ -216,16 +214,17 @@ def plan(
     options = Options(
         update=update, method=method, episodes=episodes, population=population, seed=seed, reset_seed=reset_seed
     )
-    try:
-        with progress() as show, deferred_interrupt(show) as callback:
-            found = carry_out(chosen, said, options, look=look, folder=out, callback=callback)
-    except KeyboardInterrupt:
-        typer.echo(f"interrupted; --resume goes on with what is in {out}", err=True)
-        raise typer.Exit(_INTERRUPTED) from None
-    content = found.json(options)
-    shown = {p.stem: p.read_bytes() for p in (out / "pictures").glob("*.png")}
-    write_atomically(out / "plan.json", content)
-    write_atomically(out / "report.html", plan_html(json.loads(content), said.exchanges, shown))
+    with at_work(out, "plan.json", "report.html"):
+        said = _conversation(out, endpoint, model, recorded, geometry, **limits)
+        try:
+            with progress() as show, deferred_interrupt(show) as callback:
+                found = carry_out(chosen, said, options, look=look, folder=out, callback=callback)
+        except KeyboardInterrupt:
+            raise stopped(f"what is done is kept in {out}", resume=True) from None
+        content = found.json(options)
+        shown = {p.stem: p.read_bytes() for p in (out / "pictures").glob("*.png")}
+        write_atomically(out / "plan.json", content)
+        write_atomically(out / "report.html", plan_html(json.loads(content), said.exchanges, shown))
     typer.echo(
         f"{task}: {found.ended} ({len(found.carried)} steps, {found.updates} updates, {found.source})", err=as_json
     )

@@ -10,6 +10,7 @@ from typing import Annotated
 
 import typer
 
+from torchdlo.cli import ending
 from torchdlo.cli.agent import plan, propose
 from torchdlo.cli.datasets import dataset, learn, sweep
 from torchdlo.cli.doctor import doctor
@@ -36,16 +37,20 @@ app = typer.Typer(
 
 
 def main(args: list[str] | None = None) -> None:
-    """Run the command line; what is wrong with the input is one line on stderr and exit code 2."""
+    """Run the command line.
+
+    What is wrong with the input is one line on stderr and exit code 2; Ctrl-C ends it with 130, SIGTERM with 143.
+    """
     try:
-        for argument in sys.argv[1:] if args is None else args:
-            check_path(argument, "name or option")
-        app(args=args)
+        with ending.caught(args):
+            for argument in sys.argv[1:] if args is None else args:
+                check_path(argument, "name or option")
+            app(args=args)
     except InputError as error:
         typer.echo("error: " + for_terminal(" ".join(str(error).splitlines())), err=True)
         raise SystemExit(2) from None
     except OSError as error:
-        typer.echo(f"error: {for_terminal(error)}", err=True)
+        typer.echo(f"error: {for_terminal(ending.failed(error))}", err=True)
         raise SystemExit(1) from None
 
 

@@ -9,6 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
+from torchdlo.cli.ending import stopped
 from torchdlo.cli.progress import deferred_interrupt, progress
 from torchdlo.errors import InputError
 from torchdlo.files import check_writable
@@ -23,8 +24,6 @@ dataset = typer.Typer(
     rich_markup_mode="rich",
 )
 
-_INTERRUPTED = 130
-
 SetArgument = Annotated[Path, typer.Argument(help="Folder of a data set.", metavar="DATASET")]
 OutOption = Annotated[Path, typer.Option("--out", "-o", help="New folder.", metavar="DIR")]
 Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
@@ -37,14 +36,13 @@ Address = Annotated[
 ]
 
 
-def _watched(work: Callable[[Callable[[str, int, int, str], None]], Any], kept: str) -> Any:
+def _watched(work: Callable[[Callable[[str, int, int, str], None]], Any], kept: str, resume: bool = False) -> Any:
     """Do work that shows its progress; Ctrl-C ends it with a sentence."""
     try:
         with progress() as show, deferred_interrupt(show) as callback:
             return work(callback)
     except KeyboardInterrupt:
-        typer.echo(f"interrupted; {kept}", err=True)
-        raise SystemExit(_INTERRUPTED) from None
+        raise stopped(kept, resume) from None
 
 
 @dataset.command()
@@ -59,9 +57,18 @@ def make(
             metavar="scripted|FILE|DIR",
         ),
     ] = "scripted",
-    noise: Annotated[float, typer.Option(help="Disturbance of the hands, standard deviation in m.")] = 0.002,
+    noise: Annotated[
+        float | None,
+        typer.Option(help="Disturbance of the hands, standard deviation in m; what each task says if not given."),
+    ] = None,
+    fidelity: Annotated[
+        str, typer.Option(help="How tasks are simulated: published, coarse, or such as 1ms/2.", metavar="NAME")
+    ] = "published",
     size: Annotated[int, typer.Option(help="Width and height of pictures in pixels; 0 for none.")] = 128,
     codec: Annotated[str, typer.Option(help="How pictures are encoded.", metavar="h264|av1")] = "h264",
+    arms: Annotated[
+        int, typer.Option(min=1, max=2, help="Arms that the set has room for; sets of as many can be merged.")
+    ] = 1,
     seed: Annotated[int, typer.Option(min=0, help="Seed of starts, looks, words and noise.")] = 0,
     batch: Annotated[int, typer.Option(min=1, help="Attempts that are played at once.")] = 16,
     workers: Workers = None,
@@ -83,14 +90,15 @@ def make(
     from torchdlo.agents.data.making import make as run
     from torchdlo.agents.distributed import executor
 
-    plan = DatasetPlan(tuple(tasks), episodes, seed=seed, size=size, codec=codec, actor=actor, noise=noise, batch=batch)
+    options = {"size": size, "codec": codec, "actor": actor, "noise": noise, "fidelity": fidelity, "arms": arms}
+    plan = DatasetPlan(tuple(tasks), episodes, seed=seed, batch=batch, **options)
     painter = _painter() if size else None
 
     def work(callback: Callable[[str, int, int, str], None]) -> dict[str, Any]:
         with executor(workers, address) as where:
             return run(plan, out, painter=painter, executor=where, resume=resume, callback=callback)
 
-    found = _watched(work, f"what is finished stays in {out}, and --resume goes on with it")
+    found = _watched(work, f"what is finished stays in {out}", resume=True)
     if as_json:
         typer.echo(json.dumps({"path": str(out), "tasks": found}, indent=1))
     for task, count in found.items():
@@ -210,45 +218,6 @@ def view(
     typer.echo(f"page: {out}")
 
 
-@dataset.command()
-def evaluate(
-    policy: Annotated[Path, typer.Argument(help="Policy file of torchdlo learn.", metavar="POLICY")],
-    tasks: Annotated[
-        list[str] | None, typer.Argument(help="Names of tasks; those that it has learned if not given.")
-    ] = None,
-    episodes: Annotated[int, typer.Option(min=1, help="Episodes per task and condition.")] = 15,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the starts; no data set has them.")] = 0,
-    condition: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="usual, unseen_words, swapped_words or blank_pictures; may be repeated.",
-            metavar="NAME",
-        ),
-    ] = None,
-    out: Annotated[Path | None, typer.Option("--out", "-o", help="Also write the result to this file.")] = None,
-    as_json: Json = False,
-) -> None:
-    """Let a policy act in closed loop, from starts and with looks that it has not seen, and say how often it succeeds.
-
-    [bold]Example:[/bold] torchdlo dataset evaluate policy.pt --condition usual --condition swapped_words
-    """
-    from torchdlo.agents.policies.rollout import evaluate as run
-    from torchdlo.files import write_atomically
-
-    options = {"episodes": episodes, "seed": seed, "conditions": condition or ["usual"]}
-    found = _watched(lambda show: run(policy, tasks or (), _painter(), **options, callback=show), "nothing was written")
-    content = json.dumps({"generator": "torchdlo dataset evaluate"} | found, indent=1) + "\n"
-    if out is not None:
-        check_writable(out)
-        write_atomically(out, content)
-    if as_json:
-        typer.echo(content, nl=False)
-    for name, conditions in found["tasks"].items():
-        said = ", ".join(f"{kind} {row['success']:.0%}" for kind, row in conditions.items())
-        typer.echo(f"{name}: {said}", err=as_json)
-    typer.echo("mean: " + ", ".join(f"{kind} {x:.0%}" for kind, x in found["mean"].items()), err=as_json)
-
-
 def learn(
     path: SetArgument,
     out: Annotated[
@@ -277,8 +246,7 @@ def learn(
         raise InputError(f"--out: expected a file that ends in .pt, given {out}.")
     torch.set_num_threads(threads)
     training = Training(epochs=epochs, batch=batch, rate=rate, seed=seed, language=language)
-    kept = f"what was learned until the last epoch stays in {out}, and --resume goes on with it"
-    found = _watched(lambda show: run(path, out, training, resume=resume, callback=show), kept)
+    found = _learned(lambda show: run(path, out, training, resume=resume, callback=show), out)
     if found["language"] == "hashed":
         typer.echo(
             "sentences are hashed word by word, and others that mean the same may not be understood; pip install "
@@ -291,6 +259,17 @@ def learn(
         f"policy: {out}, {found['parameters']} parameters, loss {found['loss'][-1]:.4f} after {found['epochs']} epochs",
         err=as_json,
     )
+
+
+def _learned(work: Callable[[Callable[[str, int, int, str], None]], dict[str, Any]], out: Path) -> dict[str, Any]:
+    """Do the work of `learn`, and say what is left of it if it is stopped."""
+    try:
+        with progress() as show, deferred_interrupt(show) as callback:
+            return work(callback)
+    except KeyboardInterrupt:
+        if out.with_name(f"{out.stem}.checkpoint.pt").exists():
+            raise stopped(f"what was learned until the last epoch stays in {out}", resume=True) from None
+        raise stopped("no epoch was over yet, and nothing was written") from None
 
 
 def sweep(
@@ -327,7 +306,7 @@ def sweep(
         with executor(workers, address) as where:
             return start(plan, out, where, away=address is not None, resume=resume, callback=callback)
 
-    found = _watched(work, f"what is finished stays in {out}, and --resume goes on with it")
+    found = _watched(work, f"what is finished stays in {out}", resume=True)
     bad = {name: row for name, row in found.items() if not row["done"]}
     if as_json:
         typer.echo(json.dumps(found, indent=1))

@@ -10,10 +10,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from torchdlo.cli.options import INTERRUPTED, ModelOption, RecordingArgument, ResumeOption
+from torchdlo.cli.ending import stopped
+from torchdlo.cli.options import ModelOption, RecordingArgument, ResumeOption
 from torchdlo.cli.progress import deferred_interrupt, progress
 from torchdlo.errors import InputError
 from torchdlo.files import check_writable, write_atomically
+from torchdlo.journal import at_work
 
 if TYPE_CHECKING:
     from torchdlo.sysid.estimation.result import Calibration
@@ -21,7 +23,7 @@ if TYPE_CHECKING:
 
 __all__ = ["calibrate", "design_experiment", "diagnose"]
 
-_QUICK = {"starts": 12, "iterations": 5}
+_QUICK: dict[str, Any] = {"starts": 12, "iterations": 5}
 """What --quick sets unless the options say otherwise."""
 
 
@@ -76,18 +78,19 @@ def calibrate(
     _check_outputs(out, resume)
     options: dict[str, Any] = {"starts": starts, "iterations": iterations, "vertices": vertices}
     if quick:
-        options = {name: value or _QUICK.get(name) for name, value in options.items()}
+        options = {name: value or _QUICK.get(name) for name, value in options.items()} | {"refined": False}
     options = {name: value for name, value in options.items() if value is not None} | _given(model)
-    result = _run_calibration(
-        loaded, seed=seed, rest=rest, checkpoint=out.with_name("checkpoint.json"), resume=resume, **options
-    )
-    _write_outputs(result, loaded, recording, out, quiet=as_json)
+    with at_work(out.parent, *_written(out)):
+        result = _run_calibration(
+            loaded, seed=seed, rest=rest, checkpoint=out.with_name("checkpoint.json"), resume=resume, **options
+        )
+        _write_outputs(result, loaded, recording, out, quiet=as_json)
     if as_json:
         from torchdlo.sysid.estimation.result import summary_json
 
         typer.echo(summary_json(result, recording), nl=False)
     if result.interrupted:
-        raise typer.Exit(INTERRUPTED)
+        raise stopped(f"the best so far is in {out}", resume=not loaded.filmed)
 
 
 def diagnose(
@@ -129,7 +132,7 @@ def diagnose(
     torchdlo diagnose my_rope --model runs/my_rope/model.json --out runs/my_rope_2
     """
     from torchdlo.report.pages import diagnosis as report
-    from torchdlo.sysid.diagnosis.findings import findings_json, model_json, summary
+    from torchdlo.sysid.diagnosis.findings import findings_json, limits_text, model_json, summary
     from torchdlo.sysid.diagnosis.search import diagnose as search
     from torchdlo.sysid.recordings.recording import load_recording
 
@@ -141,19 +144,23 @@ def diagnose(
     options = {"budget": budget, "seed": seed, "vertices": vertices, "trials": trials, "workers": workers}
     options |= _given(model) | {"without": exclude_effect or ()}
     journal = out / "journal"
-    try:
-        with progress() as show, deferred_interrupt(show) as callback:
-            result = search(loaded, **options, callback=callback, journal=journal, resume=resume)
-    except KeyboardInterrupt:
-        typer.echo(f"interrupted before there was a verdict; --resume goes on from {journal}", err=True)
-        raise SystemExit(INTERRUPTED) from None
-    # What cannot be trusted was taken out of it.
-    loaded = result.model.recording
-    write_atomically(out / "findings.json", findings_json(result, loaded))
-    write_atomically(out / "model.json", model_json(result))
-    page = report.write_report(result, loaded, out, command=shlex.join(["torchdlo", *sys.argv[1:]]))
-    shutil.rmtree(journal, ignore_errors=True)
+    with at_work(out, *names):
+        try:
+            with progress() as show, deferred_interrupt(show) as callback:
+                result = search(loaded, **options, callback=callback, journal=journal, resume=resume)
+        except KeyboardInterrupt:
+            raise stopped(*_begun(journal, "verdict")) from None
+        # What cannot be trusted was taken out of it.
+        loaded = result.model.recording
+        write_atomically(out / "findings.json", findings_json(result, loaded))
+        write_atomically(out / "model.json", model_json(result))
+        page = report.write_report(result, loaded, out, command=shlex.join(["torchdlo", *sys.argv[1:]]))
+        shutil.rmtree(journal, ignore_errors=True)
     typer.echo(summary(result, loaded), err=as_json)
+    if limits := limits_text(result):
+        typer.echo(limits, err=as_json)
+    for trial in result.misleading:
+        typer.echo(f"{trial.name} counts up to {trial.time:.2f} s only: {trial.why}", err=as_json)
     for fault in result.data_issues:
         typer.echo(f"data: {fault.trial + ': ' if fault.trial else ''}{fault.message}", err=as_json)
     typer.echo(f"findings: {out / 'findings.json'}\nreport:   {page}", err=as_json)
@@ -221,14 +228,14 @@ def design_experiment(
     options = {"seconds": seconds, "scale": scale, "mass": tip_mass, "seed": seed}
     journal = out / "journal"
     options |= {"vertices": vertices, "workers": workers, "journal": journal, "resume": resume}
-    try:
-        with progress() as show, deferred_interrupt(show) as callback:
-            design = designs.design_experiment(loaded, asked, findings=findings, callback=callback, **options)
-    except KeyboardInterrupt:
-        typer.echo(f"interrupted before there was a result; --resume goes on from {journal}", err=True)
-        raise typer.Exit(INTERRUPTED) from None
-    report.write_design(design, out, command=shlex.join(["torchdlo", *sys.argv[1:]]))
-    shutil.rmtree(journal, ignore_errors=True)
+    with at_work(out, *report.FILES):
+        try:
+            with progress() as show, deferred_interrupt(show) as callback:
+                design = designs.design_experiment(loaded, asked, findings=findings, callback=callback, **options)
+        except KeyboardInterrupt:
+            raise stopped(*_begun(journal, "result")) from None
+        report.write_design(design, out, command=shlex.join(["torchdlo", *sys.argv[1:]]))
+        shutil.rmtree(journal, ignore_errors=True)
     typer.echo(f"{designs.summary(design)}\n", err=as_json)
     typer.echo("\n".join(f"- {said}" for said in designs.rationale(design)), err=as_json)
     typer.echo(f"\n{report.design_table(design)}\n", err=as_json)
@@ -245,8 +252,14 @@ def _run_calibration(recording: Recording, **options: Any) -> Calibration:
         with progress() as show, deferred_interrupt(show) as callback:
             return fit(recording, workers=None, callback=callback, **options)
     except KeyboardInterrupt:
-        typer.echo("interrupted before there was a result; nothing was written", err=True)
-        raise SystemExit(INTERRUPTED) from None
+        raise stopped(*_begun(options["checkpoint"], "result")) from None
+
+
+def _begun(journal: Path, what: str) -> tuple[str, bool]:
+    """Return what is left of a search that was stopped, and whether it can go on."""
+    if journal.exists():
+        return f"there was no {what} yet, and what is done is kept in {journal}", True
+    return f"there was no {what} yet, and nothing was written", False
 
 
 def _given(model: Path | None) -> dict[str, Any]:
@@ -258,11 +271,16 @@ def _given(model: Path | None) -> dict[str, Any]:
     return {"given": model_file.load(model)}
 
 
-def _check_outputs(out: Path, resume: bool) -> None:
-    """Refuse before the work what could not be written after it."""
+def _written(out: Path) -> tuple[str, ...]:
+    """Return the names of what a calibration writes."""
     from torchdlo.report.pages import calibration as report
 
-    for name in (out.name, "calibration.json", "checkpoint.json", report.PAGE, report.PICTURE):
+    return (out.name, "calibration.json", "checkpoint.json", report.PAGE, report.PICTURE)
+
+
+def _check_outputs(out: Path, resume: bool) -> None:
+    """Refuse before the work what could not be written after it."""
+    for name in _written(out):
         check_writable(out.with_name(name))
     checkpoint = out.with_name("checkpoint.json")
     if resume and not checkpoint.is_file():

@@ -7,10 +7,7 @@ from typing import Annotated
 
 import typer
 
-__all__ = ["INTERRUPTED", "ModelOption", "PhotoOption", "RecordingArgument", "ResumeOption", "RopeModelOption"]
-
-INTERRUPTED = 130
-"""Exit code after Ctrl-C, as shells have it."""
+__all__ = ["ModelOption", "PhotoOption", "RecordingArgument", "ResumeOption", "RopeModelOption"]
 
 RecordingArgument = Annotated[
     Path,

@@ -8,9 +8,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from torchdlo.cli.ending import stopped
 from torchdlo.cli.progress import deferred_interrupt, progress
 from torchdlo.errors import InputError
 from torchdlo.files import check_writable, write_atomically
+from torchdlo.journal import at_work
 from torchdlo.untrusted import parse_json
 
 if TYPE_CHECKING:
@@ -19,8 +21,10 @@ if TYPE_CHECKING:
 
 __all__ = ["deploy", "evaluate", "train"]
 
-_INTERRUPTED = 130
-"""Exit code after Ctrl-C, as shells have it."""
+
+_WRITTEN = ("result.json", "log.csv", "curve.png", "policy.pt", "checkpoint.pt")
+_WRITTEN += ("robust.json", "expert.json", "clone.part", "clone.pt", "tune.part", "stages.json")
+"""What training writes."""
 
 
 def _quiet() -> None:
@@ -101,12 +105,13 @@ def train(
     given = {"episodes": episodes, "minutes": minutes, "seed": seed, "count": count, "fidelity": fidelity}
     chosen = preset(task, algo, variation=variation, **given, **_read(settings or []))
     made = find(task)
-    if algo == "hybrid":
-        _hybrid(made, chosen, out, trajectory or [], without or [], resume, as_json)
-        return
-    if trajectory or without:
+    if algo != "hybrid" and (trajectory or without):
         raise InputError(f"--trajectory and --without: they belong to hybrid, not to {algo}; leave them out.")
-    _train(made, chosen, out, resume, compiled, as_json)
+    with at_work(out, *_WRITTEN):
+        if algo == "hybrid":
+            _hybrid(made, chosen, out, trajectory or [], without or [], resume, as_json)
+        else:
+            _train(made, chosen, out, resume, compiled, as_json)
 
 
 def _read(pairs: list[str]) -> dict[str, Any]:
@@ -143,8 +148,7 @@ def _train(task: Task, settings: Settings, out: Path, resume: bool, compiled: bo
     if as_json:
         typer.echo(result, nl=False)
     if found.interrupted:
-        typer.echo("--resume goes on from the checkpoint", err=True)
-        raise typer.Exit(_INTERRUPTED)
+        raise stopped("the best so far is kept", resume=True)
 
 
 def _hybrid(
@@ -171,8 +175,7 @@ def _hybrid(
                 task, trajectories, settings, folder=out, plan=plan, stages=stages, resume=resume, callback=callback
             )
     except KeyboardInterrupt:
-        typer.echo(f"interrupted; --resume goes on from the stages in {out}", err=True)
-        raise typer.Exit(_INTERRUPTED) from None
+        raise stopped(f"what is done is kept in {out}", resume=True) from None
     for name in STAGES:
         if name in notes:
             spent = f"{notes[name]['episodes']} episodes, {notes[name]['cpu_seconds']:.0f} CPU s"
@@ -213,9 +216,15 @@ def evaluate(
     protocol: Annotated[
         list[str] | None,
         typer.Option(
-            help="one: from the one start; varied: from unseen starts; disturbed: those with other friction.",
-            metavar="one|varied|disturbed",
+            help="one: from the one start; varied: from unseen starts; disturbed: those with other friction. Of "
+            "policies of learn: varied, paraphrased (instructions that no data set has), swapped (those of another "
+            "task) or blanked (black pictures). May be repeated.",
+            metavar="NAME",
         ),
+    ] = None,
+    task: Annotated[
+        list[str] | None,
+        typer.Option(help="Of policies of learn: a task; all that it has learned if none is named.", metavar="NAME"),
     ] = None,
     film: Annotated[bool, typer.Option("--film", help="Write best.mp4 and worst.mp4 of the last protocol.")] = False,
     out: Annotated[
@@ -226,9 +235,13 @@ def evaluate(
 ) -> None:
     """Judge policies at the published fidelity, from starts that no training has seen.
 
+    Policies of learn, which see, are judged with looks that they have not seen either.
+
     [bold]Examples:[/bold]
 
     torchdlo evaluate runs/train/lifting-hybrid
+
+    torchdlo evaluate runs/dlo4/policy.pt --protocol varied --protocol paraphrased
 
     torchdlo evaluate runs/train/lifting-hybrid runs/train/lifting-hybrid-1 --protocol disturbed --film
     """
@@ -238,6 +251,18 @@ def evaluate(
     from torchdlo.envs import find
 
     _quiet()
+    if len(policies) == 1 and policies[0].suffix == ".pt":
+        from torchdlo.agents.policies.chunk_policy import is_chunk_policy
+
+        if is_chunk_policy(policies[0]):
+            if film or compiled:
+                raise InputError(
+                    f"{policies[0]}: it is a policy of learn; --film and --compiled are for those of train."
+                )
+            _evaluate_seeing(policies[0], task or [], starts, protocol or ["varied"], out, as_json)
+            return
+    if task:
+        raise InputError("--task: policies of train have one task of their own; leave it out.")
     names = protocol or ["one", "varied"]
     other = sorted(set(names) - set(PROTOCOLS))
     if other:
@@ -251,16 +276,37 @@ def evaluate(
         for name in ("best.mp4", "worst.mp4"):
             check_video(out / name)
     found, name = load_policies(policies)
-    task = find(name)
+    own = find(name)
     with progress() as show, deferred_interrupt(show) as callback:
-        results, plays = judge(found, task, starts=starts, protocols=names, callback=callback, compiled=compiled)
+        results, plays = judge(found, own, starts=starts, protocols=names, callback=callback, compiled=compiled)
     content = json.dumps({"generator": "torchdlo evaluate", "files": [str(p) for p in policies]} | results, indent=1)
     write_atomically(out / "evaluation.json", content + "\n")
     typer.echo(summary(results), err=as_json)
     typer.echo(f"results: {out / 'evaluation.json'}", err=as_json)
     if film:
-        for file in _films(task, plays[names[-1]], out):
+        for file in _films(own, plays[names[-1]], out):
             typer.echo(f"film:    {file}", err=as_json)
+    if as_json:
+        typer.echo(content)
+
+
+def _evaluate_seeing(
+    policy: Path, tasks: list[str], starts: int, protocols: list[str], out: Path | None, as_json: bool
+) -> None:
+    """Judge a policy that sees, and write what it came to beside it."""
+    from torchdlo.agents.data.painting import TaskPainter
+    from torchdlo.agents.policies.rollout import evaluate as judge
+
+    file = (out or policy.parent) / "evaluation.json"
+    check_writable(file)
+    with progress() as show, deferred_interrupt(show) as callback:
+        found = judge(policy, tasks, TaskPainter(), episodes=starts, conditions=protocols, callback=callback)
+    content = json.dumps({"generator": "torchdlo evaluate"} | found, indent=1)
+    write_atomically(file, content + "\n")
+    for name, rows in found["tasks"].items():
+        typer.echo(f"{name}: " + ", ".join(f"{kind} {row['success']:.0%}" for kind, row in rows.items()), err=as_json)
+    typer.echo("mean: " + ", ".join(f"{kind} {x:.0%}" for kind, x in found["mean"].items()), err=as_json)
+    typer.echo(f"results: {file}", err=as_json)
     if as_json:
         typer.echo(content)
 

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import signal
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
+
+from torchdlo.cli import ending
 
 __all__ = ["deferred_interrupt", "progress"]
 
@@ -70,18 +74,16 @@ def _lines() -> Callable[[str, int, int, str], None]:
 def deferred_interrupt(
     callback: Callable[[str, int, int, str], None],
 ) -> Iterator[Callable[[str, int, int, str], None]]:
-    """Let Ctrl-C raise KeyboardInterrupt only inside the callback; a second one raises at once."""
-    import signal
-    import threading
-
+    """Let Ctrl-C and SIGTERM raise KeyboardInterrupt only inside the callback; a second one raises at once."""
     if threading.current_thread() is not threading.main_thread():
         yield callback
         return
     asked = False
-    previous = signal.getsignal(signal.SIGINT)
+    previous = {s: signal.getsignal(s) for s in ending.SIGNALS}
 
     def ask(signum: int, frame: Any) -> None:
         nonlocal asked
+        ending.note(signum)
         if asked:
             raise KeyboardInterrupt
         asked = True
@@ -95,8 +97,11 @@ def deferred_interrupt(
             asked = False
             raise KeyboardInterrupt
 
-    signal.signal(signal.SIGINT, ask)
+    for each, handler in previous.items():
+        if handler is not signal.SIG_IGN:
+            signal.signal(each, ask)
     try:
         yield checked
     finally:
-        signal.signal(signal.SIGINT, previous)
+        for each, handler in previous.items():
+            signal.signal(each, handler)

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from torchdlo.cli.options import INTERRUPTED, PhotoOption
+from torchdlo.cli.ending import stopped
+from torchdlo.cli.options import PhotoOption
 from torchdlo.cli.progress import deferred_interrupt, progress
 from torchdlo.errors import InputError
 from torchdlo.files import check_writable, write_atomically
@@ -58,8 +59,7 @@ def simulate(
                 described, folder=scene.parent, frame_stride=frame_stride, compiled=compiled, callback=callback
             )
     except KeyboardInterrupt:
-        typer.echo("interrupted before there was a result; nothing was written", err=True)
-        raise typer.Exit(INTERRUPTED) from None
+        raise stopped("there was no result yet, and nothing was written") from None
     except ValueError as error:
         raise InputError(f"{scene}: {error}") from None
     save_frames(frames, files["frames"], described)
@@ -79,8 +79,10 @@ def simulate(
     if frames.problem:
         typer.echo(f"error: {frames.problem}", err=True)
         raise typer.Exit(1)
-    if frames.interrupted or not made:
-        raise typer.Exit(INTERRUPTED)
+    if frames.interrupted:
+        raise stopped(f"the frames so far are in {files['frames']}")
+    if not made:
+        raise stopped("the video was not made")
 
 
 def check_files(out: Path, *, video: bool, picture: bool, photo: bool) -> dict[str, Path]:
@@ -147,4 +149,7 @@ def view(
 
     viewer = Viewer(load_frames(path), title=str(path), host=host, port=port)
     typer.echo(f"{path}: open {viewer.address} (Ctrl-C ends it)")
-    viewer.wait()
+    try:
+        viewer.wait()
+    except KeyboardInterrupt:
+        raise stopped("the page is served no more") from None

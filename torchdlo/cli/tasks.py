@@ -8,11 +8,13 @@ from typing import Annotated, Any
 
 import typer
 
-from torchdlo.cli.options import INTERRUPTED, PhotoOption, ResumeOption, RopeModelOption
+from torchdlo.cli.ending import stopped
+from torchdlo.cli.options import PhotoOption, ResumeOption, RopeModelOption
 from torchdlo.cli.progress import deferred_interrupt, progress
 from torchdlo.cli.scenes import check_files, draw
 from torchdlo.errors import InputError
 from torchdlo.files import check_writable, write_atomically
+from torchdlo.journal import at_work
 
 __all__ = ["optimize", "play", "tasks"]
 
@@ -103,7 +105,7 @@ def play(
     if as_json:
         typer.echo(json.dumps(said, indent=1))
     if not drawn:
-        raise typer.Exit(INTERRUPTED)
+        raise stopped("what is done so far is kept")
 
 
 def optimize(
@@ -176,33 +178,33 @@ def optimize(
     from torchdlo.scene_files import cable
 
     out = out or Path("runs") / "optimize" / f"{task}-{method}{f'-{seed}' if seed else ''}"
-    for name in ("result.json", "trajectory.json", "curve.png"):
+    names = ("result.json", "trajectory.json", "curve.png")
+    for name in names:
         check_writable(out / name)
     steps = {"compiled": compiled and not recorded, "recorded": recorded}
     steps |= {"double": _is_double(dtype)} | _judged(task, grasps, reward)
     chosen = problem(task, None if rope_model is None else cable(rope_model), **steps)
     given = {"episodes": episodes, "population": population, "robust": Robust() if robust else None, "seed": seed}
     settings = preset(task, method, **given)
-    try:
-        with progress() as show, deferred_interrupt(show) as callback:
-            found = search(chosen, settings, journal=out / "journal", resume=resume, callback=callback)
-    except KeyboardInterrupt:
-        typer.echo(f"interrupted before there was a result; --resume goes on from {out / 'journal'}", err=True)
-        raise typer.Exit(INTERRUPTED) from None
-    result = result_json(found, chosen, settings)
-    write_atomically(out / "trajectory.json", trajectory_json(found, chosen))
-    write_atomically(out / "result.json", result)
-    write_atomically(out / "curve.png", learning_png({f"{task}, seed {seed}": {method: [found.curve]}}))
-    if not found.interrupted:
-        remove(out / "journal")
+    with at_work(out, *names):
+        try:
+            with progress() as show, deferred_interrupt(show) as callback:
+                found = search(chosen, settings, journal=out / "journal", resume=resume, callback=callback)
+        except KeyboardInterrupt:
+            raise stopped(f"there was no result yet, and what is done is kept in {out / 'journal'}", True) from None
+        result = result_json(found, chosen, settings)
+        write_atomically(out / "trajectory.json", trajectory_json(found, chosen))
+        write_atomically(out / "result.json", result)
+        write_atomically(out / "curve.png", learning_png({f"{task}, seed {seed}": {method: [found.curve]}}))
+        if not found.interrupted:
+            remove(out / "journal")
     typer.echo(summary(found, task), err=as_json)
     typer.echo(f"result:     {out / 'result.json'}\ntrajectory: {out / 'trajectory.json'}", err=as_json)
     typer.echo(f"curve:      {out / 'curve.png'}", err=as_json)
     if as_json:
         typer.echo(result, nl=False)
     if found.interrupted:
-        typer.echo(f"--resume goes on from {out / 'journal'}", err=True)
-        raise typer.Exit(INTERRUPTED)
+        raise stopped("the best so far is kept", resume=True)
 
 
 def _judged(task: str, grasps: Path | None, reward: Path | None) -> dict[str, Any]:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from torchdlo.cli.ending import stopped
 from torchdlo.cli.progress import deferred_interrupt, progress
 from torchdlo.errors import InputError
 from torchdlo.files import check_writable, write_atomically
@@ -18,9 +19,6 @@ if TYPE_CHECKING:
     from torchdlo.vision.segment import Ranges
 
 __all__ = ["calibrate_camera", "film", "print_films", "segment"]
-
-_INTERRUPTED = 130
-"""Exit code after Ctrl-C, as shells have it."""
 
 
 def calibrate_camera(
@@ -79,8 +77,7 @@ def calibrate_camera(
         with progress() as show, deferred_interrupt(show) as callback:
             found = calibration.calibrate_camera(video, printed, name=name, callback=callback)
     except KeyboardInterrupt:
-        typer.echo("interrupted before there was a result; nothing was written", err=True)
-        raise typer.Exit(_INTERRUPTED) from None
+        raise stopped("there was no result yet, and nothing was written") from None
     from torchdlo.vision.video_file import read_video
 
     shown = read_video(video)[0][found.pictures[0]]
@@ -149,8 +146,7 @@ def segment(
         if chosen is None:
             _serve(pictures, out, port)
             if not out.exists():
-                typer.echo("stopped before anything was saved", err=True)
-                raise typer.Exit(_INTERRUPTED)
+                raise stopped("nothing was saved")
             chosen = work.load_ranges(out)
         else:
             work.save_ranges(chosen, out)
@@ -266,8 +262,7 @@ def film(
                 ropes = (frames.time, frames.pos, frames.rope, width)
                 said = film_run(*ropes, shown, out, look, masks=masks, callback=callback)
     except KeyboardInterrupt:
-        typer.echo("interrupted; nothing was written", err=True)
-        raise typer.Exit(_INTERRUPTED) from None
+        raise stopped("nothing was written") from None
     for sentence in said:
         typer.echo(sentence)
 

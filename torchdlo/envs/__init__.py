@@ -108,6 +108,7 @@ def make(
     pixels: bool | Mapping[str, Any] = False,
     fidelity: Fidelity | str | None = None,
     grasps: Sequence[int | None] | None = None,
+    scaled_actions: bool = False,
 ) -> DloEnv:
     """Return a task as a TorchRL environment.
 
@@ -133,6 +134,7 @@ def make(
             one), or such as "1ms/2"; `env.task.fidelity` says which it is.
         grasps: what each hand holds until the end, slots on the vertex axis of the scene, if not what the task says;
             None for a hand that stays open. Stages of the task are left out.
+        scaled_actions: whether actions are from -1 to 1, shares of `Task.limit`; in metres and degrees if not.
     """
     try:
         from torchdlo.envs.core.env import DloEnv
@@ -164,4 +166,5 @@ def make(
         variation=variation,
         randomize=randomize,
         pixels=pixels,
+        scaled_actions=scaled_actions,
     )

@@ -1,7 +1,7 @@
 """What comes from strangers: files of JSON and of arrays, and names that are shown.
 
-Every reader returns a value or raises `InputError`, whatever is in the file. Names are imported when used: the
-help of commands needs no reader.
+Every reader returns a value or raises `InputError`, whatever is in the file. Names are imported when used: commands
+show their help without any reader.
 """
 
 from __future__ import annotations

@@ -1,13 +1,14 @@
 """The page on which a person sets the colour of a rope: served to this machine alone, until it is saved or stopped.
 
 The server listens on the loopback address and answers only requests that name it as their host and, where they change
-something, as their origin: other pages that are open in the browser cannot use it.
+something, as their origin (`torchdlo.local_server`): other pages that are open in the browser cannot use it.
 """
 
 from __future__ import annotations
 
 import base64
 import json
+import sys
 from dataclasses import asdict
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -18,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from torchdlo.errors import InputError
+from torchdlo.local_server import HEADERS, Guard, drop_log, listen
 from torchdlo.vision.segment import Ranges, color_masks, ranges_from, ranges_of, save_ranges
 
 __all__ = ["segment_server"]
@@ -33,14 +35,25 @@ class SegmentServer(ThreadingHTTPServer):
 
     def __init__(self, pictures: np.ndarray, ranges: Ranges, out: Path, port: int) -> None:
         """Listen; see `segment_server`."""
-        super().__init__(("127.0.0.1", port), _Handler)
+        listening = listen("127.0.0.1", port)
+        super().__init__(listening.getsockname(), _Handler, bind_and_activate=False)
+        self.socket.close()
+        self.socket, self.server_address = listening, listening.getsockname()
+        self.server_name, self.server_port = self.server_address[:2]
+        self.guard, self.dropped = Guard.of(listening), drop_log("segment")
         self.pictures, self.ranges, self.out = pictures, ranges, out
         self.page = resources.files("torchdlo.vision").joinpath("segment_page.html").read_bytes()
 
     @property
     def address(self) -> str:
         """What to open."""
-        return f"http://127.0.0.1:{self.server_port}/"
+        return self.guard.address
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """Say in one line that a client was dropped."""
+        error = sys.exception()
+        if not isinstance(error, (ConnectionError, TimeoutError)):
+            self.dropped(f"{type(error).__name__}: {error}")
 
 
 def segment_server(pictures: np.ndarray, ranges: Ranges, out: Path, *, port: int = 0) -> SegmentServer:
@@ -52,16 +65,15 @@ def segment_server(pictures: np.ndarray, ranges: Ranges, out: Path, *, port: int
         out: file that Save writes.
         port: of the server; a free one if 0.
     """
-    try:
-        return SegmentServer(pictures, ranges, out, port)
-    except OSError as error:
-        raise InputError(f"port {port}: expected a free one, but it cannot be used ({error.strerror}).") from None
+    return SegmentServer(pictures, ranges, out, port)
 
 
 class _Handler(BaseHTTPRequestHandler):
     server: SegmentServer
     server_version = "torchdlo"
     sys_version = ""
+    timeout = 30
+    """Seconds that a client may say nothing."""
 
     def log_message(self, *_: Any) -> None:
         """Stay quiet."""
@@ -87,7 +99,9 @@ class _Handler(BaseHTTPRequestHandler):
             answer = {"/mask": self._mask, "/pick": self._pick, "/save": self._save}[self.path](content)
         except InputError as error:
             self._json({"error": str(error)}, HTTPStatus.BAD_REQUEST)
-        except (KeyError, TypeError, ValueError, RecursionError):
+        except OSError as error:
+            self._json({"error": f"cannot be written: {error}"}, HTTPStatus.INTERNAL_SERVER_ERROR)
+        except (KeyError, TypeError, ValueError, ArithmeticError, RecursionError):
             self._json({"error": "not understood"}, HTTPStatus.BAD_REQUEST)
         else:
             self._json(answer)
@@ -120,11 +134,12 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _trusted(self, changes: bool) -> bool:
         """Return whether it was this page that asked, for something that changes nothing or also for that."""
-        hosts = {f"{name}:{self.server.server_port}" for name in ("127.0.0.1", "localhost")}
-        origin = self.headers.get("Origin")
-        own = origin in {f"http://{h}" for h in hosts} or (origin is None and not changes)
-        if self.headers.get("Host") in hosts and own:
+        hosts, origins = (self.headers.get_all(name) or [] for name in ("Host", "Origin"))
+        why = self.server.guard.refusal(hosts, origins, changes=changes)
+        if not why:
             return True
+        self.server.dropped(why)
+        self.close_connection = True
         self._json({"error": "only this machine's own page may ask"}, HTTPStatus.FORBIDDEN)
         return False
 
@@ -135,8 +150,8 @@ class _Handler(BaseHTTPRequestHandler):
         self.send_response(status)
         self.send_header("Content-Type", kind)
         self.send_header("Content-Length", str(len(body)))
-        self.send_header("Cache-Control", "no-store")
-        self.send_header("X-Content-Type-Options", "nosniff")
+        for name, value in HEADERS.items():
+            self.send_header(name, value)
         policy = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'"
         self.send_header("Content-Security-Policy", policy + "; connect-src 'self'; frame-ancestors 'none'")
         self.end_headers()

@@ -17,8 +17,8 @@ import pytest
 import torch
 from short_task import Dots, Pair, Short, plan
 
-from torchdlo.agents.data import attempts, check, open_set
-from torchdlo.agents.data.making import UNFINISHED, make
+from torchdlo.agents.data import attempts, check, merge, open_set
+from torchdlo.agents.data.making import UNFINISHED, DatasetPlan, make
 from torchdlo.agents.distributed import LocalProcesses
 from torchdlo.cli import app
 from torchdlo.envs.core import episode
@@ -81,6 +81,23 @@ def test_sets_are_as_wide_as_the_task_with_the_most_arms(tmp_path: Path) -> None
 
 
 @pytest.mark.slow
+def test_sets_of_one_arm_can_have_room_for_two(tmp_path: Path) -> None:
+    make(plan(tasks=("short",), episodes=1, arms=2, size=0), tmp_path / "one")
+    make(plan(tasks=("pair",), episodes=1, size=0), tmp_path / "two")
+    merge([tmp_path / "one", tmp_path / "two"], tmp_path / "both")
+    state = open_set(tmp_path / "both").columns()["observation.state"]
+    assert state.shape == (8, 30) and not state[:4, 15:].any() and state[4:, 15:].any()
+
+
+def test_tasks_say_their_noise_and_plans_their_fidelity() -> None:
+    usual = DatasetPlan(("coiling", "slingshot"), 1, size=0)
+    assert usual.shake("coiling").size == 0.002 and usual.shake("slingshot").size == 0.0003
+    assert DatasetPlan(("coiling", "slingshot"), 1, size=0, noise=0.001).shake("slingshot").size == 0.001
+    coarse = DatasetPlan(("coiling", "slingshot"), 1, size=0, fidelity="coarse")
+    assert [coarse.task(name).fidelity.text for name in coarse.tasks] == ["1ms/2", "1ms/4"]
+    assert usual.task("coiling").fidelity.text == "1ms/5"
+
+
 def test_workers_make_the_same_bytes(made: Path, tmp_path: Path) -> None:
     with LocalProcesses(2) as pool:
         # Workers do not know the tasks of tests: they get them with what they are told to do.
@@ -201,8 +218,11 @@ def test_wrong_requests_are_one_sentence(tmp_path: Path, capsys, monkeypatch) ->
     monkeypatch.setattr("torchdlo.cli.datasets._painter", Dots)
     cases = {
         ("make", "sweeping"): "there is no task 'sweeping'; expected one of",
+        ("make", "../short"): "there is no task '../short'; expected one of",
+        ("make", "<b>short</b>"): "there is no task '<b>short</b>'; expected one of",
         ("make", "short", "short"): "the task short is named twice",
         ("make", "short", "--noise", "0.5"): "noise: expected 0 to 0.01 m, given 0.5",
+        ("make", "short", "--fidelity", "fast"): "fidelity: it is 'fast'; expected published, or step and substeps",
         ("make", "short", "--size", "31"): "size: expected an even number of pixels",
         ("make", "short", "--codec", "gif"): "codec: expected one of h264, av1, given 'gif'",
         ("make", "short", "--actor", "nobody"): "there is no file 'nobody'; expected scripted, a trajectory.json",

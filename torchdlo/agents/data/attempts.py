@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import secrets
@@ -18,12 +19,14 @@ from torchdlo.agents.data import parquet, video
 from torchdlo.agents.data.record import Recording
 from torchdlo.agents.data.schema import Schema
 from torchdlo.agents.data.statistics import histogram
-from torchdlo.errors import InputError
-from torchdlo.untrusted import MissingFile, read_entry
+from torchdlo.files import write_atomically
+from torchdlo.journal import read_json, write_json
 
 __all__ = ["Attempt", "keep", "load", "packed", "sweep"]
 
 RECORD, FRAMES = "attempt.json", "frames.parquet"
+SUMS = "sums.json"
+"""Hashes of an attempt's files, and of the plan that it belongs to."""
 
 
 @dataclass(frozen=True)
@@ -75,14 +78,16 @@ def packed(recording: Recording, task: str, source: str, schema: Schema) -> dict
     return files
 
 
-def keep(folder: Path, files: Mapping[str, bytes]) -> None:
-    """Write the files of an attempt so that its folder is complete as soon as it is there."""
+def keep(folder: Path, files: Mapping[str, bytes], plan: str = "") -> None:
+    """Write the files of an attempt at a plan so that its folder is complete as soon as it is there."""
     folder.parent.mkdir(parents=True, exist_ok=True)
     temporary = folder.with_name(f".{secrets.token_hex(4)}-{folder.name}")
     try:
         temporary.mkdir()
         for name, content in files.items():
-            (temporary / name).write_bytes(content)
+            write_atomically(temporary / name, content)
+        sums = {name: hashlib.sha256(content).hexdigest() for name, content in files.items()}
+        write_json(temporary / SUMS, {"plan": plan, "files": sums})
         os.rename(temporary, folder)
     except OSError as error:
         if error.errno is not None:
@@ -99,12 +104,22 @@ def sweep(folder: Path) -> None:
             shutil.rmtree(file, ignore_errors=True)
 
 
-def load(folder: Path) -> Attempt | None:
-    """Return the attempt in a folder, or None if there is none."""
-    file = folder / RECORD
-    try:
-        return Attempt(folder, read_entry(file, "the record of an attempt").object())
-    except MissingFile:
+def load(folder: Path, plan: str | None = None) -> Attempt | None:
+    """Return the attempt at a plan, or at any, in a folder, None if there is none that is whole."""
+    record = read_json(folder / RECORD)
+    if record is None or "success" not in record:
         return None
-    except InputError as error:
-        raise InputError(f"{error} Remove {folder} and --resume.") from None
+    if not (folder / SUMS).exists():  # earlier versions had none
+        return Attempt(folder, record)
+    sums = read_json(folder / SUMS)
+    try:
+        whole = sums is not None and plan in (None, sums["plan"]) and RECORD in sums["files"]
+        whole = whole and all(_hash(folder / name) == seal for name, seal in sums["files"].items())
+    except (KeyError, TypeError, AttributeError, OSError):
+        return None
+    return Attempt(folder, record) if whole else None
+
+
+def _hash(file: Path) -> str:
+    with file.open("rb") as content:
+        return hashlib.file_digest(content, "sha256").hexdigest()

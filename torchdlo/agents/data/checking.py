@@ -101,8 +101,10 @@ def _numbers(data: DataSet, columns: dict[str, np.ndarray]) -> Iterator[str]:
     for k, row in enumerate(data.episodes):
         end = start + row["length"]
         if (row["episode_index"], row["dataset_from_index"], row["dataset_to_index"]) != (k, start, end):
-            yield f"{data.path}: episode {k} is said to have frames {row['dataset_from_index']} to "
-            yield f"{row['dataset_to_index']}; by the lengths they are {start} to {end}."
+            yield (
+                f"{data.path}: episode {k} is said to have frames {row['dataset_from_index']} to "
+                f"{row['dataset_to_index']}; by the lengths they are {start} to {end}."
+            )
             return
         at = np.arange(row["length"])
         own = {name: values[start:end] for name, values in columns.items()}
@@ -113,12 +115,16 @@ def _numbers(data: DataSet, columns: dict[str, np.ndarray]) -> Iterator[str]:
         for name, values in wanted.items():
             bad = np.flatnonzero(own[name] != values)
             if len(bad):
-                yield f"{data.path}: {name} is {own[name][bad[0]]} in frame {bad[0]} of episode {k}; expected "
-                yield f"{values[bad[0]]}."
+                yield (
+                    f"{data.path}: {name} is {own[name][bad[0]]} in frame {bad[0]} of episode {k}; expected "
+                    f"{values[bad[0]]}."
+                )
         told = {data.tasks[t] if 0 <= t < len(data.tasks) else None for t in np.unique(own["task_index"]).tolist()}
         if told != set(row["tasks"]):
-            yield f"{data.path}: the frames of episode {k} have the instructions {sorted(map(str, told))}; the table "
-            yield f"of episodes says {row['tasks']}."
+            yield (
+                f"{data.path}: the frames of episode {k} have the instructions {sorted(map(str, told))}; the table of "
+                f"episodes says {row['tasks']}."
+            )
         start = end
 
 

@@ -6,8 +6,8 @@ how often the run was stopped and resumed, makes no difference to any byte of th
 
 from __future__ import annotations
 
-import fcntl
 import functools
+import hashlib
 import json
 import os
 import shutil
@@ -26,11 +26,10 @@ from torchdlo.agents.data.record import Noise, Painter, record, starts
 from torchdlo.agents.data.schema import Schema
 from torchdlo.agents.distributed import Executor, Serial
 from torchdlo.agents.trajopt.search_journal import versions
-from torchdlo.envs import find
+from torchdlo.envs import Task, find, simulated
 from torchdlo.envs.core import episode
 from torchdlo.errors import InputError
-from torchdlo.files import write_atomically
-from torchdlo.untrusted import read_json
+from torchdlo.journal import locked, read_json, write_json
 
 __all__ = ["UNFINISHED", "DatasetPlan", "make", "report_of"]
 
@@ -54,8 +53,12 @@ class DatasetPlan:
     codec: str = "h264"
     actor: str = "scripted"
     """Who acts, see `demonstrators.demonstrator`."""
-    noise: float = 0.002
-    """See `Noise.size` [m]."""
+    noise: float | None = None
+    """See `Noise.size` [m]; what each task says (`Task.demonstration_noise`) if None."""
+    fidelity: str = "published"
+    """How tasks are simulated: "published", "coarse" (each task's own cheaper one), or such as "1ms/2"."""
+    arms: int = 1
+    """Arms that the set has room for, if not more by its tasks: sets of as many arms can be merged."""
     batch: int = 16
     """Attempts that are played at once."""
     tries: int = 8
@@ -67,14 +70,26 @@ class DatasetPlan:
         twice = {name for name in self.tasks if self.tasks.count(name) > 1}
         if twice:
             raise InputError(f"the task {', '.join(sorted(twice))} is named twice.")
-        if not 0 <= self.noise <= 0.01:
+        if self.noise is not None and not 0 <= self.noise <= 0.01:
             raise InputError(f"noise: expected 0 to 0.01 m, given {self.noise:g}.")
         _ = self.schema  # says what is wrong with names, size or codec
+        for name in self.tasks:
+            self.task(name)
 
     @property
     def schema(self) -> Schema:
         """What frames are like."""
-        return Schema(arms=max(find(name).arms.count for name in self.tasks), size=self.size, codec=self.codec)
+        return Schema(
+            arms=max(self.arms, *(find(name).arms.count for name in self.tasks)), size=self.size, codec=self.codec
+        )
+
+    def task(self, name: str) -> Task:
+        """Return a task in the fidelity of the plan."""
+        return simulated(find(name), self.fidelity)
+
+    def shake(self, name: str) -> Noise:
+        """Return the disturbance of the hands in a task."""
+        return Noise(find(name).demonstration_noise if self.noise is None else self.noise)
 
     @property
     def most(self) -> int:
@@ -93,9 +108,8 @@ class _Job:
 
 
 @functools.lru_cache(maxsize=2)
-def _prepared(task: str, batch: int) -> episode.Episode:
+def _prepared(found: Task, batch: int) -> episode.Episode:
     # Recorded steps take seconds to begin with; compiled ones take minutes and gain little in a batch.
-    found = find(task)
     return episode.prepare(found, batch, compiled=False, recorded=found.horizon > _LONG)
 
 
@@ -107,9 +121,9 @@ def _actor(task: str, actor: str) -> Demonstrator:
 def _played(job: _Job) -> list[dict[str, bytes]]:
     """Return the files of the attempts of a batch."""
     plan, actor = job.plan, _actor(job.task, job.plan.actor)
-    made = _prepared(job.task, plan.batch)
+    made = _prepared(plan.task(job.task), plan.batch)
     tries = starts(made.task, plan.seed, range(job.first, job.first + plan.batch))
-    recordings = record(made, tries, actor, plan.schema, job.painter, Noise(plan.noise))
+    recordings = record(made, tries, actor, plan.schema, job.painter, plan.shake(job.task))
     return [attempts.packed(each, job.task, actor.source, plan.schema) for each in recordings]
 
 
@@ -154,26 +168,32 @@ def make(
 def _begun(plan: DatasetPlan, out: Path, resume: bool) -> Iterator[Path]:
     """Yield the folder for what is under way; no other run may have it meanwhile."""
     folder = out / UNFINISHED
-    said = json.dumps(asdict(plan) | {"versions": versions()}, indent=1) + "\n"
+    said = _said(plan)
     if (folder / PLAN).is_file():
         if not resume:
             raise InputError(f"{out}: a run was begun there; --resume goes on with it, or choose another --out.")
-        if (folder / PLAN).read_text(encoding="utf-8") != said:
+        # Attempts say themselves which plan they belong to, should it be damaged.
+        if (read_json(folder / PLAN) or said) != said:
             raise InputError(
                 f"{out}: what was begun there has other options or versions, see {folder / PLAN}; give the same, or "
                 "choose another --out."
             )
     elif out.exists() and (not out.is_dir() or any(p.name != UNFINISHED for p in out.iterdir())):
         raise InputError(f"{out}: it exists already; choose another --out.")
-    folder.mkdir(parents=True, exist_ok=True)
-    with (folder / ".lock").open("w") as lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise InputError(f"{out}: another run is at work there; wait for it, or choose another --out.") from None
-        write_atomically(folder / PLAN, said)
+    with locked(folder):
+        write_json(folder / PLAN, said)
         attempts.sweep(folder)
         yield folder
+
+
+def _said(plan: DatasetPlan) -> dict[str, Any]:
+    """Return what the attempts at a plan depend on, as it is written down."""
+    return json.loads(json.dumps(asdict(plan) | {"versions": versions()}))
+
+
+def _key(plan: DatasetPlan) -> str:
+    """Return a hash of it."""
+    return hashlib.sha256(json.dumps(_said(plan), sort_keys=True).encode()).hexdigest()
 
 
 def _gather(
@@ -188,8 +208,10 @@ def _gather(
     place = folder / task
     known: dict[int, attempts.Attempt] = {}
     for each in sorted(place.glob("[0-9]*")):
-        if (found := attempts.load(each)) is not None:
+        if (found := attempts.load(each, _key(plan))) is not None:
             known[int(each.name)] = found
+        else:
+            shutil.rmtree(each, ignore_errors=True)  # it is played again
 
     def good() -> int:
         return sum(each.success for each in known.values())
@@ -209,7 +231,7 @@ def _gather(
         for k, files in executor.map(_played, jobs):
             for number, content in enumerate(files, jobs[k].first):
                 if number not in known:
-                    attempts.keep(place / f"{number:06d}", content)
+                    attempts.keep(place / f"{number:06d}", content, _key(plan))
                     known[number] = attempts.Attempt(place / f"{number:06d}", json.loads(content[attempts.RECORD]))
             told()
     return line

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchdlo.agents.data.schema import SIDES
 from torchdlo.envs.core import episode
 from torchdlo.envs.observations.pixels import CameraRig, camera_rig, rendered
 from torchdlo.vision.look import Look, draw_look
@@ -23,8 +22,8 @@ def _rig(made: episode.Episode, size: int) -> CameraRig:
 
 
 @functools.lru_cache(maxsize=256)
-def _look(seed: int) -> Look:
-    return draw_look(torch.Generator().manual_seed(seed))
+def _look(seed: int, jitter: float) -> Look:
+    return draw_look(torch.Generator().manual_seed(seed), strength=jitter)
 
 
 @dataclass(frozen=True)
@@ -33,8 +32,10 @@ class TaskPainter:
 
     samples: int = 4
     """Per pixel, 1 or 4."""
-    shadow: int = 512
+    shadow: int = 256
     """Texels of the map of shadows along each side; 0 for no shadows."""
+    jitter: float = 0.3
+    """Errors of the cameras, see `look.draw_look`: deviations of 0.34 degrees, 2.4 mm and 0.6 % of the focal length."""
 
     def __call__(
         self, made: episode.Episode, world: episode.EpisodeState, looks: Sequence[int], size: int
@@ -42,6 +43,7 @@ class TaskPainter:
         """Return pictures by camera, see `record.Painter`; the first arm has the right wrist."""
         rig = _rig(made, size)
         quality = {"samples": self.samples, "shadow": self.shadow}
-        seen = rendered(rig, world.state, world.joints, looks=[_look(seed) for seed in looks], **quality).rgb
-        names = [camera.name if camera.arm is None else f"wrist_{SIDES[camera.arm]}" for camera in rig.cameras]
-        return {name: seen[:, k] for k, name in enumerate(names)}
+        seen = rendered(
+            rig, world.state, world.joints, looks=[_look(seed, self.jitter) for seed in looks], **quality
+        ).rgb
+        return {camera.name: seen[:, k] for k, camera in enumerate(rig.cameras)}

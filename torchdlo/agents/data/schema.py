@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+from torchdlo.envs.observations.cameras import SIDES
 from torchdlo.errors import InputError
 
 __all__ = ["CODECS", "DEFAULTS", "JOINTS", "SIDES", "STATE", "Schema", "cameras", "data_path", "video_path"]
@@ -20,8 +21,6 @@ CHUNK = 1000
 """Files in a folder."""
 DATA_MB, VIDEO_MB = 100, 200
 """Size of a file from which on the next episode begins another one [MB]."""
-SIDES = ("right", "left")
-"""What the arms of a task are called, in order."""
 JOINTS = 7
 POSE = ("x", "y", "z", "qw", "qx", "qy", "qz")
 STATE = (*(f"joint_{k}" for k in range(JOINTS)), "opening", *POSE)

@@ -100,7 +100,8 @@ class LocalProcesses(_Closing):
                             tries[each] += 1
                             if tries[each] > AGAIN:
                                 raise InputError(
-                                    "a worker process died again and again; give --workers 1 if memory is short."
+                                    "a worker process died again and again, as where memory is short: give --workers "
+                                    "1, and --resume goes on with what is done."
                                 ) from None
                         todo += lost
                         break

@@ -25,8 +25,7 @@ from typing import Any
 
 from torchdlo.agents.distributed import executors
 from torchdlo.errors import InputError
-from torchdlo.files import write_atomically
-from torchdlo.untrusted import read_json
+from torchdlo.journal import at_work, read_json, write_json
 
 __all__ = ["KINDS", "Job", "Sweep", "run"]
 
@@ -97,7 +96,8 @@ class _Outcome:
 
 
 def _command(job: Job, folder: Path) -> list[str]:
-    begun = any(any(folder.glob(pattern)) for pattern in _BEGUN)
+    # A data set that is finished says so itself.
+    begun = any(any(folder.glob(pattern)) for pattern in (*_BEGUN, "meta/info.json"))
     resume = ["--resume"] if begun else []
     return [sys.executable, "-m", "torchdlo", *job.command, "--out", str(folder), *resume]
 
@@ -164,17 +164,48 @@ def run(
         resume: go on with a sweep that was begun there; what failed is tried again.
         callback: told (stage, jobs done, in all, message); may raise KeyboardInterrupt.
     """
-    jobs, said = sweep.jobs, json.dumps({"generator": "torchdlo sweep"} | asdict(sweep), indent=1) + "\n"
+    _check_plan(sweep, out, resume)
+    with at_work(out, PLAN):
+        return _run(sweep, out, executor, away, callback)
+
+
+def _said(sweep: Sweep) -> dict[str, Any]:
+    return json.loads(json.dumps({"generator": "torchdlo sweep"} | asdict(sweep)))
+
+
+def _check_plan(sweep: Sweep, out: Path, resume: bool) -> None:
+    """Refuse a folder in which this sweep was not begun."""
     plan = out / PLAN
     if plan.is_file():
         if not resume:
             raise InputError(f"{out}: a sweep was begun there; --resume goes on with it, or choose another --out.")
-        if plan.read_text(encoding="utf-8") != said:
+        found = read_json(plan)
+        if found is None:
+            raise InputError(f"{plan}: it is damaged; remove it, and the folders of another sweep, then --resume.")
+        if found != _said(sweep):
             raise InputError(f"{out}: another sweep was begun there, see {plan}; choose another --out.")
-    elif out.exists() and (not out.is_dir() or any(out.iterdir())):
+    elif out.exists() and (not out.is_dir() or (any(_visible(out)) and not resume)):
         raise InputError(f"{out}: it exists already; choose another --out.")
-    write_atomically(plan, said)
-    todo = [job for job in jobs if not (out / DONE / f"{job.name}.json").is_file()]
+    elif resume and out.exists():
+        names = {job.name for job in sweep.jobs} | {DONE, FAILED}
+        if any(p.name not in names for p in _visible(out)):
+            raise InputError(f"{out}: it exists already, and holds more than this sweep; choose another --out.")
+
+
+def _visible(folder: Path) -> list[Path]:
+    return [p for p in folder.iterdir() if not p.name.startswith(".")]
+
+
+def _run(
+    sweep: Sweep,
+    out: Path,
+    executor: executors.Executor,
+    away: bool,
+    callback: Callable[[str, int, int, str], None] | None,
+) -> dict[str, Any]:
+    jobs = sweep.jobs
+    write_json(out / PLAN, _said(sweep))
+    todo = [job for job in jobs if read_json(out / DONE / f"{job.name}.json") is None]
     done = len(jobs) - len(todo)
     work = _elsewhere if away else functools.partial(_here, root=str(out))
     if callback is not None:
@@ -192,7 +223,7 @@ def _noted(out: Path, job: Job, went: _Outcome) -> bool:
     good = went.code == 0
     if good and went.files is not None:
         _unpack(went.files, out / job.name)
-    write_atomically(out / (DONE if good else FAILED) / f"{job.name}.json", json.dumps(note, indent=1) + "\n")
+    write_json(out / (DONE if good else FAILED) / f"{job.name}.json", note)
     if good:
         (out / FAILED / f"{job.name}.json").unlink(missing_ok=True)
     return good
@@ -202,9 +233,8 @@ def _report(out: Path, jobs: Sequence[Job]) -> dict[str, Any]:
     found: dict[str, Any] = {}
     for job in jobs:
         for folder in (DONE, FAILED):
-            file = out / folder / f"{job.name}.json"
-            if file.is_file():
-                note = read_json(file, "the note of a job", finite=False)
+            note = read_json(out / folder / f"{job.name}.json")
+            if note is not None:
                 found[job.name] = {"done": folder == DONE, "seconds": note["seconds"], "message": note["message"]}
                 break
     return found

@@ -21,10 +21,10 @@ from torchdlo.errors import InputError
 
 __all__ = ["CONDITIONS", "PolicyDemonstrator", "evaluate"]
 
-CONDITIONS = ("usual", "unseen_words", "swapped_words", "blank_pictures")
-"""How a policy is judged: with instructions of data sets; with others that mean the same; with those of another task,
-when it should not succeed; and with black pictures, when it should not either."""
-AGAIN = 4
+CONDITIONS = ("varied", "paraphrased", "swapped", "blanked")
+"""How a policy is judged, always from unseen starts: with instructions of data sets; with others that mean the same;
+with those of another task, when it should not succeed; and with black pictures, when it should not either."""
+AGAIN = 8
 """Actions after which it looks again."""
 
 
@@ -95,7 +95,7 @@ def evaluate(
     *,
     episodes: int = 15,
     seed: int = 0,
-    conditions: Sequence[str] = ("usual",),
+    conditions: Sequence[str] = ("varied",),
     callback: Callable[[str, int, int, str], None] | None = None,
 ) -> dict[str, Any]:
     """Return how often a policy succeeds from unseen starts, with unseen looks and without noise.
@@ -123,7 +123,7 @@ def evaluate(
             attempts = [
                 _told(s, name, names, condition) for s in starts(made.task, f"evaluate {seed}", range(episodes))
             ]
-            who = replace(actor, blank=condition == "blank_pictures")
+            who = replace(actor, blank=condition == "blanked")
             with torch.no_grad():
                 steps, end, _ = play_batch(made, attempts, who, Noise(0.0), painter)
             returns = torch.stack([step.reward for step in steps]).sum(0)
@@ -148,12 +148,13 @@ def _prepared(name: str, count: int) -> episode.Episode:
 
 def _told(start: Start, name: str, names: Sequence[str], condition: str) -> Start:
     """Return an attempt with the instruction of its condition."""
-    if condition == "unseen_words":
+    if condition == "paraphrased":
         said = sentences.unseen(name)
-    elif condition == "swapped_words":
-        others = [other for other in names if other != name]
+    elif condition == "swapped":
+        paired = find(name).counterpart
+        others = [paired] if paired else [other for other in names if other != name]
         if not others:
-            raise InputError("swapped_words needs another task, whose instructions are given; name one more.")
+            raise InputError("swapped needs another task, whose instructions are given; name one more.")
         said = sentences.learned(others[start.number % len(others)])
     else:
         return start

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
+import shutil
 import tempfile
 import time
 from collections.abc import Callable
@@ -15,13 +16,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchdlo.agents.checkpoint import load_checkpoint, save_checkpoint
 from torchdlo.agents.data.reading import DataSet, open_set
 from torchdlo.agents.policies import language
 from torchdlo.agents.policies.chunk_policy import ChunkPolicy, Shape, save_policy
 from torchdlo.agents.trajopt.search_journal import versions
 from torchdlo.errors import InputError
-from torchdlo.files import replacing
-from torchdlo.untrusted.tensor_file import read_tensors
+from torchdlo.journal import locked, sweep
 
 __all__ = ["Training", "learn"]
 
@@ -46,6 +47,10 @@ class Training:
     """Actions that the policy looks ahead."""
     width: int = 128
     """Numbers of a token of the network."""
+    proprioception: bool = False
+    """Whether it is told where its arms are, see `chunk_policy`."""
+    recolor: float = 0.2
+    """Most that each of the colours of a picture is made lighter or darker [1]."""
     seed: int = 0
     language: str = "auto"
     """"minilm", "hashed", or the better one that is installed."""
@@ -64,8 +69,10 @@ class _Frames:
     state: Tensor
     target: Tensor
     """Shape (N, 3 R)."""
+    first: Tensor
+    """Number of the first frame of each frame's episode, shape (N,)."""
     last: Tensor
-    """Number of the last frame of each frame's episode, shape (N,)."""
+    """Number of the last one, shape (N,)."""
     sentence: Tensor
     """Vectors of the instructions, shape (tasks, 384)."""
     told: Tensor
@@ -89,7 +96,7 @@ def _read(data: DataSet, encoder: str, folder: Path, callback: Callable[[str, in
         raise InputError(
             f"{data.path}: has no column {', '.join(sorted(missing))}; make it with torchdlo dataset make."
         )
-    last = np.zeros(count, np.int64)
+    first, last = np.zeros((2, count), np.int64)
     pictures = {}
     for camera in data.cameras:
         height, width, _ = data.features[camera]["shape"]
@@ -97,7 +104,7 @@ def _read(data: DataSet, encoder: str, folder: Path, callback: Callable[[str, in
         pictures[camera.removeprefix(IMAGES)] = np.memmap(file, np.uint8, "w+", shape=(count, 3, height, width))
     for k, row in enumerate(data.episodes):
         start, end = row["dataset_from_index"], row["dataset_to_index"]
-        last[start:end] = end - 1
+        first[start:end], last[start:end] = start, end - 1
         for camera in data.cameras:
             shots = np.stack(list(data.pictures(k, camera)))
             pictures[camera.removeprefix(IMAGES)][start:end] = shots.transpose(0, 3, 1, 2)
@@ -106,6 +113,7 @@ def _read(data: DataSet, encoder: str, folder: Path, callback: Callable[[str, in
     return _Frames(
         torch.from_numpy(columns["observation.state"].copy()),
         torch.from_numpy(np.ascontiguousarray(target)),
+        torch.from_numpy(first),
         torch.from_numpy(last),
         language.encode(data.tasks, encoder),
         torch.from_numpy(columns["task_index"].copy()),
@@ -137,7 +145,10 @@ def learn(
     if resume and not checkpoint.is_file():
         raise InputError(f"{checkpoint}: there is no checkpoint to resume; leave out --resume.")
     begun = time.monotonic()
-    with tempfile.TemporaryDirectory(prefix=".frames-", dir=_parent(out)) as folder:
+    with (
+        locked(out.parent, f".{out.name}.lock"),
+        tempfile.TemporaryDirectory(prefix=_swept(out), dir=out.parent) as folder,
+    ):
         frames = _read(data, encoder, Path(folder), told)
         run = _Run(data, frames, training, encoder)
         if resume:
@@ -150,9 +161,13 @@ def learn(
     return run.about() | {"seconds": round(time.monotonic() - begun, 1)}
 
 
-def _parent(out: Path) -> Path:
-    out.parent.mkdir(parents=True, exist_ok=True)
-    return out.parent
+def _swept(out: Path) -> str:
+    """Remove what a run that was killed left half done; return how the name of the folder of pictures begins."""
+    prefix = f".frames-{out.stem}-"
+    for left in out.parent.glob(f"{prefix}*"):
+        shutil.rmtree(left, ignore_errors=True)
+    sweep(out.parent, out.name, f"{out.stem}.checkpoint.pt")
+    return prefix
 
 
 class _Run:
@@ -165,25 +180,29 @@ class _Run:
             arms=frames.target.shape[1] // 3,
             cameras=cameras,
             size=frames.pictures[cameras[0]].shape[-1],
-            state=frames.state.shape[1],
+            state=frames.state.shape[1] if training.proprioception else 0,
             chunk=training.chunk,
             width=training.width,
         )
         with torch.random.fork_rng(devices=()):
             torch.manual_seed(training.seed)
             self.policy = ChunkPolicy(shape)
-        for name, x in (("state", frames.state), ("target", frames.target)):
+        kept = {"target": frames.target} | ({"state": frames.state} if training.proprioception else {})
+        for name, x in kept.items():
             getattr(self.policy, f"{name}_mean").copy_(x.mean(0))
             getattr(self.policy, f"{name}_std").copy_(x.std(0, correction=0).clamp(min=LEAST))
         self.averaged = copy.deepcopy(self.policy).eval()
         self.optimizer = torch.optim.AdamW(self.policy.parameters(), training.rate, weight_decay=training.decay)
         self.epoch, self.curve = 0, list[float]()
-        self.steps = -(-len(frames.state) // training.batch)
+        # An epoch has every episode as often as every other, short ones as long ones.
+        longest = int((frames.last - frames.first).max()) + 1
+        self.seen = longest * len(data.episodes)
+        self.steps = -(-self.seen // training.batch)
 
     def train(self, told: Callable[[str, int, int, str], None]) -> None:
-        """Go once through all frames, in an order that the number of the epoch decides."""
+        """Go once through all episodes, in an order that the number of the epoch decides."""
         generator = torch.Generator().manual_seed(self.training.seed * 100_003 + self.epoch)
-        order = torch.randperm(len(self.frames.state), generator=generator)
+        order = self._order(generator)
         total, all_steps = 0.0, self.steps * self.training.epochs
         self.policy.train()
         for k, at in enumerate(order.split(self.training.batch)):
@@ -191,6 +210,7 @@ class _Run:
             for group in self.optimizer.param_groups:
                 group["lr"] = self.training.rate * _schedule(done, all_steps)
             shots, state, sentence, target = self.frames.batch(at, self.training.chunk)
+            shots = {name: _recolored(x, self.training.recolor, generator) for name, x in shots.items()}
             wanted = (target - self.policy.target_mean) / self.policy.target_std
             loss = (self.policy.scaled(shots, state, sentence) - wanted).abs().mean()
             self.optimizer.zero_grad()
@@ -202,6 +222,17 @@ class _Run:
             told("learn", done + 1, all_steps, f"loss {total / (len(at) * (k + 1)):.4f}")
         self.epoch += 1
         self.curve.append(total / len(order))
+
+    def _order(self, generator: torch.Generator) -> Tensor:
+        """Return the frames of an epoch: all of the longest episodes, those of shorter ones several times."""
+        frames, found = self.frames, []
+        longest = self.seen // len(self.data.episodes)
+        for first in frames.first.unique().tolist():
+            length = int(frames.last[first]) - first + 1
+            rounds = [torch.randperm(length, generator=generator) for _ in range(-(-longest // length))]
+            found.append(first + torch.cat(rounds)[:longest])
+        order = torch.cat(found)
+        return order[torch.randperm(len(order), generator=generator)]
 
     def _average(self, keep: float) -> None:
         with torch.no_grad():
@@ -238,17 +269,26 @@ class _Run:
             "averaged": self.averaged.state_dict(),
             "optimizer": self.optimizer.state_dict(),
         }
-        with replacing(path) as temporary:
-            torch.save(content, temporary)
+        save_checkpoint(path, content)
 
     def load(self, path: Path) -> None:
         """Go on from a checkpoint."""
-        content = read_tensors(path, "a checkpoint of torchdlo learn", cure="leave out --resume")
+        content = load_checkpoint(path)
+        if content is None:
+            raise InputError(f"{path}: the checkpoint is damaged; leave out --resume.")
         if content["same"] != self._same():
             raise InputError(f"{path}: it is of another data set or training; give the same, or leave out --resume.")
         self.epoch, self.curve = content["epoch"], content["curve"]
         for name in ("policy", "averaged", "optimizer"):
             getattr(self, name).load_state_dict(content[name])
+
+
+def _recolored(pictures: Tensor, most: float, generator: torch.Generator) -> Tensor:
+    """Return pictures (B, 3, H, W) with other colours and brightness; what is black stays black."""
+    if not most:
+        return pictures
+    factor = 1 + most * (2 * torch.rand(len(pictures), 3, 1, 1, generator=generator) - 1)
+    return (pictures * factor).clamp(max=255)
 
 
 def _schedule(done: int, total: int) -> float:

@@ -24,7 +24,8 @@ from torchdlo.agents.trajopt.result import read_trajectory
 from torchdlo.envs import Task
 from torchdlo.errors import InputError
 from torchdlo.files import write_atomically
-from torchdlo.untrusted import one_line, read_entry, read_json
+from torchdlo.journal import read_json, write_json
+from torchdlo.untrusted import one_line, read_entry
 
 __all__ = ["Expert", "Score", "candidates", "follow", "improve", "load_expert", "save_expert"]
 
@@ -121,10 +122,9 @@ class _Journal:
     def __init__(self, path: Path | None, choices: list[Any]) -> None:
         self.path, self.choices, self.rows = path, choices, []
         self.ahead: list[list[list[float]]] = []
-        if path is not None and path.is_file():
-            found = read_json(path, "the scores of experts", finite=False, cure="remove it")
-            if isinstance(found, dict) and found.get("choices") == choices:
-                self.ahead = found["rows"]
+        found = None if path is None else read_json(path)
+        if found is not None and found.get("choices") == choices:
+            self.ahead = found["rows"]
 
     def recall(self) -> list[Score] | None:
         """Return how the next batch went, if that is known."""
@@ -135,7 +135,7 @@ class _Journal:
         self.rows.append([list(vars(s).values()) for s in scores])
         if self.path is not None and not self.ahead:
             content = {"generator": "torchdlo train", "choices": self.choices, "rows": self.rows}
-            write_atomically(self.path, json.dumps(content) + "\n")
+            write_json(self.path, content, indent=None)
 
 
 @torch.no_grad()

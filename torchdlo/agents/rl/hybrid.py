@@ -11,8 +11,6 @@ validation starts; those of `evaluate` are never played here.
 from __future__ import annotations
 
 import copy
-import io
-import json
 import math
 import time
 from collections.abc import Callable, Sequence
@@ -22,6 +20,7 @@ from typing import Any
 
 import torch
 
+from torchdlo.agents.checkpoint import load_checkpoint, save_checkpoint
 from torchdlo.agents.policies import Policy, PolicySpec, load, save, task_features
 from torchdlo.agents.rl.clone import Labels, fit, labelled
 from torchdlo.agents.rl.episodes import TaskEpisodes
@@ -31,9 +30,7 @@ from torchdlo.agents.rl.rollout import collect
 from torchdlo.agents.rl.settings import Settings
 from torchdlo.envs import PUBLISHED, Task, simulated
 from torchdlo.errors import InputError
-from torchdlo.files import write_atomically
-from torchdlo.untrusted import MissingFile, read_json
-from torchdlo.untrusted.tensor_file import read_tensors
+from torchdlo.journal import read_json, write_json
 
 __all__ = ["STAGES", "Hybrid", "hybrid", "task_policy"]
 
@@ -131,14 +128,11 @@ def hybrid(
 
 
 def _notes(folder: Path) -> dict[str, Any]:
-    try:
-        return read_json(folder / "stages.json", "the notes of a training", finite=False)
-    except MissingFile:
-        return {}
+    return read_json(folder / "stages.json") or {}
 
 
 def _note(folder: Path, notes: dict[str, Any]) -> None:
-    write_atomically(folder / "stages.json", json.dumps({"generator": "torchdlo train", **notes}, indent=1) + "\n")
+    write_json(folder / "stages.json", {"generator": "torchdlo train", **notes})
 
 
 def _finish(policy: Policy, folder: Path, notes: dict[str, Any]) -> None:
@@ -243,15 +237,13 @@ class _Keeper:
         """Write all down."""
         states = {name: part.state_dict() for name, part in self.parts.items()}
         random = [torch.get_rng_state(), *(g.get_state() for g in self.generators)]
-        written = io.BytesIO()
-        torch.save({"parts": states, "random": random, "log": log}, written)
-        write_atomically(self.path, written.getvalue())
+        save_checkpoint(self.path, {"parts": states, "random": random, "log": log})
 
     def restore(self) -> list[dict[str, Any]]:
         """Go back to what was written down, if anything was; return the log."""
-        if not self.path.is_file():
+        content = load_checkpoint(self.path)
+        if content is None:
             return []
-        content = read_tensors(self.path, "a checkpoint of torchdlo train", cure="leave out --resume")
         for name, part in self.parts.items():
             part.load_state_dict(content["parts"][name])
         torch.set_rng_state(content["random"][0])

@@ -7,7 +7,6 @@ random numbers, the best policy so far and the log.
 from __future__ import annotations
 
 import copy
-import io
 import json
 import math
 import time
@@ -18,13 +17,13 @@ from typing import Any, Protocol
 
 import torch
 
+from torchdlo.agents.checkpoint import load_checkpoint, save_checkpoint
 from torchdlo.agents.policies import Policy, save
 from torchdlo.agents.rl.episodes import Episodes
 from torchdlo.agents.rl.rollout import Batch
 from torchdlo.agents.rl.settings import Settings
 from torchdlo.errors import InputError
 from torchdlo.files import write_atomically
-from torchdlo.untrusted.tensor_file import read_tensors
 
 __all__ = ["Trained", "Trainer", "train"]
 
@@ -185,9 +184,7 @@ def _write(
         "seconds": done.seconds,
         "rows": done.rows,
     }
-    written = io.BytesIO()
-    torch.save(content, written)
-    write_atomically(folder / _CHECKPOINT, written.getvalue())
+    save_checkpoint(folder / _CHECKPOINT, content)
     write_atomically(folder / "log.csv", log_csv(done.rows))
     save(done.policy, folder / "policy.pt", notes | {"episodes": done.episodes, "seconds": round(done.seconds, 1)})
 
@@ -196,7 +193,9 @@ def _restore(trainer: Trainer, episodes: Episodes, settings: Settings, done: Tra
     path = None if folder is None else folder / _CHECKPOINT
     if path is None or not path.is_file():
         raise InputError(f"{path}: expected the checkpoint of a run to resume, found none; leave out --resume.")
-    content = read_tensors(path, "a checkpoint of torchdlo train", cure="leave out --resume")
+    content = load_checkpoint(path)
+    if content is None:
+        raise InputError(f"{path}: the checkpoint is damaged; leave out --resume.")
     was, now = json.loads(content["settings"]), json.loads(json.dumps(asdict(settings)))
     free = ("episodes", "minutes", "interval")  # how long to go on may change
     other = [f"{k} {was.get(k)} (now {now[k]})" for k in now if k not in free and was.get(k) != now[k]]

@@ -7,15 +7,11 @@ same batches, and comes to where it was stopped by reading instead of playing: t
 from __future__ import annotations
 
 import ast
-import fcntl
 import functools
 import hashlib
-import io
 import json
-import os
 import shutil
 import threading
-import zipfile
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -23,14 +19,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torchdlo.agents.checkpoint import ARCHIVE, packed, unpacked
 from torchdlo.envs import TASKS
 from torchdlo.errors import InputError
-from torchdlo.files import write_atomically
+from torchdlo.journal import Journal
 
 __all__ = ["SearchJournal", "program", "remove", "versions"]
-
-_MARK = "journal.json"
-"""The file that says what a journal belongs to."""
 
 
 def versions() -> dict[str, str]:
@@ -102,77 +96,27 @@ class SearchJournal:
             options: all that the search depends on, as plain data.
             resume: go on from what is there.
         """
-        self.path, self.count, self.resume, self._lock = path, 0, resume, None
-        if path is None:
-            return
-        try:
-            self._open(path, options, resume)
-        except BaseException:
-            self.close()
-            raise
-
-    def _open(self, path: Path, options: dict[str, Any], resume: bool) -> None:
-        mark = {"generator": "torchdlo optimize", "options": options, "program": program(options["name"])}
-        mark = json.loads(json.dumps(mark))
-        found = self._found(path)
-        if resume:
-            self._check(path, found, mark)
-        path.mkdir(parents=True, exist_ok=True)
-        # Belongs to the process: it is free again however that ends.
-        self._lock = os.open(path, os.O_RDONLY)
-        try:
-            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise InputError(f"{path}: another search is writing here; choose another --out.") from None
-        except OSError:
-            pass  # some network drives have no locks
-        if resume:
-            return
-        for file in path.glob("*.pt"):
-            file.unlink()
-        write_atomically(path / _MARK, json.dumps(mark, indent=1) + "\n")
-
-    @staticmethod
-    def _found(path: Path) -> dict[str, Any] | None:
-        if not path.exists() or (path.is_dir() and not any(path.iterdir())):
-            return None
-        try:
-            found = json.loads((path / _MARK).read_text(encoding="utf-8"))
-            if found["generator"] == "torchdlo optimize":
-                return found
-        except (OSError, ValueError, KeyError, TypeError):
-            pass
-        raise InputError(f"{path}: expected a journal of torchdlo, found something else; choose another --out.")
-
-    @staticmethod
-    def _check(path: Path, found: dict[str, Any] | None, mark: dict[str, Any]) -> None:
-        if found is None:
-            raise InputError(f"{path}: expected the journal of a search to resume, found none; leave out --resume.")
-        was, now = found.get("options", {}), mark["options"]
-        other = sorted(k for k in {*was, *now} if was.get(k) != now.get(k))
-        if other:
-            said = ", ".join(f"{k} {was.get(k)} (now {now.get(k)})" for k in other)
-            raise InputError(
-                f"{path}: the journal belongs to a search with {said}; give the same, or leave out --resume."
-            )
-        if found.get("program") != mark["program"]:
-            raise InputError(f"{path}: the journal was written by another version of torchdlo; leave out --resume.")
+        self.path, self.count, self.resume, self._journal = path, 0, resume, None
+        if path is not None:
+            mark = {"generator": "torchdlo optimize", "options": options, "program": program(options["name"])}
+            mark = json.loads(json.dumps(mark))
+            other = functools.partial(_other, mark)
+            self._journal = Journal(path, mark, suffix=".pt", other=other, resume=resume, old=ARCHIVE)
 
     def close(self) -> None:
         """Let others write here."""
-        if self._lock is not None:
-            os.close(self._lock)
-            self._lock = None
+        if self._journal is not None:
+            self._journal.close()
 
     def recall(self, points: Tensor) -> dict[str, Any] | None:
         """Return what is written about the next batch, if these are its points; None if nothing is that can be read."""
-        file = self.path / f"{self.count:06d}.pt" if self.path is not None and self.resume else None
-        found = None if file is None else _whole(file)
-        if found is None:
+        content = self._journal.read(f"{self.count:06d}") if self._journal is not None and self.resume else None
+        found = None if content is None else unpacked(content)
+        if found is None or "points" not in found:
             return None
         if found["points"] != _digest(points):
             raise InputError(
-                f"{file}: expected the results of batch {self.count} of this search, found those of another one; "
+                f"{self.path}: expected the results of batch {self.count} of this search, found those of another one; "
                 "leave out --resume."
             )
         self.count += 1
@@ -180,22 +124,21 @@ class SearchJournal:
 
     def keep(self, points: Tensor, content: dict[str, Any]) -> None:
         """Write down how the next batch went."""
-        if self.path is not None:
-            # Torch hides what the system says of a full disk.
-            written = io.BytesIO()
-            torch.save(content | {"points": _digest(points)}, written)
-            write_atomically(self.path / f"{self.count:06d}.pt", written.getvalue())
+        if self._journal is not None:
+            self._journal.write(f"{self.count:06d}", packed(content | {"points": _digest(points)}))
         self.count += 1
 
 
-def _whole(file: Path) -> dict[str, Any] | None:
-    """Return what is in a file; None if there is none, or if a bit of it is not what was written."""
-    try:
-        with zipfile.ZipFile(file) as archive:
-            whole = archive.testzip() is None
-    except (OSError, EOFError, ValueError, RuntimeError, zipfile.BadZipFile):
-        return None
-    return torch.load(file, weights_only=True) if whole else None
+def _other(mark: dict[str, Any], found: dict[str, Any]) -> str:
+    """Return why a journal does not belong to a search."""
+    was, now = found.get("options", {}), mark["options"]
+    other = sorted(k for k in {*was, *now} if was.get(k) != now.get(k))
+    if other:
+        said = ", ".join(f"{k} {was.get(k)} (now {now.get(k)})" for k in other)
+        return f"the journal belongs to a search with {said}; give the same, or leave out --resume."
+    if found.get("program") != mark["program"]:
+        return "the journal was written by another version of torchdlo; leave out --resume."
+    return ""
 
 
 def _digest(points: Tensor) -> str:

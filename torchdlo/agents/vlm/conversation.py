@@ -17,7 +17,8 @@ from typing import Any, Protocol, TypeVar
 
 from torchdlo.errors import InputError
 from torchdlo.files import write_atomically
-from torchdlo.untrusted import one_line, read_json
+from torchdlo.journal import read_json, write_json
+from torchdlo.untrusted import one_line
 
 __all__ = ["Budget", "Conversation", "Model", "Picture", "Question", "Reply", "plain_text"]
 
@@ -200,12 +201,10 @@ class Conversation:
         file = self._file(number)
         if not self.resume or file is None or not file.is_file():
             return None
-        try:
-            found = read_json(file, "an exchange", finite=False)
-            fits = found["request_sha256"] == digest and isinstance(found["response"], str)
-            return found if fits and isinstance(found["tokens"], int) else None
-        except (OSError, ValueError, KeyError, TypeError):
+        found = read_json(file)
+        if found is None or found.get("request_sha256") != digest:
             return None
+        return found if isinstance(found.get("response"), str) and isinstance(found.get("tokens"), int) else None
 
     def _keep(self, found: dict[str, Any], question: Question) -> None:
         file = self._file(found["number"])
@@ -213,7 +212,7 @@ class Conversation:
             return
         for picture in question.pictures:
             write_atomically(self.folder / "pictures" / f"{picture.digest[:16]}.png", picture.png)
-        write_atomically(file, json.dumps(found, indent=1) + "\n")
+        write_json(file, found)
 
 
 def _fitting(text: str, answer: Any) -> Any:

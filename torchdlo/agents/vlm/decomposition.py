@@ -36,9 +36,9 @@ from torchdlo.envs.core import episode, scene_names
 from torchdlo.envs.core.subtask import SubTask, concluded, continue_from, opening
 from torchdlo.errors import InputError
 from torchdlo.files import write_atomically
+from torchdlo.journal import read_json, write_json
 from torchdlo.reward_language import Reward, reward
 from torchdlo.scene import State
-from torchdlo.untrusted import read_entry
 
 __all__ = ["Carried", "Look", "Options", "Result", "carry_out"]
 
@@ -230,19 +230,21 @@ class _Run:
         for picture in found.pictures:
             write_atomically(self.folder / "pictures" / f"{picture.digest[:16]}.png", picture.png)
         content = {"generator": "torchdlo plan", "key": self.key(part), **found.plain()}
-        write_atomically(file, json.dumps(content | {"actions": found.actions.tolist()}) + "\n")
+        write_json(file, content | {"actions": found.actions.tolist()}, indent=None)
 
     def recall(self, number: int, part: SubTask) -> tuple[Tensor, int] | None:
         """Return what was found for a step in a run that goes on."""
         file = self.file(number)
         if file is None or not self.talk.resume or not file.is_file():
             return None
+        content = read_json(file)
+        if content is None:
+            return None
         try:
-            content = read_entry(file, "a step that was carried out")
-            numbers = content["actions"].numbers(part.horizon, 3 * part.arms.count, most=1e6)
-            fits = content["key"].value == self.key(part)
-            return (torch.tensor(numbers, dtype=torch.float64), content["episodes"].whole(0)) if fits else None
-        except InputError:
+            actions = torch.tensor(content["actions"], dtype=torch.float64)
+            fits = content["key"] == self.key(part) and actions.shape == (part.horizon, 3 * part.arms.count)
+            return (actions, int(content["episodes"])) if fits else None
+        except (ValueError, KeyError, TypeError):
             return None
 
 

@@ -16,9 +16,10 @@ from torch import Tensor
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
+from torchdlo import notices
 from torchdlo.envs.core import episode as episodes
 from torchdlo.envs.core.episode import EpisodeState
-from torchdlo.envs.core.task import Task, combined
+from torchdlo.envs.core.task import Task, combined, succeeded
 from torchdlo.envs.observations.sensor import sensor_of
 from torchdlo.errors import InputError
 from torchdlo.physics import tree
@@ -46,8 +47,10 @@ class DloEnv(EnvBase):
         variation: bool = True,
         randomize: Mapping[str, float] | None = None,
         pixels: bool | Mapping[str, Any] = False,
+        scaled_actions: bool = False,
     ) -> None:
         """Make the scenes; arguments as in `torchdlo.envs.make`."""
+        _check_device(device)
         if not isinstance(num_envs, Integral) or isinstance(num_envs, bool) or num_envs < 1:
             raise InputError(
                 f"num_envs: it is {num_envs!r}; expected how many scenes there are, a whole number from 1 on."
@@ -57,6 +60,9 @@ class DloEnv(EnvBase):
         self._like = torch.zeros((), dtype=dtype, device=self.device)
         self.generator = torch.Generator()
         self._randomize = dict(randomize or {})
+        limit = torch.tensor(task.limit, device=self.device)
+        self._limit = torch.ones_like(limit) if scaled_actions else limit
+        self._scale = limit.to(dtype) if scaled_actions else None
         made = episodes.prepare(task, num_envs, like=self._like, compiled=compiled, recorded=recorded, segment=segment)
         _check(self._randomize, made.scene)
         self.episode, self.world, self._usual = made, made.start, made.params
@@ -72,11 +78,13 @@ class DloEnv(EnvBase):
     def _make_specs(self) -> None:
         shape, device = self.batch_size, self.device
         size = episodes.observe(self.episode, self.world).shape[-1]
-        limit = torch.tensor(self.task.limit, device=device).expand(*shape, -1)
+        limit = self._limit.expand(*shape, -1)
         self.action_spec = Bounded(-limit, limit, (*shape, self.task.width), device=device, dtype=torch.float32)
         flag = Binary(1, (*shape, 1), device=device, dtype=torch.bool)
         names = self.task.rewards(self.world.seen(self.task.arms.count))
-        combined(self.task, names, len(self.world.failed))  # says what is wrong before the first step
+        # Say what is wrong before the first step.
+        combined(self.task, names, len(self.world.failed))
+        succeeded(self.task, self.world.seen(self.task.arms.count))
         one = Unbounded((*shape, 1), device=device, dtype=torch.float32)
         self.observation_spec = Composite(
             observation=Unbounded((*shape, size), device=device, dtype=torch.float32),
@@ -141,7 +149,7 @@ class DloEnv(EnvBase):
             "observation": episodes.observe(self.episode, self.world),
             "start": self.first,
             "progress": (self.world.count / self.task.horizon).float().unsqueeze(-1),
-            "success": (self.task.success(seen) & ~self.world.failed).unsqueeze(-1),
+            "success": (succeeded(self.task, seen) & ~self.world.failed).unsqueeze(-1),
             "terms": TensorDict({n: t.float().unsqueeze(-1) for n, t in terms.items()}, self.batch_size, self.device),
             **self._images(),
         }
@@ -206,16 +214,42 @@ class DloEnv(EnvBase):
             return self._stepped(tensordict.get("action"))
 
     def _stepped(self, action: Tensor) -> TensorDict:
-        world = episodes.act(self.episode, self.world, action.to(self._like.dtype))
+        action = action.to(self._like.dtype)
+        action = action if self._scale is None else action.clamp(-1.0, 1.0) * self._scale
+        world = episodes.act(self.episode, self.world, action)
         over = world.count >= self.task.horizon
         if self.task.release and bool(over.any()):
             world = tree.where(over, episodes.finish(self.episode, world), world)
         self.world = world
         reward, _, terms = episodes.earned(self.episode, world)
+        _warn_of_nan(self.task, action, reward)
         failed, over = world.failed.unsqueeze(-1), over.unsqueeze(-1)
         flags = {"terminated": failed, "truncated": over, "done": failed | over}
         found = {**self._told(terms), "reward": reward.float().unsqueeze(-1), **flags}
         return TensorDict(found, self.batch_size, self.device)
+
+
+def _check_device(device: torch.device | str | None) -> None:
+    """Refuse a device that this machine lacks."""
+    try:
+        kind = torch.device(device or "cpu").type
+    except RuntimeError:
+        raise InputError(f"device: it is {device!r}; expected cpu, cuda or cuda:NUMBER.") from None
+    if kind == "cuda" and not torch.cuda.is_available():
+        raise InputError(f"device: it is {device}, but torch sees no GPU here; leave it out, or see `torchdlo doctor`.")
+
+
+def _warn_of_nan(task: Task, action: Tensor, reward: Tensor) -> None:
+    """Say once that actions or rewards are not finite, as nothing else would."""
+    if bool(torch.isfinite(action).all() & torch.isfinite(reward).all()):
+        return
+    if not bool(torch.isfinite(action).all()):
+        notices.once("nan actions", f"{task.name}: an action is not finite: its scene has failed; check the policy.")
+    elif not bool(torch.isfinite(reward).all()):
+        notices.once(
+            f"nan rewards of {task.name}",
+            f"{task.name}: a reward is not finite although its scene is; check the task's `rewards`.",
+        )
 
 
 def _wide(effects: dict[str, dict[str, Tensor]], like: dict[str, dict[str, Tensor]]) -> dict[str, dict[str, Tensor]]:

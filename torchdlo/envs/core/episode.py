@@ -25,7 +25,7 @@ from torchdlo.envs.core.divergence import broken, inside
 from torchdlo.envs.core.frames import guarded, run, slipped
 from torchdlo.envs.core.reach import FOLLOW, reachable, solve, standing
 from torchdlo.envs.core.stages import repeated
-from torchdlo.envs.core.task import Task, TaskState, combined
+from torchdlo.envs.core.task import Task, TaskState, combined, succeeded
 from torchdlo.envs.observations.state import observe, places
 from torchdlo.errors import InputError
 from torchdlo.physics import tree
@@ -370,7 +370,7 @@ def play(
             callback(k + 1, count)
     rewards, losses, terms = tree.stack(rows)
     seen = world.seen(task.arms.count)
-    success, short = task.success(seen) & ~world.failed, task.terminal_cost(seen)
+    success, short = succeeded(task, seen) & ~world.failed, task.terminal_cost(seen)
     loss = losses.sum(0) + torch.where(world.failed, 0.0, short)
     return EpisodeResult(rewards.sum(0), loss, short, success, world.failed, rewards, terms, world, tree.stack(path))
 

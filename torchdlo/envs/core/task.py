@@ -10,7 +10,7 @@ import functools
 import itertools
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal
 
@@ -113,11 +113,15 @@ class Task(ABC):
     """By how much each of the things that `build` can move is moved in x and in y at most [m]."""
     coarse: ClassVar[Fidelity] = Fidelity(substeps=2)
     """A cheaper fidelity that keeps what episodes earn, for training."""
+    demonstration_noise: ClassVar[float] = 0.002
+    """Disturbance of the hands that its scripted demonstration mostly copes with, standard deviation per axis [m]."""
     anchored: ClassVar[bool] = False
     """Whether scripted demonstrations lead to the same places wherever the rope starts, as what they lead to is
     fixed."""
     stages: ClassVar[tuple[Stage, ...]] = ()
     """What hands hold from which action on; if not given, they hold what they start at until the end."""
+    counterpart: ClassVar[str] = ""
+    """Name of a task that looks the same at the start, so that only the instruction tells which one is meant."""
     cameras: ClassVar[tuple[TaskCamera, ...]] = ()
     """Cameras beside or instead of the usual ones, "front" and "wrist_right" or "wrist_left" on each arm, see
     `observations.pixels.cameras_of`."""
@@ -125,6 +129,10 @@ class Task(ABC):
     """Actions that a hand takes from what it held to what it holds in the next stage."""
 
     def __post_init__(self) -> None:
+        for name, least in (("horizon", 1), ("frame_skip", 1), ("settle_steps", 0), ("release", 0)):
+            value = getattr(self, name)
+            if not isinstance(value, int) or isinstance(value, bool) or value < least:
+                raise InputError(f"{name}: it is {value!r}; expected a whole number from {least} on.")
         if not isinstance(self.rope, RopeMaterial | None):
             raise InputError(
                 f"rope: it is {self.rope!r}; expected a torchdlo.envs.Cable; "
@@ -306,6 +314,12 @@ def _schedule(stages: tuple[Stage, ...], travel: int) -> Schedule:
 
 def combined(task: Task, terms: dict[str, Tensor], count: int) -> Tensor:
     """Return the one reward that the terms of `count` scenes make, shape (B,)."""
+    if not isinstance(terms, Mapping):
+        kind = f"a tensor of shape {tuple(terms.shape)}" if isinstance(terms, Tensor) else repr(terms)
+        raise InputError(
+            f"{task.name}: rewards returned {kind}; expected a dictionary of named terms, such as "
+            f"{{'distance': tensor of shape ({count},)}}."
+        )
     found = {name: tuple(x.shape) if isinstance(x, Tensor) else x for name, x in terms.items()}
     wrong = {name: shape for name, shape in found.items() if shape != (count,)}
     if wrong or not terms:
@@ -315,6 +329,18 @@ def combined(task: Task, terms: dict[str, Tensor], count: int) -> Tensor:
         )
     parts = torch.stack(list(terms.values()))
     return parts.sum(0) if task.combine == "sum" else parts.prod(0)
+
+
+def succeeded(task: Task, seen: TaskState) -> Tensor:
+    """Return which episodes have reached the goal, bool, shape (B,), as the task says."""
+    found, count = task.success(seen), len(seen.x)
+    if isinstance(found, Tensor) and found.dtype == torch.bool and found.shape == (count,):
+        return found
+    kind = f"a tensor of {found.dtype}, {tuple(found.shape)}" if isinstance(found, Tensor) else repr(found)
+    raise InputError(
+        f"{task.name}: success returned {kind}; expected a tensor of bool of shape ({count},): compare with a "
+        "limit, and keep the first axis."
+    )
 
 
 def straight(start: tuple[float, float, float], count: int, moved: Tensor) -> Tensor:

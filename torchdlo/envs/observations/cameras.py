@@ -10,8 +10,10 @@ from torch import Tensor
 
 from torchdlo.errors import InputError
 
-__all__ = ["WRIST_EYE", "WRIST_TARGET", "TaskCamera", "front_camera", "wrist_names"]
+__all__ = ["SIDES", "WRIST_EYE", "WRIST_TARGET", "TaskCamera", "front_camera", "wrist_names"]
 
+SIDES = ("right", "left")
+"""What the arms of a task are called, in order."""
 WRIST_EYE, WRIST_TARGET = (0.135, 0.0, -0.03), (0.045, 0.0, 0.125)
 """Where a camera at the wrist is and what it looks at, in the frame of the hand [m]: 13 cm beside it, tilted inwards,
 so that the fingers are in the picture and the hand does not fill it."""
@@ -85,13 +87,10 @@ def front_camera(bases: Tensor, tools: Tensor, things: Tensor, *, name: str = "f
     return TaskCamera(name, tuple(eye.tolist()), tuple(middle.tolist()), _OPENING)
 
 
-def wrist_names(bases: Tensor, front: TaskCamera) -> tuple[str, ...]:
-    """Return names of the cameras of arms: left and right as the arms have them, which face the camera in front."""
-    if len(bases) == 1:
-        return ("wrist_right",)
-    to_eye = torch.tensor(front.eye).double() - torch.tensor(front.target).double()
-    # An arm that looks at the camera has its right hand at the left side of the picture.
-    across = bases[:, :2].double() @ torch.stack([to_eye[1], -to_eye[0]])
-    if len(bases) == 2:
-        return ("wrist_right", "wrist_left") if float(across[0]) >= float(across[1]) else ("wrist_left", "wrist_right")
-    return tuple(f"wrist_{k}" for k in range(len(bases)))
+def wrist_names(count: int) -> tuple[str, ...]:
+    """Return names of the cameras of so many arms: "right" is the first arm of a task, as in data sets."""
+    return tuple(f"wrist_{side}" for side in SIDES[:count]) if count <= len(SIDES) else _numbered(count)
+
+
+def _numbered(count: int) -> tuple[str, ...]:
+    return tuple(f"wrist_{k}" for k in range(count))

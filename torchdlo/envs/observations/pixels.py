@@ -66,7 +66,7 @@ def cameras_of(episode: Episode) -> tuple[TaskCamera, ...]:
             things.append(start.state.material_points.pos[0])
         front = front_camera(bases, tools, torch.cat(things).detach())
     found = {front.name: front}
-    for arm, name in enumerate(wrist_names(bases, front)):
+    for arm, name in enumerate(wrist_names(len(bases))):
         found[name] = TaskCamera(name, WRIST_EYE, WRIST_TARGET, opening=1.2, arm=arm)
     found |= {camera.name: camera for camera in task.cameras}
     return tuple(found[name] for name in ("front", *sorted((n for n in found if n != "front"), reverse=True)))

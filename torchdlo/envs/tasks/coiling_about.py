@@ -73,6 +73,7 @@ class CoilingLeft(_CoilingAbout):
     """Coil a rope round a cone counterclockwise."""
 
     name: ClassVar[str] = "coiling_left"
+    counterpart: ClassVar[str] = "coiling_right"
     side: ClassVar[float] = 1.0
 
 
@@ -81,4 +82,5 @@ class CoilingRight(_CoilingAbout):
     """Coil a rope round a cone clockwise."""
 
     name: ClassVar[str] = "coiling_right"
+    counterpart: ClassVar[str] = "coiling_left"
     side: ClassVar[float] = -1.0

@@ -45,6 +45,7 @@ class Slingshot(Task):
     arms: ClassVar[Arms] = Arms(base=((-0.33, -0.65, 0.0),), vertex=(6,), grip_force=3.0)
     cameras: ClassVar[tuple[TaskCamera, ...]] = (TaskCamera("front", (0.8, 0.55, 0.75), (0.1, 0.1, 0.18)),)
     coarse: ClassVar[Fidelity] = Fidelity(substeps=4)
+    demonstration_noise: ClassVar[float] = 0.0003
     reset_noise: ClassVar[tuple[tuple[float, float], ...]] = ((0.03, 0.0),)
 
     def build(self, moved: Tensor) -> tuple[Scene, Params, State]:

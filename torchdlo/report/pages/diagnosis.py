@@ -52,6 +52,8 @@ def diagnosis_html(
         _section("What the data cannot tell apart", _ties(found)),
         _section("What calibration had absorbed", _absorbed(result)),
         _section("Every candidate, and why it was left", _candidates(found)),
+        _section("How large an effect would have to be to be named here", _limits(found)),
+        _section("Trials that counted less", _misleading(found)),
         _section("What remains", listed(where.rest)),
         _section("The floor", _floor(found)),
         _section("Health of the data", _health(found)),
@@ -130,9 +132,25 @@ def _effects(found: dict[str, Any]) -> str:
         parts.append(
             f"<h3>{for_html(words(effect['name']))}</h3><p>{MEANING[effect['kind']].capitalize()}; it closes "
             f"{share} of the gap above the floor on the test trials.</p><pre>{for_html(law(effect['name']))}</pre>"
+            + _test(effect["test"])
             + (table(("number", "value", "90 % range", "unit"), rows) if rows else "")
         )
     return "".join(parts)
+
+
+def _test(test: dict[str, Any] | None) -> str:
+    """Return in words whether what an effect explains could be chance."""
+    if test is None:
+        return ""
+    doses = ", ".join("not known" if d is None else f"{d:.2f}" for d in test["dose_by_trial"])
+    over = test["p_value_over_trials"]
+    trials = "" if over is None else f" An exact F test of these doses over trials gives p {over:.2g}."
+    return (
+        f"<p>Could that be chance? By {for_html(test['method'])}: p {test['p_value']:.2g}; with all "
+        f"{test['candidates_looked_at']} candidates that were looked at, a false discovery rate of "
+        f"{test['false_discovery_rate']:.2g} (Benjamini-Hochberg). The test trials ask for {doses} times the dose "
+        f"that was fitted to the train trials.{trials}</p>"
+    )
 
 
 def _ties(found: dict[str, Any]) -> str:
@@ -193,6 +211,31 @@ def _candidate(c: dict[str, Any]) -> tuple[str, ...]:
 def _candidate_table(rows: list[tuple[str, ...]]) -> str:
     heads = ("effect", "explained by doses", "closed, train", "closed, test", "verdict", "law")
     return f'<div class="candidates">{table(heads, rows)}</div>'
+
+
+def _limits(found: dict[str, Any]) -> str:
+    rows = [
+        (
+            words(limit["name"]),
+            words(limit["number"]),
+            number(limit["easiest"], 3),
+            number(limit["hardest"], 3),
+            "" if limit["unit"] == "1" else limit["unit"],
+        )
+        for limit in found["detection_limits"]
+    ]
+    if not rows:
+        return ""
+    note = (
+        "<p class=soft>From this size on (stretch and compliance of grippers: up to it) an effect closes more of the "
+        "gap than the floor leaves open, where it is placed or directed so that it shows best, and where it shows "
+        "least. By doses on the train trials, to first order: smaller ones may be there.</p>"
+    )
+    return note + table(("effect", "number", "at best", "at worst", "unit"), rows)
+
+
+def _misleading(found: dict[str, Any]) -> str:
+    return listed([f"{t['name']} counts up to {t['time']:.2f} s only: {t['why']}." for t in found["misleading_trials"]])
 
 
 def _floor(found: dict[str, Any]) -> str:

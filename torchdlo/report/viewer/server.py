@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import contextlib
 import io
+import math
 import threading
 import time
-from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from torchdlo.errors import InputError
+from torchdlo.local_server import Guard, listen
 from torchdlo.report.render.surfaces import COLORS, bounds, pieces, points_of, spacing
+from torchdlo.report.viewer.guarded import Bounds, start
 from torchdlo.scene_files.run import Frames
 
 __all__ = ["Viewer"]
@@ -20,13 +22,17 @@ __all__ = ["Viewer"]
 _RATE = 30
 """Pictures per second while it plays."""
 
+_PORTS = 100
+"""Ports that are tried if some are taken."""
 
-def _viser() -> Any:
+_SPEEDS = (0.05, 2.0)
+
+
+def _check_viser() -> None:
     try:
-        import viser
+        import viser  # noqa: F401
     except ImportError:
         raise InputError("the viewer needs the package viser; install it with pip install 'torchdlo[view]'.") from None
-    return viser
 
 
 class Viewer:
@@ -38,26 +44,31 @@ class Viewer:
         Args:
             frames: the run.
             title: what the page is called.
-            host: address to serve at; this machine only if not given.
+            host: address to serve at; this machine only if not given. One that other machines reach has a random token
+                in its address.
             port: port to serve at; the next free one if it is taken.
         """
-        viser = _viser()
+        _check_viser()
         self.frames, self.frame = frames, -1
         self._pieces, self._points = pieces(frames), points_of(frames)
-        with contextlib.redirect_stdout(io.StringIO()):  # its banner
-            self.server = viser.ViserServer(host=host, port=port, label=title, verbose=False)
-        self.address = f"http://{host}:{self.server.get_port()}"
-        self._stopped = threading.Event()
+        listening = listen(host, port, tries=_PORTS)
+        guard, bounds = Guard.of(listening), Bounds()
+        self.server = start(listening, guard, title, bounds)
+        self.address = guard.address
+        self._stopped, self._failed = threading.Event(), None
         self._lock = threading.Lock()
         self._draw()
         gui, last = self.server.gui, len(frames.time) - 1
         self.slider = gui.add_slider("frame", min=0, max=max(last, 1), step=1, initial_value=0)
         self.playing = gui.add_checkbox("play", initial_value=False)
-        self.speed = gui.add_slider("speed", min=0.05, max=2.0, step=0.05, initial_value=1.0)
+        self.speed = gui.add_slider("speed", min=_SPEEDS[0], max=_SPEEDS[1], step=0.05, initial_value=1.0)
+        bounds[self.slider._impl.uuid] = (0, max(last, 1))
+        bounds[self.playing._impl.uuid] = None
+        bounds[self.speed._impl.uuid] = _SPEEDS
         self._label = gui.add_text("time", initial_value="", disabled=True)
-        self.slider.on_update(lambda _: self.show(int(self.slider.value)))
+        self.slider.on_update(lambda _: self.show(self._frame_set()))
         self.show(0)
-        self._thread = threading.Thread(target=self._play, daemon=True)
+        self._thread = threading.Thread(target=self._run, daemon=True)
         self._thread.start()
 
     def _draw(self) -> None:
@@ -108,28 +119,38 @@ class Viewer:
             self._label.value = f"{self.frames.time[k]:.3f} s"
             self.frame = k
 
+    def _run(self) -> None:
+        try:
+            self._play()
+        except BaseException as error:
+            self._failed = error
+
     def _play(self) -> None:
         """Move the slider with the clock while it plays; from the end go back to the start."""
         times, at, since = self.frames.time, 0.0, time.monotonic()
         while not self._stopped.wait(1 / _RATE):
             now = time.monotonic()
             if self.playing.value:
-                shown = float(times[int(self.slider.value)])
+                frame, speed = self._frame_set(), float(self.speed.value)
                 # Somebody may have moved the slider.
-                at = at if int(np.abs(times - at).argmin()) == int(self.slider.value) else shown
-                at += (now - since) * float(self.speed.value)
+                at = at if int(np.abs(times - at).argmin()) == frame else float(times[frame])
+                at += (now - since) * (min(max(speed, _SPEEDS[0]), _SPEEDS[1]) if math.isfinite(speed) else 1.0)
                 at = 0.0 if at > times[-1] else at
                 self.slider.value = int(np.abs(times - at).argmin())
             since = now
 
+    def _frame_set(self) -> int:
+        """Return the frame that the slider stands at."""
+        return min(max(int(self.slider.value), 0), len(self.frames.time) - 1)
+
     def wait(self) -> None:
-        """Serve until Ctrl-C."""
+        """Serve until Ctrl-C, which raises `KeyboardInterrupt`; what goes wrong in its thread is raised here."""
         try:
             self._until_interrupted()
-        except KeyboardInterrupt:
-            pass
         finally:
             self.stop()
+        if self._failed is not None:
+            raise self._failed
 
     def _until_interrupted(self) -> None:
         while self._thread.is_alive():

@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from torchdlo.errors import InputError
+from torchdlo.sysid.calibration import refinement
+from torchdlo.sysid.diagnosis.error_floor import noise
 from torchdlo.sysid.estimation import evaluation, levenberg_marquardt
 from torchdlo.sysid.estimation.checkpoint import Checkpoint
+from torchdlo.sysid.estimation.jobs import FitJob
 from torchdlo.sysid.estimation.levenberg_marquardt import ParameterSpace, Point
 from torchdlo.sysid.estimation.result import Calibration
 from torchdlo.sysid.estimation.worker_pool import Pool
@@ -21,6 +25,7 @@ from torchdlo.sysid.model import model_file
 from torchdlo.sysid.model.model_file import ModelFile
 from torchdlo.sysid.model.rope_model import RopeModel
 from torchdlo.sysid.model.trial_batch import Start, TrialBatch
+from torchdlo.sysid.recordings.metrics import average, mean_absolute_error
 from torchdlo.sysid.recordings.recording import Recording, Trial
 from torchdlo.sysid.video.filmed import FILMED_STARTS, calibrate_filmed
 
@@ -48,6 +53,10 @@ class _Job:
     values: np.ndarray
     given: bool = False
     point: Point | None = None
+    scouted: np.ndarray | None = None
+    """Coordinates of the best start so far."""
+    drifts: np.ndarray | None = None
+    """What all trials get wrong in the same way, in coordinates, see `levenberg_marquardt.interval`."""
 
     @property
     def columns(self) -> list[int]:
@@ -76,6 +85,7 @@ def calibrate(
     checkpoint: Path | None = None,
     resume: bool = False,
     given: ModelFile | None = None,
+    refined: bool = True,
     workers: int | None = 1,
     callback: Callback | None = None,
 ) -> Calibration:
@@ -96,6 +106,7 @@ def calibrate(
         checkpoint: file that keeps the best so far.
         resume: go on from it.
         given: model to start from in place of many starts, with its effects; it says what the rest shape is.
+        refined: whether to fit on with a finer mesh, and to find out what steps and mesh do to the numbers.
         workers: processes, one per core if None. More than one begin by importing the program's main module: a script
             that asks for them has to guard what it does by `if __name__ == "__main__":`.
         callback: see `Callback`; it may raise KeyboardInterrupt, which ends the fit with the best so far.
@@ -130,8 +141,9 @@ def calibrate(
                 for improved in _fit(job, starts, iterations, np.random.default_rng(seed), memory, report):
                     if best.point is None or best is improved or improved.point.cost < best.point.cost:
                         best = improved
+            best = _refined(best, iterations, vertices, report) if refined else best
         except KeyboardInterrupt:
-            if best is None or best.point is None:
+            if best is None or (best.point is None and not _settled(best)):
                 raise
             interrupted = True
         return _judge(best, seed, interrupted, begun, report)
@@ -179,16 +191,10 @@ def _fit(
     if kept or job.given:
         raw = job.space.to_raw(np.array(kept or job.first)[job.columns])
     else:
-        raw = _scout(job, starts, rng, report, name)
+        raw = _scout(job, starts, rng, memory, report, name)
     stage = f"fitting {len(job.motion.names)} trials, {name}"
     report(stage, 0, iterations + 1, "")
-    run = job.simulator(_usable(job.pool.recording))
-    job.start = starts_of.refine(job.model, job.motion, job.start, job.full(job.space.to_values(raw)), run)
-
-    def simulate(values: np.ndarray) -> np.ndarray:
-        return run(job.start, job.full(values), None)
-
-    points = levenberg_marquardt.evaluate(simulate, job.motion.markers, job.space, raw[None])
+    simulate, points = _begin(job, raw, memory.once)
     if not np.isfinite(points[0].cost):
         raise InputError(
             f"{job.pool.recording.path}: the simulation failed on the train trials from every start; check length, "
@@ -197,9 +203,8 @@ def _fit(
     job.point, job.values = points[0], job.full(job.space.to_values(points[0].raw))
     yield job
     report(stage, 1, iterations + 1, f"{1e3 * job.point.cost:.2f} mm")
-    for done, (point,) in enumerate(
-        levenberg_marquardt.improve(simulate, job.motion.markers, job.space, points, iterations=iterations)
-    ):
+    climbing = _climb(job, "fit", simulate, job.motion.markers, points, iterations, memory)
+    for done, (point,) in enumerate(climbing):
         job.point, job.values = point, job.full(job.space.to_values(point.raw))
         memory.keep(job.model.rest, job.values)
         yield job
@@ -207,7 +212,59 @@ def _fit(
     report(stage, iterations + 1, iterations + 1, f"{1e3 * job.point.cost:.2f} mm")
 
 
-def _scout(job: _Job, starts: int, rng: np.random.Generator, report: Callback, name: str) -> np.ndarray:
+Once = Callable[[str, str, Callable[[], Any]], Any]
+"""Called with a variant, the name of a step and what computes it; see `Checkpoint.once`."""
+
+
+def _begin(job: _Job, raw: np.ndarray, once: Once) -> tuple[levenberg_marquardt.Simulate, list[Point]]:
+    """Return what simulates all trials, and the point at some coordinates; sets where the trials begin."""
+    run, values = job.simulator(_usable(job.pool.recording)), job.full(job.space.to_values(raw))
+    start = job.start
+    job.start = once(job.model.rest, "start", lambda: starts_of.refine(job.model, job.motion, start, values, run))
+
+    def simulate(values: np.ndarray) -> np.ndarray:
+        return run(job.start, job.full(values), None)
+
+    def points() -> list[Point]:
+        return levenberg_marquardt.evaluate(simulate, job.motion.markers, job.space, raw[None])
+
+    return simulate, once(job.model.rest, "points", points)
+
+
+def _settled(job: _Job) -> bool:
+    """Let a job that was stopped while starts were tried have the best of them; return whether there is one."""
+    if job.scouted is None:
+        return False
+    _, (point,) = _begin(job, job.scouted, lambda rest, step, compute: compute())
+    if not np.isfinite(point.cost):
+        return False
+    job.point, job.values = point, job.full(job.space.to_values(point.raw))
+    return True
+
+
+def _climb(
+    job: _Job,
+    name: str,
+    simulate: levenberg_marquardt.Simulate,
+    measured: np.ndarray,
+    points: Sequence[Point],
+    iterations: int,
+    memory: Checkpoint,
+) -> Iterator[list[Point]]:
+    """Yield points as `levenberg_marquardt.improve` does; what is found is written down."""
+    climb = levenberg_marquardt.Climb(job.space, points)
+    for k in range(iterations):
+        tries = climb.tries()
+        if not len(tries):
+            return
+        look = partial(levenberg_marquardt.evaluate, simulate, measured, job.space, tries)
+        climb.take(memory.once(job.model.rest, f"{name} {k}", look))
+        yield list(climb.points)
+
+
+def _scout(
+    job: _Job, starts: int, rng: np.random.Generator, memory: Checkpoint, report: Callback, name: str
+) -> np.ndarray:
     """Return coordinates to start the fit from: many starts on a few trials, fewer and fewer over longer times.
 
     In its first second a rope has not forgotten where it began and the cost has few local minima; over a long horizon
@@ -215,34 +272,84 @@ def _scout(job: _Job, starts: int, rng: np.random.Generator, report: Callback, n
     """
     trials = _usable(job.pool.recording)
     scouts = [trials[i] for i in _pick(len(trials), _SCOUTS)]
-    motion, begin, run = job.model.motion(scouts), starts_of.begin(job.model, scouts), job.simulator(scouts)
-    begin = starts_of.refine(job.model, motion, begin, job.values, run)
+    motion, first, run = job.model.motion(scouts), starts_of.begin(job.model, scouts), job.simulator(scouts)
+    once = partial(memory.once, job.model.rest)
+    begin = once("scouts' start", lambda: starts_of.refine(job.model, motion, first, job.values, run))
     stage, total = f"trying {starts} starts, {name}", 2 + _LOOKS
 
     def over(share: float) -> tuple[levenberg_marquardt.Simulate, np.ndarray]:
         frames = min(max(10, round(share * motion.markers.shape[1])), motion.markers.shape[1])
         return lambda values: run(begin, values, frames), motion.markers[:, :frames]
 
+    def costs(share: float, raws: np.ndarray) -> np.ndarray:
+        simulate, measured = over(share)
+        return levenberg_marquardt.costs(simulate(job.space.to_values(raws)), measured)
+
     raws = _spread(job, starts, rng)
     report(stage, 0, total, "")
     for look, (share, keep) in enumerate(((0.3, max(2, starts // 3)), (1.0, max(2, starts // 8)))):
-        simulate, measured = over(share)
-        costs = levenberg_marquardt.costs(simulate(job.space.to_values(raws)), measured)
-        raws = raws[np.argsort(costs, kind="stable")[:keep]]
-        report(stage, look + 1, total, f"{1e3 * costs.min():.2f} mm over {share:.0%} of the time")
+        found = once(f"costs {look}", partial(costs, share, raws))
+        raws = raws[np.argsort(found, kind="stable")[:keep]]
+        job.scouted = raws[0]
+        report(stage, look + 1, total, f"{1e3 * found.min():.2f} mm over {share:.0%} of the time")
     simulate, measured = over(1.0)
-    points = levenberg_marquardt.evaluate(simulate, measured, job.space, raws)
+    points = once("scouts", partial(levenberg_marquardt.evaluate, simulate, measured, job.space, raws))
     for look, points in enumerate(  # noqa: B020
-        levenberg_marquardt.improve(simulate, measured, job.space, points, iterations=_LOOKS)
+        _climb(job, "scouts", simulate, measured, points, _LOOKS, memory)
     ):
+        job.scouted = min(points, key=lambda p: p.cost).raw
         report(stage, look + 3, total, f"{1e3 * min(p.cost for p in points):.2f} mm")
     report(stage, total, total, "")
     return min(points, key=lambda p: p.cost).raw
 
 
+def _refined(job: _Job, iterations: int, vertices: int | None, report: Callback) -> _Job:
+    """Return the job on a finer mesh, corrected, or as it was where that predicts the train trials worse.
+
+    A mesh that was asked for stays, with numbers that suit it; it then is only found out how wrong they may be.
+    """
+    pool, trials = job.pool, job.pool.recording.train
+    if len(_usable(pool.recording)) < len(trials):
+        return job
+    finer = {} if job.given or vertices is not None else refinement.finer_options(pool.recording)
+    sizes = tuple(job.space.units) if job.space.sizes else (1.0,) * len(job.columns)
+    options = tuple((dict(job.options) | finer).items())
+    names = job.space.names
+    first = FitJob(job.model.effects, job.values[None], names, sizes, iterations, options=options)
+    clamps = _CLAMPS if finer and job.model.mesh.clamps else ()
+    model = job.model
+    own = {"numerical_damping": model.numerical_damping, "clamp_fraction": model.clamp_fraction}
+    own |= {"vertices": pool.local.options.get("vertices"), "substep": (1 + 1e-9) * model.dt / model.substeps}
+    job = replace(job, options=tuple((own | dict(job.options)).items()))
+    try:
+        found = refinement.refine(pool, first, clamps, iterations, vertices is None, report)
+    except InputError:
+        # Not every rope can be simulated on a finer mesh.
+        return job
+    fitted = found.fitted
+    if not found.corrected:
+        return replace(job, drifts=found.drifts)
+    model = pool.local.model(fitted.effects)
+    better = replace(job, options=(), model=model, space=fitted.space, motion=model.motion(trials))
+    better.values, better.point, better.drifts = fitted.values, fitted.point, found.drifts
+    errors = []
+    for each in (job, better):
+        predicted = evaluation.predict(each.model, trials, each.values, each.simulator(trials))
+        errors.append(average(mean_absolute_error, [predicted[t.name] for t in trials], trials))
+    # Exact numbers predict as well with their mesh, up to what noise tells; else those that suit a coarse one count.
+    if errors[1] <= errors[0] + 0.5 * noise(pool.recording):
+        return better
+    apart = job.space.to_raw(fitted.values[job.columns]) - job.point.raw
+    scale = found.drifts * fitted.space.units / job.space.units
+    return replace(job, drifts=np.concatenate([scale, apart[None]]))
+
+
 def _pick(count: int, wanted: int) -> list[int]:
     return sorted({round(i) for i in np.linspace(0, count - 1, min(count, wanted))})
 
+
+_CLAMPS = (1.0, 0.0)
+"""Where clamps may hold the rope, see `Mesh.clamp_shares`."""
 
 _REACH = {"bending_stiffness": np.log(40.0), "twisting_stiffness": np.log(4.0), "damping_rate": np.log(10.0)}
 """How far starts go either way of the guess; the twisting stiffness relative to the bending stiffness."""
@@ -270,7 +377,10 @@ def _judge(job: _Job, seed: int, interrupted: bool, begun: float, report: Callba
     report("predicting all trials", 1, 2, "")
     after = evaluation.predict(job.model, trials, job.values, simulate)
     report("predicting all trials", 2, 2, "")
-    low, high = levenberg_marquardt.interval(job.point, job.space)
+    ends = levenberg_marquardt.interval(job.point, job.space, job.drifts)
+    least, most = (np.array([getattr(p, end) for p in job.space.params]) for end in ("low", "high"))
+    turns = np.array([p.periodic for p in job.space.params])
+    low, high = (np.where(turns, end, np.clip(end, least, most)) for end in ends)
     return Calibration(
         parameters={
             name: {"value": float(v), "low": float(min(a, b)), "high": float(max(a, b)), "unit": param.unit}
@@ -288,14 +398,29 @@ def _judge(job: _Job, seed: int, interrupted: bool, begun: float, report: Callba
         predictions_before=before,
         seed=seed,
         interrupted=interrupted,
-        notes=_notes(recording, job),
+        notes=_notes(recording, job, low, high),
     )
 
 
-def _notes(recording: Recording, job: _Job) -> list[str]:
+_VAGUE = 5.0
+"""Upper over lower end of a range from which a number counts as unknown."""
+
+_RANGES = (
+    "Ranges are 90 % intervals: nine of ten hold the true number of a rope that is like the model. They take in how "
+    "far the train trials pull apart (jackknife), noise, and what steps, mesh, the place where clamps begin to hold, "
+    "and shear may do."
+)
+_NARROW = "Ranges say how far the train trials pull apart (jackknife), not what all of them get wrong alike."
+
+
+def _notes(recording: Recording, job: _Job, low: np.ndarray, high: np.ndarray) -> list[str]:
     notes = [f"Rest shape: {job.model.rest}."]
     if job.model.effects:
         notes.append(f"Effects of the given model: {', '.join(e.replace('_', ' ') for e in job.model.effects)}.")
+    notes.append(_RANGES if job.drifts is not None else _NARROW)
+    logs = [p.scale == "log" for p in job.space.params]
+    for name in (n for n, a, b, log in zip(job.space.names, low, high, logs, strict=True) if log and b > _VAGUE * a):
+        notes.append(f"The recording says little of the {name.replace('_', ' ')}: see its range.")
     unused = sorted({t.name for t in recording.train} - set(job.motion.names))
     if unused:
         notes.append(f"Not fitted because every frame is marked suspect: {', '.join(unused)}.")

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, field
 
-from torchdlo.sysid.diagnosis import effect_library
+from torchdlo.sysid.diagnosis import effect_library, selection
 from torchdlo.sysid.diagnosis.budget import Budget
 from torchdlo.sysid.diagnosis.candidate_fits import extended
 from torchdlo.sysid.diagnosis.error_floor import rms
@@ -18,12 +18,6 @@ from torchdlo.sysid.diagnosis.score_test import score_effects
 from torchdlo.sysid.diagnosis.workspace import SILENT, Callback, Workspace
 from torchdlo.sysid.estimation.jobs import Fitted
 from torchdlo.sysid.model.trial_batch import Start
-
-MATTERS = 0.03
-"""Share of the baseline's excess gap that each effect has to close, whatever the others leave."""
-
-NEARLY_ALL = 0.8
-"""Share of what is left above the floor."""
 
 _TRIED = 2
 """Effects that are tried in the place of another, besides those that do alike things."""
@@ -40,16 +34,20 @@ class EliminationResult:
     """By effect: share of the gap above the floor that it closed on the test trials."""
     ties: dict[str, list[str]] = field(default_factory=dict)
     """By effect: others that the data cannot tell from it."""
+    rivals: dict[str, Fitted] = field(default_factory=dict)
+    """By effect: the model without it that it was held against."""
 
     def exchange(self, old: str, new: str, *, alike: bool) -> None:
         """Put another effect in the place of one, which it is `alike` if the data cannot tell them apart."""
         also = [n for n in (*self.ties.get(old, []), old) if n != new] if alike else []
         self.shares = {new if n == old else n: share for n, share in self.shares.items()}
         self.ties = {new if n == old else n: names for n, names in self.ties.items()} | {new: also}
+        self.rivals = {new if n == old else n: rival for n, rival in self.rivals.items()}
 
     def leave_out(self, name: str) -> None:
         """Forget an effect that the last one makes needless; the last one takes over its share."""
         del self.ties[name]
+        self.rivals.pop(name, None)
         share = self.shares.pop(name)
         self.shares[[*self.shares][-1]] += share
 
@@ -75,16 +73,14 @@ class Revision:
         What takes away nearly all that the others leave matters, however small that is beside the baseline's gap.
         """
         # A baseline may go astray on a trial: then what it became when it was fitted further tells what a share is.
-        first = min(rms(self.bench.gaps(f, split)) for f in self.plain) ** 2
-        before, after = (rms(self.bench.gaps(f, split)) ** 2 for f in (less, more))
-        floor, closed = self.bench.level**2, before - after
-        enough = min(MATTERS * (first - self.bench.floor.noise**2), NEARLY_ALL * (before - floor))
-        return closed > max(floor, enough)
+        first = min(rms(self.bench.gaps(f, split)) for f in self.plain)
+        before, after = (rms(self.bench.gaps(f, split)) for f in (less, more))
+        return selection.matters(first, before, after, self.bench.floor.noise, self.bench.level)
 
     def pruned(self, fitted: Fitted, found: EliminationResult) -> Fitted:
         """Return the model without the effects that the last one, or other numbers, have made needless."""
         for name in [*found.shares][:-1]:
-            less = self._without(fitted, name)
+            less = self.without(fitted, name)
             if not self.matters(less, fitted, "train"):
                 fitted = less
                 found.leave_out(name)
@@ -139,7 +135,7 @@ class Revision:
     def _astray(self, other: Fitted, fitted: Fitted) -> bool:
         return self.bench.diverged(other, self.bench.gaps(fitted, "all"))
 
-    def _without(self, fitted: Fitted, name: str) -> Fitted:
+    def without(self, fitted: Fitted, name: str) -> Fitted:
         """Return the model without one of its effects; what was asked for before is not fitted again."""
         start, key = self.bench.starts["train"], (fitted.effects, fitted.options, fitted.values.tobytes(), name)
         at, less = self._reductions.get(key, (None, None))
@@ -149,9 +145,14 @@ class Revision:
             self._reductions[key] = start, less
         return less
 
+    def known_without(self, fitted: Fitted, name: str) -> Fitted | None:
+        """Return the model without one of its effects if it was fitted before, None if it was not."""
+        key = (fitted.effects, fitted.options, fitted.values.tobytes(), name)
+        return self._reductions.get(key, (None, None))[1]
+
     def _instead(self, fitted: Fitted, old: str, names: Sequence[str]) -> Fitted:
         """Return the best model with one of several effects in the place of another."""
-        less, stage = self._without(fitted, old), f"in the place of {old}"
+        less, stage = self.without(fitted, old), f"in the place of {old}"
         scores = score_effects(self.bench.pool, less, names, self.bench.starts["train"], lambda *_: None)
         kin = {n for group in effect_library.KIN if old in group for n in group}
         tried = [*scores[:_TRIED], *(s for s in scores[_TRIED:] if s.name in kin)]

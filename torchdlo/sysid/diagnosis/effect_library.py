@@ -67,6 +67,26 @@ slow. Small doses of them are hard to tell apart, fits are not."""
 CONTAINED = {"wind": ("air_drag", {"velocity": 0.0})}
 """Effects by more general ones, and which of their numbers are what where they are the same: more numbers fit noise."""
 
+STRENGTHS = {
+    "air_drag": ("c_d", 1.0),
+    "wind": ("velocity", 2.0),
+    "tilted_gravity": ("angles", 1.0),
+    "bending_damping": ("coefficient", 1.0),
+    "rest_curvature": ("curvature", 1.0),
+    "internal_friction": ("moment", 1.0),
+    "stiffening_bending": ("c", 1.0),
+    "nonuniform_stiffness": ("factor", 1.0),
+    "anisotropic_bending": ("ratio", 1.0),
+    "point_mass": ("mass", 1.0),
+    "stretch": ("EA", 1.0),
+    "table_friction": ("mu", 1.0),
+    "gripper_compliance": ("stiffness", 1.0),
+    "time_delay": ("delay", 1.0),
+    "marker_offset": ("offset", 1.0),
+}
+"""By effect: the number that says how large it is, and the power of it with which the gap grows; plasticity has none,
+as what flows beyond a yield point does not grow with it evenly."""
+
 _KNOWN = {
     "tilted_gravity": ("acceleration",),
     "bending_plasticity": ("hardening",),

@@ -5,22 +5,37 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
+import numpy as np
+
 from torchdlo.physics.effects import EFFECTS
 from torchdlo.sysid.diagnosis.effect_equations import law, separating
+from torchdlo.sysid.diagnosis.error_floor import gap, rms
+from torchdlo.sysid.diagnosis.plausibility import implausible
 from torchdlo.sysid.diagnosis.residual_analysis import localise
+from torchdlo.sysid.diagnosis.significance import RATE, Agreement
 from torchdlo.sysid.diagnosis.verdict import Diagnosis
 from torchdlo.sysid.estimation import levenberg_marquardt
 from torchdlo.sysid.estimation.result import dump, versions
 from torchdlo.sysid.estimation.result_cache import digest
 from torchdlo.sysid.model import model_file
+from torchdlo.sysid.recordings.metrics import mean_absolute_error
 from torchdlo.sysid.recordings.recording import Recording
 
-__all__ = ["absorbed", "confidence", "findings", "findings_json", "model_json", "summary"]
+__all__ = [
+    "absorbed",
+    "confidence",
+    "findings",
+    "findings_json",
+    "limits_text",
+    "mean_absolute_errors",
+    "model_json",
+    "summary",
+]
 
 
 def findings(result: Diagnosis, recording: Recording) -> dict[str, Any]:
     """Return the findings as plain objects."""
-    numbers = _numbers(result)
+    numbers, rates = _numbers(result), result.false_discovery_rates
     effects = [
         {
             "name": name,
@@ -28,6 +43,7 @@ def findings(result: Diagnosis, recording: Recording) -> dict[str, Any]:
             "law": law(name),
             "parameters": {k.split(".", 1)[1]: v for k, v in numbers.items() if k.startswith(f"{name}.")},
             "share_of_gap": result.shares[name],
+            "test": _test(result.tests[name], rates[name], result.looked_at) if name in result.tests else None,
             "indistinguishable_from": result.ties[name],
             "separating_experiments": {other: separating(name, other) for other in result.ties[name]},
         }
@@ -35,7 +51,7 @@ def findings(result: Diagnosis, recording: Recording) -> dict[str, Any]:
     ]
     candidates = [
         {"round": r + 1, "name": c.name, "score": c.score, "train_gain": c.gain}
-        | {"heldout_gain": c.heldout_gain, "reason": c.reason}
+        | {"heldout_gain": c.heldout_gain, "reason": c.reason, "p_value": c.test and c.test.p}
         for r, each in enumerate(result.candidates)
         for c in each
     ]
@@ -45,7 +61,10 @@ def findings(result: Diagnosis, recording: Recording) -> dict[str, Any]:
         "verdict": result.verdict,
         "effects": effects,
         "confidence": confidence(result),
+        "best_candidate": _leading(result),
         "gap": _gap(result, recording),
+        "detection_limits": [dataclasses.asdict(limit) for limit in result.limits],
+        "misleading_trials": [dataclasses.asdict(trial) for trial in result.misleading],
         "candidates": candidates,
         "baseline": {k: v for k, v in numbers.items() if "." not in k},
         "absorbed_by_calibration": absorbed(result),
@@ -55,6 +74,33 @@ def findings(result: Diagnosis, recording: Recording) -> dict[str, Any]:
         "notes": result.notes,
         "seconds": result.seconds,
         "versions": versions(),
+    }
+
+
+def _test(test: Agreement, rate: float, looked_at: int) -> dict[str, Any]:
+    """Return whether what an effect explains on the test trials could be chance."""
+    return {
+        "method": f"sign flips of {test.units} {test.unit}s of the test trials, which had no part in choosing",
+        "p_value": test.p,
+        "candidates_looked_at": looked_at,
+        "false_discovery_rate": rate,
+        "p_value_over_trials": None if np.isnan(test.p_trials) else test.p_trials,
+        "dose_by_trial": [None if np.isnan(dose) else float(dose) for dose in test.doses],
+    }
+
+
+def _leading(result: Diagnosis) -> dict[str, Any] | None:
+    """Return what comes closest where a gap is left that nothing named explains."""
+    best = result.leading
+    if best is None:
+        return None
+    return {
+        "name": best.name,
+        "parameters": best.numbers,
+        "train_gain": best.gain,
+        "heldout_gain": best.heldout_gain,
+        "against": best.against,
+        "p_value": best.test.p,
     }
 
 
@@ -77,13 +123,40 @@ def _numbers(result: Diagnosis) -> dict[str, dict[str, Any]]:
 def _gap(result: Diagnosis, recording: Recording) -> dict[str, Any]:
     """Return the gap on the test trials and the floor."""
     floor, trials = result.floor, zip(recording.test, result.before, result.after, strict=True)
+    maes = {when: _by_trial(result, recording, when) for when in ("before", "after")}
     return {
         "test_rmse_before_m": result.gaps[0],
         "test_rmse_after_m": result.gaps[1],
+        **{f"test_mae_{when}_m": mae for when, mae in mean_absolute_errors(result, recording).items()},
+        **{f"train_rmse_{when}_m": _train_gap(result, recording, when) for when in maes},
         "noise_floor_m": floor.total,
         "floor_parts_m": {"marker_noise": floor.noise, "step": floor.step, "grid": floor.grid},
-        "per_trial": [{"name": t.name, "before_m": float(b), "after_m": float(a)} for t, b, a in trials],
+        "per_trial": [
+            {"name": t.name, "before_m": float(b), "after_m": float(a)}
+            | {f"mae_{when}_m": maes[when][t.name] for when in maes}
+            for t, b, a in trials
+        ],
     }
+
+
+def _train_gap(result: Diagnosis, recording: Recording, when: str) -> float:
+    """Return the root mean square gap of the train trials [m]."""
+    return rms(gap([result.predictions[when][t.name] for t in recording.train], recording.train))
+
+
+def mean_absolute_errors(result: Diagnosis, recording: Recording) -> dict[str, float]:
+    """Return the mean absolute error per coordinate [m] "before" and "after", over the test trials that are compared.
+
+    It is the measure of the literature: gripped markers and suspect frames count, see
+    `torchdlo.sysid.recordings.metrics`.
+    """
+    names = [t.name for t, kept in zip(recording.test, result.compared, strict=True) if kept]
+    found = {when: _by_trial(result, recording, when) for when in ("before", "after")}
+    return {when: float(np.mean([of_trial[name] for name in names])) for when, of_trial in found.items()}
+
+
+def _by_trial(result: Diagnosis, recording: Recording, when: str) -> dict[str, float]:
+    return {t.name: mean_absolute_error(result.predictions[when][t.name], t) for t in recording.test}
 
 
 def absorbed(result: Diagnosis) -> list[dict[str, Any]]:
@@ -115,25 +188,19 @@ def confidence(result: Diagnosis) -> dict[str, Any] | None:
     ties = sorted({t for name in result.effects for t in result.ties[name]})
     if ties:
         doubts.append(f"{_listed(ties)} would do as well")
-    open_ended = [name for name in result.effects if _may_be_off(name, _numbers(result))]
-    if open_ended:
-        doubts.append(f"the range of {_listed(open_ended)} reaches the value at which it does nothing")
+    doubts += [
+        f"{name.replace('_', ' ')} {why}"
+        for name in result.effects
+        if (why := implausible(result.final, name, result.drifts)) is not None
+    ]
+    rates = result.false_discovery_rates
+    if chance := [name for name in result.effects if rates.get(name, 0.0) > RATE]:
+        doubts.append(f"the test trials are too few to exclude that {_listed(chance)} is chance")
     if len(result.after) < 2:
         doubts.append("there is one test trial only")
     if len(result.final.point.trial_costs) < 3:
         doubts.append("there are fewer than three train trials")
     return {"word": ("high", "moderate")[len(doubts)] if len(doubts) < 2 else "low", "doubts": doubts}
-
-
-def _may_be_off(name: str, numbers: dict[str, dict[str, Any]]) -> bool:
-    """Return whether the ranges of all numbers that switch an effect hold their off values."""
-    held = []
-    for key, n in numbers.items():
-        effect, _, number = key.partition(".")
-        off = EFFECTS[name].params[number.split(".")[0]].off if effect == name else None
-        if off is not None:
-            held.append(n["low"] <= off <= n["high"])
-    return bool(held) and all(held)
 
 
 def findings_json(result: Diagnosis, recording: Recording) -> str:
@@ -158,17 +225,19 @@ def summary(result: Diagnosis, recording: Recording) -> str:
     before, after, floor = (1e3 * x for x in (*result.gaps, result.floor.total))
     failed, count = int((~result.compared).sum()), len(result.before)
     left_out = f" Left out are {failed} of {count} such trials, which a simulation fails on." if failed else ""
+    mae = mean_absolute_errors(result, recording)
+    error = f" Mean absolute error per coordinate: {1e3 * mae['before']:.2f} mm."
     if result.verdict == "none":
         return (
             "Nothing is missing that these data could show: the calibrated baseline is "
             f"{before:.1f} mm off on trials that were not used, and {floor:.1f} mm is the floor of noise and grid."
-            f"{left_out}"
+            f"{left_out}{error}"
         )
     if result.verdict == "unknown":
         return (
             "Something is missing that no effect of the library explains: the calibrated baseline is "
             f"{before:.1f} mm off on trials that were not used, {before / floor:.1f} times the floor of noise and grid "
-            f"({floor:.1f} mm).{left_out}"
+            f"({floor:.1f} mm).{left_out}{error}{_best(result)}"
         )
     numbers = _numbers(result)
     named = " and ".join(_named(name, numbers, result.ties[name]) for name in result.effects)
@@ -177,10 +246,45 @@ def summary(result: Diagnosis, recording: Recording) -> str:
     share = f", {(before**2 - after**2) / excess:.0%} of what is above the noise closed" if excess > 0 else ""
     said = f"Missing: {named}. Gap on trials that were not used: {before:.1f} → {after:.1f} mm"
     said += f" (floor {floor:.1f} mm){share}.{left_out}"
+    said += f" Mean absolute error per coordinate: {1e3 * mae['before']:.2f} → {1e3 * mae['after']:.2f} mm."
+    said += "".join(f" {_tested(name, result)}" for name in result.tests)
     if result.verdict == "partial":
-        said += " A part remains that no effect of the library explains."
+        said += f" A part remains that no effect of the library explains.{_best(result)}"
     sure = confidence(result)
     return said + f" Confidence: {sure['word']}" + (f" ({'; '.join(sure['doubts'])})." if sure["doubts"] else ".")
+
+
+def limits_text(result: Diagnosis) -> str:
+    """Return in a sentence how large effects would have to be to be named; nothing where that is not known."""
+    said = []
+    for limit in result.limits:
+        ends = sorted({f"{limit.easiest:.2g}", f"{limit.hardest:.2g}"}, key=float)
+        unit = "" if limit.unit == "1" else f" {limit.unit}"
+        said.append(f"{limit.name.replace('_', ' ')} ({limit.number} {' to '.join(ends)}{unit})")
+    return f"Would be named from this size on, by place or direction: {', '.join(said)}." if said else ""
+
+
+def _tested(name: str, result: Diagnosis) -> str:
+    """Return whether what an effect explains on the test trials could be chance, in a sentence."""
+    test, rate = result.tests[name], result.false_discovery_rates[name]
+    return (
+        f"Chance explains as much of the test trials as {name.replace('_', ' ')} with p {test.p:.2g} (sign flips of "
+        f"{test.units} {test.unit}s), at a false discovery rate of {rate:.2g} with all {result.looked_at} candidates "
+        "that were looked at."
+    )
+
+
+def _best(result: Diagnosis) -> str:
+    """Return what comes closest to explaining what is left, in a sentence; nothing where nothing comes close."""
+    best = result.leading
+    if best is None:
+        return ""
+    told = ", ".join(f"{key} {value:.3g}" for key, value in best.numbers.items())
+    return (
+        f" The best candidate is {best.name.replace('_', ' ')} ({told}), which closes {best.heldout_gain:.0%} of the "
+        f"gap above noise on the test trials and {max(best.gain, 0.0):.0%} on the train trials; it is not named "
+        f"because it {best.against} (p {best.test.p:.2g})."
+    )
 
 
 def _named(name: str, numbers: dict[str, dict[str, Any]], ties: list[str]) -> str:

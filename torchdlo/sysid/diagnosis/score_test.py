@@ -53,6 +53,8 @@ class Score:
     """What counts as much of each number, in the terms of its scale."""
     direction: np.ndarray
     """What it changes after the baseline took up its part, unit length, weighted residuals, shape (R,)."""
+    probes: tuple[tuple[dict[str, float], float], ...] = ()
+    """Its doses by themselves: numbers, and the gap that each leaves after the baseline took up its part [m]."""
 
 
 def curvature_scale(markers: np.ndarray) -> float:
@@ -108,6 +110,7 @@ def score_effects(
     residual = np.nan_to_num(residual) * weight
     jacobian = np.stack([np.nan_to_num(pick(sim - own[0])) * weight for sim in own[1:]], 1)
     q, r = np.linalg.qr(jacobian / nudge)
+    whole = float(np.linalg.norm(weight)) + 1e-30
     left = residual - q @ (q.T @ residual)
     scores: list[Score] = []
     for group, sims in zip(groups, (sims_of[k] for k in range(len(groups))), strict=True):
@@ -125,8 +128,9 @@ def score_effects(
                 for share in _ON_THE_WAY:
                     raw = base.point.raw - np.clip(share * back, -1.0, 1.0)
                     starts.append((_mixture(name, doses[name], share * found.amounts), raw))
-            sizes = _sizes(name, doses[name])
-            scores.append(Score(name, best.share, starts[0][0], tuple(starts), sizes, best.direction))
+            sizes, shown = _sizes(name, doses[name]), np.linalg.norm(change - q @ absorbed, axis=0) / whole
+            probes = tuple((dict(d.values), float(gap)) for d, gap in zip(doses[name], shown, strict=True))
+            scores.append(Score(name, best.share, starts[0][0], tuple(starts), sizes, best.direction, probes))
     return sorted(scores, key=lambda s: -s.share)
 
 

@@ -16,13 +16,18 @@ import numpy as np
 from torchdlo.errors import InputError
 from torchdlo.sysid.diagnosis import baseline as baselines
 from torchdlo.sysid.diagnosis import budget as plan
-from torchdlo.sysid.diagnosis import clamp_models, effect_library
+from torchdlo.sysid.diagnosis import clamp_models, effect_library, selection
 from torchdlo.sysid.diagnosis.backward_elimination import EliminationResult, Revision
 from torchdlo.sysid.diagnosis.budget import BUDGETS, Budget
 from torchdlo.sysid.diagnosis.candidate_fits import extended, short, vector
+from torchdlo.sysid.diagnosis.detection_limit import detection_limits, least_gap
 from torchdlo.sysid.diagnosis.error_floor import gap, rms
+from torchdlo.sysid.diagnosis.misleading_trials import MisleadingTrial, errors_by_frame, misleading_trials
+from torchdlo.sysid.diagnosis.plausibility import implausible, unresolved
 from torchdlo.sysid.diagnosis.score_test import Score, score_effects
-from torchdlo.sysid.diagnosis.verdict import UNKNOWN_FLOOR, Candidate, Diagnosis, through, word
+from torchdlo.sysid.diagnosis.selection import PAYS
+from torchdlo.sysid.diagnosis.significance import RATE, Agreement, agreement, benjamini_hochberg
+from torchdlo.sysid.diagnosis.verdict import UNKNOWN_FLOOR, BestCandidate, Candidate, Diagnosis, through, word
 from torchdlo.sysid.diagnosis.workspace import CHAIN, SILENT, Callback, Workspace
 from torchdlo.sysid.estimation.jobs import FitJob, Fitted
 from torchdlo.sysid.estimation.levenberg_marquardt import interval
@@ -32,8 +37,8 @@ from torchdlo.sysid.model.model_file import ModelFile
 from torchdlo.sysid.recordings import data_quality
 from torchdlo.sysid.recordings.recording import Recording
 
-PAYS = 0.15
-"""Share of the excess gap that an effect has to close, on the train and on the test trials."""
+MUCH = 0.15
+"""Share of the excess gap of the test trials from which an effect that is not named is spoken of, unless by chance."""
 
 MORE = 2.5
 """Times the floor that have to be left for another effect to be looked for: one of three times the floor leaves 3.2."""
@@ -110,6 +115,14 @@ class _Search:
         self.plain: list[Fitted] = []
         """The baseline, and what it became when it was fitted for as long as the first candidates were."""
         self.revision = Revision(self.bench, budget, self.plain, report)
+        self.scores: list[Score] = []
+        """Of all effects, beside the baseline."""
+        self.misleading: list[MisleadingTrial] = []
+        """Train trials that count up to a frame only."""
+        self.small = ""
+        """What was not named because it is as small as what steps do, in a sentence."""
+        self.leading: BestCandidate | None = None
+        """What came closest in the last round, if it was not taken."""
 
     def run(self, given: ModelFile | None = None) -> Diagnosis:
         """Go through all stages."""
@@ -141,6 +154,7 @@ class _Search:
                     self.pool.choose(**dict(base.options))
                 break
             name, old = best.effects[-1], self._squared(base)
+            found.rivals[name] = rival
             self.pool.choose(**dict(best.options))
             found.shares[name], found.ties[name] = (old - self._squared(best)) / whole, rivals
             base = baselines.go_further(self.bench, best, self.budget.more, self.report)
@@ -197,8 +211,16 @@ class _Search:
             for s in scores[self.budget.candidates :]
             if s.name == clamp_models.NAME and clamp_models.soft(self.bench, base)
         ]
+        self.scores = self.scores or scores
         fits, led, rival, worst = self._fits(base, [*scores[: self.budget.candidates], *soft], stage)
         self.bench.predict([base, rival, *fits.values()])
+        if lost := self._misleading([rival, *fits.values()]):
+            self.misleading += lost
+            self.bench.discount({trial.name: trial.frame for trial in lost})
+            jobs = [self.bench.further(f, self.budget.more) for f in (rival, *(fits[name] for name in led))]
+            rival, *again = self._fitted(jobs, f"{stage}, without {', '.join(trial.name for trial in lost)}")
+            fits |= dict(zip(led, again, strict=True))
+            self.bench.predict([rival, *again])
         if base is self.baseline:
             self.plain.append(rival)
         first = min(led, key=lambda name: fits[name].point.cost)
@@ -246,6 +268,10 @@ class _Search:
     ) -> tuple[Fitted | None, Fitted, list[Candidate], list[str]]:
         """Return what `_round` does, from fits; those in order lead, best first."""
         refused = {name: self._refused(rival, fits[name]) for name in order}
+        tests = {name: self._agreement(rival, fitted) for name, fitted in fits.items()}
+        chance = self._chance(tests, len(scores))
+        refused = {name: refused[name] or chance.get(name) for name in order}
+        refused |= self._below_steps(fits, order, refused, rival)
         fair = [name for name in order if refused[name] is None]
         best, rivals = None, []
         reasons = {name: refused.get(name) or "fits worse" for name in fits}
@@ -264,11 +290,83 @@ class _Search:
         )
         candidates = [
             Candidate(
-                s.name, s.share, gains.get(s.name), held.get(s.name), reasons.get(s.name, "its doses explain less")
+                s.name,
+                s.share,
+                gains.get(s.name),
+                held.get(s.name),
+                reasons.get(s.name, "its doses explain less"),
+                tests.get(s.name),
             )
             for s in scores
         ]
+        self.leading = self._closest(fits, candidates) if best is None else None
         return best, rival, candidates, rivals
+
+    def _below_steps(
+        self, fits: dict[str, Fitted], order: Sequence[str], refused: dict[str, str | None], rival: Fitted
+    ) -> dict[str, str]:
+        """Return why effects are not told from what steps of simulations do: those that are as small, and likewise
+        those that explain no more than one of them does."""
+        found: dict[str, str] = {}
+        for name in order:
+            fitted = fits[name]
+            why = unresolved(fitted, name, self.pool.local.model(fitted.effects, fitted.options))
+            if refused[name] is None and why is not None:
+                found[name] = why
+                self.small = (
+                    f"A {name.replace('_', ' ')} that closes {self._gain(rival, fitted, 'test'):.0%} of the gap"
+                )
+                self.small += f" above noise on the test trials is not named: it {why}."
+                bar = fitted.point.cost - self.bench.tie(rival.point.cost, fitted.point.cost)
+                others = [n for n in order if n != name and refused[n] is None and fits[n].point.cost > bar]
+                found |= dict.fromkeys(others, f"explains no more than a {name.replace('_', ' ')} as small as of steps")
+        return found
+
+    def _closest(self, fits: dict[str, Fitted], candidates: Sequence[Candidate]) -> BestCandidate | None:
+        """Return the candidate that closes most of the gap on the test trials if that is much, None if it is not."""
+        rates = benjamini_hochberg([c.test.p for c in candidates if c.test is not None], len(candidates))
+        sure = {c.name for c, rate in zip([c for c in candidates if c.test], rates, strict=True) if rate <= RATE}
+        tested = [c for c in candidates if c.name in sure and (c.heldout_gain or 0.0) >= MUCH]
+        if not tested:
+            return None
+        # Of those that close nearly as much, the one that fits better.
+        most = max(c.heldout_gain for c in tested)
+        first = min((c for c in tested if c.heldout_gain > most - _NEAR), key=lambda c: fits[c.name].point.cost)
+        return self._candidate(first, fits[first.name], first.reason)
+
+    def _candidate(self, candidate: Candidate, fitted: Fitted, against: str) -> BestCandidate:
+        """Return a candidate that is not named, with its numbers and what speaks against it."""
+        numbers = dict(zip(fitted.space.names, fitted.space.to_values(fitted.point.raw), strict=True))
+        own = {k.partition(".")[2]: float(v) for k, v in numbers.items() if k.split(".")[0] == candidate.name}
+        return BestCandidate(
+            candidate.name, own, candidate.gain or 0.0, candidate.heldout_gain or 0.0, against, candidate.test
+        )
+
+    def _misleading(self, fits: Sequence[Fitted]) -> list[MisleadingTrial]:
+        """Return the train trials that none of these models follows, besides those that are known already."""
+        trials, weights = self.bench.trials["train"], self.bench.starts["train"].frame_weights
+        errors = [errors_by_frame(self.bench.prediction(f, "train"), trials, weights) for f in fits]
+        found = misleading_trials(np.array(errors), trials, self.bench.level)
+        new = [trial for trial in found if trial.name not in self.bench.discounted]
+        return new if len(self.bench.discounted) + len(new) <= len(trials) - 2 else []
+
+    def _findings_only(
+        self, final: Fitted, found: EliminationResult, rounds: Sequence[Sequence[Candidate]]
+    ) -> tuple[Fitted, np.ndarray]:
+        """Return the model without effects whose ranges hold what does nothing or cannot be, and its drifts.
+
+        Ranges are wider here than when effects were taken: they hold what the errors of steps and mesh may do.
+        """
+        drifts = self.bench.drift(final)
+        while doubts := {n: why for n in found.shares if (why := implausible(final, n, drifts)) is not None}:
+            name, why = next(iter(doubts.items()))
+            said = next(c for each in rounds for c in each if c.name == name)
+            self.leading = self._candidate(said, final, why)
+            final = self.revision.without(final, name)
+            for kept in (found.shares, found.ties, found.rivals):
+                kept.pop(name, None)
+            drifts = self.bench.drift(final)
+        return final, drifts
 
     def _leaders(self, found: Sequence[Fitted], rival: Fitted) -> list[int]:
         """Return which of the fits to short trials are worth more work."""
@@ -279,26 +377,31 @@ class _Search:
 
     def _refused(self, rival: Fitted, fitted: Fitted) -> str | None:
         """Return why a fit is no better than its rival, None if it is."""
-        gain = self._gain(rival, fitted, "train")
-        if not self._on_most(rival, fitted):
-            return "helps on too few trials"
-        if gain < PAYS:
-            return f"closes {max(gain, 0):.0%} of the gap"
-        if self._gain(rival, fitted, "test") < PAYS:
-            return "does not help on the test trials"
-        if not all(self.revision.matters(rival, fitted, split) for split in ("train", "test")):
-            return "closes less than the floor leaves open"
-        return None
+        train, test = (tuple(self.bench.gaps(f, split) for f in (rival, fitted)) for split in ("train", "test"))
+        enough = all(self.revision.matters(rival, fitted, split) for split in ("train", "test"))
+        why = selection.refused(train, test, self.bench.floor.noise, enough)
+        if why is not None:
+            return why
+        return implausible(fitted, fitted.effects[-1])
+
+    def _agreement(self, less: Fitted, more: Fitted) -> Agreement:
+        """Return how what the last effect changes agrees with what is left over without it, on the test trials."""
+        sims = (self.bench.prediction(fitted, "test") for fitted in (less, more))
+        return agreement(*sims, self.bench.trials["test"], self.bench.starts["test"].frame_weights)
+
+    def _chance(self, tests: dict[str, Agreement], looked_at: int) -> dict[str, str]:
+        """Return which of the tested effects may explain the test trials by chance, and why that is thought."""
+        rates = benjamini_hochberg([t.p for t in tests.values()], looked_at)
+        # Where no flip at all could tell, nothing is held against an effect but that this is said.
+        return {
+            name: f"may explain the test trials by chance (p {test.p:.2g}, false discovery rate {rate:.2g})"
+            for (name, test), rate in zip(tests.items(), rates, strict=True)
+            if rate > RATE >= looked_at * 2.0**-test.units
+        }
 
     def _gain(self, base: Fitted, fitted: Fitted, split: str) -> float:
         """Return the share of the excess gap (squared, above noise) that a fit closes."""
-        before, after = rms(self.bench.gaps(base, split)) ** 2, rms(self.bench.gaps(fitted, split)) ** 2
-        return float(
-            (before - after) / max(before - self.bench.floor.noise**2, (0.3 * self.bench.floor.noise) ** 2, 1e-12)
-        )
-
-    def _on_most(self, base: Fitted, fitted: Fitted) -> bool:
-        return float(np.mean(self.bench.gaps(fitted, "train") < self.bench.gaps(base, "train"))) > 0.6
+        return selection.gain(self.bench.gaps(base, split), self.bench.gaps(fitted, split), self.bench.floor.noise)
 
     def _extended(
         self, base: Fitted, scores: Sequence[Score], stage: str, others: Sequence[FitJob] = ()
@@ -325,12 +428,17 @@ class _Search:
         return [found[k] for k in range(len(jobs))]
 
     def _conclude(self, final: Fitted, found: EliminationResult, rounds: list[list[Candidate]]) -> Diagnosis:
+        final, drifts = self._findings_only(final, found, rounds)
         effects = list(found.shares)
         trials, train = self.bench.trials, len(self.bench.trials["train"])
         simulated = {"before": self.before, "after": self.bench.prediction(final, "all")}
         before, after = (gap(sims[train:], trials["test"]) for sims in simulated.values())
         verdict = word(effects, rms(self.bench.gaps(final, "test")), self.bench.level, rms(after) / rms(before))
         model = self.pool.local.model(final.effects, final.options)
+        rivals = {n: self.revision.known_without(final, n) or found.rivals[n] for n in effects}
+        self.bench.predict([*rivals.values(), final])
+        tests = {name: self._agreement(rival, final) for name, rival in rivals.items()}
+        limit = least_gap(rms(self.bench.gaps(final, "test")), self.bench.floor.noise, self.bench.level, PAYS)
         said = [*baselines.notes(self.baseline), *clamp_models.notes(model, final), *self.bench.notes()]
         predictions = {
             when: {t.name: sim[: len(t.time)] for sim, t in zip(sims, trials["all"], strict=True)}
@@ -349,8 +457,16 @@ class _Search:
             rounds,
             predictions,
             model,
-            self.bench.drift(final),
-            notes=[*said, *([] if np.isfinite(self.bench.level) else [UNKNOWN_FLOOR])],
+            drifts,
+            notes=[
+                *said,
+                *([self.small] if self.small else []),
+                *([] if np.isfinite(self.bench.level) else [UNKNOWN_FLOOR]),
+            ],
+            tests=tests,
+            limits=detection_limits(self.scores, limit),
+            leading=self.leading if verdict in ("unknown", "partial") else None,
+            misleading=self.misleading,
         )
 
 

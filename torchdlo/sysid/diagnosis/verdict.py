@@ -8,7 +8,10 @@ from typing import Any
 
 import numpy as np
 
+from torchdlo.sysid.diagnosis.detection_limit import DetectionLimit
 from torchdlo.sysid.diagnosis.error_floor import ErrorFloor, rms
+from torchdlo.sysid.diagnosis.misleading_trials import MisleadingTrial
+from torchdlo.sysid.diagnosis.significance import Agreement, benjamini_hochberg
 from torchdlo.sysid.estimation.jobs import Fitted
 from torchdlo.sysid.model.rope_model import RopeModel
 from torchdlo.sysid.recordings.data_quality import DataIssue
@@ -54,6 +57,26 @@ class Candidate:
     """The same on the test trials."""
     reason: str
     """Why it was taken or left."""
+    test: Agreement | None = None
+    """Whether what it explains on the test trials could be chance; None if it was not fitted."""
+
+
+@dataclass(frozen=True, eq=False)
+class BestCandidate:
+    """An effect that closes much of the gap but is not named."""
+
+    name: str
+    """The effect."""
+    numbers: dict[str, float]
+    """Its numbers as they were fitted."""
+    gain: float
+    """Share of the train trials' excess gap that it closes."""
+    heldout_gain: float
+    """The same on the test trials."""
+    against: str
+    """Why it is not named."""
+    test: Agreement
+    """Whether what it explains on the test trials could be chance."""
 
 
 @dataclass(eq=False)
@@ -94,6 +117,26 @@ class Diagnosis:
     """What is wrong with the data."""
     options: dict[str, Any] = field(default_factory=dict)
     """What was asked for."""
+    tests: dict[str, Agreement] = field(default_factory=dict)
+    """By effect: whether what it explains on the test trials could be chance."""
+    limits: list[DetectionLimit] = field(default_factory=list)
+    """From which size on effects would be named on this recording."""
+    leading: BestCandidate | None = None
+    """What comes closest where a gap is left that nothing named explains."""
+    misleading: list[MisleadingTrial] = field(default_factory=list)
+    """Train trials that counted less."""
+
+    @property
+    def looked_at(self) -> int:
+        """How many candidates were looked at, one that was looked at in two rounds twice."""
+        return sum(len(each) for each in self.candidates)
+
+    @property
+    def false_discovery_rates(self) -> dict[str, float]:
+        """By effect: the false discovery rate at which it is named, of all candidates that were looked at."""
+        others = [c for each in self.candidates for c in each if c.test is not None and c.name not in self.tests]
+        p = [t.p for t in self.tests.values()] + [c.test.p for c in others]
+        return dict(zip(self.tests, map(float, benjamini_hochberg(p, self.looked_at)), strict=False))
 
     @property
     def compared(self) -> np.ndarray:

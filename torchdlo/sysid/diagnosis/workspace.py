@@ -69,6 +69,8 @@ class Workspace:
         """What `gaps` are for a perfect model [m]."""
         self.mended: set[str] = set()
         """Trials that were simulated once more in finer steps."""
+        self.discounted: dict[str, int] = {}
+        """Train trials that count up to a frame only."""
         self._finer: floors.Refinement | None = None
         self._known: dict[Hashable, np.ndarray] = {}
 
@@ -93,10 +95,26 @@ class Workspace:
         train, free = len(self.trials["train"]), ~self.trials["all"][0].gripped
         self.floor, self._finer = found.floor(slice(train, None), free), found
         frame_weights, self.level = found.frame_weights(free)
+        frame_weights = self._discounted(frame_weights)
         start = replace(self.starts["all"], discretisation_correction=found.correction, frame_weights=frame_weights)
         rows = np.arange(len(start.pos))
         self.starts = {"all": start, "train": start.pick(rows[:train]), "test": start.pick(rows[train:])}
         self._known.clear()
+
+    def discount(self, frames: dict[str, int]) -> None:
+        """Let train trials count up to a frame only, by their names, from now on."""
+        self.discounted |= frames
+        frame_weights = self._discounted(self.starts["all"].frame_weights)
+        rows, train = np.arange(len(self.trials["all"])), len(self.trials["train"])
+        start = replace(self.starts["all"], frame_weights=frame_weights)
+        self.starts = {"all": start, "train": start.pick(rows[:train]), "test": start.pick(rows[train:])}
+
+    def _discounted(self, frame_weights: np.ndarray) -> np.ndarray:
+        """Return what errors of frames count (B, F), nothing of what is discounted."""
+        found = frame_weights.copy()
+        for k, trial in enumerate(self.trials["train"]):
+            found[k, self.discounted.get(trial.name, found.shape[1]) :] = 0.0
+        return found
 
     def predict(self, fits: Sequence[Fitted]) -> None:
         """Simulate all trials with several models at once, for `gaps` and `prediction` to look up."""
@@ -227,8 +245,17 @@ class Workspace:
         values, sizes = found.values[None], tuple(space.units)
         return FitJob(found.effects, values, space.names, sizes, iterations, start, frames, None, found.options)
 
-    def drift(self, fitted: Fitted) -> np.ndarray:
-        """Return what simulations get wrong by their steps and by their mesh in a fit's coordinates, shape (2, K)."""
+    def drift(
+        self, fitted: Fitted, others: Sequence[np.ndarray] = (), shares: tuple[float, float] = (1.0, 2.0)
+    ) -> np.ndarray:
+        """Return what simulations get wrong by their steps and by their mesh in a fit's coordinates, shape (2 + E, K).
+
+        Args:
+            fitted: the fit.
+            others: further ways in which simulations of the train trials may be wrong [m], shape (B, F, M, 3) each.
+            shares: how much of what was extrapolated for steps and mesh may be wrong. Next to clamps the mesh's error
+                may be of first order: extrapolating to that would change twice as much.
+        """
         look, start = Look(fitted.space, fitted.point.raw[None]), self.starts["train"]
         model = self.pool.local.model(fitted.effects)
         rows = np.repeat(fitted.values[None], len(look.values), 0)
@@ -237,8 +264,8 @@ class Workspace:
         frame_weights = 1.0 if start.frame_weights is None else start.frame_weights[..., None, None]
         measured = self.pool.local.motion(model, "train").markers
         step, grid = (frame_weights * np.nan_to_num(e[: len(measured)]) for e in self._finer.unsure)
-        # Next to clamps the mesh's error may be of first order: extrapolating to that would change twice as much.
-        return drift(look, frame_weights * sims, frame_weights * measured, (step, 2 * grid))
+        errors = (shares[0] * step, shares[1] * grid, *(frame_weights * np.nan_to_num(e) for e in others))
+        return drift(look, frame_weights * sims, frame_weights * measured, errors)
 
     def fit(self, jobs: Sequence[FitJob]) -> list[Fitted]:
         """Return the results of fits in their order.

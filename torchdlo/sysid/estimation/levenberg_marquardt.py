@@ -282,7 +282,15 @@ def firm(curvature: np.ndarray) -> np.ndarray:
 
 
 def interval(point: Point, space: ParameterSpace, drifts: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """Return 90 % limits of the values, shape (K,) each.
+    """Return 90 % limits of the values, shape (K,) each; see `reach`."""
+    far = reach(point, space, drifts)
+    if far is None:
+        return np.array([p.low for p in space.params]), np.array([p.high for p in space.params])
+    return space.to_values(point.raw - far), space.to_values(point.raw + far)
+
+
+def reach(point: Point, space: ParameterSpace, drifts: np.ndarray | None = None) -> np.ndarray | None:
+    """Return how far 90 % limits are from the minimum, in coordinates, shape (K,); None where trials are too few.
 
     How trials differ says how far the minimum may be off (linearised jackknife, leaving out one trial at a time). What
     every trial gets wrong in the same way that cannot show.
@@ -296,7 +304,7 @@ def interval(point: Point, space: ParameterSpace, drifts: np.ndarray | None = No
     ran = np.trace(point.curvature, axis1=1, axis2=2) > 0
     trials = int(ran.sum())
     if trials < 2:
-        return np.array([p.low for p in space.params]), np.array([p.high for p in space.params])
+        return None
     flatter = np.ones(len(ran)) if point.flatter is None else point.flatter
     curvature = (flatter[:, None, None] * point.curvature)[ran].sum(0)
     moves = np.linalg.solve(firm(curvature), point.gradient[ran].T).T
@@ -307,9 +315,7 @@ def interval(point: Point, space: ParameterSpace, drifts: np.ndarray | None = No
     # Fits end a little before the minimum.
     left = space.clip(point.raw - moves.sum(0)) - point.raw
     left = np.where([p.periodic for p in space.params], moves.sum(0), left)
-    reach = np.linalg.norm([quantile * deviation, left, *common], axis=0)
-    reach = np.minimum(reach, 10.0)
-    return space.to_values(point.raw - reach), space.to_values(point.raw + reach)
+    return np.minimum(np.linalg.norm([quantile * deviation, left, *common], axis=0), 10.0)
 
 
 _STUDENT_95 = (6.31, 2.92, 2.35, 2.13, 2.02, 1.94, 1.89, 1.86, 1.83, 1.81, 1.80, 1.78, 1.77, 1.76, 1.75, 1.70)

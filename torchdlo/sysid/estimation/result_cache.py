@@ -9,8 +9,10 @@ from __future__ import annotations
 import hashlib
 import importlib
 import importlib.metadata
+import io
 import json
-import shutil
+import zipfile
+import zlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import fields, is_dataclass
 from pathlib import Path
@@ -18,16 +20,22 @@ from typing import Any
 
 import numpy as np
 
-from torchdlo.errors import InputError
-from torchdlo.files import replacing, write_atomically
+from torchdlo.journal import Journal
 from torchdlo.sysid.recordings.recording import Recording
-from torchdlo.untrusted import parse_json
-from torchdlo.untrusted.array_file import read_arrays
 
-__all__ = ["ResultCache", "digest"]
+__all__ = ["ResultCache", "decode", "digest", "encode", "program"]
 
-_MARK = "journal.json"
-"""The file that says what a journal belongs to."""
+_DAMAGED = (
+    OSError,
+    EOFError,
+    ValueError,
+    KeyError,
+    TypeError,
+    AttributeError,
+    ImportError,
+    zipfile.BadZipFile,
+    zlib.error,
+)
 
 _LARGEST = 2**28
 """Results of more bytes are computed again: a disk is not to be filled by a search."""
@@ -40,7 +48,7 @@ def digest(*things: Any) -> str:
     found = hashlib.sha256()
     for thing in things:
         arrays: list[np.ndarray] = []
-        found.update(json.dumps(_encode(thing, arrays), sort_keys=True).encode())
+        found.update(json.dumps(encode(thing, arrays), sort_keys=True).encode())
         for array in arrays:
             found.update(f"{array.dtype.str}{array.shape}".encode() + np.ascontiguousarray(array).tobytes())
     return found.hexdigest()
@@ -49,7 +57,15 @@ def digest(*things: Any) -> str:
 class ResultCache:
     """A folder with the results of finished jobs."""
 
-    def __init__(self, path: Path, recording: Recording, options: dict[str, Any], *, resume: bool = False) -> None:
+    def __init__(
+        self,
+        path: Path,
+        recording: Recording,
+        options: dict[str, Any],
+        *,
+        resume: bool = False,
+        command: str = "diagnose",
+    ) -> None:
         """Open the journal.
 
         Args:
@@ -57,40 +73,32 @@ class ResultCache:
             recording: what the search is about.
             options: all that it depends on besides.
             resume: go on from what is there.
+            command: what it is a journal of.
         """
         self.path = path
         key = digest({f.name: getattr(recording, f.name) for f in fields(recording) if f.name != "path"}, options)
-        mark = {"generator": "torchdlo diagnose", "key": key, "program": _program()}
-        found = self._found()
-        if resume and found is None:
-            raise InputError(f"{path}: expected the journal of a search to resume, found none; leave out --resume.")
-        if resume and found.get("key") != key:
-            raise InputError(
-                f"{path}: the journal belongs to another recording or to other options (budget, seed, vertices, "
-                "model); give the same ones, or leave out --resume."
-            )
-        if resume and found.get("program") != mark["program"]:
-            raise InputError(f"{path}: the journal was written by another version of torchdlo; leave out --resume.")
-        if found is not None and not resume:
-            self.remove()
-        if not resume:
-            write_atomically(path / _MARK, json.dumps(mark) + "\n")
+        mark = {"generator": f"torchdlo {command}", "key": key, "program": program()}
 
-    def _found(self) -> dict[str, Any] | None:
-        """Return what a journal that is there belongs to, None if there is none; refuse what is not one."""
-        if not self.path.exists() or (self.path.is_dir() and not any(self.path.iterdir())):
-            return None
-        try:
-            found = json.loads((self.path / _MARK).read_text(encoding="utf-8"))
-            if found["generator"] == "torchdlo diagnose":
-                return found
-        except (OSError, ValueError, KeyError, TypeError):
-            pass
-        raise InputError(f"{self.path}: expected a journal of torchdlo, found something else; choose another --out.")
+        def other(found: dict[str, Any]) -> str:
+            if found.get("key") != key:
+                return (
+                    "the journal belongs to another recording or to other options (budget, seed, vertices, model); "
+                    "give the same ones, or leave out --resume."
+                )
+            if found.get("program") != mark["program"]:
+                return "the journal was written by another version of torchdlo; leave out --resume."
+            return ""
+
+        # Archives of numpy begin like this; earlier versions wrote them without a hash.
+        self._journal = Journal(path, mark, suffix=".npz", other=other, resume=resume, old=(b"PK",))
+
+    def close(self) -> None:
+        """Let others write here."""
+        self._journal.close()
 
     def remove(self) -> None:
         """Delete the journal: the search is over."""
-        shutil.rmtree(self.path, ignore_errors=True)
+        self._journal.remove()
 
     def through(
         self, jobs: Sequence[Any], compute: Callable[[Sequence[Any]], Iterator[tuple[int, Any]]]
@@ -110,29 +118,32 @@ class ResultCache:
     def keep(self, job: Any, result: Any) -> None:
         """Write a result down."""
         arrays: list[np.ndarray] = []
-        plain = json.dumps(_encode(result, arrays))
+        plain = json.dumps(encode(result, arrays))
         if sum(a.nbytes for a in arrays) > _LARGEST:
             return
-        with replacing(self._file(job)) as temporary:
-            np.savez(temporary, plain=np.array(plain), **{f"a{k}": a for k, a in enumerate(arrays)})
+        written = io.BytesIO()
+        np.savez(written, plain=np.array(plain), **{f"a{k}": a for k, a in enumerate(arrays)})
+        self._journal.write(_name(job), written.getvalue())
 
     def recall(self, job: Any) -> Any:
         """Return the result of a job, None if it is not written down whole."""
-        file = self._file(job)
-        if not file.exists():
+        content = self._journal.read(_name(job))
+        if content is None:
             return None
         try:
-            arrays = read_arrays(file, "a result")
-            return _decode(parse_json(str(arrays["plain"]), where=str(file), finite=False), arrays)
-        except (InputError, ValueError, KeyError, TypeError, AttributeError, ImportError):
+            with np.load(io.BytesIO(content), allow_pickle=False) as found:
+                arrays = dict(found)
+            return decode(json.loads(str(arrays["plain"])), arrays)
+        except _DAMAGED:
             # A damaged file costs the time of its job, no more.
             return None
 
-    def _file(self, job: Any) -> Path:
-        return self.path / f"{digest(job)[:32]}.npz"
+
+def _name(job: Any) -> str:
+    return digest(job)[:32]
 
 
-def _program() -> str:
+def program() -> str:
     """Return a hash of the program itself: its version alone does not change with every edit of a law."""
     root, found = Path(__file__).parents[2], hashlib.sha256()
     parts = [root / "scene.py", *(f for name in ("physics", "coupling", "sysid") for f in (root / name).rglob("*.py"))]
@@ -143,7 +154,7 @@ def _program() -> str:
     return found.hexdigest()
 
 
-def _encode(value: Any, arrays: list[np.ndarray]) -> Any:
+def encode(value: Any, arrays: list[np.ndarray]) -> Any:
     """Return a value as objects of JSON; arrays are put aside."""
     if isinstance(value, np.ndarray):
         if value.dtype == object:
@@ -154,19 +165,19 @@ def _encode(value: Any, arrays: list[np.ndarray]) -> Any:
         return value.item()
     if is_dataclass(value) and not isinstance(value, type):
         kind = type(value)
-        inner = {f.name: _encode(getattr(value, f.name), arrays) for f in fields(value)}
+        inner = {f.name: encode(getattr(value, f.name), arrays) for f in fields(value)}
         return {"kind": [kind.__module__, kind.__qualname__], "fields": inner}
     if isinstance(value, (tuple, list)):
-        return {type(value).__name__: [_encode(item, arrays) for item in value]}
+        return {type(value).__name__: [encode(item, arrays) for item in value]}
     if isinstance(value, dict):
-        return {"dict": [[_encode(k, arrays), _encode(v, arrays)] for k, v in value.items()]}
+        return {"dict": [[encode(k, arrays), encode(v, arrays)] for k, v in value.items()]}
     if value is None or isinstance(value, (bool, int, float, str)):
         return value
     raise TypeError(f"a journal cannot keep a {type(value).__name__}")
 
 
-def _decode(value: Any, arrays: dict[str, np.ndarray]) -> Any:
-    """Undo `_encode`."""
+def decode(value: Any, arrays: dict[str, np.ndarray]) -> Any:
+    """Undo `encode`."""
     if not isinstance(value, dict):
         return value
     if "array" in value:
@@ -176,8 +187,8 @@ def _decode(value: Any, arrays: dict[str, np.ndarray]) -> Any:
         kind = getattr(importlib.import_module(module), name) if module.split(".")[0] == _PACKAGE else None
         if not is_dataclass(kind):
             raise TypeError(f"{module}.{name} is not ours")
-        return kind(**{k: _decode(v, arrays) for k, v in value["fields"].items()})
+        return kind(**{k: decode(v, arrays) for k, v in value["fields"].items()})
     if "dict" in value:
-        return {_decode(k, arrays): _decode(v, arrays) for k, v in value["dict"]}
+        return {decode(k, arrays): decode(v, arrays) for k, v in value["dict"]}
     ((name, items),) = value.items()
-    return {"tuple": tuple, "list": list}[name](_decode(item, arrays) for item in items)
+    return {"tuple": tuple, "list": list}[name](decode(item, arrays) for item in items)

@@ -7,12 +7,14 @@ import multiprocessing
 import os
 from collections.abc import Callable, Hashable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
-from dataclasses import replace
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, TypeVar
 
 import numpy as np
 
+from torchdlo.errors import InputError
 from torchdlo.sysid.estimation.jobs import FitJob, Fitted, Models, Search, SimulationJob
 from torchdlo.sysid.estimation.result_cache import ResultCache
 from torchdlo.sysid.model import initial_state as starts
@@ -37,6 +39,24 @@ def spread(kinds: Sequence[Hashable], parts: int) -> list[list[int]]:
     for k, kind in enumerate(kinds):
         alike.setdefault(kind, []).append(k)
     return [some for group in alike.values() for n in range(parts) if (some := group[n::parts])]
+
+
+_DIED = (
+    "a worker process died twice at the same work, as where memory is short: give fewer --workers if there is that "
+    "option, and --resume goes on with what is done."
+)
+
+
+@dataclass(eq=False)
+class _Task:
+    """What a worker is asked for."""
+
+    worker: int
+    what: Callable[[Models, Any], Any]
+    job: Any
+    queue: ProcessPoolExecutor | None = None
+    """Of the worker when it was asked."""
+    repeated: bool = False
 
 
 class Pool:
@@ -64,22 +84,48 @@ class Pool:
         self._chosen = {
             name: options[name] for name in ("numerical_damping", "clamp_fraction", "rest") if name in options
         }
-        context = multiprocessing.get_context("spawn")
+        self._begun_with = options
         # Each has a queue of its own: what was recorded for a model's steps is known to the process that did it.
-        self._queues = [
-            ProcessPoolExecutor(1, context, _begin, (recording, options)) for _ in range(workers if workers > 1 else 0)
-        ]
+        self._queues = [self._worker() for _ in range(workers if workers > 1 else 0)]
 
     def __enter__(self) -> Pool:
         return self
 
     def __exit__(self, *_: object) -> None:
+        if self.journal is not None:
+            self.journal.close()
         # After Ctrl-C nobody waits for fits that are still running; idle workers do not mind.
         for queue in self._queues:
             processes = list((queue._processes or {}).values())
             queue.shutdown(wait=False, cancel_futures=True)
             for process in processes:
                 process.terminate()
+
+    def _worker(self) -> ProcessPoolExecutor:
+        return ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), _begin, (self.recording, self._begun_with))
+
+    def _submit(self, task: _Task) -> Future:
+        """Have a task done by its worker, which is started again if it died."""
+        for _ in range(2):
+            task.queue = self._queues[task.worker]
+            try:
+                return task.queue.submit(_do, task.what, task.job)
+            except BrokenProcessPool:
+                self._replace(task)
+        raise InputError(_DIED)
+
+    def _replace(self, task: _Task) -> None:
+        # All tasks of a worker that died come here, one after the other.
+        if self._queues[task.worker] is task.queue:
+            self._queues[task.worker] = self._worker()
+
+    def _again(self, task: _Task) -> Future:
+        """Repeat a task whose worker died, once."""
+        self._replace(task)
+        if task.repeated:
+            raise InputError(_DIED)
+        task.repeated = True
+        return self._submit(task)
 
     def choose(self, **options: Any) -> None:
         """Give all models other options from now on."""
@@ -143,32 +189,39 @@ class Pool:
         if not self._queues:
             yield from ((k, what(self.local, job)) for k, job in enumerate(jobs))
             return
-        waiting: dict[Future, tuple[int, ProcessPoolExecutor]] = {}
+        waiting: dict[Future, tuple[int, _Task]] = {}
         left = enumerate(jobs)
 
-        def next_for(queue: ProcessPoolExecutor) -> None:
-            waiting.update({queue.submit(_do, what, job): (k, queue) for k, job in itertools.islice(left, 1)})
+        def next_for(worker: int) -> None:
+            for k, job in itertools.islice(left, 1):
+                task = _Task(worker, what, job)
+                waiting[self._submit(task)] = k, task
 
-        for queue in self._queues:
-            next_for(queue)
+        for worker in range(len(self._queues)):
+            next_for(worker)
         while waiting:
             for future in wait(waiting, return_when=FIRST_COMPLETED).done:
-                k, queue = waiting.pop(future)
-                next_for(queue)
-                yield k, future.result()
+                k, task = waiting.pop(future)
+                try:
+                    result = future.result()
+                except BrokenProcessPool:
+                    waiting[self._again(task)] = k, task
+                    continue
+                next_for(task.worker)
+                yield k, result
 
     def _led(self, searches: Sequence[Search]) -> Iterator[tuple[int, Any]]:
         """Yield the index and the result of every search as they get ready; all workers simulate what they ask for."""
         asked: dict[int, SimulationJob] = {}
-        waiting: dict[Future, tuple[int, int, int]] = {}
+        waiting: dict[Future, tuple[int, int, _Task]] = {}
         parts: dict[int, list[np.ndarray | None]] = {}
         left, home = set(range(len(searches))), {n: n % self.workers for n in range(len(searches))}
 
         def idlest(n: int) -> int:
             """Return the worker for a search: the one it had last, unless that is busy and another one is idle."""
             load = [0] * self.workers
-            for *_, worker in waiting.values():
-                load[worker] += 1
+            for *_, task in waiting.values():
+                load[task.worker] += 1
             if load[home[n]] and 0 in load:
                 home[n] = load.index(0)
             return home[n]
@@ -185,14 +238,19 @@ class Pool:
                 return
             parts[n] = [None] * count
             for p, worker in enumerate(range(count) if count > 1 else [idlest(n)]):
-                waiting[self._queues[worker].submit(_do, _simulated, (job, p, count))] = n, p, worker
+                task = _Task(worker, _simulated, (job, p, count))
+                waiting[self._submit(task)] = n, p, task
 
         for n in range(len(searches)):
             yield from go_on(n, None)
         while waiting:
             for future in wait(waiting, return_when=FIRST_COMPLETED).done:
-                n, p, _ = waiting.pop(future)
-                parts[n][p] = future.result()
+                n, p, task = waiting.pop(future)
+                try:
+                    parts[n][p] = future.result()
+                except BrokenProcessPool:
+                    waiting[self._again(task)] = n, p, task
+                    continue
                 if all(part is not None for part in parts[n]):
                     sims = np.concatenate(parts.pop(n))
                     yield from go_on(n, sims.reshape(len(asked[n].values), -1, *sims.shape[-3:]))

@@ -30,6 +30,9 @@ _SMALLEST = 4e-3
 _SHARPEST = 100.0
 """Change of acceleration from frame to frame that a rope may show when it is jerked taut [m/s^2]."""
 
+_WAVE = 0.25
+"""Share of a marker's step that the markers beside it take as well where both follow a wave in the rope."""
+
 _FADES = 0.5
 """Time after which a rope has forgotten that a few frames are missing [s]."""
 
@@ -233,6 +236,7 @@ def _labels(trial: Trial, x: np.ndarray, events: np.ndarray, size: np.ndarray) -
         faults.append(
             DataIssue(trial.name, "swap", f"markers {pair[0]} and {pair[1]} are swapped in {_frames(rows)}: left out")
         )
+    single &= ~_moves_along(single, np.where(wrong, np.nan, size))
     jumped = []
     for m in np.flatnonzero(single.any(0)):
         rows = _away(np.flatnonzero(single[:, m]), len(x))
@@ -242,6 +246,26 @@ def _labels(trial: Trial, x: np.ndarray, events: np.ndarray, size: np.ndarray) -
         shown = "; ".join(jumped[:4]) + (f" and {len(jumped) - 4} more" if len(jumped) > 4 else "")
         faults.append(DataIssue(trial.name, "jump", f"markers jump away and are left out there: {shown}"))
     return wrong, faults
+
+
+def _moves_along(events: np.ndarray, size: np.ndarray) -> np.ndarray:
+    """Return which steps are a wave that runs through the rope, (F, M) bool: markers beside them step likewise.
+
+    A whip moves a marker as far from frame to frame as a fault does, but never one marker alone.
+
+    Args:
+        events: steps that stand out, shape (F, M).
+        size: of all steps [m], NaN where it is not known, shape (F, M).
+    """
+    found, known = np.zeros_like(events), np.nan_to_num(size)
+    near = np.maximum(known, np.maximum(np.roll(known, 1, 0), np.roll(known, -1, 0)))
+    for f in np.flatnonzero(events.any(1)):
+        at = np.flatnonzero(events[f])
+        for run in np.split(at, np.flatnonzero(np.diff(at) > 1) + 1):
+            beside = [m for m in (run[0] - 1, run[-1] + 1) if 0 <= m < events.shape[1]]
+            # A fault of one marker shows there not at all, a wave as much.
+            found[f, run] = max(near[f, beside], default=0.0) > _WAVE * known[f, run].min()
+    return found
 
 
 def _exchanged(x: np.ndarray, f: int, i: int, j: int, size: np.ndarray) -> bool:

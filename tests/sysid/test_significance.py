@@ -1,0 +1,216 @@
+"""What an effect explains is tested on trials that did not choose it; ranges and limits say what is a finding."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from tests.report.fake_diagnosis import BASELINE, fake_diagnosis, fitted
+from tests.sysid.swaying import recording as swaying
+from torchdlo.sysid.diagnosis.detection_limit import detection_limits, least_gap
+from torchdlo.sysid.diagnosis.findings import findings, limits_text, mean_absolute_errors, summary
+from torchdlo.sysid.diagnosis.misleading_trials import errors_by_frame, misleading_trials
+from torchdlo.sysid.diagnosis.plausibility import implausible, unresolved
+from torchdlo.sysid.diagnosis.score_test import Score
+from torchdlo.sysid.diagnosis.significance import agreement, benjamini_hochberg, f_test, sign_flips
+from torchdlo.sysid.diagnosis.verdict import BestCandidate
+from torchdlo.sysid.recordings.metrics import mean_absolute_error
+from torchdlo.sysid.recordings.recording import Recording, Trial
+
+
+@pytest.fixture(scope="module")
+def rope() -> Recording:
+    """A rope that sways."""
+    return swaying(Path("rope"), frames=201)
+
+
+def test_sign_flips_count_what_is_at_least_as_large() -> None:
+    # Of eight flips of 1, 2 and 3, only these themselves sum to 6; four sum to 0 or more with signs +-1, +-2, 3.
+    assert sign_flips(np.array([1.0, 2.0, 3.0])) == 1 / 8
+    assert sign_flips(np.array([1.0, -2.0, 3.0])) == 3 / 8
+    assert sign_flips(-np.ones(3)) == 1.0 and sign_flips(np.zeros(4)) == 1.0
+    # Of many units flips are drawn: of 20 equal ones, all but two positive, 1 + 20 + 190 of 2^20 are as good.
+    many = np.r_[np.ones(18), -np.ones(2)]
+    assert sign_flips(many) == pytest.approx(211 / 2**20, abs=1e-4)
+
+
+def test_chance_is_found_significant_as_often_as_it_should_be() -> None:
+    rng = np.random.default_rng(0)
+    p = np.array([sign_flips(rng.normal(size=12)) for _ in range(400)])
+    assert np.mean(p <= 0.05) < 0.09 and 0.4 < np.mean(p) < 0.6
+
+
+def test_the_f_test_is_one_side_of_a_regression_on_a_constant() -> None:
+    doses = np.array([0.8, 1.3, 1.0, 0.7])
+    t = stats.ttest_1samp(doses, 0.0, alternative="greater")
+    assert f_test(doses) == pytest.approx(t.pvalue)
+    # With one degree of freedom t is Cauchy: 1 / pi of its tangent.
+    assert f_test(np.array([0.9, 1.1])) == pytest.approx(np.arctan(0.1) / np.pi)
+    assert np.isnan(f_test(np.array([1.0])))
+
+
+def test_candidates_that_were_only_looked_at_count() -> None:
+    p = np.array([0.001, 0.2, 0.004])
+    full = stats.false_discovery_control(np.r_[p, np.ones(13)])
+    np.testing.assert_allclose(benjamini_hochberg(p, 16), full[:3])
+
+
+def shaken(trials: tuple[Trial, ...], dose: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Simulations without and with an effect that shifts markers as they move, of which the trials hold a dose."""
+    change = np.stack([0.01 * np.gradient(t.markers, t.time, axis=0) for t in trials])
+    less = np.stack([t.markers for t in trials]) - dose * change + 1e-4 * rng.normal(size=change.shape)
+    return less, less + change
+
+
+def test_trials_say_which_dose_they_ask_for(rope: Recording) -> None:
+    less, more = shaken(rope.test, 0.8, np.random.default_rng(0))
+    found = agreement(less, more, rope.test)
+    assert found.unit == "block" and found.units == 10 and found.p == 1 / 2**10
+    np.testing.assert_allclose(found.doses, 0.8, rtol=0.02)
+    assert found.p_trials < 0.01
+    nothing = agreement(*shaken(rope.test, 0.0, np.random.default_rng(1)), rope.test)
+    assert nothing.p > 0.01 and np.abs(nothing.doses).max() < 0.05
+    worse = agreement(*shaken(rope.test, -0.5, np.random.default_rng(1)), rope.test)
+    assert worse.p > 0.99
+    many = rope.test * 4
+    assert agreement(*shaken(many, 0.8, np.random.default_rng(0)), many).unit == "trial"
+
+
+def test_markers_that_are_held_or_not_seen_say_nothing(rope: Recording) -> None:
+    less, more = shaken(rope.test, 0.8, np.random.default_rng(0))
+    lost = [replace(t, markers=np.where(np.arange(15)[:, None] == 9, np.nan, t.markers)) for t in rope.test]
+    found = agreement(less, more + 0.1 * rope.test[0].gripped[:, None], lost)
+    np.testing.assert_allclose(found.doses, 0.8, rtol=0.02)
+
+
+def test_a_range_that_holds_nothing_or_what_cannot_be_is_no_finding() -> None:
+    def drag(value: float) -> str | None:
+        return implausible(fitted(BASELINE | {"air_drag.c_d": value}, ("air_drag",)), "air_drag")
+
+    # Trials differ by some tenths.
+    assert drag(1.4) is None and drag(0.01) == "has a range that holds the value at which it does nothing"
+    assert drag(20.0) == "has a c d at the edge of what can be"
+    # What errors of steps may do widens it.
+    drifts = np.array([[0.0, 0.0, 0.0, 5.0]])
+    assert "does nothing" in implausible(fitted(BASELINE | {"air_drag.c_d": 1.4}, ("air_drag",)), "air_drag", drifts)
+    # Off is infinity: its range is looked at as one over it.
+    assert implausible(fitted(BASELINE | {"stretch.EA": 2.0}, ("stretch",)), "stretch") is None
+    assert "does nothing" in implausible(fitted(BASELINE | {"stretch.EA": 1e6}, ("stretch",)), "stretch")
+    # One trial tells no range.
+    assert implausible(fitted(BASELINE | {"air_drag.c_d": 1e-4}, ("air_drag",), trials=1), "air_drag") is None
+
+
+def test_damping_as_small_as_that_of_steps_is_not_told_from_it() -> None:
+    model = SimpleNamespace(
+        parameters=[*BASELINE, "bending_damping.coefficient"], numerical_damping=0.05, dt=0.01, substeps=2
+    )
+
+    def damping(loss: float) -> str | None:
+        fit = fitted(BASELINE | {"bending_damping.coefficient": loss * BASELINE["bending_stiffness"]})
+        return unresolved(fit, "bending_damping", model)
+
+    # Steps of 5 ms damp with a twentieth of that, 0.25 ms.
+    assert damping(1.1e-3) is None and "(0.7 ms, they 0.25 ms)" in damping(0.7e-3)
+    assert unresolved(fitted(BASELINE), "air_drag", model) is None
+
+
+def test_detection_limits_grow_with_what_is_left() -> None:
+    # What closes 15 % of 4 mm above 1 mm of noise: sqrt(0.15 / 0.85 * 15) mm; but no less than the floor.
+    assert least_gap(4e-3, 1e-3, 1e-3, 0.15) == pytest.approx(np.sqrt(0.15 / 0.85 * 15) * 1e-3)
+    assert least_gap(1.1e-3, 1e-3, 1e-3, 0.15) == pytest.approx(1e-3)
+
+    def score(name: str, *probes: tuple[dict[str, float], float]) -> Score:
+        return Score(name, 0.0, {}, (), {}, np.zeros(0), tuple(probes))
+
+    scores = [
+        score("stretch", ({"stretch.EA": 100.0}, 1e-3)),
+        score("point_mass", *(({"point_mass.mass": 2e-3, "point_mass.position": 0.1}, g) for g in (1e-3, 4e-3))),
+        score("air_drag", ({"air_drag.c_d": 0.5}, 0.5e-3)),
+        score("wind", ({"wind.velocity.0": 1.0, "wind.c_d": 1.2}, 0.5e-3)),
+        score("anisotropic_bending", ({"anisotropic_bending.ratio": 1.2}, 1e-3)),
+    ]
+    limits = {x.name: (x.easiest, x.hardest) for x in detection_limits(scores, 2e-3)}
+    assert [*limits] == ["air_drag", "wind", "anisotropic_bending", "point_mass", "stretch"]
+    assert limits["air_drag"] == pytest.approx((2.0, 2.0)) and limits["stretch"] == pytest.approx((50.0, 50.0))
+    assert limits["point_mass"] == pytest.approx((1e-3, 4e-3))
+    # What wind pushes grows with its square, what two stiffnesses do with the logarithm of their ratio.
+    assert limits["wind"] == pytest.approx((2.0, 2.0)) and limits["anisotropic_bending"][0] == pytest.approx(1.44)
+    assert detection_limits(scores, float("inf")) == []
+
+
+def followed(trials: tuple[Trial, ...], off: dict[int, np.ndarray]) -> np.ndarray:
+    """Simulations that are 0.5 mm off, and more in some trials (F,) [m]."""
+    rng = np.random.default_rng(0)
+    sims = np.stack([t.markers + 5e-4 * rng.normal(size=t.markers.shape) for t in trials])
+    for k, error in off.items():
+        sims[k] += error[:, None, None]
+    return sims
+
+
+@pytest.mark.parametrize(
+    ("start", "rise", "when", "why"),
+    [(0.0, 0.01, 0.0, "start"), (1.2, 0.05, 1.2, "snaps over"), (0.8, 4.0, 1.08, "drift apart")],
+)
+def test_a_trial_that_no_model_follows_is_told_and_why(
+    rope: Recording, start: float, rise: float, when: float, why: str
+) -> None:
+    time = rope.train[0].time
+    error = 20e-3 * np.clip((time - start + 0.01) / rise, 0, 1)
+    sims = followed(rope.train, {1: error})
+    errors = np.stack([errors_by_frame(s, rope.train, None) for s in (sims, sims + 1e-4)])
+    (found,) = misleading_trials(errors, rope.train, 5e-4)
+    assert found.name == "train_1" and why in found.why and found.time == pytest.approx(when, abs=0.08)
+    assert misleading_trials(errors[:, :2], rope.train[:2], 5e-4) == []
+
+
+def test_trials_that_some_model_follows_mislead_nobody(rope: Recording) -> None:
+    off = np.full(len(rope.train[0].time), 10e-3)
+    sims = [followed(rope.train, {1: off}), followed(rope.train, {})]
+    errors = np.stack([errors_by_frame(s, rope.train, None) for s in sims])
+    assert misleading_trials(errors, rope.train, 5e-4) == []
+    all_off = np.stack([errors_by_frame(followed(rope.train, dict.fromkeys(range(3), off)), rope.train, None)])
+    assert misleading_trials(all_off, rope.train, 5e-4) == []
+
+
+def test_the_verdict_has_the_test_and_the_measure_of_the_literature(rope: Recording) -> None:
+    less, more = shaken(rope.test, 0.8, np.random.default_rng(0))
+    test = agreement(less, more, rope.test)
+    found = fake_diagnosis(rope, tests={"air_drag": test})
+    said = summary(found, rope)
+    assert "with p 0.00098 (sign flips of 10 blocks), at a false discovery rate of 0.0078 with all 8 candidates" in said
+    maes = {
+        when: np.mean([mean_absolute_error(found.predictions[when][t.name], t) for t in rope.test])
+        for when in ("before", "after")
+    }
+    assert mean_absolute_errors(found, rope) == pytest.approx(maes)
+    assert f"per coordinate: {1e3 * maes['before']:.2f} → {1e3 * maes['after']:.2f} mm" in said
+    plain = findings(found, rope)
+    assert plain["gap"]["test_mae_after_m"] == pytest.approx(maes["after"])
+    assert plain["effects"][0]["test"]["false_discovery_rate"] == pytest.approx(8 / 2**10)
+    # Two blocks cannot exclude chance, which is said.
+    few = fake_diagnosis(rope, tests={"air_drag": replace(test, p=0.25, units=2)})
+    assert any("too few to exclude" in doubt for doubt in findings(few, rope)["confidence"]["doubts"])
+
+
+def test_what_comes_closest_is_never_left_out_of_an_unknown(rope: Recording) -> None:
+    test = agreement(*shaken(rope.test, 0.8, np.random.default_rng(0)), rope.test)
+    best = BestCandidate("air_drag", {"c_d": 1.8}, 0.29, 0.93, "helps on too few trials", test)
+    found = fake_diagnosis(
+        rope, verdict="unknown", effects=[], ties={}, final=fitted(BASELINE), leading=best, drifts=np.zeros((2, 3))
+    )
+    said = summary(found, rope)
+    assert "The best candidate is air drag (c_d 1.8), which closes 93% of the gap above noise on the test" in said
+    assert "29% on the train trials; it is not named because it helps on too few trials" in said
+    assert findings(found, rope)["best_candidate"]["heldout_gain"] == 0.93
+
+
+def test_limits_are_said_in_one_sentence(rope: Recording) -> None:
+    score = Score("point_mass", 0.0, {}, (), {}, np.zeros(0), (({"point_mass.mass": 2e-3}, 1e-3),))
+    found = fake_diagnosis(rope, limits=detection_limits([score], 2e-3))
+    assert limits_text(found).endswith("by place or direction: point mass (mass 0.004 kg).")
+    assert limits_text(fake_diagnosis(rope)) == ""

@@ -1,0 +1,82 @@
+"""How large an effect would have to be to be named on a recording: what a diagnosis that names nothing rules out.
+
+Doses of every effect are simulated for the screening anyway. What a dose changes, after the baseline's own numbers have
+taken up what they can, grows with the dose to first order; it is named from where it closes more than the floor leaves
+open and the least share of the gap that counts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from torchdlo.physics.effects import EFFECTS
+from torchdlo.sysid.diagnosis import effect_library
+from torchdlo.sysid.diagnosis.score_test import Score
+
+__all__ = ["DetectionLimit", "detection_limits", "least_gap"]
+
+
+@dataclass(frozen=True)
+class DetectionLimit:
+    """From which size on an effect is named on a recording."""
+
+    name: str
+    """The effect."""
+    number: str
+    """The number that says how large it is."""
+    unit: str
+    """Its unit."""
+    easiest: float
+    """The size of this number from which it is named at the best, where it is placed or directed so that it shows most;
+    of a stiffness in series, up to which."""
+    hardest: float
+    """The same where it shows least."""
+
+
+def least_gap(rest: float, noise: float, level: float, share: float) -> float:
+    """Return the gap that an effect has to leave to be named, root mean square per coordinate [m].
+
+    Args:
+        rest: gap that is left without it [m].
+        noise: of the markers [m].
+        level: gap of a perfect model [m].
+        share: least share of the gap above noise that an effect has to close [1].
+    """
+    return float(np.sqrt(max(level**2, share / (1 - share) * max(rest**2 - noise**2, 0.0))))
+
+
+def detection_limits(scores: Sequence[Score], gap: float) -> list[DetectionLimit]:
+    """Return from which size on each of the screened effects leaves this gap [m], in the order of the library."""
+    found = [limit for score in scores if (limit := _limit(score, gap)) is not None]
+    order = {name: k for k, name in enumerate(effect_library.LIBRARY)}
+    return sorted(found, key=lambda limit: order.get(limit.name, len(order)))
+
+
+def _limit(score: Score, gap: float) -> DetectionLimit | None:
+    """Return the limit of one effect, None where nothing of it shows or it has no number that tells its size."""
+    if not np.isfinite(gap):
+        return None
+    if score.name not in effect_library.STRENGTHS:
+        return None
+    key, power = effect_library.STRENGTHS[score.name]
+    sizes = []
+    for numbers, shown in score.probes:
+        own = np.array([v for name, v in numbers.items() if name.split(".")[1] == key])
+        if not len(own) or shown <= 0:
+            continue
+        param, times = EFFECTS[score.name].params[key], (gap / shown) ** (1 / power)
+        if param.scale == "reciprocal":
+            sizes.append(float(own[0] / times))
+        elif param.scale == "log" and param.off is not None and param.off < 1e3:
+            # Of a ratio, its logarithm grows with the dose.
+            sizes.append(float(np.exp(np.abs(np.log(own[0] / param.off)) * times) * param.off))
+        else:
+            sizes.append(float(np.linalg.norm(own) * times))
+    if not sizes:
+        return None
+    best, worst = (max, min) if EFFECTS[score.name].params[key].scale == "reciprocal" else (min, max)
+    unit = EFFECTS[score.name].params[key].unit
+    return DetectionLimit(score.name, key, unit, best(sizes), worst(sizes))

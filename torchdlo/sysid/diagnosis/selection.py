@@ -1,0 +1,76 @@
+"""When an effect is worth its name: rules that know nothing of ropes, from the gaps that models leave trial by trial.
+
+`torchdlo.sysid.diagnosis.search` applies them to ropes, `torchdlo.sysid.diagnosis.other_systems` to anything else.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from torchdlo.sysid.diagnosis.error_floor import rms
+
+__all__ = ["MATTERS", "NEARLY_ALL", "PAYS", "gain", "helps_on_most", "matters", "refused"]
+
+PAYS = 0.15
+"""Share of the excess gap that an effect has to close, on the train and on the test trials."""
+
+MATTERS = 0.03
+"""Share of the baseline's excess gap that each effect has to close, whatever the others leave."""
+
+NEARLY_ALL = 0.8
+"""Share of what is left above the floor."""
+
+_MOST = 0.6
+"""Share of the train trials on which an effect has to help."""
+
+_NOISE = 0.3
+"""Share of the noise below which an excess gap is none."""
+
+
+def gain(before: np.ndarray, after: np.ndarray, noise: float) -> float:
+    """Return the share of the excess gap (squared, above noise) that is closed, of gaps by trial (B,) [m]."""
+    old, new = rms(before) ** 2, rms(after) ** 2
+    return float((old - new) / max(old - noise**2, (_NOISE * noise) ** 2, 1e-12))
+
+
+def helps_on_most(before: np.ndarray, after: np.ndarray) -> bool:
+    """Return whether gaps (B,) shrink on most trials."""
+    return float(np.mean(after < before)) > _MOST
+
+
+def matters(first: float, before: float, after: float, noise: float, level: float) -> bool:
+    """Return whether a gap shrinks by more than the floor, and by a share of the baseline's.
+
+    What takes away nearly all that is left matters, however small that is beside the baseline's gap.
+
+    Args:
+        first: gap of the baseline [m].
+        before: gap without an effect [m].
+        after: gap with it [m].
+        noise: of what is measured [m].
+        level: gap of a perfect model [m].
+    """
+    closed = before**2 - after**2
+    enough = min(MATTERS * (first**2 - noise**2), NEARLY_ALL * (before**2 - level**2))
+    return closed > max(level**2, enough)
+
+
+def refused(
+    train: tuple[np.ndarray, np.ndarray], test: tuple[np.ndarray, np.ndarray], noise: float, enough: bool
+) -> str | None:
+    """Return why an effect is not worth its name, None if it is.
+
+    Args:
+        train: gaps of the train trials without and with it [m], (B,) each.
+        test: the same of the test trials.
+        noise: of what is measured [m].
+        enough: whether what it closes `matters`.
+    """
+    closed = gain(*train, noise)
+    if not helps_on_most(*train):
+        return "helps on too few trials"
+    if closed < PAYS:
+        return f"closes {max(closed, 0):.0%} of the gap"
+    if gain(*test, noise) < PAYS:
+        return "does not help on the test trials"
+    return None if enough else "closes less than the floor leaves open"
