@@ -117,7 +117,7 @@ def load_mesh(path: str | Path, *, scale: float = 1.0, cache: Path | None = None
     except ImportError as error:
         lacking = f"needs the package {error.name}" if error.name else one_line(error, 80)
         raise InputError(
-            f"{path}: the reader of {path.suffix or 'such files'} cannot be used ({lacking}); install what it lacks, or "
+            f"{path}: the reader of {path.suffix or 'such files'} cannot be used ({lacking}); install that, or "
             "convert the mesh to STL, PLY or OBJ."
         ) from None
     except Exception as error:  # readers of many formats meet damage in as many ways
