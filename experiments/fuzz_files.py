@@ -24,6 +24,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import numpy as np
 import torch
@@ -381,18 +382,15 @@ def _read_trajectory(folder: Path) -> Any:
 def _read_checkpoint(folder: Path) -> Any:
     from torchdlo.sysid.estimation import checkpoint
 
-    checkpoint.program = _program  # a hash of all of our files, which takes longer than all else
-    return checkpoint.Checkpoint(folder / "checkpoint.json", _Measured(), {}, True)
+    # The hash of all of our files takes longer than all else.
+    with mock.patch.object(checkpoint, "program", lambda: "program"):
+        return checkpoint.Checkpoint(folder / "checkpoint.json", _Measured(), {}, True)
 
 
 @dataclass
 class _Measured:
     path: Path = Path()
     length: float = 1.0
-
-
-def _program() -> str:
-    return "program"
 
 
 def _checkpoint(folder: Path) -> None:
