@@ -172,7 +172,7 @@ def _read(path: Path) -> dict[str, Any]:
         return found | {"version": VERSION, "options": options}
     if found.get("version") != VERSION:
         raise InputError(
-            f"{path}: version: expected {VERSION}, found {found.get('version')!r}; write the model again with this "
+            f"{path}: version: expected {VERSION}, found {one_line(repr(found.get('version')), 60)}; write the model again with this "
             "version of torchdlo."
         )
     return found
