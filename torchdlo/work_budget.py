@@ -31,7 +31,10 @@ def available_memory() -> float:
     try:
         limit = Path("/sys/fs/cgroup/memory.max").read_text().strip()
         if limit != "max":
-            found.append(float(limit) - float(Path("/sys/fs/cgroup/memory.current").read_text()))
+            # Files that were read lie in memory too, and make room when it is needed.
+            rows = dict(row.split() for row in Path("/sys/fs/cgroup/memory.stat").read_text().splitlines())
+            used = float(Path("/sys/fs/cgroup/memory.current").read_text()) - float(rows.get("inactive_file", 0))
+            found.append(float(limit) - used)
     except (OSError, ValueError):
         pass
     if not found:

@@ -44,7 +44,7 @@ def main(args: list[str] | None = None) -> None:
     try:
         with ending.caught(args):
             for argument in sys.argv[1:] if args is None else args:
-                check_path(argument, "name or option")
+                check_path(" ".join(argument.split()), "name or option")
             app(args=args)
     except InputError as error:
         typer.echo("error: " + for_terminal(" ".join(str(error).splitlines())), err=True)

@@ -13,6 +13,7 @@ from torchdlo.cli.ending import stopped
 from torchdlo.cli.progress import deferred_interrupt, progress
 from torchdlo.errors import InputError
 from torchdlo.files import check_writable
+from torchdlo.untrusted.names import one_line
 
 __all__ = ["dataset", "learn", "sweep"]
 
@@ -123,7 +124,7 @@ def check(path: SetArgument, as_json: Json = False) -> None:
     if as_json:
         typer.echo(json.dumps({"path": str(path), "problems": found}, indent=1))
     for sentence in found:
-        typer.echo(sentence, err=as_json)
+        typer.echo(one_line(sentence), err=as_json)
     if found:
         typer.echo(f"error: {path}: {len(found)} {'problem' if len(found) == 1 else 'problems'}", err=True)
         raise typer.Exit(1)
@@ -138,7 +139,7 @@ def info(path: SetArgument, as_json: Json = False) -> None:
 
     found = summary(open_set(path))
     if as_json:
-        typer.echo(json.dumps(found, indent=1, ensure_ascii=False))
+        typer.echo(json.dumps(found, indent=1))
         return
     typer.echo(
         f"{path}: {found['episodes']} episodes, {found['frames']} frames at {found['fps']} per second, "
@@ -146,10 +147,10 @@ def info(path: SetArgument, as_json: Json = False) -> None:
     )
     for name, task in found["tasks"].items():
         failed = "" if task["failed"] is None else f", {task['failed']} of {task['attempts']} attempts failed"
-        typer.echo(f"  {name}: {task['episodes']} episodes, {task['told']} sentences{failed}")
+        typer.echo(f"  {one_line(name)}: {task['episodes']} episodes, {task['told']} sentences{failed}")
     shapes = {**found["features"], **found["cameras"]}
     for name, shape in shapes.items():
-        typer.echo(f"  {name}: {' x '.join(map(str, shape))}")
+        typer.echo(f"  {one_line(name)}: {' x '.join(map(str, shape))}")
 
 
 @dataset.command()

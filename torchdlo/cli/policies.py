@@ -13,6 +13,7 @@ from torchdlo.cli.progress import deferred_interrupt, progress
 from torchdlo.errors import InputError
 from torchdlo.files import check_writable, write_atomically
 from torchdlo.journal import at_work
+from torchdlo.untrusted import parse_json
 
 if TYPE_CHECKING:
     from torchdlo.agents.rl.settings import Settings
@@ -121,8 +122,8 @@ def _read(pairs: list[str]) -> dict[str, Any]:
         if not equals:
             raise InputError(f"--set {pair}: expected NAME=VALUE, such as rate=1e-3.")
         try:
-            found[name] = json.loads(value)
-        except ValueError:
+            found[name] = parse_json(value, where=f"--set {name}")
+        except InputError:
             found[name] = value
         if isinstance(found[name], list):
             found[name] = tuple(found[name])

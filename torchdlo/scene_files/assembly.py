@@ -21,6 +21,7 @@ from torchdlo.scene_files import limits, motion
 from torchdlo.scene_files.json_files import EFFECTS, like, read
 from torchdlo.scene_files.rope_models import Modelled, with_models
 from torchdlo.scene_files.schema import BodySpec, ParticleBlockSpec, RopeSpec, SceneDescription
+from torchdlo.untrusted import one_line
 
 __all__ = ["Simulation", "assemble", "build", "load"]
 
@@ -238,7 +239,9 @@ def _blob(m: ParticleBlockSpec, k: int, zero: Tensor) -> particles.ParticleBlock
     here, law = f"material_points[{k}]", _LAWS[m.constitutive_model]()
     count = {"box": 3, "ball": 1}[m.shape]
     if len(m.size) != count or min(m.size) <= 0:
-        raise InputError(f"{here}.size: expected {count} numbers above 0 for a {m.shape}, given {list(m.size)}.")
+        raise InputError(
+            f"{here}.size: expected {count} numbers above 0 for a {m.shape}, given {one_line(list(m.size), 60)}."
+        )
     if not 0 < m.spacing <= 2 * min(m.size):
         raise InputError(f"{here}.spacing: expected more than 0, up to its own size, given {m.spacing:g}.")
     known = [*law.params, "density"]

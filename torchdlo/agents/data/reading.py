@@ -16,7 +16,7 @@ from torchdlo.agents.data import parquet, video
 from torchdlo.agents.data.build import PROVENANCE
 from torchdlo.agents.data.schema import FORMAT, data_path, video_path
 from torchdlo.errors import InputError
-from torchdlo.untrusted import read_json
+from torchdlo.untrusted import Entry, read_json
 
 __all__ = ["DataSet", "FrameData", "open_set", "to_tensordict"]
 
@@ -100,6 +100,18 @@ def column_array(table: Any, name: str, where: Path) -> np.ndarray:
     return column.to_numpy(zero_copy_only=False)
 
 
+def _check_info(info: Entry) -> None:
+    """Check types of what everything else reads without asking."""
+    info["fps"].number(1e-3, 1e6, "1/s")
+    for name in ("total_episodes", "total_frames"):
+        info[name].whole(0)
+    for name in info["features"].object():
+        said = info["features"][name]
+        said["dtype"].text(most=100)
+        for size in said["shape"].items(10):
+            size.whole(0, 10**9)
+
+
 def open_set(path: Path) -> DataSet:
     """Open a data set.
 
@@ -116,6 +128,7 @@ def open_set(path: Path) -> DataSet:
     missing = {"features", "fps", "total_episodes", "total_frames"} - info.keys()
     if missing:
         raise InputError(f"{path}/meta/info.json: lacks {', '.join(sorted(missing))}; it is damaged.")
+    _check_info(Entry(info, f"{path}/meta/info.json", "", "the description of a LeRobot data set"))
     table = parquet.read_table(path / "meta/tasks.parquet")
     if not {"task", "task_index"} <= set(table.column_names):
         raise InputError(

@@ -18,6 +18,7 @@ from typing import Any, Protocol, TypeVar
 from torchdlo.errors import InputError
 from torchdlo.files import write_atomically
 from torchdlo.journal import read_json, write_json
+from torchdlo.untrusted import one_line
 
 __all__ = ["Budget", "Conversation", "Model", "Picture", "Question", "Reply", "plain_text"]
 
@@ -253,5 +254,4 @@ def _json_of(text: str) -> Any:
 
 def plain_text(text: str, most: int = 400) -> str:
     """Return one line of a text that may come from anywhere: printable, and not too long."""
-    line = "".join(c if c.isprintable() else " " for c in " ".join(str(text).split()))
-    return line if len(line) <= most else line[: most - 3] + "..."
+    return one_line(text, most)

@@ -115,10 +115,10 @@ def load_mesh(path: str | Path, *, scale: float = 1.0, cache: Path | None = None
     try:
         mesh = trimesh.load_mesh(path)
     except ImportError as error:
-        missing = f" needs the package {error.name}, which is not there" if error.name else f" lacks one ({error})"
+        lacking = f"needs the package {error.name}" if error.name else one_line(error, 80)
         raise InputError(
-            f"{path}: the reader of {path.suffix or 'such files'}{missing}; install it, or convert the mesh to STL, "
-            "PLY or OBJ."
+            f"{path}: the reader of {path.suffix or 'such files'} cannot be used ({lacking}); install that, or "
+            "convert the mesh to STL, PLY or OBJ."
         ) from None
     except Exception as error:  # readers of many formats meet damage in as many ways
         said = one_line(str(error) or type(error).__name__, 120)

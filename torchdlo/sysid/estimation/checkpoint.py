@@ -19,6 +19,7 @@ from torchdlo.errors import InputError
 from torchdlo.journal import read_json, write_json
 from torchdlo.sysid.estimation.result_cache import decode, digest, encode, program
 from torchdlo.sysid.recordings.recording import Recording
+from torchdlo.untrusted import Entry
 
 __all__ = ["Checkpoint"]
 
@@ -47,6 +48,8 @@ class Checkpoint:
                 f"{self.path}: expected a checkpoint of torchdlo calibrate, found something else, or a damaged one; "
                 "run without --resume."
             )
+        for values in found["best"].values():
+            Entry(values, str(self.path), "best", "a checkpoint of torchdlo calibrate").numbers(None, most=1e300)
         if found["key"] != self.content["key"]:
             raise InputError(
                 f"{self.path}: the checkpoint belongs to another recording or other options; run without --resume."

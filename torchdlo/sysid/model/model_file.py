@@ -171,9 +171,9 @@ def _read(path: Path) -> dict[str, Any]:
         options = {_OLDER.get(name, name): value for name, value in found["options"].items()}
         return found | {"version": VERSION, "options": options}
     if found.get("version") != VERSION:
+        given = one_line(repr(found.get("version")), 60)
         raise InputError(
-            f"{path}: version: expected {VERSION}, found {found.get('version')!r}; write the model again with this "
-            "version of torchdlo."
+            f"{path}: version: expected {VERSION}, found {given}; write the model again with this version of torchdlo."
         )
     return found
 

@@ -13,6 +13,7 @@ import numpy as np
 
 from torchdlo.errors import InputError
 from torchdlo.sysid.recordings.recording import Recording, Trial, check_new_folder
+from torchdlo.untrusted import read_json
 from torchdlo.vision.camera import Camera, save_cameras
 from torchdlo.vision.film import Film, Look, check_inside, off_camera
 from torchdlo.vision.film import film as film_rope
@@ -91,7 +92,7 @@ def film_recording(
 
     def fill(folder: Path) -> None:
         nonlocal done
-        rope = json.loads((recording.path / "rope.json").read_text())
+        rope = read_json(recording.path / "rope.json", "length, mass and so on of a rope")
         rope |= {"radius": wide, "color": {"rgb": list(look.color)}, "rest_positions": None, "marker_mass": None}
         rope |= {"mass": recording.mass + _markers_mass(recording, chosen[0]), "marker_noise_std": None}
         (folder / "rope.json").write_text(json.dumps({k: v for k, v in rope.items() if v is not None or k in _KEPT}))
