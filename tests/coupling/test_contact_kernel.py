@@ -70,7 +70,7 @@ def test_a_rope_that_piles_up_comes_to_rest_without_gaining_energy():
     turn = 6 * torch.pi * s
     x = torch.stack([0.03 * turn.cos(), 0.03 * turn.sin(), 0.02 + 0.05 * s], -1)
     rope = Rope(x, radius=0.004, mass=0.02, bend=1e-5, rest="as_placed")
-    effects = [EFFECTS["bend_frame"](), EFFECTS["gravity"](), EFFECTS["damping"](), RodContact(), RodBody()]
+    effects = [EFFECTS["bend_frame"](), EFFECTS["gravity"](), EFFECTS["damping"](), RodContact(room=400), RodBody()]
     made, params, state = make(
         [rope], effects, {"damping": {"rate": 2.0}}, bodies=[RigidBody("plane", motion="fixed")], **IMPLICIT
     )
