@@ -7,9 +7,11 @@ import torch
 
 from torchdlo import scene
 from torchdlo.coupling import RodBody, RodContact
+from torchdlo.physics import tree
 from torchdlo.physics.effects import EFFECTS
 from torchdlo.physics.integrators import contact_kernel
-from torchdlo.scene import RigidBody, Rope, make
+from torchdlo.physics.linalg import banded
+from torchdlo.scene import RigidBody, Rope, check_gradients, make
 
 F64 = torch.float64
 IMPLICIT = {"integrator": "implicit", "dt": 2e-3, "substeps": 1}
@@ -51,6 +53,47 @@ def test_the_kernel_finds_what_tensor_operations_find(closed, monkeypatch):
     assert float((moved[0] - moved[1]).abs().max()) < 1e-10
     assert float(moved[0][..., :2].abs().max()) > 1e-6  # it was hit
     scene.check_state(ends[0])
+
+
+@pytest.mark.parametrize("what", ["pos", "vel"])
+def test_gradients_of_ropes_that_press_each_other_are_those_of_differences(what):
+    made, params, state = crossing(1, False)
+    control = scene.stationary_control(made, state)
+    with torch.no_grad():
+        for _ in range(2):
+            state = scene.step(made, params, state, control)
+    weight = torch.linspace(0, 1, state.rods.pos.numel(), dtype=F64).reshape(state.rods.pos.shape)
+
+    def seen(given: torch.Tensor) -> torch.Tensor:
+        now = tree.replace(state, rods=tree.replace(state.rods, **{what: given}))
+        return (scene.step(made, params, now, control).rods.pos * weight).sum()
+
+    found = check_gradients(seen, getattr(state.rods, what), directions=2, span=1e-7 if what == "pos" else 1e-5)
+    assert found.error < 1e-6, str(found)
+
+
+@pytest.mark.parametrize("transpose", [False, True])
+def test_systems_with_a_term_of_low_rank_are_those_of_full_matrices(transpose):
+    rng, (slots, pairs, scenes) = torch.Generator().manual_seed(0), (6, 3, 2)
+    name = f"touching:o{slots}"
+    entries = 0.1 * torch.rand(42 * slots, scenes, generator=rng, dtype=F64)
+    for c in (0, 4, 8):  # diagonals of the blocks of 3 x 3
+        entries[c * slots : (c + 1) * slots] += 2
+    entries[41 * slots :] -= 2
+    vertex = torch.stack([torch.randperm(slots, generator=rng)[:4] for _ in range(pairs * scenes)], -1)
+    left, right = (torch.randn(4, 3, 3, pairs, scenes, generator=rng, dtype=F64) for _ in range(2))
+    right[..., 0, 0] = 0.0  # a pair that has no part in it
+    vertex = vertex.reshape(4, pairs, scenes)
+    rhs = torch.randn(4 * slots, scenes, generator=rng, dtype=F64)
+    found = torch.ops.torchdlo.solve_low_rank(entries, vertex, left, right, rhs, name, transpose)
+    whole = banded.dense_matrix(entries, name)
+    for b in range(scenes):
+        for k in range(pairs):
+            rows = torch.stack([c * slots + vertex[:, k, b] for c in range(3)], -1).flatten()
+            up = left[..., k, b].flatten(0, 1)
+            whole[b][rows[:, None], rows] += up @ right[..., k, b].transpose(0, 1).flatten(1)
+    matrix = whole.mT if transpose else whole
+    assert float((matrix @ found.T.unsqueeze(-1) - rhs.T.unsqueeze(-1)).abs().max()) < 1e-10
 
 
 def test_recorded_steps_move_as_others_do():
