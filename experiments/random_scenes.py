@@ -11,10 +11,12 @@ examples:
   python experiments/random_scenes.py --scenes 1000 --json random_scenes.json
   python experiments/random_scenes.py --scenes 2000 --json random_scenes.json --resume
   python experiments/random_scenes.py --scenes 40 --batch 20 --seconds 0.5
+  python experiments/random_scenes.py --integrator implicit --substeps 1
 """
 
 from __future__ import annotations
 
+import functools
 import json
 import math
 import random
@@ -68,7 +70,9 @@ def tangles(scenes: int, generator: Any) -> Any:
     return torch.stack(found[:scenes])
 
 
-def build(seed: int, scenes: int, step: tuple[float, int]) -> tuple[tuple[Any, Any, Any], list[str]]:
+def build(
+    seed: int, scenes: int, step: tuple[float, int], integrator: str = "explicit"
+) -> tuple[tuple[Any, Any, Any], list[str]]:
     """Return a kind of scene with its parameters and first state, and the shapes of its bodies."""
     import torch
 
@@ -108,12 +112,20 @@ def build(seed: int, scenes: int, step: tuple[float, int]) -> tuple[tuple[Any, A
     }
     rope = scene.Rope(tangles(scenes, g), radius=RADIUS, density=1000.0, bend=1e-4)
     effects = [Gravity(), Bend(), Damping(), RodContact(burst=3.0, room=400), RodBody(), BodyContact()]
-    made = scene.make([rope], effects, values, bodies=solids, dt=step[0], substeps=step[1])
+    made = scene.make([rope], effects, values, bodies=solids, dt=step[0], substeps=step[1], integrator=integrator)
     thrown = uniform(-1.0, 1.0, 1, 3) + uniform(-0.2, 0.2, VERTICES, 3)
     material = tree.replace(made[1].rods.material, bend=10 ** uniform(-6, -4, 1, 1))
     rods = tree.replace(made[1].rods, material=material)
     state = tree.replace(made[2], rods=tree.replace(made[2].rods, vel=tree.batch_innermost(thrown)))
     return (made[0], tree.replace(made[1], rods=rods), state), shapes
+
+
+@functools.cache
+def stepper(choice: Any) -> Any:
+    """Return recorded steps of a scene."""
+    from torchdlo import scene
+
+    return scene.stepper(choice, compiled=False, recorded=True)
 
 
 def run(made: tuple[Any, Any, Any], state: Any, seconds: float, first: int, last: int) -> Any:
@@ -124,7 +136,7 @@ def run(made: tuple[Any, Any, Any], state: Any, seconds: float, first: int, last
     from torchdlo.physics import tree
 
     choice, params, placed = made
-    control = scene.stationary_control(choice, placed)
+    control, step = scene.stationary_control(choice, placed), stepper(choice)
     with torch.no_grad():
         for k in range(first, last):
             # It comes to rest at three quarters of the time.
@@ -132,7 +144,7 @@ def run(made: tuple[Any, Any, Any], state: Any, seconds: float, first: int, last
             way = 0.06 * math.sin(math.pi * share) ** 2
             pos = control.bodies.pos + control.bodies.pos.new_tensor([way, way, 0.0])
             moved = tree.replace(control, bodies=tree.replace(control.bodies, pos=pos))
-            state = scene.step(choice, params, state, moved)
+            state = step(params, state, moved)
     return state
 
 
@@ -179,13 +191,15 @@ def overlaps(made: tuple[Any, Any, Any], state: Any) -> tuple[Any, Any]:
     return inside.clamp(min=0), (2 - between.norm(dim=-1).amin(-1) / RADIUS).clamp(min=0)
 
 
-def examine(seed: int, scenes: int, seconds: float, step: tuple[float, int]) -> list[dict[str, Any]]:
+def examine(
+    seed: int, scenes: int, seconds: float, step: tuple[float, int], integrator: str = "explicit"
+) -> list[dict[str, Any]]:
     """Run a kind of scene and return a row for each of its scenes."""
     from torchdlo import scene
 
-    made, shapes = build(seed, scenes, step)
+    made, shapes = build(seed, scenes, step, integrator)
     start = time.process_time()
-    state, same = travel(made, build(seed, scenes, step)[0], seconds)
+    state, same = travel(made, build(seed, scenes, step, integrator)[0], seconds)
     used = time.process_time() - start
     x, v = state.rods.pos, state.rods.vel
     speed = v.norm(dim=-1).amax(-1)
@@ -247,9 +261,10 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=0, help="of the first kind (%(default)s)")
     parser.add_argument("--dt", type=float, default=2e-3, help="step [s] (%(default)s)")
     parser.add_argument("--substeps", type=count, default=4, help="substeps per step (%(default)s)")
+    parser.add_argument("--integrator", choices=("explicit", "implicit"), default="explicit", help="(%(default)s)")
     parser.flag("resume", "go on with the file of --json")
     options = parser.parse_args()
-    choices = {name: getattr(options, name) for name in ("batch", "seconds", "seed", "dt", "substeps")}
+    choices = {name: getattr(options, name) for name in ("batch", "seconds", "seed", "dt", "substeps", "integrator")}
     rows = earlier(parser, options.json, choices) if options.resume else []
     import torch
 
@@ -257,7 +272,7 @@ def main() -> int:
     seed = rows[-1]["kind"] + 1 if rows else options.seed
     while len(rows) < options.scenes:
         size = min(options.batch, options.scenes - len(rows))
-        rows += examine(seed, size, options.seconds, (options.dt, options.substeps))
+        rows += examine(seed, size, options.seconds, (options.dt, options.substeps), options.integrator)
         seed += 1
         print(f"{len(rows):6} scenes: {summary(rows)}", flush=True)
         save(options.json, {"choices": choices, "summary": summary(rows), "rows": rows})

@@ -27,6 +27,7 @@ SCRIPTS = [
     "bench_env.py",
     "bench_rod.py",
     "draw_tasks.py",
+    "fidelities.py",
     "gallery.py",
     "learn_through_contact.py",
     "make_reference.py",

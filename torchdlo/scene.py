@@ -137,6 +137,11 @@ class Scene:
             self.constraint_iterations is None or self.constraint_iterations >= 1,
             f"constraint_iterations is {self.constraint_iterations}; expected at least 1 step, or None",
         )
+        need(
+            self.integrator == "explicit" or (self.constraint_iterations or 1) <= _NEWTON["implicit"],
+            f"constraint_iterations is {self.constraint_iterations}; implicit steps end when they are solved, and take "
+            f"at most {_NEWTON['implicit']}: with more, straight ropes that are pressed along their line explode",
+        )
         need(self.twist_iterations >= 1, f"twist_iterations is {self.twist_iterations}; expected at least 1 step")
         need(
             self.implicit_weight >= 0.25,

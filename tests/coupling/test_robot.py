@@ -199,3 +199,27 @@ def test_reading_is_silent(capfd):
     robot.load(SLIDER, tool="twin")
     robot.panda()
     assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize(
+    "fixed",
+    [
+        '<axis xyz="0 0 0"/>',
+        '<axis xyz="0 0 0"/><limit lower="1" upper="-1" velocity="0" effort="0"/>',
+        "<axis/>",
+        '<limit effort="0"/>',
+    ],
+)
+def test_what_means_nothing_on_a_fixed_joint_is_passed_over(fixed):
+    box = '<collision><geometry><box size="0 0 0"/></geometry></collision>'
+    text = (
+        f'<robot name="r"><link name="a">{box}</link><link name="b"/><link name="c"/>'
+        f'<joint name="f" type="fixed"><parent link="a"/><child link="b"/>{fixed}</joint>'
+        '<joint name="m" type="revolute"><parent link="b"/><child link="c"/><axis xyz="0 0 2"/>'
+        '<limit lower="-1" upper="1" velocity="1" effort="1"/></joint></robot>'
+    )
+    found = urdf.read(text)
+    assert [j.kind for j in found.joints] == ["fixed", "revolute"] and found.shapes == ()
+    assert found.joints[1].axis == (0.0, 0.0, 1.0)
+    with pytest.raises(InputError, match="axis 0 0 0"):
+        urdf.read(text.replace("0 0 2", "0 0 0"))

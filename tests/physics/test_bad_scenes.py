@@ -85,6 +85,10 @@ BAD = {
     "a word for dt": (lambda: make(rope(), [], dt="1ms"), "dt is '1ms'"),
     "no substep": (lambda: make(rope(), [], substeps=0), "substeps"),
     "half a substep": (lambda: make(rope(), [], substeps=2.5), "substeps"),
+    "too many newton steps": (
+        lambda: make(rope(), [], constraint_iterations=12, integrator="implicit"),
+        "at most 8: with more, straight ropes",
+    ),
     "no newton step": (lambda: make(rope(), [], constraint_iterations=0), "constraint_iterations"),
     "small gamma": (lambda: make(rope(), [], implicit_weight=0.1), "implicit_weight"),
     "negative ahead": (lambda: make(rope(), [], numerical_damping=-0.5), "numerical_damping"),

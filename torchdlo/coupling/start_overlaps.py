@@ -8,8 +8,10 @@ so much that it jumps, such as a rope that is held on both sides of a solid, is 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import dataclasses
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -192,27 +194,12 @@ def _part(topology, names, rods, state, bodies, held, constrained) -> RodState:
     start = state.pos.detach()
     free = start.new_ones(topology.size, 1)
     free[list(held)] = 0.0
-    # What is held is where it was put, and so are the edges beside it.
-    mobile = (free * following(topology, free))[..., 0] > 0
 
     def look(pos: Tensor) -> _Overlaps:
-        view = rod.view(topology, rods, tree.replace(state, pos=pos), 1.0)
-        parts = []
-        if "rod_body" in names and bodies is not None:
-            kinds, params, placed = bodies
-            none = torch.zeros_like(placed.pos)
-            motion = PredictedBodyMotion(kinds, params, placed, 1.0, none, none, none[..., :1], none)
-            parts.append(_among_bodies(view, motion, names["rod_body"].pieces))
-        if "rod_contact" in names:
-            parts.append(_among_ropes(view, free))
-        found = _joined(parts)
-        own = mobile.expand(*found.slot.shape[:-1], -1)
-        depth = torch.where(_column(own, found.slot) > 0, found.depth, -1.0)
-        return _Overlaps(found.slot, found.share, depth, found.out, found.part, found.other, found.radius)
+        return _look(rod.view(topology, rods, tree.replace(state, pos=pos), 1.0), names, bodies, free)
 
     found = look(start)
-    over = (found.depth / found.radius).amax(-1, keepdim=True)
-    wrong = (over > SHALLOW).unsqueeze(-1)
+    wrong = _over(found) > SHALLOW
     if not bool(wrong.any()):
         return state
     deepest, what = _deepest(topology, found, bodies)
@@ -221,9 +208,6 @@ def _part(topology, names, rods, state, bodies, held, constrained) -> RodState:
     lengths = Lengths(topology, length, torch.zeros_like(length), active, rods.rest.edge_mask)
     answer = free / rods.material.mass.detach()
 
-    def left(found: _Overlaps) -> Tensor:
-        return (found.depth / found.radius).amax(-1, keepdim=True).unsqueeze(-1)
-
     def slide(pos: Tensor, found: _Overlaps) -> Tensor:
         return pos + _slide(topology, found, free)
 
@@ -231,19 +215,7 @@ def _part(topology, names, rods, state, bodies, held, constrained) -> RodState:
         moved = pos + free * _shift(topology, found)
         return settle(lengths, moved, torch.zeros_like(moved), answer)[0] if constrained else moved
 
-    there, first = start, found
-    for way, rounds in ((slide, _SLIDES), (bend, _ROUNDS)):
-        found = first
-        there = torch.where(wrong, start, there)
-        for _ in range(rounds):
-            there = torch.where(wrong, way(there, found), there)
-            found = look(there)
-            if not bool((wrong & ~(left(found) < _DONE)).any()):
-                break
-        wrong = wrong & ~(left(found) < SHALLOW)
-        if not bool(wrong.any()):
-            break
-    pos = there
+    pos, wrong = _moved(start, found, wrong, look, ((slide, _SLIDES), (bend, _ROUNDS)))
     edge = rod.edge_vectors(topology, pos, rods.rest.edge_mask).norm(dim=-1, keepdim=True)
     strained = bool(((edge / length - 1) * active).abs().amax() > 1e-4) if constrained else False
     if bool(wrong.any()) or strained or _bent(topology, rods, state, pos):
@@ -258,9 +230,46 @@ def _part(topology, names, rods, state, bodies, held, constrained) -> RodState:
         "most.",
     )
     there = state.pos + (pos - start)
-    view = rod.view(topology, rods, state, 1.0)
-    director, ref_twist = rod.advance_frames(topology, rods, view, there)
+    director, ref_twist = rod.advance_frames(topology, rods, rod.view(topology, rods, state, 1.0), there)
     return tree.replace(state, pos=tree.batch_innermost(there), director=director, ref_twist=ref_twist)
+
+
+def _look(view: rod.View, names: dict[str, Effect], bodies: Any, free: Tensor) -> _Overlaps:
+    """Return what overlaps, but for edges beside what is held, which is where it was put."""
+    parts = []
+    if "rod_body" in names and bodies is not None:
+        kinds, params, placed = bodies
+        none = torch.zeros_like(placed.pos)
+        motion = PredictedBodyMotion(kinds, params, placed, 1.0, none, none, none[..., :1], none)
+        parts.append(_among_bodies(view, motion, names["rod_body"].pieces))
+    if "rod_contact" in names:
+        parts.append(_among_ropes(view, free))
+    found = _joined(parts)
+    mobile = (free * view.next(free))[..., 0].expand(*found.slot.shape[:-1], -1) > 0
+    return dataclasses.replace(found, depth=torch.where(_column(mobile, found.slot), found.depth, -1.0))
+
+
+def _over(found: _Overlaps) -> Tensor:
+    """Return the deepest overlap over the radius [1], shape (..., 1, 1)."""
+    return (found.depth / found.radius).amax(-1, keepdim=True).unsqueeze(-1)
+
+
+def _moved(
+    start: Tensor, first: _Overlaps, wrong: Tensor, look: Callable[[Tensor], _Overlaps], ways: Sequence[Any]
+) -> tuple[Tensor, Tensor]:
+    """Return positions after ways to move have been tried one after the other, and which scenes none has parted."""
+    there = start
+    for way, rounds in ways:
+        found, there = first, torch.where(wrong, start, there)
+        for _ in range(rounds):
+            there = torch.where(wrong, way(there, found), there)
+            found = look(there)
+            if not bool((wrong & ~(_over(found) < _DONE)).any()):
+                break
+        wrong = wrong & ~(_over(found) < SHALLOW)
+        if not bool(wrong.any()):
+            break
+    return there, wrong
 
 
 def _deepest(topology: Topology, found: _Overlaps, bodies) -> tuple[float, str]:

@@ -47,7 +47,7 @@ struct Scene {
   }
 
   // How far the fastest vertex may go beside the mean of all, and so may held ones.
-  void foresee(const T* const* vel, const T* const* carried) {
+  void foresee(const T* const* vel, const T* const* carried, const T* const* thick) {
     T mean[3] = {}, most = 0;
     for (int k = 0; k < 3; ++k) {
       for (int v = 0; v < n.vertices; ++v) mean[k] += vel[k][v * n.scenes + b];
@@ -64,7 +64,11 @@ struct Scene {
       }
     };
     compare(vel, n.vertices, T(1)), compare(carried, n.held, T(1 / n.dt));
-    reach = T(n.dt) * (T(1.5) * std::sqrt(most) + T(n.burst));
+    // Without a given burst: 1 m/s, or half a radius within the step.
+    T sudden = T(n.dt) * (n.burst < 0 ? T(1) : T(n.burst));
+    if (n.burst < 0)
+      for (int v = 0; v < n.vertices; ++v) sudden = std::min(sudden, T(0.5) * thick[0][v * n.scenes + b]);
+    reach = T(n.dt) * T(1.5) * std::sqrt(most) + sudden;
   }
 
   void prepare(const T* const* at, const T* const* thick, const T* const* rest) {
@@ -208,7 +212,7 @@ static void look(const T* const* rods, const T* const* carried, int64_t* at, T* 
                  const Sizes& n, int threads) {
   SCENES {
     Scene<T> scene(n, b);
-    scene.foresee(rods + 3, carried);
+    scene.foresee(rods + 3, carried, rods + 6);
     scene.prepare(rods, rods + 6, rods + 7);
     scene.find();
     scene.write(at, real, lost);

@@ -75,7 +75,7 @@ def find_candidates(view: View, carried: Tensor, room: int, burst: float) -> Val
         view: the rods when the step begins; its dt is the whole step.
         carried: how far held vertices are moved in it [m], shape (..., H, 3).
         room: room for pairs.
-        burst: by how much vertices may speed up, beside half their speed [m/s].
+        burst: by how much vertices may speed up, beside half their speed [m/s]; below 0 as if it were not given.
     """
     topology, state, params = view.topology, view.state, view.params
     batch, size = state.pos.shape[:-2], topology.size

@@ -183,9 +183,9 @@ class RodContact(Effect):
     """Edges per row of three cells that tensor operations have room for, in scenes with many edges."""
     recovery: float = 0.2
     """Share of a shallow overlap that a substep removes; a small one lets piles come to rest."""
-    burst: float = 1.0
+    burst: float | None = None
     """By how much vertices may speed up within a step, beside half their speed [m/s]; `State.diagnostics` tells if
-    more."""
+    more. None: 1 m/s, and no more than half a radius in a step, so that thin ropes have room for their pairs."""
     slowest: float = 0.02
     """Approach below which nothing rebounds [m/s]."""
 
@@ -201,7 +201,7 @@ class RodContact(Effect):
 
     def __post_init__(self) -> None:
         for name, least in (("sweeps", 1), ("rounds", 1), ("room", 0), ("row", 1), ("burst", 0), ("slowest", 0)):
-            if not getattr(self, name) >= least:
+            if getattr(self, name) is not None and not getattr(self, name) >= least:
                 raise ValueError(f"RodContact: {name} is {getattr(self, name)}; expected at least {least}")
         if not 0 < self.recovery <= 1:
             raise ValueError(f"RodContact: recovery is {self.recovery}; expected a share above 0, up to 1")
@@ -216,12 +216,15 @@ class RodContact(Effect):
         topology, pos, params = view.topology, view.state.pos, view.params
         room = self.room or max(64, 2 * topology.size)
         if broad_phase_op.ready(pos.device.type, pos.dtype):
-            return broad_phase_op.find_candidates(view, carried, room, self.burst)
+            return broad_phase_op.find_candidates(view, carried, room, -1.0 if self.burst is None else self.burst)
         mean = view.state.vel.mean(-2, keepdim=True)
         fastest = safe_norm(view.state.vel - mean).amax(-2, keepdim=True)
         if carried.shape[-2]:
             fastest = torch.maximum(fastest, safe_norm(carried / view.dt - mean).amax(-2, keepdim=True))
-        reach = (view.dt * (1.5 * fastest + self.burst)).expand(*pos.shape[:-2], 1, 1)
+        sudden = view.dt * (1.0 if self.burst is None else self.burst)
+        if self.burst is None:
+            sudden = (0.5 * params.material.radius.amin(-2, keepdim=True)).clamp(max=sudden)
+        reach = (1.5 * view.dt * fastest + sudden).expand(*pos.shape[:-2], 1, 1)
         first, second, there, lost = near_pairs(topology, params, pos, reach, room, self.row)
         after = torch.tensor(topology.successor(), device=pos.device)
         at = corners(torch.stack([first, after[first], second, after[second]], -2))

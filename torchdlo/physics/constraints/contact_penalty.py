@@ -3,11 +3,11 @@
 At each point of an edge that may touch, with m by how much it misses where it has to be at the end of the step, the
 normal force is k/2 (m + sqrt(m^2 + w^2)), a spring that is rounded over a length w much smaller than the radius, less
 its value 100 w outside of contact, where it ends. That is times 1 - tanh(s / s0), s by how much the point parts more
-than it is asked to and s0 the way at the speed sqrt(g r / 3): surfaces take energy out of what leaves them, and things
-come to rest. Friction is mu f s / sqrt(s^2 + (mu f / k)^2) against the slip s:
-never more than Coulomb allows, and opposed to the slip at the end of the step, so that it takes energy away. Forces
-and their derivatives by the displacements of the ends of the edge and of the body are exact; surfaces are taken as
-they are, to first order, at the start of the step.
+than it is asked to and s0 the way at the speed sqrt(0.1 r) in a step: surfaces take energy out of what leaves them, and
+things come to rest. Friction is mu f s / sqrt(s^2 + (mu f / k)^2) against the slip s: never more than Coulomb allows,
+and opposed to the slip at the end of the step, so that it takes energy away. Forces and their derivatives by the
+displacements of the ends of the edge and of the body are exact; surfaces are taken as they are, to first order, at the
+start of the step.
 """
 
 from __future__ import annotations
@@ -27,7 +27,9 @@ ROUND = 1 / 300
 """Length over which contacts set in, over the radius."""
 FAR = 100.0
 """Distance at which they begin to be felt, over that length."""
-_G = 9.81
+LEAVING = 0.1
+"""Square of the speed with which surfaces are left, over the radius [m/s^2]: a hundredth of gravity, so that things hop
+by half a hundredth of the radius at most."""
 
 
 @tree.struct
@@ -231,7 +233,7 @@ def _law(
     miss, width = wanted - along, ROUND * radius
     root = (miss.square() + width.square()).sqrt()
     push = 0.5 * (miss + root) - 0.5 * width * ((1 + FAR**2) ** 0.5 - FAR)
-    leave = dt * (_G / 3 * radius).sqrt()
+    leave = dt * (LEAVING * radius).sqrt()
     left = torch.tanh((along - wanted.clamp(min=0.0)) / leave)
     fade, on = 1 - left, real * (push > 0)
     normal = firm * push * fade * on

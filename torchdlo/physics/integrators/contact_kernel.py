@@ -103,7 +103,8 @@ def solve(
     points, (between, corners) = _points(batch, touch, v), _pairs(batch, pairs, slots)
     resist = touch.resist.expand(*batch, free_bodies, 6, 6).reshape(batch.numel(), free_bodies, 36).contiguous()
     pattern = banded.pattern(f"touching:{topology.name}")
-    law = [system.turning, lengths.most, lengths.least, lengths.shift, dt, solved, penalty.ROUND, penalty.FAR]
+    law = [system.turning, lengths.most, lengths.least, lengths.shift, dt, solved]
+    law += [penalty.ROUND, penalty.FAR, penalty.LEAVING]
     body = [row.index(1.0) if 1.0 in row else -1 for row in touch.of.tolist()]
     arrays = [
         (ctypes.c_int64 * v)(*topology.successor()),

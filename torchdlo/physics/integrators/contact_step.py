@@ -100,29 +100,7 @@ class Touching:
         batch = torch.broadcast_shapes(forces.shape[:-2], excess.shape[:-2], resist.shape[:-3], firm.shape[:-3])
         with torch.no_grad():
             gradient = penalty.gradients(topology, self.touch, linear, felt, exact)
-            same, one, two = inertia.bands(topology)
-            string = now.impulse * system.lean
-            after, active = following(topology, free), lengths.active
-            soft = lengths.yielding(now.impulse / scale)[1] + lengths.shift * lengths.give
-            unit = torch.eye(3, dtype=y.dtype, device=y.device)
-            own = (same + string + preceding(topology, string)).unsqueeze(-1) * unit + gradient.same
-            beside = (one - string).unsqueeze(-1) * unit
-            own = torch.diag_embed(inertia.vertex) + free.unsqueeze(-1) * own
-            onward = free.unsqueeze(-1) * (beside + gradient.after)
-            back = free.unsqueeze(-1) * penalty.moved(topology, beside + gradient.before)
-            entries = _stacked(
-                batch,
-                own.flatten(-2),
-                onward.flatten(-2),
-                back.flatten(-2),
-                free * two,
-                free * preceding(topology, preceding(topology, two)),
-                -free * active * along_start,
-                after * active * along_start,
-                -active * along,
-                active * along,
-                -active * (lengths.compliance + soft) / scale + (active - 1),
-            )
+            entries = self._entries(batch, now.impulse, gradient, along_start, along)
             rank = None if pairs is None else self._rank(batch, pairs, exact)
             answer, row, schur = _bordered(
                 batch, entries, rank, free.unsqueeze(-1) * gradient.border, gradient, resist, topology
@@ -140,7 +118,7 @@ class Touching:
         cut = 3 * topology.size
         change, pull = _slots(step[:cut], batch, 3), _slots(step[cut:], batch, 1)
         with torch.no_grad():
-            turn = active * (following(topology, change) - change) / lengths.rest
+            turn = lengths.active * (following(topology, change) - change) / lengths.rest
             most = dot(turn, turn).amax(-2, keepdim=True).sqrt()
             short = (1 / most.clamp(min=1e-9)).clamp(max=1.0)
             sizes = (inertia.vertex * y, scale * system.force, felt.force, now.impulse * along_start)
@@ -150,6 +128,41 @@ class Touching:
             sizes = (*sizes, inertia.vertex * carried)
             left = _left(forces, sizes, excess, lengths.rest).expand(*batch, 1, 1)
         return Unknowns(now.pos + short * change, now.impulse + short * pull, bodies + short * turned), left
+
+    def _entries(
+        self,
+        batch: tuple[int, ...],
+        impulse: Tensor,
+        gradient: penalty.ContactGradients,
+        along_start: Tensor,
+        along: Tensor,
+    ) -> Tensor:
+        """Return the entries of the banded matrix, see `_pattern`."""
+        system, lengths, inertia = self.system, self.system.lengths, self.system.inertia
+        topology, free, scale = lengths.topology, system.free, system.scale
+        same, one, two = inertia.bands(topology)
+        string = impulse * system.lean
+        after, active = following(topology, free), lengths.active
+        soft = lengths.yielding(impulse / scale)[1] + lengths.shift * lengths.give
+        unit = torch.eye(3, dtype=along.dtype, device=along.device)
+        own = (same + string + preceding(topology, string)).unsqueeze(-1) * unit + gradient.same
+        beside = (one - string).unsqueeze(-1) * unit
+        own = torch.diag_embed(inertia.vertex) + free.unsqueeze(-1) * own
+        onward = free.unsqueeze(-1) * (beside + gradient.after)
+        back = free.unsqueeze(-1) * penalty.moved(topology, beside + gradient.before)
+        return _stacked(
+            batch,
+            own.flatten(-2),
+            onward.flatten(-2),
+            back.flatten(-2),
+            free * two,
+            free * preceding(topology, preceding(topology, two)),
+            -free * active * along_start,
+            after * active * along_start,
+            -active * along,
+            active * along,
+            -active * (lengths.compliance + soft) / scale + (active - 1),
+        )
 
     def _rank(self, batch: tuple[int, ...], felt: penalty.PairsFelt, exact: bool) -> low_rank.LowRank:
         """Return what pairs add to the matrix."""

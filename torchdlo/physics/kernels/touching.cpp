@@ -16,7 +16,7 @@ struct Sizes {
   int64_t slots, scenes, families, bodies, pairs, half, tries;
   const int64_t *after, *of, *steps;  // next slots; body of each family of points or -1; Newton steps of each try
   const int32_t* order;
-  const double *hardness, *law;  // law: turning, most, least, shift, dt, solved, round, far
+  const double *hardness, *law;  // law: turning, most, least, shift, dt, solved, round, far, leaving
 };
 
 // Numbers of a vertex and its edge.
@@ -170,7 +170,7 @@ class Scene {
     const T rooted = std::sqrt(miss * miss + width * width);
     const T shut = T(0.5) * (miss + rooted) - T(0.5) * width * (std::sqrt(1 + far * far) - far);
     if (!(shut > T(0))) return false;
-    const T leave = T(s.law[4]) * std::sqrt(T(9.81) / 3 * radius);
+    const T leave = T(s.law[4]) * std::sqrt(T(s.law[8]) * radius);
     const T gone = std::tanh((along - std::max(wanted, T(0))) / leave), fade = 1 - gone;
     const T force = stiff * shut * fade;
     const T steep = stiff * (T(0.5) * (1 + miss / rooted) * fade + shut * (1 - gone * gone) / leave);

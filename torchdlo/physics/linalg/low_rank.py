@@ -19,9 +19,9 @@ class LowRank:
     vertex: Tensor
     """The four vertices of each pair [1], shape (4, K, B)."""
     left: Tensor
-    """By how much a part of the pair counts in the rows of its vertices: row, part, shape (4, 3, 3, K, B)."""
+    """By how much a part of the pair counts in the rows of its vertices: row, part [1], shape (4, 3, 3, K, B)."""
     right: Tensor
-    """By how much the columns of its vertices count in a part: part, column, shape (4, 3, 3, K, B)."""
+    """By how much the columns of its vertices count in a part: part, column [kg], shape (4, 3, 3, K, B)."""
 
     def repeat(self, count: int) -> LowRank:
         """Return the same for several right-hand sides, one after the other."""

@@ -53,8 +53,7 @@ class Rope:
     rest: Literal["straight", "as_placed"] | Tensor = "straight"
     """Undeformed shape: straight, as placed, or vertex positions (..., n, 3) of it [m]."""
     rest_curvature: Tensor | None = None
-    """Natural curvature towards the first and towards the second material director [1/m], in place of `rest`'s, shape
-    (..., n, 2)."""
+    """Natural curvature towards the two material directors, in place of `rest`'s [1/m], shape (..., n, 2)."""
     rest_twist: Number | None = None
     """Natural twist, in place of `rest`'s [rad/m]."""
     velocities: Tensor | None = None
