@@ -32,10 +32,7 @@ def lacking(rope: Recording, dose: float) -> dict[str, np.ndarray]:
     found = {}
     for trial in (*rope.train, *rope.test):
         dt = float(trial.time[1])
-        smooth = np.apply_along_axis(
-            lambda x: np.convolve(np.pad(x, 10, "edge"), np.ones(21) / 21, "valid"), 0, trial.markers
-        )
-        v = np.gradient(smooth, dt, axis=0)
+        v = np.gradient(uniform_filter1d(trial.markers, 21, axis=0), dt, axis=0)
         force = -dose * np.linalg.norm(v, axis=-1, keepdims=True) * v
         found[trial.name] = trial.markers - np.cumsum(np.cumsum(force, 0), 0) * dt**2
     return found
