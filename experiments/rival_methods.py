@@ -25,6 +25,7 @@ from typing import Any
 import numpy as np
 import torch
 from options import Parser, save
+from rival_table import table
 from scipy.signal import savgol_filter
 
 from torchdlo.sysid.diagnosis import effect_library
@@ -152,7 +153,7 @@ def regress(recording: Recording, before: dict[str, np.ndarray]) -> list[tuple[s
         columns = columns / (np.linalg.norm(columns, axis=0) + 1e-30)
         columns = columns - q @ (q.T @ columns)
         fit = columns @ np.linalg.lstsq(columns, left, rcond=1e-8)[0]
-        shares.append(1 - float(((left - fit) ** 2).sum() / (left**2).sum()))
+        shares.append(1 - float(((left - fit) ** 2).sum() / max((left**2).sum(), 1e-30)))
         # Each half of the blocks is tested with what the other one says, as a fit agrees with its own.
         scores = np.zeros(block.max() + 1)
         for half in (0, 1):
@@ -233,22 +234,6 @@ def compare(path: Path, journal: Path, truth: list[str] | None) -> dict[str, Any
         "regression": [{"name": n, "share": s, "false_discovery_rate": r} for n, s, r in found],
         "network": learned(recording, before, noise),
     }
-
-
-def table(rows: list[dict[str, Any]]) -> str:
-    """Return a markdown table of what all methods say."""
-    lines = [
-        "| recording | hidden | calibration alone [mm] | `diagnose` | BIC | regression | network, train / test |",
-        "| --- | --- | --- | --- | --- | --- | --- |",
-    ]
-    for r in rows:
-        hidden = "?" if r["hidden"] is None else ", ".join(r["hidden"]) or "nothing"
-        ours = f"{', '.join(r['diagnose']['named']) or r['diagnose']['verdict']} ({r['diagnose']['closed_test']:.0%})"
-        terms_ = ", ".join(t["name"] for t in r["regression"]) or "none"
-        net = " / ".join(f"{r['network'][split]:.0%}" for split in ("train", "test"))
-        cells = (r["recording"], hidden, f"{1e3 * r['gap_m']:.1f}", ours, r["bic"] or "none", terms_, net)
-        lines.append("| " + " | ".join(cells) + " |")
-    return "\n".join(lines)
 
 
 def main() -> None:

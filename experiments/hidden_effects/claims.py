@@ -23,6 +23,7 @@ from scipy.stats import beta
 sys.path.append(str(Path(__file__).resolve().parents[1]))
 
 from options import Parser, save
+from rival_table import table
 from table import BINS, grid
 
 FOLDER = Path(__file__).resolve().parent
@@ -183,6 +184,11 @@ def sentence(stored: Sequence[Stored]) -> str:
     )
 
 
+def rivals(_: Sequence[Stored]) -> str:
+    """Return what other methods say of recordings, as `rival_methods.py` stored it."""
+    return table(json.loads((ROOT / "experiments" / "rivals.json").read_text()))
+
+
 FIGURES = {
     "measurement called something else": "5 %",
     "ranges that hold the truth": "85 to 95 %",
@@ -198,6 +204,7 @@ PARTS: dict[str, Callable[[Sequence[Stored]], str]] = {
     "power": power,
     "nothing": nothing,
     "sentence": sentence,
+    "rivals": rivals,
 }
 """What can be written, by the name between the marks in a page."""
 
