@@ -225,10 +225,11 @@ def learn(
     ] = None,
     epochs: Annotated[int, typer.Option(min=1, help="Times that all frames are seen.")] = 40,
     batch: Annotated[int, typer.Option(min=1, help="Frames of a step.")] = 64,
-    rate: Annotated[float, typer.Option(help="Largest learning rate.")] = 5e-4,
+    rate: Annotated[float, typer.Option(help="Largest learning rate.")] = 1e-3,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the weights and of the order of frames.")] = 0,
     language: Annotated[str, typer.Option(help="How sentences become vectors.", metavar="auto|minilm|hashed")] = "auto",
     threads: Annotated[int, typer.Option(min=1, help="Cores.")] = 2,
+    device: Annotated[str, typer.Option(help="Where to compute.", metavar="cpu|cuda")] = "cpu",
     resume: Annotated[bool, typer.Option("--resume", help="Go on from the checkpoint beside the policy.")] = False,
     as_json: Json = False,
 ) -> None:
@@ -245,7 +246,9 @@ def learn(
     if out.suffix != ".pt":
         raise InputError(f"--out: expected a file that ends in .pt, given {out}.")
     torch.set_num_threads(threads)
-    training = Training(epochs=epochs, batch=batch, rate=rate, seed=seed, language=language)
+    if device not in ("cpu", "cuda") or (device == "cuda" and not torch.cuda.is_available()):
+        raise InputError(f"--device: expected cpu, or cuda where there is a GPU, given {device}.")
+    training = Training(epochs=epochs, batch=batch, rate=rate, seed=seed, language=language, device=device)
     found = _learned(lambda show: run(path, out, training, resume=resume, callback=show), out)
     if found["language"] == "hashed":
         typer.echo(

@@ -29,6 +29,8 @@ __all__ = ["Training", "learn"]
 IMAGES = "observation.images."
 LEAST = 1e-3
 """Least scale of states and targets: what hardly varies is not blown up."""
+FINEST = 0.02
+"""Least spread of targets of a task by which its errors are measured [m]."""
 
 
 @dataclass(frozen=True)
@@ -37,7 +39,7 @@ class Training:
 
     epochs: int = 40
     batch: int = 64
-    rate: float = 5e-4
+    rate: float = 1e-3
     """Largest learning rate."""
     decay: float = 1e-2
     """Weight decay."""
@@ -52,6 +54,7 @@ class Training:
     recolor: float = 0.2
     """Most that each of the colours of a picture is made lighter or darker [1]."""
     seed: int = 0
+    device: str = "cpu"
     language: str = "auto"
     """"minilm", "hashed", or the better one that is installed."""
 
@@ -77,14 +80,16 @@ class _Frames:
     """Vectors of the instructions, shape (tasks, 384)."""
     told: Tensor
     """Instruction of each frame, shape (N,)."""
+    weight: Tensor
+    """Spread of all targets over that of the frame's task, shape (N, 3 R): errors count by what is much in a task."""
     pictures: dict[str, np.ndarray]
     """Shape (N, 3, H, W), 8 bits."""
 
-    def batch(self, at: Tensor, chunk: int) -> tuple[dict[str, Tensor], Tensor, Tensor, Tensor]:
-        """Return pictures, states, sentences and targets; after the end tools stay."""
+    def batch(self, at: Tensor, chunk: int) -> tuple[dict[str, Tensor], Tensor, Tensor, Tensor, Tensor]:
+        """Return pictures, states, sentences, targets, and weights of their errors; after the end tools stay."""
         ahead = torch.minimum(at[:, None] + torch.arange(chunk), self.last[at][:, None])
         shots = {name: torch.from_numpy(x[at.numpy()]) for name, x in self.pictures.items()}
-        return shots, self.state[at], self.sentence[self.told[at]], self.target[ahead]
+        return shots, self.state[at], self.sentence[self.told[at]], self.target[ahead], self.weight[at]
 
 
 def _read(data: DataSet, encoder: str, folder: Path, callback: Callable[[str, int, int, str], None]) -> _Frames:
@@ -110,15 +115,33 @@ def _read(data: DataSet, encoder: str, folder: Path, callback: Callable[[str, in
             pictures[camera.removeprefix(IMAGES)][start:end] = shots.transpose(0, 3, 1, 2)
         callback("read", k + 1, len(data.episodes), "")
     target = columns["torchdlo.target"].reshape(count, -1, 7)[..., :3].reshape(count, -1)
+    target = torch.from_numpy(np.ascontiguousarray(target))
     return _Frames(
         torch.from_numpy(columns["observation.state"].copy()),
-        torch.from_numpy(np.ascontiguousarray(target)),
+        target,
         torch.from_numpy(first),
         torch.from_numpy(last),
         language.encode(data.tasks, encoder),
         torch.from_numpy(columns["task_index"].copy()),
+        _weights(data, target),
         pictures,
     )
+
+
+def _weights(data: DataSet, target: Tensor) -> Tensor:
+    """Return the spread of all targets over that within each frame's task, 1 for arms that are not there."""
+    about = data.provenance.get("episodes") or [{}] * len(data.episodes)
+    rows: dict[str, list[Tensor]] = {}
+    for row, own in zip(data.episodes, about, strict=True):
+        at = torch.arange(row["dataset_from_index"], row["dataset_to_index"])
+        rows.setdefault(own.get("task") or row["tasks"][0], []).append(at)
+    found = torch.ones_like(target)
+    for parts in rows.values():
+        at = torch.cat(parts)
+        spread = target[at].std(0, correction=0)
+        share = target.std(0, correction=0) / spread.clamp(min=FINEST)
+        found[at] = torch.where(spread < LEAST, 1.0, share.clamp(min=1.0))
+    return found
 
 
 def learn(
@@ -186,7 +209,7 @@ class _Run:
         )
         with torch.random.fork_rng(devices=()):
             torch.manual_seed(training.seed)
-            self.policy = ChunkPolicy(shape)
+            self.policy = ChunkPolicy(shape).to(training.device)
         kept = {"target": frames.target} | ({"state": frames.state} if training.proprioception else {})
         for name, x in kept.items():
             getattr(self.policy, f"{name}_mean").copy_(x.mean(0))
@@ -209,10 +232,12 @@ class _Run:
             done = self.epoch * self.steps + k
             for group in self.optimizer.param_groups:
                 group["lr"] = self.training.rate * _schedule(done, all_steps)
-            shots, state, sentence, target = self.frames.batch(at, self.training.chunk)
+            shots, *rest = self.frames.batch(at, self.training.chunk)
+            state, sentence, target, weight = (x.to(self.training.device) for x in rest)
+            shots = {name: x.to(self.training.device) for name, x in shots.items()}
             shots = {name: _recolored(x, self.training.recolor, generator) for name, x in shots.items()}
             wanted = (target - self.policy.target_mean) / self.policy.target_std
-            loss = (self.policy.scaled(shots, state, sentence) - wanted).abs().mean()
+            loss = ((self.policy.scaled(shots, state, sentence) - wanted).abs() * weight[:, None]).mean()
             self.optimizer.zero_grad()
             loss.backward()
             torch.nn.utils.clip_grad_norm_(self.policy.parameters(), 1.0)
@@ -288,7 +313,7 @@ def _recolored(pictures: Tensor, most: float, generator: torch.Generator) -> Ten
     if not most:
         return pictures
     factor = 1 + most * (2 * torch.rand(len(pictures), 3, 1, 1, generator=generator) - 1)
-    return (pictures * factor).clamp(max=255)
+    return (pictures * factor.to(pictures.device)).clamp(max=255)
 
 
 def _schedule(done: int, total: int) -> float:
