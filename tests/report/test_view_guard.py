@@ -221,7 +221,7 @@ def test_a_browser_shows_the_run_also_with_a_token(viewer: Viewer, open_viewer: 
         address = each.address.replace(socket.gethostname(), "127.0.0.1")
         with browser.launch(program) as page:
             page._call("Page.navigate", url=address)
-            page.wait("location.protocol === 'http:' && document.body.innerText.includes('speed')")
+            page.wait("location.protocol === 'http:' && document.body?.innerText.includes('speed')")
             wait(lambda each=each: len(each.server.get_clients()) > 0)
             each.slider.value = 4
             page.wait("[...document.querySelectorAll('input')].some(i => i.value === '4')")

@@ -97,9 +97,8 @@ def deferred_interrupt(
             asked = False
             raise KeyboardInterrupt
 
-    for each, handler in previous.items():
-        if handler is not signal.SIG_IGN:
-            signal.signal(each, ask)
+    for each in previous:
+        signal.signal(each, ask)
     try:
         yield checked
     finally:

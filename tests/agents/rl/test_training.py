@@ -22,6 +22,7 @@ from torchdlo.agents.rl.sac import Sac
 from torchdlo.agents.rl.settings import preset
 from torchdlo.agents.rl.shac import Sapo, Shac
 from torchdlo.agents.rl.training import Trained, train
+from torchdlo.agents.torch_records import load_checkpoint
 from torchdlo.errors import InputError
 
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::FutureWarning")
@@ -108,7 +109,7 @@ def test_a_killed_run_loses_one_interval_at_most(tmp_path: Path):
     time.sleep(0.5)
     process.send_signal(signal.SIGKILL)
     process.wait()
-    done = torch.load(checkpoint, weights_only=True)["episodes"]
+    done = load_checkpoint(checkpoint)["episodes"]
     assert done >= 8
     batches = done // 8 + 2
     assert bits(run("ppo", batches, tmp_path, resume=True, interval=0.0)) == bits(run("ppo", batches, interval=0.0))
