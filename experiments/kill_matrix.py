@@ -1,0 +1,186 @@
+"""Kill long commands at random moments, resume them, and compare with runs that nobody disturbed.
+
+A run is killed by SIGKILL, with all its processes, up to three times: each time at a moment drawn evenly from the time
+that an undisturbed run takes. Then it goes on to its end. What it wrote has to be equal to the last bit, but for the
+time that it took.
+
+    python experiments/kill_matrix.py --out runs/kill_matrix
+    python experiments/kill_matrix.py --commands calibrate,train --kills 5 --out runs/kill_matrix
+"""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import json
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+from options import Parser, count, save
+
+ROOT = Path(__file__).resolve().parents[1]
+SAMPLE = str(ROOT / "torchdlo" / "data" / "sample_rope")
+KEPT_EFFECTS = ("air_drag", "point_mass")
+TIMES = {"seconds", "cpu_seconds", "sha256"}
+"""What may differ: how long it took, and hashes of content that says so."""
+CHAIN = 3
+"""Kills of one run at most."""
+
+
+def commands() -> dict[str, tuple[str, ...]]:
+    """Return the smallest real settings of every command."""
+    from torchdlo.sysid.diagnosis.effect_library import LIBRARY
+
+    excluded = [word for name in LIBRARY if name not in KEPT_EFFECTS for word in ("--exclude-effect", name)]
+    small = ("--vertices", "11")
+    return {
+        "calibrate": ("calibrate", SAMPLE, "--starts", "3", "--iterations", "3", *small, "--rest", "straight"),
+        "diagnose": ("diagnose", SAMPLE, "--trials", "2", "--workers", "1", *small, *excluded),
+        "optimize": ("optimize", "lifting", "--episodes", "24", "--population", "4", "--recorded"),
+        "train": (
+            *("train", "lifting", "--algo", "ppo", "--episodes", "32", "--count", "4", "--fidelity", "coarse"),
+            *("--set", "interval=0"),
+        ),
+        "dataset": (
+            *("dataset", "make", "wiring_post", "--episodes", "4", "--batch", "2", "--size", "0", "--workers", "0"),
+            *("--noise", "0.0005"),
+        ),
+    }
+
+
+def started(words: tuple[str, ...], folder: Path, resume: bool) -> subprocess.Popen[bytes]:
+    """Start a command as the leader of a process group."""
+    command = [sys.executable, "-m", "torchdlo", *words, "--out", str(folder), *(["--resume"] if resume else [])]
+    paths = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
+    env = os.environ | {"PYTHONPATH": paths, "OMP_NUM_THREADS": "1"}
+    pipes = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE}
+    return subprocess.Popen(command, env=env, start_new_session=True, **pipes)
+
+
+def ended(words: tuple[str, ...], folder: Path, resume: bool) -> tuple[int, str]:
+    """Run a command to its end; a run that was killed before it wrote anything begins anew."""
+    process = started(words, folder, resume)
+    _, said = process.communicate()
+    text = said.decode(errors="replace").strip()
+    if resume and process.returncode == 2 and ("none" in text or "no checkpoint" in text):
+        return ended(words, folder, False)
+    return process.returncode, text.splitlines()[-1] if text else ""
+
+
+def killed(words: tuple[str, ...], folder: Path, resume: bool, after: float) -> bool:
+    """Start a command and kill it after some seconds; return whether it was still at work."""
+    process = started(words, folder, resume)
+    begun = time.monotonic()
+    try:
+        _, said = process.communicate(timeout=after)
+    except subprocess.TimeoutExpired:
+        os.killpg(process.pid, signal.SIGKILL)
+        process.communicate()
+        return True
+    if resume and process.returncode == 2 and b"none" in said + b"none" * (b"no checkpoint" in said):
+        return killed(words, folder, False, max(0.0, after - (time.monotonic() - begun)))
+    return False
+
+
+def signature(folder: Path) -> dict[str, str]:
+    """Return hashes of what a run wrote, without times; reports show them."""
+    return {
+        str(file.relative_to(folder)): hashlib.sha256(plain(file).encode()).hexdigest()[:16]
+        for file in sorted(folder.rglob("*"))
+        if file.is_file() and file.suffix not in (".html", ".png") and "tensorboard" not in file.parts
+    }
+
+
+def plain(file: Path) -> str:
+    """Return what counts of a file."""
+    if file.suffix == ".json" and file.name != "checkpoint.json":
+        return json.dumps(timeless(json.loads(file.read_text())), sort_keys=True)
+    if file.suffix == ".csv":
+        rows = list(csv.DictReader(file.read_text().splitlines()))
+        return json.dumps([{k: v for k, v in row.items() if k not in TIMES} for row in rows])
+    if file.name == "policy.pt":
+        import torch
+
+        return json.dumps(timeless(torch.load(file, weights_only=True)), sort_keys=True)
+    if file.name in ("checkpoint.pt", "checkpoint.json"):
+        return ""  # how far it is says how long it took
+    return hashlib.sha256(file.read_bytes()).hexdigest()
+
+
+def timeless(value: Any) -> Any:
+    """Return plain data without times."""
+    if hasattr(value, "tolist"):
+        return [str(value.dtype), value.tolist()]
+    if isinstance(value, dict):
+        return {str(k): timeless(v) for k, v in value.items() if k not in TIMES}
+    if isinstance(value, (list, tuple)):
+        return [timeless(v) for v in value]
+    if isinstance(value, str) and value.startswith("{"):
+        return timeless(json.loads(value))
+    return value
+
+
+def matrix(name: str, words: tuple[str, ...], kills: int, folder: Path, rng: random.Random) -> dict[str, Any]:
+    """Return how runs of a command that were killed came out."""
+    shutil.rmtree(folder, ignore_errors=True)
+    ended(words, folder / "first", False)  # kernels are compiled, and files are read once
+    begun = time.monotonic()
+    code, text = ended(words, folder / "whole", False)
+    whole = time.monotonic() - begun
+    if code:
+        return {"seconds": round(whole, 1), "failed": text}
+    right = signature(folder / "whole")
+    found: dict[str, Any] = {"seconds": round(whole, 1), "reproducible": signature(folder / "first") == right}
+    found |= {"kills": 0, "runs": 0, "equal": 0, "other": []}
+    while found["kills"] < kills:
+        run, moments = folder / f"run_{found['runs']}", []
+        for k in range(min(CHAIN, kills - found["kills"])):
+            moment = rng.uniform(0.0, whole)
+            if not killed(words, run, k > 0, moment):
+                break
+            moments.append(round(moment, 1))
+        code, text = ended(words, run, bool(moments))
+        found["kills"] += len(moments)
+        found["runs"] += 1
+        left = [str(f.relative_to(run)) for f in run.rglob(".*")]
+        now = signature(run) if not code else {}
+        if now == right and not left:
+            found["equal"] += 1
+            shutil.rmtree(run)
+        else:
+            differ = sorted(k for k in {*right, *now} if right.get(k) != now.get(k))
+            found["other"].append({"moments": moments, "code": code, "said": text, "differ": differ, "left": left})
+        print(f"{name}: {found['kills']} kills, {found['equal']} of {found['runs']} runs equal", flush=True)
+    return found
+
+
+def main() -> None:
+    """Run the matrix and save it."""
+    parser = Parser(__file__, description=__doc__)
+    parser.add_argument("--commands", default="", help="some of them, with commas; all if not given")
+    parser.add_argument("--kills", type=count, default=20, help="of each command")
+    parser.add_argument("--seed", type=int, default=0, help="of the moments")
+    parser.add_argument("--out", default="runs/kill_matrix", help="folder for the runs and kill_matrix.json")
+    given = parser.parse_args()
+    known = commands()
+    names = given.commands.split(",") if given.commands else list(known)
+    if wrong := [name for name in names if name not in known]:
+        parser.error(f"{', '.join(wrong)}: expected some of {', '.join(known)}")
+    rows: dict[str, Any] = {}
+    for name in names:
+        rng = random.Random(f"{given.seed} {name}")
+        rows[name] = matrix(name, known[name], given.kills, Path(given.out) / name, rng)
+        save(str(Path(given.out) / "kill_matrix.json"), {"kills": given.kills, "seed": given.seed, "commands": rows})
+    if any(row.get("equal") != row.get("runs") or "failed" in row for row in rows.values()):
+        raise SystemExit(1)
+
+
+if __name__ == "__main__":
+    main()
