@@ -1,8 +1,9 @@
 """Kill long commands at random moments, resume them, and compare with runs that nobody disturbed.
 
 A run is killed by SIGKILL, with all its processes, up to three times: each time at a moment drawn evenly from the time
-that an undisturbed run takes. Then it goes on to its end. What it wrote has to be equal to the last bit, but for the
-time that it took.
+that an undisturbed run works, which begins when it has the lock of its folder. Then it goes on to its end. What it
+wrote has to be equal to the last bit, but for the time that it took. Commands are the real ones; the recording is a
+part of the sample, and the task a short rope, so that starting Python takes the most time.
 
     python experiments/kill_matrix.py --out runs/kill_matrix
     python experiments/kill_matrix.py --commands calibrate,train --kills 5 --out runs/kill_matrix
@@ -10,6 +11,7 @@ time that it took.
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import hashlib
 import json
@@ -20,45 +22,104 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 from options import Parser, count, save
 
 ROOT = Path(__file__).resolve().parents[1]
-SAMPLE = str(ROOT / "torchdlo" / "data" / "sample_rope")
-KEPT_EFFECTS = ("air_drag", "point_mass")
+SAMPLE = ROOT / "torchdlo" / "data" / "sample_rope"
+TRIALS, FRAMES = ("train_0", "train_1", "test_0"), 60
+"""What is taken of the sample."""
+KEPT_EFFECTS = ("air_drag",)
+"""What a diagnosis looks for."""
 TIMES = {"seconds", "cpu_seconds", "sha256"}
 """What may differ: how long it took, and hashes of content that says so."""
 CHAIN = 3
 """Kills of one run at most."""
 
 
-def commands() -> dict[str, tuple[str, ...]]:
+def recording(folder: Path) -> str:
+    """Write the recording that is identified."""
+    import numpy as np
+
+    folder.mkdir(parents=True, exist_ok=True)
+    shutil.copy(SAMPLE / "rope.json", folder)
+    for name in TRIALS:
+        with np.load(SAMPLE / f"{name}.npz") as whole:
+            frames = len(whole["time"])
+            np.savez(folder / f"{name}.npz", **{k: x[:FRAMES] if len(x) == frames else x for k, x in whole.items()})
+    return str(folder)
+
+
+def commands(rope: str) -> dict[str, tuple[str, ...]]:
     """Return the smallest real settings of every command."""
     from torchdlo.sysid.diagnosis.effect_library import LIBRARY
 
     excluded = [word for name in LIBRARY if name not in KEPT_EFFECTS for word in ("--exclude-effect", name)]
-    small = ("--vertices", "11")
     return {
-        "calibrate": ("calibrate", SAMPLE, "--starts", "3", "--iterations", "3", *small, "--rest", "straight"),
-        "diagnose": ("diagnose", SAMPLE, "--trials", "2", "--workers", "1", *small, *excluded),
-        "optimize": ("optimize", "lifting", "--episodes", "24", "--population", "4", "--recorded"),
-        "train": (
-            *("train", "lifting", "--algo", "ppo", "--episodes", "32", "--count", "4", "--fidelity", "coarse"),
-            *("--set", "interval=0"),
-        ),
+        "calibrate": ("calibrate", rope, "--starts", "3", "--iterations", "3", "--vertices", "9", "--rest", "straight"),
+        "diagnose": ("diagnose", rope, "--workers", "1", "--vertices", "9", *excluded),
+        "optimize": ("optimize", "short", "--method", "cmaes", "--episodes", "96", "--population", "8", "--recorded"),
+        "train": ("train", "short", "--algo", "ppo", "--episodes", "64", "--count", "4", "--set", "interval=0"),
         "dataset": (
-            *("dataset", "make", "wiring_post", "--episodes", "4", "--batch", "2", "--size", "0", "--workers", "0"),
-            *("--noise", "0.0005"),
+            *("dataset", "make", "short", "--episodes", "12", "--batch", "2"),
+            *("--size", "0", "--workers", "0"),
         ),
     }
 
 
+def play() -> None:
+    """Run the command line with the task of a short rope."""
+    from torchdlo import envs
+    from torchdlo.cli import main as run
+
+    envs.TASKS["short"] = short_task()
+    run(sys.argv[1:])
+
+
+def short_task() -> Any:
+    """Return a task of a few milliseconds: lead the first end of a short rope to the left of a place."""
+    from torchdlo.envs.core.task import RADIUS, Arms, Task, make, straight
+    from torchdlo.scene import Rope
+
+    @dataclass(frozen=True)
+    class Short(Task):
+        horizon: int = 4
+        frame_skip: int = 1
+        name: ClassVar[str] = "short"
+        arms: ClassVar[Any] = Arms(base=((-0.2, -0.45, 0.0),), vertex=(1,))
+        reset_noise: ClassVar[Any] = ((0.02, 0.01),)
+
+        def build(self, moved: Any) -> Any:
+            rope = Rope(straight((0.0, 0.1, 0.05), 6, moved[:, 0]), RADIUS, mass=0.006, youngs=1e4)
+            return make(self, [rope])
+
+        def rewards(self, seen: Any) -> dict[str, Any]:
+            return {"left": seen.x[:, 1, 1] - 0.1}
+
+        def success(self, seen: Any) -> Any:
+            return seen.x[:, 1, 1] > 0.137
+
+        def waypoints(self) -> list[list[tuple[float, float, float]]]:
+            return [[(0.0, 0.04, 0.0)]]
+
+    return Short
+
+
 def started(words: tuple[str, ...], folder: Path, resume: bool) -> subprocess.Popen[bytes]:
     """Start a command as the leader of a process group."""
-    command = [sys.executable, "-m", "torchdlo", *words, "--out", str(folder), *(["--resume"] if resume else [])]
-    paths = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
+    command = [
+        sys.executable,
+        "-c",
+        "import kill_matrix; kill_matrix.play()",
+        *words,
+        "--out",
+        str(folder),
+        *(["--resume"] if resume else []),
+    ]
+    paths = os.pathsep.join(filter(None, [str(ROOT), str(ROOT / "experiments"), os.environ.get("PYTHONPATH")]))
     env = os.environ | {"PYTHONPATH": paths, "OMP_NUM_THREADS": "1"}
     pipes = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE}
     return subprocess.Popen(command, env=env, start_new_session=True, **pipes)
@@ -69,24 +130,40 @@ def ended(words: tuple[str, ...], folder: Path, resume: bool) -> tuple[int, str]
     process = started(words, folder, resume)
     _, said = process.communicate()
     text = said.decode(errors="replace").strip()
-    if resume and process.returncode == 2 and ("none" in text or "no checkpoint" in text):
+    if resume and process.returncode == 2 and nothing(text):
         return ended(words, folder, False)
     return process.returncode, text.splitlines()[-1] if text else ""
 
 
-def killed(words: tuple[str, ...], folder: Path, resume: bool, after: float) -> bool:
-    """Start a command and kill it after some seconds; return whether it was still at work."""
-    process = started(words, folder, resume)
-    begun = time.monotonic()
-    try:
-        _, said = process.communicate(timeout=after)
-    except subprocess.TimeoutExpired:
-        os.killpg(process.pid, signal.SIGKILL)
-        process.communicate()
-        return True
-    if resume and process.returncode == 2 and b"none" in said + b"none" * (b"no checkpoint" in said):
-        return killed(words, folder, False, max(0.0, after - (time.monotonic() - begun)))
+def waited(process: subprocess.Popen[bytes], folder: Path) -> bool:
+    """Wait until a command has begun to work; return whether it does."""
+    while process.poll() is None:
+        if any(folder.rglob(".torchdlo.lock")):
+            return True
+        time.sleep(0.01)
     return False
+
+
+def killed(words: tuple[str, ...], folder: Path, resume: bool, after: float) -> bool:
+    """Start a command and kill it some seconds after it began to work; return whether it was still at that."""
+    for lock in folder.rglob(".torchdlo.lock"):  # of the one that was killed
+        lock.unlink()
+    process = started(words, folder, resume)
+    if waited(process, folder):
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            process.wait(after)
+    still = process.poll() is None
+    with contextlib.suppress(ProcessLookupError):
+        os.killpg(process.pid, signal.SIGKILL)
+    _, said = process.communicate()
+    if resume and process.returncode == 2 and nothing(said.decode(errors="replace")):
+        return killed(words, folder, False, after)
+    return still
+
+
+def nothing(said: str) -> bool:
+    """Return whether a command says that there is nothing to go on from."""
+    return "found none" in said or "no checkpoint" in said
 
 
 def signature(folder: Path) -> dict[str, str]:
@@ -131,10 +208,11 @@ def matrix(name: str, words: tuple[str, ...], kills: int, folder: Path, rng: ran
     """Return how runs of a command that were killed came out."""
     shutil.rmtree(folder, ignore_errors=True)
     ended(words, folder / "first", False)  # kernels are compiled, and files are read once
-    begun = time.monotonic()
-    code, text = ended(words, folder / "whole", False)
-    whole = time.monotonic() - begun
-    if code:
+    process = started(words, folder / "whole", False)
+    works, begun = waited(process, folder / "whole"), time.monotonic()
+    _, said = process.communicate()
+    whole, code, text = time.monotonic() - begun, process.returncode, said.decode(errors="replace").strip()[-500:]
+    if code or not works:
         return {"seconds": round(whole, 1), "failed": text}
     right = signature(folder / "whole")
     found: dict[str, Any] = {"seconds": round(whole, 1), "reproducible": signature(folder / "first") == right}
@@ -169,7 +247,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0, help="of the moments")
     parser.add_argument("--out", default="runs/kill_matrix", help="folder for the runs and kill_matrix.json")
     given = parser.parse_args()
-    known = commands()
+    known = commands(recording(Path(given.out).resolve() / "rope"))
     names = given.commands.split(",") if given.commands else list(known)
     if wrong := [name for name in names if name not in known]:
         parser.error(f"{', '.join(wrong)}: expected some of {', '.join(known)}")
