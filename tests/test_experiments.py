@@ -223,8 +223,8 @@ def test_an_interrupted_rod_benchmark_keeps_its_rows(tmp_path: Path) -> None:
     )
     while process.poll() is None and not target.exists():
         time.sleep(0.02)
-    time.sleep(0.5)  # the second row has to load torch first, which takes seconds
     os.killpg(process.pid, signal.SIGINT)
-    _, error = process.communicate(timeout=60)
+    _, error = process.communicate(timeout=600)
     assert process.returncode == 130 and b"Traceback" not in error, error.decode()
-    assert len(json.loads(target.read_text())["rows"]) == 1
+    # The second row takes seconds; but this process may have slept meanwhile.
+    assert len(json.loads(target.read_text())["rows"]) >= 1

@@ -33,6 +33,8 @@ _HEAD = b"torchdlo record 1 "
 _LOCK = ".torchdlo.lock"
 _SEAL = "sha256"
 _LARGEST = 2**31
+_BEGINNINGS = (b'{\n "generator": "torchdlo', b'{"generator": "torchdlo')
+"""How marks begin, those of earlier versions too."""
 _STRAY = re.compile(r"\.[0-9a-f]{8}-(.+)", re.DOTALL)
 """What `torchdlo.files.replacing` calls a file that is not complete."""
 
@@ -274,9 +276,11 @@ class Journal:
         others = [_bytes(self.path / name) for name in names - {MARK}]
         if mark is None or not all(n == MARK or n.endswith(self._suffix) for n in names):
             return False
+        if others and all(x is not None and x.startswith(_HEAD) for x in others):
+            return True
+        # Torn, a bit of it flipped, or never written by the disk.
         known = any(word in mark for word in (b"torchdlo", b"generator", b"program")) or not mark.strip(b"\0")
-        records = all(x is not None and (x.startswith(_HEAD) or (MARK in names and known)) for x in others)
-        return known and records and (MARK in names or bool(others))
+        return MARK in names and (known or any(begin.startswith(mark) for begin in _BEGINNINGS))
 
     def _lost(self) -> str:
         """Return what is wrong with a journal whose mark is damaged, "" if its records belong here."""

@@ -37,7 +37,7 @@ def ask(url: str, content: Any = None, **headers: str) -> tuple[int, Any]:
     data = None if content is None else (content if isinstance(content, bytes) else json.dumps(content).encode())
     request = urllib.request.Request(url, data=data, headers=headers)
     try:
-        with urllib.request.urlopen(request, timeout=10) as answer:
+        with urllib.request.urlopen(request, timeout=300) as answer:
             body = answer.read()
             return answer.status, json.loads(body) if answer.headers["Content-Type"].endswith("json") else body
     except urllib.error.HTTPError as error:

@@ -12,9 +12,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from torchdlo.cli.ending import stopped
-from torchdlo.cli.progress import deferred_interrupt, progress
+from torchdlo.cli.progress import at_work, deferred_interrupt, progress
 from torchdlo.files import check_writable, write_atomically
-from torchdlo.journal import at_work
 
 if TYPE_CHECKING:
     from torchdlo.agents.vlm.conversation import Conversation

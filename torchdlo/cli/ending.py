@@ -88,10 +88,8 @@ def caught(args: list[str] | None = None) -> Iterator[None]:
         return
     _by, _told, _typed = None, False, list(sys.argv[1:] if args is None else args)
     before = {s: signal.getsignal(s) for s in SIGNALS}
-    for each, handler in before.items():
-        # What is started in the background of a script ignores Ctrl-C.
-        if handler is not signal.SIG_IGN:
-            signal.signal(each, _raise)
+    for each in before:
+        signal.signal(each, _raise)
     try:
         yield
     except KeyboardInterrupt:

@@ -12,10 +12,9 @@ import typer
 
 from torchdlo.cli.ending import stopped
 from torchdlo.cli.options import ModelOption, RecordingArgument, ResumeOption
-from torchdlo.cli.progress import deferred_interrupt, progress
+from torchdlo.cli.progress import at_work, deferred_interrupt, progress
 from torchdlo.errors import InputError
 from torchdlo.files import check_writable, write_atomically
-from torchdlo.journal import at_work
 
 if TYPE_CHECKING:
     from torchdlo.sysid.estimation.result import Calibration

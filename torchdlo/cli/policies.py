@@ -9,10 +9,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from torchdlo.cli.ending import stopped
-from torchdlo.cli.progress import deferred_interrupt, progress
+from torchdlo.cli.progress import at_work, deferred_interrupt, progress
 from torchdlo.errors import InputError
 from torchdlo.files import check_writable, write_atomically
-from torchdlo.journal import at_work
 from torchdlo.untrusted import parse_json
 
 if TYPE_CHECKING:

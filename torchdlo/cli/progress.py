@@ -7,12 +7,13 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
+from pathlib import Path
 from typing import Any
 
 from torchdlo.cli import ending
 
-__all__ = ["deferred_interrupt", "progress"]
+__all__ = ["at_work", "deferred_interrupt", "progress"]
 
 _QUIET = 10.0
 """Shortest time between two lines in a log [s]."""
@@ -70,6 +71,13 @@ def _lines() -> Callable[[str, int, int, str], None]:
     return callback
 
 
+def at_work(folder: Path, *names: str) -> AbstractContextManager[None]:
+    """Hold the lock of a folder that results go to, see `torchdlo.journal.at_work`."""
+    from torchdlo import journal
+
+    return journal.at_work(folder, *names)
+
+
 @contextmanager
 def deferred_interrupt(
     callback: Callable[[str, int, int, str], None],
@@ -97,9 +105,8 @@ def deferred_interrupt(
             asked = False
             raise KeyboardInterrupt
 
-    for each, handler in previous.items():
-        if handler is not signal.SIG_IGN:
-            signal.signal(each, ask)
+    for each in previous:
+        signal.signal(each, ask)
     try:
         yield checked
     finally:

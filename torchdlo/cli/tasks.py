@@ -10,11 +10,10 @@ import typer
 
 from torchdlo.cli.ending import stopped
 from torchdlo.cli.options import PhotoOption, ResumeOption, RopeModelOption
-from torchdlo.cli.progress import deferred_interrupt, progress
+from torchdlo.cli.progress import at_work, deferred_interrupt, progress
 from torchdlo.cli.scenes import check_files, draw
 from torchdlo.errors import InputError
 from torchdlo.files import check_writable, write_atomically
-from torchdlo.journal import at_work
 
 __all__ = ["optimize", "play", "tasks"]
 

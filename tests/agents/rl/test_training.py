@@ -22,6 +22,7 @@ from torchdlo.agents.rl.sac import Sac
 from torchdlo.agents.rl.settings import preset
 from torchdlo.agents.rl.shac import Sapo, Shac
 from torchdlo.agents.rl.training import Trained, train
+from torchdlo.agents.torch_records import load_checkpoint
 from torchdlo.errors import InputError
 
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::FutureWarning")
@@ -102,13 +103,13 @@ def test_a_killed_run_loses_one_interval_at_most(tmp_path: Path):
         f"t.run('ppo', 100000, pathlib.Path({str(tmp_path)!r}), interval=0.0)\n"
     )
     process = subprocess.Popen([sys.executable, "-W", "ignore", "-c", code], env=os.environ | {"OMP_NUM_THREADS": "1"})
-    checkpoint, end = tmp_path / "checkpoint.pt", time.monotonic() + 120
+    checkpoint, end = tmp_path / "checkpoint.pt", time.monotonic() + 600
     while not checkpoint.exists() and time.monotonic() < end:
         time.sleep(0.05)
     time.sleep(0.5)
     process.send_signal(signal.SIGKILL)
     process.wait()
-    done = torch.load(checkpoint, weights_only=True)["episodes"]
+    done = load_checkpoint(checkpoint)["episodes"]
     assert done >= 8
     batches = done // 8 + 2
     assert bits(run("ppo", batches, tmp_path, resume=True, interval=0.0)) == bits(run("ppo", batches, interval=0.0))

@@ -16,10 +16,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchdlo.agents.checkpoint import load_checkpoint, save_checkpoint
 from torchdlo.agents.data.reading import DataSet, open_set
 from torchdlo.agents.policies import language
 from torchdlo.agents.policies.chunk_policy import ChunkPolicy, Shape, save_policy
+from torchdlo.agents.torch_records import load_checkpoint, save_checkpoint
 from torchdlo.agents.trajopt.search_journal import versions
 from torchdlo.errors import InputError
 from torchdlo.journal import locked, sweep

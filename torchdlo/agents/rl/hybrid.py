@@ -20,7 +20,6 @@ from typing import Any
 
 import torch
 
-from torchdlo.agents.checkpoint import load_checkpoint, save_checkpoint
 from torchdlo.agents.policies import Policy, PolicySpec, load, save, task_features
 from torchdlo.agents.rl.clone import Labels, fit, labelled
 from torchdlo.agents.rl.episodes import TaskEpisodes
@@ -28,6 +27,7 @@ from torchdlo.agents.rl.expert import Expert, candidates, improve, load_expert, 
 from torchdlo.agents.rl.ppo import Ppo
 from torchdlo.agents.rl.rollout import collect
 from torchdlo.agents.rl.settings import Settings
+from torchdlo.agents.torch_records import load_checkpoint, save_checkpoint
 from torchdlo.envs import PUBLISHED, Task, simulated
 from torchdlo.errors import InputError
 from torchdlo.journal import read_json, write_json

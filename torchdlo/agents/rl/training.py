@@ -17,11 +17,11 @@ from typing import Any, Protocol
 
 import torch
 
-from torchdlo.agents.checkpoint import load_checkpoint, save_checkpoint
 from torchdlo.agents.policies import Policy, save
 from torchdlo.agents.rl.episodes import Episodes
 from torchdlo.agents.rl.rollout import Batch
 from torchdlo.agents.rl.settings import Settings
+from torchdlo.agents.torch_records import load_checkpoint, save_checkpoint
 from torchdlo.errors import InputError
 from torchdlo.files import write_atomically
 

@@ -19,7 +19,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchdlo.agents.checkpoint import ARCHIVE, packed, unpacked
+from torchdlo.agents.torch_records import ARCHIVE, packed, unpacked
 from torchdlo.envs import TASKS
 from torchdlo.errors import InputError
 from torchdlo.journal import Journal
