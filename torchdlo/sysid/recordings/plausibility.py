@@ -66,17 +66,33 @@ def _length(recording: Recording, trials: tuple[Trial, ...]) -> list[str]:
 
 
 def _sag(trial: Trial) -> np.ndarray:
-    """Return how far free markers are, on average, from the line between their grippers [m], shape (3,)."""
+    """Return how far free markers are, on average, from where they would be without weight [m], shape (3,).
+
+    That is the line between two grippers, or the one along which a clamp holds the rope, of which only what is across
+    counts. Zero where that is not known.
+    """
     held, free = np.flatnonzero(trial.gripped), np.flatnonzero(~trial.gripped)
     s, away = trial.marker_arclength, []
     for marker in free:
         left, right = held[held < marker], held[held > marker]
-        near = trial.markers[:, [*left[-1:], *right[:1]]]
-        at = s[[*left[-1:], *right[:1]]]
-        share = (s[marker] - at[0]) / (at[1] - at[0]) if len(at) == 2 else 0.0
-        line = near[:, 0] + share * (near[:, -1] - near[:, 0])
-        away.append(np.nanmean((trial.markers[:, marker] - line)[~trial.suspect], axis=0))
-    return np.mean(away, axis=0)
+        here = trial.markers[:, marker][~trial.suspect]
+        if len(left) and len(right):
+            a, b = left[-1], right[0]
+            near, share = trial.markers[~trial.suspect], (s[marker] - s[a]) / (s[b] - s[a])
+            apart = here - near[:, a] - share * (near[:, b] - near[:, a])
+        else:
+            two = left[-2:] if len(left) else right[:2][::-1]
+            if len(two) < 2:
+                continue
+            near = trial.markers[~trial.suspect][:, two]
+            axis = near[:, 1] - near[:, 0]
+            axis = axis / np.maximum(np.linalg.norm(axis, axis=-1, keepdims=True), 1e-9)
+            apart = here - near[:, 1]
+            apart = apart - (apart * axis).sum(-1, keepdims=True) * axis
+        seen = np.isfinite(apart).all(-1)
+        if seen.any():
+            away.append(apart[seen].mean(0))
+    return np.mean(away, axis=0) if away else np.zeros(3)
 
 
 def _down(recording: Recording, trials: tuple[Trial, ...]) -> list[str]:
