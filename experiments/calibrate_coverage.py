@@ -108,8 +108,8 @@ def table(rows: list[dict[str, Any]]) -> str:
         total += held
         half, error = np.median(0.5 * (high - low) / true), np.median(abs(value / true - 1))
         out.append(f"| {name.replace('_', ' ')} | {held} of {len(rows)} | {half:.2%} | {error:.2%} |")
-    share, n = total / (3 * len(rows)), 3 * len(rows)
-    return "\n".join([*out, f"| all | {total} of {n} ({share:.0%}) | | |"])
+    n = len(rows[0]["truth"]) * len(rows)
+    return "\n".join([*out, f"| all | {total} of {n} ({total / n:.0%}) | | |"])
 
 
 def main() -> None:

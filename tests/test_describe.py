@@ -259,6 +259,10 @@ def test_the_example_of_the_documentation_runs(repository, tmp_path, monkeypatch
     exec(text.split("```python\n")[1].split("```")[0], found)
     assert found["controls"].pos.shape == (600, 3, 3)
     assert scene_files.read("lift.json") == found["lift"]
+    # Its ends are never led further apart than the rope between them is long, until the second one is let go.
+    held = found["controls"].pos[:400]
+    length = float(found["params"].rods.rest.length[..., 1:19, 0].sum())
+    assert float((held[:, 1] - held[:, 2]).norm(dim=-1).max()) < length
 
 
 OLD = """{

@@ -27,6 +27,7 @@ FLOORS = {
     "physics": 2,
     "coupling": 3,
     "scene": 4,
+    "measures": 4.2,
     "vision": 4.5,
     "reward_language": 4,
     "scene_files": 6,
@@ -55,6 +56,7 @@ ALLOWED = {
     "physics": TORCH | {"triton"},  # comes with the CUDA builds of torch
     "coupling": TORCH | {"pytorch_kinematics", "trimesh"},
     "scene": TORCH,
+    "measures": TORCH,
     "vision": ARRAYS | {"kornia", "cv2", "av", "matplotlib"},
     "reward_language": TORCH,
     "scene_files": ARRAYS,

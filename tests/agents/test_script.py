@@ -121,3 +121,29 @@ def test_ctrl_c_keeps_the_frames_so_far(monkeypatch, capsys):
     assert went["return"] is None and went["interrupted"] and "led: interrupted" in said.err
     cut = load_frames("cut")
     assert len(cut.time) == 3 < len(whole.time) and np.array_equal(cut.pos, whole.pos[:3])
+
+
+def test_a_task_of_ones_own_is_played_from_its_file(capsys):
+    Path("my_tasks.py").write_text(
+        "from dataclasses import dataclass\n\nimport torch\n\nfrom torchdlo.envs.tasks.coiling import Coiling\n\n\n"
+        "@dataclass(frozen=True)\nclass Reaching(Coiling):\n    '''Coiling, in two short actions.'''\n\n"
+        "    horizon: int = 2\n    frame_skip: int = 1\n\n"
+        "    def rewards(self, seen):\n        return {'one': torch.ones_like(seen.x[:, 0, 0])}\n"
+    )
+    assert play("my_tasks.py:Reaching", "--no-op", "--json") == 0
+    went = json.loads(capsys.readouterr().out)
+    assert went["return"] == 2.0 and went["files"][0] == "runs/play/Reaching/frames.npz"
+    for name, words in (
+        ("no.py:Reaching", "there is no file no.py"),
+        ("my_tasks.py:Away", "tasks there: Coiling, Reaching"),
+    ):
+        assert play(name, "--no-op") == 2
+        assert words in capsys.readouterr().err
+
+
+def test_what_lies_in_a_folder_is_of_one_run(capsys):
+    for name in ("motion.mp4", "picture.png"):
+        Path("runs/play/led").mkdir(parents=True, exist_ok=True)
+        (Path("runs/play/led") / name).write_bytes(b"of an earlier run")
+    assert play("led", "--no-op", "--json") == 0
+    assert sorted(p.name for p in Path("runs/play/led").iterdir()) == ["frames.npz", "shapes.png"]

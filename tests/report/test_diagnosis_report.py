@@ -101,6 +101,12 @@ def test_verdicts_without_a_name_have_a_page_too(rope: Recording, verdict: str, 
     )
     text = diagnosis_html(none, rope)
     assert said in text and "What was found</h2>" not in text and "What calibration had absorbed" not in text
+    # What was fitted stands there all the same, and what did not change is drawn once.
+    assert "Fitted numbers of the rope</h2>" in text and "bending stiffness" in text
+    maps = [
+        html.count('class="heat"') or html.count("with what was found") for html in (text, diagnosis_html(found, rope))
+    ]
+    assert "both maps have one scale" not in text and maps[0] < maps[1]
 
 
 def test_failed_and_long_trials_do_not_break_the_page(rope: Recording) -> None:

@@ -67,9 +67,12 @@ def calibrate(
 
     torchdlo calibrate my_rope --model runs/diagnose/my_rope/model.json
     """
+    from torchdlo.sysid.recordings.plausibility import doubts
     from torchdlo.sysid.recordings.recording import load_recording
 
     loaded = load_recording(recording)
+    for doubt in doubts(loaded):
+        typer.echo(f"check {doubt}", err=True)
     if out is None:
         out = Path("runs") / "calibrate" / recording.resolve().name / "model.json"
     elif out.is_dir() or out.suffix != ".json":
@@ -133,9 +136,12 @@ def diagnose(
     from torchdlo.report.pages import diagnosis as report
     from torchdlo.sysid.diagnosis.findings import findings_json, limits_text, model_json, summary
     from torchdlo.sysid.diagnosis.search import diagnose as search
+    from torchdlo.sysid.recordings.plausibility import doubts
     from torchdlo.sysid.recordings.recording import load_recording
 
     loaded = load_recording(recording, films=False)
+    for doubt in doubts(loaded):
+        typer.echo(f"check {doubt}", err=True)
     out = out or Path("runs") / "diagnose" / recording.resolve().name
     names = ("findings.json", "model.json", report.PAGE)
     for name in names:

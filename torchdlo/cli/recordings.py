@@ -23,12 +23,14 @@ def check(recording: RecordingArgument) -> None:
     """Check a recording folder and say what is in it.
 
     Exit code 0 means that the other commands accept it. Shown are also the errors of two
-    predictions without any parameter: what a calibrated model has to beat.
+    predictions without any parameter: what a calibrated model has to beat. What can hardly be, such as
+    a mass in grams or gravity that points up, is said below.
 
     [bold]Example:[/bold] torchdlo check my_rope
     """
     from rich.console import Console
 
+    from torchdlo.sysid.recordings.plausibility import doubts
     from torchdlo.sysid.recordings.recording import load_recording
 
     loaded = load_recording(recording)
@@ -38,6 +40,8 @@ def check(recording: RecordingArgument) -> None:
         print_films(loaded)
     else:
         console.print(_trial_table(loaded))
+    for doubt in doubts(loaded):
+        console.print(f"check {doubt}", highlight=False, markup=False)
 
 
 def import_deform(

@@ -62,6 +62,7 @@ def simulate(
         raise stopped("there was no result yet, and nothing was written") from None
     except ValueError as error:
         raise InputError(f"{scene}: {error}") from None
+    remove_older(files)
     save_frames(frames, files["frames"], described)
     made = draw(frames, files, scene.stem, speed, photo)
     typer.echo(f"{scene}: {len(frames.time)} frames, {frames.time[-1]:g} s", err=as_json)
@@ -106,6 +107,16 @@ def check_files(out: Path, *, video: bool, picture: bool, photo: bool) -> dict[s
 
         check_renderer()
     return files
+
+
+OUTPUTS = ("shapes.png", "picture.png", "motion.mp4")
+"""What a run may leave beside its frames."""
+
+
+def remove_older(files: dict[str, Path]) -> None:
+    """Remove what an earlier run left beside the frames, so that all in the folder is of one run."""
+    for name in OUTPUTS:
+        files["frames"].with_name(name).unlink(missing_ok=True)
 
 
 def draw(frames: Frames, files: dict[str, Path], title: str, speed: float, photo: bool) -> bool:

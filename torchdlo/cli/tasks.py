@@ -11,7 +11,7 @@ import typer
 from torchdlo.cli.ending import stopped
 from torchdlo.cli.options import PhotoOption, ResumeOption, RopeModelOption
 from torchdlo.cli.progress import at_work, deferred_interrupt, progress
-from torchdlo.cli.scenes import check_files, draw
+from torchdlo.cli.scenes import check_files, draw, remove_older
 from torchdlo.errors import InputError
 from torchdlo.files import check_writable, write_atomically
 
@@ -35,7 +35,7 @@ def tasks(as_json: Annotated[bool, typer.Option("--json", help="Print the list a
 
 
 def play(
-    task: Annotated[str, typer.Argument(help="Name of the task.", metavar="TASK")],
+    task: Annotated[str, typer.Argument(help="Name of the task, or FILE.py:CLASS for your own.", metavar="TASK")],
     trajectory: Annotated[
         Path | None,
         typer.Option(help="What optimize found. Default: the scripted demonstration.", metavar="FILE"),
@@ -73,16 +73,19 @@ def play(
 
     torchdlo play coiling --trajectory runs/optimize/coiling-hybrid/trajectory.json --picture
 
+    torchdlo play my_tasks.py:Reaching --no-op
+
     torchdlo view runs/play/wrapping
     """
     from torchdlo.agents.trajopt.script import script
+    from torchdlo.envs import short_name
     from torchdlo.report.render.episode_film import film, outcome_of
     from torchdlo.scene_files import cable
     from torchdlo.scene_files.run import save_frames
 
     if no_op and trajectory is not None:
         raise InputError("--no-op and --trajectory: expected one of them, or neither for the scripted demonstration.")
-    files = check_files(out or Path("runs") / "play" / task, video=video, picture=picture, photo=photo)
+    files = check_files(out or Path("runs") / "play" / short_name(task), video=video, picture=picture, photo=photo)
     played = script(
         task,
         trajectory,
@@ -93,6 +96,7 @@ def play(
     )
     with progress() as show, deferred_interrupt(show) as callback:
         frames, went = film(played.task, played.actions, made=played.episode, arms=arms, callback=callback)
+    remove_older(files)
     save_frames(frames, files["frames"])
     drawn = draw(frames, files, task, speed, photo) and went is not None
     said = outcome_of(went) | {"files": [str(file) for file in files.values() if file.exists()]}
@@ -108,7 +112,7 @@ def play(
 
 
 def optimize(
-    task: Annotated[str, typer.Argument(help="Name of the task.", metavar="TASK")],
+    task: Annotated[str, typer.Argument(help="Name of the task, or FILE.py:CLASS for your own.", metavar="TASK")],
     out: Annotated[
         Path | None,
         typer.Option(
@@ -173,10 +177,11 @@ def optimize(
     from torchdlo.agents.trajopt.search import optimize as search
     from torchdlo.agents.trajopt.search_journal import remove
     from torchdlo.agents.trajopt.task_problem import problem
+    from torchdlo.envs import short_name
     from torchdlo.report.figures.learning_curve import learning_png
     from torchdlo.scene_files import cable
 
-    out = out or Path("runs") / "optimize" / f"{task}-{method}{f'-{seed}' if seed else ''}"
+    out = out or Path("runs") / "optimize" / f"{short_name(task)}-{method}{f'-{seed}' if seed else ''}"
     names = ("result.json", "trajectory.json", "curve.png")
     for name in names:
         check_writable(out / name)

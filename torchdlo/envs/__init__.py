@@ -6,7 +6,10 @@ Importing this package needs torch only. Arms need the extra `robots`, `make` ne
 from __future__ import annotations
 
 import dataclasses
+import importlib.util
+import sys
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -57,16 +60,54 @@ __all__ = [
     "listing",
     "make",
     "parse_fidelity",
+    "short_name",
     "simulated",
 ]
 
 
+def _own(name: str) -> type[Task]:
+    """Return the class of a task of one's own, given as "FILE.py:CLASS"."""
+    file, _, kind = name.rpartition(":")
+    path = Path(file)
+    if not path.is_file():
+        raise InputError(f"{name}: there is no file {file}; expected FILE.py:CLASS with a task of your own.")
+    module = f"torchdlo_task_{path.stem}_{abs(hash(str(path.resolve()))):x}"
+    if module not in sys.modules:
+        spec = importlib.util.spec_from_file_location(module, path)
+        made = importlib.util.module_from_spec(spec)
+        sys.modules[module] = made  # dataclasses look their modules up
+        try:
+            spec.loader.exec_module(made)
+        except BaseException:
+            del sys.modules[module]
+            raise
+    found = getattr(sys.modules[module], kind, None)
+    if not (isinstance(found, type) and issubclass(found, Task)):
+        own = [k for k, v in vars(sys.modules[module]).items() if isinstance(v, type) and issubclass(v, Task)]
+        others = ", ".join(k for k in own if k != "Task") or "none"
+        raise InputError(f"{name}: {kind} is no task in {file}; tasks there: {others}.")
+    return found
+
+
+def short_name(name: str) -> str:
+    """Return a task's name as folders have it: that of the class for "FILE.py:CLASS"."""
+    return name.rpartition(":")[2]
+
+
 def find(name: str, rope: RopeMaterial | None = None, grasps: Sequence[int | None] | None = None) -> Task:
-    """Return a task by its name, with its ropes made of a cable and held at other vertices if these are given."""
+    """Return a task by its name, or "FILE.py:CLASS" for one of your own.
+
+    Args:
+        name: of the task.
+        rope: what its ropes are made of, if not what the task says.
+        grasps: at which other vertices it is held.
+    """
     known = TASKS | PAIRED_TASKS
-    if name not in known:
-        raise InputError(f"there is no task {name!r}; expected one of {', '.join(sorted(known))}.")
-    task = known[name]()
+    if name not in known and ":" not in name:
+        raise InputError(
+            f"there is no task {name!r}; expected one of {', '.join(sorted(known))}, or FILE.py:CLASS for your own."
+        )
+    task = (known[name] if name in known else _own(name))()
     task = task if rope is None else dataclasses.replace(task, rope=rope)
     return task if grasps is None else dataclasses.replace(task, grasps=tuple(grasps))
 

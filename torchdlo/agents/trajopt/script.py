@@ -69,10 +69,12 @@ def script(
     made = episode.prepare(task, 1, like=chosen.like, **steps, **start)
     if trajectory is not None:
         return Script(task, made, chosen.full(load_actions(trajectory, chosen)))
+    if no_op:
+        return Script(task, made, chosen.like.new_zeros(task.horizon, task.width))
     way = task.demonstration() if reset_seed is None else task.demonstration(made.start.state)[0]
-    if not no_op and not bool((way != 0).any()):
+    if not bool((way != 0).any()):
         raise InputError(f"{name}: has no scripted demonstration; give a --trajectory, or --no-op.")
-    return Script(task, made, (0 * way if no_op else way).to(chosen.like))
+    return Script(task, made, way.to(chosen.like))
 
 
 def _choices(path: Path) -> dict[str, Any]:

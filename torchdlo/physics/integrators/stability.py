@@ -111,7 +111,7 @@ def limits(settings: Settings, rods: RodParams, values: dict[str, Values]) -> di
         mobile = torch.where(held > 0, torch.inf, material.mass)
         lightest = torch.minimum(mobile, following(settings.topology, mobile))
         pull = values["gravity"]["acceleration"].norm(dim=-1, keepdim=True) * _weights(settings, material.mass)
-        firm = (0.25 * length * lightest.expand_as(length) / pull).sqrt()
+        firm = (0.25 * length * lightest / pull).sqrt()
         found["hanging weight"] = torch.where(real & (pull > 0), firm, torch.inf).amin()
     if "table" in names:
         found["table contact"] = 2 / values["table"]["hardness"].max()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import torch
@@ -21,7 +21,10 @@ Number = float | Tensor
 
 @dataclass(frozen=True, eq=False)
 class Rope:
-    """One rope. Numbers are floats, or tensors (..., n) per edge or hinge, or (...,) per scene."""
+    """One rope. Numbers are floats, or tensors (..., n) per edge or hinge, or (...,) or (..., 1) per scene.
+
+    A rope that is given once, with numbers for B scenes, (B, 1) or (B, n) or (B, n, 1), is a rope in each of them.
+    """
 
     positions: Tensor
     """Where its vertices are at the start [m], shape (..., n, 3)."""
@@ -109,6 +112,30 @@ def frame_curvature(
     return kappa * hinge_mask, rotation.signed_angle(carried, director, t) * hinge_mask
 
 
+def _columns(value: Number, positions: Tensor) -> Number:
+    """Return a number; those that are columns (..., n, 1) already, with more axes than scenes have, as (..., n)."""
+    if not isinstance(value, Tensor) or value.shape[-2:] != (positions.shape[-2], 1):
+        return value
+    # (n, 1) is n scenes that share a number along the rope.
+    return value.squeeze(-1) if value.dim() >= max(positions.dim(), 3) else value
+
+
+def _flat(rope: Rope) -> Rope:
+    """Return a rope whose numbers along it have its vertices as their last axis."""
+    given = {name: getattr(rope, name) for name in validation.NUMBERS if getattr(rope, name) is not None}
+    return replace(rope, **{name: _columns(value, rope.positions) for name, value in given.items()})
+
+
+def _scenes(rope: Rope) -> torch.Size:
+    """Return the batch axes of a rope: those of its positions and of its numbers."""
+    n, batches = rope.positions.shape[-2], [rope.positions.shape[:-2]]
+    for name in validation.NUMBERS:
+        value = getattr(rope, name)
+        if isinstance(value, Tensor):
+            batches.append(_column(value, n, rope.positions, name).shape[:-2])
+    return torch.broadcast_shapes(*batches)
+
+
 def _column(value: Number | None, count: int, like: Tensor, what: str, default: float | None = None) -> Tensor:
     """Return a number as (..., count, 1)."""
     if value is None:
@@ -135,9 +162,10 @@ def assemble(ropes: Sequence[Rope]) -> tuple[Topology, RodParams, RodState]:
         raise ValueError("no rope given; a scene needs at least one")
     for index, rope in enumerate(ropes):
         validation.rope(index, rope)
+    ropes = [_flat(rope) for rope in ropes]
     validation.together(ropes)
     topology = Topology(tuple(r.positions.shape[-2] for r in ropes), tuple(r.closed for r in ropes))
-    batch = torch.broadcast_shapes(*(r.positions.shape[:-2] for r in ropes))
+    batch = torch.broadcast_shapes(*(_scenes(r) for r in ropes))
     like = ropes[0].positions
 
     def pack(parts: Sequence[Tensor]) -> Tensor:

@@ -12,7 +12,8 @@ if TYPE_CHECKING:
     from torchdlo.physics.rod.assembly import Rope
 
 _ZERO_ALLOWED = ("youngs", "shear", "bend", "bend2", "twist")
-_NUMBERS = ("radius", "mass", "density", "stretch", "rest_twist", *_ZERO_ALLOWED)
+NUMBERS = ("radius", "mass", "density", "stretch", "rest_twist", *_ZERO_ALLOWED)
+"""Fields of a rope that are numbers."""
 
 
 def listed(given: object, kind: type, what: str) -> None:
@@ -38,7 +39,7 @@ def rope(index: int, rope: Rope) -> None:
     for one, other in (("youngs", "bend"), ("shear", "twist")):
         if getattr(rope, one) is not None and getattr(rope, other) is not None:
             raise ValueError(f"{where}: both {one} and {other} are given, but each sets the other; give one of them")
-    for name in _NUMBERS:
+    for name in NUMBERS:
         if getattr(rope, name) is not None:
             _number(where, name, getattr(rope, name), rope.positions)
     if rope.velocities is not None:

@@ -49,6 +49,7 @@ def diagnosis_html(
         _section("Replay, worst trial first", player.replay(recording, result.predictions, order)),
         _section("Where simulation and measurement disagree", _where(where, result)),
         _section("What was found", _effects(found)),
+        _section("Fitted numbers of the rope", _baseline(found)),
         _section("What the data cannot tell apart", _ties(found)),
         _section("What calibration had absorbed", _absorbed(result)),
         _section("Every candidate, and why it was left", _candidates(found)),
@@ -86,9 +87,11 @@ def _bars(result: Diagnosis, recording: Recording) -> str:
 def _where(where: Localisation, result: Diagnosis) -> str:
     both = np.concatenate([where.before.ravel(), where.after.ravel()])
     most = 1e3 * float(np.nanpercentile(both, 99)) or 1.0
+    shown = [("baseline", where.before), ("with what was found", where.after)]
+    # Without an effect both are the same.
     maps = [
         chart.heat(title, 1e3 * values, where.time, where.place, most)
-        for title, values in (("baseline", where.before), ("with what was found", where.after))
+        for title, values in (shown if result.effects else shown[:1])
     ]
     top = 1.1e3 * max(float(np.nanmax(y)) for a in where.against for y in (a.before, a.after)) or 1.0
     floor = 1e3 * np.sqrt(3) * result.floor.total
@@ -107,8 +110,8 @@ def _where(where: Localisation, result: Diagnosis) -> str:
     return "".join(
         (
             listed(where.words),
-            "<p class=soft>Distance of the free markers, root mean square over the test trials, by place and time; "
-            "both maps have one scale.</p>",
+            "<p class=soft>Distance of the free markers, root mean square over the test trials, by place and time"
+            f"{'; both maps have one scale' if result.effects else ''}.</p>",
             f'<div class="maps">{"".join(maps)}</div>{chart.ramp(most, "mm")}',
             "<h3>By the state of the rope</h3><p class=soft>Distance [mm] in groups of equal size, all trials. In "
             "per cent: share of its variance that the state explains on trials left out, beyond the place.</p>",
@@ -151,6 +154,14 @@ def _test(test: dict[str, Any] | None) -> str:
         f"{test['false_discovery_rate']:.2g} (Benjamini-Hochberg). The test trials ask for {doses} times the dose "
         f"that was fitted to the train trials.{trials}</p>"
     )
+
+
+def _baseline(found: dict[str, Any]) -> str:
+    rows = [
+        (words(key), number(n["value"], 4), f"{number(n['low'], 4)} to {number(n['high'], 4)}", n["unit"])
+        for key, n in found["baseline"].items()
+    ]
+    return table(("number", "value", "90 % range", "unit"), rows) if rows else ""
 
 
 def _ties(found: dict[str, Any]) -> str:

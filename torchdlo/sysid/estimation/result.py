@@ -35,7 +35,8 @@ class Calibration:
     """A rope model fitted to the train trials of a recording, judged on its test trials."""
 
     parameters: dict[str, dict[str, Any]]
-    """Fitted numbers by name, each with `value`, `low`, `high` (its uncertainty) and `unit`."""
+    """Fitted numbers by name, each with `value`, `low`, `high` (a 90 % interval, see `notes`) and
+    `unit`."""
     train_mae_mm: float
     """Mean absolute error per coordinate on the train trials after the fit [mm]."""
     test_mae_mm: float

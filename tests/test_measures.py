@@ -1,0 +1,107 @@
+"""Curvature, twist, tension and energies of a state are those of mechanics."""
+
+from __future__ import annotations
+
+import io
+import math
+
+import pytest
+import torch
+
+from torchdlo import measures, scene
+from torchdlo.physics import tree
+from torchdlo.physics.effects.elastic import Bend, Stretch, Twist
+from torchdlo.physics.effects.external import Damping, Gravity
+
+pytestmark = pytest.mark.quick
+
+N, R, BEND = 41, 0.2, 2e-3
+
+
+def arc(**choices):
+    """A quarter of a circle, straight at rest."""
+    angle = torch.linspace(0, math.pi / 2, N, dtype=torch.float64)
+    x = R * torch.stack([angle.sin(), 0 * angle, 1 - angle.cos()], -1)
+    rope = scene.Rope(x, radius=0.004, mass=0.05, bend=BEND, twist=1e-3)
+    effects = [Gravity(), Bend(), Twist(), Damping()]
+    return scene.make([rope], effects, integrator="implicit", dt=1e-3, substeps=1, **choices)
+
+
+def test_a_circle_has_its_curvature_and_its_bending_energy() -> None:
+    world, params, state = arc()
+    kappa = measures.curvature(world, params, state)
+    # The discrete curvature 2 tan(phi / 2) / l of chords of a circle is 1 / R up to the square of the step.
+    torch.testing.assert_close(
+        kappa[1:-1].norm(dim=-1), torch.full((N - 2,), 1 / R, dtype=torch.float64), rtol=1e-3, atol=0
+    )
+    assert kappa[[0, -1]].eq(0).all() and torch.allclose(kappa[1:-1, 1], -kappa[1:-1].norm(dim=-1))
+    inner = R * math.pi / 2 * (N - 2) / (N - 1)
+    assert float(measures.bending_energy(world, params, state)) == pytest.approx(0.5 * BEND / R**2 * inner, rel=2e-3)
+
+
+def test_weight_and_motion_have_their_energies() -> None:
+    world, params, state = arc()
+    mass, height = params.rods.material.mass, state.rods.pos[..., 2:]
+    assert float(measures.gravitational_energy(world, params, state)) == pytest.approx(
+        float(9.81 * (mass * height).sum())
+    )
+    moving = tree.replace(state, rods=tree.replace(state.rods, vel=torch.full_like(state.rods.vel, 2.0)))
+    assert float(measures.kinetic_energy(world, params, moving)) == pytest.approx(0.5 * 0.05 * 12)
+
+
+def test_a_straight_rope_that_is_turned_has_even_twist() -> None:
+    x = torch.zeros(N, 3, dtype=torch.float64)
+    x[:, 0] = torch.linspace(0, 0.4, N, dtype=torch.float64)
+    rope = scene.Rope(x, radius=0.004, mass=0.05, bend=BEND, twist=1e-3)
+    world, params, state = scene.make(
+        [rope], [Bend(), Twist()], integrator="implicit", dt=1e-3, substeps=1, twist="quasistatic"
+    )
+    angle = torch.linspace(0, 1.0, N, dtype=torch.float64)[:, None]
+    turned = tree.replace(state, rods=tree.replace(state.rods, twist=angle))
+    per_metre = 1.0 / (N - 1) / (0.4 / (N - 1))
+    torch.testing.assert_close(
+        measures.twist(world, params, turned)[1:-1], torch.full((N - 2, 1), per_metre, dtype=torch.float64)
+    )
+    energy = 0.5 * 1e-3 * per_metre**2 * 0.4 * (N - 2) / (N - 1)
+    assert float(measures.twisting_energy(world, params, turned)) == pytest.approx(energy)
+
+
+def test_a_hanging_rope_is_pulled_by_what_hangs_below() -> None:
+    x = torch.zeros(11, 3, dtype=torch.float64)
+    x[:, 2] = -torch.linspace(0, 0.4, 11)
+    rope = scene.Rope(x, radius=0.004, mass=0.05, bend=BEND)
+    world, params, state = scene.make(
+        [rope],
+        [Gravity(), Bend(), Damping()],
+        {"damping": {"rate": 20.0}},
+        integrator="implicit",
+        dt=2e-3,
+        substeps=1,
+        prescribed_vertices=(0,),
+    )
+    for _ in range(100):
+        state = scene.step(world, params, state, scene.stationary_control(world, state))
+    below = params.rods.material.mass.flip(-2).cumsum(-2).flip(-2)[1:] * 9.81
+    torch.testing.assert_close(measures.tension(world, params, state)[:-1], below, rtol=1e-4, atol=1e-6)
+
+
+def test_an_elastic_rope_pulls_by_its_stretch() -> None:
+    x = torch.zeros(5, 3, dtype=torch.float64)
+    x[:, 0] = torch.linspace(0, 0.4, 5)
+    rope = scene.Rope(x, radius=0.004, mass=0.05, bend=BEND, stretch=100.0)
+    world, params, state = scene.make([rope], [Bend(), Stretch()], dt=1e-4, constrained=False)
+    longer = tree.replace(state, rods=tree.replace(state.rods, pos=1.01 * state.rods.pos))
+    torch.testing.assert_close(
+        measures.tension(world, params, longer)[:-1], torch.full((4, 1), 1.0, dtype=torch.float64)
+    )
+
+
+def test_states_are_saved_loaded_and_moved_as_the_page_says() -> None:
+    *_, state = arc()
+    file = io.BytesIO()
+    torch.save(state, file)
+    file.seek(0)
+    again = torch.load(file, weights_only=False)
+    assert all(torch.equal(a, b) for a, b in zip(tree.leaves(state), tree.leaves(again), strict=True))
+    single = tree.map(lambda t: t.to("cpu", torch.float32), state)
+    assert all(leaf.dtype == torch.float32 for leaf in tree.leaves(single))
