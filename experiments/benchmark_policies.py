@@ -23,7 +23,7 @@ from options import Parser, save
 
 ROOT = Path(__file__).parent
 TASKS = ("coiling", "gathering", "lifting", "separation", "slingshot", "unknotting", "wiring_post", "wrapping")
-KEPT = ("policy.pt", "evaluation.json", "stages.json", "expert.json", "result.json")
+KEPT = ("policy.pt", "evaluation.json", "stages.json", "expert.json", "result.json", "student.json", "robustness.json")
 
 
 def options() -> Any:
@@ -135,6 +135,8 @@ def rows(file: Path) -> list[dict[str, Any]]:
             if last != "evaluation.json":
                 continue
             found = json.loads(archive.read(name))
+            if "varied" not in found:
+                continue  # a policy of clouds
             spent = {}
             for other in ("stages.json", "result.json"):
                 if f"{folder}/{other}" in names:
@@ -160,6 +162,7 @@ def _row(task: str, algo: str, runs: list[dict[str, Any]]) -> dict[str, Any]:
         "task": task,
         "algorithm": algo,
         "seeds": len(runs),
+        "starts": ", ".join(sorted({str(r.get("reset_seed", 0)) for r in runs})),
         "success": hits / count,
         "interval": wilson(hits, count),
         "return": statistics.mean(r["varied"]["return"] for r in runs),
@@ -173,14 +176,21 @@ def _row(task: str, algo: str, runs: list[dict[str, Any]]) -> dict[str, Any]:
 def table(found: list[dict[str, Any]]) -> str:
     """Return rows as a table of Markdown."""
     lines = [
-        "| task | algorithm | seeds | success, unseen starts | 95 % | return | one start | return | episodes | "
-        "published |",
-        "|---|---|---|---|---|---|---|---|---|---|",
+        "| task | algorithm | seeds | starts | success, unseen starts | 95 % | return | one start | return | episodes "
+        "| published |",
+        "|---|---|---|---|---|---|---|---|---|---|---|",
     ]
     for r in sorted(found, key=lambda r: (r["algorithm"], r["task"])):
         low, high = r["interval"]
         known = "" if r["published"] is None else f"{r['published'][0]:.2f}, {r['published'][1]:.0%}"
-        cells = [r["task"], r["algorithm"], str(r["seeds"]), f"{r['success']:.0%}", f"{low:.0%} to {high:.0%}"]
+        cells = [
+            r["task"],
+            r["algorithm"],
+            str(r["seeds"]),
+            r["starts"],
+            f"{r['success']:.0%}",
+            f"{low:.0%} to {high:.0%}",
+        ]
         cells += [f"{r['return']:.2f}", f"{r['one_success']:.0%}", f"{r['one_return']:.2f}", str(r["episodes"]), known]
         lines.append(f"| {' | '.join(cells)} |")
     for algo in sorted({r["algorithm"] for r in found}):
@@ -189,11 +199,46 @@ def table(found: list[dict[str, Any]]) -> str:
     return "\n".join(lines) + "\n"
 
 
+def clouds(file: Path) -> str:
+    """Return the table of policies that see clouds of points, by cameras; nothing if an archive has none."""
+    lines = []
+    with zipfile.ZipFile(file) as archive:
+        for name in sorted(n for n in archive.namelist() if n.endswith("/evaluation.json")):
+            found = json.loads(archive.read(name))
+            if "conditions" not in found:
+                continue
+            spent = json.loads(archive.read(name.replace("evaluation", "student")))
+            for camera, row in found["conditions"].items():
+                low, high = row["interval"]
+                cells = [
+                    found["task"],
+                    camera,
+                    f"{row['success']:.0%} of {row['episodes']}",
+                    f"{low:.0%} to {high:.0%}",
+                ]
+                lines.append(f"| {' | '.join([*cells, str(spent['episodes'])])} |")
+    head = ["| task | camera | success, unseen starts | 95 % | episodes |", "|---|---|---|---|---|"]
+    return "\n".join([*head, *lines]) + "\n" if lines else ""
+
+
+def robustness(file: Path) -> str:
+    """Return the tables of success under perturbations; nothing if an archive has none."""
+    from torchdlo.agents.rl.robustness import table as markdown
+
+    tables = []
+    with zipfile.ZipFile(file) as archive:
+        for name in sorted(n for n in archive.namelist() if n.endswith("/robustness.json")):
+            found = json.loads(archive.read(name))
+            tables.append(f"{found['task']}, {found['starts']} unseen starts:\n\n{markdown(found)}\n")
+    return "\n".join(tables)
+
+
 def main() -> None:
     """Run what is asked for."""
     chosen = options()
     if chosen.table:
-        sys.stdout.write(table(rows(Path(chosen.table))))
+        file = Path(chosen.table)
+        sys.stdout.write("\n".join(part for part in (table(rows(file)), clouds(file), robustness(file)) if part))
         return
     if chosen.pack:
         pack(Path(chosen.out), Path(chosen.pack))

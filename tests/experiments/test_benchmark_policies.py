@@ -39,6 +39,23 @@ def test_rows_are_means_over_seeds_and_the_archive_has_no_checkpoints(script, tm
     # Wilson's interval of 21 in 30.
     assert row["interval"] == pytest.approx((0.5212, 0.8333), abs=1e-3)
     text = script.table([row])
-    assert "| wiring_post | ppo | 2 | 70% | 52% to 83% | 60.50 | 100% | 65.00 | 101 | 62.17, 67% |" in text
+    assert "| wiring_post | ppo | 2 | 0 | 70% | 52% to 83% | 60.50 | 100% | 65.00 | 101 | 62.17, 67% |" in text
     assert "ppo: mean success from unseen starts over 1 tasks 70%." in text
     assert file.stat().st_size < 2000
+
+
+def test_clouds_and_perturbations_have_tables_of_their_own(script, tmp_path: Path):
+    stored(tmp_path / "wiring_post-ppo-0", 9 / 15, 0)
+    actors = {"policy": {"none": {"success": 0.9}, "noise": {"success": 0.5}}}
+    found = {"task": "wiring_post", "starts": 10, "perturbations": {"none": {}, "noise": {}}, "actors": actors}
+    (tmp_path / "wiring_post-ppo-0" / "robustness.json").write_text(json.dumps(found))
+    cloud = tmp_path / "wiring_post-cloud-0"
+    cloud.mkdir()
+    rows = {"usual": {"success": 0.6, "episodes": 15, "interval": [0.36, 0.8]}}
+    (cloud / "evaluation.json").write_text(json.dumps({"task": "wiring_post", "conditions": rows}))
+    (cloud / "student.json").write_text(json.dumps({"episodes": 192}))
+    file = tmp_path / "all.zip"
+    script.pack(tmp_path, file)
+    assert len(script.rows(file)) == 1
+    assert "| wiring_post | usual | 60% of 15 | 36% to 80% | 192 |" in script.clouds(file)
+    assert "| noise | 50% |" in script.robustness(file)

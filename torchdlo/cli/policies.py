@@ -377,6 +377,9 @@ def distill(
         Path | None,
         typer.Option("--out", "-o", help="Folder. Default: that of the policy, with -cloud.", metavar="DIR"),
     ] = None,
+    rounds: Annotated[
+        int | None, typer.Option(min=0, help="Rounds of DAgger in cheap steps, before the last one. Default: 2.")
+    ] = None,
     count: Annotated[int | None, typer.Option(min=1, help="Episodes of a round. Default: 64.")] = None,
     updates: Annotated[int | None, typer.Option(min=1, help="Steps of learning after a round. Default: 1000.")] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of everything.")] = 0,
@@ -404,7 +407,7 @@ def distill(
     folder = teacher if teacher.is_dir() else teacher.parent
     out = out or folder.with_name(f"{folder.name}-cloud")
     check_writable(out / "student.json")
-    given = {"count": count, "updates": updates, "seed": seed}
+    given = {"rounds": rounds, "count": count, "updates": updates, "seed": seed}
     plan = Student(**{name: value for name, value in given.items() if value is not None})
     try:
         with progress() as show, deferred_interrupt(show) as callback:

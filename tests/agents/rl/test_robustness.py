@@ -17,7 +17,7 @@ from torchdlo.agents.policies import save
 from torchdlo.agents.rl import robustness
 from torchdlo.agents.rl.expert import candidates
 from torchdlo.agents.rl.hybrid import task_policy
-from torchdlo.agents.rl.robustness import PERTURBATIONS, Perturbation, following, perturbed, replaying, table
+from torchdlo.agents.rl.robustness import PERTURBATIONS, Disturbance, following, perturbed, replaying, table
 from torchdlo.agents.rl.settings import preset
 from torchdlo.cli import app
 from torchdlo.errors import InputError
@@ -32,7 +32,7 @@ def actors(folder: Path):
 
 
 def test_following_is_robust_to_starts_and_not_to_noise(tmp_path: Path):
-    chosen = {name: PERTURBATIONS[name] for name in ("none", "starts x 1.5")} | {"noise": Perturbation(noise=0.01)}
+    chosen = {name: PERTURBATIONS[name] for name in ("none", "starts x 1.5")} | {"noise": Disturbance(noise=0.01)}
     made = perturbed(actors(tmp_path), Lead(), starts=16, perturbations=chosen)
     rows = made["actors"]
     # Ropes are up to 10 mm off, 4 mm count as success: replaying succeeds in 2 of 5, and in fewer from wider starts.
@@ -55,14 +55,14 @@ def test_actors_see_the_same_starts_and_the_same_noise(tmp_path: Path):
 def test_friction_and_stiffness_are_what_they_are_said_to_be():
     task = envs.find("wiring_post")
     scene, params, _ = task.start(1)
-    changed = robustness._changed(params, Perturbation(friction=0.5, stiffness=1.5), scene, task)
+    changed = robustness._changed(params, Disturbance(friction=0.5, stiffness=1.5), scene, task)
     assert changed.effects["rod_contact"]["mu_k"].item() == pytest.approx(0.125)
     assert changed.effects["table_friction"]["mu"].item() == pytest.approx(0.15)
     assert changed.effects["damping"]["rate"].item() == 30.0
     torch.testing.assert_close(changed.bodies.mu_k, 0.5 * params.bodies.mu_k)
     torch.testing.assert_close(changed.rods.material.bend, 1.5 * params.rods.material.bend)
     with pytest.raises(InputError, match="cannot be played with"):
-        robustness._changed(params, Perturbation(stiffness=1e6), scene, task)
+        robustness._changed(params, Disturbance(stiffness=1e6), scene, task)
 
 
 class Droop(Lead):
@@ -74,7 +74,7 @@ class Droop(Lead):
 
 
 def test_a_softer_rope_moves_otherwise():
-    chosen = {"none": Perturbation(), "soft": Perturbation(stiffness=0.01)}
+    chosen = {"none": Disturbance(), "soft": Disturbance(stiffness=0.01)}
     actions = torch.zeros(2, 6)
     actions[:, 2] = 0.01
     made = perturbed({"lift": replaying(actions)}, Droop(horizon=2, frame_skip=20), starts=1, perturbations=chosen)

@@ -24,14 +24,14 @@ from torchdlo.errors import InputError
 from torchdlo.physics import tree
 from torchdlo.scene import Params
 
-__all__ = ["PERTURBATIONS", "Actor", "Perturbation", "following", "perturbed", "policy_acting", "replaying", "table"]
+__all__ = ["PERTURBATIONS", "Actor", "Disturbance", "following", "perturbed", "policy_acting", "replaying", "table"]
 
 Actor = Callable[[int, TaskEpisodes, Tensor, slice], Tensor]
 """Says what to do after so many actions in the episodes of a slice, in units of the greatest way of a tool (N, 3 R)."""
 
 
 @dataclass(frozen=True)
-class Perturbation:
+class Disturbance:
     """What is not as it was in training."""
 
     friction: float = 1.0
@@ -45,15 +45,15 @@ class Perturbation:
 
 
 PERTURBATIONS = {
-    "none": Perturbation(),
-    "friction x 0.5": Perturbation(friction=0.5),
-    "friction x 1.5": Perturbation(friction=1.5),
-    "stiffness x 0.5": Perturbation(stiffness=0.5),
-    "stiffness x 1.5": Perturbation(stiffness=1.5),
-    "starts x 1.5": Perturbation(start=1.5),
-    "noise 1 mm": Perturbation(noise=0.001),
-    "noise 2 mm": Perturbation(noise=0.002),
-    "noise 4 mm": Perturbation(noise=0.004),
+    "none": Disturbance(),
+    "friction x 0.5": Disturbance(friction=0.5),
+    "friction x 1.5": Disturbance(friction=1.5),
+    "stiffness x 0.5": Disturbance(stiffness=0.5),
+    "stiffness x 1.5": Disturbance(stiffness=1.5),
+    "starts x 1.5": Disturbance(start=1.5),
+    "noise 1 mm": Disturbance(noise=0.001),
+    "noise 2 mm": Disturbance(noise=0.002),
+    "noise 4 mm": Disturbance(noise=0.004),
 }
 """What policies are tried under."""
 
@@ -93,7 +93,7 @@ def perturbed(
     task: Task,
     *,
     starts: int = 15,
-    perturbations: Mapping[str, Perturbation] = PERTURBATIONS,
+    perturbations: Mapping[str, Disturbance] = PERTURBATIONS,
     seed: int = 0,
     callback: Callable[[str, int, int, str], None] | None = None,
 ) -> dict[str, Any]:
@@ -138,7 +138,7 @@ def _played(
     actors: Mapping[str, Actor],
     task: Task,
     starts: int,
-    chosen: Mapping[str, Perturbation],
+    chosen: Mapping[str, Disturbance],
     seed: int,
     told: Callable[[int], None],
 ) -> dict[str, dict[str, Any]]:
@@ -182,7 +182,7 @@ def _row(good: Tensor, returns: Tensor, failed: Tensor) -> dict[str, Any]:
 _FRICTION = (("rod_contact", "mu_s"), ("rod_contact", "mu_k"), ("table_friction", "mu"))
 
 
-def _changed(params: Params, how: Perturbation, scene: scenes.Scene, task: Task) -> Params:
+def _changed(params: Params, how: Disturbance, scene: scenes.Scene, task: Task) -> Params:
     """Return parameters with other friction and stiffness."""
     effects = {name: dict(values) for name, values in params.effects.items()}
     for effect, number in _FRICTION:
