@@ -133,7 +133,7 @@ def diagnose(
     from torchdlo.sysid.diagnosis.search import diagnose as search
     from torchdlo.sysid.recordings.recording import load_recording
 
-    loaded = load_recording(recording, films=False)
+    loaded = load_recording(recording)
     out = out or Path("runs") / "diagnose" / recording.resolve().name
     names = ("findings.json", "model.json", report.PAGE)
     for name in names:

@@ -31,6 +31,7 @@ from torchdlo.sysid.estimation.worker_pool import Pool
 from torchdlo.sysid.model.model_file import ModelFile
 from torchdlo.sysid.recordings import data_quality
 from torchdlo.sysid.recordings.recording import Recording
+from torchdlo.sysid.video.filmed_diagnosis import diagnose_filmed
 
 PAYS = 0.15
 """Share of the excess gap that an effect has to close, on the train and on the test trials."""
@@ -78,6 +79,10 @@ def diagnose(
         raise InputError(f"budget is {budget!r}; expected one of {', '.join(BUDGETS)}.")
     for name in without:
         effect_library.check_known("without", name)
+    if recording.filmed:
+        asked = {"budget": budget, "seed": seed, "vertices": vertices, "given": given, "without": without}
+        most = plan.some(recording, trials or BUDGETS[budget].trials)
+        return diagnose_filmed(most, **asked, callback=callback)
     begun, report = time.perf_counter(), callback or (lambda *_: None)
     recording, faults = data_quality.check(recording)
     whole = len(recording.train)

@@ -10,6 +10,7 @@ import numpy as np
 
 from torchdlo.sysid.diagnosis.error_floor import ErrorFloor, rms
 from torchdlo.sysid.estimation.jobs import Fitted
+from torchdlo.sysid.estimation.result import Overlay
 from torchdlo.sysid.model.rope_model import RopeModel
 from torchdlo.sysid.recordings.data_quality import DataIssue
 
@@ -94,6 +95,8 @@ class Diagnosis:
     """What is wrong with the data."""
     options: dict[str, Any] = field(default_factory=dict)
     """What was asked for."""
+    overlays: list[Overlay] = field(default_factory=list)
+    """Pictures of films with the rope before and after, if there are films."""
 
     @property
     def compared(self) -> np.ndarray:
