@@ -8,7 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from torchdlo.errors import InputError
 from torchdlo.sysid.calibration.calibrate import calibrate
+from torchdlo.sysid.diagnosis.search import diagnose
 from torchdlo.sysid.model.rope_model import RopeModel
 from torchdlo.sysid.model.trial_batch import Start
 from torchdlo.sysid.recordings.recording import load_recording
@@ -81,3 +83,8 @@ def test_films_that_begin_in_motion_tell_the_bending_stiffness() -> None:
     stiffness = found.parameters["bending_stiffness"]["value"]
     assert abs(stiffness / 3e-3 - 1) < 0.05
     assert np.mean([t["distance_px"] for t in found.per_trial if t["split"] == "train"]) < 1.0
+
+
+def test_a_diagnosis_of_films_cannot_be_resumed() -> None:
+    with pytest.raises(InputError, match="no --resume for films"):
+        diagnose(load_recording(DATA / "sample_film"), resume=True)

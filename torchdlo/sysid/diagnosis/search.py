@@ -80,6 +80,8 @@ def diagnose(
     for name in without:
         effect_library.check_known("without", name)
     if recording.filmed:
+        if resume:
+            raise InputError(f"{recording.path}: expected no --resume for films, whose diagnosis keeps no journal.")
         asked = {"budget": budget, "seed": seed, "vertices": vertices, "given": given, "without": without}
         most = plan.some(recording, trials or BUDGETS[budget].trials)
         return diagnose_filmed(most, **asked, callback=callback)
