@@ -38,6 +38,9 @@ PAYS = 0.15
 MORE = 2.5
 """Times the floor that have to be left for another effect to be looked for."""
 
+SILENT = 1.3
+"""Times the floor: below, there is nothing left to look for."""
+
 MATTERS = 0.03
 """Share of the baseline's excess gap that each effect has to close, whatever the others leave."""
 
@@ -113,7 +116,7 @@ def diagnose_filmed(
     ties: dict[str, list[str]] = {}
     rounds: list[list[Candidate]] = []
     while len(rounds) < plan.rounds:
-        if rms(np.concatenate([base.gaps("train"), base.gaps("test")])) < (MORE if shares else 1.3) * level:
+        if rms(np.concatenate([base.gaps("train"), base.gaps("test")])) < (MORE if shares else SILENT) * level:
             break
         names = [n for n in effect_library.LIBRARY if n not in (*base.own.model.effects, *without)]
         names = [n for n in names if effect_library.applicable(n, recording, base.own.model.mesh)]
