@@ -139,7 +139,7 @@ def diagnose(
     from torchdlo.sysid.recordings.plausibility import doubts
     from torchdlo.sysid.recordings.recording import load_recording
 
-    loaded = load_recording(recording, films=False)
+    loaded = load_recording(recording)
     for doubt in doubts(loaded):
         typer.echo(f"check {doubt}", err=True)
     out = out or Path("runs") / "diagnose" / recording.resolve().name

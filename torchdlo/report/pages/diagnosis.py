@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import shlex
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,7 @@ import numpy as np
 
 from torchdlo.files import write_atomically
 from torchdlo.report.figures import chart
-from torchdlo.report.pages import player
+from torchdlo.report.pages import films, player
 from torchdlo.report.pages.page import STYLE, listed, number, page, percent, table, words
 from torchdlo.sysid.diagnosis.effect_equations import MEANING, law, separating
 from torchdlo.sysid.diagnosis.findings import absorbed, findings, summary
@@ -38,7 +39,8 @@ def diagnosis_html(
     result: Diagnosis, recording: Recording, *, command: str = "", model: Path = Path("model.json")
 ) -> str:
     """Return the page."""
-    found, where = findings(result, recording), localise(recording, result.predictions, result.floor)
+    found = findings(result, recording)
+    where = None if recording.filmed else localise(recording, result.predictions, result.floor)
     name = recording.path.resolve().name
     order = [recording.test[k] for k in np.argsort(-np.nan_to_num(result.before, nan=np.inf))]
     sections = [
@@ -46,8 +48,9 @@ def diagnosis_html(
         f'<p class="verdict">{for_html(summary(result, recording))}</p>',
         listed(result.notes),
         _section("The gap on trials that were not used", _bars(result, recording)),
-        _section("Replay, worst trial first", player.replay(recording, result.predictions, order)),
-        _section("Where simulation and measurement disagree", _where(where, result)),
+        _section("The films, before and after", _films(result)) if where is None else "",
+        _section("Replay, worst trial first", player.replay(recording, result.predictions, order)) if where else "",
+        _section("Where simulation and measurement disagree", _where(where, result)) if where else "",
         _section("What was found", _effects(found)),
         _section("Fitted numbers of the rope", _baseline(found)),
         _section("What the data cannot tell apart", _ties(found)),
@@ -55,7 +58,7 @@ def diagnosis_html(
         _section("Every candidate, and why it was left", _candidates(found)),
         _section("How large an effect would have to be to be named here", _limits(found)),
         _section("Trials that counted less", _misleading(found)),
-        _section("What remains", listed(where.rest)),
+        _section("What remains", listed(where.rest)) if where else "",
         _section("The floor", _floor(found)),
         _section("Health of the data", _health(found)),
         _section("The model again", _again(recording, model)),
@@ -70,6 +73,12 @@ _LIMITS = (
     "to the mass in rope.json. Ranges come from leaving out one trial at a time: with few trials they are rough, and "
     "what every trial gets wrong in the same way does not show in them."
 )
+
+
+def _films(result: Diagnosis) -> str:
+    picture = base64.b64encode(films.overlay_png(result.overlays)).decode("ascii")
+    words_of = "Pictures of the films with the simulated rope before and after"
+    return f'<img alt="{words_of}" src="data:image/png;base64,{picture}">'
 
 
 def _section(title: str, content: str) -> str:

@@ -67,6 +67,7 @@ def findings(result: Diagnosis, recording: Recording) -> dict[str, Any]:
         "misleading_trials": [dataclasses.asdict(trial) for trial in result.misleading],
         "candidates": candidates,
         "baseline": {k: v for k, v in numbers.items() if "." not in k},
+        "cameras": {k: v for k, v in numbers.items() if k.startswith("camera_")},
         "absorbed_by_calibration": absorbed(result),
         "data_issues": [dataclasses.asdict(fault) for fault in result.data_issues],
         "options": result.options,
@@ -205,6 +206,8 @@ def confidence(result: Diagnosis) -> dict[str, Any] | None:
 
 def findings_json(result: Diagnosis, recording: Recording) -> str:
     """Return the findings as JSON text."""
+    if recording.filmed:
+        return dump({"generator": "torchdlo diagnose"} | findings(result, recording))
     where = localise(recording, result.predictions, result.floor)
     place = {
         "before": where.words,

@@ -36,6 +36,7 @@ from torchdlo.sysid.estimation.worker_pool import Pool
 from torchdlo.sysid.model.model_file import ModelFile
 from torchdlo.sysid.recordings import data_quality
 from torchdlo.sysid.recordings.recording import Recording
+from torchdlo.sysid.video.filmed_diagnosis import diagnose_filmed
 
 MUCH = 0.15
 """Share of the excess gap of the test trials from which an effect that is not named is spoken of, unless by chance."""
@@ -83,6 +84,12 @@ def diagnose(
         raise InputError(f"budget is {budget!r}; expected one of {', '.join(BUDGETS)}.")
     for name in without:
         effect_library.check_known("without", name)
+    if recording.filmed:
+        if resume:
+            raise InputError(f"{recording.path}: expected no --resume for films, whose diagnosis keeps no journal.")
+        asked = {"budget": budget, "seed": seed, "vertices": vertices, "given": given, "without": without}
+        most = plan.some(recording, trials or BUDGETS[budget].trials)
+        return diagnose_filmed(most, **asked, callback=callback)
     begun, report = time.perf_counter(), callback or (lambda *_: None)
     recording, faults = data_quality.check(recording)
     whole = len(recording.train)

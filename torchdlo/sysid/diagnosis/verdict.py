@@ -13,6 +13,7 @@ from torchdlo.sysid.diagnosis.error_floor import ErrorFloor, rms
 from torchdlo.sysid.diagnosis.misleading_trials import MisleadingTrial
 from torchdlo.sysid.diagnosis.significance import Agreement, benjamini_hochberg
 from torchdlo.sysid.estimation.jobs import Fitted
+from torchdlo.sysid.estimation.result import Overlay
 from torchdlo.sysid.model.rope_model import RopeModel
 from torchdlo.sysid.recordings.data_quality import DataIssue
 
@@ -117,6 +118,8 @@ class Diagnosis:
     """What is wrong with the data."""
     options: dict[str, Any] = field(default_factory=dict)
     """What was asked for."""
+    overlays: list[Overlay] = field(default_factory=list)
+    """Pictures of films with the rope before and after, if there are films."""
     tests: dict[str, Agreement] = field(default_factory=dict)
     """By effect: whether what it explains on the test trials could be chance."""
     limits: list[DetectionLimit] = field(default_factory=list)

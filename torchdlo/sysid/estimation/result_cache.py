@@ -171,6 +171,9 @@ def encode(value: Any, arrays: list[np.ndarray]) -> Any:
         return {type(value).__name__: [encode(item, arrays) for item in value]}
     if isinstance(value, dict):
         return {"dict": [[encode(k, arrays), encode(v, arrays)] for k, v in value.items()]}
+    if isinstance(value, Path):
+        # Where a file lies does not matter.
+        return value.name
     if value is None or isinstance(value, (bool, int, float, str)):
         return value
     raise TypeError(f"a journal cannot keep a {type(value).__name__}")

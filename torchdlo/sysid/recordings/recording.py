@@ -118,7 +118,7 @@ def load_recording(path: str | Path, *, films: bool = True) -> Recording:
     found = film_files(path, [f.stem for split in files.values() for f in split])
     if found and not films:
         raise InputError(
-            f"{path}: expected markers, found films; this command does not take those yet, calibrate does."
+            f"{path}: expected markers, found films; this command does not take those yet, calibrate and diagnose do."
         )
     trials = {split: tuple(_load_trial(f, rope["length"], found) for f in files[split]) for split in files}
     _check_together(path, rope, trials["train"] + trials["test"])

@@ -27,7 +27,7 @@ from torchdlo.sysid.video.filmed_problem import Problem, begin_from_balance, cor
 from torchdlo.sysid.video.footage import views_of
 from torchdlo.sysid.video.overlay import overlaps, overlays
 
-__all__ = ["FILMED_STARTS", "calibrate_filmed"]
+__all__ = ["FILMED_STARTS", "baseline", "calibrate_filmed", "tested"]
 
 Callback = Callable[[str, int, int, str], None]
 
@@ -59,16 +59,8 @@ def calibrate_filmed(
     begun = time.perf_counter()
     report = callback or (lambda *_: None)
     views, notes = views_of(recording, recording.train, report)
-    own = _problem(recording, views, vertices, given)
+    own, first, best = baseline(recording, views, starts, iterations, seed, vertices, given, report)
     space = own.space
-    first = np.concatenate([own.fixed[list(own.free)], np.zeros(len(own.spines.nuisances.names))])
-    raw = space.to_raw(first) if given is not None else scout(own, starts, np.random.default_rng(seed), report)
-    best = _fitted(own, raw, iterations, report)
-    if not np.isfinite(best.cost):
-        raise InputError(
-            f"{recording.path}: the simulation failed on the train trials from every start; check length, mass, "
-            "cameras and marker_arclength."
-        )
     values = space.to_values(best.raw)
     low, high = intervals(own, best)
     for where, frames in own.dropped.items():
@@ -95,6 +87,42 @@ def calibrate_filmed(
         notes=[*notes, *_remarks(own, values, low, high)],
         overlays=[o for f in found for o in f.overlays],
     )
+
+
+def baseline(
+    recording: Recording,
+    views: Sequence[View],
+    starts: int,
+    iterations: int,
+    seed: int,
+    vertices: int | None,
+    given: ModelFile | None,
+    report: Callback,
+) -> tuple[Problem, np.ndarray, Fit]:
+    """Return the problem of the train trials, numbers (N,) to start from, and the best fit; see `calibrate_filmed`."""
+    own = _problem(recording, views, vertices, given)
+    first = np.concatenate([own.fixed[list(own.free)], np.zeros(len(own.spines.nuisances.names))])
+    raw = own.space.to_raw(first) if given is not None else scout(own, starts, np.random.default_rng(seed), report)
+    best = _fitted(own, raw, iterations, report)
+    if not np.isfinite(best.cost):
+        raise InputError(
+            f"{recording.path}: the simulation failed on the train trials from every start; check length, mass, "
+            "cameras and marker_arclength."
+        )
+    return own, first, best
+
+
+def tested(own: Problem, recording: Recording, values: np.ndarray, report: Callback) -> tuple[Problem, list[str]]:
+    """Return the problem of the test trials, which begin as their first frames say with numbers (N,), and remarks."""
+    views, said = views_of(recording, recording.test, report)
+    spines = Spines(views, own.model.dt, own.extent, own.spines.free)
+    parts: dict[str, Any] = {"trials": recording.test, "motion": own.model.motion(recording.test), "spines": spines}
+    here = replace(own, **parts, dropped={}, discretisation_correction=None)
+    begin_from_balance(here, own.full(values[None])[0])
+    refine_start(here, values)
+    gate(here, values)
+    correct(here, values)
+    return here, said
 
 
 def _mean(trials: Sequence[dict[str, Any]], split: str, name: str) -> float:
@@ -167,19 +195,12 @@ def _judged(
     """Return what numbers (K + Q,) are worth, beside those that the fit began with; what is wrong goes into notes."""
     here, numbers = own, len(own.free)
     if split == "test":
-        views, said = views_of(recording, recording.test, report)
+        here, said = tested(own, recording, values, report)
         notes += said
-        spines = Spines(views, own.model.dt, own.extent, own.spines.free)
-        parts: dict[str, Any] = {"trials": recording.test, "motion": own.model.motion(recording.test), "spines": spines}
-        here = replace(own, **parts, dropped={}, discretisation_correction=None)
-        begin_from_balance(here, own.full(values[None])[0])
-        refine_start(here, values)
-        gate(here, values)
-        correct(here, values)
     old, _ = picture_errors(here, first)
     new, pixels = picture_errors(here, values)
     sims = here.simulate(np.stack([first, values]))
-    share = overlaps(recording, here, sims[1], values[numbers:])
+    share = overlaps(here, sims[1], values[numbers:])
     trials = [
         {
             "name": trial.name,

@@ -15,10 +15,10 @@ import numpy as np
 
 from torchdlo.sysid.estimation import levenberg_marquardt
 from torchdlo.sysid.estimation.levenberg_marquardt import ParameterSpace, Point
-from torchdlo.sysid.estimation.observation import INDEPENDENT, SURE, Spines, View
+from torchdlo.sysid.estimation.observation import INDEPENDENT, SURE, Spines
 from torchdlo.sysid.video.filmed_problem import Problem
 
-__all__ = ["Fit", "fit", "gate", "intervals", "look", "picture_errors", "refine_start", "scout"]
+__all__ = ["Fit", "fit", "gate", "intervals", "look", "picture_errors", "refine_start", "scout", "spread"]
 
 Callback = Callable[[str, int, int, str], None]
 
@@ -290,7 +290,17 @@ def gate(own: Problem, values: np.ndarray) -> int:
 
 
 def intervals(own: Problem, found: Fit) -> tuple[np.ndarray, np.ndarray]:
-    """Return 90 % limits of the fitted numbers, shape (N,) each.
+    """Return 90 % limits of the fitted numbers, shape (N,) each; all that is possible where films do not tell."""
+    point, drifts = spread(own, found)
+    low, high = levenberg_marquardt.interval(point, own.space, drifts=drifts)
+    silent = np.diag(point.curvature.sum(0)) <= 0
+    ends = [np.array([getattr(p, end) for p in own.space.params]) for end in ("low", "high")]
+    low, high = np.where(silent, ends[0], low), np.where(silent, ends[1], high)
+    return np.minimum(low, high), np.maximum(low, high)
+
+
+def spread(own: Problem, found: Fit) -> tuple[Point, np.ndarray]:
+    """Return a fit with stretches of time in the place of trials, and what shifts all of them alike, (E, N).
 
     Stretches of time scatter; what cameras may be off shifts all of them in the same way, and starts in motion follow.
     """
@@ -303,7 +313,7 @@ def intervals(own: Problem, found: Fit) -> tuple[np.ndarray, np.ndarray]:
     prior = np.diag(np.concatenate([np.zeros(numbers), np.full(len(space.names) - numbers, precision)]))
     curvature = curvature + prior[None]
     gradient = gradient + found.raw * np.diag(prior)
-    point = Point(found.raw, found.cost, gradient, curvature, np.zeros(blocks))
+    point = Point(found.raw, found.cost, gradient, curvature, found.costs)
     drifts = np.linalg.solve(levenberg_marquardt.firm(curvature.sum(0)), blocks * prior)[numbers:]
     if own.discretisation_correction is not None:
         values = space.to_values(found.raw)[None]
@@ -316,8 +326,7 @@ def intervals(own: Problem, found: Fit) -> tuple[np.ndarray, np.ndarray]:
             weighted = replace(found, residual=found.residual + change)
             g, h = (x.sum(0) for x in eliminated(*_difference(own, found, weighted), found.offset.shape[1]))
             drifts = np.concatenate([drifts, np.linalg.solve(levenberg_marquardt.firm(h), g)[None]])
-    low, high = levenberg_marquardt.interval(point, space, drifts=drifts)
-    return np.minimum(low, high), np.maximum(low, high)
+    return point, drifts
 
 
 def _difference(own: Problem, found: Fit, moved: Fit) -> tuple[np.ndarray, np.ndarray]:
@@ -364,11 +373,6 @@ def picture_errors(own: Problem, values: np.ndarray) -> tuple[np.ndarray, np.nda
         part = np.where(np.isfinite(own.spines.target), read, np.nan)[:, :, start : start + width, 0]
         pairs = part.reshape(*part.shape[:2], -1, 2)
         metres.append(np.nanmean(np.linalg.norm(pairs, axis=-1), (1, 2)))
-        pixels.append(metres[-1] * view.camera.fx / _depth(own, view))
+        pixels.append(metres[-1] * view.camera.fx / own.depth(view))
         start += width + int(own.spines.count_free)
     return np.mean(metres, 0), np.mean(pixels, 0)
-
-
-def _depth(own: Problem, view: View) -> float:
-    held = np.concatenate([t.markers[:, t.gripped].reshape(-1, 3) for t in own.trials])
-    return float(np.mean(held @ np.array(view.camera.rotation)[2] + view.camera.translation[2]))

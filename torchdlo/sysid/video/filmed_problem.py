@@ -51,6 +51,8 @@ class Problem:
     of positions and velocities, shape (B, J); no columns where all trials begin at rest."""
     shapes: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
     """Those smooth shapes at the places of the rope, of size one, shape (M, J / 6)."""
+    sizes: dict[str, float] = field(default_factory=dict)
+    """What counts as much of some numbers, in the terms of their scale."""
 
     @property
     def lasts(self) -> float:
@@ -69,6 +71,21 @@ class Problem:
         model = RopeModel(self.model.recording, effects=self.model.effects, **known)
         return replace(self, model=model, motion=model.motion(self.trials), options=known)
 
+    def with_effects(self, effects: Sequence[str], sizes: dict[str, float], numbers: Sequence[str]) -> Problem:
+        """Return the problem with a model that has these effects, of which numbers with sizes are fitted as well.
+
+        Args:
+            effects: all of the model.
+            sizes: what counts as much of the numbers of effects, in the terms of their scale.
+            numbers: those of effects that are fitted.
+        """
+        model = RopeModel(self.model.recording, effects=effects, **self.options)
+        known = dict(zip(self.model.parameters, self.fixed, strict=True))
+        fixed = np.array([known.get(n, g) for n, g in zip(model.parameters, model.guess(), strict=True)])
+        old = [self.model.parameters[k] for k in self.free]
+        free = tuple(k for k, n in enumerate(model.parameters) if n in old or n in numbers)
+        return replace(self, model=model, fixed=fixed, free=free, sizes=self.sizes | sizes)
+
     def take(self, other: Problem) -> None:
         """Become another problem."""
         vars(self).update(vars(other))
@@ -81,7 +98,8 @@ class Problem:
         sizes = []
         for k in self.free:
             p = params[k]
-            sizes.append(1.0 if p.scale == "log" else abs(self.fixed[k]) or 0.1 * (p.high - p.low))
+            size = self.sizes.get(names[k]) or abs(self.fixed[k]) or 0.1 * (p.high - p.low)
+            sizes.append(1.0 if p.scale == "log" else size)
         return ParameterSpace(
             (*own, *other.names), (*[params[k] for k in self.free], *other.params), (*sizes, *other.units.tolist())
         )
@@ -90,6 +108,11 @@ class Problem:
     def extent(self) -> float:
         """How far the rope moves [m]."""
         return self.spines.extent
+
+    def depth(self, view: View) -> float:
+        """Return how far the grippers are from a camera in the mean [m]."""
+        held = np.concatenate([t.markers[:, t.gripped].reshape(-1, 3) for t in self.trials])
+        return float(np.mean(held @ np.array(view.camera.rotation)[2] + view.camera.translation[2]))
 
     def full(self, values: np.ndarray) -> np.ndarray:
         """Return all numbers of the model, (P, K), for fitted ones, (P, K + Q)."""

@@ -87,9 +87,10 @@ def with_stations(trial: Trial, length: float) -> Trial:
     held = trial.marker_arclength.astype(float)
     ends = [0.0, *held, length] if held[0] > 1e-6 * length else [*held, length]
     step, free = length / (STATIONS - 1), []
+    # Clamps themselves are between neighbouring markers: those of one are closer than those of two.
+    widest = max(b - a for a, b in itertools.pairwise(ends))
     for a, b in itertools.pairwise(ends):
-        # Clamps themselves are between neighbouring markers.
-        if b - a > 1.5 * step:
+        if b - a > max(1.5 * step, 0.2 * widest):
             count = max(2, round((b - a) / step))
             inner = np.linspace(a, b, count + 1)
             first = 0 if a == 0.0 and held[0] > 1e-6 * length else 1

@@ -9,9 +9,9 @@ import torch
 
 from torchdlo.sysid.estimation.observation import PER_CAMERA, seen_by
 from torchdlo.sysid.estimation.result import Overlay
-from torchdlo.sysid.recordings.recording import Recording
 from torchdlo.vision.camera import NEAR
 from torchdlo.vision.rasterizer import coverage, successors
+from torchdlo.vision.spine import curve_vectors
 
 if TYPE_CHECKING:
     from torchdlo.sysid.video.filmed_problem import Problem
@@ -20,7 +20,7 @@ __all__ = ["drawn", "overlaps", "overlays"]
 
 
 def drawn(
-    own: Problem, view: int, sims: np.ndarray, numbers: np.ndarray, frames: np.ndarray, radius: float
+    own: Problem, view: int, sims: np.ndarray, numbers: np.ndarray, frames: np.ndarray, radius: float, trial: int
 ) -> np.ndarray:
     """Return the masks of a simulated trial in some pictures of a view, shares that are covered, (N, H, W) float32.
 
@@ -30,27 +30,50 @@ def drawn(
         sims: places of the rope [m], shape (T, M, 3).
         numbers: those of all cameras, shape (Q,).
         frames: which pictures, shape (N,).
-        radius: of the rope [m].
+        radius: of the rope in the middle of the masks [px].
+        trial: number of the trial, whose masks say how much of the rope grippers hide.
     """
     seen = own.spines.views[view]
     camera = torch.as_tensor(numbers[None, PER_CAMERA * view : PER_CAMERA * (view + 1)], dtype=torch.float32)
     with torch.no_grad():
         place = torch.as_tensor(sims[None, None], dtype=torch.float32)
-        pixel, depth, focal = seen_by(seen, place, camera, own.spines.step)
+        pixel, depth, _ = seen_by(seen, place, camera, own.spines.step)
         pixel, depth = pixel[0, 0, frames], depth[0, 0, frames]
-        wide = radius * focal / depth.clamp(min=NEAR)
-        # Grippers hide what they hold.
-        shown = (depth >= NEAR) & torch.as_tensor(own.spines.free)
+        near = depth.clamp(min=NEAR)
+        wide = radius * near.median() / near
+        points = torch.as_tensor(seen.places[trial, frames], dtype=torch.float32)
+        cut, shown = _without_grippers(pixel, points, radius)
         size = (seen.camera.height, seen.camera.width)
-        return coverage(pixel, wide, shown, successors([pixel.shape[-2]]), size).numpy()
+        return coverage(cut, wide, shown & (depth >= NEAR), successors([pixel.shape[-2]]), size).numpy()
 
 
-def overlaps(recording: Recording, own: Problem, sims: np.ndarray, numbers: np.ndarray) -> list[float]:
+def _without_grippers(pixel: torch.Tensor, points: torch.Tensor, radius: float) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return a rope's pixels (N, M, 2) that begin and end where the mask does, and which of them can be seen, (N, M).
+
+    Grippers hide a piece of rope at its ends that is the same in all pictures: where centre lines (N, S, 2) end in the
+    pictures that show most of it.
+    """
+    last = pixel.shape[-2] - 1
+    _, along = curve_vectors(pixel, points.nan_to_num(1e6))
+    along = torch.where(torch.isfinite(points).all(-1), along, torch.nan)
+    edge = torch.linalg.vector_norm(pixel.diff(dim=-2), dim=-1).median().clamp(min=1e-3)
+    inset = radius / float(edge)
+    low = float(np.nanquantile(np.nanmin(along.numpy(), 1), 0.1)) - inset
+    high = float(np.nanquantile(np.nanmax(along.numpy(), 1), 0.9)) + inset
+    low, high = max(low, 0.0), min(high, float(last))
+    number = torch.arange(last + 1)
+    first, final = int(low), int(np.ceil(high))
+    cut = pixel.clone()
+    cut[:, first] = torch.lerp(pixel[:, first], pixel[:, min(first + 1, last)], low - first)
+    cut[:, final] = torch.lerp(pixel[:, final], pixel[:, max(final - 1, 0)], final - high)
+    return cut, ((number >= first) & (number <= final)).expand(pixel.shape[:-1])
+
+
+def overlaps(own: Problem, sims: np.ndarray, numbers: np.ndarray) -> list[float]:
     """Return the intersection over union of simulated and measured masks by trial, mean over good pictures and views.
 
     Args:
-        recording: the rope.
-        own: the problem, of which the radius is taken from the masks where the rope's is not known.
+        own: the problem; ropes are drawn as thick as masks are, which depends on where colours were cut off.
         sims: places of the rope [m], shape (B, T, M, 3).
         numbers: those of all cameras, shape (Q,).
     """
@@ -60,12 +83,11 @@ def overlaps(recording: Recording, own: Problem, sims: np.ndarray, numbers: np.n
         for k, view in enumerate(own.spines.views):
             frames = np.flatnonzero(view.good[b])
             frames = frames[:: max(1, len(frames) // 24)]
-            radius = recording.radius or view.half_width * 1.2 / view.camera.fx
             measured = view.masks(b, frames)
-            model = drawn(own, k, sims[b], numbers, frames, radius) > 0.5
+            model = drawn(own, k, sims[b], numbers, frames, view.half_width, b) > 0.5
             # How thick a mask is depends on where its colours were cut off: ropes are drawn as thick as it is.
-            thick = float(np.clip(measured.sum() / max(model.sum(), 1), 0.6, 1.6))
-            model = drawn(own, k, sims[b], numbers, frames, thick * radius) > 0.5
+            share = np.median(measured.sum((1, 2)) / np.maximum(model.sum((1, 2)), 1))
+            model = drawn(own, k, sims[b], numbers, frames, np.clip(share, 0.6, 1.6) * view.half_width, b) > 0.5
             both, either = (model & measured).sum((1, 2)), (model | measured).sum((1, 2))
             parts.append(float(np.mean(both / np.maximum(either, 1))))
         out.append(float(np.mean(parts)))

@@ -1,0 +1,41 @@
+"""A diagnosis of films goes through all of its stages and says what it found; a short one, of half a second."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from torchdlo.report.pages import diagnosis as page
+from torchdlo.sysid.diagnosis.budget import BUDGETS, Budget
+from torchdlo.sysid.diagnosis.effect_library import LIBRARY
+from torchdlo.sysid.diagnosis.findings import findings_json, model_json, summary
+from torchdlo.sysid.diagnosis.search import diagnose
+from torchdlo.sysid.recordings.recording import load_recording
+from torchdlo.sysid.video import filmed_diagnosis
+from torchdlo.sysid.video.filming import film_recording
+from torchdlo.vision.camera import looking_at
+from torchdlo.vision.film import Look
+
+SAMPLE = Path(__file__).parents[2] / "torchdlo" / "data" / "sample_rope"
+
+
+@pytest.mark.slow
+def test_a_diagnosis_of_films_says_what_it_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    camera = looking_at("a", [0.15, -1.35, 1.0], [0.0, 0.0, 0.88], focal=650.0)
+    film_recording(load_recording(SAMPLE), [camera], tmp_path / "rope", Look(noise=1.0), trials=1, seconds=0.5)
+    recording = load_recording(tmp_path / "rope")
+    monkeypatch.setattr(filmed_diagnosis, "FILMED_STARTS", 4)
+    monkeypatch.setattr(filmed_diagnosis, "SILENT", 0.0)
+    monkeypatch.setattr(filmed_diagnosis, "_chained", lambda model: model)
+    monkeypatch.setitem(BUDGETS, "fast", Budget(4, 1, 1, 1, 1))
+    found = diagnose(recording, without=[n for n in LIBRARY if n not in ("air_drag", "point_mass")])
+    (candidates,) = found.candidates
+    assert {c.name for c in candidates} == {"air_drag", "point_mass"} and all(c.reason for c in candidates)
+    assert np.isfinite(found.before).all() and found.verdict in ("none", "effects", "partial", "unknown")
+    content = json.loads(findings_json(found, recording))
+    assert set(content["baseline"]) == {"bending_stiffness", "twisting_stiffness", "damping_rate"}
+    assert len(content["cameras"]) == 8 and json.loads(model_json(found))["parameters"]
+    assert summary(found, recording) in page.diagnosis_html(found, recording).replace("&#x27;", "'")

@@ -1,0 +1,90 @@
+"""Fits to films: starts are eliminated exactly, lying ropes come to rest, and a small film tells its rope."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from torchdlo.errors import InputError
+from torchdlo.sysid.calibration.calibrate import calibrate
+from torchdlo.sysid.diagnosis.search import diagnose
+from torchdlo.sysid.model.rope_model import RopeModel
+from torchdlo.sysid.model.trial_batch import Start
+from torchdlo.sysid.recordings.recording import load_recording
+from torchdlo.sysid.video.filmed_fit import eliminated, normal
+from torchdlo.sysid.video.films import with_stations
+
+DATA = Path(__file__).parents[2] / "torchdlo" / "data"
+
+
+def test_eliminated_starts_leave_the_step_of_the_whole_problem() -> None:
+    rng = np.random.default_rng(0)
+    trials, shared, own = 3, 4, 5
+    root = rng.normal(size=(trials, shared + own, 12))
+    curvature, gradient = root @ root.transpose(0, 2, 1), rng.normal(size=(trials, shared + own))
+    g, h = eliminated(gradient, curvature, own)
+    step = -np.linalg.solve(h.sum(0), g.sum(0))
+    size = shared + trials * own
+    whole, pull = np.zeros((size, size)), np.zeros(size)
+    for b in range(trials):
+        at = [*range(shared), *range(shared + b * own, shared + (b + 1) * own)]
+        whole[np.ix_(at, at)] += curvature[b]
+        pull[at] += gradient[b]
+    assert np.allclose(step, -np.linalg.solve(whole, pull)[:shared], atol=1e-8)
+
+
+def test_gradients_are_those_of_the_cost() -> None:
+    rng = np.random.default_rng(1)
+    jacobian, base = rng.normal(size=(2, 3, 4, 6)), 2e-3 * rng.normal(size=(2, 4, 6))
+    prior, knee = np.array([0.1, 0.2]), 2e-3
+
+    def cost(x: np.ndarray) -> np.ndarray:
+        r = base + np.einsum("bkfr,k->bfr", jacobian, x)
+        return (np.sqrt(r**2 + knee**2) - knee).mean((1, 2)) + 0.5 * prior * x[2] ** 2
+
+    gradient, _ = normal(base, jacobian, np.zeros((2, 1)), prior)
+    for k in range(3):
+        nudge = 1e-7 * (np.arange(3) == k)
+        assert np.allclose((cost(nudge) - cost(-nudge)) / 2e-7, gradient[:, k], rtol=1e-4, atol=1e-6)
+
+
+def test_a_rope_that_lies_on_a_table_comes_to_rest_on_it() -> None:
+    recording = load_recording(DATA / "sample_film")
+    trial = recording.train[0]
+    held = np.array([[0.0, 0.0, 0.004], [0.022, 0.0, 0.004]])
+    frames = 12
+    lying = replace(
+        trial,
+        time=np.arange(frames) / 100,
+        markers=np.repeat(held[None], frames, 0),
+        marker_arclength=np.array([0.0, 0.022]),
+        gripped=np.ones(2, bool),
+        gripper_quaternion=None,
+        gripper_marker=None,
+        suspect=np.zeros(frames, bool),
+    )
+    lying = with_stations(lying, recording.length)
+    recording = replace(recording, table_height=0.0, train=(lying,), test=(lying,))
+    model = RopeModel(recording, vertices=41)
+    pos = np.zeros((1, model.count, 3))
+    pos[0, :, 0], pos[0, :, 2] = lying.marker_arclength, 0.004
+    start = Start(pos, 0 * pos, np.ones(1, bool))
+    sims = model.simulate(model.motion([lying]), start, model.guess()[None])[0, 0]
+    assert np.abs(sims[..., 2] - 0.004).max() < 3e-4  # long steps bounced by 20 mm
+    assert np.abs(sims[..., 0] - lying.marker_arclength).max() < 1e-3
+
+
+@pytest.mark.slow
+def test_films_that_begin_in_motion_tell_the_bending_stiffness() -> None:
+    found = calibrate(load_recording(DATA / "sample_film"), starts=24)
+    stiffness = found.parameters["bending_stiffness"]["value"]
+    assert abs(stiffness / 3e-3 - 1) < 0.05
+    assert np.mean([t["distance_px"] for t in found.per_trial if t["split"] == "train"]) < 1.0
+
+
+def test_a_diagnosis_of_films_cannot_be_resumed() -> None:
+    with pytest.raises(InputError, match="no --resume for films"):
+        diagnose(load_recording(DATA / "sample_film"), resume=True)

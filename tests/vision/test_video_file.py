@@ -1,0 +1,46 @@
+"""Films that cannot be used are refused in a sentence."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from torchdlo.errors import InputError
+from torchdlo.vision.video_file import frame_rate, read_video, write_video
+
+
+def test_a_film_comes_back_with_its_rate(tmp_path: Path) -> None:
+    pictures = np.zeros((6, 32, 48, 3), np.uint8)
+    pictures[:, 8:24, 8:24] = 200
+    write_video(tmp_path / "a.mp4", pictures, 25.0)
+    found, fps = read_video(tmp_path / "a.mp4")
+    assert found.shape == pictures.shape and fps == pytest.approx(25.0, rel=1e-3)
+    assert np.abs(found.astype(int) - pictures).mean() < 4
+
+
+@pytest.mark.parametrize("content", [b"not a film at all " * 50, b"\0" * 2000])
+def test_files_that_are_no_films_are_refused(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "a.mp4"
+    path.write_bytes(content)
+    with pytest.raises(InputError, match="expected a film") as caught:
+        read_video(path)
+    assert "\n" not in str(caught.value)
+
+
+def test_half_a_film_is_refused_or_read_as_far_as_it_goes(tmp_path: Path) -> None:
+    path = tmp_path / "a.mp4"
+    write_video(path, np.random.default_rng(0).integers(0, 255, (8, 32, 48, 3)).astype(np.uint8), 25.0)
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    with pytest.raises(InputError, match="expected a film"):
+        read_video(path)
+
+
+def test_a_varying_frame_rate_is_refused_and_a_dropped_picture_is_not() -> None:
+    even = np.arange(60) / 30.0
+    assert frame_rate(Path("a.mp4"), list(np.delete(even, 20))) == pytest.approx(30.0)
+    with pytest.raises(InputError, match="constant frame rate"):
+        frame_rate(Path("a.mp4"), list(np.cumsum(np.where(np.arange(60) % 3, 0.033, 0.05))))
+    with pytest.raises(InputError, match="rising times"):
+        frame_rate(Path("a.mp4"), list(-even))

@@ -1,0 +1,404 @@
+"""What films show that the baseline lacks: doses of every effect against what it leaves over, fits, and unseen films.
+
+The search is that of recordings with markers, on readings of films: lengths whose target is 0. Cameras, clocks and
+starts in motion take up what they can before an effect may explain it.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from torchdlo.sysid.diagnosis import effect_library, score_test
+from torchdlo.sysid.diagnosis.budget import BUDGETS, Budget
+from torchdlo.sysid.diagnosis.candidate_fits import vector
+from torchdlo.sysid.diagnosis.error_floor import ErrorFloor, rms
+from torchdlo.sysid.diagnosis.score_test import Score
+from torchdlo.sysid.diagnosis.verdict import UNKNOWN_FLOOR, Candidate, Diagnosis, word
+from torchdlo.sysid.estimation import levenberg_marquardt
+from torchdlo.sysid.estimation.jobs import Fitted
+from torchdlo.sysid.model.model_file import ModelFile
+from torchdlo.sysid.recordings.recording import Recording
+from torchdlo.sysid.video.filmed import FILMED_STARTS, baseline, tested
+from torchdlo.sysid.video.filmed_fit import Fit, fit, look, spread
+from torchdlo.sysid.video.filmed_problem import Problem
+from torchdlo.sysid.video.footage import views_of
+from torchdlo.sysid.video.overlay import overlays
+
+__all__ = ["diagnose_filmed"]
+
+Callback = Callable[[str, int, int, str], None]
+
+PAYS = 0.15
+"""Share of the excess gap that an effect has to close, on the train and on the test trials."""
+
+MORE = 2.5
+"""Times the floor that have to be left for another effect to be looked for."""
+
+SILENT = 1.3
+"""Times the floor: below, there is nothing left to look for."""
+
+MATTERS = 0.03
+"""Share of the baseline's excess gap that each effect has to close, whatever the others leave."""
+
+_CHAIN = "link_chain"
+"""What a chain of links does that a rope does not: fitted before any effect is considered."""
+
+_BETTER = 0.9
+"""Share of the cost that is left where the rope is taken for a chain."""
+
+_SHORT = 0.6
+"""Share of the time that doses and first fits see."""
+
+_SPINE = 0.15
+"""What centre lines of masks get wrong [px], as measured on films of known motions."""
+
+_LEADERS = 3
+"""Candidates that are fitted to all of the time."""
+
+
+@dataclass(eq=False)
+class _Model:
+    """A model with its fit."""
+
+    own: Problem
+    fit: Fit
+    test: Problem
+    """The same of the test trials."""
+    _tested: np.ndarray | None = field(init=False, default=None)
+
+    @property
+    def values(self) -> np.ndarray:
+        """Numbers of rope and cameras, shape (N,)."""
+        return self.own.space.to_values(self.fit.raw)
+
+    def gaps(self, split: str) -> np.ndarray:
+        """Return root mean squares of the readings of trials [m], shape (B,)."""
+        if split == "train":
+            residual = self.fit.residual[..., : self.own.spines.priors.start]
+            return np.sqrt(np.nanmean(residual**2, (1, 2)))
+        if self._tested is None:
+            here = self.test
+            if here.offset.shape[1]:
+                fit(here, self.fit.raw, 3, seconds=None, tolerance=1e-2, fixed=True)
+            read = here.spines.read(here.simulate(self.values[None]), self.values[None, len(here.free) :])[0]
+            residual = np.where(np.isfinite(here.spines.target), read, np.nan)[:, :, : here.spines.priors.start, 0]
+            self._tested = np.sqrt(np.nanmean(residual**2, (1, 2)))
+        return self._tested
+
+
+def diagnose_filmed(
+    recording: Recording,
+    *,
+    budget: str = "fast",
+    seed: int = 0,
+    vertices: int | None = None,
+    given: ModelFile | None = None,
+    without: Sequence[str] = (),
+    callback: Callback | None = None,
+) -> Diagnosis:
+    """Name what the films of a recording show that the baseline model lacks; see `diagnosis.search.diagnose`."""
+    begun, report = time.perf_counter(), callback or (lambda *_: None)
+    views, notes = views_of(recording, recording.train, report)
+    own, _, best = baseline(recording, views, FILMED_STARTS, 15, seed, vertices, given, report)
+    values = own.space.to_values(best.raw)
+    test, said = tested(own, recording, values, report)
+    base = _Model(own, best, test)
+    if given is None:
+        base = _chained(base)
+        report("calibrating the baseline", 1, 1, f"{1e3 * rms(base.gaps('train')):.2f} mm")
+    floor, level = _floor(base)
+    plan, first = BUDGETS[budget], base
+    shares: dict[str, float] = {}
+    ties: dict[str, list[str]] = {}
+    rounds: list[list[Candidate]] = []
+    while len(rounds) < plan.rounds:
+        if rms(np.concatenate([base.gaps("train"), base.gaps("test")])) < (MORE if shares else SILENT) * level:
+            break
+        names = [n for n in effect_library.LIBRARY if n not in (*base.own.model.effects, *without)]
+        names = [n for n in names if effect_library.applicable(n, recording, base.own.model.mesh)]
+        found, candidates, rivals = _round(base, first, names, floor, level, plan, f"round {len(rounds) + 1}", report)
+        rounds.append(candidates)
+        if found is None:
+            break
+        name = found.own.model.effects[-1]
+        excess = max(rms(first.gaps("test")) ** 2 - floor.noise**2, 1e-12)
+        shares[name] = (rms(base.gaps("test")) ** 2 - rms(found.gaps("test")) ** 2) / excess
+        ties[name] = rivals
+        base = found
+    return _concluded(recording, first, base, floor, level, shares, ties, rounds, [*notes, *said], seed, budget, begun)
+
+
+def _chained(plain: _Model) -> _Model:
+    """Return the model as a chain of links, if films fit to that much better."""
+    link, best = float(np.diff(plain.own.model.arclength).min()), plain
+    for length in (link, -link):
+        chain = _extended(plain, (_CHAIN,), {f"{_CHAIN}.length": 0.5 * link}, {f"{_CHAIN}.length": length}, None)
+        look_at = fit(chain.own, chain.fit.raw, 2)
+        if look_at.cost < best.fit.cost:
+            best = replace(chain, fit=fit(chain.own, look_at.raw, 6))
+    return best if best.fit.cost < _BETTER * plain.fit.cost else plain
+
+
+def _extended(
+    base: _Model,
+    added: Sequence[str],
+    sizes: dict[str, float],
+    numbers: dict[str, float],
+    raw: np.ndarray | None,
+) -> _Model:
+    """Return a model with more effects, that begins with some of their numbers, not yet fitted.
+
+    Args:
+        base: the model.
+        added: effects.
+        sizes: what counts as much of their numbers.
+        numbers: those that are fitted.
+        raw: coordinates (N,) of the model's own numbers; where they are if not given.
+    """
+    effects = (*base.own.model.effects, *added)
+    known = base.own.space.to_values(base.fit.raw if raw is None else base.own.space.clip(raw))
+    count = len(base.own.free)
+    parts = []
+    for problem in (base.own, base.test):
+        more = problem.with_effects(effects, {k: v for k, v in sizes.items() if v}, list(numbers))
+        for k, column in enumerate(problem.free):
+            more.fixed[more.model.parameters.index(problem.model.parameters[column])] = known[k]
+        for name, value in numbers.items():
+            more.fixed[more.model.parameters.index(name)] = value
+        parts.append(more)
+    start = np.concatenate([parts[0].fixed[list(parts[0].free)], known[count:]])
+    at = parts[0].space.clip(parts[0].space.to_raw(start))
+    return _Model(parts[0], replace(base.fit, raw=at), parts[1])
+
+
+def _floor(base: _Model) -> tuple[ErrorFloor, float]:
+    """Return what no effect explains: noise of centre lines, and what steps and mesh may still get wrong."""
+    own = base.own
+    scale = np.mean([0.5 * (v.camera.fx + v.camera.fy) / own.depth(v) for v in own.spines.views])
+    parts = []
+    values, sims = base.values[None], own.simulate(base.values[None])
+    for wrong in own.discretisation_correction.unsure:
+        moved = np.concatenate([sims, sims + np.nan_to_num(wrong)[None]])
+        change = own.spines.changes(moved, np.repeat(values[:, len(own.free) :], 2, 0))
+        change = np.where(np.isfinite(own.spines.target), change[1] - change[0], np.nan)
+        parts.append(float(np.sqrt(np.nanmean(change[:, :, : own.spines.priors.start] ** 2))))
+    floor = ErrorFloor(_SPINE / float(scale), *parts)
+    return floor, floor.total
+
+
+def _round(
+    base: _Model,
+    first: _Model,
+    names: Sequence[str],
+    floor: ErrorFloor,
+    level: float,
+    plan: Budget,
+    stage: str,
+    report: Callback,
+) -> tuple[_Model | None, list[Candidate], list[str]]:
+    """Return the model with the best effect added, if one pays, all candidates, and effects that fit as well."""
+    scores = _scores(base, names, lambda k, n: report(f"{stage}: screening", k, n, ""))
+    tried, short = scores[: plan.candidates], _SHORT * base.own.lasts
+    lead = tried[0].name
+    tried += [s for s in scores[plan.candidates :] if any({s.name, lead} <= k for k in effect_library.KIN)]
+    fits: dict[str, _Model] = {}
+    for k, score in enumerate(tried):
+        fits[score.name] = _fitted(base, score, plan.iterations, short)
+        report(f"{stage}: fitting", k + 1, len(tried), f"{score.name} {1e3 * fits[score.name].fit.cost:.3f} mm")
+    order = sorted(fits, key=lambda n: fits[n].fit.cost)
+    for name in order[:_LEADERS]:
+        one = fits[name]
+        fits[name] = replace(one, fit=fit(one.own, one.fit.raw, plan.more))
+        report(f"{stage}: fitting on", 1, 1, f"{name} {1e3 * fits[name].fit.cost:.3f} mm")
+    rival = replace(base, fit=fit(base.own, base.fit.raw, 3))
+    led = sorted(order[:_LEADERS], key=lambda n: fits[n].fit.cost)
+    refused = {name: _refused(rival, fits[name], first, floor, level) for name in led}
+    fair = [name for name in led if refused[name] is None]
+    best, rivals, reasons = None, [], {name: refused.get(name) or "fits worse" for name in fits}
+    if fair:
+        cost = fits[fair[0]].fit.cost
+        tie = max(
+            min(0.05 * (rival.fit.cost - cost), 0.5 * max(levenberg_marquardt.cost_of(level), cost)),
+            1e-12,
+        )
+        close = [n for n in fair if fits[n].fit.cost - cost < tie]
+        chosen = min(close, key=lambda n: len(fits[n].own.free))
+        reasons |= dict.fromkeys(close, "as good as the best") | {chosen: "taken"}
+        best, rivals = fits[chosen], [n for n in close if n != chosen]
+    candidates = [
+        Candidate(
+            s.name,
+            s.share,
+            _gain(rival, fits[s.name], "train", floor) if s.name in led else None,
+            _gain(rival, fits[s.name], "test", floor) if s.name in led else None,
+            reasons.get(s.name, "its doses explain less"),
+        )
+        for s in scores
+    ]
+    return best, candidates, rivals
+
+
+def _gain(base: _Model, other: _Model, split: str, floor: ErrorFloor) -> float:
+    """Return the share of the excess gap that another model closes."""
+    before, after = rms(base.gaps(split)) ** 2, rms(other.gaps(split)) ** 2
+    return float((before - after) / max(before - floor.noise**2, (0.3 * floor.noise) ** 2, 1e-12))
+
+
+def _refused(rival: _Model, other: _Model, first: _Model, floor: ErrorFloor, level: float) -> str | None:
+    """Return why a model is no better than its rival, None if it is."""
+    if float(np.mean(other.gaps("train") < rival.gaps("train"))) <= 0.6:
+        return "helps on too few trials"
+    gain = _gain(rival, other, "train", floor)
+    if gain < PAYS:
+        return f"closes {max(gain, 0):.0%} of the gap"
+    if _gain(rival, other, "test", floor) < PAYS:
+        return "does not help on the test trials"
+    for split in ("train", "test"):
+        before, after = (rms(m.gaps(split)) ** 2 for m in (rival, other))
+        enough = min(MATTERS * (rms(first.gaps(split)) ** 2 - floor.noise**2), 0.8 * (before - level**2))
+        if before - after <= max(level**2, enough):
+            return "closes less than the floor leaves open"
+    return None
+
+
+def _fitted(base: _Model, score: Score, iterations: int, seconds: float) -> _Model:
+    """Return a first fit of a model with one effect more, from the best of several doses."""
+    numbers = effect_library.numbers(score.name, base.own.model.recording)
+    starts = []
+    for dose, raw in score.starts:
+        vectors = {vector(name) for name in dose}
+        used = {n.name: dose.get(n.name, n.off) for n in numbers if vector(n.name) in vectors}
+        sizes = {n: score.sizes.get(n, 0.0) for n in used}
+        starts.append(_extended(base, (score.name,), sizes, used, raw))
+    costs = []
+    target = base.own.target(seconds)[..., None]
+    for start in starts:
+        values = start.values[None]
+        sims = start.own.simulate(values, start.own.frames(seconds))
+        read = start.own.spines.read(sims, values[:, len(start.own.free) :])
+        costs.append(levenberg_marquardt.costs(read, target, start.own.extent)[0])
+    best = starts[int(np.argmin(costs))]
+    return replace(best, fit=fit(best.own, best.fit.raw, iterations, seconds=seconds))
+
+
+def _scores(base: _Model, names: Sequence[str], report: Callable[[int, int], None]) -> list[Score]:
+    """Return the scores of effects, best first: what their doses explain beyond what all other numbers can."""
+    own, values = base.own, base.values
+    seconds = _SHORT * own.lasts
+    here = look(own, base.fit.raw, own.offset, seconds)
+    known = dict(zip(own.model.parameters, own.full(values[None])[0], strict=True))
+    sims = own.simulate(values[None])
+    step = max(1, sims.shape[2] // 50)
+    curved = score_test.curvature_scale(sims[0][:, ::step])
+    doses = {n: effect_library.probes(n, own.model.recording, own.model.mesh, curved, known) for n in names}
+    groups = score_test._groups(names, doses)
+    seen = np.isfinite(here.residual)
+    weight = np.where(seen, 1 / (np.nan_to_num(here.residual) ** 2 + levenberg_marquardt.KNEE**2) ** 0.25, 0.0)
+    left, count, moving = -(np.nan_to_num(here.residual) * weight)[seen], here.raw.size, here.offset.shape[1]
+    columns = [(here.jacobian[:, k] * weight)[seen] for k in range(count)]
+    for b in range(len(seen)):
+        only = np.zeros_like(weight)
+        only[b] = weight[b]
+        columns += [] if own.start.still[b] else [(here.jacobian[:, count + k] * only)[seen] for k in range(moving)]
+    jacobian = np.stack(columns, 1).astype(float)
+    priors = np.zeros((jacobian.shape[1], jacobian.shape[1]))
+    per_trial = float(seen.sum()) / len(seen)
+    priors[range(count, len(priors)), range(count, len(priors))] = np.sqrt(own.prior.mean() * per_trial)
+    pad = np.zeros(len(priors))
+    q, r = np.linalg.qr(np.concatenate([jacobian, priors]))
+    left = np.concatenate([left, pad])
+    left = left - q @ (q.T @ left)
+    scores = []
+    report(0, len(groups))
+    for done, group in enumerate(groups):
+        more = own.with_effects((*own.model.effects, *group), {}, [])
+        more.fixed[:] = [known.get(n, f) for n, f in zip(more.model.parameters, more.fixed, strict=True)]
+        rows = [more.fixed.copy()]
+        owner = []
+        for name in group:
+            for probe in doses[name]:
+                rows.append(more.fixed.copy())
+                owner.append(name)
+                for key, value in probe.values.items():
+                    rows[-1][more.model.parameters.index(key)] = value
+        every = replace(more, free=tuple(range(len(more.fixed))))
+        cameras = np.repeat(values[None, len(own.free) :], len(rows), 0)
+        offsets = np.repeat(own.offset[None], len(rows), 0)
+        given = np.concatenate([np.stack(rows), cameras], 1)
+        moved = every.simulate(given, own.frames(seconds), offsets)
+        read = own.spines.changes(moved, cameras)[..., 0]
+        for name in group:
+            picked = [k + 1 for k, o in enumerate(owner) if o == name]
+            change = np.stack(
+                [np.concatenate([np.nan_to_num((read[k] - read[0]) * weight)[seen], pad]) for k in picked], 1
+            )
+            absorbed = q.T @ change
+            mixtures = score_test._mixtures(doses[name], change - q @ absorbed, left)
+            starts = []
+            for found in mixtures[: score_test._PLACES]:
+                back = np.linalg.lstsq(r, absorbed @ found.amounts, rcond=1e-6)[0][:count]
+                for share in score_test._ON_THE_WAY:
+                    raw = here.raw - np.clip(share * back, -1.0, 1.0)
+                    starts.append((score_test._mixture(name, doses[name], share * found.amounts), raw))
+            best, sizes = mixtures[0], score_test._sizes(name, doses[name])
+            scores.append(Score(name, best.share, starts[0][0], tuple(starts), sizes, best.direction))
+        report(done + 1, len(groups))
+    return sorted(scores, key=lambda s: -s.share)
+
+
+def _concluded(
+    recording: Recording,
+    first: _Model,
+    final: _Model,
+    floor: ErrorFloor,
+    level: float,
+    shares: dict[str, float],
+    ties: dict[str, list[str]],
+    rounds: list[list[Candidate]],
+    notes: list[str],
+    seed: int,
+    budget: str,
+    begun: float,
+) -> Diagnosis:
+    before, after = first.gaps("test"), final.gaps("test")
+    effects = list(shares)
+    point, drifts = spread(final.own, final.fit)
+    predictions: dict[str, dict[str, np.ndarray]] = {"before": {}, "after": {}}
+    shown = []
+    for split in ("train", "test"):
+        problems = [m.own if split == "train" else m.test for m in (first, final)]
+        sims = [p.simulate(m.values[None])[0] for p, m in zip(problems, (first, final), strict=True)]
+        for when, each in zip(predictions, sims, strict=True):
+            trials = problems[0].trials
+            predictions[when] |= {t.name: s[: len(t.time)] for t, s in zip(trials, each, strict=True)}
+        numbers = [m.values[len(m.own.free) :] for m in (first, final)]
+        shown += overlays(problems[0], split, np.stack(sims), np.stack(numbers))
+    done = Diagnosis(
+        word(effects, rms(after), level, rms(after) / rms(before)),
+        effects,
+        {name: ties[name] for name in effects},
+        shares,
+        _plain(first, point=spread(first.own, first.fit)[0]),
+        _plain(final, point=point),
+        floor,
+        before,
+        after,
+        rounds,
+        predictions,
+        final.own.model,
+        drifts,
+        notes=[*notes, *([] if np.isfinite(level) else [UNKNOWN_FLOOR])],
+        options={"budget": budget, "seed": seed, "vertices": final.own.options["vertices"]},
+    )
+    done.overlays, done.seconds = shown, time.perf_counter() - begun
+    return done
+
+
+def _plain(model: _Model, point: levenberg_marquardt.Point) -> Fitted:
+    """Return a fit as those of recordings with markers are."""
+    own = model.own
+    return Fitted(own.model.effects, own.full(model.values[None])[0], own.space, point, tuple(own.options.items()))
