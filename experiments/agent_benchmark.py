@@ -21,16 +21,16 @@ import torch
 from options import Parser, count, save
 
 from torchdlo import envs
-from torchdlo.agents.trajopt.presets import preset
+from torchdlo.agents.trajopt.presets import search_preset
 from torchdlo.agents.trajopt.search import optimize
-from torchdlo.agents.trajopt.task_problem import problem
+from torchdlo.agents.trajopt.task_problem import task_problem
 from torchdlo.agents.vlm.conversation import Conversation
 from torchdlo.agents.vlm.decomposition import Options, carry_out
 from torchdlo.agents.vlm.endpoint import Endpoint
 from torchdlo.agents.vlm.geometry import Geometry
-from torchdlo.agents.vlm.grasp_proposal import places_of, propose, random_grasps
+from torchdlo.agents.vlm.grasp_proposal import places_of, propose_grasps, random_grasps
+from torchdlo.agents.vlm.plan_schema import MODES
 from torchdlo.agents.vlm.recorded import load_recorded
-from torchdlo.agents.vlm.schema import MODES
 from torchdlo.envs.core import episode
 
 TASKS = ("lifting", "unknotting", "wrapping")
@@ -80,15 +80,15 @@ def asked(task: envs.Task, model: Any, mode: str) -> tuple[int | None, ...]:
 
     made = episode.prepare(task, 1, compiled=False)
     view = marked_view(stills(made, [made.start], arms=False))
-    return propose(task, mode, Conversation(model), view).grasps
+    return propose_grasps(task, mode, Conversation(model), view).grasps
 
 
 def searched(name: str, grasps: tuple[int | None, ...], options: Any) -> dict[str, Any]:
     """Return what a search with grasps comes to."""
     own = grasps == envs.find(name).arms.vertex
-    chosen = problem(name, grasps=None if own else grasps, compiled=False, recorded=options.method == "cmaes")
+    chosen = task_problem(name, grasps=None if own else grasps, compiled=False, recorded=options.method == "cmaes")
     given = {"episodes": options.episodes, "population": options.population}
-    found = optimize(chosen, preset(name, options.method, **given))
+    found = optimize(chosen, search_preset(name, options.method, **given))
     return {"return": float(found.outcome.returns[0]), "success": bool(found.outcome.success[0])}
 
 

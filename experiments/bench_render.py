@@ -57,7 +57,7 @@ def main() -> None:
         options.repeats = 1
     import torch
 
-    from torchdlo.envs.observations.pixels import camera_rig, rendered
+    from torchdlo.envs.observations.pixels import camera_rig, render_cameras
     from torchdlo.vision.look import Look, draw_look
 
     torch.set_num_threads(1)
@@ -69,11 +69,13 @@ def main() -> None:
         for samples in (1, 4):
 
             def one(rig=rig, samples=samples):
-                return rendered(rig, world.state, world.joints, looks=(Look(),), samples=samples)
+                return render_cameras(rig, world.state, world.joints, looks=(Look(),), samples=samples)
 
             def loop(every=every, samples=samples):
                 looks = (draw_look(generator),)
-                return rendered(every, world.state, world.joints, looks=looks, samples=samples, depth=True, ids=True)
+                return render_cameras(
+                    every, world.state, world.joints, looks=looks, samples=samples, depth=True, ids=True
+                )
 
             front, frame = least(one, options.repeats), least(loop, options.repeats) / len(every.cameras)
             rows.append({"size": size, "samples": samples, "front_ms": round(front, 2), "loop_ms": round(frame, 2)})

@@ -59,7 +59,7 @@ def scripted(name: str, folder: Path) -> Path:
         task = find(name)
         with torch.no_grad():
             actions = task.demonstration().float()[None]
-            went = episode.play(task, actions, keep=episode.places, compiled=False, recorded=True)
+            went = episode.play(task, actions, keep=episode.scene_positions, compiled=False, recorded=True)
         content = {"generator": "torchdlo optimize", "task": name, "success": bool(went.success[0])}
         save(str(file), content | {"tool": went.path["tool"][:, 0].tolist()})
     return file
@@ -67,13 +67,13 @@ def scripted(name: str, folder: Path) -> Path:
 
 def run(name: str, algo: str, seed: int, chosen: Any) -> None:
     """Train one policy and judge it; what is done is not done again."""
-    from torchdlo.agents.policies import load
-    from torchdlo.agents.rl.evaluate import evaluate
-    from torchdlo.agents.rl.hybrid import STAGES, hybrid, plan_of
-    from torchdlo.agents.rl.results import prepared, train_json
-    from torchdlo.agents.rl.settings import preset
+    from torchdlo.agents.policies import load_policy
+    from torchdlo.agents.rl.evaluate import evaluate_policies
+    from torchdlo.agents.rl.hybrid_stages import STAGES, plan_of, train_hybrid
+    from torchdlo.agents.rl.results import prepare_training, train_json
+    from torchdlo.agents.rl.settings import training_preset
     from torchdlo.agents.rl.training import train
-    from torchdlo.agents.trajopt.stored import ARCHIVE, unpack
+    from torchdlo.agents.trajopt.stored import ARCHIVE, unpack_searches
     from torchdlo.envs import find
 
     label = "scripted" if algo == "hybrid" and chosen.source == "scripted" else algo
@@ -90,7 +90,7 @@ def run(name: str, algo: str, seed: int, chosen: Any) -> None:
     elif algo == "hybrid":
         searches = Path(chosen.out) / "searches"
         if not searches.exists():
-            unpack(ARCHIVE, searches)
+            unpack_searches(ARCHIVE, searches)
         files = [searches / f"{name}-hybrid-{k}" / "trajectory.json" for k in range(3)]
         if label == "scripted":
             files = [scripted(name, Path(chosen.out))]
@@ -101,14 +101,14 @@ def run(name: str, algo: str, seed: int, chosen: Any) -> None:
         plan = plan_of(name, **json.loads(chosen.plan))
         choices = {"folder": folder, "plan": plan, "stages": stages, "expert": expert}
         choices |= {"resume": True, "callback": told}
-        hybrid(task, files, preset(name, algo, **given), **choices)
+        train_hybrid(task, files, training_preset(name, algo, **given), **choices)
     else:
-        settings = preset(name, algo, episodes=chosen.episodes, fidelity=chosen.fidelity, **given)
-        trainer, played = prepared(task, settings)
+        settings = training_preset(name, algo, episodes=chosen.episodes, fidelity=chosen.fidelity, **given)
+        trainer, played = prepare_training(task, settings)
         resume = (folder / "checkpoint.pt").exists()
         found = train(trainer, played, settings, folder=folder, resume=resume, callback=told)
         (folder / "result.json").write_text(train_json(task, settings, found))
-    results, _ = evaluate([load(folder)], task, starts=chosen.starts, seed=chosen.reset_seed)
+    results, _ = evaluate_policies([load_policy(folder)], task, starts=chosen.starts, seed=chosen.reset_seed)
     results |= {"generator": "torchdlo evaluate", "algorithm": label, "seed": seed}
     save(str(folder / "evaluation.json"), results)
     told("judged", 1, 1, f"success {results['varied']['success']:.0%} from unseen starts")
@@ -116,9 +116,9 @@ def run(name: str, algo: str, seed: int, chosen: Any) -> None:
 
 def pack(out: Path, file: Path) -> None:
     """Write what is to be kept of all finished runs to one archive."""
-    from torchdlo.files import replacing
+    from torchdlo.files import replace_atomically
 
-    with replacing(file) as scratch, zipfile.ZipFile(scratch, "w", zipfile.ZIP_DEFLATED) as archive:
+    with replace_atomically(file) as scratch, zipfile.ZipFile(scratch, "w", zipfile.ZIP_DEFLATED) as archive:
         for folder in sorted(p.parent for p in out.glob("*/evaluation.json")):
             for name in KEPT:
                 if (folder / name).exists():
@@ -153,7 +153,7 @@ def _episodes(run: dict[str, Any]) -> int:
 
 
 def _row(task: str, algo: str, runs: list[dict[str, Any]]) -> dict[str, Any]:
-    from torchdlo.agents.rl.evaluate import wilson
+    from torchdlo.agents.rl.evaluate import wilson_interval
     from torchdlo.agents.rl.settings import PUBLISHED
 
     count = sum(r["varied"]["episodes"] for r in runs)
@@ -164,7 +164,7 @@ def _row(task: str, algo: str, runs: list[dict[str, Any]]) -> dict[str, Any]:
         "seeds": len(runs),
         "starts": ", ".join(sorted({str(r.get("reset_seed", 0)) for r in runs})),
         "success": hits / count,
-        "interval": wilson(hits, count),
+        "interval": wilson_interval(hits, count),
         "return": statistics.mean(r["varied"]["return"] for r in runs),
         "one_success": statistics.mean(r["one"]["success"] for r in runs),
         "one_return": statistics.mean(r["one"]["return"] for r in runs),

@@ -112,7 +112,7 @@ class Case:
 
     def ready(self, choices: dict[str, Any], again: bool) -> None:
         """Say so before anything runs if the journal of a stopped search is of another one; `again` removes it."""
-        from torchdlo.agents.trajopt.search_journal import program, remove
+        from torchdlo.agents.trajopt.search_journal import program_hash, remove_journal
         from torchdlo.errors import InputError
 
         journal = self.folder / "journal"
@@ -121,9 +121,9 @@ class Case:
         had = json.loads((journal / "journal.json").read_text())
         wanted = json.loads(json.dumps(asdict(self.settings) | choices))
         other = [name for name, value in wanted.items() if had["options"].get(name) != value]
-        other += ["version"] if had["program"] != program(self.task) else []
+        other += ["version"] if had["program"] != program_hash(self.task) else []
         if other and again:
-            remove(journal)
+            remove_journal(journal)
         elif other:
             raise InputError(
                 f"{journal}: a search was stopped here whose {', '.join(other)} differ; --again begins anew, or choose "
@@ -132,9 +132,9 @@ class Case:
 
     def search(self, problem: Any, callback: Any, over: Callable[[], bool]) -> None:
         """Search, resumed if it was stopped, and write what was found; nothing if there was no time for anything."""
-        from torchdlo.agents.trajopt.result import result_json, trajectory_json
         from torchdlo.agents.trajopt.search import optimize
-        from torchdlo.agents.trajopt.search_journal import remove
+        from torchdlo.agents.trajopt.search_journal import remove_journal
+        from torchdlo.agents.trajopt.search_result import result_json, trajectory_json
         from torchdlo.files import write_atomically
 
         journal = self.folder / "journal"
@@ -152,12 +152,12 @@ class Case:
         write_atomically(self.folder / "trajectory.json", trajectory_json(found, problem))
         write_atomically(self.result, result_json(found, problem, self.settings))
         if not found.interrupted:
-            remove(journal)
+            remove_journal(journal)
 
 
 def cases(task: str, args: Any) -> list[Case]:
     """All searches of a task."""
-    from torchdlo.agents.trajopt.presets import preset
+    from torchdlo.agents.trajopt.presets import search_preset
 
     given = {
         "episodes": args.episodes or None,
@@ -166,7 +166,13 @@ def cases(task: str, args: Any) -> list[Case]:
     }
     seeds = range(args.first, args.first + args.seeds)
     return [
-        Case(task, method, seed, preset(task, method, seed=seed, **given), Path(args.out) / f"{task}-{method}-{seed}")
+        Case(
+            task,
+            method,
+            seed,
+            search_preset(task, method, seed=seed, **given),
+            Path(args.out) / f"{task}-{method}-{seed}",
+        )
         for method in args.methods
         for seed in seeds
     ]
@@ -175,10 +181,10 @@ def cases(task: str, args: Any) -> list[Case]:
 def solve(task: str, args: Any) -> list[tuple[Case, dict[str, Any]]]:
     """Run what is not there yet of a task, all at once, and return all results."""
     from torchdlo.agents.trajopt.batched_evaluation import evaluate_batched
-    from torchdlo.agents.trajopt.task_problem import problem
+    from torchdlo.agents.trajopt.task_problem import task_problem
     from torchdlo.cli.progress import deferred_interrupt, progress
 
-    chosen, wanted = problem(task, double=args.double, compiled=args.compiled), cases(task, args)
+    chosen, wanted = task_problem(task, double=args.double, compiled=args.compiled), cases(task, args)
     left = [case for case in wanted if case.found(chosen, args.again, args.minutes is not None) is None]
     end = math.inf if args.minutes is None else time.monotonic() + 60 * args.minutes
     for case in left:

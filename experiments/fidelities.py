@@ -26,11 +26,11 @@ def play(name: str, fidelity: str, most: int | None) -> dict[str, Any]:
     """Return what a demonstration earns at a fidelity, and what it takes; `most` actions of it, if given."""
     import torch
 
-    from torchdlo.envs import find, parse_fidelity, simulated
+    from torchdlo.envs import find, parse_fidelity, with_fidelity
     from torchdlo.envs.core import episode
     from torchdlo.scene import step_diagnostics
 
-    task = simulated(find(name), parse_fidelity(fidelity))
+    task = with_fidelity(find(name), parse_fidelity(fidelity))
     made = episode.prepare(task, 1, compiled=False, recorded=True)
     actions = task.demonstration()[:most].float().unsqueeze(0)
     with torch.no_grad():

@@ -369,14 +369,18 @@ def _trajectory(folder: Path) -> None:
 
 
 def _read_trajectory(folder: Path) -> Any:
-    from torchdlo.agents.data.demonstrators import stored
+    from torchdlo.agents.data.demonstrators import trajectory_demonstrator
     from torchdlo.agents.trajopt import script
-    from torchdlo.agents.trajopt.result import load_actions
+    from torchdlo.agents.trajopt.search_result import load_actions
     from torchdlo.agents.trajopt.task_problem import TaskProblem
     from torchdlo.envs import find
 
     path, task = folder / "trajectory.json", find("lifting")
-    return load_actions(path, TaskProblem(task, compiled=False)), script._choices(path), stored(task, path)
+    return (
+        load_actions(path, TaskProblem(task, compiled=False)),
+        script._choices(path),
+        trajectory_demonstrator(task, path),
+    )
 
 
 def _read_checkpoint(folder: Path) -> Any:
@@ -450,7 +454,7 @@ def _frames(folder: Path) -> None:
 
 
 def _read_frames(folder: Path) -> Any:
-    from torchdlo.report.render.surfaces import bounds, pieces, points_of
+    from torchdlo.report.render.run_surfaces import bounds, pieces, points_of
     from torchdlo.scene_files.run import load_frames
 
     frames = load_frames(folder)
@@ -481,24 +485,24 @@ def _read_masks(folder: Path) -> Any:
 
 def _policy(folder: Path) -> None:
     from torchdlo.agents.policies.features import FeatureSpec
-    from torchdlo.agents.policies.files import save as write
     from torchdlo.agents.policies.policy import Policy, PolicySpec
+    from torchdlo.agents.policies.policy_files import save_policy as write
 
     torch.manual_seed(0)
     write(Policy(PolicySpec(FeatureSpec(4), 3, hidden=(8,))), folder / "policy.pt")
 
 
 def _read_policy(folder: Path) -> Any:
-    from torchdlo.agents.policies.files import load
+    from torchdlo.agents.policies.policy_files import load_policy
 
-    return load(folder / "policy.pt", notes=True)
+    return load_policy(folder / "policy.pt", notes=True)
 
 
 def _chunk_policy(folder: Path) -> None:
-    from torchdlo.agents.policies.chunk_policy import ChunkPolicy, Shape, save_policy
+    from torchdlo.agents.policies.chunk_policy import ChunkPolicy, NetworkShape, save_policy
 
     torch.manual_seed(0)
-    shape = Shape(1, ("a",), 8, 3, chunk=2, width=8, channels=(8,), layers=1, heads=1)
+    shape = NetworkShape(1, ("a",), 8, 3, chunk=2, width=8, channels=(8,), layers=1, heads=1)
     save_policy(folder / "chunk.pt", ChunkPolicy(shape), {"tasks": ["lifting"]})
 
 
@@ -547,7 +551,7 @@ lower="0" upper="1" velocity="2" effort="1"/> <mimic joint="j" multiplier="1" of
 def _read_robot(folder: Path) -> Any:
     from torchdlo.coupling.robot import urdf
 
-    return urdf.read(folder / "r.urdf")
+    return urdf.read_urdf(folder / "r.urdf")
 
 
 def _mesh(name: str) -> Callable[[Path], None]:

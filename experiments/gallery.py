@@ -88,7 +88,7 @@ def show(name: str, out: Path, *, quick: bool, draw: bool, video: bool) -> dict[
 
         write_atomically(here / f"{name}.jpg", jpeg(stills_png(frames, one.moments)))
     if video:
-        from torchdlo.report.render.video import write_video
+        from torchdlo.report.render.video_writer import write_video
 
         with progress() as callback:
             write_video(frames, here / "motion.mp4", speed=min(1.0, frames.time[-1] / 3), callback=callback)

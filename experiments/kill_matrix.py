@@ -70,7 +70,7 @@ def commands(rope: str) -> dict[str, tuple[str, ...]]:
 def play() -> None:
     """Run the command line with the task of a short rope."""
     from torchdlo import envs
-    from torchdlo.cli import main as run
+    from torchdlo.cli.app import main as run
 
     envs.TASKS["short"] = short_task()
     run(sys.argv[1:])

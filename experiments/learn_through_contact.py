@@ -55,7 +55,7 @@ def one(name: str, args: Any, out: Path) -> dict[str, Any]:
 
         write_atomically(out / f"{name}.png", stills_png(frames))
     if args.video:
-        from torchdlo.report.render.video import write_video
+        from torchdlo.report.render.video_writer import write_video
 
         write_video(frames, out / "motion.mp4", speed=0.2)
     row = {

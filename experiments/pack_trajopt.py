@@ -20,7 +20,7 @@ EXAMPLES = """examples:
 
 def main() -> None:
     """Pack or unpack."""
-    from torchdlo.agents.trajopt.stored import NAME, pack, unpack
+    from torchdlo.agents.trajopt.stored import NAME, pack_searches, unpack_searches
 
     parser = Parser("pack_trajopt.py", description=__doc__, epilog=EXAMPLES)
     parser.add_argument("--out", default="runs/trajopt", help="folder of the searches; default: %(default)s")
@@ -28,11 +28,11 @@ def main() -> None:
     args = parser.parse_args()
     archive = Path(args.out) / NAME
     if args.unpack:
-        unpack(archive, args.unpack)
+        unpack_searches(archive, args.unpack)
         return
     if not list(Path(args.out).glob("*/result.json")):
         sys.exit(f"error: {args.out}: expected subfolders of finished searches, found none.")
-    print(f"{archive}: {pack(args.out, archive)} searches")
+    print(f"{archive}: {pack_searches(args.out, archive)} searches")
 
 
 if __name__ == "__main__":

@@ -185,7 +185,7 @@ def overlaps(made: tuple[Any, Any, Any], state: Any) -> tuple[Any, Any]:
         nearest.append(shapes.distance(body.shape, size, rotate(conjugate(quat), points - at)).amin((-1, -2)))
     first, second = torch.triu_indices(VERTICES - 1, VERTICES - 1, 3)
     one, two = (tuple(e[:, rows] for e in ends) for rows in (first, second))
-    s, t = closest_points.closest(one, two)
+    s, t = closest_points.closest_points(one, two)
     between = torch.lerp(*one, s) - torch.lerp(*two, t)
     inside = 1 - torch.stack(nearest).amin(0) / RADIUS
     return inside.clamp(min=0), (2 - between.norm(dim=-1).amin(-1) / RADIUS).clamp(min=0)

@@ -27,8 +27,8 @@ from options import Parser, count, save
 
 from torchdlo.cli.progress import progress
 from torchdlo.files import write_atomically
+from torchdlo.sysid.diagnosis.effect_search import BUDGETS, diagnose
 from torchdlo.sysid.diagnosis.findings import findings, model_json
-from torchdlo.sysid.diagnosis.search import BUDGETS, diagnose
 from torchdlo.sysid.diagnosis.verdict import Diagnosis
 from torchdlo.sysid.model import initial_state as starts
 from torchdlo.sysid.model import model_file

@@ -40,11 +40,11 @@ def replay(name: str, had: dict[str, Any], make: Callable[..., Any]) -> dict[str
     """Play a trajectory in the problem that `make(task, **choices)` returns, and return how that went."""
     import torch
 
-    from torchdlo.agents.trajopt.result import plain
+    from torchdlo.agents.trajopt.search_result import plain_evaluation
 
     problem = make(had["task"], **{name: had["choices"][name] for name in STEPS if name in had["choices"]})
     outcome, kept = problem.record(torch.as_tensor(had["actions"], dtype=torch.float64))
-    now = plain(outcome)
+    now = plain_evaluation(outcome)
     row = {"search": name, "missed": kept.get("missed", "")}
     return row | {name: [had[name], now[name]] for name in ("return", "success")}
 
@@ -59,7 +59,7 @@ def shown(row: dict[str, Any]) -> str:
 
 def main() -> None:
     """Play all that is there."""
-    from torchdlo.agents.trajopt.task_problem import problem
+    from torchdlo.agents.trajopt.task_problem import task_problem
 
     parser = Parser("replay_trajopt.py", description=__doc__, epilog=EXAMPLES)
     parser.add_argument("--out", default="experiments/trajopt", help="folder of the searches; default: %(default)s")
@@ -73,7 +73,7 @@ def main() -> None:
         sys.exit(
             f"error: {args.out}: expected the trajectories {', '.join(wrong) or 'of searches'}, found none of them."
         )
-    rows, make = [], functools.cache(problem)
+    rows, make = [], functools.cache(task_problem)
     for name, content in found.items():
         if not wanted or name in wanted:
             rows.append(replay(name, content, make))

@@ -12,21 +12,23 @@ from options import save
 
 def earlier(result: dict[str, Any]) -> bool:
     """Return whether a result is of another version of the program or of libraries."""
-    from torchdlo.agents.trajopt.search_journal import program
+    from torchdlo.agents.trajopt.search_journal import program_hash
 
-    return result["program"] != program(result["task"])
+    return result["program"] != program_hash(result["task"])
 
 
 def finished(task: str, method: str, out: Path) -> list[dict[str, Any]]:
     """All results of a task by a method that are there, of any settings, by seed."""
-    from torchdlo.agents.trajopt.result import upgraded
+    from torchdlo.agents.trajopt.search_result import upgrade_result
     from torchdlo.agents.trajopt.stored import NAME, read_searches
 
     found, archive, start = {}, out / NAME, f"{task}-{method}-"
     if archive.is_file():
         found = {name: result for name, result, _ in read_searches(archive) if name.startswith(start)}
     # What was searched since the archive was written counts more.
-    found |= {file.parent.name: upgraded(json.loads(file.read_text())) for file in out.glob(f"{start}*/result.json")}
+    found |= {
+        file.parent.name: upgrade_result(json.loads(file.read_text())) for file in out.glob(f"{start}*/result.json")
+    }
     return sorted(found.values(), key=lambda run: run["settings"]["seed"])
 
 
@@ -38,7 +40,7 @@ def seen(runs: list[dict[str, Any]], episodes: float) -> float | None:
 
 def row(task: str, method: str, runs: list[dict[str, Any]], hybrid: list[dict[str, Any]]) -> dict[str, Any]:
     """One row of the table: mean and spread over the seeds, and what the hybrid saw of the same task."""
-    from torchdlo.agents.trajopt.presets import PUBLISHED, preset
+    from torchdlo.agents.trajopt.presets import PUBLISHED, search_preset
 
     known = "cmaes" if method == "hybrid" else method
     goal, solved = PUBLISHED.get(task, {}).get(known, (None, None))
@@ -57,7 +59,7 @@ def row(task: str, method: str, runs: list[dict[str, Any]], hybrid: list[dict[st
         "hybrid": seen(hybrid, episodes),
         "published": goal,
         "published_success": solved,
-        "published_episodes": None if goal is None else preset(task, known).episodes,
+        "published_episodes": None if goal is None else search_preset(task, known).episodes,
         "success": statistics.mean(float(r["success"]) for r in runs),
         "episodes": episodes,
         "episodes_to_success": [r["episodes_to_success"] for r in runs],

@@ -29,8 +29,8 @@ from rival_table import table
 from scipy.signal import savgol_filter
 
 from torchdlo.sysid.diagnosis import effect_library
-from torchdlo.sysid.diagnosis.error_floor import gap, rms
-from torchdlo.sysid.diagnosis.search import diagnose
+from torchdlo.sysid.diagnosis.effect_search import diagnose
+from torchdlo.sysid.diagnosis.error_floor import gap_rms, trial_gaps
 from torchdlo.sysid.diagnosis.significance import RATE, benjamini_hochberg, sign_flips
 from torchdlo.sysid.diagnosis.verdict import Diagnosis
 from torchdlo.sysid.recordings.recording import Recording, Trial, load_recording
@@ -62,7 +62,7 @@ def bic(result: Diagnosis, recording: Recording) -> str | None:
     """Return the effect with the least BIC among the fits of the first round, None if that is no effect."""
     free = int((~recording.train[0].gripped).sum())
     n = sum(len(t.time) for t in recording.train) * free * 3
-    before = rms(gap([result.predictions["before"][t.name] for t in recording.train], recording.train)) ** 2
+    before = gap_rms(trial_gaps([result.predictions["before"][t.name] for t in recording.train], recording.train)) ** 2
     excess, scores = max(before - result.floor.noise**2, 0.0), {None: n * np.log(before)}
     for c in result.candidates[0] if result.candidates else ():
         if c.gain is not None:

@@ -24,7 +24,7 @@ from torchdlo.sysid.calibration.calibrate import calibrate
 from torchdlo.sysid.recordings.recording import load_recording
 from torchdlo.sysid.video.filming import film_recording
 from torchdlo.vision.camera import looking_at
-from torchdlo.vision.film import Look
+from torchdlo.vision.film import FilmLook
 
 HELD, ELEMENTS = 3, 61
 """Elements that a gripper holds, and all of a rope."""
@@ -116,7 +116,7 @@ def run_one(case: Case, recording: Path, folder: Path, seed: int) -> dict:
     rng = np.random.default_rng(seed)
     eye = [rng.uniform(-0.3, 0.3), -rng.uniform(1.1, 1.4), rng.uniform(0.9, 1.1)]
     camera = looking_at("a", eye, [0.0, 0.0, 0.9], focal=650.0)
-    look = Look(noise=4.0, bar=(0.46, 0.0, 0.49, 1.0), wrong=0.02, seed=seed)
+    look = FilmLook(noise=4.0, bar=(0.46, 0.0, 0.49, 1.0), wrong=0.02, seed=seed)
     shutil.rmtree(folder, ignore_errors=True)
     film_recording(load_recording(recording), [camera], folder, look, off=1.0)
     begun = time.process_time()

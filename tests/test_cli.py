@@ -16,7 +16,7 @@ import pytest
 from tests.fake_calibration import FakeFit
 from torchdlo.cli import app, identification
 from torchdlo.cli.progress import deferred_interrupt
-from torchdlo.files import replacing
+from torchdlo.files import replace_atomically
 
 WRITTEN = ["calibration.json", "model.json", "report.html", "report.png"]
 
@@ -239,6 +239,9 @@ def test_one_interrupt_stops_a_search_once_and_lets_the_rest_report() -> None:
 
 
 def test_a_full_disk_is_named_by_what_did_not_fit(tmp_path: Path) -> None:
-    with pytest.raises(OSError, match=r"No space left on device.*model\.json"), replacing(tmp_path / "model.json"):
+    with (
+        pytest.raises(OSError, match=r"No space left on device.*model\.json"),
+        replace_atomically(tmp_path / "model.json"),
+    ):
         raise OSError(28, "No space left on device")
     assert not list(tmp_path.iterdir())

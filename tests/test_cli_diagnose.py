@@ -10,7 +10,7 @@ import pytest
 from tests.report.fake_diagnosis import fake_diagnosis
 from tests.sysid.swaying import recording as swaying
 from tests.test_cli import run
-from torchdlo.sysid.diagnosis import search
+from torchdlo.sysid.diagnosis import effect_search
 from torchdlo.sysid.model.rope_model import RopeModel
 from torchdlo.sysid.recordings.data_quality import DataIssue
 from torchdlo.sysid.recordings.recording import save_recording
@@ -29,7 +29,7 @@ def test_diagnose_writes_findings_model_and_page(
 ) -> None:
     asked: dict[str, object] = {}
 
-    def fake(recording: object, **options: object) -> search.Diagnosis:
+    def fake(recording: object, **options: object) -> effect_search.Diagnosis:
         asked.update(options)
         options["journal"].mkdir(parents=True)
         model = RopeModel(recording, vertices=21, effects=("air_drag",))
@@ -37,7 +37,7 @@ def test_diagnose_writes_findings_model_and_page(
             recording, model=model, data_issues=[DataIssue("train_1", "swap", "markers 3 and 4 are swapped")]
         )
 
-    monkeypatch.setattr(search, "diagnose", fake)
+    monkeypatch.setattr(effect_search, "diagnose", fake)
     assert run("diagnose", "rope", "--seed", 3) == 0
     out = work / "runs" / "diagnose" / "rope"
     assert sorted(p.name for p in out.iterdir()) == ["findings.json", "model.json", "report.html"]
@@ -56,7 +56,7 @@ def test_a_stopped_search_says_how_to_go_on(
     def stopped(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(search, "diagnose", stopped)
+    monkeypatch.setattr(effect_search, "diagnose", stopped)
     assert run("diagnose", "rope", "--out", "a") == 130
     assert "interrupted; there was no verdict yet, and nothing was written" in capsys.readouterr().err
 

@@ -16,7 +16,7 @@ from torchdlo.errors import InputError
 from torchdlo.physics import tree
 from torchdlo.scene import rollout, step
 from torchdlo.scene_files import Attachment, BodySpec, Keyframe, RopeSpec, SceneDescription
-from torchdlo.scene_files.assembly import _rope
+from torchdlo.scene_files.scene_assembly import _rope
 
 LIFT = SceneDescription(
     ropes=(

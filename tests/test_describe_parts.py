@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from torchdlo import scene_files
-from torchdlo.coupling.robot.kinematics import panda, tool_pose
+from torchdlo.coupling.robot.robot_kinematics import panda, tool_pose
 from torchdlo.errors import InputError
 from torchdlo.scene import rollout, step
 from torchdlo.scene_files import (

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from torchdlo.scene import RigidBody, Rope, check_state, rollout, stationary_control, step, stepper
     from torchdlo.scene import make as make_scene
     from torchdlo.sysid.calibration.calibrate import calibrate
-    from torchdlo.sysid.diagnosis.search import diagnose
+    from torchdlo.sysid.diagnosis.effect_search import diagnose
     from torchdlo.sysid.experiment_design.design import design_experiment
     from torchdlo.sysid.recordings.recording import load_recording
 
@@ -38,7 +38,7 @@ __getattr__, __dir__ = lazy.attach(
         "make_env": "torchdlo.envs:make",
         "load_recording": "torchdlo.sysid.recordings.recording",
         "calibrate": "torchdlo.sysid.calibration.calibrate",
-        "diagnose": "torchdlo.sysid.diagnosis.search",
+        "diagnose": "torchdlo.sysid.diagnosis.effect_search",
         "design_experiment": "torchdlo.sysid.experiment_design.design",
         "agents": "torchdlo.agents:",
         "coupling": "torchdlo.coupling:",

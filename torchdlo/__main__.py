@@ -1,6 +1,6 @@
 """`python -m torchdlo`, the same as `torchdlo`."""
 
-from torchdlo.cli import main
+from torchdlo.cli.app import main
 
 if __name__ == "__main__":
     main()

@@ -19,20 +19,20 @@ from pathlib import Path
 
 from torchdlo import notices
 
-__all__ = ["folder", "is_sound", "keep_for_torch", "locked", "problem", "sealed", "wished"]
+__all__ = ["cache_folder", "file_lock", "is_sound", "keep_for_torch", "privacy_problem", "seal_file", "wanted_folder"]
 
 _OTHERS = stat.S_IWGRP | stat.S_IWOTH
 
 
-def folder() -> Path | None:
+def cache_folder() -> Path | None:
     """Return the private folder, which exists then; None, with one warning, where there can be none.
 
     It is `TORCHDLO_CACHE` if that is set, else `torchdlo` in `XDG_CACHE_HOME` or in `~/.cache`.
     """
-    return _private(wished())
+    return _private(wanted_folder())
 
 
-def wished() -> Path:
+def wanted_folder() -> Path:
     """Return where the folder is to be, private or not."""
     base = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
     return Path(os.environ.get("TORCHDLO_CACHE") or Path(base) / "torchdlo").expanduser()
@@ -40,12 +40,12 @@ def wished() -> Path:
 
 @functools.cache
 def _private(path: Path) -> Path | None:
-    wrong = problem(path)
+    wrong = privacy_problem(path)
     if not wrong:
         return path
     temporary = Path(tempfile.gettempdir())
     used = temporary / f"torchdlo-{os.getuid() if hasattr(os, 'getuid') else 'cache'}"
-    if problem(used):
+    if privacy_problem(used):
         try:
             used = Path(tempfile.mkdtemp(prefix="torchdlo-", dir=temporary))
         except OSError:
@@ -61,7 +61,7 @@ def _private(path: Path) -> Path | None:
     return used
 
 
-def problem(path: Path) -> str:
+def privacy_problem(path: Path) -> str:
     """Make a folder and return what keeps it from being private, "" if it is."""
     try:
         path.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -90,7 +90,7 @@ def _replaceable(path: Path) -> Path | None:
 
 
 @contextlib.contextmanager
-def locked(path: Path) -> Iterator[None]:
+def file_lock(path: Path) -> Iterator[None]:
     """Hold a lock that one process has at a time; a file system without locks has none."""
     handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
     try:
@@ -104,12 +104,12 @@ def locked(path: Path) -> Iterator[None]:
 
 
 def is_sound(path: Path) -> bool:
-    """Return whether a file is the user's own and holds what `sealed` saw."""
+    """Return whether a file is the user's own and holds what `seal_file` saw."""
     content, seal = _own(path), _own(_seal(path))
     return content is not None and seal is not None and seal == _hash(content)
 
 
-def sealed(fresh: Path, path: Path) -> None:
+def seal_file(fresh: Path, path: Path) -> None:
     """Move a finished file to its place in one go, with the hash of its content beside it."""
     fresh.chmod(0o700)
     mark = _seal(fresh)
@@ -124,7 +124,7 @@ def keep_for_torch() -> None:
 
     Torch's own choice is a folder among the temporary files that anybody can make beforehand.
     """
-    private = folder()
+    private = cache_folder()
     if private is not None:
         os.environ.setdefault("TORCHINDUCTOR_CACHE_DIR", str(private / "inductor"))
 

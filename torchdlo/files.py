@@ -11,11 +11,11 @@ from pathlib import Path
 from torchdlo.errors import InputError
 from torchdlo.untrusted.names import check_path
 
-__all__ = ["check_writable", "replacing", "write_atomically"]
+__all__ = ["check_writable", "replace_atomically", "write_atomically"]
 
 
 @contextlib.contextmanager
-def replacing(path: Path) -> Iterator[Path]:
+def replace_atomically(path: Path) -> Iterator[Path]:
     """Yield a temporary path beside `path`, and rename it to `path` if the block succeeds."""
     path.parent.mkdir(parents=True, exist_ok=True)
     # The name ends like the final one: writers such as numpy's choose the format by the suffix.
@@ -45,7 +45,7 @@ def _flush(path: Path) -> None:
 
 def write_atomically(path: Path, content: str | bytes) -> None:
     """Write `content` to `path` through a temporary file in the same folder."""
-    with replacing(path) as temporary:
+    with replace_atomically(path) as temporary:
         temporary.write_bytes(content.encode() if isinstance(content, str) else content)
 
 

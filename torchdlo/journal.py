@@ -36,7 +36,7 @@ _LARGEST = 2**31
 _BEGINNINGS = (b'{\n "generator": "torchdlo', b'{"generator": "torchdlo')
 """How marks begin, those of earlier versions too."""
 _STRAY = re.compile(r"\.[0-9a-f]{8}-(.+)", re.DOTALL)
-"""What `torchdlo.files.replacing` calls a file that is not complete."""
+"""What `torchdlo.files.replace_atomically` calls a file that is not complete."""
 
 
 # Records

@@ -17,14 +17,14 @@ from torch import Tensor
 from torchdlo import notices
 from torchdlo.coupling import start_overlaps
 from torchdlo.coupling.bodies import dynamics as rigid
-from torchdlo.coupling.bodies.dynamics import Body, BodyParams, BodyState, BodyTargets, RigidBody, place
+from torchdlo.coupling.bodies.dynamics import Body, BodyParams, BodyState, BodyTargets, RigidBody, place_bodies
 from torchdlo.coupling.common import step_diagnostics
 from torchdlo.coupling.common.step_diagnostics import broad_phase
 from torchdlo.coupling.mpm import body_coupling_effect, rod_coupling_effect
 from torchdlo.coupling.mpm import substep as mpm
 from torchdlo.coupling.mpm.particles import MpmDomain, ParticleParams, Particles, laid_out
 from torchdlo.physics import tree
-from torchdlo.physics.effects.base import Effect, altered, default_values, parameters_of
+from torchdlo.physics.effects.base import Effect, altered_params, default_values, parameters_of
 from torchdlo.physics.execution import tracing
 from torchdlo.physics.execution.gradient_check import GradientCheck, check_gradients
 from torchdlo.physics.execution.replay import alike, rollout
@@ -229,15 +229,15 @@ def make(
             only evaluated may be anything.
         choices: fields of `Scene`.
     """
-    validation.listed(effects, Effect, "effects")
+    validation.check_sequence(effects, Effect, "effects")
     topology, rods, state = assembly.assemble(ropes)
-    kinds, solid, placed = place(bodies, state.pos) if bodies else ((), (), ())
+    kinds, solid, placed = place_bodies(bodies, state.pos) if bodies else ((), (), ())
     if bodies:
         batch = torch.broadcast_shapes(state.pos.shape[:-2], placed.pos.shape[:-2])
         state, placed = tree.map(lambda x: tree.batch_innermost(x.expand(*batch, *x.shape[-2:])), (state, placed))
     medium, stuff, particles = material_points or (None, (), ())
     if material_points:
-        state, placed, particles = rod_coupling_effect.together(state, placed, particles)
+        state, placed, particles = rod_coupling_effect.expand_batches(state, placed, particles)
     effects = rod_coupling_effect.fitted(effects, medium, rods)
     scene = Scene(topology, effects, bodies=kinds, material_points=medium, **choices)
     numbers = parameters_of(effects, values or {}, state.pos)
@@ -251,7 +251,7 @@ def make(
         state = start_overlaps.part(
             topology,
             effects,
-            altered(scene.effects, topology, rods, numbers),
+            altered_params(scene.effects, topology, rods, numbers),
             state,
             (kinds, solid, placed) if bodies else None,
             scene.prescribed_vertices,
@@ -268,7 +268,7 @@ def make(
     )
     if scene.twist == "quasistatic":
         held = stationary_control(scene, first)
-        changed = altered(scene.effects, topology, rods, numbers)
+        changed = altered_params(scene.effects, topology, rods, numbers)
         settled, _ = settle_twist(scene.settings, changed, numbers, state, Targets(held.pos, held.director), 30)
         first = tree.replace(first, rods=tree.replace(settled, twist_rate=torch.zeros_like(settled.twist)))
     # No two leaves share memory: steps are compiled for which of them do, and later states have none.
@@ -361,7 +361,7 @@ def advance(scene: Scene, params: Params, state: State, start: Control, control:
     mean = tree.map(lambda old, now: torch.where(later, old, 0.0) + now / scene.substeps, state.reaction, reaction)
     missed = step_diagnostics.missed(scene, params, rods, state.diagnostics, push.unsolved)
     push = body_coupling_effect.couple_bodies_to_particles(scene.effects, body, pool, push)
-    moved, particles = rigid.advance(body, poses, push) if scene.bodies else (), ()
+    moved, particles = rigid.advance_bodies(body, poses, push) if scene.bodies else (), ()
     if scene.material_points:
         particles, missed = rod_coupling_effect.finish(
             scene.material_points, params.material_points, pool, push, settings.dt, missed
@@ -415,7 +415,7 @@ def stepper(scene: Scene, *, compiled: bool = True, recorded: bool = False):
     Compiled steps need a C++ compiler; without one they are not compiled, with one warning.
     """
     if not compiled or not native.prepare_torch_compile():
-        return tracing.Recorded(partial(step, scene)) if recorded else partial(step, scene)
+        return tracing.RecordedStep(partial(step, scene)) if recorded else partial(step, scene)
     compile = partial(torch.compile, fullgraph=True, dynamic=False, isolate_recompiles=True)
     once = scene.substeps == 1 and not any(e.is_contact for e in scene.effects)
 
@@ -463,9 +463,8 @@ def ok(state: State) -> Tensor:
 def check_state(state: State) -> None:
     """Raise a `RuntimeError` that says what went wrong, if something did."""
     if not bool(ok(state).all()):
-        raise RuntimeError(
-            f"scene: {step_diagnostics.explain(state.diagnostics) or 'positions or velocities are not finite'}"
-        )
+        said = step_diagnostics.explain_diagnostics(state.diagnostics) or "positions or velocities are not finite"
+        raise RuntimeError(f"scene: {said}")
 
 
 __all__ = [

@@ -18,9 +18,9 @@ from lead import Lead
 
 from torchdlo import envs
 from torchdlo.agents import deployment
-from torchdlo.agents.deployment import JointMotion, arms_of, played, replayed, text, timed
+from torchdlo.agents.deployment import JointMotion, arms_of, motion_text, play_motion, replay_joints, time_scale
 from torchdlo.cli import app
-from torchdlo.coupling.robot.kinematics import panda, tool_pose
+from torchdlo.coupling.robot.robot_kinematics import panda, tool_pose
 from torchdlo.errors import InputError
 
 HERE = torch.zeros(1, 1, 3)
@@ -34,13 +34,13 @@ def actions() -> torch.Tensor:
 
 @pytest.fixture(scope="module")
 def path() -> dict[str, torch.Tensor]:
-    found, good = played(Lead(), actions(), HERE)
+    found, good = play_motion(Lead(), actions(), HERE)
     assert good
     return found
 
 
 def test_joints_bring_the_tool_along_the_path(path):
-    motion = timed(Lead(), arms_of(Lead()), path, same=True)
+    motion = time_scale(Lead(), arms_of(Lead()), path, same=True)
     assert motion.position.shape == (7, 7)
     full = torch.cat([motion.position, torch.zeros(7, 1, dtype=torch.float64)], -1)
     tool = tool_pose(panda(base=Lead.arms.base[0]), full).pos
@@ -51,7 +51,7 @@ def test_joints_bring_the_tool_along_the_path(path):
 def test_speeds_and_accelerations_stay_within_their_limits(path):
     robots = arms_of(Lead())
     limit = robots[0].velocity[robots[0].arm]
-    motion = timed(Lead(), robots, path, same=True, share=0.5, acceleration=10.0)
+    motion = time_scale(Lead(), robots, path, same=True, share=0.5, acceleration=10.0)
     # 4 mm in 2 ms is far too fast for an arm.
     assert motion.slower > 1
     steps = motion.position.diff(dim=0) / motion.time.diff()[:, None]
@@ -73,12 +73,12 @@ def test_velocities_are_central_differences():
 def test_joints_beyond_their_limits_are_named(path):
     wrong = path | {"joints": path["joints"] + torch.tensor([0.0, 0, 0, 5.0, 0, 0, 0, 0])}
     with pytest.raises(InputError, match=r"joint .*4.* would be .* beyond its limit at point"):
-        timed(Lead(), arms_of(Lead()), wrong, same=True)
+        time_scale(Lead(), arms_of(Lead()), wrong, same=True)
 
 
 def test_another_arm_follows_the_tools_path(path):
     """The same arm, but found by inverse kinematics alone."""
-    motion = timed(Lead(), arms_of(Lead()), path, same=False)
+    motion = time_scale(Lead(), arms_of(Lead()), path, same=False)
     full = torch.cat([motion.position, torch.zeros(7, 1, dtype=torch.float64)], -1)
     tool = tool_pose(panda(base=Lead.arms.base[0]), full).pos
     torch.testing.assert_close(tool, path["pos"][:, 0], atol=1e-3, rtol=0)
@@ -87,24 +87,24 @@ def test_another_arm_follows_the_tools_path(path):
 def test_a_path_out_of_reach_is_refused(path):
     far = path | {"pos": path["pos"] + 3}
     with pytest.raises(InputError, match="cannot get to point 0"):
-        timed(Lead(), arms_of(Lead()), far, same=False)
+        time_scale(Lead(), arms_of(Lead()), far, same=False)
 
 
 def test_the_simulator_plays_what_was_written(path):
-    motion = timed(Lead(), arms_of(Lead()), path, same=True)
-    assert replayed(Lead(), arms_of(Lead()), motion.position, HERE)
-    assert not replayed(Lead(), arms_of(Lead()), motion.position[:1].expand(7, -1), HERE)
+    motion = time_scale(Lead(), arms_of(Lead()), path, same=True)
+    assert replay_joints(Lead(), arms_of(Lead()), motion.position, HERE)
+    assert not replay_joints(Lead(), arms_of(Lead()), motion.position[:1].expand(7, -1), HERE)
 
 
 def test_files_say_the_same():
     time = torch.tensor([0.0, 1.25], dtype=torch.float64)
     numbers = [torch.tensor([[a], [b]], dtype=torch.float64) for a, b in ((0.1, 0.2), (0.0, 0.5), (0.3, -0.3))]
     motion = JointMotion(("elbow",), time, *numbers, 2.0)
-    rows = list(csv.DictReader(text(motion, "csv", {}).splitlines()))
+    rows = list(csv.DictReader(motion_text(motion, "csv", {}).splitlines()))
     assert rows[1] == {"time": "1.25", "elbow": "0.2", "elbow_velocity": "0.5"}
-    plain = json.loads(text(motion, "json", {"task": "lead"}))
+    plain = json.loads(motion_text(motion, "json", {"task": "lead"}))
     assert (plain["task"], plain["joints"], plain["position"]) == ("lead", ["elbow"], [[0.1], [0.2]])
-    ros = json.loads(text(motion, "ros2", {}))
+    ros = json.loads(motion_text(motion, "ros2", {}))
     assert ros["joint_names"] == ["elbow"]
     assert ros["points"][1]["time_from_start"] == {"sec": 1, "nanosec": 250_000_000}
     assert ros["points"][1]["velocities"] == [0.5]

@@ -12,8 +12,8 @@ import torch
 from tests.agents.problems import Push, SurrogateRound
 from torchdlo.agents.trajopt.gradient_descent import descent
 from torchdlo.agents.trajopt.proposals import SearchPlan, Told
-from torchdlo.agents.trajopt.result import result_json
 from torchdlo.agents.trajopt.search import SearchSettings, optimize
+from torchdlo.agents.trajopt.search_result import result_json
 from torchdlo.errors import InputError
 
 pytestmark = pytest.mark.quick

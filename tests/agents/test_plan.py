@@ -10,7 +10,7 @@ import torch
 from tests.agents.problems import Plain, judged
 from torchdlo.agents.trajopt.proposals import circular_proposals, drag_proposals
 from torchdlo.agents.trajopt.search import SearchSettings, optimize
-from torchdlo.agents.trajopt.task_problem import problem
+from torchdlo.agents.trajopt.task_problem import task_problem
 
 pytestmark = pytest.mark.quick
 
@@ -95,13 +95,13 @@ def test_a_hybrid_goes_round_what_it_is_told_of(touch):
 
 
 def test_tasks_say_where_their_bodies_and_matter_are_but_not_where_the_floor_is():
-    assert problem("unknotting").touch == ()
-    (cone,) = problem("coiling").touch
+    assert task_problem("unknotting").touch == ()
+    (cone,) = task_problem("coiling").touch
     assert cone == pytest.approx((0.58, -0.265, 0.063))
-    lifting, gathering = problem("lifting").touch, problem("gathering").touch
+    lifting, gathering = task_problem("lifting").touch, task_problem("gathering").touch
     assert len(lifting) == 2 and len(gathering) == 3
-    assert problem("coiling").tools == ((0.0, 0.0, 0.0),)
-    left, right = problem("gathering").tools
+    assert task_problem("coiling").tools == ((0.0, 0.0, 0.0),)
+    left, right = task_problem("gathering").tools
     assert left == pytest.approx((-0.42, 0.0, 0.0)) and right == pytest.approx((0.42, 0.0, 0.0))
     # The middle of the ball is given last.
     assert gathering[-1] == pytest.approx((0.25 - 0.29, 0.02 - 0.1, 0.07 - 0.012), abs=2e-3)

@@ -19,9 +19,9 @@ from torch import Tensor
 
 from tests.agents.problems import Push, signature
 from torchdlo.agents.trajopt.problem import Evaluation
-from torchdlo.agents.trajopt.result import result_json, trajectory_json
 from torchdlo.agents.trajopt.search import METHODS, Robust, SearchResult, SearchSettings, optimize
-from torchdlo.agents.trajopt.search_journal import _code, program, remove
+from torchdlo.agents.trajopt.search_journal import _code, program_hash, remove_journal
+from torchdlo.agents.trajopt.search_result import result_json, trajectory_json
 from torchdlo.errors import InputError
 
 SETTINGS = SearchSettings(episodes=96, population=8, hold=5, chunk=5)
@@ -58,7 +58,7 @@ def test_a_killed_search_ends_as_one_that_was_not(method: str, tmp_path: Path) -
             optimize(Stopping(after), settings, journal=tmp_path / "j", resume=after > 3)
     found = optimize(Push(), settings, journal=tmp_path / "j", resume=True)
     assert files(found, settings) == files(whole, settings)
-    remove(tmp_path / "j")
+    remove_journal(tmp_path / "j")
     assert not (tmp_path / "j").exists()
 
 
@@ -163,12 +163,14 @@ def test_only_the_same_search_goes_on(tmp_path: Path, monkeypatch: pytest.Monkey
         journal, replace(SETTINGS, method="gd", population=4)
     )
     with monkeypatch.context() as patch:
-        patch.setattr("torchdlo.agents.trajopt.search_journal.program", lambda _: "another")
+        patch.setattr("torchdlo.agents.trajopt.search_journal.program_hash", lambda _: "another")
         assert "another version of torchdlo" in refused(journal)
 
 
 def test_results_depend_on_the_code_of_their_own_task_only() -> None:
-    assert len({program("coiling"), program("wrapping"), program("push")}) == 3 and program("push") == program("reach")
+    assert len({program_hash("coiling"), program_hash("wrapping"), program_hash("push")}) == 3 and program_hash(
+        "push"
+    ) == program_hash("reach")
 
 
 def test_results_depend_on_what_runs_not_on_comments(tmp_path: Path) -> None:

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from tests.agents.problems import Drag, Peaks, Plain, Push, Reach, SurrogateRound, signature
 from torchdlo.agents.trajopt.problem import Evaluation
-from torchdlo.agents.trajopt.proposals import ranking
+from torchdlo.agents.trajopt.proposals import rank_proposals
 from torchdlo.agents.trajopt.search import METHODS, Robust, SearchResult, SearchSettings, optimize
 from torchdlo.errors import InputError
 
@@ -210,9 +210,9 @@ def test_a_search_begins_with_a_rehearsal(method: str) -> None:
 def test_trajectories_are_ranked_by_return_and_then_by_loss() -> None:
     returns = torch.tensor([1.0, 2.0, 2.00001, -torch.inf, 2.1, 2.0], dtype=torch.float64)
     loss = torch.tensor([-9.0, 0.3, 0.4, torch.inf, 7.0, 0.1], dtype=torch.float64)
-    assert ranking(returns, loss).tolist() == [4, 5, 1, 2, 0, 3]
-    assert ranking(torch.zeros(3), torch.tensor([2.0, torch.inf, 1.0])).tolist() == [2, 0, 1]
-    assert ranking(torch.full((2,), -torch.inf), torch.full((2,), torch.inf)).tolist() == [0, 1]
+    assert rank_proposals(returns, loss).tolist() == [4, 5, 1, 2, 0, 3]
+    assert rank_proposals(torch.zeros(3), torch.tensor([2.0, torch.inf, 1.0])).tolist() == [2, 0, 1]
+    assert rank_proposals(torch.full((2,), -torch.inf), torch.full((2,), torch.inf)).tolist() == [0, 1]
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from torchdlo.agents.trajopt.stored import ARCHIVE, load_trajectory, pack, read_index, read_searches, unpack
+from torchdlo.agents.trajopt.stored import (
+    ARCHIVE,
+    load_trajectory,
+    pack_searches,
+    read_index,
+    read_searches,
+    unpack_searches,
+)
 from torchdlo.errors import InputError
 
 OLD_RESULT = {
@@ -38,7 +45,7 @@ def written(folder: Path) -> dict:
 
 def test_an_archive_gives_back_every_bit_under_the_names_of_today(tmp_path: Path) -> None:
     trajectory = written(tmp_path / "had")
-    assert pack(tmp_path / "had", tmp_path / "a.npz") == 1
+    assert pack_searches(tmp_path / "had", tmp_path / "a.npz") == 1
     ((name, result, kept),) = read_searches(tmp_path / "a.npz")
     assert name == "separation-cmaes-2"
     assert result["search_return"] == result["max_return"] == 94.7850341796875 and result["episodes_to_success"] == 60
@@ -46,7 +53,7 @@ def test_an_archive_gives_back_every_bit_under_the_names_of_today(tmp_path: Path
     assert result["curve"] == [{"episodes": 60, "best": None, "without_gradient": 3, "surrogate": True}]
     assert not {"searched", "highest", "solved_after"} & set(result)
     assert kept["actions"].tolist() == trajectory["actions"] and kept["rewards"].dtype == np.float64
-    unpack(tmp_path / "a.npz", tmp_path / "out")
+    unpack_searches(tmp_path / "a.npz", tmp_path / "out")
     assert json.loads((tmp_path / "out" / name / "trajectory.json").read_text()) == trajectory
     assert json.loads((tmp_path / "out" / name / "result.json").read_text()) == result
 

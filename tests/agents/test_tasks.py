@@ -12,12 +12,12 @@ import torch
 from torch import Tensor
 
 from torchdlo import envs
-from torchdlo.agents.trajopt.presets import PUBLISHED, preset
-from torchdlo.agents.trajopt.result import load_actions
+from torchdlo.agents.trajopt.presets import PUBLISHED, search_preset
 from torchdlo.agents.trajopt.search import METHODS, Robust
-from torchdlo.agents.trajopt.task_problem import TaskProblem, problem
+from torchdlo.agents.trajopt.search_result import load_actions
+from torchdlo.agents.trajopt.task_problem import TaskProblem, task_problem
 from torchdlo.cli import app
-from torchdlo.coupling.robot.kinematics import panda, tool_pose
+from torchdlo.coupling.robot.robot_kinematics import panda, tool_pose
 from torchdlo.envs.core.task import RADIUS, Arms, Task, TaskState, make, straight
 from torchdlo.errors import InputError
 from torchdlo.scene import Params, Rope, Scene, State
@@ -178,15 +178,15 @@ def test_trajectories_of_other_tasks_are_refused(lead: TaskProblem, tmp_path: Pa
 
 
 def test_presets_are_the_published_settings() -> None:
-    assert preset("lifting", "cmaes").sigma == 0.005 and preset("lifting", "gd").rate == 1e-4
-    assert preset("coiling", "cmaes").episodes // preset("coiling", "cmaes").population == 50
+    assert search_preset("lifting", "cmaes").sigma == 0.005 and search_preset("lifting", "gd").rate == 1e-4
+    assert search_preset("coiling", "cmaes").episodes // search_preset("coiling", "cmaes").population == 50
     # Small budgets leave room for as many iterations.
-    sizes = {m: [preset("coiling", m, episodes=n).population for n in (2000, 500, 100)] for m in METHODS}
+    sizes = {m: [search_preset("coiling", m, episodes=n).population for n in (2000, 500, 100)] for m in METHODS}
     assert sizes == {"cmaes": [40, 20, 20], "gd": [16, 10, 4], "hybrid": [40, 12, 12]}
-    assert preset("coiling", "cmaes", episodes=20_000, robust=Robust(copies=8)).population == 50
-    assert preset("coiling", "hybrid", episodes=2000, population=7).population == 7
-    assert preset("coiling", "cmaes", seed=None, episodes=7).episodes == 7
-    plan = preset("coiling", "cmaes").plan(problem("coiling"))
+    assert search_preset("coiling", "cmaes", episodes=20_000, robust=Robust(copies=8)).population == 50
+    assert search_preset("coiling", "hybrid", episodes=2000, population=7).population == 7
+    assert search_preset("coiling", "cmaes", seed=None, episodes=7).episodes == 7
+    plan = search_preset("coiling", "cmaes").plan(task_problem("coiling"))
     assert plan.encoding(plan.hold).knots == 10 and plan.encoding(plan.hold).reach == pytest.approx(0.1)
     assert plan.rate == 1e-3 and plan.last == pytest.approx(1e-6)
     assert all(row["cmaes"][0] >= row["gd"][0] for name, row in PUBLISHED.items() if name != "separation")

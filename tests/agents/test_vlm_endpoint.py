@@ -14,7 +14,7 @@ from pydantic import BaseModel, ConfigDict
 
 from tests.agents import vlm_server
 from tests.agents.vlm_server import Server, completion
-from torchdlo.agents.vlm.conversation import Budget, Conversation, Picture, Question
+from torchdlo.agents.vlm.conversation import Conversation, ConversationBudget, Question, ShownPicture
 from torchdlo.agents.vlm.endpoint import Endpoint
 from torchdlo.agents.vlm.recorded import load_recorded
 from torchdlo.errors import InputError
@@ -27,7 +27,7 @@ class Answer(BaseModel):
     vertex: int
 
 
-PICTURE = Picture("the scene", b"\x89PNG torchdlo")
+PICTURE = ShownPicture("the scene", b"\x89PNG torchdlo")
 QUESTION = Question("grasps", "You are asked.", "Which vertex?", (PICTURE,), Answer)
 
 
@@ -49,7 +49,7 @@ def small(answer: Answer) -> int:
 def asked(server: Server, folder: Path | None = None, resume: bool = False, **choices: Any) -> tuple[int, Conversation]:
     """What a conversation of one question comes to."""
     given = {"seconds": 1.0, "retries": 2, "sleep": lambda _: None} | choices
-    talk = Conversation(Endpoint(server.url, "m", **given), folder, Budget(calls=6), resume)
+    talk = Conversation(Endpoint(server.url, "m", **given), folder, ConversationBudget(calls=6), resume)
     return talk.ask(QUESTION, small), talk
 
 
@@ -187,14 +187,14 @@ def test_the_budget_ends_a_run_that_can_go_on(server: Server, tmp_path: Path) ->
     server.say({"vertex": 1})
     endpoint = Endpoint(server.url, "m", sleep=lambda _: None)
     with pytest.raises(InputError, match="the budget of 2 calls"):
-        Conversation(endpoint, tmp_path, Budget(calls=2)).ask(QUESTION, small)
+        Conversation(endpoint, tmp_path, ConversationBudget(calls=2)).ask(QUESTION, small)
     with pytest.raises(InputError, match="4 tries"):
-        Conversation(endpoint, tmp_path, Budget(calls=9), resume=True).ask(QUESTION, small)
+        Conversation(endpoint, tmp_path, ConversationBudget(calls=9), resume=True).ask(QUESTION, small)
     # What was said before was not asked again: four answers in all.
     assert len(server.requests) == 4
     server.answers[:] = server.answers[:1]
     with pytest.raises(InputError, match="and 150 tokens"):
-        Conversation(endpoint, None, Budget(tokens=150)).ask(QUESTION, small)
+        Conversation(endpoint, None, ConversationBudget(tokens=150)).ask(QUESTION, small)
 
 
 def test_what_was_said_is_kept_and_replayed(server: Server, tmp_path: Path) -> None:

@@ -13,17 +13,17 @@ import torch
 
 from torchdlo import envs
 from torchdlo.agents.vlm.conversation import Conversation, Question, Reply
-from torchdlo.agents.vlm.geometry import Geometry, chosen
+from torchdlo.agents.vlm.geometry import Geometry, geometric_grasps
 from torchdlo.agents.vlm.grasp_proposal import (
     Places,
     check_grasps,
     load_grasps,
-    offered,
+    offered_vertices,
     places_of,
-    propose,
+    propose_grasps,
     random_grasps,
 )
-from torchdlo.agents.vlm.schema import MODES
+from torchdlo.agents.vlm.plan_schema import MODES
 from torchdlo.cli import app
 from torchdlo.errors import InputError
 
@@ -69,7 +69,7 @@ def places() -> Places:
 def said(places: Places, mode: str, *answers: Any, hidden: Sequence[int] = ()) -> tuple[Any, Says, Flat]:
     """What comes of answers."""
     model, view = Says(*({"grasps": a} for a in answers)), Flat(places, hidden)
-    return propose(places.task, mode, Conversation(model), view, places=places), model, view
+    return propose_grasps(places.task, mode, Conversation(model), view, places=places), model, view
 
 
 def test_each_mode_means_the_same_vertices(places: Places) -> None:
@@ -100,7 +100,7 @@ def test_hidden_vertices_are_not_offered(places: Places) -> None:
 def test_marks_do_not_cover_each_other(places: Places) -> None:
     view = Flat(places)
     view.pixels = 0.1 * view.pixels
-    slots = offered(places, view)
+    slots = offered_vertices(places, view)
     apart = torch.cdist(view.pixels[slots], view.pixels[slots]) + 1e3 * torch.eye(len(slots))
     assert 1 < len(slots) < 15 and float(apart.min()) >= 26
 
@@ -139,10 +139,10 @@ def test_a_hand_may_stay_open(places: Places) -> None:
 @pytest.mark.parametrize("name", envs.TASKS)
 def test_the_stand_in_proposes_what_can_be(name: str) -> None:
     found = places_of(envs.find(name))
-    grasps = check_grasps(found, chosen(found))
+    grasps = check_grasps(found, geometric_grasps(found))
     assert any(g is not None for g in grasps)
     for mode in MODES:
-        given = propose(found.task, mode, Conversation(Geometry()), Flat(found), places=found)
+        given = propose_grasps(found.task, mode, Conversation(Geometry()), Flat(found), places=found)
         assert given.source == "geometry, no model"
         far = [abs(a - b) for a, b in zip(given.grasps, grasps, strict=True) if a is not None and b is not None]
         assert max(far) <= 1
@@ -150,11 +150,11 @@ def test_the_stand_in_proposes_what_can_be(name: str) -> None:
 
 def test_the_stand_in_sees_what_the_tasks_ask_for() -> None:
     # Crossings, a pair about the rings, a loop opened as wide as the posts stand, and an end to thread.
-    assert chosen(places_of(envs.find("unknotting"))) == (2, 37)
-    a, b = chosen(places_of(envs.find("lifting")))
+    assert geometric_grasps(places_of(envs.find("unknotting"))) == (2, 37)
+    a, b = geometric_grasps(places_of(envs.find("lifting")))
     assert abs(a - 4) <= 1 and abs(b - 25) <= 1
-    assert chosen(places_of(envs.find("wrapping"))) == (17, 33)
-    assert chosen(places_of(envs.find("wiring_ring"))) == (2, None)
+    assert geometric_grasps(places_of(envs.find("wrapping"))) == (17, 33)
+    assert geometric_grasps(places_of(envs.find("wiring_ring"))) == (2, None)
 
 
 def test_random_grasps_can_be_and_follow_their_seed(places: Places) -> None:
@@ -189,7 +189,7 @@ def test_texts_from_a_scene_do_not_end_the_data(places: Places) -> None:
         name = "odd"
 
     model, view = Says({"grasps": {"robot_1": 4, "robot_2": 25}}), Flat(places)
-    propose(Odd(), "candidate", Conversation(model), view, places=dataclasses.replace(places, task=Odd()))
+    propose_grasps(Odd(), "candidate", Conversation(model), view, places=dataclasses.replace(places, task=Odd()))
     text = model.heard[0][1]["text"]
     assert text.count("</data>") == 1 and text.count("<data>") == 1
 

@@ -19,8 +19,8 @@ from torchdlo.agents.trajopt.task_problem import TaskProblem
 from torchdlo.agents.vlm.conversation import Conversation
 from torchdlo.agents.vlm.decomposition import Options, Result, carry_out
 from torchdlo.agents.vlm.geometry import Geometry
-from torchdlo.agents.vlm.recorded import Recorded, load_recorded
-from torchdlo.agents.vlm.schema import step_models
+from torchdlo.agents.vlm.plan_schema import step_models
+from torchdlo.agents.vlm.recorded import RecordedConversation, load_recorded
 from torchdlo.cli import app
 from torchdlo.envs import Task
 from torchdlo.envs.core.task import RADIUS, Arms, TaskState, make, straight
@@ -69,12 +69,12 @@ def step(number: int, to: float, hold: Sequence[int | None] = (1, None), success
     }
 
 
-def answers(*rows: tuple[str, Any]) -> Recorded:
+def answers(*rows: tuple[str, Any]) -> RecordedConversation:
     """A conversation that somebody wrote."""
     kept = [
         {"kind": k, "text": r if isinstance(r, str) else json.dumps(r), "sha256": None, "tokens": 0} for k, r in rows
     ]
-    return Recorded(f"recorded: {HAND}", kept, "here")
+    return RecordedConversation(f"recorded: {HAND}", kept, "here")
 
 
 CHEAP = {"method": "cmaes", "episodes": 4, "population": 4, "recorded": False}
@@ -246,13 +246,13 @@ def test_the_stand_in_has_a_plan_for_every_task(name: str) -> None:
     from torchdlo.agents.vlm.geometry import _step
     from torchdlo.agents.vlm.grasp_proposal import check_grasps, places_of
     from torchdlo.envs.core import scene_names
-    from torchdlo.envs.core.subtask import opening, rewarded
+    from torchdlo.envs.core.subtask import opening, with_reward
     from torchdlo.reward_language import reward
 
     task = envs.find(name)
     places, (here, seen) = places_of(task), opening(task)
-    made = _step(places, scene_names.named(task, here, seen))
-    rewarded(task, reward(made["reward"], made["success"]))
+    made = _step(places, scene_names.named_values(task, here, seen))
+    with_reward(task, reward(made["reward"], made["success"]))
     check_grasps(places, list(made["grasps"].values()))
 
 

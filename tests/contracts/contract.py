@@ -124,7 +124,7 @@ def respond(made, params, state, values=None) -> dict[str, torch.Tensor]:
     altered = one.modify_material(made.topology, params.rods, values)
     state = remembering(made, params, state, values)
     view = rod.view(made.topology, altered, state.rods, made.dt)
-    found = dict(effect.total([one], view, {one.name: values}))
+    found = dict(effect.total_loads([one], view, {one.name: values}))
     flow = one.plastic_flow(view, values)
     if flow is not None:
         found["flow"] = flow

@@ -11,7 +11,7 @@ from contract import ACTIVE, F64, INSTANCES, default_values, respond, ropes, sce
 
 from torchdlo.physics import tree
 from torchdlo.physics.effects import EFFECTS
-from torchdlo.physics.effects.base import KINDS, LOADS, Effect, altered, observed
+from torchdlo.physics.effects.base import KINDS, LOADS, Effect, altered_params, observed_markers
 from torchdlo.physics.linalg import rotation
 from torchdlo.physics.rod import kinematics as rod
 from torchdlo.scene import Rope, make, stationary_control, step
@@ -303,8 +303,8 @@ def test_effects_that_alter_the_same_number_compose_in_any_order():
     made, params, _ = scene("bend_frame")
     effects = [INSTANCES.get(n) or EFFECTS[n]() for n in names]
     values = {n: scene(n)[1].effects[n] for n in names}
-    one = altered(effects, made.topology, params.rods, values)
-    other = altered(effects[::-1], made.topology, params.rods, values)
+    one = altered_params(effects, made.topology, params.rods, values)
+    other = altered_params(effects[::-1], made.topology, params.rods, values)
     for a, b, before in zip(tree.leaves(one), tree.leaves(other), tree.leaves(params.rods), strict=True):
         assert torch.allclose(a, b, rtol=1e-13, atol=0.0)
         assert a.shape == before.shape or a.shape[-1] == 3
@@ -317,7 +317,7 @@ def test_delay_applies_to_offset_markers_in_any_order():
     seen = track(rod.view(made.topology, params.rods, state.rods, made.dt))
     effects = [EFFECTS[n]() for n in ("time_delay", "marker_offset")]
     values = {n: scene(n)[1].effects[n] for n in ("time_delay", "marker_offset")}
-    one, other = observed(effects, seen, values), observed(effects[::-1], seen, values)
+    one, other = observed_markers(effects, seen, values), observed_markers(effects[::-1], seen, values)
     assert torch.equal(one, other)
     beside = tree.replace(seen, pos=effects[1].observe(seen, values["marker_offset"]))
     assert torch.equal(one, effects[0].observe(beside, values["time_delay"]))

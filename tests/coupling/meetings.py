@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from material_points import DOUBLE, ONE, ball
 
-from torchdlo.coupling.bodies.dynamics import RigidBody, place, predict_free_motion, stationary_control
+from torchdlo.coupling.bodies.dynamics import RigidBody, place_bodies, predict_free_motion, stationary_control
 from torchdlo.coupling.mpm import substep as mpm
 from torchdlo.coupling.mpm.body_coupling_effect import exchange
 from torchdlo.coupling.mpm.constitutive_models import Elastic
@@ -54,7 +54,7 @@ def meeting(names, effect, mu=0.4):
                 **bulk,
             )
         )
-    bodies, params, placed = place(solids, state.pos)
+    bodies, params, placed = place_bodies(solids, state.pos)
     motion = predict_free_motion(bodies, params, placed, stationary_control(bodies, placed), 0.0, 0 * ONE, 2e-4)
     nodes, _ = mpm.to_grid(medium, material_points, state, 0 * ONE, 2e-4, ONE)
     impulse, torque, after, lost = exchange(effect, medium.grid, nodes, motion, (2,))

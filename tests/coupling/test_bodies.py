@@ -26,14 +26,14 @@ NONE = torch.zeros(1, 3, dtype=F64)
 
 def fly(solids: list[RigidBody], time: float, dt: float, gravity: float = 0.0):
     """States of bodies under gravity alone, one per substep."""
-    kinds, params, state = bodies.place(solids, NONE)
+    kinds, params, state = bodies.place_bodies(solids, NONE)
     targets, seen = bodies.stationary_control(kinds, state), [state]
     for k in range(round(time / dt)):
         first = torch.tensor([[float(k == 0)]], dtype=F64)
         motion = bodies.predict_free_motion(
             kinds, params, state, targets, NONE.new_tensor([[0, 0, -gravity]]), first, dt
         )
-        state = bodies.advance(motion, targets, ContactForces(NONE, NONE, NONE))
+        state = bodies.advance_bodies(motion, targets, ContactForces(NONE, NONE, NONE))
         seen.append(state)
     return params, seen
 

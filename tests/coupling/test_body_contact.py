@@ -11,7 +11,7 @@ import torch
 from tests.coupling.tumbling import F64, SHAPES, G, energy, ground, momenta, move, run
 from torchdlo.coupling.bodies import contact_op
 from torchdlo.coupling.bodies.contact_effect import BodyContact
-from torchdlo.coupling.bodies.dynamics import RigidBody, place
+from torchdlo.coupling.bodies.dynamics import RigidBody, place_bodies
 from torchdlo.physics import tree
 
 R = 0.05
@@ -174,7 +174,7 @@ def test_gradients_of_200_steps_agree_with_differences() -> None:
         RigidBody("sphere", 0.04, (0.12, 0.02, 0.01), mass=0.4, restitution=0.7),
     ]
     like = torch.zeros(1, dtype=F64)
-    kinds, params, state = place(bodies, like)
+    kinds, params, state = place_bodies(bodies, like)
     contact = BodyContact(pairs=((0, 1), (2, 3)))
     gravity = like.new_tensor([[0.0, 0.0, -G]])
 
@@ -210,11 +210,11 @@ def test_gradients_know_that_bodies_at_rest_are_held_by_friction(shape: str, ker
     size = SHAPES[shape]
     height = {"box": 0.03, "cylinder": 0.05, "sphere": 0.05}[shape]
     rub = {"mu_s": 0.6, "mu_k": 0.6, "density": 120.0}
-    kinds, params, state = place(
+    kinds, params, state = place_bodies(
         [ground(**rub), RigidBody(shape, size, (0.0, 0.0, height), **rub)], torch.zeros(1, dtype=F64)
     )
     if not kernel:
-        monkeypatch.setattr(contact_op, "fits", lambda _: False)
+        monkeypatch.setattr(contact_op, "kernel_fits", lambda _: False)
     gravity = torch.tensor([[0.0, 0.0, -G]], dtype=F64)
 
     def speeds(x: torch.Tensor, begun) -> torch.Tensor:
@@ -243,9 +243,9 @@ def test_gradients_hold_where_rounds_have_not_found_the_slip(kernel: bool, monke
     rub = {"mu_s": 0.6, "mu_k": 0.5, "density": 120.0}
     solids = [ground(**rub), RigidBody("box", (0.03, 0.03, 0.03), (0.0, 0.0, 0.03), **rub)]
     solids += [RigidBody("sphere", 0.03, (0.0, -0.0599, 0.035), **rub)]
-    kinds, params, state = place(solids, torch.zeros(1, dtype=F64))
+    kinds, params, state = place_bodies(solids, torch.zeros(1, dtype=F64))
     if not kernel:
-        monkeypatch.setattr(contact_op, "fits", lambda _: False)
+        monkeypatch.setattr(contact_op, "kernel_fits", lambda _: False)
     gravity = torch.tensor([[0.0, 0.0, -G]], dtype=F64)
 
     def speeds(x: torch.Tensor) -> torch.Tensor:

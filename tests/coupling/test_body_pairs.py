@@ -9,11 +9,11 @@ import torch
 
 from tests.coupling.tumbling import F64, SHAPES, ground
 from torchdlo.coupling.bodies import contact_op
-from torchdlo.coupling.bodies.contact_effect import BodyContact, resolve
+from torchdlo.coupling.bodies.contact_effect import BodyContact, contact_forces
 from torchdlo.coupling.bodies.dynamics import (
     PredictedBodyMotion,
     RigidBody,
-    place,
+    place_bodies,
     predict_free_motion,
     stationary_control,
 )
@@ -53,7 +53,7 @@ def thrown(kinds: tuple[str, ...], seed: int = 1) -> list[RigidBody]:
 
 def answered(solids: list[RigidBody], contact: BodyContact, shift: float = 0.0):
     """Forces and torques, and the derivatives of a sum of them by all numbers, each of which is changed by a share."""
-    kinds, params, state = place(solids, torch.zeros(SCENES, 1, 3, dtype=F64))
+    kinds, params, state = place_bodies(solids, torch.zeros(SCENES, 1, 3, dtype=F64))
     leaves, build = tree.flatten((params, state))
     signs = torch.Generator().manual_seed(2)
     leaves = [x * (1 + shift * torch.randn(x.shape, generator=signs, dtype=F64).sign()) for x in leaves]
@@ -64,7 +64,7 @@ def answered(solids: list[RigidBody], contact: BodyContact, shift: float = 0.0):
     one = torch.zeros(1, 1, dtype=F64)
     pulled = torch.tensor([[0.0, 0.0, -9.81]], dtype=F64)
     motion = predict_free_motion(kinds, params, state, stationary_control(kinds, state), pulled, one, DT)
-    found = torch.cat([x.expand(SCENES, -1, -1) for x in resolve(contact, motion)], -1)
+    found = torch.cat([x.expand(SCENES, -1, -1) for x in contact_forces(contact, motion)], -1)
     weight = torch.sin(torch.arange(found.numel(), dtype=F64)).reshape(found.shape)
     gradient = torch.autograd.grad((weight * found).sum(), leaves, allow_unused=True)
     return found.detach(), [torch.zeros_like(x) if g is None else g for x, g in zip(leaves, gradient, strict=True)]
@@ -107,14 +107,14 @@ def test_the_kernel_and_tensor_operations_agree_with_their_gradients(case: str, 
 
 def test_scenes_of_a_block_do_what_each_does_alone() -> None:
     solids = thrown(("plane", "box", "cylinder", "capsule"))
-    kinds, params, state = place(solids, torch.zeros(SCENES, 1, 3, dtype=F64))
+    kinds, params, state = place_bodies(solids, torch.zeros(SCENES, 1, 3, dtype=F64))
     still, zero = stationary_control(kinds, state), torch.zeros(1, 1, dtype=F64)
     motion = predict_free_motion(kinds, params, state, still, 0.0, zero, DT)
-    together = resolve(BodyContact(), motion)
+    together = contact_forces(BodyContact(), motion)
     for k in (0, 7, 10):
         one = tree.map(lambda x, k=k: x[k : k + 1], state)
         own = params if params.mass.dim() == 2 else tree.map(lambda x, k=k: x[k : k + 1] if x.dim() == 3 else x, params)
-        alone = resolve(
+        alone = contact_forces(
             BodyContact(), predict_free_motion(kinds, own, one, stationary_control(kinds, one), 0.0, zero, DT)
         )
         for whole, part in zip(together, alone, strict=True):
@@ -124,7 +124,7 @@ def test_scenes_of_a_block_do_what_each_does_alone() -> None:
 def moving(pos: torch.Tensor, vel: tuple[float, float, float]) -> PredictedBodyMotion:
     """Two balls, the second one at rest at `pos`, (B, 3)."""
     balls = [RigidBody("sphere", 0.05, vel=vel, mass=1.0), RigidBody("sphere", 0.05, pos, mass=1.0)]
-    kinds, params, state = place(balls, torch.zeros(len(pos), 1, 3, dtype=F64))
+    kinds, params, state = place_bodies(balls, torch.zeros(len(pos), 1, 3, dtype=F64))
     return predict_free_motion(
         kinds, params, state, stationary_control(kinds, state), 0.0, torch.zeros(1, 1, dtype=F64), DT
     )
@@ -133,7 +133,7 @@ def moving(pos: torch.Tensor, vel: tuple[float, float, float]) -> PredictedBodyM
 def test_pairs_are_skipped_only_where_they_cannot_meet() -> None:
     # 1 m/s over 2 ms closes gaps below 2 mm.
     gap = torch.linspace(0.7e-3, 10.2e-3, 20, dtype=F64)[:, None]
-    force, _ = resolve(BodyContact(), moving(torch.cat([0.1 + gap, 0 * gap, 0 * gap], -1), (1.0, 0.0, 0.0)))
+    force, _ = contact_forces(BodyContact(), moving(torch.cat([0.1 + gap, 0 * gap, 0 * gap], -1), (1.0, 0.0, 0.0)))
     assert torch.equal(force[:, 0, 0] < 0, gap[:, 0] < 1.0 * DT)
     assert torch.equal(force[:, 0, 0] == 0, gap[:, 0] > 1.0 * DT)
 
@@ -142,30 +142,30 @@ def test_what_is_not_a_number_stays_so_and_spoils_no_other_scene() -> None:
     motion = moving(torch.tensor([[0.0999, 0.0, 0.0]] * 3, dtype=F64), (1.0, 0.0, 0.0))
     change = motion.change.clone()
     change[1, 0, 1] = torch.nan
-    force, _ = resolve(BodyContact(), dataclasses.replace(motion, change=change))
+    force, _ = contact_forces(BodyContact(), dataclasses.replace(motion, change=change))
     assert bool(force[1].isnan().any())
     assert torch.equal(force[0], force[2])
     assert bool(force[0].isfinite().all())
 
 
 def test_a_mesh_that_is_nowhere_is_nowhere_for_the_kernel_too(monkeypatch) -> None:
-    kinds, params, state = place(thrown(("sphere", "mesh")), torch.zeros(SCENES, 1, 3, dtype=F64))
+    kinds, params, state = place_bodies(thrown(("sphere", "mesh")), torch.zeros(SCENES, 1, 3, dtype=F64))
     pos = state.pos.clone()
     pos[3, 0, 1] = torch.nan
     state = tree.replace(state, pos=pos)
     motion = predict_free_motion(
         kinds, params, state, stationary_control(kinds, state), 0.0, torch.zeros(1, 1, dtype=F64), DT
     )
-    found = resolve(BodyContact(), motion)[0]
+    found = contact_forces(BodyContact(), motion)[0]
     monkeypatch.setattr(contact_op, "ready", lambda *_: False)
-    wanted = resolve(BodyContact(), motion)[0]
+    wanted = contact_forces(BodyContact(), motion)[0]
     good = torch.arange(SCENES) != 3
     assert bool(found[3].isnan().any()) and bool(found[good].isfinite().all())
     torch.testing.assert_close(found[good], wanted[good], rtol=1e-9, atol=1e-9)
 
 
 def test_the_operator_tells_compilers_the_truth() -> None:
-    state = place(thrown(("box", "cone")), torch.zeros(SCENES, 1, 3, dtype=F64))[2]
+    state = place_bodies(thrown(("box", "cone")), torch.zeros(SCENES, 1, 3, dtype=F64))[2]
     members = torch.cat(
         [state.pos.mT, torch.rand(SCENES, 34, 2, generator=torch.Generator().manual_seed(0), dtype=F64)], 1
     )
@@ -182,7 +182,7 @@ def test_the_operator_tells_compilers_the_truth() -> None:
 def test_second_derivatives_are_refused() -> None:
     motion = moving(torch.tensor([[0.0999, 0.0, 0.0]], dtype=F64), (1.0, 0.0, 0.0))
     change = motion.change.clone().requires_grad_()
-    force, _ = resolve(BodyContact(), dataclasses.replace(motion, change=change))
+    force, _ = contact_forces(BodyContact(), dataclasses.replace(motion, change=change))
     (once,) = torch.autograd.grad(force.square().sum(), change, create_graph=True)
     with pytest.raises(RuntimeError, match="no second derivative"):
         torch.autograd.grad(once.sum(), change)

@@ -8,7 +8,7 @@ from touching import F64, line
 
 from torchdlo import scene
 from torchdlo.coupling import RodBody
-from torchdlo.coupling.rod_body import solver_op as body_sweeps
+from torchdlo.coupling.rod_body import rod_body_op as body_sweeps
 from torchdlo.envs.assets.rigid_objects import pebble
 from torchdlo.physics import tree
 from torchdlo.physics.effects.elastic import Bend
@@ -161,9 +161,9 @@ def test_blocks_of_scenes_do_what_each_scene_does_alone():
 
 @pytest.mark.compile
 def test_a_compiled_push_agrees_with_an_eager_one(monkeypatch):
-    given, push = [], body_sweeps.push
+    given, push = [], body_sweeps.contact_wrenches
     monkeypatch.setattr(
-        body_sweeps, "push", lambda *words, **named: given.append((words, named)) or push(*words, **named)
+        body_sweeps, "contact_wrenches", lambda *words, **named: given.append((words, named)) or push(*words, **named)
     )
     choice, params, state = crossing(2, [SOLIDS["plane"], SOLIDS["box"]])
     scene.step(choice, params, state, stationary_control(choice, state))

@@ -90,6 +90,6 @@ ROBOTS = {
 def test_robots_that_are_none_are_refused_in_a_sentence(case: str) -> None:
     text, sentence = ROBOTS[case]
     with pytest.raises(InputError, match=sentence) as caught:
-        urdf.read(text)
+        urdf.read_urdf(text)
     assert len(str(caught.value)) < 500
-    assert len(urdf.read(chain(400)).joints) == 400
+    assert len(urdf.read_urdf(chain(400)).joints) == 400

@@ -10,7 +10,7 @@ from touching import F64, distances, line, momenta, nearest, run, two, with_velo
 
 from torchdlo.coupling import RodContact
 from torchdlo.coupling.common.step_diagnostics import broad_phase
-from torchdlo.coupling.rod_contact import solver_op as rod_pairs
+from torchdlo.coupling.rod_contact import rod_contact_op as rod_pairs
 from torchdlo.physics import tree
 from torchdlo.physics.effects import base as effect
 from torchdlo.physics.effects.base import PredictedMotion
@@ -27,7 +27,7 @@ def solved(scene, params, state, dt: float):
     """Contacts, their forces, and the forces on vertices, for free motion from a state."""
     control = stationary_control(scene, state)
     values = broad_phase(scene, params, state, control, control).effects["rod_contact"]
-    rods = effect.altered(scene.effects, scene.topology, params.rods, params.effects)
+    rods = effect.altered_params(scene.effects, scene.topology, params.rods, params.effects)
     view = rod.view(scene.topology, rods, state.rods, dt)
     mobility = (dt * dt / rods.material.mass).expand_as(state.rods.pos)
     motion = PredictedMotion(dt * state.rods.vel, mobility, mobility)

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from torchdlo.coupling import EFFECTS, RodContact
-from torchdlo.coupling.common.step_diagnostics import explain
+from torchdlo.coupling.common.step_diagnostics import explain_diagnostics
 from torchdlo.physics.effects.base import KINDS, Effect
 
 pytestmark = pytest.mark.quick
@@ -30,11 +30,11 @@ def test_effects_are_hashable_and_equal_by_their_choices():
 
 
 def test_what_was_missed_is_explained():
-    assert explain(torch.zeros(3, 1, 3)) == ""
-    assert "12 pairs" in explain(torch.tensor([[[0.0, 0.0, 0.0]], [[12.0, 0.0, 0.0]]]))
-    assert "1.5 mm" in explain(torch.tensor([[[0.0, 1.5e-3, 0.0]]]))
-    assert "7% shorter" in explain(torch.tensor([[[0.0, 0.0, 0.07, 0.0]]]))
-    assert "9% longer" in explain(torch.tensor([[[0.0, 0.0, 0.0, 0.09, 0.0]]]))
+    assert explain_diagnostics(torch.zeros(3, 1, 3)) == ""
+    assert "12 pairs" in explain_diagnostics(torch.tensor([[[0.0, 0.0, 0.0]], [[12.0, 0.0, 0.0]]]))
+    assert "1.5 mm" in explain_diagnostics(torch.tensor([[[0.0, 1.5e-3, 0.0]]]))
+    assert "7% shorter" in explain_diagnostics(torch.tensor([[[0.0, 0.0, 0.07, 0.0]]]))
+    assert "9% longer" in explain_diagnostics(torch.tensor([[[0.0, 0.0, 0.0, 0.09, 0.0]]]))
 
 
 @pytest.mark.parametrize("wrong", [{"sweeps": 0}, {"rounds": 0}, {"room": -1}, {"recovery": 0.0}, {"recovery": 1.5}])

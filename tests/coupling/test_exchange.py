@@ -15,7 +15,7 @@ from torchdlo.coupling.mpm import rod_coupling_op
 from torchdlo.coupling.mpm import substep as mpm
 from torchdlo.coupling.mpm.constitutive_models import Elastic, Liquid
 from torchdlo.coupling.mpm.particles import Grid, ParticleBlock, assemble, fill_ball, fill_box
-from torchdlo.coupling.mpm.rod_coupling_solver import Lines, Touch, block_size, exchange, near_size
+from torchdlo.coupling.mpm.rod_coupling_solver import Lines, RodParticleTouch, block_size, exchange, near_size
 from torchdlo.physics import tree
 from torchdlo.physics.effects.elastic import Bend
 from torchdlo.physics.effects.external import Gravity
@@ -40,7 +40,7 @@ def lines_through_a_ball(vertices=14):
 
 
 def touch(room=14, sweeps=3):
-    return Touch(block_size(0.025, RADIUS, SPACING), room, sweeps)
+    return RodParticleTouch(block_size(0.025, RADIUS, SPACING), room, sweeps)
 
 
 @pytest.fixture
@@ -125,7 +125,7 @@ def test_room_for_the_nodes_of_a_capsule_is_enough_and_less_is_said(by_tensors):
     grid, nodes, lines = lines_through_a_ball()
     friction = torch.full((1, 1, 1), 0.3, dtype=DOUBLE)
     sizes = (0.025, RADIUS, SPACING)
-    every = Touch(block_size(*sizes), 14)
+    every = RodParticleTouch(block_size(*sizes), 14)
     capsule = dataclasses.replace(every, near=near_size(*sizes))
     assert capsule.near < 0.6 * every.block**3
     wanted, other = (exchange(grid, nodes, lines, t, friction) for t in (every, capsule))
@@ -227,7 +227,7 @@ def test_a_rope_in_a_liquid_feels_the_weight_of_what_it_displaces():
     real = torch.tensor([1.0, 1, 1, 1, 0], dtype=DOUBLE)[:, None]
     fixed, thick = torch.zeros(1, 5, 1, dtype=DOUBLE), torch.full((1, 1, 1), radius, dtype=DOUBLE)
     lines = Lines(pos, 0 * pos, fixed, thick, real, torch.tensor([1, 2, 3, 4, 0]))
-    near = Touch(block_size(0.011, radius, SPACING), 5)
+    near = RodParticleTouch(block_size(0.011, radius, SPACING), 5)
     force = []
     with torch.no_grad():
         for _ in range(800):

@@ -8,8 +8,8 @@ import torch
 from torchdlo.coupling.common.pose import Pose
 from torchdlo.coupling.robot import attachment as grasp
 from torchdlo.coupling.robot import inverse_kinematics
-from torchdlo.coupling.robot import kinematics as robot
-from torchdlo.coupling.robot.attachment import Hands, carry, felt, weld
+from torchdlo.coupling.robot import robot_kinematics as robot
+from torchdlo.coupling.robot.attachment import Hands, carry_attachments, close_hands, tool_wrench
 from torchdlo.physics import tree
 from torchdlo.physics.effects import EFFECTS
 from torchdlo.physics.linalg.rotation import rotate
@@ -52,7 +52,7 @@ def turned(angle) -> torch.Tensor:
 
 
 def control(hands: Hands, held: grasp.Grasp, tools: Pose) -> Control:
-    return Control(*carry(hands, held, tools))
+    return Control(*carry_attachments(hands, held, tools))
 
 
 @pytest.mark.parametrize("acceleration", [0.0, 3.0])
@@ -69,13 +69,13 @@ def test_a_tool_feels_weight_and_acceleration_of_a_hanging_rope(integrator, twis
         prescribed_edges=edges,
     )
     hands = Hands(1, (0, 0), (0,) * len(edges))
-    held = weld(scene, hands, stationary_control(scene, state), at(0.05, 0.02, 0.1), torch.ones(1, 1, dtype=F64))
+    held = close_hands(scene, hands, stationary_control(scene, state), at(0.05, 0.02, 0.1), torch.ones(1, 1, dtype=F64))
     with torch.no_grad():
         for k in range(20):
             t = (k + 1) * scene.dt
             tool = at(0.05, 0.02, 0.1 + 0.5 * acceleration * t * t)
             state = step(scene, params, state, control(hands, held, tool))
-    force, torque = felt(scene, hands, state, tool)
+    force, torque = tool_wrench(scene, hands, state, tool)
     # Rounding of positions over the square of the substep, 1e-16 / 4e-8, times the mass of a vertex and their number.
     assert float(force[0, 2]) == pytest.approx(-MASS * (G + acceleration), rel=1e-6)
     # The lever of the weight about the tool's point.
@@ -92,14 +92,14 @@ def test_what_a_tool_feels_is_the_momentum_that_a_swinging_rope_gets(integrator,
         line(7, vec(1, 0, 0)), integrator, twist, values, prescribed_vertices=(0, 1), prescribed_edges=edges
     )
     hands = Hands(1, (0, 0), (0,) * len(edges))
-    held = weld(scene, hands, stationary_control(scene, state), at(0, 0, 0), torch.ones(1, 1, dtype=F64))
+    held = close_hands(scene, hands, stationary_control(scene, state), at(0, 0, 0), torch.ones(1, 1, dtype=F64))
     mass = params.rods.material.mass
     with torch.no_grad():
         for k in range(20):
             before = (mass * state.rods.vel).sum(-2)
             tool = at(3e-4 * k, -1e-4 * k * k, 2e-4 * k)
             state = step(scene, params, state, control(hands, held, tool))
-            force, _ = felt(scene, hands, state, tool)
+            force, _ = tool_wrench(scene, hands, state, tool)
             gained = ((mass * state.rods.vel).sum(-2) - before) / scene.dt - MASS * vec(0, 0, -G)
             if k > 0:  # the first step is half a substep shorter
                 assert torch.allclose(-force[0], gained, rtol=1e-6, atol=1e-6)
@@ -117,13 +117,13 @@ def test_a_tool_that_turns_about_the_rope_feels_its_twist(twist):
     )
     hands = Hands(2, (0, 0, 1, 1), (0, 1))
     ends = Pose(torch.stack([x[0], x[-1]]), vec(1, 0, 0, 0).expand(2, 4))
-    held = weld(scene, hands, stationary_control(scene, state), ends, torch.ones(2, 1, dtype=F64))
+    held = close_hands(scene, hands, stationary_control(scene, state), ends, torch.ones(2, 1, dtype=F64))
     with torch.no_grad():
         for k in range(300):
             turn = torch.tensor([[0.0], [angle * min(1.0, (k + 1) / 100)]], dtype=F64)
             tools = Pose(ends.pos, turned(turn))
             state = step(scene, params, state, control(hands, held, tools))
-    _, torque = felt(scene, hands, state, tools)
+    _, torque = tool_wrench(scene, hands, state, tools)
     span = length * (n - 2) / (n - 1)
     # The rope pulls each tool back towards the other. Twist waves decay as e^{-30 0.2}.
     wanted = 3e-3 * angle / span
@@ -137,12 +137,12 @@ def test_parts_keep_their_place_in_the_tool():
     )
     hands = Hands(1, (0, 0), (0,))
     first = Pose(vec(0.1, 0.05, 0.2)[None], turned(torch.tensor([[0.4]], dtype=F64)))
-    held = weld(scene, hands, stationary_control(scene, state), first, torch.ones(1, 1, dtype=F64))
+    held = close_hands(scene, hands, stationary_control(scene, state), first, torch.ones(1, 1, dtype=F64))
     with torch.no_grad():
         for k in range(100):
             tool = Pose(first.pos + vec(0.0, 0.1, 0.05) * (k / 100), turned(torch.tensor([[0.4 + k / 100]], dtype=F64)))
             state = step(scene, params, state, control(hands, held, tool))
-    again = weld(scene, hands, stationary_control(scene, state), tool, torch.ones(1, 1, dtype=F64))
+    again = close_hands(scene, hands, stationary_control(scene, state), tool, torch.ones(1, 1, dtype=F64))
     assert torch.allclose(again.offset, held.offset, atol=1e-12, rtol=0)
     assert torch.allclose(again.director, held.director, atol=1e-9)
 
@@ -158,7 +158,7 @@ def lifted(scene, params, state, closed, count=50):
     tool = Pose(vec(0.2, 0, 0)[None], vec(1, 0, 0, 0)[None])
     with torch.no_grad():
         for k in range(count):
-            held = weld(scene, hands, stationary_control(scene, state), tool, closed(k), held)
+            held = close_hands(scene, hands, stationary_control(scene, state), tool, closed(k), held)
             tool = Pose(tool.pos + vec(-4e-4, 0, 4e-4), tool.quat)
             state = step(scene, params, state, control(hands, held, tool))
             seen.append(state)
@@ -255,11 +255,11 @@ def test_gradients_through_inverse_kinematics_and_weld_are_those_of_differences(
     hands, steps = Hands(1, (0, 0)), 200
     down = vec(0, 1, 0, 0)
     first = Pose(x[0], down)
-    seed = inverse_kinematics.solve(
+    seed = inverse_kinematics.solve_ik(
         arm, first, 0.5 * (arm.lower + arm.upper), search=inverse_kinematics.IkSearch(steps=60, polish=8)
     )
     assert bool(seed.settled)
-    held = weld(
+    held = close_hands(
         scene, hands, stationary_control(scene, state), tree.map(lambda q: q[None], first), torch.ones(1, 1, dtype=F64)
     )
     weight, t = rand(8, 3, seed=3), torch.linspace(0, 1, steps, dtype=F64)[:, None]
@@ -267,7 +267,7 @@ def test_gradients_through_inverse_kinematics_and_weld_are_those_of_differences(
 
     def shape(goal, bent):
         pos = first.pos + goal * (1 - torch.cos(torch.pi * t)) / 2
-        found = inverse_kinematics.solve(
+        found = inverse_kinematics.solve_ik(
             arm, Pose(pos, down.expand(steps, 4)), seed.joints.expand(steps, -1), search=many
         )
         assert bool(found.settled.all())
@@ -294,9 +294,9 @@ def test_wrong_hands_are_refused_with_what_was_expected():
     scene, _, state = rope_scene(line(5, vec(1, 0, 0)), prescribed_vertices=(0, 4))
     one = torch.ones(1, 1, dtype=F64)
     with pytest.raises(ValueError, match="1 vertices and 0 edges; the scene can hold 2 and 0"):
-        weld(scene, Hands(1, (0,)), stationary_control(scene, state), at(0, 0, 0), one)
+        close_hands(scene, Hands(1, (0,)), stationary_control(scene, state), at(0, 0, 0), one)
     with pytest.raises(ValueError, match=r"expected \(..., 2, 3\)"):
-        weld(scene, Hands(2, (0, 1)), stationary_control(scene, state), at(0, 0, 0), one)
+        close_hands(scene, Hands(2, (0, 1)), stationary_control(scene, state), at(0, 0, 0), one)
     with pytest.raises(ValueError, match="expected -1"):
         Hands(1, (0, 1))
 
@@ -316,9 +316,9 @@ def test_a_grip_of_wrong_shape_is_refused():
 def test_tools_turn_what_they_hold():
     scene, _, state = rope_scene(line(5, vec(1, 0, 0)), prescribed_vertices=(1,))
     hands = Hands(1, (0,))
-    held = weld(scene, hands, stationary_control(scene, state), at(0.1, -0.2, 0.0), torch.ones(1, 1, dtype=F64))
+    held = close_hands(scene, hands, stationary_control(scene, state), at(0.1, -0.2, 0.0), torch.ones(1, 1, dtype=F64))
     quat = turned(torch.tensor([[0.5 * torch.pi]], dtype=F64))
-    pos, _, _ = carry(hands, held, Pose(vec(0.1, -0.2, 0.0)[None], quat))
+    pos, _, _ = carry_attachments(hands, held, Pose(vec(0.1, -0.2, 0.0)[None], quat))
     assert torch.allclose(pos, vec(0.1, -0.2, 0.2)[None])
     assert torch.allclose(rotate(quat, vec(0, 1, 0)[None]), vec(0, 0, 1)[None])
 

@@ -12,7 +12,7 @@ pytest.importorskip("pytorch_kinematics")
 from torchdlo.coupling.bodies.dynamics import turn_between
 from torchdlo.coupling.common.pose import Pose
 from torchdlo.coupling.robot import inverse_kinematics
-from torchdlo.coupling.robot import kinematics as robot
+from torchdlo.coupling.robot import robot_kinematics as robot
 from torchdlo.coupling.robot.inverse_kinematics import IkSearch
 from torchdlo.physics import tree
 
@@ -35,7 +35,7 @@ def middle(count: int, dtype=F64) -> torch.Tensor:
 def test_random_poses_are_reached(dtype):
     # The bar is 98 %; 1000 poses measure a rate of 99.5 % to 0.2 % (one standard deviation).
     _, target = reachable(1000, dtype=dtype)
-    found = inverse_kinematics.solve(arm(), target, middle(1000, dtype), search=IkSearch(starts=8))
+    found = inverse_kinematics.solve_ik(arm(), target, middle(1000, dtype), search=IkSearch(starts=8))
     assert found.joints.dtype == dtype
     assert float(found.converged.double().mean()) >= 0.98
     good = found.converged
@@ -49,15 +49,15 @@ def test_near_poses_are_reached_in_few_steps():
     q, target = reachable(300)
     noise = 0.03 * torch.randn(300, 8, generator=torch.Generator().manual_seed(1), dtype=F64)
     start = torch.minimum(torch.maximum(q + noise, arm().lower), arm().upper)
-    found = inverse_kinematics.solve(arm(), target, start, search=IkSearch(steps=3, polish=2))
+    found = inverse_kinematics.solve_ik(arm(), target, start, search=IkSearch(steps=3, polish=2))
     assert float(found.converged.double().mean()) >= 0.98
 
 
 def test_batches_equal_single_poses():
     _, target = reachable(3)
-    whole = inverse_kinematics.solve(arm(), target, middle(1))
+    whole = inverse_kinematics.solve_ik(arm(), target, middle(1))
     for k in range(3):
-        one = inverse_kinematics.solve(arm(), tree.map(lambda x, k=k: x[k], target), middle(1)[0])
+        one = inverse_kinematics.solve_ik(arm(), tree.map(lambda x, k=k: x[k], target), middle(1)[0])
         # Steps are shorter than what rounding could grow by: tens of them, factors of a few.
         assert torch.allclose(whole.joints[k], one.joints, atol=1e-8)
         assert one.converged.shape == ()
@@ -68,14 +68,14 @@ def test_a_target_out_of_reach_is_reported_and_not_handed_on():
     joints, target = middle(1)[0], near
     for _ in range(5):
         # One adds to what was handed on: it stays at the edge of what the arm reaches instead of going off.
-        found = inverse_kinematics.solve(arm(), target, joints)
+        found = inverse_kinematics.solve_ik(arm(), target, joints)
         joints = found.joints
         target = Pose(found.handed.pos + torch.tensor([far / 5, 0, 0], dtype=F64), found.handed.quat)
     assert not bool(found.converged)
     assert torch.equal(found.handed.pos, found.pose.pos)
     assert float(found.pose.pos.norm()) < 1.3
     assert torch.isfinite(found.joints).all()
-    inside = inverse_kinematics.solve(arm(), near, joints, search=IkSearch(steps=40))
+    inside = inverse_kinematics.solve_ik(arm(), near, joints, search=IkSearch(steps=40))
     assert bool(inside.converged) and torch.equal(inside.handed.pos, near.pos)
 
 
@@ -87,11 +87,13 @@ def test_the_answer_does_not_depend_on_the_way_there():
         [torch.cos(angle), torch.sin(angle), 0.3 * torch.sin(angle)], -1
     )
     joints, first = (
-        inverse_kinematics.solve(arm(), Pose(path[0], down), middle(1)[0], search=IkSearch(steps=60, polish=8)).joints,
+        inverse_kinematics.solve_ik(
+            arm(), Pose(path[0], down), middle(1)[0], search=IkSearch(steps=60, polish=8)
+        ).joints,
         None,
     )
     for pos in path:
-        found = inverse_kinematics.solve(arm(), Pose(pos, down), joints)
+        found = inverse_kinematics.solve_ik(arm(), Pose(pos, down), joints)
         assert bool(found.settled)
         joints, first = found.joints, found.joints if first is None else first
     assert torch.allclose(joints, first, atol=1e-6)
@@ -99,7 +101,7 @@ def test_the_answer_does_not_depend_on_the_way_there():
 
 def test_joints_go_no_further_than_their_speeds_allow():
     _, target = reachable(20)
-    found = inverse_kinematics.solve(arm(), target, middle(20), within_time=0.02)
+    found = inverse_kinematics.solve_ik(arm(), target, middle(20), within_time=0.02)
     assert ((found.joints - middle(20)).abs() <= arm().velocity * 0.02 * (1 + 1e-12)).all()
     assert not found.converged.all()
 
@@ -108,13 +110,13 @@ def test_fingers_stay_where_they_are():
     _, target = reachable(2)
     start = middle(2).clone()
     start[:, 7] = 0.013
-    assert (inverse_kinematics.solve(arm(), target, start).joints[:, 7] == 0.013).all()
+    assert (inverse_kinematics.solve_ik(arm(), target, start).joints[:, 7] == 0.013).all()
 
 
 def settled_poses(count: int) -> tuple[Pose, torch.Tensor]:
     """Poses at which the posture is settled, with one joint at a limit in some, and starts near the answers."""
     _, target = reachable(60, seed=4)
-    found = inverse_kinematics.solve(arm(), target, middle(60), search=IkSearch(steps=60, polish=10))
+    found = inverse_kinematics.solve_ik(arm(), target, middle(60), search=IkSearch(steps=60, polish=10))
     some = found.settled.nonzero()[:count, 0]
     assert len(some) == count
     return tree.map(lambda x: x[some], target), found.joints[some]
@@ -134,7 +136,7 @@ def test_derivatives_by_the_target_are_those_of_differences():
 
     def joints(shift):
         moved = Pose(target.pos + shift[:, :3], turned(target.quat, shift[:, 3:]))
-        return inverse_kinematics.solve(arm(), moved, start, search=search).joints
+        return inverse_kinematics.solve_ik(arm(), moved, start, search=search).joints
 
     shift = torch.zeros(12, 6, dtype=F64, requires_grad=True)
     (found,) = torch.autograd.grad((weight * joints(shift)).sum(), shift)
@@ -152,7 +154,7 @@ def test_derivatives_by_the_target_are_those_of_differences():
 def test_second_derivatives_are_refused_and_not_wrong():
     target, start = settled_poses(1)
     pos = target.pos.clone().requires_grad_()
-    found = inverse_kinematics.solve(arm(), Pose(pos, target.quat), start).joints
+    found = inverse_kinematics.solve_ik(arm(), Pose(pos, target.quat), start).joints
     (first,) = torch.autograd.grad(found.square().sum(), pos, create_graph=True)
     with pytest.raises(RuntimeError):
         torch.autograd.grad(first.sum(), pos)
@@ -160,7 +162,7 @@ def test_second_derivatives_are_refused_and_not_wrong():
 
 def test_gradients_are_finite_where_the_target_is_out_of_reach():
     pos = torch.tensor([2.0, 0, 0.3], dtype=F64, requires_grad=True)
-    found = inverse_kinematics.solve(arm(), Pose(pos, torch.tensor([0.0, 1, 0, 0], dtype=F64)), middle(1)[0])
+    found = inverse_kinematics.solve_ik(arm(), Pose(pos, torch.tensor([0.0, 1, 0, 0], dtype=F64)), middle(1)[0])
     (gradient,) = torch.autograd.grad(found.joints.sum() + found.handed.pos.sum(), pos)
     assert torch.isfinite(gradient).all()
 
@@ -177,8 +179,8 @@ def test_joints_at_their_limits_leave_single_precision_all_its_digits():
     target = Pose(target.pos + 0.02 * torch.randn(200, 3, generator=torch.Generator().manual_seed(3)), target.quat)
     target.pos[0] = torch.tensor([-0.40955785, 0.30928865, 0.09328924])
     target.quat[0] = torch.tensor([0.02178209, 0.99901599, 0.02058091, -0.03269737])
-    found = inverse_kinematics.solve(arm(), target, start, search=search, posture=posture)
-    wanted = inverse_kinematics.solve(
+    found = inverse_kinematics.solve_ik(arm(), target, start, search=search, posture=posture)
+    wanted = inverse_kinematics.solve_ik(
         arm(), tree.map(torch.Tensor.double, target), start.double(), search=search, posture=posture
     )
     assert bool(found.converged[0]) and 0 < int(found.converged.sum()) < 200

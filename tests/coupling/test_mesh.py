@@ -70,7 +70,7 @@ def test_distances_are_those_of_the_nearest_triangle() -> None:
     axes = tuple(torch.linspace(-0.08, 0.08, n, dtype=F64) for n in (9, 10, 11))
     found = triangles.grid_distances(axes, vertices[faces])
     nodes = torch.cartesian_prod(*axes)
-    all_pairs = torch.stack([triangles.distances(p[None], vertices[faces]).amin() for p in nodes])
+    all_pairs = torch.stack([triangles.triangle_distances(p[None], vertices[faces]).amin() for p in nodes])
     assert torch.allclose(found.flatten(), all_pairs, atol=1e-9)
     ring = ((nodes[:, :2].norm(dim=-1) - 0.05).square() + nodes[:, 2].square()).sqrt()
     clear = (ring - 0.018).abs() > 1e-3

@@ -29,14 +29,14 @@ def _transfer_case():
 def test_transfers_have_the_derivatives_that_they_say():
     size, *tensors = _transfer_case()
     at, value, gradient, grid = (t.requires_grad_() for t in tensors)
-    assert torch.autograd.gradcheck(lambda a, v, s: p2g_g2p.spread(a, v, s, size), (at, value, gradient))
-    assert torch.autograd.gradcheck(lambda a, g: p2g_g2p.collect(a, g, size), (at, grid))
+    assert torch.autograd.gradcheck(lambda a, v, s: p2g_g2p.particles_to_grid(a, v, s, size), (at, value, gradient))
+    assert torch.autograd.gradcheck(lambda a, g: p2g_g2p.grid_to_particles(a, g, size), (at, grid))
     massive = grid.detach()[:, :40].clone()
     massive[..., 3] = massive[..., 3].abs() + 0.1
     massive[:, ::5] = 0.0  # no mass
     massive.requires_grad_()
     there = massive[..., 3:] > 0
-    assert torch.autograd.gradcheck(lambda g: p2g_g2p.divide(g * there), (massive,))
+    assert torch.autograd.gradcheck(lambda g: p2g_g2p.grid_velocities(g * there), (massive,))
 
 
 def test_the_kernel_does_what_tensor_operations_do(monkeypatch):

@@ -9,7 +9,7 @@ import torch
 
 pytest.importorskip("pytorch_kinematics")
 
-from torchdlo.coupling.robot import kinematics as robot
+from torchdlo.coupling.robot import robot_kinematics as robot
 from torchdlo.coupling.robot import urdf
 from torchdlo.errors import InputError
 from torchdlo.physics.linalg.rotation import rotate
@@ -98,7 +98,7 @@ def test_both_fingers_open_by_one_number():
 
 
 def test_a_mimic_joint_follows_with_factor_and_offset():
-    made = robot.load(SLIDER, tool="twin")
+    made = robot.load_robot(SLIDER, tool="twin")
     assert made.joints == ("turn", "slide")
     near, far = (robot.tool_pose(made, torch.tensor([0.4, s], dtype=F64)).pos for s in (0.0, 0.1))
     rail = torch.tensor([[0.0, 0.1], [-0.2, 0.0]], dtype=F64)
@@ -108,7 +108,7 @@ def test_a_mimic_joint_follows_with_factor_and_offset():
     assert float((start[-1] - start[-2]).norm()) == pytest.approx(0.05, rel=1e-12)
 
 
-@pytest.mark.parametrize("make", [robot.panda, lambda: robot.load(SLIDER, tool="twin")])
+@pytest.mark.parametrize("make", [robot.panda, lambda: robot.load_robot(SLIDER, tool="twin")])
 def test_the_jacobian_is_the_derivative_of_the_pose(make):
     arm = make()
     q = torch.tensor([0.4, 0.1], dtype=F64) if len(arm.joints) == 2 else random_joints(arm, 1)[0]
@@ -181,22 +181,22 @@ WRONG = {
 def test_wrong_descriptions_are_refused_with_what_was_expected(case):
     text, sentence = WRONG[case]
     with pytest.raises(InputError, match=sentence):
-        robot.load(text)
+        robot.load_robot(text)
 
 
 def test_a_wrong_tool_or_file_is_refused(tmp_path):
     with pytest.raises(InputError, match="did you mean 'twin'"):
-        robot.load(SLIDER, tool="twinn")
+        robot.load_robot(SLIDER, tool="twinn")
     with pytest.raises(InputError, match="no joint moves the link 'base'"):
-        robot.load(SLIDER, tool="base")
+        robot.load_robot(SLIDER, tool="base")
     with pytest.raises(InputError, match="expected a URDF file, found none"):
-        robot.load(tmp_path / "no.urdf")
+        robot.load_robot(tmp_path / "no.urdf")
     with pytest.raises(ValueError, match=r"expected \(\.\.\., 8\)"):
         robot.poses(robot.panda(), torch.zeros(7))
 
 
 def test_reading_is_silent(capfd):
-    robot.load(SLIDER, tool="twin")
+    robot.load_robot(SLIDER, tool="twin")
     robot.panda()
     assert capfd.readouterr() == ("", "")
 
@@ -218,8 +218,8 @@ def test_what_means_nothing_on_a_fixed_joint_is_passed_over(fixed):
         '<joint name="m" type="revolute"><parent link="b"/><child link="c"/><axis xyz="0 0 2"/>'
         '<limit lower="-1" upper="1" velocity="1" effort="1"/></joint></robot>'
     )
-    found = urdf.read(text)
+    found = urdf.read_urdf(text)
     assert [j.kind for j in found.joints] == ["fixed", "revolute"] and found.shapes == ()
     assert found.joints[1].axis == (0.0, 0.0, 1.0)
     with pytest.raises(InputError, match="axis 0 0 0"):
-        urdf.read(text.replace("0 0 2", "0 0 0"))
+        urdf.read_urdf(text.replace("0 0 2", "0 0 0"))

@@ -11,7 +11,7 @@ from touching import F64, line, run
 from torchdlo.coupling import RodBody
 from torchdlo.coupling.bodies import shape_sdf
 from torchdlo.coupling.bodies.dynamics import conjugate
-from torchdlo.coupling.rod_body import solver_op as body_sweeps
+from torchdlo.coupling.rod_body import rod_body_op as body_sweeps
 from torchdlo.physics import tree
 from torchdlo.physics.effects.elastic import Bend
 from torchdlo.physics.effects.external import Damping, Gravity

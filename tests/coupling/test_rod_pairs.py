@@ -14,7 +14,7 @@ from touching import F64, line
 from torchdlo.coupling import RodContact
 from torchdlo.coupling.common.step_diagnostics import broad_phase
 from torchdlo.coupling.rod_contact import broad_phase_op
-from torchdlo.coupling.rod_contact import solver_op as rod_pairs
+from torchdlo.coupling.rod_contact import rod_contact_op as rod_pairs
 from torchdlo.physics import tree
 from torchdlo.physics.effects import base as effect
 from torchdlo.physics.effects.base import PredictedMotion
@@ -62,7 +62,7 @@ def inputs(ropes: list[Rope], dtype: torch.dtype, numbers: dict[str, float] | No
     params, state = tree.to(params, dtype), tree.to(state, dtype)
     control = stationary_control(scene, state)
     values = broad_phase(scene, params, state, control, control).effects["rod_contact"]
-    rods = effect.altered(scene.effects, scene.topology, params.rods, params.effects)
+    rods = effect.altered_params(scene.effects, scene.topology, params.rods, params.effects)
     dt = 2e-4
     free = torch.ones_like(state.rods.pos[..., :1]).index_fill(-2, torch.tensor([0, 20]), 0.0)
     mobility = (dt * dt / rods.material.mass).expand_as(state.rods.pos[..., :1])

@@ -6,15 +6,15 @@ import pytest
 import torch
 from touching import F64, distances
 
-from torchdlo.coupling.rod_contact.closest_points import PULL, closest
+from torchdlo.coupling.rod_contact.closest_points import PULL, closest_points
 
 pytestmark = pytest.mark.quick
 
 
 def apart(x: torch.Tensor) -> torch.Tensor:
-    """Distances that `closest` finds for segments (n, 4, 3)."""
+    """Distances that `closest_points` finds for segments (n, 4, 3)."""
     a, b, c, d = x.unbind(-2)
-    s, t = closest((a, b), (c, d))
+    s, t = closest_points((a, b), (c, d))
     return (a + s * (b - a) - c - t * (d - c)).norm(dim=-1)
 
 
@@ -39,7 +39,7 @@ def test_distances_are_exact_up_to_the_pull_to_the_middle(flat):
 def test_points_of_a_crossing_are_its_own():
     # At a right angle and through both middles the pull moves nothing.
     x = torch.tensor([[[-1.0, 0, 0], [1, 0, 0], [0, -1, 0.3], [0, 1, 0.3]]], dtype=F64)
-    s, t = closest((x[:, 0], x[:, 1]), (x[:, 2], x[:, 3]))
+    s, t = closest_points((x[:, 0], x[:, 1]), (x[:, 2], x[:, 3]))
     assert float((torch.cat([s, t]) - 0.5).abs().max()) < 1e-15
 
 
@@ -58,7 +58,7 @@ DEGENERATE = {
 def test_shares_and_their_derivatives_are_finite_in_degenerate_cases(case, dtype):
     x = torch.tensor([DEGENERATE[case]], dtype=dtype, requires_grad=True)
     a, b, c, d = x.unbind(-2)
-    s, t = closest((a, b), (c, d))
+    s, t = closest_points((a, b), (c, d))
     assert bool(((s >= 0) & (s <= 1) & (t >= 0) & (t <= 1)).all())
     (g,) = torch.autograd.grad((s + 2 * t).sum(), x)
     assert bool(torch.isfinite(g).all())
@@ -67,7 +67,7 @@ def test_shares_and_their_derivatives_are_finite_in_degenerate_cases(case, dtype
 def test_shares_have_their_exact_derivative():
     g = torch.Generator().manual_seed(5)
     x = torch.randn(20, 4, 3, generator=g, dtype=F64, requires_grad=True)
-    assert torch.autograd.gradcheck(lambda x: closest((x[:, 0], x[:, 1]), (x[:, 2], x[:, 3])), (x,), atol=1e-6)
+    assert torch.autograd.gradcheck(lambda x: closest_points((x[:, 0], x[:, 1]), (x[:, 2], x[:, 3])), (x,), atol=1e-6)
 
 
 def test_shares_do_not_jump_where_segments_become_parallel():
@@ -76,5 +76,5 @@ def test_shares_do_not_jump_where_segments_become_parallel():
     a, b = torch.zeros(2, 3, dtype=F64), torch.tensor([1.0, 0, 0], dtype=F64).expand(2, 3)
     c = torch.tensor([0.0, 0, 0.1], dtype=F64).expand(2, 3)
     d = c + torch.stack([torch.cos(angles), torch.zeros(2, dtype=F64), torch.sin(angles)], -1)
-    s, _ = closest((a, b), (c, d))
+    s, _ = closest_points((a, b), (c, d))
     assert float((s[1] - s[0]).abs()) < 2e-6 / PULL

@@ -8,15 +8,15 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchdlo.coupling.bodies.contact_effect import BodyContact, resolve
+from torchdlo.coupling.bodies.contact_effect import BodyContact, contact_forces
 from torchdlo.coupling.bodies.dynamics import (
     Body,
     BodyParams,
     BodyState,
     RigidBody,
-    advance,
+    advance_bodies,
     conjugate,
-    place,
+    place_bodies,
     predict_free_motion,
     stationary_control,
 )
@@ -55,7 +55,7 @@ def move(
     for k in range(count):
         first = gravity.new_tensor([[float(k == 0)]])
         motion = predict_free_motion(bodies, params, state, targets, gravity, first, dt)
-        state = advance(motion, targets, ContactForces(none, *resolve(contact, motion)))
+        state = advance_bodies(motion, targets, ContactForces(none, *contact_forces(contact, motion)))
     return state
 
 
@@ -69,7 +69,7 @@ def run(
 ) -> tuple[BodyParams, BodyState, BodyState]:
     """Return the numbers of bodies, and their states at the start and after a time."""
     like = torch.zeros(1, dtype=dtype)
-    bodies, params, state = place(solids, like)
+    bodies, params, state = place_bodies(solids, like)
     with torch.no_grad():
         pulled = like.new_tensor([gravity])
         return params, state, move(bodies, params, state, round(time / dt), dt, pulled, BodyContact(**choices))

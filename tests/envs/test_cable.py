@@ -12,7 +12,7 @@ import torch
 from test_contract import F64, small, stage_waypoints
 
 from torchdlo import scene as scenes
-from torchdlo.agents.trajopt.task_problem import problem
+from torchdlo.agents.trajopt.task_problem import task_problem
 from torchdlo.envs import TASKS, RopeMaterial, find
 from torchdlo.envs.core import episode
 from torchdlo.errors import InputError
@@ -120,5 +120,5 @@ def test_what_steps_cannot_follow_is_refused(tmp_path: Path) -> None:
 
 def test_searches_depend_on_the_rope(tmp_path: Path) -> None:
     rope = cable(write(tmp_path / "model.json", ("air_drag",)))
-    usual, own = problem("coiling"), problem("coiling", rope)
+    usual, own = task_problem("coiling"), task_problem("coiling", rope)
     assert "rope" not in usual.choices and own.choices["rope"]["bend"] == 2e-3

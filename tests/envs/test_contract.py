@@ -49,7 +49,7 @@ def played(name: str) -> tuple[episode.EpisodeResult, torch.Tensor]:
     """An episode of two actions with the gradient of its loss."""
     task = prepared(name).task
     actions = stage_waypoints(task).requires_grad_()
-    outcome = episode.play(task, actions, episode=prepared(name), keep=episode.places)
+    outcome = episode.play(task, actions, episode=prepared(name), keep=episode.scene_positions)
     (gradient,) = torch.autograd.grad(outcome.loss.sum(), actions, retain_graph=True)
     return tree.detach(outcome), gradient
 
@@ -138,5 +138,5 @@ def test_the_reference_keeps_the_limits_of_actions(name: str) -> None:
     task = TASKS[name]()
     actions = task.demonstration()
     assert actions.shape == (task.horizon, task.width)
-    way, turn = episode.limited(task, actions)
+    way, turn = episode.limit_action(task, actions)
     torch.testing.assert_close(torch.cat([way.flatten(1), torch.rad2deg(turn).flatten(1)], -1), actions)

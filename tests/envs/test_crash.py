@@ -9,8 +9,8 @@ import torch
 
 from torchdlo import scene as scenes
 from torchdlo.coupling.bodies.dynamics import RigidBody
-from torchdlo.coupling.rod_body.effect import RodBody
-from torchdlo.envs.core.divergence import broken, inside
+from torchdlo.coupling.rod_body.rod_body_effect import RodBody
+from torchdlo.envs.core.divergence import broken_lengths, inside_bodies
 from torchdlo.physics import tree
 from torchdlo.physics.effects.material import AxialStiffness
 
@@ -39,7 +39,7 @@ def test_points_are_inside_what_does_not_give_way():
     line = torch.tensor([[0.0, 1.0, 0.5], [0.1, 1.0, 0.5], [0.2, 1.0, 0.5]], dtype=F64).expand(2, 3, 3)
     rope = scenes.Rope(line, 0.01, mass=0.01, bend=1e-4)
     scene, params, state = scenes.make([rope], [RodBody()], {}, dt=1e-3, substeps=1, bodies=solids)
-    found = inside(scene, params, state, torch.tensor(list(POINTS.values()), dtype=F64).expand(2, -1, -1))
+    found = inside_bodies(scene, params, state, torch.tensor(list(POINTS.values()), dtype=F64).expand(2, -1, -1))
     said = {name for name, hit in zip(POINTS, found[0].tolist(), strict=True) if hit}
     assert said == {"in the post", "in the moving box, which is turned", "below the floor"}
     assert found.shape == (2, len(POINTS)) and bool((found[0] == found[1]).all())
@@ -48,7 +48,7 @@ def test_points_are_inside_what_does_not_give_way():
 def test_nothing_is_inside_where_there_are_no_bodies():
     line = torch.tensor([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.2, 0.0, 0.0]], dtype=F64).expand(1, 3, 3)
     scene, params, state = scenes.make([scenes.Rope(line, 0.01, mass=0.01, bend=1e-4)], [], {}, dt=1e-3, substeps=1)
-    assert inside(scene, params, state, torch.zeros(1, 4, 3, dtype=F64)).tolist() == [[False] * 4]
+    assert inside_bodies(scene, params, state, torch.zeros(1, 4, 3, dtype=F64)).tolist() == [[False] * 4]
 
 
 def test_inextensible_ropes_that_lost_their_lengths_are_broken():
@@ -60,7 +60,7 @@ def test_inextensible_ropes_that_lost_their_lengths_are_broken():
         scene, params, state = scenes.make([rope], [], {}, dt=1e-3, substeps=10)
         pos = torch.cat([line[:2].expand(4, 2, 3), ends[:, None]], 1)
         moved = tree.replace(state, rods=tree.replace(state.rods, pos=pos))
-        assert broken(scene, params, moved).tolist() == expected
+        assert broken_lengths(scene, params, moved).tolist() == expected
 
 
 @pytest.mark.parametrize(("stiffness", "expected"), [(1e3, False), (1e18, True)])
@@ -71,4 +71,4 @@ def test_ropes_that_an_effect_makes_elastic_may_stretch(stiffness: float, expect
     scene, params, state = scenes.make([rope], [AxialStiffness()], values, dt=1e-3, substeps=10)
     longer = tree.replace(state, rods=tree.replace(state.rods, pos=1.2 * state.rods.pos))
     # 1e18 N stands for inextensible.
-    assert broken(scene, params, longer).tolist() == [expected]
+    assert broken_lengths(scene, params, longer).tolist() == [expected]

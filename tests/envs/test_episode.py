@@ -12,10 +12,10 @@ from test_contract import F64, prepared, small, stage_waypoints
 
 from torchdlo import scene as scenes
 from torchdlo.coupling.bodies.dynamics import turn_by
-from torchdlo.coupling.robot.kinematics import tool_pose
+from torchdlo.coupling.robot.robot_kinematics import tool_pose
 from torchdlo.envs import TASKS
 from torchdlo.envs.core import episode, reach
-from torchdlo.envs.core.task import RADIUS, Arms, Task, TaskState, make, straight, through
+from torchdlo.envs.core.task import RADIUS, Arms, Task, TaskState, actions_through, make, straight
 from torchdlo.physics import tree
 from torchdlo.physics.linalg.rotation import multiply
 from torchdlo.scene import Rope
@@ -52,7 +52,7 @@ def test_joints_are_those_of_the_tool():
 
 def test_long_ways_are_cut_and_keep_their_direction():
     task = prepared("coiling").task
-    way, turn = episode.limited(task, torch.tensor([[0.03, 0.04, 0.0, 0.05, -3.0, 0.1]], dtype=F64))
+    way, turn = episode.limit_action(task, torch.tensor([[0.03, 0.04, 0.0, 0.05, -3.0, 0.1]], dtype=F64))
     torch.testing.assert_close(way[0, 0], torch.tensor([0.006, 0.008, 0.0], dtype=F64))
     torch.testing.assert_close(turn[0, 0], torch.deg2rad(torch.tensor([0.05, -0.1, 0.1], dtype=F64)))
 
@@ -104,7 +104,9 @@ def test_recorded_episodes_go_as_others_do(name: str) -> None:
     made = prepared(name)
     recorded = dataclasses.replace(made, step=scenes.stepper(made.scene, compiled=False, recorded=True))
     actions = stage_waypoints(made.task)
-    plain, again = (episode.play(e.task, actions.clone(), episode=e, keep=episode.places) for e in (made, recorded))
+    plain, again = (
+        episode.play(e.task, actions.clone(), episode=e, keep=episode.scene_positions) for e in (made, recorded)
+    )
     torch.testing.assert_close(again.returns, plain.returns, rtol=1e-9, atol=1e-9)
     torch.testing.assert_close(again.path["pos"], plain.path["pos"], rtol=0, atol=1e-9)
     # With gradients they are the same.
@@ -116,16 +118,16 @@ def test_recorded_episodes_go_as_others_do(name: str) -> None:
 
 
 def test_way_points_become_actions_of_the_greatest_length():
-    actions = through([[(0.03, 0.0, 0.0)], [(0.03, 0.0, 0.0155)]], 6, torch.zeros(1, 3))
+    actions = actions_through([[(0.03, 0.0, 0.0)], [(0.03, 0.0, 0.0155)]], 6, torch.zeros(1, 3))
     assert actions[:, 0].tolist() == pytest.approx([0.01, 0.01, 0.01, 0, 0, 0])
     assert actions[:, 2].tolist() == pytest.approx([0, 0, 0, 0.00775, 0.00775, 0])
     with pytest.raises(ValueError, match="they take 5 actions"):
-        through([[(0.05, 0.0, 0.0)]], 4, torch.zeros(1, 3))
+        actions_through([[(0.05, 0.0, 0.0)]], 4, torch.zeros(1, 3))
 
 
 def test_way_points_that_are_off_make_the_first_leg_longer_or_shorter():
     off = torch.tensor([[[0.0, 0.0, 0.0]], [[0.015, 0.0, 0.0]]])
-    actions = through([[(0.03, 0.0, 0.0)], [(0.03, 0.0, 0.02)]], 7, off)
+    actions = actions_through([[(0.03, 0.0, 0.0)], [(0.03, 0.0, 0.02)]], 7, off)
     assert actions[0, :, 0].tolist() == pytest.approx([0.01, 0.01, 0.01, 0, 0, 0, 0])
     assert actions[1, :, 0].tolist() == pytest.approx([0.009] * 5 + [0, 0])
     assert actions[1, :, 2].tolist() == pytest.approx([0] * 5 + [0.01, 0.01])
@@ -207,7 +209,7 @@ def test_scores_are_0_for_doing_nothing_and_1_for_the_way_by_hand():
     actions = torch.stack([torch.zeros(1, 6, dtype=F64), task.demonstration(), 0.5 * task.demonstration()])
     with torch.no_grad():
         returns = episode.play(task, actions, compiled=False).returns
-    score = episode.normalized(task, returns, compiled=False)
+    score = episode.normalized_score(task, returns, compiled=False)
     torch.testing.assert_close(score[:2], score.new_tensor([0.0, 1.0]), atol=1e-6, rtol=0)
     assert 0 < float(score[2]) < 1
 

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchdlo import envs
 from torchdlo.envs.core import episode, scene_names
-from torchdlo.envs.core.subtask import concluded, continue_from, rewarded
+from torchdlo.envs.core.subtask import continue_from, task_success, with_reward
 from torchdlo.errors import InputError
 from torchdlo.physics import tree
 from torchdlo.reward_language import reward
@@ -58,7 +58,7 @@ def test_expressions_equal_the_rewards_of_tasks_with_their_gradients(name: str) 
     moves = 0.01 * (2 * torch.rand(1, 2, width, generator=rng, dtype=torch.float64) - 1)
     actions = torch.cat([moves, 0 * moves], -1)
     own, gradient = played(task, actions)
-    other, slope = played(rewarded(task, reward(EXPRESSED[name])), actions)
+    other, slope = played(with_reward(task, reward(EXPRESSED[name])), actions)
     torch.testing.assert_close(other.rewards, own.rewards, rtol=0, atol=1e-9)
     torch.testing.assert_close(slope, gradient, rtol=1e-6, atol=1e-9)
 
@@ -68,9 +68,9 @@ def test_scenes_say_what_they_offer(name: str) -> None:
     task = envs.find(name)
     scene, _, state = task.start(2, like=torch.zeros((), dtype=torch.float64))
     here = scene_names.layout(scene)
-    made = rewarded(task, reward({"late": "time"}))
+    made = with_reward(task, reward({"late": "time"}))
     seen = tree.map(lambda x: x, _seen(made, state))
-    found, rows = scene_names.named(task, here, seen), scene_names.table(task, here, seen)
+    found, rows = scene_names.named_values(task, here, seen), scene_names.names_table(task, here, seen)
     assert {row["name"] for row in rows} == found.keys() and all(row["what"] for row in rows)
     for value in found.values():
         assert (
@@ -92,14 +92,14 @@ def _seen(task: Any, state: Any) -> Any:
 def test_names_of_the_rings_are_their_centres() -> None:
     task = envs.find("wiring_ring")
     scene, _, state = task.start(2, like=torch.zeros((), dtype=torch.float64))
-    found = scene_names.named(task, scene_names.layout(scene), _seen(task, state))
+    found = scene_names.named_values(task, scene_names.layout(scene), _seen(task, state))
     assert found["ring_1"][0].tolist() == [0.09, -0.27, 0.05]
     assert found["passes_0"].tolist() == [0.0, 0.0]
 
 
 def test_unknown_names_are_said_when_the_task_is_made() -> None:
     with pytest.raises(InputError, match="there is no ring_7; this scene has"):
-        rewarded(envs.find("wrapping"), reward({"a": "z(ring_7)"}))
+        with_reward(envs.find("wrapping"), reward({"a": "z(ring_7)"}))
 
 
 @pytest.mark.slow
@@ -116,7 +116,7 @@ def test_a_cut_demonstration_ends_where_the_whole_one_does() -> None:
         assert part.horizon == 8 and part.travels == 0
         after = episode.prepare(part, 1, like=like, compiled=False)
         rest = episode.play(part, actions[:, 22:], episode=after)
-        done, _ = concluded(after, rest.world, task)
+        done, _ = task_success(after, rest.world, task)
     torch.testing.assert_close(rest.world.state.rods.pos, whole.world.state.rods.pos, rtol=0, atol=1e-9)
     torch.testing.assert_close(rest.rewards, whole.rewards[22:], rtol=0, atol=1e-9)
     assert bool(done) is bool(whole.success)

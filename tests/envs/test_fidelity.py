@@ -10,7 +10,7 @@ from test_contract import small
 
 from torchdlo import envs
 from torchdlo.agents.trajopt.task_problem import TaskProblem
-from torchdlo.envs import PUBLISHED, TASKS, Fidelity, parse_fidelity, simulated
+from torchdlo.envs import PUBLISHED, TASKS, Fidelity, parse_fidelity, with_fidelity
 from torchdlo.envs.core import episode
 from torchdlo.errors import InputError
 
@@ -29,13 +29,13 @@ def test_texts_and_fidelities_are_the_same(text: str):
 
 @pytest.mark.parametrize("name", TASKS)
 def test_the_cheaper_fidelity_of_every_task_is_stable_and_reaches_the_scene(name: str):
-    task = simulated(envs.find(name), "coarse")
+    task = with_fidelity(envs.find(name), "coarse")
     scene, _, _ = task.start(1)
     assert scene.substeps == task.coarse.substeps < PUBLISHED.substeps
 
 
 def test_an_action_takes_equally_long_in_steps_of_2_ms():
-    task = simulated(replace(envs.find("wiring_post"), horizon=2), "2ms/1/implicit")
+    task = with_fidelity(replace(envs.find("wiring_post"), horizon=2), "2ms/1/implicit")
     world = episode.play(task, torch.zeros(1, 2, 6), compiled=False).world
     # 2 actions of 20 ms.
     torch.testing.assert_close(world.state.time.flatten(), torch.tensor([0.04]))
@@ -46,7 +46,7 @@ def test_a_cheaper_fidelity_is_near_the_published_one():
     actions[..., 1], actions[..., 2] = -0.002, 0.001
     task = replace(envs.find("wiring_post"), horizon=4, frame_skip=5)
     ends = [
-        episode.play(simulated(task, how), actions, compiled=False).world.state.rods.pos
+        episode.play(with_fidelity(task, how), actions, compiled=False).world.state.rods.pos
         for how in ("published", "1ms/2")
     ]
     # A tool went 8 mm; ropes differ by less than a twentieth of that, but do differ.
@@ -67,9 +67,9 @@ def test_environments_and_results_name_it():
         (lambda: parse_fidelity("1ms/0"), "substeps is 0"),
         (lambda: parse_fidelity("1ms/2/midpoint"), "integrator is 'midpoint'"),
         (lambda: Fidelity(step=0.0015), "step is 0.0015"),
-        (lambda: simulated(envs.find("coiling"), Fidelity(3e-3)), "do not divide 20 ms"),
-        (lambda: simulated(envs.find("slingshot"), "1ms/2").start(1), "slingshot cannot be simulated by 1ms/2"),
-        (lambda: simulated(envs.find("lifting"), "2ms/1/implicit").start(1), "lifting cannot be simulated"),
+        (lambda: with_fidelity(envs.find("coiling"), Fidelity(3e-3)), "do not divide 20 ms"),
+        (lambda: with_fidelity(envs.find("slingshot"), "1ms/2").start(1), "slingshot cannot be simulated by 1ms/2"),
+        (lambda: with_fidelity(envs.find("lifting"), "2ms/1/implicit").start(1), "lifting cannot be simulated"),
     ],
 )
 def test_what_is_wrong_is_said(made, said: str):

@@ -36,7 +36,7 @@ def opened(x: torch.Tensor) -> torch.Tensor:
 def test_determinants_of_knots_are_those_of_the_tables():
     # Rolfsen's table: unknot 1, trefoil 3, figure eight 5, cinquefoil 5, 7_1 has 7.
     knots = [torus_knot(1, 2), torus_knot(2, 3), figure_eight(), torus_knot(2, 5), torus_knot(2, 7)]
-    found = curve_geometry.determinant(torch.stack([opened(x) for x in knots]))
+    found = curve_geometry.knot_determinant(torch.stack([opened(x) for x in knots]))
     assert found.tolist() == [1, 3, 5, 5, 7]
 
 
@@ -45,14 +45,14 @@ def test_the_determinant_does_not_depend_on_the_view():
     mirrored = x * x.new_tensor([1.0, -1.0, 1.0])
     a = 0.3
     turned = x @ x.new_tensor([[math.cos(a), math.sin(a), 0], [-math.sin(a), math.cos(a), 0], [0, 0, 1]])
-    assert curve_geometry.determinant(torch.stack([x, mirrored, turned])).tolist() == [3, 3, 3]
+    assert curve_geometry.knot_determinant(torch.stack([x, mirrored, turned])).tolist() == [3, 3, 3]
 
 
 def test_a_loop_that_only_looks_knotted_is_not():
     # The trefoil's top view with every strand above all earlier ones: it can be lifted off.
     x = opened(torus_knot(2, 3))
     x[:, 2] = torch.linspace(0, 1, len(x), dtype=F64)
-    assert curve_geometry.crossings(x) >= 2 and curve_geometry.determinant(x[None]) == 1
+    assert curve_geometry.crossings(x) >= 2 and curve_geometry.knot_determinant(x[None]) == 1
 
 
 def test_crossings_are_counted_once():

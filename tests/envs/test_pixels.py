@@ -14,7 +14,7 @@ from torchdlo import envs
 from torchdlo.envs import TASKS
 from torchdlo.envs.core import episode
 from torchdlo.envs.observations.cameras import TaskCamera
-from torchdlo.envs.observations.pixels import camera_rig, cameras_of, rendered, views
+from torchdlo.envs.observations.pixels import camera_rig, cameras_of, render_cameras, views
 from torchdlo.errors import InputError
 from torchdlo.vision.renderer import ARM, BODY, PARTICLES, ROPE, TABLE
 
@@ -46,7 +46,7 @@ def test_every_task_has_cameras_that_see_what_it_is_about(name: str):
     task, world = made.task, made.start
     names = [camera.name for camera in cameras_of(made)]
     assert names == ["front", "wrist_right", "wrist_left"][: 1 + task.arms.count]
-    seen = rendered(camera_rig(made, size=96), world.state, world.joints, rgb=False, depth=True, ids=True)
+    seen = render_cameras(camera_rig(made, size=96), world.state, world.joints, rgb=False, depth=True, ids=True)
     front, *wrists = seen.ids[0]
     wanted = {TABLE, *(ARM + k for k in range(task.arms.count))}
     wanted |= {ROPE + k for k in range(len(made.scene.topology.counts))}
@@ -102,7 +102,7 @@ def test_pictures_of_a_batch_are_those_of_its_scenes():
     rig, world = env._sensor.rig, env.world
     for b in range(3):
         own = episode.tree.map(lambda x, b=b: x[b : b + 1] if len(x) == 3 else x, world.state)
-        seen = rendered(rig, own, world.joints[b : b + 1]).rgb[0]
+        seen = render_cameras(rig, own, world.joints[b : b + 1]).rgb[0]
         for k, camera in enumerate(rig.cameras):
             assert torch.equal(seen[k], td["pixels", camera.name][b, -1])
     assert not torch.equal(td["pixels", "front"][0], td["pixels", "front"][1])  # starts differ

@@ -13,7 +13,7 @@ from torchdlo import scene as scenes
 from torchdlo.coupling.robot.attachment import Hands
 from torchdlo.envs import TASKS
 from torchdlo.envs.core import curve_geometry, episode, reach
-from torchdlo.envs.core.task import Task, through
+from torchdlo.envs.core.task import Task, actions_through
 from torchdlo.envs.tasks.gathering import GatheringSurrogate
 from torchdlo.physics import tree
 from torchdlo.physics.execution.tracing import record
@@ -32,8 +32,8 @@ def test_arms_can_go_the_way_by_hand(name: str) -> None:
     actions = actions[actions.any(-1).flatten()]  # without those that stay
     with torch.no_grad():
         for action in actions:
-            want = want + episode.limited(task, action)[0]
-            found = reach.solve(task, episode._aim(task, world, action), world.joints, reach.FOLLOW)
+            want = want + episode.limit_action(task, action)[0]
+            found = reach.solve_reach(task, episode._aim(task, world, action), world.joints, reach.FOLLOW)
             assert found.converged.all()
             world = tree.replace(world, joints=found.joints, target=found.handed, tool=found.pose)
     # What counts as there is 0.1 mm away at most; targets add up in single precision.
@@ -72,7 +72,7 @@ def test_ways_by_hand_are_made_on_the_device_of_the_start() -> None:
     off = torch.zeros(1, 3, device="cpu")
     # What is made without a device lands elsewhere and cannot be added.
     with torch.device("meta"):
-        assert through([[(0.03, 0.0, 0.0)]], 6, off).device.type == "cpu"
+        assert actions_through([[(0.03, 0.0, 0.0)]], 6, off).device.type == "cpu"
 
 
 @pytest.mark.parametrize("name", ["lifting", "separation", "wiring_post"])
@@ -127,7 +127,7 @@ def test_the_way_by_hand_takes_an_end_out_of_the_knot() -> None:
     # After 32 actions the first hand is beyond the second strand; then what is left has crossings, but no knot.
     found = led(TASKS["unknotting"](), 32)
     assert not found.failed.any()
-    assert (curve_geometry.determinant(found.world.state.rods.pos) == 1).all()
+    assert (curve_geometry.knot_determinant(found.world.state.rods.pos) == 1).all()
 
 
 def test_the_way_by_hand_shoots_the_ball_at_the_cube() -> None:

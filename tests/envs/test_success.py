@@ -13,10 +13,10 @@ from torchdlo.coupling.common.pose import Pose
 from torchdlo.envs import TASKS
 from torchdlo.envs.assets.rigid_objects import c_ring
 from torchdlo.envs.core import curve_geometry
-from torchdlo.envs.core.task import Task, TaskState, even, straight
+from torchdlo.envs.core.task import Task, TaskState, resample_evenly, straight
 from torchdlo.envs.tasks import letter_art as letters
 from torchdlo.envs.tasks import wiring_post as wiring
-from torchdlo.envs.tasks.lifting import into
+from torchdlo.envs.tasks.lifting import distance_into_ring
 from torchdlo.physics import tree
 
 pytestmark = pytest.mark.quick
@@ -60,7 +60,7 @@ def helix(turns: float, off: float, count: int = 60) -> torch.Tensor:
     height = 0.02 + 0.1 * dense
     radius = 0.12 * (1 - height / 0.30) + off
     angle = 2 * math.pi * turns * dense
-    return even(torch.stack([radius * angle.cos(), radius * angle.sin(), height], -1), count)
+    return resample_evenly(torch.stack([radius * angle.cos(), radius * angle.sin(), height], -1), count)
 
 
 def test_coiling_takes_a_whole_turn_near_the_cone():
@@ -73,7 +73,7 @@ def test_coiling_takes_a_whole_turn_near_the_cone():
 
 
 def test_wiring_takes_the_right_sides_of_both_posts():
-    goal = wiring.goal()
+    goal = wiring.goal_vertices()
     mirrored = goal * goal.new_tensor([1.0, -1.0, 1.0]) + goal.new_tensor([0.0, 0.4, 0.0])
     line = torch.stack([torch.linspace(0.62, 0.04, 30, dtype=F64), torch.full((30,), 0.2, dtype=F64)], -1)
     line = torch.cat([line.flip(0), torch.full((30, 1), 0.01, dtype=F64)], -1)
@@ -88,7 +88,7 @@ def band(points: list[tuple[float, float]], height: float = 0.02) -> torch.Tenso
     dense = torch.cat(
         [torch.lerp(a, b, torch.linspace(0, 1, 500, dtype=F64)[:, None]) for a, b in itertools.pairwise(corners)]
     )
-    flat = even(torch.cat([dense, torch.full((len(dense), 1), height, dtype=F64)], -1), 51)
+    flat = resample_evenly(torch.cat([dense, torch.full((len(dense), 1), height, dtype=F64)], -1), 51)
     return flat[:-1]
 
 
@@ -110,7 +110,11 @@ def two_of_three() -> list[tuple[float, float]]:
     ("name", "good", "worse"),
     [
         ("coiling", helix(1.1, 0.02), (helix(0.9, 0.02), helix(0.5, 0.02), helix(0.5, 0.12))),
-        ("wiring_post", wiring.goal(), tuple(wiring.goal() + step * torch.eye(3)[2] for step in (0.02, 0.03, 0.05))),
+        (
+            "wiring_post",
+            wiring.goal_vertices(),
+            tuple(wiring.goal_vertices() + step * torch.eye(3)[2] for step in (0.02, 0.03, 0.05)),
+        ),
         (
             "wrapping",
             band(triangle(0.024)),
@@ -129,7 +133,7 @@ def test_the_further_from_success_the_more_is_lacking(name, good, worse):
 
 
 def test_the_goal_of_wiring_is_where_the_task_says():
-    goal = wiring.goal()
+    goal = wiring.goal_vertices()
     step = (goal[1:] - goal[:-1]).norm(dim=-1)
     # Chords of an arc of 3 cm that are 2 cm along it: 2 r sin(s / 2 r) = 1.963 cm.
     assert float(step.min()) > 0.0196 and float(step.max()) < 0.02 + 1e-6
@@ -193,7 +197,7 @@ def test_the_way_into_a_ring_leads_over_it_and_through_its_gap():
     degrees = torch.tensor([0.0, 40.0, 60.0, 90.0, 135.0, 180.0, 225.0, 300.0], dtype=F64)
     angle = torch.deg2rad(degrees)
     round_it = torch.stack([-angle.cos(), angle.sin()], -1)
-    way = into(0.1 * round_it)
+    way = distance_into_ring(0.1 * round_it)
     # From the gap straight to where the rope touches the top of the hole; from elsewhere along the ring's outside to an
     # end of the gap, 45 degrees from its middle, and on from there as far out.
     out, top = 0.045 + 0.012 + 0.01, way.new_tensor([0.0, 0.045 - 0.012 - 0.01])
@@ -201,9 +205,12 @@ def test_the_way_into_a_ring_leads_over_it_and_through_its_gap():
     begin = torch.where((degrees > 45)[:, None], end, round_it)
     expected = (0.1 * begin - top).norm(dim=-1) + out * torch.deg2rad((degrees - 45).clamp(min=0))
     assert torch.allclose(way, expected)
-    assert torch.allclose(into(0.02 * round_it), (0.02 * round_it - top).norm(dim=-1)) and float(into(top)) < 1e-9
+    assert (
+        torch.allclose(distance_into_ring(0.02 * round_it), (0.02 * round_it - top).norm(dim=-1))
+        and float(distance_into_ring(top)) < 1e-9
+    )
     middle = torch.zeros(1, 2, dtype=F64, requires_grad=True)
-    assert torch.isfinite(torch.autograd.grad(into(middle).sum(), middle)[0]).all()
+    assert torch.isfinite(torch.autograd.grad(distance_into_ring(middle).sum(), middle)[0]).all()
 
 
 def test_lifting_lacks_less_in_front_of_the_gaps_than_behind_the_rings_and_nothing_in_raised_ones():
@@ -312,7 +319,7 @@ def test_a_hand_that_goes_through_a_ring_has_failed():
 
 
 def test_letters_are_taken_in_their_places():
-    goal = torch.cat(letters.goals())
+    goal = torch.cat(letters.goal_vertices())
     off = torch.zeros_like(goal)
     off[:, 1] = 0.0074  # each vertex at most that far from its goal, both ways: at most 1.48 cm in all
     aside, apart = goal + off, goal.clone()
@@ -323,9 +330,9 @@ def test_letters_are_taken_in_their_places():
 
 
 def test_letters_are_rounded_where_posts_are():
-    for corners, goal, count in zip(letters.CORNERS, letters.goals(), letters.COUNTS, strict=True):
-        _, centres = letters.rounded(corners)
-        dense = curve_geometry.distances(centres, letters.rounded(corners)[0])
+    for corners, goal, count in zip(letters.CORNERS, letters.goal_vertices(), letters.COUNTS, strict=True):
+        _, centres = letters.round_corners(corners)
+        dense = curve_geometry.distances(centres, letters.round_corners(corners)[0])
         for away in dense:
             # A circle of that radius about the post touches the curve from within.
             assert float(away.min()) == pytest.approx(letters.ROUND, rel=1e-9)

@@ -85,7 +85,7 @@ def energy(
 def loads(scene: Scene, params: Params, state: State) -> tuple[Tensor, Tensor]:
     """Forces on vertices [N] (..., V, 3) and torques on edges [N m] (..., V, 1) of the effects in closed form."""
     v = view(scene, params, state)
-    found = effect.total(scene.effects, v, params.effects)
+    found = effect.total_loads(scene.effects, v, params.effects)
     mask = v.params.rest.edge_mask
     pull = found.get("gradient", torch.zeros_like(v.state.pos)) * mask
     force = pull - preceding(scene.topology, pull) + found.get("force", 0.0)

@@ -49,7 +49,7 @@ def test_wind_is_air_drag_seen_from_the_moving_air():
         ("air_drag", v - u, {"air_drag": {"c_d": 1.1}}),
     ):
         built, params, state = make([Rope(x, velocities=velocity, **given)], effects("bend", name), values)
-        found.append(effect.total(built.effects[1:], view(built, params, state), params.effects))
+        found.append(effect.total_loads(built.effects[1:], view(built, params, state), params.effects))
     for key in ("force", "drag"):
         assert torch.allclose(found[0][key], found[1][key], rtol=1e-12, atol=0.0), key
 
@@ -59,7 +59,7 @@ def test_tilted_gravity_is_gravity_turned_about_a_horizontal_axis(angles, wanted
     # R_x (0, 0, -g) = g (0, sin a, -cos a); R_y (0, 0, -g) = g (-sin a, 0, -cos a).
     values = {"tilted_gravity": {"angles": vec(*angles)[None], "acceleration": vec(0, 0, -G)[None]}}
     built, params, state = make([Rope(straight(4), mass=0.1)], effects("gravity", "tilted_gravity"), values)
-    found = effect.total(built.effects, view(built, params, state), params.effects)["acceleration"][0]
+    found = effect.total_loads(built.effects, view(built, params, state), params.effects)["acceleration"][0]
     turned = G * vec(math.sin(0.15) * wanted[0], math.sin(0.15) * wanted[1], -math.cos(0.15))
     assert torch.allclose(found, turned, rtol=1e-14, atol=1e-14)
     both = EFFECTS["tilted_gravity"]().loads(
@@ -144,7 +144,7 @@ def test_a_cycle_of_bending_loses_the_area_of_the_dahl_loop():
 
     def resists(state):
         v = view(built, params, state)
-        loads = effect.total(built.effects[1:], v, params.effects)
+        loads = effect.total_loads(built.effects[1:], v, params.effects)
         pull = loads["gradient"] * v.params.rest.edge_mask
         return (pull - preceding(built.topology, pull))[2]
 
@@ -261,7 +261,7 @@ def test_stiffening_adds_a_cubic_moment():
         {"stiffening_bending": {"c": c}},
     )
     v = view(built, params, state)
-    loads = effect.total(built.effects, v, params.effects)
+    loads = effect.total_loads(built.effects, v, params.effects)
     pull = loads["gradient"] * v.params.rest.edge_mask
     force = (pull - preceding(built.topology, pull))[2]
     k = 2 * math.tan(angle / 2) / H
@@ -316,8 +316,8 @@ def test_a_clamp_that_turns_is_a_spring_in_series(names, share):
     )
     rest = params.rods.rest
     rods = tree.replace(params.rods, rest=tree.replace(rest, share=share * rest.share))
-    free = effect.altered(built.effects[1:], built.topology, rods, params.effects).material
-    held = effect.altered(built.effects, built.topology, rods, params.effects).material
+    free = effect.altered_params(built.effects[1:], built.topology, rods, params.effects).material
+    held = effect.altered_params(built.effects, built.topology, rods, params.effects).material
 
     def matrix(bend):
         return torch.stack([bend[[0, 2]], bend[[2, 1]]]) if bend.shape[-1] == 3 else bend[:, None]

@@ -264,15 +264,15 @@ def test_a_folder_below_one_that_anybody_can_rename_is_not_used(tmp_path):
     open_to_all = tmp_path / "open"
     open_to_all.mkdir()
     open_to_all.chmod(0o777)
-    assert "can replace" in cache.problem(open_to_all / "torchdlo")
+    assert "can replace" in cache.privacy_problem(open_to_all / "torchdlo")
     open_to_all.chmod(0o1777)
-    assert not cache.problem(open_to_all / "torchdlo")
+    assert not cache.privacy_problem(open_to_all / "torchdlo")
 
 
 def test_a_folder_of_another_user_is_not_used(tmp_path):
     (tmp_path / "torchdlo").mkdir(mode=0o700)
     give_away(tmp_path / "torchdlo")
-    assert "belongs to another user" in cache.problem(tmp_path / "torchdlo")
+    assert "belongs to another user" in cache.privacy_problem(tmp_path / "torchdlo")
 
 
 def test_where_no_folder_can_be_made_another_is_used_or_none(tmp_path, folder, monkeypatch, caplog):

@@ -82,7 +82,7 @@ def test_steps_are_recorded_at_first_use_without_gradients_and_run_as_they_are_w
         calls.append(None)
         return (factor * x,)
 
-    recorded = tracing.Recorded(step)
+    recorded = tracing.RecordedStep(step)
     factor, x = torch.tensor(2.0), torch.ones(3)
     for _ in range(3):
         assert torch.equal(recorded(factor, x)[0], 2 * x)
@@ -104,7 +104,7 @@ def test_a_step_that_cannot_be_recorded_runs_as_it_is():
             raise RuntimeError("the recorder does not know this operation")
         return (2 * x,)
 
-    recorded, x = tracing.Recorded(step), torch.ones(3)
+    recorded, x = tracing.RecordedStep(step), torch.ones(3)
     for _ in range(2):
         assert torch.equal(recorded(x)[0], 2 * x)
     assert len(calls) == 3

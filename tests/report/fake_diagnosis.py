@@ -43,7 +43,7 @@ def fake_diagnosis(recording: Recording, **fields: Any) -> Diagnosis:
         speed = np.gradient(t.markers, t.time, axis=0)
         before[t.name] = np.where(t.gripped[:, None], t.markers, t.markers + 0.01 * speed)
         after[t.name] = t.markers + 2e-4 * rng.normal(size=t.markers.shape) * ~t.gripped[:, None]
-    gaps = [floors.gap([x[t.name] for t in recording.test], recording.test) for x in (before, after)]
+    gaps = [floors.trial_gaps([x[t.name] for t in recording.test], recording.test) for x in (before, after)]
     numbers = BASELINE | {"damping_rate": 0.5, "air_drag.c_d": 1.4}
     candidates = [
         Candidate("air_drag", 0.8, 0.95, 0.93, "taken"),

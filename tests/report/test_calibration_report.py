@@ -14,7 +14,7 @@ import pytest
 from tests.fake_calibration import fake_result
 from torchdlo.report import write_report
 from torchdlo.report.figures.calibration_figure import calibration_png
-from torchdlo.report.pages.calibration import calibration_html, verdict
+from torchdlo.report.pages.calibration import calibration_html, calibration_verdict
 from torchdlo.sysid import Recording, load_recording
 
 
@@ -30,19 +30,19 @@ def test_verdict_names_before_after_and_what_to_beat(recording: Recording) -> No
         test_mae_mm=5.06,
         baselines={"frozen_shape": {"test_mae_mm": 31.8}, "catenary": {"test_mae_mm": 20.5}},
     )
-    assert verdict(result, recording) == (
+    assert calibration_verdict(result, recording) == (
         "Calibrated on 2 trials; error on unseen trials 20.0 mm → 5.1 mm (frozen shape 31.8 mm, catenary 20.5 mm)."
     )
 
 
 def test_verdict_does_not_sell_a_bad_model(recording: Recording) -> None:
     worse = fake_result(recording, test_mae_mm=1e3)
-    assert "do not use this" in verdict(worse, recording)
+    assert "do not use this" in calibration_verdict(worse, recording)
     broken = fake_result(recording, test_mae_mm=float("nan"))
-    assert "do not use this" in verdict(broken, recording)
+    assert "do not use this" in calibration_verdict(broken, recording)
     useless = fake_result(recording, before={"train_mae_mm": 0.1, "test_mae_mm": 0.1})
-    assert "did not help" in verdict(useless, recording)
-    assert "interrupted" in verdict(fake_result(recording, interrupted=True), recording)
+    assert "did not help" in calibration_verdict(useless, recording)
+    assert "interrupted" in calibration_verdict(fake_result(recording, interrupted=True), recording)
 
 
 def test_page_is_self_contained(recording: Recording, tmp_path: Path) -> None:

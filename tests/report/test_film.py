@@ -15,11 +15,11 @@ sys.path.append(str(Path(__file__).parents[1] / "agents"))
 from test_render import enclosed
 from test_tasks import Lead
 
-from torchdlo.coupling.robot.kinematics import panda, tool_pose
+from torchdlo.coupling.robot.robot_kinematics import panda, tool_pose
 from torchdlo.envs import find
 from torchdlo.envs.core import episode
 from torchdlo.report.render.episode_film import film, outcome_of, surfaces
-from torchdlo.report.render.surfaces import extent, pieces
+from torchdlo.report.render.run_surfaces import extent, pieces
 
 
 @pytest.fixture(scope="module")

@@ -11,7 +11,7 @@ from test_render import scene
 from torchdlo.errors import InputError
 from torchdlo.report.render import photo
 from torchdlo.report.render import picture as render
-from torchdlo.report.render.surfaces import pieces
+from torchdlo.report.render.run_surfaces import pieces
 from torchdlo.scene_files.run import run
 
 LIBRARIES = all(importlib.util.find_spec(name) for name in ("mitsuba", "pyoidn"))
@@ -37,7 +37,7 @@ def test_ropes_are_laid_within_their_radius():
 @pytest.mark.slow
 @pytest.mark.skipif(not LIBRARIES, reason="mitsuba and pyoidn are not installed")
 def test_photographs_show_the_rope_where_it_is(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(photo, "variant", lambda: "scalar_rgb")
+    monkeypatch.setattr(photo, "mitsuba_variant", lambda: "scalar_rgb")
     frames = run(scene())
     with photo.Photo(frames, size=(64, 48), samples=4) as picture:
         image = picture.image(0).astype(float)

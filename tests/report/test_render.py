@@ -14,7 +14,7 @@ import torch
 
 from torchdlo.coupling.bodies import shape_sdf
 from torchdlo.errors import InputError
-from torchdlo.report.render import surfaces
+from torchdlo.report.render import run_surfaces
 from torchdlo.scene_files import (
     Attachment,
     BodySpec,
@@ -49,7 +49,7 @@ def enclosed(corners: np.ndarray, faces: np.ndarray) -> tuple[float, np.ndarray]
 def test_surfaces_enclose_the_volume_of_the_solid_about_its_centre_of_mass(shape):
     size = np.ones(3)
     size[: len(SIZES[shape])] = SIZES[shape]
-    volume, centre = enclosed(*surfaces._solid(shape, size, 1.0))
+    volume, centre = enclosed(*run_surfaces._solid(shape, size, 1.0))
     wanted = float(shape_sdf.bulk(shape, torch.as_tensor(size))[0])
     # A polygon of n corners in a circle lacks 1 - sin(2 pi / n) n / (2 pi) of its area. Rings have 16 corners round the
     # tube, other shapes 24 along an arc at least.
@@ -70,7 +70,7 @@ def test_tubes_lie_round_their_ropes_and_are_closed():
     angle = np.linspace(0, 2 * np.pi, 24, endpoint=False)
     ring = tuple(map(tuple, np.stack([0.2 * np.cos(angle), 0.2 * np.sin(angle), 0 * angle], 1).tolist()))
     frames = run(scene(ropes=(scene().ropes[0], RopeSpec(ring, closed=True, radius=0.01, mass=0.01, bend=1e-3))))
-    straight, round_ = surfaces.pieces(frames)
+    straight, round_ = run_surfaces.pieces(frames)
     corners = straight.at(frames, 0)
     rings = corners[:-2]
     assert np.abs(np.hypot(rings[:, 1], rings[:, 2] - 0.5) - 0.01).max() < 1e-9
@@ -93,7 +93,7 @@ def test_the_camera_is_fitted_to_what_moves_and_not_to_large_bodies_that_stand()
             keyframes=(Keyframe(0.02, move=(0.1, 0.0, 0.0)),),
         ),
     )
-    low, high = surfaces.bounds(run(scene(bodies=bodies)))
+    low, high = run_surfaces.bounds(run(scene(bodies=bodies)))
     assert low[0] == pytest.approx(0.0, abs=1e-6) and high[0] == pytest.approx(1.05, abs=1e-6)
 
 
@@ -185,12 +185,12 @@ def test_stills_stand_side_by_side(drawing):
 
 def test_a_video_has_a_picture_for_every_thirtieth_of_a_second(drawing, tmp_path):
     av = pytest.importorskip("av", reason="videos need the extra view")
-    from torchdlo.report.render import video
+    from torchdlo.report.render import video_writer
 
     frames = run(scene(effects={"gravity": {}, "bend": {}}, attachments=(Attachment((0,)),), duration=0.1))
     seen = []
     path = tmp_path / "motion.mp4"
-    video.write_video(frames, path, speed=0.5, size=(160, 120), callback=lambda *a: seen.append(a))
+    video_writer.write_video(frames, path, speed=0.5, size=(160, 120), callback=lambda *a: seen.append(a))
     with av.open(str(path)) as file:
         images = [x.to_ndarray(format="rgb24") for x in file.decode(video=0)]
     # 0.1 s at half speed: pictures at 0, 1/30, ..., 6/30 s.
@@ -199,36 +199,36 @@ def test_a_video_has_a_picture_for_every_thirtieth_of_a_second(drawing, tmp_path
     # The rope falls: its free end, to the right, is lower in the last picture.
     ends = [np.nonzero(drawn(x)[:100])[0].max() for x in (images[0], images[-1])]
     assert ends[1] > ends[0] + 5
-    video.check_video(path)
+    video_writer.check_video(path)
     path.write_bytes(b"\x00\x00\x00\x20ftypisom of somebody else")
     with pytest.raises(InputError, match="was not written by torchdlo"):
-        video.check_video(path)
+        video_writer.check_video(path)
 
 
 def test_a_video_that_is_stopped_leaves_nothing(drawing, tmp_path):
     pytest.importorskip("av", reason="videos need the extra view")
-    from torchdlo.report.render import video
+    from torchdlo.report.render import video_writer
 
     def stop(*_):
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        video.write_video(run(scene()), tmp_path / "motion.mp4", size=(160, 120), callback=stop)
+        video_writer.write_video(run(scene()), tmp_path / "motion.mp4", size=(160, 120), callback=stop)
     assert not list(tmp_path.iterdir())
     with pytest.raises(InputError, match="speed: expected a number above 0"):
-        video.write_video(run(scene()), tmp_path / "motion.mp4", speed=0.0)
+        video_writer.write_video(run(scene()), tmp_path / "motion.mp4", speed=0.0)
 
 
 @pytest.mark.parametrize(("name", "what"), [("pyvista", "pictures"), ("av", "videos"), ("viser", "viewer")])
 def test_a_missing_package_is_named(name, what, monkeypatch, tmp_path):
     from torchdlo.report.render import picture as render
-    from torchdlo.report.render import video
+    from torchdlo.report.render import video_writer
     from torchdlo.report.viewer import server as view
 
     monkeypatch.setitem(sys.modules, name, None)
     calls = {
         "pyvista": render.check_renderer,
-        "av": lambda: video.check_video(tmp_path / "a"),
+        "av": lambda: video_writer.check_video(tmp_path / "a"),
         "viser": view._check_viser,
     }
     with pytest.raises(InputError, match=rf"{what}.* needs? the package {name}; install it with .*torchdlo\[view\]"):

@@ -261,13 +261,13 @@ def test_levenberg_marquardt_finds_the_minimum_of_a_known_curve() -> None:
 
     measured = np.array(decay(np.array([[1.7]]))[0])
     points = levenberg_marquardt.evaluate(decay, measured, space, space.to_raw(np.array([[0.3]])))
-    *_, last = levenberg_marquardt.improve(decay, measured, space, points, iterations=30, tolerance=1e-9)
+    *_, last = levenberg_marquardt.improve_points(decay, measured, space, points, iterations=30, tolerance=1e-9)
     assert space.to_values(last[0].raw)[0] == pytest.approx(1.7, rel=1e-4)
 
 
 def test_large_errors_leave_less_curvature_and_what_is_not_seen_none() -> None:
     space = levenberg_marquardt.ParameterSpace(("damping_rate",), (PARAMETERS["damping_rate"],))
-    look = levenberg_marquardt.Look(space, space.to_raw(np.array([[0.8]])))
+    look = levenberg_marquardt.PointEvaluation(space, space.to_raw(np.array([[0.8]])))
     measured = np.linspace(0.0, 1.0, 20)[None, :, None, None] * np.ones((2, 1, 4, 3))
     measured[1, 5:] = np.nan  # a short trial
     off = np.array([0.0, 3e-3])[:, None, None, None] + 1e-4 * np.arange(len(look.values))[:, None, None, None, None]
@@ -285,7 +285,7 @@ def test_ranges_take_in_what_wrong_simulations_change() -> None:
         return 1e-3 * space.to_raw(values)[:, 0, None, None, None, None] * time
 
     raw = space.to_raw(np.array([[0.8]]))
-    look, measured = levenberg_marquardt.Look(space, raw), slide(np.array([[0.8]]))[0]
+    look, measured = levenberg_marquardt.PointEvaluation(space, raw), slide(np.array([[0.8]]))[0]
     (point,) = look.points(slide(look.values), measured)
     drifts = levenberg_marquardt.drift(look, slide(look.values), measured, [2e-5 * time, 0.0 * time])
     # Simulations that run 2 % of a unit too fast make the fit find so much less.

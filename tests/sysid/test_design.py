@@ -13,16 +13,16 @@ from scipy.spatial.transform import Rotation
 
 from tests.test_cli import run
 from torchdlo.errors import InputError
-from torchdlo.report.pages import design as report
+from torchdlo.report.pages import design_page as report
 from torchdlo.sysid.diagnosis import budget
-from torchdlo.sysid.diagnosis.error_floor import gap
+from torchdlo.sysid.diagnosis.error_floor import trial_gaps
 from torchdlo.sysid.estimation.jobs import FitJob, SimulationJob
 from torchdlo.sysid.estimation.result_cache import digest
 from torchdlo.sysid.estimation.worker_pool import Pool
 from torchdlo.sysid.experiment_design import design as search
 from torchdlo.sysid.experiment_design import excitation_motions
 from torchdlo.sysid.experiment_design.design import Design, design_experiment, design_json
-from torchdlo.sysid.experiment_design.model_discrimination import size
+from torchdlo.sysid.experiment_design.model_discrimination import rms_size
 from torchdlo.sysid.model import initial_state as starts
 from torchdlo.sysid.model import model_file
 from torchdlo.sysid.model.rope_model import RopeModel
@@ -132,7 +132,7 @@ def refitted(design: Design, recording: Recording, new: Trial) -> dict[str, tupl
             job = FitJob(rival.effects, rival.values[None], rival.space.names, tuple(rival.space.units), 3, start)
             ((_, fitted),) = pool.fit([job])
             ((_, sims),) = pool.simulate([SimulationJob(rival.effects, fitted.values[None], "train", start)])
-            gaps = gap(sims[0], joined.train)
+            gaps = trial_gaps(sims[0], joined.train)
             found[name] = float(np.sqrt(np.mean(gaps[:-1] ** 2))), float(gaps[-1])
     return found
 
@@ -150,7 +150,7 @@ def test_the_suggested_motion_separates_what_the_recording_cannot(design: Design
     # Of 51 x 5 x 3 noisy coordinates the root mean square scatters by 2.6 %; four times that.
     assert gaps["tilted_gravity"][1] == pytest.approx(NOISE, rel=0.1)
     # Squares add up: what the rival leaves above the noise is what was foretold for it.
-    foretold = next(size(p.left) for p in design.pairs if p.truth == "tilted_gravity")
+    foretold = next(rms_size(p.left) for p in design.pairs if p.truth == "tilted_gravity")
     left = np.sqrt(gaps["rest_curvature"][1] ** 2 - NOISE**2)
     assert left > 0.5 * foretold and left > design.needed * design.noise
 
@@ -176,11 +176,11 @@ def test_motions_stay_within_what_was_recorded(tmp_path: Path) -> None:
     # 4 cm to and fro once a second: 2 cm to each side, 2 pi 2 cm/s; smoothing over 0.1 s takes 1 % off a sine.
     np.testing.assert_allclose(rig.reach, [0.02, 0.02, 0.0], atol=2e-5)
     assert rig.speed == pytest.approx(0.04 * np.pi, rel=0.02)
-    found = excitation_motions.menu(rig, 2.0, 9.81)
+    found = excitation_motions.motion_menu(rig, 2.0, 9.81)
     assert {"hold", "swing", "ladder", "stop", "circle", "roll"} == {g.kind for g in found}
-    tried = [*found, *excitation_motions.near(found[4], np.random.default_rng(0), 8, 1.0, 2.0)]
+    tried = [*found, *excitation_motions.nearby_motions(found[4], np.random.default_rng(0), 8, 1.0, 2.0)]
     for gesture in tried:
-        trial = excitation_motions.play(rig, gesture, 2.0, "motion")
+        trial = excitation_motions.motion_trial(rig, gesture, 2.0, "motion")
         centre = trial.markers[:, GRIPPED].mean(1)
         level = Rotation.from_rotvec([0.0, 0.0, -gesture.heading]).apply(centre - centre[0])
         speed = np.linalg.norm(np.gradient(centre, trial.time, axis=0), axis=-1)
@@ -193,7 +193,7 @@ def test_motions_stay_within_what_was_recorded(tmp_path: Path) -> None:
 
 def test_a_roll_turns_the_clamp_about_the_rope(tmp_path: Path) -> None:
     rig = excitation_motions.make_rig(empty(tmp_path))
-    trial = excitation_motions.play(rig, excitation_motions.ExcitationMotion("roll", 0.5), 2.5, "motion")
+    trial = excitation_motions.motion_trial(rig, excitation_motions.ExcitationMotion("roll", 0.5), 2.5, "motion")
     turn = Rotation.from_quat(trial.gripper_quaternion[:, 0], scalar_first=True)
     np.testing.assert_allclose(turn.apply([1.0, 0, 0]), np.tile([0, 0, -1.0], (len(turn), 1)), atol=1e-12)
     # Half a turn, from the clamp's y axis to its opposite.
@@ -212,8 +212,8 @@ def test_two_clamps_come_as_close_as_they_were(tmp_path: Path) -> None:
     trial = replace(trial, markers=markers, gripped=both, gripper_quaternion=None, gripper_marker=None)
     rig = excitation_motions.make_rig(replace(bare, train=(trial,), test=()))
     assert rig.closer == pytest.approx(0.05, rel=0.02)
-    gesture = next(g for g in excitation_motions.menu(rig, 2.0, 9.81) if g.kind == "against")
-    played = excitation_motions.play(rig, gesture, 2.0, "motion").markers
+    gesture = next(g for g in excitation_motions.motion_menu(rig, 2.0, 9.81) if g.kind == "against")
+    played = excitation_motions.motion_trial(rig, gesture, 2.0, "motion").markers
     apart = np.linalg.norm(played[:, -2:].mean(1) - played[:, :2].mean(1), axis=-1)
     assert 0.005 < apart[0] - apart.min() <= rig.closer + 1e-9 and apart.max() <= apart[0] + 1e-12
     middle = played[:, both].mean(1)
@@ -223,8 +223,8 @@ def test_two_clamps_come_as_close_as_they_were(tmp_path: Path) -> None:
 def test_a_larger_scale_allows_larger_and_faster_motions(tmp_path: Path) -> None:
     rig, wider = (excitation_motions.make_rig(empty(tmp_path), scale) for scale in (1.0, 3.0))
     gesture = excitation_motions.ExcitationMotion("swing", 1.0)
-    assert excitation_motions.travel(wider, gesture, 2.0)[0] == pytest.approx(
-        3 * excitation_motions.travel(rig, gesture, 2.0)[0]
+    assert excitation_motions.largest_amplitude(wider, gesture, 2.0)[0] == pytest.approx(
+        3 * excitation_motions.largest_amplitude(rig, gesture, 2.0)[0]
     )
 
 

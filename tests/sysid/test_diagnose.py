@@ -14,14 +14,14 @@ from scipy.spatial.transform import Rotation
 from torchdlo.errors import InputError
 from torchdlo.physics.effects import EFFECTS
 from torchdlo.report.pages import diagnosis as report
-from torchdlo.sysid.diagnosis import clamp_models, effect_library, error_floor, search
+from torchdlo.sysid.diagnosis import clamp_models, effect_library, effect_search, error_floor
 from torchdlo.sysid.diagnosis.backward_elimination import EliminationResult, Revision
 from torchdlo.sysid.diagnosis.budget import BUDGETS
-from torchdlo.sysid.diagnosis.candidate_fits import extend
+from torchdlo.sysid.diagnosis.candidate_fits import extension_jobs
 from torchdlo.sysid.diagnosis.findings import findings, findings_json, model_json, summary
 from torchdlo.sysid.diagnosis.score_test import Score
 from torchdlo.sysid.diagnosis.significance import Agreement
-from torchdlo.sysid.diagnosis.verdict import word
+from torchdlo.sysid.diagnosis.verdict import verdict_word
 from torchdlo.sysid.diagnosis.workspace import Workspace
 from torchdlo.sysid.estimation.jobs import Fitted
 from torchdlo.sysid.estimation.levenberg_marquardt import ParameterSpace, Point, interval
@@ -140,7 +140,7 @@ def test_smooth_starts_are_explained_exactly(tmp_path: Path) -> None:
     time = 0.01 * np.arange(11)
     gap = (at @ a)[:, None] + time[:, None, None] * (at @ b)[:, None]
     gap[:, 3, 2] = np.nan
-    shift, drift = equilibrium.explain(gap, at, 0.01, shapes)
+    shift, drift = equilibrium.explain_gap(gap, at, 0.01, shapes)
     np.testing.assert_allclose(shift, shapes @ a, atol=1e-9)
     np.testing.assert_allclose(drift, shapes @ b, atol=1e-7)
 
@@ -152,12 +152,12 @@ def test_noise_is_read_off_fourth_differences(tmp_path: Path) -> None:
     noisy = replace(long, markers=long.markers + 3e-4 * rng.normal(size=long.markers.shape))
     # Of 8 x 3 x 800 differences the median deviation is known to 1 %; what is smooth adds 0.02^4 of its fourth
     # gradient.
-    assert error_floor.noise(replace(recording, train=(noisy,))) == pytest.approx(3e-4, rel=0.05)
+    assert error_floor.marker_noise(replace(recording, train=(noisy,))) == pytest.approx(3e-4, rel=0.05)
 
 
 def test_an_unknown_budget_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="budget is 'huge'; expected one of fast, full"):
-        search.diagnose(make_empty(tmp_path), budget="huge")
+        effect_search.diagnose(make_empty(tmp_path), budget="huge")
 
 
 @pytest.mark.slow
@@ -167,10 +167,10 @@ def test_a_hidden_effect_is_named_and_none_where_there_is_none(
 ) -> None:
     # Two names keep it short; the mesh and the steps are not those of the recording.
     monkeypatch.setattr(effect_library, "LIBRARY", ("air_drag", "point_mass"))
-    monkeypatch.setattr(search, "BUDGETS", {"fast": search.Budget(3, 2, 3, 3, 1)})
+    monkeypatch.setattr(effect_search, "BUDGETS", {"fast": effect_search.Budget(3, 2, 3, 3, 1)})
     recording = make_recording(tmp_path, effects)
     stages = []
-    result = search.diagnose(recording, vertices=31, workers=1, callback=lambda *step: stages.append(step))
+    result = effect_search.diagnose(recording, vertices=31, workers=1, callback=lambda *step: stages.append(step))
     assert result.effects == named and result.verdict == ("effects" if named else "none")
     found = findings(result, recording)
     assert set(found["gap"]) >= {"test_rmse_before_m", "test_rmse_after_m", "noise_floor_m", "per_trial"}
@@ -191,11 +191,11 @@ def test_a_clamp_that_turns_is_told_from_one_in_which_the_rope_bends(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # As soft as 5 mm of rope: half way between a clamp that is stiff up to its last marker and one that is not.
-    monkeypatch.setattr(search, "BUDGETS", {"fast": search.Budget(3, 1, 3, 3, 1)})
+    monkeypatch.setattr(effect_search, "BUDGETS", {"fast": effect_search.Budget(3, 1, 3, 3, 1)})
     recording = make_recording(tmp_path, {"gripper_compliance.stiffness": 0.4}, grip=1.0)
     looked = {"gripper_compliance", "nonuniform_stiffness"}
     without = [name for name in effect_library.LIBRARY if name not in looked]
-    result = search.diagnose(recording, vertices=31, workers=1, without=without)
+    result = effect_search.diagnose(recording, vertices=31, workers=1, without=without)
     assert result.effects == ["gripper_compliance"]
     said = findings(result, recording)
     assert said["effects"][0]["parameters"]["stiffness"]["value"] == pytest.approx(0.4, rel=0.2)
@@ -204,7 +204,7 @@ def test_a_clamp_that_turns_is_told_from_one_in_which_the_rope_bends(
 
 def test_an_effect_that_is_not_there_cannot_be_left_out(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="without: windy is no effect that can be looked for; did you mean wind"):
-        search.diagnose(make_empty(tmp_path), without=["windy"])
+        effect_search.diagnose(make_empty(tmp_path), without=["windy"])
 
 
 def test_what_a_clamp_may_be_in_which_the_rope_bends_moves_alike(tmp_path: Path) -> None:
@@ -216,12 +216,12 @@ def test_what_a_clamp_may_be_in_which_the_rope_bends_moves_alike(tmp_path: Path)
         # 1 cm of rope from the middle of the clamp to its end: 2e-3 / 0.01 N m/rad. The grippers do not twist the rope.
         numbers |= {"gripper_compliance.stiffness": 0.2} if effects else {}
         values = np.array([numbers[name] for name in model.parameters])
-        said.append(clamp_models.notes(model, SimpleNamespace(effects=effects, values=values)))
+        said.append(clamp_models.clamp_notes(model, SimpleNamespace(effects=effects, values=values)))
         motion = model.motion(recording.train)
         sims.append(model.simulate(motion, read_off(recording.train), values[None])[0])
     assert ["0.2 N m/rad (gripper compliance)" in note for note in said[0]] == [True] and not said[1]
     np.testing.assert_allclose(sims[0], sims[1], atol=1e-6)
-    assert not clamp_models.notes(
+    assert not clamp_models.clamp_notes(
         RopeModel(recording, vertices=31, clamp_fraction=1.0), SimpleNamespace(effects=(), values=values)
     )
 
@@ -240,7 +240,7 @@ def test_vectors_are_fitted_whole_and_what_no_dose_uses_is_not(
     bench = SimpleNamespace(recording=make_empty(tmp_path), extension=lambda base, score, numbers, *_: numbers)
     doses = {f"{name}.{k}": v for k, v in dose.items()}
     score = Score(name, 0.5, doses, ((doses, np.zeros(0)),), {}, np.zeros(0))
-    (numbers,) = extend(bench, None, score, 4, None)
+    (numbers,) = extension_jobs(bench, None, score, 4, None)
     assert set(numbers) == {f"{name}.{k}" for k in fitted}
 
 
@@ -254,7 +254,7 @@ def test_a_slope_and_a_spot_are_fitted_side_by_side(tmp_path: Path) -> None:
     score = Score(
         "nonuniform_stiffness", 0.5, gradient, tuple((d, np.zeros(0)) for d in (gradient, spot, gradient)), {}, None
     )
-    jobs = extend(bench, None, score, 4, None)
+    jobs = extension_jobs(bench, None, score, 4, None)
     assert jobs == [(["slope"], 2), (["position", "width", "factor"], 1)]
 
 
@@ -310,7 +310,7 @@ def test_what_steps_may_do_is_no_finding_nor_what_explains_no_more(
         )
         for name, cost in costs.items()
     }
-    judge = object.__new__(search._Search)
+    judge = object.__new__(effect_search._Search)
     judge.bench, judge.pool = SimpleNamespace(tie=twentieth), SimpleNamespace(local=SimpleNamespace())
     judge.pool.local.model = lambda *_: model
     judge._gain = lambda *_: 0.6
@@ -326,7 +326,7 @@ def test_what_steps_may_do_is_no_finding_nor_what_explains_no_more(
 @pytest.mark.parametrize(("p", "units", "refused"), [(1e-4, 16, False), (0.02, 16, True), (0.25, 2, False)])
 def test_what_may_be_chance_is_refused_where_that_can_be_told(p: float, units: int, refused: bool) -> None:
     tests = {"air_drag": replace(SURE, p=p, units=units)}
-    assert bool(object.__new__(search._Search)._chance(tests, 16)) == refused
+    assert bool(object.__new__(effect_search._Search)._chance(tests, 16)) == refused
 
 
 @pytest.mark.parametrize(("speed", "first"), [(0.02, "air_drag"), (0.4, "wind")])
@@ -349,7 +349,7 @@ def test_a_general_law_is_named_only_where_its_other_numbers_tell(
     fits = {"wind": fitted("wind", 0.8e-3), "air_drag": fitted("air_drag", 1e-3)}
     low, high = interval(fits["wind"].point, fits["wind"].space)
     assert (low[0] < 0) == (first == "air_drag") and high[0] < 1.0
-    judge = object.__new__(search._Search)
+    judge = object.__new__(effect_search._Search)
     judge.bench = SimpleNamespace(tie=twentieth)
     asked = {"_refused": None, "_gain": 0.5, "_agreement": SURE, "_below_steps": {}, "_closest": None}
     for name, value in asked.items():
@@ -375,14 +375,14 @@ def test_an_effect_matters_beside_a_baseline_that_went_astray() -> None:
 
 
 def test_nothing_counts_as_explained_where_the_floor_is_not_known() -> None:
-    assert word([], 2e-3, 1e-3) == "none" and word([], 4e-3, 1e-3) == "unknown"
-    assert word([], 0.2, float("inf")) == "unknown"
-    assert word(["stretch"], 1e-3, float("inf")) == "partial"
+    assert verdict_word([], 2e-3, 1e-3) == "none" and verdict_word([], 4e-3, 1e-3) == "unknown"
+    assert verdict_word([], 0.2, float("inf")) == "unknown"
+    assert verdict_word(["stretch"], 1e-3, float("inf")) == "partial"
 
 
 def test_effects_that_leave_the_gap_as_it_was_do_not_explain_it() -> None:
-    assert [word(["wind"], 2e-3, 1e-3, share) for share in (0.3, 0.9, 1.1)] == ["effects", "partial", "partial"]
-    assert word([], 2e-3, 1e-3, 1.0) == "none"
+    assert [verdict_word(["wind"], 2e-3, 1e-3, share) for share in (0.3, 0.9, 1.1)] == ["effects", "partial", "partial"]
+    assert verdict_word([], 2e-3, 1e-3, 1.0) == "none"
 
 
 @pytest.mark.parametrize(("cost", "named"), [(0.7e-3, "air_drag"), (1.5e-3, "wind")])

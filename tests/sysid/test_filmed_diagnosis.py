@@ -11,13 +11,13 @@ import pytest
 from torchdlo.report.pages import diagnosis as page
 from torchdlo.sysid.diagnosis.budget import BUDGETS, Budget
 from torchdlo.sysid.diagnosis.effect_library import LIBRARY
+from torchdlo.sysid.diagnosis.effect_search import diagnose
 from torchdlo.sysid.diagnosis.findings import findings_json, model_json, summary
-from torchdlo.sysid.diagnosis.search import diagnose
 from torchdlo.sysid.recordings.recording import load_recording
 from torchdlo.sysid.video import filmed_diagnosis
 from torchdlo.sysid.video.filming import film_recording
 from torchdlo.vision.camera import looking_at
-from torchdlo.vision.film import Look
+from torchdlo.vision.film import FilmLook
 
 SAMPLE = Path(__file__).parents[2] / "torchdlo" / "data" / "sample_rope"
 
@@ -25,7 +25,7 @@ SAMPLE = Path(__file__).parents[2] / "torchdlo" / "data" / "sample_rope"
 @pytest.mark.slow
 def test_a_diagnosis_of_films_says_what_it_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     camera = looking_at("a", [0.15, -1.35, 1.0], [0.0, 0.0, 0.88], focal=650.0)
-    film_recording(load_recording(SAMPLE), [camera], tmp_path / "rope", Look(noise=1.0), trials=1, seconds=0.5)
+    film_recording(load_recording(SAMPLE), [camera], tmp_path / "rope", FilmLook(noise=1.0), trials=1, seconds=0.5)
     recording = load_recording(tmp_path / "rope")
     monkeypatch.setattr(filmed_diagnosis, "FILMED_STARTS", 4)
     monkeypatch.setattr(filmed_diagnosis, "SILENT", 0.0)

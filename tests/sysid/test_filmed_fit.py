@@ -10,7 +10,7 @@ import pytest
 
 from torchdlo.errors import InputError
 from torchdlo.sysid.calibration.calibrate import calibrate
-from torchdlo.sysid.diagnosis.search import diagnose
+from torchdlo.sysid.diagnosis.effect_search import diagnose
 from torchdlo.sysid.model.rope_model import RopeModel
 from torchdlo.sysid.model.trial_batch import Start
 from torchdlo.sysid.recordings.recording import load_recording

@@ -13,7 +13,7 @@ from torchdlo.sysid.recordings.recording import load_recording
 from torchdlo.sysid.video.filming import film_recording
 from torchdlo.sysid.video.footage import views_of
 from torchdlo.vision.camera import looking_at, save_cameras
-from torchdlo.vision.film import Look
+from torchdlo.vision.film import FilmLook
 from torchdlo.vision.segment import save_masks
 
 SAMPLE = Path(__file__).parents[2] / "torchdlo" / "data" / "sample_rope"
@@ -28,7 +28,7 @@ def view_of_sample(**others):
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The sample recording, filmed for half a second; read only."""
     out = tmp_path_factory.mktemp("films") / "rope"
-    film_recording(load_recording(SAMPLE), [view_of_sample()], out, Look(noise=1.0), trials=1, seconds=0.5)
+    film_recording(load_recording(SAMPLE), [view_of_sample()], out, FilmLook(noise=1.0), trials=1, seconds=0.5)
     return out
 
 

@@ -14,7 +14,7 @@ from tests.report.fake_diagnosis import BASELINE, fake_diagnosis, fitted
 from tests.sysid.swaying import recording as swaying
 from torchdlo.physics.effects import EFFECTS
 from torchdlo.sysid.diagnosis import effect_library
-from torchdlo.sysid.diagnosis.effect_equations import LAWS, MEANING, separating
+from torchdlo.sysid.diagnosis.effect_equations import LAWS, MEANING, separating_experiment
 from torchdlo.sysid.diagnosis.error_floor import ErrorFloor
 from torchdlo.sysid.diagnosis.findings import absorbed, confidence, findings, findings_json, summary
 from torchdlo.sysid.diagnosis.verdict import Diagnosis
@@ -117,7 +117,11 @@ def test_every_effect_has_a_law_with_its_numbers() -> None:
 
 
 def test_experiments_do_not_depend_on_the_order() -> None:
-    assert separating("wind", "tilted_gravity") == separating("tilted_gravity", "wind") != separating("wind", "stretch")
+    assert (
+        separating_experiment("wind", "tilted_gravity")
+        == separating_experiment("tilted_gravity", "wind")
+        != separating_experiment("wind", "stretch")
+    )
 
 
 def test_the_page_on_diagnoses_has_the_library_with_its_laws() -> None:

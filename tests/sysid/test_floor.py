@@ -124,5 +124,5 @@ def test_gaps_are_weighted_by_frame(tmp_path: Path) -> None:
     sims = np.stack([t.markers for t in trials]) + 1e-3
     frame_weights = np.zeros((3, 10))
     frame_weights[1], frame_weights[2, :5] = 1.0, 2.0
-    np.testing.assert_allclose(error_floor.gap(sims, trials), 1e-3)
-    np.testing.assert_allclose(error_floor.gap(sims, trials, frame_weights), [0.0, 1e-3, np.sqrt(2) * 1e-3])
+    np.testing.assert_allclose(error_floor.trial_gaps(sims, trials), 1e-3)
+    np.testing.assert_allclose(error_floor.trial_gaps(sims, trials, frame_weights), [0.0, 1e-3, np.sqrt(2) * 1e-3])

@@ -12,7 +12,8 @@ import pytest
 
 from tests.sysid.swaying import recording as swaying
 from torchdlo.errors import InputError
-from torchdlo.sysid.diagnosis import effect_library, search
+from torchdlo.sysid.diagnosis import effect_library
+from torchdlo.sysid.diagnosis import effect_search as search
 from torchdlo.sysid.diagnosis.effect_library import PARAMETERS
 from torchdlo.sysid.diagnosis.findings import findings, model_json
 from torchdlo.sysid.estimation import result_cache as journals

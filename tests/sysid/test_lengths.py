@@ -7,7 +7,7 @@ import torch
 
 from torchdlo import scene
 from torchdlo.physics.effects.elastic import Bend
-from torchdlo.sysid.model.length_projection import agree, laid
+from torchdlo.sysid.model.length_projection import agreeing_state, lay_rope
 
 F64 = torch.float64
 COUNT, EDGE = 41, 0.015
@@ -52,7 +52,7 @@ def late():
 def test_edges_get_their_lengths_and_what_is_held_stays(case):
     pos, held = case()
     made, params, state = started(pos, held)
-    found = agree(made, params, state).rods.pos
+    found = agreeing_state(made, params, state).rods.pos
     between = [k for k in range(COUNT - 1) if not {k, k + 1} <= set(held)]
     torch.testing.assert_close(ratios(found)[:, between], torch.ones(2, len(between), dtype=F64), rtol=0, atol=1e-6)
     assert float((found - pos)[:, list(held)].abs().max()) == 0
@@ -64,7 +64,7 @@ def test_a_start_does_not_depend_on_the_others_of_its_batch():
     wrong, held = stretched()
     good = arch() + 1e-4 * torch.randn(2, COUNT, 3, dtype=F64)
     good[:, list(held)] = wrong[:, list(held)] = arch()[:, list(held)]
-    found = [agree(*started(torch.stack([good[0], other]), held)).rods.pos[0] for other in (good[1], wrong[1])]
+    found = [agreeing_state(*started(torch.stack([good[0], other]), held)).rods.pos[0] for other in (good[1], wrong[1])]
     assert float((found[0] - found[1]).abs().max()) == 0
 
 
@@ -72,7 +72,7 @@ def test_what_is_laid_keeps_directions_and_what_is_held():
     torch.manual_seed(0)
     pos = arch() + 1e-3 * torch.randn(2, COUNT, 3, dtype=F64)
     length = torch.full((COUNT, 1), EDGE, dtype=F64)
-    found = laid(pos, length, (10, 11), closed=False)
+    found = lay_rope(pos, length, (10, 11), closed=False)
     torch.testing.assert_close(found[:, 10:12], pos[:, 10:12])
     outside = [k for k in range(COUNT - 1) if k != 10]
     edge, old = found[:, 1:] - found[:, :-1], pos[:, 1:] - pos[:, :-1]
@@ -81,6 +81,6 @@ def test_what_is_laid_keeps_directions_and_what_is_held():
     # Between two held vertices, and around a loop, nothing tears.
     angle = 2 * torch.pi * torch.arange(COUNT, dtype=F64) / COUNT
     ring = 0.1 * torch.stack([angle.cos(), angle.sin(), 0 * angle], -1)[None]
-    around = laid(ring, 1.02 * (ring.roll(-1, 1) - ring).norm(dim=-1, keepdim=True)[0], (3, 20), closed=True)
+    around = lay_rope(ring, 1.02 * (ring.roll(-1, 1) - ring).norm(dim=-1, keepdim=True)[0], (3, 20), closed=True)
     torch.testing.assert_close(around, ring, rtol=0, atol=3e-3)
     torch.testing.assert_close(around[:, [3, 20]], ring[:, [3, 20]])

@@ -10,8 +10,8 @@ import torch
 
 from tests.vision.scenes import front, hanging
 from torchdlo.sysid.estimation import levenberg_marquardt
-from torchdlo.sysid.estimation.observation import MarkerObservation, Spines, View, nuisances, over_time
-from torchdlo.vision.film import Look, film, off_camera
+from torchdlo.sysid.estimation.observation import FilmView, MarkerObservation, Spines, nuisances, over_time
+from torchdlo.vision.film import FilmLook, film, off_camera
 from torchdlo.vision.spine import spine
 
 STEP, PLACES = 0.02, 41
@@ -29,16 +29,16 @@ def motion() -> np.ndarray:
     return (hanging(PLACES) + swing)[None, None]
 
 
-def seen(camera, sims: np.ndarray) -> View:
+def seen(camera, sims: np.ndarray) -> FilmView:
     """What a camera sees of it."""
-    masks = film(camera, np.arange(26) * STEP, sims[0, 0], 0.006, Look(exposure=0.0), frames=14).masks
+    masks = film(camera, np.arange(26) * STEP, sims[0, 0], 0.006, FilmLook(exposure=0.0), frames=14).masks
     lines = [spine(m, 48) for m in masks]
     places, tangents = (np.stack(part)[None] for part in zip(*lines, strict=True))
-    return View(camera, np.ones((1, 14), bool), places, tangents, 3.2)
+    return FilmView(camera, np.ones((1, 14), bool), places, tangents, 3.2)
 
 
 @pytest.fixture(scope="module")
-def filmed() -> tuple[np.ndarray, View]:
+def filmed() -> tuple[np.ndarray, FilmView]:
     sims = motion()
     return sims, seen(front(), sims)
 
@@ -52,14 +52,14 @@ def none(observation) -> np.ndarray:
     return np.zeros((1, len(observation.nuisances.names)))
 
 
-def test_readings_of_the_truth_are_parts_of_a_pixel(filmed: tuple[np.ndarray, View]) -> None:
+def test_readings_of_the_truth_are_parts_of_a_pixel(filmed: tuple[np.ndarray, FilmView]) -> None:
     sims, view = filmed
     spines = Spines([view], STEP, 0.7, np.ones(PLACES, bool))
     assert size(spines.read(sims, none(spines)), spines.target) < 4e-4  # a pixel is 1.9 mm
 
 
 @pytest.mark.parametrize("far", [2e-3, 2e-2])
-def test_readings_are_as_long_as_the_rope_is_moved(filmed: tuple[np.ndarray, View], far: float) -> None:
+def test_readings_are_as_long_as_the_rope_is_moved(filmed: tuple[np.ndarray, FilmView], far: float) -> None:
     sims, view = filmed
     spines = Spines([view], STEP, 0.7, np.ones(PLACES, bool))
     # The middle of the rope is level: moved up, it is that far away.
@@ -69,7 +69,7 @@ def test_readings_are_as_long_as_the_rope_is_moved(filmed: tuple[np.ndarray, Vie
     assert abs(abs(across) - far) < 0.12 * far + 3e-4
 
 
-def test_what_a_camera_is_off_is_undone_by_its_numbers(filmed: tuple[np.ndarray, View]) -> None:
+def test_what_a_camera_is_off_is_undone_by_its_numbers(filmed: tuple[np.ndarray, FilmView]) -> None:
     sims, view = filmed
     spines = Spines(
         [replace(view, camera=off_camera(view.camera, np.random.default_rng(3)))], STEP, 0.7, np.ones(PLACES, bool)
@@ -81,14 +81,14 @@ def test_what_a_camera_is_off_is_undone_by_its_numbers(filmed: tuple[np.ndarray,
 
     points = levenberg_marquardt.evaluate(simulate, spines.target, space, np.zeros((1, 8)), 0.7)
     before = points[0].cost
-    for points in levenberg_marquardt.improve(simulate, spines.target, space, points, iterations=12, whole=0.7):  # noqa: B007, B020
+    for points in levenberg_marquardt.improve_points(simulate, spines.target, space, points, iterations=12, whole=0.7):  # noqa: B007, B020
         pass
     assert points[0].cost < 0.03 * before
     true, found = view.camera.start, spines.views[0].camera.start + space.to_values(points[0].raw)[7]
     assert abs(found - true) < 2e-3  # half a frame is 17 ms
 
 
-def test_priors_pull_where_nothing_else_does(filmed: tuple[np.ndarray, View]) -> None:
+def test_priors_pull_where_nothing_else_does(filmed: tuple[np.ndarray, FilmView]) -> None:
     _, view = filmed
     space = nuisances([view])
     assert len(space.names) == 8 and space.names[-1] == "camera_a.clock" and space.units[-1] == pytest.approx(1 / 60)
@@ -98,7 +98,7 @@ def test_priors_pull_where_nothing_else_does(filmed: tuple[np.ndarray, View]) ->
     assert (priors > 0).all() and np.allclose(priors, priors[0])
 
 
-def test_changes_are_those_of_readings(filmed: tuple[np.ndarray, View]) -> None:
+def test_changes_are_those_of_readings(filmed: tuple[np.ndarray, FilmView]) -> None:
     sims, view = filmed
     spines = Spines([view], STEP, 0.7, np.ones(PLACES, bool))
     moved = np.concatenate([sims, sims + 1e-4 * np.array([0.3, 0.2, 0.9]), sims])

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from torchdlo.sysid.recordings.plausibility import doubts
 from torchdlo.sysid.recordings.recording import Recording, load_recording
+from torchdlo.sysid.recordings.unit_doubts import doubts
 
 SAMPLE = load_recording(Path(__file__).parents[2] / "torchdlo" / "data" / "sample_rope")
 

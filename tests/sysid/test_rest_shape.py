@@ -10,7 +10,7 @@ import pytest
 
 from tests.sysid.test_diagnose import S, hanging
 from torchdlo.sysid.diagnosis import baseline
-from torchdlo.sysid.diagnosis.budget import options
+from torchdlo.sysid.diagnosis.budget import model_options
 from torchdlo.sysid.diagnosis.workspace import Workspace
 from torchdlo.sysid.estimation.jobs import FitJob
 from torchdlo.sysid.estimation.worker_pool import Pool
@@ -43,11 +43,11 @@ def test_a_rest_shape_is_given_up_only_where_a_straight_rope_fits_better(
     tmp_path: Path, share: float, rest: str
 ) -> None:
     recording = made(tmp_path, share)
-    with Pool(recording, options(recording, 31), 1) as pool:
+    with Pool(recording, model_options(recording, 31), 1) as pool:
         bench = Workspace(pool)
         model = pool.local.model(())
         assert model.rest == "given"
-        found = baseline.calibrate(bench, 12, 4, np.random.default_rng(0), lambda *_: None)
+        found = baseline.calibrate_baseline(bench, 12, 4, np.random.default_rng(0), lambda *_: None)
         assert pool.local.model(()).rest == rest
         numbers = dict(zip(pool.local.model(found.effects).parameters, found.values, strict=True))
         assert numbers["bending_stiffness"] == pytest.approx(1.5e-3, rel=0.15)
@@ -57,7 +57,7 @@ def test_a_rest_shape_is_given_up_only_where_a_straight_rope_fits_better(
 @pytest.mark.slow
 def test_a_rest_shape_that_was_given_up_is_tried_again_with_an_effect(tmp_path: Path) -> None:
     recording = made(tmp_path, 1.0)
-    with Pool(recording, options(recording, 31), 1) as pool:
+    with Pool(recording, model_options(recording, 31), 1) as pool:
         bench = Workspace(pool)
         pool.choose(rest="straight")
         model = pool.local.model(())

@@ -13,7 +13,7 @@ import pytest
 from torchdlo.errors import InputError
 from torchdlo.sysid.calibration.calibrate import calibrate
 from torchdlo.sysid.estimation import evaluation
-from torchdlo.sysid.estimation.result import dump
+from torchdlo.sysid.estimation.result import result_json
 from torchdlo.sysid.model import model_file
 from torchdlo.sysid.model.rope_model import RopeModel
 from torchdlo.sysid.recordings.recording import Recording, load_recording
@@ -36,7 +36,7 @@ def numbers(model: RopeModel) -> np.ndarray:
 
 def write(path: Path, model: RopeModel, values: np.ndarray) -> Path:
     """Write a model file as commands do."""
-    path.write_text(dump({"generator": "torchdlo diagnose"} | model_file.content(model, values)))
+    path.write_text(result_json({"generator": "torchdlo diagnose"} | model_file.content(model, values)))
     return path
 
 
@@ -88,7 +88,7 @@ def test_calibration_goes_on_from_a_model_with_its_effects(recording: Recording,
     assert not any("starts" in stage for stage in stages)
     assert set(result.parameters) == {*values}
     assert "air drag" in " ".join(result.notes)
-    (tmp_path / "next.json").write_text(dump(result.model))
+    (tmp_path / "next.json").write_text(result_json(result.model))
     again = model_file.load(tmp_path / "next.json")
     assert again.effects == ("air_drag",) and again.values == {k: v["value"] for k, v in result.parameters.items()}
     # What it started from is what the file says.

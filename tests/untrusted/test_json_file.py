@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from torchdlo import scene_files
-from torchdlo.agents.trajopt.result import read_trajectory
+from torchdlo.agents.trajopt.search_result import read_trajectory
 from torchdlo.coupling.robot import urdf
 from torchdlo.errors import InputError
 from torchdlo.reward_language import load_reward
@@ -78,7 +78,7 @@ KINDS = {
     "reward": load_reward,
     "cameras": load_cameras,
     "ranges": load_ranges,
-    "URDF": urdf.read,
+    "URDF": urdf.read_urdf,
 }
 SAID = {
     "pipe": "found a pipe; give a regular file",
@@ -161,7 +161,7 @@ def test_arguments_that_are_swapped_are_said(tmp_path: Path) -> None:
 
 
 def test_trajectories_of_no_numbers_are_refused(tmp_path: Path) -> None:
-    from torchdlo.agents.trajopt.result import load_actions
+    from torchdlo.agents.trajopt.search_result import load_actions
     from torchdlo.agents.trajopt.task_problem import TaskProblem
     from torchdlo.envs import find
 

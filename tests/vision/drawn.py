@@ -6,15 +6,17 @@ import numpy as np
 import torch
 
 from torchdlo.vision import renderer
-from torchdlo.vision.renderer import ARM, BODY, TABLE, Images, Model, Piece, Pinhole, Placement, looking_at
+from torchdlo.vision.renderer import ARM, BODY, TABLE, Images, Piece, Pinhole, Placement, RenderModel, looking_at
 from torchdlo.vision.surfaces import Surface, plate, solid
 
 
-def only(*pieces: Piece, ropes: list[np.ndarray] = (), closed: tuple[bool, ...] = (), particles: int = 0) -> Model:
+def only(
+    *pieces: Piece, ropes: list[np.ndarray] = (), closed: tuple[bool, ...] = (), particles: int = 0
+) -> RenderModel:
     """A model of pieces, ropes 1 cm thick and particles."""
     counts = tuple(len(r) for r in ropes)
     radius = np.full(sum(counts), 0.01)
-    return Model(
+    return RenderModel(
         pieces, counts, closed or (False,) * len(counts), radius, np.full(particles, 0.02), np.arange(particles) % 2
     )
 
@@ -43,7 +45,7 @@ def table(half: float = 1.0) -> Piece:
     return Piece(plate((-half, -half), (half, half), 0.0, 0.04), TABLE, "table", shadow=False)
 
 
-def mixed() -> tuple[Model, Placement]:
+def mixed() -> tuple[RenderModel, Placement]:
     """Everything that can be drawn at once."""
     t = np.linspace(0, 1, 12)
     line = np.stack([0.5 * t - 0.3, 0.1 * np.sin(6 * t), 0.02 + 0.1 * t * t], -1)
@@ -57,7 +59,7 @@ def mixed() -> tuple[Model, Placement]:
     return model, at((0.2, -0.1, 0.06), (-0.2, 0.2, 0.06), (0.3, 0.2, 0.2), ropes=[line, loop], particles=points)
 
 
-def drawn(model: Model, placement: Placement, view: Pinhole, size: tuple[int, int], **choices) -> Images:
+def drawn(model: RenderModel, placement: Placement, view: Pinhole, size: tuple[int, int], **choices) -> Images:
     choices = {"depth": True, "ids": True} | choices
     return renderer.render(model, placement, view, size, **choices)
 

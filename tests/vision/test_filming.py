@@ -5,16 +5,16 @@ from __future__ import annotations
 import numpy as np
 
 from tests.vision.scenes import front, hanging
-from torchdlo.vision.film import Look, film, off_camera
+from torchdlo.vision.film import FilmLook, film, off_camera
 
 
 def test_a_film_starts_on_its_clock_and_hides_what_is_behind_bars_and_grippers() -> None:
     time = np.linspace(0, 1, 21)
     points = hanging(31) + np.array([0.2, 0, 0]) * time[:, None, None]
-    look = Look(bar=(0.4, 0.0, 0.45, 1.0), noise=0, seed=1)
+    look = FilmLook(bar=(0.4, 0.0, 0.45, 1.0), noise=0, seed=1)
     held = [range(0, 3), range(28, 31)]
     seen = film(front(start=0.2, fps=10.0), time, points, 0.007, look, held=held)
-    bare = film(front(start=0.2, fps=10.0), time, points, 0.007, Look(noise=0))
+    bare = film(front(start=0.2, fps=10.0), time, points, 0.007, FilmLook(noise=0))
     assert len(seen.time) == 9 and seen.time[0] == 0.2
     assert not seen.masks[:, :, 257:287].any() and bare.masks[0].sum() > seen.masks[0].sum()
     middle = [np.nonzero(m)[1].mean() for m in bare.masks]
@@ -24,7 +24,7 @@ def test_a_film_starts_on_its_clock_and_hides_what_is_behind_bars_and_grippers()
 def test_wrong_frames_are_as_many_as_asked_for_and_said() -> None:
     time = np.linspace(0, 1, 31)
     points = np.repeat(hanging(21)[None], 31, 0)
-    seen = film(front(), time, points, 0.007, Look(wrong=0.2, noise=0), frames=20)
+    seen = film(front(), time, points, 0.007, FilmLook(wrong=0.2, noise=0), frames=20)
     assert seen.wrong.sum() == 4 == len(seen.kinds) and not seen.wrong[:2].any()
 
 

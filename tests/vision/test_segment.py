@@ -10,7 +10,7 @@ import pytest
 
 from tests.vision.scenes import front, hanging
 from torchdlo.errors import InputError
-from torchdlo.vision.film import Film, Look, film
+from torchdlo.vision.film import Film, FilmLook, film
 from torchdlo.vision.mask_health import check_masks
 from torchdlo.vision.segment import (
     Ranges,
@@ -31,7 +31,7 @@ def swinging(frames: int = 12, **look) -> Film:
     """A rope that swings a little."""
     time = np.linspace(0, 1, 31)
     points = hanging(31) + 0.1 * np.sin(5 * time)[:, None, None] * np.array([1.0, 0.0, 0.2])
-    return film(front(), time, points, 0.007, Look(**look), frames=frames)
+    return film(front(), time, points, 0.007, FilmLook(**look), frames=frames)
 
 
 @pytest.fixture(scope="module")

@@ -10,11 +10,11 @@ import pytest
 import torch
 from drawn import volume
 
-from torchdlo.coupling.robot.kinematics import panda
+from torchdlo.coupling.robot.robot_kinematics import panda
 from torchdlo.errors import InputError
 from torchdlo.vision.arm_surfaces import link_surfaces
 from torchdlo.vision.look import Look, Paint, draw_look
-from torchdlo.vision.surfaces import Surface, blended, isosurface, plate, solid
+from torchdlo.vision.surfaces import Surface, blended_isosurface, isosurface, plate, solid
 
 BALL = 4 / 3 * math.pi
 CLOSED = {
@@ -62,7 +62,7 @@ def test_isosurfaces_are_found_on_grids():
 
 
 def test_blended_surfaces_are_exact_on_coarse_grids():
-    made = blended(lambda p: np.linalg.norm(p, axis=1) - 0.1, np.full(3, -0.1), np.full(3, 0.1), 0.03)
+    made = blended_isosurface(lambda p: np.linalg.norm(p, axis=1) - 0.1, np.full(3, -0.1), np.full(3, 0.1), 0.03)
     np.testing.assert_allclose(np.linalg.norm(made.vertices, axis=1), 0.1, rtol=1e-6)
     np.testing.assert_allclose(made.normals, made.vertices / 0.1, atol=1e-5)
 
@@ -89,9 +89,9 @@ def test_other_robots_look_as_their_contact_shapes_do():
         '<sphere radius="0.1"/></geometry></collision></link><joint name="j" type="revolute"><parent link="a"/>'
         '<child link="b"/><axis xyz="0 0 1"/><limit lower="-1" upper="1" velocity="1" effort="1"/></joint></robot>'
     )
-    from torchdlo.coupling.robot.kinematics import load
+    from torchdlo.coupling.robot.robot_kinematics import load_robot
 
-    (part,) = link_surfaces(load(text))
+    (part,) = link_surfaces(load_robot(text))
     np.testing.assert_allclose(np.linalg.norm(part.surface.vertices - [0, 0, 1], axis=1), 0.1)
 
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from torchdlo import lazy
 
 if TYPE_CHECKING:
-    from torchdlo.agents.trajopt.presets import preset
+    from torchdlo.agents.trajopt.presets import search_preset
     from torchdlo.agents.trajopt.problem import Problem
     from torchdlo.agents.trajopt.search import SearchResult, SearchSettings, optimize
 
@@ -18,8 +18,8 @@ __getattr__, __dir__ = lazy.attach(
         "Problem": "torchdlo.agents.trajopt.problem",
         "SearchSettings": "torchdlo.agents.trajopt.search",
         "optimize": "torchdlo.agents.trajopt.search",
-        "preset": "torchdlo.agents.trajopt.presets",
+        "search_preset": "torchdlo.agents.trajopt.presets",
     },
 )
 
-__all__ = ["Problem", "SearchResult", "SearchSettings", "optimize", "preset"]
+__all__ = ["Problem", "SearchResult", "SearchSettings", "optimize", "search_preset"]

@@ -22,13 +22,13 @@ from torch import Tensor
 from torchdlo.agents.policies import Policy
 from torchdlo.coupling.common.pose import Pose
 from torchdlo.coupling.robot import inverse_kinematics
-from torchdlo.coupling.robot.kinematics import Robot, load, panda, tool_pose
+from torchdlo.coupling.robot.robot_kinematics import Robot, load_robot, panda, tool_pose
 from torchdlo.envs import Task
 from torchdlo.envs.core import episode
 from torchdlo.envs.observations.state import observe
 from torchdlo.errors import InputError
 
-__all__ = ["FORMATS", "JointMotion", "arms_of", "played", "replayed", "text", "timed"]
+__all__ = ["FORMATS", "JointMotion", "arms_of", "motion_text", "play_motion", "replay_joints", "time_scale"]
 
 FORMATS = ("csv", "json", "ros2")
 """Names of the kinds of files."""
@@ -58,11 +58,11 @@ class JointMotion:
 def arms_of(task: Task, urdf: Path | None = None, tool: str | None = None) -> list[Robot]:
     """Return the arms of a task where they stand, of another kind if a URDF file is given."""
     bases = task.arms.base
-    return [panda(base=b) if urdf is None else load(urdf, tool=tool, base=b) for b in bases]
+    return [panda(base=b) if urdf is None else load_robot(urdf, tool=tool, base=b) for b in bases]
 
 
 @torch.no_grad()
-def played(task: Task, what: Tensor | Policy, moved: Tensor) -> tuple[dict[str, Tensor], bool]:
+def play_motion(task: Task, what: Tensor | Policy, moved: Tensor) -> tuple[dict[str, Tensor], bool]:
     """Play a trajectory (T, A) or a policy once; return tools and joints at all times, and whether it succeeded.
 
     Args:
@@ -98,7 +98,7 @@ def _joints(robot: Robot, tools: Pose, known: Tensor | None) -> Tensor:
     for k in range(len(tools.pos)):
         target = Pose(tools.pos[k : k + 1], tools.quat[k : k + 1])
         search = _SEARCH if k == 0 else inverse_kinematics.IkSearch()
-        found = inverse_kinematics.solve(robot, target, last, search=search)
+        found = inverse_kinematics.solve_ik(robot, target, last, search=search)
         last = found.joints
         off = float((tool_pose(robot, last).pos - target.pos).norm())
         if off > _NEAR:
@@ -110,7 +110,7 @@ def _joints(robot: Robot, tools: Pose, known: Tensor | None) -> Tensor:
     return torch.stack(rows)
 
 
-def timed(
+def time_scale(
     task: Task,
     robots: list[Robot],
     path: dict[str, Tensor],
@@ -124,7 +124,7 @@ def timed(
     Args:
         task: whose actions these are.
         robots: its arms.
-        path: what `played` returned.
+        path: what `play_motion` returned.
         same: whether these are the arms that were simulated, whose joints are known.
         share: of the greatest speeds of the joints to use, 0 to 1.
         acceleration: greatest one of each joint [rad/s^2 or m/s^2].
@@ -171,7 +171,7 @@ def _check(robot: Robot, joints: Tensor) -> None:
         )
 
 
-def text(motion: JointMotion, kind: str, notes: dict[str, Any]) -> str:
+def motion_text(motion: JointMotion, kind: str, notes: dict[str, Any]) -> str:
     """Return a motion as a file of a kind of `FORMATS`; "ros2" has the shape of trajectory_msgs/JointTrajectory."""
     rows = zip(motion.time.tolist(), motion.position, motion.velocity, motion.acceleration, strict=True)
     if kind == "csv":
@@ -200,7 +200,7 @@ def text(motion: JointMotion, kind: str, notes: dict[str, Any]) -> str:
 
 
 @torch.no_grad()
-def replayed(task: Task, robots: list[Robot], position: Tensor, moved: Tensor) -> bool:
+def replay_joints(task: Task, robots: list[Robot], position: Tensor, moved: Tensor) -> bool:
     """Play joint positions (P, J) in the simulator; return whether the task is done."""
     parts = position.split([len(robot.arm) for robot in robots], -1)
     tools = []

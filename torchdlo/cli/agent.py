@@ -64,7 +64,7 @@ def _conversation(
         raise InputError("who is asked: expected one of --endpoint URL with --model NAME, --recorded PATH, --geometry.")
     if importlib.util.find_spec("pydantic") is None:
         raise InputError("models need the package pydantic; install it with pip install 'torchdlo[vlm]'.")
-    from torchdlo.agents.vlm.conversation import Budget, Conversation
+    from torchdlo.agents.vlm.conversation import Conversation, ConversationBudget
     from torchdlo.agents.vlm.endpoint import Endpoint
     from torchdlo.agents.vlm.geometry import Geometry
     from torchdlo.agents.vlm.recorded import load_recorded
@@ -76,7 +76,7 @@ def _conversation(
         who = Endpoint(endpoint, model, seconds=seconds)
     if not resume:
         clear(folder)
-    said = Conversation(who, folder, Budget(calls, tokens), resume, lambda text: typer.echo(text, err=True))
+    said = Conversation(who, folder, ConversationBudget(calls, tokens), resume, lambda text: typer.echo(text, err=True))
     return said
 
 
@@ -126,8 +126,8 @@ def propose(
     torchdlo optimize lifting --grasps runs/propose/lifting-candidate/proposal.json
     """
     from torchdlo.agents.vlm.grasp_proposal import places_of, random_grasps
-    from torchdlo.agents.vlm.grasp_proposal import propose as ask
-    from torchdlo.agents.vlm.schema import MODES
+    from torchdlo.agents.vlm.grasp_proposal import propose_grasps as ask
+    from torchdlo.agents.vlm.plan_schema import MODES
     from torchdlo.envs import find
     from torchdlo.envs.core import episode
     from torchdlo.errors import InputError
@@ -205,11 +205,11 @@ def plan(
     limits = {"calls": calls, "tokens": tokens, "seconds": seconds, "resume": resume}
     look: Any = None
     if pictures:
-        from torchdlo.report.render.marks import Camera
+        from torchdlo.report.render.marks import MarkCamera
         from torchdlo.report.render.picture import check_renderer
 
         check_renderer()
-        look = Camera()
+        look = MarkCamera()
     options = Options(
         update=update, method=method, episodes=episodes, population=population, seed=seed, reset_seed=reset_seed
     )

@@ -87,15 +87,15 @@ def make(
     torchdlo dataset make wiring_post --actor runs/searches --episodes 20 --out sets/found
     """
     from torchdlo.agents.data.making import DatasetPlan
-    from torchdlo.agents.data.making import make as run
-    from torchdlo.agents.distributed import executor
+    from torchdlo.agents.data.making import make_dataset as run
+    from torchdlo.agents.distributed import make_executor
 
     options = {"size": size, "codec": codec, "actor": actor, "noise": noise, "fidelity": fidelity, "arms": arms}
     plan = DatasetPlan(tuple(tasks), episodes, seed=seed, batch=batch, **options)
     painter = _painter() if size else None
 
     def work(callback: Callable[[str, int, int, str], None]) -> dict[str, Any]:
-        with executor(workers, address) as where:
+        with make_executor(workers, address) as where:
             return run(plan, out, painter=painter, executor=where, resume=resume, callback=callback)
 
     found = _watched(work, f"what is finished stays in {out}", resume=True)
@@ -118,7 +118,7 @@ def check(path: SetArgument, as_json: Json = False) -> None:
 
     Exit code 0 means that nothing is wrong.
     """
-    from torchdlo.agents.data import check as run
+    from torchdlo.agents.data import check_dataset as run
 
     found = _watched(lambda show: run(path, lambda k, n: show("check", k, n, "")), "nothing is said of the rest")
     if as_json:
@@ -135,9 +135,9 @@ def check(path: SetArgument, as_json: Json = False) -> None:
 def info(path: SetArgument, as_json: Json = False) -> None:
     """Say what is in a data set."""
     from torchdlo.agents.data import open_set
-    from torchdlo.report.dataset import summary
+    from torchdlo.report.dataset import dataset_summary
 
-    found = summary(open_set(path))
+    found = dataset_summary(open_set(path))
     if as_json:
         typer.echo(json.dumps(found, indent=1))
         return
@@ -158,7 +158,7 @@ def merge(
     paths: Annotated[list[Path], typer.Argument(help="Folders of data sets.", metavar="DATASETS...")], out: OutOption
 ) -> None:
     """Make one data set of several that are alike."""
-    from torchdlo.agents.data import merge as run
+    from torchdlo.agents.data import merge_datasets as run
 
     count = _watched(
         lambda show: run(paths, out, lambda k, n: show("merge", k, n, "")), "there is nothing left of the new data set"
@@ -182,7 +182,7 @@ def select(
     [bold]Example:[/bold] torchdlo dataset filter sets/dlo4 --task coiling --limit 50 --out sets/coiling50
     """
     from torchdlo.agents.data import Choice
-    from torchdlo.agents.data import select as run
+    from torchdlo.agents.data import select_episodes as run
 
     choice = Choice(tuple(task or ()), tuple(episode or ()), least_return, limit)
     count = _watched(
@@ -239,8 +239,8 @@ def learn(
     """
     import torch
 
-    from torchdlo.agents.policies.training import Training
-    from torchdlo.agents.policies.training import learn as run
+    from torchdlo.agents.policies.chunk_training import Training
+    from torchdlo.agents.policies.chunk_training import train_chunk_policy as run
 
     out = out or Path("runs") / "learn" / path.resolve().name / "policy.pt"
     if out.suffix != ".pt":
@@ -297,16 +297,16 @@ def sweep(
 
     torchdlo sweep diagnose recordings/a recordings/b --out runs/diagnoses --address auto
     """
-    from torchdlo.agents.distributed import executor
+    from torchdlo.agents.distributed import make_executor
     from torchdlo.agents.distributed.sweep import Sweep
-    from torchdlo.agents.distributed.sweep import run as start
+    from torchdlo.agents.distributed.sweep import run_sweep as start
 
     first = next((k for k, word in enumerate(subjects) if word.startswith("-")), len(subjects))
     plan = Sweep(kind, tuple(subjects[:first]), _seeds(seeds), tuple(subjects[first:]))
     plan.jobs  # noqa: B018, says what is wrong
 
     def work(callback: Callable[[str, int, int, str], None]) -> dict[str, Any]:
-        with executor(workers, address) as where:
+        with make_executor(workers, address) as where:
             return start(plan, out, where, away=address is not None, resume=resume, callback=callback)
 
     found = _watched(work, f"what is finished stays in {out}", resume=True)

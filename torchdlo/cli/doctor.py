@@ -166,10 +166,10 @@ def _compiler() -> Check:
 def _cache() -> Check:
     from torchdlo import cache
 
-    wished, used = cache.wished(), cache.folder()
+    wished, used = cache.wanted_folder(), cache.cache_folder()
     if used == wished:
         return Check("cache", "ok", str(used))
-    mend = f"{wished}: {cache.problem(wished)}; mend that, or set TORCHDLO_CACHE to a folder of your own"
+    mend = f"{wished}: {cache.privacy_problem(wished)}; mend that, or set TORCHDLO_CACHE to a folder of your own"
     return Check("cache", "broken", f"{used} in its place" if used else "no private folder", mend)
 
 
@@ -229,7 +229,7 @@ def _rendering() -> Check:
 
 
 def _video() -> Check:
-    from torchdlo.report.render.video import CODECS
+    from torchdlo.report.render.video_writer import CODECS
 
     try:
         import av

@@ -67,8 +67,8 @@ def calibrate(
 
     torchdlo calibrate my_rope --model runs/diagnose/my_rope/model.json
     """
-    from torchdlo.sysid.recordings.plausibility import doubts
     from torchdlo.sysid.recordings.recording import load_recording
+    from torchdlo.sysid.recordings.unit_doubts import doubts
 
     loaded = load_recording(recording)
     for doubt in doubts(loaded):
@@ -134,10 +134,10 @@ def diagnose(
     torchdlo diagnose my_rope --model runs/my_rope/model.json --out runs/my_rope_2
     """
     from torchdlo.report.pages import diagnosis as report
+    from torchdlo.sysid.diagnosis.effect_search import diagnose as search
     from torchdlo.sysid.diagnosis.findings import findings_json, limits_text, model_json, summary
-    from torchdlo.sysid.diagnosis.search import diagnose as search
-    from torchdlo.sysid.recordings.plausibility import doubts
     from torchdlo.sysid.recordings.recording import load_recording
+    from torchdlo.sysid.recordings.unit_doubts import doubts
 
     loaded = load_recording(recording)
     for doubt in doubts(loaded):
@@ -217,7 +217,7 @@ def design_experiment(
 
     torchdlo design-experiment my_rope --effects wind,tilted_gravity --seconds 4
     """
-    from torchdlo.report.pages import design as report
+    from torchdlo.report.pages import design_page as report
     from torchdlo.sysid.experiment_design import design as designs
     from torchdlo.sysid.recordings.recording import load_recording
 
@@ -241,7 +241,7 @@ def design_experiment(
             raise stopped(*_begun(journal, "result")) from None
         report.write_design(design, out, command=shlex.join(["torchdlo", *sys.argv[1:]]))
         shutil.rmtree(journal, ignore_errors=True)
-    typer.echo(f"{designs.summary(design)}\n", err=as_json)
+    typer.echo(f"{designs.design_summary(design)}\n", err=as_json)
     typer.echo("\n".join(f"- {said}" for said in designs.rationale(design)), err=as_json)
     typer.echo(f"\n{report.design_table(design)}\n", err=as_json)
     typer.echo(f"motion: {out / 'motion.npz'}\nreport: {out / 'report.html'}", err=as_json)
@@ -303,5 +303,5 @@ def _write_outputs(result: Calibration, recording: Recording, given: Path, out: 
     write_atomically(out, model_json(result))
     write_atomically(out.with_name("calibration.json"), summary_json(result, given))
     page, _ = report.write_report(result, recording, out.parent, command=command)
-    typer.echo(report.verdict(result, recording), err=quiet)
+    typer.echo(report.calibration_verdict(result, recording), err=quiet)
     typer.echo(f"model:  {out}\nreport: {page}", err=quiet)

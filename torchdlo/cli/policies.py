@@ -15,7 +15,7 @@ from torchdlo.files import check_writable, write_atomically
 from torchdlo.untrusted import parse_json
 
 if TYPE_CHECKING:
-    from torchdlo.agents.rl.settings import Settings
+    from torchdlo.agents.rl.settings import TrainingSettings
     from torchdlo.envs import Task
 
 __all__ = ["deploy", "distill", "evaluate", "export", "train"]
@@ -93,7 +93,7 @@ def train(
 
     torchdlo evaluate runs/train/wiring_post-hybrid
     """
-    from torchdlo.agents.rl.settings import preset
+    from torchdlo.agents.rl.settings import training_preset
     from torchdlo.envs import find
 
     _quiet()
@@ -102,7 +102,7 @@ def train(
         if not resume:
             check_writable(out / name, mark=b"torchdlo" if name != "log.csv" else b"episodes")
     given = {"episodes": episodes, "minutes": minutes, "seed": seed, "count": count, "fidelity": fidelity}
-    chosen = preset(task, algo, variation=variation, **given, **_read(settings or []))
+    chosen = training_preset(task, algo, variation=variation, **given, **_read(settings or []))
     made = find(task)
     if algo != "hybrid" and (trajectory or without):
         raise InputError(f"--trajectory and --without: they belong to hybrid, not to {algo}; leave them out.")
@@ -129,12 +129,12 @@ def _read(pairs: list[str]) -> dict[str, Any]:
     return found
 
 
-def _train(task: Task, settings: Settings, out: Path, resume: bool, compiled: bool, as_json: bool) -> None:
-    from torchdlo.agents.rl.results import prepared, train_json
+def _train(task: Task, settings: TrainingSettings, out: Path, resume: bool, compiled: bool, as_json: bool) -> None:
+    from torchdlo.agents.rl.results import prepare_training, train_json
     from torchdlo.agents.rl.training import train as loop
     from torchdlo.report.figures.learning_curve import training_png
 
-    trainer, played = prepared(task, settings, compiled=compiled)
+    trainer, played = prepare_training(task, settings, compiled=compiled)
     with progress() as show, deferred_interrupt(show) as callback:
         found = loop(trainer, played, settings, folder=out, resume=resume, callback=callback)
     result = train_json(task, settings, found)
@@ -152,14 +152,14 @@ def _train(task: Task, settings: Settings, out: Path, resume: bool, compiled: bo
 
 def _hybrid(
     task: Task,
-    settings: Settings,
+    settings: TrainingSettings,
     out: Path,
     trajectories: list[Path],
     without: list[str],
     resume: bool,
     as_json: bool,
 ) -> None:
-    from torchdlo.agents.rl.hybrid import STAGES, hybrid, plan_of
+    from torchdlo.agents.rl.hybrid_stages import STAGES, plan_of, train_hybrid
 
     other = sorted(set(without) - set(STAGES))
     if other:
@@ -170,7 +170,7 @@ def _hybrid(
     plan = plan_of(task.name)
     try:
         with progress() as show, deferred_interrupt(show) as callback:
-            _, notes = hybrid(
+            _, notes = train_hybrid(
                 task, trajectories, settings, folder=out, plan=plan, stages=stages, resume=resume, callback=callback
             )
     except KeyboardInterrupt:
@@ -186,15 +186,15 @@ def _hybrid(
 
 def _searched(task: Task, seed: int, out: Path) -> Path:
     """Return the file of a trajectory that is searched now, or was before."""
-    from torchdlo.agents.trajopt.presets import preset
-    from torchdlo.agents.trajopt.result import result_json, trajectory_json
+    from torchdlo.agents.trajopt.presets import search_preset
     from torchdlo.agents.trajopt.search import optimize
+    from torchdlo.agents.trajopt.search_result import result_json, trajectory_json
     from torchdlo.agents.trajopt.task_problem import TaskProblem
 
     file = out / "search" / "trajectory.json"
     if file.exists():
         return file
-    problem, chosen = TaskProblem(task), preset(task.name, "hybrid", seed=seed, episodes=1200)
+    problem, chosen = TaskProblem(task), search_preset(task.name, "hybrid", seed=seed, episodes=1200)
     journal = out / "search" / "journal"
     with progress() as show, deferred_interrupt(show) as callback:
         found = optimize(problem, chosen, journal=journal, resume=journal.exists(), callback=callback)
@@ -262,8 +262,8 @@ def evaluate(
     """
     from torchdlo.agents.policies import CloudPolicy
     from torchdlo.agents.rl.evaluate import PROTOCOLS
-    from torchdlo.agents.rl.evaluate import evaluate as judge
-    from torchdlo.agents.rl.results import load_policies, summary
+    from torchdlo.agents.rl.evaluate import evaluate_policies as judge
+    from torchdlo.agents.rl.results import evaluation_summary, load_policies
     from torchdlo.envs import find
 
     _quiet()
@@ -292,7 +292,7 @@ def evaluate(
         return
     check_writable(out / "evaluation.json")
     if film:
-        from torchdlo.report.render.video import check_video
+        from torchdlo.report.render.video_writer import check_video
 
         for name in ("best.mp4", "worst.mp4"):
             check_video(out / name)
@@ -307,7 +307,7 @@ def evaluate(
         )
     content = json.dumps({"generator": "torchdlo evaluate", "files": [str(p) for p in policies]} | results, indent=1)
     write_atomically(out / "evaluation.json", content + "\n")
-    typer.echo(summary(results), err=as_json)
+    typer.echo(evaluation_summary(results), err=as_json)
     typer.echo(f"results: {out / 'evaluation.json'}", err=as_json)
     if film:
         for file in _films(own, plays[names[-1]], out):
@@ -321,7 +321,7 @@ def _evaluate_seeing(
 ) -> None:
     """Judge a policy that sees, and write what it came to beside it."""
     from torchdlo.agents.data.painting import TaskPainter
-    from torchdlo.agents.policies.rollout import evaluate as judge
+    from torchdlo.agents.policies.chunk_rollout import evaluate_chunk_policy as judge
 
     file = (out or policy.parent) / "evaluation.json"
     check_writable(file)
@@ -396,12 +396,12 @@ def distill(
 
     torchdlo evaluate runs/train/wiring_post-hybrid-cloud
     """
-    from torchdlo.agents.policies import CloudPolicy, load
+    from torchdlo.agents.policies import CloudPolicy, load_policy
     from torchdlo.agents.rl.student import Student, teach
     from torchdlo.envs import find
 
     _quiet()
-    policy = load(teacher)
+    policy = load_policy(teacher)
     if isinstance(policy, CloudPolicy) or not policy.spec.task:
         raise InputError(f"{teacher}: expected a policy of a task that sees the state, found another one.")
     folder = teacher if teacher.is_dir() else teacher.parent
@@ -425,9 +425,9 @@ def _perturb(policies: list[Path], trajectory: Path | None, starts: int, seed: i
     """Judge policies, and the trajectory and the experts behind them, under perturbations."""
     from torchdlo.agents.policies import CloudPolicy
     from torchdlo.agents.rl import robustness
-    from torchdlo.agents.rl.expert import candidates, load_expert
+    from torchdlo.agents.rl.expert import candidate_experts, load_expert
     from torchdlo.agents.rl.results import load_policies
-    from torchdlo.agents.trajopt.result import load_actions
+    from torchdlo.agents.trajopt.search_result import load_actions
     from torchdlo.agents.trajopt.task_problem import TaskProblem
     from torchdlo.envs import find
 
@@ -439,7 +439,7 @@ def _perturb(policies: list[Path], trajectory: Path | None, starts: int, seed: i
     if trajectory is not None:
         problem = TaskProblem(task, compiled=False)
         actors["trajectory replayed"] = robustness.replaying(problem.full(load_actions(trajectory, problem)))
-        for expert in candidates(task, [trajectory])[:1]:
+        for expert in candidate_experts(task, [trajectory])[:1]:
             actors["its path followed"] = robustness.following(expert)
     for policy, path in zip(found, policies, strict=True):
         folder = path if path.is_dir() else path.parent
@@ -462,7 +462,7 @@ def _films(task: Task, plays: dict[str, Any], out: Path) -> list[Path]:
 
     from torchdlo.envs.core import episode
     from torchdlo.report.render.episode_film import film
-    from torchdlo.report.render.video import write_video
+    from torchdlo.report.render.video_writer import write_video
 
     success, returns = plays["success"].flatten(), plays["returns"].flatten()
     order = sorted(range(len(success)), key=lambda k: (bool(success[k]), float(returns[k])))
@@ -491,10 +491,10 @@ def export(
 
     torchdlo export runs/train/lifting-hybrid --format onnx
     """
-    from torchdlo.agents.policies import CloudPolicy, load
+    from torchdlo.agents.policies import CloudPolicy, load_policy
     from torchdlo.agents.policies.export import export as write
 
-    found = load(policy)
+    found = load_policy(policy)
     if isinstance(found, CloudPolicy):
         raise InputError(f"{policy}: it sees clouds of points; export takes policies that see the state.")
     out = out or (policy / "policy.pt" if policy.is_dir() else policy).with_suffix(f".{kind}")
@@ -549,13 +549,13 @@ def deploy(
     robots = deployment.arms_of(task, urdf, tool)
     seeded = torch.Generator().manual_seed(reset_seed or 0)
     moved = task.moved(1, generator=seeded, variation=reset_seed is not None)
-    path, good = deployment.played(task, what, moved)
-    motion = deployment.timed(task, robots, path, same=urdf is None, share=speed, acceleration=acceleration)
+    path, good = deployment.play_motion(task, what, moved)
+    motion = deployment.time_scale(task, robots, path, same=urdf is None, share=speed, acceleration=acceleration)
     said: dict[str, Any] = {"task": task.name, "success": good, "slower": motion.slower}
     said |= {"seconds": float(motion.time[-1]), "points": len(motion.time), "reset_seed": reset_seed}
-    write_atomically(out, deployment.text(motion, kind, said))
+    write_atomically(out, deployment.motion_text(motion, kind, said))
     if dry_run:
-        said["dry_run_success"] = deployment.replayed(task, robots, motion.position, moved)
+        said["dry_run_success"] = deployment.replay_joints(task, robots, motion.position, moved)
     what_for = "policy" if isinstance(what, Policy) else "trajectory"
     how = "success" if good else "no success"
     typer.echo(
@@ -572,13 +572,13 @@ def deploy(
 
 def _source(path: Path) -> tuple[Task, Any]:
     """Return the task, and the actions of a trajectory (T, A) or a policy."""
-    from torchdlo.agents.policies import CloudPolicy, load
-    from torchdlo.agents.trajopt.result import load_actions, read_trajectory
+    from torchdlo.agents.policies import CloudPolicy, load_policy
+    from torchdlo.agents.trajopt.search_result import load_actions, read_trajectory
     from torchdlo.agents.trajopt.task_problem import TaskProblem
     from torchdlo.envs import find
 
     if path.is_dir() or path.suffix != ".json":
-        policy = load(path)
+        policy = load_policy(path)
         if isinstance(policy, CloudPolicy):
             raise InputError(f"{path}: it sees clouds of points; deploy the policy of the state that taught it.")
         return find(policy.spec.task), policy

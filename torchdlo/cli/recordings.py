@@ -30,8 +30,8 @@ def check(recording: RecordingArgument) -> None:
     """
     from rich.console import Console
 
-    from torchdlo.sysid.recordings.plausibility import doubts
     from torchdlo.sysid.recordings.recording import load_recording
+    from torchdlo.sysid.recordings.unit_doubts import doubts
 
     loaded = load_recording(recording)
     console = Console(soft_wrap=True)

@@ -94,7 +94,7 @@ def check_files(out: Path, *, video: bool, picture: bool, photo: bool) -> dict[s
     for file in files.values():
         check_writable(file)
     if video:
-        from torchdlo.report.render.video import check_video
+        from torchdlo.report.render.video_writer import check_video
 
         files["video"] = out / "motion.mp4"
         check_video(files["video"])
@@ -131,7 +131,7 @@ def draw(frames: Frames, files: dict[str, Path], title: str, speed: float, photo
         write_atomically(files["picture"], stills_png(frames, photo=photo))
     if "video" not in files:
         return True
-    from torchdlo.report.render.video import write_video
+    from torchdlo.report.render.video_writer import write_video
 
     return _finished(lambda callback: write_video(frames, files["video"], speed=speed, photo=photo, callback=callback))
 

@@ -23,9 +23,9 @@ def tasks(as_json: Annotated[bool, typer.Option("--json", help="Print the list a
 
     [bold]Example:[/bold] torchdlo tasks --json
     """
-    from torchdlo.envs import listing
+    from torchdlo.envs import list_tasks
 
-    rows = listing()
+    rows = list_tasks()
     if as_json:
         typer.echo(json.dumps(rows, indent=1))
         return
@@ -171,12 +171,12 @@ def optimize(
 
     torchdlo optimize lifting --grasps runs/propose/lifting/proposal.json --reward reward.json
     """
-    from torchdlo.agents.trajopt.presets import preset
-    from torchdlo.agents.trajopt.result import result_json, summary, trajectory_json
+    from torchdlo.agents.trajopt.presets import search_preset
     from torchdlo.agents.trajopt.search import Robust
     from torchdlo.agents.trajopt.search import optimize as search
-    from torchdlo.agents.trajopt.search_journal import remove
-    from torchdlo.agents.trajopt.task_problem import problem
+    from torchdlo.agents.trajopt.search_journal import remove_journal
+    from torchdlo.agents.trajopt.search_result import result_json, search_summary, trajectory_json
+    from torchdlo.agents.trajopt.task_problem import task_problem
     from torchdlo.envs import short_name
     from torchdlo.report.figures.learning_curve import learning_png
     from torchdlo.scene_files import cable
@@ -187,9 +187,9 @@ def optimize(
         check_writable(out / name)
     steps = {"compiled": compiled and not recorded, "recorded": recorded}
     steps |= {"double": _is_double(dtype)} | _judged(task, grasps, reward)
-    chosen = problem(task, None if rope_model is None else cable(rope_model), **steps)
+    chosen = task_problem(task, None if rope_model is None else cable(rope_model), **steps)
     given = {"episodes": episodes, "population": population, "robust": Robust() if robust else None, "seed": seed}
-    settings = preset(task, method, **given)
+    settings = search_preset(task, method, **given)
     with at_work(out, *names):
         try:
             with progress() as show, deferred_interrupt(show) as callback:
@@ -201,8 +201,8 @@ def optimize(
         write_atomically(out / "result.json", result)
         write_atomically(out / "curve.png", learning_png({f"{task}, seed {seed}": {method: [found.curve]}}))
         if not found.interrupted:
-            remove(out / "journal")
-    typer.echo(summary(found, task), err=as_json)
+            remove_journal(out / "journal")
+    typer.echo(search_summary(found, task), err=as_json)
     typer.echo(f"result:     {out / 'result.json'}\ntrajectory: {out / 'trajectory.json'}", err=as_json)
     typer.echo(f"curve:      {out / 'curve.png'}", err=as_json)
     if as_json:

@@ -15,7 +15,7 @@ from torchdlo.files import check_writable, write_atomically
 
 if TYPE_CHECKING:
     from torchdlo.sysid.recordings.recording import Recording
-    from torchdlo.vision.film import Look
+    from torchdlo.vision.film import FilmLook
     from torchdlo.vision.segment import Ranges
 
 __all__ = ["calibrate_camera", "film", "print_films", "segment"]
@@ -267,8 +267,8 @@ def film(
         typer.echo(sentence)
 
 
-def _look(color: str, noise: float, blur: float, exposure: float, bar: str | None, wrong: float, seed: int) -> Look:
-    from torchdlo.vision.film import Look
+def _look(color: str, noise: float, blur: float, exposure: float, bar: str | None, wrong: float, seed: int) -> FilmLook:
+    from torchdlo.vision.film import FilmLook
 
     red, green, blue = (int(c) for c in _rgb(color))
     place = None
@@ -280,7 +280,7 @@ def _look(color: str, noise: float, blur: float, exposure: float, bar: str | Non
         if not (0 <= left < right <= 1 and 0 <= top < bottom <= 1):
             raise InputError(f"--bar: expected 0 <= left < right <= 1 and 0 <= top < bottom <= 1, found {bar!r}.")
         place = (left, top, right, bottom)
-    return Look((red, green, blue), noise=noise, blur=blur, exposure=exposure, bar=place, wrong=wrong, seed=seed)
+    return FilmLook((red, green, blue), noise=noise, blur=blur, exposure=exposure, bar=place, wrong=wrong, seed=seed)
 
 
 def print_films(recording: Recording) -> None:

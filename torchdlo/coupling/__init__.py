@@ -5,9 +5,9 @@ from __future__ import annotations
 from torchdlo.coupling.bodies.contact_effect import BodyContact
 from torchdlo.coupling.mpm.body_coupling_effect import BodyMpmCoupling
 from torchdlo.coupling.mpm.rod_coupling_effect import RodMpmCoupling
-from torchdlo.coupling.rod_body.effect import RodBody
 from torchdlo.coupling.rod_body.finger_pads import FingerPads
-from torchdlo.coupling.rod_contact.effect import RodContact
+from torchdlo.coupling.rod_body.rod_body_effect import RodBody
+from torchdlo.coupling.rod_contact.rod_contact_effect import RodContact
 from torchdlo.physics.effects.base import Effect
 
 EFFECTS: dict[str, type[Effect]] = {

@@ -18,9 +18,9 @@ from torch import Tensor
 
 from torchdlo import notices
 from torchdlo.coupling.bodies.dynamics import Body, BodyParams, BodyState, PredictedBodyMotion
-from torchdlo.coupling.bodies.segment_distance import families, find
+from torchdlo.coupling.bodies.segment_distance import find_contact_points, points_per_edge
 from torchdlo.coupling.rod_contact.broad_phase import near_pairs
-from torchdlo.coupling.rod_contact.closest_points import closest
+from torchdlo.coupling.rod_contact.closest_points import closest_points
 from torchdlo.physics import tree
 from torchdlo.physics.constraints.edge_lengths import Lengths, settle
 from torchdlo.physics.effects.base import Effect
@@ -64,13 +64,13 @@ def _column(x: Tensor, slot: Tensor) -> Tensor:
 
 
 def _among_bodies(view: rod.View, bodies: PredictedBodyMotion, pieces: int) -> _Overlaps:
-    at = find(view, bodies, pieces)
+    at = find_contact_points(view, bodies, pieces)
     shape = at.share.shape[:-1]
     radius = view.params.material.radius[..., 0].unsqueeze(-2).expand(shape)
     slots = torch.arange(shape[-1], device=radius.device).expand(shape)
     real = (view.params.rest.edge_mask[..., 0] > 0).expand(shape)
     depth = torch.where(real, radius - at.distance[..., 0], -1.0)
-    which = [k for k, body in enumerate(bodies.bodies) for _ in range(families(body, pieces))]
+    which = [k for k, body in enumerate(bodies.bodies) for _ in range(points_per_edge(body, pieces))]
     other = torch.tensor(which, device=radius.device)[:, None].expand(shape)
     flat = (x.flatten(-2) for x in (slots, at.share[..., 0], depth))
     return _Overlaps(*flat, at.normal.flatten(-3, -2), torch.ones_like(depth).flatten(-2), other.flatten(-2),
@@ -87,7 +87,7 @@ def _among_ropes(view: rod.View, free: Tensor) -> _Overlaps:
         return torch.gather(x, -2, slot.unsqueeze(-1).expand(*slot.shape, 3))
 
     a, b = (points(pos, first), points(after, first)), (points(pos, second), points(after, second))
-    s, t = closest(a, b)
+    s, t = closest_points(a, b)
     between = a[0] + s * (a[1] - a[0]) - b[0] - t * (b[1] - b[0])
     distance = safe_norm(between)
     radius = view.params.material.radius[..., 0]

@@ -57,11 +57,11 @@ __all__ = [
     "RopeMaterial",
     "Task",
     "find",
-    "listing",
+    "list_tasks",
     "make",
     "parse_fidelity",
     "short_name",
-    "simulated",
+    "with_fidelity",
 ]
 
 
@@ -112,13 +112,13 @@ def find(name: str, rope: RopeMaterial | None = None, grasps: Sequence[int | Non
     return task if grasps is None else dataclasses.replace(task, grasps=tuple(grasps))
 
 
-def simulated(task: Task, how: Fidelity | str) -> Task:
+def with_fidelity(task: Task, how: Fidelity | str) -> Task:
     """Return a task in another fidelity; "coarse" is the task's cheaper one."""
     chosen = (task.coarse if how == "coarse" else parse_fidelity(how)) if isinstance(how, str) else how
     return dataclasses.replace(task, fidelity=chosen)
 
 
-def listing() -> list[dict[str, Any]]:
+def list_tasks() -> list[dict[str, Any]]:
     """Return what every task is: name, what to do, arms, actions, and seconds per action."""
     return [
         {
@@ -191,7 +191,7 @@ def make(
     if rope is not None:
         chosen = dataclasses.replace(chosen, rope=rope)
     if fidelity is not None:
-        chosen = simulated(chosen, fidelity)
+        chosen = with_fidelity(chosen, fidelity)
     if grasps is not None:
         chosen = dataclasses.replace(chosen, grasps=tuple(grasps))
     return DloEnv(

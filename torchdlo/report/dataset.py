@@ -10,13 +10,13 @@ from typing import Any
 
 import numpy as np
 
-from torchdlo.agents.data import video
+from torchdlo.agents.data import video_codec
 from torchdlo.agents.data.reading import DataSet, json_file
 from torchdlo.files import write_atomically
 from torchdlo.report.pages.page import STYLE, number, page, table
 from torchdlo.untrusted import for_html
 
-__all__ = ["dataset_page", "summary", "write_page"]
+__all__ = ["dataset_page", "dataset_summary", "write_page"]
 
 _OWN = """
 .episode { background: var(--card); border-radius: 8px; padding: .8rem 1rem; margin: 1rem 0; }
@@ -38,7 +38,7 @@ document.querySelectorAll('.episode').forEach(e => {
 _COLORS = ("#00798c", "#c4472f", "#e09f3e", "#3d348b", "#5a8f3c", "#a04668")
 
 
-def summary(data: DataSet) -> dict[str, Any]:
+def dataset_summary(data: DataSet) -> dict[str, Any]:
     """Return what is in a set, as plain data."""
     about = data.provenance
     tasks: dict[str, dict[str, Any]] = {}
@@ -74,7 +74,7 @@ def dataset_page(data: DataSet, episodes: Sequence[int]) -> str:
         data: the set.
         episodes: which ones are shown with their videos.
     """
-    found = summary(data)
+    found = dataset_summary(data)
     rows = [
         (
             name,
@@ -118,7 +118,7 @@ def _episode(data: DataSet, k: int, columns: dict[str, np.ndarray]) -> str:
     for camera in data.cameras:
         with tempfile.TemporaryDirectory(prefix="torchdlo-") as folder:
             file = Path(folder) / "clip.mp4"
-            video.join(file, [data.clip(k, camera)], fps=data.fps)
+            video_codec.concatenate_clips(file, [data.clip(k, camera)], fps=data.fps)
             content = base64.b64encode(file.read_bytes()).decode()
         shots.append(
             f'<figure><video controls muted loop playsinline src="data:video/mp4;base64,{content}"></video>'

@@ -7,9 +7,9 @@ in radians. What a file does not say has the value that the field has in `kinds`
 
 from __future__ import annotations
 
-from torchdlo.scene_files.assembly import Simulation, assemble, build, load
 from torchdlo.scene_files.json_files import FORMAT, parse, plain, read, save, text
 from torchdlo.scene_files.rope_models import cable
+from torchdlo.scene_files.scene_assembly import Simulation, assemble, build, load
 from torchdlo.scene_files.schema import (
     Attachment,
     BodySpec,

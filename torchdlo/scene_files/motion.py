@@ -17,8 +17,8 @@ from torchdlo import scene as scenes
 from torchdlo.coupling.bodies.dynamics import BodyTargets, turn_by
 from torchdlo.coupling.common.pose import Pose
 from torchdlo.coupling.robot import inverse_kinematics
-from torchdlo.coupling.robot import kinematics as robots
-from torchdlo.coupling.robot.attachment import Grasp, Hands, carry, weld
+from torchdlo.coupling.robot import robot_kinematics as robots
+from torchdlo.coupling.robot.attachment import Grasp, Hands, carry_attachments, close_hands
 from torchdlo.errors import InputError
 from torchdlo.physics import tree
 from torchdlo.physics.linalg.rotation import multiply
@@ -80,7 +80,7 @@ def _arm(said: RobotSpec, here: str, folder: Path, d: SceneDescription) -> Arm:
     if said.urdf == "panda":
         robot = robots.panda(**stand)
     else:
-        robot = robots.load(folder / said.urdf, tool=said.tool, **stand)
+        robot = robots.load_robot(folder / said.urdf, tool=said.tool, **stand)
     if said.joints and len(said.joints) != len(robot.joints):
         raise InputError(
             f"{here}.joints: expected {len(robot.joints)} numbers for {', '.join(robot.joints)}, given "
@@ -91,7 +91,7 @@ def _arm(said: RobotSpec, here: str, folder: Path, d: SceneDescription) -> Arm:
     if said.pos is not None:
         quat = start.new_tensor(said.quat)
         target = Pose(start.new_tensor(said.pos), quat / quat.norm())
-        found = inverse_kinematics.solve(
+        found = inverse_kinematics.solve_ik(
             robot, target, start, search=inverse_kinematics.IkSearch(starts=16), posture=start
         )
         _check_reach(f"{here}.pos", found, start.new_zeros(1))
@@ -101,7 +101,7 @@ def _arm(said: RobotSpec, here: str, folder: Path, d: SceneDescription) -> Arm:
     time = times(d)
     shift, first = motion(said.keyframes, said.path, time), robots.tool_pose(robot, start)
     target = Pose(first.pos + shift.pos, multiply(shift.quat, first.quat.expand_as(shift.quat)))
-    found = inverse_kinematics.solve(robot, target, start.expand(len(time), -1), posture=start)
+    found = inverse_kinematics.solve_ik(robot, target, start.expand(len(time), -1), posture=start)
     _check_reach(f"{here}.keyframes", found, time)
     joints = torch.cat([start[None], found.joints])
     speed = (joints[1:] - joints[:-1]).abs() / d.dt
@@ -147,8 +147,10 @@ class ControlPlan:
 
         def control(k: int, state: scenes.State) -> scenes.Control:
             before, after = (tree.map(lambda x, n=n: x[n], self.tools) for n in (k, k + 1))
-            last[0] = weld(scene, self.hands, scenes.stationary_control(scene, state), before, self.closed[k], last[0])
-            pos, director, attachment_weight = carry(self.hands, last[0], after)
+            last[0] = close_hands(
+                scene, self.hands, scenes.stationary_control(scene, state), before, self.closed[k], last[0]
+            )
+            pos, director, attachment_weight = carry_attachments(self.hands, last[0], after)
             usual = tree.map(lambda c: c[k], self.controls)
             return tree.replace(usual, pos=pos, director=director, attachment_weight=attachment_weight)
 
@@ -175,8 +177,8 @@ def plan(d: SceneDescription, scene: scenes.Scene, state: scenes.State, armed: l
     if any(h.close > 0 for h in d.attachments):
         return ControlPlan(scenes.Control(pos, director, {}, bodies), hands, tools, closed)
     first, later = (tree.map(lambda x, part=part: x[part], tools) for part in (0, slice(1, None)))
-    held = weld(scene, hands, still, first, torch.ones_like(closed[0]))
-    pos, director, attachment_weight = carry(hands, tree.replace(held, closed=closed), later)
+    held = close_hands(scene, hands, still, first, torch.ones_like(closed[0]))
+    pos, director, attachment_weight = carry_attachments(hands, tree.replace(held, closed=closed), later)
     attachment_weight = attachment_weight if any(h.release is not None for h in d.attachments) else {}
     return ControlPlan(scenes.Control(pos, director, attachment_weight, bodies))
 

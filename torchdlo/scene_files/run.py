@@ -13,7 +13,7 @@ from torch import Tensor
 from torchdlo import scene as scenes
 from torchdlo import scene_files
 from torchdlo.errors import InputError
-from torchdlo.files import replacing
+from torchdlo.files import replace_atomically
 from torchdlo.scene_files import frames_checks, limits
 from torchdlo.scene_files.json_files import EFFECTS
 from torchdlo.untrusted.array_file import ArrayFile
@@ -185,7 +185,7 @@ def save_frames(frames: Frames, path: Path, description: scene_files.SceneDescri
     """Write frames as .npz, with the scene itself as JSON text in "torchdlo_scene", "" if it is not given."""
     arrays = {name: value for name, value in vars(frames).items() if isinstance(value, np.ndarray)}
     text = "" if description is None else scene_files.text(description)
-    with replacing(path) as temporary:
+    with replace_atomically(path) as temporary:
         np.savez_compressed(temporary, torchdlo_scene=np.array(text), **arrays)
 
 

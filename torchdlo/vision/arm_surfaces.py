@@ -11,8 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from torchdlo.coupling.robot.kinematics import Robot
-from torchdlo.vision.surfaces import Surface, blended, joined, moved, solid
+from torchdlo.coupling.robot.robot_kinematics import Robot
+from torchdlo.vision.surfaces import Surface, blended_isosurface, joined, moved, solid
 
 __all__ = ["LinkSurface", "link_surfaces", "panda_surfaces"]
 
@@ -134,7 +134,7 @@ def _shell(width: float, cones: list[_Cone], spacing: float) -> Surface:
 
     # Where surfaces run into each other they swell by a quarter of the width at most.
     ends = [np.array(p) + side * (max(a, b) + 0.25 * width) for s, e, a, b in cones for p in (s, e) for side in (-1, 1)]
-    return blended(distance, np.min(ends, 0), np.max(ends, 0), spacing)
+    return blended_isosurface(distance, np.min(ends, 0), np.max(ends, 0), spacing)
 
 
 def _disc(axis: int, at: float, across: tuple[float, float], radius: float, half: float) -> Surface:

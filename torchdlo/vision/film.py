@@ -14,7 +14,7 @@ import numpy as np
 from torchdlo.errors import InputError
 from torchdlo.vision.camera import Camera
 
-__all__ = ["Film", "Look", "film", "off_camera", "rope_coverage"]
+__all__ = ["Film", "FilmLook", "film", "off_camera", "rope_coverage"]
 
 _FINE = 4
 """How many times larger tubes are drawn."""
@@ -27,7 +27,7 @@ WRONG = ("black", "repeated", "other", "blob")
 
 
 @dataclass(frozen=True)
-class Look:
+class FilmLook:
     """What a film looks like, and what is wrong with it."""
 
     color: tuple[int, int, int] = (25, 150, 60)
@@ -134,7 +134,7 @@ def rope_coverage(
     return out
 
 
-def _texture(camera: Camera, look: Look, rng: np.random.Generator) -> np.ndarray:
+def _texture(camera: Camera, look: FilmLook, rng: np.random.Generator) -> np.ndarray:
     """Return an uneven background, (H, W, 3) float."""
     import cv2
 
@@ -163,7 +163,7 @@ def film(
     time: np.ndarray,
     points: np.ndarray,
     radius: float,
-    look: Look | None = None,
+    look: FilmLook | None = None,
     *,
     held: Sequence[Sequence[int]] = (),
     frames: int | None = None,
@@ -175,14 +175,14 @@ def film(
         time: of the motion [s], shape (T,).
         points: vertices of the rope [m], shape (T, V, 3).
         radius: of the rope [m].
-        look: see `Look`.
+        look: see `FilmLook`.
         held: runs of vertices within grippers, whose blocks hide them.
         frames: how many pictures; as many as the motion lasts if not given.
     """
     import cv2
     from scipy.interpolate import CubicSpline
 
-    look = look or Look()
+    look = look or FilmLook()
     rng = np.random.default_rng(look.seed)
     motion = CubicSpline(time, points, axis=0)
     if frames is None:
@@ -219,7 +219,7 @@ def film(
 
 
 def _spoil(
-    pictures: np.ndarray, masks: np.ndarray, look: Look, rng: np.random.Generator
+    pictures: np.ndarray, masks: np.ndarray, look: FilmLook, rng: np.random.Generator
 ) -> tuple[np.ndarray, tuple[str, ...]]:
     """Make a share of the pictures wrong, in place."""
     count, kinds = len(pictures), []

@@ -188,7 +188,7 @@ def _slip(pictures: np.ndarray, masks: np.ndarray) -> tuple[int, float] | None:
     return high, float(np.linalg.norm(ends[0]))
 
 
-def dropped(count: int, expected: float) -> Sequence[str]:
+def dropped_frames(count: int, expected: float) -> Sequence[str]:
     """Return what is to be said of a film that is shorter than its trial by more than a few frames."""
     if count < expected - 3:
         return [f"{count} pictures, {expected:.0f} expected for the time of the trial: the end is not judged"]

@@ -34,14 +34,14 @@ __all__ = [
     "ROPE",
     "TABLE",
     "Images",
-    "Model",
     "Piece",
     "Pinhole",
     "Placement",
-    "View",
+    "RenderModel",
+    "RendererView",
     "looking_at",
     "render",
-    "shifted",
+    "shifted_cameras",
 ]
 
 NOTHING, TABLE, ROPE, BODY, ARM, PARTICLES = 0, 1, 1000, 2000, 3000, 4000
@@ -68,7 +68,7 @@ class Piece:
 
 
 @dataclass(frozen=True, eq=False)
-class Model:
+class RenderModel:
     """What there is to see in a scene; it does not change."""
 
     pieces: tuple[Piece, ...] = ()
@@ -100,7 +100,7 @@ class Placement:
     """Particles [m], shape (B, M, 3)."""
 
 
-class View(Protocol):
+class RendererView(Protocol):
     """What the renderer reads of cameras, with leading axes (C,) or (B, C)."""
 
     intrinsics: Tensor
@@ -113,7 +113,7 @@ class View(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Pinhole:
-    """Cameras as tensors, see `View`."""
+    """Cameras as tensors, see `RendererView`."""
 
     intrinsics: Tensor
     rotation: Tensor
@@ -165,7 +165,7 @@ def intrinsics(size: tuple[int, int], opening: float) -> Tensor:
     return torch.tensor(rows, dtype=torch.float64)
 
 
-def shifted(view: View, looks: Sequence[Look]) -> Pinhole:
+def shifted_cameras(view: RendererView, looks: Sequence[Look]) -> Pinhole:
     """Return the cameras of scenes, (C,) or (B, C), turned, moved and zoomed as looks say, (B, C)."""
     lead = torch.broadcast_shapes(view.rotation.shape[:-2], view.intrinsics.shape[:-2], view.translation.shape[:-1])
     count, batch = lead[-1], len(looks)
@@ -209,7 +209,7 @@ def _library() -> ctypes.CDLL | None:
 
 
 @functools.lru_cache(maxsize=64)
-def packed(model: Model) -> dict[str, np.ndarray]:
+def pack_model(model: RenderModel) -> dict[str, np.ndarray]:
     """Return a model as the renderer reads it."""
     pieces = model.pieces
     vertices = [len(p.surface.vertices) for p in pieces]
@@ -246,14 +246,14 @@ def packed(model: Model) -> dict[str, np.ndarray]:
 
 
 @functools.lru_cache(maxsize=4096)
-def _painted(model: Model, look: Look) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def _painted(model: RenderModel, look: Look) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return materials of pieces, ropes and groups of particles, (n, 12) each, and lights (32,)."""
 
     def paint(piece: Piece) -> Paint:
         found = getattr(look, piece.paint)
         return found if isinstance(found, Paint) else found[piece.number % len(found)]
 
-    groups = len(packed(model)["group_id"])
+    groups = len(pack_model(model)["group_id"])
     kinds = (
         [paint(p) for p in model.pieces],
         [look.ropes[k % len(look.ropes)] for k in range(len(model.counts))],
@@ -263,8 +263,8 @@ def _painted(model: Model, look: Look) -> tuple[np.ndarray, np.ndarray, np.ndarr
     return *rows, np.array(look.lights(model.floor_height), np.float32)
 
 
-def arrays(
-    model: Model, placement: Placement, view: View, looks: Sequence[Look], size: tuple[int, int]
+def renderer_inputs(
+    model: RenderModel, placement: Placement, view: RendererView, looks: Sequence[Look], size: tuple[int, int]
 ) -> dict[str, np.ndarray]:
     """Return everything as the renderer reads it, scenes of a batch first."""
     batch = len(placement.ropes)
@@ -278,7 +278,7 @@ def arrays(
         )
     frames = [p.frame for p in model.pieces]
     pose = torch.cat([placement.turn[:, frames].flatten(-2), placement.pos[:, frames]], -1)
-    eye = shifted(view, looks)
+    eye = shifted_cameras(view, looks)
     matrix = eye.intrinsics
     focal = torch.stack([matrix[..., 0, 0], matrix[..., 1, 1], matrix[..., 0, 2], matrix[..., 1, 2]], -1)
     camera = torch.cat([focal, eye.rotation.flatten(-2), eye.translation], -1)
@@ -291,13 +291,13 @@ def arrays(
     }
     found = {k: np.ascontiguousarray(v.detach().cpu().numpy().astype(np.float32)) for k, v in moving.items()}
     painted = dict(zip(("piece_material", "rope_material", "group_material", "light"), paints, strict=True))
-    return packed(model) | found | painted
+    return pack_model(model) | found | painted
 
 
 def render(
-    model: Model,
+    model: RenderModel,
     placement: Placement,
-    view: View,
+    view: RendererView,
     size: tuple[int, int],
     *,
     looks: Sequence[Look] = (Look(),),
@@ -330,7 +330,7 @@ def render(
         raise InputError(
             f"render: size is {width} x {height} and shadow {shadow}; expected 1 to 4096 pixels, and 0 to 8192 texels."
         )
-    given = arrays(model, placement, view, looks, size)
+    given = renderer_inputs(model, placement, view, looks, size)
     batch, count = given["camera"].shape[:2]
     shape = (batch, count, height, width)
     out = {

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from torchdlo.vision.shading_reference import behind, dot, encoded, lit, painted, unit
+from torchdlo.vision.shading_reference import background_light, dot, encoded, surface_colors, surface_light, unit
 
 __all__ = ["draw", "tube"]
 
@@ -34,7 +34,7 @@ class _Mesh:
 
 
 def draw(given: dict[str, Array], settings: dict[str, int], out: dict[str, Array | None]) -> None:
-    """Fill the pictures that are asked for; arguments as `renderer.arrays` makes them."""
+    """Fill the pictures that are asked for; arguments as `renderer.renderer_inputs` makes them."""
     batch, cameras = given["camera"].shape[:2]
     for b in range(batch):
         scene = {k: v[b] if k in _MOVING else v for k, v in given.items()}
@@ -360,7 +360,7 @@ def _color(
     ray = np.concatenate([(at - camera.middle) / camera.focal, np.ones((len(at), 1))], -1).astype(np.float32)
     found, pieces, light = np.empty((len(at), 3), np.float32), len(scene["piece_id"]), scene["light"]
     nothing, ball = number < 0, number >= len(mesh.face)
-    found[nothing] = behind(light, camera.eye, unit(ray[nothing] @ camera.turn))
+    found[nothing] = background_light(light, camera.eye, unit(ray[nothing] @ camera.turn))
     if ball.any():
         k = number[ball] - len(mesh.face)
         c, r = balls[k], scene["particle_radius"][k][:, None]
@@ -368,7 +368,7 @@ def _color(
         n = unit(np.concatenate([d, -np.sqrt(1 - np.minimum(0.98, (d * d).sum(-1, keepdims=True)))], -1)) @ camera.turn
         p = (c - camera.shift) @ camera.turn + r * n
         m = scene["group_material"][scene["particle_group"][k]]
-        found[ball] = lit(light, shadow, p, n, unit(camera.eye - p), m[:, :3], m[:, 6])
+        found[ball] = surface_light(light, shadow, p, n, unit(camera.eye - p), m[:, :3], m[:, 6])
     flat = ~nothing & ~ball
     if not flat.any():
         return found
@@ -387,5 +387,5 @@ def _color(
     blur = away / camera.focal[0] / np.maximum(0.15, np.abs(dot(n, to_eye)))
     m = np.concatenate([scene["piece_material"], scene["rope_material"]])[owner]
     rope = (owner >= pieces)[:, None]
-    found[flat] = lit(light, shadow, p, n, to_eye, painted(m, p, np.where(rope, uv, 0), blur), m[:, 6])
+    found[flat] = surface_light(light, shadow, p, n, to_eye, surface_colors(m, p, np.where(rope, uv, 0), blur), m[:, 6])
     return found

@@ -10,11 +10,11 @@ import torch
 from torch import Tensor
 
 from torchdlo.coupling.common.pose import Pose
-from torchdlo.coupling.robot import kinematics as robots
-from torchdlo.coupling.robot.kinematics import Robot
+from torchdlo.coupling.robot import robot_kinematics as robots
+from torchdlo.coupling.robot.robot_kinematics import Robot
 from torchdlo.scene import Params, Scene, State
 from torchdlo.vision.arm_surfaces import link_surfaces
-from torchdlo.vision.renderer import ARM, BODY, TABLE, Model, Piece, Placement
+from torchdlo.vision.renderer import ARM, BODY, TABLE, Piece, Placement, RenderModel
 from torchdlo.vision.surfaces import isosurface, plate, solid
 
 __all__ = ["arm_frame", "matrices", "model_of", "placement_of"]
@@ -31,7 +31,7 @@ def model_of(
     low: tuple[float, float] = (-0.8, -0.8),
     high: tuple[float, float] = (0.8, 0.8),
     spacing: float = 0.015,
-) -> Model:
+) -> RenderModel:
     """Return what there is to see in a scene; of a batch, what its first scene has.
 
     Frames are the world, the bodies, then the links of all arms.
@@ -66,7 +66,7 @@ def model_of(
     radius = params.rods.material.radius
     edges = radius.reshape(-1, *radius.shape[-2:])[0, :, 0].double().cpu().numpy()
     groups = scene.material_points.groups if scene.material_points else ()
-    return Model(
+    return RenderModel(
         tuple(pieces),
         counts,
         closed,

@@ -222,7 +222,7 @@ def _from_folder(path: Path) -> np.ndarray:
 
 def save_masks(masks: np.ndarray, path: Path) -> None:
     """Write masks (F, H, W) bool as .npz."""
-    from torchdlo.files import replacing
+    from torchdlo.files import replace_atomically
 
-    with replacing(path) as temporary:
+    with replace_atomically(path) as temporary:
         np.savez_compressed(temporary, masks=masks, torchdlo=np.array("torchdlo"))

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["behind", "dot", "encoded", "lit", "mix", "painted", "smooth", "unit"]
+__all__ = ["background_light", "dot", "encoded", "mix", "smooth", "surface_colors", "surface_light", "unit"]
 
 PLAIN, WOOD, SPECKLED, CHECKED, WOVEN, TWISTED = range(6)
 
@@ -60,7 +60,7 @@ def _wave(x: Array) -> Array:
     return smooth(np.where(f < 0.5, 2 * f, 2 - 2 * f))
 
 
-def painted(m: Array, p: Array, uv: Array, blur: Array) -> Array:
+def surface_colors(m: Array, p: Array, uv: Array, blur: Array) -> Array:
     """Return colours before light falls on them; materials (n, 12), points (n, 3)."""
     one, two, kind, scale = m[:, :3], m[:, 3:6], m[:, 7].astype(int), m[:, 8]
     sharp, seed = np.clip(1.5 - blur * scale, 0, 1), m[:, 11].astype(np.int64)
@@ -82,7 +82,7 @@ def painted(m: Array, p: Array, uv: Array, blur: Array) -> Array:
     return np.where((kind == TWISTED)[:, None], twisted, found)
 
 
-def lit(light: Array, shadow: Any, p: Array, n: Array, to_eye: Array, color: Array, gloss: Array) -> Array:
+def surface_light(light: Array, shadow: Any, p: Array, n: Array, to_eye: Array, color: Array, gloss: Array) -> Array:
     """Return the light that surfaces send to the eye, shape (n, 3)."""
     off = dot(n, to_eye)[:, None]
     n = np.where(off < 0, unit(n - 1.02 * off * to_eye), n)
@@ -98,7 +98,7 @@ def lit(light: Array, shadow: Any, p: Array, n: Array, to_eye: Array, color: Arr
     return color * (direct * key + aside * fill + around) + gloss[:, None] * bright
 
 
-def behind(light: Array, eye: Array, ray: Array) -> Array:
+def background_light(light: Array, eye: Array, ray: Array) -> Array:
     """Return what is seen where nothing is: the floor of the room, and a wall that goes over into it."""
     wall = mix(light[21:24], light[18:21], smooth(0.5 + 1.2 * ray[:, 2]))
     down = (ray[:, 2] < -1e-4) & (eye[2] > light[27])

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-__all__ = ["Surface", "blended", "isosurface", "joined", "moved", "plate", "smoothed", "solid", "strip"]
+__all__ = ["Surface", "blended_isosurface", "isosurface", "joined", "moved", "plate", "smoothed", "solid", "strip"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -195,7 +195,9 @@ def isosurface(values: np.ndarray, low: np.ndarray, spacing: np.ndarray) -> Surf
     return smoothed(vertices, np.concatenate(faces).reshape(-1, 3))
 
 
-def blended(distance: Callable[[np.ndarray], np.ndarray], low: np.ndarray, high: np.ndarray, spacing: float) -> Surface:
+def blended_isosurface(
+    distance: Callable[[np.ndarray], np.ndarray], low: np.ndarray, high: np.ndarray, spacing: float
+) -> Surface:
     """Return where a smooth function is zero, with corners and normals that are exact even where the grid is coarse.
 
     Args:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from torchdlo.errors import InputError
-from torchdlo.files import replacing
+from torchdlo.files import replace_atomically
 
 __all__ = ["CODECS", "frame_rate", "read_video", "write_video"]
 
@@ -107,7 +107,7 @@ def write_video(path: Path, pictures: np.ndarray, fps: float, *, quality: int = 
         raise InputError("films need a build of the package av with H.264; pip install av has it.")
     layout = "rgb24" if pictures.ndim == 4 else "gray"
     height, width = (side // 2 * 2 for side in pictures.shape[1:3])
-    with replacing(path) as temporary, package.open(str(temporary), "w", format="mp4") as container:
+    with replace_atomically(path) as temporary, package.open(str(temporary), "w", format="mp4") as container:
         container.metadata["comment"] = "torchdlo"
         stream = container.add_stream(codec, rate=Fraction(fps).limit_denominator(1001))
         stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"

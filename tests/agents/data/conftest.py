@@ -14,7 +14,7 @@ pytest.importorskip("pytorch_kinematics", reason="arms need the extra robots")
 from short_task import SHORT, Dots, plan
 
 from torchdlo import envs
-from torchdlo.agents.data.making import make
+from torchdlo.agents.data.making import make_dataset
 
 
 @pytest.fixture(autouse=True)
@@ -29,7 +29,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("sets") / "small"
     envs.TASKS.update(SHORT)
     try:
-        make(plan(), out, painter=Dots())
+        make_dataset(plan(), out, painter=Dots())
     finally:
         for name in SHORT:
             envs.TASKS.pop(name)

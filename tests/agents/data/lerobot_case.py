@@ -10,10 +10,10 @@ from pathlib import Path
 
 import numpy as np
 
-from torchdlo.agents.data import video
-from torchdlo.agents.data.build import Episode, build
-from torchdlo.agents.data.schema import Schema
-from torchdlo.agents.data.statistics import histogram
+from torchdlo.agents.data import video_codec
+from torchdlo.agents.data.build import DatasetEpisode, write_dataset
+from torchdlo.agents.data.dataset_schema import Schema
+from torchdlo.agents.data.statistics import channel_histogram
 
 RECORD = Path(__file__).with_name("lerobot_case.json")
 LENGTH, SIZE = 100, 128
@@ -24,10 +24,10 @@ def make(out: Path) -> None:
     schema = Schema(arms=2, size=SIZE)
     with tempfile.TemporaryDirectory() as folder:
         episodes = [_episode(schema, k, Path(folder)) for k in range(3)]
-        build(out, schema, episodes, {"generator": "torchdlo tests"})
+        write_dataset(out, schema, episodes, {"generator": "torchdlo tests"})
 
 
-def _episode(schema: Schema, k: int, folder: Path) -> Episode:
+def _episode(schema: Schema, k: int, folder: Path) -> DatasetEpisode:
     at = np.arange(LENGTH)[:, None]
     # Quarters are exact in binary, so that no processor rounds their sums otherwise.
     columns = {
@@ -44,11 +44,11 @@ def _episode(schema: Schema, k: int, folder: Path) -> Episode:
         for t in range(LENGTH):
             frames[t, 16:32, t : t + 16] = (230, 200, 40)
         path = folder / f"{k}-{key}.mp4"
-        video.encode(path, frames, fps=schema.fps, codec=schema.codec)
-        clips[key] = video.Clip(path, 0, LENGTH)
-        counts[key] = histogram(video.decode(path, fps=schema.fps))
+        video_codec.encode_video(path, frames, fps=schema.fps, codec=schema.codec)
+        clips[key] = video_codec.Clip(path, 0, LENGTH)
+        counts[key] = channel_histogram(video_codec.decode_video(path, fps=schema.fps))
     told = ("Coil the rope to the left.", "Coil the rope to the right.")[k % 2]
-    return Episode(told, LENGTH, lambda: dict(columns), clips, lambda: counts, {"task": "formula", "seed": k})
+    return DatasetEpisode(told, LENGTH, lambda: dict(columns), clips, lambda: counts, {"task": "formula", "seed": k})
 
 
 def hashes(folder: Path) -> dict[str, str]:

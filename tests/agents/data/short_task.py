@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from torchdlo import envs
-from torchdlo.agents.data.making import DatasetPlan, make
+from torchdlo.agents.data.making import DatasetPlan, make_dataset
 from torchdlo.envs.core import episode
 from torchdlo.envs.core.task import RADIUS, Arms, Task, TaskState, straight
 from torchdlo.envs.core.task import make as scene
@@ -111,7 +111,7 @@ def main() -> None:
     envs.TASKS.update(SHORT)
     out, pause, episodes = Path(sys.argv[1]), float(sys.argv[2]), int(sys.argv[3])
     os.umask(0o22)
-    make(plan(episodes=episodes), out, painter=Dots(pause), resume="--resume" in sys.argv)
+    make_dataset(plan(episodes=episodes), out, painter=Dots(pause), resume="--resume" in sys.argv)
 
 
 if __name__ == "__main__":

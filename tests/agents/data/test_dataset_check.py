@@ -12,8 +12,16 @@ import pytest
 import torch
 from short_task import Dots, plan
 
-from torchdlo.agents.data import Choice, FrameData, check, merge, open_set, select, to_tensordict
-from torchdlo.agents.data.making import make
+from torchdlo.agents.data import (
+    Choice,
+    FrameData,
+    check_dataset,
+    merge_datasets,
+    open_set,
+    select_episodes,
+    to_tensordict,
+)
+from torchdlo.agents.data.making import make_dataset
 from torchdlo.cli import app
 from torchdlo.errors import InputError
 
@@ -36,16 +44,16 @@ def frames(own: Path, **columns: object) -> None:
 
 
 def test_a_sound_set_has_no_faults(made: Path) -> None:
-    assert check(made) == []
+    assert check_dataset(made) == []
 
 
 def test_each_fault_is_named(own: Path) -> None:
-    (problem,) = check(own / "nowhere")
+    (problem,) = check_dataset(own / "nowhere")
     assert "info.json: expected a file of a LeRobot data set, found none" in problem
     frames(own, index=np.arange(1, 21))
-    assert "the column index has 1 in frame 0; expected no gaps" in check(own)[0]
+    assert "the column index has 1 in frame 0; expected no gaps" in check_dataset(own)[0]
     frames(own, index=np.arange(20), timestamp=np.float32(np.arange(20) / 50))
-    assert any("timestamp is 0.07" in x or "timestamp is 0.08" in x for x in check(own))
+    assert any("timestamp is 0.07" in x or "timestamp is 0.08" in x for x in check_dataset(own))
 
 
 def test_wrong_statistics_types_and_counts_are_named(own: Path) -> None:
@@ -53,31 +61,31 @@ def test_wrong_statistics_types_and_counts_are_named(own: Path) -> None:
     stats["action"]["q99"][0] += 0.1
     stats[FRONT]["mean"][0][0][0] += 0.01
     (own / "meta/stats.json").write_text(json.dumps(stats))
-    first, second = check(own)
+    first, second = check_dataset(own)
     assert "q99 of action is" in first and f"mean of {FRONT} is" in second
     changed(own / "meta/info.json", total_frames=21, total_episodes=6)
-    assert any("total_frames is 21; the tables have 20" in x for x in check(own))
+    assert any("total_frames is 21; the tables have 20" in x for x in check_dataset(own))
     changed(own / "meta/info.json", total_frames=20, total_episodes=5)
     frames(own, next__reward=np.zeros(20, np.float64))
-    assert any("'next.reward' is of type double" in x for x in check(own))
+    assert any("'next.reward' is of type double" in x for x in check_dataset(own))
 
 
 def test_damaged_files_are_named(own: Path) -> None:
     video = own / f"videos/{FRONT}/chunk-000/file-000.mp4"
     whole = video.read_bytes()
     video.write_bytes(whole[: len(whole) // 2])
-    problems = check(own)
+    problems = check_dataset(own)
     assert problems and all(FRONT in x for x in problems) and "file-000.mp4" in problems[0]
     video.unlink()
-    assert any("the video is missing" in x for x in check(own))
+    assert any("the video is missing" in x for x in check_dataset(own))
     video.write_bytes(whole)
-    assert check(own) == []
+    assert check_dataset(own) == []
     file = own / "data/chunk-000/file-000.parquet"
     file.write_bytes(file.read_bytes()[:-100])
-    (problem,) = check(own)
+    (problem,) = check_dataset(own)
     assert "damaged and cannot be read" in problem and len(problem.splitlines()) == 1
     (own / "meta/tasks.parquet").write_bytes(b"PAR1")
-    assert "tasks.parquet: it is damaged" in check(own)[0]
+    assert "tasks.parquet: it is damaged" in check_dataset(own)[0]
 
 
 def test_sets_of_other_versions_are_refused(own: Path) -> None:
@@ -109,9 +117,9 @@ def test_commands_say_what_is_in_a_set(made: Path, own: Path, capsys) -> None:
 
 
 def test_merged_and_filtered_sets_hold_the_same_frames(made: Path, tmp_path: Path) -> None:
-    assert merge([made, made], tmp_path / "two") == 10 and check(tmp_path / "two") == []
-    assert select(tmp_path / "two", tmp_path / "some", Choice(episodes=(1, 8))) == 2
-    assert check(tmp_path / "some") == []
+    assert merge_datasets([made, made], tmp_path / "two") == 10 and check_dataset(tmp_path / "two") == []
+    assert select_episodes(tmp_path / "two", tmp_path / "some", Choice(episodes=(1, 8))) == 2
+    assert check_dataset(tmp_path / "some") == []
     data, some = open_set(made), open_set(tmp_path / "some")
     a, b = data.columns(), some.columns()
     for k, source in enumerate((1, 3)):
@@ -119,19 +127,19 @@ def test_merged_and_filtered_sets_hold_the_same_frames(made: Path, tmp_path: Pat
         for one, other in zip(some.pictures(k, FRONT), data.pictures(source, FRONT), strict=True):
             assert np.array_equal(one, other)
     assert [row["from"] for row in some.provenance["episodes"]] == [["two", 1], ["two", 8]]
-    assert select(made, tmp_path / "few", Choice(tasks=("short",), limit=2)) == 2
+    assert select_episodes(made, tmp_path / "few", Choice(tasks=("short",), limit=2)) == 2
     with pytest.raises(InputError, match="has no task 'long'; it has"):
-        select(made, tmp_path / "x", Choice(tasks=("long",)))
+        select_episodes(made, tmp_path / "x", Choice(tasks=("long",)))
     with pytest.raises(InputError, match="no episode is left"):
-        select(made, tmp_path / "x", Choice(least_return=1e6))
+        select_episodes(made, tmp_path / "x", Choice(least_return=1e6))
     with pytest.raises(InputError, match="it exists already"):
-        merge([made], tmp_path / "two")
+        merge_datasets([made], tmp_path / "two")
 
 
 def test_sets_that_differ_are_not_merged(made: Path, tmp_path: Path) -> None:
-    make(plan(episodes=1, size=16), tmp_path / "smaller", painter=Dots())
+    make_dataset(plan(episodes=1, size=16), tmp_path / "smaller", painter=Dots())
     with pytest.raises(InputError, match=r"pictures of 16 px in h264.* only sets that are alike can be merged"):
-        merge([made, tmp_path / "smaller"], tmp_path / "two")
+        merge_datasets([made, tmp_path / "smaller"], tmp_path / "two")
     assert not list(tmp_path.glob("*two*"))
 
 
@@ -177,13 +185,13 @@ def test_pages_show_names_as_they_are(own: Path, tmp_path: Path) -> None:
     rows = rows.set_column(rows.column_names.index("tasks"), "tasks", pa.array([[evil]] * 5))
     pq.write_table(rows, file)
     odd = own.rename(own.with_name("a<b>&c"))
-    assert check(odd) == []
+    assert check_dataset(odd) == []
     out = tmp_path / "page.html"
     assert cli_code("view", odd, "--episode", 0, "--episode", 4, "--out", out) == 0
     page = out.read_text()
     assert "<script>alert" not in page and "&lt;script&gt;alert" in page and "a&lt;b&gt;&amp;c" in page
     assert page.count("data:video/mp4;base64,") == 4 and "http" not in page.replace("http-equiv", "")
-    assert merge([odd], tmp_path / "copy") == 5 and open_set(tmp_path / "copy").tasks == (evil,)
+    assert merge_datasets([odd], tmp_path / "copy") == 5 and open_set(tmp_path / "copy").tasks == (evil,)
     assert cli_code("view", odd, "--episode", 9) == 2
     changed(odd / "meta/info.json", features=open_set(odd).features | {"a/b": {"dtype": "float32", "shape": [1]}})
-    assert any("the name 'a/b' has a slash" in x for x in check(odd))
+    assert any("the name 'a/b' has a slash" in x for x in check_dataset(odd))

@@ -14,7 +14,7 @@ import pytest
 
 from torchdlo.agents.data import open_set
 from torchdlo.errors import InputError
-from torchdlo.report.dataset import summary
+from torchdlo.report.dataset import dataset_summary
 
 EXPERIMENTS = Path(__file__).parents[3] / "experiments"
 
@@ -30,12 +30,12 @@ def fuzz(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
 def test_damaged_descriptions_are_refused_in_a_sentence(own: Path, fuzz: Any) -> None:
     file, faults = own / "meta" / "info.json", []
     sound = file.read_text()
-    assert summary(open_set(own))["episodes"] == 5
+    assert dataset_summary(open_set(own))["episodes"] == 5
     refused = 0
     for number in range(150):
         file.write_text(fuzz.spoiled_json(sound, random.Random(f"info {number}")), encoding="utf-8", errors="replace")
         try:
-            summary(open_set(own))
+            dataset_summary(open_set(own))
         except InputError as error:
             refused += 1
             assert "\n" not in str(error) and len(str(error)) < 1500

@@ -17,8 +17,8 @@ import pytest
 import torch
 from short_task import Dots, Pair, Short, plan
 
-from torchdlo.agents.data import attempts, check, merge, open_set
-from torchdlo.agents.data.making import UNFINISHED, DatasetPlan, make
+from torchdlo.agents.data import attempts, check_dataset, merge_datasets, open_set
+from torchdlo.agents.data.making import UNFINISHED, DatasetPlan, make_dataset
 from torchdlo.agents.distributed import LocalProcesses
 from torchdlo.cli import app
 from torchdlo.envs.core import episode
@@ -45,7 +45,7 @@ def test_what_was_executed_earns_again_what_is_kept(made: Path) -> None:
         assert np.allclose(state[:, 8:11], world.tool.pos[:, 0], atol=1e-5)
         assert np.allclose(state[:, :7], world.joints[:, 0, :7], atol=1e-4)
         world = episode.act(scene, world, actions[:, k])
-        reward = episode.earned(scene, world)[0]
+        reward = episode.episode_reward(scene, world)[0]
         assert np.allclose(columns["next.reward"].reshape(5, 4)[:, k], reward, atol=1e-5)
     sums = columns["next.reward"].reshape(5, 4).sum(1)
     assert np.allclose([row["return"] for row in rows], sums, atol=1e-5)
@@ -63,8 +63,8 @@ def test_actions_lead_back_to_where_noise_led_away_from(made: Path) -> None:
 
 
 def test_sets_are_as_wide_as_the_task_with_the_most_arms(tmp_path: Path) -> None:
-    make(plan(tasks=("short", "pair"), episodes=2), tmp_path / "set", painter=Dots())
-    assert check(tmp_path / "set") == []
+    make_dataset(plan(tasks=("short", "pair"), episodes=2), tmp_path / "set", painter=Dots())
+    assert check_dataset(tmp_path / "set") == []
     data = open_set(tmp_path / "set")
     columns = data.columns()
     one = columns["episode_index"] % 2 == 0  # tasks take turns
@@ -82,9 +82,9 @@ def test_sets_are_as_wide_as_the_task_with_the_most_arms(tmp_path: Path) -> None
 
 @pytest.mark.slow
 def test_sets_of_one_arm_can_have_room_for_two(tmp_path: Path) -> None:
-    make(plan(tasks=("short",), episodes=1, arms=2, size=0), tmp_path / "one")
-    make(plan(tasks=("pair",), episodes=1, size=0), tmp_path / "two")
-    merge([tmp_path / "one", tmp_path / "two"], tmp_path / "both")
+    make_dataset(plan(tasks=("short",), episodes=1, arms=2, size=0), tmp_path / "one")
+    make_dataset(plan(tasks=("pair",), episodes=1, size=0), tmp_path / "two")
+    merge_datasets([tmp_path / "one", tmp_path / "two"], tmp_path / "both")
     state = open_set(tmp_path / "both").columns()["observation.state"]
     assert state.shape == (8, 30) and not state[:4, 15:].any() and state[4:, 15:].any()
 
@@ -101,7 +101,7 @@ def test_tasks_say_their_noise_and_plans_their_fidelity() -> None:
 def test_workers_make_the_same_bytes(made: Path, tmp_path: Path) -> None:
     with LocalProcesses(2) as pool:
         # Workers do not know the tasks of tests: they get them with what they are told to do.
-        make(plan(), tmp_path / "set", painter=Dots(), executor=_Taught(pool))
+        make_dataset(plan(), tmp_path / "set", painter=Dots(), executor=_Taught(pool))
     assert content(tmp_path / "set") == content(made)
 
 
@@ -140,25 +140,25 @@ def test_a_stopped_run_keeps_what_is_finished_and_goes_on(made: Path, tmp_path: 
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        make(plan(), out, painter=Dots(), callback=stop)
+        make_dataset(plan(), out, painter=Dots(), callback=stop)
     kept = content(out)
     assert sum(name.endswith("attempt.json") for name in kept) in (4, 8) and not (out / "meta").exists()
     with pytest.raises(InputError, match="a run was begun there; --resume goes on with it"):
-        make(plan(), out, painter=Dots())
+        make_dataset(plan(), out, painter=Dots())
     with pytest.raises(InputError, match="other options or versions"):
-        make(plan(seed=3), out, painter=Dots(), resume=True)
+        make_dataset(plan(seed=3), out, painter=Dots(), resume=True)
     # One attempt of a batch that was half written is made again, and only it is written.
     lost = out / UNFINISHED / "short/000002"
     for file in lost.iterdir():
         file.unlink()
     lost.rmdir()
-    make(plan(), out, painter=Dots(), resume=True)
+    make_dataset(plan(), out, painter=Dots(), resume=True)
     assert content(out) == content(made)
     # A finished set is left as it is.
-    report = make(plan(), out, painter=Dots(), resume=True)
+    report = make_dataset(plan(), out, painter=Dots(), resume=True)
     assert content(out) == content(made) and report["short"]["attempts"] > 5
     with pytest.raises(InputError, match="it exists already"):
-        make(plan(), out, painter=Dots())
+        make_dataset(plan(), out, painter=Dots())
 
 
 @pytest.mark.slow
@@ -197,11 +197,11 @@ def test_a_full_disk_is_one_sentence_and_nothing_is_lost(made: Path, tmp_path: P
     with monkeypatch.context() as patch:
         patch.setattr(Path, "write_bytes", full)
         with pytest.raises(OSError, match=r"No space left on device: .*set/unfinished/short/00000\d'") as caught:
-            make(plan(), out, painter=Dots())
+            make_dataset(plan(), out, painter=Dots())
     assert len(str(caught.value).splitlines()) == 1
     folders = [f for f in (out / UNFINISHED / "short").iterdir()]
-    assert folders and all(attempts.load(f) is not None for f in folders)
-    make(plan(), out, painter=Dots(), resume=True)
+    assert folders and all(attempts.read_attempt(f) is not None for f in folders)
+    make_dataset(plan(), out, painter=Dots(), resume=True)
     assert content(out) == content(made)
 
 
@@ -236,7 +236,7 @@ def test_wrong_requests_are_one_sentence(tmp_path: Path, capsys, monkeypatch) ->
 
 def test_a_task_without_success_is_given_up_with_a_sentence(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"never: only 0 of 8 attempts succeeded, and 1 were asked for; give less"):
-        make(plan(tasks=("never",), episodes=1), tmp_path / "set", painter=Dots())
+        make_dataset(plan(tasks=("never",), episodes=1), tmp_path / "set", painter=Dots())
 
 
 def test_a_stored_trajectory_is_followed_from_other_starts(tmp_path: Path) -> None:
@@ -248,13 +248,13 @@ def test_a_stored_trajectory_is_followed_from_other_starts(tmp_path: Path) -> No
     file.write_text(json.dumps({"task": "short", "tool": places, "success": True, "return": 1.0}))
     for actor in (file, tmp_path):
         out = tmp_path / f"set_{actor.suffix}"
-        make(plan(actor=str(actor), episodes=2, size=0), out)
+        make_dataset(plan(actor=str(actor), episodes=2, size=0), out)
         data = open_set(out)
-        assert check(out) == [] and data.cameras == ()
+        assert check_dataset(out) == [] and data.cameras == ()
         assert data.provenance["episodes"][0]["actions_from"] == "trajectory found/trajectory.json"
         target = data.columns()["torchdlo.target"][:4, :3]
         away = np.array(data.provenance["episodes"][0]["offsets"][0])
         assert np.allclose(target, np.array(places)[:, 0] + away, atol=1e-5)
     assert Pair().arms.count == 2
     with pytest.raises(InputError, match="it is a trajectory of short"):
-        make(plan(tasks=("pair",), actor=str(file), size=0), tmp_path / "other")
+        make_dataset(plan(tasks=("pair",), actor=str(file), size=0), tmp_path / "other")

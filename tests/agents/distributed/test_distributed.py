@@ -13,9 +13,9 @@ from pathlib import Path
 
 import pytest
 
-from torchdlo.agents.distributed import LocalProcesses, Serial, executor
+from torchdlo.agents.distributed import LocalProcesses, Serial, make_executor
 from torchdlo.agents.distributed import sweep as sweeps
-from torchdlo.agents.distributed.sweep import Job, Sweep, run
+from torchdlo.agents.distributed.sweep import Job, Sweep, run_sweep
 from torchdlo.cli import app
 from torchdlo.errors import InputError
 
@@ -88,7 +88,7 @@ def test_without_ray_an_address_is_refused_with_what_to_install() -> None:
         import ray  # noqa: F401
     except ImportError:
         with pytest.raises(InputError, match=r"--address needs ray; install it with pip install 'torchdlo\[ray\]'"):
-            executor(address="auto")
+            make_executor(address="auto")
 
 
 def fake(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
@@ -127,18 +127,18 @@ def test_a_sweep_runs_all_jobs_and_goes_on_with_what_failed(monkeypatch, tmp_pat
     log, out = fake(monkeypatch, tmp_path), tmp_path / "out"
     (tmp_path / "bad-wrapping-1").touch()
     plan = Sweep("optimize", ("coiling", "wrapping"), (0, 1), ("--episodes", "5"))
-    found = run(plan, out, Serial(), away=away)
+    found = run_sweep(plan, out, Serial(), away=away)
     assert {name: row["done"] for name, row in found.items()} == {
         "coiling-0": True, "wrapping-0": True, "coiling-1": True, "wrapping-1": False,
     }  # fmt: skip
     assert found["wrapping-1"]["message"] == "error: it did not work"
     assert (out / "coiling-1/result.json").read_text() == "1"
     with pytest.raises(InputError, match="a sweep was begun there; --resume goes on with it"):
-        run(plan, out, Serial())
+        run_sweep(plan, out, Serial())
     with pytest.raises(InputError, match="another sweep was begun there"):
-        run(Sweep("optimize", ("coiling",), (0,)), out, Serial(), resume=True)
+        run_sweep(Sweep("optimize", ("coiling",), (0,)), out, Serial(), resume=True)
     (tmp_path / "bad-wrapping-1").unlink()
-    found = run(plan, out, Serial(), away=away, resume=True)
+    found = run_sweep(plan, out, Serial(), away=away, resume=True)
     assert all(row["done"] for row in found.values()) and len(found) == 4
     # Only what had failed is run again, and from where it was if its folder is here.
     assert log.read_text().split("\n")[4:-1] == ["wrapping-1" if away else "wrapping-1 again"]
@@ -152,8 +152,8 @@ def test_a_sweep_that_was_stopped_loses_no_finished_job(monkeypatch, tmp_path: P
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        run(plan, out, Serial(), callback=stop)
-    assert len(run(plan, out, Serial(), resume=True)) == 3
+        run_sweep(plan, out, Serial(), callback=stop)
+    assert len(run_sweep(plan, out, Serial(), resume=True)) == 3
     assert log.read_text().split() == ["coiling-0", "coiling-1", "coiling-2"]
 
 

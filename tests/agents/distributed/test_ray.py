@@ -20,8 +20,8 @@ sys.path.insert(0, str(DATA))
 from short_task import SHORT, Dots, plan  # noqa: E402
 
 from torchdlo import envs  # noqa: E402
-from torchdlo.agents.data.making import make  # noqa: E402
-from torchdlo.agents.distributed import executor  # noqa: E402
+from torchdlo.agents.data.making import make_dataset  # noqa: E402
+from torchdlo.agents.distributed import make_executor  # noqa: E402
 
 
 class Lesson:
@@ -74,10 +74,10 @@ def test_a_lost_node_changes_no_byte(tmp_path: Path, monkeypatch: pytest.MonkeyP
 
     thread = threading.Thread(target=lose)
     try:
-        make(plan(episodes=10), tmp_path / "one", painter=Dots())
-        with executor(address=cluster.address) as workers:
+        make_dataset(plan(episodes=10), tmp_path / "one", painter=Dots())
+        with make_executor(address=cluster.address) as workers:
             thread.start()
-            make(plan(episodes=10), tmp_path / "two", painter=Dots(1.0), executor=Taught(workers))
+            make_dataset(plan(episodes=10), tmp_path / "two", painter=Dots(1.0), executor=Taught(workers))
     finally:
         thread.join()
         cluster.shutdown()

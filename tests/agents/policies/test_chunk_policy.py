@@ -20,18 +20,20 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "data"))
 from short_task import SHORT, Dots, plan
 
 from torchdlo import envs
-from torchdlo.agents.data import check, open_set
-from torchdlo.agents.data.making import make
-from torchdlo.agents.data.record import Noise, play_batch, starts
+from torchdlo.agents.data import check_dataset, open_set
+from torchdlo.agents.data.making import make_dataset
+from torchdlo.agents.data.record import Noise, draw_starts, play_batch
 from torchdlo.agents.policies import language
-from torchdlo.agents.policies.chunk_policy import ChunkPolicy, Shape, load_policy, save_policy
-from torchdlo.agents.policies.rollout import PolicyDemonstrator, evaluate
-from torchdlo.agents.policies.training import Training, learn
+from torchdlo.agents.policies.chunk_policy import ChunkPolicy, NetworkShape, load_policy, save_policy
+from torchdlo.agents.policies.chunk_rollout import PolicyDemonstrator, evaluate_chunk_policy
+from torchdlo.agents.policies.chunk_training import Training, train_chunk_policy
 from torchdlo.cli import app
 from torchdlo.envs.core import episode
 from torchdlo.errors import InputError
 
-SHAPE = Shape(arms=2, cameras=("front", "wrist_right", "wrist_left"), size=32, state=30, chunk=5, width=32, heads=2)
+SHAPE = NetworkShape(
+    arms=2, cameras=("front", "wrist_right", "wrist_left"), size=32, state=30, chunk=5, width=32, heads=2
+)
 
 
 @pytest.fixture(autouse=True)
@@ -45,7 +47,7 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Eight episodes with pictures."""
     out = tmp_path_factory.mktemp("sets") / "small"
     envs.TASKS.update(SHORT)
-    make(plan(episodes=8), out, painter=Dots())
+    make_dataset(plan(episodes=8), out, painter=Dots())
     return out
 
 
@@ -53,7 +55,9 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def learned(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A policy that was trained for a while."""
     out = tmp_path_factory.mktemp("policies") / "policy.pt"
-    learn(data, out, Training(epochs=60, batch=8, rate=2e-3, chunk=4, width=32, language="hashed", recolor=0.0))
+    train_chunk_policy(
+        data, out, Training(epochs=60, batch=8, rate=2e-3, chunk=4, width=32, language="hashed", recolor=0.0)
+    )
     return out
 
 
@@ -64,7 +68,7 @@ def test_sentences_that_mean_the_same_are_near_each_other() -> None:
         ("Coil the rope around the cone.", "Wind the cord about the cone."),
         ("Coil the rope around the cone.", "Shoot the ball at the cube."),
     )
-    a, b = (language.encode(pair, "minilm") for pair in (near, far))
+    a, b = (language.encode_sentences(pair, "minilm") for pair in (near, far))
     assert torch.allclose(a.norm(dim=1), torch.ones(2)) and float(a[0] @ a[1]) > 0.6 > 0.4 > float(b[0] @ b[1])
 
 
@@ -72,15 +76,15 @@ def test_the_language_model_gives_the_vectors_of_its_authors() -> None:
     if language.default_encoder() != "minilm":
         pytest.skip("the language model is not installed")
     # The first numbers of model.encode("This is an example sentence") as its model card's example prints them.
-    (found,) = language.encode(["This is an example sentence"], "minilm")
+    (found,) = language.encode_sentences(["This is an example sentence"], "minilm")
     assert torch.allclose(found[:3], torch.tensor([0.06765693, 0.06349581, 0.0487131]), atol=2e-5)
 
 
 def test_hashed_sentences_share_what_their_words_share() -> None:
-    a, b, c = language.encode(["Coil the rope left!", "coil the ROPE, left", "lift both rings"], "hashed")
+    a, b, c = language.encode_sentences(["Coil the rope left!", "coil the ROPE, left", "lift both rings"], "hashed")
     assert torch.allclose(a, b) and abs(float(a @ c)) < 0.3 and float(a.norm()) == pytest.approx(1)
     with pytest.raises(InputError, match="expected one of minilm, hashed, given 'clip'"):
-        language.encode(["x"], "clip")
+        language.encode_sentences(["x"], "clip")
 
 
 def test_targets_depend_on_pictures_state_and_words() -> None:
@@ -122,7 +126,7 @@ def test_files_of_policies_come_back_and_others_are_refused(tmp_path: Path) -> N
 
 def test_small_files_hold_nearly_the_same_policy(tmp_path: Path) -> None:
     torch.manual_seed(0)
-    shape = Shape(arms=2, cameras=("front",), size=96)
+    shape = NetworkShape(arms=2, cameras=("front",), size=96)
     policy = ChunkPolicy(shape).eval()
     for name, small in (("whole", False), ("small", True)):
         save_policy(tmp_path / f"{name}.pt", policy, {}, small=small)
@@ -146,7 +150,7 @@ def test_training_reads_the_set_and_learns_its_targets(data: Path, learned: Path
     }
     at = 4 * np.arange(8) + 1
     state = torch.as_tensor(columns["observation.state"][at])
-    words = language.encode(found.tasks, "hashed").expand(8, -1)
+    words = language.encode_sentences(found.tasks, "hashed").expand(8, -1)
     with torch.no_grad():
         seen = {name: torch.as_tensor(x).movedim(-1, 1) for name, x in shots.items()}
         ahead = policy(seen, state, words)
@@ -158,24 +162,24 @@ def test_training_reads_the_set_and_learns_its_targets(data: Path, learned: Path
 
 def test_training_that_was_stopped_comes_to_the_same(data: Path, tmp_path: Path) -> None:
     training = Training(epochs=3, batch=16, chunk=4, width=32, language="hashed")
-    learn(data, tmp_path / "whole.pt", training)
+    train_chunk_policy(data, tmp_path / "whole.pt", training)
 
     def stop(stage: str, done: int, total: int, message: str) -> None:
         if stage == "learn" and done == 5:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        learn(data, tmp_path / "parts.pt", training, callback=stop)
+        train_chunk_policy(data, tmp_path / "parts.pt", training, callback=stop)
     with pytest.raises(InputError, match="it is of another data set or training"):
-        learn(
+        train_chunk_policy(
             data, tmp_path / "parts.pt", Training(epochs=3, batch=8, chunk=4, width=32, language="hashed"), resume=True
         )
-    learn(data, tmp_path / "parts.pt", training, resume=True)
+    train_chunk_policy(data, tmp_path / "parts.pt", training, resume=True)
     (a, one), (b, other) = (load_policy(tmp_path / f"{name}.pt") for name in ("whole", "parts"))
     assert one["loss"] == other["loss"]
     assert all(torch.equal(x, y) for x, y in zip(a.parameters(), b.parameters(), strict=True))
     with pytest.raises(InputError, match="there is no checkpoint to resume"):
-        learn(data, tmp_path / "parts.pt", training, resume=True)
+        train_chunk_policy(data, tmp_path / "parts.pt", training, resume=True)
 
 
 def test_learning_from_a_damaged_set_is_one_sentence(data: Path, tmp_path: Path) -> None:
@@ -185,20 +189,20 @@ def test_learning_from_a_damaged_set_is_one_sentence(data: Path, tmp_path: Path)
         file = next(f for f in sorted((own / part).rglob("file-*")))
         file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
         with pytest.raises(InputError, match=said) as caught:
-            learn(own, tmp_path / "policy.pt", Training(epochs=1, chunk=4, width=32, language="hashed"))
+            train_chunk_policy(own, tmp_path / "policy.pt", Training(epochs=1, chunk=4, width=32, language="hashed"))
         assert len(str(caught.value).splitlines()) == 1 and not list(tmp_path.glob(".frames*"))
 
 
 def test_a_policy_acts_in_closed_loop_and_makes_a_set(learned: Path, tmp_path: Path, monkeypatch, capsys) -> None:
-    found = evaluate(learned, ["short"], Dots(), episodes=6, conditions=("varied", "blanked"))
+    found = evaluate_chunk_policy(learned, ["short"], Dots(), episodes=6, conditions=("varied", "blanked"))
     rows = found["tasks"]["short"]
     # Starts on the left are done, those on the right cannot be.
     assert 0.3 <= rows["varied"]["success"] <= 1 and found["mean"]["varied"] == rows["varied"]["success"]
     assert len(rows["varied"]["episodes"]) == 6
-    again = evaluate(learned, ["short"], Dots(), episodes=6)
+    again = evaluate_chunk_policy(learned, ["short"], Dots(), episodes=6)
     assert again["tasks"]["short"]["varied"] == rows["varied"]
-    make(plan(episodes=2, actor=str(learned), size=16), tmp_path / "set", painter=Dots())
-    assert check(tmp_path / "set") == []
+    make_dataset(plan(episodes=2, actor=str(learned), size=16), tmp_path / "set", painter=Dots())
+    assert check_dataset(tmp_path / "set") == []
     assert open_set(tmp_path / "set").provenance["episodes"][0]["actions_from"] == "policy policy.pt"
     monkeypatch.setattr("torchdlo.agents.data.painting.TaskPainter", Dots)
     words = ["evaluate", str(learned), "--starts", "2", "--out", str(tmp_path), "--json"]
@@ -210,13 +214,13 @@ def test_a_policy_acts_in_closed_loop_and_makes_a_set(learned: Path, tmp_path: P
         app.main([*words, "--film"])
     assert wrong.value.code == 2 and "it is a policy of learn" in capsys.readouterr().err
     with pytest.raises(InputError, match="swapped needs another task"):
-        evaluate(learned, ["short"], Dots(), episodes=2, conditions=("swapped",))
+        evaluate_chunk_policy(learned, ["short"], Dots(), episodes=2, conditions=("swapped",))
     with pytest.raises(InputError, match="it moves 1 arm, and pair has 2"):
-        evaluate(learned, ["pair"], Dots(), episodes=2)
+        evaluate_chunk_policy(learned, ["pair"], Dots(), episodes=2)
 
 
 def test_a_policy_looks_again_after_some_actions_and_follows_its_chunk_between() -> None:
-    policy = ChunkPolicy(Shape(arms=1, cameras=("front",), size=32, state=15, chunk=8, width=32, heads=2))
+    policy = ChunkPolicy(NetworkShape(arms=1, cameras=("front",), size=32, state=15, chunk=8, width=32, heads=2))
     seen: list[int] = []
 
     class Counting(Dots):
@@ -228,5 +232,5 @@ def test_a_policy_looks_again_after_some_actions_and_follows_its_chunk_between()
     made = episode.prepare(task, 2, compiled=False)
     actor = PolicyDemonstrator(policy.eval(), "hashed", "policy")
     with torch.no_grad():
-        play_batch(made, starts(task, 0, range(2)), actor, Noise(0.0), Counting())
+        play_batch(made, draw_starts(task, 0, range(2)), actor, Noise(0.0), Counting())
     assert seen == [0, 8]

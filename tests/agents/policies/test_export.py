@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from torchdlo.agents.policies import FeatureSpec, Policy, PolicySpec, save
+from torchdlo.agents.policies import FeatureSpec, Policy, PolicySpec, save_policy
 from torchdlo.agents.policies.export import export
 from torchdlo.cli import app
 from torchdlo.errors import InputError
@@ -44,7 +44,7 @@ def test_onnx_acts_the_same(tmp_path: Path):
 
 
 def test_the_command_writes_it_and_says_what_is_wrong(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    save(made(), tmp_path / "policy.pt")
+    save_policy(made(), tmp_path / "policy.pt")
     with pytest.raises(SystemExit) as done:
         app.main(["export", str(tmp_path)])
     assert done.value.code in (0, None)

@@ -10,7 +10,15 @@ import pytest
 import torch
 
 from torchdlo import envs
-from torchdlo.agents.policies import FeatureSpec, Normaliser, Policy, PolicySpec, load, save, task_features
+from torchdlo.agents.policies import (
+    FeatureSpec,
+    Normaliser,
+    Policy,
+    PolicySpec,
+    load_policy,
+    save_policy,
+    task_features,
+)
 from torchdlo.agents.policies.features import Features
 from torchdlo.envs.core import episode
 from torchdlo.errors import InputError
@@ -98,8 +106,8 @@ def test_densities_are_those_of_torchs_distributions(squash: bool, state_sigma: 
 def test_a_policy_comes_back_from_its_file(tmp_path: Path):
     policy = made(task="coiling")
     policy.normaliser.update(torch.randn(10, policy.spec.features.width))
-    save(policy, tmp_path / "policy.pt", {"episodes": 3})
-    again, notes = load(tmp_path, notes=True)
+    save_policy(policy, tmp_path / "policy.pt", {"episodes": 3})
+    again, notes = load_policy(tmp_path, notes=True)
     assert (again.spec, notes) == (policy.spec, {"episodes": 3})
     x, p = torch.randn(4, 5), torch.rand(4, 1)
     assert torch.equal(again.act(x, p), policy.act(x, p))
@@ -108,12 +116,12 @@ def test_a_policy_comes_back_from_its_file(tmp_path: Path):
 def test_files_with_code_are_refused(tmp_path: Path):
     torch.save({"generator": "torchdlo train", "spec": print}, tmp_path / "policy.pt")
     with pytest.raises(InputError, match="expected a policy"):
-        load(tmp_path / "policy.pt")
+        load_policy(tmp_path / "policy.pt")
     (tmp_path / "text.pt").write_text("no policy")
     with pytest.raises(InputError, match="expected a policy"):
-        load(tmp_path / "text.pt")
+        load_policy(tmp_path / "text.pt")
     with pytest.raises(InputError, match="found none"):
-        load(tmp_path / "none.pt")
+        load_policy(tmp_path / "none.pt")
 
 
 def test_commands_are_ways_in_metres_and_no_turns():
@@ -129,18 +137,18 @@ def test_a_policy_acts_in_torchrls_rollouts():
     from small import small
     from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-    from torchdlo.agents.policies import module
+    from torchdlo.agents.policies import policy_module
 
     task = small("wiring_post", 3)
     spec = PolicySpec(task_features(task), 3, hidden=(8,), task="wiring_post", reach=0.01, turns=3)
     policy = Policy(spec)
     env = envs.make(task, num_envs=2, compiled=False, variation=False)
     with set_exploration_type(ExplorationType.DETERMINISTIC):
-        found = env.rollout(3, module(policy))
+        found = env.rollout(3, policy_module(policy))
     first = found[:, 0]
     wanted = policy.act(first["observation"], first["progress"], first["start"])
     torch.testing.assert_close(first["action"], wanted)
     torch.testing.assert_close(found["progress"][0, :, 0], torch.tensor([0, 1 / 3, 2 / 3]))
     with set_exploration_type(ExplorationType.RANDOM):
         torch.manual_seed(0)
-        assert (env.rollout(1, module(policy))["action"][:, 0] - wanted).abs().max() > 0
+        assert (env.rollout(1, policy_module(policy))["action"][:, 0] - wanted).abs().max() > 0

@@ -11,7 +11,7 @@ from torchrl.envs import PendulumEnv
 
 from torchdlo.agents.policies import FeatureSpec, Policy, PolicySpec
 from torchdlo.agents.rl.episodes import EnvEpisodes
-from torchdlo.agents.rl.rollout import collect
+from torchdlo.agents.rl.rollout import collect_episodes
 
 HORIZON = 100
 
@@ -50,4 +50,4 @@ def swinger(**choices) -> Policy:
 
 def swung(policy: Policy) -> float:
     """Mean return from 64 starts that are new."""
-    return float(collect(policy, pendulums(64, 99), random=False).reward.sum(0).mean())
+    return float(collect_episodes(policy, pendulums(64, 99), random=False).reward.sum(0).mean())

@@ -64,9 +64,9 @@ def pusher(**choices) -> Policy:
 
 def solved(policy: Policy) -> tuple[float, float, float]:
     """Mean return of a policy, of doing nothing, and of the best linear feedback, from 256 starts that are new."""
-    from torchdlo.agents.rl.rollout import collect
+    from torchdlo.agents.rl.rollout import collect_episodes
 
-    found = collect(policy, springs(256, 99), random=False).reward.sum(0).mean()
+    found = collect_episodes(policy, springs(256, 99), random=False).reward.sum(0).mean()
     values = []
     for gain in ((0.0, 0.0), (-0.6, -0.8)):
         env = Spring(256, 99)

@@ -11,7 +11,7 @@ from springs import pusher, solved, springs
 
 from torchdlo.agents.rl.ppo import Ppo
 from torchdlo.agents.rl.sac import Sac
-from torchdlo.agents.rl.settings import preset
+from torchdlo.agents.rl.settings import training_preset
 from torchdlo.agents.rl.shac import Sapo, Shac
 from torchdlo.agents.rl.training import train
 
@@ -29,7 +29,7 @@ KINDS = {"ppo": Ppo, "sac": Sac, "shac": Shac, "sapo": Sapo}
 @pytest.mark.parametrize("name", ["ppo", "shac", "sapo", pytest.param("sac", marks=pytest.mark.slow)])
 def test_a_point_on_a_spring_is_pushed_to_rest(name: str):
     torch.manual_seed(0)
-    settings = preset("", name, hidden=(32, 32), critic=(32, 32), replay=20_000, **CHOICES[name])
+    settings = training_preset("", name, hidden=(32, 32), critic=(32, 32), replay=20_000, **CHOICES[name])
     policy = pusher(sigma=settings.sigma, state_sigma=name in ("sac", "sapo"))
     found = train(KINDS[name](policy, settings), springs(settings.count), settings)
     reached, nothing, feedback = solved(found.policy)
@@ -52,7 +52,9 @@ def test_torchrls_pendulum_is_swung_up(name: str):
         "ppo": {"episodes": 64 * 120, "count": 64, "rate": 1e-3, "passes": 10, "batch": 1024, "gamma": 0.95},
         "sac": {"episodes": 8 * 30, "count": 8, "batch": 256, "warm": 2, "updates": 2, "rate": 1e-3, "gamma": 0.97},
     }
-    settings = preset("", name, hidden=(64, 64), critic=(64, 64), critic_rate=1e-3, replay=50_000, **choices[name])
+    settings = training_preset(
+        "", name, hidden=(64, 64), critic=(64, 64), critic_rate=1e-3, replay=50_000, **choices[name]
+    )
     policy = swinger(sigma=0.6, state_sigma=name == "sac")
     found = train(KINDS[name](policy, settings), pendulums(settings.count), settings)
     # Hanging down earns -pi^2 per action: about -1000 in 100 actions from random starts; upright earns 0.

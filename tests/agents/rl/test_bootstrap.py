@@ -9,7 +9,7 @@ import torch
 
 pytest.importorskip("torchrl")
 
-from torchdlo.agents.rl.rollout import Batch, advantages, targets
+from torchdlo.agents.rl.rollout import Batch, generalised_advantages, td_lambda_targets
 from torchdlo.agents.rl.shac import Window, actor_loss
 
 G = 0.5
@@ -32,21 +32,21 @@ def test_the_end_of_the_time_is_an_end():
     """With lambda 1, returns are sums of discounted rewards: 1 + 2/2 + 4/4, 2 + 4/2, 4; the value 100 is not seen."""
     terminal = batch(flags(0, 0, 0)).terminal
     value = column(0, 0, 0, 100)
-    _, returns = advantages(value, column(1, 2, 4), terminal, gamma=G, lmbda=1.0)
+    _, returns = generalised_advantages(value, column(1, 2, 4), terminal, gamma=G, lmbda=1.0)
     torch.testing.assert_close(returns, column(3, 4, 4))
 
 
 def test_a_failure_is_an_end_and_what_comes_after_is_not_learned_from():
     """It fails with the second action: 1 + 2/2, then 2; values after it are not seen."""
     played = batch(flags(0, 1, 1))
-    _, returns = advantages(column(0, 0, 50, 100), column(1, 2, 0), played.terminal, gamma=G, lmbda=1.0)
+    _, returns = generalised_advantages(column(0, 0, 50, 100), column(1, 2, 0), played.terminal, gamma=G, lmbda=1.0)
     torch.testing.assert_close(returns[:2], column(2, 2))
     assert played.alive.flatten().tolist() == [True, True, False]
 
 
 def test_advantages_mix_values_and_rewards():
     """delta_1 = 2 + 0 - 4 = -2; delta_0 = 1 + 4/2 - 3 = 0; A_0 = 0 + (1/2)(1/2)(-2)."""
-    advantage, _ = advantages(column(3, 4, 9), column(1, 2), flags(0, 1), gamma=G, lmbda=0.5)
+    advantage, _ = generalised_advantages(column(3, 4, 9), column(1, 2), flags(0, 1), gamma=G, lmbda=0.5)
     torch.testing.assert_close(advantage, column(-0.5, -2))
 
 
@@ -56,14 +56,16 @@ def test_windows_are_bootstrapped_at_their_end():
     lambda 1/2, with the first value 10: 1 + (10 + 6) / 2 / 2 = 5.
     """
     rewards, ends = column(1, 2), flags(0, 0)
-    torch.testing.assert_close(targets(column(6, 8), rewards, ends, gamma=G, lmbda=1.0), column(4, 6))
-    torch.testing.assert_close(targets(column(6, 8), rewards, ends, gamma=G, lmbda=0.0), column(4, 6))
-    torch.testing.assert_close(targets(column(10, 8), rewards, ends, gamma=G, lmbda=0.5), column(5, 6))
+    torch.testing.assert_close(td_lambda_targets(column(6, 8), rewards, ends, gamma=G, lmbda=1.0), column(4, 6))
+    torch.testing.assert_close(td_lambda_targets(column(6, 8), rewards, ends, gamma=G, lmbda=0.0), column(4, 6))
+    torch.testing.assert_close(td_lambda_targets(column(10, 8), rewards, ends, gamma=G, lmbda=0.5), column(5, 6))
 
 
 def test_failures_in_windows_are_not_bootstrapped():
     """It fails with the second action: 1 + 2/2 and 2, whatever values say."""
-    torch.testing.assert_close(targets(column(6, 8), column(1, 2), flags(0, 1), gamma=G, lmbda=1.0), column(2, 2))
+    torch.testing.assert_close(
+        td_lambda_targets(column(6, 8), column(1, 2), flags(0, 1), gamma=G, lmbda=1.0), column(2, 2)
+    )
 
 
 def window(failed: torch.Tensor, *, begun: int = 1, ends: bool = False, log_prob: float = 0.0) -> Window:

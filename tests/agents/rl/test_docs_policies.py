@@ -32,7 +32,7 @@ def test_the_tutorial_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caps
 
 
 def test_every_algorithm_and_stage_is_on_the_page():
-    from torchdlo.agents.rl.hybrid import STAGES
+    from torchdlo.agents.rl.hybrid_stages import STAGES
     from torchdlo.agents.rl.settings import ALGORITHMS
 
     text = (ROOT / "docs" / "policies.md").read_text()

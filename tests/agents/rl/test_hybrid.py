@@ -14,14 +14,14 @@ pytest.importorskip("cma")
 from lead import Lead, found
 
 from torchdlo import envs
-from torchdlo.agents.policies import load
-from torchdlo.agents.rl import hybrid as stages
+from torchdlo.agents.policies import load_policy
+from torchdlo.agents.rl import hybrid_stages as stages
 from torchdlo.agents.rl.episodes import TaskEpisodes
-from torchdlo.agents.rl.evaluate import evaluate, judged, wilson
-from torchdlo.agents.rl.expert import Expert, _spread, candidates, follow, improve
-from torchdlo.agents.rl.hybrid import Hybrid, hybrid
-from torchdlo.agents.rl.rollout import collect
-from torchdlo.agents.rl.settings import preset
+from torchdlo.agents.rl.evaluate import evaluate_policies, judge_policies, wilson_interval
+from torchdlo.agents.rl.expert import Expert, _spread, candidate_experts, follow_experts, improve_expert
+from torchdlo.agents.rl.hybrid_stages import Hybrid, train_hybrid
+from torchdlo.agents.rl.rollout import collect_episodes
+from torchdlo.agents.rl.settings import training_preset
 from torchdlo.cli import app
 from torchdlo.errors import InputError
 
@@ -33,7 +33,7 @@ PLAN = Hybrid(
 
 
 def settings(**choices):
-    return preset("lead", "hybrid", hidden=(32,), critic=(32,), count=16, **choices)
+    return training_preset("lead", "hybrid", hidden=(32,), critic=(32,), count=16, **choices)
 
 
 def test_an_expert_follows_a_path_that_moves_with_the_start():
@@ -53,18 +53,18 @@ def test_changes_of_a_path_begin_with_nothing_and_are_linear_between_knots():
 
 
 def test_following_a_path_in_the_world_succeeds_where_replaying_it_does_not(tmp_path: Path):
-    experts = candidates(Lead(), [found(tmp_path)])
+    experts = candidate_experts(Lead(), [found(tmp_path)])
     assert [e.source for e in experts] == ["lead, same places", "lead, moved along"]
-    scores = follow(experts, TaskEpisodes(Lead(), 32), noise=0.0, generator=torch.Generator().manual_seed(0))
+    scores = follow_experts(experts, TaskEpisodes(Lead(), 32), noise=0.0, generator=torch.Generator().manual_seed(0))
     # Ropes are up to 10 mm off, 4 mm count as success.
     assert scores[0].success == 1
     assert scores[1].success < 0.7
 
 
 def test_a_search_for_a_robust_path_is_repeatable_and_goes_on(tmp_path: Path):
-    experts = candidates(Lead(), [found(tmp_path)])
+    experts = candidate_experts(Lead(), [found(tmp_path)])
     choices = {"seed": 0, "starts": 4, "population": 4, "generations": 2, "enough": 2.0}
-    first, log, played = improve(Lead(), experts, **choices)
+    first, log, played = improve_expert(Lead(), experts, **choices)
     # Both candidates from 8 starts, two generations of 5 from 4, and the last comparison of 2 from 16.
     assert played == 2 * 8 + 2 * 5 * 4 + 2 * 16
     journal = tmp_path / "robust.json"
@@ -74,18 +74,18 @@ def test_a_search_for_a_robust_path_is_repeatable_and_goes_on(tmp_path: Path):
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        improve(Lead(), experts, **choices, journal=journal, callback=stop)
+        improve_expert(Lead(), experts, **choices, journal=journal, callback=stop)
     assert len(json.loads(journal.read_text())["rows"]) == 2
-    again, told, count = improve(Lead(), experts, **choices, journal=journal)
+    again, told, count = improve_expert(Lead(), experts, **choices, journal=journal)
     assert torch.equal(first.path, again.path) and torch.equal(first.gain, again.gain)
     assert (told, count) == (log, played)
 
 
 def test_a_clone_does_what_its_expert_does(tmp_path: Path):
-    policy, notes = hybrid(Lead(), [found(tmp_path)], settings(), folder=tmp_path, plan=PLAN)
+    policy, notes = train_hybrid(Lead(), [found(tmp_path)], settings(), folder=tmp_path, plan=PLAN)
     assert notes["clone"]["episodes"] == 3 * 16
     assert [row["fidelity"] for row in notes["clone"]["log"]] == ["1ms/2", "1ms/2", "1ms/5"]
-    result, plays = evaluate([policy], Lead(), protocols=("one", "varied"))
+    result, plays = evaluate_policies([policy], Lead(), protocols=("one", "varied"))
     assert result["varied"]["success"] >= 0.9 and result["one"]["success"] == 1
     assert plays["varied"]["actions"].shape == (1, 15, 6, 6)
     # All starts of the first protocol are alike, those of the second are not.
@@ -93,7 +93,7 @@ def test_a_clone_does_what_its_expert_does(tmp_path: Path):
 
 
 def test_stages_that_are_done_are_not_run_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    undisturbed, _ = hybrid(Lead(), [found(tmp_path)], settings(), folder=tmp_path / "a", plan=PLAN)
+    undisturbed, _ = train_hybrid(Lead(), [found(tmp_path)], settings(), folder=tmp_path / "a", plan=PLAN)
     told = []
 
     def stop(stage: str, done: int, *_) -> None:
@@ -102,24 +102,26 @@ def test_stages_that_are_done_are_not_run_again(tmp_path: Path, monkeypatch: pyt
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        hybrid(Lead(), [found(tmp_path)], settings(), folder=tmp_path / "b", plan=PLAN, callback=stop)
-    monkeypatch.setattr(stages, "improve", None)
-    policy, _ = hybrid(Lead(), [], settings(), folder=tmp_path / "b", plan=PLAN, resume=True)
+        train_hybrid(Lead(), [found(tmp_path)], settings(), folder=tmp_path / "b", plan=PLAN, callback=stop)
+    monkeypatch.setattr(stages, "improve_expert", None)
+    policy, _ = train_hybrid(Lead(), [], settings(), folder=tmp_path / "b", plan=PLAN, resume=True)
     for name, value in policy.state_dict().items():
         assert torch.equal(value, undisturbed.state_dict()[name]), name
 
 
 def test_each_stage_can_be_left_out(tmp_path: Path):
     file = found(tmp_path)
-    _, notes = hybrid(Lead(), [file], settings(), folder=tmp_path, plan=PLAN, stages=("clone",))
+    _, notes = train_hybrid(Lead(), [file], settings(), folder=tmp_path, plan=PLAN, stages=("clone",))
     assert "tune" not in notes and "generation" not in notes["robust"]["log"][-1]
     with pytest.raises(InputError, match="there is no search"):
-        hybrid(Lead(), [file], settings(), folder=tmp_path, plan=PLAN, stages=("search",))
+        train_hybrid(Lead(), [file], settings(), folder=tmp_path, plan=PLAN, stages=("search",))
 
 
 def test_tuning_keeps_the_best(tmp_path: Path):
     """A policy that knows nothing is not made worse, whatever PPO does in two batches."""
-    policy, notes = hybrid(Lead(), [found(tmp_path)], settings(), folder=tmp_path, plan=PLAN, stages=("robust", "tune"))
+    policy, notes = train_hybrid(
+        Lead(), [found(tmp_path)], settings(), folder=tmp_path, plan=PLAN, stages=("robust", "tune")
+    )
     rows = notes["tune"]["log"]
     assert len(rows) == 3
     assert tuple(rows[-1]["best"]) == max((row["success"], row["return"]) for row in rows)
@@ -127,21 +129,21 @@ def test_tuning_keeps_the_best(tmp_path: Path):
 
 
 def test_judgements_are_at_the_published_fidelity_and_repeatable(tmp_path: Path):
-    policy, _ = hybrid(Lead(), [found(tmp_path)], settings(), folder=tmp_path, plan=PLAN, stages=("clone",))
-    rough = envs.simulated(Lead(), "1ms/2")
+    policy, _ = train_hybrid(Lead(), [found(tmp_path)], settings(), folder=tmp_path, plan=PLAN, stages=("clone",))
+    rough = envs.with_fidelity(Lead(), "1ms/2")
     other = stages.task_policy(Lead(), settings(seed=1), squash=False)
-    first, second = (judged([policy, other], task, starts=4)["varied"] for task in (Lead(), rough))
+    first, second = (judge_policies([policy, other], task, starts=4)["varied"] for task in (Lead(), rough))
     assert torch.equal(first["returns"], second["returns"])
     # Both have the same starts, and each does in one batch with the other what it does alone.
     assert torch.equal(first["moved"][0], first["moved"][1])
     assert not torch.equal(first["actions"][0], first["actions"][1])
-    alone = judged([policy], Lead(), starts=4, protocols=("varied",))["varied"]
+    alone = judge_policies([policy], Lead(), starts=4, protocols=("varied",))["varied"]
     torch.testing.assert_close(alone["returns"][0], first["returns"][0], rtol=0, atol=1e-3)
-    disturbed = judged([policy], Lead(), starts=4, protocols=("disturbed",))["disturbed"]
+    disturbed = judge_policies([policy], Lead(), starts=4, protocols=("disturbed",))["disturbed"]
     assert not torch.equal(alone["actions"], disturbed["actions"])
     # Training starts are not those of the judgement.
     train = TaskEpisodes(Lead(), 4, seed=0)
-    collect(policy, train, random=False)
+    collect_episodes(policy, train, random=False)
     assert not torch.equal(alone["moved"][0], train.env.moved)
 
 
@@ -156,14 +158,14 @@ def test_a_task_says_what_noise_it_takes_and_what_is_given_wins():
 
 def test_another_seed_judges_from_other_starts():
     policy = stages.task_policy(Lead(), settings(), squash=False)
-    first, again, other = (judged([policy], Lead(), starts=3, seed=k)["varied"]["moved"] for k in (0, 0, 1))
+    first, again, other = (judge_policies([policy], Lead(), starts=3, seed=k)["varied"]["moved"] for k in (0, 0, 1))
     assert torch.equal(first, again) and not torch.equal(first, other)
 
 
 def test_the_interval_of_a_share_is_wilsons():
     # 8 of 10: 0.490 to 0.943.
-    assert wilson(8, 10) == pytest.approx((0.4902, 0.9433), abs=1e-3)
-    assert wilson(0, 10)[0] == 0
+    assert wilson_interval(8, 10) == pytest.approx((0.4902, 0.9433), abs=1e-3)
+    assert wilson_interval(0, 10)[0] == 0
 
 
 def test_commands_train_and_judge(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
@@ -183,7 +185,7 @@ def test_commands_train_and_judge(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     assert (out / "curve.png").read_bytes().startswith(b"\x89PNG")
     run(*words, "--episodes", "24", "--fidelity", "coarse", "--resume")
     assert len((out / "log.csv").read_text().splitlines()) == 4
-    assert load(out).spec.task == "lead"
+    assert load_policy(out).spec.task == "lead"
     result = json.loads(run("evaluate", str(out), str(out), "--starts", "4", "--json"))
     assert (result["policies"], result["varied"]["episodes"], result["fidelity"]) == (2, 8, "1ms/5")
     assert json.loads((out / "evaluation.json").read_text()) == result
@@ -206,12 +208,12 @@ def test_commands_train_and_judge(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 
 @pytest.mark.parametrize("name", ["shac", "sac"])
 def test_other_algorithms_play_tasks(name: str):
-    from torchdlo.agents.rl.results import prepared
+    from torchdlo.agents.rl.results import prepare_training
     from torchdlo.agents.rl.training import train
 
     choices = {"hidden": (16,), "critic": (16,), "count": 4, "episodes": 8, "window": 3, "warm": 1, "batch": 8}
-    chosen = preset("lead", name, critic_passes=1, **choices)
-    trainer, played = prepared(Lead(), chosen)
+    chosen = training_preset("lead", name, critic_passes=1, **choices)
+    trainer, played = prepare_training(Lead(), chosen)
     before = {k: v.clone() for k, v in trainer.policy.named_parameters()}
     found = train(trainer, played, chosen)
     assert found.episodes == 8

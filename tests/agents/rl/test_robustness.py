@@ -13,12 +13,12 @@ pytest.importorskip("torchrl")
 from lead import Lead, found
 
 from torchdlo import envs
-from torchdlo.agents.policies import save
+from torchdlo.agents.policies import save_policy
 from torchdlo.agents.rl import robustness
-from torchdlo.agents.rl.expert import candidates
-from torchdlo.agents.rl.hybrid import task_policy
+from torchdlo.agents.rl.expert import candidate_experts
+from torchdlo.agents.rl.hybrid_stages import task_policy
 from torchdlo.agents.rl.robustness import PERTURBATIONS, Disturbance, following, perturbed, replaying, table
-from torchdlo.agents.rl.settings import preset
+from torchdlo.agents.rl.settings import training_preset
 from torchdlo.cli import app
 from torchdlo.errors import InputError
 
@@ -28,7 +28,7 @@ pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::F
 def actors(folder: Path):
     actions = torch.zeros(6, 6)
     actions[:, 1] = 0.025 / 6
-    return {"replayed": replaying(actions), "followed": following(candidates(Lead(), [found(folder)])[0])}
+    return {"replayed": replaying(actions), "followed": following(candidate_experts(Lead(), [found(folder)])[0])}
 
 
 def test_following_is_robust_to_starts_and_not_to_noise(tmp_path: Path):
@@ -86,8 +86,8 @@ def test_the_command_writes_the_table(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
     monkeypatch.setitem(envs.TASKS, "lead", Lead)
-    policy = task_policy(Lead(), preset("lead", "hybrid", hidden=(8,), critic=(8,), count=8))
-    save(policy, tmp_path / "policy.pt")
+    policy = task_policy(Lead(), training_preset("lead", "hybrid", hidden=(8,), critic=(8,), count=8))
+    save_policy(policy, tmp_path / "policy.pt")
     with pytest.raises(SystemExit) as done:
         app.main(["evaluate", str(tmp_path), "--perturb", "--starts", "2", "--json"])
     assert done.value.code in (0, None)

@@ -9,8 +9,8 @@ pytest.importorskip("torchrl")
 
 from springs import move, pusher, springs
 
-from torchdlo.agents.rl.rollout import progress
-from torchdlo.agents.rl.settings import preset
+from torchdlo.agents.rl.rollout import episode_progress
+from torchdlo.agents.rl.settings import training_preset
 from torchdlo.agents.rl.shac import Sapo, Shac, actor_loss
 
 F64 = torch.float64
@@ -18,7 +18,7 @@ F64 = torch.float64
 
 def trainer(kind=Shac, **choices):
     torch.manual_seed(3)
-    settings = preset("", "shac", **({"count": 4, "episodes": 400, "window": 6, "tame": 0.0} | choices))
+    settings = training_preset("", "shac", **({"count": 4, "episodes": 400, "window": 6, "tame": 0.0} | choices))
     policy = pusher(state_sigma=kind is Sapo).double()
     return kind(policy, settings), springs(4, 1, F64)
 
@@ -65,12 +65,12 @@ def test_the_gradient_is_that_of_a_loop_by_hand():
     policy, total = made.policy, 0.0
     for k in range(6):
         seen = torch.stack([x, v], -1)
-        loc, sigma = policy(policy.features(seen, progress(episodes, k, seen)))
+        loc, sigma = policy(policy.features(seen, episode_progress(episodes, k, seen)))
         u = (loc + sigma * torch.randn_like(loc)).tanh()[:, 0]
         x, v = move(x, v, u)
         total = total - made.settings.gamma**k * (x.square() + 0.1 * v.square())
     seen = torch.stack([x, v], -1)
-    after = made.target[0](policy.features(seen, progress(episodes, 6, seen)))[:, 0]
+    after = made.target[0](policy.features(seen, episode_progress(episodes, 6, seen)))[:, 0]
     loss = -(total + made.settings.gamma**6 * after).sum() / (6 * 4)
     for a, b in zip(found, torch.autograd.grad(loss, params), strict=True):
         torch.testing.assert_close(a, b, rtol=1e-10, atol=1e-12)

@@ -12,7 +12,7 @@ pytest.importorskip("kornia")
 
 from lead import Lead
 
-from torchdlo.agents.policies import CloudPolicy, CloudSpec, load
+from torchdlo.agents.policies import CloudPolicy, CloudSpec, load_policy
 from torchdlo.agents.rl.episodes import TaskEpisodes
 from torchdlo.agents.rl.student import DepthCamera, Student, _Eyes, cloud_spec, judge_student, teach
 
@@ -74,6 +74,6 @@ def test_a_student_learns_what_its_teacher_does_and_goes_on_after_a_stop(tmp_pat
         teach(Lead(), Teacher(), folder=other, plan=plan, callback=stop)
     again, _ = teach(Lead(), Teacher(), folder=other, plan=plan, resume=True)
     assert all(torch.equal(a, b) for a, b in zip(student.parameters(), again.parameters(), strict=True))
-    read = load(tmp_path)
+    read = load_policy(tmp_path)
     assert isinstance(read, CloudPolicy) and read.spec == cloud_spec(Lead())
     assert torch.equal(read.all[0].weight, student.all[0].weight)

@@ -16,10 +16,10 @@ pytest.importorskip("torchrl")
 
 from springs import pusher, springs
 
-from torchdlo.agents.policies import load
+from torchdlo.agents.policies import load_policy
 from torchdlo.agents.rl.ppo import Ppo
 from torchdlo.agents.rl.sac import Sac
-from torchdlo.agents.rl.settings import preset
+from torchdlo.agents.rl.settings import training_preset
 from torchdlo.agents.rl.shac import Sapo, Shac
 from torchdlo.agents.rl.training import Trained, train
 from torchdlo.agents.torch_records import load_checkpoint
@@ -35,7 +35,7 @@ def run(name: str, batches: int, folder: Path | None = None, **choices) -> Train
     choices = dict(choices)
     kept = {k: choices.pop(k) for k in ("resume", "callback") if k in choices}
     torch.manual_seed(11)
-    settings = preset("", name, hidden=(16,), critic=(16,), episodes=8 * batches, **(SMALL | choices))
+    settings = training_preset("", name, hidden=(16,), critic=(16,), episodes=8 * batches, **(SMALL | choices))
     policy = pusher(hidden=(16,), state_sigma=name in ("sac", "sapo"))
     return train(KINDS[name](policy, settings), springs(8), settings, folder=folder, **kept)
 
@@ -60,7 +60,7 @@ def test_a_run_that_was_resumed_ends_as_if_never_stopped(name: str, tmp_path: Pa
 def test_training_leaves_torchs_generator_as_it_was():
     torch.manual_seed(1)
     before = torch.get_rng_state()
-    settings = preset("", "ppo", hidden=(16,), critic=(16,), episodes=8, **SMALL)
+    settings = training_preset("", "ppo", hidden=(16,), critic=(16,), episodes=8, **SMALL)
     trainer = Ppo(pusher(hidden=(16,)), settings)
     torch.set_rng_state(before)
     train(trainer, springs(8), settings)
@@ -75,7 +75,7 @@ def test_ctrl_c_keeps_the_best(tmp_path: Path):
     found = run("ppo", 100, tmp_path, callback=stop)
     assert found.interrupted
     assert found.episodes == 16
-    kept = load(tmp_path / "policy.pt")
+    kept = load_policy(tmp_path / "policy.pt")
     assert all(torch.equal(a, b) for a, b in zip(kept.parameters(), found.policy.parameters(), strict=True))
     log = (tmp_path / "log.csv").read_text().splitlines()
     assert len(log) == 3

@@ -3,9 +3,9 @@
 Writing needs pyarrow and, with pictures, av; LeRobot itself is not needed.
 """
 
-from torchdlo.agents.data.checking import check
-from torchdlo.agents.data.editing import Choice, merge, select
-from torchdlo.agents.data.making import DatasetPlan, make
+from torchdlo.agents.data.checking import check_dataset
+from torchdlo.agents.data.editing import Choice, merge_datasets, select_episodes
+from torchdlo.agents.data.making import DatasetPlan, make_dataset
 from torchdlo.agents.data.reading import DataSet, FrameData, open_set, to_tensordict
 
 __all__ = [
@@ -13,10 +13,10 @@ __all__ = [
     "DataSet",
     "DatasetPlan",
     "FrameData",
-    "check",
-    "make",
-    "merge",
+    "check_dataset",
+    "make_dataset",
+    "merge_datasets",
     "open_set",
-    "select",
+    "select_episodes",
     "to_tensordict",
 ]

@@ -15,14 +15,14 @@ from typing import Any
 
 import numpy as np
 
-from torchdlo.agents.data import parquet, video
-from torchdlo.agents.data.record import Recording
-from torchdlo.agents.data.schema import Schema
-from torchdlo.agents.data.statistics import histogram
+from torchdlo.agents.data import parquet, video_codec
+from torchdlo.agents.data.dataset_schema import Schema
+from torchdlo.agents.data.record import EpisodeRecording
+from torchdlo.agents.data.statistics import channel_histogram
 from torchdlo.files import write_atomically
 from torchdlo.journal import read_json, write_json
 
-__all__ = ["Attempt", "keep", "load", "packed", "sweep"]
+__all__ = ["Attempt", "attempt_files", "read_attempt", "remove_unfinished", "write_attempt"]
 
 RECORD, FRAMES = "attempt.json", "frames.parquet"
 SUMS = "sums.json"
@@ -42,7 +42,7 @@ class Attempt:
         return bool(self.record["success"])
 
 
-def packed(recording: Recording, task: str, source: str, schema: Schema) -> dict[str, bytes]:
+def attempt_files(recording: EpisodeRecording, task: str, source: str, schema: Schema) -> dict[str, bytes]:
     """Return the files of an attempt by name.
 
     Pictures are decoded again after they are encoded: that proves that they can be, and statistics are of what readers
@@ -68,9 +68,9 @@ def packed(recording: Recording, task: str, source: str, schema: Schema) -> dict
         counts = {}
         for key, frames in recording.pictures.items():
             file = folder / f"{key}.mp4"
-            video.encode(file, frames, fps=schema.fps, codec=schema.codec)
-            seen = video.decode(file, fps=schema.fps, first=0, count=len(frames))
-            counts[key] = histogram(seen).tolist()
+            video_codec.encode_video(file, frames, fps=schema.fps, codec=schema.codec)
+            seen = video_codec.decode_video(file, fps=schema.fps, first=0, count=len(frames))
+            counts[key] = channel_histogram(seen).tolist()
         if recording.success:
             parquet.write_tables(folder / FRAMES, [parquet.frame_table(recording.columns)])
         (folder / RECORD).write_text(json.dumps(record | {"histograms": counts}, allow_nan=False), encoding="utf-8")
@@ -78,7 +78,7 @@ def packed(recording: Recording, task: str, source: str, schema: Schema) -> dict
     return files
 
 
-def keep(folder: Path, files: Mapping[str, bytes], plan: str = "") -> None:
+def write_attempt(folder: Path, files: Mapping[str, bytes], plan: str = "") -> None:
     """Write the files of an attempt at a plan so that its folder is complete as soon as it is there."""
     folder.parent.mkdir(parents=True, exist_ok=True)
     temporary = folder.with_name(f".{secrets.token_hex(4)}-{folder.name}")
@@ -97,14 +97,14 @@ def keep(folder: Path, files: Mapping[str, bytes], plan: str = "") -> None:
         shutil.rmtree(temporary, ignore_errors=True)
 
 
-def sweep(folder: Path) -> None:
+def remove_unfinished(folder: Path) -> None:
     """Remove what a run that was killed left half done."""
     for file in folder.glob("**/.*-*"):
         if file.is_dir():
             shutil.rmtree(file, ignore_errors=True)
 
 
-def load(folder: Path, plan: str | None = None) -> Attempt | None:
+def read_attempt(folder: Path, plan: str | None = None) -> Attempt | None:
     """Return the attempt at a plan, or at any, in a folder, None if there is none that is whole."""
     record = read_json(folder / RECORD)
     if record is None or "success" not in record:

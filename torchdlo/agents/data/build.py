@@ -10,35 +10,35 @@ from typing import Any
 
 import numpy as np
 
-from torchdlo.agents.data import parquet, video
-from torchdlo.agents.data.schema import CHUNK, DATA_MB, FORMAT, VIDEO_MB, Schema, data_path, video_path
+from torchdlo.agents.data import parquet, video_codec
+from torchdlo.agents.data.dataset_schema import CHUNK, DATA_MB, FORMAT, VIDEO_MB, Schema, data_path, video_path
 from torchdlo.agents.data.statistics import column_statistics, picture_statistics
 
-__all__ = ["PROVENANCE", "Episode", "build"]
+__all__ = ["PROVENANCE", "DatasetEpisode", "write_dataset"]
 
 PROVENANCE = "meta/torchdlo.json"
 """Where a set says how it was made; other readers do not mind it."""
 
 
 @dataclass(frozen=True, eq=False)
-class Episode:
+class DatasetEpisode:
     """An episode that is to be in a set."""
 
     told: str
     length: int
     columns: Callable[[], dict[str, np.ndarray]]
     """Its columns, without those that its place in the set decides."""
-    clips: dict[str, video.Clip]
+    clips: dict[str, video_codec.Clip]
     """Its pictures."""
     histograms: Callable[[], dict[str, np.ndarray]]
     """How often each value is in its pictures, by column, shape (3, 256)."""
     provenance: dict[str, Any]
 
 
-def build(
+def write_dataset(
     out: Path,
     schema: Schema,
-    episodes: Sequence[Episode],
+    episodes: Sequence[DatasetEpisode],
     header: dict[str, Any],
     callback: Callable[[int, int], None] | None = None,
 ) -> None:
@@ -79,7 +79,7 @@ def build(
     _write_json(out / PROVENANCE, header | {"episodes": listed})
 
 
-def _numbered(schema: Schema, episode: Episode, k: int, start: int, task: int) -> dict[str, np.ndarray]:
+def _numbered(schema: Schema, episode: DatasetEpisode, k: int, start: int, task: int) -> dict[str, np.ndarray]:
     """Return the columns of an episode with its place in the set, in the order of the schema."""
     own, at = episode.columns(), np.arange(episode.length, dtype=np.int64)
     own |= {
@@ -114,13 +114,13 @@ def _write_frames(out: Path, tables: Sequence[Any], rows: list[dict[str, Any]]) 
             rows[k] |= {"data/chunk_index": chunk, "data/file_index": place}
 
 
-def _write_videos(out: Path, key: str, clips: Sequence[video.Clip], rows: list[dict[str, Any]], fps: int) -> None:
+def _write_videos(out: Path, key: str, clips: Sequence[video_codec.Clip], rows: list[dict[str, Any]], fps: int) -> None:
     sizes = [sum(packet.size for _, packet in clip.packets(fps)) for clip in clips]
     for file, members in _filed(sizes, VIDEO_MB * 10**6):
         chunk, place = divmod(file, CHUNK)
         path = out / video_path(key, chunk, place)
         path.parent.mkdir(parents=True, exist_ok=True)
-        video.join(path, [clips[k] for k in members], fps=fps)
+        video_codec.concatenate_clips(path, [clips[k] for k in members], fps=fps)
         first = 0
         for k in members:
             end = first + clips[k].count
@@ -132,7 +132,7 @@ def _write_videos(out: Path, key: str, clips: Sequence[video.Clip], rows: list[d
 def _write_meta(
     out: Path, schema: Schema, rows: list[dict[str, Any]], sentences: list[str], stats: dict[str, Any]
 ) -> None:
-    pa, _ = parquet.library()
+    pa, _ = parquet.import_pyarrow()
     path = out / "meta/episodes/chunk-000/file-000.parquet"
     path.parent.mkdir(parents=True, exist_ok=True)
     rows = [row | {"meta/episodes/chunk_index": 0, "meta/episodes/file_index": 0} for row in rows]

@@ -9,17 +9,17 @@ from typing import Any
 import numpy as np
 
 from torchdlo.agents.data import parquet
+from torchdlo.agents.data.dataset_schema import DEFAULTS, data_path
 from torchdlo.agents.data.reading import DataSet, open_set
-from torchdlo.agents.data.schema import DEFAULTS, data_path
-from torchdlo.agents.data.statistics import column_statistics, histogram, picture_statistics
+from torchdlo.agents.data.statistics import channel_histogram, column_statistics, picture_statistics
 from torchdlo.errors import InputError
 
-__all__ = ["check"]
+__all__ = ["check_dataset"]
 
 _TYPES = {"float32": "float", "float64": "double", "int64": "int64", "bool": "bool", "string": "string"}
 
 
-def check(path: Path, callback: Callable[[int, int], None] | None = None) -> list[str]:
+def check_dataset(path: Path, callback: Callable[[int, int], None] | None = None) -> list[str]:
     """Return what is wrong with a set, a sentence each; none if it is sound.
 
     Args:
@@ -166,7 +166,7 @@ def _pictures(data: DataSet, stats: dict[str, Any], callback: Callable[[int, int
                     yield image
 
             try:
-                counts[camera] += histogram(seen(data.pictures(k, camera)))
+                counts[camera] += channel_histogram(seen(data.pictures(k, camera)))
             except (InputError, KeyError) as error:
                 broken = True
                 yield f"episode {k}, {camera}: {error}"

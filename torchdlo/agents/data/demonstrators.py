@@ -14,13 +14,13 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
-from torchdlo.agents.trajopt.result import read_trajectory
+from torchdlo.agents.trajopt.search_result import read_trajectory
 from torchdlo.envs import Task
 from torchdlo.envs.core import episode
 from torchdlo.errors import InputError
 from torchdlo.untrusted import one_line
 
-__all__ = ["Demonstrator", "FollowPath", "demonstrator", "scripted", "stored"]
+__all__ = ["Demonstrator", "FollowPath", "make_demonstrator", "scripted_demonstrator", "trajectory_demonstrator"]
 
 LAG = 0.015
 """Distance of a tool from its place on the path beyond which the path waits for it [m]."""
@@ -118,14 +118,14 @@ class FollowPath:
         return path[scenes, at] + off, found
 
 
-def scripted(task: Task) -> FollowPath:
+def scripted_demonstrator(task: Task) -> FollowPath:
     """Return who acts as the task's scripted demonstration."""
     if not bool((task.demonstration() != 0).any()):
         raise InputError(f"{task.name}: has no scripted demonstration; give --actor a trajectory or a policy.")
     return FollowPath("scripted demonstration")
 
 
-def stored(task: Task, path: Path) -> FollowPath:
+def trajectory_demonstrator(task: Task, path: Path) -> FollowPath:
     """Return who follows a trajectory that `torchdlo optimize` found."""
     content = read_trajectory(path)
     name = one_line(content["task"].text(), 60)
@@ -139,7 +139,7 @@ def stored(task: Task, path: Path) -> FollowPath:
     return FollowPath(f"trajectory {path.parent.name}/{path.name}", rows)
 
 
-def demonstrator(task: Task, actor: str) -> Demonstrator:
+def make_demonstrator(task: Task, actor: str) -> Demonstrator:
     """Return who acts.
 
     Args:
@@ -148,17 +148,17 @@ def demonstrator(task: Task, actor: str) -> Demonstrator:
             task's is taken, or a policy (.pt).
     """
     if actor == "scripted":
-        return scripted(task)
+        return scripted_demonstrator(task)
     path = Path(actor)
     if path.is_dir():
         path = _best(task, path)
     if path.suffix == ".pt":
-        from torchdlo.agents.policies.rollout import PolicyDemonstrator
+        from torchdlo.agents.policies.chunk_rollout import PolicyDemonstrator
 
         return PolicyDemonstrator.load(path)
     if not path.is_file():
         raise InputError(f"--actor: there is no file {actor!r}; expected scripted, a trajectory.json or a policy.pt.")
-    return stored(task, path)
+    return trajectory_demonstrator(task, path)
 
 
 def _best(task: Task, folder: Path) -> Path:

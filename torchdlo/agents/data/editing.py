@@ -13,13 +13,13 @@ from typing import Any
 import numpy as np
 
 from torchdlo.agents.data import build
+from torchdlo.agents.data.dataset_schema import CODECS, DEFAULTS, Schema
 from torchdlo.agents.data.reading import DataSet, open_set
-from torchdlo.agents.data.schema import CODECS, DEFAULTS, Schema
-from torchdlo.agents.data.statistics import histogram
-from torchdlo.agents.trajopt.search_journal import versions
+from torchdlo.agents.data.statistics import channel_histogram
+from torchdlo.agents.trajopt.search_journal import code_versions
 from torchdlo.errors import InputError
 
-__all__ = ["Choice", "merge", "select"]
+__all__ = ["Choice", "merge_datasets", "select_episodes"]
 
 
 @dataclass(frozen=True)
@@ -78,7 +78,7 @@ def _form(owner: Schema | DataSet, name: str) -> tuple:
     return what["dtype"], list(what["shape"]), what["names"]
 
 
-def merge(paths: Sequence[Path], out: Path, callback: Callable[[int, int], None] | None = None) -> int:
+def merge_datasets(paths: Sequence[Path], out: Path, callback: Callable[[int, int], None] | None = None) -> int:
     """Write a set of all episodes of others, in order; return how many there are."""
     sets = [open_set(path) for path in paths]
     schemas = [schema_of(data) for data in sets]
@@ -92,7 +92,7 @@ def merge(paths: Sequence[Path], out: Path, callback: Callable[[int, int], None]
     return _write(out, schemas[0], episodes, {"generator": "torchdlo dataset merge"}, sets, callback)
 
 
-def select(path: Path, out: Path, choice: Choice, callback: Callable[[int, int], None] | None = None) -> int:
+def select_episodes(path: Path, out: Path, choice: Choice, callback: Callable[[int, int], None] | None = None) -> int:
     """Write a set of some episodes of another; return how many there are."""
     data = open_set(path)
     schema = schema_of(data)
@@ -104,22 +104,22 @@ def _said(schema: Schema) -> str:
     return f"{schema.arms} arm(s), pictures of {schema.size} px in {schema.codec}, {schema.fps} frames per second"
 
 
-def _episodes(data: DataSet, chosen: Sequence[int]) -> list[build.Episode]:
+def _episodes(data: DataSet, chosen: Sequence[int]) -> list[build.DatasetEpisode]:
     columns, about = data.columns(), data.provenance.get("episodes") or [{}] * len(data.episodes)
     decided = {*DEFAULTS, "task_index"}
 
-    def episode(k: int) -> build.Episode:
+    def episode(k: int) -> build.DatasetEpisode:
         row = data.episodes[k]
         rows = slice(row["dataset_from_index"], row["dataset_to_index"])
         own = {name: values[rows] for name, values in columns.items() if name not in decided}
         clips = {camera: data.clip(k, camera) for camera in data.cameras}
         provenance = {name: value for name, value in about[k].items() if name != "episode_index"}
-        return build.Episode(
+        return build.DatasetEpisode(
             row["tasks"][0],
             row["length"],
             lambda: dict(own),
             clips,
-            lambda: {camera: histogram(data.pictures(k, camera)) for camera in data.cameras},
+            lambda: {camera: channel_histogram(data.pictures(k, camera)) for camera in data.cameras},
             provenance | {"from": [data.path.resolve().name, k]},
         )
 
@@ -129,7 +129,7 @@ def _episodes(data: DataSet, chosen: Sequence[int]) -> list[build.Episode]:
 def _write(
     out: Path,
     schema: Schema,
-    episodes: Sequence[build.Episode],
+    episodes: Sequence[build.DatasetEpisode],
     header: dict[str, Any],
     sets: Sequence[DataSet],
     callback: Callable[[int, int], None] | None,
@@ -140,7 +140,9 @@ def _write(
     out.parent.mkdir(parents=True, exist_ok=True)
     fresh = out.with_name(f".{secrets.token_hex(4)}-{out.name}")
     try:
-        build.build(fresh, schema, episodes, header | {"versions": versions(), "sources": sources}, callback)
+        build.write_dataset(
+            fresh, schema, episodes, header | {"versions": code_versions(), "sources": sources}, callback
+        )
         if out.exists():
             out.rmdir()
         os.rename(fresh, out)

@@ -19,19 +19,19 @@ from typing import Any
 
 import numpy as np
 
-from torchdlo.agents.data import attempts, build, parquet, video
-from torchdlo.agents.data.demonstrators import Demonstrator, demonstrator
+from torchdlo.agents.data import attempts, build, parquet, video_codec
+from torchdlo.agents.data.dataset_schema import Schema
+from torchdlo.agents.data.demonstrators import Demonstrator, make_demonstrator
 from torchdlo.agents.data.reading import column_array
-from torchdlo.agents.data.record import Noise, Painter, record, starts
-from torchdlo.agents.data.schema import Schema
+from torchdlo.agents.data.record import Noise, Painter, draw_starts, record_attempts
 from torchdlo.agents.distributed import Executor, Serial
-from torchdlo.agents.trajopt.search_journal import versions
-from torchdlo.envs import Task, find, simulated
+from torchdlo.agents.trajopt.search_journal import code_versions
+from torchdlo.envs import Task, find, with_fidelity
 from torchdlo.envs.core import episode
 from torchdlo.errors import InputError
 from torchdlo.journal import locked, read_json, write_json
 
-__all__ = ["UNFINISHED", "DatasetPlan", "make", "report_of"]
+__all__ = ["UNFINISHED", "DatasetPlan", "make_dataset", "report_of"]
 
 UNFINISHED = "unfinished"
 """Folder within a set for what is under way."""
@@ -52,7 +52,7 @@ class DatasetPlan:
     """Width and height of pictures [px]; 0 for none."""
     codec: str = "h264"
     actor: str = "scripted"
-    """Who acts, see `demonstrators.demonstrator`."""
+    """Who acts, see `demonstrators.make_demonstrator`."""
     noise: float | None = None
     """See `Noise.size` [m]; what each task says (`Task.demonstration_noise`) if None."""
     fidelity: str = "published"
@@ -85,7 +85,7 @@ class DatasetPlan:
 
     def task(self, name: str) -> Task:
         """Return a task in the fidelity of the plan."""
-        return simulated(find(name), self.fidelity)
+        return with_fidelity(find(name), self.fidelity)
 
     def shake(self, name: str) -> Noise:
         """Return the disturbance of the hands in a task."""
@@ -115,19 +115,19 @@ def _prepared(found: Task, batch: int) -> episode.Episode:
 
 @functools.lru_cache(maxsize=8)
 def _actor(task: str, actor: str) -> Demonstrator:
-    return demonstrator(find(task), actor)
+    return make_demonstrator(find(task), actor)
 
 
 def _played(job: _Job) -> list[dict[str, bytes]]:
     """Return the files of the attempts of a batch."""
     plan, actor = job.plan, _actor(job.task, job.plan.actor)
     made = _prepared(plan.task(job.task), plan.batch)
-    tries = starts(made.task, plan.seed, range(job.first, job.first + plan.batch))
-    recordings = record(made, tries, actor, plan.schema, job.painter, plan.shake(job.task))
-    return [attempts.packed(each, job.task, actor.source, plan.schema) for each in recordings]
+    tries = draw_starts(made.task, plan.seed, range(job.first, job.first + plan.batch))
+    recordings = record_attempts(made, tries, actor, plan.schema, job.painter, plan.shake(job.task))
+    return [attempts.attempt_files(each, job.task, actor.source, plan.schema) for each in recordings]
 
 
-def make(
+def make_dataset(
     plan: DatasetPlan,
     out: Path,
     *,
@@ -153,9 +153,9 @@ def make(
         raise InputError("pictures need a painter; give one, or size 0 for a set without pictures.")
     for task in plan.tasks:
         _actor(task, plan.actor)  # says what is wrong before the work
-    parquet.library()
+    parquet.import_pyarrow()
     if plan.size:
-        video.library()
+        video_codec.import_pyav()
     if resume and (out / "meta/info.json").is_file() and not (out / UNFINISHED / PLAN).exists():
         shutil.rmtree(out / UNFINISHED, ignore_errors=True)
         found = read_json(out / build.PROVENANCE)
@@ -185,13 +185,13 @@ def _begun(plan: DatasetPlan, out: Path, resume: bool) -> Iterator[Path]:
         raise InputError(f"{out}: it exists already; choose another --out.")
     with locked(folder):
         write_json(folder / PLAN, said)
-        attempts.sweep(folder)
+        attempts.remove_unfinished(folder)
         yield folder
 
 
 def _said(plan: DatasetPlan) -> dict[str, Any]:
     """Return what the attempts at a plan depend on, as it is written down."""
-    return json.loads(json.dumps(asdict(plan) | {"versions": versions()}))
+    return json.loads(json.dumps(asdict(plan) | {"versions": code_versions()}))
 
 
 def _key(plan: DatasetPlan) -> str:
@@ -211,7 +211,7 @@ def _gather(
     place = folder / task
     known: dict[int, attempts.Attempt] = {}
     for each in sorted(place.glob("[0-9]*")):
-        if (found := attempts.load(each, _key(plan))) is not None:
+        if (found := attempts.read_attempt(each, _key(plan))) is not None:
             known[int(each.name)] = found
         else:
             shutil.rmtree(each, ignore_errors=True)  # it is played again
@@ -234,7 +234,7 @@ def _gather(
         for k, files in executor.map(_played, jobs):
             for number, content in enumerate(files, jobs[k].first):
                 if number not in known:
-                    attempts.keep(place / f"{number:06d}", content, _key(plan))
+                    attempts.write_attempt(place / f"{number:06d}", content, _key(plan))
                     known[number] = attempts.Attempt(place / f"{number:06d}", json.loads(content[attempts.RECORD]))
             told()
     return line
@@ -276,7 +276,7 @@ def _finish(
     episodes = [_episode(each, schema) for turn in turns for each in turn]
     header = {
         "generator": "torchdlo dataset make",
-        "versions": versions(),
+        "versions": code_versions(),
         "plan": asdict(plan),
         "attempts": {task: len(tries) for task, tries in done.items()},
         "failures": {task: sum(not each.success for each in tries) for task, tries in done.items()},
@@ -288,7 +288,7 @@ def _finish(
         if callback is not None:
             callback("write", number, total, "")
 
-    build.build(fresh, schema, episodes, header, told)
+    build.write_dataset(fresh, schema, episodes, header, told)
     # The description comes last: without it there is no data set.
     for name in ("data", "videos", "meta"):
         if (fresh / name).exists():
@@ -299,7 +299,7 @@ def _finish(
     return report_of(header)
 
 
-def _episode(attempt: attempts.Attempt, schema: Schema) -> build.Episode:
+def _episode(attempt: attempts.Attempt, schema: Schema) -> build.DatasetEpisode:
     made = attempt.record
     length = made["frames"]
 
@@ -307,12 +307,12 @@ def _episode(attempt: attempts.Attempt, schema: Schema) -> build.Episode:
         table = parquet.read_table(attempt.folder / attempts.FRAMES)
         return {name: column_array(table, name, attempt.folder) for name in table.column_names}
 
-    clips = {key: video.Clip(attempt.folder / f"{key}.mp4", 0, length) for key in schema.pictures}
+    clips = {key: video_codec.Clip(attempt.folder / f"{key}.mp4", 0, length) for key in schema.pictures}
     told = made["told"]
     hidden = {"histograms", "success", "failed", "frames"}
     kept = {name: value for name, value in made.items() if name not in hidden}
     counts = {key: np.array(made["histograms"][key], np.int64) for key in schema.pictures}
-    return build.Episode(told, length, columns, clips, lambda: counts, kept)
+    return build.DatasetEpisode(told, length, columns, clips, lambda: counts, kept)
 
 
 def report_of(provenance: dict[str, Any]) -> dict[str, Any]:

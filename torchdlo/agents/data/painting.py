@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from torchdlo.envs.core import episode
-from torchdlo.envs.observations.pixels import CameraRig, camera_rig, rendered
+from torchdlo.envs.observations.pixels import CameraRig, camera_rig, render_cameras
 from torchdlo.vision.look import Look, draw_look
 
 __all__ = ["TaskPainter"]
@@ -43,7 +43,7 @@ class TaskPainter:
         """Return pictures by camera, see `record.Painter`; the first arm has the right wrist."""
         rig = _rig(made, size)
         quality = {"samples": self.samples, "shadow": self.shadow}
-        seen = rendered(
+        seen = render_cameras(
             rig, world.state, world.joints, looks=[_look(seed, self.jitter) for seed in looks], **quality
         ).rgb
         return {camera.name: seen[:, k] for k, camera in enumerate(rig.cameras)}

@@ -11,10 +11,10 @@ import numpy as np
 
 from torchdlo.errors import InputError
 
-__all__ = ["frame_table", "library", "read_table", "tasks_table", "write_tables"]
+__all__ = ["frame_table", "import_pyarrow", "read_table", "tasks_table", "write_tables"]
 
 
-def library() -> tuple[Any, Any]:
+def import_pyarrow() -> tuple[Any, Any]:
     """Return pyarrow and its part for Parquet, or say how to get it."""
     try:
         import pyarrow
@@ -26,7 +26,7 @@ def library() -> tuple[Any, Any]:
 
 def frame_table(columns: Mapping[str, np.ndarray]) -> Any:
     """Return columns as a table: vectors as lists of fixed size, single numbers as they are."""
-    pa, _ = library()
+    pa, _ = import_pyarrow()
     arrays = {}
     for name, x in columns.items():
         flat = pa.array(np.ascontiguousarray(x).reshape(-1))
@@ -36,7 +36,7 @@ def frame_table(columns: Mapping[str, np.ndarray]) -> Any:
 
 def tasks_table(sentences: Sequence[str]) -> Any:
     """Return the table of instructions. Readers take the sentences for its index, as pandas would have written it."""
-    pa, _ = library()
+    pa, _ = import_pyarrow()
     table = pa.table(
         {"task_index": pa.array(range(len(sentences)), pa.int64()), "task": pa.array(list(sentences), pa.string())}
     )
@@ -56,7 +56,7 @@ def tasks_table(sentences: Sequence[str]) -> Any:
 
 def write_tables(path: Path, tables: Sequence[Any]) -> None:
     """Write tables of one schema to a file, each as a row group of its own."""
-    _, pq = library()
+    _, pq = import_pyarrow()
     with pq.ParquetWriter(path, tables[0].schema, compression="snappy", store_schema=True) as writer:
         for table in tables:
             writer.write_table(table, row_group_size=max(1, len(table)))
@@ -64,7 +64,7 @@ def write_tables(path: Path, tables: Sequence[Any]) -> None:
 
 def read_table(path: Path) -> Any:
     """Return the table in a file."""
-    pa, pq = library()
+    pa, pq = import_pyarrow()
     if not path.is_file():
         raise InputError(f"{path}: the file is missing.")
     try:

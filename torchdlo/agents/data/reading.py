@@ -12,9 +12,9 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from torchdlo.agents.data import parquet, video
+from torchdlo.agents.data import parquet, video_codec
 from torchdlo.agents.data.build import PROVENANCE
-from torchdlo.agents.data.schema import FORMAT, data_path, video_path
+from torchdlo.agents.data.dataset_schema import FORMAT, data_path, video_path
 from torchdlo.errors import InputError
 from torchdlo.untrusted import Entry, read_json
 
@@ -68,18 +68,18 @@ class DataSet:
         names = [name for name, what in self.features.items() if what["dtype"] != "video"]
         return {name: np.concatenate([column_array(t, name, self.path) for t in tables]) for name in names}
 
-    def clip(self, episode: int, camera: str) -> video.Clip:
+    def clip(self, episode: int, camera: str) -> video_codec.Clip:
         """Return where the pictures of an episode are."""
         row = self.episodes[episode]
         numbers = (row[f"videos/{camera}/chunk_index"], row[f"videos/{camera}/file_index"])
         first = round(row[f"videos/{camera}/from_timestamp"] * self.fps)
-        return video.Clip(self.path / video_path(camera, *numbers), first, row["length"])
+        return video_codec.Clip(self.path / video_path(camera, *numbers), first, row["length"])
 
     def pictures(self, episode: int, camera: str, first: int = 0, count: int | None = None) -> Iterator[np.ndarray]:
         """Yield pictures of an episode (H, W, 3), 8 bits, from a frame on."""
         clip = self.clip(episode, camera)
         most = clip.count - first if count is None else count
-        return video.decode(clip.path, fps=self.fps, first=clip.first + first, count=most)
+        return video_codec.decode_video(clip.path, fps=self.fps, first=clip.first + first, count=most)
 
 
 def json_file(file: Path) -> dict[str, Any]:

@@ -12,8 +12,8 @@ import torch
 from torch import Tensor
 
 from torchdlo.agents.data import sentences
+from torchdlo.agents.data.dataset_schema import JOINTS, Schema
 from torchdlo.agents.data.demonstrators import Demonstrator
-from torchdlo.agents.data.schema import JOINTS, Schema
 from torchdlo.coupling.bodies.dynamics import conjugate
 from torchdlo.coupling.common.pose import Pose
 from torchdlo.envs import Task
@@ -23,7 +23,18 @@ from torchdlo.physics import tree
 from torchdlo.physics.linalg.numerics import safe_norm
 from torchdlo.physics.linalg.rotation import multiply
 
-__all__ = ["Noise", "Painter", "Recording", "Start", "acted", "arm_state", "play_batch", "record", "seed_of", "starts"]
+__all__ = [
+    "EpisodeRecording",
+    "EpisodeStart",
+    "Noise",
+    "Painter",
+    "action_towards",
+    "arm_state",
+    "draw_starts",
+    "play_batch",
+    "record_attempts",
+    "seed_of",
+]
 
 OPEN = 0.08
 """Distance of fingers that hold nothing [m]."""
@@ -68,7 +79,7 @@ class Noise:
 
 
 @dataclass(frozen=True)
-class Start:
+class EpisodeStart:
     """One attempt at a task: everything random in it comes from its seed."""
 
     number: int
@@ -88,21 +99,23 @@ def seed_of(*parts: object) -> int:
     return int.from_bytes(hashlib.sha256(text.encode()).digest()[:8], "little") >> 2
 
 
-def starts(task: Task, seed: int | str, numbers: Sequence[int], told: Sequence[str] | None = None) -> list[Start]:
+def draw_starts(
+    task: Task, seed: int | str, numbers: Sequence[int], told: Sequence[str] | None = None
+) -> list[EpisodeStart]:
     """Return the attempts with these numbers; `told` are instructions in turn, drawn from a seed if not given."""
     found = []
     for k in numbers:
         own = seed_of(seed, task.name, k)
-        text = told[k % len(told)] if told else sentences.drawn(task.name, seed_of(own, "told"))
-        found.append(Start(k, own, text))
+        text = told[k % len(told)] if told else sentences.draw_instruction(task.name, seed_of(own, "told"))
+        found.append(EpisodeStart(k, own, text))
     return found
 
 
 @dataclass(frozen=True, eq=False)
-class Recording:
+class EpisodeRecording:
     """An episode as it is kept."""
 
-    start: Start
+    start: EpisodeStart
     offsets: list[list[float]]
     """How far the things that the task varies were off their places [m]."""
     success: bool
@@ -136,7 +149,7 @@ def arm_state(world: episode.EpisodeState) -> Tensor:
     return torch.cat([world.joints[..., :JOINTS], opening, world.tool.pos, world.tool.quat], -1)
 
 
-def acted(task: Task, world: episode.EpisodeState, target: Pose, shake: Tensor | None = None) -> Tensor:
+def action_towards(task: Task, world: episode.EpisodeState, target: Pose, shake: Tensor | None = None) -> Tensor:
     """Return the action that leads tools towards poses, as far as they reach, shape (B, A).
 
     Args:
@@ -161,7 +174,7 @@ def _cut(task: Task, way: Tensor) -> Tensor:
 
 def play_batch(
     made: episode.Episode,
-    attempts: Sequence[Start],
+    attempts: Sequence[EpisodeStart],
     actor: Demonstrator,
     noise: Noise,
     painter: Painter | None,
@@ -183,26 +196,26 @@ def play_batch(
         seen = painter(made, world, looks, size) if painter is not None and size else {}
         target, memory = actor.target(world, memory, seen)
         goal = Pose(target, upright)
-        action, executed = acted(task, world, goal), acted(task, world, goal, shake[k])
+        action, executed = action_towards(task, world, goal), action_towards(task, world, goal, shake[k])
         aim, joints = episode.follow(task, world, action)
         before, world = world, episode.act(made, world, executed)
         if k == task.horizon - 1:
             world = episode.finish(made, world)
-        reward = episode.earned(made, world)[0]
+        reward = episode.episode_reward(made, world)[0]
         success = task.success(world.seen(task.arms.count)) & ~world.failed
         pose = torch.cat([target, aim.quat], -1)
         steps.append(_Step(before, action, executed, pose, joints[..., :JOINTS], reward, success))
     return steps, world, moved
 
 
-def record(
+def record_attempts(
     made: episode.Episode,
-    attempts: Sequence[Start],
+    attempts: Sequence[EpisodeStart],
     actor: Demonstrator,
     schema: Schema,
     painter: Painter | None = None,
     noise: Noise | None = None,
-) -> list[Recording]:
+) -> list[EpisodeRecording]:
     """Return attempts as they are kept; those without success without their frames.
 
     A batch is filled up with its first attempt, as steps are made for one size.
@@ -210,7 +223,7 @@ def record(
     count = len(made.start.failed)
     if len(attempts) < count:
         filled = [*attempts, *[attempts[0]] * (count - len(attempts))]
-        return record(made, filled, actor, schema, painter, noise)[: len(attempts)]
+        return record_attempts(made, filled, actor, schema, painter, noise)[: len(attempts)]
     with torch.no_grad():
         steps, end, moved = play_batch(made, attempts, actor, noise or Noise(), painter)
         found = []
@@ -221,7 +234,9 @@ def record(
             worlds = _line([step.before for step in steps], k)
             pictures = _pictures(made, worlds, start, schema, painter) if success and painter is not None else {}
             sums = float(rewards.double().sum())
-            found.append(Recording(start, moved[k].tolist(), success, bool(end.failed[k]), sums, columns, pictures))
+            found.append(
+                EpisodeRecording(start, moved[k].tolist(), success, bool(end.failed[k]), sums, columns, pictures)
+            )
     return found
 
 
@@ -263,7 +278,7 @@ def _columns(schema: Schema, steps: Sequence[_Step], k: int) -> dict[str, np.nda
 
 
 def _pictures(
-    made: episode.Episode, worlds: episode.EpisodeState, start: Start, schema: Schema, painter: Painter
+    made: episode.Episode, worlds: episode.EpisodeState, start: EpisodeStart, schema: Schema, painter: Painter
 ) -> dict[str, np.ndarray]:
     if not schema.size:
         return {}

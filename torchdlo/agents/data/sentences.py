@@ -9,7 +9,7 @@ import torch
 
 from torchdlo.envs import find
 
-__all__ = ["drawn", "learned", "unseen"]
+__all__ = ["draw_instruction", "heldout_instructions", "training_instructions"]
 
 _SAID: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "coiling": (
@@ -129,19 +129,19 @@ _SAID: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
 """By task: what data sets say, and what they do not."""
 
 
-def learned(task: str) -> tuple[str, ...]:
+def training_instructions(task: str) -> tuple[str, ...]:
     """Return the sentences that data sets of a task hold."""
     return _SAID[task][0] if task in _SAID else (_plain(task),)
 
 
-def unseen(task: str) -> tuple[str, ...]:
+def heldout_instructions(task: str) -> tuple[str, ...]:
     """Return sentences that mean the same and that no data set holds."""
     return _SAID[task][1] if task in _SAID else (_plain(task),)
 
 
-def drawn(task: str, seed: int) -> str:
+def draw_instruction(task: str, seed: int) -> str:
     """Return one of the sentences of a task, drawn from a seed."""
-    said = learned(task)
+    said = training_instructions(task)
     return said[int(torch.randint(len(said), (), generator=torch.Generator().manual_seed(seed)))]
 
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["QUANTILES", "column_statistics", "histogram", "picture_statistics"]
+__all__ = ["QUANTILES", "channel_histogram", "column_statistics", "picture_statistics"]
 
 QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
 
@@ -21,7 +21,7 @@ def column_statistics(values: np.ndarray) -> dict[str, Any]:
     return {name: value.tolist() for name, value in found.items()} | {"count": [len(x)]}
 
 
-def histogram(frames: Iterable[np.ndarray]) -> np.ndarray:
+def channel_histogram(frames: Iterable[np.ndarray]) -> np.ndarray:
     """Return how often each value is there, by channel, shape (3, 256)."""
     found = np.zeros((3, 256), np.int64)
     for image in frames:

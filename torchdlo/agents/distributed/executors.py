@@ -16,7 +16,7 @@ from typing import Any, Protocol, TypeVar
 
 from torchdlo.errors import InputError
 
-__all__ = ["Executor", "LocalProcesses", "Serial", "executor"]
+__all__ = ["Executor", "LocalProcesses", "Serial", "make_executor"]
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -146,7 +146,7 @@ def _leave() -> None:
     os._exit(1)
 
 
-def executor(workers: int | None = None, address: str | None = None) -> Any:
+def make_executor(workers: int | None = None, address: str | None = None) -> Any:
     """Return where to work.
 
     Args:

@@ -24,7 +24,7 @@ class RayWorkers(_Closing):
         """Join a cluster.
 
         Args:
-            address: see `executors.executor`.
+            address: see `executors.make_executor`.
             workers: most items that are being worked on at a time; as many as the cluster has cores if not given.
         """
         os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")

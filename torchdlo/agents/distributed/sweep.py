@@ -27,7 +27,7 @@ from torchdlo.agents.distributed import executors
 from torchdlo.errors import InputError
 from torchdlo.journal import at_work, read_json, write_json
 
-__all__ = ["KINDS", "Job", "Sweep", "run"]
+__all__ = ["KINDS", "Job", "Sweep", "run_sweep"]
 
 KINDS = {
     "optimize": ("optimize",),
@@ -145,7 +145,7 @@ def _unpack(content: bytes, folder: Path) -> None:
         shutil.rmtree(temporary, ignore_errors=True)
 
 
-def run(
+def run_sweep(
     sweep: Sweep,
     out: Path,
     executor: executors.Executor,

@@ -2,8 +2,8 @@
 
 from torchdlo.agents.policies.cloud_policy import CloudPolicy, CloudSpec
 from torchdlo.agents.policies.features import FeatureSpec, Normaliser, task_features
-from torchdlo.agents.policies.files import load, module, save
 from torchdlo.agents.policies.policy import Policy, PolicySpec, mlp
+from torchdlo.agents.policies.policy_files import load_policy, policy_module, save_policy
 
 __all__ = [
     "CloudPolicy",
@@ -12,9 +12,9 @@ __all__ = [
     "Normaliser",
     "Policy",
     "PolicySpec",
-    "load",
+    "load_policy",
     "mlp",
-    "module",
-    "save",
+    "policy_module",
+    "save_policy",
     "task_features",
 ]

@@ -22,16 +22,16 @@ from torch.nn import functional as F
 
 from torchdlo.agents.policies.language import WIDTH
 from torchdlo.errors import InputError
-from torchdlo.files import replacing
+from torchdlo.files import replace_atomically
 from torchdlo.untrusted.tensor_file import check_shapes, read_tensors
 
-__all__ = ["ChunkPolicy", "Shape", "is_chunk_policy", "load_policy", "save_policy"]
+__all__ = ["ChunkPolicy", "NetworkShape", "is_chunk_policy", "load_policy", "save_policy"]
 
 GENERATOR = "torchdlo learn"
 
 
 @dataclass(frozen=True)
-class Shape:
+class NetworkShape:
     """What the network is like."""
 
     arms: int
@@ -60,7 +60,7 @@ _LATER = (3, 2, 1)
 class _Eye(nn.Module):
     """Pictures of a camera as tokens."""
 
-    def __init__(self, shape: Shape) -> None:
+    def __init__(self, shape: NetworkShape) -> None:
         super().__init__()
         pairs = list(itertools.pairwise((3, *shape.channels)))
         kinds = [_STEM if k == 0 else _LATER for k in range(len(pairs))]
@@ -90,7 +90,7 @@ class _Eye(nn.Module):
 class ChunkPolicy(nn.Module):
     """The network. States and targets are scaled by statistics that it keeps with its weights."""
 
-    def __init__(self, shape: Shape) -> None:
+    def __init__(self, shape: NetworkShape) -> None:
         """Make it, with weights drawn from torch's generator."""
         super().__init__()
         self.shape, width = shape, shape.width
@@ -165,7 +165,7 @@ def save_policy(path: Path, policy: ChunkPolicy, about: dict[str, Any], *, small
     if small:
         weights = {name: _rounded(x) if name.endswith("weight") else x for name, x in weights.items()}
     content = {"generator": GENERATOR, "shape": asdict(policy.shape), "about": about, "weights": weights}
-    with replacing(path) as temporary:
+    with replace_atomically(path) as temporary:
         torch.save(content, temporary)
 
 
@@ -200,7 +200,7 @@ def load_policy(path: Path) -> tuple[ChunkPolicy, dict[str, Any]]:
     try:
         if content["generator"] != GENERATOR:
             raise ValueError
-        shape = Shape(**{k: tuple(v) if isinstance(v, list) else v for k, v in content["shape"].items()})
+        shape = NetworkShape(**{k: tuple(v) if isinstance(v, list) else v for k, v in content["shape"].items()})
         if max(shape.arms, len(shape.cameras), shape.layers, len(shape.channels)) > 100:
             raise ValueError
         weights = {name: _exact(x) for name, x in content["weights"].items()}

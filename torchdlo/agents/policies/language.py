@@ -21,7 +21,7 @@ from torch.nn import functional as F
 from torchdlo.errors import InputError
 from torchdlo.untrusted import read_entry
 
-__all__ = ["ENCODERS", "WIDTH", "default_encoder", "encode"]
+__all__ = ["ENCODERS", "WIDTH", "default_encoder", "encode_sentences"]
 
 WIDTH = 384
 """Numbers of a sentence."""
@@ -42,7 +42,7 @@ def default_encoder() -> str:
     return "minilm" if _folder() else "hashed"
 
 
-def encode(sentences: Sequence[str], encoder: str) -> Tensor:
+def encode_sentences(sentences: Sequence[str], encoder: str) -> Tensor:
     """Return vectors of length 1 for sentences, float32, shape (n, 384).
 
     Args:

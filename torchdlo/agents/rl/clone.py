@@ -10,9 +10,9 @@ from torch import Tensor
 from torchdlo.agents.policies import Policy
 from torchdlo.agents.rl.episodes import TaskEpisodes
 from torchdlo.agents.rl.expert import Expert
-from torchdlo.agents.rl.rollout import look
+from torchdlo.agents.rl.rollout import policy_features
 
-__all__ = ["Labels", "fit", "labelled"]
+__all__ = ["Labels", "fit_clone", "label_batch"]
 
 
 @dataclass(eq=False)
@@ -35,7 +35,7 @@ class Labels:
 
 
 @torch.no_grad()
-def labelled(
+def label_batch(
     labels: Labels,
     policy: Policy,
     expert: Expert,
@@ -59,7 +59,7 @@ def labelled(
     seen, env, reach = episodes.reset(), episodes.env, episodes.task.max_translation
     alive = torch.ones(episodes.count, dtype=torch.bool)
     for k in range(episodes.horizon):
-        features = look(policy, episodes, k, seen)
+        features = policy_features(policy, episodes, k, seen)
         right = expert.act(k, env.moved, env.world.tool.pos.float(), reach)
         labels.features.append(features[alive])
         labels.actions.append(right[alive])
@@ -71,7 +71,7 @@ def labelled(
     return float(good.float().mean()), float(step.failed.float().mean())
 
 
-def fit(
+def fit_clone(
     policy: Policy, labels: Labels, *, updates: int = 3000, batch: int = 512, rate: float = 1e-3, noise: float = 0.0
 ) -> float:
     """Let a policy's means be what the expert said, from what it is now; return the last mean squared error.

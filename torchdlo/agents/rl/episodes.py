@@ -15,14 +15,14 @@ from torch import Tensor
 
 from torchdlo.envs import Task
 
-__all__ = ["EnvEpisodes", "Episodes", "Step", "TaskEpisodes"]
+__all__ = ["EnvEpisodes", "Episodes", "TaskEpisodes", "Transition"]
 
 _LONG = 10
 """Actions of episodes that are worth recording their steps."""
 
 
 @dataclass(frozen=True, eq=False)
-class Step:
+class Transition:
     """What an action led to."""
 
     observation: Tensor
@@ -50,7 +50,7 @@ class Episodes(Protocol):
     def reset(self) -> Tensor:
         """Begin anew; return observations (N, O)."""
 
-    def step(self, action: Tensor) -> Step:
+    def step(self, action: Tensor) -> Transition:
         """Do actions (N, A) of the environment."""
 
     def detach(self) -> None:
@@ -78,7 +78,7 @@ class EnvEpisodes:
         self.first = self._seen(self._td).detach()
         return self.first
 
-    def step(self, action: Tensor) -> Step:
+    def step(self, action: Tensor) -> Transition:
         """Do actions (N, A)."""
         from torchrl.envs.utils import step_mdp
 
@@ -90,7 +90,7 @@ class EnvEpisodes:
         reward = torch.where(before, 0.0, after.get("reward").reshape(self.count))
         success = after.get("success", None)
         success = torch.zeros_like(before) if success is None else success.reshape(self.count)
-        return Step(self._seen(after), reward, self._failed, success)
+        return Transition(self._seen(after), reward, self._failed, success)
 
     def detach(self) -> None:
         """Cut the history of gradients."""
@@ -171,7 +171,7 @@ class TaskEpisodes:
             self.first = episode.observe(env.episode, env.world)
         return self.first
 
-    def step(self, action: Tensor) -> Step:
+    def step(self, action: Tensor) -> Transition:
         """Do actions (N, 6 R) in metres and degrees."""
         from tensordict import TensorDict
 
@@ -186,7 +186,7 @@ class TaskEpisodes:
                 missing = self.task.terminal_cost(seen).float()
                 reward = reward - self.scale * torch.where(world.failed, 0.0, missing)
             reward = reward + self.bonus * success
-        return Step(td["observation"], reward, world.failed, success)
+        return Transition(td["observation"], reward, world.failed, success)
 
     def detach(self) -> None:
         """Cut the history of gradients."""

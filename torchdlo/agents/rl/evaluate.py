@@ -12,12 +12,12 @@ from torch import Tensor
 
 from torchdlo.agents.policies import Policy
 from torchdlo.agents.rl.episodes import TaskEpisodes
-from torchdlo.agents.rl.rollout import progress
-from torchdlo.envs import PUBLISHED, Task, simulated
+from torchdlo.agents.rl.rollout import episode_progress
+from torchdlo.envs import PUBLISHED, Task, with_fidelity
 from torchdlo.envs.observations.state import observe
 from torchdlo.physics import tree
 
-__all__ = ["PROTOCOLS", "UNSEEN", "evaluate", "judged", "wilson"]
+__all__ = ["PROTOCOLS", "UNSEEN", "evaluate_policies", "judge_policies", "wilson_interval"]
 
 UNSEEN = 777_000_000
 """Seed of the starts of the judgement; trainers add less than this to theirs."""
@@ -31,7 +31,7 @@ Numbers of effects are drawn from that share of their declared range."""
 _RANDOM = ("rod_contact.mu_k", "table_friction.mu", "damping.rate")
 
 
-def wilson(successes: int, count: int) -> tuple[float, float]:
+def wilson_interval(successes: int, count: int) -> tuple[float, float]:
     """Return the 95 % interval of a share (Wilson 1927)."""
     z, p = 1.959964, successes / count
     middle = (p + z * z / (2 * count)) / (1 + z * z / count)
@@ -40,7 +40,7 @@ def wilson(successes: int, count: int) -> tuple[float, float]:
 
 
 @torch.no_grad()
-def judged(
+def judge_policies(
     policies: Sequence[Policy],
     task: Task,
     *,
@@ -64,7 +64,7 @@ def judged(
         compiled: whether steps are compiled.
     """
     how = PROTOCOLS[protocols[-1]]
-    fine = simulated(task, PUBLISHED)
+    fine = with_fidelity(task, PUBLISHED)
     many = starts if how["variation"] else 0
     one = int("one" in protocols)
     episodes = TaskEpisodes(
@@ -80,7 +80,7 @@ def judged(
     step: Any = None
     for k in range(episodes.horizon):
         rows = zip(policies, seen.chunk(len(policies)), strict=True)
-        share, first = progress(episodes, k, seen)[: many + one], episodes.first[: many + one]
+        share, first = episode_progress(episodes, k, seen)[: many + one], episodes.first[: many + one]
         stage_waypoints = torch.stack([p.mean(p.features(part, share, first)) for p, part in rows])
         if how.get("noise"):
             stage_waypoints = stage_waypoints + torch.randn(stage_waypoints.shape[1:], generator=rng) * (
@@ -128,7 +128,7 @@ def _shared(episodes: TaskEpisodes, policies: int, starts: int, one: int) -> Ten
     return episodes.first
 
 
-def evaluate(
+def evaluate_policies(
     policies: Sequence[Policy],
     task: Task,
     *,
@@ -138,7 +138,7 @@ def evaluate(
     callback: Callable[[str, int, int, str], None] | None = None,
     compiled: bool = False,
 ) -> tuple[dict[str, Any], dict[str, dict[str, Tensor]]]:
-    """Return results as plain data, and what became of all episodes by protocol, see `judged`.
+    """Return results as plain data, and what became of all episodes by protocol, see `judge_policies`.
 
     Args:
         policies: of one task, one for each seed of training; all are judged from the same starts.
@@ -154,12 +154,12 @@ def evaluate(
     calm = [name for name in ("one", "varied") if name in protocols]
     for names in (calm, ["disturbed"] if "disturbed" in protocols else []):
         if names:
-            plays |= judged(
+            plays |= judge_policies(
                 policies, task, starts=starts, protocols=names, seed=seed, callback=callback, compiled=compiled
             )
     for name, rows in plays.items():
         success, returns = rows["success"], rows["returns"]
-        low, high = wilson(int(success.sum()), success.numel())
+        low, high = wilson_interval(int(success.sum()), success.numel())
         found[name] = {
             "episodes": success.numel(),
             "success": float(success.float().mean()),

@@ -20,14 +20,22 @@ import torch
 from torch import Tensor
 
 from torchdlo.agents.rl.episodes import TaskEpisodes
-from torchdlo.agents.trajopt.result import read_trajectory
+from torchdlo.agents.trajopt.search_result import read_trajectory
 from torchdlo.envs import Task
 from torchdlo.errors import InputError
 from torchdlo.files import write_atomically
 from torchdlo.journal import read_json, write_json
 from torchdlo.untrusted import one_line, read_entry
 
-__all__ = ["Expert", "Score", "candidates", "follow", "improve", "load_expert", "save_expert"]
+__all__ = [
+    "Expert",
+    "ExpertScore",
+    "candidate_experts",
+    "follow_experts",
+    "improve_expert",
+    "load_expert",
+    "save_expert",
+]
 
 Callback = Callable[[str, int, int, str], None]
 _KNOTS = 8
@@ -57,7 +65,7 @@ class Expert:
 
 
 @dataclass(frozen=True)
-class Score:
+class ExpertScore:
     """How an expert or a policy did."""
 
     success: float
@@ -98,7 +106,7 @@ def load_expert(path: Path, task: Task) -> Expert:
     return Expert(places, gain, content["source"].text())
 
 
-def candidates(task: Task, trajectories: list[Path]) -> list[Expert]:
+def candidate_experts(task: Task, trajectories: list[Path]) -> list[Expert]:
     """Return the paths of found trajectories that succeeded: at the same places, and moved with the first thing."""
     found = []
     shape = (task.horizon, task.arms.count, 3, len(task.reset_noise), 2)
@@ -126,11 +134,11 @@ class _Journal:
         if found is not None and found.get("choices") == choices:
             self.ahead = found["rows"]
 
-    def recall(self) -> list[Score] | None:
+    def recall(self) -> list[ExpertScore] | None:
         """Return how the next batch went, if that is known."""
-        return [Score(*row) for row in self.ahead.pop(0)] if self.ahead else None
+        return [ExpertScore(*row) for row in self.ahead.pop(0)] if self.ahead else None
 
-    def keep(self, scores: list[Score]) -> None:
+    def keep(self, scores: list[ExpertScore]) -> None:
         """Write down how a batch went."""
         self.rows.append([list(vars(s).values()) for s in scores])
         if self.path is not None and not self.ahead:
@@ -139,7 +147,9 @@ class _Journal:
 
 
 @torch.no_grad()
-def follow(experts: list[Expert], episodes: TaskEpisodes, *, noise: float, generator: torch.Generator) -> list[Score]:
+def follow_experts(
+    experts: list[Expert], episodes: TaskEpisodes, *, noise: float, generator: torch.Generator
+) -> list[ExpertScore]:
     """Play experts, each in an equal share of the batch and from the same starts; return how they did.
 
     Args:
@@ -150,7 +160,7 @@ def follow(experts: list[Expert], episodes: TaskEpisodes, *, noise: float, gener
     """
     each, reach = episodes.count // len(experts), episodes.task.max_translation
     episodes.reset()
-    same(episodes, each)
+    share_starts(episodes, each)
     env = episodes.env
     moved = env.moved[:each]
     for k in range(episodes.horizon):
@@ -168,10 +178,10 @@ def follow(experts: list[Expert], episodes: TaskEpisodes, *, noise: float, gener
         missing.split(each),
         strict=True,
     )
-    return [Score(*(float(x.mean()) for x in row)) for row in rows]
+    return [ExpertScore(*(float(x.mean()) for x in row)) for row in rows]
 
 
-def same(episodes: TaskEpisodes, each: int) -> None:
+def share_starts(episodes: TaskEpisodes, each: int) -> None:
     """Let all shares of a batch begin from the starts of its first share."""
     from torchdlo.physics import tree
 
@@ -206,7 +216,7 @@ def _changed(expert: Expert, numbers: Tensor, task: Task) -> Expert:
     return replace(expert, path=path, gain=gain)
 
 
-def improve(
+def improve_expert(
     task: Task,
     experts: list[Expert],
     *,
@@ -281,7 +291,7 @@ class _Arena:
         self.played = 0
         self._made: TaskEpisodes | None = None
 
-    def scores(self, experts: list[Expert], starts: int, number: int) -> list[Score]:
+    def scores(self, experts: list[Expert], starts: int, number: int) -> list[ExpertScore]:
         """Return how each candidate did from as many starts, which are the same for all."""
         count = starts * len(experts)
         self.played += count
@@ -291,7 +301,7 @@ class _Arena:
                 self._made = TaskEpisodes(self.task, count)
             self._made.generator.manual_seed(self.seed + number)
             random = torch.Generator().manual_seed(self.seed + 500_000 + number)
-            found = follow(experts, self._made, noise=self.noise, generator=random)
+            found = follow_experts(experts, self._made, noise=self.noise, generator=random)
         self.journal.keep(found)
         return found
 

@@ -14,16 +14,16 @@ from torchrl.objectives import ClipPPOLoss
 
 from torchdlo.agents.policies import Policy, mlp
 from torchdlo.agents.rl.episodes import Episodes
-from torchdlo.agents.rl.rollout import Batch, advantages, collect
-from torchdlo.agents.rl.settings import Settings
+from torchdlo.agents.rl.rollout import Batch, collect_episodes, generalised_advantages
+from torchdlo.agents.rl.settings import TrainingSettings
 
-__all__ = ["Critic", "Ppo", "actor"]
+__all__ = ["Critic", "Ppo", "torchrl_actor"]
 
 
 class Critic(nn.Module):
     """Values of states, or of states and actions, in the normaliser of a policy; shape (..., 1)."""
 
-    def __init__(self, policy: Policy, settings: Settings, *, actions: int = 0) -> None:
+    def __init__(self, policy: Policy, settings: TrainingSettings, *, actions: int = 0) -> None:
         """Make one with random weights."""
         super().__init__()
         self._normaliser = [policy.normaliser]  # in a list, so that it is not a part of this module
@@ -37,7 +37,7 @@ class Critic(nn.Module):
         return self.net(x if action is None else torch.cat([x, action], -1))
 
 
-def actor(policy: Policy) -> ProbabilisticActor:
+def torchrl_actor(policy: Policy) -> ProbabilisticActor:
     """Return a policy as TorchRL's actor from "features" to "action"."""
     net = TensorDictModule(policy, in_keys=["features"], out_keys=["loc", "scale"])
     kind = TanhNormal if policy.spec.squash else IndependentNormal
@@ -47,13 +47,13 @@ def actor(policy: Policy) -> ProbabilisticActor:
 class Ppo:
     """The trainer: an iteration plays one batch of episodes and goes over it some times."""
 
-    def __init__(self, policy: Policy, settings: Settings, *, fixed: bool = False) -> None:
+    def __init__(self, policy: Policy, settings: TrainingSettings, *, fixed: bool = False) -> None:
         """Make critic and optimisers for a policy; `fixed` leaves its normaliser as it is."""
         self.policy, self.settings, self.fixed = policy, settings, fixed
         self.critic = Critic(policy, settings)
         value = ValueOperator(self.critic, in_keys=["features"])
         self.loss = ClipPPOLoss(
-            actor(policy),
+            torchrl_actor(policy),
             value,
             clip_epsilon=settings.clip,
             entropy_coeff=settings.entropy,
@@ -74,7 +74,7 @@ class Ppo:
 
     def iterate(self, episodes: Episodes) -> tuple[Batch, dict[str, float]]:
         """Play and learn; return what was played and how learning went."""
-        batch = collect(self.policy, episodes)
+        batch = collect_episodes(self.policy, episodes)
         if not bool(self.policy.normaliser.count > 0):
             self.policy.normaliser.update(batch.features)
             # Densities are those of the policy as it is now.
@@ -91,7 +91,9 @@ class Ppo:
         s = self.settings
         with torch.no_grad():
             value = self.critic(batch.features).squeeze(-1)
-            advantage, returns = advantages(value, batch.reward, batch.terminal, gamma=s.gamma, lmbda=s.lmbda)
+            advantage, returns = generalised_advantages(
+                value, batch.reward, batch.terminal, gamma=s.gamma, lmbda=s.lmbda
+            )
         use = batch.alive
         data = TensorDict(
             {
@@ -123,4 +125,4 @@ class Ppo:
 def _again(policy: Policy, batch: Batch) -> Batch:
     """Return a batch with the densities of a policy whose normaliser has changed."""
     td = TensorDict({"features": batch.features[:-1]}, batch_size=batch.log_prob.shape)
-    return replace(batch, log_prob=actor(policy).get_dist(td).log_prob(batch.action))
+    return replace(batch, log_prob=torchrl_actor(policy).get_dist(td).log_prob(batch.action))

@@ -9,18 +9,18 @@ from typing import Any
 
 import torch
 
-from torchdlo.agents.policies import Policy, load
+from torchdlo.agents.policies import Policy, load_policy
 from torchdlo.agents.rl.episodes import TaskEpisodes
-from torchdlo.agents.rl.hybrid import task_policy
-from torchdlo.agents.rl.settings import Settings
+from torchdlo.agents.rl.hybrid_stages import task_policy
+from torchdlo.agents.rl.settings import TrainingSettings
 from torchdlo.agents.rl.training import Trained, Trainer
-from torchdlo.envs import Task, simulated
+from torchdlo.envs import Task, with_fidelity
 from torchdlo.errors import InputError
 
-__all__ = ["load_policies", "prepared", "summary", "train_json"]
+__all__ = ["evaluation_summary", "load_policies", "prepare_training", "train_json"]
 
 
-def prepared(task: Task, settings: Settings, *, compiled: bool = False) -> tuple[Trainer, TaskEpisodes]:
+def prepare_training(task: Task, settings: TrainingSettings, *, compiled: bool = False) -> tuple[Trainer, TaskEpisodes]:
     """Return the trainer with a new policy, and its episodes, for an algorithm without stages."""
     from torchdlo.agents.rl.ppo import Ppo
     from torchdlo.agents.rl.sac import Sac
@@ -29,7 +29,7 @@ def prepared(task: Task, settings: Settings, *, compiled: bool = False) -> tuple
     kinds = {"ppo": Ppo, "sac": Sac, "shac": Shac, "sapo": Sapo}
     if settings.algorithm not in kinds:
         raise InputError(f"algorithm is {settings.algorithm!r}; expected one of {', '.join(kinds)}.")
-    task = simulated(task, settings.fidelity)
+    task = with_fidelity(task, settings.fidelity)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(settings.seed)
         soft = settings.algorithm in ("sac", "sapo")
@@ -68,13 +68,13 @@ def _scale(task: Task) -> float:
     return 10.0 / _RETURNS.get(task.name, 10.0)
 
 
-def train_json(task: Task, settings: Settings, found: Trained) -> str:
+def train_json(task: Task, settings: TrainingSettings, found: Trained) -> str:
     """Return what training came to as JSON."""
     content = {
         "generator": "torchdlo train",
         "task": task.name,
         "algorithm": settings.algorithm,
-        "fidelity": simulated(task, settings.fidelity).fidelity.text,
+        "fidelity": with_fidelity(task, settings.fidelity).fidelity.text,
         "episodes": found.episodes,
         "seconds": round(found.seconds, 1),
         "best_batch": {"success": found.best[0], "return": found.best[1]} if found.rows else None,
@@ -88,14 +88,14 @@ def train_json(task: Task, settings: Settings, found: Trained) -> str:
 
 def load_policies(paths: list[Path]) -> tuple[list[Policy], str]:
     """Return the policies of files or folders, and the name of their one task."""
-    found = [load(path) for path in paths]
+    found = [load_policy(path) for path in paths]
     names = sorted({policy.spec.task for policy in found})
     if len(names) != 1 or not names[0]:
         raise InputError(f"policies: they are for {', '.join(names) or 'no task'}; expected policies of one task.")
     return found, names[0]
 
 
-def summary(results: dict[str, Any]) -> str:
+def evaluation_summary(results: dict[str, Any]) -> str:
     """Return an evaluation in one line per protocol."""
     lines = []
     for name in ("one", "varied", "disturbed"):

@@ -16,10 +16,10 @@ from torch import Tensor
 from torchdlo import scene as scenes
 from torchdlo.agents.policies import Policy
 from torchdlo.agents.rl.episodes import TaskEpisodes
-from torchdlo.agents.rl.evaluate import UNSEEN, wilson
+from torchdlo.agents.rl.evaluate import UNSEEN, wilson_interval
 from torchdlo.agents.rl.expert import Expert
-from torchdlo.agents.rl.rollout import look
-from torchdlo.envs import PUBLISHED, Task, simulated
+from torchdlo.agents.rl.rollout import policy_features
+from torchdlo.envs import PUBLISHED, Task, with_fidelity
 from torchdlo.errors import InputError
 from torchdlo.physics import tree
 from torchdlo.scene import Params
@@ -62,7 +62,7 @@ def policy_acting(policy: Policy) -> Actor:
     """Return what a policy does, in the middle of what it could."""
 
     def act(done: int, episodes: TaskEpisodes, seen: Tensor, rows: slice) -> Tensor:
-        return policy.mean(look(policy, episodes, done, seen)[rows])
+        return policy.mean(policy_features(policy, episodes, done, seen)[rows])
 
     return act
 
@@ -107,7 +107,7 @@ def perturbed(
         seed: of starts and noise, as in `evaluate`.
         callback: told (stage, actions done, all, message).
     """
-    fine = simulated(task, PUBLISHED)
+    fine = with_fidelity(task, PUBLISHED)
     groups: dict[tuple[float, float], list[str]] = {}
     for name, p in perturbations.items():
         groups.setdefault((p.friction, p.stiffness), []).append(name)
@@ -173,7 +173,7 @@ def _played(
 def _row(good: Tensor, returns: Tensor, failed: Tensor) -> dict[str, Any]:
     return {
         "success": float(good.float().mean()),
-        "interval": list(wilson(int(good.sum()), len(good))),
+        "interval": list(wilson_interval(int(good.sum()), len(good))),
         "return": float(returns.mean()),
         "failed": float(failed.float().mean()),
     }

@@ -11,7 +11,14 @@ from torch import Tensor
 from torchdlo.agents.policies import Policy
 from torchdlo.agents.rl.episodes import Episodes
 
-__all__ = ["Batch", "advantages", "collect", "look", "progress", "targets"]
+__all__ = [
+    "Batch",
+    "collect_episodes",
+    "episode_progress",
+    "generalised_advantages",
+    "policy_features",
+    "td_lambda_targets",
+]
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,22 +51,22 @@ class Batch:
         return ends
 
 
-def progress(episodes: Episodes, done: int, like: Tensor) -> Tensor:
+def episode_progress(episodes: Episodes, done: int, like: Tensor) -> Tensor:
     """Return the share of the episode that is over, shape (N, 1)."""
     return like.new_full((episodes.count, 1), done / episodes.horizon)
 
 
-def look(policy: Policy, episodes: Episodes, done: int, seen: Tensor) -> Tensor:
+def policy_features(policy: Policy, episodes: Episodes, done: int, seen: Tensor) -> Tensor:
     """Return a policy's features (N, F) of what is seen (N, O) after so many actions."""
-    return policy.features(seen, progress(episodes, done, seen), episodes.first)
+    return policy.features(seen, episode_progress(episodes, done, seen), episodes.first)
 
 
 @torch.no_grad()
-def collect(policy: Policy, episodes: Episodes, *, random: bool = True) -> Batch:
+def collect_episodes(policy: Policy, episodes: Episodes, *, random: bool = True) -> Batch:
     """Play whole episodes without gradients; `random` draws actions, else they are the middle of what could be."""
     seen = episodes.reset()
     rows: list[dict[str, Tensor]] = []
-    features = [look(policy, episodes, 0, seen)]
+    features = [policy_features(policy, episodes, 0, seen)]
     step: Any = None
     for k in range(episodes.horizon):
         if random:
@@ -69,13 +76,13 @@ def collect(policy: Policy, episodes: Episodes, *, random: bool = True) -> Batch
             density = torch.zeros_like(action[:, 0])
         step = episodes.step(policy.command(action))
         finite = torch.nan_to_num(step.observation)
-        features.append(look(policy, episodes, k + 1, finite))
+        features.append(policy_features(policy, episodes, k + 1, finite))
         rows.append({"action": action, "log_prob": density, "reward": step.reward, "failed": step.failed})
     kept = {name: torch.stack([row[name] for row in rows]) for name in rows[0]}
     return Batch(torch.stack(features), **kept, success=step.success & ~step.failed)
 
 
-def advantages(
+def generalised_advantages(
     value: Tensor, reward: Tensor, terminal: Tensor, *, gamma: float, lmbda: float, over: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
     """Return generalised advantages and returns, shape (T, N) each (Schulman et al. 2016).
@@ -96,7 +103,7 @@ def advantages(
     return found[0].squeeze(-1).T, found[1].squeeze(-1).T
 
 
-def targets(value: Tensor, reward: Tensor, terminal: Tensor, *, gamma: float, lmbda: float) -> Tensor:
+def td_lambda_targets(value: Tensor, reward: Tensor, terminal: Tensor, *, gamma: float, lmbda: float) -> Tensor:
     """Return TD(lambda) returns of a window, bootstrapped at its end, shape (T, N).
 
     Args:

@@ -13,9 +13,9 @@ from torchrl.objectives import SACLoss, SoftUpdate
 
 from torchdlo.agents.policies import Policy
 from torchdlo.agents.rl.episodes import Episodes
-from torchdlo.agents.rl.ppo import Critic, actor
-from torchdlo.agents.rl.rollout import Batch, look
-from torchdlo.agents.rl.settings import Settings
+from torchdlo.agents.rl.ppo import Critic, torchrl_actor
+from torchdlo.agents.rl.rollout import Batch, policy_features
+from torchdlo.agents.rl.settings import TrainingSettings
 
 __all__ = ["Sac"]
 
@@ -23,12 +23,12 @@ __all__ = ["Sac"]
 class Sac:
     """The trainer: an iteration plays one batch of episodes, and learns after every action of them."""
 
-    def __init__(self, policy: Policy, settings: Settings) -> None:
+    def __init__(self, policy: Policy, settings: TrainingSettings) -> None:
         """Make critics, target networks, temperature and buffer for a policy."""
         self.policy, self.settings, self.done = policy, settings, 0
         critic = ValueOperator(Critic(policy, settings, actions=policy.spec.actions), in_keys=["features", "action"])
         self.loss = SACLoss(
-            actor(policy), critic, num_qvalue_nets=2, target_entropy=-0.5 * policy.spec.actions, alpha_init=0.1
+            torchrl_actor(policy), critic, num_qvalue_nets=2, target_entropy=-0.5 * policy.spec.actions, alpha_init=0.1
         )
         self.loss.make_value_estimator(gamma=settings.gamma)
         # Both critics begin as one network; they are drawn anew.
@@ -82,7 +82,7 @@ class Sac:
         """Play and learn; return what was played and how learning went."""
         s, policy = self.settings, self.policy
         seen = episodes.reset()
-        features = [look(policy, episodes, 0, seen)]
+        features = [policy_features(policy, episodes, 0, seen)]
         rows: list[dict[str, Tensor]] = []
         told: list[dict[str, Tensor]] = []
         step: Any = None
@@ -96,7 +96,7 @@ class Sac:
                     action, density = policy.draw(features[-1])
                 step = episodes.step(policy.command(action))
                 finite = torch.nan_to_num(step.observation)
-                features.append(look(policy, episodes, k + 1, finite))
+                features.append(policy_features(policy, episodes, k + 1, finite))
             self._remember(features[-2:], action, step, alive, last=k + 1 == episodes.horizon)
             alive = ~step.failed
             rows.append({"action": action, "log_prob": density, "reward": step.reward, "failed": step.failed})

@@ -8,7 +8,7 @@ from typing import Any
 
 from torchdlo.errors import InputError
 
-__all__ = ["ALGORITHMS", "EPISODES", "PUBLISHED", "Settings", "preset"]
+__all__ = ["ALGORITHMS", "EPISODES", "PUBLISHED", "TrainingSettings", "training_preset"]
 
 ALGORITHMS = ("ppo", "sac", "shac", "sapo", "hybrid")
 """Names of all ways to train."""
@@ -29,7 +29,7 @@ PUBLISHED = {
 
 
 @dataclass(frozen=True)
-class Settings:
+class TrainingSettings:
     """How to train. What does not belong to an algorithm has no effect there."""
 
     algorithm: str = "ppo"
@@ -118,16 +118,16 @@ _ALGORITHM: dict[str, dict[str, Any]] = {
 }
 
 
-def preset(task: str, algorithm: str, **given: Any) -> Settings:
+def training_preset(task: str, algorithm: str, **given: Any) -> TrainingSettings:
     """Return the settings for a task and an algorithm; what is given and not None wins."""
     if algorithm not in ALGORITHMS:
         raise InputError(f"algorithm is {algorithm!r}; expected one of {', '.join(ALGORITHMS)}.")
     base = {"algorithm": algorithm, "episodes": EPISODES.get(task, 20_000)} | _ALGORITHM[algorithm]
     wanted = {name: value for name, value in given.items() if value is not None}
-    names = {f.name for f in dataclasses.fields(Settings)}
+    names = {f.name for f in dataclasses.fields(TrainingSettings)}
     other = sorted(set(wanted) - names)
     if other:
         raise InputError(f"settings: there is no {', '.join(other)}; expected some of {', '.join(sorted(names))}.")
     if wanted.get("episodes", base["episodes"]) < base.get("count", 100):
         wanted.setdefault("count", wanted["episodes"])
-    return Settings(**(base | wanted))
+    return TrainingSettings(**(base | wanted))

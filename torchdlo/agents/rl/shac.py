@@ -18,8 +18,8 @@ from torch import Tensor, nn
 from torchdlo.agents.policies import Policy
 from torchdlo.agents.rl.episodes import Episodes
 from torchdlo.agents.rl.ppo import Critic
-from torchdlo.agents.rl.rollout import Batch, look, targets
-from torchdlo.agents.rl.settings import Settings
+from torchdlo.agents.rl.rollout import Batch, policy_features, td_lambda_targets
+from torchdlo.agents.rl.settings import TrainingSettings
 
 __all__ = ["Sapo", "Shac", "Window", "actor_loss"]
 
@@ -98,7 +98,7 @@ class Shac:
     critics = 1
     soft = False
 
-    def __init__(self, policy: Policy, settings: Settings) -> None:
+    def __init__(self, policy: Policy, settings: TrainingSettings) -> None:
         """Make critics and optimisers for a policy."""
         self.policy, self.settings = policy, settings
         self.critic = nn.ModuleList(Critic(policy, settings) for _ in range(self.critics))
@@ -140,7 +140,7 @@ class Shac:
         s, policy = self.settings, self.policy
         count = min(s.window, episodes.horizon - done)
         limit = s.tame / (count * episodes.count) if s.tame else 0.0
-        features = [look(policy, episodes, done, _bounded(seen))]
+        features = [policy_features(policy, episodes, done, _bounded(seen))]
         rows: list[dict[str, Tensor]] = []
         step: Any = None
         for k in range(count):
@@ -149,7 +149,7 @@ class Shac:
                 action.register_hook(_tamed(limit, self.lost))
             step = episodes.step(policy.command(action))
             seen = _bounded(step.observation)
-            features.append(look(policy, episodes, done + k + 1, seen))
+            features.append(policy_features(policy, episodes, done + k + 1, seen))
             rows.append({"action": action, "log_prob": density, "reward": step.reward, "failed": step.failed})
         kept = {name: torch.stack([row[name] for row in rows]) for name in rows[0]}
         ends = done + count == episodes.horizon
@@ -170,7 +170,7 @@ class Shac:
         windows: list[Window] = []
         told: list[dict[str, Tensor]] = []
         if not bool(self.policy.normaliser.count > 0):
-            self.policy.normaliser.update(look(self.policy, episodes, 0, seen))
+            self.policy.normaliser.update(policy_features(self.policy, episodes, 0, seen))
         self.lost.clear()
         while done < episodes.horizon:
             window, seen = self.play(episodes, seen, done, failed)
@@ -219,7 +219,7 @@ class Shac:
         with torch.no_grad():
             value = self.aims(window.features[1:])
             gain = window.reward - self.temperature * window.log_prob
-            aim = targets(value, gain, window.terminal, gamma=s.gamma, lmbda=s.lmbda)
+            aim = td_lambda_targets(value, gain, window.terminal, gamma=s.gamma, lmbda=s.lmbda)
         use = window.alive
         features, aim = window.features[:-1][use], aim[use]
         if not len(aim):

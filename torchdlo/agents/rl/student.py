@@ -19,11 +19,11 @@ from torch import Tensor
 
 from torchdlo.agents.policies import Policy
 from torchdlo.agents.policies.cloud_policy import CloudPolicy, CloudSpec
-from torchdlo.agents.policies.files import save
+from torchdlo.agents.policies.policy_files import save_policy
 from torchdlo.agents.rl.episodes import TaskEpisodes
-from torchdlo.agents.rl.evaluate import UNSEEN, wilson
-from torchdlo.agents.rl.rollout import look, progress
-from torchdlo.envs import PUBLISHED, Task, simulated
+from torchdlo.agents.rl.evaluate import UNSEEN, wilson_interval
+from torchdlo.agents.rl.rollout import episode_progress, policy_features
+from torchdlo.envs import PUBLISHED, Task, with_fidelity
 from torchdlo.files import write_atomically
 from torchdlo.vision.camera import Lens
 from torchdlo.vision.point_cloud import POINTS, point_cloud
@@ -143,10 +143,10 @@ def _play(
     seen, start = episodes.first, env.world.tool.pos.float()
     alive, step = torch.ones(episodes.count, dtype=torch.bool), None
     for k in range(episodes.horizon):
-        cloud, tool, share = eyes.see(episodes), env.world.tool.pos.float(), progress(episodes, k, seen)
+        cloud, tool, share = eyes.see(episodes), env.world.tool.pos.float(), episode_progress(episodes, k, seen)
         done = student(cloud, tool, start, share)
         if teacher is not None and memory is not None:
-            right = teacher.mean(look(teacher, episodes, k, seen))
+            right = teacher.mean(policy_features(teacher, episodes, k, seen))
             memory.cloud.append(cloud[alive].half())
             memory.rest.append(torch.cat([tool.flatten(1), start.flatten(1), share, right], -1)[alive])
             done = right if driven else done
@@ -212,7 +212,7 @@ def teach(
             # Each round has random numbers of its own, so that it can be begun again.
             torch.manual_seed(plan.seed + 7919 * (1 + k))
             rng = torch.Generator().manual_seed(plan.seed + 104_729 * (1 + k))
-            fine = simulated(task, "coarse" if how == "coarse" else PUBLISHED)
+            fine = with_fidelity(task, "coarse" if how == "coarse" else PUBLISHED)
             episodes = TaskEpisodes(fine, plan.count, seed=plan.seed + 21 + k)
             episodes.reset()
             eyes = _Eyes(episodes, plan.camera, rng)
@@ -228,7 +228,7 @@ def teach(
             told("student", k + 1, len(rounds), f"success {shares['success']:.0%} in the round, error {error:.2g}")
         spent = round(spent + time.process_time() - began, 1)
     notes = {"plan": asdict(plan), "episodes": len(rounds) * plan.count, "cpu_seconds": spent, "log": log}
-    save(student, folder / "policy.pt", {"algorithm": "student", "episodes": notes["episodes"]})
+    save_policy(student, folder / "policy.pt", {"algorithm": "student", "episodes": notes["episodes"]})
     write_atomically(folder / "student.json", json.dumps({"generator": "torchdlo train", **notes}, indent=1) + "\n")
     part.unlink(missing_ok=True)
     return student, notes
@@ -253,7 +253,7 @@ def judge_student(
         conditions: names of `CONDITIONS`.
         callback: told (stage, actions done, all, message).
     """
-    fine, found = simulated(task, PUBLISHED), {}
+    fine, found = with_fidelity(task, PUBLISHED), {}
     drawn = task.moved(starts, generator=torch.Generator().manual_seed(UNSEEN + 1000 * seed))
     for n, name in enumerate(conditions):
         episodes = TaskEpisodes(fine, starts)
@@ -269,7 +269,7 @@ def judge_student(
             "camera": asdict(CONDITIONS[name]),
             "episodes": starts,
             "success": float(good.float().mean()),
-            "interval": list(wilson(int(good.sum()), starts)),
+            "interval": list(wilson_interval(int(good.sum()), starts)),
             "return": float(episodes.returns.mean()) if math.isfinite(float(episodes.returns.mean())) else None,
             "failed": float(failed.float().mean()),
         }

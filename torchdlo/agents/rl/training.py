@@ -17,10 +17,10 @@ from typing import Any, Protocol
 
 import torch
 
-from torchdlo.agents.policies import Policy, save
+from torchdlo.agents.policies import Policy, save_policy
 from torchdlo.agents.rl.episodes import Episodes
 from torchdlo.agents.rl.rollout import Batch
-from torchdlo.agents.rl.settings import Settings
+from torchdlo.agents.rl.settings import TrainingSettings
 from torchdlo.agents.torch_records import load_checkpoint, save_checkpoint
 from torchdlo.errors import InputError
 from torchdlo.files import write_atomically
@@ -61,7 +61,7 @@ class Trained:
 def train(
     trainer: Trainer,
     episodes: Episodes,
-    settings: Settings,
+    settings: TrainingSettings,
     *,
     folder: Path | None = None,
     resume: bool = False,
@@ -101,7 +101,7 @@ def train(
 def _loop(
     trainer: Trainer,
     episodes: Episodes,
-    settings: Settings,
+    settings: TrainingSettings,
     done: Trained,
     folder: Path | None,
     callback: Callback,
@@ -134,7 +134,7 @@ def _loop(
         writer.close()
 
 
-def _said(done: Trained, settings: Settings) -> str:
+def _said(done: Trained, settings: TrainingSettings) -> str:
     row = done.rows[-1]
     share = max(done.episodes / settings.episodes, done.seconds / (60 * settings.minutes))
     left = done.seconds * (1 / share - 1) if share > 0 else math.inf
@@ -171,7 +171,7 @@ def log_csv(rows: list[dict[str, Any]]) -> str:
 
 
 def _write(
-    trainer: Trainer, episodes: Episodes, settings: Settings, done: Trained, folder: Path, notes: dict[str, Any]
+    trainer: Trainer, episodes: Episodes, settings: TrainingSettings, done: Trained, folder: Path, notes: dict[str, Any]
 ) -> None:
     content = {
         "generator": "torchdlo train",
@@ -186,10 +186,14 @@ def _write(
     }
     save_checkpoint(folder / _CHECKPOINT, content)
     write_atomically(folder / "log.csv", log_csv(done.rows))
-    save(done.policy, folder / "policy.pt", notes | {"episodes": done.episodes, "seconds": round(done.seconds, 1)})
+    save_policy(
+        done.policy, folder / "policy.pt", notes | {"episodes": done.episodes, "seconds": round(done.seconds, 1)}
+    )
 
 
-def _restore(trainer: Trainer, episodes: Episodes, settings: Settings, done: Trained, folder: Path | None) -> None:
+def _restore(
+    trainer: Trainer, episodes: Episodes, settings: TrainingSettings, done: Trained, folder: Path | None
+) -> None:
     path = None if folder is None else folder / _CHECKPOINT
     if path is None or not path.is_file():
         raise InputError(f"{path}: expected the checkpoint of a run to resume, found none; leave out --resume.")

@@ -12,14 +12,14 @@ from torchdlo.agents.trajopt.problem import Encoding
 from torchdlo.agents.trajopt.proposals import Ask, Search, SearchPlan, Told
 from torchdlo.errors import InputError
 
-__all__ = ["cmaes", "drawn", "package", "strategy"]
+__all__ = ["cmaes", "draw_population", "import_cma", "make_strategy"]
 
 
 _NEAR = 0.2
 """First spread about a trajectory that is given, over that of other beginnings."""
 
 
-def package() -> Any:
+def import_cma() -> Any:
     """Return the module `cma`; says so if there is none."""
     try:
         import cma
@@ -28,7 +28,7 @@ def package() -> Any:
     return cma
 
 
-def strategy(start: Tensor, sigma: float, population: int, rng: torch.Generator) -> Any:
+def make_strategy(start: Tensor, sigma: float, population: int, rng: torch.Generator) -> Any:
     """Return a `cma.CMAEvolutionStrategy` that draws from `rng` and writes nothing."""
 
     def randn(*shape: int) -> Any:
@@ -47,10 +47,10 @@ def strategy(start: Tensor, sigma: float, population: int, rng: torch.Generator)
         "tolstagnation": math.inf,
         "maxiter": math.inf,
     }
-    return package().CMAEvolutionStrategy(start.numpy(), sigma, options)
+    return import_cma().CMAEvolutionStrategy(start.numpy(), sigma, options)
 
 
-def drawn(found: Any, encoding: Encoding, given: Tensor | None = None) -> Tensor:
+def draw_population(found: Any, encoding: Encoding, given: Tensor | None = None) -> Tensor:
     """Return the next population within the limits, shape (P, size); points that are given come first.
 
     The strategy is told of what was played, not of what it drew: it would else go on where limits make all alike.
@@ -72,9 +72,9 @@ def cmaes(plan: SearchPlan, rng: torch.Generator) -> Search:
     if plan.first is not None:
         yield from _about(plan, plan.first[0], rng)
     while True:
-        found = strategy(torch.zeros(encoding.size, dtype=torch.float64), plan.sigma, plan.population, rng)
+        found = make_strategy(torch.zeros(encoding.size, dtype=torch.float64), plan.sigma, plan.population, rng)
         while not found.stop():
-            x = drawn(found, encoding)
+            x = draw_population(found, encoding)
             told = yield Ask(encoding, x)
             found.tell(list(x.numpy()), _costs(told).tolist())
 
@@ -83,9 +83,9 @@ def _about(plan: SearchPlan, first: Tensor, rng: torch.Generator) -> Search:
     """Search way-points that are added to actions (T A,)."""
     encoding, whole = plan.encoding(plan.hold), plan.encoding(1)
     zero = torch.zeros(1, encoding.size, dtype=torch.float64)
-    found, given = strategy(zero[0], _NEAR * plan.sigma, plan.population, rng), zero
+    found, given = make_strategy(zero[0], _NEAR * plan.sigma, plan.population, rng), zero
     while not found.stop():
-        x = drawn(found, encoding, given)
+        x = draw_population(found, encoding, given)
         given = None
         told = yield Ask(whole, whole.project(first + encoding.decode(x).flatten(1)))
         found.tell(list(x.numpy()), _costs(told).tolist())

@@ -28,7 +28,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchdlo.agents.trajopt.cmaes import drawn, strategy
+from torchdlo.agents.trajopt.cmaes import draw_population, make_strategy
 from torchdlo.agents.trajopt.lbfgs import TRIES, Descent
 from torchdlo.agents.trajopt.problem import Encoding
 from torchdlo.agents.trajopt.proposals import (
@@ -37,11 +37,11 @@ from torchdlo.agents.trajopt.proposals import (
     SearchPlan,
     SurrogateRound,
     Told,
-    best,
+    best_indices,
     circular_proposals,
     drag_proposals,
     random_proposals,
-    ranking,
+    rank_proposals,
     straight_proposals,
 )
 
@@ -170,7 +170,7 @@ def _island(plan: SearchPlan, rng: torch.Generator, first: int = 0, about: Tenso
 
         part = coarse if k < alone else max((coarse, fine), key=turn)
         x = part.ask()
-        told = yield Ask(encoding, x, with_gradient, best if part is coarse else fine.pick)
+        told = yield Ask(encoding, x, with_gradient, best_indices if part is coarse else fine.pick)
         told = tame(told)
         # What was measured in milder worlds does not compare.
         if k < drifts:
@@ -229,7 +229,7 @@ class _Evolution:
         self.x = torch.zeros(0, self.encoding.size, dtype=torch.float64)
         self.found: Any = None
         if about is not None:
-            self.found = strategy(about.new_zeros(self.encoding.size), _CLOSE * plan.sigma, plan.population, rng)
+            self.found = make_strategy(about.new_zeros(self.encoding.size), _CLOSE * plan.sigma, plan.population, rng)
         self.lines: _Lines | None = None
         """None lets them start anew from what is told next."""
 
@@ -241,7 +241,7 @@ class _Evolution:
             moved = self.x[:0] if self.lines is None else self.encoding.project(self.lines.moved(self.found))
             if self.unplayed:
                 moved, self.unplayed = torch.zeros(1, self.encoding.size, dtype=torch.float64), False
-            self.x = drawn(self.found, self.encoding, moved)
+            self.x = draw_population(self.found, self.encoding, moved)
         actions = self.encoding.decode(self.x).flatten(1)
         return actions if self.about is None else self.plan.encoding(1).project(self.about + actions)
 
@@ -254,10 +254,10 @@ class _Evolution:
             if len(self.tried) == self.fresh:
                 x, parts = zip(*self.tried, strict=True)
                 self.lines = _Lines(torch.cat(x), Told.cat(parts), count)
-                self.found = strategy(self.lines.x[0], self.plan.sigma, self.plan.population, self.rng)
+                self.found = make_strategy(self.lines.x[0], self.plan.sigma, self.plan.population, self.rng)
             return
         # The strategy looks at nothing but the order.
-        place = ranking(told.value, told.loss).argsort()
+        place = rank_proposals(told.value, told.loss).argsort()
         self.found.tell(list(self.x.numpy()), place.double().tolist())
         if self.lines is None:
             self.lines = _Lines(self.x, told, count)
@@ -285,7 +285,7 @@ class _Lines:
     """Points that go down their gradients within an evolution strategy, the best first at the start."""
 
     def __init__(self, x: Tensor, told: Told, count: int) -> None:
-        rows = best(told, count)
+        rows = best_indices(told, count)
         self.x, self.value, self.loss, self.gradient = x[rows], told.value[rows], told.loss[rows], told.gradient[rows]
         # A drawn point lies about the root of the dimension away from the mean; half of it is a step.
         self.first = 0.5 * math.sqrt(x.shape[1])
@@ -305,7 +305,7 @@ class _Lines:
         down = told.loss[:n] < self.loss[active]
         self.length[active] *= torch.where(down, 2.0, 0.5)
         self._put(active[down], x, told, torch.arange(n)[down])
-        fresh = ranking(told.value[n:], told.loss[n:])[: max(1, len(self.x) // 2)] + n
+        fresh = rank_proposals(told.value[n:], told.loss[n:])[: max(1, len(self.x) // 2)] + n
         live = (self.length > _SHORT * self.first) & (self.gradient != 0).any(-1)
         value = torch.where(live, self.value, -math.inf)
         worst = value.argsort(stable=True)[: len(fresh)]

@@ -13,7 +13,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from torchdlo.agents.trajopt.proposals import SearchPlan, Told, random_proposals, ranking
+from torchdlo.agents.trajopt.proposals import SearchPlan, Told, random_proposals, rank_proposals
 
 __all__ = ["TRIES", "Descent"]
 
@@ -55,7 +55,7 @@ class Descent:
         told = self._noted(x, told)
         value, loss = torch.cat([self.value, told.value]), torch.cat([self.loss, told.loss])
         halves = torch.cat([self.halves, halves])
-        best = ranking(value, loss, halves)[: self.count]
+        best = rank_proposals(value, loss, halves)[: self.count]
         none = torch.zeros(_PAIRS, *x.shape, dtype=x.dtype)
         self.x, self.gradient = torch.cat([self.x, x])[best], torch.cat([self.gradient, told.gradient])[best]
         self.value, self.loss, self.halves = value[best], loss[best], halves[best]

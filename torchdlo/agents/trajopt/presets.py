@@ -7,7 +7,7 @@ from typing import Any
 
 from torchdlo.agents.trajopt.search import SearchSettings
 
-__all__ = ["PUBLISHED", "preset"]
+__all__ = ["PUBLISHED", "search_preset"]
 
 EPISODES = {"gathering": 8_000, "lifting": 10_000, "unknotting": 10_000}
 """Budgets that differ from 20 000 episodes."""
@@ -40,10 +40,10 @@ PUBLISHED = {
     "wrapping": {"gd": (139.98, 0.0), "cmaes": (162.68, 0.27)},
 }
 """Published returns, largest within the budget, mean of three seeds, and shares of successes; budgets are those of
-`preset`."""
+`search_preset`."""
 
 
-def preset(task: str, method: str, **given: Any) -> SearchSettings:
+def search_preset(task: str, method: str, **given: Any) -> SearchSettings:
     """Return the settings for a task and a method; what is given and not None wins."""
     episodes = given.get("episodes") or EPISODES.get(task, 20_000)
     copies = given["robust"].copies if given.get("robust") else 1

@@ -14,8 +14,17 @@ from torch import Tensor
 
 from torchdlo.agents.trajopt.problem import Encoding, Problem
 
-__all__ = ["Ask", "Search", "SearchPlan", "SurrogateRound", "Told", "best", "drag_proposals", "handed"]
-__all__ += ["circular_proposals", "random_proposals", "ranking", "straight_proposals"]
+__all__ = [
+    "Ask",
+    "Search",
+    "SearchPlan",
+    "SurrogateRound",
+    "Told",
+    "best_indices",
+    "drag_proposals",
+    "search_surrogate",
+]
+__all__ += ["circular_proposals", "random_proposals", "rank_proposals", "straight_proposals"]
 
 _ALIKE = 1e-4
 """Share of the largest return by which returns differ that are not to be told apart."""
@@ -58,9 +67,9 @@ class Told:
         return cls(*(torch.cat([getattr(part, f.name) for part in parts]) for f in dataclasses.fields(cls)))
 
 
-def best(told: Told, count: int) -> Tensor:
+def best_indices(told: Told, count: int) -> Tensor:
     """Return the indices of the best, failed ones last, shape (count,) or, if there are fewer, (P,)."""
-    return ranking(told.value, told.loss, ~told.failed)[:count]
+    return rank_proposals(told.value, told.loss, ~told.failed)[:count]
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +81,7 @@ class Ask:
     """Numbers of the way-points [m], shape (P, size)."""
     with_gradient: int = 0
     """How many gradients of the loss are wanted."""
-    pick: Callable[[Told, int], Tensor] = best
+    pick: Callable[[Told, int], Tensor] = best_indices
     """Returns which ones, `with_gradient` indices, from how all went. A gradient costs several times what playing does:
     those of a part are had by playing that part once more."""
 
@@ -142,7 +151,7 @@ class SurrogateRound:
     def note(self, actions: Tensor, told: Told) -> None:
         """Keep the best of an iteration; actions (P, T A) [m]."""
         each = math.ceil(self.plan.population / self.plan.surrogates)
-        self.parts.append(actions[best(told, each)])
+        self.parts.append(actions[best_indices(told, each)])
 
     @property
     def actions(self) -> Tensor:
@@ -150,7 +159,7 @@ class SurrogateRound:
         return torch.cat(self.parts[::-1])[: self.plan.population]
 
 
-def handed(search: Search, plan: SearchPlan) -> Search:
+def search_surrogate(search: Search, plan: SearchPlan) -> Search:
     """Search as `search` does; what did well in a surrogate task is played in the problem itself before that goes
     on."""
     kept, told = SurrogateRound(plan), None
@@ -255,7 +264,7 @@ def circular_proposals(plan: SearchPlan, encoding: Encoding, rng: torch.Generato
     return encoding.project(encoding.encode(moves.unsqueeze(2).expand(-1, -1, tools, -1)))
 
 
-def ranking(returns: Tensor, loss: Tensor, tier: Tensor | None = None) -> Tensor:
+def rank_proposals(returns: Tensor, loss: Tensor, tier: Tensor | None = None) -> Tensor:
     """Return indices, the best first: of the larger return; where returns are alike, of the smaller loss; shape (P,).
 
     Returns may be flat until something is touched, while the loss leads there.

@@ -9,8 +9,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchdlo.agents.trajopt.result import load_actions, read_trajectory
-from torchdlo.agents.trajopt.task_problem import problem
+from torchdlo.agents.trajopt.search_result import load_actions, read_trajectory
+from torchdlo.agents.trajopt.task_problem import task_problem
 from torchdlo.envs import RopeMaterial, Task, find
 from torchdlo.envs.core import episode
 from torchdlo.errors import InputError
@@ -59,7 +59,7 @@ def script(
         {"compiled": compiled, "recorded": find(name).horizon > _LONG} if trajectory is None else _choices(trajectory)
     )
     material = found.pop("rope", None)
-    chosen = problem(name, rope, **found)
+    chosen = task_problem(name, rope, **found)
     task = chosen.task
     if material is not None and rope is None:
         raise InputError(f"{trajectory}: it was found for its own rope; give that one, or another, with --rope-model.")

@@ -14,11 +14,11 @@ import torch
 from torch import Tensor
 
 from torchdlo import work_budget
-from torchdlo.agents.trajopt.cmaes import cmaes, package
+from torchdlo.agents.trajopt.cmaes import cmaes, import_cma
 from torchdlo.agents.trajopt.gradient_descent import descent
 from torchdlo.agents.trajopt.hybrid import hybrid
 from torchdlo.agents.trajopt.problem import Encoding, Evaluation, Problem
-from torchdlo.agents.trajopt.proposals import Ask, Search, SearchPlan, Told, handed
+from torchdlo.agents.trajopt.proposals import Ask, Search, SearchPlan, Told, search_surrogate
 from torchdlo.agents.trajopt.search_journal import SearchJournal
 from torchdlo.errors import InputError
 
@@ -89,7 +89,7 @@ class SearchSettings:
 
         need(self.method in METHODS, "method", f"one of {', '.join(METHODS)}")
         if self.method != "gd":
-            package()
+            import_cma()
         least = 1 if self.method == "gd" else 4
         need(self.population >= least, "population", f"at least {least} for {self.method}")
         numbers = self.population * problem.horizon * problem.width
@@ -171,7 +171,7 @@ def optimize(
     player = _Player(problem, settings, SearchJournal(journal, options, resume=resume), callback)
     search = METHODS[settings.method](plan, torch.Generator().manual_seed(settings.seed))
     if settings.method not in SURROGATE_ROUND:
-        search = handed(search, plan)
+        search = search_surrogate(search, plan)
     told, curve, interrupted = None, [], False
     best = _Best(robust.finalists if robust else _FINALISTS)
     try:

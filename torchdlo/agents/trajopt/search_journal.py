@@ -24,10 +24,10 @@ from torchdlo.envs import TASKS
 from torchdlo.errors import InputError
 from torchdlo.journal import Journal
 
-__all__ = ["SearchJournal", "program", "remove", "versions"]
+__all__ = ["SearchJournal", "code_versions", "program_hash", "remove_journal"]
 
 
-def versions() -> dict[str, str]:
+def code_versions() -> dict[str, str]:
     """Return the versions that a result depends on."""
     found = {"torchdlo": _package_version(), "torch": torch.__version__}
     for name in ("cma", "numpy"):
@@ -44,7 +44,7 @@ def _package_version() -> str:
     return __version__
 
 
-def program(name: str) -> str:
+def program_hash(name: str) -> str:
     """Return a hash of the code and the libraries that results of a problem depend on.
 
     Other tasks do not belong to it, nor do presets: settings are written down themselves. Nor does what Python does not
@@ -52,7 +52,7 @@ def program(name: str) -> str:
     """
     root = Path(__file__).parents[2]
     others = {"presets.py", "search_journal.py", *(f"{t}.py" for t in TASKS if t != name)}
-    found = hashlib.sha256(json.dumps(versions(), sort_keys=True).encode())
+    found = hashlib.sha256(json.dumps(code_versions(), sort_keys=True).encode())
     for part in ("physics", "coupling", "envs", "agents/trajopt", "data/robots", "scene.py"):
         files = [root / part] if part.endswith(".py") else sorted((root / part).rglob("*"))
         for file in files:
@@ -78,7 +78,7 @@ def _code(file: Path) -> bytes:
     return ast.dump(tree).encode()
 
 
-def remove(path: Path) -> None:
+def remove_journal(path: Path) -> None:
     """Delete a journal, whose search is over and written down: its mark last, so that what is left of it is known."""
     for file in path.glob("*.pt"):
         file.unlink()
@@ -98,7 +98,7 @@ class SearchJournal:
         """
         self.path, self.count, self.resume, self._journal = path, 0, resume, None
         if path is not None:
-            mark = {"generator": "torchdlo optimize", "options": options, "program": program(options["name"])}
+            mark = {"generator": "torchdlo optimize", "options": options, "program": program_hash(options["name"])}
             mark = json.loads(json.dumps(mark))
             other = functools.partial(_other, mark)
             self._journal = Journal(path, mark, suffix=".pt", other=other, resume=resume, old=ARCHIVE)

@@ -14,13 +14,13 @@ from typing import Any
 
 import numpy as np
 
-from torchdlo.agents.trajopt.result import upgraded
+from torchdlo.agents.trajopt.search_result import upgrade_result
 from torchdlo.errors import InputError
-from torchdlo.files import replacing
+from torchdlo.files import replace_atomically
 from torchdlo.untrusted import one_line, parse_json, read_json
 from torchdlo.untrusted.array_file import ArrayFile
 
-__all__ = ["ARCHIVE", "NAME", "load_trajectory", "pack", "read_index", "read_searches", "unpack"]
+__all__ = ["ARCHIVE", "NAME", "load_trajectory", "pack_searches", "read_index", "read_searches", "unpack_searches"]
 
 NAME = "searches.npz"
 """What an archive is called in the folder of a benchmark."""
@@ -35,7 +35,7 @@ def load_trajectory(task: str, method: str, seed: int, archive: str | Path = ARC
         task: name of the task.
         method: "cmaes", "gd" or "hybrid".
         seed: of the search.
-        archive: file that `pack` wrote; by default that of the repository's benchmark.
+        archive: file that `pack_searches` wrote; by default that of the repository's benchmark.
 
     Returns:
         "actions" of shape (T, A) [m, degrees], "rewards" (T,), "return", "success", "choices" (precision and kind of
@@ -63,14 +63,16 @@ def read_searches(archive: str | Path) -> Iterator[tuple[str, dict[str, Any], di
             yield name, found.result(name), _trajectory(found, name)
 
 
-def pack(folder: str | Path, archive: str | Path) -> int:
+def pack_searches(folder: str | Path, archive: str | Path) -> int:
     """Write all finished searches in the subfolders of a folder into an archive; return how many there are."""
     arrays: dict[str, np.ndarray] = {}
     index = []
     for file in sorted(Path(folder).glob("*/result.json")):
-        name, result = file.parent.name, upgraded(read_json(file, "the result of a search", finite=False))
+        name, result = file.parent.name, upgrade_result(read_json(file, "the result of a search", finite=False))
         settings, text = result["settings"], {}
-        for key, value in upgraded(read_json(file.with_name("trajectory.json"), "a trajectory", finite=False)).items():
+        for key, value in upgrade_result(
+            read_json(file.with_name("trajectory.json"), "a trajectory", finite=False)
+        ).items():
             if isinstance(value, list):
                 arrays[f"{name}/{key}"] = _exact(value)
             else:
@@ -84,12 +86,12 @@ def pack(folder: str | Path, archive: str | Path) -> int:
         )
     # Text is kept as bytes of UTF-8: an array of characters would take four bytes for each.
     packed = {k: np.frombuffer(str(v).encode(), np.uint8) if v.dtype.kind == "U" else v for k, v in arrays.items()}
-    with replacing(Path(archive)) as temporary:
+    with replace_atomically(Path(archive)) as temporary:
         np.savez_compressed(temporary, index=np.frombuffer(json.dumps(index).encode(), np.uint8), **packed)
     return len(index)
 
 
-def unpack(archive: str | Path, folder: str | Path) -> None:
+def unpack_searches(archive: str | Path, folder: str | Path) -> None:
     """Write result.json and trajectory.json of each search in an archive into a subfolder of its name."""
     for name, result, trajectory in read_searches(archive):
         plain = {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in trajectory.items()}
@@ -145,7 +147,7 @@ class _Archive:
     def result(self, name: str) -> dict[str, Any]:
         """Return what a result.json said."""
         try:
-            return upgraded(self.json(f"{name}/result"))
+            return upgrade_result(self.json(f"{name}/result"))
         except (AttributeError, TypeError, ValueError) as error:
             if isinstance(error, InputError):
                 raise

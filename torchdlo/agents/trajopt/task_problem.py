@@ -15,16 +15,16 @@ from torchdlo.agents.trajopt.problem import Evaluation
 from torchdlo.coupling.common import step_diagnostics
 from torchdlo.envs import PUBLISHED, RopeMaterial, find
 from torchdlo.envs.core import episode
-from torchdlo.envs.core.subtask import SubTask, rewarded
+from torchdlo.envs.core.subtask import SubTask, with_reward
 from torchdlo.envs.core.task import Task
 from torchdlo.errors import InputError
 from torchdlo.physics import tree
 from torchdlo.reward_language import Reward
 
-__all__ = ["TaskProblem", "problem"]
+__all__ = ["TaskProblem", "task_problem"]
 
 
-def problem(
+def task_problem(
     name: str,
     rope: RopeMaterial | None = None,
     *,
@@ -42,7 +42,7 @@ def problem(
         choices: fields of `TaskProblem`.
     """
     task = find(name, rope, grasps)
-    return TaskProblem(task if reward is None else rewarded(task, reward), **choices)
+    return TaskProblem(task if reward is None else with_reward(task, reward), **choices)
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,10 +151,10 @@ class TaskProblem:
         Kept are joints and tools after every action, by arm, [rad or m] and [m], rewards, and what contact missed: ""
         if all is well.
         """
-        went = episode.play(self.task, self.full(actions[None]), episode=self.prepared(1), keep=episode.places)
+        went = episode.play(self.task, self.full(actions[None]), episode=self.prepared(1), keep=episode.scene_positions)
         kept = {name: went.path[name][:, 0].tolist() for name in ("joints", "tool")}
         kept["rewards"] = went.rewards[:, 0].tolist()
-        kept["missed"] = step_diagnostics.explain(went.world.state.diagnostics)
+        kept["missed"] = step_diagnostics.explain_diagnostics(went.world.state.diagnostics)
         finite = all(math.isfinite(value) for value in kept["rewards"])
         return _outcome(went), kept if finite else {}
 

@@ -9,13 +9,13 @@ from typing import Any, Protocol
 
 from torch import Tensor
 
-from torchdlo.agents.vlm.conversation import Picture
+from torchdlo.agents.vlm.conversation import ShownPicture
 from torchdlo.envs.core import episode
 
-__all__ = ["Carried", "Look", "Options", "Result"]
+__all__ = ["Carried", "Options", "Result", "WorldPainter"]
 
 
-class Look(Protocol):
+class WorldPainter(Protocol):
     """What draws pictures of worlds."""
 
     def now(self, made: episode.Episode, world: episode.EpisodeState) -> bytes:
@@ -70,7 +70,7 @@ class Carried:
     """Whether the task's own condition holds now."""
     actions: Tensor | None = None
     """What was played, shape (T, 3 R)."""
-    pictures: tuple[Picture, ...] = ()
+    pictures: tuple[ShownPicture, ...] = ()
 
     def plain(self) -> dict[str, Any]:
         """Return it as plain data, without what was played."""

@@ -20,7 +20,7 @@ from torchdlo.files import write_atomically
 from torchdlo.journal import read_json, write_json
 from torchdlo.untrusted import one_line
 
-__all__ = ["Budget", "Conversation", "Model", "Picture", "Question", "Reply", "plain_text"]
+__all__ = ["Conversation", "ConversationBudget", "LanguageModel", "Question", "Reply", "ShownPicture", "plain_text"]
 
 A = TypeVar("A")
 
@@ -30,7 +30,7 @@ _FENCE = re.compile(r"```(?:json|JSON)?\s*\n?(.*?)```", re.DOTALL)
 
 
 @dataclass(frozen=True)
-class Picture:
+class ShownPicture:
     """A picture that is shown to a model."""
 
     name: str
@@ -50,7 +50,7 @@ class Question:
     """"grasps", "plan" or "update"."""
     system: str
     text: str
-    pictures: tuple[Picture, ...]
+    pictures: tuple[ShownPicture, ...]
     answer: Any
     """The pydantic model that the answer has to fit."""
     facts: Any = None
@@ -66,7 +66,7 @@ class Reply:
     """Tokens of question and answer, 0 if not said."""
 
 
-class Model(Protocol):
+class LanguageModel(Protocol):
     """What answers."""
 
     source: str
@@ -86,7 +86,7 @@ class Model(Protocol):
 
 
 @dataclass(frozen=True)
-class Budget:
+class ConversationBudget:
     """What a run may cost."""
 
     calls: int = 60
@@ -101,10 +101,10 @@ class Budget:
 class Conversation:
     """What is said in a run."""
 
-    model: Model
+    model: LanguageModel
     folder: Path | None = None
     """Where exchanges and pictures are kept."""
-    budget: Budget = field(default_factory=Budget)
+    budget: ConversationBudget = field(default_factory=ConversationBudget)
     resume: bool = False
     """Whether exchanges that are there already are read."""
     callback: Callable[[str], None] = lambda _: None

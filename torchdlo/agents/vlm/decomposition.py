@@ -23,24 +23,24 @@ from torch import Tensor
 from torchdlo.agents.trajopt.problem import Evaluation
 from torchdlo.agents.trajopt.search import SearchSettings, optimize
 from torchdlo.agents.trajopt.task_problem import TaskProblem
-from torchdlo.agents.vlm.carried import Carried, Look, Options, Result
-from torchdlo.agents.vlm.conversation import Conversation, Picture, Question, plain_text
+from torchdlo.agents.vlm.carried import Carried, Options, Result, WorldPainter
+from torchdlo.agents.vlm.conversation import Conversation, Question, ShownPicture, plain_text
 from torchdlo.agents.vlm.grasp_proposal import Places, check_grasps, places_of
-from torchdlo.agents.vlm.prompts import prompt
+from torchdlo.agents.vlm.plan_schema import step_models
+from torchdlo.agents.vlm.plan_waypoints import lead_through_waypoints
+from torchdlo.agents.vlm.prompts import fill_prompt
 from torchdlo.agents.vlm.scene_text import language_text, scene_text
-from torchdlo.agents.vlm.schema import step_models
-from torchdlo.agents.vlm.waypoints import led
 from torchdlo.coupling.common import step_diagnostics
 from torchdlo.envs import Task
 from torchdlo.envs.core import episode, scene_names
-from torchdlo.envs.core.subtask import SubTask, concluded, continue_from, opening
+from torchdlo.envs.core.subtask import SubTask, continue_from, opening, task_success
 from torchdlo.errors import InputError
 from torchdlo.files import write_atomically
 from torchdlo.journal import read_json, write_json
 from torchdlo.reward_language import Reward, reward
 from torchdlo.scene import State
 
-__all__ = ["Carried", "Look", "Options", "Result", "carry_out"]
+__all__ = ["Carried", "Options", "Result", "WorldPainter", "carry_out"]
 
 
 @dataclass(eq=False)
@@ -50,7 +50,7 @@ class _Run:
     task: Task
     talk: Conversation
     options: Options
-    look: Look | None
+    look: WorldPainter | None
     folder: Path | None
     callback: Callable[[str, int, int, str], None]
     like: Tensor
@@ -85,11 +85,11 @@ class _Run:
         text = f"{text}\n{note}" if note else text
         question = Question(
             kind=kind,
-            system=prompt("system"),
-            text=prompt(kind, language=language_text(), scene=text),
+            system=fill_prompt("system"),
+            text=fill_prompt(kind, language=language_text(), scene=text),
             pictures=self.pictures(),
             answer=plan if kind == "plan" else update,
-            facts=(places, scene_names.named(self.task, scene_names.layout(places.scene), seen)),
+            facts=(places, scene_names.named_values(self.task, scene_names.layout(places.scene), seen)),
         )
 
         def check(answer: Any) -> Any:
@@ -103,7 +103,7 @@ class _Run:
         self.plans.append(answer.model_dump())
         return bool(getattr(answer, "complete", False)), list(answer.steps)
 
-    def pictures(self) -> tuple[Picture, ...]:
+    def pictures(self) -> tuple[ShownPicture, ...]:
         """Return what is shown: the last step, and the scene as it is."""
         if self.look is None:
             return ()
@@ -111,7 +111,7 @@ class _Run:
         if made is None or world is None:
             made = episode.prepare(self.task, 1, like=self.like, compiled=False, **self.start())
             world = made.start
-        now = Picture("the scene now, vertices with their numbers", self.look.now(made, world))
+        now = ShownPicture("the scene now, vertices with their numbers", self.look.now(made, world))
         return (*(self.carried[-1].pictures if self.carried else ()), now)
 
     def start(self) -> dict[str, Any]:
@@ -127,7 +127,7 @@ class _Run:
             SubTask(inner=self.task, reward=part)
             if places is not None:
                 grasps = check_grasps(places, _grasps(step))
-                led(step, places, grasps, self.world, self.task)
+                lead_through_waypoints(step, places, grasps, self.world, self.task)
         except InputError as error:
             raise InputError(f"{where}: {error}") from None
 
@@ -157,7 +157,7 @@ class _Run:
             return
         made = problem.prepared(1)
         went, worlds = problem.played(actions)
-        failed, missed = bool(went.failed[0]), step_diagnostics.explain(went.world.state.diagnostics)
+        failed, missed = bool(went.failed[0]), step_diagnostics.explain_diagnostics(went.world.state.diagnostics)
         if missed or not math.isfinite(float(went.returns[0])):
             failed = True
         why = missed or "the rope was torn, a hand was led where it may not go, or the scene broke" if failed else ""
@@ -165,11 +165,11 @@ class _Run:
         own = False
         if not failed:
             with torch.no_grad():
-                own = bool(concluded(made, went.world, self.task)[0][0])
-        pictures: tuple[Picture, ...] = ()
+                own = bool(task_success(made, went.world, self.task)[0][0])
+        pictures: tuple[ShownPicture, ...] = ()
         if self.look is not None:
             moments = [worlds[round(k)] for k in torch.linspace(0, len(worlds) - 1, min(8, len(worlds))).tolist()]
-            pictures = (Picture(f"step {step.id}, from its start to its end", self.look.stills(made, moments)),)
+            pictures = (ShownPicture(f"step {step.id}, from its start to its end", self.look.stills(made, moments)),)
         terms = {name: float(x[-1, 0]) for name, x in went.terms.items()}
         found = Carried(
             content,
@@ -202,7 +202,7 @@ class _Run:
             seed=options.seed,
             chunk=options.population,
         )
-        first = led(step, self.places(), _grasps(step), self.world, self.task, travels=part.travels)
+        first = lead_through_waypoints(step, self.places(), _grasps(step), self.world, self.task, travels=part.travels)
 
         def told(stage: str, done: int, total: int, message: str) -> None:
             self.callback(f"step {number}", done, total, message)
@@ -291,7 +291,7 @@ def carry_out(
     talk: Conversation,
     options: Options,
     *,
-    look: Look | None = None,
+    look: WorldPainter | None = None,
     folder: Path | None = None,
     callback: Callable[[str, int, int, str], None] = lambda *_: None,
 ) -> Result:

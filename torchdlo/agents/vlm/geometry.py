@@ -16,12 +16,12 @@ from typing import Any
 import torch
 
 from torchdlo.agents.vlm.conversation import Question, Reply
-from torchdlo.agents.vlm.grasp_proposal import APART, Places, View
-from torchdlo.agents.vlm.schema import HORIZON
+from torchdlo.agents.vlm.grasp_proposal import APART, GraspView, Places
+from torchdlo.agents.vlm.plan_schema import HORIZON
 from torchdlo.envs.core import curve_geometry, scene_names
 from torchdlo.errors import InputError
 
-__all__ = ["Geometry", "chosen"]
+__all__ = ["Geometry", "geometric_grasps"]
 
 END = 2
 """How far from its end a rope is held [vertices]: fingers have room, and the end stays free to be led."""
@@ -47,9 +47,9 @@ class Geometry:
         """Do nothing."""
 
 
-def _grasps(places: Places, mode: str, view: View, marks: Sequence[int]) -> dict[str, Any]:
+def _grasps(places: Places, mode: str, view: GraspView, marks: Sequence[int]) -> dict[str, Any]:
     """Return an answer in the form of a mode."""
-    slots = chosen(places)
+    slots = geometric_grasps(places)
     said: dict[str, Any] = {}
     for k, slot in enumerate(slots):
         if slot is None:
@@ -72,7 +72,7 @@ def _grasps(places: Places, mode: str, view: View, marks: Sequence[int]) -> dict
     return {"grasps": said, "reason": "geometry of the scene"}
 
 
-def chosen(places: Places) -> tuple[int | None, ...]:
+def geometric_grasps(places: Places) -> tuple[int | None, ...]:
     """Return the vertex for each hand."""
     fixed = sorted({*places.scene.prescribed_vertices} - {*places.task.schedule.held})
     kinds = [body for body in places.scene.bodies if body.shape != "plane"]
@@ -181,7 +181,7 @@ def _one_each(places: Places) -> tuple[int | None, ...]:
 def _step(places: Places, values: Mapping[str, torch.Tensor]) -> dict[str, Any]:
     """Return one step for the whole of a task, from what there is to name in its scene."""
     terms, success = _aim(places, values)
-    grasps = {f"robot_{k + 1}": slot for k, slot in enumerate(chosen(places))}
+    grasps = {f"robot_{k + 1}": slot for k, slot in enumerate(geometric_grasps(places))}
     return {
         "id": 1,
         "description": "all at once, from the geometry of the scene",

@@ -11,9 +11,9 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
-from torchdlo.agents.vlm.conversation import Conversation, Picture, Question, plain_text
-from torchdlo.agents.vlm.prompts import prompt
-from torchdlo.agents.vlm.schema import MODES, grasps_model
+from torchdlo.agents.vlm.conversation import Conversation, Question, ShownPicture, plain_text
+from torchdlo.agents.vlm.plan_schema import MODES, grasps_model
+from torchdlo.agents.vlm.prompts import fill_prompt
 from torchdlo.envs import Task
 from torchdlo.envs.core import scene_names
 from torchdlo.envs.core.episode import reachable
@@ -22,14 +22,14 @@ from torchdlo.scene import Scene, State
 from torchdlo.untrusted import read_json
 
 __all__ = [
+    "GraspView",
     "Places",
     "Proposal",
-    "View",
     "check_grasps",
     "load_grasps",
-    "offered",
+    "offered_vertices",
     "places_of",
-    "propose",
+    "propose_grasps",
     "random_grasps",
     "reach_text",
 ]
@@ -42,7 +42,7 @@ LABEL = 26.0
 """Least distance of two marks in a picture [pixels]."""
 
 
-class View(Protocol):
+class GraspView(Protocol):
     """A picture of a scene in which vertices can be found."""
 
     pixels: Tensor
@@ -171,7 +171,7 @@ def _ranges(places: Places, hand: int) -> str:
     return ", ".join(f"{a} to {b}" if b > a else f"{a}" for a, b in parts) or "none"
 
 
-def offered(places: Places, view: View) -> list[int]:
+def offered_vertices(places: Places, view: GraspView) -> list[int]:
     """Return vertices that get a mark: those that are seen and that a hand reaches, not too close in the picture."""
     good = view.visible & places.reach.any(-1)
     chosen: list[int] = []
@@ -186,7 +186,9 @@ def offered(places: Places, view: View) -> list[int]:
     return sorted(chosen)
 
 
-def propose(task: Task, mode: str, conversation: Conversation, view: View, *, places: Places | None = None) -> Proposal:
+def propose_grasps(
+    task: Task, mode: str, conversation: Conversation, view: GraspView, *, places: Places | None = None
+) -> Proposal:
     """Return grasps that a model proposes for the start of a task.
 
     Args:
@@ -199,15 +201,15 @@ def propose(task: Task, mode: str, conversation: Conversation, view: View, *, pl
     if mode not in MODES:
         raise InputError(f"mode is {plain_text(mode, 40)!r}; expected one of {', '.join(MODES)}.")
     places = places or places_of(task)
-    marks = offered(places, view) if mode == "candidate" else []
+    marks = offered_vertices(places, view) if mode == "candidate" else []
     if mode == "candidate" and not marks:
         raise InputError(f"{task.name}: no vertex that a hand reaches can be seen; use the mode coefficient.")
-    text = prompt(f"grasps_{mode}", scene=_scene_text(places, mode, marks))
+    text = fill_prompt(f"grasps_{mode}", scene=_scene_text(places, mode, marks))
     question = Question(
         kind="grasps",
-        system=prompt("system"),
+        system=fill_prompt("system"),
         text=text,
-        pictures=(Picture("the scene at its start", view.marked(marks)),),
+        pictures=(ShownPicture("the scene at its start", view.marked(marks)),),
         answer=grasps_model(mode, places.hands),
         facts=(places, mode, view, marks),
     )
@@ -222,7 +224,7 @@ def propose(task: Task, mode: str, conversation: Conversation, view: View, *, pl
     return conversation.ask(question, check)
 
 
-def _snapped(places: Places, mode: str, view: View, marks: list[int], said: Any) -> int:
+def _snapped(places: Places, mode: str, view: GraspView, marks: list[int], said: Any) -> int:
     """Return the vertex that was meant."""
     if mode == "candidate":
         if said not in marks:

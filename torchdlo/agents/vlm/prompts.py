@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from importlib.resources import files
 
-__all__ = ["prompt"]
+__all__ = ["fill_prompt"]
 
 
-def prompt(name: str, **parts: str) -> str:
+def fill_prompt(name: str, **parts: str) -> str:
     """Return a text with its parts filled in."""
     text = (files("torchdlo.agents.vlm") / "prompts" / f"{name}.md").read_text(encoding="utf-8")
     for key, part in parts.items():

@@ -11,14 +11,14 @@ from torchdlo.agents.vlm.conversation import Question, Reply, plain_text
 from torchdlo.errors import InputError
 from torchdlo.untrusted import read_json
 
-__all__ = ["Recorded", "load_recorded"]
+__all__ = ["RecordedConversation", "load_recorded"]
 
 _SIZE = 50_000_000
 """Most bytes of a file."""
 
 
 @dataclass(eq=False)
-class Recorded:
+class RecordedConversation:
     """A conversation that is replayed in its order.
 
     Answers that say which request they are for, by its hash, answer no other; those that say none, as written by hand,
@@ -58,7 +58,7 @@ class Recorded:
         self._next = count
 
 
-def load_recorded(path: Path) -> Recorded:
+def load_recorded(path: Path) -> RecordedConversation:
     """Return the conversation in a file, or in the folder of a run.
 
     A file is {"source": who said it, "exchanges": [{"kind", "response", "request_sha256" if wanted}]}; responses are
@@ -91,7 +91,7 @@ def load_recorded(path: Path) -> Recorded:
             '[{"kind": "plan", "response": "..."}]}, or the folder of a run.'
         ) from None
     label = plain_text(source, 120)
-    return Recorded(label if label.startswith("recorded: ") else f"recorded: {label}", answers, str(path))
+    return RecordedConversation(label if label.startswith("recorded: ") else f"recorded: {label}", answers, str(path))
 
 
 def _read(file: Path) -> Any:

@@ -13,10 +13,10 @@ from torchdlo.envs.core import scene_names
 from torchdlo.envs.core.task import Task, TaskState
 from torchdlo.reward_language import FUNCTIONS
 
-__all__ = ["about", "language_text", "scene_text"]
+__all__ = ["language_text", "scene_text", "task_text"]
 
 
-def about(task: Task) -> str:
+def task_text(task: Task) -> str:
     """Return what a task is, and when it is done."""
     text = sys.modules[type(task).__module__].__doc__ or type(task).__doc__ or ""
     return " ".join(text.split())
@@ -49,9 +49,9 @@ def scene_text(
         left: steps of the plan that are left.
     """
     task = places.task
-    lines = [f"Task {task.name}: {about(task)}", reach_text(places)]
+    lines = [f"Task {task.name}: {task_text(task)}", reach_text(places)]
     lines.append("Names with their shapes, meanings and present values:")
-    rows = scene_names.table(task, scene_names.layout(places.scene), seen)
+    rows = scene_names.names_table(task, scene_names.layout(places.scene), seen)
     lines += [f"- {r['name']} ({r['shape']}): {r['what']}; now {r['now']}" for r in rows]
     if carried:
         lines.append("Carried out so far:")

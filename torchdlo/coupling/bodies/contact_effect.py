@@ -41,10 +41,10 @@ from torch import Tensor
 
 from torchdlo.coupling.bodies import contact_op
 from torchdlo.coupling.bodies.contact_op import FIT, HARD
-from torchdlo.coupling.bodies.contact_points import touches
-from torchdlo.coupling.bodies.contact_solver import Links, System, gather, inertia
+from torchdlo.coupling.bodies.contact_points import deepest_points
+from torchdlo.coupling.bodies.contact_solver import BodySystem, Links, gather, inertia
 from torchdlo.coupling.bodies.dynamics import Body, PredictedBodyMotion
-from torchdlo.coupling.common.coulomb_friction import parting, rebounding
+from torchdlo.coupling.common.coulomb_friction import rebound_separation, separation_needed
 from torchdlo.physics import tree
 from torchdlo.physics.effects.base import ContactForces, Effect, PredictedMotion, Values
 from torchdlo.physics.linalg.numerics import dot, safe_norm
@@ -60,7 +60,7 @@ def _combined(x: Tensor, pairs: tuple[tuple[int, int], ...], counts: tuple[int, 
 
 def _links(contact: BodyContact, motion: PredictedBodyMotion) -> Links:
     state, params, pairs = motion.state, motion.params, contact.chosen(motion.bodies)
-    found, counts = touches(motion, pairs, contact.points)
+    found, counts = deepest_points(motion, pairs, contact.points)
     arms = tuple(found.point - gather(state.pos, pairs, counts, side) for side in (0, 1))
     at = [tuple(gather(x, pairs, counts, side) for side in (0, 1)) for x in (motion.mobility, params.restitution)]
     like = found.gap
@@ -78,10 +78,10 @@ def _links(contact: BodyContact, motion: PredictedBodyMotion) -> Links:
     )
     free = links.seen(motion.change, motion.turn)
     approach = -dot(found.normal, links.seen(state.vel, state.omega))
-    wanted = parting(found.gap, like.new_tensor(contact.shallow), contact.recovery)
+    wanted = separation_needed(found.gap, like.new_tensor(contact.shallow), contact.recovery)
     pressed = (dot(found.normal, free) < wanted).to(like.dtype)
     bouncing = _combined(params.restitution, pairs, counts)
-    wanted = rebounding(wanted, pressed, approach, bouncing, contact.slowest, motion.dt)
+    wanted = rebound_separation(wanted, pressed, approach, bouncing, contact.slowest, motion.dt)
     return dataclasses.replace(links, wanted=wanted, free=free)
 
 
@@ -166,7 +166,7 @@ def _forces(links: Links, sets: _Sets, moved: Tensor) -> Tensor:
     return load * links.normal - torch.where(sticks, held, limit * along)
 
 
-def _settled(system: System, dt: float, slowest: float, rounds: int) -> tuple[_Sets, Tensor]:
+def _settled(system: BodySystem, dt: float, slowest: float, rounds: int) -> tuple[_Sets, Tensor]:
     """Return which contacts press and slide, and the displacements of the free bodies, shape (..., F, 6)."""
     links = system.links
     near = (links.wanted - dot(links.normal, links.free) > -slowest * dt).to(links.wanted.dtype)
@@ -182,7 +182,7 @@ def _settled(system: System, dt: float, slowest: float, rounds: int) -> tuple[_S
     return sets, q
 
 
-def _exact(system: System, sets: _Sets, q: Tensor) -> tuple[_Sets, Tensor]:
+def _exact(system: BodySystem, sets: _Sets, q: Tensor) -> tuple[_Sets, Tensor]:
     """Return the sets with the slip, and the gradients (..., C, 3, 3) of forces, at displacements q (..., F, 6)."""
     links, moved = system.links, system.moved(q)
     load = (links.stiff * sets.press * (links.wanted - dot(links.normal, moved))).clamp(min=0.0)
@@ -191,7 +191,7 @@ def _exact(system: System, sets: _Sets, q: Tensor) -> tuple[_Sets, Tensor]:
     return sets, _slopes(links, sets, load, size)
 
 
-def _excess(system: System, sets: _Sets, q: Tensor) -> Tensor:
+def _excess(system: BodySystem, sets: _Sets, q: Tensor) -> Tensor:
     """Return what contacts exert on the free bodies beyond what displaces them by q, shape (..., F, 6)."""
     force = _forces(system.links, sets, system.moved(q))
     return system.load(force) - (system.inertia @ q.unsqueeze(-1)).squeeze(-1)
@@ -202,16 +202,16 @@ def _detached(links: Links) -> Links:
     return Links(**{k: tree.detach(v) if isinstance(v, Tensor) or k == "arms" else v for k, v in found.items()})
 
 
-def resolve(contact: BodyContact, motion: PredictedBodyMotion) -> tuple[Tensor, Tensor]:
+def contact_forces(contact: BodyContact, motion: PredictedBodyMotion) -> tuple[Tensor, Tensor]:
     """Return forces [N] and torques about the centres of mass [N m] of contact on bodies, shape (..., K, 3) each."""
-    if contact_op.fits(motion):
+    if contact_op.kernel_fits(motion):
         law = (contact.recovery, contact.shallow, contact.slowest)
-        return contact_op.wrench(motion, contact.chosen(motion.bodies), contact.points, contact.steps, law)
+        return contact_op.contact_wrench(motion, contact.chosen(motion.bodies), contact.points, contact.steps, law)
     free = [k for k, b in enumerate(motion.bodies) if b.motion == "free"]
     links = _links(contact, motion)
-    system = System(links, free, inertia(motion, free))
+    system = BodySystem(links, free, inertia(motion, free))
     with torch.no_grad():
-        plain = System(_detached(links), free, system.inertia.detach())
+        plain = BodySystem(_detached(links), free, system.inertia.detach())
         sets, q = _settled(plain, motion.dt, contact.slowest, contact.steps)
         sets, gradients = _exact(plain, sets, q)
         excess = _excess(plain, sets, q)
@@ -297,4 +297,4 @@ class BodyContact(Effect):
         none = view.state.pos.new_zeros(1, 3)
         if not self.chosen(motion.bodies.bodies):
             return ContactForces(none, none, none)
-        return ContactForces(none, *resolve(self, motion.bodies))
+        return ContactForces(none, *contact_forces(self, motion.bodies))

@@ -85,21 +85,24 @@ def _backward(ctx, by: Tensor):
 
 scene_packing.operator(f"body_pairs({_FIRST}, {_OTHERS}) -> Tensor", _exert, _exert_meta, _save, _backward)
 scene_packing.operator(
-    f"body_pairs_back({_FIRST}, Tensor by, {_OTHERS}) -> Tensor", _back, _back_meta, backward=scene_packing.once
+    f"body_pairs_back({_FIRST}, Tensor by, {_OTHERS}) -> Tensor",
+    _back,
+    _back_meta,
+    backward=scene_packing.refuse_second_derivative,
 )
 
 
 def _members(motion: PredictedBodyMotion) -> list[Tensor]:
     """Return the fields of bodies in the order of the kernel, shape (..., K, C) each."""
     state, params = motion.state, motion.params
-    offset, numbers = scene_packing.measures(motion)
+    offset, numbers = scene_packing.shape_sizes(motion)
     numbers.append(params.size[..., 2:])
     moves = [state.vel, state.omega, motion.change, motion.turn, motion.mobility, motion.inverse_inertia]
     laws = [params.mu_s, params.mu_k, params.restitution]
     return [state.pos, *itertools.chain(*axes(state.quat)), offset, *numbers, *moves, *laws]
 
 
-def wrench(
+def contact_wrench(
     motion: PredictedBodyMotion,
     pairs: Sequence[tuple[int, int]],
     points: int,
@@ -119,25 +122,25 @@ def wrench(
     members, count = _members(motion), len(motion.bodies)
     batch = torch.broadcast_shapes(*(x.shape[:-2] for x in members))
     order = itertools.count()
-    (grids, cells), (inscribed, many) = scene_packing.sampled(motion), scene_packing.inscribed(motion)
+    (grids, cells), (inscribed, many) = scene_packing.sampled_grids(motion), scene_packing.inscribed_balls(motion)
     found = torch.ops.torchdlo.body_pairs(
-        scene_packing.stored(members, batch, count),
+        scene_packing.pack_components(members, batch, count),
         grids,
         inscribed,
         cells,
         many,
-        scene_packing.kinds(motion),
+        scene_packing.shape_numbers(motion),
         [next(order) if b.motion == "free" else -1 for b in motion.bodies],
         list(itertools.chain(*pairs)),
         points,
         steps,
         [*law, motion.dt],
     )
-    force, torque = scene_packing.logical(found, batch).split(3, -1)
+    force, torque = scene_packing.unpack_components(found, batch).split(3, -1)
     return force, torque
 
 
-def fits(motion: PredictedBodyMotion) -> bool:
+def kernel_fits(motion: PredictedBodyMotion) -> bool:
     """Return whether the kernel can do what these bodies need."""
     like = motion.state.pos
     return ready(like.device.type, like.dtype) and scene_packing.alike(motion)

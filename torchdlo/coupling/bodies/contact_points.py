@@ -73,7 +73,7 @@ def _on_circle(height: Tensor, radius: Tensor, thick: Tensor, count: int, arc: T
     return _rows(radius * torch.cos(angle), radius * torch.sin(angle), height + 0 * angle, thick + 0 * angle)
 
 
-def standing(body: Body, size: Tensor, balls: Tensor, edge: Tensor) -> Tensor:
+def fixed_balls(body: Body, size: Tensor, balls: Tensor, edge: Tensor) -> Tensor:
     """Return the fixed balls of a body in its frame: centre and radius [m], shape (..., P, 4).
 
     Args:
@@ -113,7 +113,7 @@ def _slack(radius: Tensor, height: Tensor) -> Tensor:
     return (gradient + radius) / height
 
 
-def circles(body: Body, size: Tensor, edge: Tensor) -> Tensor:
+def contact_circles(body: Body, size: Tensor, edge: Tensor) -> Tensor:
     """Return circles about z: height, radius, and radius of their balls [m], shape (..., Q, 3); Q may be 0."""
     a, b = size[..., :1], size[..., 1:2]
     if body.shape == "cylinder":
@@ -125,7 +125,7 @@ def circles(body: Body, size: Tensor, edge: Tensor) -> Tensor:
     return size[..., :0, :]
 
 
-def segments(body: Body, size: Tensor, edge: Tensor) -> Tensor:
+def contact_segments(body: Body, size: Tensor, edge: Tensor) -> Tensor:
     """Return segments: start, end, and radius of their balls [m], shape (..., S, 7); S may be 0."""
     a, b, zero = size[..., :1], size[..., 1:2], torch.zeros_like(edge)
     if body.shape == "box":
@@ -156,9 +156,9 @@ def _one_way(motion: PredictedBodyMotion, first: int, second: int) -> list[Tenso
     def seen(local: Tensor) -> Tensor:
         return rotate(back, rotate(quat, local) + between)
 
-    fixed = standing(bodies[first], size, params.balls[..., one, :], edge)
+    fixed = fixed_balls(bodies[first], size, params.balls[..., one, :], edge)
     found = [(seen(fixed[..., :3]), fixed[..., 3:], 0.0)]
-    round_ = circles(bodies[first], size, edge)
+    round_ = contact_circles(bodies[first], size, edge)
     if round_.shape[-2]:
         height, radius, thick = round_.split(1, -1)
         middle = _rows(torch.zeros_like(height), torch.zeros_like(height), height)
@@ -167,7 +167,7 @@ def _one_way(motion: PredictedBodyMotion, first: int, second: int) -> list[Tenso
         steep = safe_norm(down)
         out = radius * down / torch.maximum(steep, torch.full_like(steep, FLAT))
         found.append((seen(_rows(out[..., :1], out[..., 1:], height + 0 * steep)), thick, 0.0))
-    lines = segments(bodies[first], size, edge) if not flat else size[..., :0, :]
+    lines = contact_segments(bodies[first], size, edge) if not flat else size[..., :0, :]
     if lines.shape[-2]:
         start = seen(lines[..., :3])
         line = _Line(bodies[second], params.size[..., other, :], more[0], start, seen(lines[..., 3:6]) - start)
@@ -217,7 +217,7 @@ def _spread(rows: Tensor, count: int) -> Tensor:
     return torch.cat(chosen, -1)
 
 
-def touches(
+def deepest_points(
     motion: PredictedBodyMotion, pairs: tuple[tuple[int, int], ...], most: int
 ) -> tuple[Touches, tuple[int, ...]]:
     """Return the deepest points of pairs of bodies, and how many each pair has.

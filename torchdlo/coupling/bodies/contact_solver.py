@@ -147,7 +147,7 @@ banded.register_pattern("bodies", functools.cache(_pattern))
 
 
 @dataclass(frozen=True)
-class System:
+class BodySystem:
     """The equations of the displacements of the free bodies."""
 
     links: Links

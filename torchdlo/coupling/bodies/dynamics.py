@@ -280,7 +280,7 @@ def predict_free_motion(
     return PredictedBodyMotion(bodies, params, state, dt, change, turn, scale / params.mass, scale / params.inertia)
 
 
-def spin(quat: Tensor, inertia: Tensor, omega: Tensor, dt: float) -> tuple[Tensor, Tensor]:
+def spin_freely(quat: Tensor, inertia: Tensor, omega: Tensor, dt: float) -> tuple[Tensor, Tensor]:
     """Return orientations and angular velocities after a time without torque, shape (..., K, 4) and (..., K, 3).
 
     Dullweber et al. 1997, eq. 3.6: in the frame of the body, the angular momentum p turns about axis i by -t p_i / I_i
@@ -303,7 +303,7 @@ def spin(quat: Tensor, inertia: Tensor, omega: Tensor, dt: float) -> tuple[Tenso
     return quat, torch.cat(world(axes(quat), [a / m for a, m in zip(p, moments, strict=True)]), -1)
 
 
-def advance(motion: PredictedBodyMotion, targets: BodyTargets, push: ContactForces) -> BodyState:
+def advance_bodies(motion: PredictedBodyMotion, targets: BodyTargets, push: ContactForces) -> BodyState:
     """Advance bodies by a substep.
 
     Args:
@@ -318,14 +318,14 @@ def advance(motion: PredictedBodyMotion, targets: BodyTargets, push: ContactForc
     omega = free * half * state.omega + motion.turned(push.body_torque) / dt
     quat = state.quat
     if any(b.motion == "free" for b in bodies):
-        quat, omega = spin(quat, params.inertia, omega, dt)
+        quat, omega = spin_freely(quat, params.inertia, omega, dt)
     pos = _spread(bodies, targets.pos, state.pos + change)
     quat = _spread(bodies, targets.quat, torch.where(free > 0, quat, state.quat))
     shared = 1 - free + free * half
     return BodyState(pos, quat, change / dt * shared, free * half * omega + (1 - free) * motion.turn / dt)
 
 
-def place(solids: Sequence[RigidBody], like: Tensor) -> tuple[tuple[Body, ...], BodyParams, BodyState]:
+def place_bodies(solids: Sequence[RigidBody], like: Tensor) -> tuple[tuple[Body, ...], BodyParams, BodyState]:
     """Return the static side, the numbers and the state of bodies, of the dtype and device of `like`."""
     bodies, rows = [], []
     for k, solid in enumerate(solids):

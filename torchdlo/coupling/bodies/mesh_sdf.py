@@ -206,7 +206,7 @@ def _checked(vertices: Tensor, faces: Tensor, name: str) -> Tensor:
             f"{name}: is {longest:.4g} m long; expected {SMALLEST:g} to {LARGEST:g} m. Give scale, the metres per unit "
             f"of the file ({guess} if that is the unit)."
         )
-    volume = triangles.volume(vertices[faces])
+    volume = triangles.enclosed_volume(vertices[faces])
     if abs(volume) < 1e-9 * longest**3:
         raise InputError(f"{name}: encloses no volume; expected a solid.")
     return faces if volume > 0 else faces.flip(-1)
@@ -312,7 +312,7 @@ def _balls(shape: MeshShape, inset: float, count: int) -> Tensor:
     # Where the body is too thin for a ball, it is a point of the surface.
     sunk = distance(within) < 0
     corners = shape.vertices[shape.faces]
-    radius = torch.stack([triangles.distances(m[None], corners).amin(-1) for m in within])
+    radius = torch.stack([triangles.triangle_distances(m[None], corners).amin(-1) for m in within])
     return torch.where(sunk, torch.cat([within, radius], -1), torch.cat([surface, torch.zeros_like(radius)], -1))
 
 

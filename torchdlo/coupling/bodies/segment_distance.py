@@ -40,7 +40,7 @@ class EdgePoints:
     """Signed distance of the centreline from the body [m], shape (..., F, V, 1)."""
 
 
-def families(body: Body, pieces: int) -> int:
+def points_per_edge(body: Body, pieces: int) -> int:
     """Return how many points per edge are looked at: its ends, and the nearest one of each piece where that helps."""
     if body.shape == "plane":
         return 2
@@ -128,7 +128,7 @@ def _about_best(still: _Line, low: float, high: float) -> tuple[Tensor, Tensor]:
     return left.clamp(min=low), right.clamp(max=high)
 
 
-def find(view: View, motion: PredictedBodyMotion, pieces: int) -> EdgePoints:
+def find_contact_points(view: View, motion: PredictedBodyMotion, pieces: int) -> EdgePoints:
     """Return the points of all edges that may touch each body.
 
     Args:
@@ -151,7 +151,7 @@ def find(view: View, motion: PredictedBodyMotion, pieces: int) -> EdgePoints:
         normal = rotate(quat, normal)
         found.append((zero, normal, arm, distance))
         found.append((zero + 1, view.next(normal), view.next(arm), view.next(distance)))
-        count = families(body, pieces) - 2
+        count = points_per_edge(body, pieces) - 2
         for j in range(count):
             share = _nearest(line, j / count, (j + 1) / count)
             distance, normal = line.probe(share)

@@ -36,13 +36,13 @@ def edge_counts(faces: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     return edges, zero.index_add(0, at, torch.ones_like(sign)), zero.index_add(0, at, sign)
 
 
-def volume(triangles: Tensor) -> float:
+def enclosed_volume(triangles: Tensor) -> float:
     """Return the volume [m^3] that triangles (F, 3, 3) enclose; negative if they are oriented inwards."""
     a, b, c = triangles.unbind(1)
     return float((a * torch.linalg.cross(b, c)).sum() / 6)
 
 
-def distances(points: Tensor, triangles: Tensor) -> Tensor:
+def triangle_distances(points: Tensor, triangles: Tensor) -> Tensor:
     """Return distances of points (P, 3) from triangles (F, 3, 3) [m], shape (P, F).
 
     Products of points and triangles are matrix products about the middle of the points, which rounds distances to the
@@ -84,7 +84,7 @@ def grid_distances(axes: tuple[Tensor, Tensor, Tensor], triangles: Tensor) -> Te
         if all(len(part) <= LEAF for part in parts):
             points = torch.cartesian_prod(*parts)
             where = tuple(slice(lo, hi) for lo, hi in block)
-            out[where] = distances(points, near).amin(-1).reshape([len(part) for part in parts])
+            out[where] = triangle_distances(points, near).amin(-1).reshape([len(part) for part in parts])
             continue
         halves = []
         for lo, hi in block:
@@ -93,7 +93,7 @@ def grid_distances(axes: tuple[Tensor, Tensor, Tensor], triangles: Tensor) -> Te
         for child in itertools.product(*halves):
             low = torch.stack([a[lo] for a, (lo, _) in zip(axes, child, strict=True)])
             high = torch.stack([a[hi - 1] for a, (_, hi) in zip(axes, child, strict=True)])
-            far = distances(((low + high) / 2)[None], near)[0]
+            far = triangle_distances(((low + high) / 2)[None], near)[0]
             work.append((child, near[far <= (far.min() + (high - low).norm()) * (1 + 1e-6)]))
     return out
 

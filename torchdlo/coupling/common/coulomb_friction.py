@@ -11,7 +11,7 @@ FASTEST = 0.1
 """Speed at which implicit steps undo overlaps at most [m/s]: what parts in a step keeps that speed."""
 
 
-def parting(gap: Tensor, shallow: Tensor, recovery: float) -> Tensor:
+def separation_needed(gap: Tensor, shallow: Tensor, recovery: float) -> Tensor:
     """Return by how much surfaces have to part at least in a substep, negative if they may come closer [m].
 
     Of an overlap, a share goes at once, and all of it that is not shallow: small shares let piles come to rest.
@@ -26,7 +26,7 @@ def parting(gap: Tensor, shallow: Tensor, recovery: float) -> Tensor:
     return torch.where(gap > 0, -gap, recovery * overlap + (1 - recovery) * deep)
 
 
-def slowly(wanted: Tensor, dt: float) -> Tensor:
+def overlap_recovery(wanted: Tensor, dt: float) -> Tensor:
     """Return how far overlaps part in a substep where they keep the speed with which they do [m]: at most `FASTEST`.
 
     Args:
@@ -37,7 +37,7 @@ def slowly(wanted: Tensor, dt: float) -> Tensor:
     return torch.where(wanted > 0, asked * most / (asked + most), wanted)
 
 
-def rebounding(
+def rebound_separation(
     wanted: Tensor, pressed: Tensor, approach: Tensor, restitution: Tensor, slowest: float, dt: float
 ) -> Tensor:
     """Return `wanted` [m], or how far surfaces part if they rebound from their approach [m/s] within `dt` [s].
@@ -54,7 +54,7 @@ def rebounding(
     return torch.maximum(wanted, torch.where(rebound > 0, rebound, wanted))
 
 
-def rub(trial: Tensor, normal: Tensor, mu_s: Tensor, mu_k: Tensor) -> Tensor:
+def friction_force(trial: Tensor, normal: Tensor, mu_s: Tensor, mu_k: Tensor) -> Tensor:
     """Return Coulomb friction [N], shape (..., 3): `trial`, which stops the slip, if static friction can be that much.
 
     Else sliding friction, mu_k times the normal force in the direction of `trial`.

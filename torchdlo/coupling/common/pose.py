@@ -20,16 +20,16 @@ class Pose:
     """Orientation, unit quaternion (w, x, y, z), its frame to the world [1], shape (..., 4)."""
 
 
-def compose(outer: Pose, inner: Pose) -> Pose:
+def compose_poses(outer: Pose, inner: Pose) -> Pose:
     """Return the pose in the world of what has the pose `inner` in the frame of `outer`."""
     quat = outer.quat.expand(*torch.broadcast_shapes(outer.quat.shape, inner.quat.shape))
     return Pose(outer.pos + rotate(outer.quat, inner.pos), multiply(quat, inner.quat.expand_as(quat)))
 
 
-def within(outer: Pose, inner: Pose) -> Pose:
+def relative_pose(outer: Pose, inner: Pose) -> Pose:
     """Return the pose of `inner` as seen from `outer`, both given in the world."""
     back = Pose(torch.zeros_like(outer.pos), conjugate(outer.quat))
-    return compose(back, Pose(inner.pos - outer.pos, inner.quat))
+    return compose_poses(back, Pose(inner.pos - outer.pos, inner.quat))
 
 
 def from_matrix(matrix: Tensor) -> Tensor:

@@ -88,25 +88,25 @@ def fields(tensors: Sequence[Tensor]) -> ctypes.Array:
     return (ctypes.c_void_p * len(at))(*at)
 
 
-def stored(parts: Sequence[Tensor], batch: Sequence[int], count: int) -> list[Tensor]:
+def pack_components(parts: Sequence[Tensor], batch: Sequence[int], count: int) -> list[Tensor]:
     """Return tensors (..., n or 1, C) as (C, n, B) each."""
     n = len(batch) + 2
     wide = (x.expand(*batch, count, x.shape[-1]).permute(n - 1, n - 2, *range(n - 2)) for x in parts)
     return [x.reshape(x.shape[0], count, batch.numel()).contiguous() for x in wide]
 
 
-def logical(x: Tensor, batch: Sequence[int]) -> Tensor:
+def unpack_components(x: Tensor, batch: Sequence[int]) -> Tensor:
     """Return (C, n, B) as (..., n, C)."""
     x = x.reshape(*x.shape[:2], *batch)
     return x.permute(*range(2, x.dim()), 1, 0)
 
 
-def kinds(motion: PredictedBodyMotion) -> list[int]:
+def shape_numbers(motion: PredictedBodyMotion) -> list[int]:
     """Return the shapes of bodies by their numbers in the kernels."""
     return [tuple(shape_sdf.SIZES).index(b.shape) for b in motion.bodies]
 
 
-def measures(motion: PredictedBodyMotion) -> tuple[Tensor, list[Tensor]]:
+def shape_sizes(motion: PredictedBodyMotion) -> tuple[Tensor, list[Tensor]]:
     """Return how far in x shapes are from the centres of mass, and four numbers of their sizes, shape (..., K, C).
 
     The size of a ring ends in cosine and sine of half its arc.
@@ -125,12 +125,12 @@ def alike(motion: PredictedBodyMotion) -> bool:
     return not meshed or all(x.shape[:-2].numel() == 1 and not x.requires_grad for x in parts)
 
 
-def sampled(motion: PredictedBodyMotion) -> tuple[Tensor, list[int]]:
+def sampled_grids(motion: PredictedBodyMotion) -> tuple[Tensor, list[int]]:
     """Return the grids of all bodies, shape (K, n), and the cells of each in x, y and z, 0 where there is none."""
     return _rows(motion, motion.params.grid), [n for b in motion.bodies for n in (b.cells or (0, 0, 0))]
 
 
-def inscribed(motion: PredictedBodyMotion) -> tuple[Tensor, list[int]]:
+def inscribed_balls(motion: PredictedBodyMotion) -> tuple[Tensor, list[int]]:
     """Return the balls within all bodies that stand for meshes, shape (K, 4 P), and how many each has."""
     return _rows(motion, motion.params.balls), [b.balls for b in motion.bodies]
 
@@ -142,6 +142,6 @@ def _rows(motion: PredictedBodyMotion, x: Tensor) -> Tensor:
     return x.detach().reshape(x.shape[-2:]).contiguous()
 
 
-def once(ctx, *by) -> None:
+def refuse_second_derivative(ctx, *by) -> None:
     """Refuse to differentiate a derivative: what stands in for the backward pass of an operator's backward pass."""
     raise RuntimeError("contact and matter have no second derivative; do not ask for create_graph through them")

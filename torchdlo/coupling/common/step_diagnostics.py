@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torchdlo.physics import tree
-from torchdlo.physics.effects.base import altered
+from torchdlo.physics.effects.base import altered_params
 from torchdlo.physics.linalg.numerics import safe_norm, tiny
 from torchdlo.physics.rod import kinematics as rod
 from torchdlo.physics.rod.kinematics import RodState
@@ -38,7 +38,7 @@ def broad_phase(scene: Any, params: Any, state: Any, start: Any, control: Any) -
         batch = torch.broadcast_shapes(*(x.shape[:-2] for x in leaves))
         pos, vel = (x.expand(*batch, *x.shape[-2:]) for x in (state.rods.pos, state.rods.vel))
         there = tree.replace(state.rods, pos=pos, vel=vel)
-        changed = altered(scene.effects, scene.topology, params.rods, params.effects)
+        changed = altered_params(scene.effects, scene.topology, params.rods, params.effects)
         view = rod.view(scene.topology, changed, there, scene.dt)
         carried = carried.expand(*batch, -1, -1)
         found = {e.name: e.broad_phase(view, carried) for e in scene.effects if e.is_contact}
@@ -74,7 +74,7 @@ def _strained(scene: Any, params: Any, rods: RodState) -> Tensor:
     held, after = set(scene.prescribed_vertices), scene.topology.successor()
     # Hands that hold both ends of an edge set its length.
     solved = [m * (not {k, after[k]} <= held) for k, m in enumerate(scene.topology.edge_mask())]
-    changed = altered(scene.effects, scene.topology, params.rods, params.effects)
+    changed = altered_params(scene.effects, scene.topology, params.rods, params.effects)
     edge = rod.edge_vectors(scene.topology, rods.pos, changed.rest.edge_mask)
     wanted = changed.rest.length * (1 + rods.tension / changed.material.stretch)
     long = (safe_norm(edge) / wanted.clamp(min=tiny(wanted)) - 1) * wanted.new_tensor(solved).unsqueeze(-1)
@@ -82,7 +82,7 @@ def _strained(scene: Any, params: Any, rods: RodState) -> Tensor:
     return torch.where(most > STRAIN, most, 0.0)
 
 
-def explain(missed: Tensor) -> str:
+def explain_diagnostics(missed: Tensor) -> str:
     """Return what went wrong and how to mend it, "" if nothing did."""
     room, beyond, short, *others = (float(x) for x in missed.reshape(-1, missed.shape[-1]).amax(0))
     if room > 0:

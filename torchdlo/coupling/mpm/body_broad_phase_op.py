@@ -54,7 +54,7 @@ scene_packing.operator(
 )
 
 
-def fits(motion: PredictedBodyMotion) -> bool:
+def kernel_fits(motion: PredictedBodyMotion) -> bool:
     """Return whether the kernel can do what these bodies need."""
     like = motion.state.pos
     return ready(like.device.type, like.dtype) and scene_packing.alike(motion)
@@ -74,18 +74,18 @@ def choose(
         reach: distance off the surface up to which nodes are near [m].
         room: how many are chosen, R.
     """
-    offset, numbers = scene_packing.measures(motion)
+    offset, numbers = scene_packing.shape_sizes(motion)
     parts = [motion.state.pos, *itertools.chain(*axes(motion.state.quat)), offset, *numbers]
     count = len(motion.bodies)
     solids = torch.cat([x.expand(*batch, count, x.shape[-1]) for x in parts], -1).reshape(-1, count, 17)
-    grids, cells = scene_packing.sampled(motion)
+    grids, cells = scene_packing.sampled_grids(motion)
     return torch.ops.torchdlo.body_near(
         nodes.mass.contiguous(),
         nodes.origin.contiguous(),
         solids.contiguous(),
         grids,
         list(grid.size),
-        scene_packing.kinds(motion),
+        scene_packing.shape_numbers(motion),
         cells,
         list(grid.first),
         grid.spacing,

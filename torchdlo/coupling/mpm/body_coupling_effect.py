@@ -41,7 +41,7 @@ from torch import Tensor
 
 from torchdlo.coupling.bodies import shape_sdf
 from torchdlo.coupling.bodies.dynamics import PredictedBodyMotion, conjugate
-from torchdlo.coupling.common.coulomb_friction import rub
+from torchdlo.coupling.common.coulomb_friction import friction_force
 from torchdlo.coupling.mpm import body_broad_phase_op
 from torchdlo.coupling.mpm.particles import Grid
 from torchdlo.coupling.mpm.rod_coupling_effect import PredictedParticles, TouchedParticles
@@ -244,7 +244,7 @@ def _sweep(pairs: _Pairs, solids: _Solids, vel: Tensor, sweeps: int) -> Tensor:
             wanted = (1 - pairs.share) * parting.clamp(max=0.0) + pairs.leaving
         normal = (normal + along * (wanted - parting)).clamp(min=0.0)
         slip = apart - parting * pairs.normal
-        rubbed = rub(rubbed - across * slip, normal, solids.mu_s, solids.mu_k)
+        rubbed = friction_force(rubbed - across * slip, normal, solids.mu_s, solids.mu_k)
         u = normal * pairs.normal + rubbed
     return u
 
@@ -271,7 +271,7 @@ def exchange(
     lost = nodes.mass.new_zeros(nodes.mass.shape[0], 1)
     if 0 < effect.room < nodes.mass.shape[1]:
         reach, room = effect.reach * grid.spacing, effect.room
-        if body_broad_phase_op.fits(motion):
+        if body_broad_phase_op.kernel_fits(motion):
             chosen, lost = body_broad_phase_op.choose(motion, grid, nodes, batch, reach, room)
         else:
             chosen, lost = _chosen(motion, solids, nodes, places(grid, nodes), reach, room)

@@ -68,7 +68,10 @@ def _backward(ctx, by: Tensor):
 
 scene_packing.operator(f"walls({_INPUTS}, {_STATIC}) -> Tensor", _act, _act_meta, _save, _backward)
 scene_packing.operator(
-    f"walls_back({_INPUTS}, Tensor by, {_STATIC}) -> (Tensor, Tensor)", _back, _back_meta, backward=scene_packing.once
+    f"walls_back({_INPUTS}, Tensor by, {_STATIC}) -> (Tensor, Tensor)",
+    _back,
+    _back_meta,
+    backward=scene_packing.refuse_second_derivative,
 )
 
 

@@ -1,7 +1,8 @@
 """Sums from particles to grid nodes and back, with quadratic B-splines and affine fields.
 
-A particle at x says c + S (x_i - x) at node i; `spread` sums that over particles with the weights w_i(x), `collect`
-sums values of nodes with w_i and with w_i (x_i - x). Each is the other's transpose, so each is the other's derivative;
+A particle at x says c + S (x_i - x) at node i; `particles_to_grid` sums that over particles with the weights w_i(x),
+`grid_to_particles` sums values of nodes with w_i and with w_i (x_i - x). Each is the other's transpose, so each is the
+other's derivative;
 `tilt` is the derivative by x of both. Weights: Jiang et al. 2016, The Material Point Method for Simulating Continuum
 Materials, eq. 123, doi:10.1145/2897826.2927348.
 
@@ -210,10 +211,10 @@ torch.library.register_autograd(
     lib=_library,
 )
 for _name in ("tilt", "divide_back"):
-    torch.library.register_autograd(f"torchdlo::{_name}", scene_packing.once, lib=_library)
+    torch.library.register_autograd(f"torchdlo::{_name}", scene_packing.refuse_second_derivative, lib=_library)
 
 
-def spread(at: Tensor, value: Tensor, slope: Tensor, size: Sequence[int]) -> Tensor:
+def particles_to_grid(at: Tensor, value: Tensor, slope: Tensor, size: Sequence[int]) -> Tensor:
     """Return what particles say at the nodes, shape (B, X Y Z, 4); differentiable once.
 
     Args:
@@ -225,18 +226,18 @@ def spread(at: Tensor, value: Tensor, slope: Tensor, size: Sequence[int]) -> Ten
     return torch.ops.torchdlo.spread(at.contiguous(), value.contiguous(), slope.contiguous(), list(size))
 
 
-def collect(at: Tensor, grid: Tensor, size: Sequence[int]) -> tuple[Tensor, Tensor]:
+def grid_to_particles(at: Tensor, grid: Tensor, size: Sequence[int]) -> tuple[Tensor, Tensor]:
     """Return the weighted sums of node values (B, 4, P), and of the first three times distance (B, 9, P).
 
     Args:
-        at: as in `spread`.
+        at: as in `particles_to_grid`.
         grid: values of nodes, shape (B, X Y Z, 4).
-        size: as in `spread`.
+        size: as in `particles_to_grid`.
     """
     return torch.ops.torchdlo.collect(at.contiguous(), grid.contiguous(), list(size))
 
 
-def divide(grid: Tensor) -> tuple[Tensor, Tensor]:
+def grid_velocities(grid: Tensor) -> tuple[Tensor, Tensor]:
     """Return velocities of nodes, zero where there is no mass [m/s] (B, N, 3), and masses [kg] (B, N).
 
     Args:

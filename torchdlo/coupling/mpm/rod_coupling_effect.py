@@ -14,7 +14,7 @@ from torch import Tensor
 from torchdlo.coupling.bodies.dynamics import BodyState
 from torchdlo.coupling.mpm import substep as mpm
 from torchdlo.coupling.mpm.particles import Grid, MpmDomain, ParticleParams, Particles, stored
-from torchdlo.coupling.mpm.rod_coupling_solver import Lines, Touch, block_size, exchange, near_size
+from torchdlo.coupling.mpm.rod_coupling_solver import Lines, RodParticleTouch, block_size, exchange, near_size
 from torchdlo.coupling.mpm.substep import Nodes
 from torchdlo.physics import tree
 from torchdlo.physics.effects.base import ContactForces, Effect, Param, PredictedMotion, Values
@@ -84,7 +84,7 @@ class RodMpmCoupling(Effect):
             view.params.rest.edge_mask,
             after,
         )
-        touch = Touch(self.block, self.room or size, self.sweeps, self.thickness, self.near)
+        touch = RodParticleTouch(self.block, self.room or size, self.sweeps, self.thickness, self.near)
         impulse, nodes, lost = exchange(motion.material_points.grid, nodes, lines, touch, all_scenes(values["mu"]))
         none = impulse.new_zeros(1, 3)
         return ContactForces(
@@ -151,7 +151,7 @@ def finish(
     return mpm.from_grid(medium, material_points, now.particles, nodes, dt), missed
 
 
-def together(
+def expand_batches(
     rods: RodState, bodies: BodyState | tuple[()], particles: Particles
 ) -> tuple[RodState, BodyState | tuple[()], Particles]:
     """Return all with the batch axes of all."""

@@ -85,7 +85,7 @@ scene_packing.operator(
     f"node_sweeps_back({_INPUTS}, Tensor by_given, Tensor by_vel, {_STATIC}) -> Tensor[]",
     _back,
     _back_meta,
-    backward=scene_packing.once,
+    backward=scene_packing.refuse_second_derivative,
 )
 
 

@@ -44,7 +44,7 @@ RELAXATION = 1.5
 
 
 @dataclass(frozen=True)
-class Touch:
+class RodParticleTouch:
     """How ropes and matter touch; static."""
 
     block: int
@@ -106,7 +106,7 @@ def block_size(longest: float, radius: float, spacing: float, thickness: float =
         longest: length of the longest edge [m].
         radius: greatest radius [m].
         spacing: of the nodes [m].
-        thickness: as in `Touch`.
+        thickness: as in `RodParticleTouch`.
     """
     return math.floor((longest + 2 * radius) / spacing + 2 * thickness) + 1
 
@@ -118,7 +118,7 @@ def near_size(longest: float, radius: float, spacing: float, thickness: float = 
         longest: as in `block_size`, like the others.
         radius: of edges [m].
         spacing: of nodes [m].
-        thickness: as in `Touch`.
+        thickness: as in `RodParticleTouch`.
     """
     reach = radius + (thickness + 0.5) * spacing
     capsule = math.pi * reach**2 * longest + 4 / 3 * math.pi * reach**3
@@ -165,7 +165,7 @@ def _nearest(distance: Tensor, node: Tensor, mass: Tensor) -> Tensor:
         return distance <= (1 + 1e-6) * least.gather(1, node).reshape(distance.shape)
 
 
-def _pair(grid: Grid, nodes: Nodes, lines: Lines, touch: Touch) -> tuple[_Pairs, Tensor]:
+def _pair(grid: Grid, nodes: Nodes, lines: Lines, touch: RodParticleTouch) -> tuple[_Pairs, Tensor]:
     """Return the pairs that can exchange momentum, and how many edges found no room, (B, 1)."""
     h, size = grid.spacing, nodes.at.new_tensor(grid.size)
     corner = nodes.origin * h + nodes.at.new_tensor(grid.first)
@@ -233,7 +233,9 @@ def _softness(pairs: _Pairs, lines: Lines, count: int) -> tuple[Tensor, Tensor]:
     return node + rope(1 - s, s), node + rope(1 - s + lever, s + lever)
 
 
-def _by_kernel(grid: Grid, nodes: Nodes, lines: Lines, touch: Touch, friction: Tensor) -> tuple[Tensor, Nodes, Tensor]:
+def _by_kernel(
+    grid: Grid, nodes: Nodes, lines: Lines, touch: RodParticleTouch, friction: Tensor
+) -> tuple[Tensor, Nodes, Tensor]:
     """Return what `exchange` does; no edge and no node lacks room."""
     scenes, vertices = lines.pos.shape[:2]
     corner = nodes.origin * grid.spacing + nodes.at.new_tensor(grid.first)
@@ -254,7 +256,9 @@ def _by_kernel(grid: Grid, nodes: Nodes, lines: Lines, touch: Touch, friction: T
     return given, tree.replace(nodes, vel=vel), torch.zeros_like(corner[:, :1])
 
 
-def exchange(grid: Grid, nodes: Nodes, lines: Lines, touch: Touch, friction: Tensor) -> tuple[Tensor, Nodes, Tensor]:
+def exchange(
+    grid: Grid, nodes: Nodes, lines: Lines, touch: RodParticleTouch, friction: Tensor
+) -> tuple[Tensor, Nodes, Tensor]:
     """Return impulses on vertices [N s], shape (B, V, 3), the nodes after it, and how many edges found no room.
 
     Args:

@@ -121,7 +121,9 @@ def to_grid(
     gradient = h * mass * particles.affine - share * (4 * dt / h) * material_points.volume * full
     moved = particles.vel + share * dt * acceleration
     said = torch.cat([(mass * moved).mT, mass.expand(*moved.shape[:-1], 1).mT], -2)
-    vel, summed = p2g_g2p.divide(p2g_g2p.spread(at, said.reshape(-1, 4, said.shape[-1]), flat(gradient), grid.size))
+    vel, summed = p2g_g2p.grid_velocities(
+        p2g_g2p.particles_to_grid(at, said.reshape(-1, 4, said.shape[-1]), flat(gradient), grid.size)
+    )
     return Nodes(at, origin, summed, vel, share.reshape(-1, 1, 1)), particles
 
 
@@ -130,7 +132,7 @@ def from_grid(
 ) -> Particles:
     """Return the particles after the substep, moved with the nodes; walls act last."""
     filled = walls(medium.grid, nodes.origin, nodes.vel, material_points.friction)
-    value, gradient = p2g_g2p.collect(nodes.at, filled, medium.grid.size)
+    value, gradient = p2g_g2p.grid_to_particles(nodes.at, filled, medium.grid.size)
     batch = particles.pos.shape[:-2]
     vel = value[:, :3].reshape(*batch, 3, -1).mT
     affine = (gradient * (4 / medium.grid.spacing)).reshape(*batch, 9, -1).mT

@@ -196,7 +196,7 @@ def _backward(ctx, by: Tensor):
 
 
 torch.library.register_autograd("torchdlo::isotropic", _backward, setup_context=_save, lib=_library)
-torch.library.register_autograd("torchdlo::isotropic_back", scene_packing.once, lib=_library)
+torch.library.register_autograd("torchdlo::isotropic_back", scene_packing.refuse_second_derivative, lib=_library)
 
 
 def _isotropic(e: Symmetric, which: str, *formulas) -> Symmetric:

@@ -75,7 +75,7 @@ def _check(scene: Any, hands: Hands, tools: Pose) -> None:
         )
 
 
-def weld(scene: Any, hands: Hands, now: Any, tools: Pose, closed: Tensor, last: Grasp | None = None) -> Grasp:
+def close_hands(scene: Any, hands: Hands, now: Any, tools: Pose, closed: Tensor, last: Grasp | None = None) -> Grasp:
     """Close or open hands: what a hand did not hold before is held as it lies now.
 
     Args:
@@ -104,7 +104,7 @@ def _grip(hands: Hands, closed: Tensor) -> dict[str, Tensor]:
     return {"vertices": every[..., list(hands.vertices), :], "edges": every[..., list(hands.edges), :]}
 
 
-def carry(hands: Hands, grasp: Grasp, tools: Pose) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
+def carry_attachments(hands: Hands, grasp: Grasp, tools: Pose) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
     """Return what `Control` is made of when tools are at these poses: positions, directors, grip."""
     frames = _with_world(tools)
     at, edges = list(hands.vertices), list(hands.edges)
@@ -112,7 +112,7 @@ def carry(hands: Hands, grasp: Grasp, tools: Pose) -> tuple[Tensor, Tensor, dict
     return pos, rotate(frames.quat[..., edges, :], grasp.director), _grip(hands, grasp.closed)
 
 
-def felt(scene: Any, hands: Hands, state: Any, tools: Pose) -> tuple[Tensor, Tensor]:
+def tool_wrench(scene: Any, hands: Hands, state: Any, tools: Pose) -> tuple[Tensor, Tensor]:
     """Return force [N] and torque about the tool's point [N m] that ropes exerted on each tool in the last step.
 
     Args:

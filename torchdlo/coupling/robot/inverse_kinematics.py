@@ -29,8 +29,8 @@ import torch
 from torch import Tensor
 
 from torchdlo.coupling.bodies.dynamics import turn_between
-from torchdlo.coupling.common.pose import Pose, from_matrix, within
-from torchdlo.coupling.robot.kinematics import Robot, check_joints, jacobian, tool_pose, transforms
+from torchdlo.coupling.common.pose import Pose, from_matrix, relative_pose
+from torchdlo.coupling.robot.robot_kinematics import Robot, check_joints, jacobian, tool_pose, transforms
 from torchdlo.physics import tree
 from torchdlo.physics.linalg.numerics import safe_norm
 
@@ -282,7 +282,7 @@ def _repeated(problem: _Problem, count: int) -> _Problem:
     return dataclasses.replace(problem, target=target, **bounds)
 
 
-def solve(
+def solve_ik(
     robot: Robot,
     target: Pose,
     start: Tensor,
@@ -349,6 +349,6 @@ def _pose(
         reach = robot.velocity.to(start) * within_time
         lower, upper = torch.maximum(lower, start - reach), torch.minimum(upper, start + reach)
     base = tree.map(lambda x: x.to(start), robot.base)
-    seen = within(base, tree.map(lambda x: flat(x.to(start)), target))
+    seen = relative_pose(base, tree.map(lambda x: flat(x.to(start)), target))
     give = (0.5 * (high - low)).square() * on
     return _Problem(robot, seen, flat(posture.detach()), give, lower, upper), start, batch

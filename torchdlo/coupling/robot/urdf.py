@@ -58,7 +58,7 @@ class Joint:
 
 
 @dataclass(frozen=True, eq=False)
-class Shape:
+class CollisionShape:
     """A solid that stands for a link in contact."""
 
     link: str
@@ -77,7 +77,7 @@ class UrdfModel:
     name: str
     links: tuple[str, ...]
     joints: tuple[Joint, ...]
-    shapes: tuple[Shape, ...]
+    shapes: tuple[CollisionShape, ...]
 
 
 def near(name: str, known: tuple[str, ...] | list[str]) -> str:
@@ -86,7 +86,7 @@ def near(name: str, known: tuple[str, ...] | list[str]) -> str:
     return f"did you mean {like[0]!r}?" if like else f"known are {', '.join(known)}"
 
 
-def read(source: str | Path) -> UrdfModel:
+def read_urdf(source: str | Path) -> UrdfModel:
     """Read a URDF file, or URDF text that begins with "<"."""
     inline = isinstance(source, str) and source.lstrip().startswith("<")
     where = "urdf" if inline else str(source)
@@ -220,7 +220,7 @@ def _ordered(where: str, links: tuple[str, ...], joints: list[Joint]) -> tuple[J
     return tuple(found)
 
 
-def _shapes(where: str, link: xml.Element) -> list[Shape]:
+def _shapes(where: str, link: xml.Element) -> list[CollisionShape]:
     out = []
     for collision in link.findall("collision"):
         here = f"{where}: collision of link {link.get('name')!r}"
@@ -239,5 +239,5 @@ def _shapes(where: str, link: xml.Element) -> list[Shape]:
                 continue  # stands for no shape
             if min(size) <= 0:
                 raise InputError(f"{here}: <{element.tag}> has a size of {min(size):g}; expected positive numbers.")
-            out.append(Shape(link.get("name", ""), element.tag, size, _origin(here, collision)))
+            out.append(CollisionShape(link.get("name", ""), element.tag, size, _origin(here, collision)))
     return out

@@ -14,7 +14,7 @@ import math
 import torch
 from torch import Tensor
 
-from torchdlo.coupling.rod_contact.closest_points import closest
+from torchdlo.coupling.rod_contact.closest_points import closest_points
 from torchdlo.physics.linalg.numerics import safe_norm
 from torchdlo.physics.rod.kinematics import RodParams
 from torchdlo.physics.rod.topology import Topology, following
@@ -187,7 +187,7 @@ def near_pairs(
     mask = there & _steps_apart(topology, first, second) & _bend_apart(topology, params, first, second, thick)
     a = _points(pos, first), _points(after, first)
     b = _points(pos, second), _points(after, second)
-    s, t = closest(a, b)
+    s, t = closest_points(a, b)
     apart = safe_norm(a[0] + s * (a[1] - a[0]) - b[0] - t * (b[1] - b[0]))[..., 0]
     places, there, dropped = take(mask & (apart <= thick + 2 * reach[..., 0]), room)
     return torch.gather(first, -1, places), torch.gather(second, -1, places), there, dropped + lost

@@ -79,8 +79,10 @@ def find_candidates(view: View, carried: Tensor, room: int, burst: float) -> Val
     """
     topology, state, params = view.topology, view.state, view.params
     batch, size = state.pos.shape[:-2], topology.size
-    rods = scene_packing.stored([state.pos, state.vel, params.material.radius, params.rest.length], batch, size)
-    (moved,) = scene_packing.stored([carried], batch, carried.shape[-2])
+    rods = scene_packing.pack_components(
+        [state.pos, state.vel, params.material.radius, params.rest.length], batch, size
+    )
+    (moved,) = scene_packing.pack_components([carried], batch, carried.shape[-2])
     closed = [int(c) for c in topology.closed]
     at, real, lost, reach = torch.ops.torchdlo.rod_near(
         rods, moved, list(topology.counts), closed, room, broad_phase.FEW, view.dt, burst
@@ -90,13 +92,13 @@ def find_candidates(view: View, carried: Tensor, room: int, burst: float) -> Val
     return {
         "corners": at.permute(*range(2, at.dim()), 0, 1),
         "origin": state.pos,
-        **{name: scene_packing.logical(x, batch) for name, x in found.items()},
+        **{name: scene_packing.unpack_components(x, batch) for name, x in found.items()},
     }
 
 
-def beyond(pos: Tensor, values: Values) -> Tensor:
+def outrun_distance(pos: Tensor, values: Values) -> Tensor:
     """Return by how much vertices outran the find_candidates [m], shape (..., 1, 1), without derivative."""
     batch, size = values["corners"].shape[:-2], pos.shape[-2]
-    both = scene_packing.stored([pos.detach(), values["origin"].detach()], batch, size)
-    (reach,) = scene_packing.stored([values["reach"].detach()], batch, 1)
-    return scene_packing.logical(torch.ops.torchdlo.rod_outrun(*both, reach), batch)
+    both = scene_packing.pack_components([pos.detach(), values["origin"].detach()], batch, size)
+    (reach,) = scene_packing.pack_components([values["reach"].detach()], batch, 1)
+    return scene_packing.unpack_components(torch.ops.torchdlo.rod_outrun(*both, reach), batch)

@@ -18,7 +18,7 @@ PULL = 1e-3
 """Strength of the pull to the middle over the squared length."""
 
 
-def closest(a: tuple[Tensor, Tensor], b: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
+def closest_points(a: tuple[Tensor, Tensor], b: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
     """Return where the closest points of two segments lie, as shares of them, each of shape (..., 1).
 
     Args:

@@ -38,7 +38,7 @@ def length(x: Tensor) -> Tensor:
     return safe_norm(x[..., 1:, :] - x[..., :-1, :]).sum((-1, -2))
 
 
-def turns(x: Tensor, centre: Tensor) -> Tensor:
+def turning_angles(x: Tensor, centre: Tensor) -> Tensor:
     """Return the angles by which edges turn about a vertical axis [rad], shape (..., V - 1).
 
     Args:
@@ -53,7 +53,7 @@ def turns(x: Tensor, centre: Tensor) -> Tensor:
 def winding(x: Tensor, centre: Tensor) -> Tensor:
     """Return how often closed curves (..., V, 3) wind about a vertical axis at `centre` (..., 2) [1], shape (...)."""
     loop = torch.cat([x, x[..., :1, :]], -2)
-    return turns(loop, centre).sum(-1) / (2 * math.pi)
+    return turning_angles(loop, centre).sum(-1) / (2 * math.pi)
 
 
 def _apart(x: Tensor, least: int) -> tuple[Tensor, Tensor, Tensor]:
@@ -76,7 +76,7 @@ def crossing_number(x: Tensor) -> Tensor:
     return (integrand * far).sum((-1, -2)) / (4 * math.pi)
 
 
-def crowding(x: Tensor, reach: float) -> Tensor:
+def crowding_penalty(x: Tensor, reach: float) -> Tensor:
     """Return the sum of max(0, reach - r)^2 over ordered pairs of edges that are not neighbours [m^2], shape (...)."""
     _, r, far = _apart(x, 2)
     return ((reach - safe_norm(r).squeeze(-1)).clamp(min=0).square() * far).sum((-1, -2))
@@ -97,7 +97,7 @@ def _meetings(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     return skew & (s >= 0) & (s < 1) & (t >= 0) & (t < 1), s, t
 
 
-def pierced(x: Tensor, centre: Tensor, normal: Tensor, radius: float) -> Tensor:
+def pierced_edges(x: Tensor, centre: Tensor, normal: Tensor, radius: float) -> Tensor:
     """Return which edges of polylines (..., V, 3) pass through a disc, either way, bool, shape (..., V - 1).
 
     Args:
@@ -130,7 +130,7 @@ def crossing_places(x: Tensor, other: Tensor | None = None) -> Tensor:
     return (i + s[i, j]).sort().values
 
 
-def determinant(x: Tensor) -> Tensor:
+def knot_determinant(x: Tensor) -> Tensor:
     """Return the determinants of the knots that open curves make, 1 for the trivial one [1], shape (B,).
 
     It is the Alexander polynomial's magnitude at -1 (Alexander 1928, doi:10.1090/S0002-9947-1928-1501429-1): of all

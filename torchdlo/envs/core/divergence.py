@@ -7,13 +7,13 @@ from torch import Tensor
 
 from torchdlo.coupling.bodies import shape_sdf
 from torchdlo.coupling.bodies.dynamics import conjugate
-from torchdlo.physics.effects.base import altered
+from torchdlo.physics.effects.base import altered_params
 from torchdlo.physics.linalg.numerics import safe_norm
 from torchdlo.physics.linalg.rotation import rotate
 from torchdlo.physics.rod.kinematics import edge_vectors
 from torchdlo.scene import Params, Scene, State
 
-__all__ = ["broken", "inside"]
+__all__ = ["broken_lengths", "inside_bodies"]
 
 _OFF = 0.1
 """Share by which the edges of inextensible ropes may miss their lengths; solved ones miss them by 1e-6."""
@@ -22,7 +22,7 @@ _RIGID = 1e12
 """Axial stiffness from which ropes are inextensible [N]: effects have large numbers where ropes have infinite ones."""
 
 
-def inside(scene: Scene, params: Params, state: State, points: Tensor) -> Tensor:
+def inside_bodies(scene: Scene, params: Params, state: State, points: Tensor) -> Tensor:
     """Return which points [m], shape (B, N, 3), are inside a body that is not free, bool, shape (B, N)."""
     found = torch.zeros(points.shape[:-1], dtype=torch.bool, device=points.device)
     for k, body in enumerate(scene.bodies):
@@ -34,9 +34,9 @@ def inside(scene: Scene, params: Params, state: State, points: Tensor) -> Tensor
     return found
 
 
-def broken(scene: Scene, params: Params, state: State) -> Tensor:
+def broken_lengths(scene: Scene, params: Params, state: State) -> Tensor:
     """Return where inextensible ropes lost their lengths: numbers, but no motion; bool, shape (B,)."""
-    rods = altered(scene.effects, scene.topology, params.rods, params.effects)
+    rods = altered_params(scene.effects, scene.topology, params.rods, params.effects)
     rest = rods.rest
     length = safe_norm(edge_vectors(scene.topology, state.rods.pos, rest.edge_mask))
     fixed = (rods.material.stretch >= _RIGID) & (rest.edge_mask > 0)

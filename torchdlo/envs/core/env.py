@@ -221,7 +221,7 @@ class DloEnv(EnvBase):
         if self.task.release and bool(over.any()):
             world = tree.where(over, episodes.finish(self.episode, world), world)
         self.world = world
-        reward, _, terms = episodes.earned(self.episode, world)
+        reward, _, terms = episodes.episode_reward(self.episode, world)
         _warn_of_nan(self.task, action, reward)
         failed, over = world.failed.unsqueeze(-1), over.unsqueeze(-1)
         flags = {"terminated": failed, "truncated": over, "done": failed | over}

@@ -21,12 +21,12 @@ from torchdlo.coupling.bodies.dynamics import turn_by
 from torchdlo.coupling.common.pose import Pose
 from torchdlo.coupling.robot import attachment as grasp
 from torchdlo.coupling.robot.attachment import Grasp, Hands
-from torchdlo.envs.core.divergence import broken, inside
+from torchdlo.envs.core.divergence import broken_lengths, inside_bodies
 from torchdlo.envs.core.frames import guarded, run, slipped
-from torchdlo.envs.core.reach import FOLLOW, reachable, solve, standing
+from torchdlo.envs.core.reach import FOLLOW, reachable, solve_reach, standing
 from torchdlo.envs.core.stages import repeated
 from torchdlo.envs.core.task import Task, TaskState, combined, succeeded
-from torchdlo.envs.observations.state import observe, places
+from torchdlo.envs.observations.state import observe, scene_positions
 from torchdlo.errors import InputError
 from torchdlo.physics import tree
 from torchdlo.physics.linalg.numerics import safe_norm
@@ -40,13 +40,13 @@ __all__ = [
     "act",
     "begin",
     "follow",
-    "normalized",
+    "normalized_score",
     "observe",
-    "places",
     "play",
     "prepare",
     "prepare_at",
     "reachable",
+    "scene_positions",
 ]
 
 
@@ -145,7 +145,7 @@ def _begin(task: Task, scene: Scene, state: State, hands: Hands) -> EpisodeState
     failed = torch.zeros(x.shape[0], dtype=torch.bool, device=x.device)
     plan, none = task.schedule, torch.zeros_like(failed, dtype=torch.long)
     closed = plan.closed(none, target, x)
-    held = grasp.weld(scene, hands, scenes.stationary_control(scene, state), repeated(target, plan.room), closed)
+    held = grasp.close_hands(scene, hands, scenes.stationary_control(scene, state), repeated(target, plan.room), closed)
     world = EpisodeState(state, found.joints, target, target, held, {}, failed, none)
     seen = world.seen(task.arms.count)
     return tree.replace(world, notes={"rest": task.rest(seen, scene.topology), **task.note(seen)})
@@ -161,7 +161,7 @@ def _continued(task: Task, scene: Scene, state: State, hands: Hands, before: Epi
     )
     none = torch.zeros_like(failed, dtype=torch.long)
     closed = plan.closed(none, tool, x)
-    held = grasp.weld(scene, hands, scenes.stationary_control(scene, state), repeated(tool, plan.room), closed)
+    held = grasp.close_hands(scene, hands, scenes.stationary_control(scene, state), repeated(tool, plan.room), closed)
     notes = {name: t.expand(count, *t.shape[1:]) for name, t in before.notes.items()}
     return EpisodeState(state, joints, target, tool, held, notes, failed, none)
 
@@ -228,7 +228,7 @@ def prepare_at(
     return episode if not task.settle_steps else replace(episode, start=_settled(episode, world))
 
 
-def limited(task: Task, action: Tensor) -> tuple[Tensor, Tensor]:
+def limit_action(task: Task, action: Tensor) -> tuple[Tensor, Tensor]:
     """Return the ways [m] and turns [rad] of the tools that an action (B, A) asks for, (B, R, 3) each.
 
     Ways that are too long keep their direction.
@@ -246,7 +246,7 @@ def limited(task: Task, action: Tensor) -> tuple[Tensor, Tensor]:
 
 def _aim(task: Task, world: EpisodeState, action: Tensor) -> Pose:
     """Return the poses that an action asks the tools to take."""
-    way, turn = limited(task, action)
+    way, turn = limit_action(task, action)
     pos = world.target.pos + way
     # A tool that starts lower is not lifted by the rule, but may not go down.
     least = world.target.pos[..., 2:].detach().clamp(max=task.floor)
@@ -258,7 +258,7 @@ def _aim(task: Task, world: EpisodeState, action: Tensor) -> Pose:
 def follow(task: Task, world: EpisodeState, action: Tensor) -> tuple[Pose, Tensor]:
     """Return the poses that an action asks the tools to take, and joints that bring them there, shape (B, R, J)."""
     aim = _aim(task, world, action)
-    return aim, solve(task, aim, world.joints, FOLLOW).joints
+    return aim, solve_reach(task, aim, world.joints, FOLLOW).joints
 
 
 def act(episode: Episode, world: EpisodeState, action: Tensor) -> EpisodeState:
@@ -272,7 +272,7 @@ def act(episode: Episode, world: EpisodeState, action: Tensor) -> EpisodeState:
     aim, held = _aim(task, before, action), before.grasp
     if len(task.schedule.stages) > 1:
         aim, held = _staged(episode, before, aim)
-    found = solve(task, aim, before.joints, FOLLOW)
+    found = solve_reach(task, aim, before.joints, FOLLOW)
     state = run(episode, before, found.pose, held, task.fidelity.steps(task.frame_skip))
     held = tree.replace(held, closed=slipped(episode, state, found.pose, held.closed))
     after = EpisodeState(state, found.joints, found.handed, found.pose, held, world.notes, world.failed, world.count)
@@ -284,7 +284,7 @@ def _staged(episode: Episode, world: EpisodeState, aim: Pose) -> tuple[Pose, Gra
     plan, x = episode.task.schedule, world.state.rods.pos
     closed = plan.closed(world.count, world.tool, x, world.grasp.closed)
     now = scenes.stationary_control(episode.scene, world.state)
-    held = grasp.weld(episode.scene, episode.hands, now, repeated(world.tool, plan.room), closed, world.grasp)
+    held = grasp.close_hands(episode.scene, episode.hands, now, repeated(world.tool, plan.room), closed, world.grasp)
     return plan.steer(world.count, world.target, aim, x), held
 
 
@@ -299,8 +299,10 @@ def _judged(episode: Episode, before: EpisodeState, after: EpisodeState, lost: l
     after = tree.replace(after, notes={"rest": before.notes["rest"], **notes})
     seen = after.seen(task.arms.count)
     torn = (task.rest(seen, episode.scene.topology) > task.stretch * seen.notes["rest"]).any(-1)
-    stuck = (inside(episode.scene, episode.params, after.state, after.tool.pos) & (seen.closed[..., 0] > 0)).any(-1)
-    lost.append(~good | broken(episode.scene, episode.params, after.state))
+    stuck = (inside_bodies(episode.scene, episode.params, after.state, after.tool.pos) & (seen.closed[..., 0] > 0)).any(
+        -1
+    )
+    lost.append(~good | broken_lengths(episode.scene, episode.params, after.state))
     return tree.replace(after, failed=before.failed | lost[0] | torn | stuck | task.failed(seen))
 
 
@@ -316,7 +318,7 @@ def finish(episode: Episode, world: EpisodeState) -> EpisodeState:
     return _judged(episode, world, tree.replace(before, state=state, grasp=held, notes=world.notes), lost)
 
 
-def earned(episode: Episode, world: EpisodeState) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
+def episode_reward(episode: Episode, world: EpisodeState) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
     """Return the reward of the last action, its loss, and the terms of the reward, shape (B,) each."""
     task, seen = episode.task, world.seen(episode.task.arms.count)
     terms = task.rewards(seen)
@@ -340,7 +342,7 @@ def play(
         task: the task.
         actions: shape (B, T, A), in metres and degrees; one sequence per scene, of any length.
         episode: what `prepare` returned for B scenes; made if not given.
-        keep: what to keep of the world after every action, such as `places`.
+        keep: what to keep of the world after every action, such as `scene_positions`.
         callback: told (actions done, actions in all) after each.
         choices: of `prepare`.
     """
@@ -364,7 +366,7 @@ def play(
         world = act(episode, world, actions[:, k])
         if k + 1 == count:
             world = finish(episode, world)
-        rows.append(earned(episode, world))
+        rows.append(episode_reward(episode, world))
         path.append(keep(world))
         if callback is not None:
             callback(k + 1, count)
@@ -375,7 +377,7 @@ def play(
     return EpisodeResult(rewards.sum(0), loss, short, success, world.failed, rewards, terms, world, tree.stack(path))
 
 
-def normalized(task: Task, returns: Tensor, **choices: Any) -> Tensor:
+def normalized_score(task: Task, returns: Tensor, **choices: Any) -> Tensor:
     """Return scores of episodes: 0 for doing nothing, 1 for the scripted demonstration of `Task.demonstration`, shape
     of `returns`.
 

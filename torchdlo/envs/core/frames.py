@@ -64,7 +64,9 @@ def run(episode: Episode, world: EpisodeState, tool: Pose, held: Grasp, count: i
     turn = turn_between(world.tool.quat, tool.quat)
     last = world.tool.quat.expand(count, *world.tool.quat.shape)
     poses = Pose(x + share * (tool.pos - x), multiply(turn_by(share * turn), last))
-    pos, director, attachment_weight = grasp.carry(episode.hands, held, repeated(poses, episode.task.schedule.room))
+    pos, director, attachment_weight = grasp.carry_attachments(
+        episode.hands, held, repeated(poses, episode.task.schedule.room)
+    )
     bodies: Any = ()
     if episode.scene.bodies:
         still = scenes.stationary_control(episode.scene, world.state).bodies
@@ -85,7 +87,7 @@ def slipped(episode: Episode, state: State, tool: Pose, closed: Tensor) -> Tenso
     if math.isinf(task.arms.grip_force):
         return closed
     tool = repeated(tool, task.schedule.room)
-    force, _ = grasp.felt(episode.scene, episode.hands, state, tool)
+    force, _ = grasp.tool_wrench(episode.scene, episode.hands, state, tool)
     normal = rotate(tool.quat, force.new_tensor([0.0, 1.0, 0.0]).expand_as(force))
     along = force - normal * (force * normal).sum(-1, keepdim=True)
     return torch.where(safe_norm(along) > 2 * task.arms.mu * task.arms.grip_force, 0.0, closed)

@@ -10,13 +10,13 @@ from torch import Tensor
 
 from torchdlo.coupling.common.pose import Pose
 from torchdlo.coupling.robot import inverse_kinematics
-from torchdlo.coupling.robot.kinematics import Robot, panda
+from torchdlo.coupling.robot.robot_kinematics import Robot, panda
 from torchdlo.physics import tree
 
 if TYPE_CHECKING:
     from torchdlo.envs.core.task import Task
 
-__all__ = ["FOLLOW", "reachable", "solve", "standing"]
+__all__ = ["FOLLOW", "reachable", "solve_reach", "standing"]
 
 POSTURE = (1.56, -0.72, -0.02, -2.09, 0.04, 1.33, 2.4, 0.0)
 """Where joints would like to be [rad], and how far the fingers are open [m]."""
@@ -35,11 +35,13 @@ def _bases(task: Task, like: Tensor) -> Tensor:
     return like.new_tensor(task.arms.base)
 
 
-def solve(task: Task, target: Pose, joints: Tensor, search: inverse_kinematics.IkSearch) -> inverse_kinematics.Solution:
+def solve_reach(
+    task: Task, target: Pose, joints: Tensor, search: inverse_kinematics.IkSearch
+) -> inverse_kinematics.Solution:
     """Return where joints bring the tools to their targets. All arms are alike, so they are one more batch axis."""
     base = _bases(task, joints)
     wanted = Pose(target.pos - base, target.quat)
-    found = inverse_kinematics.solve(_robot(), wanted, joints, search=search, posture=joints.new_tensor(POSTURE))
+    found = inverse_kinematics.solve_ik(_robot(), wanted, joints, search=search, posture=joints.new_tensor(POSTURE))
     moved = [Pose(p.pos + base, p.quat) for p in (found.pose, found.handed)]
     return tree.replace(found, pose=moved[0], handed=moved[1])
 
@@ -50,10 +52,10 @@ def standing(task: Task, target: Pose) -> inverse_kinematics.Solution:
     posture = target.pos.new_tensor(POSTURE).expand(*target.pos.shape[:-1], -1)
     off = target.pos - _bases(task, target.pos)
     facing = torch.cat([torch.atan2(off[..., 1:2], off[..., :1]), posture[..., 1:]], -1)
-    plain = tree.detach(solve(task, target, facing, inverse_kinematics.IkSearch()))
+    plain = tree.detach(solve_reach(task, target, facing, inverse_kinematics.IkSearch()))
     if bool(plain.converged.all()):
         return plain
-    found = tree.detach(solve(task, target, posture, FIND))
+    found = tree.detach(solve_reach(task, target, posture, FIND))
     return tree.where(plain.converged, plain, found)
 
 

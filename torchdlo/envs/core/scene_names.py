@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from torchdlo.envs.core.task import Task, TaskState
     from torchdlo.scene import Scene
 
-__all__ = ["Layout", "layout", "named", "table"]
+__all__ = ["Layout", "layout", "named_values", "names_table"]
 
 _KINDS = {"torus": "ring", "ring": "ring", "cylinder": "post"}
 """What bodies are called by their shapes, if not by a name of their own."""
@@ -82,7 +82,7 @@ def _makers(task: Task, here: Layout) -> dict[str, tuple[str, Callable[[TaskStat
     return found
 
 
-def named(task: Task, here: Layout, seen: TaskState, wanted: Collection[str] | None = None) -> dict[str, Tensor]:
+def named_values(task: Task, here: Layout, seen: TaskState, wanted: Collection[str] | None = None) -> dict[str, Tensor]:
     """Return what names stand for, "time" first; all of them unless some are wanted.
 
     Args:
@@ -99,11 +99,11 @@ def named(task: Task, here: Layout, seen: TaskState, wanted: Collection[str] | N
     return {n: x.to(seen.x.dtype) if not x.is_floating_point() else x for n, x in found.items()}
 
 
-def table(task: Task, here: Layout, seen: TaskState) -> list[dict[str, str]]:
+def names_table(task: Task, here: Layout, seen: TaskState) -> list[dict[str, str]]:
     """Return what a scene offers: name, shape, what it is, and its present value in the first scene."""
     docs = {name: doc for name, (doc, _) in _makers(task, here).items()} | task.measured()
     rows = []
-    for name, value in named(task, here, seen).items():
+    for name, value in named_values(task, here, seen).items():
         shape = "number" if value.dim() == 1 else "point" if value.dim() == 2 else f"{value.shape[1]} points"
         rows.append({"name": name, "shape": shape, "what": docs[name], "now": _said(value[0])})
     return rows

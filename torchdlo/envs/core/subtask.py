@@ -27,7 +27,7 @@ from torchdlo.physics import tree
 from torchdlo.reward_language import Reward
 from torchdlo.scene import Params, Scene, State
 
-__all__ = ["SubTask", "concluded", "continue_from", "opening", "rewarded"]
+__all__ = ["SubTask", "continue_from", "opening", "task_success", "with_reward"]
 
 _SAME = ("name", "arms", "floor", "max_translation", "max_rotation", "stretch", "travel", "anchored")
 """What a part has from its task."""
@@ -35,7 +35,7 @@ _SAME = ("name", "arms", "floor", "max_translation", "max_rotation", "stretch", 
 
 @dataclass(frozen=True, eq=False)
 class SubTask(Task):
-    """A part of a task. `continue_from` and `rewarded` make it."""
+    """A part of a task. `continue_from` and `with_reward` make it."""
 
     inner: Task = None  # type: ignore[assignment]
     """The task, with what hands hold here."""
@@ -83,7 +83,7 @@ class SubTask(Task):
     def _check(self, reward: Reward) -> None:
         """Refuse expressions that this scene has no values for, with a scene as it is at the start."""
         here, seen = opening(self)
-        values = scene_names.named(self.inner, here, seen)
+        values = scene_names.named_values(self.inner, here, seen)
         reward.evaluate(values)
         reward.succeeded(values)
 
@@ -105,7 +105,7 @@ class SubTask(Task):
         return self.before
 
     def _values(self, seen: TaskState, names: frozenset[str]) -> dict[str, Tensor]:
-        return scene_names.named(self.inner, self.layout, seen, names)
+        return scene_names.named_values(self.inner, self.layout, seen, names)
 
     def rewards(self, seen: TaskState) -> dict[str, Tensor]:
         """Return the terms of the reward."""
@@ -170,7 +170,7 @@ def opening(task: Task, state: State | None = None) -> tuple[scene_names.Layout,
     return here, tree.replace(seen, notes=task.note(seen))
 
 
-def rewarded(task: Task, reward: Reward) -> SubTask:
+def with_reward(task: Task, reward: Reward) -> SubTask:
     """Return a task with another reward, and another condition of success if the reward has one."""
     return SubTask(**_fields(task), inner=task, reward=reward)
 
@@ -218,7 +218,7 @@ def continue_from(
     return SubTask(**fields, inner=inner, before=before, reward=reward, kept=kept)
 
 
-def concluded(episode: Episode, world: EpisodeState, task: Task) -> tuple[Tensor, EpisodeState]:
+def task_success(episode: Episode, world: EpisodeState, task: Task) -> tuple[Tensor, EpisodeState]:
     """Return where the task itself is done, bool, shape (B,), and the world in which that was judged.
 
     Args:

@@ -26,7 +26,7 @@ from torchdlo.envs.assets.rope_material import RopeMaterial
 from torchdlo.envs.core import curve_geometry
 from torchdlo.envs.core.fidelity import PUBLISHED, Fidelity
 from torchdlo.envs.core.stages import Schedule, Stage
-from torchdlo.envs.core.waypoints import even, through
+from torchdlo.envs.core.waypoints import actions_through, resample_evenly
 from torchdlo.envs.observations.cameras import TaskCamera
 from torchdlo.errors import InputError
 from torchdlo.physics import tree
@@ -45,13 +45,13 @@ __all__ = [
     "Stage",
     "Task",
     "TaskState",
+    "actions_through",
     "combined",
-    "even",
     "make",
     "raised",
+    "resample_evenly",
     "settled",
     "straight",
-    "through",
 ]
 
 RADIUS, SPACING = 0.01, 0.02
@@ -277,7 +277,7 @@ class Task(ABC):
         if len(stage_waypoints) != len(off):
             raise InputError(f"{self.name}: its demonstration is one for its own grasps; leave other grasps out.")
         legs = zip(stage_waypoints, self.schedule.actions(self.horizon), off, strict=True)
-        return torch.cat([through(*leg, max_translation=self.max_translation) for leg in legs], -2)
+        return torch.cat([actions_through(*leg, max_translation=self.max_translation) for leg in legs], -2)
 
     def _strays(self, start: State) -> list[Tensor]:
         """Return what each stage's way takes besides to lead to the same places from another start [m], (B, R, 3)."""
@@ -443,4 +443,4 @@ def raised(flat: Tensor, places: Tensor, width: float = 1.7) -> Tensor:
     """
     index = torch.arange(len(flat), dtype=flat.dtype)[:, None]
     rise = torch.exp(-((index - places) / width).square()).sum(-1, keepdim=True)
-    return even(torch.cat([flat[:, :2], RADIUS * (1.05 + 2.6 * rise)], -1), len(flat))
+    return resample_evenly(torch.cat([flat[:, :2], RADIUS * (1.05 + 2.6 * rise)], -1), len(flat))

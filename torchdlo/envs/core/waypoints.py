@@ -7,10 +7,10 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-__all__ = ["even", "through"]
+__all__ = ["actions_through", "resample_evenly"]
 
 
-def through(
+def actions_through(
     points: Sequence[Sequence[tuple[float, float, float]]], horizon: int, off: Tensor, *, max_translation: float = 0.01
 ) -> Tensor:
     """Return actions that lead tools through points and then keep them there, shape (..., horizon, 6 arms).
@@ -39,7 +39,7 @@ def through(
     return torch.cat([xyz, torch.zeros_like(xyz)], -1)
 
 
-def even(curve: Tensor, count: int) -> Tensor:
+def resample_evenly(curve: Tensor, count: int) -> Tensor:
     """Return `count` vertices along a dense curve (n, 3), at even distances along it."""
     along = torch.cat([curve.new_zeros(1), (curve[1:] - curve[:-1]).norm(dim=-1).cumsum(0)])
     wanted = torch.linspace(0, 1, count, dtype=curve.dtype) * along[-1]

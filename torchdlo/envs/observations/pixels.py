@@ -9,16 +9,16 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from torchdlo.coupling.robot.kinematics import Robot, panda
+from torchdlo.coupling.robot.robot_kinematics import Robot, panda
 from torchdlo.envs.core.episode import Episode
 from torchdlo.envs.observations.cameras import WRIST_EYE, WRIST_TARGET, TaskCamera, front_camera, wrist_names
 from torchdlo.errors import InputError
 from torchdlo.scene import State
 from torchdlo.vision.look import Look
-from torchdlo.vision.renderer import ROPE, Images, Model, Pinhole, intrinsics, looking_at, render
+from torchdlo.vision.renderer import ROPE, Images, Pinhole, RenderModel, intrinsics, looking_at, render
 from torchdlo.vision.scene_geometry import arm_frame, model_of, placement_of
 
-__all__ = ["CLOUD", "CameraRig", "camera_rig", "cameras_of", "rendered", "rope_points", "views"]
+__all__ = ["CLOUD", "CameraRig", "camera_rig", "cameras_of", "render_cameras", "rope_points", "views"]
 
 MARGIN = 0.35
 """How far the table goes on beyond arms and ropes [m]."""
@@ -32,7 +32,7 @@ CLOUD = 384
 class CameraRig:
     """A scene with the cameras of its task, ready to draw."""
 
-    model: Model
+    model: RenderModel
     arms: tuple[Robot, ...]
     bases: Tensor
     """Where the arms stand [m], shape (R, 3)."""
@@ -142,7 +142,7 @@ def views(rig: CameraRig, state: State, joints: Tensor) -> Pinhole:
     return _placed(rig, state, joints)[1]
 
 
-def rendered(
+def render_cameras(
     rig: CameraRig,
     state: State,
     joints: Tensor,

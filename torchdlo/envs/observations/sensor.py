@@ -10,7 +10,15 @@ import torch
 from torch import Tensor
 
 from torchdlo.envs.core.episode import Episode, EpisodeState
-from torchdlo.envs.observations.pixels import CLOUD, CameraRig, PointCloud, camera_rig, rendered, rope_points, views
+from torchdlo.envs.observations.pixels import (
+    CLOUD,
+    CameraRig,
+    PointCloud,
+    camera_rig,
+    render_cameras,
+    rope_points,
+    views,
+)
 from torchdlo.errors import InputError
 from torchdlo.vision.look import Look
 
@@ -53,7 +61,7 @@ class Sensor:
         rig, points = self.rig, bool(self.points)
         given = {"looks": looks, "samples": self.samples, "shadow": self.shadow}
         asked = {"rgb": self.pixels, "depth": self.depth or points, "ids": self.masks or points}
-        seen = rendered(rig, world.state, world.joints, **given, **asked)
+        seen = render_cameras(rig, world.state, world.joints, **given, **asked)
         parts = {"pixels": seen.rgb, "masks": seen.ids, "depth": seen.depth}
         found: dict[str, dict[str, Tensor] | Tensor] = {}
         for kind in self.shapes():

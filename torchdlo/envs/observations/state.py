@@ -10,7 +10,7 @@ from torch import Tensor
 if TYPE_CHECKING:
     from torchdlo.envs.core.episode import Episode, EpisodeState
 
-__all__ = ["observe", "places"]
+__all__ = ["observe", "scene_positions"]
 
 ELBOWS = 7
 """Joints of an arm that are observed."""
@@ -33,6 +33,6 @@ def observe(episode: Episode, world: EpisodeState) -> Tensor:
     return torch.cat([p.flatten(-2) for p in parts], -1).to(torch.float32)
 
 
-def places(world: EpisodeState) -> dict[str, Tensor]:
+def scene_positions(world: EpisodeState) -> dict[str, Tensor]:
     """Return where things are: "pos" (B, V, 3) of the ropes, "tool" (B, R, 3) and "joints" (B, R, J)."""
     return {"pos": world.state.rods.pos, "tool": world.tool.pos, "joints": world.joints}

@@ -61,11 +61,11 @@ class Coiling(Task):
 
     def success(self, seen: TaskState) -> Tensor:
         """Return whether the rope turns by a whole turn within 6 cm of the cone."""
-        return wound(seen.x).abs() >= 2 * math.pi
+        return winding_angle(seen.x).abs() >= 2 * math.pi
 
     def measures(self, seen: TaskState) -> dict[str, Tensor]:
         """Return by how many turns the rope goes round the cone."""
-        return {"turns": wound(seen.x) / (2 * math.pi)}
+        return {"turns": winding_angle(seen.x) / (2 * math.pi)}
 
     def measured(self) -> dict[str, str]:
         """Return what it is."""
@@ -76,7 +76,7 @@ class Coiling(Task):
 
         Half of it counts what turns further out, too, by less the further: the other half does not say how to get near.
         """
-        done = torch.stack([wound(seen.x), wound(seen.x, FADE)]).abs() / (1 + SPARE) / (2 * math.pi)
+        done = torch.stack([winding_angle(seen.x), winding_angle(seen.x, FADE)]).abs() / (1 + SPARE) / (2 * math.pi)
         return SHORT * (1 - done).clamp(min=0).mean(0)
 
     def waypoints(self) -> list[list[tuple[float, float, float]]]:
@@ -96,7 +96,7 @@ class Coiling(Task):
         return [[point] for point in way]
 
 
-def wound(x: Tensor, fade: float = 0.0) -> Tensor:
+def winding_angle(x: Tensor, fade: float = 0.0) -> Tensor:
     """Return by how much curves turn round the cone where they are near it [rad], shape (...).
 
     Args:
@@ -108,4 +108,4 @@ def wound(x: Tensor, fade: float = 0.0) -> Tensor:
     slant = math.hypot(BASE, HEIGHT)
     out = ((safe_norm(across[..., :2]).squeeze(-1) - BASE) * HEIGHT + across[..., 2] * BASE) / slant - RADIUS
     share = torch.exp(-(out - NEAR).clamp(min=0) / fade) if fade else out <= NEAR
-    return (curve_geometry.turns(x, x.new_zeros(2)) * share).sum(-1)
+    return (curve_geometry.turning_angles(x, x.new_zeros(2)) * share).sum(-1)

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from torchdlo.coupling.bodies.dynamics import RigidBody
 from torchdlo.envs.core.task import RADIUS, Arms, Task, TaskState, make, straight
-from torchdlo.envs.tasks.coiling import BASE, HEIGHT, wound
+from torchdlo.envs.tasks.coiling import BASE, HEIGHT, winding_angle
 from torchdlo.physics.linalg.numerics import safe_norm
 from torchdlo.scene import Params, Rope, Scene, State
 
@@ -50,12 +50,12 @@ class _CoilingAbout(Task):
         """Return how near the rope is to the cone, as in Coiling, and the turns in the task's direction, up to 1."""
         missing = safe_norm(seen.x - seen.x.new_tensor([0.0, 0.0, HEIGHT / 2])).sum((-1, -2))
         # Vertices are counted from the end that the hand leads, against its way.
-        turns = -self.side * wound(seen.x) / (2 * math.pi)
+        turns = -self.side * winding_angle(seen.x) / (2 * math.pi)
         return {"near": torch.exp(-0.1 * missing), "turned": turns.clamp(-1, 1)}
 
     def success(self, seen: TaskState) -> Tensor:
         """Return whether the rope turns by a whole turn in the task's direction."""
-        return -self.side * wound(seen.x) >= 2 * math.pi
+        return -self.side * winding_angle(seen.x) >= 2 * math.pi
 
     def waypoints(self) -> list[list[tuple[float, float, float]]]:
         """Return a way up beside the cone and round it."""

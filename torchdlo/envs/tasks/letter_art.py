@@ -48,7 +48,7 @@ CLOSE = 0.015
 """How near the letters are to be to their goals [m]."""
 
 
-def rounded(corners: tuple[tuple[float, float], ...]) -> tuple[Tensor, Tensor]:
+def round_corners(corners: tuple[tuple[float, float], ...]) -> tuple[Tensor, Tensor]:
     """Return a dense curve (n, 2) through corners that are rounded by `ROUND`, and the centres of the arcs (m, 2)."""
     points = torch.tensor(corners, dtype=torch.float64)
     parts, centres = [points[:1]], []
@@ -69,9 +69,9 @@ def rounded(corners: tuple[tuple[float, float], ...]) -> tuple[Tensor, Tensor]:
 
 
 @functools.cache
-def goals() -> tuple[Tensor, ...]:
+def goal_vertices() -> tuple[Tensor, ...]:
     """Return where the vertices of the wires belong, shapes (V, 3)."""
-    return tuple(_spaced(rounded(c)[0], n) for c, n in zip(CORNERS, COUNTS, strict=True))
+    return tuple(_spaced(round_corners(c)[0], n) for c, n in zip(CORNERS, COUNTS, strict=True))
 
 
 def _spaced(curve: Tensor, count: int) -> Tensor:
@@ -85,9 +85,9 @@ def _spaced(curve: Tensor, count: int) -> Tensor:
 
 
 @functools.cache
-def posts() -> tuple[tuple[float, float], ...]:
+def post_axes() -> tuple[tuple[float, float], ...]:
     """Return the axes of the posts [m]: the centres of all rounded corners."""
-    return tuple((float(x), float(y)) for c in CORNERS for x, y in rounded(c)[1])
+    return tuple((float(x), float(y)) for c in CORNERS for x, y in round_corners(c)[1])
 
 
 @dataclass(frozen=True)
@@ -112,7 +112,7 @@ class LetterArt(Task):
             line = torch.stack([0 * along, -along, 0 * along], -1) + moved.new_tensor([*start, RADIUS])
             x = line + moved[:, k : k + 1]
             wires.append(Rope(x, RADIUS, mass=1e-3 * (count - 1), youngs=stiffness, stretch=1e5 * area))
-        solids = [RigidBody("cylinder", (POST, TOP / 2), (*p, TOP / 2), motion="fixed") for p in posts()]
+        solids = [RigidBody("cylinder", (POST, TOP / 2), (*p, TOP / 2), motion="fixed") for p in post_axes()]
         solids.append(RigidBody("torus", (RING, RADIUS), (*MIDDLE, RADIUS), motion="fixed", name="O"))
         values = {"bending_plasticity": PLASTIC}
         return make(self, wires, [BendFrame(), BendingPlasticity()], values, solids=solids)
@@ -120,7 +120,7 @@ class LetterArt(Task):
     def missing(self, seen: TaskState) -> tuple[Tensor, Tensor]:
         """Return how far the D and the L are from their goals [m], shape (B,) each."""
         stem, bow, ell = seen.x.split(COUNTS, -2)
-        goal = [g.to(seen.x).expand(len(seen.x), -1, -1) for g in goals()]
+        goal = [g.to(seen.x).expand(len(seen.x), -1, -1) for g in goal_vertices()]
         return curve_geometry.chamfer(torch.cat([stem, bow], -2), torch.cat(goal[:2], -2)), curve_geometry.chamfer(
             ell, goal[2]
         )
@@ -132,7 +132,7 @@ class LetterArt(Task):
 
     def measures(self, seen: TaskState) -> dict[str, Tensor]:
         """Return where the wires belong."""
-        return {f"goal_{k}": g.to(seen.x).expand(len(seen.x), -1, -1) for k, g in enumerate(goals())}
+        return {f"goal_{k}": g.to(seen.x).expand(len(seen.x), -1, -1) for k, g in enumerate(goal_vertices())}
 
     def measured(self) -> dict[str, str]:
         """Return what they are."""

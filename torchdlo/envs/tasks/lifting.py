@@ -99,7 +99,7 @@ class Lifting(Task):
         """
         rings, x = self._rings(seen).unsqueeze(-2), seen.x.unsqueeze(-3)
         side = x[..., 0] - rings[..., 0]
-        way = safe_norm(torch.stack([side, into(x[..., 1:] - rings[..., 1:])], -1)).squeeze(-1).amin(-1)
+        way = safe_norm(torch.stack([side, distance_into_ring(x[..., 1:] - rings[..., 1:])], -1)).squeeze(-1).amin(-1)
         start = x.new_tensor([c[2] for c in CENTRES])
         low = (1 - (rings[..., 0, 2] - start) / LIFT).clamp(min=0)
         return (AWAY * (way - CLOSE).clamp(min=0) + LOW * low).sum(-1)
@@ -110,7 +110,7 @@ class Lifting(Task):
         return [[(-0.0025, y, z), (0.0225, y, z)] for y, z in way]
 
 
-def into(p: Tensor) -> Tensor:
+def distance_into_ring(p: Tensor) -> Tensor:
     """Return how far it is to the top of an upright ring's hole, over it and through its gap [m], shape (...).
 
     Args:

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from torchdlo.envs.core import curve_geometry
-from torchdlo.envs.core.task import RADIUS, SPACING, Arms, Task, TaskState, even, make, raised, settled
+from torchdlo.envs.core.task import RADIUS, SPACING, Arms, Task, TaskState, make, raised, resample_evenly, settled
 from torchdlo.scene import Params, Rope, Scene, State
 
 __all__ = ["Separation"]
@@ -40,7 +40,7 @@ def laid() -> Tensor:
     angle = step * ((COUNT - 1) * SPACING - 0.3 - AHEAD) / HOOK
     turn = line[-1] - HOOK * left + HOOK * (angle.cos() * left + angle.sin() * ahead)
     flat = torch.cat([line, turn[1:]])
-    second = even(torch.cat([flat, 0 * flat[:, :1]], -1), COUNT)
+    second = resample_evenly(torch.cat([flat, 0 * flat[:, :1]], -1), COUNT)
     over, back = curve_geometry.crossing_places(first, second), curve_geometry.crossing_places(second, first)
     return torch.cat([raised(first, over[:1], 5.0), raised(second, back[1:])])
 

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from torchdlo.envs.core import curve_geometry
-from torchdlo.envs.core.task import RADIUS, SPACING, Arms, Task, TaskState, even, make, raised, settled
+from torchdlo.envs.core.task import RADIUS, SPACING, Arms, Task, TaskState, make, raised, resample_evenly, settled
 from torchdlo.envs.observations.cameras import TaskCamera
 from torchdlo.scene import Params, Rope, Scene, State
 
@@ -37,7 +37,7 @@ def tied() -> Tensor:
     out = torch.linspace(0, 7.0, 500, dtype=torch.float64)[1:, None]
     curve = torch.cat([x[0] + before / before.norm() * out.flip(0), x, x[-1] + after / after.norm() * out])
     curve = curve * ((COUNT - 1) * SPACING / float((curve[1:] - curve[:-1]).norm(dim=-1).sum()))
-    flat = even(torch.cat([curve, 0 * curve[:, :1]], -1), COUNT)
+    flat = resample_evenly(torch.cat([curve, 0 * curve[:, :1]], -1), COUNT)
     middle = 0.5 * (flat.amax(0) + flat.amin(0))
     return raised(flat - middle + flat.new_tensor([0.7, -0.1, 0.0]), curve_geometry.crossing_places(flat)[1::2])
 
@@ -72,7 +72,7 @@ class Unknotting(Task):
         """Return exponentials of minus the average crossing number and of how closely the rope lies to itself."""
         return {
             "crossings": torch.exp(-curve_geometry.crossing_number(seen.x)),
-            "clear": torch.exp(-100 * curve_geometry.crowding(seen.x, 0.04)),
+            "clear": torch.exp(-100 * curve_geometry.crowding_penalty(seen.x, 0.04)),
         }
 
     def measures(self, seen: TaskState) -> dict[str, Tensor]:
@@ -80,7 +80,7 @@ class Unknotting(Task):
         return {
             "crossings": curve_geometry.crossings(seen.x).to(seen.x.dtype),
             "crossing_number": curve_geometry.crossing_number(seen.x),
-            "crowding": curve_geometry.crowding(seen.x, 0.04),
+            "crowding": curve_geometry.crowding_penalty(seen.x, 0.04),
         }
 
     def measured(self) -> dict[str, str]:
@@ -93,7 +93,7 @@ class Unknotting(Task):
 
     def success(self, seen: TaskState) -> Tensor:
         """Return whether the rope is not knotted and does not cross itself."""
-        return (curve_geometry.crossings(seen.x) == 0) & (curve_geometry.determinant(seen.x) == 1)
+        return (curve_geometry.crossings(seen.x) == 0) & (curve_geometry.knot_determinant(seen.x) == 1)
 
     def waypoints(self) -> list[list[tuple[float, float, float]]]:
         """Return a way back through the knot and then apart. It earns 30.5.

@@ -37,7 +37,7 @@ SHORT, SPARE = 30.0, 0.03
 
 
 @functools.cache
-def goal() -> Tensor:
+def goal_vertices() -> Tensor:
     """Return where the vertices belong, shape (30, 3): an S of arcs about the posts and the line that touches both."""
     a, b = (torch.tensor(p, dtype=torch.float64) for p in POSTS)
     # The inner common tangent of circles of equal radius crosses the line of their centres in its middle.
@@ -100,14 +100,14 @@ class WiringPost(Task):
         x = seen.x
         off = safe_norm(x[:, 15, :2] - x.new_tensor(MIDDLE)).squeeze(-1)
         return {
-            "goal": torch.exp(-curve_geometry.chamfer(x, goal().to(x).expand(len(x), -1, -1))),
+            "goal": torch.exp(-curve_geometry.chamfer(x, goal_vertices().to(x).expand(len(x), -1, -1))),
             "flat": torch.exp(-(x[..., 2] - 0.04).clamp(min=0).mean(-1)),
             "middle": torch.exp(-5 * (off - 0.02).clamp(min=0)),
         }
 
     def measures(self, seen: TaskState) -> dict[str, Tensor]:
         """Return the goal curve."""
-        return {"goal": goal().to(seen.x).expand(len(seen.x), -1, -1)}
+        return {"goal": goal_vertices().to(seen.x).expand(len(seen.x), -1, -1)}
 
     def measured(self) -> dict[str, str]:
         """Return what it is."""
@@ -135,8 +135,8 @@ class WiringPost(Task):
             near = curve_geometry.distances(x[..., :2], x.new_tensor(post).expand(len(x), 1, 2)).squeeze(-1)
             closest = torch.take_along_dim(x[..., 1], near.argmin(-1, keepdim=True), -1).squeeze(-1)
             beside.append(side * (closest - post[1]))
-            turn.append(bent(x, near).abs())
-        off = curve_geometry.chamfer(x, goal().to(x).expand(len(x), -1, -1))
+            turn.append(bending_near_posts(x, near).abs())
+        off = curve_geometry.chamfer(x, goal_vertices().to(x).expand(len(x), -1, -1))
         return torch.stack(beside, -1), torch.stack(turn, -1), off
 
     def waypoints(self) -> list[list[tuple[float, float, float]]]:
@@ -152,7 +152,7 @@ class WiringPost(Task):
         return [[point] for point in way]
 
 
-def bent(x: Tensor, near: Tensor, max_translation: float = 0.08) -> Tensor:
+def bending_near_posts(x: Tensor, near: Tensor, max_translation: float = 0.08) -> Tensor:
     """Return by how much curves change their direction in the top view within reach of a post [rad], shape (...).
 
     Args:

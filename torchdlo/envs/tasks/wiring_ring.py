@@ -68,7 +68,7 @@ class WiringRing(Task):
     def _passes(self, x: Tensor) -> Tensor:
         """Return which edges pass through the discs of the rings, bool, shape (B, 2, E)."""
         return torch.stack(
-            [curve_geometry.pierced(x, x.new_tensor(p), x.new_tensor(n), INNER) for p, n in _discs()], -2
+            [curve_geometry.pierced_edges(x, x.new_tensor(p), x.new_tensor(n), INNER) for p, n in _discs()], -2
         )
 
     def rewards(self, seen: TaskState) -> dict[str, Tensor]:
@@ -86,7 +86,7 @@ class WiringRing(Task):
         """Return where tools are (B, R, 3), and whether one went through a ring in the action before (B,)."""
         now = seen.tool.pos
         way = torch.stack([seen.notes.get("tool", now), now], -2)
-        through = [curve_geometry.pierced(way, way.new_tensor(p), way.new_tensor(n), OUTER) for p, n in _discs()]
+        through = [curve_geometry.pierced_edges(way, way.new_tensor(p), way.new_tensor(n), OUTER) for p, n in _discs()]
         return {"tool": now, "through": torch.stack(through).any(0).flatten(1).any(-1)}
 
     def failed(self, seen: TaskState) -> Tensor:

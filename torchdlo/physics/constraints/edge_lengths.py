@@ -233,7 +233,7 @@ def balance(
     """
     if lanes.ready(force):
         return _balanced(lengths, inertia, (free, tension), (moved, force, direction, ahead, scale), turning, steps)
-    system = System(lengths, inertia, moved, free, force, scale, direction, ahead, turning)
+    system = LengthSystem(lengths, inertia, moved, free, force, scale, direction, ahead, turning)
     with torch.no_grad():
         pos, impulse = _found(system, tension, steps)
     pos = torch.where(free > 0, pos, moved)
@@ -242,7 +242,7 @@ def balance(
 
 
 @dataclass(frozen=True)
-class System:
+class LengthSystem:
     """The equations of `balance`, whose arguments these are."""
 
     lengths: Lengths
@@ -333,7 +333,7 @@ def _done(like: Tensor) -> float:
     return 1e-6 if like.dtype == torch.float64 else 3e-4
 
 
-def _found(system: System, tension: Tensor, steps: int) -> tuple[Tensor, Tensor]:
+def _found(system: LengthSystem, tension: Tensor, steps: int) -> tuple[Tensor, Tensor]:
     """Return positions and impulses that Newton's method finds in so many steps at most, without gradient."""
     inputs, law = system.inputs(tension)
     found = torch.ops.torchdlo.balanced(inputs, system.lengths.topology.name, law, steps)
@@ -350,7 +350,7 @@ def _newton(inputs: list[Tensor], topology: str, law: list[float], steps: int) -
     lengths = Lengths(parse(topology), rest, compliance, active, mask, give, *law[1:3])
     inertia = Inertia(vertex, hinge, rest, mask, swing)
     force, direction, ahead = others
-    system = System(lengths, inertia, moved, free, force, scale, direction, ahead, law[0])
+    system = LengthSystem(lengths, inertia, moved, free, force, scale, direction, ahead, law[0])
     batch = torch.broadcast_shapes(*(x.shape[:-2] for x in inputs))
     pos, impulse = moved.expand(*batch, *moved.shape[-2:]), lengths.guess(tension) * scale
     impulse = impulse.expand(*batch, *impulse.shape[-2:])
@@ -386,7 +386,7 @@ def _balanced(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return what `balance` does, by a kernel."""
     (free, tension), (moved, force, direction, ahead, scale) = scalars, vectors
-    system = System(lengths, inertia, moved, free, force, scale, direction, ahead, turning)
+    system = LengthSystem(lengths, inertia, moved, free, force, scale, direction, ahead, turning)
     inputs, law = system.inputs(tension)
     law = (*law, steps, _done(force), 1.0)
     return tuple(lanes.apply("balance", lengths.topology.name, inputs, (3, 1, 3), "saddle", law))

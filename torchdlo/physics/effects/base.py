@@ -267,21 +267,23 @@ def parameters_of(
     return numbers
 
 
-def altered(effects: Iterable[Effect], topology: Topology, params: RodParams, values: dict[str, Values]) -> RodParams:
+def altered_params(
+    effects: Iterable[Effect], topology: Topology, params: RodParams, values: dict[str, Values]
+) -> RodParams:
     """Return the rods' parameters as all effects together change them."""
     for effect in _in_order(effects):
         params = effect.modify_material(topology, params, values.get(effect.name, {}))
     return params
 
 
-def observed(effects: Iterable[Effect], track: Track, values: dict[str, Values]) -> Tensor:
+def observed_markers(effects: Iterable[Effect], track: Track, values: dict[str, Values]) -> Tensor:
     """Return where markers are seen under all effects together [m], shape (..., F, M, 3)."""
     for effect in _in_order(effects):
         track = tree.replace(track, pos=effect.observe(track, values.get(effect.name, {})))
     return track.pos
 
 
-def total(effects: Iterable[Effect], view: View, params: dict[str, Values]) -> Values:
+def total_loads(effects: Iterable[Effect], view: View, params: dict[str, Values]) -> Values:
     """Return the sum of the loads of several effects."""
     loads: Values = {}
     for effect in effects:

@@ -11,13 +11,13 @@ from torch import Tensor
 from torchdlo.physics import tree
 from torchdlo.physics.effects.base import Effect, Param, Values
 from torchdlo.physics.effects.elastic import (
-    act,
-    answers,
-    closing,
+    bending_moments,
+    closing_stiffness,
     curvature,
     elastic_curvature,
-    greatest,
     hinge_stiffness,
+    moment_derivatives,
+    stiffness_bound,
 )
 from torchdlo.physics.linalg.numerics import dot, safe_norm
 from torchdlo.physics.rod.kinematics import RodParams, View
@@ -78,10 +78,12 @@ class InternalFriction(Effect):
         odd = 0.5 * (w[..., :1] * u[..., 1:] - w[..., 1:] * u[..., :1])
         return {
             **hinge.pull_back(view, moment),
-            **answers(view, hinge, moment, gradient * started * (even + _outer(w, u))),
+            **moment_derivatives(view, hinge, moment, gradient * started * (even + _outer(w, u))),
             "twist_skew": gradient * started * odd * (b1 * a2 - b2 * a1),
             # Turning back, friction is up to twice as stiff.
-            "hinge_stiffness": closing(gradient * (1 + safe_norm(before)), dot(hinge.binormal, hinge.binormal) / 4),
+            "hinge_stiffness": closing_stiffness(
+                gradient * (1 + safe_norm(before)), dot(hinge.binormal, hinge.binormal) / 4
+            ),
         }
 
     def update_memory(self, view: View, values: Values) -> Tensor:
@@ -111,14 +113,14 @@ class StiffeningBending(Effect):
         """Return the energy per hinge [J], shape (..., V, 1)."""
         strain = elastic_curvature(view, curvature(view))
         share = 0.25 * values["c"] / view.hinge_length.square()
-        return share * dot(act(hinge_stiffness(view), strain), strain) * dot(strain, strain)
+        return share * dot(bending_moments(hinge_stiffness(view), strain), strain) * dot(strain, strain)
 
     def loads(self, view: View, values: Values) -> Values:
         """Return the moment's loads and how they answer to bending and twist."""
         hinge = curvature(view)
         strain, stiffness = elastic_curvature(view, hinge), hinge_stiffness(view)
         share = 0.5 * values["c"] / view.hinge_length.square()
-        linear, square = act(stiffness, strain), dot(strain, strain)
+        linear, square = bending_moments(stiffness, strain), dot(strain, strain)
         work = dot(linear, strain)
         moment = share * (square * linear + work * strain)
         s1, s2 = stiffness[..., :1], stiffness[..., 1:2] if stiffness.shape[-1] > 1 else stiffness
@@ -128,9 +130,9 @@ class StiffeningBending(Effect):
         curved = dot(hinge.binormal, hinge.binormal) / 4
         return {
             **hinge.pull_back(view, moment),
-            **answers(view, hinge, moment, gradient),
+            **moment_derivatives(view, hinge, moment, gradient),
             # 3 c k^2 B along the curvature, the stiffest direction.
-            "hinge_stiffness": closing(6 * share * square * greatest(stiffness), curved),
+            "hinge_stiffness": closing_stiffness(6 * share * square * stiffness_bound(stiffness), curved),
         }
 
 

@@ -68,7 +68,7 @@ class Bend(Effect):
         after = slope / view.length * (view.before - cosine * view.tangent)
         before = slope * (view.tangent - cosine * view.before)
         gradient = after + view.next(before) / view.length
-        return {"gradient": gradient, "hinge_stiffness": closing(stiffness, (1 - cosine) / chi)}
+        return {"gradient": gradient, "hinge_stiffness": closing_stiffness(stiffness, (1 - cosine) / chi)}
 
 
 @dataclass(frozen=True)
@@ -152,14 +152,14 @@ def hinge_stiffness(view: View) -> Tensor:
     return view.params.material.bend / view.hinge_length * view.params.rest.hinge_mask
 
 
-def act(stiffness: Tensor, strain: Tensor) -> Tensor:
+def bending_moments(stiffness: Tensor, strain: Tensor) -> Tensor:
     """Return the moments of strains, both shape (..., V, 2), for a stiffness (..., V, 1, 2 or 3)."""
     if stiffness.shape[-1] < 3:
         return stiffness * strain
     return stiffness[..., :2] * strain + stiffness[..., 2:] * strain.flip(-1)
 
 
-def answers(view: View, hinge: Curvature, moment: Tensor, stiffness: Tensor) -> Values:
+def moment_derivatives(view: View, hinge: Curvature, moment: Tensor, stiffness: Tensor) -> Values:
     """Return how moments answer to the twists: parts of `LOADS` for a stiffness (..., V, 1, 2 or 3)."""
     s1 = stiffness[..., :1]
     s2 = s1 if stiffness.shape[-1] == 1 else stiffness[..., 1:2]
@@ -181,7 +181,7 @@ def answers(view: View, hinge: Curvature, moment: Tensor, stiffness: Tensor) -> 
     }
 
 
-def greatest(stiffness: Tensor) -> Tensor:
+def stiffness_bound(stiffness: Tensor) -> Tensor:
     """Return a bound on the stiffness over all directions, exact without coupling; shape (..., V, 1)."""
     if stiffness.shape[-1] == 1:
         return stiffness
@@ -204,19 +204,19 @@ class BendFrame(Effect):
     def energy(self, view: View, values: Values) -> Tensor:
         """Return the energy per hinge [J], shape (..., V, 1)."""
         strain = elastic_curvature(view, curvature(view))
-        return 0.5 * dot(act(hinge_stiffness(view), strain), strain)
+        return 0.5 * dot(bending_moments(hinge_stiffness(view), strain), strain)
 
     def loads(self, view: View, values: Values) -> Values:
         """Return gradients by the edges and torques."""
         hinge = curvature(view)
         stiffness = hinge_stiffness(view)
         natural = view.params.rest.curvature + view.state.plastic
-        moment = act(stiffness, hinge.kappa - natural)
+        moment = bending_moments(stiffness, hinge.kappa - natural)
         curved = dot(hinge.binormal, hinge.binormal) / 4
         return {
             **hinge.pull_back(view, moment),
-            **answers(view, hinge, moment, stiffness),
-            "hinge_stiffness": closing(greatest(stiffness), curved),
+            **moment_derivatives(view, hinge, moment, stiffness),
+            "hinge_stiffness": closing_stiffness(stiffness_bound(stiffness), curved),
         }
 
 
@@ -256,7 +256,7 @@ class Twist(Effect):
         }
 
 
-def closing(stiffness: Tensor, squared: Tensor) -> Tensor:
+def closing_stiffness(stiffness: Tensor, squared: Tensor) -> Tensor:
     """Return the bending moment per turning, given tan^2(angle/2): it grows as the hinge closes.
 
     Second derivative of 2 k tan^2(angle/2); capped, for hinges that are folded flat.

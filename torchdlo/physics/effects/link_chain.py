@@ -9,7 +9,7 @@ import torch
 
 from torchdlo.physics import tree
 from torchdlo.physics.effects.base import Effect, Param, Values
-from torchdlo.physics.effects.elastic import Twist, curvature, greatest, hinge_stiffness
+from torchdlo.physics.effects.elastic import Twist, curvature, hinge_stiffness, stiffness_bound
 from torchdlo.physics.kernels import lanes
 from torchdlo.physics.linalg.numerics import dot
 from torchdlo.physics.rod.kinematics import View
@@ -66,7 +66,7 @@ class _Joint:
     def __init__(self, view: View, values: Values) -> None:
         self.view, self.fast = view, lanes.ready(view.tangent)
         self.hinge, self.twist = curvature(view), Twist().strain(view)
-        self.bending = greatest(hinge_stiffness(view))
+        self.bending = stiffness_bound(hinge_stiffness(view))
         self.twisting = view.params.material.twist / view.hinge_length * view.params.rest.hinge_mask
         links = values["length"] / view.hinge_length
         self.links, self.some = links, links.abs() > 1e-4

@@ -129,7 +129,7 @@ class Recordings:
         return self._kept[key]
 
 
-class Recorded:
+class RecordedStep:
     """A step that is recorded when it is first used without gradients, and runs as it is where they are asked for.
 
     So it does where recording does not know one of its operations.

@@ -15,7 +15,7 @@ from torch import Tensor
 from torchdlo.physics import tree
 from torchdlo.physics.constraints import contact_penalty as penalty
 from torchdlo.physics.constraints.contact_penalty import Pairs, Touch
-from torchdlo.physics.constraints.edge_lengths import System
+from torchdlo.physics.constraints.edge_lengths import LengthSystem
 from torchdlo.physics.kernels import native
 from torchdlo.physics.linalg import banded
 
@@ -65,7 +65,7 @@ def _pairs(batch: torch.Size, pairs: Pairs | None, like: Tensor) -> tuple[Tensor
 
 
 def solve(
-    system: System,
+    system: LengthSystem,
     tension: Tensor,
     touch: Touch,
     pairs: Pairs | None,

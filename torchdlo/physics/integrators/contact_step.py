@@ -20,7 +20,7 @@ from torch import Tensor
 from torchdlo.physics import tree
 from torchdlo.physics.constraints import contact_penalty as penalty
 from torchdlo.physics.constraints.contact_penalty import HARD, Pairs, Touch
-from torchdlo.physics.constraints.edge_lengths import Inertia, Lengths, System, saddle_order
+from torchdlo.physics.constraints.edge_lengths import Inertia, Lengths, LengthSystem, saddle_order
 from torchdlo.physics.integrators import contact_kernel
 from torchdlo.physics.kernels import lanes
 from torchdlo.physics.linalg import banded, gather_scatter, low_rank
@@ -53,7 +53,7 @@ class Unknowns:
 class Touching:
     """The equations."""
 
-    system: System
+    system: LengthSystem
     touch: Touch
     origin: Tensor
     """Positions at the start of the substep [m], shape (..., V, 3)."""
@@ -241,7 +241,7 @@ def _slots(rows: Tensor, batch: tuple[int, ...], components: int) -> Tensor:
     return tree.logical(rows.reshape(components, -1, *batch))
 
 
-def solve(touching: Touching, tension: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
+def solve_contact_step(touching: Touching, tension: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Return positions, tensions, forces, forces of contact, wrenches on free bodies, and what is left unsolved.
 
     Args:
@@ -288,7 +288,7 @@ def _equations(
 ) -> tuple[Touching, Tensor]:
     rest, compliance, active, mask, give, hinge, swing, free, tension, vertex, moved, *others, scale = inputs
     lengths = Lengths(parse(topology), rest, compliance, active, mask, give, *law[1:3])
-    system = System(
+    system = LengthSystem(
         lengths, Inertia(vertex, hinge, rest, mask, swing), moved, free, others[0], scale, *others[1:], law[0]
     )
     between = Pairs(*pairs[:6], tuple(pairs[6:])) if pairs else None

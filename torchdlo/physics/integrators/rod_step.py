@@ -21,7 +21,7 @@ from torch import Tensor
 
 from torchdlo.physics import tree
 from torchdlo.physics.constraints.contact_penalty import Pairs, Touch, untouched
-from torchdlo.physics.constraints.edge_lengths import Inertia, Lengths, System, balance, project, solve_slots
+from torchdlo.physics.constraints.edge_lengths import Inertia, Lengths, LengthSystem, balance, project, solve_slots
 from torchdlo.physics.effects import base as effect
 from torchdlo.physics.effects.base import ContactForces, Effect, PredictedMotion, Values
 from torchdlo.physics.integrators import contact_step
@@ -103,9 +103,9 @@ def substep(
         The rods, what held them, and where bodies and matter would go with what is exerted on them.
     """
     topology, dt = settings.topology, settings.dt
-    params = effect.altered(settings.effects, topology, params, values)
+    params = effect.altered_params(settings.effects, topology, params, values)
     now = rod.view(topology, params, state, dt)
-    loads = effect.total(settings.effects, now, values)
+    loads = effect.total_loads(settings.effects, now, values)
     kick = _kick(settings, now, loads, first, targets)
     falling = loads.get("acceleration", 0.0)
     others = [None if f is None else f(falling) for f in (predict_free_motion, material_points)]
@@ -309,9 +309,9 @@ def _balance(
     if touch:
         pairs = next((x for x in touch if isinstance(x, Pairs)), None)
         points = next((x for x in touch if isinstance(x, Touch)), None) or untouched(now.state.pos)
-        system = System(lengths, inertia, moved, kick.free, force, scale, now.tangent, ahead, share)
+        system = LengthSystem(lengths, inertia, moved, kick.free, force, scale, now.tangent, ahead, share)
         touching = contact_step.Touching(system, points, now.state.pos, pairs, dt)
-        pos, tension, whole, exerted, wrench, left = contact_step.solve(touching, tension)
+        pos, tension, whole, exerted, wrench, left = contact_step.solve_contact_step(touching, tension)
         return pos, tension, whole, ContactForces(exerted, *points.spread(wrench), unsolved=left)
     return balance(
         lengths,
@@ -418,7 +418,7 @@ def settle_twist(
     def newton(angle: Tensor, exact: bool) -> tuple[Tensor, Tensor]:
         turning = tree.replace(state, twist=angle, twist_rate=(angle - state.twist) / span)
         here = rod.view(topology, params, turning, span)
-        loads = effect.total(effects, here, values)
+        loads = effect.total_loads(effects, here, values)
         if lanes.ready(angle):
             none = angle.new_zeros(1, 1)
             bent = loads.get("twist_geometry", none.expand(1, 2))

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from torchdlo import notices
-from torchdlo.physics.effects.base import Values, altered
+from torchdlo.physics.effects.base import Values, altered_params
 from torchdlo.physics.integrators.rod_step import Settings
 from torchdlo.physics.rod import kinematics as rod
 from torchdlo.physics.rod.kinematics import RodParams, RodState
@@ -17,7 +17,7 @@ def check_laws(settings: Settings, rods: RodParams, values: dict[str, Values], s
     """Raise a `ValueError` where the rods have what no effect of the scene acts on."""
     for e in settings.effects:
         e.check(settings.topology)
-    rest, material = rods.rest, altered(settings.effects, settings.topology, rods, values).material
+    rest, material = rods.rest, altered_params(settings.effects, settings.topology, rods, values).material
     kinds = {type(e).__name__ for e in settings.effects}
     if "Bend" in kinds:
         if rods.material.bend.shape[-1] == 2:
@@ -81,7 +81,7 @@ def limits(settings: Settings, rods: RodParams, values: dict[str, Values]) -> di
     """
     if settings.integrator == "implicit":
         return {}
-    rods = altered(settings.effects, settings.topology, rods, values)
+    rods = altered_params(settings.effects, settings.topology, rods, values)
     rest, material = rods.rest, rods.material
     names = {e.name for e in settings.effects}
     real = (rest.edge_mask > 0).expand_as(rest.length)

@@ -129,7 +129,7 @@ def library(source: Path, *options: str) -> ctypes.CDLL | None:
         options: what the compiler is told besides the usual.
     """
     found = compiler()
-    folder = cache.folder() if found else None
+    folder = cache.cache_folder() if found else None
     if found is None or folder is None:
         return None
     folders = sorted({source.parent, RODS})
@@ -140,7 +140,7 @@ def library(source: Path, *options: str) -> ctypes.CDLL | None:
     command = [*found.words, *_USUAL, *options, *(f"-I{each}" for each in folders), str(source)]
     try:
         if not cache.is_sound(target):
-            with cache.locked(target.with_suffix(".lock")):
+            with cache.file_lock(target.with_suffix(".lock")):
                 # Another process may have built it while this one waited.
                 if not cache.is_sound(target):
                     _build(command, target)
@@ -159,7 +159,7 @@ def _build(command: list[str], target: Path) -> None:
     with tempfile.TemporaryDirectory(dir=target.parent, prefix="build-") as build:
         fresh = Path(build) / target.name
         subprocess.run([*command, "-o", str(fresh)], capture_output=True, text=True, errors="replace", check=True)
-        cache.sealed(fresh, target)
+        cache.seal_file(fresh, target)
 
 
 def python_header() -> Path:

@@ -157,13 +157,13 @@ def assemble(ropes: Sequence[Rope]) -> tuple[Topology, RodParams, RodState]:
     Returns:
         The topology, and parameters and state with the batch axes of the ropes.
     """
-    validation.listed(ropes, Rope, "ropes")
+    validation.check_sequence(ropes, Rope, "ropes")
     if not ropes:
         raise ValueError("no rope given; a scene needs at least one")
     for index, rope in enumerate(ropes):
-        validation.rope(index, rope)
+        validation.check_rope(index, rope)
     ropes = [_flat(rope) for rope in ropes]
-    validation.together(ropes)
+    validation.check_ropes(ropes)
     topology = Topology(tuple(r.positions.shape[-2] for r in ropes), tuple(r.closed for r in ropes))
     batch = torch.broadcast_shapes(*(_scenes(r) for r in ropes))
     like = ropes[0].positions

@@ -16,7 +16,7 @@ NUMBERS = ("radius", "mass", "density", "stretch", "rest_twist", *_ZERO_ALLOWED)
 """Fields of a rope that are numbers."""
 
 
-def listed(given: object, kind: type, what: str) -> None:
+def check_sequence(given: object, kind: type, what: str) -> None:
     """Raise a `ValueError` if something is not a sequence of things of a kind."""
     wanted = f"expected a list of {what}"
     if not isinstance(given, Sequence) or isinstance(given, str):
@@ -30,7 +30,7 @@ def _called(given: object) -> str:
     return f"the class {given.__name__} (without brackets?)" if isinstance(given, type) else f"a {type(given).__name__}"
 
 
-def rope(index: int, rope: Rope) -> None:
+def check_rope(index: int, rope: Rope) -> None:
     """Raise a `ValueError` for what is wrong with one rope."""
     where = f"rope {index}"
     _positions(where, rope)
@@ -53,7 +53,7 @@ def rope(index: int, rope: Rope) -> None:
             _across(where, name, getattr(rope, name), shape if isinstance(shape, Tensor) else rope.positions)
 
 
-def together(ropes: Sequence[Rope]) -> None:
+def check_ropes(ropes: Sequence[Rope]) -> None:
     """Raise a `ValueError` for ropes that do not fit into one scene."""
     batches = [tuple(r.positions.shape[:-2]) for r in ropes]
     try:

@@ -8,13 +8,13 @@ from pathlib import Path
 
 from torchdlo.files import write_atomically
 from torchdlo.report.figures.calibration_figure import calibration_png
-from torchdlo.report.pages import films
+from torchdlo.report.pages import films_page
 from torchdlo.report.pages.page import STYLE, number, page, table, words
 from torchdlo.sysid.estimation.result import Calibration, versions
 from torchdlo.sysid.recordings.recording import Recording
 from torchdlo.untrusted import for_html
 
-__all__ = ["PAGE", "PICTURE", "calibration_html", "verdict", "write_report"]
+__all__ = ["PAGE", "PICTURE", "calibration_html", "calibration_verdict", "write_report"]
 
 PAGE = "report.html"
 PICTURE = "report.png"
@@ -33,7 +33,7 @@ def write_report(result: Calibration, recording: Recording, folder: Path, *, com
         Paths of the page and of the picture.
     """
     if recording.filmed:
-        return films.write_report(result, recording, folder, command=command)
+        return films_page.write_report(result, recording, folder, command=command)
     png = calibration_png(result, recording)
     page = calibration_html(result, recording, png, command=command)
     write_atomically(folder / PICTURE, png)
@@ -41,10 +41,10 @@ def write_report(result: Calibration, recording: Recording, folder: Path, *, com
     return folder / PAGE, folder / PICTURE
 
 
-def verdict(result: Calibration, recording: Recording) -> str:
+def calibration_verdict(result: Calibration, recording: Recording) -> str:
     """The result in one sentence."""
     if recording.filmed:
-        return films.verdict(result, recording)
+        return films_page.films_verdict(result, recording)
     others = ", ".join(f"{words(name)} {_mm(values['test_mae_mm'])}" for name, values in result.baselines.items())
     summary = (
         f"Calibrated on {_trials(len(recording.train))}; error on unseen trials "
@@ -74,7 +74,7 @@ def calibration_html(result: Calibration, recording: Recording, png: bytes, *, c
     notes = "".join(f"<li>{for_html(note)}</li>" for note in result.notes)
     sections = [
         f"<h1>{name}</h1>",
-        f'<p class="verdict">{for_html(verdict(result, recording))}</p>',
+        f'<p class="verdict">{for_html(calibration_verdict(result, recording))}</p>',
         f"<ul>{notes}</ul>" if notes else "",
         f'<img alt="Measured and simulated shapes, errors along the rope and over time, and a '
         f'comparison with trivial predictions" src="data:image/png;base64,{picture}">',

@@ -11,9 +11,9 @@ import numpy as np
 
 from torchdlo.files import write_atomically
 from torchdlo.report.figures import chart
-from torchdlo.report.pages import films, player
+from torchdlo.report.pages import films_page, player
 from torchdlo.report.pages.page import STYLE, listed, number, page, percent, table, words
-from torchdlo.sysid.diagnosis.effect_equations import MEANING, law, separating
+from torchdlo.sysid.diagnosis.effect_equations import MEANING, effect_equation, separating_experiment
 from torchdlo.sysid.diagnosis.findings import absorbed, findings, summary
 from torchdlo.sysid.diagnosis.residual_analysis import PARTS, Localisation, localise
 from torchdlo.sysid.diagnosis.residual_text import STATES
@@ -76,7 +76,7 @@ _LIMITS = (
 
 
 def _films(result: Diagnosis) -> str:
-    picture = base64.b64encode(films.overlay_png(result.overlays)).decode("ascii")
+    picture = base64.b64encode(films_page.overlay_png(result.overlays)).decode("ascii")
     words_of = "Pictures of the films with the simulated rope before and after"
     return f'<img alt="{words_of}" src="data:image/png;base64,{picture}">'
 
@@ -141,9 +141,10 @@ def _effects(found: dict[str, Any]) -> str:
             for key, n in effect["parameters"].items()
         ]
         share = percent(effect["share_of_gap"])
+        equation = for_html(effect_equation(effect["name"]))
         parts.append(
             f"<h3>{for_html(words(effect['name']))}</h3><p>{MEANING[effect['kind']].capitalize()}; it closes "
-            f"{share} of the gap above the floor on the test trials.</p><pre>{for_html(law(effect['name']))}</pre>"
+            f"{share} of the gap above the floor on the test trials.</p><pre>{equation}</pre>"
             + _test(effect["test"])
             + (table(("number", "value", "90 % range", "unit"), rows) if rows else "")
         )
@@ -177,7 +178,7 @@ def _ties(found: dict[str, Any]) -> str:
     pairs = [(e["name"], other) for e in found["effects"] for other in e["indistinguishable_from"]]
     if not pairs:
         return "<p>No other effect that was fitted does as well.</p>" if found["effects"] else ""
-    rows = [(f"{words(a)} or {words(b)}", f"{separating(a, b)}") for a, b in pairs]
+    rows = [(f"{words(a)} or {words(b)}", f"{separating_experiment(a, b)}") for a, b in pairs]
     return '<div class="text">' + table(("either", "this experiment would tell"), rows) + "</div>"
 
 
@@ -225,7 +226,7 @@ def _candidates(found: dict[str, Any]) -> str:
 
 def _candidate(c: dict[str, Any]) -> tuple[str, ...]:
     numbers = (percent(c["score"]), percent(c["train_gain"]), percent(c["heldout_gain"]))
-    return (words(c["name"]), *numbers, c["reason"], law(c["name"]))
+    return (words(c["name"]), *numbers, c["reason"], effect_equation(c["name"]))
 
 
 def _candidate_table(rows: list[tuple[str, ...]]) -> str:

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from torchdlo.coupling.common import step_diagnostics
-from torchdlo.coupling.robot import kinematics as robots
+from torchdlo.coupling.robot import robot_kinematics as robots
 from torchdlo.envs import Task
 from torchdlo.envs.core import episode
 from torchdlo.errors import InputError
@@ -112,7 +112,7 @@ def outcome_of(went: episode.EpisodeResult | None) -> dict[str, Any]:
         "return": float(went.returns[0]),
         "success": bool(went.success[0]),
         "failed": bool(went.failed[0]),
-        "missed": step_diagnostics.explain(went.world.state.diagnostics),
+        "missed": step_diagnostics.explain_diagnostics(went.world.state.diagnostics),
         "rewards": went.rewards[:, 0].tolist(),
         "interrupted": False,
     }

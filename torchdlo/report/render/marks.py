@@ -13,7 +13,7 @@ from torchdlo.report.render.episode_film import stills
 from torchdlo.report.render.picture import Picture
 from torchdlo.scene_files.run import Frames
 
-__all__ = ["Camera", "MarkedView", "marked_view", "spaced"]
+__all__ = ["MarkCamera", "MarkedView", "marked_view", "spaced_vertices"]
 
 _SLACK = 0.004
 """How much nearer than a rope's surface something has to be to hide it [m]."""
@@ -76,13 +76,13 @@ def marked_view(frames: Frames, k: int = -1, *, size: tuple[int, int] = (960, 72
     return MarkedView(image, pixels, inside & ~hidden)
 
 
-class Camera:
+class MarkCamera:
     """Draws worlds of an episode for plans."""
 
     def now(self, made: episode.Episode, world: episode.EpisodeState) -> bytes:
         """Return the scene without arms, with numbers on vertices, as PNG."""
         view = marked_view(stills(made, [world], arms=False))
-        return view.marked(spaced(view))
+        return view.marked(spaced_vertices(view))
 
     def stills(self, made: episode.Episode, worlds: Sequence[episode.EpisodeState]) -> bytes:
         """Return moments in rows of four, with arms, as PNG."""
@@ -100,7 +100,7 @@ class Camera:
         return content.getvalue()
 
 
-def spaced(view: MarkedView, apart: float = 26.0) -> list[int]:
+def spaced_vertices(view: MarkedView, apart: float = 26.0) -> list[int]:
     """Return vertices that are seen and that are so far apart in a picture [pixels]."""
     chosen: list[int] = []
     for slot in view.visible.nonzero()[:, 0].tolist():

@@ -17,11 +17,11 @@ import numpy as np
 
 from torchdlo.errors import InputError
 from torchdlo.report.render.picture import ANGLE, camera_of
-from torchdlo.report.render.surfaces import COLORS, Piece, bounds, pieces, spacing
+from torchdlo.report.render.run_surfaces import COLORS, DrawnSurface, bounds, pieces, spacing
 from torchdlo.scene_files.run import Frames
 from torchdlo.vision.look import linear
 from torchdlo.vision.renderer_reference import tube
-from torchdlo.vision.shading_reference import painted
+from torchdlo.vision.shading_reference import surface_colors
 from torchdlo.vision.surfaces import smoothed
 
 __all__ = ["Photo", "check_photo"]
@@ -41,7 +41,7 @@ def check_photo() -> None:
 
 
 @functools.cache
-def variant() -> str:
+def mitsuba_variant() -> str:
     """Return the variant of Mitsuba that works on this machine."""
     check_photo()
     for name in VARIANTS:
@@ -57,7 +57,7 @@ def _rgb(color: str) -> np.ndarray:
     return np.array(linear(tuple(int(color[k : k + 2], 16) / 255 for k in (1, 3, 5))))
 
 
-def _rope(frames: Frames, piece: Piece, k: int) -> dict[str, np.ndarray]:
+def _rope(frames: Frames, piece: DrawnSurface, k: int) -> dict[str, np.ndarray]:
     """Return a rope laid of three strands, with colours at its corners."""
     slots = piece.slots
     x, radius = frames.pos[k, slots].astype(float), frames.radius[slots].astype(float)
@@ -84,7 +84,7 @@ def _wood(reach: float) -> np.ndarray:
     p = np.stack([*np.meshgrid(at, at), np.zeros((1024, 1024))], -1).reshape(-1, 3)
     numbers = (*linear((0.78, 0.64, 0.47)), *linear((0.58, 0.42, 0.27)), 0.0, 1.0, 9.0 / reach, 0.94, 0.34, 3.0)
     m = np.broadcast_to(np.array(numbers, np.float32), (len(p), 12))
-    return painted(m, p, np.zeros((len(p), 2)), np.full(len(p), 0.5 * reach / 1024)).reshape(1024, 1024, 3)
+    return surface_colors(m, p, np.zeros((len(p), 2)), np.full(len(p), 0.5 * reach / 1024)).reshape(1024, 1024, 3)
 
 
 class Photo:
@@ -98,7 +98,7 @@ class Photo:
             size: width and height in pixels.
             samples: paths of light per pixel.
         """
-        self._variant = variant()
+        self._variant = mitsuba_variant()
         self.frames, self._size, self._samples = frames, size, samples
         self._pieces = pieces(frames)
         low, high = bounds(frames)

@@ -13,7 +13,7 @@ import torch
 from scipy.ndimage import gaussian_filter
 
 from torchdlo.errors import InputError
-from torchdlo.report.render.surfaces import COLORS, Piece, bounds, extent, pieces, points_of, spacing
+from torchdlo.report.render.run_surfaces import COLORS, DrawnSurface, bounds, extent, pieces, points_of, spacing
 from torchdlo.scene_files.run import Frames
 from torchdlo.vision import renderer as vision
 from torchdlo.vision.surfaces import smoothed
@@ -83,7 +83,7 @@ def camera_of(frames: Frames, size: tuple[int, int]) -> tuple[np.ndarray, np.nda
     return middle - 1.1 * away * ahead, middle, up
 
 
-def _level(frames: Frames, piece: Piece) -> bool:
+def _level(frames: Frames, piece: DrawnSurface) -> bool:
     """Return whether a plane is level, and stays where it is."""
     pos, turn = piece.pose(frames, 0)
     again = piece.pose(frames, len(frames.time) - 1)
@@ -98,7 +98,7 @@ class _Floor:
     """A level floor with the soft shadow of everything on it, as its texture."""
 
     def __init__(
-        self, pv: Any, plotter: Any, frames: Frames, pieces: Sequence[Piece], low: np.ndarray, high: np.ndarray
+        self, pv: Any, plotter: Any, frames: Frames, pieces: Sequence[DrawnSurface], low: np.ndarray, high: np.ndarray
     ) -> None:
         planes = [p for p in pieces if p.kind == "body" and frames.body_shape[p.slots[0]] == "plane"]
         flat = [float(p.pose(frames, 0)[0][2]) for p in planes if _level(frames, p)]
@@ -125,7 +125,7 @@ class _Floor:
 
 
 def floor_shadow(
-    frames: Frames, pieces: Sequence[Piece], middle: tuple[float, float, float], reach: float
+    frames: Frames, pieces: Sequence[DrawnSurface], middle: tuple[float, float, float], reach: float
 ) -> Callable[[int], np.ndarray]:
     """Return what makes the shadow on a square floor at a frame: 0 to 1, rows from +y to -y, shape (384, 384).
 
@@ -142,7 +142,7 @@ def floor_shadow(
     slots = np.concatenate([np.zeros(0, int), *(p.slots for p in ropes)])
     count = grains.shape[1]
     size = spacing(frames.material_points[0]) if count else 0.0
-    model = vision.Model(
+    model = vision.RenderModel(
         made,
         tuple(len(p.slots) for p in ropes),
         tuple(bool(frames.closed[frames.rope[p.slots[0]]]) for p in ropes),

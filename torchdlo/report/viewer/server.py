@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from torchdlo.errors import InputError
 from torchdlo.local_server import Guard, listen
-from torchdlo.report.render.surfaces import COLORS, bounds, pieces, points_of, spacing
+from torchdlo.report.render.run_surfaces import COLORS, bounds, pieces, points_of, spacing
 from torchdlo.report.viewer.guarded import Bounds, start
 from torchdlo.scene_files.run import Frames
 

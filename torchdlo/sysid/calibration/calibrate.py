@@ -13,7 +13,7 @@ import numpy as np
 
 from torchdlo.errors import InputError
 from torchdlo.sysid.calibration import refinement
-from torchdlo.sysid.diagnosis.error_floor import noise
+from torchdlo.sysid.diagnosis.error_floor import marker_noise
 from torchdlo.sysid.estimation import evaluation, levenberg_marquardt
 from torchdlo.sysid.estimation.checkpoint import Checkpoint
 from torchdlo.sysid.estimation.jobs import FitJob
@@ -251,7 +251,7 @@ def _climb(
     iterations: int,
     memory: Checkpoint,
 ) -> Iterator[list[Point]]:
-    """Yield points as `levenberg_marquardt.improve` does; what is found is written down."""
+    """Yield points as `levenberg_marquardt.improve_points` does; what is found is written down."""
     climb = levenberg_marquardt.Climb(job.space, points)
     for k in range(iterations):
         tries = climb.tries()
@@ -337,7 +337,7 @@ def _refined(job: _Job, iterations: int, vertices: int | None, report: Callback)
         predicted = evaluation.predict(each.model, trials, each.values, each.simulator(trials))
         errors.append(average(mean_absolute_error, [predicted[t.name] for t in trials], trials))
     # Exact numbers predict as well with their mesh, up to what noise tells; else those that suit a coarse one count.
-    if errors[1] <= errors[0] + 0.5 * noise(pool.recording):
+    if errors[1] <= errors[0] + 0.5 * marker_noise(pool.recording):
         return better
     apart = job.space.to_raw(fitted.values[job.columns]) - job.point.raw
     scale = found.drifts * fitted.space.units / job.space.units
@@ -390,7 +390,7 @@ def _judge(job: _Job, seed: int, interrupted: bool, begun: float, report: Callba
         },
         **evaluation.errors(recording, after),
         before=evaluation.errors(recording, before),
-        baselines=evaluation.trivial(recording),
+        baselines=evaluation.trivial_errors(recording),
         per_trial=evaluation.by_trial(recording, before, after),
         seconds=time.perf_counter() - begun,
         model=model_file.content(job.model, job.values),

@@ -64,7 +64,7 @@ class Refined:
 
 def finer_options(recording: Recording) -> dict[str, Any]:
     """Return the options of the finer models."""
-    options = plans.options(recording, None)
+    options = plans.model_options(recording, None)
     return {name: options[name] for name in ("vertices", "numerical_damping")}
 
 

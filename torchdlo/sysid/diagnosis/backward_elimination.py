@@ -12,8 +12,8 @@ from dataclasses import dataclass, field
 
 from torchdlo.sysid.diagnosis import effect_library, selection
 from torchdlo.sysid.diagnosis.budget import Budget
-from torchdlo.sysid.diagnosis.candidate_fits import extended
-from torchdlo.sysid.diagnosis.error_floor import rms
+from torchdlo.sysid.diagnosis.candidate_fits import extended_fits
+from torchdlo.sysid.diagnosis.error_floor import gap_rms
 from torchdlo.sysid.diagnosis.score_test import score_effects
 from torchdlo.sysid.diagnosis.workspace import SILENT, Callback, Workspace
 from torchdlo.sysid.estimation.jobs import Fitted
@@ -73,8 +73,8 @@ class Revision:
         What takes away nearly all that the others leave matters, however small that is beside the baseline's gap.
         """
         # A baseline may go astray on a trial: then what it became when it was fitted further tells what a share is.
-        first = min(rms(self.bench.gaps(f, split)) for f in self.plain)
-        before, after = (rms(self.bench.gaps(f, split)) for f in (less, more))
+        first = min(gap_rms(self.bench.gaps(f, split)) for f in self.plain)
+        before, after = (gap_rms(self.bench.gaps(f, split)) for f in (less, more))
         return selection.matters(first, before, after, self.bench.floor.noise, self.bench.level)
 
     def pruned(self, fitted: Fitted, found: EliminationResult) -> Fitted:
@@ -109,7 +109,7 @@ class Revision:
         there is nothing to look for.
         """
         waiting, count = [*found.shares][:-1], 0
-        while waiting and count < _EXCHANGES and rms(self.bench.gaps(fitted, "all")) > SILENT * self.bench.level:
+        while waiting and count < _EXCHANGES and gap_rms(self.bench.gaps(fitted, "all")) > SILENT * self.bench.level:
             old = waiting.pop(0)
             best = self._instead(fitted, old, [n for n in possible if n not in fitted.effects])
             if not self._better(best, fitted) or self._astray(best, fitted):
@@ -157,7 +157,7 @@ class Revision:
         kin = {n for group in effect_library.KIN if old in group for n in group}
         tried = [*scores[:_TRIED], *(s for s in scores[_TRIED:] if s.name in kin)]
         first, more = self.budget.iterations, self.budget.more
-        fits, _ = extended(self.bench, less, tried, first, self.bench.fit)
+        fits, _ = extended_fits(self.bench, less, tried, first, self.bench.fit)
         lead = sorted(fits, key=lambda f: f.point.cost)[:_TRIED]
         best = min(self.bench.fit([self.bench.further(f, more) for f in lead]), key=lambda f: f.point.cost)
         self.report(f"{stage}: {best.effects[-1]}", 1, 1, f"{1e3 * best.point.cost:.2f} mm")

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from torchdlo.sysid.diagnosis import clamp_models
-from torchdlo.sysid.diagnosis.error_floor import Refinement, gap, rms
+from torchdlo.sysid.diagnosis.error_floor import Refinement, gap_rms, trial_gaps
 from torchdlo.sysid.diagnosis.workspace import CHAIN, SILENT, Callback, Workspace
 from torchdlo.sysid.estimation.jobs import FitJob, Fitted
 from torchdlo.sysid.model.model_file import ModelFile
@@ -46,7 +46,9 @@ _FAR = np.log(8.0)
 """How far, in logarithms, a rope may be from that before the fit is thought to have run away."""
 
 
-def calibrate(bench: Workspace, count: int, iterations: int, rng: np.random.Generator, report: Callback) -> Fitted:
+def calibrate_baseline(
+    bench: Workspace, count: int, iterations: int, rng: np.random.Generator, report: Callback
+) -> Fitted:
     """Return the fitted baseline, straight if a given rest shape fits worse, a chain or in firm clamps if that helps.
 
     Args:
@@ -99,7 +101,7 @@ def calibrate(bench: Workspace, count: int, iterations: int, rng: np.random.Gene
     better = fit([plain(smooth.values[None], iterations, None)], 3)[0]
     if side.point.cost < _BETTER * smooth.point.cost:
         better = _chain_or(bench, better, rope, [chain(side.values[None], iterations, None)])
-    report(stage, 4, 4, f"{1e3 * rms(bench.gaps(better, 'train')):.2f} mm")
+    report(stage, 4, 4, f"{1e3 * gap_rms(bench.gaps(better, 'train')):.2f} mm")
     return better
 
 
@@ -172,8 +174,8 @@ def go_further(bench: Workspace, base: Fitted, iterations: int, report: Callback
     stage, effects, start = "fitting all numbers again", (*base.effects, CHAIN), bench.starts["train"]
     report(stage, 0, 3, "")
     jobs = [FitJob(base.effects, values, base.space.names, tuple(base.space.units), iterations, start)]
-    if clamp_models.loose(model):
-        jobs.append(clamp_models.firm(base, jobs[0]))
+    if clamp_models.bends_between_markers(model):
+        jobs.append(clamp_models.firm_clamp_job(base, jobs[0]))
     if model.rest == "straight" and bench.recording.rest_positions is not None:
         jobs.append(_shaped(bench, base, jobs[0]))
     base, *others = bench.fit(jobs)
@@ -183,16 +185,16 @@ def go_further(bench: Workspace, base: Fitted, iterations: int, report: Callback
         bench.pool.choose(**dict(base.options))
     names, sizes = base.space.names, tuple(base.space.units)
     free = (*names, f"{CHAIN}.length")
-    report(stage, 1, 3, f"{1e3 * rms(bench.gaps(base, 'train')):.2f} mm")
-    if bench.linked and CHAIN not in base.effects and rms(bench.gaps(base, "train")) > SILENT * bench.level:
+    report(stage, 1, 3, f"{1e3 * gap_rms(bench.gaps(base, 'train')):.2f} mm")
+    if bench.linked and CHAIN not in base.effects and gap_rms(bench.gaps(base, "train")) > SILENT * bench.level:
         rows = [np.append(base.values, length)[None] for length in (link, -link)]
         sides = [FitJob(effects, r, free, (*sizes, 0.5 * link), iterations, bench.starts["train"]) for r in rows]
         base = _chain_or(bench, base, rope, sides)
-    report(stage, 2, 3, f"{1e3 * rms(bench.gaps(base, 'train')):.2f} mm")
+    report(stage, 2, 3, f"{1e3 * gap_rms(bench.gaps(base, 'train')):.2f} mm")
     # Corrections of another motion are wrong where motions part.
     _begin_anew(bench, base)
     base = bench.fit([bench.further(base, iterations // 2)])[0]
-    report(stage, 3, 3, f"{1e3 * rms(bench.gaps(base, 'train')):.2f} mm")
+    report(stage, 3, 3, f"{1e3 * gap_rms(bench.gaps(base, 'train')):.2f} mm")
     return base
 
 
@@ -227,7 +229,7 @@ def _chain_or(bench: Workspace, smooth: Fitted, rope: Refinement, sides: Sequenc
     level, before, frame_weights = bench.level, bench.gaps(smooth, "all"), bench.starts["train"].frame_weights
 
     def left(fitted: Fitted) -> float:
-        return rms(gap(bench.prediction(fitted, "train"), bench.trials["train"], frame_weights))
+        return gap_rms(trial_gaps(bench.prediction(fitted, "train"), bench.trials["train"], frame_weights))
 
     smoothly = left(smooth)
     bench.use(replace(rope, links=abs(float(sides[0].values[0, -1]))))
@@ -262,7 +264,7 @@ def go_on(bench: Workspace, given: ModelFile, iterations: int, report: Callback)
     return found
 
 
-def notes(base: Fitted) -> list[str]:
+def baseline_notes(base: Fitted) -> list[str]:
     """Return sentences on the baseline that a reader should know."""
     if CHAIN not in base.effects:
         return []

@@ -40,7 +40,7 @@ _AHEAD = 0.05
 drive friction within the rope to and fro. More of it costs accuracy."""
 
 
-def some(recording: Recording, most: int) -> Recording:
+def pick_trials(recording: Recording, most: int) -> Recording:
     """Return the recording with at most so many train trials, evenly picked."""
     if len(recording.train) <= most:
         return recording
@@ -48,7 +48,7 @@ def some(recording: Recording, most: int) -> Recording:
     return replace(recording, train=tuple(recording.train[k] for k in picked))
 
 
-def options(recording: Recording, vertices: int | None) -> dict[str, Any]:
+def model_options(recording: Recording, vertices: int | None) -> dict[str, Any]:
     """Return options of the models that suit a recording."""
     taut = any(_stretched(trial) > TAUT for trial in recording.train)
     return {

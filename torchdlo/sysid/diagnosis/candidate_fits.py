@@ -14,7 +14,7 @@ _SHORT = 0.6
 """Share of the trials that first fits see."""
 
 
-def extend(bench: Workspace, base: Fitted, score: Score, iterations: int, frames: int | None) -> list[FitJob]:
+def extension_jobs(bench: Workspace, base: Fitted, score: Score, iterations: int, frames: int | None) -> list[FitJob]:
     """Return the jobs of fitting a model with one effect more, from the doses that suit best.
 
     Args:
@@ -24,8 +24,10 @@ def extend(bench: Workspace, base: Fitted, score: Score, iterations: int, frames
         iterations: most iterations.
         frames: how many frames to fit; all if None.
     """
-    if score.name == clamp_models.NAME and clamp_models.loose(bench.pool.local.model(base.effects, base.options)):
-        return [clamp_models.stiff(bench, base, score, iterations, frames)]
+    if score.name == clamp_models.NAME and clamp_models.bends_between_markers(
+        bench.pool.local.model(base.effects, base.options)
+    ):
+        return [clamp_models.stiff_clamp_job(bench, base, score, iterations, frames)]
     # Numbers that no dose uses stay off, a gradient where a spot fits better; but vectors are fitted whole.
     kinds: dict[frozenset[str], list] = {}
     for start in score.starts:
@@ -37,7 +39,7 @@ def extend(bench: Workspace, base: Fitted, score: Score, iterations: int, frames
     return jobs
 
 
-def extended(
+def extended_fits(
     bench: Workspace,
     base: Fitted,
     scores: Sequence[Score],
@@ -55,13 +57,13 @@ def extended(
         fit: does jobs.
         others: what to do besides.
     """
-    jobs = [extend(bench, base, score, iterations, short(bench)) for score in scores]
+    jobs = [extension_jobs(bench, base, score, iterations, short_frames(bench)) for score in scores]
     found = list(fit([*(job for alike in jobs for job in alike), *others]))
     best = [min((found.pop(0) for _ in alike), key=lambda f: f.point.cost) for alike in jobs]
     return best, found
 
 
-def short(bench: Workspace) -> int:
+def short_frames(bench: Workspace) -> int:
     """Return how many frames the first fits see: late ones mislead as long as early ones do not fit."""
     return max(10, int(_SHORT * bench.trials["train"][0].markers.shape[0]))
 

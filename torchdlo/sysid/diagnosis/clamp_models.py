@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from torchdlo.sysid.diagnosis.error_floor import rms
+from torchdlo.sysid.diagnosis.error_floor import gap_rms
 from torchdlo.sysid.diagnosis.score_test import Score
 from torchdlo.sysid.diagnosis.workspace import SILENT, Workspace
 from torchdlo.sysid.estimation.jobs import FitJob, Fitted
@@ -23,25 +23,25 @@ _SHARES = (0.2, 0.5, 1.5)
 """Lengths of rope that are as soft as a clamp where fits start, over the distance of its markers."""
 
 
-def loose(model: RopeModel) -> bool:
+def bends_between_markers(model: RopeModel) -> bool:
     """Return whether a model lets the rope bend between the markers of a clamp."""
     return bool(model.mesh.clamps) and model.clamp_fraction < 1
 
 
-def soft(bench: Workspace, base: Fitted) -> bool:
+def may_be_stiff(bench: Workspace, base: Fitted) -> bool:
     """Return whether clamps may be stiff that are not in a model which leaves something to be explained."""
-    bends = loose(bench.pool.local.model(base.effects, base.options))
-    return bends and NAME not in base.effects and rms(bench.gaps(base, "all")) > SILENT * bench.level
+    bends = bends_between_markers(bench.pool.local.model(base.effects, base.options))
+    return bends and NAME not in base.effects and gap_rms(bench.gaps(base, "all")) > SILENT * bench.level
 
 
-def firm(base: Fitted, job: FitJob) -> FitJob:
+def firm_clamp_job(base: Fitted, job: FitJob) -> FitJob:
     """Return the job of fitting the model without, likewise with clamps that hold the rope up to their last marker."""
     return replace(job, options=(*base.options, ("clamp_fraction", 1.0)))
 
 
-def notes(model: RopeModel, final: Fitted) -> list[str]:
+def clamp_notes(model: RopeModel, final: Fitted) -> list[str]:
     """Return a sentence on what a clamp may be in which the rope bends, for a reader of a model."""
-    if not loose(model) or NAME in final.effects:
+    if not bends_between_markers(model) or NAME in final.effects:
         return []
     bend = final.values[model.parameters.index("bending_stiffness")]
     spring = bend / (0.5 * (1 - model.clamp_fraction) * _apart(model))
@@ -57,10 +57,10 @@ def _apart(model: RopeModel) -> float:
     return min(float(np.diff(model.mesh.marker_arclength[run]).min()) for run in model.mesh.runs)
 
 
-def stiff(bench: Workspace, base: Fitted, score: Score, iterations: int, frames: int | None) -> FitJob:
+def stiff_clamp_job(bench: Workspace, base: Fitted, score: Score, iterations: int, frames: int | None) -> FitJob:
     """Return the job of fitting elastic clamps that hold the rope stiffly up to their last marker, see `extend`."""
     model, number = bench.pool.local.model(base.effects), f"{NAME}.stiffness"
     bend = base.values[model.parameters.index("bending_stiffness")]
     starts = tuple(({number: bend / (share * _apart(model))}, base.point.raw) for share in _SHARES)
     job = bench.extension(base, replace(score, starts=starts), [number], iterations, frames)
-    return firm(base, job)
+    return firm_clamp_job(base, job)

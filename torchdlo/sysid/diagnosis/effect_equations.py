@@ -5,7 +5,7 @@ The laws themselves, with their sources, stand in `torchdlo.physics.effects`.
 
 from __future__ import annotations
 
-__all__ = ["LAWS", "MEANING", "law", "separating"]
+__all__ = ["LAWS", "MEANING", "effect_equation", "separating_experiment"]
 
 LAWS = {
     "air_drag": "f = -½ rho c_d 2r |vₙ| vₙ per length; vₙ: velocity across the rope; rho = 1.2 kg/m³",
@@ -70,12 +70,12 @@ _SEPARATING = {
 """What would tell two effects apart."""
 
 
-def law(name: str) -> str:
+def effect_equation(name: str) -> str:
     """Return the law of an effect."""
     return LAWS.get(name, name.replace("_", " "))
 
 
-def separating(name: str, other: str) -> str:
+def separating_experiment(name: str, other: str) -> str:
     """Return the experiment that would tell two effects apart."""
     for pair in ((name, other), (other, name)):
         if pair in _SEPARATING:

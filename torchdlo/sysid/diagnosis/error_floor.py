@@ -29,7 +29,7 @@ class ErrorFloor:
         return float(np.sqrt(self.noise**2 + self.step**2 + self.grid**2))
 
 
-def noise(recording: Recording) -> float:
+def marker_noise(recording: Recording) -> float:
     """Return the noise of the markers [m]: as given, or what fourth differences in time say."""
     if recording.marker_noise_std is not None:
         return recording.marker_noise_std
@@ -41,7 +41,7 @@ def noise(recording: Recording) -> float:
     return float(np.median(parts))
 
 
-def gap(
+def trial_gaps(
     simulated: np.ndarray, trials: tuple[Trial, ...] | list[Trial], frame_weights: np.ndarray | None = None
 ) -> np.ndarray:
     """Return the error of each trial [m], root mean square per coordinate of the free markers, shape (B,).
@@ -63,7 +63,7 @@ def gap(
     return np.array(out)
 
 
-def rms(gaps: np.ndarray) -> float:
+def gap_rms(gaps: np.ndarray) -> float:
     """Return the root mean square of the gaps of trials."""
     return float(np.sqrt(np.mean(np.square(gaps))))
 
@@ -181,7 +181,7 @@ def refine(pool: Pool, base: Fitted, start: Start, chain: str) -> Refinement:
     ]
     sims = dict(pool.simulate(jobs))
     found = refinement(*(sims[k][0] for k in range(3)), model.numerical_damping, edge)
-    return replace(found, noise=noise(pool.recording), links=length)
+    return replace(found, noise=marker_noise(pool.recording), links=length)
 
 
 def refinement(

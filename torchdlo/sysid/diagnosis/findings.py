@@ -8,14 +8,14 @@ from typing import Any
 import numpy as np
 
 from torchdlo.physics.effects import EFFECTS
-from torchdlo.sysid.diagnosis.effect_equations import law, separating
-from torchdlo.sysid.diagnosis.error_floor import gap, rms
+from torchdlo.sysid.diagnosis.effect_equations import effect_equation, separating_experiment
+from torchdlo.sysid.diagnosis.error_floor import gap_rms, trial_gaps
 from torchdlo.sysid.diagnosis.plausibility import implausible
 from torchdlo.sysid.diagnosis.residual_analysis import localise
 from torchdlo.sysid.diagnosis.significance import RATE, Agreement
 from torchdlo.sysid.diagnosis.verdict import Diagnosis
 from torchdlo.sysid.estimation import levenberg_marquardt
-from torchdlo.sysid.estimation.result import dump, versions
+from torchdlo.sysid.estimation.result import result_json, versions
 from torchdlo.sysid.estimation.result_cache import digest
 from torchdlo.sysid.model import model_file
 from torchdlo.sysid.recordings.metrics import mean_absolute_error
@@ -40,12 +40,12 @@ def findings(result: Diagnosis, recording: Recording) -> dict[str, Any]:
         {
             "name": name,
             "kind": EFFECTS[name].kind,
-            "law": law(name),
+            "law": effect_equation(name),
             "parameters": {k.split(".", 1)[1]: v for k, v in numbers.items() if k.startswith(f"{name}.")},
             "share_of_gap": result.shares[name],
             "test": _test(result.tests[name], rates[name], result.looked_at) if name in result.tests else None,
             "indistinguishable_from": result.ties[name],
-            "separating_experiments": {other: separating(name, other) for other in result.ties[name]},
+            "separating_experiments": {other: separating_experiment(name, other) for other in result.ties[name]},
         }
         for name in result.effects
     ]
@@ -142,7 +142,7 @@ def _gap(result: Diagnosis, recording: Recording) -> dict[str, Any]:
 
 def _train_gap(result: Diagnosis, recording: Recording, when: str) -> float:
     """Return the root mean square gap of the train trials [m]."""
-    return rms(gap([result.predictions[when][t.name] for t in recording.train], recording.train))
+    return gap_rms(trial_gaps([result.predictions[when][t.name] for t in recording.train], recording.train))
 
 
 def mean_absolute_errors(result: Diagnosis, recording: Recording) -> dict[str, float]:
@@ -207,7 +207,7 @@ def confidence(result: Diagnosis) -> dict[str, Any] | None:
 def findings_json(result: Diagnosis, recording: Recording) -> str:
     """Return the findings as JSON text."""
     if recording.filmed:
-        return dump({"generator": "torchdlo diagnose"} | findings(result, recording))
+        return result_json({"generator": "torchdlo diagnose"} | findings(result, recording))
     where = localise(recording, result.predictions, result.floor)
     place = {
         "before": where.words,
@@ -215,12 +215,12 @@ def findings_json(result: Diagnosis, recording: Recording) -> str:
         "share_explained_by": {a.name: [a.share_before, a.share_after] for a in where.against},
         "share_made_of": {k: [v, where.parts_after[k]] for k, v in where.parts_before.items()},
     }
-    return dump({"generator": "torchdlo diagnose"} | findings(result, recording) | {"localisation": place})
+    return result_json({"generator": "torchdlo diagnose"} | findings(result, recording) | {"localisation": place})
 
 
 def model_json(result: Diagnosis) -> str:
     """Return the model with the effects as JSON text."""
-    return dump({"generator": "torchdlo diagnose"} | model_file.content(result.model, result.final.values))
+    return result_json({"generator": "torchdlo diagnose"} | model_file.content(result.model, result.final.values))
 
 
 def summary(result: Diagnosis, recording: Recording) -> str:

@@ -15,12 +15,12 @@ import numpy as np
 from torchdlo.errors import InputError
 from torchdlo.physics.effects.base import Param
 from torchdlo.sysid.diagnosis import selection
-from torchdlo.sysid.diagnosis.error_floor import gap, rms
+from torchdlo.sysid.diagnosis.error_floor import gap_rms, trial_gaps
 from torchdlo.sysid.diagnosis.plausibility import implausible
 from torchdlo.sysid.diagnosis.significance import RATE, Agreement, agreement, benjamini_hochberg
-from torchdlo.sysid.diagnosis.verdict import word
+from torchdlo.sysid.diagnosis.verdict import verdict_word
 from torchdlo.sysid.estimation.jobs import Fitted
-from torchdlo.sysid.estimation.levenberg_marquardt import ParameterSpace, evaluate, improve, interval
+from torchdlo.sysid.estimation.levenberg_marquardt import ParameterSpace, evaluate, improve_points, interval
 from torchdlo.sysid.recordings.recording import Trial
 
 __all__ = ["EffectSpec", "Selection", "System", "points_trial", "select"]
@@ -163,7 +163,7 @@ class _Selector:
         tested: list[tuple[str, Agreement]] = []
         for number in range(1, rounds + 1):
             names = [name for name in self.specs if name not in base.effects]
-            if not names or (ties and rms(self.gaps(base, "test")) < _DONE * self.level):
+            if not names or (ties and gap_rms(self.gaps(base, "test")) < _DONE * self.level):
                 break
             rival = self.fit(base.effects, [self.values(base)])
             fits = {name: self._extended(rival, name) for name in names}
@@ -225,7 +225,7 @@ class _Selector:
             measured = whole.copy()
             measured[:, max(2, int(share * whole.shape[1])) :] = np.nan
             points = evaluate(simulate, measured, space, raws)
-            for found in improve(simulate, measured, space, points, iterations=self.iterations):
+            for found in improve_points(simulate, measured, space, points, iterations=self.iterations):
                 points = found
             raws = np.array([p.raw for p in points])
         best = min(points, key=lambda p: p.cost)
@@ -262,7 +262,7 @@ class _Selector:
 
     def gaps(self, fitted: Fitted, split: str) -> np.ndarray:
         """Return the gap of each trial of a split [m]."""
-        return gap(self.prediction(fitted, split), self.trials[split])
+        return trial_gaps(self.prediction(fitted, split), self.trials[split])
 
     def test(self, less: Fitted, more: Fitted) -> Agreement:
         """Return whether what an effect explains on the test trials could be chance."""
@@ -288,7 +288,7 @@ class _Selector:
         return float(space.to_values(ends[:1] + share * (ends[1:] - ends[:1]))[0, 0])
 
     def _matters(self, first: Fitted, less: Fitted, more: Fitted, split: str) -> bool:
-        gaps = (rms(self.gaps(f, split)) for f in (first, less, more))
+        gaps = (gap_rms(self.gaps(f, split)) for f in (first, less, more))
         return selection.matters(*gaps, self.noise, self.level)
 
     def _refused(
@@ -322,11 +322,11 @@ class _Selector:
         looked: list[dict[str, object]],
         tested: list[tuple[str, Agreement]],
     ) -> Selection:
-        before, after = (rms(self.gaps(f, "test")) for f in (first, final))
+        before, after = (gap_rms(self.gaps(f, "test")) for f in (first, final))
         tests = {name: self.test(rivals[name], final) for name in ties}
         p = [t.p for t in tests.values()] + [t.p for name, t in tested if name not in tests]
         rates = dict(zip(tests, map(float, benjamini_hochberg(p, len(looked))), strict=False))
         ranges = zip(final.space.names, final.values, *interval(final.point, final.space), strict=True)
         numbers = {n: (float(v), float(min(a, b)), float(max(a, b))) for n, v, a, b in ranges}
-        verdict = word([*ties], after, self.level, after / max(before, 1e-30))
+        verdict = verdict_word([*ties], after, self.level, after / max(before, 1e-30))
         return Selection(verdict, [*ties], numbers, ties, tests, rates, before, after, self.level, looked)

@@ -1,13 +1,14 @@
 """When an effect is worth its name: rules that know nothing of ropes, from the gaps that models leave trial by trial.
 
-`torchdlo.sysid.diagnosis.search` applies them to ropes, `torchdlo.sysid.diagnosis.other_systems` to anything else.
+`torchdlo.sysid.diagnosis.effect_search` applies them to ropes, `torchdlo.sysid.diagnosis.other_systems` to anything
+else.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from torchdlo.sysid.diagnosis.error_floor import rms
+from torchdlo.sysid.diagnosis.error_floor import gap_rms
 
 __all__ = ["MATTERS", "NEARLY_ALL", "PAYS", "gain", "helps_on_most", "matters", "refused"]
 
@@ -29,7 +30,7 @@ _NOISE = 0.3
 
 def gain(before: np.ndarray, after: np.ndarray, noise: float) -> float:
     """Return the share of the excess gap (squared, above noise) that is closed, of gaps by trial (B,) [m]."""
-    old, new = rms(before) ** 2, rms(after) ** 2
+    old, new = gap_rms(before) ** 2, gap_rms(after) ** 2
     return float((old - new) / max(old - noise**2, (_NOISE * noise) ** 2, 1e-12))
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from torchdlo.sysid.diagnosis.detection_limit import DetectionLimit
-from torchdlo.sysid.diagnosis.error_floor import ErrorFloor, rms
+from torchdlo.sysid.diagnosis.error_floor import ErrorFloor, gap_rms
 from torchdlo.sysid.diagnosis.misleading_trials import MisleadingTrial
 from torchdlo.sysid.diagnosis.significance import Agreement, benjamini_hochberg
 from torchdlo.sysid.estimation.jobs import Fitted
@@ -31,7 +31,7 @@ UNKNOWN_FLOOR = (
 """Note where nothing is known of the simulation's own errors."""
 
 
-def word(effects: Sequence[str], left: float, level: float, share: float = 0.0) -> str:
+def verdict_word(effects: Sequence[str], left: float, level: float, share: float = 0.0) -> str:
     """Return the verdict on a gap [m] where a perfect model leaves `level`; where that is not known, none is small.
 
     Args:
@@ -144,15 +144,15 @@ class Diagnosis:
     @property
     def compared(self) -> np.ndarray:
         """Which test trials both the baseline and the final model get through; all where that is none."""
-        return through(self.before, self.after)
+        return finite_trials(self.before, self.after)
 
     @property
     def gaps(self) -> tuple[float, float]:
         """Root mean square gap [m] on these trials, with the baseline and with the effects."""
-        return rms(self.before[self.compared]), rms(self.after[self.compared])
+        return gap_rms(self.before[self.compared]), gap_rms(self.after[self.compared])
 
 
-def through(*gaps: np.ndarray) -> np.ndarray:
+def finite_trials(*gaps: np.ndarray) -> np.ndarray:
     """Return which trials have finite gaps (B,) [m] with all models, shape (B,); all trials where none have."""
     finite = np.isfinite(gaps).all(0)
     return finite if finite.any() else np.ones_like(finite)

@@ -11,8 +11,8 @@ from torchdlo.errors import InputError
 from torchdlo.sysid.diagnosis import error_floor as floors
 from torchdlo.sysid.diagnosis.score_test import Score
 from torchdlo.sysid.estimation.jobs import FitJob, Fitted, SimulationJob
-from torchdlo.sysid.estimation.levenberg_marquardt import Look, cost_of, drift
-from torchdlo.sysid.estimation.worker_pool import Pool, spread
+from torchdlo.sysid.estimation.levenberg_marquardt import PointEvaluation, cost_of, drift
+from torchdlo.sysid.estimation.worker_pool import Pool, spread_jobs
 from torchdlo.sysid.model import initial_state as starts
 from torchdlo.sysid.model.trial_batch import Start
 
@@ -63,7 +63,7 @@ class Workspace:
         """The baseline's numbers that fit the beginning of the trials, as far as they are known."""
         self.linked = True
         """Whether the rope may move like a chain of links, as far as the baseline tells."""
-        self.floor = floors.ErrorFloor(floors.noise(self.recording), float("inf"), float("inf"))
+        self.floor = floors.ErrorFloor(floors.marker_noise(self.recording), float("inf"), float("inf"))
         """What no effect explains, on the test trials, as far as it is known."""
         self.level = float("inf")
         """What `gaps` are for a perfect model [m]."""
@@ -121,7 +121,7 @@ class Workspace:
         new = [f for f in fits if _key(f) not in self._known]
         # Models that settle twists take longer than others, which all fit into one batch.
         kinds = [(self.pool.local.framed(f.effects), f.options) for f in new]
-        groups = [[new[k] for k in group] for group in spread(kinds, self.pool.workers)]
+        groups = [[new[k] for k in group] for group in spread_jobs(kinds, self.pool.workers)]
         for k, sims in self.pool.simulate([self.pool.local.joined(g, "all", self.starts["all"]) for g in groups]):
             self._known |= {_key(f): sim for f, sim in zip(groups[k], sims, strict=True)}
         for fitted in new:
@@ -158,7 +158,7 @@ class Workspace:
 
     def gaps(self, fitted: Fitted, split: str) -> np.ndarray:
         """Return the gap of each trial of a split [m], frames weighted by what they tell."""
-        return floors.gap(self.prediction(fitted, split), self.trials[split], self.starts[split].frame_weights)
+        return floors.trial_gaps(self.prediction(fitted, split), self.trials[split], self.starts[split].frame_weights)
 
     def diverged(self, fitted: Fitted, before: np.ndarray) -> bool:
         """Return whether a model goes astray in a trial whose gap another one kept as small as `before` [m], (B,)."""
@@ -256,7 +256,7 @@ class Workspace:
             shares: how much of what was extrapolated for steps and mesh may be wrong. Next to clamps the mesh's error
                 may be of first order: extrapolating to that would change twice as much.
         """
-        look, start = Look(fitted.space, fitted.point.raw[None]), self.starts["train"]
+        look, start = PointEvaluation(fitted.space, fitted.point.raw[None]), self.starts["train"]
         model = self.pool.local.model(fitted.effects)
         rows = np.repeat(fitted.values[None], len(look.values), 0)
         rows[:, [model.parameters.index(n) for n in fitted.space.names]] = look.values

@@ -36,7 +36,7 @@ def errors(recording: Recording, predictions: Predictions) -> dict[str, float]:
     }
 
 
-def trivial(recording: Recording) -> dict[str, dict[str, float]]:
+def trivial_errors(recording: Recording) -> dict[str, dict[str, float]]:
     """Return the errors of predictions without a model, by their names."""
     trials = (*recording.train, *recording.test)
     return {name: errors(recording, {t.name: rule(t, recording) for t in trials}) for name, rule in BASELINES.items()}
@@ -57,7 +57,7 @@ def by_trial(recording: Recording, before: Predictions, after: Predictions) -> l
     ]
 
 
-def rope(recording: Recording, rest: str) -> dict[str, Any]:
+def rope_content(recording: Recording, rest: str) -> dict[str, Any]:
     """Return what a model file says of the rope itself."""
     return {
         "length": recording.length,

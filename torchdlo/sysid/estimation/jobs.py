@@ -184,13 +184,13 @@ def _search(
     if job.keep is not None:
         costs = levenberg_marquardt.costs(frame_weights * (yield full(space.to_values(raws))), measured)
         raws = raws[np.argsort(costs)[: job.keep]]
-    look = levenberg_marquardt.Look(space, raws)
+    look = levenberg_marquardt.PointEvaluation(space, raws)
     climb = levenberg_marquardt.Climb(space, look.points(frame_weights * (yield full(look.values)), measured))
     for _ in range(job.iterations):
         tries = climb.tries()
         if not len(tries):
             break
-        look = levenberg_marquardt.Look(space, tries)
+        look = levenberg_marquardt.PointEvaluation(space, tries)
         climb.take(look.points(frame_weights * (yield full(look.values)), measured))
     best = min(climb.points, key=lambda p: p.cost)
     return Fitted(job.effects, full(space.to_values(best.raw)[None])[0], space, best)

@@ -126,7 +126,7 @@ def _together(of_trial: np.ndarray, lost: float) -> np.ndarray:
     return np.where(ran.any(-1), np.where(ran, of_trial, lost).mean(-1), np.inf)
 
 
-class Look:
+class PointEvaluation:
     """What it takes to know costs and their gradients at S points (S, K): S (K + 1) simulations of each trial."""
 
     def __init__(self, space: ParameterSpace, raws: np.ndarray) -> None:
@@ -183,7 +183,7 @@ def evaluate(
     simulate: Simulate, measured: np.ndarray, space: ParameterSpace, raws: np.ndarray, whole: float | None = None
 ) -> list[Point]:
     """Return costs and their gradients at S parameter sets, shape (S, K); `whole` as in `Look.points`."""
-    look = Look(space, raws)
+    look = PointEvaluation(space, raws)
     return look.points(simulate(look.values), measured, whole)
 
 
@@ -221,7 +221,7 @@ class Climb:
                 self._active[i] = self._damping[i] < 1e3
 
 
-def improve(
+def improve_points(
     simulate: Simulate,
     measured: np.ndarray,
     space: ParameterSpace,
@@ -261,7 +261,11 @@ def _step(point: Point, damping: float, space: ParameterSpace) -> np.ndarray:
 
 
 def drift(
-    look: Look, sims: np.ndarray, measured: np.ndarray, errors: Sequence[np.ndarray], whole: float | None = None
+    look: PointEvaluation,
+    sims: np.ndarray,
+    measured: np.ndarray,
+    errors: Sequence[np.ndarray],
+    whole: float | None = None,
 ) -> np.ndarray:
     """Return how far the minimum moves when simulations are wrong, shape (E, K): one step of Gauss-Newton.
 

@@ -21,7 +21,7 @@ from torchdlo.sysid.estimation.levenberg_marquardt import ParameterSpace
 from torchdlo.vision.camera import NEAR, Camera, Lens, lens, project
 from torchdlo.vision.spine import curve_vectors
 
-__all__ = ["MarkerObservation", "Observation", "Spines", "View", "nuisances", "over_time"]
+__all__ = ["FilmView", "MarkerObservation", "Observation", "Spines", "nuisances", "over_time"]
 
 
 class Observation(Protocol):
@@ -62,7 +62,7 @@ class MarkerObservation:
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class FilmView:
     """What one camera saw of all trials."""
 
     camera: Camera
@@ -100,7 +100,7 @@ _PRIORS = (
 """Numbers of a camera, and how far calibrations are usually off: standard deviations."""
 
 
-def nuisances(views: Sequence[View]) -> ParameterSpace:
+def nuisances(views: Sequence[FilmView]) -> ParameterSpace:
     """Return pose, focal length and clock of every camera as coordinates, in units of how far off they may be."""
     names, params, sizes = [], [], []
     for view in views:
@@ -128,7 +128,7 @@ def over_time(sims: Tensor, step: float, time: Tensor) -> Tensor:
     return b + 0.5 * x * (c - a + x * (2 * a - 5 * b + 4 * c - d + x * (3 * (b - c) + d - a)))
 
 
-def seen_by(view: View, sims: Tensor, numbers: Tensor, step: float) -> tuple[Tensor, Tensor, Tensor]:
+def seen_by(view: FilmView, sims: Tensor, numbers: Tensor, step: float) -> tuple[Tensor, Tensor, Tensor]:
     """Return pixels (P, B, F, M, 2), depths (P, B, F, M) [m], and focal lengths (P,) [px], of a rope in a view.
 
     Args:
@@ -163,7 +163,7 @@ INDEPENDENT = 2.0
 class _Filmed:
     """What observations of films have in common: views, priors, and the target 0."""
 
-    def __init__(self, views: Sequence[View], step: float, extent: float) -> None:
+    def __init__(self, views: Sequence[FilmView], step: float, extent: float) -> None:
         self.views, self.step, self.extent = tuple(views), step, extent
         self.nuisances = nuisances(views)
         self.target = np.empty(0)
@@ -203,14 +203,14 @@ class _Filmed:
             out.append(np.concatenate([*short, self._priors(own[None], frames)], 3)[0])
         return np.stack(out)
 
-    def _view(self, k: int, view: View, sims: Tensor, numbers: Tensor) -> np.ndarray:
+    def _view(self, k: int, view: FilmView, sims: Tensor, numbers: Tensor) -> np.ndarray:
         raise NotImplementedError
 
 
 class Spines(_Filmed):
     """Distances between centre lines and the projected rope, both ways."""
 
-    def __init__(self, views: Sequence[View], step: float, extent: float, free: np.ndarray) -> None:
+    def __init__(self, views: Sequence[FilmView], step: float, extent: float, free: np.ndarray) -> None:
         """Prepare.
 
         Args:
@@ -233,7 +233,7 @@ class Spines(_Filmed):
             known.append(np.pad(each, ((0, 0), (0, frames - each.shape[1]), (0, 0), (0, 0))))
         self._finish((len(views[0].good), frames), known)
 
-    def _view(self, k: int, view: View, sims: Tensor, numbers: Tensor) -> np.ndarray:
+    def _view(self, k: int, view: FilmView, sims: Tensor, numbers: Tensor) -> np.ndarray:
         return self._pairs(view, sims, numbers)[0]
 
     def changes(self, sims: np.ndarray, numbers: np.ndarray) -> np.ndarray:
@@ -255,7 +255,7 @@ class Spines(_Filmed):
         return np.concatenate([*parts, self._priors(numbers, self.target.shape[1])], 3)
 
     def _pairs(
-        self, view: View, sims: Tensor, numbers: Tensor, pairs: tuple[Tensor, Tensor] | None = None
+        self, view: FilmView, sims: Tensor, numbers: Tensor, pairs: tuple[Tensor, Tensor] | None = None
     ) -> tuple[np.ndarray, tuple[Tensor, Tensor]]:
         """Return readings (P, B, F, R, 1) of a view, and which edges and points belong together, or use given ones."""
         pixel, depth, focal = seen_by(view, sims, numbers, self.step)

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["Calibration", "Overlay", "dump", "model_json", "summary", "summary_json", "versions"]
+__all__ = ["Calibration", "Overlay", "model_json", "result_json", "result_summary", "summary_json", "versions"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +65,7 @@ class Calibration:
     """Pictures of films with the rope before and after, if there are films."""
 
 
-def summary(result: Calibration, recording: str | Path) -> dict[str, Any]:
+def result_summary(result: Calibration, recording: str | Path) -> dict[str, Any]:
     """The result without its motions, for people and programs."""
     return {
         "recording": str(recording),
@@ -84,13 +84,13 @@ def summary(result: Calibration, recording: str | Path) -> dict[str, Any]:
 
 
 def summary_json(result: Calibration, recording: str | Path) -> str:
-    """`summary` as JSON text."""
-    return dump({"generator": "torchdlo calibrate"} | summary(result, recording))
+    """`result_summary` as JSON text."""
+    return result_json({"generator": "torchdlo calibrate"} | result_summary(result, recording))
 
 
 def model_json(result: Calibration) -> str:
     """The model file as JSON text, marked as ours."""
-    return dump({"generator": "torchdlo calibrate"} | result.model)
+    return result_json({"generator": "torchdlo calibrate"} | result.model)
 
 
 def versions() -> dict[str, str]:
@@ -104,7 +104,7 @@ def versions() -> dict[str, str]:
     return found
 
 
-def dump(content: dict[str, Any]) -> str:
+def result_json(content: dict[str, Any]) -> str:
     """Plain objects as JSON text."""
     # JSON has no NaN: a number that is not finite is written as null.
     return json.dumps(_plain(content), indent=1, allow_nan=False) + "\n"

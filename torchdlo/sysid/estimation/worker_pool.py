@@ -33,7 +33,7 @@ _SMALL = 1000
 """Frames of scenes, less than a tenth of a second, that no worker is asked for: they need seconds to begin."""
 
 
-def spread(kinds: Sequence[Hashable], parts: int) -> list[list[int]]:
+def spread_jobs(kinds: Sequence[Hashable], parts: int) -> list[list[int]]:
     """Return indices of jobs by their kinds, those of each kind in so many groups or less."""
     alike: dict[Hashable, list[int]] = {}
     for k, kind in enumerate(kinds):
@@ -183,7 +183,7 @@ class Pool:
         """
         kinds = [(id(j.start), j.frames, self._whole(j.options), self.local.framed(j.effects)) for j in jobs]
         scenes = sum(len(j.free) + 1 for j in jobs) * len(self.recording.train)
-        return spread(kinds, max(self.workers, scenes // _MANY))
+        return spread_jobs(kinds, max(self.workers, scenes // _MANY))
 
     def _done(self, what: Callable[[Models, Job], Any], jobs: Sequence[Job]) -> Iterator[tuple[int, Any]]:
         if not self._queues:

@@ -54,7 +54,7 @@ def diagnosed(folder: Path, recording: Recording) -> tuple[list[list[str]], Mode
 
 def _digests(recording: Recording) -> set[str]:
     """Return the hashes of what a diagnosis may have used of a recording: all of it, or some of its train trials."""
-    parts = (plan.some(recording, k + 1) for k in range(len(recording.train)))
+    parts = (plan.pick_trials(recording, k + 1) for k in range(len(recording.train)))
     return {digest({f.name: getattr(p, f.name) for f in dataclasses.fields(p)[1:]}) for p in parts}
 
 
@@ -98,7 +98,7 @@ def fit_rivals(
     """
     budget = plan.BUDGETS["fast"]
     if given is None:
-        base = baselines.calibrate(bench, budget.starts, budget.more, np.random.default_rng(seed), report)
+        base = baselines.calibrate_baseline(bench, budget.starts, budget.more, np.random.default_rng(seed), report)
     else:
         base = baselines.go_on(bench, _without(given, names), budget.more, report)
     start = bench.starts["train"]

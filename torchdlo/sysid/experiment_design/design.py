@@ -19,20 +19,20 @@ import numpy as np
 from torchdlo.errors import InputError
 from torchdlo.sysid.diagnosis import budget
 from torchdlo.sysid.diagnosis import error_floor as floors
-from torchdlo.sysid.diagnosis.effect_equations import separating
+from torchdlo.sysid.diagnosis.effect_equations import separating_experiment
 from torchdlo.sysid.diagnosis.score_test import curvature_scale
 from torchdlo.sysid.diagnosis.workspace import Callback, Workspace
 from torchdlo.sysid.estimation.jobs import Fitted
-from torchdlo.sysid.estimation.result import dump, versions
+from torchdlo.sysid.estimation.result import result_json, versions
 from torchdlo.sysid.estimation.result_cache import ResultCache
 from torchdlo.sysid.estimation.worker_pool import Pool
 from torchdlo.sysid.experiment_design import competing_models, excitation_motions
 from torchdlo.sysid.experiment_design.excitation_motions import KINDS, ExcitationMotion, GripperLimits
-from torchdlo.sysid.experiment_design.model_discrimination import ModelDiscrimination, Pair, measured_misfit, size
+from torchdlo.sysid.experiment_design.model_discrimination import ModelDiscrimination, Pair, measured_misfit, rms_size
 from torchdlo.sysid.recordings import data_quality
 from torchdlo.sysid.recordings.recording import Recording, Trial
 
-__all__ = ["Design", "Option", "design_experiment", "design_json", "rationale", "summary"]
+__all__ = ["Design", "Option", "design_experiment", "design_json", "design_summary", "rationale"]
 
 TRIALS = 4
 """Most train trials that rivals have to keep explaining."""
@@ -118,7 +118,7 @@ class Design:
         return max(min(self.misfit.values()) / self.noise, 1.0)
 
     def _worst(self, pairs: Sequence[Pair]) -> float:
-        return min(size(p.left) for p in pairs) / self.noise
+        return min(rms_size(p.left) for p in pairs) / self.noise
 
 
 def design_experiment(
@@ -159,11 +159,11 @@ def design_experiment(
     _check(recording, names, findings, seconds, scale, mass)
     recording, _ = data_quality.check(recording)
     ties, given = (None, None) if findings is None else competing_models.diagnosed(findings, recording)
-    recording = budget.some(recording, TRIALS)
-    options = budget.options(recording, vertices)
+    recording = budget.pick_trials(recording, TRIALS)
+    options = budget.model_options(recording, vertices)
     if given is not None:
         options |= given.options if vertices is None else given.options | {"vertices": vertices}
-    rig, noise = excitation_motions.make_rig(recording, scale), max(floors.noise(recording), LEAST_NOISE)
+    rig, noise = excitation_motions.make_rig(recording, scale), max(floors.marker_noise(recording), LEAST_NOISE)
     asked = {"design": list(names), "seconds": seconds, "scale": scale, "mass": mass, "seed": seed, "options": options}
     asked |= {"ties": ties, "first": given and given.values}
     kept = None if journal is None else ResultCache(journal, recording, asked, resume=resume)
@@ -188,7 +188,7 @@ def design_experiment(
             confirmed[0],
             chosen,
             confirmed[1],
-            excitation_motions.play(rig, chosen[0].gesture, seconds, "motion"),
+            excitation_motions.motion_trial(rig, chosen[0].gesture, seconds, "motion"),
             time.perf_counter() - begun,
             seed,
         )
@@ -214,14 +214,14 @@ def _check(
 def _search(contest: ModelDiscrimination, mass: float, rng: np.random.Generator, report: Callback) -> list[Option]:
     """Return the motions of the menu, best first, and before them the best of them improved."""
     gravity = float(np.linalg.norm(contest.bench.recording.gravity))
-    gestures = excitation_motions.menu(contest.rig, contest.seconds, gravity, mass)
+    gestures = excitation_motions.motion_menu(contest.rig, contest.seconds, gravity, mass)
     found = _judged(contest, gestures, report, "the menu")
     moving = [o for o in found if o.gesture.kind != "hold" and np.isfinite(o.estimate)]
     if not moving:
         return found
     best = moving[0]
     for k, wide in enumerate(WIDTHS, 1):
-        tries = excitation_motions.near(best.gesture, rng, COUNT, wide, contest.seconds)
+        tries = excitation_motions.nearby_motions(best.gesture, rng, COUNT, wide, contest.seconds)
         leader = _judged(contest, tries, report, f"improving, step {k} of {len(WIDTHS)}", improved=True)[0]
         best = leader if leader.estimate > best.estimate else best
     return [best, *found] if best.improved else found
@@ -232,7 +232,7 @@ def _judged(
 ) -> list[Option]:
     found = []
     for gesture, pairs in zip(gestures, contest.judge(gestures, 0, report, stage), strict=True):
-        travel = excitation_motions.travel(contest.rig, gesture, contest.seconds)
+        travel = excitation_motions.largest_amplitude(contest.rig, gesture, contest.seconds)
         found.append(Option(gesture, *travel, contest.worst(pairs), None, improved))
     return sorted(found, key=_rank)
 
@@ -262,7 +262,7 @@ def _confirm(
     return [judged[best], *rest, *(o for o in options if o not in lead)], (present, pairs[best])
 
 
-def called(gesture: ExcitationMotion, amplitude: float, unit: str) -> str:
+def motion_text(gesture: ExcitationMotion, amplitude: float, unit: str) -> str:
     """Return a motion in words."""
     said = KINDS[gesture.kind]
     if gesture.kind != "hold":
@@ -275,12 +275,12 @@ def called(gesture: ExcitationMotion, amplitude: float, unit: str) -> str:
     return said + (f", {1e3 * gesture.mass:.3g} g on the rope" if gesture.mass else "")
 
 
-def summary(design: Design) -> str:
+def design_summary(design: Design) -> str:
     """Return the outcome in words."""
     best = design.options[0]
     names = " and ".join(n.replace("_", " ") for n in design.models)
     said = (
-        f"To tell {names} apart: the gripper {called(best.gesture, best.amplitude, best.unit)}. "
+        f"To tell {names} apart: the gripper {motion_text(best.gesture, best.amplitude, best.unit)}. "
         f"Expected separation {design.separation:.1f} times the marker noise of {1e3 * design.noise:.2g} mm, the "
         f"recording at hand has {design.reference:.1f}"
     )
@@ -305,11 +305,11 @@ def rationale(design: Design) -> list[str]:
         truth, rival = (n.replace("_", " ") for n in (pair.truth, pair.rival))
         said.append(
             f"If {truth} is true, {rival} follows best with {moved}, and is then off by "
-            f"{1e3 * size(pair.left):.2g} mm, most at {1e2 * place[at[1]]:.0f} cm along the rope after "
+            f"{1e3 * rms_size(pair.left):.2g} mm, most at {1e2 * place[at[1]]:.0f} cm along the rope after "
             f"{design.trial.time[at[0]]:.1f} s."
         )
     first, second = list(design.models)[:2]
-    return [*said, f"Known from the laws: {separating(first, second)}."]
+    return [*said, f"Known from the laws: {separating_experiment(first, second)}."]
 
 
 def _more(design: Design) -> list[str]:
@@ -354,8 +354,8 @@ def design_json(design: Design) -> str:
             {
                 "truth": p.truth,
                 "rival": p.rival,
-                "separation": size(p.left) / design.noise,
-                "left_m": size(p.left),
+                "separation": rms_size(p.left) / design.noise,
+                "left_m": rms_size(p.left),
                 "rival_parameters": dict(zip(design.parameters[p.rival], p.values, strict=True)),
             }
             for p in pairs
@@ -385,12 +385,12 @@ def design_json(design: Design) -> str:
         "seconds": design.duration,
         "versions": versions(),
     }
-    return dump(content)
+    return result_json(content)
 
 
 def _option(option: Option) -> dict[str, Any]:
     return {
-        "message": called(option.gesture, option.amplitude, option.unit),
+        "message": motion_text(option.gesture, option.amplitude, option.unit),
         "separation_estimate": option.estimate,
         "separation": option.confirmed,
         f"amplitude_{option.unit}": option.amplitude,

@@ -14,7 +14,17 @@ from torchdlo.sysid.model import initial_state as starts
 from torchdlo.sysid.model.trial_batch import Start
 from torchdlo.sysid.recordings.recording import Recording, Trial
 
-__all__ = ["KINDS", "ExcitationMotion", "GripperLimits", "first_pose", "make_rig", "menu", "near", "play", "travel"]
+__all__ = [
+    "KINDS",
+    "ExcitationMotion",
+    "GripperLimits",
+    "first_pose",
+    "largest_amplitude",
+    "make_rig",
+    "motion_menu",
+    "motion_trial",
+    "nearby_motions",
+]
 
 KINDS = {
     "hold": "holds still",
@@ -158,7 +168,7 @@ def _turns(trial: Trial, group: np.ndarray, dt: float) -> tuple[float, float]:
     return float(np.percentile(angle, 99)), float(np.percentile(rate, 99))
 
 
-def menu(rig: GripperLimits, seconds: float, gravity: float, mass: float = 0.0) -> list[ExcitationMotion]:
+def motion_menu(rig: GripperLimits, seconds: float, gravity: float, mass: float = 0.0) -> list[ExcitationMotion]:
     """Return motions that are worth a try, those that limits leave too small left out.
 
     Args:
@@ -189,7 +199,7 @@ def menu(rig: GripperLimits, seconds: float, gravity: float, mass: float = 0.0) 
         found += [ExcitationMotion("roll", min(rig.turning / (1.876 * np.pi), 1.0), heading=h) for h in (0.0, quarter)]
     if mass:
         found += [replace(g, mass=mass) for g in found if g.kind in ("hold", "swing") and g.heading == 0.0]
-    return [g for g in found if g.kind == "hold" or _worth(*travel(rig, g, seconds))]
+    return [g for g in found if g.kind == "hold" or _worth(*largest_amplitude(rig, g, seconds))]
 
 
 def _worth(amplitude: float, unit: str) -> bool:
@@ -238,7 +248,7 @@ def _axes(gesture: ExcitationMotion, channel: str) -> np.ndarray:
     return np.array([[c, s, 0.0], [-s, c, 0.0]]) if channel == "level" else np.array([[0.0, 0.0, 1.0]])
 
 
-def travel(rig: GripperLimits, gesture: ExcitationMotion, seconds: float) -> tuple[float, str]:
+def largest_amplitude(rig: GripperLimits, gesture: ExcitationMotion, seconds: float) -> tuple[float, str]:
     """Return the amplitude of a motion and its unit, "m" or "rad": as large as all limits allow, times its share."""
     time = np.linspace(0, seconds, 4 * round(seconds / (rig.trial.time[1] - rig.trial.time[0])) + 1)
     unit, channel = _profile(gesture, time)
@@ -256,13 +266,13 @@ def travel(rig: GripperLimits, gesture: ExcitationMotion, seconds: float) -> tup
     return gesture.share * float(amplitude), "rad" if channel in ("nod", "roll") else "m"
 
 
-def play(rig: GripperLimits, gesture: ExcitationMotion, seconds: float, name: str) -> Trial:
+def motion_trial(rig: GripperLimits, gesture: ExcitationMotion, seconds: float, name: str) -> Trial:
     """Return the motion as a trial; where the free markers will be is not known, NaN."""
     trial = rig.trial
     dt = float(trial.time[1] - trial.time[0])
     time = dt * np.arange(round(seconds / dt) + 1)
     unit, channel = _profile(gesture, time)
-    amount = travel(rig, gesture, seconds)[0] * unit
+    amount = largest_amplitude(rig, gesture, seconds)[0] * unit
     markers = np.full((len(time), *rig.markers.shape), np.nan)
     markers[:, trial.gripped] = rig.markers[trial.gripped]
     if channel in ("level", "up"):
@@ -322,7 +332,7 @@ def first_pose(rig: GripperLimits, gestures: Sequence[ExcitationMotion]) -> Star
     return Start(pos, np.zeros_like(pos), np.full(len(pos), rig.still))
 
 
-def near(
+def nearby_motions(
     gesture: ExcitationMotion, rng: np.random.Generator, count: int, wide: float, seconds: float
 ) -> list[ExcitationMotion]:
     """Return motions like a given one, with other amplitude, frequency, direction and timing.

@@ -25,7 +25,7 @@ from torchdlo.sysid.model.rope_model import RopeModel
 from torchdlo.sysid.model.trial_batch import Start
 from torchdlo.sysid.recordings.recording import Trial
 
-__all__ = ["ModelDiscrimination", "Pair", "measured_misfit", "size"]
+__all__ = ["ModelDiscrimination", "Pair", "measured_misfit", "rms_size"]
 
 _LOAD = "point_mass"
 """The effect by which a known mass hangs on the rope."""
@@ -220,7 +220,9 @@ class ModelDiscrimination:
 
     def _trials(self, gestures: Sequence[ExcitationMotion], shown: np.ndarray | None = None) -> tuple[Trial, ...]:
         """Return motions as trials, with markers as given."""
-        trials = [excitation_motions.play(self.rig, g, self.seconds, f"train_{k}") for k, g in enumerate(gestures)]
+        trials = [
+            excitation_motions.motion_trial(self.rig, g, self.seconds, f"train_{k}") for k, g in enumerate(gestures)
+        ]
         if shown is None:
             return tuple(trials)
         free = ~self.rig.trial.gripped[:, None]
@@ -286,7 +288,7 @@ class ModelDiscrimination:
 
     def worst(self, pairs: Sequence[Pair]) -> float:
         """Return the smallest distance over pairs [noise]; NaN where a model fails."""
-        return float(np.min([size(p.left) for p in pairs])) / self.noise
+        return float(np.min([rms_size(p.left) for p in pairs])) / self.noise
 
 
 def _moved(space: ParameterSpace, raw: np.ndarray) -> np.ndarray:
@@ -296,7 +298,7 @@ def _moved(space: ParameterSpace, raw: np.ndarray) -> np.ndarray:
     return np.where(np.isclose(upward, raw + nudge), upward, raw - nudge)
 
 
-def size(left: np.ndarray) -> float:
+def rms_size(left: np.ndarray) -> float:
     """Return the root mean square of what is seen; NaN for nothing."""
     return float(np.sqrt(np.nanmean(np.square(left)))) if np.isfinite(left).any() else float("nan")
 

@@ -24,6 +24,6 @@ def _moved(scene: scenes.Scene, params: scenes.Params, state: scenes.State, cont
     return tree.replace(after, diagnostics=state.diagnostics, reaction=state.reaction)
 
 
-def recorded(scene: scenes.Scene, params: scenes.Params, state: scenes.State, control: scenes.Control) -> Step:
+def recorded_step(scene: scenes.Scene, params: scenes.Params, state: scenes.State, control: scenes.Control) -> Step:
     """Return the step of a scene for inputs of these shapes."""
     return _RECORDINGS.find(scene, partial(_moved, scene), params, state, control)

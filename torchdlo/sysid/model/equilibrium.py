@@ -10,7 +10,7 @@ import torch
 
 from torchdlo import scene as scenes
 from torchdlo.physics import tree
-from torchdlo.sysid.model.cached_steps import recorded
+from torchdlo.sysid.model.cached_steps import recorded_step
 from torchdlo.sysid.model.discretisation import Mesh
 
 _SETTLING = 4.0
@@ -48,7 +48,7 @@ def come_to_rest(
     calmed = tree.replace(params, effects=params.effects | {"damping": damping})
     rest = tree.replace(state, rods=tree.replace(state.rods, vel=torch.zeros_like(state.rods.vel)))
     rest = scenes.step(calm, calmed, rest, control)
-    step = recorded(calm, calmed, rest, control)
+    step = recorded_step(calm, calmed, rest, control)
     for _ in range(math.ceil(lasts / length) - 1):
         rest = step(calmed, rest, control)
     zero = {name: torch.zeros_like(getattr(rest.rods, name)) for name in ("vel", "twist_rate")}
@@ -79,7 +79,7 @@ def smooth_shapes(mesh: Mesh, free: np.ndarray) -> np.ndarray | None:
     return shapes @ np.linalg.inv(np.linalg.qr(shapes[mesh.marker_vertex[free]])[1])
 
 
-def explain(gap: np.ndarray, at: np.ndarray, dt: float, shapes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def explain_gap(gap: np.ndarray, at: np.ndarray, dt: float, shapes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return a displacement [m] and a velocity [m/s] of the vertices, (B, V, 3) each, that explain a gap best.
 
     Args:

@@ -22,7 +22,7 @@ _MISSED = 1e-3
 """Share of its length by which an edge may miss it where Newton's method is trusted."""
 
 
-def agree(scene: scenes.Scene, params: scenes.Params, state: scenes.State) -> scenes.State:
+def agreeing_state(scene: scenes.Scene, params: scenes.Params, state: scenes.State) -> scenes.State:
     """Return the state with positions and velocities that keep the rope's length.
 
     Args:
@@ -46,7 +46,7 @@ def agree(scene: scenes.Scene, params: scenes.Params, state: scenes.State) -> sc
     pos, vel, missed = settled(rods.pos)
     diverged = missed > _MISSED
     if bool(diverged.any()):
-        other = settled(laid(rods.pos, rest.length, scene.prescribed_vertices or (0,), scene.topology.closed[0]))
+        other = settled(lay_rope(rods.pos, rest.length, scene.prescribed_vertices or (0,), scene.topology.closed[0]))
         # Only there: elsewhere both agree with the lengths, but they are not the same.
         better = diverged & (other[2] < missed)
         pos, vel, missed = (torch.where(better, b, a) for a, b in zip((pos, vel, missed), other, strict=True))
@@ -55,7 +55,7 @@ def agree(scene: scenes.Scene, params: scenes.Params, state: scenes.State) -> sc
     return tree.replace(state, rods=tree.replace(rods, pos=tree.batch_innermost(pos), vel=tree.batch_innermost(vel)))
 
 
-def laid(pos: Tensor, length: Tensor, held: Sequence[int], closed: bool) -> Tensor:
+def lay_rope(pos: Tensor, length: Tensor, held: Sequence[int], closed: bool) -> Tensor:
     """Return a rope whose edges have the directions of others, and lengths that are right up to what held parts leave.
 
     Ends are exactly as long as they are. Between held vertices all edges share in what is left over.

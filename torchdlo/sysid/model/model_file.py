@@ -15,7 +15,7 @@ from torchdlo.errors import InputError
 from torchdlo.physics.effects import EFFECTS
 from torchdlo.sysid.diagnosis import effect_library
 from torchdlo.sysid.diagnosis.effect_library import PARAMETERS
-from torchdlo.sysid.estimation.evaluation import rope
+from torchdlo.sysid.estimation.evaluation import rope_content
 from torchdlo.sysid.model.discretisation import make_mesh
 from torchdlo.sysid.model.rope_model import RopeModel
 from torchdlo.sysid.recordings.recording import Recording
@@ -104,7 +104,7 @@ def content(model: RopeModel, values: np.ndarray) -> dict[str, Any]:
     return {
         "format": FORMAT,
         "version": VERSION,
-        "rope": rope(model.recording, model.rest),
+        "rope": rope_content(model.recording, model.rest),
         "parameters": numbers,
         "effects": effects,
         "options": {

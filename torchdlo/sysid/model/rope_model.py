@@ -28,7 +28,7 @@ from torchdlo.physics.linalg.numerics import normalize
 from torchdlo.sysid.diagnosis import effect_library
 from torchdlo.sysid.diagnosis.effect_library import PARAMETERS, Number
 from torchdlo.sysid.model import equilibrium, length_projection
-from torchdlo.sysid.model.cached_steps import recorded
+from torchdlo.sysid.model.cached_steps import recorded_step
 from torchdlo.sysid.model.discretisation import make_mesh
 from torchdlo.sysid.model.gripper_motion import drive
 from torchdlo.sysid.model.marker_observation import Markers
@@ -217,7 +217,7 @@ class RopeModel:
             twist_iterations=4 if self.numerical_damping >= AHEAD else 2,
         )
         params = self._measured_lengths(params, number)
-        return scene, params, length_projection.agree(scene, params, state)
+        return scene, params, length_projection.agreeing_state(scene, params, state)
 
     def _laws(self) -> list[Effect]:
         """Return the effects of the scene."""
@@ -343,7 +343,7 @@ class RopeModel:
             scenes.Control(tree.batch_innermost(motion.held[:, k]), tree.batch_innermost(director[:, k]))
             for k in range((frames - 1) * self.substeps + 1)
         ]
-        step = recorded(scene, params, state, controls[0])
+        step = recorded_step(scene, params, state, controls[0])
         if start.still is not None and start.still.any():
             resting = equilibrium.come_to_rest(scene, params, state, controls[0])
             resting = self._corrected(step, scene, params, resting, controls, motion)
@@ -377,10 +377,10 @@ class RopeModel:
                 seen.append(self.markers.frame(now))
         gap = motion.markers[:, :frames] - self.markers.seen(scene, params, seen, late=False).numpy()
         shift, drift = (
-            torch.as_tensor(x) for x in equilibrium.explain(gap[:, :, free], shapes[at][free], self.dt, shapes)
+            torch.as_tensor(x) for x in equilibrium.explain_gap(gap[:, :, free], shapes[at][free], self.dt, shapes)
         )
         rods = tree.replace(state.rods, pos=state.rods.pos + shift, vel=state.rods.vel + drift)
-        return length_projection.agree(scene, params, tree.replace(state, rods=rods))
+        return length_projection.agreeing_state(scene, params, tree.replace(state, rods=rods))
 
 
 def _turned(curvature: Tensor, number: dict[str, Tensor]) -> Tensor:

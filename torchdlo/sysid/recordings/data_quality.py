@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from torchdlo.errors import InputError
-from torchdlo.sysid.diagnosis.error_floor import noise as noise_of
+from torchdlo.sysid.diagnosis.error_floor import marker_noise as noise_of
 from torchdlo.sysid.recordings.marker_spacing import spacing_faults
 from torchdlo.sysid.recordings.recording import Recording, Trial
 

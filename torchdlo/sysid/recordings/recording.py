@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from torchdlo.errors import InputError
-from torchdlo.files import replacing
+from torchdlo.files import replace_atomically
 from torchdlo.sysid.recordings import rope_schema
 from torchdlo.sysid.video.films import FilmFile, film_files, with_stations
 from torchdlo.untrusted import check_path
@@ -166,7 +166,7 @@ def save_trial(path: str | Path, trial: Trial) -> None:
     if trial.gripper_quaternion is not None and trial.gripper_marker is not None:
         arrays["gripper_quaternion"] = trial.gripper_quaternion
         arrays["gripper_marker"] = trial.gripper_marker
-    with replacing(Path(path)) as temporary:
+    with replace_atomically(Path(path)) as temporary:
         np.savez_compressed(temporary, **arrays)
 
 

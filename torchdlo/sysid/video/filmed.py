@@ -16,16 +16,16 @@ from typing import Any
 import numpy as np
 
 from torchdlo.errors import InputError
-from torchdlo.sysid.diagnosis.budget import options as suited
-from torchdlo.sysid.estimation.observation import Spines, View
+from torchdlo.sysid.diagnosis.budget import model_options as suited
+from torchdlo.sysid.estimation.observation import FilmView, Spines
 from torchdlo.sysid.estimation.result import Calibration, Overlay
 from torchdlo.sysid.model import model_file
 from torchdlo.sysid.model.model_file import ModelFile
 from torchdlo.sysid.recordings.recording import Recording
 from torchdlo.sysid.video.filmed_fit import START_WINDOW, Fit, fit, gate, intervals, picture_errors, refine_start, scout
-from torchdlo.sysid.video.filmed_problem import Problem, begin_from_balance, correct, problem
+from torchdlo.sysid.video.filmed_problem import FilmedProblem, add_correction, begin_from_balance, filmed_problem
 from torchdlo.sysid.video.footage import views_of
-from torchdlo.sysid.video.overlay import overlaps, overlays
+from torchdlo.sysid.video.overlay import mask_overlaps, overlays
 
 __all__ = ["FILMED_STARTS", "baseline", "calibrate_filmed", "tested"]
 
@@ -91,14 +91,14 @@ def calibrate_filmed(
 
 def baseline(
     recording: Recording,
-    views: Sequence[View],
+    views: Sequence[FilmView],
     starts: int,
     iterations: int,
     seed: int,
     vertices: int | None,
     given: ModelFile | None,
     report: Callback,
-) -> tuple[Problem, np.ndarray, Fit]:
+) -> tuple[FilmedProblem, np.ndarray, Fit]:
     """Return the problem of the train trials, numbers (N,) to start from, and the best fit; see `calibrate_filmed`."""
     own = _problem(recording, views, vertices, given)
     first = np.concatenate([own.fixed[list(own.free)], np.zeros(len(own.spines.nuisances.names))])
@@ -112,7 +112,9 @@ def baseline(
     return own, first, best
 
 
-def tested(own: Problem, recording: Recording, values: np.ndarray, report: Callback) -> tuple[Problem, list[str]]:
+def tested(
+    own: FilmedProblem, recording: Recording, values: np.ndarray, report: Callback
+) -> tuple[FilmedProblem, list[str]]:
     """Return the problem of the test trials, which begin as their first frames say with numbers (N,), and remarks."""
     views, said = views_of(recording, recording.test, report)
     spines = Spines(views, own.model.dt, own.extent, own.spines.free)
@@ -121,7 +123,7 @@ def tested(own: Problem, recording: Recording, values: np.ndarray, report: Callb
     begin_from_balance(here, own.full(values[None])[0])
     refine_start(here, values)
     gate(here, values)
-    correct(here, values)
+    add_correction(here, values)
     return here, said
 
 
@@ -129,18 +131,20 @@ def _mean(trials: Sequence[dict[str, Any]], split: str, name: str) -> float:
     return float(np.mean([t[name] for t in trials if t["split"] == split]))
 
 
-def _problem(recording: Recording, views: Sequence[View], vertices: int | None, given: ModelFile | None) -> Problem:
+def _problem(
+    recording: Recording, views: Sequence[FilmView], vertices: int | None, given: ModelFile | None
+) -> FilmedProblem:
     """Return the problem of the train trials, with a model that suits them or a given one."""
     if given is None:
         options = suited(recording, vertices) | {"rest": "straight"}
-        return problem(recording, recording.train, views, options=options)
+        return filmed_problem(recording, recording.train, views, options=options)
     options = dict(given.options) | ({} if vertices is None else {"vertices": vertices})
     model = given.model(recording, **({} if vertices is None else {"vertices": vertices}))
     more: dict[str, Any] = {"effects": given.effects, "values": given.start(model), "fitted": tuple(given.sizes(model))}
-    return problem(recording, recording.train, views, options=options, **more)
+    return filmed_problem(recording, recording.train, views, options=options, **more)
 
 
-def _fitted(own: Problem, raw: np.ndarray, iterations: int, report: Callback) -> Fit:
+def _fitted(own: FilmedProblem, raw: np.ndarray, iterations: int, report: Callback) -> Fit:
     """Return the best fit of all trials, without wrong frames and with what finer simulations change."""
     stage, values = f"fitting {len(own.trials)} filmed trials", own.space.to_values(raw)
     best = _in_motion(own, raw)
@@ -156,13 +160,13 @@ def _fitted(own: Problem, raw: np.ndarray, iterations: int, report: Callback) ->
     report(stage, 2, 3, f"{1e3 * best.cost:.2f} mm")
     values = own.space.to_values(best.raw)
     gate(own, values)
-    correct(own, values)
+    add_correction(own, values)
     best = fit(own, best.raw, iterations)
     report(stage, 3, 3, f"{1e3 * best.cost:.2f} mm")
     return best
 
 
-def _in_motion(own: Problem, raw: np.ndarray) -> Fit:
+def _in_motion(own: FilmedProblem, raw: np.ndarray) -> Fit:
     """Return a first fit of most of the time, with starts anew."""
     values = own.space.to_values(raw)
     if own.offset.shape[1]:
@@ -186,7 +190,7 @@ class _Judged:
 def _judged(
     recording: Recording,
     split: str,
-    own: Problem,
+    own: FilmedProblem,
     first: np.ndarray,
     values: np.ndarray,
     notes: list[str],
@@ -200,7 +204,7 @@ def _judged(
     old, _ = picture_errors(here, first)
     new, pixels = picture_errors(here, values)
     sims = here.simulate(np.stack([first, values]))
-    share = overlaps(here, sims[1], values[numbers:])
+    share = mask_overlaps(here, sims[1], values[numbers:])
     trials = [
         {
             "name": trial.name,
@@ -217,7 +221,7 @@ def _judged(
     return _Judged(trials, predictions, shown)
 
 
-def _remarks(own: Problem, values: np.ndarray, low: np.ndarray, high: np.ndarray) -> list[str]:
+def _remarks(own: FilmedProblem, values: np.ndarray, low: np.ndarray, high: np.ndarray) -> list[str]:
     """Return what these views cannot test."""
     out = []
     moving = [t.name for t, calm in zip(own.trials, own.start.still, strict=True) if not calm]

@@ -15,16 +15,16 @@ import numpy as np
 from torchdlo.sysid.diagnosis import effect_library, score_test
 from torchdlo.sysid.diagnosis.budget import BUDGETS, Budget
 from torchdlo.sysid.diagnosis.candidate_fits import vector
-from torchdlo.sysid.diagnosis.error_floor import ErrorFloor, rms
+from torchdlo.sysid.diagnosis.error_floor import ErrorFloor, gap_rms
 from torchdlo.sysid.diagnosis.score_test import Score
-from torchdlo.sysid.diagnosis.verdict import UNKNOWN_FLOOR, Candidate, Diagnosis, word
+from torchdlo.sysid.diagnosis.verdict import UNKNOWN_FLOOR, Candidate, Diagnosis, verdict_word
 from torchdlo.sysid.estimation import levenberg_marquardt
 from torchdlo.sysid.estimation.jobs import Fitted
 from torchdlo.sysid.model.model_file import ModelFile
 from torchdlo.sysid.recordings.recording import Recording
 from torchdlo.sysid.video.filmed import FILMED_STARTS, baseline, tested
 from torchdlo.sysid.video.filmed_fit import Fit, fit, look, spread
-from torchdlo.sysid.video.filmed_problem import Problem
+from torchdlo.sysid.video.filmed_problem import FilmedProblem
 from torchdlo.sysid.video.footage import views_of
 from torchdlo.sysid.video.overlay import overlays
 
@@ -64,9 +64,9 @@ _LEADERS = 3
 class _Model:
     """A model with its fit."""
 
-    own: Problem
+    own: FilmedProblem
     fit: Fit
-    test: Problem
+    test: FilmedProblem
     """The same of the test trials."""
     _tested: np.ndarray | None = field(init=False, default=None)
 
@@ -109,14 +109,14 @@ def diagnose_filmed(
     base = _Model(own, best, test)
     if given is None:
         base = _chained(base)
-        report("calibrating the baseline", 1, 1, f"{1e3 * rms(base.gaps('train')):.2f} mm")
+        report("calibrating the baseline", 1, 1, f"{1e3 * gap_rms(base.gaps('train')):.2f} mm")
     floor, level = _floor(base)
     plan, first = BUDGETS[budget], base
     shares: dict[str, float] = {}
     ties: dict[str, list[str]] = {}
     rounds: list[list[Candidate]] = []
     while len(rounds) < plan.rounds:
-        if rms(np.concatenate([base.gaps("train"), base.gaps("test")])) < (MORE if shares else SILENT) * level:
+        if gap_rms(np.concatenate([base.gaps("train"), base.gaps("test")])) < (MORE if shares else SILENT) * level:
             break
         names = [n for n in effect_library.LIBRARY if n not in (*base.own.model.effects, *without)]
         names = [n for n in names if effect_library.applicable(n, recording, base.own.model.mesh)]
@@ -125,8 +125,8 @@ def diagnose_filmed(
         if found is None:
             break
         name = found.own.model.effects[-1]
-        excess = max(rms(first.gaps("test")) ** 2 - floor.noise**2, 1e-12)
-        shares[name] = (rms(base.gaps("test")) ** 2 - rms(found.gaps("test")) ** 2) / excess
+        excess = max(gap_rms(first.gaps("test")) ** 2 - floor.noise**2, 1e-12)
+        shares[name] = (gap_rms(base.gaps("test")) ** 2 - gap_rms(found.gaps("test")) ** 2) / excess
         ties[name] = rivals
         base = found
     return _concluded(recording, first, base, floor, level, shares, ties, rounds, [*notes, *said], seed, budget, begun)
@@ -244,7 +244,7 @@ def _round(
 
 def _gain(base: _Model, other: _Model, split: str, floor: ErrorFloor) -> float:
     """Return the share of the excess gap that another model closes."""
-    before, after = rms(base.gaps(split)) ** 2, rms(other.gaps(split)) ** 2
+    before, after = gap_rms(base.gaps(split)) ** 2, gap_rms(other.gaps(split)) ** 2
     return float((before - after) / max(before - floor.noise**2, (0.3 * floor.noise) ** 2, 1e-12))
 
 
@@ -258,8 +258,8 @@ def _refused(rival: _Model, other: _Model, first: _Model, floor: ErrorFloor, lev
     if _gain(rival, other, "test", floor) < PAYS:
         return "does not help on the test trials"
     for split in ("train", "test"):
-        before, after = (rms(m.gaps(split)) ** 2 for m in (rival, other))
-        enough = min(MATTERS * (rms(first.gaps(split)) ** 2 - floor.noise**2), 0.8 * (before - level**2))
+        before, after = (gap_rms(m.gaps(split)) ** 2 for m in (rival, other))
+        enough = min(MATTERS * (gap_rms(first.gaps(split)) ** 2 - floor.noise**2), 0.8 * (before - level**2))
         if before - after <= max(level**2, enough):
             return "closes less than the floor leaves open"
     return None
@@ -378,7 +378,7 @@ def _concluded(
         numbers = [m.values[len(m.own.free) :] for m in (first, final)]
         shown += overlays(problems[0], split, np.stack(sims), np.stack(numbers))
     done = Diagnosis(
-        word(effects, rms(after), level, rms(after) / rms(before)),
+        verdict_word(effects, gap_rms(after), level, gap_rms(after) / gap_rms(before)),
         effects,
         {name: ties[name] for name in effects},
         shares,

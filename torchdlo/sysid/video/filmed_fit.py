@@ -16,7 +16,7 @@ import numpy as np
 from torchdlo.sysid.estimation import levenberg_marquardt
 from torchdlo.sysid.estimation.levenberg_marquardt import ParameterSpace, Point
 from torchdlo.sysid.estimation.observation import INDEPENDENT, SURE, Spines
-from torchdlo.sysid.video.filmed_problem import Problem
+from torchdlo.sysid.video.filmed_problem import FilmedProblem
 
 __all__ = ["Fit", "fit", "gate", "intervals", "look", "picture_errors", "refine_start", "scout", "spread"]
 
@@ -99,10 +99,10 @@ def eliminated(gradient: np.ndarray, curvature: np.ndarray, count: int) -> tuple
     return gradient[:, :-count] - (b @ solved[..., -1:])[..., 0], a - b @ solved[..., :-1]
 
 
-def look(own: Problem, raw: np.ndarray, offset: np.ndarray, seconds: float | None = None) -> Fit:
+def look(own: FilmedProblem, raw: np.ndarray, offset: np.ndarray, seconds: float | None = None) -> Fit:
     """Return readings and their derivatives at coordinates (N,) and starts (B, J), over the first seconds."""
     space, numbers, moving = own.space, len(own.free), offset.shape[1]
-    step = levenberg_marquardt.Look(space, raw[None])
+    step = levenberg_marquardt.PointEvaluation(space, raw[None])
     values = step.values
     # What cameras are off needs no simulation of its own.
     rows = np.concatenate([values[: numbers + 1], np.repeat(values[:1], moving, 0)])
@@ -132,7 +132,7 @@ def look(own: Problem, raw: np.ndarray, offset: np.ndarray, seconds: float | Non
 
 
 def fit(
-    own: Problem,
+    own: FilmedProblem,
     raw: np.ndarray,
     iterations: int,
     *,
@@ -176,7 +176,7 @@ def _total(found: Fit) -> float:
     return float(np.where(ran, found.costs, 1.0).mean()) if ran.any() else np.inf
 
 
-def _step(own: Problem, now: Fit, damping: float, fixed: bool) -> tuple[np.ndarray, np.ndarray]:
+def _step(own: FilmedProblem, now: Fit, damping: float, fixed: bool) -> tuple[np.ndarray, np.ndarray]:
     """Return a step of numbers (N,) and one of starts (B, J)."""
     gradient, curvature = now.normal(own.prior)
     count, size = now.offset.shape[1], len(now.raw)
@@ -201,14 +201,14 @@ def _step(own: Problem, now: Fit, damping: float, fixed: bool) -> tuple[np.ndarr
     return step, moves / longest
 
 
-def refine_start(own: Problem, values: np.ndarray, passes: int = 6) -> None:
+def refine_start(own: FilmedProblem, values: np.ndarray, passes: int = 6) -> None:
     """Estimate the starts of trials in motion from their first seconds, with numbers (N,) as they are."""
     if own.offset.shape[1]:
         for share in (0.5, 1.0):
             fit(own, own.space.to_raw(values), passes, seconds=share * START_WINDOW, tolerance=1e-2, fixed=True)
 
 
-def scout(own: Problem, starts: int, rng: np.random.Generator, report: Callback) -> np.ndarray:
+def scout(own: FilmedProblem, starts: int, rng: np.random.Generator, report: Callback) -> np.ndarray:
     """Return coordinates (N,) in the basin of the best fit: of the rope alone, cameras being where they are said to be.
 
     Many starts are tried on the beginning of the trials, where a cost has few local minima; the best go on.
@@ -238,7 +238,7 @@ def scout(own: Problem, starts: int, rng: np.random.Generator, report: Callback)
     report("trying starts", 1, total, f"{1e3 * cost.min():.2f} mm")
     points: list[Point] = levenberg_marquardt.evaluate(simulate, target, space, raws, own.extent)
     limits: dict[str, Any] = {"iterations": 4, "tolerance": 1e-2, "whole": own.extent}
-    for points in levenberg_marquardt.improve(simulate, target, space, points, **limits):  # noqa: B007, B020
+    for points in levenberg_marquardt.improve_points(simulate, target, space, points, **limits):  # noqa: B007, B020
         pass
     points = _different(points, 3)
     report("trying starts", 2, total, f"{1e3 * points[0].cost:.2f} mm over 35 % of the time")
@@ -260,7 +260,7 @@ def _different(points: Sequence[Point], most: int) -> list[Point]:
     return [p for p in kept[:most] if p.cost < 2 * kept[0].cost] or [min(points, key=lambda p: p.cost)]
 
 
-def gate(own: Problem, values: np.ndarray) -> int:
+def gate(own: FilmedProblem, values: np.ndarray) -> int:
     """Take out frames in which films stay far from the rope while others are near; return how many."""
     found, target = own.readings()[0](values[None])[0], own.spines.target
     lost, start = 0, 0
@@ -289,7 +289,7 @@ def gate(own: Problem, values: np.ndarray) -> int:
     return lost
 
 
-def intervals(own: Problem, found: Fit) -> tuple[np.ndarray, np.ndarray]:
+def intervals(own: FilmedProblem, found: Fit) -> tuple[np.ndarray, np.ndarray]:
     """Return 90 % limits of the fitted numbers, shape (N,) each; all that is possible where films do not tell."""
     point, drifts = spread(own, found)
     low, high = levenberg_marquardt.interval(point, own.space, drifts=drifts)
@@ -299,7 +299,7 @@ def intervals(own: Problem, found: Fit) -> tuple[np.ndarray, np.ndarray]:
     return np.minimum(low, high), np.maximum(low, high)
 
 
-def spread(own: Problem, found: Fit) -> tuple[Point, np.ndarray]:
+def spread(own: FilmedProblem, found: Fit) -> tuple[Point, np.ndarray]:
     """Return a fit with stretches of time in the place of trials, and what shifts all of them alike, (E, N).
 
     Stretches of time scatter; what cameras may be off shifts all of them in the same way, and starts in motion follow.
@@ -329,14 +329,14 @@ def spread(own: Problem, found: Fit) -> tuple[Point, np.ndarray]:
     return point, drifts
 
 
-def _difference(own: Problem, found: Fit, moved: Fit) -> tuple[np.ndarray, np.ndarray]:
+def _difference(own: FilmedProblem, found: Fit, moved: Fit) -> tuple[np.ndarray, np.ndarray]:
     """Return what another residual changes of gradients, and the curvatures as they are."""
     before, curvature = found.normal(own.prior)
     after, _ = moved.normal(own.prior)
     return after - before, curvature
 
 
-def _blocks(own: Problem, found: Fit) -> tuple[np.ndarray, np.ndarray]:
+def _blocks(own: FilmedProblem, found: Fit) -> tuple[np.ndarray, np.ndarray]:
     """Return gradients (E, N) and curvatures (E, N, N) of stretches of time of all trials, starts being eliminated."""
     count, length = found.offset.shape[1], max(3, round(_BLOCK * own.spines.views[0].camera.fps))
     size, frames = found.raw.size, found.residual.shape[1]
@@ -363,7 +363,7 @@ def _blocks(own: Problem, found: Fit) -> tuple[np.ndarray, np.ndarray]:
     return np.stack(gradients), np.stack(curvatures)
 
 
-def picture_errors(own: Problem, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def picture_errors(own: FilmedProblem, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the mean distance of the films' centre lines from the rope by trial [m] and [px], (B,) each."""
     sims = own.simulate(values[None])
     read = own.spines.read(sims, values[None, len(own.free) :])[0]

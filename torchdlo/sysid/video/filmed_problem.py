@@ -11,14 +11,14 @@ import numpy as np
 from torchdlo.sysid.diagnosis.error_floor import Refinement, refinement
 from torchdlo.sysid.estimation import levenberg_marquardt
 from torchdlo.sysid.estimation.levenberg_marquardt import KNEE, ParameterSpace
-from torchdlo.sysid.estimation.observation import INDEPENDENT, SURE, Spines, View
+from torchdlo.sysid.estimation.observation import INDEPENDENT, SURE, FilmView, Spines
 from torchdlo.sysid.model import equilibrium
 from torchdlo.sysid.model.rope_model import RopeModel
 from torchdlo.sysid.model.trial_batch import Start, TrialBatch
 from torchdlo.sysid.recordings.recording import Recording, Trial
 from torchdlo.sysid.recordings.trivial_predictors import catenary
 
-__all__ = ["Problem", "begin_from_balance", "correct", "problem", "start_of"]
+__all__ = ["FilmedProblem", "add_correction", "begin_from_balance", "filmed_problem", "start_of"]
 
 _CALM = 0.03
 """Speed of a gripper below which it is at rest [m/s]."""
@@ -28,7 +28,7 @@ _SHIFT, _DRIFT = 0.03, 0.3
 
 
 @dataclass(eq=False)
-class Problem:
+class FilmedProblem:
     """A model, trials, and what films show of them."""
 
     model: RopeModel
@@ -65,13 +65,13 @@ class Problem:
         pictures = np.sum([v.good.sum(1) for v in self.spines.views], 0)
         return SURE**2 / KNEE / (INDEPENDENT * np.maximum(pictures, 1))
 
-    def with_options(self, **options: Any) -> Problem:
+    def with_options(self, **options: Any) -> FilmedProblem:
         """Return the problem with a model that has other options."""
         known = self.options | options
         model = RopeModel(self.model.recording, effects=self.model.effects, **known)
         return replace(self, model=model, motion=model.motion(self.trials), options=known)
 
-    def with_effects(self, effects: Sequence[str], sizes: dict[str, float], numbers: Sequence[str]) -> Problem:
+    def with_effects(self, effects: Sequence[str], sizes: dict[str, float], numbers: Sequence[str]) -> FilmedProblem:
         """Return the problem with a model that has these effects, of which numbers with sizes are fitted as well.
 
         Args:
@@ -86,7 +86,7 @@ class Problem:
         free = tuple(k for k, n in enumerate(model.parameters) if n in old or n in numbers)
         return replace(self, model=model, fixed=fixed, free=free, sizes=self.sizes | sizes)
 
-    def take(self, other: Problem) -> None:
+    def take(self, other: FilmedProblem) -> None:
         """Become another problem."""
         vars(self).update(vars(other))
 
@@ -109,7 +109,7 @@ class Problem:
         """How far the rope moves [m]."""
         return self.spines.extent
 
-    def depth(self, view: View) -> float:
+    def depth(self, view: FilmView) -> float:
         """Return how far the grippers are from a camera in the mean [m]."""
         held = np.concatenate([t.markers[:, t.gripped].reshape(-1, 3) for t in self.trials])
         return float(np.mean(held @ np.array(view.camera.rotation)[2] + view.camera.translation[2]))
@@ -170,7 +170,7 @@ class Problem:
         return read, self.target(seconds)[..., None]
 
 
-def start_of(model: RopeModel, trials: Sequence[Trial], views: Sequence[View]) -> Start:
+def start_of(model: RopeModel, trials: Sequence[Trial], views: Sequence[FilmView]) -> Start:
     """Return where trials begin: hanging between the grippers, at rest if those are and pictures do not change."""
     pos, vel, still = [], [], []
     recording = model.recording
@@ -187,7 +187,7 @@ def start_of(model: RopeModel, trials: Sequence[Trial], views: Sequence[View]) -
     return Start(np.stack(pos), np.stack(vel), np.array(still))
 
 
-def _unchanged(view: View, b: int) -> bool:
+def _unchanged(view: FilmView, b: int) -> bool:
     """Return whether the centre line stays where it is in the first good pictures of a trial."""
     rows = np.flatnonzero(view.good[b])[:3]
     if len(rows) < 2:
@@ -220,16 +220,16 @@ def _placed(shape: np.ndarray, trial: Trial, recording: Recording) -> np.ndarray
     return out
 
 
-def problem(
+def filmed_problem(
     recording: Recording,
     trials: Sequence[Trial],
-    views: Sequence[View],
+    views: Sequence[FilmView],
     *,
     effects: Sequence[str] = (),
     values: np.ndarray | None = None,
     fitted: Sequence[str] | None = None,
     options: dict[str, Any] | None = None,
-) -> Problem:
+) -> FilmedProblem:
     """Return the problem of fitting a model to films.
 
     Args:
@@ -250,12 +250,12 @@ def problem(
     first = model.guess() if values is None else np.asarray(values, dtype=float)
     begin = start_of(model, trials, views)
     known = dict(options or {})
-    own = Problem(model, tuple(trials), model.motion(trials), spines, begin, columns, first, {}, known)
+    own = FilmedProblem(model, tuple(trials), model.motion(trials), spines, begin, columns, first, {}, known)
     begin_from_balance(own, first)
     return own
 
 
-def begin_from_balance(own: Problem, numbers: np.ndarray) -> None:
+def begin_from_balance(own: FilmedProblem, numbers: np.ndarray) -> None:
     """Let trials in motion begin, until more is known, in balance with numbers (K,), carried along by the grippers."""
     model, plain = own.model, start_of(own.model, own.trials, own.spines.views)
     spots = np.setdiff1d(np.arange(model.count), model.gripped)
@@ -271,7 +271,7 @@ def begin_from_balance(own: Problem, numbers: np.ndarray) -> None:
     own.offset = np.zeros((len(own.trials), 6 * own.shapes.shape[1]))
 
 
-def correct(own: Problem, values: np.ndarray) -> None:
+def add_correction(own: FilmedProblem, values: np.ndarray) -> None:
     """Add to simulations from now on what finer steps and a finer mesh change at these numbers (K + Q,)."""
     model = own.model
     own.start = replace(own.start, discretisation_correction=None)

@@ -15,7 +15,7 @@ from torchdlo.errors import InputError
 from torchdlo.sysid.recordings.recording import Recording, Trial, check_new_folder
 from torchdlo.untrusted import read_json
 from torchdlo.vision.camera import Camera, save_cameras
-from torchdlo.vision.film import Film, Look, check_inside, off_camera
+from torchdlo.vision.film import Film, FilmLook, check_inside, off_camera
 from torchdlo.vision.film import film as film_rope
 from torchdlo.vision.segment import save_masks
 from torchdlo.vision.video_file import write_video
@@ -49,7 +49,7 @@ def film_recording(
     recording: Recording,
     cameras: Sequence[Camera],
     out: Path,
-    look: Look,
+    look: FilmLook,
     *,
     radius: float | None = None,
     masks: bool = False,
@@ -153,7 +153,7 @@ def film_run(
     radius: float,
     cameras: Sequence[Camera],
     out: Path,
-    look: Look,
+    look: FilmLook,
     *,
     masks: bool = False,
     callback: Callback | None = None,

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from torchdlo.errors import InputError
-from torchdlo.sysid.estimation.observation import View
+from torchdlo.sysid.estimation.observation import FilmView
 from torchdlo.sysid.recordings.recording import Recording, Trial
 from torchdlo.sysid.video.films import FilmFile
 from torchdlo.vision.mask_health import check_masks
@@ -32,7 +32,7 @@ _STILL = 5e-4
 
 def views_of(
     recording: Recording, trials: Sequence[Trial], callback: Callable[[str, int, int, str], None] | None = None
-) -> tuple[list[View], list[str]]:
+) -> tuple[list[FilmView], list[str]]:
     """Return what each camera saw of trials, and sentences on what was wrong with it.
 
     Raises:
@@ -69,7 +69,7 @@ def views_of(
 
         lines = (stack(0, 0).astype(bool), stack(1, np.nan), stack(2, np.nan))
         wide, packed, shown = float(np.median([p[3] for p in parts])), *(tuple(p[n] for p in parts) for n in (4, 5))
-        views.append(View(trials[0].films[k].camera, *lines, wide, packed, shown))
+        views.append(FilmView(trials[0].films[k].camera, *lines, wide, packed, shown))
     return views, notes
 
 

@@ -14,13 +14,13 @@ from torchdlo.vision.rasterizer import coverage, successors
 from torchdlo.vision.spine import curve_vectors
 
 if TYPE_CHECKING:
-    from torchdlo.sysid.video.filmed_problem import Problem
+    from torchdlo.sysid.video.filmed_problem import FilmedProblem
 
-__all__ = ["drawn", "overlaps", "overlays"]
+__all__ = ["drawn_masks", "mask_overlaps", "overlays"]
 
 
-def drawn(
-    own: Problem, view: int, sims: np.ndarray, numbers: np.ndarray, frames: np.ndarray, radius: float, trial: int
+def drawn_masks(
+    own: FilmedProblem, view: int, sims: np.ndarray, numbers: np.ndarray, frames: np.ndarray, radius: float, trial: int
 ) -> np.ndarray:
     """Return the masks of a simulated trial in some pictures of a view, shares that are covered, (N, H, W) float32.
 
@@ -69,7 +69,7 @@ def _without_grippers(pixel: torch.Tensor, points: torch.Tensor, radius: float) 
     return cut, ((number >= first) & (number <= final)).expand(pixel.shape[:-1])
 
 
-def overlaps(own: Problem, sims: np.ndarray, numbers: np.ndarray) -> list[float]:
+def mask_overlaps(own: FilmedProblem, sims: np.ndarray, numbers: np.ndarray) -> list[float]:
     """Return the intersection over union of simulated and measured masks by trial, mean over good pictures and views.
 
     Args:
@@ -84,17 +84,17 @@ def overlaps(own: Problem, sims: np.ndarray, numbers: np.ndarray) -> list[float]
             frames = np.flatnonzero(view.good[b])
             frames = frames[:: max(1, len(frames) // 24)]
             measured = view.masks(b, frames)
-            model = drawn(own, k, sims[b], numbers, frames, view.half_width, b) > 0.5
+            model = drawn_masks(own, k, sims[b], numbers, frames, view.half_width, b) > 0.5
             # How thick a mask is depends on where its colours were cut off: ropes are drawn as thick as it is.
             share = np.median(measured.sum((1, 2)) / np.maximum(model.sum((1, 2)), 1))
-            model = drawn(own, k, sims[b], numbers, frames, np.clip(share, 0.6, 1.6) * view.half_width, b) > 0.5
+            model = drawn_masks(own, k, sims[b], numbers, frames, np.clip(share, 0.6, 1.6) * view.half_width, b) > 0.5
             both, either = (model & measured).sum((1, 2)), (model | measured).sum((1, 2))
             parts.append(float(np.mean(both / np.maximum(either, 1))))
         out.append(float(np.mean(parts)))
     return out
 
 
-def overlays(own: Problem, split: str, sims: np.ndarray, numbers: np.ndarray) -> list[Overlay]:
+def overlays(own: FilmedProblem, split: str, sims: np.ndarray, numbers: np.ndarray) -> list[Overlay]:
     """Return some pictures of each film with the rope before and after.
 
     Args:

@@ -12,10 +12,10 @@ from torchdlo.agents.vlm.grasp_proposal import Places
 from torchdlo.envs import Task
 from torchdlo.errors import InputError
 
-__all__ = ["led"]
+__all__ = ["lead_through_waypoints"]
 
 
-def led(
+def lead_through_waypoints(
     step: Any,
     places: Places,
     grasps: tuple[int | None, ...],

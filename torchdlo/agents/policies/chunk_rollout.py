@@ -12,14 +12,14 @@ import torch
 from torch import Tensor
 
 from torchdlo.agents.data import sentences
-from torchdlo.agents.data.record import Noise, Painter, Start, arm_state, play_batch, starts
+from torchdlo.agents.data.record import EpisodeStart, Noise, Painter, arm_state, draw_starts, play_batch
 from torchdlo.agents.policies import language
 from torchdlo.agents.policies.chunk_policy import ChunkPolicy, load_policy
 from torchdlo.envs import find
 from torchdlo.envs.core import episode
 from torchdlo.errors import InputError
 
-__all__ = ["CONDITIONS", "PolicyDemonstrator", "evaluate"]
+__all__ = ["CONDITIONS", "PolicyDemonstrator", "evaluate_chunk_policy"]
 
 CONDITIONS = ("varied", "paraphrased", "swapped", "blanked")
 """How a policy is judged, always from unseen starts: with instructions of data sets; with others that mean the same;
@@ -66,7 +66,7 @@ class PolicyDemonstrator:
                 f"{self.source}: it moves {self.policy.shape.arms} arm, and {made.task.name} has "
                 f"{made.task.arms.count}; learn from a data set with that task."
             )
-        return _Chunk(language.encode(told, self.encoder))
+        return _Chunk(language.encode_sentences(told, self.encoder))
 
     def target(self, world: episode.EpisodeState, memory: _Chunk, pictures: dict[str, Tensor]) -> tuple[Tensor, _Chunk]:
         """Return where tools are to go; it looks now and then, and follows what it has decided in between."""
@@ -88,7 +88,7 @@ class PolicyDemonstrator:
             return self.policy(seen, wide.flatten(1).float(), words)
 
 
-def evaluate(
+def evaluate_chunk_policy(
     path: Path,
     tasks: Sequence[str],
     painter: Painter,
@@ -121,7 +121,7 @@ def evaluate(
         made = _prepared(name, episodes)
         for k, condition in enumerate(conditions):
             attempts = [
-                _told(s, name, names, condition) for s in starts(made.task, f"evaluate {seed}", range(episodes))
+                _told(s, name, names, condition) for s in draw_starts(made.task, f"evaluate {seed}", range(episodes))
             ]
             who = replace(actor, blank=condition == "blanked")
             with torch.no_grad():
@@ -146,16 +146,16 @@ def _prepared(name: str, count: int) -> episode.Episode:
     return episode.prepare(task, count, compiled=False, recorded=task.horizon > 10)
 
 
-def _told(start: Start, name: str, names: Sequence[str], condition: str) -> Start:
+def _told(start: EpisodeStart, name: str, names: Sequence[str], condition: str) -> EpisodeStart:
     """Return an attempt with the instruction of its condition."""
     if condition == "paraphrased":
-        said = sentences.unseen(name)
+        said = sentences.heldout_instructions(name)
     elif condition == "swapped":
         paired = find(name).counterpart
         others = [paired] if paired else [other for other in names if other != name]
         if not others:
             raise InputError("swapped needs another task, whose instructions are given; name one more.")
-        said = sentences.learned(others[start.number % len(others)])
+        said = sentences.training_instructions(others[start.number % len(others)])
     else:
         return start
     return replace(start, told=said[start.number % len(said)])

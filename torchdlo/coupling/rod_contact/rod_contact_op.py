@@ -79,11 +79,11 @@ scene_packing.operator(
     f"rod_pairs_back({_INPUTS}, Tensor by, {_STATIC}) -> (Tensor, Tensor)",
     _back,
     _back_meta,
-    backward=scene_packing.once,
+    backward=scene_packing.refuse_second_derivative,
 )
 
 
-def push(
+def contact_forces(
     view: View, motion: PredictedMotion, values: Values, *, sweeps: int, friction: bool, law: tuple[float, float]
 ) -> Tensor:
     """Return the forces of contact on vertices [N], shape (..., V, 3); differentiable once.
@@ -102,10 +102,13 @@ def push(
     free = motion.mobility.amax(-1, keepdim=True)
     vertices = [state.pos, state.vel, motion.change, motion.answer, motion.give, free, radius]
     laws = torch.cat([values[name].expand(*batch, 1, 1) for name in ("mu_s", "mu_k", "restitution")], -1)
-    (laws,), (real,) = scene_packing.stored([laws], batch, 1), scene_packing.stored([values["real"]], batch, count)
+    (laws,), (real,) = (
+        scene_packing.pack_components([laws], batch, 1),
+        scene_packing.pack_components([values["real"]], batch, count),
+    )
     at = at.permute(at.dim() - 2, at.dim() - 1, *range(at.dim() - 2)).reshape(4, count, batch.numel()).contiguous()
     rule = [*law, view.dt]
     found = torch.ops.torchdlo.rod_pairs(
-        scene_packing.stored(vertices, batch, size), laws, at, real[0], sweeps, friction, rule
+        scene_packing.pack_components(vertices, batch, size), laws, at, real[0], sweeps, friction, rule
     )
-    return scene_packing.logical(found, batch)
+    return scene_packing.unpack_components(found, batch)

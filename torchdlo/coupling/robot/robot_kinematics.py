@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from torchdlo.coupling.bodies.dynamics import BodyTargets, RigidBody
-from torchdlo.coupling.common.pose import Pose, compose, from_matrix
+from torchdlo.coupling.common.pose import Pose, compose_poses, from_matrix
 from torchdlo.coupling.robot import urdf
 from torchdlo.errors import InputError
 
@@ -51,7 +51,7 @@ class Robot:
     """Positions of moving joints where the commanded ones are 0 [rad or m], shape (M,)."""
     behind: tuple[int, ...]
     """For each moving joint, the number of the link that it moves."""
-    shapes: tuple[urdf.Shape, ...]
+    shapes: tuple[urdf.CollisionShape, ...]
     base: Pose
     """Where the first link stands."""
     chain: Any
@@ -64,7 +64,7 @@ class Robot:
         return [k for k in range(len(self.joints)) if reach[k] > 0]
 
 
-def load(
+def load_robot(
     source: str | Path,
     *,
     tool: str | None = None,
@@ -79,7 +79,7 @@ def load(
         base: where the first link stands [m].
         base_quat: how it is turned, (w, x, y, z).
     """
-    said = urdf.read(source)
+    said = urdf.read_urdf(source)
     moving = [j for j in said.joints if j.kind != "fixed"]
     if not moving:
         raise InputError(f"{said.name}: no joint moves; expected at least one that is revolute or prismatic.")
@@ -132,7 +132,7 @@ def panda(
     Commanded are seven joints and the opening of one finger, which the other mimics.
     """
     text = resources.files("torchdlo").joinpath("data/robots/panda.urdf").read_text(encoding="utf-8")
-    return load(text, tool="tool", base=base, base_quat=base_quat)
+    return load_robot(text, tool="tool", base=base, base_quat=base_quat)
 
 
 def _chain(joints: tuple[urdf.Joint, ...]) -> Any:
@@ -198,7 +198,7 @@ def poses(robot: Robot, joints: Tensor) -> Pose:
     """
     found = transforms(robot, joints)
     base = Pose(robot.base.pos.to(joints), robot.base.quat.to(joints))
-    return compose(base, Pose(found[..., :3, 3], from_matrix(found[..., :3, :3])))
+    return compose_poses(base, Pose(found[..., :3, 3], from_matrix(found[..., :3, :3])))
 
 
 def tool_pose(robot: Robot, joints: Tensor) -> Pose:
@@ -255,5 +255,5 @@ def body_targets(robot: Robot, joints: Tensor) -> BodyTargets:
     k = [robot.links.index(shape.link) for shape in robot.shapes]
     origins = torch.stack([shape.origin for shape in robot.shapes]).to(joints)
     inner = Pose(origins[:, :3, 3], from_matrix(origins[:, :3, :3]))
-    at = compose(Pose(found.pos[..., k, :], found.quat[..., k, :]), inner)
+    at = compose_poses(Pose(found.pos[..., k, :], found.quat[..., k, :]), inner)
     return BodyTargets(at.pos, at.quat)

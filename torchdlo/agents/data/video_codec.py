@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from torchdlo.agents.data.schema import CODECS, GROUP
+from torchdlo.agents.data.dataset_schema import CODECS, GROUP
 from torchdlo.errors import InputError
 
-__all__ = ["Clip", "decode", "encode", "join", "library"]
+__all__ = ["Clip", "concatenate_clips", "decode_video", "encode_video", "import_pyav"]
 
 TICKS = 256
 """Units of time per frame: time stamps are whole numbers of them."""
@@ -31,7 +31,7 @@ _OPTIONS = {
 }
 
 
-def library() -> Any:
+def import_pyav() -> Any:
     """Return PyAV, or say how to get it."""
     try:
         import av
@@ -40,10 +40,10 @@ def library() -> Any:
     return av
 
 
-def encode(path: Path, frames: np.ndarray, *, fps: int, codec: str) -> None:
+def encode_video(path: Path, frames: np.ndarray, *, fps: int, codec: str) -> None:
     """Write pictures (T, H, W, 3), 8 bits, as a video; the same pictures make the same bytes."""
     name = CODECS[codec][0]
-    av = library()
+    av = import_pyav()
     if name not in av.codecs_available:
         others = [other for other, (encoder, _) in CODECS.items() if encoder in av.codecs_available]
         known = " or ".join(others) or "of another"
@@ -60,7 +60,7 @@ def encode(path: Path, frames: np.ndarray, *, fps: int, codec: str) -> None:
 
 
 def _encoded(frames: np.ndarray, fps: int, name: str) -> bytes:
-    av = library()
+    av = import_pyav()
     file = io.BytesIO()
     with av.open(file, "w", format="mp4", options={"fflags": "+bitexact"}) as container:
         stream = container.add_stream(name, rate=Fraction(fps), options={"g": str(GROUP), **_OPTIONS[name]})
@@ -82,7 +82,7 @@ class Clip:
 
     def packets(self, fps: int) -> Iterator[Any]:
         """Yield what is stored of its frames, with their numbers within the clip."""
-        av = library()
+        av = import_pyav()
         found = 0
         with _opened(av, self.path) as container:
             stream = container.streams.video[0]
@@ -105,9 +105,9 @@ class Clip:
             raise InputError(f"{self.path}: expected {self.first + self.count} frames, found {self.first + found}.")
 
 
-def join(path: Path, clips: Sequence[Clip], *, fps: int) -> None:
+def concatenate_clips(path: Path, clips: Sequence[Clip], *, fps: int) -> None:
     """Write clips one after the other as one video, as they are."""
-    av = library()
+    av = import_pyav()
     base = Fraction(1, fps * TICKS)
     with av.open(str(path), "w", format="mp4", options={"fflags": "+bitexact"}) as container:
         out, header, k = None, None, 0
@@ -128,13 +128,13 @@ def join(path: Path, clips: Sequence[Clip], *, fps: int) -> None:
                 k += 1
 
 
-def decode(path: Path, *, fps: int, first: int = 0, count: int | None = None) -> Iterator[np.ndarray]:
+def decode_video(path: Path, *, fps: int, first: int = 0, count: int | None = None) -> Iterator[np.ndarray]:
     """Yield pictures (H, W, 3), 8 bits, from frame `first` on, and check their time stamps.
 
     Raises:
         InputError: The file cannot be read, a frame is missing, or one is not at its time.
     """
-    av = library()
+    av = import_pyav()
     found = 0
     try:
         with _opened(av, path) as container:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from torchdlo.errors import InputError
-from torchdlo.files import check_writable, replacing
+from torchdlo.files import check_writable, replace_atomically
 from torchdlo.report.render.picture import drawing
 from torchdlo.scene_files.run import Frames
 
@@ -72,7 +72,7 @@ def write_video(
     # The frame nearest in time: what is shown was computed.
     at = np.abs(frames.time[:, None] - np.arange(count) * speed / RATE).argmin(0)
     note = "" if speed == 1 else f"(speed {speed:g})"
-    with replacing(path) as temporary, drawing(frames, size=size, photo=photo) as picture:
+    with replace_atomically(path) as temporary, drawing(frames, size=size, photo=photo) as picture:
         with av.open(str(temporary), "w", format="mp4") as container:
             container.metadata["comment"] = _MARK.decode()
             stream = container.add_stream(codec, rate=Fraction(RATE))

@@ -100,7 +100,7 @@ scene_packing.operator(
     f"body_sweeps_back({_INPUTS}, Tensor force, Tensor push, {_STATIC}) -> (Tensor, Tensor, Tensor)",
     _back,
     _back_meta,
-    backward=scene_packing.once,
+    backward=scene_packing.refuse_second_derivative,
 )
 
 
@@ -112,14 +112,14 @@ def _solids(bodies: PredictedBodyMotion) -> list[Tensor]:
         sum(a * c[i] * c[j] for a, c in zip(turning, columns, strict=True))
         for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
     ]
-    offset, numbers = scene_packing.measures(bodies)
+    offset, numbers = scene_packing.shape_sizes(bodies)
     zero = torch.zeros_like(offset)
     moves = [state.vel, state.omega, bodies.change, bodies.turn, bodies.mobility]
     laws = [inverse_inertia.amax(-1, keepdim=True), params.mu_s, params.mu_k, params.restitution]
     return [state.pos, *itertools.chain(*columns), offset, zero, zero, *numbers, *moves, *answers, *laws]
 
 
-def push(
+def contact_wrenches(
     view: View,
     motion: PredictedMotion,
     pieces: Sequence[int],
@@ -144,22 +144,25 @@ def push(
     solids = _solids(bodies)
     batch = torch.broadcast_shapes(*(x.shape[:-2] for x in (*edges, *vertices, *solids)))
     inputs = (
-        scene_packing.stored(x, batch, n) for x, n in ((edges, size), (vertices, size), (solids, len(bodies.bodies)))
+        scene_packing.pack_components(x, batch, n)
+        for x, n in ((edges, size), (vertices, size), (solids, len(bodies.bodies)))
     )
     force, wrench = torch.ops.torchdlo.body_sweeps(
         *inputs,
-        *scene_packing.sampled(bodies),
-        scene_packing.kinds(bodies),
+        *scene_packing.sampled_grids(bodies),
+        scene_packing.shape_numbers(bodies),
         list(pieces),
         view.topology.successor(),
         sweeps,
         friction,
         [*law, view.dt],
     )
-    return ContactForces(scene_packing.logical(force, batch), *scene_packing.logical(wrench, batch).split(3, -1))
+    return ContactForces(
+        scene_packing.unpack_components(force, batch), *scene_packing.unpack_components(wrench, batch).split(3, -1)
+    )
 
 
-def fits(bodies: PredictedBodyMotion) -> bool:
+def kernel_fits(bodies: PredictedBodyMotion) -> bool:
     """Return whether the kernel can do what these bodies need."""
     like = bodies.state.pos
     return ready(like.device.type, like.dtype) and scene_packing.alike(bodies)

@@ -44,12 +44,17 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from torchdlo.coupling.common.coulomb_friction import parting, rebounding, rub, slowly
+from torchdlo.coupling.common.coulomb_friction import (
+    friction_force,
+    overlap_recovery,
+    rebound_separation,
+    separation_needed,
+)
 from torchdlo.coupling.rod_contact import broad_phase_op
-from torchdlo.coupling.rod_contact import solver_op as rod_pairs
+from torchdlo.coupling.rod_contact import rod_contact_op as rod_pairs
 from torchdlo.coupling.rod_contact.broad_phase import near_pairs
-from torchdlo.coupling.rod_contact.closest_points import closest
-from torchdlo.coupling.rod_contact.solver_op import WEAK
+from torchdlo.coupling.rod_contact.closest_points import closest_points
+from torchdlo.coupling.rod_contact.rod_contact_op import WEAK
 from torchdlo.physics import tree
 from torchdlo.physics.constraints.contact_penalty import Pairs
 from torchdlo.physics.effects.base import Effect, Param, PredictedMotion, Values
@@ -96,7 +101,7 @@ def find_contacts(found: Values, pos: Four, radius: Four) -> Contacts:
         pos: positions of the corners [m], shape (..., K, 3) each.
         radius: radii of the edges that start at the corners [m], shape (..., K, 1) each.
     """
-    s, t = closest(pos[:2], pos[2:])
+    s, t = closest_points(pos[:2], pos[2:])
     weight = (1 - s, s, t - 1, -t)
     between = _sum(weight, pos)
     distance = safe_norm(between)
@@ -239,7 +244,7 @@ class RodContact(Effect):
     def capacity_overflow(self, pos: Tensor, values: Values) -> Tensor:
         """Return how many pairs found no room, and by how much vertices outran the broad phase [m], (..., 1, 2)."""
         if broad_phase_op.ready(pos.device.type, pos.dtype):
-            return torch.cat([values["lost"], broad_phase_op.beyond(pos, values)], -1).detach()
+            return torch.cat([values["lost"], broad_phase_op.outrun_distance(pos, values)], -1).detach()
         moved = pos - values["origin"]
         far = safe_norm(moved - moved.mean(-2, keepdim=True)).amax(-2, keepdim=True)
         return torch.cat([values["lost"], (far - values["reach"]).clamp(min=0.0)], -1).detach()
@@ -249,7 +254,7 @@ class RodContact(Effect):
         like = view.state.pos
         if rod_pairs.ready(like.device.type, like.dtype):
             law = (self.recovery, self.slowest)
-            return rod_pairs.push(view, motion, values, sweeps=self.sweeps, friction=self.friction, law=law)
+            return rod_pairs.contact_forces(view, motion, values, sweeps=self.sweeps, friction=self.friction, law=law)
         _, forces, spread = self.solve(view, motion, values)
         return drop(spread(forces), values["corners"], view.topology.size)
 
@@ -320,11 +325,11 @@ class RodContact(Effect):
         Slowly, if that is asked for.
         """
         # Overlaps are shallow up to a tenth of the radius.
-        wanted = parting(contacts.gap, 0.05 * (contacts.distance - contacts.gap), self.recovery)
-        wanted = slowly(wanted, dt) if calm else wanted
+        wanted = separation_needed(contacts.gap, 0.05 * (contacts.distance - contacts.gap), self.recovery)
+        wanted = overlap_recovery(wanted, dt) if calm else wanted
         pressed = contacts.real * (dot(contacts.normal, _sum(contacts.weight, change)) < wanted)
         approach = -dot(contacts.normal, _sum(contacts.weight, vel))
-        return rebounding(wanted, pressed, approach, values["restitution"], self.slowest, dt), pressed
+        return rebound_separation(wanted, pressed, approach, values["restitution"], self.slowest, dt), pressed
 
     def _sweep(
         self,
@@ -347,7 +352,7 @@ class RodContact(Effect):
         slip = apart - cross(couple.seen(change), contacts.distance * contacts.normal)
         slip = slip - contacts.normal * dot(contacts.normal, slip)
         trial = forces.friction - contacts.real * slip / torch.where(contacts.real > 0, softness[1], 1.0)
-        return Forces(normal, rub(trial, normal, values["mu_s"], values["mu_k"]))
+        return Forces(normal, friction_force(trial, normal, values["mu_s"], values["mu_k"]))
 
 
 def _skew(r: Tensor) -> Tensor:

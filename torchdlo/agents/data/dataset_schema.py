@@ -13,7 +13,7 @@ from typing import Any
 from torchdlo.envs.observations.cameras import SIDES
 from torchdlo.errors import InputError
 
-__all__ = ["CODECS", "DEFAULTS", "JOINTS", "SIDES", "STATE", "Schema", "cameras", "data_path", "video_path"]
+__all__ = ["CODECS", "DEFAULTS", "JOINTS", "SIDES", "STATE", "Schema", "camera_names", "data_path", "video_path"]
 
 FORMAT = "v3.0"
 """Version of the layout."""
@@ -33,7 +33,7 @@ GROUP = 2
 """Distance of pictures that are decoded without others: near, as readers jump."""
 
 
-def cameras(arms: int) -> tuple[str, ...]:
+def camera_names(arms: int) -> tuple[str, ...]:
     """Return the names of the cameras of a set."""
     return ("front", *(f"wrist_{side}" for side in SIDES[:arms]))
 
@@ -80,7 +80,7 @@ class Schema:
     @property
     def pictures(self) -> tuple[str, ...]:
         """Columns that are pictures."""
-        return tuple(f"observation.images.{name}" for name in cameras(self.arms)) if self.size else ()
+        return tuple(f"observation.images.{name}" for name in camera_names(self.arms)) if self.size else ()
 
     @property
     def features(self) -> dict[str, dict[str, Any]]:

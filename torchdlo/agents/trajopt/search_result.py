@@ -13,11 +13,19 @@ from torch import Tensor
 
 from torchdlo.agents.trajopt.problem import Evaluation, Problem
 from torchdlo.agents.trajopt.search import SearchResult, SearchSettings
-from torchdlo.agents.trajopt.search_journal import program, versions
+from torchdlo.agents.trajopt.search_journal import code_versions, program_hash
 from torchdlo.errors import InputError
 from torchdlo.untrusted import Entry, one_line, read_entry
 
-__all__ = ["load_actions", "plain", "read_trajectory", "result_json", "summary", "trajectory_json", "upgraded"]
+__all__ = [
+    "load_actions",
+    "plain_evaluation",
+    "read_trajectory",
+    "result_json",
+    "search_summary",
+    "trajectory_json",
+    "upgrade_result",
+]
 
 _OLDER = {
     "searched": "search_return",
@@ -34,7 +42,7 @@ _SETTINGS = {"rehearsed": "surrogate_share"}
 """Entries of their settings."""
 
 
-def upgraded(content: dict[str, Any]) -> dict[str, Any]:
+def upgrade_result(content: dict[str, Any]) -> dict[str, Any]:
     """Return a result or a trajectory of version 0.1 by the names of today; others as they are."""
     found = {_OLDER.get(name, name): value for name, value in content.items()}
     if "settings" in found:
@@ -44,7 +52,7 @@ def upgraded(content: dict[str, Any]) -> dict[str, Any]:
     return found
 
 
-def plain(outcome: Evaluation) -> dict[str, Any]:
+def plain_evaluation(outcome: Evaluation) -> dict[str, Any]:
     """Return how one trajectory went, as plain data; None for what is no number."""
     return {
         "return": _number(outcome.returns),
@@ -58,9 +66,9 @@ def _number(x: Tensor) -> float | None:
     return float(x[0]) if math.isfinite(float(x[0])) else None
 
 
-def summary(found: SearchResult, task: str) -> str:
+def search_summary(found: SearchResult, task: str) -> str:
     """Return what was found as one sentence."""
-    went = plain(found.outcome)
+    went = plain_evaluation(found.outcome)
     value = "no finite number" if went["return"] is None else f"{went['return']:.4g}"
     how = "failed" if went["failed"] else "success" if went["success"] else "no success"
     stopped = "; stopped early" if found.interrupted else ""
@@ -73,7 +81,7 @@ def result_json(found: SearchResult, problem: Problem, settings: SearchSettings)
     content = {
         "generator": "torchdlo optimize",
         "task": problem.name,
-        **plain(found.outcome),
+        **plain_evaluation(found.outcome),
         "search_return": _finite(found.search_return),
         "missed": found.kept.get("missed", ""),
         "max_return": _finite(found.max_return),
@@ -82,8 +90,8 @@ def result_json(found: SearchResult, problem: Problem, settings: SearchSettings)
         "seconds": round(found.seconds, 3),
         "interrupted": found.interrupted,
         "settings": asdict(settings) | problem.choices,
-        "versions": versions(),
-        "program": program(problem.name),
+        "versions": code_versions(),
+        "program": program_hash(problem.name),
         "curve": [{k: _finite(v) for k, v in point.items()} for point in found.curve],
     }
     return json.dumps(content, indent=1, allow_nan=False) + "\n"
@@ -99,7 +107,7 @@ def trajectory_json(found: SearchResult, problem: Problem) -> str:
         "generator": "torchdlo optimize",
         "task": problem.name,
         "choices": problem.choices,
-        **plain(found.outcome),
+        **plain_evaluation(found.outcome),
         "actions": found.actions.tolist(),
         **found.kept,
     }

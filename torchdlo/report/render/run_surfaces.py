@@ -17,7 +17,7 @@ from torchdlo.coupling.robot import urdf
 from torchdlo.scene_files.run import Frames
 from torchdlo.vision.arm_surfaces import panda_surfaces
 
-__all__ = ["COLORS", "Piece", "bounds", "extent", "pieces", "points_of", "rotations", "spacing"]
+__all__ = ["COLORS", "DrawnSurface", "bounds", "extent", "pieces", "points_of", "rotations", "spacing"]
 
 Surface = tuple[np.ndarray, np.ndarray]
 """Corners [m] and triangles."""
@@ -48,7 +48,7 @@ _STEEL = 7850.0
 
 
 @dataclass(frozen=True, eq=False)
-class Piece:
+class DrawnSurface:
     """Something that is drawn as one surface."""
 
     name: str
@@ -237,7 +237,7 @@ def points_of(frames: Frames) -> dict[str, np.ndarray]:
     return {str(law): np.flatnonzero(frames.constitutive_model == law) for law in np.unique(frames.constitutive_model)}
 
 
-def pieces(frames: Frames) -> list[Piece]:
+def pieces(frames: Frames) -> list[DrawnSurface]:
     """Return all surfaces of a run."""
     low, high = bounds(frames)
     reach = 1.5 * float(np.linalg.norm(high - low))
@@ -245,11 +245,11 @@ def pieces(frames: Frames) -> list[Piece]:
     for number, closed in enumerate(frames.closed):
         slots = np.flatnonzero(frames.rope == number)
         color, faces = _ROPES[number % len(_ROPES)], _tube_faces(3 * (len(slots) - (not closed)) + 1, bool(closed))
-        found.append(Piece(f"rope {number}", color, faces, None, slots, "rope"))
+        found.append(DrawnSurface(f"rope {number}", color, faces, None, slots, "rope"))
     for slot in np.flatnonzero(frames.weight):
         radius = (0.75 * frames.weight[slot] / (np.pi * _STEEL)) ** (1 / 3)
         corners, faces = _solid("sphere", np.array([radius, 0.0, 0.0]), reach)
-        found.append(Piece(f"weight {slot}", COLORS["weight"], faces, corners, np.array([slot]), "weight"))
+        found.append(DrawnSurface(f"weight {slot}", COLORS["weight"], faces, corners, np.array([slot]), "weight"))
     arms = _arms(frames)
     for first in arms:
         found += _arm(first)
@@ -259,15 +259,15 @@ def pieces(frames: Frames) -> list[Piece]:
             continue
         corners, faces = _local(frames, k, reach)
         motion = "table" if shape == "plane" else str(frames.body_motion[k])
-        found.append(Piece(f"body {k}", COLORS[motion], faces, corners, np.array([k]), "body"))
+        found.append(DrawnSurface(f"body {k}", COLORS[motion], faces, corners, np.array([k]), "body"))
     return found
 
 
 @functools.cache
-def _panda_shapes() -> tuple[urdf.Shape, ...]:
+def _panda_shapes() -> tuple[urdf.CollisionShape, ...]:
     """Return the shapes that stand for the links of the arm that comes with the package."""
     text = resources.files("torchdlo").joinpath("data/robots/panda.urdf").read_text(encoding="utf-8")
-    return urdf.read(text).shapes
+    return urdf.read_urdf(text).shapes
 
 
 def _arms(frames: Frames) -> list[int]:
@@ -285,7 +285,7 @@ def _arms(frames: Frames) -> list[int]:
     return found
 
 
-def _arm(first: int) -> list[Piece]:
+def _arm(first: int) -> list[DrawnSurface]:
     """Return how an arm looks, whose links' bodies begin with a number."""
     said, found = _panda_shapes(), []
     for part in panda_surfaces(0.02):
@@ -295,7 +295,7 @@ def _arm(first: int) -> list[Piece]:
         corners = part.surface.vertices @ back[:3, :3].T + back[:3, 3]
         color = COLORS["robot" if part.part == "shell" else part.part]
         name = f"body {first + k} {part.part}"
-        found.append(Piece(name, color, part.surface.faces, corners, np.array([first + k]), "body"))
+        found.append(DrawnSurface(name, color, part.surface.faces, corners, np.array([first + k]), "body"))
     return found
 
 

@@ -14,12 +14,12 @@ from torchdlo.errors import InputError
 from torchdlo.files import write_atomically
 from torchdlo.untrusted.tensor_file import check_shapes, read_tensors
 
-__all__ = ["load", "module", "save"]
+__all__ = ["load_policy", "policy_module", "save_policy"]
 
 _GENERATOR = "torchdlo train"
 
 
-def save(policy: Policy | CloudPolicy, path: Path, notes: dict[str, Any] | None = None) -> None:
+def save_policy(policy: Policy | CloudPolicy, path: Path, notes: dict[str, Any] | None = None) -> None:
     """Write a policy, and plain data about it, to one file."""
     content = {
         "generator": _GENERATOR,
@@ -33,7 +33,7 @@ def save(policy: Policy | CloudPolicy, path: Path, notes: dict[str, Any] | None 
     write_atomically(path, written.getvalue())
 
 
-def load(path: Path | str, notes: bool = False) -> Any:
+def load_policy(path: Path | str, notes: bool = False) -> Any:
     """Return the policy of a file, or (policy, plain data about it)."""
     path = Path(path)
     what = "a policy of torchdlo train"
@@ -60,7 +60,7 @@ def load(path: Path | str, notes: bool = False) -> Any:
     return (policy, content["notes"]) if notes else policy
 
 
-def module(policy: Policy) -> Any:
+def policy_module(policy: Policy) -> Any:
     """Return a policy as a TensorDictModule from "observation", "progress" and "start" to "action".
 
     It draws actions at random where TorchRL's exploration type is RANDOM, and takes their middle otherwise.

@@ -14,7 +14,7 @@ from torchdlo.coupling.bodies.dynamics import RigidBody
 from torchdlo.coupling.bodies.mesh_sdf import MeshShape, load_mesh
 from torchdlo.coupling.mpm import particles
 from torchdlo.coupling.mpm.constitutive_models import ConstitutiveModel, Elastic, Liquid, Plastic, Sand
-from torchdlo.coupling.robot import kinematics as robots
+from torchdlo.coupling.robot import robot_kinematics as robots
 from torchdlo.errors import InputError
 from torchdlo.physics import tree
 from torchdlo.scene_files import limits, motion

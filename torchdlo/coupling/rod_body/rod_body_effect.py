@@ -36,9 +36,14 @@ from torch import Tensor
 
 from torchdlo.coupling.bodies.contact_solver import inertia
 from torchdlo.coupling.bodies.dynamics import PredictedBodyMotion, conjugate
-from torchdlo.coupling.bodies.segment_distance import EdgePoints, families, find
-from torchdlo.coupling.common.coulomb_friction import parting, rebounding, rub, slowly
-from torchdlo.coupling.rod_body import solver_op as body_sweeps
+from torchdlo.coupling.bodies.segment_distance import EdgePoints, find_contact_points, points_per_edge
+from torchdlo.coupling.common.coulomb_friction import (
+    friction_force,
+    overlap_recovery,
+    rebound_separation,
+    separation_needed,
+)
+from torchdlo.coupling.rod_body import rod_body_op as body_sweeps
 from torchdlo.physics.constraints.contact_penalty import Touch
 from torchdlo.physics.effects.base import ContactForces, Effect, PredictedMotion, Values
 from torchdlo.physics.linalg.numerics import cross, dot, safe_norm
@@ -118,8 +123,8 @@ class _Points:
 
 
 def _points(view: View, bodies: PredictedBodyMotion, pieces: int) -> _Points:
-    at = find(view, bodies, pieces)
-    count = [families(b, pieces) for b in bodies.bodies]
+    at = find_contact_points(view, bodies, pieces)
+    count = [points_per_edge(b, pieces) for b in bodies.bodies]
     of = [[[float(k == j)] for k in range(len(count))] for j, n in enumerate(count) for _ in range(n)]
     axes = _Axes(view, at.share.new_tensor(of))
     mask, radius = view.params.rest.edge_mask, view.params.material.radius
@@ -238,10 +243,12 @@ class RodBody(Effect):
     def solve_contact(self, view: View, motion: PredictedMotion, values: Values) -> ContactForces:
         """Return the forces that keep ropes outside of bodies and rub [N]."""
         bodies = motion.bodies
-        if body_sweeps.fits(bodies):
-            pieces = [families(b, self.pieces) - 2 for b in bodies.bodies]
+        if body_sweeps.kernel_fits(bodies):
+            pieces = [points_per_edge(b, self.pieces) - 2 for b in bodies.bodies]
             law = (self.recovery, self.slowest)
-            return body_sweeps.push(view, motion, pieces, sweeps=self.sweeps, friction=self.friction, law=law)
+            return body_sweeps.contact_wrenches(
+                view, motion, pieces, sweeps=self.sweeps, friction=self.friction, law=law
+            )
         points = _points(view, bodies, self.pieces)
         along, slip = points.seen(motion.change, bodies)
         wanted = self._target(points, view, bodies, along)
@@ -259,13 +266,13 @@ class RodBody(Effect):
         self, points: _Points, view: View, bodies: PredictedBodyMotion, along: Tensor, calm: bool = False
     ) -> Tensor:
         """Return by how much points have to part at least [m], shape (..., F, V, 1); slowly, if that is asked for."""
-        wanted = parting(points.at.distance - points.radius, 0.1 * points.radius, self.recovery)
-        wanted = slowly(wanted, view.dt) if calm else wanted
+        wanted = separation_needed(points.at.distance - points.radius, 0.1 * points.radius, self.recovery)
+        wanted = overlap_recovery(wanted, view.dt) if calm else wanted
         pressed = points.real * (along < wanted)
         now = dataclasses.replace(bodies, change=bodies.state.vel, turn=bodies.state.omega)
         approach = -points.seen(view.state.vel, now)[0]
         restitution = points.axes.of_bodies(bodies.params.restitution)
-        return rebounding(wanted, pressed, approach, restitution, self.slowest, view.dt)
+        return rebound_separation(wanted, pressed, approach, restitution, self.slowest, view.dt)
 
     def _sweep(
         self,
@@ -284,7 +291,9 @@ class RodBody(Effect):
         # Where nothing presses, nothing rubs: those points have no part in how far the others slip.
         active = points.real * (normal > 0)
         mu_s, mu_k = (points.axes.of_bodies(mu) for mu in (bodies.params.mu_s, bodies.params.mu_k))
-        return normal, rub(forces[1] - _step(motion[1], softness.friction(active), active), normal, mu_s, mu_k)
+        return normal, friction_force(
+            forces[1] - _step(motion[1], softness.friction(active), active), normal, mu_s, mu_k
+        )
 
 
 def _step(miss: Tensor, softness: Tensor, active: Tensor) -> Tensor:

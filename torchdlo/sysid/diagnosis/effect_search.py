@@ -19,15 +19,22 @@ from torchdlo.sysid.diagnosis import budget as plan
 from torchdlo.sysid.diagnosis import clamp_models, effect_library, selection
 from torchdlo.sysid.diagnosis.backward_elimination import EliminationResult, Revision
 from torchdlo.sysid.diagnosis.budget import BUDGETS, Budget
-from torchdlo.sysid.diagnosis.candidate_fits import extended, short, vector
+from torchdlo.sysid.diagnosis.candidate_fits import extended_fits, short_frames, vector
 from torchdlo.sysid.diagnosis.detection_limit import detection_limits, least_gap
-from torchdlo.sysid.diagnosis.error_floor import gap, rms
+from torchdlo.sysid.diagnosis.error_floor import gap_rms, trial_gaps
 from torchdlo.sysid.diagnosis.misleading_trials import MisleadingTrial, errors_by_frame, misleading_trials
 from torchdlo.sysid.diagnosis.plausibility import implausible, unresolved
 from torchdlo.sysid.diagnosis.score_test import Score, score_effects
 from torchdlo.sysid.diagnosis.selection import PAYS
 from torchdlo.sysid.diagnosis.significance import RATE, Agreement, agreement, benjamini_hochberg
-from torchdlo.sysid.diagnosis.verdict import UNKNOWN_FLOOR, BestCandidate, Candidate, Diagnosis, through, word
+from torchdlo.sysid.diagnosis.verdict import (
+    UNKNOWN_FLOOR,
+    BestCandidate,
+    Candidate,
+    Diagnosis,
+    finite_trials,
+    verdict_word,
+)
 from torchdlo.sysid.diagnosis.workspace import CHAIN, SILENT, Callback, Workspace
 from torchdlo.sysid.estimation.jobs import FitJob, Fitted
 from torchdlo.sysid.estimation.levenberg_marquardt import interval
@@ -88,13 +95,13 @@ def diagnose(
         if resume:
             raise InputError(f"{recording.path}: expected no --resume for films, whose diagnosis keeps no journal.")
         asked = {"budget": budget, "seed": seed, "vertices": vertices, "given": given, "without": without}
-        most = plan.some(recording, trials or BUDGETS[budget].trials)
+        most = plan.pick_trials(recording, trials or BUDGETS[budget].trials)
         return diagnose_filmed(most, **asked, callback=callback)
     begun, report = time.perf_counter(), callback or (lambda *_: None)
     recording, faults = data_quality.check(recording)
     whole = len(recording.train)
-    recording = plan.some(recording, trials or BUDGETS[budget].trials)
-    options = plan.options(recording, vertices)
+    recording = plan.pick_trials(recording, trials or BUDGETS[budget].trials)
+    options = plan.model_options(recording, vertices)
     if given is not None:
         options |= given.options if vertices is None else given.options | {"vertices": vertices}
     asked = {"budget": BUDGETS[budget], "seed": seed, "options": options, "first": given and given.values}
@@ -135,7 +142,7 @@ class _Search:
         """Go through all stages."""
         count, most = self.budget.starts, self.budget.more
         if given is None:
-            base = baselines.calibrate(self.bench, count, most, self.rng, self.report)
+            base = baselines.calibrate_baseline(self.bench, count, most, self.rng, self.report)
         else:
             base = baselines.go_on(self.bench, given, most, self.report)
         self.baseline, self.before = base, self.bench.prediction(base, "all")
@@ -145,7 +152,7 @@ class _Search:
         found = EliminationResult()
         whole = self._excess(base)
         while len(rounds) < self.budget.rounds + (len(found.shares) < len(rounds)):
-            if found.shares and rms(self.bench.gaps(base, "all")) < MORE * self.bench.level:
+            if found.shares and gap_rms(self.bench.gaps(base, "all")) < MORE * self.bench.level:
                 break
             if not (names := [n for n in self._possible() if n not in base.effects]):
                 break
@@ -176,7 +183,7 @@ class _Search:
 
         None where nothing is left to be explained, or it is known to be a chain.
         """
-        if CHAIN in base.effects or rms(self.bench.gaps(base, "all")) < SILENT * self.bench.level:
+        if CHAIN in base.effects or gap_rms(self.bench.gaps(base, "all")) < SILENT * self.bench.level:
             return None
         further = baselines.go_further(self.bench, base, self.budget.more, self.report)
         self.baseline, self.before = further, self.bench.prediction(further, "all")
@@ -192,8 +199,10 @@ class _Search:
         Trials that the baseline does not get through are left out, as nothing can be compared with them.
         """
         trials = self.bench.trials["test"]
-        gaps, plain = (gap(s, trials) for s in (self.bench.prediction(fitted, "test"), self.before[-len(trials) :]))
-        return float(rms(gaps[through(plain)]) ** 2)
+        gaps, plain = (
+            trial_gaps(s, trials) for s in (self.bench.prediction(fitted, "test"), self.before[-len(trials) :])
+        )
+        return float(gap_rms(gaps[finite_trials(plain)]) ** 2)
 
     def _possible(self) -> list[str]:
         mesh, names = self.pool.local.model(()).mesh, [n for n in effect_library.LIBRARY if n not in self.excluded]
@@ -216,7 +225,7 @@ class _Search:
         soft = [
             s
             for s in scores[self.budget.candidates :]
-            if s.name == clamp_models.NAME and clamp_models.soft(self.bench, base)
+            if s.name == clamp_models.NAME and clamp_models.may_be_stiff(self.bench, base)
         ]
         self.scores = self.scores or scores
         fits, led, rival, worst = self._fits(base, [*scores[: self.budget.candidates], *soft], stage)
@@ -231,7 +240,7 @@ class _Search:
         if base is self.baseline:
             self.plain.append(rival)
         first = min(led, key=lambda name: fits[name].point.cost)
-        if rms(self.bench.gaps(fits[first], "all")) > SILENT * self.bench.level:
+        if gap_rms(self.bench.gaps(fits[first], "all")) > SILENT * self.bench.level:
             # Something is left: one that does alike things may be right, however little its doses explain.
             kin = [s for s in scores if s.name not in fits and any({s.name, first} <= k for k in effect_library.KIN)]
             more, also = self._fits_of_kin(base, kin, worst, f"{stage}, effects like {first}") if kin else ({}, [])
@@ -248,8 +257,8 @@ class _Search:
         does not close half as much as the best of them.
         """
         rivals = [self._further(base, base)]
-        if clamp_models.soft(self.bench, base):
-            rivals.append(clamp_models.firm(base, rivals[0]))
+        if clamp_models.may_be_stiff(self.bench, base):
+            rivals.append(clamp_models.firm_clamp_job(base, rivals[0]))
         short, alone = self._extended(base, scores, stage, rivals)
         alone = sorted(alone, key=lambda f: f.point.cost)
         lead = self._leaders(short, alone[0])
@@ -414,13 +423,13 @@ class _Search:
         self, base: Fitted, scores: Sequence[Score], stage: str, others: Sequence[FitJob] = ()
     ) -> tuple[list[Fitted], list[Fitted]]:
         """Return first fits of effects, and those of other jobs."""
-        return extended(
+        return extended_fits(
             self.bench, base, scores, self.budget.iterations, lambda jobs: self._fitted(jobs, stage), others
         )
 
     def _further(self, base: Fitted, fitted: Fitted) -> FitJob:
         """Return the job of fitting on."""
-        how = (self.budget.iterations, short(self.bench)) if fitted is base else (self.budget.more,)
+        how = (self.budget.iterations, short_frames(self.bench)) if fitted is base else (self.budget.more,)
         return self.bench.further(fitted, *how)
 
     def _fitted(self, jobs: Sequence[FitJob], stage: str) -> list[Fitted]:
@@ -439,14 +448,16 @@ class _Search:
         effects = list(found.shares)
         trials, train = self.bench.trials, len(self.bench.trials["train"])
         simulated = {"before": self.before, "after": self.bench.prediction(final, "all")}
-        before, after = (gap(sims[train:], trials["test"]) for sims in simulated.values())
-        verdict = word(effects, rms(self.bench.gaps(final, "test")), self.bench.level, rms(after) / rms(before))
+        before, after = (trial_gaps(sims[train:], trials["test"]) for sims in simulated.values())
+        verdict = verdict_word(
+            effects, gap_rms(self.bench.gaps(final, "test")), self.bench.level, gap_rms(after) / gap_rms(before)
+        )
         model = self.pool.local.model(final.effects, final.options)
         rivals = {n: self.revision.known_without(final, n) or found.rivals[n] for n in effects}
         self.bench.predict([*rivals.values(), final])
         tests = {name: self._agreement(rival, final) for name, rival in rivals.items()}
-        limit = least_gap(rms(self.bench.gaps(final, "test")), self.bench.floor.noise, self.bench.level, PAYS)
-        said = [*baselines.notes(self.baseline), *clamp_models.notes(model, final), *self.bench.notes()]
+        limit = least_gap(gap_rms(self.bench.gaps(final, "test")), self.bench.floor.noise, self.bench.level, PAYS)
+        said = [*baselines.baseline_notes(self.baseline), *clamp_models.clamp_notes(model, final), *self.bench.notes()]
         predictions = {
             when: {t.name: sim[: len(t.time)] for sim, t in zip(sims, trials["all"], strict=True)}
             for when, sims in simulated.items()

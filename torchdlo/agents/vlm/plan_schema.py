@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field, create_model, model_validator
 
-__all__ = ["HORIZON", "MODES", "STEPS", "SearchPlan", "Step", "Update", "grasps_model", "step_models"]
+__all__ = ["HORIZON", "MODES", "STEPS", "Step", "TaskPlan", "Update", "grasps_model", "step_models"]
 
 STEPS, HORIZON = 8, 140
 """Most steps of a plan, and most actions of a step."""
@@ -62,7 +62,7 @@ class Step(Strict):
     horizon: int = Field(ge=1, le=HORIZON)
 
 
-class SearchPlan(Strict):
+class TaskPlan(Strict):
     """A plan; `step_models` says of what."""
 
     steps: list[Any] = Field(min_length=1, max_length=STEPS)
@@ -78,7 +78,7 @@ class Update(Strict):
     completion: Text = ""
 
 
-def step_models(hands: int) -> tuple[type[SearchPlan], type[Update]]:
+def step_models(hands: int) -> tuple[type[TaskPlan], type[Update]]:
     """Return what plans and updates have to fit, for so many hands."""
     robots = create_model("Robots", __base__=Strict, **_robots(hands, Annotated[int, Field(ge=0, le=100_000)]))
     way = Annotated[list[Annotated[list[Coordinate], Field(min_length=3, max_length=3)]], Field(max_length=20)]
@@ -93,7 +93,7 @@ def step_models(hands: int) -> tuple[type[SearchPlan], type[Update]]:
 
     validators: dict[str, Any] = {"listed": model_validator(mode="before")(classmethod(listed))}
     steps = Annotated[list[step], Field(min_length=1, max_length=STEPS)]  # type: ignore[valid-type]
-    plan = create_model("Plan", __base__=SearchPlan, __validators__=validators, steps=(steps, ...))
+    plan = create_model("Plan", __base__=TaskPlan, __validators__=validators, steps=(steps, ...))
     rest = Annotated[list[step], Field(max_length=STEPS)]  # type: ignore[valid-type]
     update = create_model("Update", __base__=Update, __validators__=validators, steps=(rest, []))
     return plan, update

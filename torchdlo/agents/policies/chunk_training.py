@@ -18,13 +18,13 @@ from torch import Tensor
 
 from torchdlo.agents.data.reading import DataSet, open_set
 from torchdlo.agents.policies import language
-from torchdlo.agents.policies.chunk_policy import ChunkPolicy, Shape, save_policy
+from torchdlo.agents.policies.chunk_policy import ChunkPolicy, NetworkShape, save_policy
 from torchdlo.agents.torch_records import load_checkpoint, save_checkpoint
-from torchdlo.agents.trajopt.search_journal import versions
+from torchdlo.agents.trajopt.search_journal import code_versions
 from torchdlo.errors import InputError
 from torchdlo.journal import locked, sweep
 
-__all__ = ["Training", "learn"]
+__all__ = ["Training", "train_chunk_policy"]
 
 IMAGES = "observation.images."
 LEAST = 1e-3
@@ -121,7 +121,7 @@ def _read(data: DataSet, encoder: str, folder: Path, callback: Callable[[str, in
         target,
         torch.from_numpy(first),
         torch.from_numpy(last),
-        language.encode(data.tasks, encoder),
+        language.encode_sentences(data.tasks, encoder),
         torch.from_numpy(columns["task_index"].copy()),
         _weights(data, target),
         pictures,
@@ -144,7 +144,7 @@ def _weights(data: DataSet, target: Tensor) -> Tensor:
     return found
 
 
-def learn(
+def train_chunk_policy(
     path: Path,
     out: Path,
     training: Training | None = None,
@@ -199,7 +199,7 @@ class _Run:
     def __init__(self, data: DataSet, frames: _Frames, training: Training, encoder: str) -> None:
         self.data, self.frames, self.training, self.encoder = data, frames, training, encoder
         cameras = tuple(frames.pictures)
-        shape = Shape(
+        shape = NetworkShape(
             arms=frames.target.shape[1] // 3,
             cameras=cameras,
             size=frames.pictures[cameras[0]].shape[-1],
@@ -278,7 +278,7 @@ class _Run:
             "training": asdict(self.training),
             "epochs": self.epoch,
             "loss": [round(x, 6) for x in self.curve],
-            "versions": {name: str(value) for name, value in versions().items()},
+            "versions": {name: str(value) for name, value in code_versions().items()},
         }
 
     def _same(self) -> dict[str, Any]:

@@ -16,7 +16,7 @@ from torchdlo.sysid.estimation.result import Calibration, Overlay, versions
 from torchdlo.sysid.recordings.recording import Recording
 from torchdlo.untrusted import for_html, for_plot
 
-__all__ = ["PAGE", "PICTURE", "filmed_html", "overlay_png", "verdict", "write_report"]
+__all__ = ["PAGE", "PICTURE", "filmed_html", "films_verdict", "overlay_png", "write_report"]
 
 PAGE = "report.html"
 PICTURE = "report.png"
@@ -33,7 +33,7 @@ def write_report(result: Calibration, recording: Recording, folder: Path, *, com
     return folder / PAGE, folder / PICTURE
 
 
-def verdict(result: Calibration, recording: Recording) -> str:
+def films_verdict(result: Calibration, recording: Recording) -> str:
     """The result in one sentence."""
     tests = [t for t in result.per_trial if t["split"] == "test"]
     pixels = float(np.mean([t["distance_px"] for t in tests]))
@@ -84,7 +84,7 @@ def filmed_html(result: Calibration, recording: Recording, png: bytes, *, comman
     tools = ", ".join(f"{tool} {version}" for tool, version in versions().items())
     sections = [
         f"<h1>{name}</h1>",
-        f'<p class="verdict">{for_html(verdict(result, recording))}</p>',
+        f'<p class="verdict">{for_html(films_verdict(result, recording))}</p>',
         f'<img alt="Pictures of the films with the simulated rope before and after" '
         f'src="data:image/png;base64,{picture}">',
         "<h2>Parameters</h2>",

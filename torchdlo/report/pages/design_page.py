@@ -14,8 +14,8 @@ from matplotlib.figure import Figure
 
 from torchdlo.files import write_atomically
 from torchdlo.report.pages.page import STYLE, listed, number, page, table
-from torchdlo.sysid.experiment_design.design import Design, called, design_json, rationale, summary
-from torchdlo.sysid.experiment_design.model_discrimination import size
+from torchdlo.sysid.experiment_design.design import Design, design_json, design_summary, motion_text, rationale
+from torchdlo.sysid.experiment_design.model_discrimination import rms_size
 from torchdlo.sysid.recordings.recording import save_trial
 from torchdlo.untrusted import for_html
 
@@ -37,7 +37,7 @@ def write_design(design: Design, folder: Path, *, command: str = "") -> None:
 
 
 def _rows(design: Design) -> list[tuple[str, ...]]:
-    best = [(called(o.gesture, o.amplitude, o.unit), o) for o in design.options]
+    best = [(motion_text(o.gesture, o.amplitude, o.unit), o) for o in design.options]
     rows = [(name + (" (improved)" if o.improved else ""), number(o.estimate), number(o.confirmed)) for name, o in best]
     return [*rows, ("the recording at hand", "", number(design.reference))]
 
@@ -61,7 +61,7 @@ def _html(design: Design, picture: bytes, command: str) -> str:
     misfit = [(n.replace("_", " "), f"{1e3 * m:.3g} mm") for n, m in design.misfit.items()]
     body = [
         f"<h1>{for_html(name)}: the next experiment</h1>",
-        f'<p class="verdict">{for_html(summary(design))}</p>',
+        f'<p class="verdict">{for_html(design_summary(design))}</p>',
         "<h2>Why</h2>",
         listed(rationale(design)),
         "<h2>The motion, and what it would show</h2>",
@@ -81,7 +81,7 @@ def _html(design: Design, picture: bytes, command: str) -> str:
 
 def design_png(design: Design) -> bytes:
     """The picture as PNG: how the grippers move, and how far models stay apart at the markers over time."""
-    pair = min(design.pairs, key=lambda p: size(p.left))
+    pair = min(design.pairs, key=lambda p: rms_size(p.left))
     figure = Figure(figsize=(11, 8.6), dpi=110, facecolor="white", layout="constrained")
     FigureCanvasAgg(figure)
     (above, shape), (below, aside) = figure.subplots(2, 2, width_ratios=(2.2, 1.0))
@@ -103,7 +103,7 @@ def design_png(design: Design) -> bytes:
         axes.grid(alpha=0.3)
         axes.spines[["top", "right"]].set_visible(False)
     best = design.options[0]
-    figure.suptitle(f"The gripper {called(best.gesture, best.amplitude, best.unit)}", fontweight="bold")
+    figure.suptitle(f"The gripper {motion_text(best.gesture, best.amplitude, best.unit)}", fontweight="bold")
     content = io.BytesIO()
     figure.savefig(content, format="png", metadata={"Software": "torchdlo"})
     return content.getvalue()
@@ -144,7 +144,7 @@ def _shapes(axes: Any, design: Design, pair: Any) -> None:
 def _bars(axes: Any, design: Design) -> None:
     """Draw the separation of the recording at hand and of the suggestion, for each pair."""
     for k, (now, then) in enumerate(zip(design.present, design.pairs, strict=True)):
-        sizes = [size(p.left) / design.noise for p in (now, then)]
+        sizes = [rms_size(p.left) / design.noise for p in (now, then)]
         axes.bar([k - 0.2, k + 0.2], sizes, 0.36, color=["#9aa5b1", "#00798c"])
     names = [f"{p.rival}\nfor {p.truth}".replace("_", " ") for p in design.pairs]
     axes.set_xticks(range(len(names)), names, fontsize=7)

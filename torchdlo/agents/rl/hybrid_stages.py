@@ -20,19 +20,19 @@ from typing import Any
 
 import torch
 
-from torchdlo.agents.policies import Policy, PolicySpec, load, save, task_features
-from torchdlo.agents.rl.clone import Labels, fit, labelled
+from torchdlo.agents.policies import Policy, PolicySpec, load_policy, save_policy, task_features
+from torchdlo.agents.rl.clone import Labels, fit_clone, label_batch
 from torchdlo.agents.rl.episodes import TaskEpisodes
-from torchdlo.agents.rl.expert import Expert, candidates, improve, load_expert, save_expert
+from torchdlo.agents.rl.expert import Expert, candidate_experts, improve_expert, load_expert, save_expert
 from torchdlo.agents.rl.ppo import Ppo
-from torchdlo.agents.rl.rollout import collect
-from torchdlo.agents.rl.settings import Settings
+from torchdlo.agents.rl.rollout import collect_episodes
+from torchdlo.agents.rl.settings import TrainingSettings
 from torchdlo.agents.torch_records import load_checkpoint, save_checkpoint
-from torchdlo.envs import PUBLISHED, Task, simulated
+from torchdlo.envs import PUBLISHED, Task, with_fidelity
 from torchdlo.errors import InputError
 from torchdlo.journal import read_json, write_json
 
-__all__ = ["STAGES", "Hybrid", "hybrid", "plan_of", "task_policy"]
+__all__ = ["STAGES", "Hybrid", "plan_of", "task_policy", "train_hybrid"]
 
 Callback = Callable[[str, int, int, str], None]
 STAGES = ("robust", "clone", "tune")
@@ -90,7 +90,7 @@ def plan_of(task: str, **given: Any) -> Hybrid:
     return Hybrid(**(_PLANS.get(task, {}) | wanted))
 
 
-def task_policy(task: Task, settings: Settings, **choices: Any) -> Policy:
+def task_policy(task: Task, settings: TrainingSettings, **choices: Any) -> Policy:
     """Return a new policy for a task; `choices` are fields of `PolicySpec`."""
     arms = task.arms.count
     spec = PolicySpec(
@@ -107,10 +107,10 @@ def task_policy(task: Task, settings: Settings, **choices: Any) -> Policy:
     return Policy(replace(spec, **choices))
 
 
-def hybrid(
+def train_hybrid(
     task: Task,
     trajectories: Sequence[Path],
-    settings: Settings,
+    settings: TrainingSettings,
     *,
     folder: Path,
     plan: Hybrid | None = None,
@@ -160,7 +160,7 @@ def _note(folder: Path, notes: dict[str, Any]) -> None:
 
 def _finish(policy: Policy, folder: Path, notes: dict[str, Any]) -> None:
     _note(folder, notes)
-    save(policy, folder / "policy.pt", {"algorithm": "hybrid", "episodes": _episodes(notes)})
+    save_policy(policy, folder / "policy.pt", {"algorithm": "hybrid", "episodes": _episodes(notes)})
 
 
 def _episodes(notes: dict[str, Any]) -> int:
@@ -170,7 +170,7 @@ def _episodes(notes: dict[str, Any]) -> int:
 def _robust(
     task: Task,
     trajectories: Sequence[Path],
-    settings: Settings,
+    settings: TrainingSettings,
     plan: Hybrid,
     folder: Path,
     stages: Sequence[str],
@@ -186,9 +186,9 @@ def _robust(
         return None
     began = time.process_time()
     generations = plan.generations if "robust" in stages else 0
-    found, log, played = improve(
-        simulated(task, task.coarse),
-        candidates(task, list(trajectories)),
+    found, log, played = improve_expert(
+        with_fidelity(task, task.coarse),
+        candidate_experts(task, list(trajectories)),
         seed=settings.seed,
         starts=plan.starts,
         population=plan.population,
@@ -206,7 +206,7 @@ def _robust(
 def _clone(
     task: Task,
     expert: Expert | None,
-    settings: Settings,
+    settings: TrainingSettings,
     plan: Hybrid,
     folder: Path,
     stages: Sequence[str],
@@ -216,7 +216,7 @@ def _clone(
 ) -> Policy:
     file = folder / "clone.pt"
     if file.is_file() and (resume or "clone" not in stages):
-        return load(file)
+        return load_policy(file)
     policy = task_policy(task, settings, squash=False)
     if "clone" not in stages:
         return policy
@@ -224,10 +224,10 @@ def _clone(
         raise InputError(f"{folder / 'expert.json'}: there is no expert to clone; run the stage robust first.")
     began, labels, rng = time.process_time(), Labels(), torch.Generator().manual_seed(settings.seed)
     torch.manual_seed(settings.seed)
-    coarse = TaskEpisodes(simulated(task, task.coarse), plan.count, seed=settings.seed + 11)
+    coarse = TaskEpisodes(with_fidelity(task, task.coarse), plan.count, seed=settings.seed + 11)
     rounds = [coarse] * (1 + plan.rounds)
     if plan.final:
-        rounds += [TaskEpisodes(simulated(task, PUBLISHED), plan.count, seed=settings.seed + 12)] * plan.final
+        rounds += [TaskEpisodes(with_fidelity(task, PUBLISHED), plan.count, seed=settings.seed + 12)] * plan.final
     keeper = _Keeper(folder / "clone.part", {"policy": policy, "labels": labels}, [rng, *_generators(rounds)])
     log, played = keeper.restore() if resume else [], 0
     for k, episodes in enumerate(rounds):
@@ -235,14 +235,14 @@ def _clone(
         if k < len(log):
             continue
         choices = {"driven": k == 0, "noise": plan.noise, "generator": rng}
-        success, failed = labelled(labels, policy, expert, episodes, **choices)
-        error = fit(policy, labels, updates=plan.updates)
+        success, failed = label_batch(labels, policy, expert, episodes, **choices)
+        error = fit_clone(policy, labels, updates=plan.updates)
         fine = episodes.task.fidelity.text
         log.append({"round": k, "fidelity": fine, "success": success, "failed": failed, "error": error})
         keeper.keep(log)
         told("clone", k + 1, len(rounds), f"success {success:.0%} in the round, error {error:.2g}")
     notes["clone"] = {"episodes": played, "cpu_seconds": round(time.process_time() - began, 1), "log": log}
-    save(policy, file, {"stage": "clone", "log": log})
+    save_policy(policy, file, {"stage": "clone", "log": log})
     keeper.remove()
     return policy
 
@@ -284,7 +284,7 @@ class _Keeper:
 def _tune(
     task: Task,
     policy: Policy,
-    settings: Settings,
+    settings: TrainingSettings,
     plan: Hybrid,
     folder: Path,
     resume: bool,
@@ -292,13 +292,13 @@ def _tune(
     told: Callback,
 ) -> Policy:
     began = time.process_time()
-    fine = simulated(task, PUBLISHED)
+    fine = with_fidelity(task, PUBLISHED)
     judge = TaskEpisodes(fine, plan.validation, seed=settings.seed + _VALIDATION)
     start = judge.generator.get_state()
 
     def success(policy: Policy) -> tuple[float, float]:
         judge.generator.set_state(start)
-        found = collect(policy, judge, random=False)
+        found = collect_episodes(policy, judge, random=False)
         return float(found.success.float().mean()), float(judge.returns.mean())
 
     best = copy.deepcopy(policy)
@@ -317,7 +317,7 @@ def _tune(
     episodes.scale = 10.0 / max(1e-6, abs(log[0]["return"]))
     told("tune", log[-1]["episodes"], plan.tune_episodes, f"success {mark[0]:.0%}")
     while log[-1]["episodes"] + settings.count <= plan.tune_episodes and mark[0] < plan.enough:
-        batch, first = collect(policy, episodes), len(log) == 1
+        batch, first = collect_episodes(policy, episodes), len(log) == 1
         ppo.learn(batch, freeze=first)
         # The first batch teaches the critic alone.
         now = mark if first else success(policy)
