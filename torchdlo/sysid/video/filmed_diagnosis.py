@@ -285,6 +285,21 @@ def _fitted(base: _Model, score: Score, iterations: int, seconds: float) -> _Mod
     return replace(best, fit=fit(best.own, best.fit.raw, iterations, seconds=seconds))
 
 
+def _tangents(own: FilmedProblem, here: Fit, seen: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """Return what numbers, cameras and starts can change of weighted readings, (R + N, N), their priors below."""
+    count, moving = here.raw.size, here.offset.shape[1]
+    columns = [(here.jacobian[:, k] * weight)[seen] for k in range(count)]
+    for b in range(len(seen)):
+        only = np.zeros_like(weight)
+        only[b] = weight[b]
+        columns += [] if own.start.still[b] else [(here.jacobian[:, count + k] * only)[seen] for k in range(moving)]
+    jacobian = np.stack(columns, 1).astype(float)
+    priors = np.zeros((jacobian.shape[1], jacobian.shape[1]))
+    per_trial = float(seen.sum()) / len(seen)
+    priors[range(count, len(priors)), range(count, len(priors))] = np.sqrt(own.prior.mean() * per_trial)
+    return np.concatenate([jacobian, priors])
+
+
 def _scores(base: _Model, names: Sequence[str], report: Callable[[int, int], None]) -> list[Score]:
     """Return the scores of effects, best first: what their doses explain beyond what all other numbers can."""
     own, values = base.own, base.values
@@ -298,18 +313,9 @@ def _scores(base: _Model, names: Sequence[str], report: Callable[[int, int], Non
     groups = score_test._groups(names, doses)
     seen = np.isfinite(here.residual)
     weight = np.where(seen, 1 / (np.nan_to_num(here.residual) ** 2 + levenberg_marquardt.KNEE**2) ** 0.25, 0.0)
-    left, count, moving = -(np.nan_to_num(here.residual) * weight)[seen], here.raw.size, here.offset.shape[1]
-    columns = [(here.jacobian[:, k] * weight)[seen] for k in range(count)]
-    for b in range(len(seen)):
-        only = np.zeros_like(weight)
-        only[b] = weight[b]
-        columns += [] if own.start.still[b] else [(here.jacobian[:, count + k] * only)[seen] for k in range(moving)]
-    jacobian = np.stack(columns, 1).astype(float)
-    priors = np.zeros((jacobian.shape[1], jacobian.shape[1]))
-    per_trial = float(seen.sum()) / len(seen)
-    priors[range(count, len(priors)), range(count, len(priors))] = np.sqrt(own.prior.mean() * per_trial)
-    pad = np.zeros(len(priors))
-    q, r = np.linalg.qr(np.concatenate([jacobian, priors]))
+    left, count = -(np.nan_to_num(here.residual) * weight)[seen], here.raw.size
+    q, r = np.linalg.qr(_tangents(own, here, seen, weight))
+    pad = np.zeros(len(q) - len(left))
     left = np.concatenate([left, pad])
     left = left - q @ (q.T @ left)
     scores = []
