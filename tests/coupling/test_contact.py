@@ -185,8 +185,8 @@ def on_bars(tangent: float, mu_s: float, mu_k: float):
 
 @pytest.mark.parametrize("mu_k", [0.5, 0.3])
 def test_a_rope_on_ropes_sticks_below_and_slides_above_the_friction_angle(mu_k):
-    # C3 among ropes: sticks while tan a < mu_s, slides with g (sin a - mu_k cos a) above. The rope bends, and the load on
-    # its supports swings: at nine tenths of mu_s it creeps by 1 cm/s, and friction of what slides is up to 9 % high.
+    # C3 among ropes: sticks while tan a < mu_s, slides with g (sin a - mu_k cos a) above. The rope bends, and the load
+    # on its supports swings: at nine tenths of mu_s it creeps by 1 cm/s, and friction of what slides is up to 9 % high.
     for tangent, share in ((0.3, 0.01), (0.45, 0.05)) if mu_k == 0.5 else ((0.3, 0.01),):
         scene, params, state, _ = on_bars(tangent, 0.5, mu_k)
         after = run(scene, params, state, 200)

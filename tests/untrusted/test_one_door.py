@@ -21,7 +21,7 @@ OWN = {
     "report/render/photo.py",
     "report/render/photo_child.py",
     "coupling/bodies/mesh_sdf.py",
-    "agents/tensor_checkpoint.py",
+    "agents/torch_records.py",
     "agents/distributed/sweep.py",
     "sysid/estimation/checkpoint.py",
     "agents/data/making.py",

@@ -23,6 +23,7 @@ from torchdlo.agents.policies.policy_files import save_policy
 from torchdlo.agents.rl.episodes import TaskEpisodes
 from torchdlo.agents.rl.evaluate import UNSEEN, wilson_interval
 from torchdlo.agents.rl.rollout import episode_progress, policy_features
+from torchdlo.agents.torch_records import load_checkpoint, save_checkpoint
 from torchdlo.envs import PUBLISHED, Task, with_fidelity
 from torchdlo.files import write_atomically
 from torchdlo.vision.camera import Lens
@@ -201,8 +202,8 @@ def teach(
         torch.manual_seed(plan.seed)
         student, memory, log = CloudPolicy(cloud_spec(task)), _Memory(), []
         part, spent = folder / "student.part", 0.0
-        if resume and part.is_file():
-            kept = torch.load(part, weights_only=True)
+        kept = load_checkpoint(part) if resume else None
+        if kept is not None:
             student.load_state_dict(kept["student"])
             memory, log, spent = _Memory([kept["cloud"]], [kept["rest"]]), kept["log"], kept["cpu_seconds"]
         rounds = ["coarse"] * (1 + plan.rounds) + ["published"] * plan.final
@@ -224,7 +225,8 @@ def teach(
             cpu = round(spent + time.process_time() - began, 1)
             content = {"student": student.state_dict(), "cloud": torch.cat(memory.cloud)}
             folder.mkdir(parents=True, exist_ok=True)
-            torch.save(content | {"rest": torch.cat(memory.rest), "log": log, "cpu_seconds": cpu}, part)
+            content |= {"rest": torch.cat(memory.rest), "log": log, "cpu_seconds": cpu}
+            save_checkpoint(part, content)
             told("student", k + 1, len(rounds), f"success {shares['success']:.0%} in the round, error {error:.2g}")
         spent = round(spent + time.process_time() - began, 1)
     notes = {"plan": asdict(plan), "episodes": len(rounds) * plan.count, "cpu_seconds": spent, "log": log}
