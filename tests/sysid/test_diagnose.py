@@ -183,7 +183,11 @@ def test_a_hidden_effect_is_named_and_none_where_there_is_none(
     assert set(json.loads(model_json(result))["effects"]) >= set(named)
     page = report.diagnosis_html(result, recording)
     # With nothing to show before and after, one map is enough.
-    assert page.count("data:image/png") == (2 if named else 1) and "point mass" in page and summary(result, recording)[:7] in page
+    assert (
+        page.count("data:image/png") == (2 if named else 1)
+        and "point mass" in page
+        and summary(result, recording)[:7] in page
+    )
     assert {stage[0] for stage in stages} >= {"calibrating the baseline", "measuring the floor"}
 
 
