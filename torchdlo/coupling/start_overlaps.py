@@ -35,6 +35,8 @@ _DONE = 1e-3
 """Overlap over the radius at which things have parted."""
 _ROUNDS = 200
 _SLIDES = 50
+_PATIENCE = 20
+"""Rounds without getting better after which a way is given up."""
 _G = 9.81
 """Ropes may be bent by what lifts them by their radius at this acceleration [m/s^2], and no more."""
 
@@ -261,10 +263,15 @@ def _moved(
     there = start
     for way, rounds in ways:
         found, there = first, torch.where(wrong, start, there)
+        least, since = float("inf"), 0
         for _ in range(rounds):
             there = torch.where(wrong, way(there, found), there)
             found = look(there)
             if not bool((wrong & ~(_over(found) < _DONE)).any()):
+                break
+            left = float(torch.where(wrong, _over(found), 0.0).sum())
+            least, since = (left, 0) if left < 0.99 * least else (least, since + 1)
+            if since == _PATIENCE:
                 break
         wrong = wrong & ~(_over(found) < SHALLOW)
         if not bool(wrong.any()):
