@@ -121,7 +121,9 @@ def test_what_is_pushed_on_to_a_body_that_was_far_touches_it(monkeypatch):
     )
     floor = RigidBody("plane", pos=(0, 0, 0.01), motion="fixed", mu_s=0.5, mu_k=0.3)
     above = RigidBody("plane", pos=(0, 0, 0.0175), quat=(0, 1, 0, 0), motion="fixed", mu_s=0.5, mu_k=0.3)
-    alone, made = (make([rope], [RodBody()], bodies=[floor, *more], dt=1e-3, substeps=1, check=False) for more in ([], [above]))
+    alone, made = (
+        make([rope], [RodBody()], bodies=[floor, *more], dt=1e-3, substeps=1, check=False) for more in ([], [above])
+    )
     moved = [scene.step(*each, stationary_control(each[0], each[2])).rods.vel for each in (alone, made)]
     assert bool(((moved[0] - moved[1]).norm(dim=-1).amax(-1) > 0.1).all()), "nothing was hit"
     found, gradient = rolled(made, 1)
