@@ -45,7 +45,7 @@ def test_gradients_need_fewer_episodes():
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["ppo", "sac"])
 def test_torchrls_pendulum_is_swung_up(name: str):
-    from pendulum import pendulums, swinger, swung
+    from torchrl_pendulum import pendulums, swinger, swung
 
     torch.manual_seed(0)
     choices = {
