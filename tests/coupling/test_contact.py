@@ -183,21 +183,42 @@ def on_bars(tangent: float, mu_s: float, mu_k: float):
     return scene, params, state, a
 
 
-@pytest.mark.parametrize("mu_k", [0.5, 0.3])
-def test_a_rope_on_ropes_sticks_below_and_slides_above_the_friction_angle(mu_k):
-    # C3 among ropes: sticks while tan a < mu_s, slides with g (sin a - mu_k cos a) above. The rope bends, and the load
-    # on its supports swings: at nine tenths of mu_s it creeps by 1 cm/s, and friction of what slides is up to 9 % high.
-    for tangent, share in ((0.3, 0.01), (0.45, 0.05)) if mu_k == 0.5 else ((0.3, 0.01),):
+def moved_and_friction(
+    mu_k: float, stick: tuple[float, ...], begin: int, count: int
+) -> tuple[list[float], list[float]]:
+    """How far ropes move in 0.2 s below the friction angle, of what they would slide freely, and friction above it."""
+    moved, friction = [], []
+    for tangent in stick:
         scene, params, state, _ = on_bars(tangent, 0.5, mu_k)
-        after = run(scene, params, state, 200)
-        moved = float((after.rods.pos - state.rods.pos)[:13, 0].mean())
-        assert abs(moved) < share * 0.5 * G * 0.2**2 * tangent, (tangent, moved)  # of what it would slide freely
+        way = float((run(scene, params, state, 200).rods.pos - state.rods.pos)[:13, 0].mean())
+        moved.append(abs(way) / (0.5 * G * 0.2**2 * tangent))
     for tangent in (0.6, 0.9):
         scene, params, state, a = on_bars(tangent, 0.5, mu_k)
-        early = run(scene, params, state, 75)
-        late = run(scene, params, early, 150)
-        found = float((late.rods.vel - early.rods.vel)[:13, 0].mean()) / 0.15
-        assert (G * math.sin(a) - found) / (G * math.cos(a)) == pytest.approx(mu_k, rel=0.1), tangent
+        early = run(scene, params, state, begin)
+        late = run(scene, params, early, count)
+        found = float((late.rods.vel - early.rods.vel)[:13, 0].mean()) / (1e-3 * count)
+        friction.append((G * math.sin(a) - found) / (G * math.cos(a)))
+    return moved, friction
+
+
+@pytest.mark.slow
+@pytest.mark.xfail(
+    strict=True, reason="ropes creep by 1 cm/s at nine tenths of mu_s; friction is up to 14 % high at first"
+)
+@pytest.mark.parametrize("mu_k", [0.5, 0.3])
+def test_a_rope_on_ropes_sticks_below_and_slides_above_the_friction_angle(mu_k):
+    # C3 among ropes: sticks while tan a < mu_s, slides with g (sin a - mu_k cos a) above. The rope bends, and a load of
+    # 2 % either way is on the way between it and its supports; where sliding is easier than sticking, a sudden tilt to
+    # nine tenths of mu_s may therefore start it.
+    moved, friction = moved_and_friction(mu_k, (0.3, 0.45) if mu_k == 0.5 else (0.3,), 50, 100)
+    assert max(moved) < 0.01 and friction == pytest.approx([mu_k] * 2, rel=0.02)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("mu_k", [0.5, 0.3])
+def test_friction_among_ropes_is_right_to_a_tenth_once_they_slide(mu_k):
+    moved, friction = moved_and_friction(mu_k, (0.3,), 75, 150)
+    assert max(moved) < 0.01 and friction == pytest.approx([mu_k] * 2, rel=0.1)
 
 
 def test_sweeps_without_friction_equal_coefficients_of_zero():
