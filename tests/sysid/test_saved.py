@@ -82,10 +82,8 @@ def test_calibration_goes_on_from_a_model_with_its_effects(recording: Recording,
     values = dict(zip(model.parameters, model.guess(), strict=True)) | {"air_drag.c_d": 1.0}
     path = write(tmp_path / "model.json", model, np.array([values[n] for n in model.parameters]))
     stages: list[str] = []
-    given = model_file.load(path)
-    # The last stage judges what it began with at finer steps too.
     result = calibrate(
-        recording, given=given, iterations=1, refined=False, callback=lambda stage, *_: stages.append(stage)
+        recording, given=model_file.load(path), iterations=1, callback=lambda stage, *_: stages.append(stage)
     )
     assert not any("starts" in stage for stage in stages)
     assert set(result.parameters) == {*values}

@@ -132,6 +132,7 @@ def calibrate(
         asked |= {"values": given.values, "options": given.options}
     memory = Checkpoint(checkpoint, recording, asked, resume)
     best: _Job | None = None
+    before: dict[str, np.ndarray] | None = None
     interrupted = False
     with Pool(recording, {"vertices": vertices} if given is None else given.options, workers) as pool:
         try:
@@ -141,12 +142,13 @@ def calibrate(
                 for improved in _fit(job, starts, iterations, np.random.default_rng(seed), memory, report):
                     if best.point is None or best is improved or improved.point.cost < best.point.cost:
                         best = improved
+            before = _before(best)  # refining corrects what the pool simulates from then on
             best = _refined(best, iterations, vertices, report) if refined else best
         except KeyboardInterrupt:
             if best is None or (best.point is None and not _settled(best)):
                 raise
             interrupted = True
-        return _judge(best, seed, interrupted, begun, report)
+        return _judge(best, before, seed, interrupted, begun, report)
 
 
 def _job(pool: Pool, rest: str, vertices: int | None, given: ModelFile | None) -> _Job:
@@ -367,13 +369,21 @@ def _spread(job: _Job, starts: int, rng: np.random.Generator) -> np.ndarray:
     return job.space.clip(raws)
 
 
-def _judge(job: _Job, seed: int, interrupted: bool, begun: float, report: Callback) -> Calibration:
+def _before(job: _Job) -> dict[str, np.ndarray]:
+    """Predict all trials with the numbers that a job began with."""
+    trials = job.pool.recording.trials("all")
+    return evaluation.predict(job.model, trials, job.first, job.simulator(trials))
+
+
+def _judge(
+    job: _Job, before: dict[str, np.ndarray] | None, seed: int, interrupted: bool, begun: float, report: Callback
+) -> Calibration:
     """Predict all trials before and after, and compare."""
     recording = job.pool.recording
     trials = recording.trials("all")
     simulate = job.simulator(trials)
     report("predicting all trials", 0, 2, "")
-    before = evaluation.predict(job.model, trials, job.first, simulate)
+    before = before or _before(job)
     report("predicting all trials", 1, 2, "")
     after = evaluation.predict(job.model, trials, job.values, simulate)
     report("predicting all trials", 2, 2, "")
