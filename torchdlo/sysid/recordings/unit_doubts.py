@@ -66,10 +66,10 @@ def _length(recording: Recording, trials: tuple[Trial, ...]) -> list[str]:
 
 
 def _sag(trial: Trial) -> np.ndarray:
-    """Return how far free markers are, on average, from where they would be without weight [m], shape (3,).
+    """Return how far free markers are from where they would be without weight [m], shape (frames, 3), frame by frame.
 
     That is the line between two grippers, or the one along which a clamp holds the rope, of which only what is across
-    counts. Zero where that is not known.
+    counts. Frames in which it is not known are left out.
     """
     held, free = np.flatnonzero(trial.gripped), np.flatnonzero(~trial.gripped)
     s, away = trial.marker_arclength, []
@@ -89,10 +89,14 @@ def _sag(trial: Trial) -> np.ndarray:
             axis = axis / np.maximum(np.linalg.norm(axis, axis=-1, keepdims=True), 1e-9)
             apart = here - near[:, 1]
             apart = apart - (apart * axis).sum(-1, keepdims=True) * axis
-        seen = np.isfinite(apart).all(-1)
-        if seen.any():
-            away.append(apart[seen].mean(0))
-    return np.mean(away, axis=0) if away else np.zeros(3)
+        away.append(apart)
+    if not away:
+        return np.zeros((0, 3))
+    every = np.stack(away, 1)
+    seen = np.isfinite(every).all(-1)
+    count = seen.sum(1)[:, None]
+    total = np.where(seen[..., None], every, 0.0).sum(1)
+    return (total / np.maximum(count, 1))[count[:, 0] > 0]
 
 
 def _down(recording: Recording, trials: tuple[Trial, ...]) -> list[str]:
@@ -105,9 +109,13 @@ def _down(recording: Recording, trials: tuple[Trial, ...]) -> list[str]:
     known = [trial for trial in trials if not trial.suspect.all() and (~trial.gripped).any()]
     if size == 0 or recording.table_height is not None or not known:
         return said
-    sag = np.mean([_sag(trial) for trial in known], axis=0)
-    far = float(np.linalg.norm(sag))
-    if far < _SAG * recording.length or float(sag @ recording.gravity) > _ASKEW * far * size:
+    frames = np.concatenate([_sag(trial) for trial in known])
+    if not len(frames):
+        return said
+    sag = frames.mean(0)
+    far, swings = float(np.linalg.norm(sag)), float(np.linalg.norm(frames.std(0)))
+    # A rope that swings more than it hangs does not show where down is.
+    if far < max(_SAG * recording.length, swings) or float(sag @ recording.gravity) > _ASKEW * far * size:
         return said
     axis = int(np.argmax(np.abs(sag)))
     name, hangs = "xyz"[axis], "-" if sag[axis] < 0 else "+"
