@@ -84,3 +84,16 @@ def test_functions_stay_small(file: Path) -> None:
                 size -= (body.end_lineno or body.lineno) - body.lineno + 1
             size -= body.lineno - node.lineno
             assert size <= 55, f"{file.relative_to(ROOT)}:{node.lineno}: {node.name} has {size}"
+
+
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda f: str(f.relative_to(ROOT)))
+def test_pages_import_what_there_is(page: Path) -> None:
+    for block in re.findall(r"^```python\n(.*?)^```", page.read_text(), re.DOTALL | re.MULTILINE):
+        for node in ast.walk(ast.parse(block)):
+            if not isinstance(node, ast.ImportFrom) or not (node.module or "").startswith("torchdlo"):
+                continue
+            for name in node.names:
+                exec(f"from {node.module} import {name.name}", {})

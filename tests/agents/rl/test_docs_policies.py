@@ -23,7 +23,7 @@ def test_the_tutorial_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caps
     code = "\n".join(blocks)
     # A small budget: few episodes, few steps of learning.
     smaller = code.replace("count=128", "count=4, starts=2, rounds=0, final=0, updates=300")
-    smaller = smaller.replace("evaluate([policy], task)", "evaluate([policy], task, starts=2)")
+    smaller = smaller.replace("evaluate_policies([policy], task)", "evaluate_policies([policy], task, starts=2)")
     assert smaller.count("=2") >= 2
     exec(compile(smaller, "policies.md", "exec", dont_inherit=True), {"__name__": "page"})
     said = capsys.readouterr().out

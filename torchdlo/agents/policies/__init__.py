@@ -1,4 +1,4 @@
-"""Policies that act in tasks: `load(path)` returns one, `module(policy)` makes it a TensorDictModule."""
+"""Policies that act in tasks: `load_policy(path)` returns one, `policy_module(policy)` makes it a TensorDictModule."""
 
 from torchdlo.agents.policies.cloud_policy import CloudPolicy, CloudSpec
 from torchdlo.agents.policies.features import FeatureSpec, Normaliser, task_features
