@@ -316,6 +316,17 @@ def test_a_model_file_is_a_rope_of_a_scene(modelled):
         scene_files.build(change(said, ropes=(rope, LINE)), folder=folder)
 
 
+@pytest.mark.parametrize("spoil", [lambda s: s * 20_000, lambda s: s[::-1], lambda s: s[:1]])
+def test_a_mesh_of_a_model_rises_and_has_an_end(modelled, spoil):
+    folder = modelled()
+    content = json.loads((folder / "model.json").read_text())
+    content["mesh"]["arclength"] = spoil(content["mesh"]["arclength"])
+    (folder / "model.json").write_text(json.dumps(content))
+    rope = RopeSpec(((0.0, 0.0, 0.0), (1.0, 0.0, 0.0)), model="model.json")
+    with pytest.raises(InputError, match="mesh.arclength: expected 2 to 100000 numbers that rise"):
+        scene_files.build(SceneDescription((rope,), {}), folder=folder)
+
+
 def test_a_natural_shape_of_a_model_is_that_of_the_rope(modelled):
     folder = modelled("given", ())
     made = scene_files.build(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -113,6 +114,8 @@ def _read(path: Path) -> tuple[Any, dict[str, Any]]:
 
 def _rope(path: Path) -> dict[str, Any]:
     """Return what a file says of the rope and its mesh, checked."""
+    from torchdlo.sysid.model.discretisation import MOST_VERTICES
+
     found = read_entry(path, "a model file")
     rope, mesh = found["rope"], found["mesh"]
     rope["length"].number(1e-6, 1e4, "m")
@@ -124,7 +127,9 @@ def _rope(path: Path) -> dict[str, Any]:
         rope["rest_positions"].numbers(None, 3, most=1e4)
         if len(rope["rest_positions"].value) < 3:
             raise rope["rest_positions"].wrong("at least 3 positions")
-    mesh["arclength"].numbers(None, most=1e4)
+    arclength = mesh["arclength"].numbers(None, most=1e4)
+    if not 2 <= len(arclength) <= MOST_VERTICES or any(b <= a for a, b in itertools.pairwise(arclength)):
+        raise mesh["arclength"].wrong(f"2 to {MOST_VERTICES} numbers that rise")
     return found.object()
 
 

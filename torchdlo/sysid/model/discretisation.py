@@ -14,7 +14,7 @@ from torchdlo.physics.linalg import rotation
 from torchdlo.physics.linalg.numerics import normalize
 from torchdlo.sysid.recordings.recording import Trial
 
-_MOST = 100_000
+MOST_VERTICES = 100_000
 """Most vertices of a rope."""
 
 
@@ -98,8 +98,8 @@ class Mesh:
 
 def make_mesh(trial: Trial, length: float, vertices: int | None) -> Mesh:
     """Return a mesh with a vertex at every marker of a trial, and about `vertices` evenly spaced ones in all."""
-    if vertices is not None and not 2 <= vertices <= _MOST:
-        raise InputError(f"vertices: expected 2 to {_MOST} for a rope, given {vertices:g}.")
+    if vertices is not None and not 2 <= vertices <= MOST_VERTICES:
+        raise InputError(f"vertices: expected 2 to {MOST_VERTICES} for a rope, given {vertices:g}.")
     markers = trial.marker_arclength
     stations = list(markers)
     if length > markers[-1] * 1.01:
