@@ -323,7 +323,7 @@ def test_a_mesh_of_a_model_rises_and_has_an_end(modelled, spoil):
     content["mesh"]["arclength"] = spoil(content["mesh"]["arclength"])
     (folder / "model.json").write_text(json.dumps(content))
     rope = RopeSpec(((0.0, 0.0, 0.0), (1.0, 0.0, 0.0)), model="model.json")
-    with pytest.raises(InputError, match="mesh.arclength: expected 2 to 100000 numbers that rise"):
+    with pytest.raises(InputError, match=r"mesh\.arclength: expected 2 to 100000 numbers that rise"):
         scene_files.build(SceneDescription((rope,), {}), folder=folder)
 
 
