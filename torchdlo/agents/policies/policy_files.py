@@ -52,12 +52,13 @@ def load_policy(path: Path | str, notes: bool = False) -> Any:
             check_shapes(made(spec), content["state"], str(path), what)
         policy = made(spec)
         policy.load_state_dict(content["state"])
+        said = content["notes"]
     except InputError:
         raise
     except (KeyError, TypeError, ValueError, RuntimeError, AttributeError, IndexError):
         raise wrong from None
     policy.eval()
-    return (policy, content["notes"]) if notes else policy
+    return (policy, said) if notes else policy
 
 
 def policy_module(policy: Policy) -> Any:
