@@ -8,6 +8,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -223,3 +224,15 @@ def test_a_full_disk_says_how_to_go_on() -> None:
         said = ending.failed(OSError(errno.ENOSPC, "No space left on device", "a/b"))
     assert said.startswith("a/b: No space left on device; what was written before is kept, make room")
     assert said.endswith("go on with: torchdlo diagnose rope --resume")
+
+
+@pytest.mark.parametrize("full", [True, False])
+def test_a_writer_in_the_background_is_quiet_about_a_full_disk(full: bool, capsys: pytest.CaptureFixture[str]) -> None:
+    def write() -> None:
+        raise OSError(errno.ENOSPC if full else errno.EPERM, "no")
+
+    with ending.caught(["train", "separation"]):
+        thread = threading.Thread(target=write)
+        thread.start()
+        thread.join()
+    assert ("Traceback" in capsys.readouterr().err) is not full

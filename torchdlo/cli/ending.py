@@ -20,6 +20,8 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 _RESUMABLE = ("calibrate", "diagnose", "design-experiment", "optimize", "plan", "train", "distill", "learn", "sweep")
 
+_FULL = (errno.ENOSPC, errno.EDQUOT)
+
 _by: signal.Signals | None = None
 """What stopped the command, if anything did."""
 _told = False
@@ -69,7 +71,7 @@ def _again(resume: bool) -> str:
 
 def failed(error: OSError) -> str:
     """Return a sentence about what the system refused."""
-    if error.errno in (errno.ENOSPC, errno.EDQUOT):
+    if error.errno in _FULL:
         where = f"{error.filename}: " if error.filename else ""
         return _plain(f"{where}{error.strerror}; what was written before is kept, make room") + _again(_goes_on())
     return _plain(str(error))
@@ -88,6 +90,7 @@ def caught(args: list[str] | None = None) -> Iterator[None]:
         return
     _by, _told, _typed = None, False, list(sys.argv[1:] if args is None else args)
     before = {s: signal.getsignal(s) for s in SIGNALS}
+    threads, threading.excepthook = threading.excepthook, _in_thread
     for each in before:
         signal.signal(each, _raise)
     try:
@@ -99,9 +102,16 @@ def caught(args: list[str] | None = None) -> Iterator[None]:
             raise stopped("nothing more was written") from None
         raise
     finally:
+        threading.excepthook = threads
         for each, handler in before.items():
             with suppress(TypeError, ValueError):  # of one that was not set by Python
                 signal.signal(each, handler)
+
+
+def _in_thread(args: threading.ExceptHookArgs) -> None:
+    """Leave what a full disk does to a writer in the background to the command, which hears of it too."""
+    if not (isinstance(args.exc_value, OSError) and args.exc_value.errno in _FULL):
+        threading.__excepthook__(args)
 
 
 def _raise(signum: int, frame: Any) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from pathlib import Path
 from typing import Annotated
 
@@ -24,5 +23,7 @@ def sample(
     from torchdlo.sysid.recordings.recording import check_new_folder
 
     check_new_folder(out)
-    shutil.copytree(FOLDER, out, dirs_exist_ok=True)
+    out.mkdir(parents=True, exist_ok=True)
+    for file in FOLDER.iterdir():
+        (out / file.name).write_bytes(file.read_bytes())
     typer.echo(f"{out}: a recording with {len(list(out.glob('*.npz')))} trials; next: torchdlo calibrate {out}")
