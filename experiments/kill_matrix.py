@@ -213,7 +213,10 @@ def matrix(name: str, words: tuple[str, ...], kills: int, folder: Path, rng: ran
             if not killed(words, run, k > 0, moment):
                 break
             moments.append(round(moment, 1))
-        code, text = ended(words, run, bool(moments))
+        if not moments:  # it was at its end before the moment came
+            shutil.rmtree(run, ignore_errors=True)
+            continue
+        code, text = ended(words, run, True)
         found["kills"] += len(moments)
         found["runs"] += 1
         left = [str(f.relative_to(run)) for f in run.rglob(".*")]

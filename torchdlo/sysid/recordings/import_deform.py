@@ -20,7 +20,7 @@ import numpy as np
 
 from torchdlo.errors import InputError
 from torchdlo.sysid.recordings.recording import Recording, Trial
-from torchdlo.untrusted import read_bytes
+from torchdlo.untrusted import one_line, read_bytes
 
 __all__ = ["find_cables", "read_cable", "read_positions", "read_rest_shape", "suspect_frames"]
 
@@ -116,7 +116,7 @@ def read_positions(path: Path) -> np.ndarray:
     except _UNREADABLE as error:
         raise InputError(
             f"{path}: expected a pickle of lists of numbers, found one that cannot be read "
-            f"({error}); is the checkout complete?"
+            f"({one_line(error, 200)}); is the checkout complete?"
         ) from None
     return _as_positions(path, content, len(pickled))
 
