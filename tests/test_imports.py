@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -37,3 +38,8 @@ def test_optional_packages_stay_unimported(module: str) -> None:
     # What torch itself brings along is not ours to judge.
     ours = loaded_by(f"import {module}") - loaded_by("import torch")
     assert not ours & set(OPTIONAL)
+
+
+def test_a_recording_is_checked_without_torch(repository: Path) -> None:
+    folder = repository / "torchdlo" / "data" / "sample_rope"
+    assert "torch" not in loaded_by(f"from torchdlo.cli import main\nmain(['check', {str(folder)!r}])")

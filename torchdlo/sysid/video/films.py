@@ -15,10 +15,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from torchdlo.errors import InputError
-from torchdlo.vision.camera import Camera, load_cameras
 
 if TYPE_CHECKING:
     from torchdlo.sysid.recordings.recording import Trial
+    from torchdlo.vision.camera import Camera
 
 __all__ = ["STATIONS", "FilmFile", "film_files", "with_stations"]
 
@@ -61,6 +61,8 @@ def film_files(path: Path, trials: Sequence[str]) -> dict[str, tuple[FilmFile, .
         )
     if not found and not (path / "cameras.json").is_file():
         return {}
+    from torchdlo.vision.camera import load_cameras  # only films need torch, which takes seconds to start
+
     cameras = {c.name: c for c in load_cameras(path / "cameras.json")}
     films: dict[str, list[FilmFile]] = {name: [] for name in trials}
     for file in found:
