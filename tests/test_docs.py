@@ -97,3 +97,11 @@ def test_pages_import_what_there_is(page: Path) -> None:
                 continue
             for name in node.names:
                 exec(f"from {node.module} import {name.name}", {})
+
+
+def test_help_shows_what_fields_are() -> None:
+    from torchdlo.scene import Control, Rope
+
+    assert "    mass: Mass of the whole rope [kg], spread evenly over its length; or give `density`." in Rope.__doc__
+    assert "pos: Positions of the held vertices [m], shape (..., H, 3)." in Control.__doc__
+    assert Rope.__doc__.startswith("One rope.")

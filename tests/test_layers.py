@@ -16,6 +16,7 @@ PACKAGE = ROOT / "torchdlo"
 
 FLOORS = {
     "errors": 0,
+    "field_docs": 0,
     "lazy": 0,
     "notices": 0,
     "work_budget": 0.5,
@@ -45,6 +46,7 @@ ARRAYS = TORCH | {"numpy", "scipy"}
 LEARNING = TORCH | {"tensordict", "torchrl"}
 ALLOWED = {
     "errors": set(),
+    "field_docs": set(),
     "lazy": set(),
     "notices": set(),
     "work_budget": set(),

@@ -23,6 +23,7 @@ from torchdlo.coupling.common.step_diagnostics import broad_phase
 from torchdlo.coupling.mpm import body_coupling_effect, rod_coupling_effect
 from torchdlo.coupling.mpm import substep as mpm
 from torchdlo.coupling.mpm.particles import MpmDomain, ParticleParams, Particles, laid_out
+from torchdlo.field_docs import with_field_docs
 from torchdlo.physics import tree
 from torchdlo.physics.effects.base import Effect, altered_params, default_values, parameters_of
 from torchdlo.physics.execution import tracing
@@ -39,6 +40,7 @@ from torchdlo.physics.rod.prescribed import Reaction, Targets, between, check_gr
 from torchdlo.physics.rod.topology import Topology
 
 
+@with_field_docs
 @tree.struct
 class Params:
     """Numbers that stay the same along a rollout."""
@@ -52,6 +54,7 @@ class Params:
     """Numbers of the matter, () if there is none."""
 
 
+@with_field_docs
 @tree.struct
 class State:
     """What evolves."""
@@ -71,6 +74,7 @@ class State:
     """Particles of the matter, () if there is none."""
 
 
+@with_field_docs
 @tree.struct
 class Control:
     """What held parts are told to do, at the end of a step."""
@@ -90,6 +94,7 @@ _NEWTON = {"explicit": 3, "implicit": 8}
 """Newton steps for edge lengths, by integrator, where a scene says nothing."""
 
 
+@with_field_docs
 @dataclass(frozen=True)
 class Scene:
     """The static side of a simulation; hashable, without tensors."""

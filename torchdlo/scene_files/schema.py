@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
+from torchdlo.field_docs import with_field_docs
+
 __all__ = [
     "Attachment",
     "BodySpec",
@@ -22,6 +24,7 @@ Quaternion = tuple[float, float, float, float]
 Wall = Literal["open", "separate", "slip", "stick"]
 
 
+@with_field_docs
 @dataclass(frozen=True)
 class HangingMass:
     """A point mass that hangs on a rope; drawn as a ball of steel, which touches nothing."""
@@ -32,6 +35,7 @@ class HangingMass:
     """Mass [kg]."""
 
 
+@with_field_docs
 @dataclass(frozen=True)
 class RopeSpec:
     """A rope; fields without a comment are those of `scene.RopeSpec`."""
@@ -57,6 +61,7 @@ class RopeSpec:
     """What hangs on it."""
 
 
+@with_field_docs
 @dataclass(frozen=True)
 class Keyframe:
     """Where something is at a time, from where it is at the start; between keyframes it moves by `path`."""
@@ -69,6 +74,7 @@ class Keyframe:
     """By how much it has turned: axis times angle [rad]."""
 
 
+@with_field_docs
 @dataclass(frozen=True)
 class Attachment:
     """Vertices of a rope that are held together as by one tool."""
@@ -91,6 +97,7 @@ class Attachment:
     """When it is let go [s], if ever."""
 
 
+@with_field_docs
 @dataclass(frozen=True)
 class BodySpec:
     """A rigid body; fields without a comment are those of `coupling.bodies.dynamics.RigidBody`."""
@@ -121,6 +128,7 @@ class BodySpec:
     """Of a mesh: cells of its grid of distances along the longest side."""
 
 
+@with_field_docs
 @dataclass(frozen=True)
 class RobotSpec:
     """A chain of links whose joints go where they bring its tool along `keyframes`."""
@@ -144,6 +152,7 @@ class RobotSpec:
     path: Literal["smooth", "linear"] = "smooth"
 
 
+@with_field_docs
 @dataclass(frozen=True)
 class ParticleBlockSpec:
     """A block of a material, made of material points."""
@@ -162,6 +171,7 @@ class ParticleBlockSpec:
     """Parameters of its constitutive model, and its density, that differ from their defaults."""
 
 
+@with_field_docs
 @dataclass(frozen=True)
 class GridSpec:
     """Where material points may be; fields without a comment are those of `coupling.mpm.particles.Grid`."""
@@ -175,6 +185,7 @@ class GridSpec:
     """Coefficient of friction at walls that let go."""
 
 
+@with_field_docs
 @dataclass(frozen=True)
 class SceneDescription:
     """A simulation from its start to its end; fields without a comment are those of `scene.Scene`."""

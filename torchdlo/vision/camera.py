@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from torchdlo.errors import InputError
+from torchdlo.field_docs import with_field_docs
 from torchdlo.files import write_atomically
 from torchdlo.untrusted import one_line, read_json
 
@@ -29,6 +30,7 @@ _DISTORTIONS = (0, 4, 5, 8, 12, 14)
 """Numbers of coefficients that OpenCV knows."""
 
 
+@with_field_docs
 @dataclass(frozen=True)
 class Camera:
     """One calibrated camera at its place."""

@@ -19,6 +19,7 @@ from torch import Tensor
 
 from torchdlo.coupling.bodies import shape_sdf
 from torchdlo.coupling.common.vector_components import axes, local, world
+from torchdlo.field_docs import with_field_docs
 from torchdlo.physics import tree
 from torchdlo.physics.effects.base import ContactForces
 from torchdlo.physics.linalg.numerics import safe_norm
@@ -139,6 +140,7 @@ class PredictedBodyMotion:
         return dataclasses.replace(self, bodies=tuple(self.bodies[k] for k in part), **parts)
 
 
+@with_field_docs
 @dataclass(frozen=True, eq=False)
 class RigidBody:
     """One rigid body, as a person describes it. Numbers are floats, or tensors (...,) per scene."""

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import torch
 
 from torchdlo.errors import InputError
+from torchdlo.field_docs import with_field_docs
 from torchdlo.physics.effects import EFFECTS
 from torchdlo.physics.effects.base import Effect
 from torchdlo.scene import Rope
@@ -17,6 +18,7 @@ from torchdlo.scene import Rope
 __all__ = ["RopeMaterial"]
 
 
+@with_field_docs
 @dataclass(frozen=True)
 class RopeMaterial:
     """What a rope is made of, whatever its length: the ropes of a task become pieces of it, as thick as before.

@@ -29,6 +29,7 @@ from torchdlo.envs.core.stages import Schedule, Stage
 from torchdlo.envs.core.waypoints import actions_through, resample_evenly
 from torchdlo.envs.observations.cameras import TaskCamera
 from torchdlo.errors import InputError
+from torchdlo.field_docs import with_field_docs
 from torchdlo.physics import tree
 from torchdlo.physics.effects.base import Effect
 from torchdlo.physics.effects.elastic import Bend, BendFrame, Stretch
@@ -76,6 +77,7 @@ class TaskState:
         return self.state.rods.pos
 
 
+@with_field_docs
 @dataclass(frozen=True)
 class Task(ABC):
     """A task. Subclasses are final; what they leave as it is here is a rule of all tasks."""

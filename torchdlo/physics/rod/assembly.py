@@ -9,6 +9,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from torchdlo.field_docs import with_field_docs
 from torchdlo.physics import tree
 from torchdlo.physics.linalg import rotation
 from torchdlo.physics.linalg.numerics import cross, dot, normalize
@@ -19,6 +20,7 @@ from torchdlo.physics.rod.topology import Topology, preceding
 Number = float | Tensor
 
 
+@with_field_docs
 @dataclass(frozen=True, eq=False)
 class Rope:
     """One rope. Numbers are floats, or tensors (..., n) per edge or hinge, or (...,) or (..., 1) per scene.

@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from torchdlo.errors import InputError
+from torchdlo.field_docs import with_field_docs
 from torchdlo.files import replace_atomically
 from torchdlo.sysid.recordings import rope_schema
 from torchdlo.sysid.video.films import FilmFile, film_files, with_stations
@@ -31,6 +32,7 @@ __all__ = [
 ]
 
 
+@with_field_docs
 @dataclass(frozen=True, eq=False)
 class Trial:
     """One motion of the rope with its grippers, as measured."""
@@ -55,6 +57,7 @@ class Trial:
     """Films of it, if cameras saw the rope instead of markers: then free markers are places that were not seen."""
 
 
+@with_field_docs
 @dataclass(frozen=True, eq=False)
 class Recording:
     """A rope and all its trials."""
