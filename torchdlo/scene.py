@@ -434,6 +434,9 @@ def stepper(scene: Scene, *, compiled: bool = True, recorded: bool = False):
 
     def run(params: Params, state: State, control: Control) -> State:
         _check_control(scene, control)
+        notices.once(
+            "compiling", "compiling the first step: seconds to minutes, once a process; compiled=False does without."
+        )
         with_gradient = torch.is_grad_enabled()
         whole, part = ways[with_gradient]
         with trusting((params, state, control), with_gradient, *control.attachment_weight) as inputs:
