@@ -14,8 +14,12 @@ from torchdlo.sysid.diagnosis.effect_search import diagnose
 from torchdlo.sysid.model.rope_model import RopeModel
 from torchdlo.sysid.model.trial_batch import Start
 from torchdlo.sysid.recordings.recording import load_recording
-from torchdlo.sysid.video.filmed_fit import eliminated, normal
+from torchdlo.sysid.video.filmed import doubts
+from torchdlo.sysid.video.filmed_fit import eliminated, look, normal
+from torchdlo.sysid.video.filmed_problem import begin_from_balance, filmed_problem
+from torchdlo.sysid.video.filmed_starts import fit_starts, search_starts
 from torchdlo.sysid.video.films import with_stations
+from torchdlo.sysid.video.footage import views_of
 
 DATA = Path(__file__).parents[2] / "torchdlo" / "data"
 
@@ -83,6 +87,36 @@ def test_films_that_begin_in_motion_tell_the_bending_stiffness() -> None:
     stiffness = found.parameters["bending_stiffness"]["value"]
     assert abs(stiffness / 3e-3 - 1) < 0.05
     assert np.mean([t["distance_px"] for t in found.per_trial if t["split"] == "train"]) < 1.0
+    # One of them comes towards the camera at a metre per second: its start has another, wrong, basin.
+    assert np.mean([t["mae_mm"] for t in found.per_trial if t["split"] == "test"]) < 2.0
+
+
+def test_a_start_that_is_not_believed_is_said() -> None:
+    trials = [
+        {"name": name, "split": name[:-2], "mae_mm": error}
+        for name, error in (("train_0", 1.0), ("train_1", 9.0), ("test_0", 20.0), ("test_1", 2.9))
+    ]
+    said = doubts(trials, ["train_0", "test_0", "test_1"])
+    assert len(said) == 1
+    assert said[0].startswith("test_0 begins in motion and stays 20.0 mm from its films, the nearest trial 1.0 mm")
+    assert doubts([trials[0] | {"mae_mm": np.nan}], ["train_0"])
+
+
+@pytest.mark.slow
+def test_starts_on_the_other_side_of_the_camera_are_found() -> None:
+    recording = load_recording(DATA / "sample_film")
+    views, _ = views_of(recording, recording.test[:1])
+    own = filmed_problem(recording, recording.test[:1], views, options={"vertices": 21})
+    values = np.concatenate([[3e-3, 2e-3, 0.5], np.zeros(len(own.spines.nuisances.names))])
+    begin_from_balance(own, own.full(values[None])[0])
+    raw = own.space.to_raw(values)
+    nearest = fit_starts(own, raw, 8, seconds=0.4).costs
+    searched = search_starts(own, raw, seconds=0.4)
+    assert (searched.costs <= nearest).all()
+    assert np.allclose(look(own, raw, own.offset, 0.4, fixed=True).costs, searched.costs, rtol=1e-6)
+    # The rope comes and goes by more than a metre per second: the balance that is carried along does not.
+    towards = own.offset.reshape(1, 2, -1, 3)[0, 1, 0] @ np.array(views[0].camera.rotation)[2]
+    assert 1.5 < abs(towards) < 5.0
 
 
 def test_a_diagnosis_of_films_cannot_be_resumed() -> None:

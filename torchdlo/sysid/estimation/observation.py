@@ -86,6 +86,12 @@ class FilmView:
         bits = np.unpackbits(self.packed[trial][frames], axis=1, count=height * width)
         return bits.reshape(len(frames), height, width).astype(bool)
 
+    def picked(self, rows: np.ndarray) -> FilmView:
+        """Return what was seen of these trials, in their order, repeated as given."""
+        packed, shown = (tuple(part[b] for b in rows) if part else () for part in (self.packed, self.shown))
+        parts = (self.good[rows], self.places[rows], self.tangents[rows])
+        return FilmView(self.camera, *parts, self.half_width, packed, shown)
+
     @property
     def time(self) -> np.ndarray:
         """Middles of exposures, as the camera's clock has them [s], shape (F,)."""

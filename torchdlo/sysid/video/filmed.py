@@ -22,17 +22,21 @@ from torchdlo.sysid.estimation.result import Calibration, Overlay
 from torchdlo.sysid.model import model_file
 from torchdlo.sysid.model.model_file import ModelFile
 from torchdlo.sysid.recordings.recording import Recording
-from torchdlo.sysid.video.filmed_fit import START_WINDOW, Fit, fit, gate, intervals, picture_errors, refine_start, scout
+from torchdlo.sysid.video.filmed_fit import Fit, fit, gate, intervals, picture_errors
 from torchdlo.sysid.video.filmed_problem import FilmedProblem, add_correction, begin_from_balance, filmed_problem
+from torchdlo.sysid.video.filmed_starts import START_WINDOW, refine_start, restart, scout
 from torchdlo.sysid.video.footage import views_of
 from torchdlo.sysid.video.overlay import mask_overlaps, overlays
 
-__all__ = ["FILMED_STARTS", "baseline", "calibrate_filmed", "tested"]
+__all__ = ["FILMED_STARTS", "baseline", "calibrate_filmed", "doubts", "tested"]
 
 Callback = Callable[[str, int, int, str], None]
 
 FILMED_STARTS = 36
 """Starts that are enough."""
+
+_DOUBT, _DOUBT_MM = 3.0, 3.0
+"""Times the error of the nearest trial, and error [mm], from which a start in motion is not believed."""
 
 
 def calibrate_filmed(
@@ -69,6 +73,7 @@ def calibrate_filmed(
     found = [_judged(recording, split, own, first, values, notes, report) for split in ("train", "test")]
     report("judging", 1, 1, "")
     trials = [t for f in found for t in f.trials]
+    notes += doubts(trials, [name for f in found for name in f.moving])
     return Calibration(
         parameters={
             name: {"value": float(v), "low": float(a), "high": float(b), "unit": p.unit}
@@ -121,7 +126,7 @@ def tested(
     parts: dict[str, Any] = {"trials": recording.test, "motion": own.model.motion(recording.test), "spines": spines}
     here = replace(own, **parts, dropped={}, discretisation_correction=None)
     begin_from_balance(here, own.full(values[None])[0])
-    refine_start(here, values)
+    refine_start(here, values, search=True)
     gate(here, values)
     add_correction(here, values)
     return here, said
@@ -156,7 +161,7 @@ def _fitted(own: FilmedProblem, raw: np.ndarray, iterations: int, report: Callba
             own.take(other)
             best = found
     report(stage, 1, 3, f"{1e3 * best.cost:.2f} mm")
-    best = fit(own, best.raw, iterations)
+    best = restart(own, fit(own, best.raw, iterations), iterations)
     report(stage, 2, 3, f"{1e3 * best.cost:.2f} mm")
     values = own.space.to_values(best.raw)
     gate(own, values)
@@ -185,6 +190,8 @@ class _Judged:
     """Places of the rope before and after by trial [m], shape (2, T, M, 3)."""
     overlays: list[Overlay]
     """Pictures."""
+    moving: list[str]
+    """Trials that begin in motion."""
 
 
 def _judged(
@@ -218,7 +225,26 @@ def _judged(
     ]
     predictions = {trial.name: sims[:, b, : len(trial.time)] for b, trial in enumerate(here.trials)}
     shown = overlays(here, split, sims, np.stack([first, values])[:, numbers:])
-    return _Judged(trials, predictions, shown)
+    return _Judged(
+        trials, predictions, shown, [t["name"] for t, calm in zip(trials, here.start.still, strict=True) if not calm]
+    )
+
+
+def doubts(trials: Sequence[dict[str, Any]], moving: Sequence[str]) -> list[str]:
+    """Return which trials in motion may have been given a wrong start: they stay far from their films, others do not.
+
+    Args:
+        trials: errors, see `Calibration.per_trial`.
+        moving: names of those that begin in motion.
+    """
+    near = min((t["mae_mm"] for t in trials if t["split"] == "train"), default=np.inf)
+    return [
+        f"{t['name']} begins in motion and stays {t['mae_mm']:.1f} mm from its films, the nearest trial {near:.1f} mm: "
+        "where and how fast it began was perhaps not found, and its error then says little of the rope; film it with a "
+        "second camera, or from rest."
+        for t in trials
+        if t["name"] in moving and not t["mae_mm"] < max(_DOUBT * near, _DOUBT_MM)
+    ]
 
 
 def _remarks(own: FilmedProblem, values: np.ndarray, low: np.ndarray, high: np.ndarray) -> list[str]:

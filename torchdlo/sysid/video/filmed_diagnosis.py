@@ -25,6 +25,7 @@ from torchdlo.sysid.recordings.recording import Recording
 from torchdlo.sysid.video.filmed import FILMED_STARTS, baseline, tested
 from torchdlo.sysid.video.filmed_fit import Fit, fit, look, spread
 from torchdlo.sysid.video.filmed_problem import FilmedProblem
+from torchdlo.sysid.video.filmed_starts import fit_starts
 from torchdlo.sysid.video.footage import views_of
 from torchdlo.sysid.video.overlay import overlays
 
@@ -83,7 +84,7 @@ class _Model:
         if self._tested is None:
             here = self.test
             if here.offset.shape[1]:
-                fit(here, self.fit.raw, 3, seconds=None, tolerance=1e-2, fixed=True)
+                fit_starts(here, self.fit.raw, 3)
             read = here.spines.read(here.simulate(self.values[None]), self.values[None, len(here.free) :])[0]
             residual = np.where(np.isfinite(here.spines.target), read, np.nan)[:, :, : here.spines.priors.start, 0]
             self._tested = np.sqrt(np.nanmean(residual**2, (1, 2)))

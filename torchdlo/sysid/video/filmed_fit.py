@@ -7,26 +7,16 @@ normal equations (Schur complement), and what is left is a problem of the number
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
 from torchdlo.sysid.estimation import levenberg_marquardt
-from torchdlo.sysid.estimation.levenberg_marquardt import ParameterSpace, Point
+from torchdlo.sysid.estimation.levenberg_marquardt import Point
 from torchdlo.sysid.estimation.observation import INDEPENDENT, SURE, Spines
 from torchdlo.sysid.video.filmed_problem import FilmedProblem
 
-__all__ = ["Fit", "fit", "gate", "intervals", "look", "picture_errors", "refine_start", "scout", "spread"]
-
-Callback = Callable[[str, int, int, str], None]
-
-START_WINDOW = 0.4
-"""Seconds of a film that a start in motion is first estimated from."""
-
-_REACH = (np.log(40.0), np.log(4.0), np.log(10.0))
-"""How far starts go either way of the guess."""
+__all__ = ["Fit", "fit", "gate", "intervals", "look", "picture_errors", "spread", "total"]
 
 _BLOCK = 0.5
 """Time over which what simulations get wrong is one and the same error [s]."""
@@ -99,18 +89,25 @@ def eliminated(gradient: np.ndarray, curvature: np.ndarray, count: int) -> tuple
     return gradient[:, :-count] - (b @ solved[..., -1:])[..., 0], a - b @ solved[..., :-1]
 
 
-def look(own: FilmedProblem, raw: np.ndarray, offset: np.ndarray, seconds: float | None = None) -> Fit:
-    """Return readings and their derivatives at coordinates (N,) and starts (B, J), over the first seconds."""
+def look(
+    own: FilmedProblem, raw: np.ndarray, offset: np.ndarray, seconds: float | None = None, *, fixed: bool = False
+) -> Fit:
+    """Return readings and their derivatives at coordinates (N,) and starts (B, J), over the first seconds.
+
+    Where numbers are fixed, derivatives are those of starts alone, shape (B, J, F, R).
+    """
     space, numbers, moving = own.space, len(own.free), offset.shape[1]
     step = levenberg_marquardt.PointEvaluation(space, raw[None])
-    values = step.values
+    values, varied = step.values, step.steps[0]
+    if fixed:
+        values, numbers, varied = values[:1], 0, varied[:0]
     # What cameras are off needs no simulation of its own.
     rows = np.concatenate([values[: numbers + 1], np.repeat(values[:1], moving, 0)])
     offsets = np.repeat(offset[None], len(rows), 0)
     for k in range(moving):
         offsets[numbers + 1 + k, :, k] += _NUDGE
     sims = own.simulate(rows, own.frames(seconds), offsets)
-    cameras = np.concatenate([rows[:, numbers:], values[numbers + 1 :, numbers:]])
+    cameras = np.concatenate([rows, values[numbers + 1 :]])[:, len(own.free) :]
     motions = np.concatenate([sims, np.repeat(sims[:1], len(values) - numbers - 1, 0)])
     target = own.target(seconds)
     found = own.spines.changes(motions, cameras)[..., 0]
@@ -118,7 +115,7 @@ def look(own: FilmedProblem, raw: np.ndarray, offset: np.ndarray, seconds: float
     good = np.isfinite(sims).all((0, 2, 3, 4)) & np.isfinite(np.where(np.isfinite(target), found, 0.0)).all((0, 2, 3))
     change = (found[1:] - found[:1]).astype(np.float32)
     order = [*range(numbers), *range(numbers + moving, len(change)), *range(numbers, numbers + moving)]
-    width = np.concatenate([step.steps[0], np.full(moving, _NUDGE)])
+    width = np.concatenate([varied, np.full(moving, _NUDGE)])
     jacobian = (change[order] / width[:, None, None, None]).transpose(1, 0, 2, 3)
     jacobian[:, :, ~np.isfinite(residual).any(0)] = 0.0
     jacobian[~good] = 0.0
@@ -138,7 +135,6 @@ def fit(
     *,
     seconds: float | None = None,
     tolerance: float = 2e-3,
-    fixed: bool = False,
 ) -> Fit:
     """Improve numbers (N,) and the starts of the problem, which are set to what is found.
 
@@ -148,17 +144,16 @@ def fit(
         iterations: most steps.
         seconds: how much of the trials to look at; all of them if not given.
         tolerance: share of the cost that a step has to save for another one to be worth while.
-        fixed: whether numbers stay as they are, so that starts alone are fitted.
     """
     now = look(own, raw, own.offset, seconds)
     damping = 1e-2
     for _ in range(iterations):
         if not np.isfinite(now.costs).any():
             break
-        raw_step, offset_step = _step(own, now, damping, fixed)
+        raw_step, offset_step = _step(own, now, damping)
         tried = look(own, own.space.clip(now.raw + raw_step), now.offset + offset_step, seconds)
-        if _total(tried) < _total(now):
-            done = _total(now) - _total(tried) < tolerance * _total(now)
+        if total(tried) < total(now):
+            done = total(now) - total(tried) < tolerance * total(now)
             now, damping = tried, max(damping / 5, 1e-6)
             if done:
                 break
@@ -170,13 +165,13 @@ def fit(
     return now
 
 
-def _total(found: Fit) -> float:
+def total(found: Fit) -> float:
     """Return the mean cost, of which trials that failed have a large one."""
     ran = np.isfinite(found.costs)
     return float(np.where(ran, found.costs, 1.0).mean()) if ran.any() else np.inf
 
 
-def _step(own: FilmedProblem, now: Fit, damping: float, fixed: bool) -> tuple[np.ndarray, np.ndarray]:
+def _step(own: FilmedProblem, now: Fit, damping: float) -> tuple[np.ndarray, np.ndarray]:
     """Return a step of numbers (N,) and one of starts (B, J)."""
     gradient, curvature = now.normal(own.prior)
     count, size = now.offset.shape[1], len(now.raw)
@@ -185,79 +180,18 @@ def _step(own: FilmedProblem, now: Fit, damping: float, fixed: bool) -> tuple[np
     damped[:, inner, inner] *= 1 + damping
     damped[:, inner, inner] += 1e-12
     cost = float(np.mean(now.costs[np.isfinite(now.costs)]))
-    step = np.zeros(size)
-    if not fixed:
-        g, h = eliminated(gradient, damped, count)
-        scale = np.diag(curvature.mean(0))[:size]
-        firm = damping * (scale + 1e-9 * scale.sum() + 1e-12) + _FIRM * cost
-        step = -np.linalg.solve(h.mean(0) + np.diag(firm), g.mean(0))
-        step = step / max(1.0, float(np.abs(step / own.space.limits()).max()))
-        step = own.space.clip(now.raw + step) - now.raw
+    g, h = eliminated(gradient, damped, count)
+    scale = np.diag(curvature.mean(0))[:size]
+    firm = damping * (scale + 1e-9 * scale.sum() + 1e-12) + _FIRM * cost
+    step = -np.linalg.solve(h.mean(0) + np.diag(firm), g.mean(0))
+    step = step / max(1.0, float(np.abs(step / own.space.limits()).max()))
+    step = own.space.clip(now.raw + step) - now.raw
     if not count:
         return step, np.zeros_like(now.offset)
     right = gradient[:, size:] + (damped[:, size:, :size] @ step)
     moves = -np.linalg.solve(damped[:, size:, size:], right[..., None])[..., 0]
     longest = np.maximum(1.0, np.abs(moves).max(1, keepdims=True))
     return step, moves / longest
-
-
-def refine_start(own: FilmedProblem, values: np.ndarray, passes: int = 6) -> None:
-    """Estimate the starts of trials in motion from their first seconds, with numbers (N,) as they are."""
-    if own.offset.shape[1]:
-        for share in (0.5, 1.0):
-            fit(own, own.space.to_raw(values), passes, seconds=share * START_WINDOW, tolerance=1e-2, fixed=True)
-
-
-def scout(own: FilmedProblem, starts: int, rng: np.random.Generator, report: Callback) -> np.ndarray:
-    """Return coordinates (N,) in the basin of the best fit: of the rope alone, cameras being where they are said to be.
-
-    Many starts are tried on the beginning of the trials, where a cost has few local minima; the best go on.
-    """
-    whole, count = own.space, len(own.free)
-    space = ParameterSpace(whole.names[:count], whole.params[:count], whole.sizes[:count])
-    zero, lasts, total = np.zeros(len(whole.names) - count), own.lasts, 3
-    raws = np.repeat(space.to_raw(own.fixed[list(own.free)])[None], starts, 0)
-    for k in range(min(count, 3)):
-        share = (rng.permutation(starts) + rng.uniform(size=starts)) / starts - 0.5
-        raws[1:, k] += 2 * _REACH[k] * share[1:]
-    raws[1:, 1] += raws[1:, 0] - raws[0, 0]
-    raws = space.clip(raws)
-
-    def full(raw: np.ndarray) -> np.ndarray:
-        return whole.to_raw(np.concatenate([space.to_values(raw), zero]))
-
-    def over(share: float) -> tuple[levenberg_marquardt.Simulate, np.ndarray]:
-        simulate, target = own.readings(share * lasts)
-        return lambda v: simulate(np.concatenate([v, np.zeros((len(v), len(zero)))], 1)), target
-
-    report("trying starts", 0, total, "")
-    refine_start(own, whole.to_values(full(raws[0])), passes=3)
-    simulate, target = over(0.35)
-    cost = levenberg_marquardt.costs(simulate(space.to_values(raws)), target, own.extent)
-    raws = raws[np.argsort(cost, kind="stable")[: max(2, starts // 4)]]
-    report("trying starts", 1, total, f"{1e3 * cost.min():.2f} mm")
-    points: list[Point] = levenberg_marquardt.evaluate(simulate, target, space, raws, own.extent)
-    limits: dict[str, Any] = {"iterations": 4, "tolerance": 1e-2, "whole": own.extent}
-    for points in levenberg_marquardt.improve_points(simulate, target, space, points, **limits):  # noqa: B007, B020
-        pass
-    points = _different(points, 3)
-    report("trying starts", 2, total, f"{1e3 * points[0].cost:.2f} mm over 35 % of the time")
-    begun, found = own.offset, []
-    for p in points:
-        own.offset = begun
-        found.append((fit(own, full(p.raw), 4, seconds=0.7 * lasts, tolerance=2e-2), own.offset))
-    best, own.offset = min(found, key=lambda pair: _total(pair[0]))
-    report("trying starts", total, total, f"{1e3 * best.cost:.2f} mm over 70 % of the time")
-    return best.raw
-
-
-def _different(points: Sequence[Point], most: int) -> list[Point]:
-    """Return the best points that are not in the same place."""
-    kept: list[Point] = []
-    for p in sorted(points, key=lambda p: p.cost):
-        if np.isfinite(p.cost) and all(np.abs(p.raw[:3] - o.raw[:3]).max() > 0.1 for o in kept):
-            kept.append(p)
-    return [p for p in kept[:most] if p.cost < 2 * kept[0].cost] or [min(points, key=lambda p: p.cost)]
 
 
 def gate(own: FilmedProblem, values: np.ndarray) -> int:

@@ -86,6 +86,14 @@ class FilmedProblem:
         free = tuple(k for k, n in enumerate(model.parameters) if n in old or n in numbers)
         return replace(self, model=model, fixed=fixed, free=free, sizes=self.sizes | sizes)
 
+    def picked(self, rows: np.ndarray) -> FilmedProblem:
+        """Return the problem with these trials, in their order, repeated as given."""
+        views = [v.picked(rows) for v in self.spines.views]
+        spines = Spines(views, self.model.dt, self.extent, self.spines.free)
+        trials = tuple(self.trials[b] for b in rows)
+        parts: dict[str, Any] = {"trials": trials, "motion": self.motion.pick(rows), "spines": spines}
+        return replace(self, **parts, start=self.start.pick(rows), offset=self.offset[rows], dropped={})
+
     def take(self, other: FilmedProblem) -> None:
         """Become another problem."""
         vars(self).update(vars(other))

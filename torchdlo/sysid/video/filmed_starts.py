@@ -1,0 +1,204 @@
+"""Where trials in motion and fits begin: starts of several basins by trial, and numbers from many places.
+
+How a rope moves at the start is seen badly by one camera: pictures of its first tenths of a second may be explained by
+quite different depths and speeds. So starts are looked for in many places, trial by trial, and the best is kept.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from torchdlo.sysid.estimation import levenberg_marquardt
+from torchdlo.sysid.estimation.levenberg_marquardt import ParameterSpace, Point
+from torchdlo.sysid.video.filmed_fit import Fit, fit, look, total
+from torchdlo.sysid.video.filmed_problem import FilmedProblem
+
+__all__ = ["START_WINDOW", "fit_starts", "refine_start", "restart", "scout", "search_starts"]
+
+Callback = Callable[[str, int, int, str], None]
+
+START_WINDOW = 0.4
+"""Seconds of a film that a start in motion is first estimated from."""
+
+_REACH = (np.log(40.0), np.log(4.0), np.log(10.0))
+"""How far starts go either way of the guess."""
+
+_LOST = 1e-3
+"""Cost [m] from which a trial may have a wrong start: readings of 3 mm."""
+
+_RESTARTS = 3
+"""How often starts of lost trials are looked for."""
+
+_PAYS = 0.9
+"""Share of a trial's cost that is left where another start is better."""
+
+_NEARER, _FASTER = 1.0, 2.0
+"""How far off places and speeds along a camera's axis are tried, in standard deviations of their priors."""
+
+
+def fit_starts(
+    own: FilmedProblem, raw: np.ndarray, passes: int, *, seconds: float | None = None, tolerance: float = 1e-2
+) -> Fit:
+    """Improve the starts of the problem, which are set to what is found; numbers (N,) stay as they are.
+
+    Each trial goes its own way: what one of them gains does not hide what another one loses.
+    """
+    own.offset = own.offset.copy()
+    now = look(own, raw, own.offset, seconds, fixed=True)
+    count = own.offset.shape[1]
+    damping, rows = np.full(len(now.costs), 1e-2), np.flatnonzero(np.isfinite(now.costs) & ~own.start.still)
+    part = own
+    for _ in range(passes if count else 0):
+        if not len(rows):
+            break
+        if len(rows) < len(part.trials):
+            part = own.picked(rows)
+        here = _of(now, rows)
+        tried = look(part, raw, here.offset + _moves(here, part.prior, damping[rows]), seconds, fixed=True)
+        better = tried.costs < here.costs
+        slow = better & (here.costs - tried.costs < tolerance * here.costs)
+        for name in ("offset", "costs", "residual", "jacobian"):
+            getattr(now, name)[rows[better]] = getattr(tried, name)[better]
+        damping[rows] = np.where(better, np.maximum(damping[rows] / 5, 1e-6), 8 * damping[rows])
+        rows = rows[~slow & (damping[rows] < 1e3)]
+    own.offset = now.offset
+    return now
+
+
+def _of(found: Fit, rows: np.ndarray) -> Fit:
+    """Return the fit of some trials."""
+    return Fit(found.raw, *(getattr(found, name)[rows] for name in ("offset", "costs", "residual", "jacobian")))
+
+
+def _moves(now: Fit, prior: np.ndarray, damping: np.ndarray) -> np.ndarray:
+    """Return steps of starts (B, J), each trial damped by its own, (B,)."""
+    gradient, curvature = now.normal(prior)
+    inner = np.arange(now.offset.shape[1])
+    curvature[:, inner, inner] *= 1 + damping[:, None]
+    curvature[:, inner, inner] += 1e-12
+    moves = -np.linalg.solve(curvature, gradient[..., None])[..., 0]
+    return moves / np.maximum(1.0, np.abs(moves).max(1, keepdims=True))
+
+
+def refine_start(own: FilmedProblem, values: np.ndarray, passes: int = 8, *, search: bool = False) -> None:
+    """Estimate the starts of trials in motion from their first seconds, with numbers (N,) as they are.
+
+    Args:
+        own: the problem.
+        values: numbers of rope and cameras.
+        passes: most steps.
+        search: whether to look for better ones far away, too.
+    """
+    if own.offset.shape[1]:
+        raw = own.space.to_raw(values)
+        for share in (0.5, 1.0):
+            fit_starts(own, raw, passes, seconds=share * START_WINDOW)
+        if search:
+            search_starts(own, raw, passes, seconds=START_WINDOW)
+
+
+def restart(own: FilmedProblem, found: Fit, iterations: int) -> Fit:
+    """Return the fit with the starts of lost trials anew, and all of it improved, where that is better."""
+    for _ in range(_RESTARTS if own.offset.shape[1] else 0):
+        lost = np.flatnonzero(~own.start.still & ~(found.costs < _LOST))
+        if not len(lost):
+            break
+        part = own.picked(lost)
+        search_starts(part, found.raw, seconds=START_WINDOW)
+        costs = fit_starts(part, found.raw, 8).costs
+        better = costs < _PAYS * found.costs[lost]
+        if not better.any():
+            break
+        own.offset = own.offset.copy()
+        own.offset[lost[better]] = part.offset[better]
+        found = fit(own, found.raw, iterations)
+    return found
+
+
+def search_starts(own: FilmedProblem, raw: np.ndarray, passes: int = 8, *, seconds: float | None = None) -> Fit:
+    """Look for better starts far from those of the problem, which are set to the best; numbers (N,) stay as they are.
+
+    What a camera does not see is how far away the rope is and how fast it comes or goes: starts on either side are
+    followed for a while, then the better half of them, and each trial keeps its best.
+    """
+    trials = len(own.trials)
+    offset = _places(own)
+    for keep, share in ((2, 0.6), (1, 1.0)):
+        copies = own.picked(np.tile(np.arange(trials), len(offset)))
+        copies.offset = offset.reshape(-1, offset.shape[-1])
+        found = fit_starts(copies, raw, math.ceil(share * passes), seconds=seconds)
+        costs = np.where(np.isfinite(found.costs), found.costs, np.inf).reshape(len(offset), trials)
+        rows = np.argsort(costs, axis=0, kind="stable")[:keep] * trials + np.arange(trials)
+        offset = found.offset[rows]
+    own.offset = offset[0]
+    return _of(found, rows[0])
+
+
+def _places(own: FilmedProblem) -> np.ndarray:
+    """Return starts (P, B, J): those of the problem, and others nearer and farther, coming and going."""
+    away = np.array(own.spines.views[0].camera.rotation)[2]
+    out = [own.offset]
+    for place in (-_NEARER, _NEARER):
+        for speed in (-_FASTER, _FASTER):
+            each = own.offset.reshape(len(own.offset), 2, -1, 3).copy()
+            for k, size in enumerate((place, speed)):
+                # The first of the shapes is the whole rope's; the others follow.
+                each[:, k, 0] += (size - each[:, k, 0] @ away)[:, None] * away
+            out.append(each.reshape(own.offset.shape))
+    return np.stack(out)
+
+
+def scout(own: FilmedProblem, starts: int, rng: np.random.Generator, report: Callback) -> np.ndarray:
+    """Return coordinates (N,) in the basin of the best fit: of the rope alone, cameras being where they are said to be.
+
+    Many starts are tried on the beginning of the trials, where a cost has few local minima; the best go on.
+    """
+    whole, count = own.space, len(own.free)
+    space = ParameterSpace(whole.names[:count], whole.params[:count], whole.sizes[:count])
+    zero, lasts, looks = np.zeros(len(whole.names) - count), own.lasts, 3
+    raws = np.repeat(space.to_raw(own.fixed[list(own.free)])[None], starts, 0)
+    for k in range(min(count, 3)):
+        share = (rng.permutation(starts) + rng.uniform(size=starts)) / starts - 0.5
+        raws[1:, k] += 2 * _REACH[k] * share[1:]
+    raws[1:, 1] += raws[1:, 0] - raws[0, 0]
+    raws = space.clip(raws)
+
+    def full(raw: np.ndarray) -> np.ndarray:
+        return whole.to_raw(np.concatenate([space.to_values(raw), zero]))
+
+    def over(share: float) -> tuple[levenberg_marquardt.Simulate, np.ndarray]:
+        simulate, target = own.readings(share * lasts)
+        return lambda v: simulate(np.concatenate([v, np.zeros((len(v), len(zero)))], 1)), target
+
+    report("trying starts", 0, looks, "")
+    refine_start(own, whole.to_values(full(raws[0])), passes=3)
+    simulate, target = over(0.35)
+    cost = levenberg_marquardt.costs(simulate(space.to_values(raws)), target, own.extent)
+    raws = raws[np.argsort(cost, kind="stable")[: max(2, starts // 4)]]
+    report("trying starts", 1, looks, f"{1e3 * cost.min():.2f} mm")
+    points: list[Point] = levenberg_marquardt.evaluate(simulate, target, space, raws, own.extent)
+    limits: dict[str, Any] = {"iterations": 4, "tolerance": 1e-2, "whole": own.extent}
+    for points in levenberg_marquardt.improve_points(simulate, target, space, points, **limits):  # noqa: B007, B020
+        pass
+    points = _different(points, 3)
+    report("trying starts", 2, looks, f"{1e3 * points[0].cost:.2f} mm over 35 % of the time")
+    begun, found = own.offset, []
+    for p in points:
+        own.offset = begun
+        found.append((fit(own, full(p.raw), 4, seconds=0.7 * lasts, tolerance=2e-2), own.offset))
+    best, own.offset = min(found, key=lambda pair: total(pair[0]))
+    report("trying starts", looks, looks, f"{1e3 * best.cost:.2f} mm over 70 % of the time")
+    return best.raw
+
+
+def _different(points: Sequence[Point], most: int) -> list[Point]:
+    """Return the best points that are not in the same place."""
+    kept: list[Point] = []
+    for p in sorted(points, key=lambda p: p.cost):
+        if np.isfinite(p.cost) and all(np.abs(p.raw[:3] - o.raw[:3]).max() > 0.1 for o in kept):
+            kept.append(p)
+    return [p for p in kept[:most] if p.cost < 2 * kept[0].cost] or [min(points, key=lambda p: p.cost)]
