@@ -23,7 +23,7 @@ from torchdlo import envs
 from torchdlo.agents.data import check_dataset, open_set
 from torchdlo.agents.data.making import make_dataset
 from torchdlo.agents.data.record import Noise, draw_starts, play_batch
-from torchdlo.agents.policies import language
+from torchdlo.agents.policies import chunk_training, language
 from torchdlo.agents.policies.chunk_policy import ChunkPolicy, NetworkShape, load_policy, save_policy
 from torchdlo.agents.policies.chunk_rollout import PolicyDemonstrator, evaluate_chunk_policy
 from torchdlo.agents.policies.chunk_training import Training, train_chunk_policy
@@ -107,6 +107,38 @@ def test_targets_depend_on_pictures_state_and_words() -> None:
         assert not torch.allclose(policy(**given | {"pictures": black}), usual, atol=1e-4)
     assert not torch.allclose(policy(**given | {"state": given["state"] + 1}), usual, atol=1e-4)
     assert not torch.allclose(policy(**given | {"sentence": -given["sentence"]}), usual, atol=1e-4)
+
+
+def test_a_policy_on_another_device_never_waits_to_be_told_what_is_there() -> None:
+    # Tensors of the device "meta" have no values: whoever asks for one fails.
+    policy = ChunkPolicy(SHAPE).to("meta")
+    shots = {name: torch.zeros(3, 3, 32, 32, dtype=torch.uint8, device="meta") for name in SHAPE.cameras}
+    found = policy(shots, torch.zeros(3, 30, device="meta"), torch.zeros(3, 384, device="meta"))
+    assert found.shape == (3, 5, 2, 3)
+
+
+def test_frames_on_a_device_are_those_in_the_file(data: Path, tmp_path: Path) -> None:
+    frames = chunk_training._read(open_set(data), "hashed", tmp_path, lambda *_: None)
+    at, none = torch.tensor([3, 0, 17, 31]), torch.device("cpu")
+    shots, *usual = frames.batch(at, 4)
+    for room, held in ((1 << 40, torch.Tensor), (0, np.ndarray)):
+        moved = frames.on(none, room)
+        assert all(isinstance(x, held) for x in moved.pictures.values())
+        seen, *rest = moved.batch(at, 4)
+        assert all(torch.equal(a, b) for a, b in zip(usual, rest, strict=True))
+        assert seen.keys() == shots.keys() and all(torch.equal(seen[name], shots[name]) for name in shots)
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+def test_training_on_a_gpu_comes_to_the_same_losses(data: Path, tmp_path: Path) -> None:
+    losses = []
+    for device in ("cpu", "cuda"):
+        training = Training(epochs=3, batch=8, chunk=4, width=32, language="hashed", recolor=0.0, device=device)
+        losses.append(train_chunk_policy(data, tmp_path / f"{device}.pt", training)["loss"])
+    # Convolutions are rounded to 10 bits there.
+    assert np.allclose(*losses, rtol=0.05)
+    assert load_policy(tmp_path / "cuda.pt")[0].queries.device.type == "cpu"
 
 
 def test_files_of_policies_come_back_and_others_are_refused(tmp_path: Path) -> None:

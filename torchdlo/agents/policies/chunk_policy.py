@@ -137,6 +137,9 @@ class ChunkPolicy(nn.Module):
     def _seen(self, name: str, picture: Tensor, sentence: Tensor) -> Tensor:
         there = (picture != 0).flatten(1).any(1)
         eye = self.eyes[_kind(name)]
+        if picture.device.type != "cpu":
+            # To ask how many there are would wait for the device; looking at all is cheap there.
+            return torch.where(there[:, None, None], eye(picture, sentence), 0.0)
         if bool(there.all()):
             return eye(picture, sentence)
         found = self.queries.new_zeros(len(picture), self.shape.tokens, self.shape.width)

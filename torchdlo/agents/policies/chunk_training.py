@@ -8,7 +8,7 @@ import shutil
 import tempfile
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +29,8 @@ __all__ = ["Training", "train_chunk_policy"]
 IMAGES = "observation.images."
 LEAST = 1e-3
 """Least scale of states and targets: what hardly varies is not blown up."""
+TELL = 10
+"""Steps after which the loss is told again."""
 FINEST = 0.02
 """Least spread of targets of a task by which its errors are measured [m]."""
 
@@ -82,14 +84,27 @@ class _Frames:
     """Instruction of each frame, shape (N,)."""
     weight: Tensor
     """Spread of all targets over that of the frame's task, shape (N, 3 R): errors count by what is much in a task."""
-    pictures: dict[str, np.ndarray]
+    pictures: dict[str, np.ndarray] | dict[str, Tensor]
     """Shape (N, 3, H, W), 8 bits."""
 
     def batch(self, at: Tensor, chunk: int) -> tuple[dict[str, Tensor], Tensor, Tensor, Tensor, Tensor]:
         """Return pictures, states, sentences, targets, and weights of their errors; after the end tools stay."""
-        ahead = torch.minimum(at[:, None] + torch.arange(chunk), self.last[at][:, None])
-        shots = {name: torch.from_numpy(x[at.numpy()]) for name, x in self.pictures.items()}
-        return shots, self.state[at], self.sentence[self.told[at]], self.target[ahead], self.weight[at]
+        device = self.target.device
+        here = at.to(device)
+        ahead = torch.minimum(here[:, None] + torch.arange(chunk, device=device), self.last[here][:, None])
+        shots = {
+            name: x[here] if isinstance(x, Tensor) else torch.from_numpy(x[at.numpy()]).to(device)
+            for name, x in self.pictures.items()
+        }
+        return shots, self.state[here], self.sentence[self.told[here]], self.target[ahead], self.weight[here]
+
+    def on(self, device: torch.device, room: int) -> _Frames:
+        """Return them on a device, with the pictures if they take no more than `room` there [bytes]."""
+        names = [each.name for each in fields(self) if each.name != "pictures"]
+        moved = {name: getattr(self, name).to(device) for name in names}
+        fits = sum(x.nbytes for x in self.pictures.values()) <= room
+        pictures = {name: torch.as_tensor(x).to(device) for name, x in self.pictures.items()} if fits else self.pictures
+        return _Frames(**moved, pictures=pictures)
 
 
 def _read(data: DataSet, encoder: str, folder: Path, callback: Callable[[str, int, int, str], None]) -> _Frames:
@@ -173,6 +188,8 @@ def train_chunk_policy(
         tempfile.TemporaryDirectory(prefix=_swept(out), dir=out.parent) as folder,
     ):
         frames = _read(data, encoder, Path(folder), told)
+        if (device := torch.device(training.device)).type == "cuda":
+            frames = frames.on(device, torch.cuda.mem_get_info(device)[0] // 2)
         run = _Run(data, frames, training, encoder)
         if resume:
             run.load(checkpoint)
@@ -215,7 +232,10 @@ class _Run:
             getattr(self.policy, f"{name}_mean").copy_(x.mean(0))
             getattr(self.policy, f"{name}_std").copy_(x.std(0, correction=0).clamp(min=LEAST))
         self.averaged = copy.deepcopy(self.policy).eval()
-        self.optimizer = torch.optim.AdamW(self.policy.parameters(), training.rate, weight_decay=training.decay)
+        fused = torch.device(training.device).type == "cuda"
+        self.optimizer = torch.optim.AdamW(
+            self.policy.parameters(), training.rate, weight_decay=training.decay, fused=fused
+        )
         self.epoch, self.curve = 0, list[float]()
         # An epoch has every episode as often as every other, short ones as long ones.
         longest = int((frames.last - frames.first).max()) + 1
@@ -226,15 +246,14 @@ class _Run:
         """Go once through all episodes, in an order that the number of the epoch decides."""
         generator = torch.Generator().manual_seed(self.training.seed * 100_003 + self.epoch)
         order = self._order(generator)
-        total, all_steps = 0.0, self.steps * self.training.epochs
+        all_steps, said = self.steps * self.training.epochs, ""
+        total = torch.zeros((), dtype=torch.float64, device=self.training.device)
         self.policy.train()
         for k, at in enumerate(order.split(self.training.batch)):
             done = self.epoch * self.steps + k
             for group in self.optimizer.param_groups:
                 group["lr"] = self.training.rate * _schedule(done, all_steps)
-            shots, *rest = self.frames.batch(at, self.training.chunk)
-            state, sentence, target, weight = (x.to(self.training.device) for x in rest)
-            shots = {name: x.to(self.training.device) for name, x in shots.items()}
+            shots, state, sentence, target, weight = self.frames.batch(at, self.training.chunk)
             shots = {name: _recolored(x, self.training.recolor, generator) for name, x in shots.items()}
             wanted = (target - self.policy.target_mean) / self.policy.target_std
             loss = ((self.policy.scaled(shots, state, sentence) - wanted).abs() * weight[:, None]).mean()
@@ -243,10 +262,12 @@ class _Run:
             torch.nn.utils.clip_grad_norm_(self.policy.parameters(), 1.0)
             self.optimizer.step()
             self._average(min(self.training.average, (1 + done) / (10 + done)))
-            total += float(loss.detach()) * len(at)
-            told("learn", done + 1, all_steps, f"loss {total / (len(at) * (k + 1)):.4f}")
+            total += loss.detach().double() * len(at)
+            if k % TELL == 0:  # to read the loss waits for the device
+                said = f"loss {float(total) / (len(at) * (k + 1)):.4f}"
+            told("learn", done + 1, all_steps, said)
         self.epoch += 1
-        self.curve.append(total / len(order))
+        self.curve.append(float(total) / len(order))
 
     def _order(self, generator: torch.Generator) -> Tensor:
         """Return the frames of an epoch: all of the longest episodes, those of shorter ones several times."""
