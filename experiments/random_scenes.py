@@ -3,15 +3,16 @@
 A kind of scene is a set of bodies; its scenes, which differ in everything else, run as one batch: a tangled rope of
 random stiffness, friction and speed falls on a plane and on a free, a fixed and a moved body of random shapes, sizes,
 densities and spins. Found at fault are scenes that are not finite, that missed a contact, whose edges are not as long
-as they are meant to be, and those in which things overlap by more than 10 % of the rope's radius once the rope is at
-rest. A kind that is built and started again from the same seed, and a part of the run in the middle of the pile that
-is repeated, have to end in the same bits.
+as they are meant to be, those in which things overlap by more than a share of the rope's radius once the rope is at
+rest, and those whose energy rises while nothing moves the moved body: in the last quarter of the time and, with
+--still, in all of it. A kind that is built and started again from the same seed, and a part of the run in the middle of
+the pile that is repeated, have to end in the same bits.
 
 examples:
   python experiments/random_scenes.py --scenes 1000 --json random_scenes.json
   python experiments/random_scenes.py --scenes 2000 --json random_scenes.json --resume
   python experiments/random_scenes.py --scenes 40 --batch 20 --seconds 0.5
-  python experiments/random_scenes.py --integrator implicit --substeps 1
+  python experiments/random_scenes.py --integrator implicit --substeps 1 --deepest 0.05 --still
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ import math
 import random
 import sys
 import time
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -39,8 +41,8 @@ SIZES = {
 }
 AT_REST = 0.05
 """Speed below which a rope counts as being at rest [m/s]."""
-DEEPEST = 0.1
-"""Overlap at rest over the rope's radius above which a scene is at fault."""
+RISE = 1e-3
+"""Rise of the energy above its least so far, over that at the start, above which a scene is at fault."""
 LONGEST = 0.01
 """Strain of an edge above which a scene is at fault."""
 
@@ -128,7 +130,47 @@ def stepper(choice: Any) -> Any:
     return scene.stepper(choice, compiled=False, recorded=True)
 
 
-def run(made: tuple[Any, Any, Any], state: Any, seconds: float, first: int, last: int) -> Any:
+def energy(made: tuple[Any, Any, Any], state: Any) -> Any:
+    """Return the energy of the rope and of the free body [J], shape (scenes,)."""
+    from torchdlo import measures
+    from torchdlo.coupling.bodies.dynamics import conjugate
+    from torchdlo.physics import tree
+    from torchdlo.physics.linalg.rotation import rotate
+
+    choice, params, _ = made
+    # Velocities lie half a substep before positions.
+    half = 0.5 * choice.dt / choice.substeps
+    rods = tree.replace(state.rods, pos=state.rods.pos - half * state.rods.vel)
+    of_rope = measures.kinetic_energy(choice, params, state) + measures.bending_energy(choice, params, state)
+    of_rope = of_rope + measures.gravitational_energy(choice, params, tree.replace(state, rods=rods))
+    # The first body is the plane, the second one is free.
+    mass, inertia = params.bodies.mass[..., 1, 0], params.bodies.inertia[..., 1, :]
+    bodies = tree.map(lambda x: x[..., 1, :], state.bodies)
+    spin = rotate(conjugate(bodies.quat), bodies.omega)
+    moving = 0.5 * mass * bodies.vel.square().sum(-1) + 0.5 * (inertia * spin.square()).sum(-1)
+    return of_rope + moving + 9.81 * mass * (bodies.pos - half * bodies.vel)[..., 2]
+
+
+@dataclass
+class Watch:
+    """Looks at the energy in frames from `first` on, unless that is None."""
+
+    first: int | None
+    least: Any = None
+    rise: Any = 0.0
+    """Most that it was above its least so far [J], shape (scenes,)."""
+
+    def __call__(self, frame: int, made: tuple[Any, Any, Any], state: Any) -> None:
+        if self.first is None or frame < self.first or frame % 5:
+            return
+        now = energy(made, state)
+        self.least = now if self.least is None else self.least.minimum(now)
+        self.rise = (now - self.least).clamp(min=self.rise)
+
+
+def run(
+    made: tuple[Any, Any, Any], state: Any, seconds: float, first: int, last: int, way: float = 0.06, watch: Any = None
+) -> Any:
     """Return the state after frames `first` to `last` of a time; the moved body goes to and fro through the pile."""
     import torch
 
@@ -141,27 +183,34 @@ def run(made: tuple[Any, Any, Any], state: Any, seconds: float, first: int, last
         for k in range(first, last):
             # It comes to rest at three quarters of the time.
             share = min(1.0, (k + 1) * choice.dt / (0.75 * seconds))
-            way = 0.06 * math.sin(math.pi * share) ** 2
-            pos = control.bodies.pos + control.bodies.pos.new_tensor([way, way, 0.0])
+            now = way * math.sin(math.pi * share) ** 2
+            pos = control.bodies.pos + control.bodies.pos.new_tensor([now, now, 0.0])
             moved = tree.replace(control, bodies=tree.replace(control.bodies, pos=pos))
             state = step(params, state, moved)
+            if watch is not None:
+                watch(k, made, state)
     return state
 
 
-def travel(made: tuple[Any, Any, Any], again: tuple[Any, Any, Any], seconds: float) -> tuple[Any, bool]:
-    """Return the last state, and whether what is done twice ends in the same bits."""
+def travel(
+    made: tuple[Any, Any, Any], again: tuple[Any, Any, Any], seconds: float, still: bool
+) -> tuple[Any, bool, Any]:
+    """Return the last state, whether what is done twice ends in the same bits, and by how much the energy rose [J]."""
     import torch
 
     from torchdlo.physics import tree
 
     frames = round(seconds / made[0].dt)
     half, few = frames // 2, min(25, frames // 2)
-    early = run(made, made[2], seconds, 0, few)
-    middle = run(made, early, seconds, few, half)
-    later = run(made, middle, seconds, half, half + few)
-    twice = run(again, again[2], seconds, 0, few), run(again, middle, seconds, half, half + few)
+    way = 0.0 if still else 0.06
+    watch = Watch(1 if still else round(0.75 * frames) + 1)
+    early = run(made, made[2], seconds, 0, few, way, watch)
+    middle = run(made, early, seconds, few, half, way, watch)
+    later = run(made, middle, seconds, half, half + few, way, watch)
+    twice = run(again, again[2], seconds, 0, few, way), run(again, middle, seconds, half, half + few, way)
     pairs = zip(tree.leaves(twice), tree.leaves((early, later)), strict=True)
-    return run(made, later, seconds, half + few, frames), all(torch.equal(a, b) for a, b in pairs)
+    end = run(made, later, seconds, half + few, frames, way, watch)
+    return end, all(torch.equal(a, b) for a, b in pairs), watch.rise
 
 
 def overlaps(made: tuple[Any, Any, Any], state: Any) -> tuple[Any, Any]:
@@ -191,15 +240,15 @@ def overlaps(made: tuple[Any, Any, Any], state: Any) -> tuple[Any, Any]:
     return inside.clamp(min=0), (2 - between.norm(dim=-1).amin(-1) / RADIUS).clamp(min=0)
 
 
-def examine(
-    seed: int, scenes: int, seconds: float, step: tuple[float, int], integrator: str = "explicit"
-) -> list[dict[str, Any]]:
+def examine(seed: int, scenes: int, options: Any) -> list[dict[str, Any]]:
     """Run a kind of scene and return a row for each of its scenes."""
     from torchdlo import scene
 
-    made, shapes = build(seed, scenes, step, integrator)
+    way = (options.dt, options.substeps), options.integrator
+    made, shapes = build(seed, scenes, *way)
     start = time.process_time()
-    state, same = travel(made, build(seed, scenes, step, integrator)[0], seconds)
+    state, same, rise = travel(made, build(seed, scenes, *way)[0], options.seconds, options.still)
+    rise = (rise / energy(made, made[2]).abs()).expand(scenes)
     used = time.process_time() - start
     x, v = state.rods.pos, state.rods.vel
     speed = v.norm(dim=-1).amax(-1)
@@ -216,12 +265,13 @@ def examine(
                 ("not finite", not bool(finite[k])),
                 ("missed a contact", bool(finite[k]) and not bool(fine[k])),
                 ("lengths", not float(strain[k]) <= LONGEST),
-                ("overlaps at rest", resting and not deep <= DEEPEST),
+                ("overlaps at rest", resting and not deep <= options.deepest),
+                ("gains energy", not float(rise[k]) <= RISE),
                 ("other bits", not same),
             )
             if wrong
         ]
-        numbers = {"speed": speed[k], "strain": strain[k], "in_bodies": body[k], "in_itself": own[k]}
+        numbers = {"speed": speed[k], "strain": strain[k], "in_bodies": body[k], "in_itself": own[k], "rise": rise[k]}
         row = {"kind": seed, "scene": k, "shapes": shapes, "at_rest": resting, "faults": faults}
         row |= {name: float(x) for name, x in numbers.items()} | {"missed": state.diagnostics[k, 0].tolist()}
         rows.append(row | {"cpu_s": used / scenes})
@@ -262,9 +312,12 @@ def main() -> int:
     parser.add_argument("--dt", type=float, default=2e-3, help="step [s] (%(default)s)")
     parser.add_argument("--substeps", type=count, default=4, help="substeps per step (%(default)s)")
     parser.add_argument("--integrator", choices=("explicit", "implicit"), default="explicit", help="(%(default)s)")
+    parser.add_argument("--deepest", type=float, default=0.1, help="overlap at rest, over the radius (%(default)s)")
+    parser.flag("still", "leave the moved body where it is, and watch the energy from the start")
     parser.flag("resume", "go on with the file of --json")
     options = parser.parse_args()
-    choices = {name: getattr(options, name) for name in ("batch", "seconds", "seed", "dt", "substeps", "integrator")}
+    names = ("batch", "seconds", "seed", "dt", "substeps", "integrator", "deepest", "still")
+    choices = {name: getattr(options, name) for name in names}
     rows = earlier(parser, options.json, choices) if options.resume else []
     import torch
 
@@ -272,7 +325,7 @@ def main() -> int:
     seed = rows[-1]["kind"] + 1 if rows else options.seed
     while len(rows) < options.scenes:
         size = min(options.batch, options.scenes - len(rows))
-        rows += examine(seed, size, options.seconds, (options.dt, options.substeps), options.integrator)
+        rows += examine(seed, size, options)
         seed += 1
         print(f"{len(rows):6} scenes: {summary(rows)}", flush=True)
         save(options.json, {"choices": choices, "summary": summary(rows), "rows": rows})

@@ -1,10 +1,13 @@
 """Contact of ropes with surfaces and ropes inside of an implicit step: a stiff law of its end, solved with the lengths.
 
 At each point of an edge that may touch, with m by how much it misses where it has to be at the end of the step, the
-normal force is k/2 (m + sqrt(m^2 + w^2)), a spring that is rounded over a length w much smaller than the radius, less
-its value 100 w outside of contact, where it ends. That is times 1 - tanh(s / s0), s by how much the point parts more
-than it is asked to and s0 the way at the speed sqrt(0.1 r) in a step: surfaces take energy out of what leaves them, and
-things come to rest. Friction is mu f s / sqrt(s^2 + (mu f / k)^2) against the slip s: never more than Coulomb allows,
+normal force is k w ln(1 + e^(m / w)), a spring that is rounded over a length w much smaller than the radius, and
+nothing beyond a distance of 30 w. Out of contact it falls by e with every w: at rest surfaces are w ln(k w / f) apart
+under a force f, some hundredths of the radius at most, and edges beside the one that touches have no part in it. (With
+a force that falls with the distance itself, ropes hover at a tenth of the radius on several edges, whose tilted normals
+put friction off by a seventh.) That is times 1 - tanh(s / s0), s by how much the point parts more than it is asked to
+and s0 the way at the speed sqrt(0.1 r) in a step: surfaces take energy out of what leaves them, and things come to
+rest. Friction is mu f s / sqrt(s^2 + (mu f / k)^2) against the slip s: never more than Coulomb allows,
 and opposed to the slip at the end of the step, so that it takes energy away. Forces and their derivatives by the
 displacements of the ends of the edge and of the body are exact; surfaces are taken as they are, to first order, at the
 start of the step.
@@ -25,8 +28,8 @@ HARD = 100.0
 """Stiffness of contacts over what resists motion at the ends of their edge."""
 ROUND = 1 / 300
 """Length over which contacts set in, over the radius."""
-FAR = 100.0
-"""Distance at which they begin to be felt, over that length."""
+FAR = 30.0
+"""Distance at which they begin to be felt, over that length; there they are exp(-FAR) of what they are in contact."""
 LEAVING = 0.1
 """Square of the speed with which surfaces are left, over the radius [m/s^2]: a hundredth of gravity, so that things hop
 by half a hundredth of the radius at most."""
@@ -230,14 +233,15 @@ def _law(
     wanted: Tensor, along: Tensor, slip: Tensor, firm: Tensor, radius: Tensor, mu: Tensor, real: Tensor, dt: float
 ) -> tuple[Tensor, Tensor, tuple[Tensor, ...]]:
     """Return normal forces, friction over the slip, and what `_gradient` reads; shapes of numbers of points (...)."""
-    miss, width = wanted - along, ROUND * radius
-    root = (miss.square() + width.square()).sqrt()
-    push = 0.5 * (miss + root) - 0.5 * width * ((1 + FAR**2) ** 0.5 - FAR)
+    width = ROUND * radius
+    miss = (wanted - along) / width
+    # ln(1 + e^x), and its derivative, for any x.
+    push = width * (miss.clamp(min=0.0) + torch.log1p(torch.exp(-miss.abs())))
     leave = dt * (LEAVING * radius).sqrt()
     left = torch.tanh((along - wanted.clamp(min=0.0)) / leave)
-    fade, on = 1 - left, real * (push > 0)
+    fade, on = 1 - left, real * (miss > -FAR)
     normal = firm * push * fade * on
-    steep = firm * (0.5 * (1 + miss / root) * fade + push * (1 - left.square()) / leave) * on
+    steep = firm * (torch.sigmoid(miss) * fade + push * (1 - left.square()) / leave) * on
     # Rubbing sets in over the slip that a stuck point has.
     limit = mu * normal
     little = limit / firm

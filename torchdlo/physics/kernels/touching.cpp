@@ -166,14 +166,15 @@ class Scene {
   // Whether it pushes; the force, and how it falls with the motion.
   bool law(const T* normal, T radius, T wanted, T mu, T stiff, const T* moved, bool exact, Felt<T>& out) const {
     const T along = normal[0] * moved[0] + normal[1] * moved[1] + normal[2] * moved[2];
-    const T miss = wanted - along, width = T(s.law[6]) * radius, far = T(s.law[7]);
-    const T rooted = std::sqrt(miss * miss + width * width);
-    const T shut = T(0.5) * (miss + rooted) - T(0.5) * width * (std::sqrt(1 + far * far) - far);
-    if (!(shut > T(0))) return false;
+    const T width = T(s.law[6]) * radius, miss = (wanted - along) / width;
+    if (!(miss > -T(s.law[7]))) return false;
+    const T small = std::exp(-std::abs(miss));
+    const T shut = width * (std::max(miss, T(0)) + std::log1p(small));
+    const T slope = (miss > T(0) ? T(1) : small) / (1 + small);
     const T leave = T(s.law[4]) * std::sqrt(T(s.law[8]) * radius);
     const T gone = std::tanh((along - std::max(wanted, T(0))) / leave), fade = 1 - gone;
     const T force = stiff * shut * fade;
-    const T steep = stiff * (T(0.5) * (1 + miss / rooted) * fade + shut * (1 - gone * gone) / leave);
+    const T steep = stiff * (slope * fade + shut * (1 - gone * gone) / leave);
     T slip[3], squared = 0;
     for (int c = 0; c < 3; ++c) slip[c] = moved[c] - normal[c] * along, squared += slip[c] * slip[c];
     const T limit = mu * force, little = limit / stiff, tiny = T(1e-9) * radius;
