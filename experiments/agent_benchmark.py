@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import json
 import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -32,6 +33,7 @@ from torchdlo.agents.vlm.grasp_proposal import places_of, propose_grasps, random
 from torchdlo.agents.vlm.plan_schema import MODES
 from torchdlo.agents.vlm.recorded import load_recorded
 from torchdlo.envs.core import episode
+from torchdlo.errors import InputError
 
 TASKS = ("lifting", "unknotting", "wrapping")
 
@@ -49,6 +51,9 @@ def parsed(arguments: list[str] | None = None) -> Any:
     parser.add_argument("--starts", type=count, default=10, help="varied starts of plans")
     parser.add_argument("--conversation", default="", help="recorded conversation of plans")
     parser.add_argument("--task", default="wiring_ring", help="task of plans")
+    parser.add_argument(
+        "--updates", nargs="+", default=["with", "without"], choices=("with", "without"), help="runs of plans"
+    )
     parser.add_argument("--endpoint", default="", help="server of a model that proposes grasps")
     parser.add_argument("--model", default="", help="its name")
     parser.flag("smoke", "a single task with next to no budget")
@@ -93,11 +98,24 @@ def searched(name: str, grasps: tuple[int | None, ...], options: Any) -> dict[st
 
 
 def planned(name: str, file: str, update: bool, vary: int, options: Any) -> dict[str, Any]:
-    """Return what a plan from a start comes to."""
+    """Return what a plan from a start comes to; a conversation that ends too soon ends it."""
+    begun = time.process_time()
     choices = {"method": options.method, "episodes": options.episodes, "population": options.population}
     talk = Conversation(load_recorded(Path(file)))
-    found = carry_out(envs.find(name), talk, Options(update=update, reset_seed=vary, **choices))
-    return {"success": found.success, "ended": found.ended, "steps": len(found.carried), "source": found.source}
+    try:
+        found = carry_out(envs.find(name), talk, Options(update=update, reset_seed=vary, **choices))
+    except InputError as error:
+        return {"success": False, "ended": str(error), "source": talk.model.source}
+    steps = [{"id": c.step["id"], "success": c.success, "episodes": c.episodes} for c in found.carried]
+    return {
+        "success": found.success,
+        "ended": found.ended,
+        "updates": found.updates,
+        "episodes": sum(c.episodes for c in found.carried),
+        "steps": steps,
+        "source": found.source,
+        "cpu_seconds": round(time.process_time() - begun, 1),
+    }
 
 
 def main(arguments: list[str] | None = None) -> list[dict[str, Any]]:
@@ -128,7 +146,7 @@ def main(arguments: list[str] | None = None) -> list[dict[str, Any]]:
                 add({"task": name, "proposer": who} | budget, make)
     else:
         said = Path(options.conversation).name
-        for update in (True, False):
+        for update in (each == "with" for each in options.updates):
             for vary in range(options.starts):
                 key = {"task": options.task, "conversation": said, "update": update, "vary": vary}
                 add(key | budget, lambda u=update, v=vary: planned(options.task, options.conversation, u, v, options))

@@ -207,6 +207,10 @@ class _Run:
         def told(stage: str, done: int, total: int, message: str) -> None:
             self.callback(f"step {number}", done, total, message)
 
+        if first is not None and options.enough:
+            went, _ = problem.played(first)
+            if bool((went.success & ~went.failed)[0]):
+                return first, 1
         begin = None if first is None else first[None]
         found = optimize(problem, settings, callback=told, first=begin, until_success=options.enough)
         if found.interrupted:
