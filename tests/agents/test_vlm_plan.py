@@ -284,6 +284,9 @@ def test_the_page_shows_what_was_said_and_escapes_it(tmp_path: Path) -> None:
     page = plan_html(json.loads(found.json(Options(**CHEAP))), exchanges, {})
     assert "<script>" not in page and "&lt;script&gt;" in page
     assert "The task is done." in page and HAND in page and "x(rope[0])" in page
+    assert "Nothing was sent to anybody" in page and "were sent to" not in page
+    content = json.loads(found.json(Options(**CHEAP))) | {"source": "model m at localhost:1"}
+    assert "were sent to the one that is named above" in plan_html(content, exchanges, {})
 
 
 def test_first_trajectories_are_played_as_they_are() -> None:
