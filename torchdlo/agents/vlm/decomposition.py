@@ -282,7 +282,7 @@ class _Part(TaskProblem):
         Args:
             ways: returns actions (T, 3 R) for the places of the tools (R, 3): ropes move while hands travel.
         """
-        made, count = self.prepared(1), self.task.travels
+        made, count = self.prepared(1), cast(SubTask, self.task).travels
         if not count:
             return ways(made.start.tool.pos[0])
         idle = torch.zeros(count, self.width, dtype=torch.float64)
