@@ -19,6 +19,7 @@ from torchdlo.physics import tree
 EXPERIMENTS = Path(__file__).parents[1] / "experiments"
 SCRIPTS = [
     "agent_benchmark.py",
+    "agent_starts.py",
     "baselines.py",
     "bench_contact.py",
     "bench_render.py",

@@ -100,9 +100,30 @@ def test_a_plan_is_carried_out_until_the_task_is_done() -> None:
     assert [c.task_success for c in found.carried] == [False, True]
 
 
-def test_the_search_begins_with_the_way_points() -> None:
+def test_way_points_that_reach_the_condition_are_not_searched() -> None:
     found = carried_out(answers(("plan", FAR[:1])), update=False)
-    assert found.carried[0].success and found.carried[0].episodes == 4
+    assert found.carried[0].success and found.carried[0].episodes == 1
+
+
+def test_a_search_begins_with_way_points_that_do_not() -> None:
+    near = {**step(1, 0.33), "success": "x(rope[0]) > 0.34"}
+    found = carried_out(answers(("plan", [near])), update=False)
+    # What is drawn about them comes as near; ways from nothing would leave the rope at 0.30.
+    assert found.carried[0].episodes == 4 and float(found.world.state.rods.pos[0, 0, 0]) > 0.32
+
+
+def test_way_points_are_places_in_the_world_whatever_moves_before() -> None:
+    # The rope is let go above the floor and falls while the other hand travels to it.
+    lift = {
+        **step(1, 0.31, success="z(rope[0]) > 0.03", horizon=12),
+        "waypoints": {"robot_1": [[0.33, 0, 0.1]], "robot_2": None},
+    }
+    lift["reward"] = {"up": "z(rope[0])"}
+    carry = {**step(2, 0.3, hold=(None, 4), success="z(rope[4]) > 0.06", horizon=20), "reward": {"up": "z(rope[4])"}}
+    carry["waypoints"] = {"robot_1": None, "robot_2": [[0.38, 0.0, 0.09]]}
+    found = carried_out(answers(("plan", [lift, carry])), update=False)
+    assert [c.episodes for c in found.carried] == [1, 1]
+    torch.testing.assert_close(found.world.tool.pos[0, 1], torch.tensor([0.38, 0.0, 0.09]), rtol=0, atol=2e-3)
 
 
 def test_a_plan_that_is_wrong_is_mended_by_updates_only() -> None:
@@ -263,6 +284,9 @@ def test_the_page_shows_what_was_said_and_escapes_it(tmp_path: Path) -> None:
     page = plan_html(json.loads(found.json(Options(**CHEAP))), exchanges, {})
     assert "<script>" not in page and "&lt;script&gt;" in page
     assert "The task is done." in page and HAND in page and "x(rope[0])" in page
+    assert "Nothing was sent to anybody" in page and "were sent to" not in page
+    content = json.loads(found.json(Options(**CHEAP))) | {"source": "model m at localhost:1"}
+    assert "were sent to the one that is named above" in plan_html(content, exchanges, {})
 
 
 def test_first_trajectories_are_played_as_they_are() -> None:

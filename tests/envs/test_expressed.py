@@ -139,6 +139,20 @@ def test_hands_travel_to_what_they_hold_next() -> None:
     assert not went.failed.any()
 
 
+SEVERAL = [name for name in envs.TASKS if len(envs.find(name).reset_noise) > 1]
+
+
+@pytest.mark.parametrize("name", SEVERAL)
+def test_parts_go_on_in_tasks_that_move_several_things(name: str) -> None:
+    task = envs.find(name)
+    rng = torch.Generator().manual_seed(3)
+    world = episode.prepare(task, 1, generator=rng, variation=True, compiled=False).start
+    part = continue_from(task, world, task.arms.vertex, holds=task.arms.vertex, horizon=3, reward=reward({"t": "time"}))
+    made = episode.prepare(part, 2, generator=rng, variation=True, compiled=False)
+    # It begins where it was left, wherever its own starts would be.
+    torch.testing.assert_close(made.start.state.rods.pos, world.state.rods.pos.expand(2, -1, -1), rtol=0, atol=0)
+
+
 def test_other_grasps_are_held() -> None:
     task = envs.find("lifting", grasps=(3, 26))
     assert task.arms.vertex == (3, 26) and task.schedule.held == (3, 26)

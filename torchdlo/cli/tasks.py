@@ -169,7 +169,7 @@ def optimize(
 
     torchdlo optimize wiring_post --robust --resume
 
-    torchdlo optimize lifting --grasps runs/propose/lifting/proposal.json --reward reward.json
+    torchdlo optimize lifting --grasps runs/propose/lifting-candidate/proposal.json --reward reward.json
     """
     from torchdlo.agents.trajopt.presets import search_preset
     from torchdlo.agents.trajopt.search import Robust

@@ -15,7 +15,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch import Tensor
@@ -27,7 +27,7 @@ from torchdlo.agents.vlm.carried import Carried, Options, Result, WorldPainter
 from torchdlo.agents.vlm.conversation import Conversation, Question, ShownPicture, plain_text
 from torchdlo.agents.vlm.grasp_proposal import Places, check_grasps, places_of
 from torchdlo.agents.vlm.plan_schema import step_models
-from torchdlo.agents.vlm.plan_waypoints import lead_through_waypoints
+from torchdlo.agents.vlm.plan_waypoints import lead_through_waypoints, places_of_tools
 from torchdlo.agents.vlm.prompts import fill_prompt
 from torchdlo.agents.vlm.scene_text import language_text, scene_text
 from torchdlo.coupling.common import step_diagnostics
@@ -37,6 +37,7 @@ from torchdlo.envs.core.subtask import SubTask, continue_from, opening, task_suc
 from torchdlo.errors import InputError
 from torchdlo.files import write_atomically
 from torchdlo.journal import read_json, write_json
+from torchdlo.physics import tree
 from torchdlo.reward_language import Reward, reward
 from torchdlo.scene import State
 
@@ -127,7 +128,7 @@ class _Run:
             SubTask(inner=self.task, reward=part)
             if places is not None:
                 grasps = check_grasps(places, _grasps(step))
-                lead_through_waypoints(step, places, grasps, self.world, self.task)
+                lead_through_waypoints(step, places_of_tools(places, grasps, self.world, self.task), self.task)
         except InputError as error:
             raise InputError(f"{where}: {error}") from None
 
@@ -202,7 +203,11 @@ class _Run:
             seed=options.seed,
             chunk=options.population,
         )
-        first = lead_through_waypoints(step, self.places(), _grasps(step), self.world, self.task, travels=part.travels)
+        first = self.led(step, problem)
+        if first is not None and options.enough:
+            went, _ = problem.played(first)
+            if bool((went.success & ~went.failed)[0]):
+                return first, 1
 
         def told(stage: str, done: int, total: int, message: str) -> None:
             self.callback(f"step {number}", done, total, message)
@@ -212,6 +217,16 @@ class _Run:
         if found.interrupted:
             raise KeyboardInterrupt
         return found.actions, found.episodes
+
+    def led(self, step: Any, problem: _Part) -> Tensor | None:
+        """Return the trajectory (T, 3 R) through the way-points of a step, None if it has none."""
+        if step.waypoints is None or not any(step.waypoints.model_dump().values()):
+            return None
+
+        def ways(tools: Tensor) -> Tensor:
+            return cast(Tensor, lead_through_waypoints(step, tools, self.task, cut=True))
+
+        return problem.travelled(ways)
 
     def file(self, number: int) -> Path | None:
         """Return where a step is kept."""
@@ -256,22 +271,48 @@ class _Part(TaskProblem):
 
     def played(self, actions: Tensor) -> tuple[episode.EpisodeResult, list[episode.EpisodeState]]:
         """Return how a trajectory (T, 3 R) went alone, and the world after each of its actions."""
-        key, worlds = actions.double().contiguous().numpy().tobytes(), []
+        key = _bytes(actions)
         if key not in self._alone:
-
-            def keep(world: episode.EpisodeState) -> dict[str, Tensor]:
-                worlds.append(world)
-                return {}
-
-            with torch.no_grad():
-                went = episode.play(self.task, self.full(actions[None]), episode=self.prepared(1), keep=keep)
-            self._alone[key] = (went, worlds)
+            self._alone[key] = self._from(self.prepared(1), actions)
         return self._alone[key]
+
+    def travelled(self, ways: Callable[[Tensor], Tensor]) -> Tensor:
+        """Return what leads hands from where they are when they have taken hold, and play it.
+
+        Args:
+            ways: returns actions (T, 3 R) for the places of the tools (R, 3): ropes move while hands travel.
+        """
+        made, count = self.prepared(1), cast(SubTask, self.task).travels
+        if not count:
+            return ways(made.start.tool.pos[0])
+        idle = torch.zeros(count, self.width, dtype=torch.float64)
+        before, worlds = self._from(made, idle)
+        rest = ways(before.world.tool.pos[0])
+        after, more = self._from(replace(made, start=before.world), rest)
+        actions = torch.cat([idle, rest])
+        went = tree.replace(after, returns=before.returns + after.returns)
+        self._alone[_bytes(actions)] = (went, worlds + more)
+        return actions
+
+    def _from(self, made: episode.Episode, actions: Tensor) -> tuple[episode.EpisodeResult, list[episode.EpisodeState]]:
+        """Return how actions (T, 3 R) went, and the world after each of them."""
+        worlds: list[episode.EpisodeState] = []
+
+        def keep(world: episode.EpisodeState) -> dict[str, Tensor]:
+            worlds.append(world)
+            return {}
+
+        with torch.no_grad():
+            return episode.play(self.task, self.full(actions[None]), episode=made, keep=keep), worlds
 
     def record(self, actions: Tensor) -> tuple[Evaluation, dict[str, Any]]:
         """Play one trajectory alone; nothing more is kept of it here."""
         went, _ = self.played(actions)
         return Evaluation(went.returns, went.loss, went.terminal_cost, went.success, went.failed), {}
+
+
+def _bytes(actions: Tensor) -> bytes:
+    return actions.double().contiguous().numpy().tobytes()
 
 
 def _plain(step: Any) -> dict[str, Any]:

@@ -50,7 +50,8 @@ class SubTask(Task):
         for name in _SAME:
             object.__setattr__(self, name, getattr(self.inner, name))
         object.__setattr__(self, "combine", "sum" if self.reward else self.inner.combine)
-        object.__setattr__(self, "reset_noise", ((0.0, 0.0),) if self.before is not None else self.inner.reset_noise)
+        still = ((0.0, 0.0),) * len(self.inner.reset_noise)
+        object.__setattr__(self, "reset_noise", self.inner.reset_noise if self.before is None else still)
         stages = self.inner.stages
         if self.before is not None and self.kept != self.inner.grasps:
             stages = (Stage(0, self.kept), Stage(self.travel, cast(Any, self.inner.grasps)))

@@ -13,6 +13,8 @@ from torchdlo.untrusted import for_html
 __all__ = ["plan_html"]
 
 _STYLE = STYLE + ".said { white-space: pre-wrap; } .bad { color: var(--before); } .good { color: var(--after); }\n"
+_SENT = "All texts and pictures below were sent to the one that is named above, and to nobody else."
+_NOT_SENT = "Nothing was sent to anybody: this is what a model would have been told and shown."
 _SHOWN = 20_000
 """Most letters of a text that are shown."""
 
@@ -37,7 +39,7 @@ def plan_html(result: Mapping[str, Any], exchanges: Sequence[Mapping[str, Any]],
     for place, carried in enumerate(result["steps"], 1):
         parts += _step(place, carried, pictures)
     parts.append("<h2>What was said</h2>")
-    parts.append("<p>All texts and pictures below were sent to the one that is named above, and to nobody else.</p>")
+    parts.append(f"<p>{_SENT if result['source'].startswith('model ') else _NOT_SENT}</p>")
     for each in exchanges:
         parts += _exchange(each, pictures)
     return page(f"torchdlo plan: {result['task']}", _STYLE, "\n".join(parts))
@@ -57,13 +59,17 @@ def _step(place: int, carried: Mapping[str, Any], pictures: Mapping[str, bytes])
     found = [
         f"<h2>{place}. {for_html(step['description'])}</h2>",
         f'<p class="{"good" if carried["success"] else "bad"}">{how}</p>',
-        f"<p>{for_html(held)}; {step['horizon']} actions; {carried['episodes']} episodes in "
+        f"<p>{for_html(held)}; {step['horizon']} actions; {_counted(carried['episodes'])} in "
         f"{number(carried['seconds'])} s. {for_html(step['reward_description'])}</p>",
         f'<div class="text">{table(("term", "expression", "at the end"), rows)}</div>',
     ]
     if carried["failed"]:
         found.append(f"<p>{for_html(carried['failed'])}</p>")
     return [*found, *(_image(pictures, digest) for digest in carried["pictures"])]
+
+
+def _counted(episodes: int) -> str:
+    return "1 episode" if episodes == 1 else f"{episodes} episodes"
 
 
 def _image(pictures: Mapping[str, bytes], digest: str) -> str:
