@@ -24,7 +24,7 @@ from torchdlo.sysid.model.model_file import ModelFile
 from torchdlo.sysid.recordings.recording import Recording
 from torchdlo.sysid.video.filmed_fit import Fit, fit, gate, intervals, picture_errors
 from torchdlo.sysid.video.filmed_problem import FilmedProblem, add_correction, begin_from_balance, filmed_problem
-from torchdlo.sysid.video.filmed_starts import START_WINDOW, refine_start, restart, scout
+from torchdlo.sysid.video.filmed_starts import START_WINDOW, fit_starts, refine_start, restart, scout
 from torchdlo.sysid.video.footage import views_of
 from torchdlo.sysid.video.overlay import mask_overlaps, overlays
 
@@ -129,6 +129,7 @@ def tested(
     refine_start(here, values, search=True)
     gate(here, values)
     add_correction(here, values)
+    fit_starts(here, own.space.to_raw(values), 8, seconds=START_WINDOW)
     return here, said
 
 
