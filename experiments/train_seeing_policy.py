@@ -72,6 +72,7 @@ def options(given: Sequence[str] | None = None) -> Any:
     parser.add_argument("--batches", type=count, default=7, help=f"of {BATCH} demonstrations of each task")
     parser.add_argument("--fidelity", default="coarse", help="of the demonstrations: published or coarse")
     parser.add_argument("--workers", type=int, default=max(1, (os.cpu_count() or 1) - 2), help="that play and draw")
+    parser.add_argument("--threads", type=count, default=1, help="that learn on the processor")
     parser.add_argument("--pictures", type=count, default=150_000, help="in all; each has as many views as cameras")
     parser.add_argument("--size", type=count, default=96, help="of pictures [px]")
     parser.add_argument("--steps", type=count, default=4000, help="of learning")
@@ -399,7 +400,7 @@ def learned(tasks: Sequence[Demonstrations], given: Any, folder: Path) -> tuple[
 def main(words: Sequence[str] | None = None) -> None:
     """Play what was not played yet, then learn."""
     given = options(words)
-    torch.set_num_threads(1)
+    torch.set_num_threads(given.threads)
     names, folder = given.tasks.split(","), Path(given.scenes)
     folder.mkdir(parents=True, exist_ok=True)
     jobs = [(name, given.fidelity, k, folder) for k in range(given.batches) for name in names]
