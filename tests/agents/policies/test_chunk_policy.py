@@ -163,12 +163,13 @@ def test_small_files_hold_nearly_the_same_policy(tmp_path: Path) -> None:
     for name, small in (("whole", False), ("small", True)):
         save_policy(tmp_path / f"{name}.pt", policy, {}, small=small)
     sizes = [(tmp_path / f"{name}.pt").stat().st_size for name in ("whole", "small")]
-    assert sizes[1] < 0.4 * sizes[0]
+    assert sizes[1] < 0.27 * sizes[0]
     again, _ = load_policy(tmp_path / "small.pt")
     picture, words = torch.randint(256, (8, 3, 96, 96), dtype=torch.uint8), torch.randn(8, 384)
     with torch.no_grad():
         a, b = (one({"front": picture}, words, words) for one in (policy, again))
-    assert 0 < float((a - b).abs().max()) < 0.01 * float(a.std())
+    # Weights that are spread evenly come back off by 127^-1 / 2 = 0.4 % of their size; ten layers add up to 1.2 %.
+    assert 0 < float((a - b).square().mean().sqrt()) < 0.015 * float(a.std())
 
 
 def test_training_reads_the_set_and_learns_its_targets(data: Path, learned: Path) -> None:
@@ -245,7 +246,7 @@ def test_a_policy_acts_in_closed_loop_and_makes_a_set(learned: Path, tmp_path: P
     with pytest.raises(SystemExit) as wrong:
         app.main([*words, "--film"])
     assert wrong.value.code == 2 and "it is a policy of learn" in capsys.readouterr().err
-    with pytest.raises(InputError, match="swapped needs another task"):
+    with pytest.raises(InputError, match="swapped: the policy has learned no other task"):
         evaluate_chunk_policy(learned, ["short"], Dots(), episodes=2, conditions=("swapped",))
     with pytest.raises(InputError, match="it moves 1 arm, and pair has 2"):
         evaluate_chunk_policy(learned, ["pair"], Dots(), episodes=2)

@@ -33,6 +33,7 @@ __all__ = [
     "draw_starts",
     "play_batch",
     "record_attempts",
+    "scene_in_time",
     "seed_of",
 ]
 
@@ -231,7 +232,7 @@ def record_attempts(
             rewards = torch.stack([step.reward[k] for step in steps])
             success = bool(steps[-1].success[k])
             columns = _columns(schema, steps, k) if success else {}
-            worlds = _line([step.before for step in steps], k)
+            worlds = scene_in_time([step.before for step in steps], k)
             pictures = _pictures(made, worlds, start, schema, painter) if success and painter is not None else {}
             sums = float(rewards.double().sum())
             found.append(
@@ -240,7 +241,7 @@ def record_attempts(
     return found
 
 
-def _line(worlds: Sequence[episode.EpisodeState], k: int) -> episode.EpisodeState:
+def scene_in_time(worlds: Sequence[episode.EpisodeState], k: int) -> episode.EpisodeState:
     """Return the scene k of many moments as a batch of them."""
 
     def row(*parts: Tensor) -> Tensor:

@@ -121,7 +121,8 @@ def evaluate_chunk_policy(
         made = _prepared(name, episodes)
         for k, condition in enumerate(conditions):
             attempts = [
-                _told(s, name, names, condition) for s in draw_starts(made.task, f"evaluate {seed}", range(episodes))
+                _told(s, name, about["tasks"] or names, condition)
+                for s in draw_starts(made.task, f"evaluate {seed}", range(episodes))
             ]
             who = replace(actor, blank=condition == "blanked")
             with torch.no_grad():
@@ -146,15 +147,17 @@ def _prepared(name: str, count: int) -> episode.Episode:
     return episode.prepare(task, count, compiled=False, recorded=task.horizon > 10)
 
 
-def _told(start: EpisodeStart, name: str, names: Sequence[str], condition: str) -> EpisodeStart:
-    """Return an attempt with the instruction of its condition."""
+def _told(start: EpisodeStart, name: str, known: Sequence[str], condition: str) -> EpisodeStart:
+    """Return an attempt with the instruction of its condition; `known` are the tasks that the policy has learned."""
     if condition == "paraphrased":
         said = sentences.heldout_instructions(name)
     elif condition == "swapped":
         paired = find(name).counterpart
-        others = [paired] if paired else [other for other in names if other != name]
+        others = [paired] if paired else [other for other in known if other != name]
         if not others:
-            raise InputError("swapped needs another task, whose instructions are given; name one more.")
+            raise InputError(
+                f"swapped: the policy has learned no other task than {name}, whose instructions could be given."
+            )
         said = sentences.training_instructions(others[start.number % len(others)])
     else:
         return start

@@ -15,10 +15,10 @@ from torchdlo.envs.observations.cameras import WRIST_EYE, WRIST_TARGET, TaskCame
 from torchdlo.errors import InputError
 from torchdlo.scene import State
 from torchdlo.vision.look import Look
-from torchdlo.vision.renderer import ROPE, Images, Pinhole, RenderModel, intrinsics, looking_at, render
+from torchdlo.vision.renderer import ROPE, Images, Pinhole, Placement, RenderModel, intrinsics, looking_at, render
 from torchdlo.vision.scene_geometry import arm_frame, model_of, placement_of
 
-__all__ = ["CLOUD", "CameraRig", "camera_rig", "cameras_of", "render_cameras", "rope_points", "views"]
+__all__ = ["CLOUD", "CameraRig", "camera_rig", "cameras_of", "placed", "render_cameras", "rope_points", "views"]
 
 MARGIN = 0.35
 """How far the table goes on beyond arms and ropes [m]."""
@@ -126,7 +126,8 @@ def _upright(view: Pinhole, eye: Tensor) -> Pinhole:
     return Pinhole(view.intrinsics, rotation, -rotation @ eye)
 
 
-def _placed(rig: CameraRig, state: State, joints: Tensor) -> tuple:
+def placed(rig: CameraRig, state: State, joints: Tensor) -> tuple[Placement, Pinhole]:
+    """Return where everything is in scenes, and where cameras are, shape (B, C, ...); joints are (B, R, J)."""
     with torch.no_grad():
         placement = placement_of(state, arms=rig.arms, joints=joints, bases=rig.bases)
         frames = list(rig.frames)
@@ -139,7 +140,7 @@ def _placed(rig: CameraRig, state: State, joints: Tensor) -> tuple:
 
 def views(rig: CameraRig, state: State, joints: Tensor) -> Pinhole:
     """Return where cameras are in scenes, shape (B, C, ...); joints are (B, R, J) [rad or m]."""
-    return _placed(rig, state, joints)[1]
+    return placed(rig, state, joints)[1]
 
 
 def render_cameras(
@@ -167,7 +168,7 @@ def render_cameras(
         depth: whether depths are.
         ids: whether masks are.
     """
-    placement, view = _placed(rig, state, joints)
+    placement, view = placed(rig, state, joints)
     wanted = {"rgb": rgb, "depth": depth, "ids": ids}
     return render(rig.model, placement, view, rig.size, looks=looks, samples=samples, shadow=shadow, **wanted)
 
