@@ -11,6 +11,7 @@ examples:
 from __future__ import annotations
 
 import json
+import math
 import sys
 import time
 from pathlib import Path
@@ -28,17 +29,22 @@ def play(name: str, fidelity: str, most: int | None) -> dict[str, Any]:
 
     from torchdlo.envs import find, parse_fidelity, with_fidelity
     from torchdlo.envs.core import episode
+    from torchdlo.errors import InputError
     from torchdlo.scene import step_diagnostics
 
     task = with_fidelity(find(name), parse_fidelity(fidelity))
-    made = episode.prepare(task, 1, compiled=False, recorded=True)
+    row: dict[str, Any] = {"task": name, "fidelity": fidelity}
+    try:
+        made = episode.prepare(task, 1, compiled=False, recorded=True)
+    except InputError as error:
+        return row | {"return": math.nan, "success": False, "failed": True, "cpu_s": math.nan, "missed": str(error)}
     actions = task.demonstration()[:most].float().unsqueeze(0)
     with torch.no_grad():
         episode.play(task, actions[:, :1], episode=made)
         start = time.process_time()
         went = episode.play(task, actions, episode=made)
-    row = {"task": name, "fidelity": fidelity, "return": float(went.returns[0]), "success": bool(went.success[0])}
-    said = step_diagnostics.explain(went.world.state.diagnostics)
+    row |= {"return": float(went.returns[0]), "success": bool(went.success[0])}
+    said = step_diagnostics.explain_diagnostics(went.world.state.diagnostics)
     return row | {"failed": bool(went.failed[0]), "cpu_s": time.process_time() - start, "missed": said}
 
 

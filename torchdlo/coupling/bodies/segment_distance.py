@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchdlo.coupling.bodies import shape_sdf
+from torchdlo.coupling.bodies import edge_search_op, shape_sdf
 from torchdlo.coupling.bodies.dynamics import Body, PredictedBodyMotion, conjugate
 from torchdlo.physics import tree
 from torchdlo.physics.linalg.numerics import dot, safe_norm, tiny
@@ -79,12 +79,26 @@ class _Line:
         return _Line(self.body, *(x.detach().unsqueeze(-3) for x in parts))
 
 
-def _nearest(line: _Line, low: float, high: float) -> Tensor:
-    """Return the share at which edges are nearest to a body (or deepest in it) between two shares, shape (..., V, 1).
+def _nearest(line: _Line, count: int) -> list[Tensor]:
+    """Return the shares at which edges are nearest to a body (or deepest in it) in each of their pieces, (..., V, 1).
 
     Slopes enclose the nearest point, about the best of some places where the distance may have several minima; Newton's
     method finds it, and one more step of it, with graph, gives it the derivative of the implicit function theorem.
     """
+    if edge_search_op.kernel_fits(line.body, line.grid):
+        found = edge_search_op.search(line.body, line.size, line.grid, line.start, line.edge, count)
+    else:
+        found = [_search(line, j / count, (j + 1) / count) for j in range(count)]
+    shares = []
+    for j, (share, steep, left, right) in enumerate(found):
+        share = share - line.slope(share, (j + 0.5) / count) / steep
+        shares.append(torch.minimum(torch.maximum(share, left), right))
+    return shares
+
+
+@torch.no_grad()
+def _search(line: _Line, low: float, high: float) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Return the share between two shares before the last step, the slope's rise there, and bounds, (..., V, 1)."""
     middle = 0.5 * (low + high)
     step = 1e-4 if line.start.dtype == torch.float64 else 2e-3
     still = line.still()
@@ -95,25 +109,22 @@ def _nearest(line: _Line, low: float, high: float) -> Tensor:
         before, here, after = still.slope(three, middle).unbind(-3)
         return here, torch.maximum((after - before) / (2 * step), PULL * length).clamp(min=tiny(length))
 
-    with torch.no_grad():
-        left, right = torch.full_like(length, low), torch.full_like(length, high)
-        convex = line.body.shape in shape_sdf.CONVEX
-        if not convex:
-            left, right = _about_best(still, low, high)
-        for _ in range(HALVES[convex]):
-            half = 0.5 * (left + right)
-            falling = still.slope(half.unsqueeze(-3), middle).squeeze(-3) <= 0
-            left, right = torch.where(falling, half, left), torch.where(falling, right, half)
-        # The middle of a piece is nearest to what is flat: it must not be a bound, where the share has no derivative.
-        spare = 0.25 * (right - left)
-        left, right = (left - spare).clamp(min=low), (right + spare).clamp(max=high)
-        share = 0.5 * (left + right)
-        for _ in range(NEWTON):
-            slope, steep = newton(share)
-            share = torch.minimum(torch.maximum(share - slope / steep, left), right)
-        _, steep = newton(share)
-    share = share - line.slope(share, middle) / steep
-    return torch.minimum(torch.maximum(share, left), right)
+    left, right = torch.full_like(length, low), torch.full_like(length, high)
+    convex = line.body.shape in shape_sdf.CONVEX
+    if not convex:
+        left, right = _about_best(still, low, high)
+    for _ in range(HALVES[convex]):
+        half = 0.5 * (left + right)
+        falling = still.slope(half.unsqueeze(-3), middle).squeeze(-3) <= 0
+        left, right = torch.where(falling, half, left), torch.where(falling, right, half)
+    # The middle of a piece is nearest to what is flat: it must not be a bound, where the share has no derivative.
+    spare = 0.25 * (right - left)
+    left, right = (left - spare).clamp(min=low), (right + spare).clamp(max=high)
+    share = 0.5 * (left + right)
+    for _ in range(NEWTON):
+        slope, steep = newton(share)
+        share = torch.minimum(torch.maximum(share - slope / steep, left), right)
+    return share, newton(share)[1], left, right
 
 
 def _about_best(still: _Line, low: float, high: float) -> tuple[Tensor, Tensor]:
@@ -138,6 +149,10 @@ def find_contact_points(view: View, motion: PredictedBodyMotion, pieces: int) ->
     """
     state, params = motion.state, motion.params
     batch = torch.broadcast_shapes(view.state.pos.shape[:-2], state.pos.shape[:-2], params.size.shape[:-2])
+    if edge_search_op.all_at_once(motion):
+        each = [points_per_edge(body, pieces) - 2 for body in motion.bodies]
+        share, distance, normal, arm = edge_search_op.points(view, motion, batch, each)
+        return EdgePoints(share, normal, arm, distance)
     pos = view.state.pos.expand(*batch, -1, -1)
     found: list[tuple[Tensor, Tensor, Tensor, Tensor]] = []
     for k, body in enumerate(motion.bodies):
@@ -152,8 +167,7 @@ def find_contact_points(view: View, motion: PredictedBodyMotion, pieces: int) ->
         found.append((zero, normal, arm, distance))
         found.append((zero + 1, view.next(normal), view.next(arm), view.next(distance)))
         count = points_per_edge(body, pieces) - 2
-        for j in range(count):
-            share = _nearest(line, j / count, (j + 1) / count)
+        for share in _nearest(line, count) if count else []:
             distance, normal = line.probe(share)
             place = arm + share * (view.next(arm) - arm)
             found.append((share, rotate(quat, normal), place, distance))

@@ -382,7 +382,9 @@ def make(
         held: vertices that can be held at all, if others than those of the arms.
         burst: by how much vertices may speed up within a step, beside half their speed [m/s].
     """
+    # Implicit steps solve for lengths, of elastic ropes with their stiffness.
     elastic = all(isinstance(r.stretch, Tensor) or math.isfinite(r.stretch) for r in ropes)
+    elastic = elastic and task.fidelity.integrator == "explicit"
     floor = not any(s.shape == "plane" for s in solids)
     count = sum(r.positions.shape[-2] for r in ropes)
     beyond = [v for v in task.grasps or () if v is not None and v >= count]
