@@ -33,8 +33,8 @@ from torchdlo.reward_language import reward
 ROOT = Path(__file__).resolve().parents[1]
 CONVERSATIONS = ROOT / "tests" / "agents" / "conversations"
 RUNS = {
-    "wiring_ring": ("wiring_ring.json", "wiring_ring_wrong_at_first.json"),
-    "letter_art": ("letter_art.json", "letter_art_slips_at_first.json"),
+    "letter_art": ("letter_art_slips_at_first.json", "letter_art.json"),
+    "wiring_ring": ("wiring_ring_wrong_at_first.json", "wiring_ring.json"),
 }
 """Conversations by the task that they plan."""
 
@@ -111,6 +111,17 @@ def played(name: str, file: Path, update: bool, starts: int, most: int = 99) -> 
     for k, row in enumerate(rows):
         row |= {"vary": k, "success": bool(done[k]), "searched": bool(searched[k])}
     return rows
+
+
+def as_before(rows: list[dict[str, Any]], key: dict[str, Any]) -> list[dict[str, Any]] | None:
+    """Return the starts of the row with updates where one without carries out the very same steps until all is done."""
+    file, hands = CONVERSATIONS / key["conversation"], envs.find(key["task"]).arms.count
+    same = [row for row in rows if row["conversation"] == key["conversation"] and row["update"]]
+    if key["update"] or not same or not all(start["success"] for start in same[0]["starts"]):
+        return None
+    used = max(start["steps"] for start in same[0]["starts"])
+    first, other = (spoken(file, hands, update)[:used] for update in (True, False))
+    return same[0]["starts"] if first == other else None
 
 
 def main(arguments: list[str] | None = None) -> list[dict[str, Any]]:

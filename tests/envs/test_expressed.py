@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import copy
+import math
+import time
+from collections.abc import Callable
 from typing import Any
 
 import pytest
@@ -61,6 +64,29 @@ def test_expressions_equal_the_rewards_of_tasks_with_their_gradients(name: str) 
     other, slope = played(with_reward(task, reward(EXPRESSED[name])), actions)
     torch.testing.assert_close(other.rewards, own.rewards, rtol=0, atol=1e-9)
     torch.testing.assert_close(slope, gradient, rtol=1e-6, atol=1e-9)
+
+
+def spent(work: Callable[[], Any], times: int) -> float:
+    """Least CPU time that something takes [s]."""
+    best = math.inf
+    for _ in range(times):
+        begun = time.process_time()
+        work()
+        best = min(best, time.process_time() - begun)
+    return best
+
+
+@pytest.mark.parametrize("name", ["coiling", "lifting", "wrapping"])
+def test_expressions_take_less_than_a_twentieth_of_an_action_more(name: str) -> None:
+    task = envs.find(name)
+    expressed = with_reward(task, reward(EXPRESSED[name]))
+    with torch.no_grad():
+        made = episode.prepare(task, 1, compiled=False)
+        action = torch.zeros(1, task.width)
+        whole = spent(lambda: episode.act(made, made.start, action), 2)
+        seen = made.start.seen(task.arms.count)
+        own, other = (spent(lambda chosen=chosen: chosen.rewards(seen), 20) for chosen in (task, expressed))
+    assert other - own < 0.05 * whole
 
 
 @pytest.mark.parametrize("name", envs.TASKS)
