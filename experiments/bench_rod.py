@@ -183,11 +183,19 @@ def receive(jobs: list[Any], results: Any) -> Any:
 
 
 def start(jobs: list[Any]) -> None:
-    """Start processes that never see Ctrl-C, which is for their parent to answer."""
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    for job in jobs:
-        job.start()
-    signal.pthread_sigmask(signal.SIG_SETMASK, before)
+    """Start processes that never see Ctrl-C, which is for their parent to answer, once they have what they need."""
+    came: list[int] = []
+    # They inherit the mask; another thread of this process may still take the signal.
+    handler = signal.signal(signal.SIGINT, lambda number, _: came.append(number))
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        for job in jobs:
+            job.start()
+    finally:
+        signal.signal(signal.SIGINT, handler)
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+    if came:
+        signal.raise_signal(signal.SIGINT)
 
 
 @contextlib.contextmanager

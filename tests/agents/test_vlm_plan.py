@@ -16,6 +16,7 @@ from torch import Tensor
 from torchdlo import envs
 from torchdlo.agents.trajopt.search import SearchSettings, optimize
 from torchdlo.agents.trajopt.task_problem import TaskProblem
+from torchdlo.agents.vlm import decomposition
 from torchdlo.agents.vlm.conversation import Conversation
 from torchdlo.agents.vlm.decomposition import Options, Result, carry_out
 from torchdlo.agents.vlm.geometry import Geometry
@@ -217,16 +218,16 @@ def test_a_run_goes_on_where_it_was_stopped(tmp_path: Path, monkeypatch: pytest.
     with pytest.raises(InputError, match="it holds 1 answers"):
         carried_out(answers(rows[0]), folder=tmp_path / "cut")
     assert sorted(p.name for p in (tmp_path / "cut").rglob("*.json")) == ["001.json", "01.json"]
-    search_return: list[int] = []
-    before = optimize
+    led: list[int] = []
+    before = decomposition._Part.travelled
 
-    def counted(*given: Any, **more: Any) -> Any:
-        search_return.append(1)
-        return before(*given, **more)
+    def counted(*given: Any) -> Any:
+        led.append(1)
+        return before(*given)
 
-    monkeypatch.setattr("torchdlo.agents.vlm.decomposition.optimize", counted)
+    monkeypatch.setattr(decomposition._Part, "travelled", counted)
     again = carried_out(answers(*rows), folder=tmp_path / "cut", resume=True)
-    assert len(search_return) == 1 and again.success
+    assert len(led) == 1 and again.success
     torch.testing.assert_close(again.world.state.rods.pos, whole.world.state.rods.pos, rtol=0, atol=0)
     plain = [json.loads(r.json(Options(**CHEAP))) for r in (whole, again)]
     for each in plain:
