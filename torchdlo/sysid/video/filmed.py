@@ -249,7 +249,8 @@ def _judged(
             "mae_mm": 1e3 * float(new[b]),
             "before_mae_mm": 1e3 * float(old[b]),
             "distance_px": float(pixels[b]),
-            "iou": share[b],
+            "iou": share[b][0],
+            "boundary_f": share[b][1],
         }
         for b, trial in enumerate(here.trials)
     ]
