@@ -129,13 +129,16 @@ def run_one(case: Case, recording: Path, folder: Path, seed: int) -> dict:
         for name, value in true.items()
     }
     tests = [t for t in found.per_trial if t["split"] == "test"]
-    judged = {key: float(np.mean([t[key] for t in tests])) for key in ("iou", "distance_px", "mae_mm")}
+    judged = {key: float(np.mean([t[key] for t in tests])) for key in ("iou", "boundary_f", "distance_px", "mae_mm")}
     return {"cpu_s": used, "parameters": rows, "test": judged, "notes": found.notes}
 
 
 def table(rows: list[dict]) -> str:
     """Return the runs as lines of Markdown, and how many are good."""
-    lines = ["| rope | seed | bending | damping | twist | IoU | px | CPU s |", "|---|---|---|---|---|---|---|---|"]
+    lines = [
+        "| rope | seed | bending | damping | twist | IoU | edges | px | CPU s |",
+        "|---|---|---|---|---|---|---|---|---|",
+    ]
     for row in rows:
         parts = row["parameters"]
         shares = [
@@ -144,7 +147,7 @@ def table(rows: list[dict]) -> str:
         judged = row["test"]
         lines.append(
             f"| {row['rope']} | {row['seed']} | {' | '.join(shares)} | {judged['iou']:.2f} | "
-            f"{judged['distance_px']:.2f} | {row['cpu_s']:.0f} |"
+            f"{judged['boundary_f']:.2f} | {judged['distance_px']:.2f} | {row['cpu_s']:.0f} |"
         )
     main = ("bending_stiffness", "damping_rate")
     near = sum(all(abs(r["parameters"][k]["error"]) < 0.05 for k in main) for r in rows)

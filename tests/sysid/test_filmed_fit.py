@@ -20,6 +20,7 @@ from torchdlo.sysid.video.filmed_problem import begin_from_balance, filmed_probl
 from torchdlo.sysid.video.filmed_starts import fit_starts, search_starts
 from torchdlo.sysid.video.films import with_stations
 from torchdlo.sysid.video.footage import views_of
+from torchdlo.sysid.video.overlay import boundary_f
 
 DATA = Path(__file__).parents[2] / "torchdlo" / "data"
 
@@ -89,6 +90,18 @@ def test_films_that_begin_in_motion_tell_the_bending_stiffness() -> None:
     assert np.mean([t["distance_px"] for t in found.per_trial if t["split"] == "train"]) < 1.0
     # One of them comes towards the camera at a metre per second: its start has another, wrong, basin.
     assert np.mean([t["mae_mm"] for t in found.per_trial if t["split"] == "test"]) < 2.0
+
+
+def test_edges_agree_within_a_pixel_whatever_the_width() -> None:
+    for wide in (3, 12):
+        true = np.zeros((60, 80), bool)
+        true[20 : 20 + wide, 10:70] = True
+        one, three = (np.roll(true, k, 0) for k in (1, 3))
+        assert boundary_f(true, true) == 1.0
+        assert boundary_f(one, true) == pytest.approx(1.0)
+        assert boundary_f(three, true) < 0.2 if wide == 12 else boundary_f(three, true) < 0.6
+        # A shift by s of a band of width w leaves (w - s) / (w + s) of the union.
+        assert (one & true).sum() / (one | true).sum() == pytest.approx((wide - 1) / (wide + 1))
 
 
 def test_a_start_that_is_not_believed_is_said() -> None:

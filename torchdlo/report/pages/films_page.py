@@ -125,10 +125,11 @@ def _trials(result: Calibration) -> str:
             number(t["mae_mm"]),
             number(t["distance_px"]),
             f"{t['iou']:.2f}",
+            f"{t['boundary_f']:.2f}" if "boundary_f" in t else "",
         )
         for t in sorted(result.per_trial, key=lambda t: str(t["split"]))
     ]
-    return table(("trial", "split", "before [mm]", "calibrated [mm]", "[px]", "overlap"), rows)
+    return table(("trial", "split", "before [mm]", "calibrated [mm]", "[px]", "overlap", "edges within 1 px"), rows)
 
 
 def _mm(value: float) -> str:

@@ -21,9 +21,16 @@ from torchdlo.sysid.estimation.observation import FilmView, Spines
 from torchdlo.sysid.estimation.result import Calibration, Overlay
 from torchdlo.sysid.model import model_file
 from torchdlo.sysid.model.model_file import ModelFile
+from torchdlo.sysid.model.rope_model import MAX_SUBSTEP
 from torchdlo.sysid.recordings.recording import Recording
-from torchdlo.sysid.video.filmed_fit import Fit, fit, gate, intervals, picture_errors
-from torchdlo.sysid.video.filmed_problem import FilmedProblem, add_correction, begin_from_balance, filmed_problem
+from torchdlo.sysid.video.filmed_fit import Fit, fit, gate, intervals, look, picture_errors
+from torchdlo.sysid.video.filmed_problem import (
+    FilmedProblem,
+    add_correction,
+    begin_from_balance,
+    filmed_problem,
+    keep_steps_only,
+)
 from torchdlo.sysid.video.filmed_starts import START_WINDOW, fit_starts, refine_start, restart, scout
 from torchdlo.sysid.video.footage import views_of
 from torchdlo.sysid.video.overlay import mask_overlaps, overlays
@@ -34,6 +41,12 @@ Callback = Callable[[str, int, int, str], None]
 
 FILMED_STARTS = 36
 """Starts that are enough."""
+
+_LAST = 6
+"""Most iterations with finer steps, of fits that begin near their minimum."""
+
+_WORSE = 1.05
+"""Times the cost from which a correction of simulations makes the fit worse."""
 
 _DOUBT, _DOUBT_MM = 3.0, 3.0
 """Times the error of the nearest trial, and error [mm], from which a start in motion is not believed."""
@@ -126,7 +139,10 @@ def tested(
     parts: dict[str, Any] = {"trials": recording.test, "motion": own.model.motion(recording.test), "spines": spines}
     here = replace(own, **parts, dropped={}, discretisation_correction=None)
     begin_from_balance(here, own.full(values[None])[0])
-    refine_start(here, values, search=True)
+    if here.offset.shape[1]:
+        coarse = here.with_options(substep=MAX_SUBSTEP)
+        refine_start(coarse, values, search=True)
+        here.offset = coarse.offset
     gate(here, values)
     add_correction(here, values)
     fit_starts(here, own.space.to_raw(values), 8, seconds=START_WINDOW)
@@ -153,32 +169,45 @@ def _problem(
 def _fitted(own: FilmedProblem, raw: np.ndarray, iterations: int, report: Callback) -> Fit:
     """Return the best fit of all trials, without wrong frames and with what finer simulations change."""
     stage, values = f"fitting {len(own.trials)} filmed trials", own.space.to_values(raw)
-    best = _in_motion(own, raw)
+    if not own.offset.any():
+        # A scout knows the starts; a model that begins without one has to find them.
+        begin_from_balance(own, own.full(values[None])[0])
+        refine_start(own, values)
+    best = fit(own, raw, 6, seconds=0.7 * own.lasts)
     if own.model.mesh.clamps and "clamp_fraction" in own.options and not own.model.effects:
         # The rope may be held up to the last marker of a clamp, or bend between its markers.
         other = own.with_options(clamp_fraction=1.0 - own.model.clamp_fraction)
-        found = _in_motion(other, best.raw)
+        found = fit(other, best.raw, 6, seconds=0.7 * own.lasts)
         if found.cost < best.cost:
             own.take(other)
             best = found
     report(stage, 1, 3, f"{1e3 * best.cost:.2f} mm")
     best = restart(own, fit(own, best.raw, iterations), iterations)
     report(stage, 2, 3, f"{1e3 * best.cost:.2f} mm")
-    values = own.space.to_values(best.raw)
-    gate(own, values)
-    add_correction(own, values)
-    best = fit(own, best.raw, iterations)
+    if own.offset.shape[1]:
+        # What steps damp is taken for damping, and starts in motion swing more than a rope at rest.
+        own.take(own.with_options(substep=own.model.dt / (2 * own.model.substeps)))
+        best = fit(own, best.raw, min(iterations, _LAST))
+    gate(own, own.space.to_values(best.raw))
+    best = _corrected(own, best.raw, iterations)
     report(stage, 3, 3, f"{1e3 * best.cost:.2f} mm")
     return best
 
 
-def _in_motion(own: FilmedProblem, raw: np.ndarray) -> Fit:
-    """Return a first fit of most of the time, with starts anew."""
-    values = own.space.to_values(raw)
-    if own.offset.shape[1]:
-        begin_from_balance(own, own.full(values[None])[0])
-        refine_start(own, values)
-    return fit(own, raw, 6, seconds=0.7 * own.lasts)
+def _corrected(own: FilmedProblem, raw: np.ndarray, iterations: int) -> Fit:
+    """Return the fit with what finer simulations change; without what their mesh changes if that fits worse."""
+    offset = own.offset
+    if not offset.shape[1]:
+        add_correction(own, own.space.to_values(raw))
+        return fit(own, raw, iterations)
+    before = look(own, raw, offset, fixed=True).cost
+    add_correction(own, own.space.to_values(raw))
+    best = fit(own, raw, min(iterations, _LAST))
+    if best.cost > _WORSE * before:
+        own.offset = offset
+        keep_steps_only(own)
+        best = fit(own, raw, min(iterations, _LAST))
+    return best
 
 
 @dataclass(frozen=True, eq=False)
@@ -220,7 +249,8 @@ def _judged(
             "mae_mm": 1e3 * float(new[b]),
             "before_mae_mm": 1e3 * float(old[b]),
             "distance_px": float(pixels[b]),
-            "iou": share[b],
+            "iou": share[b][0],
+            "boundary_f": share[b][1],
         }
         for b, trial in enumerate(here.trials)
     ]

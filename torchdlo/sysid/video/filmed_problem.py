@@ -18,7 +18,7 @@ from torchdlo.sysid.model.trial_batch import Start, TrialBatch
 from torchdlo.sysid.recordings.recording import Recording, Trial
 from torchdlo.sysid.recordings.trivial_predictors import catenary
 
-__all__ = ["FilmedProblem", "add_correction", "begin_from_balance", "filmed_problem", "start_of"]
+__all__ = ["FilmedProblem", "add_correction", "begin_from_balance", "filmed_problem", "keep_steps_only", "start_of"]
 
 _CALM = 0.03
 """Speed of a gripper below which it is at rest [m/s]."""
@@ -284,12 +284,24 @@ def add_correction(own: FilmedProblem, values: np.ndarray) -> None:
     model = own.model
     own.start = replace(own.start, discretisation_correction=None)
     begin = own.begin(own.offset[None]) if own.offset.shape[1] else own.start
+    row = own.full(values[None])
+    plain = model.simulate(own.motion, begin, row)[0]
+    # Starts are fitted: only what the motion from one and the same place gets wrong is to be corrected.
+    moving = ~own.start.still[:, None, None] & np.isfinite(plain[:, 0])
+    begin = replace(begin, pos=np.where(moving, plain[:, 0], begin.pos))
     half = {"substep": model.dt / (2 * model.substeps)}
     fine = half | {"vertices": 2 * len(model.arclength) - 1}
-    row, sims = own.full(values[None]), []
-    for more in (fine, half, {}):
-        each = RopeModel(model.recording, effects=model.effects, **(own.options | more)) if more else model
+    sims = []
+    for more in (fine, half):
+        each = RopeModel(model.recording, effects=model.effects, **(own.options | more))
         sims.append(each.simulate(each.motion(own.trials), begin, row)[0])
     edge = float(np.mean(np.diff(model.arclength)))
-    own.discretisation_correction = refinement(sims[0], sims[1], sims[2], model.numerical_damping, edge)
+    own.discretisation_correction = refinement(sims[0], sims[1], plain, model.numerical_damping, edge)
     own.start = replace(own.start, discretisation_correction=own.discretisation_correction.correction)
+
+
+def keep_steps_only(own: FilmedProblem) -> None:
+    """Correct simulations by what finer steps change alone: where ropes bifurcate, another mesh tells nothing."""
+    found = own.discretisation_correction
+    alone = replace(found, grid=np.zeros_like(found.grid))
+    own.start = replace(own.start, discretisation_correction=alone.correction)

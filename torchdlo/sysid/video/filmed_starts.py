@@ -14,8 +14,9 @@ import numpy as np
 
 from torchdlo.sysid.estimation import levenberg_marquardt
 from torchdlo.sysid.estimation.levenberg_marquardt import ParameterSpace, Point
+from torchdlo.sysid.model.trial_batch import Start
 from torchdlo.sysid.video.filmed_fit import Fit, fit, look, total
-from torchdlo.sysid.video.filmed_problem import FilmedProblem
+from torchdlo.sysid.video.filmed_problem import FilmedProblem, begin_from_balance
 
 __all__ = ["START_WINDOW", "fit_starts", "refine_start", "restart", "scout", "search_starts"]
 
@@ -26,6 +27,9 @@ START_WINDOW = 0.4
 
 _REACH = (np.log(40.0), np.log(4.0), np.log(10.0))
 """How far starts go either way of the guess."""
+
+_MOST = 5
+"""Most stiffnesses that a fit with starts in motion begins from."""
 
 _LOST = 1e-3
 """Cost [m] from which a trial may have a wrong start: readings of 3 mm."""
@@ -153,10 +157,47 @@ def _places(own: FilmedProblem) -> np.ndarray:
 
 
 def scout(own: FilmedProblem, starts: int, rng: np.random.Generator, report: Callback) -> np.ndarray:
-    """Return coordinates (N,) in the basin of the best fit: of the rope alone, cameras being where they are said to be.
+    """Return coordinates (N,) in the basin of the best fit, from many starts on the beginning of the trials.
 
-    Many starts are tried on the beginning of the trials, where a cost has few local minima; the best go on.
+    There a cost has few local minima; the best go on over longer and longer times.
     """
+    return _scout_moving(own, starts, report) if own.offset.shape[1] else _scout_resting(own, starts, rng, report)
+
+
+def _scout_moving(own: FilmedProblem, starts: int, report: Callback) -> np.ndarray:
+    """Fit rope, cameras and starts of trials in motion together, from several stiffnesses."""
+    lasts, stage = own.lasts, "trying starts"
+    shares = (min(1.0, START_WINDOW / lasts), 0.5, 0.7)
+    first = np.concatenate([own.fixed[list(own.free)], np.zeros(len(own.spines.nuisances.names))])
+    bend = own.free.index(own.model.parameters.index("bending_stiffness"))
+    found: list[tuple[Fit, np.ndarray, Start]] = []
+    factors = np.exp(_REACH[0] * np.linspace(-1, 1, int(np.clip(starts // 4, 3, _MOST))))
+    for k, factor in enumerate(factors):
+        report(stage, k, len(factors) + 2, "")
+        values = first.copy()
+        values[bend : bend + 2] *= factor  # twisting stiffness follows
+        begin_from_balance(own, own.full(values[None])[0])
+        raw = own.space.clip(own.space.to_raw(values))
+        fit_starts(own, raw, 3, seconds=0.5 * START_WINDOW)
+        found.append((fit(own, raw, 6, seconds=shares[0] * lasts, tolerance=2e-2), own.offset, own.start))
+    for share, keep, passes in ((shares[1], 3, 6), (shares[2], 2, 8)):
+        found = sorted(found, key=lambda each: total(each[0]))[:keep]
+        better = []
+        for each, own.offset, own.start in found:
+            improved = fit(own, each.raw, passes, seconds=share * lasts, tolerance=1e-2)
+            better.append((improved, own.offset, own.start))
+        found = better
+        report(stage, len(factors) + 2 - (share < shares[2]), len(factors) + 2, f"{1e3 * _least(found):.2f} mm")
+    best, own.offset, own.start = min(found, key=lambda each: total(each[0]))
+    return best.raw
+
+
+def _least(found: Sequence[tuple[Fit, np.ndarray, Start]]) -> float:
+    return min(total(each[0]) for each in found)
+
+
+def _scout_resting(own: FilmedProblem, starts: int, rng: np.random.Generator, report: Callback) -> np.ndarray:
+    """Fit the rope of trials that begin at rest first, cameras being where they are said to be."""
     whole, count = own.space, len(own.free)
     space = ParameterSpace(whole.names[:count], whole.params[:count], whole.sizes[:count])
     zero, lasts, looks = np.zeros(len(whole.names) - count), own.lasts, 3
@@ -175,7 +216,6 @@ def scout(own: FilmedProblem, starts: int, rng: np.random.Generator, report: Cal
         return lambda v: simulate(np.concatenate([v, np.zeros((len(v), len(zero)))], 1)), target
 
     report("trying starts", 0, looks, "")
-    refine_start(own, whole.to_values(full(raws[0])), passes=3)
     simulate, target = over(0.35)
     cost = levenberg_marquardt.costs(simulate(space.to_values(raws)), target, own.extent)
     raws = raws[np.argsort(cost, kind="stable")[: max(2, starts // 4)]]
@@ -186,11 +226,7 @@ def scout(own: FilmedProblem, starts: int, rng: np.random.Generator, report: Cal
         pass
     points = _different(points, 3)
     report("trying starts", 2, looks, f"{1e3 * points[0].cost:.2f} mm over 35 % of the time")
-    begun, found = own.offset, []
-    for p in points:
-        own.offset = begun
-        found.append((fit(own, full(p.raw), 4, seconds=0.7 * lasts, tolerance=2e-2), own.offset))
-    best, own.offset = min(found, key=lambda pair: total(pair[0]))
+    best = min((fit(own, full(p.raw), 4, seconds=0.7 * lasts, tolerance=2e-2) for p in points), key=total)
     report("trying starts", looks, looks, f"{1e3 * best.cost:.2f} mm over 70 % of the time")
     return best.raw
 

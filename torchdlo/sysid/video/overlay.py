@@ -16,7 +16,7 @@ from torchdlo.vision.spine import curve_vectors
 if TYPE_CHECKING:
     from torchdlo.sysid.video.filmed_problem import FilmedProblem
 
-__all__ = ["drawn_masks", "mask_overlaps", "overlays"]
+__all__ = ["boundary_f", "drawn_masks", "mask_overlaps", "overlays"]
 
 
 def drawn_masks(
@@ -69,13 +69,16 @@ def _without_grippers(pixel: torch.Tensor, points: torch.Tensor, radius: float) 
     return cut, ((number >= first) & (number <= final)).expand(pixel.shape[:-1])
 
 
-def mask_overlaps(own: FilmedProblem, sims: np.ndarray, numbers: np.ndarray) -> list[float]:
-    """Return the intersection over union of simulated and measured masks by trial, mean over good pictures and views.
+def mask_overlaps(own: FilmedProblem, sims: np.ndarray, numbers: np.ndarray) -> list[tuple[float, float]]:
+    """Return how simulated and measured masks agree by trial, mean over good pictures and views.
 
     Args:
         own: the problem; ropes are drawn as thick as masks are, which depends on where colours were cut off.
         sims: places of the rope [m], shape (B, T, M, 3).
         numbers: those of all cameras, shape (Q,).
+
+    Returns:
+        Intersection over union, and `boundary_f`, of each trial.
     """
     out = []
     for b in range(len(own.trials)):
@@ -89,9 +92,27 @@ def mask_overlaps(own: FilmedProblem, sims: np.ndarray, numbers: np.ndarray) -> 
             share = np.median(measured.sum((1, 2)) / np.maximum(model.sum((1, 2)), 1))
             model = drawn_masks(own, k, sims[b], numbers, frames, np.clip(share, 0.6, 1.6) * view.half_width, b) > 0.5
             both, either = (model & measured).sum((1, 2)), (model | measured).sum((1, 2))
-            parts.append(float(np.mean(both / np.maximum(either, 1))))
-        out.append(float(np.mean(parts)))
+            edges = np.mean([boundary_f(a, c) for a, c in zip(model, measured, strict=True)])
+            parts.append((float(np.mean(both / np.maximum(either, 1))), float(edges)))
+        share, edges = np.mean(parts, 0)
+        out.append((float(share), float(edges)))
     return out
+
+
+def boundary_f(found: np.ndarray, true: np.ndarray) -> float:
+    """Return the boundary F-measure of a mask (H, W) against another one, with a tolerance of one pixel [1].
+
+    Harmonic mean of the shares of either boundary that are within a pixel of the other one (Csurka et al. 2013,
+    doi:10.5244/C.27.32). Unlike the intersection over union it does not fall with the width of what is seen.
+    """
+    import cv2
+
+    cross = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
+    edges = [mask.astype(np.uint8) - cv2.erode(mask.astype(np.uint8), cross) for mask in (found, true)]
+    shares = [
+        float((edge * cv2.dilate(other, cross)).sum() / max(edge.sum(), 1)) for edge, other in (edges, edges[::-1])
+    ]
+    return 2 * shares[0] * shares[1] / max(sum(shares), 1e-12)
 
 
 def overlays(own: FilmedProblem, split: str, sims: np.ndarray, numbers: np.ndarray) -> list[Overlay]:
