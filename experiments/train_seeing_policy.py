@@ -14,6 +14,7 @@ import copy
 import math
 import multiprocessing
 import os
+import shutil
 import sys
 import tempfile
 import time
@@ -42,6 +43,7 @@ from torchdlo.envs import Task, find, with_fidelity
 from torchdlo.envs.core import episode
 from torchdlo.envs.observations.pixels import camera_rig, placed
 from torchdlo.files import replace_atomically
+from torchdlo.journal import locked
 from torchdlo.vision import renderer
 from torchdlo.vision.look import draw_look
 
@@ -412,9 +414,12 @@ def main(words: Sequence[str] | None = None) -> None:
         return
     out = Path(given.out)
     out.parent.mkdir(parents=True, exist_ok=True)
-    tasks = [demonstrations(name, given) for name in names]
-    with tempfile.TemporaryDirectory(prefix=".pictures-", dir=out.parent) as album:
-        learner, curve = learned(tasks, given, Path(album))
+    tasks, prefix = [demonstrations(name, given) for name in names], f".pictures-{out.stem}-"
+    with locked(out.parent, f".{out.name}.lock"):
+        for left in out.parent.glob(f"{prefix}*"):
+            shutil.rmtree(left, ignore_errors=True)  # of a run that was killed
+        with tempfile.TemporaryDirectory(prefix=prefix, dir=out.parent) as album:
+            learner, curve = learned(tasks, given, Path(album))
     about = {
         "tasks": names,
         "sentences": [text for name in names for text in sentences.training_instructions(name)],

@@ -95,6 +95,7 @@ def test_painters_fill_the_album_and_the_policy_can_be_loaded(script, tmp_path: 
 
     monkeypatch.setattr(script.multiprocessing, "get_context", lambda kind: type("Context", (), {"Process": Here}))
     out = tmp_path / "policy.pt"
+    (tmp_path / ".pictures-policy-killed").mkdir()
     script.main([*WORDS, "--scenes", str(tmp_path / "scenes"), "--steps", "3", "--out", str(out)])
     policy, about = load_policy(out)
     assert about["tasks"] == ["short", "pair"] and about["curve"][-1]["pictures"] == 24

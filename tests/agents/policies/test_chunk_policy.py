@@ -20,10 +20,10 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "data"))
 from short_task import SHORT, Dots, plan
 
 from torchdlo import envs
-from torchdlo.agents.data import check_dataset, open_set
+from torchdlo.agents.data import check_dataset, open_set, sentences
 from torchdlo.agents.data.making import make_dataset
 from torchdlo.agents.data.record import Noise, draw_starts, play_batch
-from torchdlo.agents.policies import chunk_training, language
+from torchdlo.agents.policies import chunk_rollout, chunk_training, language
 from torchdlo.agents.policies.chunk_policy import ChunkPolicy, NetworkShape, load_policy, save_policy
 from torchdlo.agents.policies.chunk_rollout import PolicyDemonstrator, evaluate_chunk_policy
 from torchdlo.agents.policies.chunk_training import Training, train_chunk_policy
@@ -267,3 +267,12 @@ def test_a_policy_looks_again_after_some_actions_and_follows_its_chunk_between()
     with torch.no_grad():
         play_batch(made, draw_starts(task, 0, range(2)), actor, Noise(0.0), Counting())
     assert seen == [0, 8]
+
+
+def test_swapped_instructions_are_those_of_what_else_the_policy_has_learned() -> None:
+    (start,) = draw_starts(envs.find("coiling"), 0, [0])
+    told = chunk_rollout._told(start, "coiling", ["coiling", "separation"], "swapped").told
+    assert told in sentences.training_instructions("separation")
+    (start,) = draw_starts(envs.find("coiling_left"), 0, [0])
+    told = chunk_rollout._told(start, "coiling_left", ["coiling_left", "separation"], "swapped").told
+    assert told in sentences.training_instructions("coiling_right")
