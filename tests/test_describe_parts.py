@@ -368,3 +368,11 @@ def test_the_files_shown_in_the_documentation_fit(repository):
     # It grips where the rope lies.
     tool, middle = made.plan.tools.pos[300, 0], made.state.rods.pos[15]
     assert made.plan.closed[299:301, 0, 0].tolist() == [0.0, 1.0] and float((tool - middle).norm()) < 1e-4
+
+
+def test_a_clamp_at_the_vertex_reaches_the_scene_and_is_refused_where_holds_open():
+    given = change(FALL, attachments=(Attachment((0, 1)),), clamp="vertex")
+    share = scene_files.assemble(given).params.rods.rest.share
+    assert float(share[1]) == pytest.approx(0.5) and float((share - 1).abs().sum()) == pytest.approx(0.5)
+    with pytest.raises(InputError, match="released during the run"):
+        scene_files.assemble(change(given, attachments=(Attachment((0, 1), release=0.05),)))

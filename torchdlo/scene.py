@@ -10,6 +10,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import partial, reduce
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -218,6 +219,7 @@ def make(
     bodies: Sequence[RigidBody] = (),
     material_points: tuple[MpmDomain, ParticleParams, Particles] | tuple[()] = (),
     check: bool = True,
+    clamp: Literal["edge", "vertex"] = "edge",
     **choices,
 ) -> tuple[Scene, Params, State]:
     """Build a scene with its parameters and its initial state.
@@ -232,10 +234,16 @@ def make(
         check: whether to refuse what could not be stepped: laws that do not fit the ropes, ropes far from their length,
             unstable substeps; and to move ropes that start inside of what they touch out of it. Scenes whose loads are
             only evaluated may be anything.
+        clamp: where neighbouring `prescribed_vertices` clamp a rope: in the middle of the last edge between them, or at
+            the last vertex; for what stays held, as the hinge there is stiffer by the length that is left out.
         choices: fields of `Scene`.
     """
     validation.check_sequence(effects, Effect, "effects")
+    if clamp not in ("edge", "vertex"):
+        raise ValueError(f"scene: clamp is {clamp!r}; expected 'edge' or 'vertex'")
     topology, rods, state = assembly.assemble(ropes)
+    if clamp == "vertex":
+        rods = assembly.clamp_at_vertices(topology, rods, choices.get("prescribed_vertices", ()))
     kinds, solid, placed = place_bodies(bodies, state.pos) if bodies else ((), (), ())
     if bodies:
         batch = torch.broadcast_shapes(state.pos.shape[:-2], placed.pos.shape[:-2])

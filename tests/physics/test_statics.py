@@ -60,6 +60,22 @@ def test_small_tip_load_bends_by_the_beam_formula():
     assert float(tip_loaded(40, 1e-3)[0]) == pytest.approx(1e-3 / 3, rel=5e-4)
 
 
+@pytest.mark.parametrize(
+    ("clamp", "edges", "off"), [("vertex", 11, 0.005), ("vertex", 21, 0.00125), ("edge", 11, 0.16)]
+)
+def test_ropes_are_clamped_at_the_vertex_where_that_is_asked_for(clamp, edges, off):
+    # F L^3 / 3 B for the length L beyond the second held vertex. At the vertex: the trapezoidal rule, 1 / (2 n^2) too
+    # much with n free edges; in the middle of the edge before it: (L + h / 2)^3 but for 1 / (4 n^2).
+    h, a = 1.0 / (edges - 1), 1e-3
+    x = straight(edges + 1, edges * h, start=-h)
+    scene, params, state = make(
+        [Rope(x, mass=1.0, bend=1.0)], effects("bend"), dt=1e-6, prescribed_vertices=(0, 1), clamp=clamp
+    )
+    rod = Statics(scene, params, state, fixed=CLAMPED, potential=lambda pos, share: share * a * pos[-1, 2])
+    drop = float(-rod.solve([1.0], reach=1.0).rods.pos[-1, 2])
+    assert drop / (a / 3) - 1 == pytest.approx(off, rel=0.05)
+
+
 def weighted(n_edges: int, gamma: float) -> tuple[Statics, State]:
     """Cantilever under its own weight, gamma = w L^3 / B."""
     scene, params, state = cantilever(n_edges, density=1.0 / math.pi / 0.01**2, radius=0.01, bend=G / gamma)

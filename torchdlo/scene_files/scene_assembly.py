@@ -110,7 +110,7 @@ def assemble(description: SceneDescription, *, folder: str | Path = ".") -> Simu
     for arm in armed:
         bodies += robots.solids(arm.robot, arm.joints[0])
     scene, params, state = scenes.make(
-        ropes, effects, values, bodies=bodies, material_points=_matter(d, dtype), **held, **static
+        ropes, effects, values, bodies=bodies, material_points=_matter(d, dtype), clamp=d.clamp, **held, **static
     )
     weight = _weights(d, counts, state.rods.pos)
     material = tree.replace(params.rods.material, mass=params.rods.material.mass + weight)
@@ -120,6 +120,11 @@ def assemble(description: SceneDescription, *, folder: str | Path = ".") -> Simu
 
 def _check_holds(d: SceneDescription) -> None:
     for k, hold in enumerate(d.attachments):
+        if d.clamp == "vertex" and (hold.close > 0 or hold.release is not None):
+            raise InputError(
+                f"attachments[{k}]: it is closed or released during the run, and clamp 'vertex' makes the rope stiffer "
+                "where it is held; use clamp 'edge'."
+            )
         if hold.robot is not None and not 0 <= hold.robot < len(d.robots):
             raise InputError(
                 f"attachments[{k}].robot: expected the number of a robot, 0 to {len(d.robots) - 1}, given {hold.robot}."

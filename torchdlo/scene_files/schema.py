@@ -212,6 +212,8 @@ class SceneDescription:
     """Share of a substep's change at which implicit steps take stiff forces and tensions."""
     numerical_damping: float = 0.0
     """Share of a substep by which implicit steps look ahead, 0 to 1: it damps fast modes."""
+    clamp: Literal["edge", "vertex"] = "edge"
+    """Where two neighbouring held vertices clamp a rope: in the middle of their edge, or at the last of them."""
     precision: Literal["float64", "float32"] = "float64"
     """Type of all numbers."""
     camera_direction: Vector = (0.5, -1.0, 0.45)

@@ -71,6 +71,30 @@ class Rope:
     """Bending stiffness [N m^2] against bending towards the second material director if it differs from `bend`."""
 
 
+def clamp_at_vertices(topology: Topology, rods: RodParams, held: Sequence[int]) -> RodParams:
+    """Return rods that are clamped at the last held vertex of a run of them, not in the middle of its edge.
+
+    The hinge there stands for half of the free edge only. The tip of a beam of n edges then sags as in beam theory to
+    within 1 / (2 n^2).
+
+    Args:
+        topology: the rods.
+        rods: their parameters.
+        held: held vertices.
+    """
+    after, mask = topology.successor(), topology.edge_mask()
+    length, both = rods.rest.length, rods.rest.length + preceding(topology, rods.rest.length)
+    share = rods.rest.share.expand(*rods.rest.share.shape[:-2], topology.size, 1)
+    for before, k in enumerate(after):
+        onward = k in held and mask[before] > 0 and mask[k] > 0
+        if not onward or (before in held) == (after[k] in held):
+            continue
+        free = length[..., k, :] if before in held else length[..., before, :]
+        there = torch.arange(topology.size, device=share.device).unsqueeze(-1) == k
+        share = torch.where(there, (free / both[..., k, :]).unsqueeze(-2), share)
+    return tree.replace(rods, rest=tree.replace(rods.rest, share=share))
+
+
 def bishop(topology: Topology, pos: Tensor, edge_mask: Tensor, first: Sequence[Tensor | None]) -> Tensor:
     """Return directors without twist along each rod, shape (..., V, 3); the holonomy of loops is spread evenly.
 
