@@ -13,6 +13,7 @@ from torch import Tensor
 
 from torchdlo.envs.assets.rope_material import RopeMaterial
 from torchdlo.errors import InputError
+from torchdlo.physics import tree
 from torchdlo.physics.rod.assembly import frame_curvature
 from torchdlo.physics.rod.topology import Topology
 from torchdlo.scene_files.schema import RopeSpec, SceneDescription
@@ -41,7 +42,7 @@ class Modelled:
         """Return the natural curvature at evenly spaced vertices [1/m], shape (count, 2)."""
         from scipy.interpolate import CubicSpline
 
-        points = self.shape
+        points = tree.part(self.shape)
         along = torch.cat([points.new_zeros(1), (points[1:] - points[:-1]).norm(dim=-1).cumsum(0)])
         even = torch.linspace(0, float(along[-1]), count, dtype=points.dtype)
         line = torch.as_tensor(CubicSpline(along.numpy(), points.numpy(), axis=0)(even.numpy()))

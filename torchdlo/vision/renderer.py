@@ -259,8 +259,8 @@ def _painted(model: RenderModel, look: Look) -> tuple[np.ndarray, np.ndarray, np
         [look.ropes[k % len(look.ropes)] for k in range(len(model.counts))],
         [look.particles[k % len(look.particles)] for k in range(groups)],
     )
-    rows = (np.array([p.numbers() for p in kind], np.float32).reshape(-1, 12) for kind in kinds)
-    return *rows, np.array(look.lights(model.floor_height), np.float32)
+    pieces, ropes, grains = (np.array([p.numbers() for p in kind], np.float32).reshape(-1, 12) for kind in kinds)
+    return pieces, ropes, grains, np.array(look.lights(model.floor_height), np.float32)
 
 
 def renderer_inputs(

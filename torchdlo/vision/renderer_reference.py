@@ -103,8 +103,9 @@ def _mesh(scene: dict[str, Array], pixels: float) -> _Mesh:
         owner.append(np.full(len(found[3]), pieces + rope))
         casts.append(np.ones(len(found[3]), bool))
         start += len(found[0])
-    parts_ = [np.concatenate(x) for x in (pos, normal, uv, face, owner, casts)]
-    return _Mesh(*(x.astype(np.float32) for x in parts_[:3]), parts_[3].astype(int), *parts_[4:])
+    places = (np.concatenate(x).astype(np.float32) for x in (pos, normal, uv))
+    faces, owners, shadows = (np.concatenate(x) for x in (face, owner, casts))
+    return _Mesh(*places, face=faces.astype(int), owner=owners, casts=shadows)
 
 
 def tube(x: Array, radius: Array, closed: bool, sides: int, parts: int) -> tuple[Array, Array, Array, Array]:

@@ -206,7 +206,7 @@ def _from_folder(path: Path) -> np.ndarray:
     files = sorted(path.glob("*.png"))
     if not files:
         raise InputError(f"{path}: expected PNG files, one for each frame, found none.")
-    pictures = []
+    pictures: list[np.ndarray] = []
     for file in files:
         picture = cv2.imread(str(file), cv2.IMREAD_COLOR)
         if picture is None:

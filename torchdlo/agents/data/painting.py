@@ -11,6 +11,7 @@ from torch import Tensor
 
 from torchdlo.envs.core import episode
 from torchdlo.envs.observations.pixels import CameraRig, camera_rig, render_cameras
+from torchdlo.physics import tree
 from torchdlo.vision.look import Look, draw_look
 
 __all__ = ["TaskPainter"]
@@ -46,4 +47,4 @@ class TaskPainter:
         seen = render_cameras(
             rig, world.state, world.joints, looks=[_look(seed, self.jitter) for seed in looks], **quality
         ).rgb
-        return {camera.name: seen[:, k] for k, camera in enumerate(rig.cameras)}
+        return {camera.name: tree.part(seen)[:, k] for k, camera in enumerate(rig.cameras)}

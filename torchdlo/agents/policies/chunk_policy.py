@@ -90,6 +90,11 @@ class _Eye(nn.Module):
 class ChunkPolicy(nn.Module):
     """The network. States and targets are scaled by statistics that it keeps with its weights."""
 
+    state_mean: Tensor
+    state_std: Tensor
+    target_mean: Tensor
+    target_std: Tensor
+
     def __init__(self, shape: NetworkShape) -> None:
         """Make it, with weights drawn from torch's generator."""
         super().__init__()

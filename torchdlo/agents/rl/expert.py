@@ -128,7 +128,7 @@ class _Journal:
     """A file of scores, batch after batch: a search asks for the same ones again when it is run again."""
 
     def __init__(self, path: Path | None, choices: list[Any]) -> None:
-        self.path, self.choices, self.rows = path, choices, []
+        self.path, self.choices, self.rows = path, choices, list[Any]()
         self.ahead: list[list[list[float]]] = []
         found = None if path is None else read_json(path)
         if found is not None and found.get("choices") == choices:

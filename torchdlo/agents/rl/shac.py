@@ -257,7 +257,7 @@ class Sapo(Shac):
 
 def _detached(window: Window) -> Window:
     names = ("features", "action", "log_prob", "reward", "failed", "begun", "success")
-    return Window(*(getattr(window, name).detach() for name in names), window.ends)
+    return Window(*(getattr(window, name).detach() for name in names), ends=window.ends)
 
 
 def _joined(windows: list[Window]) -> Batch:

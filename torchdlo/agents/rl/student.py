@@ -142,7 +142,7 @@ def _play(
     """Play a batch from where it begins; return which episodes succeeded and which failed, bool (N,)."""
     env, reach = episodes.env, episodes.task.max_translation
     seen, start = episodes.first, env.world.tool.pos.float()
-    alive, step = torch.ones(episodes.count, dtype=torch.bool), None
+    alive = torch.ones(episodes.count, dtype=torch.bool)
     for k in range(episodes.horizon):
         cloud, tool, share = eyes.see(episodes), env.world.tool.pos.float(), episode_progress(episodes, k, seen)
         done = student(cloud, tool, start, share)

@@ -56,7 +56,7 @@ def draw_population(found: Any, encoding: Encoding, given: Tensor | None = None)
     The strategy is told of what was played, not of what it drew: it would else go on where limits make all alike.
     """
     count = 0 if given is None else len(given)
-    if count:
+    if given is not None and count:
         found.inject(list(given.numpy()), force=True)
     x = torch.stack([torch.as_tensor(x) for x in found.ask()])
     # Points that were given are known to the strategy by their last bit.

@@ -168,7 +168,7 @@ def _island(plan: SearchPlan, rng: torch.Generator, first: int = 0, about: Tenso
         def turn(part: _Evolution | Descent, k: int = k) -> tuple[bool, float, int]:
             return k - last[part] >= _TURN, gain[part], -last[part]
 
-        part = coarse if k < alone else max((coarse, fine), key=turn)
+        part: _Evolution | Descent = coarse if k < alone else max((coarse, fine), key=turn)
         x = part.ask()
         told = yield Ask(encoding, x, with_gradient, best_indices if part is coarse else fine.pick)
         told = tame(told)

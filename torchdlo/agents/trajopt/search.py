@@ -172,7 +172,8 @@ def optimize(
     search = METHODS[settings.method](plan, torch.Generator().manual_seed(settings.seed))
     if settings.method not in SURROGATE_ROUND:
         search = search_surrogate(search, plan)
-    told, curve, interrupted = None, [], False
+    curve: list[dict[str, Any]] = []
+    told, interrupted = None, False
     best = _Best(robust.finalists if robust else _FINALISTS)
     try:
         for k in range(plan.iterations):

@@ -95,7 +95,7 @@ class TaskProblem:
     @functools.cached_property
     def _places(self) -> tuple[tuple[tuple[float, float, float], ...], ...]:
         scene, _, state = self.task.start(1, like=torch.zeros((), dtype=torch.float64))
-        things = [state.bodies.pos[0, k] for k, body in enumerate(scene.bodies) if body.shape != "plane"]
+        things = [tree.part(state.bodies).pos[0, k] for k, body in enumerate(scene.bodies) if body.shape != "plane"]
         if state.material_points:
             things.append(state.material_points.pos[0].mean(0))
         tools = state.rods.pos[0, list(self.task.arms.vertex)]
@@ -182,7 +182,7 @@ class Varied:
         went = episode.play(task, self.inner.full(actions).repeat_interleave(self.copies, 0), episode=base)
         went = tree.map(lambda x: x.reshape(len(actions), self.copies), _outcome(went))
         means = (x.mean(-1) for x in (went.returns, went.loss, went.terminal_cost))
-        return Evaluation(*means, went.success.all(-1), went.failed.any(-1))
+        return Evaluation(*means, success=went.success.all(-1), failed=went.failed.any(-1))
 
 
 def _outcome(went: episode.EpisodeResult) -> Evaluation:

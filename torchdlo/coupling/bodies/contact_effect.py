@@ -46,7 +46,7 @@ from torchdlo.coupling.bodies.contact_solver import BodySystem, Links, gather, i
 from torchdlo.coupling.bodies.dynamics import Body, PredictedBodyMotion
 from torchdlo.coupling.common.coulomb_friction import rebound_separation, separation_needed
 from torchdlo.physics import tree
-from torchdlo.physics.effects.base import ContactForces, Effect, PredictedMotion, Values
+from torchdlo.physics.effects.base import ContactForces, Effect, EffectKind, PredictedMotion, Values
 from torchdlo.physics.linalg.numerics import dot, safe_norm
 from torchdlo.physics.rod.kinematics import View
 
@@ -171,7 +171,6 @@ def _settled(system: BodySystem, dt: float, slowest: float, rounds: int) -> tupl
     links = system.links
     near = (links.wanted - dot(links.normal, links.free) > -slowest * dt).to(links.wanted.dtype)
     sets = _Sets(near, torch.ones_like(near), torch.zeros_like(near), torch.zeros_like(links.normal))
-    q = None
     for _ in range(rounds):
         gradients = _slopes(links, sets, None, None)
         stays = links.stiff * sets.press * links.wanted * links.normal - (gradients @ links.free.unsqueeze(-1)).squeeze(
@@ -265,7 +264,7 @@ class BodyContact(Effect):
     """Approach below which nothing rebounds [m/s]."""
 
     name: ClassVar[str] = "body_contact"
-    kind: ClassVar[str] = "force"
+    kind: ClassVar[EffectKind] = "force"
     is_contact: ClassVar[bool] = True
 
     def __post_init__(self) -> None:

@@ -47,7 +47,7 @@ from torchdlo.coupling.mpm.particles import Grid
 from torchdlo.coupling.mpm.rod_coupling_effect import PredictedParticles, TouchedParticles
 from torchdlo.coupling.mpm.substep import Nodes, places
 from torchdlo.physics import tree
-from torchdlo.physics.effects.base import ContactForces, Effect
+from torchdlo.physics.effects.base import ContactForces, Effect, EffectKind
 from torchdlo.physics.linalg.numerics import cross, dot, safe_norm
 from torchdlo.physics.linalg.rotation import rotate
 
@@ -74,7 +74,7 @@ class BodyMpmCoupling(Effect):
     """Whether planes take part. Not where walls of the box stand for them, which cost less."""
 
     name: ClassVar[str] = "body_mpm_coupling"
-    kind: ClassVar[str] = "force"
+    kind: ClassVar[EffectKind] = "force"
 
     def __post_init__(self) -> None:
         for name, least in (("sweeps", 1), ("room", 0), ("reach", 0.0), ("recovery", 0.0)):

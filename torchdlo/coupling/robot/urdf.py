@@ -178,9 +178,10 @@ def _joint(where: str, element: xml.Element, links: tuple[str, ...]) -> Joint:
     return Joint(
         name,
         MOVING.get(kind, "fixed"),
-        *ends,
+        ends[0],
+        ends[1],
         _origin(here, element),
-        tuple(c / size for c in direction),
+        (direction[0] / size, direction[1] / size, direction[2] / size),
         lower,
         upper,
         velocity,

@@ -57,9 +57,9 @@ from torchdlo.coupling.rod_contact.closest_points import closest_points
 from torchdlo.coupling.rod_contact.rod_contact_op import WEAK
 from torchdlo.physics import tree
 from torchdlo.physics.constraints.contact_penalty import Pairs
-from torchdlo.physics.effects.base import Effect, Param, PredictedMotion, Values
+from torchdlo.physics.effects.base import Effect, EffectKind, Param, PredictedMotion, Values
 from torchdlo.physics.linalg.gather_scatter import Four, columns, corners, drop, pick
-from torchdlo.physics.linalg.numerics import cross, dot, safe_norm
+from torchdlo.physics.linalg.numerics import added, cross, dot, safe_norm
 from torchdlo.physics.rod.kinematics import View
 
 
@@ -134,7 +134,7 @@ class _Couple:
 
     def seen(self, change: Four) -> Tensor:
         """Return the rigid turn in displacements of the corners [rad], shape (..., K, 3)."""
-        return self.turn(sum(cross(arm, d) for arm, d in zip(self.arm, change, strict=True)))
+        return self.turn(added(cross(arm, d) for arm, d in zip(self.arm, change, strict=True)))
 
     def softness(self, contacts: Contacts) -> Tensor:
         """Return by how much the couple adds to the slip under one newton at most [m/N], shape (..., K, 1)."""
@@ -195,7 +195,7 @@ class RodContact(Effect):
     """Approach below which nothing rebounds [m/s]."""
 
     name: ClassVar[str] = "rod_contact"
-    kind: ClassVar[str] = "force"
+    kind: ClassVar[EffectKind] = "force"
     is_contact: ClassVar[bool] = True
     engages: ClassVar[bool] = True
     params: ClassVar[dict[str, Param]] = {
@@ -379,6 +379,6 @@ def _softness(
     load = drop(tuple(w * pressed for w in weight), at, size)
     four = pick(columns([load * give, load * free, give.expand_as(load), free.expand_as(load)]), at)
     mine = 1 - pressed
-    normal = sum(w * (c[..., :1] + mine * w * c[..., 2:3]) for w, c in zip(weight, four, strict=True))
-    slip = sum(w * (c[..., 1:2] + mine * w * c[..., 3:]) for w, c in zip(weight, four, strict=True))
+    normal = added(w * (c[..., :1] + mine * w * c[..., 2:3]) for w, c in zip(weight, four, strict=True))
+    slip = added(w * (c[..., 1:2] + mine * w * c[..., 3:]) for w, c in zip(weight, four, strict=True))
     return normal, slip

@@ -20,6 +20,7 @@ from torchdlo.envs.observations.pixels import (
     views,
 )
 from torchdlo.errors import InputError
+from torchdlo.physics import tree
 from torchdlo.vision.look import Look
 
 __all__ = ["Sensor", "sensor_of"]
@@ -66,7 +67,7 @@ class Sensor:
         found: dict[str, dict[str, Tensor] | Tensor] = {}
         for kind in self.shapes():
             if kind != "points":
-                found[kind] = {c.name: parts[kind][:, k] for k, c in enumerate(rig.cameras)}
+                found[kind] = {c.name: tree.part(parts[kind])[:, k] for k, c in enumerate(rig.cameras)}
                 continue
             make = self.points if callable(self.points) else rope_points
             found[kind] = make(seen, views(rig, world.state, world.joints))

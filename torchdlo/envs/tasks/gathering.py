@@ -20,6 +20,7 @@ from torchdlo.coupling.mpm.particles import Grid, ParticleBlock, assemble, fill_
 from torchdlo.envs.assets.rigid_objects import pebble
 from torchdlo.envs.core import curve_geometry
 from torchdlo.envs.core.task import RADIUS, Arms, Task, TaskState, make, straight
+from torchdlo.physics import tree
 from torchdlo.physics.linalg.numerics import safe_norm
 from torchdlo.scene import Params, Rope, Scene, State
 
@@ -77,7 +78,13 @@ class Gathering(Task):
 
     def _objects(self, seen: TaskState) -> Tensor:
         """Return the centres of the objects [m], shape (B, 3, 3)."""
-        return torch.cat([seen.state.material_points.pos.mean(-2, keepdim=True), seen.state.bodies.pos[:, 1:]], -2)
+        return torch.cat(
+            [
+                tree.part(seen.state.material_points).pos.mean(-2, keepdim=True),
+                tree.part(seen.state.bodies).pos[:, 1:],
+            ],
+            -2,
+        )
 
     def _apart(self, seen: TaskState) -> Tensor:
         """Return how far each two objects are from each other [m], shape (B, 3)."""
@@ -147,4 +154,4 @@ class GatheringSurrogate(Gathering):
         """Return nothing: this is it."""
 
     def _objects(self, seen: TaskState) -> Tensor:
-        return seen.state.bodies.pos[:, 1:]
+        return tree.part(seen.state.bodies).pos[:, 1:]

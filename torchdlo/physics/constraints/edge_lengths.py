@@ -388,8 +388,9 @@ def _balanced(
     (free, tension), (moved, force, direction, ahead, scale) = scalars, vectors
     system = LengthSystem(lengths, inertia, moved, free, force, scale, direction, ahead, turning)
     inputs, law = system.inputs(tension)
-    law = (*law, steps, _done(force), 1.0)
-    return tuple(lanes.apply("balance", lengths.topology.name, inputs, (3, 1, 3), "saddle", law))
+    numbers = (*law, steps, _done(force), 1.0)
+    pos, found, push = lanes.apply("balance", lengths.topology.name, inputs, (3, 1, 3), "saddle", numbers)
+    return pos, found, push
 
 
 def saddle_order(topology: Topology) -> list[int]:

@@ -24,7 +24,7 @@ from torchdlo.physics.constraints.edge_lengths import Inertia, Lengths, LengthSy
 from torchdlo.physics.integrators import contact_kernel
 from torchdlo.physics.kernels import lanes
 from torchdlo.physics.linalg import banded, gather_scatter, low_rank
-from torchdlo.physics.linalg.numerics import dot
+from torchdlo.physics.linalg.numerics import added, dot
 from torchdlo.physics.rod.topology import Topology, following, parse, preceding
 
 TRIES = ((HARD, 10), (0.1 * HARD, 24), (0.01 * HARD, 24))
@@ -197,7 +197,7 @@ class Touching:
 
 def _left(forces: Tensor, sizes: tuple[Tensor, ...], excess: Tensor, rest: Tensor) -> Tensor:
     """Return what is left of the equations over what is in them, and of lengths over lengths [1], shape (..., 1, 1)."""
-    size = sum(x.abs() for x in sizes)
+    size = added(x.abs() for x in sizes)
     left = forces.abs().amax((-2, -1), keepdim=True) / size.amax((-2, -1), keepdim=True).clamp(min=1e-30)
     return torch.maximum(left, (excess.abs() / rest).amax(-2, keepdim=True))
 
@@ -255,7 +255,8 @@ def solve_contact_step(touching: Touching, tension: Tensor) -> tuple[Tensor, Ten
     """
     system = touching.system
     if lanes.ready(system.force) and contact_kernel.available(system.force):
-        return tuple(_searched(touching, tension, True)[4:])
+        pos, tension, force, exerted, wrench, left = _searched(touching, tension, True)[4:]
+        return pos, tension, force, exerted, wrench, left
     with torch.no_grad():
         pos, found, bodies, hard = _searched(touching, tension)
     firm = touching.firm(tension, hard)
@@ -288,10 +289,9 @@ def _equations(
 ) -> tuple[Touching, Tensor]:
     rest, compliance, active, mask, give, hinge, swing, free, tension, vertex, moved, *others, scale = inputs
     lengths = Lengths(parse(topology), rest, compliance, active, mask, give, *law[1:3])
-    system = LengthSystem(
-        lengths, Inertia(vertex, hinge, rest, mask, swing), moved, free, others[0], scale, *others[1:], law[0]
-    )
-    between = Pairs(*pairs[:6], tuple(pairs[6:])) if pairs else None
+    inertia = Inertia(vertex, hinge, rest, mask, swing)
+    system = LengthSystem(lengths, inertia, moved, free, others[0], scale, *others[1:], turning=law[0])
+    between = Pairs(*pairs[:6], linear=tuple(pairs[6:])) if pairs else None
     return Touching(system, Touch(*parts), origin, between, law[-1]), tension
 
 

@@ -155,8 +155,7 @@ def _job(pool: Pool, rest: str, vertices: int | None, given: ModelFile | None) -
     recording = pool.recording
     trials = _usable(recording)
     if given is None:
-        options = {"rest": rest}
-        model = pool.local.model((), tuple(options.items()))
+        model = pool.local.model((), (("rest", rest),))
         space, values = ParameterSpace(tuple(model.parameters), tuple(model.params)), model.guess()
     else:
         options = {} if vertices is None else {"vertices": vertices}
@@ -320,7 +319,7 @@ def _refined(job: _Job, iterations: int, vertices: int | None, report: Callback)
     first = FitJob(job.model.effects, job.values[None], names, sizes, iterations, options=options)
     clamps = _CLAMPS if finer and job.model.mesh.clamps else ()
     model = job.model
-    own = {"numerical_damping": model.numerical_damping, "clamp_fraction": model.clamp_fraction}
+    own: dict[str, Any] = {"numerical_damping": model.numerical_damping, "clamp_fraction": model.clamp_fraction}
     own |= {"vertices": pool.local.options.get("vertices"), "substep": (1 + 1e-9) * model.dt / model.substeps}
     job = replace(job, options=tuple((own | dict(job.options)).items()))
     try:

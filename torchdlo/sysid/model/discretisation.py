@@ -105,7 +105,8 @@ def make_mesh(trial: Trial, length: float, vertices: int | None) -> Mesh:
     if length > markers[-1] * 1.01:
         stations.append(length)
     wanted = length / ((vertices or 2 * len(markers)) - 1)
-    parts, at = [], []
+    parts: list[np.ndarray] = []
+    at: list[int] = []
     for a, b in itertools.pairwise(stations):
         at.append(sum(len(p) for p in parts))
         pieces = max(1, round((b - a) / wanted))

@@ -225,9 +225,8 @@ def _judged(
     ]
     predictions = {trial.name: sims[:, b, : len(trial.time)] for b, trial in enumerate(here.trials)}
     shown = overlays(here, split, sims, np.stack([first, values])[:, numbers:])
-    return _Judged(
-        trials, predictions, shown, [t["name"] for t, calm in zip(trials, here.start.still, strict=True) if not calm]
-    )
+    moving = [trial.name for trial, calm in zip(here.trials, here.start.still, strict=True) if not calm]
+    return _Judged(trials, predictions, shown, moving)
 
 
 def doubts(trials: Sequence[dict[str, Any]], moving: Sequence[str]) -> list[str]:
