@@ -146,7 +146,13 @@ def diagnose(
     names = ("findings.json", "model.json", report.PAGE)
     for name in names:
         check_writable(out / name)
-    options = {"budget": budget, "seed": seed, "vertices": vertices, "trials": trials, "workers": workers}
+    options: dict[str, Any] = {
+        "budget": budget,
+        "seed": seed,
+        "vertices": vertices,
+        "trials": trials,
+        "workers": workers,
+    }
     options |= _given(model) | {"without": exclude_effect or ()}
     journal = out / "journal"
     with at_work(out, *names):

@@ -77,7 +77,7 @@ def _among_bodies(view: rod.View, bodies: PredictedBodyMotion, pieces: int) -> _
     other = torch.tensor(which, device=radius.device)[:, None].expand(shape)
     flat = (x.flatten(-2) for x in (slots, at.share[..., 0], depth))
     part, other = torch.ones_like(depth).flatten(-2), other.flatten(-2)
-    return _Overlaps(*flat, out=at.normal.flatten(-3, -2), part=part, other=other, radius=radius.flatten(-2))
+    return _Overlaps(*[*flat, at.normal.flatten(-3, -2), part, other, radius.flatten(-2)])
 
 
 def _among_ropes(view: rod.View, free: Tensor) -> _Overlaps:

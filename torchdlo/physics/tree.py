@@ -51,7 +51,7 @@ def _collect(tree: Any, found: list[Tensor]) -> None:
         found += pytree.tree_leaves(tree)
 
 
-def map(fn: Callable[..., Tensor], tree: T, *others: T) -> T:
+def map(fn: Callable[..., Tensor], tree: T, *others: Any) -> T:
     """Apply `fn` to matching leaves of one or several trees of the same structure."""
     kind: Any = type(tree)
     trees: tuple[Any, ...] = (tree, *others)

@@ -148,8 +148,9 @@ class ControlPlan:
 
         def control(k: int, state: scenes.State) -> scenes.Control:
             before, after = (tree.map(lambda x, n=n: x[n], tools) for n in (k, k + 1))
-            last[0] = close_hands(scene, hands, scenes.stationary_control(scene, state), before, closed[k], last[0])
-            pos, director, attachment_weight = carry_attachments(hands, last[0], after)
+            held = close_hands(scene, hands, scenes.stationary_control(scene, state), before, closed[k], last[0])
+            last[0] = held
+            pos, director, attachment_weight = carry_attachments(hands, held, after)
             usual = tree.map(lambda c: c[k], self.controls)
             return tree.replace(usual, pos=pos, director=director, attachment_weight=attachment_weight)
 

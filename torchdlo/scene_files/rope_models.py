@@ -68,7 +68,7 @@ def with_models(d: SceneDescription, folder: Path) -> tuple[SceneDescription, Mo
             "ropes: the effects of a model act on all ropes of a scene; expected the same model for every rope, given "
             f"{', '.join(sorted(n or 'none' for n in names))}."
         )
-    path = folder / d.ropes[0].model
+    path = folder / next(n for n in names if n is not None)
     model, said = _read(path)
     rope, shape = said["rope"], said["rope"].get("rest_positions")
     ropes = tuple(_filled(r, k, path, rope, model.values, said["mesh"]) for k, r in enumerate(d.ropes))
@@ -89,7 +89,7 @@ def cable(path: str | Path) -> RopeMaterial:
     model, said = _read(Path(path))
     rope = said["rope"]
     shape = _shape(rope.get("rest_positions"), model.values)
-    curvature = () if shape is None else tuple(map(tuple, shape.curvature(len(shape.shape)).tolist()))
+    curvature = () if shape is None else tuple(map(tuple, shape.curvature(len(tree.part(shape.shape))).tolist()))
     others = (*_OF_RECORDINGS, "tilted_gravity", "table_friction")
     effects = tuple(
         (name, tuple((key, tuple(x) if isinstance(x, list) else (x,)) for key, x in numbers.items()))

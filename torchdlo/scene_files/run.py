@@ -186,7 +186,7 @@ def run(
 
 def save_frames(frames: Frames, path: Path, description: scene_files.SceneDescription | None = None) -> None:
     """Write frames as .npz, with the scene itself as JSON text in "torchdlo_scene", "" if it is not given."""
-    arrays = {name: value for name, value in vars(frames).items() if isinstance(value, np.ndarray)}
+    arrays: dict[str, Any] = {name: value for name, value in vars(frames).items() if isinstance(value, np.ndarray)}
     text = "" if description is None else scene_files.text(description)
     with replace_atomically(path) as temporary:
         np.savez_compressed(temporary, torchdlo_scene=np.array(text), **arrays)
@@ -206,6 +206,6 @@ def load_frames(path: str | Path) -> Frames:
             raise InputError(f"{file}: lacks {', '.join(missing)}; simulate the scene again with this version.")
         frames_checks.check_headers(file, found.headers, stored)
         found.check_size(stored.values())
-        arrays = {name: found[stored[name]] for name in names}
+        arrays: dict[str, Any] = {name: found[stored[name]] for name in names}
     frames_checks.check_values(file, arrays)
     return Frames(**arrays)

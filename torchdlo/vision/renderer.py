@@ -103,12 +103,20 @@ class Placement:
 class RendererView(Protocol):
     """What the renderer reads of cameras, with leading axes (C,) or (B, C)."""
 
-    intrinsics: Tensor
-    """Camera matrices [px], shape (..., 3, 3)."""
-    rotation: Tensor
-    """World to camera [1], shape (..., 3, 3)."""
-    translation: Tensor
-    """World to camera [m], shape (..., 3)."""
+    @property
+    def intrinsics(self) -> Tensor:
+        """Camera matrices [px], shape (..., 3, 3)."""
+        ...
+
+    @property
+    def rotation(self) -> Tensor:
+        """World to camera [1], shape (..., 3, 3)."""
+        ...
+
+    @property
+    def translation(self) -> Tensor:
+        """World to camera [m], shape (..., 3)."""
+        ...
 
 
 @dataclass(frozen=True, eq=False)

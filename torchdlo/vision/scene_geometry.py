@@ -17,7 +17,7 @@ from torchdlo.physics import tree
 from torchdlo.scene import Params, Scene, State
 from torchdlo.vision.arm_surfaces import link_surfaces
 from torchdlo.vision.renderer import ARM, BODY, TABLE, Piece, Placement, RenderModel
-from torchdlo.vision.surfaces import isosurface, plate, solid
+from torchdlo.vision.surfaces import Surface, isosurface, plate, solid
 
 __all__ = ["arm_frame", "matrices", "model_of", "placement_of"]
 
@@ -82,7 +82,7 @@ def model_of(
     )
 
 
-def _sampled(body: Body, params: Params, k: int, half: np.ndarray) -> object:
+def _sampled(body: Body, params: Params, k: int, half: np.ndarray) -> Surface:
     """Return the surface of a body from its grid of distances."""
     counts = [n + 1 for n in body.cells]
     solid = tree.part(params.bodies)

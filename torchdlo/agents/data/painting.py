@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -43,7 +44,7 @@ class TaskPainter:
     ) -> dict[str, Tensor]:
         """Return pictures by camera, see `record.Painter`; the first arm has the right wrist."""
         rig = _rig(made, size)
-        quality = {"samples": self.samples, "shadow": self.shadow}
+        quality: dict[str, Any] = {"samples": self.samples, "shadow": self.shadow}
         seen = render_cameras(
             rig, world.state, world.joints, looks=[_look(seed, self.jitter) for seed in looks], **quality
         ).rgb

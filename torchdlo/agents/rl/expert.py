@@ -262,7 +262,9 @@ def improve_expert(
     base, good = experts[best], 0
     mean = base
     told("robust", 0, generations, f"{base.source}: success {scores[best].success:.0%}")
-    search = _strategy(task, population, sigma, seed) if generations else None
+    if not generations:
+        return base, log, arena.played
+    search = _strategy(task, population, sigma, seed)
     for k in range(generations):
         if time.monotonic() - began > 60 * minutes or good >= 3:
             break

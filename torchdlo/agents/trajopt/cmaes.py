@@ -83,7 +83,8 @@ def _about(plan: SearchPlan, first: Tensor, rng: torch.Generator) -> Search:
     """Search way-points that are added to actions (T A,)."""
     encoding, whole = plan.encoding(plan.hold), plan.encoding(1)
     zero = torch.zeros(1, encoding.size, dtype=torch.float64)
-    found, given = make_strategy(zero[0], _NEAR * plan.sigma, plan.population, rng), zero
+    found = make_strategy(zero[0], _NEAR * plan.sigma, plan.population, rng)
+    given: Tensor | None = zero
     while not found.stop():
         x = draw_population(found, encoding, given)
         given = None

@@ -61,7 +61,7 @@ def _combined(x: Tensor, pairs: tuple[tuple[int, int], ...], counts: tuple[int, 
 def _links(contact: BodyContact, motion: PredictedBodyMotion) -> Links:
     state, params, pairs = motion.state, motion.params, contact.chosen(motion.bodies)
     found, counts = deepest_points(motion, pairs, contact.points)
-    arms = tuple(found.point - gather(state.pos, pairs, counts, side) for side in (0, 1))
+    near, far = (found.point - gather(state.pos, pairs, counts, side) for side in (0, 1))
     at = [tuple(gather(x, pairs, counts, side) for side in (0, 1)) for x in (motion.mobility, params.restitution)]
     like = found.gap
     links = Links(
@@ -69,7 +69,7 @@ def _links(contact: BodyContact, motion: PredictedBodyMotion) -> Links:
         counts,
         motion.bodies,
         found.normal,
-        arms,
+        (near, far),
         like,
         found.normal,
         _combined(params.mu_s, pairs, counts),
@@ -147,7 +147,7 @@ def _slopes(links: Links, sets: _Sets, load: Tensor | None, size: Tensor | None)
     press, drag = (x.unsqueeze(-1) for x in (links.stiff * sets.press, sets.drag))
     across = torch.eye(3, dtype=n.dtype, device=n.device) - n @ n.mT
     gradient = press * (n @ n.mT) + drag * across
-    if load is None:
+    if load is None or size is None:
         return gradient
     mu, slides = links.mu_k.unsqueeze(-1), sets.slides.unsqueeze(-1)
     turning = mu * load.unsqueeze(-1) / size.unsqueeze(-1).clamp(min=1e-30) * (across - t @ t.mT)

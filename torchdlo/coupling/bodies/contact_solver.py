@@ -162,8 +162,8 @@ class BodySystem:
         entries = _assembled(self.links, self.inertia, gradients, self.free)
         load = load.flatten(-2)
         batch = torch.broadcast_shapes(entries.shape[:-1], load.shape[:-1])
-        rows = [x.expand(*batch, x.shape[-1]).reshape(-1, x.shape[-1]).T for x in (entries.detach(), load)]
-        found = banded.solve(*rows, name=name)
+        matrix, rhs = (x.expand(*batch, x.shape[-1]).reshape(-1, x.shape[-1]).T for x in (entries.detach(), load))
+        found = banded.solve(matrix, rhs, name)
         return found.T.reshape(*batch, len(self.free), 6)
 
     def moved(self, q: Tensor) -> Tensor:

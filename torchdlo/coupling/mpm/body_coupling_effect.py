@@ -94,11 +94,12 @@ class BodyMpmCoupling(Effect):
         part = [k for k, body in enumerate(motion.bodies) if self.planes or body.shape != "plane"]
         if not part:
             return push
-        touched = TouchedParticles(material_points.nodes, 0.0) if push.material_points == () else push.material_points
+        touched = push.material_points
+        before, missed = (material_points.nodes, 0.0) if touched == () else (touched.nodes, touched.lost)
         batch = material_points.particles.pos.shape[:-2]
         met, some = motion.pushed(push), len(part) < len(motion.bodies)
         met = met.only(part) if some else met
-        impulse, torque, nodes, lost = exchange(self, material_points.grid, touched.nodes, met, batch)
+        impulse, torque, nodes, lost = exchange(self, material_points.grid, before, met, batch)
 
         def force(x: Tensor) -> Tensor:
             x = (x / motion.dt).reshape(*batch, len(part), 3)
@@ -111,7 +112,7 @@ class BodyMpmCoupling(Effect):
             push,
             body_force=push.body_force + force(impulse),
             body_torque=push.body_torque + force(torque),
-            material_points=TouchedParticles(nodes, touched.lost + lost.to(impulse.dtype)),
+            material_points=TouchedParticles(nodes, missed + lost.to(impulse.dtype)),
         )
 
 

@@ -91,7 +91,7 @@ def read_urdf(source: str | Path) -> UrdfModel:
     inline = isinstance(source, str) and source.lstrip().startswith("<")
     where = "urdf" if inline else str(source)
     try:
-        text = source if inline else read_text(source, "a URDF file", most=_LARGEST_FILE, cure=_CURE)
+        text = str(source) if inline else read_text(source, "a URDF file", most=_LARGEST_FILE, cure=_CURE)
         root = xml.fromstring(re.sub(r"<\?xml.*?\?>", "", text))
     except (xml.ParseError, UnicodeEncodeError) as error:
         raise InputError(f"{where}: is not complete XML ({error}); is the file cut, or a xacro macro?") from None

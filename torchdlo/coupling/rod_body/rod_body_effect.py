@@ -238,8 +238,8 @@ class RodBody(Effect):
         resist = inertia(bodies, free) if free else at.share.new_zeros(0, 6, 6)
         each = points.real, at.share, at.normal, points.tangent, points.radius, rubs * points.lever, wanted
         given, mu = still * at.normal + slip, rubs * torch.where(slides, mu_k, mu_s)
-        parts = (wide(x) for x in (*each, given, mu, at.arm))
-        return Touch(*parts, of=axes.of[..., 0][:, free], resist=resist, place=place)
+        parts = [wide(x) for x in (*each, given, mu, at.arm)]
+        return Touch(*[*parts, axes.of[..., 0][:, free], resist, place])
 
     def solve_contact(self, view: View, motion: PredictedMotion, values: Values) -> ContactForces:
         """Return the forces that keep ropes outside of bodies and rub [N]."""

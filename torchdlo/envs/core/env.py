@@ -212,7 +212,7 @@ class DloEnv(EnvBase):
         # Scenes settle with their own numbers.
         if not self.variation and not (self._randomize and self.task.settle_steps):
             return self.episode.start if bool(again.all()) else tree.where(again, self.episode.start, self.world)
-        choices = {"like": self._like, "generator": self.generator, "variation": self.variation}
+        choices: dict[str, Any] = {"like": self._like, "generator": self.generator, "variation": self.variation}
         rows = again.nonzero().squeeze(-1)
         # Steps are made for one size of the batch, so that settling takes all scenes.
         count = len(again) if self.task.settle_steps else len(rows)

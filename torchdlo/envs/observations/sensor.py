@@ -60,8 +60,8 @@ class Sensor:
     def observe(self, world: EpisodeState, looks: Sequence[Look]) -> dict[str, dict[str, Tensor] | Tensor]:
         """Return the observations of a batch of scenes, on the CPU and without gradients."""
         rig, points = self.rig, bool(self.points)
-        given = {"looks": looks, "samples": self.samples, "shadow": self.shadow}
-        asked = {"rgb": self.pixels, "depth": self.depth or points, "ids": self.masks or points}
+        given: dict[str, Any] = {"looks": looks, "samples": self.samples, "shadow": self.shadow}
+        asked: dict[str, Any] = {"rgb": self.pixels, "depth": self.depth or points, "ids": self.masks or points}
         seen = render_cameras(rig, world.state, world.joints, **given, **asked)
         parts = {"pixels": seen.rgb, "masks": seen.ids, "depth": seen.depth}
         found: dict[str, dict[str, Tensor] | Tensor] = {}

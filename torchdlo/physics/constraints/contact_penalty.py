@@ -128,8 +128,8 @@ def untouched(like: Tensor) -> Touch:
     """Return that no bodies are there; vertices are (..., V, 3)."""
     v = like.shape[-2]
     widths = (1, 1, 3, 3, 1, 1, 1, 3, 1, 3)
-    none = (like.new_zeros(0, v, width) for width in widths)
-    return Touch(*none, of=like.new_zeros(0, 0), resist=like.new_zeros(0, 6, 6), place=like.new_zeros(1, 0))
+    none = [like.new_zeros(0, v, width) for width in widths]
+    return Touch(*[*none, like.new_zeros(0, 0), like.new_zeros(0, 6, 6), like.new_zeros(1, 0)])
 
 
 @dataclass(frozen=True)

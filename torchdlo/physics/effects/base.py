@@ -135,10 +135,10 @@ class ContactForces:
 
     def plus(self, other: ContactForces) -> ContactForces:
         """Return what both exert together; no more than one effect touches matter."""
-        sums = [getattr(self, n) + getattr(other, n) for n in ("force", "body_force", "body_torque")]
+        force, torque = self.force + other.force, self.body_torque + other.body_torque
         material_points = self.material_points if self.material_points != () else other.material_points
         unsolved = self.unsolved if self.unsolved != () else other.unsolved
-        return ContactForces(*sums, material_points=material_points, unsolved=unsolved)
+        return ContactForces(force, self.body_force + other.body_force, torque, material_points, unsolved)
 
 
 class Effect(ABC):

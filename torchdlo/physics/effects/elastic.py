@@ -128,8 +128,9 @@ def curvature(view: View) -> Curvature:
     if lanes.ready(view.tangent):
         angle = view.state.twist
         inputs = view.before, view.tangent, view.state.director, angle.cos(), angle.sin(), view.params.rest.hinge_mask
-        *shape, b1, b2, a1, a2 = lanes.apply("curve", view.topology.name, inputs, (2, 3, 3, 3, 3, 1, 1, 1, 1))
-        return Curvature(*shape, by_twist=(b1, b2, a1, a2))
+        found = lanes.apply("curve", view.topology.name, inputs, (2, 3, 3, 3, 3, 1, 1, 1, 1))
+        kappa, kb, mean, mean1, mean2, b1, b2, a1, a2 = found
+        return Curvature(kappa, kb, mean, mean1, mean2, (b1, b2, a1, a2))
     chi = (1 + dot(view.before, view.tangent)).clamp(min=1e-6)
     kb = 2 * cross(view.before, view.tangent) / chi * view.params.rest.hinge_mask
     m1, m2 = view.frames()

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -121,11 +122,12 @@ class Touching:
             turn = lengths.active * (following(topology, change) - change) / lengths.rest
             most = dot(turn, turn).amax(-2, keepdim=True).sqrt()
             short = (1 / most.clamp(min=1e-9)).clamp(max=1.0)
-            sizes = (inertia.vertex * y, scale * system.force, felt.force, now.impulse * along_start)
-            sizes = sizes if pairs is None else (*sizes, between)
+            sizes = [inertia.vertex * y, scale * system.force, felt.force, now.impulse * along_start]
+            if pairs is not None:
+                sizes.append(between)
             # Far from contact and loads, what is left is small beside the momentum.
             carried = 1e-3 * (system.moved - self.origin) + 1e-9 * lengths.rest
-            sizes = (*sizes, inertia.vertex * carried)
+            sizes.append(inertia.vertex * carried)
             left = _left(forces, sizes, excess, lengths.rest).expand(*batch, 1, 1)
         return Unknowns(now.pos + short * change, now.impulse + short * pull, bodies + short * turned), left
 
@@ -143,7 +145,7 @@ class Touching:
         same, one, two = inertia.bands(topology)
         string = impulse * system.lean
         after, active = following(topology, free), lengths.active
-        soft = lengths.yielding(impulse / scale)[1] + lengths.shift * lengths.give
+        soft = lengths.yielding(impulse / scale)[1] + lengths.shift * tree.part(lengths.give)
         unit = torch.eye(3, dtype=along.dtype, device=along.device)
         own = (same + string + preceding(topology, string)).unsqueeze(-1) * unit + gradient.same
         beside = (one - string).unsqueeze(-1) * unit
@@ -195,7 +197,7 @@ class Touching:
         )
 
 
-def _left(forces: Tensor, sizes: tuple[Tensor, ...], excess: Tensor, rest: Tensor) -> Tensor:
+def _left(forces: Tensor, sizes: Sequence[Tensor], excess: Tensor, rest: Tensor) -> Tensor:
     """Return what is left of the equations over what is in them, and of lengths over lengths [1], shape (..., 1, 1)."""
     size = added(x.abs() for x in sizes)
     left = forces.abs().amax((-2, -1), keepdim=True) / size.amax((-2, -1), keepdim=True).clamp(min=1e-30)
@@ -290,8 +292,12 @@ def _equations(
     rest, compliance, active, mask, give, hinge, swing, free, tension, vertex, moved, *others, scale = inputs
     lengths = Lengths(parse(topology), rest, compliance, active, mask, give, *law[1:3])
     inertia = Inertia(vertex, hinge, rest, mask, swing)
-    system = LengthSystem(lengths, inertia, moved, free, others[0], scale, *others[1:], turning=law[0])
-    between = Pairs(*pairs[:6], linear=tuple(pairs[6:])) if pairs else None
+    force, direction, ahead = others
+    system = LengthSystem(lengths, inertia, moved, free, force, scale, direction, ahead, law[0])
+    between = None
+    if pairs:
+        at, real, normal, radius, wanted, mu, *linear = pairs
+        between = Pairs(at, real, normal, radius, wanted, mu, tuple(linear))
     return Touching(system, Touch(*parts), origin, between, law[-1]), tension
 
 

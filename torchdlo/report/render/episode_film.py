@@ -83,7 +83,7 @@ def _frames(
     kept = {name: torch.cat([frame[name] for frame in seen]) for name in seen[0]}
     joints = kept.pop("joints")
     looks = appearance(made.scene, made.params, surfaces(made.scene, made.params))
-    moving = {name: value.numpy() for name, value in kept.items()}
+    moving: dict[str, Any] = {name: value.numpy() for name, value in kept.items()}
     if arms:
         shapes, pos, quat = _links(task, joints)
         moving["body_pos"] = np.concatenate([moving["body_pos"], pos], 1)

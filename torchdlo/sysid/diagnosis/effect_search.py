@@ -10,6 +10,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -94,7 +95,13 @@ def diagnose(
     if recording.filmed:
         if resume:
             raise InputError(f"{recording.path}: expected no --resume for films, whose diagnosis keeps no journal.")
-        asked = {"budget": budget, "seed": seed, "vertices": vertices, "given": given, "without": without}
+        asked: dict[str, Any] = {
+            "budget": budget,
+            "seed": seed,
+            "vertices": vertices,
+            "given": given,
+            "without": without,
+        }
         most = plan.pick_trials(recording, trials or BUDGETS[budget].trials)
         return diagnose_filmed(most, **asked, callback=callback)
     begun, report = time.perf_counter(), callback or (lambda *_: None)

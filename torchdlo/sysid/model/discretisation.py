@@ -82,8 +82,9 @@ class Mesh:
         """
         out = []
         for edge, marker in self.clamps:
-            if trial.gripper_quaternion is not None and marker in trial.gripper_marker:
-                which = int(np.flatnonzero(trial.gripper_marker == marker)[0])
+            where = () if trial.gripper_marker is None else np.flatnonzero(trial.gripper_marker == marker)
+            if trial.gripper_quaternion is not None and len(where):
+                which = int(where[0])
                 quat = torch.as_tensor(trial.gripper_quaternion[:, which])
                 out.append(rotation.rotate(quat, quat.new_tensor([0.0, 1.0, 0.0]).expand(len(quat), 3)).numpy())
                 continue

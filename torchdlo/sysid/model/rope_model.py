@@ -8,7 +8,7 @@ Effects of the library may be added to it.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -126,7 +126,7 @@ class RopeModel:
 
         The bending stiffness is the one at which weight bends the rope over a tenth of its length.
         """
-        weight = self.recording.mass * np.linalg.norm(self.recording.gravity) / self.recording.length
+        weight = float(self.recording.mass * np.linalg.norm(self.recording.gravity) / self.recording.length)
         bend = max(weight, 1e-4) * (0.1 * self.recording.length) ** 3
         first = {"bending_stiffness": bend, "twisting_stiffness": 0.7 * bend}
         return np.array([first.get(n.name, n.off) for n in self.numbers], dtype=float)
@@ -241,11 +241,11 @@ class RopeModel:
             numbers[name] |= {key: torch.stack(part, -1).unsqueeze(-2) for key, part in parts.items()}
         return numbers
 
-    def _rest_shape(self) -> str | Tensor:
+    def _rest_shape(self) -> Literal["straight"] | Tensor:
         """Return the rest shape at the vertices, flattened on its best plane: markers stand off the rope's axis."""
-        if self.rest != "given":
-            return "straight"
         points = self.recording.rest_positions
+        if self.rest != "given" or points is None:
+            return "straight"
         centre = points.mean(0)
         _, _, axes = np.linalg.svd(points - centre)
         flat = (points - centre) @ axes[:2].T
@@ -329,7 +329,7 @@ class RopeModel:
             trial = filled % trials
             begin = start.pick(trial if len(start.pos) == trials else filled)
             out[rows] = self._run(motion.pick(trial), begin, values[filled // trials], total)[: len(rows)]
-            if start.discretisation_correction is not None:
+            if begin.discretisation_correction is not None:
                 out[rows] += begin.discretisation_correction[: len(rows), :total]
         return out
 

@@ -50,7 +50,7 @@ def fit_starts(
     own.offset = own.offset.copy()
     now = look(own, raw, own.offset, seconds, fixed=True)
     count = own.offset.shape[1]
-    damping, rows = np.full(len(now.costs), 1e-2), np.flatnonzero(np.isfinite(now.costs) & ~own.start.still)
+    damping, rows = np.full(len(now.costs), 1e-2), np.flatnonzero(np.isfinite(now.costs) & ~own.start.at_rest)
     part = own
     for _ in range(passes if count else 0):
         if not len(rows):
@@ -104,7 +104,7 @@ def refine_start(own: FilmedProblem, values: np.ndarray, passes: int = 8, *, sea
 def restart(own: FilmedProblem, found: Fit, iterations: int) -> Fit:
     """Return the fit with the starts of lost trials anew, and all of it improved, where that is better."""
     for _ in range(_RESTARTS if own.offset.shape[1] else 0):
-        lost = np.flatnonzero(~own.start.still & ~(found.costs < _LOST))
+        lost = np.flatnonzero(~own.start.at_rest & ~(found.costs < _LOST))
         if not len(lost):
             break
         part = own.picked(lost)
@@ -158,7 +158,7 @@ def scout(own: FilmedProblem, starts: int, rng: np.random.Generator, report: Cal
     Many starts are tried on the beginning of the trials, where a cost has few local minima; the best go on.
     """
     whole, count = own.space, len(own.free)
-    space = ParameterSpace(whole.names[:count], whole.params[:count], whole.sizes[:count])
+    space = ParameterSpace(whole.names[:count], whole.params[:count], whole.sizes and whole.sizes[:count])
     zero, lasts, looks = np.zeros(len(whole.names) - count), own.lasts, 3
     raws = np.repeat(space.to_raw(own.fixed[list(own.free)])[None], starts, 0)
     for k in range(min(count, 3)):
