@@ -115,9 +115,9 @@ class Guard:
         return "it says nothing of where it comes from" if changes and not origins else ""
 
     def _names(self) -> set[str]:
-        names = ("localhost", "127.0.0.1", "[::1]")
+        names: tuple[str, ...] = ("localhost", "127.0.0.1", "[::1]")
         own = ipaddress.ip_address(self.host)
-        names = (*names, f"[{own}]" if own.version == 6 else str(own))
+        names += (f"[{own}]" if own.version == 6 else str(own),)
         return {f"{name}:{self.port}" for name in names} | (set(names) if self.port == 80 else set())
 
 

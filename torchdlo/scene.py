@@ -18,6 +18,7 @@ from torch import Tensor
 from torchdlo import notices
 from torchdlo.coupling import start_overlaps
 from torchdlo.coupling.bodies import dynamics as rigid
+from torchdlo.coupling.bodies.contact_effect import BodyContact
 from torchdlo.coupling.bodies.dynamics import Body, BodyParams, BodyState, BodyTargets, RigidBody, place_bodies
 from torchdlo.coupling.common import step_diagnostics
 from torchdlo.coupling.common.step_diagnostics import broad_phase
@@ -178,7 +179,7 @@ class Scene:
             "RodBody, BodyMatter or FingerPads needs bodies, but there are no bodies; give make(..., bodies=[Solid()])",
         )
         for effect in self.effects:
-            if effect.name == "body_contact":
+            if isinstance(effect, BodyContact):
                 effect.check_pairs(self.bodies)
         if self.integrator == "implicit":
             loops = [n for n, c in zip(self.topology.counts, self.topology.closed, strict=True) if c and n < 5]
@@ -246,11 +247,11 @@ def make(
         rods = assembly.clamp_at_vertices(topology, rods, choices.get("prescribed_vertices", ()))
     kinds, solid, placed = place_bodies(bodies, state.pos) if bodies else ((), (), ())
     if bodies:
-        batch = torch.broadcast_shapes(state.pos.shape[:-2], placed.pos.shape[:-2])
+        batch = torch.broadcast_shapes(state.pos.shape[:-2], tree.part(placed).pos.shape[:-2])
         state, placed = tree.map(lambda x: tree.batch_innermost(x.expand(*batch, *x.shape[-2:])), (state, placed))
     medium, stuff, particles = material_points or (None, (), ())
     if material_points:
-        state, placed, particles = rod_coupling_effect.expand_batches(state, placed, particles)
+        state, placed, particles = rod_coupling_effect.expand_batches(state, placed, tree.part(particles))
     effects = rod_coupling_effect.fitted(effects, medium, rods)
     scene = Scene(topology, effects, bodies=kinds, material_points=medium, **choices)
     numbers = parameters_of(effects, values or {}, state.pos)
@@ -266,7 +267,7 @@ def make(
             effects,
             altered_params(scene.effects, topology, rods, numbers),
             state,
-            (kinds, solid, placed) if bodies else None,
+            (kinds, tree.part(solid), tree.part(placed)) if bodies else None,
             scene.prescribed_vertices,
             scene.constrained,
         )
@@ -324,7 +325,7 @@ def check_step(scene: Scene, params: Params) -> None:
     """Raise a `ValueError` that names the limiting term if the substep is not stable."""
     dt = scene.dt / scene.substeps
     if scene.material_points:
-        mpm.check_step(scene.material_points, params.material_points, dt)
+        mpm.check_step(scene.material_points, tree.part(params.material_points), dt)
     for term, bound in limits(scene, params).items():
         if not dt < bound:
             need = scene.dt / bound * 1.05 if bound > 0 else math.inf
@@ -339,7 +340,8 @@ def stationary_control(scene: Scene, state: State) -> Control:
     """Return the control that keeps held parts and kinematic bodies where they are, with a firm grip."""
     pos = tree.take_vertices(state.rods.pos, scene.prescribed_vertices)
     director = rod.directors(scene.topology, state.rods, scene.prescribed_edges)
-    return Control(pos, director, bodies=rigid.stationary_control(scene.bodies, state.bodies) if scene.bodies else ())
+    bodies = rigid.stationary_control(scene.bodies, tree.part(state.bodies)) if scene.bodies else ()
+    return Control(pos, director, bodies=bodies)
 
 
 def advance(scene: Scene, params: Params, state: State, start: Control, control: Control, share: Tensor) -> State:
@@ -358,13 +360,15 @@ def advance(scene: Scene, params: Params, state: State, start: Control, control:
     first = (state.time == 0).to(state.time.dtype)
     predict_free_motion = poses = material_points = None
     if scene.bodies:
-        poses = rigid.between(start.bodies, control.bodies, share)
+        solid, placed = tree.part(params.bodies), tree.part(state.bodies)
+        poses = rigid.between(tree.part(start.bodies), tree.part(control.bodies), share)
         predict_free_motion = partial(
-            rigid.predict_free_motion, scene.bodies, params.bodies, state.bodies, poses, first=first, dt=settings.dt
+            rigid.predict_free_motion, scene.bodies, solid, placed, poses, first=first, dt=settings.dt
         )
     if scene.material_points:
+        stuff = tree.part(params.material_points)
         material_points = rod_coupling_effect.predict_free_motion(
-            scene.material_points, params.material_points, state.material_points, first, settings.dt
+            scene.material_points, stuff, tree.part(state.material_points), first, settings.dt
         )
     rods, reaction, (body, pool, push) = substep(
         settings, params.rods, params.effects, state.rods, targets, first, predict_free_motion, material_points
@@ -374,11 +378,10 @@ def advance(scene: Scene, params: Params, state: State, start: Control, control:
     mean = tree.map(lambda old, now: torch.where(later, old, 0.0) + now / scene.substeps, state.reaction, reaction)
     missed = step_diagnostics.missed(scene, params, rods, state.diagnostics, push.unsolved)
     push = body_coupling_effect.couple_bodies_to_particles(scene.effects, body, pool, push)
-    moved, particles = rigid.advance_bodies(body, poses, push) if scene.bodies else (), ()
+    moved: BodyState | tuple[()] = rigid.advance_bodies(body, tree.part(poses), push) if scene.bodies else ()
+    particles: Particles | tuple[()] = ()
     if scene.material_points:
-        particles, missed = rod_coupling_effect.finish(
-            scene.material_points, params.material_points, pool, push, settings.dt, missed
-        )
+        particles, missed = rod_coupling_effect.finish(scene.material_points, stuff, pool, push, settings.dt, missed)
     after = State(rods, state.time + settings.dt, missed, mean, moved, particles)
     return laid_out(after) if torch.compiler.is_compiling() else after
 

@@ -140,7 +140,7 @@ def propose(
     if random is not None:
         found = random_grasps(places_of(chosen), random)
     else:
-        limits = {"calls": calls, "tokens": tokens, "seconds": seconds, "resume": resume}
+        limits: dict[str, Any] = {"calls": calls, "tokens": tokens, "seconds": seconds, "resume": resume}
         said = _conversation(out, endpoint, model, recorded, geometry, **limits)
         from torchdlo.report.render.episode_film import stills
         from torchdlo.report.render.marks import marked_view
@@ -202,7 +202,7 @@ def plan(
     out = out or Path("runs") / "plan" / task
     for name in ("plan.json", "report.html"):
         check_writable(out / name)
-    limits = {"calls": calls, "tokens": tokens, "seconds": seconds, "resume": resume}
+    limits: dict[str, Any] = {"calls": calls, "tokens": tokens, "seconds": seconds, "resume": resume}
     look: Any = None
     if pictures:
         from torchdlo.report.render.marks import MarkCamera

@@ -90,7 +90,14 @@ def make(
     from torchdlo.agents.data.making import make_dataset as run
     from torchdlo.agents.distributed import make_executor
 
-    options = {"size": size, "codec": codec, "actor": actor, "noise": noise, "fidelity": fidelity, "arms": arms}
+    options: dict[str, Any] = {
+        "size": size,
+        "codec": codec,
+        "actor": actor,
+        "noise": noise,
+        "fidelity": fidelity,
+        "arms": arms,
+    }
     plan = DatasetPlan(tuple(tasks), episodes, seed=seed, batch=batch, **options)
     painter = _painter() if size else None
 

@@ -223,9 +223,11 @@ def _rendering() -> Check:
         done = None
     if done is not None and done.returncode == 0:
         return Check("rendering", "ok", f"pyvista {version} draws without a display")
-    lines = done.stderr.strip().splitlines() if done else ["no picture within 120 s"]
+    lines = ["no picture within 120 s"]
+    if done is not None:
+        lines = done.stderr.strip().splitlines() or [f"ended with code {done.returncode}"]
     mend = "install a software OpenGL (apt install libgl1 libegl1 libosmesa6)"
-    return Check("rendering", "broken", lines[-1] if lines else f"ended with code {done.returncode}", mend)
+    return Check("rendering", "broken", lines[-1], mend)
 
 
 def _video() -> Check:

@@ -146,7 +146,13 @@ def diagnose(
     names = ("findings.json", "model.json", report.PAGE)
     for name in names:
         check_writable(out / name)
-    options = {"budget": budget, "seed": seed, "vertices": vertices, "trials": trials, "workers": workers}
+    options: dict[str, Any] = {
+        "budget": budget,
+        "seed": seed,
+        "vertices": vertices,
+        "trials": trials,
+        "workers": workers,
+    }
     options |= _given(model) | {"without": exclude_effect or ()}
     journal = out / "journal"
     with at_work(out, *names):
@@ -230,7 +236,7 @@ def design_experiment(
         check_writable(out / file)
     if (out / "motion.npz").exists() and not (out / "design.json").exists():
         raise InputError(f"{out / 'motion.npz'}: exists without design.json; move it away or choose another --out.")
-    options = {"seconds": seconds, "scale": scale, "mass": tip_mass, "seed": seed}
+    options: dict[str, Any] = {"seconds": seconds, "scale": scale, "mass": tip_mass, "seed": seed}
     journal = out / "journal"
     options |= {"vertices": vertices, "workers": workers, "journal": journal, "resume": resume}
     with at_work(out, *report.FILES):

@@ -21,8 +21,19 @@ if TYPE_CHECKING:
 __all__ = ["deploy", "distill", "evaluate", "export", "train"]
 
 
-_WRITTEN = ("result.json", "log.csv", "curve.png", "policy.pt", "checkpoint.pt")
-_WRITTEN += ("robust.json", "expert.json", "clone.part", "clone.pt", "tune.part", "stages.json")
+_WRITTEN = (
+    "result.json",
+    "log.csv",
+    "curve.png",
+    "policy.pt",
+    "checkpoint.pt",
+    "robust.json",
+    "expert.json",
+    "clone.part",
+    "clone.pt",
+    "tune.part",
+    "stages.json",
+)
 """What training writes."""
 
 
@@ -407,7 +418,7 @@ def distill(
     folder = teacher if teacher.is_dir() else teacher.parent
     out = out or folder.with_name(f"{folder.name}-cloud")
     check_writable(out / "student.json")
-    given = {"rounds": rounds, "count": count, "updates": updates, "seed": seed}
+    given: dict[str, Any] = {"rounds": rounds, "count": count, "updates": updates, "seed": seed}
     plan = Student(**{name: value for name, value in given.items() if value is not None})
     try:
         with progress() as show, deferred_interrupt(show) as callback:

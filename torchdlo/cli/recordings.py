@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -131,7 +132,7 @@ def _trial_table(recording: Recording) -> Any:
         "suspect frames": lambda trials: pooled(trials, lambda t: t.suspect),
     }
     for name, predict in BASELINES.items():
-        rows[f"error of {name.replace('_', ' ')}"] = lambda trials, p=predict: error(trials, p)
+        rows[f"error of {name.replace('_', ' ')}"] = partial(error, predict=predict)
     table = Table(box=None, pad_edge=False)
     table.add_column("")
     for split in splits:

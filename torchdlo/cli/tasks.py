@@ -185,7 +185,7 @@ def optimize(
     names = ("result.json", "trajectory.json", "curve.png")
     for name in names:
         check_writable(out / name)
-    steps = {"compiled": compiled and not recorded, "recorded": recorded}
+    steps: dict[str, Any] = {"compiled": compiled and not recorded, "recorded": recorded}
     steps |= {"double": _is_double(dtype)} | _judged(task, grasps, reward)
     chosen = task_problem(task, None if rope_model is None else cable(rope_model), **steps)
     given = {"episodes": episodes, "population": population, "robust": Robust() if robust else None, "seed": seed}

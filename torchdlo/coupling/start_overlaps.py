@@ -19,6 +19,7 @@ from torch import Tensor
 from torchdlo import notices
 from torchdlo.coupling.bodies.dynamics import Body, BodyParams, BodyState, PredictedBodyMotion
 from torchdlo.coupling.bodies.segment_distance import find_contact_points, points_per_edge
+from torchdlo.coupling.rod_body.rod_body_effect import RodBody
 from torchdlo.coupling.rod_contact.broad_phase import near_pairs
 from torchdlo.coupling.rod_contact.closest_points import closest_points
 from torchdlo.physics import tree
@@ -75,8 +76,8 @@ def _among_bodies(view: rod.View, bodies: PredictedBodyMotion, pieces: int) -> _
     which = [k for k, body in enumerate(bodies.bodies) for _ in range(points_per_edge(body, pieces))]
     other = torch.tensor(which, device=radius.device)[:, None].expand(shape)
     flat = (x.flatten(-2) for x in (slots, at.share[..., 0], depth))
-    return _Overlaps(*flat, at.normal.flatten(-3, -2), torch.ones_like(depth).flatten(-2), other.flatten(-2),
-                     radius.flatten(-2))  # fmt: skip
+    part, other = torch.ones_like(depth).flatten(-2), other.flatten(-2)
+    return _Overlaps(*[*flat, at.normal.flatten(-3, -2), part, other, radius.flatten(-2)])
 
 
 def _among_ropes(view: rod.View, free: Tensor) -> _Overlaps:
@@ -239,11 +240,12 @@ def _part(topology, names, rods, state, bodies, held, constrained) -> RodState:
 def _look(view: rod.View, names: dict[str, Effect], bodies: Any, free: Tensor) -> _Overlaps:
     """Return what overlaps, but for edges beside what is held, which is where it was put."""
     parts = []
-    if "rod_body" in names and bodies is not None:
+    touching = names.get("rod_body")
+    if isinstance(touching, RodBody) and bodies is not None:
         kinds, params, placed = bodies
         none = torch.zeros_like(placed.pos)
         motion = PredictedBodyMotion(kinds, params, placed, 1.0, none, none, none[..., :1], none)
-        parts.append(_among_bodies(view, motion, names["rod_body"].pieces))
+        parts.append(_among_bodies(view, motion, touching.pieces))
     if "rod_contact" in names:
         parts.append(_among_ropes(view, free))
     found = _joined(parts)

@@ -74,6 +74,8 @@ def _own(name: str) -> type[Task]:
     module = f"torchdlo_task_{path.stem}_{abs(hash(str(path.resolve()))):x}"
     if module not in sys.modules:
         spec = importlib.util.spec_from_file_location(module, path)
+        if spec is None or spec.loader is None:
+            raise InputError(f"{name}: {file} is no Python file; expected FILE.py:CLASS with a task of your own.")
         made = importlib.util.module_from_spec(spec)
         sys.modules[module] = made  # dataclasses look their modules up
         try:

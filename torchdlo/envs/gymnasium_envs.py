@@ -6,7 +6,7 @@ Observations hold what a policy may see; success and the terms of the reward are
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, ClassVar
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -49,7 +49,7 @@ def register() -> list[str]:
 class GymnasiumEnv(gymnasium.Env):
     """One scene of a task. The observation is a vector, or a dictionary if there are pictures."""
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": []}
+    metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012  # declared like that by gymnasium
 
     def __init__(self, task: str | Task, *, scaled_actions: bool = True, render_mode: None = None, **options: Any):
         """Make the scene.
@@ -86,7 +86,7 @@ class GymnasiumEnv(gymnasium.Env):
 class GymnasiumVectorEnv(VectorEnv):
     """A batch of scenes of a task. Episodes that ended begin anew in the next step, as Gymnasium has it by default."""
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": [], "autoreset_mode": AutoresetMode.NEXT_STEP}
+    metadata: dict[str, Any] = {"render_modes": [], "autoreset_mode": AutoresetMode.NEXT_STEP}  # noqa: RUF012
 
     def __init__(
         self,

@@ -20,10 +20,10 @@ T = TypeVar("T")
 @dataclass_transform(frozen_default=True)
 def struct(cls: type[T]) -> type[T]:
     """Make a frozen dataclass whose fields are tensors or trees of tensors, known to torch's pytrees."""
-    cls = dataclasses.dataclass(frozen=True)(cls)
-    torch.export.register_dataclass(cls, serialized_type_name=f"{cls.__module__}.{cls.__qualname__}")
-    _FIELDS[cls] = tuple(field.name for field in dataclasses.fields(cls))
-    return cls
+    made: Any = dataclasses.dataclass(frozen=True)(cls)
+    torch.export.register_dataclass(made, serialized_type_name=f"{made.__module__}.{made.__qualname__}")
+    _FIELDS[made] = tuple(field.name for field in dataclasses.fields(made))
+    return made
 
 
 _FIELDS: dict[type, tuple[str, ...]] = {}
@@ -51,22 +51,24 @@ def _collect(tree: Any, found: list[Tensor]) -> None:
         found += pytree.tree_leaves(tree)
 
 
-def map(fn: Callable[..., Tensor], tree: T, *others: T) -> T:
+def map(fn: Callable[..., Tensor], tree: T, *others: Any) -> T:
     """Apply `fn` to matching leaves of one or several trees of the same structure."""
     kind: Any = type(tree)
-    if any(type(other) is not kind or (kind is dict and other.keys() != tree.keys()) for other in others):
-        return pytree.tree_map(fn, tree, *others)  # says what differs
-    if kind in _FIELDS:
-        return kind(*[map(fn, *[getattr(each, name) for each in (tree, *others)]) for name in _FIELDS[kind]])
-    if kind is dict:
-        return {key: map(fn, *[each[key] for each in (tree, *others)]) for key in tree}
-    if kind is tuple or kind is list:
-        return kind([map(fn, *parts) for parts in zip(tree, *others, strict=True)])
-    if isinstance(tree, Tensor):
-        return fn(tree, *others)
-    if tree is None:
-        return tree
-    return pytree.tree_map(fn, tree, *others)
+    trees: tuple[Any, ...] = (tree, *others)
+    made: Any = None
+    if any(type(other) is not kind or (kind is dict and other.keys() != trees[0].keys()) for other in others):
+        made = pytree.tree_map(fn, tree, *others)  # says what differs
+    elif kind in _FIELDS:
+        made = kind(*[map(fn, *[getattr(each, name) for each in trees]) for name in _FIELDS[kind]])
+    elif kind is dict:
+        made = {key: map(fn, *[each[key] for each in trees]) for key in trees[0]}
+    elif kind is tuple or kind is list:
+        made = kind([map(fn, *parts) for parts in zip(*trees, strict=True)])
+    elif isinstance(tree, Tensor):
+        made = fn(*trees)
+    elif tree is not None:
+        made = pytree.tree_map(fn, tree, *others)
+    return made
 
 
 def flatten(tree: T) -> tuple[list[Tensor], Callable[[Sequence[Tensor]], T]]:
@@ -77,7 +79,15 @@ def flatten(tree: T) -> tuple[list[Tensor], Callable[[Sequence[Tensor]], T]]:
 
 def replace(tree: T, **fields: Any) -> T:
     """Return a copy of a struct with some fields exchanged."""
-    return dataclasses.replace(tree, **fields)
+    struct: Any = tree
+    return dataclasses.replace(struct, **fields)
+
+
+def part(found: T | tuple[()] | None) -> T:
+    """Return a part of a tree that is known to be there; one that is not is () or None."""
+    if found is None or isinstance(found, tuple):
+        raise ValueError("tree: a part was asked for that is not there; look whether there is one before it is used.")
+    return found
 
 
 def detach(tree: T) -> T:

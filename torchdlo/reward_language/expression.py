@@ -108,7 +108,8 @@ def _check(body: ast.expr, label: str, names: set[str]) -> None:
 
 def _check_constant(node: ast.Constant, label: str, names: set[str]) -> None:
     value = node.value
-    if type(value) not in (int, float) or not abs(value) <= CONSTANT or node.kind is not None:
+    plain = isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= CONSTANT
+    if not plain or node.kind is not None:
         raise _refuse(label, f"it has the constant {str(value)[:20]!r}", f"use numbers up to {CONSTANT:g}")
 
 
@@ -178,9 +179,10 @@ def _number(node: ast.expr) -> int | float | None:
     sign = 1
     if isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.USub):
         sign, node = -1, node.operand
-    if not isinstance(node, ast.Constant) or type(node.value) not in (int, float) or not math.isfinite(node.value):
+    value = node.value if isinstance(node, ast.Constant) else None
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
         return None
-    return sign * node.value
+    return sign * value
 
 
 @dataclass(frozen=True)

@@ -156,7 +156,7 @@ def _effects(given: Any, where: str, place: str) -> dict[str, dict[str, Any]]:
                 raise InputError(f"{where}: {here}.{key}: there is no such parameter; {hint}.")
             if key in params:
                 size = params[key].size
-                kind = float if size == 1 else tuple[(float,) * size]
+                kind: Any = float if size == 1 else tuple.__class_getitem__((float,) * size)
                 _checked(kind, value, where, f"{here}.{key}")
             else:
                 _checked(typing.get_type_hints(EFFECTS[name])[key], value, where, f"{here}.{key}")

@@ -143,14 +143,14 @@ class ControlPlan:
         """Return a function that gives the control of step k from the state before it; steps come in their order."""
         if self.hands is None:
             return lambda k, state: tree.map(lambda c: c[k], self.controls)
+        hands, tools, closed = self.hands, tree.part(self.tools), tree.part(self.closed)
         last: list[Grasp | None] = [None]
 
         def control(k: int, state: scenes.State) -> scenes.Control:
-            before, after = (tree.map(lambda x, n=n: x[n], self.tools) for n in (k, k + 1))
-            last[0] = close_hands(
-                scene, self.hands, scenes.stationary_control(scene, state), before, self.closed[k], last[0]
-            )
-            pos, director, attachment_weight = carry_attachments(self.hands, last[0], after)
+            before, after = (tree.map(lambda x, n=n: x[n], tools) for n in (k, k + 1))
+            held = close_hands(scene, hands, scenes.stationary_control(scene, state), before, closed[k], last[0])
+            last[0] = held
+            pos, director, attachment_weight = carry_attachments(hands, held, after)
             usual = tree.map(lambda c: c[k], self.controls)
             return tree.replace(usual, pos=pos, director=director, attachment_weight=attachment_weight)
 

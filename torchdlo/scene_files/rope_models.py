@@ -13,6 +13,7 @@ from torch import Tensor
 
 from torchdlo.envs.assets.rope_material import RopeMaterial
 from torchdlo.errors import InputError
+from torchdlo.physics import tree
 from torchdlo.physics.rod.assembly import frame_curvature
 from torchdlo.physics.rod.topology import Topology
 from torchdlo.scene_files.schema import RopeSpec, SceneDescription
@@ -41,7 +42,7 @@ class Modelled:
         """Return the natural curvature at evenly spaced vertices [1/m], shape (count, 2)."""
         from scipy.interpolate import CubicSpline
 
-        points = self.shape
+        points = tree.part(self.shape)
         along = torch.cat([points.new_zeros(1), (points[1:] - points[:-1]).norm(dim=-1).cumsum(0)])
         even = torch.linspace(0, float(along[-1]), count, dtype=points.dtype)
         line = torch.as_tensor(CubicSpline(along.numpy(), points.numpy(), axis=0)(even.numpy()))
@@ -67,7 +68,7 @@ def with_models(d: SceneDescription, folder: Path) -> tuple[SceneDescription, Mo
             "ropes: the effects of a model act on all ropes of a scene; expected the same model for every rope, given "
             f"{', '.join(sorted(n or 'none' for n in names))}."
         )
-    path = folder / d.ropes[0].model
+    path = folder / next(n for n in names if n is not None)
     model, said = _read(path)
     rope, shape = said["rope"], said["rope"].get("rest_positions")
     ropes = tuple(_filled(r, k, path, rope, model.values, said["mesh"]) for k, r in enumerate(d.ropes))
@@ -88,7 +89,7 @@ def cable(path: str | Path) -> RopeMaterial:
     model, said = _read(Path(path))
     rope = said["rope"]
     shape = _shape(rope.get("rest_positions"), model.values)
-    curvature = () if shape is None else tuple(map(tuple, shape.curvature(len(shape.shape)).tolist()))
+    curvature = () if shape is None else tuple(map(tuple, shape.curvature(len(tree.part(shape.shape))).tolist()))
     others = (*_OF_RECORDINGS, "tilted_gravity", "table_friction")
     effects = tuple(
         (name, tuple((key, tuple(x) if isinstance(x, list) else (x,)) for key, x in numbers.items()))

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -14,6 +15,7 @@ from torchdlo import scene as scenes
 from torchdlo import scene_files
 from torchdlo.errors import InputError
 from torchdlo.files import replace_atomically
+from torchdlo.physics import tree
 from torchdlo.scene_files import frames_checks, limits
 from torchdlo.scene_files.json_files import EFFECTS
 from torchdlo.untrusted.array_file import ArrayFile
@@ -112,7 +114,7 @@ def appearance(
         "radius": radius.reshape(-1, radius.shape[-2])[0].numpy(),
         "weight": np.zeros(sum(counts)),
         "body_shape": np.array([b.shape for b in scene.bodies], str),
-        "body_size": params.bodies.size.reshape(-1, len(scene.bodies), 3)[0].numpy()
+        "body_size": tree.part(params.bodies).size.reshape(-1, len(scene.bodies), 3)[0].numpy()
         if scene.bodies
         else np.zeros((0, 3)),
         "body_motion": np.array([b.motion if k < own else "robot" for k, b in enumerate(scene.bodies)], str),
@@ -178,12 +180,13 @@ def run(
                 interrupted = True
                 break
     moving = (np.stack(parts) for parts in zip(*kept, strict=True))
-    return Frames(*moving, **_looks(made, description), interrupted=interrupted, problem=problem)
+    whole: dict[str, Any] = {**_looks(made, description), "interrupted": interrupted, "problem": problem}
+    return Frames(*moving, **whole)
 
 
 def save_frames(frames: Frames, path: Path, description: scene_files.SceneDescription | None = None) -> None:
     """Write frames as .npz, with the scene itself as JSON text in "torchdlo_scene", "" if it is not given."""
-    arrays = {name: value for name, value in vars(frames).items() if isinstance(value, np.ndarray)}
+    arrays: dict[str, Any] = {name: value for name, value in vars(frames).items() if isinstance(value, np.ndarray)}
     text = "" if description is None else scene_files.text(description)
     with replace_atomically(path) as temporary:
         np.savez_compressed(temporary, torchdlo_scene=np.array(text), **arrays)
@@ -203,6 +206,6 @@ def load_frames(path: str | Path) -> Frames:
             raise InputError(f"{file}: lacks {', '.join(missing)}; simulate the scene again with this version.")
         frames_checks.check_headers(file, found.headers, stored)
         found.check_size(stored.values())
-        arrays = {name: found[stored[name]] for name in names}
+        arrays: dict[str, Any] = {name: found[stored[name]] for name in names}
     frames_checks.check_values(file, arrays)
     return Frames(**arrays)

@@ -176,7 +176,7 @@ def _rope(rope: RopeSpec, dtype: torch.dtype, modelled: Modelled | None = None) 
     given = {k: v for k, v in vars(rope).items() if k not in _OWN and v is not None}
     points = torch.tensor(rope.points, dtype=torch.float64).reshape(-1, 3)
     if rope.vertices is not None:
-        points = _resampled(points, rope)
+        points = _resampled(points, rope, rope.vertices)
     if modelled is not None:
         given["rest_curvature"] = modelled.curvature(len(points)).to(dtype)
         # The calibrated roll is measured from the normal that points up.
@@ -187,13 +187,13 @@ def _rope(rope: RopeSpec, dtype: torch.dtype, modelled: Modelled | None = None) 
     return scenes.Rope(points.to(dtype), **given)
 
 
-def _resampled(points: Tensor, rope: RopeSpec) -> Tensor:
-    if len(points) < 2 or rope.vertices < 3:
-        raise InputError(f"rope: {len(points)} points and {rope.vertices} vertices; expected at least 2 and 3.")
+def _resampled(points: Tensor, rope: RopeSpec, vertices: int) -> Tensor:
+    if len(points) < 2 or vertices < 3:
+        raise InputError(f"rope: {len(points)} points and {vertices} vertices; expected at least 2 and 3.")
     line = torch.cat([points, points[:1]]) if rope.closed else points
     along = torch.cat([points.new_zeros(1), (line[1:] - line[:-1]).norm(dim=-1).cumsum(0)])
-    count = rope.vertices + rope.closed
-    at = torch.linspace(0, 1, count, dtype=points.dtype)[: rope.vertices] * along[-1]
+    count = vertices + rope.closed
+    at = torch.linspace(0, 1, count, dtype=points.dtype)[:vertices] * along[-1]
     k = (torch.searchsorted(along, at, right=True) - 1).clamp(0, len(line) - 2)
     share = ((at - along[k]) / (along[k + 1] - along[k]).clamp(min=1e-30))[:, None]
     return line[k] + share * (line[k + 1] - line[k])

@@ -223,7 +223,8 @@ def _camera(path: Path, k: int, entry: Any) -> Camera:
     shift = tuple(_row(path, f"{where}.translation", entry["translation"], 3))
     fps = _number(path, f"{where}.fps", entry.get("fps", 30.0), 0.0)
     start = _number(path, f"{where}.start", entry.get("start", 0.0), -math.inf)
-    return Camera(name, int(sizes[0]), int(sizes[1]), *numbers, rows, shift, distortion, fps, start)
+    fx, fy, cx, cy = numbers
+    return Camera(name, int(sizes[0]), int(sizes[1]), fx, fy, cx, cy, rows, shift, distortion, fps, start)
 
 
 def _row(path: Path, where: str, value: Any, count: int | None) -> list[float]:

@@ -160,10 +160,10 @@ def draw_look(generator: torch.Generator, *, strength: float = 1.0) -> Look:
         key_direction=(steep * math.cos(angle), steep * math.sin(angle), 1.0),
         key=(bright * (1 + warm), bright, bright * (1 - warm)),
         fill_direction=(math.cos(other), math.sin(other), number(0.3, 0.9)),
-        fill=tuple(number(0.5, 1.6) * c for c in usual.fill),
-        sky=tuple(ambient * c for c in usual.sky),
-        ground=tuple(ambient * c for c in usual.ground),
-        wall=(linear(wall), tuple(0.7 * c for c in linear(wall))),
+        fill=(number(0.5, 1.6) * usual.fill[0], number(0.5, 1.6) * usual.fill[1], number(0.5, 1.6) * usual.fill[2]),
+        sky=_times(ambient, usual.sky),
+        ground=_times(ambient, usual.ground),
+        wall=(linear(wall), _times(0.7, linear(wall))),
         floor=linear(floor),
         softness=number(0.03, 0.2),
         aside=tuple(tuple(row) for row in aside.tolist()),
@@ -177,11 +177,16 @@ def _color(number: _Number, saturation: tuple[float, float], value: tuple[float,
     return colorsys.hsv_to_rgb(number(0, 1), number(*saturation), number(*value))
 
 
+def _times(share: float, color: Color) -> Color:
+    red, green, blue = color
+    return share * red, share * green, share * blue
+
+
 def _strand(number: _Number, whole: Callable[[int], int], light: bool) -> Paint:
     """Return a paint for ropes: light ones if the table is dark, else strong or dark ones."""
     color = _color(number, (0.0, 0.75) if light else (0.6, 1.0), (0.75, 1.0) if light else (0.3, 0.85))
     darker = number(0.45, 0.9)
-    second = tuple(darker * c for c in color)
+    second = _times(darker, color)
     pattern = "twisted" if whole(4) else "plain"
     return Paint(color, second, pattern, scale=number(18, 45), strands=2 + whole(3), gloss=number(0.0, 0.2))
 
@@ -193,7 +198,7 @@ def _table(number: _Number, whole: Callable[[int], int], dark: bool) -> Paint:
     saturation = number(0.25, 0.55) if pattern == "wood" else number(0.0, 0.3)
     color = colorsys.hsv_to_rgb(hue, saturation, number(*value))
     contrast = number(0.65, 0.92)
-    second = tuple(contrast * c for c in color)
+    second = _times(contrast, color)
     scale = {"wood": (4, 12), "speckled": (15, 60), "checked": (5, 20), "woven": (80, 200)}.get(pattern, (1, 2))
     angle, gloss = number(0, 2 * math.pi), number(0.0, 0.15)
     return Paint(color, second, pattern, scale=number(*scale), angle=angle, gloss=gloss, seed=whole(1 << 16))

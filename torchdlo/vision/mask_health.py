@@ -144,8 +144,8 @@ def _blobs(masks: np.ndarray, good: np.ndarray) -> str:
         joined = cv2.dilate(masks[k].astype(np.uint8), kernel)
         count, label = cv2.connectedComponents(joined)
         area = np.bincount(label[masks[k]], minlength=count)[1:] if count > 1 else np.zeros(1)
-        area = np.sort(area)[::-1]
-        second.append(area[1] / area[0] if len(area) > 1 else 0.0)
+        largest = np.sort(area)[::-1]
+        second.append(largest[1] / largest[0] if len(largest) > 1 else 0.0)
     share = float(np.median(second))
     if share > 0.05:
         return (

@@ -79,7 +79,7 @@ def _gradient(
     if library is None or pixel.device.type != "cpu" or pixel.dtype not in _DTYPES:
         with torch.enable_grad():
             own = [x.detach().requires_grad_() for x in (pixel, radius)]
-            out = coverage_reference(*own, real, after, (height, width))
+            out = coverage_reference(own[0], own[1], real, after, (height, width))
         first, second = torch.autograd.grad(out, own, gradient)
         return first, second
     gradient, pixel, radius, real, after = _inputs(gradient, pixel, radius, real, after)

@@ -103,12 +103,20 @@ class Placement:
 class RendererView(Protocol):
     """What the renderer reads of cameras, with leading axes (C,) or (B, C)."""
 
-    intrinsics: Tensor
-    """Camera matrices [px], shape (..., 3, 3)."""
-    rotation: Tensor
-    """World to camera [1], shape (..., 3, 3)."""
-    translation: Tensor
-    """World to camera [m], shape (..., 3)."""
+    @property
+    def intrinsics(self) -> Tensor:
+        """Camera matrices [px], shape (..., 3, 3)."""
+        ...
+
+    @property
+    def rotation(self) -> Tensor:
+        """World to camera [1], shape (..., 3, 3)."""
+        ...
+
+    @property
+    def translation(self) -> Tensor:
+        """World to camera [m], shape (..., 3)."""
+        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -259,8 +267,8 @@ def _painted(model: RenderModel, look: Look) -> tuple[np.ndarray, np.ndarray, np
         [look.ropes[k % len(look.ropes)] for k in range(len(model.counts))],
         [look.particles[k % len(look.particles)] for k in range(groups)],
     )
-    rows = (np.array([p.numbers() for p in kind], np.float32).reshape(-1, 12) for kind in kinds)
-    return *rows, np.array(look.lights(model.floor_height), np.float32)
+    pieces, ropes, grains = (np.array([p.numbers() for p in kind], np.float32).reshape(-1, 12) for kind in kinds)
+    return pieces, ropes, grains, np.array(look.lights(model.floor_height), np.float32)
 
 
 def renderer_inputs(

@@ -103,8 +103,9 @@ def _mesh(scene: dict[str, Array], pixels: float) -> _Mesh:
         owner.append(np.full(len(found[3]), pieces + rope))
         casts.append(np.ones(len(found[3]), bool))
         start += len(found[0])
-    parts_ = [np.concatenate(x) for x in (pos, normal, uv, face, owner, casts)]
-    return _Mesh(*(x.astype(np.float32) for x in parts_[:3]), parts_[3].astype(int), *parts_[4:])
+    places, normals, texels = (np.concatenate(x).astype(np.float32) for x in (pos, normal, uv))
+    faces, owners, shadows = (np.concatenate(x) for x in (face, owner, casts))
+    return _Mesh(places, normals, texels, faces.astype(int), owners, shadows)
 
 
 def tube(x: Array, radius: Array, closed: bool, sides: int, parts: int) -> tuple[Array, Array, Array, Array]:
@@ -157,8 +158,8 @@ def tube(x: Array, radius: Array, closed: bool, sides: int, parts: int) -> tuple
     pos = middle[:, None] + r[:, None, None] * away
     normal = unit(away + gradient[:, None, None] * ahead[:, None])
     uv = np.stack(np.broadcast_arrays(np.arange(sides + 1) / sides, along[:, None]), -1)
-    i, k = np.meshgrid(np.arange(len(middle) - 1), np.arange(sides), indexing="ij")
-    p, q = i * (sides + 1) + k, (i + 1) * (sides + 1) + k
+    i, j = np.meshgrid(np.arange(len(middle) - 1), np.arange(sides), indexing="ij")
+    p, q = i * (sides + 1) + j, (i + 1) * (sides + 1) + j
     face = np.stack([np.stack([p, p + 1, q], -1), np.stack([p + 1, q + 1, q], -1)], -2)
     return pos.reshape(-1, 3), normal.reshape(-1, 3), uv.reshape(-1, 2), face.reshape(-1, 3)
 
@@ -268,7 +269,9 @@ def _picture(
     """Fill the pictures of one camera."""
     step = 2 if settings["samples"] == 4 else 1
     shape = (settings["height"], settings["width"])
-    near, number = np.zeros(np.multiply(shape, step), np.float32), np.full(np.multiply(shape, step), -1)
+    size = (step * shape[0], step * shape[1])
+    near: Array = np.zeros(size, np.float32)
+    number: Array = np.full(size, -1)
     local = camera.local(mesh.pos).astype(np.float32)
 
     def corner(p: Array) -> Array:
@@ -280,7 +283,7 @@ def _picture(
         for triangle in _clipped(local[face]):
             _draw(corner(triangle), k, False, near, number)
     balls = camera.local(scene["particle_pos"]).astype(np.float32)
-    y, x = np.mgrid[: near.shape[0], : near.shape[1]].astype(np.float32)
+    y, x = np.mgrid[: size[0], : size[1]].astype(np.float32)
     for k, (p, r) in enumerate(zip(balls, scene["particle_radius"], strict=True)):
         if p[2] - r <= NEAR:
             continue

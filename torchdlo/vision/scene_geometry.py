@@ -9,13 +9,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchdlo.coupling.bodies.dynamics import Body
 from torchdlo.coupling.common.pose import Pose
 from torchdlo.coupling.robot import robot_kinematics as robots
 from torchdlo.coupling.robot.robot_kinematics import Robot
+from torchdlo.physics import tree
 from torchdlo.scene import Params, Scene, State
 from torchdlo.vision.arm_surfaces import link_surfaces
 from torchdlo.vision.renderer import ARM, BODY, TABLE, Piece, Placement, RenderModel
-from torchdlo.vision.surfaces import isosurface, plate, solid
+from torchdlo.vision.surfaces import Surface, isosurface, plate, solid
 
 __all__ = ["arm_frame", "matrices", "model_of", "placement_of"]
 
@@ -49,7 +51,11 @@ def model_of(
         if name == "table":
             top = float(value["height"].reshape(-1)[0])
             pieces.append(Piece(plate(low, high, top, THICK), TABLE, "table", shadow=False))
-    size = params.bodies.size.reshape(-1, len(scene.bodies), 3)[0].double().cpu().numpy() if scene.bodies else ()
+    size = (
+        tree.part(params.bodies).size.reshape(-1, len(scene.bodies), 3)[0].double().cpu().numpy()
+        if scene.bodies
+        else ()
+    )
     for k, body in enumerate(scene.bodies):
         if body.shape == "plane":
             pieces.append(Piece(plate(low, high, 0.0, THICK), TABLE, "table", frame=1 + k, shadow=False))
@@ -76,10 +82,11 @@ def model_of(
     )
 
 
-def _sampled(body: object, params: Params, k: int, half: np.ndarray) -> object:
+def _sampled(body: Body, params: Params, k: int, half: np.ndarray) -> Surface:
     """Return the surface of a body from its grid of distances."""
     counts = [n + 1 for n in body.cells]
-    grid = params.bodies.grid.reshape(-1, *params.bodies.grid.shape[-2:])[0, k, : math.prod(counts)]
+    solid = tree.part(params.bodies)
+    grid = solid.grid.reshape(-1, *solid.grid.shape[-2:])[0, k, : math.prod(counts)]
     values = grid.reshape(counts).double().cpu().numpy()
     return isosurface(values, -half, 2 * half / np.array(body.cells))
 
@@ -101,9 +108,8 @@ def _at_vertices(edges: np.ndarray, counts: Sequence[int], closed: Sequence[bool
 
 def _ball_radii(scene: Scene, params: Params) -> np.ndarray:
     """Return radii of balls of the particles' volumes [m], larger so that they close."""
-    volume = (
-        params.material_points.volume.reshape(-1, params.material_points.volume.shape[-2])[0].double().cpu().numpy()
-    )
+    own = tree.part(params.material_points).volume
+    volume = own.reshape(-1, own.shape[-2])[0].double().cpu().numpy()
     return 0.62 * 1.6 * np.cbrt(volume)
 
 
@@ -132,7 +138,7 @@ def placement_of(
         pos.append(state.bodies.pos.expand(len(x), *state.bodies.pos.shape[-2:]))
         quat.append(state.bodies.quat.expand(len(x), *state.bodies.quat.shape[-2:]))
     for k, robot in enumerate(arms):
-        links: Pose = robots.poses(robot, joints[:, k].to(x))
+        links: Pose = robots.poses(robot, tree.part(joints)[:, k].to(x))
         pos.append(links.pos + (0.0 if bases is None else bases[k].to(x)))
         quat.append(links.quat)
     at = torch.cat(pos, 1)

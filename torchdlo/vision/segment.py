@@ -109,7 +109,7 @@ def tidy(mask: np.ndarray, ranges: Ranges) -> np.ndarray:
     here = mask.astype(np.uint8)
     if ranges.close > 1:
         kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (ranges.close, ranges.close))
-        here = cv2.morphologyEx(here, cv2.MORPH_CLOSE, kernel)
+        here = np.asarray(cv2.morphologyEx(here, cv2.MORPH_CLOSE, kernel), np.uint8)
     count, label, stats, _ = cv2.connectedComponentsWithStats(here, connectivity=8)
     if count <= 1:
         return here.astype(bool)
@@ -142,7 +142,7 @@ def ranges_from(content: Any, where: str) -> Ranges:
         if name == "generator":
             continue
         if name in _LIMITS:
-            pair = value if isinstance(value, (list, tuple)) and len(value) == 2 else (None, None)
+            pair: Sequence[Any] = value if isinstance(value, (list, tuple)) and len(value) == 2 else (None, None)
             good = all(isinstance(v, (int, float)) and not isinstance(v, bool) and math.isfinite(v) for v in pair)
             if not good or not all(0 <= v <= _LIMITS[name] for v in pair):
                 limit = f"{_LIMITS[name]:g}"
@@ -206,7 +206,7 @@ def _from_folder(path: Path) -> np.ndarray:
     files = sorted(path.glob("*.png"))
     if not files:
         raise InputError(f"{path}: expected PNG files, one for each frame, found none.")
-    pictures = []
+    pictures: list[np.ndarray] = []
     for file in files:
         picture = cv2.imread(str(file), cv2.IMREAD_COLOR)
         if picture is None:

@@ -42,7 +42,7 @@ def thin(mask: np.ndarray) -> np.ndarray:
         removed = 0
         for table in _tables():
             code = cv2.filter2D(left, cv2.CV_8U, _CODE, borderType=cv2.BORDER_CONSTANT)
-            gone = cv2.LUT(code, table) & (left * 255)
+            gone = np.asarray(cv2.LUT(code, table), np.uint8) & (left * 255)
             removed += cv2.countNonZero(gone)
             left[gone > 0] = 0
         if not removed:
@@ -122,8 +122,8 @@ def sample_field(field: Tensor, pixel: Tensor) -> Tensor:
     height, width = field.shape[-2:]
     size = pixel.new_tensor([width - 1, height - 1])
     grid = (2 * pixel / size - 1)[:, None]
-    options = {"mode": "bilinear", "padding_mode": "border", "align_corners": True}
-    return torch.nn.functional.grid_sample(field[:, None].to(pixel), grid, **options)[:, 0, 0]
+    fields = field[:, None].to(pixel)
+    return torch.nn.functional.grid_sample(fields, grid, "bilinear", "border", align_corners=True)[:, 0, 0]
 
 
 def curve_vectors(curve: Tensor, places: Tensor) -> tuple[Tensor, Tensor]:

@@ -87,7 +87,9 @@ def _bent(radius: float, thick: float, start: float, end: float, centre: float, 
 def _box(half: np.ndarray) -> Surface:
     # Each face has its own corners, so that its edges are not shaded round.
     square = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]], float)
-    corners, normals, faces = [], [], []
+    corners: list[np.ndarray] = []
+    normals: list[np.ndarray] = []
+    faces: list[list[int]] = []
     for axis in range(3):
         for side in (-1, 1):
             face = np.empty((4, 3))

@@ -40,7 +40,8 @@ def read_video(path: str | Path, *, most: int = _MOST) -> tuple[np.ndarray, floa
         InputError: It cannot be read, or its pictures are turned or not evenly spaced in time.
     """
     path = Path(path)
-    pictures, times = [], []
+    pictures: list[np.ndarray] = []
+    times: list[float | None] = []
     for picture, time in _decoded(path):
         if len(pictures) == most:
             raise InputError(f"{path}: expected at most {most} pictures, found more; cut the film.")

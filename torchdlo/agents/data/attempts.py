@@ -113,7 +113,9 @@ def read_attempt(folder: Path, plan: str | None = None) -> Attempt | None:
         return Attempt(folder, record)
     sums = read_json(folder / SUMS)
     try:
-        whole = sums is not None and plan in (None, sums["plan"]) and RECORD in sums["files"]
+        if sums is None:
+            return None
+        whole = plan in (None, sums["plan"]) and RECORD in sums["files"]
         whole = whole and all(_hash(folder / name) == seal for name, seal in sums["files"].items())
     except (KeyError, TypeError, AttributeError, OSError):
         return None

@@ -94,7 +94,7 @@ def _numbered(schema: Schema, episode: DatasetEpisode, k: int, start: int, task:
 
 def _filed(sizes: Sequence[int], most: int) -> Iterator[tuple[int, list[int]]]:
     """Yield the numbers of files and the episodes in each, by the sizes of episodes and the most of a file [B]."""
-    file, members, total = 0, [], 0
+    file, members, total = 0, list[int](), 0
     for k, size in enumerate(sizes):
         if members and total + size > most:
             yield file, members

@@ -157,7 +157,7 @@ def _pictures(data: DataSet, stats: dict[str, Any], callback: Callable[[int, int
     broken = False
     for k in range(len(data.episodes)):
         for camera in data.cameras:
-            shape, wrong = tuple(data.features[camera]["shape"]), set()
+            shape, wrong = tuple(data.features[camera]["shape"]), set[tuple[int, ...]]()
 
             def seen(images: Iterator[np.ndarray], shape: tuple = shape, wrong: set = wrong) -> Iterator[np.ndarray]:
                 for image in images:

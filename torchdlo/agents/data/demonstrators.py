@@ -31,8 +31,10 @@ FADE = 20
 class Demonstrator(Protocol):
     """Who acts. It is asked before every action of a batch of episodes."""
 
-    source: str
-    """What it is, for the record."""
+    @property
+    def source(self) -> str:
+        """What it is, for the record."""
+        ...
 
     def sees(self, memory: Any) -> int:
         """Return the width and height of the pictures that it needs for the next action [px]; 0 for none."""

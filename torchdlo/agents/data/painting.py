@@ -5,12 +5,14 @@ from __future__ import annotations
 import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from torchdlo.envs.core import episode
 from torchdlo.envs.observations.pixels import CameraRig, camera_rig, render_cameras
+from torchdlo.physics import tree
 from torchdlo.vision.look import Look, draw_look
 
 __all__ = ["TaskPainter"]
@@ -42,8 +44,8 @@ class TaskPainter:
     ) -> dict[str, Tensor]:
         """Return pictures by camera, see `record.Painter`; the first arm has the right wrist."""
         rig = _rig(made, size)
-        quality = {"samples": self.samples, "shadow": self.shadow}
+        quality: dict[str, Any] = {"samples": self.samples, "shadow": self.shadow}
         seen = render_cameras(
             rig, world.state, world.joints, looks=[_look(seed, self.jitter) for seed in looks], **quality
         ).rgb
-        return {camera.name: seen[:, k] for k, camera in enumerate(rig.cameras)}
+        return {camera.name: tree.part(seen)[:, k] for k, camera in enumerate(rig.cameras)}

@@ -49,7 +49,7 @@ class RayWorkers(_Closing):
         """Yield results as they get done."""
         ray = self._ray
         remote = ray.remote(num_cpus=1, max_retries=AGAIN)(_called)
-        todo, running = list(range(len(items)))[::-1], {}
+        todo, running = list(range(len(items)))[::-1], dict[Any, int]()
         try:
             while todo or running:
                 most = self.workers or max(1, int(ray.cluster_resources().get("CPU", 1)))

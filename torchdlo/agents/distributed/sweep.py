@@ -105,8 +105,13 @@ def _command(job: Job, folder: Path) -> list[str]:
 def _called(job: Job, folder: Path) -> _Outcome:
     begun = time.monotonic()
     environment = os.environ | {"OMP_NUM_THREADS": "1", "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
-    pipes = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE, "stdin": subprocess.DEVNULL}
-    process = subprocess.Popen(_command(job, folder), env=environment, **pipes)
+    process = subprocess.Popen(
+        _command(job, folder),
+        env=environment,
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+    )
     executors.CHILDREN.add(process)
     try:
         _, errors = process.communicate()

@@ -69,8 +69,8 @@ class _Eye(nn.Module):
         self.films = nn.ModuleList(nn.Linear(WIDTH, 2 * b) for _, b in pairs)
         for film in self.films:
             # At first the sentence changes nothing.
-            nn.init.zeros_(film.weight)
-            nn.init.zeros_(film.bias)
+            nn.init.zeros_(film.get_parameter("weight"))
+            nn.init.zeros_(film.get_parameter("bias"))
         cells = shape.size
         for kernel, stride, margin in kinds:
             cells = (cells + 2 * margin - kernel) // stride + 1
@@ -89,6 +89,11 @@ class _Eye(nn.Module):
 
 class ChunkPolicy(nn.Module):
     """The network. States and targets are scaled by statistics that it keeps with its weights."""
+
+    state_mean: Tensor
+    state_std: Tensor
+    target_mean: Tensor
+    target_std: Tensor
 
     def __init__(self, shape: NetworkShape) -> None:
         """Make it, with weights drawn from torch's generator."""
@@ -203,7 +208,8 @@ def load_policy(path: Path) -> tuple[ChunkPolicy, dict[str, Any]]:
     try:
         if content["generator"] != GENERATOR:
             raise ValueError
-        shape = NetworkShape(**{k: tuple(v) if isinstance(v, list) else v for k, v in content["shape"].items()})
+        said: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in content["shape"].items()}
+        shape = NetworkShape(**said)
         if max(shape.arms, len(shape.cameras), shape.layers, len(shape.channels)) > 100:
             raise ValueError
         weights = {name: _exact(x) for name, x in content["weights"].items()}

@@ -128,7 +128,7 @@ def evaluate_chunk_policy(
             with torch.no_grad():
                 steps, end, _ = play_batch(made, attempts, who, Noise(0.0), painter)
             returns = torch.stack([step.reward for step in steps]).sum(0)
-            rows = [
+            rows: list[dict[str, Any]] = [
                 {"told": start.told, "success": bool(good), "return": float(value) if math.isfinite(value) else None}
                 for start, good, value in zip(attempts, steps[-1].success, returns, strict=True)
             ]

@@ -130,15 +130,15 @@ def _read(data: DataSet, encoder: str, folder: Path, callback: Callable[[str, in
             pictures[camera.removeprefix(IMAGES)][start:end] = shots.transpose(0, 3, 1, 2)
         callback("read", k + 1, len(data.episodes), "")
     target = columns["torchdlo.target"].reshape(count, -1, 7)[..., :3].reshape(count, -1)
-    target = torch.from_numpy(np.ascontiguousarray(target))
+    targets = torch.from_numpy(np.ascontiguousarray(target))
     return _Frames(
         torch.from_numpy(columns["observation.state"].copy()),
-        target,
+        targets,
         torch.from_numpy(first),
         torch.from_numpy(last),
         language.encode_sentences(data.tasks, encoder),
         torch.from_numpy(columns["task_index"].copy()),
-        _weights(data, target),
+        _weights(data, targets),
         pictures,
     )
 

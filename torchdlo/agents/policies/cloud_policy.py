@@ -60,6 +60,10 @@ class CloudSpec:
 class CloudPolicy(nn.Module):
     """A policy of clouds; see `CloudSpec`."""
 
+    _center: Tensor
+    _tools: Tensor
+    _wave: Tensor
+
     def __init__(self, spec: CloudSpec) -> None:
         """Make one with random weights of torch's generator."""
         super().__init__()

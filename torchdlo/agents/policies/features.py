@@ -63,6 +63,10 @@ class FeatureSpec:
 class Features(nn.Module):
     """Features (N, F) of observations (N, O) and shares of the episode that are over (N, 1)."""
 
+    _at: Tensor
+    _centers: Tensor
+    _wave: Tensor
+
     def __init__(self, spec: FeatureSpec) -> None:
         """Make what `spec` says."""
         super().__init__()
@@ -98,6 +102,10 @@ class Features(nn.Module):
 
 class Normaliser(nn.Module):
     """Mean and spread of features, over all that it was shown."""
+
+    count: Tensor
+    mean: Tensor
+    square: Tensor
 
     def __init__(self, width: int, *, finest: float = _FINEST) -> None:
         """Make one that changes nothing yet.

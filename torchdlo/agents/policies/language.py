@@ -13,6 +13,7 @@ import itertools
 import re
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -83,7 +84,7 @@ def _hashed(text: str) -> Tensor:
 
 
 @functools.cache
-def _model(folder: Path) -> tuple[object, dict[str, Tensor], int]:
+def _model(folder: Path) -> tuple[Any, dict[str, Tensor], int]:
     from safetensors.torch import load_file
     from tokenizers import Tokenizer
 

@@ -54,7 +54,9 @@ class PolicySpec:
         return replace(made, hidden=tuple(made.hidden))
 
 
-def mlp(sizes: tuple[int, ...], activation: str = "tanh", *, layer_norm: bool = False, last: float = 1.0) -> nn.Module:
+def mlp(
+    sizes: tuple[int, ...], activation: str = "tanh", *, layer_norm: bool = False, last: float = 1.0
+) -> nn.Sequential:
     """Return a perceptron with orthogonal weights; those of the last layer are scaled by `last`."""
     kinds = {"tanh": nn.Tanh, "relu": nn.ReLU, "elu": nn.ELU, "silu": nn.SiLU}
     layers: list[nn.Module] = []
@@ -71,6 +73,9 @@ def mlp(sizes: tuple[int, ...], activation: str = "tanh", *, layer_norm: bool = 
 class Policy(nn.Module):
     """A policy. It acts on observations and the share of the episode that is over; see `PolicySpec`."""
 
+    normaliser: Normaliser
+    features: Features
+
     def __init__(self, spec: PolicySpec) -> None:
         """Make one with random weights of torch's generator."""
         super().__init__()
@@ -81,7 +86,7 @@ class Policy(nn.Module):
         self.net = mlp(sizes, spec.activation, layer_norm=spec.layer_norm, last=0.01)
         if spec.state_sigma:
             with torch.no_grad():
-                self.net[-1].bias[spec.actions :] = math.log(spec.sigma)
+                self.net[-1].get_parameter("bias")[spec.actions :] = math.log(spec.sigma)
         else:
             self.log_sigma = nn.Parameter(torch.full((spec.actions,), math.log(spec.sigma)))
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -45,12 +47,12 @@ def load_policy(path: Path | str, notes: bool = False) -> Any:
         if content["generator"] != _GENERATOR:
             raise wrong
         if content.get("kind") == "cloud":
-            made, spec = CloudPolicy, CloudSpec.of(content["spec"])
+            made: Callable[[], Policy | CloudPolicy] = partial(CloudPolicy, CloudSpec.of(content["spec"]))
         else:
-            made, spec = Policy, PolicySpec.of(content["spec"])
+            made = partial(Policy, PolicySpec.of(content["spec"]))
         with torch.device("meta"):  # what the file says of itself may be of any size
-            check_shapes(made(spec), content["state"], str(path), what)
-        policy = made(spec)
+            check_shapes(made(), content["state"], str(path), what)
+        policy = made()
         policy.load_state_dict(content["state"])
         said = content["notes"]
     except InputError:

@@ -21,7 +21,7 @@ __all__ = ["PROTOCOLS", "UNSEEN", "evaluate_policies", "judge_policies", "wilson
 
 UNSEEN = 777_000_000
 """Seed of the starts of the judgement; trainers add less than this to theirs."""
-PROTOCOLS = {
+PROTOCOLS: dict[str, dict[str, Any]] = {
     "one": {"variation": False},
     "varied": {"variation": True},
     "disturbed": {"variation": True, "noise": 0.002, "randomize": 0.2},

@@ -128,7 +128,7 @@ class _Journal:
     """A file of scores, batch after batch: a search asks for the same ones again when it is run again."""
 
     def __init__(self, path: Path | None, choices: list[Any]) -> None:
-        self.path, self.choices, self.rows = path, choices, []
+        self.path, self.choices, self.rows = path, choices, list[Any]()
         self.ahead: list[list[list[float]]] = []
         found = None if path is None else read_json(path)
         if found is not None and found.get("choices") == choices:
@@ -262,7 +262,9 @@ def improve_expert(
     base, good = experts[best], 0
     mean = base
     told("robust", 0, generations, f"{base.source}: success {scores[best].success:.0%}")
-    search = _strategy(task, population, sigma, seed) if generations else None
+    if not generations:
+        return base, log, arena.played
+    search = _strategy(task, population, sigma, seed)
     for k in range(generations):
         if time.monotonic() - began > 60 * minutes or good >= 3:
             break

@@ -234,7 +234,7 @@ def _clone(
         played += episodes.count
         if k < len(log):
             continue
-        choices = {"driven": k == 0, "noise": plan.noise, "generator": rng}
+        choices: dict[str, Any] = {"driven": k == 0, "noise": plan.noise, "generator": rng}
         success, failed = label_batch(labels, policy, expert, episodes, **choices)
         error = fit_clone(policy, labels, updates=plan.updates)
         fine = episodes.task.fidelity.text

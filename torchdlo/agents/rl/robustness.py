@@ -192,7 +192,8 @@ def _changed(params: Params, how: Disturbance, scene: scenes.Scene, task: Task) 
     material = tree.replace(material, bend=material.bend * how.stiffness, twist=material.twist * how.stiffness)
     bodies = params.bodies
     if scene.bodies:
-        bodies = tree.replace(bodies, mu_s=bodies.mu_s * how.friction, mu_k=bodies.mu_k * how.friction)
+        own = tree.part(bodies)
+        bodies = tree.replace(own, mu_s=own.mu_s * how.friction, mu_k=own.mu_k * how.friction)
     changed = tree.replace(params, effects=effects, rods=tree.replace(params.rods, material=material), bodies=bodies)
     try:
         scenes.check_step(scene, changed)

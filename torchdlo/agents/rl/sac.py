@@ -61,8 +61,8 @@ class Sac:
     def state_dict(self) -> dict[str, Any]:
         """Return what is remembered, as plain tensors."""
         count = len(self.buffer)
-        kept = self.buffer[:] if count else {}
-        flat = {"/".join(k if isinstance(k, tuple) else (k,)): v for k, v in kept.items(True, True)} if count else {}
+        kept = self.buffer[:].items(True, True) if count else ()
+        flat = {"/".join(k if isinstance(k, tuple) else (k,)): v for k, v in kept}
         return {"done": self.done, "cursor": int(self.buffer._writer._cursor), "rows": flat}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:

@@ -122,7 +122,7 @@ def training_preset(task: str, algorithm: str, **given: Any) -> TrainingSettings
     """Return the settings for a task and an algorithm; what is given and not None wins."""
     if algorithm not in ALGORITHMS:
         raise InputError(f"algorithm is {algorithm!r}; expected one of {', '.join(ALGORITHMS)}.")
-    base = {"algorithm": algorithm, "episodes": EPISODES.get(task, 20_000)} | _ALGORITHM[algorithm]
+    base: dict[str, Any] = {"algorithm": algorithm, "episodes": EPISODES.get(task, 20_000)} | _ALGORITHM[algorithm]
     wanted = {name: value for name, value in given.items() if value is not None}
     names = {f.name for f in dataclasses.fields(TrainingSettings)}
     other = sorted(set(wanted) - names)

@@ -9,7 +9,7 @@ those of others, are cut with respect to each action, before scenes are averaged
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -105,10 +105,10 @@ class Shac:
         self.target = nn.ModuleList(Critic(policy, settings) for _ in range(self.critics))
         self.target.load_state_dict(self.critic.state_dict())
         self.log_temperature = nn.Parameter(torch.zeros(()))
-        betas = {"betas": (0.7, 0.95)}
-        self.optimizer = torch.optim.Adam(policy.parameters(), lr=settings.rate, **betas)
-        self.critic_optimizer = torch.optim.Adam(self.critic.parameters(), lr=settings.critic_rate, **betas)
-        self.heat_optimizer = torch.optim.Adam([self.log_temperature], lr=settings.entropy_rate, **betas)
+        betas = (0.7, 0.95)
+        self.optimizer = torch.optim.Adam(policy.parameters(), lr=settings.rate, betas=betas)
+        self.critic_optimizer = torch.optim.Adam(self.critic.parameters(), lr=settings.critic_rate, betas=betas)
+        self.heat_optimizer = torch.optim.Adam([self.log_temperature], lr=settings.entropy_rate, betas=betas)
         self.lost: list[Tensor] = []
 
     def parts(self) -> dict[str, Any]:
@@ -257,7 +257,7 @@ class Sapo(Shac):
 
 def _detached(window: Window) -> Window:
     names = ("features", "action", "log_prob", "reward", "failed", "begun", "success")
-    return Window(*(getattr(window, name).detach() for name in names), window.ends)
+    return replace(window, **{name: getattr(window, name).detach() for name in names})
 
 
 def _joined(windows: list[Window]) -> Batch:

@@ -103,7 +103,7 @@ class _Eyes:
     def see(self, episodes: TaskEpisodes) -> Tensor:
         """Return clouds [m], shape (N, P, 3)."""
         x, size = episodes.env.world.state.rods.pos.double(), (self.camera.size,) * 2
-        choices = {"count": self.camera.count, "noise": self.camera.noise, "generator": self.generator}
+        choices: dict[str, Any] = {"count": self.camera.count, "noise": self.camera.noise, "generator": self.generator}
         # Where the camera is believed to be moves all points with it.
         return (point_cloud(self.lens, torch.nan_to_num(x), size, **choices)[0] + self.off).float()
 
@@ -142,7 +142,7 @@ def _play(
     """Play a batch from where it begins; return which episodes succeeded and which failed, bool (N,)."""
     env, reach = episodes.env, episodes.task.max_translation
     seen, start = episodes.first, env.world.tool.pos.float()
-    alive, step = torch.ones(episodes.count, dtype=torch.bool), None
+    alive = torch.ones(episodes.count, dtype=torch.bool)
     for k in range(episodes.horizon):
         cloud, tool, share = eyes.see(episodes), env.world.tool.pos.float(), episode_progress(episodes, k, seen)
         done = student(cloud, tool, start, share)
@@ -217,7 +217,7 @@ def teach(
             episodes = TaskEpisodes(fine, plan.count, seed=plan.seed + 21 + k)
             episodes.reset()
             eyes = _Eyes(episodes, plan.camera, rng)
-            choices = {"driven": k == 0, "noise": plan.noise, "memory": memory}
+            choices: dict[str, Any] = {"driven": k == 0, "noise": plan.noise, "memory": memory}
             good, failed = _play(student, teacher, episodes, eyes, **choices)
             error = _fit(student, memory, plan, plan.updates * (2 if k + 1 == len(rounds) else 1))
             shares = {"success": float(good.float().mean()), "failed": float(failed.float().mean())}

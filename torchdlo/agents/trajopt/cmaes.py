@@ -56,7 +56,7 @@ def draw_population(found: Any, encoding: Encoding, given: Tensor | None = None)
     The strategy is told of what was played, not of what it drew: it would else go on where limits make all alike.
     """
     count = 0 if given is None else len(given)
-    if count:
+    if given is not None and count:
         found.inject(list(given.numpy()), force=True)
     x = torch.stack([torch.as_tensor(x) for x in found.ask()])
     # Points that were given are known to the strategy by their last bit.
@@ -83,7 +83,8 @@ def _about(plan: SearchPlan, first: Tensor, rng: torch.Generator) -> Search:
     """Search way-points that are added to actions (T A,)."""
     encoding, whole = plan.encoding(plan.hold), plan.encoding(1)
     zero = torch.zeros(1, encoding.size, dtype=torch.float64)
-    found, given = make_strategy(zero[0], _NEAR * plan.sigma, plan.population, rng), zero
+    found = make_strategy(zero[0], _NEAR * plan.sigma, plan.population, rng)
+    given: Tensor | None = zero
     while not found.stop():
         x = draw_population(found, encoding, given)
         given = None

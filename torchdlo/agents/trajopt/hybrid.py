@@ -84,7 +84,7 @@ def hybrid(plan: SearchPlan, rng: torch.Generator) -> Search:
     plans = [replace(plan, population=size) for size in sizes]
     rngs = [torch.Generator().manual_seed(seed) for seed in torch.randint(2**31, (count,), generator=rng).tolist()]
     kinds = [_island] * (count - plain) + [_line] * plain
-    islands = [kind(*each) for kind, *each in zip(kinds, plans, rngs, strict=True)]
+    islands = [kind(own, seeded) for kind, own, seeded in zip(kinds, plans, rngs, strict=True)]
     if plan.first is not None:
         # What is given may be wrong: every other island begins as without it.
         for j in range(0, count, 2):
@@ -102,7 +102,9 @@ def hybrid(plan: SearchPlan, rng: torch.Generator) -> Search:
         for j in order[count - round(given_up.get(k, 0.0) * (count - 1)) :]:
             if top[j][0] < value - _BEHIND * abs(value):
                 islands[j], parts[j] = kinds[j](plans[j], rngs[j], k, leading), None
-        asks = [island.send(told) for island, told in zip(islands, parts, strict=True)]
+        asks = [
+            next(island) if told is None else island.send(told) for island, told in zip(islands, parts, strict=True)
+        ]
         counts = [len(ask.points) for ask in asks]
 
         def pick(told: Told, _: int, asks: list[Ask] = asks, counts: list[int] = counts) -> Tensor:
@@ -113,8 +115,9 @@ def hybrid(plan: SearchPlan, rng: torch.Generator) -> Search:
         told = yield Ask(
             asks[0].encoding, torch.cat([ask.points for ask in asks]), sum(a.with_gradient for a in asks), pick
         )
-        parts = told.split(counts)
-        for j, (ask, part) in enumerate(zip(asks, parts, strict=True)):
+        answers = told.split(counts)
+        parts = [*answers]
+        for j, (ask, part) in enumerate(zip(asks, answers, strict=True)):
             at = int(part.value.argmax())
             top[j] = max(top[j], (float(part.value[at]), ask.points[at]), key=lambda found: found[0])
 
@@ -150,9 +153,12 @@ def _island(plan: SearchPlan, rng: torch.Generator, first: int = 0, about: Tenso
     given = about is not None and first == 0
     encoding, coarse, fine = plan.encoding(1), _Evolution(plan, rng, about, given=given), Descent(plan, rng)
     with_gradient, tame = fine.count, _Tame(plan)
+    both: tuple[_Evolution | Descent, ...] = (coarse, fine)
     drifts = math.ceil(plan.drifts * plan.iterations)
     alone = max(drifts, first + 1 if first else math.ceil(_COARSE * plan.iterations))
-    gain, last, top = {coarse: 0.0, fine: math.inf}, {coarse: first, fine: first}, -math.inf
+    gain: dict[_Evolution | Descent, float] = {coarse: 0.0, fine: math.inf}
+    last: dict[_Evolution | Descent, int] = {coarse: first, fine: first}
+    top = -math.inf
     surrogate_share = SurrogateRound(plan)
     for k in itertools.count(first):
         if k == plan.surrogates > 0:
@@ -165,10 +171,8 @@ def _island(plan: SearchPlan, rng: torch.Generator, first: int = 0, about: Tenso
             top = float(told.value.max())
             continue
 
-        def turn(part: _Evolution | Descent, k: int = k) -> tuple[bool, float, int]:
-            return k - last[part] >= _TURN, gain[part], -last[part]
-
-        part = coarse if k < alone else max((coarse, fine), key=turn)
+        turns = {part: (k - last[part] >= _TURN, gain[part], -last[part]) for part in both}
+        part = coarse if k < alone else max(both, key=turns.__getitem__)
         x = part.ask()
         told = yield Ask(encoding, x, with_gradient, best_indices if part is coarse else fine.pick)
         told = tame(told)

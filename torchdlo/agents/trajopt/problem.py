@@ -30,34 +30,61 @@ class Evaluation:
     """Whether the episode broke down, bool [-], shape (P,)."""
 
 
-class Problem(Protocol):
-    """A task for trajectory optimisation; `evaluate` is differentiable in the actions where these ask for it."""
-
-    name: str
-    horizon: int
-    """Actions of an episode, T."""
-    width: int
-    """Numbers of an action, A: one group after the other."""
-    group: int
-    """Numbers of a group, e.g. 3 for how far a tool moves."""
-    limit: float
-    """Largest length of a group in one action [m]."""
-    touch: tuple[tuple[float, float, float], ...]
-    """Where bodies are, from the middle of all tools at the start [m]; () if there are none, or groups are no ways."""
-    tools: tuple[tuple[float, float, float], ...]
-    """Where tools are at the start, from the middle of them all [m]; () if groups are no ways."""
-    choices: dict[str, Any]
-    """What else its results depend on, as plain data."""
+class Playable(Protocol):
+    """What plays actions."""
 
     def evaluate(self, actions: Tensor) -> Evaluation:
         """Play actions, shape (P, T, A), float64 on the CPU, one episode each."""
+        ...
+
+
+class Problem(Playable, Protocol):
+    """A task for trajectory optimisation; `evaluate` is differentiable in the actions where these ask for it."""
+
+    @property
+    def name(self) -> str: ...
+
+    @property
+    def horizon(self) -> int:
+        """Actions of an episode, T."""
+        ...
+
+    @property
+    def width(self) -> int:
+        """Numbers of an action, A: one group after the other."""
+        ...
+
+    @property
+    def group(self) -> int:
+        """Numbers of a group, e.g. 3 for how far a tool moves."""
+        ...
+
+    @property
+    def limit(self) -> float:
+        """Largest length of a group in one action [m]."""
+        ...
+
+    @property
+    def touch(self) -> tuple[tuple[float, float, float], ...]:
+        """Where bodies are, from the middle of all tools at the start [m]; () if there are none, or groups are no
+        ways."""
+        ...
+
+    @property
+    def tools(self) -> tuple[tuple[float, float, float], ...]:
+        """Where tools are at the start, from the middle of them all [m]; () if groups are no ways."""
+        ...
+
+    @property
+    def choices(self) -> dict[str, Any]:
+        """What else its results depend on, as plain data."""
         ...
 
     def surrogate(self) -> Problem | None:
         """Return a problem of the same size that is much like this one and quicker to play, if there is one."""
         ...
 
-    def varied(self, copies: int, scale: float, seed: int) -> Problem:
+    def varied(self, copies: int, scale: float, seed: int) -> Playable:
         """Return the problem that plays each trajectory in `copies` perturbed worlds, and gives the means.
 
         Args:

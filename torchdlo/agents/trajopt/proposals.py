@@ -162,9 +162,10 @@ class SurrogateRound:
 def search_surrogate(search: Search, plan: SearchPlan) -> Search:
     """Search as `search` does; what did well in a surrogate task is played in the problem itself before that goes
     on."""
-    kept, told = SurrogateRound(plan), None
+    kept = SurrogateRound(plan)
+    told: Told | None = None
     for k in itertools.count():
-        ask = search.send(told)
+        ask = next(search) if told is None else search.send(told)
         if k == plan.surrogates > 0:
             yield Ask(plan.encoding(1), kept.actions)
         told = yield ask

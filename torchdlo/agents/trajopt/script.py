@@ -64,8 +64,8 @@ def script(
     if material is not None and rope is None:
         raise InputError(f"{trajectory}: it was found for its own rope; give that one, or another, with --rope-model.")
     seeded = torch.Generator().manual_seed(reset_seed or 0)
-    start = {"generator": seeded, "variation": reset_seed is not None}
-    steps = {"compiled": chosen.compiled, "recorded": chosen.recorded}
+    start: dict[str, Any] = {"generator": seeded, "variation": reset_seed is not None}
+    steps: dict[str, Any] = {"compiled": chosen.compiled, "recorded": chosen.recorded}
     made = episode.prepare(task, 1, like=chosen.like, **steps, **start)
     if trajectory is not None:
         return Script(task, made, chosen.full(load_actions(trajectory, chosen)))

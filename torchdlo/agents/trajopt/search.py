@@ -21,6 +21,7 @@ from torchdlo.agents.trajopt.problem import Encoding, Evaluation, Problem
 from torchdlo.agents.trajopt.proposals import Ask, Search, SearchPlan, Told, search_surrogate
 from torchdlo.agents.trajopt.search_journal import SearchJournal
 from torchdlo.errors import InputError
+from torchdlo.physics import tree
 
 __all__ = ["METHODS", "Robust", "SearchResult", "SearchSettings", "optimize"]
 
@@ -172,11 +173,13 @@ def optimize(
     search = METHODS[settings.method](plan, torch.Generator().manual_seed(settings.seed))
     if settings.method not in SURROGATE_ROUND:
         search = search_surrogate(search, plan)
-    told, curve, interrupted = None, [], False
+    curve: list[dict[str, Any]] = []
+    told: Told | None = None
+    interrupted = False
     best = _Best(robust.finalists if robust else _FINALISTS)
     try:
         for k in range(plan.iterations):
-            ask = search.send(told)
+            ask = next(search) if told is None else search.send(told)
             scale = robust.scale((k + 1) / plan.iterations) if robust else 0.0
             on_surrogate = k < plan.surrogates
             last = k + 1 == plan.iterations  # nothing is told of it
@@ -230,7 +233,8 @@ def _alone(
     What rests on a narrow escape does not do alone what it did in a batch, where numbers are rounded otherwise. Returns
     in several worlds do not compare with those in one: robust ones promise no more than success.
     """
-    best, found = None, None
+    best: _Finalist | None = None
+    found: tuple[_Finalist, Evaluation, dict[str, Any]] | None = None
     for each in finalists:
         slack = math.inf if robust else _ALIKE * abs(each.returns)
         if best is not None and best.rank >= (each.success, each.returns - slack):
@@ -241,7 +245,7 @@ def _alone(
         went = _Finalist(bool(outcome.success[0]), value if math.isfinite(value) else -math.inf, each.actions)
         if best is None or went.rank > best.rank:
             best, found = went, (each, outcome, kept)
-    return found
+    return tree.part(found)
 
 
 def _options(problem: Problem, settings: SearchSettings) -> dict[str, Any]:

@@ -95,7 +95,7 @@ class TaskProblem:
     @functools.cached_property
     def _places(self) -> tuple[tuple[tuple[float, float, float], ...], ...]:
         scene, _, state = self.task.start(1, like=torch.zeros((), dtype=torch.float64))
-        things = [state.bodies.pos[0, k] for k, body in enumerate(scene.bodies) if body.shape != "plane"]
+        things = [tree.part(state.bodies).pos[0, k] for k, body in enumerate(scene.bodies) if body.shape != "plane"]
         if state.material_points:
             things.append(state.material_points.pos[0].mean(0))
         tools = state.rods.pos[0, list(self.task.arms.vertex)]
@@ -120,8 +120,9 @@ class TaskProblem:
     def prepared(self, count: int) -> episode.Episode:
         """Return the episode for a batch; gradients run five frames again at once."""
         if count not in self._episodes:
-            choices = {"compiled": self.compiled, "recorded": self.recorded, "segment": 5}
-            self._episodes[count] = episode.prepare(self.task, count, like=self.like, **choices)
+            self._episodes[count] = episode.prepare(
+                self.task, count, like=self.like, compiled=self.compiled, recorded=self.recorded, segment=5
+            )
         return self._episodes[count]
 
     def full(self, actions: Tensor) -> Tensor:
@@ -152,7 +153,7 @@ class TaskProblem:
         if all is well.
         """
         went = episode.play(self.task, self.full(actions[None]), episode=self.prepared(1), keep=episode.scene_positions)
-        kept = {name: went.path[name][:, 0].tolist() for name in ("joints", "tool")}
+        kept: dict[str, Any] = {name: went.path[name][:, 0].tolist() for name in ("joints", "tool")}
         kept["rewards"] = went.rewards[:, 0].tolist()
         kept["missed"] = step_diagnostics.explain_diagnostics(went.world.state.diagnostics)
         finite = all(math.isfinite(value) for value in kept["rewards"])
@@ -180,9 +181,9 @@ class Varied:
         base = self.inner.prepared(count)
         base = replace(base, params=params, start=episode.begin(replace(base, params=params), state))
         went = episode.play(task, self.inner.full(actions).repeat_interleave(self.copies, 0), episode=base)
-        went = tree.map(lambda x: x.reshape(len(actions), self.copies), _outcome(went))
-        means = (x.mean(-1) for x in (went.returns, went.loss, went.terminal_cost))
-        return Evaluation(*means, went.success.all(-1), went.failed.any(-1))
+        each = tree.map(lambda x: x.reshape(len(actions), self.copies), _outcome(went))
+        returns, loss, cost = (x.mean(-1) for x in (each.returns, each.loss, each.terminal_cost))
+        return Evaluation(returns, loss, cost, each.success.all(-1), each.failed.any(-1))
 
 
 def _outcome(went: episode.EpisodeResult) -> Evaluation:

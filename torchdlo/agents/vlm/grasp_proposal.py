@@ -18,6 +18,7 @@ from torchdlo.envs import Task
 from torchdlo.envs.core import scene_names
 from torchdlo.envs.core.episode import reachable
 from torchdlo.errors import InputError
+from torchdlo.physics import tree
 from torchdlo.scene import Scene, State
 from torchdlo.untrusted import read_json
 
@@ -91,7 +92,7 @@ def places_of(task: Task, state: State | None = None) -> Places:
     x = state.rods.pos[0].double()
     reach = reachable(task, x)
     bodies = [k for k, body in enumerate(scene.bodies) if body.shape != "plane"]
-    at = state.bodies.pos[0, bodies].double() if bodies else x.new_zeros(0, 3)
+    at = tree.part(state.bodies).pos[0, bodies].double() if bodies else x.new_zeros(0, 3)
     # Vertices that are fixed in the world are nobody's.
     fixed = sorted({*scene.prescribed_vertices} - {*task.schedule.held})
     if fixed:

@@ -82,9 +82,8 @@ def step_models(hands: int) -> tuple[type[TaskPlan], type[Update]]:
     """Return what plans and updates have to fit, for so many hands."""
     robots = create_model("Robots", __base__=Strict, **_robots(hands, Annotated[int, Field(ge=0, le=100_000)]))
     way = Annotated[list[Annotated[list[Coordinate], Field(min_length=3, max_length=3)]], Field(max_length=20)]
-    stage_waypoints = create_model(
-        "Waypoints", __base__=Strict, **{f"robot_{k + 1}": (way | None, None) for k in range(hands)}
-    )
+    ways: dict[str, Any] = {f"robot_{k + 1}": (way | None, None) for k in range(hands)}
+    stage_waypoints = create_model("Waypoints", __base__=Strict, **ways)
     step = create_model("Step", __base__=Step, grasps=(robots, ...), waypoints=(stage_waypoints | None, None))
 
     def listed(cls: Any, content: Any) -> Any:

@@ -46,7 +46,7 @@ from torchdlo.coupling.bodies.contact_solver import BodySystem, Links, gather, i
 from torchdlo.coupling.bodies.dynamics import Body, PredictedBodyMotion
 from torchdlo.coupling.common.coulomb_friction import rebound_separation, separation_needed
 from torchdlo.physics import tree
-from torchdlo.physics.effects.base import ContactForces, Effect, PredictedMotion, Values
+from torchdlo.physics.effects.base import ContactForces, Effect, EffectKind, PredictedMotion, Values
 from torchdlo.physics.linalg.numerics import dot, safe_norm
 from torchdlo.physics.rod.kinematics import View
 
@@ -61,7 +61,7 @@ def _combined(x: Tensor, pairs: tuple[tuple[int, int], ...], counts: tuple[int, 
 def _links(contact: BodyContact, motion: PredictedBodyMotion) -> Links:
     state, params, pairs = motion.state, motion.params, contact.chosen(motion.bodies)
     found, counts = deepest_points(motion, pairs, contact.points)
-    arms = tuple(found.point - gather(state.pos, pairs, counts, side) for side in (0, 1))
+    near, far = (found.point - gather(state.pos, pairs, counts, side) for side in (0, 1))
     at = [tuple(gather(x, pairs, counts, side) for side in (0, 1)) for x in (motion.mobility, params.restitution)]
     like = found.gap
     links = Links(
@@ -69,7 +69,7 @@ def _links(contact: BodyContact, motion: PredictedBodyMotion) -> Links:
         counts,
         motion.bodies,
         found.normal,
-        arms,
+        (near, far),
         like,
         found.normal,
         _combined(params.mu_s, pairs, counts),
@@ -147,7 +147,7 @@ def _slopes(links: Links, sets: _Sets, load: Tensor | None, size: Tensor | None)
     press, drag = (x.unsqueeze(-1) for x in (links.stiff * sets.press, sets.drag))
     across = torch.eye(3, dtype=n.dtype, device=n.device) - n @ n.mT
     gradient = press * (n @ n.mT) + drag * across
-    if load is None:
+    if load is None or size is None:
         return gradient
     mu, slides = links.mu_k.unsqueeze(-1), sets.slides.unsqueeze(-1)
     turning = mu * load.unsqueeze(-1) / size.unsqueeze(-1).clamp(min=1e-30) * (across - t @ t.mT)
@@ -171,7 +171,6 @@ def _settled(system: BodySystem, dt: float, slowest: float, rounds: int) -> tupl
     links = system.links
     near = (links.wanted - dot(links.normal, links.free) > -slowest * dt).to(links.wanted.dtype)
     sets = _Sets(near, torch.ones_like(near), torch.zeros_like(near), torch.zeros_like(links.normal))
-    q = None
     for _ in range(rounds):
         gradients = _slopes(links, sets, None, None)
         stays = links.stiff * sets.press * links.wanted * links.normal - (gradients @ links.free.unsqueeze(-1)).squeeze(
@@ -265,7 +264,7 @@ class BodyContact(Effect):
     """Approach below which nothing rebounds [m/s]."""
 
     name: ClassVar[str] = "body_contact"
-    kind: ClassVar[str] = "force"
+    kind: ClassVar[EffectKind] = "force"
     is_contact: ClassVar[bool] = True
 
     def __post_init__(self) -> None:

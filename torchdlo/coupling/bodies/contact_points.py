@@ -234,12 +234,12 @@ def deepest_points(
             sign = motion.state.pos.new_tensor([1.0 if first == pair[0] else -1.0] * 3 + [1.0] * 5)
             rows += [sign * row for row in _one_way(motion, first, second)]
         batch = torch.broadcast_shapes(*(r.shape[:-2] for r in rows))
-        rows = torch.cat([r.expand(*batch, *r.shape[-2:]) for r in rows], -2)
-        if rows.shape[-2] > most:
-            nearest = _spread(rows.detach(), most)
-            rows = torch.gather(rows, -2, nearest.unsqueeze(-1).expand(*nearest.shape, rows.shape[-1]))
-        every.append(rows)
-        counts.append(rows.shape[-2])
+        points = torch.cat([r.expand(*batch, *r.shape[-2:]) for r in rows], -2)
+        if points.shape[-2] > most:
+            nearest = _spread(points.detach(), most)
+            points = torch.gather(points, -2, nearest.unsqueeze(-1).expand(*nearest.shape, points.shape[-1]))
+        every.append(points)
+        counts.append(points.shape[-2])
     batch = torch.broadcast_shapes(*(r.shape[:-2] for r in every))
     whole = cat_vertices([r.expand(*batch, *r.shape[-2:]) for r in every])
     return Touches(whole[..., :3], whole[..., 3:6], whole[..., 6:7]), tuple(counts)

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchdlo.coupling.bodies.dynamics import Body, PredictedBodyMotion
 from torchdlo.physics.linalg import banded
-from torchdlo.physics.linalg.numerics import cross
+from torchdlo.physics.linalg.numerics import added, cross
 from torchdlo.physics.linalg.rotation import rotate
 from torchdlo.physics.tree import cat_vertices
 
@@ -59,16 +59,17 @@ class Links:
     def exerted(self, force: Tensor) -> tuple[Tensor, Tensor]:
         """Return forces [N] and torques [N m] on the bodies of forces on the first of each pair, (..., K, 3) each."""
         torques = [cross(arm, force) for arm in self.arms]
-        total: list[list[Tensor]] = [[] for _ in self.bodies]
+        parts: list[list[Tensor]] = [[] for _ in self.bodies]
         start = 0
         for pair, count in zip(self.pairs, self.counts, strict=True):
             part = slice(start, start + count)
             for body, torque, sign in zip(pair, torques, (1.0, -1.0), strict=True):
                 both = torch.cat([force[..., part, :], torque[..., part, :]], -1)
-                total[body].append(sign * both.sum(-2, keepdim=True))
+                parts[body].append(sign * both.sum(-2, keepdim=True))
             start += count
         none = force.new_zeros(*force.shape[:-2], 1, 6)
-        return tuple(cat_vertices([sum(t) if t else none for t in total]).split(3, -1))
+        push, torque = cat_vertices([added(t) if t else none for t in parts]).split(3, -1)
+        return push, torque
 
 
 def gather(x: Tensor, pairs: tuple[tuple[int, int], ...], counts: tuple[int, ...], side: int) -> Tensor:
@@ -161,8 +162,8 @@ class BodySystem:
         entries = _assembled(self.links, self.inertia, gradients, self.free)
         load = load.flatten(-2)
         batch = torch.broadcast_shapes(entries.shape[:-1], load.shape[:-1])
-        rows = [x.expand(*batch, x.shape[-1]).reshape(-1, x.shape[-1]).T for x in (entries.detach(), load)]
-        found = banded.solve(*rows, name)
+        matrix, rhs = (x.expand(*batch, x.shape[-1]).reshape(-1, x.shape[-1]).T for x in (entries.detach(), load))
+        found = banded.solve(matrix, rhs, name)
         return found.T.reshape(*batch, len(self.free), 6)
 
     def moved(self, q: Tensor) -> Tensor:

@@ -388,8 +388,8 @@ def _described(solid: RigidBody, name: str, like: Tensor) -> tuple[Body, dict[st
         volume, moments = (size[..., :1], size) if whole else shape_sdf.bulk(solid.shape, size)
         given = number("density or mass", solid.density if solid.mass is None else solid.mass, 1, 0.0)
         row["mass"] = given if solid.mass is not None else given * volume
-        given = solid.inertia
-        row["inertia"] = row["mass"] * moments if given is None else number("inertia", given, 3, 0.0)
+        own = solid.inertia
+        row["inertia"] = row["mass"] * moments if own is None else number("inertia", own, 3, 0.0)
     for what, least in (("mu_s", None), ("mu_k", None), ("restitution", None), ("damping", None)):
         row[what] = number(what, getattr(solid, what), 1, least)
         need(bool((row[what] >= 0).all()), f"{what} is {row[what].tolist()}; expected 0 or more")

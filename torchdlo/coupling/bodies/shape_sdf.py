@@ -18,7 +18,7 @@ import math
 import torch
 from torch import Tensor
 
-from torchdlo.physics.linalg.numerics import dot, safe_norm
+from torchdlo.physics.linalg.numerics import added, dot, safe_norm
 
 SIZES: dict[str, tuple[str, ...]] = {
     "plane": (),
@@ -179,7 +179,7 @@ def _mesh(size: Tensor, p: Tensor, grid: Tensor, cells: tuple[int, int, int]) ->
     distance = low_y[0] * (1 - x) + low_y[1] * x
     dx = low_y[1] - low_y[0]
     dy = (low_z[0][1] - low_z[0][0]) * (1 - x) + (low_z[1][1] - low_z[1][0]) * x
-    dz = sum(w * (pair[0] * (1 - y) + pair[1] * y) for w, pair in zip((1 - x, x), step_z, strict=True))
+    dz = added(w * (pair[0] * (1 - y) + pair[1] * y) for w, pair in zip((1 - x, x), step_z, strict=True))
     _, normal = _unit(torch.cat([dx, dy, dz], -1) * count / size, 2)
     far, away = _unit(p - inside + distance * normal, 2)
     out = (p - inside).abs().amax(-1, keepdim=True) > 0

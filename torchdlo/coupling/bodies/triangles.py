@@ -54,7 +54,7 @@ def triangle_distances(points: Tensor, triangles: Tensor) -> Tensor:
     normal = torch.linalg.cross(b - a, c - a)
     area = (normal * normal).sum(-1)
     inside = area > 0
-    nearest = None
+    squares: list[Tensor] = []
     own = (p * p).sum(-1, keepdim=True)
     for start, end in ((a, b), (b, c), (c, a)):
         edge, side = end - start, torch.linalg.cross(normal, end - start)
@@ -62,10 +62,10 @@ def triangle_distances(points: Tensor, triangles: Tensor) -> Tensor:
         length = (edge * edge).sum(-1).clamp(min=1e-300)
         along = p @ edge.T - (start * edge).sum(-1)
         share = (along / length).clamp(0, 1)
-        squared = own - 2 * (p @ start.T) + (start * start).sum(-1) + share * (share * length - 2 * along)
-        nearest = squared if nearest is None else torch.minimum(nearest, squared)
+        squares.append(own - 2 * (p @ start.T) + (start * start).sum(-1) + share * (share * length - 2 * along))
         inside = inside & (p @ side.T >= (start * side).sum(-1))
     height = p @ normal.T - (a * normal).sum(-1)
+    nearest = torch.minimum(torch.minimum(squares[0], squares[1]), squares[2])
     return torch.where(inside, height.square() / area.clamp(min=1e-300), nearest.clamp(min=0.0)).sqrt()
 
 

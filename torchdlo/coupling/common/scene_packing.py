@@ -23,7 +23,7 @@ def _constant(ask: Callable) -> Callable:
 
     That one imports the compiler, which takes a second and is of no use in steps that are not compiled.
     """
-    ask._dynamo_marked_constant = True
+    ask._dynamo_marked_constant = True  # type: ignore[attr-defined]  # a mark that no stub knows
     return ask
 
 
@@ -88,7 +88,7 @@ def fields(tensors: Sequence[Tensor]) -> ctypes.Array:
     return (ctypes.c_void_p * len(at))(*at)
 
 
-def pack_components(parts: Sequence[Tensor], batch: Sequence[int], count: int) -> list[Tensor]:
+def pack_components(parts: Sequence[Tensor], batch: torch.Size, count: int) -> list[Tensor]:
     """Return tensors (..., n or 1, C) as (C, n, B) each."""
     n = len(batch) + 2
     wide = (x.expand(*batch, count, x.shape[-1]).permute(n - 1, n - 2, *range(n - 2)) for x in parts)

@@ -6,6 +6,8 @@ from collections.abc import Sequence
 
 from torch import Tensor
 
+from torchdlo.physics.linalg.numerics import added
+
 Numbers = tuple[Tensor, ...]
 """Components of vectors, shape (..., 1) each. For compilers,
 graphs of them are simple, and those of vector products are not."""
@@ -23,9 +25,9 @@ def axes(quat: Tensor) -> tuple[Numbers, Numbers, Numbers]:
 
 def local(columns: tuple[Numbers, Numbers, Numbers], vector: Numbers) -> list[Tensor]:
     """Return vectors of the world in the frames of bodies."""
-    return [sum(c * v for c, v in zip(column, vector, strict=True)) for column in columns]
+    return [added(c * v for c, v in zip(column, vector, strict=True)) for column in columns]
 
 
 def world(columns: tuple[Numbers, Numbers, Numbers], vector: Sequence[Tensor]) -> list[Tensor]:
     """Return vectors in the frames of bodies in the world."""
-    return [sum(column[i] * v for column, v in zip(columns, vector, strict=True)) for i in range(3)]
+    return [added(column[i] * v for column, v in zip(columns, vector, strict=True)) for i in range(3)]

@@ -47,7 +47,7 @@ from torchdlo.coupling.mpm.particles import Grid
 from torchdlo.coupling.mpm.rod_coupling_effect import PredictedParticles, TouchedParticles
 from torchdlo.coupling.mpm.substep import Nodes, places
 from torchdlo.physics import tree
-from torchdlo.physics.effects.base import ContactForces, Effect
+from torchdlo.physics.effects.base import ContactForces, Effect, EffectKind
 from torchdlo.physics.linalg.numerics import cross, dot, safe_norm
 from torchdlo.physics.linalg.rotation import rotate
 
@@ -74,7 +74,7 @@ class BodyMpmCoupling(Effect):
     """Whether planes take part. Not where walls of the box stand for them, which cost less."""
 
     name: ClassVar[str] = "body_mpm_coupling"
-    kind: ClassVar[str] = "force"
+    kind: ClassVar[EffectKind] = "force"
 
     def __post_init__(self) -> None:
         for name, least in (("sweeps", 1), ("room", 0), ("reach", 0.0), ("recovery", 0.0)):
@@ -94,11 +94,12 @@ class BodyMpmCoupling(Effect):
         part = [k for k, body in enumerate(motion.bodies) if self.planes or body.shape != "plane"]
         if not part:
             return push
-        touched = TouchedParticles(material_points.nodes, 0.0) if push.material_points == () else push.material_points
+        touched = push.material_points
+        before, missed = (material_points.nodes, 0.0) if touched == () else (touched.nodes, touched.lost)
         batch = material_points.particles.pos.shape[:-2]
         met, some = motion.pushed(push), len(part) < len(motion.bodies)
         met = met.only(part) if some else met
-        impulse, torque, nodes, lost = exchange(self, material_points.grid, touched.nodes, met, batch)
+        impulse, torque, nodes, lost = exchange(self, material_points.grid, before, met, batch)
 
         def force(x: Tensor) -> Tensor:
             x = (x / motion.dt).reshape(*batch, len(part), 3)
@@ -111,7 +112,7 @@ class BodyMpmCoupling(Effect):
             push,
             body_force=push.body_force + force(impulse),
             body_torque=push.body_torque + force(torque),
-            material_points=TouchedParticles(nodes, touched.lost + lost.to(impulse.dtype)),
+            material_points=TouchedParticles(nodes, missed + lost.to(impulse.dtype)),
         )
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
@@ -68,20 +68,25 @@ class Grid:
     @property
     def nodes(self) -> tuple[int, int, int]:
         """Nodes along each axis, those of the margin included."""
-        return tuple(
+        x, y, z = (
             round((high - low) / self.spacing) + 1 + 2 * MARGIN for low, high in zip(self.low, self.high, strict=True)
         )
+        return x, y, z
 
     @property
     def size(self) -> tuple[int, int, int]:
         """Nodes along each axis that are computed."""
         whole = self.nodes
-        return whole if self.window is None else tuple(min(w, n) for w, n in zip(self.window, whole, strict=True))
+        if self.window is None:
+            return whole
+        x, y, z = (min(w, n) for w, n in zip(self.window, whole, strict=True))
+        return x, y, z
 
     @property
     def first(self) -> tuple[float, float, float]:
         """Where the first node is [m]."""
-        return tuple(low - MARGIN * self.spacing for low in self.low)
+        x, y, z = (low - MARGIN * self.spacing for low in self.low)
+        return x, y, z
 
 
 @dataclass(frozen=True)
@@ -178,7 +183,8 @@ def stored(x: Tensor) -> Tensor:
 
 def laid_out(state: T) -> T:
     """Return the state of a scene, stored to the last stride as compiled steps expect it; matter in its own order."""
-    particles = replay.laid_out(state.material_points, rows_of, rows_of)
+    whole: Any = state
+    particles = replay.laid_out(whole.material_points, rows_of, rows_of)
     return tree.replace(replay.laid_out(tree.replace(state, material_points=())), material_points=particles)
 
 

@@ -17,7 +17,7 @@ from torchdlo.coupling.mpm.particles import Grid, MpmDomain, ParticleParams, Par
 from torchdlo.coupling.mpm.rod_coupling_solver import Lines, RodParticleTouch, block_size, exchange, near_size
 from torchdlo.coupling.mpm.substep import Nodes
 from torchdlo.physics import tree
-from torchdlo.physics.effects.base import ContactForces, Effect, Param, PredictedMotion, Values
+from torchdlo.physics.effects.base import ContactForces, Effect, EffectKind, Param, PredictedMotion, Values
 from torchdlo.physics.rod.kinematics import RodParams, RodState, View
 
 
@@ -55,7 +55,7 @@ class RodMpmCoupling(Effect):
     """Nodes of them that there is room for where an edge is the nearest; 0: found likewise."""
 
     name: ClassVar[str] = "rod_mpm_coupling"
-    kind: ClassVar[str] = "force"
+    kind: ClassVar[EffectKind] = "force"
     is_contact: ClassVar[bool] = True
     params: ClassVar[dict[str, Param]] = {
         "mu": Param(0.3, 0.0, 2.0, "1", "linear", 0.0, "Coefficient of friction between ropes and matter."),
@@ -103,7 +103,7 @@ def fitted(effects: Sequence[Effect], medium: MpmDomain | None, rods: RodParams)
         if isinstance(e, RodMpmCoupling) and not (e.block and e.near):
             longest = float((rods.rest.length * rods.rest.edge_mask).max())
             # Edges that stretch by more than a tenth are not seen to their ends.
-            sizes = (1.1 * longest, float(rods.material.radius.max()), medium.grid.spacing, e.thickness)
+            sizes = (1.1 * longest, float(rods.material.radius.max()), tree.part(medium).grid.spacing, e.thickness)
             e = dataclasses.replace(e, block=e.block or block_size(*sizes), near=e.near or near_size(*sizes))
         found.append(e)
     return tuple(found)

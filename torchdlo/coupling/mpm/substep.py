@@ -68,8 +68,8 @@ def deform(
         stresses.append(torch.stack(torch.broadcast_tensors(*stress), -2))
         strains.append(torch.stack(torch.broadcast_tensors(*strain), -2))
         histories.append(history.unsqueeze(-2))
-    stress, strain, history = (torch.cat(parts, -1).mT for parts in (stresses, strains, histories))
-    return stress, tree.replace(particles, strain=strain, history=history)
+    whole = [torch.cat(parts, -1).mT for parts in (stresses, strains, histories)]
+    return whole[0], tree.replace(particles, strain=whole[1], history=whole[2])
 
 
 def _locate(grid: Grid, pos: Tensor) -> tuple[Tensor, Tensor]:

@@ -18,9 +18,10 @@ import torch
 from torch import Tensor
 
 from torchdlo.coupling.common import scene_packing
+from torchdlo.physics.linalg.numerics import added
 
-Symmetric = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]
-"""Components xx, yy, zz, xy, xz, yz of a symmetric tensor, shape (..., N) each."""
+Symmetric = tuple[Tensor, ...]
+"""Six components xx, yy, zz, xy, xz, yz of a symmetric tensor, shape (..., N) each."""
 Square = tuple[Tensor, ...]
 """Nine components of a tensor, row by row, shape (..., N) each."""
 
@@ -133,8 +134,8 @@ def _rotate(u: Square, s: Symmetric, back: bool) -> Symmetric:
     def at(i: int, j: int) -> Tensor:
         return u[3 * i + j] if back else u[3 * j + i]
 
-    left = [[sum(at(i, k) * x[3 * k + j] for k in range(3)) for j in range(3)] for i in range(3)]
-    return tuple(sum(left[i][k] * at(j, k) for k in range(3)) for i, j in PAIRS)
+    left = [[added(at(i, k) * x[3 * k + j] for k in range(3)) for j in range(3)] for i in range(3)]
+    return tuple(added(left[i][k] * at(j, k) for k in range(3)) for i, j in PAIRS)
 
 
 def _plainly(
@@ -154,7 +155,7 @@ def _plainly(
         if least is not None:
             l = tuple(x.clamp(min=least) for x in l)
         zero = torch.zeros_like(l[0])
-        found = (value(l[0]), value(l[1]), value(l[2]), zero, zero, zero)
+        found: Symmetric = (value(l[0]), value(l[1]), value(l[2]), zero, zero, zero)
     if torch.is_grad_enabled() and any(x.requires_grad for x in e):
         # x - x.detach() is zero and has the derivative of x.
         change = _rotate(u, tuple(x - y for x, y in zip(e, plain, strict=True)), back=False)

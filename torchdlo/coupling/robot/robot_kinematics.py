@@ -160,7 +160,7 @@ def _placed(robot: Robot, dtype: torch.dtype, device: torch.device) -> tuple[Any
     chain = copy.deepcopy(robot.chain).to(dtype=dtype, device=device)
     names = [chain.idx_to_frame[f] for f in range(len(robot.links))]
     ours = [robot.links[link] for link in robot.behind]
-    theirs = [None] * len(ours)
+    theirs = [-1] * len(ours)
     for frame, joint in enumerate(chain.joint_indices.tolist()):
         if joint >= 0:
             theirs[joint] = ours.index(names[frame])

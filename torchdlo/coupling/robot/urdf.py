@@ -91,7 +91,7 @@ def read_urdf(source: str | Path) -> UrdfModel:
     inline = isinstance(source, str) and source.lstrip().startswith("<")
     where = "urdf" if inline else str(source)
     try:
-        text = source if inline else read_text(source, "a URDF file", most=_LARGEST_FILE, cure=_CURE)
+        text = str(source) if inline else read_text(source, "a URDF file", most=_LARGEST_FILE, cure=_CURE)
         root = xml.fromstring(re.sub(r"<\?xml.*?\?>", "", text))
     except (xml.ParseError, UnicodeEncodeError) as error:
         raise InputError(f"{where}: is not complete XML ({error}); is the file cut, or a xacro macro?") from None
@@ -178,9 +178,10 @@ def _joint(where: str, element: xml.Element, links: tuple[str, ...]) -> Joint:
     return Joint(
         name,
         MOVING.get(kind, "fixed"),
-        *ends,
+        ends[0],
+        ends[1],
         _origin(here, element),
-        tuple(c / size for c in direction),
+        (direction[0] / size, direction[1] / size, direction[2] / size),
         lower,
         upper,
         velocity,

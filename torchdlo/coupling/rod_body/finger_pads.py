@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from torchdlo.coupling.bodies.dynamics import conjugate
-from torchdlo.physics.effects.base import ContactForces, Effect, Param, PredictedMotion, Values
+from torchdlo.physics.effects.base import ContactForces, Effect, EffectKind, Param, PredictedMotion, Values
 from torchdlo.physics.linalg.numerics import cross, dot, safe_norm
 from torchdlo.physics.linalg.rotation import rotate
 from torchdlo.physics.rod.kinematics import View
@@ -33,7 +33,7 @@ class FingerPads(Effect):
     """Half of the pads' length along x, of their opening along y, and of their length along z [m]."""
 
     name: ClassVar[str] = "finger_pads"
-    kind: ClassVar[str] = "boundary"
+    kind: ClassVar[EffectKind] = "boundary"
     is_contact: ClassVar[bool] = True
     params: ClassVar[dict[str, Param]] = {
         "squeeze": Param(0.0, 0.0, 100.0, "N", "linear", 0.0, "Force of each finger on the rope."),

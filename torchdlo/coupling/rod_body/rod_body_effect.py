@@ -45,7 +45,7 @@ from torchdlo.coupling.common.coulomb_friction import (
 )
 from torchdlo.coupling.rod_body import rod_body_op as body_sweeps
 from torchdlo.physics.constraints.contact_penalty import Touch
-from torchdlo.physics.effects.base import ContactForces, Effect, PredictedMotion, Values
+from torchdlo.physics.effects.base import ContactForces, Effect, EffectKind, PredictedMotion, Values
 from torchdlo.physics.linalg.numerics import cross, dot, safe_norm
 from torchdlo.physics.linalg.rotation import rotate
 from torchdlo.physics.rod.kinematics import View
@@ -203,7 +203,7 @@ class RodBody(Effect):
     """Approach below which nothing rebounds [m/s]."""
 
     name: ClassVar[str] = "rod_body"
-    kind: ClassVar[str] = "force"
+    kind: ClassVar[EffectKind] = "force"
     is_contact: ClassVar[bool] = True
     engages: ClassVar[bool] = True
 
@@ -238,7 +238,8 @@ class RodBody(Effect):
         resist = inertia(bodies, free) if free else at.share.new_zeros(0, 6, 6)
         each = points.real, at.share, at.normal, points.tangent, points.radius, rubs * points.lever, wanted
         given, mu = still * at.normal + slip, rubs * torch.where(slides, mu_k, mu_s)
-        return Touch(*(wide(x) for x in (*each, given, mu, at.arm)), axes.of[..., 0][:, free], resist, place)
+        parts = [wide(x) for x in (*each, given, mu, at.arm)]
+        return Touch(*[*parts, axes.of[..., 0][:, free], resist, place])
 
     def solve_contact(self, view: View, motion: PredictedMotion, values: Values) -> ContactForces:
         """Return the forces that keep ropes outside of bodies and rub [N]."""
@@ -254,10 +255,10 @@ class RodBody(Effect):
         wanted = self._target(points, view, bodies, along)
         softness = _softness(points, motion.give, bodies)
         normal, friction = torch.zeros_like(along), torch.zeros_like(slip)
-        push = None
-        for _ in range(self.sweeps):
-            if push is not None:
-                along, slip = points.seen(motion.change + motion.answer * push.force, bodies.pushed(push))
+        normal, friction = self._sweep(points, (normal, friction), (along, slip), wanted, softness, bodies)
+        push = points.exerted(normal, friction)
+        for _ in range(self.sweeps - 1):
+            along, slip = points.seen(motion.change + motion.answer * push.force, bodies.pushed(push))
             normal, friction = self._sweep(points, (normal, friction), (along, slip), wanted, softness, bodies)
             push = points.exerted(normal, friction)
         return push

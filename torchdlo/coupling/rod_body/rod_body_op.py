@@ -54,7 +54,8 @@ def _sweep(
 
 
 def _sweep_meta(edges: list[Tensor], vertices: list[Tensor], bodies: list[Tensor], *others) -> tuple[Tensor, Tensor]:
-    return tuple(x[0].new_empty(n, *x[0].shape[1:]) for x, n in ((vertices, 3), (bodies, 6)))
+    push, wrench = (x[0].new_empty(n, *x[0].shape[1:]) for x, n in ((vertices, 3), (bodies, 6)))
+    return push, wrench
 
 
 def _back(

@@ -38,8 +38,7 @@ def _look(rods: list[Tensor], carried: Tensor, counts: list[int], closed: list[i
     lists = (scene_packing.integers(tuple(x)) for x in (counts, closed))
     sizes = (*rods[0].shape[1:], carried.shape[1], len(counts), room, few, broad_phase.APART)
     places = scene_packing.fields(rods), scene_packing.fields([carried]), *(_place(x) for x in out)
-    sizes = ctypes.byref(_Sizes(*sizes, *lists, *rule))
-    _function("look", carried.dtype)(*places, sizes, torch.get_num_threads())
+    _function("look", carried.dtype)(*places, ctypes.byref(_Sizes(*sizes, *lists, *rule)), torch.get_num_threads())
     return out
 
 

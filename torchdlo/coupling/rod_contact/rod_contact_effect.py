@@ -57,9 +57,9 @@ from torchdlo.coupling.rod_contact.closest_points import closest_points
 from torchdlo.coupling.rod_contact.rod_contact_op import WEAK
 from torchdlo.physics import tree
 from torchdlo.physics.constraints.contact_penalty import Pairs
-from torchdlo.physics.effects.base import Effect, Param, PredictedMotion, Values
+from torchdlo.physics.effects.base import Effect, EffectKind, Param, PredictedMotion, Values
 from torchdlo.physics.linalg.gather_scatter import Four, columns, corners, drop, pick
-from torchdlo.physics.linalg.numerics import cross, dot, safe_norm
+from torchdlo.physics.linalg.numerics import added, cross, dot, safe_norm
 from torchdlo.physics.rod.kinematics import View
 
 
@@ -101,7 +101,7 @@ def find_contacts(found: Values, pos: Four, radius: Four) -> Contacts:
         pos: positions of the corners [m], shape (..., K, 3) each.
         radius: radii of the edges that start at the corners [m], shape (..., K, 1) each.
     """
-    s, t = closest_points(pos[:2], pos[2:])
+    s, t = closest_points((pos[0], pos[1]), (pos[2], pos[3]))
     weight = (1 - s, s, t - 1, -t)
     between = _sum(weight, pos)
     distance = safe_norm(between)
@@ -134,7 +134,7 @@ class _Couple:
 
     def seen(self, change: Four) -> Tensor:
         """Return the rigid turn in displacements of the corners [rad], shape (..., K, 3)."""
-        return self.turn(sum(cross(arm, d) for arm, d in zip(self.arm, change, strict=True)))
+        return self.turn(added(cross(arm, d) for arm, d in zip(self.arm, change, strict=True)))
 
     def softness(self, contacts: Contacts) -> Tensor:
         """Return by how much the couple adds to the slip under one newton at most [m/N], shape (..., K, 1)."""
@@ -150,8 +150,8 @@ def _couple(pos: Four, mass: Four) -> _Couple:
     second = (mass[2] * pos[2] + mass[3] * pos[3]) / (mass[2] + mass[3])
     share = (mass[0] + mass[1]) / (mass[0] + mass[1] + mass[2] + mass[3])
     own = (pos[0] - first, pos[1] - first, pos[2] - second, pos[3] - second)
-    apart = (1 - share) * (first - second), -share * (first - second)
-    apart = (apart[0], apart[0], apart[1], apart[1])
+    ahead, behind = (1 - share) * (first - second), -share * (first - second)
+    apart = (ahead, ahead, behind, behind)
     # I = sum m (r.r 1 - r r^T), inverted by its cofactors. Corners on one line have no inertia about it.
     lever = tuple(o + WEAK**0.5 * a for o, a in zip(own, apart, strict=True))
     xx, yy, zz, xy, xz, yz = (
@@ -195,7 +195,7 @@ class RodContact(Effect):
     """Approach below which nothing rebounds [m/s]."""
 
     name: ClassVar[str] = "rod_contact"
-    kind: ClassVar[str] = "force"
+    kind: ClassVar[EffectKind] = "force"
     is_contact: ClassVar[bool] = True
     engages: ClassVar[bool] = True
     params: ClassVar[dict[str, Param]] = {
@@ -226,9 +226,9 @@ class RodContact(Effect):
         fastest = safe_norm(view.state.vel - mean).amax(-2, keepdim=True)
         if carried.shape[-2]:
             fastest = torch.maximum(fastest, safe_norm(carried / view.dt - mean).amax(-2, keepdim=True))
-        sudden = view.dt * (1.0 if self.burst is None else self.burst)
+        sudden: Tensor | float = view.dt * (1.0 if self.burst is None else self.burst)
         if self.burst is None:
-            sudden = (0.5 * params.material.radius.amin(-2, keepdim=True)).clamp(max=sudden)
+            sudden = (0.5 * params.material.radius.amin(-2, keepdim=True)).clamp(max=view.dt)
         reach = (1.5 * view.dt * fastest + sudden).expand(*pos.shape[:-2], 1, 1)
         first, second, there, lost = near_pairs(topology, params, pos, reach, room, self.row)
         after = torch.tensor(topology.successor(), device=pos.device)
@@ -379,6 +379,6 @@ def _softness(
     load = drop(tuple(w * pressed for w in weight), at, size)
     four = pick(columns([load * give, load * free, give.expand_as(load), free.expand_as(load)]), at)
     mine = 1 - pressed
-    normal = sum(w * (c[..., :1] + mine * w * c[..., 2:3]) for w, c in zip(weight, four, strict=True))
-    slip = sum(w * (c[..., 1:2] + mine * w * c[..., 3:]) for w, c in zip(weight, four, strict=True))
+    normal = added(w * (c[..., :1] + mine * w * c[..., 2:3]) for w, c in zip(weight, four, strict=True))
+    slip = added(w * (c[..., 1:2] + mine * w * c[..., 3:]) for w, c in zip(weight, four, strict=True))
     return normal, slip

@@ -7,6 +7,7 @@ from torch import Tensor
 
 from torchdlo.coupling.bodies import shape_sdf
 from torchdlo.coupling.bodies.dynamics import conjugate
+from torchdlo.physics import tree
 from torchdlo.physics.effects.base import altered_params
 from torchdlo.physics.linalg.numerics import safe_norm
 from torchdlo.physics.linalg.rotation import rotate
@@ -27,9 +28,9 @@ def inside_bodies(scene: Scene, params: Params, state: State, points: Tensor) ->
     found = torch.zeros(points.shape[:-1], dtype=torch.bool, device=points.device)
     for k, body in enumerate(scene.bodies):
         if body.motion != "free":
-            one = slice(k, k + 1)
-            away = rotate(conjugate(state.bodies.quat[:, one]), points - state.bodies.pos[:, one])
-            size, grid = (x[..., one, :] for x in (params.bodies.size, params.bodies.grid))
+            one, solid, placed = slice(k, k + 1), tree.part(params.bodies), tree.part(state.bodies)
+            away = rotate(conjugate(placed.quat[:, one]), points - placed.pos[:, one])
+            size, grid = (x[..., one, :] for x in (solid.size, solid.grid))
             found = found | (shape_sdf.distance(body.shape, size, away, grid, body.cells)[..., 0] < 0)
     return found
 

@@ -18,9 +18,9 @@ from torchrl.envs import EnvBase
 
 from torchdlo import notices
 from torchdlo.envs.core import episode as episodes
-from torchdlo.envs.core.episode import EpisodeState
+from torchdlo.envs.core.episode import Episode, EpisodeState
 from torchdlo.envs.core.task import Task, combined, succeeded
-from torchdlo.envs.observations.sensor import sensor_of
+from torchdlo.envs.observations.sensor import Sensor, sensor_of
 from torchdlo.errors import InputError
 from torchdlo.physics import tree
 from torchdlo.scene import Params, Scene
@@ -31,6 +31,25 @@ __all__ = ["DloEnv"]
 
 class DloEnv(EnvBase):
     """A batch of scenes of one task. See `torchdlo.envs.make`."""
+
+    task: Task
+    gradients: bool
+    variation: bool
+    generator: torch.Generator
+    episode: Episode
+    world: EpisodeState
+    moved: Tensor
+    """How far things are off their places at the start [m], shape (num_envs, things, 3)."""
+    first: Tensor
+    """What was observed at the start, shape (num_envs, O)."""
+    _like: Tensor
+    _limit: Tensor
+    _scale: Tensor | None
+    _randomize: dict[str, float]
+    _usual: Params
+    _sensor: Sensor | None
+    _looks: tuple[Look, ...]
+    _look_generator: torch.Generator
 
     def __init__(
         self,
@@ -69,9 +88,7 @@ class DloEnv(EnvBase):
         self._sensor = None if pixels is False else sensor_of(made, {} if pixels is True else pixels)
         self._looks, self._look_generator = (Look(),) * num_envs, torch.Generator()
         self.moved = task.moved(num_envs, like=self._like, variation=False)
-        """How far things are off their places at the start [m], shape (num_envs, things, 3)."""
         self.first = episodes.observe(made, made.start)
-        """What was observed at the start, shape (num_envs, O)."""
         self._make_specs()
         self.set_seed(seed)
 
@@ -195,7 +212,7 @@ class DloEnv(EnvBase):
         # Scenes settle with their own numbers.
         if not self.variation and not (self._randomize and self.task.settle_steps):
             return self.episode.start if bool(again.all()) else tree.where(again, self.episode.start, self.world)
-        choices = {"like": self._like, "generator": self.generator, "variation": self.variation}
+        choices: dict[str, Any] = {"like": self._like, "generator": self.generator, "variation": self.variation}
         rows = again.nonzero().squeeze(-1)
         # Steps are made for one size of the batch, so that settling takes all scenes.
         count = len(again) if self.task.settle_steps else len(rows)

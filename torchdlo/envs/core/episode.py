@@ -267,7 +267,7 @@ def act(episode: Episode, world: EpisodeState, action: Tensor) -> EpisodeState:
     Scenes that are no longer finite stay as they were and have failed. Nothing has a gradient through an action in
     which a scene broke.
     """
-    task, lost = episode.task, []
+    task, lost = episode.task, list[Tensor]()
     before, action = guarded((world, action), len(world.failed), lost)
     aim, held = _aim(task, before, action), before.grasp
     if len(task.schedule.stages) > 1:

@@ -69,7 +69,7 @@ def run(episode: Episode, world: EpisodeState, tool: Pose, held: Grasp, count: i
     )
     bodies: Any = ()
     if episode.scene.bodies:
-        still = scenes.stationary_control(episode.scene, world.state).bodies
+        still = tree.part(scenes.stationary_control(episode.scene, world.state).bodies)
         bodies = BodyTargets(*(p.expand(count, *p.shape) for p in (still.pos, still.quat)))
     attachment_weight = {name: g.expand(count, *g.shape) for name, g in attachment_weight.items()}
     controls = Control(pos, director.expand(count, *director.shape[-3:]), attachment_weight, bodies)

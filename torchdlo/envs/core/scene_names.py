@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from torchdlo.envs.core import curve_geometry
+from torchdlo.physics import tree
 
 if TYPE_CHECKING:
     from torchdlo.envs.core.task import Task, TaskState
@@ -55,6 +56,30 @@ def layout(scene: Scene) -> Layout:
     return Layout(tuple(scene.topology.counts), tuple(bodies), bool(scene.material_points))
 
 
+def _rope(rows: slice) -> Callable[[TaskState], Tensor]:
+    return lambda seen: seen.x[:, rows]
+
+
+def _length(rows: slice) -> Callable[[TaskState], Tensor]:
+    return lambda seen: curve_geometry.length(seen.x[:, rows])
+
+
+def _tool(k: int) -> Callable[[TaskState], Tensor]:
+    return lambda seen: seen.tool.pos[:, k]
+
+
+def _grip(k: int) -> Callable[[TaskState], Tensor]:
+    return lambda seen: seen.closed[:, k, 0]
+
+
+def _body(k: int) -> Callable[[TaskState], Tensor]:
+    return lambda seen: tree.part(seen.state.bodies).pos[:, k]
+
+
+def _matter(seen: TaskState) -> Tensor:
+    return tree.part(seen.state.material_points).pos.mean(-2)
+
+
 def _makers(task: Task, here: Layout) -> dict[str, tuple[str, Callable[[TaskState], Tensor]]]:
     """Return what each name is, and how it is had, without measures of the task."""
     found: dict[str, tuple[str, Callable[[TaskState], Tensor]]] = {}
@@ -62,19 +87,19 @@ def _makers(task: Task, here: Layout) -> dict[str, tuple[str, Callable[[TaskStat
     for k, count in enumerate(here.counts):
         end = "" if len(here.counts) == 1 else f"_{k}"
         rows = slice(first, first + count)
-        found[f"rope{end}"] = (f"vertices 0 to {count - 1} of the rope [m]", lambda seen, rows=rows: seen.x[:, rows])
+        found[f"rope{end}"] = (f"vertices 0 to {count - 1} of the rope [m]", _rope(rows))
         found[f"length{end}"] = (
             "length along the vertices [m]",
-            lambda seen, rows=rows: curve_geometry.length(seen.x[:, rows]),
+            _length(rows),
         )
         first += count
     for k in range(task.arms.count):
-        found[f"tool_{k}"] = ("where the tool of the hand is [m]", lambda seen, k=k: seen.tool.pos[:, k])
-        found[f"holds_{k}"] = ("1 if the hand holds a rope, else 0", lambda seen, k=k: seen.closed[:, k, 0])
+        found[f"tool_{k}"] = ("where the tool of the hand is [m]", _tool(k))
+        found[f"holds_{k}"] = ("1 if the hand holds a rope, else 0", _grip(k))
     for name, k, doc in here.bodies:
-        found[name] = (doc, lambda seen, k=k: seen.state.bodies.pos[:, k])
+        found[name] = (doc, _body(k))
     if here.material_points:
-        found["body_mpm_coupling"] = ("middle of the matter [m]", lambda seen: seen.state.material_points.pos.mean(-2))
+        found["body_mpm_coupling"] = ("middle of the matter [m]", _matter)
     found["time"] = (
         "time since the start of the task [s]",
         lambda seen: seen.state.time.expand(len(seen.x), 1, 1)[:, 0, 0],

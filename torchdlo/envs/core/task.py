@@ -391,13 +391,16 @@ def make(
     if beyond:
         raise InputError(f"grasps: {task.name} has vertices 0 to {count - 1}, and a hand is to hold {beyond[0]}.")
     room = 3 * count
-    own = [] if task.rope is None else task.rope.laws
-    effects = [*(e for e in effects if e.name not in {o.name for o in own}), *own]
+    laws = [] if task.rope is None else task.rope.laws
+    effects = [*(e for e in effects if e.name not in {o.name for o in laws}), *laws]
     acting: list[Effect] = [Gravity(), Damping(), RodContact(sweeps=5, room=room, burst=burst), *effects]
     if not any(e.name == "bend" for e in effects):
         framed = any(e.frame_bending for e in effects) or (task.rope is not None and task.rope.curvature)
         acting.append(BendFrame() if framed else Bend())
-    numbers = {"damping": {"rate": 30.0, "twist_rate": 20.0}, "rod_contact": {"mu_s": 0.3, "mu_k": 0.25}}
+    numbers: dict[str, dict[str, float | Sequence[float] | Tensor]] = {
+        "damping": {"rate": 30.0, "twist_rate": 20.0},
+        "rod_contact": {"mu_s": 0.3, "mu_k": 0.25},
+    }
     if elastic:
         acting.append(Stretch())
     if floor:
@@ -409,14 +412,14 @@ def make(
         acting.append(BodyContact())
     if material_points:
         acting.append(RodMpmCoupling())
-    for name, given in (values or {}).items():
-        numbers[name] = numbers.get(name, {}) | given
+    for name, own in (values or {}).items():
+        numbers[name] = {**numbers.get(name, {}), **own}
     if task.rope is not None:
         ropes = task.rope.pieces(ropes)
         for name, given in task.rope.values.items():
-            numbers[name] = numbers.get(name, {}) | given
+            numbers[name] = {**numbers.get(name, {}), **given}
     at = (*(task.schedule.held if held is None else held), *fixed)
-    choices = {"prescribed_vertices": at, "constrained": not elastic}
+    choices: dict[str, Any] = {"prescribed_vertices": at, "constrained": not elastic}
     choices |= {"dt": task.fidelity.step, "substeps": task.fidelity.substeps, "integrator": task.fidelity.integrator}
     try:
         return scenes.make(ropes, acting, numbers, bodies=solids, material_points=material_points, **choices)

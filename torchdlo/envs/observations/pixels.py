@@ -13,6 +13,7 @@ from torchdlo.coupling.robot.robot_kinematics import Robot, panda
 from torchdlo.envs.core.episode import Episode
 from torchdlo.envs.observations.cameras import WRIST_EYE, WRIST_TARGET, TaskCamera, front_camera, wrist_names
 from torchdlo.errors import InputError
+from torchdlo.physics import tree
 from torchdlo.scene import State
 from torchdlo.vision.look import Look
 from torchdlo.vision.renderer import ROPE, Images, Pinhole, Placement, RenderModel, intrinsics, looking_at, render
@@ -59,7 +60,7 @@ def cameras_of(episode: Episode) -> tuple[TaskCamera, ...]:
         things = [start.state.rods.pos[0]]
         solid = [k for k, body in enumerate(episode.scene.bodies) if body.shape != "plane"]
         if solid:
-            at = start.state.bodies.pos[0, solid]
+            at = tree.part(start.state.bodies).pos[0, solid]
             near = (at[:, None] - start.state.rods.pos[0]).norm(dim=-1).amin(-1) < NEARBY
             things.append(at[near])
         if start.state.material_points:
@@ -182,7 +183,7 @@ def rope_points(images: Images, view: Pinhole, *, count: int = CLOUD) -> Tensor:
 
     Pixels that are chosen more than once fill up where there are fewer; zeros where there are none.
     """
-    depth, ids = images.depth, images.ids
+    depth, ids = tree.part(images.depth), tree.part(images.ids)
     rope = (ids >= ROPE) & (ids < ROPE + 1000)
     height, width = depth.shape[-2:]
     y, x = torch.meshgrid(torch.arange(height).double(), torch.arange(width).double(), indexing="ij")

@@ -20,6 +20,7 @@ from torchdlo.envs.observations.pixels import (
     views,
 )
 from torchdlo.errors import InputError
+from torchdlo.physics import tree
 from torchdlo.vision.look import Look
 
 __all__ = ["Sensor", "sensor_of"]
@@ -59,14 +60,14 @@ class Sensor:
     def observe(self, world: EpisodeState, looks: Sequence[Look]) -> dict[str, dict[str, Tensor] | Tensor]:
         """Return the observations of a batch of scenes, on the CPU and without gradients."""
         rig, points = self.rig, bool(self.points)
-        given = {"looks": looks, "samples": self.samples, "shadow": self.shadow}
-        asked = {"rgb": self.pixels, "depth": self.depth or points, "ids": self.masks or points}
+        given: dict[str, Any] = {"looks": looks, "samples": self.samples, "shadow": self.shadow}
+        asked: dict[str, Any] = {"rgb": self.pixels, "depth": self.depth or points, "ids": self.masks or points}
         seen = render_cameras(rig, world.state, world.joints, **given, **asked)
         parts = {"pixels": seen.rgb, "masks": seen.ids, "depth": seen.depth}
         found: dict[str, dict[str, Tensor] | Tensor] = {}
         for kind in self.shapes():
             if kind != "points":
-                found[kind] = {c.name: parts[kind][:, k] for k, c in enumerate(rig.cameras)}
+                found[kind] = {c.name: tree.part(parts[kind])[:, k] for k, c in enumerate(rig.cameras)}
                 continue
             make = self.points if callable(self.points) else rope_points
             found[kind] = make(seen, views(rig, world.state, world.joints))

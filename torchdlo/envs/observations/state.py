@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from torchdlo.physics import tree
+
 if TYPE_CHECKING:
     from torchdlo.envs.core.episode import Episode, EpisodeState
 
@@ -26,7 +28,8 @@ def observe(episode: Episode, world: EpisodeState) -> Tensor:
     parts = [state.rods.pos, state.rods.vel]
     free = [k for k, body in enumerate(episode.scene.bodies) if body.motion == "free"]
     if free:
-        parts += [state.bodies.pos[:, free], state.bodies.vel[:, free]]
+        bodies = tree.part(state.bodies)
+        parts += [bodies.pos[:, free], bodies.vel[:, free]]
     if state.material_points:
         parts += [state.material_points.pos.mean(-2, keepdim=True), state.material_points.vel.mean(-2, keepdim=True)]
     parts += [world.tool.pos, world.tool.quat, world.joints[..., :ELBOWS]]

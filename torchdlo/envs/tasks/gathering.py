@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar, Literal
 
 import torch
 from torch import Tensor
@@ -20,6 +20,7 @@ from torchdlo.coupling.mpm.particles import Grid, ParticleBlock, assemble, fill_
 from torchdlo.envs.assets.rigid_objects import pebble
 from torchdlo.envs.core import curve_geometry
 from torchdlo.envs.core.task import RADIUS, Arms, Task, TaskState, make, straight
+from torchdlo.physics import tree
 from torchdlo.physics.linalg.numerics import safe_norm
 from torchdlo.scene import Params, Rope, Scene, State
 
@@ -49,20 +50,20 @@ class Gathering(Task):
 
     name: ClassVar[str] = "gathering"
     arms: ClassVar[Arms] = Arms(base=((-0.2, -0.63, 0.0), (0.5, -0.63, 0.0)), vertex=(1, 43), grip_force=10.0)
-    combine: ClassVar[str] = "product"
+    combine: ClassVar[Literal["sum", "product"]] = "product"
     stretch: ClassVar[float] = 1.1
     reset_noise: ClassVar[tuple[tuple[float, float], ...]] = ((0.025, 0.0),) * 3
 
     def build(self, moved: Tensor) -> tuple[Scene, Params, State]:
         """Return the scene; each of the objects may be moved."""
-        rub = {"mu_s": 0.3, "mu_k": 0.3, "density": 600.0}
+        rub: dict[str, Any] = {"mu_s": 0.3, "mu_k": 0.3, "density": 600.0}
         at = [moved[:, k] + moved.new_tensor(p) for k, p in enumerate((BALL, PEBBLE, CYLINDER))]
         solids = [
             pebble().solid(at[1].double(), name="pebble", **rub),
             RigidBody("cylinder", (0.05, 0.025), at[2], **rub),
         ]
         points = fill_ball((0.0, 0.0, 0.0), 0.05, FINE, moved) + at[0][:, None]
-        numbers = {"youngs": 1e5, "poisson": 0.3, "yield_stress": 1e3, "density": 1000.0}
+        numbers: dict[str, float | Tensor] = {"youngs": 1e5, "poisson": 0.3, "yield_stress": 1e3, "density": 1000.0}
         return self._made(moved, solids, assemble([ParticleBlock(points, Plastic(), FINE**3, numbers=numbers)], BOX))
 
     def _made(self, like: Tensor, solids: list[RigidBody], material_points: tuple = ()) -> tuple[Scene, Params, State]:
@@ -77,7 +78,13 @@ class Gathering(Task):
 
     def _objects(self, seen: TaskState) -> Tensor:
         """Return the centres of the objects [m], shape (B, 3, 3)."""
-        return torch.cat([seen.state.material_points.pos.mean(-2, keepdim=True), seen.state.bodies.pos[:, 1:]], -2)
+        return torch.cat(
+            [
+                tree.part(seen.state.material_points).pos.mean(-2, keepdim=True),
+                tree.part(seen.state.bodies).pos[:, 1:],
+            ],
+            -2,
+        )
 
     def _apart(self, seen: TaskState) -> Tensor:
         """Return how far each two objects are from each other [m], shape (B, 3)."""
@@ -147,4 +154,4 @@ class GatheringSurrogate(Gathering):
         """Return nothing: this is it."""
 
     def _objects(self, seen: TaskState) -> Tensor:
-        return seen.state.bodies.pos[:, 1:]
+        return tree.part(seen.state.bodies).pos[:, 1:]

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -17,6 +17,7 @@ from torchdlo.coupling.bodies.dynamics import RigidBody
 from torchdlo.envs.assets.rigid_objects import GAP, RING, TUBE, c_ring, origin
 from torchdlo.envs.core import curve_geometry
 from torchdlo.envs.core.task import RADIUS, Arms, Task, TaskState, make, straight
+from torchdlo.physics import tree
 from torchdlo.physics.linalg.numerics import safe_norm
 from torchdlo.scene import Params, Rope, Scene, State
 
@@ -49,13 +50,13 @@ class Lifting(Task):
         """Return the scene; the rope may be moved."""
         x = straight((0.3, 0.1, 0.012), 30, moved[:, 0])
         rope = Rope(x, RADIUS, mass=0.029, youngs=5e3, stretch=1e5 * math.pi * RADIUS**2)
-        rub = {"mu_s": 0.6, "mu_k": 0.6}
+        rub: dict[str, Any] = {"mu_s": 0.6, "mu_k": 0.6}
         rings = [c_ring().solid(p, density=120.0, name=f"ring {k}", **rub) for k, p in enumerate(CENTRES)]
         return make(self, [rope], solids=[RigidBody("plane", motion="fixed", **rub), *rings])
 
     def _rings(self, seen: TaskState) -> Tensor:
         """Return the centres of the rings [m], shape (B, 2, 3)."""
-        return torch.stack([origin(c_ring(), seen.state.bodies, k) for k in (1, 2)], -2)
+        return torch.stack([origin(c_ring(), tree.part(seen.state.bodies), k) for k in (1, 2)], -2)
 
     def rewards(self, seen: TaskState) -> dict[str, Tensor]:
         """Return how high the rings are, how near and how far below the rope is, and how close hands come to them."""

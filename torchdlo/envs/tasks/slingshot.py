@@ -16,6 +16,7 @@ from torchdlo.coupling.bodies.dynamics import RigidBody
 from torchdlo.envs.core.fidelity import Fidelity
 from torchdlo.envs.core.task import RADIUS, Arms, Task, TaskState, make, straight
 from torchdlo.envs.observations.cameras import TaskCamera
+from torchdlo.physics import tree
 from torchdlo.physics.linalg.numerics import safe_norm
 from torchdlo.scene import Params, Rope, Scene, State
 
@@ -65,7 +66,7 @@ class Slingshot(Task):
 
     def rewards(self, seen: TaskState) -> dict[str, Tensor]:
         """Return how far away the cube is."""
-        return {"cube": seen.state.bodies.pos[:, CUBE, 1].clamp(0.0, 5.0)}
+        return {"cube": tree.part(seen.state.bodies).pos[:, CUBE, 1].clamp(0.0, 5.0)}
 
     def auxiliary_loss(self, seen: TaskState) -> dict[str, Tensor]:
         """Return how far the middle of the band is from a point behind it: the ball tells only at the end."""
@@ -73,7 +74,7 @@ class Slingshot(Task):
 
     def success(self, seen: TaskState) -> Tensor:
         """Return whether the cube is further away and the ball left its place, which has nothing else to push it."""
-        y = seen.state.bodies.pos[..., 1]
+        y = tree.part(seen.state.bodies).pos[..., 1]
         return (y[:, CUBE] >= CUBE_Y + 0.05) & (y[:, BALL] >= BALL_Y + 0.05)
 
     def waypoints(self) -> list[list[tuple[float, float, float]]]:

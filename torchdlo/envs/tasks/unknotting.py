@@ -9,7 +9,7 @@ from __future__ import annotations
 import functools
 import math
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, Literal
 
 import torch
 from torch import Tensor
@@ -60,7 +60,7 @@ class Unknotting(Task):
     name: ClassVar[str] = "unknotting"
     arms: ClassVar[Arms] = Arms(base=((0.25, -0.5, 0.0), (1.1, 0.2, 0.0)), vertex=(2, 37), quat=(SIDEWAYS, SIDEWAYS))
     cameras: ClassVar[tuple[TaskCamera, ...]] = (TaskCamera("front", (1.1, -0.6, 0.7), (0.68, -0.09, 0.03)),)
-    combine: ClassVar[str] = "product"
+    combine: ClassVar[Literal["sum", "product"]] = "product"
     stretch: ClassVar[float] = 1.05
     reset_noise: ClassVar[tuple[tuple[float, float], ...]] = ((0.05, 0.025),)
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import functools
 import math
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar, Literal
 
 import torch
 from torch import Tensor
@@ -84,14 +84,14 @@ class WiringPost(Task):
     name: ClassVar[str] = "wiring_post"
     arms: ClassVar[Arms] = Arms(base=((-0.2, -0.25, 0.0),), vertex=(3,))
     cameras: ClassVar[tuple[TaskCamera, ...]] = (TaskCamera("front", (0.8, 0.75, 0.75), (0.4, 0.13, 0.02)),)
-    combine: ClassVar[str] = "product"
+    combine: ClassVar[Literal["sum", "product"]] = "product"
     anchored: ClassVar[bool] = True
     reset_noise: ClassVar[tuple[tuple[float, float], ...]] = ((0.05, 0.025),)
 
     def build(self, moved: Tensor) -> tuple[Scene, Params, State]:
         """Return the scene; the rope may be moved."""
         x = straight((0.3, 0.05, 0.012), COUNT, moved[:, 0])
-        rub = {"mu_s": 0.7, "mu_k": 0.7}
+        rub: dict[str, Any] = {"mu_s": 0.7, "mu_k": 0.7}
         posts = [RigidBody("cylinder", (0.02, 0.02), (*p, 0.02), motion="fixed", **rub) for p in POSTS]
         return make(self, [Rope(x, RADIUS, mass=0.029, youngs=1e4)], solids=posts)
 

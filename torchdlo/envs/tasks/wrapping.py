@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -58,7 +58,7 @@ class Wrapping(Task):
         x = circle + moved.new_tensor([0.6, 0.0, 0.012]) + moved[:, :1]
         stiff = 1e5 * math.pi * RADIUS**2
         loop = Rope(x, RADIUS, mass=0.05, youngs=1e4, stretch=stiff, closed=True)
-        rub = {"mu_s": 0.7, "mu_k": 0.7}
+        rub: dict[str, Any] = {"mu_s": 0.7, "mu_k": 0.7}
         posts = [RigidBody("cylinder", (POST, TOP / 2), (*p, TOP / 2), motion="fixed", **rub) for p in POSTS]
         return make(self, [loop], solids=posts)
 

@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 
 from torchdlo.physics import tree
-from torchdlo.physics.linalg.numerics import dot
+from torchdlo.physics.linalg.numerics import added, dot
 from torchdlo.physics.rod.topology import Topology, following, preceding
 
 HARD = 100.0
@@ -51,7 +51,7 @@ class Pairs:
     """By how much they have to part at least [m], shape (..., K, 1)."""
     mu: Tensor
     """Coefficients of friction [1], shape (..., K, 1)."""
-    linear: tuple[Tensor, Tensor, Tensor, Tensor]
+    linear: tuple[Tensor, ...]
     """How they move against each other with their corners [1], shape (..., K, 3, 3) each."""
 
 
@@ -59,8 +59,8 @@ class Pairs:
 class PairsFelt:
     """What pairs do at some displacements, times `scale`."""
 
-    forces: tuple[Tensor, Tensor, Tensor, Tensor]
-    """Forces on their corners [N s^2], shape (..., K, 3) each."""
+    forces: tuple[Tensor, ...]
+    """Forces on their four corners [N s^2], shape (..., K, 3) each."""
     parts: tuple[Tensor, ...]
     """Numbers of pairs [-] that `pair_gradient` reads, shapes (...)."""
 
@@ -75,7 +75,7 @@ def feel_pairs(pairs: Pairs, firm: Tensor, ends: tuple[Tensor, ...], dt: float) 
         dt: substep [s].
     """
     n = pairs.normal
-    moved = sum(_times(m, y) for m, y in zip(pairs.linear, ends, strict=True))
+    moved = added(_times(m, y) for m, y in zip(pairs.linear, ends, strict=True))
     along = dot(n, moved)
     slip = moved - n * along
     normal, drag, parts = _law(pairs.wanted, along, slip, firm, pairs.radius, pairs.mu, pairs.real, dt)
@@ -128,8 +128,8 @@ def untouched(like: Tensor) -> Touch:
     """Return that no bodies are there; vertices are (..., V, 3)."""
     v = like.shape[-2]
     widths = (1, 1, 3, 3, 1, 1, 1, 3, 1, 3)
-    none = (like.new_zeros(0, v, width) for width in widths)
-    return Touch(*none, like.new_zeros(0, 0), like.new_zeros(0, 6, 6), like.new_zeros(1, 0))
+    none = [like.new_zeros(0, v, width) for width in widths]
+    return Touch(*[*none, like.new_zeros(0, 0), like.new_zeros(0, 6, 6), like.new_zeros(1, 0)])
 
 
 @dataclass(frozen=True)

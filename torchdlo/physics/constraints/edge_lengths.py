@@ -282,7 +282,8 @@ class LengthSystem:
         """Return what the kernel reads, in its order, and its numbers but for how many steps it takes."""
         lengths, inertia = self.lengths, self.inertia
         swing = inertia.vertex.new_zeros(1, 1) if inertia.turning is None else inertia.turning
-        edges = lengths.rest, lengths.compliance, lengths.active, lengths.edge_mask, lengths.give, inertia.hinge, swing
+        give = tree.part(lengths.give)
+        edges = lengths.rest, lengths.compliance, lengths.active, lengths.edge_mask, give, inertia.hinge, swing
         vectors = inertia.vertex, self.moved, self.force, self.direction, self.ahead
         law = [self.turning, lengths.most, lengths.least, lengths.shift]
         return [*edges, self.free, tension, *vectors, self.scale], law
@@ -301,7 +302,7 @@ class LengthSystem:
             same, one, two = inertia.bands(topology)
             string = impulse * self.lean
             after, active = following(topology, free), lengths.active
-            soft = lengths.yielding(impulse / scale)[1] + lengths.shift * lengths.give
+            soft = lengths.yielding(impulse / scale)[1] + lengths.shift * tree.part(lengths.give)
             entries = _rows(
                 inertia.vertex + free * (same + string + preceding(topology, string)),
                 free * (one - string),
@@ -388,8 +389,9 @@ def _balanced(
     (free, tension), (moved, force, direction, ahead, scale) = scalars, vectors
     system = LengthSystem(lengths, inertia, moved, free, force, scale, direction, ahead, turning)
     inputs, law = system.inputs(tension)
-    law = (*law, steps, _done(force), 1.0)
-    return tuple(lanes.apply("balance", lengths.topology.name, inputs, (3, 1, 3), "saddle", law))
+    numbers = (*law, steps, _done(force), 1.0)
+    pos, found, push = lanes.apply("balance", lengths.topology.name, inputs, (3, 1, 3), "saddle", numbers)
+    return pos, found, push
 
 
 def saddle_order(topology: Topology) -> list[int]:

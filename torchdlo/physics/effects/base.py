@@ -18,7 +18,8 @@ if TYPE_CHECKING:
     from torchdlo.physics.constraints.contact_penalty import Pairs, Touch
     from torchdlo.physics.effects.measurement import Track
 
-KINDS = ("force", "material", "boundary", "measurement")
+EffectKind = Literal["force", "material", "boundary", "measurement"]
+KINDS: tuple[EffectKind, ...] = ("force", "material", "boundary", "measurement")
 """What an effect can be: a load from outside, a law of the rope, of how it is held, or of how it is measured."""
 
 Values = dict[str, Tensor]
@@ -134,9 +135,10 @@ class ContactForces:
 
     def plus(self, other: ContactForces) -> ContactForces:
         """Return what both exert together; no more than one effect touches matter."""
-        sums = [getattr(self, n) + getattr(other, n) for n in ("force", "body_force", "body_torque")]
+        force, torque = self.force + other.force, self.body_torque + other.body_torque
         material_points = self.material_points if self.material_points != () else other.material_points
-        return ContactForces(*sums, material_points, self.unsolved if self.unsolved != () else other.unsolved)
+        unsolved = self.unsolved if self.unsolved != () else other.unsolved
+        return ContactForces(force, self.body_force + other.body_force, torque, material_points, unsolved)
 
 
 class Effect(ABC):
@@ -147,7 +149,7 @@ class Effect(ABC):
 
     name: ClassVar[str]
     """Name in scenes, parameter trees and findings."""
-    kind: ClassVar[Literal["force", "material", "boundary", "measurement"]]
+    kind: ClassVar[EffectKind]
     """What it is, see `KINDS`."""
     params: ClassVar[dict[str, Param]] = {}
     """Its numbers."""

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchdlo.physics import tree
-from torchdlo.physics.effects.base import Effect, Param, Values
+from torchdlo.physics.effects.base import Effect, EffectKind, Param, Values
 from torchdlo.physics.effects.elastic import (
     bending_moments,
     closing_stiffness,
@@ -41,7 +41,7 @@ class InternalFriction(Effect):
     """
 
     name: ClassVar[str] = "internal_friction"
-    kind: ClassVar[str] = "material"
+    kind: ClassVar[EffectKind] = "material"
     frames: ClassVar[bool] = True
     is_quasistatic: ClassVar[bool] = True
     memory: ClassVar[int] = 5
@@ -102,7 +102,7 @@ class StiffeningBending(Effect):
     """
 
     name: ClassVar[str] = "stiffening_bending"
-    kind: ClassVar[str] = "material"
+    kind: ClassVar[EffectKind] = "material"
     frames: ClassVar[bool] = True
     is_quasistatic: ClassVar[bool] = True
     params: ClassVar[dict[str, Param]] = {
@@ -145,7 +145,7 @@ class AnisotropicBending(Effect):
     """
 
     name: ClassVar[str] = "anisotropic_bending"
-    kind: ClassVar[str] = "material"
+    kind: ClassVar[EffectKind] = "material"
     frames: ClassVar[bool] = True
     frame_bending: ClassVar[bool] = True
     params: ClassVar[dict[str, Param]] = {

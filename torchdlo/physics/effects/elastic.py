@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from torchdlo.physics import tree
-from torchdlo.physics.effects.base import Effect, Values
+from torchdlo.physics.effects.base import Effect, EffectKind, Values
 from torchdlo.physics.kernels import lanes
 from torchdlo.physics.linalg.numerics import cross, dot
 from torchdlo.physics.rod.kinematics import View
@@ -23,7 +23,7 @@ class Stretch(Effect):
     """Axial stiffness as a force: energy EA strain^2 length / 2 per edge."""
 
     name: ClassVar[str] = "stretch_force"
-    kind: ClassVar[str] = "material"
+    kind: ClassVar[EffectKind] = "material"
 
     def energy(self, view: View, values: Values) -> Tensor:
         """Return the energy per edge [J], shape (..., V, 1)."""
@@ -47,7 +47,7 @@ class Bend(Effect):
     """
 
     name: ClassVar[str] = "bend"
-    kind: ClassVar[str] = "material"
+    kind: ClassVar[EffectKind] = "material"
 
     def energy(self, view: View, values: Values) -> Tensor:
         """Return the energy per hinge [J], shape (..., V, 1)."""
@@ -85,7 +85,7 @@ class Curvature:
     """(m1' + m1) / (1 + t'.t) [1], shape (..., V, 3)."""
     mean2: Tensor
     """(m2' + m2) / (1 + t'.t) [1], shape (..., V, 3)."""
-    by_twist: tuple[Tensor, Tensor, Tensor, Tensor]
+    by_twist: tuple[Tensor, ...]
     """Derivatives of (kappa1, kappa2) by the angle of the edge before, then after [1], shape (..., V, 1) each."""
 
     def pull_back(self, view: View, moment: Tensor) -> Values:
@@ -128,8 +128,9 @@ def curvature(view: View) -> Curvature:
     if lanes.ready(view.tangent):
         angle = view.state.twist
         inputs = view.before, view.tangent, view.state.director, angle.cos(), angle.sin(), view.params.rest.hinge_mask
-        *shape, b1, b2, a1, a2 = lanes.apply("curve", view.topology.name, inputs, (2, 3, 3, 3, 3, 1, 1, 1, 1))
-        return Curvature(*shape, (b1, b2, a1, a2))
+        found = lanes.apply("curve", view.topology.name, inputs, (2, 3, 3, 3, 3, 1, 1, 1, 1))
+        kappa, kb, mean, mean1, mean2, b1, b2, a1, a2 = found
+        return Curvature(kappa, kb, mean, mean1, mean2, (b1, b2, a1, a2))
     chi = (1 + dot(view.before, view.tangent)).clamp(min=1e-6)
     kb = 2 * cross(view.before, view.tangent) / chi * view.params.rest.hinge_mask
     m1, m2 = view.frames()
@@ -197,7 +198,7 @@ class BendFrame(Effect):
     """
 
     name: ClassVar[str] = "bend"
-    kind: ClassVar[str] = "material"
+    kind: ClassVar[EffectKind] = "material"
     frames: ClassVar[bool] = True
     is_quasistatic: ClassVar[bool] = True
 
@@ -225,7 +226,7 @@ class Twist(Effect):
     """Twisting: energy GJ (twist - rest twist)^2 / (2 l) per hinge."""
 
     name: ClassVar[str] = "twist"
-    kind: ClassVar[str] = "material"
+    kind: ClassVar[EffectKind] = "material"
     frames: ClassVar[bool] = True
     is_quasistatic: ClassVar[bool] = True
 

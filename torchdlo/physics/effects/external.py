@@ -8,7 +8,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from torchdlo.physics.effects.base import Effect, Param, Values
+from torchdlo.physics.effects.base import Effect, EffectKind, Param, Values
 from torchdlo.physics.linalg.numerics import cross, dot, safe_norm
 from torchdlo.physics.rod.kinematics import View
 
@@ -21,7 +21,7 @@ class Gravity(Effect):
     """Uniform gravity."""
 
     name: ClassVar[str] = "gravity"
-    kind: ClassVar[str] = "force"
+    kind: ClassVar[EffectKind] = "force"
     params: ClassVar[dict[str, Param]] = {
         "acceleration": Param((0.0, 0.0, -9.81), -20.0, 20.0, "m/s^2", "linear", 0.0, "Acceleration of free fall.")
     }
@@ -36,7 +36,7 @@ class Damping(Effect):
     """Uniform decay of all velocities, v -> v exp(-rate t); of twist rates as well."""
 
     name: ClassVar[str] = "damping"
-    kind: ClassVar[str] = "force"
+    kind: ClassVar[EffectKind] = "force"
     params: ClassVar[dict[str, Param]] = {
         "rate": Param(0.5, 1e-3, 50.0, "1/s", "log", 0.0, "Rate at which velocities decay."),
         "twist_rate": Param(0.5, 1e-3, 1e4, "1/s", "log", 0.0, "Rate at which twist rates decay."),
@@ -55,7 +55,7 @@ class TiltedGravity(Effect):
     """
 
     name: ClassVar[str] = "tilted_gravity"
-    kind: ClassVar[str] = "force"
+    kind: ClassVar[EffectKind] = "force"
     params: ClassVar[dict[str, Param]] = {
         "angles": Param((0.0, 0.0), -0.2, 0.2, "rad", "linear", 0.0, "Turn of gravity about the x and the y axis."),
         "acceleration": Param((0.0, 0.0, -9.81), -20.0, 20.0, "m/s^2", "linear", None, "Gravity that is turned."),
@@ -91,7 +91,7 @@ class AirDrag(Effect):
     """Quadratic drag across the rope, -rho c_d r |v_n| v_n per length, v_n the velocity normal to the rope."""
 
     name: ClassVar[str] = "air_drag"
-    kind: ClassVar[str] = "force"
+    kind: ClassVar[EffectKind] = "force"
     params: ClassVar[dict[str, Param]] = {
         "c_d": Param(1.2, 0.0, 20.0, "1", "linear", 0.0, "Drag coefficient of the rope in cross-flow.")
     }
@@ -110,7 +110,7 @@ class Wind(Effect):
     """
 
     name: ClassVar[str] = "wind"
-    kind: ClassVar[str] = "force"
+    kind: ClassVar[EffectKind] = "force"
     params: ClassVar[dict[str, Param]] = {
         "velocity": Param((0.0, 0.0, 0.0), -20.0, 20.0, "m/s", "linear", None, "Velocity of the air."),
         "c_d": Param(1.2, 0.0, 20.0, "1", "linear", 0.0, "Drag coefficient of the rope in cross-flow."),

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchdlo.physics import tree
-from torchdlo.physics.effects.base import Effect, Param, Values
+from torchdlo.physics.effects.base import Effect, EffectKind, Param, Values
 from torchdlo.physics.rod.kinematics import RodParams, hinge_length
 from torchdlo.physics.rod.topology import Topology
 
@@ -37,7 +37,7 @@ class GripperCompliance(Effect):
     """Slots of the vertices where clamps end."""
 
     name: ClassVar[str] = "gripper_compliance"
-    kind: ClassVar[str] = "boundary"
+    kind: ClassVar[EffectKind] = "boundary"
     last: ClassVar[bool] = True
     params: ClassVar[dict[str, Param]] = {
         "stiffness": Param(

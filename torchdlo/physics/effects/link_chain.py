@@ -8,7 +8,7 @@ from typing import ClassVar
 import torch
 
 from torchdlo.physics import tree
-from torchdlo.physics.effects.base import Effect, Param, Values
+from torchdlo.physics.effects.base import Effect, EffectKind, Param, Values
 from torchdlo.physics.effects.elastic import Twist, curvature, hinge_stiffness, stiffness_bound
 from torchdlo.physics.kernels import lanes
 from torchdlo.physics.linalg.numerics import dot
@@ -27,7 +27,7 @@ class LinkChain(Effect):
     """
 
     name: ClassVar[str] = "link_chain"
-    kind: ClassVar[str] = "material"
+    kind: ClassVar[EffectKind] = "material"
     frames: ClassVar[bool] = True
     is_quasistatic: ClassVar[bool] = True
     params: ClassVar[dict[str, Param]] = {

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchdlo.physics import tree
-from torchdlo.physics.effects.base import Effect, Param, Values
+from torchdlo.physics.effects.base import Effect, EffectKind, Param, Values
 from torchdlo.physics.effects.elastic import Curvature, curvature
 from torchdlo.physics.linalg.numerics import dot
 from torchdlo.physics.rod.kinematics import RodParams, View, hinge_length
@@ -31,7 +31,7 @@ class RestCurvature(Effect):
     """Natural curvature, the same all along the rope, in the material frame. Needs `BendFrame`."""
 
     name: ClassVar[str] = "rest_curvature"
-    kind: ClassVar[str] = "material"
+    kind: ClassVar[EffectKind] = "material"
     frame_bending: ClassVar[bool] = True
     params: ClassVar[dict[str, Param]] = {
         "curvature": Param((0.0, 0.0), -30.0, 30.0, "1/m", "linear", 0.0, "Curvature about the two material directors.")
@@ -49,7 +49,7 @@ class NonuniformStiffness(Effect):
     """Bending stiffness times 1 + gradient (s/L - 1/2) and times a soft or stiff spot (factor at its centre)."""
 
     name: ClassVar[str] = "nonuniform_stiffness"
-    kind: ClassVar[str] = "material"
+    kind: ClassVar[EffectKind] = "material"
     params: ClassVar[dict[str, Param]] = {
         "position": Param(0.5, 0.0, 1.0, "1", "linear", None, "Centre of the spot as a fraction of the length."),
         "width": Param(0.1, 0.02, 0.5, "1", "log", None, "Half width of the spot as a fraction of the length."),
@@ -72,7 +72,7 @@ class PointMass(Effect):
     """An extra mass at one place, shared between the two vertices next to it; it has weight and inertia."""
 
     name: ClassVar[str] = "point_mass"
-    kind: ClassVar[str] = "material"
+    kind: ClassVar[EffectKind] = "material"
     params: ClassVar[dict[str, Param]] = {
         "position": Param(0.5, 0.0, 10.0, "m", "linear", None, "Place along the rope."),
         "mass": Param(0.0, 0.0, 1.0, "kg", "linear", 0.0, "The extra mass."),
@@ -96,7 +96,7 @@ class AxialStiffness(Effect):
     """Finite axial stiffness, in series with the one that the rope has: 1/EA adds to it."""
 
     name: ClassVar[str] = "stretch"
-    kind: ClassVar[str] = "material"
+    kind: ClassVar[EffectKind] = "material"
     params: ClassVar[dict[str, Param]] = {
         "EA": Param(1e18, 1.0, 1e18, "N", "reciprocal", 1e18, "Axial stiffness; 1e18 stands for inextensible.")
     }
@@ -115,7 +115,7 @@ class BendingDamping(Effect):
     """Kelvin-Voigt bending: a moment proportional to the rate of curvature."""
 
     name: ClassVar[str] = "bending_damping"
-    kind: ClassVar[str] = "material"
+    kind: ClassVar[EffectKind] = "material"
     frames: ClassVar[bool] = True
     is_quasistatic: ClassVar[bool] = True
     params: ClassVar[dict[str, Param]] = {
@@ -179,7 +179,7 @@ class BendingPlasticity(Effect):
     """
 
     name: ClassVar[str] = "bending_plasticity"
-    kind: ClassVar[str] = "material"
+    kind: ClassVar[EffectKind] = "material"
     frame_bending: ClassVar[bool] = True
     frames: ClassVar[bool] = True
     params: ClassVar[dict[str, Param]] = {

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchdlo.physics import tree
-from torchdlo.physics.effects.base import Effect, Param, Values
+from torchdlo.physics.effects.base import Effect, EffectKind, Param, Values
 
 
 @tree.struct
@@ -71,7 +71,7 @@ class TimeDelay(Effect):
     """
 
     name: ClassVar[str] = "time_delay"
-    kind: ClassVar[str] = "measurement"
+    kind: ClassVar[EffectKind] = "measurement"
     last: ClassVar[bool] = True
     params: ClassVar[dict[str, Param]] = {
         "delay": Param(0.0, -0.2, 0.2, "s", "linear", 0.0, "Time by which the markers lag the grippers.")
@@ -90,7 +90,7 @@ class MarkerOffset(Effect):
     """Free markers sit beside the axis, all to the same side of the rope, and turn with its material."""
 
     name: ClassVar[str] = "marker_offset"
-    kind: ClassVar[str] = "measurement"
+    kind: ClassVar[EffectKind] = "measurement"
     params: ClassVar[dict[str, Param]] = {
         "offset": Param((0.0, 0.0), -0.03, 0.03, "m", "linear", 0.0, "Offset along the two material directors.")
     }

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchdlo.physics import tree
-from torchdlo.physics.effects.base import Effect, Param, Values
+from torchdlo.physics.effects.base import Effect, EffectKind, Param, Values
 from torchdlo.physics.linalg.numerics import total
 from torchdlo.physics.rod.kinematics import View
 
@@ -31,7 +31,7 @@ class Table(Effect):
     """Support without friction: a stiff spring per vertex, damped at half its critical value while it is pressed."""
 
     name: ClassVar[str] = "table"
-    kind: ClassVar[str] = "force"
+    kind: ClassVar[EffectKind] = "force"
     params: ClassVar[dict[str, Param]] = {"height": _HEIGHT, "hardness": _HARDNESS}
 
     def loads(self, view: View, values: Values) -> Values:
@@ -52,7 +52,7 @@ class TableFriction(Effect):
     """Coulomb friction on the table, -mu N v / sqrt(|v|^2 + slip^2) along the surface."""
 
     name: ClassVar[str] = "table_friction"
-    kind: ClassVar[str] = "force"
+    kind: ClassVar[EffectKind] = "force"
     params: ClassVar[dict[str, Param]] = {
         "mu": Param(0.0, 0.0, 2.0, "1", "linear", 0.0, "Coefficient of friction."),
         "slip": Param(1e-3, 1e-5, 0.1, "m/s", "log", None, "Speed below which friction grows with speed: creep."),

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from torchdlo.physics import tree
+from torchdlo.physics.linalg.numerics import added
 
 
 @dataclass(frozen=True)
@@ -93,7 +94,7 @@ def check_gradients(
             return (ends[0] - ends[1]) / (2 * h)
 
         wide, narrow = gradient(2 * span), gradient(span)
-        adjoint = sum((gradients[k] * way[k]).sum() for k in way)
+        adjoint = added((gradients[k] * way[k]).sum() for k in way)
         rows.append(torch.stack([adjoint.to(like), (4 * narrow - wide) / 3, (wide - narrow).abs()]))
     return GradientCheck(*torch.stack(rows, -1).detach().unbind(0))
 

@@ -55,7 +55,7 @@ def record(step: Callable[..., Any], *inputs: Any) -> Callable[..., Any]:
 
     known: dict[int, tuple[Any, Sequence[torch.Tensor]]] = {}
 
-    def leaves(place: int, given: Any) -> Sequence[torch.Tensor]:
+    def kept(place: int, given: Any) -> Sequence[torch.Tensor]:
         # Constants stay the same over many steps, and what a step returns is given to the next one.
         if place not in known or known[place][0] is not given:
             known[place] = given, tree.leaves(given)
@@ -63,8 +63,8 @@ def record(step: Callable[..., Any], *inputs: Any) -> Callable[..., Any]:
 
     @torch.no_grad()
     def replayed(first: Any, *others: Any) -> Any:
-        now = leaves(1, others[0]) if others else ()
-        found = recorded(*leaves(0, first), *now, *tree.leaves(others[1:]))
+        now = kept(1, others[0]) if others else ()
+        found = recorded(*kept(0, first), *now, *tree.leaves(others[1:]))
         made = rebuild[0](found)
         known[1] = made, found
         return made

@@ -94,7 +94,8 @@ def solve(
     lengths, inertia, topology = system.lengths, system.inertia, system.lengths.topology
     v, free_bodies = topology.size, touch.of.shape[-1]
     swing = inertia.turning if inertia.turning is not None else inertia.vertex.new_zeros(1, 1)
-    parts = [lengths.rest, lengths.compliance, lengths.active, lengths.edge_mask, lengths.give, inertia.hinge, swing]
+    give = tree.part(lengths.give)
+    parts = [lengths.rest, lengths.compliance, lengths.active, lengths.edge_mask, give, inertia.hinge, swing]
     parts += [system.free, tension, inertia.vertex, system.moved, system.force, system.direction, system.ahead, origin]
     parts.append(system.scale)
     others = [touch.wanted.shape[:-3], touch.resist.shape[:-3]]

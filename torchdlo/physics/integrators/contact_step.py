@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -24,7 +25,7 @@ from torchdlo.physics.constraints.edge_lengths import Inertia, Lengths, LengthSy
 from torchdlo.physics.integrators import contact_kernel
 from torchdlo.physics.kernels import lanes
 from torchdlo.physics.linalg import banded, gather_scatter, low_rank
-from torchdlo.physics.linalg.numerics import dot
+from torchdlo.physics.linalg.numerics import added, dot
 from torchdlo.physics.rod.topology import Topology, following, parse, preceding
 
 TRIES = ((HARD, 10), (0.1 * HARD, 24), (0.01 * HARD, 24))
@@ -121,11 +122,12 @@ class Touching:
             turn = lengths.active * (following(topology, change) - change) / lengths.rest
             most = dot(turn, turn).amax(-2, keepdim=True).sqrt()
             short = (1 / most.clamp(min=1e-9)).clamp(max=1.0)
-            sizes = (inertia.vertex * y, scale * system.force, felt.force, now.impulse * along_start)
-            sizes = sizes if pairs is None else (*sizes, between)
+            sizes = [inertia.vertex * y, scale * system.force, felt.force, now.impulse * along_start]
+            if pairs is not None:
+                sizes.append(between)
             # Far from contact and loads, what is left is small beside the momentum.
             carried = 1e-3 * (system.moved - self.origin) + 1e-9 * lengths.rest
-            sizes = (*sizes, inertia.vertex * carried)
+            sizes.append(inertia.vertex * carried)
             left = _left(forces, sizes, excess, lengths.rest).expand(*batch, 1, 1)
         return Unknowns(now.pos + short * change, now.impulse + short * pull, bodies + short * turned), left
 
@@ -143,7 +145,7 @@ class Touching:
         same, one, two = inertia.bands(topology)
         string = impulse * system.lean
         after, active = following(topology, free), lengths.active
-        soft = lengths.yielding(impulse / scale)[1] + lengths.shift * lengths.give
+        soft = lengths.yielding(impulse / scale)[1] + lengths.shift * tree.part(lengths.give)
         unit = torch.eye(3, dtype=along.dtype, device=along.device)
         own = (same + string + preceding(topology, string)).unsqueeze(-1) * unit + gradient.same
         beside = (one - string).unsqueeze(-1) * unit
@@ -195,9 +197,9 @@ class Touching:
         )
 
 
-def _left(forces: Tensor, sizes: tuple[Tensor, ...], excess: Tensor, rest: Tensor) -> Tensor:
+def _left(forces: Tensor, sizes: Sequence[Tensor], excess: Tensor, rest: Tensor) -> Tensor:
     """Return what is left of the equations over what is in them, and of lengths over lengths [1], shape (..., 1, 1)."""
-    size = sum(x.abs() for x in sizes)
+    size = added(x.abs() for x in sizes)
     left = forces.abs().amax((-2, -1), keepdim=True) / size.amax((-2, -1), keepdim=True).clamp(min=1e-30)
     return torch.maximum(left, (excess.abs() / rest).amax(-2, keepdim=True))
 
@@ -255,7 +257,8 @@ def solve_contact_step(touching: Touching, tension: Tensor) -> tuple[Tensor, Ten
     """
     system = touching.system
     if lanes.ready(system.force) and contact_kernel.available(system.force):
-        return tuple(_searched(touching, tension, True)[4:])
+        pos, tension, force, exerted, wrench, left = _searched(touching, tension, True)[4:]
+        return pos, tension, force, exerted, wrench, left
     with torch.no_grad():
         pos, found, bodies, hard = _searched(touching, tension)
     firm = touching.firm(tension, hard)
@@ -288,10 +291,13 @@ def _equations(
 ) -> tuple[Touching, Tensor]:
     rest, compliance, active, mask, give, hinge, swing, free, tension, vertex, moved, *others, scale = inputs
     lengths = Lengths(parse(topology), rest, compliance, active, mask, give, *law[1:3])
-    system = LengthSystem(
-        lengths, Inertia(vertex, hinge, rest, mask, swing), moved, free, others[0], scale, *others[1:], law[0]
-    )
-    between = Pairs(*pairs[:6], tuple(pairs[6:])) if pairs else None
+    inertia = Inertia(vertex, hinge, rest, mask, swing)
+    force, direction, ahead = others
+    system = LengthSystem(lengths, inertia, moved, free, force, scale, direction, ahead, law[0])
+    between = None
+    if pairs:
+        at, real, normal, radius, wanted, mu, *linear = pairs
+        between = Pairs(at, real, normal, radius, wanted, mu, tuple(linear))
     return Touching(system, Touch(*parts), origin, between, law[-1]), tension
 
 

@@ -108,11 +108,11 @@ def substep(
     loads = effect.total_loads(settings.effects, now, values)
     kick = _kick(settings, now, loads, first, targets)
     falling = loads.get("acceleration", 0.0)
-    others = [None if f is None else f(falling) for f in (predict_free_motion, material_points)]
-    pos, tension, push, contact = _answered(settings, now, loads, values, kick, targets, *others)
+    body, particles = (None if f is None else f(falling) for f in (predict_free_motion, material_points))
+    pos, tension, push, contact = _answered(settings, now, loads, values, kick, targets, body, particles)
     held = list(settings.prescribed_vertices)
     force = (kick.vertex * (pos - kick.drift) / kick.scale - push)[..., held, :]
-    fields: dict[str, Tensor] = {"pos": pos, "tension": tension}
+    fields: dict[str, Any] = {"pos": pos, "tension": tension}
     half = torch.exp(-0.5 * dt * loads["rate"]) if "rate" in loads else 1.0
     fields["vel"] = (pos - state.pos) / dt * half
     for each in settings.effects:
@@ -130,7 +130,7 @@ def substep(
         moved, couple = _turn(settings, now, loads, moved, targets, first)
     if settings.twist == "quasistatic":
         moved, couple = settle_twist(settings, params, values, moved, targets)
-    return moved, Reaction(force, couple), (*others, contact)
+    return moved, Reaction(force, couple), (body, particles, contact)
 
 
 def _force(now: View, loads: Values) -> Tensor:
@@ -154,7 +154,7 @@ class _Kick:
     """Force [N], shape (..., V, 3)."""
     drift: Tensor
     """Positions without any force [m], shape (..., V, 3)."""
-    scale: Tensor | float
+    scale: Tensor
     """What turns force into mass times displacement [s^2], shape (..., 1, 1)."""
     vertex: Tensor
     """Mass along the axes [kg], shape (..., V, 3)."""
@@ -226,8 +226,8 @@ def _answered(
         if engaged:
             change = aimed - now.state.pos + answer * total.force
             motion = PredictedMotion(change, mobility, answer, bodies and bodies.pushed(total), material_points)
-            found = [e.engage(now, motion, values[e.name]) for e in engaged]
-            pos, tension, held, push = _translate(settings, now, loads, pushed, targets, tension, found)
+            touch = [e.engage(now, motion, values[e.name]) for e in engaged]
+            pos, tension, held, push = _translate(settings, now, loads, pushed, targets, tension, touch)
             pushes["in the solve"] = push
             total = total.plus(push)
         else:

@@ -12,6 +12,7 @@ import itertools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -103,7 +104,7 @@ def _plan(
             many = len(shape) > 2 and scenes > 1
         slot = stride[-2] if shape[-2] > 1 else 0
         places += [_Place(k, c * stride[-1], slot, int(many)) for c in range(shape[-1])]
-    kept = (
+    kept: tuple[Any, ...] = (
         (_Place * len(places))(*places),
         (ctypes.c_int64 * len(after))(*after),
         (ctypes.c_double * len(numbers))(*numbers),

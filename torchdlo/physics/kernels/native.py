@@ -79,19 +79,23 @@ def _compiler(given: str, path: str) -> Compiler | None:
     try:
         words = shlex.split(given)
     except ValueError as error:
-        return _without(f"CXX={given} is not a command ({error})")
+        _without(f"CXX={given} is not a command ({error})")
+        return None
     if not words:
         words = [name for name in ("g++", "clang++") if shutil.which(name)][:1]
     if not words:
-        return _without("no C++ compiler was found (g++ or clang++)")
+        _without("no C++ compiler was found (g++ or clang++)")
+        return None
     # Preprocessing nothing tells all of it in a hundredth of a second.
     command = [*words, "-march=native", "-dM", "-E", "-x", "c++", os.devnull]
     try:
         told = subprocess.run(command, capture_output=True, text=True, errors="replace", timeout=60)
     except (OSError, subprocess.TimeoutExpired) as error:
-        return _without(f"the C++ compiler {shlex.join(words)} does not run ({error})")
+        _without(f"the C++ compiler {shlex.join(words)} does not run ({error})")
+        return None
     if told.returncode:
-        return _without(f"the C++ compiler {shlex.join(words)} does not work ({_last_line(told.stderr)})")
+        _without(f"the C++ compiler {shlex.join(words)} does not work ({_last_line(told.stderr)})")
+        return None
     return Compiler(tuple(words), told.stdout)
 
 
@@ -146,9 +150,11 @@ def library(source: Path, *options: str) -> ctypes.CDLL | None:
                     _build(command, target)
         return ctypes.CDLL(str(target))
     except subprocess.CalledProcessError as error:
-        return _without(f"{shlex.join(found.words)} could not build {source.name} ({_last_line(error.stderr)})")
+        _without(f"{shlex.join(found.words)} could not build {source.name} ({_last_line(error.stderr)})")
+        return None
     except OSError as error:
-        return _without(f"{source.name} could not be built or loaded ({error})")
+        _without(f"{source.name} could not be built or loaded ({error})")
+        return None
 
 
 def _build(command: list[str], target: Path) -> None:

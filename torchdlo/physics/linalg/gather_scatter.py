@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-Four = tuple[Tensor, Tensor, Tensor, Tensor]
+Four = tuple[Tensor, ...]
 """Values at the four corners of every pair, shape (..., K, C) each."""
 
 

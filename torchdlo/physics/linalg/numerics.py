@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from typing import Any
+
 import torch
 from torch import Tensor
 
@@ -17,6 +20,12 @@ def total(x: Tensor) -> Tensor:
     """Return the sum over the last axis, kept as size 1; shape (..., 1)."""
     # In the order of storage: otherwise the result would be stored batch-outermost, which makes what follows slow.
     return x.sum(-1, keepdim=True) if x.dim() < 2 else tree.logical(tree.stored(x).sum(0, keepdim=True))
+
+
+def added(parts: Iterable[Tensor]) -> Tensor:
+    """Return the sum of some tensors, one at least."""
+    found: Any = sum(parts)  # which is 0, and no tensor, of none
+    return found
 
 
 def dot(a: Tensor, b: Tensor) -> Tensor:

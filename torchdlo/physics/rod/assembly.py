@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -148,8 +148,11 @@ def _columns(value: Number, positions: Tensor) -> Number:
 
 def _flat(rope: Rope) -> Rope:
     """Return a rope whose numbers along it have its vertices as their last axis."""
-    given = {name: getattr(rope, name) for name in validation.NUMBERS if getattr(rope, name) is not None}
-    return replace(rope, **{name: _columns(value, rope.positions) for name, value in given.items()})
+    given: dict[str, Any] = {
+        name: getattr(rope, name) for name in validation.NUMBERS if getattr(rope, name) is not None
+    }
+    columns: dict[str, Any] = {name: _columns(value, rope.positions) for name, value in given.items()}
+    return replace(rope, **columns)
 
 
 def _scenes(rope: Rope) -> torch.Size:

@@ -34,7 +34,7 @@ def calibration_png(result: Calibration, recording: Recording) -> bytes:
     trials = _chosen(result, recording)
     figure = Figure(figsize=(13.2, 11.4), dpi=120, facecolor="white", layout="constrained")
     FigureCanvasAgg(figure)
-    shapes, errors = figure.subfigures(2, 1, height_ratios=(2.2, 1.0))
+    (shapes,), (errors,) = figure.subfigures(2, 1, height_ratios=(2.2, 1.0), squeeze=False)
     panels = shapes.subplots(2, len(trials), squeeze=False)
     for (above, below), trial in zip(panels.T, trials, strict=True):
         _overlay(above, trial, result.predictions_before[trial.name], recording, "before", _BEFORE)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 from torchdlo.untrusted import for_html
@@ -13,7 +14,7 @@ def page(title: str, style: str, body: str) -> str:
     return _FRAME.format(title=for_html(title), style=style, body=body)
 
 
-def table(heads: tuple[str, ...], rows: list[tuple[str, ...]], *, last_is_ours: bool = False) -> str:
+def table(heads: tuple[str, ...], rows: Sequence[tuple[str, ...]], *, last_is_ours: bool = False) -> str:
     """A table; its last row may be marked as ours."""
     lines = ['<div class="wide"><table><thead><tr>', *(f"<th>{for_html(h)}</th>" for h in heads)]
     lines.append("</tr></thead><tbody>")

@@ -15,6 +15,7 @@ from torchdlo.coupling.robot import robot_kinematics as robots
 from torchdlo.envs import Task
 from torchdlo.envs.core import episode
 from torchdlo.errors import InputError
+from torchdlo.physics import tree
 from torchdlo.scene import Params, Scene
 from torchdlo.scene_files.run import Frames, appearance
 
@@ -82,7 +83,7 @@ def _frames(
     kept = {name: torch.cat([frame[name] for frame in seen]) for name in seen[0]}
     joints = kept.pop("joints")
     looks = appearance(made.scene, made.params, surfaces(made.scene, made.params))
-    moving = {name: value.numpy() for name, value in kept.items()}
+    moving: dict[str, Any] = {name: value.numpy() for name, value in kept.items()}
     if arms:
         shapes, pos, quat = _links(task, joints)
         moving["body_pos"] = np.concatenate([moving["body_pos"], pos], 1)
@@ -159,8 +160,9 @@ def surfaces(scene: Scene, params: Params) -> dict[int, tuple[Tensor, Tensor]]:
             continue
         counts = [n + 1 for n in body.cells]
         nodes = counts[0] * counts[1] * counts[2]
-        grid = params.bodies.grid.reshape(-1, *params.bodies.grid.shape[-2:])[0, k, :nodes]
-        half = params.bodies.size.reshape(-1, len(scene.bodies), 3)[0, k].double().numpy()
+        solid = tree.part(params.bodies)
+        grid = solid.grid.reshape(-1, *solid.grid.shape[-2:])[0, k, :nodes]
+        half = solid.size.reshape(-1, len(scene.bodies), 3)[0, k].double().numpy()
         image = _renderer().ImageData(dimensions=counts, spacing=2 * half / body.cells, origin=-half)
         # Along x first, here along z first.
         image["distance"] = grid.reshape(counts).double().numpy().flatten(order="F")

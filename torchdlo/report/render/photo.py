@@ -111,7 +111,7 @@ class Photo:
 
     def image(self, k: int, note: str = "") -> np.ndarray:
         """Return frame k, 8 bits of red, green and blue, shape (height, width, 3); `note` is left out."""
-        frames, given = self.frames, {}
+        frames, given = self.frames, dict[str, np.ndarray]()
         for number, piece in enumerate(self._pieces):
             if piece.kind == "rope":
                 part = _rope(frames, piece, k)
@@ -141,10 +141,10 @@ class Photo:
             source, target_ = Path(folder) / "scene.npz", Path(folder) / "image.npy"
             np.savez(source, **given)
             command = [sys.executable, "-m", _CHILD, self._variant, str(source), str(target_)]
-            made = subprocess.run(command, capture_output=True, text=True)
-            if made.returncode or not target_.exists():
-                lines = made.stderr.strip().splitlines() or ["it said nothing"]
-                raise InputError(f"photographs: Mitsuba ended with code {made.returncode}: {lines[-1]}")
+            done = subprocess.run(command, capture_output=True, text=True)
+            if done.returncode or not target_.exists():
+                lines = done.stderr.strip().splitlines() or ["it said nothing"]
+                raise InputError(f"photographs: Mitsuba ended with code {done.returncode}: {lines[-1]}")
             return np.load(target_)
 
     def close(self) -> None:

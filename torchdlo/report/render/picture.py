@@ -13,6 +13,7 @@ import torch
 from scipy.ndimage import gaussian_filter
 
 from torchdlo.errors import InputError
+from torchdlo.physics import tree
 from torchdlo.report.render.run_surfaces import COLORS, DrawnSurface, bounds, extent, pieces, points_of, spacing
 from torchdlo.scene_files.run import Frames
 from torchdlo.vision import renderer as vision
@@ -52,7 +53,7 @@ def _shade(mesh: Any, faces: np.ndarray) -> None:
     across = np.cross(b - a, c - a)
     at, count = faces.T.reshape(-1), len(mesh.points)
     normals = np.stack([np.bincount(at, np.tile(across[:, k], 3), count) for k in range(3)], -1)
-    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
+    normals = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
     mesh.point_data.active_normals = normals
 
 
@@ -117,7 +118,7 @@ class _Floor:
 
     def show(self, k: int) -> None:
         """Show the shadows of frame k."""
-        if self._shadow is None:
+        if self._shadow is None or self._texture is None:
             return
         dark = 1 - 0.42 * self._shadow(k)[..., None]
         image = (self._color * dark).astype(np.uint8)
@@ -164,7 +165,8 @@ def floor_shadow(
         pos, turns = (torch.from_numpy(np.stack(x))[None] for x in zip(*poses, strict=True))
         ropes_at, grains_at = torch.from_numpy(frames.pos[k, slots])[None], torch.from_numpy(grains[k])[None]
         placed = vision.Placement(pos, turns, ropes_at, grains_at)
-        seen = vision.render(model, placed, view, (_TEXELS, _TEXELS), samples=1, rgb=False, ids=True).ids[0, 0]
+        seen = vision.render(model, placed, view, (_TEXELS, _TEXELS), samples=1, rgb=False, ids=True).ids
+        seen = tree.part(seen)[0, 0]
         return gaussian_filter((seen.numpy() != vision.NOTHING).astype(np.float32), 2.2)
 
     return shadow
@@ -186,7 +188,7 @@ class Picture:
         span = float(np.linalg.norm(high - low))
         self._plotter = pv.Plotter(off_screen=True, window_size=size, lighting="none")
         self._plotter.set_background("#ffffff", top="#dfe7ee")
-        self._drawn = []
+        self._drawn: list[Any] = []
         for piece in self._pieces:
             if piece.kind == "body" and frames.body_shape[piece.slots[0]] == "plane" and _level(frames, piece):
                 self._drawn.append(None)  # the floor

@@ -146,7 +146,8 @@ def _arc(start: float, end: float, count: int = 13) -> tuple[np.ndarray, np.ndar
 def _box(size: np.ndarray) -> Surface:
     # Each face has its own corners, so that its edges are not shaded round.
     square = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]], float)
-    corners, faces = [], []
+    corners: list[np.ndarray] = []
+    faces: list[list[int]] = []
     for axis in range(3):
         for side in (-1, 1):
             face = np.empty((4, 3))

@@ -115,11 +115,11 @@ def _replaced(listening: socket.socket, guard: Guard, bounds: Bounds, protocol: 
         options |= {"create_connection": _connection(bounds, dropped)}
         return serve(handler, process_request=_doorkeeper(guard, process_request, protocol, dropped), **options)
 
-    library.serve = guarded
+    library.serve = guarded  # type: ignore[misc, assignment]  # viser takes whatever it finds under this name
     try:
         yield
     finally:
-        library.serve = serve
+        library.serve = serve  # type: ignore[misc]  # as it was
 
 
 def _doorkeeper(guard: Guard, theirs: Any, protocol: str, dropped: Callable[[str], None]) -> Callable[..., Any]:

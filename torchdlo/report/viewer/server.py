@@ -55,7 +55,8 @@ class Viewer:
         guard, bounds = Guard.of(listening), Bounds()
         self.server = start(listening, guard, title, bounds)
         self.address = guard.address
-        self._stopped, self._failed = threading.Event(), None
+        self._stopped = threading.Event()
+        self._failed: BaseException | None = None
         self._lock = threading.Lock()
         self._draw()
         gui, last = self.server.gui, len(frames.time) - 1
@@ -165,4 +166,5 @@ class Viewer:
 
 
 def _rgb(color: str) -> tuple[int, int, int]:
-    return tuple(int(color[k : k + 2], 16) for k in (1, 3, 5))
+    red, green, blue = (int(color[k : k + 2], 16) for k in (1, 3, 5))
+    return red, green, blue

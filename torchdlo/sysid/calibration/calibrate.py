@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from torchdlo.errors import InputError
+from torchdlo.physics import tree
 from torchdlo.sysid.calibration import refinement
 from torchdlo.sysid.diagnosis.error_floor import marker_noise
 from torchdlo.sysid.estimation import evaluation, levenberg_marquardt
@@ -62,6 +63,11 @@ class _Job:
     def columns(self) -> list[int]:
         """Return where the numbers that are fitted stand among those of the model."""
         return [self.model.parameters.index(name) for name in self.space.names]
+
+    @property
+    def cost(self) -> float:
+        """Return the cost of the best point [m]; infinite before there is one."""
+        return np.inf if self.point is None else self.point.cost
 
     def simulator(self, trials: Sequence[Trial]) -> starts_of.Simulator:
         """Return what simulates trials, on all cores."""
@@ -140,7 +146,7 @@ def calibrate(
                 job = _job(pool, kind, vertices, given)
                 best = best or job
                 for improved in _fit(job, starts, iterations, np.random.default_rng(seed), memory, report):
-                    if best.point is None or best is improved or improved.point.cost < best.point.cost:
+                    if best.point is None or best is improved or improved.cost < best.cost:
                         best = improved
             before = _before(best)  # refining corrects what the pool simulates from then on
             best = _refined(best, iterations, vertices, report) if refined else best
@@ -155,8 +161,7 @@ def _job(pool: Pool, rest: str, vertices: int | None, given: ModelFile | None) -
     recording = pool.recording
     trials = _usable(recording)
     if given is None:
-        options = {"rest": rest}
-        model = pool.local.model((), tuple(options.items()))
+        model = pool.local.model((), (("rest", rest),))
         space, values = ParameterSpace(tuple(model.parameters), tuple(model.params)), model.guess()
     else:
         options = {} if vertices is None else {"vertices": vertices}
@@ -320,7 +325,7 @@ def _refined(job: _Job, iterations: int, vertices: int | None, report: Callback)
     first = FitJob(job.model.effects, job.values[None], names, sizes, iterations, options=options)
     clamps = _CLAMPS if finer and job.model.mesh.clamps else ()
     model = job.model
-    own = {"numerical_damping": model.numerical_damping, "clamp_fraction": model.clamp_fraction}
+    own: dict[str, Any] = {"numerical_damping": model.numerical_damping, "clamp_fraction": model.clamp_fraction}
     own |= {"vertices": pool.local.options.get("vertices"), "substep": (1 + 1e-9) * model.dt / model.substeps}
     job = replace(job, options=tuple((own | dict(job.options)).items()))
     try:
@@ -341,7 +346,7 @@ def _refined(job: _Job, iterations: int, vertices: int | None, report: Callback)
     # Exact numbers predict as well with their mesh, up to what noise tells; else those that suit a coarse one count.
     if errors[1] <= errors[0] + 0.5 * marker_noise(pool.recording):
         return better
-    apart = job.space.to_raw(fitted.values[job.columns]) - job.point.raw
+    apart = job.space.to_raw(fitted.values[job.columns]) - tree.part(job.point).raw
     scale = found.drifts * fitted.space.units / job.space.units
     return replace(job, drifts=np.concatenate([scale, apart[None]]))
 
@@ -387,7 +392,7 @@ def _judge(
     report("predicting all trials", 1, 2, "")
     after = evaluation.predict(job.model, trials, job.values, simulate)
     report("predicting all trials", 2, 2, "")
-    ends = levenberg_marquardt.interval(job.point, job.space, job.drifts)
+    ends = levenberg_marquardt.interval(tree.part(job.point), job.space, job.drifts)
     least, most = (np.array([getattr(p, end) for p in job.space.params]) for end in ("low", "high"))
     turns = np.array([p.periodic for p in job.space.params])
     low, high = (np.where(turns, end, np.clip(end, least, most)) for end in ends)

@@ -138,12 +138,13 @@ class Revision:
     def without(self, fitted: Fitted, name: str) -> Fitted:
         """Return the model without one of its effects; what was asked for before is not fitted again."""
         start, key = self.bench.starts["train"], (fitted.effects, fitted.options, fitted.values.tobytes(), name)
-        at, less = self._reductions.get(key, (None, None))
-        if at is not start:
+        at, kept = self._reductions.get(key, (None, None))
+        if kept is None or at is not start:
             less = self.bench.fit([self.bench.reduction(fitted, name, self.plain[0], 2 * self.budget.more)])[0]
             self.report(f"without {name}", 1, 1, f"{1e3 * less.point.cost:.2f} mm")
             self._reductions[key] = start, less
-        return less
+            return less
+        return kept
 
     def known_without(self, fitted: Fitted, name: str) -> Fitted | None:
         """Return the model without one of its effects if it was fitted before, None if it was not."""

@@ -86,7 +86,7 @@ def calibrate_baseline(
         best, names, ones = straight, _names(bench, "straight"), ones[: len(straight)]
         free, sizes = (*names, free[-1]), (*ones, sizes[-1])
     bench.early = best
-    if straight is not None or not bench.starts["train"].still.all():
+    if straight is not None or not bench.starts["train"].at_rest.all():
         bench.begin(best, ())
     # Phases of late times are right only after early ones are: the horizon grows. The order of the axes of its joints
     # gives a chain's length a sign.
@@ -212,7 +212,7 @@ def _shaped(bench: Workspace, base: Fitted, job: FitJob) -> FitJob:
 
 def _begin_anew(bench: Workspace, base: Fitted) -> Refinement:
     """Begin trials as a model says, and correct simulations by what finer ones of it change; return that."""
-    if not bench.starts["train"].still.all():
+    if not bench.starts["train"].at_rest.all():
         bench.begin(base.values, base.effects)
     return bench.correct(base)
 

@@ -14,6 +14,7 @@ import numpy as np
 from torchdlo.errors import InputError
 from torchdlo.physics.effects import EFFECTS
 from torchdlo.physics.effects.base import Effect, Param
+from torchdlo.physics.effects.gripper_compliance import GripperCompliance
 from torchdlo.sysid.model.discretisation import Mesh
 from torchdlo.sysid.recordings.recording import Recording
 
@@ -127,7 +128,7 @@ def applicable(name: str, recording: Recording, mesh: Mesh) -> bool:
 def instance(name: str, mesh: Mesh) -> Effect:
     """Return the effect for the rope of a recording."""
     if name == "gripper_compliance":
-        return EFFECTS[name](hinges=mesh.clamp_hinges)
+        return GripperCompliance(hinges=mesh.clamp_hinges)
     return EFFECTS[name]()
 
 

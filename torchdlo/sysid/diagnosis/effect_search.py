@@ -10,6 +10,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -94,7 +95,13 @@ def diagnose(
     if recording.filmed:
         if resume:
             raise InputError(f"{recording.path}: expected no --resume for films, whose diagnosis keeps no journal.")
-        asked = {"budget": budget, "seed": seed, "vertices": vertices, "given": given, "without": without}
+        asked: dict[str, Any] = {
+            "budget": budget,
+            "seed": seed,
+            "vertices": vertices,
+            "given": given,
+            "without": without,
+        }
         most = plan.pick_trials(recording, trials or BUDGETS[budget].trials)
         return diagnose_filmed(most, **asked, callback=callback)
     begun, report = time.perf_counter(), callback or (lambda *_: None)
@@ -346,8 +353,10 @@ class _Search:
         if not tested:
             return None
         # Of those that close nearly as much, the one that fits better.
-        most = max(c.heldout_gain for c in tested)
-        first = min((c for c in tested if c.heldout_gain > most - _NEAR), key=lambda c: fits[c.name].point.cost)
+        most = max(c.heldout_gain or 0.0 for c in tested)
+        first = min(
+            (c for c in tested if (c.heldout_gain or 0.0) > most - _NEAR), key=lambda c: fits[c.name].point.cost
+        )
         return self._candidate(first, fits[first.name], first.reason)
 
     def _candidate(self, candidate: Candidate, fitted: Fitted, against: str) -> BestCandidate:
@@ -402,8 +411,8 @@ class _Search:
 
     def _agreement(self, less: Fitted, more: Fitted) -> Agreement:
         """Return how what the last effect changes agrees with what is left over without it, on the test trials."""
-        sims = (self.bench.prediction(fitted, "test") for fitted in (less, more))
-        return agreement(*sims, self.bench.trials["test"], self.bench.starts["test"].frame_weights)
+        before, after = (self.bench.prediction(fitted, "test") for fitted in (less, more))
+        return agreement(before, after, self.bench.trials["test"], self.bench.starts["test"].frame_weights)
 
     def _chance(self, tests: dict[str, Agreement], looked_at: int) -> dict[str, str]:
         """Return which of the tested effects may explain the test trials by chance, and why that is thought."""

@@ -180,7 +180,7 @@ def refine(pool: Pool, base: Fitted, start: Start, chain: str) -> Refinement:
         for options in ((half, discretisation_correction), (half,), ())
     ]
     sims = dict(pool.simulate(jobs))
-    found = refinement(*(sims[k][0] for k in range(3)), model.numerical_damping, edge)
+    found = refinement(sims[0][0], sims[1][0], sims[2][0], model.numerical_damping, edge)
     return replace(found, noise=marker_noise(pool.recording), links=length)
 
 

@@ -254,6 +254,8 @@ def summary(result: Diagnosis, recording: Recording) -> str:
     if result.verdict == "partial":
         said += f" A part remains that no effect of the library explains.{_best(result)}"
     sure = confidence(result)
+    if sure is None:
+        return said
     return said + f" Confidence: {sure['word']}" + (f" ({'; '.join(sure['doubts'])})." if sure["doubts"] else ".")
 
 

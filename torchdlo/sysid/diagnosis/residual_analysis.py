@@ -135,12 +135,16 @@ def localise(
     tested = {t.name for t in recording.test}
     effects_before = [(a.name, a.share_before, a.centres, a.before) for a in against]
     effects_after = [(a.name, a.share_after, a.centres, a.after) for a in against]
+    maps = [_map([r for r in each if r.name in tested]) for each in (before, after)]
+    shares = [{name: share for name, (share, _) in part.items()} for part in parts]
     return Localisation(
         recording.test[0].time[: min(len(t.time) for t in recording.test)],
         recording.test[0].marker_arclength[free],
-        *(_map([r for r in each if r.name in tested]) for each in (before, after)),
+        maps[0],
+        maps[1],
         against,
-        *({name: share for name, (share, _) in part.items()} for part in parts),
+        shares[0],
+        shares[1],
         describe_residual(recording, before, effects_before, parts[0], floor),
         describe_residual(recording, after, effects_after, parts[1], floor),
     )
@@ -177,10 +181,11 @@ def _derivatives(x: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray, np
         good = np.isfinite(column)
         if good.any():
             filled[:, k] = np.interp(time, time[good], column[good])
-    if window < 3:
-        return (np.where(np.isfinite(x), y.reshape(x.shape), np.nan) for y in (filled, 0 * filled, 0 * filled))
-    found = (savgol_filter(filled, window, 2, deriv=d, delta=step, axis=0) for d in range(3))
-    return tuple(np.where(np.isfinite(x), y.reshape(x.shape), np.nan) for y in found)
+    found = [filled, 0 * filled, 0 * filled]
+    if window >= 3:
+        found = [savgol_filter(filled, window, 2, deriv=d, delta=step, axis=0) for d in range(3)]
+    places, first, second = (np.where(np.isfinite(x), y.reshape(x.shape), np.nan) for y in found)
+    return places, first, second
 
 
 def _bend(x: np.ndarray, arclength: np.ndarray) -> np.ndarray:

@@ -112,16 +112,16 @@ def f_test(doses: np.ndarray) -> float:
     return float(stats.t.sf(t, count - 1))
 
 
-def benjamini_hochberg(p: Sequence[float], looked_at: int) -> np.ndarray:
+def benjamini_hochberg(p: Sequence[float] | np.ndarray, looked_at: int) -> np.ndarray:
     """Return the false discovery rate at which each of some tests counts (N,), of all that were looked at.
 
     Args:
         p: of the tests that were done, shape (N,).
         looked_at: candidates in all; those that were not tested count as tests that found nothing.
     """
-    p = np.asarray(p, float)
-    order = np.argsort(p)
-    rates = p[order] * max(looked_at, len(p)) / np.arange(1, len(p) + 1)
-    found = np.empty(len(p))
+    given = np.asarray(p, float)
+    order = np.argsort(given)
+    rates = given[order] * max(looked_at, len(given)) / np.arange(1, len(given) + 1)
+    found = np.empty(len(given))
     found[order] = np.minimum(np.minimum.accumulate(rates[::-1])[::-1], 1.0)
     return found

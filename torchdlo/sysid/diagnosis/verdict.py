@@ -137,8 +137,9 @@ class Diagnosis:
     @property
     def false_discovery_rates(self) -> dict[str, float]:
         """By effect: the false discovery rate at which it is named, of all candidates that were looked at."""
-        others = [c for each in self.candidates for c in each if c.test is not None and c.name not in self.tests]
-        p = [t.p for t in self.tests.values()] + [c.test.p for c in others]
+        every = (c for each in self.candidates for c in each)
+        p = [t.p for t in self.tests.values()]
+        p += [c.test.p for c in every if c.test is not None and c.name not in self.tests]
         return dict(zip(self.tests, map(float, benjamini_hochberg(p, self.looked_at)), strict=False))
 
     @property
@@ -154,5 +155,5 @@ class Diagnosis:
 
 def finite_trials(*gaps: np.ndarray) -> np.ndarray:
     """Return which trials have finite gaps (B,) [m] with all models, shape (B,); all trials where none have."""
-    finite = np.isfinite(gaps).all(0)
+    finite: np.ndarray = np.isfinite(np.asarray(gaps)).all(0)
     return finite if finite.any() else np.ones_like(finite)

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from torchdlo.errors import InputError
+from torchdlo.physics import tree
 from torchdlo.sysid.diagnosis import error_floor as floors
 from torchdlo.sysid.diagnosis.score_test import Score
 from torchdlo.sysid.estimation.jobs import FitJob, Fitted, SimulationJob
@@ -263,7 +264,7 @@ class Workspace:
         ((_, sims),) = self.pool.simulate([SimulationJob(fitted.effects, rows, "train", start, fitted.options)])
         frame_weights = 1.0 if start.frame_weights is None else start.frame_weights[..., None, None]
         measured = self.pool.local.motion(model, "train").markers
-        step, grid = (frame_weights * np.nan_to_num(e[: len(measured)]) for e in self._finer.unsure)
+        step, grid = (frame_weights * np.nan_to_num(e[: len(measured)]) for e in tree.part(self._finer).unsure)
         errors = (shares[0] * step, shares[1] * grid, *(frame_weights * np.nan_to_num(e) for e in others))
         return drift(look, frame_weights * sims, frame_weights * measured, errors)
 

@@ -174,8 +174,8 @@ class PointEvaluation:
             # The second derivative of the cost is knee^2 / size^3, where Gauss-Newton takes 1 / size.
             weight = np.where(seen.reshape(weight.shape), weight, 0.0)
             flatter = (weight**3 * KNEE**2).sum(-1) / np.maximum(weight.sum(-1), 1e-300)
-            cost = float(_together(of_trial, _LOST * whole))
-            points.append(Point(self.raws[s], cost, gradient, curvature, of_trial, flatter))
+            together = float(_together(of_trial, _LOST * whole))
+            points.append(Point(self.raws[s], together, gradient, curvature, of_trial, flatter))
         return points
 
 

@@ -172,7 +172,7 @@ class _Filmed:
     def __init__(self, views: Sequence[FilmView], step: float, extent: float) -> None:
         self.views, self.step, self.extent = tuple(views), step, extent
         self.nuisances = nuisances(views)
-        self.target = np.empty(0)
+        self.target: np.ndarray = np.empty(0)
         self.priors = slice(0, 0)
 
     def _finish(self, shape: tuple[int, ...], known: list[np.ndarray]) -> None:

@@ -188,7 +188,7 @@ def decode(value: Any, arrays: dict[str, np.ndarray]) -> Any:
     if "kind" in value:
         module, name = value["kind"]
         kind = getattr(importlib.import_module(module), name) if module.split(".")[0] == _PACKAGE else None
-        if not is_dataclass(kind):
+        if not (isinstance(kind, type) and is_dataclass(kind)):
             raise TypeError(f"{module}.{name} is not ours")
         return kind(**{k: decode(v, arrays) for k, v in value["fields"].items()})
     if "dict" in value:

@@ -168,8 +168,11 @@ class Pool:
         self, jobs: Sequence[Job], compute: Callable[[Sequence[Job]], Iterator[tuple[int, Any]]]
     ) -> Iterator[tuple[int, Any]]:
         """Yield what is computed for jobs, or written down."""
-        jobs = [replace(job, options=self._whole(job.options)) for job in jobs]
-        yield from compute(jobs) if self.journal is None else self.journal.through(jobs, compute)
+        whole = [self._completed(job) for job in jobs]
+        yield from compute(whole) if self.journal is None else self.journal.through(whole, compute)
+
+    def _completed(self, job: Any) -> Any:
+        return replace(job, options=self._whole(job.options))
 
     def _fitted(self, jobs: Sequence[FitJob]) -> Iterator[tuple[int, Fitted]]:
         groups = self.groups(jobs)
@@ -229,7 +232,7 @@ class Pool:
         def go_on(n: int, sims: np.ndarray | None) -> Iterator[tuple[int, Any]]:
             """Give a search what it asked for; yield its result, or have the next simulation done."""
             try:
-                asked[n] = job = searches[n].send(sims)
+                asked[n] = job = next(searches[n]) if sims is None else searches[n].send(sims)
                 while not (count := self._parts(job, len(left))):
                     asked[n] = job = searches[n].send(self.local.simulate(job))
             except StopIteration as end:
@@ -251,8 +254,10 @@ class Pool:
                 except BrokenProcessPool:
                     waiting[self._again(task)] = n, p, task
                     continue
-                if all(part is not None for part in parts[n]):
-                    sims = np.concatenate(parts.pop(n))
+                found = [part for part in parts[n] if part is not None]
+                if len(found) == len(parts[n]):
+                    del parts[n]
+                    sims = np.concatenate(found)
                     yield from go_on(n, sims.reshape(len(asked[n].values), -1, *sims.shape[-3:]))
 
     def _parts(self, job: SimulationJob, searches: int) -> int:

@@ -127,7 +127,7 @@ def make_rig(recording: Recording, scale: float = 1.0) -> GripperLimits:
     rates = [_rates(c, dt) for c in centres]
     turns = [_turns(t, g, dt) for t in trials for g in groups if len(g) > 1]
     apart = [np.linalg.norm(c[:, 0] - c[:, -1], axis=-1) for c in centres]
-    first = np.linalg.norm(markers[groups[0]].mean(0) - markers[groups[-1]].mean(0))
+    first = float(np.linalg.norm(markers[groups[0]].mean(0) - markers[groups[-1]].mean(0)))
     return GripperLimits(
         trial,
         markers + shift,
@@ -288,13 +288,15 @@ def motion_trial(rig: GripperLimits, gesture: ExcitationMotion, seconds: float, 
             turn = _clamp_turn(rig, group, gesture, channel, amount)
             for m in group:
                 markers[:, m] = ends[k] + turn.apply(rig.markers[m] - ends[k])
-            for c in np.flatnonzero(np.isin(trial.gripper_marker, group)) if turned is not None else ():
+            if turned is None or trial.gripper_marker is None:
+                continue
+            for c in np.flatnonzero(np.isin(trial.gripper_marker, group)):
                 turned[:, c] = (turn * Rotation.from_quat(turned[:, c], scalar_first=True)).as_quat(scalar_first=True)
     rig_turn = Rotation.from_rotvec([0.0, 0.0, gesture.heading])
     if turned is not None:
-        for c in range(turned.shape[1]):
-            around = rig_turn * Rotation.from_quat(turned[:, c], scalar_first=True)
-            turned[:, c] = around.as_quat(scalar_first=True)
+        for clamp in range(turned.shape[1]):
+            around = rig_turn * Rotation.from_quat(turned[:, clamp], scalar_first=True)
+            turned[:, clamp] = around.as_quat(scalar_first=True)
     return Trial(
         name,
         time,

@@ -82,8 +82,9 @@ class Mesh:
         """
         out = []
         for edge, marker in self.clamps:
-            if trial.gripper_quaternion is not None and marker in trial.gripper_marker:
-                which = int(np.flatnonzero(trial.gripper_marker == marker)[0])
+            where = () if trial.gripper_marker is None else np.flatnonzero(trial.gripper_marker == marker)
+            if trial.gripper_quaternion is not None and len(where):
+                which = int(where[0])
                 quat = torch.as_tensor(trial.gripper_quaternion[:, which])
                 out.append(rotation.rotate(quat, quat.new_tensor([0.0, 1.0, 0.0]).expand(len(quat), 3)).numpy())
                 continue
@@ -105,7 +106,8 @@ def make_mesh(trial: Trial, length: float, vertices: int | None) -> Mesh:
     if length > markers[-1] * 1.01:
         stations.append(length)
     wanted = length / ((vertices or 2 * len(markers)) - 1)
-    parts, at = [], []
+    parts: list[np.ndarray] = []
+    at: list[int] = []
     for a, b in itertools.pairwise(stations):
         at.append(sum(len(p) for p in parts))
         pieces = max(1, round((b - a) / wanted))

@@ -50,7 +50,7 @@ def drive(mesh: Mesh, trial: Trial, substeps: int) -> tuple[np.ndarray, np.ndarr
 
 def _rotations(mesh: Mesh, trial: Trial) -> dict[int, Rotation]:
     """Return the measured rotations by the index of their clamp."""
-    if trial.gripper_quaternion is None:
+    if trial.gripper_quaternion is None or trial.gripper_marker is None:
         return {}
     where = {int(marker): g for g, marker in enumerate(trial.gripper_marker)}
     return {

@@ -52,7 +52,8 @@ class Markers:
             late: whether markers are seen late, too, or at once.
         """
         time = torch.arange(len(frames), dtype=torch.float64) * self.dt
-        track = Track(time, *(torch.stack([f[i] for f in frames], 1) for i in range(3)), self.gripped)
+        pos, first, second = (torch.stack([f[i] for f in frames], 1) for i in range(3))
+        track = Track(time, pos, first, second, self.gripped)
         for each in sorted(scene.effects, key=lambda e: e.last):
             if late or not each.last:
                 track = tree.replace(track, pos=each.observe(track, params.effects.get(each.name, {})))

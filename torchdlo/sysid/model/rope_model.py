@@ -8,7 +8,7 @@ Effects of the library may be added to it.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -25,6 +25,7 @@ from torchdlo.physics.effects.table import Table
 from torchdlo.physics.execution import tracing
 from torchdlo.physics.linalg import rotation
 from torchdlo.physics.linalg.numerics import normalize
+from torchdlo.scene import Control, Params, Rope, Scene, State
 from torchdlo.sysid.diagnosis import effect_library
 from torchdlo.sysid.diagnosis.effect_library import PARAMETERS, Number
 from torchdlo.sysid.model import equilibrium, length_projection
@@ -125,7 +126,7 @@ class RopeModel:
 
         The bending stiffness is the one at which weight bends the rope over a tenth of its length.
         """
-        weight = self.recording.mass * np.linalg.norm(self.recording.gravity) / self.recording.length
+        weight = float(self.recording.mass * np.linalg.norm(self.recording.gravity) / self.recording.length)
         bend = max(weight, 1e-4) * (0.1 * self.recording.length) ** 3
         first = {"bending_stiffness": bend, "twisting_stiffness": 0.7 * bend}
         return np.array([first.get(n.name, n.off) for n in self.numbers], dtype=float)
@@ -154,9 +155,7 @@ class RopeModel:
         """Return whether the grippers' rotation about the rope is measured at every clamp."""
         return all(t.gripper_quaternion is not None for t in self.recording.train)
 
-    def build(
-        self, motion: TrialBatch, start: Start, values: np.ndarray
-    ) -> tuple[scenes.Scene, scenes.Params, scenes.State]:
+    def build(self, motion: TrialBatch, start: Start, values: np.ndarray) -> tuple[Scene, Params, State]:
         """Build scenes, one per row of `values` (N, K), `motion` and `start`; all have N trials.
 
         Markers may be seen late and beside the rope: it begins where they then say that it is.
@@ -176,7 +175,7 @@ class RopeModel:
 
     def _assembled(
         self, motion: TrialBatch, markers: Tensor, speed: Tensor, number: dict[str, Tensor]
-    ) -> tuple[scenes.Scene, scenes.Params, scenes.State]:
+    ) -> tuple[Scene, Params, State]:
         """Build scenes that begin with the rope's axis in places (N, M, 3) and with velocities at the markers."""
         pos, vel = (
             torch.as_tensor(CubicSpline(self.mesh.marker_arclength, x.numpy(), axis=1)(self.arclength))
@@ -185,7 +184,7 @@ class RopeModel:
         held = list(self.held)
         pos[:, held] = motion.held[:, 0]
         vel[:, held] = (motion.held[:, 1] - motion.held[:, 0]) / (self.dt / self.substeps)
-        rope = scenes.Rope(
+        rope = Rope(
             pos,
             radius=self.recording.radius or 0.005,
             mass=self.recording.mass,
@@ -242,11 +241,11 @@ class RopeModel:
             numbers[name] |= {key: torch.stack(part, -1).unsqueeze(-2) for key, part in parts.items()}
         return numbers
 
-    def _rest_shape(self) -> str | Tensor:
+    def _rest_shape(self) -> Literal["straight"] | Tensor:
         """Return the rest shape at the vertices, flattened on its best plane: markers stand off the rope's axis."""
-        if self.rest != "given":
-            return "straight"
         points = self.recording.rest_positions
+        if self.rest != "given" or points is None:
+            return "straight"
         centre = points.mean(0)
         _, _, axes = np.linalg.svd(points - centre)
         flat = (points - centre) @ axes[:2].T
@@ -259,7 +258,7 @@ class RopeModel:
         clamped = edge < len(self.held) and self.held[edge] == edge
         return motion.director[:, 0, 0] if clamped else None
 
-    def _commands(self, scene: scenes.Scene, state: scenes.State, motion: TrialBatch) -> Tensor:
+    def _commands(self, scene: Scene, state: State, motion: TrialBatch) -> Tensor:
         """Return directors of the held edges, shape (N, S, G, 3).
 
         Where the grippers' rotation was not measured, the rope is taken to be without twist at the start.
@@ -273,7 +272,7 @@ class RopeModel:
         angle = rotation.signed_angle(motion.director[:, 0], first, tangent[:, 0])
         return rotation.about(tangent, angle[:, None], motion.director)
 
-    def _measured_lengths(self, params: scenes.Params, number: dict[str, Tensor]) -> scenes.Params:
+    def _measured_lengths(self, params: Params, number: dict[str, Tensor]) -> Params:
         """Put rest lengths as measured along the rope, masses by them, and what hinges at clamps stand for."""
         rods = params.rods
         step = torch.as_tensor(np.diff(self.arclength)).reshape(-1, 1)
@@ -330,7 +329,7 @@ class RopeModel:
             trial = filled % trials
             begin = start.pick(trial if len(start.pos) == trials else filled)
             out[rows] = self._run(motion.pick(trial), begin, values[filled // trials], total)[: len(rows)]
-            if start.discretisation_correction is not None:
+            if begin.discretisation_correction is not None:
                 out[rows] += begin.discretisation_correction[: len(rows), :total]
         return out
 
@@ -340,7 +339,7 @@ class RopeModel:
         params = tree.map(tree.batch_innermost, params)
         director = self._commands(scene, state, motion)
         controls = [
-            scenes.Control(tree.batch_innermost(motion.held[:, k]), tree.batch_innermost(director[:, k]))
+            Control(tree.batch_innermost(motion.held[:, k]), tree.batch_innermost(director[:, k]))
             for k in range((frames - 1) * self.substeps + 1)
         ]
         step = recorded_step(scene, params, state, controls[0])
@@ -358,12 +357,12 @@ class RopeModel:
     def _corrected(
         self,
         step: Callable,
-        scene: scenes.Scene,
-        params: scenes.Params,
-        state: scenes.State,
-        controls: Sequence[scenes.Control],
+        scene: Scene,
+        params: Params,
+        state: State,
+        controls: Sequence[Control],
         motion: TrialBatch,
-    ) -> scenes.State:
+    ) -> State:
         """Return a resting state moved, and set in motion, as the markers say in the first tenth of a second."""
         free = np.setdiff1d(np.arange(self.count), self.gripped)
         frames = min(1 + round(WINDOW / self.dt), motion.markers.shape[1], 1 + (len(controls) - 1) // self.substeps)

@@ -49,11 +49,12 @@ class Start:
     frame_weights: np.ndarray | None = None
     """What errors of frames are multiplied by in fits [1], shape (B, F); 1 if not given."""
 
+    @property
+    def at_rest(self) -> np.ndarray:
+        """`still`, and none where that is not given, (B,) bool."""
+        return np.zeros(len(self.pos), bool) if self.still is None else self.still
+
     def pick(self, rows: np.ndarray) -> Start:
         """Return the starts of these trials."""
-        return Start(
-            *(
-                None if x is None else x[rows]
-                for x in (self.pos, self.vel, self.still, self.discretisation_correction, self.frame_weights)
-            )
-        )
+        others = (self.still, self.discretisation_correction, self.frame_weights)
+        return Start(self.pos[rows], self.vel[rows], *(None if x is None else x[rows] for x in others))

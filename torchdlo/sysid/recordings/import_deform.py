@@ -225,7 +225,7 @@ def _check_nesting(path: Path, content: object, size: int) -> None:
                 raise wrong
 
 
-def _as_positions(path: Path, content: object, size: int) -> np.ndarray:
+def _as_positions(path: Path, content: Any, size: int) -> np.ndarray:
     _check_nesting(path, content, size)
     try:
         array = np.array(content, dtype=float)

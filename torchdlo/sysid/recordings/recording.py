@@ -12,6 +12,7 @@ import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -123,7 +124,9 @@ def load_recording(path: str | Path, *, films: bool = True) -> Recording:
         raise InputError(
             f"{path}: expected markers, found films; this command does not take those yet, calibrate and diagnose do."
         )
-    trials = {split: tuple(_load_trial(f, rope["length"], found) for f in files[split]) for split in files}
+    trials: dict[str, Any] = {
+        split: tuple(_load_trial(f, rope["length"], found) for f in files[split]) for split in files
+    }
     _check_together(path, rope, trials["train"] + trials["test"])
     return Recording(path=path, **rope, **trials)
 

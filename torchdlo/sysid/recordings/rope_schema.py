@@ -90,9 +90,9 @@ def _color(path: Path, value: Any) -> tuple[float, float, float] | None:
     if value is None:
         return None
     rgb = value.get("rgb") if isinstance(value, dict) else value
-    good = isinstance(rgb, list) and len(rgb) == 3
-    good = good and all(isinstance(c, (int, float)) and not isinstance(c, bool) and 0 <= c <= 255 for c in rgb)
-    if not good:
+    rgb = rgb if isinstance(rgb, list) else []
+    good = all(isinstance(c, (int, float)) and not isinstance(c, bool) and 0 <= c <= 255 for c in rgb)
+    if len(rgb) != 3 or not good:
         _refuse(path, "color", "[r, g, b] from 0 to 255", repr(value)[:60])
     return float(rgb[0]), float(rgb[1]), float(rgb[2])
 

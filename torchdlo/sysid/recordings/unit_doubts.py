@@ -45,7 +45,7 @@ def _weight(recording: Recording) -> list[str]:
     if line > _HEAVY:
         dense = "" if volume is None else f" ({recording.mass / volume:.3g} kg/m^3)"
         return [f"mass: {recording.mass:g} kg are {line:.3g} kg a metre{dense}; is it in grams?"]
-    if volume is not None and recording.mass / volume > _DENSE:
+    if volume is not None and recording.radius and recording.mass / volume > _DENSE:
         return [
             f"mass: {recording.mass:g} kg and a radius of {1e3 * recording.radius:g} mm make "
             f"{recording.mass / volume:.3g} kg/m^3, heavier than any metal; is the radius right, and the mass in kg?"

@@ -256,9 +256,8 @@ def _judged(
     ]
     predictions = {trial.name: sims[:, b, : len(trial.time)] for b, trial in enumerate(here.trials)}
     shown = overlays(here, split, sims, np.stack([first, values])[:, numbers:])
-    return _Judged(
-        trials, predictions, shown, [t["name"] for t, calm in zip(trials, here.start.still, strict=True) if not calm]
-    )
+    moving = [trial.name for trial, calm in zip(here.trials, here.start.at_rest, strict=True) if not calm]
+    return _Judged(trials, predictions, shown, moving)
 
 
 def doubts(trials: Sequence[dict[str, Any]], moving: Sequence[str]) -> list[str]:
@@ -281,7 +280,7 @@ def doubts(trials: Sequence[dict[str, Any]], moving: Sequence[str]) -> list[str]
 def _remarks(own: FilmedProblem, values: np.ndarray, low: np.ndarray, high: np.ndarray) -> list[str]:
     """Return what these views cannot test."""
     out = []
-    moving = [t.name for t, calm in zip(own.trials, own.start.still, strict=True) if not calm]
+    moving = [t.name for t, calm in zip(own.trials, own.start.at_rest, strict=True) if not calm]
     if moving:
         out.append(
             f"{', '.join(moving)} begin in motion: shape and velocities there were fitted, too; those of test trials "

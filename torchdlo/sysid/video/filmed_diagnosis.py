@@ -182,7 +182,7 @@ def _floor(base: _Model) -> tuple[ErrorFloor, float]:
     scale = np.mean([0.5 * (v.camera.fx + v.camera.fy) / own.depth(v) for v in own.spines.views])
     parts = []
     values, sims = base.values[None], own.simulate(base.values[None])
-    for wrong in own.discretisation_correction.unsure:
+    for wrong in own.discretisation_correction.unsure if own.discretisation_correction else ():
         moved = np.concatenate([sims, sims + np.nan_to_num(wrong)[None]])
         change = own.spines.changes(moved, np.repeat(values[:, len(own.free) :], 2, 0))
         change = np.where(np.isfinite(own.spines.target), change[1] - change[0], np.nan)
@@ -293,7 +293,7 @@ def _tangents(own: FilmedProblem, here: Fit, seen: np.ndarray, weight: np.ndarra
     for b in range(len(seen)):
         only = np.zeros_like(weight)
         only[b] = weight[b]
-        columns += [] if own.start.still[b] else [(here.jacobian[:, count + k] * only)[seen] for k in range(moving)]
+        columns += [] if own.start.at_rest[b] else [(here.jacobian[:, count + k] * only)[seen] for k in range(moving)]
     jacobian = np.stack(columns, 1).astype(float)
     priors = np.zeros((jacobian.shape[1], jacobian.shape[1]))
     per_trial = float(seen.sum()) / len(seen)

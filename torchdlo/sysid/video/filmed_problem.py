@@ -153,7 +153,7 @@ class FilmedProblem:
         pos, vel = (p.reshape(-1, *self.start.pos.shape[1:]) for p in parts)
         known = self.start.discretisation_correction
         more = None if known is None else np.tile(known, (len(offsets), 1, 1, 1))
-        return Start(pos, vel, np.tile(self.start.still, len(offsets)), more)
+        return Start(pos, vel, np.tile(self.start.at_rest, len(offsets)), more)
 
     def frames(self, seconds: float | None) -> int | None:
         """Return how many frames have to be simulated for readings of the first seconds."""
@@ -268,13 +268,13 @@ def begin_from_balance(own: FilmedProblem, numbers: np.ndarray) -> None:
     model, plain = own.model, start_of(own.model, own.trials, own.spines.views)
     spots = np.setdiff1d(np.arange(model.count), model.gripped)
     shapes = equilibrium.smooth_shapes(model.mesh, spots)
-    if plain.still.all() or shapes is None:
+    if plain.at_rest.all() or shapes is None:
         own.start, own.offset = plain, np.zeros((len(own.trials), 0))
         return
     own.shapes = shapes[list(model.marker_vertex)] * np.sqrt(len(spots))
     resting = Start(plain.pos, 0 * plain.vel, np.ones(len(plain.pos), bool))
     balance = model.simulate(own.motion, resting, numbers[None], frames=1)[0, :, 0]
-    sound = np.isfinite(balance).all((1, 2))[:, None, None] & ~plain.still[:, None, None]
+    sound = np.isfinite(balance).all((1, 2))[:, None, None] & ~plain.at_rest[:, None, None]
     own.start = replace(plain, pos=np.where(sound, balance, plain.pos))
     own.offset = np.zeros((len(own.trials), 6 * own.shapes.shape[1]))
 

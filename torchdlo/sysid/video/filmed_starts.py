@@ -54,7 +54,7 @@ def fit_starts(
     own.offset = own.offset.copy()
     now = look(own, raw, own.offset, seconds, fixed=True)
     count = own.offset.shape[1]
-    damping, rows = np.full(len(now.costs), 1e-2), np.flatnonzero(np.isfinite(now.costs) & ~own.start.still)
+    damping, rows = np.full(len(now.costs), 1e-2), np.flatnonzero(np.isfinite(now.costs) & ~own.start.at_rest)
     part = own
     for _ in range(passes if count else 0):
         if not len(rows):
@@ -108,7 +108,7 @@ def refine_start(own: FilmedProblem, values: np.ndarray, passes: int = 8, *, sea
 def restart(own: FilmedProblem, found: Fit, iterations: int) -> Fit:
     """Return the fit with the starts of lost trials anew, and all of it improved, where that is better."""
     for _ in range(_RESTARTS if own.offset.shape[1] else 0):
-        lost = np.flatnonzero(~own.start.still & ~(found.costs < _LOST))
+        lost = np.flatnonzero(~own.start.at_rest & ~(found.costs < _LOST))
         if not len(lost):
             break
         part = own.picked(lost)
@@ -199,7 +199,7 @@ def _least(found: Sequence[tuple[Fit, np.ndarray, Start]]) -> float:
 def _scout_resting(own: FilmedProblem, starts: int, rng: np.random.Generator, report: Callback) -> np.ndarray:
     """Fit the rope of trials that begin at rest first, cameras being where they are said to be."""
     whole, count = own.space, len(own.free)
-    space = ParameterSpace(whole.names[:count], whole.params[:count], whole.sizes[:count])
+    space = ParameterSpace(whole.names[:count], whole.params[:count], whole.sizes and whole.sizes[:count])
     zero, lasts, looks = np.zeros(len(whole.names) - count), own.lasts, 3
     raws = np.repeat(space.to_raw(own.fixed[list(own.free)])[None], starts, 0)
     for k in range(min(count, 3)):

@@ -46,7 +46,8 @@ def views_of(
                 f"{recording.path / trial.name}.npz: expected films of the cameras {', '.join(names)} as "
                 f"{trials[0].name} has, found {', '.join(f.camera.name for f in trial.films)}."
             )
-    views, notes, done, total = [], [], 0, len(trials) * len(names)
+    notes: list[str] = []
+    views, done, total = [], 0, len(trials) * len(names)
     for k, name in enumerate(names):
         parts = []
         for trial in trials:
