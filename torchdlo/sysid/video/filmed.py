@@ -145,7 +145,8 @@ def tested(
         here.offset = coarse.offset
     gate(here, values)
     add_correction(here, values)
-    fit_starts(here, own.space.to_raw(values), 8, seconds=START_WINDOW)
+    if here.offset.shape[1]:
+        fit_starts(here, own.space.to_raw(values), 8, seconds=START_WINDOW)
     return here, said
 
 
@@ -169,7 +170,7 @@ def _problem(
 def _fitted(own: FilmedProblem, raw: np.ndarray, iterations: int, report: Callback) -> Fit:
     """Return the best fit of all trials, without wrong frames and with what finer simulations change."""
     stage, values = f"fitting {len(own.trials)} filmed trials", own.space.to_values(raw)
-    if not own.offset.any():
+    if own.offset.shape[1] and not own.offset.any():
         # A scout knows the starts; a model that begins without one has to find them.
         begin_from_balance(own, own.full(values[None])[0])
         refine_start(own, values)
