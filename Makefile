@@ -30,6 +30,7 @@ bench: $(FILLED)
 lint: $(FILLED)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+	$(BIN)/mypy torchdlo
 
 # LeRobot excludes our version of torch, so it gets an environment of its own: 5.4 GB, Python 3.12. Not a part of CI.
 LEROBOT_PYTHON ?= python3.12

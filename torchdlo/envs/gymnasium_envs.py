@@ -76,7 +76,7 @@ class GymnasiumEnv(gymnasium.Env):
         """Take an action; see `gymnasium.Env.step`."""
         found = _stepped(self._batch, np.asarray(action)[None])
         flags = (bool(found[name]) for name in ("terminated", "truncated"))
-        return _row(_observed(found)), float(found["reward"]), *flags, _told(found)  # type: ignore[return-value]
+        return _row(_observed(found)), float(found["reward"]), *flags, _told(found)
 
     def close(self) -> None:
         """Let go of the scene."""

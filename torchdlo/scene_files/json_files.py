@@ -148,7 +148,8 @@ def _effects(given: Any, where: str, place: str) -> dict[str, dict[str, Any]]:
         if not isinstance(numbers, dict):
             raise _wrong(where, here, "an object with its parameters, {} for the defaults", numbers)
         params = EFFECTS[name].params
-        choices = {f.name for f in dataclasses.fields(EFFECTS[name])}
+        own: Any = EFFECTS[name]
+        choices = {f.name for f in dataclasses.fields(own)}
         for key, value in numbers.items():
             if key not in params and key not in choices:
                 known = [*params, *sorted(choices)]

@@ -78,6 +78,10 @@ class Frames:
     """What went wrong, "" if nothing did; frames end before it."""
 
 
+_MOVING = ("time", "pos", "twist", "force", "body_pos", "body_quat", "material_points")
+"""What `_seen` returns, by the names of `Frames`."""
+
+
 def _seen(state: scenes.State) -> list[np.ndarray]:
     rods, none = state.rods, state.rods.pos.new_zeros(0, 4)
     bodies = (state.bodies.pos, state.bodies.quat) if state.bodies else (none[:, :3], none)
@@ -181,7 +185,8 @@ def run(
                 break
     moving = (np.stack(parts) for parts in zip(*kept, strict=True))
     whole: dict[str, Any] = {**_looks(made, description), "interrupted": interrupted, "problem": problem}
-    return Frames(*moving, **whole)
+    whole |= zip(_MOVING, moving, strict=True)
+    return Frames(**whole)
 
 
 def save_frames(frames: Frames, path: Path, description: scene_files.SceneDescription | None = None) -> None:

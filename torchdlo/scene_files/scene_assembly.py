@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -104,7 +105,7 @@ def assemble(description: SceneDescription, *, folder: str | Path = ".") -> Simu
     meshes = {k: _mesh(b, k, folder) for k, b in enumerate(d.bodies) if b.shape == "mesh"}
     bodies = [_body(b, k, meshes.get(k)) for k, b in enumerate(d.bodies)]
     static = {name: getattr(d, name) for name in _STEPPING}
-    held = {f"prescribed_{part}": _slots(d, counts, part) for part in ("vertices", "edges")}
+    held: dict[str, Any] = {f"prescribed_{part}": _slots(d, counts, part) for part in ("vertices", "edges")}
     _check_holds(d)
     armed = motion.arms(d, folder)
     for arm in armed:

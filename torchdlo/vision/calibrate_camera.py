@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from torchdlo.errors import InputError
-from torchdlo.vision.camera import Camera
+from torchdlo.vision.camera import Camera, triple
 from torchdlo.vision.video_file import read_video
 
 __all__ = ["Board", "Calibrated", "board_picture", "calibrate_camera", "error_picture"]
@@ -126,8 +126,8 @@ def calibrate_camera(
         float(matrix[1, 1]),
         float(matrix[0, 2]),
         float(matrix[1, 2]),
-        tuple(tuple(map(float, row)) for row in rotation),
-        tuple(map(float, shifts[0].ravel())),
+        tuple(map(triple, rotation)),
+        triple(shifts[0].ravel()),
         tuple(map(float, lens.ravel()[:5])),
         fps,
     )

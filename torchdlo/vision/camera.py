@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, NoReturn
@@ -216,15 +216,21 @@ def _camera(path: Path, k: int, entry: Any) -> Camera:
     rotation = entry["rotation"]
     if not isinstance(rotation, list) or len(rotation) != 3:
         _refuse(path, f"{where}.rotation", "3 rows of 3 numbers", repr(rotation)[:60])
-    rows = tuple(tuple(_row(path, f"{where}.rotation", row, 3)) for row in rotation)
+    rows = tuple(triple(_row(path, f"{where}.rotation", row, 3)) for row in rotation)
     turn = torch.tensor(rows, dtype=torch.float64)
     if float((turn @ turn.T - torch.eye(3, dtype=turn.dtype)).abs().max()) > 1e-3 or float(torch.linalg.det(turn)) < 0:
         _refuse(path, f"{where}.rotation", "a rotation matrix, world to camera", "one that is not a rotation")
-    shift = tuple(_row(path, f"{where}.translation", entry["translation"], 3))
+    shift = triple(_row(path, f"{where}.translation", entry["translation"], 3))
     fps = _number(path, f"{where}.fps", entry.get("fps", 30.0), 0.0)
     start = _number(path, f"{where}.start", entry.get("start", 0.0), -math.inf)
     fx, fy, cx, cy = numbers
     return Camera(name, int(sizes[0]), int(sizes[1]), fx, fy, cx, cy, rows, shift, distortion, fps, start)
+
+
+def triple(numbers: Iterable[float]) -> tuple[float, float, float]:
+    """Return three numbers as a tuple."""
+    x, y, z = map(float, numbers)
+    return x, y, z
 
 
 def _row(path: Path, where: str, value: Any, count: int | None) -> list[float]:

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from torchdlo.errors import InputError
-from torchdlo.vision.camera import Camera
+from torchdlo.vision.camera import Camera, triple
 
 __all__ = ["Film", "FilmLook", "film", "off_camera", "rope_coverage"]
 
@@ -141,7 +141,8 @@ def _texture(camera: Camera, look: FilmLook, rng: np.random.Generator) -> np.nda
     rough = np.zeros((camera.height, camera.width), np.float32)
     for cells in (4, 12, 40, 120):
         grid = rng.normal(size=(cells * camera.height // camera.width + 2, cells)).astype(np.float32)
-        rough += cv2.resize(grid, (camera.width, camera.height), interpolation=cv2.INTER_CUBIC) * 5 / (1 + cells / 20)
+        fine = np.asarray(cv2.resize(grid, (camera.width, camera.height), interpolation=cv2.INTER_CUBIC), np.float32)
+        rough += fine * 5 / (1 + cells / 20)
     return np.array(look.background, np.float32) + rough[..., None]
 
 
@@ -263,8 +264,7 @@ def off_camera(
     translation = turn @ np.array(camera.translation) + rng.uniform(-metres, metres, 3)
     factor = float(np.exp(rng.uniform(-zoom, zoom)))
     start = camera.start + float(rng.uniform(-0.5, 0.5)) / camera.fps
-    rows = tuple(tuple(map(float, row)) for row in rotation)
-    shift = tuple(map(float, translation))
+    rows, shift = tuple(map(triple, rotation)), triple(translation)
     return replace(camera, rotation=rows, translation=shift, fx=camera.fx * factor, fy=camera.fy * factor, start=start)
 
 

@@ -162,7 +162,7 @@ def _slip(pictures: np.ndarray, masks: np.ndarray) -> tuple[int, float] | None:
         small = cv2.resize(pictures[k], None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
         return cv2.cvtColor(small, cv2.COLOR_RGB2GRAY).astype(np.float32)
 
-    still = ~cv2.dilate(masks.any(0).astype(np.uint8), np.ones((25, 25), np.uint8)).astype(bool)
+    still = ~cv2.dilate(np.asarray(masks.any(0), np.uint8), np.ones((25, 25), np.uint8)).astype(bool)
     still = still[::2, ::2][: grey(0).shape[0], : grey(0).shape[1]]
     if still.mean() < 0.2:
         return None

@@ -39,7 +39,7 @@ class SegmentServer(ThreadingHTTPServer):
         super().__init__(listening.getsockname(), _Handler, bind_and_activate=False)
         self.socket.close()
         self.socket, self.server_address = listening, listening.getsockname()
-        self.server_name, self.server_port = self.server_address[:2]
+        self.server_name, self.server_port = listening.getsockname()[:2]
         self.guard, self.dropped = Guard.of(listening), drop_log("segment")
         self.pictures, self.ranges, self.out = pictures, ranges, out
         self.page = resources.files("torchdlo.vision").joinpath("segment_page.html").read_bytes()

@@ -117,7 +117,7 @@ def _read(data: DataSet, encoder: str, folder: Path, callback: Callable[[str, in
             f"{data.path}: has no column {', '.join(sorted(missing))}; make it with torchdlo dataset make."
         )
     first, last = np.zeros((2, count), np.int64)
-    pictures = {}
+    pictures: dict[str, np.ndarray] = {}
     for camera in data.cameras:
         height, width, _ = data.features[camera]["shape"]
         file = folder / f"{camera}.u8"

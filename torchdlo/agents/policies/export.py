@@ -62,7 +62,7 @@ def _onnx(acts: nn.Module, example: tuple[Tensor, ...], written: io.BytesIO) -> 
     torch.onnx.export(
         acts,
         example,
-        written,
+        written,  # type: ignore[arg-type]  # without dynamo, files in memory are taken, too
         input_names=list(_INPUTS),
         output_names=["action"],
         dynamic_axes={name: {0: "episodes"} for name in (*_INPUTS, "action")},

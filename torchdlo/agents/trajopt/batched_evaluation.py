@@ -63,7 +63,7 @@ def evaluate_batched(
                 if len(waiting) < max(1, live):
                     continue
                 if over is None:
-                    for one in (problem, stand_in):
+                    for one in filter(None, (problem, stand_in)):
                         _play(one, [wish for wish in waiting if wish.problem is one], rooms)
                     pulse()
             except BaseException as error:  # threads that wait have to hear of it, whatever it is

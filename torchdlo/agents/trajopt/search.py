@@ -17,7 +17,7 @@ from torchdlo import work_budget
 from torchdlo.agents.trajopt.cmaes import cmaes, import_cma
 from torchdlo.agents.trajopt.gradient_descent import descent
 from torchdlo.agents.trajopt.hybrid import hybrid
-from torchdlo.agents.trajopt.problem import Encoding, Evaluation, Problem
+from torchdlo.agents.trajopt.problem import Encoding, Evaluation, Playable, Problem
 from torchdlo.agents.trajopt.proposals import Ask, Search, SearchPlan, Told, search_surrogate
 from torchdlo.agents.trajopt.search_journal import SearchJournal
 from torchdlo.errors import InputError
@@ -183,7 +183,7 @@ def optimize(
             scale = robust.scale((k + 1) / plan.iterations) if robust else 0.0
             on_surrogate = k < plan.surrogates
             last = k + 1 == plan.iterations  # nothing is told of it
-            told = player.batch(ask, scale, stand_in if on_surrogate else problem, gradients=not last)
+            told = player.batch(ask, scale, tree.part(stand_in) if on_surrogate else problem, gradients=not last)
             if k == plan.surrogates > 0:
                 best.clear()  # what did well in a surrogate task has to do so in earnest
                 player.max_return = float(told.returns.max())
@@ -318,10 +318,10 @@ class _Player:
         self.done, self.seconds, self.blind, self.max_return = 0, 0.0, 0, -math.inf
         self._copies = settings.robust.copies if settings.robust else 1
 
-    def _worlds(self, copies: int, scale: float, number: int) -> Problem:
+    def _worlds(self, copies: int, scale: float, number: int) -> Playable:
         return self.problem.varied(copies, scale, self.settings.seed * 1_000_003 + number)
 
-    def batch(self, ask: Ask, scale: float, problem: Problem, gradients: bool) -> Told:
+    def batch(self, ask: Ask, scale: float, problem: Playable, gradients: bool) -> Told:
         """Play what is asked for in a problem or its surrogate task, and what needs gradients once more if not all
         do."""
         if self.settings.robust:
@@ -333,7 +333,7 @@ class _Player:
         gradient[rows] = self._told(problem, replace(ask, points=ask.points[rows]), True, again=True).gradient
         return replace(told, gradient=gradient)
 
-    def _told(self, problem: Problem, ask: Ask, with_gradient: bool, again: bool = False) -> Told:
+    def _told(self, problem: Playable, ask: Ask, with_gradient: bool, again: bool = False) -> Told:
         """Play trajectories in chunks."""
         room = max(1, self.settings.chunk // self._copies)
         parts = [self._chunk(problem, ask.encoding, x, with_gradient, again) for x in ask.points.split(room)]
@@ -347,7 +347,7 @@ class _Player:
         return Told(returns, loss, short.nan_to_num(), success, failed, torch.where(good[:, None], gradient, 0.0))
 
     def _chunk(
-        self, problem: Problem, encoding: Encoding, points: Tensor, with_gradient: bool, again: bool
+        self, problem: Playable, encoding: Encoding, points: Tensor, with_gradient: bool, again: bool
     ) -> tuple[Tensor, ...]:
         names = ("returns", "loss", "terminal_cost", "success", "failed", "slope")
         kept = self.journal.recall(points)
@@ -378,7 +378,7 @@ class _Player:
         return sorted(seen, key=lambda f: f.rank, reverse=True)
 
 
-def _play(problem: Problem, encoding: Encoding, points: Tensor, with_gradient: bool) -> tuple[Tensor, ...]:
+def _play(problem: Playable, encoding: Encoding, points: Tensor, with_gradient: bool) -> tuple[Tensor, ...]:
     """Return returns, losses, successes, failures and gradients, on the CPU."""
     x = points.detach().clone().requires_grad_(with_gradient)
     with torch.set_grad_enabled(with_gradient):

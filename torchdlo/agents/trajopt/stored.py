@@ -85,7 +85,9 @@ def pack_searches(folder: str | Path, archive: str | Path) -> int:
             | {"return": result["return"], "success": result["success"]}
         )
     # Text is kept as bytes of UTF-8: an array of characters would take four bytes for each.
-    packed = {k: np.frombuffer(str(v).encode(), np.uint8) if v.dtype.kind == "U" else v for k, v in arrays.items()}
+    packed: dict[str, Any] = {
+        k: np.frombuffer(str(v).encode(), np.uint8) if v.dtype.kind == "U" else v for k, v in arrays.items()
+    }
     with replace_atomically(Path(archive)) as temporary:
         np.savez_compressed(temporary, index=np.frombuffer(json.dumps(index).encode(), np.uint8), **packed)
     return len(index)

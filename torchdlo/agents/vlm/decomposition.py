@@ -267,6 +267,7 @@ class _Run:
 class _Part(TaskProblem):
     """The problem of a step, which remembers what it played alone."""
 
+    task: SubTask
     _alone: dict[bytes, tuple[episode.EpisodeResult, list[episode.EpisodeState]]] = field(default_factory=dict)
 
     def played(self, actions: Tensor) -> tuple[episode.EpisodeResult, list[episode.EpisodeState]]:

@@ -84,13 +84,16 @@ def step_models(hands: int) -> tuple[type[TaskPlan], type[Update]]:
     way = Annotated[list[Annotated[list[Coordinate], Field(min_length=3, max_length=3)]], Field(max_length=20)]
     ways: dict[str, Any] = {f"robot_{k + 1}": (way | None, None) for k in range(hands)}
     stage_waypoints = create_model("Waypoints", __base__=Strict, **ways)
-    step = create_model("Step", __base__=Step, grasps=(robots, ...), waypoints=(stage_waypoints | None, None))
+    parts: dict[str, Any] = {"grasps": (robots, ...), "waypoints": (stage_waypoints | None, None)}
+    step = create_model("Step", __base__=Step, **parts)
 
     def listed(cls: Any, content: Any) -> Any:
         # The published form is the bare list of steps.
         return {"steps": content} if isinstance(content, list) else content
 
-    validators: dict[str, Any] = {"listed": model_validator(mode="before")(classmethod(listed))}
+    # Pydantic takes class methods, as its documentation has them; its types do not say so.
+    before = model_validator(mode="before")(classmethod(listed))  # type: ignore[arg-type]
+    validators: dict[str, Any] = {"listed": before}
     steps = Annotated[list[step], Field(min_length=1, max_length=STEPS)]  # type: ignore[valid-type]
     plan = create_model("Plan", __base__=TaskPlan, __validators__=validators, steps=(steps, ...))
     rest = Annotated[list[step], Field(max_length=STEPS)]  # type: ignore[valid-type]

@@ -18,6 +18,7 @@ import math
 import torch
 from torch import Tensor
 
+from torchdlo.physics import tree
 from torchdlo.physics.linalg.numerics import added, dot, safe_norm
 
 SIZES: dict[str, tuple[str, ...]] = {
@@ -156,7 +157,7 @@ def _plane(size: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
     return p[..., 2:], p.new_tensor([0.0, 0.0, 1.0]).expand_as(p)
 
 
-def _mesh(size: Tensor, p: Tensor, grid: Tensor, cells: tuple[int, int, int]) -> tuple[Tensor, Tensor]:
+def _mesh(size: Tensor, p: Tensor, grid: Tensor, cells: tuple[int, ...]) -> tuple[Tensor, Tensor]:
     """Interpolate a grid of distances trilinearly; beyond the grid, go on from the surface nearest to its border."""
     count = p.new_tensor(cells)
     inside = torch.maximum(torch.minimum(p, size), -size)
@@ -212,7 +213,7 @@ def probe(
         cells: numbers of cells in x, y and z.
     """
     if shape == "mesh":
-        return _mesh(size, points, grid, cells)
+        return _mesh(size, points, tree.part(grid), cells)
     return _PROBES[shape](size, points)
 
 

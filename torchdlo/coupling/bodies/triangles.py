@@ -69,7 +69,7 @@ def triangle_distances(points: Tensor, triangles: Tensor) -> Tensor:
     return torch.where(inside, height.square() / area.clamp(min=1e-300), nearest.clamp(min=0.0)).sqrt()
 
 
-def grid_distances(axes: tuple[Tensor, Tensor, Tensor], triangles: Tensor) -> Tensor:
+def grid_distances(axes: tuple[Tensor, ...], triangles: Tensor) -> Tensor:
     """Return unsigned distances [m] of the nodes of a grid from triangles, shape (X, Y, Z).
 
     Args:
@@ -98,7 +98,7 @@ def grid_distances(axes: tuple[Tensor, Tensor, Tensor], triangles: Tensor) -> Te
     return out
 
 
-def _crossings(axes: tuple[Tensor, Tensor, Tensor], triangles: Tensor, shift: float) -> Tensor:
+def _crossings(axes: tuple[Tensor, ...], triangles: Tensor, shift: float) -> Tensor:
     """Return how often lines along x, near the nodes, leave less enter the surface beyond each node, (X, Y, Z)."""
     x, y, z = axes
     step = x[1] - x[0]
@@ -127,7 +127,7 @@ def _crossings(axes: tuple[Tensor, Tensor, Tensor], triangles: Tensor, shift: fl
     return beyond.T.reshape(len(x) + 1, len(y), len(z))
 
 
-def grid_inside(axes: tuple[Tensor, Tensor, Tensor], triangles: Tensor) -> Tensor:
+def grid_inside(axes: tuple[Tensor, ...], triangles: Tensor) -> Tensor:
     """Return which nodes of a grid lie inside a closed, outwards oriented surface, bool, shape (X, Y, Z).
 
     Nodes within overlapping parts of a surface count as inside (winding number above zero).

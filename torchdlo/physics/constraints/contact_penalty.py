@@ -197,7 +197,7 @@ def maps(touch: Touch) -> tuple[Tensor, Tensor, Tensor]:
 def feel(
     topology: Topology,
     touch: Touch,
-    linear: tuple[Tensor, Tensor, Tensor],
+    linear: tuple[Tensor, ...],
     firm: Tensor,
     y: Tensor,
     q: Tensor,
@@ -262,7 +262,7 @@ def _gradient(n: Tensor, mu: Tensor, parts: tuple[Tensor, ...], exact: bool) -> 
 
 
 def gradients(
-    topology: Topology, touch: Touch, linear: tuple[Tensor, Tensor, Tensor], felt: Felt, exact: bool
+    topology: Topology, touch: Touch, linear: tuple[Tensor, ...], felt: Felt, exact: bool
 ) -> ContactGradients:
     """Return how that falls; without the turning of friction unless `exact`, which is safer far from the solution."""
     of = touch.of

@@ -88,6 +88,13 @@ class Param:
         """How many components it has."""
         return len(self.default) if isinstance(self.default, tuple) else 1
 
+    @property
+    def scalar(self) -> float:
+        """The default of a parameter that has one component."""
+        if isinstance(self.default, tuple):
+            raise ValueError(f"parameter: its default {self.default} has several components; look at `default`.")
+        return self.default
+
 
 _HELD = 0.1
 """Share of its mobility with which a held vertex counts in `PredictedMotion.give`."""

@@ -123,7 +123,7 @@ class Touching:
             most = dot(turn, turn).amax(-2, keepdim=True).sqrt()
             short = (1 / most.clamp(min=1e-9)).clamp(max=1.0)
             sizes = [inertia.vertex * y, scale * system.force, felt.force, now.impulse * along_start]
-            if pairs is not None:
+            if isinstance(between, Tensor):
                 sizes.append(between)
             # Far from contact and loads, what is left is small beside the momentum.
             carried = 1e-3 * (system.moved - self.origin) + 1e-9 * lengths.rest

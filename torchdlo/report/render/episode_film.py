@@ -82,7 +82,7 @@ def _frames(
 ) -> Frames:
     kept = {name: torch.cat([frame[name] for frame in seen]) for name in seen[0]}
     joints = kept.pop("joints")
-    looks = appearance(made.scene, made.params, surfaces(made.scene, made.params))
+    looks: dict[str, Any] = appearance(made.scene, made.params, surfaces(made.scene, made.params))
     moving: dict[str, Any] = {name: value.numpy() for name, value in kept.items()}
     if arms:
         shapes, pos, quat = _links(task, joints)

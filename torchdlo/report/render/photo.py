@@ -12,10 +12,12 @@ import subprocess
 import sys
 import tempfile
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from torchdlo.errors import InputError
+from torchdlo.physics import tree
 from torchdlo.report.render.picture import ANGLE, camera_of
 from torchdlo.report.render.run_surfaces import COLORS, DrawnSurface, bounds, pieces, spacing
 from torchdlo.scene_files.run import Frames
@@ -54,7 +56,8 @@ _CHILD = "torchdlo.report.render.photo_child"
 
 
 def _rgb(color: str) -> np.ndarray:
-    return np.array(linear(tuple(int(color[k : k + 2], 16) / 255 for k in (1, 3, 5))))
+    red, green, blue = (int(color[k : k + 2], 16) / 255 for k in (1, 3, 5))
+    return np.asarray(linear((red, green, blue)))
 
 
 def _rope(frames: Frames, piece: DrawnSurface, k: int) -> dict[str, np.ndarray]:
@@ -111,12 +114,12 @@ class Photo:
 
     def image(self, k: int, note: str = "") -> np.ndarray:
         """Return frame k, 8 bits of red, green and blue, shape (height, width, 3); `note` is left out."""
-        frames, given = self.frames, dict[str, np.ndarray]()
+        frames, given = self.frames, dict[str, Any]()
         for number, piece in enumerate(self._pieces):
             if piece.kind == "rope":
                 part = _rope(frames, piece, k)
             else:
-                made = smoothed(piece.corners, piece.faces)
+                made = smoothed(tree.part(piece.corners), piece.faces)
                 pos, turn = piece.pose(frames, k)
                 part = {
                     "vertices": made.vertices @ turn.T + pos,

@@ -137,7 +137,8 @@ def floor_shadow(
     solids = [p for p in pieces if p.kind == "weight" or (p.kind == "body" and p.slots[0] not in planes)]
     ropes = [p for p in pieces if p.kind == "rope"]
     made = tuple(
-        vision.Piece(smoothed(p.corners, p.faces), vision.BODY, "bodies", frame=1 + k) for k, p in enumerate(solids)
+        vision.Piece(smoothed(tree.part(p.corners), p.faces), vision.BODY, "bodies", frame=1 + k)
+        for k, p in enumerate(solids)
     )
     grains = frames.material_points[:, :: max(1, frames.material_points.shape[1] // 20_000)]
     slots = np.concatenate([np.zeros(0, int), *(p.slots for p in ropes)])

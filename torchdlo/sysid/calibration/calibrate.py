@@ -148,13 +148,13 @@ def calibrate(
                 for improved in _fit(job, starts, iterations, np.random.default_rng(seed), memory, report):
                     if best.point is None or best is improved or improved.cost < best.cost:
                         best = improved
-            before = _before(best)  # refining corrects what the pool simulates from then on
-            best = _refined(best, iterations, vertices, report) if refined else best
+            before = _before(tree.part(best))  # refining corrects what the pool simulates from then on
+            best = _refined(tree.part(best), iterations, vertices, report) if refined else best
         except KeyboardInterrupt:
             if best is None or (best.point is None and not _settled(best)):
                 raise
             interrupted = True
-        return _judge(best, before, seed, interrupted, begun, report)
+        return _judge(tree.part(best), before, seed, interrupted, begun, report)
 
 
 def _job(pool: Pool, rest: str, vertices: int | None, given: ModelFile | None) -> _Job:
@@ -396,6 +396,7 @@ def _judge(
     least, most = (np.array([getattr(p, end) for p in job.space.params]) for end in ("low", "high"))
     turns = np.array([p.periodic for p in job.space.params])
     low, high = (np.where(turns, end, np.clip(end, least, most)) for end in ends)
+    errors: dict[str, Any] = evaluation.errors(recording, after)
     return Calibration(
         parameters={
             name: {"value": float(v), "low": float(min(a, b)), "high": float(max(a, b)), "unit": param.unit}
@@ -403,7 +404,7 @@ def _judge(
                 job.space.names, job.space.params, job.values[job.columns], low, high, strict=True
             )
         },
-        **evaluation.errors(recording, after),
+        **errors,
         before=evaluation.errors(recording, before),
         baselines=evaluation.trivial_errors(recording),
         per_trial=evaluation.by_trial(recording, before, after),

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from torchdlo.errors import InputError
+from torchdlo.physics import tree
 from torchdlo.sysid.diagnosis import baseline as baselines
 from torchdlo.sysid.diagnosis import budget as plan
 from torchdlo.sysid.diagnosis import clamp_models, effect_library, selection
@@ -363,9 +364,8 @@ class _Search:
         """Return a candidate that is not named, with its numbers and what speaks against it."""
         numbers = dict(zip(fitted.space.names, fitted.space.to_values(fitted.point.raw), strict=True))
         own = {k.partition(".")[2]: float(v) for k, v in numbers.items() if k.split(".")[0] == candidate.name}
-        return BestCandidate(
-            candidate.name, own, candidate.gain or 0.0, candidate.heldout_gain or 0.0, against, candidate.test
-        )
+        gains = candidate.gain or 0.0, candidate.heldout_gain or 0.0
+        return BestCandidate(candidate.name, own, *gains, against, tree.part(candidate.test))
 
     def _misleading(self, fits: Sequence[Fitted]) -> list[MisleadingTrial]:
         """Return the train trials that none of these models follows, besides those that are known already."""
@@ -402,7 +402,7 @@ class _Search:
 
     def _refused(self, rival: Fitted, fitted: Fitted) -> str | None:
         """Return why a fit is no better than its rival, None if it is."""
-        train, test = (tuple(self.bench.gaps(f, split) for f in (rival, fitted)) for split in ("train", "test"))
+        train, test = ((self.bench.gaps(rival, split), self.bench.gaps(fitted, split)) for split in ("train", "test"))
         enough = all(self.revision.matters(rival, fitted, split) for split in ("train", "test"))
         why = selection.refused(train, test, self.bench.floor.noise, enough)
         if why is not None:
@@ -466,7 +466,11 @@ class _Search:
         self.bench.predict([*rivals.values(), final])
         tests = {name: self._agreement(rival, final) for name, rival in rivals.items()}
         limit = least_gap(gap_rms(self.bench.gaps(final, "test")), self.bench.floor.noise, self.bench.level, PAYS)
-        said = [*baselines.baseline_notes(self.baseline), *clamp_models.clamp_notes(model, final), *self.bench.notes()]
+        said = [
+            *baselines.baseline_notes(tree.part(self.baseline)),
+            *clamp_models.clamp_notes(model, final),
+            *self.bench.notes(),
+        ]
         predictions = {
             when: {t.name: sim[: len(t.time)] for sim, t in zip(sims, trials["all"], strict=True)}
             for when, sims in simulated.items()
@@ -476,7 +480,7 @@ class _Search:
             effects,
             {name: found.ties[name] for name in effects},
             found.shares,
-            self.baseline,
+            tree.part(self.baseline),
             final,
             self.bench.floor,
             before,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -42,7 +43,9 @@ def marker_noise(recording: Recording) -> float:
 
 
 def trial_gaps(
-    simulated: np.ndarray, trials: tuple[Trial, ...] | list[Trial], frame_weights: np.ndarray | None = None
+    simulated: np.ndarray | Sequence[np.ndarray],
+    trials: tuple[Trial, ...] | list[Trial],
+    frame_weights: np.ndarray | None = None,
 ) -> np.ndarray:
     """Return the error of each trial [m], root mean square per coordinate of the free markers, shape (B,).
 

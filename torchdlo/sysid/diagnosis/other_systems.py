@@ -154,7 +154,7 @@ class _Selector:
 
     def run(self, rounds: int) -> Selection:
         """Go through all stages."""
-        defaults = {name: p.default for name, p in self.system.baseline.items()}
+        defaults = {name: p.scalar for name, p in self.system.baseline.items()}
         starts = [{name: times * value for name, value in defaults.items()} for times in _SPREAD]
         base = first = self.fit((), starts)
         rivals: dict[str, Fitted] = {}
@@ -204,7 +204,7 @@ class _Selector:
         for name, param in self.system.baseline.items():
             names.append(name)
             params.append(param)
-            sizes.append(abs(param.default) or 1.0)
+            sizes.append(abs(param.scalar) or 1.0)
         for effect in effects:
             spec = self.specs[effect]
             for number, param in spec.params.items():
@@ -294,7 +294,7 @@ class _Selector:
     def _refused(
         self, first: Fitted, rival: Fitted, fitted: Fitted, test: Agreement, rate: float, looked_at: int
     ) -> str | None:
-        train, held = (tuple(self.gaps(f, split) for f in (rival, fitted)) for split in ("train", "test"))
+        train, held = ((self.gaps(rival, split), self.gaps(fitted, split)) for split in ("train", "test"))
         enough = all(self._matters(first, rival, fitted, split) for split in ("train", "test"))
         why = selection.refused(train, held, self.noise, enough)
         if why is None and rate > RATE >= looked_at * 2.0**-test.units:

@@ -239,7 +239,7 @@ def _against(name: str, before: Sequence[Residual], after: Sequence[Residual]) -
         shown.append(np.sqrt(squares))
         shares.append(_explained(relative[good], row[good], group[good], count))
     centres = np.array([np.nanmedian(state[row == k]) if (row == k).any() else np.nan for k in range(count)])
-    return Against(name, centres, *shown, *shares)
+    return Against(name, centres, shown[0], shown[1], shares[0], shares[1])
 
 
 def _explained(values: np.ndarray, row: np.ndarray, group: np.ndarray, count: int) -> float:

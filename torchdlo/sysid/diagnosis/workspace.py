@@ -105,7 +105,7 @@ class Workspace:
     def discount(self, frames: dict[str, int]) -> None:
         """Let train trials count up to a frame only, by their names, from now on."""
         self.discounted |= frames
-        frame_weights = self._discounted(self.starts["all"].frame_weights)
+        frame_weights = self._discounted(tree.part(self.starts["all"].frame_weights))
         rows, train = np.arange(len(self.trials["all"])), len(self.trials["train"])
         start = replace(self.starts["all"], frame_weights=frame_weights)
         self.starts = {"all": start, "train": start.pick(rows[:train]), "test": start.pick(rows[train:])}
@@ -212,7 +212,8 @@ class Workspace:
         """
         keep = [k for k, n in enumerate(fitted.space.names) if n.split(".")[0] != name]
         left = [k for k, n in enumerate(self.pool.local.model(fitted.effects).parameters) if n.split(".")[0] != name]
-        names, sizes = (tuple(x[k] for k in keep) for x in (fitted.space.names, fitted.space.units))
+        names = tuple(fitted.space.names[k] for k in keep)
+        sizes = tuple(fitted.space.units[k] for k in keep)
         effects, values = tuple(e for e in fitted.effects if e != name), np.repeat(fitted.values[None, left], 3, 0)
         for row, numbers in zip(values[1:], (plain.values, self.early), strict=True):
             row[: len(self.early)] = numbers[: len(self.early)]

@@ -122,7 +122,8 @@ class ResultCache:
         if sum(a.nbytes for a in arrays) > _LARGEST:
             return
         written = io.BytesIO()
-        np.savez(written, plain=np.array(plain), **{f"a{k}": a for k, a in enumerate(arrays)})
+        named: dict[str, Any] = {f"a{k}": a for k, a in enumerate(arrays)}
+        np.savez(written, plain=np.array(plain), **named)
         self._journal.write(_name(job), written.getvalue())
 
     def recall(self, job: Any) -> Any:

@@ -15,6 +15,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from torchdlo.errors import InputError
+from torchdlo.physics import tree
 from torchdlo.sysid.estimation.jobs import FitJob, Fitted, Models, Search, SimulationJob
 from torchdlo.sysid.estimation.result_cache import ResultCache
 from torchdlo.sysid.model import initial_state as starts
@@ -81,7 +82,7 @@ class Pool:
         self.journal = journal
         self.recording, self.local = recording, Models(recording, options)
         # Named in every job, so that what was found with them is not mixed up with what others find later.
-        self._chosen = {
+        self._chosen: dict[str, Any] = {
             name: options[name] for name in ("numerical_damping", "clamp_fraction", "rest") if name in options
         }
         self._begun_with = options
@@ -303,7 +304,7 @@ def _end_with_parent() -> None:
 
 
 def _do(what: Callable[[Models, Job], Any], job: Job) -> Any:
-    return what(_models, job)
+    return what(tree.part(_models), job)
 
 
 def _simulated(models: Models, asked: tuple[SimulationJob, int, int]) -> np.ndarray:

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from scipy.optimize import lsq_linear
 
+from torchdlo.physics import tree
 from torchdlo.sysid.diagnosis import effect_library
 from torchdlo.sysid.diagnosis.workspace import Callback, Workspace
 from torchdlo.sysid.estimation.jobs import Fitted, Models, SimulationJob
@@ -125,7 +126,7 @@ class _Chase:
         if not self.job.trials:
             return past, None
         loaded = np.concatenate([some, np.tile(self.job.load, (len(some), 1))], 1)
-        sims = self.new.simulate(self.new_motion, self.job.start, loaded)
+        sims = self.new.simulate(self.new_motion, tree.part(self.job.start), loaded)
         # All rows meet all motions; each row's own motion is kept.
         at = np.arange(count)
         each = np.moveaxis(sims, 1, 0) if first else sims.reshape(count, own, *sims.shape[1:])[at, :, at]

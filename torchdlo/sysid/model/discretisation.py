@@ -82,7 +82,7 @@ class Mesh:
         """
         out = []
         for edge, marker in self.clamps:
-            where = () if trial.gripper_marker is None else np.flatnonzero(trial.gripper_marker == marker)
+            where = np.flatnonzero(trial.gripper_marker == marker)  # none if no marker has a quaternion
             if trial.gripper_quaternion is not None and len(where):
                 which = int(where[0])
                 quat = torch.as_tensor(trial.gripper_quaternion[:, which])

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -19,7 +20,7 @@ from torchdlo.physics.linalg.numerics import normalize
 class Markers:
     """Markers of a rope."""
 
-    vertex: tuple[int, ...]
+    vertex: Sequence[int] | np.ndarray
     """The vertices that they are at."""
     gripped: Tensor
     """Which of them are held by a gripper [bool], shape (M,)."""

@@ -102,7 +102,7 @@ class RopeModel:
         self.substeps = max(1, int(np.ceil(self.dt / substep - 1e-9)))
         baseline = ["bending_stiffness", "twisting_stiffness", "damping_rate"]
         baseline += ["rest_share", "rest_roll"] if rest == "given" else []
-        self.numbers = [Number(name, PARAMETERS[name], float(PARAMETERS[name].default)) for name in baseline]
+        self.numbers = [Number(name, PARAMETERS[name], float(PARAMETERS[name].scalar)) for name in baseline]
         for name in self.effects:
             self.numbers += effect_library.numbers(name, recording)
 

@@ -227,12 +227,12 @@ def _labels(trial: Trial, x: np.ndarray, events: np.ndarray, size: np.ndarray) -
         who = np.flatnonzero(single[f])
         for i in who:
             for j in who[who > i]:
-                if single[f, i] and single[f, j] and _exchanged(x, f, int(i), int(j), size):
+                if single[f, i] and single[f, j] and _exchanged(x, int(f), int(i), int(j), size):
                     swaps.setdefault((int(i), int(j)), []).append(int(f))
                     single[f, [i, j]] = False
     for pair, at in swaps.items():
         rows = _swapped(trial, x, pair, at)
-        wrong[np.ix_(rows, pair)] = True
+        wrong[np.ix_(rows, np.array(pair))] = True
         faults.append(
             DataIssue(trial.name, "swap", f"markers {pair[0]} and {pair[1]} are swapped in {_frames(rows)}: left out")
         )

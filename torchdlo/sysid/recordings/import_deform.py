@@ -198,7 +198,7 @@ def _check_memo(path: Path, pickled: bytes) -> None:
     if not any(op in pickled for op in (b"r", b"p")):  # LONG_BINPUT and PUT, which say a place
         return
     for op, arg, _ in pickletools.genops(pickled):
-        if op.name in ("LONG_BINPUT", "PUT") and int(arg) > len(pickled):
+        if op.name in ("LONG_BINPUT", "PUT") and int(arg or 0) > len(pickled):
             raise InputError(f"{path}: expected a pickle of lists of numbers, found one that is not sound.")
 
 

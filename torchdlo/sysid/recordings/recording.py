@@ -162,7 +162,7 @@ def check_new_folder(path: Path) -> None:
 
 def save_trial(path: str | Path, trial: Trial) -> None:
     """Write one trial; the file appears complete or not at all."""
-    arrays = {
+    arrays: dict[str, Any] = {
         "time": trial.time,
         "markers": trial.markers,
         "marker_arclength": trial.marker_arclength,

@@ -144,7 +144,7 @@ def _free_runs(trial: Trial, circumference: float | None) -> list[_Run]:
     held = np.flatnonzero(trial.gripped)
     first, last = int(held[0]), int(held[-1])
     runs = []
-    for left, right in pairwise(held):
+    for left, right in pairwise(held.tolist()):
         if right - left > 1:
             inside = np.arange(left + 1, right)
             runs.append(_Run(left, right, inside, s[inside] - s[left], s[right] - s[left]))

@@ -8,6 +8,7 @@ import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -100,7 +101,7 @@ def film_recording(
         for k, trial in enumerate(chosen):
             line, place = centre_line(trial, recording.length)
             held = _held(trial, place)
-            arrays = {"time": trial.time, "markers": trial.markers[:, trial.gripped]}
+            arrays: dict[str, Any] = {"time": trial.time, "markers": trial.markers[:, trial.gripped]}
             arrays |= {"marker_arclength": trial.marker_arclength[trial.gripped], "gripped": np.ones(held[1], bool)}
             if trial.gripper_quaternion is not None:
                 number = np.cumsum(trial.gripped) - 1

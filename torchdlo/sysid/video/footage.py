@@ -69,7 +69,8 @@ def views_of(
             )
 
         lines = (stack(0, 0).astype(bool), stack(1, np.nan), stack(2, np.nan))
-        wide, packed, shown = float(np.median([p[3] for p in parts])), *(tuple(p[n] for p in parts) for n in (4, 5))
+        wide = float(np.median([p[3] for p in parts]))
+        packed, shown = tuple(p[4] for p in parts), tuple(p[5] for p in parts)
         views.append(FilmView(trials[0].films[k].camera, *lines, wide, packed, shown))
     return views, notes
 
