@@ -56,7 +56,9 @@ def matters(first: float, before: float, after: float, noise: float, level: floa
     return closed > max(level**2, enough)
 
 
-def refused(train: tuple[np.ndarray, ...], test: tuple[np.ndarray, ...], noise: float, enough: bool) -> str | None:
+def refused(
+    train: tuple[np.ndarray, np.ndarray], test: tuple[np.ndarray, np.ndarray], noise: float, enough: bool
+) -> str | None:
     """Return why an effect is not worth its name, None if it is.
 
     Args:
