@@ -171,7 +171,7 @@ def _one_way(motion: PredictedBodyMotion, first: int, second: int) -> list[Tenso
     if lines.shape[-2]:
         start = seen(lines[..., :3])
         line = _Line(bodies[second], params.size[..., other, :], more[0], start, seen(lines[..., 3:6]) - start)
-        share = _nearest(line, 0.0, 1.0)
+        (share,) = _nearest(line, 1)
         # Where an end is as near, it shall come first: flat faces stand on their corners.
         found.append((start + share * line.edge, lines[..., 6:], 0.25))
     out = []

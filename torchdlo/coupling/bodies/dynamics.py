@@ -386,10 +386,8 @@ def _described(solid: RigidBody, name: str, like: Tensor) -> tuple[Body, dict[st
         need(one, "give a free body either mass or density")
         whole = solid.inertia is not None and solid.mass is not None
         volume, moments = (size[..., :1], size) if whole else shape_sdf.bulk(solid.shape, size)
-        heavy = solid.mass
-        if heavy is None:
-            heavy = tree.part(solid.density)
-        given = number("density or mass", heavy, 1, 0.0)
+        heavy = solid.density if solid.mass is None else solid.mass
+        given = number("density or mass", 0.0 if heavy is None else heavy, 1, 0.0)
         row["mass"] = given if solid.mass is not None else given * volume
         own = solid.inertia
         row["inertia"] = row["mass"] * moments if own is None else number("inertia", own, 3, 0.0)

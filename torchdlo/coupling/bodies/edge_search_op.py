@@ -129,7 +129,7 @@ def all_at_once(motion: PredictedBodyMotion) -> bool:
     return lanes.ready(like) and ready(like.device.type, like.dtype) and scene_packing.alike(motion)
 
 
-def points(view: View, motion: PredictedBodyMotion, batch: Sequence[int], pieces: Sequence[int]) -> list[Tensor]:
+def points(view: View, motion: PredictedBodyMotion, batch: torch.Size, pieces: Sequence[int]) -> list[Tensor]:
     """Return shares, distances, normals and arms of points of edges, F per edge, shape (..., F, V, 1 or 3) each.
 
     Args:

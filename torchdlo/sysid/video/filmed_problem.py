@@ -287,7 +287,7 @@ def add_correction(own: FilmedProblem, values: np.ndarray) -> None:
     row = own.full(values[None])
     plain = model.simulate(own.motion, begin, row)[0]
     # Starts are fitted: only what the motion from one and the same place gets wrong is to be corrected.
-    moving = ~own.start.still[:, None, None] & np.isfinite(plain[:, 0])
+    moving = ~own.start.at_rest[:, None, None] & np.isfinite(plain[:, 0])
     begin = replace(begin, pos=np.where(moving, plain[:, 0], begin.pos))
     half = {"substep": model.dt / (2 * model.substeps)}
     fine = half | {"vertices": 2 * len(model.arclength) - 1}
@@ -296,12 +296,15 @@ def add_correction(own: FilmedProblem, values: np.ndarray) -> None:
         each = RopeModel(model.recording, effects=model.effects, **(own.options | more))
         sims.append(each.simulate(each.motion(own.trials), begin, row)[0])
     edge = float(np.mean(np.diff(model.arclength)))
-    own.discretisation_correction = refinement(sims[0], sims[1], plain, model.numerical_damping, edge)
-    own.start = replace(own.start, discretisation_correction=own.discretisation_correction.correction)
+    found = refinement(sims[0], sims[1], plain, model.numerical_damping, edge)
+    own.discretisation_correction = found
+    own.start = replace(own.start, discretisation_correction=found.correction)
 
 
 def keep_steps_only(own: FilmedProblem) -> None:
     """Correct simulations by what finer steps change alone: where ropes bifurcate, another mesh tells nothing."""
     found = own.discretisation_correction
+    if found is None:
+        return
     alone = replace(found, grid=np.zeros_like(found.grid))
     own.start = replace(own.start, discretisation_correction=alone.correction)
