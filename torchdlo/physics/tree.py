@@ -85,9 +85,10 @@ def replace(tree: T, **fields: Any) -> T:
 
 def part(found: T | tuple[()] | None) -> T:
     """Return a part of a tree that is known to be there; one that is not is () or None."""
-    if found is None or isinstance(found, tuple):
+    there: Any = found
+    if there is None or (isinstance(there, tuple) and not there):
         raise ValueError("tree: a part was asked for that is not there; look whether there is one before it is used.")
-    return found
+    return there
 
 
 def detach(tree: T) -> T:
