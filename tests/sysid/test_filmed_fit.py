@@ -20,7 +20,7 @@ from torchdlo.sysid.video.filmed_problem import begin_from_balance, filmed_probl
 from torchdlo.sysid.video.filmed_starts import fit_starts, search_starts
 from torchdlo.sysid.video.films import with_stations
 from torchdlo.sysid.video.footage import views_of
-from torchdlo.sysid.video.overlay import boundary_f
+from torchdlo.vision.boundary import boundary_f
 
 DATA = Path(__file__).parents[2] / "torchdlo" / "data"
 

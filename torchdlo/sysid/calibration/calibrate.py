@@ -161,7 +161,8 @@ def _job(pool: Pool, rest: str, vertices: int | None, given: ModelFile | None) -
     recording = pool.recording
     trials = _usable(recording)
     if given is None:
-        model = pool.local.model((), (("rest", rest),))
+        options: dict[str, Any] = {"rest": rest}
+        model = pool.local.model((), tuple(options.items()))
         space, values = ParameterSpace(tuple(model.parameters), tuple(model.params)), model.guess()
     else:
         options = {} if vertices is None else {"vertices": vertices}

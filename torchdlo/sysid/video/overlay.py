@@ -9,6 +9,7 @@ import torch
 
 from torchdlo.sysid.estimation.observation import PER_CAMERA, seen_by
 from torchdlo.sysid.estimation.result import Overlay
+from torchdlo.vision.boundary import boundary_f
 from torchdlo.vision.camera import NEAR
 from torchdlo.vision.rasterizer import coverage, successors
 from torchdlo.vision.spine import curve_vectors
@@ -16,7 +17,7 @@ from torchdlo.vision.spine import curve_vectors
 if TYPE_CHECKING:
     from torchdlo.sysid.video.filmed_problem import FilmedProblem
 
-__all__ = ["boundary_f", "drawn_masks", "mask_overlaps", "overlays"]
+__all__ = ["drawn_masks", "mask_overlaps", "overlays"]
 
 
 def drawn_masks(
@@ -97,22 +98,6 @@ def mask_overlaps(own: FilmedProblem, sims: np.ndarray, numbers: np.ndarray) -> 
         share, edges = np.mean(parts, 0)
         out.append((float(share), float(edges)))
     return out
-
-
-def boundary_f(found: np.ndarray, true: np.ndarray) -> float:
-    """Return the boundary F-measure of a mask (H, W) against another one, with a tolerance of one pixel [1].
-
-    Harmonic mean of the shares of either boundary that are within a pixel of the other one (Csurka et al. 2013,
-    doi:10.5244/C.27.32). Unlike the intersection over union it does not fall with the width of what is seen.
-    """
-    import cv2
-
-    cross = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
-    edges = [mask.astype(np.uint8) - cv2.erode(mask.astype(np.uint8), cross) for mask in (found, true)]
-    shares = [
-        float((edge * cv2.dilate(other, cross)).sum() / max(edge.sum(), 1)) for edge, other in (edges, edges[::-1])
-    ]
-    return 2 * shares[0] * shares[1] / max(sum(shares), 1e-12)
 
 
 def overlays(own: FilmedProblem, split: str, sims: np.ndarray, numbers: np.ndarray) -> list[Overlay]:
