@@ -106,9 +106,14 @@ def preceding(topology: Topology, x: Tensor) -> Tensor:
     return _shifted(x, _runs(topology, False))
 
 
+_MANY = 16
+"""Pieces from which each of them costs more than to look up all slots."""
+
+
 def _shifted(x: Tensor, runs: Sequence[tuple[int, int]]) -> Tensor:
     """Return pieces [a, b) of the vertices of x (..., V, C), put together."""
-    if torch.jit.is_tracing():
+    many = len(runs) > _MANY and not x.requires_grad and not torch.compiler.is_compiling()
+    if many or torch.jit.is_tracing():
         # Several times as fast as to put pieces together; but its derivative is slow.
         slots = torch.tensor([slot for run in runs for slot in range(*run)], device=x.device)
         return tree.logical(tree.stored(x).index_select(1, slots))
