@@ -1,4 +1,4 @@
-// Points of edges that are nearest to bodies; the same formulas as in shapes.py and edge_points.py, for scenes side by side.
+// Points of edges that are nearest to bodies; the formulas of shape_sdf.py and segment_distance.py, for scenes side by side.
 #pragma once
 #include "tape.h"
 
@@ -225,7 +225,7 @@ struct Found {
 // Whether the distance from a shape is convex, so that slopes alone tell where it is least.
 static inline bool convex(int shape) { return shape != TORUS && shape != RING && shape != MESH; }
 
-// See `_nearest` in edge_points.py.
+// See `_search` in segment_distance.py.
 template <typename T>
 static Found<T> nearest(const Line<T, 0>& line, T low, T high) {
   typedef Lanes<T> L;
