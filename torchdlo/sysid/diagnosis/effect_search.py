@@ -8,7 +8,7 @@ search goes on from there. Test trials are used at the end only: to confirm, or 
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -213,7 +213,7 @@ class _Search:
         return float(gap_rms(gaps[finite_trials(plain)]) ** 2)
 
     def _possible(self) -> list[str]:
-        mesh, names = self.pool.local.model(()).mesh, [n for n in effect_library.LIBRARY if n not in self.excluded]
+        mesh, names = self.pool.local.model(()).mesh, [n for n in effect_library.library() if n not in self.excluded]
         return [n for n in names if effect_library.applicable(n, self.recording, mesh)]
 
     def _say_floor(self) -> None:
@@ -250,7 +250,7 @@ class _Search:
         first = min(led, key=lambda name: fits[name].point.cost)
         if gap_rms(self.bench.gaps(fits[first], "all")) > SILENT * self.bench.level:
             # Something is left: one that does alike things may be right, however little its doses explain.
-            kin = [s for s in scores if s.name not in fits and any({s.name, first} <= k for k in effect_library.KIN)]
+            kin = [s for s in scores if s.name not in fits and effect_library.confusable(s.name, first)]
             more, also = self._fits_of_kin(base, kin, worst, f"{stage}, effects like {first}") if kin else ({}, [])
             self.bench.predict(list(more.values()))
             fits, led = fits | more, led + also
@@ -302,7 +302,7 @@ class _Search:
         if fair:
             lead = fits[fair[0]].point.cost
             close = [n for n in order if fits[n].point.cost - lead < self.bench.tie(rival.point.cost, lead)]
-            special, numbers = effect_library.CONTAINED.get(fair[0], (None, {}))
+            special, numbers = effect_library.special_case(fair[0])
             if special in fair and special not in close and _may_be(fits[fair[0]], numbers):
                 close.append(special)
             # Of laws that fit as well, the one with the fewest numbers: others may contain it.
@@ -501,7 +501,7 @@ class _Search:
         )
 
 
-def _may_be(fitted: Fitted, numbers: dict[str, float]) -> bool:
+def _may_be(fitted: Fitted, numbers: Mapping[str, float]) -> bool:
     """Return whether the last effect's numbers may have these values, as far as their ranges tell."""
     low, high = interval(fitted.point, fitted.space)
     asked = {f"{fitted.effects[-1]}.{name}": value for name, value in numbers.items()}

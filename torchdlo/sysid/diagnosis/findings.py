@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from torchdlo.physics.effects import EFFECTS
-from torchdlo.sysid.diagnosis.effect_equations import effect_equation, separating_experiment
+from torchdlo.sysid.diagnosis.effect_library import effect_equation, separating_experiment
 from torchdlo.sysid.diagnosis.error_floor import gap_rms, trial_gaps
 from torchdlo.sysid.diagnosis.plausibility import implausible
 from torchdlo.sysid.diagnosis.residual_analysis import localise

@@ -63,7 +63,7 @@ class ModelFile:
             )
         model = RopeModel(recording, effects=self.effects, **(self.options | options))
         for name in self.effects:
-            if name in effect_library.LIBRARY and not effect_library.applicable(name, recording, model.mesh):
+            if name in effect_library.library() and not effect_library.applicable(name, recording, model.mesh):
                 raise InputError(
                     f"{self.path}: {name}: expected a recording in which it can act, but {recording.path} has nothing "
                     "that it acts on (no table, no clamp of two markers, or no radius)."

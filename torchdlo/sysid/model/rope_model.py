@@ -18,6 +18,7 @@ from torch import Tensor
 from torchdlo import scene as scenes
 from torchdlo.errors import InputError
 from torchdlo.physics import tree
+from torchdlo.physics.effects import EFFECTS
 from torchdlo.physics.effects.base import Effect, Param
 from torchdlo.physics.effects.elastic import Bend, BendFrame, Twist
 from torchdlo.physics.effects.external import Damping, Gravity
@@ -97,7 +98,8 @@ class RopeModel:
                 "rope.json: rest_positions is missing; expected it for a calibration with the given rest shape."
             )
         self.dt = float(trial.time[1] - trial.time[0])
-        beside = "marker_offset" in self.effects
+        measured = [EFFECTS[name] for name in self.effects if EFFECTS[name].kind == "measurement"]
+        beside = any(not effect.last for effect in measured)
         self.markers = Markers(self.marker_vertex, torch.as_tensor(np.array(trial.gripped)), self.dt, beside)
         self.substeps = max(1, int(np.ceil(self.dt / substep - 1e-9)))
         baseline = ["bending_stiffness", "twisting_stiffness", "damping_rate"]
