@@ -18,7 +18,7 @@ from torchrl.envs import EnvBase
 
 from torchdlo import notices
 from torchdlo.envs.core import episode as episodes
-from torchdlo.envs.core.episode import Episode, EpisodeState
+from torchdlo.envs.core.episode import ControlStep, Episode, EpisodeState
 from torchdlo.envs.core.task import Task, combined, succeeded
 from torchdlo.envs.observations.sensor import Sensor, sensor_of
 from torchdlo.errors import InputError
@@ -161,12 +161,11 @@ class DloEnv(EnvBase):
         self.world = tree.detach(self.world)
 
     def _told(self, terms: dict[str, Tensor]) -> dict[str, Any]:
-        seen = self.world.seen(self.task.arms.count)
         return {
             "observation": episodes.observe(self.episode, self.world),
             "start": self.first,
             "progress": (self.world.count / self.task.horizon).float().unsqueeze(-1),
-            "success": (succeeded(self.task, seen) & ~self.world.failed).unsqueeze(-1),
+            "success": episodes.successes(self.task, self.world).unsqueeze(-1),
             "terms": TensorDict({n: t.float().unsqueeze(-1) for n, t in terms.items()}, self.batch_size, self.device),
             **self._images(),
         }
@@ -226,24 +225,24 @@ class DloEnv(EnvBase):
             return tree.where(again, fresh, self.world)
         return tree.map(lambda old, new: old.index_copy(0, rows, new), self.world, fresh)
 
+    def advance(self, action: Tensor) -> ControlStep:
+        """Do actions (num_envs, A) of `action_spec` and return what they led to, without a tensordict."""
+        with torch.set_grad_enabled(self.gradients and torch.is_grad_enabled()):
+            action = action.to(self._like.dtype)
+            action = action if self._scale is None else action.clamp(-1.0, 1.0) * self._scale
+            last = self.world.count + 1 >= self.task.horizon
+            step = episodes.control_step(self.episode, self.world, action, last)
+        self.world = step.world
+        _warn_of_nan(self.task, action, step.reward)
+        return step
+
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
         with torch.set_grad_enabled(self.gradients and torch.is_grad_enabled()):
-            return self._stepped(tensordict.get("action"))
-
-    def _stepped(self, action: Tensor) -> TensorDict:
-        action = action.to(self._like.dtype)
-        action = action if self._scale is None else action.clamp(-1.0, 1.0) * self._scale
-        world = episodes.act(self.episode, self.world, action)
-        over = world.count >= self.task.horizon
-        if self.task.release and bool(over.any()):
-            world = tree.where(over, episodes.finish(self.episode, world), world)
-        self.world = world
-        reward, _, terms = episodes.episode_reward(self.episode, world)
-        _warn_of_nan(self.task, action, reward)
-        failed, over = world.failed.unsqueeze(-1), over.unsqueeze(-1)
-        flags = {"terminated": failed, "truncated": over, "done": failed | over}
-        found = {**self._told(terms), "reward": reward.float().unsqueeze(-1), **flags}
-        return TensorDict(found, self.batch_size, self.device)
+            step = self.advance(tensordict.get("action"))
+            failed, over = self.world.failed.unsqueeze(-1), (self.world.count >= self.task.horizon).unsqueeze(-1)
+            flags = {"terminated": failed, "truncated": over, "done": failed | over}
+            found = {**self._told(step.terms), "reward": step.reward.float().unsqueeze(-1), **flags}
+            return TensorDict(found, self.batch_size, self.device)
 
 
 def _check_device(device: torch.device | str | None) -> None:
