@@ -23,6 +23,7 @@ from torchdlo.envs.core.task import Task, combined, succeeded
 from torchdlo.envs.observations.sensor import Sensor, sensor_of
 from torchdlo.errors import InputError
 from torchdlo.physics import tree
+from torchdlo.physics.effects.parameter_name import ParameterName
 from torchdlo.scene import Params, Scene
 from torchdlo.vision.look import Look, draw_look
 
@@ -274,9 +275,9 @@ def _wide(effects: dict[str, dict[str, Tensor]], like: dict[str, dict[str, Tenso
 
 
 def _declared(scene: Scene, name: str) -> Any:
-    effect, _, number = name.partition(".")
-    params = {e.name: e.params for e in scene.effects}.get(effect, {})
-    return params.get(number)
+    asked = ParameterName.parse(name)
+    params = {e.name: e.params for e in scene.effects}.get(asked.effect, {})
+    return params.get(asked.key)
 
 
 def _check(shares: Mapping[str, float], scene: Scene) -> None:
@@ -301,14 +302,14 @@ def drawn_effects(
         effect: {name: x.expand(count, 1, x.shape[-1]) for name, x in v.items()} for effect, v in params.effects.items()
     }
     for name, share in shares.items():
-        (effect, _, number), param = name.partition("."), _declared(scene, name)
-        value = found[effect][number]
+        which, param = ParameterName.parse(name), _declared(scene, name)
+        value = found[which.effect][which.number]
         ends = [param.coordinate(value.new_tensor(float(end))) for end in (param.low, param.high)]
         low, high = min(ends), max(ends)
         random = torch.rand(value.shape, generator=generator, dtype=torch.float64).to(value)
         at = param.coordinate(value) + share * (high - low) * (random - 0.5)
-        found[effect][number] = param.value(torch.minimum(torch.maximum(at, low), high))
-    for effect in {name.partition(".")[0] for name in shares}:
+        found[which.effect][which.number] = param.value(torch.minimum(torch.maximum(at, low), high))
+    for effect in {ParameterName.parse(name).effect for name in shares}:
         if {"mu_s", "mu_k"} <= found[effect].keys():
             found[effect]["mu_s"] = torch.maximum(found[effect]["mu_s"], found[effect]["mu_k"])
     return found

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from torchdlo.physics.effects import EFFECTS
+from torchdlo.physics.effects.parameter_name import ParameterName
 from torchdlo.sysid.diagnosis import effect_library
 from torchdlo.sysid.diagnosis.score_test import Score
 
@@ -64,7 +65,7 @@ def _limit(score: Score, gap: float) -> DetectionLimit | None:
         return None
     key = how.strength[0]
     for numbers, shown in score.probes:
-        own = np.array([v for name, v in numbers.items() if name.split(".")[1] == key])
+        own = np.array([v for name, v in numbers.items() if ParameterName.parse(name).number == key])
         if not len(own) or shown <= 0:
             continue
         param, times = EFFECTS[score.name].params[key], (gap / shown) ** (1 / how.power)

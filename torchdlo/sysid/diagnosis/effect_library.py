@@ -16,6 +16,7 @@ from torchdlo.errors import InputError
 from torchdlo.physics.effects import EFFECTS
 from torchdlo.physics.effects.base import Effect, EffectKind, Param
 from torchdlo.physics.effects.effect_spec import RopeEffectSpec, RopeScales
+from torchdlo.physics.effects.parameter_name import ParameterName
 from torchdlo.sysid.model.discretisation import Mesh
 from torchdlo.sysid.recordings.recording import Recording
 
@@ -50,12 +51,17 @@ MEANING: dict[EffectKind, str] = {
 class Number:
     """One number of a model that may be fitted."""
 
-    name: str
-    """`effect.number`, with `.k` for a component, or the name of a baseline number."""
+    which: ParameterName
+    """Which one."""
     param: Param
     """Its declaration, for a component by itself."""
     off: float
     """Value at which its effect does nothing, or at which it is while the effect is off."""
+
+    @property
+    def name(self) -> str:
+        """Its name as text."""
+        return str(self.which)
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,7 +130,7 @@ def numbers(name: str, recording: Recording) -> list[Number]:
         for k, value in enumerate(components):
             off = value if param.off is None else param.off
             single = replace(param, default=value)
-            found.append(Number(f"{name}.{key}.{k}" if param.size > 1 else f"{name}.{key}", single, float(off)))
+            found.append(Number(ParameterName(name, key, k if param.size > 1 else None), single, float(off)))
     return found
 
 

@@ -16,12 +16,13 @@ import numpy as np
 
 from torchdlo.errors import InputError
 from torchdlo.physics import tree
+from torchdlo.physics.effects.parameter_name import ParameterName, values_of
 from torchdlo.sysid.diagnosis import baseline as baselines
 from torchdlo.sysid.diagnosis import budget as plan
 from torchdlo.sysid.diagnosis import clamp_models, effect_library, selection
 from torchdlo.sysid.diagnosis.backward_elimination import EliminationResult, Revision
 from torchdlo.sysid.diagnosis.budget import BUDGETS, Budget
-from torchdlo.sysid.diagnosis.candidate_fits import extended_fits, short_frames, vector
+from torchdlo.sysid.diagnosis.candidate_fits import extended_fits, short_frames
 from torchdlo.sysid.diagnosis.detection_limit import detection_limits, least_gap
 from torchdlo.sysid.diagnosis.error_floor import gap_rms, trial_gaps
 from torchdlo.sysid.diagnosis.misleading_trials import MisleadingTrial, errors_by_frame, misleading_trials
@@ -363,7 +364,7 @@ class _Search:
     def _candidate(self, candidate: Candidate, fitted: Fitted, against: str) -> BestCandidate:
         """Return a candidate that is not named, with its numbers and what speaks against it."""
         numbers = dict(zip(fitted.space.names, fitted.space.to_values(fitted.point.raw), strict=True))
-        own = {k.partition(".")[2]: float(v) for k, v in numbers.items() if k.split(".")[0] == candidate.name}
+        own = {key: float(value) for key, value in values_of(candidate.name, numbers).items()}
         gains = candidate.gain or 0.0, candidate.heldout_gain or 0.0
         return BestCandidate(candidate.name, own, *gains, against, tree.part(candidate.test))
 
@@ -504,6 +505,7 @@ class _Search:
 def _may_be(fitted: Fitted, numbers: Mapping[str, float]) -> bool:
     """Return whether the last effect's numbers may have these values, as far as their ranges tell."""
     low, high = interval(fitted.point, fitted.space)
-    asked = {f"{fitted.effects[-1]}.{name}": value for name, value in numbers.items()}
-    ranges = [(asked.get(vector(name)), a, b) for name, a, b in zip(fitted.space.names, low, high, strict=True)]
+    asked = {ParameterName(fitted.effects[-1], name): value for name, value in numbers.items()}
+    names = [ParameterName.parse(name).whole for name in fitted.space.names]
+    ranges = [(asked.get(name), a, b) for name, a, b in zip(names, low, high, strict=True)]
     return all(value is None or a <= value <= b for value, a, b in ranges)

@@ -14,6 +14,7 @@ import numpy as np
 from scipy.optimize import lsq_linear
 
 from torchdlo.physics.effects import EFFECTS
+from torchdlo.physics.effects.parameter_name import ParameterName
 from torchdlo.sysid.diagnosis import effect_library
 from torchdlo.sysid.diagnosis.effect_library import Perturbation
 from torchdlo.sysid.estimation.jobs import Fitted, SimulationJob
@@ -225,7 +226,7 @@ def _mixture(name: str, doses: list[Perturbation], amounts: np.ndarray) -> dict[
         least = 0.05
         amount = amount if abs(amount) > least else (least if amount >= 0 else -least)
         for key, value in dose.values.items():
-            number = key.split(".")[1]
+            number = ParameterName.parse(key).number
             scale = EFFECTS[name].params[number].scale
             if number not in effect_library.spec(name).strength:
                 found[key] = value
@@ -242,7 +243,7 @@ def _sizes(name: str, doses: list[Perturbation]) -> dict[str, float]:
     """Return what counts as much of each number: the dose of strengths, a share of the range of places."""
     sizes: dict[str, float] = {}
     for key, value in ((key, value) for dose in doses for key, value in dose.values.items()):
-        number = key.split(".")[1]
+        number = ParameterName.parse(key).number
         param = EFFECTS[name].params[number]
         if number in effect_library.spec(name).places:
             sizes[key] = 0.2 * max(dose.values.get(key, 0.0) for dose in doses)

@@ -12,9 +12,9 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from torchdlo.physics.effects.parameter_name import ParameterName
 from torchdlo.sysid.diagnosis import effect_library, score_test
 from torchdlo.sysid.diagnosis.budget import BUDGETS, Budget
-from torchdlo.sysid.diagnosis.candidate_fits import vector
 from torchdlo.sysid.diagnosis.error_floor import ErrorFloor, gap_rms
 from torchdlo.sysid.diagnosis.score_test import Score
 from torchdlo.sysid.diagnosis.verdict import UNKNOWN_FLOOR, Candidate, Diagnosis, verdict_word
@@ -271,8 +271,8 @@ def _fitted(base: _Model, score: Score, iterations: int, seconds: float) -> _Mod
     numbers = effect_library.numbers(score.name, base.own.model.recording)
     starts = []
     for dose, raw in score.starts:
-        vectors = {vector(name) for name in dose}
-        used = {n.name: dose.get(n.name, n.off) for n in numbers if vector(n.name) in vectors}
+        vectors = {ParameterName.parse(name).whole for name in dose}
+        used = {n.name: dose.get(n.name, n.off) for n in numbers if n.which.whole in vectors}
         sizes = {n: score.sizes.get(n, 0.0) for n in used}
         starts.append(_extended(base, (score.name,), sizes, used, raw))
     costs = []
