@@ -301,10 +301,8 @@ def _equations(
     return Touching(system, Touch(*parts), origin, between, law[-1]), tension
 
 
-def _by_kernel(*given) -> list[Tensor]:
-    touching, tension = _equations(*given)
-    others = touching.touch, touching.pairs, touching.origin, touching.dt
-    return contact_kernel.solve(touching.system, tension, *others, TRIES, _solved(tension))
+def _by_kernel(inputs, parts, pairs, origin: Tensor, topology: str, law: list[float]) -> list[Tensor]:
+    return contact_kernel.solve(inputs, parts, pairs, origin, topology, law, TRIES, _solved(origin))
 
 
 def _whole(*given) -> list[Tensor]:

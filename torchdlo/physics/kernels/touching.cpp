@@ -19,19 +19,52 @@ struct Sizes {
   const double *hardness, *law;  // law: turning, most, least, shift, dt, solved, round, far, leaving
 };
 
+// Where a number is among the inputs, and how far it is from slot to slot, family to family and scene to scene.
+struct Place {
+  int64_t input, offset, slot, family, scene;
+};
+// Numbers of slots, of points, of pairs, and of how bodies resist; where corners of pairs are told (4, pairs, scenes).
+struct Inputs {
+  const Place *slots, *points, *pairs, *bodies;
+  int64_t corner[4], scenes;  // offset, and from corner to corner, pair to pair, scene to scene; what their numbers count
+};
+
 // Numbers of a vertex and its edge.
 template <typename T>
 struct Slot {
   T rest, compliance, active, mask, give, hinge, swing, free, tension;
-  T vertex[3], moved[3], force[3], start[3], lead[3], origin[3], scale;
+  T vertex[3], moved[3], force[3], start[3], lead[3], scale, origin[3];
 };
 template <typename T>
 struct Point {
-  T real, normal[3], radius, wanted, given[3], mu, first[9], second[9], body[18];
+  T real, share, normal[3], tangent[3], radius, lever, wanted, given[3], mu, arm[3];
 };
 template <typename T>
 struct Pair {
   T real, normal[3], radius, wanted, mu, corner[4][9];
+};
+
+// How points move with the ends of edges and with bodies, see `maps` in contact_penalty.py.
+template <typename T>
+struct Maps {
+  T first[9], second[9], body[18];
+
+  explicit Maps(const Point<T>& p) {
+    const T *n = p.normal, *t = p.tangent, *r = p.arm;
+    const T nt = n[0] * t[0] + n[1] * t[1] + n[2] * t[2], held = p.lever > T(0) ? p.radius : T(0);
+    const T arm[9] = {0, -r[2], r[1], r[2], 0, -r[0], -r[1], r[0], 0};
+    const T turn[9] = {0, -n[2], n[1], n[2], 0, -n[0], -n[1], n[0], 0};
+    for (int a = 0; a < 3; ++a)
+      for (int b = 0; b < 3; ++b) {
+        const T one = T(a == b), swing = p.lever * (t[a] * n[b] - nt * one);
+        first[3 * a + b] = (1 - p.share) * one - swing;
+        second[3 * a + b] = p.share * one + swing;
+        T across = turn[3 * a + b];
+        for (int c = 0; c < 3; ++c) across -= turn[3 * a + c] * t[c] * t[b];
+        body[6 * a + b] = -one;
+        body[6 * a + 3 + b] = arm[3 * a + b] - held * across;
+      }
+  }
 };
 
 template <typename T>
@@ -62,7 +95,8 @@ class Scene {
   explicit Scene(const Sizes& sizes)
       : s(sizes), v(s.slots), n(4 * v), k(s.half), before(v), rank(n), y(3 * v), begin(3 * v), along(3 * v),
         push(3 * v), pull(3 * v), turn(3 * v), resist(3 * v), touch(3 * v), between(3 * v), residual(3 * v),
-        excess(v), lean(v), one(v), two(v), same(v), firm(v), least(v), wrench(6 * s.bodies), step(n) {
+        excess(v), lean(v), one(v), two(v), same(v), firm(v), least(v), wrench(6 * s.bodies), step(n),
+        known(s.families * v) {
     for (int64_t i = 0; i < v; ++i) before[s.after[i]] = i;
     for (int64_t j = 0; j < n; ++j) rank[s.order[j]] = j;
   }
@@ -139,6 +173,8 @@ class Scene {
 
   void prepare() {
     scale = slot[0].scale;
+    std::fill(known.begin(), known.end(), -1);
+    maps.clear();
     std::vector<T> mass(v), pulled(v);
     const auto centre = [&](int64_t i) { return slot[i].mask / slot[i].rest + slot[before[i]].mask / slot[before[i]].rest; };
     for (int64_t i = 0; i < v; ++i) {
@@ -300,6 +336,23 @@ class Scene {
     }
   }
 
+  // By how much a point parts from its body; as from `Maps`, whose parts along the normal are these.
+  T parted(const Point<T>& p, const T* one, const T* two, const T* q) const {
+    const T *n = p.normal, *r = p.arm;
+    T sum = 0;
+    for (int c = 0; c < 3; ++c) sum += n[c] * (p.given[c] + (1 - p.share) * one[c] + p.share * two[c]);
+    if (!q) return sum;
+    for (int c = 0; c < 3; ++c) {
+      const int d = (c + 1) % 3, e = (c + 2) % 3;
+      sum += n[c] * (r[d] * q[3 + e] - r[e] * q[3 + d] - q[c]);
+    }
+    return sum;
+  }
+  const Maps<T>& mapped(int64_t point) {
+    if (known[point] < 0) known[point] = int64_t(maps.size()), maps.emplace_back(points[point]);
+    return maps[known[point]];
+  }
+
   void touch_bodies(const State<T>& now, bool exact, bool matrix) {
     for (int64_t f = 0; f < s.families; ++f) {
       const int64_t body = s.of[f];
@@ -307,30 +360,34 @@ class Scene {
         const Point<T>& p = points[f * v + i];
         if (!(p.real > T(0))) continue;
         const int64_t n = s.after[i];
-        T moved[3] = {p.given[0], p.given[1], p.given[2]}, one[3], two[3];
+        T one[3], two[3];
         for (int c = 0; c < 3; ++c) {
           one[c] = now.pos[3 * i + c] - slot[i].origin[c];
           two[c] = now.pos[3 * n + c] - slot[n].origin[c];
         }
-        times(p.first, one, moved, 3);
-        times(p.second, two, moved, 3);
-        if (body >= 0) times(p.body, &now.bodies[6 * body], moved, 6);
+        const T* q = body >= 0 ? &now.bodies[6 * body] : nullptr;
+        if (!(p.wanted - parted(p, one, two, q) > -T(s.law[7] * s.law[6]) * p.radius)) continue;
+        const Maps<T>& m = mapped(f * v + i);
+        T moved[3] = {p.given[0], p.given[1], p.given[2]};
+        times(m.first, one, moved, 3);
+        times(m.second, two, moved, 3);
+        if (q) times(m.body, q, moved, 6);
         Felt<T> felt;
         if (!law(p.normal, p.radius, p.wanted, p.mu, firm[i], moved, exact, felt)) continue;
-        back(p.first, felt.force, &touch[3 * i], 3);
-        back(p.second, felt.force, &touch[3 * n], 3);
-        if (body >= 0) back(p.body, felt.force, &wrench[6 * body], 6);
+        back(m.first, felt.force, &touch[3 * i], 3);
+        back(m.second, felt.force, &touch[3 * n], 3);
+        if (q) back(m.body, felt.force, &wrench[6 * body], 6);
         if (!matrix) continue;
-        block(i, i, p.first, p.first, felt.gradient, slot[i].free);
-        block(i, n, p.first, p.second, felt.gradient, slot[i].free);
-        block(n, i, p.second, p.first, felt.gradient, slot[n].free);
-        block(n, n, p.second, p.second, felt.gradient, slot[n].free);
-        if (body >= 0) edge_of_body(p, felt.gradient, i, n, body);
+        block(i, i, m.first, m.first, felt.gradient, slot[i].free);
+        block(i, n, m.first, m.second, felt.gradient, slot[i].free);
+        block(n, i, m.second, m.first, felt.gradient, slot[n].free);
+        block(n, n, m.second, m.second, felt.gradient, slot[n].free);
+        if (q) edge_of_body(m, felt.gradient, i, n, body);
       }
     }
   }
 
-  void edge_of_body(const Point<T>& p, const T* g, int64_t i, int64_t n, int64_t body) {
+  void edge_of_body(const Maps<T>& p, const T* g, int64_t i, int64_t n, int64_t body) {
     T kc[18] = {}, ka[9] = {}, kb[9] = {};
     for (int a = 0; a < 3; ++a) {
       for (int j = 0; j < 6; ++j)
@@ -518,27 +575,68 @@ class Scene {
   std::vector<T> y, begin, along, push, pull, turn, resist, touch, between, residual, excess, lean, one, two, same, firm,
       least, wrench, step, band, border, row, corner, side, turned;
   std::vector<Acting> acting;
+  std::vector<int64_t> known;  // where the maps of points are, -1 for those that nothing asked for
+  std::vector<Maps<T>> maps;
   T scale;
+};
+
+template <typename T>
+void gather(T* to, const T* const* in, const Place* places, int64_t count, int64_t slot, int64_t family, int64_t scene) {
+  for (int64_t k = 0; k < count; ++k) {
+    const Place& p = places[k];
+    to[k] = in[p.input][p.offset + slot * p.slot + family * p.family + scene * p.scene];
+  }
+}
+
+// A scene as `Scene` reads it.
+template <typename T>
+struct Given {
+  std::vector<Slot<T>> slots;
+  std::vector<Point<T>> points;
+  std::vector<Pair<T>> pairs;
+  std::vector<int64_t> corners;
+  std::vector<T> inertia;
+
+  explicit Given(const Sizes& s)
+      : slots(s.slots), points(s.families * s.slots), pairs(s.pairs), corners(4 * s.pairs), inertia(36 * s.bodies) {}
+
+  void read(const T* const* in, const int64_t* at, const Inputs& n, const Sizes& s, int64_t b, Scene<T>& scene) {
+    const int64_t v = s.slots;
+    constexpr int64_t S = sizeof(Slot<T>) / sizeof(T), P = sizeof(Point<T>) / sizeof(T), Q = sizeof(Pair<T>) / sizeof(T);
+    for (int64_t i = 0; i < v; ++i) gather((T*)&slots[i], in, n.slots, S, i, 0, b);
+    for (int64_t f = 0; f < s.families; ++f)
+      for (int64_t i = 0; i < v; ++i) {
+        Point<T>& p = points[f * v + i];
+        gather((T*)&p, in, n.points, 1, i, f, b);
+        if (p.real > T(0)) gather((T*)&p, in, n.points, P, i, f, b);
+      }
+    for (int64_t q = 0; q < s.pairs; ++q) {
+      gather((T*)&pairs[q], in, n.pairs, 1, q, 0, b);
+      if (!(pairs[q].real > T(0))) continue;
+      gather((T*)&pairs[q], in, n.pairs, Q, q, 0, b);
+      for (int m = 0; m < 4; ++m)
+        corners[4 * q + m] = at[n.corner[0] + m * n.corner[1] + q * n.corner[2] + b * n.corner[3]] / n.scenes;
+    }
+    for (int64_t j = 0; j < s.bodies; ++j) gather(&inertia[36 * j], in, n.bodies, 36, j, 0, b);
+    scene.slot = slots.data(), scene.points = points.data(), scene.pairs = pairs.data();
+    scene.corners = corners.data(), scene.inertia = inertia.data();
+  }
 };
 
 // Batches stand innermost in what comes out, as in all storage.
 template <typename T>
-void run(const T* slots, const T* points, const T* pairs, const int64_t* corners, const T* inertia, T* const* out,
-         const Sizes& s, int threads) {
+void run(const T* const* in, const int64_t* at, const Inputs& n, T* const* out, const Sizes& s, int threads) {
   const int64_t v = s.slots, scenes = s.scenes, counts[10] = {3 * v, v, 6 * s.bodies, 1, 3 * v, v, 3 * v, 3 * v, 6 * s.bodies, 1};
 #pragma omp parallel num_threads(threads) if (threads > 1 && scenes > 1)
   {
     const FlushTiny flush;
     Scene<T> scene(s);
+    Given<T> given(s);
     std::vector<T> found[10];
     for (int r = 0; r < 10; ++r) found[r].resize(counts[r] + 1);
 #pragma omp for schedule(dynamic)
     for (int64_t b = 0; b < scenes; ++b) {
-      scene.slot = (const Slot<T>*)slots + b * v;
-      scene.points = (const Point<T>*)points + b * s.families * v;
-      scene.pairs = (const Pair<T>*)pairs + b * s.pairs;
-      scene.corners = corners + b * s.pairs * 4;
-      scene.inertia = inertia + b * s.bodies * 36;
+      given.read(in, at, n, s, b, scene);
       T* f[10];
       for (int r = 0; r < 10; ++r) f[r] = found[r].data();
       scene(f[0], f[1], f[2], f[3], f[4], f[5], f[6], f[7], f[8], f[9]);
@@ -551,12 +649,12 @@ void run(const T* slots, const T* points, const T* pairs, const int64_t* corners
 }  // namespace
 
 extern "C" {
-void touching_float(const float* a, const float* b, const float* c, const int64_t* d, const float* e, float* const* out,
-                    const Sizes* s, int threads) {
-  run<float>(a, b, c, d, e, out, *s, threads);
+void touching_float(const float* const* in, const int64_t* at, const Inputs* n, float* const* out, const Sizes* s,
+                    int threads) {
+  run<float>(in, at, *n, out, *s, threads);
 }
-void touching_double(const double* a, const double* b, const double* c, const int64_t* d, const double* e,
-                     double* const* out, const Sizes* s, int threads) {
-  run<double>(a, b, c, d, e, out, *s, threads);
+void touching_double(const double* const* in, const int64_t* at, const Inputs* n, double* const* out, const Sizes* s,
+                     int threads) {
+  run<double>(in, at, *n, out, *s, threads);
 }
 }
