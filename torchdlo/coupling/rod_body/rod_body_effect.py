@@ -235,7 +235,7 @@ class RodBody(Effect):
         share, normal, wanted, given, mu, arm = (x.expand(*shape, x.shape[-1]) for x in found)
         resist = inertia(bodies, free) if free else share.new_zeros(0, 6, 6)
         like = share.new_tensor
-        body = like(of).reshape(-1, len(free)), resist, like(place).reshape(-1, len(free))
+        body = like(of).reshape(len(of), len(free)), resist, like(place).reshape(len(count), len(free))
         return Touch(real, share, normal, tangent, radius, lever, wanted, given, mu, arm, *body)
 
     def _touches(self, view: View, motion: PredictedMotion) -> tuple[Tensor, ...]:
