@@ -23,6 +23,8 @@ from torchdlo.physics.rod.topology import parse
 _DTYPES = {torch.float32: "float", torch.float64: "double"}
 _POINTS = 10
 """Numbers of points among the parts of `Touch`; behind them stand which body they are on, and how bodies resist."""
+_SLOT, _POINT, _PAIR = 28, 18, 43
+"""How many numbers slots, points and pairs have."""
 
 
 class _Sizes(ctypes.Structure):
@@ -54,8 +56,16 @@ native.KERNELS["touching"] = _library
 
 def available(like: Tensor) -> bool:
     """Return whether there is a kernel for tensors like this one."""
-    here = native.works_on(like.device.type, "contact of ropes in implicit steps")
-    return here and like.dtype in _DTYPES and _library() is not None
+    return _ready(like.device.type, like.dtype)
+
+
+def _ready(device: str, dtype: torch.dtype) -> bool:
+    here = native.works_on(device, "contact of ropes in implicit steps")
+    return here and dtype in _DTYPES and _library() is not None
+
+
+# For compilers what it returns is a constant: `torch.compiler.assume_constant_result`, without importing them.
+_ready._dynamo_marked_constant = True  # type: ignore[attr-defined]  # a mark that no stub knows
 
 
 _Layout = tuple[tuple[torch.Size, tuple[int, ...]], ...]
@@ -100,8 +110,13 @@ def _places(first: int, layout: Sequence, core: int) -> list[_Place]:
 
 @functools.lru_cache(maxsize=1024)
 def _plan(
-    topology: str, batch: tuple[int, ...], layouts: tuple[_Layout, ...], of: tuple[int, ...], count: int,
-    law: tuple[float, ...], tries: tuple[tuple[float, int], ...]
+    topology: str,
+    batch: tuple[int, ...],
+    layouts: tuple[_Layout, ...],
+    of: tuple[int, ...],
+    count: int,
+    law: tuple[float, ...],
+    tries: tuple[tuple[float, int], ...],
 ) -> _Plan:
     shape = parse(topology)
     v, scenes, pattern = shape.size, math.prod(batch), banded.pattern(f"touching:{topology}")
@@ -230,3 +245,29 @@ def _logical(k: int, x: Tensor, batch: tuple[int, ...]) -> Tensor:
     x = x.reshape(*x.shape[:2], *batch)
     scenes = range(2, x.dim())
     return x.permute(*scenes, 0, 1) if k in (2, 3, 8, 9) else x.permute(*scenes, 1, 0)
+
+
+def derive(call: tuple, found: list[Tensor], by: list[Tensor]) -> tuple[Tensor, ...]:
+    """Return derivatives of what `solve` returns: numbers of slots (28, V, B), of points (B, F, V, 18), of pairs
+    (B, K, 43), and of how bodies resist (B, J, 36), in the order of the arguments of `solve`, positions at the start
+    behind the other numbers of slots.
+
+    Args:
+        call: those arguments.
+        found: the first four of what it returned.
+        by: derivatives by the next five.
+    """
+    planned = _call(*call)
+    sizes = planned.plan.sizes
+    given = [x.reshape(sizes.scenes, -1).contiguous() for x in (*found, *by)]
+    like = given[0]
+    out = (
+        like.new_empty(_SLOT, sizes.slots, sizes.scenes),
+        like.new_zeros(sizes.scenes, sizes.families, sizes.slots, _POINT),
+        like.new_zeros(sizes.scenes, sizes.pairs, _PAIR),
+        like.new_zeros(sizes.scenes, sizes.bodies, 36),
+    )
+    run = getattr(_library(), f"touching_back_{_DTYPES[like.dtype]}")
+    places, inputs = planned.addresses(), ctypes.byref(planned.plan.inputs)
+    run(*places, inputs, _addresses(given), _addresses(out), ctypes.byref(sizes), torch.get_num_threads())
+    return out
