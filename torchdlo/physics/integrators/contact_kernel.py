@@ -100,9 +100,7 @@ def _places(first: int, layout: Sequence, core: int) -> list[_Place]:
     for k, (shape, stride) in enumerate(layout):
         many, shape, stride = len(shape) > core, shape[-core:], stride
         scene, stride = (stride[0] if many else 0), stride[-core:]
-        family, shape, stride = (
-            (stride[0] * (shape[0] > 1), shape[1:], stride[1:]) if core == 3 else (0, shape, stride)
-        )
+        family, shape, stride = (stride[0] * (shape[0] > 1), shape[1:], stride[1:]) if core == 3 else (0, shape, stride)
         slot = stride[0] * (shape[0] > 1)
         found += [_Place(first + k, c * stride[1], slot, family, scene) for c in range(shape[1])]
     return found
@@ -128,8 +126,11 @@ def _plan(
         first += len(layout)
     (_, stride), *_ = resist
     scene = stride[0] if len(stride) > 3 else 0
-    bodies = [_Place(len(slots) + len(points), i * stride[-2] + j * stride[-1], stride[-3], 0, scene)
-              for i in range(6) for j in range(6)]
+    bodies = [
+        _Place(len(slots) + len(points), i * stride[-2] + j * stride[-1], stride[-3], 0, scene)
+        for i in range(6)
+        for j in range(6)
+    ]
     between: list[_Place] = []
     if pairs:
         between = _places(first, pairs[:5], 2)
@@ -137,7 +138,8 @@ def _plan(
             scene = stride[0] if len(wide) > 3 else 0
             between += [
                 _Place(first + 5 + k, i * stride[-2] + j * stride[-1], stride[-3], 0, scene)
-                for i in range(3) for j in range(3)
+                for i in range(3)
+                for j in range(3)
             ]
     lists = [(_Place * max(1, len(x)))(*x) for x in (places[0], places[1], between, bodies)]
     inputs = _Inputs(*(ctypes.addressof(x) for x in lists))

@@ -323,7 +323,7 @@ def _derived(
 
 
 def _derived_meta(inputs, parts, pairs, origin: Tensor, found: list[Tensor], *others) -> tuple[Tensor, ...]:
-    (*batch, slots, _), scenes = found[0].shape, found[3].numel()
+    slots, scenes = found[0].shape[-2], found[3].numel()
     points, bodies, room = parts[0].shape[-3], found[2].shape[-2], pairs[0].shape[-1] if pairs else 0
     shapes = (28, slots, scenes), (scenes, points, slots, 18), (scenes, room, 43), (scenes, bodies, 36)
     return tuple(origin.new_empty(shape) for shape in shapes)
@@ -451,9 +451,7 @@ _STATIC = "str topology, float[] law"
 _operators = torch.library.Library("torchdlo", "FRAGMENT")
 _operators.define(f"engaged({_TENSORS}, {_STATIC}) -> Tensor[]")
 _operators.define(f"engaged_whole({_TENSORS}, {_STATIC}) -> ({', '.join(['Tensor'] * 10)})")
-_operators.define(
-    f"engaged_back({_TENSORS}, Tensor[] found, Tensor[] by, {_STATIC}) -> ({', '.join(['Tensor'] * 4)})"
-)
+_operators.define(f"engaged_back({_TENSORS}, Tensor[] found, Tensor[] by, {_STATIC}) -> ({', '.join(['Tensor'] * 4)})")
 for _device in ("CPU", "CUDA"):
     _operators.impl("engaged", _engaged, _device)
 for _name, _run, _shapes in (("engaged_whole", _whole, _whole_meta), ("engaged_back", _derived, _derived_meta)):
