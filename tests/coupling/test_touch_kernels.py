@@ -12,8 +12,8 @@ from touching import F64
 
 from torchdlo import scene
 from torchdlo.coupling import RodBody, RodContact
-from torchdlo.coupling.rod_body import touch_op as body_touch
-from torchdlo.coupling.rod_contact import touch_op as rod_touch
+from torchdlo.coupling.rod_body import body_touch_op as body_touch
+from torchdlo.coupling.rod_contact import rod_touch_op as rod_touch
 from torchdlo.physics import tree
 from torchdlo.physics.effects.elastic import Bend
 from torchdlo.physics.effects.external import Damping, Gravity

@@ -43,8 +43,8 @@ from torchdlo.coupling.common.coulomb_friction import (
     rebound_separation,
     separation_needed,
 )
+from torchdlo.coupling.rod_body import body_touch_op
 from torchdlo.coupling.rod_body import rod_body_op as body_sweeps
-from torchdlo.coupling.rod_body import touch_op
 from torchdlo.physics.constraints.contact_penalty import Touch
 from torchdlo.physics.effects.base import ContactForces, Effect, EffectKind, PredictedMotion, Values
 from torchdlo.physics.linalg.numerics import cross, dot, safe_norm
@@ -223,14 +223,14 @@ class RodBody(Effect):
         of = [[float(k == j) for j in free] for k, n in enumerate(count) for _ in range(n)]
         place = [[float(k == j) for j in free] for k in range(len(count))]
         mask, radius, rubs = view.params.rest.edge_mask, view.params.material.radius, 1.0 if self.friction else 0.0
-        if touch_op.kernel_fits(bodies):
+        if body_touch_op.kernel_fits(bodies):
             law, searched = (self.recovery, self.slowest), [n - 2 for n in count]
-            found = touch_op.find_touches(view, motion, searched, friction=self.friction, law=law)
+            found = body_touch_op.find_touches(view, motion, searched, friction=self.friction, law=law)
         else:
             found = self._touches(view, motion)
         share, normal, wanted, given, mu, arm = found
         edges = mask, view.tangent, radius, rubs * radius / view.length
-        shape = torch.broadcast_shapes(share.shape, *(x.unsqueeze(-3).shape[:-1] + (1,) for x in edges))[:-1]
+        shape = torch.broadcast_shapes(share.shape, *((*x.unsqueeze(-3).shape[:-1], 1) for x in edges))[:-1]
         real, tangent, radius, lever = (x.unsqueeze(-3).expand(*shape, x.shape[-1]) for x in edges)
         share, normal, wanted, given, mu, arm = (x.expand(*shape, x.shape[-1]) for x in found)
         resist = inertia(bodies, free) if free else share.new_zeros(0, 6, 6)
