@@ -17,7 +17,7 @@ from torch import Tensor
 from torchdlo.coupling.bodies import shape_sdf
 from torchdlo.coupling.bodies.dynamics import Body, PredictedBodyMotion
 from torchdlo.coupling.common import scene_packing
-from torchdlo.coupling.common.vector_components import axes
+from torchdlo.physics.linalg.vector_components import axes
 from torchdlo.physics.kernels import lanes
 from torchdlo.physics.rod.kinematics import View
 

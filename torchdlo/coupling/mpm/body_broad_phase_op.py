@@ -16,7 +16,7 @@ from torch import Tensor
 
 from torchdlo.coupling.bodies.dynamics import PredictedBodyMotion
 from torchdlo.coupling.common import scene_packing
-from torchdlo.coupling.common.vector_components import axes
+from torchdlo.physics.linalg.vector_components import axes
 from torchdlo.coupling.mpm.particles import Grid
 from torchdlo.coupling.mpm.substep import Nodes
 

@@ -201,6 +201,8 @@ class RodBody(Effect):
     """Share of a shallow overlap that a substep removes; a small one lets ropes come to rest."""
     slowest: float = 0.02
     """Approach below which nothing rebounds [m/s]."""
+    left_out: tuple[tuple[int, int], ...] = ()
+    """Edges and bodies, by their places in the scene, that go through each other: those next to joints."""
 
     name: ClassVar[str] = "rod_body"
     kind: ClassVar[EffectKind] = "force"
@@ -217,7 +219,7 @@ class RodBody(Effect):
     def engage(self, view: View, motion: PredictedMotion, values: Values) -> Touch:
         """Return the points of edges that may touch bodies in an implicit substep."""
         bodies = motion.bodies
-        points, state = _points(view, bodies, self.pieces), bodies.state
+        points, state = self._points(view, bodies), bodies.state
         at, axes = points.at, points.axes
         none = torch.zeros_like(motion.change)
         still, slip = points.seen(none, bodies)
@@ -244,13 +246,13 @@ class RodBody(Effect):
     def solve_contact(self, view: View, motion: PredictedMotion, values: Values) -> ContactForces:
         """Return the forces that keep ropes outside of bodies and rub [N]."""
         bodies = motion.bodies
-        if body_sweeps.kernel_fits(bodies):
+        if body_sweeps.kernel_fits(bodies) and not self.left_out:
             pieces = [points_per_edge(b, self.pieces) - 2 for b in bodies.bodies]
             law = (self.recovery, self.slowest)
             return body_sweeps.contact_wrenches(
                 view, motion, pieces, sweeps=self.sweeps, friction=self.friction, law=law
             )
-        points = _points(view, bodies, self.pieces)
+        points = self._points(view, bodies)
         along, slip = points.seen(motion.change, bodies)
         wanted = self._target(points, view, bodies, along)
         softness = _softness(points, motion.give, bodies)
@@ -262,6 +264,16 @@ class RodBody(Effect):
             normal, friction = self._sweep(points, (normal, friction), (along, slip), wanted, softness, bodies)
             push = points.exerted(normal, friction)
         return push
+
+    def _points(self, view: View, bodies: PredictedBodyMotion) -> _Points:
+        points = _points(view, bodies, self.pieces)
+        if not self.left_out:
+            return points
+        whole = torch.ones(len(bodies.bodies), view.topology.size)
+        for edge, body in self.left_out:
+            whole[body, edge] = 0.0
+        there = points.axes.of[..., 0] @ whole.to(points.real)
+        return dataclasses.replace(points, real=points.real * there.unsqueeze(-1))
 
     def _target(
         self, points: _Points, view: View, bodies: PredictedBodyMotion, along: Tensor, calm: bool = False
