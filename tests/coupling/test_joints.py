@@ -111,7 +111,12 @@ def flying(joint: Joint | None, integrator: str, **other):
     frames = other.get("twist", "none") != "none"
     effects = [BendFrame(), Twist()] if frames else [Bend()]
     scene, params, state = scenes.make(
-        [rope], effects, bodies=[plug], joints=[joint] if joint else [], integrator=integrator, **STEPS[integrator] | other
+        [rope],
+        effects,
+        bodies=[plug],
+        joints=[joint] if joint else [],
+        integrator=integrator,
+        **STEPS[integrator] | other,
     )
     vel = torch.randn(9, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     return scene, params, tree.replace(state, rods=tree.replace(state.rods, vel=0.1 * vel))
@@ -131,7 +136,9 @@ def gap(made, state: scenes.State) -> Tensor:
     """By how far joined points miss their places in the body [m]."""
     joints, quat = made[0].joints, state.bodies.quat[..., :1, :]
     local = rotate(quat.expand(*made[1].joints.local.shape[:-1], 4), made[1].joints.local)
-    return joints.weights(state.rods.pos.shape[-2], state.rods.pos) @ state.rods.pos - state.bodies.pos[..., :1, :] - local
+    return (
+        joints.weights(state.rods.pos.shape[-2], state.rods.pos) @ state.rods.pos - state.bodies.pos[..., :1, :] - local
+    )
 
 
 @pytest.mark.parametrize("place", PLACES)
@@ -174,12 +181,12 @@ def test_light_and_heavy_plugs_gain_no_energy(dt: float, cable: float, plug: flo
 
     first, most = None, -math.inf
     with torch.no_grad():
-        for _ in range(round(0.25 / dt)):
+        for _ in range(round(0.1 / dt)):
             later = step(params, state, control)
             now = energy(state, later)
             first = now if first is None else first
             most, state = max(most, now), later
-    fallen = G * (cable + plug) * 0.05
+    fallen = G * (cable + plug) * 0.02
     assert most < first + 0.01 * fallen
     assert float(gap(made, state).abs().max()) < 1e-12
     scenes.check_state(state)
@@ -213,7 +220,10 @@ def inputs(made) -> list[Tensor]:
 @pytest.mark.parametrize("integrator", STEPS)
 def test_gradients_are_those_of_differences(integrator: str, place: str) -> None:
     joint, twist = PLACES[place]
-    made = flying(joint, integrator, twist=twist, substeps=1, dt=1e-3 if integrator == "implicit" else 2e-4)
+    # The velocities that ropes start with do not fit their lengths: the first step has far to go.
+    steps = {"substeps": 1, "dt": 1e-3} if integrator == "implicit" else {"substeps": 1, "dt": 2e-4}
+    steps |= {"constraint_iterations": 7} if integrator == "explicit" else {}
+    made = flying(joint, integrator, twist=twist, **steps)
     leaves = inputs(made)
     found = torch.autograd.grad(loss(made, leaves), leaves)
     generator = torch.Generator().manual_seed(1)

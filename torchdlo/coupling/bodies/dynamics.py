@@ -1,8 +1,8 @@
 """Rigid bodies: what they are, where they are, and how they move without contact.
 
 Velocities live half a substep before poses, as those of the rods do (Stoermer-Verlet), so that an impulse between a
-rod and a body changes both by the same amount of momentum. Free bodies turn as in `linalg.free_rotation`. All poses are of the centre of mass and of the principal
-axes; quaternions are (w, x, y, z), body to world.
+rod and a body changes both by the same amount of momentum. Free bodies turn as in `physics.linalg.free_rotation`. All
+poses are of the centre of mass and of the principal axes; quaternions are (w, x, y, z), body to world.
 """
 
 from __future__ import annotations

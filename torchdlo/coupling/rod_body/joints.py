@@ -398,7 +398,8 @@ def _body(place: _Place, spec: Joint, where: str) -> int:
     body = names.index(spec.body) if isinstance(spec.body, str) and spec.body in names else spec.body
     known = f"0 to {len(kinds) - 1}, or one of {names}" if kinds else "but the scene has none"
     _need(
-        not isinstance(body, str) and body in range(len(kinds)), f"{where}.body: expected a body, {known}, given {body!r}"
+        not isinstance(body, str) and body in range(len(kinds)),
+        f"{where}.body: expected a body, {known}, given {body!r}",
     )
     assert isinstance(body, int)
     kind = kinds[body]
@@ -488,7 +489,7 @@ def apart(
                 here = slot
                 while True:
                     edge = here if onward is after else onward[here]
-                    if not mask[edge] or (edge, body) in left_out and here != slot:
+                    if not mask[edge] or ((edge, body) in left_out and here != slot):
                         break
                     left_out.add((edge, body))
                     here = onward[here]

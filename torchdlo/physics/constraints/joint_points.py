@@ -215,6 +215,4 @@ def _newton(
     force = -torch.linalg.solve(system.expand(*batch, *system.shape[-2:]), left.unsqueeze(-1)).squeeze(-1)
     change = alone + (pulled * force.movedim(-1, 0)[..., None, None]).sum(0)
     bodies = turned + (mobile @ levers @ force.unsqueeze(-1)).squeeze(-1)
-    return Joined(
-        tension + change, now.force + force.unflatten(-1, (-1, 3)), now.moved - bodies.unflatten(-1, (-1, 6))
-    )
+    return Joined(tension + change, now.force + force.unflatten(-1, (-1, 3)), now.moved - bodies.unflatten(-1, (-1, 6)))

@@ -21,8 +21,8 @@ from torch import Tensor
 
 from torchdlo.physics import tree
 from torchdlo.physics.constraints import contact_penalty as penalty
-from torchdlo.physics.constraints.contact_penalty import HARD, Pairs, Touch
 from torchdlo.physics.constraints import joint_points
+from torchdlo.physics.constraints.contact_penalty import HARD, Pairs, Touch
 from torchdlo.physics.constraints.edge_lengths import Inertia, Lengths, LengthSystem, saddle_order
 from torchdlo.physics.constraints.joint_points import JointPoints
 from torchdlo.physics.integrators import contact_kernel
@@ -382,7 +382,9 @@ def _whole(*given) -> list[Tensor]:
     return [x.contiguous() for x in _by_kernel(*given)]
 
 
-def _engaged(inputs: list[Tensor], parts: list[Tensor], pairs: list[Tensor], joints: list[Tensor], *law) -> list[Tensor]:
+def _engaged(
+    inputs: list[Tensor], parts: list[Tensor], pairs: list[Tensor], joints: list[Tensor], *law
+) -> list[Tensor]:
     """Return positions, tensions, displacements of bodies, how hard contact was, and forces of joints."""
     if not joints and contact_kernel.available(inputs[0]):
         found = [x.contiguous() for x in _by_kernel(inputs, parts, pairs, joints, *law)[:4]]
@@ -446,7 +448,9 @@ def _whole_meta(*given) -> list[Tensor]:
     return [pos, tension, bodies, hard, *(torch.empty_like(x) for x in later)]
 
 
-_ARGUMENTS = "Tensor[] inputs, Tensor[] parts, Tensor[] pairs, Tensor[] joints, Tensor origin, str topology, float[] law"
+_ARGUMENTS = (
+    "Tensor[] inputs, Tensor[] parts, Tensor[] pairs, Tensor[] joints, Tensor origin, str topology, float[] law"
+)
 _operators = torch.library.Library("torchdlo", "FRAGMENT")
 for _name, _run, _shapes in (("engaged", _engaged, _engaged_meta), ("engaged_whole", _whole, _whole_meta)):
     _operators.define(f"{_name}({_ARGUMENTS}) -> Tensor[]")
