@@ -287,8 +287,8 @@ def test_a_welded_plug_turns_on_the_twist_of_its_rope() -> None:
     rope = Rope(line(9, 0.4), radius=0.004, mass=0.01, bend=1e-4, twist=1e-3)
     plug = RigidBody("box", (0.01, 0.015, 0.02), (0.0, 0.0, -0.42), mass=0.05, omega=(0.0, 0.0, 2.0))
     scene, params, state = scenes.make(
-        [rope], [Gravity(), BendFrame(), Twist()], bodies=[plug], joints=[Joint(body=0)], integrator="implicit", dt=1e-3,
-        substeps=1, prescribed_vertices=[0, 1], prescribed_edges=[0], twist="quasistatic",
+        [rope], [Gravity(), BendFrame(), Twist()], bodies=[plug], joints=[Joint(body=0)], integrator="implicit",
+        dt=1e-3, substeps=1, prescribed_vertices=[0, 1], prescribed_edges=[0], twist="quasistatic",
     )  # fmt: skip
     control, step = scenes.stationary_control(scene, state), scenes.stepper(scene, compiled=False, recorded=True)
     period = 2 * math.pi * math.sqrt(0.35 * 0.05 / 3 * (0.01**2 + 0.015**2) / 1e-3)

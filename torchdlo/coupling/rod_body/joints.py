@@ -305,9 +305,10 @@ def place_joints(
 
 def _add(place: _Place, found: _Found, spec: Joint, where: str) -> None:
     _need(spec.kind in ("weld", "ball"), f"{where}.kind: expected 'weld' or 'ball', given {spec.kind!r}")
+    given = "none" if spec.body is None else "both"
     _need(
         (spec.body is None) != (spec.other_rope is None),
-        f"{where}: expected either a body or other_rope to join the rope to, given {'none' if spec.body is None else 'both'}",
+        f"{where}: expected either a body or other_rope to join the rope to, given {given}",
     )
     _need(spec.vertex is None or spec.at is None, f"{where}: expected either vertex or at, given both")
     found.first.append(len(found.points))
@@ -455,8 +456,8 @@ def _check_slots(place: _Place, found: _Found, spec: Joint, where: str) -> None:
         found.balls += slots
     _need(
         not twice,
-        f"{where}: vertex {twice[0] - first[rope] if twice else 0} belongs to a weld already, with its neighbours; join "
-        "vertices further apart, or weld the bodies into one",
+        f"{where}: vertex {twice[0] - first[rope] if twice else 0} belongs to a weld already, with its neighbours; "
+        "join vertices further apart, or weld the bodies into one",
     )
 
 
