@@ -300,16 +300,21 @@ def make(
         pulls,
     )
     if scene.twist == "quasistatic":
-        held = stationary_control(scene, first)
-        changed = altered_params(scene.effects, topology, rods, numbers)
-        settings, targets = scene.settings, Targets(held.pos, held.director)
-        if tied is not None and tied.frames:
-            carried = joined.directors_now(tied, tree.part(sits), tree.part(placed))
-            settings, targets = with_joints(settings, targets, carried)
-        settled, _ = settle_twist(settings, changed, numbers, state, targets, 30)
-        first = tree.replace(first, rods=tree.replace(settled, twist_rate=torch.zeros_like(settled.twist)))
+        first = _settled(scene, params, first)
     # No two leaves share memory: steps are compiled for which of them do, and later states have none.
     return scene, params, tree.map(torch.clone, first)
+
+
+def _settled(scene: Scene, params: Params, first: State) -> State:
+    """Return a state whose twist is in balance."""
+    held, settings, rods = stationary_control(scene, first), scene.settings, params.rods
+    targets = Targets(held.pos, held.director)
+    if scene.joints is not None and scene.joints.frames:
+        carried = joined.directors_now(scene.joints, tree.part(params.joints), tree.part(first.bodies))
+        settings, targets = with_joints(settings, targets, carried)
+    changed = altered_params(scene.effects, scene.topology, rods, params.effects)
+    settled, _ = settle_twist(settings, changed, params.effects, first.rods, targets, 30)
+    return tree.replace(first, rods=tree.replace(settled, twist_rate=torch.zeros_like(settled.twist)))
 
 
 def _mention(scene: Scene, state: RodState) -> None:

@@ -477,7 +477,8 @@ def apart(
     after, mask = topology.successor(), topology.edge_mask()
     before = [after.index(k) for k in range(topology.size)]
     left_out: set[tuple[int, int]] = set()
-    for point, body in zip(joints.points, joints.bodies, strict=True):
+    for first, spot in zip(joints.first, joints.spots, strict=True):
+        body = joints.bodies[first]
         if body < 0:
             continue
         quat, centre = placed.quat.detach()[..., body : body + 1, :], placed.pos.detach()[..., body : body + 1, :]
@@ -485,7 +486,7 @@ def apart(
         local = rotate(conjugate(quat).expand(*pos.shape[:-1], 4), pos - centre)
         near = shape_sdf.probe(kinds[body].shape, size, local, grid, kinds[body].cells)[0] < 1.05 * radius
         inside = near.reshape(-1, topology.size).any(0).tolist()
-        for slot, _ in point:
+        for slot, _ in spot:
             for onward in (after, before):
                 here = slot
                 while True:
