@@ -202,6 +202,8 @@ class RodBody(Effect):
     """Share of a shallow overlap that a substep removes; a small one lets ropes come to rest."""
     slowest: float = 0.02
     """Approach below which nothing rebounds [m/s]."""
+    left_out: tuple[tuple[int, int], ...] = ()
+    """Edges and bodies, by their places in the scene, that go through each other: those next to joints."""
 
     name: ClassVar[str] = "rod_body"
     kind: ClassVar[EffectKind] = "force"
@@ -232,6 +234,7 @@ class RodBody(Effect):
         edges = mask, view.tangent, radius, rubs * radius / view.length
         shape = torch.broadcast_shapes(share.shape, *((*x.unsqueeze(-3).shape[:-1], 1) for x in edges))[:-1]
         real, tangent, radius, lever = (x.unsqueeze(-3).expand(*shape, x.shape[-1]) for x in edges)
+        real = real * self._there(view, bodies)
         share, normal, wanted, given, mu, arm = (x.expand(*shape, x.shape[-1]) for x in found)
         resist = inertia(bodies, free) if free else share.new_zeros(0, 6, 6)
         like = share.new_tensor
@@ -241,7 +244,7 @@ class RodBody(Effect):
     def _touches(self, view: View, motion: PredictedMotion) -> tuple[Tensor, ...]:
         """Return share, normal, wanted, given, mu and arm of points by tensor operations; see `Touch`."""
         bodies = motion.bodies
-        points, state = _points(view, bodies, self.pieces), bodies.state
+        points, state = self._points(view, bodies), bodies.state
         at, axes = points.at, points.axes
         still, slip = points.seen(torch.zeros_like(motion.change), bodies)
         wanted = self._target(points, view, bodies, points.seen(motion.change, bodies)[0], calm=True)
@@ -254,13 +257,13 @@ class RodBody(Effect):
     def solve_contact(self, view: View, motion: PredictedMotion, values: Values) -> ContactForces:
         """Return the forces that keep ropes outside of bodies and rub [N]."""
         bodies = motion.bodies
-        if body_sweeps.kernel_fits(bodies):
+        if body_sweeps.kernel_fits(bodies) and not self.left_out:
             pieces = [points_per_edge(b, self.pieces) - 2 for b in bodies.bodies]
             law = (self.recovery, self.slowest)
             return body_sweeps.contact_wrenches(
                 view, motion, pieces, sweeps=self.sweeps, friction=self.friction, law=law
             )
-        points = _points(view, bodies, self.pieces)
+        points = self._points(view, bodies)
         along, slip = points.seen(motion.change, bodies)
         wanted = self._target(points, view, bodies, along)
         softness = _softness(points, motion.give, bodies)
@@ -272,6 +275,20 @@ class RodBody(Effect):
             normal, friction = self._sweep(points, (normal, friction), (along, slip), wanted, softness, bodies)
             push = points.exerted(normal, friction)
         return push
+
+    def _points(self, view: View, bodies: PredictedBodyMotion) -> _Points:
+        points = _points(view, bodies, self.pieces)
+        return dataclasses.replace(points, real=points.real * self._there(view, bodies)) if self.left_out else points
+
+    def _there(self, view: View, bodies: PredictedBodyMotion) -> Tensor:
+        """Return 0 at points of edges that go through their body, else 1 [1], shape (F, V, 1) or (1, 1, 1)."""
+        mask = view.params.rest.edge_mask
+        if not self.left_out:
+            return mask.new_ones(1, 1, 1)
+        out = set(self.left_out)
+        count = [points_per_edge(b, self.pieces) for b in bodies.bodies]
+        rows = [[float((edge, k) not in out) for edge in range(view.topology.size)] for k in range(len(count))]
+        return mask.new_tensor([row for row, n in zip(rows, count, strict=True) for _ in range(n)]).unsqueeze(-1)
 
     def _target(
         self, points: _Points, view: View, bodies: PredictedBodyMotion, along: Tensor, calm: bool = False
