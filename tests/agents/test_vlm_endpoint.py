@@ -72,8 +72,38 @@ def test_the_key_is_written_nowhere(server: Server, tmp_path: Path) -> None:
     server.answers.clear()
     server.say({"vertex": 4})
     asked(server, tmp_path)
+    server.answers.clear()
+    server.requests.clear()
+    server.say("Your key is sk-very-secret.")
+    # As JSON may have it, too.
+    server.say(completion("Once more: KEY").replace(b"KEY", b"sk\\u002dvery\\u002dsecret"))
+    server.say({"vertex": 4})
+    assert asked(server, tmp_path / "echo")[0] == 4
     files = [p for p in tmp_path.rglob("*") if p.is_file()]
-    assert files and not any(b"sk-very-secret" in p.read_bytes() for p in files)
+    assert len(files) > 3 and not any(b"sk-very-secret" in p.read_bytes() for p in files)
+    assert "Your key is ***." in (tmp_path / "echo" / "exchanges" / "001.json").read_text()
+
+
+@pytest.mark.parametrize("key", ["sk-very-secret\n", "  sk-very-secret"])
+def test_blanks_about_a_key_are_left_out(server: Server, monkeypatch: pytest.MonkeyPatch, key: str) -> None:
+    monkeypatch.setenv("OPENAI_API_KEY", key)
+    server.say({"vertex": 4})
+    assert asked(server)[0] == 4 and server.headers[0]["authorization"] == "Bearer sk-very-secret"
+
+
+@pytest.mark.parametrize("key", ["sk-very-secret\nmore", "sk-very-secr\u00e9t"])
+def test_keys_that_are_none_are_not_shown(monkeypatch: pytest.MonkeyPatch, key: str) -> None:
+    monkeypatch.setenv("OPENAI_API_KEY", key)
+    with pytest.raises(InputError, match=r"^OPENAI_API_KEY: .*\.$") as caught:
+        Endpoint("http://localhost:1/v1", "m")
+    assert "sk-" not in str(caught.value)
+
+
+def test_words_in_the_place_of_a_key_stay_in_answers(server: Server, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("OPENAI_API_KEY", "none")
+    server.say({"vertex": "none"})
+    server.say({"vertex": 4})
+    assert asked(server)[0] == 4 and "none" in server.requests[1]["messages"][-2]["content"]
 
 
 FIXED = [
@@ -137,6 +167,7 @@ def test_errors_that_may_pass_are_waited_for(server: Server, status: int) -> Non
     [
         ("flood", "its answer is larger than 100000 bytes"),
         ("drip", "did not end its answer within 0.4 s"),
+        ("drip_headers", "did not end its answer within 0.4 s"),
         ("sleep", "did not answer within 0.4 s"),
         ("hang_up", "there is no connection"),
         ("nonsense", "no answer to the question for grasps would do"),
@@ -177,8 +208,9 @@ def test_nobody_there_is_one_sentence() -> None:
 
 @pytest.mark.parametrize("url", ["", "localhost", "file:///etc/passwd", "http://", "ftp://x/", "http://me:pw@x/v1"])
 def test_addresses_are_checked(url: str) -> None:
-    with pytest.raises(InputError, match=r"^endpoint: .*\.$"):
+    with pytest.raises(InputError, match=r"^endpoint: .*\.$") as caught:
         Endpoint(url, "m")
+    assert "pw" not in str(caught.value)
 
 
 def test_the_budget_ends_a_run_that_can_go_on(server: Server, tmp_path: Path) -> None:
