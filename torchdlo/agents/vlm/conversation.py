@@ -71,6 +71,8 @@ class LanguageModel(Protocol):
 
     source: str
     """What is written down beside everything that comes of it."""
+    remote: bool
+    """Whether questions are sent to it."""
 
     def reply(self, question: Question, messages: list[dict[str, Any]], digest: str) -> Reply:
         """Return what it says to messages: {"role", "text", "pictures"} each.
@@ -110,6 +112,8 @@ class Conversation:
     callback: Callable[[str], None] = lambda _: None
     exchanges: list[dict[str, Any]] = field(default_factory=list)
     """All that was said so far."""
+    unanswered: dict[str, Any] | None = None
+    """What was sent and is not answered; its response is None."""
 
     @property
     def calls(self) -> int:
@@ -178,19 +182,26 @@ class Conversation:
                     f"{self.model.source}: the budget of {self.budget.calls} calls and {self.budget.tokens} tokens is "
                     f"used up after {self.calls} calls and {self.tokens} tokens; go on with --resume and more of it."
                 )
-            begun = time.monotonic()
-            reply = self.model.reply(question, said, digest)
             found = {
                 "generator": "torchdlo",
                 "number": number,
                 "source": self.model.source,
                 "request": request,
                 "request_sha256": digest,
-                "response": reply.text,
-                "tokens": reply.tokens,
-                "seconds": round(time.monotonic() - begun, 3),
+                "response": None,
+                "tokens": 0,
+                "seconds": 0.0,
             }
+            if self.model.remote:
+                # What is sent is written down, whether an answer comes or not.
+                self._keep(found, question)
+                self.unanswered = found
+            begun = time.monotonic()
+            reply = self.model.reply(question, said, digest)
+            found = found | {"response": reply.text, "tokens": reply.tokens}
+            found["seconds"] = round(time.monotonic() - begun, 3)
             self._keep(found, question)
+            self.unanswered = None
         self.exchanges.append(found)
         return found["response"]
 

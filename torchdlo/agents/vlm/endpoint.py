@@ -14,7 +14,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 from urllib.parse import urlsplit
 
 from torchdlo.agents.vlm.conversation import Question, Reply, plain_text
@@ -59,6 +59,7 @@ class Endpoint:
     answer_tokens: int = 8_000
     """Most tokens of an answer."""
     sleep: Callable[[float], None] = time.sleep
+    remote: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         parts = urlsplit(self.url)

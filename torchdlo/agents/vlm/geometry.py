@@ -33,6 +33,7 @@ class Geometry:
     """What answers in a model's place."""
 
     source = "geometry, no model"
+    remote = False
 
     def reply(self, question: Question, messages: list[dict[str, Any]], digest: str) -> Reply:
         """Return an answer from the facts."""
