@@ -240,9 +240,9 @@ def test_a_run_goes_on_where_it_was_stopped(tmp_path: Path, monkeypatch: pytest.
 
 def test_a_search_goes_on_where_it_was_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     # Nothing reaches it, so that all of the budget is played.
-    far = {**step(1, 0.36, success="x(rope[0]) > 9"), "waypoints": None}
+    far = {**step(1, 0.36, success="x(rope[0]) > 9", horizon=3), "waypoints": None}
     choices: dict[str, Any] = {"update": False, "episodes": 12}
-    whole = carried_out(answers(("plan", [far])), folder=tmp_path / "whole", **choices)
+    whole = carried_out(answers(("plan", [far, far])), folder=tmp_path / "whole", **choices)
     played: list[int] = []
     before = decomposition._Part.evaluate
 
@@ -258,15 +258,17 @@ def test_a_search_goes_on_where_it_was_stopped(tmp_path: Path, monkeypatch: pyte
 
     ends: list[Result] = []
     cut, options = tmp_path / "cut", Options(**(CHEAP | choices))
-    talk = Conversation(answers(("plan", [far])), cut)
+    talk = Conversation(answers(("plan", [far, far])), cut)
     with pytest.raises(KeyboardInterrupt):
         carry_out(Carry(), talk, options, folder=cut, callback=stop, unfinished=ends.append)
     assert [r.ended for r in ends] == ["not finished: it was stopped"] and played == [4, 4]
     assert [p.is_dir() for p in (cut / "steps").iterdir()] == [True]
-    again = carried_out(answers(("plan", [far])), folder=cut, resume=True, **choices)
-    assert played == [4, 4, 4]
-    assert [p.name for p in (cut / "steps").iterdir()] == ["01.json"]
-    torch.testing.assert_close(again.carried[0].actions, whole.carried[0].actions, rtol=0, atol=0)
+    again = carried_out(answers(("plan", [far, far])), folder=cut, resume=True, **choices)
+    # The rest of the first, and all of the second step.
+    assert played == [4] * 6
+    assert sorted(p.name for p in (cut / "steps").iterdir()) == ["01.json", "02.json"]
+    for one, other in zip(again.carried, whole.carried, strict=True):
+        torch.testing.assert_close(one.actions, other.actions, rtol=0, atol=0)
 
 
 def test_a_run_without_way_points_to_search_can_be_stopped_between_steps() -> None:
@@ -334,6 +336,12 @@ def test_the_stand_in_plans_one_step_and_says_what_it_is() -> None:
     made = json.loads(str(caught.value))["steps"][0]
     assert made["success"] == "z(ring_0) > 0.110 and z(ring_1) > 0.110"
     assert Geometry.source == "geometry, no model"
+
+
+@pytest.mark.parametrize("name", ["wiring_ring", "letter_art"])
+def test_the_stand_in_says_which_tasks_it_cannot_plan(name: str) -> None:
+    with pytest.raises(InputError, match=rf"^geometry, no model: {name} takes several grasps .* use --endpoint"):
+        carried_out(Geometry(), task=envs.find(name))
 
 
 @pytest.mark.parametrize("name", envs.TASKS)

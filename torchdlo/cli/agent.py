@@ -136,14 +136,14 @@ def propose(
     from torchdlo.agents.vlm.grasp_proposal import places_of, random_grasps
     from torchdlo.agents.vlm.grasp_proposal import propose_grasps as ask
     from torchdlo.agents.vlm.plan_schema import MODES
-    from torchdlo.envs import find
+    from torchdlo.envs import find, short_name
     from torchdlo.envs.core import episode
     from torchdlo.errors import InputError
 
     chosen = find(task)
     if mode not in MODES:
         raise InputError(f"mode: it is {mode!r}; expected one of {', '.join(MODES)}.")
-    out = out or Path("runs") / "propose" / f"{task}-{mode if random is None else f'random-{random}'}"
+    out = out or Path("runs") / "propose" / f"{short_name(task)}-{mode if random is None else f'random-{random}'}"
     check_writable(out / "proposal.json")
     if random is not None:
         found = random_grasps(places_of(chosen), random)
@@ -200,14 +200,14 @@ def plan(
     torchdlo plan lifting --geometry --episodes 480
     """
     from torchdlo.agents.vlm.decomposition import Options, carry_out
-    from torchdlo.envs import find
+    from torchdlo.envs import find, short_name
     from torchdlo.errors import InputError
     from torchdlo.report.pages.plan import plan_html
 
     if method not in ("hybrid", "cmaes"):
         raise InputError(f"method: it is {method!r}; expected hybrid or cmaes.")
     chosen = find(task)
-    out = out or Path("runs") / "plan" / task
+    out = out or Path("runs") / "plan" / short_name(task)
     for name in ("plan.json", "report.html"):
         check_writable(out / name)
     limits: dict[str, Any] = {"calls": calls, "tokens": tokens, "seconds": seconds, "resume": resume}

@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 
 from torchdlo.agents.trajopt.problem import Evaluation
-from torchdlo.agents.trajopt.search import SearchSettings, optimize
+from torchdlo.agents.trajopt.search import NothingFoundError, SearchSettings, optimize
 from torchdlo.agents.trajopt.search_journal import program_hash, remove_journal
 from torchdlo.agents.trajopt.task_problem import TaskProblem
 from torchdlo.agents.vlm.carried import Carried, Options, Result, WorldPainter
@@ -227,10 +227,14 @@ class _Run:
 
         settings.plan(problem)  # what is wrong with the options is not the step's fault
         begin = None if first is None else first[None]
-        kept_in: dict[str, Any] = {"journal": self.journal(number, part), "resume": self.talk.resume}
+        journal = self.journal(number, part)
+        kept_in: dict[str, Any] = {
+            "journal": journal,
+            "resume": self.talk.resume and journal is not None and journal.is_dir(),
+        }
         try:
             found = optimize(problem, settings, callback=told, first=begin, until_success=options.enough, **kept_in)
-        except InputError as error:
+        except NothingFoundError as error:
             raise _NotCarriedOut(plain_text(str(error))) from None
         if found.interrupted:
             raise KeyboardInterrupt
