@@ -140,9 +140,11 @@ class Conversation:
             {"role": "system", "text": question.system, "pictures": ()},
             {"role": "user", "text": question.text, "pictures": question.pictures},
         ]
-        reason = ""
-        for _ in range(1 + self.budget.again):
-            text = self._exchange(question, said)
+        reason, tries = "", 0
+        while tries <= self.budget.again:
+            text, new = self._exchange(question, said)
+            # What was said in a run that goes on used up its own tries.
+            tries += new
             try:
                 return check(_fitting(text, question.answer))
             except InputError as error:
@@ -162,8 +164,8 @@ class Conversation:
             f"tries; the last reason was: {reason} Use a stronger model, or --resume to ask again."
         )
 
-    def _exchange(self, question: Question, said: list[dict[str, Any]]) -> str:
-        """Return what the model says, from the folder if it said so before."""
+    def _exchange(self, question: Question, said: list[dict[str, Any]]) -> tuple[str, bool]:
+        """Return what the model says, from the folder if it said so before, and whether it was asked."""
         request = {
             "kind": question.kind,
             "messages": [
@@ -174,6 +176,7 @@ class Conversation:
         digest = hashlib.sha256(json.dumps(request, sort_keys=True).encode()).hexdigest()
         number = self.calls + 1
         found = self._recalled(number, digest)
+        new = found is None
         if found is not None:
             self.model.skip(number)
         else:
@@ -203,7 +206,7 @@ class Conversation:
             self._keep(found, question)
             self.unanswered = None
         self.exchanges.append(found)
-        return found["response"]
+        return found["response"], new
 
     def _file(self, number: int) -> Path | None:
         return None if self.folder is None else self.folder / "exchanges" / f"{number:03d}.json"
