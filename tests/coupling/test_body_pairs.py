@@ -9,7 +9,8 @@ import torch
 
 from tests.coupling.tumbling import F64, SHAPES, ground
 from torchdlo.coupling.bodies import contact_op
-from torchdlo.coupling.bodies.contact_effect import BodyContact, contact_forces
+from torchdlo.coupling.bodies.contact_effect import BodyContact, answer, contact_forces
+from torchdlo.coupling.bodies.contact_solver import inertia
 from torchdlo.coupling.bodies.dynamics import (
     PredictedBodyMotion,
     RigidBody,
@@ -19,6 +20,7 @@ from torchdlo.coupling.bodies.dynamics import (
 )
 from torchdlo.envs.assets.rigid_objects import pebble
 from torchdlo.physics import tree
+from torchdlo.physics.effects.base import ContactForces
 
 pytestmark = pytest.mark.skipif(not contact_op.ready("cpu", F64), reason="there is no C++ compiler")
 
@@ -51,8 +53,11 @@ def thrown(kinds: tuple[str, ...], seed: int = 1) -> list[RigidBody]:
     return solids
 
 
-def answered(solids: list[RigidBody], contact: BodyContact, shift: float = 0.0):
-    """Forces and torques, and the derivatives of a sum of them by all numbers, each of which is changed by a share."""
+def answered(solids: list[RigidBody], contact: BodyContact, shift: float = 0.0, hold: bool = False):
+    """Forces and torques, and the derivatives of a sum of them by all numbers, each of which is changed by a share.
+
+    If `hold`, how they fall with displacements is among them, in units of inertia.
+    """
     kinds, params, state = place_bodies(solids, torch.zeros(SCENES, 1, 3, dtype=F64))
     leaves, build = tree.flatten((params, state))
     signs = torch.Generator().manual_seed(2)
@@ -64,7 +69,13 @@ def answered(solids: list[RigidBody], contact: BodyContact, shift: float = 0.0):
     one = torch.zeros(1, 1, dtype=F64)
     pulled = torch.tensor([[0.0, 0.0, -9.81]], dtype=F64)
     motion = predict_free_motion(kinds, params, state, stationary_control(kinds, state), pulled, one, DT)
-    found = torch.cat([x.expand(SCENES, -1, -1) for x in contact_forces(contact, motion)], -1)
+    parts = answer(contact, motion, hold)
+    found = torch.cat([x.expand(SCENES, -1, -1) for x in parts[:2]], -1)
+    if hold:
+        free = [k for k, b in enumerate(kinds) if b.motion == "free"]
+        found = torch.cat(
+            [found.flatten(1), (parts[2] / inertia(motion, free).amax()).expand(SCENES, -1, 6, 6).flatten(1)], -1
+        )
     weight = torch.sin(torch.arange(found.numel(), dtype=F64)).reshape(found.shape)
     gradient = torch.autograd.grad((weight * found).sum(), leaves, allow_unused=True)
     return found.detach(), [torch.zeros_like(x) if g is None else g for x, g in zip(leaves, gradient, strict=True)]
@@ -87,22 +98,47 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("case", CASES)
-def test_the_kernel_and_tensor_operations_agree_with_their_gradients(case: str, monkeypatch) -> None:
+@pytest.mark.parametrize(
+    ("case", "hold"), [*((c, False) for c in CASES), ("box on plane", True), ("mesh and mesh", True), ("a heap", True)]
+)
+def test_the_kernel_and_tensor_operations_agree_with_their_gradients(case: str, hold: bool, monkeypatch) -> None:
     kinds, choices = CASES[case]
     solids, contact = thrown(kinds), BodyContact(**choices)
-    found, gradient = answered(solids, contact)
+    found, gradient = answered(solids, contact, 0.0, hold)
     monkeypatch.setattr(contact_op, "ready", lambda *_: False)
-    wanted, expected = answered(solids, contact)
-    assert int((wanted.abs().amax((-1, -2)) > 0).sum()) >= 3  # scenes with contact
+    wanted, expected = answered(solids, contact, 0.0, hold)
+    assert int((wanted.flatten(1).abs().amax(-1) > 0).sum()) >= 3  # scenes with contact
     assert float((found - wanted).norm()) < 1e-9 * float(wanted.norm())
     # Derivatives answer to rounding as the stiffness of contact makes them: the scale is what the tensor operations
     # themselves find when their inputs are rounded otherwise, by the last bit. Whether a step is worth taking that
     # changes next to nothing is a matter of rounding, too.
-    _, rounded = answered(solids, contact, 2**-52)
+    _, rounded = answered(solids, contact, 2**-52, hold)
     for one, other, near in zip(gradient, expected, rounded, strict=True):
         noise = float((near - other).norm()) + 1e-10 * float(other.norm())
         assert float((one - other).norm()) <= 30 * noise
+
+
+@pytest.mark.parametrize("slides", [False, True])
+def test_how_contact_holds_a_body_is_how_its_force_falls_with_the_displacement(slides: bool) -> None:
+    box = RigidBody("box", (0.05, 0.04, 0.03), (0, 0, 0.03), vel=(0.4 * slides, 0, 0), mass=0.3, mu_s=0.4, mu_k=0.3)
+    kinds, params, state = place_bodies([ground(mu_s=0.4, mu_k=0.3), box], torch.zeros(1, 1, 3, dtype=F64))
+    still, first = stationary_control(kinds, state), torch.zeros(1, 1, dtype=F64)
+    motion = predict_free_motion(kinds, params, state, still, torch.tensor([[0.5, 0.2, -9.81]], dtype=F64), first, DT)
+    hold = answer(BodyContact(), motion, True)[2]
+    mass = inertia(motion, [1])
+    for k in range(6):
+        more = torch.zeros(6, dtype=F64)
+        more[k] = 1e-3 if k < 3 else 1e-5  # less than what lifts a corner
+
+        def wrench(sign: float, more=more) -> torch.Tensor:
+            push = ContactForces(
+                *(torch.zeros(1, 3, dtype=F64), *(torch.stack([0 * x, sign * x]) for x in more.split(3)))
+            )
+            return torch.cat(contact_forces(BodyContact(), motion.pushed(push)), -1)[..., 1, :]
+
+        change = 0.5 * (wrench(1.0) - wrench(-1.0))
+        expected = -(hold @ torch.linalg.solve(mass + hold, more.unsqueeze(-1))).squeeze(-1)
+        assert float((change - expected).norm()) < 1e-4 * float(more.norm())
 
 
 def test_scenes_of_a_block_do_what_each_does_alone() -> None:
@@ -171,12 +207,13 @@ def test_the_operator_tells_compilers_the_truth() -> None:
     )
     fields = [members.permute(1, 2, 0).contiguous().requires_grad_()]
     none = fields[0].new_zeros(2, 0)
-    given = (fields, none, none, [0] * 6, [0, 0], [2, 5], [0, 1], [0, 1], 8, 8, [0.2, 1e-3, 0.02, DT])
-    torch.library.opcheck(
-        torch.ops.torchdlo.body_pairs.default,
-        given,
-        test_utils=("test_schema", "test_autograd_registration", "test_faketensor"),
-    )
+    lists = [0] * 6, [0, 0], [2, 5], [0, 1], [0, 1]
+    for hold in (False, True):
+        torch.library.opcheck(
+            torch.ops.torchdlo.body_pairs.default,
+            (fields, none, none, *lists, 8, 8, hold, [0.2, 1e-3, 0.02, DT]),
+            test_utils=("test_schema", "test_autograd_registration", "test_faketensor"),
+        )
 
 
 def test_second_derivatives_are_refused() -> None:

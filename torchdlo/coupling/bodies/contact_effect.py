@@ -42,7 +42,7 @@ from torch import Tensor
 from torchdlo.coupling.bodies import contact_op
 from torchdlo.coupling.bodies.contact_op import FIT, HARD
 from torchdlo.coupling.bodies.contact_points import deepest_points
-from torchdlo.coupling.bodies.contact_solver import BodySystem, Links, gather, inertia
+from torchdlo.coupling.bodies.contact_solver import BodySystem, Links, assembled, gather, inertia
 from torchdlo.coupling.bodies.dynamics import Body, PredictedBodyMotion
 from torchdlo.coupling.common.coulomb_friction import rebound_separation, separation_needed
 from torchdlo.physics import tree
@@ -203,9 +203,18 @@ def _detached(links: Links) -> Links:
 
 def contact_forces(contact: BodyContact, motion: PredictedBodyMotion) -> tuple[Tensor, Tensor]:
     """Return forces [N] and torques about the centres of mass [N m] of contact on bodies, shape (..., K, 3) each."""
+    return answer(contact, motion)[:2]
+
+
+def answer(contact: BodyContact, motion: PredictedBodyMotion, hold: bool = False) -> tuple[Tensor, ...]:
+    """Return `contact_forces`, and if asked for how these fall with the displacement of each free body alone.
+
+    The latter has shape (..., F, 6, 6) [N/m, N m/rad].
+    """
     if contact_op.kernel_fits(motion):
         law = (contact.recovery, contact.shallow, contact.slowest)
-        return contact_op.contact_wrench(motion, contact.chosen(motion.bodies), contact.points, contact.steps, law)
+        pairs = contact.chosen(motion.bodies)
+        return contact_op.contact_wrench(motion, pairs, contact.points, contact.steps, law, hold)
     free = [k for k, b in enumerate(motion.bodies) if b.motion == "free"]
     links = _links(contact, motion)
     system = BodySystem(links, free, inertia(motion, free))
@@ -229,7 +238,26 @@ def contact_forces(contact: BodyContact, motion: PredictedBodyMotion) -> tuple[T
     simple = (links.wanted - dot(links.normal, links.free)).clamp(min=0.0) * links.stiff / HARD * links.normal
     simple = simple * _fitting(links, motion, simple)
     found = _fitting(links, motion, force.detach()) > 1 - FIT
-    return links.exerted(torch.where(found, force, simple))
+    wrench = links.exerted(torch.where(found, force, simple))
+    if not hold:
+        return wrench
+    gradients = torch.where(found.unsqueeze(-1), _firmness(links, sets, system.moved(q)), 0.0)
+    blocks = assembled(links, torch.zeros_like(system.inertia), gradients, free)[..., : 36 * len(free)]
+    return *wrench, blocks.unflatten(-1, (len(free), 6, 6))
+
+
+def _firmness(links: Links, sets: _Sets, moved: Tensor) -> Tensor:
+    """Return by how much `_forces` fall with the motion of points [N/m], shape (..., C, 3, 3)."""
+    load = (links.stiff * sets.press * (links.wanted - dot(links.normal, moved))).clamp(min=0.0)
+    size, along = _slip(links, moved)
+    mu = torch.where(sets.slides > 0, links.mu_k, links.mu_s)
+    sticks = (sets.slides <= 0) & (sets.drag * size <= mu * load)
+    drag = torch.where(sticks, sets.drag, mu * load / torch.maximum(size, mu * load / links.stiff).clamp(min=1e-30))
+    press = links.stiff * sets.press * (load > 0)
+    n, t = links.normal.unsqueeze(-1), torch.where(sticks, 0.0, along).unsqueeze(-1)
+    press, drag, mu = (x.unsqueeze(-1) for x in (press, drag, mu))
+    across = torch.eye(3, dtype=n.dtype, device=n.device) - n @ n.mT
+    return press * (n @ n.mT) + drag * (across - t @ t.mT) - mu * press * (t @ n.mT)
 
 
 def _fitting(links: Links, motion: PredictedBodyMotion, force: Tensor) -> Tensor:
@@ -297,3 +325,28 @@ class BodyContact(Effect):
         if not self.chosen(motion.bodies.bodies):
             return ContactForces(none, none, none)
         return ContactForces(none, *contact_forces(self, motion.bodies))
+
+    def backs(self, bodies: PredictedBodyMotion) -> bool:
+        """Return whether any may touch another one."""
+        return bool(self.chosen(bodies.bodies))
+
+    def backed(self, bodies: PredictedBodyMotion, push: ContactForces) -> PredictedBodyMotion:
+        """Return where bodies would go under contact, and how it resists what moves them from there.
+
+        Under the push bodies go by d1, and contact, to first order, exerts w - K (d - d1) where they go by d. That
+        leads to (M + K) d = w + K d1 plus what is exerted, M their inertia.
+        """
+        free = [k for k, b in enumerate(bodies.bodies) if b.motion == "free"]
+        force, torque, hold = answer(self, bodies.pushed(push), True)
+        exerted, given = (
+            torch.cat(pair, -1)[..., free, :].unsqueeze(-1)
+            for pair in ((force, torque), (push.body_force, push.body_torque))
+        )
+        mass = inertia(bodies, free)
+        under = torch.linalg.solve(mass, exerted + given)
+        moved = torch.linalg.solve(mass + hold, exerted + hold @ under).squeeze(-1)
+        there = moved.new_zeros(len(bodies.bodies), len(free))
+        for j, k in enumerate(free):
+            there[k, j] = 1.0
+        change, turn = (there @ moved).split(3, -1)
+        return dataclasses.replace(bodies, change=bodies.change + change, turn=bodies.turn + turn, hold=hold)

@@ -22,7 +22,7 @@ from torchdlo.physics.linalg.vector_components import axes
 
 _FIRST = "Tensor[] bodies"
 _LISTS = "int[] cells, int[] many, int[] shapes, int[] free, int[] pairs"
-_OTHERS = f"Tensor grids, Tensor balls, {_LISTS}, int points, int steps, float[] law"
+_OTHERS = f"Tensor grids, Tensor balls, {_LISTS}, int points, int steps, bool hold, float[] law"
 HARD = 1e4
 """Stiffness of contact times the mobility of the two bodies: its inverse is the share of an impact that is let through.
 Harder contact takes more rounds, and single precision has no digits for it."""
@@ -37,28 +37,28 @@ _function, ready = scene_packing.kernel("body_pairs", "BodyContact, the forces o
 
 class _Sizes(ctypes.Structure):
     _fields_ = (
-        *((name, ctypes.c_int64) for name in ("bodies", "scenes", "pairs", "points", "steps")),
+        *((name, ctypes.c_int64) for name in ("bodies", "scenes", "pairs", "points", "steps", "hold")),
         *((name, ctypes.c_void_p) for name in ("shape", "free", "pair", "cells", "many", "grids", "balls")),
         *((name, ctypes.c_int64) for name in ("corners", "numbers")),
         *((name, ctypes.c_double) for name in ("recovery", "shallow", "slowest", "dt")),
     )
 
 
-def _sizes(like, grids, inscribed, cells, many, kinds, free, pairs, points: int, steps: int, law: Sequence[float]):
+def _sizes(like, grids, inscribed, cells, many, kinds, free, pairs, points, steps, hold, law):
     lists = (scene_packing.integers(tuple(x)) for x in (kinds, free, pairs, cells, many))
     fixed = (grids.data_ptr(), inscribed.data_ptr(), grids.shape[1], inscribed.shape[1])
-    return ctypes.byref(_Sizes(*like.shape[1:], len(pairs) // 2, points, steps, *lists, *fixed, *law))
+    return ctypes.byref(_Sizes(*like.shape[1:], len(pairs) // 2, points, steps, hold, *lists, *fixed, *law))
 
 
 def _exert(bodies: list[Tensor], *others) -> Tensor:
-    out = _exert_meta(bodies)
+    out = _exert_meta(bodies, *others)
     places = (scene_packing.fields(bodies), scene_packing.fields([out]))
     _function("exert", out.dtype)(*places, _sizes(bodies[0], *others), torch.get_num_threads())
     return out
 
 
 def _exert_meta(bodies: list[Tensor], *others) -> Tensor:
-    return bodies[0].new_empty(6, *bodies[0].shape[1:])
+    return bodies[0].new_empty(42 if others[-2] else 6, *bodies[0].shape[1:])
 
 
 def _back(bodies: list[Tensor], by: Tensor, *others) -> Tensor:
@@ -108,8 +108,11 @@ def contact_wrench(
     points: int,
     steps: int,
     law: tuple[float, float, float],
-) -> tuple[Tensor, Tensor]:
+    hold: bool = False,
+) -> tuple[Tensor, ...]:
     """Return forces [N] and torques [N m] of contact on bodies, shape (..., K, 3) each; differentiable once.
+
+    If `hold`, also how they fall with the displacement of each free body alone, (..., F, 6, 6) [N/m, N m/rad].
 
     Args:
         motion: where bodies would go.
@@ -118,6 +121,7 @@ def contact_wrench(
         steps: choices of the contacts that press and stick.
         law: share of a shallow overlap that a substep removes, overlap up to which only that share goes [m], and
             approach below which nothing rebounds [m/s].
+        hold: whether to return the last one.
     """
     members, count = _members(motion), len(motion.bodies)
     batch = torch.broadcast_shapes(*(x.shape[:-2] for x in members))
@@ -134,10 +138,12 @@ def contact_wrench(
         list(itertools.chain(*pairs)),
         points,
         steps,
+        hold,
         [*law, motion.dt],
     )
-    force, torque = scene_packing.unpack_components(found, batch).split(3, -1)
-    return force, torque
+    force, torque, *others = scene_packing.unpack_components(found, batch).split([3, 3, 36][: 3 if hold else 2], -1)
+    free = [k for k, b in enumerate(motion.bodies) if b.motion == "free"]
+    return force, torque, *(x[..., free, :].unflatten(-1, (6, 6)) for x in others)
 
 
 def kernel_fits(motion: PredictedBodyMotion) -> bool:

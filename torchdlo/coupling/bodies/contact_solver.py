@@ -87,7 +87,10 @@ def _skew(r: Tensor) -> Tensor:
 
 
 def inertia(motion: PredictedBodyMotion, free: list[int]) -> Tensor:
-    """Return by how much free bodies resist displacements and turns [N/m, N m/rad], shape (..., F, 6, 6)."""
+    """Return by how much free bodies, and what stands behind them, resist displacements and turns [N/m, N m/rad].
+
+    Shape (..., F, 6, 6).
+    """
     quat = motion.state.quat[..., free, :]
     axes = torch.eye(3, dtype=quat.dtype, device=quat.device)
     turn = torch.stack([rotate(quat, axis.expand(*quat.shape[:-1], 3)) for axis in axes], -1)
@@ -96,7 +99,8 @@ def inertia(motion: PredictedBodyMotion, free: list[int]) -> Tensor:
     batch = torch.broadcast_shapes(force.shape[:-2], torque.shape[:-2])
     force, torque = (x.expand(*batch, 3, 3) for x in (force, torque))
     none = torch.zeros_like(force)
-    return torch.cat([torch.cat([force, none], -1), torch.cat([none, torque], -1)], -2)
+    own = torch.cat([torch.cat([force, none], -1), torch.cat([none, torque], -1)], -2)
+    return own if motion.hold is None else own + motion.hold
 
 
 def _coupled(links: Links, free: list[int]) -> list[tuple[int, int]]:
@@ -104,7 +108,7 @@ def _coupled(links: Links, free: list[int]) -> list[tuple[int, int]]:
     return [(free.index(a), free.index(b)) for a, b in links.pairs if a in free and b in free]
 
 
-def _assembled(links: Links, inertia: Tensor, gradients: Tensor, free: list[int]) -> Tensor:
+def assembled(links: Links, inertia: Tensor, gradients: Tensor, free: list[int]) -> Tensor:
     """Return the matrix of the displacements of free bodies as `bodies` patterns want it, shape (..., m)."""
     unit = torch.eye(3, dtype=gradients.dtype, device=gradients.device).expand(*links.arms[0].shape, 3)
     seen = torch.cat([unit, -_skew(links.arms[0]), -unit, _skew(links.arms[1])], -1)
@@ -159,7 +163,7 @@ class BodySystem:
     def solve(self, gradients: Tensor, load: Tensor) -> Tensor:
         """Return displacements and turns under forces that fall with the motion, shape (..., F, 6)."""
         name = f"bodies:{len(self.free)}:" + ",".join(f"{a}-{b}" for a, b in _coupled(self.links, self.free))
-        entries = _assembled(self.links, self.inertia, gradients, self.free)
+        entries = assembled(self.links, self.inertia, gradients, self.free)
         load = load.flatten(-2)
         batch = torch.broadcast_shapes(entries.shape[:-1], load.shape[:-1])
         matrix, rhs = (x.expand(*batch, x.shape[-1]).reshape(-1, x.shape[-1]).T for x in (entries.detach(), load))

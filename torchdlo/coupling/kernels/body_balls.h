@@ -40,7 +40,7 @@ struct Candidate {
 };
 
 struct Sizes {
-  int64_t bodies, scenes, pairs, points, steps;
+  int64_t bodies, scenes, pairs, points, steps, hold;  // hold: whether to say how contact holds bodies
   const int64_t *shape, *free, *pair;  // per body; its place among free bodies, or -1; two bodies per pair
   const int64_t *cells, *many;         // three per body, and how many balls stand for a mesh
   const void *grids, *balls;           // of all bodies, each with so many corners, and with so many numbers

@@ -1,6 +1,7 @@
 // Contact among rigid bodies, and its derivative; formulas and names as in body_contact.py, balls.py and linked.py.
 //
-// All arrays have the scenes last: (K, B) for each field of Member in body_balls.h, force and torque on bodies (6).
+// All arrays have the scenes last: (K, B) for each field of Member in body_balls.h, force and torque on bodies (6), and
+// if asked for how these fall with the displacement of the body (36, row by row).
 //
 // A block of scenes is worked on side by side; pairs that are far apart in all of them cost next to nothing.
 #include "body_links.h"
@@ -9,6 +10,12 @@
 
 #include <limits>
 #include <memory>
+
+template <typename T, int N>
+struct Held {
+  Wrench<T, N> wrench;
+  Num<T, N> hold[36];
+};
 
 template <typename T>
 struct Block : Linked<T> {
@@ -266,9 +273,56 @@ struct Block : Linked<T> {
     return kept;
   }
 
+  // How the force of a contact falls with the motion of its points, (3, 3) row by row; see `_firmness`.
+  template <int N>
+  void firmness(const Link<T, N>& l, int c, const Three<T, N>& moved, Num<T, N>* out) const {
+    typedef Num<T, N> S;
+    const Sets<T>& s = sets[c];
+    Three<T, N> along;
+    const S size = slip(l, c, moved, along), none(T(0)), unit(T(1));
+    const S load = positive(S(stiff[c] * s.press) * (l.wanted - dot(l.normal, moved)));
+    const auto slides = s.slides > T(0);
+    const S mu = select(slides, l.mu_k, l.mu_s), limit = mu * load;
+    const auto sticks = ~slides & (s.drag * size.x <= limit.x);
+    const S drag = select(sticks, S(s.drag), limit / larger(larger(size, limit / S(stiff[c])), S(T(1e-30))));
+    const S press(load.x > T(0) ? stiff[c] * s.press : zero);
+    const S normals[3] = {l.normal.x, l.normal.y, l.normal.z}, ways[3] = {along.x, along.y, along.z};
+    for (int i = 0; i < 3; ++i)
+      for (int j = 0; j < 3; ++j) {
+        const S both = normals[i] * normals[j], ti = select(sticks, none, ways[i]), tj = select(sticks, none, ways[j]);
+        out[3 * i + j] = press * both + drag * ((i == j ? unit : none) - both - ti * tj) - mu * press * ti * normals[j];
+      }
+  }
+  // How what contacts exert on free bodies falls with the displacement of each alone.
+  template <int N, typename M>
+  void hold(const List<Link<T, N>>& l, const List<Three<T, N>>& moved, const M& good, List<Held<T, N>>& to) const {
+    typedef Num<T, N> S;
+    const S none(T(0)), unit(T(1));
+    for (size_t c = 0; c < l.size(); ++c) {
+      if (!active[owner[c]]) continue;
+      S falls[9];
+      firmness(l[c], int(c), moved[c], falls);
+      for (S& x : falls) x = select(good, x, none);
+      for (int side = 0; side < 2; ++side) {
+        const int k = side ? l[c].b : l[c].a;
+        if (n.free[k] < 0) continue;
+        const Three<T, N>& arm = l[c].arms[side];
+        for (int j = 0; j < 6; ++j) {
+          const int axis = j % 3;
+          const Three<T, N> e = {axis == 0 ? unit : none, axis == 1 ? unit : none, axis == 2 ? unit : none};
+          const Three<T, N> m = j < 3 ? e : cross(e, arm);
+          const auto row = [&](int i) { return falls[3 * i] * m.x + falls[3 * i + 1] * m.y + falls[3 * i + 2] * m.z; };
+          const Three<T, N> force = {row(0), row(1), row(2)}, torque = cross(arm, force);
+          const S fall[6] = {force.x, force.y, force.z, torque.x, torque.y, torque.z};
+          for (int i = 0; i < 6; ++i) to[k].hold[6 * i + j] = to[k].hold[6 * i + j] + fall[i];
+        }
+      }
+    }
+  }
+
   // What contacts exert on bodies, from bodies and contacts.
   template <int N>
-  Wrenches<N> finish(const Bodies<N>& b, const List<Touch<T, N>>& contacts) {
+  Wrenches<N> finish(const Bodies<N>& b, const List<Touch<T, N>>& contacts, List<Held<T, N>>* held = nullptr) {
     typedef Num<T, N> S;
     const List<Link<T, N>> l = this->template link<N>(b, contacts);
     List<S> q = constants<N>(motion), more = excess(b, l, q);
@@ -282,6 +336,7 @@ struct Block : Linked<T> {
     for (size_t c = 0; c < f.size(); ++c) plain[c] = {P(f[c].x.x), P(f[c].y.x), P(f[c].z.x)};
     const auto good = this->template fitting<0>(bodies, links, plain).x > T(1 - FIT);
     if (any(~good)) simplify(b, l, good, f);
+    if (held) hold(l, moved(l, q), good, *held);
     return this->exerted(l, f);
   }
   // Where rounds ended too early, all contacts press along their normals, by as much as fits at best.
@@ -299,8 +354,16 @@ struct Block : Linked<T> {
     }
   }
 
+  template <int N>
+  List<Held<T, N>> nothing() const {
+    const Num<T, N> none(T(0));
+    Held<T, N> empty;
+    empty.wrench = {{none, none, none}, {none, none, none}};
+    for (auto& x : empty.hold) x = none;
+    return List<Held<T, N>>(n.bodies, empty);
+  }
   // Returns derivatives by bodies, from those by what is exerted on them.
-  Bodies<0> backward(const Wrenches<0>& by) {
+  Bodies<0> backward(const Wrenches<0>& by, const List<Held<T, 0>>* by_held = nullptr) {
     Bodies<0> to(n.bodies);
     for (auto& k : to)
       for (int i = 0; i < ALL; ++i) ((P*)&k)[i] = P(T(0));
@@ -312,8 +375,12 @@ struct Block : Linked<T> {
     for (int k = 0; k < n.bodies; ++k) this->template remember<ALL>(bodies[k], b[k]);
     for (size_t k = 0; k < c.size(); ++k)
       if (active[owner[k]]) this->template remember<FIELDS>(contacts[k], c[k]);
-    const Wrenches<TAPED> out = finish<TAPED>(b, c);
+    List<Held<T, TAPED>> held;
+    if (by_held) held = nothing<TAPED>();
+    const Wrenches<TAPED> out = finish<TAPED>(b, c, by_held ? &held : nullptr);
     tape.begin();
+    for (int k = 0; by_held && k < n.bodies; ++k)
+      for (int i = 0; i < 36; ++i) held[k].hold[i].give((*by_held)[k].hold[i].x);
     for (int k = 0; k < n.bodies; ++k)
       for (int i = 0; i < 6; ++i) ((const Num<T, TAPED>*)&out[k])[i].give(((const P*)&by[k])[i].x);
     const Unknowns& at = last();
@@ -358,8 +425,11 @@ static void exert(const T* const* in, T* const* out, const Sizes& n, int threads
     const Num<T, 0> none(T(0));
     const bool near = block.prepare();
     List<Wrench<T, 0>> found(n.bodies, {{none, none, none}, {none, none, none}});
-    if (near) found = block.template finish<0>(block.bodies, block.contacts);
-    put(found, out, b, n.scenes);
+    List<Held<T, 0>> held;
+    if (n.hold) held = block.template nothing<0>();
+    if (near) found = block.template finish<0>(block.bodies, block.contacts, n.hold ? &held : nullptr);
+    for (size_t k = 0; k < held.size(); ++k) held[k].wrench = found[k];
+    n.hold ? put(held, out, b, n.scenes) : put(found, out, b, n.scenes);
   }
 }
 
@@ -369,9 +439,11 @@ static void back(const T* const* in, const T* const* by, T* const* out, const Si
     Block<T>& block = working<T>(n);
     fetch(block.bodies, in, b, n.scenes);
     List<Wrench<T, 0>> given(n.bodies);
-    fetch(given, by, b, n.scenes);
+    List<Held<T, 0>> held(n.hold ? n.bodies : 0);
+    n.hold ? fetch(held, by, b, n.scenes) : fetch(given, by, b, n.scenes);
+    for (size_t k = 0; k < held.size(); ++k) given[k] = held[k].wrench;
     block.prepare();
-    put(block.backward(given), out, b, n.scenes);
+    put(block.backward(given, n.hold ? &held : nullptr), out, b, n.scenes);
   }
 }
 

@@ -232,6 +232,19 @@ class Effect(ABC):
         """Return forces on vertices that answer to where they would go [N], shape (..., V, 3), or on bodies too."""
         return view.state.pos.new_zeros(1, 3)
 
+    def backs(self, bodies: Any) -> bool:
+        """Return whether it exerts on these bodies alone and has `backed`: implicit steps feel what is behind them."""
+        return False
+
+    def backed(self, bodies: Any, push: ContactForces) -> Any:
+        """Return where bodies would go under what this effect exerts, and how it resists what moves them from there.
+
+        Args:
+            bodies: where they would go under what all others exert but `push`, a `PredictedBodyMotion`.
+            push: what ropes exert, as far as it is known: that decides which contacts press and stick.
+        """
+        raise NotImplementedError
+
 
 def _in_order(effects: Iterable[Effect]) -> list[Effect]:
     effects = list(effects)

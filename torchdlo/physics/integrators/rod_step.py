@@ -11,6 +11,7 @@ strain at the end of the substep, which damps axial waves), and `numerical_dampi
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -228,6 +229,10 @@ def _answered(
 
     The motion is foreseen with the last tension, then found. Each effect answers to what the others exert. `others`
     are where bodies and matter would go, and what is joined, None each where there is none.
+
+    Ropes that press a body against another one are solved twice: with what bodies exert on each other under their
+    weight, then with how that answers to what the ropes exert. Else the body would give way by the fall of a step, and
+    would be thrown back if the rope is the heavier one.
     """
     bodies, material_points, joints = others
     engaged = [e for e in settings.effects if e.engages and settings.integrator == "implicit"]
@@ -264,13 +269,22 @@ def _answered(
         pushed = dataclasses.replace(kick, force=kick.force + total.force)
         if engaged or joints is not None:
             change = aimed - now.state.pos + answer * total.force
-            moved = bodies and bodies.pushed(total)
-            motion = PredictedMotion(change, mobility, answer, moved, material_points)
-            touch = [e.engage(now, motion, values[e.name]) for e in engaged]
-            joined = None if joints is None else (joints, joints.points(now.state.pos, moved))
-            pos, tension, held, push = _translate(settings, now, loads, pushed, targets, tension, touch, joined)
-            pushes[solved] = push
-            total = total.plus(push)
+            seen = PredictedMotion(change, mobility, answer, bodies and bodies.pushed(total), material_points)
+
+            def solve(motion: PredictedMotion, kick: _Kick, tension: Tensor) -> tuple[Any, ...]:
+                touch = [e.engage(now, motion, values[e.name]) for e in engaged]
+                joined = None if joints is None else (joints, joints.points(now.state.pos, motion.bodies))
+                return _translate(settings, now, loads, kick, targets, tension, touch, joined)
+
+            found = solve(seen, pushed, tension)
+            for e in [e for e in reacting if bodies and e.backs(bodies)]:
+                others = [p for name, p in pushes.items() if name not in (e.name, solved)]
+                free = functools.reduce(lambda b, p: b.pushed(p), others, bodies)
+                found = solve(dataclasses.replace(seen, bodies=e.backed(free, found[3])), pushed, tension)
+                motion = dataclasses.replace(seen, bodies=free.pushed(found[3]))
+                pushes[e.name] = e.solve_contact(now, motion, values[e.name])
+            pos, tension, held, pushes[solved] = found
+            total = functools.reduce(ContactForces.plus, pushes.values())
         else:
             pos, tension, held = _translate(settings, now, loads, pushed, targets, tension)
         aimed = pos - answer * total.force
