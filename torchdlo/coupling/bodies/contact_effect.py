@@ -203,7 +203,8 @@ def _detached(links: Links) -> Links:
 
 def contact_forces(contact: BodyContact, motion: PredictedBodyMotion) -> tuple[Tensor, Tensor]:
     """Return forces [N] and torques about the centres of mass [N m] of contact on bodies, shape (..., K, 3) each."""
-    return answer(contact, motion)[:2]
+    force, torque = answer(contact, motion)
+    return force, torque
 
 
 def answer(contact: BodyContact, motion: PredictedBodyMotion, hold: bool = False) -> tuple[Tensor, ...]:
@@ -321,10 +322,14 @@ class BodyContact(Effect):
 
     def solve_contact(self, view: View, motion: PredictedMotion, values: Values) -> ContactForces:
         """Return the forces and torques on bodies."""
-        none = view.state.pos.new_zeros(1, 3)
-        if not self.chosen(motion.bodies.bodies):
+        return self.backing(motion.bodies)
+
+    def backing(self, bodies: PredictedBodyMotion) -> ContactForces:
+        """Return the forces and torques on bodies."""
+        none = bodies.change.new_zeros(1, 3)
+        if not self.backs(bodies):
             return ContactForces(none, none, none)
-        return ContactForces(none, *contact_forces(self, motion.bodies))
+        return ContactForces(none, *contact_forces(self, bodies))
 
     def backs(self, bodies: PredictedBodyMotion) -> bool:
         """Return whether any may touch another one."""

@@ -233,8 +233,12 @@ class Effect(ABC):
         return view.state.pos.new_zeros(1, 3)
 
     def backs(self, bodies: Any) -> bool:
-        """Return whether it exerts on these bodies alone and has `backed`: implicit steps feel what is behind them."""
+        """Return whether it exerts on bodies alone, with `backing` and `backed`: implicit steps feel what is behind."""
         return False
+
+    def backing(self, bodies: Any) -> ContactForces:
+        """Return what it exerts on bodies that would go like that, a `PredictedBodyMotion`."""
+        raise NotImplementedError
 
     def backed(self, bodies: Any, push: ContactForces) -> Any:
         """Return where bodies would go under what this effect exerts, and how it resists what moves them from there.

@@ -276,14 +276,13 @@ def _answered(
                 joined = None if joints is None else (joints, joints.points(now.state.pos, motion.bodies))
                 return _translate(settings, now, loads, kick, targets, tension, touch, joined)
 
-            found = solve(seen, pushed, tension)
+            solution = solve(seen, pushed, tension)
             for e in [e for e in reacting if bodies and e.backs(bodies)]:
-                others = [p for name, p in pushes.items() if name not in (e.name, solved)]
-                free = functools.reduce(lambda b, p: b.pushed(p), others, bodies)
-                found = solve(dataclasses.replace(seen, bodies=e.backed(free, found[3])), pushed, tension)
-                motion = dataclasses.replace(seen, bodies=free.pushed(found[3]))
-                pushes[e.name] = e.solve_contact(now, motion, values[e.name])
-            pos, tension, held, pushes[solved] = found
+                rest = [p for name, p in pushes.items() if name not in (e.name, solved)]
+                free = functools.reduce(lambda b, p: b.pushed(p), rest, bodies)
+                solution = solve(dataclasses.replace(seen, bodies=e.backed(free, solution[3])), pushed, tension)
+                pushes[e.name] = e.backing(free.pushed(solution[3]))
+            pos, tension, held, pushes[solved] = solution
             total = functools.reduce(ContactForces.plus, pushes.values())
         else:
             pos, tension, held = _translate(settings, now, loads, pushed, targets, tension)
