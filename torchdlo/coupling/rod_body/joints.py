@@ -38,7 +38,7 @@ Vector = tuple[float, float, float]
 
 @with_field_docs
 @dataclass(frozen=True)
-class Joint:
+class RopeJoint:
     """A point of a rope that is joined to a free body, or to a vertex of another rope."""
 
     rope: int = 0
@@ -257,7 +257,7 @@ class _Found:
 
 
 def place_joints(
-    specs: Sequence[Joint],
+    specs: Sequence[RopeJoint],
     topology: Topology,
     params: RodParams,
     state: RodState,
@@ -303,7 +303,7 @@ def place_joints(
     return joints, params_, JointState(force, couple)
 
 
-def _add(place: _Place, found: _Found, spec: Joint, where: str) -> None:
+def _add(place: _Place, found: _Found, spec: RopeJoint, where: str) -> None:
     _need(spec.kind in ("weld", "ball"), f"{where}.kind: expected 'weld' or 'ball', given {spec.kind!r}")
     given = "none" if spec.body is None else "both"
     _need(
@@ -334,7 +334,7 @@ def _add(place: _Place, found: _Found, spec: Joint, where: str) -> None:
     _check_slots(place, found, spec, where)
 
 
-def _join_body(place: _Place, found: _Found, spec: Joint, at: tuple[Any, int, list[int]], where: str) -> None:
+def _join_body(place: _Place, found: _Found, spec: RopeJoint, at: tuple[Any, int, list[int]], where: str) -> None:
     spot, slot, beside = at
     body = _body(place, spec, where)
     _check_anchor(place, spec, spot, body, where)
@@ -354,7 +354,7 @@ def _join_body(place: _Place, found: _Found, spec: Joint, at: tuple[Any, int, li
         found.frame_bodies += [body] * len(edges)
 
 
-def _join_ropes(place: _Place, found: _Found, spec: Joint, spot: tuple[tuple[int, float], ...], where: str) -> None:
+def _join_ropes(place: _Place, found: _Found, spec: RopeJoint, spot: tuple[tuple[int, float], ...], where: str) -> None:
     other = place.slot(spec.other_rope, spec.other_vertex, f"{where}.other_vertex")
     _need(
         spec.anchor is None, f"{where}.anchor: belongs to a body; two ropes are joined where they start, leave it out"
@@ -393,7 +393,7 @@ def _join_ropes(place: _Place, found: _Found, spec: Joint, spot: tuple[tuple[int
     found.edges.append(edge)
 
 
-def _body(place: _Place, spec: Joint, where: str) -> int:
+def _body(place: _Place, spec: RopeJoint, where: str) -> int:
     kinds = () if place.bodies is None else place.bodies[0]
     names = [b.name for b in kinds]
     body = names.index(spec.body) if isinstance(spec.body, str) and spec.body in names else spec.body
@@ -412,7 +412,7 @@ def _body(place: _Place, spec: Joint, where: str) -> int:
     return body
 
 
-def _check_anchor(place: _Place, spec: Joint, spot: tuple[tuple[int, float], ...], body: int, where: str) -> None:
+def _check_anchor(place: _Place, spec: RopeJoint, spot: tuple[tuple[int, float], ...], body: int, where: str) -> None:
     assert place.bodies is not None
     kinds, params, placed = (tree.detach(x) if k else x for k, x in enumerate(place.bodies))
     here = sum(w * place.state.pos.detach()[..., k, :] for k, w in spot)
@@ -437,7 +437,7 @@ def _check_anchor(place: _Place, spec: Joint, spot: tuple[tuple[int, float], ...
     )
 
 
-def _check_slots(place: _Place, found: _Found, spec: Joint, where: str) -> None:
+def _check_slots(place: _Place, found: _Found, spec: RopeJoint, where: str) -> None:
     """Refuse joints that hold what is held already."""
     start, rope = found.first[-1], spec.rope
     slots = {slot for point in found.points[start:] for slot, _ in point}
