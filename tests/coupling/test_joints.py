@@ -162,8 +162,8 @@ def test_light_and_heavy_plugs_gain_no_energy(dt: float, cable: float, plug: flo
     rope = Rope(line(7, 0.3, way=(0.8, 0.0, -0.6)), radius=0.004, mass=cable, bend=1e-4)
     body = RigidBody("sphere", (0.01,), (0.248, 0.0, -0.186), mass=plug)
     made = scenes.make(
-        [rope], [Gravity(), Bend()], bodies=[body], joints=[RopeJoint(body=0)], dt=dt, substeps=1, integrator="implicit",
-        prescribed_vertices=[0],
+        [rope], [Gravity(), Bend()], bodies=[body], joints=[RopeJoint(body=0)], dt=dt, substeps=1,
+        integrator="implicit", prescribed_vertices=[0],
     )  # fmt: skip
     scene, params, state = made
     control, step = scenes.stationary_control(scene, state), scenes.stepper(scene, compiled=False, recorded=True)
@@ -353,8 +353,8 @@ def test_an_elastic_rope_stretches_under_its_plug() -> None:
     rope = Rope(line(5, 0.4), radius=0.004, mass=1e-4, bend=1e-4, stretch=20.0)
     body = RigidBody("sphere", (0.01,), (0.0, 0.0, -0.41), mass=0.05, damping=20.0)
     made = scenes.make(
-        [rope], [Gravity(), Bend()], bodies=[body], joints=[RopeJoint(body=0, kind="ball")], integrator="implicit", dt=5e-3,
-        substeps=1, prescribed_vertices=[0],
+        [rope], [Gravity(), Bend()], bodies=[body], joints=[RopeJoint(body=0, kind="ball")], integrator="implicit",
+        dt=5e-3, substeps=1, prescribed_vertices=[0],
     )  # fmt: skip
     state = ran(made, 150)
     # Strain = m g / EA, by the weight below.
