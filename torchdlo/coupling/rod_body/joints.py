@@ -118,9 +118,12 @@ class Joining:
 
     joints: Joints
     kinds: tuple[Body, ...]
+    """Static sides of the bodies."""
     params: JointParams
     state: JointState
+    """What joints did in the last substep."""
     dt: float
+    """Substep [s]."""
 
     @property
     def _free(self) -> list[int]:

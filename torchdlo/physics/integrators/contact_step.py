@@ -265,11 +265,11 @@ class _Border:
     """What displacements of bodies and forces of joints add to the banded system, n unknowns in all."""
 
     column: Tensor
-    """How equations of vertices and lengths feel them, shape (4 V, n N)."""
+    """How equations of vertices and lengths feel them [-], shape (4 V, n N)."""
     row: Tensor
-    """How their equations feel vertices, shape (N, n, 3 V)."""
+    """How their equations feel vertices [-], shape (N, n, 3 V)."""
     own: Tensor
-    """How their equations feel them, shape (N, n, n)."""
+    """How their equations feel them [-], shape (N, n, n)."""
 
 
 def _bordered(
