@@ -77,21 +77,21 @@ def draw(name: str, target: Path) -> None:
     axes.set(aspect="equal", xlabel="x [m]", ylabel="y [m]", title=f"{name}: square: arm, triangle: hand")
     axes.spines[["top", "right"]].set_visible(False)
     target.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(target, metadata={"Software": "torchdlo"})
+    figure.savefig(target, pil_kwargs={"lossless": True, "quality": 100, "method": 6})
 
 
 def main() -> None:
     """Draw the tasks that are asked for."""
     parser = Parser(__file__, description=__doc__)
     parser.add_argument("--tasks", default="", help="names, separated by commas; all if not given")
-    parser.add_argument("--out", default="docs/pictures", help="folder of the pictures, task_NAME.png")
+    parser.add_argument("--out", default="docs/pictures", help="folder of the pictures, task_NAME.webp")
     parser.flag("smoke", "one task: does it run?")
     choices = parser.parse_args()
     from torchdlo.envs import TASKS
 
     names = [n for n in choices.tasks.split(",") if n] or list(TASKS)
     for name in names[:1] if choices.smoke else names:
-        draw(name, Path(choices.out) / f"task_{name}.png")
+        draw(name, Path(choices.out) / f"task_{name}.webp")
 
 
 if __name__ == "__main__":

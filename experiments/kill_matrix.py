@@ -55,9 +55,9 @@ def recording(folder: Path) -> str:
 
 def commands(rope: str) -> dict[str, tuple[str, ...]]:
     """Return the smallest real settings of every command."""
-    from torchdlo.sysid.diagnosis.effect_library import LIBRARY
+    from torchdlo.sysid.diagnosis.effect_library import library
 
-    excluded = [word for name in LIBRARY if name not in KEPT_EFFECTS for word in ("--exclude-effect", name)]
+    excluded = [word for name in library() if name not in KEPT_EFFECTS for word in ("--exclude-effect", name)]
     return {
         "calibrate": ("calibrate", rope, "--starts", "3", "--iterations", "3", "--vertices", "9", "--rest", "straight"),
         "diagnose": ("diagnose", rope, "--workers", "1", "--vertices", "9", *excluded),

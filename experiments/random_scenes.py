@@ -294,7 +294,8 @@ def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
 def earlier(parser: Parser, path: str, choices: dict[str, Any]) -> list[dict[str, Any]]:
     """Return the rows of a file whose run is to go on; it must have been made with the same choices."""
     if not path or not Path(path).exists():
-        parser.error(f"--resume goes on with the file of --json, but {path or 'none'} is there; leave out --resume")
+        there = f"there is no {path}" if path else "no --json is given"
+        parser.error(f"--resume goes on with the file of --json, but {there}; leave out --resume")
     found = json.loads(Path(path).read_text())
     if found.get("choices") != choices:
         parser.error(f"{path} was made with {found.get('choices')}; --resume needs the same, not {choices}")

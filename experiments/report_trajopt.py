@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import statistics
 from pathlib import Path
@@ -102,6 +103,8 @@ def table(rows: list[dict[str, Any]]) -> str:
 
 def report(runs: dict[tuple[str, str], list[dict[str, Any]]], out: Path) -> None:
     """Print and write the table and the curves of what is there so far."""
+    from PIL import Image
+
     from torchdlo.files import write_atomically
     from torchdlo.report.figures.learning_curve import learning_png
 
@@ -112,5 +115,7 @@ def report(runs: dict[tuple[str, str], list[dict[str, Any]]], out: Path) -> None
     panels: dict[str, dict[str, list[Any]]] = {}
     for (task, method), found in runs.items():
         panels.setdefault(task, {})[method] = [r["curve"] for r in found]
-    write_atomically(out / "curves.png", learning_png(panels))
+    picture = io.BytesIO()
+    Image.open(io.BytesIO(learning_png(panels))).save(picture, "WEBP", lossless=True, quality=100, method=6)
+    write_atomically(out / "curves.webp", picture.getvalue())
     print(text, end="", flush=True)

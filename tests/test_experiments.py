@@ -165,7 +165,7 @@ def test_overlaps_of_random_scenes_are_seen(monkeypatch: pytest.MonkeyPatch) -> 
 
 def test_pictures_of_tasks_are_drawn(tmp_path: Path) -> None:
     done = call(EXPERIMENTS / "draw_tasks.py", "--tasks", "slingshot", "--out", tmp_path)
-    assert done.returncode == 0 and (tmp_path / "task_slingshot.png").stat().st_size > 1000, done.stderr
+    assert done.returncode == 0 and (tmp_path / "task_slingshot.webp").stat().st_size > 1000, done.stderr
 
 
 @pytest.mark.parametrize("script", SCRIPTS)

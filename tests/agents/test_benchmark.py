@@ -38,7 +38,7 @@ def test_the_benchmark_writes_its_table_and_reads_finished_runs(tmp_path: Path) 
     assert (row["task"], row["method"], row["seeds"], row["episodes"]) == ("wiring_post", "cmaes", 1, 4)
     assert row["published"] == 64.31 and 0 <= row["return"] <= 1
     assert "| wiring_post | cmaes | 1 |" in done.stdout == (tmp_path / "benchmark.md").read_text()
-    assert (tmp_path / "curves.png").read_bytes().startswith(b"\x89PNG")
+    assert (tmp_path / "curves.webp").read_bytes()[8:12] == b"WEBP"
     result = tmp_path / "wiring_post-cmaes-0" / "result.json"
     # What a finished run has written is taken as it is.
     content = json.loads(result.read_text())

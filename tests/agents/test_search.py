@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 import random
+import warnings
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,7 +14,8 @@ import torch
 from torch import Tensor
 
 from tests.agents.problems import Drag, Peaks, Plain, Push, Reach, SurrogateRound, signature
-from torchdlo.agents.trajopt.problem import Evaluation
+from torchdlo.agents.trajopt.cmaes import draw_population, make_strategy
+from torchdlo.agents.trajopt.problem import Encoding, Evaluation
 from torchdlo.agents.trajopt.proposals import rank_proposals
 from torchdlo.agents.trajopt.search import METHODS, Robust, SearchResult, SearchSettings, optimize
 from torchdlo.errors import InputError
@@ -311,3 +313,17 @@ def test_problems_of_any_width_are_searched() -> None:
     for method in METHODS:
         found = optimize(Line(), SearchSettings(method, episodes=400, population=4))
         assert float(found.actions) == pytest.approx(0.3, abs=1e-3), method
+
+
+def test_strategies_of_many_numbers_do_not_warn_of_what_they_were_not_told() -> None:
+    # From 300 numbers on cma proposes points of its own; limits move them, so that it does not find them again.
+    encoding = Encoding(60, 6, 3, 0.02, 1)
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        found = make_strategy(
+            torch.zeros(encoding.size, dtype=torch.float64), 0.01, 16, torch.Generator().manual_seed(0)
+        )
+        for _ in range(5):
+            x = draw_population(found, encoding)
+            found.tell(list(x.numpy()), (x - 0.01).square().sum(-1).tolist())
+    assert not said, said[0].message

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from torchdlo import scene as scenes
-from torchdlo.coupling import RodBody
+from torchdlo.coupling import RodBody, RodContact
 from torchdlo.coupling.bodies.dynamics import conjugate
 from torchdlo.physics import tree
 from torchdlo.physics.effects import Bend, BendFrame, Gravity, Twist
@@ -347,6 +347,19 @@ def test_a_rope_does_not_push_the_plug_that_it_is_joined_to(integrator: str) -> 
     with_contact, without = ran((scene, params, state), 4), ran(made, 4)
     torch.testing.assert_close(with_contact.rods.pos, without.rods.pos, atol=1e-9, rtol=0)
     torch.testing.assert_close(with_contact.bodies.pos, without.bodies.pos, atol=1e-9, rtol=0)
+
+
+@pytest.mark.parametrize("integrator", STEPS)
+def test_ropes_do_not_push_each_other_at_their_joint(integrator: str) -> None:
+    points = line(9, 0.2, way=(0.8, 0.0, -0.6))
+    choices = {"dt": 1e-3, "substeps": 1} | {"integrator": integrator, "prescribed_vertices": [0]}
+    halves = [Rope(x, radius=0.004, mass=0.01, bend=1e-6) for x in (points[:5], points[4:])]
+    joint = RopeJoint(other_rope=1, kind="ball")
+    one, two = (
+        scenes.make(halves, [Gravity(), Bend(), *contact], joints=[joint], **choices)
+        for contact in ((), (RodContact(),))
+    )
+    torch.testing.assert_close(ran(two, 5).rods.pos, ran(one, 5).rods.pos, atol=1e-9, rtol=0)
 
 
 def test_an_elastic_rope_stretches_under_its_plug() -> None:

@@ -78,7 +78,7 @@ def test_a_rope_of_a_model_file_is_that_of_the_task(tmp_path: Path) -> None:
     assert find("separation").start(1)[2].rods.pos.double().sub(state.rods.pos).abs().max() < 1e-6
 
 
-@pytest.mark.parametrize("effect", effect_library.LIBRARY)
+@pytest.mark.parametrize("effect", effect_library.library())
 def test_effects_of_a_model_act_in_tasks(tmp_path: Path, effect: str) -> None:
     rope = cable(write(tmp_path / "model.json", (effect,)))
     plain = dataclasses.replace(rope, effects=())

@@ -74,12 +74,12 @@ def make_recording(path: Path, effects: dict[str, float], noise: float = 2e-4, g
     return replace(empty, train=tuple(made[:2]), test=tuple(made[2:]))
 
 
-@pytest.mark.parametrize("name", effect_library.LIBRARY)
+@pytest.mark.parametrize("name", effect_library.library())
 def test_the_library_knows_how_to_search_for_every_effect(name: str, tmp_path: Path) -> None:
     recording = replace(make_empty(tmp_path), table_height=0.0)
     mesh = make_mesh(recording.train[0], recording.length, 31)
     numbers = {n.name: n for n in effect_library.numbers(name, recording)}
-    doses = effect_library.probes(name, recording, mesh, 10.0, {"bending_stiffness": 2e-3})
+    doses = effect_library.perturbations(name, recording, mesh, 10.0, {"bending_stiffness": 2e-3})
     assert effect_library.applicable(name, recording, mesh) and numbers and doses
     for dose in doses:
         for key, value in dose.values.items():
@@ -166,7 +166,7 @@ def test_a_hidden_effect_is_named_and_none_where_there_is_none(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, effects: dict[str, float], named: list[str]
 ) -> None:
     # Two names keep it short; the mesh and the steps are not those of the recording.
-    monkeypatch.setattr(effect_library, "LIBRARY", ("air_drag", "point_mass"))
+    monkeypatch.setattr(effect_library, "library", lambda: ("air_drag", "point_mass"))
     monkeypatch.setattr(effect_search, "BUDGETS", {"fast": effect_search.Budget(3, 2, 3, 3, 1)})
     recording = make_recording(tmp_path, effects)
     stages = []
@@ -199,7 +199,7 @@ def test_a_clamp_that_turns_is_told_from_one_in_which_the_rope_bends(
     monkeypatch.setattr(effect_search, "BUDGETS", {"fast": effect_search.Budget(3, 1, 3, 3, 1)})
     recording = make_recording(tmp_path, {"gripper_compliance.stiffness": 0.4}, grip=1.0)
     looked = {"gripper_compliance", "nonuniform_stiffness"}
-    without = [name for name in effect_library.LIBRARY if name not in looked]
+    without = [name for name in effect_library.library() if name not in looked]
     result = effect_search.diagnose(recording, vertices=31, workers=1, without=without)
     assert result.effects == ["gripper_compliance"]
     said = findings(result, recording)

@@ -10,7 +10,7 @@ import pytest
 
 from torchdlo.report.pages import diagnosis as page
 from torchdlo.sysid.diagnosis.budget import BUDGETS, Budget
-from torchdlo.sysid.diagnosis.effect_library import LIBRARY
+from torchdlo.sysid.diagnosis.effect_library import library
 from torchdlo.sysid.diagnosis.effect_search import diagnose
 from torchdlo.sysid.diagnosis.findings import findings_json, model_json, summary
 from torchdlo.sysid.recordings.recording import load_recording
@@ -31,7 +31,7 @@ def test_a_diagnosis_of_films_says_what_it_found(tmp_path: Path, monkeypatch: py
     monkeypatch.setattr(filmed_diagnosis, "SILENT", 0.0)
     monkeypatch.setattr(filmed_diagnosis, "_chained", lambda model: model)
     monkeypatch.setitem(BUDGETS, "fast", Budget(4, 1, 1, 1, 1))
-    found = diagnose(recording, without=[n for n in LIBRARY if n not in ("air_drag", "point_mass")])
+    found = diagnose(recording, without=[n for n in library() if n not in ("air_drag", "point_mass")])
     (candidates,) = found.candidates
     assert {c.name for c in candidates} == {"air_drag", "point_mass"} and all(c.reason for c in candidates)
     assert np.isfinite(found.before).all() and found.verdict in ("none", "effects", "partial", "unknown")

@@ -14,7 +14,7 @@ from tests.report.fake_diagnosis import BASELINE, fake_diagnosis, fitted
 from tests.sysid.swaying import recording as swaying
 from torchdlo.physics.effects import EFFECTS
 from torchdlo.sysid.diagnosis import effect_library
-from torchdlo.sysid.diagnosis.effect_equations import LAWS, MEANING, separating_experiment
+from torchdlo.sysid.diagnosis.effect_library import MEANING, separating_experiment
 from torchdlo.sysid.diagnosis.error_floor import ErrorFloor
 from torchdlo.sysid.diagnosis.findings import absorbed, confidence, findings, findings_json, summary
 from torchdlo.sysid.diagnosis.verdict import Diagnosis
@@ -107,11 +107,11 @@ def test_findings_are_json_with_all_that_the_page_says(rope: Recording, found: D
 
 
 def test_every_effect_has_a_law_with_its_numbers() -> None:
-    for name in effect_library.LIBRARY:
-        law = LAWS[name]
+    for name in effect_library.library():
+        law = EFFECTS[name].equation
         assert EFFECTS[name].kind in MEANING
         # What is fitted is in the formula by its name, or is said in it in words.
-        numbers = {n for n in EFFECTS[name].params if n not in effect_library._KNOWN.get(name, ())}
+        numbers = {n for n in EFFECTS[name].params if n not in effect_library.spec(name).fixed}
         spoken = {"velocity": "velocity", "curvature": "κ̄", "offset": "offset", "c": "c κ³"}
         assert all(spoken.get(n, n) in law for n in numbers), (name, numbers)
 
@@ -127,4 +127,4 @@ def test_experiments_do_not_depend_on_the_order() -> None:
 def test_the_page_on_diagnoses_has_the_library_with_its_laws() -> None:
     page = Path(__file__).parents[2] / "docs" / "diagnose.md"
     rows = dict(re.findall(r"^\| `(\w+)` \| (.*?) \| `", page.read_text(), re.MULTILINE))
-    assert rows == {name: LAWS[name].replace("|", "\\|") for name in effect_library.LIBRARY}
+    assert rows == {name: EFFECTS[name].equation.replace("|", "\\|") for name in effect_library.library()}

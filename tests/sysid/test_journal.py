@@ -177,7 +177,7 @@ def test_a_stopped_diagnosis_goes_on_and_its_model_starts_the_next(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(pools, "Models", FakeModels)
-    monkeypatch.setattr(effect_library, "LIBRARY", ("air_drag", "point_mass", "time_delay"))
+    monkeypatch.setattr(effect_library, "library", lambda: ("air_drag", "point_mass", "time_delay"))
     recording, computed = swaying(tmp_path, frames=60), FakeModels.computed
     options = {"vertices": 21, "workers": 1, "journal": tmp_path / "j"}
 

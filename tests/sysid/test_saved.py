@@ -140,6 +140,8 @@ def edit(recording: Recording, tmp_path: Path) -> Callable[..., Path]:
             r"expected velocity.0, velocity.1, velocity.2, found veloc",
         ),
         (lambda c: c["effects"]["wind"].update({"velocity.3": 3}), r"found velocity.3"),
+        # A digit that is no decimal number.
+        (lambda c: c["effects"]["wind"].update({"velocity.²": 3}), r"found velocity.²"),
         (
             lambda c: c["effects"]["wind"].update(c_d="high"),
             r"effects.wind.c_d: expected a number from -200 to 200, found 'high'",

@@ -14,6 +14,7 @@ from torch import Tensor
 from torchdlo.envs.assets.rope_material import RopeMaterial
 from torchdlo.errors import InputError
 from torchdlo.physics import tree
+from torchdlo.physics.effects.parameter_name import ParameterName
 from torchdlo.physics.rod.assembly import frame_curvature
 from torchdlo.physics.rod.topology import Topology
 from torchdlo.scene_files.schema import RopeSpec, SceneDescription
@@ -193,14 +194,13 @@ def _own(model: Any) -> dict[str, dict[str, Any]]:
     """Return the numbers of a model's effects, vectors as lists."""
     found: dict[str, dict[str, Any]] = {name: {} for name in model.effects}
     for key, value in model.values.items():
-        effect, _, number = key.partition(".")
-        number, _, part = number.partition(".")
-        if not number:
+        name = ParameterName.parse(key)
+        if not name.effect:
             continue
-        if part:
-            found[effect].setdefault(number, []).append(value)
+        if name.component is None:
+            found[name.effect][name.number] = value
         else:
-            found[effect][number] = value
+            found[name.effect].setdefault(name.number, []).append(value)
     return found
 
 

@@ -173,20 +173,18 @@ class TaskEpisodes:
 
     def step(self, action: Tensor) -> Transition:
         """Do actions (N, 6 R) in metres and degrees."""
-        from tensordict import TensorDict
+        from torchdlo.envs.core import episode
 
-        td = self.env.step(TensorDict({"action": action}, self.env.batch_size)).get("next")
+        step, env = self.env.advance(action), self.env
         self._over += 1
-        plain, world = td["reward"][:, 0], self.env.world
+        plain, world = step.reward.float(), step.world
         self.returns = self.returns + plain.detach()
-        reward, success = self.scale * plain, td["success"][:, 0]
+        reward, success = self.scale * plain, episode.successes(self.task, world)
         if self._over == self.horizon:
-            seen = world.seen(self.task.arms.count)
             if self.ends:
-                missing = self.task.terminal_cost(seen).float()
-                reward = reward - self.scale * torch.where(world.failed, 0.0, missing)
+                reward = reward - self.scale * episode.terminal_costs(self.task, world).float()
             reward = reward + self.bonus * success
-        return Transition(td["observation"], reward, world.failed, success)
+        return Transition(episode.observe(env.episode, world), reward, world.failed, success)
 
     def detach(self) -> None:
         """Cut the history of gradients."""

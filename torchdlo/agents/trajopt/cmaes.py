@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from typing import Any
 
 import torch
@@ -25,6 +26,9 @@ def import_cma() -> Any:
         import cma
     except ModuleNotFoundError:
         raise InputError("cmaes and hybrid need the package cma; pip install 'torchdlo[cmaes]', or use gd.") from None
+    # From 300 numbers on the strategy proposes two points itself and misses them, as it is told of what was played.
+    warnings.filterwarnings("ignore", category=cma.evolution_strategy.InjectionWarning)
+    warnings.filterwarnings("ignore", message="TPA: apparent inconsistency")
     return cma
 
 

@@ -11,6 +11,7 @@ own axis, which is much smaller than that of a body, is left out.
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -22,6 +23,8 @@ from torchdlo.coupling.bodies import shape_sdf
 from torchdlo.coupling.bodies.contact_solver import inertia
 from torchdlo.coupling.bodies.dynamics import Body, BodyParams, BodyState, PredictedBodyMotion, conjugate
 from torchdlo.coupling.rod_body.rod_body_effect import RodBody
+from torchdlo.coupling.rod_contact.broad_phase import APART
+from torchdlo.coupling.rod_contact.rod_contact_effect import RodContact
 from torchdlo.field_docs import with_field_docs
 from torchdlo.physics import tree
 from torchdlo.physics.constraints.joint_points import JointPoints
@@ -472,8 +475,14 @@ def apart(
     state: RodState,
     bodies: tuple[tuple[Body, ...], BodyParams, BodyState] | None,
 ) -> tuple[Effect, ...]:
-    """Return effects of which `RodBody` leaves out what is joined: edges that start in a body, from its joint on."""
-    if bodies is None or not joints.points:
+    """Return effects of which contacts leave out what is joined.
+
+    `RodBody` leaves out edges that start in a body, from its joint on; `RodContact` pairs of edges of two ropes that
+    are as near to each other along them as those of one rope that it leaves out.
+    """
+    near = _beside(joints, topology, params)
+    effects = [dataclasses.replace(e, left_out=near) if isinstance(e, RodContact) and near else e for e in effects]
+    if bodies is None:
         return tuple(effects)
     kinds, solid, placed = bodies
     pos, radius = state.pos.detach(), params.material.radius.detach().expand(*state.pos.shape[:-1], 1)
@@ -502,6 +511,37 @@ def apart(
                         break
     pairs = tuple(sorted(left_out))
     return tuple(dataclasses.replace(e, left_out=pairs) if isinstance(e, RodBody) else e for e in effects)
+
+
+def _beside(joints: Joints, topology: Topology, params: RodParams) -> tuple[tuple[int, int], ...]:
+    """Return the edges of two ropes that are beside their joint."""
+    after, mask = topology.successor(), topology.edge_mask()
+    length = params.rest.length.detach().reshape(-1, topology.size).amin(0).tolist()
+    radius = float(params.material.radius.detach().amax())
+
+    def along(slot: int) -> list[tuple[int, int, float]]:
+        """Edges on both sides of a vertex: how many others, and what length [m], lie between."""
+        found = []
+        for onward in (True, False):
+            here, way = slot, 0.0
+            for steps in range(topology.size):
+                edge = here if onward else after.index(here)
+                if not mask[edge] or (way > math.pi * radius and steps >= APART):
+                    break
+                found.append((edge, steps, way))
+                here, way = (after[edge] if onward else edge), way + length[edge]
+        return found
+
+    pairs = set()
+    for point, first, body in zip(joints.points, range(len(joints.points)), joints.bodies, strict=True):
+        if body >= 0 or first not in joints.first:
+            continue
+        one, other = (next(slot for slot, w in point if sign * w > 0) for sign in (1, -1))
+        for a, steps, way in along(one):
+            for b, more, further in along(other):
+                if steps + more + 1 < APART or way + further < math.pi * radius:
+                    pairs.add((a, b))
+    return tuple(sorted(pairs))
 
 
 def directors_now(joints: Joints, params: JointParams, placed: BodyState) -> Tensor:

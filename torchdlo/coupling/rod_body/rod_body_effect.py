@@ -28,6 +28,7 @@ stepping); Tonge, Benevolenski, Voroshilov 2012, doi:10.1145/2185520.2185601 (Ja
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -43,6 +44,7 @@ from torchdlo.coupling.common.coulomb_friction import (
     rebound_separation,
     separation_needed,
 )
+from torchdlo.coupling.rod_body import body_touch_op
 from torchdlo.coupling.rod_body import rod_body_op as body_sweeps
 from torchdlo.physics.constraints.contact_penalty import Touch
 from torchdlo.physics.effects.base import ContactForces, Effect, EffectKind, PredictedMotion, Values
@@ -219,29 +221,40 @@ class RodBody(Effect):
     def engage(self, view: View, motion: PredictedMotion, values: Values) -> Touch:
         """Return the points of edges that may touch bodies in an implicit substep."""
         bodies = motion.bodies
-        points, state = self._points(view, bodies), bodies.state
+        free = [k for k, b in enumerate(bodies.bodies) if b.motion == "free"]
+        count = [points_per_edge(b, self.pieces) for b in bodies.bodies]
+        of = [[float(k == j) for j in free] for k, n in enumerate(count) for _ in range(n)]
+        place = [[float(k == j) for j in free] for k in range(len(count))]
+        mask, radius, rubs = view.params.rest.edge_mask, view.params.material.radius, 1.0 if self.friction else 0.0
+        if body_touch_op.kernel_fits(bodies):
+            law, searched = (self.recovery, self.slowest), [n - 2 for n in count]
+            found = body_touch_op.find_touches(view, motion, searched, friction=self.friction, law=law)
+        else:
+            found = self._touches(view, motion)
+        share, normal, wanted, given, mu, arm = found
+        edges = mask, view.tangent, radius, rubs * radius / view.length
+        shape = torch.broadcast_shapes(share.shape, *((*x.unsqueeze(-3).shape[:-1], 1) for x in edges))[:-1]
+        real, tangent, radius, lever = (x.unsqueeze(-3).expand(*shape, x.shape[-1]) for x in edges)
+        share, normal, wanted, given, mu, arm = (x.expand(*shape, x.shape[-1]) for x in found)
+        if self.left_out:
+            real = real * self._kept(real, count)
+        resist = inertia(bodies, free) if free else share.new_zeros(0, 6, 6)
+        like = share.new_tensor
+        body = like(of).reshape(len(of), len(free)), resist, like(place).reshape(len(count), len(free))
+        return Touch(real, share, normal, tangent, radius, lever, wanted, given, mu, arm, *body)
+
+    def _touches(self, view: View, motion: PredictedMotion) -> tuple[Tensor, ...]:
+        """Return share, normal, wanted, given, mu and arm of points by tensor operations; see `Touch`."""
+        bodies = motion.bodies
+        points, state = _points(view, bodies, self.pieces), bodies.state
         at, axes = points.at, points.axes
-        none = torch.zeros_like(motion.change)
-        still, slip = points.seen(none, bodies)
+        still, slip = points.seen(torch.zeros_like(motion.change), bodies)
         wanted = self._target(points, view, bodies, points.seen(motion.change, bodies)[0], calm=True)
         now = dataclasses.replace(bodies, change=state.vel, turn=state.omega)
         slides = safe_norm(points.seen(view.state.vel, now)[1]).detach() > self.slowest
         mu_s, mu_k = (axes.of_bodies(mu) for mu in (bodies.params.mu_s, bodies.params.mu_k))
-        rubs = 1.0 if self.friction else 0.0
-        shape = torch.broadcast_shapes(at.share.shape, wanted.shape)
-        free = [k for k, b in enumerate(bodies.bodies) if b.motion == "free"]
-        place = at.share.new_zeros(len(bodies.bodies), len(free))
-        for j, k in enumerate(free):
-            place[k, j] = 1.0
-
-        def wide(x: Tensor) -> Tensor:
-            return x.expand(*shape[:-1], x.shape[-1])
-
-        resist = inertia(bodies, free) if free else at.share.new_zeros(0, 6, 6)
-        each = points.real, at.share, at.normal, points.tangent, points.radius, rubs * points.lever, wanted
-        given, mu = still * at.normal + slip, rubs * torch.where(slides, mu_k, mu_s)
-        parts = [wide(x) for x in (*each, given, mu, at.arm)]
-        return Touch(*[*parts, axes.of[..., 0][:, free], resist, place])
+        mu = torch.where(slides, mu_k, mu_s) if self.friction else torch.zeros_like(at.share)
+        return at.share, at.normal, wanted, still * at.normal + slip, mu, at.arm
 
     def solve_contact(self, view: View, motion: PredictedMotion, values: Values) -> ContactForces:
         """Return the forces that keep ropes outside of bodies and rub [N]."""
@@ -265,15 +278,20 @@ class RodBody(Effect):
             push = points.exerted(normal, friction)
         return push
 
+    def _kept(self, like: Tensor, count: Sequence[int]) -> Tensor:
+        """Return 0 at points of what is left out, else 1 [1], shape (F, V, 1); of so many points for each body."""
+        whole = torch.ones(len(count), like.shape[-2])
+        for edge, body in self.left_out:
+            whole[body, edge] = 0.0
+        rows = [whole[k] for k, n in enumerate(count) for _ in range(n)]
+        return torch.stack(rows).unsqueeze(-1).to(like)
+
     def _points(self, view: View, bodies: PredictedBodyMotion) -> _Points:
         points = _points(view, bodies, self.pieces)
         if not self.left_out:
             return points
-        whole = torch.ones(len(bodies.bodies), view.topology.size)
-        for edge, body in self.left_out:
-            whole[body, edge] = 0.0
-        there = points.axes.of[..., 0] @ whole.to(points.real)
-        return dataclasses.replace(points, real=points.real * there.unsqueeze(-1))
+        kept = self._kept(points.at.share, [points_per_edge(b, self.pieces) for b in bodies.bodies])
+        return dataclasses.replace(points, real=points.real * kept)
 
     def _target(
         self, points: _Points, view: View, bodies: PredictedBodyMotion, along: Tensor, calm: bool = False

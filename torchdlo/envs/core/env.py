@@ -18,11 +18,12 @@ from torchrl.envs import EnvBase
 
 from torchdlo import notices
 from torchdlo.envs.core import episode as episodes
-from torchdlo.envs.core.episode import Episode, EpisodeState
+from torchdlo.envs.core.episode import ControlStep, Episode, EpisodeState
 from torchdlo.envs.core.task import Task, combined, succeeded
 from torchdlo.envs.observations.sensor import Sensor, sensor_of
 from torchdlo.errors import InputError
 from torchdlo.physics import tree
+from torchdlo.physics.effects.parameter_name import ParameterName
 from torchdlo.scene import Params, Scene
 from torchdlo.vision.look import Look, draw_look
 
@@ -161,12 +162,11 @@ class DloEnv(EnvBase):
         self.world = tree.detach(self.world)
 
     def _told(self, terms: dict[str, Tensor]) -> dict[str, Any]:
-        seen = self.world.seen(self.task.arms.count)
         return {
             "observation": episodes.observe(self.episode, self.world),
             "start": self.first,
             "progress": (self.world.count / self.task.horizon).float().unsqueeze(-1),
-            "success": (succeeded(self.task, seen) & ~self.world.failed).unsqueeze(-1),
+            "success": episodes.successes(self.task, self.world).unsqueeze(-1),
             "terms": TensorDict({n: t.float().unsqueeze(-1) for n, t in terms.items()}, self.batch_size, self.device),
             **self._images(),
         }
@@ -226,24 +226,24 @@ class DloEnv(EnvBase):
             return tree.where(again, fresh, self.world)
         return tree.map(lambda old, new: old.index_copy(0, rows, new), self.world, fresh)
 
+    def advance(self, action: Tensor) -> ControlStep:
+        """Do actions (num_envs, A) of `action_spec` and return what they led to, without a tensordict."""
+        with torch.set_grad_enabled(self.gradients and torch.is_grad_enabled()):
+            action = action.to(self._like.dtype)
+            action = action if self._scale is None else action.clamp(-1.0, 1.0) * self._scale
+            last = self.world.count + 1 >= self.task.horizon
+            step = episodes.control_step(self.episode, self.world, action, last)
+        self.world = step.world
+        _warn_of_nan(self.task, action, step.reward)
+        return step
+
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
         with torch.set_grad_enabled(self.gradients and torch.is_grad_enabled()):
-            return self._stepped(tensordict.get("action"))
-
-    def _stepped(self, action: Tensor) -> TensorDict:
-        action = action.to(self._like.dtype)
-        action = action if self._scale is None else action.clamp(-1.0, 1.0) * self._scale
-        world = episodes.act(self.episode, self.world, action)
-        over = world.count >= self.task.horizon
-        if self.task.release and bool(over.any()):
-            world = tree.where(over, episodes.finish(self.episode, world), world)
-        self.world = world
-        reward, _, terms = episodes.episode_reward(self.episode, world)
-        _warn_of_nan(self.task, action, reward)
-        failed, over = world.failed.unsqueeze(-1), over.unsqueeze(-1)
-        flags = {"terminated": failed, "truncated": over, "done": failed | over}
-        found = {**self._told(terms), "reward": reward.float().unsqueeze(-1), **flags}
-        return TensorDict(found, self.batch_size, self.device)
+            step = self.advance(tensordict.get("action"))
+            failed, over = self.world.failed.unsqueeze(-1), (self.world.count >= self.task.horizon).unsqueeze(-1)
+            flags = {"terminated": failed, "truncated": over, "done": failed | over}
+            found = {**self._told(step.terms), "reward": step.reward.float().unsqueeze(-1), **flags}
+            return TensorDict(found, self.batch_size, self.device)
 
 
 def _check_device(device: torch.device | str | None) -> None:
@@ -275,9 +275,9 @@ def _wide(effects: dict[str, dict[str, Tensor]], like: dict[str, dict[str, Tenso
 
 
 def _declared(scene: Scene, name: str) -> Any:
-    effect, _, number = name.partition(".")
-    params = {e.name: e.params for e in scene.effects}.get(effect, {})
-    return params.get(number)
+    asked = ParameterName.parse(name)
+    params = {e.name: e.params for e in scene.effects}.get(asked.effect, {})
+    return params.get(asked.key)
 
 
 def _check(shares: Mapping[str, float], scene: Scene) -> None:
@@ -302,14 +302,14 @@ def drawn_effects(
         effect: {name: x.expand(count, 1, x.shape[-1]) for name, x in v.items()} for effect, v in params.effects.items()
     }
     for name, share in shares.items():
-        (effect, _, number), param = name.partition("."), _declared(scene, name)
-        value = found[effect][number]
+        which, param = ParameterName.parse(name), _declared(scene, name)
+        value = found[which.effect][which.number]
         ends = [param.coordinate(value.new_tensor(float(end))) for end in (param.low, param.high)]
         low, high = min(ends), max(ends)
         random = torch.rand(value.shape, generator=generator, dtype=torch.float64).to(value)
         at = param.coordinate(value) + share * (high - low) * (random - 0.5)
-        found[effect][number] = param.value(torch.minimum(torch.maximum(at, low), high))
-    for effect in {name.partition(".")[0] for name in shares}:
+        found[which.effect][which.number] = param.value(torch.minimum(torch.maximum(at, low), high))
+    for effect in {ParameterName.parse(name).effect for name in shares}:
         if {"mu_s", "mu_k"} <= found[effect].keys():
             found[effect]["mu_s"] = torch.maximum(found[effect]["mu_s"], found[effect]["mu_k"])
     return found

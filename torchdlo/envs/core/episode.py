@@ -34,11 +34,13 @@ from torchdlo.physics.linalg.rotation import multiply
 from torchdlo.scene import Control, Params, Scene, State
 
 __all__ = [
+    "ControlStep",
     "Episode",
     "EpisodeResult",
     "EpisodeState",
     "act",
     "begin",
+    "control_step",
     "follow",
     "normalized_score",
     "observe",
@@ -47,6 +49,8 @@ __all__ = [
     "prepare_at",
     "reachable",
     "scene_positions",
+    "successes",
+    "terminal_costs",
 ]
 
 
@@ -72,6 +76,19 @@ class EpisodeState:
     def seen(self, hands: int) -> TaskState:
         """Return what a task judges."""
         return TaskState(self.state, self.tool, self.grasp.closed.unflatten(-2, (hands, -1)).amax(-2), self.notes)
+
+
+@tree.struct
+class ControlStep:
+    """What an action led to."""
+
+    world: EpisodeState
+    reward: Tensor
+    """What it earned, 0 in episodes that have failed [1], shape (B,)."""
+    loss: Tensor
+    """What gradients should descend: minus the reward, and `Task.auxiliary_loss` [1], shape (B,)."""
+    terms: dict[str, Tensor]
+    """Terms of the reward by name [1], shape (B,) each."""
 
 
 @tree.struct
@@ -318,6 +335,23 @@ def finish(episode: Episode, world: EpisodeState) -> EpisodeState:
     return _judged(episode, world, tree.replace(before, state=state, grasp=held, notes=world.notes), lost)
 
 
+def control_step(episode: Episode, world: EpisodeState, action: Tensor, last: Tensor | bool) -> ControlStep:
+    """Return what an action (B, A) leads to: the one step that environments, searches and films play.
+
+    Args:
+        episode: the scenes.
+        world: before the action.
+        action: in metres and degrees, see `Task.width`.
+        last: whether the episode ends with it, of each scene (B,) or of all: hands then open where a task asks for it.
+    """
+    world = act(episode, world, action)
+    if last is True:
+        world = finish(episode, world)
+    elif isinstance(last, Tensor) and episode.task.release and bool(last.any()):
+        world = tree.where(last, finish(episode, world), world)
+    return ControlStep(world, *episode_reward(episode, world))
+
+
 def episode_reward(episode: Episode, world: EpisodeState) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
     """Return the reward of the last action, its loss, and the terms of the reward, shape (B,) each."""
     task, seen = episode.task, world.seen(episode.task.arms.count)
@@ -325,6 +359,16 @@ def episode_reward(episode: Episode, world: EpisodeState) -> tuple[Tensor, Tenso
     reward = combined(task, terms, len(world.failed))
     loss = sum(task.auxiliary_loss(seen).values(), -reward)
     return torch.where(world.failed, 0.0, reward), torch.where(world.failed, 0.0, loss), terms
+
+
+def successes(task: Task, world: EpisodeState) -> Tensor:
+    """Return which episodes are where they should be and have not failed, bool, shape (B,)."""
+    return succeeded(task, world.seen(task.arms.count)) & ~world.failed
+
+
+def terminal_costs(task: Task, world: EpisodeState) -> Tensor:
+    """Return how far ends are from success, 0 in episodes that have failed, see `Task.terminal_cost` [1], (B,)."""
+    return torch.where(world.failed, 0.0, task.terminal_cost(world.seen(task.arms.count)))
 
 
 def play(
@@ -363,16 +407,14 @@ def play(
     if len(world.joints) != len(actions):
         raise ValueError(f"{task.name}: {len(actions)} sequences for an episode of {len(world.joints)} scenes")
     for k in range(count):
-        world = act(episode, world, actions[:, k])
-        if k + 1 == count:
-            world = finish(episode, world)
-        rows.append(episode_reward(episode, world))
+        step = control_step(episode, world, actions[:, k], last=k + 1 == count)
+        world = step.world
+        rows.append((step.reward, step.loss, step.terms))
         path.append(keep(world))
         if callback is not None:
             callback(k + 1, count)
     rewards, losses, terms = tree.stack(rows)
-    seen = world.seen(task.arms.count)
-    success, short = succeeded(task, seen) & ~world.failed, task.terminal_cost(seen)
+    success, short = successes(task, world), task.terminal_cost(world.seen(task.arms.count))
     loss = losses.sum(0) + torch.where(world.failed, 0.0, short)
     return EpisodeResult(rewards.sum(0), loss, short, success, world.failed, rewards, terms, world, tree.stack(path))
 

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from torchdlo.physics import tree
+from torchdlo.physics.effects.effect_spec import RopeEffectSpec
 from torchdlo.physics.rod.kinematics import RodParams, View
 from torchdlo.physics.rod.topology import Topology
 
@@ -161,8 +162,12 @@ class Effect(ABC):
     """Name in scenes, parameter trees and findings."""
     kind: ClassVar[EffectKind]
     """What it is, see `KINDS`."""
+    equation: ClassVar[str] = ""
+    """Its constitutive or other law as a formula to read, with the names of its numbers spelled out."""
     params: ClassVar[dict[str, Param]] = {}
     """Its numbers."""
+    spec: ClassVar[RopeEffectSpec | None] = None
+    """How a diagnosis looks for it; None if it does not."""
     frames: ClassVar[bool] = False
     """Whether it reads the material frames or exerts torques about the edges' axes."""
     frame_bending: ClassVar[bool] = False

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchdlo.physics import tree
 from torchdlo.physics.effects.base import Effect, EffectKind, Param, Values
+from torchdlo.physics.effects.effect_spec import RopeEffectSpec
 from torchdlo.physics.effects.elastic import (
     bending_moments,
     closing_stiffness,
@@ -42,6 +43,7 @@ class InternalFriction(Effect):
 
     name: ClassVar[str] = "internal_friction"
     kind: ClassVar[EffectKind] = "material"
+    equation: ClassVar[str] = "M = moment · z, dz = (dκ - |dκ| z) / kappa_c"
     frames: ClassVar[bool] = True
     is_quasistatic: ClassVar[bool] = True
     memory: ClassVar[int] = 5
@@ -49,6 +51,12 @@ class InternalFriction(Effect):
         "moment": Param(0.0, 0.0, 0.2, "N m", "linear", 0.0, "Moment at which it saturates."),
         "kappa_c": Param(1.0, 0.01, 100.0, "1/m", "log", None, "Change of curvature over which it builds up."),
     }
+    spec = RopeEffectSpec(
+        lambda s: [
+            {"moment": 0.1 * s.bending_stiffness * s.curvature, "kappa_c": share * s.curvature} for share in (0.03, 0.2)
+        ],
+        strength=("moment",),
+    )
 
     def _change(self, view: View, values: Values, kappa: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Return the change of curvature since the last view over kappa_c, its size a, exp(-a), (1 - exp(-a)) / a."""
@@ -103,11 +111,21 @@ class StiffeningBending(Effect):
 
     name: ClassVar[str] = "stiffening_bending"
     kind: ClassVar[EffectKind] = "material"
+    equation: ClassVar[str] = "M = B (κ + c κ³)"
     frames: ClassVar[bool] = True
     is_quasistatic: ClassVar[bool] = True
     params: ClassVar[dict[str, Param]] = {
         "c": Param(0.0, 0.0, 0.1, "m^2", "linear", 0.0, "Relative growth of the moment per squared curvature.")
     }
+    spec = RopeEffectSpec(
+        lambda s: [{"c": 0.2 / s.curvature**2}],
+        strength=("c",),
+        confusable=("anisotropic_bending", "gripper_compliance"),
+        experiments={
+            "nonuniform_stiffness": "repeat the motion with half its amplitude: stiffening disappears",
+            "anisotropic_bending": "move it in one plane, and again after a quarter turn in its grippers",
+        },
+    )
 
     def energy(self, view: View, values: Values) -> Tensor:
         """Return the energy per hinge [J], shape (..., V, 1)."""
@@ -146,6 +164,7 @@ class AnisotropicBending(Effect):
 
     name: ClassVar[str] = "anisotropic_bending"
     kind: ClassVar[EffectKind] = "material"
+    equation: ClassVar[str] = "B₁ = B √ratio, B₂ = B / √ratio; direction: angle of the stiff one in the rope's material"
     frames: ClassVar[bool] = True
     frame_bending: ClassVar[bool] = True
     params: ClassVar[dict[str, Param]] = {
@@ -161,6 +180,12 @@ class AnisotropicBending(Effect):
             periodic=True,
         ),
     }
+    spec = RopeEffectSpec(
+        lambda _: [{"ratio": 1.2, "direction": 0.0}, {"ratio": 1.2, "direction": 0.25 * torch.pi}],
+        signed=True,
+        strength=("ratio",),
+        confusable=("gripper_compliance",),
+    )
 
     def modify_material(self, topology: Topology, params: RodParams, values: Values) -> RodParams:
         """Make the stiffness a matrix."""

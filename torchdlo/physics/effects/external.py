@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from torchdlo.physics.effects.base import Effect, EffectKind, Param, Values
+from torchdlo.physics.effects.effect_spec import RopeEffectSpec
 from torchdlo.physics.linalg.numerics import cross, dot, safe_norm
 from torchdlo.physics.rod.kinematics import View
 
@@ -37,6 +38,7 @@ class Damping(Effect):
 
     name: ClassVar[str] = "damping"
     kind: ClassVar[EffectKind] = "force"
+    equation: ClassVar[str] = "dv/dt = -rate · v"
     params: ClassVar[dict[str, Param]] = {
         "rate": Param(0.5, 1e-3, 50.0, "1/s", "log", 0.0, "Rate at which velocities decay."),
         "twist_rate": Param(0.5, 1e-3, 1e4, "1/s", "log", 0.0, "Rate at which twist rates decay."),
@@ -56,10 +58,19 @@ class TiltedGravity(Effect):
 
     name: ClassVar[str] = "tilted_gravity"
     kind: ClassVar[EffectKind] = "force"
+    equation: ClassVar[str] = "g → R(angles) g"
     params: ClassVar[dict[str, Param]] = {
         "angles": Param((0.0, 0.0), -0.2, 0.2, "rad", "linear", 0.0, "Turn of gravity about the x and the y axis."),
         "acceleration": Param((0.0, 0.0, -9.81), -20.0, 20.0, "m/s^2", "linear", None, "Gravity that is turned."),
     }
+    spec = RopeEffectSpec(
+        lambda _: [{"angles.0": 0.01}, {"angles.1": 0.01}],
+        signed=True,
+        strength=("angles",),
+        fixed=("acceleration",),
+        known=lambda rope: {"acceleration": list(rope.gravity)},
+        confusable=("rest_curvature", "marker_offset"),
+    )
 
     def loads(self, view: View, values: Values) -> Values:
         """Return the acceleration that is added."""
@@ -92,9 +103,21 @@ class AirDrag(Effect):
 
     name: ClassVar[str] = "air_drag"
     kind: ClassVar[EffectKind] = "force"
+    equation: ClassVar[str] = "f = -½ rho c_d 2r |vₙ| vₙ per length; vₙ: velocity across the rope; rho = 1.2 kg/m³"
     params: ClassVar[dict[str, Param]] = {
         "c_d": Param(1.2, 0.0, 20.0, "1", "linear", 0.0, "Drag coefficient of the rope in cross-flow.")
     }
+    spec = RopeEffectSpec(
+        lambda _: [{"c_d": 0.5}],
+        strength=("c_d",),
+        confusable=("bending_damping", "internal_friction", "bending_plasticity"),
+        experiments={
+            "bending_damping": "pluck short waves, then swing the whole rope slowly: air brakes what is fast, inner "
+            "damping what bends quickly",
+            "internal_friction": "let it swing freely from a large and from a small amplitude: air brakes the large "
+            "one more, friction the small one",
+        },
+    )
 
     def loads(self, view: View, values: Values) -> Values:
         """Return drag forces and how they answer to velocity."""
@@ -111,10 +134,24 @@ class Wind(Effect):
 
     name: ClassVar[str] = "wind"
     kind: ClassVar[EffectKind] = "force"
+    equation: ClassVar[str] = (
+        "f = -½ rho c_d 2r |wₙ| wₙ per length; w = v - velocity of the air, wₙ: its part across the rope"
+    )
     params: ClassVar[dict[str, Param]] = {
         "velocity": Param((0.0, 0.0, 0.0), -20.0, 20.0, "m/s", "linear", None, "Velocity of the air."),
         "c_d": Param(1.2, 0.0, 20.0, "1", "linear", 0.0, "Drag coefficient of the rope in cross-flow."),
     }
+    spec = RopeEffectSpec(
+        lambda _: [{"c_d": 1.2, f"velocity.{k}": v} for k in range(3) for v in (-1.0, 1.0)],
+        strength=("velocity",),
+        power=2.0,
+        confusable=("tilted_gravity", "rest_curvature", "marker_offset"),
+        experiments={
+            "tilted_gravity": "hang a known weight on the rope: what a tilt does grows with it, what air does shrinks",
+            "air_drag": "repeat the motion in the opposite direction: a flow of air favours one",
+        },
+        special_case=("air_drag", {"velocity": 0.0}),
+    )
 
     def loads(self, view: View, values: Values) -> Values:
         """Return drag forces and how they answer to velocity."""

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchdlo.physics import tree
 from torchdlo.physics.effects.base import Effect, EffectKind, Param, Values
+from torchdlo.physics.effects.effect_spec import RopeEffectSpec
 from torchdlo.physics.rod.kinematics import RodParams, hinge_length
 from torchdlo.physics.rod.topology import Topology
 
@@ -38,12 +39,22 @@ class GripperCompliance(Effect):
 
     name: ClassVar[str] = "gripper_compliance"
     kind: ClassVar[EffectKind] = "boundary"
+    equation: ClassVar[str] = "moment at a clamp = stiffness · turn of the rope in it"
     last: ClassVar[bool] = True
     params: ClassVar[dict[str, Param]] = {
         "stiffness": Param(
             1e18, 1e-3, 1e18, "N m/rad", "reciprocal", 1e18, "Stiffness of a clamp; 1e18 stands for a rigid one."
         )
     }
+    spec = RopeEffectSpec(
+        lambda s: [{"stiffness": 100 * s.bending_stiffness / s.rope.length}],
+        strength=("stiffness",),
+        experiments={
+            "nonuniform_stiffness": "grip it at another place: compliance moves with the gripper",
+            "time_delay": "hold the grippers still in two poses: a delay shows in motion only",
+        },
+        requires="clamps",
+    )
 
     def check(self, topology: Topology) -> None:
         """Raise a `ValueError` if the clamps are not at hinges."""

@@ -28,6 +28,7 @@ class LinkChain(Effect):
 
     name: ClassVar[str] = "link_chain"
     kind: ClassVar[EffectKind] = "material"
+    equation: ClassVar[str] = "rigid links of this length; joints turn about one axis after the other"
     frames: ClassVar[bool] = True
     is_quasistatic: ClassVar[bool] = True
     params: ClassVar[dict[str, Param]] = {

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchdlo.physics import tree
 from torchdlo.physics.effects.base import Effect, EffectKind, Param, Values
+from torchdlo.physics.effects.effect_spec import RopeEffectSpec
 from torchdlo.physics.effects.elastic import Curvature, curvature
 from torchdlo.physics.linalg.numerics import dot
 from torchdlo.physics.rod.kinematics import RodParams, View, hinge_length
@@ -32,10 +33,23 @@ class RestCurvature(Effect):
 
     name: ClassVar[str] = "rest_curvature"
     kind: ClassVar[EffectKind] = "material"
+    equation: ClassVar[str] = "M = B (κ - κ̄); κ̄: the two curvatures, fixed in the rope's material"
     frame_bending: ClassVar[bool] = True
     params: ClassVar[dict[str, Param]] = {
         "curvature": Param((0.0, 0.0), -30.0, 30.0, "1/m", "linear", 0.0, "Curvature about the two material directors.")
     }
+    spec = RopeEffectSpec(
+        lambda s: [{"curvature.0": 0.05 * s.curvature}, {"curvature.1": 0.05 * s.curvature}],
+        signed=True,
+        strength=("curvature",),
+        confusable=("marker_offset",),
+        experiments={
+            "marker_offset": "roll the rope by half a turn in its grippers and repeat",
+            "anisotropic_bending": "hang it by one end at rest: natural curvature shows without motion",
+            "tilted_gravity": "roll the rope by half a turn in its grippers: a tilt stays, curvature turns",
+            "gripper_compliance": "grip it at another place: compliance moves with the gripper",
+        },
+    )
 
     def modify_material(self, topology: Topology, params: RodParams, values: Values) -> RodParams:
         """Add the curvature to the rest shape."""
@@ -50,12 +64,20 @@ class NonuniformStiffness(Effect):
 
     name: ClassVar[str] = "nonuniform_stiffness"
     kind: ClassVar[EffectKind] = "material"
+    equation: ClassVar[str] = "B(s) = B (1 + slope (s/L - ½)) exp(factor · exp(-½ ((s/L - position) / width)²))"
     params: ClassVar[dict[str, Param]] = {
         "position": Param(0.5, 0.0, 1.0, "1", "linear", None, "Centre of the spot as a fraction of the length."),
         "width": Param(0.1, 0.02, 0.5, "1", "log", None, "Half width of the spot as a fraction of the length."),
         "factor": Param(0.0, -2.5, 2.5, "1", "linear", 0.0, "Logarithm of stiffness at the spot over that elsewhere."),
         "slope": Param(0.0, -1.8, 1.8, "1", "linear", 0.0, "Relative change of stiffness from end to end."),
     }
+    spec = RopeEffectSpec(
+        lambda s: [*({"position": x, "factor": 0.3, "width": 0.08} for x in s.inside), {"slope": 0.3}],
+        signed=True,
+        strength=("factor", "slope"),
+        places=("position",),
+        confusable=("stiffening_bending", "anisotropic_bending", "gripper_compliance"),
+    )
 
     def modify_material(self, topology: Topology, params: RodParams, values: Values) -> RodParams:
         """Scale the bending stiffness of the hinges."""
@@ -73,10 +95,19 @@ class PointMass(Effect):
 
     name: ClassVar[str] = "point_mass"
     kind: ClassVar[EffectKind] = "material"
+    equation: ClassVar[str] = "rho(s) → rho(s) + mass · δ(s - position)"
     params: ClassVar[dict[str, Param]] = {
         "position": Param(0.5, 0.0, 10.0, "m", "linear", None, "Place along the rope."),
         "mass": Param(0.0, 0.0, 1.0, "kg", "linear", 0.0, "The extra mass."),
     }
+    spec = RopeEffectSpec(
+        lambda s: [{"position": x * s.rope.length, "mass": 0.05 * s.rope.mass} for x in s.loose],
+        strength=("mass",),
+        places=("position",),
+        limits=lambda rope: {"position": (0.5 * rope.length, rope.length), "mass": (0.0, 2 * rope.mass)},
+        confusable=("nonuniform_stiffness",),
+        experiments={"nonuniform_stiffness": "bend it slowly, then swing it fast: a mass shows in fast motion"},
+    )
 
     def modify_material(self, topology: Topology, params: RodParams, values: Values) -> RodParams:
         """Add the mass to the vertices."""
@@ -97,9 +128,15 @@ class AxialStiffness(Effect):
 
     name: ClassVar[str] = "stretch"
     kind: ClassVar[EffectKind] = "material"
+    equation: ClassVar[str] = "T = EA · strain"
     params: ClassVar[dict[str, Param]] = {
         "EA": Param(1e18, 1.0, 1e18, "N", "reciprocal", 1e18, "Axial stiffness; 1e18 stands for inextensible.")
     }
+    spec = RopeEffectSpec(
+        lambda s: [{"EA": 100 * s.weight}],
+        strength=("EA",),
+        experiments={"marker_offset": "pull it straight with two forces: only stretch moves the markers apart"},
+    )
 
     def modify_material(self, topology: Topology, params: RodParams, values: Values) -> RodParams:
         """Soften the edges."""
@@ -116,11 +153,21 @@ class BendingDamping(Effect):
 
     name: ClassVar[str] = "bending_damping"
     kind: ClassVar[EffectKind] = "material"
+    equation: ClassVar[str] = "M = coefficient · dκ/dt"
     frames: ClassVar[bool] = True
     is_quasistatic: ClassVar[bool] = True
     params: ClassVar[dict[str, Param]] = {
         "coefficient": Param(0.0, 0.0, 1.0, "N m^2 s", "linear", 0.0, "Bending moment per rate of curvature.")
     }
+    spec = RopeEffectSpec(
+        lambda s: [{"coefficient": 3e-3 * s.bending_stiffness}],
+        strength=("coefficient",),
+        confusable=("internal_friction", "bending_plasticity"),
+        experiments={
+            "internal_friction": "bend it slowly at two speeds: friction does not depend on them",
+            "time_delay": "move a gripper in steps: a delay is the same at all speeds and places",
+        },
+    )
 
     def loads(self, view: View, values: Values) -> Values:
         """Return the moment's loads and how they answer to turning and to twists."""
@@ -180,6 +227,7 @@ class BendingPlasticity(Effect):
 
     name: ClassVar[str] = "bending_plasticity"
     kind: ClassVar[EffectKind] = "material"
+    equation: ClassVar[str] = "dκ̄/dt = rate · (|κ - κ̄| - yield_curvature) along κ - κ̄, once that is positive"
     frame_bending: ClassVar[bool] = True
     frames: ClassVar[bool] = True
     params: ClassVar[dict[str, Param]] = {
@@ -187,6 +235,18 @@ class BendingPlasticity(Effect):
         "rate": Param(10.0, 0.01, 1e4, "1/s", "log", None, "Rate of the flow."),
         "hardening": Param(0.0, 0.0, 100.0, "1", "linear", None, "Growth of yield per plastic curvature."),
     }
+    spec = RopeEffectSpec(
+        # What flows beyond a yield point does not grow evenly with it: no number is its strength.
+        lambda s: [
+            {"yield_curvature": share * s.curvature, "rate": rate} for share in (0.3, 0.6) for rate in (0.5, 10.0)
+        ],
+        fixed=("hardening",),
+        confusable=("internal_friction",),
+        experiments={
+            "internal_friction": "hold it bent for a minute and let go: plastic bends stay",
+            "rest_curvature": "measure its shape before and after a strong bend: only one of them changes",
+        },
+    )
 
     def plastic_flow(self, view: View, values: Values) -> Tensor:
         """Return the change of the plastic curvature."""

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchdlo.physics import tree
 from torchdlo.physics.effects.base import Effect, EffectKind, Param, Values
+from torchdlo.physics.effects.effect_spec import RopeEffectSpec
 
 
 @tree.struct
@@ -72,10 +73,17 @@ class TimeDelay(Effect):
 
     name: ClassVar[str] = "time_delay"
     kind: ClassVar[EffectKind] = "measurement"
+    equation: ClassVar[str] = "marker(t) = rope(t - delay)"
     last: ClassVar[bool] = True
     params: ClassVar[dict[str, Param]] = {
         "delay": Param(0.0, -0.2, 0.2, "s", "linear", 0.0, "Time by which the markers lag the grippers.")
     }
+    spec = RopeEffectSpec(
+        lambda _: [{"delay": 2e-3}],
+        signed=True,
+        strength=("delay",),
+        experiments={"air_drag": "tap a gripper at the start and at the end: a delay is the same for both"},
+    )
 
     def observe(self, track: Track, values: Values) -> Tensor:
         """Return earlier positions of the free markers."""
@@ -91,9 +99,15 @@ class MarkerOffset(Effect):
 
     name: ClassVar[str] = "marker_offset"
     kind: ClassVar[EffectKind] = "measurement"
+    equation: ClassVar[str] = "marker = axis + offset₀ d₁ + offset₁ d₂; d: directors of the rope's material"
     params: ClassVar[dict[str, Param]] = {
         "offset": Param((0.0, 0.0), -0.03, 0.03, "m", "linear", 0.0, "Offset along the two material directors.")
     }
+    spec = RopeEffectSpec(
+        lambda s: [{f"offset.{k}": 0.5 * (s.rope.radius or 5e-3)} for k in range(2)],
+        signed=True,
+        strength=("offset",),
+    )
 
     def observe(self, track: Track, values: Values) -> Tensor:
         """Return the markers beside the axis."""

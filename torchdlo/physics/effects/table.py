@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchdlo.physics import tree
 from torchdlo.physics.effects.base import Effect, EffectKind, Param, Values
+from torchdlo.physics.effects.effect_spec import RopeEffectSpec
 from torchdlo.physics.linalg.numerics import total
 from torchdlo.physics.rod.kinematics import View
 
@@ -53,12 +54,20 @@ class TableFriction(Effect):
 
     name: ClassVar[str] = "table_friction"
     kind: ClassVar[EffectKind] = "force"
+    equation: ClassVar[str] = "f = -mu N v / √(|v|² + slip²) along the table"
     params: ClassVar[dict[str, Param]] = {
         "mu": Param(0.0, 0.0, 2.0, "1", "linear", 0.0, "Coefficient of friction."),
         "slip": Param(1e-3, 1e-5, 0.1, "m/s", "log", None, "Speed below which friction grows with speed: creep."),
         "height": _HEIGHT,
         "hardness": _HARDNESS,
     }
+    spec = RopeEffectSpec(
+        lambda _: [{"mu": 0.05}],
+        strength=("mu",),
+        fixed=("slip", "height", "hardness"),
+        known=lambda rope: {"height": rope.table_height},
+        requires="table",
+    )
 
     def loads(self, view: View, values: Values) -> Values:
         """Return the friction force and how it answers to velocity."""

@@ -26,7 +26,6 @@ from torchdlo.physics.constraints.contact_penalty import HARD, Pairs, Touch
 from torchdlo.physics.constraints.edge_lengths import Inertia, Lengths, LengthSystem, saddle_order
 from torchdlo.physics.constraints.joint_points import JointPoints
 from torchdlo.physics.integrators import contact_kernel
-from torchdlo.physics.kernels import lanes
 from torchdlo.physics.linalg import banded, gather_scatter, low_rank
 from torchdlo.physics.linalg.numerics import added, dot
 from torchdlo.physics.rod.topology import Topology, following, parse, preceding
@@ -315,9 +314,9 @@ def solve_contact_step(touching: Touching, tension: Tensor) -> tuple[Tensor, ...
         and displacements and turns of free bodies, shape (..., J, 6).
     """
     system = touching.system
-    if touching.joints is None and lanes.ready(system.force) and contact_kernel.available(system.force):
+    if touching.joints is None and contact_kernel.available(system.force):
         pos, tension, force, exerted, wrench, left = _searched(touching, tension, True)[4:]
-        return pos, tension, force, exerted, wrench, left, wrench[..., :0, :3], wrench
+        return pos, tension, force, exerted, wrench, left.detach(), wrench[..., :0, :3], wrench
     with torch.no_grad():
         pos, found, bodies, hard, tied = _searched(touching, tension)
     firm = touching.firm(tension, hard)
@@ -344,10 +343,11 @@ def _searched(touching: Touching, tension: Tensor, whole: bool = False) -> tuple
     inputs, law = system.inputs(tension)
     parts = [getattr(touching.touch, name) for name in _FIELDS]
     pairs = [] if touching.pairs is None else tree.leaves(touching.pairs)
-    law = [*law, touching.dt]
-    operator = torch.ops.torchdlo.engaged_whole if whole else torch.ops.torchdlo.engaged
-    tied = [] if touching.joints is None else [getattr(touching.joints, name) for name in joint_points.FIELDS]
-    return tuple(operator(inputs, parts, pairs, tied, touching.origin, system.lengths.topology.name, law))
+    law, name = [*law, touching.dt], system.lengths.topology.name
+    if whole:
+        return tuple(torch.ops.torchdlo.engaged_whole(inputs, parts, pairs, touching.origin, name, law))
+    tied = [] if touching.joints is None else [getattr(touching.joints, field) for field in joint_points.FIELDS]
+    return tuple(torch.ops.torchdlo.engaged(inputs, parts, pairs, tied, touching.origin, name, law))
 
 
 def _equations(
@@ -372,23 +372,91 @@ def _equations(
     return Touching(system, Touch(*parts), origin, between, law[-1], tied), tension
 
 
-def _by_kernel(*given) -> list[Tensor]:
-    touching, tension = _equations(*given)
-    others = touching.touch, touching.pairs, touching.origin, touching.dt
-    return contact_kernel.solve(touching.system, tension, *others, TRIES, _solved(tension))
+def _by_kernel(inputs, parts, pairs, origin: Tensor, topology: str, law: list[float]) -> list[Tensor]:
+    return contact_kernel.solve(inputs, parts, pairs, origin, topology, law, TRIES, _solved(origin))
 
 
-def _whole(*given) -> list[Tensor]:
-    return [x.contiguous() for x in _by_kernel(*given)]
+def _whole(*given) -> tuple[Tensor, ...]:
+    return tuple(x.contiguous() for x in _by_kernel(*given))
+
+
+def _derived(
+    inputs: list[Tensor],
+    parts: list[Tensor],
+    pairs: list[Tensor],
+    origin: Tensor,
+    found: list[Tensor],
+    by: list[Tensor],
+    topology: str,
+    law: list[float],
+) -> tuple[Tensor, ...]:
+    call = inputs, parts, pairs, origin, topology, law, TRIES, _solved(origin)
+    return contact_kernel.derive(call, found, by)
+
+
+def _derived_meta(inputs, parts, pairs, origin: Tensor, found: list[Tensor], *others) -> tuple[Tensor, ...]:
+    slots, scenes = found[0].shape[-2], found[3].numel()
+    points, bodies, room = parts[0].shape[-3], found[2].shape[-2], pairs[0].shape[-1] if pairs else 0
+    shapes = (28, slots, scenes), (scenes, points, slots, 18), (scenes, room, 43), (scenes, bodies, 36)
+    return tuple(origin.new_empty(shape) for shape in shapes)
+
+
+def _save(ctx, inputs, output) -> None:
+    inputs, parts, pairs, origin, *ctx.static = inputs
+    ctx.counts = [len(x) for x in (inputs, parts, pairs)]
+    ctx.save_for_backward(*inputs, *parts, *pairs, origin, *output[:4])
+
+
+def _backward(ctx, *by: Tensor):
+    """Return derivatives by the arguments of `engaged_whole`: of those that no derivative is taken by, None."""
+    (*tensors, origin), found = ctx.saved_tensors[:-4], list(ctx.saved_tensors[-4:])
+    groups = []
+    for count in ctx.counts:
+        groups.append(tensors[:count])
+        tensors = tensors[count:]
+    inputs, parts, pairs = groups
+    slots, points, between, bodies = torch.ops.torchdlo.engaged_back(
+        inputs, parts, pairs, origin, found, [x.contiguous() for x in by[4:9]], *ctx.static
+    )
+    batch = found[3].shape[:-2]
+    slots = slots.reshape(*slots.shape[:2], *batch)
+    slots = slots.permute(*range(2, slots.dim()), 1, 0)
+    by_slots = list(slots.split([x.shape[-1] for x in (*inputs, origin)], -1))
+    points = points.reshape(*batch, *points.shape[1:])
+    by_points = list(points.split([x.shape[-1] for x in parts[:-3]], -1))
+    resist = bodies.reshape(*batch, -1, 6, 6)
+    by_pairs: list[Tensor | None] = []
+    if pairs:
+        between = between.reshape(*batch, *between.shape[1:])
+        widths = [x.shape[-1] * (x.shape[-2] if k > 4 else 1) for k, x in enumerate(pairs[1:])]
+        split = between.split(widths, -1)
+        by_pairs = [None, None, *(x if k < 4 else x.unflatten(-1, (3, 3)) for k, x in enumerate(split[1:]))]
+        by_pairs = [None if g is None else g.sum_to_size(x.shape) for g, x in zip(by_pairs, pairs, strict=True)]
+    found_slots = [g.sum_to_size(x.shape) for g, x in zip(by_slots, (*inputs, origin), strict=True)]
+    found_parts = [g.sum_to_size(x.shape) for g, x in zip(by_points, parts, strict=False)]
+    return (
+        [None if k in _MASKS else g for k, g in enumerate(found_slots[:-1])],
+        [None, *found_parts[1:], None, resist.sum_to_size(parts[-2].shape), None],
+        by_pairs,
+        found_slots[-1],
+        None,
+        None,
+    )
+
+
+def _refused(ctx, *by) -> None:
+    """Refuse to differentiate a derivative."""
+    raise RuntimeError("contact in implicit steps has no second derivative; do not ask for create_graph through it")
+
+
+_MASKS = (2, 3, 4)
+"""Of what `LengthSystem.inputs` returns, what no derivative is taken by: masks, and when edges yield."""
 
 
 def _engaged(
     inputs: list[Tensor], parts: list[Tensor], pairs: list[Tensor], joints: list[Tensor], *law
 ) -> list[Tensor]:
     """Return positions, tensions, displacements of bodies, how hard contact was, and forces of joints."""
-    if not joints and contact_kernel.available(inputs[0]):
-        found = [x.contiguous() for x in _by_kernel(inputs, parts, pairs, joints, *law)[:4]]
-        return [*found, found[0].new_zeros(*found[0].shape[:-2], 0, 3)]
     return _by_tensors(*_equations(inputs, parts, pairs, joints, *law))
 
 
@@ -442,21 +510,27 @@ def _engaged_meta(
     return [like(*batch, *shape) for shape in shapes]
 
 
-def _whole_meta(*given) -> list[Tensor]:
-    pos, tension, bodies, hard, _ = _engaged_meta(*given)
+def _whole_meta(inputs, parts, pairs, *given) -> tuple[Tensor, ...]:
+    pos, tension, bodies, hard, _ = _engaged_meta(inputs, parts, pairs, [], *given)
     later = (pos, tension, pos, pos, bodies, hard)
-    return [pos, tension, bodies, hard, *(torch.empty_like(x) for x in later)]
+    return (pos, tension, bodies, hard, *(torch.empty_like(x) for x in later))
 
 
-_ARGUMENTS = (
-    "Tensor[] inputs, Tensor[] parts, Tensor[] pairs, Tensor[] joints, Tensor origin, str topology, float[] law"
-)
+_TENSORS = "Tensor[] inputs, Tensor[] parts, Tensor[] pairs, Tensor origin"
+_JOINED = "Tensor[] inputs, Tensor[] parts, Tensor[] pairs, Tensor[] joints, Tensor origin"
+_STATIC = "str topology, float[] law"
 _operators = torch.library.Library("torchdlo", "FRAGMENT")
-for _name, _run, _shapes in (("engaged", _engaged, _engaged_meta), ("engaged_whole", _whole, _whole_meta)):
-    _operators.define(f"{_name}({_ARGUMENTS}) -> Tensor[]")
-    for _device in ("CPU", "CUDA"):
-        _operators.impl(_name, _run, _device)
+_operators.define(f"engaged({_JOINED}, {_STATIC}) -> Tensor[]")
+_operators.define(f"engaged_whole({_TENSORS}, {_STATIC}) -> ({', '.join(['Tensor'] * 10)})")
+_operators.define(f"engaged_back({_TENSORS}, Tensor[] found, Tensor[] by, {_STATIC}) -> ({', '.join(['Tensor'] * 4)})")
+for _device in ("CPU", "CUDA"):
+    _operators.impl("engaged", _engaged, _device)
+for _name, _run, _shapes in (("engaged_whole", _whole, _whole_meta), ("engaged_back", _derived, _derived_meta)):
+    _operators.impl(_name, _run, "CPU")
     _operators.impl(_name, _shapes, "Meta")
+_operators.impl("engaged", _engaged_meta, "Meta")
+torch.library.register_autograd("torchdlo::engaged_whole", _backward, setup_context=_save, lib=_operators)
+torch.library.register_autograd("torchdlo::engaged_back", _refused, lib=_operators)
 
 
 def _pattern(name: str) -> banded.Pattern:

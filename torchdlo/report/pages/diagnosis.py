@@ -13,7 +13,7 @@ from torchdlo.files import write_atomically
 from torchdlo.report.figures import chart
 from torchdlo.report.pages import films_page, player
 from torchdlo.report.pages.page import STYLE, listed, number, page, percent, table, words
-from torchdlo.sysid.diagnosis.effect_equations import MEANING, effect_equation, separating_experiment
+from torchdlo.sysid.diagnosis.effect_library import MEANING, effect_equation, separating_experiment
 from torchdlo.sysid.diagnosis.findings import absorbed, findings, summary
 from torchdlo.sysid.diagnosis.residual_analysis import PARTS, Localisation, localise
 from torchdlo.sysid.diagnosis.residual_text import STATES

@@ -92,8 +92,9 @@ class Revision:
         What one effect alone cannot explain bends a law with more numbers than it needs; with the others it may do
         without them.
         """
-        for general, (special, _) in effect_library.CONTAINED.items():
-            if general not in found.shares or special in fitted.effects or special not in possible:
+        for general in [*found.shares]:
+            special, _ = effect_library.special_case(general)
+            if special is None or special in fitted.effects or special not in possible:
                 continue
             less = self.bench.fit([self.bench.exchange(fitted, general, special, self.budget.more)])[0]
             self.report(f"{special} in the place of {general}", 1, 1, f"{1e3 * less.point.cost:.2f} mm")
@@ -155,8 +156,7 @@ class Revision:
         """Return the best model with one of several effects in the place of another."""
         less, stage = self.without(fitted, old), f"in the place of {old}"
         scores = score_effects(self.bench.pool, less, names, self.bench.starts["train"], lambda *_: None)
-        kin = {n for group in effect_library.KIN if old in group for n in group}
-        tried = [*scores[:_TRIED], *(s for s in scores[_TRIED:] if s.name in kin)]
+        tried = [*scores[:_TRIED], *(s for s in scores[_TRIED:] if effect_library.confusable(s.name, old))]
         first, more = self.budget.iterations, self.budget.more
         fits, _ = extended_fits(self.bench, less, tried, first, self.bench.fit)
         lead = sorted(fits, key=lambda f: f.point.cost)[:_TRIED]

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
+from torchdlo.physics.effects.parameter_name import ParameterName
 from torchdlo.sysid.diagnosis import clamp_models, effect_library
 from torchdlo.sysid.diagnosis.score_test import Score
 from torchdlo.sysid.diagnosis.workspace import Workspace
@@ -29,12 +30,12 @@ def extension_jobs(bench: Workspace, base: Fitted, score: Score, iterations: int
     ):
         return [clamp_models.stiff_clamp_job(bench, base, score, iterations, frames)]
     # Numbers that no dose uses stay off, a gradient where a spot fits better; but vectors are fitted whole.
-    kinds: dict[frozenset[str], list] = {}
+    kinds: dict[frozenset[ParameterName], list] = {}
     for start in score.starts:
-        kinds.setdefault(frozenset(vector(name) for name in start[0]), []).append(start)
+        kinds.setdefault(frozenset(ParameterName.parse(name).whole for name in start[0]), []).append(start)
     jobs = []
     for vectors, starts in kinds.items():
-        used = [n.name for n in effect_library.numbers(score.name, bench.recording) if vector(n.name) in vectors]
+        used = [n.name for n in effect_library.numbers(score.name, bench.recording) if n.which.whole in vectors]
         jobs.append(bench.extension(base, replace(score, starts=tuple(starts)), used, iterations, frames))
     return jobs
 
@@ -66,8 +67,3 @@ def extended_fits(
 def short_frames(bench: Workspace) -> int:
     """Return how many frames the first fits see: late ones mislead as long as early ones do not fit."""
     return max(10, int(_SHORT * bench.trials["train"][0].markers.shape[0]))
-
-
-def vector(name: str) -> str:
-    """Return the name of a number without that of its component."""
-    return ".".join(name.split(".")[:2])

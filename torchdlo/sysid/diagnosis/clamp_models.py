@@ -11,13 +11,14 @@ from dataclasses import replace
 
 import numpy as np
 
+from torchdlo.physics.effects.gripper_compliance import GripperCompliance
 from torchdlo.sysid.diagnosis.error_floor import gap_rms
 from torchdlo.sysid.diagnosis.score_test import Score
 from torchdlo.sysid.diagnosis.workspace import SILENT, Workspace
 from torchdlo.sysid.estimation.jobs import FitJob, Fitted
 from torchdlo.sysid.model.rope_model import RopeModel
 
-NAME = "gripper_compliance"
+NAME = GripperCompliance.name
 
 _SHARES = (0.2, 0.5, 1.5)
 """Lengths of rope that are as soft as a clamp where fits start, over the distance of its markers."""

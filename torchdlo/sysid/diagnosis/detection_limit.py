@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from torchdlo.physics.effects import EFFECTS
+from torchdlo.physics.effects.parameter_name import ParameterName
 from torchdlo.sysid.diagnosis import effect_library
 from torchdlo.sysid.diagnosis.score_test import Score
 
@@ -51,7 +52,7 @@ def least_gap(rest: float, noise: float, level: float, share: float) -> float:
 def detection_limits(scores: Sequence[Score], gap: float) -> list[DetectionLimit]:
     """Return from which size on each of the screened effects leaves this gap [m], in the order of the library."""
     found = [limit for score in scores if (limit := _limit(score, gap)) is not None]
-    order = {name: k for k, name in enumerate(effect_library.LIBRARY)}
+    order = {name: k for k, name in enumerate(effect_library.library())}
     return sorted(found, key=lambda limit: order.get(limit.name, len(order)))
 
 
@@ -59,15 +60,15 @@ def _limit(score: Score, gap: float) -> DetectionLimit | None:
     """Return the limit of one effect, None where nothing of it shows or it has no number that tells its size."""
     if not np.isfinite(gap):
         return None
-    if score.name not in effect_library.STRENGTHS:
+    how, sizes = effect_library.spec(score.name), []
+    if not how.strength:
         return None
-    key, power = effect_library.STRENGTHS[score.name]
-    sizes = []
+    key = how.strength[0]
     for numbers, shown in score.probes:
-        own = np.array([v for name, v in numbers.items() if name.split(".")[1] == key])
+        own = np.array([v for name, v in numbers.items() if ParameterName.parse(name).number == key])
         if not len(own) or shown <= 0:
             continue
-        param, times = EFFECTS[score.name].params[key], (gap / shown) ** (1 / power)
+        param, times = EFFECTS[score.name].params[key], (gap / shown) ** (1 / how.power)
         if param.scale == "reciprocal":
             sizes.append(float(own[0] / times))
         elif param.scale == "log" and param.off is not None and param.off < 1e3:

@@ -1,20 +1,22 @@
-"""The effects that a recording may need beyond the baseline model: which can be in it, with which numbers.
+"""The effects that a recording may need beyond the baseline model.
 
-The laws are the simulator's own (`torchdlo.physics.effects`). Here stands what only a recording tells: whether an
-effect can show in it at all, numbers that are known, and where a search for the others begins.
+What an effect is, its equation and how it is looked for is declared beside it, in `torchdlo.physics.effects`: here that
+meets a recording. An effect with a `spec` is looked for as soon as it is in `EFFECTS`.
 """
 
 from __future__ import annotations
 
 import difflib
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from torchdlo.errors import InputError
 from torchdlo.physics.effects import EFFECTS
-from torchdlo.physics.effects.base import Effect, Param
-from torchdlo.physics.effects.gripper_compliance import GripperCompliance
+from torchdlo.physics.effects.base import Effect, EffectKind, Param
+from torchdlo.physics.effects.effect_spec import RopeEffectSpec, RopeScales
+from torchdlo.physics.effects.parameter_name import ParameterName
 from torchdlo.sysid.model.discretisation import Mesh
 from torchdlo.sysid.recordings.recording import Recording
 
@@ -36,126 +38,30 @@ PARAMETERS: dict[str, Param] = {
 }
 """Numbers that calibration may fit."""
 
-LIBRARY: tuple[str, ...] = (
-    "air_drag",
-    "wind",
-    "tilted_gravity",
-    "bending_damping",
-    "rest_curvature",
-    "bending_plasticity",
-    "internal_friction",
-    "stiffening_bending",
-    "nonuniform_stiffness",
-    "anisotropic_bending",
-    "point_mass",
-    "stretch",
-    "table_friction",
-    "gripper_compliance",
-    "time_delay",
-    "marker_offset",
-)
-"""Names of the effects that may be found missing."""
-
-KIN: tuple[frozenset[str], ...] = (
-    frozenset({"air_drag", "bending_damping", "internal_friction", "bending_plasticity"}),
-    frozenset({"wind", "tilted_gravity", "rest_curvature", "marker_offset"}),
-    frozenset({"nonuniform_stiffness", "stiffening_bending", "anisotropic_bending", "gripper_compliance"}),
-    frozenset({"point_mass", "nonuniform_stiffness"}),
-)
-"""Effects that do alike things: take up energy, push or bend to one side, change how firm the rope is, or where it is
-slow. Small doses of them are hard to tell apart, fits are not."""
-
-CONTAINED = {"wind": ("air_drag", {"velocity": 0.0})}
-"""Effects by more general ones, and which of their numbers are what where they are the same: more numbers fit noise."""
-
-STRENGTHS = {
-    "air_drag": ("c_d", 1.0),
-    "wind": ("velocity", 2.0),
-    "tilted_gravity": ("angles", 1.0),
-    "bending_damping": ("coefficient", 1.0),
-    "rest_curvature": ("curvature", 1.0),
-    "internal_friction": ("moment", 1.0),
-    "stiffening_bending": ("c", 1.0),
-    "nonuniform_stiffness": ("factor", 1.0),
-    "anisotropic_bending": ("ratio", 1.0),
-    "point_mass": ("mass", 1.0),
-    "stretch": ("EA", 1.0),
-    "table_friction": ("mu", 1.0),
-    "gripper_compliance": ("stiffness", 1.0),
-    "time_delay": ("delay", 1.0),
-    "marker_offset": ("offset", 1.0),
+MEANING: dict[EffectKind, str] = {
+    "force": "a force from outside",
+    "material": "a law of the rope",
+    "boundary": "a law of its grips",
+    "measurement": "how it is measured, no force",
 }
-"""By effect: the number that says how large it is, and the power of it with which the gap grows; plasticity has none,
-as what flows beyond a yield point does not grow with it evenly."""
-
-_KNOWN = {
-    "tilted_gravity": ("acceleration",),
-    "bending_plasticity": ("hardening",),
-    "table_friction": ("slip", "height", "hardness"),
-}
-"""Numbers of effects that are not fitted: what the recording says, or what motion hardly shows."""
+"""What the kinds of effects are."""
 
 
 @dataclass(frozen=True)
 class Number:
     """One number of a model that may be fitted."""
 
-    name: str
-    """`effect.number`, with `.k` for a component, or the name of a baseline number."""
+    which: ParameterName
+    """Which one."""
     param: Param
     """Its declaration, for a component by itself."""
     off: float
     """Value at which its effect does nothing, or at which it is while the effect is off."""
 
-
-def check_known(what: str, name: str) -> None:
-    """Raise an `InputError` that begins with `what` if there is no such effect in the library."""
-    if name not in LIBRARY:
-        close = difflib.get_close_matches(name, LIBRARY, n=1)
-        hint = f"did you mean {close[0]}?" if close else f"known are {', '.join(LIBRARY)}."
-        raise InputError(f"{what}: {name} is no effect that can be looked for; {hint}")
-
-
-def applicable(name: str, recording: Recording, mesh: Mesh) -> bool:
-    """Return whether an effect can show in a recording."""
-    if name == "table_friction":
-        return recording.table_height is not None
-    if name == "gripper_compliance":
-        return bool(mesh.clamp_hinges)
-    return True
-
-
-def instance(name: str, mesh: Mesh) -> Effect:
-    """Return the effect for the rope of a recording."""
-    if name == "gripper_compliance":
-        return GripperCompliance(hinges=mesh.clamp_hinges)
-    return EFFECTS[name]()
-
-
-def known(name: str, recording: Recording) -> dict[str, object]:
-    """Return the numbers of an effect that the recording gives."""
-    if name == "tilted_gravity":
-        return {"acceleration": list(recording.gravity)}
-    if name in ("table_friction", "table"):
-        return {"height": recording.table_height}
-    return {}
-
-
-def numbers(name: str, recording: Recording) -> list[Number]:
-    """Return the numbers of an effect that are fitted."""
-    found = []
-    for key, param in EFFECTS[name].params.items():
-        if key in _KNOWN.get(name, ()):
-            continue
-        if name == "point_mass":
-            high = {"position": recording.length, "mass": 2 * recording.mass}[key]
-            param = replace(param, high=high, default=0.5 * high if key == "position" else 0.0)
-        default = param.default if isinstance(param.default, tuple) else (param.default,)
-        for k, value in enumerate(default):
-            off = value if param.off is None else param.off
-            single = replace(param, default=value)
-            found.append(Number(f"{name}.{key}.{k}" if param.size > 1 else f"{name}.{key}", single, float(off)))
-    return found
+    @property
+    def name(self) -> str:
+        """Its name as text."""
+        return str(self.which)
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,8 +74,68 @@ class Perturbation:
     """Whether the opposite dose is possible too."""
 
 
-def probes(
-    name: str, recording: Recording, mesh: Mesh, curved: float, baseline: dict[str, float]
+def library() -> tuple[str, ...]:
+    """Return the names of the effects that may be found missing."""
+    return tuple(name for name, effect in EFFECTS.items() if effect.spec is not None)
+
+
+def spec(name: str) -> RopeEffectSpec:
+    """Return how an effect of the library is looked for."""
+    found = EFFECTS[name].spec
+    if found is None:
+        raise ValueError(f"{name}: expected an effect that a diagnosis looks for, one with a `spec`.")
+    return found
+
+
+def check_known(what: str, name: str) -> None:
+    """Raise an `InputError` that begins with `what` if there is no such effect in the library."""
+    if name not in library():
+        close = difflib.get_close_matches(name, library(), n=1)
+        hint = f"did you mean {close[0]}?" if close else f"known are {', '.join(library())}."
+        raise InputError(f"{what}: {name} is no effect that can be looked for; {hint}")
+
+
+def applicable(name: str, recording: Recording, mesh: Mesh) -> bool:
+    """Return whether an effect can show in a recording."""
+    here = {"table": recording.table_height is not None, "clamps": bool(mesh.clamp_hinges), None: True}
+    return here[spec(name).requires]
+
+
+def instance(name: str, mesh: Mesh) -> Effect:
+    """Return the effect for the rope of a recording."""
+    kind = EFFECTS[name]
+    if kind.spec is not None and kind.spec.requires == "clamps":
+        return replace(kind(), hinges=mesh.clamp_hinges)  # type: ignore[type-var]  # effects are dataclasses
+    return kind()
+
+
+def known(name: str, recording: Recording) -> Mapping[str, object]:
+    """Return the numbers of an effect that the recording gives."""
+    found = EFFECTS[name].spec
+    return {} if found is None else found.known(recording)
+
+
+def numbers(name: str, recording: Recording) -> list[Number]:
+    """Return the numbers of an effect that are fitted."""
+    kind, found = EFFECTS[name], []
+    fixed = () if kind.spec is None else kind.spec.fixed
+    limits = {} if kind.spec is None else kind.spec.limits(recording)
+    for key, param in kind.params.items():
+        if key in fixed:
+            continue
+        if key in limits:
+            default, high = limits[key]
+            param = replace(param, default=default, high=high)
+        components = param.default if isinstance(param.default, tuple) else (param.default,)
+        for k, value in enumerate(components):
+            off = value if param.off is None else param.off
+            single = replace(param, default=value)
+            found.append(Number(ParameterName(name, key, k if param.size > 1 else None), single, float(off)))
+    return found
+
+
+def perturbations(
+    name: str, recording: Recording, mesh: Mesh, curvature: float, baseline: Mapping[str, float]
 ) -> list[Perturbation]:
     """Return doses of an effect that together show what it can do.
 
@@ -177,37 +143,43 @@ def probes(
         name: the effect.
         recording: the rope.
         mesh: its vertices.
-        curved: a large curvature of the recording [1/m].
+        curvature: a large one of the recording [1/m].
         baseline: calibrated numbers of the baseline.
     """
-    bend, length = baseline["bending_stiffness"], recording.length
     weight = max(recording.mass * float(np.linalg.norm(recording.gravity)), 1e-3)
-    inner = [float(x) for x in np.linspace(0.1, 0.9, 7)]
-    tips = inner if len(mesh.clamps) > 1 else [*inner, 1.0]
-    signed: dict[str, list[dict[str, float]]] = {
-        "tilted_gravity": [{"angles.0": 0.01}, {"angles.1": 0.01}],
-        "rest_curvature": [{"curvature.0": 0.05 * curved}, {"curvature.1": 0.05 * curved}],
-        "marker_offset": [
-            {"offset.0": 0.5 * (recording.radius or 5e-3)},
-            {"offset.1": 0.5 * (recording.radius or 5e-3)},
-        ],
-        "nonuniform_stiffness": [{"position": x, "factor": 0.3, "width": 0.08} for x in inner] + [{"slope": 0.3}],
-        "anisotropic_bending": [{"ratio": 1.2, "direction": 0.0}, {"ratio": 1.2, "direction": 0.25 * np.pi}],
-        "time_delay": [{"delay": 2e-3}],
-    }
-    positive: dict[str, list[dict[str, float]]] = {
-        "air_drag": [{"c_d": 0.5}],
-        "wind": [{"c_d": 1.2, f"velocity.{k}": v} for k in range(3) for v in (-1.0, 1.0)],
-        "bending_damping": [{"coefficient": 3e-3 * bend}],
-        "bending_plasticity": [
-            {"yield_curvature": share * curved, "rate": rate} for share in (0.3, 0.6) for rate in (0.5, 10.0)
-        ],
-        "internal_friction": [{"moment": 0.1 * bend * curved, "kappa_c": share * curved} for share in (0.03, 0.2)],
-        "stiffening_bending": [{"c": 0.2 / curved**2}],
-        "point_mass": [{"position": x * length, "mass": 0.05 * recording.mass} for x in tips],
-        "stretch": [{"EA": 100 * weight}],
-        "table_friction": [{"mu": 0.05}],
-        "gripper_compliance": [{"stiffness": 100 * bend / length}],
-    }
-    doses = signed.get(name) or positive[name]
-    return [Perturbation({f"{name}.{key}": float(v) for key, v in dose.items()}, name in signed) for dose in doses]
+    inside = tuple(float(x) for x in np.linspace(0.1, 0.9, 7))
+    loose = inside if len(mesh.clamps) > 1 else (*inside, 1.0)
+    scales = RopeScales(recording, baseline["bending_stiffness"], curvature, weight, inside, loose)
+    how = spec(name)
+    return [
+        Perturbation({f"{name}.{key}": float(value) for key, value in dose.items()}, how.signed)
+        for dose in how.perturbations(scales)
+    ]
+
+
+def confusable(name: str, other: str) -> bool:
+    """Return whether two effects do alike things: small doses of them are hard to tell apart, fits are not."""
+    return other in spec(name).confusable or name in spec(other).confusable
+
+
+def special_case(name: str) -> tuple[str | None, Mapping[str, float]]:
+    """Return the effect that a more general one contains, None if it contains none, and what it is in numbers.
+
+    Where those numbers may be these, they fit noise.
+    """
+    return spec(name).special_case or (None, {})
+
+
+def effect_equation(name: str) -> str:
+    """Return the equation of an effect. The letters are names of its numbers where they are spelled out."""
+    equation = EFFECTS[name].equation if name in EFFECTS else ""
+    return equation or name.replace("_", " ")
+
+
+def separating_experiment(name: str, other: str) -> str:
+    """Return the experiment that would tell two effects apart."""
+    for one, two in ((name, other), (other, name)):
+        how = EFFECTS[one].spec if one in EFFECTS else None
+        if how is not None and two in how.experiments:
+            return how.experiments[two]
+    return "record motions of other speeds, amplitudes and directions"

@@ -8,7 +8,7 @@ search goes on from there. Test trials are used at the end only: to confirm, or 
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,12 +16,13 @@ import numpy as np
 
 from torchdlo.errors import InputError
 from torchdlo.physics import tree
+from torchdlo.physics.effects.parameter_name import ParameterName, values_of
 from torchdlo.sysid.diagnosis import baseline as baselines
 from torchdlo.sysid.diagnosis import budget as plan
 from torchdlo.sysid.diagnosis import clamp_models, effect_library, selection
 from torchdlo.sysid.diagnosis.backward_elimination import EliminationResult, Revision
 from torchdlo.sysid.diagnosis.budget import BUDGETS, Budget
-from torchdlo.sysid.diagnosis.candidate_fits import extended_fits, short_frames, vector
+from torchdlo.sysid.diagnosis.candidate_fits import extended_fits, short_frames
 from torchdlo.sysid.diagnosis.detection_limit import detection_limits, least_gap
 from torchdlo.sysid.diagnosis.error_floor import gap_rms, trial_gaps
 from torchdlo.sysid.diagnosis.misleading_trials import MisleadingTrial, errors_by_frame, misleading_trials
@@ -213,7 +214,7 @@ class _Search:
         return float(gap_rms(gaps[finite_trials(plain)]) ** 2)
 
     def _possible(self) -> list[str]:
-        mesh, names = self.pool.local.model(()).mesh, [n for n in effect_library.LIBRARY if n not in self.excluded]
+        mesh, names = self.pool.local.model(()).mesh, [n for n in effect_library.library() if n not in self.excluded]
         return [n for n in names if effect_library.applicable(n, self.recording, mesh)]
 
     def _say_floor(self) -> None:
@@ -250,7 +251,7 @@ class _Search:
         first = min(led, key=lambda name: fits[name].point.cost)
         if gap_rms(self.bench.gaps(fits[first], "all")) > SILENT * self.bench.level:
             # Something is left: one that does alike things may be right, however little its doses explain.
-            kin = [s for s in scores if s.name not in fits and any({s.name, first} <= k for k in effect_library.KIN)]
+            kin = [s for s in scores if s.name not in fits and effect_library.confusable(s.name, first)]
             more, also = self._fits_of_kin(base, kin, worst, f"{stage}, effects like {first}") if kin else ({}, [])
             self.bench.predict(list(more.values()))
             fits, led = fits | more, led + also
@@ -302,7 +303,7 @@ class _Search:
         if fair:
             lead = fits[fair[0]].point.cost
             close = [n for n in order if fits[n].point.cost - lead < self.bench.tie(rival.point.cost, lead)]
-            special, numbers = effect_library.CONTAINED.get(fair[0], (None, {}))
+            special, numbers = effect_library.special_case(fair[0])
             if special in fair and special not in close and _may_be(fits[fair[0]], numbers):
                 close.append(special)
             # Of laws that fit as well, the one with the fewest numbers: others may contain it.
@@ -363,7 +364,7 @@ class _Search:
     def _candidate(self, candidate: Candidate, fitted: Fitted, against: str) -> BestCandidate:
         """Return a candidate that is not named, with its numbers and what speaks against it."""
         numbers = dict(zip(fitted.space.names, fitted.space.to_values(fitted.point.raw), strict=True))
-        own = {k.partition(".")[2]: float(v) for k, v in numbers.items() if k.split(".")[0] == candidate.name}
+        own = {key: float(value) for key, value in values_of(candidate.name, numbers).items()}
         gains = candidate.gain or 0.0, candidate.heldout_gain or 0.0
         return BestCandidate(candidate.name, own, *gains, against, tree.part(candidate.test))
 
@@ -501,9 +502,10 @@ class _Search:
         )
 
 
-def _may_be(fitted: Fitted, numbers: dict[str, float]) -> bool:
+def _may_be(fitted: Fitted, numbers: Mapping[str, float]) -> bool:
     """Return whether the last effect's numbers may have these values, as far as their ranges tell."""
     low, high = interval(fitted.point, fitted.space)
-    asked = {f"{fitted.effects[-1]}.{name}": value for name, value in numbers.items()}
-    ranges = [(asked.get(vector(name)), a, b) for name, a, b in zip(fitted.space.names, low, high, strict=True)]
+    asked = {ParameterName(fitted.effects[-1], name): value for name, value in numbers.items()}
+    names = [ParameterName.parse(name).whole for name in fitted.space.names]
+    ranges = [(asked.get(name), a, b) for name, a, b in zip(names, low, high, strict=True)]
     return all(value is None or a <= value <= b for value, a, b in ranges)

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from torchdlo.physics.effects.parameter_name import ParameterName
 from torchdlo.sysid.estimation.jobs import Fitted, SimulationJob
 from torchdlo.sysid.estimation.worker_pool import Pool
 from torchdlo.sysid.model.trial_batch import Start
@@ -172,7 +173,7 @@ def refine(pool: Pool, base: Fitted, start: Start, chain: str) -> Refinement:
     """
     model = pool.local.model(base.effects)
     plain = tuple(e for e in base.effects if e != chain)
-    links = np.array([name.split(".")[0] == chain for name in model.parameters])
+    links = np.array([ParameterName.parse(name).effect == chain for name in model.parameters])
     values = base.values[None, ~links]
     edge, length = float(np.mean(np.diff(model.arclength))), float(np.abs(base.values[links]).sum())
     half = ("substep", model.dt / (2 * model.substeps))

@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 
 from torchdlo.physics.effects import EFFECTS
-from torchdlo.sysid.diagnosis.effect_equations import effect_equation, separating_experiment
+from torchdlo.physics.effects.parameter_name import values_of
+from torchdlo.sysid.diagnosis.effect_library import effect_equation, separating_experiment
 from torchdlo.sysid.diagnosis.error_floor import gap_rms, trial_gaps
 from torchdlo.sysid.diagnosis.plausibility import implausible
 from torchdlo.sysid.diagnosis.residual_analysis import localise
@@ -41,7 +42,7 @@ def findings(result: Diagnosis, recording: Recording) -> dict[str, Any]:
             "name": name,
             "kind": EFFECTS[name].kind,
             "law": effect_equation(name),
-            "parameters": {k.split(".", 1)[1]: v for k, v in numbers.items() if k.startswith(f"{name}.")},
+            "parameters": values_of(name, numbers),
             "share_of_gap": result.shares[name],
             "test": _test(result.tests[name], rates[name], result.looked_at) if name in result.tests else None,
             "indistinguishable_from": result.ties[name],
@@ -66,7 +67,7 @@ def findings(result: Diagnosis, recording: Recording) -> dict[str, Any]:
         "detection_limits": [dataclasses.asdict(limit) for limit in result.limits],
         "misleading_trials": [dataclasses.asdict(trial) for trial in result.misleading],
         "candidates": candidates,
-        "baseline": {k: v for k, v in numbers.items() if "." not in k},
+        "baseline": values_of("", numbers),
         "cameras": {k: v for k, v in numbers.items() if k.startswith("camera_")},
         "absorbed_by_calibration": absorbed(result),
         "data_issues": [dataclasses.asdict(fault) for fault in result.data_issues],
@@ -173,8 +174,8 @@ def absorbed(result: Diagnosis) -> list[dict[str, Any]]:
             "change": float(before[name] / n["value"] - 1),
             "unit": n["unit"],
         }
-        for name, n in _numbers(result).items()
-        if name in before and "." not in name and n["value"]
+        for name, n in values_of("", _numbers(result)).items()
+        if name in before and n["value"]
     ]
 
 
@@ -293,7 +294,7 @@ def _best(result: Diagnosis) -> str:
 
 
 def _named(name: str, numbers: dict[str, dict[str, Any]], ties: list[str]) -> str:
-    own = {k.split(".", 1)[1]: n for k, n in numbers.items() if k.startswith(f"{name}.")}
+    own = values_of(name, numbers)
     told = ", ".join(
         f"{key} {n['value']:.3g} [{n['low']:.3g}, {n['high']:.3g}]{'' if n['unit'] == '1' else ' ' + n['unit']}"
         for key, n in own.items()

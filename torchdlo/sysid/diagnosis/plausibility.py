@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from torchdlo.physics.effects.parameter_name import ParameterName
 from torchdlo.sysid.estimation.jobs import Fitted
 from torchdlo.sysid.estimation.levenberg_marquardt import reach
 from torchdlo.sysid.model.rope_model import RopeModel
@@ -38,8 +39,8 @@ def implausible(fitted: Fitted, name: str, drifts: np.ndarray | None = None) -> 
         return None
     switches: list[bool] = []
     for k, key in enumerate(space.names):
-        effect, _, number = key.partition(".")
-        if effect != name:
+        which = ParameterName.parse(key)
+        if which.effect != name:
             continue
         param = space.params[k]
         ends = space.to_raw(np.array([[p.low for p in space.params], [p.high for p in space.params]]))[:, k]
@@ -49,7 +50,7 @@ def implausible(fitted: Fitted, name: str, drifts: np.ndarray | None = None) -> 
             continue
         off = float(space.to_raw(np.where(np.arange(len(space.names)) == k, param.off, fitted_values(fitted)))[k])
         switches.append(abs(at - off) <= width)
-        spoken = number.split(".")[0].replace("_", " ")
+        spoken = which.number.replace("_", " ")
         if not np.isclose(high, off) and at > high - _EDGE * (high - low):
             return f"has a {spoken} at the edge of what can be"
         if not np.isclose(low, off) and at < low + _EDGE * (high - low):

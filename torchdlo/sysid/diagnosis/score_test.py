@@ -13,6 +13,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.optimize import lsq_linear
 
+from torchdlo.physics.effects import EFFECTS
+from torchdlo.physics.effects.parameter_name import ParameterName
 from torchdlo.sysid.diagnosis import effect_library
 from torchdlo.sysid.diagnosis.effect_library import Perturbation
 from torchdlo.sysid.estimation.jobs import Fitted, SimulationJob
@@ -83,7 +85,7 @@ def score_effects(
     motion = pool.local.motion(model, "train")
     known = dict(zip(model.parameters, base.values, strict=True))
     curved = curvature_scale(motion.markers[:, :: max(1, motion.markers.shape[1] // 50)])
-    doses = {n: effect_library.probes(n, recording, model.mesh, curved, known) for n in names}
+    doses = {n: effect_library.perturbations(n, recording, model.mesh, curved, known) for n in names}
     groups, nudge = _groups(names, doses), base.space.nudges()
     jobs = [_job(pool, base, group, doses) for group in groups]
     jobs.append(SimulationJob(base.effects, _nudged(model, base, nudge)))
@@ -148,13 +150,17 @@ def _groups(names: Sequence[str], doses: dict[str, list[Perturbation]]) -> list[
     groups: list[list[str]] = []
     for name in sorted(names, key=lambda n: -len(doses[n])):
         fitting = [g for g in groups if len(g) < 4 and sum(len(doses[n]) for n in g) + len(doses[name]) <= 12]
-        # Drag and wind are the same law.
-        fitting = [g for g in fitting if not ({name, *g} >= {"air_drag", "wind"})]
+        # One that is a case of another is the same law.
+        fitting = [g for g in fitting if not any(_same_law(name, other) for other in g)]
         if fitting:
             min(fitting, key=lambda g: sum(len(doses[n]) for n in g)).append(name)
         else:
             groups.append([name])
     return groups
+
+
+def _same_law(name: str, other: str) -> bool:
+    return effect_library.special_case(name)[0] == other or effect_library.special_case(other)[0] == name
 
 
 def _job(pool: Pool, base: Fitted, group: Sequence[str], doses: dict[str, list[Perturbation]]) -> SimulationJob:
@@ -209,17 +215,6 @@ def _additive(doses: list[Perturbation]) -> bool:
     return len(keys) > 1 and all(len(k) == 1 for k in keys) and len(set(keys)) == len(keys)
 
 
-_STRENGTH = {
-    "wind": "velocity",
-    "point_mass": "mass",
-    "nonuniform_stiffness": "factor",
-    "internal_friction": "moment",
-    "anisotropic_bending": "ratio",
-    "bending_plasticity": "",
-}
-"""The number of an effect that grows with the dose; the others say where or how. Default: all."""
-
-
 def _mixture(name: str, doses: list[Perturbation], amounts: np.ndarray) -> dict[str, float]:
     """Return numbers for amounts of doses, kept within reason."""
     found: dict[str, float] = {}
@@ -231,13 +226,14 @@ def _mixture(name: str, doses: list[Perturbation], amounts: np.ndarray) -> dict[
         least = 0.05
         amount = amount if abs(amount) > least else (least if amount >= 0 else -least)
         for key, value in dose.values.items():
-            number = key.split(".")[1]
-            if name in ("stretch", "gripper_compliance"):
-                found[key] = value / amount
-            elif name == "anisotropic_bending" and number == "ratio":
-                found[key] = float(np.exp(np.clip(amount * np.log(value), -1.5, 1.5)))
-            elif name in _STRENGTH and number != _STRENGTH[name] and number != "slope":
+            number = ParameterName.parse(key).number
+            scale = EFFECTS[name].params[number].scale
+            if number not in effect_library.spec(name).strength:
                 found[key] = value
+            elif scale == "reciprocal":
+                found[key] = value / amount
+            elif scale == "log":
+                found[key] = float(np.exp(np.clip(amount * np.log(value), -1.5, 1.5)))
             else:
                 found[key] = value * amount
     return found
@@ -246,12 +242,13 @@ def _mixture(name: str, doses: list[Perturbation], amounts: np.ndarray) -> dict[
 def _sizes(name: str, doses: list[Perturbation]) -> dict[str, float]:
     """Return what counts as much of each number: the dose of strengths, a share of the range of places."""
     sizes: dict[str, float] = {}
-    for dose in doses:
-        for key, value in dose.values.items():
-            inverse = name in ("stretch", "gripper_compliance")
-            sizes[key] = 1 / value if inverse else abs(value) or 1.0
-    for key in ("point_mass.position", "nonuniform_stiffness.position"):
-        if key in sizes:
-            sizes[key] = 0.2 * max(d.values.get(key, 0.0) for d in doses)
-    sizes |= {k: 0.2 for k in sizes if k.endswith(".direction")}
+    for key, value in ((key, value) for dose in doses for key, value in dose.values.items()):
+        number = ParameterName.parse(key).number
+        param = EFFECTS[name].params[number]
+        if number in effect_library.spec(name).places:
+            sizes[key] = 0.2 * max(dose.values.get(key, 0.0) for dose in doses)
+        elif param.periodic:
+            sizes[key] = 0.2
+        else:
+            sizes[key] = 1 / value if param.scale == "reciprocal" else abs(value) or 1.0
     return sizes

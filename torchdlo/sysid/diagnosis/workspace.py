@@ -9,6 +9,7 @@ import numpy as np
 
 from torchdlo.errors import InputError
 from torchdlo.physics import tree
+from torchdlo.physics.effects.parameter_name import ParameterName
 from torchdlo.sysid.diagnosis import error_floor as floors
 from torchdlo.sysid.diagnosis.score_test import Score
 from torchdlo.sysid.estimation.jobs import FitJob, Fitted, SimulationJob
@@ -210,8 +211,9 @@ class Workspace:
             plain: the baseline, whose numbers may be nearer than those that made up for the effect.
             iterations: most iterations.
         """
-        keep = [k for k, n in enumerate(fitted.space.names) if n.split(".")[0] != name]
-        left = [k for k, n in enumerate(self.pool.local.model(fitted.effects).parameters) if n.split(".")[0] != name]
+        keep = [k for k, n in enumerate(fitted.space.names) if ParameterName.parse(n).effect != name]
+        whole = self.pool.local.model(fitted.effects).parameters
+        left = [k for k, n in enumerate(whole) if ParameterName.parse(n).effect != name]
         names = tuple(fitted.space.names[k] for k in keep)
         sizes = tuple(fitted.space.units[k] for k in keep)
         effects, values = tuple(e for e in fitted.effects if e != name), np.repeat(fitted.values[None, left], 3, 0)
@@ -229,9 +231,9 @@ class Workspace:
             iterations: most iterations.
         """
 
-        def named(number: str) -> str:
-            effect, *rest = number.split(".")
-            return ".".join([special if effect == general else effect, *rest])
+        def named(text: str) -> str:
+            name = ParameterName.parse(text)
+            return str(replace(name, effect=special) if name.effect == general else name)
 
         effects = tuple(special if e == general else e for e in fitted.effects)
         model, before = self.pool.local.model(effects), self.pool.local.model(fitted.effects).parameters

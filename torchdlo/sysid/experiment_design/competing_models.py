@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from torchdlo.errors import InputError
+from torchdlo.physics.effects.parameter_name import ParameterName
 from torchdlo.sysid.diagnosis import baseline as baselines
 from torchdlo.sysid.diagnosis import budget as plan
 from torchdlo.sysid.diagnosis import effect_library
@@ -123,7 +124,7 @@ def fit_rivals(
 
 def _without(given: ModelFile, names: Sequence[str]) -> ModelFile:
     """Return a model without some of its effects."""
-    values = {k: v for k, v in given.values.items() if k.split(".")[0] not in names}
+    values = {k: v for k, v in given.values.items() if ParameterName.parse(k).effect not in names}
     return replace(given, effects=tuple(e for e in given.effects if e not in names), values=values)
 
 

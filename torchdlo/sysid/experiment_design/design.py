@@ -19,7 +19,7 @@ import numpy as np
 from torchdlo.errors import InputError
 from torchdlo.sysid.diagnosis import budget
 from torchdlo.sysid.diagnosis import error_floor as floors
-from torchdlo.sysid.diagnosis.effect_equations import separating_experiment
+from torchdlo.sysid.diagnosis.effect_library import separating_experiment
 from torchdlo.sysid.diagnosis.score_test import curvature_scale
 from torchdlo.sysid.diagnosis.workspace import Callback, Workspace
 from torchdlo.sysid.estimation.jobs import Fitted

@@ -217,7 +217,7 @@ class ModelDiscrimination:
             return ()
         recording = self.bench.recording
         place = {"position": recording.length * (0.5 if recording.train[0].gripped[-1] else 1.0), "mass": mass}
-        return tuple(place[n.name.split(".")[1]] for n in effect_library.numbers(_LOAD, recording))
+        return tuple(place[n.which.number] for n in effect_library.numbers(_LOAD, recording))
 
     def _trials(self, gestures: Sequence[ExcitationMotion], shown: np.ndarray | None = None) -> tuple[Trial, ...]:
         """Return motions as trials, with markers as given."""

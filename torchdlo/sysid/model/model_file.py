@@ -13,6 +13,7 @@ import numpy as np
 
 from torchdlo.errors import InputError
 from torchdlo.physics.effects import EFFECTS
+from torchdlo.physics.effects.parameter_name import ParameterName, values_of
 from torchdlo.sysid.diagnosis import effect_library
 from torchdlo.sysid.diagnosis.effect_library import PARAMETERS
 from torchdlo.sysid.estimation.evaluation import rope_content
@@ -63,7 +64,7 @@ class ModelFile:
             )
         model = RopeModel(recording, effects=self.effects, **(self.options | options))
         for name in self.effects:
-            if name in effect_library.LIBRARY and not effect_library.applicable(name, recording, model.mesh):
+            if name in effect_library.library() and not effect_library.applicable(name, recording, model.mesh):
                 raise InputError(
                     f"{self.path}: {name}: expected a recording in which it can act, but {recording.path} has nothing "
                     "that it acts on (no table, no clamp of two markers, or no radius)."
@@ -83,7 +84,7 @@ class ModelFile:
         found = {}
         for number, value in zip(model.numbers, self.start(model), strict=True):
             param = number.param
-            if number.name.split(".")[0] in self.effects and param.off is not None and value == param.off:
+            if number.which.effect in self.effects and param.off is not None and value == param.off:
                 continue
             if param.scale == "log":
                 found[number.name] = 1.0
@@ -97,16 +98,12 @@ class ModelFile:
 def content(model: RopeModel, values: np.ndarray) -> dict[str, Any]:
     """Return what a model file holds, for JSON."""
     numbers = dict(zip(model.parameters, map(float, values), strict=True))
-    effects: dict[str, dict[str, float]] = {name: {} for name in model.effects}
-    for key in [k for k in numbers if "." in k]:
-        effect, number = key.split(".", 1)
-        effects[effect][number] = numbers.pop(key)
     return {
         "format": FORMAT,
         "version": VERSION,
         "rope": rope_content(model.recording, model.rest),
-        "parameters": numbers,
-        "effects": effects,
+        "parameters": values_of("", numbers),
+        "effects": {name: values_of(name, numbers) for name in model.effects},
         "options": {
             "vertices": _asked(model),
             "rest": model.rest,
@@ -215,17 +212,16 @@ def _check_name(path: Path, where: str, name: str, known: Mapping[str, Any]) -> 
 
 def _check_number(path: Path, effect: str, key: str) -> None:
     """Refuse a number that an effect does not have; those with components are called `number.0`, `number.1`, ..."""
-    name, _, part = key.partition(".")
-    params = EFFECTS[effect].params
+    name, params = key.partition(".")[0], EFFECTS[effect].params
     _check_name(path, f"effects.{effect}", name, params)
     size = params[name].size
-    if (size > 1) != bool(part) or (part and not (part.isdigit() and int(part) < size)):
-        parts = ", ".join(f"{name}.{k}" for k in range(size)) if size > 1 else name
-        _refuse(path, f"effects.{effect}", parts, key)
+    parts = [f"{name}.{k}" for k in range(size)] if size > 1 else [name]
+    if key not in parts:
+        _refuse(path, f"effects.{effect}", ", ".join(parts), key)
 
 
 def _bounds(effect: str, key: str) -> tuple[float, ...]:
-    param = EFFECTS[effect].params[key.partition(".")[0]]
+    param = EFFECTS[effect].params[ParameterName.parse(f"{effect}.{key}").number]
     return param.low, param.high, param.off or 0.0
 
 

@@ -18,9 +18,11 @@ from torch import Tensor
 from torchdlo import scene as scenes
 from torchdlo.errors import InputError
 from torchdlo.physics import tree
+from torchdlo.physics.effects import EFFECTS
 from torchdlo.physics.effects.base import Effect, Param
 from torchdlo.physics.effects.elastic import Bend, BendFrame, Twist
 from torchdlo.physics.effects.external import Damping, Gravity
+from torchdlo.physics.effects.parameter_name import ParameterName
 from torchdlo.physics.effects.table import Table
 from torchdlo.physics.execution import tracing
 from torchdlo.physics.linalg import rotation
@@ -97,12 +99,13 @@ class RopeModel:
                 "rope.json: rest_positions is missing; expected it for a calibration with the given rest shape."
             )
         self.dt = float(trial.time[1] - trial.time[0])
-        beside = "marker_offset" in self.effects
+        measured = [EFFECTS[name] for name in self.effects if EFFECTS[name].kind == "measurement"]
+        beside = any(not effect.last for effect in measured)
         self.markers = Markers(self.marker_vertex, torch.as_tensor(np.array(trial.gripped)), self.dt, beside)
         self.substeps = max(1, int(np.ceil(self.dt / substep - 1e-9)))
         baseline = ["bending_stiffness", "twisting_stiffness", "damping_rate"]
         baseline += ["rest_share", "rest_roll"] if rest == "given" else []
-        self.numbers = [Number(name, PARAMETERS[name], float(PARAMETERS[name].scalar)) for name in baseline]
+        self.numbers = [Number(ParameterName("", n), PARAMETERS[n], float(PARAMETERS[n].scalar)) for n in baseline]
         for name in self.effects:
             self.numbers += effect_library.numbers(name, recording)
 
@@ -237,7 +240,7 @@ class RopeModel:
             numbers[name] = dict(effect_library.known(name, self.recording))
             parts: dict[str, list[Tensor]] = {}
             for each in effect_library.numbers(name, self.recording):
-                parts.setdefault(each.name.split(".")[1], []).append(number[each.name])
+                parts.setdefault(each.which.number, []).append(number[each.name])
             numbers[name] |= {key: torch.stack(part, -1).unsqueeze(-2) for key, part in parts.items()}
         return numbers
 

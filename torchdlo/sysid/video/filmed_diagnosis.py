@@ -12,9 +12,9 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from torchdlo.physics.effects.parameter_name import ParameterName
 from torchdlo.sysid.diagnosis import effect_library, score_test
 from torchdlo.sysid.diagnosis.budget import BUDGETS, Budget
-from torchdlo.sysid.diagnosis.candidate_fits import vector
 from torchdlo.sysid.diagnosis.error_floor import ErrorFloor, gap_rms
 from torchdlo.sysid.diagnosis.score_test import Score
 from torchdlo.sysid.diagnosis.verdict import UNKNOWN_FLOOR, Candidate, Diagnosis, verdict_word
@@ -119,7 +119,7 @@ def diagnose_filmed(
     while len(rounds) < plan.rounds:
         if gap_rms(np.concatenate([base.gaps("train"), base.gaps("test")])) < (MORE if shares else SILENT) * level:
             break
-        names = [n for n in effect_library.LIBRARY if n not in (*base.own.model.effects, *without)]
+        names = [n for n in effect_library.library() if n not in (*base.own.model.effects, *without)]
         names = [n for n in names if effect_library.applicable(n, recording, base.own.model.mesh)]
         found, candidates, rivals = _round(base, first, names, floor, level, plan, f"round {len(rounds) + 1}", report)
         rounds.append(candidates)
@@ -205,7 +205,7 @@ def _round(
     scores = _scores(base, names, lambda k, n: report(f"{stage}: screening", k, n, ""))
     tried, short = scores[: plan.candidates], _SHORT * base.own.lasts
     lead = tried[0].name
-    tried += [s for s in scores[plan.candidates :] if any({s.name, lead} <= k for k in effect_library.KIN)]
+    tried += [s for s in scores[plan.candidates :] if effect_library.confusable(s.name, lead)]
     fits: dict[str, _Model] = {}
     for k, score in enumerate(tried):
         fits[score.name] = _fitted(base, score, plan.iterations, short)
@@ -271,8 +271,8 @@ def _fitted(base: _Model, score: Score, iterations: int, seconds: float) -> _Mod
     numbers = effect_library.numbers(score.name, base.own.model.recording)
     starts = []
     for dose, raw in score.starts:
-        vectors = {vector(name) for name in dose}
-        used = {n.name: dose.get(n.name, n.off) for n in numbers if vector(n.name) in vectors}
+        vectors = {ParameterName.parse(name).whole for name in dose}
+        used = {n.name: dose.get(n.name, n.off) for n in numbers if n.which.whole in vectors}
         sizes = {n: score.sizes.get(n, 0.0) for n in used}
         starts.append(_extended(base, (score.name,), sizes, used, raw))
     costs = []
@@ -310,7 +310,7 @@ def _scores(base: _Model, names: Sequence[str], report: Callable[[int, int], Non
     sims = own.simulate(values[None])
     step = max(1, sims.shape[2] // 50)
     curved = score_test.curvature_scale(sims[0][:, ::step])
-    doses = {n: effect_library.probes(n, own.model.recording, own.model.mesh, curved, known) for n in names}
+    doses = {n: effect_library.perturbations(n, own.model.recording, own.model.mesh, curved, known) for n in names}
     groups = score_test._groups(names, doses)
     seen = np.isfinite(here.residual)
     weight = np.where(seen, 1 / (np.nan_to_num(here.residual) ** 2 + levenberg_marquardt.KNEE**2) ** 0.25, 0.0)
