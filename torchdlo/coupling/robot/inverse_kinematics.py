@@ -56,7 +56,8 @@ class IkSearch:
     starts: int = 1
     """Postures from which to start, spread over the joints' ranges after the given one; the best answer counts."""
     restarts: int = 0
-    """How often what is not there and settled begins again from `SEEDS` other starts, with more steps."""
+    """How often what is not there and settled begins again with more steps, first where it is, then from `SEEDS` other
+    starts each time; of positions alone, what is not there."""
     pull: float = 0.05
     """Most that a joint is pulled to the posture in a step, over half its range."""
     stride: float = 0.5
@@ -300,7 +301,9 @@ def _restarted(problem: _Problem, start: Tensor, joints: Tensor, search: IkSearc
     patient = dataclasses.replace(search, steps=2 * search.steps, **longer)
     for again in range(search.restarts):
         here = _look(problem, joints)
-        done = _reached(_missing(here.error), search) & _still(_left(problem, joints, here)[0])
+        done = _reached(_missing(here.error), search)
+        if problem.turns:  # where the tool may turn, postures seldom settle
+            done = done & _still(_left(problem, joints, here)[0])
         rows = (~done).nonzero()[:, 0]
         if not len(rows):
             break
@@ -311,9 +314,10 @@ def _restarted(problem: _Problem, start: Tensor, joints: Tensor, search: IkSearc
         names = ("posture", "lower", "upper")
         parts = {name: cut(getattr(problem, name)) for name in names}
         part = dataclasses.replace(problem, target=tree.map(cut, problem.target), **parts)
-        # Where it was is the first of them: more steps may be all that it lacks.
-        begin = _spread(part, joints[rows] if again == 0 else start[rows], SEEDS, again * SEEDS)
-        found = _descend(_repeated(part, SEEDS), begin, patient).reshape(SEEDS, len(rows), -1)
+        # More steps from where it was may be all that it lacks.
+        count, here_or_there = (1, joints) if again == 0 else (SEEDS, start)
+        begin = _spread(part, here_or_there[rows], count, max(0, again - 1) * SEEDS)
+        found = _descend(_repeated(part, count), begin, patient).reshape(count, len(rows), -1)
         best = _best(part, torch.cat([joints[None, rows], found]), search, settled=True)
         joints = joints.index_copy(0, rows, best)
     return joints
