@@ -26,7 +26,7 @@ from torchdlo.coupling.mpm import body_coupling_effect, rod_coupling_effect
 from torchdlo.coupling.mpm import substep as mpm
 from torchdlo.coupling.mpm.particles import MpmDomain, ParticleParams, Particles, laid_out
 from torchdlo.coupling.rod_body import joints as joined
-from torchdlo.coupling.rod_body.joints import Joining, Joint, JointParams, Joints, JointState
+from torchdlo.coupling.rod_body.joints import Joining, JointParams, Joints, JointState, RopeJoint
 from torchdlo.field_docs import with_field_docs
 from torchdlo.physics import tree
 from torchdlo.physics.effects.base import Effect, altered_params, default_values, parameters_of
@@ -228,7 +228,7 @@ def make(
     *,
     bodies: Sequence[RigidBody] = (),
     material_points: tuple[MpmDomain, ParticleParams, Particles] | tuple[()] = (),
-    joints: Sequence[Joint] = (),
+    joints: Sequence[RopeJoint] = (),
     check: bool = True,
     clamp: Literal["edge", "vertex"] = "edge",
     **choices,
@@ -267,7 +267,7 @@ def make(
     solids = (kinds, tree.part(solid), tree.part(placed)) if bodies else None
     tied, sits, pulls = (None, (), ())
     if joints:
-        validation.check_sequence(joints, Joint, "joints")
+        validation.check_sequence(joints, RopeJoint, "joints")
         held, twisting = choices.get("prescribed_vertices", ()), choices.get("twist", "none") != "none"
         tied, sits, pulls = joined.place_joints(joints, topology, rods, state, solids, held=held, twisting=twisting)
         effects = joined.apart(effects, tied, topology, rods, state, solids)
@@ -511,7 +511,7 @@ def joint_forces(scene: Scene, state: State) -> tuple[Tensor, Tensor]:
         Forces [N] and torques about the places of the joints [N m], shape (..., N, 3) each.
     """
     if scene.joints is None:
-        raise ValueError("scene: it has no joints; give make(..., joints=[Joint(body=0)])")
+        raise ValueError("scene: it has no joints; give make(..., joints=[RopeJoint(body=0)])")
     return joined.reading(scene.joints, scene.topology, state.rods, tree.part(state.joints))
 
 
@@ -536,10 +536,10 @@ def check_state(state: State) -> None:
 __all__ = [
     "Control",
     "GradientCheck",
-    "Joint",
     "Params",
     "RigidBody",
     "Rope",
+    "RopeJoint",
     "Scene",
     "State",
     "check_gradients",

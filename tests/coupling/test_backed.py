@@ -12,7 +12,7 @@ from torchdlo.coupling import BodyContact, RodBody
 from torchdlo.coupling.bodies import contact_op
 from torchdlo.physics import tree
 from torchdlo.physics.effects import EFFECTS
-from torchdlo.scene import Joint, RigidBody, Rope, check_gradients, make
+from torchdlo.scene import RigidBody, Rope, RopeJoint, check_gradients, make
 
 F64 = torch.float64
 G = 9.81
@@ -74,7 +74,7 @@ def test_a_box_that_stands_on_the_ground_is_lifted_by_its_rope_without_a_jerk() 
         [EFFECTS[name]() for name in ("bend", "gravity", "damping")] + [RodBody(), BodyContact()],
         {"damping": {"rate": 0.5}},
         bodies=solids,
-        joints=[Joint(body=1, kind="ball", anchor=(0.0, 0.0, HALF))],
+        joints=[RopeJoint(body=1, kind="ball", anchor=(0.0, 0.0, HALF))],
         prescribed_vertices=[0],
         integrator="implicit",
         dt=dt,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import math
 
 import pytest
 import torch
@@ -185,3 +186,65 @@ def test_joints_at_their_limits_leave_single_precision_all_its_digits():
     )
     assert bool(found.converged[0]) and 0 < int(found.converged.sum()) < 200
     assert torch.equal(found.joints, wanted.joints.float())
+
+
+LIMITS = (2.96706, 2.0944, 2.96706, 2.0944, 2.96706, 2.0944, 3.05433)
+OFFSETS = ("0 0 0.1575", "0 0 0.2025", "0 0.2045 0", "0 0 0.2155", "0 0.1845 0", "0 0 0.2155", "0 0.081 0")
+TURNS = ("0 0 0", "{q} 0 {p}", "{q} 0 {p}", "{q} 0 0", "-{q} {p} 0", "{q} 0 0", "-{q} {p} 0")
+
+
+@functools.cache
+def iiwa14() -> robot.Robot:
+    """KUKA's LBR iiwa 14 by its published lengths and limits, without shapes."""
+    links = "".join(f'<link name="l{k}"/>' for k in range(8))
+    joints = ""
+    for k, (limit, offset, turn) in enumerate(zip(LIMITS, OFFSETS, TURNS, strict=True)):
+        turn = turn.format(p=math.pi, q=math.pi / 2)
+        joints += (
+            f'<joint name="j{k}" type="revolute"><parent link="l{k}"/><child link="l{k + 1}"/>'
+            f'<origin xyz="{offset}" rpy="{turn}"/><axis xyz="0 0 1"/>'
+            f'<limit lower="{-limit}" upper="{limit}" effort="100" velocity="1.5"/></joint>'
+        )
+    return robot.load_robot(f'<robot name="iiwa14">{links}{joints}</robot>')
+
+
+@pytest.mark.parametrize("position_only", [False, True])
+@pytest.mark.parametrize("make", [arm, iiwa14])
+def test_all_of_a_hundred_reachable_poses_are_reached_and_settle_with_restarts(make, position_only):
+    # From the middle of the ranges, one start brings 89 of them there and settles a third.
+    chain = make()
+    share = torch.rand(100, len(chain.joints), generator=torch.Generator().manual_seed(7), dtype=F64)
+    target = robot.tool_pose(chain, chain.lower + (chain.upper - chain.lower) * share)
+    start = (0.5 * (chain.lower + chain.upper)).expand(100, -1)
+    search = IkSearch(restarts=16)
+    found = inverse_kinematics.solve_ik(chain, target, start, search=search, position_only=position_only)
+    assert bool(found.converged.all()) and (position_only or bool(found.settled.all()))
+    there = robot.tool_pose(chain, found.joints)
+    assert float((there.pos - target.pos).norm(dim=-1).max()) <= 1.01e-4
+    if not position_only:
+        assert float(turn_between(there.quat, target.quat).norm(dim=-1).max()) <= 1.01e-3
+    assert torch.equal(found.handed.pos, target.pos)
+
+
+def test_derivatives_of_positions_alone_are_those_of_differences():
+    _, target = reachable(30, seed=4)
+    search = IkSearch(steps=60, polish=60)
+    found = inverse_kinematics.solve_ik(arm(), target, middle(30), search=search, position_only=True)
+    some = found.settled.nonzero()[:6, 0]
+    assert len(some) == 6
+    target, start = tree.map(lambda x: x[some], target), found.joints[some]
+    weight = torch.randn(6, 8, generator=torch.Generator().manual_seed(2), dtype=F64)
+
+    def joints(shift):
+        moved = Pose(target.pos + shift, target.quat)
+        near = IkSearch(steps=6, polish=8)
+        return inverse_kinematics.solve_ik(arm(), moved, start, search=near, position_only=True).joints
+
+    shift = torch.zeros(6, 3, dtype=F64, requires_grad=True)
+    (found,) = torch.autograd.grad((weight * joints(shift)).sum(), shift)
+    with torch.no_grad():
+        for k in range(3):
+            step = torch.zeros(6, 3, dtype=F64)
+            step[:, k] = 1e-5
+            wanted = (weight * (joints(step) - joints(-step))).sum(-1) / 2e-5
+            assert ((found[:, k] - wanted).abs() <= 1e-4 * found.abs().amax(-1)).all(), k

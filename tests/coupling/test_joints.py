@@ -10,13 +10,13 @@ import torch
 from torch import Tensor
 
 from torchdlo import scene as scenes
-from torchdlo.coupling import RodBody
+from torchdlo.coupling import RodBody, RodContact
 from torchdlo.coupling.bodies.dynamics import conjugate
 from torchdlo.physics import tree
 from torchdlo.physics.effects import Bend, BendFrame, Gravity, Twist
 from torchdlo.physics.linalg.free_rotation import spin_freely, spin_gradient
 from torchdlo.physics.linalg.rotation import multiply, rotate
-from torchdlo.scene import Joint, RigidBody, Rope
+from torchdlo.scene import RigidBody, Rope, RopeJoint
 
 pytestmark = pytest.mark.quick
 G = 9.81
@@ -37,7 +37,7 @@ def hung(integrator: str, kind: str = "weld", n: int = 9, mass: float = 0.05, be
     plug = RigidBody("box", (0.01, 0.015, 0.02), pos=centre, quat=quat, mass=mass, name="plug")
     choices = STEPS[integrator] | {"integrator": integrator, "prescribed_vertices": [0]} | other
     effects = [Gravity(), Bend()]
-    return scenes.make([rope], effects, bodies=[plug], joints=[Joint(body="plug", kind=kind)], **choices)
+    return scenes.make([rope], effects, bodies=[plug], joints=[RopeJoint(body="plug", kind=kind)], **choices)
 
 
 def ran(made, steps: int, step=scenes.step):
@@ -105,7 +105,7 @@ def momentum(params: scenes.Params, state: scenes.State) -> tuple[Tensor, Tensor
     return whole[0] + whole[1], turning + spin.sum(-2)
 
 
-def flying(joint: Joint | None, integrator: str, **other):
+def flying(joint: RopeJoint | None, integrator: str, **other):
     rope = Rope(line(9, 0.4), radius=0.004, mass=0.01, bend=1e-4, twist=1e-4)
     plug = RigidBody("box", (0.01, 0.015, 0.02), (0, 0, -0.42), mass=0.05, omega=(3.0, 2.0, 8.0), vel=(0.1, 0, 0))
     frames = other.get("twist", "none") != "none"
@@ -123,12 +123,12 @@ def flying(joint: Joint | None, integrator: str, **other):
 
 
 PLACES = {
-    "ball": (Joint(body=0, kind="ball"), "none"),
-    "weld": (Joint(body=0), "none"),
-    "weld with twist": (Joint(body=0), "quasistatic"),
-    "ball within an edge": (Joint(body=0, kind="ball", at=0.93, anchor=(0.0, 0.0, 0.048)), "none"),
-    "weld within an edge": (Joint(body=0, at=0.93, anchor=(0.0, 0.0, 0.048)), "none"),
-    "weld in the middle": (Joint(body=0, vertex=-3, anchor=(0.0, 0.0, 0.12)), "quasistatic"),
+    "ball": (RopeJoint(body=0, kind="ball"), "none"),
+    "weld": (RopeJoint(body=0), "none"),
+    "weld with twist": (RopeJoint(body=0), "quasistatic"),
+    "ball within an edge": (RopeJoint(body=0, kind="ball", at=0.93, anchor=(0.0, 0.0, 0.048)), "none"),
+    "weld within an edge": (RopeJoint(body=0, at=0.93, anchor=(0.0, 0.0, 0.048)), "none"),
+    "weld in the middle": (RopeJoint(body=0, vertex=-3, anchor=(0.0, 0.0, 0.12)), "quasistatic"),
 }
 
 
@@ -162,8 +162,8 @@ def test_light_and_heavy_plugs_gain_no_energy(dt: float, cable: float, plug: flo
     rope = Rope(line(7, 0.3, way=(0.8, 0.0, -0.6)), radius=0.004, mass=cable, bend=1e-4)
     body = RigidBody("sphere", (0.01,), (0.248, 0.0, -0.186), mass=plug)
     made = scenes.make(
-        [rope], [Gravity(), Bend()], bodies=[body], joints=[Joint(body=0)], dt=dt, substeps=1, integrator="implicit",
-        prescribed_vertices=[0],
+        [rope], [Gravity(), Bend()], bodies=[body], joints=[RopeJoint(body=0)], dt=dt, substeps=1,
+        integrator="implicit", prescribed_vertices=[0],
     )  # fmt: skip
     scene, params, state = made
     control, step = scenes.stationary_control(scene, state), scenes.stepper(scene, compiled=False, recorded=True)
@@ -260,7 +260,7 @@ def test_two_ropes_end_to_end_swing_as_one(integrator: str) -> None:
         return Rope(points, radius=0.004, mass=mass, bend=1e-9)
 
     whole = scenes.make([rope(points, 0.02)], [Gravity(), Bend()], **choices)
-    joint = Joint(other_rope=1, kind="ball")
+    joint = RopeJoint(other_rope=1, kind="ball")
     halves = [rope(points[:5], 0.01), rope(points[4:], 0.01)]
     parts = scenes.make(halves, [Gravity(), Bend()], joints=[joint], **choices)
     one, two = (ran(made, 40).rods.pos for made in (whole, parts))
@@ -279,7 +279,7 @@ def test_two_stiff_ropes_that_are_welded_bend_as_one() -> None:
 
     whole = scenes.make([rope(points, 0.02)], [Gravity(), Bend()], **choices)
     halves = [rope(points[:9], 0.01), rope(points[8:], 0.01)]
-    parts = scenes.make(halves, [Gravity(), Bend()], joints=[Joint(other_rope=1)], **choices)
+    parts = scenes.make(halves, [Gravity(), Bend()], joints=[RopeJoint(other_rope=1)], **choices)
     one, two = (ran(made, 20) for made in (whole, parts))
     assert float(two.rods.pos[-1, 2]) == pytest.approx(float(one.rods.pos[-1, 2]), rel=0.08)
     edges = two.rods.pos[1:] - two.rods.pos[:-1]
@@ -292,7 +292,7 @@ def test_a_welded_plug_turns_on_the_twist_of_its_rope() -> None:
     rope = Rope(line(9, 0.4), radius=0.004, mass=0.01, bend=1e-4, twist=1e-3)
     plug = RigidBody("box", (0.01, 0.015, 0.02), (0.0, 0.0, -0.42), mass=0.05, omega=(0.0, 0.0, 2.0))
     scene, params, state = scenes.make(
-        [rope], [Gravity(), BendFrame(), Twist()], bodies=[plug], joints=[Joint(body=0)], integrator="implicit",
+        [rope], [Gravity(), BendFrame(), Twist()], bodies=[plug], joints=[RopeJoint(body=0)], integrator="implicit",
         dt=1e-3, substeps=1, prescribed_vertices=[0, 1], prescribed_edges=[0], twist="quasistatic",
     )  # fmt: skip
     control, step = scenes.stationary_control(scene, state), scenes.stepper(scene, compiled=False, recorded=True)
@@ -319,7 +319,7 @@ def test_scenes_of_a_batch_are_as_alone_and_recorded_steps_as_others() -> None:
         body = RigidBody("sphere", (0.01,), (0.248, 0.0, -0.186), mass=mass)
         given = Rope(rope.positions.to(dtype), radius=0.004, mass=0.01, bend=1e-4)
         choices = {"dt": 1e-3, "substeps": 1, "prescribed_vertices": [0], "integrator": integrator}
-        return scenes.make([given], [Gravity(), Bend()], bodies=[body], joints=[Joint(body=0)], **choices)
+        return scenes.make([given], [Gravity(), Bend()], bodies=[body], joints=[RopeJoint(body=0)], **choices)
 
     for integrator in STEPS:
         both = made(masses, integrator=integrator)
@@ -340,7 +340,7 @@ def test_a_rope_does_not_push_the_plug_that_it_is_joined_to(integrator: str) -> 
     made = hung(integrator)
     scene, params, state = scenes.make(
         [Rope(line(9, 0.4), radius=0.004, mass=0.01, bend=1e-4)], [Gravity(), Bend(), RodBody()],
-        bodies=[RigidBody("box", (0.01, 0.015, 0.02), (0.0, 0.0, -0.42), mass=0.05)], joints=[Joint(body=0)],
+        bodies=[RigidBody("box", (0.01, 0.015, 0.02), (0.0, 0.0, -0.42), mass=0.05)], joints=[RopeJoint(body=0)],
         integrator=integrator, prescribed_vertices=[0], **STEPS[integrator],
     )  # fmt: skip
     assert scene.effects[-1].left_out == ((7, 0),)
@@ -349,12 +349,25 @@ def test_a_rope_does_not_push_the_plug_that_it_is_joined_to(integrator: str) -> 
     torch.testing.assert_close(with_contact.bodies.pos, without.bodies.pos, atol=1e-9, rtol=0)
 
 
+@pytest.mark.parametrize("integrator", STEPS)
+def test_ropes_do_not_push_each_other_at_their_joint(integrator: str) -> None:
+    points = line(9, 0.2, way=(0.8, 0.0, -0.6))
+    choices = {"dt": 1e-3, "substeps": 1} | {"integrator": integrator, "prescribed_vertices": [0]}
+    halves = [Rope(x, radius=0.004, mass=0.01, bend=1e-6) for x in (points[:5], points[4:])]
+    joint = RopeJoint(other_rope=1, kind="ball")
+    one, two = (
+        scenes.make(halves, [Gravity(), Bend(), *contact], joints=[joint], **choices)
+        for contact in ((), (RodContact(),))
+    )
+    torch.testing.assert_close(ran(two, 5).rods.pos, ran(one, 5).rods.pos, atol=1e-9, rtol=0)
+
+
 def test_an_elastic_rope_stretches_under_its_plug() -> None:
     rope = Rope(line(5, 0.4), radius=0.004, mass=1e-4, bend=1e-4, stretch=20.0)
     body = RigidBody("sphere", (0.01,), (0.0, 0.0, -0.41), mass=0.05, damping=20.0)
     made = scenes.make(
-        [rope], [Gravity(), Bend()], bodies=[body], joints=[Joint(body=0, kind="ball")], integrator="implicit", dt=5e-3,
-        substeps=1, prescribed_vertices=[0],
+        [rope], [Gravity(), Bend()], bodies=[body], joints=[RopeJoint(body=0, kind="ball")], integrator="implicit",
+        dt=5e-3, substeps=1, prescribed_vertices=[0],
     )  # fmt: skip
     state = ran(made, 150)
     # Strain = m g / EA, by the weight below.
@@ -362,15 +375,15 @@ def test_an_elastic_rope_stretches_under_its_plug() -> None:
 
 
 WRONG = {
-    "expected a body, 0 to 1": Joint(body="plugg"),
-    "is fixed, and joints are for free bodies": Joint(body="wall"),
-    "expected a vertex, -9 to 8": Joint(body=0, vertex=9),
-    "mm off the surface of body 'plug'": Joint(body=0, vertex=3),
-    "starts 40 mm from it": Joint(body=0, anchor=(0.0, 0.0, 0.06)),
-    "either a body or other_rope": Joint(),
-    "which is prescribed": Joint(body=0, vertex=0, anchor=(0.0, 0.0, 0.42)),
-    "expected another rope": Joint(other_rope=0),
-    "a share of the rope's length": Joint(body=0, at=1.5),
+    "expected a body, 0 to 1": RopeJoint(body="plugg"),
+    "is fixed, and joints are for free bodies": RopeJoint(body="wall"),
+    "expected a vertex, -9 to 8": RopeJoint(body=0, vertex=9),
+    "mm off the surface of body 'plug'": RopeJoint(body=0, vertex=3),
+    "starts 40 mm from it": RopeJoint(body=0, anchor=(0.0, 0.0, 0.06)),
+    "either a body or other_rope": RopeJoint(),
+    "which is prescribed": RopeJoint(body=0, vertex=0, anchor=(0.0, 0.0, 0.42)),
+    "expected another rope": RopeJoint(other_rope=0),
+    "a share of the rope's length": RopeJoint(body=0, at=1.5),
 }
 
 
@@ -387,4 +400,4 @@ def test_two_welds_on_one_vertex_are_refused() -> None:
     rope = Rope(line(9, 0.4), radius=0.004, mass=0.01, bend=1e-4)
     plugs = [RigidBody("sphere", (0.02,), (x, 0.0, -0.4), mass=0.05) for x in (0.02, -0.02)]
     with pytest.raises(ValueError, match=r"joints\[1\]: vertex 7 belongs to a weld already"):
-        scenes.make([rope], [Gravity()], bodies=plugs, joints=[Joint(body=0), Joint(body=1)])
+        scenes.make([rope], [Gravity()], bodies=plugs, joints=[RopeJoint(body=0), RopeJoint(body=1)])

@@ -22,6 +22,7 @@ from torchdlo.coupling.bodies.segment_distance import find_contact_points, point
 from torchdlo.coupling.rod_body.rod_body_effect import RodBody
 from torchdlo.coupling.rod_contact.broad_phase import near_pairs
 from torchdlo.coupling.rod_contact.closest_points import closest_points
+from torchdlo.coupling.rod_contact.rod_contact_effect import RodContact
 from torchdlo.physics import tree
 from torchdlo.physics.constraints.edge_lengths import Lengths, settle
 from torchdlo.physics.effects.base import Effect
@@ -83,7 +84,7 @@ def _among_bodies(view: rod.View, bodies: PredictedBodyMotion, touching: RodBody
     return _Overlaps(*[*flat, at.normal.flatten(-3, -2), part, other, radius.flatten(-2)])
 
 
-def _among_ropes(view: rod.View, free: Tensor) -> _Overlaps:
+def _among_ropes(view: rod.View, free: Tensor, touching: RodContact) -> _Overlaps:
     topology, pos = view.topology, view.state.pos
     reach = pos.new_zeros(*pos.shape[:-2], 1, 1)
     first, second, there, _ = near_pairs(topology, view.params, pos, reach, max(64, 8 * topology.size), 64)
@@ -101,7 +102,8 @@ def _among_ropes(view: rod.View, free: Tensor) -> _Overlaps:
     across = cross(a[1] - a[0], b[1] - b[0])  # where centrelines meet
     out = torch.where(distance > 0.01 * thick.unsqueeze(-1), between, across)
     out = out / safe_norm(out).clamp(min=1e-30)
-    depth = torch.where(there > 0, thick - distance[..., 0], -1.0)
+    kept = (there > 0) & touching.kept(topology.size, first, second)
+    depth = torch.where(kept, thick - distance[..., 0], -1.0)
     mobile = torch.maximum(free, following(topology, free))[..., 0]
     one, two = _column(mobile, first), _column(mobile, second)
     share = one / (one + two).clamp(min=1e-9), two / (one + two).clamp(min=1e-9)
@@ -249,8 +251,9 @@ def _look(view: rod.View, names: dict[str, Effect], bodies: Any, free: Tensor) -
         none = torch.zeros_like(placed.pos)
         motion = PredictedBodyMotion(kinds, params, placed, 1.0, none, none, none[..., :1], none)
         parts.append(_among_bodies(view, motion, touching))
-    if "rod_contact" in names:
-        parts.append(_among_ropes(view, free))
+    among = names.get("rod_contact")
+    if isinstance(among, RodContact):
+        parts.append(_among_ropes(view, free, among))
     found = _joined(parts)
     mobile = (free * view.next(free))[..., 0].expand(*found.slot.shape[:-1], -1) > 0
     return dataclasses.replace(found, depth=torch.where(_column(mobile, found.slot), found.depth, -1.0))

@@ -111,7 +111,7 @@ def assemble(description: SceneDescription, *, folder: str | Path = ".") -> Simu
     for arm in armed:
         bodies += robots.solids(arm.robot, arm.joints[0])
     _check_joints(d)
-    joints = [scenes.Joint(**vars(joint)) for joint in d.joints]
+    joints = [scenes.RopeJoint(**vars(joint)) for joint in d.joints]
     held |= {"material_points": _matter(d, dtype), "clamp": d.clamp}
     scene, params, state = scenes.make(ropes, effects, values, bodies=bodies, joints=joints, **held, **static)
     weight = _weights(d, counts, state.rods.pos)

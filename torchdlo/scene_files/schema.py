@@ -132,7 +132,7 @@ class BodySpec:
 @with_field_docs
 @dataclass(frozen=True)
 class JointSpec:
-    """A point of a rope that is joined to a free body, or to another rope; fields are those of `scene.Joint`."""
+    """A point of a rope that is joined to a free body, or to another rope; fields are those of `scene.RopeJoint`."""
 
     rope: int = 0
     vertex: int | None = None

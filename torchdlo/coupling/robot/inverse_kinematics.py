@@ -8,7 +8,8 @@ depend on the way there, but for the choice among separate solutions, and redund
     The damping m = |e|^2 / 2 + const (Sugihara 2011, doi:10.1109/TRO.2011.2148230) needs no trial steps and is good for
     targets out of reach. Joints at a limit that would go beyond it are left where they are.
 2.  A few Newton steps for the same problem with its second derivatives: they settle the posture.
-3.  One more of these is the only one with a graph: it puts the derivative of the implicit function theorem on the
+3.  What is not there, or not settled, may begin again from other postures, with more steps (`IkSearch.restarts`).
+4.  One more Newton step is the only one with a graph: it puts the derivative of the implicit function theorem on the
     answer. The derivative by the target is exact where the tool is there and the posture is settled; it is one-sided
     where a joint just reaches a limit. Second derivatives are refused.
 
@@ -38,6 +39,8 @@ LEVER = 0.3
 """How many metres of error a radian counts as [m/rad]."""
 STILL = 1e-9
 """Damping that stays when the tool is there [m^2]."""
+SEEDS = 8
+"""Starts of a restart."""
 
 
 @dataclass(frozen=True)
@@ -52,6 +55,9 @@ class IkSearch:
     """Newton steps after them."""
     starts: int = 1
     """Postures from which to start, spread over the joints' ranges after the given one; the best answer counts."""
+    restarts: int = 0
+    """How often what is not there and settled begins again with more steps, first where it is, then from `SEEDS` other
+    starts each time; of positions alone, what is not there."""
     pull: float = 0.05
     """Most that a joint is pulled to the posture in a step, over half its range."""
     stride: float = 0.5
@@ -94,6 +100,8 @@ class _Problem:
     """Least positions [rad or m], shape (B or 1, J)."""
     upper: Tensor
     """Greatest positions [rad or m], shape (B or 1, J)."""
+    turns: bool = True
+    """Whether the orientation of the target counts."""
 
 
 @tree.struct
@@ -127,8 +135,9 @@ def _look(problem: _Problem, joints: Tensor) -> _Here:
     tip = found[..., robot.links.index(robot.tool), :, :]
     turn = turn_between(from_matrix(tip[..., :3, :3]), target.quat)
     error = torch.cat([target.pos - tip[..., :3, 3], LEVER * turn], -1)
-    scale = error.new_tensor([1.0] * 3 + [LEVER] * 3)
-    return _Here(error, jacobian(robot, found) * scale[:, None])
+    counts = error.new_tensor([1.0] * 3 + [float(problem.turns)] * 3)
+    scale = counts * error.new_tensor([1.0] * 3 + [LEVER] * 3)
+    return _Here(error * counts, jacobian(robot, found) * scale[:, None])
 
 
 def _stopped(problem: _Problem, joints: Tensor, change: Tensor) -> Tensor:
@@ -240,12 +249,16 @@ def _descend(problem: _Problem, joints: Tensor, search: IkSearch) -> Tensor:
     return joints
 
 
-def _spread(problem: _Problem, start: Tensor, count: int) -> Tensor:
-    """Return `count` starts: the given one, then others spread evenly over the joints' ranges, (count B, J)."""
+def _spread(problem: _Problem, start: Tensor, count: int, before: int = 0) -> Tensor:
+    """Return `count` starts: the given one, then others spread evenly over the joints' ranges, (count B, J).
+
+    `before` of these others are left out.
+    """
     roots = start.new_tensor([2.0, 3.0, 5.0, 7.0, 11.0, 13.0, 17.0, 19.0, 23.0, 29.0]).sqrt()
     n = start.shape[-1]
     roots = roots.repeat(-(-n // len(roots)))[:n]
-    share = torch.frac(torch.arange(1, count, dtype=start.dtype, device=start.device)[:, None] * roots)
+    share = torch.arange(1 + before, count + before, dtype=start.dtype, device=start.device)
+    share = torch.frac(share[:, None] * roots)
     half = problem.give.sqrt()
     others = problem.posture[:1] + (2 * share - 1) * half
     others = torch.where(half > 0, others[:, None, :], start)
@@ -253,15 +266,61 @@ def _spread(problem: _Problem, start: Tensor, count: int) -> Tensor:
     return _bounded(problem, whole).reshape(-1, n)
 
 
-def _best(problem: _Problem, found: Tensor, search: IkSearch) -> Tensor:
-    """Return of several answers (S, B, J) the one that is there and nearest to the posture, or else nearest to it."""
+def _best(problem: _Problem, found: Tensor, search: IkSearch, settled: bool = False) -> Tensor:
+    """Return of several answers (S, B, J) the one that is there and nearest to the posture, or else nearest to it.
+
+    With `settled`, one that is at rest comes before one that is not.
+    """
     repeated = _repeated(problem, len(found))
-    missing = _missing(_look(repeated, found.flatten(0, 1)).error).reshape(*found.shape[:2], 2)
+    here = _look(repeated, found.flatten(0, 1))
+    missing = _missing(here.error).reshape(*found.shape[:2], 2)
     there = _reached(missing, search)
     used = problem.give > 0
     far = ((found - problem.posture).square() / torch.where(used, problem.give, 1.0) * used).sum(-1)
+    if settled:
+        moves = ~_still(_left(repeated, found.flatten(0, 1), here)[0])
+        far = far + 1e3 * moves.reshape(far.shape)
     cost = torch.where(there, far, 1e6 * (1 + missing[..., 0] + LEVER * missing[..., 1]))
     return torch.take_along_dim(found, cost.argmin(0)[None, :, None], 0)[0]
+
+
+def _left(problem: _Problem, joints: Tensor, here: _Here) -> tuple[Tensor, Tensor]:
+    """Return how far the next Newton step goes [rad or m], shape (B,), and how it follows the error, (B, J, 6)."""
+    rest, matrix = _newton(problem, joints, here)
+    return (rest + (matrix @ here.error.unsqueeze(-1)).squeeze(-1)).abs().amax(-1), matrix
+
+
+def _still(left: Tensor) -> Tensor:
+    """Return whether a posture is settled, bool: the next Newton step would find the digits that are missing."""
+    return left < torch.finfo(left.dtype).eps ** 0.5 * 100
+
+
+def _restarted(problem: _Problem, start: Tensor, joints: Tensor, search: IkSearch) -> Tensor:
+    """Return joint positions (B, J) of which those that are not there and settled have begun again, time after time."""
+    longer = {name: 5 * getattr(search, name) for name in ("closing", "polish")}
+    patient = dataclasses.replace(search, steps=2 * search.steps, **longer)
+    for again in range(search.restarts):
+        here = _look(problem, joints)
+        done = _reached(_missing(here.error), search)
+        if problem.turns:  # where the tool may turn, postures seldom settle
+            done = done & _still(_left(problem, joints, here)[0])
+        rows = (~done).nonzero()[:, 0]
+        if not len(rows):
+            break
+
+        def cut(x: Tensor, rows: Tensor = rows) -> Tensor:
+            return x if len(x) == 1 else x[rows]
+
+        names = ("posture", "lower", "upper")
+        parts = {name: cut(getattr(problem, name)) for name in names}
+        part = dataclasses.replace(problem, target=tree.map(cut, problem.target), **parts)
+        # More steps from where it was may be all that it lacks.
+        count, here_or_there = (1, joints) if again == 0 else (SEEDS, start)
+        begin = _spread(part, here_or_there[rows], count, max(0, again - 1) * SEEDS)
+        found = _descend(_repeated(part, count), begin, patient).reshape(count, len(rows), -1)
+        best = _best(part, torch.cat([joints[None, rows], found]), search, settled=True)
+        joints = joints.index_copy(0, rows, best)
+    return joints
 
 
 def _missing(error: Tensor) -> Tensor:
@@ -290,6 +349,7 @@ def solve_ik(
     search: IkSearch = IkSearch(),
     posture: Tensor | None = None,
     within_time: float | None = None,
+    position_only: bool = False,
 ) -> Solution:
     """Return joint positions that bring the tool to a pose.
 
@@ -303,29 +363,31 @@ def solve_ik(
         search: how hard to look.
         posture: where joints would like to be [rad or m], shape (..., J); the middle of their ranges if not given.
         within_time: if given, joints go no further than their greatest speeds allow in that time [s].
+        position_only: whether the tool may be turned in any way; the orientation of the target is not looked at then.
     """
     check_joints(robot, start)
     given = start.dtype
     problem, start, batch = _pose(robot, target, start, posture, within_time)
+    problem = dataclasses.replace(problem, turns=not position_only)
     with torch.no_grad():
         many = _repeated(problem, search.starts)
         many = dataclasses.replace(many, target=tree.detach(many.target))
         found = _descend(many, _spread(problem, start, search.starts), search)
         joints = _best(problem, found.reshape(search.starts, *start.shape), search)
+        joints = _restarted(dataclasses.replace(problem, target=tree.detach(problem.target)), start, joints, search)
     here = _look(problem, joints)
     error = here.error
     with torch.no_grad():
-        rest, matrix = _newton(problem, joints, here)
-        left = (rest + (matrix @ error.unsqueeze(-1)).squeeze(-1)).abs().amax(-1)
+        left, matrix = _left(problem, joints, here)
     # Its value is 0: the answer stays within the limits.
     joints = joints + _Answer.apply(matrix, error - error.detach())
     joints = joints.reshape(*batch, -1)
     missing = _missing(error.detach()).reshape(*batch, 2)
     there = _reached(missing, search)
-    # Half of the digits: the next Newton step would find the rest.
-    settled = there & (left.reshape(batch) < torch.finfo(joints.dtype).eps ** 0.5 * 100)
+    settled = there & _still(left.reshape(batch))
     joints, missing, pose = tree.map(lambda x: x.to(given), (joints, missing, tool_pose(robot, joints)))
     wanted = tree.map(lambda x: x.expand(*batch, x.shape[-1]).to(given), target)
+    wanted = Pose(wanted.pos, pose.quat) if position_only else wanted
     return Solution(joints, pose, tree.where(there, wanted, pose), missing, there, settled)
 
 

@@ -11,6 +11,7 @@ own axis, which is much smaller than that of a body, is left out.
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -22,6 +23,8 @@ from torchdlo.coupling.bodies import shape_sdf
 from torchdlo.coupling.bodies.contact_solver import inertia
 from torchdlo.coupling.bodies.dynamics import Body, BodyParams, BodyState, PredictedBodyMotion, conjugate
 from torchdlo.coupling.rod_body.rod_body_effect import RodBody
+from torchdlo.coupling.rod_contact.broad_phase import APART
+from torchdlo.coupling.rod_contact.rod_contact_effect import RodContact
 from torchdlo.field_docs import with_field_docs
 from torchdlo.physics import tree
 from torchdlo.physics.constraints.joint_points import JointPoints
@@ -38,7 +41,7 @@ Vector = tuple[float, float, float]
 
 @with_field_docs
 @dataclass(frozen=True)
-class Joint:
+class RopeJoint:
     """A point of a rope that is joined to a free body, or to a vertex of another rope."""
 
     rope: int = 0
@@ -118,9 +121,12 @@ class Joining:
 
     joints: Joints
     kinds: tuple[Body, ...]
+    """Static sides of the bodies."""
     params: JointParams
     state: JointState
+    """What joints did in the last substep."""
     dt: float
+    """Substep [s]."""
 
     @property
     def _free(self) -> list[int]:
@@ -257,7 +263,7 @@ class _Found:
 
 
 def place_joints(
-    specs: Sequence[Joint],
+    specs: Sequence[RopeJoint],
     topology: Topology,
     params: RodParams,
     state: RodState,
@@ -303,7 +309,7 @@ def place_joints(
     return joints, params_, JointState(force, couple)
 
 
-def _add(place: _Place, found: _Found, spec: Joint, where: str) -> None:
+def _add(place: _Place, found: _Found, spec: RopeJoint, where: str) -> None:
     _need(spec.kind in ("weld", "ball"), f"{where}.kind: expected 'weld' or 'ball', given {spec.kind!r}")
     given = "none" if spec.body is None else "both"
     _need(
@@ -334,7 +340,7 @@ def _add(place: _Place, found: _Found, spec: Joint, where: str) -> None:
     _check_slots(place, found, spec, where)
 
 
-def _join_body(place: _Place, found: _Found, spec: Joint, at: tuple[Any, int, list[int]], where: str) -> None:
+def _join_body(place: _Place, found: _Found, spec: RopeJoint, at: tuple[Any, int, list[int]], where: str) -> None:
     spot, slot, beside = at
     body = _body(place, spec, where)
     _check_anchor(place, spec, spot, body, where)
@@ -354,7 +360,7 @@ def _join_body(place: _Place, found: _Found, spec: Joint, at: tuple[Any, int, li
         found.frame_bodies += [body] * len(edges)
 
 
-def _join_ropes(place: _Place, found: _Found, spec: Joint, spot: tuple[tuple[int, float], ...], where: str) -> None:
+def _join_ropes(place: _Place, found: _Found, spec: RopeJoint, spot: tuple[tuple[int, float], ...], where: str) -> None:
     other = place.slot(spec.other_rope, spec.other_vertex, f"{where}.other_vertex")
     _need(
         spec.anchor is None, f"{where}.anchor: belongs to a body; two ropes are joined where they start, leave it out"
@@ -393,7 +399,7 @@ def _join_ropes(place: _Place, found: _Found, spec: Joint, spot: tuple[tuple[int
     found.edges.append(edge)
 
 
-def _body(place: _Place, spec: Joint, where: str) -> int:
+def _body(place: _Place, spec: RopeJoint, where: str) -> int:
     kinds = () if place.bodies is None else place.bodies[0]
     names = [b.name for b in kinds]
     body = names.index(spec.body) if isinstance(spec.body, str) and spec.body in names else spec.body
@@ -412,7 +418,7 @@ def _body(place: _Place, spec: Joint, where: str) -> int:
     return body
 
 
-def _check_anchor(place: _Place, spec: Joint, spot: tuple[tuple[int, float], ...], body: int, where: str) -> None:
+def _check_anchor(place: _Place, spec: RopeJoint, spot: tuple[tuple[int, float], ...], body: int, where: str) -> None:
     assert place.bodies is not None
     kinds, params, placed = (tree.detach(x) if k else x for k, x in enumerate(place.bodies))
     here = sum(w * place.state.pos.detach()[..., k, :] for k, w in spot)
@@ -437,7 +443,7 @@ def _check_anchor(place: _Place, spec: Joint, spot: tuple[tuple[int, float], ...
     )
 
 
-def _check_slots(place: _Place, found: _Found, spec: Joint, where: str) -> None:
+def _check_slots(place: _Place, found: _Found, spec: RopeJoint, where: str) -> None:
     """Refuse joints that hold what is held already."""
     start, rope = found.first[-1], spec.rope
     slots = {slot for point in found.points[start:] for slot, _ in point}
@@ -469,8 +475,14 @@ def apart(
     state: RodState,
     bodies: tuple[tuple[Body, ...], BodyParams, BodyState] | None,
 ) -> tuple[Effect, ...]:
-    """Return effects of which `RodBody` leaves out what is joined: edges that start in a body, from its joint on."""
-    if bodies is None or not joints.points:
+    """Return effects of which contacts leave out what is joined.
+
+    `RodBody` leaves out edges that start in a body, from its joint on; `RodContact` pairs of edges of two ropes that
+    are as near to each other along them as those of one rope that it leaves out.
+    """
+    near = _beside(joints, topology, params)
+    effects = [dataclasses.replace(e, left_out=near) if isinstance(e, RodContact) and near else e for e in effects]
+    if bodies is None:
         return tuple(effects)
     kinds, solid, placed = bodies
     pos, radius = state.pos.detach(), params.material.radius.detach().expand(*state.pos.shape[:-1], 1)
@@ -499,6 +511,37 @@ def apart(
                         break
     pairs = tuple(sorted(left_out))
     return tuple(dataclasses.replace(e, left_out=pairs) if isinstance(e, RodBody) else e for e in effects)
+
+
+def _beside(joints: Joints, topology: Topology, params: RodParams) -> tuple[tuple[int, int], ...]:
+    """Return the edges of two ropes that are beside their joint."""
+    after, mask = topology.successor(), topology.edge_mask()
+    length = params.rest.length.detach().reshape(-1, topology.size).amin(0).tolist()
+    radius = float(params.material.radius.detach().amax())
+
+    def along(slot: int) -> list[tuple[int, int, float]]:
+        """Edges on both sides of a vertex: how many others, and what length [m], lie between."""
+        found = []
+        for onward in (True, False):
+            here, way = slot, 0.0
+            for steps in range(topology.size):
+                edge = here if onward else after.index(here)
+                if not mask[edge] or (way > math.pi * radius and steps >= APART):
+                    break
+                found.append((edge, steps, way))
+                here, way = (after[edge] if onward else edge), way + length[edge]
+        return found
+
+    pairs = set()
+    for point, first, body in zip(joints.points, range(len(joints.points)), joints.bodies, strict=True):
+        if body >= 0 or first not in joints.first:
+            continue
+        one, other = (next(slot for slot, w in point if sign * w > 0) for sign in (1, -1))
+        for a, steps, way in along(one):
+            for b, more, further in along(other):
+                if steps + more + 1 < APART or way + further < math.pi * radius:
+                    pairs.add((a, b))
+    return tuple(sorted(pairs))
 
 
 def directors_now(joints: Joints, params: JointParams, placed: BodyState) -> Tensor:

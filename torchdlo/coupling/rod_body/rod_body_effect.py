@@ -28,6 +28,7 @@ stepping); Tonge, Benevolenski, Voroshilov 2012, doi:10.1145/2185520.2185601 (Ja
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -234,8 +235,9 @@ class RodBody(Effect):
         edges = mask, view.tangent, radius, rubs * radius / view.length
         shape = torch.broadcast_shapes(share.shape, *((*x.unsqueeze(-3).shape[:-1], 1) for x in edges))[:-1]
         real, tangent, radius, lever = (x.unsqueeze(-3).expand(*shape, x.shape[-1]) for x in edges)
-        real = real * self._there(view, bodies)
         share, normal, wanted, given, mu, arm = (x.expand(*shape, x.shape[-1]) for x in found)
+        if self.left_out:
+            real = real * self._kept(real, count)
         resist = inertia(bodies, free) if free else share.new_zeros(0, 6, 6)
         like = share.new_tensor
         body = like(of).reshape(len(of), len(free)), resist, like(place).reshape(len(count), len(free))
@@ -244,7 +246,7 @@ class RodBody(Effect):
     def _touches(self, view: View, motion: PredictedMotion) -> tuple[Tensor, ...]:
         """Return share, normal, wanted, given, mu and arm of points by tensor operations; see `Touch`."""
         bodies = motion.bodies
-        points, state = self._points(view, bodies), bodies.state
+        points, state = _points(view, bodies, self.pieces), bodies.state
         at, axes = points.at, points.axes
         still, slip = points.seen(torch.zeros_like(motion.change), bodies)
         wanted = self._target(points, view, bodies, points.seen(motion.change, bodies)[0], calm=True)
@@ -276,19 +278,20 @@ class RodBody(Effect):
             push = points.exerted(normal, friction)
         return push
 
+    def _kept(self, like: Tensor, count: Sequence[int]) -> Tensor:
+        """Return 0 at points of what is left out, else 1 [1], shape (F, V, 1); of so many points for each body."""
+        whole = torch.ones(len(count), like.shape[-2])
+        for edge, body in self.left_out:
+            whole[body, edge] = 0.0
+        rows = [whole[k] for k, n in enumerate(count) for _ in range(n)]
+        return torch.stack(rows).unsqueeze(-1).to(like)
+
     def _points(self, view: View, bodies: PredictedBodyMotion) -> _Points:
         points = _points(view, bodies, self.pieces)
-        return dataclasses.replace(points, real=points.real * self._there(view, bodies)) if self.left_out else points
-
-    def _there(self, view: View, bodies: PredictedBodyMotion) -> Tensor:
-        """Return 0 at points of edges that go through their body, else 1 [1], shape (F, V, 1) or (1, 1, 1)."""
-        mask = view.params.rest.edge_mask
         if not self.left_out:
-            return mask.new_ones(1, 1, 1)
-        out = set(self.left_out)
-        count = [points_per_edge(b, self.pieces) for b in bodies.bodies]
-        rows = [[float((edge, k) not in out) for edge in range(view.topology.size)] for k in range(len(count))]
-        return mask.new_tensor([row for row, n in zip(rows, count, strict=True) for _ in range(n)]).unsqueeze(-1)
+            return points
+        kept = self._kept(points.at.share, [points_per_edge(b, self.pieces) for b in bodies.bodies])
+        return dataclasses.replace(points, real=points.real * kept)
 
     def _target(
         self, points: _Points, view: View, bodies: PredictedBodyMotion, along: Tensor, calm: bool = False

@@ -193,6 +193,8 @@ class RodContact(Effect):
     more. None: 1 m/s, and no more than half a radius in a step, so that thin ropes have room for their pairs."""
     slowest: float = 0.02
     """Approach below which nothing rebounds [m/s]."""
+    left_out: tuple[tuple[int, int], ...] = ()
+    """Pairs of edges, by their places in the scene, that overlap: those of two ropes next to their joint."""
 
     name: ClassVar[str] = "rod_contact"
     kind: ClassVar[EffectKind] = "force"
@@ -218,6 +220,21 @@ class RodContact(Effect):
             view: the rods when the step begins; its dt is the whole step.
             carried: how far held vertices are moved in it [m], shape (..., H, 3).
         """
+        found = self._near(view, carried)
+        if not self.left_out:
+            return found
+        at = torch.div(found["corners"], found["corners"].shape[:-2].numel(), rounding_mode="floor")
+        kept = self.kept(view.topology.size, at[..., 0, :], at[..., 2, :]).to(found["real"])
+        return found | {"real": tree.batch_innermost(found["real"] * kept.unsqueeze(-1))}
+
+    def kept(self, size: int, first: Tensor, second: Tensor) -> Tensor:
+        """Return whether pairs of edges are not left out, bool, shape (..., K); the scene has V = `size` slots."""
+        table = torch.ones(size, size, dtype=torch.bool)
+        for one, other in self.left_out:
+            table[one, other] = table[other, one] = False
+        return table.to(first.device)[first, second]
+
+    def _near(self, view: View, carried: Tensor) -> Values:
         topology, pos, params = view.topology, view.state.pos, view.params
         room = self.room or max(64, 2 * topology.size)
         if broad_phase_op.ready(pos.device.type, pos.dtype):

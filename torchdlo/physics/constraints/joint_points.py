@@ -130,7 +130,7 @@ class JointForces:
     force: Tensor
     """Forces on the ropes [N], shape (..., A, 3)."""
     director: Tensor
-    """What `JointPoints.directors` returns."""
+    """First material directors of carried edges at the end [1], shape (..., W, 3)."""
     couple: Tensor | tuple[()] = ()
     """Torques on the edges whose frames bodies carry, about their axes [N m], shape (..., W, 1)."""
 

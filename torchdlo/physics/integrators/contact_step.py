@@ -264,11 +264,11 @@ class _Border:
     """What displacements of bodies and forces of joints add to the banded system, n unknowns in all."""
 
     column: Tensor
-    """How equations of vertices and lengths feel them, shape (4 V, n N)."""
+    """How equations of vertices and lengths feel them [-], shape (4 V, n N)."""
     row: Tensor
-    """How their equations feel vertices, shape (N, n, 3 V)."""
+    """How their equations feel vertices [-], shape (N, n, 3 V)."""
     own: Tensor
-    """How their equations feel them, shape (N, n, n)."""
+    """How their equations feel them [-], shape (N, n, n)."""
 
 
 def _bordered(
@@ -343,15 +343,11 @@ def _searched(touching: Touching, tension: Tensor, whole: bool = False) -> tuple
     inputs, law = system.inputs(tension)
     parts = [getattr(touching.touch, name) for name in _FIELDS]
     pairs = [] if touching.pairs is None else tree.leaves(touching.pairs)
-    law = [*law, touching.dt]
+    law, name = [*law, touching.dt], system.lengths.topology.name
     if whole:
-        return torch.ops.torchdlo.engaged_whole(
-            inputs, parts, pairs, touching.origin, system.lengths.topology.name, law
-        )
-    tied = [] if touching.joints is None else [getattr(touching.joints, name) for name in joint_points.FIELDS]
-    return tuple(
-        torch.ops.torchdlo.engaged(inputs, parts, pairs, tied, touching.origin, system.lengths.topology.name, law)
-    )
+        return tuple(torch.ops.torchdlo.engaged_whole(inputs, parts, pairs, touching.origin, name, law))
+    tied = [] if touching.joints is None else [getattr(touching.joints, field) for field in joint_points.FIELDS]
+    return tuple(torch.ops.torchdlo.engaged(inputs, parts, pairs, tied, touching.origin, name, law))
 
 
 def _equations(
@@ -461,9 +457,6 @@ def _engaged(
     inputs: list[Tensor], parts: list[Tensor], pairs: list[Tensor], joints: list[Tensor], *law
 ) -> list[Tensor]:
     """Return positions, tensions, displacements of bodies, how hard contact was, and forces of joints."""
-    if not joints and contact_kernel.available(inputs[0]):
-        found = [x.contiguous() for x in _by_kernel(inputs, parts, pairs, *law)[:4]]
-        return [*found, found[0].new_zeros(*found[0].shape[:-2], 0, 3)]
     return _by_tensors(*_equations(inputs, parts, pairs, joints, *law))
 
 
@@ -517,20 +510,19 @@ def _engaged_meta(
     return [like(*batch, *shape) for shape in shapes]
 
 
-def _whole_meta(inputs, parts, pairs, *others) -> tuple[Tensor, ...]:
-    pos, tension, bodies, hard, _ = _engaged_meta(inputs, parts, pairs, [], *others)
+def _whole_meta(inputs, parts, pairs, *given) -> tuple[Tensor, ...]:
+    pos, tension, bodies, hard, _ = _engaged_meta(inputs, parts, pairs, [], *given)
     later = (pos, tension, pos, pos, bodies, hard)
     return (pos, tension, bodies, hard, *(torch.empty_like(x) for x in later))
 
 
-_TENSORS = "Tensor[] inputs, Tensor[] parts, Tensor[] pairs"
+_TENSORS = "Tensor[] inputs, Tensor[] parts, Tensor[] pairs, Tensor origin"
+_JOINED = "Tensor[] inputs, Tensor[] parts, Tensor[] pairs, Tensor[] joints, Tensor origin"
 _STATIC = "str topology, float[] law"
 _operators = torch.library.Library("torchdlo", "FRAGMENT")
-_operators.define(f"engaged({_TENSORS}, Tensor[] joints, Tensor origin, {_STATIC}) -> Tensor[]")
-_operators.define(f"engaged_whole({_TENSORS}, Tensor origin, {_STATIC}) -> ({', '.join(['Tensor'] * 10)})")
-_operators.define(
-    f"engaged_back({_TENSORS}, Tensor origin, Tensor[] found, Tensor[] by, {_STATIC}) -> ({', '.join(['Tensor'] * 4)})"
-)
+_operators.define(f"engaged({_JOINED}, {_STATIC}) -> Tensor[]")
+_operators.define(f"engaged_whole({_TENSORS}, {_STATIC}) -> ({', '.join(['Tensor'] * 10)})")
+_operators.define(f"engaged_back({_TENSORS}, Tensor[] found, Tensor[] by, {_STATIC}) -> ({', '.join(['Tensor'] * 4)})")
 for _device in ("CPU", "CUDA"):
     _operators.impl("engaged", _engaged, _device)
 for _name, _run, _shapes in (("engaged_whole", _whole, _whole_meta), ("engaged_back", _derived, _derived_meta)):
