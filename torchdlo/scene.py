@@ -27,7 +27,7 @@ from torchdlo.coupling.mpm import substep as mpm
 from torchdlo.coupling.mpm.particles import MpmDomain, ParticleParams, Particles, laid_out
 from torchdlo.field_docs import with_field_docs
 from torchdlo.physics import tree
-from torchdlo.physics.effects.base import Effect, altered_params, default_values, parameters_of
+from torchdlo.physics.effects.base import ContactForces, Effect, altered_params, default_values, parameters_of
 from torchdlo.physics.execution import tracing
 from torchdlo.physics.execution.gradient_check import GradientCheck, check_gradients
 from torchdlo.physics.execution.replay import alike, rollout
@@ -345,7 +345,14 @@ def stationary_control(scene: Scene, state: State) -> Control:
 
 
 def advance(scene: Scene, params: Params, state: State, start: Control, control: Control, share: Tensor) -> State:
-    """Advance a scene by one substep.
+    """Advance a scene by one substep; arguments as of `substep_with_contact`."""
+    return substep_with_contact(scene, params, state, start, control, share)[0]
+
+
+def substep_with_contact(
+    scene: Scene, params: Params, state: State, start: Control, control: Control, share: Tensor
+) -> tuple[State, ContactForces]:
+    """Advance a scene by one substep; return it with what contact exerted in it.
 
     Args:
         scene: static choices.
@@ -383,7 +390,7 @@ def advance(scene: Scene, params: Params, state: State, start: Control, control:
     if scene.material_points:
         particles, missed = rod_coupling_effect.finish(scene.material_points, stuff, pool, push, settings.dt, missed)
     after = State(rods, state.time + settings.dt, missed, mean, moved, particles)
-    return laid_out(after) if torch.compiler.is_compiling() else after
+    return (laid_out(after) if torch.compiler.is_compiling() else after), push
 
 
 def step(
