@@ -24,6 +24,8 @@ from gallery_ropes import (
     gripper_claims,
     knot,
     knot_claims,
+    plug,
+    plug_claims,
     pulley,
     pulley_claims,
     wire,
@@ -42,6 +44,7 @@ LARGEST = 60_000
 GALLERY: dict[str, Show] = {
     "knot": Show("An overhand knot is pulled tight", knot, knot_claims),
     "chain": Show("Two linked loops", chain, chain_claims, moments=(0.0, 0.1, 0.6)),
+    "plug": Show("A plug on a cable, and a ball on a thread below it", plug, plug_claims, 10, (0.0, 0.28, 2.0)),
     "gripper": Show("A gripper lifts a rope from a table", gripper, gripper_claims, 10, (0.0, 0.7, 2.2)),
     "wire": Show("A wire that is bent over a post keeps its bend", wire, wire_claims, 10, (0.0, 0.6, 1.0)),
     "pulley": Show("Two weights on a rope over a pulley", pulley, pulley_claims),

@@ -99,6 +99,54 @@ def chain_claims(frames: Frames, d: SceneDescription) -> Claims:
     }
 
 
+def plug(quick: bool) -> SceneDescription:
+    """A cable that is held at its top, a plug welded to its end, and a ball on a thread that is jointed to the plug."""
+    from torchdlo.scene_files import Attachment, BodySpec, JointSpec, RopeSpec, SceneDescription
+
+    count = 9 if quick else 15
+    cable = RopeSpec(((0, 0, 0), (0.24, 0, -0.07)), vertices=count, radius=4e-3, mass=0.01, bend=2e-3)
+    thread = RopeSpec(((0.2976, 0, -0.0868), (0.37, 0, -0.108)), vertices=6, radius=1.5e-3, mass=5e-4, bend=1e-6)
+    # Its axis lies along the cable.
+    half = 0.5 * math.atan2(0.24, 0.07)
+    return SceneDescription(
+        ropes=(cable, thread),
+        effects={"gravity": {}, "bend": {}, "damping": {"rate": 2.5}},
+        bodies=(
+            BodySpec(
+                "cylinder", (0.014, 0.03), (0.2688, 0, -0.0784), (math.cos(half), 0, -math.sin(half), 0), mass=0.05,
+                damping=2.5,
+            ),
+            BodySpec("sphere", (0.012,), (0.3815, 0, -0.1114), mass=0.02, damping=2.5),
+        ),
+        attachments=(Attachment((0,)),),
+        joints=(JointSpec(body=0), JointSpec(1, 0, body=0, kind="ball"), JointSpec(1, body=1, kind="ball")),
+        duration=2.0,
+        dt=4e-3,
+        substeps=1,
+        integrator="implicit",
+        camera_direction=(0.2, -1.0, 0.2),
+    )  # fmt: skip
+
+
+def plug_claims(frames: Frames, d: SceneDescription) -> Claims:
+    """At the end the joints bear what hangs on them, and the cable leaves the plug along its axis all the time."""
+    import numpy as np
+
+    late = frames.time > 1.2
+    weights = [9.81 * m for m in (0.0705, 0.0205, 0.02)]
+    borne = [-float(frames.joint_force[late, k, 2].mean()) for k in range(3)]
+    end = rope_of(frames, 0)[-1] - rope_of(frames, 0)[-2]
+    w, x, y, z = frames.body_quat[-1, 0]
+    axis = np.array([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)])
+    off = math.acos(min(1.0, abs(float(end @ axis)) / float(np.linalg.norm(end))))
+    return {
+        "force of the weld over the weight below": (borne[0] / weights[0], 0.98, 1.02),
+        "force of the joint of the thread, the same": (-borne[1] / weights[1], 0.98, 1.02),
+        "force of the joint of the ball, the same": (borne[2] / weights[2], 0.98, 1.02),
+        "angle between cable and plug [rad]": (off, 0.0, 1e-6),
+    }
+
+
 def gripper(quick: bool) -> SceneDescription:
     """An arm reaches down, grips a rope on a table, and lifts it."""
     from torchdlo.scene_files import Attachment, Keyframe, RobotSpec, RopeSpec, SceneDescription

@@ -25,6 +25,8 @@ from torchdlo.coupling.common.step_diagnostics import broad_phase
 from torchdlo.coupling.mpm import body_coupling_effect, rod_coupling_effect
 from torchdlo.coupling.mpm import substep as mpm
 from torchdlo.coupling.mpm.particles import MpmDomain, ParticleParams, Particles, laid_out
+from torchdlo.coupling.rod_body import joints as joined
+from torchdlo.coupling.rod_body.joints import Joining, Joint, JointParams, Joints, JointState
 from torchdlo.field_docs import with_field_docs
 from torchdlo.physics import tree
 from torchdlo.physics.effects.base import ContactForces, Effect, altered_params, default_values, parameters_of
@@ -32,7 +34,7 @@ from torchdlo.physics.execution import tracing
 from torchdlo.physics.execution.gradient_check import GradientCheck, check_gradients
 from torchdlo.physics.execution.replay import alike, rollout
 from torchdlo.physics.integrators import stability
-from torchdlo.physics.integrators.rod_step import INTEGRATORS, TWISTS, Settings, settle_twist, substep
+from torchdlo.physics.integrators.rod_step import INTEGRATORS, TWISTS, Settings, settle_twist, substep, with_joints
 from torchdlo.physics.kernels import native
 from torchdlo.physics.rod import assembly, validation
 from torchdlo.physics.rod import kinematics as rod
@@ -54,6 +56,8 @@ class Params:
     """Numbers of the rigid bodies, () if there are none."""
     material_points: ParticleParams | tuple[()] = ()
     """Numbers of the matter, () if there is none."""
+    joints: JointParams | tuple[()] = ()
+    """Where joints sit in bodies, () if there are none."""
 
 
 @with_field_docs
@@ -74,6 +78,8 @@ class State:
     """Poses and velocities of the rigid bodies, () if there are none."""
     material_points: Particles | tuple[()] = ()
     """Particles of the matter, () if there is none."""
+    joints: JointState | tuple[()] = ()
+    """What joints exerted in the last substep, () if there are none; see `joint_forces`."""
 
 
 @with_field_docs
@@ -130,6 +136,8 @@ class Scene:
     """Rigid bodies."""
     material_points: MpmDomain | None = None
     """Elastic, plastic, liquid or granular matter."""
+    joints: Joints | None = None
+    """What ropes are joined to, as `make` found it."""
 
     def __post_init__(self) -> None:
         def need(ok: bool, sentence: str) -> None:
@@ -209,6 +217,7 @@ class Scene:
             # Twist and bending answer to each other only in the next step: that costs stability.
             max(self.implicit_weight, 0.5) if self.twist == "dynamic" else self.implicit_weight,
             self.numerical_damping,
+            *(() if self.joints is None else (self.joints.edges, self.joints.frames)),
         )
 
 
@@ -219,6 +228,7 @@ def make(
     *,
     bodies: Sequence[RigidBody] = (),
     material_points: tuple[MpmDomain, ParticleParams, Particles] | tuple[()] = (),
+    joints: Sequence[Joint] = (),
     check: bool = True,
     clamp: Literal["edge", "vertex"] = "edge",
     **choices,
@@ -232,6 +242,7 @@ def make(
         bodies: rigid bodies; `RodBody` among the effects makes ropes touch them.
         matter: what `coupling.mpm.particles.assemble` returned; `RodMpmCoupling` and `BodyMpmCoupling` let ropes and
             bodies touch it.
+        joints: points of ropes that are welded or ball-jointed to free bodies or other ropes.
         check: whether to refuse what could not be stepped: laws that do not fit the ropes, ropes far from their length,
             unstable substeps; and to move ropes that start inside of what they touch out of it. Scenes whose loads are
             only evaluated may be anything.
@@ -253,11 +264,18 @@ def make(
     if material_points:
         state, placed, particles = rod_coupling_effect.expand_batches(state, placed, tree.part(particles))
     effects = rod_coupling_effect.fitted(effects, medium, rods)
-    scene = Scene(topology, effects, bodies=kinds, material_points=medium, **choices)
+    solids = (kinds, tree.part(solid), tree.part(placed)) if bodies else None
+    tied, sits, pulls = (None, (), ())
+    if joints:
+        validation.check_sequence(joints, Joint, "joints")
+        held, twisting = choices.get("prescribed_vertices", ()), choices.get("twist", "none") != "none"
+        tied, sits, pulls = joined.place_joints(joints, topology, rods, state, solids, held=held, twisting=twisting)
+        effects = joined.apart(effects, tied, topology, rods, state, solids)
+    scene = Scene(topology, effects, bodies=kinds, material_points=medium, joints=tied, **choices)
     numbers = parameters_of(effects, values or {}, state.pos)
     blank = {e.name: state.pos.new_zeros(*state.pos.shape[:-1], e.memory) for e in effects if e.memory}
     state = tree.replace(state, memory=tree.map(tree.batch_innermost, blank))
-    params = Params(rods, numbers, solid, stuff)
+    params = Params(rods, numbers, solid, stuff, sits)
     if check:
         stability.check_laws(scene.settings, rods, numbers, state)
         check_step(scene, params)
@@ -267,8 +285,8 @@ def make(
             effects,
             altered_params(scene.effects, topology, rods, numbers),
             state,
-            (kinds, tree.part(solid), tree.part(placed)) if bodies else None,
-            scene.prescribed_vertices,
+            solids,
+            scene.prescribed_vertices + (() if tied is None else tied.slots),
             scene.constrained,
         )
     zero = state.pos.new_zeros(*state.pos.shape[:-2], 1, 3)
@@ -279,14 +297,24 @@ def make(
         unfelt(state.pos, *scene.held),
         placed,
         particles,
+        pulls,
     )
     if scene.twist == "quasistatic":
-        held = stationary_control(scene, first)
-        changed = altered_params(scene.effects, topology, rods, numbers)
-        settled, _ = settle_twist(scene.settings, changed, numbers, state, Targets(held.pos, held.director), 30)
-        first = tree.replace(first, rods=tree.replace(settled, twist_rate=torch.zeros_like(settled.twist)))
+        first = _settled(scene, params, first)
     # No two leaves share memory: steps are compiled for which of them do, and later states have none.
     return scene, params, tree.map(torch.clone, first)
+
+
+def _settled(scene: Scene, params: Params, first: State) -> State:
+    """Return a state whose twist is in balance."""
+    held, settings, rods = stationary_control(scene, first), scene.settings, params.rods
+    targets = Targets(held.pos, held.director)
+    if scene.joints is not None and scene.joints.frames:
+        carried = joined.directors_now(scene.joints, tree.part(params.joints), tree.part(first.bodies))
+        settings, targets = with_joints(settings, targets, carried)
+    changed = altered_params(scene.effects, scene.topology, rods, params.effects)
+    settled, _ = settle_twist(settings, changed, params.effects, first.rods, targets, 30)
+    return tree.replace(first, rods=tree.replace(settled, twist_rate=torch.zeros_like(settled.twist)))
 
 
 def _mention(scene: Scene, state: RodState) -> None:
@@ -377,9 +405,15 @@ def substep_with_contact(
         material_points = rod_coupling_effect.predict_free_motion(
             scene.material_points, stuff, tree.part(state.material_points), first, settings.dt
         )
+    joints = None
+    if scene.joints is not None:
+        at, last = tree.part(params.joints), tree.part(state.joints)
+        joints = Joining(scene.joints, scene.bodies, at, last, settings.dt)
+    others = predict_free_motion, material_points, joints
     rods, reaction, (body, pool, push) = substep(
-        settings, params.rods, params.effects, state.rods, targets, first, predict_free_motion, material_points
+        settings, params.rods, params.effects, state.rods, targets, first, *others
     )
+    pulls = () if joints is None else JointState(push.joints.force, push.joints.couple)
     # Over the substeps of this step; a sum set to zero outside would have no gradient at first.
     later = share * scene.substeps > 1.5
     mean = tree.map(lambda old, now: torch.where(later, old, 0.0) + now / scene.substeps, state.reaction, reaction)
@@ -389,7 +423,7 @@ def substep_with_contact(
     particles: Particles | tuple[()] = ()
     if scene.material_points:
         particles, missed = rod_coupling_effect.finish(scene.material_points, stuff, pool, push, settings.dt, missed)
-    after = State(rods, state.time + settings.dt, missed, mean, moved, particles)
+    after = State(rods, state.time + settings.dt, missed, mean, moved, particles, pulls)
     return (laid_out(after) if torch.compiler.is_compiling() else after), push
 
 
@@ -469,15 +503,28 @@ def _prepared(inputs: tuple[Params, State, Control]) -> tuple[Params, State, Con
     # Compilers tell numbers that need a gradient from others, also where none is taken: replays run both ways.
     if not torch.is_grad_enabled():
         return tree.detach((params, state, control))
-    moving = alike((state.rods, state.reaction, state.bodies, state.material_points), (params, control))
-    names = ("rods", "reaction", "bodies", "material_points")
+    names = ("rods", "reaction", "bodies", "material_points", "joints")
+    moving = alike(tuple(getattr(state, name) for name in names), (params, control))
     fields = dict(zip(names, moving, strict=True)) | tree.detach({"time": state.time, "diagnostics": state.diagnostics})
     return params, tree.replace(state, **fields), control
 
 
+def joint_forces(scene: Scene, state: State) -> tuple[Tensor, Tensor]:
+    """Return what joints exert on their ropes in the last substep, in the order in which `make` was given them.
+
+    Bodies, or the other rope, feel the opposite.
+
+    Returns:
+        Forces [N] and torques about the places of the joints [N m], shape (..., N, 3) each.
+    """
+    if scene.joints is None:
+        raise ValueError("scene: it has no joints; give make(..., joints=[Joint(body=0)])")
+    return joined.reading(scene.joints, scene.topology, state.rods, tree.part(state.joints))
+
+
 def finite(state: State) -> Tensor:
     """Return which scenes are made of numbers only, bool, shape (...)."""
-    moving = (state.rods.pos, state.rods.vel, *tree.leaves((state.bodies, state.material_points)))
+    moving = (state.rods.pos, state.rods.vel, *tree.leaves((state.bodies, state.material_points, state.joints)))
     return reduce(torch.logical_and, (torch.isfinite(x).all(-1).all(-1) for x in moving))
 
 
@@ -496,6 +543,7 @@ def check_state(state: State) -> None:
 __all__ = [
     "Control",
     "GradientCheck",
+    "Joint",
     "Params",
     "RigidBody",
     "Rope",
@@ -506,6 +554,7 @@ __all__ = [
     "check_step",
     "default_values",
     "finite",
+    "joint_forces",
     "limits",
     "make",
     "ok",

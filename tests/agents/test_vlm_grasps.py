@@ -47,6 +47,7 @@ class Says:
     """A model that gives answers one after the other."""
 
     source = "a test"
+    remote = False
 
     def __init__(self, *answers: Any) -> None:
         self.answers, self.heard = list(answers), []

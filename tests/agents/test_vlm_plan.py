@@ -227,6 +227,7 @@ def test_a_run_goes_on_where_it_was_stopped(tmp_path: Path, monkeypatch: pytest.
 
     monkeypatch.setattr(decomposition._Part, "travelled", counted)
     again = carried_out(answers(*rows), folder=tmp_path / "cut", resume=True)
+    assert again.world is not None and whole.world is not None
     assert len(led) == 1 and again.success
     torch.testing.assert_close(again.world.state.rods.pos, whole.world.state.rods.pos, rtol=0, atol=0)
     plain = [json.loads(r.json(Options(**CHEAP))) for r in (whole, again)]
@@ -235,6 +236,80 @@ def test_a_run_goes_on_where_it_was_stopped(tmp_path: Path, monkeypatch: pytest.
         for c in each["steps"]:
             c.pop("seconds")
     assert plain[0] == plain[1]
+
+
+def test_a_search_goes_on_where_it_was_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    # Nothing reaches it, so that all of the budget is played.
+    far = {**step(1, 0.36, success="x(rope[0]) > 9", horizon=3), "waypoints": None}
+    choices: dict[str, Any] = {"update": False, "episodes": 12}
+    whole = carried_out(answers(("plan", [far, far])), folder=tmp_path / "whole", **choices)
+    played: list[int] = []
+    before = decomposition._Part.evaluate
+
+    def counted(self: Any, actions: Tensor) -> Any:
+        played.append(len(actions))
+        return before(self, actions)
+
+    monkeypatch.setattr(decomposition._Part, "evaluate", counted)
+
+    def stop(stage: str, done: int, total: int, message: str) -> None:
+        if stage == "step 1" and done == 8:
+            raise KeyboardInterrupt
+
+    ends: list[Result] = []
+    cut, options = tmp_path / "cut", Options(**(CHEAP | choices))
+    talk = Conversation(answers(("plan", [far, far])), cut)
+    with pytest.raises(KeyboardInterrupt):
+        carry_out(Carry(), talk, options, folder=cut, callback=stop, unfinished=ends.append)
+    assert [r.ended for r in ends] == ["not finished: it was stopped"] and played == [4, 4]
+    assert [p.is_dir() for p in (cut / "steps").iterdir()] == [True]
+    again = carried_out(answers(("plan", [far, far])), folder=cut, resume=True, **choices)
+    # The rest of the first, and all of the second step.
+    assert played == [4] * 6
+    assert sorted(p.name for p in (cut / "steps").iterdir()) == ["01.json", "02.json"]
+    for one, other in zip(again.carried, whole.carried, strict=True):
+        torch.testing.assert_close(one.actions, other.actions, rtol=0, atol=0)
+
+
+def test_a_run_without_way_points_to_search_can_be_stopped_between_steps() -> None:
+    def stop(stage: str, done: int, total: int, message: str) -> None:
+        if stage == "step 2":
+            raise KeyboardInterrupt
+
+    ends: list[Result] = []
+    with pytest.raises(KeyboardInterrupt):
+        talk = Conversation(answers(("plan", FAR)))
+        carry_out(Carry(), talk, Options(**CHEAP, update=False), callback=stop, unfinished=ends.append)
+    assert [c.success for c in ends[0].carried] == [True]
+
+
+def test_what_was_sent_is_kept_and_shown_if_no_answer_comes(tmp_path: Path) -> None:
+    class Deaf:
+        source, remote = "model m at localhost:1", True
+
+        def reply(self, question: Any, messages: Any, digest: str) -> Any:
+            raise InputError("model m at localhost:1: it is off.")
+
+        def skip(self, count: int) -> None:
+            pass
+
+    ends: list[Result] = []
+    talk = Conversation(Deaf(), tmp_path)
+    with pytest.raises(InputError, match="it is off"):
+        carry_out(Carry(), talk, Options(**CHEAP), folder=tmp_path, unfinished=ends.append)
+    kept = json.loads((tmp_path / "exchanges" / "001.json").read_text())
+    assert kept["response"] is None and "Task carry" in kept["request"]["messages"][1]["text"]
+    page = plan_html(json.loads(ends[0].json(Options(**CHEAP))), [kept], {})
+    assert "(no answer came)" in page and "Task carry" in page and "it is off" in page
+    with pytest.raises(InputError, match="expected a conversation"):
+        load_recorded(tmp_path)
+    again = carried_out(answers(("plan", FAR[:1])), folder=tmp_path, resume=True, update=False)
+    assert again.carried[0].success and again.calls == 1
+
+
+def test_options_that_cannot_be_are_not_the_fault_of_a_step() -> None:
+    with pytest.raises(InputError, match="seed"):
+        carried_out(answers(("plan", [{**step(1, 0.36), "waypoints": None}])), seed=-1)
 
 
 def test_starts_can_vary() -> None:
@@ -261,6 +336,12 @@ def test_the_stand_in_plans_one_step_and_says_what_it_is() -> None:
     made = json.loads(str(caught.value))["steps"][0]
     assert made["success"] == "z(ring_0) > 0.110 and z(ring_1) > 0.110"
     assert Geometry.source == "geometry, no model"
+
+
+@pytest.mark.parametrize("name", ["wiring_ring", "letter_art"])
+def test_the_stand_in_says_which_tasks_it_cannot_plan(name: str) -> None:
+    with pytest.raises(InputError, match=rf"^geometry, no model: {name} takes several grasps .* use --endpoint"):
+        carried_out(Geometry(), task=envs.find(name))
 
 
 @pytest.mark.parametrize("name", envs.TASKS)

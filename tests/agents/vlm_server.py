@@ -76,6 +76,16 @@ def drip(handler: BaseHTTPRequestHandler) -> None:
             time.sleep(0.1)
 
 
+def drip_headers(handler: BaseHTTPRequestHandler) -> None:
+    """Send a line of the header now and then."""
+    with contextlib.suppress(OSError):
+        handler.wfile.write(b"HTTP/1.1 200 OK\r\n")
+        for k in range(100):
+            handler.wfile.write(b"x-%d: 1\r\n" % k)
+            handler.wfile.flush()
+            time.sleep(0.1)
+
+
 def sleep(handler: BaseHTTPRequestHandler) -> None:
     """Say nothing."""
     time.sleep(3)

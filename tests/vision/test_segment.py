@@ -120,6 +120,19 @@ def test_a_camera_that_slips_is_found(plain: Film) -> None:
     assert check_masks(plain.masks, "film", pictures=plain.pictures)[0].all()
 
 
+@pytest.mark.parametrize("far", [0, 15])
+def test_grippers_that_move_are_not_a_camera_that_slips(plain: Film, far: int) -> None:
+    # The whole picture correlates with what is dark and moves in it: a shift that is none of the camera's.
+    pictures = plain.pictures.copy()
+    for k, picture in enumerate(pictures):
+        way = 2 * min(k, 8)
+        for x in (60, 500):
+            picture[60 + way : 80 + way, x + 2 * way : x + 2 * way + 40] = 70
+    pictures[8:] = np.roll(pictures[8:], (far // 2, far), (1, 2))
+    issues = check_masks(plain.masks, "film", pictures=pictures)[1]
+    assert ("slip" in {i.kind for i in issues}) == bool(far)
+
+
 @pytest.mark.parametrize(
     ("masks", "message"),
     [

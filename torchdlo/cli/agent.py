@@ -16,6 +16,7 @@ from torchdlo.cli.progress import at_work, deferred_interrupt, progress
 from torchdlo.files import check_writable, write_atomically
 
 if TYPE_CHECKING:
+    from torchdlo.agents.vlm.carried import Result
     from torchdlo.agents.vlm.conversation import Conversation
 
 __all__ = ["plan", "propose"]
@@ -27,6 +28,8 @@ _Rope = Annotated[
 
 _KEPT = {"exchanges": "[0-9][0-9][0-9]", "steps": "[0-9][0-9]"}
 """What a run keeps, by the folder, and how it is named there."""
+_SEARCH = "[0-9][0-9]-[0-9a-f]{16}"
+"""How searches of steps that are not over are named there."""
 
 _Out = Annotated[Path | None, typer.Option("--out", "-o", help="Folder for what is made.", metavar="DIR")]
 _Endpoint = Annotated[
@@ -82,6 +85,8 @@ def _conversation(
 
 def clear(folder: Path) -> None:
     """Delete what is kept of an earlier run."""
+    from torchdlo.agents.trajopt.search_journal import remove_journal
+
     kept = [(folder / part).glob(f"{digits}.json") for part, digits in _KEPT.items()]
     for file in itertools.chain(*kept):
         check_writable(file)
@@ -89,6 +94,9 @@ def clear(folder: Path) -> None:
     for file in (folder / "pictures").glob("*.png"):
         if re.fullmatch("[0-9a-f]{16}", file.stem):
             file.unlink()
+    for search in (folder / "steps").glob("[0-9][0-9]-*"):
+        if re.fullmatch(_SEARCH, search.name) and search.is_dir() and not search.is_symlink():
+            remove_journal(search)
 
 
 def propose(
@@ -128,14 +136,14 @@ def propose(
     from torchdlo.agents.vlm.grasp_proposal import places_of, random_grasps
     from torchdlo.agents.vlm.grasp_proposal import propose_grasps as ask
     from torchdlo.agents.vlm.plan_schema import MODES
-    from torchdlo.envs import find
+    from torchdlo.envs import find, short_name
     from torchdlo.envs.core import episode
     from torchdlo.errors import InputError
 
     chosen = find(task)
     if mode not in MODES:
         raise InputError(f"mode: it is {mode!r}; expected one of {', '.join(MODES)}.")
-    out = out or Path("runs") / "propose" / f"{task}-{mode if random is None else f'random-{random}'}"
+    out = out or Path("runs") / "propose" / f"{short_name(task)}-{mode if random is None else f'random-{random}'}"
     check_writable(out / "proposal.json")
     if random is not None:
         found = random_grasps(places_of(chosen), random)
@@ -192,14 +200,14 @@ def plan(
     torchdlo plan lifting --geometry --episodes 480
     """
     from torchdlo.agents.vlm.decomposition import Options, carry_out
-    from torchdlo.envs import find
+    from torchdlo.envs import find, short_name
     from torchdlo.errors import InputError
     from torchdlo.report.pages.plan import plan_html
 
     if method not in ("hybrid", "cmaes"):
         raise InputError(f"method: it is {method!r}; expected hybrid or cmaes.")
     chosen = find(task)
-    out = out or Path("runs") / "plan" / task
+    out = out or Path("runs") / "plan" / short_name(task)
     for name in ("plan.json", "report.html"):
         check_writable(out / name)
     limits: dict[str, Any] = {"calls": calls, "tokens": tokens, "seconds": seconds, "resume": resume}
@@ -215,18 +223,23 @@ def plan(
     )
     with at_work(out, "plan.json", "report.html"):
         said = _conversation(out, endpoint, model, recorded, geometry, **limits)
+
+        def write(found: Result) -> None:
+            content = json.loads(found.json(options))
+            shown = {p.stem: p.read_bytes() for p in (out / "pictures").glob("*.png")}
+            exchanges = [*said.exchanges, *([said.unanswered] if said.unanswered else [])]
+            write_atomically(out / "plan.json", found.json(options))
+            write_atomically(out / "report.html", plan_html(content, exchanges, shown))
+
         try:
             with progress() as show, deferred_interrupt(show) as callback:
-                found = carry_out(chosen, said, options, look=look, folder=out, callback=callback)
+                found = carry_out(chosen, said, options, look=look, folder=out, callback=callback, unfinished=write)
         except KeyboardInterrupt:
             raise stopped(f"what is done is kept in {out}", resume=True) from None
-        content = found.json(options)
-        shown = {p.stem: p.read_bytes() for p in (out / "pictures").glob("*.png")}
-        write_atomically(out / "plan.json", content)
-        write_atomically(out / "report.html", plan_html(json.loads(content), said.exchanges, shown))
+        write(found)
     typer.echo(
         f"{task}: {found.ended} ({len(found.carried)} steps, {found.updates} updates, {found.source})", err=as_json
     )
     typer.echo(f"plan:   {out / 'plan.json'}\nreport: {out / 'report.html'}", err=as_json)
     if as_json:
-        typer.echo(content, nl=False)
+        typer.echo(found.json(options), nl=False)

@@ -18,7 +18,18 @@ __all__ = ["SIGNALS", "caught", "failed", "note", "stopped"]
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
-_RESUMABLE = ("calibrate", "diagnose", "design-experiment", "optimize", "plan", "train", "distill", "learn", "sweep")
+_RESUMABLE = (
+    "calibrate",
+    "diagnose",
+    "design-experiment",
+    "optimize",
+    "plan",
+    "propose",
+    "train",
+    "distill",
+    "learn",
+    "sweep",
+)
 
 _FULL = (errno.ENOSPC, errno.EDQUOT)
 

@@ -216,8 +216,9 @@ def _judged(task: str, grasps: Path | None, reward: Path | None) -> dict[str, An
     found: dict[str, Any] = {}
     if grasps is not None:
         from torchdlo.agents.vlm.grasp_proposal import load_grasps
+        from torchdlo.envs import find
 
-        found["grasps"] = load_grasps(grasps, task)
+        found["grasps"] = load_grasps(grasps, find(task).name)
     if reward is not None:
         from torchdlo.reward_language import load_reward
 

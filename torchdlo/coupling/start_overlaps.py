@@ -66,7 +66,8 @@ def _column(x: Tensor, slot: Tensor) -> Tensor:
     return torch.gather(x.expand(*slot.shape[:-1], x.shape[-1]), -1, slot)
 
 
-def _among_bodies(view: rod.View, bodies: PredictedBodyMotion, pieces: int) -> _Overlaps:
+def _among_bodies(view: rod.View, bodies: PredictedBodyMotion, touching: RodBody) -> _Overlaps:
+    pieces = touching.pieces
     at = find_contact_points(view, bodies, pieces)
     shape = at.share.shape[:-1]
     radius = view.params.material.radius[..., 0].unsqueeze(-2).expand(shape)
@@ -75,6 +76,8 @@ def _among_bodies(view: rod.View, bodies: PredictedBodyMotion, pieces: int) -> _
     depth = torch.where(real, radius - at.distance[..., 0], -1.0)
     which = [k for k, body in enumerate(bodies.bodies) for _ in range(points_per_edge(body, pieces))]
     other = torch.tensor(which, device=radius.device)[:, None].expand(shape)
+    for edge, body in touching.left_out:
+        depth = torch.where((slots == edge) & (other == body), -1.0, depth)
     flat = (x.flatten(-2) for x in (slots, at.share[..., 0], depth))
     part, other = torch.ones_like(depth).flatten(-2), other.flatten(-2)
     return _Overlaps(*[*flat, at.normal.flatten(-3, -2), part, other, radius.flatten(-2)])
@@ -245,7 +248,7 @@ def _look(view: rod.View, names: dict[str, Effect], bodies: Any, free: Tensor) -
         kinds, params, placed = bodies
         none = torch.zeros_like(placed.pos)
         motion = PredictedBodyMotion(kinds, params, placed, 1.0, none, none, none[..., :1], none)
-        parts.append(_among_bodies(view, motion, touching.pieces))
+        parts.append(_among_bodies(view, motion, touching))
     if "rod_contact" in names:
         parts.append(_among_ropes(view, free))
     found = _joined(parts)

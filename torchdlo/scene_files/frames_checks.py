@@ -19,6 +19,7 @@ _SHAPES: dict[str, tuple[str | int, ...]] = {
     "pos": ("frames", "vertices", 3),
     "twist": ("frames", "vertices"),
     "force": ("frames", "held vertices", 3),
+    "joint_force": ("frames", "joints", 3),
     "body_pos": ("frames", "bodies", 3),
     "body_quat": ("frames", "bodies", 4),
     "material_points": ("frames", "material points", 3),
@@ -64,7 +65,7 @@ def check_headers(file: Path, headers: Mapping[str, Header], stored: Mapping[str
         stored: names in the file by those of today.
     """
     counts: dict[str, int] = {}
-    for name, shape in _SHAPES.items():
+    for name, shape in ((name, _SHAPES[name]) for name in _SHAPES if name in stored):
         found, here = headers[stored[name]], f"{file}: {stored[name]}"
         kinds = _KINDS.get(name, "f")
         if found.dtype.kind not in kinds:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
@@ -72,22 +72,25 @@ class Frames:
     """Heights of tables that effects hold [m], shape (0,) or (1,)."""
     camera_direction: np.ndarray
     """Direction from the scene to the camera, shape (3,)."""
+    joint_force: np.ndarray = field(default_factory=lambda: np.zeros((0, 0, 3)))
+    """Forces that joints exert on their ropes [N], shape (F, N, 3); of films that have none, (F, 0, 3)."""
     interrupted: bool = False
     """Whether it was stopped before its end."""
     problem: str = ""
     """What went wrong, "" if nothing did; frames end before it."""
 
 
-_MOVING = ("time", "pos", "twist", "force", "body_pos", "body_quat", "material_points")
+_MOVING = ("time", "pos", "twist", "force", "body_pos", "body_quat", "material_points", "joint_force")
 """What `_seen` returns, by the names of `Frames`."""
 
 
-def _seen(state: scenes.State) -> list[np.ndarray]:
+def _seen(scene: scenes.Scene, state: scenes.State) -> list[np.ndarray]:
     rods, none = state.rods, state.rods.pos.new_zeros(0, 4)
     bodies = (state.bodies.pos, state.bodies.quat) if state.bodies else (none[:, :3], none)
     # Pictures need no more digits, and there are many points.
     material_points = (state.material_points.pos if state.material_points else none[:, :3]).to(torch.float32)
-    found = (state.time[0, 0], rods.pos, rods.twist[:, 0], state.reaction.force, *bodies, material_points)
+    joined = none[:, :3] if scene.joints is None else scenes.joint_forces(scene, state)[0]
+    found = (state.time[0, 0], rods.pos, rods.twist[:, 0], state.reaction.force, *bodies, material_points, joined)
     return [x.cpu().numpy().copy() for x in found]
 
 
@@ -164,7 +167,7 @@ def run(
     control = made.plan.follow(scene)
     total = max(1, round(description.duration / description.dt))
     step = scenes.stepper(scene, compiled=compiled, recorded=total > 50)
-    kept, interrupted, problem = [_seen(state)], False, ""
+    kept, interrupted, problem = [_seen(scene, state)], False, ""
     with torch.no_grad():
         for k in range(total):
             command = control(k, state)
@@ -176,7 +179,7 @@ def run(
             except RuntimeError as error:
                 problem = f"after {float(state.time):g} s: {error}"
                 break
-            kept.append(_seen(state))
+            kept.append(_seen(scene, state))
             try:
                 if callback is not None:
                     callback("simulate", k + 1, total, f"{float(state.time):.3g} s")
@@ -192,6 +195,8 @@ def run(
 def save_frames(frames: Frames, path: Path, description: scene_files.SceneDescription | None = None) -> None:
     """Write frames as .npz, with the scene itself as JSON text in "torchdlo_scene", "" if it is not given."""
     arrays: dict[str, Any] = {name: value for name, value in vars(frames).items() if isinstance(value, np.ndarray)}
+    if not frames.joint_force.size:
+        del arrays["joint_force"]
     text = "" if description is None else scene_files.text(description)
     with replace_atomically(path) as temporary:
         np.savez_compressed(temporary, torchdlo_scene=np.array(text), **arrays)
@@ -206,6 +211,9 @@ def load_frames(path: str | Path) -> Frames:
     with ArrayFile(file, "the frames of a run", most=MOST, cure=cure) as found:
         stored = {name: _OLDER.get(name, name) for name in names}
         stored = {name: name if name in found.headers else older for name, older in stored.items()}
+        if "joint_force" not in found.headers:
+            names.remove("joint_force")
+        stored = {name: stored[name] for name in names}
         missing = [name for name in names if stored[name] not in found.headers]
         if missing:
             raise InputError(f"{file}: lacks {', '.join(missing)}; simulate the scene again with this version.")
@@ -213,4 +221,5 @@ def load_frames(path: str | Path) -> Frames:
         found.check_size(stored.values())
         arrays: dict[str, Any] = {name: found[stored[name]] for name in names}
     frames_checks.check_values(file, arrays)
+    arrays.setdefault("joint_force", np.zeros((len(arrays["time"]), 0, 3)))
     return Frames(**arrays)

@@ -110,9 +110,10 @@ def assemble(description: SceneDescription, *, folder: str | Path = ".") -> Simu
     armed = motion.arms(d, folder)
     for arm in armed:
         bodies += robots.solids(arm.robot, arm.joints[0])
-    scene, params, state = scenes.make(
-        ropes, effects, values, bodies=bodies, material_points=_matter(d, dtype), clamp=d.clamp, **held, **static
-    )
+    _check_joints(d)
+    joints = [scenes.Joint(**vars(joint)) for joint in d.joints]
+    held |= {"material_points": _matter(d, dtype), "clamp": d.clamp}
+    scene, params, state = scenes.make(ropes, effects, values, bodies=bodies, joints=joints, **held, **static)
     weight = _weights(d, counts, state.rods.pos)
     material = tree.replace(params.rods.material, mass=params.rods.material.mass + weight)
     params = tree.replace(params, rods=tree.replace(params.rods, material=material))
@@ -138,6 +139,16 @@ def _check_holds(d: SceneDescription) -> None:
             )
         if hold.close < 0:
             raise InputError(f"attachments[{k}].close: expected a time from 0 on, given {hold.close:g}.")
+
+
+def _check_joints(d: SceneDescription) -> None:
+    for k, joint in enumerate(d.joints):
+        if joint.body is not None and not 0 <= joint.body < len(d.bodies):
+            raise InputError(
+                f"joints[{k}].body: expected the number of a body, 0 to {len(d.bodies) - 1}, given {joint.body}."
+                if d.bodies
+                else f"joints[{k}].body: there is no body in the scene."
+            )
 
 
 def _slots(d: SceneDescription, counts: list[int], part: str) -> tuple[int, ...]:

@@ -12,6 +12,7 @@ __all__ = [
     "BodySpec",
     "GridSpec",
     "HangingMass",
+    "JointSpec",
     "Keyframe",
     "ParticleBlockSpec",
     "RobotSpec",
@@ -130,6 +131,24 @@ class BodySpec:
 
 @with_field_docs
 @dataclass(frozen=True)
+class JointSpec:
+    """A point of a rope that is joined to a free body, or to another rope; fields are those of `scene.Joint`."""
+
+    rope: int = 0
+    vertex: int | None = None
+    """Number of a vertex along the rope; -1, the last, if neither it nor `at` is given."""
+    at: float | None = None
+    """Share of the rope's length where the point is, 0 to 1."""
+    body: int | None = None
+    """Number of a free body."""
+    other_rope: int | None = None
+    other_vertex: int = 0
+    kind: Literal["weld", "ball"] = "weld"
+    anchor: Vector | None = None
+
+
+@with_field_docs
+@dataclass(frozen=True)
 class RobotSpec:
     """A chain of links whose joints go where they bring its tool along `keyframes`."""
 
@@ -195,6 +214,8 @@ class SceneDescription:
     """Effects by name, each with the parameters and choices that differ from its defaults."""
     bodies: tuple[BodySpec, ...] = ()
     attachments: tuple[Attachment, ...] = ()
+    joints: tuple[JointSpec, ...] = ()
+    """What ropes are joined to."""
     robots: tuple[RobotSpec, ...] = ()
     material_points: tuple[ParticleBlockSpec, ...] = ()
     box: GridSpec | None = None

@@ -23,6 +23,9 @@ _SLIP = 6.0
 _CLEAR = 0.1
 """Response of a phase correlation from which a shift is taken for one."""
 
+_ALIKE = 0.7
+"""Difference of two pictures of the background after a shift, over that before, below which it has shifted."""
+
 
 @dataclass(frozen=True)
 class Issue:
@@ -162,6 +165,10 @@ def _slip(pictures: np.ndarray, masks: np.ndarray) -> tuple[int, float] | None:
         small = cv2.resize(pictures[k], None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
         return cv2.cvtColor(small, cv2.COLOR_RGB2GRAY).astype(np.float32)
 
+    def fine(picture: np.ndarray) -> np.ndarray:
+        """Return what is neither noise nor shade."""
+        return cv2.GaussianBlur(picture, (0, 0), 1.5) - cv2.GaussianBlur(picture, (0, 0), 8)
+
     still = ~cv2.dilate(np.asarray(masks.any(0), np.uint8), np.ones((25, 25), np.uint8)).astype(bool)
     still = still[::2, ::2][: grey(0).shape[0], : grey(0).shape[1]]
     if still.mean() < 0.2:
@@ -172,8 +179,15 @@ def _slip(pictures: np.ndarray, masks: np.ndarray) -> tuple[int, float] | None:
 
     def shift(k: int) -> np.ndarray:
         """Return by how much a picture is shifted against the first [px], NaN where that is not clear."""
-        (dx, dy), response = cv2.phaseCorrelate((first - first.mean()) * window, (grey(k) - first.mean()) * window)
-        return 2 * np.array([dx, dy]) if response > _CLEAR else np.full(2, np.nan)
+        now = grey(k)
+        (dx, dy), response = cv2.phaseCorrelate((first - first.mean()) * window, (now - first.mean()) * window)
+        if response <= _CLEAR:
+            return np.full(2, np.nan)
+        # Along a bar, and of grippers that move, any shift correlates: a true one makes pictures alike.
+        away = np.array([[1, 0, -dx], [0, 1, -dy]], np.float32)
+        back = cv2.warpAffine(now, away, now.shape[::-1], borderMode=cv2.BORDER_REFLECT)
+        apart, left = (float(np.abs(fine(first - x))[still].mean()) for x in (now, back))
+        return 2 * np.array([dx, dy]) if left < _ALIKE * apart else np.zeros(2)
 
     last = len(pictures) - 1
     ends = np.array([shift(k) for k in (last, last - 1, last - 2)])

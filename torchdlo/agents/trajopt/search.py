@@ -23,7 +23,7 @@ from torchdlo.agents.trajopt.search_journal import SearchJournal
 from torchdlo.errors import InputError
 from torchdlo.physics import tree
 
-__all__ = ["METHODS", "Robust", "SearchResult", "SearchSettings", "optimize"]
+__all__ = ["METHODS", "NothingFoundError", "Robust", "SearchResult", "SearchSettings", "optimize"]
 
 METHODS: dict[str, Callable[[SearchPlan, torch.Generator], Search]] = {"cmaes": cmaes, "gd": descent, "hybrid": hybrid}
 """Optimisers by name."""
@@ -37,6 +37,10 @@ _FINALISTS = 8
 """Best trajectories that may be played alone in the end."""
 _ALIKE = 0.01
 """Share of a return by which rounding may change it."""
+
+
+class NothingFoundError(InputError):
+    """No episode of a search had a return."""
 
 
 @dataclass(frozen=True)
@@ -201,7 +205,9 @@ def optimize(
     finally:
         player.journal.close()
     if not math.isfinite(finalists[0].returns):
-        raise InputError(f"{problem.name}: none of {player.done} episodes had a finite return; nothing was found.")
+        raise NothingFoundError(
+            f"{problem.name}: none of {player.done} episodes had a finite return; nothing was found."
+        )
     chosen, outcome, kept = _alone(problem, finalists, robust is not None)
     surrogate = curve[-1]["surrogate"]  # what it promised there, it does not promise here
     return SearchResult(

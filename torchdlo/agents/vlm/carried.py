@@ -95,7 +95,8 @@ class Result:
     calls: int
     tokens: int
     seconds: float
-    world: episode.EpisodeState = field(repr=False)
+    world: episode.EpisodeState | None = field(repr=False)
+    """What it ended in; None if no step was carried out."""
 
     def json(self, options: Options) -> str:
         """Return the content of a file."""

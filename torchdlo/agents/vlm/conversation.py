@@ -71,6 +71,8 @@ class LanguageModel(Protocol):
 
     source: str
     """What is written down beside everything that comes of it."""
+    remote: bool
+    """Whether questions are sent to it."""
 
     def reply(self, question: Question, messages: list[dict[str, Any]], digest: str) -> Reply:
         """Return what it says to messages: {"role", "text", "pictures"} each.
@@ -110,6 +112,8 @@ class Conversation:
     callback: Callable[[str], None] = lambda _: None
     exchanges: list[dict[str, Any]] = field(default_factory=list)
     """All that was said so far."""
+    unanswered: dict[str, Any] | None = None
+    """What was sent and is not answered; its response is None."""
 
     @property
     def calls(self) -> int:
@@ -136,9 +140,11 @@ class Conversation:
             {"role": "system", "text": question.system, "pictures": ()},
             {"role": "user", "text": question.text, "pictures": question.pictures},
         ]
-        reason = ""
-        for _ in range(1 + self.budget.again):
-            text = self._exchange(question, said)
+        reason, tries = "", 0
+        while tries <= self.budget.again:
+            text, new = self._exchange(question, said)
+            # What was said in a run that goes on used up its own tries.
+            tries += new
             try:
                 return check(_fitting(text, question.answer))
             except InputError as error:
@@ -158,8 +164,8 @@ class Conversation:
             f"tries; the last reason was: {reason} Use a stronger model, or --resume to ask again."
         )
 
-    def _exchange(self, question: Question, said: list[dict[str, Any]]) -> str:
-        """Return what the model says, from the folder if it said so before."""
+    def _exchange(self, question: Question, said: list[dict[str, Any]]) -> tuple[str, bool]:
+        """Return what the model says, from the folder if it said so before, and whether it was asked."""
         request = {
             "kind": question.kind,
             "messages": [
@@ -170,6 +176,7 @@ class Conversation:
         digest = hashlib.sha256(json.dumps(request, sort_keys=True).encode()).hexdigest()
         number = self.calls + 1
         found = self._recalled(number, digest)
+        new = found is None
         if found is not None:
             self.model.skip(number)
         else:
@@ -178,21 +185,28 @@ class Conversation:
                     f"{self.model.source}: the budget of {self.budget.calls} calls and {self.budget.tokens} tokens is "
                     f"used up after {self.calls} calls and {self.tokens} tokens; go on with --resume and more of it."
                 )
-            begun = time.monotonic()
-            reply = self.model.reply(question, said, digest)
             found = {
                 "generator": "torchdlo",
                 "number": number,
                 "source": self.model.source,
                 "request": request,
                 "request_sha256": digest,
-                "response": reply.text,
-                "tokens": reply.tokens,
-                "seconds": round(time.monotonic() - begun, 3),
+                "response": None,
+                "tokens": 0,
+                "seconds": 0.0,
             }
+            if self.model.remote:
+                # What is sent is written down, whether an answer comes or not.
+                self._keep(found, question)
+                self.unanswered = found
+            begun = time.monotonic()
+            reply = self.model.reply(question, said, digest)
+            found = found | {"response": reply.text, "tokens": reply.tokens}
+            found["seconds"] = round(time.monotonic() - begun, 3)
             self._keep(found, question)
+            self.unanswered = None
         self.exchanges.append(found)
-        return found["response"]
+        return found["response"], new
 
     def _file(self, number: int) -> Path | None:
         return None if self.folder is None else self.folder / "exchanges" / f"{number:03d}.json"

@@ -21,7 +21,8 @@ import torch
 from torch import Tensor
 
 from torchdlo.agents.trajopt.problem import Evaluation
-from torchdlo.agents.trajopt.search import SearchSettings, optimize
+from torchdlo.agents.trajopt.search import NothingFoundError, SearchSettings, optimize
+from torchdlo.agents.trajopt.search_journal import program_hash, remove_journal
 from torchdlo.agents.trajopt.task_problem import TaskProblem
 from torchdlo.agents.vlm.carried import Carried, Options, Result, WorldPainter
 from torchdlo.agents.vlm.conversation import Conversation, Question, ShownPicture, plain_text
@@ -44,6 +45,10 @@ from torchdlo.scene import State
 __all__ = ["Carried", "Options", "Result", "WorldPainter", "carry_out"]
 
 
+class _NotCarriedOut(Exception):
+    """A step cannot be carried out; one sentence that the model is told."""
+
+
 @dataclass(eq=False)
 class _Run:
     """A run so far."""
@@ -61,6 +66,8 @@ class _Run:
     carried: list[Carried] = field(default_factory=list)
     plans: list[dict[str, Any]] = field(default_factory=list)
     done: bool = False
+    updates: int = 0
+    begun: float = field(default_factory=time.monotonic)
     _places: tuple[Any, Places] | None = None
 
     # -- asking ------------------------------------------------------------------------------------------------------
@@ -79,6 +86,7 @@ class _Run:
 
     def ask(self, kind: str, left: Sequence[Any] = (), note: str = "") -> tuple[bool, list[Any]]:
         """Return whether the model says that all is done, and the steps that are left; a note ends what it is told."""
+        self.callback("model", self.talk.calls, self.talk.budget.calls, f"asked for {kind}")
         plan, update = step_models(self.task.arms.count)
         places = self.places()
         seen = opening(self.task, self.opening)[1] if self.world is None else self.world.seen(self.task.arms.count)
@@ -136,7 +144,10 @@ class _Run:
 
     def part_of(self, step: Any) -> SubTask:
         """Return the task of a step; before the first one, hands stand at what they hold."""
-        grasps = check_grasps(self.places(), _grasps(step))
+        try:
+            grasps = check_grasps(self.places(), _grasps(step))
+        except InputError as error:  # what can be held is known only now
+            raise _NotCarriedOut(plain_text(str(error))) from None
         world, holds = self.world, self.holds
         if world is None:
             first = replace(self.task, grasps=grasps)
@@ -148,13 +159,13 @@ class _Run:
         """Search a step, play the best, and go on from its end if it did not fail."""
         begun = time.monotonic()
         content = _plain(step)
+        self.callback(f"step {number}", 0, self.options.episodes, "way-points")
         try:
             part = self.part_of(step)
             problem = _Part(part, compiled=self.options.compiled, recorded=self.options.recorded)
             actions, episodes = self.search(step, problem, number)
-        except InputError as error:
-            why = plain_text(str(error))
-            self.carried.append(Carried(content, False, why, None, {}, 0, time.monotonic() - begun, False))
+        except _NotCarriedOut as error:
+            self.carried.append(Carried(content, False, str(error), None, {}, 0, time.monotonic() - begun, False))
             return
         made = problem.prepared(1)
         went, worlds = problem.played(actions)
@@ -204,16 +215,27 @@ class _Run:
             chunk=options.population,
         )
         first = self.led(step, problem)
-        if first is not None and options.enough:
-            went, _ = problem.played(first)
+        if options.enough:
+            # Steps that only take hold of something are done by waiting.
+            tried = torch.zeros(part.horizon, problem.width, dtype=torch.float64) if first is None else first
+            went, _ = problem.played(tried)
             if bool((went.success & ~went.failed)[0]):
-                return first, 1
+                return tried, 1
 
         def told(stage: str, done: int, total: int, message: str) -> None:
             self.callback(f"step {number}", done, total, message)
 
+        settings.plan(problem)  # what is wrong with the options is not the step's fault
         begin = None if first is None else first[None]
-        found = optimize(problem, settings, callback=told, first=begin, until_success=options.enough)
+        journal = self.journal(number, part)
+        kept_in: dict[str, Any] = {
+            "journal": journal,
+            "resume": self.talk.resume and journal is not None and journal.is_dir(),
+        }
+        try:
+            found = optimize(problem, settings, callback=told, first=begin, until_success=options.enough, **kept_in)
+        except NothingFoundError as error:
+            raise _NotCarriedOut(plain_text(str(error))) from None
         if found.interrupted:
             raise KeyboardInterrupt
         return found.actions, found.episodes
@@ -232,6 +254,14 @@ class _Run:
         """Return where a step is kept."""
         return None if self.folder is None else self.folder / "steps" / f"{number:02d}.json"
 
+    def journal(self, number: int, part: SubTask) -> Path | None:
+        """Return where the search of a step is kept until it is over."""
+        file = self.file(number)
+        if file is None:
+            return None
+        digest = hashlib.sha256((self.key(part) + program_hash(part.name)).encode()).hexdigest()
+        return file.with_name(f"{number:02d}-{digest[:16]}")
+
     def key(self, part: SubTask) -> str:
         """Return a hash of all that the search of a step depends on."""
         content = {"part": part.identity, "options": asdict(self.options), "grasps": part.grasps}
@@ -246,6 +276,9 @@ class _Run:
             write_atomically(self.folder / "pictures" / f"{picture.digest[:16]}.png", picture.png)
         content = {"generator": "torchdlo plan", "key": self.key(part), **found.plain()}
         write_json(file, content | {"actions": found.actions.tolist()}, indent=None)
+        journal = self.journal(number, part)
+        if journal is not None and journal.is_dir():
+            remove_journal(journal)
 
     def recall(self, number: int, part: SubTask) -> tuple[Tensor, int] | None:
         """Return what was found for a step in a run that goes on."""
@@ -336,6 +369,7 @@ def carry_out(
     look: WorldPainter | None = None,
     folder: Path | None = None,
     callback: Callable[[str, int, int, str], None] = lambda *_: None,
+    unfinished: Callable[[Result], None] = lambda _: None,
 ) -> Result:
     """Plan a task and carry the plan out.
 
@@ -346,52 +380,59 @@ def carry_out(
         look: what draws pictures for the model and the report; none are shown if not given.
         folder: where steps are kept, so that a run can go on.
         callback: told (stage, episodes done, episodes in all, message).
+        unfinished: told what there is of a run that an exception ends.
     """
-    begun = time.monotonic()
-    like = torch.zeros((), dtype=torch.float32)
-    run = _Run(task, talk, options, look, folder, callback, like)
+    run = _Run(task, talk, options, look, folder, callback, torch.zeros((), dtype=torch.float32))
+    try:
+        return _result(run, _ended(run))
+    except (InputError, KeyboardInterrupt) as error:
+        why = plain_text(str(error).rstrip(".")) or "it was stopped"
+        unfinished(_result(run, f"not finished: {why}"))
+        raise
+
+
+def _ended(run: _Run) -> str:
+    """Carry out steps and ask after each what is left; return why this ended."""
+    options = run.options
     _, left = run.ask("plan")
-    updates = fruitless = 0
-    ended = ""
-    while not ended:
+    fruitless = 0
+    while True:
         if not left:
-            ended = "the plan was carried out, and the task is not done"
-            break
+            return "the plan was carried out, and the task is not done"
         run.step(left.pop(0), len(run.carried) + 1)
         last = run.carried[-1]
         if run.done:
-            ended = "the task is done"
-        elif sum(not c.failed for c in run.carried) >= options.steps:
-            ended = f"{options.steps} steps were carried out, and the task is not done"
-        elif not options.update:
+            return "the task is done"
+        if sum(not c.failed for c in run.carried) >= options.steps:
+            return f"{options.steps} steps were carried out, and the task is not done"
+        if not options.update:
             if last.failed:
-                ended = f"step {last.step['id']} failed: {last.failed}"
-        else:
-            fruitless = 0 if last.success else fruitless
-            complete = False
-            while not ended:
-                if fruitless >= options.patience:
-                    ended = f"{options.patience} updates made no progress"
-                    break
-                note = "You said that all is done, but the task's own condition does not hold." if complete else ""
-                complete, steps = run.ask("update", left, note)
-                updates, fruitless = updates + 1, fruitless + 1
-                if not complete:
-                    left = steps
-                    break
-    if run.world is None:
-        made = episode.prepare(task, 1, like=like, compiled=False, **run.start())
-        run.world = made.start
+                return f"step {last.step['id']} failed: {last.failed}"
+            continue
+        fruitless = 0 if last.success else fruitless
+        complete, note = True, ""
+        while complete:
+            if fruitless >= options.patience:
+                return f"{options.patience} updates made no progress"
+            complete, steps = run.ask("update", left, note)
+            run.updates, fruitless = run.updates + 1, fruitless + 1
+            left = left if complete else steps
+            note = "You said that all is done, but the task's own condition does not hold."
+
+
+def _result(run: _Run, ended: str) -> Result:
+    """Return what came of a run."""
+    talk = run.talk
     return Result(
-        task.name,
+        run.task.name,
         talk.model.source,
         run.done,
         ended,
         run.plans,
         run.carried,
-        updates,
+        run.updates,
         talk.calls,
         talk.tokens,
-        time.monotonic() - begun,
+        time.monotonic() - run.begun,
         run.world,
     )

@@ -1,7 +1,7 @@
 """A model behind an endpoint that speaks the chat completions of OpenAI, such as vLLM, SGLang, llama.cpp or Ollama.
 
-Nothing is sent but to this endpoint: redirects are not followed. The key is read from the environment and is neither
-written down nor shown.
+Nothing is sent but to this endpoint: redirects are not followed, and no proxy of the environment is asked. The key is
+read from the environment and is neither written down nor shown, not even where a server says it.
 """
 
 from __future__ import annotations
@@ -9,10 +9,12 @@ from __future__ import annotations
 import base64
 import json
 import os
+import queue
+import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 from urllib.parse import urlsplit
 
 from torchdlo.agents.vlm.conversation import Question, Reply, plain_text
@@ -25,6 +27,15 @@ KEY = "OPENAI_API_KEY"
 
 _AGAIN = (408, 409, 425, 429, 500, 502, 503, 504, 529)
 """What servers say that may do better later."""
+
+
+_SECRET = 8
+"""Letters from which on a key is one: servers without keys are given words such as "none" or "EMPTY"."""
+_GRACE = 1.0
+"""How long it may take beyond its time until a request is given up from outside [s]."""
+
+_Sent = tuple[int | None, str, float | None, str | None]
+"""Status, what went wrong, how long to wait if the server says so [s], and the body if all went well."""
 
 
 class _TooMuch(Exception):
@@ -48,15 +59,22 @@ class Endpoint:
     answer_tokens: int = 8_000
     """Most tokens of an answer."""
     sleep: Callable[[float], None] = time.sleep
+    remote: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         parts = urlsplit(self.url)
-        if parts.scheme not in ("http", "https") or not parts.hostname or parts.username or parts.password:
+        if parts.username or parts.password:
             raise InputError(
-                f"endpoint: it is {plain_text(self.url, 80)!r}; expected the address of a server without a name or "
-                "password in it, such as http://localhost:8000/v1."
+                f"endpoint: there is a name or password in the address of {plain_text(parts.hostname or '', 80)!r}; "
+                f"leave it out, and put the key into {KEY}."
+            )
+        if parts.scheme not in ("http", "https") or not parts.hostname:
+            raise InputError(
+                f"endpoint: it is {plain_text(self.url, 80)!r}; expected the address of a server, such as "
+                "http://localhost:8000/v1."
             )
         _packages()
+        _key()
 
     @property
     def source(self) -> str:
@@ -87,12 +105,31 @@ class Endpoint:
     def skip(self, count: int) -> None:
         """Do nothing: servers remember nothing."""
 
-    def _send(
-        self, content: list[dict[str, Any]], wanted: dict[str, Any]
-    ) -> tuple[int | None, str, float | None, str | None]:
+    def _send(self, content: list[dict[str, Any]], wanted: dict[str, Any]) -> _Sent:
+        """Return what came of a request, in the time that there is for it, whatever the server does with it."""
+        found: queue.SimpleQueue[_Sent | Exception] = queue.SimpleQueue()
+
+        def request() -> None:
+            try:
+                found.put(self._request(content, wanted))
+            except Exception as error:  # raised below, where somebody hears of it
+                found.put(error)
+
+        # Time-outs of HTTP are for each piece of a response, and there is none for finding a name's address.
+        threading.Thread(target=request, daemon=True).start()
+        try:
+            sent = found.get(timeout=self.seconds + _GRACE)
+        except queue.Empty:
+            return None, f"it did not end its answer within {self.seconds:g} s", None, None
+        if isinstance(sent, Exception):
+            raise sent
+        status, why, wait, text = sent
+        return status, _without_key(why), wait, None if text is None else _without_key(text)
+
+    def _request(self, content: list[dict[str, Any]], wanted: dict[str, Any]) -> _Sent:
         """Return status, what went wrong, how long to wait if the server says so, and the body if all went well."""
         openai, httpx = _packages()
-        key = os.environ.get(KEY) or "none"
+        key = _key() or "none"
         transport = _Capped(httpx, self.size, self.seconds)
         with httpx.Client(transport=transport, follow_redirects=False, timeout=self.seconds) as http:
             client = openai.OpenAI(api_key=key, base_url=self.url, http_client=http, max_retries=0)
@@ -105,9 +142,7 @@ class Endpoint:
                 )
                 return 200, "", None, raw.http_response.text
             except openai.APIStatusError as error:
-                said = plain_text(
-                    error.response.text.replace(key, "***") if key != "none" else error.response.text, 200
-                )
+                said = plain_text(_without_key(error.response.text), 200)
                 return error.status_code, f"it answered {error.status_code}: {said}", _asked(error.response), None
             except openai.APITimeoutError:
                 return None, f"it did not answer within {self.seconds:g} s", None, None
@@ -137,7 +172,22 @@ class Endpoint:
             tokens = used.get("total_tokens") if isinstance(used, dict) else 0
         except (ValueError, KeyError, IndexError, TypeError, AttributeError, RecursionError):
             return Reply(f"(no completion: {plain_text(body, 200)})")
-        return Reply(str(text), tokens if isinstance(tokens, int) and tokens >= 0 else 0)
+        # What was escaped in the body is plain now.
+        return Reply(_without_key(str(text)), tokens if isinstance(tokens, int) and tokens >= 0 else 0)
+
+
+def _key() -> str:
+    """Return the key, "" if there is none."""
+    key = os.environ.get(KEY, "").strip()
+    if not (key.isascii() and key.isprintable()):
+        raise InputError(f"{KEY}: it holds letters that no key has; set it to the key alone.")
+    return key
+
+
+def _without_key(text: str) -> str:
+    """Return a text in which the key does not stand, whatever a server put there."""
+    key = _key()
+    return text.replace(key, "***") if len(key) >= _SECRET else text
 
 
 def _message(message: dict[str, Any]) -> dict[str, Any]:

@@ -33,6 +33,7 @@ class Geometry:
     """What answers in a model's place."""
 
     source = "geometry, no model"
+    remote = False
 
     def reply(self, question: Question, messages: list[dict[str, Any]], digest: str) -> Reply:
         """Return an answer from the facts."""
@@ -41,6 +42,12 @@ class Geometry:
             raise InputError(f"geometry, no model: its answer for {question.kind} will not do, and it has no other.")
         if question.kind == "grasps":
             return Reply(json.dumps(_grasps(*question.facts)))
+        task = question.facts[0].task
+        if len(task.stages) > 1:
+            raise InputError(
+                f"geometry, no model: {task.name} takes several grasps one after the other, and geometry alone plans "
+                "one; use --endpoint or --recorded."
+            )
         return Reply(json.dumps({"steps": [_step(*question.facts)]}))
 
     def skip(self, count: int) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 from torchdlo.agents.vlm.conversation import Question, Reply, plain_text
 from torchdlo.errors import InputError
@@ -29,6 +29,7 @@ class RecordedConversation:
     answers: list[dict[str, Any]]
     where: str
     _next: int = field(default=0)
+    remote: ClassVar[bool] = False
 
     def reply(self, question: Question, messages: list[dict[str, Any]], digest: str) -> Reply:
         """Return the next answer."""
@@ -67,8 +68,9 @@ def load_recorded(path: Path) -> RecordedConversation:
     try:
         if path.is_dir():
             files = sorted((path / "exchanges").glob("*.json"))
-            rows = [_read(file) for file in files]
-            source = rows[0]["source"] if rows else ""
+            said = [_read(file) for file in files]
+            source = said[0]["source"] if said else ""
+            rows = [row for row in said if row["response"] is not None]  # the last one may have been sent in vain
         else:
             content = _read(path)
             source, rows = content["source"], content["exchanges"]

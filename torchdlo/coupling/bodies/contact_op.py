@@ -18,7 +18,7 @@ from torch import Tensor
 from torchdlo.coupling.bodies import contact_points
 from torchdlo.coupling.bodies.dynamics import PredictedBodyMotion
 from torchdlo.coupling.common import scene_packing
-from torchdlo.coupling.common.vector_components import axes
+from torchdlo.physics.linalg.vector_components import axes
 
 _FIRST = "Tensor[] bodies"
 _LISTS = "int[] cells, int[] many, int[] shapes, int[] free, int[] pairs"

@@ -1,10 +1,8 @@
 """Rigid bodies: what they are, where they are, and how they move without contact.
 
 Velocities live half a substep before poses, as those of the rods do (Stoermer-Verlet), so that an impulse between a
-rod and a body changes both by the same amount of momentum. A free body turns by five turns about its principal axes
-one after the other, x y z y x, each exact: second order, symplectic, and of exactly constant angular momentum
-(Dullweber, Leimkuhler, McLachlan 1997, doi:10.1063/1.474310). All poses are of the centre of mass and of the principal
-axes; quaternions are (w, x, y, z), body to world.
+rod and a body changes both by the same amount of momentum. Free bodies turn as in `physics.linalg.free_rotation`. All
+poses are of the centre of mass and of the principal axes; quaternions are (w, x, y, z), body to world.
 """
 
 from __future__ import annotations
@@ -18,12 +16,13 @@ import torch
 from torch import Tensor
 
 from torchdlo.coupling.bodies import shape_sdf
-from torchdlo.coupling.common.vector_components import axes, local, world
 from torchdlo.field_docs import with_field_docs
 from torchdlo.physics import tree
 from torchdlo.physics.effects.base import ContactForces
+from torchdlo.physics.linalg.free_rotation import spin_freely
 from torchdlo.physics.linalg.numerics import safe_norm
 from torchdlo.physics.linalg.rotation import multiply
+from torchdlo.physics.linalg.vector_components import axes, local, world
 
 MOTIONS = ("free", "fixed", "kinematic")
 """How a body can move: by forces, not at all, or as `Control` says."""
@@ -280,29 +279,6 @@ def predict_free_motion(
             state.quat, _spread(bodies, targets.quat, state.quat)
         )
     return PredictedBodyMotion(bodies, params, state, dt, change, turn, scale / params.mass, scale / params.inertia)
-
-
-def spin_freely(quat: Tensor, inertia: Tensor, omega: Tensor, dt: float) -> tuple[Tensor, Tensor]:
-    """Return orientations and angular velocities after a time without torque, shape (..., K, 4) and (..., K, 3).
-
-    Dullweber et al. 1997, eq. 3.6: in the frame of the body, the angular momentum p turns about axis i by -t p_i / I_i
-    while the body turns by the opposite.
-    """
-    moments = inertia.split(1, -1)
-    p = [m * o for m, o in zip(moments, local(axes(quat), omega.split(1, -1)), strict=True)]
-    q = list(quat.split(1, -1))
-    for axis, share in ((0, 0.5), (1, 0.5), (2, 1.0), (1, 0.5), (0, 0.5)):
-        angle = share * dt * p[axis] / moments[axis]
-        j, k = (axis + 1) % 3, (axis + 2) % 3
-        c, s = torch.cos(angle), torch.sin(angle)
-        p[j], p[k] = c * p[j] + s * p[k], c * p[k] - s * p[j]
-        # The product with the quaternion of a turn about that axis.
-        c, s = torch.cos(0.5 * angle), torch.sin(0.5 * angle)
-        w, own, one, two = q[0], q[1 + axis], q[1 + j], q[1 + k]
-        q[0], q[1 + axis], q[1 + j], q[1 + k] = w * c - own * s, own * c + w * s, one * c + two * s, two * c - one * s
-    quat = torch.cat(q, -1)
-    quat = quat / quat.square().sum(-1, keepdim=True).sqrt()  # rounding only
-    return quat, torch.cat(world(axes(quat), [a / m for a, m in zip(p, moments, strict=True)]), -1)
 
 
 def advance_bodies(motion: PredictedBodyMotion, targets: BodyTargets, push: ContactForces) -> BodyState:

@@ -16,9 +16,9 @@ from torch import Tensor
 
 from torchdlo.coupling.bodies.dynamics import PredictedBodyMotion
 from torchdlo.coupling.common import scene_packing
-from torchdlo.coupling.common.vector_components import axes
 from torchdlo.coupling.mpm.particles import Grid
 from torchdlo.coupling.mpm.substep import Nodes
+from torchdlo.physics.linalg.vector_components import axes
 
 _function, ready = scene_packing.kernel("body_near", "BodyMatter, which bodies are near particles")
 

@@ -43,6 +43,7 @@ from torchdlo.coupling.common.coulomb_friction import (
     rebound_separation,
     separation_needed,
 )
+from torchdlo.coupling.rod_body import body_touch_op
 from torchdlo.coupling.rod_body import rod_body_op as body_sweeps
 from torchdlo.physics.constraints.contact_penalty import Touch
 from torchdlo.physics.effects.base import ContactForces, Effect, EffectKind, PredictedMotion, Values
@@ -201,6 +202,8 @@ class RodBody(Effect):
     """Share of a shallow overlap that a substep removes; a small one lets ropes come to rest."""
     slowest: float = 0.02
     """Approach below which nothing rebounds [m/s]."""
+    left_out: tuple[tuple[int, int], ...] = ()
+    """Edges and bodies, by their places in the scene, that go through each other: those next to joints."""
 
     name: ClassVar[str] = "rod_body"
     kind: ClassVar[EffectKind] = "force"
@@ -217,40 +220,50 @@ class RodBody(Effect):
     def engage(self, view: View, motion: PredictedMotion, values: Values) -> Touch:
         """Return the points of edges that may touch bodies in an implicit substep."""
         bodies = motion.bodies
-        points, state = _points(view, bodies, self.pieces), bodies.state
+        free = [k for k, b in enumerate(bodies.bodies) if b.motion == "free"]
+        count = [points_per_edge(b, self.pieces) for b in bodies.bodies]
+        of = [[float(k == j) for j in free] for k, n in enumerate(count) for _ in range(n)]
+        place = [[float(k == j) for j in free] for k in range(len(count))]
+        mask, radius, rubs = view.params.rest.edge_mask, view.params.material.radius, 1.0 if self.friction else 0.0
+        if body_touch_op.kernel_fits(bodies):
+            law, searched = (self.recovery, self.slowest), [n - 2 for n in count]
+            found = body_touch_op.find_touches(view, motion, searched, friction=self.friction, law=law)
+        else:
+            found = self._touches(view, motion)
+        share, normal, wanted, given, mu, arm = found
+        edges = mask, view.tangent, radius, rubs * radius / view.length
+        shape = torch.broadcast_shapes(share.shape, *((*x.unsqueeze(-3).shape[:-1], 1) for x in edges))[:-1]
+        real, tangent, radius, lever = (x.unsqueeze(-3).expand(*shape, x.shape[-1]) for x in edges)
+        real = real * self._there(view, bodies)
+        share, normal, wanted, given, mu, arm = (x.expand(*shape, x.shape[-1]) for x in found)
+        resist = inertia(bodies, free) if free else share.new_zeros(0, 6, 6)
+        like = share.new_tensor
+        body = like(of).reshape(len(of), len(free)), resist, like(place).reshape(len(count), len(free))
+        return Touch(real, share, normal, tangent, radius, lever, wanted, given, mu, arm, *body)
+
+    def _touches(self, view: View, motion: PredictedMotion) -> tuple[Tensor, ...]:
+        """Return share, normal, wanted, given, mu and arm of points by tensor operations; see `Touch`."""
+        bodies = motion.bodies
+        points, state = self._points(view, bodies), bodies.state
         at, axes = points.at, points.axes
-        none = torch.zeros_like(motion.change)
-        still, slip = points.seen(none, bodies)
+        still, slip = points.seen(torch.zeros_like(motion.change), bodies)
         wanted = self._target(points, view, bodies, points.seen(motion.change, bodies)[0], calm=True)
         now = dataclasses.replace(bodies, change=state.vel, turn=state.omega)
         slides = safe_norm(points.seen(view.state.vel, now)[1]).detach() > self.slowest
         mu_s, mu_k = (axes.of_bodies(mu) for mu in (bodies.params.mu_s, bodies.params.mu_k))
-        rubs = 1.0 if self.friction else 0.0
-        shape = torch.broadcast_shapes(at.share.shape, wanted.shape)
-        free = [k for k, b in enumerate(bodies.bodies) if b.motion == "free"]
-        place = at.share.new_zeros(len(bodies.bodies), len(free))
-        for j, k in enumerate(free):
-            place[k, j] = 1.0
-
-        def wide(x: Tensor) -> Tensor:
-            return x.expand(*shape[:-1], x.shape[-1])
-
-        resist = inertia(bodies, free) if free else at.share.new_zeros(0, 6, 6)
-        each = points.real, at.share, at.normal, points.tangent, points.radius, rubs * points.lever, wanted
-        given, mu = still * at.normal + slip, rubs * torch.where(slides, mu_k, mu_s)
-        parts = [wide(x) for x in (*each, given, mu, at.arm)]
-        return Touch(*[*parts, axes.of[..., 0][:, free], resist, place])
+        mu = torch.where(slides, mu_k, mu_s) if self.friction else torch.zeros_like(at.share)
+        return at.share, at.normal, wanted, still * at.normal + slip, mu, at.arm
 
     def solve_contact(self, view: View, motion: PredictedMotion, values: Values) -> ContactForces:
         """Return the forces that keep ropes outside of bodies and rub [N]."""
         bodies = motion.bodies
-        if body_sweeps.kernel_fits(bodies):
+        if body_sweeps.kernel_fits(bodies) and not self.left_out:
             pieces = [points_per_edge(b, self.pieces) - 2 for b in bodies.bodies]
             law = (self.recovery, self.slowest)
             return body_sweeps.contact_wrenches(
                 view, motion, pieces, sweeps=self.sweeps, friction=self.friction, law=law
             )
-        points = _points(view, bodies, self.pieces)
+        points = self._points(view, bodies)
         along, slip = points.seen(motion.change, bodies)
         wanted = self._target(points, view, bodies, along)
         softness = _softness(points, motion.give, bodies)
@@ -262,6 +275,20 @@ class RodBody(Effect):
             normal, friction = self._sweep(points, (normal, friction), (along, slip), wanted, softness, bodies)
             push = points.exerted(normal, friction)
         return push
+
+    def _points(self, view: View, bodies: PredictedBodyMotion) -> _Points:
+        points = _points(view, bodies, self.pieces)
+        return dataclasses.replace(points, real=points.real * self._there(view, bodies)) if self.left_out else points
+
+    def _there(self, view: View, bodies: PredictedBodyMotion) -> Tensor:
+        """Return 0 at points of edges that go through their body, else 1 [1], shape (F, V, 1) or (1, 1, 1)."""
+        mask = view.params.rest.edge_mask
+        if not self.left_out:
+            return mask.new_ones(1, 1, 1)
+        out = set(self.left_out)
+        count = [points_per_edge(b, self.pieces) for b in bodies.bodies]
+        rows = [[float((edge, k) not in out) for edge in range(view.topology.size)] for k in range(len(count))]
+        return mask.new_tensor([row for row, n in zip(rows, count, strict=True) for _ in range(n)]).unsqueeze(-1)
 
     def _target(
         self, points: _Points, view: View, bodies: PredictedBodyMotion, along: Tensor, calm: bool = False

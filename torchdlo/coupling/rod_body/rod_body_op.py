@@ -18,8 +18,8 @@ from torch import Tensor
 
 from torchdlo.coupling.bodies.dynamics import PredictedBodyMotion
 from torchdlo.coupling.common import scene_packing
-from torchdlo.coupling.common.vector_components import axes
 from torchdlo.physics.effects.base import ContactForces, PredictedMotion
+from torchdlo.physics.linalg.vector_components import axes
 from torchdlo.physics.rod.kinematics import View
 
 _INPUTS = "Tensor[] edges, Tensor[] vertices, Tensor[] bodies, Tensor grids"

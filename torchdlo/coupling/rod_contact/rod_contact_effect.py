@@ -50,7 +50,7 @@ from torchdlo.coupling.common.coulomb_friction import (
     rebound_separation,
     separation_needed,
 )
-from torchdlo.coupling.rod_contact import broad_phase_op
+from torchdlo.coupling.rod_contact import broad_phase_op, rod_touch_op
 from torchdlo.coupling.rod_contact import rod_contact_op as rod_pairs
 from torchdlo.coupling.rod_contact.broad_phase import near_pairs
 from torchdlo.coupling.rod_contact.closest_points import closest_points
@@ -261,6 +261,9 @@ class RodContact(Effect):
     def engage(self, view: View, motion: PredictedMotion, values: Values) -> Pairs:
         """Return the pairs of edges that may touch in an implicit substep."""
         at, like = values["corners"], view.state.pos
+        if rod_touch_op.ready(like.device.type, like.dtype):
+            law = (self.recovery, self.slowest)
+            return rod_touch_op.find_touches(view, motion, values, friction=self.friction, law=law)
         batch, size = at.shape[:-2], view.topology.size
         mass = 1 / motion.mobility.amax(-1, keepdim=True)
         parts = [like, motion.change, view.state.vel, view.params.material.radius, mass]

@@ -124,12 +124,14 @@ class Touch:
         return (self.place @ wrench).split(3, -1)
 
 
-def untouched(like: Tensor) -> Touch:
-    """Return that no bodies are there; vertices are (..., V, 3)."""
+def untouched(like: Tensor, resist: Tensor | None = None, place: Tensor | None = None) -> Touch:
+    """Return that nothing may touch bodies; vertices are (..., V, 3), and the others as in `Touch`, None for none."""
     v = like.shape[-2]
+    resist = like.new_zeros(0, 6, 6) if resist is None else resist
+    place = like.new_zeros(1, 0) if place is None else place
     widths = (1, 1, 3, 3, 1, 1, 1, 3, 1, 3)
     none = [like.new_zeros(0, v, width) for width in widths]
-    return Touch(*[*none, like.new_zeros(0, 0), like.new_zeros(0, 6, 6), like.new_zeros(1, 0)])
+    return Touch(*[*none, like.new_zeros(0, resist.shape[-3]), resist, place])
 
 
 @dataclass(frozen=True)

@@ -140,13 +140,16 @@ class ContactForces:
     """What is left of matter, see `coupling.mpm.rod_coupling_effect.TouchedParticles`; () if it is not touched."""
     unsolved: Any = ()
     """Share of the forces that an implicit substep left unbalanced [1], shape (..., 1, 1); () if none was looked at."""
+    joints: Any = ()
+    """What joints do, see `physics.constraints.joint_points.JointForces`; () if there are none."""
 
     def plus(self, other: ContactForces) -> ContactForces:
         """Return what both exert together; no more than one effect touches matter."""
         force, torque = self.force + other.force, self.body_torque + other.body_torque
         material_points = self.material_points if self.material_points != () else other.material_points
         unsolved = self.unsolved if self.unsolved != () else other.unsolved
-        return ContactForces(force, self.body_force + other.body_force, torque, material_points, unsolved)
+        joints = self.joints if self.joints != () else other.joints
+        return ContactForces(force, self.body_force + other.body_force, torque, material_points, unsolved, joints)
 
 
 class Effect(ABC):

@@ -1,31 +1,48 @@
-"""The Newton iteration of implicit substeps with contact as a C++ kernel: a scene at a time, without derivative.
+"""The Newton iteration of implicit substeps with contact as a C++ kernel, a scene at a time, and its derivative.
 
 The formulas stand in `contact_step`, `contact_penalty` and `edge_lengths`, as tensor operations; these are used on a
-GPU, where there is no C++ compiler, and for the step that carries derivatives.
+GPU and where there is no C++ compiler. The kernel reads tensors as they are stored.
 """
 
 from __future__ import annotations
 
 import ctypes
 import functools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from torchdlo.physics import tree
 from torchdlo.physics.constraints import contact_penalty as penalty
-from torchdlo.physics.constraints.contact_penalty import Pairs, Touch
-from torchdlo.physics.constraints.edge_lengths import LengthSystem
 from torchdlo.physics.kernels import native
 from torchdlo.physics.linalg import banded
+from torchdlo.physics.rod.topology import parse
 
 _DTYPES = {torch.float32: "float", torch.float64: "double"}
+_POINTS = 10
+"""Numbers of points among the parts of `Touch`; behind them stand which body they are on, and how bodies resist."""
+_SLOT, _POINT, _PAIR = 28, 18, 43
+"""How many numbers slots, points and pairs have."""
 
 
 class _Sizes(ctypes.Structure):
     _fields_ = (
         *((name, ctypes.c_int64) for name in ("slots", "scenes", "families", "bodies", "pairs", "half", "tries")),
         *((name, ctypes.c_void_p) for name in ("after", "of", "steps", "order", "hardness", "law")),
+    )
+
+
+class _Place(ctypes.Structure):
+    _fields_ = tuple((name, ctypes.c_int64) for name in ("input", "offset", "slot", "family", "scene"))
+
+
+class _Inputs(ctypes.Structure):
+    _fields_ = (
+        *((name, ctypes.c_void_p) for name in ("slots", "points", "pairs", "bodies")),
+        ("corner", ctypes.c_int64 * 4),
+        ("scenes", ctypes.c_int64),
     )
 
 
@@ -39,50 +56,175 @@ native.KERNELS["touching"] = _library
 
 def available(like: Tensor) -> bool:
     """Return whether there is a kernel for tensors like this one."""
-    here = native.works_on(like.device.type, "contact of ropes in implicit steps")
-    return here and like.dtype in _DTYPES and _library() is not None
+    return _ready(like.device.type, like.dtype)
 
 
-def _rows(batch: torch.Size, middle: tuple[int, ...], *parts: Tensor) -> Tensor:
-    """Join numbers (..., *middle, C) of scenes along the last axis, shape (B, *middle, C in all)."""
-    joined = torch.cat([x.expand(*batch, *middle, x.shape[-1]) for x in parts], -1)
-    return joined.reshape(batch.numel(), *middle, joined.shape[-1]).contiguous()
+def _ready(device: str, dtype: torch.dtype) -> bool:
+    here = native.works_on(device, "contact of ropes in implicit steps")
+    return here and dtype in _DTYPES and _library() is not None
 
 
-def _points(batch: torch.Size, touch: Touch, slots: int) -> Tensor:
-    maps = (x.flatten(-2) for x in penalty.maps(touch))
-    parts = touch.real, touch.normal, touch.radius, touch.wanted, touch.given, touch.mu, *maps
-    return _rows(batch, (touch.of.shape[0], slots), *parts)
+# For compilers what it returns is a constant: `torch.compiler.assume_constant_result`, without importing them.
+_ready._dynamo_marked_constant = True  # type: ignore[attr-defined]  # a mark that no stub knows
 
 
-def _pairs(batch: torch.Size, pairs: Pairs | None, like: Tensor) -> tuple[Tensor, Tensor]:
-    if pairs is None:
-        return like.new_empty(0), torch.empty(0, dtype=torch.int64)
-    count = pairs.at.shape[-1]
-    parts = pairs.real, pairs.normal, pairs.radius, pairs.wanted, pairs.mu, *(x.flatten(-2) for x in pairs.linear)
-    at = torch.div(pairs.at, pairs.at.shape[:-2].numel(), rounding_mode="floor")
-    return _rows(batch, (count,), *parts), at.mT.expand(*batch, count, 4).reshape(batch.numel(), count, 4).contiguous()
+_Layout = tuple[tuple[torch.Size, tuple[int, ...]], ...]
+
+
+@dataclass(frozen=True)
+class _Plan:
+    """How to call the kernel with inputs of given shapes and strides."""
+
+    batch: tuple[int, ...]
+    sizes: _Sizes
+    inputs: _Inputs
+    shapes: tuple[tuple[int, ...], ...]
+    """Shapes of what it returns, without the scenes, which come last."""
+    kept: tuple
+    """What these point to."""
+
+
+def _flat(x: Tensor, batch: tuple[int, ...], core: int) -> Tensor:
+    """Return a tensor with one axis for all scenes, or none, in front of the last `core` axes."""
+    own = x.dim() - core
+    if own == 0 or (own == 1 and (x.shape[0] == math.prod(batch))):
+        return x
+    if math.prod(x.shape[:own]) == 1:
+        return x.reshape(x.shape[own:])
+    return x.expand(*batch, *x.shape[own:]).reshape(-1, *x.shape[own:])
+
+
+def _places(first: int, layout: Sequence, core: int) -> list[_Place]:
+    """Return where numbers are: axes are scenes, if there are any, then `core` of (family,) slot and components."""
+    found = []
+    for k, (shape, stride) in enumerate(layout):
+        many, shape, stride = len(shape) > core, shape[-core:], stride
+        scene, stride = (stride[0] if many else 0), stride[-core:]
+        family, shape, stride = (stride[0] * (shape[0] > 1), shape[1:], stride[1:]) if core == 3 else (0, shape, stride)
+        slot = stride[0] * (shape[0] > 1)
+        found += [_Place(first + k, c * stride[1], slot, family, scene) for c in range(shape[1])]
+    return found
+
+
+@functools.lru_cache(maxsize=1024)
+def _plan(
+    topology: str,
+    batch: tuple[int, ...],
+    layouts: tuple[_Layout, ...],
+    of: tuple[int, ...],
+    count: int,
+    law: tuple[float, ...],
+    tries: tuple[tuple[float, int], ...],
+) -> _Plan:
+    shape = parse(topology)
+    v, scenes, pattern = shape.size, math.prod(batch), banded.pattern(f"touching:{topology}")
+    slots, points, resist, pairs, corners = layouts
+    first = 0
+    places = []
+    for layout, core in ((slots, 2), (points, 3), (resist, 3)):
+        places.append(_places(first, layout, core))
+        first += len(layout)
+    (_, stride), *_ = resist
+    scene = stride[0] if len(stride) > 3 else 0
+    bodies = [
+        _Place(len(slots) + len(points), i * stride[-2] + j * stride[-1], stride[-3], 0, scene)
+        for i in range(6)
+        for j in range(6)
+    ]
+    between: list[_Place] = []
+    if pairs:
+        between = _places(first, pairs[:5], 2)
+        for k, (wide, stride) in enumerate(pairs[5:]):
+            scene = stride[0] if len(wide) > 3 else 0
+            between += [
+                _Place(first + 5 + k, i * stride[-2] + j * stride[-1], stride[-3], 0, scene)
+                for i in range(3)
+                for j in range(3)
+            ]
+    lists = [(_Place * max(1, len(x)))(*x) for x in (places[0], places[1], between, bodies)]
+    inputs = _Inputs(*(ctypes.addressof(x) for x in lists))
+    room = 0
+    if corners:
+        ((wide, stride),) = corners
+        room, scene = wide[-1], stride[0] if len(wide) > 2 else 0
+        inputs.corner[:] = [0, stride[-2], stride[-1], scene]
+        inputs.scenes = wide[0] if len(wide) > 2 else 1
+    arrays = [
+        (ctypes.c_int64 * v)(*shape.successor()),
+        (ctypes.c_int64 * max(1, len(of)))(*of),
+        (ctypes.c_int64 * len(tries))(*(steps for _, steps in tries)),
+        ctypes.c_void_p(pattern.order.data_ptr()),
+        (ctypes.c_double * len(tries))(*(hard for hard, _ in tries)),
+        (ctypes.c_double * len(law))(*law),
+    ]
+    sizes = _Sizes(v, scenes, len(of), count, room, pattern.half_bandwidth, len(tries))
+    for name, array in zip(("after", "of", "steps", "order", "hardness", "law"), arrays, strict=True):
+        setattr(sizes, name, ctypes.cast(array, ctypes.c_void_p))
+    shapes = ((3, v), (1, v), (count, 6), (1, 1), (3, v), (1, v), (3, v), (3, v), (count, 6), (1, 1))
+    return _Plan(batch, sizes, inputs, shapes, (lists, arrays, pattern))
+
+
+def _addresses(tensors: Sequence[Tensor]) -> ctypes.Array:
+    return (ctypes.c_void_p * len(tensors))(*[x.data_ptr() for x in tensors])
+
+
+@dataclass(frozen=True)
+class _Call:
+    """A plan, and the tensors that it is for."""
+
+    plan: _Plan
+    tensors: list[Tensor]
+    corners: Tensor | None
+
+    def addresses(self) -> tuple[ctypes.Array, ctypes.c_void_p]:
+        """Return where the tensors are."""
+        corners = ctypes.c_void_p(None if self.corners is None else self.corners.data_ptr())
+        return _addresses(self.tensors), corners
+
+
+def _call(
+    inputs: list[Tensor],
+    parts: list[Tensor],
+    pairs: list[Tensor],
+    origin: Tensor,
+    topology: str,
+    law: Sequence[float],
+    tries: tuple[tuple[float, int], ...],
+    solved: float,
+) -> _Call:
+    points, (of, resist) = parts[:_POINTS], parts[_POINTS : _POINTS + 2]
+    slots, at, pairs = [*inputs, origin], pairs[:1], pairs[1:]
+    groups = [(slots, 2), (points, 3), ([resist], 3), (pairs[:5], 2), (pairs[5:], 3), (at, 2)]
+    leading = {x.shape[:-core] for group, core in groups for x in group}
+    batch = tuple(torch.broadcast_shapes(*leading))
+    flat = [[_flat(x, batch, core) for x in group] for group, core in groups]
+    flat = [*flat[:3], flat[3] + flat[4], flat[5]]
+    layouts = tuple(tuple((x.shape, x.stride()) for x in group) for group in flat)
+    body = tuple(row.index(1.0) if 1.0 in row else -1 for row in of.tolist())
+    numbers = (*law, solved, penalty.ROUND, penalty.FAR, penalty.LEAVING)
+    plan = _plan(topology, batch, layouts, body, of.shape[-1], numbers, tries)
+    return _Call(plan, [x for group in flat[:4] for x in group], flat[4][0] if at else None)
 
 
 def solve(
-    system: LengthSystem,
-    tension: Tensor,
-    touch: Touch,
-    pairs: Pairs | None,
+    inputs: list[Tensor],
+    parts: list[Tensor],
+    pairs: list[Tensor],
     origin: Tensor,
-    dt: float,
+    topology: str,
+    law: Sequence[float],
     tries: tuple[tuple[float, int], ...],
     solved: float,
 ) -> list[Tensor]:
     """Return what Newton's method finds, and what an exact step makes of it.
 
     Args:
-        system: the equations without contact.
-        tension: those of the last substep [N], shape (..., V, 1).
-        touch: points on bodies.
-        pairs: edges of ropes that may touch.
+        inputs: what `LengthSystem.inputs` returns.
+        parts: those of `Touch`: points on bodies.
+        pairs: those of `Pairs`: edges of ropes that may touch; none if no ropes do.
         origin: positions at the start of the substep [m], shape (..., V, 3).
-        dt: substep [s].
+        topology: name of the topology.
+        law: numbers of the equations without contact, and the substep [s].
         tries: how hard contact is, and Newton steps at most, one after the other.
         solved: what may be left of the equations.
 
@@ -91,42 +233,43 @@ def solve(
         then, after the exact step, positions, tensions, forces and forces of contact (..., V, 3), wrenches (..., J, 6)
         and what is left (..., 1, 1).
     """
-    lengths, inertia, topology = system.lengths, system.inertia, system.lengths.topology
-    v, free_bodies = topology.size, touch.of.shape[-1]
-    swing = inertia.turning if inertia.turning is not None else inertia.vertex.new_zeros(1, 1)
-    give = tree.part(lengths.give)
-    parts = [lengths.rest, lengths.compliance, lengths.active, lengths.edge_mask, give, inertia.hinge, swing]
-    parts += [system.free, tension, inertia.vertex, system.moved, system.force, system.direction, system.ahead, origin]
-    parts.append(system.scale)
-    others = [touch.wanted.shape[:-3], touch.resist.shape[:-3]]
-    batch = torch.broadcast_shapes(*(x.shape[:-2] for x in parts), *others)
-    slots = _rows(batch, (v,), *parts)
-    points, (between, corners) = _points(batch, touch, v), _pairs(batch, pairs, slots)
-    resist = touch.resist.expand(*batch, free_bodies, 6, 6).reshape(batch.numel(), free_bodies, 36).contiguous()
-    pattern = banded.pattern(f"touching:{topology.name}")
-    law = [system.turning, lengths.most, lengths.least, lengths.shift, dt, solved]
-    law += [penalty.ROUND, penalty.FAR, penalty.LEAVING]
-    body = [row.index(1.0) if 1.0 in row else -1 for row in touch.of.tolist()]
-    arrays = [
-        (ctypes.c_int64 * v)(*topology.successor()),
-        (ctypes.c_int64 * max(1, len(body)))(*body),
-        (ctypes.c_int64 * len(tries))(*(steps for _, steps in tries)),
-        ctypes.c_void_p(pattern.order.data_ptr()),
-        (ctypes.c_double * len(tries))(*(hard for hard, _ in tries)),
-        (ctypes.c_double * len(law))(*law),
-    ]
-    scenes, count = batch.numel(), between.shape[1] if between.dim() > 1 else 0
-    sizes = _Sizes(v, scenes, len(body), free_bodies, count, pattern.half_bandwidth, len(tries))
-    for name, array in zip(("after", "of", "steps", "order", "hardness", "law"), arrays, strict=True):
-        setattr(sizes, name, ctypes.cast(array, ctypes.c_void_p))
-    shapes = [(3, v), (1, v), (free_bodies, 6), (1, 1), (3, v), (1, v), (3, v), (3, v), (free_bodies, 6), (1, 1)]
-    out = [slots.new_empty(*shape, scenes) for shape in shapes]
-    places = (ctypes.c_void_p * len(out))(*(x.data_ptr() for x in out))
-    inputs = (ctypes.c_void_p(x.data_ptr()) for x in (slots, points, between, corners, resist))
-    run = getattr(_library(), f"touching_{_DTYPES[slots.dtype]}")
-    run(*inputs, places, ctypes.byref(sizes), torch.get_num_threads())
-    found = []
-    for k, (x, shape) in enumerate(zip(out, shapes, strict=True)):
-        x = x.reshape(*shape, *batch)
-        found.append(x.permute(*range(2, x.dim()), 0, 1) if k in (2, 3, 8, 9) else tree.logical(x))
-    return found
+    call = _call(inputs, parts, pairs, origin, topology, law, tries, solved)
+    plan = call.plan
+    out = [origin.new_empty(*shape, plan.sizes.scenes) for shape in plan.shapes]
+    run = getattr(_library(), f"touching_{_DTYPES[origin.dtype]}")
+    threads = torch.get_num_threads()
+    run(*call.addresses(), ctypes.byref(plan.inputs), _addresses(out), ctypes.byref(plan.sizes), threads)
+    return [_logical(k, x, plan.batch) for k, x in enumerate(out)]
+
+
+def _logical(k: int, x: Tensor, batch: tuple[int, ...]) -> Tensor:
+    """Return what the kernel made with its scenes in front: of vertices (C, V, B), of bodies (J, C, B)."""
+    x = x.reshape(*x.shape[:2], *batch)
+    scenes = range(2, x.dim())
+    return x.permute(*scenes, 0, 1) if k in (2, 3, 8, 9) else x.permute(*scenes, 1, 0)
+
+
+def derive(call: tuple, found: list[Tensor], by: list[Tensor]) -> tuple[Tensor, ...]:
+    """Return derivatives of what `solve` returns: numbers of slots (28, V, B), of points (B, F, V, 18), of pairs
+    (B, K, 43), and of how bodies resist (B, J, 36), in the order of the arguments of `solve`, positions at the start
+    behind the other numbers of slots.
+
+    Args:
+        call: those arguments.
+        found: the first four of what it returned.
+        by: derivatives by the next five.
+    """
+    planned = _call(*call)
+    sizes = planned.plan.sizes
+    given = [x.reshape(sizes.scenes, -1).contiguous() for x in (*found, *by)]
+    like = given[0]
+    out = (
+        like.new_empty(_SLOT, sizes.slots, sizes.scenes),
+        like.new_zeros(sizes.scenes, sizes.families, sizes.slots, _POINT),
+        like.new_zeros(sizes.scenes, sizes.pairs, _PAIR),
+        like.new_zeros(sizes.scenes, sizes.bodies, 36),
+    )
+    run = getattr(_library(), f"touching_back_{_DTYPES[like.dtype]}")
+    places, inputs = planned.addresses(), ctypes.byref(planned.plan.inputs)
+    run(*places, inputs, _addresses(given), _addresses(out), ctypes.byref(sizes), torch.get_num_threads())
+    return out

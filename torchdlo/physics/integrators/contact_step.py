@@ -4,7 +4,8 @@ The equations are those of `edge_lengths.balance` with the forces of `contact_pe
 driven surfaces fill blocks of 3 x 3 on and beside the diagonal, within the band that bending needs; free bodies add a
 border of six unknowns each, which their Schur complement takes out; pairs of edges that touch add three each, which
 `linalg.low_rank` takes out by Woodbury's formula. Newton's method runs without graph until each scene
-is solved; scenes that are not are tried again with softer contact. One more step, with graph, gives the derivative of
+is solved; scenes that are not are tried again with softer contact. Points that are joined to bodies or other ropes
+(`joint_points`) add three unknowns each to the border. One more step, with graph, gives the derivative of
 the implicit function theorem, and what is left of the equations is reported.
 """
 
@@ -20,10 +21,11 @@ from torch import Tensor
 
 from torchdlo.physics import tree
 from torchdlo.physics.constraints import contact_penalty as penalty
+from torchdlo.physics.constraints import joint_points
 from torchdlo.physics.constraints.contact_penalty import HARD, Pairs, Touch
 from torchdlo.physics.constraints.edge_lengths import Inertia, Lengths, LengthSystem, saddle_order
+from torchdlo.physics.constraints.joint_points import JointPoints
 from torchdlo.physics.integrators import contact_kernel
-from torchdlo.physics.kernels import lanes
 from torchdlo.physics.linalg import banded, gather_scatter, low_rank
 from torchdlo.physics.linalg.numerics import added, dot
 from torchdlo.physics.rod.topology import Topology, following, parse, preceding
@@ -47,7 +49,9 @@ class Unknowns:
     impulse: Tensor
     """Tensions times `scale` [N s^2], shape (..., V, 1)."""
     bodies: Tensor
-    """By how much contact moves and turns free bodies [m, rad], shape (..., J, 6)."""
+    """By how much contact and joints move and turn free bodies [m, rad], shape (..., J, 6)."""
+    joints: Tensor
+    """Forces of joints on the ropes times `scale` [N s^2], shape (..., A, 3)."""
 
 
 @dataclass(frozen=True)
@@ -62,6 +66,8 @@ class Touching:
     """Edges of ropes that may touch each other."""
     dt: float
     """Substep [s]."""
+    joints: JointPoints | None = None
+    """Points that are joined."""
 
     def firm(self, tension: Tensor, hard: Tensor) -> Tensor:
         """Return the stiffness of points times `scale` [kg], (..., 1, V, 1), for a hardness (..., 1, 1)."""
@@ -95,27 +101,35 @@ class Touching:
         y, push, excess, along, along_start = system.residual(now.pos, now.impulse)
         felt = penalty.feel(topology, self.touch, linear, firm, now.pos - self.origin, now.bodies, self.dt)
         between, pairs = self.feel_pairs(now.pos, firm)
-        forces = inertia.vertex * y - free * (push + felt.force + between)
+        joined = 0.0 if self.joints is None else self.joints.pulls(now.joints)
+        forces = inertia.vertex * y - free * (push + felt.force + between + joined)
         resist = self.touch.resist * scale.unsqueeze(-1)
         wrenches = (resist @ now.bodies.unsqueeze(-1)).squeeze(-1) - felt.wrench
-        batch = torch.broadcast_shapes(forces.shape[:-2], excess.shape[:-2], resist.shape[:-3], firm.shape[:-3])
+        shapes = [forces.shape[:-2], excess.shape[:-2], resist.shape[:-3], firm.shape[:-3]]
+        batch = torch.broadcast_shapes(*shapes, *([] if self.joints is None else [self.joints.batch]))
+        end, gap = None, None
+        if self.joints is not None:
+            wrenches = wrenches - self.joints.wrench(now.joints)
+            end = self.joints.orientation(now.bodies, self.dt)
+            gap = self.joints.gap(now.pos, now.bodies, end)
         with torch.no_grad():
             gradient = penalty.gradients(topology, self.touch, linear, felt, exact)
             entries = self._entries(batch, now.impulse, gradient, along_start, along)
             rank = None if pairs is None else self._rank(batch, pairs, exact)
-            answer, row, schur = _bordered(
-                batch, entries, rank, free.unsqueeze(-1) * gradient.border, gradient, resist, topology
-            )
+            border = self._border(batch, now, gradient, resist, end)
+            answer, schur = _bordered(batch, entries, rank, border, topology)
         step = _solve(entries, rank, -_stacked(batch, forces, excess), topology)
-        bodies = now.bodies.expand(*batch, count, 6)
-        turned = torch.zeros_like(bodies)
-        if count:
-            load = -wrenches.expand(*batch, count, 6).reshape(-1, 6 * count, 1) - row @ step[
-                : 3 * topology.size
-            ].T.unsqueeze(-1)
+        bodies, joints = now.bodies.expand(*batch, count, 6), now.joints.expand(*batch, *now.joints.shape[-2:])
+        turned, tied = torch.zeros_like(bodies), torch.zeros_like(joints)
+        if border.own.shape[-1]:
+            rows = [x.expand(*batch, *x.shape[-2:]).flatten(-2) for x in (wrenches, gap) if x is not None]
+            load = -torch.cat(rows, -1).reshape(-1, border.own.shape[-1], 1)
+            load = load - border.row @ step[: 3 * topology.size].T.unsqueeze(-1)
             moved = torch.linalg.solve(schur, load)
             step = step - (answer @ moved).squeeze(-1).T
-            turned = moved.reshape(*batch, count, 6)
+            moved = moved.reshape(*batch, -1)
+            turned = moved[..., : 6 * count].reshape(*batch, count, 6)
+            tied = moved[..., 6 * count :].reshape(joints.shape)
         cut = 3 * topology.size
         change, pull = _slots(step[:cut], batch, 3), _slots(step[cut:], batch, 1)
         with torch.no_grad():
@@ -123,13 +137,51 @@ class Touching:
             most = dot(turn, turn).amax(-2, keepdim=True).sqrt()
             short = (1 / most.clamp(min=1e-9)).clamp(max=1.0)
             sizes = [inertia.vertex * y, scale * system.force, felt.force, now.impulse * along_start]
-            if isinstance(between, Tensor):
-                sizes.append(between)
+            sizes += [x for x in (between, joined) if isinstance(x, Tensor)]
             # Far from contact and loads, what is left is small beside the momentum.
             carried = 1e-3 * (system.moved - self.origin) + 1e-9 * lengths.rest
             sizes.append(inertia.vertex * carried)
             left = _left(forces, sizes, excess, lengths.rest).expand(*batch, 1, 1)
-        return Unknowns(now.pos + short * change, now.impulse + short * pull, bodies + short * turned), left
+            if gap is not None:
+                edge = torch.where(lengths.edge_mask > 0, lengths.rest, torch.inf).amin(-2, keepdim=True)
+                left = torch.maximum(left, gap.abs().amax((-2, -1), keepdim=True) / edge)
+        found = now.pos + short * change, now.impulse + short * pull, bodies + short * turned, joints + short * tied
+        return Unknowns(*found), left
+
+    def _border(
+        self,
+        batch: tuple[int, ...],
+        now: Unknowns,
+        gradient: penalty.ContactGradients,
+        resist: Tensor,
+        end: Tensor | None,
+    ) -> _Border:
+        """Return how equations of vertices, of bodies and of joints hang together; N scenes in a row."""
+        joints, v, count = self.joints, self.system.lengths.topology.size, self.touch.of.shape[-1]
+        free = self.system.free.unsqueeze(-1)
+        columns, rows = [free * gradient.border] if count else [], [gradient.back] if count else []
+        own = penalty.blocks(resist) + gradient.corner if count else resist.new_zeros(0, 0)
+        if joints is not None:
+            unit = torch.eye(3, dtype=free.dtype, device=free.device)
+            held = (joints.weight.mT[:, None, :, None] * unit[:, None]).flatten(-2)
+            columns.append(-free * held)
+            rows.append(held.mT)
+            none = own.new_zeros(3 * joints.count, 3 * joints.count)
+            sides = own, joints.levers(), -joints.reach(now.bodies, tree.part(end), self.dt), none
+            shape = torch.broadcast_shapes(*(x.shape[:-2] for x in sides))
+            own, lever, reach, none = (x.expand(*shape, *x.shape[-2:]) for x in sides)
+            own = torch.cat([torch.cat([own, lever], -1), torch.cat([reach, none], -1)], -2)
+        size, axes = own.shape[-1], range(len(batch))
+        if not size:
+            return _Border(own, own, own)
+        column = torch.cat([x.expand(*batch, v, 3, x.shape[-1]) for x in columns], -1)
+        row = torch.cat([x.expand(*batch, v, x.shape[-2], 3) for x in rows], -2)
+        column = column.permute(-2, -3, -1, *axes).reshape(3 * v, -1)
+        return _Border(
+            torch.cat([column, column.new_zeros(v, column.shape[1])]),
+            row.permute(*axes, -2, -1, -3).reshape(-1, size, 3 * v),
+            own.expand(*batch, size, size).reshape(-1, size, size),
+        )
 
     def _entries(
         self,
@@ -188,12 +240,15 @@ class Touching:
         """Return the first guess: no forces but the last tensions."""
         system, count = self.system, self.touch.of.shape[-1]
         parts = [system.moved.shape[:-2], tension.shape[:-2], self.touch.wanted.shape[:-3]]
+        parts += [] if self.joints is None else [self.joints.batch]
         batch = torch.broadcast_shapes(*parts, *([] if self.pairs is None else [self.pairs.at.shape[:-2]]))
         impulse = (system.lengths.guess(tension) * system.scale).detach()
+        tied = system.moved.new_zeros(0, 3) if self.joints is None else (self.joints.force * system.scale).detach()
         return Unknowns(
             system.moved.detach().expand(*batch, *system.moved.shape[-2:]),
             impulse.expand(*batch, *impulse.shape[-2:]),
             system.moved.new_zeros(*batch, count, 6),
+            tied.expand(*batch, *tied.shape[-2:]),
         )
 
 
@@ -204,27 +259,29 @@ def _left(forces: Tensor, sizes: Sequence[Tensor], excess: Tensor, rest: Tensor)
     return torch.maximum(left, (excess.abs() / rest).amax(-2, keepdim=True))
 
 
+@dataclass(frozen=True)
+class _Border:
+    """What displacements of bodies and forces of joints add to the banded system, n unknowns in all."""
+
+    column: Tensor
+    """How equations of vertices and lengths feel them, shape (4 V, n N)."""
+    row: Tensor
+    """How their equations feel vertices, shape (N, n, 3 V)."""
+    own: Tensor
+    """How their equations feel them, shape (N, n, n)."""
+
+
 def _bordered(
-    batch: tuple[int, ...],
-    entries: Tensor,
-    rank: low_rank.LowRank | None,
-    border: Tensor,
-    gradient: penalty.ContactGradients,
-    resist: Tensor,
-    topology: Topology,
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Return how vertices answer to bodies (N, 4 V, 6 J), how bodies feel vertices, and the bodies' own matrix."""
-    v, count = topology.size, gradient.corner.shape[-1]
-    if count == 0:
-        return border, border, border
-    border = border.expand(*batch, v, 3, count).permute(-2, -3, -1, *range(len(batch))).reshape(3 * v, -1)
-    border = torch.cat([border, border.new_zeros(v, border.shape[1])])
-    many = None if rank is None else rank.repeat(count)
-    answer = _solve(entries.repeat(1, count), many, border, topology)
-    answer = answer.reshape(4 * v, count, -1).permute(2, 0, 1)
-    row = gradient.back.expand(*batch, v, count, 3).permute(*range(len(batch)), -2, -1, -3).reshape(-1, count, 3 * v)
-    own = (penalty.blocks(resist) + gradient.corner).expand(*batch, count, count).reshape(-1, count, count)
-    return answer, row, own - row @ answer[:, : 3 * v]
+    batch: tuple[int, ...], entries: Tensor, rank: low_rank.LowRank | None, border: _Border, topology: Topology
+) -> tuple[Tensor, Tensor]:
+    """Return how vertices and tensions answer to the border (N, 4 V, n), and the border's own matrix (N, n, n)."""
+    size, v = border.own.shape[-1], topology.size
+    if not size:
+        return border.own, border.own
+    many = None if rank is None else rank.repeat(size)
+    answer = _solve(entries.repeat(1, size), many, border.column, topology)
+    answer = answer.reshape(4 * v, size, -1).permute(2, 0, 1)
+    return answer, border.own - border.row @ answer[:, : 3 * v]
 
 
 def _solve(entries: Tensor, rank: low_rank.LowRank | None, rhs: Tensor, topology: Topology) -> Tensor:
@@ -243,7 +300,7 @@ def _slots(rows: Tensor, batch: tuple[int, ...], components: int) -> Tensor:
     return tree.logical(rows.reshape(components, -1, *batch))
 
 
-def solve_contact_step(touching: Touching, tension: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
+def solve_contact_step(touching: Touching, tension: Tensor) -> tuple[Tensor, ...]:
     """Return positions, tensions, forces, forces of contact, wrenches on free bodies, and what is left unsolved.
 
     Args:
@@ -252,28 +309,33 @@ def solve_contact_step(touching: Touching, tension: Tensor) -> tuple[Tensor, Ten
 
     Returns:
         Positions (..., V, 3) [m], tensions (..., V, 1) [N], forces on vertices with tension, hinges and contact
-        (..., V, 3) [N], those of contact alone (..., V, 3) [N], forces and torques on free bodies (..., J, 6), and the
-        share of the forces that is not in balance, shape (..., 1, 1).
+        (..., V, 3) [N], those of contact alone (..., V, 3) [N], forces and torques on free bodies (..., J, 6), the
+        share of the forces that is not in balance, shape (..., 1, 1), forces of joints on the ropes (..., A, 3) [N],
+        and displacements and turns of free bodies, shape (..., J, 6).
     """
     system = touching.system
-    if lanes.ready(system.force) and contact_kernel.available(system.force):
+    if touching.joints is None and contact_kernel.available(system.force):
         pos, tension, force, exerted, wrench, left = _searched(touching, tension, True)[4:]
-        return pos, tension, force, exerted, wrench, left
+        return pos, tension, force, exerted, wrench, left.detach(), wrench[..., :0, :3], wrench
     with torch.no_grad():
-        pos, found, bodies, hard = _searched(touching, tension)
+        pos, found, bodies, hard, tied = _searched(touching, tension)
     firm = touching.firm(tension, hard)
     linear = penalty.maps(touching.touch)
     pos = torch.where(system.free > 0, pos, system.moved)
-    now, _ = touching.newton_step(Unknowns(pos, found * system.scale, bodies), firm, linear, True)
+    before = Unknowns(pos, found * system.scale, bodies, tied * system.scale)
+    now, _ = touching.newton_step(before, firm, linear, True)
     topology, scale = system.lengths.topology, system.scale
     felt = penalty.feel(topology, touching.touch, linear, firm, now.pos - touching.origin, now.bodies, touching.dt)
     exerted = felt.force + touching.feel_pairs(now.pos, firm)[0]
     push = system.residual(now.pos, now.impulse)[1]
+    if touching.joints is not None:
+        push = push + touching.joints.pulls(now.joints)
     with torch.no_grad():
-        still = tree.detach((now.pos, now.impulse, now.bodies))
+        still = tree.detach((now.pos, now.impulse, now.bodies, now.joints))
         _, left = touching.newton_step(Unknowns(*still), firm, tuple(x.detach() for x in linear), True)
     wrench = (touching.touch.resist @ now.bodies.unsqueeze(-1)).squeeze(-1)
-    return now.pos, now.impulse / scale, (push + exerted) / scale, exerted / scale, wrench, left
+    whole, tied = (push + exerted) / scale, now.joints / scale
+    return now.pos, now.impulse / scale, whole, exerted / scale, wrench, left, tied, now.bodies
 
 
 def _searched(touching: Touching, tension: Tensor, whole: bool = False) -> tuple[Tensor, ...]:
@@ -282,12 +344,24 @@ def _searched(touching: Touching, tension: Tensor, whole: bool = False) -> tuple
     parts = [getattr(touching.touch, name) for name in _FIELDS]
     pairs = [] if touching.pairs is None else tree.leaves(touching.pairs)
     law = [*law, touching.dt]
-    operator = torch.ops.torchdlo.engaged_whole if whole else torch.ops.torchdlo.engaged
-    return tuple(operator(inputs, parts, pairs, touching.origin, system.lengths.topology.name, law))
+    if whole:
+        return torch.ops.torchdlo.engaged_whole(
+            inputs, parts, pairs, touching.origin, system.lengths.topology.name, law
+        )
+    tied = [] if touching.joints is None else [getattr(touching.joints, name) for name in joint_points.FIELDS]
+    return tuple(
+        torch.ops.torchdlo.engaged(inputs, parts, pairs, tied, touching.origin, system.lengths.topology.name, law)
+    )
 
 
 def _equations(
-    inputs: list[Tensor], parts: list[Tensor], pairs: list[Tensor], origin: Tensor, topology: str, law: list[float]
+    inputs: list[Tensor],
+    parts: list[Tensor],
+    pairs: list[Tensor],
+    joints: list[Tensor],
+    origin: Tensor,
+    topology: str,
+    law: list[float],
 ) -> tuple[Touching, Tensor]:
     rest, compliance, active, mask, give, hinge, swing, free, tension, vertex, moved, *others, scale = inputs
     lengths = Lengths(parse(topology), rest, compliance, active, mask, give, *law[1:3])
@@ -298,26 +372,99 @@ def _equations(
     if pairs:
         at, real, normal, radius, wanted, mu, *linear = pairs
         between = Pairs(at, real, normal, radius, wanted, mu, tuple(linear))
-    return Touching(system, Touch(*parts), origin, between, law[-1]), tension
+    tied = JointPoints(*joints) if joints else None
+    return Touching(system, Touch(*parts), origin, between, law[-1], tied), tension
 
 
-def _by_kernel(*given) -> list[Tensor]:
-    touching, tension = _equations(*given)
-    others = touching.touch, touching.pairs, touching.origin, touching.dt
-    return contact_kernel.solve(touching.system, tension, *others, TRIES, _solved(tension))
+def _by_kernel(inputs, parts, pairs, origin: Tensor, topology: str, law: list[float]) -> list[Tensor]:
+    return contact_kernel.solve(inputs, parts, pairs, origin, topology, law, TRIES, _solved(origin))
 
 
-def _whole(*given) -> list[Tensor]:
-    return [x.contiguous() for x in _by_kernel(*given)]
+def _whole(*given) -> tuple[Tensor, ...]:
+    return tuple(x.contiguous() for x in _by_kernel(*given))
+
+
+def _derived(
+    inputs: list[Tensor],
+    parts: list[Tensor],
+    pairs: list[Tensor],
+    origin: Tensor,
+    found: list[Tensor],
+    by: list[Tensor],
+    topology: str,
+    law: list[float],
+) -> tuple[Tensor, ...]:
+    call = inputs, parts, pairs, origin, topology, law, TRIES, _solved(origin)
+    return contact_kernel.derive(call, found, by)
+
+
+def _derived_meta(inputs, parts, pairs, origin: Tensor, found: list[Tensor], *others) -> tuple[Tensor, ...]:
+    slots, scenes = found[0].shape[-2], found[3].numel()
+    points, bodies, room = parts[0].shape[-3], found[2].shape[-2], pairs[0].shape[-1] if pairs else 0
+    shapes = (28, slots, scenes), (scenes, points, slots, 18), (scenes, room, 43), (scenes, bodies, 36)
+    return tuple(origin.new_empty(shape) for shape in shapes)
+
+
+def _save(ctx, inputs, output) -> None:
+    inputs, parts, pairs, origin, *ctx.static = inputs
+    ctx.counts = [len(x) for x in (inputs, parts, pairs)]
+    ctx.save_for_backward(*inputs, *parts, *pairs, origin, *output[:4])
+
+
+def _backward(ctx, *by: Tensor):
+    """Return derivatives by the arguments of `engaged_whole`: of those that no derivative is taken by, None."""
+    (*tensors, origin), found = ctx.saved_tensors[:-4], list(ctx.saved_tensors[-4:])
+    groups = []
+    for count in ctx.counts:
+        groups.append(tensors[:count])
+        tensors = tensors[count:]
+    inputs, parts, pairs = groups
+    slots, points, between, bodies = torch.ops.torchdlo.engaged_back(
+        inputs, parts, pairs, origin, found, [x.contiguous() for x in by[4:9]], *ctx.static
+    )
+    batch = found[3].shape[:-2]
+    slots = slots.reshape(*slots.shape[:2], *batch)
+    slots = slots.permute(*range(2, slots.dim()), 1, 0)
+    by_slots = list(slots.split([x.shape[-1] for x in (*inputs, origin)], -1))
+    points = points.reshape(*batch, *points.shape[1:])
+    by_points = list(points.split([x.shape[-1] for x in parts[:-3]], -1))
+    resist = bodies.reshape(*batch, -1, 6, 6)
+    by_pairs: list[Tensor | None] = []
+    if pairs:
+        between = between.reshape(*batch, *between.shape[1:])
+        widths = [x.shape[-1] * (x.shape[-2] if k > 4 else 1) for k, x in enumerate(pairs[1:])]
+        split = between.split(widths, -1)
+        by_pairs = [None, None, *(x if k < 4 else x.unflatten(-1, (3, 3)) for k, x in enumerate(split[1:]))]
+        by_pairs = [None if g is None else g.sum_to_size(x.shape) for g, x in zip(by_pairs, pairs, strict=True)]
+    found_slots = [g.sum_to_size(x.shape) for g, x in zip(by_slots, (*inputs, origin), strict=True)]
+    found_parts = [g.sum_to_size(x.shape) for g, x in zip(by_points, parts, strict=False)]
+    return (
+        [None if k in _MASKS else g for k, g in enumerate(found_slots[:-1])],
+        [None, *found_parts[1:], None, resist.sum_to_size(parts[-2].shape), None],
+        by_pairs,
+        found_slots[-1],
+        None,
+        None,
+    )
+
+
+def _refused(ctx, *by) -> None:
+    """Refuse to differentiate a derivative."""
+    raise RuntimeError("contact in implicit steps has no second derivative; do not ask for create_graph through it")
+
+
+_MASKS = (2, 3, 4)
+"""Of what `LengthSystem.inputs` returns, what no derivative is taken by: masks, and when edges yield."""
 
 
 def _engaged(
-    inputs: list[Tensor], parts: list[Tensor], pairs: list[Tensor], origin: Tensor, topology: str, law: list[float]
+    inputs: list[Tensor], parts: list[Tensor], pairs: list[Tensor], joints: list[Tensor], *law
 ) -> list[Tensor]:
-    """Return positions, tensions, displacements of bodies, and how hard contact was."""
-    if contact_kernel.available(origin):
-        return [x.contiguous() for x in _by_kernel(inputs, parts, pairs, origin, topology, law)[:4]]
-    return _by_tensors(*_equations(inputs, parts, pairs, origin, topology, law))
+    """Return positions, tensions, displacements of bodies, how hard contact was, and forces of joints."""
+    if not joints and contact_kernel.available(inputs[0]):
+        found = [x.contiguous() for x in _by_kernel(inputs, parts, pairs, *law)[:4]]
+        return [*found, found[0].new_zeros(*found[0].shape[:-2], 0, 3)]
+    return _by_tensors(*_equations(inputs, parts, pairs, joints, *law))
 
 
 def _by_tensors(touching: Touching, tension: Tensor) -> list[Tensor]:
@@ -350,39 +497,48 @@ def _by_tensors(touching: Touching, tension: Tensor) -> list[Tensor]:
     # What stays unsolved ends where least was left, not where the last step happened to go.
     lost = open & (least < torch.inf)
     found, chosen = _chosen(lost, best, found), torch.where(lost, kept, chosen)
-    return [x.contiguous() for x in (found.pos, found.impulse / system.scale, found.bodies, chosen)]
+    tied = found.joints / system.scale
+    return [x.contiguous() for x in (found.pos, found.impulse / system.scale, found.bodies, chosen, tied)]
 
 
 def _chosen(condition: Tensor, one: Unknowns, other: Unknowns) -> Unknowns:
-    pairs = zip((one.pos, one.impulse, one.bodies), (other.pos, other.impulse, other.bodies), strict=True)
-    return Unknowns(*(torch.where(condition, a, b) for a, b in pairs))
+    names = ("pos", "impulse", "bodies", "joints")
+    return Unknowns(*(torch.where(condition, getattr(one, name), getattr(other, name)) for name in names))
 
 
 def _engaged_meta(
-    inputs: list[Tensor], parts: list[Tensor], pairs: list[Tensor], origin: Tensor, topology: str, law: list[float]
+    inputs: list[Tensor], parts: list[Tensor], pairs: list[Tensor], joints: list[Tensor], origin: Tensor, topology, law
 ) -> list[Tensor]:
     tension, moved, wanted, of = inputs[8], inputs[10], parts[_FIELDS.index("wanted")], parts[_FIELDS.index("of")]
-    batch = torch.broadcast_shapes(
-        moved.shape[:-2], tension.shape[:-2], wanted.shape[:-3], *(x.shape[:-2] for x in pairs[:1])
-    )
-    like = moved.new_empty
-    v = parse(topology).size
-    return [like(*batch, v, 3), like(*batch, v, 1), like(*batch, of.shape[-1], 6), like(*batch, 1, 1)]
+    shapes = [moved.shape[:-2], tension.shape[:-2], wanted.shape[:-3], *(x.shape[:-2] for x in pairs[:1])]
+    batch = torch.broadcast_shapes(*shapes, *([JointPoints(*joints).batch] if joints else []))
+    like, v, points = moved.new_empty, parse(topology).size, joints[0].shape[0] if joints else 0
+    shapes = (v, 3), (v, 1), (of.shape[-1], 6), (1, 1), (points, 3)
+    return [like(*batch, *shape) for shape in shapes]
 
 
-def _whole_meta(*given) -> list[Tensor]:
-    pos, tension, bodies, hard = _engaged_meta(*given)
+def _whole_meta(inputs, parts, pairs, *others) -> tuple[Tensor, ...]:
+    pos, tension, bodies, hard, _ = _engaged_meta(inputs, parts, pairs, [], *others)
     later = (pos, tension, pos, pos, bodies, hard)
-    return [pos, tension, bodies, hard, *(torch.empty_like(x) for x in later)]
+    return (pos, tension, bodies, hard, *(torch.empty_like(x) for x in later))
 
 
-_ARGUMENTS = "Tensor[] inputs, Tensor[] parts, Tensor[] pairs, Tensor origin, str topology, float[] law"
+_TENSORS = "Tensor[] inputs, Tensor[] parts, Tensor[] pairs"
+_STATIC = "str topology, float[] law"
 _operators = torch.library.Library("torchdlo", "FRAGMENT")
-for _name, _run, _shapes in (("engaged", _engaged, _engaged_meta), ("engaged_whole", _whole, _whole_meta)):
-    _operators.define(f"{_name}({_ARGUMENTS}) -> Tensor[]")
-    for _device in ("CPU", "CUDA"):
-        _operators.impl(_name, _run, _device)
+_operators.define(f"engaged({_TENSORS}, Tensor[] joints, Tensor origin, {_STATIC}) -> Tensor[]")
+_operators.define(f"engaged_whole({_TENSORS}, Tensor origin, {_STATIC}) -> ({', '.join(['Tensor'] * 10)})")
+_operators.define(
+    f"engaged_back({_TENSORS}, Tensor origin, Tensor[] found, Tensor[] by, {_STATIC}) -> ({', '.join(['Tensor'] * 4)})"
+)
+for _device in ("CPU", "CUDA"):
+    _operators.impl("engaged", _engaged, _device)
+for _name, _run, _shapes in (("engaged_whole", _whole, _whole_meta), ("engaged_back", _derived, _derived_meta)):
+    _operators.impl(_name, _run, "CPU")
     _operators.impl(_name, _shapes, "Meta")
+_operators.impl("engaged", _engaged_meta, "Meta")
+torch.library.register_autograd("torchdlo::engaged_whole", _backward, setup_context=_save, lib=_operators)
+torch.library.register_autograd("torchdlo::engaged_back", _refused, lib=_operators)
 
 
 def _pattern(name: str) -> banded.Pattern:

@@ -22,6 +22,7 @@ from torch import Tensor
 from torchdlo.physics import tree
 from torchdlo.physics.constraints.contact_penalty import Pairs, Touch, untouched
 from torchdlo.physics.constraints.edge_lengths import Inertia, Lengths, LengthSystem, balance, project, solve_slots
+from torchdlo.physics.constraints.joint_points import JointForces, JointPoints, project_joined
 from torchdlo.physics.effects import base as effect
 from torchdlo.physics.effects.base import ContactForces, Effect, PredictedMotion, Values
 from torchdlo.physics.integrators import contact_step
@@ -64,6 +65,10 @@ class Settings:
     1/2, whatever T does from step to step."""
     numerical_damping: float = 0.0
     """In "implicit", stiff forces are taken this share of a substep ahead: damps fast modes, first order if not 0."""
+    joint_edges: tuple[int, ...] = ()
+    """Edges of which joints carry both ends."""
+    joint_frames: tuple[int, ...] = ()
+    """Edges whose material frames joints carry."""
 
     @property
     def frames(self) -> bool:
@@ -76,6 +81,25 @@ def _placed(settings: Settings, targets: Targets, pos: Tensor) -> Tensor:
     return put(targets.pos, settings.prescribed_vertices, targets.attachment_weight.get("vertices"), pos)
 
 
+def with_joints(settings: Settings, targets: Targets, director: Tensor) -> tuple[Settings, Targets]:
+    """Return both with the frames that joints carry among those that are prescribed.
+
+    Args:
+        settings: static choices.
+        targets: where held parts are.
+        director: first material directors of the edges that joints carry [1], shape (..., W, 3).
+    """
+    if not settings.joint_frames:
+        return settings, targets
+    edges, weight = settings.prescribed_edges + settings.joint_frames, dict(targets.attachment_weight)
+    batch = torch.broadcast_shapes(director.shape[:-2], targets.director.shape[:-2])
+    both = torch.cat([x.expand(*batch, *x.shape[-2:]) for x in (targets.director, director)], -2)
+    if "edges" in weight:
+        firm = weight["edges"].new_ones(*weight["edges"].shape[:-2], len(settings.joint_frames), 1)
+        weight["edges"] = torch.cat([weight["edges"], firm], -2)
+    return dataclasses.replace(settings, prescribed_edges=edges), Targets(targets.pos, both, weight)
+
+
 def substep(
     settings: Settings,
     params: RodParams,
@@ -85,6 +109,7 @@ def substep(
     first: Tensor,
     predict_free_motion: Callable[[Tensor | float], Any] | None = None,
     material_points: Callable[[Tensor | float], Any] | None = None,
+    joints: Any = None,
 ) -> tuple[RodState, Reaction, tuple[Any, Any, ContactForces]]:
     """Advance the rods by one substep.
 
@@ -98,6 +123,7 @@ def substep(
             shape (..., 1, 1).
         foresee: where rigid bodies would go under an acceleration (..., 1, 3) [m/s^2]; None in a scene without.
         matter: where matter would go; likewise.
+        joints: what is joined, see `coupling.rod_body.joints.Joining`; None in a scene without.
 
     Returns:
         The rods, what held them, and where bodies and matter would go with what is exerted on them.
@@ -109,7 +135,10 @@ def substep(
     kick = _kick(settings, now, loads, first, targets)
     falling = loads.get("acceleration", 0.0)
     body, particles = (None if f is None else f(falling) for f in (predict_free_motion, material_points))
-    pos, tension, push, contact = _answered(settings, now, loads, values, kick, targets, body, particles)
+    twist = None if joints is None else joints.twist(now, loads)
+    others = body if twist is None else body.pushed(twist), particles, joints
+    pos, tension, push, contact = _answered(settings, now, loads, values, kick, targets, others)
+    contact = contact if twist is None else contact.plus(twist)
     held = list(settings.prescribed_vertices)
     force = (kick.vertex * (pos - kick.drift) / kick.scale - push)[..., held, :]
     fields: dict[str, Any] = {"pos": pos, "tension": tension}
@@ -125,11 +154,17 @@ def substep(
     if settings.frames:
         fields["director"], fields["ref_twist"] = rod.advance_frames(topology, params, now, pos)
     moved = tree.replace(state, **fields)
-    couple = force.new_zeros(*force.shape[:-2], len(settings.prescribed_edges), 1)
+    held_edges = len(settings.prescribed_edges)
+    if joints is not None:
+        settings, targets = with_joints(settings, targets, contact.joints.director)
+    couple = force.new_zeros(*force.shape[:-2], held_edges, 1)
     if settings.twist == "dynamic":
         moved, couple = _turn(settings, now, loads, moved, targets, first)
     if settings.twist == "quasistatic":
         moved, couple = settle_twist(settings, params, values, moved, targets)
+    if joints is not None:
+        does = tree.replace(contact.joints, couple=couple[..., held_edges:, :])
+        couple, contact = couple[..., :held_edges, :], tree.replace(contact, joints=does)
     return moved, Reaction(force, couple), (body, particles, contact)
 
 
@@ -187,18 +222,19 @@ def _answered(
     values: dict[str, Values],
     kick: _Kick,
     targets: Targets,
-    bodies: Any = None,
-    material_points: Any = None,
+    others: tuple[Any, Any, Any],
 ) -> tuple[Tensor, Tensor, Tensor, ContactForces]:
     """Return what `_translate` does where effects answer to the motion, and what they exert.
 
-    The motion is foreseen with the last tension, then found. Each effect answers to what the others exert.
+    The motion is foreseen with the last tension, then found. Each effect answers to what the others exert. `others`
+    are where bodies and matter would go, and what is joined, None each where there is none.
     """
+    bodies, material_points, joints = others
     engaged = [e for e in settings.effects if e.engages and settings.integrator == "implicit"]
     reacting = [e for e in settings.effects if e.is_contact and e not in engaged]
     none = kick.force.new_zeros(1, 3)
     total = ContactForces(none, none, none)
-    if not reacting and not engaged:
+    if not reacting and not engaged and joints is None:
         return *_translate(settings, now, loads, kick, targets, now.state.tension), total
     firm, tension = kick.vertex, now.state.tension
     if settings.integrator == "implicit" and "stiffness" in loads:
@@ -206,9 +242,12 @@ def _answered(
     mobility = (kick.scale / firm).expand_as(firm)
     answer = mobility * kick.free
     pull = tension * now.params.rest.edge_mask * now.tangent
-    aimed = kick.drift + answer * (kick.force + pull - now.prev(pull))
-    aimed = _placed(settings, targets, aimed)
-    pushes: dict[str, ContactForces] = {}
+    force, pushes, solved = kick.force + pull - now.prev(pull), dict[str, ContactForces](), "in the solve"
+    if joints is not None:
+        tied = joints.points(now.state.pos, bodies)
+        force = force + tied.pulls(tied.force)
+        pushes[solved] = ContactForces(none, *joints.spread(tied.wrench(tied.force)))
+    aimed = _placed(settings, targets, kick.drift + answer * force)
     for _ in range(max([1, *[e.rounds for e in reacting]])):
         for e in reacting:
             motion = PredictedMotion(aimed - now.state.pos, mobility, answer, bodies, material_points)
@@ -220,15 +259,17 @@ def _answered(
             found = e.solve_contact(now, motion, values[e.name])
             pushes[e.name] = found if isinstance(found, ContactForces) else ContactForces(found, none, none)
         total = ContactForces(none, none, none)
-        for push in pushes.values():
+        for push in (push for name, push in pushes.items() if name != solved):
             total = total.plus(push)
         pushed = dataclasses.replace(kick, force=kick.force + total.force)
-        if engaged:
+        if engaged or joints is not None:
             change = aimed - now.state.pos + answer * total.force
-            motion = PredictedMotion(change, mobility, answer, bodies and bodies.pushed(total), material_points)
+            moved = bodies and bodies.pushed(total)
+            motion = PredictedMotion(change, mobility, answer, moved, material_points)
             touch = [e.engage(now, motion, values[e.name]) for e in engaged]
-            pos, tension, held, push = _translate(settings, now, loads, pushed, targets, tension, touch)
-            pushes["in the solve"] = push
+            joined = None if joints is None else (joints, joints.points(now.state.pos, moved))
+            pos, tension, held, push = _translate(settings, now, loads, pushed, targets, tension, touch, joined)
+            pushes[solved] = push
             total = total.plus(push)
         else:
             pos, tension, held = _translate(settings, now, loads, pushed, targets, tension)
@@ -244,15 +285,18 @@ def _translate(
     targets: Targets,
     tension: Tensor,
     touch: Sequence[Touch | Pairs] = (),
+    joined: tuple[Any, JointPoints] | None = None,
 ) -> tuple[Any, ...]:
     """Return positions after the substep, tensions, whose first guess is given, and the force with them [N].
 
-    With points and pairs of edges that may touch, also return what these exert.
+    With points and pairs of edges that may touch, or points that are joined, also return what these exert.
     """
     topology, dt, state = settings.topology, settings.dt, now.state
     rest, material, free = now.params.rest, now.params.material, kick.free
     fixed = (1 - free) * (1 - following(topology, free)) >= 1
     active = rest.edge_mask * (1 - fixed.to(free.dtype))
+    if settings.joint_edges:
+        active = active * active.new_tensor([[float(k not in settings.joint_edges)] for k in range(topology.size)])
     lightest = torch.minimum(material.mass, following(topology, material.mass)).detach()
     most, least = (1e4, 10.0) if settings.integrator == "implicit" else (0.25, 0.25)
     lengths = Lengths(
@@ -267,14 +311,38 @@ def _translate(
     )
     if settings.integrator == "implicit":
         moved = _placed(settings, targets, kick.drift)
-        return _balance(settings, now, loads, lengths, kick, moved, tension, touch)
+        return _balance(settings, now, loads, lengths, kick, moved, tension, (touch, joined))
     answer = kick.scale / kick.vertex * free
     moved = _placed(settings, targets, kick.drift + kick.scale / kick.vertex * kick.force)
+    if joined is not None:
+        return _joined(settings, lengths, kick, moved, answer, now, joined)
     if not settings.constrained:
         return moved, state.tension, kick.force
     pos, tension = project(lengths, moved, answer, now.tangent, tension, settings.constraint_iterations - 1)
     pull = tension * now.tangent
     return pos, tension, kick.force + pull - now.prev(pull)
+
+
+def _joined(
+    settings: Settings,
+    lengths: Lengths,
+    kick: _Kick,
+    moved: Tensor,
+    answer: Tensor,
+    now: View,
+    joined: tuple[Any, JointPoints],
+) -> tuple[Any, ...]:
+    """Return what `_translate` does for an explicit substep with joints."""
+    joints, points = joined
+    steps, dt, tension = settings.constraint_iterations - 1, settings.dt, now.state.tension
+    if not settings.constrained:
+        lengths = dataclasses.replace(lengths, active=0 * lengths.active)
+    pos, found = project_joined(lengths, moved, answer, now.tangent, tension, points, steps, dt)
+    pull = found.tension * now.tangent
+    force = kick.force + pull - now.prev(pull) + points.pulls(found.force)
+    none, does = force.new_zeros(1, 3), JointForces(found.force, points.directors(found.moved, dt))
+    push = ContactForces(none, *joints.spread(points.wrench(found.force)), joints=does)
+    return pos, found.tension if settings.constrained else tension, force, push
 
 
 def _balance(
@@ -285,7 +353,7 @@ def _balance(
     kick: _Kick,
     moved: Tensor,
     tension: Tensor,
-    touch: Sequence[Touch | Pairs],
+    others: tuple[Sequence[Touch | Pairs], tuple[Any, JointPoints] | None],
 ) -> tuple[Any, ...]:
     """Return what `_translate` does for an implicit substep; arguments as in `constrain.balance`."""
     topology, dt, rest, vertex = settings.topology, settings.dt, now.params.rest, kick.vertex
@@ -306,13 +374,17 @@ def _balance(
     scale = kick.scale.expand_as(now.length[..., :1, :])
     if inertia.turning is not None:  # held vertices do not move freely either
         force = force - inertia.swing(topology, (1 - kick.free) * (moved - kick.drift)) / scale
-    if touch:
+    touch, joined = others
+    if touch or joined is not None:
+        joints, tied = (None, None) if joined is None else joined
+        empty = (now.state.pos,) if tied is None else (now.state.pos, tied.resist, joints.place)
         pairs = next((x for x in touch if isinstance(x, Pairs)), None)
-        points = next((x for x in touch if isinstance(x, Touch)), None) or untouched(now.state.pos)
+        points = next((x for x in touch if isinstance(x, Touch)), None) or untouched(*empty)
         system = LengthSystem(lengths, inertia, moved, kick.free, force, scale, now.tangent, ahead, share)
-        touching = contact_step.Touching(system, points, now.state.pos, pairs, dt)
-        pos, tension, whole, exerted, wrench, left = contact_step.solve_contact_step(touching, tension)
-        return pos, tension, whole, ContactForces(exerted, *points.spread(wrench), unsolved=left)
+        touching = contact_step.Touching(system, points, now.state.pos, pairs, dt, tied)
+        pos, tension, whole, exerted, wrench, left, found, turned = contact_step.solve_contact_step(touching, tension)
+        does = () if tied is None else JointForces(found, tied.directors(turned, dt))
+        return pos, tension, whole, ContactForces(exerted, *points.spread(wrench), unsolved=left, joints=does)
     return balance(
         lengths,
         inertia,

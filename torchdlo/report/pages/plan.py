@@ -95,6 +95,8 @@ def _exchange(each: Mapping[str, Any], pictures: Mapping[str, bytes]) -> list[st
 
 
 def _pretty(each: Mapping[str, Any]) -> str:
+    if each["response"] is None:
+        return "(no answer came)"
     text = each["response"][:_SHOWN]
     try:
         return json.dumps(json.loads(text), indent=1)
