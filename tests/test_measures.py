@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from torchdlo import measures, scene
+from torchdlo.coupling.rod_body.rod_body_effect import RodBody
 from torchdlo.physics import tree
 from torchdlo.physics.effects.elastic import Bend, Stretch, Twist
 from torchdlo.physics.effects.external import Damping, Gravity
@@ -105,3 +106,48 @@ def test_states_are_saved_loaded_and_moved_as_the_page_says() -> None:
     assert all(torch.equal(a, b) for a, b in zip(tree.leaves(state), tree.leaves(again), strict=True))
     single = tree.map(lambda t: t.to("cpu", torch.float32), state)
     assert all(leaf.dtype == torch.float32 for leaf in tree.leaves(single))
+
+
+@pytest.mark.parametrize("how", [{}, {"integrator": "implicit"}], ids=["explicit", "implicit"])
+def test_contact_carries_a_rope_that_lies_on_a_slope(how: dict[str, str]) -> None:
+    # Friction holds it while tan a < mu, so that contact is minus the weight, vertex by vertex.
+    a, mass = math.atan(0.3), 0.02
+    down = torch.tensor([math.cos(a), 0.0, -math.sin(a)], dtype=torch.float64)
+    up = torch.tensor([math.sin(a), 0.0, math.cos(a)], dtype=torch.float64)
+    across = torch.linspace(-0.05, 0.05, 6, dtype=torch.float64)[:, None] * down.new_tensor([0, 1.0, 0])
+    rope = scene.Rope(across + 0.005 * up, radius=0.005, mass=mass, bend=1e-4)
+    plane = scene.RigidBody(
+        "plane", quat=(math.cos(a / 2), 0.0, math.sin(a / 2), 0.0), motion="fixed", mu_s=0.5, mu_k=0.5
+    )
+    made, params, state = scene.make([rope], [Gravity(), Bend(), RodBody()], bodies=[plane], dt=1e-3, substeps=2, **how)
+    control = scene.stationary_control(made, state)
+    with torch.no_grad():
+        for _ in range(60):
+            state = scene.step(made, params, state, control)
+        felt = measures.contact_forces(made, params, state, control)
+    weight = params.rods.material.mass * torch.tensor([0.0, 0.0, -9.81], dtype=torch.float64)
+    torch.testing.assert_close(felt.force, -weight, rtol=0, atol=0.02 * 9.81 * mass / 6)
+    # Implicit steps do not add up what a fixed body bears.
+    borne = felt.force.sum(0) if not how else 0 * felt.force[0]
+    torch.testing.assert_close(felt.body_force[0], -borne, rtol=1e-9, atol=1e-12)
+
+
+def test_contact_changes_the_momentum_of_a_free_body() -> None:
+    x = torch.zeros(5, 3, dtype=torch.float64)
+    x[:, 0] = torch.linspace(-0.05, 0.05, 5, dtype=torch.float64)
+    ball = scene.RigidBody("sphere", 0.02, pos=(0.004, 0.0, 0.0255), vel=(0.0, 0.0, -1.0), mass=0.02)
+    rope = scene.Rope(x, radius=0.005, mass=0.01, bend=1e-4)
+    made, params, before = scene.make([rope], [Bend(), RodBody()], bodies=[ball], dt=1e-3, substeps=2)
+    control = scene.stationary_control(made, before)
+    felt = measures.contact_forces(made, params, before, control)
+    after = scene.step(made, params, before, control)
+    change = 0.02 * (after.bodies.vel - before.bodies.vel)
+    assert felt.force.shape == (5, 3) and felt.body_torque.shape == (1, 3) and float(change[0, 2]) > 1e-3
+    torch.testing.assert_close(1e-3 * felt.body_force, change, rtol=1e-9, atol=1e-12)
+    torch.testing.assert_close(felt.force.sum(0), -felt.body_force[0], rtol=1e-9, atol=1e-12)
+
+
+def test_a_scene_without_contact_has_no_contact_forces() -> None:
+    made, params, state = arc()
+    felt = measures.contact_forces(made, params, state, scene.stationary_control(made, state))
+    assert felt.force.eq(0).all() and felt.force.shape == (N, 3) and felt.body_force.shape == (0, 3)

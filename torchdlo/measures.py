@@ -1,4 +1,4 @@
-"""What a state says of ropes in the quantities of mechanics: curvature, twist, tension, energies.
+"""What a state says of ropes in the quantities of mechanics: curvature, twist, tension, contact, energies.
 
 All are functions of a scene, its parameters and a state, follow their dtype and device, and carry gradients. Slots of
 vertices, edges and hinges are those of the scene's vertex axis; dummies are zero.
@@ -6,15 +6,20 @@ vertices, edges and hinges are those of the scene's vertex axis; dummies are zer
 
 from __future__ import annotations
 
+from typing import Any
+
+import torch
 from torch import Tensor
 
+from torchdlo.physics.effects.base import ContactForces
 from torchdlo.physics.linalg.numerics import safe_norm
 from torchdlo.physics.rod import kinematics
 from torchdlo.physics.rod.topology import preceding
-from torchdlo.scene import Params, Scene, State
+from torchdlo.scene import Control, Params, Scene, State, step, substep_with_contact
 
 __all__ = [
     "bending_energy",
+    "contact_forces",
     "curvature",
     "gravitational_energy",
     "kinetic_energy",
@@ -73,6 +78,35 @@ def tension(scene: Scene, params: Params, state: State) -> Tensor:
     edges = kinematics.edge_vectors(scene.topology, state.rods.pos, rest.edge_mask)
     strain = (safe_norm(edges) / rest.length - 1) * rest.edge_mask
     return params.rods.material.stretch * strain
+
+
+def contact_forces(scene: Scene, params: Params, state: State, control: Control) -> ContactForces:
+    """Return what contact exerts in the step from a state to a control, the mean over its substeps.
+
+    On vertices, by bodies, particles and other parts of ropes (..., V, 3) [N]; and on free bodies, by ropes and
+    particles, as a force (..., K, 3) [N] and a torque about the centre of mass (..., K, 3) [N m]. What fixed and guided
+    bodies bear is added up in explicit steps only, and zero in implicit ones. Forces of contact are found with the
+    motion that they allow, so that they belong to a step and not to a state; the step costs what `scene.step` does.
+    Normal forces and friction are added up. To see what one partner does, leave out the effects of the others. Where
+    there are joints, bodies feel what these exert, too, see `torchdlo.scene.joint_forces`; vertices do not.
+    """
+    felt: list[ContactForces] = []
+
+    def noting(*given: Any) -> State:
+        after, push = substep_with_contact(*given)
+        felt.append(push)
+        return after
+
+    step(scene, params, state, control, advance=noting)
+    parts = zip(*((p.force, p.body_force, p.body_torque) for p in felt), strict=True)
+    force, body_force, body_torque = (torch.stack(torch.broadcast_tensors(*x)).mean(0) for x in parts)
+    batch = torch.broadcast_shapes(state.rods.pos.shape[:-2], force.shape[:-2], body_force.shape[:-2])
+
+    def rows(x: Tensor, count: int) -> Tensor:
+        return x.expand(*batch, count, 3) if count else x.new_zeros(*batch, 0, 3)
+
+    count = len(scene.bodies)
+    return ContactForces(rows(force, state.rods.pos.shape[-2]), rows(body_force, count), rows(body_torque, count))
 
 
 def kinetic_energy(scene: Scene, params: Params, state: State) -> Tensor:

@@ -29,7 +29,7 @@ from torchdlo.coupling.rod_body import joints as joined
 from torchdlo.coupling.rod_body.joints import Joining, JointParams, Joints, JointState, RopeJoint
 from torchdlo.field_docs import with_field_docs
 from torchdlo.physics import tree
-from torchdlo.physics.effects.base import Effect, altered_params, default_values, parameters_of
+from torchdlo.physics.effects.base import ContactForces, Effect, altered_params, default_values, parameters_of
 from torchdlo.physics.execution import tracing
 from torchdlo.physics.execution.gradient_check import GradientCheck, check_gradients
 from torchdlo.physics.execution.replay import alike, rollout
@@ -373,7 +373,14 @@ def stationary_control(scene: Scene, state: State) -> Control:
 
 
 def advance(scene: Scene, params: Params, state: State, start: Control, control: Control, share: Tensor) -> State:
-    """Advance a scene by one substep.
+    """Advance a scene by one substep; arguments as of `substep_with_contact`."""
+    return substep_with_contact(scene, params, state, start, control, share)[0]
+
+
+def substep_with_contact(
+    scene: Scene, params: Params, state: State, start: Control, control: Control, share: Tensor
+) -> tuple[State, ContactForces]:
+    """Advance a scene by one substep; return it with what contact exerted in it.
 
     Args:
         scene: static choices.
@@ -417,7 +424,7 @@ def advance(scene: Scene, params: Params, state: State, start: Control, control:
     if scene.material_points:
         particles, missed = rod_coupling_effect.finish(scene.material_points, stuff, pool, push, settings.dt, missed)
     after = State(rods, state.time + settings.dt, missed, mean, moved, particles, pulls)
-    return laid_out(after) if torch.compiler.is_compiling() else after
+    return (laid_out(after) if torch.compiler.is_compiling() else after), push
 
 
 def step(
