@@ -225,7 +225,8 @@ def _answered(
         pushed = dataclasses.replace(kick, force=kick.force + total.force)
         if engaged:
             change = aimed - now.state.pos + answer * total.force
-            motion = PredictedMotion(change, mobility, answer, bodies and bodies.pushed(total), material_points)
+            pushed_bodies = bodies.pushed(total) if bodies and reacting else bodies
+            motion = PredictedMotion(change, mobility, answer, pushed_bodies, material_points)
             touch = [e.engage(now, motion, values[e.name]) for e in engaged]
             pos, tension, held, push = _translate(settings, now, loads, pushed, targets, tension, touch)
             pushes["in the solve"] = push

@@ -69,7 +69,7 @@ struct Maps {
 
 template <typename T>
 struct Felt {
-  T force[3], gradient[9];
+  T force[3], gradient[9], steep;
 };
 
 template <typename T>
@@ -286,7 +286,7 @@ class Scene {
     const T leave = T(s.law[4]) * std::sqrt(T(s.law[8]) * radius);
     const T gone = std::tanh((along - std::max(wanted, T(0))) / leave), fade = 1 - gone;
     const T force = stiff * shut * fade;
-    const T steep = stiff * (slope * fade + shut * (1 - gone * gone) / leave);
+    const T steep = out.steep = stiff * (slope * fade + shut * (1 - gone * gone) / leave);
     T slip[3], squared = 0;
     for (int c = 0; c < 3; ++c) slip[c] = moved[c] - normal[c] * along, squared += slip[c] * slip[c];
     const T limit = mu * force, little = limit / stiff, tiny = T(1e-9) * radius;
@@ -568,7 +568,14 @@ class Scene {
   struct Acting {
     int64_t pair;
     Felt<T> felt;
+    int64_t row;  // the first of its rows in the matrix
   };
+  int64_t first_row(const int64_t* at) const {
+    int64_t first = n;
+    for (int q = 0; q < 4; ++q)
+      for (int c = 0; c < 3; ++c) first = std::min(first, rank[c * v + at[q]]);
+    return first;
+  }
 
   // Forces at a state and what is left of the equations; with the matrix, if that is asked for.
   T evaluate(const State<T>& now, bool exact, bool matrix) {
@@ -751,7 +758,8 @@ class Scene {
       const T stiff = std::min(firm[at[0]], firm[at[2]]);
       if (!law(p.normal, p.radius, p.wanted, p.mu, stiff, moved, exact, felt)) continue;
       for (int m = 0; m < 4; ++m) back(p.corner[m], felt.force, &between[3 * at[m]], 3);
-      if (matrix) acting.push_back({q, felt});
+      // What changes by less than rounding has no part in the matrix.
+      if (matrix && felt.steep > std::numeric_limits<T>::epsilon() / 4 * stiff) acting.push_back({q, felt, first_row(at)});
     }
   }
 
@@ -809,8 +817,9 @@ class Scene {
 
   // Solves for `step` and `turned` what `load_pos`, `load_length` and `load_body` are to be; or the transposed system.
   void solve(bool transposed) {
-    const int64_t own = 6 * s.bodies, extra = own + 3 * (int64_t)acting.size(), m = 1 + extra, width = 2 * k + 1;
+    const int64_t own = 6 * s.bodies, extra = own + 3 * (int64_t)acting.size(), m = 1 + extra;
     if (transposed) transpose();
+    std::sort(acting.begin(), acting.end(), [](const Acting& a, const Acting& b) { return a.row < b.row; });
     side.assign((n + k) * m, T(0));  // by rank
     for (int64_t i = 0; i < v; ++i) {
       for (int c = 0; c < 3; ++c) side[rank[c * v + i] * m] = load_pos[3 * i + c];
@@ -826,7 +835,24 @@ class Scene {
             side[rank[c * v + at[q]] * m + 1 + own + 3 * a + f] +=
                 transposed ? feeling(acting[a], q, c, f) : given(acting[a], q, c, f);
     }
+    switch (k) {
+      case 8: eliminate<8>(own, m); break;
+      case 16: eliminate<16>(own, m); break;
+      default: eliminate<0>(own, m);
+    }
+    turned.assign(own, T(0));
+    if (extra) border_out(transposed, own, extra, m);
+    for (int64_t u = 0; u < n; ++u) step[u] = side[rank[u] * m];
+  }
+
+  // Solves the banded system for all columns of `side`; K is half its bandwidth, or 0 for any.
+  template <int K>
+  void eliminate(int64_t own, int64_t m) {
+    const int64_t k = K ? K : this->k, width = 2 * k + 1;
+    int64_t used = 1 + own;  // columns that are not 0 yet: pairs stand in the order of their first rows
+    size_t next = 0;
     for (int64_t i = 0; i < n; ++i) {
+      while (next < acting.size() && acting[next].row <= i) ++next, used += 3;
       T* pivot = &band[i * width + k];
       const T inverse = *pivot = 1 / *pivot;
       const T* mine = &side[i * m];
@@ -836,7 +862,7 @@ class Scene {
         if (factor == T(0)) continue;
         for (int64_t u = 1; u <= k; ++u) below[u] -= factor * pivot[u];
         T* theirs = &side[(i + l) * m];
-        for (int64_t j = 0; j < m; ++j) theirs[j] -= factor * mine[j];
+        for (int64_t j = 0; j < used; ++j) theirs[j] -= factor * mine[j];
       }
     }
     for (int64_t i = n - 1; i >= 0; --i) {
@@ -850,9 +876,6 @@ class Scene {
       }
       for (int64_t j = 0; j < m; ++j) mine[j] *= *pivot;
     }
-    turned.assign(own, T(0));
-    if (extra) border_out(transposed, own, extra, m);
-    for (int64_t u = 0; u < n; ++u) step[u] = side[rank[u] * m];
   }
 
   // Takes bodies and pairs out by their Schur complement.
