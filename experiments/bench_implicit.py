@@ -1,9 +1,9 @@
 """What a simulated second with contact costs in implicit and in explicit steps, and how far each is off.
 
-A rope of 60 vertices falls over a fixed cone with friction, in many scenes: the one of `bench_coupled.py` named coiling.
+A rope of 60 vertices falls over a fixed cone with friction, in many scenes: `bench_coupled.py` calls it coiling.
 Implicit steps are of 2 ms, explicit ones the published 1 ms in 5 substeps. Both are recorded, and timed by CPU seconds
-of one thread, the least of some repeats, from a state in contact. Gradients are those of four steps that are not compiled.
-The error is the root mean square distance of vertices from those of 40 explicit substeps per millisecond.
+of one thread, the least of some repeats, from a state in contact. Gradients are those of four steps, not compiled. The
+error is the root mean square distance of vertices from those of 40 explicit substeps per millisecond.
 
 examples:
   python experiments/bench_implicit.py --json implicit.json
@@ -97,9 +97,7 @@ def main() -> int:
     parser = Parser(__file__, description=__doc__)
     parser.add_argument("--scenes", type=count, default=100, help="scenes that are timed (%(default)s)")
     parser.add_argument("--repeats", type=count, default=6, help="of each timing (%(default)s)")
-    parser.add_argument(
-        "--seconds", type=float, default=0.2, help="simulated time at which errors are told (%(default)s)"
-    )
+    parser.add_argument("--seconds", type=float, default=0.2, help="time at which errors are told (%(default)s)")
     parser.add_argument("--json", metavar="FILE", default="", help="file that the results go to")
     parser.flag("smoke", "two scenes, no errors")
     options = parser.parse_args()
