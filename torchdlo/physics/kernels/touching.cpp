@@ -99,6 +99,16 @@ class Scene {
         load_pos(3 * v), load_length(v), load_body(6 * s.bodies), known(s.families * v) {
     for (int64_t i = 0; i < v; ++i) before[s.after[i]] = i;
     for (int64_t j = 0; j < n; ++j) rank[s.order[j]] = j;
+    const auto place = [&](int64_t row, int64_t column) { places.push_back(rank[row] * 2 * k + rank[column] + k); };
+    for (int64_t i = 0; i < v; ++i) {
+      const int64_t next = s.after[i], far = s.after[next], length = 3 * v + i;
+      for (int64_t c = 0; c < 3; ++c) {
+        const int64_t here = c * v + i, there = c * v + next, beyond = c * v + far;
+        place(here, here), place(here, there), place(there, here), place(here, length), place(there, length);
+        place(length, here), place(length, there), place(here, beyond), place(beyond, here);
+      }
+      place(length, length);
+    }
   }
 
   const Slot<T>* slot;
@@ -640,23 +650,24 @@ class Scene {
       const int64_t next = s.after[i], b = before[i], far = s.after[next];
       const bool inside = p.mask > T(0), further = inside && slot[next].mask > T(0);
       const T string = now.impulse[i] * lean[i], own = same[i] + string + now.impulse[b] * lean[b];
-      for (int c = 0; c < 3; ++c) {
-        at(c * v + i, c * v + i) += p.vertex[c] + p.free * own;
+      const int64_t* to = &places[28 * i];
+      for (int c = 0; c < 3; ++c, to += 9) {
+        band[to[0]] += p.vertex[c] + p.free * own;
         if (inside) {
-          at(c * v + i, c * v + next) += p.free * (one[i] - string);
-          at(c * v + next, c * v + i) += slot[next].free * (one[i] - string);
-          at(c * v + i, 3 * v + i) += -p.free * p.active * begin[3 * i + c];
-          at(c * v + next, 3 * v + i) += slot[next].free * p.active * begin[3 * i + c];
-          at(3 * v + i, c * v + i) += -p.active * along[3 * i + c];
-          at(3 * v + i, c * v + next) += p.active * along[3 * i + c];
+          band[to[1]] += p.free * (one[i] - string);
+          band[to[2]] += slot[next].free * (one[i] - string);
+          band[to[3]] -= p.free * p.active * begin[3 * i + c];
+          band[to[4]] += slot[next].free * p.active * begin[3 * i + c];
+          band[to[5]] -= p.active * along[3 * i + c];
+          band[to[6]] += p.active * along[3 * i + c];
         }
         if (further) {
-          at(c * v + i, c * v + far) += p.free * two[i];
-          at(c * v + far, c * v + i) += slot[far].free * two[i];
+          band[to[7]] += p.free * two[i];
+          band[to[8]] += slot[far].free * two[i];
         }
       }
       const T soft = (now.impulse[i] / scale > yielding(i) ? p.give : T(0)) + T(s.law[3]) * p.give;
-      at(3 * v + i, 3 * v + i) += -p.active * (p.compliance + soft) / scale + (p.active - 1);
+      band[*to] += -p.active * (p.compliance + soft) / scale + (p.active - 1);
     }
   }
 
@@ -937,6 +948,7 @@ class Scene {
   const Sizes& s;
   const int64_t v, n, k;
   std::vector<int64_t> before, rank;
+  std::vector<int64_t> places;  // where the entries of `assemble` stand in the band, 28 for each slot
   std::vector<T> y, begin, along, push, pull, turn, resist, touch, between, residual, excess, lean, one, two, same, firm,
       least, wrench, step, band, border, row, corner, side, turned, load_pos, load_length, load_body, other, by_firm,
       by_lean;
@@ -946,11 +958,15 @@ class Scene {
   T scale, share;
 };
 
-template <typename T>
-void gather(T* to, const T* const* in, const Place* places, int64_t count, int64_t slot, int64_t family, int64_t scene) {
-  for (int64_t k = 0; k < count; ++k) {
+// Reads numbers of structs behind each other, in a family and a scene.
+template <typename T, class S>
+void gather(S* to, int64_t count, const T* const* in, const Place* places, int64_t family, int64_t scene) {
+  constexpr int64_t wide = sizeof(S) / sizeof(T);
+  for (int64_t k = 0; k < wide; ++k) {
     const Place& p = places[k];
-    to[k] = in[p.input][p.offset + slot * p.slot + family * p.family + scene * p.scene];
+    const T* from = in[p.input] + p.offset + family * p.family + scene * p.scene;
+    T* at = (T*)to + k;
+    for (int64_t i = 0; i < count; ++i) at[i * wide] = from[i * p.slot];
   }
 }
 
@@ -968,22 +984,24 @@ struct Given {
 
   void read(const T* const* in, const int64_t* at, const Inputs& n, const Sizes& s, int64_t b, Scene<T>& scene) {
     const int64_t v = s.slots;
-    constexpr int64_t S = sizeof(Slot<T>) / sizeof(T), P = sizeof(Point<T>) / sizeof(T), Q = sizeof(Pair<T>) / sizeof(T);
-    for (int64_t i = 0; i < v; ++i) gather((T*)&slots[i], in, n.slots, S, i, 0, b);
-    for (int64_t f = 0; f < s.families; ++f)
-      for (int64_t i = 0; i < v; ++i) {
-        Point<T>& p = points[f * v + i];
-        gather((T*)&p, in, n.points, 1, i, f, b);
-        if (p.real > T(0)) gather((T*)&p, in, n.points, P, i, f, b);
-      }
+    gather(slots.data(), v, in, n.slots, 0, b);
+    for (int64_t f = 0; f < s.families; ++f) gather(&points[f * v], v, in, n.points, f, b);
+    const Place& real = n.pairs[0];
     for (int64_t q = 0; q < s.pairs; ++q) {
-      gather((T*)&pairs[q], in, n.pairs, 1, q, 0, b);
+      pairs[q].real = in[real.input][real.offset + q * real.slot + b * real.scene];
       if (!(pairs[q].real > T(0))) continue;
-      gather((T*)&pairs[q], in, n.pairs, Q, q, 0, b);
+      for (int64_t k = 1; k < int64_t(sizeof(Pair<T>) / sizeof(T)); ++k) {
+        const Place& p = n.pairs[k];
+        ((T*)&pairs[q])[k] = in[p.input][p.offset + q * p.slot + b * p.scene];
+      }
       for (int m = 0; m < 4; ++m)
         corners[4 * q + m] = at[n.corner[0] + m * n.corner[1] + q * n.corner[2] + b * n.corner[3]] / n.scenes;
     }
-    for (int64_t j = 0; j < s.bodies; ++j) gather(&inertia[36 * j], in, n.bodies, 36, j, 0, b);
+    for (int64_t j = 0; j < s.bodies; ++j)
+      for (int64_t k = 0; k < 36; ++k) {
+        const Place& p = n.bodies[k];
+        inertia[36 * j + k] = in[p.input][p.offset + j * p.slot + b * p.scene];
+      }
     scene.slot = slots.data(), scene.points = points.data(), scene.pairs = pairs.data();
     scene.corners = corners.data(), scene.inertia = inertia.data();
   }
