@@ -25,6 +25,7 @@ SCRIPTS = [
     "bench_render.py",
     "bench_coupled.py",
     "bench_gpu.py",
+    "bench_implicit.py",
     "bench_env.py",
     "bench_rod.py",
     "draw_tasks.py",

@@ -117,6 +117,8 @@ class PredictedBodyMotion:
 
     def turned(self, torque: Tensor) -> Tensor:
         """Return by how much torques in the world turn the bodies [rad], shape (..., K, 3)."""
+        if all(b.motion != "free" for b in self.bodies):
+            return torch.zeros_like(torque)
         columns = axes(self.state.quat)
         inside = local(columns, torque.split(1, -1))
         return torch.cat(

@@ -95,6 +95,13 @@ def pack_components(parts: Sequence[Tensor], batch: torch.Size, count: int) -> l
     return [x.reshape(x.shape[0], count, batch.numel()).contiguous() for x in wide]
 
 
+def join_components(parts: Sequence[Tensor], batch: torch.Size, count: int) -> Tensor:
+    """Return tensors (..., n or 1, C) as one, (C in all, n, B)."""
+    n = len(batch) + 2
+    joined = torch.cat([x.expand(*batch, count, x.shape[-1]).permute(n - 1, n - 2, *range(n - 2)) for x in parts])
+    return joined.reshape(joined.shape[0], count, batch.numel())
+
+
 def unpack_components(x: Tensor, batch: Sequence[int]) -> Tensor:
     """Return (C, n, B) as (..., n, C)."""
     x = x.reshape(*x.shape[:2], *batch)
@@ -112,6 +119,9 @@ def shape_sizes(motion: PredictedBodyMotion) -> tuple[Tensor, list[Tensor]]:
     The size of a ring ends in cosine and sine of half its arc.
     """
     size = motion.params.size
+    if all(b.shape != "ring" for b in motion.bodies):
+        none = torch.zeros_like(size[..., 2:])
+        return none, [size, none]
     ring = size.new_tensor([[float(b.shape == "ring")] for b in motion.bodies]) > 0
     third, none = size[..., 2:], torch.zeros_like(size[..., 2:])
     third, fourth = torch.where(ring, torch.cos(0.5 * third), third), torch.where(ring, torch.sin(0.5 * third), none)

@@ -127,7 +127,7 @@ def find_touches(
     solids = [state.pos, *itertools.chain(*axes(state.quat)), offset, *numbers, *moves, *laws]
     batch = torch.broadcast_shapes(*(x.shape[:-2] for x in (*edges, *vertices, *solids)))
     inputs = (
-        scene_packing.pack_components(x, batch, n)
+        [scene_packing.join_components(x, batch, n)]
         for x, n in ((edges, size), (vertices, size), (solids, len(bodies.bodies)))
     )
     found = torch.ops.torchdlo.body_touch(

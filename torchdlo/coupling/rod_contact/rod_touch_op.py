@@ -107,7 +107,7 @@ def find_touches(
     )
     places = at.permute(at.dim() - 2, at.dim() - 1, *range(at.dim() - 2)).reshape(4, count, batch.numel()).contiguous()
     rule = [*law, coulomb_friction.FASTEST, view.dt]
-    packed = scene_packing.pack_components(vertices, batch, size)
+    packed = [scene_packing.join_components(vertices, batch, size)]
     found = torch.ops.torchdlo.rod_touch(packed, laws, places, real[0], friction, rule)
     there, normal, radius, wanted, mu, *linear = found.reshape(*batch, *found.shape[1:]).split(_FIELDS, -1)
     return Pairs(at, there.detach(), normal, radius, wanted, mu, tuple(m.unflatten(-1, (3, 3)) for m in linear))

@@ -258,9 +258,8 @@ def _answered(
             motion = PredictedMotion(aimed - now.state.pos, mobility, answer, bodies, material_points)
             for other in (push for name, push in pushes.items() if name != e.name):
                 change = motion.change + answer * other.force
-                motion = PredictedMotion(
-                    change, mobility, answer, bodies and motion.bodies.pushed(other), material_points
-                )
+                there = bodies and motion.bodies.pushed(other)
+                motion = PredictedMotion(change, mobility, answer, there, material_points)
             found = e.solve_contact(now, motion, values[e.name])
             pushes[e.name] = found if isinstance(found, ContactForces) else ContactForces(found, none, none)
         total = ContactForces(none, none, none)
@@ -269,7 +268,8 @@ def _answered(
         pushed = dataclasses.replace(kick, force=kick.force + total.force)
         if engaged or joints is not None:
             change = aimed - now.state.pos + answer * total.force
-            seen = PredictedMotion(change, mobility, answer, bodies and bodies.pushed(total), material_points)
+            there = bodies.pushed(total) if bodies and reacting else bodies
+            seen = PredictedMotion(change, mobility, answer, there, material_points)
 
             def solve(motion: PredictedMotion, kick: _Kick, tension: Tensor) -> tuple[Any, ...]:
                 touch = [e.engage(now, motion, values[e.name]) for e in engaged]

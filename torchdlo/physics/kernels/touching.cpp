@@ -69,7 +69,7 @@ struct Maps {
 
 template <typename T>
 struct Felt {
-  T force[3], gradient[9];
+  T force[3], gradient[9], steep;
 };
 
 template <typename T>
@@ -99,6 +99,16 @@ class Scene {
         load_pos(3 * v), load_length(v), load_body(6 * s.bodies), known(s.families * v) {
     for (int64_t i = 0; i < v; ++i) before[s.after[i]] = i;
     for (int64_t j = 0; j < n; ++j) rank[s.order[j]] = j;
+    const auto place = [&](int64_t row, int64_t column) { places.push_back(rank[row] * 2 * k + rank[column] + k); };
+    for (int64_t i = 0; i < v; ++i) {
+      const int64_t next = s.after[i], far = s.after[next], length = 3 * v + i;
+      for (int64_t c = 0; c < 3; ++c) {
+        const int64_t here = c * v + i, there = c * v + next, beyond = c * v + far;
+        place(here, here), place(here, there), place(there, here), place(here, length), place(there, length);
+        place(length, here), place(length, there), place(here, beyond), place(beyond, here);
+      }
+      place(length, length);
+    }
   }
 
   const Slot<T>* slot;
@@ -286,7 +296,7 @@ class Scene {
     const T leave = T(s.law[4]) * std::sqrt(T(s.law[8]) * radius);
     const T gone = std::tanh((along - std::max(wanted, T(0))) / leave), fade = 1 - gone;
     const T force = stiff * shut * fade;
-    const T steep = stiff * (slope * fade + shut * (1 - gone * gone) / leave);
+    const T steep = out.steep = stiff * (slope * fade + shut * (1 - gone * gone) / leave);
     T slip[3], squared = 0;
     for (int c = 0; c < 3; ++c) slip[c] = moved[c] - normal[c] * along, squared += slip[c] * slip[c];
     const T limit = mu * force, little = limit / stiff, tiny = T(1e-9) * radius;
@@ -568,7 +578,14 @@ class Scene {
   struct Acting {
     int64_t pair;
     Felt<T> felt;
+    int64_t row;  // the first of its rows in the matrix
   };
+  int64_t first_row(const int64_t* at) const {
+    int64_t first = n;
+    for (int q = 0; q < 4; ++q)
+      for (int c = 0; c < 3; ++c) first = std::min(first, rank[c * v + at[q]]);
+    return first;
+  }
 
   // Forces at a state and what is left of the equations; with the matrix, if that is asked for.
   T evaluate(const State<T>& now, bool exact, bool matrix) {
@@ -633,23 +650,24 @@ class Scene {
       const int64_t next = s.after[i], b = before[i], far = s.after[next];
       const bool inside = p.mask > T(0), further = inside && slot[next].mask > T(0);
       const T string = now.impulse[i] * lean[i], own = same[i] + string + now.impulse[b] * lean[b];
-      for (int c = 0; c < 3; ++c) {
-        at(c * v + i, c * v + i) += p.vertex[c] + p.free * own;
+      const int64_t* to = &places[28 * i];
+      for (int c = 0; c < 3; ++c, to += 9) {
+        band[to[0]] += p.vertex[c] + p.free * own;
         if (inside) {
-          at(c * v + i, c * v + next) += p.free * (one[i] - string);
-          at(c * v + next, c * v + i) += slot[next].free * (one[i] - string);
-          at(c * v + i, 3 * v + i) += -p.free * p.active * begin[3 * i + c];
-          at(c * v + next, 3 * v + i) += slot[next].free * p.active * begin[3 * i + c];
-          at(3 * v + i, c * v + i) += -p.active * along[3 * i + c];
-          at(3 * v + i, c * v + next) += p.active * along[3 * i + c];
+          band[to[1]] += p.free * (one[i] - string);
+          band[to[2]] += slot[next].free * (one[i] - string);
+          band[to[3]] -= p.free * p.active * begin[3 * i + c];
+          band[to[4]] += slot[next].free * p.active * begin[3 * i + c];
+          band[to[5]] -= p.active * along[3 * i + c];
+          band[to[6]] += p.active * along[3 * i + c];
         }
         if (further) {
-          at(c * v + i, c * v + far) += p.free * two[i];
-          at(c * v + far, c * v + i) += slot[far].free * two[i];
+          band[to[7]] += p.free * two[i];
+          band[to[8]] += slot[far].free * two[i];
         }
       }
       const T soft = (now.impulse[i] / scale > yielding(i) ? p.give : T(0)) + T(s.law[3]) * p.give;
-      at(3 * v + i, 3 * v + i) += -p.active * (p.compliance + soft) / scale + (p.active - 1);
+      band[*to] += -p.active * (p.compliance + soft) / scale + (p.active - 1);
     }
   }
 
@@ -751,7 +769,8 @@ class Scene {
       const T stiff = std::min(firm[at[0]], firm[at[2]]);
       if (!law(p.normal, p.radius, p.wanted, p.mu, stiff, moved, exact, felt)) continue;
       for (int m = 0; m < 4; ++m) back(p.corner[m], felt.force, &between[3 * at[m]], 3);
-      if (matrix) acting.push_back({q, felt});
+      // What changes by less than rounding has no part in the matrix.
+      if (matrix && felt.steep > std::numeric_limits<T>::epsilon() / 4 * stiff) acting.push_back({q, felt, first_row(at)});
     }
   }
 
@@ -809,8 +828,9 @@ class Scene {
 
   // Solves for `step` and `turned` what `load_pos`, `load_length` and `load_body` are to be; or the transposed system.
   void solve(bool transposed) {
-    const int64_t own = 6 * s.bodies, extra = own + 3 * (int64_t)acting.size(), m = 1 + extra, width = 2 * k + 1;
+    const int64_t own = 6 * s.bodies, extra = own + 3 * (int64_t)acting.size(), m = 1 + extra;
     if (transposed) transpose();
+    std::sort(acting.begin(), acting.end(), [](const Acting& a, const Acting& b) { return a.row < b.row; });
     side.assign((n + k) * m, T(0));  // by rank
     for (int64_t i = 0; i < v; ++i) {
       for (int c = 0; c < 3; ++c) side[rank[c * v + i] * m] = load_pos[3 * i + c];
@@ -826,7 +846,24 @@ class Scene {
             side[rank[c * v + at[q]] * m + 1 + own + 3 * a + f] +=
                 transposed ? feeling(acting[a], q, c, f) : given(acting[a], q, c, f);
     }
+    switch (k) {
+      case 8: eliminate<8>(own, m); break;
+      case 16: eliminate<16>(own, m); break;
+      default: eliminate<0>(own, m);
+    }
+    turned.assign(own, T(0));
+    if (extra) border_out(transposed, own, extra, m);
+    for (int64_t u = 0; u < n; ++u) step[u] = side[rank[u] * m];
+  }
+
+  // Solves the banded system for all columns of `side`; K is half its bandwidth, or 0 for any.
+  template <int K>
+  void eliminate(int64_t own, int64_t m) {
+    const int64_t k = K ? K : this->k, width = 2 * k + 1;
+    int64_t used = 1 + own;  // columns that are not 0 yet: pairs stand in the order of their first rows
+    size_t next = 0;
     for (int64_t i = 0; i < n; ++i) {
+      while (next < acting.size() && acting[next].row <= i) ++next, used += 3;
       T* pivot = &band[i * width + k];
       const T inverse = *pivot = 1 / *pivot;
       const T* mine = &side[i * m];
@@ -836,7 +873,7 @@ class Scene {
         if (factor == T(0)) continue;
         for (int64_t u = 1; u <= k; ++u) below[u] -= factor * pivot[u];
         T* theirs = &side[(i + l) * m];
-        for (int64_t j = 0; j < m; ++j) theirs[j] -= factor * mine[j];
+        for (int64_t j = 0; j < used; ++j) theirs[j] -= factor * mine[j];
       }
     }
     for (int64_t i = n - 1; i >= 0; --i) {
@@ -850,9 +887,6 @@ class Scene {
       }
       for (int64_t j = 0; j < m; ++j) mine[j] *= *pivot;
     }
-    turned.assign(own, T(0));
-    if (extra) border_out(transposed, own, extra, m);
-    for (int64_t u = 0; u < n; ++u) step[u] = side[rank[u] * m];
   }
 
   // Takes bodies and pairs out by their Schur complement.
@@ -914,6 +948,7 @@ class Scene {
   const Sizes& s;
   const int64_t v, n, k;
   std::vector<int64_t> before, rank;
+  std::vector<int64_t> places;  // where the entries of `assemble` stand in the band, 28 for each slot
   std::vector<T> y, begin, along, push, pull, turn, resist, touch, between, residual, excess, lean, one, two, same, firm,
       least, wrench, step, band, border, row, corner, side, turned, load_pos, load_length, load_body, other, by_firm,
       by_lean;
@@ -923,11 +958,15 @@ class Scene {
   T scale, share;
 };
 
-template <typename T>
-void gather(T* to, const T* const* in, const Place* places, int64_t count, int64_t slot, int64_t family, int64_t scene) {
-  for (int64_t k = 0; k < count; ++k) {
+// Reads numbers of structs behind each other, in a family and a scene.
+template <typename T, class S>
+void gather(S* to, int64_t count, const T* const* in, const Place* places, int64_t family, int64_t scene) {
+  constexpr int64_t wide = sizeof(S) / sizeof(T);
+  for (int64_t k = 0; k < wide; ++k) {
     const Place& p = places[k];
-    to[k] = in[p.input][p.offset + slot * p.slot + family * p.family + scene * p.scene];
+    const T* from = in[p.input] + p.offset + family * p.family + scene * p.scene;
+    T* at = (T*)to + k;
+    for (int64_t i = 0; i < count; ++i) at[i * wide] = from[i * p.slot];
   }
 }
 
@@ -945,22 +984,24 @@ struct Given {
 
   void read(const T* const* in, const int64_t* at, const Inputs& n, const Sizes& s, int64_t b, Scene<T>& scene) {
     const int64_t v = s.slots;
-    constexpr int64_t S = sizeof(Slot<T>) / sizeof(T), P = sizeof(Point<T>) / sizeof(T), Q = sizeof(Pair<T>) / sizeof(T);
-    for (int64_t i = 0; i < v; ++i) gather((T*)&slots[i], in, n.slots, S, i, 0, b);
-    for (int64_t f = 0; f < s.families; ++f)
-      for (int64_t i = 0; i < v; ++i) {
-        Point<T>& p = points[f * v + i];
-        gather((T*)&p, in, n.points, 1, i, f, b);
-        if (p.real > T(0)) gather((T*)&p, in, n.points, P, i, f, b);
-      }
+    gather(slots.data(), v, in, n.slots, 0, b);
+    for (int64_t f = 0; f < s.families; ++f) gather(&points[f * v], v, in, n.points, f, b);
+    const Place& real = n.pairs[0];
     for (int64_t q = 0; q < s.pairs; ++q) {
-      gather((T*)&pairs[q], in, n.pairs, 1, q, 0, b);
+      pairs[q].real = in[real.input][real.offset + q * real.slot + b * real.scene];
       if (!(pairs[q].real > T(0))) continue;
-      gather((T*)&pairs[q], in, n.pairs, Q, q, 0, b);
+      for (int64_t k = 1; k < int64_t(sizeof(Pair<T>) / sizeof(T)); ++k) {
+        const Place& p = n.pairs[k];
+        ((T*)&pairs[q])[k] = in[p.input][p.offset + q * p.slot + b * p.scene];
+      }
       for (int m = 0; m < 4; ++m)
         corners[4 * q + m] = at[n.corner[0] + m * n.corner[1] + q * n.corner[2] + b * n.corner[3]] / n.scenes;
     }
-    for (int64_t j = 0; j < s.bodies; ++j) gather(&inertia[36 * j], in, n.bodies, 36, j, 0, b);
+    for (int64_t j = 0; j < s.bodies; ++j)
+      for (int64_t k = 0; k < 36; ++k) {
+        const Place& p = n.bodies[k];
+        inertia[36 * j + k] = in[p.input][p.offset + j * p.slot + b * p.scene];
+      }
     scene.slot = slots.data(), scene.points = points.data(), scene.pairs = pairs.data();
     scene.corners = corners.data(), scene.inertia = inertia.data();
   }
