@@ -316,6 +316,14 @@ def test_a_model_file_is_a_rope_of_a_scene(modelled):
         scene_files.build(change(said, ropes=(rope, LINE)), folder=folder)
 
 
+@pytest.mark.parametrize("effect", ["rest_curvature", "bending_plasticity", "anisotropic_bending"])
+def test_effects_of_a_model_that_need_frames_get_them(modelled, effect):
+    rope = RopeSpec(((0.0, 0.0, 0.5), (0.5, 0.0, 0.5), (0.5, 0.5, 0.5)), model="model.json")
+    said = SceneDescription((rope,), {}, attachments=(Attachment((0,)),), duration=0.02, integrator="implicit")
+    scene, *_ = scene_files.build(said, folder=modelled(effects=(effect,)))
+    assert {type(e).__name__ for e in scene.effects} >= {"BendFrame"} and effect in {e.name for e in scene.effects}
+
+
 @pytest.mark.parametrize("spoil", [lambda s: s * 20_000, lambda s: s[::-1], lambda s: s[:1]])
 def test_a_mesh_of_a_model_rises_and_has_an_end(modelled, spoil):
     folder = modelled()

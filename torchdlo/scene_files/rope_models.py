@@ -14,6 +14,7 @@ from torch import Tensor
 from torchdlo.envs.assets.rope_material import RopeMaterial
 from torchdlo.errors import InputError
 from torchdlo.physics import tree
+from torchdlo.physics.effects import EFFECTS
 from torchdlo.physics.effects.parameter_name import ParameterName
 from torchdlo.physics.rod.assembly import frame_curvature
 from torchdlo.physics.rod.topology import Topology
@@ -22,7 +23,7 @@ from torchdlo.untrusted import read_entry
 
 __all__ = ["Modelled", "cable", "with_models"]
 
-_OF_RECORDINGS = ("time_delay", "marker_offset", "gripper_compliance")
+_OF_RECORDINGS = tuple(name for name, effect in EFFECTS.items() if effect.kind in ("measurement", "boundary"))
 """Effects of how a rope was measured and clamped, which are not its own."""
 _SAME = 0.01
 """Share by which the drawn line may differ in length from the calibrated rope."""
@@ -175,7 +176,7 @@ def _effects(d: SceneDescription, model: Any, rope: dict[str, Any], *, framed: b
     """Return the model's effects with those of the scene put over them."""
     found: dict[str, dict[str, Any]] = {
         "gravity": {"acceleration": rope["gravity"]},
-        "bend_frame" if framed or "anisotropic_bending" in model.effects else "bend": {},
+        "bend_frame" if framed or any(EFFECTS[name].frame_bending for name in model.effects) else "bend": {},
         "twist": {},
         "damping": {"rate": model.values["damping_rate"]},
     }
