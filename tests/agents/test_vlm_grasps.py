@@ -25,6 +25,7 @@ from torchdlo.agents.vlm.grasp_proposal import (
 )
 from torchdlo.agents.vlm.plan_schema import MODES
 from torchdlo.cli import app
+from torchdlo.cli import tasks as commands
 from torchdlo.errors import InputError
 
 
@@ -193,6 +194,16 @@ def test_texts_from_a_scene_do_not_end_the_data(places: Places) -> None:
     propose_grasps(Odd(), "candidate", Conversation(model), view, places=dataclasses.replace(places, task=Odd()))
     text = model.heard[0][1]["text"]
     assert text.count("</data>") == 1 and text.count("<data>") == 1
+
+
+def test_proposals_for_own_tasks_are_taken_back_by_their_names(tmp_path: Path) -> None:
+    own = tmp_path / "own.py"
+    own.write_text("from torchdlo.envs.tasks.lifting import Lifting\n\n\nclass Mine(Lifting):\n    name = 'mine'\n")
+    file = tmp_path / "proposal.json"
+    file.write_text(json.dumps({"task": "mine", "grasps": [4, 25]}))
+    assert commands._judged(f"{own}:Mine", file, None) == {"grasps": (4, 25)}
+    with pytest.raises(InputError, match="its grasps are for mine; give grasps for lifting"):
+        commands._judged("lifting", file, None)
 
 
 def run(*arguments: object) -> int:
