@@ -162,8 +162,7 @@ def _train(
         with progress() as show, deferred_interrupt(show) as callback:
             found = loop(trainer, played, settings, folder=out, resume=resume, callback=callback)
     finally:
-        if settings.collectors:
-            played.close()
+        played.close()
     result = train_json(task, settings, found)
     write_atomically(out / "result.json", result)
     if found.rows:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -18,6 +19,7 @@ from torchdlo.envs.core import episode
 from torchdlo.envs.observations.pixels import camera_rig, placed
 from torchdlo.errors import InputError
 from torchdlo.files import replace_atomically
+from torchdlo.physics import tree
 from torchdlo.untrusted.array_file import read_arrays
 from torchdlo.vision import renderer
 from torchdlo.vision.look import draw_look
@@ -66,7 +68,8 @@ def play_scenes(job: tuple[str, str, int, Path]) -> int:
         for own, x in zip(rows.values(), (*found, target), strict=True):
             own.append(x.float())
     with replace_atomically(scene_file(folder, name, number)) as file, open(file, "wb") as stream:
-        np.savez(stream, **{key: torch.stack(x).numpy() for key, x in rows.items() if x})
+        kept: dict[str, Any] = {key: torch.stack(x).numpy() for key, x in rows.items() if x}
+        np.savez(stream, **kept)
     return len(rows["target"])
 
 
@@ -102,10 +105,10 @@ class SceneDemonstrations:
         things = renderer.Placement(own["pos"], own["turn"], own["ropes"], own["particles"])
         view = renderer.Pinhole(self.intrinsics.expand(len(which), -1, 3, 3), own["rotation"], own["shift"])
         drawn = [draw_look(torch.Generator().manual_seed(int(x)), strength=painter.jitter) for x in looks]
-        quality = {"samples": painter.samples, "shadow": painter.shadow}
+        quality: dict[str, Any] = {"samples": painter.samples, "shadow": painter.shadow}
         seen = renderer.render(self.model, things, view, (size, size), looks=drawn, **quality).rgb
         found = np.zeros((len(which), len(CAMERAS), 3, size, size), np.uint8)
-        found[:, [CAMERAS.index(name) for name in self.cameras]] = seen.movedim(-1, 2).numpy()
+        found[:, [CAMERAS.index(name) for name in self.cameras]] = tree.part(seen).movedim(-1, 2).numpy()
         return found
 
 

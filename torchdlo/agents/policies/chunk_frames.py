@@ -75,7 +75,8 @@ class SetFrames:
     @property
     def size(self) -> int:
         """Width of pictures [px]."""
-        return next(iter(self.pictures.values())).shape[-1]
+        pictures: list[Any] = list(self.pictures.values())
+        return int(pictures[0].shape[-1])
 
     @property
     def cameras(self) -> tuple[str, ...]:

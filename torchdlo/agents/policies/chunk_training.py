@@ -78,12 +78,21 @@ class Training:
 class Source(Protocol):
     """What is learned from."""
 
-    seen: int
-    """Pictures of an epoch."""
-    arms: int
-    size: int
-    """Width of pictures [px]."""
-    cameras: tuple[str, ...]
+    @property
+    def seen(self) -> int:
+        """Pictures of an epoch."""
+
+    @property
+    def arms(self) -> int:
+        """Arms of the widest task."""
+
+    @property
+    def size(self) -> int:
+        """Width of pictures [px]."""
+
+    @property
+    def cameras(self) -> tuple[str, ...]:
+        """Their names."""
 
     def statistics(self) -> dict[str, tuple[Tensor, Tensor]]:
         """Return means and deviations of targets, and of states if there are any."""

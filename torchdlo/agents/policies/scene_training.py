@@ -86,8 +86,16 @@ class SceneTraining:
 
     def demonstrations(self, seed: int) -> list[SceneDemonstrations]:
         """Return the demonstrations of all tasks."""
-        choice = {"size": self.size, "batches": self.batches, "held_out": self.held_out, "fidelity": self.fidelity}
-        return [load_scenes(self.folder, name, seed=seed, **choice) for name in self.tasks]
+        load = functools.partial(
+            load_scenes,
+            self.folder,
+            size=self.size,
+            batches=self.batches,
+            seed=seed,
+            held_out=self.held_out,
+            fidelity=self.fidelity,
+        )
+        return [load(name) for name in self.tasks]
 
     @property
     def groups(self) -> int:
@@ -129,7 +137,7 @@ def paint_group(tasks: Sequence[SceneDemonstrations], shares: Sequence[float], k
     which, when = rng.integers(0, demos - tasks[k].held_out, GROUP), rng.integers(0, length, GROUP)
     if find(tasks[k].name).counterpart:
         when = np.where(rng.random(GROUP) < 0.5, rng.integers(0, min(FIRST, length), GROUP), when)
-    drawn = tasks[k].drawn(which, when, rng.integers(0, 1 << 60, GROUP), size)
+    drawn = tasks[k].drawn(which, when, rng.integers(0, 1 << 60, GROUP).tolist(), size)
     return drawn, np.stack([np.full(GROUP, k), which, when], 1)
 
 
@@ -146,7 +154,7 @@ def _paint(folder: Path, about: SceneTraining, seed: int, own: int) -> None:
 
 
 @contextmanager
-def _painters(folder: Path, about: SceneTraining, seed: int) -> Iterator[list[BaseProcess]]:
+def _painters(folder: Path, about: SceneTraining, seed: int) -> Iterator[Sequence[BaseProcess]]:
     """Let processes draw while the block runs."""
     # Forked ones would share a GPU that was begun with.
     context = multiprocessing.get_context("spawn")
@@ -166,7 +174,7 @@ def _painters(folder: Path, about: SceneTraining, seed: int) -> Iterator[list[Ba
 class ScenePictures:
     """Pictures that are being drawn, and what belongs to them: a `chunk_training.Source`."""
 
-    cameras = CAMERAS
+    cameras: tuple[str, ...] = CAMERAS
 
     def __init__(
         self, tasks: Sequence[SceneDemonstrations], about: SceneTraining, training: Training, album: _Album
@@ -255,7 +263,9 @@ class ScenePictures:
                 demos, length = task.target.shape[:2]
                 which = rng.integers(demos - task.held_out, demos, JUDGED)
                 when = FOLLOWED * rng.integers(0, -(-length // FOLLOWED), JUDGED)
-                pictures.append(torch.from_numpy(task.drawn(which, when, rng.integers(0, 1 << 60, JUDGED), self.size)))
+                pictures.append(
+                    torch.from_numpy(task.drawn(which, when, rng.integers(0, 1 << 60, JUDGED).tolist(), self.size))
+                )
                 labels.append(torch.from_numpy(np.stack([np.full(JUDGED, k), which, when], 1)))
             self._judged = torch.cat(pictures).to(self.device), torch.cat(labels).to(self.device)
         return self._judged
