@@ -166,6 +166,10 @@ def test_the_script_plays_and_learns(folder: Path, tmp_path: Path, monkeypatch, 
     policy, found = load_policy(tmp_path / "policy.pt")
     assert found["tasks"] == list(TASKS) and policy.shape.arms == 2 and policy.shape.cameras == kept.CAMERAS
     assert "of 16" not in capsys.readouterr().out  # what was played is there
+    # One task of one arm can go on from a policy of two.
+    more = [*words, "--tasks", "short", "--from", str(tmp_path / "policy.pt"), "--out", str(tmp_path / "more.pt")]
+    script.main(more)
+    assert load_policy(tmp_path / "more.pt")[0].shape == policy.shape
     with pytest.raises(SystemExit, match="there is no checkpoint to resume"):
         script.main([*words, "--resume", "--out", str(tmp_path / "other.pt")])
     with pytest.raises(InputError, match="demonstrations of short succeeded, and 90 are held out; play more of them"):

@@ -16,7 +16,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any
@@ -30,7 +30,7 @@ from torchdlo.agents.data import sentences
 from torchdlo.agents.data.demonstration_scenes import CAMERAS, SceneDemonstrations, load_scenes
 from torchdlo.agents.policies import language
 from torchdlo.agents.policies.chunk_frames import LEAST, Shown
-from torchdlo.agents.policies.chunk_policy import ChunkPolicy
+from torchdlo.agents.policies.chunk_policy import ChunkPolicy, load_policy
 from torchdlo.agents.policies.chunk_training import Callback, ChunkRun, Training, chosen_encoder, run_training
 from torchdlo.envs import find
 from torchdlo.errors import InputError
@@ -77,6 +77,8 @@ class SceneTraining:
     """Pictures of an epoch."""
     workers: int = 1
     """Processes that draw."""
+    arms: int = 1
+    """Arms for which there is room at least."""
 
     def __post_init__(self) -> None:
         if self.shares and len(self.shares) != len(self.tasks):
@@ -188,7 +190,11 @@ class ScenePictures:
             album: where the pictures get ready.
         """
         self.tasks, self.scenes, self.training, self.album = tasks, about, training, album
-        self.seen, self.size, self.arms = about.seen, about.size, max(task.target.shape[2] for task in tasks)
+        self.seen, self.size, self.arms = (
+            about.seen,
+            about.size,
+            max(about.arms, *(task.target.shape[2] for task in tasks)),
+        )
         self.encoder, self.device = chosen_encoder(training), torch.device(training.device)
         self.alive: Callable[[], None] = lambda: None
         longest, chunk = max(task.target.shape[1] for task in tasks), training.chunk
@@ -327,6 +333,8 @@ def train_on_scenes(
     checkpoint, told = out.with_name(f"{out.stem}.checkpoint.pt"), callback or (lambda *_: None)
     if resume and not checkpoint.is_file():
         raise InputError(f"{checkpoint}: there is no checkpoint to resume; leave out --resume.")
+    if start is not None:
+        scenes = replace(scenes, arms=max(scenes.arms, load_policy(start)[0].shape.arms))
     tasks, prefix = scenes.demonstrations(training.seed), f".pictures-{out.stem}-"
     out.parent.mkdir(parents=True, exist_ok=True)
     begun = time.monotonic()
