@@ -151,9 +151,9 @@ def heldout_instructions(task: str) -> tuple[str, ...]:
     return _SAID[task][1] if task in _SAID else (_plain(task),)
 
 
-def draw_instruction(task: str, seed: int) -> str:
-    """Return one of the sentences of a task, drawn from a seed."""
-    said = training_instructions(task)
+def draw_instruction(task: str, seed: int, plain: str = "") -> str:
+    """Return one of the sentences of a task, drawn from a seed; `plain` is what a task of one's own says of itself."""
+    said = training_instructions(task) if task in _SAID or not plain else (plain,)
     return said[int(torch.randint(len(said), (), generator=torch.Generator().manual_seed(seed)))]
 
 

@@ -37,8 +37,9 @@ def join_cluster(address: str) -> tuple[Any, bool]:
     own: dict[str, Any] = {"include_dashboard": False, "object_store_memory": 200 * 2**20} if local else {}
     try:
         ray.init(None if local else address, log_to_driver=False, ignore_reinit_error=True, **own)
-    except (ConnectionError, ValueError, RuntimeError) as error:
-        raise InputError(f"--address {address}: no Ray cluster answers there ({error}).") from None
+    except Exception as error:  # Ray raises what it meets, also an exception of no narrower kind
+        said = f"no Ray could be started ({error})" if local else f"no Ray cluster answers there ({error})"
+        raise InputError(f"--address {address}: {said}.") from None
     return ray, True
 
 
