@@ -88,6 +88,13 @@ def train(
         list[str] | None,
         typer.Option(help="hybrid: a stage to leave out, robust, clone or tune; may be repeated.", metavar="STAGE"),
     ] = None,
+    address: Annotated[
+        str | None,
+        typer.Option(help="ppo, sac: Ray cluster whose processes play: auto, local, or HOST:PORT.", metavar="ADDRESS"),
+    ] = None,
+    workers: Annotated[
+        int | None, typer.Option(min=1, help="With --address: how many processes; they share the count. Default: 2.")
+    ] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Go on from the last checkpoint.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
 ) -> None:
@@ -113,6 +120,9 @@ def train(
         if not resume:
             check_writable(out / name, mark=b"torchdlo" if name != "log.csv" else b"episodes")
     given = {"episodes": episodes, "minutes": minutes, "seed": seed, "count": count, "fidelity": fidelity}
+    if workers is not None and address is None:
+        raise InputError("--workers: it says how many processes of a Ray cluster play; give --address, too.")
+    given["collectors"] = None if address is None else workers or 2
     chosen = training_preset(task, algo, variation=variation, **given, **_read(settings or []))
     made = find(task)
     if algo != "hybrid" and (trajectory or without):
@@ -121,7 +131,7 @@ def train(
         if algo == "hybrid":
             _hybrid(made, chosen, out, trajectory or [], without or [], resume, as_json)
         else:
-            _train(made, chosen, out, resume, compiled, as_json)
+            _train(made, chosen, out, resume, compiled, as_json, address)
 
 
 def _read(pairs: list[str]) -> dict[str, Any]:
@@ -140,14 +150,19 @@ def _read(pairs: list[str]) -> dict[str, Any]:
     return found
 
 
-def _train(task: Task, settings: TrainingSettings, out: Path, resume: bool, compiled: bool, as_json: bool) -> None:
+def _train(
+    task: Task, settings: TrainingSettings, out: Path, resume: bool, compiled: bool, as_json: bool, address: str | None
+) -> None:
     from torchdlo.agents.rl.results import prepare_training, train_json
     from torchdlo.agents.rl.training import train as loop
     from torchdlo.report.figures.learning_curve import training_png
 
-    trainer, played = prepare_training(task, settings, compiled=compiled)
-    with progress() as show, deferred_interrupt(show) as callback:
-        found = loop(trainer, played, settings, folder=out, resume=resume, callback=callback)
+    trainer, played = prepare_training(task, settings, compiled=compiled, address=address)
+    try:
+        with progress() as show, deferred_interrupt(show) as callback:
+            found = loop(trainer, played, settings, folder=out, resume=resume, callback=callback)
+    finally:
+        played.close()
     result = train_json(task, settings, found)
     write_atomically(out / "result.json", result)
     if found.rows:

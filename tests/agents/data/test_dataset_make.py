@@ -239,6 +239,12 @@ def test_a_task_without_success_is_given_up_with_a_sentence(tmp_path: Path) -> N
         make_dataset(plan(tasks=("never",), episodes=1), tmp_path / "set", painter=Dots())
 
 
+def test_a_task_of_ones_own_is_told_what_it_says_of_itself(tmp_path: Path) -> None:
+    name = f"{HERE / 'short_task.py'}:Short"
+    make_dataset(plan(tasks=(name,), episodes=1, size=0), tmp_path / "own")
+    assert open_set(tmp_path / "own").tasks == ("Lead the first end of a short rope to the left of a place.",)
+
+
 def test_a_stored_trajectory_is_followed_from_other_starts(tmp_path: Path) -> None:
     task = Short()
     start = task.start(1)[2].rods.pos[0, 1]

@@ -1,8 +1,9 @@
-"""Ray with two simulated nodes: the same bytes as in one process, also when a node is lost."""
+"""Ray with two simulated nodes: the same bytes as in one process, also when a node is lost or the driver killed."""
 
 from __future__ import annotations
 
 import os
+import subprocess
 import sys
 import threading
 import time
@@ -54,8 +55,12 @@ class Taught:
         """Nothing."""
 
 
-@pytest.mark.slow
-def test_a_lost_node_changes_no_byte(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+NODE = {"num_cpus": 1, "object_store_memory": 100 * 2**20}
+
+
+@pytest.fixture
+def cluster(monkeypatch: pytest.MonkeyPatch):
+    """A cluster of one node, whose workers find the tasks of tests."""
     from ray.cluster_utils import Cluster
 
     for name, kind in SHORT.items():
@@ -63,9 +68,19 @@ def test_a_lost_node_changes_no_byte(tmp_path: Path, monkeypatch: pytest.MonkeyP
     root = DATA.parents[2]
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join(map(str, (root, DATA, Path(__file__).parent))))
     monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
-    node = {"num_cpus": 1, "object_store_memory": 100 * 2**20}
-    cluster = Cluster(initialize_head=True, head_node_args=node | {"include_dashboard": False})
-    second = cluster.add_node(**node)
+    found = Cluster(initialize_head=True, head_node_args=NODE | {"include_dashboard": False})
+    yield found
+    found.shutdown()
+
+
+def content(folder: Path) -> dict[Path, bytes]:
+    """All files of a folder."""
+    return {file.relative_to(folder): file.read_bytes() for file in folder.rglob("*") if file.is_file()}
+
+
+@pytest.mark.slow
+def test_a_lost_node_changes_no_byte(tmp_path: Path, cluster) -> None:
+    second = cluster.add_node(**NODE)
     cluster.wait_for_nodes()
 
     def lose() -> None:
@@ -73,16 +88,41 @@ def test_a_lost_node_changes_no_byte(tmp_path: Path, monkeypatch: pytest.MonkeyP
         cluster.remove_node(second, allow_graceful=False)
 
     thread = threading.Thread(target=lose)
-    try:
-        make_dataset(plan(episodes=10), tmp_path / "one", painter=Dots())
-        with make_executor(address=cluster.address) as workers:
-            thread.start()
-            make_dataset(plan(episodes=10), tmp_path / "two", painter=Dots(1.0), executor=Taught(workers))
-    finally:
+    make_dataset(plan(episodes=10), tmp_path / "one", painter=Dots())
+    with make_executor(address=cluster.address) as workers:
+        thread.start()
+        make_dataset(plan(episodes=10), tmp_path / "two", painter=Dots(1.0), executor=Taught(workers))
         thread.join()
-        cluster.shutdown()
-    one, two = (
-        {file.relative_to(folder): file.read_bytes() for file in folder.rglob("*") if file.is_file()}
-        for folder in (tmp_path / "one", tmp_path / "two")
-    )
-    assert one == two
+    assert content(tmp_path / "one") == content(tmp_path / "two")
+
+
+def main() -> None:
+    """Make a set on a cluster in a process of its own: OUT ADDRESS [--resume]."""
+    envs.TASKS.update(SHORT)
+    os.umask(0o22)
+    with make_executor(address=sys.argv[2]) as workers:
+        options = {"painter": Dots(1.0), "executor": Taught(workers), "resume": "--resume" in sys.argv}
+        make_dataset(plan(episodes=10), Path(sys.argv[1]), **options)
+
+
+@pytest.mark.slow
+def test_a_killed_driver_goes_on_to_the_same_bytes(tmp_path: Path, cluster) -> None:
+    cluster.add_node(**NODE)
+    cluster.wait_for_nodes()
+    os.umask(0o22)
+    make_dataset(plan(episodes=10), tmp_path / "one", painter=Dots())
+    command = [sys.executable, __file__, str(tmp_path / "two"), cluster.address]
+    driver, begun = subprocess.Popen(command), time.monotonic()
+    while not list(tmp_path.glob("two/unfinished/short/*")) and time.monotonic() < begun + 300:
+        assert driver.poll() is None
+        time.sleep(0.05)
+    driver.kill()
+    driver.wait()
+    finished = len(list(tmp_path.glob("two/unfinished/short/[0-9]*")))
+    assert 0 < finished and not (tmp_path / "two/meta/info.json").exists()
+    subprocess.run([*command, "--resume"], check=True)
+    assert content(tmp_path / "one") == content(tmp_path / "two")
+
+
+if __name__ == "__main__":
+    main()

@@ -23,7 +23,7 @@ from torchdlo import envs
 from torchdlo.agents.data import check_dataset, open_set, sentences
 from torchdlo.agents.data.making import make_dataset
 from torchdlo.agents.data.record import Noise, draw_starts, play_batch
-from torchdlo.agents.policies import chunk_rollout, chunk_training, language
+from torchdlo.agents.policies import chunk_frames, chunk_rollout, language
 from torchdlo.agents.policies.chunk_policy import ChunkPolicy, NetworkShape, load_policy, save_policy
 from torchdlo.agents.policies.chunk_rollout import PolicyDemonstrator, evaluate_chunk_policy
 from torchdlo.agents.policies.chunk_training import Training, train_chunk_policy
@@ -118,14 +118,16 @@ def test_a_policy_on_another_device_never_waits_to_be_told_what_is_there() -> No
 
 
 def test_frames_on_a_device_are_those_in_the_file(data: Path, tmp_path: Path) -> None:
-    frames = chunk_training._read(open_set(data), "hashed", tmp_path, lambda *_: None)
+    frames = chunk_frames.read_frames(open_set(data), "hashed", tmp_path, lambda *_: None)
     at, none = torch.tensor([3, 0, 17, 31]), torch.device("cpu")
-    shots, *usual = frames.batch(at, 4)
+    usual = vars(frames.batch(at, 4, torch.Generator()))
+    shots = usual.pop("shots")
     for room, held in ((1 << 40, torch.Tensor), (0, np.ndarray)):
         moved = frames.on(none, room)
         assert all(isinstance(x, held) for x in moved.pictures.values())
-        seen, *rest = moved.batch(at, 4)
-        assert all(torch.equal(a, b) for a, b in zip(usual, rest, strict=True))
+        rest = vars(moved.batch(at, 4, torch.Generator()))
+        seen = rest.pop("shots")
+        assert all(torch.equal(x, rest[name]) for name, x in usual.items())
         assert seen.keys() == shots.keys() and all(torch.equal(seen[name], shots[name]) for name in shots)
 
 
@@ -213,6 +215,18 @@ def test_training_that_was_stopped_comes_to_the_same(data: Path, tmp_path: Path)
     assert all(torch.equal(x, y) for x, y in zip(a.parameters(), b.parameters(), strict=True))
     with pytest.raises(InputError, match="there is no checkpoint to resume"):
         train_chunk_policy(data, tmp_path / "parts.pt", training, resume=True)
+
+
+def test_training_can_begin_with_the_weights_of_a_policy(data: Path, learned: Path, tmp_path: Path) -> None:
+    training = Training(epochs=1, batch=8, rate=1e-9, chunk=4, width=32, language="hashed", decay=0.0)
+    found = train_chunk_policy(data, tmp_path / "next.pt", training, start=learned)
+    # It is as good as it was; a new one is far from it.
+    assert found["loss"][0] < 2 * load_policy(learned)[1]["loss"][-1] + 0.05
+    (a, _), (b, _) = load_policy(learned), load_policy(tmp_path / "next.pt")
+    assert all(torch.allclose(x, y, atol=1e-6) for x, y in zip(a.parameters(), b.parameters(), strict=True))
+    other = Training(epochs=1, chunk=4, width=64, language="hashed")
+    with pytest.raises(InputError, match=r"its network has width 32 \(now 64\); begin with one that is alike"):
+        train_chunk_policy(data, tmp_path / "other.pt", other, start=learned)
 
 
 def test_learning_from_a_damaged_set_is_one_sentence(data: Path, tmp_path: Path) -> None:

@@ -104,10 +104,10 @@ def draw_starts(
     task: Task, seed: int | str, numbers: Sequence[int], told: Sequence[str] | None = None
 ) -> list[EpisodeStart]:
     """Return the attempts with these numbers; `told` are instructions in turn, drawn from a seed if not given."""
-    found = []
+    found, plain = [], (type(task).__doc__ or task.name).splitlines()[0]
     for k in numbers:
         own = seed_of(seed, task.name, k)
-        text = told[k % len(told)] if told else sentences.draw_instruction(task.name, seed_of(own, "told"))
+        text = told[k % len(told)] if told else sentences.draw_instruction(task.name, seed_of(own, "told"), plain)
         found.append(EpisodeStart(k, own, text))
     return found
 

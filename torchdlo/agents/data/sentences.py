@@ -31,6 +31,12 @@ _SAID: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
             "Lead the rope left about the cone.",
             "Go round the cone on the left with the rope, counterclockwise.",
             "Coil the rope counterclockwise about the cone.",
+            "Go left round the cone with the rope.",
+            "Wind the rope leftwards around the cone.",
+            "Take the rope's end to the left and round the cone.",
+            "Circle the cone leftwards with the rope.",
+            "Bend the rope to the left about the cone.",
+            "The rope should go left round the cone.",
         ),
         ("Please loop the rope leftwards around the cone.", "Turn left round the cone with the rope."),
     ),
@@ -42,6 +48,12 @@ _SAID: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
             "Lead the rope right about the cone.",
             "Go round the cone on the right with the rope, clockwise.",
             "Coil the rope clockwise about the cone.",
+            "Go right round the cone with the rope.",
+            "Wind the rope rightwards around the cone.",
+            "Take the rope's end to the right and round the cone.",
+            "Circle the cone rightwards with the rope.",
+            "Bend the rope to the right about the cone.",
+            "The rope should go right round the cone.",
         ),
         ("Please loop the rope rightwards around the cone.", "Turn right round the cone with the rope."),
     ),
@@ -139,9 +151,9 @@ def heldout_instructions(task: str) -> tuple[str, ...]:
     return _SAID[task][1] if task in _SAID else (_plain(task),)
 
 
-def draw_instruction(task: str, seed: int) -> str:
-    """Return one of the sentences of a task, drawn from a seed."""
-    said = training_instructions(task)
+def draw_instruction(task: str, seed: int, plain: str = "") -> str:
+    """Return one of the sentences of a task, drawn from a seed; `plain` is what a task of one's own says of itself."""
+    said = training_instructions(task) if task in _SAID or not plain else (plain,)
     return said[int(torch.randint(len(said), (), generator=torch.Generator().manual_seed(seed)))]
 
 

@@ -9,12 +9,38 @@ from typing import Any, TypeVar
 from torchdlo.agents.distributed.executors import _Closing
 from torchdlo.errors import InputError
 
-__all__ = ["RayWorkers"]
+__all__ = ["RayWorkers", "join_cluster"]
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 AGAIN = 5
 """How often an item is done again if its node is lost."""
+
+
+def join_cluster(address: str) -> tuple[Any, bool]:
+    """Join a cluster; return the module ray, and whether it was joined here, and is to be left again.
+
+    Args:
+        address: see `executors.make_executor`.
+    """
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    try:
+        import ray
+    except ImportError:
+        raise InputError(
+            "--address needs ray; install it with pip install 'torchdlo[ray]', or leave out --address to work in "
+            "processes of this machine."
+        ) from None
+    if ray.is_initialized():
+        return ray, False
+    local = address == "local"
+    own: dict[str, Any] = {"include_dashboard": False, "object_store_memory": 200 * 2**20} if local else {}
+    try:
+        ray.init(None if local else address, log_to_driver=False, ignore_reinit_error=True, **own)
+    except Exception as error:  # Ray raises what it meets, also an exception of no narrower kind
+        said = f"no Ray could be started ({error})" if local else f"no Ray cluster answers there ({error})"
+        raise InputError(f"--address {address}: {said}.") from None
+    return ray, True
 
 
 class RayWorkers(_Closing):
@@ -27,22 +53,7 @@ class RayWorkers(_Closing):
             address: see `executors.make_executor`.
             workers: most items that are being worked on at a time; as many as the cluster has cores if not given.
         """
-        os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-        try:
-            import ray
-        except ImportError:
-            raise InputError(
-                "--address needs ray; install it with pip install 'torchdlo[ray]', or leave out --address to work in "
-                "processes of this machine."
-            ) from None
-        self._ray, self._owned = ray, not ray.is_initialized()
-        if self._owned:
-            local = address == "local"
-            own: dict[str, Any] = {"include_dashboard": False, "object_store_memory": 200 * 2**20} if local else {}
-            try:
-                ray.init(None if local else address, log_to_driver=False, ignore_reinit_error=True, **own)
-            except (ConnectionError, ValueError, RuntimeError) as error:
-                raise InputError(f"--address {address}: no Ray cluster answers there ({error}).") from None
+        self._ray, self._owned = join_cluster(address)
         self.workers = workers
 
     def map(self, fn: Callable[[Item], Result], items: Sequence[Item]) -> Iterator[tuple[int, Result]]:

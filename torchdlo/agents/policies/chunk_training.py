@@ -1,4 +1,4 @@
-"""Training the chunk policy from an exported data set, through its own reader."""
+"""Training the chunk policy: from an exported data set, through its own reader, or from scenes drawn anew."""
 
 from __future__ import annotations
 
@@ -8,31 +8,29 @@ import shutil
 import tempfile
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from torchdlo.agents.data.reading import DataSet, open_set
+from torchdlo.agents.data.reading import open_set
 from torchdlo.agents.policies import language
-from torchdlo.agents.policies.chunk_policy import ChunkPolicy, NetworkShape, save_policy
+from torchdlo.agents.policies.chunk_frames import Shown, read_frames
+from torchdlo.agents.policies.chunk_policy import ChunkPolicy, NetworkShape, load_policy, save_policy
 from torchdlo.agents.torch_records import load_checkpoint, save_checkpoint
 from torchdlo.agents.trajopt.search_journal import code_versions
 from torchdlo.errors import InputError
 from torchdlo.journal import locked, sweep
 
-__all__ = ["Training", "train_chunk_policy"]
+__all__ = ["ChunkRun", "Source", "Training", "chosen_encoder", "run_training", "swept", "train_chunk_policy"]
 
-IMAGES = "observation.images."
-LEAST = 1e-3
-"""Least scale of states and targets: what hardly varies is not blown up."""
+Callback = Callable[[str, int, int, str], None]
 TELL = 10
 """Steps after which the loss is told again."""
-FINEST = 0.02
-"""Least spread of targets of a task by which its errors are measured [m]."""
+LATER = 0.3
+"""What a target counts that is not followed before the policy looks again, see `Training.followed`."""
 
 
 @dataclass(frozen=True)
@@ -43,14 +41,24 @@ class Training:
     batch: int = 64
     rate: float = 1e-3
     """Largest learning rate."""
+    word_rate: float = 1.0
+    """Times by which that of what reads sentences is larger: where sentences differ little, it has far to go."""
     decay: float = 1e-2
-    """Weight decay."""
+    """Weight decay of matrices."""
     average: float = 0.995
     """How much of the averaged weights a step keeps; these are what is saved."""
     chunk: int = 20
     """Actions that the policy looks ahead."""
+    followed: int = 0
+    """Targets that count in full, the later ones less; 0: all count the same."""
     width: int = 128
     """Numbers of a token of the network."""
+    channels: tuple[int, ...] = (32, 64, 96)
+    """Of its convolutions."""
+    tokens: int = 2
+    """Tokens that a picture becomes."""
+    layers: int = 2
+    """Of the transformer."""
     proprioception: bool = False
     """Whether it is told where its arms are, see `chunk_policy`."""
     recolor: float = 0.2
@@ -67,96 +75,44 @@ class Training:
             )
 
 
-@dataclass(frozen=True, eq=False)
-class _Frames:
-    """A set in memory, its pictures in a file that is mapped."""
+class Source(Protocol):
+    """What is learned from."""
 
-    state: Tensor
-    target: Tensor
-    """Shape (N, 3 R)."""
-    first: Tensor
-    """Number of the first frame of each frame's episode, shape (N,)."""
-    last: Tensor
-    """Number of the last one, shape (N,)."""
-    sentence: Tensor
-    """Vectors of the instructions, shape (tasks, 384)."""
-    told: Tensor
-    """Instruction of each frame, shape (N,)."""
-    weight: Tensor
-    """Spread of all targets over that of the frame's task, shape (N, 3 R): errors count by what is much in a task."""
-    pictures: dict[str, np.ndarray] | dict[str, Tensor]
-    """Shape (N, 3, H, W), 8 bits."""
+    @property
+    def seen(self) -> int:
+        """Pictures of an epoch."""
 
-    def batch(self, at: Tensor, chunk: int) -> tuple[dict[str, Tensor], Tensor, Tensor, Tensor, Tensor]:
-        """Return pictures, states, sentences, targets, and weights of their errors; after the end tools stay."""
-        device = self.target.device
-        here = at.to(device)
-        ahead = torch.minimum(here[:, None] + torch.arange(chunk, device=device), self.last[here][:, None])
-        shots = {
-            name: x[here] if isinstance(x, Tensor) else torch.from_numpy(x[at.numpy()]).to(device)
-            for name, x in self.pictures.items()
-        }
-        return shots, self.state[here], self.sentence[self.told[here]], self.target[ahead], self.weight[here]
+    @property
+    def arms(self) -> int:
+        """Arms of the widest task."""
 
-    def on(self, device: torch.device, room: int) -> _Frames:
-        """Return them on a device, with the pictures if they take no more than `room` there [bytes]."""
-        names = [each.name for each in fields(self) if each.name != "pictures"]
-        moved = {name: getattr(self, name).to(device) for name in names}
-        fits = sum(x.nbytes for x in self.pictures.values()) <= room
-        pictures = {name: torch.as_tensor(x).to(device) for name, x in self.pictures.items()} if fits else self.pictures
-        return _Frames(**moved, pictures=pictures)
+    @property
+    def size(self) -> int:
+        """Width of pictures [px]."""
+
+    @property
+    def cameras(self) -> tuple[str, ...]:
+        """Their names."""
+
+    def statistics(self) -> dict[str, tuple[Tensor, Tensor]]:
+        """Return means and deviations of targets, and of states if there are any."""
+
+    def order(self, epoch: int, generator: torch.Generator) -> Tensor:
+        """Return the numbers of the pictures of an epoch, shape (seen,)."""
+
+    def batch(self, at: Tensor, chunk: int, generator: torch.Generator) -> Shown:
+        """Return pictures with these numbers, and what belongs to them."""
+
+    def judged(self, policy: ChunkPolicy) -> dict[str, Any]:
+        """Return how a policy does where it does not learn, as plain data."""
+
+    def about(self) -> dict[str, Any]:
+        """Return what is to be known of it, as plain data; what is the same is the same source."""
 
 
-def _read(data: DataSet, encoder: str, folder: Path, callback: Callable[[str, int, int, str], None]) -> _Frames:
-    if not data.cameras:
-        raise InputError(f"{data.path}: has no pictures; the policy learns from what it sees.")
-    columns, count = data.columns(), data.info["total_frames"]
-    missing = {"observation.state", "torchdlo.target"} - columns.keys()
-    if missing:
-        raise InputError(
-            f"{data.path}: has no column {', '.join(sorted(missing))}; make it with torchdlo dataset make."
-        )
-    first, last = np.zeros((2, count), np.int64)
-    pictures: dict[str, np.ndarray] = {}
-    for camera in data.cameras:
-        height, width, _ = data.features[camera]["shape"]
-        file = folder / f"{camera}.u8"
-        pictures[camera.removeprefix(IMAGES)] = np.memmap(file, np.uint8, "w+", shape=(count, 3, height, width))
-    for k, row in enumerate(data.episodes):
-        start, end = row["dataset_from_index"], row["dataset_to_index"]
-        first[start:end], last[start:end] = start, end - 1
-        for camera in data.cameras:
-            shots = np.stack(list(data.pictures(k, camera)))
-            pictures[camera.removeprefix(IMAGES)][start:end] = shots.transpose(0, 3, 1, 2)
-        callback("read", k + 1, len(data.episodes), "")
-    target = columns["torchdlo.target"].reshape(count, -1, 7)[..., :3].reshape(count, -1)
-    targets = torch.from_numpy(np.ascontiguousarray(target))
-    return _Frames(
-        torch.from_numpy(columns["observation.state"].copy()),
-        targets,
-        torch.from_numpy(first),
-        torch.from_numpy(last),
-        language.encode_sentences(data.tasks, encoder),
-        torch.from_numpy(columns["task_index"].copy()),
-        _weights(data, targets),
-        pictures,
-    )
-
-
-def _weights(data: DataSet, target: Tensor) -> Tensor:
-    """Return the spread of all targets over that within each frame's task, 1 for arms that are not there."""
-    about = data.provenance.get("episodes") or [{}] * len(data.episodes)
-    rows: dict[str, list[Tensor]] = {}
-    for row, own in zip(data.episodes, about, strict=True):
-        at = torch.arange(row["dataset_from_index"], row["dataset_to_index"])
-        rows.setdefault(own.get("task") or row["tasks"][0], []).append(at)
-    found = torch.ones_like(target)
-    for parts in rows.values():
-        at = torch.cat(parts)
-        spread = target[at].std(0, correction=0)
-        share = target.std(0, correction=0) / spread.clamp(min=FINEST)
-        found[at] = torch.where(spread < LEAST, 1.0, share.clamp(min=1.0))
-    return found
+def chosen_encoder(training: Training) -> str:
+    """Return how sentences become vectors."""
+    return language.default_encoder() if training.language == "auto" else training.language
 
 
 def train_chunk_policy(
@@ -164,8 +120,9 @@ def train_chunk_policy(
     out: Path,
     training: Training | None = None,
     *,
+    start: Path | None = None,
     resume: bool = False,
-    callback: Callable[[str, int, int, str], None] | None = None,
+    callback: Callback | None = None,
 ) -> dict[str, Any]:
     """Train a policy and write it to a file after every epoch; return how it went.
 
@@ -173,35 +130,53 @@ def train_chunk_policy(
         path: a data set of `torchdlo dataset make`.
         out: the policy's file; a checkpoint lies beside it until training is over.
         training: how to train.
+        start: a policy of the same network, whose weights to begin with.
         resume: go on from the checkpoint; with the same number of threads the policy comes out the same.
         callback: told (stage, done, in all, message); may raise KeyboardInterrupt.
     """
     training, told = training or Training(), callback or (lambda *_: None)
-    data = open_set(path)
-    encoder = language.default_encoder() if training.language == "auto" else training.language
-    checkpoint = out.with_name(f"{out.stem}.checkpoint.pt")
-    if resume and not checkpoint.is_file():
-        raise InputError(f"{checkpoint}: there is no checkpoint to resume; leave out --resume.")
-    begun = time.monotonic()
+    data, encoder, begun = open_set(path), chosen_encoder(training), time.monotonic()
+    checkpoint = _checkpoint(out, resume)
     with (
         locked(out.parent, f".{out.name}.lock"),
-        tempfile.TemporaryDirectory(prefix=_swept(out), dir=out.parent) as folder,
+        tempfile.TemporaryDirectory(prefix=swept(out), dir=out.parent) as folder,
     ):
-        frames = _read(data, encoder, Path(folder), told)
+        frames = read_frames(data, encoder, Path(folder), told)
         if (device := torch.device(training.device)).type == "cuda":
             frames = frames.on(device, torch.cuda.mem_get_info(device)[0] // 2)
-        run = _Run(data, frames, training, encoder)
-        if resume:
-            run.load(checkpoint)
-        while run.epoch < training.epochs:
-            run.train(told)
-            run.save(checkpoint)
-            save_policy(out, run.averaged, run.about())
-    checkpoint.unlink(missing_ok=True)
+        run = ChunkRun(frames, training, start)
+        run_training(run, out, checkpoint if resume else None, told)
     return run.about() | {"seconds": round(time.monotonic() - begun, 1)}
 
 
-def _swept(out: Path) -> str:
+def _checkpoint(out: Path, resume: bool) -> Path:
+    checkpoint = out.with_name(f"{out.stem}.checkpoint.pt")
+    if resume and not checkpoint.is_file():
+        raise InputError(f"{checkpoint}: there is no checkpoint to resume; leave out --resume.")
+    return checkpoint
+
+
+def run_training(run: ChunkRun, out: Path, resumed: Path | None, told: Callback, *, small: bool = False) -> None:
+    """Train epoch by epoch, with a policy and a checkpoint written after each; the checkpoint goes at the end.
+
+    Args:
+        run: the training.
+        out: the policy's file.
+        resumed: the checkpoint to go on from.
+        told: see `train_chunk_policy`.
+        small: see `save_policy`.
+    """
+    checkpoint = out.with_name(f"{out.stem}.checkpoint.pt")
+    if resumed is not None:
+        run.load(resumed)
+    while run.epoch < run.training.epochs:
+        run.train(told)
+        run.save(checkpoint)
+        save_policy(out, run.averaged, run.about(), small=small)
+    checkpoint.unlink(missing_ok=True)
+
+
+def swept(out: Path) -> str:
     """Remove what a run that was killed left half done; return how the name of the folder of pictures begins."""
     prefix = f".frames-{out.stem}-"
     for left in out.parent.glob(f"{prefix}*"):
@@ -210,100 +185,101 @@ def _swept(out: Path) -> str:
     return prefix
 
 
-class _Run:
+class ChunkRun:
     """A training under way."""
 
-    def __init__(self, data: DataSet, frames: _Frames, training: Training, encoder: str) -> None:
-        self.data, self.frames, self.training, self.encoder = data, frames, training, encoder
-        cameras = tuple(frames.pictures)
+    def __init__(self, source: Source, training: Training, start: Path | None = None) -> None:
+        """Make a network, with weights drawn from the seed or those of a policy."""
+        self.source, self.training = source, training
+        kept = source.statistics()
         shape = NetworkShape(
-            arms=frames.target.shape[1] // 3,
-            cameras=cameras,
-            size=frames.pictures[cameras[0]].shape[-1],
-            state=frames.state.shape[1] if training.proprioception else 0,
+            arms=source.arms,
+            cameras=source.cameras,
+            size=source.size,
+            state=len(kept["state"][0]) if training.proprioception else 0,
             chunk=training.chunk,
             width=training.width,
+            channels=training.channels,
+            tokens=training.tokens,
+            layers=training.layers,
         )
         with torch.random.fork_rng(devices=()):
             torch.manual_seed(training.seed)
-            self.policy = ChunkPolicy(shape).to(training.device)
-        kept = {"target": frames.target} | ({"state": frames.state} if training.proprioception else {})
-        for name, x in kept.items():
-            getattr(self.policy, f"{name}_mean").copy_(x.mean(0))
-            getattr(self.policy, f"{name}_std").copy_(x.std(0, correction=0).clamp(min=LEAST))
+            self.policy = ChunkPolicy(shape)
+        for name in ("target", "state") if training.proprioception else ("target",):
+            getattr(self.policy, f"{name}_mean").copy_(kept[name][0])
+            getattr(self.policy, f"{name}_std").copy_(kept[name][1])
+        if start is not None:
+            self._begin_with(start)
+        self.policy.to(training.device)
         self.averaged = copy.deepcopy(self.policy).eval()
-        fused = torch.device(training.device).type == "cuda"
-        self.optimizer = torch.optim.AdamW(
-            self.policy.parameters(), training.rate, weight_decay=training.decay, fused=fused
-        )
-        self.epoch, self.curve = 0, list[float]()
-        # An epoch has every episode as often as every other, short ones as long ones.
-        longest = int((frames.last - frames.first).max()) + 1
-        self.seen = longest * len(data.episodes)
-        self.steps = -(-self.seen // training.batch)
+        self.optimizer = _optimizer(self.policy, training)
+        near = torch.ones(training.chunk)
+        near[training.followed or training.chunk :] = LATER
+        self.near = (near / near.mean())[:, None].to(training.device)
+        self.epoch, self.curve, self.judged = 0, list[float](), list[dict[str, Any]]()
+        self.steps = -(-source.seen // training.batch)
 
-    def train(self, told: Callable[[str, int, int, str], None]) -> None:
-        """Go once through all episodes, in an order that the number of the epoch decides."""
+    def _begin_with(self, start: Path) -> None:
+        policy, _ = load_policy(start)
+        if policy.shape != self.policy.shape:
+            there, here = asdict(policy.shape), asdict(self.policy.shape)
+            other = [f"{k} {v} (now {here[k]})" for k, v in there.items() if v != here[k]]
+            raise InputError(f"{start}: its network has {', '.join(other)}; begin with one that is alike.")
+        self.policy.load_state_dict(policy.state_dict())
+
+    def train(self, told: Callback) -> None:
+        """Go once through all pictures of an epoch, in an order that its number decides."""
         generator = torch.Generator().manual_seed(self.training.seed * 100_003 + self.epoch)
-        order = self._order(generator)
+        order = self.source.order(self.epoch, generator)
         all_steps, said = self.steps * self.training.epochs, ""
         total = torch.zeros((), dtype=torch.float64, device=self.training.device)
         self.policy.train()
         for k, at in enumerate(order.split(self.training.batch)):
             done = self.epoch * self.steps + k
-            for group in self.optimizer.param_groups:
-                group["lr"] = self.training.rate * _schedule(done, all_steps)
-            shots, state, sentence, target, weight = self.frames.batch(at, self.training.chunk)
-            shots = {name: _recolored(x, self.training.recolor, generator) for name, x in shots.items()}
-            wanted = (target - self.policy.target_mean) / self.policy.target_std
-            loss = ((self.policy.scaled(shots, state, sentence) - wanted).abs() * weight[:, None]).mean()
-            self.optimizer.zero_grad()
-            loss.backward()
-            torch.nn.utils.clip_grad_norm_(self.policy.parameters(), 1.0)
-            self.optimizer.step()
-            self._average(min(self.training.average, (1 + done) / (10 + done)))
-            total += loss.detach().double() * len(at)
+            loss = self.step(self.source.batch(at, self.training.chunk, generator), done, generator)
+            total += loss.double() * len(at)
             if k % TELL == 0:  # to read the loss waits for the device
                 said = f"loss {float(total) / (len(at) * (k + 1)):.4f}"
             told("learn", done + 1, all_steps, said)
         self.epoch += 1
         self.curve.append(float(total) / len(order))
+        self.judged.append(self.source.judged(self.averaged))
 
-    def _order(self, generator: torch.Generator) -> Tensor:
-        """Return the frames of an epoch: all of the longest episodes, those of shorter ones several times."""
-        frames, found = self.frames, []
-        longest = self.seen // len(self.data.episodes)
-        for first in frames.first.unique().tolist():
-            length = int(frames.last[first]) - first + 1
-            rounds = [torch.randperm(length, generator=generator) for _ in range(-(-longest // length))]
-            found.append(first + torch.cat(rounds)[:longest])
-        order = torch.cat(found)
-        return order[torch.randperm(len(order), generator=generator)]
-
-    def _average(self, keep: float) -> None:
+    def step(self, shown: Shown, done: int, generator: torch.Generator) -> Tensor:
+        """Learn from a batch after so many others, and return the loss."""
+        share = _schedule(done, self.steps * self.training.epochs)
+        for group in self.optimizer.param_groups:
+            group["lr"] = self.training.rate * group["times"] * share
+        shots = {name: _recolored(x, self.training.recolor, generator) for name, x in shown.shots.items()}
+        wanted = (shown.target - self.policy.target_mean) / self.policy.target_std
+        weight = torch.where(shown.scale > 0, self.policy.target_std / shown.scale, 1.0)
+        off = (self.policy.scaled(shots, shown.state, shown.sentence) - wanted).abs()
+        loss = (off * weight[:, None] * self.near).mean()
+        self.optimizer.zero_grad()
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(self.policy.parameters(), 1.0)
+        self.optimizer.step()
+        keep = min(self.training.average, (1 + done) / (10 + done))
         with torch.no_grad():
             for mean, own in zip(self.averaged.parameters(), self.policy.parameters(), strict=True):
                 mean.lerp_(own, 1 - keep)
+        return loss.detach()
 
     def about(self) -> dict[str, Any]:
         """Return what is to be known of the policy."""
-        rows = self.data.provenance.get("episodes") or []
-        return {
-            "tasks": sorted({row["task"] for row in rows if row.get("task")}),
-            "sentences": list(self.data.tasks),
-            "language": self.encoder,
-            "dataset": self.data.path.resolve().name,
-            "episodes": len(self.data.episodes),
-            "frames": len(self.frames.state),
+        judged = {"held_out": self.judged} if any(self.judged) else {}
+        return self.source.about() | {
             "parameters": sum(p.numel() for p in self.policy.parameters()),
             "training": asdict(self.training),
             "epochs": self.epoch,
             "loss": [round(x, 6) for x in self.curve],
+            **judged,
             "versions": {name: str(value) for name, value in code_versions().items()},
         }
 
     def _same(self) -> dict[str, Any]:
-        return {"training": asdict(self.training), "frames": len(self.frames.state), "language": self.encoder}
+        return {"training": asdict(self.training), "source": self.source.about()}
 
     def save(self, path: Path) -> None:
         """Write all that is needed to go on."""
@@ -311,6 +287,7 @@ class _Run:
             "same": self._same(),
             "epoch": self.epoch,
             "curve": self.curve,
+            "judged": self.judged,
             "policy": self.policy.state_dict(),
             "averaged": self.averaged.state_dict(),
             "optimizer": self.optimizer.state_dict(),
@@ -324,9 +301,27 @@ class _Run:
             raise InputError(f"{path}: the checkpoint is damaged; leave out --resume.")
         if content["same"] != self._same():
             raise InputError(f"{path}: it is of another data set or training; give the same, or leave out --resume.")
-        self.epoch, self.curve = content["epoch"], content["curve"]
+        self.epoch, self.curve, self.judged = content["epoch"], content["curve"], content["judged"]
         for name in ("policy", "averaged", "optimizer"):
             getattr(self, name).load_state_dict(content[name])
+
+
+def _optimizer(policy: ChunkPolicy, training: Training) -> torch.optim.AdamW:
+    """Return what moves the weights: only matrices decay, and what reads sentences may go faster."""
+    groups: dict[tuple[bool, bool], list[Tensor]] = {}
+    for name, x in policy.named_parameters():
+        reads = name.startswith("sentence.") or ".films." in name
+        groups.setdefault((reads, x.dim() > 1), []).append(x)
+    rows = [
+        {
+            "params": own,
+            "weight_decay": training.decay * matrix,
+            "times": training.word_rate if reads else 1.0,
+        }
+        for (reads, matrix), own in groups.items()
+    ]
+    fused = torch.device(training.device).type == "cuda"
+    return torch.optim.AdamW(rows, training.rate, betas=(0.9, 0.98), fused=fused)
 
 
 def _recolored(pictures: Tensor, most: float, generator: torch.Generator) -> Tensor:

@@ -56,6 +56,9 @@ class Episodes(Protocol):
     def detach(self) -> None:
         """Cut the history of gradients."""
 
+    def close(self) -> None:
+        """End what was begun for them."""
+
 
 class EnvEpisodes:
     """Episodes of any TorchRL environment with one axis of the batch, of which `keys` are seen."""
@@ -97,6 +100,9 @@ class EnvEpisodes:
         self._td = self._td.detach()
         if hasattr(self.env, "detach"):
             self.env.detach()
+
+    def close(self) -> None:
+        """Do nothing: the environment is whose it was."""
 
 
 class TaskEpisodes:
@@ -189,3 +195,6 @@ class TaskEpisodes:
     def detach(self) -> None:
         """Cut the history of gradients."""
         self.env.detach()
+
+    def close(self) -> None:
+        """Do nothing."""

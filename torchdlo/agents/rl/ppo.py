@@ -13,8 +13,9 @@ from torchrl.modules import IndependentNormal, ProbabilisticActor, TanhNormal, V
 from torchrl.objectives import ClipPPOLoss
 
 from torchdlo.agents.policies import Policy, mlp
+from torchdlo.agents.rl.collectors import played_batch
 from torchdlo.agents.rl.episodes import Episodes
-from torchdlo.agents.rl.rollout import Batch, collect_episodes, generalised_advantages
+from torchdlo.agents.rl.rollout import Batch, generalised_advantages
 from torchdlo.agents.rl.settings import TrainingSettings
 
 __all__ = ["Critic", "Ppo", "torchrl_actor"]
@@ -74,7 +75,7 @@ class Ppo:
 
     def iterate(self, episodes: Episodes) -> tuple[Batch, dict[str, float]]:
         """Play and learn; return what was played and how learning went."""
-        batch = collect_episodes(self.policy, episodes)
+        batch = played_batch(self.policy, episodes)
         if not bool(self.policy.normaliser.count > 0):
             self.policy.normaliser.update(batch.features)
             # Densities are those of the policy as it is now.

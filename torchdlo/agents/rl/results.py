@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 from dataclasses import asdict
 from pathlib import Path
@@ -10,7 +11,7 @@ from typing import Any
 import torch
 
 from torchdlo.agents.policies import Policy, load_policy
-from torchdlo.agents.rl.episodes import TaskEpisodes
+from torchdlo.agents.rl.episodes import Episodes, TaskEpisodes
 from torchdlo.agents.rl.hybrid_stages import task_policy
 from torchdlo.agents.rl.settings import TrainingSettings
 from torchdlo.agents.rl.training import Trained, Trainer
@@ -20,8 +21,17 @@ from torchdlo.errors import InputError
 __all__ = ["evaluation_summary", "load_policies", "prepare_training", "train_json"]
 
 
-def prepare_training(task: Task, settings: TrainingSettings, *, compiled: bool = False) -> tuple[Trainer, TaskEpisodes]:
-    """Return the trainer with a new policy, and its episodes, for an algorithm without stages."""
+def prepare_training(
+    task: Task, settings: TrainingSettings, *, compiled: bool = False, address: str | None = None
+) -> tuple[Trainer, Episodes]:
+    """Return the trainer with a new policy, and its episodes, for an algorithm without stages.
+
+    Args:
+        task: the task.
+        settings: how to train.
+        compiled: whether steps are compiled.
+        address: of a Ray cluster whose processes play, see `executors.make_executor`.
+    """
     from torchdlo.agents.rl.ppo import Ppo
     from torchdlo.agents.rl.sac import Sac
     from torchdlo.agents.rl.shac import Sapo, Shac
@@ -35,9 +45,9 @@ def prepare_training(task: Task, settings: TrainingSettings, *, compiled: bool =
         soft = settings.algorithm in ("sac", "sapo")
         policy = task_policy(task, settings, state_sigma=soft, squash=settings.algorithm != "ppo")
         trainer = kinds[settings.algorithm](policy, settings)
-    episodes = TaskEpisodes(
+    make = functools.partial(
+        TaskEpisodes,
         task,
-        settings.count,
         seed=settings.seed,
         variation=settings.variation,
         gradients=settings.algorithm in ("shac", "sapo"),
@@ -46,7 +56,12 @@ def prepare_training(task: Task, settings: TrainingSettings, *, compiled: bool =
         scale=_scale(task),
         bonus=settings.bonus,
     )
-    return trainer, episodes
+    if not settings.collectors:
+        return trainer, make(settings.count)
+    from torchdlo.agents.rl.collectors import RayEpisodes
+
+    size = {"count": settings.count, "horizon": task.horizon, "workers": settings.collectors}
+    return trainer, RayEpisodes(make, trainer.policy, **size, address=address or "auto")
 
 
 _RETURNS = {

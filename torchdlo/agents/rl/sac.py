@@ -12,7 +12,8 @@ from torchrl.modules import ValueOperator
 from torchrl.objectives import SACLoss, SoftUpdate
 
 from torchdlo.agents.policies import Policy
-from torchdlo.agents.rl.episodes import Episodes
+from torchdlo.agents.rl.collectors import RayEpisodes
+from torchdlo.agents.rl.episodes import Episodes, Transition
 from torchdlo.agents.rl.ppo import Critic, torchrl_actor
 from torchdlo.agents.rl.rollout import Batch, policy_features
 from torchdlo.agents.rl.settings import TrainingSettings
@@ -81,6 +82,8 @@ class Sac:
     def iterate(self, episodes: Episodes) -> tuple[Batch, dict[str, float]]:
         """Play and learn; return what was played and how learning went."""
         s, policy = self.settings, self.policy
+        if isinstance(episodes, RayEpisodes):
+            return self._learn_from(episodes.collect(policy, uniform=self.done < s.warm))
         seen = episodes.reset()
         features = [policy_features(policy, episodes, 0, seen)]
         rows: list[dict[str, Tensor]] = []
@@ -102,11 +105,23 @@ class Sac:
             rows.append({"action": action, "log_prob": density, "reward": step.reward, "failed": step.failed})
             if self.done >= s.warm:
                 told += [self._learn() for _ in range(s.updates)]
-        self.done += 1
         kept = {name: torch.stack([row[name] for row in rows]) for name in rows[0]}
-        batch = Batch(torch.stack(features), **kept, success=step.success & ~step.failed)
-        if self.done <= s.warm:
-            policy.normaliser.update(batch.features)
+        return self._ended(Batch(torch.stack(features), **kept, success=step.success & ~step.failed), told)
+
+    def _learn_from(self, batch: Batch) -> tuple[Batch, dict[str, float]]:
+        """Learn from what collectors played: as often as beside playing, but after the whole batch."""
+        s, horizon = self.settings, len(batch.action)
+        for k in range(horizon):
+            step = Transition(batch.features[k + 1], batch.reward[k], batch.failed[k], batch.success)
+            pair = [batch.features[k], batch.features[k + 1]]
+            self._remember(pair, batch.action[k], step, batch.alive[k], last=k + 1 == horizon)
+        told = [self._learn() for _ in range(s.updates * horizon)] if self.done >= s.warm else []
+        return self._ended(batch, told)
+
+    def _ended(self, batch: Batch, told: list[dict[str, Tensor]]) -> tuple[Batch, dict[str, float]]:
+        self.done += 1
+        if self.done <= self.settings.warm:
+            self.policy.normaliser.update(batch.features)
         return batch, {k: float(torch.stack([t[k] for t in told]).mean()) for k in (told[0] if told else {})}
 
     def _remember(self, features: list[Tensor], action: Tensor, step: Any, alive: Tensor, *, last: bool) -> None:

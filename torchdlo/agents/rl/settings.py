@@ -91,6 +91,8 @@ class TrainingSettings:
     """Fidelity of training; results are judged at the published one."""
     variation: bool = True
     """Whether starts vary."""
+    collectors: int = 0
+    """Processes of a Ray cluster that play for PPO and SAC; 0: this one plays."""
     interval: float = 60.0
     """Seconds between checkpoints at most, as far as iterations allow."""
 
@@ -102,6 +104,10 @@ class TrainingSettings:
         need(self.algorithm in ALGORITHMS, "algorithm", f"one of {', '.join(ALGORITHMS)}")
         need(self.count >= 1, "count", "at least 1 episode at once")
         need(self.episodes >= self.count, "episodes", f"at least {self.count}, which are played at once")
+        alone = self.algorithm in ("ppo", "sac") or not self.collectors
+        need(alone, "collectors", f"0, as {self.algorithm} needs gradients; ppo and sac can have them")
+        even = self.collectors >= 0 and not self.count % max(1, self.collectors)
+        need(even, "collectors", f"a number that divides the {self.count} episodes that are played at once")
         need(self.minutes > 0, "minutes", "a positive number")
         need(0 <= self.seed < 2**32, "seed", "a whole number from 0 to 2^32 - 1")
         need(0 < self.gamma <= 1, "gamma", "a discount above 0, at most 1")

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from torchdlo.coupling.bodies.dynamics import RigidBody
 from torchdlo.envs.core.task import RADIUS, Arms, Task, TaskState, make, straight
+from torchdlo.envs.observations.cameras import TaskCamera
 from torchdlo.envs.tasks.coiling import BASE, HEIGHT, winding_angle
 from torchdlo.physics.linalg.numerics import safe_norm
 from torchdlo.scene import Params, Rope, Scene, State
@@ -40,6 +41,7 @@ class _CoilingAbout(Task):
     arms: ClassVar[Arms] = Arms(base=((-0.35, 0.0, 0.0),), vertex=(1,))
     anchored: ClassVar[bool] = True
     reset_noise: ClassVar[tuple[tuple[float, float], ...]] = ((0.03, 0.01),)
+    cameras: ClassVar[tuple[TaskCamera, ...]] = (TaskCamera("front", (0.65, 0.35, 0.75), (0.05, 0.0, 0.11)),)
 
     def build(self, moved: Tensor) -> tuple[Scene, Params, State]:
         """Return the scene; the rope may be moved."""
