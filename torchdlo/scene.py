@@ -265,7 +265,9 @@ def make(
         state, placed, particles = rod_coupling_effect.expand_batches(state, placed, tree.part(particles))
     effects = rod_coupling_effect.fitted(effects, medium, rods)
     solids = (kinds, tree.part(solid), tree.part(placed)) if bodies else None
-    tied, sits, pulls = (None, (), ())
+    tied: Joints | None = None
+    sits: JointParams | tuple[()] = ()
+    pulls: JointState | tuple[()] = ()
     if joints:
         validation.check_sequence(joints, RopeJoint, "joints")
         held, twisting = choices.get("prescribed_vertices", ()), choices.get("twist", "none") != "none"

@@ -311,9 +311,13 @@ def _restarted(problem: _Problem, start: Tensor, joints: Tensor, search: IkSearc
         def cut(x: Tensor, rows: Tensor = rows) -> Tensor:
             return x if len(x) == 1 else x[rows]
 
-        names = ("posture", "lower", "upper")
-        parts = {name: cut(getattr(problem, name)) for name in names}
-        part = dataclasses.replace(problem, target=tree.map(cut, problem.target), **parts)
+        part = dataclasses.replace(
+            problem,
+            target=tree.map(cut, problem.target),
+            posture=cut(problem.posture),
+            lower=cut(problem.lower),
+            upper=cut(problem.upper),
+        )
         # More steps from where it was may be all that it lacks.
         count, here_or_there = (1, joints) if again == 0 else (SEEDS, start)
         begin = _spread(part, here_or_there[rows], count, max(0, again - 1) * SEEDS)

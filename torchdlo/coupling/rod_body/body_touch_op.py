@@ -56,7 +56,7 @@ def _find_meta(edges: list[Tensor], vertices, bodies, grids, cells, shapes, piec
 
 def _back(
     edges: list[Tensor], vertices: list[Tensor], bodies: list[Tensor], grids: Tensor, by: Tensor, *static
-) -> tuple[Tensor, Tensor, Tensor]:
+) -> tuple[Tensor, ...]:
     out = tuple(x.zero_() for x in _back_meta(edges, vertices, bodies))
     places = (scene_packing.fields(x) for x in (edges, vertices, bodies))
     given, sizes = ctypes.c_void_p(by.data_ptr()), _sizes(bodies[0], grids, *static)

@@ -420,7 +420,8 @@ def _body(place: _Place, spec: RopeJoint, where: str) -> int:
 
 def _check_anchor(place: _Place, spec: RopeJoint, spot: tuple[tuple[int, float], ...], body: int, where: str) -> None:
     assert place.bodies is not None
-    kinds, params, placed = (tree.detach(x) if k else x for k, x in enumerate(place.bodies))
+    kinds, params, placed = place.bodies
+    params, placed = tree.detach(params), tree.detach(placed)
     here = sum(w * place.state.pos.detach()[..., k, :] for k, w in spot)
     local = rotate(conjugate(placed.quat[..., body, :]), here - placed.pos[..., body, :])
     radius = float(place.params.material.radius.detach().amax())
@@ -496,8 +497,8 @@ def apart(
         quat, centre = placed.quat.detach()[..., body : body + 1, :], placed.pos.detach()[..., body : body + 1, :]
         size, grid = (x.detach()[..., body : body + 1, :] for x in (solid.size, solid.grid))
         local = rotate(conjugate(quat).expand(*pos.shape[:-1], 4), pos - centre)
-        near = shape_sdf.probe(kinds[body].shape, size, local, grid, kinds[body].cells)[0] < 1.05 * radius
-        inside = near.reshape(-1, topology.size).any(0).tolist()
+        within = shape_sdf.probe(kinds[body].shape, size, local, grid, kinds[body].cells)[0] < 1.05 * radius
+        inside = within.reshape(-1, topology.size).any(0).tolist()
         for slot, _ in spot:
             for onward in (after, before):
                 here = slot

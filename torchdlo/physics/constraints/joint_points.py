@@ -135,7 +135,7 @@ class JointForces:
     """Torques on the edges whose frames bodies carry, about their axes [N m], shape (..., W, 1)."""
 
 
-FIELDS = tuple(field.name for field in dataclasses.fields(JointPoints))  # type: ignore[arg-type]  # a dataclass
+FIELDS = tuple(field.name for field in dataclasses.fields(JointPoints))
 
 
 @dataclasses.dataclass(frozen=True)

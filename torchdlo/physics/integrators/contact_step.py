@@ -503,8 +503,8 @@ def _engaged_meta(
     inputs: list[Tensor], parts: list[Tensor], pairs: list[Tensor], joints: list[Tensor], origin: Tensor, topology, law
 ) -> list[Tensor]:
     tension, moved, wanted, of = inputs[8], inputs[10], parts[_FIELDS.index("wanted")], parts[_FIELDS.index("of")]
-    shapes = [moved.shape[:-2], tension.shape[:-2], wanted.shape[:-3], *(x.shape[:-2] for x in pairs[:1])]
-    batch = torch.broadcast_shapes(*shapes, *([JointPoints(*joints).batch] if joints else []))
+    batches = [moved.shape[:-2], tension.shape[:-2], wanted.shape[:-3], *(x.shape[:-2] for x in pairs[:1])]
+    batch = torch.broadcast_shapes(*batches, *([JointPoints(*joints).batch] if joints else []))
     like, v, points = moved.new_empty, parse(topology).size, joints[0].shape[0] if joints else 0
     shapes = (v, 3), (v, 1), (of.shape[-1], 6), (1, 1), (points, 3)
     return [like(*batch, *shape) for shape in shapes]

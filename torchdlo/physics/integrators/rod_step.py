@@ -135,7 +135,8 @@ def substep(
     loads = effect.total_loads(settings.effects, now, values)
     kick = _kick(settings, now, loads, first, targets)
     falling = loads.get("acceleration", 0.0)
-    body, particles = (None if f is None else f(falling) for f in (predict_free_motion, material_points))
+    body: Any = None if predict_free_motion is None else predict_free_motion(falling)
+    particles = None if material_points is None else material_points(falling)
     twist = None if joints is None else joints.twist(now, loads)
     others = body if twist is None else body.pushed(twist), particles, joints
     pos, tension, push, contact = _answered(settings, now, loads, values, kick, targets, others)
@@ -354,7 +355,8 @@ def _joined(
     pull = found.tension * now.tangent
     force = kick.force + pull - now.prev(pull) + points.pulls(found.force)
     none, does = force.new_zeros(1, 3), JointForces(found.force, points.directors(found.moved, dt))
-    push = ContactForces(none, *joints.spread(points.wrench(found.force)), joints=does)
+    body_force, body_torque = joints.spread(points.wrench(found.force))
+    push = ContactForces(none, body_force, body_torque, joints=does)
     return pos, found.tension if settings.constrained else tension, force, push
 
 
@@ -389,8 +391,8 @@ def _balance(
         force = force - inertia.swing(topology, (1 - kick.free) * (moved - kick.drift)) / scale
     touch, joined = others
     if touch or joined is not None:
-        joints, tied = (None, None) if joined is None else joined
-        empty = (now.state.pos,) if tied is None else (now.state.pos, tied.resist, joints.place)
+        tied = None if joined is None else joined[1]
+        empty = (now.state.pos,) if joined is None else (now.state.pos, joined[1].resist, joined[0].place)
         pairs = next((x for x in touch if isinstance(x, Pairs)), None)
         points = next((x for x in touch if isinstance(x, Touch)), None) or untouched(*empty)
         system = LengthSystem(lengths, inertia, moved, kick.free, force, scale, now.tangent, ahead, share)
