@@ -208,6 +208,7 @@ def iiwa14() -> robot.Robot:
     return robot.load_robot(f'<robot name="iiwa14">{links}{joints}</robot>')
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("position_only", [False, True])
 @pytest.mark.parametrize("make", [arm, iiwa14])
 def test_all_of_a_hundred_reachable_poses_are_reached_and_settle_with_restarts(make, position_only):
