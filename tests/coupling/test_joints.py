@@ -156,6 +156,7 @@ def test_a_rope_and_a_plug_in_free_flight_keep_their_momentum(integrator: str, p
     scenes.check_state(state)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("cable", "plug"), [(0.01, 0.05), (0.2, 0.005)])
 @pytest.mark.parametrize("dt", [1e-3, 2e-3, 5e-3])
 def test_light_and_heavy_plugs_gain_no_energy(dt: float, cable: float, plug: float) -> None:

@@ -367,7 +367,8 @@ def solve_ik(
         search: how hard to look.
         posture: where joints would like to be [rad or m], shape (..., J); the middle of their ranges if not given.
         within_time: if given, joints go no further than their greatest speeds allow in that time [s].
-        position_only: whether the tool may be turned in any way; the orientation of the target is not looked at then.
+        position_only: whether the tool may be turned in any way; the orientation of the target is not looked at then,
+            postures seldom settle, and derivatives are not to be relied on.
     """
     check_joints(robot, start)
     given = start.dtype
