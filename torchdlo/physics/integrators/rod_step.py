@@ -248,7 +248,8 @@ def _answered(
     mobility = (kick.scale / firm).expand_as(firm)
     answer = mobility * kick.free
     pull = tension * now.params.rest.edge_mask * now.tangent
-    force, pushes, solved = kick.force + pull - now.prev(pull), dict[str, ContactForces](), "in the solve"
+    force, solved = kick.force + pull - now.prev(pull), "in the solve"
+    pushes: dict[str, ContactForces] = {}
     if joints is not None:
         tied = joints.points(now.state.pos, bodies)
         force = force + tied.pulls(tied.force)
