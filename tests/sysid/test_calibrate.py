@@ -14,7 +14,7 @@ from torchdlo.physics.effects.base import Param
 from torchdlo.sysid.calibration import refinement
 from torchdlo.sysid.calibration.calibrate import calibrate
 from torchdlo.sysid.diagnosis.effect_library import PARAMETERS
-from torchdlo.sysid.estimation import levenberg_marquardt
+from torchdlo.sysid.estimation import levenberg_marquardt, model_uncertainty
 from torchdlo.sysid.estimation.levenberg_marquardt import Point
 from torchdlo.sysid.model import initial_state
 from torchdlo.sysid.model.rope_model import RopeModel
