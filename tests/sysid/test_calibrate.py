@@ -14,7 +14,7 @@ from torchdlo.physics.effects.base import Param
 from torchdlo.sysid.calibration import refinement
 from torchdlo.sysid.calibration.calibrate import calibrate
 from torchdlo.sysid.diagnosis.effect_library import PARAMETERS
-from torchdlo.sysid.estimation import levenberg_marquardt
+from torchdlo.sysid.estimation import levenberg_marquardt, model_uncertainty
 from torchdlo.sysid.estimation.levenberg_marquardt import Point
 from torchdlo.sysid.model import initial_state
 from torchdlo.sysid.model.rope_model import RopeModel
@@ -318,9 +318,9 @@ def test_shear_lowers_stiffness_with_the_square_of_thickness_over_wavelength() -
     s, k, radius = np.linspace(0.0, 1.0, 41), 4 * np.pi, 0.004
     wave = np.sin(k * s) * np.sin(np.linspace(0.0, 2 * np.pi, 20, endpoint=False))[:, None]
     markers = np.stack([np.broadcast_to(s, wave.shape), wave, 0 * wave], -1)[None]
-    share = refinement.shear_share(markers, s, radius)
+    share = model_uncertainty.shear_share(markers, s, radius)
     assert share == pytest.approx(10 / 12 * (k * radius) ** 2, rel=0.02)
-    assert refinement.shear_share(markers, s, 2 * radius) == pytest.approx(4 * share)
+    assert model_uncertainty.shear_share(markers, s, 2 * radius) == pytest.approx(4 * share)
 
 
 def test_a_number_that_does_not_show_is_not_known() -> None:

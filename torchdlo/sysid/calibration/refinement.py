@@ -12,12 +12,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.interpolate import CubicSpline
 
 from torchdlo.sysid.diagnosis import budget as plans
 from torchdlo.sysid.diagnosis.workspace import Workspace
 from torchdlo.sysid.estimation.jobs import FitJob, Fitted, SimulationJob
 from torchdlo.sysid.estimation.levenberg_marquardt import Point, firm
+from torchdlo.sysid.estimation.model_uncertainty import CLAMP_SPREAD, radius_of_clamps, shear_share
 from torchdlo.sysid.estimation.worker_pool import Pool
 from torchdlo.sysid.model.rope_model import MAX_SUBSTEP
 from torchdlo.sysid.recordings.recording import Recording
@@ -36,18 +36,11 @@ _LEFT = (0.4, 1.0)
 _ALL = (1.5, 4.0)
 """and that simulations which are not corrected may be wrong by: all that finer ones change."""
 
-_CLAMP = 0.4
-"""Standard deviation of the place where a clamp begins to hold, by the radius of the rope."""
-
 _INDEPENDENT = 100
 """Readings of a trial that are independent of each other: about ten moments, three shapes, three coordinates."""
 
 _WILD = 0.1
 """Change of a trial from which it says nothing of small ones [m]."""
-
-_SHEAR = 10 / 12
-"""Bending over shearing stiffness of a round rope of one incompressible material, by the square of its radius:
-(7 + 6 nu) / 12, Cowper 1966, doi:10.1115/1.3625046."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,16 +123,15 @@ def _clamped(bench: Workspace, fitted: Fitted) -> list[np.ndarray]:
 
     That is known to about half a radius either way, as ropes are as thick as that.
     """
-    model = bench.pool.local.model(fitted.effects, fitted.options)
-    gaps = [float(np.ptp(model.mesh.marker_arclength[run[-2:] if run[0] == 0 else run[:2]])) for run in model.mesh.runs]
-    if not gaps or not bench.recording.radius:
+    less = radius_of_clamps(bench.pool.local.model(fitted.effects, fitted.options), bench.recording.radius)
+    if not less:
         return []
-    less = bench.recording.radius / float(np.mean(gaps))
-    options = dict(fitted.options) | {"clamp_fraction": model.clamp_fraction - less}
+    options = dict(fitted.options)
+    options["clamp_fraction"] = bench.pool.local.model(fitted.effects, fitted.options).clamp_fraction - less
     start = bench.starts["train"]
     jobs = [SimulationJob(fitted.effects, fitted.values[None], "train", start, tuple(options.items()))]
     ((_, (moved,)),) = bench.pool.simulate(jobs)
-    change = 2 * _CLAMP * (moved - bench.prediction(fitted, "train"))
+    change = CLAMP_SPREAD * (moved - bench.prediction(fitted, "train"))
     return [np.where((np.abs(change).max((1, 2, 3)) < _WILD)[:, None, None, None], change, 0.0)]
 
 
@@ -155,21 +147,3 @@ def _thickness(bench: Workspace, fitted: Fitted) -> np.ndarray:
     arclength = bench.pool.local.model(fitted.effects).mesh.marker_arclength
     out[space.names.index("bending_stiffness")] = shear_share(bench.prediction(fitted, "train"), arclength, radius)
     return out
-
-
-def shear_share(markers: np.ndarray, arclength: np.ndarray, radius: float) -> float:
-    """Return by how much shear lowers the bending stiffness that a round rope of one material shows [1].
-
-    Args:
-        markers: places of the markers [m], shape (B, F, M, 3).
-        arclength: where along the rope they are [m], shape (M,).
-        radius: of the rope [m].
-    """
-    ran = markers[np.isfinite(markers).all((1, 2, 3))]
-    if not len(ran) or len(arclength) < 4:
-        return 0.0
-    # What moves tells the stiffness.
-    spline = CubicSpline(arclength, ran - ran.mean(1, keepdims=True), axis=2)
-    at = np.linspace(arclength[0], arclength[-1], 8 * len(arclength))[1:-1]
-    bending, change = (float((spline(at, order) ** 2).sum()) for order in (2, 3))
-    return min(_SHEAR * radius**2 * change / max(bending, 1e-300), 1.0)

@@ -185,10 +185,9 @@ def _fitted(own: FilmedProblem, raw: np.ndarray, iterations: int, report: Callba
     report(stage, 1, 3, f"{1e3 * best.cost:.2f} mm")
     best = restart(own, fit(own, best.raw, iterations), iterations)
     report(stage, 2, 3, f"{1e3 * best.cost:.2f} mm")
-    if own.offset.shape[1]:
-        # What steps damp is taken for damping, and starts in motion swing more than a rope at rest.
-        own.take(own.with_options(substep=own.model.dt / (2 * own.model.substeps)))
-        best = fit(own, best.raw, min(iterations, _LAST))
+    # What steps damp is taken for damping.
+    own.take(own.with_options(substep=own.model.dt / (2 * own.model.substeps)))
+    best = fit(own, best.raw, min(iterations, _LAST))
     gate(own, own.space.to_values(best.raw))
     best = _corrected(own, best.raw, iterations)
     report(stage, 3, 3, f"{1e3 * best.cost:.2f} mm")

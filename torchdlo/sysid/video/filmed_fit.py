@@ -13,6 +13,7 @@ import numpy as np
 
 from torchdlo.sysid.estimation import levenberg_marquardt
 from torchdlo.sysid.estimation.levenberg_marquardt import Point
+from torchdlo.sysid.estimation.model_uncertainty import CLAMP_SPREAD, radius_of_clamps, shear_share
 from torchdlo.sysid.estimation.observation import INDEPENDENT, SURE, Spines
 from torchdlo.sysid.video.filmed_problem import FilmedProblem
 
@@ -254,12 +255,23 @@ def spread(own: FilmedProblem, found: Fit) -> tuple[Point, np.ndarray]:
         sims = own.simulate(values)
         read = own.spines.changes(sims, values[:, numbers:])
         # Next to clamps the mesh's error may be of first order: extrapolating to that would change twice as much.
-        for factor, wrong in zip((1.0, 2.0), own.discretisation_correction.unsure, strict=True):
-            moved = np.concatenate([sims, sims + factor * np.nan_to_num(wrong)[None]])
+        unsure = [f * np.nan_to_num(x) for f, x in zip((1.0, 2.0), own.discretisation_correction.unsure, strict=True)]
+        radius = own.model.recording.radius
+        if less := radius_of_clamps(own.model, radius):
+            # Where a clamp begins to hold is known to about half a radius, and the model's rope does not shear.
+            other = own.with_options(clamp_fraction=own.model.clamp_fraction - less)
+            unsure.append(CLAMP_SPREAD * np.nan_to_num(other.simulate(values) - sims)[0])
+        for wrong in unsure:
+            moved = np.concatenate([sims, sims + wrong[None]])
             change = own.spines.changes(moved, np.repeat(values[:, numbers:], 2, 0))[1, ..., 0] - read[0, ..., 0]
             weighted = replace(found, residual=found.residual + change)
             g, h = (x.sum(0) for x in eliminated(*_difference(own, found, weighted), found.offset.shape[1]))
             drifts = np.concatenate([drifts, np.linalg.solve(levenberg_marquardt.firm(h), g)[None]])
+        if radius and "bending_stiffness" in space.names:
+            share = np.zeros((1, len(space.names)))
+            arclength = own.model.mesh.marker_arclength
+            share[0, space.names.index("bending_stiffness")] = shear_share(sims[0], arclength, radius)
+            drifts = np.concatenate([drifts, share])
     return point, drifts
 
 
