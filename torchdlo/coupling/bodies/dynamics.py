@@ -112,8 +112,7 @@ class PredictedBodyMotion:
     inverse_inertia: Tensor
     """By how much a torque turns them about their principal axes, 0 if not free [rad/(N m)], shape (..., K, 3)."""
     hold: Tensor | None = None
-    """How what stands behind free bodies resists their displacements and turns from there [N/m, N m/rad], shape
-    (..., F, 6, 6); None where nothing does."""
+    """How what stands behind free bodies resists their motion from there [N/m, N m/rad], shape (..., F, 6, 6)."""
 
     def turned(self, torque: Tensor) -> Tensor:
         """Return by how much torques in the world turn the bodies [rad], shape (..., K, 3)."""

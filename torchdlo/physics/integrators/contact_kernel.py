@@ -175,6 +175,7 @@ class _Call:
     plan: _Plan
     tensors: list[Tensor]
     corners: Tensor | None
+    """Corners of pairs of edges [1], shape (..., 4, K); None without pairs."""
 
     def addresses(self) -> tuple[ctypes.Array, ctypes.c_void_p]:
         """Return where the tensors are."""
