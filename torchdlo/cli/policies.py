@@ -112,10 +112,10 @@ def train(
     torchdlo evaluate runs/train/wiring_post-hybrid
     """
     from torchdlo.agents.rl.settings import training_preset
-    from torchdlo.envs import find
+    from torchdlo.envs import find, short_name
 
     _quiet()
-    out = out or Path("runs") / "train" / f"{task}-{algo}{f'-{seed}' if seed else ''}"
+    out = out or Path("runs") / "train" / f"{short_name(task)}-{algo}{f'-{seed}' if seed else ''}"
     for name in ("result.json", "log.csv", "curve.png"):
         if not resume:
             check_writable(out / name, mark=b"torchdlo" if name != "log.csv" else b"episodes")

@@ -243,6 +243,9 @@ def test_a_task_of_ones_own_is_told_what_it_says_of_itself(tmp_path: Path) -> No
     name = f"{HERE / 'short_task.py'}:Short"
     make_dataset(plan(tasks=(name,), episodes=1, size=0), tmp_path / "own")
     assert open_set(tmp_path / "own").tasks == ("Lead the first end of a short rope to the left of a place.",)
+    assert not list(HERE.glob("short_task.py:*"))  # all that was written is in the set's folder
+    with pytest.raises(InputError, match="the task Short is named twice"):
+        plan(tasks=(name, f"other/{name}"))
 
 
 def test_a_stored_trajectory_is_followed_from_other_starts(tmp_path: Path) -> None:

@@ -14,7 +14,7 @@ from torch import Tensor
 from torchdlo.agents.data.demonstrators import scripted_demonstrator
 from torchdlo.agents.data.painting import TaskPainter
 from torchdlo.agents.data.record import Noise, draw_starts, play_batch, scene_in_time
-from torchdlo.envs import Task, find, with_fidelity
+from torchdlo.envs import Task, find, short_name, with_fidelity
 from torchdlo.envs.core import episode
 from torchdlo.envs.observations.pixels import camera_rig, placed
 from torchdlo.errors import InputError
@@ -36,7 +36,7 @@ _KEPT = ("pos", "turn", "ropes", "particles", "rotation", "shift", "target")
 
 def scene_file(folder: Path, name: str, number: int) -> Path:
     """Return the file of a batch of demonstrations."""
-    return folder / f"{name}-{number:04d}.npz"
+    return folder / f"{short_name(name)}-{number:04d}.npz"
 
 
 def _prepared(task: Task, size: int) -> episode.Episode:

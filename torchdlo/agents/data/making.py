@@ -26,7 +26,7 @@ from torchdlo.agents.data.reading import column_array
 from torchdlo.agents.data.record import Noise, Painter, draw_starts, record_attempts
 from torchdlo.agents.distributed import Executor, Serial
 from torchdlo.agents.trajopt.search_journal import code_versions
-from torchdlo.envs import Task, find, with_fidelity
+from torchdlo.envs import Task, find, short_name, with_fidelity
 from torchdlo.envs.core import episode
 from torchdlo.errors import InputError
 from torchdlo.journal import locked, read_json, write_json
@@ -67,9 +67,10 @@ class DatasetPlan:
     def __post_init__(self) -> None:
         if not self.tasks or self.episodes < 1:
             raise InputError("a data set needs one task and one episode or more.")
-        twice = {name for name in self.tasks if self.tasks.count(name) > 1}
+        names = [short_name(name) for name in self.tasks]
+        twice = {name for name in names if names.count(name) > 1}
         if twice:
-            raise InputError(f"the task {', '.join(sorted(twice))} is named twice.")
+            raise InputError(f"the task {', '.join(sorted(twice))} is named twice; folders go by the names of tasks.")
         if self.noise is not None and not 0 <= self.noise <= 0.01:
             raise InputError(f"noise: expected 0 to 0.01 m, given {self.noise:g}.")
         _ = self.schema  # says what is wrong with names, size or codec
@@ -208,7 +209,7 @@ def _gather(
     callback: Callable[[str, int, int, str], None] | None,
 ) -> list[attempts.Attempt]:
     """Return the attempts at a task in order, up to the last that is needed; play those that are not there."""
-    place = folder / task
+    place = folder / short_name(task)
     known: dict[int, attempts.Attempt] = {}
     for each in sorted(place.glob("[0-9]*")):
         if (found := attempts.read_attempt(each, _key(plan))) is not None:

@@ -73,7 +73,10 @@ class Sweep:
     @property
     def jobs(self) -> list[Job]:
         """The jobs, seed by seed."""
-        names = [Path(subject).resolve().name if self.kind == "diagnose" else subject for subject in self.subjects]
+        from torchdlo.envs import short_name
+
+        named = (lambda path: Path(path).resolve().name) if self.kind == "diagnose" else short_name
+        names = [named(subject) for subject in self.subjects]
         if len(set(names)) < len(names):
             raise InputError(f"sweep: two of {', '.join(names)} have the same name.")
         found = []
