@@ -233,6 +233,12 @@ def learn(
     epochs: Annotated[int, typer.Option(min=1, help="Times that all frames are seen.")] = 40,
     batch: Annotated[int, typer.Option(min=1, help="Frames of a step.")] = 64,
     rate: Annotated[float, typer.Option(help="Largest learning rate.")] = 1e-3,
+    size: Annotated[
+        int, typer.Option(min=0, help="Width to which pictures are made smaller [px]; 0: as the set has them.")
+    ] = 0,
+    start: Annotated[
+        Path | None, typer.Option("--from", help="Policy whose weights to begin with; its network is kept.")
+    ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the weights and of the order of frames.")] = 0,
     language: Annotated[str, typer.Option(help="How sentences become vectors.", metavar="auto|minilm|hashed")] = "auto",
     threads: Annotated[int, typer.Option(min=1, help="Cores.")] = 2,
@@ -246,6 +252,7 @@ def learn(
     """
     import torch
 
+    from torchdlo.agents.policies.chunk_policy import load_policy
     from torchdlo.agents.policies.chunk_training import Training
     from torchdlo.agents.policies.chunk_training import train_chunk_policy as run
 
@@ -256,7 +263,10 @@ def learn(
     if device not in ("cpu", "cuda") or (device == "cuda" and not torch.cuda.is_available()):
         raise InputError(f"--device: expected cpu, or cuda where there is a GPU, given {device}.")
     training = Training(epochs=epochs, batch=batch, rate=rate, seed=seed, language=language, device=device)
-    found = _learned(lambda show: run(path, out, training, resume=resume, callback=show), out)
+    if start is not None:
+        shape = load_policy(start)[0].shape
+        training, size = training.like(shape), size or shape.size
+    found = _learned(lambda show: run(path, out, training, size=size, start=start, resume=resume, callback=show), out)
     if found["language"] == "hashed":
         typer.echo(
             "sentences are hashed word by word, and others that mean the same may not be understood; pip install "

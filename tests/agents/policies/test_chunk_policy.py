@@ -229,6 +229,33 @@ def test_training_can_begin_with_the_weights_of_a_policy(data: Path, learned: Pa
         train_chunk_policy(data, tmp_path / "other.pt", other, start=learned)
 
 
+def test_learning_goes_on_from_a_policy_and_from_smaller_pictures(
+    data: Path, learned: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    size = load_policy(learned)[0].shape.size
+    half, more = tmp_path / "half.pt", tmp_path / "more.pt"
+
+    def learn(*words: object) -> int:
+        with pytest.raises(SystemExit) as end:
+            app.main(["learn", str(data), "--epochs", "1", *map(str, words)])
+        return int(end.value.code or 0)
+
+    assert learn("--size", size // 2, "--out", half) == learn("--from", half, "--out", more) == 0
+    assert load_policy(more)[0].shape == load_policy(half)[0].shape and load_policy(half)[0].shape.size == size // 2
+    capsys.readouterr()
+    assert learn("--size", 2 * size, "--out", tmp_path / "big.pt") == 2
+    assert f"expected a size below, given {2 * size}" in capsys.readouterr().err
+
+
+def test_smaller_pictures_are_means_of_what_their_pixels_cover(data: Path, tmp_path: Path) -> None:
+    (tmp_path / "small").mkdir()
+    whole = chunk_frames.read_frames(open_set(data), "hashed", tmp_path, lambda *_: None)
+    small = chunk_frames.read_frames(open_set(data), "hashed", tmp_path / "small", lambda *_: None, whole.size // 2)
+    for name, x in whole.pictures.items():
+        mean = np.asarray(x, float).reshape(*x.shape[:2], small.size, 2, small.size, 2).mean((3, 5))
+        assert np.abs(np.asarray(small.pictures[name]) - mean).max() <= 0.5
+
+
 def test_learning_from_a_damaged_set_is_one_sentence(data: Path, tmp_path: Path) -> None:
     for part, said in (("data", "damaged and cannot be read"), ("videos", "file-000.mp4")):
         own = tmp_path / part

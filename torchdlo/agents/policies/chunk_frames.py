@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.functional import interpolate
 
 from torchdlo.agents.data.reading import DataSet
 from torchdlo.agents.policies import language
@@ -128,8 +129,18 @@ class SetFrames:
         return SetFrames(**moved, pictures=pictures, description=self.description)
 
 
-def read_frames(data: DataSet, encoder: str, folder: Path, callback: Callable[[str, int, int, str], None]) -> SetFrames:
-    """Return the frames of a set; pictures are decoded into files in a folder."""
+def read_frames(
+    data: DataSet, encoder: str, folder: Path, callback: Callable[[str, int, int, str], None], size: int = 0
+) -> SetFrames:
+    """Return the frames of a set; pictures are decoded into files in a folder.
+
+    Args:
+        data: the set.
+        encoder: how sentences become vectors.
+        folder: where the files go.
+        callback: told (stage, done, in all, message).
+        size: width and height to which pictures are made smaller [px]; 0: as they are.
+    """
     if not data.cameras:
         raise InputError(f"{data.path}: has no pictures; the policy learns from what it sees.")
     columns, count = data.columns(), data.info["total_frames"]
@@ -142,14 +153,20 @@ def read_frames(data: DataSet, encoder: str, folder: Path, callback: Callable[[s
     pictures: dict[str, np.ndarray] = {}
     for camera in data.cameras:
         height, width, _ = data.features[camera]["shape"]
+        if size > min(height, width):
+            raise InputError(
+                f"{data.path}: its pictures are {width} x {height} pixels; expected a size below, given {size}."
+            )
+        height, width = (size, size) if size else (height, width)
         file = folder / f"{camera}.u8"
         pictures[camera.removeprefix(IMAGES)] = np.memmap(file, np.uint8, "w+", shape=(count, 3, height, width))
     for k, row in enumerate(data.episodes):
         start, end = row["dataset_from_index"], row["dataset_to_index"]
         first[start:end], last[start:end] = start, end - 1
         for camera in data.cameras:
-            shots = np.stack(list(data.pictures(k, camera)))
-            pictures[camera.removeprefix(IMAGES)][start:end] = shots.transpose(0, 3, 1, 2)
+            kept = pictures[camera.removeprefix(IMAGES)]
+            shots = torch.from_numpy(np.stack(list(data.pictures(k, camera))).transpose(0, 3, 1, 2))
+            kept[start:end] = _smaller(shots, kept.shape[2]).numpy()
         callback("read", k + 1, len(data.episodes), "")
     target = columns["torchdlo.target"].reshape(count, -1, 7)[..., :3].reshape(count, -1)
     targets = torch.from_numpy(np.ascontiguousarray(target))
@@ -164,6 +181,13 @@ def read_frames(data: DataSet, encoder: str, folder: Path, callback: Callable[[s
         pictures,
         _about(data, encoder),
     )
+
+
+def _smaller(shots: Tensor, size: int) -> Tensor:
+    """Return pictures (N, 3, H, W), 8 bits, with another height and width: the mean of what a pixel covers."""
+    if shots.shape[2] == size:
+        return shots
+    return interpolate(shots.float(), (size, size), mode="area").round().to(torch.uint8)
 
 
 def _about(data: DataSet, encoder: str) -> dict[str, Any]:

@@ -8,7 +8,7 @@ import shutil
 import tempfile
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -74,6 +74,11 @@ class Training:
                 "training: epochs, batch and chunk are 1 or more, and the learning rate is between 0 and 1."
             )
 
+    def like(self, shape: NetworkShape) -> Training:
+        """Return the same for a network of this shape."""
+        kept = {name: getattr(shape, name) for name in ("chunk", "width", "channels", "tokens", "layers")}
+        return replace(self, **kept, proprioception=bool(shape.state))
+
 
 class Source(Protocol):
     """What is learned from."""
@@ -120,6 +125,7 @@ def train_chunk_policy(
     out: Path,
     training: Training | None = None,
     *,
+    size: int = 0,
     start: Path | None = None,
     resume: bool = False,
     callback: Callback | None = None,
@@ -130,6 +136,7 @@ def train_chunk_policy(
         path: a data set of `torchdlo dataset make`.
         out: the policy's file; a checkpoint lies beside it until training is over.
         training: how to train.
+        size: width of the pictures that it sees [px]; 0: as the set has them.
         start: a policy of the same network, whose weights to begin with.
         resume: go on from the checkpoint; with the same number of threads the policy comes out the same.
         callback: told (stage, done, in all, message); may raise KeyboardInterrupt.
@@ -141,7 +148,7 @@ def train_chunk_policy(
         locked(out.parent, f".{out.name}.lock"),
         tempfile.TemporaryDirectory(prefix=swept(out), dir=out.parent) as folder,
     ):
-        frames = read_frames(data, encoder, Path(folder), told)
+        frames = read_frames(data, encoder, Path(folder), told, size)
         if (device := torch.device(training.device)).type == "cuda":
             frames = frames.on(device, torch.cuda.mem_get_info(device)[0] // 2)
         run = ChunkRun(frames, training, start)
