@@ -6,12 +6,14 @@ Run by `make lerobot` in an environment of its own, which has LeRobot and not to
 from __future__ import annotations
 
 import argparse
+import hashlib
 import os
 import random
 import subprocess
 import sys
 import tempfile
 from pathlib import Path
+from typing import Any
 
 os.environ |= {"HF_HUB_OFFLINE": "1", "HF_DATASETS_OFFLINE": "1"}
 
@@ -39,24 +41,32 @@ def read(root: Path, folder: Path) -> None:
 
     data = LeRobotDataset("local/set", root=root, video_backend="pyav")
     cameras = [name for name, what in data.meta.features.items() if what["dtype"] == "video"]
-    every = [data[k] for k in range(len(data))]
+    said, every = set(), []
+    for k in range(len(data)):
+        frame = data[k]
+        said.add(frame["task"])
+        every.append([mark(frame[camera]) for camera in cameras])
     for k in random.Random(0).sample(range(len(data)), min(40, len(data))):
         again = data[k]
         assert int(again["index"]) == k and isinstance(again["task"], str)
-        for camera in cameras:
-            assert torch.equal(again[camera], every[k][camera]), f"{camera}, frame {k}: another picture"
-    print(f"{len(data)} frames, the same in random order; instructions: {sorted({f['task'] for f in every})[:3]}")
+        for camera, first in zip(cameras, every[k], strict=True):
+            assert mark(again[camera]) == first, f"{camera}, frame {k}: another picture"
+    print(f"{len(data)} frames, the same in random order; instructions: {sorted(said)[:3]}")
     window = {"action": [0, 1 / data.fps, 2 / data.fps], cameras[0]: [-1 / data.fps, 0]} if cameras else {}
     some = LeRobotDataset("local/set", root=root, video_backend="pyav", episodes=[0], delta_timestamps=window)
-    assert some[1]["action"].shape[0] == 3 and torch.equal(some[1][cameras[0]][0], every[0][cameras[0]])
+    assert some[1]["action"].shape[0] == 3 and mark(some[1][cameras[0]][0]) == every[0][0]
     batch = next(iter(torch.utils.data.DataLoader(data, batch_size=8)))
     print("windows and loader:", {name: tuple(x.shape) for name, x in batch.items() if name in ("action", *cameras)})
     whole = merge_datasets([data, data], output_repo_id="local/two", output_dir=folder / "two")
     assert len(whole) == 2 * len(data)
     for k in (0, len(data) - 1, len(data), len(whole) - 1):
-        off = (whole[k][cameras[0]] - every[k % len(data)][cameras[0]]).abs().max()
-        assert off == 0, f"after merging, frame {k} is off by {off}"
+        assert mark(whole[k][cameras[0]]) == every[k % len(data)][0], f"after merging, frame {k} is another picture"
     print("merged:", len(whole))
+
+
+def mark(picture: Any) -> str:
+    """Return what tells a picture from others, without keeping it: a large set would not fit into memory."""
+    return hashlib.sha256(picture.contiguous().numpy().tobytes()).hexdigest()
 
 
 def train(root: Path, out: Path, steps: int) -> None:
