@@ -81,6 +81,30 @@ def test_a_search_for_a_robust_path_is_repeatable_and_goes_on(tmp_path: Path):
     assert (told, count) == (log, played)
 
 
+class Vain(Lead):
+    """Nothing succeeds here."""
+
+    def success(self, seen):
+        return torch.zeros_like(super().success(seen))
+
+
+class Double(Lead):
+    """Has a surrogate."""
+
+    def surrogate(self):
+        return Vain(fidelity=self.fidelity)
+
+
+def test_a_path_is_searched_in_the_surrogate_and_compared_in_the_task_itself(tmp_path: Path):
+    file = found(tmp_path)
+    _, notes = train_hybrid(Double(), [file], settings(), folder=tmp_path, plan=PLAN, stages=("robust", "clone"))
+    log = notes["robust"]["log"]
+    searched, compared = [row for row in log if "playoff" not in row], [row for row in log if "playoff" in row]
+    assert all(row["success"] == 0 for row in searched) and len(searched) == 2 + PLAN.generations
+    assert [row["playoff"] for row in compared] == ["before", "after"] and compared[0]["success"] > 0.5
+    assert notes["robust"]["episodes"] == 2 * 8 + 2 * 5 * 4 + 2 * 16
+
+
 def test_a_clone_does_what_its_expert_does(tmp_path: Path):
     policy, notes = train_hybrid(Lead(), [found(tmp_path)], settings(), folder=tmp_path, plan=PLAN)
     assert notes["clone"]["episodes"] == 3 * 16

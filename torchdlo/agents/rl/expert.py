@@ -228,6 +228,7 @@ def improve_expert(
     noise: float = 0.0015,
     enough: float = 0.99,
     minutes: float = math.inf,
+    judged: Task | None = None,
     journal: Path | None = None,
     callback: Callback | None = None,
 ) -> tuple[Expert, list[dict[str, Any]], int]:
@@ -247,6 +248,7 @@ def improve_expert(
         noise: of actions [m].
         enough: see above.
         minutes: budget of the clock.
+        judged: the task itself where `task` is its surrogate: what the search found has to be better there.
         journal: file that keeps how candidates did; a search that finds one of the same choices goes on from there.
         callback: told (stage, generations done, all, message).
     """
@@ -254,7 +256,10 @@ def improve_expert(
     if not experts:
         raise InputError(f"{task.name}: there is no trajectory that succeeds; search one with torchdlo optimize first.")
     choices = [task.name, task.fidelity.text, seed, starts, population, sigma, noise]
-    arena = _Arena(task, seed, noise, _Journal(journal, choices))
+    choices += [] if judged is None else [judged.fidelity.text]
+    kept = _Journal(journal, choices)
+    arena = _Arena(task, seed, noise, kept)
+    final = arena if judged is None else _Arena(judged, seed, noise, kept)
     scores = arena.scores(experts, 2 * starts, 0)
     scale = max(abs(s.returns) for s in scores) or 1.0
     best = max(range(len(experts)), key=lambda k: scores[k].value(scale))
@@ -280,9 +285,10 @@ def improve_expert(
     if good < 3:
         mean = _changed(base, torch.tensor(search.mean), task)
     # A search may lose its way: the path that it began with is the one to beat, from starts that neither has seen.
-    scores = arena.scores([base, mean], 4 * starts, 100_000)
+    scores = final.scores([base, mean], 4 * starts, 100_000)
     log += [{"playoff": name, **vars(s)} for name, s in zip(("before", "after"), scores, strict=True)]
-    return (mean if scores[1].value(scale) >= scores[0].value(scale) else base), log, arena.played
+    played = arena.played + (0 if final is arena else final.played)
+    return (mean if scores[1].value(scale) >= scores[0].value(scale) else base), log, played
 
 
 class _Arena:
