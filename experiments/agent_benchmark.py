@@ -92,7 +92,7 @@ def asked(task: envs.Task, model: Any, mode: str) -> tuple[int | None, ...]:
     from torchdlo.report.render.episode_film import stills
     from torchdlo.report.render.marks import marked_view
 
-    made = episode.prepare(task, 1, compiled=False)
+    made = episode.prepare(task, 1, execution="eager")
     view = marked_view(stills(made, [made.start], arms=False))
     return propose_grasps(task, mode, Conversation(model), view).grasps
 
@@ -113,7 +113,7 @@ def stored(name: str) -> Tensor:
 def searched(name: str, grasps: tuple[int | None, ...], options: Any) -> dict[str, Any]:
     """Return what a search with grasps comes to."""
     begun, own = time.process_time(), grasps == envs.find(name).arms.vertex
-    chosen = task_problem(name, grasps=None if own else grasps, compiled=False, recorded=True)
+    chosen = task_problem(name, grasps=None if own else grasps, execution="recorded")
     given = {"episodes": options.episodes, "population": options.population}
     first = stored(name) if options.begin == "stored" else None
     found = optimize(chosen, search_preset(name, options.method, surrogate_share=0.0, **given), first=first)

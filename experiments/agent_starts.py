@@ -88,12 +88,12 @@ def played(name: str, file: Path, update: bool, starts: int, most: int = 99) -> 
     seeds = [torch.Generator().manual_seed(k) for k in range(starts)]
     moved = torch.cat([task.moved(1, like=like, generator=g, variation=True) for g in seeds])
     holds = tuple(steps[0].grasps.model_dump().values())
-    world = episode.prepare_at(dataclasses.replace(task, grasps=holds), moved, compiled=False).start
+    world = episode.prepare_at(dataclasses.replace(task, grasps=holds), moved, execution="eager").start
     done = torch.zeros(starts, dtype=torch.bool)
     searched = torch.zeros_like(done)
     for number, step in enumerate(steps[:most], 1):
         judged, part = reward(step.reward, step.success, "reward"), part_of(task, world, step, holds)
-        made = episode.prepare_at(part, torch.zeros_like(moved), compiled=False, recorded=True)
+        made = episode.prepare_at(part, torch.zeros_like(moved), execution="recorded")
         if part.travels:
             idle = like.new_zeros(starts, part.travels, task.width)
             made = dataclasses.replace(made, start=episode.play(part, idle, episode=made).world)

@@ -36,7 +36,7 @@ def measure(name: str, starts: int, seed: int, horizon: int | None) -> dict[str,
     # From the one start: nothing and the scripted demonstration; from all others: nothing, random actions and the
     # scripted demonstration.
     moved = torch.cat([torch.zeros(2, *away.shape[1:]), away, away, away])
-    base = episode.prepare(task, len(moved), compiled=False, recorded=horizon is None)
+    base = episode.prepare(task, len(moved), execution="recorded" if horizon is None else "eager")
     _, params, state = task.build(moved)
     base = replace(base, params=params)
     base = replace(base, start=episode.begin(base, state))

@@ -82,7 +82,10 @@ def timed(made: tuple[Any, Any, Any], backward: bool, seconds: float, compiled: 
 
     torch.set_num_threads(1)
     choice, params, state = made
-    step, control = scene.stepper(choice, compiled=compiled), scene.stationary_control(choice, state)
+    step, control = (
+        scene.stepper(choice, execution="compiled" if compiled else "eager"),
+        scene.stationary_control(choice, state),
+    )
 
     def forward(count: int) -> None:
         now = state

@@ -116,7 +116,7 @@ def measure(scenario: str, scenes: int, mode: str, options: Any) -> dict[str, An
     from torchdlo import scene
 
     made = build(scenario, scenes, "float32", options.device)
-    step = scene.stepper(made[0], compiled=not options.eager)
+    step = scene.stepper(made[0], execution="eager" if options.eager else "compiled")
     run = bench_rod.forward if mode == FORWARD else functools.partial(bench_rod.gradient, segment=1)
     if options.device != "cpu":
         torch.cuda.reset_peak_memory_stats()

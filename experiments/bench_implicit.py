@@ -40,7 +40,7 @@ def played(made: tuple[Any, Any, Any], seconds: float) -> Any:
     from torchdlo import scene
 
     choice, params, state = made
-    step = scene.stepper(choice, compiled=False, recorded=True)
+    step = scene.stepper(choice, execution="recorded")
     control = scene.stationary_control(choice, state)
     with torch.no_grad():
         for _ in range(round(seconds / choice.dt)):
@@ -70,7 +70,7 @@ def timed(scenes: int, way: dict[str, Any], start: float, repeats: int) -> dict[
     choice, params, state = cell(scenes, way)
     state = played((choice, params, state), start)
     control = scene.stationary_control(choice, state)
-    recorded, plain = (scene.stepper(choice, compiled=False, recorded=r) for r in (True, False))
+    recorded, plain = (scene.stepper(choice, execution=r) for r in (True, False))
 
     def forward() -> None:
         now = state

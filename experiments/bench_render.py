@@ -43,7 +43,7 @@ def scene():
             posts = [RigidBody("cylinder", (0.02, 0.02), (0.4 + 0.1 * k, 0.2, 0.02), motion="fixed") for k in range(3)]
             return make(self, [Rope(x, RADIUS / 2, mass=0.01, youngs=1e4)], solids=posts)
 
-    return episode.prepare(Posts(), 1, compiled=False)
+    return episode.prepare(Posts(), 1, execution="eager")
 
 
 def main() -> None:

@@ -59,7 +59,7 @@ def scripted(name: str, folder: Path) -> Path:
         task = find(name)
         with torch.no_grad():
             actions = task.demonstration().float()[None]
-            went = episode.play(task, actions, keep=episode.scene_positions, compiled=False, recorded=True)
+            went = episode.play(task, actions, keep=episode.scene_positions, execution="recorded")
         content = {"generator": "torchdlo optimize", "task": name, "success": bool(went.success[0])}
         save(str(file), content | {"tool": went.path["tool"][:, 0].tolist()})
     return file

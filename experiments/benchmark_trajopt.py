@@ -184,7 +184,10 @@ def solve(task: str, args: Any) -> list[tuple[Case, dict[str, Any]]]:
     from torchdlo.agents.trajopt.task_problem import task_problem
     from torchdlo.cli.progress import deferred_interrupt, progress
 
-    chosen, wanted = task_problem(task, double=args.double, compiled=args.compiled), cases(task, args)
+    chosen, wanted = (
+        task_problem(task, double=args.double, execution="eager" if args.smoke else "compiled"),
+        cases(task, args),
+    )
     left = [case for case in wanted if case.found(chosen, args.again, args.minutes is not None) is None]
     end = math.inf if args.minutes is None else time.monotonic() + 60 * args.minutes
     for case in left:
@@ -269,7 +272,6 @@ def arguments(words: list[str] | None = None) -> Any:
     parser.flag("quiet", "search only; no table")
     parser.flag("smoke", "one iteration of each method on short episodes with uncompiled steps")
     args = parser.parse_args(words)
-    args.compiled = not args.smoke
     for name, known in (("tasks", TASKS), ("methods", METHODS)):
         chosen = [word for word in getattr(args, name).split(",") if word]
         wrong = [word for word in chosen if word not in known]

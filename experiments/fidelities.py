@@ -35,7 +35,7 @@ def play(name: str, fidelity: str, most: int | None) -> dict[str, Any]:
     task = with_fidelity(find(name), parse_fidelity(fidelity))
     row: dict[str, Any] = {"task": name, "fidelity": fidelity}
     try:
-        made = episode.prepare(task, 1, compiled=False, recorded=True)
+        made = episode.prepare(task, 1, execution="recorded")
     except InputError as error:
         return row | {"return": math.nan, "success": False, "failed": True, "cpu_s": math.nan, "missed": str(error)}
     actions = task.demonstration()[:most].float().unsqueeze(0)

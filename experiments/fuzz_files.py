@@ -360,7 +360,7 @@ def _trajectory(folder: Path) -> None:
     from torchdlo.agents.trajopt.task_problem import TaskProblem
     from torchdlo.envs import find
 
-    problem = TaskProblem(find("lifting"), compiled=False)
+    problem = TaskProblem(find("lifting"), execution="eager")
     actions = np.full((problem.horizon, problem.width), 0.01)
     tool = np.zeros((problem.horizon, problem.task.arms.count, 3)).tolist()
     choices = {"double": False, "compiled": True, "recorded": False, "rope": None, "grasps": [3, None]}
@@ -377,7 +377,7 @@ def _read_trajectory(folder: Path) -> Any:
 
     path, task = folder / "trajectory.json", find("lifting")
     return (
-        load_actions(path, TaskProblem(task, compiled=False)),
+        load_actions(path, TaskProblem(task, execution="eager")),
         script._choices(path),
         trajectory_demonstrator(task, path),
     )

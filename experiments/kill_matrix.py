@@ -61,7 +61,18 @@ def commands(rope: str) -> dict[str, tuple[str, ...]]:
     return {
         "calibrate": ("calibrate", rope, "--starts", "3", "--iterations", "3", "--vertices", "9", "--rest", "straight"),
         "diagnose": ("diagnose", rope, "--workers", "1", "--vertices", "9", *excluded),
-        "optimize": ("optimize", "short", "--method", "cmaes", "--episodes", "96", "--population", "8", "--recorded"),
+        "optimize": (
+            "optimize",
+            "short",
+            "--method",
+            "cmaes",
+            "--episodes",
+            "96",
+            "--population",
+            "8",
+            "--execution",
+            "recorded",
+        ),
         "train": ("train", "short", "--algo", "ppo", "--episodes", "64", "--count", "4", "--set", "interval=0"),
         "dataset": ("dataset", "make", "short", *"--episodes 12 --batch 2 --size 0 --workers 0".split()),
     }

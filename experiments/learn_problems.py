@@ -164,7 +164,10 @@ def learn(
     if cut:
         effects = tuple(CUT[type(e)](**vars(e)) if type(e) in CUT else e for e in world.effects)
         world = tree.replace(world, effects=effects)
-    step, free = scene.stepper(world, compiled=compiled), torch.tensor(problem.free, dtype=torch.float64)
+    step, free = (
+        scene.stepper(world, execution="compiled" if compiled else "eager"),
+        torch.tensor(problem.free, dtype=torch.float64),
+    )
     run = partial(scene.rollout, step, made.params, made.state, segment=10, keep=lambda s: s.time)
     random = torch.Generator().manual_seed(seed)
 

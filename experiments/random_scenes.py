@@ -127,7 +127,7 @@ def stepper(choice: Any) -> Any:
     """Return recorded steps of a scene."""
     from torchdlo import scene
 
-    return scene.stepper(choice, compiled=False, recorded=True)
+    return scene.stepper(choice, execution="recorded")
 
 
 def energy(made: tuple[Any, Any, Any], state: Any) -> Any:

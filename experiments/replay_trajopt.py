@@ -23,10 +23,6 @@ EXAMPLES = """examples:
 """
 
 
-STEPS = ("double", "compiled", "recorded")
-"""Choices of a problem that change how numbers are rounded."""
-
-
 def trajectories(out: Path) -> dict[str, dict[str, Any]]:
     """Return the contents of all trajectories below a folder, by the names of their searches."""
     from torchdlo.agents.trajopt.stored import NAME, read_searches
@@ -40,9 +36,11 @@ def replay(name: str, had: dict[str, Any], make: Callable[..., Any]) -> dict[str
     """Play a trajectory in the problem that `make(task, **choices)` returns, and return how that went."""
     import torch
 
-    from torchdlo.agents.trajopt.search_result import plain_evaluation
+    from torchdlo.agents.trajopt.search_result import execution_of, plain_evaluation
+    from torchdlo.untrusted import Entry
 
-    problem = make(had["task"], **{name: had["choices"][name] for name in STEPS if name in had["choices"]})
+    choices = Entry(had["choices"], had["task"])
+    problem = make(had["task"], double=choices["double"].flag(), execution=execution_of(choices))
     outcome, kept = problem.record(torch.as_tensor(had["actions"], dtype=torch.float64))
     now = plain_evaluation(outcome)
     row = {"search": name, "missed": kept.get("missed", "")}

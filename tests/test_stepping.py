@@ -46,13 +46,13 @@ def test_a_rollout_with_gradients_compiles_one_graph(graphs, choices, learned):
     else:
         state = tree.replace(state, rods=tree.replace(state.rods, vel=number))
     found = {}
-    for compiled in (False, True):
-        last, _ = scene.rollout(scene.stepper(made, compiled=compiled), params, state, controls)
-        (found[compiled],) = torch.autograd.grad(last.rods.pos.square().sum(), number)
+    for execution in ("eager", "compiled"):
+        last, _ = scene.rollout(scene.stepper(made, execution=execution), params, state, controls)
+        (found[execution],) = torch.autograd.grad(last.rods.pos.square().sum(), number)
     assert graphs() == 1
-    assert float(found[False].abs().max()) > 0
+    assert float(found["eager"].abs().max()) > 0
     # The same operations in the same order: rounding of float64 over 4 steps at most.
-    assert torch.allclose(found[True], found[False], rtol=1e-12, atol=0)
+    assert torch.allclose(found["compiled"], found["eager"], rtol=1e-12, atol=0)
 
 
 @pytest.mark.compile
@@ -66,7 +66,7 @@ def test_a_rollout_without_gradients_compiles_one_graph(graphs, scenes, held, su
     made, params, state, controls = hanging(scenes, held, substeps=substeps)
     with torch.no_grad():
         last, _ = scene.rollout(scene.stepper(made), params, state, controls)
-        expected, _ = scene.rollout(scene.stepper(made, compiled=False), params, state, controls)
+        expected, _ = scene.rollout(scene.stepper(made, execution="eager"), params, state, controls)
     assert graphs() == 1
     assert torch.allclose(last.rods.pos, expected.rods.pos, rtol=1e-12, atol=0)
 
@@ -81,7 +81,7 @@ def test_compiled_steps_tell_tensors_of_different_kinds_apart(graphs):
         inputs = [*inputs, tree.map(lambda c: c[0], controls)]
         if not double:
             inputs = tree.to(inputs, torch.float32)
-        found, wanted = (run(*inputs).rods.pos for run in (step, scene.stepper(made, compiled=False)))
+        found, wanted = (run(*inputs).rods.pos for run in (step, scene.stepper(made, execution="eager")))
         assert found.shape == wanted.shape and found.dtype == wanted.dtype
         # The same operations in the same order: rounding at most.
         assert torch.allclose(found, wanted, rtol=1e-12 if double else 1e-6, atol=0)
@@ -124,9 +124,9 @@ def test_a_rollout_with_bodies_and_gradients_compiles_one_graph_and_the_survey(g
     assert graphs() == 2
 
 
-@pytest.mark.parametrize("compiled", [False, True])
-def test_controls_of_the_wrong_shape_are_refused(compiled):
+@pytest.mark.parametrize("execution", ["eager", "compiled"])
+def test_controls_of_the_wrong_shape_are_refused(execution):
     made, params, state, controls = hanging(2, substeps=1)
     wrong = tree.map(lambda c: c[0, ..., :1, :], controls)
     with pytest.raises(ValueError, match="control: pos and director"):
-        scene.stepper(made, compiled=compiled)(params, state, wrong)
+        scene.stepper(made, execution=execution)(params, state, wrong)

@@ -30,7 +30,7 @@ from torchdlo.coupling.rod_body.joints import Joining, JointParams, Joints, Join
 from torchdlo.field_docs import with_field_docs
 from torchdlo.physics import tree
 from torchdlo.physics.effects.base import ContactForces, Effect, altered_params, default_values, parameters_of
-from torchdlo.physics.execution import tracing
+from torchdlo.physics.execution import Execution, check_execution, tracing
 from torchdlo.physics.execution.gradient_check import GradientCheck, check_gradients
 from torchdlo.physics.execution.replay import alike, rollout
 from torchdlo.physics.integrators import stability
@@ -465,7 +465,7 @@ def _step(scene: Scene, params: Params, state: State, control: Control, advance,
     return state
 
 
-def stepper(scene: Scene, *, compiled: bool = True, recorded: bool = False):
+def stepper(scene: Scene, *, execution: Execution = "compiled"):
     """Return `step` bound to a scene: a function of (params, state, control).
 
     Recorded steps take seconds at the first call, and then, without gradients, half to a third of the time. Compiled
@@ -473,8 +473,9 @@ def stepper(scene: Scene, *, compiled: bool = True, recorded: bool = False):
     substep is compiled as a whole; of more, the substep is, so that their number does not matter.
     Compiled steps need a C++ compiler; without one they are not compiled, with one warning.
     """
-    if not compiled or not native.prepare_torch_compile():
-        return tracing.RecordedStep(partial(step, scene)) if recorded else partial(step, scene)
+    check_execution(execution)
+    if execution != "compiled" or not native.prepare_torch_compile():
+        return tracing.RecordedStep(partial(step, scene)) if execution == "recorded" else partial(step, scene)
     compile = partial(torch.compile, fullgraph=True, dynamic=False, isolate_recompiles=True)
     once = scene.substeps == 1 and not any(e.is_contact for e in scene.effects)
 
@@ -489,7 +490,8 @@ def stepper(scene: Scene, *, compiled: bool = True, recorded: bool = False):
     def run(params: Params, state: State, control: Control) -> State:
         _check_control(scene, control)
         notices.once(
-            "compiling", "compiling the first step: seconds to minutes, once a process; compiled=False does without."
+            "compiling",
+            "compiling the first step: seconds to minutes, once a process; execution='recorded' does without.",
         )
         with_gradient = torch.is_grad_enabled()
         whole, part = ways[with_gradient]

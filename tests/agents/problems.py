@@ -196,7 +196,7 @@ class Drag(Plain):
         paths = control.pos[:, None] + (actions * actions.new_tensor([1.0, 1.0, 0.0])).cumsum(1)[:, :, None]
         controls = tree.map(lambda c: c.expand(self.horizon, *c.shape), control)
         controls = tree.replace(controls, pos=paths.transpose(0, 1))
-        last, _ = scene.rollout(scene.stepper(world, compiled=False), params, state, controls, keep=lambda s: s.time)
+        last, _ = scene.rollout(scene.stepper(world, execution="eager"), params, state, controls, keep=lambda s: s.time)
         angle = torch.linspace(0, 3.0, 10, dtype=torch.float64)
         goal = 0.06 * torch.stack([1 - angle.cos(), angle.sin(), 0 * angle], -1) + torch.tensor([0.0, 0.05, 0.0])
         loss = (last.rods.pos - goal)[..., :2].square().sum(-1).mean(-1)

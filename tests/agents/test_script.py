@@ -67,7 +67,7 @@ def test_another_start_is_that_of_its_seed(capsys):
 def test_a_trajectory_comes_back_bit_by_bit(capsys):
     words = ["optimize", "lead", "--method", "cmaes", "--episodes", "8", "--population", "4", "--dtype", "float64"]
     with pytest.raises(SystemExit):
-        app.main([*words, "--no-compiled", "--out", "found"])
+        app.main([*words, "--execution", "eager", "--out", "found"])
     capsys.readouterr()
     assert play("lead", "--trajectory", "found/trajectory.json", "--json") == 0
     went, kept = json.loads(capsys.readouterr().out), json.loads(Path("found/trajectory.json").read_text())

@@ -51,7 +51,7 @@ class Lead(Task):
 @pytest.fixture(scope="module")
 def lead() -> TaskProblem:
     """The task in double precision; its few frames are not worth compiling."""
-    return TaskProblem(Lead(), double=True, compiled=False)
+    return TaskProblem(Lead(), double=True, execution="eager")
 
 
 def test_returns_and_slopes_are_those_of_the_way_of_the_tool(lead: TaskProblem) -> None:
@@ -86,7 +86,7 @@ class Still(Lead):
 
 def test_a_task_without_spread_cannot_be_robust() -> None:
     with pytest.raises(InputError, match="lead: its start does not vary; leave out --robust"):
-        TaskProblem(Still(), compiled=False).varied(2, 1.0, 0)
+        TaskProblem(Still(), execution="eager").varied(2, 1.0, 0)
 
 
 def test_the_command_finds_keeps_and_plays_again(
@@ -96,7 +96,7 @@ def test_the_command_finds_keeps_and_plays_again(
     out = tmp_path / "out"
     words = ["optimize", "lead", "--method", "hybrid", "--episodes", "16", "--population", "4", "--dtype", "float64"]
     with pytest.raises(SystemExit) as done:
-        app.main([*words, "--no-compiled", "--out", str(out), "--json"])
+        app.main([*words, "--execution", "eager", "--out", str(out), "--json"])
     assert done.value.code in (0, None)
     said = capsys.readouterr()
     result = json.loads(said.out)
@@ -129,7 +129,7 @@ class Missing(Lead):
 def test_a_trajectory_that_cannot_be_trusted_says_so(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    words = ["--episodes", "4", "--population", "4", "--no-compiled", "--json"]
+    words = ["--episodes", "4", "--population", "4", "--execution", "eager", "--json"]
     for kind, missed in ((Lead, ""), (Missing, "an edge became 20% shorter than it has to be")):
         monkeypatch.setitem(envs.TASKS, "lead", kind)
         out = tmp_path / kind.__name__
@@ -162,7 +162,7 @@ def test_the_command_says_what_is_wrong(
     monkeypatch.chdir(tmp_path)
     monkeypatch.setitem(envs.TASKS, "lead", Lead)
     with pytest.raises(SystemExit) as done:
-        app.main(["optimize", *words, "--no-compiled"])
+        app.main(["optimize", *words, "--execution", "eager"])
     assert done.value.code == 2 and sentence in capsys.readouterr().err
     assert not list(tmp_path.rglob("*.pt"))
 

@@ -78,7 +78,7 @@ def answers(*rows: tuple[str, Any]) -> RecordedConversation:
     return RecordedConversation(f"recorded: {HAND}", kept, "here")
 
 
-CHEAP = {"method": "cmaes", "episodes": 4, "population": 4, "recorded": False}
+CHEAP = {"method": "cmaes", "episodes": 4, "population": 4, "execution": "eager"}
 
 
 def carried_out(
@@ -372,7 +372,7 @@ def test_the_page_shows_what_was_said_and_escapes_it(tmp_path: Path) -> None:
 
 
 def test_first_trajectories_are_played_as_they_are() -> None:
-    problem = TaskProblem(Carry(), compiled=False)
+    problem = TaskProblem(Carry(), execution="eager")
     first = torch.zeros(1, 12, 6, dtype=torch.float64)
     first[0, :6, [0, 3]] = 0.009
     for method in ("cmaes", "hybrid"):

@@ -50,7 +50,7 @@ def on_a_box(dt: float, slope: float, *, n: int = 9, drop: float = 0.0, damping:
 def test_a_heavy_rope_does_not_press_a_light_box_into_the_ground(dt: float, slope: float) -> None:
     # The friction that is needed, tan 0.2 = 0.2, is less than there is: the box stays where it is.
     made, params, state = on_a_box(dt, slope)
-    control, step, lowest = scene.stationary_control(made, state), scene.stepper(made, compiled=False), HALF
+    control, step, lowest = scene.stationary_control(made, state), scene.stepper(made, execution="eager"), HALF
     half = round(0.1 / dt)
     with torch.no_grad():
         for k in range(2 * half):
@@ -81,7 +81,7 @@ def test_a_box_that_stands_on_the_ground_is_lifted_by_its_rope_without_a_jerk() 
         substeps=1,
         check=False,
     )
-    control, step, fastest = scene.stationary_control(made, state), scene.stepper(made, compiled=False), 0.0
+    control, step, fastest = scene.stationary_control(made, state), scene.stepper(made, execution="eager"), 0.0
     with torch.no_grad():
         for k in range(150):
             way = up * dt * max(0, k - 10)

@@ -312,18 +312,18 @@ def test_compiled_steps_are_the_same(monkeypatch):
     monkeypatch.setattr(torch, "compile", lambda fn, *, options=None, **given: compile(fn, backend="eager", **given))
     cable, params, state, control = thrown((0.5, 0.0, -1.0), 0.3, batch=(2,))
     found = {}
-    for compiled in (False, True):
+    for execution in ("eager", "compiled"):
         vel = state.bodies.vel.clone().requires_grad_()
         end, step = (
             tree.replace(state, bodies=tree.replace(state.bodies, vel=vel)),
-            scene.stepper(cable, compiled=compiled),
+            scene.stepper(cable, execution=execution),
         )
         for _ in range(3):
             end = step(params, end, control)
-        found[compiled] = torch.autograd.grad(end.material_points.pos.square().sum(), vel)[0]
-    assert float(found[False].abs().max()) > 0
+        found[execution] = torch.autograd.grad(end.material_points.pos.square().sum(), vel)[0]
+    assert float(found["eager"].abs().max()) > 0
     # The same operations in the same order.
-    assert torch.allclose(found[True], found[False], rtol=1e-12, atol=1e-15)
+    assert torch.allclose(found["compiled"], found["eager"], rtol=1e-12, atol=1e-15)
 
 
 def test_a_body_and_a_rope_touch_the_same_matter():

@@ -104,8 +104,8 @@ def test_compiled_steps_equal_eager_ones_with_gradients():
 
     scene, params, state = two(math.pi / 3, 0.8, (0.3, 0.1, 0), {"mu_s": 0.5, "mu_k": 0.4, "restitution": 0.3}, n=9)
     control, results = stationary_control(scene, state), []
-    for compiled in (False, True):
-        run = stepper(scene, compiled=compiled)
+    for execution in ("eager", "compiled"):
+        run = stepper(scene, execution=execution)
         vel = state.rods.vel.clone().requires_grad_()
         now = tree.replace(state, rods=tree.replace(state.rods, vel=vel))
         for _ in range(3):

@@ -99,7 +99,7 @@ def test_systems_with_a_term_of_low_rank_are_those_of_full_matrices(transpose):
 def test_recorded_steps_move_as_others_do():
     made, params, start = crossing(1, False)
     control, ends = scene.stationary_control(made, start), []
-    for step in (scene.stepper(made, compiled=False, recorded=True), scene.stepper(made, compiled=False)):
+    for step in (scene.stepper(made, execution="recorded"), scene.stepper(made, execution="eager")):
         state = start
         with torch.no_grad():
             for _ in range(12):
@@ -117,7 +117,7 @@ def test_a_rope_that_piles_up_comes_to_rest_without_gaining_energy():
     made, params, state = make(
         [rope], effects, {"damping": {"rate": 2.0}}, bodies=[RigidBody("plane", motion="fixed")], **IMPLICIT
     )
-    step, control = scene.stepper(made, compiled=False, recorded=True), scene.stationary_control(made, state)
+    step, control = scene.stepper(made, execution="recorded"), scene.stationary_control(made, state)
     mass, energy = params.rods.material.mass, []
     with torch.no_grad():
         for _ in range(300):

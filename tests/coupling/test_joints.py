@@ -81,7 +81,7 @@ def test_a_plug_on_a_stiff_cable_swings_as_a_compound_pendulum() -> None:
     inertia = 0.01 * 0.4**2 / 3 + 0.05 * 0.42**2 + 0.05 / 3 * (0.01**2 + 0.02**2)
     period = 2 * math.pi * math.sqrt(inertia / (G * (0.01 * 0.2 + 0.05 * 0.42))) * (1 + 0.05**2 / 16)
     scene, params, state = made
-    control, step = scenes.stationary_control(scene, state), scenes.stepper(scene, compiled=False, recorded=True)
+    control, step = scenes.stationary_control(scene, state), scenes.stepper(scene, execution="recorded")
     crossings, last = [], float(state.bodies.pos[0, 0])
     with torch.no_grad():
         for k in range(200):
@@ -167,7 +167,7 @@ def test_light_and_heavy_plugs_gain_no_energy(dt: float, cable: float, plug: flo
         integrator="implicit", prescribed_vertices=[0],
     )  # fmt: skip
     scene, params, state = made
-    control, step = scenes.stationary_control(scene, state), scenes.stepper(scene, compiled=False, recorded=True)
+    control, step = scenes.stationary_control(scene, state), scenes.stepper(scene, execution="recorded")
 
     def energy(one: scenes.State, two: scenes.State) -> float:
         """At the time of `one`: velocities stand half a step before positions."""
@@ -296,7 +296,7 @@ def test_a_welded_plug_turns_on_the_twist_of_its_rope() -> None:
         [rope], [Gravity(), BendFrame(), Twist()], bodies=[plug], joints=[RopeJoint(body=0)], integrator="implicit",
         dt=1e-3, substeps=1, prescribed_vertices=[0, 1], prescribed_edges=[0], twist="quasistatic",
     )  # fmt: skip
-    control, step = scenes.stationary_control(scene, state), scenes.stepper(scene, compiled=False, recorded=True)
+    control, step = scenes.stationary_control(scene, state), scenes.stepper(scene, execution="recorded")
     period = 2 * math.pi * math.sqrt(0.35 * 0.05 / 3 * (0.01**2 + 0.015**2) / 1e-3)
     last, crossing = 2.0, None
     with torch.no_grad():
@@ -329,7 +329,7 @@ def test_scenes_of_a_batch_are_as_alone_and_recorded_steps_as_others() -> None:
         single = ran(made(0.01, torch.float32, integrator), 3)
         torch.testing.assert_close(single.bodies.pos.double(), alone.bodies.pos, atol=2e-5, rtol=0)
         scenes.check_state(single)
-    recorded = scenes.stepper(both[0], compiled=False, recorded=True)
+    recorded = scenes.stepper(both[0], execution="recorded")
     quick = ran(both, 3, lambda scene, *given: recorded(*given))
     torch.testing.assert_close(quick.rods.pos, many.rods.pos, atol=1e-10, rtol=0)
 

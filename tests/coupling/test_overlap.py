@@ -20,7 +20,7 @@ def highest(bodies, choices, seconds: float, depth: float) -> tuple[float, float
     x[:, 2] = -depth
     effects = [EFFECTS["bend"](), EFFECTS["gravity"](), RodBody()]
     made, params, state = make([Rope(x, radius=0.003, mass=0.01, bend=1e-4)], effects, bodies=bodies, **choices)
-    step, control, most = scene.stepper(made, compiled=False, recorded=True), scene.stationary_control(made, state), 0.0
+    step, control, most = scene.stepper(made, execution="recorded"), scene.stationary_control(made, state), 0.0
     with torch.no_grad():
         for _ in range(round(seconds / made.dt)):
             state = step(params, state, control)

@@ -29,7 +29,7 @@ def test_a_broken_scene_leaves_the_slope_of_what_all_share(segment: int | None):
     slopes = []
     for breaks in (False, True):
         env = envs.make(
-            small("unknotting"), num_envs=2, gradients=True, compiled=False, variation=False, segment=segment
+            small("unknotting"), num_envs=2, gradients=True, execution="eager", variation=False, segment=segment
         )
         shared = torch.full((12,), 0.002, requires_grad=True)
         tensordict = env.reset().set("action", shared.expand(2, -1))

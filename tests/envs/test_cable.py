@@ -53,7 +53,7 @@ def write(path: Path, effects: tuple[str, ...] = (), **numbers: float) -> Path:
 def play(name: str, rope: RopeMaterial | None, actions: int = 3) -> torch.Tensor:
     """Where the rope is after a few short actions."""
     task = dataclasses.replace(small(name, actions), rope=rope)
-    made = episode.prepare(task, 2, like=torch.zeros((), dtype=F64), compiled=False)
+    made = episode.prepare(task, 2, like=torch.zeros((), dtype=F64), execution="eager")
     world = made.start
     with torch.no_grad():
         for action in stage_waypoints(task, actions).unbind(1):

@@ -47,9 +47,7 @@ def test_their_demonstrations_mirror_each_other() -> None:
 @pytest.mark.parametrize("task", [LEFT, RIGHT], ids=lambda task: task.name)
 def test_demonstrations_succeed_from_starts_that_vary(task) -> None:
     pytest.importorskip("pytorch_kinematics", reason="arms need the extra robots")
-    made = episode.prepare(
-        task, 4, generator=torch.Generator().manual_seed(2), variation=True, compiled=False, recorded=True
-    )
+    made = episode.prepare(task, 4, generator=torch.Generator().manual_seed(2), variation=True, execution="recorded")
     with torch.no_grad():
         went = episode.play(task, task.demonstration(made.start.state).float(), episode=made)
     assert went.success.all() and not went.failed.any()

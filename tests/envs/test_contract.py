@@ -31,7 +31,7 @@ def prepared(name: str) -> episode.Episode:
     """Two scenes with different starts, in double precision."""
     generator = torch.Generator().manual_seed(0)
     like = torch.zeros((), dtype=F64)
-    return episode.prepare(small(name), 2, like=like, generator=generator, variation=True, compiled=False)
+    return episode.prepare(small(name), 2, like=like, generator=generator, variation=True, execution="eager")
 
 
 def stage_waypoints(task, count: int = 2) -> torch.Tensor:

@@ -22,7 +22,7 @@ SAME = {"rtol": 0, "atol": 0}
 @pytest.mark.parametrize("name", ["unknotting", "slingshot"])
 def test_an_action_earns_the_same_however_it_is_done(name: str) -> None:
     # Slingshot opens its hands at the end, which a short task is to do as well.
-    task, steps = small(name, 2), {"compiled": False}
+    task, steps = small(name, 2), {"execution": "eager"}
     task = dataclasses.replace(task, release=task.release and 2)
     actions = 0.002 * torch.randn(2, 2, task.width, generator=torch.Generator().manual_seed(0))
     went = episode.play(task, actions, episode=episode.prepare(task, 2, **steps))
@@ -49,7 +49,7 @@ def test_an_action_earns_the_same_however_it_is_done(name: str) -> None:
 
 def test_scenes_that_end_open_their_hands_and_others_do_not() -> None:
     task = dataclasses.replace(small("slingshot", 2), release=2)
-    made = episode.prepare(task, 2, compiled=False)
+    made = episode.prepare(task, 2, execution="eager")
     still = torch.zeros(2, task.width)
     with torch.no_grad():
         step = episode.control_step(made, made.start, still, torch.tensor([True, False]))

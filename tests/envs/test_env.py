@@ -26,7 +26,7 @@ pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::F
 
 
 def made(name: str = "unknotting", horizon: int = 2, **choices):
-    choices = {"num_envs": 2, "compiled": False, "seed": 0} | choices
+    choices = {"num_envs": 2, "execution": "eager", "seed": 0} | choices
     return envs.make(small(name, horizon), **choices)
 
 
@@ -77,7 +77,7 @@ def test_rollouts_carry_gradients_to_actions():
     actions = torch.full((2, 12), 0.002, requires_grad=True)
     found = env.rollout(2, lambda td: td.set("action", actions))["next", "reward"]
     (gradient,) = torch.autograd.grad(found.sum(), actions)
-    made_ = episode.prepare(task, 2, like=torch.zeros((), dtype=F64), compiled=False)
+    made_ = episode.prepare(task, 2, like=torch.zeros((), dtype=F64), execution="eager")
     other = actions.detach().double().requires_grad_()
     outcome = episode.play(task, other[:, None].expand(-1, 2, -1), episode=made_)
     (wanted,) = torch.autograd.grad(outcome.returns.sum(), other)
@@ -133,7 +133,7 @@ def test_random_numbers_of_effects_stay_in_their_declared_range():
 
 def test_scenes_settle_with_the_numbers_that_are_drawn_for_them():
     task = dataclasses.replace(small("slingshot"), settle_steps=5)
-    choices = {"num_envs": 2, "compiled": False, "variation": False, "dtype": F64, "seed": 0}
+    choices = {"num_envs": 2, "execution": "eager", "variation": False, "dtype": F64, "seed": 0}
     env = envs.make(task, randomize={"gravity.acceleration": 0.5}, **choices)
     env.reset()
     fall = env.episode.params.effects["gravity"]["acceleration"][..., 2].flatten()
@@ -212,6 +212,6 @@ def test_arms_stand_still_without_a_way_by_hand():
 
 def test_tasks_can_be_changed_field_by_field():
     short = dataclasses.replace(TASKS["coiling"](), horizon=7, frame_skip=1)
-    assert envs.make(short, compiled=False).task.horizon == 7
+    assert envs.make(short, execution="eager").task.horizon == 7
     with pytest.raises(ValueError, match=r"take 96 actions of 0\.01 m; expected at most 7"):
         short.demonstration()

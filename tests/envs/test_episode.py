@@ -102,7 +102,7 @@ def test_replayed_gradients_are_those_of_the_recorded_graph():
 @pytest.mark.parametrize("name", ["wrapping"])
 def test_recorded_episodes_go_as_others_do(name: str) -> None:
     made = prepared(name)
-    recorded = dataclasses.replace(made, step=scenes.stepper(made.scene, compiled=False, recorded=True))
+    recorded = dataclasses.replace(made, step=scenes.stepper(made.scene, execution="recorded"))
     actions = stage_waypoints(made.task)
     plain, again = (
         episode.play(e.task, actions.clone(), episode=e, keep=episode.scene_positions) for e in (made, recorded)
@@ -143,7 +143,7 @@ def test_doing_nothing_earns_what_is_published(name: str, idle: float):
     if name not in TASKS:
         pytest.skip(f"{name} is not among the tasks")
     task = small(name, 1)
-    made = episode.prepare(task, 1, like=torch.zeros((), dtype=F64), compiled=False)
+    made = episode.prepare(task, 1, like=torch.zeros((), dtype=F64), execution="eager")
     with torch.no_grad():
         outcome = episode.play(task, torch.zeros(1, 1, task.width, dtype=F64), episode=made)
     assert float(outcome.returns) * TASKS[name]().horizon == pytest.approx(idle, rel=0.02)
@@ -195,7 +195,7 @@ def test_hands_on_two_ropes_may_draw_apart():
 
         arms: ClassVar[Arms] = Arms(Side.arms.base[::2], (0, 7))
 
-    made = episode.prepare(Apart(frame_skip=1), 1, like=torch.zeros((), dtype=F64), compiled=False)
+    made = episode.prepare(Apart(frame_skip=1), 1, like=torch.zeros((), dtype=F64), execution="eager")
     with torch.no_grad():
         after = episode.act(made, made.start, torch.zeros(1, 12, dtype=F64))
     assert made.start.notes["rest"].shape == (1, 0) and not after.failed.any()
@@ -208,8 +208,8 @@ def test_scores_are_0_for_doing_nothing_and_1_for_the_way_by_hand():
     task = led_(horizon=1, frame_skip=1)
     actions = torch.stack([torch.zeros(1, 6, dtype=F64), task.demonstration(), 0.5 * task.demonstration()])
     with torch.no_grad():
-        returns = episode.play(task, actions, compiled=False).returns
-    score = episode.normalized_score(task, returns, compiled=False)
+        returns = episode.play(task, actions, execution="eager").returns
+    score = episode.normalized_score(task, returns, execution="eager")
     torch.testing.assert_close(score[:2], score.new_tensor([0.0, 1.0]), atol=1e-6, rtol=0)
     assert 0 < float(score[2]) < 1
 

@@ -47,7 +47,7 @@ EXPRESSED = {
 def played(task: envs.Task, actions: Tensor) -> tuple[episode.EpisodeResult, Tensor]:
     """How an episode went and the gradient of its return, shape (1, T, A)."""
     x = actions.clone().requires_grad_()
-    went = episode.play(task, x, episode=episode.prepare(task, len(x), like=actions, compiled=False))
+    went = episode.play(task, x, episode=episode.prepare(task, len(x), like=actions, execution="eager"))
     (gradient,) = torch.autograd.grad(went.returns.sum(), x)
     return went, gradient
 
@@ -81,7 +81,7 @@ def test_expressions_take_less_than_a_twentieth_of_an_action_more(name: str) -> 
     task = envs.find(name)
     expressed = with_reward(task, reward(EXPRESSED[name]))
     with torch.no_grad():
-        made = episode.prepare(task, 1, compiled=False)
+        made = episode.prepare(task, 1, execution="eager")
         action = torch.zeros(1, task.width)
         whole = spent(lambda: episode.act(made, made.start, action), 2)
         seen = made.start.seen(task.arms.count)
@@ -133,14 +133,14 @@ def test_a_cut_demonstration_ends_where_the_whole_one_does() -> None:
     task = envs.find("wiring_ring")
     actions = task.demonstration()[None, :30]
     like = torch.zeros((), dtype=torch.float64)
-    made = episode.prepare(task, 1, like=like, compiled=False)
+    made = episode.prepare(task, 1, like=like, execution="eager")
     with torch.no_grad():
         whole = episode.play(task, actions, episode=made)
         first = episode.play(task, actions[:, :22], episode=made).world
         # From action 22 on the first hand is open, and the second holds vertex 0.
         part = continue_from(task, first, (None, 0), holds=(2, 0), horizon=8)
         assert part.horizon == 8 and part.travels == 0
-        after = episode.prepare(part, 1, like=like, compiled=False)
+        after = episode.prepare(part, 1, like=like, execution="eager")
         rest = episode.play(part, actions[:, 22:], episode=after)
         done, _ = task_success(after, rest.world, task)
     torch.testing.assert_close(rest.world.state.rods.pos, whole.world.state.rods.pos, rtol=0, atol=1e-9)
@@ -153,12 +153,12 @@ def test_hands_travel_to_what_they_hold_next() -> None:
     task = envs.find("wiring_ring", grasps=(2, None))
     like = torch.zeros(())
     with torch.no_grad():
-        made = episode.prepare(task, 1, like=like, compiled=False)
+        made = episode.prepare(task, 1, like=like, execution="eager")
         still = torch.zeros(1, 1, task.width)
         world = episode.play(task, still, episode=made).world
         part = continue_from(envs.find("wiring_ring"), world, (2, 6), holds=(2, None), horizon=1)
         assert part.travels == 10 and part.horizon == 11
-        went = episode.play(part, torch.zeros(3, 11, task.width), episode=episode.prepare(part, 3, compiled=False))
+        went = episode.play(part, torch.zeros(3, 11, task.width), episode=episode.prepare(part, 3, execution="eager"))
     assert went.world.seen(2).closed.flatten().tolist() == [1.0] * 6
     off = (went.world.tool.pos[:, 1] - went.world.state.rods.pos[:, 6]).norm(dim=-1)
     assert float(off.max()) < 0.01
@@ -172,9 +172,9 @@ SEVERAL = [name for name in envs.TASKS if len(envs.find(name).reset_noise) > 1]
 def test_parts_go_on_in_tasks_that_move_several_things(name: str) -> None:
     task = envs.find(name)
     rng = torch.Generator().manual_seed(3)
-    world = episode.prepare(task, 1, generator=rng, variation=True, compiled=False).start
+    world = episode.prepare(task, 1, generator=rng, variation=True, execution="eager").start
     part = continue_from(task, world, task.arms.vertex, holds=task.arms.vertex, horizon=3, reward=reward({"t": "time"}))
-    made = episode.prepare(part, 2, generator=rng, variation=True, compiled=False)
+    made = episode.prepare(part, 2, generator=rng, variation=True, execution="eager")
     # It begins where it was left, wherever its own starts would be.
     torch.testing.assert_close(made.start.state.rods.pos, world.state.rods.pos.expand(2, -1, -1), rtol=0, atol=0)
 
@@ -184,7 +184,7 @@ def test_other_grasps_are_held() -> None:
     assert task.arms.vertex == (3, 26) and task.schedule.held == (3, 26)
     assert envs.find("lifting").arms.vertex == (4, 25)
     assert copy.deepcopy(task) == task != envs.find("lifting") and hash(task) == hash(copy.copy(task))
-    made = episode.prepare(task, 1, compiled=False)
+    made = episode.prepare(task, 1, execution="eager")
     torch.testing.assert_close(made.start.tool.pos[0], made.start.state.rods.pos[0, [3, 26]])
 
 
@@ -200,5 +200,5 @@ def test_a_demonstration_is_for_its_own_grasps() -> None:
 
 
 def test_environments_take_other_grasps() -> None:
-    env = envs.make("wrapping", grasps=(15, 35), compiled=False, variation=False)
+    env = envs.make("wrapping", grasps=(15, 35), execution="eager", variation=False)
     assert env.task.arms.vertex == (15, 35)

@@ -44,7 +44,7 @@ def test_tasks_without_matter_step_implicitly_elastic_ropes_with_their_stiffness
 
 def test_an_action_takes_equally_long_in_steps_of_2_ms():
     task = with_fidelity(replace(envs.find("wiring_post"), horizon=2), "2ms/1/implicit")
-    world = episode.play(task, torch.zeros(1, 2, 6), compiled=False).world
+    world = episode.play(task, torch.zeros(1, 2, 6), execution="eager").world
     # 2 actions of 20 ms.
     torch.testing.assert_close(world.state.time.flatten(), torch.tensor([0.04]))
 
@@ -54,7 +54,7 @@ def test_a_cheaper_fidelity_is_near_the_published_one():
     actions[..., 1], actions[..., 2] = -0.002, 0.001
     task = replace(envs.find("wiring_post"), horizon=4, frame_skip=5)
     ends = [
-        episode.play(with_fidelity(task, how), actions, compiled=False).world.state.rods.pos
+        episode.play(with_fidelity(task, how), actions, execution="eager").world.state.rods.pos
         for how in ("published", "1ms/2")
     ]
     # A tool went 8 mm; ropes differ by less than a twentieth of that, but do differ.
@@ -62,7 +62,7 @@ def test_a_cheaper_fidelity_is_near_the_published_one():
 
 
 def test_environments_and_results_name_it():
-    env = envs.make(small("wiring_post", 2), compiled=False, fidelity="1ms/2")
+    env = envs.make(small("wiring_post", 2), execution="eager", fidelity="1ms/2")
     assert env.task.fidelity.text == "1ms/2"
     assert TaskProblem(env.task).choices["fidelity"] == {"step": 1e-3, "substeps": 2, "integrator": "explicit"}
     assert "fidelity" not in TaskProblem(envs.find("wiring_post")).choices

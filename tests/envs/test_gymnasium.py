@@ -17,7 +17,7 @@ from torchdlo import envs  # noqa: E402
 from torchdlo.envs.gymnasium_envs import GymnasiumEnv, GymnasiumVectorEnv, register  # noqa: E402
 from torchdlo.errors import InputError  # noqa: E402
 
-OPTIONS = {"compiled": False}
+OPTIONS = {"execution": "eager"}
 
 
 def test_the_checker_of_gymnasium_finds_nothing_wrong() -> None:

@@ -27,21 +27,21 @@ def mask(*rows: int, count: int) -> TensorDict:
 
 @pytest.mark.parametrize("name", ["wiring_post", "slingshot"])
 def test_scenes_that_begin_again_are_where_their_start_says_and_others_go_on(name: str):
-    env = envs.make(small(name), num_envs=3, compiled=False, seed=3)
+    env = envs.make(small(name), num_envs=3, execution="eager", seed=3)
     td = env.reset()
     env.step(td.set("action", torch.full((3, env.task.width), 0.002)))
     before, moved = env.world, env.moved
     env.reset(mask(1, count=3))
     assert (env.moved[1] - moved[1]).abs().max() > 1e-4
     assert torch.equal(env.moved[[0, 2]], moved[[0, 2]])
-    fresh = episode.prepare_at(env.task, env.moved, compiled=False).start
+    fresh = episode.prepare_at(env.task, env.moved, execution="eager").start
     for old, new, start in zip(*(tree.leaves(w) for w in (before, env.world, fresh)), strict=True):
         assert torch.equal(old[[0, 2]], new[[0, 2]])
         torch.testing.assert_close(new[1], start[1], rtol=1e-5, atol=1e-5)
 
 
 def test_only_scenes_that_begin_again_are_built(monkeypatch: pytest.MonkeyPatch):
-    env = envs.make(small("wiring_post"), num_envs=8, compiled=False, seed=3)
+    env = envs.make(small("wiring_post"), num_envs=8, execution="eager", seed=3)
     env.reset()
     sizes = []
     begin = episode.begin
@@ -52,7 +52,7 @@ def test_only_scenes_that_begin_again_are_built(monkeypatch: pytest.MonkeyPatch)
 
 
 def test_the_share_of_the_episode_is_told():
-    env = envs.make(small("wiring_post", 2), num_envs=2, compiled=False)
+    env = envs.make(small("wiring_post", 2), num_envs=2, execution="eager")
     td = env.reset()
     assert (td["progress"] == 0).all()
     td = env.step(td.set("action", torch.zeros(2, env.task.width)))

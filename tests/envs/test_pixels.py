@@ -28,13 +28,13 @@ SIZE = 48
 
 
 def made(name: str = "lifting", horizon: int = 2, **choices):
-    choices = {"num_envs": 2, "compiled": False, "seed": 0, "pixels": {"size": SIZE}} | choices
+    choices = {"num_envs": 2, "execution": "eager", "seed": 0, "pixels": {"size": SIZE}} | choices
     return envs.make(small(name, horizon), **choices)
 
 
 @functools.cache
 def started(name: str) -> episode.Episode:
-    return episode.prepare(envs.find(name), 1, compiled=False)
+    return episode.prepare(envs.find(name), 1, execution="eager")
 
 
 QUICK = ("coiling", "lifting", "wiring_post")

@@ -98,7 +98,7 @@ def test_the_rehearsal_of_gathering_has_objects_as_heavy_and_where_they_are() ->
 
 def led(task: Task, count: int, moved: tuple[float, float] = (0.0, 0.0)) -> episode.EpisodeResult:
     """What the first actions of the scripted demonstration come to, from a start that is moved in x and y."""
-    made = episode.prepare(task, 1, compiled=False)
+    made = episode.prepare(task, 1, execution="eager")
     start = task.build(torch.tensor([*moved, 0.0]).expand(1, len(task.reset_noise), 3))[2]
     control = scenes.stationary_control(made.scene, start)
     attachment_weight = {
@@ -145,7 +145,7 @@ def test_the_way_by_hand_gathers_drums() -> None:
 def test_the_way_by_hand_lifts_rings_by_their_arches() -> None:
     # The last leg, upwards, begins with action 46; after two more the rope is 3 mm below the arches, straight.
     task = TASKS["lifting"]()
-    made = episode.prepare(task, 1, compiled=False)
+    made = episode.prepare(task, 1, execution="eager")
     rods, hands = made.start.state.rods, list(task.arms.vertex)
     ends = rods.pos[:, hands] + torch.tensor(task.waypoints()[3]) + torch.tensor([0.0, 0.0, 0.02])
     share = (torch.arange(rods.pos.shape[-2]) - hands[0]) / (hands[1] - hands[0])

@@ -21,7 +21,7 @@ class Played:
 
     def __init__(self, task: Task, x: Tensor | None = None, lower: float = 0.0) -> None:
         like = torch.zeros((), dtype=torch.float64)
-        made = episode.prepare(task, 1, like=like, compiled=False, segment=1)
+        made = episode.prepare(task, 1, like=like, execution="eager", segment=1)
         state = made.start.state
         if x is not None:
             state = tree.replace(state, rods=tree.replace(state.rods, pos=x.expand_as(state.rods.pos)))

@@ -49,7 +49,7 @@ class Passing(Task):
 
 def worlds(actions: torch.Tensor) -> list[episode.EpisodeState]:
     """The worlds of a scene before and after each of some actions, shape (T, 12)."""
-    made = episode.prepare(Passing(), 1, like=torch.zeros((), dtype=F64), compiled=False)
+    made = episode.prepare(Passing(), 1, like=torch.zeros((), dtype=F64), execution="eager")
     found = [made.start]
     with torch.no_grad():
         for action in actions:
@@ -106,7 +106,7 @@ def test_turns_of_a_hand_on_its_way_count_for_nothing():
 
 
 def test_a_hand_that_does_not_get_there_stays_open():
-    made = episode.prepare(Passing(), 1, like=torch.zeros((), dtype=F64), compiled=False)
+    made = episode.prepare(Passing(), 1, like=torch.zeros((), dtype=F64), execution="eager")
     world = tree.replace(made.start, count=made.start.count + 4)
     far = world.tool.pos + world.tool.pos.new_tensor([[0.0, 0.0, 2e-2], [0.0, 0.0, 0.0]])
     world = tree.replace(world, tool=tree.replace(world.tool, pos=far))
@@ -120,7 +120,7 @@ def test_a_hand_that_does_not_get_there_stays_open():
 def test_scenes_of_a_batch_may_be_in_different_stages():
     actions = led(6, 0, (0.0, 0.002, 0.003)) + led(6, 1, (0.001, 0.0, 0.002))
     run = worlds(actions)
-    made = episode.prepare(Passing(), 2, like=torch.zeros((), dtype=F64), compiled=False)
+    made = episode.prepare(Passing(), 2, like=torch.zeros((), dtype=F64), execution="eager")
     both = tree.map(lambda a, b: torch.cat([a, b]), run[1], run[4])
     with torch.no_grad():
         for k in range(2):
@@ -131,7 +131,7 @@ def test_scenes_of_a_batch_may_be_in_different_stages():
 
 
 def test_gradients_go_through_a_change_of_hands():
-    made = episode.prepare(Passing(), 1, like=torch.zeros((), dtype=F64), compiled=False)
+    made = episode.prepare(Passing(), 1, like=torch.zeros((), dtype=F64), execution="eager")
     actions = (led(7, 0, (0.0001, 0.0002, 0.0003)) + led(7, 1, (0.0, 0.0002, 0.0004)))[None].requires_grad_()
     outcome = episode.play(Passing(), actions, episode=made)
     (gradient,) = torch.autograd.grad(outcome.loss.sum(), actions)
@@ -185,7 +185,7 @@ def test_tasks_without_stages_hold_what_they_start_at():
 def test_arms_can_go_the_way_by_hand_of_tasks_with_stages(name: str):
     # Without physics, as ropes lie at the start: where hands go to take them differs, where they lead them does not.
     task = TASKS[name]()
-    made = dataclasses.replace(episode.prepare(task, 1, compiled=False), step=lambda params, state, control: state)
+    made = dataclasses.replace(episode.prepare(task, 1, execution="eager"), step=lambda params, state, control: state)
     world, plan = made.start, task.schedule
     with torch.no_grad():
         for action in task.demonstration().float()[:, None]:

@@ -60,7 +60,7 @@ def test_what_is_no_task_is_refused() -> None:
 def test_what_is_no_number_of_scenes_is_refused(count: Any) -> None:
     pytest.importorskip("torchrl")
     with pytest.raises(InputError, match=f"num_envs: it is {count!r}; expected how many"):
-        envs.make("coiling", num_envs=count, compiled=False)
+        envs.make("coiling", num_envs=count, execution="eager")
 
 
 @pytest.mark.parametrize(
@@ -79,7 +79,7 @@ def test_terms_that_are_not_a_number_for_each_scene_are_refused(terms: dict[str,
     kind = type("Other", (TASKS["coiling"],), {"rewards": lambda self, seen: terms, "__doc__": "With other terms."})
     pytest.importorskip("torchrl")
     with pytest.raises(InputError, match=words):
-        envs.make(kind(), num_envs=2, compiled=False)
+        envs.make(kind(), num_envs=2, execution="eager")
 
 
 def test_choices_beside_an_episode_and_episodes_of_other_tasks_are_refused() -> None:
@@ -118,7 +118,7 @@ def test_rewards_and_success_of_another_kind_are_refused(method: str, value: Any
     pytest.importorskip("torchrl")
     kind = type("Other", (TASKS["coiling"],), {method: lambda self, seen: value, "__doc__": "Says something else."})
     with pytest.raises(InputError, match=words):
-        envs.make(kind(), compiled=False)
+        envs.make(kind(), execution="eager")
 
 
 def test_actions_and_rewards_that_are_not_finite_are_said_once(caplog: pytest.LogCaptureFixture) -> None:
@@ -132,7 +132,7 @@ def test_actions_and_rewards_that_are_not_finite_are_said_once(caplog: pytest.Lo
         (kind,),
         {"rewards": lambda self, seen: {"far": 0 / seen.x[:, 0, 0].mul(0)}, "__doc__": "Divides by zero."},
     )
-    env = envs.make(bad(horizon=5), compiled=False)
+    env = envs.make(bad(horizon=5), execution="eager")
     seen = env.reset()
     for _ in range(2):
         env.step(seen.set("action", torch.zeros(1, 12)))

@@ -301,11 +301,11 @@ def test_gradients_through_compiled_steps_equal_eager_ones(integrator):
     trees = (params, state, controls)
     names = [*MATERIAL, "effects.gravity.acceleration", "effects.damping.rate", "state.pos", "state.vel"]
     found = {}
-    for compiled in (False, True):
+    for execution in ("eager", "compiled"):
         leaves = {p: number(trees, p).detach().clone().requires_grad_() for p in names}
-        last, kept = rollout(stepper(scene, compiled=compiled), *swapped(trees, leaves), keep=seen)
-        found[compiled] = torch.autograd.grad(objective(last, kept), list(leaves.values()))
-    for name, a, b in zip(names, found[False], found[True], strict=True):
+        last, kept = rollout(stepper(scene, execution=execution), *swapped(trees, leaves), keep=seen)
+        found[execution] = torch.autograd.grad(objective(last, kept), list(leaves.values()))
+    for name, a, b in zip(names, found["eager"], found["compiled"], strict=True):
         assert float(a.norm()) > 0 and float((a - b).norm()) <= 1e-9 * float(a.norm()), name
 
 

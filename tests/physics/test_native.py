@@ -43,7 +43,7 @@ bodies = [
 ]
 effects = [Gravity(), Bend(), RodContact(), RodBody(), BodyContact()]
 made, params, now = scene.make(ropes, effects, bodies=bodies, dt=2e-3, substeps=4)
-step = scene.stepper(made, compiled="compiled" in sys.argv)
+step = scene.stepper(made, execution="compiled" if "compiled" in sys.argv else "eager")
 for _ in range(6):
     now = step(params, now, scene.stationary_control(made, now))
 print(*now.rods.pos.flatten().tolist(), *now.bodies.pos.flatten().tolist())

@@ -34,7 +34,7 @@ def test_a_slack_rope_of_straight_pieces_keeps_its_length(n, dt):
     # With gamma 0.3 it reached 700 and 4700 m within a second.
     made, params, state = vee(n, dt)
     step, control, worst = (
-        scene.stepper(made, compiled=False, recorded=True),
+        scene.stepper(made, execution="recorded"),
         scene.stationary_control(made, state),
         0.0,
     )
@@ -51,7 +51,7 @@ def test_a_slack_rope_of_straight_pieces_keeps_its_length(n, dt):
 def test_it_comes_to_rest_as_a_catenary():
     # 2 a sinh(d / 2a) = L; sag = a (cosh(d / 2a) - 1).
     made, params, state = vee(401, 5e-3, damping=2.0)
-    step, control = scene.stepper(made, compiled=False, recorded=True), scene.stationary_control(made, state)
+    step, control = scene.stepper(made, execution="recorded"), scene.stationary_control(made, state)
     with torch.no_grad():
         for _ in range(1600):
             state = step(params, state, control)

@@ -21,7 +21,7 @@ def _rope(batch=2, vertices=8):
 
 def test_a_recorded_step_does_what_the_step_does_with_other_numbers_too():
     scene, params, state = _rope()
-    step = scenes.stepper(scene, compiled=False)
+    step = scenes.stepper(scene, execution="eager")
     control = scenes.stationary_control(scene, state)
     recorded = tracing.record(step, params, state, control)
     stiffer = tree.replace(params, rods=tree.map(lambda x: 1.5 * x, params.rods))

@@ -24,7 +24,7 @@ from torchdlo.report.render.run_surfaces import extent, pieces
 
 @pytest.fixture(scope="module")
 def made() -> episode.Episode:
-    return episode.prepare(Lead(), 1, compiled=False)
+    return episode.prepare(Lead(), 1, execution="eager")
 
 
 def way() -> torch.Tensor:

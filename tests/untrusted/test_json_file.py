@@ -165,7 +165,7 @@ def test_trajectories_of_no_numbers_are_refused(tmp_path: Path) -> None:
     from torchdlo.agents.trajopt.task_problem import TaskProblem
     from torchdlo.envs import find
 
-    problem = TaskProblem(find("lifting"), compiled=False)
+    problem = TaskProblem(find("lifting"), execution="eager")
     file = tmp_path / "t.json"
     for content, sentence in (
         ("[]", "t.json: expected a trajectory of torchdlo optimize, an object {...}, found an empty list"),

@@ -70,7 +70,7 @@ def play_motion(task: Task, what: Tensor | Policy, moved: Tensor) -> tuple[dict[
         what: actions, or who chooses them.
         moved: how far things are off their places at the start [m], shape (1, things, 3).
     """
-    made = episode.prepare_at(task, moved, compiled=False, recorded=task.horizon > 10)
+    made = episode.prepare_at(task, moved, execution=episode.quick_execution(task))
     world, rows = made.start, [made.start]
     for k in range(task.horizon):
         if isinstance(what, Policy):
@@ -209,7 +209,7 @@ def replay_joints(task: Task, robots: list[Robot], position: Tensor, moved: Tens
         full[:, robot.arm] = part
         tools.append(tool_pose(robot, full).pos)
     path = torch.stack(tools, 1)
-    made = episode.prepare_at(task, moved, compiled=False, recorded=task.horizon > 10)
+    made = episode.prepare_at(task, moved, execution=episode.quick_execution(task))
     world = made.start
     for k in range(task.horizon):
         way = path[k + 1].to(moved) - world.target.pos[0]

@@ -153,7 +153,7 @@ def propose(
         from torchdlo.report.render.episode_film import stills
         from torchdlo.report.render.marks import marked_view
 
-        made = episode.prepare(chosen, 1, compiled=False)
+        made = episode.prepare(chosen, 1, execution="eager")
         found = ask(chosen, mode, said, marked_view(stills(made, [made.start], arms=False)))
     write_atomically(out / "proposal.json", found.json())
     held = ", ".join(f"robot_{k + 1} {'open' if g is None else f'vertex {g}'}" for k, g in enumerate(found.grasps))

@@ -3,11 +3,22 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-__all__ = ["ModelOption", "PhotoOption", "RecordingArgument", "ResumeOption", "RopeModelOption"]
+if TYPE_CHECKING:
+    from torchdlo.physics.execution import Execution
+
+__all__ = [
+    "ExecutionOption",
+    "ModelOption",
+    "PhotoOption",
+    "RecordingArgument",
+    "ResumeOption",
+    "RopeModelOption",
+    "execution_choice",
+]
 
 RecordingArgument = Annotated[
     Path,
@@ -27,6 +38,16 @@ RopeModelOption = Annotated[
         "--rope-model", help="What ropes are made of: model.json of a calibration or diagnosis.", metavar="MODEL"
     ),
 ]
+ExecutionOption = Annotated[
+    str | None,
+    typer.Option(
+        "--execution",
+        help="How steps run: compiled takes a minute or more at first and is many times faster then, recorded takes "
+        "seconds at first, eager begins at once. Default: compiled for searches, else recorded. A trajectory is played "
+        "as it was found.",
+        metavar="compiled|recorded|eager",
+    ),
+]
 PhotoOption = Annotated[
     bool,
     typer.Option(
@@ -35,3 +56,10 @@ PhotoOption = Annotated[
     ),
 ]
 ResumeOption = Annotated[bool, typer.Option("--resume", help="Go on from the journal of a search that was stopped.")]
+
+
+def execution_choice(given: str | None) -> Execution | None:
+    """Return how steps are to run, or None where it was not said."""
+    from torchdlo.physics.execution import check_execution
+
+    return None if given is None else check_execution(given, "--execution")

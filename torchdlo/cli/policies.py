@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from torchdlo.cli.ending import stopped
+from torchdlo.cli.options import ExecutionOption, execution_choice
 from torchdlo.cli.progress import at_work, deferred_interrupt, progress
 from torchdlo.errors import InputError
 from torchdlo.files import check_writable, write_atomically
@@ -17,6 +18,7 @@ from torchdlo.untrusted import parse_json
 if TYPE_CHECKING:
     from torchdlo.agents.rl.settings import TrainingSettings
     from torchdlo.envs import Task
+    from torchdlo.physics.execution import Execution
 
 __all__ = ["deploy", "distill", "evaluate", "export", "train"]
 
@@ -77,9 +79,7 @@ def train(
         typer.Option("--set", help="Another setting, such as rate=1e-3; may be repeated.", metavar="NAME=VALUE"),
     ] = None,
     variation: Annotated[bool, typer.Option(help="Let starts vary.")] = True,
-    compiled: Annotated[
-        bool, typer.Option("--compiled", help="Compile steps: minutes at first, many times faster with gradients.")
-    ] = False,
+    execution: ExecutionOption = None,
     trajectory: Annotated[
         list[Path] | None,
         typer.Option(help="hybrid: what optimize found; may be repeated. Default: search one.", metavar="FILE"),
@@ -124,14 +124,14 @@ def train(
         raise InputError("--workers: it says how many processes of a Ray cluster play; give --address, too.")
     given["collectors"] = None if address is None else workers or 2
     chosen = training_preset(task, algo, variation=variation, **given, **_read(settings or []))
-    made = find(task)
+    made, how = find(task), execution_choice(execution)
     if algo != "hybrid" and (trajectory or without):
         raise InputError(f"--trajectory and --without: they belong to hybrid, not to {algo}; leave them out.")
     with at_work(out, *_WRITTEN):
         if algo == "hybrid":
             _hybrid(made, chosen, out, trajectory or [], without or [], resume, as_json)
         else:
-            _train(made, chosen, out, resume, compiled, as_json, address)
+            _train(made, chosen, out, resume, how, as_json, address)
 
 
 def _read(pairs: list[str]) -> dict[str, Any]:
@@ -151,13 +151,19 @@ def _read(pairs: list[str]) -> dict[str, Any]:
 
 
 def _train(
-    task: Task, settings: TrainingSettings, out: Path, resume: bool, compiled: bool, as_json: bool, address: str | None
+    task: Task,
+    settings: TrainingSettings,
+    out: Path,
+    resume: bool,
+    execution: Execution | None,
+    as_json: bool,
+    address: str | None,
 ) -> None:
     from torchdlo.agents.rl.results import prepare_training, train_json
     from torchdlo.agents.rl.training import train as loop
     from torchdlo.report.figures.learning_curve import training_png
 
-    trainer, played = prepare_training(task, settings, compiled=compiled, address=address)
+    trainer, played = prepare_training(task, settings, execution=execution, address=address)
     try:
         with progress() as show, deferred_interrupt(show) as callback:
             found = loop(trainer, played, settings, folder=out, resume=resume, callback=callback)
@@ -269,7 +275,7 @@ def evaluate(
     out: Annotated[
         Path | None, typer.Option("--out", "-o", help="Folder for evaluation.json and films.", metavar="DIR")
     ] = None,
-    compiled: Annotated[bool, typer.Option("--compiled", help="Compile steps instead of recording them.")] = False,
+    execution: ExecutionOption = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the results as JSON.")] = False,
 ) -> None:
     """Judge policies at the published fidelity, from starts that no training has seen.
@@ -297,9 +303,9 @@ def evaluate(
         from torchdlo.agents.policies.chunk_policy import is_chunk_policy
 
         if is_chunk_policy(policies[0]):
-            if film or compiled:
+            if film or execution:
                 raise InputError(
-                    f"{policies[0]}: it is a policy of learn; --film and --compiled are for those of train."
+                    f"{policies[0]}: it is a policy of learn; --film and --execution are for those of train."
                 )
             _evaluate_seeing(policies[0], task or [], starts, protocol or ["varied"], out, as_json)
             return
@@ -323,13 +329,19 @@ def evaluate(
         for name in ("best.mp4", "worst.mp4"):
             check_video(out / name)
     found, name = load_policies(policies)
-    own = find(name)
+    own, how = find(name), execution_choice(execution)
     if any(isinstance(policy, CloudPolicy) for policy in found):
         _judge_student(policies, found, own, starts, reset_seed, out, film or bool(protocol), as_json)
         return
     with progress() as show, deferred_interrupt(show) as callback:
         results, plays = judge(
-            found, own, starts=starts, protocols=names, seed=reset_seed, callback=callback, compiled=compiled
+            found,
+            own,
+            starts=starts,
+            protocols=names,
+            seed=reset_seed,
+            callback=callback,
+            execution=how,
         )
     content = json.dumps({"generator": "torchdlo evaluate", "files": [str(p) for p in policies]} | results, indent=1)
     write_atomically(out / "evaluation.json", content + "\n")
@@ -463,7 +475,7 @@ def _perturb(policies: list[Path], trajectory: Path | None, starts: int, seed: i
         raise InputError(f"{policies[0]}: it sees clouds of points; leave out --perturb, cameras are what is varied.")
     task, actors = find(name), {}
     if trajectory is not None:
-        problem = TaskProblem(task, compiled=False)
+        problem = TaskProblem(task, execution="eager")
         actors["trajectory replayed"] = robustness.replaying(problem.full(load_actions(trajectory, problem)))
         for expert in candidate_experts(task, [trajectory])[:1]:
             actors["its path followed"] = robustness.following(expert)
@@ -496,7 +508,7 @@ def _films(task: Task, plays: dict[str, Any], out: Path) -> list[Path]:
     files = []
     for name, k in {"best.mp4": order[-1], "worst.mp4": order[0]}.items():
         with torch.no_grad():
-            made = episode.prepare_at(task, moved[k : k + 1], compiled=False, recorded=True)
+            made = episode.prepare_at(task, moved[k : k + 1], execution="recorded")
             frames, _ = film(task, actions[k], made=made)
         with progress() as show, deferred_interrupt(show) as callback:
             write_video(frames, out / name, speed=0.5, callback=callback)
@@ -609,5 +621,5 @@ def _source(path: Path) -> tuple[Task, Any]:
             raise InputError(f"{path}: it sees clouds of points; deploy the policy of the state that taught it.")
         return find(policy.spec.task), policy
     name = read_trajectory(path)["task"].text()
-    problem = TaskProblem(find(name), compiled=False)
+    problem = TaskProblem(find(name), execution="eager")
     return problem.task, problem.full(load_actions(path, problem))

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from torchdlo.cli.ending import stopped
-from torchdlo.cli.options import PhotoOption
+from torchdlo.cli.options import ExecutionOption, PhotoOption, execution_choice
 from torchdlo.cli.progress import deferred_interrupt, progress
 from torchdlo.errors import InputError
 from torchdlo.files import check_writable, write_atomically
@@ -32,9 +32,7 @@ def simulate(
     picture: Annotated[bool, typer.Option("--picture", help="Write picture.png, too: start, middle and end.")] = False,
     photo: PhotoOption = False,
     speed: Annotated[float, typer.Option(min=0.001, help="Seconds of the run per second of the video.")] = 1.0,
-    compiled: Annotated[
-        bool, typer.Option("--compiled", help="Compile the step: a minute at first, then many times faster.")
-    ] = False,
+    execution: ExecutionOption = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print a summary as JSON.")] = False,
 ) -> None:
     """Run a scene file, and keep its frames and a picture of the shapes.
@@ -53,11 +51,10 @@ def simulate(
     described = read(scene)
     out = out or Path("runs") / "simulate" / scene.stem
     files = check_files(out, video=video, picture=picture, photo=photo)
+    how = execution_choice(execution) or "recorded"
     try:
         with progress() as show, deferred_interrupt(show) as callback:
-            frames = run(
-                described, folder=scene.parent, frame_stride=frame_stride, compiled=compiled, callback=callback
-            )
+            frames = run(described, folder=scene.parent, frame_stride=frame_stride, execution=how, callback=callback)
     except KeyboardInterrupt:
         raise stopped("there was no result yet, and nothing was written") from None
     except ValueError as error:

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import typer
 
 from torchdlo.cli.ending import stopped
-from torchdlo.cli.options import PhotoOption, ResumeOption, RopeModelOption
+from torchdlo.cli.options import ExecutionOption, PhotoOption, ResumeOption, RopeModelOption, execution_choice
 from torchdlo.cli.progress import at_work, deferred_interrupt, progress
 from torchdlo.cli.scenes import check_files, draw, remove_older
 from torchdlo.errors import InputError
@@ -55,14 +55,7 @@ def play(
     speed: Annotated[float, typer.Option(min=0.001, help="Seconds of the episode per second of the video.")] = 0.5,
     arms: Annotated[bool, typer.Option(help="Show the arms.")] = True,
     rope_model: RopeModelOption = None,
-    compiled: Annotated[
-        bool,
-        typer.Option(
-            "--compiled",
-            help="Compile the step instead of recording it: minutes at first. "
-            "A trajectory is played with the steps with which it was found.",
-        ),
-    ] = False,
+    execution: ExecutionOption = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print how it went as JSON.")] = False,
 ) -> None:
     """Play an episode of a task, say what it earns, and keep frames to look at. Ctrl-C stops and keeps those so far.
@@ -92,7 +85,7 @@ def play(
         None if rope_model is None else cable(rope_model),
         no_op=no_op,
         reset_seed=reset_seed,
-        compiled=compiled,
+        execution=execution_choice(execution),
     )
     with progress() as show, deferred_interrupt(show) as callback:
         frames, went = film(played.task, played.actions, made=played.episode, arms=arms, callback=callback)
@@ -145,13 +138,7 @@ def optimize(
         typer.Option(help="Reward of expressions, if not the task's; see docs/reward_language.md.", metavar="FILE"),
     ] = None,
     dtype: Annotated[str, typer.Option(help="Precision of the physics.", metavar="float32|float64")] = "float32",
-    compiled: Annotated[bool, typer.Option(help="Compile the step: slow at first, then many times faster.")] = True,
-    recorded: Annotated[
-        bool,
-        typer.Option(
-            "--recorded", help="Trace the step instead of compiling it: takes seconds, helps where cmaes searches."
-        ),
-    ] = False,
+    execution: ExecutionOption = None,
     resume: ResumeOption = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
 ) -> None:
@@ -185,7 +172,7 @@ def optimize(
     names = ("result.json", "trajectory.json", "curve.png")
     for name in names:
         check_writable(out / name)
-    steps: dict[str, Any] = {"compiled": compiled and not recorded, "recorded": recorded}
+    steps: dict[str, Any] = {"execution": execution_choice(execution) or "compiled"}
     steps |= {"double": _is_double(dtype)} | _judged(task, grasps, reward)
     chosen = task_problem(task, None if rope_model is None else cable(rope_model), **steps)
     given = {"episodes": episodes, "population": population, "robust": Robust() if robust else None, "seed": seed}

@@ -29,6 +29,7 @@ from torchdlo.envs.tasks.wiring_post import WiringPost
 from torchdlo.envs.tasks.wiring_ring import WiringRing
 from torchdlo.envs.tasks.wrapping import Wrapping
 from torchdlo.errors import InputError
+from torchdlo.physics.execution import Execution
 
 if TYPE_CHECKING:
     from torchdlo.envs.core.env import DloEnv
@@ -142,8 +143,7 @@ def make(
     dtype: torch.dtype = torch.float32,
     seed: int | None = None,
     gradients: bool = False,
-    compiled: bool = True,
-    recorded: bool = False,
+    execution: Execution = "compiled",
     segment: int | None = 1,
     variation: bool = True,
     randomize: Mapping[str, float] | None = None,
@@ -162,8 +162,8 @@ def make(
         dtype: precision of the physics; observations and rewards are in single precision.
         seed: of the starts and of what is randomised; None draws one from torch's generator (`torch.manual_seed`).
         gradients: whether rewards and observations carry gradients to actions.
-        compiled: whether to compile steps: minutes at first, then about three times as fast, with gradients too.
-        recorded: if not, whether to record them: seconds at first, then two to three times as fast without gradients.
+        execution: how steps run: "compiled", minutes at first, then about three times as fast, with gradients too;
+            "recorded", seconds at first, then two to three times as fast without gradients; or "eager", at once.
         segment: frames that gradients run again at once; None keeps all of them in memory.
         variation: whether starts differ, by as much as `Task.reset_noise` says.
         randomize: numbers of effects that differ from scene to scene and are drawn at every reset, e.g.
@@ -203,8 +203,7 @@ def make(
         dtype=dtype,
         seed=seed,
         gradients=gradients,
-        compiled=compiled,
-        recorded=recorded,
+        execution=execution,
         segment=segment,
         variation=variation,
         randomize=randomize,

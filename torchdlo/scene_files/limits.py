@@ -8,6 +8,7 @@ from typing import Any
 
 from torchdlo import work_budget
 from torchdlo.errors import InputError
+from torchdlo.physics.execution import Execution
 from torchdlo.scene_files.schema import ParticleBlockSpec, SceneDescription
 
 __all__ = ["check_memory", "check_ranges", "check_time", "steps_of"]
@@ -130,12 +131,12 @@ def check_memory(d: SceneDescription, where: str = "scene", frame_stride: int | 
         work_budget.check(where, work, memory=2 * frames, cure=cure)
 
 
-def check_time(d: SceneDescription, where: str = "scene", *, compiled: bool = False) -> None:
+def check_time(d: SceneDescription, where: str = "scene", *, execution: Execution = "recorded") -> None:
     """Refuse a scene that would run for months, and say how long one takes that runs for more than a minute."""
     vertices, points = _vertices(d), _points(d)
     substep = _SUBSTEP + _VERTEX_SECONDS * vertices
     substep += _MPM_SUBSTEP + _POINT_SECONDS * points if points else 0.0
-    steps, share = steps_of(d), _COMPILED if compiled else 1.0
+    steps, share = steps_of(d), _COMPILED if execution == "compiled" else 1.0
     work = f"{steps:.4g} steps of {d.substeps} substeps with {vertices:.4g} vertices"
     work += f" and {points:.4g} material points" if points else ""
     work_budget.check(

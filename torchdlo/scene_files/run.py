@@ -16,6 +16,7 @@ from torchdlo import scene_files
 from torchdlo.errors import InputError
 from torchdlo.files import replace_atomically
 from torchdlo.physics import tree
+from torchdlo.physics.execution import Execution
 from torchdlo.scene_files import frames_checks, limits
 from torchdlo.scene_files.json_files import EFFECTS
 from torchdlo.untrusted.array_file import ArrayFile
@@ -83,6 +84,9 @@ class Frames:
 _MOVING = ("time", "pos", "twist", "force", "body_pos", "body_quat", "material_points", "joint_force")
 """What `_seen` returns, by the names of `Frames`."""
 
+_FEW = 50
+"""Steps that are not worth recording."""
+
 
 def _seen(scene: scenes.Scene, state: scenes.State) -> list[np.ndarray]:
     rods, none = state.rods, state.rods.pos.new_zeros(0, 4)
@@ -144,7 +148,7 @@ def run(
     *,
     folder: str | Path = ".",
     frame_stride: int = 10,
-    compiled: bool = False,
+    execution: Execution = "recorded",
     callback: Callable[[str, int, int, str], None] | None = None,
 ) -> Frames:
     """Run a scene and keep a frame of its start and after every `frame_stride` steps.
@@ -156,17 +160,17 @@ def run(
         description: the scene.
         folder: where the files that it names are looked for.
         frame_stride: steps per frame.
-        compiled: whether to compile the step, worth it for long runs; else it is recorded.
+        execution: how steps run; to compile them is worth it for long runs, to record them from 50 steps on.
         callback: told (stage, steps done, steps in all, message) after every frame.
     """
     limits.check_ranges(description, EFFECTS)
     limits.check_memory(description, frame_stride=frame_stride)
-    limits.check_time(description, compiled=compiled)
+    limits.check_time(description, execution=execution)
     made = scene_files.assemble(description, folder=folder)
     scene, params, state = made.scene, made.params, made.state
     control = made.plan.follow(scene)
     total = max(1, round(description.duration / description.dt))
-    step = scenes.stepper(scene, compiled=compiled, recorded=total > 50)
+    step = scenes.stepper(scene, execution="eager" if execution == "recorded" and total <= _FEW else execution)
     kept, interrupted, problem = [_seen(scene, state)], False, ""
     with torch.no_grad():
         for k in range(total):

@@ -37,7 +37,7 @@ def test_what_was_executed_earns_again_what_is_kept(made: Path) -> None:
     columns, rows = data.columns(), data.provenance["episodes"]
     task = Short()
     moved = torch.tensor([row["offsets"] for row in rows])
-    scene = episode.prepare(task, 5, compiled=False)
+    scene = episode.prepare(task, 5, execution="eager")
     world = episode.begin(scene, task.build(moved)[2])
     actions = torch.as_tensor(columns["torchdlo.executed"]).view(5, 4, 6)
     for k in range(4):

@@ -303,7 +303,7 @@ def test_a_policy_looks_again_after_some_actions_and_follows_its_chunk_between()
             return super().__call__(made, world, looks, size)
 
     task = SHORT["short"](horizon=10)
-    made = episode.prepare(task, 2, compiled=False)
+    made = episode.prepare(task, 2, execution="eager")
     actor = PolicyDemonstrator(policy.eval(), "hashed", "policy")
     with torch.no_grad():
         play_batch(made, draw_starts(task, 0, range(2)), actor, Noise(0.0), Counting())

@@ -57,8 +57,8 @@ def test_the_share_of_the_episode_is_told_in_waves():
 def test_task_features_find_ropes_bodies_and_tools_without_velocities(name: str):
     task = envs.find(name)
     spec = task_features(task)
-    start = episode.prepare(task, 1, compiled=False).start
-    seen = episode.observe(episode.prepare(task, 1, compiled=False), start)
+    start = episode.prepare(task, 1, execution="eager").start
+    seen = episode.observe(episode.prepare(task, 1, execution="eager"), start)
     points = Features(spec)(seen, torch.zeros(1, 1), seen)
     # At the usual start, all points are where they usually are.
     count = 3 * len(spec.points)
@@ -142,7 +142,7 @@ def test_a_policy_acts_in_torchrls_rollouts():
     task = small("wiring_post", 3)
     spec = PolicySpec(task_features(task), 3, hidden=(8,), task="wiring_post", reach=0.01, turns=3)
     policy = Policy(spec)
-    env = envs.make(task, num_envs=2, compiled=False, variation=False)
+    env = envs.make(task, num_envs=2, execution="eager", variation=False)
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         found = env.rollout(3, policy_module(policy))
     first = found[:, 0]

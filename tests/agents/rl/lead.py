@@ -45,7 +45,7 @@ def found(folder: Path) -> Path:
     actions = torch.zeros(1, 6, 6)
     actions[:, :, 1] = 0.025 / 6
     with torch.no_grad():
-        went = episode.play(Lead(), actions, keep=episode.scene_positions, compiled=False)
+        went = episode.play(Lead(), actions, keep=episode.scene_positions, execution="eager")
     file = folder / "lead" / "trajectory.json"
     file.parent.mkdir(parents=True, exist_ok=True)
     content = {"generator": "torchdlo optimize", "task": "lead", "success": bool(went.success[0])}

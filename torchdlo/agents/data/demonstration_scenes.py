@@ -40,7 +40,7 @@ def scene_file(folder: Path, name: str, number: int) -> Path:
 
 
 def _prepared(task: Task, size: int) -> episode.Episode:
-    return episode.prepare(task, size, compiled=False, recorded=task.horizon > 10)
+    return episode.prepare(task, size, execution=episode.quick_execution(task))
 
 
 def play_scenes(job: tuple[str, str, int, Path]) -> int:

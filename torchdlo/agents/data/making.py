@@ -36,8 +36,6 @@ __all__ = ["UNFINISHED", "DatasetPlan", "make_dataset", "report_of"]
 UNFINISHED = "unfinished"
 """Folder within a set for what is under way."""
 PLAN = "torchdlo-plan.json"
-_LONG = 10
-"""Actions of episodes whose steps are worth recording."""
 
 
 @dataclass(frozen=True)
@@ -111,7 +109,7 @@ class _Job:
 @functools.lru_cache(maxsize=2)
 def _prepared(found: Task, batch: int) -> episode.Episode:
     # Recorded steps take seconds to begin with; compiled ones take minutes and gain little in a batch.
-    return episode.prepare(found, batch, compiled=False, recorded=found.horizon > _LONG)
+    return episode.prepare(found, batch, execution=episode.quick_execution(found))
 
 
 @functools.lru_cache(maxsize=8)

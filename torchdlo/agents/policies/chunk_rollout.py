@@ -144,7 +144,7 @@ def evaluate_chunk_policy(
 
 def _prepared(name: str, count: int) -> episode.Episode:
     task = find(name)
-    return episode.prepare(task, count, compiled=False, recorded=task.horizon > 10)
+    return episode.prepare(task, count, execution=episode.quick_execution(task))
 
 
 def _told(start: EpisodeStart, name: str, known: Sequence[str], condition: str) -> EpisodeStart:

@@ -150,7 +150,7 @@ def task_features(task: Task, waves: int = 24, *, memory: bool = True) -> Featur
     """
     from torchdlo.envs.core import episode
 
-    made = episode.prepare(task, 1, compiled=False)
+    made = episode.prepare(task, 1, execution="eager")
     world = made.start
     vertices = world.state.rods.pos.shape[-2]
     bodies = sum(body.motion == "free" for body in made.scene.bodies)

@@ -14,11 +14,9 @@ import torch
 from torch import Tensor
 
 from torchdlo.envs import Task
+from torchdlo.physics.execution import Execution
 
 __all__ = ["EnvEpisodes", "Episodes", "TaskEpisodes", "Transition"]
-
-_LONG = 10
-"""Actions of episodes that are worth recording their steps."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,7 +114,7 @@ class TaskEpisodes:
         seed: int = 0,
         variation: bool = True,
         gradients: bool = False,
-        compiled: bool = False,
+        execution: Execution | None = None,
         dtype: torch.dtype = torch.float32,
         ends: bool = True,
         scale: float = 1.0,
@@ -131,7 +129,7 @@ class TaskEpisodes:
             seed: of the starts.
             variation: whether starts differ.
             gradients: whether rewards carry gradients to actions.
-            compiled: whether steps are compiled; they are recorded otherwise, which has no gradients.
+            execution: how steps run; without gradients as `quick_execution` says, else eager, if not given.
             dtype: of the physics.
             ends: whether what an end lacks to success is subtracted from the last reward.
             scale: what rewards are multiplied by.
@@ -139,6 +137,7 @@ class TaskEpisodes:
             randomize: see `torchdlo.envs.make`.
         """
         from torchdlo.envs.core.env import DloEnv
+        from torchdlo.envs.core.episode import quick_execution
 
         self.env = DloEnv(
             task,
@@ -146,8 +145,7 @@ class TaskEpisodes:
             dtype=dtype,
             seed=seed,
             gradients=gradients,
-            compiled=compiled,
-            recorded=not compiled and not gradients and task.horizon > _LONG,
+            execution=execution or ("eager" if gradients else quick_execution(task)),
             segment=5,
             variation=variation,
             randomize=randomize,

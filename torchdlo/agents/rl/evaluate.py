@@ -16,6 +16,7 @@ from torchdlo.agents.rl.rollout import episode_progress
 from torchdlo.envs import PUBLISHED, Task, with_fidelity
 from torchdlo.envs.observations.state import observe
 from torchdlo.physics import tree
+from torchdlo.physics.execution import Execution
 
 __all__ = ["PROTOCOLS", "UNSEEN", "evaluate_policies", "judge_policies", "wilson_interval"]
 
@@ -48,7 +49,7 @@ def judge_policies(
     protocols: Sequence[str] = ("one", "varied"),
     seed: int = 0,
     callback: Callable[[str, int, int, str], None] | None = None,
-    compiled: bool = False,
+    execution: Execution | None = None,
 ) -> dict[str, dict[str, Tensor]]:
     """Return how policies do, all in one batch: by protocol what became of all episodes, (policies, starts, ...).
 
@@ -61,7 +62,7 @@ def judge_policies(
         protocols: "disturbed" alone, or of the others.
         seed: of starts and noise.
         callback: told (stage, actions done, all, message).
-        compiled: whether steps are compiled.
+        execution: see `TaskEpisodes`.
     """
     how = PROTOCOLS[protocols[-1]]
     fine = with_fidelity(task, PUBLISHED)
@@ -71,7 +72,7 @@ def judge_policies(
         fine,
         len(policies) * (many + one),
         seed=UNSEEN + 1000 * seed,
-        compiled=compiled,
+        execution=execution,
         randomize=_randomized(fine, how.get("randomize", 0.0)),
     )
     rng = torch.Generator().manual_seed(UNSEEN + 1000 * seed + 1)
@@ -136,7 +137,7 @@ def evaluate_policies(
     protocols: Sequence[str] = ("one", "varied"),
     seed: int = 0,
     callback: Callable[[str, int, int, str], None] | None = None,
-    compiled: bool = False,
+    execution: Execution | None = None,
 ) -> tuple[dict[str, Any], dict[str, dict[str, Tensor]]]:
     """Return results as plain data, and what became of all episodes by protocol, see `judge_policies`.
 
@@ -147,7 +148,7 @@ def evaluate_policies(
         protocols: of `PROTOCOLS`.
         seed: of starts and noise; another one is for starts that no earlier judgement has seen.
         callback: told (stage, actions done, all, message).
-        compiled: whether steps are compiled.
+        execution: see `TaskEpisodes`.
     """
     found: dict[str, Any] = {}
     plays: dict[str, dict[str, Tensor]] = {}
@@ -155,7 +156,7 @@ def evaluate_policies(
     for names in (calm, ["disturbed"] if "disturbed" in protocols else []):
         if names:
             plays |= judge_policies(
-                policies, task, starts=starts, protocols=names, seed=seed, callback=callback, compiled=compiled
+                policies, task, starts=starts, protocols=names, seed=seed, callback=callback, execution=execution
             )
     for name, rows in plays.items():
         success, returns = rows["success"], rows["returns"]

@@ -17,19 +17,20 @@ from torchdlo.agents.rl.settings import TrainingSettings
 from torchdlo.agents.rl.training import Trained, Trainer
 from torchdlo.envs import Task, with_fidelity
 from torchdlo.errors import InputError
+from torchdlo.physics.execution import Execution
 
 __all__ = ["evaluation_summary", "load_policies", "prepare_training", "train_json"]
 
 
 def prepare_training(
-    task: Task, settings: TrainingSettings, *, compiled: bool = False, address: str | None = None
+    task: Task, settings: TrainingSettings, *, execution: Execution | None = None, address: str | None = None
 ) -> tuple[Trainer, Episodes]:
     """Return the trainer with a new policy, and its episodes, for an algorithm without stages.
 
     Args:
         task: the task.
         settings: how to train.
-        compiled: whether steps are compiled.
+        execution: see `TaskEpisodes`.
         address: of a Ray cluster whose processes play, see `executors.make_executor`.
     """
     from torchdlo.agents.rl.ppo import Ppo
@@ -51,7 +52,7 @@ def prepare_training(
         seed=settings.seed,
         variation=settings.variation,
         gradients=settings.algorithm in ("shac", "sapo"),
-        compiled=compiled,
+        execution=execution,
         ends=settings.ends,
         scale=_scale(task),
         bonus=settings.bonus,

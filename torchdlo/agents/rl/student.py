@@ -112,7 +112,7 @@ def cloud_spec(task: Task) -> CloudSpec:
     """Return what a policy of clouds for a task is."""
     from torchdlo.envs.core import episode
 
-    start = episode.prepare(task, 1, compiled=False).start
+    start = episode.prepare(task, 1, execution="eager").start
     center = tuple(start.state.rods.pos[0].mean(0).tolist())
     tools = tuple(tuple(p) for p in start.tool.pos[0].tolist())
     return CloudSpec(center, tools, task=task.name, reach=task.max_translation)

@@ -99,7 +99,7 @@ def polish(
     ways = actions[..., : 3 * task.arms.count].unflatten(-1, (-1, 3))
     turns = actions[..., 3 * task.arms.count :]
     rng, number = torch.Generator().manual_seed(seed), len(actions)
-    made = episode.prepare(task, number * count, compiled=False, recorded=task.horizon > 10)
+    made = episode.prepare(task, number * count, execution=episode.quick_execution(task))
     returns, success = torch.zeros(number), torch.zeros(number, dtype=torch.bool)
     for k in range(rounds):
         tried = torch.stack([variants(way, count, task.max_translation, rng) for way in ways])

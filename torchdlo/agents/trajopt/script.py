@@ -9,17 +9,14 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchdlo.agents.trajopt.search_result import load_actions, read_trajectory
+from torchdlo.agents.trajopt.search_result import execution_of, load_actions, read_trajectory
 from torchdlo.agents.trajopt.task_problem import task_problem
 from torchdlo.envs import RopeMaterial, Task, find
 from torchdlo.envs.core import episode
 from torchdlo.errors import InputError
+from torchdlo.physics.execution import Execution
 
 __all__ = ["Script", "script"]
-
-
-_LONG = 10
-"""Actions of episodes that are worth recording their steps."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,7 +36,7 @@ def script(
     *,
     no_op: bool = False,
     reset_seed: int | None = None,
-    compiled: bool = False,
+    execution: Execution | None = None,
 ) -> Script:
     """Return what to play.
 
@@ -50,14 +47,13 @@ def script(
         rope: see `torchdlo.envs.make`; a trajectory that was found for another one shows how well it carries over.
         no_op: do nothing.
         reset_seed: seed of a start with noise; without it, the nominal start.
-        compiled: whether to compile steps.
+        execution: how steps run, if no trajectory decides.
 
     Raises:
         InputError: The trajectory is none, is one of another task, needs a rope, or there is no scripted demonstration.
     """
-    found = (
-        {"compiled": compiled, "recorded": find(name).horizon > _LONG} if trajectory is None else _choices(trajectory)
-    )
+    usual: dict[str, Any] = {"execution": execution or episode.quick_execution(find(name))}
+    found = usual if trajectory is None else _choices(trajectory)
     material = found.pop("rope", None)
     chosen = task_problem(name, rope, **found)
     task = chosen.task
@@ -65,8 +61,7 @@ def script(
         raise InputError(f"{trajectory}: it was found for its own rope; give that one, or another, with --rope-model.")
     seeded = torch.Generator().manual_seed(reset_seed or 0)
     start: dict[str, Any] = {"generator": seeded, "variation": reset_seed is not None}
-    steps: dict[str, Any] = {"compiled": chosen.compiled, "recorded": chosen.recorded}
-    made = episode.prepare(task, 1, like=chosen.like, **steps, **start)
+    made = episode.prepare(task, 1, like=chosen.like, execution=chosen.execution, **start)
     if trajectory is not None:
         return Script(task, made, chosen.full(load_actions(trajectory, chosen)))
     if no_op:
@@ -80,10 +75,7 @@ def script(
 def _choices(path: Path) -> dict[str, Any]:
     """Return how a trajectory was found."""
     choices = read_trajectory(path)["choices"]
-    steps: dict[str, Any] = {
-        "compiled": choices["compiled"].flag(),
-        "recorded": choices.get("recorded", False).flag(),
-    }
+    steps: dict[str, Any] = {"execution": execution_of(choices)}
     if "grasps" in choices:
         hands = choices["grasps"].items(100)
         steps["grasps"] = tuple(None if hand.value is None else hand.whole(0, 10**6) for hand in hands)

@@ -15,9 +15,11 @@ from torchdlo.agents.trajopt.problem import Evaluation, Problem
 from torchdlo.agents.trajopt.search import SearchResult, SearchSettings
 from torchdlo.agents.trajopt.search_journal import code_versions, program_hash
 from torchdlo.errors import InputError
+from torchdlo.physics.execution import EXECUTIONS, Execution
 from torchdlo.untrusted import Entry, one_line, read_entry
 
 __all__ = [
+    "execution_of",
     "load_actions",
     "plain_evaluation",
     "read_trajectory",
@@ -112,6 +114,19 @@ def trajectory_json(found: SearchResult, problem: Problem) -> str:
         **found.kept,
     }
     return json.dumps(content, allow_nan=False) + "\n"
+
+
+def execution_of(choices: Entry) -> Execution:
+    """Return how steps of a search ran; files of 0.1 say it by two flags."""
+    if "execution" in choices:
+        said = choices["execution"]
+        for known in EXECUTIONS:
+            if said.value == known:
+                return known
+        raise said.wrong(f"one of {', '.join(EXECUTIONS)}")
+    if choices["compiled"].flag():
+        return "compiled"
+    return "recorded" if choices.get("recorded", False).flag() else "eager"
 
 
 def read_trajectory(path: Path) -> Entry:

@@ -19,6 +19,7 @@ from torchdlo.envs.core.subtask import SubTask, with_reward
 from torchdlo.envs.core.task import Task
 from torchdlo.errors import InputError
 from torchdlo.physics import tree
+from torchdlo.physics.execution import Execution
 from torchdlo.reward_language import Reward
 
 __all__ = ["TaskProblem", "task_problem"]
@@ -52,10 +53,8 @@ class TaskProblem:
     task: Task
     double: bool = False
     """Whether the physics runs in double precision."""
-    compiled: bool = True
-    """Whether steps are compiled."""
-    recorded: bool = False
-    """If not, whether they are recorded, see `torchdlo.scene.stepper`."""
+    execution: Execution = "compiled"
+    """How steps run, see `torchdlo.scene.stepper`."""
     device: str = "cpu"
     _episodes: dict[int, episode.Episode] = field(default_factory=dict)
     """Prepared once per size of batch."""
@@ -105,12 +104,11 @@ class TaskProblem:
     def choices(self) -> dict[str, Any]:
         """What else results depend on."""
         rope = {} if self.task.rope is None else {"rope": asdict(self.task.rope)}
-        steps = {"compiled": self.compiled, "recorded": self.recorded and not self.compiled}
         grasps = {} if self.task.grasps is None else {"grasps": list(self.task.grasps)}
         part = self.task.identity if isinstance(self.task, SubTask) else {}
         # Files from before it could be chosen are of the published one, and do not name it.
         how = {} if self.task.fidelity == PUBLISHED else {"fidelity": self.task.fidelity.plain()}
-        return {"double": self.double, **steps, "device": self.device} | rope | grasps | part | how
+        return {"double": self.double, "execution": self.execution, "device": self.device} | rope | grasps | part | how
 
     @property
     def like(self) -> Tensor:
@@ -121,7 +119,7 @@ class TaskProblem:
         """Return the episode for a batch; gradients run five frames again at once."""
         if count not in self._episodes:
             self._episodes[count] = episode.prepare(
-                self.task, count, like=self.like, compiled=self.compiled, recorded=self.recorded, segment=5
+                self.task, count, like=self.like, execution=self.execution, segment=5
             )
         return self._episodes[count]
 
@@ -137,7 +135,7 @@ class TaskProblem:
     def surrogate(self) -> TaskProblem | None:
         """Return the problem of the task's surrogate task, if it has one."""
         found = self.task.surrogate()
-        choices = (self.double, self.compiled, self.recorded, self.device)
+        choices = (self.double, self.execution, self.device)
         return None if found is None else TaskProblem(found, *choices)
 
     def varied(self, copies: int, scale: float, seed: int) -> Varied:

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from torchdlo.agents.vlm.conversation import ShownPicture
 from torchdlo.envs.core import episode
+from torchdlo.physics.execution import Execution
 
 __all__ = ["Carried", "Options", "Result", "WorldPainter"]
 
@@ -46,9 +47,8 @@ class Options:
     """Seed of a start that differs from the usual one."""
     enough: bool = True
     """Whether a search ends with the first trajectory that reaches the success of its step."""
-    compiled: bool = False
-    recorded: bool = True
-    """If not compiled, whether steps of the scene are recorded."""
+    execution: Execution = "recorded"
+    """How steps of the scene run."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -118,7 +118,7 @@ class _Run:
             return ()
         made, world = self.made, self.world
         if made is None or world is None:
-            made = episode.prepare(self.task, 1, like=self.like, compiled=False, **self.start())
+            made = episode.prepare(self.task, 1, like=self.like, execution="eager", **self.start())
             world = made.start
         now = ShownPicture("the scene now, vertices with their numbers", self.look.now(made, world))
         return (*(self.carried[-1].pictures if self.carried else ()), now)
@@ -151,7 +151,7 @@ class _Run:
         world, holds = self.world, self.holds
         if world is None:
             first = replace(self.task, grasps=grasps)
-            made = episode.prepare(first, 1, like=self.like, compiled=False, **self.start())
+            made = episode.prepare(first, 1, like=self.like, execution="eager", **self.start())
             world, holds = made.start, grasps
         return continue_from(self.task, world, grasps, holds=holds, horizon=step.horizon, reward=_judged(step))
 
@@ -162,7 +162,7 @@ class _Run:
         self.callback(f"step {number}", 0, self.options.episodes, "way-points")
         try:
             part = self.part_of(step)
-            problem = _Part(part, compiled=self.options.compiled, recorded=self.options.recorded)
+            problem = _Part(part, execution=self.options.execution)
             actions, episodes = self.search(step, problem, number)
         except _NotCarriedOut as error:
             self.carried.append(Carried(content, False, str(error), None, {}, 0, time.monotonic() - begun, False))

@@ -24,6 +24,7 @@ from torchdlo.envs.observations.sensor import Sensor, sensor_of
 from torchdlo.errors import InputError
 from torchdlo.physics import tree
 from torchdlo.physics.effects.parameter_name import ParameterName
+from torchdlo.physics.execution import Execution
 from torchdlo.scene import Params, Scene
 from torchdlo.vision.look import Look, draw_look
 
@@ -61,8 +62,7 @@ class DloEnv(EnvBase):
         dtype: torch.dtype = torch.float32,
         seed: int | None = None,
         gradients: bool = False,
-        compiled: bool = True,
-        recorded: bool = False,
+        execution: Execution = "compiled",
         segment: int | None = 1,
         variation: bool = True,
         randomize: Mapping[str, float] | None = None,
@@ -83,7 +83,7 @@ class DloEnv(EnvBase):
         limit = torch.tensor(task.limit, device=self.device)
         self._limit = torch.ones_like(limit) if scaled_actions else limit
         self._scale = limit.to(dtype) if scaled_actions else None
-        made = episodes.prepare(task, num_envs, like=self._like, compiled=compiled, recorded=recorded, segment=segment)
+        made = episodes.prepare(task, num_envs, like=self._like, execution=execution, segment=segment)
         _check(self._randomize, made.scene)
         self.episode, self.world, self._usual = made, made.start, made.params
         self._sensor = None if pixels is False else sensor_of(made, {} if pixels is True else pixels)

@@ -29,6 +29,7 @@ from torchdlo.envs.core.task import Task, TaskState, combined, succeeded
 from torchdlo.envs.observations.state import observe, scene_positions
 from torchdlo.errors import InputError
 from torchdlo.physics import tree
+from torchdlo.physics.execution import Execution
 from torchdlo.physics.linalg.numerics import safe_norm
 from torchdlo.physics.linalg.rotation import multiply
 from torchdlo.scene import Control, Params, Scene, State
@@ -118,6 +119,8 @@ class EpisodeResult:
     """What `keep` returned after every action, (T, ...) each."""
 
 
+_FEW = 10
+"""Actions of episodes that are not worth recording their steps."""
 _SCENE_BYTES = 1e5
 """What the state of a scene takes at least [bytes]."""
 
@@ -197,6 +200,11 @@ def _settled(episode: Episode, world: EpisodeState) -> EpisodeState:
     return tree.replace(world, state=state)
 
 
+def quick_execution(task: Task) -> Execution:
+    """Return how steps of a task run best that are to begin within seconds: recorded, unless there are few of them."""
+    return "recorded" if task.horizon > _FEW else "eager"
+
+
 def prepare(
     task: Task,
     num: int,
@@ -204,8 +212,7 @@ def prepare(
     like: Tensor | None = None,
     generator: torch.Generator | None = None,
     variation: bool = False,
-    compiled: bool = True,
-    recorded: bool = False,
+    execution: Execution = "compiled",
     segment: int | None = None,
 ) -> Episode:
     """Return an episode of a task for a batch.
@@ -216,30 +223,27 @@ def prepare(
         like: a tensor of the dtype and device that they get; float32 on the CPU if not given.
         generator: where random numbers come from.
         variation: whether starts differ.
-        compiled: whether to compile steps; `recorded`: if not, whether to record them, see `scene.stepper`.
+        execution: how steps run, see `scene.stepper`.
         segment: frames that gradients run again at once; None keeps all of them in memory.
     """
     if like is None or like.device.type == "cpu":
         work_budget.check(task.name, f"{num} scenes at once", memory=_SCENE_BYTES * num, cure="use fewer at once")
     moved = task.moved(num, like=like, generator=generator, variation=variation)
-    return prepare_at(task, moved, compiled=compiled, recorded=recorded, segment=segment)
+    return prepare_at(task, moved, execution=execution, segment=segment)
 
 
-def prepare_at(
-    task: Task, moved: Tensor, *, compiled: bool = True, recorded: bool = False, segment: int | None = None
-) -> Episode:
+def prepare_at(task: Task, moved: Tensor, *, execution: Execution = "compiled", segment: int | None = None) -> Episode:
     """Return an episode whose things are that far off their places at the start [m], shape (B, things, 3).
 
     Args:
         task: the task.
         moved: see `Task.build`.
-        compiled: see `prepare`.
-        recorded: see `prepare`.
+        execution: see `prepare`.
         segment: see `prepare`.
     """
     scene, params, state = task.build(moved)
     hands = hands_of(task, scene)
-    step = scenes.stepper(scene, compiled=compiled, recorded=recorded)
+    step = scenes.stepper(scene, execution=execution)
     world = _begin(task, scene, state, hands)
     episode = Episode(task, scene, params, step, hands, world, segment)
     return episode if not task.settle_steps else replace(episode, start=_settled(episode, world))
