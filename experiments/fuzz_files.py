@@ -363,7 +363,7 @@ def _trajectory(folder: Path) -> None:
     problem = TaskProblem(find("lifting"), execution="eager")
     actions = np.full((problem.horizon, problem.width), 0.01)
     tool = np.zeros((problem.horizon, problem.task.arms.count, 3)).tolist()
-    choices = {"double": False, "compiled": True, "recorded": False, "rope": None, "grasps": [3, None]}
+    choices = {"double": False, "execution": "compiled", "rope": None, "grasps": [3, None]}
     content = {"generator": "torchdlo optimize", "task": "lifting", "choices": choices, "return": 1.0, "success": True}
     (folder / "trajectory.json").write_text(json.dumps(content | {"actions": actions.tolist(), "tool": tool}))
 
