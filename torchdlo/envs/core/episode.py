@@ -85,7 +85,7 @@ class ControlStep:
 
     world: EpisodeState
     reward: Tensor
-    """What it earned, 0 in episodes that have failed [1], shape (B,)."""
+    """What it earned, 0 in episodes that had failed before [1], shape (B,)."""
     loss: Tensor
     """What gradients should descend: minus the reward, and `Task.auxiliary_loss` [1], shape (B,)."""
     terms: dict[str, Tensor]
@@ -108,7 +108,7 @@ class EpisodeResult:
     success: Tensor
     """Which episodes reached the goal [-], bool, shape (B,)."""
     failed: Tensor
-    """Which failed; they earn nothing from then on [-], bool, shape (B,)."""
+    """Which failed; they earn nothing from then on, see `Task.forfeits` [-], bool, shape (B,)."""
     rewards: Tensor
     """Rewards of the actions [1], shape (T, B)."""
     terms: dict[str, Tensor]
@@ -119,6 +119,8 @@ class EpisodeResult:
     """What `keep` returned after every action, (T, ...) each."""
 
 
+LEAST = "least"
+"""Note of the least that an action earned so far, at most 0, see `Task.forfeits`."""
 _FEW = 10
 """Actions of episodes that are not worth recording their steps."""
 _SCENE_BYTES = 1e5
@@ -168,7 +170,8 @@ def _begin(task: Task, scene: Scene, state: State, hands: Hands) -> EpisodeState
     held = grasp.close_hands(scene, hands, scenes.stationary_control(scene, state), repeated(target, plan.room), closed)
     world = EpisodeState(state, found.joints, target, target, held, {}, failed, none)
     seen = world.seen(task.arms.count)
-    return tree.replace(world, notes={"rest": task.rest(seen, scene.topology), **task.note(seen)})
+    rest, least = task.rest(seen, scene.topology), x.new_zeros(len(x))
+    return tree.replace(world, notes={"rest": rest, LEAST: least, **task.note(seen)})
 
 
 def _continued(task: Task, scene: Scene, state: State, hands: Hands, before: EpisodeState) -> EpisodeState:
@@ -183,6 +186,7 @@ def _continued(task: Task, scene: Scene, state: State, hands: Hands, before: Epi
     closed = plan.closed(none, tool, x)
     held = grasp.close_hands(scene, hands, scenes.stationary_control(scene, state), repeated(tool, plan.room), closed)
     notes = {name: t.expand(count, *t.shape[1:]) for name, t in before.notes.items()}
+    notes[LEAST] = x.new_zeros(count)
     return EpisodeState(state, joints, target, tool, held, notes, failed, none)
 
 
@@ -317,7 +321,7 @@ def _judged(episode: Episode, before: EpisodeState, after: EpisodeState, lost: l
     task, good = episode.task, scenes.finite(after.state)
     after = tree.where(good, after, before)
     notes = task.note(after.seen(task.arms.count))
-    after = tree.replace(after, notes={"rest": before.notes["rest"], **notes})
+    after = tree.replace(after, notes={"rest": before.notes["rest"], LEAST: before.notes[LEAST], **notes})
     seen = after.seen(task.arms.count)
     torn = (task.rest(seen, episode.scene.topology) > task.stretch * seen.notes["rest"]).any(-1)
     stuck = (inside_bodies(episode.scene, episode.params, after.state, after.tool.pos) & (seen.closed[..., 0] > 0)).any(
@@ -348,12 +352,25 @@ def control_step(episode: Episode, world: EpisodeState, action: Tensor, last: Te
         action: in metres and degrees, see `Task.width`.
         last: whether the episode ends with it, of each scene (B,) or of all: hands then open where a task asks for it.
     """
-    world = act(episode, world, action)
+    before, world = world, act(episode, world, action)
     if last is True:
         world = finish(episode, world)
     elif isinstance(last, Tensor) and episode.task.release and bool(last.any()):
         world = tree.where(last, finish(episode, world), world)
-    return ControlStep(world, *episode_reward(episode, world))
+    return _earned(episode, before, world)
+
+
+def _earned(episode: Episode, before: EpisodeState, world: EpisodeState) -> ControlStep:
+    """Return what an action came to, with what an episode forfeits that failed in it."""
+    reward, loss, terms = episode_reward(episode, world)
+    if not episode.task.forfeits:
+        return ControlStep(world, reward, loss, terms)
+    gone = combined(episode.task, terms, len(world.failed)).detach().nan_to_num()
+    least = torch.minimum(world.notes[LEAST], gone.to(world.notes[LEAST]))
+    left = (1 + episode.task.horizon - world.count).clamp(min=1)
+    now = world.failed & ~before.failed
+    reward, loss = torch.where(now, least * left, reward), torch.where(now, -least * left, loss)
+    return ControlStep(tree.replace(world, notes=world.notes | {LEAST: least}), reward, loss, terms)
 
 
 def episode_reward(episode: Episode, world: EpisodeState) -> tuple[Tensor, Tensor, dict[str, Tensor]]:

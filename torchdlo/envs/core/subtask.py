@@ -50,6 +50,7 @@ class SubTask(Task):
         for name in _SAME:
             object.__setattr__(self, name, getattr(self.inner, name))
         object.__setattr__(self, "combine", "sum" if self.reward else self.inner.combine)
+        object.__setattr__(self, "forfeits", self.reward is not None or self.inner.forfeits)
         still = ((0.0, 0.0),) * len(self.inner.reset_noise)
         object.__setattr__(self, "reset_noise", self.inner.reset_noise if self.before is None else still)
         stages = self.inner.stages

@@ -111,6 +111,9 @@ class Task(ABC):
     """Greatest turn of a tool in an action about each of its axes [degrees]."""
     stretch: ClassVar[float] = math.inf
     """Length of the rope between the hands over that at the start, above which an episode has failed [1]."""
+    forfeits: ClassVar[bool] = True
+    """Whether an episode that fails earns at once, for each action that is left, the least that one earned so far, if
+    that is less than nothing: where rewards are negative, such as minus a distance, it would pay to fail early."""
     reset_noise: ClassVar[tuple[tuple[float, float], ...]] = ((0.0, 0.0),)
     """By how much each of the things that `build` can move is moved in x and in y at most [m]."""
     coarse: ClassVar[Fidelity] = Fidelity(substeps=2)

@@ -44,6 +44,7 @@ class Lifting(Task):
     arms: ClassVar[Arms] = Arms(base=((0.25, -0.4, 0.0), (0.95, -0.4, 0.0)), vertex=(4, 25))
     stretch: ClassVar[float] = 1.1
     anchored: ClassVar[bool] = True
+    forfeits: ClassVar[bool] = False  # as published
     reset_noise: ClassVar[tuple[tuple[float, float], ...]] = ((0.05, 0.025),)
 
     def build(self, moved: Tensor) -> tuple[Scene, Params, State]:

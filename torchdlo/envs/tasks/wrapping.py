@@ -49,6 +49,7 @@ class Wrapping(Task):
     floor: ClassVar[float] = 0.04
     stretch: ClassVar[float] = 1.2
     anchored: ClassVar[bool] = True
+    forfeits: ClassVar[bool] = False  # as published
     reset_noise: ClassVar[tuple[tuple[float, float], ...]] = ((0.025, 0.01),)
 
     def build(self, moved: Tensor) -> tuple[Scene, Params, State]:
