@@ -359,10 +359,11 @@ def check_step(scene: Scene, params: Params) -> None:
     for term, bound in limits(scene, params).items():
         if not dt < bound:
             need = scene.dt / bound * 1.05 if bound > 0 else math.inf
-            finer = f"substeps={math.ceil(need)} or more, or " if need < 10**6 else ""
+            cures = [f"substeps={math.ceil(need)} or more"] if need < 10**6 else []
+            cures += ["integrator='implicit'"] if scene.integrator == "explicit" else []
             raise ValueError(
                 f"scene: a substep of {dt:.3g} s (dt {scene.dt:g} s / {scene.substeps} substeps) is not stable: {term} "
-                f"allows less than {bound:.3g} s. Use {finer}integrator='implicit'."
+                f"allows less than {bound:.3g} s. Use {', or '.join(cures) or 'a lighter load'}."
             )
 
 

@@ -5,13 +5,8 @@ from __future__ import annotations
 import pytest
 import torch
 
-from torchdlo.coupling import RodBody
 from torchdlo.coupling.bodies import edge_search_op, segment_distance, shape_sdf
-from torchdlo.coupling.bodies.dynamics import Body, PredictedBodyMotion
-from torchdlo.physics import tree
-from torchdlo.physics.kernels import lanes
-from torchdlo.physics.rod import kinematics
-from torchdlo.scene import RigidBody, Rope, make
+from torchdlo.coupling.bodies.dynamics import Body
 
 SIZES = {
     "sphere": (0.04, 1.0, 1.0),
@@ -65,37 +60,3 @@ def test_the_kernel_and_tensor_operations_find_the_same_points(shape, dtype, mon
 def test_meshes_that_differ_from_scene_to_scene_are_left_to_tensor_operations():
     line = edges("mesh", torch.float64, ())
     assert not edge_search_op.kernel_fits(line.body, line.grid.expand(2, *line.grid.shape))
-
-
-def test_all_points_at_once_are_those_of_each_body(monkeypatch):
-    g = torch.Generator().manual_seed(1)
-    batch, dtype = (3, 2), torch.float64
-    turn = torch.randn(*batch, len(SIZES), 4, generator=g, dtype=dtype)
-    solids = [
-        RigidBody(
-            shape,
-            SIZES[shape][: len(shape_sdf.SIZES[shape])],
-            0.05 * torch.randn(3, generator=g, dtype=dtype),
-            motion="fixed",
-        )
-        for shape in SIZES
-        if shape != "mesh"
-    ]
-    ropes = [
-        Rope(torch.cumsum(0.03 * torch.randn(n, 3, generator=g, dtype=dtype), 0), mass=0.01, radius=0.001)
-        for n in (9, 5)
-    ]
-    scene, params, state = make(ropes, [RodBody()], bodies=[RigidBody("plane", motion="fixed"), *solids], check=False)
-    quat = turn / turn.norm(dim=-1, keepdim=True)
-    state = tree.replace(
-        state, bodies=tree.replace(state.bodies, quat=quat, pos=state.bodies.pos.expand(*batch, -1, -1))
-    )
-    none = torch.zeros_like(state.bodies.pos)
-    motion = PredictedBodyMotion(scene.bodies, params.bodies, state.bodies, 1e-3, none, none, none[..., :1], none)
-    real = params.rods.rest.edge_mask
-    view = kinematics.view(scene.topology, params.rods, state.rods, 1e-3)
-    by_tensors = segment_distance.find_contact_points(view, motion, 2)
-    monkeypatch.setattr(lanes, "ready", lambda like: True)
-    at_once = segment_distance.find_contact_points(view, motion, 2)
-    for a, b in zip(tree.leaves(at_once), tree.leaves(by_tensors), strict=True):
-        assert a.shape == b.shape and float((real * (a - b)).abs().max()) < 1e-9

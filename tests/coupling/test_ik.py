@@ -12,7 +12,7 @@ pytest.importorskip("pytorch_kinematics")
 
 from torchdlo.coupling.bodies.dynamics import turn_between
 from torchdlo.coupling.common.pose import Pose
-from torchdlo.coupling.robot import inverse_kinematics
+from torchdlo.coupling.robot import ik_op, inverse_kinematics
 from torchdlo.coupling.robot import robot_kinematics as robot
 from torchdlo.coupling.robot.inverse_kinematics import IkSearch
 from torchdlo.physics import tree
@@ -225,3 +225,43 @@ def test_all_of_a_hundred_reachable_poses_are_reached_and_settle_with_restarts(m
     if not position_only:
         assert float(turn_between(there.quat, target.quat).norm(dim=-1).max()) <= 1.01e-3
     assert torch.equal(found.handed.pos, target.pos)
+
+
+@pytest.mark.parametrize("choices", [{}, {"position_only": True}, {"within_time": 0.02}], ids=str)
+def test_the_kernel_gives_what_tensor_operations_give(choices, monkeypatch):
+    if not ik_op.ready("cpu", F64):
+        pytest.skip("needs a C++ compiler")
+    # Stretched arms, whose joints answer to anything, are left out.
+    start = 0.5 * (reachable(50)[0] + middle(50))
+    target = robot.tool_pose(arm(), start)
+    quat = torch.nn.functional.normalize(target.quat + 0.02, dim=-1)
+    moved = [x.requires_grad_() for x in (target.pos + 0.02, quat)]
+    weight = torch.randn(50, 8, generator=torch.Generator().manual_seed(5), dtype=F64)
+
+    def found() -> list[torch.Tensor]:
+        search = IkSearch(steps=4, closing=2, polish=2, starts=2)
+        there = inverse_kinematics.solve_ik(arm(), Pose(*moved), start, search=search, **choices)
+        loss = (weight * there.joints).sum() + (weight[:, :3] * there.pose.pos).sum() + there.pose.quat[:, 0].sum()
+        return [*tree.leaves(there), *torch.autograd.grad(loss, moved, allow_unused=True)]
+
+    fast = found()
+    monkeypatch.setattr(ik_op, "ready", lambda *_: False)
+    for one, other in zip(fast, found(), strict=True):
+        off = 0.0 if one is None and other is None else float((one.double() - other.double()).detach().abs().max())
+        assert off < 1e-9, off
+
+
+def test_the_pose_follows_the_joints_as_forward_kinematics_say():
+    _, start = settled_poses(6)
+    made = robot.panda(base=(0.1, -0.2, 0.3), base_quat=(0.8, 0.0, 0.0, 0.6))
+    there = robot.tool_pose(made, start)
+    pos, weight = (there.pos + 0.01).requires_grad_(), torch.randn(6, 7, dtype=F64)
+    found = inverse_kinematics.solve_ik(made, Pose(pos, there.quat), start)
+    again = robot.tool_pose(made, found.joints)
+    for pose in (found.pose, again):
+        assert torch.allclose(pose.pos, again.pos, atol=1e-12) and torch.allclose(pose.quat, again.quat, atol=1e-12)
+    one, other = (
+        torch.autograd.grad((weight * torch.cat([p.pos, p.quat], -1)).sum(), pos, retain_graph=True)[0]
+        for p in (found.pose, again)
+    )
+    assert torch.allclose(one, other, rtol=1e-9, atol=1e-12)

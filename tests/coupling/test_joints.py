@@ -14,6 +14,7 @@ from torchdlo.coupling import RodBody, RodContact
 from torchdlo.coupling.bodies.dynamics import conjugate
 from torchdlo.physics import tree
 from torchdlo.physics.effects import Bend, BendFrame, Gravity, Twist
+from torchdlo.physics.integrators import contact_kernel
 from torchdlo.physics.linalg.free_rotation import spin_freely, spin_gradient
 from torchdlo.physics.linalg.rotation import multiply, rotate
 from torchdlo.scene import RigidBody, Rope, RopeJoint
@@ -154,6 +155,36 @@ def test_a_rope_and_a_plug_in_free_flight_keep_their_momentum(integrator: str, p
     torch.testing.assert_close(later, turning, atol=1e-14 if integrator == "explicit" else 2e-7, rtol=0)
     assert float(gap(made, state).abs().max()) < 1e-13
     scenes.check_state(state)
+
+
+def knotted():
+    """Two ropes that are joined, crossed by a third one, with a plug at an end and a ball near it."""
+    points = line(9, 0.2, way=(0.8, 0.0, -0.6))
+    other = line(5, 0.1, start=(0.04, -0.05, -0.0198), way=(0.0, 1.0, 0.0))
+    ropes = [Rope(x, radius=0.004, mass=0.01, bend=1e-6) for x in (points[:5], points[4:], other)]
+    plug = RigidBody("sphere", (0.01,), pos=(0.168, 0.0, -0.126), mass=0.05, omega=(3.0, 2.0, 8.0))
+    ball = RigidBody("sphere", (0.02,), pos=(0.0973, 0.0, -0.1036), mass=0.02)
+    joints = [RopeJoint(other_rope=1, kind="ball"), RopeJoint(rope=1, body=0)]
+    effects = [Gravity(), Bend(), RodContact(), RodBody()]
+    return scenes.make(
+        ropes, effects, bodies=[plug, ball], joints=joints, prescribed_vertices=[0], **STEPS["implicit"],
+        integrator="implicit",
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("case", ["weld with twist", "ball within an edge", "ropes, contact"])
+def test_the_kernel_gives_what_tensor_operations_give(case: str, monkeypatch) -> None:
+    if not contact_kernel.available(torch.zeros(1, dtype=torch.float64)):
+        pytest.skip("needs a C++ compiler")
+    made = knotted() if case not in PLACES else flying(PLACES[case][0], "implicit", twist=PLACES[case][1])
+    fast = ran(made, 3)
+    monkeypatch.setattr(contact_kernel, "available", lambda _: False)
+    slow = ran(made, 3)
+    pairs = [(fast.rods, slow.rods, 1e-10), (fast.bodies, slow.bodies, 1e-8), (fast.joints, slow.joints, 1e-5)]
+    for one, other, least in pairs:
+        for a, b in zip(tree.leaves(one), tree.leaves(other), strict=True):
+            torch.testing.assert_close(a, b, rtol=1e-7, atol=least)
+    torch.testing.assert_close(fast.diagnostics, slow.diagnostics)
 
 
 @pytest.mark.slow

@@ -1,25 +1,19 @@
-"""The search for the nearest points of edges as a C++ kernel, up to the last step of Newton's method or with it.
+"""The search for the nearest points of edges as a C++ kernel, up to the last step of Newton's method.
 
 The formulas stand in `segment_distance`, as tensor operations; these are used on a GPU, where there is no C++ compiler,
-and for meshes that differ from scene to scene. What is found has no derivative: the last step gives it one. Recorded
-steps, which carry none, do all of it in the kernel.
+and for meshes that differ from scene to scene. What is found has no derivative: the last step gives it one.
 """
 
 from __future__ import annotations
 
 import ctypes
-import itertools
-from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
 from torchdlo.coupling.bodies import shape_sdf
-from torchdlo.coupling.bodies.dynamics import Body, PredictedBodyMotion
+from torchdlo.coupling.bodies.dynamics import Body
 from torchdlo.coupling.common import scene_packing
-from torchdlo.physics.kernels import lanes
-from torchdlo.physics.linalg.vector_components import axes
-from torchdlo.physics.rod.kinematics import View
 
 _function, ready = scene_packing.kernel("edge_search", "RodBody, the points of edges in implicit steps")
 
@@ -85,66 +79,3 @@ def search(
     found = torch.ops.torchdlo.edge_search(edges, numbers, flat, shape, cells, pieces)
     parts = [x.reshape(count, *batch).movedim(0, -1).unsqueeze(-1) for x in found]
     return [tuple(parts[4 * j : 4 * j + 4]) for j in range(pieces)]
-
-
-class _AllSizes(ctypes.Structure):
-    _fields_ = (
-        *((name, ctypes.c_int64) for name in ("vertices", "scenes", "bodies", "corners")),
-        *((name, ctypes.c_void_p) for name in ("shape", "pieces", "after", "cells", "grids")),
-    )
-
-
-def _points(
-    pos: Tensor,
-    bodies: list[Tensor],
-    grids: Tensor,
-    cells: list[int],
-    shapes: list[int],
-    pieces: list[int],
-    after: list[int],
-) -> Tensor:
-    out = _points_meta(pos, bodies, grids, cells, shapes, pieces, after)
-    lists = (scene_packing.integers(tuple(x)) for x in (shapes, pieces, after, cells))
-    sizes = _AllSizes(*pos.shape[1:], len(shapes), grids.shape[1], *lists, grids.data_ptr())
-    places = (scene_packing.fields(x) for x in ([pos], bodies, [out]))
-    _function("points", out.dtype)(*places, ctypes.byref(sizes), torch.get_num_threads())
-    return out
-
-
-def _points_meta(pos: Tensor, bodies, grids, cells, shapes, pieces: list[int], after) -> Tensor:
-    return pos.new_empty(8, sum(2 + n for n in pieces), *pos.shape[1:])
-
-
-scene_packing.operator(
-    "edge_points(Tensor pos, Tensor[] bodies, Tensor grids, int[] cells, int[] shapes, int[] pieces, int[] after) "
-    "-> Tensor",
-    _points,
-    _points_meta,
-)
-
-
-def all_at_once(motion: PredictedBodyMotion) -> bool:
-    """Return whether `points` can be used now: in steps that are being recorded."""
-    like = motion.state.pos
-    return lanes.ready(like) and ready(like.device.type, like.dtype) and scene_packing.alike(motion)
-
-
-def points(view: View, motion: PredictedBodyMotion, batch: torch.Size, pieces: Sequence[int]) -> list[Tensor]:
-    """Return shares, distances, normals and arms of points of edges, F per edge, shape (..., F, V, 1 or 3) each.
-
-    Args:
-        view: the rods.
-        motion: the bodies.
-        batch: axes of the scenes.
-        pieces: how many pieces of an edge are searched for each body.
-    """
-    offset, numbers = scene_packing.shape_sizes(motion)
-    solids = [motion.state.pos, *itertools.chain(*axes(motion.state.quat)), offset, *numbers]
-    (pos,) = scene_packing.pack_components([view.state.pos], batch, view.topology.size)
-    bodies = scene_packing.pack_components(solids, batch, len(motion.bodies))
-    shapes = scene_packing.shape_numbers(motion)
-    found = torch.ops.torchdlo.edge_points(
-        pos, bodies, *scene_packing.sampled_grids(motion), shapes, list(pieces), view.topology.successor()
-    )
-    found = found.reshape(*found.shape[:3], *batch)
-    return list(found.permute(*range(3, found.dim()), 1, 2, 0).split((1, 1, 3, 3), -1))

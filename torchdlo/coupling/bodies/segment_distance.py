@@ -149,10 +149,6 @@ def find_contact_points(view: View, motion: PredictedBodyMotion, pieces: int) ->
     """
     state, params = motion.state, motion.params
     batch = torch.broadcast_shapes(view.state.pos.shape[:-2], state.pos.shape[:-2], params.size.shape[:-2])
-    if edge_search_op.all_at_once(motion):
-        each = [points_per_edge(body, pieces) - 2 for body in motion.bodies]
-        share, distance, normal, arm = edge_search_op.points(view, motion, batch, each)
-        return EdgePoints(share, normal, arm, distance)
     pos = view.state.pos.expand(*batch, -1, -1)
     found: list[tuple[Tensor, Tensor, Tensor, Tensor]] = []
     for k, body in enumerate(motion.bodies):

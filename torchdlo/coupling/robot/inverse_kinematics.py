@@ -30,10 +30,12 @@ import torch
 from torch import Tensor
 
 from torchdlo.coupling.bodies.dynamics import turn_between
-from torchdlo.coupling.common.pose import Pose, from_matrix, relative_pose
+from torchdlo.coupling.common.pose import Pose, compose_poses, from_matrix, relative_pose
+from torchdlo.coupling.robot import ik_op
 from torchdlo.coupling.robot.robot_kinematics import Robot, check_joints, jacobian, tool_pose, transforms
 from torchdlo.physics import tree
 from torchdlo.physics.linalg.numerics import safe_norm
+from torchdlo.physics.linalg.rotation import multiply
 
 LEVER = 0.3
 """How many metres of error a radian counts as [m/rad]."""
@@ -112,6 +114,24 @@ class _Here:
     """What is missing to the target, orientations times `LEVER` [m], shape (B, 6)."""
     slope: Tensor
     """How moving joints change the tool's pose, rotations times `LEVER` [-, m], shape (B, 6, M)."""
+    tip: Pose
+    """The pose of the tool, (B, 3) and (B, 4)."""
+
+
+@tree.struct
+class _End:
+    """Where a search ends."""
+
+    joints: Tensor
+    """Joint positions [rad or m], shape (B, J)."""
+    tip: Pose
+    """The pose of the tool, (B, 3) and (B, 4)."""
+    left: Tensor
+    """How far the next Newton step goes [rad or m], shape (B,)."""
+    slope: Tensor
+    """How commanded joints change the tool's pose, rotations times `LEVER` [-, m], shape (B, 6, J)."""
+    matrix: Tensor
+    """How the next Newton step follows the error, shape (B, J, 6)."""
 
 
 class _Answer(torch.autograd.Function):
@@ -129,15 +149,19 @@ class _Answer(torch.autograd.Function):
         return None, (matrix.transpose(-1, -2) @ gradient.unsqueeze(-1)).squeeze(-1)
 
 
+def _error(problem: _Problem, tip: Pose) -> Tensor:
+    """Return what is missing to the target, orientations times `LEVER` [m], shape (B, 6)."""
+    turn = LEVER * turn_between(tip.quat, problem.target.quat)
+    return torch.cat([problem.target.pos - tip.pos, turn if problem.turns else 0 * turn], -1)
+
+
 def _look(problem: _Problem, joints: Tensor) -> _Here:
-    robot, target = problem.robot, problem.target
+    robot = problem.robot
     found = transforms(robot, joints)
-    tip = found[..., robot.links.index(robot.tool), :, :]
-    turn = turn_between(from_matrix(tip[..., :3, :3]), target.quat)
-    error = torch.cat([target.pos - tip[..., :3, 3], LEVER * turn], -1)
-    counts = error.new_tensor([1.0] * 3 + [float(problem.turns)] * 3)
-    scale = counts * error.new_tensor([1.0] * 3 + [LEVER] * 3)
-    return _Here(error * counts, jacobian(robot, found) * scale[:, None])
+    at = found[..., robot.links.index(robot.tool), :, :]
+    tip = Pose(at[..., :3, 3], from_matrix(at[..., :3, :3]))
+    scale = at.new_tensor([1.0] * 3 + [LEVER * problem.turns] * 3)
+    return _Here(_error(problem, tip), jacobian(robot, found) * scale[:, None], tip)
 
 
 def _stopped(problem: _Problem, joints: Tensor, change: Tensor) -> Tensor:
@@ -232,9 +256,28 @@ def _newton(problem: _Problem, joints: Tensor, here: _Here) -> tuple[Tensor, Ten
     return parts(_stopped(problem, joints, change))
 
 
+def _by_kernel(problem: _Problem, joints: Tensor, search: IkSearch) -> _End:
+    """Return where all steps lead, and what is known there, by the kernel."""
+    target, counts = problem.target, (search.steps, search.closing, search.polish)
+    sizes = search.pull, search.stride, search.near, search.aligned
+    given = target.pos, target.quat, problem.posture, problem.lower, problem.upper, joints
+    found = ik_op.solve(problem.robot, problem.give, problem.turns, (LEVER, STILL), (counts, sizes), given)
+    return _End(found[0], Pose(found[1], found[2]), *found[3:])
+
+
+def _ended(problem: _Problem, joints: Tensor, search: IkSearch) -> _End:
+    """Return where all steps lead, and what is known there."""
+    if ik_op.ready(joints.device.type, joints.dtype):
+        return _by_kernel(problem, joints, search)
+    joints = _descend(problem, joints, search)
+    here = _look(problem, joints)
+    return _End(joints, here.tip, *_left(problem, joints, here))
+
+
 def _descend(problem: _Problem, joints: Tensor, search: IkSearch) -> Tensor:
     """Return joint positions after all steps, shape (B, J)."""
-
+    if ik_op.ready(joints.device.type, joints.dtype):
+        return _by_kernel(problem, joints, search).joints
     for pull in [search.pull] * search.steps + [0.0] * search.closing:
         joints = _bounded(problem, joints + _damped(problem, joints, pull, search.stride))
     here = _look(problem, joints)
@@ -284,10 +327,11 @@ def _best(problem: _Problem, found: Tensor, search: IkSearch, settled: bool = Fa
     return torch.take_along_dim(found, cost.argmin(0)[None, :, None], 0)[0]
 
 
-def _left(problem: _Problem, joints: Tensor, here: _Here) -> tuple[Tensor, Tensor]:
-    """Return how far the next Newton step goes [rad or m], shape (B,), and how it follows the error, (B, J, 6)."""
+def _left(problem: _Problem, joints: Tensor, here: _Here) -> tuple[Tensor, Tensor, Tensor]:
+    """Return `left`, `slope` and `matrix` of `_End`."""
     rest, matrix = _newton(problem, joints, here)
-    return (rest + (matrix @ here.error.unsqueeze(-1)).squeeze(-1)).abs().amax(-1), matrix
+    left = (rest + (matrix @ here.error.unsqueeze(-1)).squeeze(-1)).abs().amax(-1)
+    return left, here.slope @ problem.robot.mix.to(joints), matrix
 
 
 def _still(left: Tensor) -> Tensor:
@@ -375,25 +419,46 @@ def solve_ik(
     problem, start, batch = _pose(robot, target, start, posture, within_time)
     problem = dataclasses.replace(problem, turns=not position_only)
     with torch.no_grad():
-        many = _repeated(problem, search.starts)
-        many = dataclasses.replace(many, target=tree.detach(many.target))
-        found = _descend(many, _spread(problem, start, search.starts), search)
-        joints = _best(problem, found.reshape(search.starts, *start.shape), search)
-        joints = _restarted(dataclasses.replace(problem, target=tree.detach(problem.target)), start, joints, search)
-    here = _look(problem, joints)
-    error = here.error
-    with torch.no_grad():
-        left, matrix = _left(problem, joints, here)
-    # Its value is 0: the answer stays within the limits.
-    joints = joints + _Answer.apply(matrix, error - error.detach())
-    joints = joints.reshape(*batch, -1)
+        end = _found(dataclasses.replace(problem, target=tree.detach(problem.target)), start, search)
+    error = _error(problem, end.tip)
+    # The values of both changes are 0: the answer stays within the limits.
+    change = _Answer.apply(end.matrix, error - error.detach())
+    joints = (end.joints + change).reshape(*batch, -1)
+    if position_only:
+        pose = tool_pose(robot, joints)
+    else:
+        pose = tree.map(lambda x: x.reshape(*batch, -1), compose_poses(_base(robot, start), _moved(end, change)))
     missing = _missing(error.detach()).reshape(*batch, 2)
     there = _reached(missing, search)
-    settled = there & _still(left.reshape(batch))
-    joints, missing, pose = tree.map(lambda x: x.to(given), (joints, missing, tool_pose(robot, joints)))
+    settled = there & _still(end.left.reshape(batch))
+    joints, missing, pose = tree.map(lambda x: x.to(given), (joints, missing, pose))
     wanted = tree.map(lambda x: x.expand(*batch, x.shape[-1]).to(given), target)
     wanted = Pose(wanted.pos, pose.quat) if position_only else wanted
     return Solution(joints, pose, tree.where(there, wanted, pose), missing, there, settled)
+
+
+def _found(problem: _Problem, start: Tensor, search: IkSearch) -> _End:
+    """Return where the best of all starts, or of those that begin again, leads."""
+    if search.starts == 1 and not search.restarts:
+        return _ended(problem, start, search)
+    many = _repeated(problem, search.starts)
+    found = _descend(many, _spread(problem, start, search.starts), search)
+    joints = _best(problem, found.reshape(search.starts, *start.shape), search)
+    joints = _restarted(problem, start, joints, search)
+    return _ended(problem, joints, dataclasses.replace(search, steps=0, closing=0, polish=0))
+
+
+def _moved(end: _End, change: Tensor) -> Pose:
+    """Return the pose of the tool with the derivative that small changes of the joints (B, J) give it."""
+    if not change.requires_grad:
+        return end.tip
+    far, turn = _Answer.apply(end.slope, change).split(3, -1)
+    spin = torch.cat([0 * turn[..., :1], 0.5 / LEVER * turn], -1)
+    return Pose(end.tip.pos + far, end.tip.quat + multiply(spin, end.tip.quat))
+
+
+def _base(robot: Robot, like: Tensor) -> Pose:
+    return tree.map(lambda x: x.to(like), robot.base)
 
 
 def _pose(
@@ -415,7 +480,6 @@ def _pose(
     if within_time is not None:
         reach = robot.velocity.to(start) * within_time
         lower, upper = torch.maximum(lower, start - reach), torch.minimum(upper, start + reach)
-    base = tree.map(lambda x: x.to(start), robot.base)
-    seen = relative_pose(base, tree.map(lambda x: flat(x.to(start)), target))
+    seen = relative_pose(_base(robot, start), tree.map(lambda x: flat(x.to(start)), target))
     give = (0.5 * (high - low)).square() * on
     return _Problem(robot, seen, flat(posture.detach()), give, lower, upper), start, batch

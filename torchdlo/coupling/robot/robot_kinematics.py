@@ -51,6 +51,10 @@ class Robot:
     """Positions of moving joints where the commanded ones are 0 [rad or m], shape (M,)."""
     behind: tuple[int, ...]
     """For each moving joint, the number of the link that it moves."""
+    path: tuple[int, ...]
+    """For each joint from the first link to the tool, its number among the moving ones; -1 for fixed ones."""
+    origins: Tensor
+    """Where these joints are in the frames of the links before them [1, m], shape (joints of the path, 4, 4)."""
     shapes: tuple[urdf.CollisionShape, ...]
     base: Pose
     """Where the first link stands."""
@@ -89,18 +93,19 @@ def load_robot(
     tool = ends[0] if tool is None else tool
     if tool not in said.links:
         raise InputError(f"{said.name}: has no link {tool!r}; {urdf.near(tool, said.links)}.")
-    before, way = {j.child: j for j in said.joints}, []
+    before, way = {j.child: j for j in said.joints}, list[urdf.Joint]()
     link = tool
     while link in before:
-        way.append(before[link].name)
+        way.insert(0, before[link])
         link = before[link].parent
-    moved = tuple(k for k, j in enumerate(moving) if j.name in way)
+    names = [j.name for j in moving]
+    moved = tuple(k for k, name in enumerate(names) if name in [j.name for j in way])
     if not moved:
         raise InputError(f"{said.name}: no joint moves the link {tool!r}; choose another tool.")
     leaders = [j for j in moving if not j.mimics]
     mix = [[(j.factor if j.mimics else 1.0) * ((j.mimics or j.name) == k.name) for k in leaders] for j in moving]
     links = (said.joints[0].parent, *(j.child for j in said.joints))
-    number = functools.partial(torch.tensor, dtype=torch.float64)
+    number = functools.partial(torch.as_tensor, dtype=torch.float64)
     quat = number(base_quat)
     return Robot(
         said.name,
@@ -116,6 +121,8 @@ def load_robot(
         number(mix),
         number([j.offset for j in moving]),
         tuple(links.index(j.child) for j in moving),
+        tuple(names.index(j.name) if j.name in names else -1 for j in way),
+        torch.stack([number(j.origin) for j in way]),
         said.shapes,
         Pose(number(base), quat / quat.norm()),
         _chain(said.joints),

@@ -11,11 +11,13 @@ import functools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from torchdlo.physics.constraints import contact_penalty as penalty
+from torchdlo.physics.constraints.joint_points import JointPoints
 from torchdlo.physics.kernels import native
 from torchdlo.physics.linalg import banded
 from torchdlo.physics.rod.topology import parse
@@ -27,10 +29,18 @@ _SLOT, _POINT, _PAIR = 28, 18, 43
 """How many numbers slots, points and pairs have."""
 
 
+class _Tied(ctypes.Structure):
+    _fields_ = (
+        ("count", ctypes.c_int64),
+        *((name, ctypes.c_void_p) for name in ("first", "slot", "body", "weight")),
+    )
+
+
 class _Sizes(ctypes.Structure):
     _fields_ = (
         *((name, ctypes.c_int64) for name in ("slots", "scenes", "families", "bodies", "pairs", "half", "tries")),
         *((name, ctypes.c_void_p) for name in ("after", "of", "steps", "order", "hardness", "law")),
+        ("tied", _Tied),
     )
 
 
@@ -41,6 +51,7 @@ class _Place(ctypes.Structure):
 class _Inputs(ctypes.Structure):
     _fields_ = (
         *((name, ctypes.c_void_p) for name in ("slots", "points", "pairs", "bodies")),
+        ("joints", ctypes.c_int64),
         ("corner", ctypes.c_int64 * 4),
         ("scenes", ctypes.c_int64),
     )
@@ -115,6 +126,7 @@ def _plan(
     count: int,
     law: tuple[float, ...],
     tries: tuple[tuple[float, int], ...],
+    tied: tuple[tuple[tuple[tuple[int, float], ...], ...], tuple[int, ...]],
 ) -> _Plan:
     shape = parse(topology)
     v, scenes, pattern = shape.size, math.prod(batch), banded.pattern(f"touching:{topology}")
@@ -143,6 +155,7 @@ def _plan(
             ]
     lists = [(_Place * max(1, len(x)))(*x) for x in (places[0], places[1], between, bodies)]
     inputs = _Inputs(*(ctypes.addressof(x) for x in lists))
+    inputs.joints = first + len(pairs) if tied[0] else -1
     room = 0
     if corners:
         ((wide, stride),) = corners
@@ -157,11 +170,22 @@ def _plan(
         (ctypes.c_double * len(tries))(*(hard for hard, _ in tries)),
         (ctypes.c_double * len(law))(*law),
     ]
+    joined, points_at = _tied(*tied), len(tied[0])
     sizes = _Sizes(v, scenes, len(of), count, room, pattern.half_bandwidth, len(tries))
+    sizes.tied = _Tied(points_at, *(ctypes.addressof(x) for x in joined))
     for name, array in zip(("after", "of", "steps", "order", "hardness", "law"), arrays, strict=True):
         setattr(sizes, name, ctypes.cast(array, ctypes.c_void_p))
     shapes = ((3, v), (1, v), (count, 6), (1, 1), (3, v), (1, v), (3, v), (3, v), (count, 6), (1, 1))
-    return _Plan(batch, sizes, inputs, shapes, (lists, arrays, pattern))
+    shapes += ((points_at, 3), (points_at, 3), (count, 6))
+    return _Plan(batch, sizes, inputs, shapes, (lists, arrays, joined, pattern))
+
+
+def _tied(points: Sequence[Sequence[tuple[int, float]]], bodies: Sequence[int]) -> list[ctypes.Array]:
+    """Return the vertices of joined points, where each point's begin, their bodies, and the vertices' weights."""
+    pairs = [pair for point in points for pair in point]
+    first = [sum(len(x) for x in points[:k]) for k in range(len(points) + 1)]
+    whole = [(ctypes.c_int64 * max(1, len(x)))(*x) for x in (first, [slot for slot, _ in pairs], bodies)]
+    return [*whole, (ctypes.c_double * max(1, len(pairs)))(*(weight for _, weight in pairs))]
 
 
 def _addresses(tensors: Sequence[Tensor]) -> ctypes.Array:
@@ -192,19 +216,29 @@ def _call(
     law: Sequence[float],
     tries: tuple[tuple[float, int], ...],
     solved: float,
+    joints: JointPoints | None = None,
 ) -> _Call:
     points, (of, resist) = parts[:_POINTS], parts[_POINTS : _POINTS + 2]
     slots, at, pairs = [*inputs, origin], pairs[:1], pairs[1:]
     groups = [(slots, 2), (points, 3), ([resist], 3), (pairs[:5], 2), (pairs[5:], 3), (at, 2)]
     leading = {x.shape[:-core] for group, core in groups for x in group}
-    batch = tuple(torch.broadcast_shapes(*leading))
+    batch = tuple(torch.broadcast_shapes(*leading, () if joints is None else joints.batch))
     flat = [[_flat(x, batch, core) for x in group] for group, core in groups]
     flat = [*flat[:3], flat[3] + flat[4], flat[5]]
     layouts = tuple(tuple((x.shape, x.stride()) for x in group) for group in flat)
     body = tuple(row.index(1.0) if 1.0 in row else -1 for row in of.tolist())
     numbers = (*law, solved, penalty.ROUND, penalty.FAR, penalty.LEAVING)
-    plan = _plan(topology, batch, layouts, body, of.shape[-1], numbers, tries)
-    return _Call(plan, [x for group in flat[:4] for x in group], flat[4][0] if at else None)
+    tensors = [x for group in flat[:4] for x in group]
+    if joints is None:
+        tied: tuple[Any, tuple[int, ...]] = (), ()
+    else:
+        rows = [tuple((k, w) for k, w in enumerate(row) if w) for row in joints.weight.tolist()]
+        tied = tuple(rows), tuple(row.index(1.0) if 1.0 in row else -1 for row in joints.on.tolist())
+        given = joints.local, joints.arm, joints.force, joints.pos, joints.quat, joints.inertia, joints.omega
+        given = [x.expand(*batch, *x.shape[-2:]).reshape(math.prod(batch), -1) for x in given]
+        tensors.append(torch.cat(given, -1).contiguous())
+    plan = _plan(topology, batch, layouts, body, of.shape[-1], numbers, tries, tied)
+    return _Call(plan, tensors, flat[4][0] if at else None)
 
 
 def solve(
@@ -216,6 +250,7 @@ def solve(
     law: Sequence[float],
     tries: tuple[tuple[float, int], ...],
     solved: float,
+    joints: JointPoints | None = None,
 ) -> list[Tensor]:
     """Return what Newton's method finds, and what an exact step makes of it.
 
@@ -228,13 +263,15 @@ def solve(
         law: numbers of the equations without contact, and the substep [s].
         tries: how hard contact is, and Newton steps at most, one after the other.
         solved: what may be left of the equations.
+        joints: points that are joined, if any are.
 
     Returns:
         Positions (..., V, 3), tensions (..., V, 1), displacements of bodies (..., J, 6) and hardness (..., 1, 1);
         then, after the exact step, positions, tensions, forces and forces of contact (..., V, 3), wrenches (..., J, 6)
-        and what is left (..., 1, 1).
+        and what is left (..., 1, 1); forces of joints before that step and after it (..., A, 3), and displacements of
+        bodies after it (..., J, 6).
     """
-    call = _call(inputs, parts, pairs, origin, topology, law, tries, solved)
+    call = _call(inputs, parts, pairs, origin, topology, law, tries, solved, joints)
     plan = call.plan
     out = [origin.new_empty(*shape, plan.sizes.scenes) for shape in plan.shapes]
     run = getattr(_library(), f"touching_{_DTYPES[origin.dtype]}")
@@ -247,7 +284,7 @@ def _logical(k: int, x: Tensor, batch: tuple[int, ...]) -> Tensor:
     """Return what the kernel made with its scenes in front: of vertices (C, V, B), of bodies (J, C, B)."""
     x = x.reshape(*x.shape[:2], *batch)
     scenes = range(2, x.dim())
-    return x.permute(*scenes, 0, 1) if k in (2, 3, 8, 9) else x.permute(*scenes, 1, 0)
+    return x.permute(*scenes, 0, 1) if k in (2, 3, 8, 9, 10, 11, 12) else x.permute(*scenes, 1, 0)
 
 
 def derive(call: tuple, found: list[Tensor], by: list[Tensor]) -> tuple[Tensor, ...]:

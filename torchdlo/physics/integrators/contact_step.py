@@ -318,11 +318,13 @@ def solve_contact_step(touching: Touching, tension: Tensor) -> tuple[Tensor, ...
         pos, tension, force, exerted, wrench, left = _searched(touching, tension, True)[4:]
         return pos, tension, force, exerted, wrench, left.detach(), wrench[..., :0, :3], wrench
     with torch.no_grad():
-        pos, found, bodies, hard, tied = _searched(touching, tension)
+        pos, pulled, bodies, hard, tied, *after = _searched(touching, tension)
+    if after and not torch.is_grad_enabled():
+        return tuple(after)
     firm = touching.firm(tension, hard)
     linear = penalty.maps(touching.touch)
     pos = torch.where(system.free > 0, pos, system.moved)
-    before = Unknowns(pos, found * system.scale, bodies, tied * system.scale)
+    before = Unknowns(pos, pulled * system.scale, bodies, tied * system.scale)
     now, _ = touching.newton_step(before, firm, linear, True)
     topology, scale = system.lengths.topology, system.scale
     felt = penalty.feel(topology, touching.touch, linear, firm, now.pos - touching.origin, now.bodies, touching.dt)
@@ -332,10 +334,13 @@ def solve_contact_step(touching: Touching, tension: Tensor) -> tuple[Tensor, ...
         push = push + touching.joints.pulls(now.joints)
     with torch.no_grad():
         still = tree.detach((now.pos, now.impulse, now.bodies, now.joints))
-        _, left = touching.newton_step(Unknowns(*still), firm, tuple(x.detach() for x in linear), True)
+        plain = tuple(x.detach() for x in linear)
+        left = after[5] if after else touching.newton_step(Unknowns(*still), firm, plain, True)[1]
     wrench = (touching.touch.resist @ now.bodies.unsqueeze(-1)).squeeze(-1)
     whole, tied = (push + exerted) / scale, now.joints / scale
-    return now.pos, now.impulse / scale, whole, exerted / scale, wrench, left, tied, now.bodies
+    found = now.pos, now.impulse / scale, whole, exerted / scale, wrench, left, tied, now.bodies
+    # Replays, and steps without gradients, do the same to the last bit: the graph gives derivatives only.
+    return tuple(y + (x - x.detach()) for x, y in zip(found, after, strict=True)) if after else found
 
 
 def _searched(touching: Touching, tension: Tensor, whole: bool = False) -> tuple[Tensor, ...]:
@@ -372,12 +377,12 @@ def _equations(
     return Touching(system, Touch(*parts), origin, between, law[-1], tied), tension
 
 
-def _by_kernel(inputs, parts, pairs, origin: Tensor, topology: str, law: list[float]) -> list[Tensor]:
-    return contact_kernel.solve(inputs, parts, pairs, origin, topology, law, TRIES, _solved(origin))
+def _by_kernel(inputs, parts, pairs, origin: Tensor, topology: str, law: list[float], joints=None) -> list[Tensor]:
+    return contact_kernel.solve(inputs, parts, pairs, origin, topology, law, TRIES, _solved(origin), joints)
 
 
 def _whole(*given) -> tuple[Tensor, ...]:
-    return tuple(x.contiguous() for x in _by_kernel(*given))
+    return tuple(x.contiguous() for x in _by_kernel(*given)[:10])
 
 
 def _derived(
@@ -456,8 +461,15 @@ _MASKS = (2, 3, 4)
 def _engaged(
     inputs: list[Tensor], parts: list[Tensor], pairs: list[Tensor], joints: list[Tensor], *law
 ) -> list[Tensor]:
-    """Return positions, tensions, displacements of bodies, how hard contact was, and forces of joints."""
-    return _by_tensors(*_equations(inputs, parts, pairs, joints, *law))
+    """Return positions, tensions, displacements of bodies, how hard contact was, and forces of joints.
+
+    The kernel also tells what the exact step makes of them: what `solve_contact_step` returns.
+    """
+    origin, topology, numbers = law
+    if joints and contact_kernel.available(origin):
+        found = _by_kernel(inputs, parts, pairs, origin, topology, numbers, JointPoints(*joints))
+        return [x.contiguous() for x in (*found[:4], found[10], *found[4:10], *found[11:])]
+    return _by_tensors(*_equations(inputs, parts, pairs, joints, origin, topology, numbers))
 
 
 def _by_tensors(touching: Touching, tension: Tensor) -> list[Tensor]:
@@ -506,7 +518,9 @@ def _engaged_meta(
     batches = [moved.shape[:-2], tension.shape[:-2], wanted.shape[:-3], *(x.shape[:-2] for x in pairs[:1])]
     batch = torch.broadcast_shapes(*batches, *([JointPoints(*joints).batch] if joints else []))
     like, v, points = moved.new_empty, parse(topology).size, joints[0].shape[0] if joints else 0
-    shapes = (v, 3), (v, 1), (of.shape[-1], 6), (1, 1), (points, 3)
+    shapes = [(v, 3), (v, 1), (of.shape[-1], 6), (1, 1), (points, 3)]
+    if joints and contact_kernel.available(origin):
+        shapes += [(v, 3), (v, 1), (v, 3), (v, 3), (of.shape[-1], 6), (1, 1), (points, 3), (of.shape[-1], 6)]
     return [like(*batch, *shape) for shape in shapes]
 
 

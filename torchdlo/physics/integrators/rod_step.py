@@ -292,6 +292,11 @@ def _answered(
     return pos, tension, held, total
 
 
+def yield_shares(integrator: str) -> tuple[float, float]:
+    """Return `most` and `least` of `edge_lengths.Lengths` [1]."""
+    return (1e4, 10.0) if integrator == "implicit" else (0.25, 0.25)
+
+
 def _translate(
     settings: Settings,
     now: View,
@@ -313,7 +318,6 @@ def _translate(
     if settings.joint_edges:
         active = active * active.new_tensor([[float(k not in settings.joint_edges)] for k in range(topology.size)])
     lightest = torch.minimum(material.mass, following(topology, material.mass)).detach()
-    most, least = (1e4, 10.0) if settings.integrator == "implicit" else (0.25, 0.25)
     lengths = Lengths(
         topology,
         rest.length,
@@ -321,8 +325,7 @@ def _translate(
         active,
         rest.edge_mask,
         dt * dt / lightest,
-        most,
-        least,
+        *yield_shares(settings.integrator),
     )
     if settings.integrator == "implicit":
         moved = _placed(settings, targets, kick.drift)

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from torchdlo import notices
 from torchdlo.physics.effects.base import Values, altered_params
-from torchdlo.physics.integrators.rod_step import Settings
+from torchdlo.physics.integrators.rod_step import Settings, yield_shares
 from torchdlo.physics.rod import kinematics as rod
 from torchdlo.physics.rod.kinematics import RodParams, RodState
 from torchdlo.physics.rod.topology import following
@@ -71,17 +71,36 @@ def _weights(settings: Settings, mass: Tensor) -> Tensor:
     return torch.cat(parts, -2)
 
 
+def _hanging(settings: Settings, rods: RodParams, values: dict[str, Values]) -> dict[str, float]:
+    """Return the substep [s] up to which ropes keep their length that hang from holds, if any does."""
+    gravity, topology = "gravity" in {e.name for e in settings.effects}, settings.topology
+    if not (settings.constrained and settings.prescribed_vertices and gravity):
+        return {}
+    # Tensions above a share of l m / dt^2 are not held: edges give way, see `edge_lengths.Lengths.yielding`. An edge
+    # at a hold counts by its free end.
+    rest, material = rods.rest, rods.material
+    held = material.mass.new_zeros(topology.size, 1)
+    held[list(settings.prescribed_vertices)] = 1.0
+    mobile = torch.where(held > 0, torch.inf, material.mass)
+    lightest = torch.minimum(mobile, following(topology, mobile))
+    pull = values["gravity"]["acceleration"].norm(dim=-1, keepdim=True) * _weights(settings, material.mass)
+    firm = (yield_shares(settings.integrator)[0] * rest.length * lightest / pull).sqrt()
+    counts = (rest.edge_mask > 0) & (pull > 0)
+    return {"hanging weight": float(torch.where(counts, firm, torch.inf).amin())}
+
+
 def limits(settings: Settings, rods: RodParams, values: dict[str, Values]) -> dict[str, float]:
     """Return the largest stable substep [s] by the term that limits it.
 
     Bending waves reach w = 4/l^2 sqrt(EI/m'), stretching waves w = 2/l sqrt(EA/m'), twist waves w = 2 sqrt(GJ/(l I));
     Stoermer-Verlet is stable for w dt < 2. Bending damping takes its force from the velocities before, and damps the
     shortest waves by r = 16 c/(m' l^4): both together are stable for (w dt)^2/4 + r dt/2 < 1. The weight of a rope that
-    is held may pull as much as steps keep its length: T < l m / 4 dt^2. Implicit steps are limited by none of them.
+    is held may pull as much as steps keep its length: T < l m / 4 dt^2. Implicit steps are limited by the last one
+    only, with 10^4 in the place of 1/4.
     """
-    if settings.integrator == "implicit":
-        return {}
     rods = altered_params(settings.effects, settings.topology, rods, values)
+    if settings.integrator == "implicit":
+        return _hanging(settings, rods, values)
     rest, material = rods.rest, rods.material
     names = {e.name for e in settings.effects}
     real = (rest.edge_mask > 0).expand_as(rest.length)
@@ -103,16 +122,7 @@ def limits(settings: Settings, rods: RodParams, values: dict[str, Values]) -> di
         found["stretching"] = (mass * length / material.stretch).amin().sqrt()
     if "twist" in names and settings.twist == "dynamic":
         found["twisting"] = (torch.where(real, material.inertia, torch.inf) * length / material.twist).amin().sqrt()
-    if settings.constrained and settings.prescribed_vertices and "gravity" in names:
-        # What hangs from a hold pulls with its weight. Tensions above a quarter of l m / dt^2 are not held: edges give
-        # way, see `constrain.Lengths.yielding`.
-        held = material.mass.new_zeros(settings.topology.size, 1)
-        held[list(settings.prescribed_vertices)] = 1.0
-        mobile = torch.where(held > 0, torch.inf, material.mass)
-        lightest = torch.minimum(mobile, following(settings.topology, mobile))
-        pull = values["gravity"]["acceleration"].norm(dim=-1, keepdim=True) * _weights(settings, material.mass)
-        firm = (0.25 * length * lightest / pull).sqrt()
-        found["hanging weight"] = torch.where(real & (pull > 0), firm, torch.inf).amin()
+    found |= _hanging(settings, rods, values)
     if "table" in names:
         found["table contact"] = 2 / values["table"]["hardness"].max()
     return {name: float(value) for name, value in found.items()}

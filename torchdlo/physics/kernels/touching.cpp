@@ -9,6 +9,7 @@
 #include <vector>
 
 #include "flush.h"
+#include "joint_points.h"
 
 namespace {
 
@@ -17,6 +18,7 @@ struct Sizes {
   const int64_t *after, *of, *steps;  // next slots; body of each family of points or -1; Newton steps of each try
   const int32_t* order;
   const double *hardness, *law;  // law: turning, most, least, shift, dt, solved, round, far, leaving
+  Tied tied;
 };
 
 // Where a number is among the inputs, and how far it is from slot to slot, family to family and scene to scene.
@@ -26,6 +28,7 @@ struct Place {
 // Numbers of slots, of points, of pairs, and of how bodies resist; where corners of pairs are told (4, pairs, scenes).
 struct Inputs {
   const Place *slots, *points, *pairs, *bodies;
+  int64_t joints;             // which input has the numbers of joints, (scenes, numbers), or -1
   int64_t corner[4], scenes;  // offset, and from corner to corner, pair to pair, scene to scene; what their numbers count
 };
 
@@ -86,17 +89,18 @@ void back(const T* m, const T* x, T* y, int columns) {
 
 template <typename T>
 struct State {
-  std::vector<T> pos, impulse, bodies;
+  std::vector<T> pos, impulse, bodies, joints;
 };
 
 template <typename T>
 class Scene {
  public:
   explicit Scene(const Sizes& sizes)
-      : s(sizes), v(s.slots), n(4 * v), k(s.half), before(v), rank(n), y(3 * v), begin(3 * v), along(3 * v),
-        push(3 * v), pull(3 * v), turn(3 * v), resist(3 * v), touch(3 * v), between(3 * v), residual(3 * v),
+      : joints{sizes.tied, sizes.bodies}, s(sizes), v(s.slots), n(4 * v), k(s.half),
+        own(6 * s.bodies + 3 * s.tied.count), before(v), rank(n), y(3 * v), begin(3 * v), along(3 * v),
+        push(3 * v), pull(3 * v), turn(3 * v), resist(3 * v), touch(3 * v), between(3 * v), joined(3 * v), residual(3 * v),
         excess(v), lean(v), one(v), two(v), same(v), firm(v), least(v), wrench(6 * s.bodies), step(n),
-        load_pos(3 * v), load_length(v), load_body(6 * s.bodies), known(s.families * v) {
+        load_pos(3 * v), load_length(v), load_body(own), gap(3 * s.tied.count), known(s.families * v) {
     for (int64_t i = 0; i < v; ++i) before[s.after[i]] = i;
     for (int64_t j = 0; j < n; ++j) rank[s.order[j]] = j;
     const auto place = [&](int64_t row, int64_t column) { places.push_back(rank[row] * 2 * k + rank[column] + k); };
@@ -116,6 +120,7 @@ class Scene {
   const Pair<T>* pairs;
   const int64_t* corners;  // of pairs
   const T* inertia;        // how bodies resist displacements, 6 x 6 each
+  Joints<T> joints;        // a scene with some has no derivative here
 
   struct Parts {  // derivatives by what the scene is made of
     Slot<T>* slots;
@@ -194,10 +199,13 @@ class Scene {
   }
 
   // Results: positions, tensions, bodies, hardness; then those of an exact step from there: positions, tensions,
-  // forces, forces of contact, wrenches, what is left.
-  void operator()(T* pos, T* tension, T* bodies, T* hard, T* pos2, T* tension2, T* whole, T* exerted, T* held, T* left) {
+  // forces, forces of contact, wrenches, what is left; and forces of joints before and after, and bodies after.
+  void operator()(T* pos, T* tension, T* bodies, T* hard, T* pos2, T* tension2, T* whole, T* exerted, T* held, T* left,
+                  T* tied, T* tied2, T* bodies2) {
     prepare();
-    State<T> first{std::vector<T>(3 * v), std::vector<T>(v), std::vector<T>(6 * s.bodies)}, found, best, now, last;
+    State<T> first{std::vector<T>(3 * v), std::vector<T>(v), std::vector<T>(6 * s.bodies), std::vector<T>(gap.size())};
+    State<T> found, best, now, last;
+    for (size_t i = 0; i < gap.size(); ++i) first.joints[i] = joints.force(0)[i] * scale;
     for (int64_t i = 0; i < v; ++i) {
       for (int c = 0; c < 3; ++c) first.pos[3 * i + c] = slot[i].moved[c];
       first.impulse[i] = guess(i) * scale;
@@ -227,6 +235,7 @@ class Scene {
       tension[i] = found.impulse[i] / scale;
     }
     std::copy(found.bodies.begin(), found.bodies.end(), bodies);
+    for (size_t i = 0; i < gap.size(); ++i) tied[i] = found.joints[i] / scale;
     *hard = chosen;
     harden(chosen);
     for (int64_t i = 0; i < v; ++i)
@@ -238,11 +247,13 @@ class Scene {
       for (int c = 0; c < 3; ++c) {
         const T contact = touch[3 * i + c] + between[3 * i + c];
         pos2[c * v + i] = found.pos[3 * i + c];
-        whole[c * v + i] = (push[3 * i + c] + contact) / scale;
+        whole[c * v + i] = (push[3 * i + c] + joined[3 * i + c] + contact) / scale;
         exerted[c * v + i] = contact / scale;
       }
       tension2[i] = found.impulse[i] / scale;
     }
+    std::copy(found.bodies.begin(), found.bodies.end(), bodies2);
+    for (size_t i = 0; i < gap.size(); ++i) tied2[i] = found.joints[i] / scale;
     for (int64_t b = 0; b < s.bodies; ++b)
       for (int i = 0; i < 6; ++i) {
         T sum = 0;
@@ -622,16 +633,17 @@ class Scene {
     if (matrix) assemble(now);
     touch_bodies(now, exact, matrix);
     touch_ropes(now, exact, matrix);
-    T worst = 0, size = 0, strain = 0;
+    T worst = 0, size = 0, strain = pull_joints(now, matrix);
     for (int64_t i = 0; i < v; ++i) {
       const Slot<T>& p = slot[i];
       strain = std::max(strain, std::abs(excess[i]) / p.rest);
       for (int c = 0; c < 3; ++c) {
         const int64_t j = 3 * i + c;
-        residual[j] = p.vertex[c] * y[j] - p.free * (push[j] + touch[j] + between[j]);
+        residual[j] = p.vertex[c] * y[j] - p.free * (push[j] + touch[j] + between[j] + joined[j]);
         const T carried = T(1e-3) * (p.moved[c] - p.origin[c]) + T(1e-9) * p.rest;
         const T whole = std::abs(p.vertex[c] * y[j]) + std::abs(scale * p.force[c]) + std::abs(touch[j]) +
-                        std::abs(now.impulse[i] * begin[j]) + std::abs(between[j]) + std::abs(p.vertex[c] * carried);
+                        std::abs(now.impulse[i] * begin[j]) + std::abs(between[j]) + std::abs(joined[j]) +
+                        std::abs(p.vertex[c] * carried);
         worst = std::max(worst, std::abs(residual[j]));
         size = std::max(size, whole);
       }
@@ -642,8 +654,8 @@ class Scene {
 
   void assemble(const State<T>& now) {
     band.assign((n + k) * (2 * k + 1), T(0));
-    border.assign(n * 6 * s.bodies, T(0));
-    row.assign(n * 6 * s.bodies, T(0));
+    border.assign(n * own, T(0));
+    row.assign(n * own, T(0));
     corner.assign(36 * s.bodies, T(0));
     for (int64_t i = 0; i < v; ++i) {
       const Slot<T>& p = slot[i];
@@ -733,7 +745,7 @@ class Scene {
           kb[3 * a + j] += g[3 * a + c] * p.second[3 * c + j];
         }
     }
-    const int64_t wide = 6 * s.bodies, first = 6 * body;
+    const int64_t wide = own, first = 6 * body;
     for (int a = 0; a < 3; ++a)
       for (int j = 0; j < 6; ++j) {
         T one = 0, two = 0, three = 0, four = 0;
@@ -774,6 +786,41 @@ class Scene {
     }
   }
 
+  // What joints do to vertices and bodies; returns by how far they miss, over the shortest edge.
+  T pull_joints(const State<T>& now, bool matrix) {
+    if (gap.empty()) return T(0);
+    const Tied& tied = s.tied;
+    std::fill(joined.begin(), joined.end(), T(0));
+    if (matrix) levers.assign(18 * tied.count, T(0)), reach.assign(18 * tied.count, T(0));
+    T worst = 0, edge = std::numeric_limits<T>::infinity();
+    for (int64_t i = 0; i < v; ++i)
+      if (slot[i].mask > T(0)) edge = std::min(edge, slot[i].rest);
+    for (int64_t a = 0; a < tied.count; ++a) {
+      joints.gap(a, now.pos.data(), now.bodies.data(), T(s.law[4]), &gap[3 * a], matrix ? &reach[18 * a] : nullptr);
+      const T *force = &now.joints[3 * a], *r = joints.arm(a);
+      for (int c = 0; c < 3; ++c) worst = std::max(worst, std::abs(gap[3 * a + c]));
+      for (int64_t q = tied.first[a]; q < tied.first[a + 1]; ++q)
+        for (int c = 0; c < 3; ++c) {
+          const int64_t i = tied.slot[q], at = (c * v + i) * own + 6 * s.bodies + 3 * a + c;
+          const T weight = T(tied.weight[q]);
+          joined[3 * i + c] += weight * force[c];
+          if (matrix) border[at] -= slot[i].free * weight, row[at] += weight;
+        }
+      const int64_t b = tied.body[a];
+      if (b < 0) continue;
+      for (int c = 0; c < 3; ++c) {
+        const int d = (c + 1) % 3, e = (c + 2) % 3;
+        wrench[6 * b + c] -= force[c];
+        wrench[6 * b + 3 + c] -= r[d] * force[e] - r[e] * force[d];
+        if (!matrix) continue;
+        T* lever = &levers[18 * a];  // (6, 3)
+        lever[3 * c + c] = 1;
+        lever[3 * (3 + c) + e] = r[d], lever[3 * (3 + c) + d] = -r[e];
+      }
+    }
+    return worst / edge;
+  }
+
   // Takes a step; returns what was left before it.
   T newton(State<T>& now, bool exact) {
     const T left = evaluate(now, exact, true);
@@ -785,6 +832,7 @@ class Scene {
         for (int j = 0; j < 6; ++j) sum -= scale * inertia[36 * b + 6 * i + j] * now.bodies[6 * b + j];
         load_body[6 * b + i] = sum;
       }
+    for (size_t i = 0; i < gap.size(); ++i) load_body[6 * s.bodies + i] = -gap[i];
     solve(false);
     T most = 0;
     for (int64_t i = 0; i < v; ++i) {
@@ -802,6 +850,7 @@ class Scene {
       now.impulse[i] += share * step[3 * v + i];
     }
     for (int64_t b = 0; b < 6 * s.bodies; ++b) now.bodies[b] += share * turned[b];
+    for (size_t i = 0; i < gap.size(); ++i) now.joints[i] += share * turned[6 * s.bodies + i];
     return left;
   }
 
@@ -828,7 +877,7 @@ class Scene {
 
   // Solves for `step` and `turned` what `load_pos`, `load_length` and `load_body` are to be; or the transposed system.
   void solve(bool transposed) {
-    const int64_t own = 6 * s.bodies, extra = own + 3 * (int64_t)acting.size(), m = 1 + extra;
+    const int64_t extra = own + 3 * (int64_t)acting.size(), m = 1 + extra;
     if (transposed) transpose();
     std::sort(acting.begin(), acting.end(), [](const Acting& a, const Acting& b) { return a.row < b.row; });
     side.assign((n + k) * m, T(0));  // by rank
@@ -847,18 +896,18 @@ class Scene {
                 transposed ? feeling(acting[a], q, c, f) : given(acting[a], q, c, f);
     }
     switch (k) {
-      case 8: eliminate<8>(own, m); break;
-      case 16: eliminate<16>(own, m); break;
-      default: eliminate<0>(own, m);
+      case 8: eliminate<8>(m); break;
+      case 16: eliminate<16>(m); break;
+      default: eliminate<0>(m);
     }
     turned.assign(own, T(0));
-    if (extra) border_out(transposed, own, extra, m);
+    if (extra) border_out(transposed, extra, m);
     for (int64_t u = 0; u < n; ++u) step[u] = side[rank[u] * m];
   }
 
   // Solves the banded system for all columns of `side`; K is half its bandwidth, or 0 for any.
   template <int K>
-  void eliminate(int64_t own, int64_t m) {
+  void eliminate(int64_t m) {
     const int64_t k = K ? K : this->k, width = 2 * k + 1;
     int64_t used = 1 + own;  // columns that are not 0 yet: pairs stand in the order of their first rows
     size_t next = 0;
@@ -889,8 +938,8 @@ class Scene {
     }
   }
 
-  // Takes bodies and pairs out by their Schur complement.
-  void border_out(bool transposed, int64_t own, int64_t extra, int64_t m) {
+  // Takes bodies, joints and pairs out by their Schur complement.
+  void border_out(bool transposed, int64_t extra, int64_t m) {
     std::vector<T> small(extra * (extra + 1), T(0));  // with its right-hand side behind
     const auto entry = [&](int64_t i, int64_t j) -> T& { return small[i * (extra + 1) + j]; };
     const auto minus = [&](int64_t i, T factor, int64_t unknown) {
@@ -901,10 +950,19 @@ class Scene {
     for (int64_t b = 0; b < s.bodies; ++b)
       for (int i = 0; i < 6; ++i) {
         for (int j = 0; j < 6; ++j) {
-          const T own = scale * inertia[36 * b + (transposed ? 6 * j + i : 6 * i + j)];
-          entry(6 * b + i, 6 * b + j) = own + corner[36 * b + 6 * i + j];
+          const T held = scale * inertia[36 * b + (transposed ? 6 * j + i : 6 * i + j)];
+          entry(6 * b + i, 6 * b + j) = held + corner[36 * b + 6 * i + j];
         }
         entry(6 * b + i, extra) = load_body[6 * b + i];
+      }
+    for (int64_t a = 0; a < s.tied.count; ++a)
+      for (int c = 0; c < 3; ++c) {
+        const int64_t i = 6 * s.bodies + 3 * a + c, b = s.tied.body[a];
+        entry(i, extra) = load_body[i];
+        for (int j = 0; j < 6 && b >= 0; ++j) {
+          entry(6 * b + j, i) = levers[18 * a + 3 * j + c];
+          entry(i, 6 * b + j) = -reach[18 * a + 6 * c + j];
+        }
       }
     for (int64_t u = 0; u < 3 * v; ++u)
       for (int64_t i = 0; i < own; ++i)
@@ -946,11 +1004,11 @@ class Scene {
   }
 
   const Sizes& s;
-  const int64_t v, n, k;
+  const int64_t v, n, k, own;  // own: unknowns of bodies and joints
   std::vector<int64_t> before, rank;
   std::vector<int64_t> places;  // where the entries of `assemble` stand in the band, 28 for each slot
-  std::vector<T> y, begin, along, push, pull, turn, resist, touch, between, residual, excess, lean, one, two, same, firm,
-      least, wrench, step, band, border, row, corner, side, turned, load_pos, load_length, load_body, other, by_firm,
+  std::vector<T> y, begin, along, push, pull, turn, resist, touch, between, joined, residual, excess, lean, one, two, same, firm,
+      least, wrench, step, band, border, row, corner, side, turned, load_pos, load_length, load_body, gap, levers, reach, other, by_firm,
       by_lean;
   std::vector<Acting> acting;
   std::vector<int64_t> known;  // where the maps of points are, -1 for those that nothing asked for
@@ -1004,27 +1062,29 @@ struct Given {
       }
     scene.slot = slots.data(), scene.points = points.data(), scene.pairs = pairs.data();
     scene.corners = corners.data(), scene.inertia = inertia.data();
+    if (n.joints >= 0) scene.joints.numbers = in[n.joints] + b * (9 * s.tied.count + 13 * s.bodies);
   }
 };
 
 // Batches stand innermost in what comes out, as in all storage.
 template <typename T>
 void run(const T* const* in, const int64_t* at, const Inputs& n, T* const* out, const Sizes& s, int threads) {
-  const int64_t v = s.slots, scenes = s.scenes, counts[10] = {3 * v, v, 6 * s.bodies, 1, 3 * v, v, 3 * v, 3 * v, 6 * s.bodies, 1};
+  const int64_t v = s.slots, scenes = s.scenes, J = 6 * s.bodies, A = 3 * s.tied.count;
+  const int64_t counts[13] = {3 * v, v, J, 1, 3 * v, v, 3 * v, 3 * v, J, 1, A, A, J};
 #pragma omp parallel num_threads(threads) if (threads > 1 && scenes > 1)
   {
     const FlushTiny flush;
     Scene<T> scene(s);
     Given<T> given(s);
-    std::vector<T> found[10];
-    for (int r = 0; r < 10; ++r) found[r].resize(counts[r] + 1);
+    std::vector<T> found[13];
+    for (int r = 0; r < 13; ++r) found[r].resize(counts[r] + 1);
 #pragma omp for schedule(dynamic)
     for (int64_t b = 0; b < scenes; ++b) {
       given.read(in, at, n, s, b, scene);
-      T* f[10];
-      for (int r = 0; r < 10; ++r) f[r] = found[r].data();
-      scene(f[0], f[1], f[2], f[3], f[4], f[5], f[6], f[7], f[8], f[9]);
-      for (int r = 0; r < 10; ++r)
+      T* f[13];
+      for (int r = 0; r < 13; ++r) f[r] = found[r].data();
+      scene(f[0], f[1], f[2], f[3], f[4], f[5], f[6], f[7], f[8], f[9], f[10], f[11], f[12]);
+      for (int r = 0; r < 13; ++r)
         for (int64_t i = 0; i < counts[r]; ++i) out[r][i * scenes + b] = found[r][i];
     }
   }
