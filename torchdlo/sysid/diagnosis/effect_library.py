@@ -97,7 +97,12 @@ def check_known(what: str, name: str) -> None:
 
 def applicable(name: str, recording: Recording, mesh: Mesh) -> bool:
     """Return whether an effect can show in a recording."""
-    here = {"table": recording.table_height is not None, "clamps": bool(mesh.clamp_hinges), None: True}
+    here = {
+        "table": recording.table_height is not None,
+        "clamps": bool(mesh.clamp_hinges),
+        "fluid": recording.fluid_density is not None,
+        None: True,
+    }
     return here[spec(name).requires]
 
 

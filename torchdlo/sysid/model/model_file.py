@@ -67,7 +67,7 @@ class ModelFile:
             if name in effect_library.library() and not effect_library.applicable(name, recording, model.mesh):
                 raise InputError(
                     f"{self.path}: {name}: expected a recording in which it can act, but {recording.path} has nothing "
-                    "that it acts on (no table, no clamp of two markers, or no radius)."
+                    "that it acts on (no table, no clamp of two markers, no liquid, or no radius)."
                 )
         return model
 

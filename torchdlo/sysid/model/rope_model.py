@@ -1,8 +1,8 @@
 """The model of a recorded rope: recordings in, simulated markers out, many parameter sets at once.
 
 Its baseline is gravity, an almost inextensible rod, straight or given rest shape, uniform bending and twisting
-stiffness, one damping rate, a frictionless table where there is one, and clamps that follow the gripped markers.
-Effects of the library may be added to it.
+stiffness, one damping rate, a frictionless table where there is one, buoyancy in a liquid, and clamps that follow the
+gripped markers. Effects of the library may be added to it.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from torchdlo.physics.effects import EFFECTS
 from torchdlo.physics.effects.base import Effect, Param
 from torchdlo.physics.effects.elastic import Bend, BendFrame, Twist
 from torchdlo.physics.effects.external import Damping, Gravity
+from torchdlo.physics.effects.fluid import Buoyancy
 from torchdlo.physics.effects.parameter_name import ParameterName
 from torchdlo.physics.effects.table import Table
 from torchdlo.physics.execution import tracing
@@ -226,7 +227,8 @@ class RopeModel:
         extra = [effect_library.instance(name, self.mesh) for name in self.effects]
         framed = self.rest == "given" or any(e.frame_bending for e in extra)
         table = [Table()] if self.recording.table_height is not None else []
-        return [Gravity(), BendFrame() if framed else Bend(), Twist(), Damping(), *table, *extra]
+        fluid = [Buoyancy()] if self.recording.fluid_density is not None else []
+        return [Gravity(), BendFrame() if framed else Bend(), Twist(), Damping(), *table, *fluid, *extra]
 
     def _values(self, number: dict[str, Tensor]) -> dict[str, dict[str, Any]]:
         """Return the numbers of the effects: fitted ones with shape (N, 1, C), known ones as they are."""
@@ -236,6 +238,9 @@ class RopeModel:
         }
         if self.recording.table_height is not None:
             numbers["table"] = {"height": self.recording.table_height}
+        if self.recording.fluid_density is not None:
+            gravity, density = list(self.recording.gravity), self.recording.fluid_density
+            numbers["buoyancy"] = {"density": density, "acceleration": gravity}
         for name in self.effects:
             numbers[name] = dict(effect_library.known(name, self.recording))
             parts: dict[str, list[Tensor]] = {}

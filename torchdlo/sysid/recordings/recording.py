@@ -91,6 +91,8 @@ class Recording:
     """Trials to judge on, never to fit on."""
     color: tuple[float, float, float] | None = None
     """Colour of the rope, RGB from 0 to 255, None where not known."""
+    fluid_density: float | None = None
+    """Density of the liquid in which the rope moves [kg/m^3], None in air."""
 
     @property
     def filmed(self) -> bool:

@@ -23,7 +23,7 @@ __all__ = ["OPTIONAL", "REQUIRED", "check_arrays", "check_rope", "read_trial", "
 
 REQUIRED = ("length", "radius", "mass", "gravity", "table_height", "marker_noise_std")
 """Entries that every rope.json has."""
-OPTIONAL = ("rest_positions", "marker_mass", "closed", "notes", "color")
+OPTIONAL = ("rest_positions", "marker_mass", "closed", "notes", "color", "fluid_density")
 """Entries that a rope.json may have."""
 
 _ARRAYS = ("time", "markers", "marker_arclength", "gripped")
@@ -67,6 +67,7 @@ def check_rope(path: Path) -> dict[str, Any]:
         "table_height": _number(path, rope, "table_height", "m", low=-1e4, high=1e4, optional=True),
         "marker_mass": _number(path, rope, "marker_mass", "kg", low=0.0, high=1e3, optional=True),
         "marker_noise_std": _number(path, rope, "marker_noise_std", "m", low=0.0, high=1.0, optional=True),
+        "fluid_density": _number(path, rope, "fluid_density", "kg/m^3", positive=True, high=2e4, optional=True),
         "gravity": _positions(path, rope, "gravity", (3,), "[gx, gy, gz] in m/s^2", most=1e3),
         "rest_positions": None,
         "closed": rope.get("closed") or False,
@@ -79,6 +80,8 @@ def check_rope(path: Path) -> dict[str, Any]:
     for name, kind, said in (("closed", bool, "true or false"), ("notes", str, "a text")):
         if not isinstance(checked[name], kind):
             _refuse(path, name, said, repr(checked[name]))
+    if checked["fluid_density"] is not None and checked["radius"] is None:
+        _refuse(path, "radius", "a number in m, as the rope displaces a liquid", "none")
     if checked["radius"] is not None and checked["radius"] > 0.5 * checked["length"]:
         found = f"{checked['radius']:g} m for a rope of {checked['length']:g} m"
         _refuse(path, "radius", "at most half the length", f"{found}; the unit is metres")
