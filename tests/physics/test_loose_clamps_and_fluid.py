@@ -106,8 +106,8 @@ def bar_turn(play: float, spring: float) -> float:
 
 
 def test_a_bar_in_a_clamp_with_play_hangs_by_the_play_and_the_spring():
-    # The hinge's bend is 2 tan(turn / 2), its moment k (2 tan(turn / 2) - 2 tan(play / 2)) / cos^2(turn / 2): turn^2 / 3
-    # beside the law, 2e-3 of 0.08 rad; the bar itself bends by 1e-3 of it.
+    # The hinge's bend is 2 tan(turn / 2), its moment k (2 tan(turn / 2) - 2 tan(play / 2)) / cos^2(turn / 2):
+    # turn^2 / 3 beside the law, 2e-3 of 0.08 rad; the bar itself bends by 1e-3 of it.
     for play in (0.0, 0.04):
         values = {"gripper_play": {"angle": play, "stiffness": 5.0}}
         turn = math.asin(hanging([GripperPlay(hinges=(1,))], values, 1.0))
