@@ -8,6 +8,7 @@ from torchdlo.physics import tree
 from torchdlo.physics.effects import EFFECTS
 from torchdlo.physics.effects import base as effect
 from torchdlo.physics.effects.gripper_compliance import GripperCompliance
+from torchdlo.physics.effects.loose_clamps import GripperDamping, GripperPlay
 from torchdlo.physics.effects.measurement import Track
 from torchdlo.physics.rod import kinematics as rod
 from torchdlo.scene import Rope, default_values, make
@@ -30,12 +31,19 @@ ACTIVE = {
     "stiffening_bending": {"c": 0.02},
     "anisotropic_bending": {"ratio": 2.5, "direction": 0.4},
     "gripper_compliance": {"stiffness": 0.02},
+    "gripper_play": {"angle": 0.05, "stiffness": 0.02},
+    "gripper_damping": {"stiffness": 0.02, "loss_time": 0.03},
+    "fluid_forces": {"across": 1.1, "along": 0.1, "added_mass": 0.8},
     "link_chain": {"length": 0.05},
     "time_delay": {"delay": 0.013},
     "marker_offset": {"offset": (0.01, -0.02)},
 }
 # Effects that need static choices.
-INSTANCES = {"gripper_compliance": GripperCompliance(hinges=(1,))}
+INSTANCES = {
+    "gripper_compliance": GripperCompliance(hinges=(1,)),
+    "gripper_play": GripperPlay(hinges=(1,)),
+    "gripper_damping": GripperDamping(hinges=(1,)),
+}
 
 
 def ropes(batch: tuple[int, ...] = (), seed: int = 0, dtype=F64) -> list[Rope]:

@@ -173,6 +173,7 @@ WORLD = {
     "gravity": ["acceleration"],
     "wind": ["velocity"],
     "tilted_gravity": ["acceleration", "angles"],
+    "buoyancy": ["acceleration"],
 }
 
 

@@ -13,6 +13,7 @@ from helpers import F64, circle, rand, vec, wild
 from torchdlo.physics import tree
 from torchdlo.physics.effects import EFFECTS
 from torchdlo.physics.effects.gripper_compliance import GripperCompliance
+from torchdlo.physics.effects.loose_clamps import GripperDamping, GripperPlay
 from torchdlo.physics.execution import replay
 from torchdlo.scene import Control, Rope, make, rollout, stationary_control, step, stepper
 
@@ -41,8 +42,17 @@ VALUES = {
     "anisotropic_bending": {"ratio": 1.4, "direction": 0.4},
     "gripper_compliance": {"stiffness": 0.02},
     "link_chain": {"length": 0.03},
+    "gripper_play": {"angle": 0.02, "stiffness": 0.02},
+    "gripper_damping": {"stiffness": 0.02, "loss_time": 0.05},
+    "buoyancy": {"density": 200.0, "acceleration": (0.3, 0.2, -9.7)},
+    "fluid_forces": {"across": 1.2, "along": 0.1, "added_mass": 0.9, "density": 200.0},
 }
-INSTANCES = {"gripper_compliance": GripperCompliance(hinges=(1,))}
+INSTANCES = {
+    "gripper_compliance": GripperCompliance(hinges=(1,)),
+    "gripper_play": GripperPlay(hinges=(1,)),
+    "gripper_damping": GripperDamping(hinges=(1,)),
+}
+CLAMPS = ["gripper_play", "gripper_damping"]
 LAWS = ["internal_friction", "stiffening_bending", "anisotropic_bending", "gripper_compliance"]
 CASES: dict[str, dict] = {
     "explicit": {
@@ -60,6 +70,9 @@ CASES: dict[str, dict] = {
     "implicit wind": {"effects": ["bend", "tilted_gravity", "wind", "stretch"], "dt": 3e-3},
     "explicit laws": {"effects": ["bend_frame", "twist", "gravity", *LAWS], "dt": 1e-3, "twist": "dynamic"},
     "implicit laws": {"effects": ["bend_frame", "twist", "gravity", *LAWS], "dt": 2e-3, "twist": "quasistatic"},
+    "implicit clamps": {"effects": ["bend_frame", "twist", "gravity", *CLAMPS], "dt": 2e-3, "twist": "quasistatic"},
+    "explicit fluid": {"effects": ["bend", "gravity", "buoyancy", "fluid_forces"], "dt": 1e-3},
+    "implicit fluid": {"effects": ["bend", "gravity", "buoyancy", "fluid_forces"], "dt": 3e-3},
     "explicit loop": {"effects": ["bend", "gravity"], "dt": 1e-3, "closed": True},
     "explicit dynamic": {
         "effects": ["bend_frame", "twist", "gravity", "damping", "bending_damping", "rest_curvature", "link_chain"],
@@ -168,7 +181,7 @@ def paths(case: str, scene, trees) -> list[str]:
         found += ["rods.material.inertia", "state.twist", "state.twist_rate"]
     if "extensible" in case or "forces" in case:
         found += ["rods.material.stretch"]
-    if any(e.name in ("air_drag", "table") for e in scene.effects):
+    if any(e.name in ("air_drag", "table", "fluid_forces") for e in scene.effects):
         found += ["rods.material.radius"]
     found += [
         f"effects.{e}.{name}"

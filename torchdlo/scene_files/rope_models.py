@@ -83,7 +83,7 @@ def cable(path: str | Path) -> RopeMaterial:
     """Return what a model file says of a rope, for a task: `envs.make("wiring_post", rope=cable("model.json"))`.
 
     Left out are twisting, which ropes of tasks do not resist, and what belongs to the recording or to its scene: delay,
-    marker offset, clamps, tilt, the table.
+    marker offset, clamps, tilt, the table, a liquid.
 
     Raises:
         InputError: The file is not a model.
@@ -92,7 +92,7 @@ def cable(path: str | Path) -> RopeMaterial:
     rope = said["rope"]
     shape = _shape(rope.get("rest_positions"), model.values)
     curvature = () if shape is None else tuple(map(tuple, shape.curvature(len(tree.part(shape.shape))).tolist()))
-    others = (*_OF_RECORDINGS, "tilted_gravity", "table_friction")
+    others = (*_OF_RECORDINGS, "tilted_gravity", "table_friction", "fluid_forces")
     effects = tuple(
         (name, tuple((key, tuple(x) if isinstance(x, list) else (x,)) for key, x in numbers.items()))
         for name, numbers in _own(model).items()
@@ -188,6 +188,11 @@ def _effects(d: SceneDescription, model: Any, rope: dict[str, Any], *, framed: b
         rub = found.pop("table_friction")
         if "table" in d.effects:
             found["table_friction"] = rub | d.effects["table"]
+    if "fluid_forces" in found:
+        # So does the liquid.
+        drag = found.pop("fluid_forces")
+        if "density" in d.effects.get("buoyancy", {}):
+            found["fluid_forces"] = drag | {"density": d.effects["buoyancy"]["density"]}
     return found | d.effects
 
 

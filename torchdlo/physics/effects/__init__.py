@@ -6,8 +6,10 @@ from torchdlo.physics.effects.base import Effect
 from torchdlo.physics.effects.bending_models import AnisotropicBending, InternalFriction, StiffeningBending
 from torchdlo.physics.effects.elastic import Bend, BendFrame, Stretch, Twist
 from torchdlo.physics.effects.external import AirDrag, Damping, Gravity, TiltedGravity, Wind
+from torchdlo.physics.effects.fluid import Buoyancy, FluidForces
 from torchdlo.physics.effects.gripper_compliance import GripperCompliance
 from torchdlo.physics.effects.link_chain import LinkChain
+from torchdlo.physics.effects.loose_clamps import GripperDamping, GripperPlay
 from torchdlo.physics.effects.material import (
     AxialStiffness,
     BendingDamping,
@@ -28,6 +30,7 @@ EFFECTS: dict[str, type[Effect]] = {
     "damping": Damping,
     "table": Table,
     "link_chain": LinkChain,
+    "buoyancy": Buoyancy,
     # Those that a diagnosis looks for, in the order in which it does.
     "air_drag": AirDrag,
     "wind": Wind,
@@ -42,7 +45,10 @@ EFFECTS: dict[str, type[Effect]] = {
     "point_mass": PointMass,
     "stretch": AxialStiffness,
     "table_friction": TableFriction,
+    "fluid_forces": FluidForces,
     "gripper_compliance": GripperCompliance,
+    "gripper_play": GripperPlay,
+    "gripper_damping": GripperDamping,
     "time_delay": TimeDelay,
     "marker_offset": MarkerOffset,
 }
@@ -56,9 +62,13 @@ __all__ = [
     "BendFrame",
     "BendingDamping",
     "BendingPlasticity",
+    "Buoyancy",
     "Damping",
+    "FluidForces",
     "Gravity",
     "GripperCompliance",
+    "GripperDamping",
+    "GripperPlay",
     "InternalFriction",
     "LinkChain",
     "MarkerOffset",

@@ -32,6 +32,10 @@ class RecordedRope(Protocol):
     def table_height(self) -> float | None:
         """Height of the table [m], None where there is none."""
 
+    @property
+    def fluid_density(self) -> float | None:
+        """Density of the liquid around the rope [kg/m^3], None in air."""
+
 
 @dataclass(frozen=True)
 class RopeScales:
@@ -82,5 +86,5 @@ class RopeEffectSpec:
     """By effect: what would tell the two apart. Naming it on one side is enough."""
     special_case: tuple[str, Mapping[str, float]] | None = None
     """An effect with fewer numbers that this one contains, and the values of those that it lacks."""
-    requires: Literal["table", "clamps"] | None = None
+    requires: Literal["table", "clamps", "fluid"] | None = None
     """What a recording must have for it to act. One that requires clamps has a field `hinges` for where they end."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -26,6 +27,38 @@ def _in_series(stiffness: Tensor, other: Tensor) -> Tensor:
     return tree.cat_components(torch.broadcast_tensors(s11 + both, s22 + both, s12)) / divisor
 
 
+def check_hinges(name: str, hinges: Sequence[int], topology: Topology) -> None:
+    """Raise a `ValueError` if the clamps of the effect `name` are not at hinges."""
+    mask = topology.hinge_mask()
+    wrong = [h for h in hinges if not 0 <= h < topology.size or not mask[h]]
+    if wrong or not hinges:
+        here = [i for i, real in enumerate(mask) if real]
+        raise ValueError(
+            f"{name}: hinges are {list(hinges)}; expected one or more of {here[0]} to {here[-1]} "
+            "inside the ropes, where clamps end"
+        )
+
+
+def at_clamps(topology: Topology, hinges: Sequence[int], like: Tensor) -> Tensor:
+    """Return 1 where clamps end and 0 elsewhere, shape (V, 1), of the dtype and device of a tensor."""
+    return like.new_tensor([[float(slot in hinges)] for slot in range(topology.size)])
+
+
+def softened(topology: Topology, params: RodParams, hinges: Sequence[int], stiffness: Tensor) -> RodParams:
+    """Return the rods' parameters with springs [N m/rad] in series with bending and twisting where clamps end."""
+    length, material = hinge_length(topology, params.rest), params.material
+    here, spring = at_clamps(topology, hinges, length) > 0, stiffness * length
+    bend = torch.where(here, _in_series(material.bend, spring), material.bend)
+    twist = torch.where(here, _in_series(material.twist, spring), material.twist)
+    return tree.replace(params, material=tree.replace(material, bend=bend, twist=twist))
+
+
+CLAMP_STIFFNESS = Param(
+    1e18, 1e-3, 1e18, "N m/rad", "reciprocal", 1e18, "Stiffness of a clamp; 1e18 stands for a rigid one."
+)
+"""The spring of a clamp, whatever else it does."""
+
+
 @dataclass(frozen=True)
 class GripperCompliance(Effect):
     """Clamps that turn elastically: a spring in series with bending and twisting of the hinge at each of them.
@@ -41,11 +74,7 @@ class GripperCompliance(Effect):
     kind: ClassVar[EffectKind] = "boundary"
     equation: ClassVar[str] = "moment at a clamp = stiffness · turn of the rope in it"
     last: ClassVar[bool] = True
-    params: ClassVar[dict[str, Param]] = {
-        "stiffness": Param(
-            1e18, 1e-3, 1e18, "N m/rad", "reciprocal", 1e18, "Stiffness of a clamp; 1e18 stands for a rigid one."
-        )
-    }
+    params: ClassVar[dict[str, Param]] = {"stiffness": CLAMP_STIFFNESS}
     spec = RopeEffectSpec(
         lambda s: [{"stiffness": 100 * s.bending_stiffness / s.rope.length}],
         strength=("stiffness",),
@@ -58,20 +87,8 @@ class GripperCompliance(Effect):
 
     def check(self, topology: Topology) -> None:
         """Raise a `ValueError` if the clamps are not at hinges."""
-        mask = topology.hinge_mask()
-        wrong = [h for h in self.hinges if not 0 <= h < topology.size or not mask[h]]
-        if wrong or not self.hinges:
-            here = [i for i, real in enumerate(mask) if real]
-            raise ValueError(
-                f"gripper_compliance: hinges are {list(self.hinges)}; expected one or more of {here[0]} to {here[-1]} "
-                "inside the ropes, where clamps end"
-            )
+        check_hinges(self.name, self.hinges, topology)
 
     def modify_material(self, topology: Topology, params: RodParams, values: Values) -> RodParams:
         """Soften the hinges."""
-        length, material = hinge_length(topology, params.rest), params.material
-        here = length.new_tensor([[float(slot in self.hinges)] for slot in range(topology.size)]) > 0
-        spring = values["stiffness"] * length
-        bend = torch.where(here, _in_series(material.bend, spring), material.bend)
-        twist = torch.where(here, _in_series(material.twist, spring), material.twist)
-        return tree.replace(params, material=tree.replace(material, bend=bend, twist=twist))
+        return softened(topology, params, self.hinges, values["stiffness"])

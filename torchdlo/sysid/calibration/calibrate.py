@@ -14,6 +14,7 @@ import numpy as np
 from torchdlo.errors import InputError
 from torchdlo.physics import tree
 from torchdlo.sysid.calibration import refinement
+from torchdlo.sysid.calibration.absolute import fit_absolute
 from torchdlo.sysid.diagnosis.error_floor import marker_noise
 from torchdlo.sysid.estimation import evaluation, levenberg_marquardt
 from torchdlo.sysid.estimation.checkpoint import Checkpoint
@@ -28,6 +29,7 @@ from torchdlo.sysid.model.rope_model import RopeModel
 from torchdlo.sysid.model.trial_batch import Start, TrialBatch
 from torchdlo.sysid.recordings.metrics import average, mean_absolute_error
 from torchdlo.sysid.recordings.recording import Recording, Trial
+from torchdlo.sysid.recordings.wrench import check_forces, force_doubts
 from torchdlo.sysid.video.filmed import FILMED_STARTS, calibrate_filmed
 
 Callback = Callable[[str, int, int, str], None]
@@ -58,6 +60,8 @@ class _Job:
     """Coordinates of the best start so far."""
     drifts: np.ndarray | None = None
     """What all trials get wrong in the same way, in coordinates, see `levenberg_marquardt.interval`."""
+    weighed: bool = False
+    """Whether forces told the mass."""
 
     @property
     def columns(self) -> list[int]:
@@ -97,6 +101,7 @@ def calibrate(
 ) -> Calibration:
     """Fit the baseline model to the train trials and judge it on the test trials.
 
+    Where forces at the grippers were measured, they tell the mass, too, and with it stiffnesses by themselves.
     Stiffnesses and damping rate (and, with a given rest shape, how much of it is real and how it lies in the first
     clamp) are fitted from several starts in one batch on a few trials, and from the best of them on all. Initial
     velocities are estimated for each trial from its first 0.1 s.
@@ -126,6 +131,7 @@ def calibrate(
         options: dict[str, Any] = {"seed": seed, "vertices": vertices, "given": given, "callback": callback}
         return calibrate_filmed(recording, starts=min(starts, FILMED_STARTS), iterations=iterations, **options)
     begun = time.perf_counter()
+    check_forces(recording)
     if rest not in ("auto", "straight", "given"):
         raise InputError(f"rest is {rest!r}; expected auto, straight or given.")
     report = callback or (lambda stage, done, total, message: None)
@@ -150,6 +156,7 @@ def calibrate(
                         best = improved
             before = _before(tree.part(best))  # refining corrects what the pool simulates from then on
             best = _refined(tree.part(best), iterations, vertices, report) if refined else best
+            best = _weighed(tree.part(best), iterations, report)
         except KeyboardInterrupt:
             if best is None or (best.point is None and not _settled(best)):
                 raise
@@ -352,6 +359,25 @@ def _refined(job: _Job, iterations: int, vertices: int | None, report: Callback)
     return replace(job, drifts=np.concatenate([scale, apart[None]]))
 
 
+def _weighed(job: _Job, iterations: int, report: Callback) -> _Job:
+    """Return the job with a mass that forces at the grippers tell, or as it was where none were measured."""
+    recording, trials = job.pool.recording, _usable(job.pool.recording)
+    if recording.wrench is None or all(t.wrench is None for t in trials):
+        return job
+    model = job.model
+    options = dict(job.pool.local.options) | dict(job.options)
+    start = starts_of.refine(model, job.motion, starts_of.begin(model, trials), job.values, job.simulator(trials))
+
+    def said(done: int, total: int, message: str) -> None:
+        report("fitting forces", done, total, message)
+
+    before = (job.values, job.space, job.drifts)
+    model, found = fit_absolute(recording, trials, options, model.effects, before, start, min(iterations, 8), said)
+    better = replace(job, options=(*job.options, ("forces", True)), model=model, values=found.values)
+    better.space, better.point, better.drifts, better.weighed = found.space, found.point, found.drifts, True
+    return better
+
+
 def _pick(count: int, wanted: int) -> list[int]:
     return sorted({round(i) for i in np.linspace(0, count - 1, min(count, wanted))})
 
@@ -434,6 +460,15 @@ def _notes(recording: Recording, job: _Job, low: np.ndarray, high: np.ndarray) -
     notes = [f"Rest shape: {job.model.rest}."]
     if job.model.effects:
         notes.append(f"Effects of the given model: {', '.join(e.replace('_', ' ') for e in job.model.effects)}.")
+    if job.weighed:
+        told = job.values[job.model.parameters.index("mass")]
+        notes.append(
+            f"Forces at the grippers say that the rope has {1e3 * told:.4g} g, rope.json {1e3 * recording.mass:.4g} g; "
+            "stiffnesses go with the first."
+        )
+    else:
+        notes.append("No forces were measured: stiffnesses are as right as the mass in rope.json, in proportion.")
+    notes += force_doubts(recording)
     notes.append(_RANGES if job.drifts is not None else _NARROW)
     logs = [p.scale == "log" for p in job.space.params]
     for name in (n for n, a, b, log in zip(job.space.names, low, high, logs, strict=True) if log and b > _VAGUE * a):

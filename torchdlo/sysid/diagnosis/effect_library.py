@@ -24,6 +24,7 @@ PARAMETERS: dict[str, Param] = {
     "bending_stiffness": Param(1e-3, 1e-7, 1.0, "N m^2", "log", None, "Uniform bending stiffness EI."),
     "twisting_stiffness": Param(1e-3, 1e-7, 1.0, "N m^2", "log", None, "Uniform twisting stiffness GJ."),
     "damping_rate": Param(0.5, 1e-2, 20.0, "1/s", "log", None, "Rate at which all velocities decay."),
+    "mass": Param(0.1, 1e-6, 1e5, "kg", "log", None, "Mass of the rope without markers."),
     "rest_share": Param(1.0, 0.0, 2.0, "1", "linear", 0.0, "Share of the given rest shape's curvature that is real."),
     "rest_roll": Param(
         0.0,
@@ -97,7 +98,12 @@ def check_known(what: str, name: str) -> None:
 
 def applicable(name: str, recording: Recording, mesh: Mesh) -> bool:
     """Return whether an effect can show in a recording."""
-    here = {"table": recording.table_height is not None, "clamps": bool(mesh.clamp_hinges), None: True}
+    here = {
+        "table": recording.table_height is not None,
+        "clamps": bool(mesh.clamp_hinges),
+        "fluid": recording.fluid_density is not None,
+        None: True,
+    }
     return here[spec(name).requires]
 
 

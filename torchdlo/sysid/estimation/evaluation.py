@@ -66,6 +66,7 @@ def rope_content(recording: Recording, rest: str) -> dict[str, Any]:
         "marker_mass": recording.marker_mass,
         "gravity": list(recording.gravity),
         "table_height": recording.table_height,
+        "fluid_density": recording.fluid_density,
         "rest": rest,
         "rest_positions": recording.rest_positions if rest == "given" else None,
     }

@@ -1,6 +1,6 @@
 """Steps of many alike scenes without gradients, recorded once for each scene and number of them.
 
-What held parts feel and what contact missed stays as it was: nobody asks for it, so it is not computed.
+What contact missed stays as it was, and so does what held parts feel unless that is asked for: it is not computed.
 """
 
 from __future__ import annotations
@@ -24,6 +24,18 @@ def _moved(scene: scenes.Scene, params: scenes.Params, state: scenes.State, cont
     return tree.replace(after, diagnostics=state.diagnostics, reaction=state.reaction)
 
 
-def recorded_step(scene: scenes.Scene, params: scenes.Params, state: scenes.State, control: scenes.Control) -> Step:
-    """Return the step of a scene for inputs of these shapes."""
-    return _RECORDINGS.find(scene, partial(_moved, scene), params, state, control)
+def _felt(scene: scenes.Scene, params: scenes.Params, state: scenes.State, control: scenes.Control) -> scenes.State:
+    return tree.replace(scenes.step(scene, params, state, control), diagnostics=state.diagnostics)
+
+
+def recorded_step(
+    scene: scenes.Scene,
+    params: scenes.Params,
+    state: scenes.State,
+    control: scenes.Control,
+    *,
+    reactions: bool = False,
+) -> Step:
+    """Return the step of a scene for inputs of these shapes; `reactions`: with what held parts feel."""
+    step = _felt if reactions else _moved
+    return _RECORDINGS.find((scene, reactions), partial(step, scene), params, state, control)

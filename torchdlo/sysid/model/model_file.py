@@ -36,7 +36,10 @@ _OLDER = {"ahead": "numerical_damping", "grip": "clamp_fraction"}
 _OPTIONS = {"vertices": int, "rest": str, "numerical_damping": float, "clamp_fraction": float, "substep": float}
 """How the model is built, see `RopeModel`."""
 
-_OPTION_RANGES = {"vertices": (2, 100_000), "substep": (1e-9, 1.0)}
+_OPTIONAL = {"mass": float}
+"""Those that a file may lack."""
+
+_OPTION_RANGES = {"vertices": (2, 100_000), "substep": (1e-9, 1.0), "mass": (1e-12, 1e5)}
 """Least and greatest values, 0 and 1 where nothing is said."""
 
 _BASELINE = ("bending_stiffness", "twisting_stiffness", "damping_rate")
@@ -67,7 +70,7 @@ class ModelFile:
             if name in effect_library.library() and not effect_library.applicable(name, recording, model.mesh):
                 raise InputError(
                     f"{self.path}: {name}: expected a recording in which it can act, but {recording.path} has nothing "
-                    "that it acts on (no table, no clamp of two markers, or no radius)."
+                    "that it acts on (no table, no clamp of two markers, no liquid, or no radius)."
                 )
         return model
 
@@ -98,10 +101,13 @@ class ModelFile:
 def content(model: RopeModel, values: np.ndarray) -> dict[str, Any]:
     """Return what a model file holds, for JSON."""
     numbers = dict(zip(model.parameters, map(float, values), strict=True))
+    # A mass that forces told is one of the rope, whichever recording it is simulated on.
+    mass = numbers.pop("mass", model.mass)
+    own = {} if mass == model.recording.mass else {"mass": mass}
     return {
         "format": FORMAT,
         "version": VERSION,
-        "rope": rope_content(model.recording, model.rest),
+        "rope": rope_content(model.recording, model.rest) | {"mass": mass},
         "parameters": values_of("", numbers),
         "effects": {name: values_of(name, numbers) for name in model.effects},
         "options": {
@@ -110,6 +116,7 @@ def content(model: RopeModel, values: np.ndarray) -> dict[str, Any]:
             "numerical_damping": model.numerical_damping,
             "clamp_fraction": model.clamp_fraction,
             "substep": model.dt / model.substeps,
+            **own,
         },
         "mesh": {"arclength": model.arclength, "marker_vertex": model.marker_vertex},
         "step": model.step,
@@ -177,7 +184,9 @@ def _read(path: Path) -> dict[str, Any]:
 
 def _options(path: Path, given: dict[str, Any]) -> dict[str, Any]:
     options: dict[str, Any] = {}
-    for name, kind in _OPTIONS.items():
+    for name, kind in (_OPTIONS | _OPTIONAL).items():
+        if name not in given and name in _OPTIONAL:
+            continue
         if name not in given:
             _refuse(path, f"options.{name}", "this entry", "none")
         value = given[name]
@@ -193,7 +202,7 @@ def _options(path: Path, given: dict[str, Any]) -> dict[str, Any]:
     # A quotient of frame times by substeps may round down: one substep more would be another model.
     options["substep"] *= 1 + 1e-9
     for name in given:
-        _check_name(path, "options", name, _OPTIONS)
+        _check_name(path, "options", name, _OPTIONS | _OPTIONAL)
     return options
 
 

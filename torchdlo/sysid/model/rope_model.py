@@ -1,8 +1,8 @@
 """The model of a recorded rope: recordings in, simulated markers out, many parameter sets at once.
 
 Its baseline is gravity, an almost inextensible rod, straight or given rest shape, uniform bending and twisting
-stiffness, one damping rate, a frictionless table where there is one, and clamps that follow the gripped markers.
-Effects of the library may be added to it.
+stiffness, one damping rate, a frictionless table where there is one, buoyancy in a liquid, and clamps that follow the
+gripped markers. Effects of the library may be added to it.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from torchdlo.physics.effects import EFFECTS
 from torchdlo.physics.effects.base import Effect, Param
 from torchdlo.physics.effects.elastic import Bend, BendFrame, Twist
 from torchdlo.physics.effects.external import Damping, Gravity
+from torchdlo.physics.effects.fluid import Buoyancy
 from torchdlo.physics.effects.parameter_name import ParameterName
 from torchdlo.physics.effects.table import Table
 from torchdlo.physics.execution import tracing
@@ -33,6 +34,7 @@ from torchdlo.sysid.diagnosis.effect_library import PARAMETERS, Number
 from torchdlo.sysid.model import equilibrium, length_projection
 from torchdlo.sysid.model.cached_steps import recorded_step
 from torchdlo.sysid.model.discretisation import make_mesh
+from torchdlo.sysid.model.grip_wrench import Grip, grip_wrench
 from torchdlo.sysid.model.gripper_motion import drive
 from torchdlo.sysid.model.marker_observation import Markers
 from torchdlo.sysid.model.trial_batch import WINDOW, Start, TrialBatch
@@ -67,6 +69,8 @@ class RopeModel:
         substep: float = MAX_SUBSTEP,
         numerical_damping: float = AHEAD,
         clamp_fraction: float = 1.0,
+        mass: float | None = None,
+        forces: bool = False,
     ) -> None:
         """Prepare the model.
 
@@ -78,6 +82,8 @@ class RopeModel:
             substep: longest substep [s].
             ahead: see `torchdlo.scene.Scene`.
             clamp_fraction: where clamps hold the rope's direction, see `Mesh.clamp_shares`.
+            mass: of the rope [kg], in place of the recording's.
+            forces: whether forces at the grippers tell the mass, which then is a number to fit.
         """
         trial = recording.train[0]
         self.recording, self.rest, self.effects = recording, rest, tuple(effects)
@@ -87,6 +93,7 @@ class RopeModel:
         self.held, self.clamps = self.mesh.held, self.mesh.clamps
         self.gripped = np.flatnonzero(trial.gripped)
         self.numerical_damping, self.clamp_fraction = numerical_damping, clamp_fraction
+        self.mass = recording.mass if mass is None else mass
         for other in (*recording.train, *recording.test):
             same = np.array_equal(other.gripped, trial.gripped)
             if not same or not np.allclose(other.marker_arclength, trial.marker_arclength):
@@ -105,6 +112,7 @@ class RopeModel:
         self.substeps = max(1, int(np.ceil(self.dt / substep - 1e-9)))
         baseline = ["bending_stiffness", "twisting_stiffness", "damping_rate"]
         baseline += ["rest_share", "rest_roll"] if rest == "given" else []
+        baseline += ["mass"] if forces else []
         self.numbers = [Number(ParameterName("", n), PARAMETERS[n], float(PARAMETERS[n].scalar)) for n in baseline]
         for name in self.effects:
             self.numbers += effect_library.numbers(name, recording)
@@ -129,9 +137,9 @@ class RopeModel:
 
         The bending stiffness is the one at which weight bends the rope over a tenth of its length.
         """
-        weight = float(self.recording.mass * np.linalg.norm(self.recording.gravity) / self.recording.length)
+        weight = float(self.mass * np.linalg.norm(self.recording.gravity) / self.recording.length)
         bend = max(weight, 1e-4) * (0.1 * self.recording.length) ** 3
-        first = {"bending_stiffness": bend, "twisting_stiffness": 0.7 * bend}
+        first = {"bending_stiffness": bend, "twisting_stiffness": 0.7 * bend, "mass": self.mass}
         return np.array([first.get(n.name, n.off) for n in self.numbers], dtype=float)
 
     def motion(self, trials: Sequence[Trial]) -> TrialBatch:
@@ -190,7 +198,7 @@ class RopeModel:
         rope = Rope(
             pos,
             radius=self.recording.radius or 0.005,
-            mass=self.recording.mass,
+            mass=self.mass,
             # (N, 1): per scene, however many vertices there are.
             bend=number["bending_stiffness"].unsqueeze(-1),
             twist=number["twisting_stiffness"].unsqueeze(-1),
@@ -226,7 +234,8 @@ class RopeModel:
         extra = [effect_library.instance(name, self.mesh) for name in self.effects]
         framed = self.rest == "given" or any(e.frame_bending for e in extra)
         table = [Table()] if self.recording.table_height is not None else []
-        return [Gravity(), BendFrame() if framed else Bend(), Twist(), Damping(), *table, *extra]
+        fluid = [Buoyancy()] if self.recording.fluid_density is not None else []
+        return [Gravity(), BendFrame() if framed else Bend(), Twist(), Damping(), *table, *fluid, *extra]
 
     def _values(self, number: dict[str, Tensor]) -> dict[str, dict[str, Any]]:
         """Return the numbers of the effects: fitted ones with shape (N, 1, C), known ones as they are."""
@@ -236,6 +245,9 @@ class RopeModel:
         }
         if self.recording.table_height is not None:
             numbers["table"] = {"height": self.recording.table_height}
+        if self.recording.fluid_density is not None:
+            gravity, density = list(self.recording.gravity), self.recording.fluid_density
+            numbers["buoyancy"] = {"density": density, "acceleration": gravity}
         for name in self.effects:
             numbers[name] = dict(effect_library.known(name, self.recording))
             parts: dict[str, list[Tensor]] = {}
@@ -281,10 +293,11 @@ class RopeModel:
         step = torch.as_tensor(np.diff(self.arclength)).reshape(-1, 1)
         length = torch.cat([step, step.new_ones(1, 1)])
         real = length * rods.rest.edge_mask
-        line = self.recording.mass / real.sum() * real
+        whole = number["mass"].reshape(-1, 1, 1) if "mass" in number else self.mass
+        line = whole / real.sum() * real
         mass = 0.5 * (line + torch.roll(line, 1, -2))
         extra = torch.zeros_like(mass)
-        extra[torch.as_tensor(self.marker_vertex)] = self.recording.marker_mass or 0.0
+        extra[..., torch.as_tensor(self.marker_vertex), :] = self.recording.marker_mass or 0.0
         material = tree.replace(rods.material, mass=mass + extra)
         share = torch.as_tensor(self.mesh.clamp_shares(self.clamp_fraction)).unsqueeze(-1)
         rest = tree.replace(rods.rest, length=length, share=share)
@@ -336,8 +349,44 @@ class RopeModel:
                 out[rows] += begin.discretisation_correction[: len(rows), :total]
         return out
 
+    def with_forces(
+        self, motion: TrialBatch, start: Start, values: np.ndarray, found: Sequence[Grip]
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return simulated markers [m] as `simulate`, and what grippers exert on the rope.
+
+        Args:
+            motion: see `simulate`.
+            start: likewise, for B trials.
+            values: likewise.
+            found: the grippers.
+
+        Returns:
+            Markers (P, B, F, M, 3), and force [N] and torque [N m] (P, B, F, W, 6), NaN in the last frame.
+        """
+        sets, trials, total = len(values), len(motion.names), motion.markers.shape[1]
+        rows = np.arange(sets * trials)
+        own, begin = motion.pick(rows % trials), start.pick(rows % trials)
+        wrench = np.full((len(rows), total, len(found), 6), np.nan)
+
+        def keep(force: Tensor, couple: Tensor) -> None:
+            places = own.held[:, : self.substeps * (total - 1) : self.substeps]
+            wrench[:, :-1] = grip_wrench(found, places, force, couple).numpy()
+
+        markers = self._run(own, begin, values[rows // trials], total, keep)
+        if begin.discretisation_correction is not None:
+            markers = markers + begin.discretisation_correction[:, :total]
+        return tuple(x.reshape(sets, trials, *x.shape[1:]) for x in (markers, wrench))
+
     @torch.no_grad()
-    def _run(self, motion: TrialBatch, start: Start, values: np.ndarray, frames: int) -> np.ndarray:
+    def _run(
+        self,
+        motion: TrialBatch,
+        start: Start,
+        values: np.ndarray,
+        frames: int,
+        keep: Callable[[Tensor, Tensor], None] | None = None,
+    ) -> np.ndarray:
+        """Return markers (N, F, M, 3); `keep` is given forces on held vertices (N, F - 1, H, 3) and couples."""
         scene, params, state = self.build(motion, start, values)
         params = tree.map(tree.batch_innermost, params)
         director = self._commands(scene, state, motion)
@@ -345,16 +394,22 @@ class RopeModel:
             Control(tree.batch_innermost(motion.held[:, k]), tree.batch_innermost(director[:, k]))
             for k in range((frames - 1) * self.substeps + 1)
         ]
-        step = recorded_step(scene, params, state, controls[0])
+        step = recorded_step(scene, params, state, controls[0], reactions=keep is not None)
         if start.still is not None and start.still.any():
             resting = equilibrium.come_to_rest(scene, params, state, controls[0])
             resting = self._corrected(step, scene, params, resting, controls, motion)
             state = tree.map(tree.batch_innermost, tree.where(torch.as_tensor(start.still), resting, state))
-        seen = [self.markers.frame(state)]
+        seen, force, couple = [self.markers.frame(state)], [], []
         for k, control in enumerate(controls[1:], 1):
             state = step(params, state, control)
+            if keep is not None and (k - 1) % self.substeps == 0:
+                # A substep is led by the forces where it begins.
+                force.append(state.reaction.force)
+                couple.append(state.reaction.couple)
             if k % self.substeps == 0:
                 seen.append(self.markers.frame(state))
+        if keep is not None:
+            keep(torch.stack(force, 1), torch.stack(couple, 1))
         return self.markers.seen(scene, params, seen, late=True).numpy()
 
     def _corrected(

@@ -10,7 +10,7 @@ import json
 import shutil
 import tempfile
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,9 @@ import numpy as np
 from torchdlo.errors import InputError
 from torchdlo.field_docs import with_field_docs
 from torchdlo.files import replace_atomically
+from torchdlo.physics import tree
 from torchdlo.sysid.recordings import rope_schema
+from torchdlo.sysid.recordings.wrench import ForceSensor
 from torchdlo.sysid.video.films import FilmFile, film_files, with_stations
 from torchdlo.untrusted import check_path
 
@@ -56,6 +58,11 @@ class Trial:
     """Frames not to trust, shape (F,) bool."""
     films: tuple[FilmFile, ...] = ()
     """Films of it, if cameras saw the rope instead of markers: then free markers are places that were not seen."""
+    wrench: np.ndarray | None = None
+    """Force [N] and torque about its marker [N m] that each gripper exerts on the rope, in the frame that rope.json
+    says, NaN where not measured, shape (F, W, 6)."""
+    wrench_marker: np.ndarray | None = None
+    """A gripped marker of each gripper whose force was measured, shape (W,) int."""
 
 
 @with_field_docs
@@ -91,6 +98,10 @@ class Recording:
     """Trials to judge on, never to fit on."""
     color: tuple[float, float, float] | None = None
     """Colour of the rope, RGB from 0 to 255, None where not known."""
+    fluid_density: float | None = None
+    """Density of the liquid in which the rope moves [kg/m^3], None in air."""
+    wrench: ForceSensor | None = None
+    """How forces at the grippers were measured, None if they were not."""
 
     @property
     def filmed(self) -> bool:
@@ -172,6 +183,8 @@ def save_trial(path: str | Path, trial: Trial) -> None:
     if trial.gripper_quaternion is not None and trial.gripper_marker is not None:
         arrays["gripper_quaternion"] = trial.gripper_quaternion
         arrays["gripper_marker"] = trial.gripper_marker
+    if trial.wrench is not None and trial.wrench_marker is not None:
+        arrays |= {"wrench": trial.wrench, "wrench_marker": trial.wrench_marker}
     with replace_atomically(Path(path)) as temporary:
         np.savez_compressed(temporary, **arrays)
 
@@ -205,6 +218,19 @@ def _check_together(path: Path, rope: dict, trials: tuple[Trial, ...]) -> None:
         raise InputError(
             f"{path / 'rope.json'}: closed: expected false or none, found true; loops cannot be calibrated yet."
         )
+    for trial in trials:
+        if trial.wrench is not None and rope["wrench"] is None:
+            raise InputError(
+                f"{path / 'rope.json'}: wrench: expected frame and noise of the forces in {trial.name}.npz, found none."
+            )
+        if trial.wrench is not None and rope["wrench"].frame == "gripper":
+            known = () if trial.gripper_marker is None else trial.gripper_marker
+            lacking = np.setdiff1d(tree.part(trial.wrench_marker), known)
+            if len(lacking):
+                raise InputError(
+                    f"{path / trial.name}.npz: gripper_quaternion: expected orientations of all grippers, as forces "
+                    f"are in their frames, found none for marker {lacking[0]}; give it, or forces in the world frame."
+                )
     rest = rope["rest_positions"]
     if rest is not None and len(rest) != n_markers:
         raise InputError(
@@ -219,4 +245,6 @@ def _check_together(path: Path, rope: dict, trials: tuple[Trial, ...]) -> None:
 
 
 def _to_json(value: object) -> object:
+    if isinstance(value, ForceSensor):
+        return asdict(value)
     return value.tolist() if isinstance(value, np.ndarray) else value

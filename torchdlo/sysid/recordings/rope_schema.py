@@ -15,7 +15,8 @@ from typing import Any, NoReturn
 import numpy as np
 
 from torchdlo.errors import InputError
-from torchdlo.sysid.recordings.trial_checks import check_clamps, check_markers, check_time
+from torchdlo.sysid.recordings.trial_checks import check_clamps, check_markers, check_time, check_wrench
+from torchdlo.sysid.recordings.wrench import FRAMES, ForceSensor
 from torchdlo.untrusted import check_path, one_line, read_json
 from torchdlo.untrusted.array_file import Header, read_arrays
 
@@ -23,13 +24,13 @@ __all__ = ["OPTIONAL", "REQUIRED", "check_arrays", "check_rope", "read_trial", "
 
 REQUIRED = ("length", "radius", "mass", "gravity", "table_height", "marker_noise_std")
 """Entries that every rope.json has."""
-OPTIONAL = ("rest_positions", "marker_mass", "closed", "notes", "color")
+OPTIONAL = ("rest_positions", "marker_mass", "closed", "notes", "color", "fluid_density", "wrench")
 """Entries that a rope.json may have."""
 
 _ARRAYS = ("time", "markers", "marker_arclength", "gripped")
-_OPTIONAL_ARRAYS = ("gripper_quaternion", "gripper_marker", "suspect")
+_OPTIONAL_ARRAYS = ("gripper_quaternion", "gripper_marker", "suspect", "wrench", "wrench_marker")
 _VIDEO_ARRAYS = ("masks", "mask", "video", "frames", "images")
-_FLOATS = ("time", "markers", "marker_arclength", "gripper_quaternion")
+_FLOATS = ("time", "markers", "marker_arclength", "gripper_quaternion", "wrench")
 
 
 def trial_files(path: Path) -> dict[str, list[Path]]:
@@ -67,6 +68,7 @@ def check_rope(path: Path) -> dict[str, Any]:
         "table_height": _number(path, rope, "table_height", "m", low=-1e4, high=1e4, optional=True),
         "marker_mass": _number(path, rope, "marker_mass", "kg", low=0.0, high=1e3, optional=True),
         "marker_noise_std": _number(path, rope, "marker_noise_std", "m", low=0.0, high=1.0, optional=True),
+        "fluid_density": _number(path, rope, "fluid_density", "kg/m^3", positive=True, high=2e4, optional=True),
         "gravity": _positions(path, rope, "gravity", (3,), "[gx, gy, gz] in m/s^2", most=1e3),
         "rest_positions": None,
         "closed": rope.get("closed") or False,
@@ -76,13 +78,31 @@ def check_rope(path: Path) -> dict[str, Any]:
         wanted = "a list of [x, y, z] in m, one for each marker"
         checked["rest_positions"] = _positions(path, rope, "rest_positions", (-1, 3), wanted)
     checked["color"] = _color(path, rope.get("color"))
+    checked["wrench"] = _sensor(path, rope.get("wrench"))
     for name, kind, said in (("closed", bool, "true or false"), ("notes", str, "a text")):
         if not isinstance(checked[name], kind):
             _refuse(path, name, said, repr(checked[name]))
+    if checked["fluid_density"] is not None and checked["radius"] is None:
+        _refuse(path, "radius", "a number in m, as the rope displaces a liquid", "none")
     if checked["radius"] is not None and checked["radius"] > 0.5 * checked["length"]:
         found = f"{checked['radius']:g} m for a rope of {checked['length']:g} m"
         _refuse(path, "radius", "at most half the length", f"{found}; the unit is metres")
     return checked
+
+
+def _sensor(path: Path, value: Any) -> ForceSensor | None:
+    """Return how forces were measured."""
+    if value is None:
+        return None
+    if not isinstance(value, dict):
+        _refuse(path, "wrench", "an object with frame and force_noise_std", _kind(value))
+    _check_names(path, value, ("frame", "force_noise_std"), ("torque_noise_std", "force_bias_std"), "entry of wrench")
+    if value["frame"] not in FRAMES:
+        _refuse(path, "wrench.frame", " or ".join(FRAMES), repr(value["frame"]))
+    force = _number(path, value, "force_noise_std", "N", positive=True, high=1e3)
+    torque = _number(path, value, "torque_noise_std", "N m", positive=True, high=1e3, optional=True)
+    bias = _number(path, value, "force_bias_std", "N", low=0.0, high=1e3, optional=True)
+    return ForceSensor(value["frame"], force or 0.0, torque, bias or 0.0)
 
 
 def _color(path: Path, value: Any) -> tuple[float, float, float] | None:
@@ -137,7 +157,8 @@ def check_arrays(path: Path, arrays: dict[str, np.ndarray], length: float, *, fi
     check_time(path, arrays["time"])
     check_markers(path, arrays, suspect, length, filmed=filmed)
     check_clamps(path, arrays)
-    optional = {name: arrays.get(name) for name in ("gripper_quaternion", "gripper_marker")}
+    check_wrench(path, arrays)
+    optional = {name: arrays.get(name) for name in ("gripper_quaternion", "gripper_marker", "wrench", "wrench_marker")}
     return {name: arrays[name] for name in _ARRAYS} | optional | {"suspect": suspect}
 
 
@@ -169,7 +190,7 @@ def _as_float(path: Path, name: str, array: np.ndarray) -> np.ndarray:
     if np.isinf(array).any():
         place = ", ".join(str(int(i)) for i in np.argwhere(np.isinf(array))[0])
         _refuse(path, name, "finite numbers", f"infinity at index ({place})")
-    if name != "markers" and np.isnan(array).any():
+    if name not in ("markers", "wrench") and np.isnan(array).any():
         place = ", ".join(str(int(i)) for i in np.argwhere(np.isnan(array))[0])
         _refuse(path, name, "finite numbers", f"NaN at index ({place})")
     return array

@@ -8,7 +8,7 @@ import numpy as np
 
 from torchdlo.errors import InputError
 
-__all__ = ["check_clamps", "check_markers", "check_time"]
+__all__ = ["check_clamps", "check_markers", "check_time", "check_wrench"]
 
 _EVEN = 0.01
 """Largest deviation of a time step from the median step, as a share of it."""
@@ -108,6 +108,36 @@ def check_clamps(path: Path, arrays: dict[str, np.ndarray]) -> None:
             f"{path}: gripper_quaternion: expected unit quaternions (w, x, y, z), found length "
             f"{norm[frame, clamp]:.4g} at frame {frame}, clamp {clamp}."
         )
+
+
+def check_wrench(path: Path, arrays: dict[str, np.ndarray]) -> None:
+    """Forces and torques come with a marker of each gripper that has a sensor."""
+    names = ("wrench", "wrench_marker")
+    wrench, marker = (arrays.get(name) for name in names)
+    if wrench is None and marker is None:
+        return
+    if wrench is None or marker is None:
+        absent, present = names if wrench is None else names[::-1]
+        raise InputError(f"{path}: {absent}: expected together with {present}, but missing.")
+    if marker.ndim != 1 or marker.dtype.kind not in "iu" or not len(marker):
+        raise InputError(
+            f"{path}: wrench_marker: expected integers of shape (grippers,), "
+            f"found {marker.dtype} of shape {marker.shape}."
+        )
+    n_frames = len(arrays["markers"])
+    if wrench.shape != (n_frames, len(marker), 6):
+        raise InputError(
+            f"{path}: wrench: expected shape ({n_frames}, {len(marker)}, 6), force [N] and torque [N m] for each frame "
+            f"and gripper, found {wrench.shape}."
+        )
+    gripped = arrays["gripped"]
+    for index in marker:
+        if not 0 <= index < len(gripped) or not gripped[index]:
+            raise InputError(f"{path}: wrench_marker: expected indices of gripped markers, found {index}.")
+    held = np.flatnonzero(gripped)
+    run = dict(zip(held, np.cumsum(np.diff(held, prepend=held[0]) > 1), strict=True))
+    if len({run[index] for index in marker}) < len(marker):
+        raise InputError(f"{path}: wrench_marker: expected one for each gripper, found two markers of the same one.")
 
 
 def _check_arclength(path: Path, arclength: np.ndarray, length: float) -> None:

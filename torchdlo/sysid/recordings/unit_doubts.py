@@ -8,6 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from torchdlo.sysid.recordings.recording import Recording, Trial
+from torchdlo.sysid.recordings.wrench import force_doubts
 
 __all__ = ["doubts"]
 
@@ -36,7 +37,8 @@ _GRAVITY = (8.0, 11.0)
 def doubts(recording: Recording) -> list[str]:
     """Return what can hardly be, a sentence each with what to look at; none for most recordings."""
     trials = recording.trials("all")
-    return [*_weight(recording), *_length(recording, trials), *_down(recording, trials), *_axes(trials)]
+    found = [*_weight(recording), *_length(recording, trials), *_down(recording, trials), *_axes(trials)]
+    return [*found, *force_doubts(recording)]
 
 
 def _weight(recording: Recording) -> list[str]:
