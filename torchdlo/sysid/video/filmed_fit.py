@@ -10,17 +10,22 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+import torch
 
 from torchdlo.sysid.estimation import levenberg_marquardt
 from torchdlo.sysid.estimation.levenberg_marquardt import Point
 from torchdlo.sysid.estimation.model_uncertainty import CLAMP_SPREAD, radius_of_clamps, shear_share
-from torchdlo.sysid.estimation.observation import INDEPENDENT, SURE, Spines
+from torchdlo.sysid.estimation.observation import INDEPENDENT, PER_CAMERA, SURE, Spines, seen_by
 from torchdlo.sysid.video.filmed_problem import FilmedProblem
+from torchdlo.vision.spine import curve_vectors
 
 __all__ = ["Fit", "fit", "gate", "intervals", "look", "picture_errors", "spread", "total"]
 
 _BLOCK = 0.5
 """Time over which what simulations get wrong is one and the same error [s]."""
+
+_STRETCHES = 14
+"""Stretches along a rope at rest, in each of which what a model gets wrong is one and the same error."""
 
 _GATE = 3.0
 """Times the usual distance in a picture from which it is a wrong one."""
@@ -283,7 +288,12 @@ def _difference(own: FilmedProblem, found: Fit, moved: Fit) -> tuple[np.ndarray,
 
 
 def _blocks(own: FilmedProblem, found: Fit) -> tuple[np.ndarray, np.ndarray]:
-    """Return gradients (E, N) and curvatures (E, N, N) of stretches of time of all trials, starts being eliminated."""
+    """Return gradients (E, N) and curvatures (E, N, N) of stretches of time of all trials, starts being eliminated.
+
+    Of ropes at rest they are of stretches along the rope.
+    """
+    if own.trials[0].still:
+        return _stretches(own, found)
     count, length = found.offset.shape[1], max(3, round(_BLOCK * own.spines.views[0].camera.fps))
     size, frames = found.raw.size, found.residual.shape[1]
     data = found.residual[:, :, : own.spines.priors.start]
@@ -306,6 +316,36 @@ def _blocks(own: FilmedProblem, found: Fit) -> tuple[np.ndarray, np.ndarray]:
             gradients.append(g[0, :size] - follow @ g[0, size:])
             reduced = np.concatenate([np.eye(size), -follow], 1)
             curvatures.append(reduced @ c[0] @ reduced.T)
+    return np.stack(gradients), np.stack(curvatures)
+
+
+def _stretches(own: FilmedProblem, found: Fit) -> tuple[np.ndarray, np.ndarray]:
+    """Return gradients (E, N) and curvatures (E, N, N) of stretches along ropes at rest."""
+    values = own.space.to_values(found.raw)[None]
+    places = torch.as_tensor(own.simulate(values), dtype=torch.float32)
+    spots = np.flatnonzero(own.spines.free)
+    parts = []
+    for k, view in enumerate(own.spines.views):
+        numbers = torch.as_tensor(values[:, len(own.free) :][:, PER_CAMERA * k :][:, :PER_CAMERA], dtype=torch.float32)
+        pixel = seen_by(view, places, numbers, own.spines.step)[0][0]
+        points = torch.as_tensor(view.places, dtype=torch.float32).nan_to_num(1e6)
+        along = curve_vectors(pixel, points)[1].numpy()
+        own_place = np.broadcast_to(spots, (*along.shape[:2], len(spots)))
+        parts.append(np.concatenate([np.repeat(along, 2, -1), own_place], -1))
+    share = np.concatenate(parts, -1) / (own.model.count - 1)
+    number = np.minimum((share * _STRETCHES).astype(int), _STRETCHES - 1)
+    gradients, curvatures = [], []
+    data = slice(0, own.spines.priors.start)
+    for b in range(len(found.residual)):
+        whole = np.isfinite(found.residual[b, :, data]).sum()
+        for k in range(_STRETCHES):
+            residual = np.where(number[b] == k, found.residual[b, :, data], np.nan)
+            count = np.isfinite(residual).sum()
+            if not count:
+                continue
+            g, c = normal(residual[None], found.jacobian[b : b + 1, :, :, data], found.offset[b : b + 1], own.prior[b : b + 1])
+            gradients.append(g[0] * count / whole * _STRETCHES)
+            curvatures.append(c[0] * count / whole * _STRETCHES)
     return np.stack(gradients), np.stack(curvatures)
 
 

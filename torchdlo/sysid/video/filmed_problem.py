@@ -189,7 +189,7 @@ def start_of(model: RopeModel, trials: Sequence[Trial], views: Sequence[FilmView
         speed = (shape[frames - 1] - shape[0]) / (trial.time[frames - 1] - trial.time[0])
         held = trial.markers[:frames, trial.gripped]
         quick = np.linalg.norm(held[-1] - held[0], axis=-1).max() / (trial.time[frames - 1] - trial.time[0])
-        calm = quick < _CALM and all(_unchanged(view, b) for view in views)
+        calm = trial.still or quick < _CALM and all(_unchanged(view, b) for view in views)
         vel.append(0 * speed if calm else speed)
         still.append(calm)
     return Start(np.stack(pos), np.stack(vel), np.array(still))
