@@ -111,7 +111,9 @@ def tidy(mask: np.ndarray, ranges: Ranges) -> np.ndarray:
 
     here = mask.astype(np.uint8)
     for left, top, right, bottom in ranges.ignore:
-        (y0, y1), (x0, x1) = ((round(a * n), round(b * n)) for n, a, b in zip(mask.shape, (top, left), (bottom, right), strict=True))
+        (y0, y1), (x0, x1) = (
+            (round(a * n), round(b * n)) for n, a, b in zip(mask.shape, (top, left), (bottom, right), strict=True)
+        )
         here[y0:y1, x0:x1] = 0
     if ranges.close > 1:
         kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (ranges.close, ranges.close))

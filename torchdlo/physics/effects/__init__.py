@@ -15,6 +15,7 @@ from torchdlo.physics.effects.material import (
     NonuniformStiffness,
     PointMass,
     RestCurvature,
+    VaryingRestCurvature,
 )
 from torchdlo.physics.effects.measurement import MarkerOffset, TimeDelay
 from torchdlo.physics.effects.table import Table, TableFriction
@@ -45,6 +46,7 @@ EFFECTS: dict[str, type[Effect]] = {
     "gripper_compliance": GripperCompliance,
     "time_delay": TimeDelay,
     "marker_offset": MarkerOffset,
+    "varying_rest_curvature": VaryingRestCurvature,
 }
 
 __all__ = [
@@ -72,5 +74,6 @@ __all__ = [
     "TiltedGravity",
     "TimeDelay",
     "Twist",
+    "VaryingRestCurvature",
     "Wind",
 ]

@@ -97,8 +97,9 @@ def check_known(what: str, name: str) -> None:
 
 def applicable(name: str, recording: Recording, mesh: Mesh) -> bool:
     """Return whether an effect can show in a recording."""
-    here = {"table": recording.table_height is not None, "clamps": bool(mesh.clamp_hinges), None: True}
-    return here[spec(name).requires]
+    here = {"table": recording.table_height is not None, "clamps": bool(mesh.clamp_hinges), "rest": recording.still}
+    required = spec(name).requires
+    return required is None or here[required]
 
 
 def instance(name: str, mesh: Mesh) -> Effect:

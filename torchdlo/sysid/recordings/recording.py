@@ -59,7 +59,7 @@ class Trial:
     still: bool = False
     """Whether it is a rope at rest, of which there are photographs: its frames are all the same."""
     stretches: Literal["all", "even", "odd"] = "all"
-    """Which stretches along the rope count of its photographs: where there are no others, some are left out to judge on."""
+    """Which stretches along the rope count of its photographs: where there are no others, some are left out."""
 
 
 @with_field_docs

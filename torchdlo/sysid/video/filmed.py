@@ -135,7 +135,7 @@ def tested(
 ) -> tuple[FilmedProblem, list[str]]:
     """Return the problem of the test trials, which begin as their first frames say with numbers (N,), and remarks."""
     views, said = views_of(recording, recording.test, report)
-    spines = Spines(views, own.model.dt, own.extent, own.spines.free)
+    spines = Spines(views, own.model.dt, own.extent, own.spines.free, own.spines.sure)
     parts: dict[str, Any] = {"trials": recording.test, "motion": own.model.motion(recording.test), "spines": spines}
     here = replace(own, **parts, dropped={}, discretisation_correction=None)
     begin_from_balance(here, own.full(values[None])[0])

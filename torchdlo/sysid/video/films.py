@@ -28,7 +28,7 @@ STATIONS = 41
 _PHOTOGRAPHS = (".png", ".jpg", ".jpeg")
 _SUFFIXES = (".mp4", ".mov", ".mkv", ".avi", ".webm", *_PHOTOGRAPHS, ".npz")
 
-_STILL_FRAMES, _STILL_STEP = 3, 5e-3
+_STILL_FRAMES, _STILL_STEP = 5, 5e-3
 """Frames of a simulated rope at rest, and the time between them [s]."""
 
 
