@@ -211,9 +211,19 @@ def design_experiment(
     vertices: Annotated[int | None, typer.Option(min=3, help="Vertices of the simulated rope.")] = None,
     workers: Annotated[int | None, typer.Option(min=1, help="Processes; one per core if not given.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the design as JSON.")] = False,
+    model: Annotated[
+        Path | None,
+        typer.Option(
+            help="Of films: model file whose parameters are to be found better. Default: "
+            "runs/calibrate/NAME/model.json.",
+            metavar="FILE",
+        ),
+    ] = None,
     resume: ResumeOption = False,
 ) -> None:
     """Find the motion of the grippers that tells apart effects which a recording cannot.
+
+    Of a recording with films: find the motion, and the place of the camera, that tell most of the rope's parameters.
 
     Ctrl-C stops after the running step; --resume goes on from there.
 
@@ -227,8 +237,15 @@ def design_experiment(
     from torchdlo.sysid.experiment_design import design as designs
     from torchdlo.sysid.recordings.recording import load_recording
 
-    loaded = load_recording(recording, films=False)
+    loaded = load_recording(recording)
     asked, name = [n.strip() for n in effects.split(",") if n.strip()], recording.resolve().name
+    if loaded.filmed:
+        if asked or findings is not None or tip_mass or resume:
+            raise InputError(f"{recording}: expected no --effects, --findings, --tip-mass or --resume for films.")
+        path = model or Path("runs") / "calibrate" / name / "model.json"
+        return _place_cameras(loaded, path, out or Path("runs") / "design" / name, seconds, scale, as_json)
+    if model is not None:
+        raise InputError(f"{recording}: expected --model for films only; --findings says what to start from.")
     if findings is None and not asked:
         findings = Path("runs") / "diagnose" / name
     out = out or Path("runs") / "design" / name
@@ -253,6 +270,32 @@ def design_experiment(
     typer.echo(f"motion: {out / 'motion.npz'}\nreport: {out / 'report.html'}", err=as_json)
     if as_json:
         typer.echo(designs.design_json(design), nl=False)
+
+
+def _place_cameras(recording: Recording, model: Path, out: Path, seconds: float, scale: float, as_json: bool) -> None:
+    from torchdlo.report.pages import camera_page as report
+    from torchdlo.sysid.model import model_file
+    from torchdlo.sysid.video import camera_placement
+
+    for file in report.FILES[:-1]:
+        check_writable(out / file)
+    if (out / "motion.npz").exists() and not (out / "design.json").exists():
+        raise InputError(f"{out / 'motion.npz'}: exists without design.json; move it away or choose another --out.")
+    given = model_file.load(model)
+    with at_work(out, *report.FILES):
+        try:
+            with progress() as show, deferred_interrupt(show) as callback:
+                design = camera_placement.place_cameras(
+                    recording, given, seconds=seconds, scale=scale, callback=callback
+                )
+        except KeyboardInterrupt:
+            raise stopped("nothing was written") from None
+        report.write_placement(design, out, command=shlex.join(["torchdlo", *sys.argv[1:]]))
+    typer.echo(f"{camera_placement.camera_summary(design)}\n", err=as_json)
+    typer.echo(f"{report.camera_table(design)}\n", err=as_json)
+    typer.echo(f"cameras: {out / 'cameras.json'}\nreport:  {out / 'report.html'}", err=as_json)
+    if as_json:
+        typer.echo(camera_placement.camera_json(design), nl=False)
 
 
 def _run_calibration(recording: Recording, **options: Any) -> Calibration:

@@ -95,13 +95,13 @@ def check_masks(
     if edge.any():
         text = f"the rope leaves the picture in {frames_text(edge)}: what is out of it does not count"
         issues.append(Issue("edge", text))
-    if pictures is not None:
+    if pictures is not None and count > 2:
         slipped = _slip(pictures, masks)
         if slipped is not None:
             at, far = slipped
             rows = np.arange(count) >= at
             leave(rows, "slip", f"the background has shifted by {far:.0f} px, as if the camera had slipped,")
-    if good.sum() < max(5, _FEW * count):
+    if good.sum() < max(min(count, 5), _FEW * count):
         kinds = ", ".join(dict.fromkeys(i.text for i in issues if i.kind not in ("edge", "blobs")))
         raise InputError(
             f"{where}: expected at least half of its {count} frames to be usable, found {int(good.sum())} ({kinds}); "

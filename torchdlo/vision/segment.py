@@ -49,6 +49,9 @@ class Ranges:
     """Gaps up to so many pixels are closed [px]."""
     smallest: int = 25
     """Blobs of fewer pixels are left out [px]."""
+    ignore: tuple[tuple[float, float, float, float], ...] = ()
+    """Left, top, right and bottom of rectangles that are left out, as shares of the picture [1]: clamps that have the
+    rope's colour for instance."""
 
 
 def ranges_of(rgb: Sequence[float]) -> Ranges:
@@ -107,6 +110,11 @@ def tidy(mask: np.ndarray, ranges: Ranges) -> np.ndarray:
     import cv2
 
     here = mask.astype(np.uint8)
+    for left, top, right, bottom in ranges.ignore:
+        (y0, y1), (x0, x1) = (
+            (round(a * n), round(b * n)) for n, a, b in zip(mask.shape, (top, left), (bottom, right), strict=True)
+        )
+        here[y0:y1, x0:x1] = 0
     if ranges.close > 1:
         kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (ranges.close, ranges.close))
         here = np.asarray(cv2.morphologyEx(here, cv2.MORPH_CLOSE, kernel), np.uint8)
@@ -156,9 +164,26 @@ def ranges_from(content: Any, where: str) -> Ranges:
                     f"{where}: {name}: expected a whole number from 0 to 10000, found {one_line(repr(value), 60)}."
                 )
             given[name] = value
+        elif name == "ignore":
+            given[name] = _rectangles(value, where)
         else:
-            raise InputError(f"{where}: {name}: unknown; known are hue, saturation, value, close, smallest.")
+            raise InputError(f"{where}: {name}: unknown; known are hue, saturation, value, close, smallest, ignore.")
     return Ranges(**given)
+
+
+def _rectangles(value: Any, where: str) -> tuple[tuple[float, float, float, float], ...]:
+    """Return rectangles from plain objects."""
+    found = []
+    for each in value if isinstance(value, (list, tuple)) else [None]:
+        four: Sequence[Any] = each if isinstance(each, (list, tuple)) and len(each) == 4 else [None]
+        number = all(isinstance(x, (int, float)) and not isinstance(x, bool) and 0 <= x <= 1 for x in four)
+        if not number or not (four[0] < four[2] and four[1] < four[3]):
+            raise InputError(
+                f"{where}: ignore: expected [[left, top, right, bottom], ...] as shares from 0 to 1, found "
+                f"{one_line(repr(each), 60)}."
+            )
+        found.append((float(four[0]), float(four[1]), float(four[2]), float(four[3])))
+    return tuple(found)
 
 
 def load_film(path: Path) -> tuple[np.ndarray, float | None]:
@@ -173,6 +198,8 @@ def load_film(path: Path) -> tuple[np.ndarray, float | None]:
         return _from_folder(path), None
     if path.suffix == ".npz":
         return _from_archive(path), None
+    if path.suffix.lower() in (".png", ".jpg", ".jpeg"):
+        return _maybe_masks(np.stack([_picture(path)])), None
     pictures, fps = read_video(path)
     return _maybe_masks(pictures), fps
 
@@ -200,23 +227,29 @@ def _from_archive(path: Path) -> np.ndarray:
     return masks > (0 if masks.dtype == bool or masks.max(initial=0) <= 1 else 127)
 
 
-def _from_folder(path: Path) -> np.ndarray:
+def _picture(file: Path) -> np.ndarray:
+    """Return a picture as it is stored, RGB (H, W, 3) uint8: tags that turn it do not count, as cameras do not turn."""
     import cv2
 
+    picture = cv2.imread(str(file), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    if picture is None:
+        raise InputError(f"{file}: expected a picture, PNG or JPEG, but it cannot be read.")
+    return np.ascontiguousarray(picture[..., ::-1])
+
+
+def _from_folder(path: Path) -> np.ndarray:
     files = sorted(path.glob("*.png"))
     if not files:
         raise InputError(f"{path}: expected PNG files, one for each frame, found none.")
     pictures: list[np.ndarray] = []
     for file in files:
-        picture = cv2.imread(str(file), cv2.IMREAD_COLOR)
-        if picture is None:
-            raise InputError(f"{file}: expected a PNG picture, but it cannot be read.")
+        picture = _picture(file)
         if pictures and picture.shape != pictures[0].shape:
             raise InputError(
                 f"{file}: expected {pictures[0].shape[1]} x {pictures[0].shape[0]} pixels as {files[0].name} has, "
                 f"found {picture.shape[1]} x {picture.shape[0]}."
             )
-        pictures.append(picture[..., ::-1])
+        pictures.append(picture)
     return _maybe_masks(np.stack(pictures))
 
 

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-__all__ = ["curve_vectors", "distance_field", "half_width", "sample_field", "spine", "thin"]
+__all__ = ["along", "curve_vectors", "distance_field", "half_width", "sample_field", "spine", "thin"]
 
 
 @functools.cache
@@ -106,6 +106,24 @@ def spine(mask: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
     places[: len(y)] = near + np.array([x0, y0])
     tangents[: len(y)] = np.stack([np.cos(angle), np.sin(angle)], 1)
     return places, tangents
+
+
+def along(places: np.ndarray, start: np.ndarray) -> np.ndarray:
+    """Return how far points of a centre line are along it from where it begins [px], shape (S,).
+
+    They are joined by a minimum spanning tree, whose branches are short where the line is one.
+
+    Args:
+        places: shape (S, 2) [px].
+        start: the point (2,) that it begins nearest to [px].
+    """
+    from scipy.sparse.csgraph import minimum_spanning_tree, shortest_path
+    from scipy.spatial.distance import cdist
+
+    gap = cdist(places, places)
+    tree = minimum_spanning_tree(np.maximum(gap, 1e-9))
+    first = int(np.linalg.norm(places - start, axis=1).argmin())
+    return np.asarray(shortest_path(tree, directed=False, indices=first))
 
 
 def distance_field(mask: np.ndarray) -> np.ndarray:

@@ -17,6 +17,7 @@ from torchdlo.physics.effects.material import (
     NonuniformStiffness,
     PointMass,
     RestCurvature,
+    VaryingRestCurvature,
 )
 from torchdlo.physics.effects.measurement import MarkerOffset, TimeDelay
 from torchdlo.physics.effects.table import Table, TableFriction
@@ -51,6 +52,7 @@ EFFECTS: dict[str, type[Effect]] = {
     "gripper_damping": GripperDamping,
     "time_delay": TimeDelay,
     "marker_offset": MarkerOffset,
+    "varying_rest_curvature": VaryingRestCurvature,
 }
 
 __all__ = [
@@ -82,5 +84,6 @@ __all__ = [
     "TiltedGravity",
     "TimeDelay",
     "Twist",
+    "VaryingRestCurvature",
     "Wind",
 ]

@@ -59,6 +59,41 @@ class RestCurvature(Effect):
 
 
 @dataclass(frozen=True)
+class VaryingRestCurvature(Effect):
+    """Natural curvature that varies along the rope, as of a wire that was bent by hand. Needs `BendFrame`."""
+
+    name: ClassVar[str] = "varying_rest_curvature"
+    kind: ClassVar[EffectKind] = "material"
+    equation: ClassVar[str] = "M = B (κ - Σ c_k P_k(2 s/L - 1)); P_k: Legendre's polynomials, fixed in the material"
+    frame_bending: ClassVar[bool] = True
+    params: ClassVar[dict[str, Param]] = {
+        "c": Param((0.0,) * 10, -30.0, 30.0, "1/m", "linear", 0.0, "Five about the first director, then the second.")
+    }
+    spec = RopeEffectSpec(
+        lambda s: [{f"c.{k}": 0.05 * s.curvature} for k in range(10)],
+        signed=True,
+        strength=("c",),
+        confusable=("rest_curvature", "nonuniform_stiffness", "gripper_compliance"),
+        experiments={"nonuniform_stiffness": "lay it on a level table: what is bent there is natural curvature"},
+        requires="rest",
+    )
+
+    def modify_material(self, topology: Topology, params: RodParams, values: Values) -> RodParams:
+        """Add the curvature to the rest shape."""
+        s, length = arclength(params)
+        x = 2 * s / length - 1
+        modes = [torch.ones_like(x), x]
+        for n in range(1, 4):
+            # Bonnet's recursion.
+            modes.append(((2 * n + 1) * x * modes[n] - n * modes[n - 1]) / (n + 1))
+        basis = torch.cat(modes, -1)
+        curvature = torch.stack([(basis * values["c"][..., 5 * k : 5 * k + 5]).sum(-1) for k in (0, 1)], -1)
+        hinge = hinge_length(topology, params.rest) * params.rest.hinge_mask
+        rest = tree.replace(params.rest, curvature=params.rest.curvature + hinge * curvature)
+        return tree.replace(params, rest=rest)
+
+
+@dataclass(frozen=True)
 class NonuniformStiffness(Effect):
     """Bending stiffness times 1 + gradient (s/L - 1/2) and times a soft or stiff spot (factor at its centre)."""
 

@@ -102,6 +102,7 @@ def applicable(name: str, recording: Recording, mesh: Mesh) -> bool:
         "table": recording.table_height is not None,
         "clamps": bool(mesh.clamp_hinges),
         "fluid": recording.fluid_density is not None,
+        "rest": recording.still,
         None: True,
     }
     return here[spec(name).requires]

@@ -169,8 +169,8 @@ INDEPENDENT = 2.0
 class _Filmed:
     """What observations of films have in common: views, priors, and the target 0."""
 
-    def __init__(self, views: Sequence[FilmView], step: float, extent: float) -> None:
-        self.views, self.step, self.extent = tuple(views), step, extent
+    def __init__(self, views: Sequence[FilmView], step: float, extent: float, sure: float) -> None:
+        self.views, self.step, self.extent, self.sure = tuple(views), step, extent, sure
         self.nuisances = nuisances(views)
         self.target: np.ndarray = np.empty(0)
         self.priors = slice(0, 0)
@@ -184,7 +184,7 @@ class _Filmed:
         # A squared reading counts one of `count`; a trial tells as much as `INDEPENDENT` readings per picture.
         share = count / np.maximum(INDEPENDENT * pictures * trials, 1)
         self.priors = slice(target.shape[2], None)
-        self._weight = SURE * np.sqrt(share / _COPIES)
+        self._weight = self.sure * np.sqrt(share / _COPIES)
         prior = np.full((trials, frames, _COPIES * len(self.nuisances.names), 1), np.nan)
         prior[:, 0] = 0.0
         self.target = np.concatenate([target, prior], 2)
@@ -216,7 +216,9 @@ class _Filmed:
 class Spines(_Filmed):
     """Distances between centre lines and the projected rope, both ways."""
 
-    def __init__(self, views: Sequence[FilmView], step: float, extent: float, free: np.ndarray) -> None:
+    def __init__(
+        self, views: Sequence[FilmView], step: float, extent: float, free: np.ndarray, sure: float = SURE
+    ) -> None:
         """Prepare.
 
         Args:
@@ -224,8 +226,9 @@ class Spines(_Filmed):
             step: time between simulated frames [s].
             extent: how far the rope moves [m].
             free: which of the simulated places may be visible, shape (M,) bool.
+            sure: what independent readings get wrong [m].
         """
-        super().__init__(views, step, extent)
+        super().__init__(views, step, extent, sure)
         self.free, self.count_free = free, int(free.sum())
         self._free = torch.as_tensor(free)
         frames = max(v.good.shape[1] for v in views)

@@ -10,9 +10,9 @@ import json
 import shutil
 import tempfile
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -22,7 +22,7 @@ from torchdlo.files import replace_atomically
 from torchdlo.physics import tree
 from torchdlo.sysid.recordings import rope_schema
 from torchdlo.sysid.recordings.wrench import ForceSensor
-from torchdlo.sysid.video.films import FilmFile, film_files, with_stations
+from torchdlo.sysid.video.films import FilmFile, film_files, held_still, with_stations
 from torchdlo.untrusted import check_path
 
 __all__ = [
@@ -63,6 +63,10 @@ class Trial:
     says, NaN where not measured, shape (F, W, 6)."""
     wrench_marker: np.ndarray | None = None
     """A gripped marker of each gripper whose force was measured, shape (W,) int."""
+    still: bool = False
+    """Whether it is a rope at rest, of which there are photographs: its frames are all the same."""
+    stretches: Literal["all", "even", "odd"] = "all"
+    """Which stretches along the rope count of its photographs: where there are no others, some are left out."""
 
 
 @with_field_docs
@@ -108,6 +112,11 @@ class Recording:
         """Whether cameras saw the rope, not markers on it."""
         return bool(self.train[0].films)
 
+    @property
+    def still(self) -> bool:
+        """Whether it is of ropes at rest, seen in photographs."""
+        return self.train[0].still
+
     def trials(self, split: str | tuple[str, ...]) -> tuple[Trial, ...]:
         """Return the trials of a split: "train", "test", or "all", those to fit on first; or those of these names."""
         splits = {"train": self.train, "test": self.test, "all": self.train + self.test}
@@ -139,6 +148,9 @@ def load_recording(path: str | Path, *, films: bool = True) -> Recording:
         split: tuple(_load_trial(f, rope["length"], found) for f in files[split]) for split in files
     }
     _check_together(path, rope, trials["train"] + trials["test"])
+    if not trials["test"]:
+        trials["test"] = tuple(replace(t, name=f"{t.name}_left_out", stretches="odd") for t in trials["train"])
+        trials["train"] = tuple(replace(t, stretches="even") for t in trials["train"])
     return Recording(path=path, **rope, **trials)
 
 
@@ -194,12 +206,15 @@ def _load_trial(path: Path, length: float, films: Mapping[str, tuple[FilmFile, .
     arrays = rope_schema.read_trial(path, filmed=bool(own))
     arrays = rope_schema.check_arrays(path, arrays, length, filmed=bool(own))
     trial = Trial(name=path.stem, **arrays, films=own)
-    return with_stations(trial, length) if own else trial
+    return with_stations(held_still(trial), length) if own else trial
 
 
 def _check_together(path: Path, rope: dict, trials: tuple[Trial, ...]) -> None:
     """What only several files together can tell: they must be of the same rope."""
     first = trials[0]
+    moving = [t.name for t in trials if not t.still]
+    if moving and len(moving) < len(trials):
+        raise InputError(f"{path}: expected films or photographs, found both; {moving[0]} is no rope at rest.")
     n_markers = len(first.marker_arclength)
     for trial in trials[1:]:
         if len(trial.marker_arclength) != n_markers:

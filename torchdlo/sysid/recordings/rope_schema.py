@@ -17,6 +17,7 @@ import numpy as np
 from torchdlo.errors import InputError
 from torchdlo.sysid.recordings.trial_checks import check_clamps, check_markers, check_time, check_wrench
 from torchdlo.sysid.recordings.wrench import FRAMES, ForceSensor
+from torchdlo.sysid.video.films import photographs
 from torchdlo.untrusted import check_path, one_line, read_json
 from torchdlo.untrusted.array_file import Header, read_arrays
 
@@ -49,7 +50,8 @@ def trial_files(path: Path) -> dict[str, list[Path]]:
     for file in (f for split in files.values() for f in split):
         check_path(file.name, "name of a trial")
     for split, purpose in (("train", "fit on"), ("test", "judge on")):
-        if not files[split]:
+        # Of a single photograph stretches of the rope are left out to judge on.
+        if not files[split] and not (split == "test" and photographs(path)):
             raise InputError(
                 f"{path}: expected at least one trial {split}_*.npz to {purpose}, found none; "
                 f"rename one of your trials to {split}_0.npz."
@@ -169,8 +171,8 @@ def _check_shapes(path: Path, arrays: Mapping[str, Header], fewest: int) -> None
     n_frames, n_markers = markers.shape[:2]
     if time.shape != (n_frames,):
         _refuse(path, "time", f"shape ({n_frames},), one for each frame", f"{time.shape}")
-    if n_frames < 3:
-        _refuse(path, "markers", "at least 3 frames", f"{n_frames}")
+    if n_frames < 3 and not (fewest == 1 and n_frames == 1):
+        _refuse(path, "markers", "at least 3 frames" + ", or 1 of a rope at rest" * (fewest == 1), f"{n_frames}")
     if n_markers < fewest:
         _refuse(path, "markers", f"at least {fewest} marker{'s' if fewest > 1 else ''}", f"{n_markers}")
     for name, size, each in (

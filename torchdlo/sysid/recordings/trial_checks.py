@@ -28,6 +28,8 @@ def check_time(path: Path, time: np.ndarray) -> None:
     """Times [s] must start at 0 and rise in even steps."""
     if abs(time[0]) > 1e-9:
         raise InputError(f"{path}: time: expected to start at 0 s, found {time[0]:g}; subtract the first time.")
+    if len(time) == 1:
+        return
     steps = np.diff(time)
     if (steps <= 0).any():
         frame = int(np.argmax(steps <= 0)) + 1

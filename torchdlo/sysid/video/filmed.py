@@ -135,7 +135,7 @@ def tested(
 ) -> tuple[FilmedProblem, list[str]]:
     """Return the problem of the test trials, which begin as their first frames say with numbers (N,), and remarks."""
     views, said = views_of(recording, recording.test, report)
-    spines = Spines(views, own.model.dt, own.extent, own.spines.free)
+    spines = Spines(views, own.model.dt, own.extent, own.spines.free, own.spines.sure)
     parts: dict[str, Any] = {"trials": recording.test, "motion": own.model.motion(recording.test), "spines": spines}
     here = replace(own, **parts, dropped={}, discretisation_correction=None)
     begin_from_balance(here, own.full(values[None])[0])
@@ -160,11 +160,18 @@ def _problem(
     """Return the problem of the train trials, with a model that suits them or a given one."""
     if given is None:
         options = suited(recording, vertices) | {"rest": "straight"}
-        return filmed_problem(recording, recording.train, views, options=options)
+        own = filmed_problem(recording, recording.train, views, options=options)
+        return _at_rest(own) if recording.still else own
     options = dict(given.options) | ({} if vertices is None else {"vertices": vertices})
     model = given.model(recording, **({} if vertices is None else {"vertices": vertices}))
     more: dict[str, Any] = {"effects": given.effects, "values": given.start(model), "fitted": tuple(given.sizes(model))}
-    return filmed_problem(recording, recording.train, views, options=options, **more)
+    own = filmed_problem(recording, recording.train, views, options=options, **more)
+    return _at_rest(own) if recording.still else own
+
+
+def _at_rest(own: FilmedProblem) -> FilmedProblem:
+    """Return the problem without what a rope at rest tells nothing of."""
+    return replace(own, free=tuple(k for k in own.free if own.model.parameters[k] != "damping_rate"))
 
 
 def _fitted(own: FilmedProblem, raw: np.ndarray, iterations: int, report: Callback) -> Fit:

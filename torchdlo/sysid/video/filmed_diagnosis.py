@@ -57,6 +57,13 @@ _SHORT = 0.6
 _SPINE = 0.15
 """What centre lines of masks get wrong [px], as measured on films of known motions."""
 
+_AT_REST = ("rest_curvature", "varying_rest_curvature", "tilted_gravity", "gripper_compliance")
+"""What a single photograph of a rope at rest may name."""
+
+_SAME_AT_REST = ("nonuniform_stiffness", "anisotropic_bending", "stiffening_bending")
+"""What no single photograph tells from natural curvature that varies: the moment B κ of any bending stiffness B along
+the rope is also B₀ (κ - κ̄) with κ̄ = κ (1 - B / B₀)."""
+
 _LEADERS = 3
 """Candidates that are fitted to all of the time."""
 
@@ -121,6 +128,8 @@ def diagnose_filmed(
             break
         names = [n for n in effect_library.library() if n not in (*base.own.model.effects, *without)]
         names = [n for n in names if effect_library.applicable(n, recording, base.own.model.mesh)]
+        if single := recording.still and len(recording.train) == 1:
+            names = [n for n in names if n in _AT_REST]
         found, candidates, rivals = _round(base, first, names, floor, level, plan, f"round {len(rounds) + 1}", report)
         rounds.append(candidates)
         if found is None:
@@ -128,7 +137,7 @@ def diagnose_filmed(
         name = found.own.model.effects[-1]
         excess = max(gap_rms(first.gaps("test")) ** 2 - floor.noise**2, 1e-12)
         shares[name] = (gap_rms(base.gaps("test")) ** 2 - gap_rms(found.gaps("test")) ** 2) / excess
-        ties[name] = rivals
+        ties[name] = [*rivals, *(_SAME_AT_REST if single and "curvature" in name else ())]
         base = found
     return _concluded(recording, first, base, floor, level, shares, ties, rounds, [*notes, *said], seed, budget, begun)
 
@@ -204,6 +213,8 @@ def _round(
     """Return the model with the best effect added, if one pays, all candidates, and effects that fit as well."""
     scores = _scores(base, names, lambda k, n: report(f"{stage}: screening", k, n, ""))
     tried, short = scores[: plan.candidates], _SHORT * base.own.lasts
+    if not tried:
+        return None, [], []
     lead = tried[0].name
     tried += [s for s in scores[plan.candidates :] if effect_library.confusable(s.name, lead)]
     fits: dict[str, _Model] = {}

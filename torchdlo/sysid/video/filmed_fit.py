@@ -10,12 +10,14 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+import torch
 
 from torchdlo.sysid.estimation import levenberg_marquardt
 from torchdlo.sysid.estimation.levenberg_marquardt import Point
 from torchdlo.sysid.estimation.model_uncertainty import CLAMP_SPREAD, radius_of_clamps, shear_share
-from torchdlo.sysid.estimation.observation import INDEPENDENT, SURE, Spines
-from torchdlo.sysid.video.filmed_problem import FilmedProblem
+from torchdlo.sysid.estimation.observation import INDEPENDENT, PER_CAMERA, Spines, seen_by
+from torchdlo.sysid.video.filmed_problem import STRETCHES, FilmedProblem
+from torchdlo.vision.spine import curve_vectors
 
 __all__ = ["Fit", "fit", "gate", "intervals", "look", "picture_errors", "spread", "total"]
 
@@ -147,6 +149,9 @@ def fit(
         tolerance: share of the cost that a step has to save for another one to be worth while.
     """
     now = look(own, raw, own.offset, seconds)
+    if own.trials[0].still and np.isfinite(now.costs).all():
+        own.weigh(now.residual)
+        now = look(own, raw, own.offset, seconds)
     damping = 1e-2
     for _ in range(iterations):
         if not np.isfinite(now.costs).any():
@@ -218,9 +223,7 @@ def gate(own: FilmedProblem, values: np.ndarray) -> int:
                 lost += len(bad)
                 own.dropped.setdefault(f"{trial.name}, camera {view.camera.name}", []).extend(bad.tolist())
     if lost:
-        free = np.ones(own.model.count, bool)
-        free[own.model.gripped] = False
-        own.spines = Spines(own.spines.views, own.model.dt, own.extent, free)
+        own.spines = Spines(own.spines.views, own.model.dt, own.extent, own.spines.free, own.spines.sure)
     return lost
 
 
@@ -244,7 +247,7 @@ def spread(own: FilmedProblem, found: Fit) -> tuple[Point, np.ndarray]:
     blocks = len(gradient)
     # Priors: a standard deviation of one coordinate, weighed as a few independent readings of each picture are.
     pictures = sum(float(v.good.sum()) for v in own.spines.views)
-    precision = SURE**2 / levenberg_marquardt.KNEE / (INDEPENDENT * pictures)
+    precision = own.spines.sure**2 / levenberg_marquardt.KNEE / (INDEPENDENT * pictures)
     prior = np.diag(np.concatenate([np.zeros(numbers), np.full(len(space.names) - numbers, precision)]))
     curvature = curvature + prior[None]
     gradient = gradient + found.raw * np.diag(prior)
@@ -283,7 +286,12 @@ def _difference(own: FilmedProblem, found: Fit, moved: Fit) -> tuple[np.ndarray,
 
 
 def _blocks(own: FilmedProblem, found: Fit) -> tuple[np.ndarray, np.ndarray]:
-    """Return gradients (E, N) and curvatures (E, N, N) of stretches of time of all trials, starts being eliminated."""
+    """Return gradients (E, N) and curvatures (E, N, N) of stretches of time of all trials, starts being eliminated.
+
+    Of ropes at rest they are of stretches along the rope.
+    """
+    if own.trials[0].still:
+        return _stretches(own, found)
     count, length = found.offset.shape[1], max(3, round(_BLOCK * own.spines.views[0].camera.fps))
     size, frames = found.raw.size, found.residual.shape[1]
     data = found.residual[:, :, : own.spines.priors.start]
@@ -306,6 +314,38 @@ def _blocks(own: FilmedProblem, found: Fit) -> tuple[np.ndarray, np.ndarray]:
             gradients.append(g[0, :size] - follow @ g[0, size:])
             reduced = np.concatenate([np.eye(size), -follow], 1)
             curvatures.append(reduced @ c[0] @ reduced.T)
+    return np.stack(gradients), np.stack(curvatures)
+
+
+def _stretches(own: FilmedProblem, found: Fit) -> tuple[np.ndarray, np.ndarray]:
+    """Return gradients (E, N) and curvatures (E, N, N) of stretches along ropes at rest."""
+    values = own.space.to_values(found.raw)[None]
+    places = torch.as_tensor(own.simulate(values), dtype=torch.float32)
+    spots = np.flatnonzero(own.spines.free)
+    parts = []
+    for k, view in enumerate(own.spines.views):
+        numbers = torch.as_tensor(values[:, len(own.free) :][:, PER_CAMERA * k :][:, :PER_CAMERA], dtype=torch.float32)
+        pixel = seen_by(view, places, numbers, own.spines.step)[0][0]
+        points = torch.as_tensor(view.places, dtype=torch.float32).nan_to_num(1e6)
+        along = curve_vectors(pixel, points)[1].numpy()
+        own_place = np.broadcast_to(spots, (*along.shape[:2], len(spots)))
+        parts.append(np.concatenate([np.repeat(along, 2, -1), own_place], -1))
+    share = np.concatenate(parts, -1) / (own.model.count - 1)
+    number = np.minimum((share * STRETCHES).astype(int), STRETCHES - 1)
+    gradients, curvatures = [], []
+    data = slice(0, own.spines.priors.start)
+    for b in range(len(found.residual)):
+        whole = np.isfinite(found.residual[b, :, data]).sum()
+        for k in range(STRETCHES):
+            residual = np.where(number[b] == k, found.residual[b, :, data], np.nan)
+            count = np.isfinite(residual).sum()
+            if not count:
+                continue
+            g, c = normal(
+                residual[None], found.jacobian[b : b + 1, :, :, data], found.offset[b : b + 1], own.prior[b : b + 1]
+            )
+            gradients.append(g[0] * count / whole * STRETCHES)
+            curvatures.append(c[0] * count / whole * STRETCHES)
     return np.stack(gradients), np.stack(curvatures)
 
 

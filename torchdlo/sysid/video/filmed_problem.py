@@ -18,7 +18,18 @@ from torchdlo.sysid.model.trial_batch import Start, TrialBatch
 from torchdlo.sysid.recordings.recording import Recording, Trial
 from torchdlo.sysid.recordings.trivial_predictors import catenary
 
-__all__ = ["FilmedProblem", "add_correction", "begin_from_balance", "filmed_problem", "keep_steps_only", "start_of"]
+__all__ = [
+    "STRETCHES",
+    "FilmedProblem",
+    "add_correction",
+    "begin_from_balance",
+    "filmed_problem",
+    "keep_steps_only",
+    "start_of",
+]
+
+STRETCHES = 14
+"""Stretches along a rope at rest, in each of which what a model gets wrong is one and the same error."""
 
 _CALM = 0.03
 """Speed of a gripper below which it is at rest [m/s]."""
@@ -63,7 +74,7 @@ class FilmedProblem:
     def prior(self) -> np.ndarray:
         """What half a squared standard deviation of a start costs [m], by trial, shape (B,)."""
         pictures = np.sum([v.good.sum(1) for v in self.spines.views], 0)
-        return SURE**2 / KNEE / (INDEPENDENT * np.maximum(pictures, 1))
+        return self.spines.sure**2 / KNEE / (INDEPENDENT * np.maximum(pictures, 1))
 
     def with_options(self, **options: Any) -> FilmedProblem:
         """Return the problem with a model that has other options."""
@@ -89,10 +100,20 @@ class FilmedProblem:
     def picked(self, rows: np.ndarray) -> FilmedProblem:
         """Return the problem with these trials, in their order, repeated as given."""
         views = [v.picked(rows) for v in self.spines.views]
-        spines = Spines(views, self.model.dt, self.extent, self.spines.free)
+        spines = Spines(views, self.model.dt, self.extent, self.spines.free, self.spines.sure)
         trials = tuple(self.trials[b] for b in rows)
         parts: dict[str, Any] = {"trials": trials, "motion": self.motion.pick(rows), "spines": spines}
         return replace(self, **parts, start=self.start.pick(rows), offset=self.offset[rows], dropped={})
+
+    def weigh(self, residual: np.ndarray) -> None:
+        """Take for what readings get wrong what a model of a rope at rest leaves of them (B, F, R) [m].
+
+        Neighbours along the rope have one and the same error of the model: cameras would be bent to take it up.
+        """
+        left = residual[..., : self.spines.priors.start]
+        square = KNEE * np.nanmean(left**2 * levenberg_marquardt.robust(left)[1]) * INDEPENDENT / STRETCHES
+        sure, old = max(SURE, float(np.sqrt(square))), self.spines
+        self.spines = Spines(old.views, old.step, old.extent, old.free, sure)
 
     def take(self, other: FilmedProblem) -> None:
         """Become another problem."""
@@ -189,7 +210,7 @@ def start_of(model: RopeModel, trials: Sequence[Trial], views: Sequence[FilmView
         speed = (shape[frames - 1] - shape[0]) / (trial.time[frames - 1] - trial.time[0])
         held = trial.markers[:frames, trial.gripped]
         quick = np.linalg.norm(held[-1] - held[0], axis=-1).max() / (trial.time[frames - 1] - trial.time[0])
-        calm = quick < _CALM and all(_unchanged(view, b) for view in views)
+        calm = trial.still or (quick < _CALM and all(_unchanged(view, b) for view in views))
         vel.append(0 * speed if calm else speed)
         still.append(calm)
     return Start(np.stack(pos), np.stack(vel), np.array(still))

@@ -10,7 +10,7 @@ import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -20,12 +20,16 @@ if TYPE_CHECKING:
     from torchdlo.sysid.recordings.recording import Trial
     from torchdlo.vision.camera import Camera
 
-__all__ = ["STATIONS", "FilmFile", "film_files", "with_stations"]
+__all__ = ["STATIONS", "FilmFile", "film_files", "held_still", "photographs", "with_stations"]
 
 STATIONS = 41
 """Places along a filmed rope that are compared with its films."""
 
-_SUFFIXES = (".mp4", ".mov", ".mkv", ".avi", ".webm", ".npz")
+_PHOTOGRAPHS = (".png", ".jpg", ".jpeg")
+_SUFFIXES = (".mp4", ".mov", ".mkv", ".avi", ".webm", *_PHOTOGRAPHS, ".npz")
+
+_STILL_FRAMES, _STILL_STEP = 5, 5e-3
+"""Frames of a simulated rope at rest, and the time between them [s]."""
 
 
 @dataclass(frozen=True)
@@ -36,6 +40,33 @@ class FilmFile:
     """The camera, as it was calibrated."""
     path: Path
     """Film, masks, or a folder of pictures."""
+
+
+def photographs(path: Path) -> list[Path]:
+    """Return the photographs beside trials of a recording folder."""
+    return sorted(f for f in path.glob("t*_*.*") if f.suffix.lower() in _PHOTOGRAPHS and f.is_file())
+
+
+def held_still(trial: Trial) -> Trial:
+    """Return a trial of one frame, a rope at rest, as one that lasts for a moment.
+
+    Raises:
+        InputError: It has a film that lasts, or one frame has been photographed of many.
+    """
+    still = len(trial.time) == 1
+    for film in trial.films:
+        photo = film.path.suffix.lower() in _PHOTOGRAPHS
+        if photo and not still:
+            raise InputError(
+                f"{film.path}: expected one frame in {trial.name}.npz beside a photograph, a rope at rest, found "
+                f"{len(trial.time)}."
+            )
+    if not still:
+        return trial
+    names = ("markers", "suspect", "gripper_quaternion", "wrench")
+    parts: dict[str, Any] = {n: getattr(trial, n) for n in names if getattr(trial, n) is not None}
+    repeated = {n: np.repeat(x, _STILL_FRAMES, 0) for n, x in parts.items()}
+    return replace(trial, time=_STILL_STEP * np.arange(_STILL_FRAMES), **repeated, still=True)
 
 
 def film_files(path: Path, trials: Sequence[str]) -> dict[str, tuple[FilmFile, ...]]:

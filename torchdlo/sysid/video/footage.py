@@ -6,14 +6,16 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
+import torch
 
 from torchdlo.errors import InputError
 from torchdlo.sysid.estimation.observation import FilmView
 from torchdlo.sysid.recordings.recording import Recording, Trial
 from torchdlo.sysid.video.films import FilmFile
+from torchdlo.vision.camera import lens, project
 from torchdlo.vision.mask_health import check_masks
 from torchdlo.vision.segment import Ranges, color_masks, load_film, load_ranges, ranges_of
-from torchdlo.vision.spine import half_width, spine
+from torchdlo.vision.spine import along, half_width, spine
 
 __all__ = ["RANGES", "masks_of", "views_of"]
 
@@ -25,6 +27,12 @@ SHOWN = 3
 
 _POINTS = 48
 """Points of a centre line."""
+
+_PHOTO_POINTS = 192
+"""Points of the centre line in a photograph."""
+
+_STRETCHES = 14
+"""Stretches of a rope, of which every other one is left out where there is one photograph only."""
 
 _STILL = 5e-4
 """Motion of a gripper between two pictures that shows [m]."""
@@ -113,6 +121,8 @@ def _reduced(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, float, np.ndarray, dict[int, np.ndarray]]:
     """Return good frames, centre lines with tangents, half width, packed masks and some pictures of a film."""
     masks, pictures, _ = masks_of(recording, film)
+    if trial.still:
+        return _photographed(trial, film, masks, pictures, notes)
     time = film.camera.start + np.arange(len(masks)) / film.camera.fps
     lasts = trial.time[-1]
     inside = (time > -0.75 / film.camera.fps) & (time < lasts + 0.25 / film.camera.fps)
@@ -144,7 +154,35 @@ def _reduced(
     places, tangents = (np.stack(part) for part in zip(*lines, strict=True))
     wide = float(np.median([half_width(m) for m in masks[good][::10]]))
     some = np.flatnonzero(good)[np.linspace(0, good.sum() - 1, SHOWN + 1).round().astype(int)[1:]]
-    shown = {
-        int(k): (255 - 160 * masks[k] if pictures is None else pictures[k].mean(-1)).astype(np.uint8) for k in some
-    }
-    return good, places, tangents, wide, np.packbits(masks.reshape(count, -1), axis=1), shown
+    return good, places, tangents, wide, np.packbits(masks.reshape(count, -1), axis=1), _shown(masks, pictures, some)
+
+
+def _shown(masks: np.ndarray, pictures: np.ndarray | None, some: Sequence[int]) -> dict[int, np.ndarray]:
+    """Return grey pictures of some frames."""
+    grey = {int(k): 255 - 160 * masks[k] if pictures is None else pictures[k].mean(-1) for k in some}
+    return {k: picture.astype(np.uint8) for k, picture in grey.items()}
+
+
+def _photographed(
+    trial: Trial, film: FilmFile, masks: np.ndarray, pictures: np.ndarray | None, notes: list[str]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, float, np.ndarray, dict[int, np.ndarray]]:
+    """Return what `_reduced` does of a photograph of a rope at rest, without the stretches that do not count."""
+    if len(masks) != 1:
+        raise InputError(f"{film.path}: expected one picture of a rope at rest, found {len(masks)}.")
+    good, issues = check_masks(masks, str(film.path), pictures=pictures)
+    notes += [f"{trial.name}, camera {film.camera.name}: {i.text}." for i in issues]
+    places, tangents = (x[None] for x in spine(masks[0], _PHOTO_POINTS))
+    known = np.isfinite(places[0]).all(1)
+    if known.sum() < 2 * _STRETCHES:
+        raise InputError(
+            f"{film.path}: expected a mask with the centre line of a rope, found one of {int(masks.sum())} pixels; set "
+            "the rope's colour with torchdlo segment, or hang a sheet of another colour behind it."
+        )
+    if trial.stretches != "all":
+        held = torch.as_tensor(trial.markers[0, trial.gripped][None])
+        start = project(lens([film.camera]), held)[0][0, 0].numpy()
+        far = along(places[0, known], start)
+        number = np.minimum((far / far.max() * _STRETCHES).astype(int), _STRETCHES - 1)
+        places[0, np.flatnonzero(known)[number % 2 == (trial.stretches == "even")]] = np.nan
+    wide = half_width(masks[0])
+    return good, places, tangents, wide, np.packbits(masks.reshape(1, -1), axis=1), _shown(masks, pictures, [0])
