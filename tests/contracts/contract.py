@@ -22,6 +22,7 @@ ACTIVE = {
     "bending_damping": {"coefficient": 1e-3},
     "bending_plasticity": {"yield_curvature": 0.5, "rate": 5.0},
     "rest_curvature": {"curvature": (0.8, -0.4)},
+    "varying_rest_curvature": {"c": (0.8, 0.3, 0.0, 0.2, 0.0, -0.4, 0.0, 0.1, 0.0, -0.2)},
     "nonuniform_stiffness": {"position": 0.4, "width": 0.2, "factor": 0.5, "slope": 0.3},
     "point_mass": {"position": 0.23, "mass": 0.1},
     "wind": {"velocity": (1.5, -0.7, 0.4), "c_d": 1.1},

@@ -299,16 +299,11 @@ def evaluate(
     from torchdlo.envs import find
 
     _quiet()
-    if len(policies) == 1 and policies[0].suffix == ".pt":
-        from torchdlo.agents.policies.chunk_policy import is_chunk_policy
-
-        if is_chunk_policy(policies[0]):
-            if film or execution:
-                raise InputError(
-                    f"{policies[0]}: it is a policy of learn; --film and --execution are for those of train."
-                )
-            _evaluate_seeing(policies[0], task or [], starts, protocol or ["varied"], out, as_json)
-            return
+    if len(policies) == 1 and _sees(policies[0]):
+        if film or execution:
+            raise InputError(f"{policies[0]}: it is a policy of learn; --film and --execution are for those of train.")
+        _evaluate_seeing(policies[0], task or [], starts, protocol or ["varied"], out, as_json)
+        return
     if task:
         raise InputError("--task: policies of train have one task of their own; leave it out.")
     names = protocol or ["one", "varied"]
@@ -352,6 +347,13 @@ def evaluate(
             typer.echo(f"film:    {file}", err=as_json)
     if as_json:
         typer.echo(content)
+
+
+def _sees(policy: Path) -> bool:
+    """Return whether a file holds a policy of learn."""
+    from torchdlo.agents.policies.chunk_policy import is_chunk_policy
+
+    return policy.suffix == ".pt" and is_chunk_policy(policy)
 
 
 def _evaluate_seeing(
