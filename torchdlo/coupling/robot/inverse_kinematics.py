@@ -131,7 +131,7 @@ class _End:
     slope: Tensor
     """How commanded joints change the tool's pose, rotations times `LEVER` [-, m], shape (B, 6, J)."""
     matrix: Tensor
-    """How the next Newton step follows the error [1], shape (B, J, 6)."""
+    """How the next Newton step follows the error [1/m or -], shape (B, J, 6)."""
 
 
 class _Answer(torch.autograd.Function):

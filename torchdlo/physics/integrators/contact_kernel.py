@@ -175,8 +175,9 @@ def _plan(
     sizes.tied = _Tied(points_at, *(ctypes.addressof(x) for x in joined))
     for name, array in zip(("after", "of", "steps", "order", "hardness", "law"), arrays, strict=True):
         setattr(sizes, name, ctypes.cast(array, ctypes.c_void_p))
-    shapes = ((3, v), (1, v), (count, 6), (1, 1), (3, v), (1, v), (3, v), (3, v), (count, 6), (1, 1))
-    shapes += ((points_at, 3), (points_at, 3), (count, 6))
+    before = (3, v), (1, v), (count, 6), (1, 1)
+    after = (3, v), (1, v), (3, v), (3, v), (count, 6), (1, 1)
+    shapes = *before, *after, (points_at, 3), (points_at, 3), (count, 6)
     return _Plan(batch, sizes, inputs, shapes, (lists, arrays, joined, pattern))
 
 
@@ -235,8 +236,8 @@ def _call(
         rows = [tuple((k, w) for k, w in enumerate(row) if w) for row in joints.weight.tolist()]
         tied = tuple(rows), tuple(row.index(1.0) if 1.0 in row else -1 for row in joints.on.tolist())
         given = joints.local, joints.arm, joints.force, joints.pos, joints.quat, joints.inertia, joints.omega
-        given = [x.expand(*batch, *x.shape[-2:]).reshape(math.prod(batch), -1) for x in given]
-        tensors.append(torch.cat(given, -1).contiguous())
+        wide = [x.expand(*batch, *x.shape[-2:]).reshape(math.prod(batch), -1) for x in given]
+        tensors.append(torch.cat(wide, -1).contiguous())
     plan = _plan(topology, batch, layouts, body, of.shape[-1], numbers, tries, tied)
     return _Call(plan, tensors, flat[4][0] if at else None)
 

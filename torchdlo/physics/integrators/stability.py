@@ -122,7 +122,6 @@ def limits(settings: Settings, rods: RodParams, values: dict[str, Values]) -> di
         found["stretching"] = (mass * length / material.stretch).amin().sqrt()
     if "twist" in names and settings.twist == "dynamic":
         found["twisting"] = (torch.where(real, material.inertia, torch.inf) * length / material.twist).amin().sqrt()
-    found |= _hanging(settings, rods, values)
     if "table" in names:
         found["table contact"] = 2 / values["table"]["hardness"].max()
-    return {name: float(value) for name, value in found.items()}
+    return {name: float(value) for name, value in found.items()} | _hanging(settings, rods, values)
