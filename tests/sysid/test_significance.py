@@ -12,7 +12,7 @@ from scipy import stats
 
 from tests.report.fake_diagnosis import BASELINE, fake_diagnosis, fitted
 from tests.sysid.swaying import recording as swaying
-from torchdlo.sysid.diagnosis.detection_limit import detection_limits, least_gap
+from torchdlo.sysid.diagnosis.detection_limit import detection_limits, least_gap, limit_gap
 from torchdlo.sysid.diagnosis.findings import findings, limits_text, mean_absolute_errors, summary
 from torchdlo.sysid.diagnosis.misleading_trials import errors_by_frame, misleading_trials
 from torchdlo.sysid.diagnosis.plausibility import implausible, unresolved
@@ -117,6 +117,14 @@ def test_damping_as_small_as_that_of_steps_is_not_told_from_it() -> None:
     # Steps of 5 ms damp with a twentieth of that, 0.25 ms.
     assert damping(1.1e-3) is None and "(0.7 ms, they 0.25 ms)" in damping(0.7e-3)
     assert unresolved(fitted(BASELINE), "air_drag", model) is None
+
+
+def test_there_is_a_limit_where_a_simulation_failed_or_no_floor_is_known() -> None:
+    gaps = np.array([3e-3, np.inf, 5e-3])
+    rest = float(np.sqrt(17e-6))
+    assert limit_gap(gaps, 1e-3, 2e-3, 0.15) == pytest.approx(least_gap(rest, 1e-3, 2e-3, 0.15))
+    assert limit_gap(gaps, 1e-3, np.inf, 0.15) == pytest.approx(least_gap(rest, 1e-3, 1e-3, 0.15))
+    assert not np.isfinite(limit_gap(np.array([np.inf]), 1e-3, 2e-3, 0.15))
 
 
 def test_detection_limits_grow_with_what_is_left() -> None:

@@ -248,9 +248,9 @@ def _limits(found: dict[str, Any]) -> str:
     if not rows:
         return ""
     note = (
-        "<p class=soft>From this size on (stretch and compliance of grippers: up to it) an effect closes more of the "
-        "gap than the floor leaves open, where it is placed or directed so that it shows best, and where it shows "
-        "least. By doses on the train trials, to first order: smaller ones may be there.</p>"
+        "<p class=soft>From this size on (stretch, compliance and damping of grippers: up to it) an effect closes more "
+        "of the gap than the floor leaves open, where it is placed or directed so that it shows best, and where it "
+        "shows least. By doses on the train trials, to first order: smaller ones may be there.</p>"
     )
     return note + table(("effect", "number", "at best", "at worst", "unit"), rows)
 

@@ -17,7 +17,7 @@ from torchdlo.physics.effects.parameter_name import ParameterName
 from torchdlo.sysid.diagnosis import effect_library
 from torchdlo.sysid.diagnosis.score_test import Score
 
-__all__ = ["DetectionLimit", "detection_limits", "least_gap"]
+__all__ = ["DetectionLimit", "detection_limits", "least_gap", "limit_gap"]
 
 
 @dataclass(frozen=True)
@@ -47,6 +47,17 @@ def least_gap(rest: float, noise: float, level: float, share: float) -> float:
         share: least share of the gap above noise that an effect has to close [1].
     """
     return float(np.sqrt(max(level**2, share / (1 - share) * max(rest**2 - noise**2, 0.0))))
+
+
+def limit_gap(gaps: np.ndarray, noise: float, level: float, share: float) -> float:
+    """Return `least_gap` for the gaps of the test trials (B,), also where a simulation failed or no floor is known.
+
+    Trials that no simulation gets through are left out; where finer simulations failed, noise is all that is known of
+    the floor, so that limits are lower ones.
+    """
+    ran = gaps[np.isfinite(gaps)]
+    rest = float(np.sqrt(np.mean(ran**2))) if len(ran) else float("inf")
+    return least_gap(rest, noise, level if np.isfinite(level) else noise, share)
 
 
 def detection_limits(scores: Sequence[Score], gap: float) -> list[DetectionLimit]:

@@ -23,7 +23,7 @@ from torchdlo.sysid.diagnosis import clamp_models, effect_library, selection
 from torchdlo.sysid.diagnosis.backward_elimination import EliminationResult, Revision
 from torchdlo.sysid.diagnosis.budget import BUDGETS, Budget
 from torchdlo.sysid.diagnosis.candidate_fits import extended_fits, short_frames
-from torchdlo.sysid.diagnosis.detection_limit import detection_limits, least_gap
+from torchdlo.sysid.diagnosis.detection_limit import detection_limits, limit_gap
 from torchdlo.sysid.diagnosis.error_floor import gap_rms, trial_gaps
 from torchdlo.sysid.diagnosis.misleading_trials import MisleadingTrial, errors_by_frame, misleading_trials
 from torchdlo.sysid.diagnosis.plausibility import implausible, unresolved
@@ -466,7 +466,7 @@ class _Search:
         rivals = {n: self.revision.known_without(final, n) or found.rivals[n] for n in effects}
         self.bench.predict([*rivals.values(), final])
         tests = {name: self._agreement(rival, final) for name, rival in rivals.items()}
-        limit = least_gap(gap_rms(self.bench.gaps(final, "test")), self.bench.floor.noise, self.bench.level, PAYS)
+        limit = limit_gap(self.bench.gaps(final, "test"), self.bench.floor.noise, self.bench.level, PAYS)
         said = [
             *baselines.baseline_notes(tree.part(self.baseline)),
             *clamp_models.clamp_notes(model, final),

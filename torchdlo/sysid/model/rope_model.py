@@ -375,7 +375,10 @@ class RopeModel:
         markers = self._run(own, begin, values[rows // trials], total, keep)
         if begin.discretisation_correction is not None:
             markers = markers + begin.discretisation_correction[:, :total]
-        return tuple(x.reshape(sets, trials, *x.shape[1:]) for x in (markers, wrench))
+        return (
+            markers.reshape(sets, trials, *markers.shape[1:]),
+            wrench.reshape(sets, trials, *wrench.shape[1:]),
+        )
 
     @torch.no_grad()
     def _run(
