@@ -110,14 +110,14 @@ def tidy(mask: np.ndarray, ranges: Ranges) -> np.ndarray:
     import cv2
 
     here = mask.astype(np.uint8)
+    if ranges.close > 1:
+        kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (ranges.close, ranges.close))
+        here = np.asarray(cv2.morphologyEx(here, cv2.MORPH_CLOSE, kernel), np.uint8)
     for left, top, right, bottom in ranges.ignore:
         (y0, y1), (x0, x1) = (
             (round(a * n), round(b * n)) for n, a, b in zip(mask.shape, (top, left), (bottom, right), strict=True)
         )
         here[y0:y1, x0:x1] = 0
-    if ranges.close > 1:
-        kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (ranges.close, ranges.close))
-        here = np.asarray(cv2.morphologyEx(here, cv2.MORPH_CLOSE, kernel), np.uint8)
     count, label, stats, _ = cv2.connectedComponentsWithStats(here, connectivity=8)
     if count <= 1:
         return here.astype(bool)

@@ -15,6 +15,7 @@ from torchdlo.physics.effects.material import (
     NonuniformStiffness,
     PointMass,
     RestCurvature,
+    StiffnessProfile,
     VaryingRestCurvature,
 )
 from torchdlo.physics.effects.measurement import MarkerOffset, TimeDelay
@@ -29,6 +30,7 @@ EFFECTS: dict[str, type[Effect]] = {
     "damping": Damping,
     "table": Table,
     "link_chain": LinkChain,
+    "stiffness_profile": StiffnessProfile,
     # Those that a diagnosis looks for, in the order in which it does.
     "air_drag": AirDrag,
     "wind": Wind,
@@ -68,6 +70,7 @@ __all__ = [
     "PointMass",
     "RestCurvature",
     "StiffeningBending",
+    "StiffnessProfile",
     "Stretch",
     "Table",
     "TableFriction",
