@@ -1,4 +1,4 @@
-"""Gradients of pictures, through rasteriser, camera and motion, are those of finite differences; a soft spot is found."""
+"""Gradients of pictures are those of finite differences, and a soft spot of the rope is found by them."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def filmed(tmp_path_factory: pytest.TempPathFactory) -> FilmedProblem:
     """A tenth of a second of the sample rope, as masks; read only."""
     out = tmp_path_factory.mktemp("gradient") / "rope"
     film_recording(
-        load_recording(SAMPLE), [view_of_sample(fps=60.0)], out, FilmLook(noise=0.0), masks=True, trials=1, seconds=0.12
+        load_recording(SAMPLE), [view_of_sample(fps=80.0)], out, FilmLook(noise=0.0), masks=True, trials=1, seconds=0.08
     )
     recording = load_recording(out)
     views, _ = views_of(recording, recording.train)
@@ -39,6 +39,7 @@ def test_the_gradient_is_that_of_finite_differences(filmed: FilmedProblem, resti
     begin = replace(filmed.start, still=np.full(1, resting))
     own = replace(filmed, start=begin, offset=np.zeros((1, 0)))
     numbers = torch.as_tensor(own.model.guess())
+    numbers[0] = 1e-2  # of a soft rope hardly anything shows so soon but what is rounded off
     cameras = torch.zeros(len(own.spines.nuisances.names), dtype=torch.float64)
     bend = torch.ones(len(own.model.arclength), dtype=torch.float64, requires_grad=True)
     loss = picture_loss(own, numbers, cameras, bend=bend)
@@ -47,7 +48,7 @@ def test_the_gradient_is_that_of_finite_differences(filmed: FilmedProblem, resti
     way = gradient / gradient.norm()
     errors = []
     with torch.no_grad():
-        for step in (1e-3, 3e-4, 1e-4):
+        for step in (3e-2, 1e-2):
             # Fourth order.
             ends = [picture_loss(own, numbers, cameras, bend=bend + k * step * way) for k in (-2, -1, 1, 2)]
             found = float((ends[0] - 8 * ends[1] + 8 * ends[2] - ends[3]) / (12 * step))

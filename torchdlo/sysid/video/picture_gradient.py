@@ -126,7 +126,7 @@ def picture_loss(
             good = np.flatnonzero(view.good[b])
             rows = good[np.unique(np.linspace(0, len(good) - 1, _FRAMES).round().astype(int))]
             near = depth[b, rows].clamp(min=NEAR)
-            wide = view.half_width * near.detach().median() / near
+            wide = view.half_width * near.median() / near
             shown = _shown(pixel[b, rows], view.places[b, rows]) & (near > NEAR)
             place = (pixel[b, rows] + 0.5) * scale - 0.5
             drawn = coverage(place, wide * scale, shown, successors([pixel.shape[-2]]), size)
