@@ -42,16 +42,15 @@ def test_the_gradient_is_that_of_finite_differences(filmed: FilmedProblem, resti
     numbers[0] = 1e-2  # of a soft rope hardly anything shows so soon but what is rounded off
     cameras = torch.zeros(len(own.spines.nuisances.names), dtype=torch.float64)
     bend = torch.ones(len(own.model.arclength), dtype=torch.float64, requires_grad=True)
-    loss = picture_loss(own, numbers, cameras, bend=bend)
+    loss = picture_loss(own, numbers, cameras, bend=bend, converged=True)
     (gradient,) = torch.autograd.grad(loss, bend)
     assert gradient.isfinite().all() and (gradient != 0).sum() > 10
     way = gradient / gradient.norm()
     errors = []
     with torch.no_grad():
-        for step in (3e-2, 1e-2):
-            # Fourth order.
-            ends = [picture_loss(own, numbers, cameras, bend=bend + k * step * way) for k in (-2, -1, 1, 2)]
-            found = float((ends[0] - 8 * ends[1] + 8 * ends[2] - ends[3]) / (12 * step))
+        for step in (1e-5, 3e-6):  # larger ones move edges of tubes across pixels, where the loss has kinks
+            down, up = (picture_loss(own, numbers, cameras, bend=bend + k * way, converged=True) for k in (-step, step))
+            found = float(up - down) / (2 * step)
             errors.append(abs(found / float(gradient.norm()) - 1))
     assert min(errors) < 1e-5, errors
 

@@ -8,6 +8,7 @@ Shanno's method with little memory (Liu and Nocedal 1989, doi:10.1007/BF01589116
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 
 import numpy as np
@@ -32,6 +33,9 @@ Callback = Callable[[str, int, int, str], None]
 PROFILE = "stiffness_profile"
 """The effect whose numbers are the stiffness along the rope."""
 
+_MANY = 12
+"""Iterations after which nothing changes."""
+
 _SEGMENT = 10
 """Steps that are run again together."""
 
@@ -51,25 +55,28 @@ _ROUGH = 0.3
 """Standard deviation of the change of a logarithm of stiffness from one place to the next one."""
 
 
-def simulated(own: FilmedProblem, numbers: Tensor, *, bend: Tensor | None = None, frames: int | None = None) -> Tensor:
+def simulated(own: FilmedProblem, numbers: Tensor, *, bend: Tensor | None = None, converged: bool = False) -> Tensor:
     """Return places of the rope [m], shape (B, T, M, 3), with gradients.
 
     Args:
         own: the problem, whose starts stay as they are.
         numbers: all of the model's, shape (K,).
         bend: factors of the bending stiffness by vertex, shape (V,); all 1 if not given.
-        frames: how many to simulate; all if not given.
+        converged: whether steps iterate until nothing changes. Gradients take that for granted; as fits do them, steps
+            end sooner, and gradients are wrong by about 5e-5 of their size.
     """
     model, motion = own.model, own.motion
     start = own.begin(own.offset[None]) if own.offset.shape[1] else own.start
     rows: Tensor = numbers.expand(len(own.trials), -1)
     scene, params, state = model.build(motion, start, rows)  # type: ignore[arg-type]  # tensors pass with gradients
+    if converged:
+        scene = dataclasses.replace(scene, constraint_iterations=None, twist_iterations=_MANY)
     if bend is not None:
         rods = params.rods
         material = tree.replace(rods.material, bend=rods.material.bend * bend[:, None])
         params = tree.replace(params, rods=tree.replace(rods, material=material))
     director = model._commands(scene, state, motion)
-    count = (frames or motion.markers.shape[1]) - 1
+    count = motion.markers.shape[1] - 1
     controls = [Control(motion.held[:, k], director[:, k]) for k in range(count * model.substeps + 1)]
     if start.at_rest.any():
         resting = _rest(scene, params, state, controls[0])
@@ -104,7 +111,13 @@ def _rest(scene: Scene, params: Params, state: State, control: Control) -> State
 
 
 def picture_loss(
-    own: FilmedProblem, numbers: Tensor, cameras: Tensor, *, bend: Tensor | None = None, scale: float = 0.5
+    own: FilmedProblem,
+    numbers: Tensor,
+    cameras: Tensor,
+    *,
+    bend: Tensor | None = None,
+    scale: float = 0.5,
+    converged: bool = False,
 ) -> Tensor:
     """Return what blurred masks of the rope differ by from those of the films, 1 for no rope at all; a scalar.
 
@@ -114,8 +127,9 @@ def picture_loss(
         cameras: what cameras are off, shape (Q,).
         bend: factors of the bending stiffness by vertex, see `simulated`.
         scale: size of the pictures that are compared over those of the films.
+        converged: see `simulated`.
     """
-    sims = simulated(own, numbers, bend=bend)
+    sims = simulated(own, numbers, bend=bend, converged=converged)
     parts = []
     for k, view in enumerate(own.spines.views):
         off = cameras[None, PER_CAMERA * k : PER_CAMERA * (k + 1)]
