@@ -2,9 +2,8 @@
 
 The folder holds `hanging_wires.npz` (traced centre lines, weights and the authors' fits) and the photographs
 black0.jpg, red0.jpg and white0.jpg, 1000 x 1333 pixels. A wire of 1.5 m hangs in a loop between two level clamps
-0.12 m apart. Its
-camera is made from the tracings, which are known in pixels and in metres; it is taken to look level at the wires from
-afar.
+0.12 m apart. Its camera is made from the tracings, which are known in pixels and in metres; it is taken to look level
+at the wires from afar.
 
     python experiments/hanging_wires.py FOLDER --out runs/wires
 """

@@ -30,6 +30,7 @@ STRONG = {
     "wind.c_d": 1.2,
     "bending_damping.coefficient": 2e-6,
     "rest_curvature.curvature.0": 3.0,
+    "varying_rest_curvature.modes.1": 3.0,
     "bending_plasticity.yield_curvature": 1e-3,
     "internal_friction.moment": 1e-3,
     "stiffening_bending.c": 0.1,

@@ -31,6 +31,8 @@ VALUES = {
     "bending_damping": {"coefficient": 2e-4},
     "bending_plasticity": {"yield_curvature": 0.8, "rate": 3.0, "hardening": 0.3},
     "rest_curvature": {"curvature": (0.7, -0.5)},
+    "varying_rest_curvature": {"modes": (0.2, 0.5, -0.3, 0.4, 0.1, -0.2, 0.3, 0.2, -0.4, 0.1)},
+    "stiffness_profile": {"factors": tuple(0.1 * (-1) ** k * (1 + k % 5) for k in range(16))},
     "nonuniform_stiffness": {"position": 0.4, "width": 0.2, "factor": 0.5, "slope": 0.3},
     "point_mass": {"position": 0.53, "mass": 0.1},
     "wind": {"velocity": (2.0, -1.0, 1.5), "c_d": 4.0},
@@ -80,7 +82,7 @@ CASES: dict[str, dict] = {
         "twist": "dynamic",
     },
     "explicit quasistatic": {
-        "effects": ["bend_frame", "twist", "gravity", "rest_curvature"],
+        "effects": ["bend_frame", "twist", "gravity", "rest_curvature", "varying_rest_curvature", "stiffness_profile"],
         "dt": 1e-3,
         "twist": "quasistatic",
     },

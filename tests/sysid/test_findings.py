@@ -112,7 +112,7 @@ def test_every_effect_has_a_law_with_its_numbers() -> None:
         assert EFFECTS[name].kind in MEANING
         # What is fitted is in the formula by its name, or is said in it in words.
         numbers = {n for n in EFFECTS[name].params if n not in effect_library.spec(name).fixed}
-        spoken = {"velocity": "velocity", "curvature": "κ̄", "offset": "offset", "c": "c κ³"}
+        spoken = {"velocity": "velocity", "curvature": "κ̄", "offset": "offset", "c": "c κ³", "modes": "modesₖ"}
         assert all(spoken.get(n, n) in law for n in numbers), (name, numbers)
 
 

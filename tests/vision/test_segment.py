@@ -10,7 +10,8 @@ import pytest
 
 from tests.vision.scenes import front, hanging
 from torchdlo.errors import InputError
-from torchdlo.vision.film import Film, FilmLook, film
+from torchdlo.vision.camera import looking_at
+from torchdlo.vision.film import Film, FilmLook, film, rope_coverage
 from torchdlo.vision.mask_health import check_masks
 from torchdlo.vision.segment import (
     Ranges,
@@ -18,6 +19,7 @@ from torchdlo.vision.segment import (
     color_masks,
     load_film,
     load_ranges,
+    matted,
     ranges_of,
     save_masks,
     save_ranges,
@@ -177,3 +179,24 @@ def test_films_that_cannot_be_read_are_refused(tmp_path: Path, make, message: st
     with pytest.raises(InputError, match=message) as caught:
         read_video(tmp_path / "x.mp4")
     assert str(tmp_path / "x.mp4") in str(caught.value)
+
+
+def test_edges_of_masks_are_where_half_a_pixel_is_covered(tmp_path: Path) -> None:
+    camera = looking_at("a", [0.0, -1.0, 0.0], [0.0, 0.0, 0.0], size=(320, 240), focal=400.0)
+    x = np.linspace(-0.3, 0.3, 61)
+    line = np.stack([x, 0 * x, 0.08 * np.sin(9 * x)], 1)
+    cover = rope_coverage(camera, line, 0.006)[..., None]
+    picture = (cover * np.array([25, 150, 60]) + (1 - cover) * np.array([196, 194, 190])).round().astype(np.uint8)
+    write_video(tmp_path / "film.mp4", np.stack([picture] * 6), 30.0)
+    stored, _ = read_video(tmp_path / "film.mp4")
+    found, true = color_masks(stored, ranges_of((25, 150, 60)))[-1], cover[..., 0] > 0.5
+    # Ranges of colours alone come to 0.9: the film has hue at half of its size.
+    assert (found & true).sum() / (found | true).sum() > 0.93
+    assert found.sum() == pytest.approx(true.sum(), rel=0.05)
+
+
+def test_a_mask_stays_where_there_is_no_contrast() -> None:
+    mask = np.zeros((40, 60), bool)
+    mask[15:22, 10:50] = True
+    assert (matted(np.full((40, 60, 3), 90, np.uint8), mask) == mask).all()
+    assert not matted(np.full((40, 60, 3), 90, np.uint8), mask & False).any()

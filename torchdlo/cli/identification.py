@@ -50,6 +50,14 @@ def calibrate(
         ),
     ] = "auto",
     model: ModelOption = None,
+    method: Annotated[
+        str,
+        typer.Option(
+            help="Of films: gradient fits the stiffness along the rope as well, by the gradient of masks through "
+            "rasteriser and physics; auto stays with few numbers, for which differences are quicker.",
+            metavar="auto|differences|gradient",
+        ),
+    ] = "auto",
     quick: Annotated[bool, typer.Option("--quick", help="A rough fit in a fraction of the time.")] = False,
     resume: Annotated[bool, typer.Option("--resume", help="Go on from the checkpoint beside the model file.")] = False,
 ) -> None:
@@ -84,7 +92,13 @@ def calibrate(
     options = {name: value for name, value in options.items() if value is not None} | _given(model)
     with at_work(out.parent, *_written(out)):
         result = _run_calibration(
-            loaded, seed=seed, rest=rest, checkpoint=out.with_name("checkpoint.json"), resume=resume, **options
+            loaded,
+            seed=seed,
+            rest=rest,
+            method=method,
+            checkpoint=out.with_name("checkpoint.json"),
+            resume=resume,
+            **options,
         )
         _write_outputs(result, loaded, recording, out, quiet=as_json)
     if as_json:

@@ -28,11 +28,19 @@ __all__ = [
     "color_masks",
     "load_film",
     "load_ranges",
+    "matted",
     "ranges_of",
     "save_masks",
     "save_ranges",
     "tidy",
 ]
+
+
+_MATTE = 15
+"""Side of the surroundings that colours within and outside of a mask are taken from [px]."""
+
+_CONTRAST = 30.0
+"""Least difference of the two, from 0 to 255."""
 
 
 @dataclass(frozen=True)
@@ -87,7 +95,44 @@ def color_masks(pictures: np.ndarray, ranges: Ranges) -> np.ndarray:
         for a, b in spans:
             lower, upper = (np.array([np.round(v) for v in ends]) for ends in ((a, *rest_low), (b, *rest_high)))
             found |= cv2.inRange(hsv, lower, upper)
-        out[k] = tidy(found > 0, ranges)
+        out[k] = tidy(matted(picture, tidy(found > 0, ranges)), ranges)
+    return out
+
+
+def matted(picture: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    """Return a mask (H, W) bool whose edge is where the rope covers half of a pixel.
+
+    Films store hue at half of their size: a range of colours puts the edge up to a pixel off. Next to it a picture is a
+    mixture of the colour within and that outside, which tells what is covered with all of the picture's sharpness.
+
+    Args:
+        picture: RGB (H, W, 3) uint8.
+        mask: the pixels whose colour is the rope's, (H, W) bool.
+    """
+    import cv2
+
+    rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
+    if not len(rows):
+        return mask
+    cut = tuple(slice(max(0, k[0] - _MATTE), k[-1] + _MATTE + 1) for k in (rows, columns))
+    here, colors = mask[cut].astype(np.uint8), picture[cut].astype(np.float32)
+    within, grown = (step(here, np.ones((3, 3), np.uint8)) > 0 for step in (cv2.erode, cv2.dilate))
+    outside = cv2.dilate(here, np.ones((5, 5), np.uint8)) == 0
+
+    def usual(part: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the mean colour of a part around each pixel, and where there is any."""
+        weight, side = part.astype(np.float32), (_MATTE, _MATTE)
+        count = cv2.boxFilter(weight, -1, side, normalize=False)
+        color = cv2.boxFilter(colors * weight[..., None], -1, side, normalize=False)
+        return color / np.maximum(count, 1.0)[..., None], count > 0.5
+
+    (rope, near), (ground, far) = usual(within), usual(outside)
+    way = rope - ground
+    square = (way**2).sum(-1)
+    share = ((colors - ground) * way).sum(-1) / np.maximum(square, 1.0)
+    out = mask.copy()
+    # Where a rope is so thin that nothing is within, its colour is not known.
+    out[cut] = np.where(grown & near & far & (square > _CONTRAST**2), share > 0.5, mask[cut])
     return out
 
 
@@ -110,14 +155,14 @@ def tidy(mask: np.ndarray, ranges: Ranges) -> np.ndarray:
     import cv2
 
     here = mask.astype(np.uint8)
+    if ranges.close > 1:
+        kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (ranges.close, ranges.close))
+        here = np.asarray(cv2.morphologyEx(here, cv2.MORPH_CLOSE, kernel), np.uint8)
     for left, top, right, bottom in ranges.ignore:
         (y0, y1), (x0, x1) = (
             (round(a * n), round(b * n)) for n, a, b in zip(mask.shape, (top, left), (bottom, right), strict=True)
         )
         here[y0:y1, x0:x1] = 0
-    if ranges.close > 1:
-        kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (ranges.close, ranges.close))
-        here = np.asarray(cv2.morphologyEx(here, cv2.MORPH_CLOSE, kernel), np.uint8)
     count, label, stats, _ = cv2.connectedComponentsWithStats(here, connectivity=8)
     if count <= 1:
         return here.astype(bool)

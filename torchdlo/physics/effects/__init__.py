@@ -17,6 +17,7 @@ from torchdlo.physics.effects.material import (
     NonuniformStiffness,
     PointMass,
     RestCurvature,
+    StiffnessProfile,
     VaryingRestCurvature,
 )
 from torchdlo.physics.effects.measurement import MarkerOffset, TimeDelay
@@ -32,6 +33,7 @@ EFFECTS: dict[str, type[Effect]] = {
     "table": Table,
     "link_chain": LinkChain,
     "buoyancy": Buoyancy,
+    "stiffness_profile": StiffnessProfile,
     # Those that a diagnosis looks for, in the order in which it does.
     "air_drag": AirDrag,
     "wind": Wind,
@@ -78,6 +80,7 @@ __all__ = [
     "PointMass",
     "RestCurvature",
     "StiffeningBending",
+    "StiffnessProfile",
     "Stretch",
     "Table",
     "TableFriction",

@@ -64,15 +64,17 @@ class VaryingRestCurvature(Effect):
 
     name: ClassVar[str] = "varying_rest_curvature"
     kind: ClassVar[EffectKind] = "material"
-    equation: ClassVar[str] = "M = B (κ - Σ c_k P_k(2 s/L - 1)); P_k: Legendre's polynomials, fixed in the material"
+    equation: ClassVar[str] = "M = B (κ - κ̄), κ̄(s) = Σ modesₖ Pₖ(2 s/L - 1); Pₖ: Legendre's polynomials"
     frame_bending: ClassVar[bool] = True
     params: ClassVar[dict[str, Param]] = {
-        "c": Param((0.0,) * 10, -30.0, 30.0, "1/m", "linear", 0.0, "Five about the first director, then the second.")
+        "modes": Param(
+            (0.0,) * 10, -30.0, 30.0, "1/m", "linear", 0.0, "Five about the first director, five the second."
+        )
     }
     spec = RopeEffectSpec(
-        lambda s: [{f"c.{k}": 0.05 * s.curvature} for k in range(10)],
+        lambda s: [{f"modes.{k}": 0.05 * s.curvature} for k in range(10)],
         signed=True,
-        strength=("c",),
+        strength=("modes",),
         confusable=("rest_curvature", "nonuniform_stiffness", "gripper_compliance"),
         experiments={"nonuniform_stiffness": "lay it on a level table: what is bent there is natural curvature"},
         requires="rest",
@@ -87,7 +89,7 @@ class VaryingRestCurvature(Effect):
             # Bonnet's recursion.
             modes.append(((2 * n + 1) * x * modes[n] - n * modes[n - 1]) / (n + 1))
         basis = torch.cat(modes, -1)
-        curvature = torch.stack([(basis * values["c"][..., 5 * k : 5 * k + 5]).sum(-1) for k in (0, 1)], -1)
+        curvature = torch.stack([(basis * values["modes"][..., 5 * k : 5 * k + 5]).sum(-1) for k in (0, 1)], -1)
         hinge = hinge_length(topology, params.rest) * params.rest.hinge_mask
         rest = tree.replace(params.rest, curvature=params.rest.curvature + hinge * curvature)
         return tree.replace(params, rest=rest)
@@ -122,6 +124,26 @@ class NonuniformStiffness(Effect):
         scale = torch.exp(values["factor"] * spot) * (1 + values["slope"] * (at - 0.5))
         material = tree.replace(params.material, bend=params.material.bend * scale)
         return tree.replace(params, material=material)
+
+
+@dataclass(frozen=True)
+class StiffnessProfile(Effect):
+    """Bending stiffness that varies along the rope in any way: logarithms of factors at 16 places, linear between."""
+
+    name: ClassVar[str] = "stiffness_profile"
+    kind: ClassVar[EffectKind] = "material"
+    equation: ClassVar[str] = "B(s) = B exp(factors(s/L))"
+    params: ClassVar[dict[str, Param]] = {
+        "factors": Param((0.0,) * 16, -2.5, 2.5, "1", "linear", 0.0, "Logarithms of stiffness over the uniform one.")
+    }
+
+    def modify_material(self, topology: Topology, params: RodParams, values: Values) -> RodParams:
+        """Scale the bending stiffness of the hinges."""
+        s, length = arclength(params)
+        count = values["factors"].shape[-1]
+        near = (1 - ((count - 1) * s / length - torch.arange(count).to(s)).abs()).clamp(min=0.0)
+        scale = torch.exp((near * values["factors"]).sum(-1, keepdim=True))
+        return tree.replace(params, material=tree.replace(params.material, bend=params.material.bend * scale))
 
 
 @dataclass(frozen=True)

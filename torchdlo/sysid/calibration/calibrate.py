@@ -30,7 +30,7 @@ from torchdlo.sysid.model.trial_batch import Start, TrialBatch
 from torchdlo.sysid.recordings.metrics import average, mean_absolute_error
 from torchdlo.sysid.recordings.recording import Recording, Trial
 from torchdlo.sysid.recordings.wrench import check_forces, force_doubts
-from torchdlo.sysid.video.filmed import FILMED_STARTS, calibrate_filmed
+from torchdlo.sysid.video.filmed import FILMED_STARTS, METHODS, calibrate_filmed
 
 Callback = Callable[[str, int, int, str], None]
 """Called with stage, steps done, steps in all, and a word on how it goes."""
@@ -97,6 +97,7 @@ def calibrate(
     given: ModelFile | None = None,
     refined: bool = True,
     workers: int | None = 1,
+    method: str = "auto",
     callback: Callback | None = None,
 ) -> Calibration:
     """Fit the baseline model to the train trials and judge it on the test trials.
@@ -120,15 +121,22 @@ def calibrate(
         refined: whether to fit on with a finer mesh, and to find out what steps and mesh do to the numbers.
         workers: processes, one per core if None. More than one begin by importing the program's main module: a script
             that asks for them has to guard what it does by `if __name__ == "__main__":`.
+        method: of films: "gradient" to fit the stiffness along the rope by the gradient of masks; see
+            `calibrate_filmed`.
         callback: see `Callback`; it may raise KeyboardInterrupt, which ends the fit with the best so far.
 
     Raises:
         InputError: the recording cannot be calibrated with these options.
     """
+    if method not in METHODS or (method == "gradient" and not recording.filmed):
+        raise InputError(
+            f"{recording.path}: method: expected {', '.join(METHODS)}, and gradient for films only, found {method!r}."
+        )
     if recording.filmed:
         if rest == "given" or resume:
             raise InputError(f"{recording.path}: expected neither --rest given nor --resume for films.")
         options: dict[str, Any] = {"seed": seed, "vertices": vertices, "given": given, "callback": callback}
+        options |= {"method": method}
         return calibrate_filmed(recording, starts=min(starts, FILMED_STARTS), iterations=iterations, **options)
     begun = time.perf_counter()
     check_forces(recording)

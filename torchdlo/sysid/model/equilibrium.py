@@ -40,17 +40,27 @@ def come_to_rest(
         state: where they are.
         control: where the grippers stay.
     """
+    calm, calmed, count = settling(scene, params)
+    rest = tree.replace(state, rods=tree.replace(state.rods, vel=torch.zeros_like(state.rods.vel)))
+    rest = scenes.step(calm, calmed, rest, control)
+    step = recorded_step(calm, calmed, rest, control)
+    for _ in range(count - 1):
+        rest = step(calmed, rest, control)
+    return stopped(rest, state)
+
+
+def settling(scene: scenes.Scene, params: scenes.Params) -> tuple[scenes.Scene, scenes.Params, int]:
+    """Return the scene and its numbers while ropes come to rest, and how many steps that takes."""
     table = any(effect.name == "table" for effect in scene.effects)
     length, lasts = (_LYING_STEP, _LYING) if table else (_SETTLING_STEP, _SETTLING)
     calm = dataclasses.replace(scene, dt=length, substeps=1, numerical_damping=1.0)
     damping = dict(params.effects["damping"])
     damping["rate"] = torch.full_like(damping["rate"], _SETTLING_RATE)
-    calmed = tree.replace(params, effects=params.effects | {"damping": damping})
-    rest = tree.replace(state, rods=tree.replace(state.rods, vel=torch.zeros_like(state.rods.vel)))
-    rest = scenes.step(calm, calmed, rest, control)
-    step = recorded_step(calm, calmed, rest, control)
-    for _ in range(math.ceil(lasts / length) - 1):
-        rest = step(calmed, rest, control)
+    return calm, tree.replace(params, effects=params.effects | {"damping": damping}), math.ceil(lasts / length)
+
+
+def stopped(rest: scenes.State, state: scenes.State) -> scenes.State:
+    """Return a state that has come to rest, without what is left of its motion, at the time of another one."""
     zero = {name: torch.zeros_like(getattr(rest.rods, name)) for name in ("vel", "twist_rate")}
     return tree.replace(rest, rods=tree.replace(rest.rods, **zero), time=state.time)
 

@@ -57,12 +57,15 @@ _SHORT = 0.6
 _SPINE = 0.15
 """What centre lines of masks get wrong [px], as measured on films of known motions."""
 
-_AT_REST = ("rest_curvature", "varying_rest_curvature", "tilted_gravity", "gripper_compliance")
+_AT_REST = ("rest_curvature", "varying_rest_curvature", "gripper_compliance")
 """What a single photograph of a rope at rest may name."""
 
-_SAME_AT_REST = ("nonuniform_stiffness", "anisotropic_bending", "stiffening_bending")
+_SAME_AT_REST = ("nonuniform_stiffness", "anisotropic_bending", "stiffening_bending", "tilted_gravity")
 """What no single photograph tells from natural curvature that varies: the moment B κ of any bending stiffness B along
-the rope is also B₀ (κ - κ̄) with κ̄ = κ (1 - B / B₀)."""
+the rope is also B₀ (κ - κ̄) with κ̄ = κ (1 - B / B₀), and so is that of any other load."""
+
+_PATIENCE = 3
+"""Times as many steps of the fits that lead, of ropes at rest, whose natural curvature has ten numbers."""
 
 _LEADERS = 3
 """Candidates that are fitted to all of the time."""
@@ -224,7 +227,8 @@ def _round(
     order = sorted(fits, key=lambda n: fits[n].fit.cost)
     for name in order[:_LEADERS]:
         one = fits[name]
-        fits[name] = replace(one, fit=fit(one.own, one.fit.raw, plan.more))
+        more = plan.more * (_PATIENCE if base.own.trials[0].still else 1)
+        fits[name] = replace(one, fit=fit(one.own, one.fit.raw, more))
         report(f"{stage}: fitting on", 1, 1, f"{name} {1e3 * fits[name].fit.cost:.3f} mm")
     rival = replace(base, fit=fit(base.own, base.fit.raw, 3))
     led = sorted(order[:_LEADERS], key=lambda n: fits[n].fit.cost)
