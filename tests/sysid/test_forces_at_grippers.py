@@ -102,6 +102,7 @@ def test_grippers_exert_what_momentum_and_its_moment_take(tmp_path: Path, ends: 
     assert np.abs(torque - moment).max() < 0.02 * np.abs(moment).max()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("forces", [True, False])
 def test_forces_tell_mass_and_stiffness_by_themselves(rope: Recording, forces: bool) -> None:
     # rope.json has a mass that is 60 % too large. Without forces the stiffness is too large by as much. A start that is
