@@ -126,7 +126,7 @@ def _gap(result: Diagnosis, recording: Recording) -> dict[str, Any]:
     """Return the gap on the test trials and the floor."""
     floor, trials = result.floor, zip(recording.test, result.before, result.after, strict=True)
     if recording.filmed:
-        # Films have no markers but those at the grippers, which are given: noise is that of centre lines.
+        # Films have no markers but those at the grippers, which are given; noise is that of centre lines.
         return {
             "test_rmse_before_m": result.gaps[0],
             "test_rmse_after_m": result.gaps[1],
