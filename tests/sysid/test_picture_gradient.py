@@ -82,6 +82,7 @@ def test_a_soft_spot_is_found(tmp_path: Path) -> None:
     place = np.linspace(0, 1, 16)
     soft = -1.2 * np.exp(-0.5 * ((place - 0.4) / 0.1) ** 2)
     count = len(plain.free)
+    own.fixed[0] = 6e-3
     truth = np.concatenate([own.fixed[list(own.free)], np.zeros(len(own.spines.nuisances.names))])
     start = truth.copy()
     truth[count : count + 16] = soft

@@ -191,8 +191,8 @@ def save_trial(path: str | Path, trial: Trial) -> None:
 def _load_trial(path: Path, length: float, films: Mapping[str, tuple[FilmFile, ...]]) -> Trial:
     own = films.get(path.stem, ())
     arrays = rope_schema.read_trial(path, filmed=bool(own))
-    arrays = rope_schema.check_arrays(path, arrays, length, filmed=bool(own))
-    trial = Trial(name=path.stem, **arrays, films=own)
+    checked = rope_schema.check_arrays(path, arrays, length, filmed=bool(own))
+    trial = Trial(name=path.stem, **checked, films=own)
     return with_stations(held_still(trial), length) if own else trial
 
 

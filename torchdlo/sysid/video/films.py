@@ -65,7 +65,7 @@ def held_still(trial: Trial) -> Trial:
         return trial
     names = ("markers", "suspect", "gripper_quaternion")
     parts: dict[str, Any] = {n: getattr(trial, n) for n in names if getattr(trial, n) is not None}
-    repeated = {n: np.repeat(x, _STILL_FRAMES, 0) for n, x in parts.items()}
+    repeated: dict[str, Any] = {n: np.repeat(x, _STILL_FRAMES, 0) for n, x in parts.items()}
     return replace(trial, time=_STILL_STEP * np.arange(_STILL_FRAMES), **repeated, still=True)
 
 
