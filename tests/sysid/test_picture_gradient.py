@@ -92,9 +92,8 @@ def test_a_soft_spot_is_found(tmp_path: Path) -> None:
     drawn = drawn_masks(own, 0, sims[0], 0 * truth[len(own.free) :], frames, views[0].half_width, 0) > 0.5
     packed = np.packbits(drawn.reshape(len(drawn), -1), axis=1)
     own.spines.views = (replace(views[0], packed=(packed,)),)
-    raw = descend(own, own.space.to_raw(start), 12, lambda *said: print(said[3]))
+    raw = descend(own, own.space.to_raw(start), 12)
     found = own.space.to_values(raw)[count : count + 16]
-    print(found.round(2), soft.round(2))
     inside = (place > 0.1) & (place < 0.9)
     assert np.corrcoef(found[inside], soft[inside])[0, 1] > 0.8
     assert found[5:8].mean() < -0.4
