@@ -82,6 +82,7 @@ def test_a_soft_spot_is_found(tmp_path: Path) -> None:
     place = np.linspace(0, 1, 16)
     soft = -1.2 * np.exp(-0.5 * ((place - 0.4) / 0.1) ** 2)
     count = len(plain.free)
+    own.fixed[0] = 6e-3
     truth = np.concatenate([own.fixed[list(own.free)], np.zeros(len(own.spines.nuisances.names))])
     start = truth.copy()
     truth[count : count + 16] = soft
@@ -91,7 +92,7 @@ def test_a_soft_spot_is_found(tmp_path: Path) -> None:
     drawn = drawn_masks(own, 0, sims[0], 0 * truth[len(own.free) :], frames, views[0].half_width, 0) > 0.5
     packed = np.packbits(drawn.reshape(len(drawn), -1), axis=1)
     own.spines.views = (replace(views[0], packed=(packed,)),)
-    raw = descend(own, own.space.to_raw(start), 12, lambda *_: None)
+    raw = descend(own, own.space.to_raw(start), 12)
     found = own.space.to_values(raw)[count : count + 16]
     inside = (place > 0.1) & (place < 0.9)
     assert np.corrcoef(found[inside], soft[inside])[0, 1] > 0.8

@@ -195,7 +195,8 @@ def descend(own: FilmedProblem, raw: np.ndarray, iterations: int, callback: Call
         steps = torch.diff(x[profile]) if len(profile) > 1 else x[:0]
         # The mean of the profile is the uniform stiffness's.
         mean = x[profile].mean() if profile else x.new_zeros(())
-        return data + _PRIOR * 0.5 * (x[count:].square().sum() + steps.square().sum() + 100 * mean.square())
+        # In units of the prior: line searches take small numbers for none.
+        return data / _PRIOR + 0.5 * (x[count:].square().sum() + steps.square().sum() + 100 * mean.square())
 
     descent = torch.optim.LBFGS([x], max_iter=1, history_size=12, line_search_fn="strong_wolfe")
 
@@ -208,7 +209,7 @@ def descend(own: FilmedProblem, raw: np.ndarray, iterations: int, callback: Call
     best, before = x.detach().clone(), float("inf")
     for k in range(iterations):
         here = float(descent.step(closure).detach())  # what it was before the step
-        report("following the gradient of masks", k + 1, iterations, f"{here:.4f}")
+        report("following the gradient of masks", k + 1, iterations, f"{_PRIOR * here:.5f}")
         if not np.isfinite(here) or not torch.isfinite(x).all():
             break
         best = x.detach().clone()
