@@ -208,7 +208,7 @@ def descend(own: FilmedProblem, raw: np.ndarray, iterations: int, callback: Call
 
     best, before = x.detach().clone(), float("inf")
     for k in range(iterations):
-        here = float(descent.step(closure).detach())  # what it was before the step
+        here = float(descent.step(closure).detach())  # before the step
         report("following the gradient of masks", k + 1, iterations, f"{_PRIOR * here:.5f}")
         if not np.isfinite(here) or not torch.isfinite(x).all():
             break
