@@ -40,7 +40,10 @@ def replay(name: str, had: dict[str, Any], make: Callable[..., Any]) -> dict[str
     from torchdlo.untrusted import Entry
 
     choices = Entry(had["choices"], had["task"])
-    problem = make(had["task"], double=choices["double"].flag(), execution=execution_of(choices))
+    # Problems that are no tasks of TorchRL have neither.
+    how: dict[str, Any] = {"double": choices["double"].flag()} if "double" in choices else {}
+    how |= {"execution": execution_of(choices)} if "execution" in choices or "compiled" in choices else {}
+    problem = make(had["task"], **how)
     outcome, kept = problem.record(torch.as_tensor(had["actions"], dtype=torch.float64))
     now = plain_evaluation(outcome)
     row = {"search": name, "missed": kept.get("missed", "")}
