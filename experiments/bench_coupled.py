@@ -156,7 +156,7 @@ def chosen(text: str) -> list[str]:
 def cases(options: Any) -> list[Case]:
     """Return what is timed."""
     if options.smoke:
-        tiny = [Case(s, 2, FORWARD, execution="eager", workers=1, seconds=0.01) for s in options.only]
+        tiny = [Case(s, 2, FORWARD, compiled=False, workers=1, seconds=0.01) for s in options.only]
         return [*tiny, replace(tiny[0], mode=BOTH)]
     scenes = [100] if options.quick else [int(n) for n in options.scenes.split(",")]
     only, dtypes = (["coiling"], ["float32"]) if options.quick else (options.only, options.dtypes.split(","))

@@ -260,14 +260,14 @@ def cases(quick: bool, smoke: bool, workers: int) -> list[Case]:
     """Return what is timed."""
     both = (FORWARD, BOTH)
     if smoke:
-        return [Case(2, 6, mode=m, execution="eager", seconds=0.01) for m in both]
+        return [Case(2, 6, mode=m, compiled=False, seconds=0.01) for m in both]
     if quick:
         found = [*(Case(100, mode=m, workers=workers) for m in both), Case(1), Case(1, integrator="implicit")]
         return [replace(case, seconds=0.3) for case in found]
     found = [Case(100, mode=m, workers=workers) for m in both]
     for dtype in ("float32", "float64"):
         found += [Case(n, dtype=dtype, mode=m) for n in (1, 10, 100, 1000) for m in both]
-        found += [Case(n, dtype=dtype, execution="eager", mode=m) for n in (1, 100) for m in both]
+        found += [Case(n, dtype=dtype, compiled=False, mode=m) for n in (1, 100) for m in both]
     found += [Case(n, integrator="implicit", mode=m) for n in (1, 100) for m in both]
     found += [Case(100, twist="dynamic", mode=m) for m in both]
     found += [Case(100, integrator="implicit", twist="quasistatic", mode=m) for m in both]

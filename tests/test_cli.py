@@ -83,7 +83,7 @@ def test_calibrate_writes_model_and_report(folder: Path, fit: FakeFit, capsys: p
     assert "runs/calibrate/rope/report.html" in said
     assert json.loads((out / "model.json").read_text())["vertices"] == 31
     asked = {"seed": 0, "rest": "auto", "checkpoint": out / "checkpoint.json", "resume": False, "workers": None}
-    assert fit.options == asked
+    assert fit.options == asked | {"method": "auto"}
 
 
 def test_calibrate_prints_json_and_nothing_else(folder: Path, fit: FakeFit, capsys: pytest.CaptureFixture[str]) -> None:
