@@ -96,7 +96,12 @@ def remember(task: str, actions: int, compiled: bool, go: Any, results: Any) -> 
     from torchdlo import envs
 
     torch.set_num_threads(1)
-    choices = {"gradients": True, "execution": "compiled" if compiled else "eager", "variation": False, "segment": SEGMENT}
+    choices = {
+        "gradients": True,
+        "execution": "compiled" if compiled else "eager",
+        "variation": False,
+        "segment": SEGMENT,
+    }
     env = envs.make(task, num_envs=10, **choices)
     stage_waypoints = [torch.full_like(env.action_spec.zero(), 1e-3).requires_grad_() for _ in range(actions)]
 

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
-from scipy.signal import savgol_filter
 
 from torchdlo.errors import InputError
 from torchdlo.physics.linalg import rotation
@@ -181,6 +180,8 @@ def _newton(force: np.ndarray, weight: np.ndarray) -> str:
 
 def _acceleration(trial: Trial) -> tuple[np.ndarray, np.ndarray]:
     """Return the acceleration of the rope's centre of mass [m/s^2], shape (F, 3), and where it is known, (F,) bool."""
+    from scipy.signal import savgol_filter
+
     step_along = np.diff(trial.marker_arclength)
     share = 0.5 * (np.append(step_along, 0.0) + np.append(0.0, step_along)) / step_along.sum()
     centre = (share[:, None] * trial.markers).sum(1)
