@@ -8,7 +8,7 @@ from pathlib import Path
 from torchdlo.files import write_atomically
 from torchdlo.report.pages.page import STYLE, listed, number, page, table, words
 from torchdlo.sysid.recordings.recording import save_trial
-from torchdlo.sysid.video.camera_placement import CameraDesign, Placement, camera_json, camera_summary
+from torchdlo.sysid.video.camera_placement import CameraDesign, CameraPlacement, camera_json, camera_summary
 from torchdlo.untrusted import for_html
 from torchdlo.vision.camera import save_cameras
 
@@ -33,7 +33,7 @@ def _heads(design: CameraDesign) -> tuple[str, ...]:
     return ("motion", "camera", *map(words, design.best.deviations), "mean")
 
 
-def _rows(placements: Sequence[Placement]) -> list[tuple[str, ...]]:
+def _rows(placements: Sequence[CameraPlacement]) -> list[tuple[str, ...]]:
     return [(p.moves, p.stands, *(number(d) for d in p.deviations.values()), number(p.score)) for p in placements]
 
 

@@ -40,7 +40,7 @@ def come_to_rest(
         state: where they are.
         control: where the grippers stay.
     """
-    calm, calmed, count = settling(scene, params)
+    calm, calmed, count = resting_scene(scene, params)
     rest = tree.replace(state, rods=tree.replace(state.rods, vel=torch.zeros_like(state.rods.vel)))
     rest = scenes.step(calm, calmed, rest, control)
     step = recorded_step(calm, calmed, rest, control)
@@ -49,7 +49,7 @@ def come_to_rest(
     return stopped(rest, state)
 
 
-def settling(scene: scenes.Scene, params: scenes.Params) -> tuple[scenes.Scene, scenes.Params, int]:
+def resting_scene(scene: scenes.Scene, params: scenes.Params) -> tuple[scenes.Scene, scenes.Params, int]:
     """Return the scene and its numbers while ropes come to rest, and how many steps that takes."""
     table = any(effect.name == "table" for effect in scene.effects)
     length, lasts = (_LYING_STEP, _LYING) if table else (_SETTLING_STEP, _SETTLING)

@@ -35,7 +35,7 @@ from torchdlo.vision.camera import NEAR, Camera, looking_at
 
 __all__ = [
     "CameraDesign",
-    "Placement",
+    "CameraPlacement",
     "camera_json",
     "camera_places",
     "camera_summary",
@@ -62,7 +62,7 @@ _UNKNOWN = math.log(10.0)
 
 
 @dataclass(frozen=True, eq=False)
-class Placement:
+class CameraPlacement:
     """A motion, the cameras that film it, and what they would tell."""
 
     motion: ExcitationMotion
@@ -87,11 +87,11 @@ class CameraDesign:
     """The films at hand."""
     values: dict[str, float]
     """Parameters that were taken for true."""
-    single: list[Placement]
+    single: list[CameraPlacement]
     """Motions with one camera, best first, each from its best place and those of the recording's cameras."""
-    added: list[Placement]
+    added: list[CameraPlacement]
     """The best motions with the recording's cameras and one more, best first."""
-    now: Placement | None
+    now: CameraPlacement | None
     """The best motion with the recording's cameras alone; None if they do not see it."""
     trial: Trial
     """The suggested motion, of the grippers."""
@@ -103,7 +103,7 @@ class CameraDesign:
     """Sentences that a reader should know."""
 
     @property
-    def best(self) -> Placement:
+    def best(self) -> CameraPlacement:
         """Return what is suggested for one camera."""
         return self.single[0]
 
@@ -209,9 +209,9 @@ def place_cameras(
     trials = [excitation_motions.motion_trial(rig, g, seconds, f"motion_{k}") for k, g in enumerate(motions)]
     space, sims = _varied(model, given, trials, report)
     around = _Surroundings(space, model, tuple(f.camera for f in recording.train[0].films))
-    single: list[Placement] = []
-    added: list[Placement] = []
-    now: list[Placement] = []
+    single: list[CameraPlacement] = []
+    added: list[CameraPlacement] = []
+    now: list[CameraPlacement] = []
     for k, (motion, trial) in enumerate(zip(motions, trials, strict=True)):
         report("placing cameras", k, len(motions), motion.kind)
         moves = motion_text(motion, *excitation_motions.largest_amplitude(rig, motion, seconds))
@@ -260,7 +260,7 @@ class _Surroundings:
 
     def placements(
         self, motion: ExcitationMotion, moves: str, rope: np.ndarray
-    ) -> tuple[list[Placement], list[Placement], list[Placement]]:
+    ) -> tuple[list[CameraPlacement], list[CameraPlacement], list[CameraPlacement]]:
         """Return what a motion tells one camera, the recording's with one more, and those alone.
 
         Args:
@@ -276,8 +276,8 @@ class _Surroundings:
         mine = [(c, information(c, rope, steps, dt, free)) for c in self.cameras]
         known = [(c, told) for c, told in mine if told is not None]
         own = [_judged(self.space, motion, moves, f"camera {c.name} as it stands", [(c, told)]) for c, told in known]
-        new: list[Placement] = []
-        more: list[Placement] = []
+        new: list[CameraPlacement] = []
+        more: list[CameraPlacement] = []
         for camera, where in camera_places(self.cameras[0], rope[0].reshape(-1, 3), lowest):
             told = information(camera, rope, steps, dt, free)
             if told is not None:
@@ -317,14 +317,14 @@ def _judged(
     moves: str,
     stands: str,
     told: Sequence[tuple[Camera, np.ndarray]],
-) -> Placement:
+) -> CameraPlacement:
     """Return what films of a motion by cameras are expected to tell, from what each tells."""
     prior = np.array([_UNKNOWN if p.scale == "log" else 3.0 for p in space.params]) ** -2.0
     spread = np.linalg.inv(np.sum([each for _, each in told], 0) + np.diag(prior))
     deviation = np.sqrt(np.diag(spread)) * space.units
     score = float(np.exp(0.5 * np.linalg.slogdet(spread)[1] / len(spread)))
     names = dict(zip(space.names, map(float, deviation), strict=True))
-    return Placement(motion, moves, tuple(c for c, _ in told), stands, names, score)
+    return CameraPlacement(motion, moves, tuple(c for c, _ in told), stands, names, score)
 
 
 def _of_grippers(trial: Trial) -> Trial:
@@ -354,7 +354,7 @@ def camera_summary(design: CameraDesign) -> str:
 def camera_json(design: CameraDesign) -> str:
     """Return the design as JSON text."""
 
-    def plain(placement: Placement) -> dict[str, Any]:
+    def plain(placement: CameraPlacement) -> dict[str, Any]:
         return {
             "message": placement.moves,
             "motion": vars(placement.motion),

@@ -100,7 +100,7 @@ def simulated(own: FilmedProblem, numbers: Tensor, *, bend: Tensor | None = None
 
 def _rest(scene: Scene, params: Params, state: State, control: Control) -> State:
     """Return the state in balance, with gradients; see `equilibrium.come_to_rest`."""
-    calm, calmed, count = equilibrium.settling(scene, params)
+    calm, calmed, count = equilibrium.resting_scene(scene, params)
     zero = torch.zeros_like(state.rods.vel)
     begun = tree.replace(state, rods=tree.replace(state.rods, vel=zero))
     steady = tree.stack([control] * count)
