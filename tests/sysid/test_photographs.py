@@ -133,8 +133,8 @@ def test_a_photograph_tells_the_bending_stiffness(made: Path) -> None:
     found = calibrate(load_recording(made), starts=8, vertices=41)
     stiffness = found.parameters["bending_stiffness"]
     assert "damping_rate" not in found.parameters
-    assert stiffness["low"] < BEND < stiffness["high"] < 1.5 * stiffness["low"]
-    assert abs(stiffness["value"] / BEND - 1) < 0.05
+    assert stiffness["low"] < BEND < stiffness["high"] < 2 * stiffness["low"]
+    assert abs(stiffness["value"] / BEND - 1) < 0.1
     assert found.test_mae_mm < 1.0
 
 

@@ -131,7 +131,7 @@ def baseline(
     # Balances are cheap, and stiff ropes have shapes that do not depend on how stiff they are.
     starts = max(starts, FILMED_STARTS) if recording.still else starts
     first = np.concatenate([own.fixed[list(own.free)], np.zeros(len(own.spines.nuisances.names))])
-    raw = own.space.to_raw(first) if given is not None else scout(own, starts, np.random.default_rng(seed), report)
+    raw = own.space.to_raw(first) if given is not None else _scouted(own, starts, seed, report)
     best = _fitted(own, raw, iterations, report)
     if not np.isfinite(best.cost):
         raise InputError(
@@ -139,6 +139,23 @@ def baseline(
             "cameras and marker_arclength."
         )
     return own, first, best
+
+
+def _scouted(own: FilmedProblem, starts: int, seed: int, report: Callback) -> np.ndarray:
+    """Return coordinates (N,) in the basin of the best fit; of ropes at rest with the clamps that fit better.
+
+    A rope that bends within clamps that hold it looks like a very stiff one at rest: a basin of its own.
+    """
+    raw = scout(own, starts, np.random.default_rng(seed), report)
+    if not (own.trials[0].still and own.model.mesh.clamps and "clamp_fraction" in own.options):
+        return raw
+    other = own.with_options(clamp_fraction=1.0 - own.model.clamp_fraction)
+    best = fit(own, raw, 6)
+    found = fit(other, scout(other, starts, np.random.default_rng(seed), report), 6)
+    if found.cost < best.cost:
+        own.take(other)
+        best = found
+    return best.raw
 
 
 def _by_gradient(
