@@ -67,8 +67,11 @@ the rope is also B₀ (κ - κ̄) with κ̄ = κ (1 - B / B₀), and so is that 
 _PATIENCE = 3
 """Times as many steps of the fits that lead, of ropes at rest, whose natural curvature has ten numbers."""
 
-_SIGNS, _KEPT = (1.0, -1.0), 2
+_SIGNS, _KEPT = (1.0, -1.0), 3
 """Directions in which doses are tried with cameras as they were calibrated, and fits that are followed further."""
+
+_AS_GOOD = 1.1
+"""Times what the best fit leaves on test trials up to which another one's numbers may be the true ones as well."""
 
 _LEADERS = 3
 """Candidates that are fitted to all of the time."""
@@ -82,6 +85,8 @@ class _Model:
     fit: Fit
     test: FilmedProblem
     """The same of the test trials."""
+    others: tuple[_Model, ...] = ()
+    """Where other starts ended."""
     _tested: np.ndarray | None = field(init=False, default=None)
 
     @property
@@ -295,10 +300,10 @@ def _fitted(base: _Model, score: Score, iterations: int, seconds: float) -> _Mod
         for dose, raw in score.starts:
             both = ({k: sign * v for k, v in dose.items()} for sign in _SIGNS)
             starts += [_upright(_dosed(base, score, each, raw)) for each in both]
-        for keep in (len(starts), _KEPT):
-            starts = [replace(s, fit=fit(s.own, s.fit.raw, iterations)) for s in starts[:keep]]
+        for keep, times in ((len(starts), 1), (_KEPT, _PATIENCE)):
+            starts = [replace(s, fit=fit(s.own, s.fit.raw, times * iterations)) for s in starts[:keep]]
             starts.sort(key=lambda s: total(s.fit))
-        return starts[0]
+        return replace(starts[0], others=tuple(starts[1:]))
     costs = []
     target = base.own.target(seconds)[..., None]
     for start in starts:
@@ -412,6 +417,9 @@ def _concluded(
     before, after = first.gaps("test"), final.gaps("test")
     effects = list(shares)
     point, drifts = spread(final.own, final.fit)
+    good = [m for m in final.others if gap_rms(m.gaps("test")) < _AS_GOOD * gap_rms(after)]
+    apart = [m.fit.raw - final.fit.raw for m in good]
+    drifts = np.concatenate([drifts, *(each[None] / np.sqrt(len(apart)) for each in apart)])
     predictions: dict[str, dict[str, np.ndarray]] = {"before": {}, "after": {}}
     shown = []
     for split in ("train", "test"):
