@@ -48,12 +48,12 @@ def test_a_bar_in_front_of_the_rope_is_found(behind_a_bar) -> None:
 
 def test_a_wrong_rope_hides_nothing(behind_a_bar) -> None:
     own, sims = behind_a_bar
-    assert not hidden_area(own, 0, sims + [0.0, 0.0, 0.05], np.zeros(8)).any()
+    assert not hidden_area(own, 0, sims + np.array([0.0, 0.0, 0.05]), np.zeros(8)).any()
 
 
 def test_rectangles_that_are_left_out_of_masks_are_hidden(behind_a_bar) -> None:
     own, sims = behind_a_bar
     file = own.model.recording.path / "segment.json"
     file.write_text(json.dumps({"hue": [100, 180], "ignore": [[0.0, 0.0, 0.25, 0.5]]}))
-    assert hidden_area(own, 0, sims + [0.0, 0.0, 0.05], np.zeros(8)).sum() == 160 * 240
+    assert hidden_area(own, 0, sims + np.array([0.0, 0.0, 0.05]), np.zeros(8)).sum() == 160 * 240
     file.unlink()
