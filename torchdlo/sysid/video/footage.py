@@ -35,7 +35,7 @@ _STRETCHES = 14
 """Stretches of a rope, of which every other one is left out where there is one photograph only."""
 
 _TOO_MUCH = 1.15
-"""Times its length from which what is seen is more than one rope: single ones showed 0.4 to 0.8 of it, two 0.7 to 1.6."""
+"""Times its length from which what is seen is more than one rope: one shows 0.4 to 0.8 of it, two 0.7 to 1.6."""
 
 _STILL = 5e-4
 """Motion of a gripper between two pictures that shows [m]."""
