@@ -99,17 +99,26 @@ class Workspace:
         frame_weights, self.level = found.frame_weights(free)
         frame_weights = self._discounted(frame_weights)
         start = replace(self.starts["all"], discretisation_correction=found.correction, frame_weights=frame_weights)
-        rows = np.arange(len(start.pos))
-        self.starts = {"all": start, "train": start.pick(rows[:train]), "test": start.pick(rows[train:])}
+        self._share(start)
         self._known.clear()
 
     def discount(self, frames: dict[str, int]) -> None:
         """Let train trials count up to a frame only, by their names, from now on."""
         self.discounted |= frames
         frame_weights = self._discounted(tree.part(self.starts["all"].frame_weights))
+        self._share(replace(self.starts["all"], frame_weights=frame_weights))
+
+    def _share(self, start: Start) -> None:
+        """Let trials begin here from now on; splits have as many frames as the longest of their own trials."""
         rows, train = np.arange(len(self.trials["all"])), len(self.trials["train"])
-        start = replace(self.starts["all"], frame_weights=frame_weights)
-        self.starts = {"all": start, "train": start.pick(rows[:train]), "test": start.pick(rows[train:])}
+        self.starts = {"all": start}
+        for split, part in (("train", rows[:train]), ("test", rows[train:])):
+            weights = tree.part(start.frame_weights)[part, : self._frames(split)]
+            self.starts[split] = replace(start.pick(part), frame_weights=weights)
+
+    def _frames(self, split: str) -> int:
+        """Return how many frames the longest trial of a split has."""
+        return max((len(t.time) for t in self.trials[split]), default=0)
 
     def _discounted(self, frame_weights: np.ndarray) -> np.ndarray:
         """Return what errors of frames count (B, F), nothing of what is discounted."""
@@ -156,7 +165,8 @@ class Workspace:
         """Return the simulated markers of the trials of a split, shape (B, F, M, 3)."""
         self.predict([fitted])
         first = len(self.trials["train"])
-        return self._known[_key(fitted)][{"train": slice(first), "test": slice(first, None), "all": slice(None)}[split]]
+        rows = {"train": slice(first), "test": slice(first, None), "all": slice(None)}[split]
+        return self._known[_key(fitted)][rows, : self._frames(split)]
 
     def gaps(self, fitted: Fitted, split: str) -> np.ndarray:
         """Return the gap of each trial of a split [m], frames weighted by what they tell."""
@@ -267,7 +277,10 @@ class Workspace:
         ((_, sims),) = self.pool.simulate([SimulationJob(fitted.effects, rows, "train", start, fitted.options)])
         frame_weights = 1.0 if start.frame_weights is None else start.frame_weights[..., None, None]
         measured = self.pool.local.motion(model, "train").markers
-        step, grid = (frame_weights * np.nan_to_num(e[: len(measured)]) for e in tree.part(self._finer).unsure)
+        step, grid = (
+            frame_weights * np.nan_to_num(e[: len(measured), : measured.shape[1]])
+            for e in tree.part(self._finer).unsure
+        )
         errors = (shares[0] * step, shares[1] * grid, *(frame_weights * np.nan_to_num(e) for e in others))
         return drift(look, frame_weights * sims, frame_weights * measured, errors)
 
