@@ -72,14 +72,21 @@ class Workspace:
 
     @cached_property
     def starts(self) -> dict[str, Start]:
-        """Where the trials of each split begin, and what their frames count."""
+        """Where the trials of each split begin, and what their frames count, as many as its longest trial has."""
         weights, rows, count = self._judged[0], np.arange(len(self.trials["all"])), len(self.trials["train"])
         if weights is not None:
             weights = weights.copy()
             for k, trial in enumerate(self.trials["train"]):
                 weights[k, self.discounted.get(trial.name, weights.shape[1]) :] = 0.0
-        start = replace(tree.part(self.start), frame_weights=weights)
-        return {"all": start, "train": start.pick(rows[:count]), "test": start.pick(rows[count:])}
+        found = {"all": replace(tree.part(self.start), frame_weights=weights)}
+        for split, part in (("train", rows[:count]), ("test", rows[count:])):
+            own = None if weights is None else weights[part, : self._frames(split)]
+            found[split] = replace(found["all"].pick(part), frame_weights=own)
+        return found
+
+    def _frames(self, split: str) -> int:
+        """Return how many frames the longest trial of a split has."""
+        return max((len(t.time) for t in self.trials[split]), default=0)
 
     @cached_property
     def floor(self) -> floors.ErrorFloor:
@@ -134,7 +141,8 @@ class Workspace:
         """Return the simulated markers of the trials of a split, shape (B, F, M, 3)."""
         (sims,) = self.predictions.of(self.pool, tree.part(self.start), [fitted])
         first = len(self.trials["train"])
-        return sims[{"train": slice(first), "test": slice(first, None), "all": slice(None)}[split]]
+        rows = {"train": slice(first), "test": slice(first, None), "all": slice(None)}[split]
+        return sims[rows, : self._frames(split)]
 
     def gaps(self, fitted: Fitted, split: str) -> np.ndarray:
         """Return the gap of each trial of a split [m], frames weighted by what they tell."""
@@ -245,7 +253,10 @@ class Workspace:
         ((_, sims),) = self.pool.simulate([SimulationJob(fitted.effects, rows, "train", start, fitted.options)])
         frame_weights = 1.0 if start.frame_weights is None else start.frame_weights[..., None, None]
         measured = self.pool.local.motion(model, "train").markers
-        step, grid = (frame_weights * np.nan_to_num(e[: len(measured)]) for e in tree.part(self.refinement).unsure)
+        step, grid = (
+            frame_weights * np.nan_to_num(e[: len(measured), : measured.shape[1]])
+            for e in tree.part(self.refinement).unsure
+        )
         errors = (shares[0] * step, shares[1] * grid, *(frame_weights * np.nan_to_num(e) for e in others))
         return drift(look, frame_weights * sims, frame_weights * measured, errors)
 
