@@ -184,7 +184,8 @@ def refine(pool: Pool, base: Fitted, start: Start, chain: str) -> Refinement:
         for options in ((half, discretisation_correction), (half,), ())
     ]
     sims = dict(pool.simulate(jobs))
-    found = refinement(sims[0][0], sims[1][0], sims[2][0], model.numerical_damping, edge)
+    fine, half_steps, as_it_is = (sims[k][0][..., : model.count, :] for k in range(3))
+    found = refinement(fine, half_steps, as_it_is, model.numerical_damping, edge)
     return replace(found, noise=marker_noise(pool.recording), links=length)
 
 

@@ -13,7 +13,7 @@ from torchdlo.physics.effects.parameter_name import ParameterName
 from torchdlo.sysid.diagnosis import error_floor as floors
 from torchdlo.sysid.diagnosis.score_test import Score
 from torchdlo.sysid.estimation.jobs import FitJob, Fitted, SimulationJob
-from torchdlo.sysid.estimation.levenberg_marquardt import PointEvaluation, cost_of, drift
+from torchdlo.sysid.estimation.levenberg_marquardt import PointEvaluation, cost_of, drift, extent
 from torchdlo.sysid.estimation.worker_pool import Pool, spread_jobs
 from torchdlo.sysid.model import initial_state as starts
 from torchdlo.sysid.model.trial_batch import Start
@@ -118,6 +118,10 @@ class Workspace:
             found[k, self.discounted.get(trial.name, found.shape[1]) :] = 0.0
         return found
 
+    def forget(self) -> None:
+        """Forget predictions that were made with other readings."""
+        self._known.clear()
+
     def predict(self, fits: Sequence[Fitted]) -> None:
         """Simulate all trials with several models at once, for `gaps` and `prediction` to look up."""
         new = [f for f in fits if _key(f) not in self._known]
@@ -132,7 +136,7 @@ class Workspace:
     def _mend(self, fitted: Fitted, sims: np.ndarray) -> None:
         """Simulate the trials in which the rope was torn apart once more, in finer steps, into (B, F, M, 3)."""
         model = self.pool.local.model(fitted.effects, fitted.options)
-        torn = np.flatnonzero(torn_apart(sims, model.mesh.marker_arclength))
+        torn = np.flatnonzero(torn_apart(sims[..., : model.count, :], model.mesh.marker_arclength))
         if not len(torn):
             return
         options = dict(fitted.options) | {"substep": model.dt / (_FINER * model.substeps)}
@@ -154,6 +158,10 @@ class Workspace:
 
     def prediction(self, fitted: Fitted, split: str) -> np.ndarray:
         """Return the simulated markers of the trials of a split, shape (B, F, M, 3)."""
+        return self.readings(fitted, split)[..., : len(self.recording.train[0].marker_arclength), :]
+
+    def readings(self, fitted: Fitted, split: str) -> np.ndarray:
+        """Return likewise what is simulated, with forces behind the markers where they count, shape (B, F, R, 3)."""
         self.predict([fitted])
         first = len(self.trials["train"])
         return self._known[_key(fitted)][{"train": slice(first), "test": slice(first, None), "all": slice(None)}[split]]
@@ -266,10 +274,15 @@ class Workspace:
         rows[:, [model.parameters.index(n) for n in fitted.space.names]] = look.values
         ((_, sims),) = self.pool.simulate([SimulationJob(fitted.effects, rows, "train", start, fitted.options)])
         frame_weights = 1.0 if start.frame_weights is None else start.frame_weights[..., None, None]
-        measured = self.pool.local.motion(model, "train").markers
-        step, grid = (frame_weights * np.nan_to_num(e[: len(measured)]) for e in tree.part(self._finer).unsure)
-        errors = (shares[0] * step, shares[1] * grid, *(frame_weights * np.nan_to_num(e) for e in others))
-        return drift(look, frame_weights * sims, frame_weights * measured, errors)
+        measured = self.pool.local.measured(model, "train")
+        step, grid = (e[: len(measured)] for e in tree.part(self._finer).unsure)
+        # What is wrong with forces is not known.
+        behind = ((0, 0), (0, 0), (0, measured.shape[2] - model.count), (0, 0))
+        errors = [
+            frame_weights * np.pad(np.nan_to_num(e), behind) for e in (shares[0] * step, shares[1] * grid, *others)
+        ]
+        whole = extent(frame_weights * measured[..., : model.count, :])
+        return drift(look, frame_weights * sims, frame_weights * measured, errors, whole)
 
     def fit(self, jobs: Sequence[FitJob]) -> list[Fitted]:
         """Return the results of fits in their order.
