@@ -82,14 +82,13 @@ def score_effects(
         report: called with the number of groups done and in all.
     """
     recording, model = pool.recording, pool.local.model(base.effects)
-    motion = pool.local.motion(model, "train")
+    measured = pool.local.measured(model, "train")
     known = dict(zip(model.parameters, base.values, strict=True))
-    curved = curvature_scale(motion.markers[:, :: max(1, motion.markers.shape[1] // 50)])
+    curved = curvature_scale(measured[:, :: max(1, measured.shape[1] // 50), : model.count])
     doses = {n: effect_library.perturbations(n, recording, model.mesh, curved, known) for n in names}
     groups, nudge = _groups(names, doses), base.space.nudges()
     jobs = [_job(pool, base, group, doses) for group in groups]
     jobs.append(SimulationJob(base.effects, _nudged(model, base, nudge)))
-    measured = pool.local.measured(model, "train")
     frames = min(max(10, int(_HORIZON * measured.shape[1])), measured.shape[1])
     jobs = [replace(job, start=start, frames=frames) for job in jobs]
     sims_of: dict[int, np.ndarray] = {}
