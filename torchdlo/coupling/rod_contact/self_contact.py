@@ -30,7 +30,7 @@ class SelfContact(Effect):
 
     name: ClassVar[str] = "self_contact"
     kind: ClassVar[EffectKind] = "force"
-    equation: ClassVar[str] = "parts of the rope stay 2 share r apart, and rub with mu N"
+    equation: ClassVar[str] = "parts of the rope stay 2 share r apart, and rub with mu N, mu = 0.3"
     is_contact: ClassVar[bool] = True
     engages: ClassVar[bool] = True
     params: ClassVar[dict[str, Param]] = {

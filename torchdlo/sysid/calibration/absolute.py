@@ -76,7 +76,7 @@ class ForceReadings:
         factors = [min(f, 1.0) for f in factors]
         target = self.target.copy()
         target[..., self.count :, :] *= np.repeat(factors, wrenches)[:, None]
-        worth = [None if m is None else m * f for m, f in zip(self.metres, (*factors, 1.0), strict=False)]
+        worth = [None if m is None else float(m * f) for m, f in zip(self.metres, (*factors, 1.0), strict=False)]
         return replace(self, target=target, metres=(worth[0] or 0.0, worth[1]))
 
 

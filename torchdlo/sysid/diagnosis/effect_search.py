@@ -20,7 +20,7 @@ from torchdlo.physics.effects.parameter_name import ParameterName, values_of
 from torchdlo.sysid.calibration.absolute import mass_note
 from torchdlo.sysid.diagnosis import baseline as baselines
 from torchdlo.sysid.diagnosis import budget as plan
-from torchdlo.sysid.diagnosis import clamp_models, effect_library, gripper_forces, selection
+from torchdlo.sysid.diagnosis import clamp_models, effect_library, error_floor, gripper_forces, selection
 from torchdlo.sysid.diagnosis.backward_elimination import EliminationResult, Revision
 from torchdlo.sysid.diagnosis.budget import BUDGETS, Budget
 from torchdlo.sysid.diagnosis.candidate_fits import extended_fits, short_frames
@@ -56,6 +56,9 @@ MUCH = 0.15
 
 MORE = 2.5
 """Times the floor that have to be left for another effect to be looked for: one of three times the floor leaves 3.2."""
+
+NOTHING_LEFT = "the floor leaves nothing that could be named"
+"""Why nothing is fitted where the baseline is as near the floor as it may be."""
 
 LEADERS = 2
 """Effects that are fitted further in each round, besides those that are nearly as good."""
@@ -246,6 +249,8 @@ class _Search:
             if s.name == clamp_models.NAME and clamp_models.may_be_stiff(self.bench, base)
         ]
         self.scores = self.scores or scores
+        if self._nothing_left(base):
+            return None, base, [Candidate(s.name, s.share, None, None, NOTHING_LEFT) for s in scores], []
         fits, led, rival, worst = self._fits(base, [*scores[: self.budget.candidates], *soft], stage)
         self.bench.predict([base, rival, *fits.values()])
         if lost := self._misleading([rival, *fits.values()]):
@@ -265,6 +270,12 @@ class _Search:
             self.bench.predict(list(more.values()))
             fits, led = fits | more, led + also
         return self._judged(scores, fits, sorted(led, key=lambda name: fits[name].point.cost), rival)
+
+    def _nothing_left(self, base: Fitted) -> bool:
+        """Return whether the gap is so near the floor that no effect could close enough of it to be named."""
+        noise = min(self.bench.floor.noise, error_floor.shown_noise(self.recording))
+        gaps = (gap_rms(self.bench.gaps(base, split)) for split in ("train", "test"))
+        return any(selection.nothing_can_matter(gap, noise, self.bench.level) for gap in gaps)
 
     def _fits(
         self, base: Fitted, scores: Sequence[Score], stage: str

@@ -32,9 +32,12 @@ class ErrorFloor:
 
 
 def marker_noise(recording: Recording) -> float:
-    """Return the noise of the markers [m]: as given, or what fourth differences in time say."""
-    if recording.marker_noise_std is not None:
-        return recording.marker_noise_std
+    """Return the noise of the markers [m]: as given, or as it shows."""
+    return shown_noise(recording) if recording.marker_noise_std is None else recording.marker_noise_std
+
+
+def shown_noise(recording: Recording) -> float:
+    """Return the noise of the markers [m] that fourth differences in time say; less than there is if it is coloured."""
     parts = []
     for trial in recording.train:
         fourth = np.diff(trial.markers[:, ~trial.gripped], n=4, axis=0)

@@ -17,7 +17,7 @@ _ALONG = 12.0
 _EVERY = 0.05
 """Time between the frames that are looked at [s]."""
 
-_MOST = 200
+_MOST = 100
 """Most points along the rope that are looked at."""
 
 
