@@ -403,7 +403,8 @@ def test_what_clamps_and_liquids_do_is_as_declared() -> None:
     q, spin = exponential(0.4 * about_z + np.zeros((3, 2, 4))), 3.0 * about_z + np.zeros((3, 2, 4))
     grips = np.zeros((3, 2, 1)), exponential(0.1 * about_z + np.zeros((3, 2, 1))), about_z + np.zeros((3, 2, 1))
     turn = laws.grip_moment(Laws([numbers, damped]), q, spin, grips, False)
-    np.testing.assert_allclose(turn[2, :, 0], [2.0 * 0.25, 2.0 * (0.3 + 0.1 * 2.0)], rtol=1e-12)
+    # The corner at the end of the play is rounded off within 0.005 rad: 5e-5 rad of it are left 0.25 rad beyond.
+    np.testing.assert_allclose(turn[2, :, 0], [2.0 * 0.25, 2.0 * (0.3 + 0.1 * 2.0)], rtol=5e-4)
     assert not turn[:, :, 1:].any() and np.abs(turn[:2]).max() < 1e-12
     # Along x at 2 m/s and across at 3 m/s: buoyancy, 1/2 rho c (2 r) v^2 across, 1/2 rho c (2 pi r) v^2 along.
     mesh, density = Mesh(10, 0.0, BEAM.length, False), 1000.0

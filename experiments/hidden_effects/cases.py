@@ -180,7 +180,7 @@ def dose(effect: str, scene: Scene, bend: float, x: Array) -> Dose:
         "gripper_compliance": (lambda d: {"stiffness": 30 * rope.bending / rope.length / d}, 20),
         "time_delay": (lambda d: {"delay": 0.006 * d}, 12),
         "marker_offset": (lambda d: {"offset.0": 0.002 * d * c, "offset.1": 0.002 * d * s}, 8),
-        "gripper_play": (lambda d: {"angle": 0.02 * d, "stiffness": 5.0}, 8),
+        "gripper_play": (lambda d: {"angle": 0.02 * d, "stiffness": 10.0}, 8),
         "gripper_damping": (lambda d: {"stiffness": 30 * rope.bending / rope.length / d, "loss_time": 0.1}, 20),
         "fluid_forces": (lambda d: {"across": d, "along": 0.02 * d, "added_mass": min(d, 1.0)}, 3),
         "attractor": (
