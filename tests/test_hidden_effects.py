@@ -392,3 +392,38 @@ def test_the_scripts_work_together(tmp_path: Path) -> None:
     assert "| nothing missing, said so | 1 of 1 | 100% |" in page
     assert json.loads((out / "score.json").read_text())["rows"][0]["right"] is True
     assert (out / "score.md").read_text() in page
+
+
+def test_what_clamps_and_liquids_do_is_as_declared() -> None:
+    # A clamp turned by 0.1 about z, a node by 0.4 and turning at 3 rad/s, while the clamp turns at 1 rad/s: 0.3 rad of
+    # turn, of which 0.05 is play, and 2 rad/s.
+    numbers = {"gripper_play.angle": 0.05, "gripper_play.stiffness": 2.0}
+    damped = {"gripper_damping.stiffness": 2.0, "gripper_damping.loss_time": 0.1}
+    about_z = np.array([0.0, 0.0, 1.0])[:, None, None]
+    q, spin = exponential(0.4 * about_z + np.zeros((3, 2, 4))), 3.0 * about_z + np.zeros((3, 2, 4))
+    grips = np.zeros((3, 2, 1)), exponential(0.1 * about_z + np.zeros((3, 2, 1))), about_z + np.zeros((3, 2, 1))
+    turn = laws.grip_moment(Laws([numbers, damped]), q, spin, grips, False)
+    # The corner at the end of the play is rounded off within 0.005 rad: 5e-5 rad of it are left 0.25 rad beyond.
+    np.testing.assert_allclose(turn[2, :, 0], [2.0 * 0.25, 2.0 * (0.3 + 0.1 * 2.0)], rtol=5e-4)
+    assert not turn[:, :, 1:].any() and np.abs(turn[:2]).max() < 1e-12
+    # Along x at 2 m/s and across at 3 m/s: buoyancy, 1/2 rho c (2 r) v^2 across, 1/2 rho c (2 pi r) v^2 along.
+    mesh, density = Mesh(10, 0.0, BEAM.length, False), 1000.0
+    numbers = {"fluid_forces.across": 1.1, "fluid_forces.along": 0.02, "fluid_forces.added_mass": 0.9}
+    wet, q = Laws([numbers], fluid=density), exponential(np.zeros((3, 1, 11)))
+    v = np.broadcast_to(np.array([2.0, 3.0, 0.0])[:, None, None], (3, 1, 11))
+    found = laws._fluid(wet, BEAM, mesh, np.zeros((3, 1, 11)), q, v).sum(-1)[:, 0]
+    r, whole = BEAM.radius, BEAM.length
+    drag = [-0.5 * density * 0.02 * 2 * np.pi * r * 4 * whole, -0.5 * density * 1.1 * 2 * r * 9 * whole]
+    np.testing.assert_allclose(found, [*drag, density * np.pi * r**2 * whole * GRAVITY], rtol=1e-12)
+    heavy = laws.added_inertia(wet, BEAM, mesh, q, v).sum(-1)[:, 0]
+    np.testing.assert_allclose(heavy, [0.0, 0.9 * density * np.pi * r**2 * whole * 3.0, 0.0], rtol=1e-12)
+
+
+def test_newer_effects_have_recordings_of_their_own() -> None:
+    newer = cases.subset("newer")
+    assert len({c.seed for c in newer}) == 3 and not {c.effects for c in newer} & {c.effects for c in cases.all_cases()}
+    (wet,) = {c.scene.fluid for c in newer if c.effects == ("fluid_forces",)}
+    rope = next(c.scene.rope for c in newer if c.effects == ("fluid_forces",))
+    assert wet * np.pi * rope.radius**2 * rope.length == pytest.approx(0.5 * rope.mass)
+    # What came before is as it was: seeds go by the places of numbers.
+    assert list(laws.PLAIN).index("baseline.damping") == 43

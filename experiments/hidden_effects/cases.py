@@ -21,7 +21,20 @@ ABSORBED = {"baseline.bending": 1.05, "baseline.twisting": 1.3, "baseline.dampin
 
 MEASUREMENT = ("time_delay", "marker_offset")
 """Effects of the measurement, not of the rope."""
-PARTS = ("first", "ci", "singles", "nulls", "compounds", "outside", "ties", "all", "fresh", "links", "mismatch")
+PARTS = (
+    "first",
+    "ci",
+    "singles",
+    "nulls",
+    "compounds",
+    "outside",
+    "ties",
+    "all",
+    "fresh",
+    "links",
+    "mismatch",
+    "newer",
+)
 """Parts of the benchmark; what is fresh, made of links, or differs only in how it is made is not in all."""
 MISMATCH = (
     ("implicit", "links"),
@@ -39,6 +52,10 @@ MISMATCH = (
     ("", ""),
 )
 """Kinds of recordings that hide nothing but differ in how they are made, and what they are made with."""
+NEWER = ("gripper_play", "gripper_damping", "fluid_forces")
+"""Effects of the library that came later."""
+LIGHTER = 0.5
+"""Share of a rope's weight that a liquid carries."""
 REPEATS = 5
 """Recordings of each of these kinds."""
 LINKS = (40, 61)
@@ -93,13 +110,16 @@ class Case:
     def scene(self) -> Scene:
         """Its rope and motions."""
         has, held = set(self.effects), None
-        if {"gripper_compliance", "backlash"} & has:
+        if {"gripper_compliance", "backlash", "gripper_play", "gripper_damping"} & has:
             held = 2
-        elif {"attractor", "stretch", "air_drag", "wind"} & has:
+        elif {"attractor", "stretch", "air_drag", "wind", "fluid_forces"} & has:
             held = 1
         pace = 0.4 if self.variant == "slow" else 1.25 if "air_drag" in has else 1.0
         table = "table_friction" in has or self.variant == "table"
         scene = draw(self.seed, table=table, grippers=held, pace=pace)
+        if "fluid_forces" in has:
+            rope = scene.rope
+            scene = replace(scene, fluid=LIGHTER * rope.mass / (rope.length * np.pi * rope.radius**2))
         if self.simulator == "links":
             # A clamp holds one link.
             count = int(np.random.default_rng([self.seed, 15]).integers(*LINKS))
@@ -160,6 +180,9 @@ def dose(effect: str, scene: Scene, bend: float, x: Array) -> Dose:
         "gripper_compliance": (lambda d: {"stiffness": 30 * rope.bending / rope.length / d}, 20),
         "time_delay": (lambda d: {"delay": 0.006 * d}, 12),
         "marker_offset": (lambda d: {"offset.0": 0.002 * d * c, "offset.1": 0.002 * d * s}, 8),
+        "gripper_play": (lambda d: {"angle": 0.02 * d, "stiffness": 10.0}, 8),
+        "gripper_damping": (lambda d: {"stiffness": 30 * rope.bending / rope.length / d, "loss_time": 0.1}, 20),
+        "fluid_forces": (lambda d: {"across": d, "along": 0.02 * d, "added_mass": min(d, 1.0)}, 3),
         "attractor": (
             lambda d: (
                 {"strength": 4e-4 * weight * d, "position": rope.length * (1.0 if scene.grippers == 1 else 0.5)}
@@ -268,6 +291,8 @@ def subset(name: str) -> list[Case]:
         return other_cases(600, ("", "grid", "coloured", "table"), PAIRS[::3], "")
     if name == "links":
         return other_cases(1100, ("", "", "coloured", "table"), PAIRS[1::3], "links")
+    if name == "newer":
+        return [Case("single", (e,), r, 2200 + k) for r in (10.0, 30.0, 3.0) for k, e in enumerate(NEWER)]
     if name == "mismatch":
         made = [(k, i, v, by) for i in range(REPEATS) for k, (v, by) in enumerate(MISMATCH)]
         return [Case("null", (), 0.0, 2000 + 10 * k + i, v, by) for k, i, v, by in made]

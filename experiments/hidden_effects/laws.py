@@ -66,6 +66,14 @@ PLAIN: dict[str, float] = {
     "baseline.bending": 1.0,
     "baseline.twisting": 1.0,
     "baseline.damping": 1.0,
+    # Of the library, behind the others as their places number them.
+    "gripper_play.angle": 0.0,
+    "gripper_play.stiffness": 1e3,
+    "gripper_damping.stiffness": 1e3,
+    "gripper_damping.loss_time": 0.0,
+    "fluid_forces.across": 0.0,
+    "fluid_forces.along": 0.0,
+    "fluid_forces.added_mass": 0.0,
 }
 """Numbers by law, and where they do nothing."""
 
@@ -75,7 +83,9 @@ SLIP = 5e-4
 """Speed at which friction on the table is three quarters of what it becomes [m/s]."""
 STOP = 1.0
 """Stiffness of what ends the play in a clamp [N m/rad]; it alone leaves 25 times the noise in r2b978eb9."""
-SOFT_CLAMP = ("gripper_compliance", "backlash")
+CORNER = 0.1
+"""Share of the play within which a spring that ends it is rounded off."""
+SOFT_CLAMP = ("gripper_compliance", "backlash", "gripper_play", "gripper_damping")
 
 
 @dataclass(frozen=True)
@@ -88,6 +98,8 @@ class Laws:
     """Height of a table [m]."""
     gravity: float = GRAVITY
     """Gravity [m/s^2]."""
+    fluid: float | None = None
+    """Density of the liquid around the rope [kg/m^3]."""
 
     @property
     def rows(self) -> int:
@@ -129,7 +141,8 @@ def _fit(a: Array, like: Array) -> Array:
 def elastic(given: Laws) -> Laws:
     """Return the laws without those that remember, for a rope that is only brought to rest."""
     past = ("internal_friction.moment", "bending_plasticity.yield_curvature")
-    return Laws([{k: v for k, v in row.items() if k not in past} for row in given.numbers], given.table, given.gravity)
+    kept = [{k: v for k, v in row.items() if k not in past} for row in given.numbers]
+    return Laws(kept, given.table, given.gravity, given.fluid)
 
 
 def loose(given: Laws) -> bool:
@@ -240,12 +253,37 @@ def force(given: Laws, rope: Rope, mesh: Mesh, weight: Array, x: Array, q: Array
             tangent = rotate(q, np.array([1.0, 0.0, 0.0]).reshape((3,) + (1,) * (x.ndim - 1)))
             normal = flow - tangent * dot(tangent, flow)
             out -= AIR * given.get(f"{law}.c_d") * rope.radius * mesh.share * norm(normal) * normal
+    if given.fluid is not None:
+        out += _fluid(given, rope, mesh, x, q, v)
     if given.table is not None:
         out += _table(given, rope, weight, x, v)
     for law, load in (("attractor", _attractor), ("wall", _wall), ("rotating_frame", _rotating)):
         if given.on(law):
             out += load(given, rope, mesh, weight, x, v)
     return out
+
+
+def _across(q: Array, v: Array) -> tuple[Array, Array]:
+    """Return vectors at the nodes (3, ..., B, N) across the rope and along it."""
+    tangent = rotate(q, np.array([1.0, 0.0, 0.0]).reshape((3,) + (1,) * (v.ndim - 1)))
+    along = tangent * dot(tangent, v)
+    return v - along, along
+
+
+def _fluid(given: Laws, rope: Rope, mesh: Mesh, x: Array, q: Array, v: Array) -> Array:
+    """Return what a liquid at rest does: buoyancy, drag across the rope, friction along it."""
+    share, (across, along) = given.fluid * rope.radius * mesh.share, _across(q, v)
+    out = -np.pi * rope.radius * share * _fit(_gravity(given), x)
+    out = out - given.get("fluid_forces.across") * share * norm(across) * across
+    return out - np.pi * given.get("fluid_forces.along") * share * norm(along) * along
+
+
+def added_inertia(given: Laws, rope: Rope, mesh: Mesh, q: Array, dv: Array) -> Array:
+    """Return what it takes to accelerate the liquid around the nodes by dv (3, ..., B, N) across the rope [N]."""
+    if not given.on("fluid_forces"):
+        return np.zeros_like(dv)
+    across, _ = _across(q, dv)
+    return given.get("fluid_forces.added_mass") * given.fluid * np.pi * rope.radius**2 * mesh.share * across
 
 
 def _gravity(given: Laws) -> Array:
@@ -296,15 +334,32 @@ def _rotating(given: Laws, rope: Rope, mesh: Mesh, weight: Array, x: Array, v: A
     return out
 
 
-def grip_moment(given: Laws, q: Array, turns: Array, both: bool) -> Array:
-    """Return the lack of moment (3, ..., B, N) [N m], in the nodes' frames, that springs of the clamps make."""
+def grip_moment(given: Laws, q: Array, spin: Array, grips: tuple[Array, Array, Array], both: bool) -> Array:
+    """Return the lack of moment (3, ..., B, N) [N m], in the nodes' frames, that springs of the clamps make.
+
+    Args:
+        given: the laws.
+        q: orientations of the nodes, (4, ..., B, N).
+        spin: their angular velocities, in their frames [rad/s], (3, ..., B, N).
+        grips: poses of the clamps, and their angular velocities in their frames.
+        both: whether there are two.
+    """
     out = np.zeros((3, *q.shape[1:]))
     spring, play = given.get("gripper_compliance.stiffness")[:, 0], given.get("backlash.angle")[:, 0]
     # What ends the play gives way: Newton's method misses a wall, and stops of 20 N m/rad.
     spring = np.where(play > 0, np.minimum(spring, STOP), spring)
+    corner = CORNER * given.get("gripper_play.angle")[:, 0]
+    play = np.maximum(play, given.get("gripper_play.angle")[:, 0])
+    for law in ("gripper_play", "gripper_damping"):
+        spring = np.minimum(spring, given.get(f"{law}.stiffness")[:, 0])
+    damper = spring * given.get("gripper_damping.loss_time")[:, 0]
     for k, node in enumerate((0, -1)[: 1 + both]):
-        grip = turns[:, None, :, k] if q.ndim == 4 else turns[..., k]
+        grip, turning = ((a[:, None, :, k] if q.ndim == 4 else a[..., k]) for a in grips[1:])
         angle = logarithm(multiply(conjugate(grip), q[..., node]))
         size = norm(angle)
-        out[..., node] = spring * np.maximum(size - play, 0.0) / size * angle
+        away = multiply(conjugate(q[..., node]), grip)
+        # Newton's method misses a sharp corner. Nothing is left of it where the rope is not turned.
+        beyond = 0.5 * (size + np.hypot(size - play, corner) - np.hypot(play, corner))
+        out[..., node] = spring * beyond / size * angle
+        out[..., node] += damper * (spin[..., node] - rotate(away, turning))
     return out

@@ -152,7 +152,7 @@ def write(folder: Path, scene: Scene, trials: list[dict]) -> None:
         "gravity": [0.0, 0.0, -9.81],
         "table_height": scene.table,
         "marker_noise_std": scene.noise,
-    }
+    } | ({} if scene.fluid is None else {"fluid_density": scene.fluid})
     (scratch / "rope.json").write_text(json.dumps(rope, indent=1) + "\n")
     for name, arrays in zip(TRIALS, trials, strict=True):
         np.savez_compressed(scratch / f"{name}.npz", **arrays)

@@ -39,6 +39,8 @@ class Scene:
     """Seed of the motions."""
     pace: float = 1.0
     """How fast the grippers move, relative to what is usual."""
+    fluid: float | None = None
+    """Density of the liquid around the rope [kg/m^3]."""
 
     @property
     def arclength(self) -> Array:
@@ -136,7 +138,7 @@ class Drive:
 def run(scene: Scene, trials: list[str], numbers: list[dict], elements: int, dt: float) -> tuple[Track, Mesh]:
     """Simulate trials, each with laws of its own, with steps of about `dt` [s]; time 0 is the first frame."""
     drive, mesh = Drive(scene, trials), scene.mesh(elements)
-    given = Laws(numbers, scene.table)
+    given = Laws(numbers, scene.table, fluid=scene.fluid)
     state = settle(scene.rope, mesh, given, drive)
     step = 1 / scene.rate / np.ceil(1 / scene.rate / dt - 1e-9)
     before = round(LEAD / step)  # whole steps, as LEAD is a multiple of all frames' lengths

@@ -219,6 +219,7 @@ class Simulator:
         inner, turn = out[:3], out[3:]
         # Balance: mass times acceleration minus all loads; the elements' force and moment act on both their nodes.
         inner += self.weight * dv[:3] - laws.force(self.laws, rope, self.mesh, self.weight, x, q, v[:3], time)
+        inner += laws.added_inertia(self.laws, rope, self.mesh, q, dv[:3])
         inner[..., :-1] -= force
         inner[..., 1:] += force
         turn[..., :-1] -= moment + lever
@@ -226,7 +227,7 @@ class Simulator:
         inner[:] = back(q0, inner)
         turn[:] = back(q, turn) + self.inertia.reshape(3, *(1,) * (x.ndim - 2), -1) * (dv[3:] + rope.damping * spin)
         if laws.loose(self.laws):
-            turn += laws.grip_moment(self.laws, q, grips[1], self.mesh.both)
+            turn += laws.grip_moment(self.laws, q, spin, grips, self.mesh.both)
         return out * (self.free[:, None] if move.ndim == 4 else self.free)
 
     def factorise(self, state: State, move: Array, time: float, grips) -> None:

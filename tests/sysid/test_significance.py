@@ -12,6 +12,7 @@ from scipy import stats
 
 from tests.report.fake_diagnosis import BASELINE, fake_diagnosis, fitted
 from tests.sysid.swaying import recording as swaying
+from torchdlo.sysid.diagnosis import selection
 from torchdlo.sysid.diagnosis.detection_limit import detection_limits, least_gap, limit_gap
 from torchdlo.sysid.diagnosis.findings import findings, limits_text, mean_absolute_errors, summary
 from torchdlo.sysid.diagnosis.misleading_trials import errors_by_frame, misleading_trials
@@ -222,3 +223,20 @@ def test_limits_are_said_in_one_sentence(rope: Recording) -> None:
     found = fake_diagnosis(rope, limits=detection_limits([score], 2e-3))
     assert limits_text(found).endswith("by place or direction: point mass (mass 0.004 kg).")
     assert limits_text(fake_diagnosis(rope)) == ""
+
+
+def test_where_nothing_can_matter_nothing_does() -> None:
+    # Whatever a fit closes, a tenth of the squared noise stays at least nine tenths of it.
+    rng = np.random.default_rng(0)
+    for _ in range(2000):
+        noise = 1e-3 * rng.uniform(0.1, 1.0)
+        level, before = noise * rng.uniform(1.0, 3.0), noise * rng.uniform(0.5, 5.0)
+        after = np.sqrt(0.9) * noise * rng.uniform(1.0, 1.5)
+        if selection.nothing_can_matter(before, noise, level):
+            assert not selection.matters(before, before, min(before, after), noise, level)
+    # Just above, it may; where no floor is known, nothing is said.
+    assert selection.matters(1.4e-3, 1.4e-3, 0.95e-3, 1e-3, 1e-3) and not selection.nothing_can_matter(
+        1.4e-3, 1e-3, 1e-3
+    )
+    assert selection.nothing_can_matter(1.3e-3, 1e-3, 1e-3)
+    assert not selection.nothing_can_matter(1.0, 1e-3, np.inf)

@@ -17,13 +17,13 @@ from torchdlo.physics import tree
 from torchdlo.sysid.diagnosis.error_floor import marker_noise
 from torchdlo.sysid.estimation import levenberg_marquardt
 from torchdlo.sysid.estimation.levenberg_marquardt import ParameterSpace, Point
-from torchdlo.sysid.model.grip_wrench import Grip, grips
+from torchdlo.sysid.model.grip_wrench import ForceWorth, Grip, grips, measured_wrench, packed
 from torchdlo.sysid.model.rope_model import RopeModel
 from torchdlo.sysid.model.trial_batch import Start, TrialBatch
 from torchdlo.sysid.recordings.recording import Recording, Trial
-from torchdlo.sysid.recordings.wrench import ForceSensor, world_wrench
+from torchdlo.sysid.recordings.wrench import ForceSensor
 
-__all__ = ["Absolute", "ForceReadings", "fit_absolute", "readings"]
+__all__ = ["Absolute", "ForceReadings", "fit_absolute", "mass_note", "readings", "weighed"]
 
 _LEAST_NOISE = 1e-4
 """Noise of markers that is assumed at least [m]."""
@@ -43,7 +43,7 @@ class ForceReadings:
     """The grippers."""
     target: np.ndarray
     """Markers, forces and torques as measured, in metres, NaN where not, shape (B, F, R, 3)."""
-    metres: tuple[float, float | None]
+    metres: ForceWorth
     """What a newton and a newton metre are worth [m/N, m/(N m)]; None: torques do not count."""
     count: int
     """Markers."""
@@ -52,8 +52,7 @@ class ForceReadings:
 
     def pack(self, markers: np.ndarray, wrench: np.ndarray) -> np.ndarray:
         """Return readings (..., R, 3) of markers (..., M, 3) and forces and torques (..., W, 6)."""
-        parts = [markers, self.metres[0] * wrench[..., :3]]
-        return np.concatenate(parts if self.metres[1] is None else [*parts, self.metres[1] * wrench[..., 3:]], -2)
+        return packed(markers, wrench, self.metres)
 
     def forces(self, packed: np.ndarray) -> np.ndarray:
         """Return the part of readings (..., R, 3) that are forces and torques."""
@@ -77,7 +76,7 @@ class ForceReadings:
         factors = [min(f, 1.0) for f in factors]
         target = self.target.copy()
         target[..., self.count :, :] *= np.repeat(factors, wrenches)[:, None]
-        worth = [None if m is None else m * f for m, f in zip(self.metres, (*factors, 1.0), strict=False)]
+        worth = [None if m is None else float(m * f) for m, f in zip(self.metres, (*factors, 1.0), strict=False)]
         return replace(self, target=target, metres=(worth[0] or 0.0, worth[1]))
 
 
@@ -103,13 +102,30 @@ def readings(model: RopeModel, trials: Sequence[Trial], motion: TrialBatch) -> F
     noise = max(marker_noise(recording), _LEAST_NOISE)
     torque = None if sensor.torque_noise_std is None else noise / sensor.torque_noise_std
     made = ForceReadings(found, motion.markers, (noise / sensor.force_noise_std, torque), model.count, noise)
-    wrench = np.full((*motion.markers.shape[:2], len(found), 6), np.nan)
-    for k, trial in enumerate(trials):
-        if trial.wrench is not None:
-            own = np.where(trial.suspect[:, None, None], np.nan, world_wrench(trial, sensor))
-            # The last frame's would be felt in a step that is not simulated any more.
-            wrench[k, : len(own) - 1] = own[:-1]
+    wrench = measured_wrench(trials, sensor, motion.markers.shape[1], len(found))
     return replace(made, target=made.pack(motion.markers, wrench))
+
+
+def weighed(
+    model: RopeModel, trials: Sequence[Trial], motion: TrialBatch, start: Start, values: dict[str, float]
+) -> tuple[ForceReadings, np.ndarray]:
+    """Return the forces of trials as readings, and first numbers (K,) of a model with a mass: as heavy as they say.
+
+    Args:
+        model: with the mass as a number.
+        trials: B trials.
+        motion: theirs.
+        start: where they begin.
+        values: numbers that the markers told.
+    """
+    known, first = readings(model, trials, motion), model.guess()
+    for name, value in values.items():
+        first[model.parameters.index(name)] = value
+    begun = known.pack(*model.with_forces(motion, start, first[None], known.grips))[0]
+    share = _heavier(known, begun)
+    for name in _WITH_MASS:
+        first[model.parameters.index(name)] *= share
+    return known.scaled(begun, share, ~trials[0].gripped), first
 
 
 def fit_absolute(
@@ -137,10 +153,10 @@ def fit_absolute(
     values, space, drifts = fitted
     model = RopeModel(recording, effects=effects, **(options | {"forces": True}))
     motion = model.motion(trials)
-    known = readings(model, trials, motion)
     plain = RopeModel(recording, effects=effects, **options).parameters
-    first = model.guess()
-    first[[model.parameters.index(name) for name in plain]] = values
+    report(0, iterations + 2, "")
+    known, first = weighed(model, trials, motion, start, dict(zip(plain, values, strict=True)))
+    report(1, iterations + 2, f"{first[model.parameters.index('mass')]:.3g} kg")
     sizes = (*space.units, 1.0) if space.sizes else None
     whole = ParameterSpace((*space.names, "mass"), (*space.params, model.params[model.parameters.index("mass")]), sizes)
     columns = [model.parameters.index(name) for name in whole.names]
@@ -151,13 +167,6 @@ def fit_absolute(
         return known.pack(*model.with_forces(motion, start, rows, known.grips))
 
     extent = levenberg_marquardt.extent(motion.markers)
-    report(0, iterations + 2, "")
-    begun = simulate(first[None, columns])[0]
-    share = _heavier(known, begun)
-    known = known.scaled(begun, share, ~trials[0].gripped)
-    for name in _WITH_MASS:
-        first[model.parameters.index(name)] *= share
-    report(1, iterations + 2, f"{first[model.parameters.index('mass')]:.3g} kg")
     raws = whole.clip(whole.to_raw(first[columns]))[None]
     points = levenberg_marquardt.evaluate(simulate, known.target, whole, raws, extent)
     climbing = levenberg_marquardt.improve_points(
@@ -170,6 +179,14 @@ def fit_absolute(
     found[columns] = whole.to_values(points[0].raw)
     mass = float(found[model.parameters.index("mass")])
     return model, Absolute(found, whole, points[0], _drifts(drifts, whole, recording, mass))
+
+
+def mass_note(told: float, said: float) -> str:
+    """Return a sentence on the mass that forces told [kg], and that of rope.json."""
+    return (
+        f"Forces at the grippers say that the rope has {1e3 * told:.4g} g, rope.json {1e3 * said:.4g} g; "
+        "stiffnesses go with the first."
+    )
 
 
 def _usual(deviations: np.ndarray) -> float:

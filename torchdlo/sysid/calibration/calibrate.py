@@ -14,7 +14,7 @@ import numpy as np
 from torchdlo.errors import InputError
 from torchdlo.physics import tree
 from torchdlo.sysid.calibration import refinement
-from torchdlo.sysid.calibration.absolute import fit_absolute
+from torchdlo.sysid.calibration.absolute import fit_absolute, mass_note
 from torchdlo.sysid.diagnosis.error_floor import marker_noise
 from torchdlo.sysid.estimation import evaluation, levenberg_marquardt
 from torchdlo.sysid.estimation.checkpoint import Checkpoint
@@ -465,11 +465,7 @@ def _notes(recording: Recording, job: _Job, low: np.ndarray, high: np.ndarray) -
     if job.model.effects:
         notes.append(f"Effects of the given model: {', '.join(e.replace('_', ' ') for e in job.model.effects)}.")
     if job.weighed:
-        told = job.values[job.model.parameters.index("mass")]
-        notes.append(
-            f"Forces at the grippers say that the rope has {1e3 * told:.4g} g, rope.json {1e3 * recording.mass:.4g} g; "
-            "stiffnesses go with the first."
-        )
+        notes.append(mass_note(float(job.values[job.model.parameters.index("mass")]), recording.mass))
     else:
         notes.append("No forces were measured: stiffnesses are as right as the mass in rope.json, in proportion.")
     notes += force_doubts(recording)

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from torchdlo.coupling.rod_contact.self_contact import SelfContact
 from torchdlo.errors import InputError
 from torchdlo.physics.effects import EFFECTS
 from torchdlo.physics.effects.base import Effect, EffectKind, Param
@@ -19,6 +20,9 @@ from torchdlo.physics.effects.effect_spec import RopeEffectSpec, RopeScales
 from torchdlo.physics.effects.parameter_name import ParameterName
 from torchdlo.sysid.model.discretisation import Mesh
 from torchdlo.sysid.recordings.recording import Recording
+from torchdlo.sysid.recordings.self_approach import near_itself
+
+EFFECTS[SelfContact.name] = SelfContact  # it stands above `physics.effects`, as contact of ropes does
 
 PARAMETERS: dict[str, Param] = {
     "bending_stiffness": Param(1e-3, 1e-7, 1.0, "N m^2", "log", None, "Uniform bending stiffness EI."),
@@ -98,6 +102,9 @@ def check_known(what: str, name: str) -> None:
 
 def applicable(name: str, recording: Recording, mesh: Mesh) -> bool:
     """Return whether an effect can show in a recording."""
+    required = spec(name).requires
+    if required == "near_itself":
+        return near_itself(recording)
     here = {
         "table": recording.table_height is not None,
         "clamps": bool(mesh.clamp_hinges),
@@ -105,7 +112,7 @@ def applicable(name: str, recording: Recording, mesh: Mesh) -> bool:
         "rest": recording.still,
         None: True,
     }
-    return here[spec(name).requires]
+    return here[required]
 
 
 def instance(name: str, mesh: Mesh) -> Effect:

@@ -17,14 +17,16 @@ import numpy as np
 from torchdlo.errors import InputError
 from torchdlo.physics import tree
 from torchdlo.physics.effects.parameter_name import ParameterName, values_of
+from torchdlo.sysid.calibration.absolute import mass_note
 from torchdlo.sysid.diagnosis import baseline as baselines
 from torchdlo.sysid.diagnosis import budget as plan
-from torchdlo.sysid.diagnosis import clamp_models, effect_library, selection
+from torchdlo.sysid.diagnosis import clamp_models, effect_library, error_floor, gripper_forces, selection
 from torchdlo.sysid.diagnosis.backward_elimination import EliminationResult, Revision
 from torchdlo.sysid.diagnosis.budget import BUDGETS, Budget
 from torchdlo.sysid.diagnosis.candidate_fits import extended_fits, short_frames
 from torchdlo.sysid.diagnosis.detection_limit import detection_limits, limit_gap
 from torchdlo.sysid.diagnosis.error_floor import gap_rms, trial_gaps
+from torchdlo.sysid.diagnosis.gripper_forces import ForceErrors
 from torchdlo.sysid.diagnosis.misleading_trials import MisleadingTrial, errors_by_frame, misleading_trials
 from torchdlo.sysid.diagnosis.plausibility import implausible, unresolved
 from torchdlo.sysid.diagnosis.score_test import Score, score_effects
@@ -46,6 +48,7 @@ from torchdlo.sysid.estimation.worker_pool import Pool
 from torchdlo.sysid.model.model_file import ModelFile
 from torchdlo.sysid.recordings import data_quality
 from torchdlo.sysid.recordings.recording import Recording
+from torchdlo.sysid.recordings.wrench import check_forces, force_doubts
 from torchdlo.sysid.video.filmed_diagnosis import diagnose_filmed
 
 MUCH = 0.15
@@ -53,6 +56,9 @@ MUCH = 0.15
 
 MORE = 2.5
 """Times the floor that have to be left for another effect to be looked for: one of three times the floor leaves 3.2."""
+
+NOTHING_LEFT = "the floor leaves nothing that could be named"
+"""Why nothing is fitted where the baseline is as near the floor as it may be."""
 
 LEADERS = 2
 """Effects that are fitted further in each round, besides those that are nearly as good."""
@@ -107,6 +113,7 @@ def diagnose(
         most = plan.pick_trials(recording, trials or BUDGETS[budget].trials)
         return diagnose_filmed(most, **asked, callback=callback)
     begun, report = time.perf_counter(), callback or (lambda *_: None)
+    check_forces(recording)
     recording, faults = data_quality.check(recording)
     whole = len(recording.train)
     recording = plan.pick_trials(recording, trials or BUDGETS[budget].trials)
@@ -136,6 +143,8 @@ class _Search:
         self.bench, self.recording = Workspace(pool), pool.recording
         """What is known by now."""
         self.baseline: Fitted | None = None
+        self.force_before: ForceErrors | None = None
+        """How far the baseline's forces at the grippers are off."""
         self.plain: list[Fitted] = []
         """The baseline, and what it became when it was fitted for as long as the first candidates were."""
         self._reductions: dict[Hashable, tuple[Hashable, Fitted]] = {}
@@ -165,6 +174,8 @@ class _Search:
             self.bench, base = baselines.calibrate_baseline(self.bench, count, most, self.rng, self.report)
         else:
             self.bench, base = baselines.go_on(self.bench, given, most, self.report)
+        self.bench, base = gripper_forces.take_forces(self.bench, base, most, self.report)
+        self.force_before = gripper_forces.force_errors(self.bench, base)
         self.baseline, self.before = base, self.bench.prediction(base, "all")
         self.plain.append(base)
         self._say_floor()
@@ -212,6 +223,7 @@ class _Search:
             return None
         self.bench, further = baselines.go_further(self.bench, base, self.budget.more, self.report)
         self.baseline, self.before = further, self.bench.prediction(further, "all")
+        self.force_before = gripper_forces.force_errors(self.bench, further)
         self.plain[:] = [further]
         return further
 
@@ -253,6 +265,8 @@ class _Search:
             if s.name == clamp_models.NAME and clamp_models.may_be_stiff(self.bench, base)
         ]
         self.scores = self.scores or scores
+        if self._nothing_left(base):
+            return None, base, [Candidate(s.name, s.share, None, None, NOTHING_LEFT) for s in scores], []
         fits, led, rival, worst = self._fits(base, [*scores[: self.budget.candidates], *soft], stage)
         self.bench.predict([base, rival, *fits.values()])
         if lost := self._misleading([rival, *fits.values()]):
@@ -272,6 +286,12 @@ class _Search:
             self.bench.predict(list(more.values()))
             fits, led = fits | more, led + also
         return self._judged(scores, fits, sorted(led, key=lambda name: fits[name].point.cost), rival)
+
+    def _nothing_left(self, base: Fitted) -> bool:
+        """Return whether the gap is so near the floor that no effect could close enough of it to be named."""
+        noise = min(self.bench.floor.noise, error_floor.shown_noise(self.recording))
+        gaps = (gap_rms(self.bench.gaps(base, split)) for split in ("train", "test"))
+        return any(selection.nothing_can_matter(gap, noise, self.bench.level) for gap in gaps)
 
     def _fits(
         self, base: Fitted, scores: Sequence[Score], stage: str
@@ -399,7 +419,7 @@ class _Search:
 
         Ranges are wider here than when effects were taken: they hold what the errors of steps and mesh may do.
         """
-        drifts = self.bench.drift(final)
+        drifts = self._drifts(final)
         while doubts := {n: why for n in found.shares if (why := implausible(final, n, drifts)) is not None}:
             name, why = next(iter(doubts.items()))
             said = next(c for each in rounds for c in each if c.name == name)
@@ -407,8 +427,12 @@ class _Search:
             final = self.revision.without(final, name)
             for kept in (found.shares, found.ties, found.rivals):
                 kept.pop(name, None)
-            drifts = self.bench.drift(final)
+            drifts = self._drifts(final)
         return final, drifts
+
+    def _drifts(self, fitted: Fitted) -> np.ndarray:
+        """Return what steps, mesh and a bias of forces may do to a fit's coordinates, shape (2 or 3, K)."""
+        return np.concatenate([self.bench.drift(fitted), gripper_forces.bias_drift(self.bench, fitted)])
 
     def _leaders(self, found: Sequence[Fitted], rival: Fitted) -> list[int]:
         """Return which of the fits to short trials are worth more work."""
@@ -487,6 +511,7 @@ class _Search:
             *baselines.baseline_notes(tree.part(self.baseline)),
             *clamp_models.clamp_notes(model, final),
             *self.bench.predictions.notes(),
+            *self._force_notes(final),
         ]
         predictions = {
             when: {t.name: sim[: len(t.time)] for sim, t in zip(sims, trials["all"], strict=True)}
@@ -515,7 +540,16 @@ class _Search:
             limits=detection_limits(self.scores, limit),
             leading=self.leading if verdict in ("unknown", "partial") else None,
             misleading=self.misleading,
+            forces=None if self.force_before is None else (self.force_before, self._forces(final)),
         )
+
+    def _forces(self, fitted: Fitted) -> ForceErrors:
+        return tree.part(gripper_forces.force_errors(self.bench, fitted))
+
+    def _force_notes(self, final: Fitted) -> list[str]:
+        """Return sentences on forces at the grippers, none where a recording has none."""
+        told = gripper_forces.told_mass(self.bench, final)
+        return [*force_doubts(self.recording), *([] if told is None else [mass_note(told, self.recording.mass)])]
 
 
 def _may_be(fitted: Fitted, numbers: Mapping[str, float]) -> bool:

@@ -32,9 +32,12 @@ class ErrorFloor:
 
 
 def marker_noise(recording: Recording) -> float:
-    """Return the noise of the markers [m]: as given, or what fourth differences in time say."""
-    if recording.marker_noise_std is not None:
-        return recording.marker_noise_std
+    """Return the noise of the markers [m]: as given, or as it shows."""
+    return shown_noise(recording) if recording.marker_noise_std is None else recording.marker_noise_std
+
+
+def shown_noise(recording: Recording) -> float:
+    """Return the noise of the markers [m] that fourth differences in time say; less than there is if it is coloured."""
     parts = []
     for trial in recording.train:
         fourth = np.diff(trial.markers[:, ~trial.gripped], n=4, axis=0)
@@ -184,7 +187,8 @@ def refine(pool: Pool, base: Fitted, start: Start, chain: str) -> Refinement:
         for options in ((half, discretisation_correction), (half,), ())
     ]
     sims = dict(pool.simulate(jobs))
-    found = refinement(sims[0][0], sims[1][0], sims[2][0], model.numerical_damping, edge)
+    fine, half_steps, as_it_is = (sims[k][0][..., : model.count, :] for k in range(3))
+    found = refinement(fine, half_steps, as_it_is, model.numerical_damping, edge)
     return replace(found, noise=marker_noise(pool.recording), links=length)
 
 

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from torchdlo.physics import tree
 from torchdlo.physics.effects import EFFECTS
 from torchdlo.physics.effects.parameter_name import values_of
 from torchdlo.sysid.diagnosis.effect_library import effect_equation, separating_experiment
@@ -64,6 +65,7 @@ def findings(result: Diagnosis, recording: Recording) -> dict[str, Any]:
         "confidence": confidence(result),
         "best_candidate": _leading(result),
         "gap": _gap(result, recording),
+        "forces": _forces(result, recording),
         "detection_limits": [dataclasses.asdict(limit) for limit in result.limits],
         "misleading_trials": [dataclasses.asdict(trial) for trial in result.misleading],
         "candidates": candidates,
@@ -148,6 +150,33 @@ def _gap(result: Diagnosis, recording: Recording) -> dict[str, Any]:
             for t, b, a in trials
         ],
     }
+
+
+def _forces(result: Diagnosis, recording: Recording) -> dict[str, Any] | None:
+    """Return how far forces at the grippers are off on the test trials; None where none count."""
+    if result.forces is None:
+        return None
+    sensor, said = tree.part(recording.wrench), dict(zip(("before", "after"), result.forces, strict=True))
+    return {
+        **{f"test_force_rmse_{when}_n": each.force for when, each in said.items()},
+        **{f"test_torque_rmse_{when}_nm": each.torque for when, each in said.items()},
+        "force_noise_n": sensor.force_noise_std,
+        "torque_noise_nm": sensor.torque_noise_std,
+    }
+
+
+def _force_text(result: Diagnosis, recording: Recording) -> str:
+    """Return likewise a sentence, nothing where none count."""
+    if result.forces is None:
+        return ""
+    before, after = result.forces
+    sensor = tree.part(recording.wrench)
+    change = f"{before.force:.3g}" if after.force == before.force else f"{before.force:.3g} → {after.force:.3g}"
+    said = f" Force at the grippers: {change} N off (noise {sensor.force_noise_std:.2g} N)"
+    if before.torque is None or after.torque is None:
+        return f"{said}."
+    change = f"{before.torque:.3g}" if after.torque == before.torque else f"{before.torque:.3g} → {after.torque:.3g}"
+    return f"{said}, torque {change} N m (noise {sensor.torque_noise_std:.2g} N m)."
 
 
 def _train_gap(result: Diagnosis, recording: Recording, when: str) -> float:
@@ -243,6 +272,7 @@ def summary(result: Diagnosis, recording: Recording) -> str:
         mae = mean_absolute_errors(result, recording)
         error = f" Mean absolute error per coordinate: {1e3 * mae['before']:.2f} mm."
         errors = f" Mean absolute error per coordinate: {1e3 * mae['before']:.2f} → {1e3 * mae['after']:.2f} mm."
+        error, errors = (text + _force_text(result, recording) for text in (error, errors))
     if result.verdict == "none":
         return (
             "Nothing is missing that these data could show: the calibrated baseline is "

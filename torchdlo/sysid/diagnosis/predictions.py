@@ -27,7 +27,7 @@ def torn_apart(sims: np.ndarray, arclength: np.ndarray) -> np.ndarray:
 
 
 class Predictions:
-    """A cache of simulations, by where the trials begin, which says how they are corrected too, and by model.
+    """A cache of simulations, by where the trials begin, which says how they are corrected, by options and by model.
 
     What began where nothing begins any more is dropped.
     """
@@ -40,20 +40,20 @@ class Predictions:
     def of(self, pool: Pool, start: Start, fits: Sequence[Fitted]) -> list[np.ndarray]:
         """Return the simulated markers of all trials with several models, shape (B, F, M, 3) each."""
         known = self._known.setdefault(start, {})
-        new = [f for f in fits if _key(f) not in known]
+        new = [f for f in fits if _key(pool, f) not in known]
         # Models that settle twists take longer than others, which all fit into one batch.
         kinds = [(pool.local.framed(f.effects), f.options) for f in new]
         groups = [[new[k] for k in group] for group in spread_jobs(kinds, pool.workers)]
         for k, sims in pool.simulate([pool.local.joined(g, "all", start) for g in groups]):
-            known |= {_key(f): sim for f, sim in zip(groups[k], sims, strict=True)}
+            known |= {_key(pool, f): sim for f, sim in zip(groups[k], sims, strict=True)}
         for fitted in new:
-            self._mend(pool, start, fitted, known[_key(fitted)])
-        return [known[_key(f)] for f in fits]
+            self._mend(pool, start, fitted, known[_key(pool, fitted)])
+        return [known[_key(pool, f)] for f in fits]
 
     def _mend(self, pool: Pool, start: Start, fitted: Fitted, sims: np.ndarray) -> None:
         """Simulate the trials in which the rope was torn apart once more, in finer steps, into (B, F, M, 3)."""
         model = pool.local.model(fitted.effects, fitted.options)
-        torn = np.flatnonzero(torn_apart(sims, model.mesh.marker_arclength))
+        torn = np.flatnonzero(torn_apart(sims[..., : model.count, :], model.mesh.marker_arclength))
         if not len(torn):
             return
         options = dict(fitted.options) | {"substep": model.dt / (_FINER * model.substeps)}
@@ -75,5 +75,5 @@ class Predictions:
         ]
 
 
-def _key(fitted: Fitted) -> Hashable:
-    return fitted.effects, fitted.options, fitted.values.tobytes()
+def _key(pool: Pool, fitted: Fitted) -> Hashable:
+    return frozenset(pool.local.options.items()), fitted.effects, fitted.options, fitted.values.tobytes()

@@ -82,37 +82,39 @@ def score_effects(
         report: called with the number of groups done and in all.
     """
     recording, model = pool.recording, pool.local.model(base.effects)
-    motion = pool.local.motion(model, "train")
+    measured = pool.local.measured(model, "train")
     known = dict(zip(model.parameters, base.values, strict=True))
-    curved = curvature_scale(motion.markers[:, :: max(1, motion.markers.shape[1] // 50)])
+    curved = curvature_scale(measured[:, :: max(1, measured.shape[1] // 50), : model.count])
     doses = {n: effect_library.perturbations(n, recording, model.mesh, curved, known) for n in names}
     groups, nudge = _groups(names, doses), base.space.nudges()
     jobs = [_job(pool, base, group, doses) for group in groups]
     jobs.append(SimulationJob(base.effects, _nudged(model, base, nudge)))
-    frames = min(max(10, int(_HORIZON * motion.markers.shape[1])), motion.markers.shape[1])
+    frames = min(max(10, int(_HORIZON * measured.shape[1])), measured.shape[1])
     jobs = [replace(job, start=start, frames=frames) for job in jobs]
     sims_of: dict[int, np.ndarray] = {}
     report(0, len(jobs))
     for k, sims in pool.simulate(jobs):
         sims_of[k] = sims
         report(len(sims_of), len(jobs))
-    free = np.setdiff1d(np.arange(model.count), model.gripped)
+    free = np.setdiff1d(np.arange(measured.shape[2]), model.gripped)
 
     def pick(x: np.ndarray) -> np.ndarray:
         return x[..., :frames, free, :].reshape(*x.shape[:-4], -1)
 
     own = sims_of[len(groups)]
-    residual = pick(motion.markers) - pick(own[0])
+    residual = pick(measured) - pick(own[0])
     good = np.isfinite(residual) & np.isfinite(pick(own)).all(0)
     trust: np.ndarray | float = 1.0
     if start.frame_weights is not None:
-        trust = pick(np.broadcast_to(start.frame_weights[..., None, None], motion.markers.shape))
+        trust = pick(np.broadcast_to(start.frame_weights[..., None, None], measured.shape))
     size = np.nan_to_num(trust * residual)
     weight = np.where(good, trust / (size**2 + _KNEE**2) ** 0.25, 0.0)
     residual = np.nan_to_num(residual) * weight
     jacobian = np.stack([np.nan_to_num(pick(sim - own[0])) * weight for sim in own[1:]], 1)
     q, r = np.linalg.qr(jacobian / nudge)
-    whole = float(np.linalg.norm(weight)) + 1e-30
+    # Limits are said of markers.
+    places = pick(np.broadcast_to((np.arange(measured.shape[2]) < model.count)[:, None], measured.shape))
+    whole = float(np.linalg.norm(weight[places])) + 1e-30
     left = residual - q @ (q.T @ residual)
     scores: list[Score] = []
     for group, sims in zip(groups, (sims_of[k] for k in range(len(groups))), strict=True):
@@ -130,7 +132,7 @@ def score_effects(
                 for share in _ON_THE_WAY:
                     raw = base.point.raw - np.clip(share * back, -1.0, 1.0)
                     starts.append((_mixture(name, doses[name], share * found.amounts), raw))
-            sizes, shown = _sizes(name, doses[name]), np.linalg.norm(change - q @ absorbed, axis=0) / whole
+            sizes, shown = _sizes(name, doses[name]), np.linalg.norm((change - q @ absorbed)[places], axis=0) / whole
             probes = tuple((dict(d.values), float(gap)) for d, gap in zip(doses[name], shown, strict=True))
             scores.append(Score(name, best.share, starts[0][0], tuple(starts), sizes, best.direction, probes))
     return sorted(scores, key=lambda s: -s.share)

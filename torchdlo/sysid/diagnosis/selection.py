@@ -10,7 +10,7 @@ import numpy as np
 
 from torchdlo.sysid.diagnosis.error_floor import gap_rms
 
-__all__ = ["MATTERS", "NEARLY_ALL", "PAYS", "gain", "helps_on_most", "matters", "refused"]
+__all__ = ["MATTERS", "NEARLY_ALL", "PAYS", "gain", "helps_on_most", "matters", "nothing_can_matter", "refused"]
 
 PAYS = 0.15
 """Share of the excess gap that an effect has to close, on the train and on the test trials."""
@@ -23,6 +23,9 @@ NEARLY_ALL = 0.8
 
 _MOST = 0.6
 """Share of the train trials on which an effect has to help."""
+
+_OVERFIT = 0.9
+"""Share of the squared noise that a fit with a few numbers leaves at least."""
 
 _NOISE = 0.3
 """Share of the noise below which an excess gap is none."""
@@ -54,6 +57,17 @@ def matters(first: float, before: float, after: float, noise: float, level: floa
     closed = before**2 - after**2
     enough = min(MATTERS * (first**2 - noise**2), NEARLY_ALL * (before**2 - level**2))
     return closed > max(level**2, enough)
+
+
+def nothing_can_matter(before: float, noise: float, level: float) -> bool:
+    """Return whether a gap is so near the floor that nothing which closes it down to the noise `matters`.
+
+    Args:
+        before: the gap [m].
+        noise: of what is measured, at least [m].
+        level: gap of a perfect model [m].
+    """
+    return bool(np.isfinite(level)) and before**2 - _OVERFIT * noise**2 <= level**2
 
 
 def refused(

@@ -10,6 +10,7 @@ import numpy as np
 
 from torchdlo.sysid.diagnosis.detection_limit import DetectionLimit
 from torchdlo.sysid.diagnosis.error_floor import ErrorFloor, gap_rms
+from torchdlo.sysid.diagnosis.gripper_forces import ForceErrors
 from torchdlo.sysid.diagnosis.misleading_trials import MisleadingTrial
 from torchdlo.sysid.diagnosis.significance import Agreement, benjamini_hochberg
 from torchdlo.sysid.estimation.jobs import Fitted
@@ -128,6 +129,8 @@ class Diagnosis:
     """What comes closest where a gap is left that nothing named explains."""
     misleading: list[MisleadingTrial] = field(default_factory=list)
     """Train trials that counted less."""
+    forces: tuple[ForceErrors, ForceErrors] | None = None
+    """How far forces at the grippers are off on the test trials, before and after; None where none count."""
 
     @property
     def looked_at(self) -> int:

@@ -16,7 +16,7 @@ from torchdlo.sysid.diagnosis import error_floor as floors
 from torchdlo.sysid.diagnosis.predictions import Predictions
 from torchdlo.sysid.diagnosis.score_test import Score
 from torchdlo.sysid.estimation.jobs import FitJob, Fitted, SimulationJob
-from torchdlo.sysid.estimation.levenberg_marquardt import PointEvaluation, cost_of, drift
+from torchdlo.sysid.estimation.levenberg_marquardt import PointEvaluation, cost_of, drift, extent
 from torchdlo.sysid.estimation.worker_pool import Pool
 from torchdlo.sysid.model import initial_state
 from torchdlo.sysid.model.trial_batch import Start
@@ -139,6 +139,10 @@ class Workspace:
 
     def prediction(self, fitted: Fitted, split: str) -> np.ndarray:
         """Return the simulated markers of the trials of a split, shape (B, F, M, 3)."""
+        return self.readings(fitted, split)[..., : len(self.recording.train[0].marker_arclength), :]
+
+    def readings(self, fitted: Fitted, split: str) -> np.ndarray:
+        """Return likewise what is simulated, with forces behind the markers where they count, shape (B, F, R, 3)."""
         (sims,) = self.predictions.of(self.pool, tree.part(self.start), [fitted])
         first = len(self.trials["train"])
         rows = {"train": slice(first), "test": slice(first, None), "all": slice(None)}[split]
@@ -252,13 +256,15 @@ class Workspace:
         rows[:, [model.parameters.index(n) for n in fitted.space.names]] = look.values
         ((_, sims),) = self.pool.simulate([SimulationJob(fitted.effects, rows, "train", start, fitted.options)])
         frame_weights = 1.0 if start.frame_weights is None else start.frame_weights[..., None, None]
-        measured = self.pool.local.motion(model, "train").markers
-        step, grid = (
-            frame_weights * np.nan_to_num(e[: len(measured), : measured.shape[1]])
-            for e in tree.part(self.refinement).unsure
-        )
-        errors = (shares[0] * step, shares[1] * grid, *(frame_weights * np.nan_to_num(e) for e in others))
-        return drift(look, frame_weights * sims, frame_weights * measured, errors)
+        measured = self.pool.local.measured(model, "train")
+        step, grid = (e[: len(measured), : measured.shape[1]] for e in tree.part(self.refinement).unsure)
+        # What is wrong with forces is not known.
+        behind = ((0, 0), (0, 0), (0, measured.shape[2] - model.count), (0, 0))
+        errors = [
+            frame_weights * np.pad(np.nan_to_num(e), behind) for e in (shares[0] * step, shares[1] * grid, *others)
+        ]
+        whole = extent(frame_weights * measured[..., : model.count, :])
+        return drift(look, frame_weights * sims, frame_weights * measured, errors, whole)
 
     def fit(self, jobs: Sequence[FitJob]) -> list[Fitted]:
         """Return the results of fits in their order.

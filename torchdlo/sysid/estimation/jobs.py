@@ -8,10 +8,12 @@ from typing import Any
 
 import numpy as np
 
+from torchdlo.physics import tree
 from torchdlo.sysid.diagnosis import effect_library
 from torchdlo.sysid.estimation import levenberg_marquardt
 from torchdlo.sysid.estimation.levenberg_marquardt import ParameterSpace, Point
 from torchdlo.sysid.model import initial_state as starts
+from torchdlo.sysid.model.grip_wrench import measured_wrench, packed
 from torchdlo.sysid.model.rope_model import RopeModel
 from torchdlo.sysid.model.trial_batch import Start, TrialBatch
 from torchdlo.sysid.recordings.recording import Recording
@@ -104,8 +106,19 @@ class Models:
             self._motions[key] = model.motion(self.recording.trials(split))
         return self._motions[key]
 
+    def measured(self, model: RopeModel, split: str | tuple[str, ...]) -> np.ndarray:
+        """Return what was measured of the trials of a split as the model simulates it, shape (B, F, R, 3) [m]."""
+        markers, worth = self.motion(model, split).markers, model.force_worth
+        if worth is None:
+            return markers
+        sensor, trials = tree.part(self.recording.wrench), self.recording.trials(split)
+        return packed(markers, measured_wrench(trials, sensor, markers.shape[1], len(model.grips)), worth)
+
     def simulate(self, job: SimulationJob, part: int = 0, parts: int = 1) -> np.ndarray:
-        """Return markers [m], shape (P, B, F, M, 3); of one of several parts, those of its P B / parts scenes."""
+        """Return what `RopeModel.simulate` does, shape (P, B, F, R, 3) [m].
+
+        Of one of several parts, return those of its P B / parts scenes.
+        """
         model = self.model(job.effects, job.options)
         start = job.start or starts.begin(model, self.recording.trials(job.split))
         motion = self.motion(model, job.split)
@@ -118,7 +131,7 @@ class Models:
         """Ask for what several fits with the same start, frames and options need, together; return their results."""
         effects, options = tuple(dict.fromkeys(e for job in jobs for e in job.effects)), jobs[0].options
         model = self.model(effects, options)
-        measured = self.motion(model, "train").markers[:, : jobs[0].frames]
+        measured = self.measured(model, "train")[:, : jobs[0].frames]
         start = jobs[0].start or starts.begin(model, self.recording.train)
         frame_weights = 1.0 if start.frame_weights is None else start.frame_weights[:, : jobs[0].frames, None, None]
         searches, places = [], []
@@ -126,7 +139,7 @@ class Models:
             own = self.model(job.effects, options)
             columns = [own.parameters.index(name) for name in job.free]
             space = ParameterSpace(job.free, tuple(own.params[k] for k in columns), job.sizes)
-            searches.append(_search(job, space, columns, measured, frame_weights))
+            searches.append(_search(job, space, columns, measured, frame_weights, model.count))
             places.append(_places(model, own))
         found: dict[int, Fitted] = {}
         asked = {k: next(search) for k, search in enumerate(searches)}
@@ -169,28 +182,35 @@ def _filled(guess: np.ndarray, places: Sequence[int], values: np.ndarray) -> np.
 
 
 def _search(
-    job: FitJob, space: ParameterSpace, columns: Sequence[int], measured: np.ndarray, frame_weights: np.ndarray | float
+    job: FitJob,
+    space: ParameterSpace,
+    columns: Sequence[int],
+    measured: np.ndarray,
+    frame_weights: np.ndarray | float,
+    markers: int,
 ) -> _Search:
     """Fit: yield parameter sets (P, K) of the job's model, take their simulations, return the best.
 
-    Markers (..., B, F, M, 3), measured and simulated, are multiplied by what they are trusted, (B, F, 1, 1).
+    Readings (..., B, F, R, 3), measured and simulated, are multiplied by what they are trusted, (B, F, 1, 1). The first
+    of them, `markers`, are places.
     """
     measured = frame_weights * measured
+    whole = levenberg_marquardt.extent(measured[..., :markers, :])
 
     def full(values: np.ndarray) -> np.ndarray:
         return _filled(job.values[0], columns, values)
 
     raws = space.clip(space.to_raw(job.values[:, columns]))
     if job.keep is not None:
-        costs = levenberg_marquardt.costs(frame_weights * (yield full(space.to_values(raws))), measured)
+        costs = levenberg_marquardt.costs(frame_weights * (yield full(space.to_values(raws))), measured, whole)
         raws = raws[np.argsort(costs)[: job.keep]]
     look = levenberg_marquardt.PointEvaluation(space, raws)
-    climb = levenberg_marquardt.Climb(space, look.points(frame_weights * (yield full(look.values)), measured))
+    climb = levenberg_marquardt.Climb(space, look.points(frame_weights * (yield full(look.values)), measured, whole))
     for _ in range(job.iterations):
         tries = climb.tries()
         if not len(tries):
             break
         look = levenberg_marquardt.PointEvaluation(space, tries)
-        climb.take(look.points(frame_weights * (yield full(look.values)), measured))
+        climb.take(look.points(frame_weights * (yield full(look.values)), measured, whole))
     best = min(climb.points, key=lambda p: p.cost)
     return Fitted(job.effects, full(space.to_values(best.raw)[None])[0], space, best)

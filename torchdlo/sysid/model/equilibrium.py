@@ -42,9 +42,8 @@ def come_to_rest(
     """
     calm, calmed, count = resting_scene(scene, params)
     rest = tree.replace(state, rods=tree.replace(state.rods, vel=torch.zeros_like(state.rods.vel)))
-    rest = scenes.step(calm, calmed, rest, control)
     step = recorded_step(calm, calmed, rest, control)
-    for _ in range(count - 1):
+    for _ in range(count):
         rest = step(calmed, rest, control)
     return stopped(rest, state)
 

@@ -14,8 +14,12 @@ from torchdlo.physics import tree
 from torchdlo.physics.linalg.numerics import cross, normalize
 from torchdlo.sysid.model.discretisation import Mesh
 from torchdlo.sysid.recordings.recording import Trial
+from torchdlo.sysid.recordings.wrench import ForceSensor, world_wrench
 
-__all__ = ["Grip", "grip_wrench", "grips"]
+__all__ = ["ForceWorth", "Grip", "grip_wrench", "grips", "measured_wrench", "packed", "unpacked"]
+
+ForceWorth = tuple[float, float | None]
+"""What a newton and a newton metre are worth beside markers [m/N, m/(N m)]; None: torques do not count."""
 
 
 @dataclass(frozen=True)
@@ -65,3 +69,36 @@ def grip_wrench(found: Sequence[Grip], held: Tensor, force: Tensor, couple: Tens
             torque = torque + couple[..., edge, :] * along
         out.append(tree.cat_components([force[..., at, :].sum(-2), torque]))
     return torch.stack(out, -2)
+
+
+def measured_wrench(trials: Sequence[Trial], sensor: ForceSensor, frames: int, count: int) -> np.ndarray:
+    """Return force [N] and torque [N m] as measured, in the world, NaN where they do not count, shape (B, F, W, 6).
+
+    Args:
+        trials: B trials; those without forces do not count.
+        sensor: how forces were measured.
+        frames: F, at least as many as those of any trial.
+        count: W, sensors of a trial.
+    """
+    found = np.full((len(trials), frames, count, 6), np.nan)
+    for k, trial in enumerate(trials):
+        if trial.wrench is not None:
+            own = np.where(trial.suspect[:, None, None], np.nan, world_wrench(trial, sensor))
+            # The last frame's would be felt in a step that is not simulated any more.
+            found[k, : len(own) - 1] = own[:-1]
+    return found
+
+
+def packed(markers: np.ndarray, wrench: np.ndarray, worth: ForceWorth) -> np.ndarray:
+    """Return readings (..., R, 3) [m]: markers (..., M, 3), then forces and torques of wrenches (..., W, 6)."""
+    parts = [markers, worth[0] * wrench[..., :3]]
+    return np.concatenate(parts if worth[1] is None else [*parts, worth[1] * wrench[..., 3:]], -2)
+
+
+def unpacked(readings: np.ndarray, count: int, worth: ForceWorth) -> np.ndarray:
+    """Return force [N] and torque [N m] (..., W, 6) of readings (..., R, 3); NaN for torques that do not count."""
+    felt = readings[..., count:, :]
+    if worth[1] is None:
+        return np.concatenate([felt / worth[0], np.full_like(felt, np.nan)], -1)
+    force, torque = np.split(felt, 2, -2)
+    return np.concatenate([force / worth[0], torque / worth[1]], -1)

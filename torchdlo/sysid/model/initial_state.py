@@ -112,7 +112,7 @@ def refine(
         vel[half + u + 1, :, free[u // 3], u % 3] += nudge[half + u]
     still = None if start.still is None else np.tile(start.still, 2 * half + 1)
     varied = Start(pos.reshape(-1, *start.pos.shape[1:]), vel.reshape(-1, *start.vel.shape[1:]), still)
-    sim = simulate(varied, np.tile(values, (2 * half + 1, 1)), frames)
+    sim = simulate(varied, np.tile(values, (2 * half + 1, 1)), frames)[..., : model.count, :]
     measured = motion.markers[:, :frames]
     seen = np.isfinite(measured).reshape(trials, -1)
     residual = np.where(seen, (measured - sim[0]).reshape(trials, -1), 0.0)

@@ -34,7 +34,7 @@ from torchdlo.sysid.diagnosis.effect_library import PARAMETERS, Number
 from torchdlo.sysid.model import equilibrium, length_projection
 from torchdlo.sysid.model.cached_steps import recorded_step
 from torchdlo.sysid.model.discretisation import make_mesh
-from torchdlo.sysid.model.grip_wrench import Grip, grip_wrench
+from torchdlo.sysid.model.grip_wrench import ForceWorth, Grip, grip_wrench, grips, packed
 from torchdlo.sysid.model.gripper_motion import drive
 from torchdlo.sysid.model.marker_observation import Markers
 from torchdlo.sysid.model.trial_batch import WINDOW, Start, TrialBatch
@@ -71,6 +71,7 @@ class RopeModel:
         clamp_fraction: float = 1.0,
         mass: float | None = None,
         forces: bool = False,
+        force_worth: ForceWorth | None = None,
     ) -> None:
         """Prepare the model.
 
@@ -84,6 +85,7 @@ class RopeModel:
             clamp_fraction: where clamps hold the rope's direction, see `Mesh.clamp_shares`.
             mass: of the rope [kg], in place of the recording's.
             forces: whether forces at the grippers tell the mass, which then is a number to fit.
+            force_worth: what they are worth as readings, which simulations then have behind the markers, see `packed`.
         """
         trial = recording.train[0]
         self.recording, self.rest, self.effects = recording, rest, tuple(effects)
@@ -108,6 +110,9 @@ class RopeModel:
         self.dt = float(trial.time[1] - trial.time[0])
         measured = [EFFECTS[name] for name in self.effects if EFFECTS[name].kind == "measurement"]
         beside = any(not effect.last for effect in measured)
+        felt = None if force_worth is None else next((t for t in recording.train if t.wrench is not None), None)
+        self.grips: tuple[Grip, ...] = () if felt is None else grips(self.mesh, felt)
+        self.force_worth = force_worth if self.grips else None
         self.markers = Markers(self.marker_vertex, torch.as_tensor(np.array(trial.gripped)), self.dt, beside)
         self.substeps = max(1, int(np.ceil(self.dt / substep - 1e-9)))
         baseline = ["bending_stiffness", "twisting_stiffness", "damping_rate"]
@@ -116,6 +121,13 @@ class RopeModel:
         self.numbers = [Number(ParameterName("", n), PARAMETERS[n], float(PARAMETERS[n].scalar)) for n in baseline]
         for name in self.effects:
             self.numbers += effect_library.numbers(name, recording)
+
+    @property
+    def readings(self) -> int:
+        """Number of readings of a frame: markers, and forces and torques that count."""
+        if self.force_worth is None:
+            return self.count
+        return self.count + len(self.grips) * (1 if self.force_worth[1] is None else 2)
 
     @property
     def parameters(self) -> list[str]:
@@ -317,7 +329,8 @@ class RopeModel:
             frames: how many frames to simulate; all if not given.
 
         Returns:
-            Marker positions, shape (P, B, F, M, 3); NaN from where a simulation failed.
+            Marker positions, shape (P, B, F, M, 3), NaN from where a simulation failed; if forces count, readings of
+            shape (P, B, F, R, 3).
         """
         sets, trials = len(values), len(motion.names)
         out = self.scenes(motion, start, values, np.arange(sets * trials), frames=frames)
@@ -336,17 +349,17 @@ class RopeModel:
             frames: see `simulate`.
 
         Returns:
-            Marker positions, shape (N, F, M, 3); NaN from where a simulation failed.
+            As `simulate`, shape (N, F, M, 3) or (N, F, R, 3).
         """
         trials, total = len(motion.names), frames or motion.markers.shape[1]
-        out = np.empty((len(wanted), total, self.count, 3))
+        out = np.empty((len(wanted), total, self.readings, 3))
         for rows in np.split(np.arange(len(wanted)), range(_CHUNK, len(wanted), _CHUNK)):
             filled = wanted[np.resize(rows, tracing.batch(len(rows)))]
             trial = filled % trials
             begin = start.pick(trial if len(start.pos) == trials else filled)
-            out[rows] = self._run(motion.pick(trial), begin, values[filled // trials], total)[: len(rows)]
+            out[rows] = self._read(motion.pick(trial), begin, values[filled // trials], total)[: len(rows)]
             if begin.discretisation_correction is not None:
-                out[rows] += begin.discretisation_correction[: len(rows), :total]
+                out[rows, :, : self.count] += begin.discretisation_correction[: len(rows), :total]
         return out
 
     def with_forces(
@@ -366,19 +379,32 @@ class RopeModel:
         sets, trials, total = len(values), len(motion.names), motion.markers.shape[1]
         rows = np.arange(sets * trials)
         own, begin = motion.pick(rows % trials), start.pick(rows % trials)
-        wrench = np.full((len(rows), total, len(found), 6), np.nan)
-
-        def keep(force: Tensor, couple: Tensor) -> None:
-            places = own.held[:, : self.substeps * (total - 1) : self.substeps]
-            wrench[:, :-1] = grip_wrench(found, places, force, couple).numpy()
-
-        markers = self._run(own, begin, values[rows // trials], total, keep)
+        markers, wrench = self._felt(own, begin, values[rows // trials], total, found)
         if begin.discretisation_correction is not None:
             markers = markers + begin.discretisation_correction[:, :total]
         return (
             markers.reshape(sets, trials, *markers.shape[1:]),
             wrench.reshape(sets, trials, *wrench.shape[1:]),
         )
+
+    def _read(self, motion: TrialBatch, start: Start, values: np.ndarray, frames: int) -> np.ndarray:
+        """Return markers (N, F, M, 3) [m], behind them forces if they count, (N, F, R, 3)."""
+        if self.force_worth is None:
+            return self._run(motion, start, values, frames)
+        return packed(*self._felt(motion, start, values, frames, self.grips), self.force_worth)
+
+    def _felt(
+        self, motion: TrialBatch, start: Start, values: np.ndarray, frames: int, found: Sequence[Grip]
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return markers (N, F, M, 3) and what grippers exert on the rope (N, F, W, 6), NaN in the last frame."""
+        wrench = np.full((len(values), frames, len(found), 6), np.nan)
+
+        def keep(force: Tensor, couple: Tensor) -> None:
+            places = motion.held[:, : self.substeps * (frames - 1) : self.substeps]
+            wrench[:, :-1] = grip_wrench(found, places, force, couple).numpy()
+
+        markers = self._run(motion, start, values, frames, keep)
+        return markers, wrench
 
     @torch.no_grad()
     def _run(
