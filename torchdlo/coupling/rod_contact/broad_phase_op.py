@@ -19,7 +19,9 @@ from torchdlo.physics.effects.base import Values
 from torchdlo.physics.rod.kinematics import View
 
 _OPTIONS = (f"-DPULL={closest_points.PULL}",)
-_function, ready = scene_packing.kernel("rod_near", "RodContact, which parts of ropes are near each other", *_OPTIONS, gpu=True)
+_function, ready = scene_packing.kernel(
+    "rod_near", "RodContact, which parts of ropes are near each other", *_OPTIONS, gpu=True
+)
 
 
 class _Sizes(ctypes.Structure):
@@ -66,7 +68,10 @@ def _outrun_meta(pos: Tensor, origin: Tensor, reach: Tensor) -> Tensor:
 
 _STATIC = "int[] counts, int[] closed, int room, int few, float dt, float burst"
 scene_packing.operator(
-    f"rod_near(Tensor[] rods, Tensor carried, {_STATIC}) -> (Tensor, Tensor, Tensor, Tensor)", _look, _look_meta, gpu=True
+    f"rod_near(Tensor[] rods, Tensor carried, {_STATIC}) -> (Tensor, Tensor, Tensor, Tensor)",
+    _look,
+    _look_meta,
+    gpu=True,
 )
 scene_packing.operator("rod_outrun(Tensor pos, Tensor origin, Tensor reach) -> Tensor", _outrun, _outrun_meta, gpu=True)
 

@@ -77,9 +77,7 @@ def _backward(ctx, by: Tensor):
     return list(found.split([x.shape[0] for x in vertices])), law, None, None, *(None for _ in ctx.static)
 
 
-scene_packing.operator(
-    f"rod_pairs({_INPUTS}, {_STATIC}) -> Tensor", _sweep, _sweep_meta, _save, _backward, gpu=True
-)
+scene_packing.operator(f"rod_pairs({_INPUTS}, {_STATIC}) -> Tensor", _sweep, _sweep_meta, _save, _backward, gpu=True)
 scene_packing.operator(
     f"rod_pairs_back({_INPUTS}, Tensor by, {_STATIC}) -> (Tensor, Tensor)",
     _back,

@@ -106,7 +106,8 @@ def _code(source: Path, options: tuple[str, ...], kind: str) -> bytes | None:
         return None
 
 
-def _given(dtype: torch.dtype, options: Sequence[str], derive: bool) -> tuple[str, ...]:
+def definitions(dtype: torch.dtype, options: Sequence[str], derive: bool) -> tuple[str, ...]:
+    """Return what a compiler is told of a source: what it is told anyhow, its numbers, and whether to derive."""
     return (*options, f"-DNUMBER={_NUMBERS[dtype]}", f"-DDERIVE={int(derive)}")
 
 
@@ -115,7 +116,7 @@ def ready(source: Path, options: Sequence[str], dtype: torch.dtype) -> bool:
     if dtype not in _NUMBERS or _nvrtc() is None:
         return False
     major, minor = torch.cuda.get_device_capability()
-    return _code(source, _given(dtype, options, False), f"sm_{major}{minor}") is not None
+    return _code(source, definitions(dtype, options, False), f"sm_{major}{minor}") is not None
 
 
 def _check(cuda: ctypes.CDLL, failed: int, what: str) -> None:
@@ -131,7 +132,7 @@ def launcher(source: Path, options: tuple[str, ...], dtype: torch.dtype, derive:
     cuda, module = ctypes.CDLL("libcuda.so.1"), ctypes.c_void_p()
     cuda.cuLaunchKernel.argtypes = [ctypes.c_void_p, *[ctypes.c_uint] * 7, *[ctypes.c_void_p] * 3]
     major, minor = torch.cuda.get_device_capability(device)
-    code = _code(source, _given(dtype, options, derive), f"sm_{major}{minor}")
+    code = _code(source, definitions(dtype, options, derive), f"sm_{major}{minor}")
     if code is None:
         raise RuntimeError(f"{source.name}: there is no kernel for {torch.cuda.get_device_name(device)}")
     with torch.cuda.device(device):

@@ -148,7 +148,7 @@ constexpr T TINY = sizeof(T) == 8 ? T(1e-12) : T(1e-8);
 // Not all compilers have arrays of no numbers.
 template <typename T>
 struct Nothing {
-  Lanes<T>& operator[](int) const { return *(Lanes<T>*)nullptr; }
+  Lanes<T> operator[](int) const { return {}; }
 };
 template <typename T, int N>
 struct Derivatives {

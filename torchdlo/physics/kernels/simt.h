@@ -50,7 +50,8 @@ static inline int ahead(bool yes, int& all) {
 }
 template <typename T>
 static inline void add_number(T& to, T x) {
-  T old = to, now;
+  T old, now;
+  __atomic_load(&to, &old, __ATOMIC_RELAXED);
   do now = old + x;
   while (!__atomic_compare_exchange(&to, &old, &now, false, __ATOMIC_RELAXED, __ATOMIC_RELAXED));
 }
