@@ -36,7 +36,7 @@ struct Scene {
   }
 
   // The square of how far the fastest goes beside `mean`; what is not a number stays so.
-  static T further(T a, T b) { return b <= a ? b != b ? b : a : a != a ? a : b; }
+  static T further(T a, T b) { return b <= a || a != a ? a : b; }
   T most(const T* const* x, const T* const* from, int64_t count, T scale, const T* mean, int64_t b) const {
     T found = 0;
     EVERY(v, count) {

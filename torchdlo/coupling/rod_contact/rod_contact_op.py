@@ -35,8 +35,8 @@ class _Sizes(ctypes.Structure):
 
 def _call(what: str, inputs: Sequence, others: Sequence[Tensor], sweeps: int, friction: bool, rule: Sequence[float]):
     vertices, laws, at, real = inputs
-    places = scene_packing.fields(vertices), scene_packing.fields([laws]), at.data_ptr(), real.data_ptr()
-    places = [*places, *(scene_packing.fields([x]) for x in others)]
+    fields = [scene_packing.fields(x) for x in (vertices, [laws], *([x] for x in others))]
+    places = [*fields[:2], at.data_ptr(), real.data_ptr(), *fields[2:]]
     sizes = _Sizes(*vertices[0].shape[1:], real.shape[0], sweeps, friction, *rule)
     if scene_packing.uses_gpu(real):
         scene_packing.on_gpu("rod_pairs", what, sizes, places, real, sizes.scenes, *_OPTIONS)

@@ -126,6 +126,15 @@ def _check(cuda: ctypes.CDLL, failed: int, what: str) -> None:
         raise RuntimeError(f"CUDA kernel {what}: {(name.value or b'unknown error').decode()}")
 
 
+def _enter(cuda: ctypes.CDLL, device: torch.device) -> None:
+    """Let this thread use the context of torch; one in which torch has not worked yet has none."""
+    context = ctypes.c_void_p()
+    _check(cuda, cuda.cuCtxGetCurrent(ctypes.byref(context)), "context")
+    if not context:
+        _check(cuda, cuda.cuDevicePrimaryCtxRetain(ctypes.byref(context), device.index or 0), "context")
+        _check(cuda, cuda.cuCtxSetCurrent(context), "context")
+
+
 @functools.cache
 def launcher(source: Path, options: tuple[str, ...], dtype: torch.dtype, derive: bool, device: torch.device) -> Launch:
     """Return what runs the entries of a source, or its derivatives, on a device; only where it is `ready`."""
@@ -136,7 +145,7 @@ def launcher(source: Path, options: tuple[str, ...], dtype: torch.dtype, derive:
     if code is None:
         raise RuntimeError(f"{source.name}: there is no kernel for {torch.cuda.get_device_name(device)}")
     with torch.cuda.device(device):
-        torch.cuda.synchronize()
+        _enter(cuda, device)
         _check(cuda, cuda.cuModuleLoadData(ctypes.byref(module), code), source.name)
 
     @functools.cache
@@ -149,6 +158,7 @@ def launcher(source: Path, options: tuple[str, ...], dtype: torch.dtype, derive:
         given = (ctypes.c_void_p * 3)(*(ctypes.addressof(x) for x in (sizes, fields, room)))
         with torch.cuda.device(device):
             stream = torch.cuda.current_stream().cuda_stream
+            _enter(cuda, device)
             run = function(entry)
             _check(cuda, cuda.cuLaunchKernel(run, blocks, 1, 1, _LANES, 1, 1, shared, stream, given, None), entry)
 
