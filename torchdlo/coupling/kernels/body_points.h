@@ -29,13 +29,13 @@ struct Solid {
     return {xx * t.x + xy * t.y + xz * t.z, xy * t.x + yy * t.y + yz * t.z, xz * t.x + yz * t.y + zz * t.z};
   }
   void add_turned(const Vec<T>& a, const Vec<T>& b) {  // derivative of a . turned(b)
-    ADD_TOGETHER(xx, a.x * b.x), ADD_TOGETHER(yy, a.y * b.y), ADD_TOGETHER(zz, a.z * b.z);
-    ADD_TOGETHER(xy, a.x * b.y + a.y * b.x), ADD_TOGETHER(xz, a.x * b.z + a.z * b.x), ADD_TOGETHER(yz, a.y * b.z + a.z * b.y);
+    ADD(xx, a.x * b.x), ADD(yy, a.y * b.y), ADD(zz, a.z * b.z);
+    ADD(xy, a.x * b.y + a.y * b.x), ADD(xz, a.x * b.z + a.z * b.x), ADD(yz, a.y * b.z + a.z * b.y);
   }
   Vec<T> local(const Vec<T>& a) const { return {dot(axes[0], a), dot(axes[1], a), dot(axes[2], a)}; }
   Vec<T> world(const Vec<T>& a) const { return axes[0] * a.x + axes[1] * a.y + axes[2] * a.z; }
   void add_world(const Vec<T>& by, const Vec<T>& a) {  // derivative by the axes of by . world(a)
-    ADD_TOGETHER(axes[0], by * a.x), ADD_TOGETHER(axes[1], by * a.y), ADD_TOGETHER(axes[2], by * a.z);
+    ADD(axes[0], by * a.x), ADD(axes[1], by * a.y), ADD(axes[2], by * a.z);
   }
 };
 template <typename T>
@@ -149,8 +149,8 @@ struct Geometry : Inputs<T> {
     const R pair = cross(couple, e.tangent) * e.lever, second = whole * a.share + pair;
     ADD(f[v], whole - second);
     ADD(f[n.after[v]], second);
-    ADD_TOGETHER(m[body(p)].force, -whole);
-    ADD_TOGETHER(m[body(p)].torque, -(cross(a.arm, whole) + (couple - e.tangent * dot(e.tangent, couple)) * e.radius));
+    ADD(m[body(p)].force, -whole);
+    ADD(m[body(p)].torque, -(cross(a.arm, whole) + (couple - e.tangent * dot(e.tangent, couple)) * e.radius));
   }
   Force<T> seen(int p, const Shifts& x, const Turns& m) const {
     const R d = apart(p, x, m);
@@ -312,11 +312,11 @@ struct Geometry : Inputs<T> {
     const R dx = turned * by_turning;
     d.arm += cross(a.normal, dx) + a.arm * (by_sliding * b.agile);
     d.normal += cross(dx, a.arm);
-    ADD_TOGETHER(db.agile, T(0.5) * by_sliding * dot(a.arm, a.arm));
+    ADD(db.agile, T(0.5) * by_sliding * dot(a.arm, a.arm));
     const L back = rebound(p);
     const auto bounces = (back > T(0)) & (back > simple(p));
     const L bounced = bounces ? d.wanted * T(n.dt) : zero, kept = bounces ? zero : d.wanted;
-    ADD_TOGETHER(db.restitution, bounced * approach(p));
+    ADD(db.restitution, bounced * approach(p));
     exert(p, -bounced * b.restitution, R{}, dvel, dspin);
     tilt(p, -bounced * b.restitution, R{}, vel, spin, to);
     const L more = deep(p) > T(0) ? kept * T(1 - n.recovery) : zero;
@@ -334,11 +334,11 @@ struct Geometry : Inputs<T> {
     for (int i = 0; i < 10; ++i)
       g[i] = d.share * r[0].g[i] - dover * r[1].g[i] + normal.x * r[2].g[i] + normal.y * r[3].g[i] + normal.z * r[4].g[i];
     const R start = {g[0], g[1], g[2]}, along = {g[3], g[4], g[5]};
-    for (int i = 0; i < 4; ++i) ADD_TOGETHER(db.numbers[i], g[6 + i]);
-    ADD_TOGETHER(db.offset, start);
+    for (int i = 0; i < 4; ++i) ADD(db.numbers[i], g[6 + i]);
+    ADD(db.offset, start);
     db.add_world(from, start), db.add_world(way, along);
     dfrom += b.world(start), dway += b.world(along);
     ADD(to.vertices[v].pos, dfrom - dway), ADD(to.vertices[w].pos, dway);
-    ADD_TOGETHER(db.pos, -dfrom);
+    ADD(db.pos, -dfrom);
   }
 };

@@ -83,7 +83,7 @@ struct Block : Geometry<T> {
       const L on = active[p], &s = points[p].share;
       const int v = edge(p), k = body(p);
       ADD(load_[v], on * (T(1) - s)), ADD(load_[n.after[v]], on * s), many[v] += on;
-      ADD_TOGETHER(count[k], on), ADD_TOGETHER(levers[k], on * (points[p].*root));
+      ADD(count[k], on), ADD(levers[k], on * (points[p].*root));
     }
     meet();
   }
@@ -107,9 +107,9 @@ struct Block : Geometry<T> {
       to.points[p].share += g * (load_[w] * j - load_[v] * i);
       ADD(dload[v], one * i), ADD(dload[w], two * j);
       ADD(to.vertices[v].soft, one * load_[v]), ADD(to.vertices[w].soft, two * load_[w]);
-      ADD_TOGETHER(to.bodies[k].mobility, g * count[k]);
+      ADD(to.bodies[k].mobility, g * count[k]);
       to.points[p].*root += g * levers[k];
-      ADD_TOGETHER(dlevers[k], g * (a.*root));
+      ADD(dlevers[k], g * (a.*root));
       if (!friction) continue;
       const L lever = edges[v].lever, part = lever * lever * many[v] * g;
       to.edges[v].lever += T(2) * lever * (i + j) * many[v] * g;
@@ -238,7 +238,7 @@ struct Block : Geometry<T> {
                           r.sticks ? d.y : mu * f / r.size * (d.y - way.y * along),
                           r.sticks ? d.z : mu * f / r.size * (d.z - way.z * along)};
         by[p].normal += r.sticks ? zero : mu * along;
-        ADD_TOGETHER(to.bodies[body(p)].mu_k, r.sticks ? zero : f * along);
+        ADD(to.bodies[body(p)].mu_k, r.sticks ? zero : f * along);
         by[p].friction = dtrial;
         soft[p] = dot(dtrial, r.slip) * inverse * inverse;
         slipped(p, dtrial * -inverse, df, dm);

@@ -115,7 +115,6 @@ static inline bool any(const M& mask) {
 #define CALLED
 #define EVERY(i, n) for (int i = 0; i < int(n); ++i)
 #define ADD(to, ...) (to) += __VA_ARGS__
-#define ADD_TOGETHER(to, ...) (to) += __VA_ARGS__
 static inline int lane() { return 0; }
 static inline void meet() {}
 static inline bool anyone(bool yes) { return yes; }
@@ -261,9 +260,5 @@ static inline Vec<T> cross(const Vec<T>& a, const Vec<T>& b) {
 template <typename T>
 static inline void add_number(Vec<T>& to, const Vec<T>& x) {
   ADD(to.x, x.x), ADD(to.y, x.y), ADD(to.z, x.z);
-}
-template <typename T>
-static inline void add_together(Vec<T>& to, const Vec<T>& x) {
-  ADD_TOGETHER(to.x, x.x), ADD_TOGETHER(to.y, x.y), ADD_TOGETHER(to.z, x.z);
 }
 #endif

@@ -1,6 +1,5 @@
 // What lanes.h is on a GPU: one scene per warp, one number per lane, lists in memory that the caller gives. All lanes of
-// a warp run the same code; each takes its share of the loops that say EVERY, and what several add to is added to by ADD,
-// or by ADD_TOGETHER if most add to the same.
+// a warp run the same code; each takes its share of the loops that say EVERY, and what several add to is added to by ADD.
 //
 // With EMULATED a CPU runs it, with threads in place of lanes: so it is tested where there is no GPU.
 #pragma once
@@ -56,10 +55,6 @@ static inline void add_number(T& to, T x) {
   do now = old + x;
   while (!__atomic_compare_exchange(&to, &old, &now, false, __ATOMIC_RELAXED, __ATOMIC_RELAXED));
 }
-template <typename T>
-static inline void add_together(T& to, T x) {
-  add_number(to, x);
-}
 #else
 #define WARP 32
 typedef long long int64_t;
@@ -98,19 +93,6 @@ static inline int ahead(bool yes, int& all) {
 template <typename T>
 static inline void add_number(T& to, T x) {
   atomicAdd(&to, x);
-}
-// The same where most lanes add to one number: those that are here together add up first. One after the other they would
-// take as long as all others together.
-template <typename T>
-static inline void add_together(T& to, T x) {
-  const unsigned here = __activemask(), same = __match_any_sync(here, (unsigned long long)&to);
-  T sum = 0;
-  for (unsigned rest = here; rest; rest &= rest - 1) {
-    const int other = __ffs(rest) - 1;
-    const T theirs = __shfl_sync(here, x, other);
-    if (same >> other & 1) sum += theirs;
-  }
-  if (__ffs(same) - 1 == lane()) atomicAdd(&to, sum);
 }
 #endif
 
@@ -153,10 +135,6 @@ template <typename T>
 static inline void add_number(One<T>& to, const One<T>& x) {
   add_number(to.v, x.v);
 }
-template <typename T>
-static inline void add_together(One<T>& to, const One<T>& x) {
-  add_together(to.v, x.v);
-}
 
 // A list as std::vector is one, in memory that `Memory` gave it and that it cannot outgrow.
 template <class S>
@@ -193,7 +171,6 @@ struct List {
 
 #define EVERY(i, n) for (int i = lane(); i < (n); i += WARP)
 #define ADD(to, ...) add_number(to, __VA_ARGS__)
-#define ADD_TOGETHER(to, ...) add_together(to, __VA_ARGS__)
 
 // Sets all numbers of a list that lanes share.
 template <class S>
