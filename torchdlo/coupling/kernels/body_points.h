@@ -70,7 +70,7 @@ struct Inputs {
 
   void take(const Sizes& n, Memory& memory) {
     memory.common(edges, n.vertices), memory.common(vertices, n.vertices), memory.common(bodies, n.bodies);
-    memory.dear(points, n.families * n.vertices);
+    memory.large(points, n.families * n.vertices);
   }
   template <typename P>
   void all(P work) {

@@ -136,8 +136,6 @@ struct Memory {
   template <class S>
   void large(List<S>& list, int64_t count) { list.resize(count); }
   template <class S>
-  void dear(List<S>& list, int64_t count) { list.resize(count); }
-  template <class S>
   void own(List<S>& list, int64_t, int64_t = 1) { list.clear(); }
 };
 #endif

@@ -225,15 +225,6 @@ struct Memory {
   void large(List<S>& list, int64_t count) {
     list = {(S*)(far + away), count}, away += rounded(count * sizeof(S));
   }
-  // What is used often, if it fits.
-  template <class S>
-  void dear(List<S>& list, int64_t count) {
-#if DEAR
-    common(list, count);
-#else
-    large(list, count);
-#endif
-  }
   // For each lane by itself, empty at first, with room for `times` as many as it gets of EVERY(i, count).
   template <class S>
   void own(List<S>& list, int64_t count, int64_t times = 1) {
