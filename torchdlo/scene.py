@@ -32,6 +32,7 @@ from torchdlo.physics import tree
 from torchdlo.physics.effects.base import ContactForces, Effect, altered_params, default_values, parameters_of
 from torchdlo.physics.execution import Execution, check_execution, tracing
 from torchdlo.physics.execution.gradient_check import GradientCheck, check_gradients
+from torchdlo.physics.execution.graphs import Graphs
 from torchdlo.physics.execution.replay import alike, rollout
 from torchdlo.physics.integrators import stability
 from torchdlo.physics.integrators.rod_step import INTEGRATORS, TWISTS, Settings, settle_twist, substep, with_joints
@@ -472,6 +473,7 @@ def stepper(scene: Scene, *, execution: Execution = "compiled"):
     Recorded steps take seconds at the first call, and then, without gradients, half to a third of the time. Compiled
     ones take ten seconds to minutes at first, with and without gradients, and are many times faster then. A step of one
     substep is compiled as a whole; of more, the substep is, so that their number does not matter.
+    On CUDA devices explicit ones are recorded as CUDA graphs at the third call with tensors of the same shapes.
     Compiled steps need a C++ compiler; without one they are not compiled, with one warning.
     """
     check_execution(execution)
@@ -486,7 +488,7 @@ def stepper(scene: Scene, *, execution: Execution = "compiled"):
         return (part(_step), advance) if once else (_step, part(advance))
 
     ways = {True: made(False), False: made(True)}
-    look, trusting = compile(broad_phase), tracing.Trusting(_prepared)
+    look, trusting, graphs = compile(broad_phase), tracing.Trusting(_prepared), Graphs()
 
     def run(params: Params, state: State, control: Control) -> State:
         _check_control(scene, control)
@@ -496,8 +498,11 @@ def stepper(scene: Scene, *, execution: Execution = "compiled"):
         )
         with_gradient = torch.is_grad_enabled()
         whole, part = ways[with_gradient]
-        with trusting((params, state, control), with_gradient, *control.attachment_weight) as inputs:
-            return whole(scene, *inputs, part, look)
+        grip = control.attachment_weight
+        with trusting((params, state, control), with_gradient, *grip) as inputs:
+            if scene.integrator != "explicit" or not state.rods.pos.is_cuda:
+                return whole(scene, *inputs, part, look)
+            return graphs(lambda *given: whole(scene, *given, part, look), inputs, *grip)
 
     return run
 

@@ -67,7 +67,13 @@ def test_gpu_replay_keeps_states_in_cpu_memory() -> None:
         begin = tree.replace(state, rods=tree.replace(state.rods, vel=vel))
         control = tree.map(lambda c: c.expand(frames, *c.shape), scenes.stationary_control(scene, state))
         last, _ = scenes.rollout(
-            lambda p, s, c: scenes.step(scene, p, s, c), params, begin, control, segment=5, keep=lambda s: s.time
+            lambda p, s, c: scenes.step(scene, p, s, c),
+            params,
+            begin,
+            control,
+            segment=5,
+            keep=lambda s: s.time,
+            offload=True,
         )
         last.rods.pos.sum().backward()
         return torch.cuda.max_memory_allocated()

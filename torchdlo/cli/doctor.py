@@ -203,7 +203,10 @@ def _gpu() -> Check:
 
     if torch.cuda.is_available():
         names = {torch.cuda.get_device_name(k) for k in range(torch.cuda.device_count())}
-        return Check("gpu", "ok", ", ".join(sorted(names)))
+        from torchdlo.physics.kernels import cuda
+
+        ends = "contact in explicit steps is compiled for it" if cuda.works() else "contact by slower tensor operations"
+        return Check("gpu", "ok", f"{', '.join(sorted(names))}; {ends}")
     built = torch.version.cuda or torch.version.hip
     reason = "no device that torch can use" if built else "this torch is built for the CPU"
     return Check("gpu", "missing", f"{reason}; all runs on the CPU", "see pytorch.org for a build for your device")

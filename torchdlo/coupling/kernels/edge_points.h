@@ -171,7 +171,11 @@ static Lanes<T> bounding(int shape, const Lanes<T>* size) {
       return root<T>(size[0] * size[0] + size[1] * size[1] + size[2] * size[2]);
     case CYLINDER:
       return root<T>(size[0] * size[0] + size[1] * size[1]);
-    default:  // capsules, cones, and what is round
+    case CONE: {  // its base is a quarter of its height below the origin
+      const Lanes<T> rim = root<T>(size[0] * size[0] + T(0.0625) * (size[1] * size[1])), apex = T(0.75) * size[1];
+      return rim > apex ? rim : apex;
+    }
+    default:  // capsules, and what is round
       return size[0] + size[1];
   }
 }

@@ -1,10 +1,10 @@
 """Contact forces of ropes on bodies as a C++ kernel, with its derivative.
 
-The formulas stand in `rod_body` and `edge_points`, as tensor operations; these are used on a GPU, where there is no C++
-compiler, and for meshes that differ from scene to scene or are learned. The kernel does the same, several scenes per
-instruction, skips what touches in none of them, and looks for the nearest point of an edge only where it may come
-within a radius of the body if the edge moves twice as far as foreseen. Compilers of graphs take minutes to unroll the
-sweeps; for them the kernel is one operation.
+The formulas stand in `rod_body` and `edge_points`, as tensor operations; these are used where there is no C++ compiler,
+or none for a GPU, and for meshes that differ from scene to scene or are learned. The kernel does the same, several
+scenes per instruction, skips what touches in none of them, and looks for the nearest point of an edge only where it may
+come within a radius of the body if the edge moves twice as far as foreseen. Compilers of graphs take minutes to unroll
+the sweeps; for them the kernel is one operation.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Which pairs of edges of ropes can touch within a step as a C++ kernel.
 
-The method and its reasons stand in `nearby`, as tensor operations; these are used on a GPU and where there is no C++
-compiler. The kernel finds the same pairs, in time near-linear in their number, and has room for any number of edges in
-a row of cells. It has no derivative, as no choice of pairs has.
+The method and its reasons stand in `nearby`, as tensor operations; these are used where there is no C++ compiler, or
+none for a GPU. The kernel finds the same pairs, in time near-linear in their number, and has room for any number of
+edges in a row of cells. It has no derivative, as no choice of pairs has.
 """
 
 from __future__ import annotations

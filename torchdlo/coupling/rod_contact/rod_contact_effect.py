@@ -30,7 +30,8 @@ Ropes are not spun by friction: they slide and do not roll, and parallel ropes r
 The derivative is the one of the step as computed: of normals, closest points, friction and inverse masses. It is
 finite everywhere, and one-sided where a pair starts to touch or to slide.
 
-On the CPU C++ kernels do what the tensor operations below say, see `rod_near` and `rod_pairs`.
+C++ kernels do what the tensor operations below say, on the CPU and on CUDA devices, see `broad_phase_op` and
+`rod_contact_op`.
 
 Stewart and Trinkle 1996, doi:10.1002/(SICI)1097-0207(19960815)39:15<2673::AID-NME972>3.0.CO;2-I (velocity-level time
 stepping); Tonge, Benevolenski, Voroshilov 2012, doi:10.1145/2185520.2185601 (Jacobi sweeps with split masses).

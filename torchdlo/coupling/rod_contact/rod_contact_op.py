@@ -1,8 +1,8 @@
 """Contact forces among ropes as a C++ kernel, with its derivative.
 
-The formulas stand in `contact`, `segments` and `coulomb`, as tensor operations; these are used on a GPU and where there
-is no C++ compiler. The kernel does the same, several pairs per instruction, and leaves out friction and derivatives of
-pairs that exert nothing. For compilers of graphs it is one operation.
+The formulas stand in `contact`, `segments` and `coulomb`, as tensor operations; these are used where there is no C++
+compiler, or none for a GPU. The kernel does the same, several pairs per instruction, and leaves out friction and
+derivatives of pairs that exert nothing. For compilers of graphs it is one operation.
 """
 
 from __future__ import annotations

@@ -132,6 +132,15 @@ def _dense(shape: Sequence[int]) -> tuple[int, ...]:
     return tuple(reversed(strides))
 
 
+def _many(state: Any, count: int) -> bool:
+    """Return whether so many states would take more than a tenth of their device's memory."""
+    there = [x for x in tree.leaves(state) if x.is_cuda]
+    if not there:
+        return False
+    whole = torch.cuda.get_device_properties(there[0].device).total_memory
+    return 10 * count * sum(x.nbytes for x in there) > whole
+
+
 def rollout(
     step: Callable[[Any, Any, Any], Any],
     params: Any,
@@ -141,6 +150,7 @@ def rollout(
     segment: int | None = None,
     nested: bool = False,
     keep: Callable[[Any], Any] = lambda state: state,
+    offload: bool | None = None,
 ) -> tuple[Any, Any]:
     """Apply `step` once per entry of `controls`.
 
@@ -152,6 +162,8 @@ def rollout(
         segment: steps per replayed segment; None records everything.
         nested: also replay runs of segments, so that about sqrt(T / segment) states are kept instead of T / segment.
         keep: what to return of each new state, e.g. positions.
+        offload: keep states of a GPU run in CPU memory until they are needed; None: if there are so many that they
+            would take more than a tenth of the device's.
 
     Returns:
         The last state, and the kept trees stacked along a first time axis.
@@ -177,7 +189,8 @@ def rollout(
             for a in range(0, tree.leaves(controls)[0].shape[0], size):
                 part = tree.map(lambda c, a=a: c[a : a + size], controls)
                 # Parameters and controls stay on the device all along; only states are many.
-                state, seen = replay(inner, params, state, part, offload=(False, True, False))
+                away = _many(state, -(-count // size)) if offload is None else offload
+                state, seen = replay(inner, params, state, part, offload=(False, away, False))
                 kept.append(seen)
             return state, tree.map(lambda *parts: torch.cat(parts), kept[0], *kept[1:])
 

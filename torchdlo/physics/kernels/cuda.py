@@ -47,6 +47,11 @@ Launch = Callable[[str, ctypes.Structure, Fields, Room, int, int], None]
 """Runs an entry, by its name, with sizes, arrays and memory, so many warps, and bytes of fast memory for each."""
 
 
+def works() -> bool:
+    """Return whether there are CUDA devices, and what compiles for them."""
+    return _nvrtc() is not None
+
+
 @functools.cache
 def _nvrtc() -> ctypes.CDLL | None:
     if not torch.version.cuda or not torch.cuda.is_available():
