@@ -240,8 +240,8 @@ def make(
         effects: what acts on them.
         values: numbers of effects that differ from their defaults, e.g. {"damping": {"rate": 0.6}}.
         bodies: rigid bodies; `RodBody` among the effects makes ropes touch them.
-        matter: what `coupling.mpm.particles.assemble` returned; `RodMpmCoupling` and `BodyMpmCoupling` let ropes and
-            bodies touch it.
+        material_points: what `coupling.mpm.particles.assemble` returned; `RodMpmCoupling` and `BodyMpmCoupling` let
+            ropes and bodies touch it.
         joints: points of ropes that are welded or ball-jointed to free bodies or other ropes.
         check: whether to refuse what could not be stepped: laws that do not fit the ropes, ropes far from their length,
             unstable substeps; and to move ropes that start inside of what they touch out of it. Scenes whose loads are
