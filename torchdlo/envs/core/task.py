@@ -237,7 +237,7 @@ class Task(ABC):
         return None
 
     def waypoints(self) -> Sequence[Sequence[tuple[float, float, float]]]:
-        """Return a way to the goal by hand: per point, how far each tool is from its start [m]."""
+        """Return the path of a scripted demonstration: per point, how far each tool is from its start [m]."""
         return ()
 
     def stage_waypoints(self) -> Sequence[Sequence[Sequence[tuple[float, float, float]]]]:
