@@ -60,7 +60,7 @@ def measure(name: str, starts: int, seed: int, horizon: int | None) -> dict[str,
 
 def table(rows: list[dict[str, Any]]) -> str:
     """Return the rows as a table of Markdown."""
-    heads = ("task", "doing nothing", "published", "by hand", "of starts", *("nothing", "random", "by hand") * 2)
+    heads = ("task", "doing nothing", "published", "scripted", "of starts", *("nothing", "random", "scripted") * 2)
     lines = [f"| {' | '.join(heads)} |", "|---" * len(heads) + "|"]
     for r in rows:
         means = [f"{statistics.mean(r[f'{w}_varied']):.1f}" for w in ("nothing", "random", "hand")]
@@ -94,7 +94,7 @@ def main() -> None:
             found = measure(name, choices.starts, choices.seed, 1 if choices.smoke else None)
             rows.append(found | {"seed": choices.seed})
             save(choices.json, {"generator": "torchdlo baselines", "rows": rows})
-            print(f"{name}: nothing {found['nothing']:.2f}, by hand {found['hand']:.2f}", file=sys.stderr, flush=True)
+            print(f"{name}: nothing {found['nothing']:.2f}, scripted {found['hand']:.2f}", file=sys.stderr, flush=True)
     print(table(rows))
 
 

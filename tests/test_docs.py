@@ -73,6 +73,25 @@ def test_public_names_have_docstrings(file: Path) -> None:
             assert ast.get_docstring(node), f"{file.relative_to(ROOT)}:{node.lineno}: {node.name}"
 
 
+def told(doc: str) -> Iterator[str]:
+    """Names in the section "Args" of a docstring."""
+    section = re.search(r"^Args:\n((?: +.*\n?|\n)*)", doc, re.MULTILINE)
+    for names in re.findall(r"^    (\*{0,2}\w+(?:, \*{0,2}\w+)*):", section[1] if section else "", re.MULTILINE):
+        yield from (name.lstrip("*") for name in names.split(", "))
+
+
+def test_docstrings_tell_of_arguments_that_there_are() -> None:
+    seen, wrong = 0, []
+    for file in FILES:
+        for node in ast.walk(ast.parse(file.read_text())):
+            if isinstance(node, ast.FunctionDef):
+                own = {each.arg for each in ast.walk(node.args) if isinstance(each, ast.arg)}
+                names = list(told(ast.get_docstring(node) or ""))
+                wrong += [f"{file.relative_to(ROOT)}: {node.name}: {name}" for name in names if name not in own]
+                seen += len(names)
+    assert seen > 100 and not wrong, wrong
+
+
 @pytest.mark.parametrize("file", FILES, ids=lambda f: str(f.relative_to(ROOT)))
 def test_functions_stay_small(file: Path) -> None:
     for node in ast.walk(ast.parse(file.read_text())):

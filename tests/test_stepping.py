@@ -130,3 +130,10 @@ def test_controls_of_the_wrong_shape_are_refused(execution):
     wrong = tree.map(lambda c: c[0, ..., :1, :], controls)
     with pytest.raises(ValueError, match="control: pos and director"):
         scene.stepper(made, execution=execution)(params, state, wrong)
+
+
+@pytest.mark.parametrize("execution", ["eager", "recorded", "compiled"])
+def test_swapped_arguments_are_refused(execution):
+    made, params, state, controls = hanging(2, substeps=1)
+    with pytest.raises(TypeError, match="it is given State, Params, Control; expected Params, State, Control"):
+        scene.stepper(made, execution=execution)(state, params, tree.map(lambda c: c[0], controls))

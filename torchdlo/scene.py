@@ -241,8 +241,8 @@ def make(
         effects: what acts on them.
         values: numbers of effects that differ from their defaults, e.g. {"damping": {"rate": 0.6}}.
         bodies: rigid bodies; `RodBody` among the effects makes ropes touch them.
-        matter: what `coupling.mpm.particles.assemble` returned; `RodMpmCoupling` and `BodyMpmCoupling` let ropes and
-            bodies touch it.
+        material_points: what `coupling.mpm.particles.assemble` returned; `RodMpmCoupling` and `BodyMpmCoupling` let
+            ropes and bodies touch it.
         joints: points of ropes that are welded or ball-jointed to free bodies or other ropes.
         check: whether to refuse what could not be stepped: laws that do not fit the ropes, ropes far from their length,
             unstable substeps; and to move ropes that start inside of what they touch out of it. Scenes whose loads are
@@ -444,11 +444,14 @@ def step(
         advance: what does a substep; `stepper` puts a compiled one here.
         broad_phase: what looks up once per step what effects need to know; likewise.
     """
-    _check_control(scene, control)
+    _check_given(scene, params, state, control)
     return _step(scene, params, state, control, advance, broad_phase)
 
 
-def _check_control(scene: Scene, control: Control) -> None:
+def _check_given(scene: Scene, params: Params, state: State, control: Control) -> None:
+    if not (isinstance(params, Params) and isinstance(state, State) and isinstance(control, Control)):
+        kinds = ", ".join(type(x).__name__ for x in (params, state, control))
+        raise TypeError(f"step: it is given {kinds}; expected Params, State, Control, in this order.")
     given, (h, g) = (tuple(control.pos.shape), tuple(control.director.shape)), scene.held
     if (given[0][-2], given[1][-2]) != (h, g):
         raise ValueError(f"control: pos and director are {given}; expected (..., {h}, 3) and (..., {g}, 3)")
@@ -491,7 +494,7 @@ def stepper(scene: Scene, *, execution: Execution = "compiled"):
     look, trusting, graphs = compile(broad_phase), tracing.Trusting(_prepared), Graphs()
 
     def run(params: Params, state: State, control: Control) -> State:
-        _check_control(scene, control)
+        _check_given(scene, params, state, control)
         notices.once(
             "compiling",
             "compiling the first step: seconds to minutes, once a process; execution='recorded' does without.",

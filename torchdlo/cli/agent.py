@@ -21,11 +21,6 @@ if TYPE_CHECKING:
 
 __all__ = ["plan", "propose"]
 
-_Rope = Annotated[
-    Path | None,
-    typer.Option(help="What ropes are made of: model.json of a calibration or diagnosis.", metavar="MODEL"),
-]
-
 _KEPT = {"exchanges": "[0-9][0-9][0-9]", "steps": "[0-9][0-9]"}
 """What a run keeps, by the folder, and how it is named there."""
 _SEARCH = "[0-9][0-9]-[0-9a-f]{16}"

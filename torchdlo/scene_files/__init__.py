@@ -1,6 +1,6 @@
 """Scene files: a whole simulation as plain data that a person writes.
 
-Ropes, effects, bodies, matter, robots, and what is held and moved. A `SceneDescription` becomes a scene, its
+Ropes, effects, bodies, material points, robots, and what is held and moved. A `SceneDescription` becomes a scene, its
 parameters, its first state and the controls of all steps by `build`, and a JSON file by `save`. Numbers are SI, angles
 in radians. What a file does not say has the value that the field has in `kinds`.
 """

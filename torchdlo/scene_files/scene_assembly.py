@@ -28,7 +28,7 @@ __all__ = ["Simulation", "assemble", "build", "load"]
 
 _LAWS: dict[str, type[ConstitutiveModel]] = {law.name: law for law in (Elastic, Plastic, Liquid, Sand)}
 _OWN = ("points", "vertices", "model", "hanging_masses")
-"""Entries of a rope that are not fields of `scene.RopeSpec`."""
+"""Entries of a rope that are not fields of `scene.Rope`."""
 _BODY_OWN = ("keyframes", "path", "file", "scale", "cells")
 """Entries of a body that are not fields of `RigidBody`."""
 

@@ -39,7 +39,7 @@ class HangingMass:
 @with_field_docs
 @dataclass(frozen=True)
 class RopeSpec:
-    """A rope; fields without a comment are those of `scene.RopeSpec`."""
+    """A rope; fields without a comment are those of `scene.Rope`."""
 
     points: tuple[Vector, ...]
     """Corners of the line along which it lies [m]; its vertices, if `vertices` is not given."""

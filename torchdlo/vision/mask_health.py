@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -200,10 +199,3 @@ def _slip(pictures: np.ndarray, masks: np.ndarray) -> tuple[int, float] | None:
         middle = (low + high) // 2
         low, high = (low, middle) if np.linalg.norm(shift(middle)) >= _SLIP else (middle, high)
     return high, float(np.linalg.norm(ends[0]))
-
-
-def dropped_frames(count: int, expected: float) -> Sequence[str]:
-    """Return what is to be said of a film that is shorter than its trial by more than a few frames."""
-    if count < expected - 3:
-        return [f"{count} pictures, {expected:.0f} expected for the time of the trial: the end is not judged"]
-    return []

@@ -36,7 +36,7 @@ def evaluate_batched(
         searches: each is called with the problem that it is to search.
         room: episodes of a batch; short ones are filled up, as steps are compiled for every size.
         pulse: called after every batch; a `KeyboardInterrupt` that it raises ends all searches that ask for more.
-        graded: episodes of a batch with gradients; as many as without if not given.
+        with_gradient: episodes of a batch with gradients; as many as without if not given.
 
     Returns:
         What the searches returned, in order.

@@ -88,7 +88,7 @@ class BodyMpmCoupling(Effect):
 
         Args:
             motion: where bodies would go without contact.
-            matter: where matter would go without contact.
+            material_points: where matter would go without contact.
             push: what all other contact exerts on bodies, and what it leaves of the matter.
         """
         part = [k for k, body in enumerate(motion.bodies) if self.planes or body.shape != "plane"]

@@ -126,7 +126,7 @@ def predict_free_motion(
 
     Args:
         medium: static choices.
-        matter: constant numbers.
+        material_points: constant numbers.
         particles: matter now.
         first: 1 in the very first substep, else 0, shape (..., 1, 1).
         dt: substep [s].

@@ -104,7 +104,7 @@ def to_grid(
 
     Args:
         medium: static choices.
-        matter: constant numbers.
+        material_points: constant numbers.
         particles: matter now.
         acceleration: of all matter, shape (..., 1, 3) [m/s^2].
         dt: substep [s].

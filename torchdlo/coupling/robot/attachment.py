@@ -81,7 +81,7 @@ def close_hands(scene: Any, hands: Hands, now: Any, tools: Pose, closed: Tensor,
     Args:
         scene: the static scene, `scene.Scene`.
         hands: which tool holds what.
-        now: where held parts are now, `scene.hold(scene, state)`.
+        now: where held parts are now, `scene.stationary_control(scene, state)`.
         tools: poses of the tools now, shapes (..., T, 3) and (..., T, 4).
         closed: how firmly each tool is to hold from now on, 0 to 1, shape (..., T, 1).
         last: the grasp until now; open hands if not given.

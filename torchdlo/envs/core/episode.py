@@ -456,7 +456,7 @@ def normalized_score(task: Task, returns: Tensor, **choices: Any) -> Tensor:
     """
     way = task.demonstration().to(returns)
     if not bool((way != 0).any()):
-        raise ValueError(f"{task.name}: has no way by hand to compare with; give it `waypoints`")
+        raise ValueError(f"{task.name}: has no scripted demonstration to compare with; give it `waypoints`")
     with torch.no_grad():
         idle, best = play(task, torch.stack([torch.zeros_like(way), way]), **choices).returns.to(returns)
     return (returns - idle) / (best - idle)

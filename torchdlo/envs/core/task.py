@@ -237,7 +237,7 @@ class Task(ABC):
         return None
 
     def waypoints(self) -> Sequence[Sequence[tuple[float, float, float]]]:
-        """Return a way to the goal by hand: per point, how far each tool is from its start [m]."""
+        """Return the path of a scripted demonstration: per point, how far each tool is from its start [m]."""
         return ()
 
     def stage_waypoints(self) -> Sequence[Sequence[Sequence[tuple[float, float, float]]]]:
@@ -381,7 +381,7 @@ def make(
         values: numbers that differ from those of all tasks.
         solids: its bodies.
         fixed: vertices that stay in their places, beside those that arms hold.
-        matter: its matter, as `coupling.mpm.particles.assemble` returns it.
+        material_points: its matter, as `coupling.mpm.particles.assemble` returns it.
         held: vertices that can be held at all, if others than those of the arms.
         burst: by how much vertices may speed up within a step, beside half their speed [m/s].
     """

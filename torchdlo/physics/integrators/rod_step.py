@@ -122,8 +122,9 @@ def substep(
         targets: where held parts are at the end.
         first: 1 in the very first substep, when velocities stand at the same time as positions, else 0;
             shape (..., 1, 1).
-        foresee: where rigid bodies would go under an acceleration (..., 1, 3) [m/s^2]; None in a scene without.
-        matter: where matter would go; likewise.
+        predict_free_motion: where rigid bodies would go under an acceleration (..., 1, 3) [m/s^2]; None in a scene
+            without.
+        material_points: where matter would go; likewise.
         joints: what is joined, see `coupling.rod_body.joints.Joining`; None in a scene without.
 
     Returns:

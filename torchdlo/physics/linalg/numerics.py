@@ -64,8 +64,3 @@ def wrap(angle: Tensor) -> Tensor:
     """Return the angle [rad] in (-pi, pi] that differs by whole turns; derivative 1."""
     turns = torch.round(angle.detach() / (2 * torch.pi))
     return angle - 2 * torch.pi * turns
-
-
-def smooth_positive(x: Tensor) -> Tensor:
-    """Return max(x, 0)."""
-    return x.clamp(min=0.0)

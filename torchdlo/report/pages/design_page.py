@@ -69,7 +69,7 @@ def _html(design: Design, picture: bytes, command: str) -> str:
         "<h2>All motions that were tried</h2>",
         note,
         table(_HEADS, _rows(design), last_is_ours=True),
-        "<h2>The rivals</h2>",
+        "<h2>The competing models</h2>",
         table(("effect", "off the recording by"), misfit),
         "<h2>Made by</h2>",
         f"<pre>{for_html(command)}</pre>" if command else "",

@@ -56,7 +56,7 @@ def trial_gaps(
     Args:
         simulated: markers [m], shape (B, F, M, 3).
         trials: B trials.
-        trust: what errors of frames are multiplied by [1], shape (B, F); 1 if not given.
+        frame_weights: what errors of frames are multiplied by [1], shape (B, F); 1 if not given.
     """
     out = []
     for sim, trial, of_frame in zip(
@@ -201,7 +201,7 @@ def refinement(
         fine: with half the steps and twice the vertices.
         half: with half the steps.
         plain: as they are.
-        ahead: how far steps look ahead, see `torchdlo.scene.Scene`.
+        numerical_damping: how far steps look ahead, see `torchdlo.scene.Scene`.
         edge: mean length of the mesh's edges [m].
     """
     return Refinement(_tame(half - plain), _tame(fine - half), 0.0, _AHEAD if numerical_damping else 2, edge)

@@ -105,7 +105,7 @@ def fit_rivals(
     else:
         bench, base = baselines.go_on(bench, _without(given, names), budget.more, report)
     start = bench.starts["train"]
-    stage = "fitting the rivals"
+    stage = "fitting the competing models"
     scores = score_effects(bench.pool, base, names, start, lambda k, n: report(f"{stage}: doses", k, n, ""))
     jobs = {s.name: _job(bench, base, s, budget.iterations) for s in scores}
     if given is not None:

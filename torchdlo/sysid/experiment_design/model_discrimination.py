@@ -200,7 +200,7 @@ class ModelDiscrimination:
 
     def prepare(self, report: Callback) -> None:
         """Simulate the trials at hand with every model, and with each of its numbers a little changed."""
-        names, stage, jobs = list(self.models), "what the rivals say of the recording", []
+        names, stage, jobs = list(self.models), "what competing models say of the recording", []
         for model in self.models.values():
             columns = [self.bench.pool.local.model(model.effects).parameters.index(n) for n in model.space.names]
             raw = model.space.to_raw(model.values[columns])

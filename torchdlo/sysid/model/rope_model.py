@@ -81,7 +81,7 @@ class RopeModel:
             rest: "straight" or "given".
             effects: names of effects of the library to add to the baseline.
             substep: longest substep [s].
-            ahead: see `torchdlo.scene.Scene`.
+            numerical_damping: see `torchdlo.scene.Scene`.
             clamp_fraction: where clamps hold the rope's direction, see `Mesh.clamp_shares`.
             mass: of the rope [kg], in place of the recording's.
             forces: whether forces at the grippers tell the mass, which then is a number to fit.
