@@ -1,10 +1,10 @@
-"""How well the boundary of a mask is met."""
+"""How well the boundary of a mask is met, and where that is more than a matter of boundaries."""
 
 from __future__ import annotations
 
 import numpy as np
 
-__all__ = ["boundary_f"]
+__all__ = ["boundary_f", "wide_areas"]
 
 
 def boundary_f(found: np.ndarray, true: np.ndarray) -> float:
@@ -21,3 +21,11 @@ def boundary_f(found: np.ndarray, true: np.ndarray) -> float:
         float((edge * cv2.dilate(other, cross)).sum() / max(edge.sum(), 1)) for edge, other in (edges, edges[::-1])
     ]
     return 2 * shares[0] * shares[1] / max(sum(shares), 1e-12)
+
+
+def wide_areas(mask: np.ndarray, least: int) -> np.ndarray:
+    """Return the parts of a mask (H, W) that are at least so wide [px], and two pixels around them, (H, W) bool."""
+    import cv2
+
+    kernel, more = (cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (n, n)) for n in (least, 5))
+    return np.asarray(cv2.dilate(cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_OPEN, kernel), more) > 0)
