@@ -1,10 +1,10 @@
-"""How well the boundary of a mask is met, and which of its parts are wide."""
+"""How well the boundary of a mask is met, and where that is more than a matter of boundaries."""
 
 from __future__ import annotations
 
 import numpy as np
 
-__all__ = ["boundary_f", "wide_parts"]
+__all__ = ["boundary_f", "wide_areas"]
 
 
 def boundary_f(found: np.ndarray, true: np.ndarray) -> float:
@@ -23,9 +23,9 @@ def boundary_f(found: np.ndarray, true: np.ndarray) -> float:
     return 2 * shares[0] * shares[1] / max(sum(shares), 1e-12)
 
 
-def wide_parts(area: np.ndarray, width: int, more: int = 0) -> np.ndarray:
-    """Return the parts of an area (H, W) bool that are as wide as `width` [px], grown by `more` pixels."""
+def wide_areas(mask: np.ndarray, least: int) -> np.ndarray:
+    """Return the parts of a mask (H, W) that are at least so wide [px], and two pixels around them, (H, W) bool."""
     import cv2
 
-    disc, ring = (cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (n, n)) for n in (width, 2 * more + 1))
-    return np.asarray(cv2.dilate(cv2.morphologyEx(area.astype(np.uint8), cv2.MORPH_OPEN, disc), ring) > 0)
+    kernel, more = (cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (n, n)) for n in (least, 5))
+    return np.asarray(cv2.dilate(cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_OPEN, kernel), more) > 0)

@@ -26,6 +26,7 @@ __all__ = [
     "Ranges",
     "background_masks",
     "color_masks",
+    "left_out",
     "load_film",
     "load_ranges",
     "matted",
@@ -158,17 +159,24 @@ def tidy(mask: np.ndarray, ranges: Ranges) -> np.ndarray:
     if ranges.close > 1:
         kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (ranges.close, ranges.close))
         here = np.asarray(cv2.morphologyEx(here, cv2.MORPH_CLOSE, kernel), np.uint8)
-    for left, top, right, bottom in ranges.ignore:
-        (y0, y1), (x0, x1) = (
-            (round(a * n), round(b * n)) for n, a, b in zip(mask.shape, (top, left), (bottom, right), strict=True)
-        )
-        here[y0:y1, x0:x1] = 0
+    here[left_out(ranges, mask.shape)] = 0
     count, label, stats, _ = cv2.connectedComponentsWithStats(here, connectivity=8)
     if count <= 1:
         return here.astype(bool)
     area = stats[1:, cv2.CC_STAT_AREA]
     keep = np.concatenate([[False], area >= max(ranges.smallest, 0.02 * area.max())])
     return keep[label]
+
+
+def left_out(ranges: Ranges, shape: Sequence[int]) -> np.ndarray:
+    """Return which pixels of pictures of a shape (H, W) are left out, (H, W) bool."""
+    out = np.zeros(tuple(shape), bool)
+    for left, top, right, bottom in ranges.ignore:
+        (y0, y1), (x0, x1) = (
+            (round(a * n), round(b * n)) for n, a, b in zip(shape, (top, left), (bottom, right), strict=True)
+        )
+        out[y0:y1, x0:x1] = True
+    return out
 
 
 def save_ranges(ranges: Ranges, path: Path) -> None:

@@ -34,7 +34,7 @@ from torchdlo.sysid.video.filmed_problem import (
 from torchdlo.sysid.video.filmed_starts import START_WINDOW, fit_starts, refine_start, restart, scout
 from torchdlo.sysid.video.footage import views_of
 from torchdlo.sysid.video.overlay import mask_overlaps, overlays
-from torchdlo.sysid.video.picture_gradient import descend, with_profile
+from torchdlo.sysid.video.picture_gradient import descend, whitening, with_profile
 
 __all__ = ["FILMED_STARTS", "METHODS", "baseline", "calibrate_filmed", "doubts", "tested"]
 
@@ -48,6 +48,9 @@ METHODS = ("auto", "differences", "gradient")
 
 _LAST = 6
 """Most iterations with finer steps, of fits that begin near their minimum."""
+
+_PROFILE = 12
+"""Least iterations of a fit of the stiffness along a rope to centre lines."""
 
 _WORSE = 1.05
 """Times the cost from which a correction of simulations makes the fit worse."""
@@ -161,13 +164,17 @@ def _scouted(own: FilmedProblem, starts: int, seed: int, report: Callback) -> np
 def _by_gradient(
     own: FilmedProblem, first: np.ndarray, found: Fit, iterations: int, report: Callback
 ) -> tuple[FilmedProblem, np.ndarray, Fit]:
-    """Return what `baseline` does, with the stiffness along the rope, by the gradient of masks."""
+    """Return what `baseline` does, with the stiffness along the rope: by centre lines, then by gradients of masks."""
     count, values = len(own.free), own.space.to_values(found.raw)
     fuller = with_profile(own)
     more = np.zeros(len(fuller.free) - count)
     both = [np.concatenate([x[:count], more, x[count:]]) for x in (first, values)]
-    raw = descend(fuller, fuller.space.to_raw(both[1]), max(1, 2 * iterations), report)
-    return fuller, both[0], look(fuller, raw, fuller.offset)
+    found = fit(fuller, fuller.space.to_raw(both[1]), max(iterations, _PROFILE))
+    report("fitting the stiffness along the rope", 1, 1, f"{1e3 * found.cost:.2f} mm")
+    raw = descend(fuller, found.raw, iterations, report, whitening(fuller, found.raw))
+    sharper = look(fuller, raw, fuller.offset)
+    # Blurred masks are less sharp than centre lines, and see what those do not: ends, and crossings.
+    return fuller, both[0], sharper if sharper.cost < _WORSE * found.cost else found
 
 
 def tested(

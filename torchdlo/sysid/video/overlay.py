@@ -10,10 +10,10 @@ import torch
 from torchdlo.sysid.estimation.observation import PER_CAMERA, seen_by
 from torchdlo.sysid.estimation.result import Overlay
 from torchdlo.sysid.video.footage import RANGES
-from torchdlo.vision.boundary import boundary_f, wide_parts
+from torchdlo.vision.boundary import boundary_f, wide_areas
 from torchdlo.vision.camera import NEAR
 from torchdlo.vision.rasterizer import coverage, successors
-from torchdlo.vision.segment import load_ranges
+from torchdlo.vision.segment import left_out, load_ranges
 from torchdlo.vision.spine import curve_vectors
 
 if TYPE_CHECKING:
@@ -120,14 +120,9 @@ def hidden_area(own: FilmedProblem, view: int, sims: np.ndarray, numbers: np.nda
                 swept |= (drawn_masks(own, view, sims[b], numbers, frames, seen.half_width, b) > 0.5).any(0)
                 reached |= seen.masks(b, frames).any(0)
     follows = (swept & reached).sum() >= _FOLLOWED * reached.sum()
-    out = wide_parts(swept & ~reached & follows, 2 * round(seen.half_width) + 3, more=2)
+    out = wide_areas(swept & ~reached & follows, 2 * round(seen.half_width) + 3)
     file = own.model.recording.path / RANGES
-    for left, top, right, bottom in load_ranges(file).ignore if file.is_file() else ():
-        (y0, y1), (x0, x1) = (
-            (round(a * n), round(b * n)) for n, a, b in zip(out.shape, (top, left), (bottom, right), strict=True)
-        )
-        out[y0:y1, x0:x1] = True
-    return out
+    return out | left_out(load_ranges(file), out.shape) if file.is_file() else out
 
 
 def overlays(own: FilmedProblem, split: str, sims: np.ndarray, numbers: np.ndarray) -> list[Overlay]:

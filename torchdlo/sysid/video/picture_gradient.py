@@ -21,12 +21,13 @@ from torchdlo.physics.execution.replay import rollout
 from torchdlo.scene import Control, Params, Scene, State
 from torchdlo.sysid.estimation.observation import PER_CAMERA, seen_by
 from torchdlo.sysid.model import equilibrium
+from torchdlo.sysid.video.filmed_fit import eliminated, look
 from torchdlo.sysid.video.filmed_problem import FilmedProblem
 from torchdlo.vision.camera import NEAR
 from torchdlo.vision.rasterizer import coverage, pyramid, successors
 from torchdlo.vision.spine import curve_vectors
 
-__all__ = ["PROFILE", "descend", "picture_loss", "simulated", "with_profile"]
+__all__ = ["PROFILE", "descend", "picture_loss", "simulated", "whitening", "with_profile"]
 
 Callback = Callable[[str, int, int, str], None]
 
@@ -50,6 +51,9 @@ _PRIOR = 1e-4
 
 _ENOUGH = 1e-3
 """Share of the loss that a step has to save for another one to be worth while."""
+
+_SHARP = 10.0
+"""Steps of unit length change the cost of centre lines by about a share of one half of this inverse."""
 
 _ROUGH = 0.3
 """Standard deviation of the change of a logarithm of stiffness from one place to the next one."""
@@ -168,7 +172,24 @@ def with_profile(own: FilmedProblem) -> FilmedProblem:
     return own.with_effects((*own.model.effects, PROFILE), dict.fromkeys(factors, _ROUGH), factors)
 
 
-def descend(own: FilmedProblem, raw: np.ndarray, iterations: int, callback: Callback | None = None) -> np.ndarray:
+def whitening(own: FilmedProblem, raw: np.ndarray) -> np.ndarray:
+    """Return directions (N, N) in which centre lines are about equally sensitive, at coordinates (N,).
+
+    Cameras move masks much more than stiffness does: down the plain gradient, steps are as short as theirs have to be.
+    """
+    found = look(own, raw, own.offset)
+    _, curvature = eliminated(*found.normal(own.prior), found.offset.shape[1])
+    size, turn = np.linalg.eigh(_SHARP / max(found.cost, 1e-6) * curvature.mean(0) + np.eye(len(raw)))
+    return turn / np.sqrt(np.maximum(size, 1.0))
+
+
+def descend(
+    own: FilmedProblem,
+    raw: np.ndarray,
+    iterations: int,
+    callback: Callback | None = None,
+    directions: np.ndarray | None = None,
+) -> np.ndarray:
     """Return coordinates (N,) of rope and cameras at which masks agree best, from given ones, by gradient.
 
     Args:
@@ -176,6 +197,7 @@ def descend(own: FilmedProblem, raw: np.ndarray, iterations: int, callback: Call
         raw: where to start.
         iterations: most steps.
         callback: told (stage, steps done, in all, message).
+        directions: in which steps are taken, shape (N, N), see `whitening`; along each number if not given.
     """
     report = callback or (lambda *_: None)
     space, count = own.space, len(own.free)
@@ -183,10 +205,11 @@ def descend(own: FilmedProblem, raw: np.ndarray, iterations: int, callback: Call
     logs, inverse = (torch.tensor([p.scale == scale for p in space.params]) for scale in ("log", "reciprocal"))
     profile = [k for k, name in enumerate(space.names) if name.startswith(PROFILE)]
     fixed, free = torch.as_tensor(own.fixed), torch.tensor(own.free)
-    begun = torch.as_tensor(raw)
-    x = begun.clone().requires_grad_()
+    begun, ways = torch.as_tensor(raw), torch.as_tensor(np.eye(len(raw)) if directions is None else directions)
+    z = torch.zeros_like(begun, requires_grad=True)
 
     def loss() -> Tensor:
+        x = begun + ways @ z
         plain = x * units
         values = torch.where(logs, torch.exp(torch.where(logs, plain, 0.0)), plain)
         values = torch.where(inverse, 1 / torch.where(inverse, plain, 1.0), values)
@@ -198,7 +221,7 @@ def descend(own: FilmedProblem, raw: np.ndarray, iterations: int, callback: Call
         # In units of the prior: line searches take small numbers for none.
         return data / _PRIOR + 0.5 * (x[count:].square().sum() + steps.square().sum() + 100 * mean.square())
 
-    descent = torch.optim.LBFGS([x], max_iter=1, history_size=12, line_search_fn="strong_wolfe")
+    descent = torch.optim.LBFGS([z], max_iter=1, history_size=12, line_search_fn="strong_wolfe")
 
     def closure() -> Tensor:
         descent.zero_grad()
@@ -206,13 +229,13 @@ def descend(own: FilmedProblem, raw: np.ndarray, iterations: int, callback: Call
         value.backward()
         return value
 
-    best, before = x.detach().clone(), float("inf")
+    best, before = begun, float("inf")
     for k in range(iterations):
         here = float(descent.step(closure).detach())  # before the step
         report("following the gradient of masks", k + 1, iterations, f"{_PRIOR * here:.5f}")
-        if not np.isfinite(here) or not torch.isfinite(x).all():
+        if not np.isfinite(here) or not torch.isfinite(z).all():
             break
-        best = x.detach().clone()
+        best = begun + ways @ z.detach()
         if before - here < _ENOUGH * here:
             break
         before = here
