@@ -70,7 +70,7 @@ def timed(scenes: int, way: dict[str, Any], start: float, repeats: int) -> dict[
     choice, params, state = cell(scenes, way)
     state = played((choice, params, state), start)
     control = scene.stationary_control(choice, state)
-    recorded, plain = (scene.stepper(choice, execution=r) for r in (True, False))
+    recorded, plain = scene.stepper(choice, execution="recorded"), scene.stepper(choice, execution="eager")
 
     def forward() -> None:
         now = state

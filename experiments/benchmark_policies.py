@@ -11,6 +11,7 @@ scripted demonstrations of tasks, and runs are called TASK-scripted-SEED.
 
 from __future__ import annotations
 
+import io
 import json
 import statistics
 import sys
@@ -114,15 +115,26 @@ def run(name: str, algo: str, seed: int, chosen: Any) -> None:
     told("judged", 1, 1, f"success {results['varied']['success']:.0%} from unseen starts")
 
 
+def rounded(policy: Path) -> bytes:
+    """Return the file of a policy with matrices of half precision, which are read as others are."""
+    import torch
+
+    content = torch.load(policy, map_location="cpu", weights_only=True)
+    state = {k: x.half() if x.dim() > 1 and x.dtype == torch.float32 else x for k, x in content["state"].items()}
+    torch.save(content | {"state": state}, written := io.BytesIO())
+    return written.getvalue()
+
+
 def pack(out: Path, file: Path) -> None:
-    """Write what is to be kept of all finished runs to one archive."""
+    """Write what is to be kept of all finished runs to one archive, weights of policies in half precision."""
     from torchdlo.files import replace_atomically
 
-    with replace_atomically(file) as scratch, zipfile.ZipFile(scratch, "w", zipfile.ZIP_DEFLATED) as archive:
+    with replace_atomically(file) as scratch, zipfile.ZipFile(scratch, "w") as archive:
         for folder in sorted(p.parent for p in out.glob("*/evaluation.json")):
             for name in KEPT:
                 if (folder / name).exists():
-                    archive.write(folder / name, f"{folder.name}/{name}")
+                    found = rounded(folder / name) if name == "policy.pt" else (folder / name).read_bytes()
+                    archive.writestr(zipfile.ZipInfo(f"{folder.name}/{name}"), found, zipfile.ZIP_DEFLATED, 9)
 
 
 def rows(file: Path) -> list[dict[str, Any]]:

@@ -8,8 +8,9 @@ import torch
 from torchdlo import scene
 from torchdlo.coupling import RodBody, RodContact
 from torchdlo.physics import tree
+from torchdlo.physics.constraints import contact_penalty as penalty
 from torchdlo.physics.effects import EFFECTS
-from torchdlo.physics.integrators import contact_kernel
+from torchdlo.physics.integrators import contact_kernel, contact_step
 from torchdlo.physics.linalg import banded
 from torchdlo.scene import RigidBody, Rope, check_gradients, make
 
@@ -127,3 +128,32 @@ def test_a_rope_that_piles_up_comes_to_rest_without_gaining_energy():
     scene.check_state(state)
     assert max(energy) <= energy[0] * (1 + 1e-3) and energy[-1] < 0.6 * energy[0]
     assert float(state.rods.vel.norm(dim=-1).max()) < 0.1 and float(state.rods.pos[:, 2].min()) > 0.004 * 0.95
+
+
+@pytest.mark.parametrize("kernel", [True, False], ids=["kernel", "tensors"])
+def test_a_knot_in_single_precision_is_not_softened_for_rounding(kernel, monkeypatch):
+    """Rounding leaves more than what counts as solved: softer contact would cost eightfold and not help."""
+    from torchdlo.envs import find, parse_fidelity, with_fidelity
+    from torchdlo.envs.core import episode
+
+    if kernel and not contact_kernel.available(torch.zeros(())):
+        pytest.skip("no C++ compiler")
+    task = with_fidelity(find("unknotting"), parse_fidelity("2ms/1/implicit"))
+    made = episode.prepare(task, 1, execution="eager")
+    if not kernel:
+        monkeypatch.setattr(contact_kernel, "available", lambda like: False)
+    hard, searched = [], contact_step._searched
+
+    def watched(touching, tension, whole=False):
+        found = searched(touching, tension, whole)
+        hard.append(float(found[3].min()))
+        return found
+
+    monkeypatch.setattr(contact_step, "_searched", watched)
+    world, action = made.start, torch.zeros(1, task.width)
+    for _ in range(2 if kernel else 1):
+        world = episode.act(made, world, action)
+    assert len(hard) >= 10
+    assert min(hard) > 0.05 * penalty.HARD, hard
+    assert sum(x == pytest.approx(penalty.HARD) for x in hard) >= 0.6 * len(hard), hard
+    assert not bool(world.failed.any())

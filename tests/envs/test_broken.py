@@ -53,6 +53,6 @@ def test_a_scene_that_breaks_when_hands_open_leaves_the_slope_of_what_all_share(
         world = episode.act(made, made.start, shared.expand(2, -1))
         after = episode.finish(made, wild(world) if breaks else world)
         assert after.failed.tolist() == [False, breaks]
-        slopes.append(torch.autograd.grad(episode.episode_reward(made, after)[1][0], shared)[0])
+        slopes.append(torch.autograd.grad(episode.episode_reward(made, after)[2][0], shared)[0])
     assert slopes[0].dtype == F64 and slopes[0].any()
     torch.testing.assert_close(slopes[1], slopes[0], rtol=0, atol=0)

@@ -336,6 +336,9 @@ def test_replay_keeps_inputs_where_offload_says():
         y = replay.replay(lambda t: {"y": t["x"].sin()}, {"x": x}, offload=offload)["y"]
         (g,) = torch.autograd.grad(y.sum(), x)
         assert torch.equal(g, x.cos())
+    y = replay.replay(lambda t, k: t["x"].sin() * k, {"x": x}, x, offload=(True, False))
+    (g,) = torch.autograd.grad(y.sum(), x)
+    assert torch.allclose(g, x * x.cos() + x.sin())
 
 
 def test_replay_says_that_closed_over_tensors_get_no_gradient():

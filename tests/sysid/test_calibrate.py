@@ -74,6 +74,18 @@ def test_a_rope_held_at_one_end_is_calibrated(tmp_path: Path) -> None:
     assert result.parameters["bending_stiffness"]["value"] == pytest.approx(TRUE[0], rel=0.03)
 
 
+def test_train_trials_may_be_shorter_than_test_trials(tmp_path: Path) -> None:
+    recording = make_recording(tmp_path)
+    short = [
+        replace(t, time=t.time[:25], markers=t.markers[:25], suspect=t.suspect[:25], gripper_quaternion=None)
+        for t in recording.train
+    ]
+    short = [replace(t, gripper_marker=None) for t in short]
+    tests = tuple(replace(t, gripper_quaternion=None, gripper_marker=None) for t in recording.test)
+    found = calibrate(replace(recording, train=tuple(short), test=tests), **OPTIONS | {"refined": True})
+    assert np.isfinite([found.train_mae_mm, found.test_mae_mm]).all()
+
+
 def test_same_seed_same_numbers(tmp_path: Path) -> None:
     recording = make_recording(tmp_path)
     one, two = (calibrate(recording, seed=3, starts=4, iterations=1, vertices=13) for _ in range(2))

@@ -289,15 +289,18 @@ def test_an_effect_is_left_out_once_only_from_the_same_model() -> None:
         asked.extend(jobs)
         return [SimpleNamespace(point=SimpleNamespace(cost=1e-3), of=job) for job in jobs]
 
-    bench = SimpleNamespace(starts={"train": object()}, fit=fit, reduction=lambda fitted, name, *_: (fitted, name))
+    bench = SimpleNamespace(start=object(), discounted={}, fit=fit, reduction=lambda fitted, name, *_: (fitted, name))
     revision = Revision(bench, BUDGETS["fast"], ["plain"], lambda *_: None)
     fitted = SimpleNamespace(effects=("wind", "stretch"), options=(), values=np.ones(3))
     again = SimpleNamespace(effects=("wind", "stretch"), options=(), values=np.ones(3))
     assert revision.without(fitted, "wind") is revision.without(again, "wind") and len(asked) == 1
     assert revision.without(fitted, "stretch").of == (fitted, "stretch")
-    bench.starts = {"train": object()}
+    bench.start = object()
     revision.without(fitted, "wind")
     assert len(asked) == 3
+    bench.discounted = {"train_1": 20}
+    revision.without(fitted, "wind")
+    assert len(asked) == 4
 
 
 SURE = Agreement(1e-4, "block", 16, np.ones(2), 0.01)
@@ -320,8 +323,8 @@ def test_what_steps_may_do_is_no_finding_nor_what_explains_no_more(
         for name, cost in costs.items()
     }
     judge = object.__new__(effect_search._Search)
-    judge.bench, judge.pool = SimpleNamespace(tie=twentieth), SimpleNamespace(local=SimpleNamespace())
-    judge.pool.local.model = lambda *_: model
+    local = SimpleNamespace(model=lambda *_: model)
+    judge.bench = SimpleNamespace(tie=twentieth, pool=SimpleNamespace(local=local))
     judge._gain = lambda *_: 0.6
     order = sorted(fits, key=lambda name: costs[name])
     rival = SimpleNamespace(point=SimpleNamespace(cost=2e-3))
@@ -424,9 +427,8 @@ def test_an_effect_gives_way_to_another_that_fits_better_beside_the_rest(cost: f
         return model(cost if old == "wind" else 9e-3, 3, *rest, "tilted_gravity" if old == "wind" else "air_drag")
 
     monkeypatch.setattr(Revision, "_instead", instead)
-    pool = SimpleNamespace(choose=lambda **_: None)
-    bench = SimpleNamespace(gaps=lambda f, _: np.array([5e-3]), level=1e-3, diverged=lambda *_: False, pool=pool)
-    bench.tie = twentieth
+    bench = SimpleNamespace(gaps=lambda f, _: np.array([5e-3]), level=1e-3, diverged=lambda *_: False, tie=twentieth)
+    bench.with_options = lambda _: bench
     revision = Revision(bench, BUDGETS["fast"], [model(9e-3, 3), model(6e-3, 3)], lambda *_: None)
     found = EliminationResult({"wind": 0.5, "point_mass": 0.3}, {"wind": ["rest_curvature"], "point_mass": []})
     # Of 4 mm that are explained, 0.2 mm are a tie: fewer numbers win that.

@@ -11,7 +11,7 @@ from tests.vision.scenes import front
 from torchdlo.errors import InputError
 from torchdlo.sysid.recordings.recording import load_recording
 from torchdlo.sysid.video.filming import film_recording
-from torchdlo.sysid.video.footage import views_of
+from torchdlo.sysid.video.footage import masks_of, views_of
 from torchdlo.vision.camera import looking_at, save_cameras
 from torchdlo.vision.film import FilmLook
 from torchdlo.vision.segment import save_masks
@@ -89,10 +89,21 @@ def _masks(filmed: Path, masks: np.ndarray) -> None:
     save_masks(masks, filmed / "train_0.a.npz")
 
 
+def _twice(filmed: Path) -> None:
+    recording = load_recording(filmed)
+    masks = masks_of(recording, recording.train[0].films[0])[0]
+    _masks(filmed, masks | np.roll(masks, 60, 1))
+
+
 @pytest.mark.parametrize(
     ("spoil", "message"),
     [
         (lambda f: (f / "train_0.a.mp4").write_bytes(b""), "empty file"),
+        (_twice, "two ropes"),
+        (
+            lambda f: save_cameras([looking_at("a", [0, -1, 1], [0, -2, 1], focal=650.0)], f / "cameras.json"),
+            "behind it",
+        ),
         (lambda f: _masks(f, np.zeros((15, 480, 640), bool)), "never visible"),
         (lambda f: _masks(f, np.zeros((15, 120, 160), bool)), "640 x 480"),
         (lambda f: _masks(f, np.ones((6, 480, 640), bool)), "about 15 pictures"),

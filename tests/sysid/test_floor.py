@@ -38,16 +38,17 @@ def carried(path: Path) -> Recording:
 
 def test_a_correction_leaves_little_of_the_error_of_steps_and_mesh(tmp_path: Path) -> None:
     with Pool(carried(tmp_path), OPTIONS, workers=1) as pool:
-        bench, model = Workspace(pool), pool.local.model(())
-        values = np.array([3e-3, 2e-3, 2.0])
-        bench.begin(values, ())
+        model, values = pool.local.model(()), np.array([3e-3, 2e-3, 2.0])
+        bench = Workspace(pool).begin(values, ())
         none = ParameterSpace((), ())
         fitted = Fitted((), values, none, Point(np.empty(0), 0.0, np.empty(0), np.empty(0), np.empty(0)))
         coarse, count = bench.prediction(fitted, "all"), len(model.arclength)
         fine = (("vertices", 4 * count - 3), ("substep", model.dt / (8 * model.substeps)))
         exact = dict(pool.simulate([SimulationJob((), values[None], "all", bench.starts["all"], fine)]))[0][0]
-        bench.correct(fitted)
+        before, bench = bench, bench.correct(fitted)
         corrected = bench.prediction(fitted, "all")
+        assert bench.prediction(fitted, "all") is not before.prediction(fitted, "all")
+        np.testing.assert_array_equal(before.prediction(fitted, "all"), coarse)
     free = ~pool.recording.train[0].gripped
 
     def error(sims: np.ndarray) -> float:
@@ -100,8 +101,7 @@ def test_motions_that_magnify_errors_count_less() -> None:
 
 def test_a_chain_is_corrected_by_what_its_links_do_not_explain(tmp_path: Path) -> None:
     with Pool(swaying(tmp_path, frames=5), OPTIONS, workers=1) as pool:
-        bench, none = Workspace(pool), ParameterSpace((), ())
-        bench.begin(pool.local.model(()).guess(), ())
+        bench, none = Workspace(pool).begin(pool.local.model(()).guess(), ()), ParameterSpace((), ())
         edge = np.mean(np.diff(pool.local.model(()).arclength))
         for links, wrong in ((0.0, 1.0), (0.5, 0.75), (-1.0, 0.0), (4.0, -1.0)):
             values = np.append(pool.local.model(()).guess(), links * edge)

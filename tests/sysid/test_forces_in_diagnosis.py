@@ -91,17 +91,17 @@ def test_simulations_have_forces_behind_the_markers(dragged: Recording) -> None:
     assert np.isnan(measured[:, -1, 10:]).all() and not np.isnan(measured[:, :-1]).any()
 
 
-def fitted(bench: Workspace, forces: bool) -> tuple[Fitted, Fitted]:
-    """A baseline, and the model with air drag."""
+def fitted(bench: Workspace, forces: bool) -> tuple[Workspace, Fitted, Fitted]:
+    """A workspace, its baseline, and the model with air drag."""
     plain = bench.pool.local.model(())
     first = np.array([TOO_HEAVY * BEND, TOO_HEAVY * TWIST, RATE])
-    bench.begin(first, ())
+    bench = bench.begin(first, ())
     base = bench.fit([FitJob((), first[None], tuple(plain.parameters), (1.0,) * 3, 2, bench.starts["train"])])[0]
-    base = gripper_forces.take_forces(bench, base, 3, lambda *_: None) if forces else base
+    bench, base = gripper_forces.take_forces(bench, base, 3, lambda *_: None) if forces else (bench, base)
     names = (*base.space.names, "air_drag.c_d")
     values = np.append(base.values, 3.0)[None]
     job = FitJob(("air_drag",), values, names, (1.0,) * len(names), 5, bench.starts["train"])
-    return base, bench.fit([job])[0]
+    return bench, base, bench.fit([job])[0]
 
 
 @pytest.mark.parametrize("forces", [True, False])
@@ -109,8 +109,7 @@ def test_forces_tell_how_large_a_drag_is(dragged: Recording, forces: bool) -> No
     # Markers tell stiffness and drag only over mass: by what rope.json says too much of that, both are too large.
     said = dragged if forces else replace(dragged, wrench=None)
     with Pool(said, {"vertices": 31, "numerical_damping": 0.05, "clamp_fraction": 0.0}, workers=1) as pool:
-        bench = Workspace(pool)
-        base, more = fitted(bench, forces)
+        bench, base, more = fitted(Workspace(pool), forces)
         found = dict(zip(more.space.names, more.values, strict=True))
         before, after = (gripper_forces.force_errors(bench, f) for f in (base, more))
     factor = 1.0 if forces else TOO_HEAVY

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from tests.sysid.swaying import recording as swaying
-from torchdlo.sysid.diagnosis.workspace import Workspace, torn_apart
+from torchdlo.sysid.diagnosis.predictions import torn_apart
+from torchdlo.sysid.diagnosis.workspace import Workspace
 from torchdlo.sysid.estimation.jobs import Fitted, Models, SimulationJob
 from torchdlo.sysid.estimation.levenberg_marquardt import ParameterSpace, Point
 from torchdlo.sysid.estimation.worker_pool import Pool
@@ -42,8 +43,8 @@ def test_a_torn_trial_is_simulated_in_finer_steps(tmp_path: Path) -> None:
     options = {"vertices": 10}
     with Pool(swaying(tmp_path, frames=12), options, workers=1) as pool:
         pool.local, plain = Tearing(pool.recording, options), pool.local
-        bench, values = Workspace(pool), np.array([3e-3, 2e-3, 2.0])
-        bench.begin(values, ())
+        values = np.array([3e-3, 2e-3, 2.0])
+        bench = Workspace(pool).begin(values, ())
         fitted = Fitted(
             (), values, ParameterSpace((), ()), Point(np.empty(0), 0.0, np.empty(0), np.empty(0), np.empty(0))
         )
@@ -56,8 +57,8 @@ def test_a_torn_trial_is_simulated_in_finer_steps(tmp_path: Path) -> None:
     np.testing.assert_allclose(got[:-1], coarse[:-1], rtol=0, atol=1e-9)
     np.testing.assert_allclose(got[-1], fine[-1], rtol=0, atol=1e-9)
     assert np.abs(fine[-1] - coarse[-1]).max() > 1e-6
-    assert bench.mended == {last}
-    assert bench.notes() == [
+    assert bench.predictions.mended == {last}
+    assert bench.predictions.notes() == [
         f"Simulated ropes were torn apart in {last}, by some model at least; they were simulated once more there in "
         "steps of a 4th."
     ]

@@ -93,9 +93,8 @@ def simulation(pool: Pool, job: FitJob) -> SimulationJob:
 
 def test_a_special_law_takes_over_the_numbers_of_a_general_one(tmp_path: Path) -> None:
     with Pool(swaying(tmp_path, frames=10), OPTIONS, workers=1) as pool:
-        bench = Workspace(pool)
-        bench.starts = {"train": None}
         model = pool.local.model(("wind", "point_mass"))
+        bench = Workspace(pool, starts.begin(model, pool.recording.trials("all")))
         values = dict(zip(model.parameters, np.arange(10.0, 10.0 + len(model.parameters)), strict=True))
         names = ("bending_stiffness", "wind.velocity.1", "wind.c_d", "point_mass.mass")
         params = tuple(model.params[model.parameters.index(n)] for n in names)
@@ -112,9 +111,9 @@ def test_a_special_law_takes_over_the_numbers_of_a_general_one(tmp_path: Path) -
 
 def test_a_model_loses_an_effect_and_starts_from_several_baselines(tmp_path: Path) -> None:
     with Pool(swaying(tmp_path, frames=10), OPTIONS, workers=1) as pool:
-        bench = Workspace(pool)
-        bench.starts, bench.early = {"train": None}, np.array([1.0, 2.0, 3.0])
         model = pool.local.model(("air_drag", "point_mass"))
+        start = starts.begin(model, pool.recording.trials("all"))
+        bench = Workspace(pool, start, early=np.array([1.0, 2.0, 3.0]))
         values = np.arange(10.0, 10.0 + len(model.parameters))
         names = ("bending_stiffness", "air_drag.c_d", "point_mass.mass")
         params = tuple(model.params[model.parameters.index(n)] for n in names)

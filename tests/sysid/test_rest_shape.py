@@ -47,9 +47,9 @@ def test_a_rest_shape_is_given_up_only_where_a_straight_rope_fits_better(
         bench = Workspace(pool)
         model = pool.local.model(())
         assert model.rest == "given"
-        found = baseline.calibrate_baseline(bench, 12, 4, np.random.default_rng(0), lambda *_: None)
-        assert pool.local.model(()).rest == rest
-        numbers = dict(zip(pool.local.model(found.effects).parameters, found.values, strict=True))
+        bench, found = baseline.calibrate_baseline(bench, 12, 4, np.random.default_rng(0), lambda *_: None)
+        assert bench.pool.local.model(()).rest == rest and pool.local.model(()).rest == "given"
+        numbers = dict(zip(bench.pool.local.model(found.effects).parameters, found.values, strict=True))
         assert numbers["bending_stiffness"] == pytest.approx(1.5e-3, rel=0.15)
         assert ("rest_share" in numbers) == (rest == "given")
 
@@ -58,16 +58,15 @@ def test_a_rest_shape_is_given_up_only_where_a_straight_rope_fits_better(
 def test_a_rest_shape_that_was_given_up_is_tried_again_with_an_effect(tmp_path: Path) -> None:
     recording = made(tmp_path, 1.0)
     with Pool(recording, model_options(recording, 31), 1) as pool:
-        bench = Workspace(pool)
-        pool.choose(rest="straight")
-        model = pool.local.model(())
-        bench.begin(model.guess(), ())
+        bench = Workspace(pool.with_options(rest="straight"))
+        model = bench.pool.local.model(())
+        bench = bench.begin(model.guess(), ())
         names, start = tuple(model.parameters), bench.starts["train"]
         straight = bench.fit([FitJob((), model.guess()[None], names, (1.0,) * len(names), 4, start)])[0]
         before = np.sqrt(np.mean(bench.gaps(straight, "test") ** 2))
-        found = baseline.go_further(bench, straight, 6, lambda *_: None)
-        assert pool.local.model(()).rest == "given" == dict(found.options)["rest"]
-        numbers = dict(zip(pool.local.model(found.effects).parameters, found.values, strict=True))
+        bench, found = baseline.go_further(bench, straight, 6, lambda *_: None)
+        assert bench.pool.local.model(()).rest == "given" == dict(found.options)["rest"]
+        numbers = dict(zip(bench.pool.local.model(found.effects).parameters, found.values, strict=True))
         assert numbers["rest_share"] == pytest.approx(1.0, abs=0.1)
         left = np.sqrt(np.mean(bench.gaps(found, "test") ** 2))
         assert left < 0.2 * before

@@ -17,12 +17,15 @@ from tests.vision.test_segment import COLORS, swinging
 from torchdlo.vision.segment import Ranges, load_ranges, ranges_of
 from torchdlo.vision.segment_server import segment_server
 
+BAR = ((0.0, 0.0, 0.02, 0.03), (0.97, 0.98, 1.0, 1.0))
+"""What is left out of pictures, which the page cannot set."""
+
 
 @pytest.fixture
 def served(tmp_path: Path) -> Iterator[tuple[str, Path]]:
     """The address of a page, and the file that it saves."""
     out = tmp_path / "segment.json"
-    server = segment_server(swinging(3).pictures, Ranges(), out)
+    server = segment_server(swinging(3).pictures, Ranges(ignore=BAR), out)
     thread = threading.Thread(target=server.serve_forever, daemon=True)
     thread.start()
     try:
@@ -49,6 +52,7 @@ def test_only_its_own_page_may_ask(served: tuple[str, Path]) -> None:
     own = address.rstrip("/")
     body = {"ranges": {"hue": [0, 10]}}
     assert ask(address)[0] == 200 and ask(address + "state")[1]["frames"] == 3
+    assert ask(address + "state")[1]["ranges"]["ignore"] == [list(part) for part in BAR]
     assert ask(address, Host="evil.example")[0] == 403
     assert ask(address + "save", body)[0] == 403  # no origin
     assert ask(address + "save", body, Origin="http://evil.example")[0] == 403
@@ -81,6 +85,7 @@ def test_a_person_clicks_on_the_rope_and_saves(served: tuple[str, Path]) -> None
         page.run("document.getElementById('limits').requestSubmit()")
         page.wait("document.getElementById('said').textContent.startsWith('saved')")
         assert all(c.startswith("asked for http://127.0.0.1") for c in page.complaints), page.complaints
+    assert load_ranges(out).ignore == BAR
     low, high = load_ranges(out).hue
     middle = sum(ranges_of(COLORS[0]).hue) / 2
     assert low < middle < high

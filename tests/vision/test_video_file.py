@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from torchdlo.errors import InputError
+from torchdlo.vision import video_file
 from torchdlo.vision.video_file import frame_rate, read_video, write_video
 
 
@@ -44,3 +45,13 @@ def test_a_varying_frame_rate_is_refused_and_a_dropped_picture_is_not() -> None:
         frame_rate(Path("a.mp4"), list(np.cumsum(np.where(np.arange(60) % 3, 0.033, 0.05))))
     with pytest.raises(InputError, match="rising times"):
         frame_rate(Path("a.mp4"), list(-even))
+
+
+def test_the_picture_before_stands_in_the_place_of_those_that_were_dropped(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shown = [(np.full((2, 2, 3), k, np.uint8), k / 30.0) for k in range(40) if k not in (20, 21)]
+    monkeypatch.setattr(video_file, "_decoded", lambda path: iter(shown))
+    pictures, fps = read_video(tmp_path / "a.mp4")
+    assert fps == pytest.approx(30.0)
+    assert pictures[:, 0, 0, 0].tolist() == [*range(20), 19, 19, *range(22, 40)]

@@ -15,7 +15,8 @@ from torchdlo.cli.agent import plan, propose
 from torchdlo.cli.datasets import dataset, learn, sweep
 from torchdlo.cli.doctor import doctor
 from torchdlo.cli.identification import calibrate, design_experiment, diagnose
-from torchdlo.cli.policies import deploy, distill, evaluate, export, train
+from torchdlo.cli.policies import evaluate, train
+from torchdlo.cli.policy_deployment import deploy, distill, export
 from torchdlo.cli.recordings import check, import_deform
 from torchdlo.cli.sample import sample
 from torchdlo.cli.scenes import simulate, view

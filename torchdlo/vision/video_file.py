@@ -36,6 +36,8 @@ def av() -> Any:
 def read_video(path: str | Path, *, most: int = _MOST) -> tuple[np.ndarray, float]:
     """Return the pictures of a film, RGB (F, H, W, 3) uint8, and pictures per second [1/s].
 
+    In the place of pictures that were dropped are those before, as in a film that was encoded at a constant rate.
+
     Raises:
         InputError: It cannot be read, or its pictures are turned or not evenly spaced in time.
     """
@@ -49,7 +51,19 @@ def read_video(path: str | Path, *, most: int = _MOST) -> tuple[np.ndarray, floa
         times.append(time)
     if not pictures:
         raise InputError(f"{path}: expected a film, found no picture in it; record or copy the file again.")
-    return np.stack(pictures), frame_rate(path, times)
+    fps = frame_rate(path, times)
+    number = _numbers(times, fps)
+    if number[-1] >= most:
+        raise InputError(f"{path}: expected at most {most} pictures, found times for more; cut the film.")
+    return np.stack([pictures[k] for k in np.searchsorted(number, np.arange(number[-1] + 1), side="right") - 1]), fps
+
+
+def _numbers(times: Sequence[float | None], fps: float) -> np.ndarray:
+    """Return which picture each one is (F,), counted by its time from the first: some may have been dropped."""
+    known = np.array([np.nan if t is None else t for t in times], dtype=float)
+    if not np.isfinite(known).all():
+        return np.arange(len(known))
+    return np.cumsum([0, *np.maximum(np.round(np.diff(known) * fps), 1).astype(int)])
 
 
 def frame_rate(path: Path, times: Sequence[float | None]) -> float:
@@ -61,7 +75,7 @@ def frame_rate(path: Path, times: Sequence[float | None]) -> float:
     usual = float(np.median(steps))
     if usual <= 0:
         raise InputError(f"{path}: expected rising times of its pictures, found others; encode the film again.")
-    # A picture that was dropped leaves a whole gap, which health of masks handles; a varying rate does not.
+    # A picture that was dropped leaves a whole gap, which `read_video` fills; a varying rate does not.
     share = steps / usual
     uneven = np.abs(share - np.round(share)) > _UNEVEN
     if uneven.mean() > 0.02 or (np.round(share) != 1).mean() > 0.2:

@@ -45,7 +45,7 @@ def test_what_was_executed_earns_again_what_is_kept(made: Path) -> None:
         assert np.allclose(state[:, 8:11], world.tool.pos[:, 0], atol=1e-5)
         assert np.allclose(state[:, :7], world.joints[:, 0, :7], atol=1e-4)
         world = episode.act(scene, world, actions[:, k])
-        reward = episode.episode_reward(scene, world)[0]
+        reward = episode.episode_reward(scene, world)[1]
         assert np.allclose(columns["next.reward"].reshape(5, 4)[:, k], reward, atol=1e-5)
     sums = columns["next.reward"].reshape(5, 4).sum(1)
     assert np.allclose([row["return"] for row in rows], sums, atol=1e-5)

@@ -14,10 +14,11 @@ from lead import Lead, found
 
 from torchdlo import envs
 from torchdlo.agents.policies import save_policy
-from torchdlo.agents.rl import robustness
-from torchdlo.agents.rl.expert import candidate_experts
+from torchdlo.agents.rl.disturbances import Disturbance, disturbed_params
+from torchdlo.agents.rl.episodes import TaskEpisodes
+from torchdlo.agents.rl.expert import candidate_experts, follow_experts
 from torchdlo.agents.rl.hybrid_stages import task_policy
-from torchdlo.agents.rl.robustness import PERTURBATIONS, Disturbance, following, perturbed, replaying, table
+from torchdlo.agents.rl.robustness import PERTURBATIONS, following, perturbed, replaying, table
 from torchdlo.agents.rl.settings import training_preset
 from torchdlo.cli import app
 from torchdlo.errors import InputError
@@ -55,14 +56,43 @@ def test_actors_see_the_same_starts_and_the_same_noise(tmp_path: Path):
 def test_friction_and_stiffness_are_what_they_are_said_to_be():
     task = envs.find("wiring_post")
     scene, params, _ = task.start(1)
-    changed = robustness._changed(params, Disturbance(friction=0.5, stiffness=1.5), scene, task)
+    changed = disturbed_params(params, Disturbance(friction=0.5, stiffness=1.5), scene, task)
     assert changed.effects["rod_contact"]["mu_k"].item() == pytest.approx(0.125)
     assert changed.effects["table_friction"]["mu"].item() == pytest.approx(0.15)
     assert changed.effects["damping"]["rate"].item() == 30.0
     torch.testing.assert_close(changed.bodies.mu_k, 0.5 * params.bodies.mu_k)
     torch.testing.assert_close(changed.rods.material.bend, 1.5 * params.rods.material.bend)
     with pytest.raises(InputError, match="cannot be played with"):
-        robustness._changed(params, Disturbance(stiffness=1e6), scene, task)
+        disturbed_params(params, Disturbance(stiffness=1e6), scene, task)
+
+
+def test_each_episode_has_a_rope_of_its_own_and_the_same_seed_the_same_ones():
+    made = [TaskEpisodes(Lead(), 6, seed=4, disturbed=0.5) for _ in range(2)]
+    stiff = []
+    for episodes in made:
+        usual = episodes.env.episode.params.rods.material
+        episodes.reset()
+        now = episodes.env.episode.params.rods.material
+        factor = now.bend / usual.bend
+        assert factor.shape[0] == 6
+        assert 0.5 <= float(factor.min()) < 0.95 < 1.05 < float(factor.max()) <= 1.5
+        torch.testing.assert_close(now.twist, factor * usual.twist)
+        stiff.append(factor)
+        episodes.reset()
+        assert not torch.equal(episodes.env.episode.params.rods.material.bend / usual.bend, factor)
+    assert torch.equal(*stiff)
+    with pytest.raises(InputError, match="disturbed"):
+        TaskEpisodes(Lead(), 2, disturbed=1.0).reset()
+
+
+def test_experts_are_compared_with_the_same_ropes(tmp_path: Path):
+    expert = candidate_experts(Lead(), [found(tmp_path)])[0]
+    episodes = TaskEpisodes(Lead(), 6, seed=1, disturbed=0.5)
+    rows = follow_experts([expert, expert], episodes, noise=0.0, generator=torch.Generator().manual_seed(0))
+    bend = episodes.env.episode.params.rods.material.bend
+    assert torch.equal(bend[:3], bend[3:])
+    assert not torch.equal(bend[0], bend[1])
+    assert rows[0] == rows[1]
 
 
 class Droop(Lead):

@@ -202,7 +202,7 @@ def play_batch(
         before, world = world, episode.act(made, world, executed)
         if k == task.horizon - 1:
             world = episode.finish(made, world)
-        reward = episode.episode_reward(made, world)[0]
+        reward = episode.episode_reward(made, world)[1]
         success = task.success(world.seen(task.arms.count)) & ~world.failed
         pose = torch.cat([target, aim.quat], -1)
         steps.append(_Step(before, action, executed, pose, joints[..., :JOINTS], reward, success))

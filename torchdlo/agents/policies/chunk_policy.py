@@ -12,6 +12,7 @@ and a policy that is told both succeeds blind.
 from __future__ import annotations
 
 import itertools
+import zipfile
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -166,8 +167,8 @@ def save_policy(path: Path, policy: ChunkPolicy, about: dict[str, Any], *, small
         path: the file.
         policy: the policy.
         about: what else is to be known of it, as plain data.
-        small: whether to round weights, to 16 bits, those of large matrices to 8 with a scale for each row: a quarter
-            of the size.
+        small: whether to round weights, to 16 bits, those of large matrices to 8 with a scale for each row, and to
+            compress the file: a fifth of the size.
     """
     weights: dict[str, Any] = policy.state_dict()
     if small:
@@ -175,6 +176,17 @@ def save_policy(path: Path, policy: ChunkPolicy, about: dict[str, Any], *, small
     content = {"generator": GENERATOR, "shape": asdict(policy.shape), "about": about, "weights": weights}
     with replace_atomically(path) as temporary:
         torch.save(content, temporary)
+        if small:
+            _compress(temporary)
+
+
+def _compress(path: Path) -> None:
+    """Compress the entries of a file of `torch.save`, an archive that need not be stored as it is."""
+    with zipfile.ZipFile(path) as archive:
+        found = {info.filename: archive.read(info) for info in archive.infolist()}
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, content in found.items():
+            archive.writestr(zipfile.ZipInfo(name), content, zipfile.ZIP_DEFLATED, 9)
 
 
 def _rounded(x: Tensor) -> Tensor | dict[str, Tensor]:

@@ -7,13 +7,15 @@ to bootstrap there.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import torch
 from torch import Tensor
 
+from torchdlo.agents.rl.disturbances import drawn_params
 from torchdlo.envs import Task
+from torchdlo.errors import InputError
 from torchdlo.physics.execution import Execution
 
 __all__ = ["EnvEpisodes", "Episodes", "TaskEpisodes", "Transition"]
@@ -120,6 +122,7 @@ class TaskEpisodes:
         scale: float = 1.0,
         bonus: float = 0.0,
         randomize: dict[str, float] | None = None,
+        disturbed: float = 0.0,
     ) -> None:
         """Make the scenes.
 
@@ -135,6 +138,8 @@ class TaskEpisodes:
             scale: what rewards are multiplied by.
             bonus: what success earns at the end, after scaling.
             randomize: see `torchdlo.envs.make`.
+            disturbed: by how much friction and stiffness of ropes differ from scene to scene, as shares of their own;
+                drawn at every reset.
         """
         from torchdlo.envs.core.env import DloEnv
         from torchdlo.envs.core.episode import quick_execution
@@ -153,6 +158,9 @@ class TaskEpisodes:
         self.task, self.count, self.horizon = task, count, task.horizon
         self.generator = self.env.generator
         self.ends, self.scale, self.bonus = ends, scale, bonus
+        if disturbed and randomize:
+            raise InputError("randomize and disturbed: both draw friction anew; give one of them.")
+        self.disturbed, self._usual = disturbed, self.env.episode.params
         self._over = 0
         self.returns = torch.zeros(count)
         """What the task itself pays, without the rest."""
@@ -161,8 +169,17 @@ class TaskEpisodes:
         """Begin anew; return observations (N, O)."""
         self._over = 0
         self.returns = torch.zeros(self.count)
+        if self.disturbed:
+            self.disturb(torch.rand(self.count, 2, generator=self.generator))
         self.first = self.env.reset()["observation"].detach()
         return self.first
+
+    def disturb(self, random: Tensor) -> None:
+        """Give each scene a friction and a stiffness of its own, which numbers (N, 2) between 0 and 1 decide."""
+        env = self.env
+        self.random = random
+        params = drawn_params(self._usual, self.disturbed, env.episode.scene, self.task, random)
+        env.episode = replace(env.episode, params=params)
 
     def begin(self, moved: Tensor) -> Tensor:
         """Begin anew with things that far off their places [m], shape (N, things, 3); return observations (N, O)."""

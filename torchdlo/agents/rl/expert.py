@@ -188,6 +188,8 @@ def share_starts(episodes: TaskEpisodes, each: int) -> None:
     env, copies = episodes.env, episodes.count // each
     env.world = tree.map(lambda x: x[:each].repeat(copies, *[1] * (x.dim() - 1)), env.world)
     env.moved = env.moved[:each].repeat(copies, 1, 1)
+    if episodes.disturbed:
+        episodes.disturb(episodes.random[:each].repeat(copies, 1))
 
 
 def _spread(knots: Tensor, horizon: int) -> Tensor:
@@ -229,6 +231,7 @@ def improve_expert(
     enough: float = 0.99,
     minutes: float = math.inf,
     judged: Task | None = None,
+    disturbed: float = 0.0,
     journal: Path | None = None,
     callback: Callback | None = None,
 ) -> tuple[Expert, list[dict[str, Any]], int]:
@@ -249,6 +252,8 @@ def improve_expert(
         enough: see above.
         minutes: budget of the clock.
         judged: the task itself where `task` is its surrogate: what the search found has to be better there.
+        disturbed: by how much friction and stiffness vary from episode to episode, as shares of their own; it grows
+            from nothing over the first half of the generations.
         journal: file that keeps how candidates did; a search that finds one of the same choices goes on from there.
         callback: told (stage, generations done, all, message).
     """
@@ -257,10 +262,11 @@ def improve_expert(
         raise InputError(f"{task.name}: there is no trajectory that succeeds; search one with torchdlo optimize first.")
     choices = [task.name, task.fidelity.text, seed, starts, population, sigma, noise]
     choices += [] if judged is None else [judged.fidelity.text]
+    choices += [disturbed] if disturbed else []
     kept = _Journal(journal, choices)
     arena = _Arena(task, seed, noise, kept)
     final = arena if judged is None else _Arena(judged, seed, noise, kept)
-    scores = arena.scores(experts, 2 * starts, 0)
+    scores = arena.scores(experts, 2 * starts, 0, disturbed)
     scale = max(abs(s.returns) for s in scores) or 1.0
     best = max(range(len(experts)), key=lambda k: scores[k].value(scale))
     log: list[dict[str, Any]] = [{"source": e.source, **vars(s)} for e, s in zip(experts, scores, strict=True)]
@@ -275,7 +281,8 @@ def improve_expert(
             break
         asked = search.ask()
         mean = _changed(base, torch.tensor(search.mean), task)
-        scores = arena.scores([mean, *(_changed(base, torch.tensor(x), task) for x in asked)], starts, 1 + k)
+        candidates = [mean, *(_changed(base, torch.tensor(x), task) for x in asked)]
+        scores = arena.scores(candidates, starts, 1 + k, disturbed * min(1.0, 2 * (k + 1) / generations))
         search.tell(asked, [-s.value(scale) for s in scores[1:]])
         log.append({"generation": k, **vars(scores[0]), "best": max(s.success for s in scores[1:])})
         good = good + 1 if scores[0].success >= enough else 0
@@ -285,7 +292,7 @@ def improve_expert(
     if good < 3:
         mean = _changed(base, torch.tensor(search.mean), task)
     # A search may lose its way: the path that it began with is the one to beat, from starts that neither has seen.
-    scores = final.scores([base, mean], 4 * starts, 100_000)
+    scores = final.scores([base, mean], 4 * starts, 100_000, disturbed)
     log += [{"playoff": name, **vars(s)} for name, s in zip(("before", "after"), scores, strict=True)]
     played = arena.played + (0 if final is arena else final.played)
     return (mean if scores[1].value(scale) >= scores[0].value(scale) else base), log, played
@@ -299,14 +306,15 @@ class _Arena:
         self.played = 0
         self._made: TaskEpisodes | None = None
 
-    def scores(self, experts: list[Expert], starts: int, number: int) -> list[ExpertScore]:
-        """Return how each candidate did from as many starts, which are the same for all."""
+    def scores(self, experts: list[Expert], starts: int, number: int, disturbed: float) -> list[ExpertScore]:
+        """Return how each candidate did from as many starts, which are the same for all, and so are disturbances."""
         count = starts * len(experts)
         self.played += count
         found = self.journal.recall()
         if found is None:
             if self._made is None or self._made.count != count:
                 self._made = TaskEpisodes(self.task, count)
+            self._made.disturbed = disturbed
             self._made.generator.manual_seed(self.seed + number)
             random = torch.Generator().manual_seed(self.seed + 500_000 + number)
             found = follow_experts(experts, self._made, noise=self.noise, generator=random)

@@ -28,7 +28,7 @@ from torchdlo.agents.rl.ppo import Ppo
 from torchdlo.agents.rl.rollout import collect_episodes
 from torchdlo.agents.rl.settings import TrainingSettings
 from torchdlo.agents.torch_records import load_checkpoint, save_checkpoint
-from torchdlo.envs import PUBLISHED, Task, with_fidelity
+from torchdlo.envs import PUBLISHED, Fidelity, Task, with_fidelity
 from torchdlo.errors import InputError
 from torchdlo.journal import read_json, write_json
 
@@ -69,6 +69,9 @@ class Hybrid:
     """Share of successes on validation starts from which there is nothing to tune."""
     tune_episodes: int = 1280
     """Budget of the last stage."""
+    disturbed: float = 0.0
+    """By how much friction and stiffness of ropes vary from episode to episode in all stages, as shares of their own;
+    annealed from nothing in the first one."""
 
 
 _PLANS: dict[str, dict[str, float]] = {
@@ -200,6 +203,7 @@ def _robust(
         sigma=plan.search_sigma,
         noise=plan.search_noise,
         judged=coarse if surrogate else None,
+        disturbed=plan.disturbed,
         journal=folder / "robust.json",
         callback=told,
     )
@@ -229,10 +233,15 @@ def _clone(
         raise InputError(f"{folder / 'expert.json'}: there is no expert to clone; run the stage robust first.")
     began, labels, rng = time.process_time(), Labels(), torch.Generator().manual_seed(settings.seed)
     torch.manual_seed(settings.seed)
-    coarse = TaskEpisodes(with_fidelity(task, task.coarse), plan.count, seed=settings.seed + 11)
-    rounds = [coarse] * (1 + plan.rounds)
+
+    def batches(fidelity: Fidelity, seed: int) -> TaskEpisodes:
+        return TaskEpisodes(
+            with_fidelity(task, fidelity), plan.count, seed=settings.seed + seed, disturbed=plan.disturbed
+        )
+
+    rounds = [batches(task.coarse, 11)] * (1 + plan.rounds)
     if plan.final:
-        rounds += [TaskEpisodes(with_fidelity(task, PUBLISHED), plan.count, seed=settings.seed + 12)] * plan.final
+        rounds += [batches(PUBLISHED, 12)] * plan.final
     keeper = _Keeper(folder / "clone.part", {"policy": policy, "labels": labels}, [rng, *_generators(rounds)])
     log, played = keeper.restore() if resume else [], 0
     for k, episodes in enumerate(rounds):
@@ -298,7 +307,7 @@ def _tune(
 ) -> Policy:
     began = time.process_time()
     fine = with_fidelity(task, PUBLISHED)
-    judge = TaskEpisodes(fine, plan.validation, seed=settings.seed + _VALIDATION)
+    judge = TaskEpisodes(fine, plan.validation, seed=settings.seed + _VALIDATION, disturbed=plan.disturbed)
     start = judge.generator.get_state()
 
     def success(policy: Policy) -> tuple[float, float]:
@@ -307,7 +316,9 @@ def _tune(
         return float(found.success.float().mean()), float(judge.returns.mean())
 
     best = copy.deepcopy(policy)
-    episodes = TaskEpisodes(fine, settings.count, seed=settings.seed + 13, bonus=settings.bonus)
+    episodes = TaskEpisodes(
+        fine, settings.count, seed=settings.seed + 13, bonus=settings.bonus, disturbed=plan.disturbed
+    )
     ppo = Ppo(policy, settings, fixed=True)
     torch.manual_seed(settings.seed)
     keeper = _Keeper(folder / "tune.part", ppo.parts() | {"best": best}, [episodes.generator])

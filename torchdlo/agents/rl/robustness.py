@@ -7,41 +7,24 @@ world, and the expert that was made robust. All see the same starts and the same
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from torchdlo import scene as scenes
 from torchdlo.agents.policies import Policy
+from torchdlo.agents.rl.disturbances import Disturbance, disturbed_params
 from torchdlo.agents.rl.episodes import TaskEpisodes
 from torchdlo.agents.rl.evaluate import UNSEEN, wilson_interval
 from torchdlo.agents.rl.expert import Expert
 from torchdlo.agents.rl.rollout import policy_features
 from torchdlo.envs import PUBLISHED, Task, with_fidelity
-from torchdlo.errors import InputError
-from torchdlo.physics import tree
-from torchdlo.scene import Params
 
-__all__ = ["PERTURBATIONS", "Actor", "Disturbance", "following", "perturbed", "policy_acting", "replaying", "table"]
+__all__ = ["PERTURBATIONS", "Actor", "following", "perturbed", "policy_acting", "replaying", "table"]
 
 Actor = Callable[[int, TaskEpisodes, Tensor, slice], Tensor]
 """Says what to do after so many actions in the episodes of a slice, in units of the greatest way of a tool (N, 3 R)."""
-
-
-@dataclass(frozen=True)
-class Disturbance:
-    """What is not as it was in training."""
-
-    friction: float = 1.0
-    """Factor of all friction of ropes: with themselves, the table and bodies, and of bodies with each other."""
-    stiffness: float = 1.0
-    """Factor of the ropes' stiffness in bending and torsion."""
-    start: float = 1.0
-    """Factor of how far starts vary."""
-    noise: float = 0.0
-    """Deviation of what is added to each action [m]."""
 
 
 PERTURBATIONS = {
@@ -147,7 +130,7 @@ def _played(
     episodes = TaskEpisodes(task, each * len(actors), seed=UNSEEN + 1000 * seed)
     first = next(iter(chosen.values()))
     env = episodes.env
-    env.episode = replace(env.episode, params=_changed(env.episode.params, first, env.episode.scene, task))
+    env.episode = replace(env.episode, params=disturbed_params(env.episode.params, first, env.episode.scene, task))
     drawn = task.moved(starts, generator=torch.Generator().manual_seed(UNSEEN + 1000 * seed))
     moved = torch.cat([drawn * p.start for p in chosen.values()]).repeat(len(actors), 1, 1)
     seen = episodes.begin(moved)
@@ -177,29 +160,6 @@ def _row(good: Tensor, returns: Tensor, failed: Tensor) -> dict[str, Any]:
         "return": float(returns.mean()),
         "failed": float(failed.float().mean()),
     }
-
-
-_FRICTION = (("rod_contact", "mu_s"), ("rod_contact", "mu_k"), ("table_friction", "mu"))
-
-
-def _changed(params: Params, how: Disturbance, scene: scenes.Scene, task: Task) -> Params:
-    """Return parameters with other friction and stiffness."""
-    effects = {name: dict(values) for name, values in params.effects.items()}
-    for effect, number in _FRICTION:
-        if number in effects.get(effect, {}):
-            effects[effect][number] = effects[effect][number] * how.friction
-    material = params.rods.material
-    material = tree.replace(material, bend=material.bend * how.stiffness, twist=material.twist * how.stiffness)
-    bodies = params.bodies
-    if scene.bodies:
-        own = tree.part(bodies)
-        bodies = tree.replace(own, mu_s=own.mu_s * how.friction, mu_k=own.mu_k * how.friction)
-    changed = tree.replace(params, effects=effects, rods=tree.replace(params.rods, material=material), bodies=bodies)
-    try:
-        scenes.check_step(scene, changed)
-    except ValueError as error:
-        raise InputError(f"perturbation: {task.name} cannot be played with {how}: {error}") from None
-    return changed
 
 
 def table(results: Mapping[str, Any]) -> str:

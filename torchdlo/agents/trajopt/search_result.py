@@ -15,7 +15,7 @@ from torchdlo.agents.trajopt.problem import Evaluation, Problem
 from torchdlo.agents.trajopt.search import SearchResult, SearchSettings
 from torchdlo.agents.trajopt.search_journal import code_versions, program_hash
 from torchdlo.errors import InputError
-from torchdlo.physics.execution import EXECUTIONS, Execution
+from torchdlo.physics.execution import EXECUTIONS, Execution, execution_named
 from torchdlo.untrusted import Entry, one_line, read_entry
 
 __all__ = [
@@ -120,10 +120,10 @@ def execution_of(choices: Entry) -> Execution:
     """Return how steps of a search ran; files of 0.1 say it by two flags."""
     if "execution" in choices:
         said = choices["execution"]
-        for known in EXECUTIONS:
-            if said.value == known:
-                return known
-        raise said.wrong(f"one of {', '.join(EXECUTIONS)}")
+        found = execution_named(said.value)
+        if found is None:
+            raise said.wrong(f"one of {', '.join(EXECUTIONS)}")
+        return found
     if choices["compiled"].flag():
         return "compiled"
     return "recorded" if choices.get("recorded", False).flag() else "eager"

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchdlo.coupling.bodies import shape_sdf
 from torchdlo.coupling.bodies.dynamics import PredictedBodyMotion
-from torchdlo.physics.kernels import native
+from torchdlo.physics.kernels import cuda, native
 
 _OPTIONS = ("-fno-math-errno", "-fno-trapping-math", "-Wno-psabi")
 _operators = torch.library.Library("torchdlo", "FRAGMENT")
@@ -27,13 +27,16 @@ def _constant(ask: Callable) -> Callable:
     return ask
 
 
-def kernel(name: str, what: str, *options: str) -> tuple[Callable, Callable[[str, torch.dtype], bool]]:
+def kernel(
+    name: str, what: str, *options: str, gpu: bool = False
+) -> tuple[Callable, Callable[[str, torch.dtype], bool]]:
     """Return what finds a function of a C++ kernel by its name and the dtype of its numbers, and `ready`.
 
     Args:
         name: of the source file, beside this one.
         what: what it does, in words of the user.
         options: what the compiler is told besides the usual.
+        gpu: whether it works on CUDA devices, too; see `on_gpu`.
     """
 
     @functools.cache
@@ -48,12 +51,44 @@ def kernel(name: str, what: str, *options: str) -> tuple[Callable, Callable[[str
     @_constant
     def ready(device: str, dtype: torch.dtype) -> bool:
         """Return whether the kernel works for tensors of a kind of device and a dtype."""
+        if gpu and device == "cuda" and cuda.ready(native.COUPLING / f"{name}.cpp", options, dtype):
+            return True
         return native.works_on(device, what) and dtype in _KINDS and library() is not None
 
     return function, ready
 
 
-def operator(schema: str, run: Callable, empty: Callable, save=None, backward=None) -> None:
+def on_gpu(
+    name: str, what: str, sizes: ctypes.Structure, arrays: Sequence, like: Tensor, scenes: int, *options: str
+) -> None:
+    """Run an entry of a kernel on the device of a tensor.
+
+    Args:
+        name: of the source file.
+        what: of the entry.
+        sizes: its sizes; addresses in it are those of `numbers`.
+        arrays: what `fields` returns, and addresses.
+        like: a tensor with its dtype, on its device.
+        scenes: how many there are.
+        options: those of `kernel`.
+    """
+    launch = cuda.launcher(native.COUPLING / f"{name}.cpp", options, like.dtype, what == "back", like.device)
+    addresses = [at for x in arrays for at in (x if isinstance(x, ctypes.Array) else [x])]
+    cuda.run(launch, f"{name}_{what}", sizes, addresses, scenes, like)
+
+
+def uses_gpu(like: Tensor) -> bool:
+    """Return whether what works on CUDA devices is to work on a tensor."""
+    return like.is_cuda
+
+
+def numbers(values: Sequence[int], like: Tensor) -> int:
+    """Return the address of whole numbers that stay in the memory of a tensor's device."""
+    given = tuple(values)
+    return cuda.integers(given, like.device).data_ptr() if uses_gpu(like) else integers(given)
+
+
+def operator(schema: str, run: Callable, empty: Callable, save=None, backward=None, gpu: bool = False) -> None:
     """Register an operator `torch.ops.torchdlo.NAME` that runs a kernel on the CPU.
 
     Args:
@@ -62,10 +97,12 @@ def operator(schema: str, run: Callable, empty: Callable, save=None, backward=No
         empty: what makes outputs of the right shapes for the compiler.
         save: see `setup_context` of `torch.library.register_autograd`.
         backward: its derivative; None if it has none.
+        gpu: whether `run` works on CUDA devices, too.
     """
     name = schema.partition("(")[0]
     _operators.define(schema, tags=(torch.Tag.needs_contiguous_strides,))
-    _operators.impl(name, run, "CPU")
+    for device in ("CPU", "CUDA") if gpu else ("CPU",):
+        _operators.impl(name, run, device)
     _operators.impl(name, empty, "Meta")
     if backward is not None:
         torch.library.register_autograd(f"torchdlo::{name}", backward, setup_context=save, lib=_operators)

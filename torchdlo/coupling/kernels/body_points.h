@@ -3,9 +3,6 @@
 #pragma once
 #include "edge_points.h"
 
-#include <algorithm>
-#include <vector>
-
 template <typename T>
 struct Point {
   Lanes<T> share;
@@ -32,13 +29,13 @@ struct Solid {
     return {xx * t.x + xy * t.y + xz * t.z, xy * t.x + yy * t.y + yz * t.z, xz * t.x + yz * t.y + zz * t.z};
   }
   void add_turned(const Vec<T>& a, const Vec<T>& b) {  // derivative of a . turned(b)
-    xx += a.x * b.x, yy += a.y * b.y, zz += a.z * b.z;
-    xy += a.x * b.y + a.y * b.x, xz += a.x * b.z + a.z * b.x, yz += a.y * b.z + a.z * b.y;
+    ADD(xx, a.x * b.x), ADD(yy, a.y * b.y), ADD(zz, a.z * b.z);
+    ADD(xy, a.x * b.y + a.y * b.x), ADD(xz, a.x * b.z + a.z * b.x), ADD(yz, a.y * b.z + a.z * b.y);
   }
   Vec<T> local(const Vec<T>& a) const { return {dot(axes[0], a), dot(axes[1], a), dot(axes[2], a)}; }
   Vec<T> world(const Vec<T>& a) const { return axes[0] * a.x + axes[1] * a.y + axes[2] * a.z; }
   void add_world(const Vec<T>& by, const Vec<T>& a) {  // derivative by the axes of by . world(a)
-    axes[0] += by * a.x, axes[1] += by * a.y, axes[2] += by * a.z;
+    ADD(axes[0], by * a.x), ADD(axes[1], by * a.y), ADD(axes[2], by * a.z);
   }
 };
 template <typename T>
@@ -71,8 +68,10 @@ struct Inputs {
   List<Solid<T>> bodies;
   List<Point<T>> points;  // made of the others
 
-  explicit Inputs(const Sizes& n)
-      : edges(n.vertices), vertices(n.vertices), bodies(n.bodies), points(n.families * n.vertices) {}
+  void take(const Sizes& n, Memory& memory) {
+    memory.common(edges, n.vertices), memory.common(vertices, n.vertices), memory.common(bodies, n.bodies);
+    memory.large(points, n.families * n.vertices);
+  }
   template <typename P>
   void all(P work) {
     work(edges, 0), work(vertices, 1), work(bodies, 2);
@@ -92,6 +91,7 @@ struct Geometry : Inputs<T> {
   Sizes n;
   struct Far {  // an edge, a body, and how much nearer they have to come before points of them matter
     int edge, body;
+    bool late;  // whether they have
     L gap, arm;
   };
   List<int> owner, piece, first;  // body of each family; piece of an edge, or -2 and -1 for its ends; by body
@@ -103,13 +103,22 @@ struct Geometry : Inputs<T> {
   Shifts change, vel;  // how vertices move now
   Turns motion, spin;  // and bodies
 
-  explicit Geometry(const Sizes& n)
-      : Inputs<T>(n), n(n), found(points.size()), searched(points.size()), distance(points.size()),
-        change(n.vertices), vel(n.vertices), motion(n.bodies), spin(n.bodies) {
+  Geometry(const Sizes& n, Memory& memory) : n(n) {
+    this->take(n, memory);
+    memory.common(change, n.vertices), memory.common(vel, n.vertices);
+    memory.common(motion, n.bodies), memory.common(spin, n.bodies), memory.common(first, n.bodies);
+    memory.common(owner, n.families), memory.common(piece, n.families);
+    memory.large(found, points.size()), memory.large(searched, points.size()), memory.large(distance, points.size());
+    memory.own(near, n.vertices, n.families), memory.own(far, n.vertices, n.bodies);
+  }
+  void number() {
+    int f = 0;
     for (int k = 0; k < n.bodies; ++k) {
-      first.push_back(owner.size());
-      for (int j = -2; j < n.pieces[k]; ++j) owner.push_back(k), piece.push_back(j);
+      if (lane() == 0) first[k] = f;
+      for (int j = -2; j < n.pieces[k]; ++j, ++f)
+        if (lane() == 0) owner[f] = k, piece[f] = j;
     }
+    meet();
   }
 
   int edge(int p) const { return p % n.vertices; }
@@ -138,10 +147,10 @@ struct Geometry : Inputs<T> {
     const Edge<T>& e = edges[v];
     const R whole = a.normal * normal + friction, couple = cross(friction, a.normal);
     const R pair = cross(couple, e.tangent) * e.lever, second = whole * a.share + pair;
-    f[v] += whole - second;
-    f[n.after[v]] += second;
-    m[body(p)].force -= whole;
-    m[body(p)].torque -= cross(a.arm, whole) + (couple - e.tangent * dot(e.tangent, couple)) * e.radius;
+    ADD(f[v], whole - second);
+    ADD(f[n.after[v]], second);
+    ADD(m[body(p)].force, -whole);
+    ADD(m[body(p)].torque, -(cross(a.arm, whole) + (couple - e.tangent * dot(e.tangent, couple)) * e.radius));
   }
   Force<T> seen(int p, const Shifts& x, const Turns& m) const {
     const R d = apart(p, x, m);
@@ -168,16 +177,17 @@ struct Geometry : Inputs<T> {
 
 
   void foresee() {
-    for (int v = 0; v < n.vertices; ++v) change[v] = vertices[v].change, vel[v] = vertices[v].vel;
-    for (int k = 0; k < n.bodies; ++k)
+    EVERY(v, n.vertices) change[v] = vertices[v].change, vel[v] = vertices[v].vel;
+    EVERY(k, n.bodies)
       motion[k] = {bodies[k].change, bodies[k].turn}, spin[k] = {bodies[k].vel, bodies[k].omega};
   }
   // Places points where edges may come near to bodies; the others wait, see `reach`.
   void prepare() {
     foresee();
+    meet();
     near.clear(), far.clear();
     for (int k = 0; k < n.bodies; ++k)
-      for (int v = 0; v < n.vertices; ++v) {
+      EVERY(v, n.vertices) {
         const Far f = distant(v, k);
         if (any((edges[v].real > T(0)) & ~(f.gap > edges[v].radius + T(2) * moved(f))))
           place(v, k);
@@ -186,18 +196,26 @@ struct Geometry : Inputs<T> {
       }
   }
   // Places the points of those that go so far by now that they may touch after all; as foreseen, like the others.
-  void reach() {
-    const auto touches = [&](const Far& f) { return any((edges[f.edge].real > T(0)) & ~(f.gap > moved(f))); };
-    const auto waits = [&](const Far& f) { return !touches(f); };
-    if (std::all_of(far.begin(), far.end(), waits)) return;
-    // Not std::stable_partition: its buffer is not aligned as lanes have to be.
-    List<Far> late, wait;
-    for (const Far& f : far) (touches(f) ? late : wait).push_back(f);
-    const Shifts shifts = change;
-    const Turns turns = motion;
+  // Returns whether there are any: all move as foreseen then.
+  bool reach() {
+    bool some = false;
+    for (Far& f : far) {
+      f.late = any((edges[f.edge].real > T(0)) & ~(f.gap > moved(f)));
+      some = some || f.late;
+    }
+    if (!anyone(some)) return false;
+    meet();
     foresee();
-    for (const Far& f : late) place(f.edge, f.body);
-    far.swap(wait), change = shifts, motion = turns;
+    meet();
+    size_t kept = 0;
+    for (size_t i = 0; i < size_t(far.size()); ++i)
+      if (far[i].late)
+        place(far[i].edge, far[i].body);
+      else
+        far[kept++] = far[i];
+    far.resize(kept);
+    meet();
+    return true;
   }
 
   static L size(const R& x) { return root<T>(dot(x, x)); }
@@ -212,13 +230,13 @@ struct Geometry : Inputs<T> {
     const R from = vertices[v].pos - b.pos, way = vertices[n.after[v]].pos - vertices[v].pos;
     const R at = b.local(from) + b.offset;
     const L length = size(way), out = n.shape[k] == PLANE ? at.z : size(at) - bounding<T>(n.shape[k], b.numbers);
-    return {v, k, out - length - edges[v].radius, size(from) + length};
+    return {v, k, false, out - length - edges[v].radius, size(from) + length};
   }
 
   // Whether an edge may come within a radius of a body in some scene, if it moves twice as far as foreseen.
   bool close(int p, const Line<T, 0>& line) const {
     const int v = edge(p), k = body(p), start = first[k] * n.vertices + v;
-    const L reach = T(2) * (edges[v].radius + moved({v, k, L{}, size(points[start].arm) + line.length.x}));
+    const L reach = T(2) * (edges[v].radius + moved({v, k, false, L{}, size(points[start].arm) + line.length.x}));
     return any((edges[v].real > T(0)) & (distance[start] - line.length.x <= reach));
   }
   T share(int family) const {
@@ -294,11 +312,11 @@ struct Geometry : Inputs<T> {
     const R dx = turned * by_turning;
     d.arm += cross(a.normal, dx) + a.arm * (by_sliding * b.agile);
     d.normal += cross(dx, a.arm);
-    db.agile += T(0.5) * by_sliding * dot(a.arm, a.arm);
+    ADD(db.agile, T(0.5) * by_sliding * dot(a.arm, a.arm));
     const L back = rebound(p);
     const auto bounces = (back > T(0)) & (back > simple(p));
     const L bounced = bounces ? d.wanted * T(n.dt) : zero, kept = bounces ? zero : d.wanted;
-    db.restitution += bounced * approach(p);
+    ADD(db.restitution, bounced * approach(p));
     exert(p, -bounced * b.restitution, R{}, dvel, dspin);
     tilt(p, -bounced * b.restitution, R{}, vel, spin, to);
     const L more = deep(p) > T(0) ? kept * T(1 - n.recovery) : zero;
@@ -316,11 +334,11 @@ struct Geometry : Inputs<T> {
     for (int i = 0; i < 10; ++i)
       g[i] = d.share * r[0].g[i] - dover * r[1].g[i] + normal.x * r[2].g[i] + normal.y * r[3].g[i] + normal.z * r[4].g[i];
     const R start = {g[0], g[1], g[2]}, along = {g[3], g[4], g[5]};
-    for (int i = 0; i < 4; ++i) db.numbers[i] += g[6 + i];
-    db.offset += start;
+    for (int i = 0; i < 4; ++i) ADD(db.numbers[i], g[6 + i]);
+    ADD(db.offset, start);
     db.add_world(from, start), db.add_world(way, along);
     dfrom += b.world(start), dway += b.world(along);
-    to.vertices[v].pos += dfrom - dway, to.vertices[w].pos += dway;
-    db.pos -= dfrom;
+    ADD(to.vertices[v].pos, dfrom - dway), ADD(to.vertices[w].pos, dway);
+    ADD(db.pos, -dfrom);
   }
 };

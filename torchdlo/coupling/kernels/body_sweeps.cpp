@@ -3,12 +3,15 @@
 // All arrays have the scenes last: (V, B) or (K, B) for each field of the structs in body_points.h, force on vertices (3),
 // force and torque on bodies (6).
 //
-// A block of scenes is worked on side by side; points that are active in none of them cost next to nothing.
+// A block of scenes is worked on side by side; points that are active in none of them cost next to nothing. On a GPU a
+// warp works on one scene, and its lanes on edges: what belongs to an edge, and to points of it, is only theirs.
 #include "body_points.h"
+#ifndef SIMT
 #include "flush.h"
 
 #include <memory>
 #include <vector>
+#endif
 
 template <typename T>
 struct Block : Geometry<T> {
@@ -17,41 +20,72 @@ struct Block : Geometry<T> {
   using G::near, G::edge, G::body, G::apart, G::exert, G::seen, G::tilt;
   typedef Lanes<T> L;
   typedef Vec<T> R;
-  struct Step {  // what a sweep starts from, and what it finds
-    List<Vec<T>> force;    // on vertices, from the sweep before
-    List<Wrench<T>> push;  // on bodies, likewise
-    List<Force<T>> found;
-    List<int> pressed, rubbing;  // points that are active in some scene
+  struct Part {  // some of a list
+    const int *from, *to;
+    const int* begin() const { return from; }
+    const int* end() const { return to; }
   };
-  List<Step> steps;
-  List<Vec<T>> force;
-  List<Wrench<T>> push;
-  List<L> active, load_, many, count, levers;
+  List<R> forces;                 // on vertices, before each sweep
+  List<Wrench<T>> pushes;         // on bodies, likewise
+  List<Force<T>> found;           // by points, after each sweep
+  List<int> pressed, rubbing;     // points that are active in some scene, sweep after sweep
+  List<int> presses_to, rubs_to;  // where those of each sweep end
+  List<R> force, dvel;
+  List<Wrench<T>> push, dspin;
+  List<L> active, load_, many, count, levers, dload, dlevers, soft;
+  List<Force<T>> by, later;  // derivatives by forces
+  List<char> used;
+  Inputs<T> to;
 
-  explicit Block(const Sizes& n)
-      : G(n), steps(n.sweeps), active(points.size()) {
-    for (Step& s : steps) s.found.resize(points.size());
+  Block(const Sizes& n, Memory& memory, bool derive) : G(n, memory) {
+    const int64_t all = points.size();
+    memory.common(load_, n.vertices), memory.common(many, n.vertices);
+    memory.common(count, n.bodies), memory.common(levers, n.bodies);
+    memory.common(forces, n.vertices * n.sweeps), memory.common(pushes, n.bodies * n.sweeps);
+    memory.common(force, n.vertices), memory.common(push, n.bodies);
+    memory.large(found, all * n.sweeps), memory.large(active, all);
+    memory.own(pressed, n.vertices, n.families * n.sweeps), memory.own(rubbing, n.vertices, n.families * n.sweeps);
+    memory.own(presses_to, 1, n.sweeps), memory.own(rubs_to, 1, n.sweeps);
+    if (!derive) return;
+    memory.common(dload, n.vertices), memory.common(dlevers, n.bodies);
+    memory.common(dvel, n.vertices), memory.common(dspin, n.bodies);
+    memory.large(soft, all), memory.large(by, all), memory.large(later, all), memory.large(used, all);
+    to.take(n, memory);
   }
 
-  void move(const Step& s) {
-    for (int v = 0; v < n.vertices; ++v) change[v] = vertices[v].change + vertices[v].answer.times(s.force[v]);
-    for (int k = 0; k < n.bodies; ++k) {
+  size_t at(int s, int p) const { return s * points.size() + p; }
+  static Part part(const List<int>& list, const List<int>& ends, int s) {
+    return {list.data() + (s ? ends[s - 1] : 0), list.data() + ends[s]};
+  }
+  Part pressing(int s) const { return part(pressed, presses_to, s); }
+  Part rubbers(int s) const { return part(rubbing, rubs_to, s); }
+  // Sets what belongs to points, each lane its own.
+  template <class S>
+  void blank_points(List<S>& list) const {
+    for (int f = 0; f < n.families; ++f) EVERY(v, n.vertices) list[f * n.vertices + v] = S{};
+  }
+
+  void move(int s) {
+    EVERY(v, n.vertices) change[v] = vertices[v].change + vertices[v].answer.times(forces[s * n.vertices + v]);
+    EVERY(k, n.bodies) {
       const Solid<T>& b = bodies[k];
-      motion[k] = {b.change + s.push[k].force * b.mobility, b.turn + b.turned(s.push[k].torque)};
+      const Wrench<T>& by = pushes[s * n.bodies + k];
+      motion[k] = {b.change + by.force * b.mobility, b.turn + b.turned(by.torque)};
     }
   }
 
   // Sums over active points that all softness is made of; `root` is the turning or the sliding part of a point.
-  void gather(const List<int>& list, L Point<T>::*root) {
-    const L zero{};
-    load_.assign(n.vertices, zero), many.assign(n.vertices, zero);
-    count.assign(n.bodies, zero), levers.assign(n.bodies, zero);
+  void gather(const Part& list, L Point<T>::*root) {
+    meet();
+    blank(load_), blank(many), blank(count), blank(levers);
+    meet();
     for (int p : list) {
       const L on = active[p], &s = points[p].share;
       const int v = edge(p), k = body(p);
-      load_[v] += on * (T(1) - s), load_[n.after[v]] += on * s, many[v] += on;
-      count[k] += on, levers[k] += on * (points[p].*root);
+      ADD(load_[v], on * (T(1) - s)), ADD(load_[n.after[v]], on * s), many[v] += on;
+      ADD(count[k], on), ADD(levers[k], on * (points[p].*root));
     }
+    meet();
   }
   L softness(int p, L Point<T>::*root, bool friction) const {
     const Point<T>& a = points[p];
@@ -62,24 +96,26 @@ struct Block : Geometry<T> {
     return friction ? sum + lever * lever * (i + j) * many[v] : sum;
   }
   // Adds the derivative of the softness of all points, given as `by`.
-  void soften(const List<int>& list, const List<L>& by, L Point<T>::*root, bool friction, Inputs<T>& to) {
-    const L zero{};
-    List<L> dload(n.vertices, zero), dlevers(n.bodies, zero);
+  void soften(const Part& list, L Point<T>::*root, bool friction) {
+    meet();
+    blank(dload), blank(dlevers);
+    meet();
     for (int p : list) {
       const Point<T>& a = points[p];
       const int v = edge(p), w = n.after[v], k = body(p);
-      const L i = vertices[v].soft, j = vertices[w].soft, g = by[p], one = (T(1) - a.share) * g, two = a.share * g;
+      const L i = vertices[v].soft, j = vertices[w].soft, g = soft[p], one = (T(1) - a.share) * g, two = a.share * g;
       to.points[p].share += g * (load_[w] * j - load_[v] * i);
-      dload[v] += one * i, dload[w] += two * j;
-      to.vertices[v].soft += one * load_[v], to.vertices[w].soft += two * load_[w];
-      to.bodies[k].mobility += g * count[k];
+      ADD(dload[v], one * i), ADD(dload[w], two * j);
+      ADD(to.vertices[v].soft, one * load_[v]), ADD(to.vertices[w].soft, two * load_[w]);
+      ADD(to.bodies[k].mobility, g * count[k]);
       to.points[p].*root += g * levers[k];
-      dlevers[k] += g * (a.*root);
+      ADD(dlevers[k], g * (a.*root));
       if (!friction) continue;
       const L lever = edges[v].lever, part = lever * lever * many[v] * g;
       to.edges[v].lever += T(2) * lever * (i + j) * many[v] * g;
-      to.vertices[v].soft += part, to.vertices[w].soft += part;
+      ADD(to.vertices[v].soft, part), ADD(to.vertices[w].soft, part);
     }
+    meet();
     for (int p : list) {
       const int v = edge(p);
       to.points[p].share += active[p] * (dload[n.after[v]] - dload[v]);
@@ -107,83 +143,93 @@ struct Block : Geometry<T> {
     r.sticks = (zero ? L{} : r.size) <= b.mu_s * normal;
     return r;
   }
-  const Force<T>& before(int s, int p) const {
-    static const Force<T> none{};
-    return s ? steps[s - 1].found[p] : none;
-  }
+  Force<T> before(int s, int p) const { return s ? found[at(s - 1, p)] : Force<T>{}; }
   auto presses(int s, int p) const {
     const L along = dot(points[p].normal, apart(p, change, motion));
     return (edges[edge(p)].real > T(0)) & ((before(s, p).normal > T(0)) | (along < points[p].wanted));
   }
 
   void forward(int s) {
-    Step& now = steps[s];
     const L zero{}, one = zero + T(1);
-    now.force = force, now.push = push;
-    move(now);
-    now.pressed.clear(), now.rubbing.clear();
+    EVERY(v, n.vertices) forces[s * n.vertices + v] = force[v];
+    EVERY(k, n.bodies) pushes[s * n.bodies + k] = push[k];
+    move(s);
+    meet();
     const size_t known = near.size();
-    this->reach();
-    for (size_t i = known; i < near.size(); ++i)
-      for (Step& each : steps) each.found[near[i]] = Force<T>{};
+    if (this->reach()) {
+      move(s);
+      meet();
+    }
+    for (size_t i = known; i < size_t(near.size()); ++i)
+      for (int each = 0; each < n.sweeps; ++each) found[at(each, near[i])] = Force<T>{};
     for (int p : near) {
       const auto on = presses(s, p);
-      now.found[p] = Force<T>{};
+      found[at(s, p)] = Force<T>{};
       if (!any(on)) continue;
       active[p] = on ? one : zero;
-      now.pressed.push_back(p);
+      pressed.push_back(p);
     }
-    gather(now.pressed, &Point<T>::turning);
-    for (int p : now.pressed) {
+    presses_to.push_back(int(pressed.size()));
+    gather(pressing(s), &Point<T>::turning);
+    for (int p : pressing(s)) {
       const L soft = softness(p, &Point<T>::turning, false), along = dot(points[p].normal, apart(p, change, motion));
       const auto mobile = (active[p] > T(0)) & (soft > T(0));
       L f = before(s, p).normal + (mobile ? (points[p].wanted - along) / (mobile ? soft : one) : zero);
       f = f > T(0) ? f : zero;
       if (!any(f > T(0))) continue;
-      now.found[p].normal = f;
-      now.rubbing.push_back(p);
+      found[at(s, p)].normal = f;
+      rubbing.push_back(p);
     }
+    rubs_to.push_back(int(rubbing.size()));
     if (n.friction) {
-      for (int p : now.rubbing) active[p] = (edges[edge(p)].real > T(0)) & (now.found[p].normal > T(0)) ? one : zero;
-      gather(now.rubbing, &Point<T>::sliding);
-      for (int p : now.rubbing) {
-        const L f = now.found[p].normal;
+      for (int p : rubbers(s)) active[p] = presses_now(s, p);
+      gather(rubbers(s), &Point<T>::sliding);
+      for (int p : rubbers(s)) {
+        const L f = found[at(s, p)].normal;
         const Rub r = rub(p, before(s, p), f);
         const L slides = bodies[body(p)].mu_k * f / r.size;
-        now.found[p].friction = r.trial * (r.sticks ? one : slides);
+        found[at(s, p)].friction = r.trial * (r.sticks ? one : slides);
       }
     }
-    force.assign(n.vertices, Vec<T>{}), push.assign(n.bodies, Wrench<T>{});
-    for (int p : now.rubbing) exert(p, now.found[p].normal, now.found[p].friction, force, push);
+    blank(force), blank(push);
+    meet();
+    for (int p : rubbers(s)) exert(p, found[at(s, p)].normal, found[at(s, p)].friction, force, push);
+    meet();
+  }
+  L presses_now(int s, int p) const {
+    const L zero{}, one = zero + T(1);
+    return (edges[edge(p)].real > T(0)) & (found[at(s, p)].normal > T(0)) ? one : zero;
   }
 
   void run() {
     this->prepare();
-    force.assign(n.vertices, Vec<T>{}), push.assign(n.bodies, Wrench<T>{});
+    meet();
+    blank(force), blank(push);
+    pressed.clear(), rubbing.clear(), presses_to.clear(), rubs_to.clear();
     for (int s = 0; s < n.sweeps; ++s) forward(s);
   }
 
   // Goes through a sweep backwards: `by` holds derivatives by its forces, then by those before.
-  void backward(int s, List<Force<T>>& by, List<R>& df, List<Wrench<T>>& dm, Inputs<T>& to) {
-    Step& now = steps[s];
+  void backward(int s, List<R>& df, List<Wrench<T>>& dm) {
     const L zero{}, one = zero + T(1);
-    List<L> soft(points.size(), zero);
-    List<Force<T>> later(points.size());
+    blank_points(soft), blank_points(later);
     // Where nothing presses, forces are constant. Else they count for the next sweep and by what they exert.
     later.swap(by);
-    for (int p : now.rubbing) by[p] = later[p];
-    for (int p : now.rubbing) {
+    for (int p : rubbers(s)) by[p] = later[p];
+    for (int p : rubbers(s)) {
       const Force<T> d = seen(p, df, dm);
       by[p].normal += d.normal, by[p].friction += d.friction;
-      tilt(p, now.found[p].normal, now.found[p].friction, df, dm, to);
+      tilt(p, found[at(s, p)].normal, found[at(s, p)].friction, df, dm, to);
     }
-    move(now);
-    df.assign(n.vertices, Vec<T>{}), dm.assign(n.bodies, Wrench<T>{});
+    meet();
+    move(s);
+    blank(df), blank(dm);
+    meet();
     if (n.friction) {
-      for (int p : now.rubbing) active[p] = (edges[edge(p)].real > T(0)) & (now.found[p].normal > T(0)) ? one : zero;
-      gather(now.rubbing, &Point<T>::sliding);
-      for (int p : now.rubbing) {
-        const L f = now.found[p].normal, mu = bodies[body(p)].mu_k;
+      for (int p : rubbers(s)) active[p] = presses_now(s, p);
+      gather(rubbers(s), &Point<T>::sliding);
+      for (int p : rubbers(s)) {
+        const L f = found[at(s, p)].normal, mu = bodies[body(p)].mu_k;
         const Rub r = rub(p, before(s, p), f);
         const R &d = by[p].friction, way = r.trial * (one / r.size);
         const L along = dot(way, d);
@@ -192,72 +238,87 @@ struct Block : Geometry<T> {
                           r.sticks ? d.y : mu * f / r.size * (d.y - way.y * along),
                           r.sticks ? d.z : mu * f / r.size * (d.z - way.z * along)};
         by[p].normal += r.sticks ? zero : mu * along;
-        to.bodies[body(p)].mu_k += r.sticks ? zero : f * along;
+        ADD(to.bodies[body(p)].mu_k, r.sticks ? zero : f * along);
         by[p].friction = dtrial;
         soft[p] = dot(dtrial, r.slip) * inverse * inverse;
-        slipped(p, dtrial * -inverse, df, dm, to);
+        slipped(p, dtrial * -inverse, df, dm);
       }
-      soften(now.rubbing, soft, &Point<T>::sliding, true, to);
+      soften(rubbers(s), &Point<T>::sliding, true);
     }
-    soft.assign(points.size(), zero);
-    for (int p : now.pressed) active[p] = presses(s, p) ? one : zero;
-    gather(now.pressed, &Point<T>::turning);
-    for (int p : now.rubbing) {
+    blank_points(soft);
+    for (int p : pressing(s)) active[p] = presses(s, p) ? one : zero;
+    gather(pressing(s), &Point<T>::turning);
+    for (int p : rubbers(s)) {
       const L give = softness(p, &Point<T>::turning, false), along = dot(points[p].normal, apart(p, change, motion));
       const auto mobile = (active[p] > T(0)) & (give > T(0));
       const L inverse = mobile ? one / (mobile ? give : one) : zero;
-      by[p].normal = now.found[p].normal > T(0) ? by[p].normal : zero;
+      by[p].normal = found[at(s, p)].normal > T(0) ? by[p].normal : zero;
       const L d = by[p].normal * inverse;
       to.points[p].wanted += d;
       soft[p] = -d * (points[p].wanted - along) * inverse;
       exert(p, -d, R{}, df, dm);
       tilt(p, -d, R{}, change, motion, to);
     }
-    soften(now.pressed, soft, &Point<T>::turning, false, to);
-    for (int v = 0; v < n.vertices; ++v) {
+    soften(pressing(s), &Point<T>::turning, false);
+    meet();
+    EVERY(v, n.vertices) {
       to.vertices[v].change += df[v];
-      to.vertices[v].answer += df[v].times(now.force[v]);
+      to.vertices[v].answer += df[v].times(forces[s * n.vertices + v]);
       df[v] = df[v].times(vertices[v].answer);
     }
-    for (int k = 0; k < n.bodies; ++k) {
+    EVERY(k, n.bodies) {
       Solid<T>& d = to.bodies[k];
-      const R c = dm[k].force, t = dm[k].torque, w = now.push[k].torque;
-      d.change += c, d.turn += t, d.mobility += dot(c, now.push[k].force);
+      const Wrench<T>& pushed = pushes[s * n.bodies + k];
+      const R c = dm[k].force, t = dm[k].torque, w = pushed.torque;
+      d.change += c, d.turn += t, d.mobility += dot(c, pushed.force);
       d.add_turned(t, w);
       dm[k] = {c * bodies[k].mobility, bodies[k].turned(t)};
     }
+    meet();
   }
   // Goes back from points to ropes and bodies. A point that has never been active has no part in the forces.
-  void begin(Inputs<T>& to) {
-    List<char> used(points.size());
-    for (const Step& s : steps)
-      for (int p : s.pressed) used[p] = 1;
+  void begin() {
+    blank_points(used);
+    for (int p : pressed) used[p] = 1;
     this->foresee();
-    List<R> dvel(n.vertices);
-    List<Wrench<T>> dspin(n.bodies);
-    for (int p = 0; p < int(points.size()); ++p)
-      if (used[p]) this->place_back(p, to, dvel, dspin);
-    for (int v = 0; v < n.vertices; ++v) to.vertices[v].vel += dvel[v];
-    for (int k = 0; k < n.bodies; ++k) to.bodies[k].vel += dspin[k].force, to.bodies[k].omega += dspin[k].torque;
+    blank(dvel), blank(dspin);
+    meet();
+    for (int f = 0; f < n.families; ++f)
+      EVERY(v, n.vertices)
+        if (used[f * n.vertices + v]) this->place_back(f * n.vertices + v, to, dvel, dspin);
+    meet();
+    EVERY(v, n.vertices) to.vertices[v].vel += dvel[v];
+    EVERY(k, n.bodies) to.bodies[k].vel += dspin[k].force, to.bodies[k].omega += dspin[k].torque;
+    meet();
   }
   // Adds the derivative by the motion and the geometry of the slip, given as `by`.
-  void slipped(int p, const R& by, List<R>& df, List<Wrench<T>>& dm, Inputs<T>& to) const {
+  void slipped(int p, const R& by, List<R>& df, List<Wrench<T>>& dm) {
     const R& a = points[p].normal;
     const R all = seen(p, change, motion).friction, across = by - a * dot(a, by);
     to.points[p].normal -= by * dot(a, all) + all * dot(a, by);
     exert(p, L{}, across, df, dm);
     tilt(p, L{}, across, change, motion, to);
   }
+  // Makes of `force` and `push`, the derivatives by what is exerted, those by all inputs.
+  void back() {
+    blank(to.edges), blank(to.vertices), blank(to.bodies);
+    blank_points(to.points), blank_points(by);
+    meet();
+    for (int s = int(n.sweeps); s--;) backward(s, force, push);
+    begin();
+  }
 };
 
+#ifndef SIMT
 // One per thread and kind of scene: memory for its blocks is asked for once.
 template <typename T>
 static Block<T>& working(const Sizes& n) {
   static thread_local std::unique_ptr<Block<T>> kept;
+  Memory memory;
   // Equal lists of numbers stand at the same place, see blocks.py.
   const bool fits = kept && kept->n.shape == n.shape && kept->n.pieces == n.pieces && kept->n.after == n.after &&
                     kept->n.bodies == n.bodies && kept->n.vertices == n.vertices && kept->n.sweeps == n.sweeps;
-  if (!fits) kept.reset(new Block<T>(n));
+  if (!fits) kept.reset(new Block<T>(n, memory, true)), kept->number();
   kept->n = n;
   return *kept;
 }
@@ -287,13 +348,10 @@ static void back(const Fields<const T>& in, const T* const* by, const T* const* 
     Block<T>& block = working<T>(n);
     block.all([&](auto& part, int k) { fetch(part, in[k], b, n.scenes); });
     block.run();
-    Inputs<T> to(n);
-    List<Force<T>> forces(block.points.size());
     fetch(block.force, by, b, n.scenes);
     fetch(block.push, body_by, b, n.scenes);
-    for (int s = n.sweeps; s--;) block.backward(s, forces, block.force, block.push, to);
-    block.begin(to);
-    to.all([&](auto& part, int k) { put(part, out[k], b, n.scenes); });
+    block.back();
+    block.to.all([&](auto& part, int k) { put(part, out[k], b, n.scenes); });
   }
 }
 
@@ -309,3 +367,43 @@ static void back(const Fields<const T>& in, const T* const* by, const T* const* 
   }
 ENTRY(body_sweeps_float, float)
 ENTRY(body_sweeps_double, double)
+#else
+// Arrays stand in the order of the arguments above.
+template <typename T>
+static void sweep(const Sizes& n, const Fields& p, const Room& room, bool derive) {
+  Memory memory = room.memory();
+  Block<T> block(n, memory, derive);
+  const int each[3] = {sizeof(Edge<T>) / sizeof(T), sizeof(Vertex<T>) / sizeof(T), sizeof(Solid<T>) / sizeof(T)};
+  const int first[4] = {0, each[0], each[0] + each[1], each[0] + each[1] + each[2]};
+  const int by = first[3], out = by + derive * 9;
+  block.number();
+  for (int64_t b = first_scene(); b < n.scenes; b += scene_step()) {
+    block.all([&](auto& part, int k) { fetch(part, p.from<const T>(first[k]), b, n.scenes); });
+    meet();
+    block.run();
+    if (!derive) {
+      put(block.force, p.from<T>(out), b, n.scenes);
+      put(block.push, p.from<T>(out + 3), b, n.scenes);
+    } else {
+      fetch(block.force, p.from<const T>(by), b, n.scenes);
+      fetch(block.push, p.from<const T>(by + 3), b, n.scenes);
+      block.back();
+      block.to.all([&](auto& part, int k) { put(part, p.from<T>(out + first[k]), b, n.scenes); });
+    }
+    meet();
+  }
+}
+template <typename T>
+static void count(const Sizes& n, const Fields& p, bool derive) {
+  Memory memory{};
+  Block<T> block(n, memory, derive);
+  memory.report(p);
+}
+#if DERIVE
+KERNEL(body_sweeps_back, Sizes) { sweep<NUMBER>(n, p, room, true); }
+KERNEL(body_sweeps_back_memory, Sizes) { count<NUMBER>(n, p, true); }
+#else
+KERNEL(body_sweeps_sweep, Sizes) { sweep<NUMBER>(n, p, room, false); }
+KERNEL(body_sweeps_sweep_memory, Sizes) { count<NUMBER>(n, p, false); }
+#endif
+#endif

@@ -115,7 +115,8 @@ NUM sampled(const Grid<T>& grid, const Num<T, N>* size, const Num<T, N>* p, Num<
   return select(out, far, distance);
 }
 
-NUM probe(int shape, const Grid<T>& grid, const Num<T, N>* size, const Num<T, N>* p, Num<T, N>* n) {
+template <typename T, int N>
+static inline CALLED Num<T, N> probe(int shape, const Grid<T>& grid, const Num<T, N>* size, const Num<T, N>* p, Num<T, N>* n) {
   typedef Num<T, N> S;
   const S zero(T(0)), one(T(1));
   S out[2], on[2];

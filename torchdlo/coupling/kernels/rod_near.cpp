@@ -3,6 +3,9 @@
 //
 // All arrays have the scenes last: (V, B) for numbers of vertices, (4, K, B) for the places v B + b of the corners of
 // pairs, (K, B) for whether they are pairs.
+#ifdef SIMT
+#include "rod_near_simt.h"
+#else
 #include <algorithm>
 #include <memory>
 
@@ -254,3 +257,4 @@ static void outrun(const T* const* pos, const T* const* origin, const T* reach, 
   }
 ENTRY(rod_near_float, float)
 ENTRY(rod_near_double, double)
+#endif

@@ -3,11 +3,13 @@
 // All arrays have the scenes last: (V, B) for each field of vertices below, (B) for each law, (4, K, B) for where the
 // corners of pairs stand on the axis v B + b, (K, B) for whether they are pairs.
 //
-// One scene is worked on at a time, and several of its pairs side by side.
+// One scene is worked on at a time, and several of its pairs side by side: those of a register, or of a warp of a GPU.
+#ifndef SIMT
 #include <algorithm>
 #include <memory>
 
 #include "flush.h"
+#endif
 #include "rod_pairs.h"
 
 struct Sizes {
@@ -33,23 +35,26 @@ struct Work {
     P apart, slip, wanted;  // how far a newton parts and slips them at most, and by how much they have to part
     bool used;
   };
-  struct Sweep {
-    List<T> force;  // on vertices, from the sweep before
-    List<F> found;
-    List<char> active;
-  };
   const P zero{T(0)}, one{T(1)};
   Sizes n;
   const int size;
-  List<T> vertices, by, change, force, load;  // field by field
+  List<T> vertices, by, change, force, load, moved, dload;  // field by field
+  List<T> forces;         // on vertices, before each sweep
   List<Group> groups;
-  List<Pair<T>> parts;  // derivatives by the pairs
-  List<Sweep> sweeps;
+  List<F> found;          // after each sweep, by all pairs
+  List<char> active;      // whether any is more than none, likewise
+  List<Pair<T>> parts;    // derivatives by the pairs
+  List<F> later, soft;    // derivatives by their forces, and by how far a newton moves them
   T law[LAWS], by_law[LAWS];
 
-  explicit Work(const Sizes& n)
-      : n(n), size(int(n.vertices)), vertices(FIELDS * size), by(FIELDS * size), change(3 * size), force(3 * size),
-        load(size), sweeps(n.sweeps) {}
+  Work(const Sizes& n, Memory& memory, bool derive) : n(n), size(int(n.vertices)) {
+    memory.common(vertices, FIELDS * size), memory.common(change, 3 * size), memory.common(force, 3 * size);
+    memory.common(forces, 3 * size * n.sweeps), memory.common(load, size), memory.own(groups, n.room);
+    memory.own(found, n.room, n.sweeps), memory.own(active, n.room, n.sweeps);
+    if (!derive) return;
+    memory.common(by, FIELDS * size), memory.common(moved, 3 * size), memory.common(dload, size);
+    memory.own(parts, n.room), memory.own(later, n.room), memory.own(soft, n.room);
+  }
 
   V pick3(const T* field, const int* at) const {
     return {pick(field, at), pick(field + size, at), pick(field + 2 * size, at)};
@@ -68,10 +73,10 @@ struct Work {
 
   void read(const T* const* in, const T* const* laws, const int64_t* at, const T* real, int64_t b) {
     for (int f = 0; f < FIELDS; ++f)
-      for (int v = 0; v < size; ++v) vertices[f * size + v] = in[f][v * n.scenes + b];
+      EVERY(v, size) vertices[f * size + v] = in[f][v * n.scenes + b];
     for (int f = 0; f < LAWS; ++f) law[f] = laws[f][b];
     groups.clear();
-    for (int64_t k = 0; k < n.room; ++k) {
+    EVERY(k, n.room) {
       if (!(real[k * n.scenes + b] > T(0))) continue;
       if (groups.empty() || groups.back().count == W) groups.emplace_back(), groups.back().count = 0;
       Group& g = groups.back();
@@ -102,7 +107,8 @@ struct Work {
   }
   static Mask bounces(const Group& g, const P& back) { return (back.x > T(0)) & (back.x > g.pair.wanted.x); }
   void prepare() {
-    std::fill(load.begin(), load.end(), T(0));
+    blank(load);
+    meet();
     for (Group& g : groups) {
       g.pair = pair(corners(g), n.friction, T(n.recovery));
       for (int i = 0; i < W; ++i) g.real[i] = T(i < g.count);
@@ -119,6 +125,7 @@ struct Work {
       shares(g.pair, w);
       for (int c = 0; c < 4; ++c) drop(w[c] * P(g.pressed), load.data(), g.corner[c], g.count);
     }
+    meet();
     for (Group& g : groups) soften(g);
   }
   void soften(Group& g) const {
@@ -147,33 +154,34 @@ struct Work {
     r.sticks = select(none, zero, r.size).x <= law[MU_S] * normal.x;
     return r;
   }
-  F before(int s, size_t g) const { return s ? sweeps[s - 1].found[g] : F{zero, {zero, zero, zero}}; }
+  size_t place(int s, size_t g) const { return s * groups.size() + g; }
+  F before(int s, size_t g) const { return s ? found[place(s - 1, g)] : F{zero, {zero, zero, zero}}; }
   // By what factor the normal force answers to what a pair still has to part.
   P stiffness(const Group& g) const {
     const Mask mobile = (g.real > T(0)) & (g.apart.x > T(0));
     return where(mobile, one / select(mobile, g.apart, one));
   }
-  void move(const Sweep& s) {
-    for (int i = 0; i < 3 * size; ++i)
-      change[i] = vertices[CHANGE * size + i] + vertices[ANSWER * size + i] * s.force[i];
+  void move(int s) {
+    EVERY(i, 3 * size)
+      change[i] = vertices[CHANGE * size + i] + vertices[ANSWER * size + i] * forces[3 * size * s + i];
   }
 
   void forward(int s) {
-    Sweep& now = sweeps[s];
-    now.force = force, now.found.resize(groups.size()), now.active.resize(groups.size());
-    move(now);
-    std::fill(force.begin(), force.end(), T(0));
+    EVERY(i, 3 * size) forces[3 * size * s + i] = force[i];
+    move(s);
+    blank(force);
+    meet();
     for (size_t k = 0; k < groups.size(); ++k) {
       Group& g = groups[k];
       V x[4];
       pick4(change.data(), g, x);
       const F moved = seen(g.pair, x, n.friction), last = before(s, k);
-      F& f = now.found[k];
+      F& f = found[place(s, k)];
       f.normal = positive(last.normal + stiffness(g) * (g.wanted - moved.normal));
       f.friction = {zero, zero, zero};
       const Mask on = ~(f.normal.x <= T(0));
-      now.active[k] = any(on);
-      if (!now.active[k]) continue;
+      active[place(s, k)] = any(on);
+      if (!any(on)) continue;
       g.used = true;
       if (n.friction) {
         const Rub r = rub(g, last, moved, f.normal);
@@ -182,10 +190,13 @@ struct Work {
       exert(g.pair, f, n.friction, x);
       drop4(x, force.data(), g);
     }
+    meet();
   }
   void run() {
+    found.resize(n.sweeps * groups.size()), active.resize(n.sweeps * groups.size());
+    meet();
     prepare();
-    std::fill(force.begin(), force.end(), T(0));
+    blank(force);
     for (int s = 0; s < n.sweeps; ++s) forward(s);
   }
 
@@ -209,17 +220,17 @@ struct Work {
   }
   // Goes through a sweep backwards: `later` holds derivatives by its forces, then by those before; `force` by what the
   // forces exert on vertices, likewise.
-  void backward(int s, List<F>& later, List<F>& soft) {
-    const Sweep& now = sweeps[s];
-    move(now);
-    List<T> moved(3 * size);
+  void backward(int s) {
+    move(s);
+    blank(moved);
+    meet();
     for (size_t k = 0; k < groups.size(); ++k) {
-      if (!now.active[k]) {
+      if (!active[place(s, k)]) {
         later[k] = F{zero, {zero, zero, zero}};
         continue;
       }
       const Group& g = groups[k];
-      const F &f = now.found[k], last = before(s, k);
+      const F &f = found[place(s, k)], last = before(s, k);
       const Mask on = ~(f.normal.x <= T(0));
       V x[4];
       pick4(force.data(), g, x);
@@ -240,16 +251,18 @@ struct Work {
       exert(g.pair, back, n.friction, x);
       drop4(x, moved.data(), g);
     }
-    for (int i = 0; i < 3 * size; ++i) {
+    meet();
+    EVERY(i, 3 * size) {
       by[CHANGE * size + i] += moved[i];
-      by[ANSWER * size + i] += moved[i] * now.force[i];
+      by[ANSWER * size + i] += moved[i] * forces[3 * size * s + i];
       force[i] = moved[i] * vertices[ANSWER * size + i];
     }
   }
 
   // Adds the derivative of how far pairs part and slip under a newton.
-  void soften_back(const List<F>& soft) {
-    List<T> dload(size);
+  void soften_back() {
+    blank(dload);
+    meet();
     for (size_t k = 0; k < groups.size(); ++k) {
       const Group& g = groups[k];
       if (!g.used) continue;
@@ -268,6 +281,7 @@ struct Work {
       parts[k].s = parts[k].s + dw[1] - dw[0], parts[k].t = parts[k].t + dw[3] - dw[2];
       parts[k].turning = parts[k].turning + j;
     }
+    meet();
     for (size_t k = 0; k < groups.size(); ++k) {
       const Group& g = groups[k];
       if (!any(g.pressed > T(0))) continue;
@@ -307,21 +321,37 @@ struct Work {
     const F none{zero, {zero, zero, zero}};
     Pair<T> nothing;
     for (int i = 0; i < ALL; ++i) ((P*)&nothing)[i] = zero;
-    parts.assign(groups.size(), nothing);
-    List<F> later(groups.size(), none), soft(groups.size(), none);
-    std::fill(by.begin(), by.end(), T(0)), std::fill(by_law, by_law + LAWS, T(0));
-    for (int s = int(n.sweeps); s--;) backward(s, later, soft);
-    soften_back(soft);
+    for (List<F>* x = &later;; x = &soft) {
+      x->resize(groups.size());
+      for (F& each : *x) each = none;
+      if (x == &soft) break;
+    }
+    parts.resize(groups.size());
+    for (Pair<T>& each : parts) each = nothing;
+    for (T& each : by_law) each = T(0);
+    blank(by);
+    for (int s = int(n.sweeps); s--;) backward(s);
+    meet();
+    soften_back();
     for (size_t k = 0; k < groups.size(); ++k)
       if (groups[k].used) place_back(k);
+    for (T& each : by_law) each = total(each);
+    meet();
+  }
+
+  void write(const List<T>& from, int fields, T* const* to, int64_t b) const {
+    for (int f = 0; f < fields; ++f)
+      EVERY(v, size) to[f][v * n.scenes + b] = from[f * size + v];
   }
 };
 
+#ifndef SIMT
 // One per thread and kind of scene: memory is asked for once.
 template <typename T>
 static Work<T>& working(const Sizes& n) {
   static thread_local std::unique_ptr<Work<T>> kept;
-  if (!kept || kept->n.vertices != n.vertices || kept->n.sweeps != n.sweeps) kept.reset(new Work<T>(n));
+  Memory memory;
+  if (!kept || kept->n.vertices != n.vertices || kept->n.sweeps != n.sweeps) kept.reset(new Work<T>(n, memory, true));
   kept->n = n;
   return *kept;
 }
@@ -338,8 +368,7 @@ static void sweep(const T* const* in, const T* const* laws, const int64_t* at, c
     Work<T>& w = working<T>(n);
     w.read(in, laws, at, real, b);
     w.run();
-    for (int k = 0; k < 3; ++k)
-      for (int v = 0; v < w.size; ++v) out[k][v * n.scenes + b] = w.force[k * w.size + v];
+    w.write(w.force, 3, out, b);
   }
 }
 
@@ -353,8 +382,7 @@ static void back(const T* const* in, const T* const* laws, const int64_t* at, co
     for (int k = 0; k < 3; ++k)
       for (int v = 0; v < w.size; ++v) w.force[k * w.size + v] = by[k][v * n.scenes + b];
     w.back();
-    for (int f = 0; f < FIELDS; ++f)
-      for (int v = 0; v < w.size; ++v) out[f][v * n.scenes + b] = w.by[f * w.size + v];
+    w.write(w.by, FIELDS, out, b);
     for (int f = 0; f < LAWS; ++f) out_laws[f][b] = w.by_law[f];
   }
 }
@@ -370,3 +398,41 @@ static void back(const T* const* in, const T* const* laws, const int64_t* at, co
   }
 ENTRY(rod_pairs_float, float)
 ENTRY(rod_pairs_double, double)
+#else
+// Arrays stand in the order of the arguments above.
+template <typename T>
+static void sweep(const Sizes& n, const Fields& p, const Room& room, bool derive) {
+  Memory memory = room.memory();
+  Work<T> w(n, memory, derive);
+  const int laws = FIELDS, at = laws + LAWS, by = at + 2, out = by + derive * 3;
+  for (int64_t b = first_scene(); b < n.scenes; b += scene_step()) {
+    w.read(p.from<const T>(0), p.from<const T>(laws), (const int64_t*)p.at[at], (const T*)p.at[at + 1], b);
+    w.run();
+    if (!derive) {
+      w.write(w.force, 3, p.from<T>(out), b);
+    } else {
+      for (int k = 0; k < 3; ++k)
+        EVERY(v, w.size) w.force[k * w.size + v] = p.from<const T>(by)[k][v * n.scenes + b];
+      meet();
+      w.back();
+      w.write(w.by, FIELDS, p.from<T>(out), b);
+      if (lane() == 0)
+        for (int f = 0; f < LAWS; ++f) p.from<T>(out + FIELDS)[f][b] = w.by_law[f];
+    }
+    meet();
+  }
+}
+template <typename T>
+static void count(const Sizes& n, const Fields& p, bool derive) {
+  Memory memory{};
+  Work<T> w(n, memory, derive);
+  memory.report(p);
+}
+#if DERIVE
+KERNEL(rod_pairs_back, Sizes) { sweep<NUMBER>(n, p, room, true); }
+KERNEL(rod_pairs_back_memory, Sizes) { count<NUMBER>(n, p, true); }
+#else
+KERNEL(rod_pairs_sweep, Sizes) { sweep<NUMBER>(n, p, room, false); }
+KERNEL(rod_pairs_sweep_memory, Sizes) { count<NUMBER>(n, p, false); }
+#endif
+#endif

@@ -41,7 +41,7 @@ struct Brace {
   V own[4], far, apart[2];
 
   static P weak() { return P(T(WEAK)); }
-  static P root_weak() { return P(T(std::sqrt(WEAK))); }
+  static P root_weak() { return P(T(ROOT_WEAK)); }
   static P little() { return P(sizeof(T) == 8 ? T(1e-14) : T(1e-6)); }
 
   explicit Brace(const Corners<T>& c) {
@@ -68,7 +68,7 @@ struct Brace {
       xy = xy + ml.x * l.y, xz = xz + ml.x * l.z, yz = yz + ml.y * l.z;
       a.arm[i] = arm(i) * mass[i];
     }
-    const P more = little() * (xx + yy + zz) + P(T(std::pow(double(std::numeric_limits<T>::min()), 0.25)));
+    const P more = little() * (xx + yy + zz) + P(T(sizeof(T) == 8 ? 1.221338669755462e-77 : 3.2927225399135965e-10));
     const P x = yy + zz + more, y = xx + zz + more, z = xx + yy + more, d = -xy, e = -xz, f = -yz;
     const P first = y * z - f * f, second = e * f - d * z, third = d * f - y * e;
     const P inverse = P(T(1)) / (x * first + d * second + e * third);
@@ -199,15 +199,19 @@ static inline void tilt(const Pair<T>& a, const Force<T>& f, const Three<T, 0>* 
 // Values of a field of vertices at corners, their sum to the vertices, and the sum of some lanes.
 template <typename T>
 static inline Num<T, 0> pick(const T* field, const int* at) {
+#ifdef SIMT
+  return Num<T, 0>(field[*at]);
+#else
   T found[WIDTH<T>];
   for (int i = 0; i < WIDTH<T>; ++i) found[i] = field[at[i]];
   Num<T, 0> x;
   std::memcpy(&x.x, found, sizeof(found));
   return x;
+#endif
 }
 template <typename T>
 static inline void drop(const Num<T, 0>& x, T* field, const int* at, int count) {
-  for (int i = 0; i < count; ++i) field[at[i]] += x.x[i];
+  for (int i = 0; i < count; ++i) ADD(field[at[i]], x.x[i]);
 }
 template <typename T>
 static inline T sum(const Num<T, 0>& x, int count) {

@@ -1,8 +1,9 @@
 // Closest points of straight segments side by side, and their derivative; see segments.py.
 #pragma once
-#include <limits>
-
 #include "tape.h"
+#ifndef SIMT
+#include <limits>
+#endif
 
 // Where the closest points lie, before they are put onto the segments, and what that is made of.
 template <typename T>

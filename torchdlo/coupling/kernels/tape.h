@@ -2,6 +2,7 @@
 #pragma once
 #include "lanes.h"
 
+#ifndef SIMT
 constexpr int TAPED = -1;
 
 template <typename T>
@@ -96,6 +97,8 @@ static inline void turn(const Num<T, TAPED>& angle, Num<T, TAPED>& c, Num<T, TAP
   turn<T>(angle.x, cosine, sine);
   c = {cosine, angle, -sine, T(0), Lanes<T>{}}, s = {sine, angle, cosine, T(0), Lanes<T>{}};
 }
+
+#endif
 
 // Three numbers, with or without derivatives.
 template <typename T, int N>

@@ -24,7 +24,7 @@ from torchdlo.physics.rod.kinematics import View
 
 _INPUTS = "Tensor[] edges, Tensor[] vertices, Tensor[] bodies, Tensor grids"
 _STATIC = "int[] cells, int[] shapes, int[] pieces, int[] after, int sweeps, bool friction, float[] law"
-_function, ready = scene_packing.kernel("body_sweeps", "RodBody, the forces of contact")
+_function, ready = scene_packing.kernel("body_sweeps", "RodBody, the forces of contact", gpu=True)
 
 
 class _Sizes(ctypes.Structure):
@@ -38,18 +38,24 @@ class _Sizes(ctypes.Structure):
 
 def _sizes(like: Tensor, grids: Tensor, cells, kinds, pieces, after, sweeps: int, friction: bool, law: Sequence[float]):
     families, (_, count, scenes) = sum(2 + n for n in pieces), like.shape
-    lists = (scene_packing.integers(tuple(x)) for x in (kinds, pieces, after, cells))
+    lists = (scene_packing.numbers(x, like) for x in (kinds, pieces, after, cells))
     sizes = (families, len(after), count, scenes, sweeps, friction, *lists, grids.data_ptr(), grids.shape[1], *law)
-    return ctypes.byref(_Sizes(*sizes))
+    return _Sizes(*sizes)
+
+
+def _call(what: str, places: list, sizes: _Sizes, like: Tensor) -> None:
+    if scene_packing.uses_gpu(like):
+        scene_packing.on_gpu("body_sweeps", what, sizes, places, like, sizes.scenes)
+    else:
+        _function(what, like.dtype)(*places, ctypes.byref(sizes), torch.get_num_threads())
 
 
 def _sweep(
     edges: list[Tensor], vertices: list[Tensor], bodies: list[Tensor], grids: Tensor, *static
 ) -> tuple[Tensor, Tensor]:
     out = _sweep_meta(edges, vertices, bodies)
-    places = [scene_packing.fields(x) for x in (edges, vertices, bodies)]
-    sizes = _sizes(bodies[0], grids, *static)
-    _function("sweep", out[0].dtype)(*places, *(scene_packing.fields([x]) for x in out), sizes, torch.get_num_threads())
+    places = [scene_packing.fields(x) for x in (edges, vertices, bodies, *([x] for x in out))]
+    _call("sweep", places, _sizes(bodies[0], grids, *static), out[0])
     return out
 
 
@@ -68,9 +74,8 @@ def _back(
     *static,
 ):
     out = _back_meta(edges, vertices, bodies)
-    places = [scene_packing.fields(x) for x in (edges, vertices, bodies, [force], [push])]
-    sizes = _sizes(bodies[0], grids, *static)
-    _function("back", force.dtype)(*places, *(scene_packing.fields([x]) for x in out), sizes, torch.get_num_threads())
+    places = [scene_packing.fields(x) for x in (edges, vertices, bodies, [force], [push], *([x] for x in out))]
+    _call("back", places, _sizes(bodies[0], grids, *static), force)
     return out
 
 
@@ -96,12 +101,15 @@ def _backward(ctx, force: Tensor, push: Tensor):
     return *parts, None, *(None for _ in ctx.static)
 
 
-scene_packing.operator(f"body_sweeps({_INPUTS}, {_STATIC}) -> (Tensor, Tensor)", _sweep, _sweep_meta, _save, _backward)
+scene_packing.operator(
+    f"body_sweeps({_INPUTS}, {_STATIC}) -> (Tensor, Tensor)", _sweep, _sweep_meta, _save, _backward, gpu=True
+)
 scene_packing.operator(
     f"body_sweeps_back({_INPUTS}, Tensor force, Tensor push, {_STATIC}) -> (Tensor, Tensor, Tensor)",
     _back,
     _back_meta,
     backward=scene_packing.refuse_second_derivative,
+    gpu=True,
 )
 
 

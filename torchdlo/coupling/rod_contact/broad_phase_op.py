@@ -8,6 +8,7 @@ a row of cells. It has no derivative, as no choice of pairs has.
 from __future__ import annotations
 
 import ctypes
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
@@ -18,7 +19,9 @@ from torchdlo.physics.effects.base import Values
 from torchdlo.physics.rod.kinematics import View
 
 _OPTIONS = (f"-DPULL={closest_points.PULL}",)
-_function, ready = scene_packing.kernel("rod_near", "RodContact, which parts of ropes are near each other", *_OPTIONS)
+_function, ready = scene_packing.kernel(
+    "rod_near", "RodContact, which parts of ropes are near each other", *_OPTIONS, gpu=True
+)
 
 
 class _Sizes(ctypes.Structure):
@@ -29,16 +32,21 @@ class _Sizes(ctypes.Structure):
     )
 
 
-def _place(x: Tensor) -> ctypes.c_void_p:
-    return ctypes.c_void_p(x.data_ptr())
+def _call(what: str, fields: list[Tensor], others: list[Tensor], out: Sequence[Tensor], sizes: _Sizes) -> None:
+    like, places = fields[0], [scene_packing.fields(x) for x in (fields, others)]
+    single = [x.data_ptr() for x in out]
+    if scene_packing.uses_gpu(like):
+        scene_packing.on_gpu("rod_near", what, sizes, [*places, *single], like, sizes.scenes, *_OPTIONS)
+    else:
+        arrays = (*places, *(ctypes.c_void_p(x) for x in single))
+        _function(what, like.dtype)(*arrays, ctypes.byref(sizes), torch.get_num_threads())
 
 
 def _look(rods: list[Tensor], carried: Tensor, counts: list[int], closed: list[int], room: int, few: int, *rule: float):
     out = _look_meta(rods, carried, counts, closed, room)
-    lists = (scene_packing.integers(tuple(x)) for x in (counts, closed))
+    lists = (scene_packing.numbers(x, carried) for x in (counts, closed))
     sizes = (*rods[0].shape[1:], carried.shape[1], len(counts), room, few, broad_phase.APART)
-    places = scene_packing.fields(rods), scene_packing.fields([carried]), *(_place(x) for x in out)
-    _function("look", carried.dtype)(*places, ctypes.byref(_Sizes(*sizes, *lists, *rule)), torch.get_num_threads())
+    _call("look", [*rods], [carried], out, _Sizes(*sizes, *lists, *rule))
     return out
 
 
@@ -50,9 +58,7 @@ def _look_meta(rods: list[Tensor], carried: Tensor, counts, closed, room: int, *
 
 def _outrun(pos: Tensor, origin: Tensor, reach: Tensor) -> Tensor:
     out = _outrun_meta(pos, origin, reach)
-    sizes = ctypes.byref(_Sizes(*pos.shape[1:]))
-    places = scene_packing.fields([pos]), scene_packing.fields([origin]), _place(reach), _place(out)
-    _function("outrun", pos.dtype)(*places, sizes, torch.get_num_threads())
+    _call("outrun", [pos], [origin], [reach, out], _Sizes(*pos.shape[1:]))
     return out
 
 
@@ -62,9 +68,12 @@ def _outrun_meta(pos: Tensor, origin: Tensor, reach: Tensor) -> Tensor:
 
 _STATIC = "int[] counts, int[] closed, int room, int few, float dt, float burst"
 scene_packing.operator(
-    f"rod_near(Tensor[] rods, Tensor carried, {_STATIC}) -> (Tensor, Tensor, Tensor, Tensor)", _look, _look_meta
+    f"rod_near(Tensor[] rods, Tensor carried, {_STATIC}) -> (Tensor, Tensor, Tensor, Tensor)",
+    _look,
+    _look_meta,
+    gpu=True,
 )
-scene_packing.operator("rod_outrun(Tensor pos, Tensor origin, Tensor reach) -> Tensor", _outrun, _outrun_meta)
+scene_packing.operator("rod_outrun(Tensor pos, Tensor origin, Tensor reach) -> Tensor", _outrun, _outrun_meta, gpu=True)
 
 
 def find_candidates(view: View, carried: Tensor, room: int, burst: float) -> Values:

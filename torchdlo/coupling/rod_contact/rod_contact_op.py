@@ -20,10 +20,10 @@ from torchdlo.physics.rod.kinematics import View
 
 WEAK = 0.01
 """Inertia of two edges against each other in the balance of friction's couple, over what it is."""
-_OPTIONS = (f"-DWEAK={WEAK}", f"-DPULL={closest_points.PULL}")
+_OPTIONS = (f"-DWEAK={WEAK}", f"-DROOT_WEAK={WEAK**0.5}", f"-DPULL={closest_points.PULL}")
 _INPUTS = "Tensor[] vertices, Tensor laws, Tensor at, Tensor real"
 _STATIC = "int sweeps, bool friction, float[] rule"
-_function, ready = scene_packing.kernel("rod_pairs", "RodContact, the forces of contact", *_OPTIONS)
+_function, ready = scene_packing.kernel("rod_pairs", "RodContact, the forces of contact", *_OPTIONS, gpu=True)
 
 
 class _Sizes(ctypes.Structure):
@@ -35,11 +35,14 @@ class _Sizes(ctypes.Structure):
 
 def _call(what: str, inputs: Sequence, others: Sequence[Tensor], sweeps: int, friction: bool, rule: Sequence[float]):
     vertices, laws, at, real = inputs
-    places = scene_packing.fields(vertices), scene_packing.fields([laws]), at.data_ptr(), real.data_ptr()
-    arrays = (ctypes.c_void_p(x) if isinstance(x, int) else x for x in places)
+    fields = [scene_packing.fields(x) for x in (vertices, [laws], *([x] for x in others))]
+    places = [*fields[:2], at.data_ptr(), real.data_ptr(), *fields[2:]]
     sizes = _Sizes(*vertices[0].shape[1:], real.shape[0], sweeps, friction, *rule)
-    call = _function(what, real.dtype)
-    call(*arrays, *(scene_packing.fields([x]) for x in others), ctypes.byref(sizes), torch.get_num_threads())
+    if scene_packing.uses_gpu(real):
+        scene_packing.on_gpu("rod_pairs", what, sizes, places, real, sizes.scenes, *_OPTIONS)
+    else:
+        arrays = (ctypes.c_void_p(x) if isinstance(x, int) else x for x in places)
+        _function(what, real.dtype)(*arrays, ctypes.byref(sizes), torch.get_num_threads())
 
 
 def _sweep(vertices: list[Tensor], laws: Tensor, at: Tensor, real: Tensor, *static) -> Tensor:
@@ -74,12 +77,13 @@ def _backward(ctx, by: Tensor):
     return list(found.split([x.shape[0] for x in vertices])), law, None, None, *(None for _ in ctx.static)
 
 
-scene_packing.operator(f"rod_pairs({_INPUTS}, {_STATIC}) -> Tensor", _sweep, _sweep_meta, _save, _backward)
+scene_packing.operator(f"rod_pairs({_INPUTS}, {_STATIC}) -> Tensor", _sweep, _sweep_meta, _save, _backward, gpu=True)
 scene_packing.operator(
     f"rod_pairs_back({_INPUTS}, Tensor by, {_STATIC}) -> (Tensor, Tensor)",
     _back,
     _back_meta,
     backward=scene_packing.refuse_second_derivative,
+    gpu=True,
 )
 
 

@@ -19,7 +19,7 @@ from torchdlo.physics.constraints.contact_penalty import Pairs
 from torchdlo.physics.effects.base import PredictedMotion, Values
 from torchdlo.physics.rod.kinematics import View
 
-_OPTIONS = (f"-DWEAK={WEAK}", f"-DPULL={closest_points.PULL}")
+_OPTIONS = (f"-DWEAK={WEAK}", f"-DROOT_WEAK={WEAK**0.5}", f"-DPULL={closest_points.PULL}")
 _INPUTS = "Tensor[] vertices, Tensor laws, Tensor at, Tensor real"
 _STATIC = "bool friction, float[] rule"
 _function, ready = scene_packing.kernel("rod_touch", "RodContact, pairs of edges in implicit steps", *_OPTIONS)

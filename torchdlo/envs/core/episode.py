@@ -362,10 +362,10 @@ def control_step(episode: Episode, world: EpisodeState, action: Tensor, last: Te
 
 def _earned(episode: Episode, before: EpisodeState, world: EpisodeState) -> ControlStep:
     """Return what an action came to, with what an episode forfeits that failed in it."""
-    reward, loss, terms = episode_reward(episode, world)
+    earned, reward, loss, terms = episode_reward(episode, world)
     if not episode.task.forfeits:
         return ControlStep(world, reward, loss, terms)
-    gone = combined(episode.task, terms, len(world.failed)).detach().nan_to_num()
+    gone = earned.detach().nan_to_num()
     least = torch.minimum(world.notes[LEAST], gone.to(world.notes[LEAST]))
     left = (1 + episode.task.horizon - world.count).clamp(min=1)
     now = world.failed & ~before.failed
@@ -373,13 +373,16 @@ def _earned(episode: Episode, before: EpisodeState, world: EpisodeState) -> Cont
     return ControlStep(tree.replace(world, notes=world.notes | {LEAST: least}), reward, loss, terms)
 
 
-def episode_reward(episode: Episode, world: EpisodeState) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
-    """Return the reward of the last action, its loss, and the terms of the reward, shape (B,) each."""
+def episode_reward(episode: Episode, world: EpisodeState) -> tuple[Tensor, Tensor, Tensor, dict[str, Tensor]]:
+    """Return the sum of the terms of the last action's reward, the reward, its loss, and the terms, shape (B,) each.
+
+    The reward is that sum, and 0 in episodes that have failed, as the loss is.
+    """
     task, seen = episode.task, world.seen(episode.task.arms.count)
     terms = task.rewards(seen)
-    reward = combined(task, terms, len(world.failed))
-    loss = sum(task.auxiliary_loss(seen).values(), -reward)
-    return torch.where(world.failed, 0.0, reward), torch.where(world.failed, 0.0, loss), terms
+    earned = combined(task, terms, len(world.failed))
+    loss = sum(task.auxiliary_loss(seen).values(), -earned)
+    return earned, torch.where(world.failed, 0.0, earned), torch.where(world.failed, 0.0, loss), terms
 
 
 def successes(task: Task, world: EpisodeState) -> Tensor:

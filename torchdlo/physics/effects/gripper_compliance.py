@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -27,32 +26,6 @@ def _in_series(stiffness: Tensor, other: Tensor) -> Tensor:
     return tree.cat_components(torch.broadcast_tensors(s11 + both, s22 + both, s12)) / divisor
 
 
-def check_hinges(name: str, hinges: Sequence[int], topology: Topology) -> None:
-    """Raise a `ValueError` if the clamps of the effect `name` are not at hinges."""
-    mask = topology.hinge_mask()
-    wrong = [h for h in hinges if not 0 <= h < topology.size or not mask[h]]
-    if wrong or not hinges:
-        here = [i for i, real in enumerate(mask) if real]
-        raise ValueError(
-            f"{name}: hinges are {list(hinges)}; expected one or more of {here[0]} to {here[-1]} "
-            "inside the ropes, where clamps end"
-        )
-
-
-def at_clamps(topology: Topology, hinges: Sequence[int], like: Tensor) -> Tensor:
-    """Return 1 where clamps end and 0 elsewhere, shape (V, 1), of the dtype and device of a tensor."""
-    return like.new_tensor([[float(slot in hinges)] for slot in range(topology.size)])
-
-
-def softened(topology: Topology, params: RodParams, hinges: Sequence[int], stiffness: Tensor) -> RodParams:
-    """Return the rods' parameters with springs [N m/rad] in series with bending and twisting where clamps end."""
-    length, material = hinge_length(topology, params.rest), params.material
-    here, spring = at_clamps(topology, hinges, length) > 0, stiffness * length
-    bend = torch.where(here, _in_series(material.bend, spring), material.bend)
-    twist = torch.where(here, _in_series(material.twist, spring), material.twist)
-    return tree.replace(params, material=tree.replace(material, bend=bend, twist=twist))
-
-
 CLAMP_STIFFNESS = Param(
     1e18, 1e-3, 1e18, "N m/rad", "reciprocal", 1e18, "Stiffness of a clamp; 1e18 stands for a rigid one."
 )
@@ -60,20 +33,49 @@ CLAMP_STIFFNESS = Param(
 
 
 @dataclass(frozen=True)
-class GripperCompliance(Effect):
+class Clamps(Effect):
+    """Clamps that turn like a spring, whatever else they do: what such effects have in common."""
+
+    hinges: tuple[int, ...] = ()
+    """Slots of the vertices where clamps end."""
+
+    last: ClassVar[bool] = True
+
+    def check(self, topology: Topology) -> None:
+        """Raise a `ValueError` if the clamps are not at hinges."""
+        mask = topology.hinge_mask()
+        wrong = [h for h in self.hinges if not 0 <= h < topology.size or not mask[h]]
+        if wrong or not self.hinges:
+            here = [i for i, real in enumerate(mask) if real]
+            raise ValueError(
+                f"{self.name}: hinges are {list(self.hinges)}; expected one or more of {here[0]} to {here[-1]} "
+                "inside the ropes, where clamps end"
+            )
+
+    def here(self, topology: Topology, like: Tensor) -> Tensor:
+        """Return 1 where clamps end and 0 elsewhere, shape (V, 1), of the dtype and device of a tensor."""
+        return like.new_tensor([[float(slot in self.hinges)] for slot in range(topology.size)])
+
+    def modify_material(self, topology: Topology, params: RodParams, values: Values) -> RodParams:
+        """Put the springs in series with bending and twisting where clamps end."""
+        length, material = hinge_length(topology, params.rest), params.material
+        here, spring = self.here(topology, length) > 0, values["stiffness"] * length
+        bend = torch.where(here, _in_series(material.bend, spring), material.bend)
+        twist = torch.where(here, _in_series(material.twist, spring), material.twist)
+        return tree.replace(params, material=tree.replace(material, bend=bend, twist=twist))
+
+
+@dataclass(frozen=True)
+class GripperCompliance(Clamps):
     """Clamps that turn elastically: a spring in series with bending and twisting of the hinge at each of them.
 
     It softens the elastic hinge, 1/total = l/B + 1/stiffness; other moments of that hinge, such as friction, are taken
     to act on the rope behind the spring.
     """
 
-    hinges: tuple[int, ...] = ()
-    """Slots of the vertices where clamps end."""
-
     name: ClassVar[str] = "gripper_compliance"
     kind: ClassVar[EffectKind] = "boundary"
     equation: ClassVar[str] = "moment at a clamp = stiffness · turn of the rope in it"
-    last: ClassVar[bool] = True
     params: ClassVar[dict[str, Param]] = {"stiffness": CLAMP_STIFFNESS}
     spec = RopeEffectSpec(
         lambda s: [{"stiffness": 100 * s.bending_stiffness / s.rope.length}],
@@ -84,11 +86,3 @@ class GripperCompliance(Effect):
         },
         requires="clamps",
     )
-
-    def check(self, topology: Topology) -> None:
-        """Raise a `ValueError` if the clamps are not at hinges."""
-        check_hinges(self.name, self.hinges, topology)
-
-    def modify_material(self, topology: Topology, params: RodParams, values: Values) -> RodParams:
-        """Soften the hinges."""
-        return softened(topology, params, self.hinges, values["stiffness"])

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchdlo.physics import tree
-from torchdlo.physics.effects.base import Effect, EffectKind, Param, Values
+from torchdlo.physics.effects.base import EffectKind, Param, Values
 from torchdlo.physics.effects.effect_spec import RopeEffectSpec
 from torchdlo.physics.effects.elastic import (
     bending_moments,
@@ -20,10 +20,9 @@ from torchdlo.physics.effects.elastic import (
     moment_derivatives,
     stiffness_bound,
 )
-from torchdlo.physics.effects.gripper_compliance import CLAMP_STIFFNESS, at_clamps, check_hinges, softened
+from torchdlo.physics.effects.gripper_compliance import CLAMP_STIFFNESS, Clamps
 from torchdlo.physics.linalg.numerics import dot, safe_norm
-from torchdlo.physics.rod.kinematics import RodParams, View
-from torchdlo.physics.rod.topology import Topology
+from torchdlo.physics.rod.kinematics import View
 
 __all__ = ["GripperDamping", "GripperPlay"]
 
@@ -35,13 +34,13 @@ def _matrix(stiffness: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     return first, second, stiffness[..., 2:] if stiffness.shape[-1] == 3 else torch.zeros_like(first)
 
 
-def _clamped(effect: GripperPlay | GripperDamping, view: View) -> Tensor:
+def _clamped(effect: Clamps, view: View) -> Tensor:
     """Return the stiffness of the hinges at clamps [N m], as `hinge_stiffness`; 0 elsewhere."""
-    return hinge_stiffness(view) * at_clamps(view.topology, effect.hinges, view.length)
+    return hinge_stiffness(view) * effect.here(view.topology, view.length)
 
 
 @dataclass(frozen=True)
-class GripperPlay(Effect):
+class GripperPlay(Clamps):
     """Clamps in which the rope turns freely within an angle to every side, and beyond it against a spring.
 
     The play is taken off the bend b of the hinge at a clamp, which is rope and clamp in series: with the energy E of
@@ -50,13 +49,9 @@ class GripperPlay(Effect):
     in twist the spring alone acts. There is no friction in the play.
     """
 
-    hinges: tuple[int, ...] = ()
-    """Slots of the vertices where clamps end."""
-
     name: ClassVar[str] = "gripper_play"
     kind: ClassVar[EffectKind] = "boundary"
     equation: ClassVar[str] = "moment at a clamp = stiffness · (turn of the rope in it - angle), 0 within the angle"
-    last: ClassVar[bool] = True
     frames: ClassVar[bool] = True
     frame_bending: ClassVar[bool] = True
     is_quasistatic: ClassVar[bool] = True
@@ -77,14 +72,6 @@ class GripperPlay(Effect):
         special_case=("gripper_compliance", {"angle": 0.0}),
         requires="clamps",
     )
-
-    def check(self, topology: Topology) -> None:
-        """Raise a `ValueError` if the clamps are not at hinges."""
-        check_hinges(self.name, self.hinges, topology)
-
-    def modify_material(self, topology: Topology, params: RodParams, values: Values) -> RodParams:
-        """Soften the hinges by the spring."""
-        return softened(topology, params, self.hinges, values["stiffness"])
 
     def loads(self, view: View, values: Values) -> Values:
         """Return what the play takes off the moment of bending, and how that answers to twist."""
@@ -121,7 +108,7 @@ class GripperPlay(Effect):
 
 
 @dataclass(frozen=True)
-class GripperDamping(Effect):
+class GripperDamping(Clamps):
     """Clamps that turn like a spring and a damper side by side: what is bent in them creeps, and loses energy.
 
     In series with the rope's hinge of stiffness S that is a standard linear solid: the turn t of the clamp obeys
@@ -130,13 +117,9 @@ class GripperDamping(Effect):
     of first order in the substep. A rope starts with its clamps at rest. Bending only: in twist the spring alone acts.
     """
 
-    hinges: tuple[int, ...] = ()
-    """Slots of the vertices where clamps end."""
-
     name: ClassVar[str] = "gripper_damping"
     kind: ClassVar[EffectKind] = "boundary"
     equation: ClassVar[str] = "moment at a clamp = stiffness · (turn of the rope in it + loss_time · d turn/dt)"
-    last: ClassVar[bool] = True
     frames: ClassVar[bool] = True
     frame_bending: ClassVar[bool] = True
     is_quasistatic: ClassVar[bool] = True
@@ -159,14 +142,6 @@ class GripperDamping(Effect):
         special_case=("gripper_compliance", {"loss_time": 0.0}),
         requires="clamps",
     )
-
-    def check(self, topology: Topology) -> None:
-        """Raise a `ValueError` if the clamps are not at hinges."""
-        check_hinges(self.name, self.hinges, topology)
-
-    def modify_material(self, topology: Topology, params: RodParams, values: Values) -> RodParams:
-        """Soften the hinges by the spring."""
-        return softened(topology, params, self.hinges, values["stiffness"])
 
     def _lag(self, view: View, values: Values, strain: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return by how much the turns lag behind those at rest, (1 + h (1 - q S))^-1 h d, see `loads`, and q S b."""

@@ -6,7 +6,7 @@ from typing import Literal, get_args
 
 from torchdlo.errors import InputError
 
-__all__ = ["EXECUTIONS", "Execution", "check_execution"]
+__all__ = ["EXECUTIONS", "Execution", "check_execution", "execution_named"]
 
 Execution = Literal["compiled", "recorded", "eager"]
 """Who runs the operations of a step.
@@ -22,7 +22,12 @@ EXECUTIONS: tuple[Execution, ...] = get_args(Execution)
 
 def check_execution(given: str, where: str = "execution") -> Execution:
     """Return the way of running steps that is meant."""
-    for known in EXECUTIONS:
-        if given == known:
-            return known
-    raise InputError(f"{where}: it is {given!r}; expected one of {', '.join(EXECUTIONS)}.")
+    found = execution_named(given)
+    if found is None:
+        raise InputError(f"{where}: it is {given!r}; expected one of {', '.join(EXECUTIONS)}.")
+    return found
+
+
+def execution_named(given: object) -> Execution | None:
+    """Return the way of running steps of this name, None if there is none."""
+    return next((known for known in EXECUTIONS if known == given), None)

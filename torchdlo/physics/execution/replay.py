@@ -20,12 +20,12 @@ T = TypeVar("T")
 class _Replay(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any, run: Callable[[list[Tensor]], list[Tensor]], offload: bool, *inputs: Tensor
+        ctx: Any, run: Callable[[list[Tensor]], list[Tensor]], offloaded: Sequence[bool], *inputs: Tensor
     ) -> tuple[Tensor, ...]:
         ctx.run = run
         ctx.set_materialize_grads(False)
         ctx.devices = [x.device for x in inputs]
-        kept = [x.cpu() if offload and x.is_cuda else x for x in inputs]
+        kept = [_to_cpu(x) if offload and x.is_cuda else x for x, offload in zip(inputs, offloaded, strict=True)]
         ctx.save_for_backward(*kept)
         with torch.no_grad():
             return tuple(run(list(inputs)))
@@ -35,7 +35,7 @@ class _Replay(torch.autograd.Function):
     def backward(ctx: Any, *cotangents: Tensor | None) -> tuple[Any, ...]:
         needed = ctx.needs_input_grad[2:]
         inputs = [
-            x.detach().to(device).requires_grad_(need)
+            x.detach().to(device, non_blocking=True).requires_grad_(need)
             for x, device, need in zip(ctx.saved_tensors, ctx.devices, needed, strict=True)
         ]
         with torch.enable_grad():
@@ -50,7 +50,12 @@ class _Replay(torch.autograd.Function):
         return None, None, *(next(found) if need else None for need in needed)
 
 
-def replay(fn: Callable[..., Any], *trees: Any, offload: bool = True) -> Any:
+def _to_cpu(x: Tensor) -> Tensor:
+    """Return a copy in page-locked memory of the CPU, which is written and read in the order of the device's stream."""
+    return torch.empty_like(x, device="cpu", pin_memory=True).copy_(x, non_blocking=True)
+
+
+def replay(fn: Callable[..., Any], *trees: Any, offload: bool | Sequence[bool] = True) -> Any:
     """Run `fn(*trees)` without recording it; the backward pass runs it again with recording.
 
     Every tensor that needs a gradient has to be in `trees`: captured ones get none. Random numbers have to be inputs,
@@ -59,9 +64,11 @@ def replay(fn: Callable[..., Any], *trees: Any, offload: bool = True) -> Any:
     Args:
         fn: pure function of trees of tensors that returns such a tree.
         trees: its arguments.
-        offload: keep the inputs of a GPU run in CPU memory until they are needed.
+        offload: keep the inputs of a GPU run in CPU memory until they are needed; of all trees or of each.
     """
     inputs, rebuild = tree.flatten(trees)
+    each = (offload,) * len(trees) if isinstance(offload, bool) else offload
+    offloaded = [k for part, k in zip(trees, each, strict=True) for _ in tree.leaves(part)]
     shape: list[Any] = []
 
     def run(values: list[Tensor]) -> list[Tensor]:
@@ -72,7 +79,7 @@ def replay(fn: Callable[..., Any], *trees: Any, offload: bool = True) -> Any:
     moved = [i for i, x in enumerate(inputs) if x.is_floating_point() and x.requires_grad]
     if not moved or not torch.is_grad_enabled():
         return fn(*trees)
-    return _finish(_Replay.apply(run, offload, *inputs), shape)
+    return _finish(_Replay.apply(run, offloaded, *inputs), shape)
 
 
 def _finish(outputs: tuple[Tensor, ...], shape: list[Any]) -> Any:
@@ -169,7 +176,8 @@ def rollout(
             kept = []
             for a in range(0, tree.leaves(controls)[0].shape[0], size):
                 part = tree.map(lambda c, a=a: c[a : a + size], controls)
-                state, seen = replay(inner, params, state, part)
+                # Parameters and controls stay on the device all along; only states are many.
+                state, seen = replay(inner, params, state, part, offload=(False, True, False))
                 kept.append(seen)
             return state, tree.map(lambda *parts: torch.cat(parts), kept[0], *kept[1:])
 

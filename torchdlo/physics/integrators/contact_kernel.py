@@ -217,6 +217,7 @@ def _call(
     law: Sequence[float],
     tries: tuple[tuple[float, int], ...],
     solved: float,
+    stalled: tuple[float, float],
     joints: JointPoints | None = None,
 ) -> _Call:
     points, (of, resist) = parts[:_POINTS], parts[_POINTS : _POINTS + 2]
@@ -228,7 +229,7 @@ def _call(
     flat = [*flat[:3], flat[3] + flat[4], flat[5]]
     layouts = tuple(tuple((x.shape, x.stride()) for x in group) for group in flat)
     body = tuple(row.index(1.0) if 1.0 in row else -1 for row in of.tolist())
-    numbers = (*law, solved, penalty.ROUND, penalty.FAR, penalty.LEAVING)
+    numbers = (*law, solved, penalty.ROUND, penalty.FAR, penalty.LEAVING, *stalled)
     tensors = [x for group in flat[:4] for x in group]
     if joints is None:
         tied: tuple[Any, tuple[int, ...]] = (), ()
@@ -251,6 +252,7 @@ def solve(
     law: Sequence[float],
     tries: tuple[tuple[float, int], ...],
     solved: float,
+    stalled: tuple[float, float],
     joints: JointPoints | None = None,
 ) -> list[Tensor]:
     """Return what Newton's method finds, and what an exact step makes of it.
@@ -264,6 +266,8 @@ def solve(
         law: numbers of the equations without contact, and the substep [s].
         tries: how hard contact is, and Newton steps at most, one after the other.
         solved: what may be left of the equations.
+        stalled: what is left after an exact step, over what was left before it, from which on it falls no further, and
+            up to how many times `solved` that is taken for rounding.
         joints: points that are joined, if any are.
 
     Returns:
@@ -272,7 +276,7 @@ def solve(
         and what is left (..., 1, 1); forces of joints before that step and after it (..., A, 3), and displacements of
         bodies after it (..., J, 6).
     """
-    call = _call(inputs, parts, pairs, origin, topology, law, tries, solved, joints)
+    call = _call(inputs, parts, pairs, origin, topology, law, tries, solved, stalled, joints)
     plan = call.plan
     out = [origin.new_empty(*shape, plan.sizes.scenes) for shape in plan.shapes]
     run = getattr(_library(), f"touching_{_DTYPES[origin.dtype]}")

@@ -32,6 +32,9 @@ from torchdlo.physics.rod.topology import Topology, following, parse, preceding
 
 TRIES = ((HARD, 10), (0.1 * HARD, 24), (0.01 * HARD, 24))
 """How hard contact is, and Newton steps at most, of what is tried one after the other."""
+STALLED = 0.9, 10.0
+"""A scene counts as solved, too, if a step leaves more than this share of what was left before it, and less than so
+many times what may be left: that is rounding, which neither more steps nor softer contact makes less."""
 _FIELDS = tuple(field.name for field in dataclasses.fields(Touch))
 
 
@@ -378,7 +381,7 @@ def _equations(
 
 
 def _by_kernel(inputs, parts, pairs, origin: Tensor, topology: str, law: list[float], joints=None) -> list[Tensor]:
-    return contact_kernel.solve(inputs, parts, pairs, origin, topology, law, TRIES, _solved(origin), joints)
+    return contact_kernel.solve(inputs, parts, pairs, origin, topology, law, TRIES, _solved(origin), STALLED, joints)
 
 
 def _whole(*given) -> tuple[Tensor, ...]:
@@ -395,7 +398,7 @@ def _derived(
     topology: str,
     law: list[float],
 ) -> tuple[Tensor, ...]:
-    call = inputs, parts, pairs, origin, topology, law, TRIES, _solved(origin)
+    call = inputs, parts, pairs, origin, topology, law, TRIES, _solved(origin), STALLED
     return contact_kernel.derive(call, found, by)
 
 
@@ -485,7 +488,7 @@ def _by_tensors(touching: Touching, tension: Tensor) -> list[Tensor]:
         # Scenes that are not solved begin again.
         chosen = torch.where(open, hard, chosen)
         firm, now = touching.firm(tension, chosen), _chosen(open, first, found)
-        before = now
+        before, last = now, torch.full_like(least, torch.inf)
         for k in range(steps):
             new, left = touching.newton_step(now, firm, linear, k >= 2)
             if k >= 3:  # the step from the one before is the exact one, which is taken again with graph
@@ -493,7 +496,8 @@ def _by_tensors(touching: Touching, tension: Tensor) -> list[Tensor]:
                 best, kept = _chosen(better, before, best), torch.where(better, chosen, kept)
                 least = torch.where(better, left, least)
             before, now = now, _chosen(open, new, now)
-            open = open & ~(left < _solved(left))
+            stalled = (left > STALLED[0] * last) & (left < STALLED[1] * _solved(left))
+            open, last = open & ~((left < _solved(left)) | (stalled & (k >= 3))), left
             if not bool(open.any()):
                 break
         found = now

@@ -1,5 +1,8 @@
 // Numbers of several scenes side by side, with any number of derivatives carried along.
 #pragma once
+#ifdef SIMT
+#include "simt.h"
+#else
 #include <cmath>
 #include <cstdint>
 #include <cstdlib>
@@ -107,15 +110,67 @@ static inline bool any(const M& mask) {
   return whole != 0;
 }
 
+// The same code runs on GPUs, see simt.h, where the lanes of a warp share what is done for each scene: one loop of all,
+// sums of which each adds a part, numbers that all lanes may set or read.
+#define CALLED
+#define EVERY(i, n) for (int i = 0; i < int(n); ++i)
+#define ADD(to, ...) (to) += __VA_ARGS__
+static inline int lane() { return 0; }
+static inline void meet() {}
+static inline bool anyone(bool yes) { return yes; }
+template <typename T>
+static inline T total(T mine) {
+  return mine;
+}
+template <class S>
+static inline void blank(List<S>& list) {
+  list.assign(list.size(), S{});
+}
+template <class S>
+static inline void copy(const List<S>& from, List<S>& to) {
+  to = from;
+}
+struct Memory {
+  template <class S>
+  void common(List<S>& list, int64_t count) { list.resize(count); }
+  template <class S>
+  void large(List<S>& list, int64_t count) { list.resize(count); }
+  template <class S>
+  void own(List<S>& list, int64_t, int64_t = 1) { list.clear(); }
+};
+#endif
+
 // A length below which vectors count as zero, as in physics/linalg/numerics.py.
 template <typename T>
 constexpr T TINY = sizeof(T) == 8 ? T(1e-12) : T(1e-8);
 
+#ifdef SIMT
+// Not all compilers have arrays of no numbers.
+template <typename T>
+struct Nothing {
+  Lanes<T> operator[](int) const { return {}; }
+};
+template <typename T, int N>
+struct Derivatives {
+  Lanes<T> g[N];
+};
+template <typename T>
+struct Derivatives<T, 0> {
+  static constexpr Nothing<T> g{};
+};
+#endif
+
 // A number with its derivatives by N variables; N may be 0.
 template <typename T, int N>
+#ifdef SIMT
+struct Num : Derivatives<T, N> {
+  using Derivatives<T, N>::g;
+  Lanes<T> x;
+#else
 struct Num {
   Lanes<T> x;
   Lanes<T> g[N];
+#endif
   Num() {}
   Num(const Lanes<T>& value) : x(value) {
     for (int i = 0; i < N; ++i) g[i] = Lanes<T>{};
@@ -201,3 +256,9 @@ template <typename T>
 static inline Vec<T> cross(const Vec<T>& a, const Vec<T>& b) {
   return {a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x};
 }
+#ifdef SIMT
+template <typename T>
+static inline void add_number(Vec<T>& to, const Vec<T>& x) {
+  ADD(to.x, x.x), ADD(to.y, x.y), ADD(to.z, x.z);
+}
+#endif

@@ -94,7 +94,7 @@ def _compiler(given: str, path: str) -> Compiler | None:
         _without(f"the C++ compiler {shlex.join(words)} does not run ({error})")
         return None
     if told.returncode:
-        _without(f"the C++ compiler {shlex.join(words)} does not work ({_last_line(told.stderr)})")
+        _without(f"the C++ compiler {shlex.join(words)} does not work ({last_line(told.stderr)})")
         return None
     return Compiler(tuple(words), told.stdout)
 
@@ -103,7 +103,8 @@ def _without(reason: str) -> None:
     notices.once("kernels", f"{reason}: slower tensor operations are used. `torchdlo doctor` says more.")
 
 
-def _last_line(text: str) -> str:
+def last_line(text: str) -> str:
+    """Return the line of a compiler's message that says most."""
     lines = [line for line in text.splitlines() if line.strip()]
     return next((line for line in lines if "error" in line), lines[-1] if lines else "no message").strip()
 
@@ -150,7 +151,7 @@ def library(source: Path, *options: str) -> ctypes.CDLL | None:
                     _build(command, target)
         return ctypes.CDLL(str(target))
     except subprocess.CalledProcessError as error:
-        _without(f"{shlex.join(found.words)} could not build {source.name} ({_last_line(error.stderr)})")
+        _without(f"{shlex.join(found.words)} could not build {source.name} ({last_line(error.stderr)})")
         return None
     except OSError as error:
         _without(f"{source.name} could not be built or loaded ({error})")

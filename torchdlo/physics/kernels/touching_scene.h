@@ -14,11 +14,11 @@ template <typename T>
 class Scene {
  public:
   explicit Scene(const Sizes& sizes)
-      : joints{sizes.tied, sizes.bodies}, s(sizes), v(s.slots), n(4 * v), k(s.half),
+      : joints{sizes.tied, sizes.bodies}, s(sizes), v(s.slots), n(4 * v), k((s.half + 7) / 8 * 8),
         own(6 * s.bodies + 3 * s.tied.count), before(v), rank(n), y(3 * v), begin(3 * v), along(3 * v),
         push(3 * v), pull(3 * v), turn(3 * v), resist(3 * v), touch(3 * v), between(3 * v), joined(3 * v), residual(3 * v),
         excess(v), lean(v), one(v), two(v), same(v), firm(v), least(v), wrench(6 * s.bodies), step(n),
-        load_pos(3 * v), load_length(v), load_body(own), gap(3 * s.tied.count), known(s.families * v) {
+        load_pos(3 * v), load_length(v), load_body(own), gap(3 * s.tied.count), factors(k), known(s.families * v) {
     for (int64_t i = 0; i < v; ++i) before[s.after[i]] = i;
     for (int64_t j = 0; j < n; ++j) rank[s.order[j]] = j;
     const auto place = [&](int64_t row, int64_t column) { places.push_back(rank[row] * 2 * k + rank[column] + k); };
@@ -69,12 +69,15 @@ class Scene {
       chosen = T(s.hardness[t]);
       harden(chosen);
       now = last = first;
+      T fallen = std::numeric_limits<T>::infinity();  // what was left a step ago
       for (int64_t j = 0; j < s.steps[t]; ++j) {
         const State<T> here = now;
         const T rest = newton(now, j >= 2);
         if (j >= 3 && rest < smallest) best = last, kept = chosen, smallest = rest;
-        last = here;
-        if (rest < T(s.law[5])) {
+        // What falls no further, and is little, is rounding.
+        const bool stays = j >= 3 && rest > T(s.law[9]) * fallen && rest < T(s.law[10]) * T(s.law[5]);
+        last = here, fallen = rest;
+        if (rest < T(s.law[5]) || stays) {
           open = false;
           break;
         }
@@ -526,7 +529,7 @@ class Scene {
   std::vector<int64_t> places;  // where the entries of `assemble` stand in the band, 28 for each slot
   std::vector<T> y, begin, along, push, pull, turn, resist, touch, between, joined, residual, excess, lean, one, two, same, firm,
       least, wrench, step, band, border, row, corner, side, turned, load_pos, load_length, load_body, gap, levers, reach, other, by_firm,
-      by_lean;
+      by_lean, factors;
   std::vector<Acting> acting;
   std::vector<int64_t> known;  // where the maps of points are, -1 for those that nothing asked for
   std::vector<Maps<T>> maps;

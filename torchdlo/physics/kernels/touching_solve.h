@@ -9,6 +9,18 @@
 
 namespace {
 
+// Eight numbers, wherever they stand.
+template <typename T>
+struct Together {
+  typedef T type __attribute__((vector_size(8 * sizeof(T)), aligned(sizeof(T)), may_alias));
+};
+template <typename T>
+using Eight = typename Together<T>::type;
+template <typename T>
+Eight<T>& eight(T* first) {
+  return *(Eight<T>*)first;
+}
+
 template <typename T>
 void Scene<T>::transpose() {
   const int64_t width = 2 * k + 1;
@@ -25,7 +37,7 @@ void Scene<T>::transpose() {
 // Solves for `step` and `turned` what `load_pos`, `load_length` and `load_body` are to be; or the transposed system.
 template <typename T>
 void Scene<T>::solve(bool transposed) {
-  const int64_t extra = own + 3 * (int64_t)acting.size(), m = 1 + extra;
+  const int64_t extra = own + 3 * (int64_t)acting.size(), m = extra ? (1 + extra + 7) / 8 * 8 : 1;
   if (transposed) transpose();
   std::sort(acting.begin(), acting.end(), [](const Acting& a, const Acting& b) { return a.row < b.row; });
   side.assign((n + k) * m, T(0));  // by rank
@@ -53,7 +65,8 @@ void Scene<T>::solve(bool transposed) {
   for (int64_t u = 0; u < n; ++u) step[u] = side[rank[u] * m];
 }
 
-// Solves the banded system for all columns of `side`; K is half its bandwidth, or 0 for any.
+// Solves the banded system for all columns of `side`; K is half its bandwidth, or 0 for any. Compilers do less well by
+// loops over eight numbers than by vectors.
 template <typename T>
 template <int K>
 void Scene<T>::eliminate(int64_t m) {
@@ -64,26 +77,34 @@ void Scene<T>::eliminate(int64_t m) {
     while (next < acting.size() && acting[next].row <= i) ++next, used += 3;
     T* pivot = &band[i * width + k];
     const T inverse = *pivot = 1 / *pivot;
-    const T* mine = &side[i * m];
-    for (int64_t l = 1; l <= k; ++l) {
-      T* below = &band[(i + l) * width + k - l];
-      const T factor = *below * inverse;
-      if (factor == T(0)) continue;
-      for (int64_t u = 1; u <= k; ++u) below[u] -= factor * pivot[u];
-      T* theirs = &side[(i + l) * m];
-      for (int64_t j = 0; j < used; ++j) theirs[j] -= factor * mine[j];
+    for (int64_t l = 0; l < k; ++l) factors[l] = band[(i + l + 1) * width + k - l - 1] * inverse;
+    for (int64_t u = 0; u < k; u += 8) {
+      const Eight<T> mine = eight(pivot + 1 + u);
+      for (int64_t l = 0; l < k; ++l) eight(&band[(i + l + 1) * width + k - l + u]) -= factors[l] * mine;
+    }
+    if (m == 1) {
+      for (int64_t l = 0; l < k; l += 8) eight(&side[i + 1 + l]) -= side[i] * eight(&factors[l]);
+      continue;
+    }
+    for (int64_t j = 0; j < used; j += 8) {
+      const Eight<T> mine = eight(&side[i * m + j]);
+      for (int64_t l = 0; l < k; ++l) eight(&side[(i + l + 1) * m + j]) -= factors[l] * mine;
     }
   }
   for (int64_t i = n - 1; i >= 0; --i) {
-    const T* pivot = &band[i * width + k];
-    T* mine = &side[i * m];
-    for (int64_t u = 1; u <= k && i + u < n; ++u) {
-      const T factor = pivot[u];
-      if (factor == T(0)) continue;
-      const T* theirs = &side[(i + u) * m];
-      for (int64_t j = 0; j < m; ++j) mine[j] -= factor * theirs[j];
+    T* pivot = &band[i * width + k];
+    if (m == 1) {
+      Eight<T> sum = {};
+      for (int64_t u = 1; u <= k; u += 8) sum += eight(pivot + u) * eight(&side[i + u]);
+      for (int c = 0; c < 8; ++c) side[i] -= sum[c];
+      side[i] *= *pivot;
+      continue;
     }
-    for (int64_t j = 0; j < m; ++j) mine[j] *= *pivot;
+    for (int64_t j = 0; j < m; j += 8) {
+      Eight<T> mine = eight(&side[i * m + j]);
+      for (int64_t u = 1; u <= k; ++u) mine -= pivot[u] * eight(&side[(i + u) * m + j]);
+      eight(&side[i * m + j]) = mine * *pivot;
+    }
   }
 }
 

@@ -162,7 +162,7 @@ def calibrate(
                 for improved in _fit(job, starts, iterations, np.random.default_rng(seed), memory, report):
                     if best.point is None or best is improved or improved.cost < best.cost:
                         best = improved
-            before = _before(tree.part(best))  # refining corrects what the pool simulates from then on
+            before = _before(tree.part(best))
             best = _refined(tree.part(best), iterations, vertices, report) if refined else best
             best = _weighed(tree.part(best), iterations, report)
         except KeyboardInterrupt:
@@ -340,10 +340,6 @@ def _refined(job: _Job, iterations: int, vertices: int | None, report: Callback)
     names = job.space.names
     first = FitJob(job.model.effects, job.values[None], names, sizes, iterations, options=options)
     clamps = _CLAMPS if finer and job.model.mesh.clamps else ()
-    model = job.model
-    own: dict[str, Any] = {"numerical_damping": model.numerical_damping, "clamp_fraction": model.clamp_fraction}
-    own |= {"vertices": pool.local.options.get("vertices"), "substep": (1 + 1e-9) * model.dt / model.substeps}
-    job = replace(job, options=tuple((own | dict(job.options)).items()))
     try:
         found = refinement.refine(pool, first, clamps, iterations, vertices is None, report)
     except InputError:
@@ -352,8 +348,8 @@ def _refined(job: _Job, iterations: int, vertices: int | None, report: Callback)
     fitted = found.fitted
     if not found.corrected:
         return replace(job, drifts=found.drifts)
-    model = pool.local.model(fitted.effects)
-    better = replace(job, options=(), model=model, space=fitted.space, motion=model.motion(trials))
+    model = found.pool.local.model(fitted.effects)
+    better = replace(job, pool=found.pool, options=(), model=model, space=fitted.space, motion=model.motion(trials))
     better.values, better.point, better.drifts = fitted.values, fitted.point, found.drifts
     errors = []
     for each in (job, better):

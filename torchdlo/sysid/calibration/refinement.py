@@ -47,6 +47,8 @@ _WILD = 0.1
 class Refined:
     """What the last stage found."""
 
+    pool: Pool
+    """Simulates with the options that were found to suit."""
     fitted: Fitted
     """Numbers, where they stand, and how trials pull at them."""
     drifts: np.ndarray
@@ -68,7 +70,7 @@ def refine(
 
     Args:
         pool: the simulations.
-        first: where to start, which numbers to fit, and with which options, which the pool has from then on.
+        first: where to start, which numbers to fit, and with which options.
         clamp_fractions: where clamps may hold the rope, see `Mesh.clamp_shares`; the best is kept. None: as it is.
         iterations: most iterations of the last fit.
         correct: whether the numbers shall be those of an exact simulation; else they stay as they are.
@@ -76,9 +78,7 @@ def refine(
     """
     stage = "refining the fit"
     report(stage, 0, 3, "")
-    pool.choose(**dict(first.options))
-    bench = Workspace(pool)
-    bench.begin(first.values[0], first.effects)
+    bench = Workspace(pool.with_options(**dict(first.options))).begin(first.values[0], first.effects)
 
     def job(most: int, **options: float) -> FitJob:
         start, free = bench.starts["train"], first.free
@@ -87,20 +87,20 @@ def refine(
     jobs = [job(_FIRST, clamp_fraction=c) for c in clamp_fractions] or [job(_FIRST if correct else 0)]
     best = min(bench.fit(jobs), key=lambda f: f.point.cost)
     if clamp_fractions:
-        pool.choose(clamp_fraction=dict(best.options)["clamp_fraction"])
-    if correct and _size(pool) <= _SMALL:
-        pool.choose(substep=MAX_SUBSTEP / 2)
+        bench = bench.with_options({"clamp_fraction": dict(best.options)["clamp_fraction"]})
+    if correct and _size(bench.pool) <= _SMALL:
+        bench = bench.with_options({"substep": MAX_SUBSTEP / 2})
     report(stage, 1, 3, f"{1e3 * best.point.cost:.2f} mm")
     if correct:
-        bench.begin(best.values, best.effects)
-    bench.correct(best)
+        bench = bench.begin(best.values, best.effects)
+    bench = bench.correct(best)
     report(stage, 2, 3, "")
     if correct:
         best = bench.fit([bench.further(best, iterations)])[0]
     own = np.stack([_thickness(bench, best), noise_of(best.point)])
     drifts = np.concatenate([bench.drift(best, _clamped(bench, best), _LEFT if correct else _ALL), own])
     report(stage, 3, 3, f"{1e3 * best.point.cost:.2f} mm")
-    return Refined(best, drifts, correct)
+    return Refined(bench.pool, best, drifts, correct)
 
 
 def _size(pool: Pool) -> int:

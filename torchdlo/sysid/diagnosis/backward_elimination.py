@@ -8,7 +8,7 @@ doi:10.1016/0167-8655(94)90127-9).
 from __future__ import annotations
 
 from collections.abc import Hashable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from torchdlo.sysid.diagnosis import effect_library, selection
 from torchdlo.sysid.diagnosis.budget import Budget
@@ -17,7 +17,6 @@ from torchdlo.sysid.diagnosis.error_floor import gap_rms
 from torchdlo.sysid.diagnosis.score_test import score_effects
 from torchdlo.sysid.diagnosis.workspace import SILENT, Callback, Workspace
 from torchdlo.sysid.estimation.jobs import Fitted
-from torchdlo.sysid.model.trial_batch import Start
 
 _TRIED = 2
 """Effects that are tried in the place of another, besides those that do alike things."""
@@ -52,20 +51,20 @@ class EliminationResult:
         self.shares[[*self.shares][-1]] += share
 
 
+@dataclass(frozen=True, eq=False)
 class Revision:
     """Second looks at the effects of a search."""
 
-    def __init__(self, bench: Workspace, budget: Budget, plain: Sequence[Fitted], report: Callback) -> None:
-        """Prepare.
-
-        Args:
-            bench: the trials.
-            budget: how much work to do.
-            plain: the baseline, and what it became when it was fitted for longer.
-            report: told how it goes.
-        """
-        self.bench, self.budget, self.plain, self.report = bench, budget, plain, report
-        self._reductions: dict[Hashable, tuple[Start, Fitted]] = {}
+    bench: Workspace
+    """What is known."""
+    budget: Budget
+    """How much work to do."""
+    plain: Sequence[Fitted]
+    """The baseline, and what it became when it was fitted for longer."""
+    report: Callback
+    """Told how it goes."""
+    reductions: dict[Hashable, tuple[Hashable, Fitted]] = field(default_factory=dict)
+    """A cache of models without one of their effects, with where trials began, and counted up to, in their fits."""
 
     def matters(self, less: Fitted, more: Fitted, split: str) -> bool:
         """Return whether a model's gap is smaller by more than the floor, and by a share of the baseline's.
@@ -106,19 +105,19 @@ class Revision:
     def exchanged(self, fitted: Fitted, found: EliminationResult, possible: Sequence[str]) -> Fitted:
         """Return the model with other effects in the place of some, where they fit better beside the rest.
 
-        Where nothing is left to be explained, and of one effect alone, which was held against all others just now,
-        there is nothing to look for.
+        Its options may be others than those of the workspace. Where nothing is left to be explained, and of one effect
+        alone, which was held against all others just now, there is nothing to look for.
         """
-        waiting, count = [*found.shares][:-1], 0
+        look, waiting, count = self, [*found.shares][:-1], 0
         while waiting and count < _EXCHANGES and gap_rms(self.bench.gaps(fitted, "all")) > SILENT * self.bench.level:
             old = waiting.pop(0)
-            best = self._instead(fitted, old, [n for n in possible if n not in fitted.effects])
+            best = look._instead(fitted, old, [n for n in possible if n not in fitted.effects])
             if not self._better(best, fitted) or self._astray(best, fitted):
                 continue
             new, count = best.effects[-1], count + 1
             alike = fitted.point.cost - best.point.cost < self._tie(fitted)
             fitted = best
-            self.bench.pool.choose(**dict(best.options))
+            look = replace(look, bench=look.bench.with_options(dict(best.options)))
             found.exchange(old, new, alike=alike)
             waiting = [n for n in found.shares if n != new]
         return fitted
@@ -138,19 +137,18 @@ class Revision:
 
     def without(self, fitted: Fitted, name: str) -> Fitted:
         """Return the model without one of its effects; what was asked for before is not fitted again."""
-        start, key = self.bench.starts["train"], (fitted.effects, fitted.options, fitted.values.tobytes(), name)
-        at, kept = self._reductions.get(key, (None, None))
-        if kept is None or at is not start:
+        here, key = (self.bench.start, *self.bench.discounted.items()), _key(fitted, name)
+        at, kept = self.reductions.get(key, (None, None))
+        if kept is None or at != here:
             less = self.bench.fit([self.bench.reduction(fitted, name, self.plain[0], 2 * self.budget.more)])[0]
             self.report(f"without {name}", 1, 1, f"{1e3 * less.point.cost:.2f} mm")
-            self._reductions[key] = start, less
+            self.reductions[key] = here, less
             return less
         return kept
 
     def known_without(self, fitted: Fitted, name: str) -> Fitted | None:
         """Return the model without one of its effects if it was fitted before, None if it was not."""
-        key = (fitted.effects, fitted.options, fitted.values.tobytes(), name)
-        return self._reductions.get(key, (None, None))[1]
+        return self.reductions.get(_key(fitted, name), (None, None))[1]
 
     def _instead(self, fitted: Fitted, old: str, names: Sequence[str]) -> Fitted:
         """Return the best model with one of several effects in the place of another."""
@@ -163,3 +161,7 @@ class Revision:
         best = min(self.bench.fit([self.bench.further(f, more) for f in lead]), key=lambda f: f.point.cost)
         self.report(f"{stage}: {best.effects[-1]}", 1, 1, f"{1e3 * best.point.cost:.2f} mm")
         return best
+
+
+def _key(fitted: Fitted, name: str) -> Hashable:
+    return fitted.effects, fitted.options, fitted.values.tobytes(), name

@@ -8,8 +8,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from torchdlo.physics import tree
 from torchdlo.sysid.diagnosis import clamp_models
-from torchdlo.sysid.diagnosis.error_floor import Refinement, gap_rms, trial_gaps
+from torchdlo.sysid.diagnosis.error_floor import gap_rms, trial_gaps
 from torchdlo.sysid.diagnosis.workspace import CHAIN, SILENT, Callback, Workspace
 from torchdlo.sysid.estimation.jobs import FitJob, Fitted
 from torchdlo.sysid.model.model_file import ModelFile
@@ -48,8 +49,10 @@ _FAR = np.log(8.0)
 
 def calibrate_baseline(
     bench: Workspace, count: int, iterations: int, rng: np.random.Generator, report: Callback
-) -> Fitted:
+) -> tuple[Workspace, Fitted]:
     """Return the fitted baseline, straight if a given rest shape fits worse, a chain or in firm clamps if that helps.
+
+    Also return the workspace with what was learned on the way.
 
     Args:
         bench: the trials.
@@ -59,7 +62,7 @@ def calibrate_baseline(
         report: told how it goes.
     """
     model = bench.pool.local.model(())
-    bench.begin(model.guess(), ())
+    bench = bench.begin(model.guess(), ())
     names, stage = tuple(model.parameters), "calibrating the baseline"
     report(stage, 0, 4, f"{count} starts")
     frames = bench.pool.local.motion(model, "train").markers.shape[1]
@@ -83,30 +86,32 @@ def calibrate_baseline(
     best = min(first, key=lambda f: f.point.cost).values
     straight = _straight(bench, values, best, frames) if model.rest == "given" else None
     if straight is not None:
+        bench = bench.with_options({"rest": "straight"})
         best, names, ones = straight, _names(bench, "straight"), ones[: len(straight)]
         free, sizes = (*names, free[-1]), (*ones, sizes[-1])
-    bench.early = best
+    bench = replace(bench, early=best)
     if straight is not None or not bench.starts["train"].at_rest.all():
-        bench.begin(best, ())
+        bench = bench.begin(best, ())
     # Phases of late times are right only after early ones are: the horizon grows. The order of the axes of its joints
     # gives a chain's length a sign.
     sides = [chain(np.append(best, length)[None], 4, 2 * frames // 3) for length in (link, -link)]
     firm = [plain(best[None], 5, 2 * frames // 3, clamp_fraction=1.0)] if model.mesh.clamps else []
     smooth, one, other, *held = fit([plain(best[None], 5, 2 * frames // 3), *sides, *firm], 2)
     side = min((one, other), key=lambda f: f.point.cost)
-    bench.linked = side.point.cost < _LINKED * smooth.point.cost
-    if held:
-        smooth, side = _held(bench, held[0], smooth, side)
-    rope = bench.correct(smooth)
+    bench = replace(bench, linked=side.point.cost < _LINKED * smooth.point.cost)
+    if held and held[0].point.cost < _BETTER * min(smooth.point.cost, side.point.cost):
+        bench, smooth = bench.with_options({"clamp_fraction": 1.0}), held[0]
+        side = _moved(side, smooth)
+    bench = bench.correct(smooth)
     better = fit([plain(smooth.values[None], iterations, None)], 3)[0]
     if side.point.cost < _BETTER * smooth.point.cost:
-        better = _chain_or(bench, better, rope, [chain(side.values[None], iterations, None)])
+        bench, better = _chain_or(bench, better, [chain(side.values[None], iterations, None)])
     report(stage, 4, 4, f"{1e3 * gap_rms(bench.gaps(better, 'train')):.2f} mm")
-    return better
+    return bench, better
 
 
 def _straight(bench: Workspace, values: np.ndarray, given: np.ndarray, frames: int) -> np.ndarray | None:
-    """Return the numbers of a rope without rest shape if it fits better, and give up the shape; None if it does not.
+    """Return the numbers of a rope without rest shape if it fits better than with the given one, None if it does not.
 
     Such a rope is one whose share of the rest shape is 0, which searches that begin with the shape do not always find.
     """
@@ -120,23 +125,11 @@ def _straight(bench: Workspace, values: np.ndarray, given: np.ndarray, frames: i
     best = min(found, key=lambda f: f.point.cost).values
     longer = 2 * frames // 3
     straight, shaped = bench.fit([job(best[None], 5, longer), job(given[None], 5, longer, "given")])
-    if straight.point.cost >= shaped.point.cost:
-        return None
-    bench.pool.choose(rest="straight")
-    return straight.values
+    return straight.values if straight.point.cost < shaped.point.cost else None
 
 
 def _names(bench: Workspace, rest: str) -> tuple[str, ...]:
     return tuple(bench.pool.local.model((), (("rest", rest),)).parameters)
-
-
-def _held(bench: Workspace, firm: Fitted, smooth: Fitted, side: Fitted) -> tuple[Fitted, Fitted]:
-    """Return a smooth rope and a chain in the clamps that fit better: those that hold it to their ends, or others."""
-    least = min(smooth.point.cost, side.point.cost)
-    if firm.point.cost >= _BETTER * least:
-        return smooth, side
-    bench.pool.choose(clamp_fraction=1.0)
-    return firm, _moved(side, firm)
 
 
 def _moved(side: Fitted, smooth: Fitted) -> Fitted:
@@ -158,12 +151,13 @@ def _random(model: RopeModel, count: int, rng: np.random.Generator) -> np.ndarra
     return values
 
 
-def go_further(bench: Workspace, base: Fitted, iterations: int, report: Callback) -> Fitted:
+def go_further(bench: Workspace, base: Fitted, iterations: int, report: Callback) -> tuple[Workspace, Fitted]:
     """Return a model that took up an effect, with what the lack of that effect kept the baseline from finding.
 
-    That is the law of a chain, a given rest shape, and a twisting stiffness that hardly shows and ran away.
+    That is the law of a chain, a given rest shape, and a twisting stiffness that hardly shows and ran away. Also return
+    the workspace for that model.
     """
-    rope = _begin_anew(bench, base)
+    bench = _begun_anew(bench, base)
     model = bench.pool.local.model(base.effects)
     bend, twist = (model.parameters.index(f"{way}ing_stiffness") for way in ("bend", "twist"))
     values, link = base.values[None], float(np.diff(model.arclength).min())
@@ -181,21 +175,20 @@ def go_further(bench: Workspace, base: Fitted, iterations: int, report: Callback
     base, *others = bench.fit(jobs)
     better = min(others, key=lambda f: f.point.cost, default=base)
     if better.point.cost < _FIRMER * base.point.cost:
-        base = better
-        bench.pool.choose(**dict(base.options))
+        bench, base = bench.with_options(dict(better.options)), better
     names, sizes = base.space.names, tuple(base.space.units)
     free = (*names, f"{CHAIN}.length")
     report(stage, 1, 3, f"{1e3 * gap_rms(bench.gaps(base, 'train')):.2f} mm")
     if bench.linked and CHAIN not in base.effects and gap_rms(bench.gaps(base, "train")) > SILENT * bench.level:
         rows = [np.append(base.values, length)[None] for length in (link, -link)]
         sides = [FitJob(effects, r, free, (*sizes, 0.5 * link), iterations, bench.starts["train"]) for r in rows]
-        base = _chain_or(bench, base, rope, sides)
+        bench, base = _chain_or(bench, base, sides)
     report(stage, 2, 3, f"{1e3 * gap_rms(bench.gaps(base, 'train')):.2f} mm")
     # Corrections of another motion are wrong where motions part.
-    _begin_anew(bench, base)
+    bench = _begun_anew(bench, base)
     base = bench.fit([bench.further(base, iterations // 2)])[0]
     report(stage, 3, 3, f"{1e3 * gap_rms(bench.gaps(base, 'train')):.2f} mm")
-    return base
+    return bench, base
 
 
 def _shaped(bench: Workspace, base: Fitted, job: FitJob) -> FitJob:
@@ -210,58 +203,56 @@ def _shaped(bench: Workspace, base: Fitted, job: FitJob) -> FitJob:
     return replace(job, values=values, free=free, sizes=sizes, keep=2, options=options)
 
 
-def _begin_anew(bench: Workspace, base: Fitted) -> Refinement:
-    """Begin trials as a model says, and correct simulations by what finer ones of it change; return that."""
+def _begun_anew(bench: Workspace, base: Fitted) -> Workspace:
+    """Begin trials as a model says, and correct simulations by what finer ones of it change."""
     if not bench.starts["train"].at_rest.all():
-        bench.begin(base.values, base.effects)
+        bench = bench.begin(base.values, base.effects)
     return bench.correct(base)
 
 
-def _chain_or(bench: Workspace, smooth: Fitted, rope: Refinement, sides: Sequence[FitJob]) -> Fitted:
-    """Return the best fit of a chain, if it is better than that of a smooth rope, else the latter.
+def _chain_or(bench: Workspace, smooth: Fitted, sides: Sequence[FitJob]) -> tuple[Workspace, Fitted]:
+    """Return the best fit of a chain, with what is known of its errors, if it is better, else the smooth rope as it is.
 
     Args:
-        bench: the trials.
+        bench: what is known of the smooth rope.
         smooth: what was fitted.
-        rope: how simulations were corrected for it.
         sides: fits of the chain.
     """
-    level, before, frame_weights = bench.level, bench.gaps(smooth, "all"), bench.starts["train"].frame_weights
+    linked = bench.use(replace(tree.part(bench.refinement), links=abs(float(sides[0].values[0, -1]))))
+    frame_weights = bench.starts["train"].frame_weights
 
-    def left(fitted: Fitted) -> float:
+    def left(bench: Workspace, fitted: Fitted) -> float:
         return gap_rms(trial_gaps(bench.prediction(fitted, "train"), bench.trials["train"], frame_weights))
 
-    smoothly = left(smooth)
-    bench.use(replace(rope, links=abs(float(sides[0].values[0, -1]))))
-    start, most = bench.starts["train"], sides[0].iterations
-    found = bench.fit([replace(side, start=start, iterations=min(_LOOK, most)) for side in sides])
+    start, most = linked.starts["train"], sides[0].iterations
+    found = linked.fit([replace(side, start=start, iterations=min(_LOOK, most)) for side in sides])
     best = min(found, key=lambda f: f.point.cost)
     # Each in its own measure of what can be known. A rope that is no chain fits worse from the beginning.
-    if most > _LOOK and best.point.cost / bench.level < smooth.point.cost / level:
-        best = bench.fit([bench.further(best, most - _LOOK)])[0]
+    plainly = smooth.point.cost / bench.level
+    if most > _LOOK and best.point.cost / linked.level < plainly:
+        best = linked.fit([linked.further(best, most - _LOOK)])[0]
     # Less is known of a chain: that alone does not make it better where much more is left than can be known.
-    better = best.point.cost / bench.level < _BETTER * smooth.point.cost / level and left(best) < _BETTER * smoothly
-    if better and not bench.diverged(best, before):
-        return best
-    bench.use(rope)
-    return smooth
+    better = best.point.cost / linked.level < _BETTER * plainly and left(linked, best) < _BETTER * left(bench, smooth)
+    if better and not linked.diverged(best, bench.gaps(smooth, "all")):
+        return linked, best
+    return bench, smooth
 
 
-def go_on(bench: Workspace, given: ModelFile, iterations: int, report: Callback) -> Fitted:
-    """Return a given model, fitted to this recording."""
+def go_on(bench: Workspace, given: ModelFile, iterations: int, report: Callback) -> tuple[Workspace, Fitted]:
+    """Return a given model, fitted to this recording, and the workspace for it."""
     model = given.model(bench.recording, **bench.pool.local.options)
     sizes, values = given.sizes(model), given.start(model)
-    bench.begin(values, given.effects)
 
     def fit(values: np.ndarray, most: int) -> Fitted:
         start = bench.starts["train"]
         return bench.fit([FitJob(given.effects, values[None], tuple(sizes), tuple(sizes.values()), most, start)])[0]
 
+    bench = bench.begin(values, given.effects)
     found = fit(values, iterations // 2)
-    bench.correct(found)
+    bench = bench.correct(found)
     found = fit(found.values, iterations)
     report("fitting the given model", 1, 1, f"{1e3 * found.point.cost:.2f} mm")
-    return found
+    return bench, found
 
 
 def baseline_notes(base: Fitted) -> list[str]:

@@ -8,7 +8,7 @@ search goes on from there. Test trials are used at the end only: to confirm, or 
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -139,14 +139,15 @@ class _Search:
     def __init__(
         self, pool: Pool, budget: Budget, rng: np.random.Generator, report: Callback, without: Sequence[str] = ()
     ) -> None:
-        self.pool, self.budget, self.rng, self.report = pool, budget, rng, report
-        self.bench, self.recording, self.excluded = Workspace(pool), pool.recording, without
+        self.budget, self.rng, self.report, self.excluded = budget, rng, report, without
+        self.bench, self.recording = Workspace(pool), pool.recording
+        """What is known by now."""
         self.baseline: Fitted | None = None
         self.force_before: ForceErrors | None = None
         """How far the baseline's forces at the grippers are off."""
         self.plain: list[Fitted] = []
         """The baseline, and what it became when it was fitted for as long as the first candidates were."""
-        self.revision = Revision(self.bench, budget, self.plain, report)
+        self._reductions: dict[Hashable, tuple[Hashable, Fitted]] = {}
         self.scores: list[Score] = []
         """Of all effects, beside the baseline."""
         self.misleading: list[MisleadingTrial] = []
@@ -156,14 +157,24 @@ class _Search:
         self.leading: BestCandidate | None = None
         """What came closest in the last round, if it was not taken."""
 
+    @property
+    def pool(self) -> Pool:
+        """What simulates by now."""
+        return self.bench.pool
+
+    @property
+    def revision(self) -> Revision:
+        """Second looks, with what is known by now."""
+        return Revision(self.bench, self.budget, self.plain, self.report, self._reductions)
+
     def run(self, given: ModelFile | None = None) -> Diagnosis:
         """Go through all stages."""
         count, most = self.budget.starts, self.budget.more
         if given is None:
-            base = baselines.calibrate_baseline(self.bench, count, most, self.rng, self.report)
+            self.bench, base = baselines.calibrate_baseline(self.bench, count, most, self.rng, self.report)
         else:
-            base = baselines.go_on(self.bench, given, most, self.report)
-        base = gripper_forces.take_forces(self.bench, base, most, self.report)
+            self.bench, base = baselines.go_on(self.bench, given, most, self.report)
+        self.bench, base = gripper_forces.take_forces(self.bench, base, most, self.report)
         self.force_before = gripper_forces.force_errors(self.bench, base)
         self.baseline, self.before = base, self.bench.prediction(base, "all")
         self.plain.append(base)
@@ -185,18 +196,23 @@ class _Search:
                         continue
                 elif rival is not base and (found.shares or rival.options != base.options):
                     base = rival
-                    self.pool.choose(**dict(base.options))
+                    self._take(base)
                 break
             name, old = best.effects[-1], self._squared(base)
             found.rivals[name] = rival
-            self.pool.choose(**dict(best.options))
+            self._take(best)
             found.shares[name], found.ties[name] = (old - self._squared(best)) / whole, rivals
-            base = baselines.go_further(self.bench, best, self.budget.more, self.report)
+            self.bench, base = baselines.go_further(self.bench, best, self.budget.more, self.report)
             found.shares[name] += (self._squared(best) - self._squared(base)) / whole
             base = self.revision.exchanged(self.revision.pruned(base, found), found, self._possible())
+            self._take(base)
             self._say_floor()
         base = self.revision.plainer(self.revision.pruned(base, found), found, self._possible())
         return self._conclude(base, found, rounds)
+
+    def _take(self, model: Fitted) -> None:
+        """Give all models the options of this one from now on."""
+        self.bench = self.bench.with_options(dict(model.options))
 
     def _anew(self, base: Fitted) -> Fitted | None:
         """Return a baseline that no effect explains, fitted further, as a chain of links if that is what it then is.
@@ -205,7 +221,7 @@ class _Search:
         """
         if CHAIN in base.effects or gap_rms(self.bench.gaps(base, "all")) < SILENT * self.bench.level:
             return None
-        further = baselines.go_further(self.bench, base, self.budget.more, self.report)
+        self.bench, further = baselines.go_further(self.bench, base, self.budget.more, self.report)
         self.baseline, self.before = further, self.bench.prediction(further, "all")
         self.force_before = gripper_forces.force_errors(self.bench, further)
         self.plain[:] = [further]
@@ -255,7 +271,7 @@ class _Search:
         self.bench.predict([base, rival, *fits.values()])
         if lost := self._misleading([rival, *fits.values()]):
             self.misleading += lost
-            self.bench.discount({trial.name: trial.frame for trial in lost})
+            self.bench = self.bench.discount({trial.name: trial.frame for trial in lost})
             jobs = [self.bench.further(f, self.budget.more) for f in (rival, *(fits[name] for name in led))]
             rival, *again = self._fitted(jobs, f"{stage}, without {', '.join(trial.name for trial in lost)}")
             fits |= dict(zip(led, again, strict=True))
@@ -494,7 +510,7 @@ class _Search:
         said = [
             *baselines.baseline_notes(tree.part(self.baseline)),
             *clamp_models.clamp_notes(model, final),
-            *self.bench.notes(),
+            *self.bench.predictions.notes(),
             *self._force_notes(final),
         ]
         predictions = {

@@ -7,7 +7,7 @@ the screening and in the fits. Whether an effect is worth its name is judged by 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -39,10 +39,10 @@ class ForceErrors:
     """[N m]; None where torques do not count."""
 
 
-def take_forces(bench: Workspace, base: Fitted, iterations: int, report: Callback) -> Fitted:
-    """Return the baseline with the mass as one of its numbers, and let forces count in fits from now on.
+def take_forces(bench: Workspace, base: Fitted, iterations: int, report: Callback) -> tuple[Workspace, Fitted]:
+    """Return a workspace in whose fits forces count, and the baseline with the mass as one of its numbers.
 
-    The same baseline where no train trial has forces.
+    Both are as they were where no train trial has forces.
 
     Args:
         bench: the trials.
@@ -52,21 +52,20 @@ def take_forces(bench: Workspace, base: Fitted, iterations: int, report: Callbac
     """
     recording, trials, start = bench.recording, bench.trials["train"], bench.starts["train"]
     if recording.wrench is None or all(t.wrench is None for t in trials):
-        return base
+        return bench, base
     stage, pool = "fitting forces", bench.pool
     report(stage, 0, 1, "")
     plain = pool.local.model(base.effects, base.options)
     model = RopeModel(recording, effects=base.effects, **(pool.local.options | dict(base.options) | {"forces": True}))
     numbers = dict(zip(plain.parameters, base.values, strict=True))
     known, first = weighed(model, trials, model.motion(trials), start, numbers)
-    pool.choose(**dict(base.options), forces=True, force_worth=known.metres)
-    bench.forget()
+    bench = bench.with_options(dict(base.options) | {"forces": True, "force_worth": known.metres})
     share = first[model.parameters.index("mass")] / model.mass
-    bench.early = _heavier(bench.early, plain, model, share)
+    bench = replace(bench, early=_heavier(bench.early, plain, model, share))
     free, sizes = (*base.space.names, "mass"), (*base.space.units, 1.0)
     (found,) = bench.fit([FitJob(base.effects, first[None], free, sizes, iterations, start)])
     report(stage, 1, 1, f"{float(found.values[model.parameters.index('mass')]):.3g} kg")
-    return found
+    return bench, found
 
 
 def _heavier(early: np.ndarray, plain: RopeModel, model: RopeModel, share: float) -> np.ndarray:

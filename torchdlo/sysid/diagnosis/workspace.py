@@ -1,9 +1,11 @@
-"""What a search works on: the trials of a recording, where they begin, and what models say of them."""
+"""What a search works on: what is known of a recording, a value that every stage returns anew."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -11,12 +13,14 @@ from torchdlo.errors import InputError
 from torchdlo.physics import tree
 from torchdlo.physics.effects.parameter_name import ParameterName
 from torchdlo.sysid.diagnosis import error_floor as floors
+from torchdlo.sysid.diagnosis.predictions import Predictions
 from torchdlo.sysid.diagnosis.score_test import Score
 from torchdlo.sysid.estimation.jobs import FitJob, Fitted, SimulationJob
 from torchdlo.sysid.estimation.levenberg_marquardt import PointEvaluation, cost_of, drift, extent
-from torchdlo.sysid.estimation.worker_pool import Pool, spread_jobs
-from torchdlo.sysid.model import initial_state as starts
+from torchdlo.sysid.estimation.worker_pool import Pool
+from torchdlo.sysid.model import initial_state
 from torchdlo.sysid.model.trial_batch import Start
+from torchdlo.sysid.recordings.recording import Recording, Trial
 
 Callback = Callable[[str, int, int, str], None]
 """Called with stage, steps done, steps in all, and a word on how it goes."""
@@ -26,13 +30,6 @@ SILENT = 1.3
 
 _ASTRAY = 3.0
 """Times the gap of another model from which a simulation has gone astray."""
-
-_TORN = 0.1
-"""Share of the rope's length by which markers may be further apart than along it: a simulated rope that is torn
-further has missed what happened within a step."""
-
-_FINER = 4
-"""How many times shorter the steps are with which such a trial is simulated once more."""
 
 _TIE = 0.05
 """Share of what fits save by which their costs have to differ to be told apart,"""
@@ -44,117 +41,101 @@ CHAIN = "link_chain"
 """What a chain of links does that a rope does not: candidate number 0, fitted before any effect is considered."""
 
 
-def _key(fitted: Fitted) -> Hashable:
-    return fitted.effects, fitted.options, fitted.values.tobytes()
-
-
-def torn_apart(sims: np.ndarray, arclength: np.ndarray) -> np.ndarray:
-    """Return which trials of simulated markers (B, F, M, 3), at places (M,) along the rope [m], tear it; shape (B,)."""
-    apart = np.linalg.norm(np.diff(sims, axis=2), axis=3) - np.diff(arclength)
-    return ~(apart <= _TORN * (arclength[-1] - arclength[0])).all((1, 2))
-
-
+@dataclass(frozen=True, eq=False)
 class Workspace:
-    """Trials, their starts and the predictions that were asked for."""
+    """What is known of a recording at one stage of a search; each method that learns something returns a new one."""
 
-    def __init__(self, pool: Pool) -> None:
-        self.pool, self.recording = pool, pool.recording
-        self.trials = {split: self.recording.trials(split) for split in ("train", "test", "all")}
-        self.starts: dict[str, Start] = {}
-        self.early = np.empty(0)
-        """The baseline's numbers that fit the beginning of the trials, as far as they are known."""
-        self.linked = True
-        """Whether the rope may move like a chain of links, as far as the baseline tells."""
-        self.floor = floors.ErrorFloor(floors.marker_noise(self.recording), float("inf"), float("inf"))
-        """What no effect explains, on the test trials, as far as it is known."""
-        self.level = float("inf")
-        """What `gaps` are for a perfect model [m]."""
-        self.mended: set[str] = set()
-        """Trials that were simulated once more in finer steps."""
-        self.discounted: dict[str, int] = {}
-        """Train trials that count up to a frame only."""
-        self._finer: floors.Refinement | None = None
-        self._known: dict[Hashable, np.ndarray] = {}
+    pool: Pool
+    """Simulates, with the options that models have from here on."""
+    start: Start | None = None
+    """Where all trials begin, and how simulations that begin there are corrected; not known before `begin`."""
+    refinement: floors.Refinement | None = None
+    """What finer steps and a finer mesh change, as far as it is known."""
+    discounted: Mapping[str, int] = field(default_factory=dict)
+    """Train trials that count up to a frame only, by their names."""
+    early: np.ndarray = field(default_factory=lambda: np.empty(0))
+    """The baseline's numbers that fit the beginning of the trials, as far as they are known."""
+    linked: bool = True
+    """Whether the rope may move like a chain of links, as far as the baseline tells."""
+    predictions: Predictions = field(default_factory=Predictions)
+    """A cache, which all workspaces of a search share."""
 
-    def begin(self, base: np.ndarray, effects: Sequence[str]) -> None:
+    @property
+    def recording(self) -> Recording:
+        """What was measured."""
+        return self.pool.recording
+
+    @cached_property
+    def trials(self) -> dict[str, tuple[Trial, ...]]:
+        """Trials by split: "train", "test", "all"."""
+        return {split: self.recording.trials(split) for split in ("train", "test", "all")}
+
+    @cached_property
+    def starts(self) -> dict[str, Start]:
+        """Where the trials of each split begin, and what their frames count, as many as its longest trial has."""
+        weights, rows, count = self._judged[0], np.arange(len(self.trials["all"])), len(self.trials["train"])
+        if weights is not None:
+            weights = weights.copy()
+            for k, trial in enumerate(self.trials["train"]):
+                weights[k, self.discounted.get(trial.name, weights.shape[1]) :] = 0.0
+        found = {"all": replace(tree.part(self.start), frame_weights=weights)}
+        for split, part in (("train", rows[:count]), ("test", rows[count:])):
+            own = None if weights is None else weights[part, : self._frames(split)]
+            found[split] = replace(found["all"].pick(part), frame_weights=own)
+        return found
+
+    def _frames(self, split: str) -> int:
+        """Return how many frames the longest trial of a split has."""
+        return max((len(t.time) for t in self.trials[split]), default=0)
+
+    @cached_property
+    def floor(self) -> floors.ErrorFloor:
+        """What no effect explains, on the test trials; infinite as long as it is not known."""
+        if self.refinement is None:
+            return floors.ErrorFloor(floors.marker_noise(self.recording), float("inf"), float("inf"))
+        return self.refinement.floor(slice(len(self.trials["train"]), None), ~self.trials["all"][0].gripped)
+
+    @property
+    def level(self) -> float:
+        """What `gaps` are for a perfect model [m]; infinite as long as it is not known."""
+        return self._judged[1]
+
+    @cached_property
+    def _judged(self) -> tuple[np.ndarray | None, float]:
+        """What errors of frames count (B, F), apart from what is discounted, and `level`."""
+        if self.refinement is None:
+            return None, float("inf")
+        return self.refinement.frame_weights(~self.trials["all"][0].gripped)
+
+    def with_options(self, options: Mapping[str, Any]) -> Workspace:
+        """Give all models these options."""
+        pool = self.pool.with_options(**options)
+        return self if pool is self.pool else replace(self, pool=pool)
+
+    def begin(self, base: np.ndarray, effects: Sequence[str]) -> Workspace:
         """Estimate where trials begin with these numbers."""
         model = self.pool.local.model(effects)
-        first = starts.begin(model, self.trials["all"])
+        first = initial_state.begin(model, self.trials["all"])
         simulate = self.pool.simulator(effects, "all")
-        start = starts.refine(model, self.pool.local.motion(model, "all"), first, base, simulate)
-        train = np.arange(len(self.trials["train"]))
-        test = np.arange(len(train), len(self.trials["all"]))
-        self.starts = {"all": start, "train": start.pick(train), "test": start.pick(test)}
+        start = initial_state.refine(model, self.pool.local.motion(model, "all"), first, base, simulate)
+        return replace(self, start=start, refinement=None)
 
-    def correct(self, base: Fitted) -> floors.Refinement:
-        """Correct simulations from now on by what finer steps and a finer mesh change of this model; return that."""
-        found = floors.refine(self.pool, base, self.starts["all"], CHAIN)
-        self.use(found)
-        return found
+    def correct(self, base: Fitted) -> Workspace:
+        """Correct simulations by what finer steps and a finer mesh change of this model."""
+        return self.use(floors.refine(self.pool, base, self.starts["all"], CHAIN))
 
-    def use(self, found: floors.Refinement) -> None:
-        """Correct simulations from now on by this."""
-        train, free = len(self.trials["train"]), ~self.trials["all"][0].gripped
-        self.floor, self._finer = found.floor(slice(train, None), free), found
-        frame_weights, self.level = found.frame_weights(free)
-        frame_weights = self._discounted(frame_weights)
-        start = replace(self.starts["all"], discretisation_correction=found.correction, frame_weights=frame_weights)
-        rows = np.arange(len(start.pos))
-        self.starts = {"all": start, "train": start.pick(rows[:train]), "test": start.pick(rows[train:])}
-        self._known.clear()
+    def use(self, found: floors.Refinement) -> Workspace:
+        """Correct simulations by this."""
+        start = replace(tree.part(self.start), discretisation_correction=found.correction)
+        return replace(self, start=start, refinement=found)
 
-    def discount(self, frames: dict[str, int]) -> None:
-        """Let train trials count up to a frame only, by their names, from now on."""
-        self.discounted |= frames
-        frame_weights = self._discounted(tree.part(self.starts["all"].frame_weights))
-        rows, train = np.arange(len(self.trials["all"])), len(self.trials["train"])
-        start = replace(self.starts["all"], frame_weights=frame_weights)
-        self.starts = {"all": start, "train": start.pick(rows[:train]), "test": start.pick(rows[train:])}
-
-    def _discounted(self, frame_weights: np.ndarray) -> np.ndarray:
-        """Return what errors of frames count (B, F), nothing of what is discounted."""
-        found = frame_weights.copy()
-        for k, trial in enumerate(self.trials["train"]):
-            found[k, self.discounted.get(trial.name, found.shape[1]) :] = 0.0
-        return found
-
-    def forget(self) -> None:
-        """Forget predictions that were made with other readings."""
-        self._known.clear()
+    def discount(self, frames: Mapping[str, int]) -> Workspace:
+        """Let train trials count up to a frame only, by their names."""
+        return replace(self, discounted={**self.discounted, **frames})
 
     def predict(self, fits: Sequence[Fitted]) -> None:
         """Simulate all trials with several models at once, for `gaps` and `prediction` to look up."""
-        new = [f for f in fits if _key(f) not in self._known]
-        # Models that settle twists take longer than others, which all fit into one batch.
-        kinds = [(self.pool.local.framed(f.effects), f.options) for f in new]
-        groups = [[new[k] for k in group] for group in spread_jobs(kinds, self.pool.workers)]
-        for k, sims in self.pool.simulate([self.pool.local.joined(g, "all", self.starts["all"]) for g in groups]):
-            self._known |= {_key(f): sim for f, sim in zip(groups[k], sims, strict=True)}
-        for fitted in new:
-            self._mend(fitted, self._known[_key(fitted)])
-
-    def _mend(self, fitted: Fitted, sims: np.ndarray) -> None:
-        """Simulate the trials in which the rope was torn apart once more, in finer steps, into (B, F, M, 3)."""
-        model = self.pool.local.model(fitted.effects, fitted.options)
-        torn = np.flatnonzero(torn_apart(sims[..., : model.count, :], model.mesh.marker_arclength))
-        if not len(torn):
-            return
-        options = dict(fitted.options) | {"substep": model.dt / (_FINER * model.substeps)}
-        names = tuple(self.trials["all"][k].name for k in torn)
-        start = replace(self.starts["all"].pick(torn), discretisation_correction=None)
-        job = SimulationJob(fitted.effects, fitted.values[None], names, start, tuple(options.items()))
-        ((_, again),) = self.pool.simulate([job])
-        sims[torn, : again.shape[2]] = again[0]
-        self.mended |= set(names)
-
-    def notes(self) -> list[str]:
-        """Return sentences on the simulations that a reader should know."""
-        if not self.mended:
-            return []
-        return [
-            f"Simulated ropes were torn apart in {', '.join(sorted(self.mended))}, by some model at least; they were "
-            f"simulated once more there in steps of a {_FINER}th."
-        ]
+        self.predictions.of(self.pool, tree.part(self.start), fits)
 
     def prediction(self, fitted: Fitted, split: str) -> np.ndarray:
         """Return the simulated markers of the trials of a split, shape (B, F, M, 3)."""
@@ -162,9 +143,10 @@ class Workspace:
 
     def readings(self, fitted: Fitted, split: str) -> np.ndarray:
         """Return likewise what is simulated, with forces behind the markers where they count, shape (B, F, R, 3)."""
-        self.predict([fitted])
+        (sims,) = self.predictions.of(self.pool, tree.part(self.start), [fitted])
         first = len(self.trials["train"])
-        return self._known[_key(fitted)][{"train": slice(first), "test": slice(first, None), "all": slice(None)}[split]]
+        rows = {"train": slice(first), "test": slice(first, None), "all": slice(None)}[split]
+        return sims[rows, : self._frames(split)]
 
     def gaps(self, fitted: Fitted, split: str) -> np.ndarray:
         """Return the gap of each trial of a split [m], frames weighted by what they tell."""
@@ -275,7 +257,7 @@ class Workspace:
         ((_, sims),) = self.pool.simulate([SimulationJob(fitted.effects, rows, "train", start, fitted.options)])
         frame_weights = 1.0 if start.frame_weights is None else start.frame_weights[..., None, None]
         measured = self.pool.local.measured(model, "train")
-        step, grid = (e[: len(measured)] for e in tree.part(self._finer).unsure)
+        step, grid = (e[: len(measured), : measured.shape[1]] for e in tree.part(self.refinement).unsure)
         # What is wrong with forces is not known.
         behind = ((0, 0), (0, 0), (0, measured.shape[2] - model.count), (0, 0))
         errors = [

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import itertools
 import multiprocessing
 import os
@@ -128,11 +129,13 @@ class Pool:
         task.repeated = True
         return self._submit(task)
 
-    def choose(self, **options: Any) -> None:
-        """Give all models other options from now on."""
-        if not options.items() <= self._chosen.items():
-            self.local = Models(self.recording, self.local.options | options)
-            self._chosen |= options
+    def with_options(self, **options: Any) -> Pool:
+        """Return the same workers for models with other options."""
+        if options.items() <= self._chosen.items():
+            return self
+        other = copy.copy(self)
+        other.local, other._chosen = Models(self.recording, self.local.options | options), self._chosen | options
+        return other
 
     def _whole(self, options: tuple[tuple[str, Any], ...]) -> tuple[tuple[str, Any], ...]:
         return tuple((self._chosen | dict(options)).items())

@@ -87,8 +87,8 @@ def check_names(names: Sequence[str], ties: list[list[str]] | None, bench: Works
 
 def fit_rivals(
     bench: Workspace, names: Sequence[str], given: ModelFile | None, seed: int, report: Callback
-) -> dict[str, Fitted]:
-    """Return the model of each name, fitted to the train trials.
+) -> tuple[Workspace, dict[str, Fitted]]:
+    """Return the model of each name, fitted to the train trials, and the workspace for them.
 
     Args:
         bench: the trials.
@@ -99,9 +99,11 @@ def fit_rivals(
     """
     budget = plan.BUDGETS["fast"]
     if given is None:
-        base = baselines.calibrate_baseline(bench, budget.starts, budget.more, np.random.default_rng(seed), report)
+        bench, base = baselines.calibrate_baseline(
+            bench, budget.starts, budget.more, np.random.default_rng(seed), report
+        )
     else:
-        base = baselines.go_on(bench, _without(given, names), budget.more, report)
+        bench, base = baselines.go_on(bench, _without(given, names), budget.more, report)
     start = bench.starts["train"]
     stage = "fitting the rivals"
     scores = score_effects(bench.pool, base, names, start, lambda k, n: report(f"{stage}: doses", k, n, ""))
@@ -119,7 +121,7 @@ def fit_rivals(
         report(stage, 1 if more else 0, 2, "")
         found = dict(zip(names, bench.fit(again), strict=True))
     report(stage, 2, 2, ", ".join(f"{n.replace('_', ' ')} {1e3 * found[n].point.cost:.2f} mm" for n in names))
-    return found
+    return bench, found
 
 
 def _without(given: ModelFile, names: Sequence[str]) -> ModelFile:

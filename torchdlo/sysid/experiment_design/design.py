@@ -172,7 +172,7 @@ def design_experiment(
         names = competing_models.check_names(names, ties, bench)
         if mass and "point_mass" in (*names, *(given.effects if given else ())):
             raise InputError("mass: a known mass on the rope cannot be told from point_mass; leave out one of them.")
-        models = competing_models.fit_rivals(bench, names, given, seed, report)
+        bench, models = competing_models.fit_rivals(bench, names, given, seed, report)
         contest = ModelDiscrimination(bench, models, rig, seconds, noise)
         contest.prepare(report)
         options_tried = _search(contest, mass, np.random.default_rng(seed), report)
@@ -180,7 +180,7 @@ def design_experiment(
         return Design(
             recording,
             models,
-            {n: pool.local.model(m.effects).parameters for n, m in models.items()},
+            {n: bench.pool.local.model(m.effects).parameters for n, m in models.items()},
             measured_misfit(models, bench),
             noise,
             rig,

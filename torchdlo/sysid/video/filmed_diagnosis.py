@@ -23,7 +23,7 @@ from torchdlo.sysid.estimation.jobs import Fitted
 from torchdlo.sysid.model.model_file import ModelFile
 from torchdlo.sysid.recordings.recording import Recording
 from torchdlo.sysid.video.filmed import FILMED_STARTS, baseline, tested
-from torchdlo.sysid.video.filmed_fit import Fit, fit, look, spread
+from torchdlo.sysid.video.filmed_fit import Fit, fit, look, spread, total
 from torchdlo.sysid.video.filmed_problem import FilmedProblem
 from torchdlo.sysid.video.filmed_starts import fit_starts
 from torchdlo.sysid.video.footage import views_of
@@ -67,6 +67,12 @@ the rope is also B₀ (κ - κ̄) with κ̄ = κ (1 - B / B₀), and so is that 
 _PATIENCE = 3
 """Times as many steps of the fits that lead, of ropes at rest, whose natural curvature has ten numbers."""
 
+_SIGNS, _KEPT = (1.0, -1.0), 3
+"""Directions in which doses are tried with cameras as they were calibrated, and fits that are followed further."""
+
+_AS_GOOD = 1.1
+"""Times what the best fit leaves on test trials up to which another one's numbers may be the true ones as well."""
+
 _LEADERS = 3
 """Candidates that are fitted to all of the time."""
 
@@ -79,6 +85,8 @@ class _Model:
     fit: Fit
     test: FilmedProblem
     """The same of the test trials."""
+    others: tuple[_Model, ...] = ()
+    """Where other starts ended."""
     _tested: np.ndarray | None = field(init=False, default=None)
 
     @property
@@ -118,7 +126,7 @@ def diagnose_filmed(
     values = own.space.to_values(best.raw)
     test, said = tested(own, recording, values, report)
     base = _Model(own, best, test)
-    if given is None:
+    if given is None and not recording.still:
         base = _chained(base)
         report("calibrating the baseline", 1, 1, f"{1e3 * gap_rms(base.gaps('train')):.2f} mm")
     floor, level = _floor(base)
@@ -282,14 +290,20 @@ def _refused(rival: _Model, other: _Model, first: _Model, floor: ErrorFloor, lev
 
 
 def _fitted(base: _Model, score: Score, iterations: int, seconds: float) -> _Model:
-    """Return a first fit of a model with one effect more, from the best of several doses."""
-    numbers = effect_library.numbers(score.name, base.own.model.recording)
-    starts = []
-    for dose, raw in score.starts:
-        vectors = {ParameterName.parse(name).whole for name in dose}
-        used = {n.name: dose.get(n.name, n.off) for n in numbers if n.which.whole in vectors}
-        sizes = {n: score.sizes.get(n, 0.0) for n in used}
-        starts.append(_extended(base, (score.name,), sizes, used, raw))
+    """Return a first fit of a model with one effect more, from the best of several doses.
+
+    Of ropes at rest all doses are followed, with the camera as it was calibrated, too: a baseline that lacks what bends
+    the rope turns the camera, and from there the way to the effect is lost.
+    """
+    starts = [_dosed(base, score, dose, raw) for dose, raw in score.starts]
+    if base.own.trials[0].still:
+        for dose, raw in score.starts:
+            both = ({k: sign * v for k, v in dose.items()} for sign in _SIGNS)
+            starts += [_upright(_dosed(base, score, each, raw)) for each in both]
+        for keep, times in ((len(starts), 1), (_KEPT, _PATIENCE)):
+            starts = [replace(s, fit=fit(s.own, s.fit.raw, times * iterations)) for s in starts[:keep]]
+            starts.sort(key=lambda s: total(s.fit))
+        return replace(starts[0], others=tuple(starts[1:]))
     costs = []
     target = base.own.target(seconds)[..., None]
     for start in starts:
@@ -299,6 +313,20 @@ def _fitted(base: _Model, score: Score, iterations: int, seconds: float) -> _Mod
         costs.append(levenberg_marquardt.costs(read, target, start.own.extent)[0])
     best = starts[int(np.argmin(costs))]
     return replace(best, fit=fit(best.own, best.fit.raw, iterations, seconds=seconds))
+
+
+def _dosed(base: _Model, score: Score, dose: dict[str, float], raw: np.ndarray) -> _Model:
+    """Return a model with one effect more, that begins with a dose of it, not yet fitted."""
+    vectors = {ParameterName.parse(name).whole for name in dose}
+    numbers = effect_library.numbers(score.name, base.own.model.recording)
+    used = {n.name: dose.get(n.name, n.off) for n in numbers if n.which.whole in vectors}
+    return _extended(base, (score.name,), {n: score.sizes.get(n, 0.0) for n in used}, used, raw)
+
+
+def _upright(model: _Model) -> _Model:
+    """Return a model that begins with cameras as they were calibrated."""
+    numbers = np.arange(model.fit.raw.size) < len(model.own.free)
+    return replace(model, fit=replace(model.fit, raw=np.where(numbers, model.fit.raw, 0.0)))
 
 
 def _tangents(own: FilmedProblem, here: Fit, seen: np.ndarray, weight: np.ndarray) -> np.ndarray:
@@ -389,6 +417,9 @@ def _concluded(
     before, after = first.gaps("test"), final.gaps("test")
     effects = list(shares)
     point, drifts = spread(final.own, final.fit)
+    good = [m for m in final.others if gap_rms(m.gaps("test")) < _AS_GOOD * gap_rms(after)]
+    apart = [m.fit.raw - final.fit.raw for m in good]
+    drifts = np.concatenate([drifts, *(each[None] / np.sqrt(len(apart)) for each in apart)])
     predictions: dict[str, dict[str, np.ndarray]] = {"before": {}, "after": {}}
     shown = []
     for split in ("train", "test"):

@@ -12,7 +12,7 @@ from torchdlo.errors import InputError
 from torchdlo.sysid.estimation.observation import FilmView
 from torchdlo.sysid.recordings.recording import Recording, Trial
 from torchdlo.sysid.video.films import FilmFile
-from torchdlo.vision.camera import lens, project
+from torchdlo.vision.camera import NEAR, lens, project
 from torchdlo.vision.mask_health import check_masks
 from torchdlo.vision.segment import Ranges, color_masks, load_film, load_ranges, ranges_of
 from torchdlo.vision.spine import along, half_width, spine
@@ -33,6 +33,9 @@ _PHOTO_POINTS = 192
 
 _STRETCHES = 14
 """Stretches of a rope, of which every other one is left out where there is one photograph only."""
+
+_TOO_MUCH = 1.15
+"""Times its length from which what is seen is more than one rope: one shows 0.4 to 0.8 of it, two 0.7 to 1.6."""
 
 _STILL = 5e-4
 """Motion of a gripper between two pictures that shows [m]."""
@@ -120,6 +123,7 @@ def _reduced(
     recording: Recording, trial: Trial, film: FilmFile, notes: list[str]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, float, np.ndarray, dict[int, np.ndarray]]:
     """Return good frames, centre lines with tangents, half width, packed masks and some pictures of a film."""
+    nearest = _nearest(trial, film)
     masks, pictures, _ = masks_of(recording, film)
     if trial.still:
         return _photographed(trial, film, masks, pictures, notes)
@@ -153,8 +157,32 @@ def _reduced(
     lines = [spine(m, _POINTS) if ok else none for m, ok in zip(masks, good, strict=True)]
     places, tangents = (np.stack(part) for part in zip(*lines, strict=True))
     wide = float(np.median([half_width(m) for m in masks[good][::10]]))
+    _check_amount(recording, film, float(np.median(masks[good].sum((1, 2)))) / max(2 * wide, 1.0), nearest)
     some = np.flatnonzero(good)[np.linspace(0, good.sum() - 1, SHOWN + 1).round().astype(int)[1:]]
     return good, places, tangents, wide, np.packbits(masks.reshape(count, -1), axis=1), _shown(masks, pictures, some)
+
+
+def _nearest(trial: Trial, film: FilmFile) -> float:
+    """Return how near grippers come to a camera [m]; refuse one that they are behind."""
+    held = trial.markers[:, trial.gripped].reshape(-1, 3)
+    depth = held @ np.array(film.camera.rotation)[2] + film.camera.translation[2]
+    nearest = float(depth.min())
+    if nearest < NEAR:
+        raise InputError(
+            f"{film.path}: expected the grippers in front of camera {film.camera.name}, found them behind it; rotation "
+            "and translation in cameras.json take points of the world to the camera (x right, y down, z forward)."
+        )
+    return nearest
+
+
+def _check_amount(recording: Recording, film: FilmFile, pixels: float, nearest: float) -> None:
+    """Refuse masks that hold far more than one rope, whose centre lines have so many pixels in the usual picture."""
+    seen = pixels * nearest / (0.5 * (film.camera.fx + film.camera.fy))
+    if seen > _TOO_MUCH * recording.length:
+        raise InputError(
+            f"{film.path}: expected a rope of {recording.length:.3g} m, found {seen:.2g} m of it in the masks: two "
+            "ropes, or something else of its colour, are in view; take it away, or set ranges with torchdlo segment."
+        )
 
 
 def _shown(masks: np.ndarray, pictures: np.ndarray | None, some: Sequence[int]) -> dict[int, np.ndarray]:

@@ -9,15 +9,20 @@ import torch
 
 from torchdlo.sysid.estimation.observation import PER_CAMERA, seen_by
 from torchdlo.sysid.estimation.result import Overlay
-from torchdlo.vision.boundary import boundary_f
+from torchdlo.sysid.video.footage import RANGES
+from torchdlo.vision.boundary import boundary_f, wide_parts
 from torchdlo.vision.camera import NEAR
 from torchdlo.vision.rasterizer import coverage, successors
+from torchdlo.vision.segment import load_ranges
 from torchdlo.vision.spine import curve_vectors
 
 if TYPE_CHECKING:
     from torchdlo.sysid.video.filmed_problem import FilmedProblem
 
-__all__ = ["drawn_masks", "mask_overlaps", "overlays"]
+__all__ = ["drawn_masks", "hidden_area", "mask_overlaps", "overlays"]
+
+_FOLLOWED = 0.9
+"""Share of what masks reach that a simulated rope has to sweep to tell what is hidden."""
 
 
 def drawn_masks(
@@ -79,24 +84,49 @@ def mask_overlaps(own: FilmedProblem, sims: np.ndarray, numbers: np.ndarray) -> 
         numbers: those of all cameras, shape (Q,).
 
     Returns:
-        Intersection over union, and `boundary_f`, of each trial.
+        Intersection over union, and `boundary_f`, of each trial, where nothing hides the rope.
     """
-    out = []
-    for b in range(len(own.trials)):
-        parts = []
-        for k, view in enumerate(own.spines.views):
+    parts: list[list[tuple[float, float]]] = [[] for _ in own.trials]
+    for k, view in enumerate(own.spines.views):
+        seen = ~hidden_area(own, k, sims, numbers)
+        for b in range(len(own.trials)):
             frames = np.flatnonzero(view.good[b])
             frames = frames[:: max(1, len(frames) // 24)]
-            measured = view.masks(b, frames)
-            model = drawn_masks(own, k, sims[b], numbers, frames, view.half_width, b) > 0.5
+            measured = view.masks(b, frames) & seen
+            model = (drawn_masks(own, k, sims[b], numbers, frames, view.half_width, b) > 0.5) & seen
             # How thick a mask is depends on where its colours were cut off: ropes are drawn as thick as it is.
-            share = np.median(measured.sum((1, 2)) / np.maximum(model.sum((1, 2)), 1))
-            model = drawn_masks(own, k, sims[b], numbers, frames, np.clip(share, 0.6, 1.6) * view.half_width, b) > 0.5
+            wide = view.half_width * np.clip(
+                np.median(measured.sum((1, 2)) / np.maximum(model.sum((1, 2)), 1)), 0.6, 1.6
+            )
+            model = (drawn_masks(own, k, sims[b], numbers, frames, wide, b) > 0.5) & seen
             both, either = (model & measured).sum((1, 2)), (model | measured).sum((1, 2))
             edges = np.mean([boundary_f(a, c) for a, c in zip(model, measured, strict=True)])
-            parts.append((float(np.mean(both / np.maximum(either, 1))), float(edges)))
-        share, edges = np.mean(parts, 0)
-        out.append((float(share), float(edges)))
+            parts[b].append((float(np.mean(both / np.maximum(either, 1))), float(edges)))
+    return [(float(share), float(edges)) for share, edges in (np.mean(each, 0) for each in parts)]
+
+
+def hidden_area(own: FilmedProblem, view: int, sims: np.ndarray, numbers: np.ndarray) -> np.ndarray:
+    """Return where something in front hides the rope in a view, shape (H, W) bool.
+
+    Rectangles that are left out of masks, and areas that the simulated rope sweeps while no mask ever reaches into
+    them. Strips that are not wider than the rope do not count: those are errors of the simulation; nor does any area if
+    it does not follow the masks elsewhere.
+    """
+    seen = own.spines.views[view]
+    swept, reached = (np.zeros((seen.camera.height, seen.camera.width), bool) for _ in range(2))
+    for b in range(len(own.trials)):
+        for frames in np.array_split(np.flatnonzero(seen.good[b]), 4):
+            if len(frames):
+                swept |= (drawn_masks(own, view, sims[b], numbers, frames, seen.half_width, b) > 0.5).any(0)
+                reached |= seen.masks(b, frames).any(0)
+    follows = (swept & reached).sum() >= _FOLLOWED * reached.sum()
+    out = wide_parts(swept & ~reached & follows, 2 * round(seen.half_width) + 3, more=2)
+    file = own.model.recording.path / RANGES
+    for left, top, right, bottom in load_ranges(file).ignore if file.is_file() else ():
+        (y0, y1), (x0, x1) = (
+            (round(a * n), round(b * n)) for n, a, b in zip(out.shape, (top, left), (bottom, right), strict=True)
+        )
+        out[y0:y1, x0:x1] = True
     return out
 
 

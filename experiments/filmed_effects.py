@@ -1,0 +1,149 @@
+"""Does `torchdlo diagnose` name what is missing when all that it has is films?
+
+    python experiments/filmed_effects.py make --out runs/filmed_effects        # films of ropes that hide an effect
+    python experiments/filmed_effects.py diagnose --out runs/filmed_effects    # and what is found in them, as a table
+
+`make` simulates ropes by the rod code of `experiments/hidden_effects`, which shares nothing with the program, and films
+them by one or two cameras that are written down wrongly, with noise, blur and 2 % wrong frames: each of five effects
+at ten times the noise of markers, and ropes that hide nothing. `diagnose` takes any folder of films with the answers
+beside it. What is there already is not done again.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+sys.path.append(str(Path(__file__).resolve().parent / "hidden_effects"))
+
+from cases import FINE, Case
+from filmed_cables import cameras_of
+from make import answer, hide, record, write
+from options import Parser, count, save
+
+from torchdlo.report.pages import diagnosis as report
+from torchdlo.sysid.diagnosis.effect_search import diagnose
+from torchdlo.sysid.diagnosis.findings import findings
+from torchdlo.sysid.recordings.recording import load_recording
+from torchdlo.sysid.video.filming import film_recording
+from torchdlo.vision.film import FilmLook
+
+EFFECTS = ("point_mass", "rest_curvature", "bending_damping", "air_drag", "table_friction")
+EXACT = 1e-6
+"""Noise of markers that centre lines are drawn through [m]."""
+
+
+def cases(seeds: int, nothing: int) -> list[Case]:
+    """Return what is hidden: each effect so many times, and nothing."""
+    single = [Case("single", (e,), 10.0, 3000 + 10 * k + s) for s in range(seeds) for k, e in enumerate(EFFECTS)]
+    return [*single, *[Case("null", (), 0.0, 3100 + s, "table" if s % 3 == 2 else "") for s in range(nothing)]]
+
+
+def make(out: Path, chosen: list[Case], cameras: int, trials: int, seconds: float) -> None:
+    """Film ropes that hide an effect, or nothing."""
+    for case in chosen:
+        name = f"{case.name}_{cameras}"
+        folder, target = out / "films" / name, out / "answers" / f"{name}.json"
+        if folder.is_dir():
+            continue
+        source = out / "markers" / case.name
+        if not source.is_dir():
+            numbers, gap = hide(case, case.scene)
+            arrays = record(case, replace(case.scene, noise=EXACT), numbers, FINE, "films")
+            write(source, replace(case.scene, noise=EXACT), arrays)
+            save(str(out / "markers" / f"{case.name}.json"), answer(case, case.scene, numbers, gap))
+        recording = load_recording(source)
+        look = FilmLook(noise=4.0, wrong=0.02, seed=case.seed)
+        seen = cameras_of(recording, cameras)
+        film_recording(recording, seen, folder, look, off=1.0, trials=trials, seconds=seconds)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(out / "markers" / f"{case.name}.json", target)
+        print(f"{name}: filmed", flush=True)
+
+
+def look_at(folder: Path, answers: Path, seed: int, page: Path) -> dict[str, Any]:
+    """Return what is found in films, beside what they hide."""
+    recording = load_recording(folder)
+    begun, wall = time.process_time(), time.perf_counter()
+    found = diagnose(recording, workers=1, seed=seed)
+    told = findings(found, recording)
+    used = {"cpu_s": time.process_time() - begun, "wall_s": time.perf_counter() - wall}
+    report.write_report(found, recording, page)
+    true = json.loads((answers / f"{folder.name}.json").read_text())["answer"]
+    named = [e["name"] for e in told["effects"]]
+    as_well = sorted({other for e in told["effects"] for other in e.get("indistinguishable_from", [])})
+    return {
+        "name": folder.name,
+        "cameras": len(recording.train[0].films),
+        "hidden": true,
+        "verdict": told["verdict"],
+        "named": named,
+        "or": as_well,
+        "right": set(true) <= {*named, *as_well} if true else not named,
+        "gap": {k: v for k, v in told["gap"].items() if isinstance(v, float)},
+        "effects": {e["name"]: {k: v["value"] for k, v in e["parameters"].items()} for e in told["effects"]},
+        "candidates": told["candidates"],
+        **used,
+    }
+
+
+def table(rows: list[dict[str, Any]]) -> str:
+    """Return rows as Markdown, and how often findings are right, with 90 % bounds by counting (Clopper-Pearson)."""
+    from scipy.stats import binomtest
+
+    lines = [
+        "| films | cameras | hidden | named | or | gap before, after [mm] | CPU s |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for row in rows:
+        gap = [1e3 * row["gap"][f"test_rmse_{when}_m"] for when in ("before", "after")]
+        words = [", ".join(row[k]) or "nothing" for k in ("hidden", "named")]
+        lines.append(
+            f"| {row['name']} | {row['cameras']} | {words[0]} | {words[1]} | {', '.join(row['or'])} | "
+            f"{gap[0]:.2f}, {gap[1]:.2f} | {row['cpu_s']:.0f} |"
+        )
+    lines.append("")
+    for what, wanted in (("something hidden", True), ("nothing hidden", False)):
+        some = [row["right"] for row in rows if bool(row["hidden"]) == wanted]
+        if some:
+            ends = binomtest(int(sum(some)), len(some)).proportion_ci(0.9)
+            lines.append(f"{what}: {sum(some)} of {len(some)} right, {ends.low:.0%} to {ends.high:.0%}")
+    return "\n".join(lines)
+
+
+def main() -> None:
+    """Make films, or diagnose those that are there."""
+    parser = Parser(__file__, description=(__doc__ or "").split("\n\n")[0])
+    parser.add_argument("what", choices=("make", "diagnose"))
+    parser.add_argument("--out", type=Path, default=Path("runs/filmed_effects"), help="folder that keeps what is done")
+    parser.add_argument("--films", type=Path, default=None, help="folder of films, if not those that were made")
+    parser.add_argument("--answers", type=Path, default=None, help="folder of what they hide, NAME.json with `answer`")
+    parser.add_argument("--only", nargs="*", default=None, help="names of films")
+    parser.add_argument("--seeds", type=count, default=3, help="films of each effect")
+    parser.add_argument("--nothing", type=count, default=10, help="films that hide nothing")
+    parser.add_argument("--cameras", type=int, choices=(1, 2), default=2)
+    parser.add_argument("--trials", type=count, default=2, help="most trials of each split")
+    parser.add_argument("--seconds", type=float, default=2.5, help="of each trial")
+    parser.add_argument("--seed", type=int, default=0)
+    given = parser.parse_args()
+    if given.what == "make":
+        make(given.out, cases(given.seeds, given.nothing), given.cameras, given.trials, given.seconds)
+        return
+    films, answers, rows = given.films or given.out / "films", given.answers or given.out / "answers", []
+    names = given.only or sorted(p.name for p in films.iterdir() if (p / "rope.json").is_file())
+    for name in names:
+        done = given.out / "found" / f"{name}.json"
+        if not done.is_file():
+            save(str(done), look_at(films / name, answers, given.seed, given.out / "reports" / name))
+        rows.append(json.loads(done.read_text()))
+        print(table(rows[-1:]).splitlines()[2], flush=True)
+    print(table(rows))
+
+
+if __name__ == "__main__":
+    main()
