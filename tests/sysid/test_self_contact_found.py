@@ -11,6 +11,7 @@ import pytest
 from tests.sysid.swaying import recording as swaying
 from torchdlo.sysid.diagnosis import effect_library, effect_search
 from torchdlo.sysid.diagnosis.findings import findings
+from torchdlo.sysid.model.model_file import ModelFile
 from torchdlo.sysid.model.rope_model import RopeModel
 from torchdlo.sysid.model.trial_batch import Start
 from torchdlo.sysid.recordings.recording import Recording, Trial
@@ -64,12 +65,19 @@ def hooked(tmp_path_factory: pytest.TempPathFactory) -> Recording:
 def test_contact_is_looked_for_where_a_rope_comes_near_itself(hooked: Recording, tmp_path: Path) -> None:
     assert near_itself(hooked) and not near_itself(replace(hooked, radius=None))
     assert not near_itself(swaying(tmp_path, frames=60))
+    single = tuple(replace(t, time=t.time[:1], markers=t.markers[:1], suspect=t.suspect[:1]) for t in hooked.train)
+    assert not near_itself(replace(hooked, train=single))
     # Before the grippers turn, its legs hang apart.
     early = tuple(replace(t, time=t.time[:8], markers=t.markers[:8], suspect=t.suspect[:8]) for t in hooked.train)
     assert not near_itself(replace(hooked, train=early))
     mesh = RopeModel(hooked, vertices=33).mesh
     assert effect_library.applicable("self_contact", hooked, mesh)
     assert not effect_library.applicable("self_contact", replace(hooked, train=early), mesh)
+    # A model that has it can be simulated there nevertheless.
+    values = {"bending_stiffness": 5e-4, "twisting_stiffness": 4e-4, "damping_rate": 1.0, "self_contact.share": 1.0}
+    options = {"vertices": 33, "rest": "straight"}
+    given = ModelFile(tmp_path / "model.json", ("self_contact",), values, options)
+    assert "self_contact.share" in given.model(replace(hooked, train=early)).parameters
 
 
 def test_a_rope_that_passes_through_itself_moves_otherwise(hooked: Recording) -> None:

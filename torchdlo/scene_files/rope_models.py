@@ -92,7 +92,7 @@ def cable(path: str | Path) -> RopeMaterial:
     rope = said["rope"]
     shape = _shape(rope.get("rest_positions"), model.values)
     curvature = () if shape is None else tuple(map(tuple, shape.curvature(len(tree.part(shape.shape))).tolist()))
-    others = (*_OF_RECORDINGS, "tilted_gravity", "table_friction", "fluid_forces")
+    others = (*_OF_RECORDINGS, "tilted_gravity", "table_friction", "fluid_forces", "self_contact")
     effects = tuple(
         (name, tuple((key, tuple(x) if isinstance(x, list) else (x,)) for key, x in numbers.items()))
         for name, numbers in _own(model).items()
@@ -188,6 +188,9 @@ def _effects(d: SceneDescription, model: Any, rope: dict[str, Any], *, framed: b
         rub = found.pop("table_friction")
         if "table" in d.effects:
             found["table_friction"] = rub | d.effects["table"]
+    if "rod_contact" in d.effects:
+        # Ropes of the scene meet themselves already.
+        found.pop("self_contact", None)
     if "fluid_forces" in found:
         # So does the liquid.
         drag = found.pop("fluid_forces")

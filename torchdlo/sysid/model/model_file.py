@@ -67,7 +67,8 @@ class ModelFile:
             )
         model = RopeModel(recording, effects=self.effects, **(self.options | options))
         for name in self.effects:
-            if name in effect_library.library() and not effect_library.applicable(name, recording, model.mesh):
+            known = name in effect_library.library() and effect_library.spec(name).requires != "near_itself"
+            if known and not effect_library.applicable(name, recording, model.mesh):
                 raise InputError(
                     f"{self.path}: {name}: expected a recording in which it can act, but {recording.path} has nothing "
                     "that it acts on (no table, no clamp of two markers, no liquid, or no radius)."
