@@ -458,11 +458,11 @@ def _far(level: float, floor: ErrorFloor) -> str:
     """Return that nothing counts as explained."""
     if not np.isfinite(level):
         return UNKNOWN_FLOOR
-    times = level / floor.noise
+    wrong, times = 1e3 * level, level / floor.noise
     return (
-        f"Finer simulations of the calibrated model differ from it by {1e3 * level:.1f} mm, {times:.0f} times what "
-        "centre lines get wrong: the model is far from this rope, or its motion magnifies small errors, so nothing counts as "
-        "explained. Record slower motions, or with a second camera."
+        f"Finer simulations of the calibrated model differ from it by {wrong:.1f} mm, {times:.0f} times what centre "
+        "lines get wrong: the model is far from this rope, or its motion magnifies small errors, so nothing "
+        "counts as explained. Record slower motions, or with a second camera."
     )
 
 
