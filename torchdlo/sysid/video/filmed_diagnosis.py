@@ -45,6 +45,9 @@ SILENT = 1.3
 MATTERS = 0.03
 """Share of the baseline's excess gap that each effect has to close, whatever the others leave."""
 
+BLUNT = 10.0
+"""Times what centre lines get wrong from which what finer simulations change is no floor, but a fit that is far off."""
+
 _CHAIN = "link_chain"
 """What a chain of links does that a rope does not: fitted before any effect is considered."""
 
@@ -415,7 +418,7 @@ def _concluded(
     begun: float,
 ) -> Diagnosis:
     before, after = first.gaps("test"), final.gaps("test")
-    effects = list(shares)
+    effects, blunt = list(shares), not level < BLUNT * floor.noise
     point, drifts = spread(final.own, final.fit)
     good = [m for m in final.others if gap_rms(m.gaps("test")) < _AS_GOOD * gap_rms(after)]
     apart = [m.fit.raw - final.fit.raw for m in good]
@@ -431,7 +434,7 @@ def _concluded(
         numbers = [m.values[len(m.own.free) :] for m in (first, final)]
         shown += overlays(problems[0], split, np.stack(sims), np.stack(numbers))
     done = Diagnosis(
-        verdict_word(effects, gap_rms(after), level, gap_rms(after) / gap_rms(before)),
+        verdict_word(effects, gap_rms(after), np.inf if blunt else level, gap_rms(after) / gap_rms(before)),
         effects,
         {name: ties[name] for name in effects},
         shares,
@@ -444,11 +447,23 @@ def _concluded(
         predictions,
         final.own.model,
         drifts,
-        notes=[*notes, *([] if np.isfinite(level) else [UNKNOWN_FLOOR])],
+        notes=[*notes, *([_far(level, floor)] if blunt else [])],
         options={"budget": budget, "seed": seed, "vertices": final.own.options["vertices"]},
     )
     done.overlays, done.seconds = shown, time.perf_counter() - begun
     return done
+
+
+def _far(level: float, floor: ErrorFloor) -> str:
+    """Return that nothing counts as explained."""
+    if not np.isfinite(level):
+        return UNKNOWN_FLOOR
+    wrong, times = 1e3 * level, level / floor.noise
+    return (
+        f"Finer simulations of the calibrated model differ from it by {wrong:.1f} mm, {times:.0f} times what centre "
+        "lines get wrong: the model is far from this rope, or its motion magnifies small errors, so nothing "
+        "counts as explained. Record slower motions, or with a second camera."
+    )
 
 
 def _plain(model: _Model, point: levenberg_marquardt.Point) -> Fitted:

@@ -1,0 +1,15 @@
+"""A fit that is far from its films says so: what finer simulations change of it is no floor."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from torchdlo.sysid.diagnosis.error_floor import ErrorFloor
+from torchdlo.sysid.diagnosis.verdict import UNKNOWN_FLOOR
+from torchdlo.sysid.video.filmed_diagnosis import _far
+
+
+def test_a_blunt_floor_is_said() -> None:
+    said = _far(6.6e-3, ErrorFloor(3e-4, 0.0, 6.6e-3))
+    assert said.startswith("Finer simulations of the calibrated model differ from it by 6.6 mm, 22 times")
+    assert _far(np.inf, ErrorFloor(3e-4, 0.0, np.inf)) == UNKNOWN_FLOOR
