@@ -57,8 +57,8 @@ def test_the_share_of_the_episode_is_told_in_waves():
 def test_task_features_find_ropes_bodies_and_tools_without_velocities(name: str):
     task = envs.find(name)
     spec = task_features(task)
-    start = episode.prepare(task, 1, execution="eager").start
-    seen = episode.observe(episode.prepare(task, 1, execution="eager"), start)
+    made = episode.prepare(task, 1, execution="eager")
+    start, seen = made.start, episode.observe(made, made.start)
     points = Features(spec)(seen, torch.zeros(1, 1), seen)
     # At the usual start, all points are where they usually are.
     count = 3 * len(spec.points)
