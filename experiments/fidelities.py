@@ -92,17 +92,19 @@ def main() -> int:
     import torch
 
     torch.set_num_threads(1)
-    rows = json.loads(Path(options.json).read_text()) if options.json and Path(options.json).exists() else []
+    rows = json.loads(Path(options.json).read_text()) if options.json and Path(options.json).exists() else {}
+    kind = "stored" if options.stored else "demonstrations"
+    kept = rows.get(kind, [])
     ways = options.fidelities.split(",")
     for name in options.tasks.split(","):
         actions = actions_of(name, options.stored)
         for way in ways if actions is not None else ():
-            row = next((r for r in rows if (r["task"], r["fidelity"]) == (name, way)), None)
+            row = next((r for r in kept if (r["task"], r["fidelity"]) == (name, way)), None)
             if row is None:
                 row = play(name, way, actions[:, : 3 if options.smoke else None])
-                rows.append(row)
-                save(options.json, rows)
-            first = next(r for r in rows if (r["task"], r["fidelity"]) == (name, ways[0]))
+                kept.append(row)
+                save(options.json, rows | {kind: kept})
+            first = next(r for r in kept if (r["task"], r["fidelity"]) == (name, ways[0]))
             print(shown(row, first), flush=True)
     return 0
 

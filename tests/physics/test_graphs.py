@@ -133,13 +133,21 @@ def test_gpu_graphs_change_nothing(monkeypatch):
         params, rods=tree.replace(params.rods, material=tree.replace(params.rods.material, bend=bend))
     )
     controls = tree.map(lambda c: c.expand(8, *c.shape), scenes.stationary_control(choice, state))
-    step, found = scenes.stepper(choice), []
+    made_by, recordings, found = graphs._Recording.__init__, [], []
+
+    def counted(self, *given):
+        made_by(self, *given)
+        recordings.append(self)
+
+    monkeypatch.setattr(graphs._Recording, "__init__", counted)
     for runs in (10**9, graphs.RUNS):
         monkeypatch.setattr(graphs, "RUNS", runs)
+        step = scenes.stepper(choice)
         for segment in (1, None):
             last, _ = scenes.rollout(step, params, state, controls, segment=segment, keep=lambda s: s.time)
             (gradient,) = torch.autograd.grad(last.rods.pos.square().sum(), bend)
             found.append((last.rods.pos.detach(), gradient))
+    assert len(recordings) >= 2, "nothing was recorded"
     for pos, gradient in found[1:]:
         torch.testing.assert_close(pos, found[0][0], rtol=1e-12, atol=1e-14)
         torch.testing.assert_close(gradient, found[0][1], rtol=1e-10, atol=1e-14)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -61,9 +62,10 @@ def test_following_a_path_in_the_world_succeeds_where_replaying_it_does_not(tmp_
     assert scores[1].success < 0.7
 
 
-def test_a_search_for_a_robust_path_is_repeatable_and_goes_on(tmp_path: Path):
+@pytest.mark.parametrize("disturbed", [0.0, 0.3])
+def test_a_search_for_a_robust_path_is_repeatable_and_goes_on(tmp_path: Path, disturbed: float):
     experts = candidate_experts(Lead(), [found(tmp_path)])
-    choices = {"seed": 0, "starts": 4, "population": 4, "generations": 2, "enough": 2.0}
+    choices = {"seed": 0, "starts": 4, "population": 4, "generations": 2, "enough": 2.0, "disturbed": disturbed}
     first, log, played = improve_expert(Lead(), experts, **choices)
     # Both candidates from 8 starts, two generations of 5 from 4, and the last comparison of 2 from 16.
     assert played == 2 * 8 + 2 * 5 * 4 + 2 * 16
@@ -116,8 +118,10 @@ def test_a_clone_does_what_its_expert_does(tmp_path: Path):
     assert float(plays["one"]["moved"].abs().max()) == 0 < float(plays["varied"]["moved"].std())
 
 
-def test_stages_that_are_done_are_not_run_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    undisturbed, _ = train_hybrid(Lead(), [found(tmp_path)], settings(), folder=tmp_path / "a", plan=PLAN)
+@pytest.mark.parametrize("disturbed", [0.0, 0.3])
+def test_stages_that_are_done_are_not_run_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, disturbed: float):
+    plan = replace(PLAN, disturbed=disturbed)
+    undisturbed, _ = train_hybrid(Lead(), [found(tmp_path)], settings(), folder=tmp_path / "a", plan=plan)
     told = []
 
     def stop(stage: str, done: int, *_) -> None:
@@ -126,9 +130,9 @@ def test_stages_that_are_done_are_not_run_again(tmp_path: Path, monkeypatch: pyt
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        train_hybrid(Lead(), [found(tmp_path)], settings(), folder=tmp_path / "b", plan=PLAN, callback=stop)
+        train_hybrid(Lead(), [found(tmp_path)], settings(), folder=tmp_path / "b", plan=plan, callback=stop)
     monkeypatch.setattr(stages, "improve_expert", None)
-    policy, _ = train_hybrid(Lead(), [], settings(), folder=tmp_path / "b", plan=PLAN, resume=True)
+    policy, _ = train_hybrid(Lead(), [], settings(), folder=tmp_path / "b", plan=plan, resume=True)
     for name, value in policy.state_dict().items():
         assert torch.equal(value, undisturbed.state_dict()[name]), name
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from torch import Tensor
 
@@ -69,7 +69,7 @@ def drawn_params(params: Params, size: float, scene: Scene, task: Task, random: 
     """
     if not 0 <= size < 1:
         raise InputError(f"disturbed: it is {size}; expected a share of friction and stiffness, from 0 to below 1.")
-    disturbed_params(params, replace(Disturbance(), stiffness=1 + size), scene, task)  # what is stiffest has to hold
+    disturbed_params(params, Disturbance(stiffness=1 + size), scene, task)  # what is stiffest has to hold
     factors = 1 + size * (2 * random - 1)
     friction, stiffness = (x.reshape(-1, 1, 1).to(params.rods.material.bend) for x in factors.unbind(-1))
     return _scaled(params, friction, stiffness, scene)

@@ -160,7 +160,7 @@ class TaskEpisodes:
         self.ends, self.scale, self.bonus = ends, scale, bonus
         if disturbed and randomize:
             raise InputError("randomize and disturbed: both draw friction anew; give one of them.")
-        self.disturbed, self._usual = disturbed, self.env.episode.params
+        self.disturbed, self._randomized, self._usual = disturbed, bool(randomize), self.env.episode.params
         self._over = 0
         self.returns = torch.zeros(count)
         """What the task itself pays, without the rest."""
@@ -171,6 +171,8 @@ class TaskEpisodes:
         self.returns = torch.zeros(self.count)
         if self.disturbed:
             self.disturb(torch.rand(self.count, 2, generator=self.generator))
+        elif not self._randomized:
+            self.env.episode = replace(self.env.episode, params=self._usual)
         self.first = self.env.reset()["observation"].detach()
         return self.first
 

@@ -252,8 +252,8 @@ def improve_expert(
         enough: see above.
         minutes: budget of the clock.
         judged: the task itself where `task` is its surrogate: what the search found has to be better there.
-        disturbed: by how much friction and stiffness vary from episode to episode, as shares of their own; it grows
-            from nothing over the first half of the generations.
+        disturbed: by how much friction and stiffness vary from episode to episode, as shares of their own; in
+            the search it grows from nothing over the first half of the generations.
         journal: file that keeps how candidates did; a search that finds one of the same choices goes on from there.
         callback: told (stage, generations done, all, message).
     """
@@ -262,7 +262,7 @@ def improve_expert(
         raise InputError(f"{task.name}: there is no trajectory that succeeds; search one with torchdlo optimize first.")
     choices = [task.name, task.fidelity.text, seed, starts, population, sigma, noise]
     choices += [] if judged is None else [judged.fidelity.text]
-    choices += [disturbed] if disturbed else []
+    choices += [disturbed, generations] if disturbed else []
     kept = _Journal(journal, choices)
     arena = _Arena(task, seed, noise, kept)
     final = arena if judged is None else _Arena(judged, seed, noise, kept)
@@ -282,10 +282,11 @@ def improve_expert(
         asked = search.ask()
         mean = _changed(base, torch.tensor(search.mean), task)
         candidates = [mean, *(_changed(base, torch.tensor(x), task) for x in asked)]
-        scores = arena.scores(candidates, starts, 1 + k, disturbed * min(1.0, 2 * (k + 1) / generations))
+        strength = min(1.0, 2 * (k + 1) / generations)
+        scores = arena.scores(candidates, starts, 1 + k, disturbed * strength)
         search.tell(asked, [-s.value(scale) for s in scores[1:]])
         log.append({"generation": k, **vars(scores[0]), "best": max(s.success for s in scores[1:])})
-        good = good + 1 if scores[0].success >= enough else 0
+        good = good + 1 if scores[0].success >= enough and (strength == 1.0 or not disturbed) else 0
         told("robust", k + 1, generations, f"success {scores[0].success:.0%}, best {log[-1]['best']:.0%}")
     if mean is base:
         return base, log, arena.played

@@ -89,7 +89,7 @@ def numbers(values: Sequence[int], like: Tensor) -> int:
 
 
 def operator(schema: str, run: Callable, empty: Callable, save=None, backward=None, gpu: bool = False) -> None:
-    """Register an operator `torch.ops.torchdlo.NAME` that runs a kernel on the CPU.
+    """Register an operator `torch.ops.torchdlo.NAME` that runs a kernel.
 
     Args:
         schema: its name, inputs and outputs; tensors come to it contiguous.

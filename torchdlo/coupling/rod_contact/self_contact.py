@@ -26,7 +26,10 @@ _PAIRS = RodContact()
 
 @dataclass(frozen=True)
 class SelfContact(Effect):
-    """A rope does not pass through itself: `RodContact` at a share of its radius, nothing at all at a share of 0."""
+    """A rope does not pass through itself: `RodContact` at a share of its radius, nothing at all at a share of 0.
+
+    Parts that are nearer to each other along the rope than 2 pi radii never meet.
+    """
 
     name: ClassVar[str] = "self_contact"
     kind: ClassVar[EffectKind] = "force"

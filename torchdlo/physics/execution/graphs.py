@@ -14,6 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torchdlo import notices
 from torchdlo.physics import tree
 
 RUNS = 2
@@ -63,7 +64,8 @@ class _Recording:
             known = self.known[k]
             if known is None or known[0] is not x or known[1] != x._version:
                 _narrow(self.given[k].detach()).copy_(_narrow(x.detach()))
-                self.known[k] = x, x._version
+                # What has a history would keep it.
+                self.known[k] = None if x.grad_fn is not None else (x, x._version)
         self.run += 1
         self.forward.replay()
 
@@ -117,15 +119,21 @@ class Graphs:
         with_gradient = torch.is_grad_enabled() and any(x.requires_grad for x in leaves)
         if not all(x.is_cuda for x in leaves) or torch.cuda.is_current_stream_capturing():
             return step(*inputs)
+        # Recordings are of the current device, and see by versions what was changed in place.
+        if leaves[0].device.index != torch.cuda.current_device() or torch.is_inference_mode_enabled():
+            return step(*inputs)
         kind = others, with_gradient, *((x.shape, x.stride(), x.dtype, x.device, x.requires_grad) for x in leaves)
         if kind not in self._kept:
             runs = self._runs.get(kind, 0)
             self._runs[kind] = runs + 1
             if runs != RUNS:  # also if it could not be recorded
                 return step(*inputs)
+            stream = torch.cuda.current_stream()
             try:
                 self._kept[kind] = _Recording(step, leaves, build)
-            except RuntimeError:
+            except RuntimeError as error:
+                torch.cuda.set_stream(stream)  # a recording that broke off would leave its own
+                notices.once("graphs", f"steps are not recorded as CUDA graphs, which is slower: {error}")
                 return step(*inputs)
             if len(self._kept) > KEPT:
                 gone, _ = self._kept.popitem(last=False)

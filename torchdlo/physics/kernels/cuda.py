@@ -176,12 +176,13 @@ def _fields(addresses: Sequence[int | None]) -> Fields:
     return fields
 
 
-_memories: dict[tuple[Launch, str, bytes], tuple[int, int]] = {}
+_memories: dict[tuple[Launch, str, tuple], tuple[int, int]] = {}
 
 
 def _memory(launch: Launch, entry: str, sizes: ctypes.Structure, like: Tensor) -> tuple[int, int]:
     """Return how much memory a warp takes of what is fast, and else [bytes]; the kernel itself tells."""
-    key = launch, entry, bytes(sizes)
+    # Addresses say nothing of it, and are others in every call.
+    key = launch, entry, tuple(getattr(sizes, name) for name, kind, *_ in sizes._fields_ if kind is not ctypes.c_void_p)
     if key not in _memories:
         told = torch.zeros(2, dtype=torch.int64, device=like.device)
         launch(f"{entry}_memory", sizes, _fields([told.data_ptr()]), Room(None, 0, 0), 1, 0)
@@ -214,7 +215,7 @@ def run(
     launch(entry, sizes, _fields(addresses), Room(scratch.data_ptr(), each, spare), blocks, near - spare)
 
 
-@functools.lru_cache(maxsize=256)
+@functools.cache  # recorded graphs read them for good
 def integers(numbers: tuple[int, ...], device: torch.device) -> Tensor:
     """Return whole numbers on a device, which stay there."""
     return torch.tensor(numbers, dtype=torch.int64, device=device)

@@ -11,7 +11,7 @@ struct Sizes {
   int64_t slots, scenes, families, bodies, pairs, half, tries;
   const int64_t *after, *of, *steps;  // next slots; body of each family of points or -1; Newton steps of each try
   const int32_t* order;
-  const double *hardness, *law;  // law: turning, most, least, shift, dt, solved, round, far, leaving
+  const double *hardness, *law;  // law: turning, most, least, shift, dt, solved, round, far, leaving, stalled (2)
   Tied tied;
 };
 
