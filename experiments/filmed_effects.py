@@ -76,6 +76,8 @@ def look_at(folder: Path, answers: Path, seed: int, page: Path) -> dict[str, Any
     report.write_report(found, recording, page)
     true = json.loads((answers / f"{folder.name}.json").read_text())["answer"]
     named = [e["name"] for e in told["effects"]]
+    sets = [{e["name"], *e.get("indistinguishable_from", [])} for e in told["effects"]]
+    right = all(any(t in each for each in sets) for t in true) and all(each & set(true) for each in sets)
     as_well = sorted({other for e in told["effects"] for other in e.get("indistinguishable_from", [])})
     return {
         "name": folder.name,
@@ -84,7 +86,7 @@ def look_at(folder: Path, answers: Path, seed: int, page: Path) -> dict[str, Any
         "verdict": told["verdict"],
         "named": named,
         "or": as_well,
-        "right": set(true) <= {*named, *as_well} if true else not named,
+        "right": right if true else told["verdict"] == "none",
         "gap": {k: v for k, v in told["gap"].items() if isinstance(v, float)},
         "effects": {e["name"]: {k: v["value"] for k, v in e["parameters"].items()} for e in told["effects"]},
         "candidates": told["candidates"],

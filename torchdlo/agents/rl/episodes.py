@@ -160,7 +160,9 @@ class TaskEpisodes:
         self.ends, self.scale, self.bonus = ends, scale, bonus
         if disturbed and randomize:
             raise InputError("randomize and disturbed: both draw friction anew; give one of them.")
-        self.disturbed, self._randomized, self._usual = disturbed, bool(randomize), self.env.episode.params
+        self.disturbed, self._usual = disturbed, self.env.episode.params
+        self.random: Tensor | None = None
+        """What decided the friction and the stiffness of each scene, (N, 2); None where they are the usual ones."""
         self._over = 0
         self.returns = torch.zeros(count)
         """What the task itself pays, without the rest."""
@@ -171,7 +173,8 @@ class TaskEpisodes:
         self.returns = torch.zeros(self.count)
         if self.disturbed:
             self.disturb(torch.rand(self.count, 2, generator=self.generator))
-        elif not self._randomized:
+        elif self.random is not None:
+            self.random = None
             self.env.episode = replace(self.env.episode, params=self._usual)
         self.first = self.env.reset()["observation"].detach()
         return self.first

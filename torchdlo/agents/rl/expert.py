@@ -188,7 +188,7 @@ def share_starts(episodes: TaskEpisodes, each: int) -> None:
     env, copies = episodes.env, episodes.count // each
     env.world = tree.map(lambda x: x[:each].repeat(copies, *[1] * (x.dim() - 1)), env.world)
     env.moved = env.moved[:each].repeat(copies, 1, 1)
-    if episodes.disturbed:
+    if episodes.random is not None:
         episodes.disturb(episodes.random[:each].repeat(copies, 1))
 
 

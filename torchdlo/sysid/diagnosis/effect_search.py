@@ -266,6 +266,7 @@ class _Search:
         ]
         self.scores = self.scores or scores
         if self._nothing_left(base):
+            self.leading = None
             return None, base, [Candidate(s.name, s.share, None, None, NOTHING_LEFT) for s in scores], []
         fits, led, rival, worst = self._fits(base, [*scores[: self.budget.candidates], *soft], stage)
         self.bench.predict([base, rival, *fits.values()])
@@ -289,9 +290,15 @@ class _Search:
 
     def _nothing_left(self, base: Fitted) -> bool:
         """Return whether the gap is so near the floor that no effect could close enough of it to be named."""
-        noise = min(self.bench.floor.noise, error_floor.shown_noise(self.recording))
-        gaps = (gap_rms(self.bench.gaps(base, split)) for split in ("train", "test"))
-        return any(selection.nothing_can_matter(gap, noise, self.bench.level) for gap in gaps)
+        noise, level = min(self.bench.floor.noise, error_floor.shown_noise(self.recording)), self.bench.level
+
+        def little(split: str) -> bool:
+            # Frames that count less leave less of the noise, too.
+            weights = self.bench.starts[split].frame_weights
+            told = 1.0 if weights is None else min(1.0, float(np.sqrt(np.mean(np.square(weights)))))
+            return selection.nothing_can_matter(gap_rms(self.bench.gaps(base, split)), told * noise, level)
+
+        return little("train") or little("test")
 
     def _fits(
         self, base: Fitted, scores: Sequence[Score], stage: str

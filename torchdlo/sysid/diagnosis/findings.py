@@ -279,6 +279,11 @@ def summary(result: Diagnosis, recording: Recording) -> str:
             f"{before:.1f} mm off on trials that were not used, and {floor:.1f} mm is the floor of noise and grid."
             f"{left_out}{error}"
         )
+    if result.verdict == "unknown" and before <= floor:
+        return (
+            f"Whether something is missing is not known: the calibrated baseline is {before:.1f} mm off on trials that "
+            f"were not used, and finer simulations differ from it by {floor:.1f} mm.{left_out}{error}{_best(result)}"
+        )
     if result.verdict == "unknown":
         return (
             "Something is missing that no effect of the library explains: the calibrated baseline is "

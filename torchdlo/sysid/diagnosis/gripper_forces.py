@@ -61,19 +61,19 @@ def take_forces(bench: Workspace, base: Fitted, iterations: int, report: Callbac
     known, first = weighed(model, trials, model.motion(trials), start, numbers)
     bench = bench.with_options(dict(base.options) | {"forces": True, "force_worth": known.metres})
     share = first[model.parameters.index("mass")] / model.mass
-    bench = replace(bench, early=_heavier(bench.early, plain, model, share))
+    bench = replace(bench, early=_heavier(bench.early, plain, share))
     free, sizes = (*base.space.names, "mass"), (*base.space.units, 1.0)
     (found,) = bench.fit([FitJob(base.effects, first[None], free, sizes, iterations, start)])
     report(stage, 1, 1, f"{float(found.values[model.parameters.index('mass')]):.3g} kg")
     return bench, found
 
 
-def _heavier(early: np.ndarray, plain: RopeModel, model: RopeModel, share: float) -> np.ndarray:
-    """Return numbers of the beginning of trials for a rope that is heavier by a factor, with its mass."""
+def _heavier(early: np.ndarray, plain: RopeModel, share: float) -> np.ndarray:
+    """Return numbers of the beginning of trials for a rope that is heavier by a factor."""
     if not len(early):
         return early
     scale = [share if name.endswith("_stiffness") else 1.0 for name in plain.parameters[: len(early)]]
-    return np.append(early * scale, share * model.mass)
+    return early * scale
 
 
 def simulated_forces(bench: Workspace, fitted: Fitted, split: str) -> np.ndarray | None:

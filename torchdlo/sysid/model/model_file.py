@@ -67,8 +67,12 @@ class ModelFile:
             )
         model = RopeModel(recording, effects=self.effects, **(self.options | options))
         for name in self.effects:
-            known = name in effect_library.library() and effect_library.spec(name).requires != "near_itself"
-            if known and not effect_library.applicable(name, recording, model.mesh):
+            if name not in effect_library.library():
+                continue
+            # Whether a rope comes near itself is a matter of its motion, which may be another one here.
+            near = effect_library.spec(name).requires == "near_itself"
+            acts = recording.radius is not None if near else effect_library.applicable(name, recording, model.mesh)
+            if not acts:
                 raise InputError(
                     f"{self.path}: {name}: expected a recording in which it can act, but {recording.path} has nothing "
                     "that it acts on (no table, no clamp of two markers, no liquid, or no radius)."

@@ -133,12 +133,13 @@ def diagnose_filmed(
         base = _chained(base)
         report("calibrating the baseline", 1, 1, f"{1e3 * gap_rms(base.gaps('train')):.2f} mm")
     floor, level = _floor(base)
+    bar = floor.noise if _blunt(level, floor) else level
     plan, first = BUDGETS[budget], base
     shares: dict[str, float] = {}
     ties: dict[str, list[str]] = {}
     rounds: list[list[Candidate]] = []
     while len(rounds) < plan.rounds:
-        if gap_rms(np.concatenate([base.gaps("train"), base.gaps("test")])) < (MORE if shares else SILENT) * level:
+        if gap_rms(np.concatenate([base.gaps("train"), base.gaps("test")])) < (MORE if shares else SILENT) * bar:
             break
         names = [n for n in effect_library.library() if n not in (*base.own.model.effects, *without)]
         names = [n for n in names if effect_library.applicable(n, recording, base.own.model.mesh)]
@@ -418,7 +419,7 @@ def _concluded(
     begun: float,
 ) -> Diagnosis:
     before, after = first.gaps("test"), final.gaps("test")
-    effects, blunt = list(shares), not level < BLUNT * floor.noise
+    effects = list(shares)
     point, drifts = spread(final.own, final.fit)
     good = [m for m in final.others if gap_rms(m.gaps("test")) < _AS_GOOD * gap_rms(after)]
     apart = [m.fit.raw - final.fit.raw for m in good]
@@ -434,7 +435,7 @@ def _concluded(
         numbers = [m.values[len(m.own.free) :] for m in (first, final)]
         shown += overlays(problems[0], split, np.stack(sims), np.stack(numbers))
     done = Diagnosis(
-        verdict_word(effects, gap_rms(after), np.inf if blunt else level, gap_rms(after) / gap_rms(before)),
+        _verdict(effects, gap_rms(before), gap_rms(after), floor, level),
         effects,
         {name: ties[name] for name in effects},
         shares,
@@ -447,11 +448,21 @@ def _concluded(
         predictions,
         final.own.model,
         drifts,
-        notes=[*notes, *([_far(level, floor)] if blunt else [])],
+        notes=[*notes, *([_far(level, floor)] if _blunt(level, floor) else [])],
         options={"budget": budget, "seed": seed, "vertices": final.own.options["vertices"]},
     )
     done.overlays, done.seconds = shown, time.perf_counter() - begun
     return done
+
+
+def _blunt(level: float, floor: ErrorFloor) -> bool:
+    """Return whether finer simulations change so much that this is no floor."""
+    return not level < BLUNT * floor.noise
+
+
+def _verdict(effects: list[str], before: float, after: float, floor: ErrorFloor, level: float) -> str:
+    """Return the verdict in a word, from gaps [m]; nothing is explained down to a floor that is none."""
+    return verdict_word(effects, after, np.inf if _blunt(level, floor) else level, after / before)
 
 
 def _far(level: float, floor: ErrorFloor) -> str:
