@@ -82,7 +82,7 @@ _PLANS: dict[str, dict[str, float]] = {
     # Fingers hold the band by friction: it slips out where its halves pull unevenly, by 0.7 mm of way.
     "slingshot": {"search_noise": 2e-4, "search_sigma": 5e-4, "noise": 1e-4},
     "unknotting": {"search_noise": 1e-3, "search_sigma": 3e-3, "noise": 5e-4},
-    # Ropes that are stiffer or smoother than it was searched with slip past the post.
+    # Without disturbances it fails with half the friction, and with ropes that are stiffer by half.
     "wiring_post": {"generations": 30, "disturbed": 0.5},
 }
 """What differs by task: noise that the task itself takes, and what it has to be made robust against."""

@@ -1,15 +1,8 @@
-// Which pairs of edges of ropes can touch before the next look, and whether vertices outran it; see nearby.py and
-// `RodContact` in contact.py.
+// Which pairs of edges of ropes can touch before the next look, and whether vertices outran it; see broad_phase.py and
+// `RodContact` in rod_contact_effect.py.
 //
 // All arrays have the scenes last: (V, B) for numbers of vertices, (4, K, B) for the places v B + b of the corners of
 // pairs, (K, B) for whether they are pairs.
-#ifdef SIMT
-#include "rod_near_simt.h"
-#else
-#include <algorithm>
-#include <memory>
-
-#include "flush.h"
 #include "segments.h"
 
 struct Sizes {
@@ -17,6 +10,14 @@ struct Sizes {
   const int64_t *counts, *closed;  // of each rod
   double dt, burst;
 };
+
+#ifdef SIMT
+#include "rod_near_simt.h"
+#else
+#include <algorithm>
+#include <memory>
+
+#include "flush.h"
 
 template <typename T>
 struct Scene {

@@ -1,12 +1,5 @@
 // What rod_near.cpp does on a GPU: a warp tries all pairs of edges of a scene, its lanes the partners of one edge.
 #pragma once
-#include "segments.h"
-
-struct Sizes {
-  int64_t vertices, scenes, held, rods, room, few, apart;
-  const int64_t *counts, *closed;  // of each rod
-  double dt, burst;
-};
 
 template <typename T>
 struct Scene {
