@@ -64,7 +64,9 @@ def record(step: Callable[..., Any], *inputs: Any) -> Callable[..., Any]:
     @torch.no_grad()
     def replayed(first: Any, *others: Any) -> Any:
         now = kept(1, others[0]) if others else ()
-        found = recorded(*kept(0, first), *now, *tree.leaves(others[1:]))
+        last = tree.leaves(others[1:])
+        with torch._C._AutoDispatchBelowAutograd():
+            found = recorded(*kept(0, first), *now, *last)
         made = rebuild[0](found)
         known[1] = made, found
         return made
