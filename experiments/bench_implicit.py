@@ -1,12 +1,14 @@
 """What a simulated second with contact costs in implicit and in explicit steps, and how far each is off.
 
 A rope of 60 vertices falls over a fixed cone with friction, in many scenes: `bench_coupled.py` calls it coiling.
-Implicit steps are of 2 ms, explicit ones the published 1 ms in 5 substeps. Both are recorded, and timed by CPU seconds
-of one thread, the least of some repeats, from a state in contact. Gradients are those of four steps, not compiled. The
-error is the root mean square distance of vertices from those of 40 explicit substeps per millisecond.
+Implicit steps are of 2 ms, explicit ones the published 1 ms in 5 substeps. Both are timed by CPU seconds of one thread,
+the least of some repeats, from a state in contact; gradients are those of four steps. Steps are recorded forward, and
+eager with gradients; with --compiled both are compiled, so that their ratio compares like with like. The error is the
+root mean square distance of vertices from those of 40 explicit substeps per millisecond.
 
 examples:
   python experiments/bench_implicit.py --json implicit.json
+  python experiments/bench_implicit.py --compiled
   PYTHONPATH=/path/to/another/version python experiments/bench_implicit.py
 """
 
@@ -60,7 +62,7 @@ def least(work: Any, repeats: int) -> float:
     return min(times)
 
 
-def timed(scenes: int, way: dict[str, Any], start: float, repeats: int) -> dict[str, float]:
+def timed(scenes: int, way: dict[str, Any], start: float, repeats: int, compiled: bool) -> dict[str, float]:
     """Return simulated seconds per CPU second, forward and with a gradient, and the ratio of their costs."""
     import torch
 
@@ -70,7 +72,8 @@ def timed(scenes: int, way: dict[str, Any], start: float, repeats: int) -> dict[
     choice, params, state = cell(scenes, way)
     state = played((choice, params, state), start)
     control = scene.stationary_control(choice, state)
-    recorded, plain = scene.stepper(choice, execution="recorded"), scene.stepper(choice, execution="eager")
+    ways = ("compiled", "compiled") if compiled else ("recorded", "eager")
+    recorded, plain = (scene.stepper(choice, execution=way) for way in ways)
 
     def forward() -> None:
         now = state
@@ -99,6 +102,7 @@ def main() -> int:
     parser.add_argument("--repeats", type=count, default=6, help="of each timing (%(default)s)")
     parser.add_argument("--seconds", type=float, default=0.2, help="time at which errors are told (%(default)s)")
     parser.add_argument("--json", metavar="FILE", default="", help="file that the results go to")
+    parser.flag("compiled", "compile steps, half a minute each")
     parser.flag("smoke", "two scenes, no errors")
     options = parser.parse_args()
     import torch
@@ -107,7 +111,7 @@ def main() -> int:
     scenes, repeats = (2, 1) if options.smoke else (options.scenes, options.repeats)
     rows: dict[str, dict[str, float]] = {}
     for name, way in (("implicit", IMPLICIT), ("explicit", EXPLICIT)):
-        rows[name] = timed(scenes, way, 0.004 if options.smoke else 0.05, repeats)
+        rows[name] = timed(scenes, way, 0.004 if options.smoke else 0.05, repeats, options.compiled)
         line = "{forward:8.2f} simulated s per CPU s, {both:8.2f} with gradients ({ratio:.1f} times)".format(
             **rows[name]
         )
