@@ -273,7 +273,9 @@ def _moved(
         found, there = first, torch.where(wrong, start, there)
         least, since = float("inf"), 0
         for _ in range(rounds):
-            there = torch.where(wrong, way(there, found), there)
+            before, there = there, torch.where(wrong, way(there, found), there)
+            if torch.equal(before, there):  # ropes that are held do not slide
+                break
             found = look(there)
             if not bool((wrong & ~(_over(found) < _DONE)).any()):
                 break
