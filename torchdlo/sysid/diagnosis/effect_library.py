@@ -148,6 +148,12 @@ def numbers(name: str, recording: Recording) -> list[Number]:
     return found
 
 
+def greatest(name: str, number: str, recording: Recording) -> float:
+    """Return the greatest size that a number of an effect may have, whatever its sign, as declared or as recorded."""
+    param = EFFECTS[name].params[number]
+    return max(abs(param.low), abs(spec(name).limits(recording).get(number, (0.0, param.high))[1]))
+
+
 def perturbations(
     name: str, recording: Recording, mesh: Mesh, curvature: float, baseline: Mapping[str, float]
 ) -> list[Perturbation]:

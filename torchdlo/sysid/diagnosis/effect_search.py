@@ -60,6 +60,10 @@ MORE = 2.5
 NOTHING_LEFT = "the floor leaves nothing that could be named"
 """Why nothing is fitted where the baseline is as near the floor as it may be."""
 
+_AKIN = 0.1
+"""Share of the excess gap of the train trials that the best fit has to close for others that do alike things to be
+fitted: two thirds of what one has to close to be named."""
+
 LEADERS = 2
 """Effects that are fitted further in each round, besides those that are nearly as good."""
 
@@ -280,8 +284,10 @@ class _Search:
         if base is self.baseline:
             self.plain.append(rival)
         first = min(led, key=lambda name: fits[name].point.cost)
-        if gap_rms(self.bench.gaps(fits[first], "all")) > SILENT * self.bench.level:
-            # Something is left: one that does alike things may be right, however little its doses explain.
+        left = gap_rms(self.bench.gaps(fits[first], "all")) > SILENT * self.bench.level
+        if left and max(self._gain(rival, fits[name], "train") for name in led) > _AKIN:
+            # Something is left: one that does alike things may be right, however little its doses explain. Of what it
+            # does, the best fit would have made up a part.
             kin = [s for s in scores if s.name not in fits and effect_library.confusable(s.name, first)]
             more, also = self._fits_of_kin(base, kin, worst, f"{stage}, effects like {first}") if kin else ({}, [])
             self.bench.predict(list(more.values()))
@@ -544,7 +550,7 @@ class _Search:
                 *([] if np.isfinite(self.bench.level) else [UNKNOWN_FLOOR]),
             ],
             tests=tests,
-            limits=detection_limits(self.scores, limit),
+            limits=detection_limits(self.scores, limit, self.recording),
             leading=self.leading if verdict in ("unknown", "partial") else None,
             misleading=self.misleading,
             forces=None if self.force_before is None else (self.force_before, self._forces(final)),
