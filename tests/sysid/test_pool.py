@@ -54,6 +54,22 @@ def test_fits_find_together_what_they_find_alone(tmp_path: Path) -> None:
         assert np.abs(together[1].values / jobs[1].values[0] - 1).max() > 1e-2
 
 
+def test_the_effects_of_fits_that_have_ended_are_simulated_no_more(tmp_path: Path) -> None:
+    with Pool(swaying(tmp_path, frames=40), OPTIONS, workers=1) as pool:
+        plain, drag, mass, _ = fits(pool)
+        search = pool.local.search([replace(plain, iterations=2), replace(drag, iterations=0), mass])
+        asked, effects = next(search), []
+        try:
+            while True:
+                effects.append(asked.effects)
+                asked = search.send(pool.local.simulate(asked))
+        except StopIteration as end:
+            found = end.value
+        # Drag needs one look, the mass one more to choose its start, and as many as it has iterations.
+        assert effects[0] == ("air_drag", "point_mass") and effects[1] == ("point_mass",)
+        assert [f.effects for f in found] == [(), ("air_drag",), ("point_mass",)]
+
+
 def test_workers_share_the_scenes_of_a_fit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(pools, "_FEW", 2)
     monkeypatch.setattr(pools, "_SMALL", 0)

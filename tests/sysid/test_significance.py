@@ -258,6 +258,14 @@ def test_limits_are_said_in_one_sentence(rope: Recording) -> None:
     assert limits_text(fake_diagnosis(rope)) == ""
 
 
+def test_an_effect_that_closes_next_to_nothing_tells_of_no_other() -> None:
+    # Bending damping that closes 7 % says nothing of inner friction, one that closes a quarter does.
+    assert not selection.tells_of_kin([0.049, 0.073]) and not selection.tells_of_kin([-1.0])
+    assert selection.tells_of_kin([-0.3, 0.25])
+    # What could be named itself always does.
+    assert selection.tells_of_kin([selection.PAYS])
+
+
 def test_where_nothing_can_matter_nothing_does() -> None:
     # Whatever a fit closes, a tenth of the squared noise stays at least nine tenths of it.
     rng = np.random.default_rng(0)

@@ -60,10 +60,6 @@ MORE = 2.5
 NOTHING_LEFT = "the floor leaves nothing that could be named"
 """Why nothing is fitted where the baseline is as near the floor as it may be."""
 
-_AKIN = 0.1
-"""Share of the excess gap of the train trials that the best fit has to close for others that do alike things to be
-fitted: two thirds of what one has to close to be named."""
-
 LEADERS = 2
 """Effects that are fitted further in each round, besides those that are nearly as good."""
 
@@ -285,9 +281,8 @@ class _Search:
             self.plain.append(rival)
         first = min(led, key=lambda name: fits[name].point.cost)
         left = gap_rms(self.bench.gaps(fits[first], "all")) > SILENT * self.bench.level
-        if left and max(self._gain(rival, fits[name], "train") for name in led) > _AKIN:
-            # Something is left: one that does alike things may be right, however little its doses explain. Of what it
-            # does, the best fit would have made up a part.
+        if left and selection.tells_of_kin([self._gain(rival, fits[name], "train") for name in led]):
+            # Something is left: one that does alike things may be right, however little its doses explain.
             kin = [s for s in scores if s.name not in fits and effect_library.confusable(s.name, first)]
             more, also = self._fits_of_kin(base, kin, worst, f"{stage}, effects like {first}") if kin else ({}, [])
             self.bench.predict(list(more.values()))
