@@ -125,6 +125,24 @@ def test_a_special_law_takes_over_the_numbers_of_a_general_one(tmp_path: Path) -
         assert less.pop("air_drag.c_d") == values["wind.c_d"] and less.items() <= values.items()
 
 
+def test_a_special_law_may_call_its_numbers_otherwise(tmp_path: Path) -> None:
+    # In a liquid the coefficient of drag belongs to its density: what takes its place begins as it is declared.
+    rope = replace(swaying(tmp_path, frames=40), fluid_density=1000.0)
+    with Pool(rope, OPTIONS, workers=1) as pool:
+        bench = Workspace(pool)
+        bench = bench.begin(pool.local.model(()).guess(), ())
+        model = pool.local.model(("fluid_forces",))
+        names = tuple(n for n in model.parameters if n != "twisting_stiffness")
+        params = tuple(model.params[model.parameters.index(n)] for n in names)
+        space = ParameterSpace(names, params, (1.0,) * len(names))
+        fitted = Fitted(("fluid_forces",), model.guess(), space, None)  # type: ignore[arg-type]
+        job = bench.exchange(fitted, "fluid_forces", "air_drag", 2)
+        other = pool.local.model(job.effects)
+        assert job.effects == ("air_drag",) and job.free == ("bending_stiffness", "damping_rate", "air_drag.c_d")
+        assert dict(zip(other.parameters, job.values[0], strict=True))["air_drag.c_d"] == 1.2
+        assert job.sizes[-1] == 1.2
+
+
 def test_a_model_loses_an_effect_and_starts_from_several_baselines(tmp_path: Path) -> None:
     with Pool(swaying(tmp_path, frames=10), OPTIONS, workers=1) as pool:
         model = pool.local.model(("air_drag", "point_mass"))
