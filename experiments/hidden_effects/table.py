@@ -44,6 +44,9 @@ COMPARED: dict[str, Callable[[Numbers], list[float]]] = {
     "stretch": _pick("EA"),
     "table_friction": _pick("mu"),
     "gripper_compliance": _pick("stiffness"),
+    "gripper_play": _pick("angle"),
+    "gripper_damping": _pick("stiffness"),
+    "fluid_forces": _pick("across", "added_mass"),
     "time_delay": _pick("delay"),
     "marker_offset": _pick("offset.0", "offset.1"),
 }
@@ -62,6 +65,9 @@ COVERED = {
     "stretch": ("EA",),
     "table_friction": ("mu",),
     "gripper_compliance": ("stiffness",),
+    "gripper_play": ("angle",),
+    "gripper_damping": ("stiffness", "loss_time"),
+    "fluid_forces": ("across", "along", "added_mass"),
     "time_delay": ("delay",),
     "marker_offset": ("offset.0", "offset.1"),
 }

@@ -80,7 +80,19 @@ def test_drag_of_hinges_and_steps_that_look_ahead_are_the_same(ahead, monkeypatc
         numerical_damping=ahead,
         prescribed_vertices=(0, 8),
     )
-    assert_same(monkeypatch, built, 1e-9, uses=("look", "bend", "curve", "pull", "carry", "balance"))
+    assert_same(monkeypatch, built, 1e-9, uses=("look", "bend", "curve", "damp", "pull", "carry", "balance"))
+
+
+@pytest.mark.parametrize("loop", [False, True])
+def test_damping_of_bends_answers_to_twists_the_same(loop, monkeypatch):
+    built = make(
+        ropes((5,), F64, loop=loop),
+        effects("gravity", "bend_frame", "twist", "bending_damping"),
+        {"bending_damping": {"coefficient": 1e-4}},
+        **BALANCED,
+        prescribed_edges=(0,),
+    )
+    assert_same(monkeypatch, built, 1e-9, uses=(*FRAMED, "damp"))
 
 
 @pytest.mark.parametrize("length", [0.03, -0.02, 0.0])

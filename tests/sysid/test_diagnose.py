@@ -80,7 +80,8 @@ def test_the_library_knows_how_to_search_for_every_effect(name: str, tmp_path: P
     folded = empty.train[0].markers.copy()
     folded[:, -1] = folded[:, 3]
     still = (replace(empty.train[0], still=True, markers=folded),)
-    recording = replace(empty, table_height=0.0, fluid_density=1000.0, train=still)
+    in_air = effect_library.spec(name).requires == "air"
+    recording = replace(empty, table_height=0.0, fluid_density=None if in_air else 1000.0, train=still)
     mesh = make_mesh(recording.train[0], recording.length, 31)
     numbers = {n.name: n for n in effect_library.numbers(name, recording)}
     doses = effect_library.perturbations(name, recording, mesh, 10.0, {"bending_stiffness": 2e-3})
@@ -90,6 +91,15 @@ def test_the_library_knows_how_to_search_for_every_effect(name: str, tmp_path: P
             assert numbers[key].param.low <= value <= numbers[key].param.high
             assert key in numbers
     assert EFFECTS[name].params.keys() >= {key.split(".")[1] for key in numbers}
+
+
+@pytest.mark.parametrize("name", ["air_drag", "wind"])
+def test_air_does_nothing_in_a_liquid(name: str, tmp_path: Path) -> None:
+    air = make_empty(tmp_path)
+    mesh = make_mesh(air.train[0], air.length, 31)
+    assert effect_library.applicable(name, air, mesh)
+    assert effect_library.applicable(name, replace(air, fluid_density=1.2), mesh)
+    assert not effect_library.applicable(name, replace(air, fluid_density=1000.0), mesh)
 
 
 def make_empty(path: Path) -> Recording:

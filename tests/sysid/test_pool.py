@@ -54,6 +54,22 @@ def test_fits_find_together_what_they_find_alone(tmp_path: Path) -> None:
         assert np.abs(together[1].values / jobs[1].values[0] - 1).max() > 1e-2
 
 
+def test_the_effects_of_fits_that_have_ended_are_simulated_no_more(tmp_path: Path) -> None:
+    with Pool(swaying(tmp_path, frames=40), OPTIONS, workers=1) as pool:
+        plain, drag, mass, _ = fits(pool)
+        search = pool.local.search([replace(plain, iterations=2), replace(drag, iterations=0), mass])
+        asked, effects = next(search), []
+        try:
+            while True:
+                effects.append(asked.effects)
+                asked = search.send(pool.local.simulate(asked))
+        except StopIteration as end:
+            found = end.value
+        # Drag needs one look, the mass one more to choose its start, and as many as it has iterations.
+        assert effects[0] == ("air_drag", "point_mass") and effects[1] == ("point_mass",)
+        assert [f.effects for f in found] == [(), ("air_drag",), ("point_mass",)]
+
+
 def test_workers_share_the_scenes_of_a_fit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(pools, "_FEW", 2)
     monkeypatch.setattr(pools, "_SMALL", 0)
@@ -107,6 +123,24 @@ def test_a_special_law_takes_over_the_numbers_of_a_general_one(tmp_path: Path) -
         assert job.free == ("bending_stiffness", "air_drag.c_d", "point_mass.mass") and job.sizes == (1.0, 3.0, 4.0)
         less = dict(zip(pool.local.model(job.effects).parameters, job.values[0], strict=True))
         assert less.pop("air_drag.c_d") == values["wind.c_d"] and less.items() <= values.items()
+
+
+def test_a_special_law_may_call_its_numbers_otherwise(tmp_path: Path) -> None:
+    # In a liquid the coefficient of drag belongs to its density: what takes its place begins as it is declared.
+    rope = replace(swaying(tmp_path, frames=40), fluid_density=1000.0)
+    with Pool(rope, OPTIONS, workers=1) as pool:
+        bench = Workspace(pool)
+        bench = bench.begin(pool.local.model(()).guess(), ())
+        model = pool.local.model(("fluid_forces",))
+        names = tuple(n for n in model.parameters if n != "twisting_stiffness")
+        params = tuple(model.params[model.parameters.index(n)] for n in names)
+        space = ParameterSpace(names, params, (1.0,) * len(names))
+        fitted = Fitted(("fluid_forces",), model.guess(), space, None)  # type: ignore[arg-type]
+        job = bench.exchange(fitted, "fluid_forces", "air_drag", 2)
+        other = pool.local.model(job.effects)
+        assert job.effects == ("air_drag",) and job.free == ("bending_stiffness", "damping_rate", "air_drag.c_d")
+        assert dict(zip(other.parameters, job.values[0], strict=True))["air_drag.c_d"] == 1.2
+        assert job.sizes[-1] == 1.2
 
 
 def test_a_model_loses_an_effect_and_starts_from_several_baselines(tmp_path: Path) -> None:

@@ -12,6 +12,7 @@ from scipy import stats
 
 from tests.report.fake_diagnosis import BASELINE, fake_diagnosis, fitted
 from tests.sysid.swaying import recording as swaying
+from torchdlo.report.pages.diagnosis import diagnosis_html
 from torchdlo.sysid.diagnosis import selection
 from torchdlo.sysid.diagnosis.detection_limit import detection_limits, least_gap, limit_gap
 from torchdlo.sysid.diagnosis.findings import findings, limits_text, mean_absolute_errors, summary
@@ -128,7 +129,7 @@ def test_there_is_a_limit_where_a_simulation_failed_or_no_floor_is_known() -> No
     assert not np.isfinite(limit_gap(np.array([np.inf]), 1e-3, 2e-3, 0.15))
 
 
-def test_detection_limits_grow_with_what_is_left() -> None:
+def test_detection_limits_grow_with_what_is_left(rope: Recording) -> None:
     # What closes 15 % of 4 mm above 1 mm of noise: sqrt(0.15 / 0.85 * 15) mm; but no less than the floor.
     assert least_gap(4e-3, 1e-3, 1e-3, 0.15) == pytest.approx(np.sqrt(0.15 / 0.85 * 15) * 1e-3)
     assert least_gap(1.1e-3, 1e-3, 1e-3, 0.15) == pytest.approx(1e-3)
@@ -143,13 +144,45 @@ def test_detection_limits_grow_with_what_is_left() -> None:
         score("wind", ({"wind.velocity.0": 1.0, "wind.c_d": 1.2}, 0.5e-3)),
         score("anisotropic_bending", ({"anisotropic_bending.ratio": 1.2}, 1e-3)),
     ]
-    limits = {x.name: (x.easiest, x.hardest) for x in detection_limits(scores, 2e-3)}
+    limits = {x.name: (x.easiest, x.hardest) for x in detection_limits(scores, 2e-3, rope)}
     assert [*limits] == ["air_drag", "wind", "anisotropic_bending", "point_mass", "stretch"]
     assert limits["air_drag"] == pytest.approx((2.0, 2.0)) and limits["stretch"] == pytest.approx((50.0, 50.0))
     assert limits["point_mass"] == pytest.approx((1e-3, 4e-3))
     # What wind pushes grows with its square, what two stiffnesses do with the logarithm of their ratio.
     assert limits["wind"] == pytest.approx((2.0, 2.0)) and limits["anisotropic_bending"][0] == pytest.approx(1.44)
-    assert detection_limits(scores, float("inf")) == []
+    assert detection_limits(scores, float("inf"), rope) == []
+
+
+def test_what_would_have_to_be_larger_than_it_can_be_cannot_be_seen(rope: Recording) -> None:
+    def score(name: str, *probes: tuple[dict[str, float], float]) -> Score:
+        return Score(name, 0.0, {}, (), {}, np.zeros(0), tuple(probes))
+
+    scores = [
+        # A coefficient of 0.5 shows 2 um: it would have to be 500 to show 2 mm, and 20 is the most.
+        score("air_drag", ({"air_drag.c_d": 0.5}, 2e-6)),
+        # Beads of more than twice the rope's mass are none: near a clamp none is heavy enough.
+        score("point_mass", *(({"point_mass.mass": 0.01 * rope.mass}, g) for g in (1e-3, 1e-9))),
+        # Clamps softer than the softest; a dose that shows nothing at all; a ratio that overflows.
+        score("gripper_compliance", ({"gripper_compliance.stiffness": 1.0}, 1e-6)),
+        score("time_delay", ({"time_delay.delay": 2e-3}, 0.0)),
+        score("anisotropic_bending", ({"anisotropic_bending.ratio": 1.2}, 1e-9)),
+        score("tilted_gravity", ({"tilted_gravity.angles.0": 0.01}, 1e-3)),
+    ]
+    limits = detection_limits(scores, 2e-3, rope)
+    by_name = {x.name: (x.easiest, x.hardest, x.greatest) for x in limits}
+    assert by_name["air_drag"] == (None, None, 20.0) and by_name["time_delay"] == (None, None, 0.2)
+    assert by_name["gripper_compliance"] == (None, None, 1e-3) and by_name["anisotropic_bending"] == (None, None, 20.0)
+    assert by_name["point_mass"] == (pytest.approx(0.02 * rope.mass), None, pytest.approx(2 * rope.mass))
+    assert by_name["tilted_gravity"] == (pytest.approx(0.02), pytest.approx(0.02), 0.2)
+    found = fake_diagnosis(rope, limits=limits)
+    said = limits_text(found)
+    assert "tilted gravity (angles 0.02 rad)" in said and "kg at best, elsewhere it cannot be seen)" in said
+    hidden = "air drag, anisotropic bending, gripper compliance, time delay."
+    assert said.endswith(f"What cannot be seen in this recording, however large it may be: {hidden}")
+    plain = {x["name"]: x for x in findings(found, rope)["detection_limits"]}
+    assert plain["air_drag"]["easiest"] is None and plain["air_drag"]["note"] == "cannot be seen in this recording"
+    assert plain["point_mass"]["note"] is None and plain["point_mass"]["hardest"] is None
+    assert "<td>cannot be seen in this recording</td>" in diagnosis_html(found, rope)
 
 
 def followed(trials: tuple[Trial, ...], off: dict[int, np.ndarray]) -> np.ndarray:
@@ -220,9 +253,17 @@ def test_what_comes_closest_is_never_left_out_of_an_unknown(rope: Recording) -> 
 
 def test_limits_are_said_in_one_sentence(rope: Recording) -> None:
     score = Score("point_mass", 0.0, {}, (), {}, np.zeros(0), (({"point_mass.mass": 2e-3}, 1e-3),))
-    found = fake_diagnosis(rope, limits=detection_limits([score], 2e-3))
+    found = fake_diagnosis(rope, limits=detection_limits([score], 2e-3, rope))
     assert limits_text(found).endswith("by place or direction: point mass (mass 0.004 kg).")
     assert limits_text(fake_diagnosis(rope)) == ""
+
+
+def test_an_effect_that_closes_next_to_nothing_tells_of_no_other() -> None:
+    # Bending damping that closes 7 % says nothing of inner friction, one that closes a quarter does.
+    assert not selection.tells_of_kin([0.049, 0.073]) and not selection.tells_of_kin([-1.0])
+    assert selection.tells_of_kin([-0.3, 0.25])
+    # What could be named itself always does.
+    assert selection.tells_of_kin([selection.PAYS])
 
 
 def test_where_nothing_can_matter_nothing_does() -> None:

@@ -86,6 +86,6 @@ class RopeEffectSpec:
     """By effect: what would tell the two apart. Naming it on one side is enough."""
     special_case: tuple[str, Mapping[str, float]] | None = None
     """An effect with fewer numbers that this one contains, and the values of those that it lacks."""
-    requires: Literal["table", "clamps", "fluid", "rest", "near_itself"] | None = None
-    """What a recording must have for it to act, or be: of a rope at rest, or of one that comes near itself. One that
-    requires clamps has a field `hinges` for where they end."""
+    requires: Literal["table", "clamps", "fluid", "air", "rest", "near_itself"] | None = None
+    """What a recording must have for it to act, or be: of a rope in air, at rest, or of one that comes near itself. One
+    that requires clamps has a field `hinges` for where they end."""

@@ -117,6 +117,7 @@ class AirDrag(Effect):
             "internal_friction": "let it swing freely from a large and from a small amplitude: air brakes the large "
             "one more, friction the small one",
         },
+        requires="air",
     )
 
     def loads(self, view: View, values: Values) -> Values:
@@ -151,6 +152,7 @@ class Wind(Effect):
             "air_drag": "repeat the motion in the opposite direction: a flow of air favours one",
         },
         special_case=("air_drag", {"velocity": 0.0}),
+        requires="air",
     )
 
     def loads(self, view: View, values: Values) -> Values:

@@ -12,6 +12,7 @@ from torchdlo.physics import tree
 from torchdlo.physics.effects.base import Effect, EffectKind, Param, Values
 from torchdlo.physics.effects.effect_spec import RopeEffectSpec
 from torchdlo.physics.effects.elastic import Curvature, curvature
+from torchdlo.physics.kernels import lanes
 from torchdlo.physics.linalg.numerics import dot
 from torchdlo.physics.rod.kinematics import RodParams, View, hinge_length
 from torchdlo.physics.rod.topology import Topology, preceding
@@ -230,14 +231,27 @@ class BendingDamping(Effect):
         """Return the moment's loads and how they answer to turning and to twists."""
         hinge = curvature(view)
         resistance = values["coefficient"] / view.hinge_length * view.params.rest.hinge_mask
-        rate = hinge.rate(view)
+        rate, twisted = _rate_and_twisted(view, hinge, resistance)
         # The integrated curvature is 2 tan(angle/2): it grows by 1 + tan^2 per turning, and so does its work.
         faster = 1 + (dot(hinge.binormal, hinge.binormal) / 4).clamp(max=100.0)
         return {
             **hinge.pull_back(view, resistance * rate),
-            **_twisted(view, hinge, resistance, rate),
+            **twisted,
             "hinge_drag": resistance * faster.square(),
         }
+
+
+def _rate_and_twisted(view: View, hinge: Curvature, resistance: Tensor) -> tuple[Tensor, Values]:
+    """Return the rates of curvature [1/s], shape (..., V, 2), and what `_twisted` does."""
+    if not lanes.ready(view.tangent):
+        rate = hinge.rate(view)
+        return rate, _twisted(view, hinge, resistance, rate)
+    state, angle = view.state, view.state.twist
+    own = hinge.kappa, hinge.binormal, hinge.mean, hinge.mean1, hinge.mean2, *hinge.by_twist
+    edge = view.before, view.tangent, state.director, angle.cos(), angle.sin(), state.vel, state.twist_rate
+    inputs = *own, *edge, view.length, view.params.rest.edge_mask, resistance
+    found = lanes.apply("damp", view.topology.name, inputs, (2, 3, 1, 2), numbers=(1 / view.dt,))
+    return found[0], dict(zip(("twist_hessian", "twist_skew", "twist_geometry"), found[1:], strict=True))
 
 
 def _twisted(view: View, hinge: Curvature, resistance: Tensor, rate: Tensor) -> Values:

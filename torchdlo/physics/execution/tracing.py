@@ -16,7 +16,7 @@ import torch
 
 from torchdlo.physics import tree
 
-_ROUND = 16
+_ROUND = 8
 """Larger batches are filled up to multiples of this."""
 
 

@@ -219,6 +219,61 @@ struct Answer {  // elastic.answers: second derivatives by twists, and what mome
 };
 
 template <typename T>
+struct Damp {  // material.BendingDamping: rates of curvature, how moments in proportion to them answer to twists
+  struct In {
+    Lanes<T> kappa1, kappa2;
+    Vec<T> binormal, mean, mean1, mean2;
+    Lanes<T> b1, b2, a1, a2;
+    Vec<T> before, tangent, director;
+    Lanes<T> cosine, sine;
+    Vec<T> vel;
+    Lanes<T> spin, length, mask, resistance;
+  };
+  Damp(const Call&, const Scratch<T>& free) : room(free) {}
+  void operator()(const In* slot, const Out<T>& out) {
+    struct Edge {
+      Vec<T> m1, m2, turning;
+    };
+    Scratch<T> scratch = room;
+    Edge* edges = scratch.template take<Edge>(out.call.slots);
+    const T often = T(out.call.numbers[0]);
+    for (int64_t i = 0; i < out.call.slots; ++i) {
+      const In& p = slot[i];
+      const Vec<T> v = cross(p.tangent, p.director);
+      edges[i] = {p.director * p.cosine + v * p.sine, v * p.cosine - p.director * p.sine,
+                  (slot[out.call.after[i]].vel - p.vel) * (p.mask / p.length)};
+    }
+    for (int64_t k = 0; k < out.call.slots; ++k) {
+      const int64_t i = out.call.after[k];
+      const In& p = slot[i];
+      const Edge &old = edges[k], &own = edges[i];
+      const Lanes<T> back = slot[k].spin;
+      const Vec<T> swept = cross(old.turning, p.tangent) - cross(own.turning, p.before);
+      const Lanes<T> stretched = dot(p.mean, old.turning + own.turning);
+      const Lanes<T> rate1 = dot(p.mean2, swept) - p.kappa1 * stretched + p.b1 * back + p.a1 * p.spin;
+      const Lanes<T> rate2 = -dot(p.mean1, swept) - p.kappa2 * stretched + p.b2 * back + p.a2 * p.spin;
+      const Lanes<T> chi = at_least<T>(dot(p.before, p.tangent) + T(1), T(1e-6));
+      const Vec<T> moved = swept * (T(2) / chi) - p.binormal * stretched;
+      const Lanes<T> grown_b1 = T(-0.5) * dot(moved, old.m1) + back * p.b2;
+      const Lanes<T> grown_b2 = T(-0.5) * dot(moved, old.m2) - back * p.b1;
+      const Lanes<T> grown_a1 = T(-0.5) * dot(moved, own.m1) + p.spin * p.a2;
+      const Lanes<T> grown_a2 = T(-0.5) * dot(moved, own.m2) - p.spin * p.a1;
+      const Lanes<T> onward = p.b1 * grown_a1 + p.b2 * grown_a2, backward = p.a1 * grown_b1 + p.a2 * grown_b2;
+      const Lanes<T> own_b = p.b1 * grown_b1 + p.b2 * grown_b2, own_a = p.a1 * grown_a1 + p.a2 * grown_a2;
+      out.put(0, i, rate1);
+      out.put(1, i, rate2);
+      out.put(2, i, p.resistance * ((p.b1 * p.b1 + p.b2 * p.b2) * often + own_b));
+      out.put(3, i, p.resistance * ((p.a1 * p.b1 + p.a2 * p.b2) * often + T(0.5) * (onward + backward)));
+      out.put(4, i, p.resistance * ((p.a1 * p.a1 + p.a2 * p.a2) * often + own_a));
+      out.put(5, i, T(0.5) * p.resistance * (onward - backward));
+      out.put(6, i, p.resistance * (rate1 * p.b2 - rate2 * p.b1));
+      out.put(7, i, p.resistance * (rate1 * p.a2 - rate2 * p.a1));
+    }
+  }
+  const Scratch<T>& room;
+};
+
+template <typename T>
 struct Joint {  // grid._Joint: what the angles of a joint are angles of, and the sine of the second
   struct In {
     Lanes<T> k1, k2, twist, c, s, w;
@@ -340,6 +395,7 @@ KERNELS(twist, Twist)
 KERNELS(curve, Curve)
 KERNELS(pull, Pull)
 KERNELS(answer, Answer)
+KERNELS(damp, Damp)
 KERNELS(joint, Joint)
 KERNELS(spring, Spring)
 KERNELS(settle, Settle)

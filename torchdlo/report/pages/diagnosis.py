@@ -13,6 +13,7 @@ from torchdlo.files import write_atomically
 from torchdlo.report.figures import chart
 from torchdlo.report.pages import films_page, player
 from torchdlo.report.pages.page import STYLE, listed, number, page, percent, table, words
+from torchdlo.sysid.diagnosis.detection_limit import HIDDEN
 from torchdlo.sysid.diagnosis.effect_library import MEANING, effect_equation, separating_experiment
 from torchdlo.sysid.diagnosis.findings import absorbed, findings, summary
 from torchdlo.sysid.diagnosis.residual_analysis import PARTS, Localisation, localise
@@ -239,8 +240,9 @@ def _limits(found: dict[str, Any]) -> str:
         (
             words(limit["name"]),
             words(limit["number"]),
-            number(limit["easiest"], 3),
-            number(limit["hardest"], 3),
+            HIDDEN if limit["easiest"] is None else number(limit["easiest"], 3),
+            HIDDEN if limit["hardest"] is None else number(limit["hardest"], 3),
+            number(limit["greatest"], 3),
             "" if limit["unit"] == "1" else limit["unit"],
         )
         for limit in found["detection_limits"]
@@ -250,9 +252,10 @@ def _limits(found: dict[str, Any]) -> str:
     note = (
         "<p class=soft>From this size on (stretch, compliance and damping of grippers: up to it) an effect closes more "
         "of the gap than the floor leaves open, where it is placed or directed so that it shows best, and where it "
-        "shows least. By doses on the train trials, to first order: smaller ones may be there.</p>"
+        "shows least. By doses on the train trials, to first order: smaller ones may be there. What would have to be "
+        "larger (softer) than the last number, the most that can be, cannot be seen.</p>"
     )
-    return note + table(("effect", "number", "at best", "at worst", "unit"), rows)
+    return note + table(("effect", "number", "at best", "at worst", "most", "unit"), rows)
 
 
 def _misleading(found: dict[str, Any]) -> str:

@@ -43,6 +43,9 @@ PARAMETERS: dict[str, Param] = {
 }
 """Numbers that calibration may fit."""
 
+_GAS = 20.0
+"""Density above which what surrounds a rope is a liquid, in which air does nothing [kg/m^3]."""
+
 MEANING: dict[EffectKind, str] = {
     "force": "a force from outside",
     "material": "a law of the rope",
@@ -109,6 +112,7 @@ def applicable(name: str, recording: Recording, mesh: Mesh) -> bool:
         "table": recording.table_height is not None,
         "clamps": bool(mesh.clamp_hinges),
         "fluid": recording.fluid_density is not None,
+        "air": recording.fluid_density is None or recording.fluid_density < _GAS,
         "rest": recording.still,
         None: True,
     }
@@ -146,6 +150,12 @@ def numbers(name: str, recording: Recording) -> list[Number]:
             single = replace(param, default=value)
             found.append(Number(ParameterName(name, key, k if param.size > 1 else None), single, float(off)))
     return found
+
+
+def greatest(name: str, number: str, recording: Recording) -> float:
+    """Return the greatest size that a number of an effect may have, whatever its sign, as declared or as recorded."""
+    param = EFFECTS[name].params[number]
+    return max(abs(param.low), abs(spec(name).limits(recording).get(number, (0.0, param.high))[1]))
 
 
 def perturbations(

@@ -280,7 +280,8 @@ class _Search:
         if base is self.baseline:
             self.plain.append(rival)
         first = min(led, key=lambda name: fits[name].point.cost)
-        if gap_rms(self.bench.gaps(fits[first], "all")) > SILENT * self.bench.level:
+        left = gap_rms(self.bench.gaps(fits[first], "all")) > SILENT * self.bench.level
+        if left and selection.tells_of_kin([self._gain(rival, fits[name], "train") for name in led]):
             # Something is left: one that does alike things may be right, however little its doses explain.
             kin = [s for s in scores if s.name not in fits and effect_library.confusable(s.name, first)]
             more, also = self._fits_of_kin(base, kin, worst, f"{stage}, effects like {first}") if kin else ({}, [])
@@ -544,7 +545,7 @@ class _Search:
                 *([] if np.isfinite(self.bench.level) else [UNKNOWN_FLOOR]),
             ],
             tests=tests,
-            limits=detection_limits(self.scores, limit),
+            limits=detection_limits(self.scores, limit, self.recording),
             leading=self.leading if verdict in ("unknown", "partial") else None,
             misleading=self.misleading,
             forces=None if self.force_before is None else (self.force_before, self._forces(final)),

@@ -10,6 +10,7 @@ import numpy as np
 from torchdlo.physics import tree
 from torchdlo.physics.effects import EFFECTS
 from torchdlo.physics.effects.parameter_name import values_of
+from torchdlo.sysid.diagnosis.detection_limit import HIDDEN
 from torchdlo.sysid.diagnosis.effect_library import effect_equation, separating_experiment
 from torchdlo.sysid.diagnosis.error_floor import gap_rms, trial_gaps
 from torchdlo.sysid.diagnosis.plausibility import implausible
@@ -66,7 +67,9 @@ def findings(result: Diagnosis, recording: Recording) -> dict[str, Any]:
         "best_candidate": _leading(result),
         "gap": _gap(result, recording),
         "forces": _forces(result, recording),
-        "detection_limits": [dataclasses.asdict(limit) for limit in result.limits],
+        "detection_limits": [
+            dataclasses.asdict(limit) | {"note": HIDDEN if limit.easiest is None else None} for limit in result.limits
+        ],
         "misleading_trials": [dataclasses.asdict(trial) for trial in result.misleading],
         "candidates": candidates,
         "baseline": values_of("", numbers),
@@ -309,12 +312,20 @@ def summary(result: Diagnosis, recording: Recording) -> str:
 
 def limits_text(result: Diagnosis) -> str:
     """Return in a sentence how large effects would have to be to be named; nothing where that is not known."""
-    said = []
+    seen, hidden = [], []
     for limit in result.limits:
-        ends = sorted({f"{limit.easiest:.2g}", f"{limit.hardest:.2g}"}, key=float)
-        unit = "" if limit.unit == "1" else f" {limit.unit}"
-        said.append(f"{limit.name.replace('_', ' ')} ({limit.number} {' to '.join(ends)}{unit})")
-    return f"Would be named from this size on, by place or direction: {', '.join(said)}." if said else ""
+        name, unit = limit.name.replace("_", " "), "" if limit.unit == "1" else f" {limit.unit}"
+        if limit.easiest is None:
+            hidden.append(name)
+            continue
+        least = f"{limit.easiest:.2g}"
+        if limit.hardest is None:
+            seen.append(f"{name} ({limit.number} {least}{unit} at best, elsewhere it cannot be seen)")
+            continue
+        ends = sorted({least, f"{limit.hardest:.2g}"}, key=float)
+        seen.append(f"{name} ({limit.number} {' to '.join(ends)}{unit})")
+    said = [f"Would be named from this size on, by place or direction: {', '.join(seen)}."] if seen else []
+    return " ".join([*said, *([f"What {HIDDEN}, however large it may be: {', '.join(hidden)}."] if hidden else [])])
 
 
 def _tested(name: str, result: Diagnosis) -> str:

@@ -6,11 +6,23 @@ else.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from torchdlo.sysid.diagnosis.error_floor import gap_rms
 
-__all__ = ["MATTERS", "NEARLY_ALL", "PAYS", "gain", "helps_on_most", "matters", "nothing_can_matter", "refused"]
+__all__ = [
+    "MATTERS",
+    "NEARLY_ALL",
+    "PAYS",
+    "gain",
+    "helps_on_most",
+    "matters",
+    "nothing_can_matter",
+    "refused",
+    "tells_of_kin",
+]
 
 PAYS = 0.15
 """Share of the excess gap that an effect has to close, on the train and on the test trials."""
@@ -20,6 +32,9 @@ MATTERS = 0.03
 
 NEARLY_ALL = 0.8
 """Share of what is left above the floor."""
+
+_AKIN = 0.1
+"""The same share from which an effect tells of others that do alike things: two thirds of what it takes to be named."""
 
 _MOST = 0.6
 """Share of the train trials on which an effect has to help."""
@@ -57,6 +72,17 @@ def matters(first: float, before: float, after: float, noise: float, level: floa
     closed = before**2 - after**2
     enough = min(MATTERS * (first**2 - noise**2), NEARLY_ALL * (before**2 - level**2))
     return closed > max(level**2, enough)
+
+
+def tells_of_kin(gains: Sequence[float]) -> bool:
+    """Return whether effects that do things alike to the ones that fit best may fit better still.
+
+    However little the doses of such an effect explain, the one that resembles it would have made up for a part of it.
+
+    Args:
+        gains: shares of the excess gap of the train trials that the leading effects close.
+    """
+    return max(gains, default=0.0) > _AKIN
 
 
 def nothing_can_matter(before: float, noise: float, level: float) -> bool:

@@ -12,6 +12,7 @@ import numpy as np
 from torchdlo.errors import InputError
 from torchdlo.physics import tree
 from torchdlo.physics.effects.parameter_name import ParameterName
+from torchdlo.sysid.diagnosis import effect_library
 from torchdlo.sysid.diagnosis import error_floor as floors
 from torchdlo.sysid.diagnosis.predictions import Predictions
 from torchdlo.sysid.diagnosis.score_test import Score
@@ -217,7 +218,7 @@ class Workspace:
         Args:
             fitted: the model.
             general: one of its effects.
-            special: another one, whose numbers have the same names there.
+            special: another one, whose numbers have the same names there, as far as it has them.
             iterations: most iterations.
         """
 
@@ -229,6 +230,11 @@ class Workspace:
         model, before = self.pool.local.model(effects), self.pool.local.model(fitted.effects).parameters
         values = dict(zip(map(named, before), fitted.values, strict=True))
         units = dict(zip(map(named, fitted.space.names), fitted.space.units, strict=True))
+        # Of another name there, as the drag coefficient of a liquid is: it begins as it is declared.
+        lacking = {
+            n.name: n.param.scalar for n in effect_library.numbers(special, self.recording) if n.name not in values
+        }
+        values, units = values | lacking, units | {name: abs(value) or 1.0 for name, value in lacking.items()}
         names, first = tuple(n for n in units if n in model.parameters), [values[n] for n in model.parameters]
         sizes, start = tuple(units[n] for n in names), self.starts["train"]
         return FitJob(effects, np.array([first]), names, sizes, iterations, start, options=fitted.options)

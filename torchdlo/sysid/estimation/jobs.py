@@ -129,23 +129,25 @@ class Models:
 
     def search(self, jobs: Sequence[FitJob]) -> Search:
         """Ask for what several fits with the same start, frames and options need, together; return their results."""
-        effects, options = tuple(dict.fromkeys(e for job in jobs for e in job.effects)), jobs[0].options
-        model = self.model(effects, options)
+        options = jobs[0].options
+        model = self.model(_all(jobs), options)
         measured = self.measured(model, "train")[:, : jobs[0].frames]
         start = jobs[0].start or starts.begin(model, self.recording.train)
         frame_weights = 1.0 if start.frame_weights is None else start.frame_weights[:, : jobs[0].frames, None, None]
-        searches, places = [], []
+        searches = []
         for job in jobs:
             own = self.model(job.effects, options)
             columns = [own.parameters.index(name) for name in job.free]
             space = ParameterSpace(job.free, tuple(own.params[k] for k in columns), job.sizes)
             searches.append(_search(job, space, columns, measured, frame_weights, model.count))
-            places.append(_places(model, own))
         found: dict[int, Fitted] = {}
         asked = {k: next(search) for k, search in enumerate(searches)}
         while asked:
+            # Each effect costs in all scenes: those of fits that have ended are left out.
+            model = self.model(_all([jobs[k] for k in asked]), options)
+            places = {k: _places(model, self.model(jobs[k].effects, options)) for k in asked}
             rows = [_filled(model.guess(), places[k], values) for k, values in asked.items()]
-            sims = yield SimulationJob(effects, np.concatenate(rows), "train", start, options, jobs[0].frames)
+            sims = yield SimulationJob(model.effects, np.concatenate(rows), "train", start, options, jobs[0].frames)
             ends = np.cumsum([len(r) for r in rows])[:-1]
             for k, sim in zip(list(asked), np.split(sims, ends), strict=True):
                 try:
@@ -163,10 +165,15 @@ class Models:
     def joined(self, fits: Sequence[Fitted], split: str, start: Start) -> SimulationJob:
         """Return one job that simulates several fits with the same options, by a model that has the effects of all."""
         options = fits[0].options
-        model = self.model(tuple(dict.fromkeys(e for f in fits for e in f.effects)), options)
+        model = self.model(_all(fits), options)
         owns = [_places(model, self.model(f.effects, options)) for f in fits]
         rows = [_filled(model.guess(), own, f.values[None]) for own, f in zip(owns, fits, strict=True)]
         return SimulationJob(model.effects, np.concatenate(rows), split, start, options)
+
+
+def _all(models: Sequence[FitJob] | Sequence[Fitted]) -> tuple[str, ...]:
+    """Return the effects that any of several models has."""
+    return tuple(dict.fromkeys(e for model in models for e in model.effects))
 
 
 def _places(model: RopeModel, own: RopeModel) -> list[int]:
