@@ -421,9 +421,10 @@ PEERS: dict[str, tuple[str, Callable[..., Run], Callable[..., Slide] | None, lis
 """What is run: name of the package, forward, with gradients, settings, steps [s]."""
 
 
-def measure(name: str, scenes: int, repeats: int, gradients: bool) -> list[dict[str, Any]]:
+def measure(name: str, scenes: int, repeats: int, gradients: bool, smoke: bool = False) -> list[dict[str, Any]]:
     """Rows of one peer: each setting and step, in one scene and in `scenes`; the fastest repeat counts."""
     package, run, derive, settings, steps = PEERS[name]
+    settings, steps = (settings[:1], steps[-1:]) if smoke else (settings, steps)
     rows: list[dict[str, Any]] = []
     times = DURATION * np.arange(1, LOOKS + 1) / LOOKS
     run(DURATION / LOOKS, **settings[0])  # compiles
@@ -485,6 +486,7 @@ def main() -> None:
     parser.add_argument("--peer", default="torchdlo", help=f"beginnings of names, with commas: {', '.join(PEERS)}")
     parser.add_argument("--scenes", type=count, default=100, help="scenes of the run with many")
     parser.add_argument("--repeats", type=count, default=2, help="timings of each; the fastest counts")
+    parser.flag("smoke", "one scene, one setting, the longest step: does the script run?")
     parser.flag("gradients", "forward and backward as well, where a peer has it")
     parser.add_argument(
         "--json", default="", metavar="FILE", help="file that rows are added to, one peer's in place of its old ones"
@@ -499,7 +501,9 @@ def main() -> None:
         if not any(name.lower().startswith(w) for w in wanted):
             continue
         print(name, flush=True)
-        rows = measure(name, chosen.scenes, chosen.repeats, chosen.gradients)
+        rows = measure(
+            name, *((1, 1, False, True) if chosen.smoke else (chosen.scenes, chosen.repeats, chosen.gradients))
+        )
         old = json.loads(Path(chosen.json).read_text())["rows"] if chosen.json and Path(chosen.json).exists() else []
         save(chosen.json, {"rows": [r for r in old if r["peer"] != name] + rows})
 

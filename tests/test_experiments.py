@@ -35,6 +35,7 @@ SCRIPTS = [
     "make_reference.py",
     "make_sample.py",
     "peers.py",
+    "peers_contact.py",
 ]
 PREFIX = "TORCHDLO_PROBE_"
 BAD = {"WORKERS": ["x", "", "0", "1.5"], "NOISE": ["much", ""], "QUICK": ["maybe", ""]}
@@ -174,6 +175,16 @@ def test_scripts_explain_themselves(script: str) -> None:
     done = call(EXPERIMENTS / script, "--help")
     assert done.returncode == 0 and "usage" in done.stdout.lower(), done.stderr
     assert f"TORCHDLO_{Path(script).stem.upper()}_SMOKE" in done.stdout
+
+
+def test_a_rope_slides_off_a_peg_as_the_closed_form_has_it(tmp_path: Path) -> None:
+    target = tmp_path / "contact.json"
+    done = call(EXPERIMENTS / "peers_contact.py", "--smoke", "--peer", "torchdlo, implicit", "--json", target)
+    assert done.returncode == 0, done.stderr
+    (row,) = json.loads(target.read_text())["rows"]
+    assert row["mean_error_m"] < 1e-3  # of 137 mm that it slides, in steps of 5 ms
+    shown = call(EXPERIMENTS / "peers_contact.py", "--table", target)
+    assert "torchdlo, implicit" in shown.stdout
 
 
 def test_the_command_line_wins_over_the_environment_and_that_over_the_default(probe) -> None:
