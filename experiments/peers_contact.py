@@ -407,13 +407,13 @@ def gradient_dismech(dt: float, scenes: int = 1, *, iterations: int = 10) -> Sli
 
 
 PEERS: dict[str, tuple[str, Callable[..., Run], Callable[..., Slide] | None, list[dict[str, Any]], list[float]]] = {
-    "torchdlo, implicit": ("torchdlo", run_torchdlo, gradient_torchdlo, [{}], [1e-3, 2e-3, 5e-3]),
-    "torchdlo, explicit": (
+    "torchdlo implicit": ("torchdlo", run_torchdlo, gradient_torchdlo, [{}], [1e-3, 2e-3, 5e-3]),
+    "torchdlo explicit": (
         "torchdlo", run_torchdlo, None, [{"integrator": "explicit", "substeps": 5}], [1e-3],
     ),
     "MuJoCo": ("mujoco", run_mujoco, None, [{"solref": s} for s in (0.002, 0.02, 0.05)], [1e-3, 2e-3, 5e-3]),
     "PyElastica": ("pyelastica", run_pyelastica, None, [{}], [5e-5, 1e-4]),
-    "Newton, VBD": ("newton", run_newton, None, [{"iterations": n} for n in (10, 40)], [1e-3, 2e-3, 5e-3]),
+    "Newton VBD": ("newton", run_newton, None, [{"iterations": n} for n in (10, 40)], [1e-3, 2e-3, 5e-3]),
     "dismech-newton": (
         "dismech-newton", run_dismech, gradient_dismech, [{"iterations": n} for n in (10, 40)], [1e-3, 2e-3, 5e-3],
     ),
