@@ -95,8 +95,8 @@ class FilmView:
     def shortened(self, seconds: float) -> FilmView:
         """Return what was seen in the first seconds; frames that turn out wrong are so in both."""
         count = int(np.searchsorted(self.time, seconds, side="right"))
-        lines = (x[:, :count] for x in (self.good, self.places, self.tangents))
-        return FilmView(self.camera, *lines, self.half_width, self.packed, self.shown)
+        good, places, tangents = self.good[:, :count], self.places[:, :count], self.tangents[:, :count]
+        return FilmView(self.camera, good, places, tangents, self.half_width, self.packed, self.shown)
 
     @property
     def time(self) -> np.ndarray:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
@@ -209,7 +210,12 @@ class _Films:
         here, model_of = model.test, model.own.model
         spines = Spines(self.views, model_of.dt, here.extent, here.spines.free, here.spines.sure)
         start = replace(here.start, discretisation_correction=None)
-        parts = {"trials": self.trials, "motion": model_of.motion(self.trials), "spines": spines, "start": start}
+        parts: dict[str, Any] = {
+            "trials": self.trials,
+            "motion": model_of.motion(self.trials),
+            "spines": spines,
+            "start": start,
+        }
         return replace(here, **parts, discretisation_correction=None)
 
 
@@ -360,14 +366,14 @@ def _round(
         fits[score.name] = _fitted(base, score, plan.iterations, short)
         report(f"{stage}: fitting", k + 1, len(tried), f"{score.name} {1e3 * fits[score.name].fit.cost:.3f} mm")
     order = sorted(fits, key=lambda n: fits[n].fit.cost)
-    lead = [n for n in order[:_LEADERS] if not fits[n].fit.cost > _BEHIND * fits[order[0]].fit.cost]
-    for name in lead:
+    leading = [n for n in order[:_LEADERS] if not fits[n].fit.cost > _BEHIND * fits[order[0]].fit.cost]
+    for name in leading:
         one = fits[name]
         more = plan.more * (_PATIENCE if base.own.trials[0].still else 1)
         fits[name] = replace(one, fit=fit(one.own, one.fit.raw, more))
         report(f"{stage}: fitting on", 1, 1, f"{name} {1e3 * fits[name].fit.cost:.3f} mm")
     rival = replace(base, fit=fit(base.own, base.fit.raw, 3))
-    led = sorted(lead, key=lambda n: fits[n].fit.cost)
+    led = sorted(leading, key=lambda n: fits[n].fit.cost)
     refused = {name: _refused(rival, fits[name], first, floor, level) for name in led}
     fair = [name for name in led if refused[name] is None]
     best, rivals, reasons = None, [], {name: refused.get(name) or "fits worse" for name in fits}
