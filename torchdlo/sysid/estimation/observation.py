@@ -92,6 +92,12 @@ class FilmView:
         parts = (self.good[rows], self.places[rows], self.tangents[rows])
         return FilmView(self.camera, *parts, self.half_width, packed, shown)
 
+    def shortened(self, seconds: float) -> FilmView:
+        """Return what was seen in the first seconds; frames that turn out wrong are so in both."""
+        count = int(np.searchsorted(self.time, seconds, side="right"))
+        good, places, tangents = self.good[:, :count], self.places[:, :count], self.tangents[:, :count]
+        return FilmView(self.camera, good, places, tangents, self.half_width, self.packed, self.shown)
+
     @property
     def time(self) -> np.ndarray:
         """Middles of exposures, as the camera's clock has them [s], shape (F,)."""

@@ -22,8 +22,8 @@ from torchdlo.sysid.estimation.result import Calibration, Overlay
 from torchdlo.sysid.model import model_file
 from torchdlo.sysid.model.model_file import ModelFile
 from torchdlo.sysid.model.rope_model import MAX_SUBSTEP
-from torchdlo.sysid.recordings.recording import Recording
-from torchdlo.sysid.video.filmed_fit import Fit, fit, gate, intervals, look, picture_errors
+from torchdlo.sysid.recordings.recording import Recording, Trial
+from torchdlo.sysid.video.filmed_fit import Fit, film_gaps, fit, gate, intervals, look, picture_errors
 from torchdlo.sysid.video.filmed_problem import (
     FilmedProblem,
     add_correction,
@@ -36,7 +36,16 @@ from torchdlo.sysid.video.footage import views_of
 from torchdlo.sysid.video.overlay import mask_overlaps, overlays
 from torchdlo.sysid.video.picture_gradient import descend, whitening, with_profile
 
-__all__ = ["FILMED_STARTS", "METHODS", "baseline", "calibrate_filmed", "doubts", "tested"]
+__all__ = [
+    "FILMED_STARTS",
+    "METHODS",
+    "baseline",
+    "calibrate_filmed",
+    "doubts",
+    "sharper",
+    "test_problem",
+    "tested",
+]
 
 Callback = Callable[[str, int, int, str], None]
 
@@ -128,14 +137,18 @@ def baseline(
     vertices: int | None,
     given: ModelFile | None,
     report: Callback,
+    near: float = np.inf,
 ) -> tuple[FilmedProblem, np.ndarray, Fit]:
-    """Return the problem of the train trials, numbers (N,) to start from, and the best fit; see `calibrate_filmed`."""
+    """Return the problem of the train trials, numbers (N,) to start from, and the best fit; see `calibrate_filmed`.
+
+    A fit that stays farther than `near` [m] from the films, root mean square per reading, is not made sharper.
+    """
     own = _problem(recording, views, vertices, given)
     # Balances are cheap, and stiff ropes have shapes that do not depend on how stiff they are.
     starts = max(starts, FILMED_STARTS) if recording.still else starts
     first = np.concatenate([own.fixed[list(own.free)], np.zeros(len(own.spines.nuisances.names))])
     raw = own.space.to_raw(first) if given is not None else _scouted(own, starts, seed, report)
-    best = _fitted(own, raw, iterations, report)
+    best = _fitted(own, raw, iterations, report, near)
     if not np.isfinite(best.cost):
         raise InputError(
             f"{recording.path}: the simulation failed on the train trials from every start; check length, mass, "
@@ -182,8 +195,15 @@ def tested(
 ) -> tuple[FilmedProblem, list[str]]:
     """Return the problem of the test trials, which begin as their first frames say with numbers (N,), and remarks."""
     views, said = views_of(recording, recording.test, report)
+    return test_problem(own, recording.test, views, values), said
+
+
+def test_problem(
+    own: FilmedProblem, trials: Sequence[Trial], views: Sequence[FilmView], values: np.ndarray
+) -> FilmedProblem:
+    """Return the problem of test trials that were filmed, see `tested`."""
     spines = Spines(views, own.model.dt, own.extent, own.spines.free, own.spines.sure)
-    parts: dict[str, Any] = {"trials": recording.test, "motion": own.model.motion(recording.test), "spines": spines}
+    parts: dict[str, Any] = {"trials": tuple(trials), "motion": own.model.motion(trials), "spines": spines}
     here = replace(own, **parts, dropped={}, discretisation_correction=None)
     begin_from_balance(here, own.full(values[None])[0])
     if here.offset.shape[1]:
@@ -194,7 +214,7 @@ def tested(
     add_correction(here, values)
     if here.offset.shape[1]:
         fit_starts(here, own.space.to_raw(values), 8, seconds=START_WINDOW)
-    return here, said
+    return here
 
 
 def _mean(trials: Sequence[dict[str, Any]], split: str, name: str) -> float:
@@ -221,8 +241,11 @@ def _at_rest(own: FilmedProblem) -> FilmedProblem:
     return replace(own, free=tuple(k for k in own.free if own.model.parameters[k] != "damping_rate"))
 
 
-def _fitted(own: FilmedProblem, raw: np.ndarray, iterations: int, report: Callback) -> Fit:
-    """Return the best fit of all trials, without wrong frames and with what finer simulations change."""
+def _fitted(own: FilmedProblem, raw: np.ndarray, iterations: int, report: Callback, near: float = np.inf) -> Fit:
+    """Return the best fit of all trials, without wrong frames and with what finer simulations change.
+
+    One that is not `near` [m] the films over 70 % of the time stays as it is.
+    """
     stage, values = f"fitting {len(own.trials)} filmed trials", own.space.to_values(raw)
     if own.offset.shape[1] and not own.offset.any():
         # A scout knows the starts; a model that begins without one has to find them.
@@ -237,15 +260,22 @@ def _fitted(own: FilmedProblem, raw: np.ndarray, iterations: int, report: Callba
             own.take(other)
             best = found
     report(stage, 1, 3, f"{1e3 * best.cost:.2f} mm")
+    if not film_gaps(own, best).max() < near:
+        return best
     best = restart(own, fit(own, best.raw, iterations), iterations)
     report(stage, 2, 3, f"{1e3 * best.cost:.2f} mm")
-    # What steps damp is taken for damping.
-    own.take(own.with_options(substep=own.model.dt / (2 * own.model.substeps)))
-    best = fit(own, best.raw, min(iterations, _LAST))
-    gate(own, own.space.to_values(best.raw))
-    best = _corrected(own, best.raw, iterations)
+    best = sharper(own, best.raw, iterations)
     report(stage, 3, 3, f"{1e3 * best.cost:.2f} mm")
     return best
+
+
+def sharper(own: FilmedProblem, raw: np.ndarray, iterations: int) -> Fit:
+    """Return the fit with half the steps, without wrong frames and with what finer simulations change."""
+    # What steps damp is taken for damping.
+    own.take(own.with_options(substep=own.model.dt / (2 * own.model.substeps)))
+    best = fit(own, raw, min(iterations, _LAST))
+    gate(own, own.space.to_values(best.raw))
+    return _corrected(own, best.raw, iterations)
 
 
 def _corrected(own: FilmedProblem, raw: np.ndarray, iterations: int) -> Fit:

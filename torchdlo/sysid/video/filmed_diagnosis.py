@@ -9,6 +9,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
@@ -20,11 +21,13 @@ from torchdlo.sysid.diagnosis.score_test import Score
 from torchdlo.sysid.diagnosis.verdict import UNKNOWN_FLOOR, Candidate, Diagnosis, verdict_word
 from torchdlo.sysid.estimation import levenberg_marquardt
 from torchdlo.sysid.estimation.jobs import Fitted
+from torchdlo.sysid.estimation.observation import FilmView, Spines
 from torchdlo.sysid.model.model_file import ModelFile
-from torchdlo.sysid.recordings.recording import Recording
-from torchdlo.sysid.video.filmed import FILMED_STARTS, baseline, tested
-from torchdlo.sysid.video.filmed_fit import Fit, fit, look, spread, total
-from torchdlo.sysid.video.filmed_problem import FilmedProblem
+from torchdlo.sysid.model.rope_model import MAX_SUBSTEP
+from torchdlo.sysid.recordings.recording import Recording, Trial
+from torchdlo.sysid.video.filmed import FILMED_STARTS, baseline, sharper, test_problem
+from torchdlo.sysid.video.filmed_fit import Fit, film_gaps, fit, look, spread, total
+from torchdlo.sysid.video.filmed_problem import CHAIN, FilmedProblem, add_correction, correct, first_frames
 from torchdlo.sysid.video.filmed_starts import fit_starts
 from torchdlo.sysid.video.footage import views_of
 from torchdlo.sysid.video.overlay import overlays
@@ -48,8 +51,17 @@ MATTERS = 0.03
 BLUNT = 10.0
 """Times what centre lines get wrong from which what finer simulations change is no floor, but a fit that is far off."""
 
-_CHAIN = "link_chain"
-"""What a chain of links does that a rope does not: fitted before any effect is considered."""
+NEAR = 5e-3
+"""Gap [m] from which a baseline is not near its films: only the beginnings of trials are then looked at."""
+
+_SHARES = (0.6, 0.35, 0.2)
+"""Shares of the time that are tried for these."""
+
+_LONGER = 1.5
+"""Times as much of the films that a model with a new effect is fitted to at once."""
+
+_FOLLOW = 6
+"""Most steps of each such fit."""
 
 _BETTER = 0.9
 """Share of the cost that is left where the rope is taken for a chain."""
@@ -79,6 +91,9 @@ _AS_GOOD = 1.1
 _LEADERS = 3
 """Candidates that are fitted to all of the time."""
 
+_BEHIND = 2.0
+"""Times the cost of the best first fit from which another one is not followed."""
+
 
 @dataclass(eq=False)
 class _Model:
@@ -100,8 +115,7 @@ class _Model:
     def gaps(self, split: str) -> np.ndarray:
         """Return root mean squares of the readings of trials [m], shape (B,)."""
         if split == "train":
-            residual = self.fit.residual[..., : self.own.spines.priors.start]
-            return np.sqrt(np.nanmean(residual**2, (1, 2)))
+            return film_gaps(self.own, self.fit)
         if self._tested is None:
             here = self.test
             if here.offset.shape[1]:
@@ -125,27 +139,34 @@ def diagnose_filmed(
     """Name what the films of a recording show that the baseline model lacks; see `diagnosis.search.diagnose`."""
     begun, report = time.perf_counter(), callback or (lambda *_: None)
     views, notes = views_of(recording, recording.train, report)
-    own, _, best = baseline(recording, views, FILMED_STARTS, 15, seed, vertices, given, report)
-    values = own.space.to_values(best.raw)
-    test, said = tested(own, recording, values, report)
-    base = _Model(own, best, test)
+    near = np.inf if recording.still else NEAR
+    own, _, best = baseline(recording, views, FILMED_STARTS, 15, seed, vertices, given, report, near)
+    unseen, said = views_of(recording, recording.test, report)
+    films = _Films(own, recording.test, unseen)
+    base = _nearer(films, best, report) if film_gaps(own, best).max() > near else films.test(own, best)
     if given is None and not recording.still:
         base = _chained(base)
         report("calibrating the baseline", 1, 1, f"{1e3 * gap_rms(base.gaps('train')):.2f} mm")
     floor, level = _floor(base)
-    bar = floor.noise if _blunt(level, floor) else level
     plan, first = BUDGETS[budget], base
     shares: dict[str, float] = {}
     ties: dict[str, list[str]] = {}
     rounds: list[list[Candidate]] = []
     while len(rounds) < plan.rounds:
-        if gap_rms(np.concatenate([base.gaps("train"), base.gaps("test")])) < (MORE if shares else SILENT) * bar:
+        # What is left beside an effect, and less than finer simulations change, may be an error of theirs.
+        bar = floor.noise if _blunt(level, floor) and not shares else level
+        # Ends of films that are left out say that something is missing.
+        if (shares or base.own.lasts == own.lasts) and gap_rms(
+            np.concatenate([base.gaps("train"), base.gaps("test")])
+        ) < (MORE if shares else SILENT) * bar:
             break
         names = [n for n in effect_library.library() if n not in (*base.own.model.effects, *without)]
         names = [n for n in names if effect_library.applicable(n, recording, base.own.model.mesh)]
         if single := recording.still and len(recording.train) == 1:
             names = [n for n in names if n in _AT_REST]
-        found, candidates, rivals = _round(base, first, names, floor, level, plan, f"round {len(rounds) + 1}", report)
+        found, candidates, rivals = _round(
+            base, first, names, floor, level, plan, own.lasts, f"round {len(rounds) + 1}", report
+        )
         rounds.append(candidates)
         if found is None:
             break
@@ -154,17 +175,123 @@ def diagnose_filmed(
         shares[name] = (gap_rms(base.gaps("test")) ** 2 - gap_rms(found.gaps("test")) ** 2) / excess
         ties[name] = [*rivals, *(_SAME_AT_REST if single and "curvature" in name else ())]
         base = found
-    return _concluded(recording, first, base, floor, level, shares, ties, rounds, [*notes, *said], seed, budget, begun)
+        if not recording.still:
+            first, base = _further(films, first, base, report)
+            floor, level = _floor(base)
+    notes = [*notes, *said, *_left_out(base, own)]
+    return _concluded(films, recording, first, base, floor, level, shares, ties, rounds, notes, seed, budget, begun)
+
+
+@dataclass(frozen=True, eq=False)
+class _Films:
+    """All films of a recording."""
+
+    whole: FilmedProblem
+    """The problem of all of the train trials."""
+    trials: tuple[Trial, ...]
+    """Test trials."""
+    views: list[FilmView]
+    """What cameras saw of those."""
+
+    def test(self, own: FilmedProblem, best: Fit) -> _Model:
+        """Return a fitted model with what its numbers say of the test films, over as long a time."""
+        trials, views, seconds = self.trials, self.views, own.lasts
+        if seconds < self.whole.lasts:
+            trials = first_frames(trials, own.motion.markers.shape[1])
+            views = [v.shortened(seconds) for v in views]
+        return _Model(own, best, test_problem(own, trials, views, own.space.to_values(best.raw)))
+
+    def all_of(self, model: _Model, split: str) -> FilmedProblem:
+        """Return a model's problem of all of the time."""
+        if not model.own.lasts < self.whole.lasts:
+            return model.own if split == "train" else model.test
+        if split == "train":
+            return model.own.over(self.whole, self.whole.lasts)
+        here, model_of = model.test, model.own.model
+        spines = Spines(self.views, model_of.dt, here.extent, here.spines.free, here.spines.sure)
+        start = replace(here.start, discretisation_correction=None)
+        parts: dict[str, Any] = {
+            "trials": self.trials,
+            "motion": model_of.motion(self.trials),
+            "spines": spines,
+            "start": start,
+        }
+        return replace(here, **parts, discretisation_correction=None)
+
+
+def _nearer(films: _Films, best: Fit, report: Callback) -> _Model:
+    """Return the baseline of as much of the films' beginnings as it can stay near to.
+
+    Over longer times the answer to what is missing is so large that nothing leads back to it: other numbers have gone
+    far off to follow at all, and small doses of the right effect do not help them.
+    """
+    whole, raw = films.whole, best.raw
+    coarse = whole.with_options(substep=MAX_SUBSTEP)
+    for share in _SHARES:
+        own = coarse.over(whole, share * whole.lasts)
+        found = fit(own, raw, _FOLLOW)
+        report("fitting the beginnings", 1, 1, f"{own.lasts:.2f} s: {1e3 * gap_rms(film_gaps(own, found)):.2f} mm")
+        if film_gaps(own, found).max() < NEAR:
+            break
+        raw = found.raw
+    found = sharper(own, found.raw, _FOLLOW)
+    return films.test(own, found)
+
+
+def _further(films: _Films, first: _Model, found: _Model, report: Callback) -> tuple[_Model, _Model]:
+    """Return the baseline and the model that took up an effect, over as much of the films as that stays near to.
+
+    What the lack of the effect hid is looked for, too: whether the rope is a chain of links.
+    """
+    whole, longest = films.whole, found.own.lasts
+    chain = CHAIN in found.own.model.effects
+    if not chain:
+        found = _chained(found)
+        chain = CHAIN in found.own.model.effects
+    while found.own.lasts < whole.lasts:
+        own = found.own.over(whole, min(_LONGER * found.own.lasts, whole.lasts))
+        best = fit(own, found.fit.raw, _FOLLOW)
+        report("fitting longer", 1, 1, f"{own.lasts:.2f} s: {1e3 * gap_rms(film_gaps(own, best)):.2f} mm")
+        if not chain:
+            other = _chained(_Model(own, best, found.test))
+            chain = CHAIN in other.own.model.effects
+            own, best = other.own, other.fit
+        if not film_gaps(own, best).max() < NEAR:
+            break
+        found = replace(found, own=own, fit=best)
+    if found.own.lasts == longest:
+        return first, found
+    add_correction(found.own, found.values)
+    found = films.test(found.own, fit(found.own, found.fit.raw, _FOLLOW))
+    plain = first.own.over(whole, found.own.lasts)
+    return films.test(plain, fit(plain, first.fit.raw, _FOLLOW)), found
+
+
+def _left_out(final: _Model, whole: FilmedProblem) -> list[str]:
+    """Return that films were not compared to their ends."""
+    if not final.own.lasts < whole.lasts:
+        return []
+    return [
+        f"Only the first {final.own.lasts:.2f} s of each trial count: over longer times no model stayed within "
+        f"{1e3 * NEAR:.0f} mm of the films."
+    ]
 
 
 def _chained(plain: _Model) -> _Model:
     """Return the model as a chain of links, if films fit to that much better."""
-    link, best = float(np.diff(plain.own.model.arclength).min()), plain
+    link = float(np.diff(plain.own.model.arclength).min())
+    sides = []
     for length in (link, -link):
-        chain = _extended(plain, (_CHAIN,), {f"{_CHAIN}.length": 0.5 * link}, {f"{_CHAIN}.length": length}, None)
-        look_at = fit(chain.own, chain.fit.raw, 2)
-        if look_at.cost < best.fit.cost:
-            best = replace(chain, fit=fit(chain.own, look_at.raw, 6))
+        chain = _extended(plain, (CHAIN,), {f"{CHAIN}.length": 0.5 * link}, {f"{CHAIN}.length": length}, None)
+        for problem in (chain.own, chain.test):
+            if (known := problem.discretisation_correction) is not None:
+                # A mesh with edges as long as the links is not wrong.
+                correct(problem, replace(known, links=link))
+        sides.append(replace(chain, fit=fit(chain.own, chain.fit.raw, 2)))
+    best = min(sides, key=lambda s: s.fit.cost)
+    if not best.fit.cost < plain.fit.cost:
+        return plain
+    best = replace(best, fit=fit(best.own, best.fit.raw, 6))
     return best if best.fit.cost < _BETTER * plain.fit.cost else plain
 
 
@@ -222,12 +349,14 @@ def _round(
     floor: ErrorFloor,
     level: float,
     plan: Budget,
+    whole: float,
     stage: str,
     report: Callback,
 ) -> tuple[_Model | None, list[Candidate], list[str]]:
     """Return the model with the best effect added, if one pays, all candidates, and effects that fit as well."""
-    scores = _scores(base, names, lambda k, n: report(f"{stage}: screening", k, n, ""))
-    tried, short = scores[: plan.candidates], _SHORT * base.own.lasts
+    short = base.own.lasts if base.own.lasts < whole else _SHORT * whole
+    scores = _scores(base, names, short, lambda k, n: report(f"{stage}: screening", k, n, ""))
+    tried = scores[: plan.candidates]
     if not tried:
         return None, [], []
     lead = tried[0].name
@@ -237,13 +366,14 @@ def _round(
         fits[score.name] = _fitted(base, score, plan.iterations, short)
         report(f"{stage}: fitting", k + 1, len(tried), f"{score.name} {1e3 * fits[score.name].fit.cost:.3f} mm")
     order = sorted(fits, key=lambda n: fits[n].fit.cost)
-    for name in order[:_LEADERS]:
+    leading = [n for n in order[:_LEADERS] if not fits[n].fit.cost > _BEHIND * fits[order[0]].fit.cost]
+    for name in leading:
         one = fits[name]
         more = plan.more * (_PATIENCE if base.own.trials[0].still else 1)
         fits[name] = replace(one, fit=fit(one.own, one.fit.raw, more))
         report(f"{stage}: fitting on", 1, 1, f"{name} {1e3 * fits[name].fit.cost:.3f} mm")
     rival = replace(base, fit=fit(base.own, base.fit.raw, 3))
-    led = sorted(order[:_LEADERS], key=lambda n: fits[n].fit.cost)
+    led = sorted(leading, key=lambda n: fits[n].fit.cost)
     refused = {name: _refused(rival, fits[name], first, floor, level) for name in led}
     fair = [name for name in led if refused[name] is None]
     best, rivals, reasons = None, [], {name: refused.get(name) or "fits worse" for name in fits}
@@ -348,10 +478,16 @@ def _tangents(own: FilmedProblem, here: Fit, seen: np.ndarray, weight: np.ndarra
     return np.concatenate([jacobian, priors])
 
 
-def _scores(base: _Model, names: Sequence[str], report: Callable[[int, int], None]) -> list[Score]:
-    """Return the scores of effects, best first: what their doses explain beyond what all other numbers can."""
+def _scores(base: _Model, names: Sequence[str], seconds: float, report: Callable[[int, int], None]) -> list[Score]:
+    """Return the scores of effects, best first: what their doses explain beyond what all other numbers can.
+
+    Args:
+        base: the model.
+        names: effects to try.
+        seconds: over which films are compared.
+        report: told how many groups are done, and in all.
+    """
     own, values = base.own, base.values
-    seconds = _SHORT * own.lasts
     here = look(own, base.fit.raw, own.offset, seconds)
     known = dict(zip(own.model.parameters, own.full(values[None])[0], strict=True))
     sims = own.simulate(values[None])
@@ -405,6 +541,7 @@ def _scores(base: _Model, names: Sequence[str], report: Callable[[int, int], Non
 
 
 def _concluded(
+    films: _Films,
     recording: Recording,
     first: _Model,
     final: _Model,
@@ -419,6 +556,7 @@ def _concluded(
     begun: float,
 ) -> Diagnosis:
     before, after = first.gaps("test"), final.gaps("test")
+    whole = not final.own.lasts < films.whole.lasts
     effects = list(shares)
     point, drifts = spread(final.own, final.fit)
     good = [m for m in final.others if gap_rms(m.gaps("test")) < _AS_GOOD * gap_rms(after)]
@@ -427,7 +565,7 @@ def _concluded(
     predictions: dict[str, dict[str, np.ndarray]] = {"before": {}, "after": {}}
     shown = []
     for split in ("train", "test"):
-        problems = [m.own if split == "train" else m.test for m in (first, final)]
+        problems = [films.all_of(m, split) for m in (first, final)]
         sims = [p.simulate(m.values[None])[0] for p, m in zip(problems, (first, final), strict=True)]
         for when, each in zip(predictions, sims, strict=True):
             trials = problems[0].trials
@@ -435,7 +573,7 @@ def _concluded(
         numbers = [m.values[len(m.own.free) :] for m in (first, final)]
         shown += overlays(problems[0], split, np.stack(sims), np.stack(numbers))
     done = Diagnosis(
-        _verdict(effects, gap_rms(before), gap_rms(after), floor, level),
+        _verdict(effects, gap_rms(before), gap_rms(after), floor, level if whole else np.inf),
         effects,
         {name: ties[name] for name in effects},
         shares,

@@ -19,7 +19,7 @@ from torchdlo.sysid.estimation.observation import INDEPENDENT, PER_CAMERA, Spine
 from torchdlo.sysid.video.filmed_problem import STRETCHES, FilmedProblem
 from torchdlo.vision.spine import curve_vectors
 
-__all__ = ["Fit", "fit", "gate", "intervals", "look", "picture_errors", "spread", "total"]
+__all__ = ["Fit", "film_gaps", "fit", "gate", "intervals", "look", "picture_errors", "spread", "total"]
 
 _BLOCK = 0.5
 """Time over which what simulations get wrong is one and the same error [s]."""
@@ -198,6 +198,12 @@ def _step(own: FilmedProblem, now: Fit, damping: float) -> tuple[np.ndarray, np.
     moves = -np.linalg.solve(damped[:, size:, size:], right[..., None])[..., 0]
     longest = np.maximum(1.0, np.abs(moves).max(1, keepdims=True))
     return step, moves / longest
+
+
+def film_gaps(own: FilmedProblem, found: Fit) -> np.ndarray:
+    """Return root mean squares of the readings of trials [m], shape (B,); infinite where the simulation failed."""
+    gaps = np.sqrt(np.nanmean(found.residual[..., : own.spines.priors.start] ** 2, (1, 2)))
+    return np.where(np.isfinite(found.costs), gaps, np.inf)
 
 
 def gate(own: FilmedProblem, values: np.ndarray) -> int:

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from torchdlo.physics.effects.parameter_name import ParameterName
 from torchdlo.sysid.diagnosis.error_floor import Refinement, refinement
 from torchdlo.sysid.estimation import levenberg_marquardt
 from torchdlo.sysid.estimation.levenberg_marquardt import KNEE, ParameterSpace
@@ -19,14 +20,20 @@ from torchdlo.sysid.recordings.recording import Recording, Trial
 from torchdlo.sysid.recordings.trivial_predictors import catenary
 
 __all__ = [
+    "CHAIN",
     "STRETCHES",
     "FilmedProblem",
     "add_correction",
     "begin_from_balance",
+    "correct",
     "filmed_problem",
+    "first_frames",
     "keep_steps_only",
     "start_of",
 ]
+
+CHAIN = "link_chain"
+"""What a chain of links does that a rope does not: fitted before any effect is considered."""
 
 STRETCHES = 14
 """Stretches along a rope at rest, in each of which what a model gets wrong is one and the same error."""
@@ -104,6 +111,28 @@ class FilmedProblem:
         trials = tuple(self.trials[b] for b in rows)
         parts: dict[str, Any] = {"trials": trials, "motion": self.motion.pick(rows), "spines": spines}
         return replace(self, **parts, start=self.start.pick(rows), offset=self.offset[rows], dropped={})
+
+    def shortened(self, seconds: float) -> FilmedProblem:
+        """Return the problem of the first seconds of all trials."""
+        count = int(np.ceil(seconds / self.model.dt)) + 1
+        if count >= self.motion.markers.shape[1]:
+            return self
+        found = self.discretisation_correction
+        if found is not None:
+            found = replace(found, step=found.step[:, :count], grid=found.grid[:, :count])
+        trials = first_frames(self.trials, count)
+        views = [v.shortened(seconds) for v in self.spines.views]
+        spines = Spines(views, self.model.dt, self.extent, self.spines.free, self.spines.sure)
+        start = replace(self.start, discretisation_correction=None if found is None else found.correction)
+        parts: dict[str, Any] = {"trials": trials, "motion": self.model.motion(trials), "spines": spines}
+        return replace(self, **parts, start=start, discretisation_correction=found)
+
+    def over(self, whole: FilmedProblem, seconds: float) -> FilmedProblem:
+        """Return the problem with the first seconds of the trials of another one; corrections are not known there."""
+        spines = Spines(whole.spines.views, self.model.dt, self.extent, self.spines.free, self.spines.sure)
+        parts: dict[str, Any] = {"trials": whole.trials, "motion": self.model.motion(whole.trials), "spines": spines}
+        start = replace(self.start, discretisation_correction=None)
+        return replace(self, **parts, start=start, discretisation_correction=None).shortened(seconds)
 
     def weigh(self, residual: np.ndarray) -> None:
         """Take for what readings get wrong what a model of a rope at rest leaves of them (B, F, R) [m].
@@ -197,6 +226,13 @@ class FilmedProblem:
             return self.spines.read(self.simulate(values, frames), values[:, len(self.free) :])
 
         return read, self.target(seconds)[..., None]
+
+
+def first_frames(trials: Sequence[Trial], count: int) -> tuple[Trial, ...]:
+    """Return trials that end after so many frames."""
+    series = ("time", "markers", "suspect", "gripper_quaternion", "wrench")
+    cut = ({n: getattr(t, n)[:count] for n in series if getattr(t, n) is not None} for t in trials)
+    return tuple(replace(t, **parts) for t, parts in zip(trials, cut, strict=True))
 
 
 def start_of(model: RopeModel, trials: Sequence[Trial], views: Sequence[FilmView]) -> Start:
@@ -301,11 +337,18 @@ def begin_from_balance(own: FilmedProblem, numbers: np.ndarray) -> None:
 
 
 def add_correction(own: FilmedProblem, values: np.ndarray) -> None:
-    """Add to simulations from now on what finer steps and a finer mesh change at these numbers (K + Q,)."""
-    model = own.model
+    """Add to simulations from now on what finer steps and a finer mesh change at these numbers (K + Q,).
+
+    Of a chain of links it is what they change of a rope, whose mesh is right where its edges are as long as the links.
+    """
+    model, row = own.model, own.full(values[None])
     own.start = replace(own.start, discretisation_correction=None)
     begin = own.begin(own.offset[None]) if own.offset.shape[1] else own.start
-    row = own.full(values[None])
+    links = np.array([ParameterName.parse(name).effect == CHAIN for name in model.parameters])
+    length, row = float(np.abs(row[:, links]).sum()), row[:, ~links]
+    effects = tuple(e for e in model.effects if e != CHAIN)
+    if links.any():
+        model = RopeModel(model.recording, effects=effects, **own.options)
     plain = model.simulate(own.motion, begin, row)[0]
     # Starts are fitted: only what the motion from one and the same place gets wrong is to be corrected.
     moving = ~own.start.at_rest[:, None, None] & np.isfinite(plain[:, 0])
@@ -314,10 +357,15 @@ def add_correction(own: FilmedProblem, values: np.ndarray) -> None:
     fine = half | {"vertices": 2 * len(model.arclength) - 1}
     sims = []
     for more in (fine, half):
-        each = RopeModel(model.recording, effects=model.effects, **(own.options | more))
+        each = RopeModel(model.recording, effects=effects, **(own.options | more))
         sims.append(each.simulate(each.motion(own.trials), begin, row)[0])
     edge = float(np.mean(np.diff(model.arclength)))
     found = refinement(sims[0], sims[1], plain, model.numerical_damping, edge)
+    correct(own, replace(found, links=length))
+
+
+def correct(own: FilmedProblem, found: Refinement) -> None:
+    """Add to simulations from now on what is known of finer ones."""
     own.discretisation_correction = found
     own.start = replace(own.start, discretisation_correction=found.correction)
 
