@@ -1,8 +1,8 @@
 """Inverse kinematics as a C++ kernel, pose by pose: all steps of a search, and what its answer's derivative is made of.
 
-The formulas stand in `inverse_kinematics`, as tensor operations; these are used where there is no C++ compiler. Of a few
-poses they take some tens of milliseconds, and the kernel some tens of microseconds. Poses on a GPU are brought to the
-CPU and the answers back: once per action, which takes less time than to launch the tensor operations.
+The formulas stand in `inverse_kinematics`, as tensor operations; these are used where there is no C++ compiler. Of a
+few poses they take some tens of milliseconds, and the kernel some tens of microseconds. Poses on a GPU are brought to
+the CPU and the answers back, once per search.
 """
 
 from __future__ import annotations
