@@ -1,6 +1,6 @@
 """Play and train whole tasks on a GPU: errors, agreement with the CPU, time, memory; tasks beside each other.
 
-Each task is a process: some actions of many scenes, the same for a few scenes on the CPU, then the gradient of a window.
+Each task is a process: actions of many scenes, the same for a few scenes on the CPU, then the gradient of a window.
 "train" trains each algorithm for two short batches, and once more with a stop between. What is found is printed line by
 line as it is found. With --profile a task is run once more alone, with a table of what takes the GPU's time.
 
