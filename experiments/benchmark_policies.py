@@ -36,6 +36,9 @@ def options() -> Any:
     parser.add_argument("--episodes", type=int, default=None, help="budget; default: the published one")
     parser.add_argument("--minutes", type=float, default=None, help="budget of the clock of each run")
     parser.add_argument("--fidelity", default=None, help="of training, for algorithms without stages")
+    parser.add_argument("--device", default=None, help="of training, for algorithms without stages: cpu or cuda")
+    parser.add_argument("--count", type=int, default=None, help="episodes at once, for algorithms without stages")
+    parser.add_argument("--train-only", action="store_true", help="leave the judgement to a later run with --judge")
     parser.add_argument("--without", default="", help="stages of the hybrid to leave out, with commas")
     parser.add_argument("--source", default="found", choices=("found", "scripted"), help="what the hybrid begins with")
     parser.add_argument("--starts", type=int, default=15, help="episodes of each judgement")
@@ -104,11 +107,14 @@ def run(name: str, algo: str, seed: int, chosen: Any) -> None:
         choices |= {"resume": True, "callback": told}
         train_hybrid(task, files, training_preset(name, algo, **given), **choices)
     else:
-        settings = training_preset(name, algo, episodes=chosen.episodes, fidelity=chosen.fidelity, **given)
+        given |= {"episodes": chosen.episodes, "fidelity": chosen.fidelity, "count": chosen.count}
+        settings = training_preset(name, algo, device=chosen.device, **given)
         trainer, played = prepare_training(task, settings)
         resume = (folder / "checkpoint.pt").exists()
         found = train(trainer, played, settings, folder=folder, resume=resume, callback=told)
         (folder / "result.json").write_text(train_json(task, settings, found))
+    if chosen.train_only and not chosen.judge:
+        return
     results, _ = evaluate_policies([load_policy(folder)], task, starts=chosen.starts, seed=chosen.reset_seed)
     results |= {"generator": "torchdlo evaluate", "algorithm": label, "seed": seed}
     save(str(folder / "evaluation.json"), results)

@@ -79,6 +79,9 @@ def train(
         typer.Option("--set", help="Another setting, such as rate=1e-3; may be repeated.", metavar="NAME=VALUE"),
     ] = None,
     variation: Annotated[bool, typer.Option(help="Let starts vary.")] = True,
+    device: Annotated[
+        str | None, typer.Option(help="Where to train; hybrid on the CPU only. Default: cpu.", metavar="cpu|cuda")
+    ] = None,
     execution: ExecutionOption = None,
     trajectory: Annotated[
         list[Path] | None,
@@ -120,6 +123,7 @@ def train(
         if not resume:
             check_writable(out / name, mark=b"torchdlo" if name != "log.csv" else b"episodes")
     given = {"episodes": episodes, "minutes": minutes, "seed": seed, "count": count, "fidelity": fidelity}
+    given["device"] = device
     if workers is not None and address is None:
         raise InputError("--workers: it says how many processes of a Ray cluster play; give --address, too.")
     given["collectors"] = None if address is None else workers or 2

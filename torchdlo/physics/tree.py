@@ -7,6 +7,7 @@ scenes and vertices of one scene sit a whole batch apart. `batch_innermost` is t
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable, Sequence
 from typing import Any, TypeVar, dataclass_transform
 
@@ -144,7 +145,15 @@ def take_vertices(x: Tensor, slots: Sequence[int]) -> Tensor:
     first = slots[0] if slots else 0
     if list(slots) == list(range(first, first + len(slots))):
         return x.narrow(-2, first, len(slots)).clone()  # several times as fast as looking up
+    if x.is_cuda and not torch.compiler.is_compiling():
+        # A list would be copied from the CPU each time, for which a CUDA graph has no place.
+        return x.index_select(-2, _slots(tuple(slots), x.device))
     return x[..., list(slots), :]
+
+
+@functools.cache  # recorded graphs read them for good
+def _slots(slots: tuple[int, ...], device: torch.device) -> Tensor:
+    return torch.tensor(slots, dtype=torch.int64, device=device)
 
 
 def cat_vertices(parts: Sequence[Tensor]) -> Tensor:

@@ -69,7 +69,7 @@ class EnvEpisodes:
         self.count = env.batch_size[0]
         self.generator: torch.Generator = env.generator
         self._td: Any = None
-        self._failed = torch.zeros(self.count, dtype=torch.bool)
+        self._failed = torch.zeros(self.count, dtype=torch.bool, device=env.device)
 
     def _seen(self, td: Any) -> Tensor:
         return torch.cat([td.get(key).reshape(self.count, -1) for key in self.keys], -1)
@@ -77,7 +77,7 @@ class EnvEpisodes:
     def reset(self) -> Tensor:
         """Begin anew; return observations (N, O)."""
         self._td = self.env.reset()
-        self._failed = torch.zeros(self.count, dtype=torch.bool)
+        self._failed = torch.zeros(self.count, dtype=torch.bool, device=self.env.device)
         self.first = self._seen(self._td).detach()
         return self.first
 
@@ -123,6 +123,7 @@ class TaskEpisodes:
         bonus: float = 0.0,
         randomize: dict[str, float] | None = None,
         disturbed: float = 0.0,
+        device: torch.device | str = "cpu",
     ) -> None:
         """Make the scenes.
 
@@ -132,7 +133,8 @@ class TaskEpisodes:
             seed: of the starts.
             variation: whether starts differ.
             gradients: whether rewards carry gradients to actions.
-            execution: how steps run; without gradients as `quick_execution` says, else eager, if not given.
+            execution: how steps run; if not given, compiled on a GPU, and on the CPU eager with gradients and else as
+                `quick_execution` says.
             dtype: of the physics.
             ends: whether what an end lacks to success is subtracted from the last reward.
             scale: what rewards are multiplied by.
@@ -140,18 +142,23 @@ class TaskEpisodes:
             randomize: see `torchdlo.envs.make`.
             disturbed: by how much friction and stiffness of ropes differ from scene to scene, as shares of their own;
                 drawn at every reset.
+            device: where they are played.
         """
         from torchdlo.envs.core.env import DloEnv
         from torchdlo.envs.core.episode import quick_execution
 
+        gpu = torch.device(device).type == "cuda"
+        quick: Execution = "compiled" if gpu else ("eager" if gradients else quick_execution(task))
         self.env = DloEnv(
             task,
             num_envs=count,
+            device=device,
             dtype=dtype,
             seed=seed,
             gradients=gradients,
-            execution=execution or ("eager" if gradients else quick_execution(task)),
-            segment=5,
+            execution=execution or quick,
+            # Recorded steps of a GPU differentiate the last frame alone without running it once more.
+            segment=1 if gpu else 5,
             variation=variation,
             randomize=randomize,
         )
@@ -164,13 +171,13 @@ class TaskEpisodes:
         self.random: Tensor | None = None
         """What decided the friction and the stiffness of each scene, (N, 2); None where they are the usual ones."""
         self._over = 0
-        self.returns = torch.zeros(count)
+        self.returns = torch.zeros(count, device=device)
         """What the task itself pays, without the rest."""
 
     def reset(self) -> Tensor:
         """Begin anew; return observations (N, O)."""
         self._over = 0
-        self.returns = torch.zeros(self.count)
+        self.returns = torch.zeros_like(self.returns)
         if self.disturbed:
             self.disturb(torch.rand(self.count, 2, generator=self.generator))
         elif self.random is not None:
@@ -193,7 +200,8 @@ class TaskEpisodes:
         self.reset()
         env = self.env
         with torch.no_grad():
-            env.world, env.moved = episode.begin(env.episode, self.task.build(moved)[2]), moved
+            moved = moved.to(self.returns.device)
+            env.world, env.moved = episode.begin(env.episode, episode.laid_down(self.task, moved)[2]), moved
             self.first = episode.observe(env.episode, env.world)
         return self.first
 

@@ -110,7 +110,7 @@ class Ppo:
             return {}
         rows: list[dict[str, Tensor]] = []
         for _ in range(s.passes):
-            for sample in torch.randperm(len(data)).split(s.batch):
+            for sample in torch.randperm(len(data), device=batch.features.device).split(s.batch):
                 part = self.loss(data[sample])
                 own = 0.0 if freeze else part["loss_objective"] + part["loss_entropy"]
                 loss = part["loss_critic"] + own

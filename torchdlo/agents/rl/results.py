@@ -14,7 +14,7 @@ from torchdlo.agents.policies import Policy, load_policy
 from torchdlo.agents.rl.episodes import Episodes, TaskEpisodes
 from torchdlo.agents.rl.hybrid_stages import task_policy
 from torchdlo.agents.rl.settings import TrainingSettings
-from torchdlo.agents.rl.training import Trained, Trainer
+from torchdlo.agents.rl.training import Trained, Trainer, gpus, usable_device
 from torchdlo.envs import Task, with_fidelity
 from torchdlo.errors import InputError
 from torchdlo.physics.execution import Execution
@@ -41,11 +41,13 @@ def prepare_training(
     if settings.algorithm not in kinds:
         raise InputError(f"algorithm is {settings.algorithm!r}; expected one of {', '.join(kinds)}.")
     task = with_fidelity(task, settings.fidelity)
-    with torch.random.fork_rng(devices=[]):
+    device = usable_device(settings)
+    with torch.random.fork_rng(devices=gpus(device)):
         torch.manual_seed(settings.seed)
         soft = settings.algorithm in ("sac", "sapo")
-        policy = task_policy(task, settings, state_sigma=soft, squash=settings.algorithm != "ppo")
-        trainer = kinds[settings.algorithm](policy, settings)
+        policy = task_policy(task, settings, state_sigma=soft, squash=settings.algorithm != "ppo").to(device)
+        with device:  # critics and losses are made there
+            trainer = kinds[settings.algorithm](policy, settings)
     make = functools.partial(
         TaskEpisodes,
         task,
@@ -56,6 +58,7 @@ def prepare_training(
         ends=settings.ends,
         scale=_scale(task),
         bonus=settings.bonus,
+        device=device,
     )
     if not settings.collectors:
         return trainer, make(settings.count)
@@ -97,9 +100,15 @@ def train_json(task: Task, settings: TrainingSettings, found: Trained) -> str:
         "interrupted": found.interrupted,
         "settings": asdict(settings),
         "torch": torch.__version__,
+        "device": device_name(torch.device(settings.device)),
         "curve": found.rows,
     }
     return json.dumps(content, indent=1) + "\n"
+
+
+def device_name(device: torch.device) -> str:
+    """Return what a device is called: "cpu", or the GPU's name."""
+    return torch.cuda.get_device_name(device) if device.type == "cuda" else device.type
 
 
 def load_policies(paths: list[Path]) -> tuple[list[Policy], str]:

@@ -53,7 +53,8 @@ class Sac:
                 {"params": [self.loss.log_alpha], "lr": settings.rate},
             ]
         )
-        self.buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(settings.replay), batch_size=settings.batch)
+        storage = LazyTensorStorage(settings.replay, device=settings.device)
+        self.buffer = TensorDictReplayBuffer(storage=storage, batch_size=settings.batch)
 
     def parts(self) -> dict[str, Any]:
         """Return what a checkpoint has to hold, by name."""
@@ -74,7 +75,7 @@ class Sac:
             count = len(rows["features"])
             found = TensorDict({}, batch_size=[count])
             for name, value in rows.items():
-                found[tuple(name.split("/"))] = value
+                found[tuple(name.split("/"))] = value.to(self.settings.device)
             self.buffer.extend(found)
         # Where the next one goes: over the oldest one, once all room is taken.
         self.buffer._writer._cursor = state["cursor"]
@@ -89,12 +90,12 @@ class Sac:
         rows: list[dict[str, Tensor]] = []
         told: list[dict[str, Tensor]] = []
         step: Any = None
-        alive = torch.ones(episodes.count, dtype=torch.bool)
+        alive = torch.ones(episodes.count, dtype=torch.bool, device=seen.device)
         for k in range(episodes.horizon):
             with torch.no_grad():
                 if self.done < s.warm:
-                    action = 2 * torch.rand(episodes.count, policy.spec.actions) - 1
-                    density = torch.zeros(episodes.count)
+                    action = 2 * torch.rand(episodes.count, policy.spec.actions, device=seen.device) - 1
+                    density = torch.zeros_like(action[:, 0])
                 else:
                     action, density = policy.draw(features[-1])
                 step = episodes.step(policy.command(action))

@@ -69,7 +69,7 @@ def actor_loss(window: Window, value: Tensor, *, gamma: float, temperature: Tens
         temperature: what entropy earns.
     """
     steps, count = window.reward.shape
-    power = gamma ** torch.arange(steps, dtype=window.reward.dtype)[:, None]
+    power = gamma ** torch.arange(steps, dtype=window.reward.dtype, device=window.reward.device)[:, None]
     gain = window.reward - temperature * window.log_prob
     earned = (power * torch.where(window.alive, gain, 0.0)).sum(0)
     after = torch.where(window.terminal[-1] | ~window.begun, 0.0, value)
@@ -166,7 +166,7 @@ class Shac:
     def iterate(self, episodes: Episodes) -> tuple[Batch, dict[str, float]]:
         """Play and learn; return what was played and how learning went."""
         seen, done = episodes.reset(), 0
-        failed = torch.zeros(episodes.count, dtype=torch.bool)
+        failed = torch.zeros(episodes.count, dtype=torch.bool, device=seen.device)
         windows: list[Window] = []
         told: list[dict[str, Tensor]] = []
         if not bool(self.policy.normaliser.count > 0):
@@ -223,10 +223,10 @@ class Shac:
         use = window.alive
         features, aim = window.features[:-1][use], aim[use]
         if not len(aim):
-            return torch.zeros(())
+            return aim.new_zeros(())
         losses = []
         for _ in range(s.critic_passes):
-            for rows in torch.randperm(len(aim)).chunk(s.parts):
+            for rows in torch.randperm(len(aim), device=aim.device).chunk(s.parts):
                 loss = sum((c(features[rows]).squeeze(-1) - aim[rows]).square().mean() for c in self.critic)
                 self.critic_optimizer.zero_grad()
                 loss.backward()

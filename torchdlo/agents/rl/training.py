@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 import torch
+from torch.utils import _pytree as pytree
 
 from torchdlo.agents.policies import Policy, save_policy
 from torchdlo.agents.rl.episodes import Episodes
@@ -84,7 +85,7 @@ def train(
         stage: what to call it.
         notes: plain data to keep in policy.pt.
     """
-    with torch.random.fork_rng(devices=[]):
+    with torch.random.fork_rng(devices=gpus(usable_device(settings))):
         torch.manual_seed(settings.seed)
         done = Trained(copy.deepcopy(trainer.policy), (-math.inf, -math.inf))
         if resume:
@@ -96,6 +97,23 @@ def train(
         if folder is not None:
             _write(trainer, episodes, settings, done, folder, notes or {})
     return done
+
+
+def usable_device(settings: TrainingSettings) -> torch.device:
+    """Return where to train; refuse a GPU that is not there."""
+    device = torch.device(settings.device)
+    count = torch.cuda.device_count() if torch.cuda.is_available() else 0
+    if device.type == "cuda" and (device.index or 0) >= count:
+        raise InputError(
+            f"device is {settings.device!r}, but torch sees {count or 'no'} GPU{'s' * (count > 1)} here; leave it out, "
+            "or see `torchdlo doctor`."
+        )
+    return device
+
+
+def gpus(device: torch.device) -> list[torch.device]:
+    """Return the devices beside the CPU whose random numbers a run uses."""
+    return [device] if device.type == "cuda" else []
 
 
 def _loop(
@@ -178,13 +196,15 @@ def _write(
         "settings": json.dumps(asdict(settings), sort_keys=True),
         "parts": {name: part.state_dict() for name, part in trainer.parts().items()},
         "torch": torch.get_rng_state(),
+        "cuda": [torch.cuda.get_rng_state(device) for device in gpus(torch.device(settings.device))],
         "starts": episodes.generator.get_state(),
         "best": {"policy": done.policy.state_dict(), "mark": done.best},
         "episodes": done.episodes,
         "seconds": done.seconds,
         "rows": done.rows,
     }
-    save_checkpoint(folder / _CHECKPOINT, content)
+    # Files of a GPU's run are read where there is none.
+    save_checkpoint(folder / _CHECKPOINT, pytree.tree_map_only(torch.Tensor, torch.Tensor.cpu, content))
     write_atomically(folder / "log.csv", log_csv(done.rows))
     save_policy(
         done.policy, folder / "policy.pt", notes | {"episodes": done.episodes, "seconds": round(done.seconds, 1)}
@@ -200,7 +220,8 @@ def _restore(
     content = load_checkpoint(path)
     if content is None:
         raise InputError(f"{path}: the checkpoint is damaged; leave out --resume.")
-    was, now = json.loads(content["settings"]), json.loads(json.dumps(asdict(settings)))
+    was = {"device": "cpu"} | json.loads(content["settings"])  # those of 0.1 did not say
+    now = json.loads(json.dumps(asdict(settings)))
     free = ("episodes", "minutes", "interval")  # how long to go on may change
     other = [f"{k} {was.get(k)} (now {now[k]})" for k in now if k not in free and was.get(k) != now[k]]
     if other:
@@ -208,6 +229,8 @@ def _restore(
     for name, part in trainer.parts().items():
         part.load_state_dict(content["parts"][name])
     torch.set_rng_state(content["torch"])
+    for device, state in zip(gpus(torch.device(settings.device)), content.get("cuda", ()), strict=True):
+        torch.cuda.set_rng_state(state, device)
     episodes.generator.set_state(content["starts"])
     done.policy.load_state_dict(content["best"]["policy"])
     done.best = tuple(content["best"]["mark"])

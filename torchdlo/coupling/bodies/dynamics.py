@@ -220,7 +220,7 @@ def _kinematic(bodies: tuple[Body, ...]) -> list[int]:
 def stationary_control(bodies: tuple[Body, ...], state: BodyState) -> BodyTargets:
     """Return the targets that keep kinematic bodies where they are."""
     slots = _kinematic(bodies)
-    return BodyTargets(state.pos[..., slots, :], state.quat[..., slots, :])
+    return BodyTargets(tree.take_vertices(state.pos, slots), tree.take_vertices(state.quat, slots))
 
 
 def check_targets(bodies: tuple[Body, ...], targets: BodyTargets | tuple[()]) -> None:

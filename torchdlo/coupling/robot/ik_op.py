@@ -1,7 +1,8 @@
 """Inverse kinematics as a C++ kernel, pose by pose: all steps of a search, and what its answer's derivative is made of.
 
-The formulas stand in `inverse_kinematics`, as tensor operations; these are used on a GPU and where there is no C++
-compiler. Of a few poses they take some tens of milliseconds, and the kernel some tens of microseconds.
+The formulas stand in `inverse_kinematics`, as tensor operations; these are used where there is no C++ compiler. Of a
+few poses they take some tens of milliseconds, and the kernel some tens of microseconds. Poses on a GPU are brought to
+the CPU and the answers back, once per search.
 """
 
 from __future__ import annotations
@@ -15,7 +16,12 @@ from torch import Tensor
 from torchdlo.coupling.common import scene_packing
 from torchdlo.coupling.robot.robot_kinematics import Robot
 
-_function, ready = scene_packing.kernel("ik", "inverse kinematics")
+_function, _ready = scene_packing.kernel("ik", "inverse kinematics")
+
+
+def ready(device: str, dtype: torch.dtype) -> bool:
+    """Return whether the kernel works for tensors of a kind of device and a dtype."""
+    return _ready("cpu" if device == "cuda" else device, dtype)
 
 
 class _Chain(ctypes.Structure):
@@ -65,6 +71,11 @@ def solve(
         next Newton step goes [rad or m], (B,), how the tool moves with the joints, turns times `LEVER` [-, m],
         (B, 6, J), and how that step follows the error, (B, J, 6).
     """
+    device = given[-1].device
+    if device.type != "cpu":
+        # In one piece there and back: each copy waits for the device.
+        rows = torch.cat([x.detach().expand(len(given[-1]), -1) for x in given], -1).cpu()
+        given, give = rows.split([x.shape[-1] for x in given], -1), give.cpu()
     pos, quat, posture, lower, upper, start = (x.detach() for x in given)
     joints, n = start.clone(memory_format=torch.contiguous_format), start.shape[-1]
     target = torch.cat([pos, quat], -1)
@@ -79,5 +90,7 @@ def solve(
         ctypes.c_int64(len(joints)),
         torch.get_num_threads(),
     )
+    if device.type != "cpu":
+        joints, out = torch.cat([joints, out], -1).to(device).split((n, out.shape[-1]), -1)
     tip, quat, left, slope, matrix = out.split((3, 4, 1, 6 * n, 6 * n), -1)
     return joints, tip, quat, left[:, 0], slope.unflatten(-1, (6, n)), matrix.unflatten(-1, (n, 6))

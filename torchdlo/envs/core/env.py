@@ -218,7 +218,7 @@ class DloEnv(EnvBase):
         count = len(again) if self.task.settle_steps else len(rows)
         with torch.no_grad():
             moved = self.task.moved(count, **choices)
-            fresh = episodes.begin(self.episode, self.task.build(moved)[2])
+            fresh = episodes.begin(self.episode, episodes.laid_down(self.task, moved)[2])
         self.moved = self.moved.index_copy(0, rows, moved[rows] if self.task.settle_steps else moved)
         if bool(again.all()):
             return fresh

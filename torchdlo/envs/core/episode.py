@@ -245,12 +245,20 @@ def prepare_at(task: Task, moved: Tensor, *, execution: Execution = "compiled", 
         execution: see `prepare`.
         segment: see `prepare`.
     """
-    scene, params, state = task.build(moved)
+    scene, params, state = laid_down(task, moved)
     hands = hands_of(task, scene)
     step = scenes.stepper(scene, execution=execution)
     world = _begin(task, scene, state, hands)
     episode = Episode(task, scene, params, step, hands, world, segment)
     return episode if not task.settle_steps else replace(episode, start=_settled(episode, world))
+
+
+def laid_down(task: Task, moved: Tensor) -> tuple[Scene, Params, State]:
+    """Return what `Task.build` does, made on the CPU, where thousands of small operations take least time."""
+    if moved.device.type == "cpu":
+        return task.build(moved)
+    scene, params, state = task.build(moved.cpu())
+    return scene, tree.to(params, moved.device), tree.to(state, moved.device)
 
 
 def limit_action(task: Task, action: Tensor) -> tuple[Tensor, Tensor]:
