@@ -20,7 +20,7 @@ class _Batch:
     """PendulumEnv is stateless: a batch is a tensordict with that many rows."""
 
     def __init__(self, count: int, seed: int) -> None:
-        self.env, self.batch_size = PendulumEnv(), torch.Size([count])
+        self.env, self.batch_size, self.device = PendulumEnv(), torch.Size([count]), torch.device("cpu")
         self.generator = torch.Generator().manual_seed(seed)
 
     def _seen(self, td: Any) -> Any:
