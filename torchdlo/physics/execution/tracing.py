@@ -13,6 +13,7 @@ from contextlib import contextmanager
 from typing import Any
 
 import torch
+from torch.autograd import forward_ad
 
 from torchdlo.physics import tree
 
@@ -145,6 +146,7 @@ class RecordedStep:
     def __call__(self, *inputs: Any) -> Any:
         """Do the step."""
         with_gradient = torch.is_grad_enabled() and any(x.requires_grad for x in tree.leaves(inputs))
+        with_gradient |= forward_ad._current_level >= 0  # dual numbers
         if with_gradient or not self._known:
             return self._step(*inputs)
         try:
