@@ -260,7 +260,7 @@ def main() -> None:
     chosen = options()
     if chosen.smoke:
         chosen.device, chosen.count, chosen.actions = "cpu", FEW, 1
-        chosen.tasks = "wiring_post" if chosen.tasks == TASKS else chosen.tasks
+        chosen.tasks = "wiring_post,train" if chosen.tasks == TASKS else chosen.tasks
     if chosen.only or chosen.smoke:
         for name in [chosen.only] if chosen.only else chosen.tasks.split(","):
             one(name, chosen)

@@ -86,9 +86,11 @@ def run(name: str, algo: str, seed: int, chosen: Any) -> None:
     def told(stage: str, done: int, total: int, message: str) -> None:
         print(f"{time.process_time() - began:7.0f} CPU s  {folder.name} {stage} {done}/{total} {message}", flush=True)
 
-    if (folder / "evaluation.json").exists() or (chosen.judge and not (folder / "policy.pt").exists()):
+    # A run that was killed has a policy, too, but no result.
+    finished = folder / ("policy.pt" if algo == "hybrid" else "result.json")
+    if (folder / "evaluation.json").exists() or (chosen.judge and not finished.exists()):
         return
-    given = {"seed": seed, "minutes": chosen.minutes}
+    given = {"seed": seed, "minutes": chosen.minutes, "device": chosen.device}
     if chosen.judge:
         pass
     elif algo == "hybrid":
@@ -108,7 +110,7 @@ def run(name: str, algo: str, seed: int, chosen: Any) -> None:
         train_hybrid(task, files, training_preset(name, algo, **given), **choices)
     else:
         given |= {"episodes": chosen.episodes, "fidelity": chosen.fidelity, "count": chosen.count}
-        settings = training_preset(name, algo, device=chosen.device, **given)
+        settings = training_preset(name, algo, **given)
         trainer, played = prepare_training(task, settings)
         resume = (folder / "checkpoint.pt").exists()
         found = train(trainer, played, settings, folder=folder, resume=resume, callback=told)

@@ -33,8 +33,8 @@ TINY = {"count": 2, "hidden": (8,), "critic": (8,), "window": 1, "warm": 1, "rep
 @pytest.mark.parametrize(
     ("choices", "said"),
     [
-        ({"device": "gpu"}, "device is 'gpu'; expected cpu, cuda"),
-        ({"device": "cuda:"}, "device is 'cuda:'; expected cpu, cuda"),
+        ({"device": "gpu"}, "device is 'gpu'; expected cpu or cuda"),
+        ({"device": "cuda:1"}, "CUDA_VISIBLE_DEVICES chooses"),
         ({"device": "cuda", "algorithm": "hybrid"}, "ppo, sac, shac and sapo can have a GPU"),
         ({"device": "cuda", "collectors": 2}, "as collectors play there"),
     ],
@@ -44,12 +44,10 @@ def test_settings_say_which_devices_there_are(choices: dict, said: str):
         TrainingSettings(**choices)
 
 
-@pytest.mark.parametrize(("count", "said"), [(0, "no GPU here"), (1, "1 GPU here"), (2, "2 GPUs here")])
-def test_a_gpu_that_is_not_there_is_refused(monkeypatch, count: int, said: str):
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: count > 0)
-    monkeypatch.setattr(torch.cuda, "device_count", lambda: count)
-    with pytest.raises(InputError, match=f"device is 'cuda:{count}', but torch sees {said}"):
-        prepare_training(find("wiring_post"), training_preset("wiring_post", "ppo", device=f"cuda:{count}"))
+def test_a_gpu_that_is_not_there_is_refused(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    with pytest.raises(InputError, match="device is 'cuda', but torch sees no GPU here"):
+        prepare_training(find("wiring_post"), training_preset("wiring_post", "ppo", device="cuda"))
 
 
 @pytest.mark.parametrize("algo", ["ppo", "hybrid"])
@@ -117,7 +115,10 @@ def test_a_gpus_run_leaves_files_for_the_cpu(algo: str, tmp_path: Path):
     straight, _ = short(algo, tmp_path / "straight", 2, device="cuda")
     short(algo, tmp_path, 1, device="cuda")
     resumed, _ = short(algo, tmp_path, 2, resume=True, device="cuda")
-    assert resumed.rows[0]["return"] == pytest.approx(straight.rows[0]["return"], abs=1e-4)
+    assert len(resumed.rows) == len(straight.rows) == 2
+    assert resumed.rows[-1]["return"] == pytest.approx(straight.rows[-1]["return"], abs=1e-4)
+    for one, other in zip(resumed.policy.parameters(), straight.policy.parameters(), strict=True):
+        torch.testing.assert_close(one, other, atol=1e-3, rtol=1e-3)
     content = load_checkpoint(tmp_path / "checkpoint.pt")
     assert content is not None
     assert not any(x.is_cuda for x in tree.leaves(content["parts"]) if isinstance(x, torch.Tensor))

@@ -92,7 +92,7 @@ class TrainingSettings:
     variation: bool = True
     """Whether starts vary."""
     device: str = "cpu"
-    """Where episodes are played and networks learn: "cpu", "cuda" or such as "cuda:1"."""
+    """Where episodes are played and networks learn: "cpu" or "cuda", the first GPU that CUDA_VISIBLE_DEVICES leaves."""
     collectors: int = 0
     """Processes of a Ray cluster that play for PPO and SAC; 0: this one plays."""
     interval: float = 60.0
@@ -110,12 +110,10 @@ class TrainingSettings:
         need(alone, "collectors", f"0, as {self.algorithm} needs gradients; ppo and sac can have them")
         even = self.collectors >= 0 and not self.count % max(1, self.collectors)
         need(even, "collectors", f"a number that divides the {self.count} episodes that are played at once")
-        kind, _, number = self.device.partition(":")
-        known = kind in ("cpu", "cuda") and (number.isdigit() or self.device == kind)
-        need(known, "device", "cpu, cuda, or such as cuda:1")
-        here = kind == "cpu" or self.algorithm != "hybrid"
+        need(self.device in ("cpu", "cuda"), "device", "cpu or cuda; CUDA_VISIBLE_DEVICES chooses among several GPUs")
+        here = self.device == "cpu" or self.algorithm != "hybrid"
         need(here, "device", "cpu, as stages of hybrid run there; ppo, sac, shac and sapo can have a GPU")
-        need(kind == "cpu" or not self.collectors, "device", "cpu, as collectors play there")
+        need(self.device == "cpu" or not self.collectors, "device", "cpu, as collectors play there")
         need(self.minutes > 0, "minutes", "a positive number")
         need(0 <= self.seed < 2**32, "seed", "a whole number from 0 to 2^32 - 1")
         need(0 < self.gamma <= 1, "gamma", "a discount above 0, at most 1")

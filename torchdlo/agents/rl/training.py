@@ -102,12 +102,8 @@ def train(
 def usable_device(settings: TrainingSettings) -> torch.device:
     """Return where to train; refuse a GPU that is not there."""
     device = torch.device(settings.device)
-    count = torch.cuda.device_count() if torch.cuda.is_available() else 0
-    if device.type == "cuda" and (device.index or 0) >= count:
-        raise InputError(
-            f"device is {settings.device!r}, but torch sees {count or 'no'} GPU{'s' * (count > 1)} here; leave it out, "
-            "or see `torchdlo doctor`."
-        )
+    if device.type == "cuda" and not torch.cuda.is_available():
+        raise InputError("device is 'cuda', but torch sees no GPU here; leave it out, or see `torchdlo doctor`.")
     return device
 
 
