@@ -85,10 +85,10 @@ def _limit(score: Score, gap: float, recording: Recording) -> DetectionLimit | N
     key = how.strength[0]
     param = EFFECTS[score.name].params[key]
     series, high = param.scale == "reciprocal", effect_library.greatest(score.name, key, recording)
-    greatest = param.low if series else high
+    greatest = param.low if series else high * float(np.sqrt(param.size))
     for numbers, shown in score.probes:
         own = np.array([v for name, v in numbers.items() if ParameterName.parse(name).number == key])
-        if len(own):
+        if len(own) and np.isfinite(shown):
             sizes.append(_size(own, (gap / shown) ** (1 / how.power) if shown > 0 else np.inf, param))
     if not sizes:
         return None

@@ -325,7 +325,8 @@ def limits_text(result: Diagnosis) -> str:
         ends = sorted({least, f"{limit.hardest:.2g}"}, key=float)
         seen.append(f"{name} ({limit.number} {' to '.join(ends)}{unit})")
     said = [f"Would be named from this size on, by place or direction: {', '.join(seen)}."] if seen else []
-    return " ".join([*said, *([f"What {HIDDEN}, however large it may be: {', '.join(hidden)}."] if hidden else [])])
+    never = f"What {HIDDEN}, as it would have to be larger than it can be: {', '.join(hidden)}."
+    return " ".join([*said, *([never] if hidden else [])])
 
 
 def _tested(name: str, result: Diagnosis) -> str:

@@ -133,6 +133,9 @@ def score_effects(
                     raw = base.point.raw - np.clip(share * back, -1.0, 1.0)
                     starts.append((_mixture(name, doses[name], share * found.amounts), raw))
             sizes, shown = _sizes(name, doses[name]), np.linalg.norm((change - q @ absorbed)[places], axis=0) / whole
+            # Of a dose whose simulation failed, nothing is known.
+            ran = [bool(np.isfinite(pick(sims[k]))[good].all()) for k in rows]
+            shown = np.where(ran, shown, np.nan)
             probes = tuple((dict(d.values), float(gap)) for d, gap in zip(doses[name], shown, strict=True))
             scores.append(Score(name, best.share, starts[0][0], tuple(starts), sizes, best.direction, probes))
     return sorted(scores, key=lambda s: -s.share)
