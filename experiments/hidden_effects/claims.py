@@ -43,6 +43,8 @@ class Stored:
     """As of `table.judge`."""
     figures: dict[str, str]
     """What is not counted, by the names in `FIGURES`."""
+    developed: bool = False
+    """Whether the program was changed because of these rows: then the sentence of the README leaves them out."""
 
 
 @dataclass(frozen=True)
@@ -107,7 +109,7 @@ def bound(yes: int, of: int, *, upper: bool) -> float:
 def load(folder: Path) -> list[Stored]:
     """Return all stored runs, by the names of their files."""
     found = [json.loads(path.read_text()) for path in sorted(folder.glob("*.json"))]
-    return [Stored(x["title"], x["note"], x["rows"], x["figures"]) for x in found]
+    return [Stored(x["title"], x["note"], x["rows"], x["figures"], x.get("developed", False)) for x in found]
 
 
 def _cell(measure: Measure, rows: Sequence[Row]) -> str:
@@ -171,7 +173,7 @@ def nothing(stored: Sequence[Stored]) -> str:
 
 def sentence(stored: Sequence[Stored]) -> str:
     """Return what the README says, in a sentence."""
-    rows = [r for s in stored for r in s.rows]
+    rows = [r for s in stored if not s.developed for r in s.rows]
     single, null = ([r for r in rows if r["kind"] == k] for k in ("single", "null"))
     pair, outside = ([r for r in rows if r["kind"] == k] for k in ("compound", "outside"))
     false = sum(bool(r["named"]) for r in null)
