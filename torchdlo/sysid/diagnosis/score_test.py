@@ -132,13 +132,18 @@ def score_effects(
                 for share in _ON_THE_WAY:
                     raw = base.point.raw - np.clip(share * back, -1.0, 1.0)
                     starts.append((_mixture(name, doses[name], share * found.amounts), raw))
-            sizes, shown = _sizes(name, doses[name]), np.linalg.norm((change - q @ absorbed)[places], axis=0) / whole
-            # Of a dose whose simulation failed, nothing is known.
-            ran = [bool(np.isfinite(pick(sims[k]))[good].all()) for k in rows]
-            shown = np.where(ran, shown, np.nan)
-            probes = tuple((dict(d.values), float(gap)) for d, gap in zip(doses[name], shown, strict=True))
+            changes, sizes = (change - q @ absorbed)[places] / whole, _sizes(name, doses[name])
+            probes = _probes(doses[name], changes, [pick(sims[k])[good] for k in rows])
             scores.append(Score(name, best.share, starts[0][0], tuple(starts), sizes, best.direction, probes))
     return sorted(scores, key=lambda s: -s.share)
+
+
+def _probes(
+    doses: Sequence[Perturbation], changes: np.ndarray, simulated: Sequence[np.ndarray]
+) -> tuple[tuple[dict[str, float], float], ...]:
+    """Return by how much each dose changes (N, K) [m]; not a number where it failed: of that nothing is known."""
+    shown = np.where([np.isfinite(x).all() for x in simulated], np.linalg.norm(changes, axis=0), np.nan)
+    return tuple((dict(d.values), float(x)) for d, x in zip(doses, shown, strict=True))
 
 
 def _nudged(model: RopeModel, base: Fitted, nudge: np.ndarray) -> np.ndarray:
