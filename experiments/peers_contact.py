@@ -254,7 +254,7 @@ def run_mujoco(dt: float, scenes: int = 1, *, solref: float = 0.002) -> Run:
     return found
 
 
-def run_pyelastica(dt: float, scenes: int = 1, *, k: float = 1e3) -> Run:
+def run_pyelastica(dt: float, scenes: int = 1, *, k: float = 1e3, nu: float = 0.0) -> Run:
     """PyElastica: Cosserat rods with penalty contact; explicit, so steps are bounded by their axial stiffness."""
     import elastica as ea
 
@@ -278,7 +278,7 @@ def run_pyelastica(dt: float, scenes: int = 1, *, k: float = 1e3) -> Run:
         simulator.append(peg)
         simulator.constrain(peg).using(ea.FixedConstraint, constrained_position_idx=(0,), constrained_director_idx=(0,))
         simulator.add_forcing_to(rod).using(ea.GravityForces, acc_gravity=np.array([0.0, 0.0, -GRAVITY]))
-        simulator.detect_contact_between(rod, peg).using(ea.RodCylinderContact, k=k, nu=0.0)
+        simulator.detect_contact_between(rod, peg).using(ea.RodCylinderContact, k=k, nu=nu)
         rods.append(rod)
     simulator.finalize()
     stepper, steps, now = ea.PositionVerlet(), step_count(dt), [0.0]
@@ -291,8 +291,8 @@ def run_pyelastica(dt: float, scenes: int = 1, *, k: float = 1e3) -> Run:
     return play(steps, advance, lambda: rods[0].position_collection.T.copy())
 
 
-def _newton_model(add: Callable[[Any, Any, Any], Any], scenes: int) -> tuple[Any, Any]:
-    """A model of Newton with so many worlds: peg and rope; and what `add(builder, rod, cfg)` returns."""
+def _newton_model(add: Callable[[Any, Any, Any], Any], scenes: int, density: float, **rest: bool) -> Any:
+    """A model of Newton with so many worlds: peg and rope, which `add(builder, rod, cfg)` adds."""
     import newton
     import warp as wp
 
@@ -300,19 +300,19 @@ def _newton_model(add: Callable[[Any, Any, Any], Any], scenes: int) -> tuple[Any
     wp.set_device("cpu")
     one = newton.ModelBuilder()  # falls along -z at 9.81 m/s^2
     one.rigid_gap = 0.0
-    cfg = newton.ModelBuilder.ShapeConfig(density=DENSITY, mu=0.0, ke=1e5, kd=0.0)
+    cfg = newton.ModelBuilder.ShapeConfig(density=density, mu=0.0, ke=1e5, kd=0.0)
     one.default_shape_cfg.mu = 0.0
     w, x, y, z = TURNED
     one.add_shape_cylinder(
         -1, xform=wp.transform(wp.vec3(0.0, 0.0, 0.0), wp.quat(x, y, z, w)), radius=PEG, half_height=0.1, cfg=cfg
     )
-    added = add(one, newton.Rod([wp.vec3(*map(float, p)) for p in polygon()], radius=RADIUS), cfg)
+    add(one, newton.Rod([wp.vec3(*map(float, p)) for p in polygon()], radius=RADIUS, **rest), cfg)
     builder = one
     if scenes > 1:
         builder = newton.ModelBuilder()  # falls along -z at 9.81 m/s^2
         builder.rigid_gap = 0.0
         builder.replicate(one, scenes)
-    return builder, added
+    return builder
 
 
 def run_newton(dt: float, scenes: int = 1, *, iterations: int = 10) -> Run:
@@ -322,9 +322,10 @@ def run_newton(dt: float, scenes: int = 1, *, iterations: int = 10) -> Run:
 
     def add(builder: Any, rod: Any, cfg: Any) -> Any:
         stretch, bend = STIFFNESS / EDGE, BEND / EDGE
-        return builder.add_rod(rod=rod, cfg=cfg, stretch_stiffness=stretch, bend_stiffness=bend)[0]
+        return builder.add_rod(rod=rod, cfg=cfg, stretch_stiffness=stretch, bend_stiffness=bend)
 
-    builder, _ = _newton_model(add, scenes)
+    # Its segments are capsules, whose round ends overlap: their mass is to be that of the rope.
+    builder = _newton_model(add, scenes, DENSITY / (1 + 4 / 3 * RADIUS / EDGE), rest_straight=True)
     builder.color()
     model = builder.finalize(device="cpu")
     pipeline = newton.CollisionPipeline(model, contact_matching="sticky")
@@ -362,9 +363,11 @@ def _dismech_solver(scenes: int, iterations: int, gradient: bool = False) -> tup
         stretch, bend = STIFFNESS / EDGE, BEND / EDGE
         return DiSMechSolver.add_rod(builder, rod, cfg=cfg, stretch_stiffness=stretch, bend_stiffness=bend)
 
-    builder, _ = _newton_model(add, scenes)
-    model = builder.finalize(device="cpu", requires_grad=gradient)
-    return model, DiSMechSolver(model, iterations=iterations, self_contact=False, friction=0.0)
+    model = _newton_model(add, scenes, DENSITY).finalize(device="cpu", requires_grad=gradient)
+    solver = DiSMechSolver(model, iterations=iterations, self_contact=False, friction=0.0)
+    for part in solver.elements:
+        part.rest.zero_()  # straight at rest; it takes the start for the rest shape
+    return model, solver
 
 
 def run_dismech(dt: float, scenes: int = 1, *, iterations: int = 10) -> Run:
@@ -412,7 +415,9 @@ PEERS: dict[str, tuple[str, Callable[..., Run], Callable[..., Slide] | None, lis
         "torchdlo", run_torchdlo, None, [{"integrator": "explicit", "substeps": 5}], [1e-3],
     ),
     "MuJoCo": ("mujoco", run_mujoco, None, [{"solref": s} for s in (0.002, 0.02, 0.05)], [1e-3, 2e-3, 5e-3]),
-    "PyElastica": ("pyelastica", run_pyelastica, None, [{}], [5e-5, 1e-4]),
+    "PyElastica": (
+        "pyelastica", run_pyelastica, None, [{"k": k, "nu": nu} for k in (1e3, 1e4) for nu in (0.0, 0.1)], [5e-5, 1e-4],
+    ),
     "Newton VBD": ("newton", run_newton, None, [{"iterations": n} for n in (10, 40)], [1e-3, 2e-3, 5e-3]),
     "dismech-newton": (
         "dismech-newton", run_dismech, gradient_dismech, [{"iterations": n} for n in (10, 40)], [1e-3, 2e-3, 5e-3],
@@ -421,28 +426,33 @@ PEERS: dict[str, tuple[str, Callable[..., Run], Callable[..., Slide] | None, lis
 """What is run: name of the package, forward, with gradients, settings, steps [s]."""
 
 
+def _errors(run: Run) -> dict[str, float]:
+    """Errors of the displacement [m]: mean over the times, and at the end."""
+    times = DURATION * np.arange(1, LOOKS + 1) / LOOKS
+    off = (run.ends[:, 0] - run.ends[:, 1]) / 2 - displacement(times)
+    return {"mean_error_m": float(np.abs(off).mean()), "last_error_m": float(off[-1])}
+
+
 def measure(name: str, scenes: int, repeats: int, gradients: bool, smoke: bool = False) -> list[dict[str, Any]]:
     """Rows of one peer: each setting and step, in one scene and in `scenes`; the fastest repeat counts."""
     package, run, derive, settings, steps = PEERS[name]
     settings, steps = (settings[:1], steps[-1:]) if smoke else (settings, steps)
     rows: list[dict[str, Any]] = []
-    times = DURATION * np.arange(1, LOOKS + 1) / LOOKS
     run(DURATION / LOOKS, **settings[0])  # compiles
     for setting in settings:
         for dt in steps:
             one = [run(dt, **setting) for _ in range(repeats)]
-            off = (one[0].ends[:, 0] - one[0].ends[:, 1]) / 2 - displacement(times)
             row: dict[str, Any] = {
                 "peer": name,
                 "version": version(package),
                 "dt": DURATION / step_count(dt),
                 **setting,
             }
-            row |= {"mean_error_m": float(np.abs(off).mean()), "last_error_m": float(off[-1]), "strain": one[0].strain}
-            row["one_per_cpu_s"] = DURATION / min(r.cpu for r in one)
+            row |= _errors(one[0]) | {"strain": one[0].strain, "one_per_cpu_s": DURATION / min(r.cpu for r in one)}
             if scenes > 1:
-                row["scenes"] = scenes
-                row["many_per_cpu_s"] = scenes * DURATION / min(run(dt, scenes, **setting).cpu for _ in range(repeats))
+                many = [run(dt, scenes, **setting) for _ in range(repeats)]
+                row |= {"scenes": scenes} | {f"many_{k}": v for k, v in _errors(many[0]).items()}
+                row["many_per_cpu_s"] = scenes * DURATION / min(r.cpu for r in many)
             if gradients and derive is not None:
                 slides = [derive(dt, **setting) for _ in range(repeats)]
                 row["gradient_error"] = slides[0].gradient / sensitivity() - 1
@@ -461,7 +471,8 @@ def measure(name: str, scenes: int, repeats: int, gradients: bool, smoke: bool =
 
 def table(rows: list[dict[str, Any]]) -> str:
     """The rows as a table of Markdown."""
-    head = ["", "step", "mean error", "last error", "strain", "one scene", "many", "with gradient, one", "many", "off"]
+    head = ["", "step", "mean error", "last error", "strain", "one scene", "mean error", "many"]
+    head += ["with gradient, one", "many", "off"]
     lines = [f"| {' | '.join(head)} |", "|---" * len(head) + "|"]
 
     def speed(row: dict[str, Any], key: str) -> str:
@@ -470,11 +481,13 @@ def table(rows: list[dict[str, Any]]) -> str:
         return f"{row[key]:.2g}" + (f" ({row['scenes']})" if "many" in key else "")
 
     for row in rows:
-        setting = "".join(f", {k} {row[k]}" for k in ("solref", "iterations") if k in row)
+        setting = "".join(f", {k} {row[k]}" for k in ("solref", "iterations", "k", "nu") if k in row)
         cells = [f"{row['peer']} {row['version']}{setting}", f"{1e3 * row['dt']:.3g} ms"]
         cells += [f"{1e3 * row[k]:.2g} mm" for k in ("mean_error_m", "last_error_m")]
         cells.append(f"{row['strain']:.1%}")
-        cells += [speed(row, f"{k}_per_cpu_s") for k in ("one", "many", "gradient_one", "gradient_many")]
+        cells.append(speed(row, "one_per_cpu_s"))
+        cells.append(f"{1e3 * row['many_mean_error_m']:.2g} mm" if "many_mean_error_m" in row else "")
+        cells += [speed(row, f"{k}_per_cpu_s") for k in ("many", "gradient_one", "gradient_many")]
         cells.append(f"{row['gradient_error']:+.1%}" if "gradient_error" in row else "")
         lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines) + "\n"
