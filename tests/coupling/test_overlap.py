@@ -55,6 +55,18 @@ def test_a_shallow_overlap_is_left_to_the_steps():
     assert most < 0.003 + 0.003 and last == pytest.approx(0.003, abs=1e-4)
 
 
+def test_a_rope_that_is_held_does_not_keep_another_one_from_sliding_out():
+    apart = [
+        torch.stack([torch.linspace(-0.1, 0.1, 21, dtype=F64), torch.full((21,), y, dtype=F64)], -1) for y in (0, 1)
+    ]
+    held, loose = (Rope(torch.nn.functional.pad(x, (0, 1), value=-0.002), radius=0.003, mass=0.01) for x in apart)
+    bodies = [RigidBody("plane", motion="fixed")]
+    _, _, state = make([held, loose], [RodBody()], bodies=bodies, prescribed_vertices=(0,), **STEPS["explicit"])
+    # The loose one has slid out as it is, straight; the held one is bent out, but for the edge beside its hold.
+    torch.testing.assert_close(state.rods.pos[21:, 2], torch.full((21,), 0.003, dtype=F64), atol=1e-5, rtol=0)
+    assert float(state.rods.pos[0, 2]) == -0.002 and float(state.rods.pos[2:21, 2].min()) > 0.003 - 3e-4
+
+
 def line(start: tuple[float, ...], end: tuple[float, ...]) -> Rope:
     s = torch.linspace(0, 1, 21, dtype=F64)[:, None]
     x = torch.tensor(start, dtype=F64) * (1 - s) + torch.tensor(end, dtype=F64) * s

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from torch.autograd import forward_ad
 
 from torchdlo import scene as scenes
 from torchdlo.physics import tree
@@ -91,8 +92,12 @@ def test_steps_are_recorded_at_first_use_without_gradients_and_run_as_they_are_w
     (found,) = recorded(learned, x)
     assert len(calls) == 2 and torch.autograd.grad(found.sum(), learned)[0] == 3
     with torch.no_grad():
-        assert torch.equal(recorded(learned, x)[0], 2 * x)
+        (found,) = recorded(learned, x)
+    assert torch.equal(found, 2 * x) and not found.requires_grad and found.grad_fn is None
     assert len(calls) == 2
+    with forward_ad.dual_level():  # recorded steps do not see what is carried forward
+        (found,) = recorded(forward_ad.make_dual(factor, torch.tensor(1.0)), x)
+        assert torch.equal(forward_ad.unpack_dual(found).tangent, x)
 
 
 def test_a_step_that_cannot_be_recorded_runs_as_it_is():
