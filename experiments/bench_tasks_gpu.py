@@ -101,7 +101,7 @@ def play(task: Any, report: Report, chosen: Any) -> None:
         synchronize(chosen.device)
         times.append(round(time.perf_counter() - began, 4))
     report(done="forward", seconds_of_actions=times)
-    few = TaskEpisodes(task, FEW, execution="eager")
+    few = TaskEpisodes(task, min(FEW, chosen.count), execution="eager")
     few.begin(moved[:FEW])
     report(start_off=off(played.first[:FEW], few.first))
     for k, action in enumerate(actions):
@@ -159,7 +159,7 @@ def differentiate(task: Any, report: Report, chosen: Any) -> None:
     moved = played.env.moved.cpu()
     found, first = gradient(played, actions.to(chosen.device))
     report(done="gradient", seconds=first, finite=float(torch.isfinite(found).all(-1).float().mean()))
-    few = TaskEpisodes(task, FEW, execution="eager", gradients=True)
+    few = TaskEpisodes(task, min(FEW, chosen.count), execution="eager", gradients=True)
     few.begin(moved[:FEW])
     expected, _ = gradient(few, actions[:, :FEW])
     report(gradient_off=off(found[:, :FEW], expected), gradient_size=float(expected.abs().max()))
@@ -223,7 +223,7 @@ def profile(name: str, report: Report, chosen: Any) -> None:
         played.step(action)
         synchronize(chosen.device)
         times.append(round(time.perf_counter() - began, 4))
-    report(alone=times, frames_per_s=round(task.frame_skip * chosen.count / min(times)))
+    report(alone=times, frames_per_s=round(task.fidelity.steps(task.frame_skip) * chosen.count / min(times)))
     kinds = [ProfilerActivity.CPU] + [ProfilerActivity.CUDA] * (chosen.device != "cpu")
     with torch.profiler.profile(activities=kinds) as seen:
         played.step(action)

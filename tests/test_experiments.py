@@ -28,6 +28,7 @@ SCRIPTS = [
     "bench_implicit.py",
     "bench_env.py",
     "bench_rod.py",
+    "bench_tasks_gpu.py",
     "draw_tasks.py",
     "fidelities.py",
     "gallery.py",
