@@ -26,6 +26,8 @@ ROOT = Path(__file__).parent
 TASKS = ("coiling", "gathering", "lifting", "separation", "slingshot", "unknotting", "wiring_post", "wrapping")
 KEPT = ("policy.pt", "evaluation.json", "stages.json", "expert.json", "result.json", "student.json", "robustness.json")
 
+JUDGED = ("evaluation.json", "stages.json", "result.json", "robustness.json")
+
 
 def options() -> Any:
     """Read the options."""
@@ -134,12 +136,13 @@ def rounded(policy: Path) -> bytes:
 
 
 def pack(out: Path, file: Path) -> None:
-    """Write what is to be kept of all finished runs to one archive, weights of policies in half precision."""
+    """Write what is to be kept of all finished runs to one archive, weights in half precision."""
     from torchdlo.files import replace_atomically
 
     with replace_atomically(file) as scratch, zipfile.ZipFile(scratch, "w") as archive:
         for folder in sorted(p.parent for p in out.glob("*/evaluation.json")):
-            for name in KEPT:
+            # What each seed came to, and the weights of the first.
+            for name in KEPT if folder.name.endswith("-0") else JUDGED:
                 if (folder / name).exists():
                     found = rounded(folder / name) if name == "policy.pt" else (folder / name).read_bytes()
                     archive.writestr(zipfile.ZipInfo(f"{folder.name}/{name}"), found, zipfile.ZIP_DEFLATED, 9)
