@@ -2,11 +2,22 @@
 
 from __future__ import annotations
 
-import numpy as np
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
 
+import numpy as np
+import pytest
+
+from torchdlo.errors import InputError
 from torchdlo.sysid.diagnosis.error_floor import ErrorFloor
 from torchdlo.sysid.diagnosis.verdict import UNKNOWN_FLOOR
+from torchdlo.sysid.recordings.recording import load_recording
+from torchdlo.sysid.video import filmed
 from torchdlo.sysid.video.filmed_diagnosis import _far, _verdict
+from torchdlo.sysid.video.filmed_fit import Fit
+
+SAMPLE = Path(__file__).parents[2] / "torchdlo" / "data" / "sample_rope"
 
 
 def test_a_blunt_floor_is_said() -> None:
@@ -20,3 +31,36 @@ def test_nothing_is_explained_by_a_blunt_floor() -> None:
     assert _verdict([], 5e-3, 5e-3, ErrorFloor(noise, 0.0, 6.7e-3), 6.7e-3) == "unknown"
     assert _verdict([], 4e-4, 4e-4, ErrorFloor(noise, 0.0, 4e-4), 4e-4) == "none"
     assert _verdict(["air_drag"], 5e-3, 4e-3, ErrorFloor(noise, 0.0, 6.7e-3), 6.7e-3) == "partial"
+
+
+def test_lost_trials_begin_anew_and_failed_ones_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A trial whose simulation fails gets another start, whatever is near; one that stays lost is handed on or said."""
+    model = SimpleNamespace(mesh=SimpleNamespace(clamps=()), effects=())
+    own = SimpleNamespace(
+        model=model,
+        options={},
+        trials=(0,),
+        lasts=1.0,
+        offset=np.zeros((1, 0)),
+        space=SimpleNamespace(to_values=lambda raw: raw),
+        spines=SimpleNamespace(priors=slice(1, 1)),
+    )
+    none = np.zeros(0)
+    lost, fair = (Fit(none, none, np.array([c]), np.full((1, 1, 1), 1e-3), none) for c in (np.inf, 1e-3))
+    far = replace(fair, residual=np.full((1, 1, 1), 0.1))
+    recording = load_recording(SAMPLE)
+    for first, then, near, wanted in (
+        (lost, fair, np.inf, "sharper"),
+        (lost, fair, 5e-3, "sharper"),
+        (lost, lost, 5e-3, lost),
+        (fair, fair, 5e-3, "sharper"),
+        (far, fair, 5e-3, far),
+    ):
+        monkeypatch.setattr(filmed, "fit", lambda *_, out=first, **__: out)
+        monkeypatch.setattr(filmed, "restart", lambda *_, out=then: out)
+        monkeypatch.setattr(filmed, "sharper", lambda own, *_: replace(fair, raw=np.ones(1)))
+        found = filmed._fitted(own, none, 1, lambda *_: None, near)
+        assert found.raw.size == 1 if wanted == "sharper" else found is wanted
+    filmed.require_simulated(recording, fair)
+    with pytest.raises(InputError, match="from every start"):
+        filmed.require_simulated(recording, lost)

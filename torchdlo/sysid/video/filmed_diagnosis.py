@@ -25,7 +25,7 @@ from torchdlo.sysid.estimation.observation import FilmView, Spines
 from torchdlo.sysid.model.model_file import ModelFile
 from torchdlo.sysid.model.rope_model import MAX_SUBSTEP
 from torchdlo.sysid.recordings.recording import Recording, Trial
-from torchdlo.sysid.video.filmed import FILMED_STARTS, baseline, sharper, test_problem
+from torchdlo.sysid.video.filmed import FILMED_STARTS, baseline, require_simulated, sharper, test_problem
 from torchdlo.sysid.video.filmed_fit import Fit, film_gaps, fit, look, spread, total
 from torchdlo.sysid.video.filmed_problem import CHAIN, FilmedProblem, add_correction, correct, first_frames
 from torchdlo.sysid.video.filmed_starts import fit_starts
@@ -234,6 +234,7 @@ def _nearer(films: _Films, best: Fit, report: Callback) -> _Model:
         if film_gaps(own, found).max() < NEAR:
             break
         raw = found.raw
+    require_simulated(whole.model.recording, found)
     found = sharper(own, found.raw, _FOLLOW)
     return films.test(own, found)
 
