@@ -19,6 +19,7 @@ from torchdlo.sysid.diagnosis.budget import BUDGETS, Budget
 from torchdlo.sysid.diagnosis.error_floor import ErrorFloor, gap_rms
 from torchdlo.sysid.diagnosis.score_test import Score
 from torchdlo.sysid.diagnosis.verdict import UNKNOWN_FLOOR, Candidate, Diagnosis, verdict_word
+from torchdlo.sysid.diagnosis.workspace import CHAIN
 from torchdlo.sysid.estimation import levenberg_marquardt
 from torchdlo.sysid.estimation.jobs import Fitted
 from torchdlo.sysid.estimation.observation import FilmView, Spines
@@ -27,7 +28,7 @@ from torchdlo.sysid.model.rope_model import MAX_SUBSTEP
 from torchdlo.sysid.recordings.recording import Recording, Trial
 from torchdlo.sysid.video.filmed import FILMED_STARTS, baseline, require_simulated, sharper, test_problem
 from torchdlo.sysid.video.filmed_fit import Fit, film_gaps, fit, look, spread, total
-from torchdlo.sysid.video.filmed_problem import CHAIN, FilmedProblem, add_correction, correct, first_frames
+from torchdlo.sysid.video.filmed_problem import FilmedProblem, add_correction, correct, first_frames
 from torchdlo.sysid.video.filmed_starts import fit_starts
 from torchdlo.sysid.video.footage import views_of
 from torchdlo.sysid.video.overlay import overlays
@@ -230,6 +231,7 @@ def _nearer(films: _Films, best: Fit, report: Callback) -> _Model:
     for share in _SHARES:
         own = coarse.over(whole, share * whole.lasts)
         found = fit(own, raw, _FOLLOW)
+        coarse.offset = own.offset
         report("fitting the beginnings", 1, 1, f"{own.lasts:.2f} s: {1e3 * gap_rms(film_gaps(own, found)):.2f} mm")
         if film_gaps(own, found).max() < NEAR:
             break
@@ -244,7 +246,7 @@ def _further(films: _Films, first: _Model, found: _Model, report: Callback) -> t
 
     What the lack of the effect hid is looked for, too: whether the rope is a chain of links.
     """
-    whole, longest = films.whole, found.own.lasts
+    whole, begun_with = films.whole, found.own.lasts
     chain = CHAIN in found.own.model.effects
     if not chain:
         found = _chained(found)
@@ -260,7 +262,7 @@ def _further(films: _Films, first: _Model, found: _Model, report: Callback) -> t
         if not film_gaps(own, best).max() < NEAR:
             break
         found = replace(found, own=own, fit=best)
-    if found.own.lasts == longest:
+    if found.own.lasts == begun_with:
         return first, found
     add_correction(found.own, found.values)
     found = films.test(found.own, fit(found.own, found.fit.raw, _FOLLOW))
