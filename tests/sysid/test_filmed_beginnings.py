@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 import torch
 
+from torchdlo.sysid.diagnosis.workspace import CHAIN
 from torchdlo.sysid.estimation.observation import FilmView
 from torchdlo.sysid.model.rope_model import RopeModel
 from torchdlo.sysid.recordings.recording import Recording, Trial, load_recording
 from torchdlo.sysid.video.filmed_diagnosis import NEAR, _Films, _nearer, _scores
 from torchdlo.sysid.video.filmed_fit import film_gaps, fit
-from torchdlo.sysid.video.filmed_problem import CHAIN, FilmedProblem, add_correction, filmed_problem, start_of
+from torchdlo.sysid.video.filmed_problem import FilmedProblem, add_correction, filmed_problem, start_of
 from torchdlo.sysid.video.films import with_stations
 from torchdlo.vision.camera import lens, looking_at, project
 

@@ -42,6 +42,7 @@ __all__ = [
     "baseline",
     "calibrate_filmed",
     "doubts",
+    "require_simulated",
     "sharper",
     "test_problem",
     "tested",
@@ -141,7 +142,8 @@ def baseline(
 ) -> tuple[FilmedProblem, np.ndarray, Fit]:
     """Return the problem of the train trials, numbers (N,) to start from, and the best fit; see `calibrate_filmed`.
 
-    A fit that stays farther than `near` [m] from the films, root mean square per reading, is not made sharper.
+    A fit that stays farther than `near` [m] from the films, root mean square per reading, is not made sharper; where
+    that is finite a fit whose simulations fail before the films end is returned, too: their beginnings may still do.
     """
     own = _problem(recording, views, vertices, given)
     # Balances are cheap, and stiff ropes have shapes that do not depend on how stiff they are.
@@ -149,12 +151,18 @@ def baseline(
     first = np.concatenate([own.fixed[list(own.free)], np.zeros(len(own.spines.nuisances.names))])
     raw = own.space.to_raw(first) if given is not None else _scouted(own, starts, seed, report)
     best = _fitted(own, raw, iterations, report, near)
+    if not np.isfinite(near):
+        require_simulated(recording, best)
+    return own, first, best
+
+
+def require_simulated(recording: Recording, best: Fit) -> None:
+    """Raise unless the simulations of a fit of the train trials went through."""
     if not np.isfinite(best.cost):
         raise InputError(
             f"{recording.path}: the simulation failed on the train trials from every start; check length, mass, "
             "cameras and marker_arclength."
         )
-    return own, first, best
 
 
 def _scouted(own: FilmedProblem, starts: int, seed: int, report: Callback) -> np.ndarray:
@@ -260,10 +268,12 @@ def _fitted(own: FilmedProblem, raw: np.ndarray, iterations: int, report: Callba
             own.take(other)
             best = found
     report(stage, 1, 3, f"{1e3 * best.cost:.2f} mm")
-    if not film_gaps(own, best).max() < near:
+    if np.isfinite(best.cost) and film_gaps(own, best).max() > near:
         return best
     best = restart(own, fit(own, best.raw, iterations), iterations)
     report(stage, 2, 3, f"{1e3 * best.cost:.2f} mm")
+    if not np.isfinite(best.cost):
+        return best
     best = sharper(own, best.raw, iterations)
     report(stage, 3, 3, f"{1e3 * best.cost:.2f} mm")
     return best

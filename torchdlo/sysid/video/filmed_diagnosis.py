@@ -19,15 +19,16 @@ from torchdlo.sysid.diagnosis.budget import BUDGETS, Budget
 from torchdlo.sysid.diagnosis.error_floor import ErrorFloor, gap_rms
 from torchdlo.sysid.diagnosis.score_test import Score
 from torchdlo.sysid.diagnosis.verdict import UNKNOWN_FLOOR, Candidate, Diagnosis, verdict_word
+from torchdlo.sysid.diagnosis.workspace import CHAIN
 from torchdlo.sysid.estimation import levenberg_marquardt
 from torchdlo.sysid.estimation.jobs import Fitted
 from torchdlo.sysid.estimation.observation import FilmView, Spines
 from torchdlo.sysid.model.model_file import ModelFile
 from torchdlo.sysid.model.rope_model import MAX_SUBSTEP
 from torchdlo.sysid.recordings.recording import Recording, Trial
-from torchdlo.sysid.video.filmed import FILMED_STARTS, baseline, sharper, test_problem
+from torchdlo.sysid.video.filmed import FILMED_STARTS, baseline, require_simulated, sharper, test_problem
 from torchdlo.sysid.video.filmed_fit import Fit, film_gaps, fit, look, spread, total
-from torchdlo.sysid.video.filmed_problem import CHAIN, FilmedProblem, add_correction, correct, first_frames
+from torchdlo.sysid.video.filmed_problem import FilmedProblem, add_correction, correct, first_frames
 from torchdlo.sysid.video.filmed_starts import fit_starts
 from torchdlo.sysid.video.footage import views_of
 from torchdlo.sysid.video.overlay import overlays
@@ -155,10 +156,11 @@ def diagnose_filmed(
     while len(rounds) < plan.rounds:
         # What is left beside an effect, and less than finer simulations change, may be an error of theirs.
         bar = floor.noise if _blunt(level, floor) and not shares else level
-        # Ends of films that are left out say that something is missing.
-        if (shares or base.own.lasts == own.lasts) and gap_rms(
-            np.concatenate([base.gaps("train"), base.gaps("test")])
-        ) < (MORE if shares else SILENT) * bar:
+        # Ends of films that are left out say that something is missing, also beside what was found.
+        if (
+            base.own.lasts == own.lasts
+            and gap_rms(np.concatenate([base.gaps("train"), base.gaps("test")])) < (MORE if shares else SILENT) * bar
+        ):
             break
         names = [n for n in effect_library.library() if n not in (*base.own.model.effects, *without)]
         names = [n for n in names if effect_library.applicable(n, recording, base.own.model.mesh)]
@@ -176,10 +178,22 @@ def diagnose_filmed(
         ties[name] = [*rivals, *(_SAME_AT_REST if single and "curvature" in name else ())]
         base = found
         if not recording.still:
-            first, base = _further(films, first, base, report)
+            first, base = _further(films, first, base, given is None, report)
             floor, level = _floor(base)
-    notes = [*notes, *said, *_left_out(base, own)]
+    notes = [*notes, *said, *_left_out(base, own), *_chain_note(base)]
+    shares = _rescaled(shares, first, base, floor)
     return _concluded(films, recording, first, base, floor, level, shares, ties, rounds, notes, seed, budget, begun)
+
+
+def _rescaled(shares: dict[str, float], first: _Model, final: _Model, floor: ErrorFloor) -> dict[str, float]:
+    """Return the shares of effects so that they add up to what all of them explain of the films that count.
+
+    Each was found when other lengths of the films may have been looked at; there they are compared to each other.
+    """
+    before, after = (gap_rms(m.gaps("test")) ** 2 for m in (first, final))
+    explained = max(before - after, 0.0) / max(before - floor.noise**2, 1e-12)
+    parts = {name: max(share, 1e-6) for name, share in shares.items()}
+    return {name: explained * part / sum(parts.values()) for name, part in parts.items()}
 
 
 @dataclass(frozen=True, eq=False)
@@ -230,21 +244,24 @@ def _nearer(films: _Films, best: Fit, report: Callback) -> _Model:
     for share in _SHARES:
         own = coarse.over(whole, share * whole.lasts)
         found = fit(own, raw, _FOLLOW)
+        coarse.offset = own.offset
         report("fitting the beginnings", 1, 1, f"{own.lasts:.2f} s: {1e3 * gap_rms(film_gaps(own, found)):.2f} mm")
         if film_gaps(own, found).max() < NEAR:
             break
         raw = found.raw
+    require_simulated(whole.model.recording, found)
     found = sharper(own, found.raw, _FOLLOW)
     return films.test(own, found)
 
 
-def _further(films: _Films, first: _Model, found: _Model, report: Callback) -> tuple[_Model, _Model]:
+def _further(films: _Films, first: _Model, found: _Model, chains: bool, report: Callback) -> tuple[_Model, _Model]:
     """Return the baseline and the model that took up an effect, over as much of the films as that stays near to.
 
-    What the lack of the effect hid is looked for, too: whether the rope is a chain of links.
+    What the lack of the effect hid is looked for, too, unless `chains` is false: whether the rope is a chain of links.
+    The baseline then becomes one as well: what links explain is no merit of the effect.
     """
-    whole, longest = films.whole, found.own.lasts
-    chain = CHAIN in found.own.model.effects
+    whole, begun_with = films.whole, found.own.lasts
+    chain = not chains or CHAIN in found.own.model.effects
     if not chain:
         found = _chained(found)
         chain = CHAIN in found.own.model.effects
@@ -259,22 +276,53 @@ def _further(films: _Films, first: _Model, found: _Model, report: Callback) -> t
         if not film_gaps(own, best).max() < NEAR:
             break
         found = replace(found, own=own, fit=best)
-    if found.own.lasts == longest:
-        return first, found
+    if found.own.lasts == begun_with:
+        return _alike(first, found), found
     add_correction(found.own, found.values)
     found = films.test(found.own, fit(found.own, found.fit.raw, _FOLLOW))
     plain = first.own.over(whole, found.own.lasts)
-    return films.test(plain, fit(plain, first.fit.raw, _FOLLOW)), found
+    # Both are compared to films with what finer simulations change.
+    add_correction(plain, first.values)
+    return _alike(films.test(plain, fit(plain, first.fit.raw, _FOLLOW)), found), found
+
+
+def _alike(first: _Model, found: _Model) -> _Model:
+    """Return the baseline as a chain of links if the model is one, unless films fit worse to that."""
+    length = _links(found)
+    if length is None or _links(first) is not None:
+        return first
+    chain = _linked(first, length)
+    chain = replace(chain, fit=fit(chain.own, chain.fit.raw, _FOLLOW))
+    return chain if chain.fit.cost < first.fit.cost else first
+
+
+def _links(model: _Model) -> float | None:
+    """Return the length of a chain's links [m], with the sign of their number; None of a rope."""
+    own = model.own
+    if CHAIN not in own.model.effects:
+        return None
+    return float(own.full(model.values[None])[0, own.model.parameters.index(f"{CHAIN}.length")])
+
+
+def _chain_note(final: _Model) -> list[str]:
+    """Return that the rope was taken for a chain of links."""
+    length = _links(final)
+    if length is None:
+        return []
+    return [
+        f"The rope moves like a chain of links of about {1e3 * abs(length):.0f} mm, as simulated ones may; what that "
+        "explains is not counted as an effect."
+    ]
 
 
 def _left_out(final: _Model, whole: FilmedProblem) -> list[str]:
     """Return that films were not compared to their ends."""
     if not final.own.lasts < whole.lasts:
         return []
-    return [
-        f"Only the first {final.own.lasts:.2f} s of each trial count: over longer times no model stayed within "
-        f"{1e3 * NEAR:.0f} mm of the films."
-    ]
+    begun = f"Only the first {final.own.lasts:.2f} s of each trial count"
+    if not final.gaps("train").max() < NEAR:
+        return [f"{begun}, and even over these no model stayed within {1e3 * NEAR:.0f} mm of the films."]
+    return [f"{begun}: over longer times no model stayed within {1e3 * NEAR:.0f} mm of the films."]
 
 
 def _chained(plain: _Model) -> _Model:
@@ -282,17 +330,24 @@ def _chained(plain: _Model) -> _Model:
     link = float(np.diff(plain.own.model.arclength).min())
     sides = []
     for length in (link, -link):
-        chain = _extended(plain, (CHAIN,), {f"{CHAIN}.length": 0.5 * link}, {f"{CHAIN}.length": length}, None)
-        for problem in (chain.own, chain.test):
-            if (known := problem.discretisation_correction) is not None:
-                # A mesh with edges as long as the links is not wrong.
-                correct(problem, replace(known, links=link))
+        chain = _linked(plain, length)
         sides.append(replace(chain, fit=fit(chain.own, chain.fit.raw, 2)))
     best = min(sides, key=lambda s: s.fit.cost)
     if not best.fit.cost < plain.fit.cost:
         return plain
     best = replace(best, fit=fit(best.own, best.fit.raw, 6))
     return best if best.fit.cost < _BETTER * plain.fit.cost else plain
+
+
+def _linked(plain: _Model, length: float) -> _Model:
+    """Return the model as a chain of links of this length [m], not yet fitted."""
+    link = float(np.diff(plain.own.model.arclength).min())
+    chain = _extended(plain, (CHAIN,), {f"{CHAIN}.length": 0.5 * link}, {f"{CHAIN}.length": length}, None)
+    for problem in (chain.own, chain.test):
+        if (known := problem.discretisation_correction) is not None:
+            # A mesh with edges as long as the links is not wrong.
+            correct(problem, replace(known, links=abs(length)))
+    return chain
 
 
 def _extended(

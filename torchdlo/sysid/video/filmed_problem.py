@@ -10,6 +10,7 @@ import numpy as np
 
 from torchdlo.physics.effects.parameter_name import ParameterName
 from torchdlo.sysid.diagnosis.error_floor import Refinement, refinement
+from torchdlo.sysid.diagnosis.workspace import CHAIN
 from torchdlo.sysid.estimation import levenberg_marquardt
 from torchdlo.sysid.estimation.levenberg_marquardt import KNEE, ParameterSpace
 from torchdlo.sysid.estimation.observation import INDEPENDENT, SURE, FilmView, Spines
@@ -20,7 +21,6 @@ from torchdlo.sysid.recordings.recording import Recording, Trial
 from torchdlo.sysid.recordings.trivial_predictors import catenary
 
 __all__ = [
-    "CHAIN",
     "STRETCHES",
     "FilmedProblem",
     "add_correction",
@@ -31,9 +31,6 @@ __all__ = [
     "keep_steps_only",
     "start_of",
 ]
-
-CHAIN = "link_chain"
-"""What a chain of links does that a rope does not: fitted before any effect is considered."""
 
 STRETCHES = 14
 """Stretches along a rope at rest, in each of which what a model gets wrong is one and the same error."""
