@@ -218,7 +218,10 @@ def table(found: list[dict[str, Any]]) -> str:
         lines.append(f"| {' | '.join(cells)} |")
     for algo in sorted({r["algorithm"] for r in found}):
         own = [r["success"] for r in found if r["algorithm"] == algo]
-        lines.append(f"\n{algo}: mean success from unseen starts over {len(own)} tasks {statistics.mean(own):.0%}.")
+        lines.append(
+            f"\n{algo}: mean success from unseen starts over {len(own)} task{'s' * (len(own) != 1)} "
+            f"{statistics.mean(own):.0%}."
+        )
     return "\n".join(lines) + "\n"
 
 
