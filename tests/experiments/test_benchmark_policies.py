@@ -40,7 +40,7 @@ def test_rows_are_means_over_seeds_and_the_archive_has_no_checkpoints(script, tm
     assert row["interval"] == pytest.approx((0.5212, 0.8333), abs=1e-3)
     text = script.table([row])
     assert "| wiring_post | ppo | 2 | 0 | 70% | 52% to 83% | 60.50 | 100% | 65.00 | 101 | 62.17, 67% |" in text
-    assert "ppo: mean success from unseen starts over 1 tasks 70%." in text
+    assert "ppo: mean success from unseen starts over 1 task 70%." in text
     assert file.stat().st_size < 2000
 
 
