@@ -31,6 +31,7 @@ from torchdlo.field_docs import with_field_docs
 from torchdlo.physics import tree
 from torchdlo.physics.effects.base import ContactForces, Effect, altered_params, default_values, parameters_of
 from torchdlo.physics.execution import Execution, check_execution, tracing
+from torchdlo.physics.execution.compiled import Compiled, Kinds
 from torchdlo.physics.execution.gradient_check import GradientCheck, check_gradients
 from torchdlo.physics.execution.graphs import Graphs
 from torchdlo.physics.execution.replay import alike, rollout
@@ -487,14 +488,25 @@ def _check_given(scene: Scene, params: Params, state: State, control: Control) -
 
 
 def _step(scene: Scene, params: Params, state: State, control: Control, advance, broad_phase) -> State:
+    def repeat(params: Params, state: State, fixed: tuple[Control, Control], shares: Sequence[Tensor]) -> State:
+        for share in shares:
+            state = advance(scene, params, state, *fixed, share)
+        return state
+
+    return _in_substeps(scene, params, state, control, repeat, partial(broad_phase, scene))
+
+
+def _at_once(scene: Scene, params: Params, state: State, control: Control) -> State:
+    return _step(scene, params, state, control, advance, broad_phase)
+
+
+def _in_substeps(scene: Scene, params: Params, state: State, control: Control, repeat, broad_phase) -> State:
     start = stationary_control(scene, state)
     state = tree.replace(state, reaction=state.reaction.sized(state.rods.pos, *scene.held))
     if any(e.is_contact for e in scene.effects):
-        params = broad_phase(scene, params, state, start, control)
+        params = broad_phase(params, state, start, control)
     shares = torch.arange(1, scene.substeps + 1, dtype=start.pos.dtype, device=start.pos.device) / scene.substeps
-    for share in shares.split(1):
-        state = advance(scene, params, state, start, control, share)
-    return state
+    return repeat(params, state, (start, control), shares.split(1))
 
 
 def stepper(scene: Scene, *, execution: Execution = "compiled"):
@@ -509,16 +521,15 @@ def stepper(scene: Scene, *, execution: Execution = "compiled"):
     check_execution(execution)
     if execution != "compiled" or not native.prepare_torch_compile():
         return tracing.RecordedStep(partial(step, scene)) if execution == "recorded" else partial(step, scene)
-    compile = partial(torch.compile, fullgraph=True, dynamic=False, isolate_recompiles=True)
     once = scene.substeps == 1 and not any(e.is_contact for e in scene.effects)
 
-    def made(inline: bool):
+    def made(inline: bool) -> Compiled:
         # Neighbours are best read where they are used, but with gradients and of much matter copies pay.
-        part = partial(compile, options={"force_pointwise_cat": inline and scene.material_points is None})
-        return (part(_step), advance) if once else (_step, part(advance))
+        options = {"force_pointwise_cat": inline and scene.material_points is None}
+        return Compiled(_at_once if once else advance, scene, options=options)
 
     ways = {True: made(False), False: made(True)}
-    look, trusting, graphs = compile(broad_phase), tracing.Trusting(_prepared), Graphs()
+    look, kinds, graphs = Compiled(broad_phase, scene), Kinds(_prepared), Graphs()
 
     def run(params: Params, state: State, control: Control) -> State:
         _check_given(scene, params, state, control)
@@ -527,12 +538,18 @@ def stepper(scene: Scene, *, execution: Execution = "compiled"):
             "compiling the first step: seconds to minutes, once a process; execution='recorded' does without.",
         )
         with_gradient = torch.is_grad_enabled()
-        whole, part = ways[with_gradient]
+        part = ways[with_gradient]
         grip = control.attachment_weight
-        with trusting((params, state, control), with_gradient, *grip) as inputs:
+        with kinds((params, state, control), with_gradient, *grip) as (inputs, kind):
+
+            def whole(params: Params, state: State, control: Control) -> State:
+                if once:
+                    return part(kind, params, state, control)
+                return _in_substeps(scene, params, state, control, partial(part.repeat, kind), partial(look, kind))
+
             if scene.integrator != "explicit" or not state.rods.pos.is_cuda:
-                return whole(scene, *inputs, part, look)
-            return graphs(lambda *given: whole(scene, *given, part, look), inputs, *grip)
+                return whole(*inputs)
+            return graphs(whole, inputs, *grip)
 
     return run
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, TypeVar, dataclass_transform
 
 import torch
@@ -42,7 +42,11 @@ def _collect(tree: Any, found: list[Tensor]) -> None:
     kind = type(tree)
     if kind in _FIELDS:
         for name in _FIELDS[kind]:
-            _collect(getattr(tree, name), found)
+            part = getattr(tree, name)
+            if type(part) is Tensor:  # half of the calls
+                found.append(part)
+            else:
+                _collect(part, found)
     elif kind is tuple or kind is list or kind is dict:
         for part in tree.values() if kind is dict else tree:
             _collect(part, found)
@@ -72,10 +76,34 @@ def map(fn: Callable[..., Tensor], tree: T, *others: Any) -> T:
     return made
 
 
-def flatten(tree: T) -> tuple[list[Tensor], Callable[[Sequence[Tensor]], T]]:
+def flatten(tree: T) -> tuple[list[Tensor], Callable[[Iterable[Tensor]], T]]:
     """Return the leaves and a function that rebuilds the tree from such leaves."""
-    values, spec = pytree.tree_flatten(tree)
-    return values, lambda new: pytree.tree_unflatten(list(new), spec)
+    return leaves(tree), builder(tree)
+
+
+def builder(tree: T) -> Callable[[Iterable[Tensor]], T]:
+    """Return a function that makes such a tree of leaves in the order of `leaves`; it keeps none of this one."""
+    build = _builder(tree)
+    return lambda values: build(iter(values))
+
+
+def _builder(tree: Any) -> Callable[[Iterator[Tensor]], Any]:
+    kind = type(tree)
+    if kind in _FIELDS:
+        parts = [_builder(getattr(tree, name)) for name in _FIELDS[kind]]
+        return lambda values: kind(*[part(values) for part in parts])
+    if kind is tuple or kind is list:
+        parts = [_builder(part) for part in tree]
+        return lambda values: kind([part(values) for part in parts])
+    if kind is dict:
+        named = {key: _builder(part) for key, part in tree.items()}
+        return lambda values: {key: part(values) for key, part in named.items()}
+    if isinstance(tree, Tensor):
+        return next
+    if tree is None:
+        return lambda values: None
+    spec = pytree.tree_structure(tree)
+    return lambda values: pytree.tree_unflatten([next(values) for _ in range(spec.num_leaves)], spec)
 
 
 def replace(tree: T, **fields: Any) -> T:

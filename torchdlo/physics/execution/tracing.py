@@ -1,7 +1,7 @@
 """Steps without Python between their operations: recorded once for given shapes, then replayed.
 
 Recording takes less than a second where compiling takes many, and makes steps of small batches two or three times as
-fast as they are in eager mode. It is for simulations without gradients. `Trusting` makes compiled steps faster.
+fast as they are in eager mode. It is for simulations without gradients.
 """
 
 from __future__ import annotations
@@ -9,8 +9,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections import OrderedDict
-from collections.abc import Callable, Hashable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Hashable, Sequence
 from typing import Any
 
 import torch
@@ -78,6 +77,7 @@ def record(step: Callable[..., Any], *inputs: Any) -> Callable[..., Any]:
     return replayed
 
 
+<<<<<<< HEAD
 _CLOSE = 1e-6
 """Relative difference below which TorchScript may take numbers for the same: it does up to 6e-8."""
 
@@ -140,6 +140,8 @@ def _kinds(inputs: Any) -> Iterator[Hashable]:
     return ((x.shape, x.stride(), x.dtype, x.device, x.requires_grad) for x in tree.leaves(inputs))
 
 
+=======
+>>>>>>> speed8
 class Recordings:
     """The steps that were recorded or used last."""
 
