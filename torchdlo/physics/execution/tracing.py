@@ -77,7 +77,6 @@ def record(step: Callable[..., Any], *inputs: Any) -> Callable[..., Any]:
     return replayed
 
 
-<<<<<<< HEAD
 _CLOSE = 1e-6
 """Relative difference below which TorchScript may take numbers for the same: it does up to 6e-8."""
 
@@ -107,41 +106,6 @@ def _close_constants(graph: Any) -> list[torch.Tensor]:
     return moved
 
 
-class Trusting:
-    """Lets compiled code run without looking whether it was made for its inputs, once it has for inputs of their kind.
-
-    With the hundred tensors of a scene, looking takes a seventh of a step of one rope among two posts.
-    """
-
-    def __init__(self, prepare: Callable[[Any], Any]) -> None:
-        """Begin without any kind.
-
-        Args:
-            prepare: makes inputs, a tree, what compiled code expects. What it does to them depends on their kind only,
-                that is on the shape, the storage and the need for a gradient of each, and it leaves them as they are
-                where it did it already.
-        """
-        self._prepare, self._known = prepare, set[Any]()
-
-    @contextmanager
-    def __call__(self, inputs: Any, *others: Hashable) -> Iterator[Any]:
-        """Prepare inputs and run what is compiled inside on them; `others` is all that their structure depends on."""
-        kind = others, *_kinds(inputs)
-        known = kind in self._known
-        if not known:
-            inputs = self._prepare(inputs)
-            kind = others, *_kinds(inputs)
-        with torch.compiler.set_stance(skip_guard_eval_unsafe=known or kind in self._known):
-            yield inputs
-        self._known.add(kind)
-
-
-def _kinds(inputs: Any) -> Iterator[Hashable]:
-    return ((x.shape, x.stride(), x.dtype, x.device, x.requires_grad) for x in tree.leaves(inputs))
-
-
-=======
->>>>>>> speed8
 class Recordings:
     """The steps that were recorded or used last."""
 
