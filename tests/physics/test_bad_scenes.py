@@ -224,3 +224,26 @@ def test_limits_are_those_of_the_discrete_rod(term):
 def test_parameters_are_checked_against_the_step_when_asked():
     scene, params, _ = make(rope(), effects("bend"), dt=1e-3)
     assert isinstance(params, Params) and limits(scene, params)["bending"] > 1e-3 / 5
+
+
+def test_controls_and_states_of_other_scenes_are_refused_in_a_sentence():
+    scene, params, state = make(rope(), effects("gravity"), prescribed_vertices=(0,))
+    control = stationary_control(scene, state)
+
+    def given(pos) -> Control:
+        return tree.replace(control, pos=pos)
+
+    with pytest.raises(ValueError, match=re.escape("control: pos and director are ((1, 2), (0, 3))")):
+        step(scene, params, state, given(control.pos[:, :2]))
+    with pytest.raises(ValueError, match=re.escape("batches (3,) and (), the state is of ()")):
+        step(scene, params, state, given(control.pos.expand(3, 1, 3)))
+    with pytest.raises(TypeError, match="control: pos and director are ndarray, Tensor"):
+        step(scene, params, state, given(control.pos.numpy()))
+    other = make(rope(positions=straight(4)), effects("gravity"))[2]
+    with pytest.raises(ValueError, match="state: it has 4 vertices and no bodies, the scene 6 and none"):
+        step(scene, params, other, control)
+    many = make(rope(positions=X.expand(2, -1, 3)), effects("gravity"), prescribed_vertices=(0,))
+    pos = stationary_control(scene, many[2]).pos
+    assert step(*many, given(pos)).rods.pos.shape == step(*many, control).rods.pos.shape == (2, 6, 3)
+    with pytest.raises(ValueError, match=re.escape("batches (3,) and (), the state is of (2,)")):
+        step(*many, given(pos[:1].expand(3, 1, 3)))

@@ -101,7 +101,8 @@ def _arm(said: RobotSpec, here: str, folder: Path, d: SceneDescription) -> Arm:
     time = times(d)
     shift, first = motion(said.keyframes, said.path, time), robots.tool_pose(robot, start)
     target = Pose(first.pos + shift.pos, multiply(shift.quat, first.quat.expand_as(shift.quat)))
-    found = inverse_kinematics.solve_ik(robot, target, start.expand(len(time), -1), posture=start)
+    follow = inverse_kinematics.IkSearch()
+    found = inverse_kinematics.solve_ik(robot, target, start.expand(len(time), -1), search=follow, posture=start)
     _check_reach(f"{here}.keyframes", found, time)
     joints = torch.cat([start[None], found.joints])
     speed = (joints[1:] - joints[:-1]).abs() / d.dt

@@ -108,5 +108,7 @@ def explain_diagnostics(missed: Tensor) -> str:
         )
     if others[1:] and others[1] > 0:
         left = f"{others[1]:.0%} of its forces unbalanced"
-        return f"a step with contact left {left}; shorten dt, or take explicit steps with contact by sweeps"
+        # Single precision leaves rounding of positions, over the square of a substep.
+        cure = "shorten dt" if missed.dtype == torch.float64 else "take substeps of a millisecond, or double precision"
+        return f"a step with contact left {left}; {cure}, or take explicit steps with contact by sweeps"
     return ""

@@ -43,6 +43,8 @@ STILL = 1e-9
 """Damping that stays when the tool is there [m^2]."""
 SEEDS = 8
 """Starts of a restart."""
+_RESTARTS = 16
+"""Restarts where nothing is said and joints may go anywhere."""
 
 
 @dataclass(frozen=True)
@@ -394,7 +396,7 @@ def solve_ik(
     target: Pose,
     start: Tensor,
     *,
-    search: IkSearch = IkSearch(),
+    search: IkSearch | None = None,
     posture: Tensor | None = None,
     within_time: float | None = None,
     position_only: bool = False,
@@ -408,13 +410,17 @@ def solve_ik(
         robot: the robot.
         target: the wanted pose of the tool in the world, shapes (..., 3) and (..., 4).
         start: joint positions to start from [rad or m], shape (..., J); joints that do not move the tool stay there.
-        search: how hard to look.
+        search: how hard to look. If not given, what is not there and settled begins again up to 16 times, from other
+            postures, too, which may lead to another branch and takes 0.1 s out of reach; for paths, and with
+            `within_time`, one start is right: `IkSearch()`.
         posture: where joints would like to be [rad or m], shape (..., J); the middle of their ranges if not given.
         within_time: if given, joints go no further than their greatest speeds allow in that time [s].
         position_only: whether the tool may be turned in any way; the orientation of the target is not looked at then,
             postures seldom settle, and derivatives are not to be relied on.
     """
     check_joints(robot, start)
+    if search is None:
+        search = IkSearch() if within_time is not None else IkSearch(restarts=_RESTARTS)
     given = start.dtype
     problem, start, batch = _pose(robot, target, start, posture, within_time)
     problem = dataclasses.replace(problem, turns=not position_only)
