@@ -15,6 +15,7 @@ from torch import Tensor
 
 from torchdlo.agents.rl.disturbances import drawn_params
 from torchdlo.envs import Task
+from torchdlo.envs.core.episode import EpisodeState
 from torchdlo.errors import InputError
 from torchdlo.physics.execution import Execution
 
@@ -121,6 +122,7 @@ class TaskEpisodes:
         ends: bool = True,
         scale: float = 1.0,
         bonus: float = 0.0,
+        barrier: float = 0.0,
         randomize: dict[str, float] | None = None,
         disturbed: float = 0.0,
         device: torch.device | str = "cpu",
@@ -139,6 +141,8 @@ class TaskEpisodes:
             ends: whether what an end lacks to success is subtracted from the last reward.
             scale: what rewards are multiplied by.
             bonus: what success earns at the end, after scaling.
+            barrier: what an action costs, after scaling, after which a rope is stretched as far as the task allows; it
+                grows from half of that on as the square.
             randomize: see `torchdlo.envs.make`.
             disturbed: by how much friction and stiffness of ropes differ from scene to scene, as shares of their own;
                 drawn at every reset.
@@ -164,7 +168,7 @@ class TaskEpisodes:
         )
         self.task, self.count, self.horizon = task, count, task.horizon
         self.generator = self.env.generator
-        self.ends, self.scale, self.bonus = ends, scale, bonus
+        self.ends, self.scale, self.bonus, self.barrier = ends, scale, bonus, barrier
         if disturbed and randomize:
             raise InputError("randomize and disturbed: both draw friction anew; give one of them.")
         self.disturbed, self._usual = disturbed, self.env.episode.params
@@ -218,7 +222,16 @@ class TaskEpisodes:
             if self.ends:
                 reward = reward - self.scale * episode.terminal_costs(self.task, world).float()
             reward = reward + self.bonus * success
+        if self.barrier:
+            reward = reward - self.barrier * torch.where(world.failed, 0.0, self._tension(world)).float()
         return Transition(episode.observe(env.episode, world), reward, world.failed, success)
+
+    def _tension(self, world: EpisodeState) -> Tensor:
+        """Return how near ropes are to tearing: 0 up to half of the stretch that is allowed, 1 at all of it, (N,)."""
+        seen = world.seen(self.task.arms.count)
+        now = self.task.rest(seen, self.env.episode.scene.topology)
+        used = (now / seen.notes["rest"] - 1) / (self.task.stretch - 1)
+        return (2 * used - 1).clamp(min=0).square().sum(-1)
 
     def detach(self) -> None:
         """Cut the history of gradients."""
