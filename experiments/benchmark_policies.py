@@ -114,10 +114,8 @@ def run(name: str, algo: str, seed: int, chosen: Any) -> None:
     else:
         given |= {"episodes": chosen.episodes, "fidelity": chosen.fidelity, "count": chosen.count}
         settings = training_preset(name, algo, **given, **json.loads(chosen.settings))
-        # Compiling takes half a minute, and halves the time of a step with its gradient.
-        trainer, played = prepare_training(
-            task, settings, execution="compiled" if algo in ("shac", "sapo") else None
-        )
+        # Compiling takes half a minute, and halves the time of a step.
+        trainer, played = prepare_training(task, settings, execution="compiled")
         resume = (folder / "checkpoint.pt").exists()
         found = train(trainer, played, settings, folder=folder, resume=resume, callback=told)
         (folder / "result.json").write_text(train_json(task, settings, found))
