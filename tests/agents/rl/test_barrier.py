@@ -66,10 +66,11 @@ def test_it_grows_from_half_of_the_stretch_that_is_allowed():
     torch.testing.assert_close(made.returns, plain.returns, rtol=0, atol=0)  # what the task pays is the same
 
 
-def test_episodes_that_tore_neither_earn_nor_pay():
-    made, _, found = pulled(3.0, [0.004, 0.008])
+def test_episodes_that_tore_pay_once_for_all_actions_that_are_left():
+    made, action, found = pulled(3.0, [0.004, 0.008])
     assert made.env.world.failed.tolist() == [False, True]
-    assert found[-1][1] == 0
+    assert [float(reward[1]) for reward in found][1] == -3.0 * 5  # in the second of six actions
+    assert made.step(action).reward[1] == 0
 
 
 @pytest.mark.parametrize(("barrier", "sign"), [(0.0, 1), (3.0, -1)])

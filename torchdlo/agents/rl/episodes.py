@@ -119,7 +119,7 @@ class TaskEpisodes:
         gradients: bool = False,
         execution: Execution | None = None,
         dtype: torch.dtype = torch.float32,
-        ends: bool = True,
+        ends: float = 1.0,
         scale: float = 1.0,
         bonus: float = 0.0,
         barrier: float = 0.0,
@@ -138,11 +138,11 @@ class TaskEpisodes:
             execution: how steps run; if not given, compiled on a GPU, and on the CPU eager with gradients and else as
                 `quick_execution` says.
             dtype: of the physics.
-            ends: whether what an end lacks to success is subtracted from the last reward.
+            ends: what share of what an end lacks to success is subtracted from the last reward.
             scale: what rewards are multiplied by.
             bonus: what success earns at the end, after scaling.
             barrier: what an action costs, after scaling, after which a rope is stretched as far as the task allows; it
-                grows from half of that on as the square.
+                grows from half of that on as the square. An episode that fails pays it for each action that is left.
             randomize: see `torchdlo.envs.make`.
             disturbed: by how much friction and stiffness of ropes differ from scene to scene, as shares of their own;
                 drawn at every reset.
@@ -213,6 +213,7 @@ class TaskEpisodes:
         """Do actions (N, 6 R) in metres and degrees."""
         from torchdlo.envs.core import episode
 
+        before = self.env.world.failed
         step, env = self.env.advance(action), self.env
         self._over += 1
         plain, world = step.reward.float(), step.world
@@ -220,10 +221,12 @@ class TaskEpisodes:
         reward, success = self.scale * plain, episode.successes(self.task, world)
         if self._over == self.horizon:
             if self.ends:
-                reward = reward - self.scale * episode.terminal_costs(self.task, world).float()
+                reward = reward - self.ends * self.scale * episode.terminal_costs(self.task, world).float()
             reward = reward + self.bonus * success
         if self.barrier:
-            reward = reward - self.barrier * torch.where(world.failed, 0.0, self._tension(world)).float()
+            # Failing must not cost less than all that would have been left to pay.
+            left = (1 + self.horizon - self._over) * (world.failed & ~before)
+            reward = reward - self.barrier * torch.where(world.failed, left, self._tension(world)).float()
         return Transition(episode.observe(env.episode, world), reward, world.failed, success)
 
     def _tension(self, world: EpisodeState) -> Tensor:

@@ -86,10 +86,10 @@ class TrainingSettings:
     bonus: float = 0.0
     """What success earns beside the reward, where the sum of an episode's rewards is about 10."""
     barrier: float = 0.0
-    """What an action costs after which a rope is stretched as far as its task allows, growing from half of that on:
-    where it fails, nothing has a gradient that says so. In units of `bonus`."""
-    ends: bool = True
-    """Whether what the end lacks to success is subtracted from the return."""
+    """What an action costs after which a rope is stretched as far as its task allows, growing from half of that on; an
+    episode that fails pays it for each action that is left. In units of `bonus`."""
+    ends: float = 1.0
+    """What share of what the end lacks to success is subtracted from the return."""
     fidelity: str = "published"
     """Fidelity of training; results are judged at the published one."""
     variation: bool = True
