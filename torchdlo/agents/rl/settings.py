@@ -80,6 +80,9 @@ class TrainingSettings:
     """Minibatches of these passes."""
     entropy_rate: float = 5e-3
     """Step of SAPO's temperature."""
+    temperature: float = 0.02
+    """What SAPO pays for entropy at first. An action that is worth its share of a success earns 0.1, so that much more
+    would hide it for hundreds of windows."""
     tame: float = 10.0
     """Greatest norm of a scene's gradient with respect to one action, times the size of the batch and the window; 0:
     none is cut. Contact makes a few that dwarf all others."""
@@ -122,6 +125,7 @@ class TrainingSettings:
         need(0 < self.gamma <= 1, "gamma", "a discount above 0, at most 1")
         need(self.window >= 1, "window", "at least 1 action")
         need(self.sigma > 0, "sigma", "a positive number")
+        need(self.temperature > 0, "temperature", "a positive number")
 
 
 _ALGORITHM: dict[str, dict[str, Any]] = {
