@@ -13,6 +13,7 @@ from torch import Tensor
 pytest.importorskip("torchrl")
 
 from torchdlo.agents.rl.episodes import TaskEpisodes
+from torchdlo.agents.rl.settings import training_preset
 from torchdlo.envs.core import curve_geometry
 from torchdlo.envs.core.task import RADIUS, Arms, Task, TaskState, make, straight
 from torchdlo.scene import Params, Rope, Scene, State
@@ -78,3 +79,14 @@ def test_its_gradient_leads_away_from_tearing(barrier: float, sign: int):
     _, action, rewards = pulled(barrier, [0.004], gradients=True)
     (gradient,) = torch.autograd.grad(rewards[-1].sum(), action)
     assert gradient[0, 3].sign() == sign
+
+
+def test_published_tasks_begin_with_it_where_gradients_do_not_say_what_failing_costs():
+    assert training_preset("unknotting", "shac").barrier == training_preset("unknotting", "sapo").barrier == 0.2
+    assert training_preset("unknotting", "ppo").barrier == training_preset("unknotting", "hybrid").barrier == 0
+
+
+def test_what_the_end_of_coiling_lacks_does_not_dwarf_what_it_earns():
+    """It is up to 100, and the return of a success 12: critics do not reach -80 within hundreds of steps."""
+    assert training_preset("coiling", "shac").ends == 0.1
+    assert training_preset("coiling", "shac", ends=1.0).ends == training_preset("coiling", "hybrid").ends == 1

@@ -131,10 +131,12 @@ class TrainingSettings:
 _ALGORITHM: dict[str, dict[str, Any]] = {
     "ppo": {},
     "sac": {"polyak": 0.995, "sigma": 0.5},
-    "shac": {"rate": 2e-3, "polyak": 0.8},
-    "sapo": {"rate": 2e-3, "activation": "silu", "layer_norm": True, "sigma": 0.3},
+    "shac": {"rate": 2e-3, "polyak": 0.8, "barrier": 0.2},
+    "sapo": {"rate": 2e-3, "activation": "silu", "layer_norm": True, "sigma": 0.3, "barrier": 0.2},
     "hybrid": {"episodes": 4_000, "count": 128, "hidden": (256, 128, 64), "sigma": 0.15, "rate": 1e-4, "bonus": 5.0},
 }
+_ENDS = {"coiling": 0.1}
+"""Shares of what ends lack to success where that is many times what an episode earns, for algorithms without stages."""
 
 
 def training_preset(task: str, algorithm: str, **given: Any) -> TrainingSettings:
@@ -142,6 +144,8 @@ def training_preset(task: str, algorithm: str, **given: Any) -> TrainingSettings
     if algorithm not in ALGORITHMS:
         raise InputError(f"algorithm is {algorithm!r}; expected one of {', '.join(ALGORITHMS)}.")
     base: dict[str, Any] = {"algorithm": algorithm, "episodes": EPISODES.get(task, 20_000)} | _ALGORITHM[algorithm]
+    if algorithm != "hybrid":
+        base["ends"] = _ENDS.get(task, 1.0)
     wanted = {name: value for name, value in given.items() if value is not None}
     names = {f.name for f in dataclasses.fields(TrainingSettings)}
     other = sorted(set(wanted) - names)
