@@ -143,8 +143,10 @@ def pack(out: Path, file: Path) -> None:
 
     with replace_atomically(file) as scratch, zipfile.ZipFile(scratch, "w") as archive:
         for folder in sorted(p.parent for p in out.glob("*/evaluation.json")):
-            # What each seed came to, and the weights of the first.
-            for name in KEPT if folder.name.endswith("-0") else JUDGED:
+            # What each seed came to, and the weights of the first if they ever succeed.
+            judged = json.loads((folder / "evaluation.json").read_text())
+            useful = judged.get("varied", {"success": 1.0})["success"] > 0
+            for name in KEPT if folder.name.endswith("-0") and useful else JUDGED:
                 if (folder / name).exists():
                     found = rounded(folder / name) if name == "policy.pt" else (folder / name).read_bytes()
                     archive.writestr(zipfile.ZipInfo(f"{folder.name}/{name}"), found, zipfile.ZIP_DEFLATED, 9)
