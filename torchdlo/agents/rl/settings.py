@@ -80,9 +80,9 @@ class TrainingSettings:
     """Minibatches of these passes."""
     entropy_rate: float = 5e-3
     """Step of SAPO's temperature."""
-    temperature: float = 0.02
-    """What SAPO pays for entropy at first. An action that is worth its share of a success earns 0.1, so that much more
-    would hide it for hundreds of windows."""
+    temperature: float = 0.002
+    """What SAPO pays for entropy at first. An action of a success earns 0.1 and one of doing nothing 0.01: much more
+    would hide what is earned for hundreds of windows."""
     tame: float = 10.0
     """Greatest norm of a scene's gradient with respect to one action, times the size of the batch and the window; 0:
     none is cut. Contact makes a few that dwarf all others."""
