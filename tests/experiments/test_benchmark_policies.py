@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import json
 import sys
+import zipfile
 from pathlib import Path
 
 import pytest
@@ -59,3 +60,15 @@ def test_clouds_and_perturbations_have_tables_of_their_own(script, tmp_path: Pat
     assert len(script.rows(file)) == 1
     assert "| wiring_post | usual | 60% of 15 | 36% to 80% | 192 |" in script.clouds(file)
     assert "| noise | 50% |" in script.robustness(file)
+
+
+def test_weights_that_never_succeed_are_left_out(script, tmp_path: Path):
+    import torch
+
+    for name, success in (("a-ppo-0", 0.0), ("b-ppo-0", 0.2), ("b-ppo-1", 0.2)):
+        stored(tmp_path / name, success, int(name[-1]))
+        torch.save({"state": {"weight": torch.ones(2, 2)}}, tmp_path / name / "policy.pt")
+    script.pack(tmp_path, file := tmp_path / "all.zip")
+    with zipfile.ZipFile(file) as archive:
+        assert [n for n in archive.namelist() if n.endswith(".pt")] == ["b-ppo-0/policy.pt"]
+        assert "a-ppo-0/result.json" in archive.namelist()

@@ -90,3 +90,11 @@ def test_wild_scenes_are_tamed_before_scenes_are_averaged():
     large = torch.autograd.grad(loss_of(plain, other), list(plain.policy.parameters()))
     assert sum(g.square().sum() for g in small) < 0.01 * sum(g.square().sum() for g in large)
     assert float(torch.stack(made.lost).max()) > 0 == float(torch.stack(plain.lost).max())
+
+
+def test_entropy_is_worth_less_than_what_actions_earn_at_first():
+    """An entropy of a unit per action earns less than an action of a success, a hundredth of a scaled return of 10."""
+    made, _ = trainer(Sapo)
+    assert float(made.temperature) == pytest.approx(0.002)
+    made, _ = trainer(Sapo, temperature=0.5)
+    assert float(made.temperature) == pytest.approx(0.5)

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from torchdlo.agents.rl.disturbances import drawn_params
 from torchdlo.envs import Task
+from torchdlo.envs.core.episode import EpisodeState
 from torchdlo.errors import InputError
 from torchdlo.physics.execution import Execution
 
@@ -118,9 +119,10 @@ class TaskEpisodes:
         gradients: bool = False,
         execution: Execution | None = None,
         dtype: torch.dtype = torch.float32,
-        ends: bool = True,
+        ends: float = 1.0,
         scale: float = 1.0,
         bonus: float = 0.0,
+        barrier: float = 0.0,
         randomize: dict[str, float] | None = None,
         disturbed: float = 0.0,
         device: torch.device | str = "cpu",
@@ -136,9 +138,11 @@ class TaskEpisodes:
             execution: how steps run; if not given, compiled on a GPU, and on the CPU eager with gradients and else as
                 `quick_execution` says.
             dtype: of the physics.
-            ends: whether what an end lacks to success is subtracted from the last reward.
+            ends: what share of what an end lacks to success is subtracted from the last reward.
             scale: what rewards are multiplied by.
             bonus: what success earns at the end, after scaling.
+            barrier: what an action costs, after scaling, after which a rope is stretched as far as the task allows; it
+                grows from half of that on as the square. An episode that fails pays it for each action that is left.
             randomize: see `torchdlo.envs.make`.
             disturbed: by how much friction and stiffness of ropes differ from scene to scene, as shares of their own;
                 drawn at every reset.
@@ -164,7 +168,7 @@ class TaskEpisodes:
         )
         self.task, self.count, self.horizon = task, count, task.horizon
         self.generator = self.env.generator
-        self.ends, self.scale, self.bonus = ends, scale, bonus
+        self.ends, self.scale, self.bonus, self.barrier = ends, scale, bonus, barrier
         if disturbed and randomize:
             raise InputError("randomize and disturbed: both draw friction anew; give one of them.")
         self.disturbed, self._usual = disturbed, self.env.episode.params
@@ -209,6 +213,7 @@ class TaskEpisodes:
         """Do actions (N, 6 R) in metres and degrees."""
         from torchdlo.envs.core import episode
 
+        before = self.env.world.failed
         step, env = self.env.advance(action), self.env
         self._over += 1
         plain, world = step.reward.float(), step.world
@@ -216,9 +221,20 @@ class TaskEpisodes:
         reward, success = self.scale * plain, episode.successes(self.task, world)
         if self._over == self.horizon:
             if self.ends:
-                reward = reward - self.scale * episode.terminal_costs(self.task, world).float()
+                reward = reward - self.ends * self.scale * episode.terminal_costs(self.task, world).float()
             reward = reward + self.bonus * success
+        if self.barrier:
+            # Failing must not cost less than all that would have been left to pay.
+            left = (1 + self.horizon - self._over) * (world.failed & ~before)
+            reward = reward - self.barrier * torch.where(world.failed, left, self._tension(world)).float()
         return Transition(episode.observe(env.episode, world), reward, world.failed, success)
+
+    def _tension(self, world: EpisodeState) -> Tensor:
+        """Return how near ropes are to tearing: 0 up to half of the stretch that is allowed, 1 at all of it, (N,)."""
+        seen = world.seen(self.task.arms.count)
+        now = self.task.rest(seen, self.env.episode.scene.topology)
+        used = (now / seen.notes["rest"] - 1) / (self.task.stretch - 1)
+        return (2 * used - 1).clamp(min=0).square().sum(-1)
 
     def detach(self) -> None:
         """Cut the history of gradients."""

@@ -58,6 +58,7 @@ def prepare_training(
         ends=settings.ends,
         scale=_scale(task),
         bonus=settings.bonus,
+        barrier=settings.barrier,
         device=device,
     )
     if not settings.collectors:

@@ -80,13 +80,19 @@ class TrainingSettings:
     """Minibatches of these passes."""
     entropy_rate: float = 5e-3
     """Step of SAPO's temperature."""
+    temperature: float = 0.002
+    """What SAPO pays for entropy at first. An action of a success earns 0.1 and one of doing nothing 0.01: much more
+    would hide what is earned for hundreds of windows."""
     tame: float = 10.0
     """Greatest norm of a scene's gradient with respect to one action, times the size of the batch and the window; 0:
     none is cut. Contact makes a few that dwarf all others."""
     bonus: float = 0.0
     """What success earns beside the reward, where the sum of an episode's rewards is about 10."""
-    ends: bool = True
-    """Whether what the end lacks to success is subtracted from the return."""
+    barrier: float = 0.0
+    """What an action costs after which a rope is stretched as far as its task allows, growing from half of that on; an
+    episode that fails pays it for each action that is left. In units of `bonus`."""
+    ends: float = 1.0
+    """What share of what the end lacks to success is subtracted from the return."""
     fidelity: str = "published"
     """Fidelity of training; results are judged at the published one."""
     variation: bool = True
@@ -119,15 +125,18 @@ class TrainingSettings:
         need(0 < self.gamma <= 1, "gamma", "a discount above 0, at most 1")
         need(self.window >= 1, "window", "at least 1 action")
         need(self.sigma > 0, "sigma", "a positive number")
+        need(self.temperature > 0, "temperature", "a positive number")
 
 
 _ALGORITHM: dict[str, dict[str, Any]] = {
     "ppo": {},
     "sac": {"polyak": 0.995, "sigma": 0.5},
-    "shac": {"rate": 2e-3, "polyak": 0.8},
-    "sapo": {"rate": 2e-3, "activation": "silu", "layer_norm": True, "sigma": 0.3},
+    "shac": {"rate": 2e-3, "polyak": 0.8, "barrier": 0.2},
+    "sapo": {"rate": 2e-3, "activation": "silu", "layer_norm": True, "sigma": 0.3, "barrier": 0.2},
     "hybrid": {"episodes": 4_000, "count": 128, "hidden": (256, 128, 64), "sigma": 0.15, "rate": 1e-4, "bonus": 5.0},
 }
+_ENDS = {"coiling": 0.1}
+"""Shares of what ends lack to success where that is many times what an episode earns, for algorithms without stages."""
 
 
 def training_preset(task: str, algorithm: str, **given: Any) -> TrainingSettings:
@@ -135,6 +144,8 @@ def training_preset(task: str, algorithm: str, **given: Any) -> TrainingSettings
     if algorithm not in ALGORITHMS:
         raise InputError(f"algorithm is {algorithm!r}; expected one of {', '.join(ALGORITHMS)}.")
     base: dict[str, Any] = {"algorithm": algorithm, "episodes": EPISODES.get(task, 20_000)} | _ALGORITHM[algorithm]
+    if algorithm != "hybrid":
+        base["ends"] = _ENDS.get(task, 1.0)
     wanted = {name: value for name, value in given.items() if value is not None}
     names = {f.name for f in dataclasses.fields(TrainingSettings)}
     other = sorted(set(wanted) - names)

@@ -8,6 +8,7 @@ those of others, are cut with respect to each action, before scenes are averaged
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
@@ -104,7 +105,7 @@ class Shac:
         self.critic = nn.ModuleList(Critic(policy, settings) for _ in range(self.critics))
         self.target = nn.ModuleList(Critic(policy, settings) for _ in range(self.critics))
         self.target.load_state_dict(self.critic.state_dict())
-        self.log_temperature = nn.Parameter(torch.zeros(()))
+        self.log_temperature = nn.Parameter(torch.tensor(math.log(settings.temperature)))
         betas = (0.7, 0.95)
         self.optimizer = torch.optim.Adam(policy.parameters(), lr=settings.rate, betas=betas)
         self.critic_optimizer = torch.optim.Adam(self.critic.parameters(), lr=settings.critic_rate, betas=betas)

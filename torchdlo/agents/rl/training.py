@@ -216,9 +216,10 @@ def _restore(
     content = load_checkpoint(path)
     if content is None:
         raise InputError(f"{path}: the checkpoint is damaged; leave out --resume.")
-    was = {"device": "cpu"} | json.loads(content["settings"])  # those of 0.1 did not say
+    was = {"device": "cpu", "barrier": 0.0} | json.loads(content["settings"])  # those of 0.1 did not say
     now = json.loads(json.dumps(asdict(settings)))
-    free = ("episodes", "minutes", "interval")  # how long to go on may change
+    # How long to go on may change, and a temperature goes on from where it was.
+    free = ("episodes", "minutes", "interval", "temperature")
     other = [f"{k} {was.get(k)} (now {now[k]})" for k in now if k not in free and was.get(k) != now[k]]
     if other:
         raise InputError(f"{path}: it belongs to a run with {', '.join(other)}; give the same, or leave out --resume.")
