@@ -36,7 +36,15 @@ from torchdlo.physics.execution.gradient_check import GradientCheck, check_gradi
 from torchdlo.physics.execution.graphs import Graphs
 from torchdlo.physics.execution.replay import alike, rollout
 from torchdlo.physics.integrators import stability
-from torchdlo.physics.integrators.rod_step import INTEGRATORS, TWISTS, Settings, settle_twist, substep, with_joints
+from torchdlo.physics.integrators.rod_step import (
+    CONTACTS,
+    INTEGRATORS,
+    TWISTS,
+    Settings,
+    settle_twist,
+    substep,
+    with_joints,
+)
 from torchdlo.physics.kernels import native
 from torchdlo.physics.rod import assembly, validation
 from torchdlo.physics.rod import kinematics as rod
@@ -73,7 +81,7 @@ class State:
     diagnostics: Tensor
     """What steps missed since the start, zeros if all is well: contacts without room [1], by how much vertices were
     faster than foreseen [m], by what share an edge was too short and too long [1], and what
-    share of its forces an implicit step with contact left unbalanced [1], shape (..., 1, 5)."""
+    share of its forces a step with coupled contact left unbalanced [1], shape (..., 1, 5)."""
     reaction: Reaction
     """What holds exerted on the ropes in the last step, its mean."""
     bodies: BodyState | tuple[()] = ()
@@ -140,6 +148,9 @@ class Scene:
     """Elastic, plastic, liquid or granular matter."""
     joints: Joints | None = None
     """What ropes are joined to, as `make` found it."""
+    contact: Literal["sweeps", "coupled"] = "sweeps"
+    """How explicit steps find contact of ropes: by "sweeps" before edge lengths, or "coupled" with them in one solve,
+    as implicit steps do. Take the second for taut ropes over bodies, and for friction of such."""
 
     def __post_init__(self) -> None:
         def need(ok: bool, sentence: str) -> None:
@@ -147,6 +158,7 @@ class Scene:
                 raise ValueError(f"scene: {sentence}")
 
         need(self.integrator in INTEGRATORS, f"integrator is {self.integrator!r}; expected one of {INTEGRATORS}")
+        need(self.contact in CONTACTS, f"contact is {self.contact!r}; expected one of {CONTACTS}")
         need(self.twist in TWISTS, f"twist is {self.twist!r}; expected one of {TWISTS}")
         need(isinstance(self.dt, int | float) and 0 < self.dt < math.inf, f"dt is {self.dt!r}; give seconds above 0")
         need(self.substeps in range(1, 10**6), f"substeps is {self.substeps!r}; expected a whole number from 1 up")
@@ -219,7 +231,8 @@ class Scene:
             # Twist and bending answer to each other only in the next step: that costs stability.
             max(self.implicit_weight, 0.5) if self.twist == "dynamic" else self.implicit_weight,
             self.numerical_damping,
-            *(() if self.joints is None else (self.joints.edges, self.joints.frames)),
+            *(((), ()) if self.joints is None else (self.joints.edges, self.joints.frames)),
+            self.contact,
         )
 
 
@@ -324,6 +337,8 @@ def _settled(scene: Scene, params: Params, first: State) -> State:
 def _mention(scene: Scene, state: RodState) -> None:
     """Say once which things of a scene go through each other because no effect keeps them apart."""
     names, topology = {e.name for e in scene.effects}, scene.topology
+    if scene.joints is not None:
+        mention_sweeps(scene)
     if scene.bodies and not names & {"rod_body", "finger_pads"}:
         notices.once("rod_body", "scene: ropes go through its bodies; add RodBody if they are to touch.")
     if "rod_contact" in names or len(topology.counts) < 2:
@@ -346,6 +361,18 @@ def _mention(scene: Scene, state: RodState) -> None:
             "rod_contact",
             f"scene: ropes {one} and {other} go through each other; add RodContact if they are to touch.",
         )
+
+
+def mention_sweeps(scene: Scene) -> None:
+    """Say once that ropes that carry something are not best found by sweeps, if they are."""
+    if scene.bodies and scene.integrator == "explicit" and not scene.settings.coupled:
+        if any(e.engages for e in scene.effects):
+            notices.once(
+                "sweeps",
+                "scene: a rope carries something among bodies; where it hangs over one, its tension rings in explicit "
+                "steps that find contact by sweeps, and friction is wrong. Give contact='coupled' (or "
+                "integrator='implicit').",
+            )
 
 
 def limits(scene: Scene, params: Params) -> dict[str, float]:

@@ -13,8 +13,10 @@ from torchdlo.sysid.diagnosis.workspace import CHAIN
 from torchdlo.sysid.estimation.observation import FilmView
 from torchdlo.sysid.model.rope_model import RopeModel
 from torchdlo.sysid.recordings.recording import Recording, Trial, load_recording
-from torchdlo.sysid.video.filmed_diagnosis import NEAR, _Films, _nearer, _scores
+from torchdlo.sysid.video.filmed_beginnings import NEAR, nearer
+from torchdlo.sysid.video.filmed_diagnosis import _scores
 from torchdlo.sysid.video.filmed_fit import film_gaps, fit
+from torchdlo.sysid.video.filmed_model import Films
 from torchdlo.sysid.video.filmed_problem import FilmedProblem, add_correction, filmed_problem, start_of
 from torchdlo.sysid.video.films import with_stations
 from torchdlo.vision.camera import lens, looking_at, project
@@ -101,8 +103,8 @@ def test_beginnings_lead_to_a_mass_that_is_missing() -> None:
     first = np.concatenate([whole.fixed, np.zeros(8)])
     best = fit(whole, whole.space.to_raw(first), 8)
     assert film_gaps(whole, best).max() > NEAR
-    films = _Films(whole, whole.trials, list(whole.spines.views))
-    base = _nearer(films, best, lambda *_: None)
+    films = Films(whole, whole.trials, list(whole.spines.views))
+    base = nearer(films, best, lambda *_: None)
     assert base.own.lasts < whole.lasts
     names = ["point_mass", "nonuniform_stiffness", "rest_curvature", "air_drag", "gripper_compliance"]
     lead = _scores(base, names, base.own.lasts, lambda *_: None)[0]

@@ -29,7 +29,7 @@ def test_a_diagnosis_of_films_says_what_it_found(tmp_path: Path, monkeypatch: py
     recording = load_recording(tmp_path / "rope")
     monkeypatch.setattr(filmed_diagnosis, "FILMED_STARTS", 4)
     monkeypatch.setattr(filmed_diagnosis, "SILENT", 0.0)
-    monkeypatch.setattr(filmed_diagnosis, "_chained", lambda model: model)
+    monkeypatch.setattr(filmed_diagnosis, "chained", lambda model: model)
     monkeypatch.setitem(BUDGETS, "fast", Budget(4, 1, 1, 1, 1))
     found = diagnose(recording, without=[n for n in library() if n not in ("air_drag", "point_mass")])
     (candidates,) = found.candidates

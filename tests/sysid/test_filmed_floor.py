@@ -14,8 +14,9 @@ from torchdlo.errors import InputError
 from torchdlo.sysid.diagnosis.error_floor import ErrorFloor
 from torchdlo.sysid.diagnosis.verdict import UNKNOWN_FLOOR
 from torchdlo.sysid.recordings.recording import load_recording
-from torchdlo.sysid.video import filmed, filmed_diagnosis
-from torchdlo.sysid.video.filmed_diagnosis import NEAR, _alike, _far, _left_out, _rescaled, _verdict
+from torchdlo.sysid.video import filmed, filmed_beginnings
+from torchdlo.sysid.video.filmed_beginnings import NEAR, alike, left_out
+from torchdlo.sysid.video.filmed_diagnosis import _far, _rescaled, _verdict
 from torchdlo.sysid.video.filmed_fit import Fit
 
 SAMPLE = Path(__file__).parents[2] / "torchdlo" / "data" / "sample_rope"
@@ -79,7 +80,7 @@ def test_shares_add_up_to_what_is_explained_of_the_films_that_count() -> None:
 def test_films_that_are_left_out_are_told_as_they_are() -> None:
     def said(seconds: float, gap: float) -> list[str]:
         model = SimpleNamespace(own=SimpleNamespace(lasts=seconds), gaps=lambda _: np.array([gap]))
-        return _left_out(model, SimpleNamespace(lasts=2.0))
+        return left_out(model, SimpleNamespace(lasts=2.0))
 
     assert said(2.0, 2 * NEAR) == []
     assert "over longer times no model" in said(1.0, 0.5 * NEAR)[0]
@@ -94,12 +95,12 @@ def test_a_baseline_is_a_chain_where_the_model_is_one(monkeypatch: pytest.Monkey
 
     plain, chain = model((), 2e-3), model(("air_drag", "link_chain"), 1e-3)
     lengths = []
-    monkeypatch.setattr(filmed_diagnosis, "_linked", lambda first, length: lengths.append(length) or first)
-    monkeypatch.setattr(filmed_diagnosis, "replace", lambda first, fit: model(("link_chain",), fit.cost))
+    monkeypatch.setattr(filmed_beginnings, "linked", lambda first, length: lengths.append(length) or first)
+    monkeypatch.setattr(filmed_beginnings, "replace", lambda first, fit: model(("link_chain",), fit.cost))
     for cost, better in ((1.5e-3, True), (3e-3, False)):
-        monkeypatch.setattr(filmed_diagnosis, "fit", lambda *_, cost=cost: SimpleNamespace(cost=cost, raw=None))
-        found = _alike(plain, chain)
+        monkeypatch.setattr(filmed_beginnings, "fit", lambda *_, cost=cost: SimpleNamespace(cost=cost, raw=None))
+        found = alike(plain, chain)
         assert (found is not plain) is better
     assert lengths == [-0.01, -0.01]
-    assert _alike(plain, model(("air_drag",), 1e-3)) is plain
-    assert _alike(chain, chain) is chain
+    assert alike(plain, model(("air_drag",), 1e-3)) is plain
+    assert alike(chain, chain) is chain

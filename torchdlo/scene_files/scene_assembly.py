@@ -76,7 +76,7 @@ def build(
 
 
 _STEPPING = (
-    *("dt", "substeps", "integrator", "twist", "constrained"),
+    *("dt", "substeps", "integrator", "contact", "twist", "constrained"),
     *("constraint_iterations", "implicit_weight", "numerical_damping"),
 )
 """What a description says of steps, in the words of `scene.Scene`."""
@@ -115,6 +115,8 @@ def assemble(description: SceneDescription, *, folder: str | Path = ".") -> Simu
     held |= {"material_points": _matter(d, dtype), "clamp": d.clamp}
     scene, params, state = scenes.make(ropes, effects, values, bodies=bodies, joints=joints, **held, **static)
     weight = _weights(d, counts, state.rods.pos)
+    if bool((weight > 0).any()):
+        scenes.mention_sweeps(scene)
     material = tree.replace(params.rods.material, mass=params.rods.material.mass + weight)
     params = tree.replace(params, rods=tree.replace(params.rods, material=material))
     return Simulation(scene, params, state, motion.plan(d, scene, state, armed), meshes, weight)

@@ -17,7 +17,7 @@ STRAIN = 0.05
 """By what share of its length an edge may be too short or too long before it counts; lengths are kept to 1e-5 and
 better."""
 UNSOLVED = 0.02
-"""What share of the forces an implicit step with contact may leave unbalanced before it counts."""
+"""What share of the forces a step with coupled contact may leave unbalanced before it counts."""
 WIDTH = 5
 """How many numbers tell what was missed: see `diagnostics`."""
 
@@ -108,5 +108,5 @@ def explain_diagnostics(missed: Tensor) -> str:
         )
     if others[1:] and others[1] > 0:
         left = f"{others[1]:.0%} of its forces unbalanced"
-        return f"an implicit step with contact left {left}; shorten dt, or take explicit steps"
+        return f"a step with contact left {left}; shorten dt, or take explicit steps with contact by sweeps"
     return ""

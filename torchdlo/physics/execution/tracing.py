@@ -6,6 +6,7 @@ fast as they are in eager mode. It is for simulations without gradients.
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections import OrderedDict
 from collections.abc import Callable, Hashable, Sequence
@@ -45,6 +46,7 @@ def record(step: Callable[..., Any], *inputs: Any) -> Callable[..., Any]:
         warnings.simplefilter("ignore", torch.jit.TracerWarning)
         # What `torch.jit.trace` makes is kept for as long as the process lives, some 30 MB each.
         graph, _ = torch._C._create_graph_by_tracing(run, tuple(leaves), lambda _: "", True, False, None, [])
+        numbers = _close_constants(graph)
         # Sizes are fixed: numbers made of them are computed now.
         torch._C._jit_pass_peephole(graph, True)
         torch._C._jit_pass_constant_propagation(graph)
@@ -67,12 +69,41 @@ def record(step: Callable[..., Any], *inputs: Any) -> Callable[..., Any]:
         last = tree.leaves(others[1:])
         # Nothing here has a gradient: operations need not look, which is a tenth of a step of one scene.
         with torch._C._AutoDispatchBelowAutograd():
-            found = recorded(*kept(0, first), *now, *last)
+            found = recorded(*kept(0, first), *now, *last, *numbers)
         made = rebuild[0](found)
         known[1] = made, found
         return made
 
     return replayed
+
+
+_CLOSE = 1e-6
+"""Relative difference below which TorchScript may take numbers for the same: it does up to 6e-8."""
+
+
+def _close_constants(graph: Any) -> list[torch.Tensor]:
+    """Turn numbers that are nearly another one into inputs of the graph, added behind the others; return their values.
+
+    TorchScript keeps one of them only: a velocity times 1 became one times 1 + 1e-10, in every substep.
+    """
+    moved: list[torch.Tensor] = []
+    seen: list[float] = []
+    for node in list(graph.nodes()):
+        if node.kind() != "prim::Constant" or not node.hasAttribute("value") or node.kindOf("value") != "t":
+            continue
+        value = node.t("value")
+        if value.dim() or not value.is_floating_point():
+            continue
+        number = value.item()
+        if any(number != other and math.isclose(number, other, rel_tol=_CLOSE) for other in seen):
+            given = graph.addInput()
+            given.setType(node.output().type())
+            node.output().replaceAllUsesWith(given)
+            node.destroy()
+            moved.append(value)
+        else:
+            seen.append(number)
+    return moved
 
 
 class Recordings:

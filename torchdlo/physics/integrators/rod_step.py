@@ -37,6 +37,7 @@ from torchdlo.physics.rod.prescribed import free as free_slots
 from torchdlo.physics.rod.topology import Topology, following
 
 INTEGRATORS = ("explicit", "implicit")
+CONTACTS = ("sweeps", "coupled")
 TWISTS = ("none", "dynamic", "quasistatic")
 
 
@@ -70,6 +71,13 @@ class Settings:
     """Edges of which joints carry both ends."""
     joint_frames: tuple[int, ...] = ()
     """Edges whose material frames joints carry."""
+    contact: str = "sweeps"
+    """In "explicit", whether contact is found by "sweeps", then lengths, or both "coupled", as in "implicit"."""
+
+    @property
+    def coupled(self) -> bool:
+        """Whether contact and lengths are found in one solve, and tensions follow their edges within a substep."""
+        return self.integrator == "implicit" or (self.contact == "coupled" and any(e.engages for e in self.effects))
 
     @property
     def frames(self) -> bool:
@@ -237,7 +245,7 @@ def _answered(
     would be thrown back if the rope is the heavier one.
     """
     bodies, material_points, joints = others
-    engaged = [e for e in settings.effects if e.engages and settings.integrator == "implicit"]
+    engaged = [e for e in settings.effects if e.engages and settings.coupled]
     reacting = [e for e in settings.effects if e.is_contact and e not in engaged]
     none = kick.force.new_zeros(1, 3)
     total = ContactForces(none, none, none)
@@ -293,9 +301,9 @@ def _answered(
     return pos, tension, held, total
 
 
-def yield_shares(integrator: str) -> tuple[float, float]:
-    """Return `most` and `least` of `edge_lengths.Lengths` [1]."""
-    return (1e4, 10.0) if integrator == "implicit" else (0.25, 0.25)
+def yield_shares(coupled: bool) -> tuple[float, float]:
+    """Return `most` and `least` of `edge_lengths.Lengths` [1], where tensions follow their edges or not."""
+    return (1e4, 10.0) if coupled else (0.25, 0.25)
 
 
 def _translate(
@@ -326,9 +334,11 @@ def _translate(
         active,
         rest.edge_mask,
         dt * dt / lightest,
-        *yield_shares(settings.integrator),
+        *yield_shares(settings.coupled),
     )
-    if settings.integrator == "implicit":
+    if settings.integrator == "implicit" or touch:
+        if not settings.constrained:
+            lengths = dataclasses.replace(lengths, active=0 * lengths.active)
         moved = _placed(settings, targets, kick.drift)
         return _balance(settings, now, loads, lengths, kick, moved, tension, (touch, joined))
     answer = kick.scale / kick.vertex * free
@@ -375,8 +385,10 @@ def _balance(
     tension: Tensor,
     others: tuple[Sequence[Touch | Pairs], tuple[Any, JointPoints] | None],
 ) -> tuple[Any, ...]:
-    """Return what `_translate` does for an implicit substep; arguments as in `constrain.balance`."""
+    """Return what `_translate` does where tensions follow their edges; arguments as in `constrain.balance`."""
     topology, dt, rest, vertex = settings.topology, settings.dt, now.params.rest, kick.vertex
+    if settings.integrator == "explicit":  # nothing but lengths and contact is solved for
+        loads = {}
     if "stiffness" in loads:
         vertex = vertex + settings.implicit_weight * dt * dt * loads["stiffness"]
     # Stiff forces are taken at x + ahead dt v; `share` is their answer to the change of v.

@@ -84,7 +84,7 @@ def _hanging(settings: Settings, rods: RodParams, values: dict[str, Values]) -> 
     mobile = torch.where(held > 0, torch.inf, material.mass)
     lightest = torch.minimum(mobile, following(topology, mobile))
     pull = values["gravity"]["acceleration"].norm(dim=-1, keepdim=True) * _weights(settings, material.mass)
-    firm = (yield_shares(settings.integrator)[0] * rest.length * lightest / pull).sqrt()
+    firm = (yield_shares(settings.coupled)[0] * rest.length * lightest / pull).sqrt()
     counts = (rest.edge_mask > 0) & (pull > 0)
     return {"hanging weight": float(torch.where(counts, firm, torch.inf).amin())}
 

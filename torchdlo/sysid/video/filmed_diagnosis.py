@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
-from typing import Any
+from dataclasses import replace
 
 import numpy as np
 
@@ -19,17 +18,15 @@ from torchdlo.sysid.diagnosis.budget import BUDGETS, Budget
 from torchdlo.sysid.diagnosis.error_floor import ErrorFloor, gap_rms
 from torchdlo.sysid.diagnosis.score_test import Score
 from torchdlo.sysid.diagnosis.verdict import UNKNOWN_FLOOR, Candidate, Diagnosis, verdict_word
-from torchdlo.sysid.diagnosis.workspace import CHAIN
 from torchdlo.sysid.estimation import levenberg_marquardt
 from torchdlo.sysid.estimation.jobs import Fitted
-from torchdlo.sysid.estimation.observation import FilmView, Spines
 from torchdlo.sysid.model.model_file import ModelFile
-from torchdlo.sysid.model.rope_model import MAX_SUBSTEP
-from torchdlo.sysid.recordings.recording import Recording, Trial
-from torchdlo.sysid.video.filmed import FILMED_STARTS, baseline, require_simulated, sharper, test_problem
+from torchdlo.sysid.recordings.recording import Recording
+from torchdlo.sysid.video.filmed import FILMED_STARTS, baseline
+from torchdlo.sysid.video.filmed_beginnings import NEAR, chain_note, chained, further, left_out, nearer
 from torchdlo.sysid.video.filmed_fit import Fit, film_gaps, fit, look, spread, total
-from torchdlo.sysid.video.filmed_problem import FilmedProblem, add_correction, correct, first_frames
-from torchdlo.sysid.video.filmed_starts import fit_starts
+from torchdlo.sysid.video.filmed_model import FilmedModel, Films, extended
+from torchdlo.sysid.video.filmed_problem import FilmedProblem
 from torchdlo.sysid.video.footage import views_of
 from torchdlo.sysid.video.overlay import overlays
 
@@ -51,21 +48,6 @@ MATTERS = 0.03
 
 BLUNT = 10.0
 """Times what centre lines get wrong from which what finer simulations change is no floor, but a fit that is far off."""
-
-NEAR = 5e-3
-"""Gap [m] from which a baseline is not near its films: only the beginnings of trials are then looked at."""
-
-_SHARES = (0.6, 0.35, 0.2)
-"""Shares of the time that are tried for these."""
-
-_LONGER = 1.5
-"""Times as much of the films that a model with a new effect is fitted to at once."""
-
-_FOLLOW = 6
-"""Most steps of each such fit."""
-
-_BETTER = 0.9
-"""Share of the cost that is left where the rope is taken for a chain."""
 
 _SHORT = 0.6
 """Share of the time that doses and first fits see."""
@@ -96,37 +78,6 @@ _BEHIND = 2.0
 """Times the cost of the best first fit from which another one is not followed."""
 
 
-@dataclass(eq=False)
-class _Model:
-    """A model with its fit."""
-
-    own: FilmedProblem
-    fit: Fit
-    test: FilmedProblem
-    """The same of the test trials."""
-    others: tuple[_Model, ...] = ()
-    """Where other starts ended."""
-    _tested: np.ndarray | None = field(init=False, default=None)
-
-    @property
-    def values(self) -> np.ndarray:
-        """Numbers of rope and cameras, shape (N,)."""
-        return self.own.space.to_values(self.fit.raw)
-
-    def gaps(self, split: str) -> np.ndarray:
-        """Return root mean squares of the readings of trials [m], shape (B,)."""
-        if split == "train":
-            return film_gaps(self.own, self.fit)
-        if self._tested is None:
-            here = self.test
-            if here.offset.shape[1]:
-                fit_starts(here, self.fit.raw, 3)
-            read = here.spines.read(here.simulate(self.values[None]), self.values[None, len(here.free) :])[0]
-            residual = np.where(np.isfinite(here.spines.target), read, np.nan)[:, :, : here.spines.priors.start, 0]
-            self._tested = np.sqrt(np.nanmean(residual**2, (1, 2)))
-        return self._tested
-
-
 def diagnose_filmed(
     recording: Recording,
     *,
@@ -143,10 +94,10 @@ def diagnose_filmed(
     near = np.inf if recording.still else NEAR
     own, _, best = baseline(recording, views, FILMED_STARTS, 15, seed, vertices, given, report, near)
     unseen, said = views_of(recording, recording.test, report)
-    films = _Films(own, recording.test, unseen)
-    base = _nearer(films, best, report) if film_gaps(own, best).max() > near else films.test(own, best)
+    films = Films(own, recording.test, unseen)
+    base = nearer(films, best, report) if film_gaps(own, best).max() > near else films.test(own, best)
     if given is None and not recording.still:
-        base = _chained(base)
+        base = chained(base)
         report("calibrating the baseline", 1, 1, f"{1e3 * gap_rms(base.gaps('train')):.2f} mm")
     floor, level = _floor(base)
     plan, first = BUDGETS[budget], base
@@ -178,14 +129,14 @@ def diagnose_filmed(
         ties[name] = [*rivals, *(_SAME_AT_REST if single and "curvature" in name else ())]
         base = found
         if not recording.still:
-            first, base = _further(films, first, base, given is None, report)
+            first, base = further(films, first, base, given is None, report)
             floor, level = _floor(base)
-    notes = [*notes, *said, *_left_out(base, own), *_chain_note(base)]
+    notes = [*notes, *said, *left_out(base, own), *chain_note(base)]
     shares = _rescaled(shares, first, base, floor)
     return _concluded(films, recording, first, base, floor, level, shares, ties, rounds, notes, seed, budget, begun)
 
 
-def _rescaled(shares: dict[str, float], first: _Model, final: _Model, floor: ErrorFloor) -> dict[str, float]:
+def _rescaled(shares: dict[str, float], first: FilmedModel, final: FilmedModel, floor: ErrorFloor) -> dict[str, float]:
     """Return the shares of effects so that they add up to what all of them explain of the films that count.
 
     Each was found when other lengths of the films may have been looked at; there they are compared to each other.
@@ -196,193 +147,7 @@ def _rescaled(shares: dict[str, float], first: _Model, final: _Model, floor: Err
     return {name: explained * part / sum(parts.values()) for name, part in parts.items()}
 
 
-@dataclass(frozen=True, eq=False)
-class _Films:
-    """All films of a recording."""
-
-    whole: FilmedProblem
-    """The problem of all of the train trials."""
-    trials: tuple[Trial, ...]
-    """Test trials."""
-    views: list[FilmView]
-    """What cameras saw of those."""
-
-    def test(self, own: FilmedProblem, best: Fit) -> _Model:
-        """Return a fitted model with what its numbers say of the test films, over as long a time."""
-        trials, views, seconds = self.trials, self.views, own.lasts
-        if seconds < self.whole.lasts:
-            trials = first_frames(trials, own.motion.markers.shape[1])
-            views = [v.shortened(seconds) for v in views]
-        return _Model(own, best, test_problem(own, trials, views, own.space.to_values(best.raw)))
-
-    def all_of(self, model: _Model, split: str) -> FilmedProblem:
-        """Return a model's problem of all of the time."""
-        if not model.own.lasts < self.whole.lasts:
-            return model.own if split == "train" else model.test
-        if split == "train":
-            return model.own.over(self.whole, self.whole.lasts)
-        here, model_of = model.test, model.own.model
-        spines = Spines(self.views, model_of.dt, here.extent, here.spines.free, here.spines.sure)
-        start = replace(here.start, discretisation_correction=None)
-        parts: dict[str, Any] = {
-            "trials": self.trials,
-            "motion": model_of.motion(self.trials),
-            "spines": spines,
-            "start": start,
-        }
-        return replace(here, **parts, discretisation_correction=None)
-
-
-def _nearer(films: _Films, best: Fit, report: Callback) -> _Model:
-    """Return the baseline of as much of the films' beginnings as it can stay near to.
-
-    Over longer times the answer to what is missing is so large that nothing leads back to it: other numbers have gone
-    far off to follow at all, and small doses of the right effect do not help them.
-    """
-    whole, raw = films.whole, best.raw
-    coarse = whole.with_options(substep=MAX_SUBSTEP)
-    for share in _SHARES:
-        own = coarse.over(whole, share * whole.lasts)
-        found = fit(own, raw, _FOLLOW)
-        coarse.offset = own.offset
-        report("fitting the beginnings", 1, 1, f"{own.lasts:.2f} s: {1e3 * gap_rms(film_gaps(own, found)):.2f} mm")
-        if film_gaps(own, found).max() < NEAR:
-            break
-        raw = found.raw
-    require_simulated(whole.model.recording, found)
-    found = sharper(own, found.raw, _FOLLOW)
-    return films.test(own, found)
-
-
-def _further(films: _Films, first: _Model, found: _Model, chains: bool, report: Callback) -> tuple[_Model, _Model]:
-    """Return the baseline and the model that took up an effect, over as much of the films as that stays near to.
-
-    What the lack of the effect hid is looked for, too, unless `chains` is false: whether the rope is a chain of links.
-    The baseline then becomes one as well: what links explain is no merit of the effect.
-    """
-    whole, begun_with = films.whole, found.own.lasts
-    chain = not chains or CHAIN in found.own.model.effects
-    if not chain:
-        found = _chained(found)
-        chain = CHAIN in found.own.model.effects
-    while found.own.lasts < whole.lasts:
-        own = found.own.over(whole, min(_LONGER * found.own.lasts, whole.lasts))
-        best = fit(own, found.fit.raw, _FOLLOW)
-        report("fitting longer", 1, 1, f"{own.lasts:.2f} s: {1e3 * gap_rms(film_gaps(own, best)):.2f} mm")
-        if not chain:
-            other = _chained(_Model(own, best, found.test))
-            chain = CHAIN in other.own.model.effects
-            own, best = other.own, other.fit
-        if not film_gaps(own, best).max() < NEAR:
-            break
-        found = replace(found, own=own, fit=best)
-    if found.own.lasts == begun_with:
-        return _alike(first, found), found
-    add_correction(found.own, found.values)
-    found = films.test(found.own, fit(found.own, found.fit.raw, _FOLLOW))
-    plain = first.own.over(whole, found.own.lasts)
-    # Both are compared to films with what finer simulations change.
-    add_correction(plain, first.values)
-    return _alike(films.test(plain, fit(plain, first.fit.raw, _FOLLOW)), found), found
-
-
-def _alike(first: _Model, found: _Model) -> _Model:
-    """Return the baseline as a chain of links if the model is one, unless films fit worse to that."""
-    length = _links(found)
-    if length is None or _links(first) is not None:
-        return first
-    chain = _linked(first, length)
-    chain = replace(chain, fit=fit(chain.own, chain.fit.raw, _FOLLOW))
-    return chain if chain.fit.cost < first.fit.cost else first
-
-
-def _links(model: _Model) -> float | None:
-    """Return the length of a chain's links [m], with the sign of their number; None of a rope."""
-    own = model.own
-    if CHAIN not in own.model.effects:
-        return None
-    return float(own.full(model.values[None])[0, own.model.parameters.index(f"{CHAIN}.length")])
-
-
-def _chain_note(final: _Model) -> list[str]:
-    """Return that the rope was taken for a chain of links."""
-    length = _links(final)
-    if length is None:
-        return []
-    return [
-        f"The rope moves like a chain of links of about {1e3 * abs(length):.0f} mm, as simulated ones may; what that "
-        "explains is not counted as an effect."
-    ]
-
-
-def _left_out(final: _Model, whole: FilmedProblem) -> list[str]:
-    """Return that films were not compared to their ends."""
-    if not final.own.lasts < whole.lasts:
-        return []
-    begun = f"Only the first {final.own.lasts:.2f} s of each trial count"
-    if not final.gaps("train").max() < NEAR:
-        return [f"{begun}, and even over these no model stayed within {1e3 * NEAR:.0f} mm of the films."]
-    return [f"{begun}: over longer times no model stayed within {1e3 * NEAR:.0f} mm of the films."]
-
-
-def _chained(plain: _Model) -> _Model:
-    """Return the model as a chain of links, if films fit to that much better."""
-    link = float(np.diff(plain.own.model.arclength).min())
-    sides = []
-    for length in (link, -link):
-        chain = _linked(plain, length)
-        sides.append(replace(chain, fit=fit(chain.own, chain.fit.raw, 2)))
-    best = min(sides, key=lambda s: s.fit.cost)
-    if not best.fit.cost < plain.fit.cost:
-        return plain
-    best = replace(best, fit=fit(best.own, best.fit.raw, 6))
-    return best if best.fit.cost < _BETTER * plain.fit.cost else plain
-
-
-def _linked(plain: _Model, length: float) -> _Model:
-    """Return the model as a chain of links of this length [m], not yet fitted."""
-    link = float(np.diff(plain.own.model.arclength).min())
-    chain = _extended(plain, (CHAIN,), {f"{CHAIN}.length": 0.5 * link}, {f"{CHAIN}.length": length}, None)
-    for problem in (chain.own, chain.test):
-        if (known := problem.discretisation_correction) is not None:
-            # A mesh with edges as long as the links is not wrong.
-            correct(problem, replace(known, links=abs(length)))
-    return chain
-
-
-def _extended(
-    base: _Model,
-    added: Sequence[str],
-    sizes: dict[str, float],
-    numbers: dict[str, float],
-    raw: np.ndarray | None,
-) -> _Model:
-    """Return a model with more effects, that begins with some of their numbers, not yet fitted.
-
-    Args:
-        base: the model.
-        added: effects.
-        sizes: what counts as much of their numbers.
-        numbers: those that are fitted.
-        raw: coordinates (N,) of the model's own numbers; where they are if not given.
-    """
-    effects = (*base.own.model.effects, *added)
-    known = base.own.space.to_values(base.fit.raw if raw is None else base.own.space.clip(raw))
-    count = len(base.own.free)
-    parts = []
-    for problem in (base.own, base.test):
-        more = problem.with_effects(effects, {k: v for k, v in sizes.items() if v}, list(numbers))
-        for k, column in enumerate(problem.free):
-            more.fixed[more.model.parameters.index(problem.model.parameters[column])] = known[k]
-        for name, value in numbers.items():
-            more.fixed[more.model.parameters.index(name)] = value
-        parts.append(more)
-    start = np.concatenate([parts[0].fixed[list(parts[0].free)], known[count:]])
-    at = parts[0].space.clip(parts[0].space.to_raw(start))
-    return _Model(parts[0], replace(base.fit, raw=at), parts[1])
-
-
-def _floor(base: _Model) -> tuple[ErrorFloor, float]:
+def _floor(base: FilmedModel) -> tuple[ErrorFloor, float]:
     """Return what no effect explains: noise of centre lines, and what steps and mesh may still get wrong."""
     own = base.own
     scale = np.mean([0.5 * (v.camera.fx + v.camera.fy) / own.depth(v) for v in own.spines.views])
@@ -398,8 +163,8 @@ def _floor(base: _Model) -> tuple[ErrorFloor, float]:
 
 
 def _round(
-    base: _Model,
-    first: _Model,
+    base: FilmedModel,
+    first: FilmedModel,
     names: Sequence[str],
     floor: ErrorFloor,
     level: float,
@@ -407,7 +172,7 @@ def _round(
     whole: float,
     stage: str,
     report: Callback,
-) -> tuple[_Model | None, list[Candidate], list[str]]:
+) -> tuple[FilmedModel | None, list[Candidate], list[str]]:
     """Return the model with the best effect added, if one pays, all candidates, and effects that fit as well."""
     short = base.own.lasts if base.own.lasts < whole else _SHORT * whole
     scores = _scores(base, names, short, lambda k, n: report(f"{stage}: screening", k, n, ""))
@@ -416,7 +181,7 @@ def _round(
         return None, [], []
     lead = tried[0].name
     tried += [s for s in scores[plan.candidates :] if effect_library.confusable(s.name, lead)]
-    fits: dict[str, _Model] = {}
+    fits: dict[str, FilmedModel] = {}
     for k, score in enumerate(tried):
         fits[score.name] = _fitted(base, score, plan.iterations, short)
         report(f"{stage}: fitting", k + 1, len(tried), f"{score.name} {1e3 * fits[score.name].fit.cost:.3f} mm")
@@ -455,13 +220,13 @@ def _round(
     return best, candidates, rivals
 
 
-def _gain(base: _Model, other: _Model, split: str, floor: ErrorFloor) -> float:
+def _gain(base: FilmedModel, other: FilmedModel, split: str, floor: ErrorFloor) -> float:
     """Return the share of the excess gap that another model closes."""
     before, after = gap_rms(base.gaps(split)) ** 2, gap_rms(other.gaps(split)) ** 2
     return float((before - after) / max(before - floor.noise**2, (0.3 * floor.noise) ** 2, 1e-12))
 
 
-def _refused(rival: _Model, other: _Model, first: _Model, floor: ErrorFloor, level: float) -> str | None:
+def _refused(rival: FilmedModel, other: FilmedModel, first: FilmedModel, floor: ErrorFloor, level: float) -> str | None:
     """Return why a model is no better than its rival, None if it is."""
     if float(np.mean(other.gaps("train") < rival.gaps("train"))) <= 0.6:
         return "helps on too few trials"
@@ -478,7 +243,7 @@ def _refused(rival: _Model, other: _Model, first: _Model, floor: ErrorFloor, lev
     return None
 
 
-def _fitted(base: _Model, score: Score, iterations: int, seconds: float) -> _Model:
+def _fitted(base: FilmedModel, score: Score, iterations: int, seconds: float) -> FilmedModel:
     """Return a first fit of a model with one effect more, from the best of several doses.
 
     Of ropes at rest all doses are followed, with the camera as it was calibrated, too: a baseline that lacks what bends
@@ -504,15 +269,15 @@ def _fitted(base: _Model, score: Score, iterations: int, seconds: float) -> _Mod
     return replace(best, fit=fit(best.own, best.fit.raw, iterations, seconds=seconds))
 
 
-def _dosed(base: _Model, score: Score, dose: dict[str, float], raw: np.ndarray) -> _Model:
+def _dosed(base: FilmedModel, score: Score, dose: dict[str, float], raw: np.ndarray) -> FilmedModel:
     """Return a model with one effect more, that begins with a dose of it, not yet fitted."""
     vectors = {ParameterName.parse(name).whole for name in dose}
     numbers = effect_library.numbers(score.name, base.own.model.recording)
     used = {n.name: dose.get(n.name, n.off) for n in numbers if n.which.whole in vectors}
-    return _extended(base, (score.name,), {n: score.sizes.get(n, 0.0) for n in used}, used, raw)
+    return extended(base, (score.name,), {n: score.sizes.get(n, 0.0) for n in used}, used, raw)
 
 
-def _upright(model: _Model) -> _Model:
+def _upright(model: FilmedModel) -> FilmedModel:
     """Return a model that begins with cameras as they were calibrated."""
     numbers = np.arange(model.fit.raw.size) < len(model.own.free)
     return replace(model, fit=replace(model.fit, raw=np.where(numbers, model.fit.raw, 0.0)))
@@ -533,7 +298,7 @@ def _tangents(own: FilmedProblem, here: Fit, seen: np.ndarray, weight: np.ndarra
     return np.concatenate([jacobian, priors])
 
 
-def _scores(base: _Model, names: Sequence[str], seconds: float, report: Callable[[int, int], None]) -> list[Score]:
+def _scores(base: FilmedModel, names: Sequence[str], seconds: float, report: Callable[[int, int], None]) -> list[Score]:
     """Return the scores of effects, best first: what their doses explain beyond what all other numbers can.
 
     Args:
@@ -596,10 +361,10 @@ def _scores(base: _Model, names: Sequence[str], seconds: float, report: Callable
 
 
 def _concluded(
-    films: _Films,
+    films: Films,
     recording: Recording,
-    first: _Model,
-    final: _Model,
+    first: FilmedModel,
+    final: FilmedModel,
     floor: ErrorFloor,
     level: float,
     shares: dict[str, float],
@@ -670,7 +435,7 @@ def _far(level: float, floor: ErrorFloor) -> str:
     )
 
 
-def _plain(model: _Model, point: levenberg_marquardt.Point) -> Fitted:
+def _plain(model: FilmedModel, point: levenberg_marquardt.Point) -> Fitted:
     """Return a fit as those of recordings with markers are."""
     own = model.own
     return Fitted(own.model.effects, own.full(model.values[None])[0], own.space, point, tuple(own.options.items()))
