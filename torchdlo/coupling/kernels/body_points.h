@@ -189,8 +189,9 @@ struct Geometry : Inputs<T> {
     near.clear(), far.clear();
     for (int k = 0; k < n.bodies; ++k)
       EVERY(v, n.vertices) {
-        const Far f = distant(v, k);
-        if (any((edges[v].real > T(0)) & ~(f.gap > edges[v].radius + T(2) * moved(f))))
+        Far f = distant(v, k);
+        if (soon(f)) f.gap = narrow(v, k);
+        if (soon(f))
           place(v, k);
         else
           far.push_back(f);
@@ -224,6 +225,17 @@ struct Geometry : Inputs<T> {
   L moved(const Far& f) const {
     const L i = size(change[f.edge]), j = size(change[n.after[f.edge]]);
     return (i > j ? i : j) + size(motion[f.body].force) + size(motion[f.body].torque) * f.arm;
+  }
+  // Whether an edge may touch a body in some scene, if it moves twice as far as foreseen.
+  bool soon(const Far& f) const { return any((edges[f.edge].real > T(0)) & ~(f.gap > T(2) * moved(f))); }
+  // How far an edge is from a body at least: no point of it is nearer than its ends by more than its distance from them.
+  L narrow(int v, int k) const {
+    const Solid<T>& b = bodies[k];
+    const R from = vertices[v].pos, to = vertices[n.after[v]].pos;
+    const Line<T, 0> line(n.shape[k], n.grid<T>(k), b.local(from - b.pos) + b.offset, b.local(to - from), b.numbers);
+    Num<T, 0> normal[3];
+    const L ends = line.at(Num<T, 0>(T(0)), normal).x + line.at(Num<T, 0>(T(1)), normal).x;
+    return T(0.5) * (ends - line.length.x) - edges[v].radius;
   }
   // How far an edge is from the ball about a body, or from a plane.
   Far distant(int v, int k) const {

@@ -32,6 +32,7 @@ struct Block : Geometry<T> {
     Wrench<T> push;
     L mu;
   };
+  bool quiet;                     // whether nothing touches
   const bool derive;              // otherwise only the last sweep is kept, and the one before
   List<R> forces;                 // on vertices, before each sweep
   List<Wrench<T>> pushes;         // on bodies, likewise
@@ -233,7 +234,10 @@ struct Block : Geometry<T> {
     meet();
     blank(force), blank(push);
     pressed.clear(), rubbing.clear(), presses_to.clear(), rubs_to.clear();
-    for (int s = 0; s < n.sweeps; ++s) forward(s);
+    forward(0);
+    // Nothing exerts forces then, and all sweeps are like the first.
+    quiet = !anyone(!rubbing.empty());
+    for (int s = 1; s < n.sweeps && !quiet; ++s) forward(s);
   }
 
   // Goes through a sweep backwards: `by` holds derivatives by its forces, then by those before.
@@ -338,6 +342,7 @@ struct Block : Geometry<T> {
   // Makes of `force` and `push`, the derivatives by what is exerted, those by all inputs.
   void back() {
     blank(to.edges), blank(to.vertices), blank(to.bodies);
+    if (quiet) return meet();
     blank_points(to.points), blank_points(by);
     meet();
     for (int s = int(n.sweeps); s--;) backward(s, force, push);
