@@ -190,7 +190,9 @@ struct Geometry : Inputs<T> {
     for (int k = 0; k < n.bodies; ++k)
       EVERY(v, n.vertices) {
         Far f = distant(v, k);
+#ifdef SIMT  // of several scenes that share an instruction, one is near enough in most cases
         if (soon(f)) f.gap = narrow(v, k);
+#endif
         if (soon(f))
           place(v, k);
         else
