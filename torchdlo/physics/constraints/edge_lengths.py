@@ -131,7 +131,8 @@ def project(
         edges = lengths.rest, lengths.compliance, lengths.active, lengths.edge_mask, lengths.give, tension
         numbers = lengths.most, lengths.least, lengths.shift, steps
         inputs = *edges, moved, answer, direction
-        return tuple(lanes.apply("project", topology.name, inputs, (3, 1), "tridiagonal", numbers))
+        pos, tension = lanes.apply("project", topology.name, inputs, (3, 1), "tridiagonal", numbers)
+        return pos, tension
 
     def place(tension: Tensor, moved: Tensor, answer: Tensor, direction: Tensor) -> Tensor:
         pull = tension * direction
