@@ -29,13 +29,13 @@ struct Solid {
     return {xx * t.x + xy * t.y + xz * t.z, xy * t.x + yy * t.y + yz * t.z, xz * t.x + yz * t.y + zz * t.z};
   }
   void add_turned(const Vec<T>& a, const Vec<T>& b) {  // derivative of a . turned(b)
-    ADD(xx, a.x * b.x), ADD(yy, a.y * b.y), ADD(zz, a.z * b.z);
-    ADD(xy, a.x * b.y + a.y * b.x), ADD(xz, a.x * b.z + a.z * b.x), ADD(yz, a.y * b.z + a.z * b.y);
+    xx += a.x * b.x, yy += a.y * b.y, zz += a.z * b.z;
+    xy += a.x * b.y + a.y * b.x, xz += a.x * b.z + a.z * b.x, yz += a.y * b.z + a.z * b.y;
   }
   Vec<T> local(const Vec<T>& a) const { return {dot(axes[0], a), dot(axes[1], a), dot(axes[2], a)}; }
   Vec<T> world(const Vec<T>& a) const { return axes[0] * a.x + axes[1] * a.y + axes[2] * a.z; }
   void add_world(const Vec<T>& by, const Vec<T>& a) {  // derivative by the axes of by . world(a)
-    ADD(axes[0], by * a.x), ADD(axes[1], by * a.y), ADD(axes[2], by * a.z);
+    axes[0] += by * a.x, axes[1] += by * a.y, axes[2] += by * a.z;
   }
 };
 template <typename T>
@@ -121,8 +121,8 @@ struct Geometry : Inputs<T> {
     meet();
   }
 
-  int edge(int p) const { return p % n.vertices; }
-  int body(int p) const { return owner[p / n.vertices]; }
+  int edge(int p) const { return p % int(n.vertices); }
+  int body(int p) const { return owner[p / int(n.vertices)]; }
 
   // By how much a point moves against its body without friction's turn.
   R apart(int p, const Shifts& x, const Turns& m) const {
@@ -140,8 +140,9 @@ struct Geometry : Inputs<T> {
     return cross(e.tangent, stretch) * e.lever - (turn - e.tangent * dot(e.tangent, turn)) * e.radius;
   }
 
-  // Adds what forces on points exert, and its transpose: motions seen at the points, `slip` with its normal part.
-  void exert(int p, const L& normal, const R& friction, Shifts& f, Turns& m) const {
+  // Adds what forces on points exert on ropes and on the body of the point, and its transpose: motions seen at the points,
+  // `slip` with its normal part.
+  void exert(int p, const L& normal, const R& friction, Shifts& f, Wrench<T>& m) const {
     const Point<T>& a = points[p];
     const int v = edge(p);
     const Edge<T>& e = edges[v];
@@ -149,8 +150,8 @@ struct Geometry : Inputs<T> {
     const R pair = cross(couple, e.tangent) * e.lever, second = whole * a.share + pair;
     ADD(f[v], whole - second);
     ADD(f[n.after[v]], second);
-    ADD(m[body(p)].force, -whole);
-    ADD(m[body(p)].torque, -(cross(a.arm, whole) + (couple - e.tangent * dot(e.tangent, couple)) * e.radius));
+    m.force -= whole;
+    m.torque -= cross(a.arm, whole) + (couple - e.tangent * dot(e.tangent, couple)) * e.radius;
   }
   Force<T> seen(int p, const Shifts& x, const Turns& m) const {
     const R d = apart(p, x, m);
@@ -188,8 +189,11 @@ struct Geometry : Inputs<T> {
     near.clear(), far.clear();
     for (int k = 0; k < n.bodies; ++k)
       EVERY(v, n.vertices) {
-        const Far f = distant(v, k);
-        if (any((edges[v].real > T(0)) & ~(f.gap > edges[v].radius + T(2) * moved(f))))
+        Far f = distant(v, k);
+#ifdef SIMT  // of several scenes that share an instruction, one is near enough in most cases
+        if (soon(f)) f.gap = narrow(v, k);
+#endif
+        if (soon(f))
           place(v, k);
         else
           far.push_back(f);
@@ -223,6 +227,17 @@ struct Geometry : Inputs<T> {
   L moved(const Far& f) const {
     const L i = size(change[f.edge]), j = size(change[n.after[f.edge]]);
     return (i > j ? i : j) + size(motion[f.body].force) + size(motion[f.body].torque) * f.arm;
+  }
+  // Whether an edge may touch a body in some scene, if it moves twice as far as foreseen.
+  bool soon(const Far& f) const { return any((edges[f.edge].real > T(0)) & ~(f.gap > T(2) * moved(f))); }
+  // How far an edge is from a body at least: no point of it is nearer than its ends by more than its distance from them.
+  L narrow(int v, int k) const {
+    const Solid<T>& b = bodies[k];
+    const R from = vertices[v].pos, to = vertices[n.after[v]].pos;
+    const Line<T, 0> line(n.shape[k], n.grid<T>(k), b.local(from - b.pos) + b.offset, b.local(to - from), b.numbers);
+    Num<T, 0> normal[3];
+    const L ends = line.at(Num<T, 0>(T(0)), normal).x + line.at(Num<T, 0>(T(1)), normal).x;
+    return T(0.5) * (ends - line.length.x) - edges[v].radius;
   }
   // How far an edge is from the ball about a body, or from a plane.
   Far distant(int v, int k) const {
@@ -297,13 +312,12 @@ struct Geometry : Inputs<T> {
     return (back > T(0)) & (back > by) ? back : by;
   }
 
-  // Adds the derivative by ropes and bodies of what depends on a point as `to.points[p]` says.
-  void place_back(int p, Inputs<T>& to, Shifts& dvel, Turns& dspin) {
+  // Adds the derivative by ropes and by the point's body of what depends on a point as `to.points[p]` says.
+  void place_back(int p, Inputs<T>& to, Solid<T>& db, Shifts& dvel, Wrench<T>& dspin) {
     const int f = p / n.vertices, v = edge(p), w = n.after[v], k = body(p);
     const Solid<T>& b = bodies[k];
     const Point<T>& a = points[p];
     Point<T>& d = to.points[p];
-    Solid<T>& db = to.bodies[k];
     const L zero{}, one = zero + T(1);
     const R x = cross(a.arm, a.normal), turned = b.turned(x);
     const L by_turning = a.turning > T(0) ? d.turning / (a.turning > T(0) ? a.turning : one) : zero;
@@ -312,11 +326,11 @@ struct Geometry : Inputs<T> {
     const R dx = turned * by_turning;
     d.arm += cross(a.normal, dx) + a.arm * (by_sliding * b.agile);
     d.normal += cross(dx, a.arm);
-    ADD(db.agile, T(0.5) * by_sliding * dot(a.arm, a.arm));
+    db.agile += T(0.5) * by_sliding * dot(a.arm, a.arm);
     const L back = rebound(p);
     const auto bounces = (back > T(0)) & (back > simple(p));
     const L bounced = bounces ? d.wanted * T(n.dt) : zero, kept = bounces ? zero : d.wanted;
-    ADD(db.restitution, bounced * approach(p));
+    db.restitution += bounced * approach(p);
     exert(p, -bounced * b.restitution, R{}, dvel, dspin);
     tilt(p, -bounced * b.restitution, R{}, vel, spin, to);
     const L more = deep(p) > T(0) ? kept * T(1 - n.recovery) : zero;
@@ -334,11 +348,11 @@ struct Geometry : Inputs<T> {
     for (int i = 0; i < 10; ++i)
       g[i] = d.share * r[0].g[i] - dover * r[1].g[i] + normal.x * r[2].g[i] + normal.y * r[3].g[i] + normal.z * r[4].g[i];
     const R start = {g[0], g[1], g[2]}, along = {g[3], g[4], g[5]};
-    for (int i = 0; i < 4; ++i) ADD(db.numbers[i], g[6 + i]);
-    ADD(db.offset, start);
+    for (int i = 0; i < 4; ++i) db.numbers[i] += g[6 + i];
+    db.offset += start;
     db.add_world(from, start), db.add_world(way, along);
     dfrom += b.world(start), dway += b.world(along);
     ADD(to.vertices[v].pos, dfrom - dway), ADD(to.vertices[w].pos, dway);
-    ADD(db.pos, -dfrom);
+    db.pos -= dfrom;
   }
 };

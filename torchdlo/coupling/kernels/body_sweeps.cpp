@@ -25,6 +25,15 @@ struct Block : Geometry<T> {
     const int* begin() const { return from; }
     const int* end() const { return to; }
   };
+  struct Tally {  // sums over points of a body
+    L count, levers;
+  };
+  struct Drag {
+    Wrench<T> push;
+    L mu;
+  };
+  bool quiet;                     // whether nothing touches
+  const bool derive;              // otherwise only the last sweep is kept, and the one before
   List<R> forces;                 // on vertices, before each sweep
   List<Wrench<T>> pushes;         // on bodies, likewise
   List<Force<T>> found;           // by points, after each sweep
@@ -32,33 +41,49 @@ struct Block : Geometry<T> {
   List<int> presses_to, rubs_to;  // where those of each sweep end
   List<R> force, dvel;
   List<Wrench<T>> push, dspin;
-  List<L> active, load_, many, count, levers, dload, dlevers, soft;
+  List<Tally> tally, dtally;
+  List<Drag> drags;
+  List<L> active, load_, many, dload, soft;
   List<Force<T>> by, later;  // derivatives by forces
   List<char> used;
   Inputs<T> to;
 
-  Block(const Sizes& n, Memory& memory, bool derive) : G(n, memory) {
-    const int64_t all = points.size();
+  Block(const Sizes& n, Memory& memory, bool derive) : G(n, memory), derive(derive) {
+    const int64_t all = points.size(), kept = derive ? n.sweeps : 1;
     memory.common(load_, n.vertices), memory.common(many, n.vertices);
-    memory.common(count, n.bodies), memory.common(levers, n.bodies);
-    memory.common(forces, n.vertices * n.sweeps), memory.common(pushes, n.bodies * n.sweeps);
+    memory.common(tally, n.bodies);
+    memory.common(forces, n.vertices * kept), memory.common(pushes, n.bodies * kept);
     memory.common(force, n.vertices), memory.common(push, n.bodies);
-    memory.large(found, all * n.sweeps), memory.large(active, all);
-    memory.own(pressed, n.vertices, n.families * n.sweeps), memory.own(rubbing, n.vertices, n.families * n.sweeps);
-    memory.own(presses_to, 1, n.sweeps), memory.own(rubs_to, 1, n.sweeps);
+    memory.large(found, all * (derive ? n.sweeps : 2)), memory.large(active, all);
+    memory.own(pressed, n.vertices, n.families * kept), memory.own(rubbing, n.vertices, n.families * kept);
+    memory.own(presses_to, 1, kept), memory.own(rubs_to, 1, kept);
     if (!derive) return;
-    memory.common(dload, n.vertices), memory.common(dlevers, n.bodies);
+    memory.common(dload, n.vertices), memory.common(dtally, n.bodies), memory.common(drags, n.bodies);
     memory.common(dvel, n.vertices), memory.common(dspin, n.bodies);
     memory.large(soft, all), memory.large(by, all), memory.large(later, all), memory.large(used, all);
     to.take(n, memory);
   }
 
-  size_t at(int s, int p) const { return s * points.size() + p; }
+  int kept(int s) const { return derive ? s : 0; }
+  size_t at(int s, int p) const { return (derive ? s : s & 1) * points.size() + p; }
+  // What points of a list add to sums of their bodies: work(p, sum).
+  template <class S, class W>
+  void by_body(const Part& list, List<S>& sums, W work) const {
+#ifdef SIMT
+    for (int k = 0; k < n.bodies; ++k) {
+      Own<T, S> own(sums[k]);
+      for (int p : list)
+        if (body(p) == k) work(p, own.sum);
+    }
+#else
+    for (int p : list) work(p, sums[body(p)]);
+#endif
+  }
   static Part part(const List<int>& list, const List<int>& ends, int s) {
     return {list.data() + (s ? ends[s - 1] : 0), list.data() + ends[s]};
   }
-  Part pressing(int s) const { return part(pressed, presses_to, s); }
-  Part rubbers(int s) const { return part(rubbing, rubs_to, s); }
+  Part pressing(int s) const { return part(pressed, presses_to, kept(s)); }
+  Part rubbers(int s) const { return part(rubbing, rubs_to, kept(s)); }
   // Sets what belongs to points, each lane its own.
   template <class S>
   void blank_points(List<S>& list) const {
@@ -66,10 +91,10 @@ struct Block : Geometry<T> {
   }
 
   void move(int s) {
-    EVERY(v, n.vertices) change[v] = vertices[v].change + vertices[v].answer.times(forces[s * n.vertices + v]);
+    EVERY(v, n.vertices) change[v] = vertices[v].change + vertices[v].answer.times(forces[kept(s) * n.vertices + v]);
     EVERY(k, n.bodies) {
       const Solid<T>& b = bodies[k];
-      const Wrench<T>& by = pushes[s * n.bodies + k];
+      const Wrench<T>& by = pushes[kept(s) * n.bodies + k];
       motion[k] = {b.change + by.force * b.mobility, b.turn + b.turned(by.torque)};
     }
   }
@@ -77,14 +102,14 @@ struct Block : Geometry<T> {
   // Sums over active points that all softness is made of; `root` is the turning or the sliding part of a point.
   void gather(const Part& list, L Point<T>::*root) {
     meet();
-    blank(load_), blank(many), blank(count), blank(levers);
+    blank(load_), blank(many), blank(tally);
     meet();
-    for (int p : list) {
+    by_body(list, tally, [&](int p, Tally& sum) {
       const L on = active[p], &s = points[p].share;
-      const int v = edge(p), k = body(p);
+      const int v = edge(p);
       ADD(load_[v], on * (T(1) - s)), ADD(load_[n.after[v]], on * s), many[v] += on;
-      ADD(count[k], on), ADD(levers[k], on * (points[p].*root));
-    }
+      sum.count += on, sum.levers += on * (points[p].*root);
+    });
     meet();
   }
   L softness(int p, L Point<T>::*root, bool friction) const {
@@ -92,34 +117,34 @@ struct Block : Geometry<T> {
     const int v = edge(p), w = n.after[v], k = body(p);
     const L i = vertices[v].soft, j = vertices[w].soft, lever = edges[v].lever;
     L sum = (T(1) - a.share) * load_[v] * i + a.share * load_[w] * j;
-    sum += bodies[k].mobility * count[k] + (a.*root) * levers[k];
+    sum += bodies[k].mobility * tally[k].count + (a.*root) * tally[k].levers;
     return friction ? sum + lever * lever * (i + j) * many[v] : sum;
   }
   // Adds the derivative of the softness of all points, given as `by`.
   void soften(const Part& list, L Point<T>::*root, bool friction) {
     meet();
-    blank(dload), blank(dlevers);
+    blank(dload), blank(dtally);
     meet();
-    for (int p : list) {
+    by_body(list, dtally, [&](int p, Tally& sum) {
       const Point<T>& a = points[p];
       const int v = edge(p), w = n.after[v], k = body(p);
       const L i = vertices[v].soft, j = vertices[w].soft, g = soft[p], one = (T(1) - a.share) * g, two = a.share * g;
       to.points[p].share += g * (load_[w] * j - load_[v] * i);
       ADD(dload[v], one * i), ADD(dload[w], two * j);
       ADD(to.vertices[v].soft, one * load_[v]), ADD(to.vertices[w].soft, two * load_[w]);
-      ADD(to.bodies[k].mobility, g * count[k]);
-      to.points[p].*root += g * levers[k];
-      ADD(dlevers[k], g * (a.*root));
-      if (!friction) continue;
+      to.points[p].*root += g * tally[k].levers;
+      sum.count += g * tally[k].count, sum.levers += g * (a.*root);
+      if (!friction) return;
       const L lever = edges[v].lever, part = lever * lever * many[v] * g;
       to.edges[v].lever += T(2) * lever * (i + j) * many[v] * g;
       ADD(to.vertices[v].soft, part), ADD(to.vertices[w].soft, part);
-    }
+    });
     meet();
+    EVERY(k, n.bodies) to.bodies[k].mobility += dtally[k].count;
     for (int p : list) {
       const int v = edge(p);
       to.points[p].share += active[p] * (dload[n.after[v]] - dload[v]);
-      to.points[p].*root += active[p] * dlevers[body(p)];
+      to.points[p].*root += active[p] * dtally[body(p)].levers;
     }
   }
 
@@ -151,8 +176,9 @@ struct Block : Geometry<T> {
 
   void forward(int s) {
     const L zero{}, one = zero + T(1);
-    EVERY(v, n.vertices) forces[s * n.vertices + v] = force[v];
-    EVERY(k, n.bodies) pushes[s * n.bodies + k] = push[k];
+    if (!derive) pressed.clear(), rubbing.clear(), presses_to.clear(), rubs_to.clear();
+    EVERY(v, n.vertices) forces[kept(s) * n.vertices + v] = force[v];
+    EVERY(k, n.bodies) pushes[kept(s) * n.bodies + k] = push[k];
     move(s);
     meet();
     const size_t known = near.size();
@@ -161,7 +187,7 @@ struct Block : Geometry<T> {
       meet();
     }
     for (size_t i = known; i < size_t(near.size()); ++i)
-      for (int each = 0; each < n.sweeps; ++each) found[at(each, near[i])] = Force<T>{};
+      for (int each = 0; each < (derive ? n.sweeps : 2); ++each) found[at(each, near[i])] = Force<T>{};
     for (int p : near) {
       const auto on = presses(s, p);
       found[at(s, p)] = Force<T>{};
@@ -193,7 +219,9 @@ struct Block : Geometry<T> {
     }
     blank(force), blank(push);
     meet();
-    for (int p : rubbers(s)) exert(p, found[at(s, p)].normal, found[at(s, p)].friction, force, push);
+    by_body(rubbers(s), push, [&](int p, Wrench<T>& sum) {
+      exert(p, found[at(s, p)].normal, found[at(s, p)].friction, force, sum);
+    });
     meet();
   }
   L presses_now(int s, int p) const {
@@ -206,7 +234,10 @@ struct Block : Geometry<T> {
     meet();
     blank(force), blank(push);
     pressed.clear(), rubbing.clear(), presses_to.clear(), rubs_to.clear();
-    for (int s = 0; s < n.sweeps; ++s) forward(s);
+    forward(0);
+    // Nothing exerts forces then, and all sweeps are like the first.
+    quiet = !anyone(!rubbing.empty());
+    for (int s = 1; s < n.sweeps && !quiet; ++s) forward(s);
   }
 
   // Goes through a sweep backwards: `by` holds derivatives by its forces, then by those before.
@@ -223,12 +254,12 @@ struct Block : Geometry<T> {
     }
     meet();
     move(s);
-    blank(df), blank(dm);
+    blank(df), blank(dm), blank(drags);
     meet();
     if (n.friction) {
       for (int p : rubbers(s)) active[p] = presses_now(s, p);
       gather(rubbers(s), &Point<T>::sliding);
-      for (int p : rubbers(s)) {
+      by_body(rubbers(s), drags, [&](int p, Drag& sum) {
         const L f = found[at(s, p)].normal, mu = bodies[body(p)].mu_k;
         const Rub r = rub(p, before(s, p), f);
         const R &d = by[p].friction, way = r.trial * (one / r.size);
@@ -238,17 +269,22 @@ struct Block : Geometry<T> {
                           r.sticks ? d.y : mu * f / r.size * (d.y - way.y * along),
                           r.sticks ? d.z : mu * f / r.size * (d.z - way.z * along)};
         by[p].normal += r.sticks ? zero : mu * along;
-        ADD(to.bodies[body(p)].mu_k, r.sticks ? zero : f * along);
+        sum.mu += r.sticks ? zero : f * along;
         by[p].friction = dtrial;
         soft[p] = dot(dtrial, r.slip) * inverse * inverse;
-        slipped(p, dtrial * -inverse, df, dm);
+        slipped(p, dtrial * -inverse, df, sum.push);
+      });
+      meet();
+      EVERY(k, n.bodies) {
+        dm[k].force += drags[k].push.force, dm[k].torque += drags[k].push.torque;
+        to.bodies[k].mu_k += drags[k].mu;
       }
       soften(rubbers(s), &Point<T>::sliding, true);
     }
     blank_points(soft);
     for (int p : pressing(s)) active[p] = presses(s, p) ? one : zero;
     gather(pressing(s), &Point<T>::turning);
-    for (int p : rubbers(s)) {
+    by_body(rubbers(s), dm, [&](int p, Wrench<T>& sum) {
       const L give = softness(p, &Point<T>::turning, false), along = dot(points[p].normal, apart(p, change, motion));
       const auto mobile = (active[p] > T(0)) & (give > T(0));
       const L inverse = mobile ? one / (mobile ? give : one) : zero;
@@ -256,19 +292,19 @@ struct Block : Geometry<T> {
       const L d = by[p].normal * inverse;
       to.points[p].wanted += d;
       soft[p] = -d * (points[p].wanted - along) * inverse;
-      exert(p, -d, R{}, df, dm);
+      exert(p, -d, R{}, df, sum);
       tilt(p, -d, R{}, change, motion, to);
-    }
+    });
     soften(pressing(s), &Point<T>::turning, false);
     meet();
     EVERY(v, n.vertices) {
       to.vertices[v].change += df[v];
-      to.vertices[v].answer += df[v].times(forces[s * n.vertices + v]);
+      to.vertices[v].answer += df[v].times(forces[kept(s) * n.vertices + v]);
       df[v] = df[v].times(vertices[v].answer);
     }
     EVERY(k, n.bodies) {
       Solid<T>& d = to.bodies[k];
-      const Wrench<T>& pushed = pushes[s * n.bodies + k];
+      const Wrench<T>& pushed = pushes[kept(s) * n.bodies + k];
       const R c = dm[k].force, t = dm[k].torque, w = pushed.torque;
       d.change += c, d.turn += t, d.mobility += dot(c, pushed.force);
       d.add_turned(t, w);
@@ -283,16 +319,20 @@ struct Block : Geometry<T> {
     this->foresee();
     blank(dvel), blank(dspin);
     meet();
-    for (int f = 0; f < n.families; ++f)
-      EVERY(v, n.vertices)
-        if (used[f * n.vertices + v]) this->place_back(f * n.vertices + v, to, dvel, dspin);
+    for (int k = 0, f = 0; k < n.bodies; ++k) {
+      Own<T, Solid<T>> body(to.bodies[k]);
+      Own<T, Wrench<T>> spin(dspin[k]);
+      for (const int end = f + 2 + int(n.pieces[k]); f < end; ++f)
+        EVERY(v, n.vertices)
+          if (used[f * n.vertices + v]) this->place_back(f * n.vertices + v, to, body.sum, dvel, spin.sum);
+    }
     meet();
     EVERY(v, n.vertices) to.vertices[v].vel += dvel[v];
     EVERY(k, n.bodies) to.bodies[k].vel += dspin[k].force, to.bodies[k].omega += dspin[k].torque;
     meet();
   }
   // Adds the derivative by the motion and the geometry of the slip, given as `by`.
-  void slipped(int p, const R& by, List<R>& df, List<Wrench<T>>& dm) {
+  void slipped(int p, const R& by, List<R>& df, Wrench<T>& dm) {
     const R& a = points[p].normal;
     const R all = seen(p, change, motion).friction, across = by - a * dot(a, by);
     to.points[p].normal -= by * dot(a, all) + all * dot(a, by);
@@ -302,6 +342,7 @@ struct Block : Geometry<T> {
   // Makes of `force` and `push`, the derivatives by what is exerted, those by all inputs.
   void back() {
     blank(to.edges), blank(to.vertices), blank(to.bodies);
+    if (quiet) return meet();
     blank_points(to.points), blank_points(by);
     meet();
     for (int s = int(n.sweeps); s--;) backward(s, force, push);

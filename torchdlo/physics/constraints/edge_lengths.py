@@ -127,6 +127,12 @@ def project(
         Positions (..., V, 3) and tensions (..., V, 1).
     """
     topology = lengths.topology
+    if lanes.ready(moved) and lengths.give is not None:
+        edges = lengths.rest, lengths.compliance, lengths.active, lengths.edge_mask, lengths.give, tension
+        numbers = lengths.most, lengths.least, lengths.shift, steps
+        inputs = *edges, moved, answer, direction
+        pos, tension = lanes.apply("project", topology.name, inputs, (3, 1), "tridiagonal", numbers)
+        return pos, tension
 
     def place(tension: Tensor, moved: Tensor, answer: Tensor, direction: Tensor) -> Tensor:
         pull = tension * direction

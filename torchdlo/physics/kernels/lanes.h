@@ -122,6 +122,11 @@ template <typename T>
 static inline T total(T mine) {
   return mine;
 }
+template <typename T, class S>
+struct Own {  // what a lane adds to a sum of all; see simt.h
+  S& sum;
+  explicit Own(S& to) : sum(to) {}
+};
 template <class S>
 static inline void blank(List<S>& list) {
   list.assign(list.size(), S{});

@@ -360,7 +360,7 @@ struct Settle {  // integrate.settle_twist: one step of Newton's method, and the
       const In& p = slot[i];
       same[i] += T(1e-9) * most;
       back[i] = slot[i].across - p.skew;
-      entries[i] = p.free * same[i] + T(1) - p.free;
+      entries[i] = p.free * same[i] + (T(1) - p.free);
       entries[v + i] = p.free * onward[i];
       entries[2 * v + i] = p.free * back[i];
       rhs[i] = p.torque * p.free;
@@ -374,6 +374,61 @@ struct Settle {  // integrate.settle_twist: one step of Newton's method, and the
       out.put(1, i, slot[i].torque - same[i] * change[i] - onward[i] * change[s.after[i]] - back[i] * change[prior[i]]);
     }
   }
+  const Scratch<T>& room;
+  const std::vector<int64_t> prior;
+};
+
+template <typename T>
+struct Project {  // edge_lengths.project: positions and tensions by Newton's method
+  struct In {
+    Lanes<T> rest, compliance, active, mask, give, tension;
+    Vec<T> moved, answer, along;
+  };
+  Project(const Call& call, const Scratch<T>& free) : room(free), prior(preceding(call)) {}
+  void operator()(const In* slot, const Out<T>& out) {
+    const Call& s = out.call;
+    const int64_t v = s.slots;
+    const T most = T(s.numbers[0]), least = T(s.numbers[1]), stiff = T(1 + s.numbers[2]);
+    Scratch<T> scratch = room;
+    Lanes<T> *tension = scratch.take(v), *entries = scratch.take(3 * v), *rhs = scratch.take(v),
+             *change = scratch.take(v), *space = scratch.take((v + s.half) * (2 * s.half + 2));
+    Vec<T>*pull = scratch.template take<Vec<T>>(v), *pos = scratch.template take<Vec<T>>(v);
+    const Lanes<T> zero{};
+    const auto place = [&] {
+      for (int64_t i = 0; i < v; ++i) pull[i] = slot[i].along * tension[i];
+      for (int64_t i = 0; i < v; ++i) pos[i] = slot[i].moved + times(slot[i].answer, pull[i] - pull[prior[i]]);
+    };
+    for (int64_t i = 0; i < v; ++i) {
+      const In& p = slot[i];
+      // A straight rope pressed along its line leaves tensions of any size: no first guess.
+      tension[i] = (p.tension < -least * p.rest / p.give ? zero : p.tension) * p.active;
+    }
+    const auto solve = s.half == 1 ? solve_lanes<T, Lanes<T>, 1> : solve_lanes<T, Lanes<T>, 0>;
+    for (int64_t k = 0; k <= s.numbers[3]; ++k) {
+      place();
+      for (int64_t i = 0; i < v; ++i) {
+        const In &p = slot[i], &next = slot[s.after[i]], &last = slot[prior[i]];
+        const Vec<T> e = edge(pos[i], pos[s.after[i]], p.mask);
+        const Lanes<T> size = length(e), beyond = tension[i] - most * p.rest / p.give;
+        const Vec<T> end = e * (T(1) / at_least<T>(size, T(1e-12)));
+        const auto yields = beyond > T(0);
+        const Lanes<T> soft = p.compliance + (yields ? p.give : zero);
+        rhs[i] = (size - p.rest - p.compliance * tension[i] - p.give * (yields ? beyond : zero)) * p.active;
+        entries[i] = p.active * (stiff * dot(times(end, p.along), p.answer + next.answer) + soft) + (T(1) - p.active);
+        entries[v + i] = -p.active * dot(end, times(next.along, next.answer));
+        entries[2 * v + i] = -p.active * dot(times(end, p.answer), last.along);
+      }
+      solve((const T*)entries, s.pattern, (int)s.count, s.order, (const T*)rhs, (T*)change, (int)v, (int)s.half,
+            WIDTH<T>, 0, WIDTH<T>, space);
+      for (int64_t i = 0; i < v; ++i) tension[i] += change[i];
+    }
+    place();
+    for (int64_t i = 0; i < v; ++i) {
+      out.put(0, i, pos[i]);
+      out.put(3, i, tension[i]);
+    }
+  }
+  static Vec<T> times(const Vec<T>& a, const Vec<T>& b) { return {a.x * b.x, a.y * b.y, a.z * b.z}; }
   const Scratch<T>& room;
   const std::vector<int64_t> prior;
 };
@@ -400,3 +455,4 @@ KERNELS(joint, Joint)
 KERNELS(spring, Spring)
 KERNELS(settle, Settle)
 KERNELS(balance, Balance)
+KERNELS(project, Project)

@@ -191,6 +191,23 @@ template <typename T>
 static inline T total(T mine) {
   return everyones(mine, [](T a, T b) { return a + b; });
 }
+// What a lane adds to a sum of all, which it is added to in the end; all lanes have one at the same time.
+template <typename T, class S>
+struct Own {
+  S sum{};
+  S& to;
+  explicit Own(S& to) : to(to) {}
+  ~Own() {
+    constexpr int numbers = sizeof(S) / sizeof(T);
+#ifndef EMULATED
+#pragma unroll
+#endif
+    for (int i = 0; i < numbers; ++i) {
+      const T all = total(((const T*)&sum)[i]);
+      if (lane() == 0) ((T*)&to)[i] += all;
+    }
+  }
+};
 
 // Moves a scene between arrays (rows, scenes), one per field, and structs.
 template <typename T, class S>
