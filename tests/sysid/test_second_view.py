@@ -105,6 +105,25 @@ def test_what_shows_from_nowhere_decides_nothing(recording: Recording) -> None:
     assert placed(recording, motion, [1.0, 0.0, -0.2], named=["air_drag"]).effects == ("air_drag",)
 
 
+def test_doses_and_trials_whose_simulation_fails_tell_nothing(recording: Recording) -> None:
+    motion = swinging(recording, {"wind.velocity.0": 0, "air_drag.c_d": 0})
+    doses = motion.doses.copy()
+    doses[1, 0, 50:] = np.nan
+    whole, some = (
+        placed(recording, m, [0.0, -1.0, -0.2]).now for m in (motion, replace(motion, doses=doses, _sampled={}))
+    )
+    assert whole is not None and some is not None and np.isnan(some.probes[1][2])
+    assert some.probes[0][2] == pytest.approx(whole.probes[0][2]) and some.deviations == whole.deviations
+    assert set(some.limits(1e-3, recording)) == {"wind"}
+    two = replace(
+        motion, **{n: np.repeat(getattr(motion, n), 2, -4) for n in ("rope", "numbers", "doses")}, frames=(101, 51)
+    )
+    two.rope[0, 70] = np.nan
+    assert two.sound.tolist() == [False, True]
+    kept = two.picked(np.flatnonzero(two.sound))
+    assert kept.rope.shape[:2] == (1, 51) and kept.doses.shape[:3] == (2, 1, 51) and kept.frames == (51,)
+
+
 def test_numbers_of_the_rope_are_told_better_from_where_they_show(recording: Recording) -> None:
     view = placed(recording, swinging(recording, {}), [1.0, 0.0, -0.2])
     assert view.effects == () and abs(towards(view.best.camera)[1]) > 0.8

@@ -179,11 +179,11 @@ def place_cameras(
     single: list[CameraPlacement] = []
     added: list[CameraPlacement] = []
     now: list[CameraPlacement] = []
-    for k, (motion, trial) in enumerate(zip(motions, trials, strict=True)):
+    for k, motion in enumerate(motions):
         report("placing cameras", k, len(motions), motion.kind)
         moves = motion_text(motion, *excitation_motions.largest_amplitude(rig, motion, seconds))
-        rope = _one(varying, k, len(trial.time))
-        if np.isfinite(rope.rope).all() and np.isfinite(rope.numbers).all():
+        rope = varying.picked(np.array([k]))
+        if rope.sound.all():
             for whole, part in zip((single, added, now), around.placements(motion, moves, rope), strict=True):
                 whole += part
     if not single:
@@ -260,12 +260,6 @@ def _simulation(
     motion = model.motion(cut)
     frames = min(count, motion.markers.shape[1])
     return SimulatedTrials(recording, given.effects, options, numbers, motion, start_of(model, alone, ()), frames)
-
-
-def _one(motion: MotionVariations, k: int, frames: int) -> MotionVariations:
-    """Return one of the trials, over its own frames."""
-    parts = {name: getattr(motion, name)[:, k : k + 1, :frames] for name in ("numbers", "doses", "starts")}
-    return replace(motion, rope=motion.rope[k : k + 1, :frames], **parts, frames=(), _sampled={})
 
 
 def _rig(recording: Recording, scale: float) -> excitation_motions.GripperLimits:

@@ -205,7 +205,7 @@ def second_view(
         lens: camera like which the new one is; the first one at hand if not given.
         report: told how many groups of effects are done, and in all.
     """
-    if own.trials[0].still:
+    if own.trials[0].still or not own.free:
         return None
     values = own.space.to_values(raw)
     count = len(own.trials)
@@ -217,13 +217,15 @@ def second_view(
         own.model.recording, own.model.effects, own.options, numbers, own.motion.pick(rows), begin.pick(rows), frames
     )
     units = dict(zip(own.space.names, own.space.units, strict=True))
-    # Trials whose simulation fails tell nothing.
-    sound = np.isfinite(run.run([{}])[0]).all((1, 2, 3))
-    if not sound.any():
-        return None
-    rows = rows[sound]
-    run = replace(run, motion=own.motion.pick(rows), begin=begin.pick(rows))
     motion = varied(run, {own.model.parameters[k]: float(units[own.model.parameters[k]]) for k in own.free})
+    # Trials whose simulation fails tell nothing.
+    kept = np.flatnonzero(motion.sound)
+    if not len(kept):
+        return None
+    if len(kept) < len(rows):
+        rows, motion = rows[kept], motion.picked(kept)
+        frames = motion.rope.shape[1]
+        run = replace(run, motion=own.motion.pick(rows), begin=begin.pick(rows), frames=frames)
     if own.offset.shape[1]:
         motion = replace(motion, starts=_starts(own, values, rows, frames))
     if names:

@@ -95,8 +95,22 @@ class MotionVariations:
             time = torch.arange(self.pictures(fps), dtype=torch.float64)[None] / fps
             parts = [p for p in (self.numbers, self.doses, self.starts) if len(p)]
             rows = [over_time(torch.as_tensor(row[None]), self.step, time)[0].numpy() for part in parts for row in part]
-            self._sampled[fps] = np.stack(rows) if rows else np.zeros((0, *self.rope.shape))
+            # Of doses whose simulation fails nothing is said.
+            self._sampled[fps] = np.nan_to_num(np.stack(rows)) if rows else np.zeros((0, *self.rope.shape))
         return self._sampled[fps]
+
+    def picked(self, rows: np.ndarray) -> MotionVariations:
+        """Return some of the trials, each over its own frames."""
+        frames = tuple(self.frames[b] for b in rows) if self.frames else ()
+        last = max(frames, default=self.rope.shape[1])
+        parts = {n: getattr(self, n)[:, rows, :last] for n in ("numbers", "doses", "starts") if len(getattr(self, n))}
+        return replace(self, rope=self.rope[rows, :last], **parts, frames=frames, _sampled={})
+
+    @property
+    def sound(self) -> np.ndarray:
+        """Trials that all simulations of numbers went through, shape (B,) bool."""
+        known: np.ndarray = np.isfinite(self.rope).all((1, 2, 3)) & np.isfinite(self.numbers).all((0, 2, 3, 4))
+        return known
 
     def pictures(self, fps: float) -> int:
         """Return how many pictures a camera takes of the longest trial."""
