@@ -7,13 +7,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
+from tests.sysid.test_filmed_beginnings import gripped
 from torchdlo.physics.effects.base import Param
 from torchdlo.report.pages.camera_page import places_png, places_table
-from torchdlo.sysid.estimation.levenberg_marquardt import ParameterSpace
+from torchdlo.sysid.estimation.levenberg_marquardt import KNEE, ParameterSpace
+from torchdlo.sysid.estimation.observation import INDEPENDENT, SURE, FilmView
 from torchdlo.sysid.model.rope_model import RopeModel
 from torchdlo.sysid.recordings.recording import Recording, load_recording
-from torchdlo.sysid.video.filmed_problem import start_of
+from torchdlo.sysid.video import second_view as second_views
+from torchdlo.sysid.video.filmed_fit import look
+from torchdlo.sysid.video.filmed_problem import FilmedProblem, filmed_problem, start_of
 from torchdlo.sysid.video.second_view import (
     SecondView,
     added_rows,
@@ -24,7 +29,7 @@ from torchdlo.sysid.video.second_view import (
     visible,
 )
 from torchdlo.sysid.video.view_information import MotionVariations, SimulatedTrials, doses_of, varied
-from torchdlo.vision.camera import Camera, looking_at
+from torchdlo.vision.camera import Camera, lens, looking_at, project
 
 SAMPLE = Path(__file__).parents[2] / "torchdlo" / "data" / "sample_rope"
 STEP = 0.02
@@ -149,6 +154,46 @@ def test_a_view_is_shown_in_tables_a_picture_and_json(recording: Recording) -> N
     eye = np.array(content["places"][0]["position"])
     assert np.abs(np.array(view.best.camera.rotation) @ eye + np.array(view.best.camera.translation)).max() < 1e-9
     assert content["now"]["detection_limits"]["wind"]["hardest"] is None
+
+
+def problem_of(recording: Recording, cameras: list[Camera]) -> FilmedProblem:
+    """Return the problem of films from rest without any error."""
+    options = {"vertices": 21, "numerical_damping": 0.05}
+    model = RopeModel(recording, **options)
+    begun = start_of(model, recording.train, ())
+    start = replace(begun, vel=0 * begun.vel, still=np.ones(len(recording.train), bool))
+    every = model.simulate(model.motion(recording.train), start, model.guess()[None])[0][:, ::2]
+    views = []
+    for name, camera in zip("ab", cameras, strict=False):
+        camera = replace(camera, fps=50.0, name=name)
+        pixel, _ = project(lens([camera]), torch.as_tensor(every.reshape(1, -1, 3)))
+        places = pixel.numpy().reshape(*every.shape[:3], 2)
+        tangents = np.gradient(places, axis=2)
+        tangents /= np.linalg.norm(tangents, axis=-1, keepdims=True)
+        views.append(FilmView(camera, np.ones(places.shape[:2], bool), places, tangents, 3.0))
+    own = filmed_problem(recording, recording.train, views, options=options)
+    own.start, own.offset = start, np.zeros((len(recording.train), 0))
+    return own
+
+
+def test_what_is_expected_of_films_is_what_fits_to_them_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Expectations are lengths across the rope; fits read centre lines of masks, both ways: an independent path."""
+    monkeypatch.setattr(second_views, "HORIZON", 1.0)
+    recording = gripped(0.6, 1)
+    front = looking_at("a", [0.15, -1.35, 1.0], [0.0, 0.0, 0.88], focal=650.0)
+    own = problem_of(recording, [front])
+    raw = own.space.to_raw(np.concatenate([own.fixed, np.zeros(8)]))
+    view = second_views.second_view(own, raw)
+    assert view is not None and view.now is not None
+    for cameras, expected in (([front], view.now), ([front, view.best.camera], view.best.told)):
+        here = problem_of(recording, cameras)
+        at = here.space.to_raw(np.concatenate([here.fixed, np.zeros(8 * len(cameras))]))
+        _, curvature = look(here, at, here.offset).normal(here.prior)
+        pictures = sum(float(v.good.sum()) for v in here.spines.views)
+        information = curvature.mean(0) * KNEE / SURE**2 * INDEPENDENT * pictures
+        deviations = np.sqrt(np.diag(np.linalg.inv(information)))
+        for k, said in enumerate(expected.deviations.values()):
+            assert 0.75 < said / deviations[k] < 1.4
 
 
 def test_natural_curvature_out_of_the_plane_of_a_loop_is_seen_along_the_plane(recording: Recording) -> None:
