@@ -93,7 +93,7 @@ def one(path: Path, out: Path, options: Any) -> dict[str, Any]:
                     )
                 fitted = calibrate(load_recording(folder), seed=options.seed, vertices=options.vertices)
             else:
-                fitted = calibrate(few, seed=options.seed, vertices=options.vertices)
+                fitted = calibrate(few, seed=options.seed, vertices=options.vertices, rest=options.rest)
             used = time.process_time() - begun
             write_atomically(out / f"{kind}_model.json", model_json(fitted))
             result = {"parameters": fitted.parameters, "notes": fitted.notes, "cpu_s": used}
@@ -114,6 +114,7 @@ def main() -> None:
     parser.add_argument("--cameras", type=int, choices=(1, 2), default=1)
     parser.add_argument("--radius", type=float, default=0.004, help="of the cable as it is drawn, if not known [m]")
     parser.add_argument("--vertices", type=count, default=None)
+    parser.add_argument("--rest", choices=("auto", "straight"), default="straight", help="shape at rest, of markers")
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
     for path in options.recordings:

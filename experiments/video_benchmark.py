@@ -160,14 +160,57 @@ def table(rows: list[dict]) -> str:
     return "\n".join(lines)
 
 
+def stored(row: dict) -> dict:
+    """Return what is kept of a run in the repository."""
+    parts = {k: {n: v[n] for n in ("true", "value", "low", "high")} for k, v in row["parameters"].items()}
+    return {"rope": row["rope"], "seed": row["seed"], "cpu_s": row["cpu_s"], "parameters": parts, "test": row["test"]}
+
+
+def summary(rows: list[dict]) -> str:
+    """Return the table and the sentences of the documentation, from rows as `stored` returns them."""
+    names = {"bending_stiffness": "bending", "damping_rate": "damping", "twisting_stiffness": "twist"}
+
+    def error(row: dict, name: str) -> float:
+        return 100 * (row["parameters"][name]["value"] / row["parameters"][name]["true"] - 1)
+
+    def between(values: list[float], digits: int = 1, unit: str = "") -> str:
+        low, high = (f"{x:.{digits}f}" for x in (min(values), max(values)))
+        return f"{low}{unit}" if low == high else f"{low} to {high}{unit}"
+
+    lines = [f"| rope | runs | {' | '.join(names.values())} |", "|---|---|---|---|---|"]
+    for rope in ROPES:
+        own = [r for r in rows if r["rope"] == rope]
+        if own:
+            cells = " | ".join(between([error(r, n) for r in own], 1, " %") for n in names)
+            lines.append(f"| {rope} | {len(own)} | {cells} |")
+    near = sum(all(abs(error(r, n)) < 5 for n in ("bending_stiffness", "damping_rate")) for r in rows)
+    ranges = [r["parameters"][n] for r in rows for n in names]
+    held = sum(p["low"] <= p["true"] <= p["high"] for p in ranges)
+    seen = {k: [r["test"][k] for r in rows] for k in ("distance_px", "mae_mm", "boundary_f", "iou")}
+    used = sorted(r["cpu_s"] for r in rows)
+    lines += [
+        "",
+        f"{near} of {len(rows)} runs have bending stiffness and damping within 5 %.",
+        f"{held} of {len(ranges)} ranges hold the true value.",
+        f"Unseen films: {between(seen['distance_px'], 2)} px, {between(seen['mae_mm'], 2)} mm,",
+        f"boundary F {between(seen['boundary_f'], 2)}, overlap {between(seen['iou'], 2)}.",
+        f"{used[0]:.0f} to {used[-1]:.0f} CPU seconds, {float(np.median(used)):.0f} in the median.",
+    ]
+    return "\n".join(lines)
+
+
 def main() -> None:
     """Run what is left of the benchmark."""
     parser = Parser(__file__, description=(__doc__ or "").split("\n\n")[0])
     parser.add_argument("--out", default="runs/video_benchmark", help="folder that keeps what is done")
     parser.add_argument("--json", default="", help="file for all rows")
     parser.add_argument("--runs", type=count, default=20)
+    parser.add_argument("--summary", default="", help="print the table of the documentation from a file, and end")
     parser.flag("smoke", "one short run of one rope")
     options = parser.parse_args()
+    if options.summary:
+        print(summary(json.loads(Path(options.summary).read_text())["rows"]))
+        return
     torch.set_num_threads(1)
     out, rows = Path(options.out), []
     trials, seconds = ((1, 1), 0.6) if options.smoke else ((4, 2), 2.0)
@@ -183,7 +226,7 @@ def main() -> None:
             save(str(done), row)
         rows.append(json.loads(done.read_text()))
         print(table(rows[-1:]).splitlines()[2], flush=True)
-    save(options.json, {"rows": rows})
+    save(options.json, {"rows": [stored(r) for r in rows]})
     print(table(rows))
 
 

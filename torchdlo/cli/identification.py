@@ -228,16 +228,25 @@ def design_experiment(
     model: Annotated[
         Path | None,
         typer.Option(
-            help="Of films: model file whose parameters are to be found better. Default: "
+            help="Of films, and with --camera: model file that is taken for true. Default: "
             "runs/calibrate/NAME/model.json.",
             metavar="FILE",
         ),
     ] = None,
+    camera: Annotated[
+        str,
+        typer.Option(
+            help="Of a recording with markers: where a camera would have to stand. `nominal` for one of 640 x 480 "
+            "pixels, or a cameras.json: its cameras are those at hand. Of films: what the new one is like.",
+            metavar="nominal|FILE",
+        ),
+    ] = "",
     resume: ResumeOption = False,
 ) -> None:
     """Find the motion of the grippers that tells apart effects which a recording cannot.
 
-    Of a recording with films: find the motion, and the place of the camera, that tell most of the rope's parameters.
+    Of a recording with films, or with --camera: find the place of one more camera that shows what those at hand cannot,
+    and the motion and the place that tell most of the rope's parameters, or of --effects.
 
     Ctrl-C stops after the running step; --resume goes on from there.
 
@@ -246,6 +255,8 @@ def design_experiment(
     torchdlo design-experiment my_rope
 
     torchdlo design-experiment my_rope --effects wind,tilted_gravity --seconds 4
+
+    torchdlo design-experiment my_rope --camera nominal --effects rest_curvature
     """
     from torchdlo.report.pages import design_page as report
     from torchdlo.sysid.experiment_design import design as designs
@@ -253,13 +264,16 @@ def design_experiment(
 
     loaded = load_recording(recording)
     asked, name = [n.strip() for n in effects.split(",") if n.strip()], recording.resolve().name
-    if loaded.filmed:
-        if asked or findings is not None or tip_mass or resume:
-            raise InputError(f"{recording}: expected no --effects, --findings, --tip-mass or --resume for films.")
+    if loaded.filmed or camera:
+        if findings is not None or tip_mass or resume:
+            raise InputError(f"{recording}: expected no --findings, --tip-mass or --resume for films or with --camera.")
         path = model or Path("runs") / "calibrate" / name / "model.json"
-        return _place_cameras(loaded, path, out or Path("runs") / "design" / name, seconds, scale, as_json)
+        out = out or Path("runs") / "design" / name
+        return _place_cameras(loaded, path, out, camera, as_json, seconds=seconds, scale=scale, effects=asked)
     if model is not None:
-        raise InputError(f"{recording}: expected --model for films only; --findings says what to start from.")
+        raise InputError(
+            f"{recording}: expected --model for films only, or with --camera; --findings says what to start from."
+        )
     if findings is None and not asked:
         findings = Path("runs") / "diagnose" / name
     out = out or Path("runs") / "design" / name
@@ -286,10 +300,17 @@ def design_experiment(
         typer.echo(designs.design_json(design), nl=False)
 
 
-def _place_cameras(recording: Recording, model: Path, out: Path, seconds: float, scale: float, as_json: bool) -> None:
+def _place_cameras(recording: Recording, model: Path, out: Path, camera: str, as_json: bool, **options: Any) -> None:
     from torchdlo.report.pages import camera_page as report
     from torchdlo.sysid.model import model_file
     from torchdlo.sysid.video import camera_placement
+    from torchdlo.vision.camera import load_cameras
+
+    if camera == "nominal":
+        options["lens"] = camera_placement.nominal_camera()
+    elif camera:
+        options["cameras"] = load_cameras(camera)
+        options["lens"] = options["cameras"][0]
 
     for file in report.FILES[:-1]:
         check_writable(out / file)
@@ -299,14 +320,15 @@ def _place_cameras(recording: Recording, model: Path, out: Path, seconds: float,
     with at_work(out, *report.FILES):
         try:
             with progress() as show, deferred_interrupt(show) as callback:
-                design = camera_placement.place_cameras(
-                    recording, given, seconds=seconds, scale=scale, callback=callback
-                )
+                design = camera_placement.place_cameras(recording, given, callback=callback, **options)
         except KeyboardInterrupt:
             raise stopped("nothing was written") from None
         report.write_placement(design, out, command=shlex.join(["torchdlo", *sys.argv[1:]]))
     typer.echo(f"{camera_placement.camera_summary(design)}\n", err=as_json)
-    typer.echo(f"{report.camera_table(design)}\n", err=as_json)
+    typer.echo("\n".join(f"- {said}" for said in camera_placement.recorded_notes(design)), err=as_json)
+    if design.recorded is not None:
+        typer.echo(f"\nThe recorded motion:\n{report.places_table(design.recorded)}", err=as_json)
+    typer.echo(f"\nAnother motion:\n{report.camera_table(design)}\n", err=as_json)
     typer.echo(f"cameras: {out / 'cameras.json'}\nreport:  {out / 'report.html'}", err=as_json)
     if as_json:
         typer.echo(camera_placement.camera_json(design), nl=False)

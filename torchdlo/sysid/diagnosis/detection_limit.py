@@ -20,7 +20,7 @@ from torchdlo.sysid.diagnosis import effect_library
 from torchdlo.sysid.diagnosis.score_test import Score
 from torchdlo.sysid.recordings.recording import Recording
 
-__all__ = ["HIDDEN", "DetectionLimit", "detection_limits", "least_gap", "limit_gap"]
+__all__ = ["HIDDEN", "DetectionLimit", "ProbedEffect", "detection_limits", "least_gap", "limit_gap"]
 
 HIDDEN = "cannot be seen in this recording"
 """Of an effect that would have to be larger than it can be to be named."""
@@ -43,6 +43,16 @@ class DetectionLimit:
     """The same where it shows least."""
     greatest: float
     """The greatest size that there can be; of a stiffness in series, the least."""
+
+
+@dataclass(frozen=True)
+class ProbedEffect:
+    """Doses of an effect, and what they show."""
+
+    name: str
+    """The effect."""
+    probes: tuple[tuple[dict[str, float], float], ...]
+    """Its doses by themselves: numbers, and the gap that each leaves after all other numbers took up their part [m]."""
 
 
 def least_gap(rest: float, noise: float, level: float, share: float) -> float:
@@ -68,14 +78,14 @@ def limit_gap(gaps: np.ndarray, noise: float, level: float, share: float) -> flo
     return least_gap(rest, noise, level if np.isfinite(level) else noise, share)
 
 
-def detection_limits(scores: Sequence[Score], gap: float, recording: Recording) -> list[DetectionLimit]:
+def detection_limits(scores: Sequence[Score | ProbedEffect], gap: float, recording: Recording) -> list[DetectionLimit]:
     """Return from which size on each of the screened effects leaves this gap [m], in the order of the library."""
     found = [limit for score in scores if (limit := _limit(score, gap, recording)) is not None]
     order = {name: k for k, name in enumerate(effect_library.library())}
     return sorted(found, key=lambda limit: order.get(limit.name, len(order)))
 
 
-def _limit(score: Score, gap: float, recording: Recording) -> DetectionLimit | None:
+def _limit(score: Score | ProbedEffect, gap: float, recording: Recording) -> DetectionLimit | None:
     """Return the limit of one effect, None where no gap is known or it has no number that tells its size."""
     if not np.isfinite(gap):
         return None

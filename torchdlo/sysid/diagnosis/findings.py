@@ -70,6 +70,7 @@ def findings(result: Diagnosis, recording: Recording) -> dict[str, Any]:
         "detection_limits": [
             dataclasses.asdict(limit) | {"note": HIDDEN if limit.easiest is None else None} for limit in result.limits
         ],
+        "second_view": result.second_view,
         "misleading_trials": [dataclasses.asdict(trial) for trial in result.misleading],
         "candidates": candidates,
         "baseline": values_of("", numbers),

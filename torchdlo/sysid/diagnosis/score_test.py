@@ -86,7 +86,7 @@ def score_effects(
     known = dict(zip(model.parameters, base.values, strict=True))
     curved = curvature_scale(measured[:, :: max(1, measured.shape[1] // 50), : model.count])
     doses = {n: effect_library.perturbations(n, recording, model.mesh, curved, known) for n in names}
-    groups, nudge = _groups(names, doses), base.space.nudges()
+    groups, nudge = groups_of(names, doses), base.space.nudges()
     jobs = [_job(pool, base, group, doses) for group in groups]
     jobs.append(SimulationJob(base.effects, _nudged(model, base, nudge)))
     frames = min(max(10, int(_HORIZON * measured.shape[1])), measured.shape[1])
@@ -155,7 +155,7 @@ def _nudged(model: RopeModel, base: Fitted, nudge: np.ndarray) -> np.ndarray:
     return rows
 
 
-def _groups(names: Sequence[str], doses: dict[str, list[Perturbation]]) -> list[list[str]]:
+def groups_of(names: Sequence[str], doses: dict[str, list[Perturbation]]) -> list[list[str]]:
     """Return effects that are simulated together: a scene of many effects is slow, one scene per effect wasteful."""
     groups: list[list[str]] = []
     for name in sorted(names, key=lambda n: -len(doses[n])):

@@ -125,6 +125,8 @@ class Diagnosis:
     """By effect: whether what it explains on the test trials could be chance."""
     limits: list[DetectionLimit] = field(default_factory=list)
     """From which size on effects would be named on this recording."""
+    second_view: dict[str, Any] | None = None
+    """Of films: places of one more camera, and what would be named from there; None if there are none."""
     leading: BestCandidate | None = None
     """What comes closest where a gap is left that nothing named explains."""
     misleading: list[MisleadingTrial] = field(default_factory=list)

@@ -1,10 +1,8 @@
-"""Where to put a camera, and how to move the grippers: what films from there would tell of the rope's parameters.
+"""Where to put a camera, and how to move the grippers: what films from there would tell of the rope.
 
-A motion is simulated once with each parameter varied; a camera's readings of it are linear in small changes, of the
-parameters as of its own pose, focal length and clock. What those nuisances can take up under their priors is lost
-(Schur complement of the information), and what is left of several cameras adds up. Places are ranked by the geometric
-mean of the standard deviations that are left, which is the criterion D of optimal design (Pukelsheim 1993,
-doi:10.1137/1.9780898719109).
+Places of a camera are compared for the motion that was recorded (`second_view`), and for the motions of a menu. Those
+are ranked by the geometric mean of the standard deviations of the parameters, which is the criterion D of optimal
+design (Pukelsheim 1993, doi:10.1137/1.9780898719109), or by how large named effects have to be to show.
 """
 
 from __future__ import annotations
@@ -16,12 +14,11 @@ from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
-import torch
 
 from torchdlo.errors import InputError
+from torchdlo.sysid.diagnosis import effect_library
 from torchdlo.sysid.diagnosis.budget import model_options
-from torchdlo.sysid.estimation.levenberg_marquardt import ParameterSpace
-from torchdlo.sysid.estimation.observation import INDEPENDENT, PER_CAMERA, SURE, FilmView, nuisances, seen_by
+from torchdlo.sysid.estimation.observation import PER_CAMERA, FilmView
 from torchdlo.sysid.estimation.result import result_json, versions
 from torchdlo.sysid.experiment_design import excitation_motions
 from torchdlo.sysid.experiment_design.design import motion_text
@@ -30,35 +27,45 @@ from torchdlo.sysid.model.model_file import ModelFile
 from torchdlo.sysid.model.rope_model import RopeModel
 from torchdlo.sysid.recordings.recording import Recording, Trial
 from torchdlo.sysid.recordings.trivial_predictors import catenary
-from torchdlo.sysid.video.filmed_problem import start_of
-from torchdlo.vision.camera import NEAR, Camera, looking_at
+from torchdlo.sysid.video.filmed_problem import filmed_problem, first_frames, start_of
+from torchdlo.sysid.video.second_view import (
+    SecondView,
+    effect_notes,
+    number_notes,
+    second_view,
+    second_view_json,
+    visible,
+)
+from torchdlo.sysid.video.view_information import (
+    CameraInformation,
+    ExpectedInformation,
+    MotionVariations,
+    SimulatedTrials,
+    camera_information,
+    camera_places,
+    doses_of,
+    told,
+    varied,
+)
+from torchdlo.vision.camera import Camera, looking_at
 
 __all__ = [
     "CameraDesign",
     "CameraPlacement",
     "camera_json",
-    "camera_places",
     "camera_summary",
-    "information",
+    "nominal_camera",
     "place_cameras",
+    "recorded_notes",
 ]
 
 Callback = Callable[[str, int, int, str], None]
 
-_AZIMUTHS, _ELEVATIONS = 8, (0.0, 35.0)
-"""Directions around the rope, and angles above the level [degrees], from which it is looked at."""
+_TRIALS = 3
+"""Most recorded trials for whose motion places are compared."""
 
-_MARGIN = 1.1
-"""How much farther a camera is than it has to be to see all of the motion."""
-
-_NEAREST = 0.25
-"""Least distance of a camera [m]."""
-
-_LINE = 0.15
-"""What centre lines of masks get wrong [px]."""
-
-_UNKNOWN = math.log(10.0)
-"""Standard deviation of the logarithm of what is not known: a factor of ten either way."""
+_SECONDS = 3.0
+"""Most seconds of each."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +83,8 @@ class CameraPlacement:
     deviations: dict[str, float]
     """By parameter: expected standard deviation, of the logarithm where the scale is one, else in its unit."""
     score: float
-    """Geometric mean of the standard deviations in coordinates, along the principal axes [1]."""
+    """Geometric mean of the standard deviations in coordinates, along the principal axes [1]; where effects are named,
+    times as large as tried that the dose has to be which shows least."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,6 +107,10 @@ class CameraDesign:
     """How long it lasts."""
     duration: float
     """Time that the search took [s]."""
+    recorded: SecondView | None = None
+    """Places of one more camera for the motion that was recorded; None if from none all of the rope is seen."""
+    effects: tuple[str, ...] = ()
+    """Named effects by which motions and places are ranked; none if by parameters."""
     notes: list[str] = field(default_factory=list)
     """Sentences that a reader should know."""
 
@@ -108,73 +120,9 @@ class CameraDesign:
         return self.single[0]
 
 
-def camera_places(own: Camera, points: np.ndarray, lowest: float) -> list[tuple[Camera, str]]:
-    """Return cameras around a motion, as near as all of it is in the picture, with words for where they are.
-
-    Args:
-        own: camera whose lens and sensor they have.
-        points: places of the rope [m], shape (N, 3).
-        lowest: least height of a camera [m].
-    """
-    middle = 0.5 * (points.min(0) + points.max(0))
-    size, focal = (own.width, own.height), 0.5 * (own.fx + own.fy)
-    half = 0.5 * np.array(size) / focal
-    found = []
-    for elevation in _ELEVATIONS:
-        for azimuth in np.arange(_AZIMUTHS) * 360.0 / _AZIMUTHS:
-            a, e = np.radians([azimuth, elevation])
-            away = np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
-            turn = np.array(looking_at("", away.tolist(), [0.0, 0.0, 0.0]).rotation)
-            local = (points - middle) @ turn.T
-            # A point is in the picture where |x| <= half (distance + z).
-            need = float((np.abs(local[:, :2]) / half - local[:, 2:]).max())
-            distance = max(_MARGIN * need, _NEAREST)
-            eye = middle + distance * away
-            if eye[2] < lowest:
-                continue
-            camera = looking_at("new", eye.tolist(), middle.tolist(), size=size, focal=focal, fps=own.fps)
-            where = f"{distance:.2f} m away, {azimuth:.0f}° from x, {elevation:.0f}° above the level"
-            found.append((camera, where))
-    return found
-
-
-def information(
-    camera: Camera, sims: np.ndarray, steps: np.ndarray, step: float, free: np.ndarray
-) -> np.ndarray | None:
-    """Return what films of a motion tell of parameters in coordinates, shape (K, K); None where it leaves the picture.
-
-    Args:
-        camera: that films.
-        sims: places of the rope [m], as it is and with each parameter varied, shape (K + 1, T, M, 3).
-        steps: by how much the coordinates were varied, shape (K,).
-        step: time between simulated frames [s].
-        free: which of the places may be seen, shape (M,) bool.
-    """
-    frames = int((sims.shape[1] - 1) * step * camera.fps) + 1
-    blank = np.zeros((1, frames, 1, 2))
-    view = FilmView(replace(camera, start=0.0), np.ones((1, frames), bool), blank, blank, 1.0)
-    size = 0.1 * nuisances([view]).units
-    rows = np.concatenate([np.zeros((len(sims), PER_CAMERA)), np.diag(size)])
-    ropes = torch.as_tensor(np.concatenate([sims, np.repeat(sims[:1], PER_CAMERA, 0)])[:, None])
-    with torch.no_grad():
-        pixel, depth, focal = (x.numpy() for x in seen_by(view, ropes, torch.as_tensor(rows), step))
-    pixel, depth = pixel[:, 0], depth[0, 0]
-    here = pixel[0]
-    seen = (depth > NEAR) & (here >= 0).all(-1) & (here <= np.array([camera.width - 1, camera.height - 1])).all(-1)
-    if not seen[:, free].all():
-        return None
-    tangent = np.gradient(here, axis=1)
-    tangent /= np.linalg.norm(tangent, axis=-1, keepdims=True).clip(1e-9)
-    scale = depth / focal[0]
-    across = (pixel[1:] - here) @ np.array([[0.0, 1.0], [-1.0, 0.0]])
-    change = ((across * tangent).sum(-1) * scale)[:, :, free].reshape(len(rows) - 1, -1)
-    change /= np.concatenate([steps, np.full(PER_CAMERA, 0.1)])[:, None]
-    noise = SURE**2 + (_LINE * scale[:, free]) ** 2
-    whole = (change * (INDEPENDENT / free.sum() / noise.ravel())) @ change.T
-    count = len(steps)
-    camera_part = whole[count:, count:] + np.eye(PER_CAMERA)  # their priors
-    mixed = whole[:count, count:]
-    return np.asarray(whole[:count, :count] - mixed @ np.linalg.solve(camera_part, mixed.T))
+def nominal_camera() -> Camera:
+    """Return a camera of 640 x 480 pixels that sees 56 degrees, at 30 pictures a second."""
+    return looking_at("nominal", [0.0, -1.0, 0.0], [0.0, 0.0, 0.0], focal=600.0)
 
 
 def place_cameras(
@@ -183,40 +131,59 @@ def place_cameras(
     *,
     seconds: float = 3.0,
     scale: float = 1.0,
+    effects: Sequence[str] = (),
+    cameras: Sequence[Camera] = (),
+    lens: Camera | None = None,
     callback: Callback | None = None,
 ) -> CameraDesign:
-    """Rank motions and places of a camera by what their films are expected to tell of the parameters.
+    """Rank motions and places of a camera by what their films are expected to tell.
 
     Args:
-        recording: with films, which say what grippers can do and which cameras there are.
+        recording: which says what grippers can do, and if it has films, which cameras there are.
         given: model that is taken for true, and whose parameters are to be found better.
         seconds: how long the motion may last.
         scale: by what factor it may leave the workspace, and exceed the speeds, of the recording.
+        effects: by which places and motions are ranked; the parameters, and all effects for the recorded motion, if
+            not given.
+        cameras: at hand, of a recording without films.
+        lens: camera like which the new one is; the first one at hand if not given, or a nominal one.
         callback: told (stage, steps done, in all, message).
 
     Raises:
-        InputError: There are no films, or no motion can be simulated.
+        InputError: The recording is of a rope at rest, or no motion can be simulated.
     """
     begun, report = time.perf_counter(), callback or (lambda *_: None)
     if recording.still:
-        raise InputError(f"{recording.path}: expected films, whose grippers move, found photographs.")
+        raise InputError(f"{recording.path}: expected trials in which grippers move, found photographs.")
     if not (math.isfinite(seconds) and 1.0 <= seconds <= 60.0):
         raise InputError(f"seconds: expected 1 to 60, found {seconds:g}.")
     model = RopeModel(recording, effects=given.effects, **(model_options(recording, None) | given.options))
+    for name in effects:
+        effect_library.check_known("--effects", name)
+        if name in given.effects or not effect_library.applicable(name, recording, model.mesh):
+            raise InputError(
+                f"--effects {name}: expected effects that can act in {recording.path} and that the model lacks."
+            )
+    own = tuple(f.camera for f in recording.train[0].films) if recording.filmed else tuple(cameras)
+    like = lens or (own[0] if own else nominal_camera())
+    recorded = _recorded(recording, given, model, effects, own, like, report)
     rig = _rig(recording, scale)
     motions = excitation_motions.motion_menu(rig, seconds, float(np.linalg.norm(recording.gravity)))
     motions = [g for g in motions if not g.heading]
     trials = [excitation_motions.motion_trial(rig, g, seconds, f"motion_{k}") for k, g in enumerate(motions)]
-    space, sims = _varied(model, given, trials, report)
-    around = _Surroundings(space, model, tuple(f.camera for f in recording.train[0].films))
+    menu = _simulation(recording, given, model, trials, seconds)
+    varying = varied(menu, given.sizes(model))
+    if effects:
+        varying = doses_of(menu, varying, effects, lambda k, n: report("simulating motions", k, n, ""))
+    around = _Surroundings(model, own, like, bool(effects))
     single: list[CameraPlacement] = []
     added: list[CameraPlacement] = []
     now: list[CameraPlacement] = []
-    for k, (motion, trial) in enumerate(zip(motions, trials, strict=True)):
+    for k, motion in enumerate(motions):
         report("placing cameras", k, len(motions), motion.kind)
         moves = motion_text(motion, *excitation_motions.largest_amplitude(rig, motion, seconds))
-        rope = sims[:, k, : len(trial.time)]
-        if np.isfinite(rope).all():
+        rope = varying.picked(np.array([k]))
+        if rope.sound.all():
             for whole, part in zip((single, added, now), around.placements(motion, moves, rope), strict=True):
                 whole += part
     if not single:
@@ -235,8 +202,64 @@ def place_cameras(
         _of_grippers(trials[motions.index(single[0].motion)]),
         seconds,
         time.perf_counter() - begun,
+        recorded,
+        tuple(effects),
         ["Whether something stands between a camera and the rope is not known here."],
     )
+
+
+def _recorded(
+    recording: Recording,
+    given: ModelFile,
+    model: RopeModel,
+    effects: Sequence[str],
+    cameras: Sequence[Camera],
+    like: Camera,
+    report: Callback,
+) -> SecondView | None:
+    """Return places of one more camera for the recorded motion."""
+    count = len(recording.train)
+    chosen = np.unique(np.linspace(0, count - 1, min(count, _TRIALS)).round().astype(int))
+    trials = [replace(t, markers=catenary(t, recording)) for t in (recording.train[k] for k in chosen)]
+    trials = [first_frames([t], math.ceil(_SECONDS / model.dt) + 1)[0] for t in trials]
+    # Where films begin in motion is fitted, too; pictures are not looked at.
+    longest = max(float(t.time[-1] - t.time[0]) for t in trials)
+    blank = np.zeros((len(trials), int(longest * like.fps) + 1, 1, 2))
+    views = [FilmView(c, np.ones(blank.shape[:2], bool), blank, blank, 1.0) for c in cameras or (like,)]
+    own = filmed_problem(
+        recording,
+        trials,
+        views,
+        effects=given.effects,
+        values=given.start(model),
+        fitted=tuple(given.sizes(model)),
+        options=model_options(recording, None) | given.options,
+    )
+    values = np.concatenate([own.fixed[list(own.free)], np.zeros(PER_CAMERA * len(views))])
+    names = list(effects) or visible(recording, model, given.effects)
+    return second_view(
+        own,
+        own.space.to_raw(values),
+        names=names,
+        ranked=effects,
+        cameras=cameras,
+        lens=like,
+        report=lambda k, n: report("trying effects in the recorded motion", k, n, ""),
+    )
+
+
+def _simulation(
+    recording: Recording, given: ModelFile, model: RopeModel, trials: Sequence[Trial], seconds: float
+) -> SimulatedTrials:
+    """Return trials with the model that is taken for true, begun at rest where grippers are."""
+    count = max(3, math.ceil(seconds / model.dt) + 1)
+    cut = first_frames(trials, count)
+    alone = [replace(t, markers=catenary(t, recording)) for t in cut]
+    numbers = dict(zip(model.parameters, map(float, given.start(model)), strict=True))
+    options = model_options(recording, None) | given.options
+    motion = model.motion(cut)
+    frames = min(count, motion.markers.shape[1])
+    return SimulatedTrials(recording, given.effects, options, numbers, motion, start_of(model, alone, ()), frames)
 
 
 def _rig(recording: Recording, scale: float) -> excitation_motions.GripperLimits:
@@ -251,80 +274,49 @@ def _rig(recording: Recording, scale: float) -> excitation_motions.GripperLimits
 class _Surroundings:
     """What is the same for all motions."""
 
-    space: ParameterSpace
-    """The numbers to find."""
     model: RopeModel
     """The rope."""
     cameras: tuple[Camera, ...]
-    """Those of the recording."""
+    """Those at hand."""
+    like: Camera
+    """What a new one is like."""
+    by_effects: bool
+    """Whether effects rank, not parameters."""
 
     def placements(
-        self, motion: ExcitationMotion, moves: str, rope: np.ndarray
+        self, motion: ExcitationMotion, moves: str, rope: MotionVariations
     ) -> tuple[list[CameraPlacement], list[CameraPlacement], list[CameraPlacement]]:
-        """Return what a motion tells one camera, the recording's with one more, and those alone.
+        """Return what a motion tells one camera, those at hand with one more, and those alone.
 
         Args:
             motion: of the grippers.
             moves: the same in words.
-            rope: its places as it is and with each number varied [m], shape (K + 1, T, M, 3).
+            rope: its places, as they are and varied.
         """
-        free = np.ones(self.model.count, bool)
-        free[self.model.gripped] = False
         table = self.model.recording.table_height
         lowest = -np.inf if table is None else table + 0.05
-        steps, dt = self.space.nudges(), self.model.dt
-        mine = [(c, information(c, rope, steps, dt, free)) for c in self.cameras]
-        known = [(c, told) for c, told in mine if told is not None]
-        own = [_judged(self.space, motion, moves, f"camera {c.name} as it stands", [(c, told)]) for c, told in known]
+        known = [each for c in self.cameras if (each := camera_information(c, rope)).whole]
+
+        def judged(stands: str, films: Sequence[CameraInformation]) -> CameraPlacement:
+            found = told(films, rope)
+            score = self.score(found)
+            return CameraPlacement(motion, moves, tuple(f.camera for f in films), stands, found.deviations, score)
+
+        own = [judged(f"camera {each.camera.name} as it stands", [each]) for each in known]
         new: list[CameraPlacement] = []
         more: list[CameraPlacement] = []
-        for camera, where in camera_places(self.cameras[0], rope[0].reshape(-1, 3), lowest):
-            told = information(camera, rope, steps, dt, free)
-            if told is not None:
-                new.append(_judged(self.space, motion, moves, where, [(camera, told)]))
-            if told is not None and known:
-                more.append(_judged(self.space, motion, moves, f"with one more {where}", [*known, (camera, told)]))
-        together = [_judged(self.space, motion, moves, "the cameras as they stand", known)] if known else []
+        for camera, where in camera_places(self.like, rope.rope.reshape(-1, 3), lowest):
+            each = camera_information(camera, rope)
+            if each.whole:
+                new.append(judged(where, [each]))
+                if known:
+                    more.append(judged(f"with one more {where}", [*known, each]))
+        together = [judged("the cameras as they stand", known)] if known else []
         return [*own, *sorted(new, key=lambda p: p.score)[:2]], more, together
 
-
-def _varied(
-    model: RopeModel, given: ModelFile, trials: Sequence[Trial], report: Callback
-) -> tuple[ParameterSpace, np.ndarray]:
-    """Return the numbers to find as coordinates, and motions with none and each of them varied, (K + 1, B, T, M, 3)."""
-    sizes, values = given.sizes(model), given.start(model)
-    columns = [k for k, name in enumerate(model.parameters) if name in sizes]
-    space = ParameterSpace(
-        tuple(model.parameters[k] for k in columns),
-        tuple(model.params[k] for k in columns),
-        tuple(sizes[model.parameters[k]] for k in columns),
-    )
-    raw = space.to_raw(values[columns])
-    rows = np.repeat(values[None], len(columns) + 1, 0)
-    rows[1:, columns] = space.to_values(raw + np.diag(space.nudges()))
-    start = start_of(model, trials, ())
-    out = []
-    for k, row in enumerate(rows):
-        report("simulating motions", k, len(rows), "")
-        out.append(model.simulate(model.motion(trials), start, row[None])[0])
-    report("simulating motions", len(rows), len(rows), "")
-    return space, np.stack(out)
-
-
-def _judged(
-    space: ParameterSpace,
-    motion: ExcitationMotion,
-    moves: str,
-    stands: str,
-    told: Sequence[tuple[Camera, np.ndarray]],
-) -> CameraPlacement:
-    """Return what films of a motion by cameras are expected to tell, from what each tells."""
-    prior = np.array([_UNKNOWN if p.scale == "log" else 3.0 for p in space.params]) ** -2.0
-    spread = np.linalg.inv(np.sum([each for _, each in told], 0) + np.diag(prior))
-    deviation = np.sqrt(np.diag(spread)) * space.units
-    score = float(np.exp(0.5 * np.linalg.slogdet(spread)[1] / len(spread)))
-    names = dict(zip(space.names, map(float, deviation), strict=True))
-    return CameraPlacement(motion, moves, tuple(c for c, _ in told), stands, names, score)
+    def score(self, found: ExpectedInformation) -> float:
+        """Return what ranks: the parameters' mean deviation, or the dose of the worst of named effects."""
+        return max(found.doses(found.noise).values(), default=math.inf) if self.by_effects else found.score
 
 
 def _of_grippers(trial: Trial) -> Trial:
@@ -339,7 +331,10 @@ def _of_grippers(trial: Trial) -> Trial:
 def camera_summary(design: CameraDesign) -> str:
     """Return the outcome in words."""
     best, names = design.best, ", ".join(f"{n.replace('_', ' ')} {d:.2g}" for n, d in design.best.deviations.items())
-    said = f"Move the gripper so that it {best.moves}, and film it from {best.stands}: expected deviations {names}."
+    shows = f"expected deviations {names}"
+    if design.effects:
+        shows = f"{', '.join(n.replace('_', ' ') for n in design.effects)} shows best"
+    said = f"Move the gripper so that it {best.moves}, and film it from {best.stands}: {shows}."
     if design.now is not None:
         gain = design.now.score / best.score
         said += f" From where the cameras stand, the best motion ({design.now.moves}) tells {gain:.2g} times less." * (
@@ -347,8 +342,20 @@ def camera_summary(design: CameraDesign) -> str:
         )
     if design.added:
         gain = best.score / design.added[0].score
-        said += f" The cameras as they stand, {design.added[0].stands}, tell {gain:.2g} times more."
+        said += f" The cameras as they stand, {design.added[0].stands}, tell {gain:.2g} times more." * (gain > 1.02)
     return said
+
+
+def recorded_notes(design: CameraDesign) -> list[str]:
+    """Return what one more camera would add to the recorded motion, in words."""
+    view = design.recorded
+    if view is None:
+        return ["From no place is all of the recorded motion in the picture."]
+    if view.now is None:
+        return [
+            f"Of places for a first camera, with the recorded motion, {view.best.where} shows the worst effect best."
+        ]
+    return [*effect_notes(view), *(n for n in number_notes(view) if n.startswith("One more"))]
 
 
 def camera_json(design: CameraDesign) -> str:
@@ -371,6 +378,9 @@ def camera_json(design: CameraDesign) -> str:
         "placements": [plain(p) for p in design.single],
         "with_one_more": [plain(p) for p in design.added],
         "as_it_stands": None if design.now is None else plain(design.now),
+        "effects": list(design.effects),
+        "recorded_motion": None if design.recorded is None else second_view_json(design.recorded),
+        "recorded_notes": recorded_notes(design),
         "seconds_of_motion": design.seconds,
         "notes": design.notes,
         "file": "motion.npz",

@@ -35,6 +35,7 @@ from torchdlo.sysid.video.filmed_starts import START_WINDOW, fit_starts, refine_
 from torchdlo.sysid.video.footage import views_of
 from torchdlo.sysid.video.overlay import mask_overlaps, overlays
 from torchdlo.sysid.video.picture_gradient import descend, whitening, with_profile
+from torchdlo.sysid.video.second_view import number_notes, second_view
 
 __all__ = [
     "FILMED_STARTS",
@@ -108,6 +109,8 @@ def calibrate_filmed(
     found = [_judged(recording, split, own, first, values, notes, report) for split in ("train", "test")]
     report("judging", 1, 1, "")
     trials = [t for f in found for t in f.trials]
+    if method != "gradient" and (view := second_view(own, best.raw)) is not None:
+        notes += number_notes(view)
     notes += doubts(trials, [name for f in found for name in f.moving])
     return Calibration(
         parameters={

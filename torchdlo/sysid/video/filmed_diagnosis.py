@@ -15,6 +15,7 @@ import numpy as np
 from torchdlo.physics.effects.parameter_name import ParameterName
 from torchdlo.sysid.diagnosis import effect_library, score_test
 from torchdlo.sysid.diagnosis.budget import BUDGETS, Budget
+from torchdlo.sysid.diagnosis.detection_limit import limit_gap
 from torchdlo.sysid.diagnosis.error_floor import ErrorFloor, gap_rms
 from torchdlo.sysid.diagnosis.score_test import Score
 from torchdlo.sysid.diagnosis.verdict import UNKNOWN_FLOOR, Candidate, Diagnosis, verdict_word
@@ -29,6 +30,7 @@ from torchdlo.sysid.video.filmed_model import FilmedModel, Films, extended
 from torchdlo.sysid.video.filmed_problem import FilmedProblem
 from torchdlo.sysid.video.footage import views_of
 from torchdlo.sysid.video.overlay import overlays
+from torchdlo.sysid.video.second_view import SecondView, effect_notes, second_view, second_view_json, visible
 
 __all__ = ["diagnose_filmed"]
 
@@ -132,8 +134,27 @@ def diagnose_filmed(
             first, base = further(films, first, base, given is None, report)
             floor, level = _floor(base)
     notes = [*notes, *said, *left_out(base, own), *chain_note(base)]
+    view = _elsewhere(base, floor, level, without, report)
     shares = _rescaled(shares, first, base, floor)
-    return _concluded(films, recording, first, base, floor, level, shares, ties, rounds, notes, seed, budget, begun)
+    done = _concluded(films, recording, first, base, floor, level, shares, ties, rounds, notes, seed, budget, begun)
+    if view is not None:
+        done.notes += effect_notes(view)
+        done.limits, done.second_view = list(view.limits.values()), second_view_json(view)
+    done.seconds = time.perf_counter() - begun
+    return done
+
+
+def _elsewhere(
+    final: FilmedModel, floor: ErrorFloor, level: float, without: Sequence[str], report: Callback
+) -> SecondView | None:
+    """Return from which sizes on effects are named on these films, and with one more camera."""
+    gap = limit_gap(final.gaps("test"), floor.noise, level, PAYS)
+    if not np.isfinite(gap):
+        return None
+    model = final.own.model
+    names = visible(model.recording, model, (*model.effects, *without))
+    stage = "looking for a second view"
+    return second_view(final.own, final.fit.raw, names=names, level=gap, report=lambda k, n: report(stage, k, n, ""))
 
 
 def _rescaled(shares: dict[str, float], first: FilmedModel, final: FilmedModel, floor: ErrorFloor) -> dict[str, float]:
@@ -314,7 +335,7 @@ def _scores(base: FilmedModel, names: Sequence[str], seconds: float, report: Cal
     step = max(1, sims.shape[2] // 50)
     curved = score_test.curvature_scale(sims[0][:, ::step])
     doses = {n: effect_library.perturbations(n, own.model.recording, own.model.mesh, curved, known) for n in names}
-    groups = score_test._groups(names, doses)
+    groups = score_test.groups_of(names, doses)
     seen = np.isfinite(here.residual)
     weight = np.where(seen, 1 / (np.nan_to_num(here.residual) ** 2 + levenberg_marquardt.KNEE**2) ** 0.25, 0.0)
     left, count = -(np.nan_to_num(here.residual) * weight)[seen], here.raw.size
@@ -409,7 +430,7 @@ def _concluded(
         notes=[*notes, *([_far(level, floor)] if _blunt(level, floor) else [])],
         options={"budget": budget, "seed": seed, "vertices": final.own.options["vertices"]},
     )
-    done.overlays, done.seconds = shown, time.perf_counter() - begun
+    done.overlays = shown
     return done
 
 
