@@ -76,7 +76,7 @@ def _strained(scene: Any, params: Any, rods: RodState) -> Tensor:
     solved = [m * (not {k, after[k]} <= held) for k, m in enumerate(scene.topology.edge_mask())]
     changed = altered_params(scene.effects, scene.topology, params.rods, params.effects)
     edge = rod.edge_vectors(scene.topology, rods.pos, changed.rest.edge_mask)
-    wanted = changed.rest.length * (1 + rods.tension / changed.material.stretch.clamp(max=1e30))
+    wanted = changed.rest.length * (1 + rods.tension / changed.material.stretch)
     long = (safe_norm(edge) / wanted.clamp(min=tiny(wanted)) - 1) * wanted.new_tensor(solved).unsqueeze(-1)
     most = torch.cat([(-long).amax(-2, keepdim=True), long.amax(-2, keepdim=True)], -1)
     return torch.where(most > STRAIN, most, 0.0)

@@ -333,7 +333,7 @@ def _translate(
     lengths = Lengths(
         topology,
         rest.length,
-        rest.length / material.stretch.clamp(max=1e30),  # vectorised division by infinity may be NaN
+        rest.length / material.stretch,
         active,
         rest.edge_mask,
         dt * dt / lightest,
