@@ -119,14 +119,19 @@ def seal_file(fresh: Path, path: Path) -> None:
     os.replace(mark, _seal(path))
 
 
-def keep_for_torch() -> None:
+def keep_for_torch(vectors: str) -> None:
     """Let `torch.compile` keep its code in the private folder, unless the user chose another place.
 
-    Torch's own choice is a folder among the temporary files that anybody can make beforehand.
+    Torch's own choice is a folder among the temporary files that anybody can make beforehand. And torch does not look
+    at the vector instructions that code was made for, in which machines that share a home may differ: code of one
+    crashes on another, or computes what is not a number.
+
+    Args:
+        vectors: names these instructions, as `torch.backends.cpu.get_cpu_capability` does.
     """
     private = cache_folder()
     if private is not None:
-        os.environ.setdefault("TORCHINDUCTOR_CACHE_DIR", str(private / "inductor"))
+        os.environ.setdefault("TORCHINDUCTOR_CACHE_DIR", str(private / f"inductor_{vectors.lower()}"))
 
 
 def _seal(path: Path) -> Path:

@@ -284,10 +284,13 @@ def test_where_no_folder_can_be_made_another_is_used_or_none(tmp_path, folder, m
 
 def test_the_cache_of_torch_is_private_unless_the_user_chose_one(folder, monkeypatch):
     monkeypatch.delenv("TORCHINDUCTOR_CACHE_DIR", raising=False)
-    cache.keep_for_torch()
-    assert os.environ["TORCHINDUCTOR_CACHE_DIR"] == str(folder / "inductor")
+    cache.keep_for_torch("AVX2")
+    assert os.environ["TORCHINDUCTOR_CACHE_DIR"] == str(folder / "inductor_avx2")
+    monkeypatch.delenv("TORCHINDUCTOR_CACHE_DIR")
+    cache.keep_for_torch("AVX512")  # a machine that shares the folder
+    assert os.environ["TORCHINDUCTOR_CACHE_DIR"] == str(folder / "inductor_avx512")
     monkeypatch.setenv("TORCHINDUCTOR_CACHE_DIR", "elsewhere")
-    cache.keep_for_torch()
+    cache.keep_for_torch("AVX2")
     assert os.environ["TORCHINDUCTOR_CACHE_DIR"] == "elsewhere"
 
 

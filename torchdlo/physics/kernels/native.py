@@ -182,7 +182,9 @@ def prepare_torch_compile() -> bool:
     if not python_header().is_file():
         notices.once("compile", f"{python_header()} is missing, so that steps are not compiled: install python3-dev.")
         return False
-    cache.keep_for_torch()
+    import torch
+
+    cache.keep_for_torch(torch.backends.cpu.get_cpu_capability())
     if len(found.words) > 1:
         # It takes the name of a program, not a command.
         import torch._inductor.config
