@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
+from torch.autograd import forward_ad
 
 from torchdlo import scene
 from torchdlo.coupling import RodBody
@@ -30,6 +31,22 @@ def graphs(monkeypatch: pytest.MonkeyPatch):
     torch._dynamo.reset()
     torch._dynamo.utils.counters.clear()
     return lambda: torch._dynamo.utils.counters["stats"]["unique_graphs"]
+
+
+@pytest.mark.compile
+def test_compiled_steps_leave_dual_numbers_their_tangents(graphs):
+    choice, params, state, controls = hanging(1)
+    control, run = tree.map(lambda c: c[0], controls), scene.stepper(choice, execution="compiled")
+    moving = torch.ones_like(state.rods.vel)
+    with torch.no_grad():
+        for _ in range(2):  # the second call knows the code
+            run(params, state, control)
+        with forward_ad.dual_level():
+            dual = tree.replace(state, rods=tree.replace(state.rods, vel=forward_ad.make_dual(state.rods.vel, moving)))
+            found = forward_ad.unpack_dual(run(params, dual, control).rods.pos).tangent
+            wanted = forward_ad.unpack_dual(scene.step(choice, params, dual, control).rods.pos).tangent
+    assert float(found.abs().max()) > 0
+    torch.testing.assert_close(found, wanted)
 
 
 @pytest.mark.compile

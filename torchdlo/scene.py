@@ -14,6 +14,7 @@ from typing import Literal
 
 import torch
 from torch import Tensor
+from torch.autograd import forward_ad
 
 from torchdlo import notices
 from torchdlo.coupling import start_overlaps
@@ -133,7 +134,7 @@ class Scene:
     prescribed_edges: tuple[int, ...] = ()
     constraint_iterations: int | None = None
     """Newton steps for edge lengths per substep: in explicit steps as many, 3 if None; in implicit ones at most, 8 if
-    None, as each scene ends when it is solved."""
+    None, as each scene ends when it is solved. Explicit steps with coupled contact take what they need."""
     twist_iterations: int = 4
     """Newton steps for quasistatic twist per substep, where bending has a part in it; without, one is exact."""
     implicit_weight: float = 0.5
@@ -204,9 +205,9 @@ class Scene:
         for effect in self.effects:
             if isinstance(effect, BodyContact):
                 effect.check_pairs(self.bodies)
-        if self.integrator == "implicit":
+        if self.settings.coupled:
             loops = [n for n, c in zip(self.topology.counts, self.topology.closed, strict=True) if c and n < 5]
-            need(not loops, f"a closed rope has {loops[:1]} vertices; implicit steps need at least 5")
+            need(not loops, f"a closed rope has {loops[:1]} vertices; implicit and coupled steps need at least 5")
         twisted = self.twist != "quasistatic" or "twist" in names
         need(twisted, "quasistatic twist needs the Twist effect; add it, or set twist='none'")
 
@@ -561,6 +562,8 @@ def stepper(scene: Scene, *, execution: Execution = "compiled"):
     look, kinds, graphs = Compiled(broad_phase, scene), Kinds(_prepared), Graphs()
 
     def run(params: Params, state: State, control: Control) -> State:
+        if forward_ad._current_level >= 0:  # compiled code knows no dual numbers, and would drop their tangents
+            return step(scene, params, state, control)
         _check_given(scene, params, state, control)
         notices.once(
             "compiling",

@@ -108,3 +108,12 @@ def test_a_builder_makes_trees_of_leaves():
     made = build(leaves)
     assert made["a"][0] is leaves[0] and made["a"][1][0] is leaves[1] and made["a"][1][1] is None
     assert made["b"] is leaves[2] and made["c"] == ()
+
+
+def test_dictionaries_in_another_order_are_of_another_kind(looked_up):
+    run, kinds = Compiled(lambda x, numbers: x * numbers["a"] + numbers["b"]), Kinds(same)
+    a, b, x = (torch.full((1,), k) for k in (2.0, 100.0, 3.0))
+    for numbers in ({"a": a, "b": b}, {"b": b, "a": a}, {"a": a, "b": b}):
+        with kinds((x, numbers)) as (inputs, kind):
+            assert run(kind, *inputs) == 106
+    assert len(looked_up) == 2

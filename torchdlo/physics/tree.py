@@ -34,11 +34,22 @@ _FIELDS: dict[type, tuple[str, ...]] = {}
 def leaves(tree: Any) -> list[Tensor]:
     """Return the tensors of a tree in a fixed order."""
     found: list[Tensor] = []
-    _collect(tree, found)
+    _collect(tree, found, [])
     return found
 
 
-def _collect(tree: Any, found: list[Tensor]) -> None:
+def described(tree: Any) -> tuple[list[Tensor], tuple[Any, ...]]:
+    """Return the tensors of a tree in the order of `leaves`, and the keys of its dictionaries in theirs.
+
+    Two trees of which all fields and keys are the same may still differ in the order of their tensors: that of keys.
+    """
+    found: list[Tensor] = []
+    keys: list[Any] = []
+    _collect(tree, found, keys)
+    return found, tuple(keys)
+
+
+def _collect(tree: Any, found: list[Tensor], keys: list[Any]) -> None:
     kind = type(tree)
     if kind in _FIELDS:
         for name in _FIELDS[kind]:
@@ -46,10 +57,14 @@ def _collect(tree: Any, found: list[Tensor]) -> None:
             if type(part) is Tensor:  # half of the calls
                 found.append(part)
             else:
-                _collect(part, found)
-    elif kind is tuple or kind is list or kind is dict:
-        for part in tree.values() if kind is dict else tree:
-            _collect(part, found)
+                _collect(part, found, keys)
+    elif kind is dict:
+        keys.append(tuple(tree))
+        for part in tree.values():
+            _collect(part, found, keys)
+    elif kind is tuple or kind is list:
+        for part in tree:
+            _collect(part, found, keys)
     elif isinstance(tree, Tensor):
         found.append(tree)
     elif tree is not None:

@@ -83,12 +83,13 @@ class Kinds:
 
 
 def _name(inputs: Any, others: Hashable) -> Hashable:
-    tensors = tree.leaves(inputs)
+    tensors, keys = tree.described(inputs)
     first: dict[int, int] = {}
     same = tuple([first.setdefault(id(x), k) for k, x in enumerate(tensors)])
     # Code is made for a number of threads.
     each = [(x.shape, x.stride(), x.dtype, x.device, x.requires_grad) for x in tensors]
-    return others, torch.get_num_threads(), same, *each
+    mixed = tensors[0].device.type if tensors else "cpu"
+    return others, torch.get_num_threads(), torch.is_autocast_enabled(mixed), keys, same, *each
 
 
 class Compiled:

@@ -122,7 +122,8 @@ class Graphs:
         # Recordings are of the current device, and see by versions what was changed in place.
         if leaves[0].device.index != torch.cuda.current_device() or torch.is_inference_mode_enabled():
             return step(*inputs)
-        kind = others, with_gradient, *((x.shape, x.stride(), x.dtype, x.device, x.requires_grad) for x in leaves)
+        _, keys = tree.described(inputs)
+        kind = others, with_gradient, keys, *((x.shape, x.stride(), x.dtype, x.device, x.requires_grad) for x in leaves)
         if kind not in self._kept:
             runs = self._runs.get(kind, 0)
             self._runs[kind] = runs + 1

@@ -121,7 +121,8 @@ class Recordings:
             step: see `record`.
             inputs: likewise.
         """
-        key = key, tuple((x.shape, x.dtype) for x in tree.leaves(inputs))
+        tensors, keys = tree.described(inputs)
+        key = key, keys, tuple((x.shape, x.dtype) for x in tensors)
         if key not in self._kept:
             self._kept[key] = record(step, *inputs)
         self._kept.move_to_end(key)

@@ -390,15 +390,13 @@ def _balance(
 ) -> tuple[Any, ...]:
     """Return what `_translate` does where tensions follow their edges; arguments as in `constrain.balance`."""
     topology, dt, rest, vertex = settings.topology, settings.dt, now.params.rest, kick.vertex
+    damping = settings.numerical_damping
     if settings.integrator == "explicit":  # nothing but lengths and contact is solved for
-        loads = {}
+        loads, damping = {}, 0.0
     if "stiffness" in loads:
         vertex = vertex + settings.implicit_weight * dt * dt * loads["stiffness"]
     # Stiff forces are taken at x + ahead dt v; `share` is their answer to the change of v.
-    share, lead = (
-        settings.implicit_weight + 0.5 * settings.numerical_damping,
-        settings.numerical_damping * dt * now.state.vel,
-    )
+    share, lead = settings.implicit_weight + 0.5 * damping, damping * dt * now.state.vel
     stiff = loads.get("hinge_stiffness", torch.zeros_like(now.length)) * rest.hinge_mask
     hinge = share * dt * dt * stiff
     if "hinge_drag" in loads:
