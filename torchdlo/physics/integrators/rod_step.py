@@ -326,10 +326,7 @@ def _translate(
     active = rest.edge_mask * (1 - fixed.to(free.dtype))
     if settings.joint_edges:
         active = active * active.new_tensor([[float(k not in settings.joint_edges)] for k in range(topology.size)])
-    # What is held has no part in how far an edge moves: `stability.limits` counts on that.
-    mobile = torch.where(free > 0, material.mass, torch.inf)
-    lightest = torch.minimum(mobile, following(topology, mobile))
-    lightest = torch.where(lightest < torch.inf, lightest, material.mass).detach()
+    lightest = torch.minimum(material.mass, following(topology, material.mass)).detach()
     lengths = Lengths(
         topology,
         rest.length,
