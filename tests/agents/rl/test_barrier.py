@@ -16,6 +16,7 @@ from torchdlo.agents.rl.episodes import TaskEpisodes
 from torchdlo.agents.rl.settings import training_preset
 from torchdlo.envs.core import curve_geometry
 from torchdlo.envs.core.task import RADIUS, Arms, Task, TaskState, make, straight
+from torchdlo.errors import InputError
 from torchdlo.scene import Params, Rope, Scene, State
 
 
@@ -90,3 +91,25 @@ def test_what_the_end_of_coiling_lacks_does_not_dwarf_what_it_earns():
     """It is up to 100, and the return of a success 12: critics do not reach -80 within hundreds of steps."""
     assert training_preset("coiling", "shac").ends == 0.1
     assert training_preset("coiling", "shac", ends=1.0).ends == training_preset("coiling", "hybrid").ends == 1
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"ends": -1.0},
+        {"ends": math.nan},
+        {"ends": "abc"},
+        {"barrier": -1.0},
+        {"barrier": math.inf},
+        {"temperature": "x"},
+    ],
+)
+def test_what_cannot_be_paid_is_refused_in_a_sentence(wrong):
+    (name,) = wrong
+    with pytest.raises(InputError, match=f"{name} is .*expected a finite number"):
+        training_preset("coiling", "shac", **wrong)
+
+
+def test_the_hybrid_refuses_a_barrier():
+    with pytest.raises(InputError, match="barrier"):
+        training_preset("coiling", "hybrid", barrier=0.2)

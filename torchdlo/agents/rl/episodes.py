@@ -234,7 +234,8 @@ class TaskEpisodes:
         seen = world.seen(self.task.arms.count)
         now = self.task.rest(seen, self.env.episode.scene.topology)
         used = (now / seen.notes["rest"] - 1) / (self.task.stretch - 1)
-        return (2 * used - 1).clamp(min=0).square().sum(-1)
+        # The tightest of them, as one that tears ends the episode; none of no ropes between hands.
+        return torch.nn.functional.pad((2 * used - 1).clamp(min=0), (1, 0)).amax(-1).square()
 
     def detach(self) -> None:
         """Cut the history of gradients."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -125,7 +126,12 @@ class TrainingSettings:
         need(0 < self.gamma <= 1, "gamma", "a discount above 0, at most 1")
         need(self.window >= 1, "window", "at least 1 action")
         need(self.sigma > 0, "sigma", "a positive number")
+        for name in ("ends", "barrier", "temperature"):
+            value = getattr(self, name)
+            need(isinstance(value, int | float) and 0 <= value < math.inf, name, "a finite number, not below 0")
         need(self.temperature > 0, "temperature", "a positive number")
+        plain = self.algorithm != "hybrid" or not self.barrier
+        need(plain, "barrier", "0, as stages of hybrid know none; ppo, sac, shac and sapo can have one")
 
 
 _ALGORITHM: dict[str, dict[str, Any]] = {
