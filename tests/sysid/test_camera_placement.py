@@ -59,6 +59,17 @@ def test_information_is_what_is_seen_across_the_rope() -> None:
     assert both == pytest.approx(2 * seen + np.log(10) ** -2, rel=1e-6)
 
 
+def test_readings_outside_of_pictures_do_not_count_as_noise() -> None:
+    motion = motion_of(waving(1e-3), 0.02)
+    front, low = (looking_at("a", [0.0, -1.0, z], [0.0, 0.0, z]) for z in (-0.2, -0.6))
+    whole, part = (camera_information(c, motion) for c in (front, low))
+    assert whole.whole and whole.readings == pytest.approx(61 * INDEPENDENT)
+    assert not part.whole and 0 < part.readings < 0.6 * whole.readings
+    # Both are one metre away.
+    assert told([part], motion).noise == pytest.approx(told([whole], motion).noise, rel=1e-3)
+    assert told([whole, part], motion).noise == pytest.approx(told([whole], motion).noise, rel=1e-3)
+
+
 def test_what_a_camera_may_be_off_tells_nothing() -> None:
     rope = waving(0.0)
     rope[1, ..., 0] += 1e-3
