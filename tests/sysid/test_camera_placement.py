@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ from torchdlo.sysid.estimation.observation import INDEPENDENT, SURE
 from torchdlo.sysid.model import model_file
 from torchdlo.sysid.model.rope_model import RopeModel
 from torchdlo.sysid.recordings.recording import load_recording
+from torchdlo.sysid.video import camera_placement
 from torchdlo.sysid.video.camera_placement import place_cameras
 from torchdlo.sysid.video.view_information import MotionVariations, camera_information, camera_places, told
 from torchdlo.vision.camera import Camera, lens, looking_at, project
@@ -100,6 +102,25 @@ def test_places_see_all_of_a_motion_and_one_that_does_not_is_told() -> None:
     assert not camera_information(near, motion_of(rope, 0.02)).whole
     away = looking_at("a", [0.0, -1.0, -0.2], [0.0, -2.0, -0.2])
     assert camera_information(away, motion_of(rope, 0.02)).weight == 0.0
+
+
+@pytest.mark.parametrize("lost", [slice(1, 2), slice(2, 4), slice(1, 4)])
+def test_a_named_effect_whose_simulation_fails_does_not_rank_a_motion_higher(lost: slice) -> None:
+    recording = load_recording(DATA / "sample_rope")
+    front = looking_at("a", [0.0, -1.0, -0.2], [0.0, 0.0, -0.2])
+    around = camera_placement._Surroundings(RopeModel(recording), (front,), front, ("wind", "air_drag"))
+    wave = motion_of(waving(1e-3), 0.02)
+    change = np.zeros((4, *wave.rope.shape))
+    change[..., 0] = (1e-3 * np.sin(np.arange(101) * 0.3)[:, None] * np.sin(np.linspace(0, 9, 21)))[None, None]
+    change *= np.array([1.0, 0.1, 0.2, 0.3])[:, None, None, None, None]
+    probes = (("wind", {"x": 1.0}), ("wind", {"y": 1.0}), ("air_drag", {"x": 1.0}), ("air_drag", {"y": 1.0}))
+    failed = change.copy()
+    failed[lost, 0, 50:] = np.nan
+    scores = []
+    for doses in (change, failed):
+        motion = replace(wave, doses=doses, probes=probes, _sampled={})
+        scores.append(around.score(told([camera_information(front, motion)], motion)))
+    assert np.isfinite(scores[0]) and scores[1] == np.inf
 
 
 @pytest.fixture
