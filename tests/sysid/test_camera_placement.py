@@ -17,7 +17,7 @@ from torchdlo.sysid.estimation.observation import INDEPENDENT, SURE
 from torchdlo.sysid.model import model_file
 from torchdlo.sysid.model.rope_model import RopeModel
 from torchdlo.sysid.recordings.recording import load_recording
-from torchdlo.sysid.video import camera_placement
+from torchdlo.sysid.video import camera_placement, second_view
 from torchdlo.sysid.video.camera_placement import place_cameras
 from torchdlo.sysid.video.view_information import MotionVariations, camera_information, camera_places, told
 from torchdlo.vision.camera import Camera, lens, looking_at, project
@@ -121,6 +121,12 @@ def test_a_named_effect_whose_simulation_fails_does_not_rank_a_motion_higher(los
         motion = replace(wave, doses=doses, probes=probes, _sampled={})
         scores.append(around.score(told([camera_information(front, motion)], motion)))
     assert np.isfinite(scores[0]) and scores[1] == np.inf
+
+
+def test_the_page_says_how_much_of_the_recorded_motion_is_looked_at() -> None:
+    said = f"the first {100 * second_view.HORIZON:.0f} % of at most {camera_placement._SECONDS:.0f} s of each"
+    text = (Path(__file__).parents[2] / "docs" / "design_experiment.md").read_text(encoding="utf-8")
+    assert said in " ".join(text.split()) and said in (camera_placement._recorded.__doc__ or "")
 
 
 @pytest.fixture

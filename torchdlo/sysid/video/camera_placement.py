@@ -65,7 +65,7 @@ _TRIALS = 3
 """Most recorded trials for whose motion places are compared."""
 
 _SECONDS = 3.0
-"""Most seconds of each."""
+"""Most seconds of each, of which `second_view` looks at the first 60 %."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -217,7 +217,7 @@ def _recorded(
     like: Camera,
     report: Callback,
 ) -> SecondView | None:
-    """Return places of one more camera for the recorded motion."""
+    """Return places of one more camera for the recorded motion: the first 60 % of at most 3 s of each trial."""
     count = len(recording.train)
     chosen = np.unique(np.linspace(0, count - 1, min(count, _TRIALS)).round().astype(int))
     trials = [replace(t, markers=catenary(t, recording)) for t in (recording.train[k] for k in chosen)]

@@ -49,7 +49,7 @@ __all__ = [
 ]
 
 HORIZON = 0.6
-"""Share of each trial that is looked at: over longer times the answer to a dose is not linear any more."""
+"""Share of each trial that is looked at, its beginning: over longer times what doses change is not linear any more."""
 
 _TRIALS = 4
 """Most trials that are looked at."""
