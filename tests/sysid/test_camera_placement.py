@@ -12,13 +12,15 @@ import pytest
 from tests.test_cli import run
 from torchdlo.errors import InputError
 from torchdlo.physics.effects.base import Param
+from torchdlo.report.pages.camera_page import FILES, write_placement
 from torchdlo.sysid.estimation.levenberg_marquardt import ParameterSpace
 from torchdlo.sysid.estimation.observation import INDEPENDENT, SURE
+from torchdlo.sysid.experiment_design.excitation_motions import ExcitationMotion
 from torchdlo.sysid.model import model_file
 from torchdlo.sysid.model.rope_model import RopeModel
 from torchdlo.sysid.recordings.recording import load_recording
 from torchdlo.sysid.video import camera_placement, second_view
-from torchdlo.sysid.video.camera_placement import place_cameras
+from torchdlo.sysid.video.camera_placement import CameraDesign, CameraPlacement, place_cameras
 from torchdlo.sysid.video.view_information import MotionVariations, camera_information, camera_places, told
 from torchdlo.vision.camera import Camera, lens, looking_at, project
 
@@ -127,6 +129,17 @@ def test_the_page_says_how_much_of_the_recorded_motion_is_looked_at() -> None:
     said = f"the first {100 * second_view.HORIZON:.0f} % of at most {camera_placement._SECONDS:.0f} s of each"
     text = (Path(__file__).parents[2] / "docs" / "design_experiment.md").read_text(encoding="utf-8")
     assert said in " ".join(text.split()) and said in (camera_placement._recorded.__doc__ or "")
+
+
+def test_a_picture_of_an_earlier_run_does_not_stay_beside_a_report_without_one(tmp_path: Path) -> None:
+    recording = load_recording(DATA / "sample_rope")
+    front = looking_at("a", [0.0, -1.0, -0.2], [0.0, 0.0, -0.2])
+    best = CameraPlacement(ExcitationMotion("swing"), "swings", (front,), "here", {"bending_stiffness": 0.1}, 0.1)
+    design = CameraDesign(recording, {}, [best], [], None, recording.train[0], 1.0, 0.0)
+    (tmp_path / "design.png").write_bytes(b"earlier")
+    for _ in range(2):
+        write_placement(design, tmp_path)
+        assert {p.name for p in tmp_path.iterdir()} == set(FILES) - {"design.png"}
 
 
 @pytest.fixture
