@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,12 +12,15 @@ import pytest
 from tests.test_cli import run
 from torchdlo.errors import InputError
 from torchdlo.physics.effects.base import Param
+from torchdlo.report.pages.camera_page import FILES, write_placement
 from torchdlo.sysid.estimation.levenberg_marquardt import ParameterSpace
 from torchdlo.sysid.estimation.observation import INDEPENDENT, SURE
+from torchdlo.sysid.experiment_design.excitation_motions import ExcitationMotion
 from torchdlo.sysid.model import model_file
 from torchdlo.sysid.model.rope_model import RopeModel
 from torchdlo.sysid.recordings.recording import load_recording
-from torchdlo.sysid.video.camera_placement import place_cameras
+from torchdlo.sysid.video import camera_placement, second_view
+from torchdlo.sysid.video.camera_placement import CameraDesign, CameraPlacement, place_cameras
 from torchdlo.sysid.video.view_information import MotionVariations, camera_information, camera_places, told
 from torchdlo.vision.camera import Camera, lens, looking_at, project
 
@@ -59,6 +63,17 @@ def test_information_is_what_is_seen_across_the_rope() -> None:
     assert both == pytest.approx(2 * seen + np.log(10) ** -2, rel=1e-6)
 
 
+def test_readings_outside_of_pictures_do_not_count_as_noise() -> None:
+    motion = motion_of(waving(1e-3), 0.02)
+    front, low = (looking_at("a", [0.0, -1.0, z], [0.0, 0.0, z]) for z in (-0.2, -0.6))
+    whole, part = (camera_information(c, motion) for c in (front, low))
+    assert whole.whole and whole.readings == pytest.approx(61 * INDEPENDENT)
+    assert not part.whole and 0 < part.readings < 0.6 * whole.readings
+    # Both are one metre away.
+    assert told([part], motion).noise == pytest.approx(told([whole], motion).noise, rel=1e-3)
+    assert told([whole, part], motion).noise == pytest.approx(told([whole], motion).noise, rel=1e-3)
+
+
 def test_what_a_camera_may_be_off_tells_nothing() -> None:
     rope = waving(0.0)
     rope[1, ..., 0] += 1e-3
@@ -89,6 +104,42 @@ def test_places_see_all_of_a_motion_and_one_that_does_not_is_told() -> None:
     assert not camera_information(near, motion_of(rope, 0.02)).whole
     away = looking_at("a", [0.0, -1.0, -0.2], [0.0, -2.0, -0.2])
     assert camera_information(away, motion_of(rope, 0.02)).weight == 0.0
+
+
+@pytest.mark.parametrize("lost", [slice(1, 2), slice(2, 4), slice(1, 4)])
+def test_a_named_effect_whose_simulation_fails_does_not_rank_a_motion_higher(lost: slice) -> None:
+    recording = load_recording(DATA / "sample_rope")
+    front = looking_at("a", [0.0, -1.0, -0.2], [0.0, 0.0, -0.2])
+    around = camera_placement._Surroundings(RopeModel(recording), (front,), front, ("wind", "air_drag"))
+    wave = motion_of(waving(1e-3), 0.02)
+    change = np.zeros((4, *wave.rope.shape))
+    change[..., 0] = (1e-3 * np.sin(np.arange(101) * 0.3)[:, None] * np.sin(np.linspace(0, 9, 21)))[None, None]
+    change *= np.array([1.0, 0.1, 0.2, 0.3])[:, None, None, None, None]
+    probes = (("wind", {"x": 1.0}), ("wind", {"y": 1.0}), ("air_drag", {"x": 1.0}), ("air_drag", {"y": 1.0}))
+    failed = change.copy()
+    failed[lost, 0, 50:] = np.nan
+    scores = []
+    for doses in (change, failed):
+        motion = replace(wave, doses=doses, probes=probes, _sampled={})
+        scores.append(around.score(told([camera_information(front, motion)], motion)))
+    assert np.isfinite(scores[0]) and scores[1] == np.inf
+
+
+def test_the_page_says_how_much_of_the_recorded_motion_is_looked_at() -> None:
+    said = f"the first {100 * second_view.HORIZON:.0f} % of at most {camera_placement._SECONDS:.0f} s of each"
+    text = (Path(__file__).parents[2] / "docs" / "design_experiment.md").read_text(encoding="utf-8")
+    assert said in " ".join(text.split()) and said in (camera_placement._recorded.__doc__ or "")
+
+
+def test_a_picture_of_an_earlier_run_does_not_stay_beside_a_report_without_one(tmp_path: Path) -> None:
+    recording = load_recording(DATA / "sample_rope")
+    front = looking_at("a", [0.0, -1.0, -0.2], [0.0, 0.0, -0.2])
+    best = CameraPlacement(ExcitationMotion("swing"), "swings", (front,), "here", {"bending_stiffness": 0.1}, 0.1)
+    design = CameraDesign(recording, {}, [best], [], None, recording.train[0], 1.0, 0.0)
+    (tmp_path / "design.png").write_bytes(b"earlier")
+    for _ in range(2):
+        write_placement(design, tmp_path)
+        assert {p.name for p in tmp_path.iterdir()} == set(FILES) - {"design.png"}
 
 
 @pytest.fixture

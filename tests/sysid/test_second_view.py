@@ -144,6 +144,20 @@ def test_numbers_of_the_rope_are_told_better_from_where_they_show(recording: Rec
     ]
 
 
+def test_what_no_place_would_tell_is_looked_for_in_all_places(recording: Recording) -> None:
+    motion = swinging(recording, {"wind.velocity.0": 0})
+    view = placed(recording, motion, [1.0, 0.0, -0.2])
+    # The best place is told first; here it is one that shows nothing.
+    turned = replace(view, places=(view.places[-1], *view.places[:-1]))
+    assert turned.best.told.deviations["bending_stiffness"] > 0.42
+    assert not any("From no place" in note for note in number_notes(turned))
+    (note,) = effect_notes(turned)
+    assert note.startswith("The best place of one more camera would not halve") and view.best.where in note
+    alone = replace(view, places=view.places[-1:])
+    assert effect_notes(alone)[0].startswith("No second camera would halve")
+    assert number_notes(alone)[-1].startswith("From no place would these motions tell")
+
+
 def test_a_view_is_shown_in_tables_a_picture_and_json(recording: Recording) -> None:
     view = placed(recording, swinging(recording, {"wind.velocity.0": 0}), [1.0, 0.0, -0.2])
     assert places_table(view).splitlines()[1].startswith(view.best.where)

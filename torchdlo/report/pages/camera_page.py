@@ -35,12 +35,14 @@ _MOST = 12
 
 
 def write_placement(design: CameraDesign, folder: Path, *, command: str = "") -> None:
-    """Write all files into a folder, each complete or not at all."""
+    """Write all files into a folder, each complete or not at all; without a picture, an earlier one is removed."""
     save_trial(folder / "motion.npz", design.trial)
     save_cameras(design.best.cameras, folder / "cameras.json")
     picture = places_png(design.recorded) if design.recorded is not None else None
     if picture is not None:
         write_atomically(folder / "design.png", picture)
+    else:
+        (folder / "design.png").unlink(missing_ok=True)
     write_atomically(folder / "report.html", _html(design, picture, command))
     write_atomically(folder / "design.json", camera_json(design))
 

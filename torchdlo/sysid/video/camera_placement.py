@@ -65,7 +65,7 @@ _TRIALS = 3
 """Most recorded trials for whose motion places are compared."""
 
 _SECONDS = 3.0
-"""Most seconds of each."""
+"""Most seconds of each, of which `second_view` looks at the first 60 %."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,7 +175,7 @@ def place_cameras(
     varying = varied(menu, given.sizes(model))
     if effects:
         varying = doses_of(menu, varying, effects, lambda k, n: report("simulating motions", k, n, ""))
-    around = _Surroundings(model, own, like, bool(effects))
+    around = _Surroundings(model, own, like, tuple(effects))
     single: list[CameraPlacement] = []
     added: list[CameraPlacement] = []
     now: list[CameraPlacement] = []
@@ -217,7 +217,7 @@ def _recorded(
     like: Camera,
     report: Callback,
 ) -> SecondView | None:
-    """Return places of one more camera for the recorded motion."""
+    """Return places of one more camera for the recorded motion: the first 60 % of at most 3 s of each trial."""
     count = len(recording.train)
     chosen = np.unique(np.linspace(0, count - 1, min(count, _TRIALS)).round().astype(int))
     trials = [replace(t, markers=catenary(t, recording)) for t in (recording.train[k] for k in chosen)]
@@ -280,8 +280,8 @@ class _Surroundings:
     """Those at hand."""
     like: Camera
     """What a new one is like."""
-    by_effects: bool
-    """Whether effects rank, not parameters."""
+    effects: tuple[str, ...]
+    """Those that rank; none if parameters do."""
 
     def placements(
         self, motion: ExcitationMotion, moves: str, rope: MotionVariations
@@ -315,8 +315,15 @@ class _Surroundings:
         return [*own, *sorted(new, key=lambda p: p.score)[:2]], more, together
 
     def score(self, found: ExpectedInformation) -> float:
-        """Return what ranks: the parameters' mean deviation, or the dose of the worst of named effects."""
-        return max(found.doses(found.noise).values(), default=math.inf) if self.by_effects else found.score
+        """Return what ranks: the parameters' mean deviation, or the dose of the worst of named effects.
+
+        Infinite where a simulation of a named effect failed: what it shows is not known.
+        """
+        if not self.effects:
+            return found.score
+        doses = found.doses(found.noise)
+        known = all(math.isfinite(shown) for _, _, shown in found.probes)
+        return max(doses[n] for n in self.effects) if known and doses.keys() >= set(self.effects) else math.inf
 
 
 def _of_grippers(trial: Trial) -> Trial:

@@ -49,7 +49,7 @@ __all__ = [
 ]
 
 HORIZON = 0.6
-"""Share of each trial that is looked at: over longer times the answer to a dose is not linear any more."""
+"""Share of each trial that is looked at, its beginning: over longer times what doses change is not linear any more."""
 
 _TRIALS = 4
 """Most trials that are looked at."""
@@ -266,11 +266,8 @@ def effect_notes(view: SecondView) -> list[str]:
     """Return which effects these films cannot test, and which second view would, in words."""
     if view.now is None:
         return []
-    best, before, after = view.best, view.now.doses(view.level), view.best.told.doses(view.level)
-    gain = {n: before[n] / after[n] for n in view.effects if after[n] > 0 and n in view.limits}
-    order = sorted(gain, key=lambda n: -gain[n])
-    blind = [n for n in order if view.limits[n].hardest is None and best.limits[n].hardest is not None]
-    lower = [n for n in order if gain[n] >= _GAIN and n not in blind and best.limits[n].hardest is not None]
+    best, before = view.best, view.now.doses(view.level)
+    blind, lower = _gained(view, before, best)
     out = []
     if blind:
         would = "; ".join(f"{_words(n)} {limit_text(best.limits[n])}" for n in blind[:_TEXT])
@@ -283,7 +280,17 @@ def effect_notes(view: SecondView) -> list[str]:
             f"{_words(n)} {limit_text(best.limits[n])} instead of {limit_text(view.limits[n])}" for n in lower[:_TEXT]
         )
         out.append(f"One more camera, {best.where}, would lower what can be named where it shows least: {would}.")
-    if not out:
+    other = {n: p for p in reversed(view.places) for part in _gained(view, before, p) for n in part}
+    if not out and other:
+        would = "; ".join(
+            f"{_words(n)} {limit_text(p.limits[n])} (now {limit_text(view.limits[n])}), {p.where}"
+            for n, p in list(other.items())[:_TEXT]
+        )
+        out.append(
+            "The best place of one more camera would not halve the size from which an effect can be named; others "
+            f"would, where it shows least: {would}."
+        )
+    elif not out:
         out.append(
             "No second camera would halve the size from which an effect can be named: what these films do not show, "
             "another motion may (design-experiment proposes one)."
@@ -293,6 +300,15 @@ def effect_notes(view: SecondView) -> list[str]:
         more = f" and {len(never) - _TEXT} more" if len(never) > _TEXT else ""
         out.append(f"From no place would this motion show {_listed(never[:_TEXT])}{more}.")
     return [*out, *thin_note(view)]
+
+
+def _gained(view: SecondView, before: Mapping[str, float], place: ViewPlace) -> tuple[list[str], list[str]]:
+    """Return which effects can be named from a place alone, and of which it lowers limits by much, most first."""
+    after = place.told.doses(view.level)
+    gain = {n: before[n] / after[n] for n in view.effects if after[n] > 0 and n in view.limits}
+    order = [n for n in sorted(gain, key=lambda n: -gain[n]) if place.limits[n].hardest is not None]
+    blind = [n for n in order if view.limits[n].hardest is None]
+    return blind, [n for n in order if gain[n] >= _GAIN and n not in blind]
 
 
 def number_notes(view: SecondView) -> list[str]:
@@ -307,7 +323,8 @@ def number_notes(view: SecondView) -> list[str]:
         if wide > _NARROWER * best.told.deviations[name] and wide > _WIDE * _unit(view.space, name)
     ]
     out = [f"One more camera, {best.where}, would narrow ranges: {'; '.join(said)}.", *thin_note(view)] if said else []
-    lost = [n for n, wide in best.told.deviations.items() if _open(view.space, n) and wide > _SILENT]
+    least = {n: min(p.told.deviations[n] for p in view.places) for n in view.space.names}
+    lost = [n for n, wide in least.items() if _open(view.space, n) and wide > _SILENT]
     if lost:
         out.append(f"From no place would these motions tell the {_listed(lost)}: another motion may.")
     return out

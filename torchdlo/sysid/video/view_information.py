@@ -127,6 +127,8 @@ class CameraInformation:
     """Fisher information of numbers, doses, the camera's own numbers and starts, by trial, (B, N, N)."""
     weight: float
     """That of a change by one metre of all places of a rope that is not foreshortened [1/m^2]."""
+    readings: float
+    """Independent readings: `INDEPENDENT` of each picture that all of a rope is in, fewer of one that shows a part."""
     whole: bool
     """Whether all of the rope is in all of the pictures."""
     pixel: float
@@ -210,7 +212,8 @@ def camera_information(camera: Camera, motion: MotionVariations) -> CameraInform
     flat = np.moveaxis(every, 1, 0).reshape(trials, len(every), -1)
     matrix = (flat * readings.reshape(trials, 1, -1)) @ flat.transpose(0, 2, 1)
     typical = float(np.median(scale[seen])) if seen.any() else math.inf
-    return CameraInformation(camera, matrix, float(weight.sum()), whole, typical)
+    pictures = float(seen.sum() / motion.free.sum())
+    return CameraInformation(camera, matrix, float(weight.sum()), INDEPENDENT * pictures, whole, typical)
 
 
 @dataclass(frozen=True, eq=False)
@@ -272,19 +275,13 @@ def told(cameras: Sequence[CameraInformation], motion: MotionVariations) -> Expe
     shown = np.where(np.isfinite(motion.doses).all((1, 2, 3, 4)), shown, np.nan)
     deviation = np.sqrt(np.diag(spread)) * motion.space.units
     score = float(np.exp(0.5 * np.linalg.slogdet(spread)[1] / numbers))
-    pictures = sum(sum(_pictures(motion, c.camera.fps)) for c in cameras)
+    readings = sum(c.readings for c in cameras)
     return ExpectedInformation(
         dict(zip(motion.space.names, map(float, deviation), strict=True)),
         score,
         tuple((name, dose, float(x)) for (name, dose), x in zip(motion.probes, shown, strict=True)),
-        math.sqrt(INDEPENDENT * pictures / weight) if weight > 0 else math.inf,
+        math.sqrt(readings / weight) if weight > 0 else math.inf,
     )
-
-
-def _pictures(motion: MotionVariations, fps: float) -> list[int]:
-    """Return how many pictures there are of each trial."""
-    ends = motion.frames or (motion.rope.shape[1],) * len(motion.rope)
-    return [int((end - 1) * motion.step * fps + 1e-9) + 1 for end in ends]
 
 
 @dataclass(frozen=True, eq=False)
