@@ -179,7 +179,7 @@ def test_loads_on_ropes_come_to_what_closed_forms_say(name, dt, factor):
 
 
 def test_a_weight_that_implicit_steps_cannot_hold_is_refused_with_the_bound():
-    # T < 10^4 l m / dt^2 at the lightest edge, the one at the weight having the mass of its other end.
-    bound = math.sqrt(1e4 * 0.01 * 1e-5 / (G * 5.001))
+    # T < 10^4 l m / dt^2 at the lightest edge, that of the hold, whose held end has half a mass.
+    bound = math.sqrt(1e4 * 0.01 * 0.5e-5 / (G * 5.001))
     with pytest.raises(ValueError, match=f"hanging weight allows less than {bound:.3g} s. Use substeps=2 or more."):
         hanging(5e-3, 0.1)

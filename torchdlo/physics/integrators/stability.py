@@ -76,13 +76,10 @@ def _hanging(settings: Settings, rods: RodParams, values: dict[str, Values]) -> 
     gravity, topology = "gravity" in {e.name for e in settings.effects}, settings.topology
     if not (settings.constrained and settings.prescribed_vertices and gravity):
         return {}
-    # Tensions above a share of l m / dt^2 are not held: edges give way, see `edge_lengths.Lengths.yielding`. An edge
-    # at a hold counts by its free end.
+    # Tensions above a share of l m / dt^2 are not held: edges give way, see `edge_lengths.Lengths.yielding`. As there,
+    # m is the lighter end's, also if that is held.
     rest, material = rods.rest, rods.material
-    held = material.mass.new_zeros(topology.size, 1)
-    held[list(settings.prescribed_vertices)] = 1.0
-    mobile = torch.where(held > 0, torch.inf, material.mass)
-    lightest = torch.minimum(mobile, following(topology, mobile))
+    lightest = torch.minimum(material.mass, following(topology, material.mass))
     pull = values["gravity"]["acceleration"].norm(dim=-1, keepdim=True) * _weights(settings, material.mass)
     firm = (yield_shares(settings.coupled)[0] * rest.length * lightest / pull).sqrt()
     counts = (rest.edge_mask > 0) & (pull > 0)
