@@ -88,7 +88,7 @@ def test_hanging_rope_swings_at_the_bessel_frequency(integrator):
         [Rope(x, mass=1.0, bend=1e-9)],
         effects("bend", "gravity"),
         prescribed_vertices=(0,),
-        substeps=1,
+        substeps=2 if integrator == "explicit" else 1,  # its weight allows 3.8 ms
         dt=dt,
         integrator=integrator,
     )
