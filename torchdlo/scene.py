@@ -17,7 +17,7 @@ from torch import Tensor
 from torch.autograd import forward_ad
 
 from torchdlo import notices
-from torchdlo.coupling import start_overlaps
+from torchdlo.coupling import scene_notices, start_overlaps
 from torchdlo.coupling.bodies import dynamics as rigid
 from torchdlo.coupling.bodies.contact_effect import BodyContact
 from torchdlo.coupling.bodies.dynamics import Body, BodyParams, BodyState, BodyTargets, RigidBody, place_bodies
@@ -298,7 +298,7 @@ def make(
     if check:
         stability.check_laws(scene.settings, rods, numbers, state)
         check_step(scene, params)
-        _mention(scene, state)
+        scene_notices.mention(scene.settings, bool(scene.bodies), scene.joints is not None, state.pos)
         state = start_overlaps.part(
             topology,
             effects,
@@ -334,47 +334,6 @@ def _settled(scene: Scene, params: Params, first: State) -> State:
     changed = altered_params(scene.effects, scene.topology, rods, params.effects)
     settled, _ = settle_twist(settings, changed, params.effects, first.rods, targets, 30)
     return tree.replace(first, rods=tree.replace(settled, twist_rate=torch.zeros_like(settled.twist)))
-
-
-def _mention(scene: Scene, state: RodState) -> None:
-    """Say once which things of a scene go through each other because no effect keeps them apart."""
-    names, topology = {e.name for e in scene.effects}, scene.topology
-    if scene.joints is not None:
-        mention_sweeps(scene)
-    if scene.bodies and not names & {"rod_body", "finger_pads"}:
-        notices.once("rod_body", "scene: ropes go through its bodies; add RodBody if they are to touch.")
-    if "rod_contact" in names or len(topology.counts) < 2:
-        return
-    pos = state.pos.detach().reshape(-1, *state.pos.shape[-2:])[0]
-    ropes = [pos[start : start + count] for start, count in zip(topology.starts, topology.counts, strict=True)]
-    low, high, length = (
-        torch.stack([reduced(x) for x in ropes])
-        for reduced in (
-            lambda x: x.amin(0),
-            lambda x: x.amax(0),
-            lambda x: (x[1:] - x[:-1]).norm(dim=-1).sum(),
-        )
-    )
-    apart = torch.maximum(low[:, None] - high, low - high[:, None]).clamp(min=0.0).norm(dim=-1)
-    near = (apart < 0.5 * torch.minimum(length[:, None], length)).triu(1)
-    if bool(near.any()):
-        one, other = near.nonzero()[0].tolist()
-        notices.once(
-            "rod_contact",
-            f"scene: ropes {one} and {other} go through each other; add RodContact if they are to touch.",
-        )
-
-
-def mention_sweeps(scene: Scene) -> None:
-    """Say once that ropes that carry something are not best found by sweeps, if they are."""
-    if scene.bodies and scene.integrator == "explicit" and not scene.settings.coupled:
-        if any(e.engages for e in scene.effects):
-            notices.once(
-                "sweeps",
-                "scene: a rope carries something among bodies; where it hangs over one, its tension rings in explicit "
-                "steps that find contact by sweeps, and friction is wrong. Give contact='coupled' (or "
-                "integrator='implicit').",
-            )
 
 
 def limits(scene: Scene, params: Params) -> dict[str, float]:
@@ -495,25 +454,9 @@ def _check_given(scene: Scene, params: Params, state: State, control: Control) -
         there = f"{scene.topology.size} and {'bodies' if scene.bodies else 'none'}"
         raise ValueError(f"state: it has {said}, the scene {there}; give a state that `make` or `step` made for it.")
     if any(shape[-2] and shape[:-2] not in ((), state.rods.pos.shape[:-2]) for shape in given):
-        _check_batch(params, state, given)
+        validation.check_control_batch((params, state), state.rods.pos.shape[:-2], given)
     rigid.check_targets(scene.bodies, control.bodies)
     check_grip(control.attachment_weight, scene.held)
-
-
-def _check_batch(params: Params, state: State, given: tuple[tuple[int, ...], ...]) -> None:
-    """Raise a `ValueError` if controls are of more scenes than the state and the parameters are."""
-    own, shapes = tuple(state.rods.pos.shape[:-2]), [x.shape[:-2] for x in tree.leaves((params, state))]
-    batches = [shape[:-2] * (shape[-2] > 0) for shape in given]
-    try:
-        known = torch.broadcast_shapes(*shapes)
-        fits = torch.broadcast_shapes(known, *batches) == known
-    except RuntimeError:
-        fits = False
-    if not fits:
-        raise ValueError(
-            f"control: pos and director are of batches {tuple(batches[0])} and {tuple(batches[1])}, the state is of "
-            f"{own}; give the controls of one scene, or make the scene with as many ropes (..., n, 3)."
-        )
 
 
 def _step(scene: Scene, params: Params, state: State, control: Control, advance, broad_phase) -> State:

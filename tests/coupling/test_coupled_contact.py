@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from torchdlo import notices, scene
-from torchdlo.coupling import RodBody, RodContact
+from torchdlo.coupling import RodBody, RodContact, scene_notices
 from torchdlo.physics import tree
 from torchdlo.physics.effects import EFFECTS
 from torchdlo.scene import RigidBody, Rope, make
@@ -130,9 +130,10 @@ def test_sweeps_under_a_rope_that_carries_something_are_mentioned(monkeypatch):
     said: list[str] = []
     monkeypatch.setattr(notices, "once", lambda key, text: said.append(key))
     made, _, _ = fall()
-    scene.mention_sweeps(made)
+    scene_notices.mention_sweeps(made.settings, bodies=True)
     assert "sweeps" not in said
-    scene.mention_sweeps(scene.Scene(made.topology, made.effects, bodies=made.bodies))
+    sweeps = scene.Scene(made.topology, made.effects, bodies=made.bodies)
+    scene_notices.mention_sweeps(sweeps.settings, bodies=True)
     assert "sweeps" in said
 
 

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from torchdlo import scene as scenes
+from torchdlo.coupling import scene_notices
 from torchdlo.coupling.bodies.dynamics import RigidBody
 from torchdlo.coupling.bodies.mesh_sdf import MeshShape, load_mesh
 from torchdlo.coupling.mpm import particles
@@ -116,7 +117,7 @@ def assemble(description: SceneDescription, *, folder: str | Path = ".") -> Simu
     scene, params, state = scenes.make(ropes, effects, values, bodies=bodies, joints=joints, **held, **static)
     weight = _weights(d, counts, state.rods.pos)
     if bool((weight > 0).any()):
-        scenes.mention_sweeps(scene)
+        scene_notices.mention_sweeps(scene.settings, bool(scene.bodies))
     material = tree.replace(params.rods.material, mass=params.rods.material.mass + weight)
     params = tree.replace(params, rods=tree.replace(params.rods, material=material))
     return Simulation(scene, params, state, motion.plan(d, scene, state, armed), meshes, weight)

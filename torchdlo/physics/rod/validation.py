@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, SupportsFloat
 import torch
 from torch import Tensor
 
+from torchdlo.physics import tree
+
 if TYPE_CHECKING:
     from torchdlo.physics.rod.assembly import Rope
 
@@ -140,3 +142,24 @@ def _vectors(where: str, name: str, value: Tensor, positions: Tensor) -> None:
         )
     if not bool(torch.isfinite(value).all()):
         raise ValueError(f"{where}: {name} contains NaN or infinity; every component must be a number")
+
+
+def check_control_batch(known: object, own: Sequence[int], given: Sequence[tuple[int, ...]]) -> None:
+    """Raise a `ValueError` if controls are of more scenes than what is controlled.
+
+    Args:
+        known: parameters and state, whose tensors are all (..., n, d).
+        own: batch of the ropes.
+        given: shapes of the positions and directors of the control.
+    """
+    batches = [shape[:-2] * (shape[-2] > 0) for shape in given]
+    try:
+        batch = torch.broadcast_shapes(*(x.shape[:-2] for x in tree.leaves(known)))
+        fits = torch.broadcast_shapes(batch, *batches) == batch
+    except RuntimeError:
+        fits = False
+    if not fits:
+        raise ValueError(
+            f"control: pos and director are of batches {tuple(batches[0])} and {tuple(batches[1])}, the state is of "
+            f"{tuple(own)}; give the controls of one scene, or make the scene with as many ropes (..., n, 3)."
+        )
