@@ -142,6 +142,18 @@ def test_a_picture_of_an_earlier_run_does_not_stay_beside_a_report_without_one(t
         assert {p.name for p in tmp_path.iterdir()} == set(FILES) - {"design.png"}
 
 
+def test_a_motion_in_which_the_named_effect_could_not_be_simulated_is_not_recommended() -> None:
+    recording = load_recording(DATA / "sample_rope")
+    front = looking_at("a", [0.0, -1.0, -0.2], [0.0, 0.0, -0.2])
+    said = []
+    for score in (0.1, np.inf):
+        best = CameraPlacement(ExcitationMotion("swing"), "swings", (front,), "here", {"bending_stiffness": 0.1}, score)
+        design = CameraDesign(recording, {}, [best], [], None, recording.train[0], 1.0, 0.0, effects=("air_drag",))
+        said.append(camera_placement.camera_summary(design))
+    assert "film it from here: air drag shows best" in said[0]
+    assert "air drag failed in all" in said[1] and "Move" not in said[1]
+
+
 @pytest.fixture
 def model(tmp_path: Path) -> Path:
     """A model of the filmed sample rope."""

@@ -340,7 +340,10 @@ def camera_summary(design: CameraDesign) -> str:
     best, names = design.best, ", ".join(f"{n.replace('_', ' ')} {d:.2g}" for n, d in design.best.deviations.items())
     shows = f"expected deviations {names}"
     if design.effects:
-        shows = f"{', '.join(n.replace('_', ' ') for n in design.effects)} shows best"
+        wanted = ", ".join(n.replace("_", " ") for n in design.effects)
+        if not math.isfinite(design.best.score):
+            return f"No motion can be recommended: simulations with {wanted} failed in all that were tried."
+        shows = f"{wanted} shows best"
     said = f"Move the gripper so that it {best.moves}, and film it from {best.stands}: {shows}."
     if design.now is not None:
         gain = design.now.score / best.score
