@@ -37,6 +37,39 @@ def change(description: SceneDescription, **fields) -> SceneDescription:
     return dataclasses.replace(description, **fields)
 
 
+def over_a_peg(**fields) -> SceneDescription:
+    """A rope of 11 g that hangs over a smooth peg of 5 cm radius, with 200 g at either end."""
+    arc = [(0.052 * math.sin(a), 0.0, 0.052 * math.cos(a)) for a in np.linspace(-math.pi / 2, math.pi / 2, 25)]
+    points = ((-0.052, 0.0, -0.1), *arc, (0.052, 0.0, -0.1))
+    weights = tuple(HangingMass(vertex=v, mass=0.2) for v in (0, -1))
+    rope = RopeSpec(points, vertices=41, radius=0.002, mass=0.011, hanging_masses=weights)
+    # A capsule along the y axis.
+    peg = BodySpec("capsule", (0.05, 0.2), quat=(math.sqrt(0.5), math.sqrt(0.5), 0, 0), motion="fixed")
+    effects = {"gravity": {}, "damping": {"rate": 0.5}, "rod_body": {}}
+    return change(SceneDescription((rope,), effects, bodies=(peg,), duration=0.2), **fields)
+
+
+def test_taut_ropes_over_bodies_are_still_without_asking_for_a_way_of_contact():
+    made = scene_files.assemble(over_a_peg())
+    assert made.scene.contact == "coupled"
+    frames = run(over_a_peg())
+    moved = np.linalg.norm(frames.pos - frames.pos[0], axis=-1).max()
+    assert not frames.problem and moved < 1e-3
+
+
+@pytest.mark.parametrize(
+    ("fields", "expected"),
+    [
+        ({"contact": "sweeps"}, "sweeps"),
+        ({"precision": "float32"}, "sweeps"),
+        ({"bodies": (), "effects": {"gravity": {}, "rod_contact": {}}}, "sweeps"),
+        ({"effects": {"gravity": {}}}, "sweeps"),
+    ],
+)
+def test_contact_is_by_sweeps_where_one_solve_is_not_wanted_or_not_resolved(fields, expected):
+    assert scene_files.assemble(over_a_peg(**fields)).scene.contact == expected
+
+
 def test_bodies_touch_matter_where_the_effect_says_so():
     ball = ParticleBlockSpec("elastic", (0.03,), 0.01, "ball", (0.0, 0.0, 0.3), vel=(0.0, 0.0, -1.0))
     room, plate = (

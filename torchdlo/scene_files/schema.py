@@ -225,9 +225,10 @@ class SceneDescription:
     dt: float = 1e-3
     substeps: int = 5
     integrator: Literal["explicit", "implicit"] = "explicit"
-    contact: Literal["sweeps", "coupled"] = "sweeps"
+    contact: Literal["auto", "sweeps", "coupled"] = "auto"
     """How explicit steps find contact of ropes: by sweeps before edge lengths, or coupled with them in one solve, which
-    is right for taut ropes over bodies."""
+    is right for taut ropes over bodies. "auto" is coupled where ropes touch bodies, in double precision and without
+    material points."""
     twist: Literal["none", "dynamic", "quasistatic"] = "none"
     constrained: bool = True
     constraint_iterations: int | None = None
