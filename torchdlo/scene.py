@@ -453,10 +453,9 @@ def _check_given(scene: Scene, params: Params, state: State, control: Control) -
         said = f"{count} vertices and {'bodies' if bodies else 'no bodies'}"
         there = f"{scene.topology.size} and {'bodies' if scene.bodies else 'none'}"
         raise ValueError(f"state: it has {said}, the scene {there}; give a state that `make` or `step` made for it.")
-    if any(shape[-2] and shape[:-2] not in ((), state.rods.pos.shape[:-2]) for shape in given):
-        validation.check_control_batch((params, state), state.rods.pos.shape[:-2], given)
     rigid.check_targets(scene.bodies, control.bodies)
     check_grip(control.attachment_weight, scene.held)
+    validation.check_control_batch((params, state), state.rods.pos.shape[:-2], control)
 
 
 def _step(scene: Scene, params: Params, state: State, control: Control, advance, broad_phase) -> State:

@@ -12,7 +12,19 @@ from helpers import circle, effects, run, straight, vec
 from torchdlo.physics import tree
 from torchdlo.physics.effects.external import Gravity
 from torchdlo.physics.rod.topology import Topology
-from torchdlo.scene import Control, Params, Rope, Scene, finite, limits, make, rollout, stationary_control, step
+from torchdlo.scene import (
+    Control,
+    Params,
+    RigidBody,
+    Rope,
+    Scene,
+    finite,
+    limits,
+    make,
+    rollout,
+    stationary_control,
+    step,
+)
 
 X = straight(6)
 GOOD = {"mass": 0.1, "bend": 1e-3, "twist": 1e-3}
@@ -235,7 +247,7 @@ def test_controls_and_states_of_other_scenes_are_refused_in_a_sentence():
 
     with pytest.raises(ValueError, match=re.escape("control: pos and director are ((1, 2), (0, 3))")):
         step(scene, params, state, given(control.pos[:, :2]))
-    with pytest.raises(ValueError, match=re.escape("batches (3,) and (), the state is of ()")):
+    with pytest.raises(ValueError, match=re.escape("batches (3,), the state is of ()")):
         step(scene, params, state, given(control.pos.expand(3, 1, 3)))
     with pytest.raises(TypeError, match="control: pos and director are ndarray, Tensor"):
         step(scene, params, state, given(control.pos.numpy()))
@@ -245,5 +257,17 @@ def test_controls_and_states_of_other_scenes_are_refused_in_a_sentence():
     many = make(rope(positions=X.expand(2, -1, 3)), effects("gravity"), prescribed_vertices=(0,))
     pos = stationary_control(scene, many[2]).pos
     assert step(*many, given(pos)).rods.pos.shape == step(*many, control).rods.pos.shape == (2, 6, 3)
-    with pytest.raises(ValueError, match=re.escape("batches (3,) and (), the state is of (2,)")):
+    with pytest.raises(ValueError, match=re.escape("batches (3,), the state is of (2,)")):
         step(*many, given(pos[:1].expand(3, 1, 3)))
+    grip = {"vertices": torch.ones(3, 1, 1, dtype=torch.float64)}
+    with pytest.raises(ValueError, match=re.escape("batches () and (3,), the state is of ()")):
+        step(scene, params, state, tree.replace(control, attachment_weight=grip))
+
+
+def test_targets_of_bodies_of_more_scenes_are_refused():
+    box = RigidBody("box", (0.05, 0.05, 0.05), pos=(0, 0, -1), motion="kinematic")
+    scene, params, state = make(rope(), effects("gravity"), bodies=[box])
+    control = stationary_control(scene, state)
+    wide = tree.replace(control, bodies=tree.map(lambda x: x.expand(3, *x.shape[-2:]), control.bodies))
+    with pytest.raises(ValueError, match=re.escape("(3,), the state is of ()")):
+        step(scene, params, state, wide)

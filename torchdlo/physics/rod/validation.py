@@ -144,22 +144,25 @@ def _vectors(where: str, name: str, value: Tensor, positions: Tensor) -> None:
         raise ValueError(f"{where}: {name} contains NaN or infinity; every component must be a number")
 
 
-def check_control_batch(known: object, own: Sequence[int], given: Sequence[tuple[int, ...]]) -> None:
+def check_control_batch(known: object, own: Sequence[int], control: object) -> None:
     """Raise a `ValueError` if controls are of more scenes than what is controlled.
 
     Args:
         known: parameters and state, whose tensors are all (..., n, d).
         own: batch of the ropes.
-        given: shapes of the positions and directors of the control.
+        control: where held parts, grips and bodies go, likewise.
     """
-    batches = [shape[:-2] * (shape[-2] > 0) for shape in given]
+    given = [tuple(x.shape[:-2]) for x in tree.leaves(control) if x.shape[-2]]
+    if all(batch in ((), tuple(own)) for batch in given):
+        return
     try:
         batch = torch.broadcast_shapes(*(x.shape[:-2] for x in tree.leaves(known)))
-        fits = torch.broadcast_shapes(batch, *batches) == batch
+        fits = torch.broadcast_shapes(batch, *given) == batch
     except RuntimeError:
         fits = False
     if not fits:
+        said = " and ".join(map(str, sorted(set(given))))
         raise ValueError(
-            f"control: pos and director are of batches {tuple(batches[0])} and {tuple(batches[1])}, the state is of "
-            f"{tuple(own)}; give the controls of one scene, or make the scene with as many ropes (..., n, 3)."
+            f"control: its poses are of batches {said}, the state is of {tuple(own)}; give the controls of one scene, "
+            "or make the scene with as many ropes (..., n, 3)."
         )
