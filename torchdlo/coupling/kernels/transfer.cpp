@@ -1,13 +1,26 @@
-// Between particles and grid nodes with quadratic B-splines; one scene per thread, sums always in the same order.
+// Particles and grid nodes with quadratic B-splines: what moves at the nodes, and what particles take back behind the
+// walls of the box, with the derivatives. One scene per thread, sums always in the same order.
 //
 // at (scenes, 3, count): places in units of the node spacing, from the first node.
 // value (scenes, 4, count), slope (scenes, 9, count): four values c and the slopes S of the first three of them,
 //   row by row; what a particle says at a node that lies d from it is c + S d.
-// grid (scenes, nodes, 4): nodes in the order x, y, z, the last one fastest.
+// vel (scenes, nodes, 3), mass (scenes, nodes): nodes in the order x, y, z, the last one fastest.
+// origin (scenes, 3), friction (scenes): number of the first node, and coefficient at walls.
+//
+// Most nodes have no matter: only the block of those about particles is worked on, in memory that stays in the cache;
+// backward it is made again.
+#include <algorithm>
 #include <cmath>
 #include <cstdint>
+#include <vector>
 
 #include "flush.h"
+#include "walls.h"
+
+struct Sizes {
+  int64_t scenes, count, margin;
+  const int64_t *size, *whole, *kinds;  // nodes that are computed and of the box along each axis; six of `Kind`
+};
 
 template <typename T>
 struct Lanes;
@@ -22,6 +35,14 @@ struct Lanes<double> {
 template <typename T>
 using Four = typename Lanes<T>::type;
 
+// Number of the first of the three nodes about a place along an axis. Particles that left the grid take its border; NaN
+// compares false and takes the first node.
+template <typename T>
+static inline int64_t base_of(T x, int64_t size) {
+  const T most = T(size - 3), b = std::floor(x - T(0.5));
+  return b > 0 ? (b < most ? int64_t(b) : int64_t(most)) : 0;
+}
+
 template <typename T>
 struct Stencil {
   int64_t first;  // node with the lowest numbers of the 27
@@ -32,10 +53,8 @@ struct Stencil {
   Stencil(const T* at, int64_t count, const int64_t* size) {
     int64_t base[3];
     for (int a = 0; a < 3; ++a) {
-      // Particles that left the grid take its border; NaN compares false and takes the first node.
-      const T x = at[a * count], most = T(size[a] - 3);
-      const T b = std::floor(x - T(0.5));
-      base[a] = b > 0 ? (b < most ? int64_t(b) : int64_t(most)) : 0;
+      const T x = at[a * count];
+      base[a] = base_of(x, size[a]);
       const T f = x - T(base[a]);
       w[a][0] = T(0.5) * (T(1.5) - f) * (T(1.5) - f);
       w[a][1] = T(0.75) - (f - 1) * (f - 1);
@@ -130,62 +149,187 @@ static void tilt(const T* at, const T* value, const T* slope, const T* grid, T* 
   }
 }
 
-// What moves at the nodes: grid holds momentum and mass, vel (scenes, nodes, 3), mass (scenes, nodes).
-template <typename T>
-static void divide(const T* grid, T* vel, T* mass, int64_t nodes) {
-  for (int64_t i = 0; i < nodes; ++i) {
-    const T m = mass[i] = grid[4 * i + 3];
-    for (int a = 0; a < 3; ++a) vel[3 * i + a] = m > 0 ? grid[4 * i + a] / m : T(0);
-  }
-}
+// The block of nodes about all particles of a scene.
+struct Span {
+  int64_t low[3], high[3], size[3];  // first and last node along each axis
 
-// Its derivative: `by` is that by the velocities, `mass_by` that by the masses.
-template <typename T>
-static void divide_back(const T* grid, const T* by, const T* mass_by, T* out, int64_t nodes) {
-  for (int64_t i = 0; i < nodes; ++i) {
-    const T *g = grid + 4 * i, *d = by + 3 * i;
-    T moved = 0;
+  template <typename T>
+  Span(const T* at, int64_t count, const int64_t* size) {
     for (int a = 0; a < 3; ++a) {
-      out[4 * i + a] = g[3] > 0 ? d[a] / g[3] : T(0);
-      moved += g[3] > 0 ? g[a] / g[3] * out[4 * i + a] : T(0);
+      int64_t least = size[a], most = 0;
+      for (int64_t p = 0; p < count; ++p) {
+        const int64_t b = base_of(at[a * count + p], size[a]);
+        least = b < least ? b : least, most = b > most ? b : most;
+      }
+      low[a] = least, high[a] = most + 2, this->size[a] = size[a];
     }
-    out[4 * i + 3] = mass_by[i] - moved;
   }
+  // Calls with the numbers of a row of nodes along z: in x and y, and its first and last one.
+  template <class F>
+  void rows(F call) const {
+    for (int64_t i = low[0]; i <= high[0]; ++i)
+      for (int64_t j = low[1]; j <= high[1]; ++j) {
+        const int64_t first = (i * size[1] + j) * size[2];
+        call(i, j, first + low[2], first + high[2]);
+      }
+  }
+  template <typename T>
+  void clear(T* grid) const {
+    rows([&](int64_t, int64_t, int64_t first, int64_t last) { std::fill(grid + 4 * first, grid + 4 * last + 4, T(0)); });
+  }
+  // Calls with every node and what it is behind, or nullptr if that is nothing; `origin` is that of the scene.
+  template <typename T, class F>
+  void nodes(const T* origin, const Sizes& n, F call) const {
+    int behind[6];
+    const auto look = [&](int axis, int64_t i) {
+      const T number = origin[axis] + T(i);
+      const bool lower = number <= T(n.margin), upper = number >= T(n.whole[axis] - 1 - n.margin);
+      behind[2 * axis] = lower ? int(n.kinds[2 * axis]) : OPEN;
+      behind[2 * axis + 1] = upper ? int(n.kinds[2 * axis + 1]) : OPEN;
+      return behind[2 * axis] != OPEN || behind[2 * axis + 1] != OPEN;
+    };
+    rows([&](int64_t i, int64_t j, int64_t first, int64_t last) {
+      const bool x = look(0, i), y = look(1, j);
+      for (int64_t node = first; node <= last; ++node) {
+        const bool z = look(2, node - first + low[2]);
+        call(node, x || y || z ? behind : nullptr);
+      }
+    });
+  }
+};
+
+// Memory for two grids of a scene, one per thread.
+template <typename T>
+static T* working(int64_t nodes, int which) {
+  static thread_local std::vector<T> kept[2];
+  if (int64_t(kept[which].size()) < 4 * nodes) kept[which].resize(4 * nodes);
+  return kept[which].data();
 }
 
 #define SCENES _Pragma("omp parallel for num_threads(threads)") \
-  for (int64_t b = 0; b < scenes; ++b) if (const FlushTiny flush; true)
+  for (int64_t b = 0; b < n.scenes; ++b) if (const FlushTiny flush; true)
+#define NODES const int64_t nodes = n.size[0] * n.size[1] * n.size[2], count = n.count
+
+// Velocities of nodes, zero where there is no mass, and masses.
+template <typename T>
+static void give(const T* at, const T* value, const T* slope, T* vel, T* mass, const Sizes& n, int threads) {
+  NODES;
+  SCENES {
+    T *grid = working<T>(nodes, 0), *v = vel + 3 * b * nodes, *m = mass + b * nodes;
+    const Span span(at + 3 * b * count, count, n.size);
+    span.clear(grid);
+    spread<T>(at + 3 * b * count, value + 4 * b * count, slope + 9 * b * count, grid, count, n.size);
+    std::fill(v, v + 3 * nodes, T(0)), std::fill(m, m + nodes, T(0));
+    span.rows([&](int64_t, int64_t, int64_t first, int64_t last) {
+      for (int64_t i = first; i <= last; ++i) {
+        const T *g = grid + 4 * i;
+        m[i] = g[3];
+        for (int a = 0; a < 3; ++a) v[3 * i + a] = g[3] > 0 ? g[a] / g[3] : T(0);
+      }
+    });
+  }
+}
 
 template <typename T>
-static void run(int which, const T* at, T* value, T* slope, T* grid, T* out, int64_t scenes, int64_t count,
-                const int64_t* size, int threads) {
-  const int64_t nodes = size[0] * size[1] * size[2];
+static void give_back(const T* at, const T* value, const T* slope, const T* vel_by, const T* mass_by, T* dat, T* dvalue,
+                      T* dslope, const Sizes& n, int threads) {
+  NODES;
   SCENES {
-    const T* a = at + 3 * b * count;
-    T *v = value + 4 * b * count, *s = slope + 9 * b * count, *g = grid + 4 * b * nodes;
-    if (which == 0) spread<T>(a, v, s, g, count, size);
-    if (which == 1) collect<T>(a, g, v, s, count, size);
-    if (which == 2) tilt<T>(a, v, s, g, out + 3 * b * count, count, size);
+    const T *x = at + 3 * b * count, *c = value + 4 * b * count, *s = slope + 9 * b * count;
+    T *grid = working<T>(nodes, 0), *by = working<T>(nodes, 1);
+    const Span span(x, count, n.size);
+    span.clear(grid);
+    spread<T>(x, c, s, grid, count, n.size);
+    span.rows([&](int64_t, int64_t, int64_t first, int64_t last) {
+      for (int64_t i = first; i <= last; ++i) {
+        const T *g = grid + 4 * i, *d = vel_by + 3 * (b * nodes + i);
+        T *to = by + 4 * i, moved = 0;
+        for (int a = 0; a < 3; ++a) {
+          to[a] = g[3] > 0 ? d[a] / g[3] : T(0);
+          moved += g[3] > 0 ? g[a] / g[3] * to[a] : T(0);
+        }
+        to[3] = mass_by[b * nodes + i] - moved;
+      }
+    });
+    tilt<T>(x, c, s, by, dat + 3 * b * count, count, n.size);
+    collect<T>(x, by, dvalue + 4 * b * count, dslope + 9 * b * count, count, n.size);
   }
 }
 
-#define DIVIDE(T)                                                                                                  \
-  extern "C" void transfer_divide_##T(const T* grid, T* vel, T* mass, int64_t scenes, int64_t nodes, int threads) {   \
-    SCENES divide<T>(grid + 4 * b * nodes, vel + 3 * b * nodes, mass + b * nodes, nodes);                             \
-  }                                                                                                                   \
-  extern "C" void transfer_divide_back_##T(const T* grid, const T* by, const T* mass_by, T* out, int64_t scenes,      \
-                                           int64_t nodes, int threads) {                                              \
-    SCENES divide_back<T>(grid + 4 * b * nodes, by + 3 * b * nodes, mass_by + b * nodes, out + 4 * b * nodes, nodes); \
+// Velocities behind the walls, with a zero behind each.
+template <typename T>
+static void fill(const Span& span, const T* vel, const T* origin, T friction, T* grid, const Sizes& n) {
+  span.nodes<T>(origin, n, [&](int64_t node, const int* behind) {
+    const T* v = vel + 3 * node;
+    T* to = grid + 4 * node;
+    to[3] = 0;
+    if (!behind) {
+      to[0] = v[0], to[1] = v[1], to[2] = v[2];
+      return;
+    }
+    const Stopped<T> s(v, behind, friction);
+    for (int a = 0; a < 3; ++a) to[a] = s.share * s.left[a];
+  });
+}
+
+// What particles see of the nodes behind the walls.
+template <typename T>
+static void take(const T* at, const T* vel, const T* origin, const T* friction, T* value, T* slope, const Sizes& n,
+                 int threads) {
+  NODES;
+  SCENES {
+    T* grid = working<T>(nodes, 0);
+    const Span span(at + 3 * b * count, count, n.size);
+    fill<T>(span, vel + 3 * b * nodes, origin + 3 * b, friction[b], grid, n);
+    collect<T>(at + 3 * b * count, grid, value + 4 * b * count, slope + 9 * b * count, count, n.size);
   }
-DIVIDE(float)
-DIVIDE(double)
-
-extern "C" void transfer_float(int which, const float* at, float* value, float* slope, float* grid, float* out,
-                               int64_t scenes, int64_t count, const int64_t* size, int threads) {
-  run<float>(which, at, value, slope, grid, out, scenes, count, size, threads);
 }
 
-extern "C" void transfer_double(int which, const double* at, double* value, double* slope, double* grid, double* out,
-                                int64_t scenes, int64_t count, const int64_t* size, int threads) {
-  run<double>(which, at, value, slope, grid, out, scenes, count, size, threads);
+template <typename T>
+static void take_back(const T* at, const T* vel, const T* origin, const T* friction, const T* value_by,
+                      const T* slope_by, T* dat, T* dvel, T* dfriction, const Sizes& n, int threads) {
+  NODES;
+  SCENES {
+    const T *x = at + 3 * b * count, *c = value_by + 4 * b * count, *s = slope_by + 9 * b * count;
+    const T* from = vel + 3 * b * nodes;
+    T *grid = working<T>(nodes, 0), *by = working<T>(nodes, 1), *to = dvel + 3 * b * nodes, sum = 0;
+    const Span span(x, count, n.size);
+    fill<T>(span, from, origin + 3 * b, friction[b], grid, n);
+    tilt<T>(x, c, s, grid, dat + 3 * b * count, count, n.size);
+    span.clear(by);
+    spread<T>(x, c, s, by, count, n.size);
+    std::fill(to, to + 3 * nodes, T(0));
+    span.nodes<T>(origin + 3 * b, n, [&](int64_t node, const int* behind) {
+      const T* g = by + 4 * node;
+      T* o = to + 3 * node;
+      if (!behind) {
+        o[0] = g[0], o[1] = g[1], o[2] = g[2];
+        return;
+      }
+      stopped_back(Stopped<T>(from + 3 * node, behind, friction[b]), behind, friction[b], g, o, sum);
+    });
+    dfriction[b] = sum;
+  }
 }
+
+#define ENTRY(T)                                                                                                    \
+  extern "C" void transfer_##T##_give(const T* at, const T* value, const T* slope, T* vel, T* mass, const Sizes* n, \
+                                      int threads) {                                                                \
+    give<T>(at, value, slope, vel, mass, *n, threads);                                                              \
+  }                                                                                                                 \
+  extern "C" void transfer_##T##_give_back(const T* at, const T* value, const T* slope, const T* vel_by,            \
+                                           const T* mass_by, T* dat, T* dvalue, T* dslope, const Sizes* n,          \
+                                           int threads) {                                                           \
+    give_back<T>(at, value, slope, vel_by, mass_by, dat, dvalue, dslope, *n, threads);                              \
+  }                                                                                                                 \
+  extern "C" void transfer_##T##_take(const T* at, const T* vel, const T* origin, const T* friction, T* value,      \
+                                      T* slope, const Sizes* n, int threads) {                                      \
+    take<T>(at, vel, origin, friction, value, slope, *n, threads);                                                  \
+  }                                                                                                                 \
+  extern "C" void transfer_##T##_take_back(const T* at, const T* vel, const T* origin, const T* friction,           \
+                                           const T* value_by, const T* slope_by, T* dat, T* dvel, T* dfriction,     \
+                                           const Sizes* n, int threads) {                                           \
+    take_back<T>(at, vel, origin, friction, value_by, slope_by, dat, dvel, dfriction, *n, threads);                 \
+  }
+ENTRY(float)
+ENTRY(double)
