@@ -27,13 +27,52 @@ struct Lanes;
 template <>
 struct Lanes<float> {
   typedef float type __attribute__((vector_size(16), aligned(4), may_alias));
+  typedef float pair __attribute__((vector_size(32), aligned(4), may_alias));
 };
 template <>
 struct Lanes<double> {
   typedef double type __attribute__((vector_size(32), aligned(8), may_alias));
+  typedef double pair __attribute__((vector_size(64), aligned(8), may_alias));
 };
 template <typename T>
 using Four = typename Lanes<T>::type;
+template <typename T>
+using Eight = typename Lanes<T>::pair;
+
+#if defined(__has_builtin)
+#if __has_builtin(__builtin_shufflevector)
+#define SHUFFLE __builtin_shufflevector
+#endif
+#endif
+template <typename T>
+static inline Eight<T> pair(const Four<T>& a, const Four<T>& b) {
+#ifdef SHUFFLE
+  return SHUFFLE(a, b, 0, 1, 2, 3, 4, 5, 6, 7);
+#else
+  return Eight<T>{a[0], a[1], a[2], a[3], b[0], b[1], b[2], b[3]};
+#endif
+}
+template <typename T>
+static inline Eight<T> twice(const T* from) {
+  const Four<T> a = *(const Four<T>*)from;
+  return pair<T>(a, a);
+}
+template <typename T>
+static inline Four<T> first(const Eight<T>& a) {
+#ifdef SHUFFLE
+  return SHUFFLE(a, a, 0, 1, 2, 3);
+#else
+  return Four<T>{a[0], a[1], a[2], a[3]};
+#endif
+}
+template <typename T>
+static inline Four<T> last(const Eight<T>& a) {
+#ifdef SHUFFLE
+  return SHUFFLE(a, a, 4, 5, 6, 7);
+#else
+  return Four<T>{a[4], a[5], a[6], a[7]};
+#endif
+}
 
 // Number of the first of the three nodes about a place along an axis. Particles that left the grid take its border; NaN
 // compares false and takes the first node.
@@ -75,77 +114,96 @@ static inline void load(const T* value, const T* slope, int64_t count, Four<T>& 
 }
 
 template <typename T>
-static void spread(const T* at, const T* value, const T* slope, T* grid, int64_t count, const int64_t* size) {
-  for (int64_t p = 0; p < count; ++p) {
-    const Stencil<T> n(at + p, count, size);
-    Four<T> c, s[3];
-    load(value + p, slope + p, count, c, s);
-    for (int i = 0; i < 3; ++i) {
-      const Four<T> ci = c + s[0] * n.d[0][i];
-      for (int j = 0; j < 3; ++j) {
-        const T wij = n.w[0][i] * n.w[1][j];
-        const Four<T> cij = (ci + s[1] * n.d[1][j]) * wij, sij = s[2] * wij;
-        Four<T>* to = (Four<T>*)(grid + 4 * (n.first + (i * size[1] + j) * size[2]));
-        for (int k = 0; k < 3; ++k) to[k] += (cij + sij * n.d[2][k]) * n.w[2][k];
-      }
+static inline void spread(const Stencil<T>& n, const Four<T>& c, const Four<T>* s, T* grid, const int64_t* size) {
+  // The first two nodes of a row at once.
+  const Eight<T> w = pair<T>(Four<T>{} + n.w[2][0], Four<T>{} + n.w[2][1]);
+  const Eight<T> d = pair<T>(Four<T>{} + n.d[2][0], Four<T>{} + n.d[2][1]);
+  const Eight<T> c2 = pair<T>(c, c), sx = pair<T>(s[0], s[0]), sy = pair<T>(s[1], s[1]), sz = pair<T>(s[2], s[2]);
+  for (int i = 0; i < 3; ++i) {
+    const Eight<T> ci = c2 + sx * n.d[0][i];
+    for (int j = 0; j < 3; ++j) {
+      const T wij = n.w[0][i] * n.w[1][j];
+      const Eight<T> cij = (ci + sy * n.d[1][j]) * wij, sij = sz * wij;
+      T* to = grid + 4 * (n.first + (i * size[1] + j) * size[2]);
+      *(Eight<T>*)to += (cij + sij * d) * w;
+      *(Four<T>*)(to + 8) += (first<T>(cij) + first<T>(sij) * n.d[2][2]) * n.w[2][2];
     }
   }
 }
 
 template <typename T>
-static void collect(const T* at, const T* grid, T* value, T* slope, int64_t count, const int64_t* size) {
+static void spread(const T* at, const T* value, const T* slope, T* grid, int64_t count, const int64_t* size) {
   for (int64_t p = 0; p < count; ++p) {
-    const Stencil<T> n(at + p, count, size);
-    Four<T> c{}, s[3] = {};
-    for (int i = 0; i < 3; ++i) {
-      Four<T> ci{}, sy{}, sz{};
-      for (int j = 0; j < 3; ++j) {
-        const Four<T>* from = (const Four<T>*)(grid + 4 * (n.first + (i * size[1] + j) * size[2]));
-        const Four<T> a = from[0] * n.w[2][0], b = from[1] * n.w[2][1], e = from[2] * n.w[2][2];
-        const Four<T> sum = (a + b + e) * n.w[1][j];
-        ci += sum;
-        sy += sum * n.d[1][j];
-        sz += (a * n.d[2][0] + b * n.d[2][1] + e * n.d[2][2]) * n.w[1][j];
-      }
-      c += ci * n.w[0][i];
-      s[0] += ci * (n.w[0][i] * n.d[0][i]);
-      s[1] += sy * n.w[0][i];
-      s[2] += sz * n.w[0][i];
-    }
-    for (int k = 0; k < 4; ++k) value[k * count + p] = c[k];
-    for (int k = 0; k < 3; ++k)
-      for (int a = 0; a < 3; ++a) slope[(3 * k + a) * count + p] = s[a][k];
+    Four<T> c, s[3];
+    load(value + p, slope + p, count, c, s);
+    spread<T>(Stencil<T>(at + p, count, size), c, s, grid, size);
   }
+}
+
+// Sums over the 27 nodes of their values times weights and more, for each of the four values: `sum` with the weights,
+// `by[a]` with distances along an axis, `slope[a]` with derivatives by the place along an axis, `both[a][b]` with the
+// derivative along a and the distance along b, which itself is not differentiated.
+template <typename T>
+struct Moments {
+  Four<T> sum{}, by[3] = {}, slope[3] = {}, both[3][3] = {};
+};
+
+// Axis by axis, the last one first. In a pair, the second has distances of the last axis as factors.
+template <typename T, bool SLOPES>
+static inline Moments<T> moments(const Stencil<T>& n, const T* grid, const int64_t* size) {
+  Eight<T> w2[3], g2[3];
+  for (int k = 0; k < 3; ++k) {
+    w2[k] = pair<T>(Four<T>{} + n.w[2][k], Four<T>{} + n.w[2][k] * n.d[2][k]);
+    g2[k] = pair<T>(Four<T>{} + n.g[2][k], Four<T>{} + n.g[2][k] * n.d[2][k]);
+  }
+  Moments<T> m;
+  Eight<T> www{}, gww{}, wgw{}, wwg{};
+  for (int i = 0; i < 3; ++i) {
+    Eight<T> ww{}, gw{}, wg{};
+    Four<T> dw{}, gdw{}, dg{};
+    for (int j = 0; j < 3; ++j) {
+      const T* from = grid + 4 * (n.first + (i * size[1] + j) * size[2]);
+      const T w = n.w[1][j], g = n.g[1][j], d = n.d[1][j];
+      const Eight<T> a = twice<T>(from), b = twice<T>(from + 4), c = twice<T>(from + 8);
+      const Eight<T> plain = a * w2[0] + b * w2[1] + c * w2[2];
+      ww += plain * w, dw += first<T>(plain) * (w * d);
+      if (SLOPES) {
+        const Eight<T> steep = a * g2[0] + b * g2[1] + c * g2[2];
+        gw += plain * g, gdw += first<T>(plain) * (g * d);
+        wg += steep * w, dg += first<T>(steep) * (w * d);
+      }
+    }
+    const T w = n.w[0][i], g = n.g[0][i], d = n.d[0][i];
+    www += ww * w;
+    m.by[0] += first<T>(ww) * (w * d), m.by[1] += dw * w;
+    if (SLOPES) {
+      gww += ww * g, m.both[0][0] += first<T>(ww) * (g * d), m.both[0][1] += dw * g;
+      wgw += gw * w, m.both[1][0] += first<T>(gw) * (w * d), m.both[1][1] += gdw * w;
+      wwg += wg * w, m.both[2][0] += first<T>(wg) * (w * d), m.both[2][1] += dg * w;
+    }
+  }
+  m.sum = first<T>(www), m.by[2] = last<T>(www);
+  if (SLOPES) {
+    m.slope[0] = first<T>(gww), m.both[0][2] = last<T>(gww);
+    m.slope[1] = first<T>(wgw), m.both[1][2] = last<T>(wgw);
+    m.slope[2] = first<T>(wwg), m.both[2][2] = last<T>(wwg);
+  }
+  return m;
+}
+
+template <typename T>
+static inline void keep(const Moments<T>& m, T* value, T* slope, int64_t count) {
+  for (int k = 0; k < 4; ++k) value[k * count] = m.sum[k];
+  for (int k = 0; k < 3; ++k)
+    for (int a = 0; a < 3; ++a) slope[(3 * k + a) * count] = m.by[a][k];
 }
 
 // Derivative of sum_i w_i (c + S d_i) . g_i by the particle's place; d_i loses what the place gains.
 template <typename T>
-static void tilt(const T* at, const T* value, const T* slope, const T* grid, T* out, int64_t count,
-                 const int64_t* size) {
-  for (int64_t p = 0; p < count; ++p) {
-    const Stencil<T> n(at + p, count, size);
-    Four<T> c, s[3], x{}, y{}, z{}, sum{};
-    load(value + p, slope + p, count, c, s);
-    for (int i = 0; i < 3; ++i) {
-      const Four<T> ci = c + s[0] * n.d[0][i];
-      for (int j = 0; j < 3; ++j) {
-        const Four<T> cij = ci + s[1] * n.d[1][j];
-        const Four<T>* from = (const Four<T>*)(grid + 4 * (n.first + (i * size[1] + j) * size[2]));
-        Four<T> along{}, across{}, total{};
-        for (int k = 0; k < 3; ++k) {
-          const Four<T> g = from[k], said = (cij + s[2] * n.d[2][k]) * g;
-          along += said * n.w[2][k];
-          across += said * n.g[2][k];
-          total += g * n.w[2][k];
-        }
-        x += along * (n.g[0][i] * n.w[1][j]);
-        y += along * (n.w[0][i] * n.g[1][j]);
-        z += across * (n.w[0][i] * n.w[1][j]);
-        sum += total * (n.w[0][i] * n.w[1][j]);
-      }
-    }
-    const Four<T> all[3] = {x - s[0] * sum, y - s[1] * sum, z - s[2] * sum};
-    for (int a = 0; a < 3; ++a) out[a * count + p] = all[a][0] + all[a][1] + all[a][2] + all[a][3];
+static inline void tilt(const Moments<T>& m, const Four<T>& c, const Four<T>* s, T* out, int64_t count) {
+  for (int a = 0; a < 3; ++a) {
+    const Four<T> all = c * m.slope[a] + s[0] * m.both[a][0] + s[1] * m.both[a][1] + s[2] * m.both[a][2] - s[a] * m.sum;
+    out[a * count] = all[0] + all[1] + all[2] + all[3];
   }
 }
 
@@ -251,8 +309,13 @@ static void give_back(const T* at, const T* value, const T* slope, const T* vel_
         to[3] = mass_by[b * nodes + i] - moved;
       }
     });
-    tilt<T>(x, c, s, by, dat + 3 * b * count, count, n.size);
-    collect<T>(x, by, dvalue + 4 * b * count, dslope + 9 * b * count, count, n.size);
+    for (int64_t p = 0; p < count; ++p) {
+      Four<T> value_p, slope_p[3];
+      load(c + p, s + p, count, value_p, slope_p);
+      const Moments<T> m = moments<T, true>(Stencil<T>(x + p, count, n.size), by, n.size);
+      tilt<T>(m, value_p, slope_p, dat + 3 * b * count + p, count);
+      keep<T>(m, dvalue + 4 * b * count + p, dslope + 9 * b * count + p, count);
+    }
   }
 }
 
@@ -281,7 +344,10 @@ static void take(const T* at, const T* vel, const T* origin, const T* friction, 
     T* grid = working<T>(nodes, 0);
     const Span span(at + 3 * b * count, count, n.size);
     fill<T>(span, vel + 3 * b * nodes, origin + 3 * b, friction[b], grid, n);
-    collect<T>(at + 3 * b * count, grid, value + 4 * b * count, slope + 9 * b * count, count, n.size);
+    for (int64_t p = 0; p < count; ++p) {
+      const Stencil<T> stencil(at + 3 * b * count + p, count, n.size);
+      keep<T>(moments<T, false>(stencil, grid, n.size), value + 4 * b * count + p, slope + 9 * b * count + p, count);
+    }
   }
 }
 
@@ -295,9 +361,14 @@ static void take_back(const T* at, const T* vel, const T* origin, const T* frict
     T *grid = working<T>(nodes, 0), *by = working<T>(nodes, 1), *to = dvel + 3 * b * nodes, sum = 0;
     const Span span(x, count, n.size);
     fill<T>(span, from, origin + 3 * b, friction[b], grid, n);
-    tilt<T>(x, c, s, grid, dat + 3 * b * count, count, n.size);
     span.clear(by);
-    spread<T>(x, c, s, by, count, n.size);
+    for (int64_t p = 0; p < count; ++p) {
+      Four<T> value_p, slope_p[3];
+      load(c + p, s + p, count, value_p, slope_p);
+      const Stencil<T> stencil(x + p, count, n.size);
+      tilt<T>(moments<T, true>(stencil, grid, n.size), value_p, slope_p, dat + 3 * b * count + p, count);
+      spread<T>(stencil, value_p, slope_p, by, n.size);
+    }
     std::fill(to, to + 3 * nodes, T(0));
     span.nodes<T>(origin + 3 * b, n, [&](int64_t node, const int* behind) {
       const T* g = by + 4 * node;
