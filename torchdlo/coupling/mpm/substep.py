@@ -59,13 +59,10 @@ def deform(
     stresses, strains, histories = [], [], []
     for group, here in medium.pieces():
         numbers = {n: v[..., 0] for n, v in material_points.laws[group.name].items()}
-        # Component by component, as they are stored; so are the derivatives then.
-        strain = rows_of(particles.strain)[..., here].unbind(-2)
-        change = tuple(dt * row for row in rows_of(particles.affine)[..., here].unbind(-2))
-        history = particles.history[..., here, 0]
-        stress, strain, history = group.law.answer(numbers, strain, history, change, dt)
-        stresses.append(torch.stack(torch.broadcast_tensors(*stress), -2))
-        strains.append(torch.stack(torch.broadcast_tensors(*strain), -2))
+        strain, affine = (rows_of(x)[..., here] for x in (particles.strain, particles.affine))
+        stress, strain, history = group.law.deformed(numbers, strain, particles.history[..., here, 0], affine, dt)
+        stresses.append(stress)
+        strains.append(strain)
         histories.append(history.unsqueeze(-2))
     whole = [torch.cat(parts, -1).mT for parts in (stresses, strains, histories)]
     return whole[0], tree.replace(particles, strain=whole[1], history=whole[2])
