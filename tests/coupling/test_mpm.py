@@ -8,7 +8,7 @@ import pytest
 import torch
 from material_points import DOUBLE, ONE, OPEN, ball, derivative, momenta, run, with_number
 
-from torchdlo.coupling.mpm import p2g_g2p
+from torchdlo.coupling.mpm import p2g_g2p, transfer_op
 from torchdlo.coupling.mpm import substep as mpm
 from torchdlo.coupling.mpm.constitutive_models import Elastic, Liquid, Plastic, Sand
 from torchdlo.coupling.mpm.particles import Grid, ParticleBlock, assemble, fill_box
@@ -31,31 +31,32 @@ def test_transfers_have_the_derivatives_that_they_say():
     at, value, gradient, grid = (t.requires_grad_() for t in tensors)
     assert torch.autograd.gradcheck(lambda a, v, s: p2g_g2p.particles_to_grid(a, v, s, size), (at, value, gradient))
     assert torch.autograd.gradcheck(lambda a, g: p2g_g2p.grid_to_particles(a, g, size), (at, grid))
-    massive = grid.detach()[:, :40].clone()
-    massive[..., 3] = massive[..., 3].abs() + 0.1
-    massive[:, ::5] = 0.0  # no mass
-    massive.requires_grad_()
-    there = massive[..., 3:] > 0
-    assert torch.autograd.gradcheck(lambda g: p2g_g2p.grid_velocities(g * there), (massive,))
 
 
-def test_the_kernel_does_what_tensor_operations_do(monkeypatch):
-    size, at, value, gradient, grid = _transfer_case()
-    at[0, :, 0], at[1, 1, 1], at[1, 0, 2] = -5.0, 1e9, torch.nan  # lost particles, too
-    calls = torch.ops.torchdlo
-
-    grid[:, ::5] = 0.0
+@pytest.mark.skipif(not transfer_op.ready("cpu", DOUBLE), reason="there is no C++ compiler")
+@pytest.mark.parametrize("lost", [False, True])
+def test_the_kernel_does_what_tensor_operations_do(lost, monkeypatch):
+    size, at, value, gradient, _ = _transfer_case()
+    value[:, 3] = value[:, 3].abs() + 0.1
+    value[0, 3, 5] = 0.0
+    if lost:
+        at[0, :, 0], at[1, 1, 1], at[1, 0, 2] = -5.0, 15.0, torch.nan
+    tensors = [t.requires_grad_() for t in (at, value, gradient)]
+    weight = torch.sin(torch.arange(2 * 7 * 6 * 8 * 4, dtype=DOUBLE)).reshape(2, -1, 4)
 
     def everything():
-        carried = calls.divide(grid), calls.divide_back(grid, *calls.divide(grid + 1))
-        return calls.spread(at, value, gradient, size), *calls.collect(at, grid, size), *carried[0], carried[1]
+        vel, mass = transfer_op.give_to_nodes(*tensors, size)
+        # Where little mass is, velocities are large.
+        said = (weight[..., :3] * mass.detach().nan_to_num().unsqueeze(-1) * vel).sum() + (weight[..., 3] * mass).sum()
+        return vel.detach(), mass.detach(), *torch.autograd.grad(said, tensors)
 
     fast = everything()
-    monkeypatch.setattr(p2g_g2p, "_native", lambda *_: False)
-    monkeypatch.setattr(p2g_g2p, "_native_divide", lambda *_: False)
+    monkeypatch.setattr(transfer_op, "ready", lambda *_: False)
     for a, b in zip(fast, everything(), strict=True):
-        assert torch.allclose(a.nan_to_num(), b.nan_to_num(), rtol=1e-12, atol=1e-12)
         assert a.shape == b.shape
+        known = a.isfinite() & b.isfinite() if lost else torch.ones_like(a, dtype=torch.bool)
+        assert float(known.double().mean()) > 0.4
+        assert float((a - b)[known].abs().max()) < 1e-10 * float(b[known].abs().max())
 
 
 def test_affine_fields_survive_the_way_to_the_grid_and_back():

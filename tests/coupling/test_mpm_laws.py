@@ -8,7 +8,7 @@ import pytest
 import torch
 from material_points import DOUBLE, derivative, run
 
-from torchdlo.coupling.mpm import constitutive_models, symmetric_tensors
+from torchdlo.coupling.mpm import constitutive_models, plastic_op, symmetric_tensors
 from torchdlo.coupling.mpm.constitutive_models import Elastic, Liquid, Plastic, Sand
 from torchdlo.coupling.mpm.particles import Grid, ParticleBlock, assemble, fill_box
 from torchdlo.coupling.mpm.symmetric_tensors import deviator, eigen, from_hencky, full, hencky, squared, stretch, trace
@@ -242,3 +242,38 @@ def test_the_kernel_and_tensor_operations_agree_with_their_derivatives(function,
     for found, wanted in zip(mine, both(), strict=True):
         # Tensors that are nearly crushed magnify rounding by up to the square of their stretch.
         torch.testing.assert_close(found, wanted, rtol=1e-10, atol=1e-12 * size)
+
+
+@pytest.mark.skipif(not plastic_op.ready("cpu", DOUBLE), reason="there is no C++ compiler")
+@pytest.mark.parametrize("size", [1e-6, 3e-3, 0.05, 0.3])
+@pytest.mark.parametrize("per_particle", [False, True])
+def test_the_kernel_of_plastic_matter_and_tensor_operations_agree_with_their_derivatives(
+    size, per_particle, monkeypatch
+):
+    g, count, dt = torch.Generator().manual_seed(2), 37, 1e-3
+    root = size * torch.randn(2, count, 3, 3, generator=g, dtype=DOUBLE)
+    root[:, :4] = 0.0
+    e = root + root.mT + root @ root.mT
+    strain = torch.stack([e[..., i, j] for i, j in symmetric_tensors.PAIRS], -2).requires_grad_()
+    affine = (size / dt * torch.randn(2, 9, count, generator=g, dtype=DOUBLE)).requires_grad_()
+    history = torch.rand(2, count, generator=g, dtype=DOUBLE).requires_grad_()
+    shape = (2, count) if per_particle else (1,)
+    middle = {"youngs": 1e5, "poisson": 0.3, "yield_stress": 1e3}
+    numbers = {n: (x * (0.8 + 0.4 * torch.rand(shape, generator=g, dtype=DOUBLE))) for n, x in middle.items()}
+    leaves = [strain, history, affine, *(x.requires_grad_() for x in numbers.values())]
+    weight = torch.randn(2, 13, count, generator=g, dtype=DOUBLE)
+
+    def both():
+        stress, after, remembered = Plastic().deformed(numbers, strain, history, affine, dt)
+        found = torch.cat([1e-5 * stress, after, remembered.unsqueeze(-2)], -2)
+        return found.detach(), *torch.autograd.grad((weight * found).sum(), leaves, allow_unused=True)
+
+    mine = both()
+    monkeypatch.setattr(plastic_op, "ready", lambda *_: False)
+    monkeypatch.setattr(symmetric_tensors, "ready", lambda *_: False)
+    wanted = both()
+    flows = wanted[0][:, 12] > history
+    assert bool(flows.any()) == (size > 1e-3) and bool(flows.all()) == (size > 1e-2)
+    for found, expected in zip(mine, wanted, strict=True):
+        assert found.shape == expected.shape
+        assert float((found - expected).abs().max()) <= 1e-9 * float(expected.abs().max())

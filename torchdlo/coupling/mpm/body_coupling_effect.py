@@ -42,7 +42,7 @@ from torch import Tensor
 from torchdlo.coupling.bodies import shape_sdf
 from torchdlo.coupling.bodies.dynamics import PredictedBodyMotion, conjugate
 from torchdlo.coupling.common.coulomb_friction import friction_force
-from torchdlo.coupling.mpm import body_broad_phase_op
+from torchdlo.coupling.mpm import body_broad_phase_op, body_coupling_op
 from torchdlo.coupling.mpm.particles import Grid
 from torchdlo.coupling.mpm.rod_coupling_effect import PredictedParticles, TouchedParticles
 from torchdlo.coupling.mpm.substep import Nodes, places
@@ -278,12 +278,19 @@ def exchange(
             chosen, lost = _chosen(motion, solids, nodes, places(grid, nodes), reach, room)
         index = chosen.unsqueeze(-1).expand(-1, -1, 3)
         near = tree.replace(nodes, mass=nodes.mass.gather(1, chosen), vel=nodes.vel.gather(1, index))
-    pairs = _pairs(effect, motion, solids, near, places(grid, near, chosen), grid.spacing)
-    u = _sweep(pairs, solids, near.vel, effect.sweeps)
-    push, torque = _felt(pairs, u)
-    given = (pairs.answer * u.sum(1, keepdim=True)).squeeze(1)
+    if body_coupling_op.kernel_fits(motion):
+        numbers = chosen
+        if numbers is None:
+            numbers = torch.arange(nodes.mass.shape[1], device=nodes.mass.device).expand(nodes.mass.shape)
+        law = (effect.reach, RAMP, effect.recovery)
+        push, torque, given = body_coupling_op.exchange(motion, grid, near, numbers, batch, effect.sweeps, law)
+    else:
+        pairs = _pairs(effect, motion, solids, near, places(grid, near, chosen), grid.spacing)
+        u = _sweep(pairs, solids, near.vel, effect.sweeps)
+        push, torque = (x.squeeze(2) for x in _felt(pairs, u))
+        given = (pairs.answer * u.sum(1, keepdim=True)).squeeze(1)
     vel = nodes.vel + given if chosen is None else nodes.vel.scatter_add(1, index, given)
-    return push.squeeze(2), torque.squeeze(2), tree.replace(nodes, vel=vel), lost
+    return push, torque, tree.replace(nodes, vel=vel), lost
 
 
 def couple_bodies_to_particles(

@@ -18,6 +18,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
+from torchdlo.coupling.mpm import plastic_op
 from torchdlo.coupling.mpm.symmetric_tensors import (
     PAIRS,
     Square,
@@ -63,6 +64,27 @@ class ConstitutiveModel(ABC):
             change: by how much it is deformed, F -> (I + change) F; shape (..., N) each.
             dt: in what time [s].
         """
+
+    def deformed(
+        self, numbers: Values, strain: Tensor, history: Tensor, affine: Tensor, dt: float
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Return stress [Pa] (..., 6, N), strain [1] (..., 6, N) and history (..., N) after velocity gradients acted.
+
+        Args:
+            numbers: its numbers, each of shape (..., N or 1).
+            strain: e before, shape (..., 6, N).
+            history: what else it remembered, shape (..., N).
+            affine: velocity gradients, row by row [1/s], shape (..., 9, N).
+            dt: how long they act [s].
+        """
+        # Component by component, as they are stored; so are the derivatives then.
+        change = tuple(dt * row for row in affine.unbind(-2))
+        stress, after, history = self.answer(numbers, strain.unbind(-2), history, change, dt)
+        return (
+            torch.stack(torch.broadcast_tensors(*stress), -2),
+            torch.stack(torch.broadcast_tensors(*after), -2),
+            history,
+        )
 
     @abstractmethod
     def modulus(self, numbers: Values) -> Tensor:
@@ -146,6 +168,14 @@ class Plastic(ConstitutiveModel):
         h = tuple(x - share * d for x, d in zip(h, dev, strict=True))
         strain = select(flows, from_hencky(h), strain)
         return _hooke(first, mu, h), strain, history + math.sqrt(2 / 3) * excess
+
+    def deformed(
+        self, numbers: Values, strain: Tensor, history: Tensor, affine: Tensor, dt: float
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Return stress, strain and history after velocity gradients acted."""
+        if not plastic_op.ready(strain.device.type, strain.dtype):
+            return super().deformed(numbers, strain, history, affine, dt)
+        return plastic_op.answer((*lame(numbers), numbers["yield_stress"]), strain, history, affine, dt)
 
     def modulus(self, numbers: Values) -> Tensor:
         """Return lambda + 2 mu."""

@@ -6,50 +6,18 @@ other's derivative;
 `tilt` is the derivative by x of both. Weights: Jiang et al. 2016, The Material Point Method for Simulating Continuum
 Materials, eq. 123, doi:10.1145/2897826.2927348.
 
-On the CPU a C++ kernel does it, one scene per thread; sums have the same order in every run. Elsewhere, and without a
-compiler, tensor operations do; on a GPU their sums come in the order in which threads arrive.
+These are tensor operations; on a GPU their sums come in the order in which threads arrive. On the CPU a C++ kernel does
+the same, see `transfer_op`.
 """
 
 from __future__ import annotations
 
-import ctypes
-import functools
 from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
 
 from torchdlo.coupling.common import scene_packing
-from torchdlo.physics.kernels import native
-
-_SPREAD, _COLLECT, _TILT = range(3)
-
-
-@functools.cache
-def _kernel() -> ctypes.CDLL | None:
-    return native.library(native.COUPLING / "transfer.cpp")
-
-
-native.KERNELS["transfer"] = _kernel
-
-
-def _library_for(like: Tensor) -> ctypes.CDLL | None:
-    if not native.works_on(like.device.type, "material points, the transfer between particles and grid"):
-        return None
-    return _kernel()
-
-
-def _native(which: int, size: Sequence[int], *tensors: Tensor) -> bool:
-    """Run the C++ kernel on (at, value, slope, grid, out); whether it could."""
-    at = tensors[0]
-    library = _library_for(at)
-    if library is None or at.dtype not in (torch.float32, torch.float64):
-        return False
-    call = library.transfer_double if at.dtype == torch.float64 else library.transfer_float
-    address = [ctypes.c_void_p(t.data_ptr()) for t in tensors]
-    scenes, count = (ctypes.c_int64(n) for n in (at.shape[0], at.shape[2]))
-    call(which, *address, scenes, count, (ctypes.c_int64 * 3)(*size), torch.get_num_threads())
-    return True
 
 
 def _stencil(at: Tensor, size: Sequence[int]) -> tuple[Tensor, Tensor, Tensor, Callable[[int], Tensor]]:
@@ -89,68 +57,26 @@ def _reach(grid: Tensor, nodes: Tensor) -> Tensor:
 
 
 def _spread(at: Tensor, value: Tensor, slope: Tensor, size: Sequence[int]) -> Tensor:
-    grid = at.new_zeros(at.shape[0], size[0] * size[1] * size[2], 4)
-    if _native(_SPREAD, size, at, value, slope, grid, grid):
-        return grid
+    grid = at.new_zeros(at.shape[0], 4, size[0] * size[1] * size[2])
     nodes, distance, weight, _ = _stencil(at, size)
     said = (weight[:, None] * _said(value, slope, distance)).flatten(2)
     flat = nodes.flatten(1)[:, None].expand(-1, 4, -1)
-    return torch.zeros_like(grid.mT, memory_format=torch.contiguous_format).scatter_add_(2, flat, said).mT.contiguous()
+    return grid.scatter_add_(2, flat, said).mT.contiguous()
 
 
 def _collect(at: Tensor, grid: Tensor, size: Sequence[int]) -> tuple[Tensor, Tensor]:
-    value, slope = at.new_empty(at.shape[0], 4, at.shape[2]), at.new_empty(at.shape[0], 9, at.shape[2])
-    if _native(_COLLECT, size, at, value, slope, grid, grid):
-        return value, slope
     nodes, distance, weight, _ = _stencil(at, size)
     seen = weight[:, None] * _reach(grid, nodes)
     return seen.sum(2), torch.einsum("bknp,banp->bkap", seen[:, :3], distance).flatten(1, 2)
 
 
 def _tilt(at: Tensor, value: Tensor, slope: Tensor, grid: Tensor, size: Sequence[int]) -> Tensor:
-    out = torch.empty_like(at)
-    if _native(_TILT, size, at, value, slope, grid, out):
-        return out
     nodes, distance, weight, along = _stencil(at, size)
     seen = _reach(grid, nodes)
     product = (_said(value, slope, distance) * seen).sum(1)
     tilted = torch.stack([(along(a) * product).sum(1) for a in range(3)], 1)
     means = (weight[:, None] * seen[:, :3]).sum(2)
     return tilted - torch.einsum("bkap,bkp->bap", slope.unflatten(1, (3, 3)), means)
-
-
-def _divide(grid: Tensor) -> tuple[Tensor, Tensor]:
-    vel, mass = _divide_meta(grid)
-    if _native_divide("divide", grid, vel, mass):
-        return vel, mass
-    there = grid[..., 3:] > 0
-    return torch.where(there, grid[..., :3] / torch.where(there, grid[..., 3:], 1.0), 0.0), grid[..., 3].clone()
-
-
-def _divide_meta(grid: Tensor) -> tuple[Tensor, Tensor]:
-    return grid.new_empty(*grid.shape[:2], 3), grid.new_empty(grid.shape[:2])
-
-
-def _divide_back(grid: Tensor, vel: Tensor, mass: Tensor) -> Tensor:
-    out = torch.empty_like(grid)
-    if _native_divide("divide_back", grid, vel, mass, out):
-        return out
-    there = grid[..., 3:] > 0
-    whole = torch.where(there, grid[..., 3:], 1.0)
-    found = torch.where(there, vel / whole, 0.0)
-    moved = torch.where(there, grid[..., :3] / whole * found, 0.0).sum(-1)
-    return torch.cat([found, (mass - moved).unsqueeze(-1)], -1)
-
-
-def _native_divide(what: str, grid: Tensor, *tensors: Tensor) -> bool:
-    """Run a C++ kernel on (grid, ...); whether it could."""
-    library = _library_for(grid)
-    if library is None or grid.dtype not in (torch.float32, torch.float64):
-        return False
-    call = getattr(library, f"transfer_{what}_{'double' if grid.dtype == torch.float64 else 'float'}")
-    address = [ctypes.c_void_p(t.data_ptr()) for t in (grid, *tensors)]
-    call(*address, *(ctypes.c_int64(n) for n in grid.shape[:2]), torch.get_num_threads())
-    return True
 
 
 _library = torch.library.Library("torchdlo", "FRAGMENT")
@@ -169,12 +95,6 @@ _OPS: dict[str, tuple[str, Callable, Callable]] = {
         "(Tensor at, Tensor value, Tensor slope, Tensor grid, int[] size) -> Tensor",
         _tilt,
         lambda at, value, slope, grid, size: at.new_empty(at.shape),
-    ),
-    "divide": ("(Tensor grid) -> (Tensor, Tensor)", _divide, _divide_meta),
-    "divide_back": (
-        "(Tensor grid, Tensor vel, Tensor mass) -> Tensor",
-        _divide_back,
-        lambda grid, vel, mass: torch.empty_like(grid),
     ),
 }
 for _name, (_schema, _make, _fake) in _OPS.items():
@@ -204,14 +124,7 @@ def _collect_backward(ctx, value: Tensor, slope: Tensor):
 
 torch.library.register_autograd("torchdlo::spread", _spread_backward, setup_context=_save_spread, lib=_library)
 torch.library.register_autograd("torchdlo::collect", _collect_backward, setup_context=_save_spread, lib=_library)
-torch.library.register_autograd(
-    "torchdlo::divide",
-    lambda ctx, vel, mass: torch.ops.torchdlo.divide_back(*ctx.saved_tensors, vel.contiguous(), mass.contiguous()),
-    setup_context=lambda ctx, inputs, output: ctx.save_for_backward(*inputs),
-    lib=_library,
-)
-for _name in ("tilt", "divide_back"):
-    torch.library.register_autograd(f"torchdlo::{_name}", scene_packing.refuse_second_derivative, lib=_library)
+torch.library.register_autograd("torchdlo::tilt", scene_packing.refuse_second_derivative, lib=_library)
 
 
 def particles_to_grid(at: Tensor, value: Tensor, slope: Tensor, size: Sequence[int]) -> Tensor:
@@ -243,4 +156,5 @@ def grid_velocities(grid: Tensor) -> tuple[Tensor, Tensor]:
     Args:
         grid: momentum [kg m/s] and mass [kg] of nodes, shape (B, N, 4).
     """
-    return torch.ops.torchdlo.divide(grid.contiguous())
+    there = grid[..., 3:] > 0
+    return torch.where(there, grid[..., :3] / torch.where(there, grid[..., 3:], 1.0), 0.0), grid[..., 3]

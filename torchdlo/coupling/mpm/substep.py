@@ -15,8 +15,7 @@ import math
 import torch
 from torch import Tensor
 
-from torchdlo.coupling.mpm import p2g_g2p
-from torchdlo.coupling.mpm.grid_boundaries import walls
+from torchdlo.coupling.mpm import transfer_op
 from torchdlo.coupling.mpm.particles import Grid, MpmDomain, ParticleParams, Particles, rows_of
 from torchdlo.physics import tree
 
@@ -60,13 +59,10 @@ def deform(
     stresses, strains, histories = [], [], []
     for group, here in medium.pieces():
         numbers = {n: v[..., 0] for n, v in material_points.laws[group.name].items()}
-        # Component by component, as they are stored; so are the derivatives then.
-        strain = rows_of(particles.strain)[..., here].unbind(-2)
-        change = tuple(dt * row for row in rows_of(particles.affine)[..., here].unbind(-2))
-        history = particles.history[..., here, 0]
-        stress, strain, history = group.law.answer(numbers, strain, history, change, dt)
-        stresses.append(torch.stack(torch.broadcast_tensors(*stress), -2))
-        strains.append(torch.stack(torch.broadcast_tensors(*strain), -2))
+        strain, affine = (rows_of(x)[..., here] for x in (particles.strain, particles.affine))
+        stress, strain, history = group.law.deformed(numbers, strain, particles.history[..., here, 0], affine, dt)
+        stresses.append(stress)
+        strains.append(strain)
         histories.append(history.unsqueeze(-2))
     whole = [torch.cat(parts, -1).mT for parts in (stresses, strains, histories)]
     return whole[0], tree.replace(particles, strain=whole[1], history=whole[2])
@@ -121,9 +117,8 @@ def to_grid(
     gradient = h * mass * particles.affine - share * (4 * dt / h) * material_points.volume * full
     moved = particles.vel + share * dt * acceleration
     said = torch.cat([(mass * moved).mT, mass.expand(*moved.shape[:-1], 1).mT], -2)
-    vel, summed = p2g_g2p.grid_velocities(
-        p2g_g2p.particles_to_grid(at, said.reshape(-1, 4, said.shape[-1]), flat(gradient), grid.size)
-    )
+    said = said.reshape(-1, 4, said.shape[-1])
+    vel, summed = transfer_op.give_to_nodes(at, said, flat(gradient), grid.size)
     return Nodes(at, origin, summed, vel, share.reshape(-1, 1, 1)), particles
 
 
@@ -131,8 +126,9 @@ def from_grid(
     medium: MpmDomain, material_points: ParticleParams, particles: Particles, nodes: Nodes, dt: float
 ) -> Particles:
     """Return the particles after the substep, moved with the nodes; walls act last."""
-    filled = walls(medium.grid, nodes.origin, nodes.vel, material_points.friction)
-    value, gradient = p2g_g2p.grid_to_particles(nodes.at, filled, medium.grid.size)
+    value, gradient = transfer_op.take_from_nodes(
+        medium.grid, nodes.at, nodes.vel, nodes.origin, material_points.friction
+    )
     batch = particles.pos.shape[:-2]
     vel = value[:, :3].reshape(*batch, 3, -1).mT
     affine = (gradient * (4 / medium.grid.spacing)).reshape(*batch, 9, -1).mT

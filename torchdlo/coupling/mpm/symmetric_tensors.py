@@ -166,13 +166,13 @@ def _plainly(
 
 
 _FUNCTIONS = ("stretch", "hencky", "from_hencky")
-_function, ready = scene_packing.kernel("symmetric", "material points, their elastic laws")
+kernel_function, ready = scene_packing.kernel("symmetric", "material points, their elastic laws")
 
 
 def _run(tensors: Tensor, by: Tensor | None, which: str) -> Tensor:
     out = torch.empty_like(tensors)
     places = (None if x is None else ctypes.c_void_p(x.data_ptr()) for x in (tensors, by, out))
-    call = _function("act", tensors.dtype)
+    call = kernel_function("act", tensors.dtype)
     call(_FUNCTIONS.index(which), *places, ctypes.c_int64(tensors.shape[1]), torch.get_num_threads())
     return out
 
