@@ -95,8 +95,8 @@ class TrainingSettings:
     auxiliary: float = 0.0
     """What share of what a task's auxiliary loss has fallen by since the start is paid after every action."""
     saturation: float = 0.0
-    """What SHAC and SAPO pay for the square of what a mean exceeds 1.5 by before the hyperbolic tangent, where an action is
-    nine tenths of the greatest one: far beyond, no gradient leads back."""
+    """What SHAC and SAPO pay for the square of what means exceed 1.5 by before the hyperbolic tangent; actions are nine
+    tenths of the greatest there, and far beyond no gradient leads back."""
     ends: float = 1.0
     """What share of what the end lacks to success is subtracted from the return."""
     fidelity: str = "published"
