@@ -101,6 +101,8 @@ def test_what_the_end_of_coiling_lacks_does_not_dwarf_what_it_earns():
         {"ends": "abc"},
         {"barrier": -1.0},
         {"barrier": math.inf},
+        {"auxiliary": -0.1},
+        {"saturation": math.nan},
         {"temperature": "x"},
     ],
 )
@@ -110,6 +112,7 @@ def test_what_cannot_be_paid_is_refused_in_a_sentence(wrong):
         training_preset("coiling", "shac", **wrong)
 
 
-def test_the_hybrid_refuses_a_barrier():
-    with pytest.raises(InputError, match="barrier"):
-        training_preset("coiling", "hybrid", barrier=0.2)
+@pytest.mark.parametrize("name", ["barrier", "auxiliary"])
+def test_the_hybrid_refuses_what_its_stages_do_not_pay(name: str):
+    with pytest.raises(InputError, match=name):
+        training_preset("coiling", "hybrid", **{name: 0.2})

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -11,7 +13,7 @@ from springs import move, pusher, springs
 
 from torchdlo.agents.rl.rollout import episode_progress
 from torchdlo.agents.rl.settings import training_preset
-from torchdlo.agents.rl.shac import Sapo, Shac, actor_loss
+from torchdlo.agents.rl.shac import Sapo, Shac, Window, actor_loss, saturation_loss
 
 F64 = torch.float64
 
@@ -23,11 +25,15 @@ def trainer(kind=Shac, **choices):
     return kind(policy, settings), springs(4, 1, F64)
 
 
-def loss_of(made: Shac, episodes, seed: int = 5) -> torch.Tensor:
+def played(made: Shac, episodes, seed: int = 5) -> Window:
     episodes.generator.manual_seed(7)
     seen = episodes.reset()
     torch.manual_seed(seed)
-    window, _ = made.play(episodes, seen, 0, torch.zeros(4, dtype=torch.bool))
+    return made.play(episodes, seen, 0, torch.zeros(4, dtype=torch.bool))[0]
+
+
+def loss_of(made: Shac, episodes, seed: int = 5) -> torch.Tensor:
+    window = played(made, episodes, seed)
     value = made.bootstrap(window.features[-1])
     return actor_loss(window, value, gamma=made.settings.gamma, temperature=made.temperature)
 
@@ -98,3 +104,34 @@ def test_entropy_is_worth_less_than_what_actions_earn_at_first():
     assert float(made.temperature) == pytest.approx(0.002)
     made, _ = trainer(Sapo, temperature=0.5)
     assert float(made.temperature) == pytest.approx(0.5)
+
+
+def test_means_that_saturate_are_led_back_where_no_reward_does():
+    made, episodes = trainer(saturation=1.0)
+    policy = made.policy
+    with torch.no_grad():
+        policy.net[-1].bias.fill_(5.0)
+    window = played(made, episodes)
+    with torch.no_grad():
+        loc, _ = policy(window.features[:-1])
+    assert float(loc.min()) > 4
+    loss = saturation_loss(policy, window)
+    assert loss.item() == pytest.approx(float((loc - 1.5).square().mean()), rel=1e-12)
+    actor = actor_loss(window, torch.zeros(4, dtype=F64), gamma=0.99)
+    bias = policy.net[-1].bias
+    (weak,) = torch.autograd.grad(actor, bias, retain_graph=True)
+    (strong,) = torch.autograd.grad(loss, bias)
+    assert float(strong.min()) == pytest.approx(float(2 * (loc - 1.5).mean()), rel=1e-12)
+    assert float(strong.abs().max()) > 100 * float(weak.abs().max())
+
+
+def test_means_within_bounds_and_episodes_that_failed_pay_nothing_for_saturation():
+    made, episodes = trainer(saturation=1.0)
+    window = played(made, episodes)
+    assert saturation_loss(made.policy, window).item() == 0
+    with torch.no_grad():
+        made.policy.net[-1].bias.fill_(5.0)
+    whole = saturation_loss(made.policy, window).item()
+    gone = torch.tensor([False, True, False, True])
+    half = replace(window, begun=~gone, failed=gone.expand_as(window.failed))
+    assert 0.3 * whole < saturation_loss(made.policy, half).item() < 0.7 * whole

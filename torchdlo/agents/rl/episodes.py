@@ -123,6 +123,7 @@ class TaskEpisodes:
         scale: float = 1.0,
         bonus: float = 0.0,
         barrier: float = 0.0,
+        auxiliary: float = 0.0,
         randomize: dict[str, float] | None = None,
         disturbed: float = 0.0,
         device: torch.device | str = "cpu",
@@ -143,6 +144,8 @@ class TaskEpisodes:
             bonus: what success earns at the end, after scaling.
             barrier: what an action costs, after scaling, after which a rope is stretched as far as the task allows; it
                 grows from half of that on as the square. An episode that fails pays it for each action that is left.
+            auxiliary: what share of what `Task.auxiliary_loss` has fallen by since the start is added to each reward,
+                before scaling. Counted from the start it does not make failing cheap, and values stay near 0.
             randomize: see `torchdlo.envs.make`.
             disturbed: by how much friction and stiffness of ropes differ from scene to scene, as shares of their own;
                 drawn at every reset.
@@ -169,6 +172,7 @@ class TaskEpisodes:
         self.task, self.count, self.horizon = task, count, task.horizon
         self.generator = self.env.generator
         self.ends, self.scale, self.bonus, self.barrier = ends, scale, bonus, barrier
+        self.auxiliary, self._first_loss = auxiliary, torch.zeros(count, dtype=dtype, device=device)
         if disturbed and randomize:
             raise InputError("randomize and disturbed: both draw friction anew; give one of them.")
         self.disturbed, self._usual = disturbed, self.env.episode.params
@@ -188,6 +192,7 @@ class TaskEpisodes:
             self.random = None
             self.env.episode = replace(self.env.episode, params=self._usual)
         self.first = self.env.reset()["observation"].detach()
+        self._first_loss = self._auxiliary_loss(self.env.world).detach()
         return self.first
 
     def disturb(self, random: Tensor) -> None:
@@ -207,6 +212,7 @@ class TaskEpisodes:
             moved = moved.to(self.returns.device)
             env.world, env.moved = episode.begin(env.episode, episode.laid_down(self.task, moved)[2]), moved
             self.first = episode.observe(env.episode, env.world)
+            self._first_loss = self._auxiliary_loss(env.world)
         return self.first
 
     def step(self, action: Tensor) -> Transition:
@@ -223,11 +229,19 @@ class TaskEpisodes:
             if self.ends:
                 reward = reward - self.ends * self.scale * episode.terminal_costs(self.task, world).float()
             reward = reward + self.bonus * success
+        if self.auxiliary:
+            fallen = torch.where(world.failed, 0.0, self._first_loss - self._auxiliary_loss(world))
+            reward = reward + self.auxiliary * self.scale * fallen.float()
         if self.barrier:
             # Failing must not cost less than all that would have been left to pay.
             left = (1 + self.horizon - self._over) * (world.failed & ~before)
             reward = reward - self.barrier * torch.where(world.failed, left, self._tension(world)).float()
         return Transition(episode.observe(env.episode, world), reward, world.failed, success)
+
+    def _auxiliary_loss(self, world: EpisodeState) -> Tensor:
+        """Return the sum of the task's terms, (N,)."""
+        terms = self.task.auxiliary_loss(world.seen(self.task.arms.count)) if self.auxiliary else {}
+        return sum(terms.values(), torch.zeros_like(self._first_loss))
 
     def _tension(self, world: EpisodeState) -> Tensor:
         """Return how near ropes are to tearing: 0 up to half of the stretch that is allowed, 1 at all of it, (N,)."""

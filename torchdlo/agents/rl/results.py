@@ -59,6 +59,7 @@ def prepare_training(
         scale=_scale(task),
         bonus=settings.bonus,
         barrier=settings.barrier,
+        auxiliary=settings.auxiliary,
         device=device,
     )
     if not settings.collectors:

@@ -92,6 +92,11 @@ class TrainingSettings:
     barrier: float = 0.0
     """What an action costs after which a rope is stretched as far as its task allows, growing from half of that on; an
     episode that fails pays it for each action that is left. In units of `bonus`."""
+    auxiliary: float = 0.0
+    """What share of what a task's auxiliary loss has fallen by since the start is paid after every action."""
+    saturation: float = 0.0
+    """What SHAC and SAPO pay for the square of what means exceed 1.5 by before the hyperbolic tangent; actions are nine
+    tenths of the greatest there, and far beyond no gradient leads back."""
     ends: float = 1.0
     """What share of what the end lacks to success is subtracted from the return."""
     fidelity: str = "published"
@@ -126,12 +131,13 @@ class TrainingSettings:
         need(0 < self.gamma <= 1, "gamma", "a discount above 0, at most 1")
         need(self.window >= 1, "window", "at least 1 action")
         need(self.sigma > 0, "sigma", "a positive number")
-        for name in ("ends", "barrier", "temperature"):
+        for name in ("ends", "barrier", "auxiliary", "saturation", "temperature"):
             value = getattr(self, name)
             need(isinstance(value, int | float) and 0 <= value < math.inf, name, "a finite number, not below 0")
         need(self.temperature > 0, "temperature", "a positive number")
-        plain = self.algorithm != "hybrid" or not self.barrier
-        need(plain, "barrier", "0, as stages of hybrid know none; ppo, sac, shac and sapo can have one")
+        for name in ("barrier", "auxiliary"):
+            plain = self.algorithm != "hybrid" or not getattr(self, name)
+            need(plain, name, "0, as stages of hybrid know none; ppo, sac, shac and sapo can have one")
 
 
 _ALGORITHM: dict[str, dict[str, Any]] = {

@@ -22,7 +22,10 @@ from torchdlo.agents.rl.ppo import Critic
 from torchdlo.agents.rl.rollout import Batch, policy_features, td_lambda_targets
 from torchdlo.agents.rl.settings import TrainingSettings
 
-__all__ = ["Sapo", "Shac", "Window", "actor_loss"]
+__all__ = ["Sapo", "Shac", "Window", "actor_loss", "saturation_loss"]
+
+EDGE = 1.5
+"""Means up to which nothing is paid before they are squashed; a fifth of a gradient is left there."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,6 +78,16 @@ def actor_loss(window: Window, value: Tensor, *, gamma: float, temperature: Tens
     earned = (power * torch.where(window.alive, gain, 0.0)).sum(0)
     after = torch.where(window.terminal[-1] | ~window.begun, 0.0, value)
     return -(earned + gamma**steps * after).sum() / (steps * count)
+
+
+def saturation_loss(policy: Policy, window: Window) -> Tensor:
+    """Return the mean square of what means exceed `EDGE` by before they are squashed, of episodes that go on, shape ().
+
+    Its gradient reaches the policy alone: not through the simulation, where what led to such means is long gone.
+    """
+    loc, _ = policy(window.features[:-1].detach())
+    over = (loc.abs() - EDGE).clamp(min=0).square().mean(-1)
+    return torch.where(window.alive, over, 0.0).mean()
 
 
 def _tamed(limit: float, lost: list[Tensor]) -> Callable[[Tensor], Tensor]:
@@ -191,8 +204,9 @@ class Shac:
         s = self.settings
         value = self.bootstrap(window.features[-1])
         loss = actor_loss(window, value, gamma=s.gamma, temperature=self.temperature)
+        whole = loss + s.saturation * saturation_loss(self.policy, window) if s.saturation else loss
         self.optimizer.zero_grad()
-        loss.backward()
+        whole.backward()
         for p in self.policy.parameters():
             if p.grad is not None:
                 p.grad.nan_to_num_(0.0, 0.0, 0.0)

@@ -216,7 +216,8 @@ def _restore(
     content = load_checkpoint(path)
     if content is None:
         raise InputError(f"{path}: the checkpoint is damaged; leave out --resume.")
-    was = {"device": "cpu", "barrier": 0.0} | json.loads(content["settings"])  # those of 0.1 did not say
+    first = {"device": "cpu", "barrier": 0.0, "auxiliary": 0.0, "saturation": 0.0}
+    was = first | json.loads(content["settings"])  # those of 0.1 did not say
     now = json.loads(json.dumps(asdict(settings)))
     # How long to go on may change, and a temperature goes on from where it was.
     free = ("episodes", "minutes", "interval", "temperature")
