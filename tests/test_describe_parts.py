@@ -64,6 +64,9 @@ def test_taut_ropes_over_bodies_are_still_without_asking_for_a_way_of_contact():
         ({"precision": "float32"}, "sweeps"),
         ({"bodies": (), "effects": {"gravity": {}, "rod_contact": {}}}, "sweeps"),
         ({"effects": {"gravity": {}}}, "sweeps"),
+        ({"effects": {"gravity": {}, "rod_contact": {}}}, "sweeps"),
+        ({"effects": {"gravity": {}, "rod_body": {}, "rod_contact": {}, "self_contact": {}}}, "sweeps"),
+        ({"integrator": "implicit", "dt": 1e-3, "substeps": 1}, "sweeps"),
     ],
 )
 def test_contact_is_by_sweeps_where_one_solve_is_not_wanted_or_not_resolved(fields, expected):

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import pytest
 import torch
 from torch.autograd import forward_ad
 
 from torchdlo import scene
-from torchdlo.coupling import RodBody
+from torchdlo.coupling import RodBody, RodContact
 from torchdlo.physics import tree
 from torchdlo.physics.effects.elastic import Bend
 from torchdlo.physics.effects.external import Gravity
@@ -31,6 +33,13 @@ def graphs(monkeypatch: pytest.MonkeyPatch):
     torch._dynamo.reset()
     torch._dynamo.utils.counters.clear()
     return lambda: torch._dynamo.utils.counters["stats"]["unique_graphs"]
+
+
+def test_forward_mode_through_contact_is_refused():
+    choice, params, state, controls = hanging(1)
+    touching = dataclasses.replace(choice, effects=(*choice.effects, RodContact()))
+    with forward_ad.dual_level(), pytest.raises(NotImplementedError, match="reverse mode"):
+        scene.step(touching, params, state, tree.map(lambda c: c[0], controls))
 
 
 @pytest.mark.compile

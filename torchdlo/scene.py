@@ -206,6 +206,11 @@ class Scene:
             if isinstance(effect, BodyContact):
                 effect.check_pairs(self.bodies)
         if self.settings.coupled:
+            need(
+                not {"rod_contact", "self_contact"} <= set(names),
+                "effects have rod_contact and self_contact, which are not solved together; leave self_contact out, as "
+                "rod_contact keeps ropes apart from themselves, too",
+            )
             loops = [n for n, c in zip(self.topology.counts, self.topology.closed, strict=True) if c and n < 5]
             need(not loops, f"a closed rope has {loops[:1]} vertices; implicit and coupled steps need at least 5")
         twisted = self.twist != "quasistatic" or "twist" in names
@@ -453,6 +458,8 @@ def _check_given(scene: Scene, params: Params, state: State, control: Control) -
         said = f"{count} vertices and {'bodies' if bodies else 'no bodies'}"
         there = f"{scene.topology.size} and {'bodies' if scene.bodies else 'none'}"
         raise ValueError(f"state: it has {said}, the scene {there}; give a state that `make` or `step` made for it.")
+    if forward_ad._current_level >= 0 and any(e.is_contact for e in scene.effects):
+        raise NotImplementedError("step: contact has no forward-mode derivatives; differentiate in reverse mode.")
     rigid.check_targets(scene.bodies, control.bodies)
     check_grip(control.attachment_weight, scene.held)
     validation.check_control_batch((params, state), state.rods.pos.shape[:-2], control)

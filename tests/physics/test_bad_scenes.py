@@ -9,6 +9,7 @@ import pytest
 import torch
 from helpers import circle, effects, run, straight, vec
 
+from torchdlo.coupling import RodContact, SelfContact
 from torchdlo.physics import tree
 from torchdlo.physics.effects.external import Gravity
 from torchdlo.physics.rod.topology import Topology
@@ -262,6 +263,13 @@ def test_controls_and_states_of_other_scenes_are_refused_in_a_sentence():
     grip = {"vertices": torch.ones(3, 1, 1, dtype=torch.float64)}
     with pytest.raises(ValueError, match=re.escape("batches () and (3,), the state is of ()")):
         step(scene, params, state, tree.replace(control, attachment_weight=grip))
+
+
+def test_two_effects_that_keep_ropes_apart_are_not_solved_together():
+    both = [*effects("gravity"), RodContact(), SelfContact()]
+    make(rope(), both, dt=1e-3)
+    with pytest.raises(ValueError, match="leave self_contact out"):
+        make(rope(), both, dt=1e-3, contact="coupled")
 
 
 def test_targets_of_bodies_of_more_scenes_are_refused():

@@ -41,11 +41,12 @@ def mention(settings: Settings, bodies: bool, joined: bool, pos: Tensor) -> None
 
 def mention_sweeps(settings: Settings, bodies: bool) -> None:
     """Say that ropes that carry something among bodies are not best found by sweeps, if they are."""
-    if bodies and settings.integrator == "explicit" and not settings.coupled:
-        if any(e.engages for e in settings.effects):
+    names = {e.name for e in settings.effects}
+    if bodies and settings.integrator == "explicit" and settings.constrained and not settings.coupled:
+        if any(e.engages for e in settings.effects) and "rod_mpm_coupling" not in names:
             notices.once(
                 "sweeps",
                 "scene: a rope carries something among bodies; where it hangs over one, its tension rings in explicit "
-                "steps that find contact by sweeps, and friction is wrong. Give contact='coupled' (or "
-                "integrator='implicit').",
+                "steps that find contact by sweeps, and friction is wrong. Give contact='coupled' in double "
+                "precision (or integrator='implicit').",
             )

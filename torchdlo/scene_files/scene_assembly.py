@@ -134,7 +134,8 @@ def _contact(d: SceneDescription, effects: Sequence[Effect], counts: Sequence[in
     if d.contact != "auto":
         return d.contact
     small = any(r.closed and n < 5 for r, n in zip(d.ropes, counts, strict=True))
-    touched = bool(d.bodies or d.robots) and any(e.engages for e in effects)
+    names = {e.name for e in effects}
+    touched = "rod_body" in names and not {"rod_contact", "self_contact"} <= names
     exact = d.precision == "float64" and not d.material_points and not small
     return "coupled" if touched and exact and d.integrator == "explicit" and d.constrained else "sweeps"
 

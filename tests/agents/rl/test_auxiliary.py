@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from dataclasses import dataclass
 from typing import ClassVar
@@ -13,8 +14,10 @@ from torch import Tensor
 pytest.importorskip("torchrl")
 
 from torchdlo.agents.rl.episodes import TaskEpisodes
+from torchdlo.envs import find
 from torchdlo.envs.core import episode
 from torchdlo.envs.core.task import RADIUS, Arms, Task, TaskState, make, straight
+from torchdlo.errors import InputError
 from torchdlo.scene import Params, Rope, Scene, State
 
 F64 = torch.float64
@@ -90,6 +93,31 @@ def test_what_is_paid_is_the_share_of_what_it_has_fallen_by_since_the_start():
     first = sum(Lead().auxiliary_loss(made.env.world.seen(1)).values())
     fallen = (rewards - without)[:, -1].double()
     torch.testing.assert_close(fallen, 0.25 * 2 * (first - now), rtol=1e-4, atol=1e-5)
+
+
+def test_an_episode_that_fails_pays_the_worst_so_far_for_each_action_that_is_left(monkeypatch):
+    away = torch.zeros(2, 4, 6, dtype=F64)
+    away[..., 2] = -0.003
+    made, _ = led(0.25, away)
+    made.reset()
+    first = made.step(away[:, 0]).reward
+    assert first[1] == first[0] < 0
+    advance = made.env.advance
+
+    def failing(action: Tensor):
+        step = advance(action)
+        failed = torch.tensor([False, True])
+        return dataclasses.replace(step, world=dataclasses.replace(step.world, failed=failed))
+
+    monkeypatch.setattr(made.env, "advance", failing)
+    second = made.step(away[:, 1]).reward
+    assert float(second[1]) == pytest.approx(3 * float(first[1]), rel=1e-3)
+    assert first[0] > second[0] > second[1]
+
+
+def test_tasks_without_one_are_refused():
+    with pytest.raises(InputError, match="separation declares no auxiliary loss"):
+        TaskEpisodes(find("separation"), 1, execution="eager", auxiliary=0.25).reset()
 
 
 def test_episodes_that_failed_are_paid_nothing():

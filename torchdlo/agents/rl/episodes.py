@@ -145,7 +145,8 @@ class TaskEpisodes:
             barrier: what an action costs, after scaling, after which a rope is stretched as far as the task allows; it
                 grows from half of that on as the square. An episode that fails pays it for each action that is left.
             auxiliary: what share of what `Task.auxiliary_loss` has fallen by since the start is added to each reward,
-                before scaling. Counted from the start it does not make failing cheap, and values stay near 0.
+                before scaling. Counted from the start, values stay near 0. An episode that fails pays for each action
+                that is left as much as for the worst so far.
             randomize: see `torchdlo.envs.make`.
             disturbed: by how much friction and stiffness of ropes differ from scene to scene, as shares of their own;
                 drawn at every reset.
@@ -173,6 +174,7 @@ class TaskEpisodes:
         self.generator = self.env.generator
         self.ends, self.scale, self.bonus, self.barrier = ends, scale, bonus, barrier
         self.auxiliary, self._first_loss = auxiliary, torch.zeros(count, dtype=dtype, device=device)
+        self._least = torch.zeros_like(self._first_loss)
         if disturbed and randomize:
             raise InputError("randomize and disturbed: both draw friction anew; give one of them.")
         self.disturbed, self._usual = disturbed, self.env.episode.params
@@ -193,6 +195,7 @@ class TaskEpisodes:
             self.env.episode = replace(self.env.episode, params=self._usual)
         self.first = self.env.reset()["observation"].detach()
         self._first_loss = self._auxiliary_loss(self.env.world).detach()
+        self._least = torch.zeros_like(self._first_loss)
         return self.first
 
     def disturb(self, random: Tensor) -> None:
@@ -229,18 +232,22 @@ class TaskEpisodes:
             if self.ends:
                 reward = reward - self.ends * self.scale * episode.terminal_costs(self.task, world).float()
             reward = reward + self.bonus * success
+        # Failing must not cost less than what would have been left to pay.
+        left = (1 + self.horizon - self._over) * (world.failed & ~before)
         if self.auxiliary:
             fallen = torch.where(world.failed, 0.0, self._first_loss - self._auxiliary_loss(world))
+            self._least = torch.minimum(self._least, fallen.detach())
+            fallen = fallen + left * self._least
             reward = reward + self.auxiliary * self.scale * fallen.float()
         if self.barrier:
-            # Failing must not cost less than all that would have been left to pay.
-            left = (1 + self.horizon - self._over) * (world.failed & ~before)
             reward = reward - self.barrier * torch.where(world.failed, left, self._tension(world)).float()
         return Transition(episode.observe(env.episode, world), reward, world.failed, success)
 
     def _auxiliary_loss(self, world: EpisodeState) -> Tensor:
         """Return the sum of the task's terms, (N,)."""
         terms = self.task.auxiliary_loss(world.seen(self.task.arms.count)) if self.auxiliary else {}
+        if self.auxiliary and not terms:
+            raise InputError(f"auxiliary: {self.task.name} declares no auxiliary loss; leave it at 0.")
         return sum(terms.values(), torch.zeros_like(self._first_loss))
 
     def _tension(self, world: EpisodeState) -> Tensor:

@@ -133,7 +133,8 @@ class TrainingSettings:
         need(self.sigma > 0, "sigma", "a positive number")
         for name in ("ends", "barrier", "auxiliary", "saturation", "temperature"):
             value = getattr(self, name)
-            need(isinstance(value, int | float) and 0 <= value < math.inf, name, "a finite number, not below 0")
+            plain = isinstance(value, int | float) and not isinstance(value, bool)
+            need(plain and 0 <= value < math.inf, name, "a finite number, not below 0")
         need(self.temperature > 0, "temperature", "a positive number")
         for name in ("barrier", "auxiliary"):
             plain = self.algorithm != "hybrid" or not getattr(self, name)

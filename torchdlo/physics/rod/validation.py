@@ -152,7 +152,7 @@ def check_control_batch(known: object, own: Sequence[int], control: object) -> N
         own: batch of the ropes.
         control: where held parts, grips and bodies go, likewise.
     """
-    given = [tuple(x.shape[:-2]) for x in tree.leaves(control) if x.shape[-2]]
+    given = [tuple(x.shape[:-2]) for x in tree.leaves(control) if x.dim() < 2 or x.shape[-2]]
     if all(batch in ((), tuple(own)) for batch in given):
         return
     try:
