@@ -206,13 +206,7 @@ class Scene:
             if isinstance(effect, BodyContact):
                 effect.check_pairs(self.bodies)
         if self.settings.coupled:
-            need(
-                not {"rod_contact", "self_contact"} <= set(names),
-                "effects have rod_contact and self_contact, which are not solved together; leave self_contact out, as "
-                "rod_contact keeps ropes apart from themselves, too",
-            )
-            loops = [n for n, c in zip(self.topology.counts, self.topology.closed, strict=True) if c and n < 5]
-            need(not loops, f"a closed rope has {loops[:1]} vertices; implicit and coupled steps need at least 5")
+            validation.check_solved_together(names, self.topology)
         twisted = self.twist != "quasistatic" or "twist" in names
         need(twisted, "quasistatic twist needs the Twist effect; add it, or set twist='none'")
 

@@ -12,6 +12,7 @@ from torchdlo.physics import tree
 
 if TYPE_CHECKING:
     from torchdlo.physics.rod.assembly import Rope
+    from torchdlo.physics.rod.topology import Topology
 
 _ZERO_ALLOWED = ("youngs", "shear", "bend", "bend2", "twist")
 NUMBERS = ("radius", "mass", "density", "stretch", "rest_twist", *_ZERO_ALLOWED)
@@ -142,6 +143,23 @@ def _vectors(where: str, name: str, value: Tensor, positions: Tensor) -> None:
         )
     if not bool(torch.isfinite(value).all()):
         raise ValueError(f"{where}: {name} contains NaN or infinity; every component must be a number")
+
+
+def check_solved_together(names: Sequence[str], topology: Topology) -> None:
+    """Raise a `ValueError` if contact cannot be solved together with edge lengths.
+
+    Args:
+        names: of the effects.
+        topology: of the ropes.
+    """
+    if {"rod_contact", "self_contact"} <= set(names):
+        raise ValueError(
+            "scene: effects have rod_contact and self_contact, which are not solved together; leave self_contact out, "
+            "as rod_contact keeps ropes apart from themselves, too"
+        )
+    loops = [n for n, c in zip(topology.counts, topology.closed, strict=True) if c and n < 5]
+    if loops:
+        raise ValueError(f"scene: a closed rope has {loops[:1]} vertices; implicit and coupled steps need at least 5")
 
 
 def check_control_batch(known: object, own: Sequence[int], control: object) -> None:
