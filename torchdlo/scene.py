@@ -293,7 +293,7 @@ def make(
     numbers = parameters_of(effects, values or {}, state.pos)
     blank = {e.name: state.pos.new_zeros(*state.pos.shape[:-1], e.memory) for e in effects if e.memory}
     state = tree.replace(state, memory=tree.map(tree.batch_innermost, blank))
-    params = Params(rods, numbers, solid, stuff, sits)
+    params = Params(rods, numbers, solid, tree.to(stuff, state.pos.dtype), sits)  # kernels read one type
     if check:
         stability.check_laws(scene.settings, rods, numbers, state)
         check_step(scene, params)

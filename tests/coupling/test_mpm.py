@@ -8,6 +8,7 @@ import pytest
 import torch
 from material_points import DOUBLE, ONE, OPEN, ball, derivative, momenta, run, with_number
 
+from torchdlo import scene
 from torchdlo.coupling.mpm import p2g_g2p, transfer_op
 from torchdlo.coupling.mpm import substep as mpm
 from torchdlo.coupling.mpm.constitutive_models import Elastic, Liquid, Plastic, Sand
@@ -267,3 +268,19 @@ def test_gradients_of_the_start_are_central_differences(law):
     (found,) = torch.autograd.grad(value(x), x)
     expected = derivative(value, x.detach(), 1e-7)
     assert float((found - expected).abs() / expected.abs()) < 1e-4
+
+
+def test_matter_of_another_precision_than_the_rope_is_read_as_numbers_of_its_own():
+    found = []
+    for kind in (torch.float32, torch.float64):
+        places = fill_box((0.075, 0.075, 0.0), (0.125, 0.125, 0.04), 0.01, torch.zeros((), dtype=kind))
+        block = ParticleBlock(places, Plastic(), 1e-6, velocity=torch.tensor([0, 0, -1.0], dtype=kind))
+        matter = assemble([block], Grid((0.0,) * 3, (0.2,) * 3, 0.01), friction=0.3)
+        x = torch.tensor([[0.0, 0, 3], [0.01, 0, 3], [0.02, 0, 3]], dtype=torch.float64)
+        rope = scene.Rope(x, radius=1e-3, density=1000.0)
+        made, params, state = scene.make([rope], [], material_points=matter, dt=1e-3, prescribed_vertices=(0, 1, 2))
+        state = scene.step(made, params, state, scene.stationary_control(made, state))
+        found.append(state.material_points)
+    assert found[0].vel.norm() > 1
+    torch.testing.assert_close(found[0].vel, found[1].vel, rtol=1e-5, atol=1e-6)
+    torch.testing.assert_close(found[0].strain, found[1].strain, rtol=1e-4, atol=1e-6)
