@@ -452,8 +452,8 @@ def _check_given(scene: Scene, params: Params, state: State, control: Control) -
         said = f"{count} vertices and {'bodies' if bodies else 'no bodies'}"
         there = f"{scene.topology.size} and {'bodies' if scene.bodies else 'none'}"
         raise ValueError(f"state: it has {said}, the scene {there}; give a state that `make` or `step` made for it.")
-    if forward_ad._current_level >= 0 and any(e.is_contact for e in scene.effects):
-        raise NotImplementedError("step: contact has no forward-mode derivatives; differentiate in reverse mode.")
+    if forward_ad._current_level >= 0 and (scene.material_points or any(e.is_contact for e in scene.effects)):
+        raise NotImplementedError("step: contact and material points have no forward mode; use reverse mode.")
     rigid.check_targets(scene.bodies, control.bodies)
     check_grip(control.attachment_weight, scene.held)
     validation.check_control_batch((params, state), state.rods.pos.shape[:-2], control)
