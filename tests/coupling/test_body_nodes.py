@@ -24,8 +24,12 @@ def exchanged(names, effect, mu):
         return tree.replace(x, **leaves), list(leaves.values())
 
     nodes, moved = free(nodes, "mass", "vel", "share")
+    # Scenes, which are worked on side by side, differ: in one a node may stick where it slides in the other.
+    scene = torch.tensor([1.0, 1.6], dtype=DOUBLE).reshape(2, 1, 1)
+    rough = tree.replace(motion.params, mu_s=motion.params.mu_s * scene, mu_k=0.8 * motion.params.mu_s / scene)
     # Nodes that lie at the very end of a plane's reach would be at a kink.
-    motion = tree.replace(motion, state=tree.replace(motion.state, pos=motion.state.pos + 0.0013))
+    pos = motion.state.pos + 0.0013 * scene
+    motion = tree.replace(motion, params=rough, state=tree.replace(motion.state, pos=pos))
     state, placed = free(motion.state, "pos", "quat")
     params, sized = free(motion.params, "size", "mu_s", "mu_k")
     motion, pushed = free(motion, "change", "turn", "mobility", "inverse_inertia")

@@ -269,6 +269,7 @@ static void back(const T* vel, const T* mass, const T* answer, const T* origin, 
     for (int64_t k = 0; k < n.bodies; ++k)
       for (int i = 0; i < FIELDS; ++i)
         store<T>(dbodies[i] + k * n.scenes + b, ((const R*)&solids[k])[i].by(), n.scenes - b);
+    tape.rest();
   }
 }
 

@@ -27,6 +27,11 @@ struct Tape {
       if (n.b >= 0) by[n.b] += n.db * by[i];
     }
   }
+  // Gives memory back that few calls need, after the results are read; what most need is kept for the next.
+  void rest() {
+    if (nodes.capacity() * (sizeof(Node) + sizeof(Lanes<T>)) < (size_t(1) << 26)) return;
+    List<Node>().swap(nodes), List<Lanes<T>>().swap(by);
+  }
 };
 
 template <typename T>
