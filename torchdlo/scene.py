@@ -278,7 +278,8 @@ def make(
         state, placed = tree.map(lambda x: tree.batch_innermost(x.expand(*batch, *x.shape[-2:])), (state, placed))
     medium, stuff, particles = material_points or (None, (), ())
     if material_points:
-        state, placed, particles = rod_coupling_effect.expand_batches(state, placed, tree.part(particles))
+        whole = state, placed, tree.part(particles)
+        state, placed, particles = rod_coupling_effect.expand_batches(*whole, stuff, solid, values)
     effects = rod_coupling_effect.fitted(effects, medium, rods)
     solids = (kinds, tree.part(solid), tree.part(placed)) if bodies else None
     tied: Joints | None = None

@@ -7,14 +7,14 @@ from functools import partial
 
 import pytest
 import torch
-from material_points import DOUBLE, OPEN, momenta
+from material_points import DOUBLE, OPEN, ball, momenta
 from meetings import SHAPES, meeting
 
 from torchdlo import scene
 from torchdlo.coupling import BodyMpmCoupling
 from torchdlo.coupling.bodies.dynamics import RigidBody, conjugate
 from torchdlo.coupling.mpm import substep as mpm
-from torchdlo.coupling.mpm.constitutive_models import Elastic, Liquid
+from torchdlo.coupling.mpm.constitutive_models import Elastic, Liquid, Plastic
 from torchdlo.coupling.mpm.particles import Grid, ParticleBlock, assemble, fill_box
 from torchdlo.coupling.mpm.rod_coupling_effect import RodMpmCoupling
 from torchdlo.physics import tree
@@ -371,3 +371,30 @@ def test_the_effect_needs_bodies_and_matter():
 def test_choices_that_make_no_sense_are_refused(wrong):
     with pytest.raises(ValueError, match=f"BodyMatter: {next(iter(wrong))} is"):
         BodyMpmCoupling(**wrong)
+
+
+@pytest.mark.parametrize("what", ["youngs", "rope", "body"])
+def test_numbers_of_more_scenes_than_the_matter_make_as_many(what):
+    """One ball, three numbers of its law, of its friction with the rope, or of that with the ground."""
+
+    def moved(number):
+        given = {"youngs": 3e4, "rope": 0.3, "body": 0.3} | {what: number}
+        matter = ball(Plastic(), shake=0.3, youngs=given["youngs"])
+        line = torch.tensor([[0.05 + 0.025 * k, 0.1, 0.125] for k in range(5)], dtype=DOUBLE)
+        rope = scene.Rope(line, radius=3e-3, density=1e3)
+        ground = RigidBody("plane", motion="fixed", pos=(0.0, 0.0, 0.07), mu_s=given["body"], mu_k=given["body"])
+        made, params, state = scene.make(
+            [rope],
+            [RodMpmCoupling(), BodyMpmCoupling()],
+            {"rod_mpm_coupling": {"mu": given["rope"]}},
+            bodies=[ground],
+            material_points=matter,
+        )
+        last = go((made, params, state, scene.stationary_control(made, state)), 4)
+        return torch.cat([last.material_points.pos, last.rods.pos], -2)
+
+    numbers = torch.tensor([1e4, 5e4, 2e5] if what == "youngs" else [0.0, 0.9, 0.3], dtype=DOUBLE)
+    per_scene = {"youngs": (3,), "rope": (3, 1, 1), "body": (3, 1)}[what]
+    together, alone = moved(numbers.reshape(per_scene)), [moved(float(x)) for x in numbers]
+    torch.testing.assert_close(together, torch.stack(alone), rtol=0, atol=1e-14)
+    assert all(float((x - alone[0]).abs().max()) > 1e-7 for x in alone[1:])

@@ -152,10 +152,11 @@ def finish(
 
 
 def expand_batches(
-    rods: RodState, bodies: BodyState | tuple[()], particles: Particles
+    rods: RodState, bodies: BodyState | tuple[()], particles: Particles, *numbers: object
 ) -> tuple[RodState, BodyState | tuple[()], Particles]:
-    """Return all with the batch axes of all."""
-    batch = torch.broadcast_shapes(rods.pos.shape[:-2], particles.pos.shape[:-2])
+    """Return all with the batch axes of all, those of numbers (..., n, d) of laws and effects among them."""
+    all_of = (x for x in tree.leaves((rods.pos, particles.pos, numbers)) if isinstance(x, Tensor))
+    batch = torch.broadcast_shapes(*(x.shape[:-2] for x in all_of))
     wide = tree.map(lambda x: tree.batch_innermost(x.expand(*batch, *x.shape[-2:])), (rods, bodies))
     particles = tree.to(particles, rods.pos.dtype)
     return *wide, tree.map(lambda x: stored(x.expand(*batch, *x.shape[-2:])), particles)
