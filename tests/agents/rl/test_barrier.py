@@ -112,6 +112,13 @@ def test_what_cannot_be_paid_is_refused_in_a_sentence(wrong):
         training_preset("coiling", "shac", **wrong)
 
 
+@pytest.mark.parametrize("algorithm", ["ppo", "sac", "hybrid"])
+def test_what_only_gradients_of_returns_feel_is_refused_elsewhere(algorithm: str):
+    with pytest.raises(InputError, match=r"saturation is 0\.01; expected 0"):
+        training_preset("coiling", algorithm, saturation=0.01)
+    assert training_preset("coiling", "sapo", saturation=0.01).saturation == 0.01
+
+
 @pytest.mark.parametrize("name", ["barrier", "auxiliary"])
 def test_the_hybrid_refuses_what_its_stages_do_not_pay(name: str):
     with pytest.raises(InputError, match=name):

@@ -139,6 +139,8 @@ class TrainingSettings:
         for name in ("barrier", "auxiliary"):
             plain = self.algorithm != "hybrid" or not getattr(self, name)
             need(plain, name, "0, as stages of hybrid know none; ppo, sac, shac and sapo can have one")
+        graded = self.algorithm in ("shac", "sapo") or not self.saturation
+        need(graded, "saturation", f"0, as {self.algorithm} does not go down the gradient of returns; shac and sapo do")
 
 
 _ALGORITHM: dict[str, dict[str, Any]] = {
