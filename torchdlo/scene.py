@@ -151,8 +151,7 @@ class Scene:
     """What ropes are joined to, as `make` found it."""
     contact: Literal["sweeps", "coupled"] = "sweeps"
     """How explicit steps find contact of ropes: by "sweeps" before edge lengths, or "coupled" with them in one solve,
-    as implicit steps do. Take the second for taut ropes over bodies, and for friction of such; in single precision its
-    forces are rounding at substeps below 1 ms, which is reported."""
+    as in implicit ones. Take the second for taut ropes over bodies; the first keeps angular momentum exactly."""
 
     def __post_init__(self) -> None:
         def need(ok: bool, sentence: str) -> None:
@@ -264,7 +263,7 @@ def make(
             only evaluated may be anything.
         clamp: where neighbouring `prescribed_vertices` clamp a rope: in the middle of the last edge between them, or at
             the last vertex; for what stays held, as the hinge there is stiffer by the length that is left out.
-        choices: fields of `Scene`.
+        choices: fields of `Scene`. `contact` may also be "auto": "coupled" where ropes touch bodies, if it can be.
     """
     validation.check_sequence(effects, Effect, "effects")
     if clamp not in ("edge", "vertex"):
@@ -290,6 +289,7 @@ def make(
         held, twisting = choices.get("prescribed_vertices", ()), choices.get("twist", "none") != "none"
         tied, sits, pulls = joined.place_joints(joints, topology, rods, state, solids, held=held, twisting=twisting)
         effects = joined.apart(effects, tied, topology, rods, state, solids)
+    choices = validation.with_contact(choices, effects, topology, None if material_points else state.pos.dtype)
     scene = Scene(topology, effects, bodies=kinds, material_points=medium, joints=tied, **choices)
     numbers = parameters_of(effects, values or {}, state.pos)
     blank = {e.name: state.pos.new_zeros(*state.pos.shape[:-1], e.memory) for e in effects if e.memory}
@@ -299,15 +299,9 @@ def make(
         stability.check_laws(scene.settings, rods, numbers, state)
         check_step(scene, params)
         scene_notices.mention(scene.settings, bool(scene.bodies), scene.joints is not None, state.pos)
-        state = start_overlaps.part(
-            topology,
-            effects,
-            altered_params(scene.effects, topology, rods, numbers),
-            state,
-            solids,
-            scene.prescribed_vertices + (() if tied is None else tied.slots),
-            scene.constrained,
-        )
+        altered = altered_params(scene.effects, topology, rods, numbers)
+        placed_by = scene.prescribed_vertices + (() if tied is None else tied.slots)
+        state = start_overlaps.part(topology, effects, altered, state, solids, placed_by, scene.constrained)
     zero = state.pos.new_zeros(*state.pos.shape[:-2], 1, 3)
     first = State(
         state,

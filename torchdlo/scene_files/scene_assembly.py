@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,7 +19,6 @@ from torchdlo.coupling.mpm.constitutive_models import ConstitutiveModel, Elastic
 from torchdlo.coupling.robot import robot_kinematics as robots
 from torchdlo.errors import InputError
 from torchdlo.physics import tree
-from torchdlo.physics.effects.base import Effect
 from torchdlo.scene_files import limits, motion
 from torchdlo.scene_files.json_files import EFFECTS, like, read
 from torchdlo.scene_files.rope_models import Modelled, with_models
@@ -107,7 +105,7 @@ def assemble(description: SceneDescription, *, folder: str | Path = ".") -> Simu
         values[kind.name] = {k: v for k, v in given.items() if k in kind.params}
     meshes = {k: _mesh(b, k, folder) for k, b in enumerate(d.bodies) if b.shape == "mesh"}
     bodies = [_body(b, k, meshes.get(k)) for k, b in enumerate(d.bodies)]
-    static = {name: getattr(d, name) for name in _STEPPING} | {"contact": _contact(d, effects, counts)}
+    static = {name: getattr(d, name) for name in _STEPPING}
     held: dict[str, Any] = {f"prescribed_{part}": _slots(d, counts, part) for part in ("vertices", "edges")}
     _check_holds(d)
     armed = motion.arms(d, folder)
@@ -123,21 +121,6 @@ def assemble(description: SceneDescription, *, folder: str | Path = ".") -> Simu
     material = tree.replace(params.rods.material, mass=params.rods.material.mass + weight)
     params = tree.replace(params, rods=tree.replace(params.rods, material=material))
     return Simulation(scene, params, state, motion.plan(d, scene, state, armed), meshes, weight)
-
-
-def _contact(d: SceneDescription, effects: Sequence[Effect], counts: Sequence[int]) -> str:
-    """Return how explicit steps find contact.
-
-    Sweeps are wrong about friction of taut ropes, and fast where scenes are many; a file is of one. In single precision
-    small substeps do not resolve the forces of one solve, and material points need contact before their own.
-    """
-    if d.contact != "auto":
-        return d.contact
-    small = any(r.closed and n < 5 for r, n in zip(d.ropes, counts, strict=True))
-    names = {e.name for e in effects}
-    touched = "rod_body" in names and not {"rod_contact", "self_contact"} <= names
-    exact = d.precision == "float64" and not d.material_points and not small
-    return "coupled" if touched and exact and d.integrator == "explicit" and d.constrained else "sweeps"
 
 
 def _check_holds(d: SceneDescription) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, SupportsFloat
+from typing import TYPE_CHECKING, Any, SupportsFloat
 
 import torch
 from torch import Tensor
@@ -11,6 +11,7 @@ from torch import Tensor
 from torchdlo.physics import tree
 
 if TYPE_CHECKING:
+    from torchdlo.physics.effects.base import Effect
     from torchdlo.physics.rod.assembly import Rope
     from torchdlo.physics.rod.topology import Topology
 
@@ -160,6 +161,33 @@ def check_solved_together(names: Sequence[str], topology: Topology) -> None:
     loops = [n for n, c in zip(topology.counts, topology.closed, strict=True) if c and n < 5]
     if loops:
         raise ValueError(f"scene: a closed rope has {loops[:1]} vertices; implicit and coupled steps need at least 5")
+
+
+def with_contact(
+    choices: dict[str, Any], effects: Sequence[Effect], topology: Topology, dtype: torch.dtype | None
+) -> dict[str, Any]:
+    """Return choices of a scene with how explicit steps had best find contact, if that is "auto".
+
+    "coupled" where ropes touch bodies, as sweeps are wrong about friction of taut ropes; not in single precision, where
+    forces of one solve are rounding at substeps below 1 ms, nor where `check_solved_together` would refuse.
+
+    Args:
+        choices: fields of `Scene`.
+        effects: what acts.
+        topology: of the ropes.
+        dtype: of all numbers, or None if there are material points, which need contact before their own.
+    """
+    if choices.get("contact") != "auto":
+        return choices
+    names = [e.name for e in effects]
+    explicit = choices.get("integrator", "explicit") == "explicit" and choices.get("constrained", True)
+    touch = "rod_body" in names and explicit and dtype == torch.float64
+    if touch:
+        try:
+            check_solved_together(names, topology)
+        except ValueError:
+            touch = False
+    return choices | {"contact": "coupled" if touch else "sweeps"}
 
 
 def check_control_batch(known: object, own: Sequence[int], control: object) -> None:
