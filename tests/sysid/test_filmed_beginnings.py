@@ -19,6 +19,7 @@ from torchdlo.sysid.video.filmed_fit import film_gaps, fit
 from torchdlo.sysid.video.filmed_model import Films
 from torchdlo.sysid.video.filmed_problem import FilmedProblem, add_correction, filmed_problem, start_of
 from torchdlo.sysid.video.films import with_stations
+from torchdlo.sysid.video.fit_pool import FitPool
 from torchdlo.vision.camera import lens, looking_at, project
 
 SAMPLE = Path(__file__).parents[2] / "torchdlo" / "data" / "sample_rope"
@@ -107,6 +108,6 @@ def test_beginnings_lead_to_a_mass_that_is_missing() -> None:
     base = nearer(films, best, lambda *_: None)
     assert base.own.lasts < whole.lasts
     names = ["point_mass", "nonuniform_stiffness", "rest_curvature", "air_drag", "gripper_compliance"]
-    leads = [s.name for s in _scores(base, names, base.own.lasts, lambda *_: None)]
+    leads = [s.name for s in _scores(base, names, base.own.lasts, lambda *_: None, FitPool(1))]
     # Those that lead are fitted next. A soft spot does nearly as well; which of them is first differs by machine.
     assert "point_mass" in leads[:2]

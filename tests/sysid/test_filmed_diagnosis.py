@@ -29,9 +29,10 @@ def test_a_diagnosis_of_films_says_what_it_found(tmp_path: Path, monkeypatch: py
     recording = load_recording(tmp_path / "rope")
     monkeypatch.setattr(filmed_diagnosis, "FILMED_STARTS", 4)
     monkeypatch.setattr(filmed_diagnosis, "SILENT", 0.0)
-    monkeypatch.setattr(filmed_diagnosis, "chained", lambda model: model)
+    monkeypatch.setattr(filmed_diagnosis, "chained", lambda model, pool: model)
     monkeypatch.setitem(BUDGETS, "fast", Budget(4, 1, 1, 1, 1))
-    found = diagnose(recording, without=[n for n in library() if n not in ("air_drag", "point_mass")])
+    others = [n for n in library() if n not in ("air_drag", "point_mass")]
+    found = diagnose(recording, without=others, workers=2)
     (candidates,) = found.candidates
     assert {c.name for c in candidates} == {"air_drag", "point_mass"} and all(c.reason for c in candidates)
     assert np.isfinite(found.before).all() and found.verdict in ("none", "effects", "partial", "unknown")

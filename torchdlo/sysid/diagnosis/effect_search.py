@@ -109,6 +109,7 @@ def diagnose(
             "vertices": vertices,
             "given": given,
             "without": without,
+            "workers": workers,
         }
         most = plan.pick_trials(recording, trials or BUDGETS[budget].trials)
         return diagnose_filmed(most, **asked, callback=callback)

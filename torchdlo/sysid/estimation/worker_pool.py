@@ -285,17 +285,22 @@ _models: Models | None = None
 """Those of a worker process."""
 
 
-def _begin(recording: Recording, options: dict[str, Any]) -> None:
+def begin_worker() -> None:
+    """Make this process a worker: of one thread, deaf to Ctrl-C, and no longer there than the one that began it."""
     import signal
     import threading
 
     import torch
 
-    global _models
     torch.set_num_threads(1)
     # Ctrl-C is the parent's to handle; and when the parent is gone, nobody wants the rest.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _begin(recording: Recording, options: dict[str, Any]) -> None:
+    global _models
+    begin_worker()
     _models = Models(recording, options)
 
 

@@ -18,6 +18,7 @@ from torchdlo.sysid.video.filmed import require_simulated, sharper
 from torchdlo.sysid.video.filmed_fit import Fit, film_gaps, fit
 from torchdlo.sysid.video.filmed_model import FilmedModel, Films, extended
 from torchdlo.sysid.video.filmed_problem import FilmedProblem, add_correction, correct
+from torchdlo.sysid.video.fit_pool import FitPool
 
 __all__ = ["NEAR", "alike", "chain_note", "chained", "further", "left_out", "nearer"]
 
@@ -61,7 +62,7 @@ def nearer(films: Films, best: Fit, report: Callback) -> FilmedModel:
 
 
 def further(
-    films: Films, first: FilmedModel, found: FilmedModel, chains: bool, report: Callback
+    films: Films, first: FilmedModel, found: FilmedModel, chains: bool, report: Callback, pool: FitPool
 ) -> tuple[FilmedModel, FilmedModel]:
     """Return the baseline and the model that took up an effect, over as much of the films as that stays near to.
 
@@ -71,14 +72,14 @@ def further(
     whole, begun_with = films.whole, found.own.lasts
     chain = not chains or CHAIN in found.own.model.effects
     if not chain:
-        found = chained(found)
+        found = chained(found, pool)
         chain = CHAIN in found.own.model.effects
     while found.own.lasts < whole.lasts:
         own = found.own.over(whole, min(_LONGER * found.own.lasts, whole.lasts))
         best = fit(own, found.fit.raw, _FOLLOW)
         report("fitting longer", 1, 1, f"{own.lasts:.2f} s: {1e3 * gap_rms(film_gaps(own, best)):.2f} mm")
         if not chain:
-            other = chained(FilmedModel(own, best, own))  # only its train trials matter here
+            other = chained(FilmedModel(own, best, own), pool)  # only its train trials matter here
             chain = CHAIN in other.own.model.effects
             own, best = other.own, other.fit
         if not film_gaps(own, best).max() < NEAR:
@@ -133,18 +134,20 @@ def left_out(final: FilmedModel, whole: FilmedProblem) -> list[str]:
     return [f"{begun}: over longer times no model stayed within {1e3 * NEAR:.0f} mm of the films."]
 
 
-def chained(plain: FilmedModel) -> FilmedModel:
+def chained(plain: FilmedModel, pool: FitPool) -> FilmedModel:
     """Return the model as a chain of links, if films fit to that much better."""
     link = float(np.diff(plain.own.model.arclength).min())
-    sides = []
-    for length in (link, -link):
-        chain = linked(plain, length)
-        sides.append(replace(chain, fit=fit(chain.own, chain.fit.raw, 2)))
+    sides = pool.all(_as_chain, [(plain, length) for length in (link, -link)])
     best = min(sides, key=lambda s: s.fit.cost)
     if not best.fit.cost < plain.fit.cost:
         return plain
     best = replace(best, fit=fit(best.own, best.fit.raw, 6))
     return best if best.fit.cost < _BETTER * plain.fit.cost else plain
+
+
+def _as_chain(plain: FilmedModel, length: float) -> FilmedModel:
+    chain = linked(plain, length)
+    return replace(chain, fit=fit(chain.own, chain.fit.raw, 2))
 
 
 def linked(plain: FilmedModel, length: float) -> FilmedModel:

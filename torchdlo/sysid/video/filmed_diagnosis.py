@@ -7,7 +7,7 @@ starts in motion take up what they can before an effect may explain it.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -16,6 +16,7 @@ from torchdlo.physics.effects.parameter_name import ParameterName
 from torchdlo.sysid.diagnosis import effect_library, score_test
 from torchdlo.sysid.diagnosis.budget import BUDGETS, Budget
 from torchdlo.sysid.diagnosis.detection_limit import limit_gap
+from torchdlo.sysid.diagnosis.effect_library import Perturbation
 from torchdlo.sysid.diagnosis.error_floor import ErrorFloor, gap_rms
 from torchdlo.sysid.diagnosis.score_test import Score
 from torchdlo.sysid.diagnosis.verdict import UNKNOWN_FLOOR, Candidate, Diagnosis, verdict_word
@@ -28,6 +29,7 @@ from torchdlo.sysid.video.filmed_beginnings import NEAR, chain_note, chained, fu
 from torchdlo.sysid.video.filmed_fit import Fit, film_gaps, fit, look, spread, total
 from torchdlo.sysid.video.filmed_model import FilmedModel, Films, extended
 from torchdlo.sysid.video.filmed_problem import FilmedProblem
+from torchdlo.sysid.video.fit_pool import FitPool
 from torchdlo.sysid.video.footage import views_of
 from torchdlo.sysid.video.overlay import overlays
 from torchdlo.sysid.video.second_view import SecondView, effect_notes, second_view, second_view_json, visible
@@ -88,10 +90,26 @@ def diagnose_filmed(
     vertices: int | None = None,
     given: ModelFile | None = None,
     without: Sequence[str] = (),
+    workers: int | None = None,
     callback: Callback | None = None,
 ) -> Diagnosis:
-    """Name what the films of a recording show that the baseline model lacks; see `diagnosis.search.diagnose`."""
-    begun, report = time.perf_counter(), callback or (lambda *_: None)
+    """Name what the films of a recording show that the baseline model lacks; see `effect_search.diagnose`."""
+    asked = budget, seed, vertices, given, without
+    with FitPool(workers) as pool:
+        return _diagnosed(recording, *asked, pool, callback or (lambda *_: None))
+
+
+def _diagnosed(
+    recording: Recording,
+    budget: str,
+    seed: int,
+    vertices: int | None,
+    given: ModelFile | None,
+    without: Sequence[str],
+    pool: FitPool,
+    report: Callback,
+) -> Diagnosis:
+    begun = time.perf_counter()
     views, notes = views_of(recording, recording.train, report)
     near = np.inf if recording.still else NEAR
     own, _, best = baseline(recording, views, FILMED_STARTS, 15, seed, vertices, given, report, near)
@@ -99,7 +117,7 @@ def diagnose_filmed(
     films = Films(own, recording.test, unseen)
     base = nearer(films, best, report) if film_gaps(own, best).max() > near else films.test(own, best)
     if given is None and not recording.still:
-        base = chained(base)
+        base = chained(base, pool)
         report("calibrating the baseline", 1, 1, f"{1e3 * gap_rms(base.gaps('train')):.2f} mm")
     floor, level = _floor(base)
     plan, first = BUDGETS[budget], base
@@ -120,7 +138,7 @@ def diagnose_filmed(
         if single := recording.still and len(recording.train) == 1:
             names = [n for n in names if n in _AT_REST]
         found, candidates, rivals = _round(
-            base, first, names, floor, level, plan, own.lasts, f"round {len(rounds) + 1}", report
+            base, first, names, floor, level, plan, own.lasts, f"round {len(rounds) + 1}", report, pool
         )
         rounds.append(candidates)
         if found is None:
@@ -131,7 +149,7 @@ def diagnose_filmed(
         ties[name] = [*rivals, *(_SAME_AT_REST if single and "curvature" in name else ())]
         base = found
         if not recording.still:
-            first, base = further(films, first, base, given is None, report)
+            first, base = further(films, first, base, given is None, report, pool)
             floor, level = _floor(base)
     notes = [*notes, *said, *left_out(base, own), *chain_note(base)]
     view = _elsewhere(base, floor, level, without, report)
@@ -193,27 +211,31 @@ def _round(
     whole: float,
     stage: str,
     report: Callback,
+    pool: FitPool,
 ) -> tuple[FilmedModel | None, list[Candidate], list[str]]:
     """Return the model with the best effect added, if one pays, all candidates, and effects that fit as well."""
     short = base.own.lasts if base.own.lasts < whole else _SHORT * whole
-    scores = _scores(base, names, short, lambda k, n: report(f"{stage}: screening", k, n, ""))
+    scores = _scores(base, names, short, lambda k, n: report(f"{stage}: screening", k, n, ""), pool)
     tried = scores[: plan.candidates]
     if not tried:
         return None, [], []
     lead = tried[0].name
     tried += [s for s in scores[plan.candidates :] if effect_library.confusable(s.name, lead)]
     fits: dict[str, FilmedModel] = {}
-    for k, score in enumerate(tried):
-        fits[score.name] = _fitted(base, score, plan.iterations, short)
-        report(f"{stage}: fitting", k + 1, len(tried), f"{score.name} {1e3 * fits[score.name].fit.cost:.3f} mm")
+    for k, found in pool.map(_fitted, [(base, score, plan.iterations, short) for score in tried]):
+        fits[tried[k].name] = found
+        report(f"{stage}: fitting", len(fits), len(tried), f"{tried[k].name} {1e3 * found.fit.cost:.3f} mm")
     order = sorted(fits, key=lambda n: fits[n].fit.cost)
     leading = [n for n in order[:_LEADERS] if not fits[n].fit.cost > _BEHIND * fits[order[0]].fit.cost]
-    for name in leading:
-        one = fits[name]
-        more = plan.more * (_PATIENCE if base.own.trials[0].still else 1)
-        fits[name] = replace(one, fit=fit(one.own, one.fit.raw, more))
-        report(f"{stage}: fitting on", 1, 1, f"{name} {1e3 * fits[name].fit.cost:.3f} mm")
-    rival = replace(base, fit=fit(base.own, base.fit.raw, 3))
+    more = plan.more * (_PATIENCE if base.own.trials[0].still else 1)
+    on = [*((fits[name], more) for name in leading), (base, 3)]
+    rival = base
+    for k, found in pool.map(_fitted_on, on):
+        if k == len(leading):
+            rival = found
+            continue
+        fits[leading[k]] = found
+        report(f"{stage}: fitting on", 1, 1, f"{leading[k]} {1e3 * found.fit.cost:.3f} mm")
     led = sorted(leading, key=lambda n: fits[n].fit.cost)
     refused = {name: _refused(rival, fits[name], first, floor, level) for name in led}
     fair = [name for name in led if refused[name] is None]
@@ -290,6 +312,13 @@ def _fitted(base: FilmedModel, score: Score, iterations: int, seconds: float) ->
     return replace(best, fit=fit(best.own, best.fit.raw, iterations, seconds=seconds))
 
 
+def _fitted_on(model: FilmedModel, iterations: int) -> FilmedModel:
+    """Return a model with a better fit; the given one and its starts stay what they are."""
+    own = replace(model.own)
+    found = fit(own, model.fit.raw, iterations)
+    return replace(model, own=own, fit=found, test=own if model.test is model.own else model.test)
+
+
 def _dosed(base: FilmedModel, score: Score, dose: dict[str, float], raw: np.ndarray) -> FilmedModel:
     """Return a model with one effect more, that begins with a dose of it, not yet fitted."""
     vectors = {ParameterName.parse(name).whole for name in dose}
@@ -319,7 +348,9 @@ def _tangents(own: FilmedProblem, here: Fit, seen: np.ndarray, weight: np.ndarra
     return np.concatenate([jacobian, priors])
 
 
-def _scores(base: FilmedModel, names: Sequence[str], seconds: float, report: Callable[[int, int], None]) -> list[Score]:
+def _scores(
+    base: FilmedModel, names: Sequence[str], seconds: float, report: Callable[[int, int], None], pool: FitPool
+) -> list[Score]:
     """Return the scores of effects, best first: what their doses explain beyond what all other numbers can.
 
     Args:
@@ -327,6 +358,7 @@ def _scores(base: FilmedModel, names: Sequence[str], seconds: float, report: Cal
         names: effects to try.
         seconds: over which films are compared.
         report: told how many groups are done, and in all.
+        pool: who simulates them.
     """
     own, values = base.own, base.values
     here = look(own, base.fit.raw, own.offset, seconds)
@@ -345,24 +377,10 @@ def _scores(base: FilmedModel, names: Sequence[str], seconds: float, report: Cal
     left = left - q @ (q.T @ left)
     scores = []
     report(0, len(groups))
-    for done, group in enumerate(groups):
-        more = own.with_effects((*own.model.effects, *group), {}, [])
-        more.fixed[:] = [known.get(n, f) for n, f in zip(more.model.parameters, more.fixed, strict=True)]
-        rows = [more.fixed.copy()]
-        owner = []
-        for name in group:
-            for probe in doses[name]:
-                rows.append(more.fixed.copy())
-                owner.append(name)
-                for key, value in probe.values.items():
-                    rows[-1][more.model.parameters.index(key)] = value
-        every = replace(more, free=tuple(range(len(more.fixed))))
-        cameras = np.repeat(values[None, len(own.free) :], len(rows), 0)
-        offsets = np.repeat(own.offset[None], len(rows), 0)
-        given = np.concatenate([np.stack(rows), cameras], 1)
-        moved = every.simulate(given, own.frames(seconds), offsets)
-        read = own.spines.changes(moved, cameras)[..., 0]
-        for name in group:
+    probed = [(own, values, {n: doses[n] for n in group}, seconds) for group in groups]
+    for done, (g, read) in enumerate(pool.map(_dose_readings, probed)):
+        owner = [name for name in groups[g] for _ in doses[name]]
+        for name in groups[g]:
             picked = [k + 1 for k, o in enumerate(owner) if o == name]
             change = np.stack(
                 [np.concatenate([np.nan_to_num((read[k] - read[0]) * weight)[seen], pad]) for k in picked], 1
@@ -378,7 +396,27 @@ def _scores(base: FilmedModel, names: Sequence[str], seconds: float, report: Cal
             best, sizes = mixtures[0], score_test._sizes(name, doses[name])
             scores.append(Score(name, best.share, starts[0][0], tuple(starts), sizes, best.direction))
         report(done + 1, len(groups))
-    return sorted(scores, key=lambda s: -s.share)
+    return sorted(scores, key=lambda s: (-s.share, s.name))
+
+
+def _dose_readings(
+    own: FilmedProblem, values: np.ndarray, doses: Mapping[str, Sequence[Perturbation]], seconds: float
+) -> np.ndarray:
+    """Return readings at the numbers (N,) of a problem and with each dose of some effects, (1 + doses, B, F, R)."""
+    known = dict(zip(own.model.parameters, own.full(values[None])[0], strict=True))
+    more = own.with_effects((*own.model.effects, *doses), {}, [])
+    more.fixed[:] = [known.get(n, f) for n, f in zip(more.model.parameters, more.fixed, strict=True)]
+    rows = [more.fixed.copy()]
+    for probes in doses.values():
+        for probe in probes:
+            rows.append(more.fixed.copy())
+            for key, value in probe.values.items():
+                rows[-1][more.model.parameters.index(key)] = value
+    every = replace(more, free=tuple(range(len(more.fixed))))
+    cameras = np.repeat(values[None, len(own.free) :], len(rows), 0)
+    offsets = np.repeat(own.offset[None], len(rows), 0)
+    moved = every.simulate(np.concatenate([np.stack(rows), cameras], 1), own.frames(seconds), offsets)
+    return own.spines.changes(moved, cameras)[..., 0]
 
 
 def _concluded(
