@@ -86,6 +86,9 @@ def further(
             break
         found = replace(found, own=own, fit=best)
     if found.own.lasts == begun_with:
+        # What a fit that has not come to its end leaves over looks like another effect.
+        found = films.test(found.own, fit(found.own, found.fit.raw, _FOLLOW))
+        report("fitting to its end", 1, 1, f"{1e3 * gap_rms(found.gaps('train')):.2f} mm")
         return alike(first, found), found
     add_correction(found.own, found.values)
     found = films.test(found.own, fit(found.own, found.fit.raw, _FOLLOW))
