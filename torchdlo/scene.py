@@ -289,16 +289,17 @@ def make(
         held, twisting = choices.get("prescribed_vertices", ()), choices.get("twist", "none") != "none"
         tied, sits, pulls = joined.place_joints(joints, topology, rods, state, solids, held=held, twisting=twisting)
         effects = joined.apart(effects, tied, topology, rods, state, solids)
-    choices = validation.with_contact(choices, effects, topology, None if material_points else state.pos.dtype)
-    scene = Scene(topology, effects, bodies=kinds, material_points=medium, joints=tied, **choices)
     numbers = parameters_of(effects, values or {}, state.pos)
+    bounces, dtype = scene_notices.rebounds(solid, numbers), None if material_points else state.pos.dtype
+    choices = validation.with_contact(choices, effects, topology, dtype, bounces)
+    scene = Scene(topology, effects, bodies=kinds, material_points=medium, joints=tied, **choices)
     blank = {e.name: state.pos.new_zeros(*state.pos.shape[:-1], e.memory) for e in effects if e.memory}
     state = tree.replace(state, memory=tree.map(tree.batch_innermost, blank))
     params = Params(rods, numbers, solid, tree.to(stuff, state.pos.dtype), sits)  # kernels read one type
     if check:
         stability.check_laws(scene.settings, rods, numbers, state)
         check_step(scene, params)
-        scene_notices.mention(scene.settings, bool(scene.bodies), scene.joints is not None, state.pos)
+        scene_notices.mention(scene.settings, bool(scene.bodies), scene.joints is not None, bounces, state.pos)
         altered = altered_params(scene.effects, topology, rods, numbers)
         placed_by = scene.prescribed_vertices + (() if tied is None else tied.slots)
         state = start_overlaps.part(topology, effects, altered, state, solids, placed_by, scene.constrained)

@@ -137,6 +137,36 @@ def test_sweeps_under_a_rope_that_carries_something_are_mentioned(monkeypatch):
     assert "sweeps" in said
 
 
+def falling(restitution: float = 0.8, **choices):
+    x = torch.zeros(6, 3, dtype=F64)
+    x[:, 0], x[:, 2] = torch.linspace(0, 0.1, 6, dtype=F64), 0.015
+    plane = RigidBody("plane", motion="fixed", restitution=restitution, mu_s=0.0, mu_k=0.0)
+    rope = Rope(x, radius=0.005, mass=0.02)
+    made, params, state = make([rope], [*effects("gravity"), RodBody()], bodies=[plane], dt=1e-3, **choices)
+    control, highest = scene.stationary_control(made, state), 0.0
+    with torch.no_grad():
+        for k in range(90):
+            state = scene.step(made, params, state, control)
+            highest = max(highest, float(state.rods.pos[:, 2].mean()) - 0.005) if k > 50 else 0.0
+    return made, highest
+
+
+def test_what_rebounds_is_found_by_sweeps_where_nothing_else_is_asked_for(caplog, monkeypatch):
+    monkeypatch.setattr(notices, "_said", set())
+    made, highest = falling(contact="auto")
+    assert made.contact == "sweeps" and not caplog.text
+    assert highest == pytest.approx(0.8**2 * 0.01, rel=0.02)
+    assert falling(0.0, contact="auto")[0].contact == "coupled" and not caplog.text
+
+
+def test_rebounds_that_short_steps_lose_are_mentioned(caplog, monkeypatch):
+    monkeypatch.setattr(notices, "_said", set())
+    _, highest = falling(contact="coupled")
+    assert highest < 0.5 * 0.8**2 * 0.01 and caplog.text.count("rebound with less than their restitution") == 1
+    _, highest = falling(integrator="implicit", substeps=1)
+    assert highest == pytest.approx(0.8**2 * 0.01, rel=0.1) and caplog.text.count("restitution") == 1
+
+
 def test_unknown_ways_of_contact_are_refused():
     with pytest.raises(ValueError, match="contact is 'gauss'"):
         make([Rope(torch.eye(3, dtype=F64), mass=0.01)], effects("gravity"), contact="gauss")

@@ -6,21 +6,45 @@ import torch
 from torch import Tensor
 
 from torchdlo import notices
+from torchdlo.coupling.bodies.dynamics import BodyParams
+from torchdlo.physics.effects.base import Values
 from torchdlo.physics.integrators.rod_step import Settings
 
+RESOLVED = 1e-3
+"""Substep from which on contact that is solved together with lengths keeps restitution [s]."""
 
-def mention(settings: Settings, bodies: bool, joined: bool, pos: Tensor) -> None:
+
+def rebounds(bodies: BodyParams | tuple[()], numbers: dict[str, Values]) -> bool:
+    """Return whether something rebounds: a body, or ropes from each other.
+
+    Args:
+        bodies: numbers of the bodies, () if there are none.
+        numbers: those of effects, by effect and name.
+    """
+    among = numbers.get("rod_contact", {}).get("restitution")
+    return any(x is not None and bool((x > 0).any()) for x in (bodies.restitution if bodies else None, among))
+
+
+def mention(settings: Settings, bodies: bool, joined: bool, bounces: bool, pos: Tensor) -> None:
     """Say what goes through each other because no effect keeps it apart, and whose contact is found badly.
 
     Args:
         settings: ropes, effects and steps of the scene.
         bodies: whether it has bodies.
         joined: whether ropes are joined to them, or to each other.
+        bounces: whether there is restitution.
         pos: vertices at the start (..., n, 3) [m]; the first scene is looked at.
     """
     names, topology = {e.name for e in settings.effects}, settings.topology
     if joined:
         mention_sweeps(settings, bodies)
+    if bounces and settings.coupled and settings.dt < RESOLVED:
+        notices.once(
+            "restitution",
+            "scene: contact that is solved together with edge lengths brakes what comes near, within some substeps if "
+            f"these are as short as {1e3 * settings.dt:.2g} ms: ropes rebound with less than their restitution. Give "
+            "contact='sweeps', or substeps of 1 ms or more.",
+        )
     if bodies and not names & {"rod_body", "finger_pads"}:
         notices.once("rod_body", "scene: ropes go through its bodies; add RodBody if they are to touch.")
     if "rod_contact" in names or len(topology.counts) < 2:

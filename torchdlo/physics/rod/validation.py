@@ -164,24 +164,26 @@ def check_solved_together(names: Sequence[str], topology: Topology) -> None:
 
 
 def with_contact(
-    choices: dict[str, Any], effects: Sequence[Effect], topology: Topology, dtype: torch.dtype | None
+    choices: dict[str, Any], effects: Sequence[Effect], topology: Topology, dtype: torch.dtype | None, bounces: bool
 ) -> dict[str, Any]:
     """Return choices of a scene with how explicit steps had best find contact, if that is "auto".
 
     "coupled" where ropes touch bodies, as sweeps are wrong about friction of taut ropes; not in single precision, where
-    forces of one solve are rounding at substeps below 1 ms, nor where `check_solved_together` would refuse.
+    forces of one solve are rounding at substeps below 1 ms, nor where things rebound, as such contact brakes them
+    before, nor where `check_solved_together` would refuse.
 
     Args:
         choices: fields of `Scene`.
         effects: what acts.
         topology: of the ropes.
         dtype: of all numbers, or None if there are material points, which need contact before their own.
+        bounces: whether there is restitution.
     """
     if choices.get("contact") != "auto":
         return choices
     names = [e.name for e in effects]
     explicit = choices.get("integrator", "explicit") == "explicit" and choices.get("constrained", True)
-    touch = "rod_body" in names and explicit and dtype == torch.float64
+    touch = "rod_body" in names and explicit and dtype == torch.float64 and not bounces
     if touch:
         try:
             check_solved_together(names, topology)
