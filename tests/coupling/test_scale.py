@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 import torch
 
 from torchdlo import scene
-from torchdlo.coupling import RodContact
+from torchdlo.coupling import RodBody, RodContact
+from torchdlo.coupling.rod_body import body_touch_op
 from torchdlo.physics.effects import EFFECTS
-from torchdlo.scene import Rope, make
+from torchdlo.scene import RigidBody, Rope, make
 
 F64 = torch.float64
 
@@ -54,3 +57,36 @@ def test_a_suture_has_room_for_its_pairs_of_edges():
         for _ in range(10):
             state = scene.step(made, params, state, control)
     scene.check_state(state)
+
+
+def slid(scale: float, kernel: bool, monkeypatch) -> tuple[float, float]:
+    """Places down a slope, over the scale, of a rope that begins at rest, and its speed over the scale's root."""
+    slope = 0.6
+    down = torch.tensor([math.cos(slope), 0.0, -math.sin(slope)], dtype=F64)
+    up = torch.tensor([math.sin(slope), 0.0, math.cos(slope)], dtype=F64)
+    x = torch.linspace(-0.05, 0.05, 6, dtype=F64)[:, None] * (0.8 * down + 0.6 * down.new_tensor([0, 1.0, 0]))
+    rope = Rope(scale * (x + 0.005 * up), radius=0.005 * scale, mass=0.01 * scale**3, bend=1e-3 * scale**5)
+    turned = (math.cos(slope / 2), 0.0, math.sin(slope / 2), 0.0)
+    plane = RigidBody("plane", quat=turned, motion="fixed", mu_s=0.5, mu_k=0.2)
+    made, params, state = make(
+        [rope],
+        [EFFECTS["bend"](), EFFECTS["gravity"](), RodBody()],
+        bodies=[plane],
+        integrator="implicit",
+        dt=2e-3 * scale**0.5,
+        substeps=1,
+    )
+    control = scene.stationary_control(made, state)
+    if not kernel:
+        monkeypatch.setattr(body_touch_op, "ready", lambda *_: False)
+    with torch.no_grad():
+        for _ in range(40):
+            state = scene.step(made, params, state, control)
+    return float(state.rods.pos.mean(-2) @ down) / scale, float(state.rods.vel.mean(-2) @ down) / scale**0.5
+
+
+@pytest.mark.parametrize("kernel", [True, False], ids=["kernel", "tensors"])
+def test_ropes_begin_to_slide_alike_at_any_scale(kernel, monkeypatch):
+    # Where friction turns from static to sliding goes with the speed of what falls by its own size.
+    (place, speed), small = (slid(scale, kernel, monkeypatch) for scale in (1.0, 1e-3))
+    assert speed > 0.1 and small == (pytest.approx(place, rel=1e-6), pytest.approx(speed, rel=1e-6))

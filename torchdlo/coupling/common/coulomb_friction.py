@@ -10,6 +10,15 @@ from torchdlo.physics.linalg.numerics import safe_norm
 FASTEST = 0.1
 """Speed at which implicit steps undo overlaps at most [m/s]: what parts in a step keeps that speed."""
 
+THICK = 5e-3
+"""Radius at which speeds are compared with those that are given [m]: what falls by its own size is as fast as the root
+of that."""
+
+
+def compared(speed: float, radius: Tensor) -> Tensor:
+    """Return a speed [m/s] for ropes of some radius [m], so that scenes of any size do alike things."""
+    return speed * (radius.detach() / THICK).sqrt()
+
 
 def separation_needed(gap: Tensor, shallow: Tensor, recovery: float) -> Tensor:
     """Return by how much surfaces have to part at least in a substep, negative if they may come closer [m].
@@ -38,7 +47,7 @@ def overlap_recovery(wanted: Tensor, dt: float) -> Tensor:
 
 
 def rebound_separation(
-    wanted: Tensor, pressed: Tensor, approach: Tensor, restitution: Tensor, slowest: float, dt: float
+    wanted: Tensor, pressed: Tensor, approach: Tensor, restitution: Tensor, slowest: float | Tensor, dt: float
 ) -> Tensor:
     """Return `wanted` [m], or how far surfaces part if they rebound from their approach [m/s] within `dt` [s].
 

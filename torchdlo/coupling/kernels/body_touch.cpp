@@ -12,7 +12,7 @@ struct Sizes {
   int64_t vertices, scenes, bodies, families, corners, friction;
   const int64_t *shape, *pieces, *after, *cells;
   const void* grids;
-  double recovery, slowest, fastest, dt;
+  double recovery, slowest, fastest, thick, dt;
   template <typename T>
   Grid<T> grid(int64_t body) const {
     return {(const T*)grids + body * corners, cells + 3 * body};
@@ -87,6 +87,7 @@ static Result<T, N> result(const Around<T, N>& x, const Line<T, N>& line, const 
   const S simple = select(over.x < T(0), over, S(T(n.recovery)) * over + deep), asked = positive(simple);
   to.wanted = select(simple.x > T(0), asked * most / (asked + most), simple);
 
+  const Lanes<T> slowest = root<T>(x.radius.x * T(n.slowest * n.slowest / n.thick));
   const Three<T, 0> normal = plain(to.normal), place = plain(to.arm), tangent = plain(x.tangent);
   const Num<T, 0> share(to.share.x);
   if (any(x.restitution.x > T(0))) {
@@ -95,7 +96,7 @@ static Result<T, N> result(const Around<T, N>& x, const Line<T, N>& line, const 
     const auto pressed = (real > T(0)) & (dot(normal, ahead).x < to.wanted.x);
     const S approach = -dot(to.normal, parted(x.vel, x.speed, x.spin, to.share, to.arm));
     const S back = x.restitution * approach * S(T(n.dt));
-    const auto hits = pressed & (approach.x > T(n.slowest)) & (back.x > T(0)) & (back.x > to.wanted.x);
+    const auto hits = pressed & (approach.x > slowest) & (back.x > T(0)) & (back.x > to.wanted.x);
     to.wanted = select(hits, back, to.wanted);
   }
   to.mu = zero;
@@ -105,7 +106,7 @@ static Result<T, N> result(const Around<T, N>& x, const Line<T, N>& line, const 
   const Three<T, 0> swing = cross(tangent, vel[1] - vel[0]) * Num<T, 0>(x.lever.x) - beside * Num<T, 0>(x.radius.x);
   Three<T, 0> slip = parted(vel, plain(x.speed), spin, share, place) - cross(swing, normal);
   slip -= normal * dot(normal, slip);
-  const auto slides = root<T>(dot(slip, slip).x) > T(n.slowest);
+  const auto slides = root<T>(dot(slip, slip).x) > slowest;
   to.mu = select(slides, x.mu_k, x.mu_s);
   return to;
 }

@@ -11,7 +11,7 @@
 
 struct Sizes {
   int64_t vertices, scenes, room, friction;
-  double recovery, slowest, fastest, dt;
+  double recovery, slowest, fastest, thick, dt;
 };
 enum { POS = 0, VEL = 3, CHANGE = 6, FREE = 9, RADIUS, FIELDS };
 enum { MU_S, MU_K, RESTITUTION, LAWS };
@@ -92,10 +92,12 @@ static void meet(const Meeting<T, N>& m, const Group<T>& g, const Sizes& n, Num<
   typedef Three<T, N> V;
   const S zero(T(0)), one(T(1)), most(T(n.fastest * n.dt)), asked = positive(m.wanted);
   S wanted = select(m.wanted.x > T(0), asked * most / (asked + most), m.wanted);
+  const Lanes<T> radius = (g.corners.radius[0].x + g.corners.radius[1].x) * T(0.5);
+  const Lanes<T> slowest = root<T>(radius * T(n.slowest * n.slowest / n.thick));
   if (any(m.restitution.x > T(0))) {
     const auto pressed = (g.real > T(0)) & (dot(g.pair_.normal, apart(g.pair_, g.change)).x < wanted.x);
     const S approach = -dot(m.normal, parted(m, m.vel)), back = m.restitution * approach * S(T(n.dt));
-    const auto hits = pressed & (approach.x > T(n.slowest)) & (back.x > T(0)) & (back.x > wanted.x);
+    const auto hits = pressed & (approach.x > slowest) & (back.x > T(0)) & (back.x > wanted.x);
     wanted = select(hits, back, wanted);
   }
   to[0] = wanted, to[1] = zero;
@@ -106,7 +108,7 @@ static void meet(const Meeting<T, N>& m, const Group<T>& g, const Sizes& n, Num<
   const Pair<T>& a = g.pair_;
   const Three<T, 0> slip = apart(a, g.vel) - cross(a.turned(moment(a, g.vel)), a.between);
   const Three<T, 0> across = slip - a.normal * dot(a.normal, slip);
-  to[1] = select(root<T>(dot(across, across).x) > T(n.slowest), m.mu_k, m.mu_s);
+  to[1] = select(root<T>(dot(across, across).x) > slowest, m.mu_k, m.mu_s);
   // Rows of (1 - n n^T) [d x] J, d from the second edge to the first and J the inverse of inertia; times [arm x].
   const V &d = m.between, &u = m.normal;
   const V J[3] = {{m.xx, m.xy, m.xz}, {m.xy, m.yy, m.yz}, {m.xz, m.yz, m.zz}};

@@ -30,7 +30,7 @@ class _Sizes(ctypes.Structure):
     _fields_ = (
         *((name, ctypes.c_int64) for name in ("vertices", "scenes", "bodies", "families", "corners", "friction")),
         *((name, ctypes.c_void_p) for name in ("shape", "pieces", "after", "cells", "grids")),
-        *((name, ctypes.c_double) for name in ("recovery", "slowest", "fastest", "dt")),
+        *((name, ctypes.c_double) for name in ("recovery", "slowest", "fastest", "thick", "dt")),
     )
 
 
@@ -137,6 +137,6 @@ def find_touches(
         list(pieces),
         view.topology.successor(),
         friction,
-        [*law, coulomb_friction.FASTEST, view.dt],
+        [*law, coulomb_friction.FASTEST, coulomb_friction.THICK, view.dt],
     )
     return found.reshape(*batch, *found.shape[1:]).split(_FIELDS, -1)

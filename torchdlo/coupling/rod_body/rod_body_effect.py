@@ -39,6 +39,7 @@ from torchdlo.coupling.bodies.contact_solver import inertia
 from torchdlo.coupling.bodies.dynamics import PredictedBodyMotion, conjugate
 from torchdlo.coupling.bodies.segment_distance import EdgePoints, find_contact_points, points_per_edge
 from torchdlo.coupling.common.coulomb_friction import (
+    compared,
     friction_force,
     overlap_recovery,
     rebound_separation,
@@ -202,7 +203,8 @@ class RodBody(Effect):
     recovery: float = 0.2
     """Share of a shallow overlap that a substep removes; a small one lets ropes come to rest."""
     slowest: float = 0.02
-    """Approach below which nothing rebounds [m/s]."""
+    """Approach below which nothing rebounds [m/s]. In implicit and coupled steps it is that of a rope of 5 mm radius,
+    goes with the root of the radius, and is the slip below which friction is static, too."""
     left_out: tuple[tuple[int, int], ...] = ()
     """Edges and bodies, by their places in the scene, that go through each other: those next to joints."""
 
@@ -251,7 +253,8 @@ class RodBody(Effect):
         still, slip = points.seen(torch.zeros_like(motion.change), bodies)
         wanted = self._target(points, view, bodies, points.seen(motion.change, bodies)[0], calm=True)
         now = dataclasses.replace(bodies, change=state.vel, turn=state.omega)
-        slides = safe_norm(points.seen(view.state.vel, now)[1]).detach() > self.slowest
+        slip_speed = safe_norm(points.seen(view.state.vel, now)[1]).detach()
+        slides = slip_speed > compared(self.slowest, points.radius)
         mu_s, mu_k = (axes.of_bodies(mu) for mu in (bodies.params.mu_s, bodies.params.mu_k))
         mu = torch.where(slides, mu_k, mu_s) if self.friction else torch.zeros_like(at.share)
         return at.share, at.normal, wanted, still * at.normal + slip, mu, at.arm
@@ -303,7 +306,8 @@ class RodBody(Effect):
         now = dataclasses.replace(bodies, change=bodies.state.vel, turn=bodies.state.omega)
         approach = -points.seen(view.state.vel, now)[0]
         restitution = points.axes.of_bodies(bodies.params.restitution)
-        return rebound_separation(wanted, pressed, approach, restitution, self.slowest, view.dt)
+        slowest = compared(self.slowest, points.radius) if calm else self.slowest
+        return rebound_separation(wanted, pressed, approach, restitution, slowest, view.dt)
 
     def _sweep(
         self,

@@ -46,6 +46,7 @@ import torch
 from torch import Tensor
 
 from torchdlo.coupling.common.coulomb_friction import (
+    compared,
     friction_force,
     overlap_recovery,
     rebound_separation,
@@ -193,7 +194,7 @@ class RodContact(Effect):
     """By how much vertices may speed up within a step, beside half their speed [m/s]; `State.diagnostics` tells if
     more. None: 1 m/s, and no more than half a radius in a step, so that thin ropes have room for their pairs."""
     slowest: float = 0.02
-    """Approach below which nothing rebounds [m/s]."""
+    """Approach below which nothing rebounds [m/s]; see `RodBody.slowest`."""
     left_out: tuple[tuple[int, int], ...] = ()
     """Pairs of edges, by their places in the scene, that overlap: those of two ropes next to their joint."""
 
@@ -302,7 +303,7 @@ class RodContact(Effect):
             linear = [m + turn @ _skew(arm) for m, arm in zip(linear, couple.arm, strict=True)]
             slip = _sum(contacts.weight, vel)
             slip = slip - cross(couple.seen(vel), contacts.distance * n)
-            slides = safe_norm(slip - n * dot(n, slip)).detach() > self.slowest
+            slides = safe_norm(slip - n * dot(n, slip)).detach() > compared(self.slowest, 0.5 * (radius[0] + radius[2]))
             mu = torch.where(slides, values["mu_k"], values["mu_s"])
         return Pairs(at, contacts.real, n, 0.5 * (radius[0] + radius[2]), wanted, mu, tuple(linear))
 
@@ -350,7 +351,8 @@ class RodContact(Effect):
         wanted = overlap_recovery(wanted, dt) if calm else wanted
         pressed = contacts.real * (dot(contacts.normal, _sum(contacts.weight, change)) < wanted)
         approach = -dot(contacts.normal, _sum(contacts.weight, vel))
-        return rebound_separation(wanted, pressed, approach, values["restitution"], self.slowest, dt), pressed
+        slowest = compared(self.slowest, 0.5 * (contacts.distance - contacts.gap)) if calm else self.slowest
+        return rebound_separation(wanted, pressed, approach, values["restitution"], slowest, dt), pressed
 
     def _sweep(
         self,

@@ -30,7 +30,7 @@ _FIELDS = (1, 3, 1, 1, 1, 9, 9, 9, 9)
 class _Sizes(ctypes.Structure):
     _fields_ = (
         *((name, ctypes.c_int64) for name in ("vertices", "scenes", "room", "friction")),
-        *((name, ctypes.c_double) for name in ("recovery", "slowest", "fastest", "dt")),
+        *((name, ctypes.c_double) for name in ("recovery", "slowest", "fastest", "thick", "dt")),
     )
 
 
@@ -106,7 +106,7 @@ def find_touches(
         scene_packing.pack_components([values["real"]], batch, count),
     )
     places = at.permute(at.dim() - 2, at.dim() - 1, *range(at.dim() - 2)).reshape(4, count, batch.numel()).contiguous()
-    rule = [*law, coulomb_friction.FASTEST, view.dt]
+    rule = [*law, coulomb_friction.FASTEST, coulomb_friction.THICK, view.dt]
     packed = [scene_packing.join_components(vertices, batch, size)]
     found = torch.ops.torchdlo.rod_touch(packed, laws, places, real[0], friction, rule)
     there, normal, radius, wanted, mu, *linear = found.reshape(*batch, *found.shape[1:]).split(_FIELDS, -1)
