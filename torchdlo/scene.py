@@ -332,7 +332,8 @@ def _settled(scene: Scene, params: Params, first: State) -> State:
 
 def limits(scene: Scene, params: Params) -> dict[str, float]:
     """Return the largest stable substep [s] by the term that limits it; see `physics.integrators.stability`."""
-    return stability.limits(scene.settings, params.rods, params.effects)
+    load = stability.NO_LOAD if scene.joints is None else scene.joints.load(params.bodies)
+    return stability.limits(scene.settings, params.rods, params.effects, load)
 
 
 def check_step(scene: Scene, params: Params) -> None:

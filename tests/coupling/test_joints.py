@@ -15,6 +15,7 @@ from torchdlo.coupling.bodies.dynamics import conjugate
 from torchdlo.physics import tree
 from torchdlo.physics.effects import Bend, BendFrame, Gravity, Twist
 from torchdlo.physics.integrators import contact_kernel
+from torchdlo.physics.integrators.carried_mass import carried_mass
 from torchdlo.physics.linalg.free_rotation import spin_freely, spin_gradient
 from torchdlo.physics.linalg.rotation import multiply, rotate
 from torchdlo.scene import RigidBody, Rope, RopeJoint
@@ -74,6 +75,45 @@ def test_a_hanging_plug_pulls_with_its_weight(integrator: str, kind: str) -> Non
     torch.testing.assert_close(force, weight, atol=1e-9, rtol=0)
     torch.testing.assert_close(torque, torch.zeros_like(torque), atol=1e-12, rtol=0)
     scenes.check_state(state)
+
+
+def chained(*, held=(0,), between=5.0, ropes=2, **steps):
+    """Ropes of 10 g and 11 vertices one below the other, with a ball of some mass at the end of each."""
+    made = [Rope(line(11, 1.0, (0.0, 0.0, -1.04 * k)), radius=0.003, mass=0.01) for k in range(ropes)]
+    mass = (between, 0.1)[:ropes]
+    balls = [RigidBody("sphere", 0.02, pos=(0, 0, -1.02 - 1.04 * k), mass=m) for k, m in enumerate(mass)]
+    joints = [RopeJoint(rope=k, body=k, kind="ball") for k in range(ropes)]
+    joints += [RopeJoint(rope=k + 1, vertex=0, body=k, kind="ball") for k in range(ropes - 1)]
+    return scenes.make(made, [Gravity()], bodies=balls, joints=joints, prescribed_vertices=held, **steps)
+
+
+def bound(load: float) -> float:
+    """Longest explicit substep [s] in which the lightest vertex of these ropes, of 0.5 g, holds a mass [kg]."""
+    return math.sqrt(0.25 * 0.1 * 0.0005 / (G * load))
+
+
+def test_explicit_steps_refuse_bodies_that_ropes_cannot_carry_by_their_joints() -> None:
+    # The bound was that of the rope alone, 28 ms: it carried 21 N of 49, and nothing was said.
+    with pytest.raises(ValueError, match=r"hanging weight allows less than 0\.000504 s"):
+        chained(ropes=1, dt=2e-3, substeps=1)
+    made, params, _ = chained(ropes=1)
+    assert scenes.limits(made, params)["hanging weight"] == pytest.approx(bound(5.01))
+    # Of two, the upper one carries all. Held in the middle of the lower one, its upper end carries what is above, and
+    # edges between carry all on vertices of twice that mass. What nothing holds carries nothing.
+    made, params, _ = chained(dt=1e-3)
+    assert scenes.limits(made, params)["hanging weight"] == pytest.approx(bound(5.12))
+    made, params, _ = chained(held=(11 + 5,), between=0.3)
+    assert scenes.limits(made, params)["hanging weight"] == pytest.approx(bound(0.3105))
+    made, params, _ = chained(held=())
+    assert not scenes.limits(made, params)
+
+
+def test_a_thin_rope_below_carries_what_is_below_it_only() -> None:
+    made, params, _ = chained(between=2.0)
+    loads = made.joints.load(params.bodies)
+    carried = carried_mass(made.topology, made.prescribed_vertices, params.rods.material.mass, loads)[:, 0]
+    assert carried[:10].tolist() == pytest.approx([2.12] * 9 + [0.0005 + 2.11])
+    assert carried[11:21].tolist() == pytest.approx([0.11] * 9 + [0.1005])
 
 
 def test_a_plug_on_a_stiff_cable_swings_as_a_compound_pendulum() -> None:

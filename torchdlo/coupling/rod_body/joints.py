@@ -29,6 +29,7 @@ from torchdlo.field_docs import with_field_docs
 from torchdlo.physics import tree
 from torchdlo.physics.constraints.joint_points import JointPoints
 from torchdlo.physics.effects.base import ContactForces, Effect, Values
+from torchdlo.physics.integrators.carried_mass import Load
 from torchdlo.physics.linalg.free_rotation import matrix
 from torchdlo.physics.linalg.numerics import added, cross, normalize, safe_norm
 from torchdlo.physics.linalg.rotation import rotate
@@ -108,6 +109,16 @@ class Joints:
     def slots(self) -> tuple[int, ...]:
         """All vertices that are joined."""
         return tuple(sorted({slot for point in self.points for slot, _ in point}))
+
+    def load(self, bodies: BodyParams | tuple[()]) -> Load:
+        """Return what is joined, with the masses of all bodies of the scene."""
+        links: list[tuple[int, int]] = []
+        for first, spot in zip(self.first, self.spots, strict=True):
+            body, own = self.bodies[first], {slot for slot, _ in spot}
+            there = (slot for slot, weight in self.points[first] if weight < 0 and slot not in own)
+            other = -1 - body if body >= 0 else next(there)
+            links += [(slot, other) for slot in own]
+        return Load(tuple(links), () if isinstance(bodies, tuple) else bodies.mass.detach())
 
     def weights(self, size: int, like: Tensor) -> Tensor:
         """Return how vertices count in the points [1], shape (A, V)."""
