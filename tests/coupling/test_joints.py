@@ -467,6 +467,51 @@ def test_what_cannot_be_joined_is_refused(sentence: str) -> None:
         scenes.make([rope], [Gravity()], bodies=[plug, wall], joints=[WRONG[sentence]], prescribed_vertices=[0])
 
 
+def star(pairs, bodies=(), joined=()):
+    """Three ropes of 1 m that start at one point, joined there pairwise, and to bodies."""
+    ways = ((1.0, 0.0, 0.0), (-0.6, 0.8, 0.0), (-0.6, -0.8, 0.0))
+    ropes = [Rope(line(5, 1.0, way=way), radius=0.003, mass=0.01) for way in ways]
+    joints = [RopeJoint(rope=a, vertex=0, other_rope=b, other_vertex=0, kind="ball") for a, b in pairs]
+    return scenes.make(ropes, [Gravity()], bodies=bodies, joints=[*joints, *joined], dt=1e-3)
+
+
+def test_joints_that_repeat_others_are_refused() -> None:
+    # Explicit steps ended in a singular matrix, implicit ones in numbers that are none.
+    ball = RigidBody("sphere", 0.02, pos=(0.0, 0.0, -0.02), mass=0.1)
+    onto = [RopeJoint(rope=k, vertex=0, body=0, kind="ball") for k in (0, 1)]
+    with pytest.raises(
+        ValueError, match=r"joints\[2\]: repeats what joints\[0\] and joints\[1\] hold together already"
+    ):
+        star([(0, 1), (0, 2), (1, 2)])
+    with pytest.raises(ValueError, match=r"joints\[1\]: repeats what joints\[0\] holds together already"):
+        star([], [ball], [onto[0], onto[0]])
+    with pytest.raises(ValueError, match=r"joints\[2\]: repeats what joints\[0\] and joints\[1\] hold together"):
+        star([(0, 1)], [ball], onto)
+    for made in (star([(0, 1), (0, 2)]), star([(0, 1)], [ball], onto[:1]), star([], [ball], onto)):
+        scenes.check_state(ran(made, 3))
+
+
+def test_two_bodies_on_two_points_of_a_rope_are_refused_and_three_in_a_ring_are_not() -> None:
+    def ring(corners) -> None:
+        # A rope round a triangle, and balls between its corners.
+        at = [torch.tensor(x, dtype=torch.float64) for x in ((0.0, 0.0, 0.0), (0.3, 0.0, 0.0), (0.1, 0.3, 0.0))]
+        points = torch.stack([a + share * (at[(k + 1) % 3] - a) for k, a in enumerate(at) for share in (0.0, 0.3, 0.6)])
+        balls, joints = [], []
+        for k, (a, b) in enumerate(corners):
+            centre = ((at[a] + at[b]) / 2).tolist()
+            balls.append(RigidBody("sphere", 0.02, pos=(*centre[:2], -0.05 * (k + 1)), mass=0.1))
+            ends = [tuple(float(at[c][j]) - balls[k].pos[j] for j in range(3)) for c in (a, b)]
+            joints += [
+                RopeJoint(vertex=3 * c, body=k, kind="ball", anchor=end) for c, end in zip((a, b), ends, strict=True)
+            ]
+        rope = Rope(points, radius=0.003, mass=0.01, closed=True)
+        scenes.check_state(ran(scenes.make([rope], [Gravity()], bodies=balls, joints=joints, dt=1e-3), 3))
+
+    ring([(0, 1), (1, 2), (2, 0)])
+    with pytest.raises(ValueError, match=r"joints\[3\]: repeats what joints\[0\] and joints\[1\] and joints\[2\] hold"):
+        ring([(0, 1), (0, 1)])
+
+
 def test_two_welds_on_one_vertex_are_refused() -> None:
     rope = Rope(line(9, 0.4), radius=0.004, mass=0.01, bend=1e-4)
     plugs = [RigidBody("sphere", (0.02,), (x, 0.0, -0.4), mass=0.05) for x in (0.02, -0.02)]

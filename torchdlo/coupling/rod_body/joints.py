@@ -22,6 +22,7 @@ from torch import Tensor
 from torchdlo.coupling.bodies import shape_sdf
 from torchdlo.coupling.bodies.contact_solver import inertia
 from torchdlo.coupling.bodies.dynamics import Body, BodyParams, BodyState, PredictedBodyMotion, conjugate
+from torchdlo.coupling.rod_body.joint_ranks import check_repeats
 from torchdlo.coupling.rod_body.rod_body_effect import RodBody
 from torchdlo.coupling.rod_contact.broad_phase import APART
 from torchdlo.coupling.rod_contact.rod_contact_effect import RodContact
@@ -314,6 +315,7 @@ def place_joints(
         if joints.frames:
             outward = rod.directors(topology, state, joints.frames)
             director = rotate(conjugate(placed.quat[..., list(joints.frame_bodies), :]), outward)
+    check_repeats(joints, local, float(params.material.radius.detach().amax()))
     batch = torch.broadcast_shapes(local.shape[:-2], pos.shape[:-2])
     couple = pos.new_zeros(*batch, len(joints.frames), 1)
     params_, force = JointParams(local, director), pos.new_zeros(*batch, len(joints.points), 3)
