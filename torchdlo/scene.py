@@ -300,8 +300,8 @@ def make(
         check_step(scene, params)
         scene_notices.mention(scene.settings, bool(scene.bodies), scene.joints is not None, state.pos)
         altered = altered_params(scene.effects, topology, rods, numbers)
-        placed_by = scene.prescribed_vertices + (() if tied is None else tied.slots)
-        state = start_overlaps.part(topology, effects, altered, state, solids, placed_by, scene.constrained)
+        sits_on = () if tied is None else tied.slots
+        state = start_overlaps.part(scene.settings, altered, numbers, state, solids, sits_on)
     zero = state.pos.new_zeros(*state.pos.shape[:-2], 1, 3)
     first = State(
         state,

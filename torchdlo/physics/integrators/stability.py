@@ -46,6 +46,15 @@ def check_laws(settings: Settings, rods: RodParams, values: dict[str, Values], s
         raise ValueError(
             "scene: stretch is infinite, which no force can be; give EA [N], or keep constrained=True without Stretch"
         )
+    if {"table", "gravity"} <= {e.name for e in settings.effects}:
+        sunk = values["gravity"]["acceleration"].norm(dim=-1, keepdim=True) / values["table"]["hardness"].square()
+        share = float((sunk / material.radius).detach().max())
+        if share > 0.1:
+            notices.once(
+                "table hardness",
+                f"scene: ropes rest {float(sunk.detach().max()):.2g} m deep in the table, {share:.0%} of their radius: "
+                "g over its hardness squared; give Table a larger hardness, or RodBody with a plane in its place.",
+            )
     if settings.constrained:
         length = rod.edge_vectors(settings.topology, state.pos.detach(), rest.edge_mask).norm(dim=-1, keepdim=True)
         strain = ((length / rest.length.detach() - 1) * rest.edge_mask).abs().max()
