@@ -300,8 +300,7 @@ def make(
         check_step(scene, params)
         scene_notices.mention(scene.settings, bool(scene.bodies), scene.joints is not None, state.pos)
         altered = altered_params(scene.effects, topology, rods, numbers)
-        sits_on = () if tied is None else tied.slots
-        state = start_overlaps.part(scene.settings, altered, numbers, state, solids, sits_on)
+        state, placed = start_overlaps.part(scene.settings, altered, numbers, state, solids, tied)
     zero = state.pos.new_zeros(*state.pos.shape[:-2], 1, 3)
     first = State(
         state,

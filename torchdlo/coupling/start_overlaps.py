@@ -17,8 +17,11 @@ import torch
 from torch import Tensor
 
 from torchdlo import notices
+from torchdlo.coupling.bodies import body_starts
+from torchdlo.coupling.bodies.contact_effect import BodyContact
 from torchdlo.coupling.bodies.dynamics import Body, BodyParams, BodyState, PredictedBodyMotion
 from torchdlo.coupling.bodies.segment_distance import find_contact_points, points_per_edge
+from torchdlo.coupling.rod_body.joints import Joints
 from torchdlo.coupling.rod_body.rod_body_effect import RodBody
 from torchdlo.coupling.rod_contact.broad_phase import near_pairs
 from torchdlo.coupling.rod_contact.closest_points import closest_points
@@ -192,9 +195,9 @@ def part(
     values: dict[str, Values],
     state: RodState,
     bodies: tuple[tuple[Body, ...], BodyParams, BodyState] | None,
-    joined: Sequence[int] = (),
-) -> RodState:
-    """Return the ropes moved out of what they start in, with one notice; the same if they start in nothing.
+    joints: Joints | None = None,
+) -> tuple[RodState, BodyState | tuple[()]]:
+    """Return ropes and bodies moved out of what they start in, with a notice; the same if they start in nothing.
 
     Args:
         settings: ropes and effects of the scene; only what its contacts keep apart is parted.
@@ -202,18 +205,25 @@ def part(
         values: numbers of the effects.
         state: the ropes.
         bodies: the bodies with their numbers and states, None if there are none.
-        joined: vertices that stay where they are beside the prescribed ones.
+        joints: what ropes are joined to; their vertices and bodies stay where they are.
 
     Raises:
         ValueError: names what overlaps, and by how much, where it could not be parted.
     """
     names = {e.name: e for e in settings.effects}
     touching = "rod_body" in names and bodies is not None, "rod_contact" in names, "table" in names
+    placed: BodyState | tuple[()] = ()
+    if bodies is not None:
+        among = names.get("body_contact")
+        tied = () if joints is None else joints.bodies
+        placed = body_starts.part_bodies(among, bodies, tied) if isinstance(among, BodyContact) else bodies[2]
+        bodies = (*bodies[:2], placed)
     if not any(touching):
-        return state
-    held = (*settings.prescribed_vertices, *joined)
+        return state, placed
+    held = (*settings.prescribed_vertices, *(() if joints is None else joints.slots))
     with torch.no_grad():
-        return _part(settings.topology, (names, values), rods, state, bodies, held, settings.constrained)
+        moved = _part(settings.topology, (names, values), rods, state, bodies, held, settings.constrained)
+    return moved, placed
 
 
 def _part(topology, laws, rods, state, bodies, held, constrained) -> RodState:

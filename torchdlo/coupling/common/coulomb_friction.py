@@ -8,7 +8,7 @@ from torch import Tensor
 from torchdlo.physics.linalg.numerics import safe_norm
 
 FASTEST = 0.1
-"""Speed at which implicit steps undo overlaps at most [m/s]: what parts in a step keeps that speed."""
+"""Speed at which implicit steps, and those of bodies, undo overlaps at most [m/s]: what parts in a step keeps it."""
 
 
 def separation_needed(gap: Tensor, shallow: Tensor, recovery: float) -> Tensor:
