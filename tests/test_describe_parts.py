@@ -201,6 +201,15 @@ def test_wrong_parts_are_refused_with_place_and_expectation(case, tmp_path):
     assert "scene.json" in str(caught.value) or "no.stl" in str(caught.value)
 
 
+def test_a_weight_that_steps_cannot_hold_is_refused():
+    # The hold carried 14 N for 49, and nothing was said.
+    rope = RopeSpec(((0, 0, 1), (0, 0, 0)), vertices=11, radius=0.003, mass=0.01, hanging_masses=(HangingMass(-1, 5),))
+    still = SceneDescription((rope,), {"gravity": {}}, attachments=(Attachment((0,)),), duration=0.003)
+    with pytest.raises(ValueError, match=r"hanging weight allows less than 0\.000504 s"):
+        scene_files.assemble(change(still, substeps=1))
+    assert not run(still).problem
+
+
 def test_a_weight_hangs_with_its_weight():
     # The hold bears rope and weight. After many times 1 / rate the swing is gone: exp(-0.5 20 1) of it is left.
     rope = RopeSpec(

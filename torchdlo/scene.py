@@ -301,8 +301,7 @@ def make(
         check_step(scene, params)
         scene_notices.mention(scene.settings, bool(scene.bodies), scene.joints is not None, bounces, state.pos)
         altered = altered_params(scene.effects, topology, rods, numbers)
-        placed_by = scene.prescribed_vertices + (() if tied is None else tied.slots)
-        state = start_overlaps.part(topology, effects, altered, state, solids, placed_by, scene.constrained)
+        state, placed = start_overlaps.part(scene.settings, altered, numbers, state, solids, tied)
     zero = state.pos.new_zeros(*state.pos.shape[:-2], 1, 3)
     first = State(
         state,
@@ -333,7 +332,8 @@ def _settled(scene: Scene, params: Params, first: State) -> State:
 
 def limits(scene: Scene, params: Params) -> dict[str, float]:
     """Return the largest stable substep [s] by the term that limits it; see `physics.integrators.stability`."""
-    return stability.limits(scene.settings, params.rods, params.effects)
+    load = stability.NO_LOAD if scene.joints is None else scene.joints.load(params.bodies)
+    return stability.limits(scene.settings, params.rods, params.effects, load)
 
 
 def check_step(scene: Scene, params: Params) -> None:

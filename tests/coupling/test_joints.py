@@ -15,6 +15,7 @@ from torchdlo.coupling.bodies.dynamics import conjugate
 from torchdlo.physics import tree
 from torchdlo.physics.effects import Bend, BendFrame, Gravity, Twist
 from torchdlo.physics.integrators import contact_kernel
+from torchdlo.physics.integrators.carried_mass import carried_mass
 from torchdlo.physics.linalg.free_rotation import spin_freely, spin_gradient
 from torchdlo.physics.linalg.rotation import multiply, rotate
 from torchdlo.scene import RigidBody, Rope, RopeJoint
@@ -74,6 +75,45 @@ def test_a_hanging_plug_pulls_with_its_weight(integrator: str, kind: str) -> Non
     torch.testing.assert_close(force, weight, atol=1e-9, rtol=0)
     torch.testing.assert_close(torque, torch.zeros_like(torque), atol=1e-12, rtol=0)
     scenes.check_state(state)
+
+
+def chained(*, held=(0,), between=5.0, ropes=2, **steps):
+    """Ropes of 10 g and 11 vertices one below the other, with a ball of some mass at the end of each."""
+    made = [Rope(line(11, 1.0, (0.0, 0.0, -1.04 * k)), radius=0.003, mass=0.01) for k in range(ropes)]
+    mass = (between, 0.1)[:ropes]
+    balls = [RigidBody("sphere", 0.02, pos=(0, 0, -1.02 - 1.04 * k), mass=m) for k, m in enumerate(mass)]
+    joints = [RopeJoint(rope=k, body=k, kind="ball") for k in range(ropes)]
+    joints += [RopeJoint(rope=k + 1, vertex=0, body=k, kind="ball") for k in range(ropes - 1)]
+    return scenes.make(made, [Gravity()], bodies=balls, joints=joints, prescribed_vertices=held, **steps)
+
+
+def bound(load: float) -> float:
+    """Longest explicit substep [s] in which the lightest vertex of these ropes, of 0.5 g, holds a mass [kg]."""
+    return math.sqrt(0.25 * 0.1 * 0.0005 / (G * load))
+
+
+def test_explicit_steps_refuse_bodies_that_ropes_cannot_carry_by_their_joints() -> None:
+    # The bound was that of the rope alone, 28 ms: it carried 21 N of 49, and nothing was said.
+    with pytest.raises(ValueError, match=r"hanging weight allows less than 0\.000504 s"):
+        chained(ropes=1, dt=2e-3, substeps=1)
+    made, params, _ = chained(ropes=1)
+    assert scenes.limits(made, params)["hanging weight"] == pytest.approx(bound(5.01))
+    # Of two, the upper one carries all. Held in the middle of the lower one, its upper end carries what is above, and
+    # edges between carry all on vertices of twice that mass. What nothing holds carries nothing.
+    made, params, _ = chained(dt=1e-3)
+    assert scenes.limits(made, params)["hanging weight"] == pytest.approx(bound(5.12))
+    made, params, _ = chained(held=(11 + 5,), between=0.3)
+    assert scenes.limits(made, params)["hanging weight"] == pytest.approx(bound(0.3105))
+    made, params, _ = chained(held=())
+    assert not scenes.limits(made, params)
+
+
+def test_a_thin_rope_below_carries_what_is_below_it_only() -> None:
+    made, params, _ = chained(between=2.0)
+    loads = made.joints.load(params.bodies)
+    carried = carried_mass(made.topology, made.prescribed_vertices, params.rods.material.mass, loads)[:, 0]
+    assert carried[:10].tolist() == pytest.approx([2.12] * 9 + [0.0005 + 2.11])
+    assert carried[11:21].tolist() == pytest.approx([0.11] * 9 + [0.1005])
 
 
 def test_a_plug_on_a_stiff_cable_swings_as_a_compound_pendulum() -> None:
@@ -425,6 +465,51 @@ def test_what_cannot_be_joined_is_refused(sentence: str) -> None:
     wall = RigidBody("box", (0.1, 0.1, 0.1), (0.0, 1.0, 0.0), motion="fixed", name="wall")
     with pytest.raises(ValueError, match=re.escape(sentence)):
         scenes.make([rope], [Gravity()], bodies=[plug, wall], joints=[WRONG[sentence]], prescribed_vertices=[0])
+
+
+def star(pairs, bodies=(), joined=()):
+    """Three ropes of 1 m that start at one point, joined there pairwise, and to bodies."""
+    ways = ((1.0, 0.0, 0.0), (-0.6, 0.8, 0.0), (-0.6, -0.8, 0.0))
+    ropes = [Rope(line(5, 1.0, way=way), radius=0.003, mass=0.01) for way in ways]
+    joints = [RopeJoint(rope=a, vertex=0, other_rope=b, other_vertex=0, kind="ball") for a, b in pairs]
+    return scenes.make(ropes, [Gravity()], bodies=bodies, joints=[*joints, *joined], dt=1e-3)
+
+
+def test_joints_that_repeat_others_are_refused() -> None:
+    # Explicit steps ended in a singular matrix, implicit ones in numbers that are none.
+    ball = RigidBody("sphere", 0.02, pos=(0.0, 0.0, -0.02), mass=0.1)
+    onto = [RopeJoint(rope=k, vertex=0, body=0, kind="ball") for k in (0, 1)]
+    with pytest.raises(
+        ValueError, match=r"joints\[2\]: repeats what joints\[0\] and joints\[1\] hold together already"
+    ):
+        star([(0, 1), (0, 2), (1, 2)])
+    with pytest.raises(ValueError, match=r"joints\[1\]: repeats what joints\[0\] holds together already"):
+        star([], [ball], [onto[0], onto[0]])
+    with pytest.raises(ValueError, match=r"joints\[2\]: repeats what joints\[0\] and joints\[1\] hold together"):
+        star([(0, 1)], [ball], onto)
+    for made in (star([(0, 1), (0, 2)]), star([(0, 1)], [ball], onto[:1]), star([], [ball], onto)):
+        scenes.check_state(ran(made, 3))
+
+
+def test_two_bodies_on_two_points_of_a_rope_are_refused_and_three_in_a_ring_are_not() -> None:
+    def ring(corners) -> None:
+        # A rope round a triangle, and balls between its corners.
+        at = [torch.tensor(x, dtype=torch.float64) for x in ((0.0, 0.0, 0.0), (0.3, 0.0, 0.0), (0.1, 0.3, 0.0))]
+        points = torch.stack([a + share * (at[(k + 1) % 3] - a) for k, a in enumerate(at) for share in (0.0, 0.3, 0.6)])
+        balls, joints = [], []
+        for k, (a, b) in enumerate(corners):
+            centre = ((at[a] + at[b]) / 2).tolist()
+            balls.append(RigidBody("sphere", 0.02, pos=(*centre[:2], -0.05 * (k + 1)), mass=0.1))
+            ends = [tuple(float(at[c][j]) - balls[k].pos[j] for j in range(3)) for c in (a, b)]
+            joints += [
+                RopeJoint(vertex=3 * c, body=k, kind="ball", anchor=end) for c, end in zip((a, b), ends, strict=True)
+            ]
+        rope = Rope(points, radius=0.003, mass=0.01, closed=True)
+        scenes.check_state(ran(scenes.make([rope], [Gravity()], bodies=balls, joints=joints, dt=1e-3), 3))
+
+    ring([(0, 1), (1, 2), (2, 0)])
+    with pytest.raises(ValueError, match=r"joints\[3\]: repeats what joints\[0\] and joints\[1\] and joints\[2\] hold"):
+        ring([(0, 1), (0, 1)])
 
 
 def test_two_welds_on_one_vertex_are_refused() -> None:

@@ -91,6 +91,35 @@ def test_ropes_that_start_in_each_other_are_moved_apart_and_stay_at_rest(steps, 
     assert float(state.rods.vel.norm(dim=-1).max()) < 0.02
 
 
+@pytest.mark.parametrize("steps", STEPS)
+@pytest.mark.parametrize("height", [0.001, -0.01])
+def test_a_rope_that_starts_inside_of_the_table_lies_on_it_and_is_not_thrown(steps, height):
+    # It was thrown at 0.9 to 4 m/s.
+    rope, effects = line((-0.1, 0, height), (0.1, 0, height)), [EFFECTS[k]() for k in ("bend", "gravity", "table")]
+    made, params, state = make([rope], effects, **STEPS[steps])
+    rest = 0.003 - 9.81 / 500**2
+    torch.testing.assert_close(state.rods.pos[:, 2], torch.full((21,), rest, dtype=F64), atol=1e-5, rtol=0)
+    control = scene.stationary_control(made, state)
+    with torch.no_grad():
+        for _ in range(10):
+            state = scene.step(made, params, state, control)
+            assert float(state.rods.vel.abs().max()) < 0.01
+
+
+def test_a_rope_that_is_held_in_the_table_is_refused_with_its_depth():
+    rope, effects = line((-0.1, 0, -0.02), (0.1, 0, -0.02)), [EFFECTS[k]() for k in ("bend", "gravity", "table")]
+    with pytest.raises(ValueError, match=r"rope 0 in the table starts 23 mm deep, and cannot be moved out"):
+        make([rope], effects, prescribed_vertices=(0, 20))
+
+
+def test_a_rope_where_it_rests_on_the_table_stays_there():
+    # It rests a quarter of its radius deep: that is where the table carries it.
+    x = line((-0.1, 0, 0.15e-3 - 9.81 / 500**2), (0.1, 0, 0.15e-3 - 9.81 / 500**2)).positions
+    effects = [EFFECTS[k]() for k in ("gravity", "table")]
+    _, _, state = make([Rope(x, radius=0.15e-3, mass=1e-4)], effects)
+    assert torch.equal(state.rods.pos, x)
+
+
 def test_what_cannot_be_moved_out_is_refused_with_what_overlaps_and_how_deep():
     ball = RigidBody("sphere", (0.02,), motion="fixed", name="ball")
     rope, effects = line((-0.1, 0, 0.012), (0.1, 0, 0.012)), [EFFECTS["bend"](), RodBody()]

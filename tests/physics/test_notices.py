@@ -5,13 +5,14 @@ from __future__ import annotations
 import logging
 
 import pytest
-from helpers import straight
+from helpers import straight, vec
 
 from torchdlo import notices
 from torchdlo.coupling import RodBody, RodContact
 from torchdlo.coupling.bodies.dynamics import RigidBody
 from torchdlo.physics.effects.elastic import Bend
 from torchdlo.physics.effects.external import Gravity
+from torchdlo.physics.effects.table import Table
 from torchdlo.scene import Rope, make
 
 BALL = RigidBody("sphere", (0.02,), pos=(0.0, 0.0, -0.1), mass=0.1)
@@ -50,3 +51,10 @@ def test_scenes_that_leave_nothing_out_are_silent(caplog, monkeypatch):
     # Too far apart to meet soon, and a rope of no stiffness without bending.
     assert not said(caplog, monkeypatch, [rope(), rope(1.0)], [Bend()])
     assert not said(caplog, monkeypatch, [rope(bend=0.0)], [Gravity()])
+
+
+@pytest.mark.parametrize(("hardness", "told"), [(500.0, True), (2000.0, False)])
+def test_a_table_that_is_too_soft_for_a_thin_rope_is_told(hardness, told, caplog, monkeypatch) -> None:
+    thin = Rope(straight(11, 0.5) + vec(0, 0, 1.0), radius=0.15e-3, density=1000.0)
+    text = said(caplog, monkeypatch, [thin], [Gravity(), Table()], {"table": {"hardness": hardness}})
+    assert ("rest 3.9e-05 m deep in the table, 26% of their radius" in text) == told

@@ -56,6 +56,15 @@ def test_what_stretches_all_the_same_is_reported():
         scene.check_state(state)
 
 
+def test_what_gives_way_is_reported_before_it_is_long():
+    # It was silent up to 5 % of an edge's length: the hold carried 13 N for 49, and all was well.
+    made, params, state = loaded(5.0, check=False)
+    state, _ = run(made, params, state, 10)
+    assert length(state) < 1.01
+    with pytest.raises(RuntimeError, match="longer than it has to be"):
+        scene.check_state(state)
+
+
 @pytest.mark.parametrize("load", [5.0, 50.0])
 def test_implicit_steps_hold_any_weight(load):
     made, params, state = loaded(load, integrator="implicit", dt=2e-3, substeps=1)

@@ -1,4 +1,4 @@
-"""Ropes that start inside of bodies, or of ropes: moved out before the first step, without any speed.
+"""Ropes that start inside of bodies, of ropes, or of a table: moved out before the first step, without any speed.
 
 A step that parted them would leave them the speed with which it did. Here ropes that nothing holds move as they are,
 out of what they are deepest in, until nothing overlaps. Where that does not part them, vertices move, each by the mean
@@ -17,15 +17,19 @@ import torch
 from torch import Tensor
 
 from torchdlo import notices
+from torchdlo.coupling.bodies import body_starts
+from torchdlo.coupling.bodies.contact_effect import BodyContact
 from torchdlo.coupling.bodies.dynamics import Body, BodyParams, BodyState, PredictedBodyMotion
 from torchdlo.coupling.bodies.segment_distance import find_contact_points, points_per_edge
+from torchdlo.coupling.rod_body.joints import Joints
 from torchdlo.coupling.rod_body.rod_body_effect import RodBody
 from torchdlo.coupling.rod_contact.broad_phase import near_pairs
 from torchdlo.coupling.rod_contact.closest_points import closest_points
 from torchdlo.coupling.rod_contact.rod_contact_effect import RodContact
 from torchdlo.physics import tree
 from torchdlo.physics.constraints.edge_lengths import Lengths, settle
-from torchdlo.physics.effects.base import Effect
+from torchdlo.physics.effects.base import Effect, Values
+from torchdlo.physics.integrators.rod_step import Settings
 from torchdlo.physics.linalg.numerics import cross, safe_norm
 from torchdlo.physics.rod import kinematics as rod
 from torchdlo.physics.rod.kinematics import RodParams, RodState
@@ -39,6 +43,8 @@ _ROUNDS = 200
 _SLIDES = 50
 _PATIENCE = 20
 """Rounds without getting better after which a way is given up."""
+_TABLE = 1 << 30
+"""What stands for the table in the place of a body."""
 _G = 9.81
 """Ropes may be bent by what lifts them by their radius at this acceleration [m/s^2], and no more."""
 
@@ -58,7 +64,7 @@ class _Overlaps:
     part: Tensor
     """Which share of it they have to go themselves [1], shape (..., N)."""
     other: Tensor
-    """With which body they overlap, or -1 - k for the rope of slot k [1], shape (..., N)."""
+    """With which body they overlap, -1 - k for the rope of slot k, or `_TABLE` [1], shape (..., N)."""
     radius: Tensor
     """Radius of the edges [m], shape (..., N)."""
 
@@ -112,6 +118,22 @@ def _among_ropes(view: rod.View, free: Tensor, touching: RodContact) -> _Overlap
         (_column(radius, first), _column(radius, second)),
     )  # fmt: skip
     return _Overlaps(*(torch.cat(x, -2 if x[0].dim() > depth.dim() else -1) for x in both))
+
+
+def _on_table(view: rod.View, free: Tensor, values: dict[str, Values]) -> _Overlaps:
+    """Return how far vertices are below where they would rest on a table."""
+    pos, surface = view.state.pos, values["table"]
+    sunk = 0.0
+    if "gravity" in values:
+        sunk = values["gravity"]["acceleration"].norm(dim=-1, keepdim=True) / surface["hardness"].square()
+    radius = view.params.material.radius
+    depth = torch.where(free > 0, surface["height"] + radius - sunk - pos[..., 2:], -1.0)[..., 0].detach()
+    slot = torch.arange(depth.shape[-1], device=depth.device).expand(depth.shape)
+    up = torch.zeros(3, dtype=depth.dtype, device=depth.device)
+    up[2] = 1.0
+    none, other = torch.zeros_like(depth), torch.full_like(slot, _TABLE)
+    out, part = up.expand(*depth.shape, 3), torch.ones_like(depth)
+    return _Overlaps(slot, none, depth, out, part, other, radius[..., 0].detach().expand(depth.shape))
 
 
 def _joined(parts: Sequence[_Overlaps]) -> _Overlaps:
@@ -168,43 +190,49 @@ def _bent(topology: Topology, rods: RodParams, state: RodState, pos: Tensor) -> 
 
 
 def part(
-    topology: Topology,
-    effects: Sequence[Effect],
+    settings: Settings,
     rods: RodParams,
+    values: dict[str, Values],
     state: RodState,
     bodies: tuple[tuple[Body, ...], BodyParams, BodyState] | None,
-    held: Sequence[int],
-    constrained: bool,
-) -> RodState:
-    """Return the ropes moved out of what they start in, with one notice; the same if they start in nothing.
+    joints: Joints | None = None,
+) -> tuple[RodState, BodyState | tuple[()]]:
+    """Return ropes and bodies moved out of what they start in, with a notice; the same if they start in nothing.
 
     Args:
-        topology: the ropes.
-        effects: those of the scene; only what its contacts keep apart is parted.
+        settings: ropes and effects of the scene; only what its contacts keep apart is parted.
         rods: rest shape and material, as effects alter them.
+        values: numbers of the effects.
         state: the ropes.
         bodies: the bodies with their numbers and states, None if there are none.
-        held: vertices that stay where they are.
-        constrained: whether edges keep their lengths.
+        joints: what ropes are joined to; their vertices and bodies stay where they are.
 
     Raises:
         ValueError: names what overlaps, and by how much, where it could not be parted.
     """
-    names = {e.name: e for e in effects}
-    touching = "rod_body" in names and bodies is not None, "rod_contact" in names
+    names = {e.name: e for e in settings.effects}
+    touching = "rod_body" in names and bodies is not None, "rod_contact" in names, "table" in names
+    placed: BodyState | tuple[()] = ()
+    if bodies is not None:
+        among = names.get("body_contact")
+        tied = () if joints is None else joints.bodies
+        placed = body_starts.part_bodies(among, bodies, tied) if isinstance(among, BodyContact) else bodies[2]
+        bodies = (*bodies[:2], placed)
     if not any(touching):
-        return state
+        return state, placed
+    held = (*settings.prescribed_vertices, *(() if joints is None else joints.slots))
     with torch.no_grad():
-        return _part(topology, names, rods, state, bodies, held, constrained)
+        moved = _part(settings.topology, (names, values), rods, state, bodies, held, settings.constrained)
+    return moved, placed
 
 
-def _part(topology, names, rods, state, bodies, held, constrained) -> RodState:
+def _part(topology, laws, rods, state, bodies, held, constrained) -> RodState:
     start = state.pos.detach()
     free = start.new_ones(topology.size, 1)
     free[list(held)] = 0.0
 
     def look(pos: Tensor) -> _Overlaps:
-        return _look(rod.view(topology, rods, tree.replace(state, pos=pos), 1.0), names, bodies, free)
+        return _look(rod.view(topology, rods, tree.replace(state, pos=pos), 1.0), laws, bodies, free)
 
     found = look(start)
     wrong = _over(found) > SHALLOW
@@ -242,9 +270,9 @@ def _part(topology, names, rods, state, bodies, held, constrained) -> RodState:
     return tree.replace(state, pos=tree.batch_innermost(there), director=director, ref_twist=ref_twist)
 
 
-def _look(view: rod.View, names: dict[str, Effect], bodies: Any, free: Tensor) -> _Overlaps:
+def _look(view: rod.View, laws: tuple[dict[str, Effect], Any], bodies: Any, free: Tensor) -> _Overlaps:
     """Return what overlaps, but for edges beside what is held, which is where it was put."""
-    parts = []
+    (names, values), parts = laws, []
     touching = names.get("rod_body")
     if isinstance(touching, RodBody) and bodies is not None:
         kinds, params, placed = bodies
@@ -254,9 +282,13 @@ def _look(view: rod.View, names: dict[str, Effect], bodies: Any, free: Tensor) -
     among = names.get("rod_contact")
     if isinstance(among, RodContact):
         parts.append(_among_ropes(view, free, among))
-    found = _joined(parts)
-    mobile = (free * view.next(free))[..., 0].expand(*found.slot.shape[:-1], -1) > 0
-    return dataclasses.replace(found, depth=torch.where(_column(mobile, found.slot), found.depth, -1.0))
+    if parts:
+        found = _joined(parts)
+        mobile = (free * view.next(free))[..., 0].expand(*found.slot.shape[:-1], -1) > 0
+        parts = [dataclasses.replace(found, depth=torch.where(_column(mobile, found.slot), found.depth, -1.0))]
+    if "table" in names:
+        parts.append(_on_table(view, free, values))
+    return _joined(parts)
 
 
 def _over(found: _Overlaps) -> Tensor:
@@ -294,5 +326,6 @@ def _deepest(topology: Topology, found: _Overlaps, bodies) -> tuple[float, str]:
     at = int(found.depth.argmax())
     slot, other = (int(x.flatten()[at]) for x in (found.slot, found.other))
     ropes = [k for k, n in enumerate(topology.counts) for _ in range(n)]
-    it = f"body {bodies[0][other].name!r}" if other >= 0 else f"rope {ropes[-1 - other]}"
+    it = f"rope {ropes[-1 - other]}" if other < 0 else "the table" if other == _TABLE else ""
+    it = it or f"body {bodies[0][other].name!r}"
     return float(found.depth.flatten()[at]), f"rope {ropes[slot]} in {it}"

@@ -120,6 +120,7 @@ def assemble(description: SceneDescription, *, folder: str | Path = ".") -> Simu
         scene_notices.mention_sweeps(scene.settings, bool(scene.bodies))
     material = tree.replace(params.rods.material, mass=params.rods.material.mass + weight)
     params = tree.replace(params, rods=tree.replace(params.rods, material=material))
+    scenes.check_step(scene, params)  # with what hangs on ropes
     return Simulation(scene, params, state, motion.plan(d, scene, state, armed), meshes, weight)
 
 

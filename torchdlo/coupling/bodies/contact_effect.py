@@ -3,8 +3,9 @@
 Per substep, on a fixed number of points of each pair of bodies (see `balls`):
 
 1.  Where bodies would go without contact gives the displacement d = d0 of a pair at each point.
-2.  No overlap at the end: n . d >= b, where b is minus the gap, a share of an overlap that is there already, or what a
-    rebound asks for. A contact presses with r max(0, b - n . d), r being so large that b is met to 1e-4 of an impact.
+2.  No overlap at the end: n . d >= b, where b is minus the gap, a share of an overlap that is there already (at most
+    0.1 m/s times the substep, as bodies keep the speed with which they part), or what a rebound asks for. A contact
+    presses with r max(0, b - n . d), r being so large that b is met to 1e-4 of an impact.
 3.  A contact that slips by s sticks with -r s while that is at most mu_s times the normal force, else it slides with
     mu_k times the normal force against s.
 4.  The displacements q of the free bodies that these forces make solve M q = sum J^T f(d0 + J q). All contacts of a
@@ -44,7 +45,7 @@ from torchdlo.coupling.bodies.contact_op import FIT, HARD
 from torchdlo.coupling.bodies.contact_points import deepest_points
 from torchdlo.coupling.bodies.contact_solver import BodySystem, Links, assembled, gather, inertia
 from torchdlo.coupling.bodies.dynamics import Body, PredictedBodyMotion
-from torchdlo.coupling.common.coulomb_friction import rebound_separation, separation_needed
+from torchdlo.coupling.common.coulomb_friction import overlap_recovery, rebound_separation, separation_needed
 from torchdlo.physics import tree
 from torchdlo.physics.effects.base import ContactForces, Effect, EffectKind, PredictedMotion, Values
 from torchdlo.physics.linalg.numerics import dot, safe_norm
@@ -78,7 +79,9 @@ def _links(contact: BodyContact, motion: PredictedBodyMotion) -> Links:
     )
     free = links.seen(motion.change, motion.turn)
     approach = -dot(found.normal, links.seen(state.vel, state.omega))
+    # What parts in a step keeps the speed with which it does.
     wanted = separation_needed(found.gap, like.new_tensor(contact.shallow), contact.recovery)
+    wanted = overlap_recovery(wanted, motion.dt)
     pressed = (dot(found.normal, free) < wanted).to(like.dtype)
     bouncing = _combined(params.restitution, pairs, counts)
     wanted = rebound_separation(wanted, pressed, approach, bouncing, contact.slowest, motion.dt)

@@ -18,6 +18,7 @@ from torch import Tensor
 from torchdlo.coupling.bodies import contact_points
 from torchdlo.coupling.bodies.dynamics import PredictedBodyMotion
 from torchdlo.coupling.common import scene_packing
+from torchdlo.coupling.common.coulomb_friction import FASTEST
 from torchdlo.physics.linalg.vector_components import axes
 
 _FIRST = "Tensor[] bodies"
@@ -40,7 +41,7 @@ class _Sizes(ctypes.Structure):
         *((name, ctypes.c_int64) for name in ("bodies", "scenes", "pairs", "points", "steps", "hold")),
         *((name, ctypes.c_void_p) for name in ("shape", "free", "pair", "cells", "many", "grids", "balls")),
         *((name, ctypes.c_int64) for name in ("corners", "numbers")),
-        *((name, ctypes.c_double) for name in ("recovery", "shallow", "slowest", "dt")),
+        *((name, ctypes.c_double) for name in ("recovery", "shallow", "slowest", "fastest", "dt")),
     )
 
 
@@ -139,7 +140,7 @@ def contact_wrench(
         points,
         steps,
         hold,
-        [*law, motion.dt],
+        [*law, FASTEST, motion.dt],
     )
     force, torque, *others = scene_packing.unpack_components(found, batch).split([3, 3, 36][: 3 if hold else 2], -1)
     free = [k for k, b in enumerate(motion.bodies) if b.motion == "free"]

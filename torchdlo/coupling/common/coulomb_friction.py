@@ -8,7 +8,7 @@ from torch import Tensor
 from torchdlo.physics.linalg.numerics import safe_norm
 
 FASTEST = 0.1
-"""Speed at which implicit steps undo overlaps at most [m/s]: what parts in a step keeps that speed."""
+"""Speed at which implicit steps, and those of bodies, undo overlaps at most [m/s]: what parts in a step keeps it."""
 
 THICK = 5e-3
 """Radius at which speeds are compared with those that are given [m]: what falls by its own size is as fast as the root

@@ -9,13 +9,17 @@ from torch import Tensor
 
 from torchdlo.physics import tree
 from torchdlo.physics.effects.base import altered_params
+from torchdlo.physics.integrators.rod_step import yield_shares
 from torchdlo.physics.linalg.numerics import safe_norm, tiny
 from torchdlo.physics.rod import kinematics as rod
 from torchdlo.physics.rod.kinematics import RodState
+from torchdlo.physics.rod.topology import following
 
 STRAIN = 0.05
 """By what share of its length an edge may be too short or too long before it counts; lengths are kept to 1e-5 and
 better."""
+YIELDING = 1e-3
+"""By what share of its length an edge may give way because its tension is more than its steps can hold, likewise."""
 UNSOLVED = 0.02
 """What share of the forces a step with coupled contact may leave unbalanced before it counts."""
 WIDTH = 5
@@ -70,7 +74,10 @@ def missed(scene: Any, params: Any, rods: RodState, before: Tensor, unsolved: An
 
 @torch.no_grad()
 def _strained(scene: Any, params: Any, rods: RodState) -> Tensor:
-    """Return by what share an edge is too short and too long, 0 where it is by less than `STRAIN`, (..., 1, 2)."""
+    """Return by what share an edge is too short and too long, (..., 1, 2).
+
+    That is 0 where it is by less than `STRAIN`, or `YIELDING` where its tension stands at what its steps can hold.
+    """
     held, after = set(scene.prescribed_vertices), scene.topology.successor()
     # Hands that hold both ends of an edge set its length.
     solved = [m * (not {k, after[k]} <= held) for k, m in enumerate(scene.topology.edge_mask())]
@@ -78,8 +85,12 @@ def _strained(scene: Any, params: Any, rods: RodState) -> Tensor:
     edge = rod.edge_vectors(scene.topology, rods.pos, changed.rest.edge_mask)
     wanted = changed.rest.length * (1 + rods.tension / changed.material.stretch)
     long = (safe_norm(edge) / wanted.clamp(min=tiny(wanted)) - 1) * wanted.new_tensor(solved).unsqueeze(-1)
+    mass, settings = changed.material.mass, scene.settings
+    cap = yield_shares(settings.coupled)[0] * changed.rest.length * torch.minimum(mass, following(scene.topology, mass))
+    gives = (rods.tension * settings.dt**2 >= cap) & (long > YIELDING)
     most = torch.cat([(-long).amax(-2, keepdim=True), long.amax(-2, keepdim=True)], -1)
-    return torch.where(most > STRAIN, most, 0.0)
+    told = torch.cat([torch.zeros_like(gives[..., :1, :]), gives.any(-2, keepdim=True)], -1)
+    return torch.where((most > STRAIN) | told, most, 0.0)
 
 
 def explain_diagnostics(missed: Tensor) -> str:
@@ -102,7 +113,7 @@ def explain_diagnostics(missed: Tensor) -> str:
         )
     if others and others[0] > 0:
         return (
-            f"an edge became {others[0]:.0%} longer than it has to be: a rope was pulled beyond its length, moved too "
+            f"an edge became {others[0]:.1%} longer than it has to be: a rope was pulled beyond its length, moved too "
             "far within a step, or carries more than its steps can hold; move what holds it more slowly, take shorter "
             "substeps or integrator='implicit', or give it a finite `stretch`"
         )

@@ -45,7 +45,7 @@ struct Sizes {
   const int64_t *cells, *many;         // three per body, and how many balls stand for a mesh
   const void *grids, *balls;           // of all bodies, each with so many corners, and with so many numbers
   int64_t corners, numbers;
-  double recovery, shallow, slowest, dt;
+  double recovery, shallow, slowest, fastest, dt;
   template <typename T>
   Grid<T> grid(int body) const {
     return {(const T*)grids + body * corners, cells + 3 * body};

@@ -76,7 +76,9 @@ struct Linked : Pairs<T> {
       // By how much they have to part at least; see coulomb.py.
       const S gap = contacts[c].gap, overlap = larger(-gap, none), deep = larger(overlap - S(T(n.shallow)), none);
       const S shared = S(T(n.recovery)) * overlap + S(T(1 - n.recovery)) * deep;
-      const S simple = select(gap.x > T(0), -gap, shared), approach = -dot(l.normal, seen(l, speeds));
+      const S most(T(n.fastest * n.dt)), asked = larger(shared, none);
+      const S simple = select(gap.x < T(0), asked * most / (asked + most), -gap);
+      const S approach = -dot(l.normal, seen(l, speeds));
       const auto hits = (dot(l.normal, l.free).x < simple.x) & (approach.x > T(n.slowest));
       const S back = combined(one.restitution, two.restitution) * approach * S(T(n.dt));
       l.wanted = select(hits & (back.x > T(0)) & (back.x > simple.x), back, simple);

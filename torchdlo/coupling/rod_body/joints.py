@@ -22,6 +22,7 @@ from torch import Tensor
 from torchdlo.coupling.bodies import shape_sdf
 from torchdlo.coupling.bodies.contact_solver import inertia
 from torchdlo.coupling.bodies.dynamics import Body, BodyParams, BodyState, PredictedBodyMotion, conjugate
+from torchdlo.coupling.rod_body.joint_ranks import check_repeats
 from torchdlo.coupling.rod_body.rod_body_effect import RodBody
 from torchdlo.coupling.rod_contact.broad_phase import APART
 from torchdlo.coupling.rod_contact.rod_contact_effect import RodContact
@@ -29,6 +30,7 @@ from torchdlo.field_docs import with_field_docs
 from torchdlo.physics import tree
 from torchdlo.physics.constraints.joint_points import JointPoints
 from torchdlo.physics.effects.base import ContactForces, Effect, Values
+from torchdlo.physics.integrators.carried_mass import Load
 from torchdlo.physics.linalg.free_rotation import matrix
 from torchdlo.physics.linalg.numerics import added, cross, normalize, safe_norm
 from torchdlo.physics.linalg.rotation import rotate
@@ -108,6 +110,16 @@ class Joints:
     def slots(self) -> tuple[int, ...]:
         """All vertices that are joined."""
         return tuple(sorted({slot for point in self.points for slot, _ in point}))
+
+    def load(self, bodies: BodyParams | tuple[()]) -> Load:
+        """Return what is joined, with the masses of all bodies of the scene."""
+        links: list[tuple[int, int]] = []
+        for first, spot in zip(self.first, self.spots, strict=True):
+            body, own = self.bodies[first], {slot for slot, _ in spot}
+            there = (slot for slot, weight in self.points[first] if weight < 0 and slot not in own)
+            other = -1 - body if body >= 0 else next(there)
+            links += [(slot, other) for slot in own]
+        return Load(tuple(links), () if isinstance(bodies, tuple) else bodies.mass.detach())
 
     def weights(self, size: int, like: Tensor) -> Tensor:
         """Return how vertices count in the points [1], shape (A, V)."""
@@ -303,6 +315,7 @@ def place_joints(
         if joints.frames:
             outward = rod.directors(topology, state, joints.frames)
             director = rotate(conjugate(placed.quat[..., list(joints.frame_bodies), :]), outward)
+    check_repeats(joints, local, float(params.material.radius.detach().amax()))
     batch = torch.broadcast_shapes(local.shape[:-2], pos.shape[:-2])
     couple = pos.new_zeros(*batch, len(joints.frames), 1)
     params_, force = JointParams(local, director), pos.new_zeros(*batch, len(joints.points), 3)

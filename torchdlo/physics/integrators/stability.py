@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import torch
-from torch import Tensor
 
 from torchdlo import notices
 from torchdlo.physics.effects.base import Values, altered_params
+from torchdlo.physics.integrators.carried_mass import Load, carried_mass
 from torchdlo.physics.integrators.rod_step import Settings, yield_shares
 from torchdlo.physics.rod import kinematics as rod
 from torchdlo.physics.rod.kinematics import RodParams, RodState
 from torchdlo.physics.rod.topology import following
+
+NO_LOAD = Load()
+"""Nothing joined to ropes."""
 
 
 def check_laws(settings: Settings, rods: RodParams, values: dict[str, Values], state: RodState) -> None:
@@ -43,6 +46,15 @@ def check_laws(settings: Settings, rods: RodParams, values: dict[str, Values], s
         raise ValueError(
             "scene: stretch is infinite, which no force can be; give EA [N], or keep constrained=True without Stretch"
         )
+    if {"table", "gravity"} <= {e.name for e in settings.effects}:
+        sunk = values["gravity"]["acceleration"].norm(dim=-1, keepdim=True) / values["table"]["hardness"].square()
+        share = float((sunk / material.radius).detach().max())
+        if share > 0.1:
+            notices.once(
+                "table hardness",
+                f"scene: ropes rest {float(sunk.detach().max()):.2g} m deep in the table, {share:.0%} of their radius: "
+                "g over its hardness squared; give Table a larger hardness, or RodBody with a plane in its place.",
+            )
     if settings.constrained:
         length = rod.edge_vectors(settings.topology, state.pos.detach(), rest.edge_mask).norm(dim=-1, keepdim=True)
         strain = ((length / rest.length.detach() - 1) * rest.edge_mask).abs().max()
@@ -53,25 +65,7 @@ def check_laws(settings: Settings, rods: RodParams, values: dict[str, Values], s
             )
 
 
-def _weights(settings: Settings, mass: Tensor) -> Tensor:
-    """Return at each slot the mass that its edge may carry [kg], shape (..., V, 1).
-
-    That is the mass of its rope, of its own end if that is a free one, and 0 if the rope is not held.
-    """
-    topology, parts = settings.topology, []
-    for start, count, closed in zip(topology.starts, topology.counts, topology.closed, strict=True):
-        own = mass[..., start : start + count, :]
-        held = [k - start for k in settings.prescribed_vertices if start <= k < start + count]
-        carried = (own.sum(-2, keepdim=True) * bool(held)).expand_as(own).clone()
-        if held and not closed:
-            for edge, end in ((0, 0), (count - 2, count - 1)):
-                if end not in held:
-                    carried[..., edge, :] = own[..., end, :]
-        parts.append(carried)
-    return torch.cat(parts, -2)
-
-
-def _hanging(settings: Settings, rods: RodParams, values: dict[str, Values]) -> dict[str, float]:
+def _hanging(settings: Settings, rods: RodParams, values: dict[str, Values], load: Load) -> dict[str, float]:
     """Return the substep [s] up to which ropes keep their length that hang from holds, if any does."""
     gravity, topology = "gravity" in {e.name for e in settings.effects}, settings.topology
     if not (settings.constrained and settings.prescribed_vertices and gravity):
@@ -80,24 +74,26 @@ def _hanging(settings: Settings, rods: RodParams, values: dict[str, Values]) -> 
     # m is the lighter end's, also if that is held.
     rest, material = rods.rest, rods.material
     lightest = torch.minimum(material.mass, following(topology, material.mass))
-    pull = values["gravity"]["acceleration"].norm(dim=-1, keepdim=True) * _weights(settings, material.mass)
+    carried = carried_mass(topology, settings.prescribed_vertices, material.mass, load)
+    pull = values["gravity"]["acceleration"].norm(dim=-1, keepdim=True) * carried
     firm = (yield_shares(settings.coupled)[0] * rest.length * lightest / pull).sqrt()
-    counts = (rest.edge_mask > 0) & (pull > 0)
+    solved = pull.new_tensor([[k not in settings.joint_edges] for k in range(topology.size)], dtype=torch.bool)
+    counts = (rest.edge_mask > 0) & (pull > 0) & solved
     return {"hanging weight": float(torch.where(counts, firm, torch.inf).amin())}
 
 
-def limits(settings: Settings, rods: RodParams, values: dict[str, Values]) -> dict[str, float]:
+def limits(settings: Settings, rods: RodParams, values: dict[str, Values], load: Load = NO_LOAD) -> dict[str, float]:
     """Return the largest stable substep [s] by the term that limits it.
 
     Bending waves reach w = 4/l^2 sqrt(EI/m'), stretching waves w = 2/l sqrt(EA/m'), twist waves w = 2 sqrt(GJ/(l I));
     Stoermer-Verlet is stable for w dt < 2. Bending damping takes its force from the velocities before, and damps the
     shortest waves by r = 16 c/(m' l^4): both together are stable for (w dt)^2/4 + r dt/2 < 1. The weight of a rope that
-    is held may pull as much as steps keep its length: T < l m / 4 dt^2. Implicit steps are limited by the last one
-    only, with 10^4 in the place of 1/4.
+    is held, and of the `load` that is joined to it, may pull as much as steps keep its length: T < l m / 4 dt^2.
+    Implicit steps are limited by the last one only, with 10^4 in the place of 1/4.
     """
     rods = altered_params(settings.effects, settings.topology, rods, values)
     if settings.integrator == "implicit":
-        return _hanging(settings, rods, values)
+        return _hanging(settings, rods, values, load)
     rest, material = rods.rest, rods.material
     names = {e.name for e in settings.effects}
     real = (rest.edge_mask > 0).expand_as(rest.length)
@@ -121,4 +117,4 @@ def limits(settings: Settings, rods: RodParams, values: dict[str, Values]) -> di
         found["twisting"] = (torch.where(real, material.inertia, torch.inf) * length / material.twist).amin().sqrt()
     if "table" in names:
         found["table contact"] = 2 / values["table"]["hardness"].max()
-    return {name: float(value) for name, value in found.items()} | _hanging(settings, rods, values)
+    return {name: float(value) for name, value in found.items()} | _hanging(settings, rods, values, load)
