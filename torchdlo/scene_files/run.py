@@ -40,7 +40,7 @@ class Frames:
     twist: np.ndarray
     """Twist of edges against their reference frames [rad], shape (F, V)."""
     force: np.ndarray
-    """Forces that holds exert on held vertices [N], shape (F, H, 3)."""
+    """Forces that attachments exert on held vertices, each vertex once [N], shape (F, H, 3)."""
     body_pos: np.ndarray
     """Positions of bodies, those of robots' links last [m], shape (F, K, 3)."""
     body_quat: np.ndarray

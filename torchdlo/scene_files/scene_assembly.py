@@ -20,6 +20,7 @@ from torchdlo.coupling.robot import robot_kinematics as robots
 from torchdlo.errors import InputError
 from torchdlo.physics import tree
 from torchdlo.scene_files import limits, motion
+from torchdlo.scene_files.holds import check_holds, holds_of, numbered
 from torchdlo.scene_files.json_files import EFFECTS, like, read
 from torchdlo.scene_files.rope_models import Modelled, with_models
 from torchdlo.scene_files.schema import BodySpec, ParticleBlockSpec, RopeSpec, SceneDescription
@@ -67,7 +68,7 @@ def build(
         folder: where the files that it names are looked for.
     """
     made = assemble(description, folder=folder)
-    if made.plan.hands is not None:
+    if made.plan.holds is not None:
         late = next(k for k, h in enumerate(description.attachments) if h.close > 0)
         raise InputError(
             f"attachments[{late}].close: how a hold sits that closes during the run depends on the run; use "
@@ -106,8 +107,9 @@ def assemble(description: SceneDescription, *, folder: str | Path = ".") -> Simu
     meshes = {k: _mesh(b, k, folder) for k, b in enumerate(d.bodies) if b.shape == "mesh"}
     bodies = [_body(b, k, meshes.get(k)) for k, b in enumerate(d.bodies)]
     static = {name: getattr(d, name) for name in _STEPPING}
-    held: dict[str, Any] = {f"prescribed_{part}": _slots(d, counts, part) for part in ("vertices", "edges")}
-    _check_holds(d)
+    check_holds(d)
+    holds = holds_of(d, counts)
+    held: dict[str, Any] = {f"prescribed_{part}": getattr(holds, part).slots for part in ("vertices", "edges")}
     armed = motion.arms(d, folder)
     for arm in armed:
         bodies += robots.solids(arm.robot, arm.joints[0])
@@ -120,28 +122,7 @@ def assemble(description: SceneDescription, *, folder: str | Path = ".") -> Simu
         scene_notices.mention_sweeps(scene.settings, bool(scene.bodies))
     material = tree.replace(params.rods.material, mass=params.rods.material.mass + weight)
     params = tree.replace(params, rods=tree.replace(params.rods, material=material))
-    return Simulation(scene, params, state, motion.plan(d, scene, state, armed), meshes, weight)
-
-
-def _check_holds(d: SceneDescription) -> None:
-    for k, hold in enumerate(d.attachments):
-        if d.clamp == "vertex" and (hold.close > 0 or hold.release is not None):
-            raise InputError(
-                f"attachments[{k}]: it is closed or released during the run, and clamp 'vertex' makes the rope stiffer "
-                "where it is held; use clamp 'edge'."
-            )
-        if hold.robot is not None and not 0 <= hold.robot < len(d.robots):
-            raise InputError(
-                f"attachments[{k}].robot: expected the number of a robot, 0 to {len(d.robots) - 1}, given {hold.robot}."
-                if d.robots
-                else f"attachments[{k}].robot: there is no robot in the scene."
-            )
-        if hold.robot is not None and hold.keyframes:
-            raise InputError(
-                f"attachments[{k}].keyframes: the robot moves what it holds; put the keyframes into the robot."
-            )
-        if hold.close < 0:
-            raise InputError(f"attachments[{k}].close: expected a time from 0 on, given {hold.close:g}.")
+    return Simulation(scene, params, state, motion.plan(d, scene, state, armed, holds), meshes, weight)
 
 
 def _check_joints(d: SceneDescription) -> None:
@@ -154,27 +135,6 @@ def _check_joints(d: SceneDescription) -> None:
             )
 
 
-def _slots(d: SceneDescription, counts: list[int], part: str) -> tuple[int, ...]:
-    """Return the scene's slots of held vertices or edges: ropes lie one after the other."""
-    slots = []
-    for k, held in enumerate(d.attachments):
-        if not held.vertices:
-            raise InputError(f"attachments[{k}].vertices: is empty; expected at least one.")
-        if not 0 <= held.rope < len(counts):
-            raise InputError(f"attachments[{k}].rope: expected 0 to {len(counts) - 1}, given {held.rope}.")
-        count = counts[held.rope] - (part == "edges" and not d.ropes[held.rope].closed)
-        for number in getattr(held, part):
-            place = f"attachments[{k}].{part}"
-            slots.append(sum(counts[: held.rope]) + _numbered(number, count, place))
-    return tuple(slots)
-
-
-def _numbered(number: int, count: int, place: str) -> int:
-    if not -count <= number < count:
-        raise InputError(f"{place}: expected {-count} to {count - 1}, given {number}.")
-    return number % count
-
-
 def _weights(d: SceneDescription, counts: list[int], like: Tensor) -> Tensor:
     """Return the masses that hang on vertices [kg], shape (V, 1)."""
     found = like.new_zeros(sum(counts), 1)
@@ -182,7 +142,7 @@ def _weights(d: SceneDescription, counts: list[int], like: Tensor) -> Tensor:
         for j, weight in enumerate(rope.hanging_masses):
             if weight.mass <= 0:
                 raise InputError(f"ropes[{k}].hanging_masses[{j}].mass: expected more than 0, given {weight.mass:g}.")
-            at = sum(counts[:k]) + _numbered(weight.vertex, counts[k], f"ropes[{k}].hanging_masses[{j}].vertex")
+            at = sum(counts[:k]) + numbered(weight.vertex, counts[k], f"ropes[{k}].hanging_masses[{j}].vertex")
             found[at] += weight.mass
     return found
 
