@@ -22,7 +22,7 @@ from torchdlo.coupling.robot.attachment import Grasp
 from torchdlo.errors import InputError
 from torchdlo.physics import tree
 from torchdlo.physics.linalg.rotation import multiply
-from torchdlo.scene_files.holds import Holds
+from torchdlo.scene_files.held_parts import Holds
 from torchdlo.scene_files.schema import Keyframe, RobotSpec, SceneDescription
 
 
@@ -134,7 +134,7 @@ class ControlPlan:
 
     controls: scenes.Control
     """The controls, with time as the first axis; of holds that close later all but the grip."""
-    holds: Holds | None = None
+    held: Holds | None = None
     """Which attachments have which vertices and edges, if some close later."""
     tools: Pose | None = None
     """Where they are at the start and after every step, shapes (T + 1, holds, 3) and (T + 1, holds, 4)."""
@@ -143,9 +143,9 @@ class ControlPlan:
 
     def follow(self, scene: scenes.Scene) -> Callable[[int, scenes.State], scenes.Control]:
         """Return a function that gives the control of step k from the state before it; steps come in their order."""
-        if self.holds is None:
+        if self.held is None:
             return lambda k, state: tree.map(lambda c: c[k], self.controls)
-        holds, tools, closed = self.holds, tree.part(self.tools), tree.part(self.closed)
+        holds, tools, closed = self.held, tree.part(self.tools), tree.part(self.closed)
         last: list[Grasp | None] = [None]
 
         def control(k: int, state: scenes.State) -> scenes.Control:

@@ -20,17 +20,16 @@ from torchdlo.coupling.robot import robot_kinematics as robots
 from torchdlo.errors import InputError
 from torchdlo.physics import tree
 from torchdlo.scene_files import limits, motion
-from torchdlo.scene_files.holds import check_holds, holds_of, numbered
+from torchdlo.scene_files.held_parts import check_holds, holds_of
 from torchdlo.scene_files.json_files import EFFECTS, like, read
-from torchdlo.scene_files.rope_models import Modelled, with_models
-from torchdlo.scene_files.schema import BodySpec, ParticleBlockSpec, RopeSpec, SceneDescription
+from torchdlo.scene_files.rope_models import with_models
+from torchdlo.scene_files.ropes import hanging_masses, pulling, rope_of, twisted
+from torchdlo.scene_files.schema import BodySpec, ParticleBlockSpec, SceneDescription
 from torchdlo.untrusted import one_line
 
 __all__ = ["Simulation", "assemble", "build", "load"]
 
 _LAWS: dict[str, type[ConstitutiveModel]] = {law.name: law for law in (Elastic, Plastic, Liquid, Sand)}
-_OWN = ("points", "vertices", "model", "hanging_masses")
-"""Entries of a rope that are not fields of `scene.Rope`."""
 _BODY_OWN = ("keyframes", "path", "file", "scale", "cells")
 """Entries of a body that are not fields of `RigidBody`."""
 
@@ -68,7 +67,7 @@ def build(
         folder: where the files that it names are looked for.
     """
     made = assemble(description, folder=folder)
-    if made.plan.holds is not None:
+    if made.plan.held is not None:
         late = next(k for k, h in enumerate(description.attachments) if h.close > 0)
         raise InputError(
             f"attachments[{late}].close: how a hold sits that closes during the run depends on the run; use "
@@ -96,7 +95,7 @@ def assemble(description: SceneDescription, *, folder: str | Path = ".") -> Simu
     limits.check_memory(description)
     d, modelled = with_models(description, folder)
     dtype = getattr(torch, d.precision)
-    ropes = [_rope(r, dtype, modelled) for r in d.ropes]
+    ropes = [rope_of(r, k, dtype, modelled) for k, r in enumerate(d.ropes)]
     counts = [r.positions.shape[-2] for r in ropes]
     effects, values = [], {}
     for name, given in d.effects.items():
@@ -104,6 +103,7 @@ def assemble(description: SceneDescription, *, folder: str | Path = ".") -> Simu
         choices = {k: tuple(v) if isinstance(v, (list, tuple)) else v for k, v in given.items() if k not in kind.params}
         effects.append(kind(**choices))
         values[kind.name] = {k: v for k, v in given.items() if k in kind.params}
+    effects += pulling(d, counts)
     meshes = {k: _mesh(b, k, folder) for k, b in enumerate(d.bodies) if b.shape == "mesh"}
     bodies = [_body(b, k, meshes.get(k)) for k, b in enumerate(d.bodies)]
     static = {name: getattr(d, name) for name in _STEPPING}
@@ -117,11 +117,12 @@ def assemble(description: SceneDescription, *, folder: str | Path = ".") -> Simu
     joints = [scenes.RopeJoint(**vars(joint)) for joint in d.joints]
     held |= {"material_points": _matter(d, dtype), "clamp": d.clamp}
     scene, params, state = scenes.make(ropes, effects, values, bodies=bodies, joints=joints, **held, **static)
-    weight = _weights(d, counts, state.rods.pos)
+    weight = hanging_masses(d, counts, state.rods.pos)
     if bool((weight > 0).any()):
         scene_notices.mention_sweeps(scene.settings, bool(scene.bodies))
     material = tree.replace(params.rods.material, mass=params.rods.material.mass + weight)
     params = tree.replace(params, rods=tree.replace(params.rods, material=material))
+    state = twisted(d, scene, params, state)
     return Simulation(scene, params, state, motion.plan(d, scene, state, armed, holds), meshes, weight)
 
 
@@ -133,45 +134,6 @@ def _check_joints(d: SceneDescription) -> None:
                 if d.bodies
                 else f"joints[{k}].body: there is no body in the scene."
             )
-
-
-def _weights(d: SceneDescription, counts: list[int], like: Tensor) -> Tensor:
-    """Return the masses that hang on vertices [kg], shape (V, 1)."""
-    found = like.new_zeros(sum(counts), 1)
-    for k, rope in enumerate(d.ropes):
-        for j, weight in enumerate(rope.hanging_masses):
-            if weight.mass <= 0:
-                raise InputError(f"ropes[{k}].hanging_masses[{j}].mass: expected more than 0, given {weight.mass:g}.")
-            at = sum(counts[:k]) + numbered(weight.vertex, counts[k], f"ropes[{k}].hanging_masses[{j}].vertex")
-            found[at] += weight.mass
-    return found
-
-
-def _rope(rope: RopeSpec, dtype: torch.dtype, modelled: Modelled | None = None) -> scenes.Rope:
-    given = {k: v for k, v in vars(rope).items() if k not in _OWN and v is not None}
-    points = torch.tensor(rope.points, dtype=torch.float64).reshape(-1, 3)
-    if rope.vertices is not None:
-        points = _resampled(points, rope, rope.vertices)
-    if modelled is not None:
-        given["rest_curvature"] = modelled.curvature(len(points)).to(dtype)
-        # The calibrated roll is measured from the normal that points up.
-        level = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
-        first = points[1] - points[0]
-        steep = float(first[:2].norm()) < 1e-3 * float(first.norm())
-        given["director"] = (torch.tensor([1.0, 0.0, 0.0]) if steep else level).to(dtype)
-    return scenes.Rope(points.to(dtype), **given)
-
-
-def _resampled(points: Tensor, rope: RopeSpec, vertices: int) -> Tensor:
-    if len(points) < 2 or vertices < 3:
-        raise InputError(f"rope: {len(points)} points and {vertices} vertices; expected at least 2 and 3.")
-    line = torch.cat([points, points[:1]]) if rope.closed else points
-    along = torch.cat([points.new_zeros(1), (line[1:] - line[:-1]).norm(dim=-1).cumsum(0)])
-    count = vertices + rope.closed
-    at = torch.linspace(0, 1, count, dtype=points.dtype)[:vertices] * along[-1]
-    k = (torch.searchsorted(along, at, right=True) - 1).clamp(0, len(line) - 2)
-    share = ((at - along[k]) / (along[k + 1] - along[k]).clamp(min=1e-30))[:, None]
-    return line[k] + share * (line[k + 1] - line[k])
 
 
 def _mesh(body: BodySpec, k: int, folder: Path) -> MeshShape:
