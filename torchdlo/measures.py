@@ -123,10 +123,11 @@ def contact_forces(scene: Scene, params: Params, state: State, control: Control)
 
     On vertices, by bodies, particles and other parts of ropes (..., V, 3) [N]; and on free bodies, by ropes and
     particles, as a force (..., K, 3) [N] and a torque about the centre of mass (..., K, 3) [N m]. What fixed and guided
-    bodies bear is added up in explicit steps only, and zero in implicit ones. Forces of contact are found with the
-    motion that they allow, so that they belong to a step and not to a state; the step costs what `scene.step` does.
-    Normal forces and friction are added up. To see what one partner does, leave out the effects of the others. Where
-    there are joints, bodies feel what these exert, too, see `torchdlo.scene.joint_forces`; vertices do not.
+    bodies bear is added up in explicit steps with `contact="sweeps"` only, and zero in others. Forces of contact are
+    found with the motion that they allow, so that they belong to a step and not to a state; the step costs what
+    `scene.step` does. Normal forces and friction are added up. To see what one partner does, leave out the effects of
+    the others. Where there are joints, bodies feel what these exert, too, see `torchdlo.scene.joint_forces`; vertices
+    do not.
     """
     felt: list[ContactForces] = []
 
