@@ -20,6 +20,7 @@ from torchdlo.coupling.robot import robot_kinematics as robots
 from torchdlo.errors import InputError
 from torchdlo.physics import tree
 from torchdlo.scene_files import limits, motion
+from torchdlo.scene_files.checks import check_duration, check_joints, check_keyframes
 from torchdlo.scene_files.held_parts import check_holds, holds_of
 from torchdlo.scene_files.json_files import EFFECTS, like, read
 from torchdlo.scene_files.rope_models import with_models
@@ -107,13 +108,15 @@ def assemble(description: SceneDescription, *, folder: str | Path = ".") -> Simu
     meshes = {k: _mesh(b, k, folder) for k, b in enumerate(d.bodies) if b.shape == "mesh"}
     bodies = [_body(b, k, meshes.get(k)) for k, b in enumerate(d.bodies)]
     static = {name: getattr(d, name) for name in _STEPPING}
+    check_duration(d)
+    check_keyframes(d)
+    check_joints(d)
     check_holds(d)
     holds = holds_of(d, counts)
     held: dict[str, Any] = {f"prescribed_{part}": getattr(holds, part).slots for part in ("vertices", "edges")}
     armed = motion.arms(d, folder)
     for arm in armed:
         bodies += robots.solids(arm.robot, arm.joints[0])
-    _check_joints(d)
     joints = [scenes.RopeJoint(**vars(joint)) for joint in d.joints]
     held |= {"material_points": _matter(d, dtype), "clamp": d.clamp}
     scene, params, state = scenes.make(ropes, effects, values, bodies=bodies, joints=joints, **held, **static)
@@ -124,16 +127,6 @@ def assemble(description: SceneDescription, *, folder: str | Path = ".") -> Simu
     params = tree.replace(params, rods=tree.replace(params.rods, material=material))
     state = twisted(d, scene, params, state)
     return Simulation(scene, params, state, motion.plan(d, scene, state, armed, holds), meshes, weight)
-
-
-def _check_joints(d: SceneDescription) -> None:
-    for k, joint in enumerate(d.joints):
-        if joint.body is not None and not 0 <= joint.body < len(d.bodies):
-            raise InputError(
-                f"joints[{k}].body: expected the number of a body, 0 to {len(d.bodies) - 1}, given {joint.body}."
-                if d.bodies
-                else f"joints[{k}].body: there is no body in the scene."
-            )
 
 
 def _mesh(body: BodySpec, k: int, folder: Path) -> MeshShape:
