@@ -86,7 +86,7 @@ def test_a_line_is_cut_into_equal_parts():
 
 
 def test_steps_are_solved_as_a_file_says(tmp_path):
-    chosen = {"constraint_iterations": 5, "implicit_weight": 0.3, "numerical_damping": 0.1}
+    chosen = {"constraint_iterations": 5, "twist_iterations": 6, "implicit_weight": 0.3, "numerical_damping": 0.1}
     scene_files.save(dataclasses.replace(LIFT, **chosen), tmp_path / "scene.json")
     made = scene_files.load(tmp_path / "scene.json")[0]
     assert {name: getattr(made, name) for name in chosen} == chosen

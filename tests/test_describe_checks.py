@@ -107,6 +107,12 @@ def test_flat_bodies_and_full_rebound_are_of_this_world(dtype):
     assert made[1].bodies.inertia.shape == (1, 3)
 
 
+def test_a_file_says_the_inertia_of_a_body():
+    ball = dataclasses.replace(BALL, inertia=(1e-4, 2e-4, 2.5e-4))
+    params = scene_files.build(dataclasses.replace(FALL, bodies=(ball,)))[1]
+    assert params.bodies.inertia[0].tolist() == [1e-4, 2e-4, 2.5e-4]
+
+
 def test_what_had_no_room_is_said_with_the_names_of_effects():
     said = explain_diagnostics(torch.eye(WIDTH)[:1])
     assert all(

@@ -79,7 +79,7 @@ def build(
 
 _STEPPING = (
     *("dt", "substeps", "integrator", "contact", "twist", "constrained"),
-    *("constraint_iterations", "implicit_weight", "numerical_damping"),
+    *("constraint_iterations", "twist_iterations", "implicit_weight", "numerical_damping"),
 )
 """What a description says of steps, in the words of `scene.Scene`."""
 

@@ -147,6 +147,7 @@ class BodySpec:
     motion: Literal["free", "fixed", "kinematic"] = "free"
     density: float | None = None
     mass: float | None = None
+    inertia: Vector | None = None
     mu_s: float = 0.3
     mu_k: float = 0.3
     restitution: float = 0.0
@@ -267,6 +268,7 @@ class SceneDescription:
     constrained: bool = True
     constraint_iterations: int | None = None
     """Newton steps for edge lengths per substep, in implicit steps at most; if null, 3 explicit and 8 implicit ones."""
+    twist_iterations: int = 4
     implicit_weight: float = 0.5
     """Share of a substep's change at which implicit steps take stiff forces and tensions."""
     numerical_damping: float = 0.0
