@@ -27,9 +27,14 @@ def check_duration(d: SceneDescription) -> None:
 
 def check_keyframes(d: SceneDescription) -> None:
     """Refuse keyframes before the start, and of bodies that do not follow them."""
-    for name, things in (("bodies", d.bodies), ("attachments", d.attachments), ("robots", d.robots)):
-        for k, thing in enumerate(things):
-            for j, key in enumerate(thing.keyframes):
+    moved = {
+        "bodies": [b.keyframes for b in d.bodies],
+        "attachments": [a.keyframes for a in d.attachments],
+        "robots": [r.keyframes for r in d.robots],
+    }
+    for name, all_keys in moved.items():
+        for k, keys in enumerate(all_keys):
+            for j, key in enumerate(keys):
                 if key.time < 0:
                     raise InputError(f"{name}[{k}].keyframes[{j}].time: expected a time from 0 on, given {key.time:g}.")
     for k, body in enumerate(d.bodies):

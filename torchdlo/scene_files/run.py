@@ -284,5 +284,5 @@ def load_frames(path: str | Path) -> Frames:
         found.check_size(stored.values())
         arrays: dict[str, Any] = {name: found[stored[name]] for name in names}
     frames_checks.check_values(file, arrays)
-    lacking = {name: frames_checks.none_of(name, arrays) for name in _OPTIONAL if name not in arrays}
-    return Frames(**arrays, **lacking)
+    arrays |= {name: frames_checks.none_of(name, arrays) for name in _OPTIONAL if name not in arrays}
+    return Frames(**arrays)
