@@ -16,7 +16,7 @@ from torchdlo.errors import InputError
 from torchdlo.physics import tree
 from torchdlo.scene import rollout, step
 from torchdlo.scene_files import Attachment, BodySpec, Keyframe, RopeSpec, SceneDescription
-from torchdlo.scene_files.scene_assembly import _rope
+from torchdlo.scene_files.ropes import rope_of
 
 LIFT = SceneDescription(
     ropes=(
@@ -76,17 +76,17 @@ def test_a_described_scene_runs_and_held_parts_go_where_keys_say():
 
 def test_a_line_is_cut_into_equal_parts():
     corner = RopeSpec(points=((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), (1.0, 1.0, 0.0)), vertices=5, mass=1.0)
-    positions = _rope(corner, torch.float64).positions
+    positions = rope_of(corner, 0, torch.float64).positions
     assert positions.tolist() == [[0, 0, 0], [0.5, 0, 0], [1, 0, 0], [1, 0.5, 0], [1, 1, 0]]
     square = RopeSpec(
         points=((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), (1.0, 1.0, 0.0), (0.0, 1.0, 0.0)), vertices=8, closed=True
     )
-    found = _rope(square, torch.float64).positions
+    found = rope_of(square, 0, torch.float64).positions
     assert len(found) == 8 and found[-1].tolist() == [0, 0.5, 0]
 
 
 def test_steps_are_solved_as_a_file_says(tmp_path):
-    chosen = {"constraint_iterations": 5, "implicit_weight": 0.3, "numerical_damping": 0.1}
+    chosen = {"constraint_iterations": 5, "twist_iterations": 6, "implicit_weight": 0.3, "numerical_damping": 0.1}
     scene_files.save(dataclasses.replace(LIFT, **chosen), tmp_path / "scene.json")
     made = scene_files.load(tmp_path / "scene.json")[0]
     assert {name: getattr(made, name) for name in chosen} == chosen

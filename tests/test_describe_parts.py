@@ -414,7 +414,8 @@ def test_frames_read_back_and_others_are_refused(tmp_path):
 
 
 def test_the_files_shown_in_the_documentation_fit(repository):
-    grip, model = (repository / "docs" / "scenes.md").read_text().split("```json\n")[1:]
+    grip, turns, model = (repository / "docs" / "scenes.md").read_text().split("```json\n")[1:]
+    assert scene_files.assemble(scene_files.parse(turns.split("```")[0])).scene.prescribed_vertices == (0,)
     assert scene_files.parse(model.split("```")[0]).ropes[0].model == "model.json"
     pytest.importorskip("pytorch_kinematics", reason="robots need the extra robots")
     made = scene_files.assemble(scene_files.parse(grip.split("```")[0]))

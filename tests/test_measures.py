@@ -11,8 +11,9 @@ import torch
 from torchdlo import measures, scene
 from torchdlo.coupling.rod_body.rod_body_effect import RodBody
 from torchdlo.physics import tree
-from torchdlo.physics.effects.elastic import Bend, Stretch, Twist
-from torchdlo.physics.effects.external import Damping, Gravity
+from torchdlo.physics.effects.elastic import Bend, BendFrame, Stretch, Twist
+from torchdlo.physics.effects.external import Damping, Gravity, TiltedGravity
+from torchdlo.physics.effects.material import AxialStiffness, NonuniformStiffness, PointMass
 
 pytestmark = pytest.mark.quick
 
@@ -95,6 +96,100 @@ def test_an_elastic_rope_pulls_by_its_stretch() -> None:
     torch.testing.assert_close(
         measures.tension(world, params, longer)[:-1], torch.full((4, 1), 1.0, dtype=torch.float64)
     )
+
+
+def test_energies_tension_and_moments_are_of_what_steps_use() -> None:
+    x = torch.zeros(N, 3, dtype=torch.float64)
+    x[:, 0] = torch.linspace(0, 0.4, N, dtype=torch.float64)
+    rope = scene.Rope(x, radius=0.004, mass=0.01, bend=BEND)
+    values = {"point_mass": {"mass": 1.0, "position": 0.4}, "tilted_gravity": {"angles": (0.1, 0.0)}}
+    world, params, state = scene.make([rope], [Gravity(), TiltedGravity(), PointMass()], values, check=False)
+    state = tree.replace(state, rods=tree.replace(state.rods, vel=torch.ones_like(x) * x.new_tensor([0, 1.0, 0])))
+    assert float(measures.kinetic_energy(world, params, state)) == pytest.approx(0.505)
+    up = tree.replace(state, rods=tree.replace(state.rods, pos=state.rods.pos + x.new_tensor([0.0, 0.0, 2.0])))
+    rise = float(measures.gravitational_energy(world, params, up) - measures.gravitational_energy(world, params, state))
+    assert rise == pytest.approx(1.01 * 9.81 * 2 * math.cos(0.1))
+    soft = scene.Rope(x, radius=0.004, mass=0.01, bend=BEND, stretch=100.0)
+    effects = [Stretch(), AxialStiffness()]
+    given = scene.make([soft], effects, {"stretch": {"EA": 100.0}}, dt=1e-4, constrained=False)
+    longer = tree.replace(given[2], rods=tree.replace(given[2].rods, pos=1.01 * given[2].rods.pos))
+    assert measures.tension(*given[:2], longer)[:-1, 0].tolist() == pytest.approx([0.5] * (N - 1))
+    world, params, state = arc()
+    plain, moment = measures.bending_energy(world, params, state), measures.bending_moment(world, params, state)
+    stiffer = scene.make(
+        [scene.Rope(state.rods.pos, radius=0.004, mass=0.05, bend=BEND)],
+        [Bend(), NonuniformStiffness()],
+        {"nonuniform_stiffness": {"factor": math.log(2), "width": 1e3}},
+        check=False,
+    )
+    torch.testing.assert_close(measures.bending_energy(*stiffer), 2 * plain, rtol=1e-6, atol=0)
+    torch.testing.assert_close(measures.bending_moment(*stiffer), 2 * moment, rtol=1e-6, atol=0)
+
+
+def test_the_moment_of_a_circle_is_its_stiffness_times_its_curvature() -> None:
+    world, params, state = arc()
+    moment = measures.bending_moment(world, params, state)
+    torch.testing.assert_close(moment, BEND * measures.curvature(world, params, state))
+    # In the material frame it is the same, whichever way the directors point.
+    for director in ((0.0, 1.0, 0.0), (0.0, 1.0, 2.0)):
+        rope = scene.Rope(state.rods.pos, mass=0.05, bend=BEND, director=torch.tensor(director).double())
+        framed = scene.make([rope], [BendFrame()], check=False)
+        torch.testing.assert_close(measures.bending_moment(*framed), moment)
+        torch.testing.assert_close(measures.bending_energy(*framed), measures.bending_energy(world, params, state))
+
+
+def test_natural_curvature_and_two_stiffnesses_count() -> None:
+    x = arc()[2].rods.pos
+    across, inside = torch.tensor([0.0, 1.0, 0.0]).double(), torch.tensor([0.0, 0.0, 1.0]).double()
+    length = R * math.pi / 2 * (N - 2) / (N - 1)
+    # It bends towards the second director if the first one is across the plane of the arc.
+    for director, stiffness in ((inside, BEND), (across, 3 * BEND)):
+        rope = scene.Rope(x, mass=0.05, bend=BEND, bend2=3 * BEND, director=director)
+        made = scene.make([rope], [BendFrame()], check=False)
+        energy = 0.5 * stiffness / R**2 * length
+        assert float(measures.bending_energy(*made)) == pytest.approx(energy, rel=2e-3)
+        size = measures.bending_moment(*made)[1:-1].norm(dim=-1)
+        torch.testing.assert_close(size, torch.full_like(size, stiffness / R), rtol=1e-3, atol=0)
+        natural = scene.make([scene.Rope(x, mass=0.05, bend=BEND, rest="as_placed")], [BendFrame()], check=False)
+        assert float(measures.bending_energy(*natural)) < 1e-15 and bool(
+            (measures.bending_moment(*natural).abs() < 1e-12).all()
+        )
+    half = torch.tensor([[0.0, 0.5 / R]]).double().expand(N, 2)
+    made = scene.make(
+        [scene.Rope(x, mass=0.05, bend=BEND, rest_curvature=half, director=across)], [BendFrame()], check=False
+    )
+    size = measures.bending_moment(*made)[1:-1].norm(dim=-1)
+    either = (torch.full_like(size, 0.5 * BEND / R), torch.full_like(size, 1.5 * BEND / R))
+    assert min(float((size - e).abs().max()) for e in either) < 1e-3 * BEND / R
+
+
+def drift(dt: float) -> float:
+    """How far the energy of a rope with a welded plug, falling and swinging from one end, strays from its start [J]."""
+    x = torch.zeros(9, 3, dtype=torch.float64)
+    x[:, 0] = torch.linspace(0, 0.4, 9, dtype=torch.float64)
+    rope = scene.Rope(x, radius=0.004, mass=0.01, bend=1e-3)
+    plug = scene.RigidBody("box", (0.02, 0.015, 0.01), pos=(0.42, 0.0, 0.0), mass=0.05)
+    weld = scene.RopeJoint(body=0)
+    world, params, state = scene.make(
+        [rope], [Gravity(), Bend()], bodies=[plug], joints=[weld], dt=dt, substeps=1, prescribed_vertices=(0,)
+    )
+    control, found = scene.stationary_control(world, state), []
+    moving = (measures.kinetic_energy, measures.body_kinetic_energy)
+    resting = (measures.gravitational_energy, measures.body_gravitational_energy, measures.bending_energy)
+    with torch.no_grad():
+        for _ in range(round(0.12 / dt)):
+            after = scene.step(world, params, state, control)
+            # Velocities lie half a step before positions.
+            kinetic = sum(0.5 * float(e(world, params, s)) for e in moving for s in (state, after))
+            found.append(kinetic + sum(float(e(world, params, state)) for e in resting))
+            state = after
+    return max(abs(e - found[1]) for e in found[1:])
+
+
+def test_the_energy_of_a_rope_and_the_body_at_its_end_stays() -> None:
+    # Of the second order of the step, while the plug falls by centimetres.
+    coarse, fine = drift(2e-3), drift(1e-3)
+    assert fine < 0.35 * coarse and coarse < 1e-5, (coarse, fine)
 
 
 def test_states_are_saved_loaded_and_moved_as_the_page_says() -> None:

@@ -199,7 +199,7 @@ class Scene:
         need(solved, "implicit steps solve for edge lengths; keep constrained=True and give ropes a stretch stiffness")
         need(
             bool(self.bodies) or not {"rod_body", "finger_pads", "body_mpm_coupling"} & set(names),
-            "RodBody, BodyMatter or FingerPads needs bodies, but there are no bodies; give make(..., bodies=[Solid()])",
+            "RodBody, BodyMpmCoupling or FingerPads needs bodies, but there are none; give make(..., bodies=[...])",
         )
         for effect in self.effects:
             if isinstance(effect, BodyContact):

@@ -363,13 +363,13 @@ def test_the_effect_needs_bodies_and_matter():
     solid, material_points = RigidBody("sphere", 0.02, density=100.0), block((0.07,) * 3, (0.1,) * 3)
     with pytest.raises(ValueError, match="BodyMpmCoupling is among the effects, but there is no matter"):
         world((), [solid])
-    with pytest.raises(ValueError, match="BodyMatter or FingerPads needs bodies, but there are no bodies"):
+    with pytest.raises(ValueError, match="BodyMpmCoupling or FingerPads needs bodies, but there are none"):
         world(material_points, [])
 
 
 @pytest.mark.parametrize("wrong", [{"sweeps": 0}, {"room": -1}, {"reach": -0.1}, {"recovery": -1.0}])
 def test_choices_that_make_no_sense_are_refused(wrong):
-    with pytest.raises(ValueError, match=f"BodyMatter: {next(iter(wrong))} is"):
+    with pytest.raises(ValueError, match=f"BodyMpmCoupling: {next(iter(wrong))} is"):
         BodyMpmCoupling(**wrong)
 
 

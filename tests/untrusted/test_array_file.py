@@ -196,9 +196,24 @@ FRAMES: dict[str, tuple[Callable[[dict[str, np.ndarray]], None], str]] = {
         ),
         "mesh_faces: expected numbers from 0 to 2, found 1000000000",
     ),
+    "tension of fewer vertices": (instead("tension", np.zeros((3, 4))), r"tension: expected shape \(3, 5\), found"),
+    "energy of more frames": (instead("bending_energy", np.zeros(4)), r"bending_energy: expected shape \(3\), found"),
+    "contact of a body that is not": (
+        instead("body_contact_force", np.zeros((3, 1, 3))),
+        r"body_contact_force: expected shape \(3, 0, 3\), found \(3, 1, 3\)",
+    ),
+    "moments that are no numbers": (
+        put("bending_moment", (1, 2, 0), np.nan),
+        r"bending_moment: expected finite numbers up to 1e\+30, found nan at index \[1, 2, 0\]",
+    ),
     "no direction": (instead("camera_direction", [0.0, 0.0, 0.0]), "camera_direction: expected a direction"),
 }
-MOVING = ("time", "pos", "twist", "force", "body_pos", "body_quat", "material_points")
+MOVING = (
+    *("time", "pos", "twist", "force", "body_pos", "body_quat", "material_points"),
+    *("tension", "curvature", "twist_density", "bending_moment", "contact_force"),
+    *("kinetic_energy", "gravitational_energy", "bending_energy", "twisting_energy"),
+    *("body_kinetic_energy", "body_gravitational_energy"),
+)
 BODY = {
     "body_pos": np.zeros((3, 1, 3)),
     "body_quat": np.tile([1.0, 0, 0, 0], (3, 1, 1)),

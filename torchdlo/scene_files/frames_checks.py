@@ -12,7 +12,7 @@ from torchdlo.errors import InputError
 from torchdlo.untrusted import one_line
 from torchdlo.untrusted.array_file import Header
 
-__all__ = ["check_headers", "check_values"]
+__all__ = ["check_headers", "check_values", "none_of"]
 
 _SHAPES: dict[str, tuple[str | int, ...]] = {
     "time": ("frames",),
@@ -36,6 +36,18 @@ _SHAPES: dict[str, tuple[str | int, ...]] = {
     "constitutive_model": ("material points",),
     "table": ("tables",),
     "camera_direction": (3,),
+    "tension": ("frames", "vertices"),
+    "curvature": ("frames", "vertices", 3),
+    "twist_density": ("frames", "vertices"),
+    "bending_moment": ("frames", "vertices", 3),
+    "contact_force": ("frames", "vertices", 3),
+    "body_contact_force": ("frames", "bodies", 3),
+    "kinetic_energy": ("frames",),
+    "gravitational_energy": ("frames",),
+    "bending_energy": ("frames",),
+    "twisting_energy": ("frames",),
+    "body_kinetic_energy": ("frames",),
+    "body_gravitational_energy": ("frames",),
 }
 _KINDS = {
     "rope": "iu",
@@ -54,6 +66,17 @@ _WORDS = {
 }
 _FARTHEST = 1e6
 """Largest number that can be drawn [m]."""
+_LARGEST = 1e30
+"""Largest number of what is only read, forces and energies among it."""
+_READ = ("force", "joint_force", *list(_SHAPES)[list(_SHAPES).index("tension") :])
+"""What is only read."""
+
+
+def none_of(name: str, arrays: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Return an array that a file lacks: no frames of it, or all frames of nothing."""
+    counts = {"vertices": len(arrays["rope"]), "bodies": len(arrays["body_shape"]), "joints": 0}
+    shape = [said if isinstance(said, int) else counts[said] for said in _SHAPES[name][1:]]
+    return np.zeros((0 if all(shape) else len(arrays["time"]), *shape))
 
 
 def check_headers(file: Path, headers: Mapping[str, Header], stored: Mapping[str, str]) -> None:
@@ -86,11 +109,12 @@ def check_headers(file: Path, headers: Mapping[str, Header], stored: Mapping[str
 def check_values(file: Path, arrays: Mapping[str, np.ndarray]) -> None:
     """Check what the arrays hold: finite numbers, words that are known, and indices of what there is."""
     for name, array in arrays.items():
-        if array.dtype.kind == "f" and array.size and not np.abs(array).max() <= _FARTHEST:
-            place = np.argwhere(~(np.abs(array) <= _FARTHEST))[0].tolist()
+        most = _LARGEST if name in _READ else _FARTHEST
+        if array.dtype.kind == "f" and array.size and not np.abs(array).max() <= most:
+            place = np.argwhere(~(np.abs(array) <= most))[0].tolist()
             value = float(array[tuple(place)])
             raise InputError(
-                f"{file}: {name}: expected finite numbers up to {_FARTHEST:g}, found {value:g} at index {place}; "
+                f"{file}: {name}: expected finite numbers up to {most:g}, found {value:g} at index {place}; "
                 "simulate the scene again."
             )
     for name, known in _WORDS.items():

@@ -95,7 +95,10 @@ def _checked(kind: Any, given: Any, where: str, place: str) -> Any:
         return _record(kind, given, where, place)
     origin, inner = typing.get_origin(kind), typing.get_args(kind)
     if origin in (types.UnionType, typing.Union):
-        return None if given is None else _checked(inner[0], given, where, place)
+        if given is None and type(None) in inner:
+            return None
+        lists = [one for one in inner if typing.get_origin(one) is tuple and isinstance(given, list)]
+        return _checked((lists or inner)[0], given, where, place)
     if origin is Literal:
         if given not in inner:
             hint = like(given, inner) if isinstance(given, str) else "give it in quotes"

@@ -29,6 +29,12 @@ _LIMITS = {
     "time": 1e9,
     "close": 1e9,
     "release": 1e9,
+    "since": 1e9,
+    "until": 1e9,
+    "force": 1e9,
+    "rest_curvature": 1e9,
+    "rest_twist": 1e9,
+    "initial_twist": 1e9,
     "duration": 1e9,
     "dt": 10.0,
     "scale": 1e9,
@@ -125,7 +131,7 @@ def check_memory(d: SceneDescription, where: str = "scene", frame_stride: int | 
     cure = "use fewer vertices, a shorter duration, a longer dt" + (", or a larger spacing" if points else "")
     work_budget.check(where, ", ".join(parts), memory=state + commands, cure=cure)
     if frame_stride is not None:
-        each = 32.0 * vertices + 24 * held + 56 * (len(d.bodies) + moved) + 12 * points
+        each = 80.0 * vertices + 24 * held + 68 * (len(d.bodies) + moved) + 12 * points
         frames = (steps / frame_stride + 1) * each
         work, cure = f"{steps / frame_stride:.4g} frames", "keep fewer with a larger --frame-stride"
         work_budget.check(where, work, memory=2 * frames, cure=cure)

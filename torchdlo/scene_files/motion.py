@@ -18,10 +18,11 @@ from torchdlo.coupling.bodies.dynamics import BodyTargets, turn_by
 from torchdlo.coupling.common.pose import Pose
 from torchdlo.coupling.robot import inverse_kinematics
 from torchdlo.coupling.robot import robot_kinematics as robots
-from torchdlo.coupling.robot.attachment import Grasp, Hands, carry_attachments, close_hands
+from torchdlo.coupling.robot.attachment import Grasp
 from torchdlo.errors import InputError
 from torchdlo.physics import tree
 from torchdlo.physics.linalg.rotation import multiply
+from torchdlo.scene_files.held_parts import Holds
 from torchdlo.scene_files.schema import Keyframe, RobotSpec, SceneDescription
 
 
@@ -133,8 +134,8 @@ class ControlPlan:
 
     controls: scenes.Control
     """The controls, with time as the first axis; of holds that close later all but the grip."""
-    hands: Hands | None = None
-    """Which holds have which vertices and edges, if some close later."""
+    held: Holds | None = None
+    """Which attachments have which vertices and edges, if some close later."""
     tools: Pose | None = None
     """Where they are at the start and after every step, shapes (T + 1, holds, 3) and (T + 1, holds, 4)."""
     closed: Tensor | None = None
@@ -142,57 +143,50 @@ class ControlPlan:
 
     def follow(self, scene: scenes.Scene) -> Callable[[int, scenes.State], scenes.Control]:
         """Return a function that gives the control of step k from the state before it; steps come in their order."""
-        if self.hands is None:
+        if self.held is None:
             return lambda k, state: tree.map(lambda c: c[k], self.controls)
-        hands, tools, closed = self.hands, tree.part(self.tools), tree.part(self.closed)
+        holds, tools, closed = self.held, tree.part(self.tools), tree.part(self.closed)
         last: list[Grasp | None] = [None]
 
         def control(k: int, state: scenes.State) -> scenes.Control:
             before, after = (tree.map(lambda x, n=n: x[n], tools) for n in (k, k + 1))
-            held = close_hands(scene, hands, scenes.stationary_control(scene, state), before, closed[k], last[0])
+            held = holds.close(scenes.stationary_control(scene, state), before, closed[k], last[0])
             last[0] = held
-            pos, director, attachment_weight = carry_attachments(hands, held, after)
+            pos, director, attachment_weight = holds.carry(held, after)
             usual = tree.map(lambda c: c[k], self.controls)
             return tree.replace(usual, pos=pos, director=director, attachment_weight=attachment_weight)
 
         return control
 
 
-def plan(d: SceneDescription, scene: scenes.Scene, state: scenes.State, armed: list[Arm]) -> ControlPlan:
+def plan(d: SceneDescription, scene: scenes.Scene, state: scenes.State, armed: list[Arm], holds: Holds) -> ControlPlan:
     """Return what is commanded in every step."""
     time, still = times(d), scenes.stationary_control(scene, state)
     bodies = _targets(d, still.bodies, time, state.rods.pos, armed)
     pos, director = (x.expand(len(time), -1, -1) for x in (still.pos, still.director))
     if not d.attachments:
         return ControlPlan(scenes.Control(pos, director, {}, bodies))
-    owners = {
-        part: [k for k, h in enumerate(d.attachments) for _ in getattr(h, part)] for part in ("vertices", "edges")
-    }
-    hands = Hands(len(d.attachments), tuple(owners["vertices"]), tuple(owners["edges"]))
-    tools = _tools(d, hands, still, time, armed)
-    begin = time - d.dt
-    until = time.new_tensor([math.inf if h.release is None else h.release for h in d.attachments])
-    since = time.new_tensor([h.close for h in d.attachments])
-    # Half a step's slack: the sums of steps are not exactly the times that a person writes.
-    closed = ((time[:, None] <= until) & (begin[:, None] >= since - 0.5 * d.dt)).to(still.pos)[..., None]
+    tools = _tools(d, holds, still, time, armed)
+    closed = holds.firm(d, still.pos)
     if any(h.close > 0 for h in d.attachments):
-        return ControlPlan(scenes.Control(pos, director, {}, bodies), hands, tools, closed)
+        return ControlPlan(scenes.Control(pos, director, {}, bodies), holds, tools, closed)
     first, later = (tree.map(lambda x, part=part: x[part], tools) for part in (0, slice(1, None)))
-    held = close_hands(scene, hands, still, first, torch.ones_like(closed[0]))
-    pos, director, attachment_weight = carry_attachments(hands, tree.replace(held, closed=closed), later)
+    held = holds.close(still, first, torch.ones_like(closed[0]))
+    pos, director, attachment_weight = holds.carry(tree.replace(held, closed=closed), later)
     attachment_weight = attachment_weight if any(h.release is not None for h in d.attachments) else {}
     return ControlPlan(scenes.Control(pos, director, attachment_weight, bodies))
 
 
-def _tools(d: SceneDescription, hands: Hands, still: scenes.Control, time: Tensor, armed: list[Arm]) -> Pose:
+def _tools(d: SceneDescription, holds: Holds, still: scenes.Control, time: Tensor, armed: list[Arm]) -> Pose:
     """Return where the holds' tools are at the start and after every step, shapes (T + 1, holds, .)."""
     found, with_start = [], torch.cat([time.new_zeros(1), time])
+    named, owners = holds.vertices.spread(still.pos), holds.vertices.owners
     for k, hold in enumerate(d.attachments):
         if hold.robot is not None:
             found.append(armed[hold.robot].tool)
             continue
         moved = motion(hold.keyframes, hold.path, with_start)
-        found.append(Pose(still.pos[hands.vertices.index(k)].to(moved.pos) + moved.pos, moved.quat))
+        found.append(Pose(named[owners.index(k)].to(moved.pos) + moved.pos, moved.quat))
     pos, quat = (torch.stack([getattr(p, part) for p in found], 1).to(still.pos) for part in ("pos", "quat"))
     return Pose(pos, quat)
 

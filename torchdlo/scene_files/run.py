@@ -11,8 +11,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchdlo import measures, scene_files
 from torchdlo import scene as scenes
-from torchdlo import scene_files
 from torchdlo.errors import InputError
 from torchdlo.files import replace_atomically
 from torchdlo.physics import tree
@@ -40,7 +40,7 @@ class Frames:
     twist: np.ndarray
     """Twist of edges against their reference frames [rad], shape (F, V)."""
     force: np.ndarray
-    """Forces that holds exert on held vertices [N], shape (F, H, 3)."""
+    """Forces that attachments exert on held vertices, each vertex once [N], shape (F, H, 3)."""
     body_pos: np.ndarray
     """Positions of bodies, those of robots' links last [m], shape (F, K, 3)."""
     body_quat: np.ndarray
@@ -75,6 +75,31 @@ class Frames:
     """Direction from the scene to the camera, shape (3,)."""
     joint_force: np.ndarray = field(default_factory=lambda: np.zeros((0, 0, 3)))
     """Forces that joints exert on their ropes [N], shape (F, N, 3); of films that have none, (F, 0, 3)."""
+    tension: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
+    """Tension of the edges after vertices in the last substep [N], shape (F, V). Of this and all that follows there are
+    no frames, (0, ...), in films and in files of older versions."""
+    curvature: np.ndarray = field(default_factory=lambda: np.zeros((0, 0, 3)))
+    """Curvature at vertices, as a vector about which the rope bends [1/m], shape (F, V, 3)."""
+    twist_density: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
+    """Twist at vertices [rad/m], shape (F, V)."""
+    bending_moment: np.ndarray = field(default_factory=lambda: np.zeros((0, 0, 3)))
+    """Bending moment at vertices [N m], shape (F, V, 3)."""
+    contact_force: np.ndarray = field(default_factory=lambda: np.zeros((0, 0, 3)))
+    """What contact exerted on vertices, mean over the last step [N], shape (F, V, 3)."""
+    body_contact_force: np.ndarray = field(default_factory=lambda: np.zeros((0, 0, 3)))
+    """What ropes and particles exerted on bodies, likewise; see `measures.contact_forces` [N], shape (F, K, 3)."""
+    kinetic_energy: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    """Kinetic energy of ropes, half a substep before positions [J], shape (F,)."""
+    gravitational_energy: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    """Energy of the ropes' weight, zero at the origin [J], shape (F,)."""
+    bending_energy: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    """Energy of bending [J], shape (F,)."""
+    twisting_energy: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    """Energy of twisting [J], shape (F,)."""
+    body_kinetic_energy: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    """Kinetic energy of free bodies, half a substep before their poses [J], shape (F,)."""
+    body_gravitational_energy: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    """Energy of their weight, zero at the origin [J], shape (F,)."""
     interrupted: bool = False
     """Whether it was stopped before its end."""
     problem: str = ""
@@ -84,6 +109,17 @@ class Frames:
 _MOVING = ("time", "pos", "twist", "force", "body_pos", "body_quat", "material_points", "joint_force")
 """What `_seen` returns, by the names of `Frames`."""
 
+_ENERGIES = (
+    *("kinetic_energy", "gravitational_energy", "bending_energy", "twisting_energy"),
+    *("body_kinetic_energy", "body_gravitational_energy"),
+)
+_MEASURED = (
+    *("tension", "curvature", "twist_density", "bending_moment", "contact_force", "body_contact_force"),
+    *_ENERGIES,
+)
+"""What `_measured` returns, by the names of `Frames`."""
+_OPTIONAL = ("joint_force", *_MEASURED)
+"""Arrays that a file may lack."""
 _FEW = 50
 """Steps that are not worth recording."""
 
@@ -96,6 +132,29 @@ def _seen(scene: scenes.Scene, state: scenes.State) -> list[np.ndarray]:
     joined = none[:, :3] if scene.joints is None else scenes.joint_forces(scene, state)[0]
     found = (state.time[0, 0], rods.pos, rods.twist[:, 0], state.reaction.force, *bodies, material_points, joined)
     return [x.cpu().numpy().copy() for x in found]
+
+
+def _measured(
+    made: scene_files.Simulation, state: scenes.State, last: tuple[scenes.State, scenes.Control] | None
+) -> list[np.ndarray]:
+    """Return what mechanics says of a state.
+
+    Args:
+        made: what is run.
+        state: it, now.
+        last: the state before the last step, and the control of the step; None at the start, before all contact.
+    """
+    given, pos = (made.scene, made.params, state), state.rods.pos
+    force, body_force = torch.zeros_like(pos), pos.new_zeros(len(made.scene.bodies), 3)
+    if last is not None and any(e.is_contact for e in made.scene.effects):
+        # Contact is found with the motion that it allows, so the step is made once more.
+        push = measures.contact_forces(made.scene, made.params, *last)
+        force, body_force = push.force, push.body_force
+    tension, twist = (measure(*given)[..., 0] for measure in (measures.tension, measures.twist))
+    along = tension, measures.curvature(*given), twist, measures.bending_moment(*given), force, body_force
+    energies = (getattr(measures, name)(*given) for name in _ENERGIES)
+    # Seven digits are enough to look at, and there are many vertices.
+    return [x.to(torch.float32).cpu().numpy() for x in along] + [x.cpu().numpy().copy() for x in energies]
 
 
 def appearance(
@@ -171,11 +230,11 @@ def run(
     control = made.plan.follow(scene)
     total = max(1, round(description.duration / description.dt))
     step = scenes.stepper(scene, execution="eager" if execution == "recorded" and total <= _FEW else execution)
-    kept, interrupted, problem = [_seen(scene, state)], False, ""
     with torch.no_grad():
+        kept, interrupted, problem = [[*_seen(scene, state), *_measured(made, state, None)]], False, ""
         for k in range(total):
-            command = control(k, state)
-            state = step(params, state, command)
+            last = state, control(k, state)
+            state = step(params, *last)
             if (k + 1) % frame_stride and k + 1 < total:
                 continue
             try:
@@ -183,7 +242,7 @@ def run(
             except RuntimeError as error:
                 problem = f"after {float(state.time):g} s: {error}"
                 break
-            kept.append(_seen(scene, state))
+            kept.append([*_seen(scene, state), *_measured(made, state, last)])
             try:
                 if callback is not None:
                     callback("simulate", k + 1, total, f"{float(state.time):.3g} s")
@@ -192,15 +251,16 @@ def run(
                 break
     moving = (np.stack(parts) for parts in zip(*kept, strict=True))
     whole: dict[str, Any] = {**_looks(made, description), "interrupted": interrupted, "problem": problem}
-    whole |= zip(_MOVING, moving, strict=True)
+    whole |= zip((*_MOVING, *_MEASURED), moving, strict=True)
     return Frames(**whole)
 
 
 def save_frames(frames: Frames, path: Path, description: scene_files.SceneDescription | None = None) -> None:
     """Write frames as .npz, with the scene itself as JSON text in "torchdlo_scene", "" if it is not given."""
     arrays: dict[str, Any] = {name: value for name, value in vars(frames).items() if isinstance(value, np.ndarray)}
-    if not frames.joint_force.size:
-        del arrays["joint_force"]
+    for name in _OPTIONAL:
+        if not arrays[name].size:
+            del arrays[name]
     text = "" if description is None else scene_files.text(description)
     with replace_atomically(path) as temporary:
         np.savez_compressed(temporary, torchdlo_scene=np.array(text), **arrays)
@@ -215,8 +275,7 @@ def load_frames(path: str | Path) -> Frames:
     with ArrayFile(file, "the frames of a run", most=MOST, cure=cure) as found:
         stored = {name: _OLDER.get(name, name) for name in names}
         stored = {name: name if name in found.headers else older for name, older in stored.items()}
-        if "joint_force" not in found.headers:
-            names.remove("joint_force")
+        names = [name for name in names if name not in _OPTIONAL or name in found.headers]
         stored = {name: stored[name] for name in names}
         missing = [name for name in names if stored[name] not in found.headers]
         if missing:
@@ -225,5 +284,5 @@ def load_frames(path: str | Path) -> Frames:
         found.check_size(stored.values())
         arrays: dict[str, Any] = {name: found[stored[name]] for name in names}
     frames_checks.check_values(file, arrays)
-    arrays.setdefault("joint_force", np.zeros((len(arrays["time"]), 0, 3)))
+    arrays |= {name: frames_checks.none_of(name, arrays) for name in _OPTIONAL if name not in arrays}
     return Frames(**arrays)

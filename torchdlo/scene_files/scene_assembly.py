@@ -20,16 +20,17 @@ from torchdlo.coupling.robot import robot_kinematics as robots
 from torchdlo.errors import InputError
 from torchdlo.physics import tree
 from torchdlo.scene_files import limits, motion
+from torchdlo.scene_files.checks import check_duration, check_joints, check_keyframes
+from torchdlo.scene_files.held_parts import check_holds, holds_of
 from torchdlo.scene_files.json_files import EFFECTS, like, read
-from torchdlo.scene_files.rope_models import Modelled, with_models
-from torchdlo.scene_files.schema import BodySpec, ParticleBlockSpec, RopeSpec, SceneDescription
+from torchdlo.scene_files.rope_models import with_models
+from torchdlo.scene_files.ropes import hanging_masses, pulling, rope_of, twisted
+from torchdlo.scene_files.schema import BodySpec, ParticleBlockSpec, SceneDescription
 from torchdlo.untrusted import one_line
 
 __all__ = ["Simulation", "assemble", "build", "load"]
 
 _LAWS: dict[str, type[ConstitutiveModel]] = {law.name: law for law in (Elastic, Plastic, Liquid, Sand)}
-_OWN = ("points", "vertices", "model", "hanging_masses")
-"""Entries of a rope that are not fields of `scene.Rope`."""
 _BODY_OWN = ("keyframes", "path", "file", "scale", "cells")
 """Entries of a body that are not fields of `RigidBody`."""
 
@@ -67,7 +68,7 @@ def build(
         folder: where the files that it names are looked for.
     """
     made = assemble(description, folder=folder)
-    if made.plan.hands is not None:
+    if made.plan.held is not None:
         late = next(k for k, h in enumerate(description.attachments) if h.close > 0)
         raise InputError(
             f"attachments[{late}].close: how a hold sits that closes during the run depends on the run; use "
@@ -78,7 +79,7 @@ def build(
 
 _STEPPING = (
     *("dt", "substeps", "integrator", "contact", "twist", "constrained"),
-    *("constraint_iterations", "implicit_weight", "numerical_damping"),
+    *("constraint_iterations", "twist_iterations", "implicit_weight", "numerical_damping"),
 )
 """What a description says of steps, in the words of `scene.Scene`."""
 
@@ -95,7 +96,7 @@ def assemble(description: SceneDescription, *, folder: str | Path = ".") -> Simu
     limits.check_memory(description)
     d, modelled = with_models(description, folder)
     dtype = getattr(torch, d.precision)
-    ropes = [_rope(r, dtype, modelled) for r in d.ropes]
+    ropes = [rope_of(r, k, dtype, modelled) for k, r in enumerate(d.ropes)]
     counts = [r.positions.shape[-2] for r in ropes]
     effects, values = [], {}
     for name, given in d.effects.items():
@@ -103,116 +104,30 @@ def assemble(description: SceneDescription, *, folder: str | Path = ".") -> Simu
         choices = {k: tuple(v) if isinstance(v, (list, tuple)) else v for k, v in given.items() if k not in kind.params}
         effects.append(kind(**choices))
         values[kind.name] = {k: v for k, v in given.items() if k in kind.params}
+    effects += pulling(d, counts)
     meshes = {k: _mesh(b, k, folder) for k, b in enumerate(d.bodies) if b.shape == "mesh"}
     bodies = [_body(b, k, meshes.get(k)) for k, b in enumerate(d.bodies)]
     static = {name: getattr(d, name) for name in _STEPPING}
-    held: dict[str, Any] = {f"prescribed_{part}": _slots(d, counts, part) for part in ("vertices", "edges")}
-    _check_holds(d)
+    check_duration(d)
+    check_keyframes(d)
+    check_joints(d)
+    check_holds(d)
+    holds = holds_of(d, counts)
+    held: dict[str, Any] = {f"prescribed_{part}": getattr(holds, part).slots for part in ("vertices", "edges")}
     armed = motion.arms(d, folder)
     for arm in armed:
         bodies += robots.solids(arm.robot, arm.joints[0])
-    _check_joints(d)
     joints = [scenes.RopeJoint(**vars(joint)) for joint in d.joints]
     held |= {"material_points": _matter(d, dtype), "clamp": d.clamp}
     scene, params, state = scenes.make(ropes, effects, values, bodies=bodies, joints=joints, **held, **static)
-    weight = _weights(d, counts, state.rods.pos)
+    weight = hanging_masses(d, counts, state.rods.pos)
     if bool((weight > 0).any()):
         scene_notices.mention_sweeps(scene.settings, bool(scene.bodies))
     material = tree.replace(params.rods.material, mass=params.rods.material.mass + weight)
     params = tree.replace(params, rods=tree.replace(params.rods, material=material))
     scenes.check_step(scene, params)  # with what hangs on ropes
-    return Simulation(scene, params, state, motion.plan(d, scene, state, armed), meshes, weight)
-
-
-def _check_holds(d: SceneDescription) -> None:
-    for k, hold in enumerate(d.attachments):
-        if d.clamp == "vertex" and (hold.close > 0 or hold.release is not None):
-            raise InputError(
-                f"attachments[{k}]: it is closed or released during the run, and clamp 'vertex' makes the rope stiffer "
-                "where it is held; use clamp 'edge'."
-            )
-        if hold.robot is not None and not 0 <= hold.robot < len(d.robots):
-            raise InputError(
-                f"attachments[{k}].robot: expected the number of a robot, 0 to {len(d.robots) - 1}, given {hold.robot}."
-                if d.robots
-                else f"attachments[{k}].robot: there is no robot in the scene."
-            )
-        if hold.robot is not None and hold.keyframes:
-            raise InputError(
-                f"attachments[{k}].keyframes: the robot moves what it holds; put the keyframes into the robot."
-            )
-        if hold.close < 0:
-            raise InputError(f"attachments[{k}].close: expected a time from 0 on, given {hold.close:g}.")
-
-
-def _check_joints(d: SceneDescription) -> None:
-    for k, joint in enumerate(d.joints):
-        if joint.body is not None and not 0 <= joint.body < len(d.bodies):
-            raise InputError(
-                f"joints[{k}].body: expected the number of a body, 0 to {len(d.bodies) - 1}, given {joint.body}."
-                if d.bodies
-                else f"joints[{k}].body: there is no body in the scene."
-            )
-
-
-def _slots(d: SceneDescription, counts: list[int], part: str) -> tuple[int, ...]:
-    """Return the scene's slots of held vertices or edges: ropes lie one after the other."""
-    slots = []
-    for k, held in enumerate(d.attachments):
-        if not held.vertices:
-            raise InputError(f"attachments[{k}].vertices: is empty; expected at least one.")
-        if not 0 <= held.rope < len(counts):
-            raise InputError(f"attachments[{k}].rope: expected 0 to {len(counts) - 1}, given {held.rope}.")
-        count = counts[held.rope] - (part == "edges" and not d.ropes[held.rope].closed)
-        for number in getattr(held, part):
-            place = f"attachments[{k}].{part}"
-            slots.append(sum(counts[: held.rope]) + _numbered(number, count, place))
-    return tuple(slots)
-
-
-def _numbered(number: int, count: int, place: str) -> int:
-    if not -count <= number < count:
-        raise InputError(f"{place}: expected {-count} to {count - 1}, given {number}.")
-    return number % count
-
-
-def _weights(d: SceneDescription, counts: list[int], like: Tensor) -> Tensor:
-    """Return the masses that hang on vertices [kg], shape (V, 1)."""
-    found = like.new_zeros(sum(counts), 1)
-    for k, rope in enumerate(d.ropes):
-        for j, weight in enumerate(rope.hanging_masses):
-            if weight.mass <= 0:
-                raise InputError(f"ropes[{k}].hanging_masses[{j}].mass: expected more than 0, given {weight.mass:g}.")
-            at = sum(counts[:k]) + _numbered(weight.vertex, counts[k], f"ropes[{k}].hanging_masses[{j}].vertex")
-            found[at] += weight.mass
-    return found
-
-
-def _rope(rope: RopeSpec, dtype: torch.dtype, modelled: Modelled | None = None) -> scenes.Rope:
-    given = {k: v for k, v in vars(rope).items() if k not in _OWN and v is not None}
-    points = torch.tensor(rope.points, dtype=torch.float64).reshape(-1, 3)
-    if rope.vertices is not None:
-        points = _resampled(points, rope, rope.vertices)
-    if modelled is not None:
-        given["rest_curvature"] = modelled.curvature(len(points)).to(dtype)
-        # The calibrated roll is measured from the normal that points up.
-        level = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
-        first = points[1] - points[0]
-        steep = float(first[:2].norm()) < 1e-3 * float(first.norm())
-        given["director"] = (torch.tensor([1.0, 0.0, 0.0]) if steep else level).to(dtype)
-    return scenes.Rope(points.to(dtype), **given)
-
-
-def _resampled(points: Tensor, rope: RopeSpec, vertices: int) -> Tensor:
-    if len(points) < 2 or vertices < 3:
-        raise InputError(f"rope: {len(points)} points and {vertices} vertices; expected at least 2 and 3.")
-    line = torch.cat([points, points[:1]]) if rope.closed else points
-    along = torch.cat([points.new_zeros(1), (line[1:] - line[:-1]).norm(dim=-1).cumsum(0)])
-    count = vertices + rope.closed
-    at = torch.linspace(0, 1, count, dtype=points.dtype)[:vertices] * along[-1]
-    k = (torch.searchsorted(along, at, right=True) - 1).clamp(0, len(line) - 2)
-    share = ((at - along[k]) / (along[k + 1] - along[k]).clamp(min=1e-30))[:, None]
-    return line[k] + share * (line[k + 1] - line[k])
+    state = twisted(d, scene, params, state)
+    return Simulation(scene, params, state, motion.plan(d, scene, state, armed, holds), meshes, weight)
 
 
 def _mesh(body: BodySpec, k: int, folder: Path) -> MeshShape:

@@ -15,6 +15,7 @@ __all__ = [
     "JointSpec",
     "Keyframe",
     "ParticleBlockSpec",
+    "PointForceSpec",
     "RobotSpec",
     "RopeSpec",
     "SceneDescription",
@@ -22,6 +23,9 @@ __all__ = [
 
 Vector = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
+Number = float | tuple[float, ...]
+"""One number, or as many as a rope has vertices: of edges that of the edge after the vertex, of hinges that of the
+vertex. The last edge of an open rope and the hinges at its ends count for nothing."""
 Wall = Literal["open", "separate", "slip", "stick"]
 
 
@@ -38,28 +42,58 @@ class HangingMass:
 
 @with_field_docs
 @dataclass(frozen=True)
+class PointForceSpec:
+    """A force on a vertex that does not change."""
+
+    vertex: int
+    """Number of the vertex; -1 is the last."""
+    force: Vector
+    """Force [N]."""
+    since: float = 0.0
+    """When it begins [s]."""
+    until: float | None = None
+    """When it ends [s], if ever."""
+
+
+@with_field_docs
+@dataclass(frozen=True)
 class RopeSpec:
-    """A rope; fields without a comment are those of `scene.Rope`."""
+    """A rope; fields without a comment are those of `scene.Rope`, where lists are tensors.
+
+    Numbers are the same along the rope, or lists of as many as it has vertices: of edges that of the edge after the
+    vertex, of hinges that of the vertex.
+    """
 
     points: tuple[Vector, ...]
     """Corners of the line along which it lies [m]; its vertices, if `vertices` is not given."""
     vertices: int | None = None
     """How many vertices to place at equal distances along that line."""
-    radius: float = 0.005
+    radius: Number = 0.005
     mass: float | None = None
-    density: float | None = None
-    youngs: float | None = None
-    shear: float | None = None
-    bend: float | None = None
-    bend2: float | None = None
-    twist: float | None = None
-    stretch: float | None = None
+    density: Number | None = None
+    youngs: Number | None = None
+    shear: Number | None = None
+    bend: Number | None = None
+    bend2: Number | None = None
+    twist: Number | None = None
+    stretch: Number | None = None
     closed: bool = False
-    rest: Literal["straight", "as_placed"] = "straight"
+    rest: Literal["straight", "as_placed"] | tuple[Vector, ...] = "straight"
+    rest_curvature: tuple[tuple[float, float], ...] | None = None
+    """One pair for all vertices, or a pair for each [1/m]."""
+    rest_twist: Number | None = None
+    director: Vector | None = None
+    rest_director: Vector | None = None
+    velocities: tuple[Vector, ...] | None = None
+    """One velocity for all vertices, or one for each [m/s]."""
+    initial_twist: Number | None = None
+    """How much an open rope is twisted at the start, beyond its `director` [rad/m]."""
     model: str | None = None
     """Model file of `torchdlo calibrate` or `diagnose`, from which parameters and effects are taken."""
     hanging_masses: tuple[HangingMass, ...] = ()
     """What hangs on it."""
+    point_forces: tuple[PointForceSpec, ...] = ()
+    """What pulls on it."""
 
 
 @with_field_docs
@@ -113,6 +147,7 @@ class BodySpec:
     motion: Literal["free", "fixed", "kinematic"] = "free"
     density: float | None = None
     mass: float | None = None
+    inertia: Vector | None = None
     mu_s: float = 0.3
     mu_k: float = 0.3
     restitution: float = 0.0
@@ -233,6 +268,7 @@ class SceneDescription:
     constrained: bool = True
     constraint_iterations: int | None = None
     """Newton steps for edge lengths per substep, in implicit steps at most; if null, 3 explicit and 8 implicit ones."""
+    twist_iterations: int = 4
     implicit_weight: float = 0.5
     """Share of a substep's change at which implicit steps take stiff forces and tensions."""
     numerical_damping: float = 0.0

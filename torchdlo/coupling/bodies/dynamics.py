@@ -339,7 +339,10 @@ def _described(solid: RigidBody, name: str, like: Tensor) -> tuple[Body, dict[st
             raise ValueError(f"body {name!r}: {sentence}")
 
     def number(what: str, value: Number, width: int, least: float | None = None) -> Tensor:
-        x = value.to(like) if isinstance(value, Tensor) else like.new_tensor(value)
+        try:
+            x = value.to(like) if isinstance(value, Tensor) else like.new_tensor(value)
+        except (TypeError, ValueError, RuntimeError):
+            raise ValueError(f"body {name!r}: {what} is {value!r}; expected numbers") from None
         per_scene = isinstance(value, Tensor) and width == 1 and x.shape[-1:] != (1,)
         x = x.unsqueeze(-1) if x.dim() == 0 or per_scene else x
         need(x.dim() > 0 and x.shape[-1] == width, f"{what} has shape {tuple(x.shape)}; expected (..., {width})")
@@ -371,9 +374,17 @@ def _described(solid: RigidBody, name: str, like: Tensor) -> tuple[Body, dict[st
         row["mass"] = given if solid.mass is not None else given * volume
         own = solid.inertia
         row["inertia"] = row["mass"] * moments if own is None else number("inertia", own, 3, 0.0)
+        third = 2 * row["inertia"].amax(-1) - row["inertia"].sum(-1)
+        solid_like = bool((third <= 1e-5 * row["inertia"].amax(-1)).all())
+        need(solid_like, f"inertia is {row['inertia'].tolist()}; of a solid none is more than the other two together")
     for what, least in (("mu_s", None), ("mu_k", None), ("restitution", None), ("damping", None)):
         row[what] = number(what, getattr(solid, what), 1, least)
         need(bool((row[what] >= 0).all()), f"{what} is {row[what].tolist()}; expected 0 or more")
+    rebound = row["restitution"]
+    need(
+        bool((rebound <= 1).all()),
+        f"restitution is {rebound.tolist()}; expected at most 1, beyond which it gains speed",
+    )
     for what, width in (("pos", 3), ("quat", 4), ("vel", 3), ("omega", 3)):
         row[what] = number(what, getattr(solid, what), width)
     length = safe_norm(row["quat"])

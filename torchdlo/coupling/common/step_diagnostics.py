@@ -99,7 +99,7 @@ def explain_diagnostics(missed: Tensor) -> str:
     if room > 0:
         return (
             f"contact had no room for {room:.0f} pairs of edges, edges or nodes; give a larger `room` to RodContact, "
-            "RodMatter or BodyMatter, whichever has one"
+            "RodMpmCoupling or BodyMpmCoupling, whichever the scene has; SelfContact has a fixed one: take RodContact"
         )
     if beyond > 0:
         return (

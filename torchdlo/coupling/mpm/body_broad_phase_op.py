@@ -20,7 +20,7 @@ from torchdlo.coupling.mpm.particles import Grid
 from torchdlo.coupling.mpm.substep import Nodes
 from torchdlo.physics.linalg.vector_components import axes
 
-_function, ready = scene_packing.kernel("body_near", "BodyMatter, which bodies are near particles")
+_function, ready = scene_packing.kernel("body_near", "BodyMpmCoupling, which bodies are near particles")
 
 
 class _Sizes(ctypes.Structure):

@@ -79,7 +79,7 @@ class BodyMpmCoupling(Effect):
     def __post_init__(self) -> None:
         for name, least in (("sweeps", 1), ("room", 0), ("reach", 0.0), ("recovery", 0.0)):
             if not getattr(self, name) >= least:
-                raise ValueError(f"BodyMatter: {name} is {getattr(self, name)}; expected at least {least}")
+                raise ValueError(f"BodyMpmCoupling: {name} is {getattr(self, name)}; expected at least {least}")
 
     def couple_bodies_to_particles(
         self, motion: PredictedBodyMotion, material_points: PredictedParticles, push: ContactForces

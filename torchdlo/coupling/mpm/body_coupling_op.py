@@ -22,7 +22,7 @@ from torchdlo.physics.linalg.vector_components import axes
 
 _INPUTS = "Tensor vel, Tensor mass, Tensor answer, Tensor solids"
 _OTHERS = "Tensor origin, Tensor chosen, Tensor grids, int[] size, int[] shapes, int[] cells, int sweeps, float[] law"
-_function, ready = scene_packing.kernel("body_nodes", "BodyMatter, what bodies and particles give each other")
+_function, ready = scene_packing.kernel("body_nodes", "BodyMpmCoupling, what bodies and particles give each other")
 
 
 class _Sizes(ctypes.Structure):

@@ -64,7 +64,7 @@ class RodMpmCoupling(Effect):
     def __post_init__(self) -> None:
         for name, least in (("sweeps", 1), ("room", 0), ("thickness", 0.0), ("block", 0), ("near", 0)):
             if not getattr(self, name) >= least:
-                raise ValueError(f"RodMatter: {name} is {getattr(self, name)}; expected at least {least}")
+                raise ValueError(f"RodMpmCoupling: {name} is {getattr(self, name)}; expected at least {least}")
 
     def solve_contact(self, view: View, motion: PredictedMotion, values: Values) -> ContactForces:
         """Return the forces on vertices [N] and what they leave of the matter."""

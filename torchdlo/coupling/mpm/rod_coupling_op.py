@@ -23,7 +23,7 @@ _STATIC = "int[] size, int sweeps, float spacing, float relaxation"
 _COUNT = 10
 _FIXED = (3, 7, 9)
 """Inputs that have no derivative: the first node's place, how far off an edge nodes are felt, and what comes next."""
-_function, ready = scene_packing.kernel("node_sweeps", "RodMatter, the forces of contact")
+_function, ready = scene_packing.kernel("node_sweeps", "RodMpmCoupling, the forces of contact")
 
 
 class _Sizes(ctypes.Structure):

@@ -205,7 +205,7 @@ class RodContact(Effect):
     params: ClassVar[dict[str, Param]] = {
         "mu_s": Param(0.3, 0.0, 2.0, "1", "linear", 0.0, "Coefficient of static friction among ropes."),
         "mu_k": Param(0.3, 0.0, 2.0, "1", "linear", 0.0, "Coefficient of sliding friction among ropes."),
-        "restitution": Param(0.0, 0.0, 1.0, "1", "linear", 0.0, "Speed of parting over speed of approach."),
+        "restitution": Param(0.0, 0.0, 1.0, "1", "linear", 0.0, "Speed of parting over speed of approach.", most=1.0),
     }
 
     def __post_init__(self) -> None:

@@ -21,6 +21,7 @@ from torchdlo.physics.effects.material import (
     VaryingRestCurvature,
 )
 from torchdlo.physics.effects.measurement import MarkerOffset, TimeDelay
+from torchdlo.physics.effects.point_forces import PointForce, PointForces
 from torchdlo.physics.effects.table import Table, TableFriction
 
 EFFECTS: dict[str, type[Effect]] = {
@@ -77,6 +78,8 @@ __all__ = [
     "LinkChain",
     "MarkerOffset",
     "NonuniformStiffness",
+    "PointForce",
+    "PointForces",
     "PointMass",
     "RestCurvature",
     "StiffeningBending",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -71,6 +72,8 @@ class Param:
     """What it is, in one sentence."""
     periodic: bool = False
     """Whether its least and its greatest value mean the same, as those of an angle may."""
+    most: float = math.inf
+    """Greatest value that can be, as of a share."""
 
     def coordinate(self, value: Tensor) -> Tensor:
         """Return what `scale` searches in place of the value."""
@@ -297,6 +300,9 @@ def parameters_of(
                 raise ValueError(f"scene: {effect}.{name} is {number.flatten().tolist()[:3]}; expected finite numbers")
             if declared[effect].params[name].low >= 0 and bool((number < 0).any()):
                 raise ValueError(f"scene: {effect}.{name} is {float(number.min()):g}; expected no negative number")
+            most = declared[effect].params[name].most
+            if bool((number > most).any()):
+                raise ValueError(f"scene: {effect}.{name} is {float(number.max()):g}; expected at most {most:g}")
             numbers[effect][name] = number
     return numbers
 

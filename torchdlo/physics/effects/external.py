@@ -74,6 +74,10 @@ class TiltedGravity(Effect):
 
     def loads(self, view: View, values: Values) -> Values:
         """Return the acceleration that is added."""
+        return {"acceleration": self.added(values)}
+
+    def added(self, values: Values) -> Tensor:
+        """Return the acceleration that is added [m/s^2], shape (..., 1, 3)."""
         angles, g = values["angles"], values["acceleration"]
         axis = torch.cat([angles, torch.zeros_like(angles[..., :1])], -1)
         angle = safe_norm(axis)
@@ -81,7 +85,7 @@ class TiltedGravity(Effect):
         first = torch.sinc(angle / torch.pi)
         second = 0.5 * torch.sinc(0.5 * angle / torch.pi).square()
         turned = cross(axis, g)
-        return {"acceleration": first * turned + second * cross(axis, turned)}
+        return first * turned + second * cross(axis, turned)
 
 
 def _drag(view: View, c_d: Tensor, velocity: Tensor) -> Values:
