@@ -140,3 +140,12 @@ def test_only_the_scenes_of_a_batch_that_overlap_are_moved_and_edges_keep_their_
     assert float(pos[1, :19, 2].min()) > 0.003 * (1 - 2e-3) and float((pos[1] - x[1]).norm(dim=-1).max()) < 0.0045
     length = (pos[:, 1:] - pos[:, :-1]).norm(dim=-1)
     assert float((length / params.rods.rest.length[..., :-1, 0] - 1).abs().max()) < 1e-6
+
+
+def test_a_rope_of_two_edges_has_nothing_to_touch_itself_with():
+    x = torch.zeros(3, 3, dtype=F64)
+    x[:, 0] = torch.linspace(0, 0.1, 3, dtype=F64)
+    made, params, state = make([Rope(x, radius=0.003, mass=0.01, bend=1e-4)], [EFFECTS["bend"](), RodContact()])
+    state = scene.step(made, params, state, scene.stationary_control(made, state))
+    scene.check_state(state)
+    assert torch.equal(state.rods.pos, x)

@@ -178,8 +178,10 @@ def near_pairs(
         pairs = torch.triu_indices(size, size, APART, device=pos.device)
         if len(topology.counts) > 1:
             pairs = torch.triu_indices(size, size, 1, device=pos.device)
+        some = pairs.shape[-1] > 0  # two edges touch no others; there is room for one pair that is none
+        pairs = pairs if some else pairs.new_zeros(2, 1)
         first, second = pairs[0].expand(*batch, -1), pairs[1].expand(*batch, -1)
-        there = torch.ones_like(first, dtype=torch.bool)
+        there = torch.full_like(first, some, dtype=torch.bool)
     else:
         half = 0.5 * safe_norm(after - pos)
         first, second, there, lost = _by_cells(topology, 0.5 * (pos + after), half + radius + reach, row, _rough(room))
