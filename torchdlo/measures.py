@@ -12,6 +12,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torchdlo.coupling.bodies.segment_distance import points_per_edge
+from torchdlo.coupling.rod_body.rod_body_effect import RodBody
+from torchdlo.field_docs import with_field_docs
 from torchdlo.physics import tree
 from torchdlo.physics.effects.base import ContactForces, altered_params
 from torchdlo.physics.effects.bending_models import StiffeningBending
@@ -26,6 +29,7 @@ from torchdlo.physics.effects.elastic import (
 )
 from torchdlo.physics.effects.elastic import curvature as frame_curvature
 from torchdlo.physics.effects.external import Gravity, TiltedGravity
+from torchdlo.physics.integrators import observed_contact
 from torchdlo.physics.linalg.numerics import safe_norm
 from torchdlo.physics.linalg.vector_components import axes, local
 from torchdlo.physics.rod import kinematics
@@ -34,11 +38,13 @@ from torchdlo.physics.rod.topology import preceding
 from torchdlo.scene import Control, Params, Scene, State, step, substep_with_contact
 
 __all__ = [
+    "ContactPartners",
     "bending_energy",
     "bending_moment",
     "body_gravitational_energy",
     "body_kinetic_energy",
     "contact_forces",
+    "contact_partners",
     "curvature",
     "gravitational_energy",
     "kinetic_energy",
@@ -125,9 +131,8 @@ def contact_forces(scene: Scene, params: Params, state: State, control: Control)
     particles, as a force (..., K, 3) [N] and a torque about the centre of mass (..., K, 3) [N m]. What fixed and guided
     bodies bear is added up in explicit steps with `contact="sweeps"` only, and zero in others. Forces of contact are
     found with the motion that they allow, so that they belong to a step and not to a state; the step costs what
-    `scene.step` does. Normal forces and friction are added up. To see what one partner does, leave out the effects of
-    the others. Where there are joints, bodies feel what these exert, too, see `torchdlo.scene.joint_forces`; vertices
-    do not.
+    `scene.step` does. Normal forces and friction are added up; `contact_partners` tells them apart by who exerts them.
+    Where there are joints, bodies feel what these exert, too, see `torchdlo.scene.joint_forces`; vertices do not.
     """
     felt: list[ContactForces] = []
 
@@ -146,6 +151,61 @@ def contact_forces(scene: Scene, params: Params, state: State, control: Control)
 
     count = len(scene.bodies)
     return ContactForces(rows(force, state.rods.pos.shape[-2]), rows(body_force, count), rows(body_torque, count))
+
+
+@with_field_docs
+@tree.struct
+class ContactPartners:
+    """Who exerts what on ropes by contact, the mean over a step."""
+
+    bodies: Tensor
+    """What each body exerts on all ropes [N], fixed and guided ones, too, shape (..., K, 3)."""
+    by_bodies: Tensor
+    """What bodies exert on vertices [N], shape (..., V, 3)."""
+    by_ropes: Tensor
+    """What ropes, or other parts of the same one, exert on vertices [N], shape (..., V, 3)."""
+    by_material_points: Tensor
+    """What matter exerts on vertices [N], shape (..., V, 3)."""
+
+
+_PARTNERS = {
+    **dict.fromkeys(("rod_body", "finger_pads"), "by_bodies"),
+    **dict.fromkeys(("rod_contact", "self_contact"), "by_ropes"),
+    "rod_mpm_coupling": "by_material_points",
+}
+
+
+def contact_partners(scene: Scene, params: Params, state: State, control: Control) -> ContactPartners:
+    """Return between whom forces of contact act in the step from a state to a control, see `contact_forces`.
+
+    Their sum is `contact_forces(...).force`. The step costs what `scene.step` does.
+    """
+    with observed_contact.observe() as seen:
+        step(scene, params, state, control)
+    shape = state.rods.pos.shape
+    zero = state.rods.pos.new_zeros
+    sums = {name: zero(shape) for name in ("by_bodies", "by_ropes", "by_material_points")}
+    of = zero(*shape[:-2], len(scene.bodies), 3)
+    for pushes, solved in zip(seen.pushes, seen.solved, strict=True):
+        for name, push in pushes.items():
+            if name in _PARTNERS:
+                sums[_PARTNERS[name]] = sums[_PARTNERS[name]] + push.force
+                of = of - push.body_force if _PARTNERS[name] == "by_bodies" else of
+        if solved is not None:
+            points, felt = solved.by_bodies()
+            sums["by_bodies"], sums["by_ropes"] = sums["by_bodies"] + felt, sums["by_ropes"] + solved.by_ropes()
+            of = of + _of_bodies(scene, points)
+    many = max(1, len(seen.pushes))
+    return ContactPartners(of / many, *(sums[name] / many for name in ("by_bodies", "by_ropes", "by_material_points")))
+
+
+def _of_bodies(scene: Scene, points: Tensor) -> Tensor:
+    """Return the sum over the points (..., F, V, 3) of each body, shape (..., K, 3)."""
+    pieces = next((e.pieces for e in scene.effects if isinstance(e, RodBody)), None)
+    if pieces is None:
+        return points.new_zeros(*points.shape[:-3], len(scene.bodies), 3)
+    counts = [points_per_edge(b, pieces) for b in scene.bodies]
+    return torch.stack([x.sum((-3, -2)) for x in points.split(counts, -3)], -2)
 
 
 def _fall(scene: Scene, params: Params, like: Tensor) -> Tensor:

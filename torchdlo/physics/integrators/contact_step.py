@@ -26,6 +26,7 @@ from torchdlo.physics.constraints.contact_penalty import HARD, Pairs, Touch
 from torchdlo.physics.constraints.edge_lengths import Inertia, Lengths, LengthSystem, saddle_order
 from torchdlo.physics.constraints.joint_points import JointPoints
 from torchdlo.physics.integrators import contact_kernel
+from torchdlo.physics.integrators.observed_contact import SolvedContact, observing
 from torchdlo.physics.linalg import banded, gather_scatter, low_rank
 from torchdlo.physics.linalg.numerics import added, dot
 from torchdlo.physics.rod.topology import Topology, following, parse, preceding
@@ -318,10 +319,17 @@ def solve_contact_step(touching: Touching, tension: Tensor) -> tuple[Tensor, ...
     """
     system = touching.system
     if touching.joints is None and contact_kernel.available(system.force):
-        pos, tension, force, exerted, wrench, left = _searched(touching, tension, True)[4:]
+        *_, hard, pos, pulled, force, exerted, wrench, left = _searched(touching, tension, True)
+        if (asked := observing()) is not None:
+            turned = torch.linalg.solve(touching.touch.resist, wrench.unsqueeze(-1)).squeeze(-1)
+            asked.solve(SolvedContact(touching, touching.firm(tension, hard), pos, turned))
+        tension = pulled
         return pos, tension, force, exerted, wrench, left.detach(), wrench[..., :0, :3], wrench
     with torch.no_grad():
         pos, pulled, bodies, hard, tied, *after = _searched(touching, tension)
+    if (asked := observing()) is not None:
+        ends = (after[0], after[7]) if after else (pos, bodies)
+        asked.solve(SolvedContact(touching, touching.firm(tension, hard), *ends))
     if after and not torch.is_grad_enabled():
         return tuple(after)
     firm = touching.firm(tension, hard)

@@ -27,6 +27,7 @@ from torchdlo.physics.constraints.joint_points import JointForces, JointPoints, 
 from torchdlo.physics.effects import base as effect
 from torchdlo.physics.effects.base import ContactForces, Effect, PredictedMotion, Values
 from torchdlo.physics.integrators import contact_step
+from torchdlo.physics.integrators.observed_contact import observing
 from torchdlo.physics.kernels import lanes
 from torchdlo.physics.linalg import rotation
 from torchdlo.physics.linalg.numerics import normalize, wrap
@@ -298,6 +299,8 @@ def _answered(
         else:
             pos, tension, held = _translate(settings, now, loads, pushed, targets, tension)
         aimed = pos - answer * total.force
+    if (asked := observing()) is not None:
+        asked.end({name: push for name, push in pushes.items() if name != solved})
     return pos, tension, held, total
 
 
