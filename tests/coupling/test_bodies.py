@@ -168,7 +168,7 @@ def test_bad_bodies_are_refused_with_what_is_expected(solid, words):
 
 
 def test_bad_scenes_and_controls_are_refused():
-    with pytest.raises(ValueError, match="no bodies"):
+    with pytest.raises(ValueError, match="there are none"):
         scene_of(effects=(RodBody(),))
     with pytest.raises(ValueError, match="rename one"):
         scene_of(RigidBody("plane", motion="fixed", name="a"), RigidBody("sphere", 0.1, motion="fixed", name="a"))

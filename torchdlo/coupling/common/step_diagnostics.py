@@ -18,7 +18,7 @@ from torchdlo.physics.rod.topology import following
 STRAIN = 0.05
 """By what share of its length an edge may be too short or too long before it counts; lengths are kept to 1e-5 and
 better."""
-YIELDING = 1e-3
+YIELDING = 5e-3
 """By what share of its length an edge may give way because its tension is more than its steps can hold, likewise."""
 UNSOLVED = 0.02
 """What share of the forces a step with coupled contact may leave unbalanced before it counts."""
