@@ -113,7 +113,7 @@ def explain_diagnostics(missed: Tensor) -> str:
         )
     if others and others[0] > 0:
         return (
-            f"an edge became {others[0]:.1%} longer than it has to be: a rope was pulled beyond its length, moved too "
+            f"an edge became {others[0]:.{0 if others[0] > STRAIN else 1}%} longer than it has to be: a rope was pulled beyond its length, moved too "
             "far within a step, or carries more than its steps can hold; move what holds it more slowly, take shorter "
             "substeps or integrator='implicit', or give it a finite `stretch`"
         )
