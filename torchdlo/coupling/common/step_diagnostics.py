@@ -87,10 +87,11 @@ def _strained(scene: Any, params: Any, rods: RodState) -> Tensor:
     long = (safe_norm(edge) / wanted.clamp(min=tiny(wanted)) - 1) * wanted.new_tensor(solved).unsqueeze(-1)
     mass, settings = changed.material.mass, scene.settings
     cap = yield_shares(settings.coupled)[0] * changed.rest.length * torch.minimum(mass, following(scene.topology, mass))
-    gives = (rods.tension * settings.dt**2 >= cap) & (long > YIELDING)
-    most = torch.cat([(-long).amax(-2, keepdim=True), long.amax(-2, keepdim=True)], -1)
-    told = torch.cat([torch.zeros_like(gives[..., :1, :]), gives.any(-2, keepdim=True)], -1)
-    return torch.where((most > STRAIN) | told, most, 0.0)
+    # No flags are put together with flags: compilers of graphs make code of that which does not compile.
+    gives = ((rods.tension * settings.dt**2 >= cap) & (long > YIELDING)).to(long).amax(-2, keepdim=True)
+    short, longest = (-long).amax(-2, keepdim=True), long.amax(-2, keepdim=True)
+    told = (longest > STRAIN) | (gives > 0)
+    return torch.cat([torch.where(short > STRAIN, short, 0.0), torch.where(told, longest, 0.0)], -1)
 
 
 def explain_diagnostics(missed: Tensor) -> str:
@@ -112,8 +113,9 @@ def explain_diagnostics(missed: Tensor) -> str:
             "jerked; lay it in a slight bend, move what holds it more slowly, or give it a finite `stretch`"
         )
     if others and others[0] > 0:
+        share = f"{others[0]:.0%}" if others[0] > STRAIN else f"{others[0]:.1%}"
         return (
-            f"an edge became {others[0]:.{0 if others[0] > STRAIN else 1}%} longer than it has to be: a rope was pulled beyond its length, moved too "
+            f"an edge became {share} longer than it has to be: a rope was pulled beyond its length, moved too "
             "far within a step, or carries more than its steps can hold; move what holds it more slowly, take shorter "
             "substeps or integrator='implicit', or give it a finite `stretch`"
         )
