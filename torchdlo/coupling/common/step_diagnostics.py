@@ -18,8 +18,9 @@ from torchdlo.physics.rod.topology import following
 STRAIN = 0.05
 """By what share of its length an edge may be too short or too long before it counts; lengths are kept to 1e-5 and
 better."""
-YIELDING = 5e-3
-"""By what share of its length an edge may give way because its tension is more than its steps can hold, likewise."""
+YIELDING = 0.02
+"""By what share of its length an edge may give way because its tension is more than its steps can hold, likewise; hits
+of taut ropes leave less."""
 UNSOLVED = 0.02
 """What share of the forces a step with coupled contact may leave unbalanced before it counts."""
 WIDTH = 5
