@@ -331,6 +331,12 @@ def place_bodies(solids: Sequence[RigidBody], like: Tensor) -> tuple[tuple[Body,
     return tuple(bodies), BodyParams(**packed), BodyState(**state)
 
 
+def _of_a_solid(inertia: Tensor) -> bool:
+    """Return whether no moment of inertia is more than the other two together."""
+    most = inertia.amax(-1)
+    return bool((2 * most - inertia.sum(-1) <= 1e-5 * most).all())
+
+
 def _described(solid: RigidBody, name: str, like: Tensor) -> tuple[Body, dict[str, Tensor]]:
     """Return the static side of a solid and its numbers, shape (..., C) each."""
 
@@ -365,8 +371,7 @@ def _described(solid: RigidBody, name: str, like: Tensor) -> tuple[Body, dict[st
     row["balls"] = like.new_zeros(0) if solid.balls is None else solid.balls.to(like).flatten(-2)
     row["mass"], row["inertia"] = like.new_ones(1), like.new_ones(3)
     if free:
-        one = (solid.mass is None) != (solid.density is None)
-        need(one, "give a free body either mass or density")
+        need((solid.mass is None) != (solid.density is None), "give a free body either mass or density")
         whole = solid.inertia is not None and solid.mass is not None
         volume, moments = (size[..., :1], size) if whole else shape_sdf.bulk(solid.shape, size)
         heavy = solid.density if solid.mass is None else solid.mass
@@ -374,17 +379,12 @@ def _described(solid: RigidBody, name: str, like: Tensor) -> tuple[Body, dict[st
         row["mass"] = given if solid.mass is not None else given * volume
         own = solid.inertia
         row["inertia"] = row["mass"] * moments if own is None else number("inertia", own, 3, 0.0)
-        third = 2 * row["inertia"].amax(-1) - row["inertia"].sum(-1)
-        solid_like = bool((third <= 1e-5 * row["inertia"].amax(-1)).all())
-        need(solid_like, f"inertia is {row['inertia'].tolist()}; of a solid none is more than the other two together")
+        need(_of_a_solid(row["inertia"]), f"inertia is {row['inertia'].tolist()}; none of a solid exceeds both others")
     for what, least in (("mu_s", None), ("mu_k", None), ("restitution", None), ("damping", None)):
         row[what] = number(what, getattr(solid, what), 1, least)
         need(bool((row[what] >= 0).all()), f"{what} is {row[what].tolist()}; expected 0 or more")
-    rebound = row["restitution"]
-    need(
-        bool((rebound <= 1).all()),
-        f"restitution is {rebound.tolist()}; expected at most 1, beyond which it gains speed",
-    )
+    gains = f"restitution is {row['restitution'].tolist()}; expected at most 1, beyond which it gains speed"
+    need(bool((row["restitution"] <= 1).all()), gains)
     for what, width in (("pos", 3), ("quat", 4), ("vel", 3), ("omega", 3)):
         row[what] = number(what, getattr(solid, what), width)
     length = safe_norm(row["quat"])

@@ -15,7 +15,7 @@ from torchdlo.physics.effects.base import ContactForces
 if TYPE_CHECKING:
     from torchdlo.physics.integrators.contact_step import Touching
 
-__all__ = ["ObservedContact", "SolvedContact", "observe", "observing"]
+__all__ = ["ObservedContact", "SolvedContact", "observe", "observing", "told"]
 
 
 @dataclass(frozen=True)
@@ -71,6 +71,17 @@ _observers: list[ObservedContact] = []
 def observing() -> ObservedContact | None:
     """Return who asks, if anybody does. Recorded and compiled steps tell nothing."""
     return _observers[-1] if _observers else None
+
+
+def told(pushes: dict[str, ContactForces], solved: str) -> None:
+    """Tell who asks what a substep came to.
+
+    Args:
+        pushes: what was exerted, by the names of effects.
+        solved: name of what was solved together with lengths, which is told by itself.
+    """
+    if (asked := observing()) is not None:
+        asked.end({name: push for name, push in pushes.items() if name != solved})
 
 
 @contextlib.contextmanager

@@ -27,7 +27,7 @@ from torchdlo.physics.constraints.joint_points import JointForces, JointPoints, 
 from torchdlo.physics.effects import base as effect
 from torchdlo.physics.effects.base import ContactForces, Effect, PredictedMotion, Values
 from torchdlo.physics.integrators import contact_step
-from torchdlo.physics.integrators.observed_contact import observing
+from torchdlo.physics.integrators.observed_contact import told
 from torchdlo.physics.kernels import lanes
 from torchdlo.physics.linalg import rotation
 from torchdlo.physics.linalg.numerics import normalize, wrap
@@ -275,8 +275,7 @@ def _answered(
             found = e.solve_contact(now, motion, values[e.name])
             pushes[e.name] = found if isinstance(found, ContactForces) else ContactForces(found, none, none)
         total = ContactForces(none, none, none)
-        for push in (push for name, push in pushes.items() if name != solved):
-            total = total.plus(push)
+        total = functools.reduce(ContactForces.plus, (p for name, p in pushes.items() if name != solved), total)
         pushed = dataclasses.replace(kick, force=kick.force + total.force)
         if engaged or joints is not None:
             change = aimed - now.state.pos + answer * total.force
@@ -299,8 +298,7 @@ def _answered(
         else:
             pos, tension, held = _translate(settings, now, loads, pushed, targets, tension)
         aimed = pos - answer * total.force
-    if (asked := observing()) is not None:
-        asked.end({name: push for name, push in pushes.items() if name != solved})
+    told(pushes, solved)
     return pos, tension, held, total
 
 
