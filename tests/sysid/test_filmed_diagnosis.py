@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,6 +17,8 @@ from torchdlo.sysid.diagnosis.effect_search import diagnose
 from torchdlo.sysid.diagnosis.findings import findings_json, model_json, summary
 from torchdlo.sysid.recordings.recording import load_recording
 from torchdlo.sysid.video import filmed_diagnosis
+from torchdlo.sysid.video.filmed_model import FilmedModel
+from torchdlo.sysid.video.filmed_problem import FilmedProblem
 from torchdlo.sysid.video.filming import film_recording
 from torchdlo.vision.camera import looking_at
 from torchdlo.vision.film import FilmLook
@@ -40,3 +44,22 @@ def test_a_diagnosis_of_films_says_what_it_found(tmp_path: Path, monkeypatch: py
     assert set(content["baseline"]) == {"bending_stiffness", "twisting_stiffness", "damping_rate"}
     assert len(content["cameras"]) == 8 and json.loads(model_json(found))["parameters"]
     assert summary(found, recording) in page.diagnosis_html(found, recording).replace("&#x27;", "'")
+
+
+def test_fits_leave_models_and_starts_as_they_are(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In this process models are shared between fits, in others each has its own: both have to come to the same."""
+    none: Any = None
+    own, test = (FilmedProblem(none, (), none, none, none, (), np.zeros(0), {}) for _ in range(2))
+
+    def fitted(problem: FilmedProblem, raw: np.ndarray, iterations: int) -> Any:
+        problem.offset = np.ones((1, iterations))
+        return "better"
+
+    monkeypatch.setattr(filmed_diagnosis, "fit", fitted)
+    model = FilmedModel(own, SimpleNamespace(raw=np.zeros(1)), test)
+    found = filmed_diagnosis._fitted_on(model, 3)
+    found.test.offset = np.ones((1, 2))
+    assert found.fit == "better" and found.own.offset.shape == (1, 3)
+    assert own.offset.size == test.offset.size == 0 and model.own is own and model.test is test
+    alone = filmed_diagnosis._fitted_on(FilmedModel(own, model.fit, own), 3)
+    assert alone.test is alone.own

@@ -162,6 +162,8 @@ class Felt:
     """Force and torque on free bodies [N s^2, N m s^2], shape (..., J, 6)."""
     parts: tuple[Tensor, ...]
     """Numbers of points [-] that `gradients` reads, shapes (...)."""
+    points: Tensor
+    """Force on edges at each point [N s^2], shape (..., F, V, 3)."""
 
 
 def _column(x: Tensor) -> Tensor:
@@ -217,35 +219,6 @@ def feel(
         dt: substep [s].
     """
     first, second, body = linear
-    force, parts = _felt(topology, touch, linear, firm, y, q, dt)
-    exerted = preceding(topology, _times(second.mT, force).sum(-3))
-    wrench = torch.einsum("...fvi,fj->...ji", _times(body.mT, force), touch.of)
-    return Felt(_times(first.mT, force).sum(-3) + exerted, wrench, parts)
-
-
-def point_forces(
-    topology: Topology,
-    touch: Touch,
-    linear: tuple[Tensor, ...],
-    firm: Tensor,
-    y: Tensor,
-    q: Tensor,
-    dt: float,
-) -> Tensor:
-    """Return what bodies exert on the points, times `scale` [N s^2], shape (..., F, V, 3); arguments as of `feel`."""
-    return _felt(topology, touch, linear, firm, y, q, dt)[0]
-
-
-def _felt(
-    topology: Topology,
-    touch: Touch,
-    linear: tuple[Tensor, ...],
-    firm: Tensor,
-    y: Tensor,
-    q: Tensor,
-    dt: float,
-) -> tuple[Tensor, tuple[Tensor, ...]]:
-    first, second, body = linear
     n = touch.normal
     ends = y.unsqueeze(-3), following(topology, y).unsqueeze(-3)
     moved = touch.given + _times(first, ends[0]) + _times(second, ends[1])
@@ -254,7 +227,10 @@ def _felt(
     along = dot(n, moved)
     slip = moved - n * along
     normal, drag, parts = _law(touch.wanted, along, slip, firm, touch.radius, touch.mu, touch.real, dt)
-    return normal * n - drag * slip, parts
+    force = normal * n - drag * slip
+    exerted = preceding(topology, _times(second.mT, force).sum(-3))
+    wrench = torch.einsum("...fvi,fj->...ji", _times(body.mT, force), touch.of)
+    return Felt(_times(first.mT, force).sum(-3) + exerted, wrench, parts, force)
 
 
 def _law(

@@ -35,9 +35,8 @@ class SolvedContact:
         system, touch, dt = self.touching.system, self.touching.touch, self.touching.dt
         topology, linear = system.lengths.topology, contact_penalty.maps(touch)
         moved = self.pos - self.touching.origin
-        force = contact_penalty.point_forces(topology, touch, linear, self.firm, moved, self.bodies, dt)
         felt = contact_penalty.feel(topology, touch, linear, self.firm, moved, self.bodies, dt)
-        return force / system.scale.unsqueeze(-3), felt.force / system.scale
+        return felt.points / system.scale.unsqueeze(-3), felt.force / system.scale
 
     def by_ropes(self) -> Tensor:
         """Return what ropes exert on each other [N], shape (..., V, 3)."""

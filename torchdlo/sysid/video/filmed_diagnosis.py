@@ -316,7 +316,8 @@ def _fitted_on(model: FilmedModel, iterations: int) -> FilmedModel:
     """Return a model with a better fit; the given one and its starts stay what they are."""
     own = replace(model.own)
     found = fit(own, model.fit.raw, iterations)
-    return replace(model, own=own, fit=found, test=own if model.test is model.own else model.test)
+    # Starts of test trials are fitted when they are asked for, and kept where they were found.
+    return replace(model, own=own, fit=found, test=own if model.test is model.own else replace(model.test))
 
 
 def _dosed(base: FilmedModel, score: Score, dose: dict[str, float], raw: np.ndarray) -> FilmedModel:
