@@ -74,7 +74,7 @@ def test_a_photograph_is_a_rope_at_rest_of_which_stretches_are_left_out(made: Pa
     (train, notes), (test, _) = (views_of(recording, trials) for trials in (recording.train, recording.test))
     seen = [np.isfinite(v[0].places[0, 0]).all(1) for v in (train, test)]
     assert not (seen[0] & seen[1]).any() and 60 < seen[0].sum() < 130 and 60 < seen[1].sum() < 130 and not notes
-    assert start_of(RopeModel(recording, vertices=41, workers=1), recording.train, train).at_rest.all()
+    assert start_of(RopeModel(recording, vertices=41), recording.train, train).at_rest.all()
 
 
 def test_a_centre_line_is_ordered_from_where_it_begins() -> None:
