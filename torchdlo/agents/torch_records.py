@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import io
 import pickle
 import zipfile
@@ -9,11 +10,12 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from torchdlo.files import write_atomically
 from torchdlo.journal import pack, read_record
 
-__all__ = ["ARCHIVE", "load_checkpoint", "packed", "save_checkpoint", "unpacked"]
+__all__ = ["ARCHIVE", "load_checkpoint", "packed", "save_checkpoint", "tensors_hash", "unpacked"]
 
 ARCHIVE = (b"PK",)
 """How archives of torch begin; earlier versions wrote them without a hash."""
@@ -59,3 +61,11 @@ def load_checkpoint(file: Path) -> dict[str, Any] | None:
     """Return what `save_checkpoint` wrote, None if it is not there whole."""
     content = read_record(file, old=ARCHIVE)
     return None if content is None else unpacked(content)
+
+
+def tensors_hash(*tensors: Tensor) -> str:
+    """Return what tells the numbers and shapes of tensors from others: 16 digits of their SHA-256."""
+    found = hashlib.sha256()
+    for x in tensors:
+        found.update(str(tuple(x.shape)).encode() + x.detach().cpu().double().contiguous().numpy().tobytes())
+    return found.hexdigest()[:16]

@@ -83,6 +83,63 @@ def test_a_search_for_a_robust_path_is_repeatable_and_goes_on(tmp_path: Path, di
     assert (told, count) == (log, played)
 
 
+def elsewhere(file: Path, name: str, off: float) -> Path:
+    """The same trajectory with tools that are so much higher at the end [m]."""
+    content = json.loads(file.read_text())
+    for k, places in enumerate(content["tool"]):
+        places[0][2] += off * (k + 1) / len(content["tool"])
+    (file.parents[1] / name).mkdir()
+    other = file.parents[1] / name / "trajectory.json"
+    other.write_text(json.dumps(content))
+    return other
+
+
+def searched(files: list[Path], folder: Path, **choices) -> dict:
+    """What the first stage alone notes."""
+    plan = replace(PLAN, generations=1)
+    _, notes = train_hybrid(Lead(), files, settings(), folder=folder, plan=plan, stages=("robust",), **choices)
+    return {k: v for k, v in notes["robust"].items() if k in ("episodes", "log")}
+
+
+def test_a_journal_of_scores_belongs_to_its_trajectories(tmp_path: Path):
+    first = found(tmp_path)
+    second, third = elsewhere(first, "second", 0.01), elsewhere(first, "third", 0.02)
+    other = searched([first], tmp_path / "run")
+    again = searched([second], tmp_path / "run")
+    assert again == searched([second], tmp_path / "fresh")
+    assert again["log"][0]["returns"] != other["log"][0]["returns"]
+    # Two where there was one, also with what a search that was killed has left.
+    (tmp_path / "run" / "expert.json").unlink()
+    (tmp_path / "run" / "stages.json").unlink()
+    both = searched([second, third], tmp_path / "run", resume=True)
+    assert len([row for row in both["log"] if "source" in row]) == 4
+    # Before, journals did not say whose scores they are.
+    journal = tmp_path / "run" / "robust.json"
+    content = json.loads(journal.read_text())
+    journal.write_text(json.dumps(content | {"choices": content["choices"][:7]}))
+    (tmp_path / "run" / "expert.json").unlink()
+    (tmp_path / "run" / "stages.json").unlink()
+    assert searched([second, third], tmp_path / "run", resume=True) == both
+
+
+def test_a_run_that_is_not_resumed_begins_afresh(tmp_path: Path):
+    plan, folder = replace(PLAN, generations=0, updates=20), tmp_path / "run"
+    train_hybrid(Lead(), [found(tmp_path)], settings(), folder=folder, plan=plan, stages=("clone",))
+
+    def stop(stage: str, *_) -> None:
+        if stage == "robust":
+            raise KeyboardInterrupt
+
+    with pytest.raises(InputError, match="no trajectory that succeeds"):
+        train_hybrid(Lead(), [], settings(), folder=folder, plan=plan)
+    assert (folder / "clone.pt").is_file() and (folder / "expert.json").is_file()
+    with pytest.raises(KeyboardInterrupt):
+        train_hybrid(Lead(), [found(tmp_path)], settings(), folder=folder, plan=plan, callback=stop)
+    # Going on must not take what the first run has made.
+    left = {file.name for file in folder.iterdir()}
+    assert "policy.pt" in left and not left & {"expert.json", "clone.pt", "stages.json", "clone.part"}
+
+
 class Vain(Lead):
     """Nothing succeeds here."""
 

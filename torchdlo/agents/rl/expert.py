@@ -20,6 +20,8 @@ import torch
 from torch import Tensor
 
 from torchdlo.agents.rl.episodes import TaskEpisodes
+from torchdlo.agents.torch_records import tensors_hash
+from torchdlo.agents.trajopt.search_journal import code_versions
 from torchdlo.agents.trajopt.search_result import read_trajectory
 from torchdlo.envs import Task
 from torchdlo.errors import InputError
@@ -31,6 +33,8 @@ __all__ = [
     "Expert",
     "ExpertScore",
     "candidate_experts",
+    "check_experts",
+    "expert_hash",
     "follow_experts",
     "improve_expert",
     "load_expert",
@@ -122,6 +126,17 @@ def candidate_experts(task: Task, trajectories: list[Path]) -> list[Expert]:
             found.append(Expert(path, still, f"{file.parent.name}, same places"))
             found.append(Expert(path, along, f"{file.parent.name}, moved along"))
     return found
+
+
+def expert_hash(expert: Expert) -> str:
+    """Return what tells the path and the gains of an expert from those of others."""
+    return tensors_hash(expert.path, expert.gain)
+
+
+def check_experts(task: Task, experts: list[Expert]) -> None:
+    """Refuse to begin with nothing."""
+    if not experts:
+        raise InputError(f"{task.name}: there is no trajectory that succeeds; search one with torchdlo optimize first.")
 
 
 class _Journal:
@@ -254,15 +269,16 @@ def improve_expert(
         judged: the task itself where `task` is its surrogate: what the search found has to be better there.
         disturbed: by how much friction and stiffness vary from episode to episode, as shares of their own; in
             the search it grows from nothing over the first half of the generations.
-        journal: file that keeps how candidates did; a search that finds one of the same choices goes on from there.
+        journal: file that keeps how candidates did; a search of the same choices, experts and versions goes on from
+            there.
         callback: told (stage, generations done, all, message).
     """
     began, told = time.monotonic(), callback or (lambda *_: None)
-    if not experts:
-        raise InputError(f"{task.name}: there is no trajectory that succeeds; search one with torchdlo optimize first.")
+    check_experts(task, experts)
     choices = [task.name, task.fidelity.text, seed, starts, population, sigma, noise]
     choices += [] if judged is None else [judged.fidelity.text]
     choices += [disturbed, generations] if disturbed else []
+    choices += [*map(expert_hash, experts), code_versions()]
     kept = _Journal(journal, choices)
     arena = _Arena(task, seed, noise, kept)
     final = arena if judged is None else _Arena(judged, seed, noise, kept)

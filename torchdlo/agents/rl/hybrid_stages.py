@@ -23,7 +23,14 @@ import torch
 from torchdlo.agents.policies import Policy, PolicySpec, load_policy, save_policy, task_features
 from torchdlo.agents.rl.clone import Labels, fit_clone, label_batch
 from torchdlo.agents.rl.episodes import TaskEpisodes
-from torchdlo.agents.rl.expert import Expert, candidate_experts, improve_expert, load_expert, save_expert
+from torchdlo.agents.rl.expert import (
+    Expert,
+    candidate_experts,
+    check_experts,
+    improve_expert,
+    load_expert,
+    save_expert,
+)
 from torchdlo.agents.rl.ppo import Ppo
 from torchdlo.agents.rl.rollout import collect_episodes
 from torchdlo.agents.rl.settings import TrainingSettings
@@ -97,6 +104,21 @@ def plan_of(task: str, **given: Any) -> Hybrid:
     return Hybrid(**(_PLANS.get(task, {}) | wanted))
 
 
+@dataclass(frozen=True)
+class _Run:
+    """What all stages of a run share."""
+
+    task: Task
+    settings: TrainingSettings
+    plan: Hybrid
+    folder: Path
+    stages: Sequence[str]
+    resume: bool
+    told: Callback
+    notes: dict[str, Any]
+    """What stages came to."""
+
+
 def task_policy(task: Task, settings: TrainingSettings, **choices: Any) -> Policy:
     """Return a new policy for a task; `choices` are fields of `PolicySpec`."""
     arms = task.arms.count
@@ -145,14 +167,18 @@ def train_hybrid(
     plan, told = plan or plan_of(task.name), callback or (lambda *_: None)
     notes: dict[str, Any] = _notes(folder) if resume else {}
     notes |= {"plan": asdict(plan), "settings": asdict(settings), "coarse": task.coarse.plain()}
+    run = _Run(task, settings, plan, folder, stages, resume, told, notes)
+    experts = candidate_experts(task, list(trajectories))
+    if not resume:
+        _begin_afresh(run, experts, expert)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(settings.seed)
-        chosen = _robust(task, trajectories, settings, plan, folder, stages, expert, resume, notes, told)
+        chosen = _robust(run, experts, expert)
         _note(folder, notes)
-        policy = _clone(task, chosen, settings, plan, folder, stages, resume, notes, told)
+        policy = _clone(run, chosen)
         _note(folder, notes)
         if "tune" in stages:
-            policy = _tune(task, policy, settings, plan, folder, resume, notes, told)
+            policy = _tune(run, policy)
     _finish(policy, folder, notes)
     return policy, notes
 
@@ -174,31 +200,40 @@ def _episodes(notes: dict[str, Any]) -> int:
     return sum(notes[name]["episodes"] for name in STAGES if name in notes)
 
 
-def _robust(
-    task: Task,
-    trajectories: Sequence[Path],
-    settings: TrainingSettings,
-    plan: Hybrid,
-    folder: Path,
-    stages: Sequence[str],
-    given: Path | None,
-    resume: bool,
-    notes: dict[str, Any],
-    told: Callback,
-) -> Expert | None:
-    file = given or folder / "expert.json"
-    if (given is not None or resume) and file.is_file():
-        return load_expert(file, task)
-    if "robust" not in stages and (folder / "clone.pt").is_file():
-        return None
+def _begin_afresh(run: _Run, experts: list[Expert], given: Path | None) -> None:
+    """Remove what an earlier run left of the stages that are to run, so that nothing goes on from it."""
+    old = ["robust.json", "clone.part", "tune.part", "stages.json"]
+    if _searches(run, given):
+        check_experts(run.task, experts)
+        old.append("expert.json")
+    if "clone" in run.stages:
+        old.append("clone.pt")
+    for name in old:
+        (run.folder / name).unlink(missing_ok=True)
+
+
+def _searches(run: _Run, given: Path | None) -> bool:
+    """Return whether the first stage makes an expert, instead of taking one that is there, or none."""
+    if given is not None and given.is_file():
+        return False
+    if run.resume and (run.folder / "expert.json").is_file():
+        return False
+    return "robust" in run.stages or not (run.folder / "clone.pt").is_file()
+
+
+def _robust(run: _Run, experts: list[Expert], given: Path | None) -> Expert | None:
+    task, plan, folder = run.task, run.plan, run.folder
+    if not _searches(run, given):
+        file = given or folder / "expert.json"
+        return load_expert(file, task) if given is not None or (run.resume and file.is_file()) else None
     began = time.process_time()
-    generations = plan.generations if "robust" in stages else 0
+    generations = plan.generations if "robust" in run.stages else 0
     coarse = with_fidelity(task, task.coarse)
     surrogate = coarse.surrogate()
     found, log, played = improve_expert(
         surrogate or coarse,
-        candidate_experts(task, list(trajectories)),
-        seed=settings.seed,
+        experts,
+        seed=run.settings.seed,
         starts=plan.starts,
         population=plan.population,
         generations=generations,
@@ -207,29 +242,20 @@ def _robust(
         judged=coarse if surrogate else None,
         disturbed=plan.disturbed,
         journal=folder / "robust.json",
-        callback=told,
+        callback=run.told,
     )
-    notes["robust"] = {"episodes": played, "cpu_seconds": round(time.process_time() - began, 1), "log": log}
+    run.notes["robust"] = {"episodes": played, "cpu_seconds": round(time.process_time() - began, 1), "log": log}
     save_expert(found, folder / "expert.json", task, {"episodes": played, "log": log})
     return found
 
 
-def _clone(
-    task: Task,
-    expert: Expert | None,
-    settings: TrainingSettings,
-    plan: Hybrid,
-    folder: Path,
-    stages: Sequence[str],
-    resume: bool,
-    notes: dict[str, Any],
-    told: Callback,
-) -> Policy:
+def _clone(run: _Run, expert: Expert | None) -> Policy:
+    task, settings, plan, folder = run.task, run.settings, run.plan, run.folder
     file = folder / "clone.pt"
-    if file.is_file() and (resume or "clone" not in stages):
+    if file.is_file() and (run.resume or "clone" not in run.stages):
         return load_policy(file)
     policy = task_policy(task, settings, squash=False)
-    if "clone" not in stages:
+    if "clone" not in run.stages:
         return policy
     if expert is None:
         raise InputError(f"{folder / 'expert.json'}: there is no expert to clone; run the stage robust first.")
@@ -245,7 +271,7 @@ def _clone(
     if plan.final:
         rounds += [batches(PUBLISHED, 12)] * plan.final
     keeper = _Keeper(folder / "clone.part", {"policy": policy, "labels": labels}, [rng, *_generators(rounds)])
-    log, played = keeper.restore() if resume else [], 0
+    log, played = keeper.restore() if run.resume else [], 0
     for k, episodes in enumerate(rounds):
         played += episodes.count
         if k < len(log):
@@ -256,8 +282,8 @@ def _clone(
         fine = episodes.task.fidelity.text
         log.append({"round": k, "fidelity": fine, "success": success, "failed": failed, "error": error})
         keeper.keep(log)
-        told("clone", k + 1, len(rounds), f"success {success:.0%} in the round, error {error:.2g}")
-    notes["clone"] = {"episodes": played, "cpu_seconds": round(time.process_time() - began, 1), "log": log}
+        run.told("clone", k + 1, len(rounds), f"success {success:.0%} in the round, error {error:.2g}")
+    run.notes["clone"] = {"episodes": played, "cpu_seconds": round(time.process_time() - began, 1), "log": log}
     save_policy(policy, file, {"stage": "clone", "log": log})
     keeper.remove()
     return policy
@@ -297,16 +323,8 @@ class _Keeper:
         self.path.unlink(missing_ok=True)
 
 
-def _tune(
-    task: Task,
-    policy: Policy,
-    settings: TrainingSettings,
-    plan: Hybrid,
-    folder: Path,
-    resume: bool,
-    notes: dict[str, Any],
-    told: Callback,
-) -> Policy:
+def _tune(run: _Run, policy: Policy) -> Policy:
+    task, settings, plan, folder = run.task, run.settings, run.plan, run.folder
     began = time.process_time()
     fine = with_fidelity(task, PUBLISHED)
     judge = TaskEpisodes(fine, plan.validation, seed=settings.seed + _VALIDATION, disturbed=plan.disturbed)
@@ -324,7 +342,7 @@ def _tune(
     ppo = Ppo(policy, settings, fixed=True)
     torch.manual_seed(settings.seed)
     keeper = _Keeper(folder / "tune.part", ppo.parts() | {"best": best}, [episodes.generator])
-    log = keeper.restore() if resume else []
+    log = keeper.restore() if run.resume else []
     if not log:
         mark = success(policy)
         log = [{"episodes": 0, "success": mark[0], "return": mark[1], "best": mark}]
@@ -333,7 +351,7 @@ def _tune(
         keeper.keep(log)
     mark = tuple(log[-1]["best"])
     episodes.scale = 10.0 / max(1e-6, abs(log[0]["return"]))
-    told("tune", log[-1]["episodes"], plan.tune_episodes, f"success {mark[0]:.0%}")
+    run.told("tune", log[-1]["episodes"], plan.tune_episodes, f"success {mark[0]:.0%}")
     while log[-1]["episodes"] + settings.count <= plan.tune_episodes and mark[0] < plan.enough:
         batch, first = collect_episodes(policy, episodes), len(log) == 1
         ppo.learn(batch, freeze=first)
@@ -348,8 +366,8 @@ def _tune(
         done = log[-1]["episodes"] + settings.count
         log.append({"episodes": done, "success": now[0], "return": now[1], "noisy": share, "best": mark})
         keeper.keep(log)
-        told("tune", done, plan.tune_episodes, f"success {now[0]:.0%}, with noise {share:.0%}, best {mark[0]:.0%}")
+        run.told("tune", done, plan.tune_episodes, f"success {now[0]:.0%}, with noise {share:.0%}, best {mark[0]:.0%}")
     played = log[-1]["episodes"] + judge.count * max(1, len(log) - 1)
     keeper.remove()
-    notes["tune"] = {"episodes": played, "cpu_seconds": round(time.process_time() - began, 1), "log": log}
+    run.notes["tune"] = {"episodes": played, "cpu_seconds": round(time.process_time() - began, 1), "log": log}
     return best
