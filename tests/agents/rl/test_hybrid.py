@@ -198,6 +198,10 @@ def test_each_stage_can_be_left_out(tmp_path: Path):
     file = found(tmp_path)
     _, notes = train_hybrid(Lead(), [file], settings(), folder=tmp_path, plan=PLAN, stages=("clone",))
     assert "tune" not in notes and "generation" not in notes["robust"]["log"][-1]
+    # Also where an earlier run has left its clone.
+    (tmp_path / "expert.json").unlink()
+    _, again = train_hybrid(Lead(), [file], settings(), folder=tmp_path, plan=PLAN, stages=("clone",))
+    assert again["clone"]["log"] == notes["clone"]["log"]
     with pytest.raises(InputError, match="there is no search"):
         train_hybrid(Lead(), [file], settings(), folder=tmp_path, plan=PLAN, stages=("search",))
 

@@ -218,7 +218,8 @@ def _searches(run: _Run, given: Path | None) -> bool:
         return False
     if run.resume and (run.folder / "expert.json").is_file():
         return False
-    return "robust" in run.stages or not (run.folder / "clone.pt").is_file()
+    cloned = "clone" not in run.stages and (run.folder / "clone.pt").is_file()
+    return "robust" in run.stages or not cloned
 
 
 def _robust(run: _Run, experts: list[Expert], given: Path | None) -> Expert | None:
