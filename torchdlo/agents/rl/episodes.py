@@ -139,7 +139,8 @@ class TaskEpisodes:
             execution: how steps run; if not given, compiled on a GPU, and on the CPU eager with gradients and else as
                 `quick_execution` says.
             dtype: of the physics.
-            ends: what share of what an end lacks to success is subtracted from the last reward.
+            ends: what share of what an end lacks to success is subtracted from the last reward. An episode that fails
+                pays at once for the worst moment so far, the start among them.
             scale: what rewards are multiplied by.
             bonus: what success earns at the end, after scaling.
             barrier: what an action costs, after scaling, after which a rope is stretched as far as the task allows; it
@@ -174,7 +175,7 @@ class TaskEpisodes:
         self.generator = self.env.generator
         self.ends, self.scale, self.bonus, self.barrier = ends, scale, bonus, barrier
         self.auxiliary, self._first_loss = auxiliary, torch.zeros(count, dtype=dtype, device=device)
-        self._least = torch.zeros_like(self._first_loss)
+        self._least, self._most = torch.zeros_like(self._first_loss), torch.zeros_like(self._first_loss)
         if disturbed and randomize:
             raise InputError("randomize and disturbed: both draw friction anew; give one of them.")
         self.disturbed, self._usual = disturbed, self.env.episode.params
@@ -194,9 +195,18 @@ class TaskEpisodes:
             self.random = None
             self.env.episode = replace(self.env.episode, params=self._usual)
         self.first = self.env.reset()["observation"].detach()
-        self._first_loss = self._auxiliary_loss(self.env.world).detach()
-        self._least = torch.zeros_like(self._first_loss)
+        self._measure_start()
         return self.first
+
+    @torch.no_grad()
+    def _measure_start(self) -> None:
+        """Note what later costs are compared with."""
+        from torchdlo.envs.core import episode
+
+        self._first_loss = self._auxiliary_loss(self.env.world)
+        self._least, self._most = torch.zeros_like(self._first_loss), torch.zeros_like(self._first_loss)
+        if self.ends:
+            self._note_costs(episode.terminal_costs(self.task, self.env.world))
 
     def disturb(self, random: Tensor) -> None:
         """Give each scene a friction and a stiffness of its own, which numbers (N, 2) between 0 and 1 decide."""
@@ -215,7 +225,7 @@ class TaskEpisodes:
             moved = moved.to(self.returns.device)
             env.world, env.moved = episode.begin(env.episode, episode.laid_down(self.task, moved)[2]), moved
             self.first = episode.observe(env.episode, env.world)
-            self._first_loss = self._auxiliary_loss(env.world)
+        self._measure_start()
         return self.first
 
     def step(self, action: Tensor) -> Transition:
@@ -229,9 +239,9 @@ class TaskEpisodes:
         self.returns = self.returns + plain.detach()
         reward, success = self.scale * plain, episode.successes(self.task, world)
         if self._over == self.horizon:
-            if self.ends:
-                reward = reward - self.ends * self.scale * episode.terminal_costs(self.task, world).float()
             reward = reward + self.bonus * success
+        if self.ends:
+            reward = reward - self.ends * self.scale * self._lacking(before).float()
         # Failing must not cost less than what would have been left to pay.
         left = (1 + self.horizon - self._over) * (world.failed & ~before)
         if self.auxiliary:
@@ -242,6 +252,23 @@ class TaskEpisodes:
         if self.barrier:
             reward = reward - self.barrier * torch.where(world.failed, left, self._tension(world)).float()
         return Transition(episode.observe(env.episode, world), reward, world.failed, success)
+
+    def _lacking(self, before: Tensor) -> Tensor:
+        """Return what episodes lack to success that end with the last action, 0 in others, (N,).
+
+        Those that fail lack as much as in the worst moment so far: else failing were better than not succeeding.
+        """
+        from torchdlo.envs.core import episode
+
+        world, last = self.env.world, self._over == self.horizon
+        with torch.set_grad_enabled(last and torch.is_grad_enabled()):
+            now = episode.terminal_costs(self.task, world)
+        self._note_costs(now.detach())
+        fell = torch.where(world.failed & ~before, self._most, 0.0)
+        return now + fell if last else fell
+
+    def _note_costs(self, now: Tensor) -> None:
+        self._most = torch.where(torch.isfinite(now), torch.maximum(self._most, now), self._most)
 
     def _auxiliary_loss(self, world: EpisodeState) -> Tensor:
         """Return the sum of the task's terms, (N,)."""
