@@ -138,6 +138,15 @@ def train(
             _train(made, chosen, out, resume, how, as_json, address)
 
 
+_OPTIONS = {
+    "algorithm": "--algo",
+    "collectors": "--address and --workers",
+    "variation": "--no-variation",
+    **{name: f"--{name}" for name in ("episodes", "minutes", "seed", "count", "fidelity", "device")},
+}
+"""Settings that have options of their own."""
+
+
 def _read(pairs: list[str]) -> dict[str, Any]:
     """Return settings of NAME=VALUE, with values as in JSON."""
     found = {}
@@ -145,6 +154,8 @@ def _read(pairs: list[str]) -> dict[str, Any]:
         name, equals, value = pair.partition("=")
         if not equals:
             raise InputError(f"--set {pair}: expected NAME=VALUE, such as rate=1e-3.")
+        if name in _OPTIONS:
+            raise InputError(f"--set {pair}: {name} has an option; give {_OPTIONS[name]} instead.")
         try:
             found[name] = parse_json(value, where=f"--set {name}")
         except InputError:

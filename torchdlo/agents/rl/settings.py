@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 from torchdlo.errors import InputError
 
-__all__ = ["ALGORITHMS", "EPISODES", "PUBLISHED", "TrainingSettings", "training_preset"]
+__all__ = ["ALGORITHMS", "EPISODES", "EXPECTED", "PUBLISHED", "TrainingSettings", "training_preset"]
 
 ALGORITHMS = ("ppo", "sac", "shac", "sapo", "hybrid")
 """Names of all ways to train."""
@@ -115,32 +116,89 @@ class TrainingSettings:
             if not ok:
                 raise InputError(f"{name} is {getattr(self, name)!r}; expected {expected}.")
 
-        need(self.algorithm in ALGORITHMS, "algorithm", f"one of {', '.join(ALGORITHMS)}")
-        need(self.count >= 1, "count", "at least 1 episode at once")
+        for name, (expected, good) in EXPECTED.items():
+            need(good(getattr(self, name)), name, expected)
         need(self.episodes >= self.count, "episodes", f"at least {self.count}, which are played at once")
         alone = self.algorithm in ("ppo", "sac") or not self.collectors
         need(alone, "collectors", f"0, as {self.algorithm} needs gradients; ppo and sac can have them")
-        even = self.collectors >= 0 and not self.count % max(1, self.collectors)
+        even = not self.count % max(1, self.collectors)
         need(even, "collectors", f"a number that divides the {self.count} episodes that are played at once")
-        need(self.device in ("cpu", "cuda"), "device", "cpu or cuda; CUDA_VISIBLE_DEVICES chooses among several GPUs")
         here = self.device == "cpu" or self.algorithm != "hybrid"
         need(here, "device", "cpu, as stages of hybrid run there; ppo, sac, shac and sapo can have a GPU")
         need(self.device == "cpu" or not self.collectors, "device", "cpu, as collectors play there")
-        need(self.minutes > 0, "minutes", "a positive number")
-        need(0 <= self.seed < 2**32, "seed", "a whole number from 0 to 2^32 - 1")
-        need(0 < self.gamma <= 1, "gamma", "a discount above 0, at most 1")
-        need(self.window >= 1, "window", "at least 1 action")
-        need(self.sigma > 0, "sigma", "a positive number")
-        for name in ("ends", "barrier", "auxiliary", "saturation", "temperature"):
-            value = getattr(self, name)
-            plain = isinstance(value, int | float) and not isinstance(value, bool)
-            need(plain and 0 <= value < math.inf, name, "a finite number, not below 0")
-        need(self.temperature > 0, "temperature", "a positive number")
         for name in ("barrier", "auxiliary"):
             plain = self.algorithm != "hybrid" or not getattr(self, name)
             need(plain, name, "0, as stages of hybrid know none; ppo, sac, shac and sapo can have one")
         graded = self.algorithm in ("shac", "sapo") or not self.saturation
         need(graded, "saturation", f"0, as {self.algorithm} does not go down the gradient of returns; shac and sapo do")
+
+
+_Check = tuple[str, Callable[[Any], bool]]
+
+
+def _number(expected: str, good: Callable[[float], bool]) -> _Check:
+    return expected, lambda x: isinstance(x, int | float) and not isinstance(x, bool) and good(x)
+
+
+def _whole(least: int, expected: str = "", most: float = math.inf) -> _Check:
+    said = expected or f"a whole number from {least} on"
+    return said, lambda x: isinstance(x, int) and not isinstance(x, bool) and least <= x <= most
+
+
+def _one_of(names: tuple[Any, ...], expected: str = "") -> _Check:
+    said = expected or f"one of {', '.join(map(str, names))}"
+    return said, lambda x: isinstance(x, type(names[0])) and x in names
+
+
+_POSITIVE = _number("a finite number above 0", lambda x: 0 < x < math.inf)
+_NOT_NEGATIVE = _number("a finite number, not below 0", lambda x: 0 <= x < math.inf)
+_LAYERS: _Check = (
+    "the sizes of layers, such as [64, 64]",
+    lambda x: isinstance(x, list | tuple) and all(_whole(1)[1](size) for size in x),
+)
+
+EXPECTED: dict[str, _Check] = {
+    "algorithm": _one_of(ALGORITHMS),
+    "episodes": _whole(1),
+    "minutes": _number("a number above 0", lambda x: x > 0),
+    "seed": _whole(0, "a whole number from 0 to 2^32 - 1", 2**32 - 1),
+    "count": _whole(1, "at least 1 episode at once"),
+    "hidden": _LAYERS,
+    "critic": _LAYERS,
+    "activation": _one_of(("tanh", "relu", "elu", "silu")),
+    "layer_norm": _one_of((True, False), "true or false"),
+    "sigma": _POSITIVE,
+    "rate": _POSITIVE,
+    "critic_rate": _POSITIVE,
+    "gamma": _number("a discount above 0, at most 1", lambda x: 0 < x <= 1),
+    "lmbda": _number("a number from 0 to 1", lambda x: 0 <= x <= 1),
+    "clip_norm": _POSITIVE,
+    "batch": _whole(1),
+    "passes": _whole(1),
+    "clip": _POSITIVE,
+    "entropy": _NOT_NEGATIVE,
+    "replay": _whole(1),
+    "updates": _whole(1),
+    "warm": _whole(0),
+    "polyak": _number("a number from 0 on, below 1", lambda x: 0 <= x < 1),
+    "window": _whole(1, "at least 1 action, a whole number"),
+    "critic_passes": _whole(1),
+    "parts": _whole(1),
+    "entropy_rate": _NOT_NEGATIVE,
+    "temperature": _POSITIVE,
+    "tame": _NOT_NEGATIVE,
+    "bonus": _NOT_NEGATIVE,
+    "barrier": _NOT_NEGATIVE,
+    "auxiliary": _NOT_NEGATIVE,
+    "saturation": _NOT_NEGATIVE,
+    "ends": _NOT_NEGATIVE,
+    "fidelity": ("a name, or such as 1ms/2", lambda x: isinstance(x, str)),
+    "variation": _one_of((True, False), "true or false"),
+    "device": _one_of(("cpu", "cuda"), "cpu or cuda; CUDA_VISIBLE_DEVICES chooses among several GPUs"),
+    "collectors": _whole(0),
+    "interval": _NOT_NEGATIVE,
+}
+"""What each setting may be, in words and as a check."""
 
 
 _ALGORITHM: dict[str, dict[str, Any]] = {
@@ -166,6 +224,7 @@ def training_preset(task: str, algorithm: str, **given: Any) -> TrainingSettings
     other = sorted(set(wanted) - names)
     if other:
         raise InputError(f"settings: there is no {', '.join(other)}; expected some of {', '.join(sorted(names))}.")
-    if wanted.get("episodes", base["episodes"]) < base.get("count", 100):
-        wanted.setdefault("count", wanted["episodes"])
+    few = wanted.get("episodes", base["episodes"])
+    if isinstance(few, int) and 1 <= few < base.get("count", 100):
+        wanted.setdefault("count", few)
     return TrainingSettings(**(base | wanted))
