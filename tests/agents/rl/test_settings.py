@@ -6,11 +6,16 @@ import dataclasses
 import math
 
 import pytest
+import torch
 
 pytest.importorskip("torchrl")
 
 from torchdlo.agents.policies import mlp
-from torchdlo.agents.rl.settings import ALGORITHMS, EXPECTED, TrainingSettings, training_preset
+from torchdlo.agents.rl.evaluate import UNSEEN
+from torchdlo.agents.rl.expert import _Arena
+from torchdlo.agents.rl.hybrid_stages import _VALIDATION
+from torchdlo.agents.rl.settings import ALGORITHMS, EXPECTED, LARGEST_SEED, TrainingSettings, training_preset
+from torchdlo.agents.rl.student import Student
 from torchdlo.cli import app
 from torchdlo.errors import InputError
 
@@ -42,6 +47,20 @@ pytestmark = pytest.mark.quick
 def test_what_a_setting_cannot_be_is_said(name: str, value: object, expected: str):
     with pytest.raises(InputError, match=rf"{name} is .*; expected {expected}"):
         training_preset("coiling", "ppo", **{name: value})
+
+
+def test_seeds_of_training_are_not_those_of_judgements():
+    """All that is added to a seed is less than what lies between the largest one and those of judgements."""
+    for seed in (LARGEST_SEED + 1, UNSEEN, 2**32 - 1, -1):
+        with pytest.raises(InputError, match=r"seed is .*; expected a whole number from 0 to 699999999, as seeds"):
+            training_preset("coiling", "ppo", seed=seed)
+        with pytest.raises(InputError, match=r"seed is .*; expected a whole number from 0 to 699999999, as seeds"):
+            Student(seed=seed)
+    assert training_preset("coiling", "ppo", seed=LARGEST_SEED).seed == Student(seed=LARGEST_SEED).seed == LARGEST_SEED
+    assert max(_VALIDATION, 104_729 * 20) < UNSEEN - LARGEST_SEED
+    # Candidates of a robust path are played from starts of seeds far apart.
+    assert _Arena(None, 699, 0.0, None).seed + 10**6 < UNSEEN < 2**60 < _Arena(None, 777, 0.0, None).seed
+    torch.Generator().manual_seed(_Arena(None, LARGEST_SEED, 0.0, None).seed + 10**6)
 
 
 def test_every_setting_has_a_check_that_its_default_passes():

@@ -10,10 +10,12 @@ from typing import Any
 
 from torchdlo.errors import InputError
 
-__all__ = ["ALGORITHMS", "EPISODES", "EXPECTED", "PUBLISHED", "TrainingSettings", "training_preset"]
+__all__ = ["ALGORITHMS", "EPISODES", "EXPECTED", "LARGEST_SEED", "PUBLISHED", "TrainingSettings", "training_preset"]
 
 ALGORITHMS = ("ppo", "sac", "shac", "sapo", "hybrid")
 """Names of all ways to train."""
+LARGEST_SEED = 699_999_999
+"""Of training. What is added to it stays below the seeds of judgements, so that these are from starts of their own."""
 EPISODES = {"gathering": 8_000, "lifting": 10_000, "unknotting": 10_000}
 """Published budgets that differ from 20 000 episodes."""
 
@@ -161,7 +163,9 @@ EXPECTED: dict[str, _Check] = {
     "algorithm": _one_of(ALGORITHMS),
     "episodes": _whole(1),
     "minutes": _number("a number above 0", lambda x: x > 0),
-    "seed": _whole(0, "a whole number from 0 to 2^32 - 1", 2**32 - 1),
+    "seed": _whole(
+        0, f"a whole number from 0 to {LARGEST_SEED}, as seeds beyond are those of judgements", LARGEST_SEED
+    ),
     "count": _whole(1, "at least 1 episode at once"),
     "hidden": _LAYERS,
     "critic": _LAYERS,

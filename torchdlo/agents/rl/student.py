@@ -23,8 +23,10 @@ from torchdlo.agents.policies.policy_files import save_policy
 from torchdlo.agents.rl.episodes import TaskEpisodes
 from torchdlo.agents.rl.evaluate import UNSEEN, wilson_interval
 from torchdlo.agents.rl.rollout import episode_progress, policy_features
+from torchdlo.agents.rl.settings import EXPECTED
 from torchdlo.agents.torch_records import load_checkpoint, save_checkpoint
 from torchdlo.envs import PUBLISHED, Task, with_fidelity
+from torchdlo.errors import InputError
 from torchdlo.files import write_atomically
 from torchdlo.vision.camera import Lens
 from torchdlo.vision.point_cloud import POINTS, point_cloud
@@ -80,6 +82,11 @@ class Student:
     rate: float = 1e-3
     seed: int = 0
     camera: DepthCamera = field(default_factory=DepthCamera)
+
+    def __post_init__(self) -> None:
+        expected, good = EXPECTED["seed"]
+        if not good(self.seed):
+            raise InputError(f"seed is {self.seed!r}; expected {expected}.")
 
 
 class _Eyes:
