@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -22,7 +23,7 @@ from torchdlo.agents.rl.sac import Sac
 from torchdlo.agents.rl.settings import training_preset
 from torchdlo.agents.rl.shac import Sapo, Shac
 from torchdlo.agents.rl.training import Trained, train
-from torchdlo.agents.torch_records import load_checkpoint
+from torchdlo.agents.torch_records import load_checkpoint, save_checkpoint
 from torchdlo.errors import InputError
 
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::FutureWarning")
@@ -33,10 +34,11 @@ SMALL = {"count": 8, "batch": 64, "warm": 1, "replay": 1000, "passes": 2, "criti
 
 def run(name: str, batches: int, folder: Path | None = None, **choices) -> Trained:
     choices = dict(choices)
-    kept = {k: choices.pop(k) for k in ("resume", "callback") if k in choices}
+    kept = {k: choices.pop(k) for k in ("resume", "callback", "task") if k in choices}
     torch.manual_seed(11)
     settings = training_preset("", name, hidden=(16,), critic=(16,), episodes=8 * batches, **(SMALL | choices))
     policy = pusher(hidden=(16,), state_sigma=name in ("sac", "sapo"))
+    policy.spec = replace(policy.spec, task=kept.pop("task", ""))
     return train(KINDS[name](policy, settings), springs(8), settings, folder=folder, **kept)
 
 
@@ -88,6 +90,23 @@ def test_other_settings_are_refused_by_what_differs(tmp_path: Path):
         run("ppo", 2, tmp_path, resume=True, clip=0.1)
     with pytest.raises(InputError, match="found none"):
         run("ppo", 2, tmp_path / "other", resume=True)
+
+
+@pytest.mark.parametrize("old", [False, True])
+def test_a_run_of_another_task_is_refused(old: bool, tmp_path: Path):
+    run("ppo", 1, tmp_path, task="left")
+    file = tmp_path / "checkpoint.pt"
+    if old:
+        content = load_checkpoint(file)
+        save_checkpoint(file, {k: v for k, v in content.items() if k != "policy"})
+    with pytest.raises(InputError, match=r"of the task left \(now right\); give the same, or leave out --resume"):
+        run("ppo", 2, tmp_path, task="right", resume=True)
+    wider = pusher(hidden=(16, 16))
+    wider.spec = replace(wider.spec, task="left")
+    settings = training_preset("", "ppo", hidden=(16,), critic=(16,), episodes=16, **SMALL)
+    with pytest.raises(InputError, match="of a policy of other hidden"):
+        train(Ppo(wider, settings), springs(8), settings, folder=tmp_path, resume=True)
+    assert run("ppo", 2, tmp_path, task="left", resume=True).episodes == 16
 
 
 def test_minutes_are_a_budget_too():

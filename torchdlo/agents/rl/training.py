@@ -18,7 +18,7 @@ from typing import Any, Protocol
 import torch
 from torch.utils import _pytree as pytree
 
-from torchdlo.agents.policies import Policy, save_policy
+from torchdlo.agents.policies import Policy, load_policy, save_policy
 from torchdlo.agents.rl.episodes import Episodes
 from torchdlo.agents.rl.rollout import Batch
 from torchdlo.agents.rl.settings import TrainingSettings
@@ -190,6 +190,7 @@ def _write(
     content = {
         "generator": "torchdlo train",
         "settings": json.dumps(asdict(settings), sort_keys=True),
+        "policy": json.dumps(trainer.policy.spec.plain(), sort_keys=True),
         "parts": {name: part.state_dict() for name, part in trainer.parts().items()},
         "torch": torch.get_rng_state(),
         "cuda": [torch.cuda.get_rng_state(device) for device in gpus(torch.device(settings.device))],
@@ -207,6 +208,28 @@ def _write(
     )
 
 
+def _check_policy(policy: Policy, content: dict[str, Any], path: Path) -> None:
+    """Refuse a checkpoint of another task, or of a policy that sees or does something else."""
+    kept = path.with_name("policy.pt")
+    if "policy" in content:
+        was = json.loads(content["policy"])
+    elif kept.is_file():  # checkpoints did not say before
+        was = json.loads(json.dumps(load_policy(kept).spec.plain()))
+    else:
+        return
+    now = json.loads(json.dumps(policy.spec.plain()))
+    # Places are found by simulation, and so to rounding; their number is that of the points.
+    for spec in (was, now):
+        spec["features"].pop("centers", None)
+    if was["task"] != now["task"]:
+        said = f"the task {was['task']} (now {now['task']})"
+    elif other := [name for name in now if was.get(name, now[name]) != now[name]]:
+        said = f"a policy of other {', '.join(other)}"
+    else:
+        return
+    raise InputError(f"{path}: it belongs to a run of {said}; give the same, or leave out --resume.")
+
+
 def _restore(
     trainer: Trainer, episodes: Episodes, settings: TrainingSettings, done: Trained, folder: Path | None
 ) -> None:
@@ -216,6 +239,7 @@ def _restore(
     content = load_checkpoint(path)
     if content is None:
         raise InputError(f"{path}: the checkpoint is damaged; leave out --resume.")
+    _check_policy(trainer.policy, content, path)
     first = {"device": "cpu", "barrier": 0.0, "auxiliary": 0.0, "saturation": 0.0}
     was = first | json.loads(content["settings"])  # those of 0.1 did not say
     now = json.loads(json.dumps(asdict(settings)))
