@@ -106,6 +106,28 @@ def test_entropy_is_worth_less_than_what_actions_earn_at_first():
     assert float(made.temperature) == pytest.approx(0.5)
 
 
+def test_the_temperature_goes_by_actions_of_episodes_that_have_not_failed():
+    made, episodes = trainer(Sapo)
+    window = played(made, episodes)
+    density = window.log_prob.detach().clone()
+    density[:, 0], density[1:, 1] = 1.5, -50.0  # the second scene fails in its first action
+    density[0, 1] = 0.5
+    failed = torch.zeros_like(window.failed)
+    failed[:, 1] = True
+    begun = torch.tensor([True, True, False, False])
+    failed[:, 2:] = True
+    dead = replace(window, log_prob=density, failed=failed, begun=begun)
+    steps = len(density)
+    before = made.log_temperature.detach().clone()
+    told = made._heat(dead)
+    assert float(told["entropy"]) == pytest.approx(-(1.5 * steps + 0.5) / (steps + 1))
+    after = made.log_temperature.detach().clone()
+    assert after > before  # the entropy that is wanted is -0.5
+    # Nothing is left to go by.
+    assert "entropy" not in made._heat(replace(dead, failed=torch.ones_like(failed), begun=~torch.ones_like(begun)))
+    assert made.log_temperature == after
+
+
 def test_means_that_saturate_are_led_back_where_no_reward_does():
     made, episodes = trainer(saturation=1.0)
     policy = made.policy

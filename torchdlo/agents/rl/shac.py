@@ -195,7 +195,8 @@ class Shac:
             windows.append(_detached(window))
         batch = _joined(windows)
         self.policy.normaliser.update(batch.features)
-        found = {k: float(torch.stack([t[k] for t in told]).mean()) for k in told[0]}
+        names = dict.fromkeys(k for t in told for k in t)
+        found = {k: float(torch.stack([t[k] for t in told if k in t]).mean()) for k in names}
         found["cut"] = float(torch.stack(self.lost).mean()) if self.lost else 0.0
         return batch, found
 
@@ -219,9 +220,15 @@ class Shac:
         return told | {"loss_critic": self._teach(window)}
 
     def _heat(self, window: Window) -> dict[str, Tensor]:
-        """Move the temperature so that the entropy becomes half of minus the number of an action's components."""
+        """Move the temperature so that the entropy becomes half of minus the number of an action's components.
+
+        What is drawn in episodes that have failed leads nowhere, and is not of them.
+        """
+        drawn = window.log_prob[window.alive]
+        if not len(drawn):
+            return {"temperature": self.log_temperature.detach().exp()}
         wanted = -0.5 * self.policy.spec.actions
-        entropy = -window.log_prob.mean()
+        entropy = -drawn.mean()
         loss = self.log_temperature.exp() * (entropy - wanted)
         self.heat_optimizer.zero_grad()
         loss.backward()
