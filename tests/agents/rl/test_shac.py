@@ -11,9 +11,11 @@ pytest.importorskip("torchrl")
 
 from springs import move, pusher, springs
 
-from torchdlo.agents.rl.rollout import episode_progress
+from torchdlo.agents.policies import Policy, PolicySpec
+from torchdlo.agents.policies.features import FeatureSpec
+from torchdlo.agents.rl.rollout import episode_progress, policy_features
 from torchdlo.agents.rl.settings import training_preset
-from torchdlo.agents.rl.shac import Sapo, Shac, Window, actor_loss, saturation_loss
+from torchdlo.agents.rl.shac import Sapo, Shac, Window, _look_first, actor_loss, saturation_loss
 
 F64 = torch.float64
 
@@ -126,6 +128,23 @@ def test_the_temperature_goes_by_actions_of_episodes_that_have_not_failed():
     # Nothing is left to go by.
     assert "entropy" not in made._heat(replace(dead, failed=torch.ones_like(failed), begun=~torch.ones_like(begun)))
     assert made.log_temperature == after
+
+
+def test_the_first_batch_sees_how_far_the_episode_is():
+    episodes = springs(4, 1, F64)
+    policy = Policy(PolicySpec(FeatureSpec(2, waves=6), actions=1, hidden=(8,))).double()
+    seen = episodes.reset()
+    _look_first(policy, episodes, seen)
+    assert float(policy.normaliser.count) == pytest.approx(4)
+    ends = range(episodes.horizon + 1)
+    x = torch.stack([policy.normaliser(policy_features(policy, episodes, k, seen)) for k in ends])
+    assert float(x.abs().max()) < 5
+    # The share of the episode itself has mean 0 and spread 1, all its values being equally often.
+    torch.testing.assert_close(x[..., 2].mean(), torch.zeros((), dtype=F64), rtol=0, atol=1e-9)
+    torch.testing.assert_close(x[..., 2].square().mean(), torch.ones((), dtype=F64), rtol=1e-9, atol=0)
+    # What does not depend on time is as the starts alone have it.
+    torch.testing.assert_close(policy.normaliser.mean[:2], seen.mean(0))
+    torch.testing.assert_close(policy.normaliser.square[:2] / 4, seen.var(0, unbiased=False))
 
 
 def test_means_that_saturate_are_led_back_where_no_reward_does():

@@ -101,6 +101,18 @@ def _tamed(limit: float, lost: list[Tensor]) -> Callable[[Tensor], Tensor]:
     return hook
 
 
+def _look_first(policy: Policy, episodes: Episodes, seen: Tensor) -> None:
+    """Show the normaliser of a new policy the starts of a batch, at all times of the episode.
+
+    How far the episode is does not differ among starts: what tells it would be scaled up to the bounds, where it tells
+    nothing. All weighs as much as the starts alone.
+    """
+    times = range(episodes.horizon + 1)
+    policy.normaliser.update(torch.cat([policy_features(policy, episodes, k, seen) for k in times]))
+    policy.normaliser.square /= len(times)
+    policy.normaliser.count /= len(times)
+
+
 def _bounded(observation: Tensor) -> Tensor:
     """Return observations whose numbers are finite; others have no gradient."""
     return torch.where(torch.isfinite(observation), observation, 0.0)
@@ -184,7 +196,7 @@ class Shac:
         windows: list[Window] = []
         told: list[dict[str, Tensor]] = []
         if not bool(self.policy.normaliser.count > 0):
-            self.policy.normaliser.update(policy_features(self.policy, episodes, 0, seen))
+            _look_first(self.policy, episodes, seen)
         self.lost.clear()
         while done < episodes.horizon:
             window, seen = self.play(episodes, seen, done, failed)
