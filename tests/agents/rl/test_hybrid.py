@@ -23,8 +23,11 @@ from torchdlo.agents.rl.expert import Expert, _spread, candidate_experts, follow
 from torchdlo.agents.rl.hybrid_stages import Hybrid, train_hybrid
 from torchdlo.agents.rl.rollout import collect_episodes
 from torchdlo.agents.rl.settings import training_preset
+from torchdlo.agents.rl.spending import Spending
+from torchdlo.agents.torch_records import load_checkpoint, save_checkpoint
 from torchdlo.cli import app
 from torchdlo.errors import InputError
+from torchdlo.journal import read_json, write_json
 
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::FutureWarning")
 
@@ -78,7 +81,11 @@ def test_a_search_for_a_robust_path_is_repeatable_and_goes_on(tmp_path: Path, di
     with pytest.raises(KeyboardInterrupt):
         improve_expert(Lead(), experts, **choices, journal=journal, callback=stop)
     assert len(json.loads(journal.read_text())["rows"]) == 2
-    again, told, count = improve_expert(Lead(), experts, **choices, journal=journal)
+    kept = read_json(journal)
+    write_json(journal, kept | {"spent": kept["spent"] | {"cpu_seconds": 1000.0}}, indent=None)
+    spending = Spending()
+    again, told, count = improve_expert(Lead(), experts, **choices, journal=journal, spending=spending)
+    assert spending.played == played and spending.mark().cpu_seconds > 1000
     assert torch.equal(first.path, again.path) and torch.equal(first.gain, again.gain)
     assert (told, count) == (log, played)
 
@@ -175,10 +182,23 @@ def test_a_clone_does_what_its_expert_does(tmp_path: Path):
     assert float(plays["one"]["moved"].abs().max()) == 0 < float(plays["varied"]["moved"].std())
 
 
+def slow(folder: Path, names: tuple[str, ...]) -> None:
+    """Let what is there of stages have taken 1000 s."""
+    time = {"seconds": 1000.0, "cpu_seconds": 1000.0}
+    notes = read_json(folder / "stages.json")
+    for name in names:
+        if name in notes:
+            notes[name] |= time
+    write_json(folder / "stages.json", notes)
+    if (folder / "clone.part").is_file():
+        content = load_checkpoint(folder / "clone.part")
+        save_checkpoint(folder / "clone.part", content | {"spent": content["spent"] | time})
+
+
 @pytest.mark.parametrize("disturbed", [0.0, 0.3])
 def test_stages_that_are_done_are_not_run_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, disturbed: float):
     plan = replace(PLAN, disturbed=disturbed)
-    undisturbed, _ = train_hybrid(Lead(), [found(tmp_path)], settings(), folder=tmp_path / "a", plan=plan)
+    undisturbed, whole = train_hybrid(Lead(), [found(tmp_path)], settings(), folder=tmp_path / "a", plan=plan)
     told = []
 
     def stop(stage: str, done: int, *_) -> None:
@@ -189,7 +209,15 @@ def test_stages_that_are_done_are_not_run_again(tmp_path: Path, monkeypatch: pyt
     with pytest.raises(KeyboardInterrupt):
         train_hybrid(Lead(), [found(tmp_path)], settings(), folder=tmp_path / "b", plan=plan, callback=stop)
     monkeypatch.setattr(stages, "improve_expert", None)
-    policy, _ = train_hybrid(Lead(), [], settings(), folder=tmp_path / "b", plan=plan, resume=True)
+    if not disturbed:
+        slow(tmp_path / "b", ("robust", "clone"))
+    policy, notes = train_hybrid(Lead(), [], settings(), folder=tmp_path / "b", plan=plan, resume=True)
+    for name in stages.STAGES:
+        assert notes[name]["episodes"] == whole[name]["episodes"], name
+    if not disturbed:
+        # The time of the process that was stopped belongs to it.
+        assert notes["robust"]["cpu_seconds"] == notes["robust"]["seconds"] == 1000
+        assert min(notes["clone"]["cpu_seconds"], notes["clone"]["seconds"]) >= 1000
     for name, value in policy.state_dict().items():
         assert torch.equal(value, undisturbed.state_dict()[name]), name
 

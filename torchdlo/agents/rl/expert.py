@@ -9,8 +9,6 @@ that they keep clear of what they must not touch.
 from __future__ import annotations
 
 import json
-import math
-import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -20,6 +18,7 @@ import torch
 from torch import Tensor
 
 from torchdlo.agents.rl.episodes import TaskEpisodes
+from torchdlo.agents.rl.spending import Spending
 from torchdlo.agents.torch_records import tensors_hash
 from torchdlo.agents.trajopt.search_journal import code_versions
 from torchdlo.agents.trajopt.search_result import read_trajectory
@@ -142,12 +141,14 @@ def check_experts(task: Task, experts: list[Expert]) -> None:
 class _Journal:
     """A file of scores, batch after batch: a search asks for the same ones again when it is run again."""
 
-    def __init__(self, path: Path | None, choices: list[Any]) -> None:
+    def __init__(self, path: Path | None, choices: list[Any], spending: Spending) -> None:
         self.path, self.choices, self.rows = path, choices, list[Any]()
+        self.spending, self.begun = spending, spending.mark()
         self.ahead: list[list[list[float]]] = []
         found = None if path is None else read_json(path)
         if found is not None and found.get("choices") == choices:
             self.ahead = found["rows"]
+            spending.add_time(found.get("spent", {}))
 
     def recall(self) -> list[ExpertScore] | None:
         """Return how the next batch went, if that is known."""
@@ -158,7 +159,7 @@ class _Journal:
         self.rows.append([list(vars(s).values()) for s in scores])
         if self.path is not None and not self.ahead:
             content = {"generator": "torchdlo train", "choices": self.choices, "rows": self.rows}
-            write_json(self.path, content, indent=None)
+            write_json(self.path, content | {"spent": self.spending.since(self.begun)}, indent=None)
 
 
 @torch.no_grad()
@@ -244,7 +245,7 @@ def improve_expert(
     sigma: float = 0.004,
     noise: float = 0.0015,
     enough: float = 0.99,
-    minutes: float = math.inf,
+    spending: Spending | None = None,
     judged: Task | None = None,
     disturbed: float = 0.0,
     journal: Path | None = None,
@@ -265,7 +266,7 @@ def improve_expert(
         sigma: first deviation of a place [m].
         noise: of actions [m].
         enough: see above.
-        minutes: budget of the clock.
+        spending: counts what it uses, also in earlier processes where there is a journal.
         judged: the task itself where `task` is its surrogate: what the search found has to be better there.
         disturbed: by how much friction and stiffness vary from episode to episode, as shares of their own; in
             the search it grows from nothing over the first half of the generations.
@@ -273,13 +274,13 @@ def improve_expert(
             there.
         callback: told (stage, generations done, all, message).
     """
-    began, told = time.monotonic(), callback or (lambda *_: None)
+    spending, told = spending or Spending(), callback or (lambda *_: None)
     check_experts(task, experts)
     choices = [task.name, task.fidelity.text, seed, starts, population, sigma, noise]
     choices += [] if judged is None else [judged.fidelity.text]
     choices += [disturbed, generations] if disturbed else []
     choices += [*map(expert_hash, experts), code_versions()]
-    kept = _Journal(journal, choices)
+    kept = _Journal(journal, choices, spending)
     arena = _Arena(task, seed, noise, kept)
     final = arena if judged is None else _Arena(judged, seed, noise, kept)
     scores = arena.scores(experts, 2 * starts, 0, disturbed)
@@ -293,7 +294,7 @@ def improve_expert(
         return base, log, arena.played
     search = _strategy(task, population, sigma, seed)
     for k in range(generations):
-        if time.monotonic() - began > 60 * minutes or good >= 3:
+        if good >= 3:
             break
         asked = search.ask()
         mean = _changed(base, torch.tensor(search.mean), task)
@@ -329,6 +330,7 @@ class _Arena:
         """Return how each candidate did from as many starts, which are the same for all, and so are disturbances."""
         count = starts * len(experts)
         self.played += count
+        self.journal.spending.played += count
         found = self.journal.recall()
         if found is None:
             if self._made is None or self._made.count != count:

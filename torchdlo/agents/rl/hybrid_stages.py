@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import copy
 import math
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
@@ -34,6 +33,7 @@ from torchdlo.agents.rl.expert import (
 from torchdlo.agents.rl.ppo import Ppo
 from torchdlo.agents.rl.rollout import collect_episodes
 from torchdlo.agents.rl.settings import TrainingSettings
+from torchdlo.agents.rl.spending import Spending
 from torchdlo.agents.torch_records import load_checkpoint, save_checkpoint
 from torchdlo.envs import PUBLISHED, Fidelity, Task, with_fidelity
 from torchdlo.errors import InputError
@@ -115,6 +115,7 @@ class _Run:
     stages: Sequence[str]
     resume: bool
     told: Callback
+    spending: Spending
     notes: dict[str, Any]
     """What stages came to."""
 
@@ -167,7 +168,7 @@ def train_hybrid(
     plan, told = plan or plan_of(task.name), callback or (lambda *_: None)
     notes: dict[str, Any] = _notes(folder) if resume else {}
     notes |= {"plan": asdict(plan), "settings": asdict(settings), "coarse": task.coarse.plain()}
-    run = _Run(task, settings, plan, folder, stages, resume, told, notes)
+    run = _Run(task, settings, plan, folder, stages, resume, told, Spending(), notes)
     experts = candidate_experts(task, list(trajectories))
     if not resume:
         _begin_afresh(run, experts, expert)
@@ -226,12 +227,13 @@ def _robust(run: _Run, experts: list[Expert], given: Path | None) -> Expert | No
     task, plan, folder = run.task, run.plan, run.folder
     if not _searches(run, given):
         file = given or folder / "expert.json"
+        run.spending.add(run.notes.get("robust", {}))
         return load_expert(file, task) if given is not None or (run.resume and file.is_file()) else None
-    began = time.process_time()
+    began = run.spending.mark()
     generations = plan.generations if "robust" in run.stages else 0
     coarse = with_fidelity(task, task.coarse)
     surrogate = coarse.surrogate()
-    found, log, played = improve_expert(
+    found, log, _ = improve_expert(
         surrogate or coarse,
         experts,
         seed=run.settings.seed,
@@ -240,13 +242,14 @@ def _robust(run: _Run, experts: list[Expert], given: Path | None) -> Expert | No
         generations=generations,
         sigma=plan.search_sigma,
         noise=plan.search_noise,
+        spending=run.spending,
         judged=coarse if surrogate else None,
         disturbed=plan.disturbed,
         journal=folder / "robust.json",
         callback=run.told,
     )
-    run.notes["robust"] = {"episodes": played, "cpu_seconds": round(time.process_time() - began, 1), "log": log}
-    save_expert(found, folder / "expert.json", task, {"episodes": played, "log": log})
+    run.notes["robust"] = run.spending.since(began) | {"log": log}
+    save_expert(found, folder / "expert.json", task, {"episodes": run.notes["robust"]["episodes"], "log": log})
     return found
 
 
@@ -254,13 +257,14 @@ def _clone(run: _Run, expert: Expert | None) -> Policy:
     task, settings, plan, folder = run.task, run.settings, run.plan, run.folder
     file = folder / "clone.pt"
     if file.is_file() and (run.resume or "clone" not in run.stages):
+        run.spending.add(run.notes.get("clone", {}))
         return load_policy(file)
     policy = task_policy(task, settings, squash=False)
     if "clone" not in run.stages:
         return policy
     if expert is None:
         raise InputError(f"{folder / 'expert.json'}: there is no expert to clone; run the stage robust first.")
-    began, labels, rng = time.process_time(), Labels(), torch.Generator().manual_seed(settings.seed)
+    began, labels, rng = run.spending.mark(), Labels(), torch.Generator().manual_seed(settings.seed)
     torch.manual_seed(settings.seed)
 
     def batches(fidelity: Fidelity, seed: int) -> TaskEpisodes:
@@ -271,10 +275,11 @@ def _clone(run: _Run, expert: Expert | None) -> Policy:
     rounds = [batches(task.coarse, 11)] * (1 + plan.rounds)
     if plan.final:
         rounds += [batches(PUBLISHED, 12)] * plan.final
-    keeper = _Keeper(folder / "clone.part", {"policy": policy, "labels": labels}, [rng, *_generators(rounds)])
-    log, played = keeper.restore() if run.resume else [], 0
+    parts = {"policy": policy, "labels": labels}
+    keeper = _Keeper(folder / "clone.part", parts, [rng, *_generators(rounds)], run.spending)
+    log = keeper.restore() if run.resume else []
     for k, episodes in enumerate(rounds):
-        played += episodes.count
+        run.spending.played += episodes.count
         if k < len(log):
             continue
         choices: dict[str, Any] = {"driven": k == 0, "noise": plan.noise, "generator": rng}
@@ -284,7 +289,7 @@ def _clone(run: _Run, expert: Expert | None) -> Policy:
         log.append({"round": k, "fidelity": fine, "success": success, "failed": failed, "error": error})
         keeper.keep(log)
         run.told("clone", k + 1, len(rounds), f"success {success:.0%} in the round, error {error:.2g}")
-    run.notes["clone"] = {"episodes": played, "cpu_seconds": round(time.process_time() - began, 1), "log": log}
+    run.notes["clone"] = run.spending.since(began) | {"log": log}
     save_policy(policy, file, {"stage": "clone", "log": log})
     keeper.remove()
     return policy
@@ -296,16 +301,20 @@ def _generators(rounds: Sequence[TaskEpisodes]) -> list[torch.Generator]:
 
 
 class _Keeper:
-    """What a stage needs to go on: parts with a `state_dict`, generators of random numbers, and its log."""
+    """What a stage needs to go on: parts with a `state_dict`, generators of random numbers, its log and its time."""
 
-    def __init__(self, path: Path, parts: dict[str, Any], generators: list[torch.Generator]) -> None:
+    def __init__(
+        self, path: Path, parts: dict[str, Any], generators: list[torch.Generator], spending: Spending
+    ) -> None:
         self.path, self.parts, self.generators = path, parts, generators
+        self.spending, self.begun = spending, spending.mark()
 
     def keep(self, log: list[dict[str, Any]]) -> None:
         """Write all down."""
         states = {name: part.state_dict() for name, part in self.parts.items()}
         random = [torch.get_rng_state(), *(g.get_state() for g in self.generators)]
-        save_checkpoint(self.path, {"parts": states, "random": random, "log": log})
+        spent = self.spending.since(self.begun)
+        save_checkpoint(self.path, {"parts": states, "random": random, "log": log, "spent": spent})
 
     def restore(self) -> list[dict[str, Any]]:
         """Go back to what was written down, if anything was; return the log."""
@@ -317,6 +326,7 @@ class _Keeper:
         torch.set_rng_state(content["random"][0])
         for generator, state in zip(self.generators, content["random"][1:], strict=True):
             generator.set_state(state)
+        self.spending.add_time(content.get("spent", {}))
         return content["log"]
 
     def remove(self) -> None:
@@ -326,7 +336,7 @@ class _Keeper:
 
 def _tune(run: _Run, policy: Policy) -> Policy:
     task, settings, plan, folder = run.task, run.settings, run.plan, run.folder
-    began = time.process_time()
+    began = run.spending.mark()
     fine = with_fidelity(task, PUBLISHED)
     judge = TaskEpisodes(fine, plan.validation, seed=settings.seed + _VALIDATION, disturbed=plan.disturbed)
     start = judge.generator.get_state()
@@ -342,7 +352,7 @@ def _tune(run: _Run, policy: Policy) -> Policy:
     )
     ppo = Ppo(policy, settings, fixed=True)
     torch.manual_seed(settings.seed)
-    keeper = _Keeper(folder / "tune.part", ppo.parts() | {"best": best}, [episodes.generator])
+    keeper = _Keeper(folder / "tune.part", ppo.parts() | {"best": best}, [episodes.generator], run.spending)
     log = keeper.restore() if run.resume else []
     if not log:
         mark = success(policy)
@@ -368,7 +378,7 @@ def _tune(run: _Run, policy: Policy) -> Policy:
         log.append({"episodes": done, "success": now[0], "return": now[1], "noisy": share, "best": mark})
         keeper.keep(log)
         run.told("tune", done, plan.tune_episodes, f"success {now[0]:.0%}, with noise {share:.0%}, best {mark[0]:.0%}")
-    played = log[-1]["episodes"] + judge.count * max(1, len(log) - 1)
+    run.spending.played += log[-1]["episodes"] + judge.count * max(1, len(log) - 1)
     keeper.remove()
-    run.notes["tune"] = {"episodes": played, "cpu_seconds": round(time.process_time() - began, 1), "log": log}
+    run.notes["tune"] = run.spending.since(began) | {"log": log}
     return best
