@@ -68,17 +68,20 @@ def train(
         ),
     ] = None,
     episodes: Annotated[int | None, typer.Option(min=1, help="Budget of episodes. Default: the published one.")] = None,
-    minutes: Annotated[float | None, typer.Option(help="Budget of the clock. Default: 60.")] = None,
+    minutes: Annotated[
+        float | None, typer.Option(help="Budget of the clock. Default: 60, and 180 for gathering by hybrid.")
+    ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of everything.")] = 0,
     count: Annotated[int | None, typer.Option(min=1, help="Episodes that are played at once.")] = None,
     fidelity: Annotated[
-        str | None, typer.Option(help="Of training: published, coarse, or such as 1ms/2.", metavar="FIDELITY")
+        str | None,
+        typer.Option(help="Of training, but for hybrid: published, coarse, or such as 1ms/2.", metavar="FIDELITY"),
     ] = None,
     settings: Annotated[
         list[str] | None,
         typer.Option("--set", help="Another setting, such as rate=1e-3; may be repeated.", metavar="NAME=VALUE"),
     ] = None,
-    variation: Annotated[bool, typer.Option(help="Let starts vary.")] = True,
+    variation: Annotated[bool, typer.Option(help="Let starts vary; hybrid always does.")] = True,
     device: Annotated[
         str | None, typer.Option(help="Where to train; hybrid on the CPU only. Default: cpu.", metavar="cpu|cuda")
     ] = None,
@@ -131,6 +134,8 @@ def train(
     made, how = find(task), execution_choice(execution)
     if algo != "hybrid" and (trajectory or without):
         raise InputError(f"--trajectory and --without: they belong to hybrid, not to {algo}; leave them out.")
+    if algo == "hybrid" and execution is not None:
+        raise InputError("--execution: stages of hybrid choose it themselves; leave it out.")
     with at_work(out, *_WRITTEN):
         if algo == "hybrid":
             _hybrid(made, chosen, out, trajectory or [], without or [], resume, as_json)
@@ -225,6 +230,8 @@ def _hybrid(
     for name in STAGES:
         if name in notes:
             spent = f"{notes[name]['episodes']} episodes, {notes[name]['cpu_seconds']:.0f} CPU s"
+            ended = notes[name].get("ended")
+            spent += f"; the budget of {ended} ended it" if ended else ""
             typer.echo(f"{name + ':':8}{spent}", err=as_json)
     typer.echo(f"policy: {out / 'policy.pt'}", err=as_json)
     if as_json:

@@ -150,8 +150,10 @@ class _Journal:
             self.ahead = found["rows"]
             spending.add_time(found.get("spent", {}))
 
-    def recall(self) -> list[ExpertScore] | None:
-        """Return how the next batch went, if that is known."""
+    def recall(self, count: int) -> list[ExpertScore] | None:
+        """Return how the next batch of so many candidates went, if that is known."""
+        if self.ahead and len(self.ahead[0]) != count:  # a budget ended that search elsewhere
+            self.ahead = []
         return [ExpertScore(*row) for row in self.ahead.pop(0)] if self.ahead else None
 
     def keep(self, scores: list[ExpertScore]) -> None:
@@ -266,7 +268,8 @@ def improve_expert(
         sigma: first deviation of a place [m].
         noise: of actions [m].
         enough: see above.
-        spending: counts what it uses, also in earlier processes where there is a journal.
+        spending: counts what it uses, also in earlier processes where there is a journal, and ends it with the best so
+            far when a budget does not allow another generation; the log says which.
         judged: the task itself where `task` is its surrogate: what the search found has to be better there.
         disturbed: by how much friction and stiffness vary from episode to episode, as shares of their own; in
             the search it grows from nothing over the first half of the generations.
@@ -287,14 +290,16 @@ def improve_expert(
     scale = max(abs(s.returns) for s in scores) or 1.0
     best = max(range(len(experts)), key=lambda k: scores[k].value(scale))
     log: list[dict[str, Any]] = [{"source": e.source, **vars(s)} for e, s in zip(experts, scores, strict=True)]
-    base, good = experts[best], 0
+    base, good, ended = experts[best], 0, ""
     mean = base
     told("robust", 0, generations, f"{base.source}: success {scores[best].success:.0%}")
     if not generations:
         return base, log, arena.played
     search = _strategy(task, population, sigma, seed)
     for k in range(generations):
-        if good >= 3:
+        # What is known costs nothing more, and what is found has to be compared with what was there.
+        ended = "" if kept.ahead else spending.ended((1 + population) * starts + 8 * starts)
+        if ended or good >= 3:
             break
         asked = search.ask()
         mean = _changed(base, torch.tensor(search.mean), task)
@@ -305,6 +310,9 @@ def improve_expert(
         log.append({"generation": k, **vars(scores[0]), "best": max(s.success for s in scores[1:])})
         good = good + 1 if scores[0].success >= enough and (strength == 1.0 or not disturbed) else 0
         told("robust", k + 1, generations, f"success {scores[0].success:.0%}, best {log[-1]['best']:.0%}")
+    if ended:
+        told("robust", len(log) - len(experts), generations, f"the budget of {ended} ends it")
+        log.append({"ended": ended})
     if mean is base:
         return base, log, arena.played
     if good < 3:
@@ -331,7 +339,7 @@ class _Arena:
         count = starts * len(experts)
         self.played += count
         self.journal.spending.played += count
-        found = self.journal.recall()
+        found = self.journal.recall(len(experts))
         if found is None:
             if self._made is None or self._made.count != count:
                 self._made = TaskEpisodes(self.task, count)

@@ -4,8 +4,9 @@
 2. `clone`: a policy learns what a follower does, from what it sees itself, first in cheap steps, at last as published.
 3. `tune`: PPO goes on from the clone in published steps, near to it, and gives back what made it worse.
 
-Each stage leaves a file and begins with those of the stages before it. All that is judged on the way is judged from
-validation starts; those of `evaluate` are never played here.
+Each stage leaves a file and begins with those of the stages before it. A budget of episodes or minutes that is used up
+ends a stage with the best so far; what has to be there then is one comparison of paths and one round of cloning. All
+that is judged on the way is judged from validation starts; those of `evaluate` are never played here.
 """
 
 from __future__ import annotations
@@ -154,7 +155,7 @@ def train_hybrid(
     Args:
         task: in the published fidelity.
         trajectories: files of `torchdlo optimize`.
-        settings: seed, sizes and settings of PPO.
+        settings: budgets, seed, sizes and settings of PPO.
         folder: gets expert.json, clone.pt, policy.pt and stages.json.
         plan: sizes of the stages.
         stages: which of `STAGES` to run; those left out are skipped, or taken from the files of an earlier run.
@@ -168,8 +169,10 @@ def train_hybrid(
     plan, told = plan or plan_of(task.name), callback or (lambda *_: None)
     notes: dict[str, Any] = _notes(folder) if resume else {}
     notes |= {"plan": asdict(plan), "settings": asdict(settings), "coarse": task.coarse.plain()}
-    run = _Run(task, settings, plan, folder, stages, resume, told, Spending(), notes)
+    spending = Spending(settings.episodes, settings.minutes)
+    run = _Run(task, settings, plan, folder, stages, resume, told, spending, notes)
     experts = candidate_experts(task, list(trajectories))
+    _check_budget(run, experts, expert)
     if not resume:
         _begin_afresh(run, experts, expert)
     with torch.random.fork_rng(devices=[]):
@@ -193,12 +196,22 @@ def _note(folder: Path, notes: dict[str, Any]) -> None:
 
 
 def _finish(policy: Policy, folder: Path, notes: dict[str, Any]) -> None:
-    _note(folder, notes)
     save_policy(policy, folder / "policy.pt", {"algorithm": "hybrid", "episodes": _episodes(notes)})
+    _note(folder, notes)
 
 
 def _episodes(notes: dict[str, Any]) -> int:
     return sum(notes[name]["episodes"] for name in STAGES if name in notes)
+
+
+def _check_budget(run: _Run, experts: list[Expert], given: Path | None) -> None:
+    """Refuse a budget of episodes that does not suffice for what has to be there."""
+    plan, resume = run.plan, run.resume
+    compared = 2 * plan.starts * len(experts) if _searches(run, given) else 0
+    cloned = plan.count if "clone" in run.stages and not (resume and (run.folder / "clone.pt").is_file()) else 0
+    if run.settings.episodes < compared + cloned:
+        said = f"{compared} to compare paths and {cloned} for a round of cloning"
+        raise InputError(f"episodes is {run.settings.episodes}; expected at least {compared + cloned}: {said}.")
 
 
 def _begin_afresh(run: _Run, experts: list[Expert], given: Path | None) -> None:
@@ -233,6 +246,7 @@ def _robust(run: _Run, experts: list[Expert], given: Path | None) -> Expert | No
     generations = plan.generations if "robust" in run.stages else 0
     coarse = with_fidelity(task, task.coarse)
     surrogate = coarse.surrogate()
+    run.spending.reserved = plan.count if "clone" in run.stages else 0
     found, log, _ = improve_expert(
         surrogate or coarse,
         experts,
@@ -248,7 +262,9 @@ def _robust(run: _Run, experts: list[Expert], given: Path | None) -> Expert | No
         journal=folder / "robust.json",
         callback=run.told,
     )
-    run.notes["robust"] = run.spending.since(began) | {"log": log}
+    run.spending.reserved = 0
+    ended = next((row for row in log if "ended" in row), {})
+    run.notes["robust"] = run.spending.since(began) | ended | {"log": log}
     save_expert(found, folder / "expert.json", task, {"episodes": run.notes["robust"]["episodes"], "log": log})
     return found
 
@@ -278,7 +294,12 @@ def _clone(run: _Run, expert: Expert | None) -> Policy:
     parts = {"policy": policy, "labels": labels}
     keeper = _Keeper(folder / "clone.part", parts, [rng, *_generators(rounds)], run.spending)
     log = keeper.restore() if run.resume else []
+    ended = {}
     for k, episodes in enumerate(rounds):
+        if k >= max(1, len(log)) and (budget := run.spending.ended(episodes.count)):
+            ended = {"ended": budget}
+            run.told("clone", k, len(rounds), f"the budget of {budget} ends it")
+            break
         run.spending.played += episodes.count
         if k < len(log):
             continue
@@ -289,7 +310,8 @@ def _clone(run: _Run, expert: Expert | None) -> Policy:
         log.append({"round": k, "fidelity": fine, "success": success, "failed": failed, "error": error})
         keeper.keep(log)
         run.told("clone", k + 1, len(rounds), f"success {success:.0%} in the round, error {error:.2g}")
-    run.notes["clone"] = run.spending.since(began) | {"log": log}
+    run.notes["clone"] = run.spending.since(began) | ended | {"log": log}
+    run.notes.pop("tune", None)
     save_policy(policy, file, {"stage": "clone", "log": log})
     keeper.remove()
     return policy
@@ -334,51 +356,91 @@ class _Keeper:
         self.path.unlink(missing_ok=True)
 
 
+class _Judge:
+    """Plays policies from the validation starts, always the same ones."""
+
+    def __init__(self, run: _Run, task: Task) -> None:
+        plan, seed = run.plan, run.settings.seed + _VALIDATION
+        self.episodes = TaskEpisodes(task, plan.validation, seed=seed, disturbed=plan.disturbed)
+        self.start, self.spending = self.episodes.generator.get_state(), run.spending
+
+    def mark(self, policy: Policy) -> tuple[float, float]:
+        """Return a policy's share of successes and its mean return."""
+        self.episodes.generator.set_state(self.start)
+        found = collect_episodes(policy, self.episodes, random=False)
+        self.spending.played += self.episodes.count
+        return float(found.success.float().mean()), float(self.episodes.returns.mean())
+
+
+def _tuned(run: _Run) -> bool:
+    """Return whether this run has finished its last stage before."""
+    return run.resume and (run.folder / "policy.pt").is_file() and not run.notes.get("tune", {"ended": ""}).get("ended")
+
+
 def _tune(run: _Run, policy: Policy) -> Policy:
-    task, settings, plan, folder = run.task, run.settings, run.plan, run.folder
+    settings, plan = run.settings, run.plan
+    if _tuned(run):
+        run.spending.add(run.notes["tune"])
+        return load_policy(run.folder / "policy.pt")
     began = run.spending.mark()
-    fine = with_fidelity(task, PUBLISHED)
-    judge = TaskEpisodes(fine, plan.validation, seed=settings.seed + _VALIDATION, disturbed=plan.disturbed)
-    start = judge.generator.get_state()
-
-    def success(policy: Policy) -> tuple[float, float]:
-        judge.generator.set_state(start)
-        found = collect_episodes(policy, judge, random=False)
-        return float(found.success.float().mean()), float(judge.returns.mean())
-
-    best = copy.deepcopy(policy)
-    episodes = TaskEpisodes(
-        fine, settings.count, seed=settings.seed + 13, bonus=settings.bonus, disturbed=plan.disturbed
-    )
+    fine = with_fidelity(run.task, PUBLISHED)
+    judge, best = _Judge(run, fine), copy.deepcopy(policy)
+    choices: dict[str, Any] = {"bonus": settings.bonus, "disturbed": plan.disturbed}
+    episodes = TaskEpisodes(fine, settings.count, seed=settings.seed + 13, **choices)
     ppo = Ppo(policy, settings, fixed=True)
     torch.manual_seed(settings.seed)
-    keeper = _Keeper(folder / "tune.part", ppo.parts() | {"best": best}, [episodes.generator], run.spending)
+    parts = ppo.parts() | {"best": best}
+    keeper = _Keeper(run.folder / "tune.part", parts, [episodes.generator], run.spending)
     log = keeper.restore() if run.resume else []
-    if not log:
-        mark = success(policy)
+    if log:
+        run.spending.played += log[-1]["episodes"] + plan.validation * max(1, len(log) - 1)
+    elif not (ended := run.spending.ended(plan.validation)):
+        mark = judge.mark(policy)
         log = [{"episodes": 0, "success": mark[0], "return": mark[1], "best": mark}]
         with torch.no_grad():
             policy.log_sigma.fill_(math.log(settings.sigma))
         keeper.keep(log)
+    if log:
+        episodes.scale = 10.0 / max(1e-6, abs(log[0]["return"]))
+        ended = _tune_on(run, ppo, best, episodes, judge, keeper, log)
+    if ended:
+        run.told("tune", log[-1]["episodes"] if log else 0, plan.tune_episodes, f"the budget of {ended} ends it")
+    else:
+        keeper.remove()
+    run.notes["tune"] = run.spending.since(began) | ({"ended": ended} if ended else {}) | {"log": log}
+    return best
+
+
+def _tune_on(
+    run: _Run,
+    ppo: Ppo,
+    best: Policy,
+    episodes: TaskEpisodes,
+    judge: _Judge,
+    keeper: _Keeper,
+    log: list[dict[str, Any]],
+) -> str:
+    """Go on with PPO from what the log says last; return which budget ended it, if any did."""
+    plan, count, policy = run.plan, run.settings.count, ppo.policy
     mark = tuple(log[-1]["best"])
-    episodes.scale = 10.0 / max(1e-6, abs(log[0]["return"]))
     run.told("tune", log[-1]["episodes"], plan.tune_episodes, f"success {mark[0]:.0%}")
-    while log[-1]["episodes"] + settings.count <= plan.tune_episodes and mark[0] < plan.enough:
-        batch, first = collect_episodes(policy, episodes), len(log) == 1
+    while log[-1]["episodes"] + count <= plan.tune_episodes and mark[0] < plan.enough:
+        first = len(log) == 1
+        if ended := run.spending.ended(count + (0 if first else plan.validation)):
+            return ended
+        batch = collect_episodes(policy, episodes)
+        run.spending.played += count
         ppo.learn(batch, freeze=first)
         # The first batch teaches the critic alone.
-        now = mark if first else success(policy)
+        now = mark if first else judge.mark(policy)
         share = float(batch.success.float().mean())
         if now > mark:
             mark = now
             best.load_state_dict(policy.state_dict())
         elif now[0] < mark[0] - 0.15:
             policy.load_state_dict(best.state_dict())
-        done = log[-1]["episodes"] + settings.count
+        done = log[-1]["episodes"] + count
         log.append({"episodes": done, "success": now[0], "return": now[1], "noisy": share, "best": mark})
         keeper.keep(log)
         run.told("tune", done, plan.tune_episodes, f"success {now[0]:.0%}, with noise {share:.0%}, best {mark[0]:.0%}")
-    run.spending.played += log[-1]["episodes"] + judge.count * max(1, len(log) - 1)
-    keeper.remove()
-    run.notes["tune"] = run.spending.since(began) | {"log": log}
-    return best
+    return ""

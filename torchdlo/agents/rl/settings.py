@@ -131,6 +131,10 @@ class TrainingSettings:
         for name in ("barrier", "auxiliary"):
             plain = self.algorithm != "hybrid" or not getattr(self, name)
             need(plain, name, "0, as stages of hybrid know none; ppo, sac, shac and sapo can have one")
+        stages = {"fidelity": "published", "variation": True, "ends": 1.0} if self.algorithm == "hybrid" else {}
+        for name, own in stages.items():
+            said = f"{own}, as stages of hybrid have their own; ppo, sac, shac and sapo can have another"
+            need(getattr(self, name) == own, name, said)
         graded = self.algorithm in ("shac", "sapo") or not self.saturation
         need(graded, "saturation", f"0, as {self.algorithm} does not go down the gradient of returns; shac and sapo do")
 
@@ -210,8 +214,11 @@ _ALGORITHM: dict[str, dict[str, Any]] = {
     "sac": {"polyak": 0.995, "sigma": 0.5},
     "shac": {"rate": 2e-3, "polyak": 0.8, "barrier": 0.2},
     "sapo": {"rate": 2e-3, "activation": "silu", "layer_norm": True, "sigma": 0.3, "barrier": 0.2},
-    "hybrid": {"episodes": 4_000, "count": 128, "hidden": (256, 128, 64), "sigma": 0.15, "rate": 1e-4, "bonus": 5.0},
+    # More than any plan takes; of Wiring post, 8 992.
+    "hybrid": {"episodes": 10_000, "count": 128, "hidden": (256, 128, 64), "sigma": 0.15, "rate": 1e-4, "bonus": 5.0},
 }
+_MINUTES = {"gathering": 180.0}
+"""Budgets of the clock of the hybrid where an hour is not enough."""
 _ENDS = {"coiling": 0.1}
 """Shares of what ends lack to success where that is many times what an episode earns, for algorithms without stages."""
 
@@ -221,7 +228,9 @@ def training_preset(task: str, algorithm: str, **given: Any) -> TrainingSettings
     if algorithm not in ALGORITHMS:
         raise InputError(f"algorithm is {algorithm!r}; expected one of {', '.join(ALGORITHMS)}.")
     base: dict[str, Any] = {"algorithm": algorithm, "episodes": EPISODES.get(task, 20_000)} | _ALGORITHM[algorithm]
-    if algorithm != "hybrid":
+    if algorithm == "hybrid":
+        base["minutes"] = _MINUTES.get(task, 60.0)
+    else:
         base["ends"] = _ENDS.get(task, 1.0)
     wanted = {name: value for name, value in given.items() if value is not None}
     names = {f.name for f in dataclasses.fields(TrainingSettings)}

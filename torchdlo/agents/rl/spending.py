@@ -31,6 +31,12 @@ class Spending:
         """Episodes that have to be left for what comes later."""
         self._wall, self._cpu = time.monotonic(), time.process_time()
 
+    def ended(self, episodes: int) -> str:
+        """Return which budget does not allow so many more episodes, "" if all do; time may be exceeded by them."""
+        if self.played + episodes + self.reserved > self.episodes:
+            return "episodes"
+        return "minutes" if self.mark().seconds >= 60 * self.minutes else ""
+
     def mark(self) -> Mark:
         """Return what was used so far."""
         return Mark(self.played, time.monotonic() - self._wall, time.process_time() - self._cpu)
