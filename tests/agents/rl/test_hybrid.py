@@ -147,6 +147,30 @@ def test_a_run_that_is_not_resumed_begins_afresh(tmp_path: Path):
     assert "policy.pt" in left and not left & {"expert.json", "clone.pt", "stages.json", "clone.part"}
 
 
+def test_going_on_with_something_else_is_refused_by_what_differs(tmp_path: Path):
+    plan, folder, first = replace(PLAN, generations=0, updates=20), tmp_path / "run", found(tmp_path)
+    choices = {"folder": folder, "plan": plan, "stages": ("clone",), "resume": True}
+    train_hybrid(Lead(), [first], settings(), **choices)
+    before = {file.name: file.read_bytes() for file in folder.iterdir()}
+    other = elsewhere(first, "other", 0.01)
+    for files, chosen, changes, said in (
+        ([first], settings(seed=5), {}, r"seed 0 \(now 5\)"),
+        ([first], settings(rate=0.1), {}, r"rate 0.0001 \(now 0.1\)"),
+        ([first], settings(), {"plan": replace(plan, noise=0.5)}, r"noise 0.001 \(now 0.5\)"),
+        ([other], settings(), {}, "other trajectories"),
+        ([], settings(), {"expert": folder / "expert.json"}, "another expert"),
+    ):
+        with pytest.raises(InputError, match=f"stages.json: it belongs to a run with {said}; give the same"):
+            train_hybrid(Lead(), files, chosen, **choices | changes)
+    assert {file.name: file.read_bytes() for file in folder.iterdir()} == before
+    # Budgets may change, and trajectories need not be given again; files of 0.1 do not say which they were.
+    notes = json.loads((folder / "stages.json").read_text())
+    kept = {k: v for k, v in notes.items() if k not in ("experts", "given", "task", "sha256")}
+    (folder / "stages.json").write_text(json.dumps(kept))
+    train_hybrid(Lead(), [], settings(minutes=5.0, episodes=999), **choices)
+    train_hybrid(Lead(), [other], settings(), **choices)
+
+
 class Vain(Lead):
     """Nothing succeeds here."""
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -15,6 +16,7 @@ from lead import Lead
 from torchdlo.agents.policies import CloudPolicy, CloudSpec, load_policy
 from torchdlo.agents.rl.episodes import TaskEpisodes
 from torchdlo.agents.rl.student import DepthCamera, Student, _Eyes, cloud_spec, judge_student, teach
+from torchdlo.errors import InputError
 
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::FutureWarning")
 
@@ -77,3 +79,27 @@ def test_a_student_learns_what_its_teacher_does_and_goes_on_after_a_stop(tmp_pat
     read = load_policy(tmp_path)
     assert isinstance(read, CloudPolicy) and read.spec == cloud_spec(Lead())
     assert torch.equal(read.all[0].weight, student.all[0].weight)
+
+
+def test_going_on_with_another_plan_or_teacher_is_refused(tmp_path: Path):
+    plan = Student(rounds=1, final=0, count=1, updates=1, subset=8, camera=DepthCamera(size=32, count=16))
+
+    def stop(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        teach(Lead(), Teacher(), folder=tmp_path, plan=plan, callback=stop)
+
+    class Other(Teacher):
+        def state_dict(self):
+            return {"weight": torch.ones(2)}
+
+    for teacher, changes, said in (
+        (Teacher(), {"seed": 3}, r"seed 0 \(now 3\)"),
+        (Teacher(), {"noise": 0.5}, r"noise 0.001 \(now 0.5\)"),
+        (Other(), {}, "another teacher"),
+    ):
+        with pytest.raises(InputError, match=f"student.part: it belongs to a run with {said}; give the same"):
+            teach(Lead(), teacher, folder=tmp_path, plan=replace(plan, **changes), resume=True)
+    _, notes = teach(Lead(), Teacher(), folder=tmp_path, plan=plan, resume=True)
+    assert len(notes["log"]) == 2

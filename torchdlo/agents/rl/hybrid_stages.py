@@ -27,13 +27,14 @@ from torchdlo.agents.rl.expert import (
     Expert,
     candidate_experts,
     check_experts,
+    expert_hash,
     improve_expert,
     load_expert,
     save_expert,
 )
 from torchdlo.agents.rl.ppo import Ppo
 from torchdlo.agents.rl.rollout import collect_episodes
-from torchdlo.agents.rl.settings import TrainingSettings
+from torchdlo.agents.rl.settings import TrainingSettings, changed
 from torchdlo.agents.rl.spending import Spending
 from torchdlo.agents.torch_records import load_checkpoint, save_checkpoint
 from torchdlo.envs import PUBLISHED, Fidelity, Task, with_fidelity
@@ -167,14 +168,14 @@ def train_hybrid(
     if other:
         raise InputError(f"stages: there is no {', '.join(other)}; expected some of {', '.join(STAGES)}.")
     plan, told = plan or plan_of(task.name), callback or (lambda *_: None)
-    notes: dict[str, Any] = _notes(folder) if resume else {}
-    notes |= {"plan": asdict(plan), "settings": asdict(settings), "coarse": task.coarse.plain()}
-    spending = Spending(settings.episodes, settings.minutes)
-    run = _Run(task, settings, plan, folder, stages, resume, told, spending, notes)
     experts = candidate_experts(task, list(trajectories))
+    spending = Spending(settings.episodes, settings.minutes)
+    run = _Run(task, settings, plan, folder, stages, resume, told, spending, _notes(folder) if resume else {})
+    notes = _belonging(run, experts if trajectories else None, expert)
     _check_budget(run, experts, expert)
     if not resume:
         _begin_afresh(run, experts, expert)
+    _note(folder, notes)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(settings.seed)
         chosen = _robust(run, experts, expert)
@@ -202,6 +203,30 @@ def _finish(policy: Policy, folder: Path, notes: dict[str, Any]) -> None:
 
 def _episodes(notes: dict[str, Any]) -> int:
     return sum(notes[name]["episodes"] for name in STAGES if name in notes)
+
+
+def _belonging(run: _Run, experts: list[Expert] | None, given: Path | None) -> dict[str, Any]:
+    """Return the notes of a run with what it belongs to; refuse what differs from that of a run to go on with.
+
+    Budgets may change, and trajectories (None) need not be given again.
+    """
+    own: dict[str, Any] = {"task": run.task.name, "plan": asdict(run.plan), "settings": asdict(run.settings)}
+    own |= {"coarse": run.task.coarse.plain()}
+    if experts is not None:
+        own["experts"] = [expert_hash(e) for e in experts]
+    own["given"] = expert_hash(load_expert(given, run.task)) if given is not None and given.is_file() else None
+    was, other = run.notes, changed(run.notes, own, ("plan", "settings", "experts", "given"))
+    other += changed(was.get("plan", {}), own["plan"])
+    other += changed(was.get("settings", {}), own["settings"], ("episodes", "minutes", "interval"))
+    if changed(was, {"experts": own.get("experts")}) and experts is not None:
+        other.append("other trajectories")
+    if changed(was, {"given": own["given"]}):
+        other.append("another expert")
+    if other:
+        said = f"it belongs to a run with {', '.join(other)}; give the same, or leave out --resume"
+        raise InputError(f"{run.folder / 'stages.json'}: {said}.")
+    run.notes.update(own)
+    return run.notes
 
 
 def _check_budget(run: _Run, experts: list[Expert], given: Path | None) -> None:

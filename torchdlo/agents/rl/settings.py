@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -10,7 +11,16 @@ from typing import Any
 
 from torchdlo.errors import InputError
 
-__all__ = ["ALGORITHMS", "EPISODES", "EXPECTED", "LARGEST_SEED", "PUBLISHED", "TrainingSettings", "training_preset"]
+__all__ = [
+    "ALGORITHMS",
+    "EPISODES",
+    "EXPECTED",
+    "LARGEST_SEED",
+    "PUBLISHED",
+    "TrainingSettings",
+    "changed",
+    "training_preset",
+]
 
 ALGORITHMS = ("ppo", "sac", "shac", "sapo", "hybrid")
 """Names of all ways to train."""
@@ -221,6 +231,16 @@ _MINUTES = {"gathering": 180.0}
 """Budgets of the clock of the hybrid where an hour is not enough."""
 _ENDS = {"coiling": 0.1}
 """Shares of what ends lack to success where that is many times what an episode earns, for algorithms without stages."""
+
+
+def changed(was: dict[str, Any], now: dict[str, Any], free: tuple[str, ...] = ()) -> list[str]:
+    """Return what differs from what a file says, as "rate 0.1 (now 0.2)"; what it does not say is not compared."""
+    plain = json.loads(json.dumps(now))
+    return [
+        f"{name} {was[name]} (now {value})"
+        for name, value in plain.items()
+        if name not in free and name in was and was[name] != value
+    ]
 
 
 def training_preset(task: str, algorithm: str, **given: Any) -> TrainingSettings:

@@ -23,8 +23,8 @@ from torchdlo.agents.policies.policy_files import save_policy
 from torchdlo.agents.rl.episodes import TaskEpisodes
 from torchdlo.agents.rl.evaluate import UNSEEN, wilson_interval
 from torchdlo.agents.rl.rollout import episode_progress, policy_features
-from torchdlo.agents.rl.settings import EXPECTED
-from torchdlo.agents.torch_records import load_checkpoint, save_checkpoint
+from torchdlo.agents.rl.settings import EXPECTED, changed
+from torchdlo.agents.torch_records import load_checkpoint, save_checkpoint, tensors_hash
 from torchdlo.envs import PUBLISHED, Task, with_fidelity
 from torchdlo.errors import InputError
 from torchdlo.files import write_atomically
@@ -185,6 +185,22 @@ def _fit(student: CloudPolicy, memory: _Memory, plan: Student, updates: int) -> 
     return error
 
 
+def _teacher_hash(teacher: Any) -> str:
+    """Return what tells a policy from others, "" of one that has no numbers."""
+    state = teacher.state_dict() if hasattr(teacher, "state_dict") else {}
+    return tensors_hash(*state.values()) if state else ""
+
+
+def _check_same(part: Path, kept: dict[str, Any], now: dict[str, Any]) -> None:
+    """Refuse what belongs to another task, teacher or plan; those of 0.1 did not say."""
+    was = json.loads(kept.get("belongs", "{}"))
+    other = changed(was, {"task": now["task"]}) + changed(was.get("plan", {}), now["plan"])
+    other += ["another teacher"] if changed(was, {"teacher": now["teacher"]}) else []
+    if other:
+        said = f"it belongs to a run with {', '.join(other)}; give the same, or leave out --resume"
+        raise InputError(f"{part}: {said}.")
+
+
 def teach(
     task: Task,
     teacher: Policy,
@@ -209,8 +225,10 @@ def teach(
         torch.manual_seed(plan.seed)
         student, memory, log = CloudPolicy(cloud_spec(task)), _Memory(), []
         part, spent = folder / "student.part", 0.0
+        belongs = {"plan": asdict(plan), "teacher": _teacher_hash(teacher), "task": task.name}
         kept = load_checkpoint(part) if resume else None
         if kept is not None:
+            _check_same(part, kept, belongs)
             student.load_state_dict(kept["student"])
             memory, log, spent = _Memory([kept["cloud"]], [kept["rest"]]), kept["log"], kept["cpu_seconds"]
         rounds = ["coarse"] * (1 + plan.rounds) + ["published"] * plan.final
@@ -233,7 +251,7 @@ def teach(
             content = {"student": student.state_dict(), "cloud": torch.cat(memory.cloud)}
             folder.mkdir(parents=True, exist_ok=True)
             content |= {"rest": torch.cat(memory.rest), "log": log, "cpu_seconds": cpu}
-            save_checkpoint(part, content)
+            save_checkpoint(part, content | {"belongs": json.dumps(belongs)})
             told("student", k + 1, len(rounds), f"success {shares['success']:.0%} in the round, error {error:.2g}")
         spent = round(spent + time.process_time() - began, 1)
     notes = {"plan": asdict(plan), "episodes": len(rounds) * plan.count, "cpu_seconds": spent, "log": log}

@@ -21,7 +21,7 @@ from torch.utils import _pytree as pytree
 from torchdlo.agents.policies import Policy, load_policy, save_policy
 from torchdlo.agents.rl.episodes import Episodes
 from torchdlo.agents.rl.rollout import Batch
-from torchdlo.agents.rl.settings import TrainingSettings
+from torchdlo.agents.rl.settings import TrainingSettings, changed
 from torchdlo.agents.torch_records import load_checkpoint, save_checkpoint
 from torchdlo.errors import InputError
 from torchdlo.files import write_atomically
@@ -242,10 +242,8 @@ def _restore(
     _check_policy(trainer.policy, content, path)
     first = {"device": "cpu", "barrier": 0.0, "auxiliary": 0.0, "saturation": 0.0}
     was = first | json.loads(content["settings"])  # those of 0.1 did not say
-    now = json.loads(json.dumps(asdict(settings)))
     # How long to go on may change, and a temperature goes on from where it was.
-    free = ("episodes", "minutes", "interval", "temperature")
-    other = [f"{k} {was.get(k)} (now {now[k]})" for k in now if k not in free and was.get(k) != now[k]]
+    other = changed(was, asdict(settings), ("episodes", "minutes", "interval", "temperature"))
     if other:
         raise InputError(f"{path}: it belongs to a run with {', '.join(other)}; give the same, or leave out --resume.")
     for name, part in trainer.parts().items():
