@@ -252,6 +252,8 @@ def _searched(task: Task, seed: int, out: Path) -> Path:
     journal = out / "search" / "journal"
     with progress() as show, deferred_interrupt(show) as callback:
         found = optimize(problem, chosen, journal=journal, resume=journal.exists(), callback=callback)
+    if found.interrupted:
+        raise stopped(f"what was searched is kept in {out / 'search'}", resume=True)
     if not bool(found.outcome.success[0]):
         raise InputError(
             f"{task.name}: the search found no trajectory that succeeds; give one with --trajectory, or another --seed."

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -169,6 +170,20 @@ def test_going_on_with_something_else_is_refused_by_what_differs(tmp_path: Path)
     (folder / "stages.json").write_text(json.dumps(kept))
     train_hybrid(Lead(), [], settings(minutes=5.0, episodes=999), **choices)
     train_hybrid(Lead(), [other], settings(), **choices)
+
+
+def test_ctrl_c_ends_the_search_of_a_trajectory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys):
+    from torchdlo.agents.trajopt import search
+
+    monkeypatch.setitem(envs.TASKS, "lead", Lead)
+    won = SimpleNamespace(success=torch.tensor([True]))
+    monkeypatch.setattr(search, "optimize", lambda *_, **__: SimpleNamespace(interrupted=True, outcome=won))
+    with pytest.raises(SystemExit) as done:
+        app.main(["train", "lead", "--out", str(tmp_path / "x")])
+    assert done.value.code == 130
+    said = capsys.readouterr().err
+    assert "interrupted; what was searched is kept in" in said and "go on with: torchdlo train lead" in said
+    assert not (tmp_path / "x" / "search" / "trajectory.json").exists()
 
 
 class Vain(Lead):
