@@ -148,7 +148,7 @@ def test_a_run_that_is_not_resumed_begins_afresh(tmp_path: Path):
     assert "policy.pt" in left and not left & {"expert.json", "clone.pt", "stages.json", "clone.part"}
 
 
-def test_going_on_with_something_else_is_refused_by_what_differs(tmp_path: Path):
+def test_going_on_with_something_else_is_refused_by_what_differs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     plan, folder, first = replace(PLAN, generations=0, updates=20), tmp_path / "run", found(tmp_path)
     choices = {"folder": folder, "plan": plan, "stages": ("clone",), "resume": True}
     train_hybrid(Lead(), [first], settings(), **choices)
@@ -169,7 +169,15 @@ def test_going_on_with_something_else_is_refused_by_what_differs(tmp_path: Path)
     kept = {k: v for k, v in notes.items() if k not in ("experts", "given", "task", "sha256")}
     (folder / "stages.json").write_text(json.dumps(kept))
     train_hybrid(Lead(), [], settings(minutes=5.0, episodes=999), **choices)
-    train_hybrid(Lead(), [other], settings(), **choices)
+    # Nor which stages are left: what was left out is run, and only once.
+    whole = choices | {"stages": ("clone", "tune")}
+    policy, notes = train_hybrid(Lead(), [other], settings(), **whole)
+    assert notes["tune"]["log"]
+    monkeypatch.setattr(stages, "Ppo", None)
+    again, told = train_hybrid(Lead(), [other], settings(), **whole)
+    assert told["tune"] == json.loads(json.dumps(notes["tune"]))
+    for name, value in policy.state_dict().items():
+        assert torch.equal(value, again.state_dict()[name]), name
 
 
 def test_ctrl_c_ends_the_search_of_a_trajectory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys):

@@ -399,7 +399,8 @@ class _Judge:
 
 def _tuned(run: _Run) -> bool:
     """Return whether this run has finished its last stage before."""
-    return run.resume and (run.folder / "policy.pt").is_file() and not run.notes.get("tune", {"ended": ""}).get("ended")
+    done = run.notes.get("tune", {"ended": "before it began"})
+    return run.resume and (run.folder / "policy.pt").is_file() and "ended" not in done
 
 
 def _tune(run: _Run, policy: Policy) -> Policy:
