@@ -183,6 +183,8 @@ class _Filmed:
         self.views, self.step, self.extent, self.sure = tuple(views), step, extent, sure
         self.nuisances = nuisances(views)
         self.target: np.ndarray = np.empty(0)
+        self.times: np.ndarray = np.empty(0)
+        """When readings are taken [s], of priors 0, shape (F, R)."""
         self.priors = slice(0, 0)
 
     def _finish(self, shape: tuple[int, ...], known: list[np.ndarray]) -> None:
@@ -198,6 +200,11 @@ class _Filmed:
         prior = np.full((trials, frames, _COPIES * len(self.nuisances.names), 1), np.nan)
         prior[:, 0] = 0.0
         self.target = np.concatenate([target, prior], 2)
+        taken = np.zeros((frames, self.target.shape[2]))
+        ends = np.cumsum([k.shape[2] for k in known])
+        for view, last, each in zip(self.views, ends, known, strict=True):
+            taken[: len(view.time), last - each.shape[2] : last] = view.time[:, None]
+        self.times = taken
 
     def _priors(self, numbers: np.ndarray, frames: int) -> np.ndarray:
         """Return readings of the priors, shape (P, B, F, R, 1)."""

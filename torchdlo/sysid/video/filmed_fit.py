@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import torch
@@ -111,7 +112,7 @@ def look(
     """Return readings and their derivatives at coordinates (N,) and starts (B, J), over the first seconds.
 
     Where numbers are fixed, derivatives are those of starts alone, shape (B, J, F, R). They are most of the work, and
-    left out (all 0) where costs (B,) are not worth it.
+    left out, `jacobian` being empty, where costs (B,) are not worth it.
     """
     values, target = own.space.to_values(raw)[None], own.target(seconds)
     sims = own.simulate(values, own.frames(seconds), offset[None])
@@ -191,7 +192,7 @@ def fit(
         raw_step, offset_step = _step(own, now, damping)
         least = total(now)
         point = own.space.clip(now.raw + raw_step), now.offset + offset_step
-        tried = look(own, *point, seconds, worth=lambda costs, least=least: _together(costs) < least)
+        tried = look(own, *point, seconds, worth=partial(_less, least))
         if total(tried) < least:
             done = least - total(tried) < tolerance * least
             now, damping = tried, max(damping / 5, 1e-6)
@@ -213,6 +214,10 @@ def total(found: Fit) -> float:
 def _together(costs: np.ndarray) -> float:
     ran = np.isfinite(costs)
     return float(np.where(ran, costs, 1.0).mean()) if ran.any() else np.inf
+
+
+def _less(least: float, costs: np.ndarray) -> bool:
+    return _together(costs) < least
 
 
 def _step(own: FilmedProblem, now: Fit, damping: float) -> tuple[np.ndarray, np.ndarray]:
@@ -296,7 +301,7 @@ def spread(own: FilmedProblem, found: Fit) -> tuple[Point, np.ndarray]:
     curvature = curvature + prior[None]
     gradient = gradient + found.raw * np.diag(prior)
     point = Point(found.raw, found.cost, gradient, curvature, found.costs)
-    drifts = np.linalg.solve(levenberg_marquardt.firm(curvature.sum(0)), blocks * prior)[numbers:]
+    drifts = np.linalg.solve(levenberg_marquardt.firm(curvature.sum(0)), blocks * prior).T[numbers:]
     if own.discretisation_correction is not None:
         values = space.to_values(found.raw)[None]
         sims = own.simulate(values)
@@ -336,25 +341,25 @@ def _blocks(own: FilmedProblem, found: Fit) -> tuple[np.ndarray, np.ndarray]:
     """
     if own.trials[0].still:
         return _stretches(own, found)
-    count, length = found.offset.shape[1], max(3, round(_BLOCK * own.spines.views[0].camera.fps))
-    size, frames = found.raw.size, found.residual.shape[1]
-    data = found.residual[:, :, : own.spines.priors.start]
+    count, size, last = found.offset.shape[1], found.raw.size, own.spines.priors.start
+    data, times = found.residual[..., :last], own.spines.times[:, :last]
+    blocks = np.floor((times - times.min()) / _BLOCK).astype(int)
+    least = 0.3 * _BLOCK / max(np.ptp(times), _BLOCK)
     gradients, curvatures = [], []
     for b in range(len(data)):
         whole = np.isfinite(data[b]).sum()
         single = slice(b, b + 1)
-        jacobian = found.jacobian[single][..., : own.spines.priors.start]
+        jacobian = found.jacobian[single][..., :last]
         _, h = normal(data[single], jacobian, found.offset[single], own.prior[single])
         follow = np.zeros((size, count))
         if count:
             inner = h[0, size:, size:] + 1e-12 * np.eye(count)
             follow = np.linalg.solve(inner, h[0, size:, :size]).T
-        for k in range(0, frames, length):
-            rows = slice(k, k + length)
-            share = np.isfinite(data[b, rows]).sum() / max(whole, 1)
-            if share < 0.3 * length / frames:
+        for k in range(blocks.max() + 1):
+            inside = np.where(blocks == k, data[single], np.nan)
+            if np.isfinite(inside).sum() < least * max(whole, 1):
                 continue
-            g, c = normal(data[single, rows], jacobian[:, :, rows], found.offset[single], 0 * own.prior[single])
+            g, c = normal(inside, jacobian, found.offset[single], 0 * own.prior[single])
             gradients.append(g[0, :size] - follow @ g[0, size:])
             reduced = np.concatenate([np.eye(size), -follow], 1)
             curvatures.append(reduced @ c[0] @ reduced.T)

@@ -68,8 +68,9 @@ def fit_starts(
         tried = look(part, raw, moved, seconds, fixed=True, worth=partial(_any_less, least))
         better = tried.costs < least
         slow = better & (least - tried.costs < tolerance * least)
-        for name in ("offset", "costs", "residual", "jacobian"):
-            getattr(now, name)[rows[better]] = getattr(tried, name)[better]
+        if better.any():
+            for name in ("offset", "costs", "residual", "jacobian"):
+                getattr(now, name)[rows[better]] = getattr(tried, name)[better]
         damping[rows] = np.where(better, np.maximum(damping[rows] / 5, 1e-6), 8 * damping[rows])
         rows = rows[~slow & (damping[rows] < 1e3)]
     own.offset = now.offset
