@@ -10,10 +10,10 @@ import pytest
 import torch
 
 from torchdlo.sysid.diagnosis.workspace import CHAIN
-from torchdlo.sysid.estimation.observation import FilmView
+from torchdlo.sysid.estimation.observation import FilmView, Spines
 from torchdlo.sysid.model.rope_model import RopeModel
 from torchdlo.sysid.recordings.recording import Recording, Trial, load_recording
-from torchdlo.sysid.video.filmed_beginnings import NEAR, nearer
+from torchdlo.sysid.video.filmed_beginnings import NEAR, _followed, nearer
 from torchdlo.sysid.video.filmed_diagnosis import _scores
 from torchdlo.sysid.video.filmed_fit import film_gaps, fit
 from torchdlo.sysid.video.filmed_model import Films
@@ -96,6 +96,17 @@ def test_a_chain_is_not_corrected_for_its_mesh() -> None:
         add_correction(problem, values)
         found = problem.discretisation_correction
         assert found is not None and abs(found.wrong - wrong) < 1e-6 and np.abs(found.grid).max() > 0
+
+
+def test_a_wrong_picture_does_not_end_what_is_followed() -> None:
+    whole = filmed(gripped(0.5, 1), {})
+    whole.spines.views[0].places[0, 14] += 90.0
+    spines = whole.spines
+    whole.spines = Spines(spines.views, whole.model.dt, whole.extent, spines.free)
+    raw = whole.space.to_raw(np.concatenate([whole.fixed, np.zeros(8)]))
+    assert film_gaps(whole, fit(replace(whole), raw, 2)).max() > NEAR
+    assert film_gaps(whole, _followed(whole, raw)).max() < 0.2 * NEAR
+    assert whole.dropped == {f"{whole.trials[0].name}, camera a": [14]}
 
 
 @pytest.mark.slow

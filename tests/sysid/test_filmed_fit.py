@@ -7,16 +7,19 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from torchdlo.errors import InputError
 from torchdlo.sysid.calibration.calibrate import calibrate
 from torchdlo.sysid.diagnosis.effect_search import diagnose
+from torchdlo.sysid.estimation.levenberg_marquardt import KNEE
+from torchdlo.sysid.estimation.observation import INDEPENDENT, Spines, seen_by
 from torchdlo.sysid.model.rope_model import RopeModel
 from torchdlo.sysid.model.trial_batch import Start
 from torchdlo.sysid.recordings.recording import load_recording
 from torchdlo.sysid.video.filmed import doubts
-from torchdlo.sysid.video.filmed_fit import eliminated, look, normal
-from torchdlo.sysid.video.filmed_problem import begin_from_balance, filmed_problem
+from torchdlo.sysid.video.filmed_fit import eliminated, look, normal, spread
+from torchdlo.sysid.video.filmed_problem import FilmedProblem, begin_from_balance, filmed_problem
 from torchdlo.sysid.video.filmed_starts import fit_starts, search_starts
 from torchdlo.sysid.video.films import with_stations
 from torchdlo.sysid.video.footage import views_of
@@ -90,6 +93,70 @@ def test_films_that_begin_in_motion_tell_the_bending_stiffness() -> None:
     assert np.mean([t["distance_px"] for t in found.per_trial if t["split"] == "train"]) < 1.0
     # One of them comes towards the camera at a metre per second: its start has another, wrong, basin.
     assert np.mean([t["mae_mm"] for t in found.per_trial if t["split"] == "test"]) < 2.0
+
+
+@pytest.fixture(scope="module")
+def swing() -> FilmedProblem:
+    """The first 0.4 s of a film of a rope in motion."""
+    recording = load_recording(DATA / "sample_film")
+    views, _ = views_of(recording, recording.train[:1])
+    own = filmed_problem(recording, recording.train[:1], views, options={"vertices": 13})
+    begin_from_balance(own, own.fixed)
+    return own.shortened(0.4)
+
+
+def test_near_the_films_derivatives_are_those_of_small_steps(swing: FilmedProblem) -> None:
+    numbers = np.concatenate([[3e-3, 2e-3, 0.5], np.zeros(len(swing.spines.nuisances.names))])
+    raw, own = swing.space.to_raw(numbers), replace(swing)
+    # A film of the simulation itself, a fraction of a pixel off.
+    motion = torch.as_tensor(own.simulate(numbers[None])).float()
+    pixel = seen_by(own.spines.views[0], motion, torch.zeros(1, 8), own.model.dt)[0][0].numpy()
+    along = np.diff(pixel, axis=2)
+    parts = {
+        "places": pixel[:, :, :-1] + 0.5 * along + 0.15,
+        "tangents": along / np.linalg.norm(along, axis=-1)[..., None],
+    }
+    view = replace(own.spines.views[0], good=np.ones_like(own.spines.views[0].good), **parts)
+    own.spines = Spines([view], own.model.dt, own.extent, own.spines.free)
+    here = look(own, raw, own.offset)
+    assert here.costs.max() < 1e-4
+    last = own.spines.priors.start
+    for k in (0, len(raw), len(raw) + 5):
+        ends = []
+        for way in (-1e-3, 1e-3):
+            point, offset = raw.copy(), own.offset.copy()
+            if k < len(raw):
+                point[k] += way
+            else:
+                offset[:, k - len(raw)] += way
+            values = own.space.to_values(point)[None]
+            sims = own.simulate(values, None, offset[None])
+            pairs = own.spines.paired(own.simulate(numbers[None], None, own.offset[None]), 0 * values[:, 3:])[1]
+            ends.append(own.spines.beside(pairs, sims, values[:, 3:])[0, ..., :last, 0])
+        exact = (ends[1] - ends[0]) / 2e-3
+        gap = np.linalg.norm(here.jacobian[:, k, :, :last] - exact) / np.linalg.norm(exact)
+        assert gap < 0.03, (k, gap)
+
+
+def test_what_is_not_worth_it_is_not_differentiated(swing: FilmedProblem) -> None:
+    raw = swing.space.to_raw(np.concatenate([swing.fixed, np.zeros(len(swing.spines.nuisances.names))]))
+    whole, cheap = look(swing, raw, swing.offset), look(swing, raw, swing.offset, worth=lambda costs: False)
+    assert np.array_equal(whole.costs, cheap.costs) and whole.jacobian.size and not cheap.jacobian.size
+
+
+def test_ranges_follow_what_cameras_may_be_off(swing: FilmedProblem) -> None:
+    raw = swing.space.to_raw(np.concatenate([swing.fixed, np.zeros(len(swing.spines.nuisances.names))]))
+    found, numbers = look(swing, raw, swing.offset), len(swing.free)
+    point, drifts = spread(swing, found)
+    cameras = len(raw) - numbers
+    # A prior whose mean is one standard deviation off, solved anew.
+    pictures = float(sum(v.good.sum() for v in swing.spines.views))
+    weight = len(point.curvature) * swing.spines.sure**2 / KNEE / (INDEPENDENT * pictures)
+    curvature = point.curvature.sum(0) + 1e-12 * np.eye(len(raw))
+    for k in range(cameras):
+        moved = np.linalg.solve(curvature, weight * (np.arange(len(raw)) == numbers + k))
+        assert np.allclose(drifts[k], moved, rtol=1e-2, atol=1e-2 * np.abs(moved).max()), (k, drifts[k], moved)
+    assert np.abs(drifts[:cameras, :numbers]).max() > 1e-3
 
 
 def test_edges_agree_within_a_pixel_whatever_the_width() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,6 +12,8 @@ import torch
 from tests.vision.scenes import front, hanging
 from torchdlo.sysid.estimation import levenberg_marquardt
 from torchdlo.sysid.estimation.observation import FilmView, MarkerObservation, Spines, nuisances, over_time
+from torchdlo.sysid.video.filmed_problem import FilmedProblem
+from torchdlo.vision.camera import lens, looking_at, project
 from torchdlo.vision.film import FilmLook, film, off_camera
 from torchdlo.vision.spine import spine
 
@@ -126,3 +129,35 @@ def test_interpolation_in_time_is_cubic_and_stays_within_the_motion() -> None:
     found = over_time(sims, 0.1, at)[0, 0, :, 0, 0]
     torch.testing.assert_close(found[1:4], at[0, 1:4] ** 2)
     assert float(found[4]) == 0.0 and float(found[5]) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize(
+    ("start", "fps"), [((0.0, 0.0), (30.0, 30.0)), ((0.0, 0.5), (30.0, 30.0)), ((0.5, 0.0), (60.0, 30.0))]
+)
+def test_readings_of_the_first_seconds_are_within_what_is_simulated(
+    start: tuple[float, float], fps: tuple[float, float]
+) -> None:
+    places, step, lasts, seconds = np.linspace(-0.3, 0.3, PLACES), 0.01, 2.0, 0.7
+
+    def rope(time: np.ndarray) -> np.ndarray:
+        level = np.broadcast_to(places, (len(time), PLACES))
+        return np.stack([level, 0 * level, 0.3 * np.sin(2 * time)[:, None] + 0 * level], -1)
+
+    views = []
+    for name, begin, rate in zip("ab", start, fps, strict=True):
+        camera = looking_at(name, [0.0, -1.5, 0.0], [0.0, 0.0, 0.0], fps=rate, start=begin)
+        time = begin + np.arange(int((lasts - begin) * rate)) / rate
+        pixel = project(lens([camera]), torch.as_tensor(rope(time)))[0].numpy()
+        tangent = np.zeros_like(pixel)
+        tangent[..., 0] = 1.0
+        views.append(FilmView(camera, np.ones((1, len(time)), bool), pixel[None], tangent[None], 3.0))
+    spines = Spines(views, step, 0.6, np.ones(PLACES, bool))
+    sims = rope(np.arange(round(lasts / step) + 1) * step)[None, None]
+    own = FilmedProblem.__new__(FilmedProblem)
+    own.spines, own.model = spines, SimpleNamespace(dt=step)
+    own.motion = SimpleNamespace(markers=np.zeros((1, sims.shape[2], PLACES, 3)))
+    read = spines.read(sims[:, :, : own.frames(seconds)], none(spines))[0, ..., 0]
+    seen = np.isfinite(own.target(seconds)[..., : spines.priors.start])
+    assert np.abs(read[..., : spines.priors.start][seen]).max() < 2e-4  # a frozen rope is up to 75 mm away
+    pictures = sum(int((v.time <= seconds).sum()) for v in views)
+    assert seen[:, :, :].any(2).sum() >= pictures / 2 and seen.sum() == pictures * 3 * PLACES

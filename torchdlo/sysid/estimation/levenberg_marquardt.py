@@ -106,6 +106,11 @@ def cost_of(error: float) -> float:
     return float(robust(np.array(error))[0])
 
 
+def error_of(cost: np.ndarray) -> np.ndarray:
+    """Return the error of a coordinate [m] that costs so much [m], any shape."""
+    return np.sqrt((cost + KNEE) ** 2 - KNEE**2)
+
+
 def costs(sims: np.ndarray, measured: np.ndarray, whole: float | None = None) -> np.ndarray:
     """Return the cost [m] of simulations (S, B, F, M, 3), shape (S,); `whole` as in `Look.points`."""
     seen = np.isfinite(measured)
@@ -129,10 +134,10 @@ def _together(of_trial: np.ndarray, lost: float) -> np.ndarray:
 class PointEvaluation:
     """What it takes to know costs and their gradients at S points (S, K): S (K + 1) simulations of each trial."""
 
-    def __init__(self, space: ParameterSpace, raws: np.ndarray) -> None:
-        """Prepare to look at these coordinates."""
+    def __init__(self, space: ParameterSpace, raws: np.ndarray, share: float = 1.0) -> None:
+        """Prepare to look at these coordinates, with a share of the usual steps of finite differences."""
         self.raws, k = raws, raws.shape[1]
-        nudge = np.diag(space.nudges())
+        nudge = np.diag(share * space.nudges())
         # Difference inwards where a number stands at its upper bound.
         upward = space.clip(raws[:, None] + nudge)
         moved = np.where(np.isclose(upward, raws[:, None] + nudge), upward, raws[:, None] - nudge)

@@ -24,6 +24,10 @@ from torchdlo.vision.spine import curve_vectors
 __all__ = ["FilmView", "MarkerObservation", "Observation", "Spines", "nuisances", "over_time"]
 
 
+Pairs = tuple[Tensor, Tensor]
+"""Edges of the rope that points of a centre line belong to, and points that places of the rope belong to."""
+
+
 class Observation(Protocol):
     """Something that is measured of the rope."""
 
@@ -179,6 +183,8 @@ class _Filmed:
         self.views, self.step, self.extent, self.sure = tuple(views), step, extent, sure
         self.nuisances = nuisances(views)
         self.target: np.ndarray = np.empty(0)
+        self.times: np.ndarray = np.empty(0)
+        """When readings are taken [s], of priors 0, shape (F, R)."""
         self.priors = slice(0, 0)
 
     def _finish(self, shape: tuple[int, ...], known: list[np.ndarray]) -> None:
@@ -194,6 +200,11 @@ class _Filmed:
         prior = np.full((trials, frames, _COPIES * len(self.nuisances.names), 1), np.nan)
         prior[:, 0] = 0.0
         self.target = np.concatenate([target, prior], 2)
+        taken = np.zeros((frames, self.target.shape[2]))
+        ends = np.cumsum([k.shape[2] for k in known])
+        for view, last, each in zip(self.views, ends, known, strict=True):
+            taken[: len(view.time), last - each.shape[2] : last] = view.time[:, None]
+        self.times = taken
 
     def _priors(self, numbers: np.ndarray, frames: int) -> np.ndarray:
         """Return readings of the priors, shape (P, B, F, R, 1)."""
@@ -251,27 +262,45 @@ class Spines(_Filmed):
     def _view(self, k: int, view: FilmView, sims: Tensor, numbers: Tensor) -> np.ndarray:
         return self._pairs(view, sims, numbers)[0]
 
-    def changes(self, sims: np.ndarray, numbers: np.ndarray) -> np.ndarray:
-        """Return readings of several motions near the first one, as `read` does, shape (P, B, F, R, 1).
+    def paired(self, sims: np.ndarray, numbers: np.ndarray) -> tuple[np.ndarray, list[Pairs]]:
+        """Return readings of one motion, as `read` does, shape (1, B, F, R, 1), and which points belong together.
 
-        Which points belong together is found for the first one and kept for the others: their differences to it are
-        those of finite differences, at a tenth of the time.
+        Args:
+            sims: simulated places of the rope [m], shape (1, B, T, M, 3).
+            numbers: those of the cameras, shape (1, Q).
         """
-        parts = []
+        found = self._all_views(sims, numbers, [None] * len(self.views))
+        return found[0], found[1]
+
+    def beside(self, pairs: Sequence[Pairs], sims: np.ndarray, numbers: np.ndarray) -> np.ndarray:
+        """Return readings of motions near one whose points were paired, shape (P, B, F, R, 1).
+
+        Which points belong together is kept: differences are those of finite differences, at a tenth of the time.
+        """
+        rows = [self._all_views(s[None], n[None], pairs)[0] for s, n in zip(sims, numbers, strict=True)]
+        return np.concatenate(rows) if rows else np.empty((0, len(self.target), *self.target.shape[1:]))
+
+    def changes(self, sims: np.ndarray, numbers: np.ndarray) -> np.ndarray:
+        """Return readings of several motions near the first one, as `read` does, shape (P, B, F, R, 1)."""
+        first, pairs = self.paired(sims[:1], numbers[:1])
+        return np.concatenate([first, self.beside(pairs, sims[1:], numbers[1:])])
+
+    def _all_views(
+        self, sims: np.ndarray, numbers: np.ndarray, pairs: Sequence[Pairs | None]
+    ) -> tuple[np.ndarray, list[Pairs]]:
+        rope, parts, used = torch.as_tensor(sims, dtype=torch.float32), [], []
         for k, view in enumerate(self.views):
             own = torch.as_tensor(numbers[:, PER_CAMERA * k : PER_CAMERA * (k + 1)], dtype=torch.float32)
-            rope = torch.as_tensor(sims, dtype=torch.float32)
             with torch.no_grad():
-                first, pairs = self._pairs(view, rope[:1], own[:1])
-                others = [self._pairs(view, r[None], o[None], pairs)[0] for r, o in zip(rope[1:], own[1:], strict=True)]
-            each = np.concatenate([first, *others])
+                each, found = self._pairs(view, rope, own, pairs[k])
             gap = self.target.shape[1] - each.shape[2]
             parts.append(np.pad(each, ((0, 0), (0, 0), (0, gap), (0, 0), (0, 0))))
-        return np.concatenate([*parts, self._priors(numbers, self.target.shape[1])], 3)
+            used.append(found)
+        return np.concatenate([*parts, self._priors(numbers, self.target.shape[1])], 3), used
 
     def _pairs(
-        self, view: FilmView, sims: Tensor, numbers: Tensor, pairs: tuple[Tensor, Tensor] | None = None
-    ) -> tuple[np.ndarray, tuple[Tensor, Tensor]]:
+        self, view: FilmView, sims: Tensor, numbers: Tensor, pairs: Pairs | None = None
+    ) -> tuple[np.ndarray, Pairs]:
         """Return readings (P, B, F, R, 1) of a view, and which edges and points belong together, or use given ones."""
         pixel, depth, focal = seen_by(view, sims, numbers, self.step)
         scale = depth.clamp(min=NEAR).mean(-1, keepdim=True) / focal.reshape(-1, 1, 1, 1)

@@ -15,7 +15,7 @@ from torchdlo.sysid.diagnosis.error_floor import gap_rms
 from torchdlo.sysid.diagnosis.workspace import CHAIN
 from torchdlo.sysid.model.rope_model import MAX_SUBSTEP
 from torchdlo.sysid.video.filmed import require_simulated, sharper
-from torchdlo.sysid.video.filmed_fit import Fit, film_gaps, fit
+from torchdlo.sysid.video.filmed_fit import Fit, film_gaps, fit, gate
 from torchdlo.sysid.video.filmed_model import FilmedModel, Films, extended
 from torchdlo.sysid.video.filmed_problem import FilmedProblem, add_correction, correct
 from torchdlo.sysid.video.fit_pool import FitPool
@@ -50,7 +50,7 @@ def nearer(films: Films, best: Fit, report: Callback) -> FilmedModel:
     coarse = whole.with_options(substep=MAX_SUBSTEP)
     for share in _SHARES:
         own = coarse.over(whole, share * whole.lasts)
-        found = fit(own, raw, _FOLLOW)
+        found = _followed(own, raw)
         coarse.offset = own.offset
         report("fitting the beginnings", 1, 1, f"{own.lasts:.2f} s: {1e3 * gap_rms(film_gaps(own, found)):.2f} mm")
         if film_gaps(own, found).max() < NEAR:
@@ -59,6 +59,14 @@ def nearer(films: Films, best: Fit, report: Callback) -> FilmedModel:
     require_simulated(whole.model.recording, found)
     found = sharper(own, found.raw, _FOLLOW)
     return films.test(own, found)
+
+
+def _followed(own: FilmedProblem, raw: np.ndarray) -> Fit:
+    """Return a fit without wrong frames: one of them, that nothing explains, is no reason to go no further."""
+    found = fit(own, raw, _FOLLOW)
+    if np.isfinite(found.cost) and gate(own, own.space.to_values(found.raw)):
+        found = fit(own, found.raw, _FOLLOW)
+    return found
 
 
 def further(
@@ -76,7 +84,7 @@ def further(
         chain = CHAIN in found.own.model.effects
     while found.own.lasts < whole.lasts:
         own = found.own.over(whole, min(_LONGER * found.own.lasts, whole.lasts))
-        best = fit(own, found.fit.raw, _FOLLOW)
+        best = _followed(own, found.fit.raw)
         report("fitting longer", 1, 1, f"{own.lasts:.2f} s: {1e3 * gap_rms(film_gaps(own, best)):.2f} mm")
         if not chain:
             other = chained(FilmedModel(own, best, own), pool)  # only its train trials matter here

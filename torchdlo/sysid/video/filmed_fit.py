@@ -7,7 +7,9 @@ normal equations (Schur complement), and what is left is a problem of the number
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import torch
@@ -15,7 +17,7 @@ import torch
 from torchdlo.sysid.estimation import levenberg_marquardt
 from torchdlo.sysid.estimation.levenberg_marquardt import Point
 from torchdlo.sysid.estimation.model_uncertainty import CLAMP_SPREAD, radius_of_clamps, shear_share
-from torchdlo.sysid.estimation.observation import INDEPENDENT, PER_CAMERA, Spines, seen_by
+from torchdlo.sysid.estimation.observation import INDEPENDENT, PER_CAMERA, Pairs, Spines, seen_by
 from torchdlo.sysid.video.filmed_problem import STRETCHES, FilmedProblem
 from torchdlo.vision.spine import curve_vectors
 
@@ -34,7 +36,13 @@ _FIRM = 5e-3
 """Share of the cost that a number has to save per squared coordinate to be followed as far as its gradient says."""
 
 _NUDGE = 0.02
-"""Steps of finite differences of starts, in standard deviations of their priors."""
+"""Steps of finite differences of starts far from the films, in standard deviations of their priors."""
+
+_FAR, _FINEST = 1e-2, 0.05
+"""Error [m] from which steps of finite differences are whole, and the least share of them.
+
+Near the films those would go past the minimum: a rope that moves answers to its start by ten times as much, and not in
+proportion. Far from them, smaller ones would see the unevenness of what belongs together and not the slope."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,42 +101,67 @@ def eliminated(gradient: np.ndarray, curvature: np.ndarray, count: int) -> tuple
 
 
 def look(
-    own: FilmedProblem, raw: np.ndarray, offset: np.ndarray, seconds: float | None = None, *, fixed: bool = False
+    own: FilmedProblem,
+    raw: np.ndarray,
+    offset: np.ndarray,
+    seconds: float | None = None,
+    *,
+    fixed: bool = False,
+    worth: Callable[[np.ndarray], bool] = lambda costs: True,
 ) -> Fit:
     """Return readings and their derivatives at coordinates (N,) and starts (B, J), over the first seconds.
 
-    Where numbers are fixed, derivatives are those of starts alone, shape (B, J, F, R).
+    Where numbers are fixed, derivatives are those of starts alone, shape (B, J, F, R). They are most of the work, and
+    left out, `jacobian` being empty, where costs (B,) are not worth it.
     """
-    space, numbers, moving = own.space, len(own.free), offset.shape[1]
-    step = levenberg_marquardt.PointEvaluation(space, raw[None])
-    values, varied = step.values, step.steps[0]
-    if fixed:
-        values, numbers, varied = values[:1], 0, varied[:0]
+    values, target = own.space.to_values(raw)[None], own.target(seconds)
+    sims = own.simulate(values, own.frames(seconds), offset[None])
+    read, pairs = own.spines.paired(sims, values[:, len(own.free) :])
+    here, seen = read[..., 0], np.isfinite(target)
+    residual = np.where(seen, here[0], np.nan)
+    good = np.isfinite(sims).all((0, 2, 3, 4)) & np.isfinite(np.where(seen, here, 0.0)).all((0, 2, 3))
+    costs, priors = np.full(len(residual), np.inf), 0.5 * own.prior * (offset**2).sum(1)
+    for b in np.flatnonzero(good):
+        costs[b] = levenberg_marquardt.robust(residual[b][seen[b]])[0].mean()
+    errors = np.minimum(levenberg_marquardt.error_of(costs), _FAR)
+    costs = costs + priors
+    if not worth(costs):
+        return Fit(raw, offset, costs, residual, np.zeros((len(costs), 0, *residual.shape[1:]), np.float32))
+    change, width = _changes(own, raw, offset, sims, pairs, np.maximum(errors / _FAR, _FINEST), fixed)
+    change -= here
+    good &= np.isfinite(np.where(seen, change, 0.0)).all((0, 2, 3))
+    jacobian = (change.astype(np.float32) / width[..., None, None].astype(np.float32)).transpose(1, 0, 2, 3)
+    jacobian[:, :, ~seen.any(0)] = 0.0
+    jacobian[~good] = 0.0
+    if offset.shape[1]:
+        jacobian[own.start.still, -offset.shape[1] :] = 0.0
+    return Fit(raw, offset, np.where(good, costs, np.inf), residual, jacobian)
+
+
+def _changes(
+    own: FilmedProblem,
+    raw: np.ndarray,
+    offset: np.ndarray,
+    sims: np.ndarray,
+    pairs: Sequence[Pairs],
+    share: np.ndarray,
+    fixed: bool,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return readings beside a point, (C, B, F, R), and how far beside, (C, B): numbers, cameras, then starts."""
+    point = levenberg_marquardt.PointEvaluation(own.space, raw[None], float(share.mean()))
+    moving, values = offset.shape[1], point.values
+    numbers, last = (0, 1) if fixed else (len(own.free), len(values))
     # What cameras are off needs no simulation of its own.
-    rows = np.concatenate([values[: numbers + 1], np.repeat(values[:1], moving, 0)])
+    rows = np.concatenate([values[1 : numbers + 1], np.repeat(values[:1], moving, 0)])
     offsets = np.repeat(offset[None], len(rows), 0)
     for k in range(moving):
-        offsets[numbers + 1 + k, :, k] += _NUDGE
-    sims = own.simulate(rows, own.frames(seconds), offsets)
-    cameras = np.concatenate([rows, values[numbers + 1 :]])[:, len(own.free) :]
-    motions = np.concatenate([sims, np.repeat(sims[:1], len(values) - numbers - 1, 0)])
-    target = own.target(seconds)
-    found = own.spines.changes(motions, cameras)[..., 0]
-    residual = np.where(np.isfinite(target), found[0], np.nan)
-    good = np.isfinite(sims).all((0, 2, 3, 4)) & np.isfinite(np.where(np.isfinite(target), found, 0.0)).all((0, 2, 3))
-    change = (found[1:] - found[:1]).astype(np.float32)
-    order = [*range(numbers), *range(numbers + moving, len(change)), *range(numbers, numbers + moving)]
-    width = np.concatenate([varied, np.full(moving, _NUDGE)])
-    jacobian = (change[order] / width[:, None, None, None]).transpose(1, 0, 2, 3)
-    jacobian[:, :, ~np.isfinite(residual).any(0)] = 0.0
-    jacobian[~good] = 0.0
-    if moving:
-        jacobian[own.start.still, -moving:] = 0.0
-    costs = np.full(len(residual), np.inf)
-    for b in np.flatnonzero(good):
-        seen = np.isfinite(residual[b])
-        costs[b] = levenberg_marquardt.robust(residual[b][seen])[0].mean() + 0.5 * own.prior[b] * (offset[b] ** 2).sum()
-    return Fit(raw, offset, costs, residual, jacobian)
+        offsets[numbers + k, :, k] += _NUDGE * share
+    moved = own.simulate(rows, sims.shape[2], offsets) if len(rows) else sims[:0]
+    motions = np.concatenate([moved[:numbers], np.repeat(sims, last - numbers - 1, 0), moved[numbers:]])
+    cameras = np.concatenate([values[1:last], rows[numbers:]])[:, len(own.free) :]
+    steps = np.concatenate([point.steps[0, : last - 1], np.full(moving, _NUDGE)])[:, None].repeat(len(share), 1)
+    steps[last - 1 :] *= share
+    return own.spines.beside(pairs, motions, cameras)[..., 0], steps
 
 
 def fit(
@@ -157,9 +190,11 @@ def fit(
         if not np.isfinite(now.costs).any():
             break
         raw_step, offset_step = _step(own, now, damping)
-        tried = look(own, own.space.clip(now.raw + raw_step), now.offset + offset_step, seconds)
-        if total(tried) < total(now):
-            done = total(now) - total(tried) < tolerance * total(now)
+        least = total(now)
+        point = own.space.clip(now.raw + raw_step), now.offset + offset_step
+        tried = look(own, *point, seconds, worth=partial(_less, least))
+        if total(tried) < least:
+            done = least - total(tried) < tolerance * least
             now, damping = tried, max(damping / 5, 1e-6)
             if done:
                 break
@@ -173,8 +208,16 @@ def fit(
 
 def total(found: Fit) -> float:
     """Return the mean cost, of which trials that failed have a large one."""
-    ran = np.isfinite(found.costs)
-    return float(np.where(ran, found.costs, 1.0).mean()) if ran.any() else np.inf
+    return _together(found.costs)
+
+
+def _together(costs: np.ndarray) -> float:
+    ran = np.isfinite(costs)
+    return float(np.where(ran, costs, 1.0).mean()) if ran.any() else np.inf
+
+
+def _less(least: float, costs: np.ndarray) -> bool:
+    return _together(costs) < least
 
 
 def _step(own: FilmedProblem, now: Fit, damping: float) -> tuple[np.ndarray, np.ndarray]:
@@ -258,7 +301,7 @@ def spread(own: FilmedProblem, found: Fit) -> tuple[Point, np.ndarray]:
     curvature = curvature + prior[None]
     gradient = gradient + found.raw * np.diag(prior)
     point = Point(found.raw, found.cost, gradient, curvature, found.costs)
-    drifts = np.linalg.solve(levenberg_marquardt.firm(curvature.sum(0)), blocks * prior)[numbers:]
+    drifts = np.linalg.solve(levenberg_marquardt.firm(curvature.sum(0)), blocks * prior).T[numbers:]
     if own.discretisation_correction is not None:
         values = space.to_values(found.raw)[None]
         sims = own.simulate(values)
@@ -298,25 +341,25 @@ def _blocks(own: FilmedProblem, found: Fit) -> tuple[np.ndarray, np.ndarray]:
     """
     if own.trials[0].still:
         return _stretches(own, found)
-    count, length = found.offset.shape[1], max(3, round(_BLOCK * own.spines.views[0].camera.fps))
-    size, frames = found.raw.size, found.residual.shape[1]
-    data = found.residual[:, :, : own.spines.priors.start]
+    count, size, last = found.offset.shape[1], found.raw.size, own.spines.priors.start
+    data, times = found.residual[..., :last], own.spines.times[:, :last]
+    blocks = np.floor((times - times.min()) / _BLOCK).astype(int)
+    least = 0.3 * _BLOCK / max(np.ptp(times), _BLOCK)
     gradients, curvatures = [], []
     for b in range(len(data)):
         whole = np.isfinite(data[b]).sum()
         single = slice(b, b + 1)
-        jacobian = found.jacobian[single][..., : own.spines.priors.start]
+        jacobian = found.jacobian[single][..., :last]
         _, h = normal(data[single], jacobian, found.offset[single], own.prior[single])
         follow = np.zeros((size, count))
         if count:
             inner = h[0, size:, size:] + 1e-12 * np.eye(count)
             follow = np.linalg.solve(inner, h[0, size:, :size]).T
-        for k in range(0, frames, length):
-            rows = slice(k, k + length)
-            share = np.isfinite(data[b, rows]).sum() / max(whole, 1)
-            if share < 0.3 * length / frames:
+        for k in range(blocks.max() + 1):
+            inside = np.where(blocks == k, data[single], np.nan)
+            if np.isfinite(inside).sum() < least * max(whole, 1):
                 continue
-            g, c = normal(data[single, rows], jacobian[:, :, rows], found.offset[single], 0 * own.prior[single])
+            g, c = normal(inside, jacobian, found.offset[single], 0 * own.prior[single])
             gradients.append(g[0, :size] - follow @ g[0, size:])
             reduced = np.concatenate([np.eye(size), -follow], 1)
             curvatures.append(reduced @ c[0] @ reduced.T)

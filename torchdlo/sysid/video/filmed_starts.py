@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -62,15 +63,22 @@ def fit_starts(
         if len(rows) < len(part.trials):
             part = own.picked(rows)
         here = _of(now, rows)
-        tried = look(part, raw, here.offset + _moves(here, part.prior, damping[rows]), seconds, fixed=True)
-        better = tried.costs < here.costs
-        slow = better & (here.costs - tried.costs < tolerance * here.costs)
-        for name in ("offset", "costs", "residual", "jacobian"):
-            getattr(now, name)[rows[better]] = getattr(tried, name)[better]
+        moved = here.offset + _moves(here, part.prior, damping[rows])
+        least = here.costs
+        tried = look(part, raw, moved, seconds, fixed=True, worth=partial(_any_less, least))
+        better = tried.costs < least
+        slow = better & (least - tried.costs < tolerance * least)
+        if better.any():
+            for name in ("offset", "costs", "residual", "jacobian"):
+                getattr(now, name)[rows[better]] = getattr(tried, name)[better]
         damping[rows] = np.where(better, np.maximum(damping[rows] / 5, 1e-6), 8 * damping[rows])
         rows = rows[~slow & (damping[rows] < 1e3)]
     own.offset = now.offset
     return now
+
+
+def _any_less(least: np.ndarray, costs: np.ndarray) -> bool:
+    return bool((costs < least).any())
 
 
 def _of(found: Fit, rows: np.ndarray) -> Fit:
