@@ -47,6 +47,24 @@ def test_a_varying_frame_rate_is_refused_and_a_dropped_picture_is_not() -> None:
         frame_rate(Path("a.mp4"), list(-even))
 
 
+@pytest.mark.parametrize("rate", [30, 60, 120, 240])
+def test_times_in_whole_milliseconds_give_the_rate(rate: int) -> None:
+    # Matroska and WebM keep whole milliseconds: the median of steps is 17 of 16.67 ms at 60 pictures per second.
+    times = [round(1000 * k / rate) / 1000 for k in range(2 * rate)]
+    assert frame_rate(Path("a.mkv"), times) == pytest.approx(rate, rel=2e-4)
+
+
+def test_a_rate_that_falls_from_30_to_25_is_refused() -> None:
+    # As phones do in dim light: no step is 25 % from the usual one, but the last picture is 0.4 s from where it seems.
+    times = np.concatenate([np.arange(60) / 30, 2 + np.arange(60) / 25])
+    with pytest.raises(InputError, match="constant frame rate"):
+        frame_rate(Path("a.mp4"), list(times))
+    jitter = np.random.default_rng(0).uniform(-3e-3, 3e-3, 120)
+    assert frame_rate(Path("a.mp4"), list(np.arange(120) / 30 + jitter)) == pytest.approx(30, rel=5e-4)
+    with pytest.raises(InputError, match="times of its pictures"):
+        frame_rate(Path("a.h264"), [None, None])
+
+
 def test_the_picture_before_stands_in_the_place_of_those_that_were_dropped(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -18,7 +18,7 @@ CODECS = ("libx264", "libopenh264", "h264")
 """Encoders, the first that is there is used."""
 
 _UNEVEN = 0.25
-"""Deviation of a time between pictures from the usual one, as a share, from which the frame rate varies."""
+"""Distance of a time from the line through all of them, in pictures, from which the frame rate varies."""
 
 _MOST = 20_000
 """Pictures that a film may have."""
@@ -51,40 +51,46 @@ def read_video(path: str | Path, *, most: int = _MOST) -> tuple[np.ndarray, floa
         times.append(time)
     if not pictures:
         raise InputError(f"{path}: expected a film, found no picture in it; record or copy the file again.")
-    fps = frame_rate(path, times)
-    number = _numbers(times, fps)
+    slope, number = _clock(path, times)
     if number[-1] >= most:
         raise InputError(f"{path}: expected at most {most} pictures, found times for more; cut the film.")
-    return np.stack([pictures[k] for k in np.searchsorted(number, np.arange(number[-1] + 1), side="right") - 1]), fps
-
-
-def _numbers(times: Sequence[float | None], fps: float) -> np.ndarray:
-    """Return which picture each one is (F,), counted by its time from the first: some may have been dropped."""
-    known = np.array([np.nan if t is None else t for t in times], dtype=float)
-    if not np.isfinite(known).all():
-        return np.arange(len(known))
-    return np.cumsum([0, *np.maximum(np.round(np.diff(known) * fps), 1).astype(int)])
+    shown = np.searchsorted(number, np.arange(number[-1] + 1), side="right") - 1
+    return np.stack([pictures[k] for k in shown]), 1 / slope
 
 
 def frame_rate(path: Path, times: Sequence[float | None]) -> float:
     """Return pictures per second [1/s] of pictures at these times [s]; refuse uneven ones."""
+    return 1 / _clock(path, times)[0]
+
+
+def _clock(path: Path, times: Sequence[float | None]) -> tuple[float, np.ndarray]:
+    """Return the time between pictures [s] and which picture each one is (F,): some may have been dropped.
+
+    The time is the slope of a line through all of them: containers round times, some to whole milliseconds.
+    """
     known = np.array([np.nan if t is None else t for t in times], dtype=float)
+    if not np.isfinite(known).all():
+        raise InputError(f"{path}: expected times of its pictures, found none; encode it again as an .mp4 file.")
+    if len(known) < 2:
+        return 1 / 30.0, np.arange(len(known))
     steps = np.diff(known)
-    if len(steps) == 0 or not np.isfinite(steps).all():
-        return 30.0
-    usual = float(np.median(steps))
-    if usual <= 0:
+    usual = float(np.sort(steps)[len(steps) // 2])
+    if usual <= 0 or steps.min() <= 0:
         raise InputError(f"{path}: expected rising times of its pictures, found others; encode the film again.")
+    whole = steps[np.round(steps / usual) == 1]
+    usual = float(whole.mean())
     # A picture that was dropped leaves a whole gap, which `read_video` fills; a varying rate does not.
-    share = steps / usual
-    uneven = np.abs(share - np.round(share)) > _UNEVEN
-    if uneven.mean() > 0.02 or (np.round(share) != 1).mean() > 0.2:
-        k = int(np.argmax(np.abs(share - 1)))
+    number = np.concatenate([[0], np.cumsum(np.maximum(np.round(steps / usual), 1).astype(int))])
+    slope, first = np.polyfit(number, known, 1)
+    off = np.abs(known - first - slope * number) / slope
+    if off.max() > _UNEVEN or len(whole) < 0.8 * len(steps):
+        k = int(np.argmax(off))
         raise InputError(
-            f"{path}: expected a constant frame rate, found times between pictures of {1e3 * usual:.1f} ms and of "
-            f"{1e3 * steps[k]:.1f} ms (picture {k + 1}); encode it again at a constant rate (ffmpeg -vsync cfr)."
+            f"{path}: expected a constant frame rate, found times between pictures from {1e3 * steps.min():.1f} to "
+            f"{1e3 * steps.max():.1f} ms, so that picture {k} is {1e3 * slope * off[k]:.1f} ms from where an even rate "
+            "has it; film with the rate and the exposure locked, or cut what is uneven."
         )
-    return 1 / usual
+    return float(slope), number
 
 
 def _decoded(path: Path) -> Iterator[tuple[np.ndarray, float | None]]:
