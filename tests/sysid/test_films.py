@@ -15,6 +15,7 @@ from torchdlo.sysid.video.footage import masks_of, views_of
 from torchdlo.vision.camera import looking_at, save_cameras
 from torchdlo.vision.film import FilmLook
 from torchdlo.vision.segment import save_masks
+from torchdlo.vision.video_file import read_video, write_video
 
 SAMPLE = Path(__file__).parents[2] / "torchdlo" / "data" / "sample_rope"
 
@@ -120,6 +121,19 @@ def test_films_that_cannot_be_used_are_refused(filmed: Path, spoil, message: str
     with pytest.raises(InputError, match=message) as caught:
         views_of(recording, recording.train)
     assert str(caught.value).startswith(str(filmed)) and "\n" not in str(caught.value)
+
+
+def test_films_have_a_rate_of_their_own(filmed: Path) -> None:
+    pictures, _ = read_video(filmed / "train_0.a.mp4")
+    for name in ("train_0", "test_0"):
+        write_video(filmed / f"{name}.a.mp4", pictures, 30000 / 1001)
+    recording = load_recording(filmed)
+    views, _ = views_of(recording, recording.train)
+    assert recording.train[0].films[0].camera.fps == 30
+    assert views[0].camera.fps == pytest.approx(29.97, rel=1e-5)
+    write_video(filmed / "test_0.a.mp4", pictures.repeat(5, 0), 29.5)
+    with pytest.raises(InputError, match="same settings"):
+        views_of(recording, recording.train)
 
 
 def _color(filmed: Path, color: list[int] | None) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,7 @@ import numpy as np
 from torchdlo.errors import InputError
 from torchdlo.files import replace_atomically
 
-__all__ = ["CODECS", "frame_rate", "read_video", "write_video"]
+__all__ = ["CODECS", "film_rate", "frame_rate", "read_video", "write_video"]
 
 CODECS = ("libx264", "libopenh264", "h264")
 """Encoders, the first that is there is used."""
@@ -93,7 +94,40 @@ def _clock(path: Path, times: Sequence[float | None]) -> tuple[float, np.ndarray
     return float(slope), number
 
 
+def film_rate(path: str | Path) -> tuple[float, int]:
+    """Return pictures per second [1/s] of a film, and how many it has, without decoding them.
+
+    Raises:
+        InputError: It cannot be read, or its pictures are not evenly spaced in time.
+    """
+    path, times = Path(path), []
+    with _opened(path) as (container, stream):
+        for packet in container.demux(stream):
+            if packet.size:
+                stamp = packet.dts if packet.pts is None else packet.pts
+                times.append(None if stamp is None else float(stamp * packet.time_base))
+    if not times:
+        raise InputError(f"{path}: expected a film, found no picture in it; record or copy the file again.")
+    # Packets come in the order in which they are decoded.
+    return frame_rate(path, times if None in times else sorted(times)), len(times)
+
+
 def _decoded(path: Path) -> Iterator[tuple[np.ndarray, float | None]]:
+    with _opened(path) as (container, stream):
+        stream.thread_type = "AUTO"
+        for frame in container.decode(stream):
+            turned = int(getattr(frame, "rotation", 0) or 0)
+            if turned % 360:
+                raise InputError(
+                    f"{path}: expected pictures as the sensor took them, found a tag that turns them by "
+                    f"{abs(turned)} degrees; film with the phone held level, or encode the film again."
+                )
+            yield frame.to_ndarray(format="rgb24"), frame.time
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[tuple[Any, Any]]:
+    """Give the container of a film and its first stream of pictures; refuse what is none."""
     if not path.is_file():
         raise InputError(f"{path}: expected a film, found nothing there.")
     if path.stat().st_size == 0:
@@ -103,16 +137,7 @@ def _decoded(path: Path) -> Iterator[tuple[np.ndarray, float | None]]:
         with package.open(str(path)) as container:
             if not container.streams.video:
                 raise InputError(f"{path}: expected a film, found a file without pictures.")
-            stream = container.streams.video[0]
-            stream.thread_type = "AUTO"
-            for frame in container.decode(stream):
-                turned = int(getattr(frame, "rotation", 0) or 0)
-                if turned % 360:
-                    raise InputError(
-                        f"{path}: expected pictures as the sensor took them, found a tag that turns them by "
-                        f"{abs(turned)} degrees; film with the phone held level, or encode the film again."
-                    )
-                yield frame.to_ndarray(format="rgb24"), frame.time
+            yield container, container.streams.video[0]
     except package.error.FFmpegError as error:
         raise InputError(
             f"{path}: expected a film that can be decoded, but reading failed ({error.strerror or error}); "

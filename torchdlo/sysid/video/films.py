@@ -20,13 +20,16 @@ if TYPE_CHECKING:
     from torchdlo.sysid.recordings.recording import Trial
     from torchdlo.vision.camera import Camera
 
-__all__ = ["STATIONS", "FilmFile", "film_files", "held_still", "photographs", "with_stations"]
+__all__ = ["FILMS", "STATIONS", "FilmFile", "film_files", "held_still", "photographs", "with_stations"]
 
 STATIONS = 41
 """Places along a filmed rope that are compared with its films."""
 
 _PHOTOGRAPHS = (".png", ".jpg", ".jpeg")
-_SUFFIXES = (".mp4", ".mov", ".mkv", ".avi", ".webm", *_PHOTOGRAPHS, ".npz")
+FILMS = (".mp4", ".mov", ".mkv", ".avi", ".webm")
+"""Endings of films, which say when their pictures were taken."""
+
+_SUFFIXES = (*FILMS, *_PHOTOGRAPHS, ".npz")
 
 _STILL_FRAMES, _STILL_STEP = 5, 5e-3
 """Frames of a simulated rope at rest, and the time between them [s]."""

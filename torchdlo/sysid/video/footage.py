@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,11 +12,12 @@ import torch
 from torchdlo.errors import InputError
 from torchdlo.sysid.estimation.observation import FilmView
 from torchdlo.sysid.recordings.recording import Recording, Trial
-from torchdlo.sysid.video.films import FilmFile
+from torchdlo.sysid.video.films import FILMS, FilmFile
 from torchdlo.vision.camera import NEAR, lens, project
 from torchdlo.vision.mask_health import check_masks
 from torchdlo.vision.segment import Ranges, color_masks, load_film, load_ranges, ranges_of
 from torchdlo.vision.spine import along, half_width, spine
+from torchdlo.vision.video_file import film_rate
 
 __all__ = ["RANGES", "masks_of", "views_of"]
 
@@ -36,6 +38,12 @@ _STRETCHES = 14
 
 _TOO_MUCH = 1.15
 """Times its length from which what is seen is more than one rope: one shows 0.4 to 0.8 of it, two 0.7 to 1.6."""
+
+_OTHER_RATE = 0.02
+"""Share by which the rate of a film is another one than `cameras.json` says: 29.97 is 30, 25 is not."""
+
+_DRIFT = 0.25
+"""Pictures by which films of one camera may come apart from a common rate by their ends."""
 
 _STILL = 5e-4
 """Motion of a gripper between two pictures that shows [m]."""
@@ -61,8 +69,9 @@ def views_of(
     views, done, total = [], 0, len(trials) * len(names)
     for k, name in enumerate(names):
         parts = []
-        for trial in trials:
-            parts.append(_reduced(recording, trial, trial.films[k], notes))
+        films = _timed(recording, [trial.films[k] for trial in trials])
+        for trial, film in zip(trials, films, strict=True):
+            parts.append(_reduced(recording, trial, film, notes))
             done += 1
             report("reading films", done, total, f"{trial.name}, camera {name}")
         frames = max(len(p[0]) for p in parts)
@@ -82,7 +91,7 @@ def views_of(
         lines = (stack(0, 0).astype(bool), stack(1, np.nan), stack(2, np.nan))
         wide = float(np.median([p[3] for p in parts]))
         packed, shown = tuple(p[4] for p in parts), tuple(p[5] for p in parts)
-        views.append(FilmView(trials[0].films[k].camera, *lines, wide, packed, shown))
+        views.append(FilmView(films[0].camera, *lines, wide, packed, shown))
     return views, notes
 
 
@@ -95,13 +104,33 @@ def masks_of(recording: Recording, film: FilmFile) -> tuple[np.ndarray, np.ndarr
             f"{film.path}: expected pictures of {size[1]} x {size[0]} pixels as camera {film.camera.name} has, found "
             f"{found.shape[2]} x {found.shape[1]}."
         )
-    if fps is not None and abs(fps / film.camera.fps - 1) > 0.02:
-        raise InputError(
-            f"{film.path}: expected {film.camera.fps:g} pictures per second as cameras.json says, found {fps:.4g}."
-        )
     if found.dtype == bool:
         return found, None, fps
     return color_masks(found, _ranges(recording, film.path)), found, fps
+
+
+def _timed(recording: Recording, films: Sequence[FilmFile]) -> list[FilmFile]:
+    """Return films of one camera with the rate that all of its films have, those of other trials too.
+
+    `cameras.json` has the rate of the film of a board, or a round number: 29.97 and 30 part by half a picture in 17 s.
+    """
+    name = films[0].camera.name
+    every = [f.path for t in recording.train + recording.test for f in t.films if f.camera.name == name and not t.still]
+    found = {path: film_rate(path) for path in dict.fromkeys(every) if path.suffix.lower() in FILMS and path.is_file()}
+    said = films[0].camera.fps
+    for path, (fps, _) in found.items():
+        if abs(fps / said - 1) > _OTHER_RATE:
+            raise InputError(f"{path}: expected {said:g} pictures per second as cameras.json says, found {fps:.4g}.")
+    if not found:
+        return list(films)
+    usual = float(np.median([fps for fps, _ in found.values()]))
+    for path, (fps, count) in found.items():
+        if count * abs(fps / usual - 1) > _DRIFT:
+            raise InputError(
+                f"{path}: expected {usual:.5g} pictures per second as other films of camera {name} have, found "
+                f"{fps:.5g}; film all with the same settings."
+            )
+    return [replace(f, camera=replace(f.camera, fps=usual)) for f in films]
 
 
 def _ranges(recording: Recording, film: Path) -> Ranges:
