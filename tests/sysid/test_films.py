@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -61,9 +62,22 @@ def _two(filmed: Path) -> None:
     save_masks(np.zeros((15, 480, 640), bool), filmed / "train_0.a.npz")
 
 
+def _another(filmed: Path) -> None:
+    # A test film of another camera would be judged with pose, zoom and clock that were fitted to the first one's.
+    save_cameras([view_of_sample(), replace(view_of_sample(), name="b")], filmed / "cameras.json")
+    (filmed / "test_0.a.mp4").rename(filmed / "test_0.b.mp4")
+
+
+def _fewer(filmed: Path) -> None:
+    save_cameras([view_of_sample(), replace(view_of_sample(), name="b")], filmed / "cameras.json")
+    save_masks(np.zeros((15, 480, 640), bool), filmed / "train_0.b.npz")
+
+
 @pytest.mark.parametrize(
     ("spoil", "message"),
     [
+        (_another, "cameras a as train_0 has, found b"),
+        (_fewer, "cameras a, b as train_0 has, found a"),
         (_cameras, "expected the file of the cameras"),
         (lambda f: (f / "train_0.a.mp4").rename(f / "train_0.b.mp4"), "name of a camera"),
         (lambda f: (f / "train_0.a.mp4").rename(f / "train_7.a.mp4"), "train_7.npz with the motion"),

@@ -59,12 +59,6 @@ def views_of(
     """
     report = callback or (lambda *_: None)
     names = [f.camera.name for f in trials[0].films]
-    for trial in trials[1:]:
-        if [f.camera.name for f in trial.films] != names:
-            raise InputError(
-                f"{recording.path / trial.name}.npz: expected films of the cameras {', '.join(names)} as "
-                f"{trials[0].name} has, found {', '.join(f.camera.name for f in trial.films)}."
-            )
     notes: list[str] = []
     views, done, total = [], 0, len(trials) * len(names)
     for k, name in enumerate(names):
