@@ -123,7 +123,7 @@ def _twice(filmed: Path) -> None:
         (lambda f: _masks(f, np.zeros((15, 120, 160), bool)), "640 x 480"),
         (lambda f: _masks(f, np.ones((6, 480, 640), bool)), "about 15 pictures"),
         (lambda f: save_cameras([view_of_sample(fps=60.0)], f / "cameras.json"), "60 pictures per second"),
-        (lambda f: save_cameras([view_of_sample(start=-0.2)], f / "cameras.json"), "start with its trial"),
+        (lambda f: save_cameras([view_of_sample(start=-9.0)], f / "cameras.json"), "check start"),
         (lambda f: save_cameras([front(size=(320, 240))], f / "cameras.json"), "320 x 240"),
         (lambda f: _color(f, None), "the rope's colour"),
         (lambda f: _color(f, [220, 220, 220]), "stands out"),
@@ -148,6 +148,21 @@ def test_films_have_a_rate_of_their_own(filmed: Path) -> None:
     write_video(filmed / "test_0.a.mp4", pictures.repeat(5, 0), 29.5)
     with pytest.raises(InputError, match="same settings"):
         views_of(recording, recording.train)
+
+
+def test_pictures_before_the_trial_are_skipped(filmed: Path) -> None:
+    recording = load_recording(filmed)
+    view = views_of(recording, recording.train)[0][0]
+    masks = masks_of(recording, recording.train[0].films[0])[0]
+    _masks(filmed, np.concatenate([np.zeros((7, 480, 640), bool), masks]))
+    save_masks(np.zeros((22, 480, 640), bool), filmed / "test_0.a.npz")
+    (filmed / "test_0.a.mp4").unlink()
+    save_cameras([view_of_sample(start=-0.23)], filmed / "cameras.json")
+    recording = load_recording(filmed)
+    views, notes = views_of(recording, recording.train)
+    # The seventh picture, at -0.03 s, is the last one that is more than three quarters of a picture early.
+    assert views[0].camera.start == pytest.approx(-0.23 + 7 / 30) and not notes
+    assert np.array_equal(views[0].packed[0], view.packed[0]) and np.array_equal(views[0].good, view.good)
 
 
 def _color(filmed: Path, color: list[int] | None) -> None:

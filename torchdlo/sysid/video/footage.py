@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -63,9 +64,9 @@ def views_of(
     views, done, total = [], 0, len(trials) * len(names)
     for k, name in enumerate(names):
         parts = []
-        films = _timed(recording, [trial.films[k] for trial in trials])
+        films, early = _from_start(_timed(recording, [trial.films[k] for trial in trials]))
         for trial, film in zip(trials, films, strict=True):
-            parts.append(_reduced(recording, trial, film, notes))
+            parts.append(_reduced(recording, trial, film, early, notes))
             done += 1
             report("reading films", done, total, f"{trial.name}, camera {name}")
         frames = max(len(p[0]) for p in parts)
@@ -143,38 +144,28 @@ def _ranges(recording: Recording, film: Path) -> Ranges:
 
 
 def _reduced(
-    recording: Recording, trial: Trial, film: FilmFile, notes: list[str]
+    recording: Recording, trial: Trial, film: FilmFile, early: int, notes: list[str]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, float, np.ndarray, dict[int, np.ndarray]]:
-    """Return good frames, centre lines with tangents, half width, packed masks and some pictures of a film."""
+    """Return good frames, centre lines with tangents, half width, packed masks and some pictures of a film.
+
+    The camera's `start` is when the picture after the first `early` ones was taken, which are left out.
+    """
     nearest = _nearest(trial, film)
     masks, pictures, _ = masks_of(recording, film)
     if trial.still:
         return _photographed(trial, film, masks, pictures, notes)
-    time = film.camera.start + np.arange(len(masks)) / film.camera.fps
-    lasts = trial.time[-1]
-    inside = (time > -0.75 / film.camera.fps) & (time < lasts + 0.25 / film.camera.fps)
-    if inside.sum() < 5:
-        raise InputError(
-            f"{film.path}: expected pictures of the {lasts:g} s of {trial.name}.npz, found {int(inside.sum())} in that "
-            "time; check start in cameras.json."
-        )
-    masks, pictures = masks[inside], None if pictures is None else pictures[inside]
-    if not inside[0]:
-        raise InputError(f"{film.path}: expected the film to start with its trial; cut what is before it.")
-    count, expected = len(masks), (lasts - max(time[0], 0.0)) * film.camera.fps
-    if count < 0.6 * expected:
-        raise InputError(
-            f"{film.path}: expected about {expected:.0f} pictures for the {lasts:g} s of {trial.name}.npz, found "
-            f"{count}; were pictures dropped, or is fps in cameras.json wrong?"
-        )
+    rows = slice(early, early + _lasting(trial, film, len(masks) - early))
+    masks, pictures = masks[rows], None if pictures is None else pictures[rows]
+    count = len(masks)
+    time = film.camera.start + np.arange(count) / film.camera.fps
     held = trial.markers[:, trial.gripped]
     flat = held.reshape(len(held), -1)
-    where = np.stack([np.interp(time[inside], trial.time, column) for column in flat.T], 1)
+    where = np.stack([np.interp(time, trial.time, column) for column in flat.T], 1)
     moving = np.zeros(count, bool)
     moving[1:] = np.abs(np.diff(where, axis=0)).max(1) > _STILL
     good, issues = check_masks(masks, str(film.path), pictures=pictures, moving=moving)
     notes += [f"{trial.name}, camera {film.camera.name}: {i.text}." for i in issues]
-    suspect = np.interp(time[inside], trial.time, trial.suspect.astype(float)) > 0
+    suspect = np.interp(time, trial.time, trial.suspect.astype(float)) > 0
     good &= ~suspect
     none = (np.full((_POINTS, 2), np.nan),) * 2
     lines = [spine(m, _POINTS) if ok else none for m, ok in zip(masks, good, strict=True)]
@@ -183,6 +174,31 @@ def _reduced(
     _check_amount(recording, film, float(np.median(masks[good].sum((1, 2)))) / max(2 * wide, 1.0), nearest)
     some = np.flatnonzero(good)[np.linspace(0, good.sum() - 1, SHOWN + 1).round().astype(int)[1:]]
     return good, places, tangents, wide, np.packbits(masks.reshape(count, -1), axis=1), _shown(masks, pictures, some)
+
+
+def _from_start(films: Sequence[FilmFile]) -> tuple[list[FilmFile], int]:
+    """Return films of one camera from their first picture of the trial on, and how many pictures are before it."""
+    start, fps = films[0].camera.start, films[0].camera.fps
+    early = max(0, math.floor(-0.75 - start * fps) + 1)
+    return [replace(f, camera=replace(f.camera, start=start + early / fps)) for f in films], early
+
+
+def _lasting(trial: Trial, film: FilmFile, count: int) -> int:
+    """Return how many pictures of a film, of which `count` are left, are of the trial; refuse too few."""
+    lasts, start, fps = trial.time[-1], film.camera.start, film.camera.fps
+    inside = int((start + np.arange(max(count, 0)) / fps < lasts + 0.25 / fps).sum())
+    if inside < 5:
+        raise InputError(
+            f"{film.path}: expected pictures of the {lasts:g} s of {trial.name}.npz, found {inside} in that time; "
+            "check start in cameras.json."
+        )
+    expected = (lasts - max(start, 0.0)) * fps
+    if inside < 0.6 * expected:
+        raise InputError(
+            f"{film.path}: expected about {expected:.0f} pictures for the {lasts:g} s of {trial.name}.npz, found "
+            f"{inside}; were pictures dropped, or is fps in cameras.json wrong?"
+        )
+    return inside
 
 
 def _nearest(trial: Trial, film: FilmFile) -> float:
