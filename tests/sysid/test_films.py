@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -165,9 +166,31 @@ def test_pictures_before_the_trial_are_skipped(filmed: Path) -> None:
     assert np.array_equal(views[0].packed[0], view.packed[0]) and np.array_equal(views[0].good, view.good)
 
 
-def _color(filmed: Path, color: list[int] | None) -> None:
-    import json
+def test_masks_need_a_rate_and_as_many_pictures_as_their_trial_has(filmed: Path) -> None:
+    masks = masks_of(load_recording(filmed), load_recording(filmed).train[0].films[0])[0]
+    _masks(filmed, masks)
+    file = filmed / "cameras.json"
 
+    def seen(fps: float | None) -> list[str]:
+        content = json.loads(file.read_text())
+        content["cameras"][0] |= {"fps": fps}
+        content["cameras"][0] = {k: v for k, v in content["cameras"][0].items() if v is not None}
+        file.write_text(json.dumps(content))
+        recording = load_recording(filmed)
+        return views_of(recording, recording.train)[1]
+
+    assert not seen(None) and not seen(30.0)  # the test trial has a film, which says it
+    (filmed / "test_0.a.mp4").unlink()
+    save_masks(masks, filmed / "test_0.a.npz")
+    assert not seen(30.0)
+    with pytest.raises(InputError, match="expected fps of camera a"):
+        seen(None)
+    with pytest.raises(InputError, match=r"expected 11 pictures .* found 16"):
+        seen(20.0)
+    assert "16 pictures for 0.5 s, which have 21 at 40" in seen(40.0)[0]
+
+
+def _color(filmed: Path, color: list[int] | None) -> None:
     rope = json.loads((filmed / "rope.json").read_text())
     rope["color"] = color
     (filmed / "rope.json").write_text(json.dumps(rope))

@@ -21,7 +21,18 @@ from torchdlo.field_docs import with_field_docs
 from torchdlo.files import write_atomically
 from torchdlo.untrusted import one_line, read_json
 
-__all__ = ["NEAR", "Camera", "Lens", "back_project", "lens", "load_cameras", "looking_at", "project", "save_cameras"]
+__all__ = [
+    "NEAR",
+    "Camera",
+    "Lens",
+    "back_project",
+    "lens",
+    "load_cameras",
+    "looking_at",
+    "project",
+    "save_cameras",
+    "states_rate",
+]
 
 NEAR = 1e-2
 """Depth below which a point counts as behind the camera [m]."""
@@ -56,7 +67,7 @@ class Camera:
     distortion: tuple[float, ...] = ()
     """Coefficients k1 k2 p1 p2 k3 ... as OpenCV orders them, none for a pinhole."""
     fps: float = 30.0
-    """Pictures per second [1/s]."""
+    """Pictures per second [1/s]; films have their own rate, masks need it."""
     start: float = 0.0
     """When the first picture was taken, on the clock of the recording [s]."""
 
@@ -187,6 +198,12 @@ def load_cameras(path: str | Path) -> tuple[Camera, ...]:
     if len(set(names)) < len(names):
         raise InputError(f"{path}: cameras: expected a different name for each, found {', '.join(names)}.")
     return cameras
+
+
+def states_rate(path: str | Path) -> frozenset[str]:
+    """Return the names of the cameras of a `cameras.json`, as `load_cameras` reads it, for which `fps` is written."""
+    content = read_json(path, "the file of the cameras that filmed", most=2**20)
+    return frozenset(entry["name"] for entry in content["cameras"] if "fps" in entry)
 
 
 _NUMBERS = {"fx": 0.0, "fy": 0.0, "cx": -math.inf, "cy": -math.inf}

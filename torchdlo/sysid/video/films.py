@@ -43,6 +43,8 @@ class FilmFile:
     """The camera, as it was calibrated."""
     path: Path
     """Film, masks, or a folder of pictures."""
+    rate_stated: bool = True
+    """Whether `cameras.json` says how many pictures per second there are."""
 
 
 def photographs(path: Path) -> list[Path]:
@@ -95,9 +97,10 @@ def film_files(path: Path, trials: Sequence[str]) -> dict[str, tuple[FilmFile, .
         )
     if not found and not (path / "cameras.json").is_file():
         return {}
-    from torchdlo.vision.camera import load_cameras  # only films need torch, which takes seconds to start
+    from torchdlo.vision.camera import load_cameras, states_rate  # only films need torch, which takes seconds to start
 
     cameras = {c.name: c for c in load_cameras(path / "cameras.json")}
+    stated = states_rate(path / "cameras.json")
     films: dict[str, list[FilmFile]] = {name: [] for name in trials}
     for file in found:
         trial, _, name = (file.name if file.is_dir() else file.stem).partition(".")
@@ -109,7 +112,7 @@ def film_files(path: Path, trials: Sequence[str]) -> dict[str, tuple[FilmFile, .
             raise InputError(f"{file}: expected {trial}.npz with the motion of the grippers beside it, found none.")
         if any(f.camera.name == name for f in films[trial]):
             raise InputError(f"{file}: expected one film of each trial and camera, found two.")
-        films[trial].append(FilmFile(cameras[name], file))
+        films[trial].append(FilmFile(cameras[name], file, name in stated))
     for trial, own in films.items():
         if not own:
             raise InputError(

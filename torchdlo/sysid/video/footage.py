@@ -46,6 +46,9 @@ _OTHER_RATE = 0.02
 _DRIFT = 0.25
 """Pictures by which films of one camera may come apart from a common rate by their ends."""
 
+_FRAMES_OFF = 3
+"""Pictures by which masks without times may differ from the length of their trial: a clock may be off so much."""
+
 _STILL = 5e-4
 """Motion of a gripper between two pictures that shows [m]."""
 
@@ -112,11 +115,16 @@ def _timed(recording: Recording, films: Sequence[FilmFile]) -> list[FilmFile]:
     name = films[0].camera.name
     every = [f.path for t in recording.train + recording.test for f in t.films if f.camera.name == name and not t.still]
     found = {path: film_rate(path) for path in dict.fromkeys(every) if path.suffix.lower() in FILMS and path.is_file()}
-    said = films[0].camera.fps
+    said, stated = films[0].camera.fps, films[0].rate_stated
     for path, (fps, _) in found.items():
-        if abs(fps / said - 1) > _OTHER_RATE:
+        if stated and abs(fps / said - 1) > _OTHER_RATE:
             raise InputError(f"{path}: expected {said:g} pictures per second as cameras.json says, found {fps:.4g}.")
     if not found:
+        if every and not stated:
+            raise InputError(
+                f"{films[0].path}: expected fps of camera {name} in cameras.json, found none; masks and folders of "
+                "pictures do not say when they were taken."
+            )
         return list(films)
     usual = float(np.median([fps for fps, _ in found.values()]))
     for path, (fps, count) in found.items():
@@ -151,10 +159,12 @@ def _reduced(
     The camera's `start` is when the picture after the first `early` ones was taken, which are left out.
     """
     nearest = _nearest(trial, film)
-    masks, pictures, _ = masks_of(recording, film)
+    masks, pictures, own_rate = masks_of(recording, film)
     if trial.still:
         return _photographed(trial, film, masks, pictures, notes)
     rows = slice(early, early + _lasting(trial, film, len(masks) - early))
+    if own_rate is None:
+        _check_length(trial, film, len(masks) - early, notes)
     masks, pictures = masks[rows], None if pictures is None else pictures[rows]
     count = len(masks)
     time = film.camera.start + np.arange(count) / film.camera.fps
@@ -199,6 +209,22 @@ def _lasting(trial: Trial, film: FilmFile, count: int) -> int:
             f"{inside}; were pictures dropped, or is fps in cameras.json wrong?"
         )
     return inside
+
+
+def _check_length(trial: Trial, film: FilmFile, count: int, notes: list[str]) -> None:
+    """Refuse masks that have no times and last longer than their trial; say it of shorter ones."""
+    fps, lasts = film.camera.fps, trial.time[-1] - film.camera.start
+    expected = int(lasts * fps + 0.25) + 1
+    if count > expected + _FRAMES_OFF:
+        raise InputError(
+            f"{film.path}: expected {expected} pictures for the {trial.time[-1]:g} s of {trial.name}.npz at {fps:g} "
+            f"per second, found {count}; set fps and start in cameras.json, or leave out what is after the trial."
+        )
+    if count < expected - _FRAMES_OFF:
+        notes.append(
+            f"{trial.name}, camera {film.camera.name}: {count} pictures for {lasts:.3g} s, which have {expected} at "
+            f"{fps:g} per second: check fps if the camera did not stop early."
+        )
 
 
 def _nearest(trial: Trial, film: FilmFile) -> float:
