@@ -75,6 +75,13 @@ def test_masks_come_as_npz_as_png_files_and_as_a_film(plain: Film, tmp_path: Pat
     assert pictures.shape == plain.pictures.shape and pictures.dtype == np.uint8 and fps == pytest.approx(30)
 
 
+def test_files_of_a_folder_are_read_by_their_numbers(tmp_path: Path) -> None:
+    for k in range(12):
+        cv2.imwrite(str(tmp_path / f"{k}.png"), np.repeat(np.arange(12) == k, 3)[None].repeat(9, 0) * np.uint8(255))
+    masks, _ = load_film(tmp_path)
+    assert masks[:, 0, ::3].argmax(1).tolist() == list(range(12))
+
+
 def test_ranges_are_written_and_read_and_wrong_ones_refused(tmp_path: Path) -> None:
     path = tmp_path / "segment.json"
     save_ranges(ranges_of(COLORS[1]), path)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import colorsys
 import json
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -290,8 +291,14 @@ def _picture(file: Path) -> np.ndarray:
     return np.ascontiguousarray(picture[..., ::-1])
 
 
+def _counted(file: Path) -> tuple[list[str | int], str]:
+    """Return what sorts files by the numbers in their names: 2.png before 11.png."""
+    # Every other part is of digits, so that parts at the same place are compared as the same kind.
+    return [int(part) if part.isdecimal() else part for part in re.split(r"([0-9]+)", file.stem)], file.name
+
+
 def _from_folder(path: Path) -> np.ndarray:
-    files = sorted(path.glob("*.png"))
+    files = sorted(path.glob("*.png"), key=_counted)
     if not files:
         raise InputError(f"{path}: expected PNG files, one for each frame, found none.")
     pictures: list[np.ndarray] = []
