@@ -114,6 +114,21 @@ def test_wrong_frames_are_left_out(plain: Film, kind: str, spoil) -> None:
     assert "frame 5" in issues[0].text
 
 
+@pytest.mark.parametrize("coloured", [False, True])
+def test_repeats_of_a_rope_that_swings_are_left_out_while_its_grippers_rest(plain: Film, coloured: bool) -> None:
+    masks, pictures, resting = plain.masks.copy(), plain.pictures.copy(), np.zeros(len(plain.masks), bool)
+    for k in (5, 6, 9):
+        masks[k], pictures[k] = masks[k - 1], pictures[k - 1]
+    shown = {"pictures": pictures} if coloured else {}
+    assert np.flatnonzero(~check_masks(masks, "film", moving=resting, **shown)[0]).tolist() == [5, 6, 9]
+    # At rest, pictures are alike, and nothing is wrong with them.
+    masks[:7], pictures[:7] = masks[0], pictures[0]
+    assert np.flatnonzero(~check_masks(masks, "film", moving=resting, **shown)[0]).tolist() == [9]
+    # Masks of a rope that turns round may be alike where pictures are not.
+    pictures[9, 0, 0] ^= 1
+    assert check_masks(masks, "film", moving=resting, pictures=pictures)[0].all()
+
+
 def test_second_blobs_and_ropes_that_leave_the_picture_are_said(plain: Film) -> None:
     masks = plain.masks.copy()
     masks[:, 20:60, 20:60] = True
