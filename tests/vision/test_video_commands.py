@@ -54,6 +54,29 @@ def test_masks_are_made_by_a_colour(tmp_path: Path) -> None:
         run("segment", tmp_path / "film.mp4", "--color", "green", "--out", tmp_path / "segment.json")
 
 
+def test_the_background_is_taken_as_stored_and_ranges_tidy_its_masks(tmp_path: Path) -> None:
+    from PIL import Image
+
+    empty = np.full((100, 160, 3), 120, np.uint8)
+    empty[:20] = (200, 30, 30)
+    (tmp_path / "film").mkdir()
+    for k in range(6):
+        picture = empty.copy()
+        picture[60 + k : 64 + k, 20:140] = (20, 160, 60)
+        picture[30:34, 20 + k : 100 + k] = (20, 160, 60)
+        Image.fromarray(picture).save(tmp_path / "film" / f"{k}.png")
+    tag = Image.Exif()
+    tag[0x0112] = 3  # turned by half a circle, as a viewer shows it
+    Image.fromarray(empty).save(tmp_path / "empty.jpg", exif=tag, quality=98)
+    (tmp_path / "ranges.json").write_text('{"ignore": [[0, 0.5, 1, 1]]}')
+    given = ("--ranges", tmp_path / "ranges.json", "--masks", tmp_path / "masks.npz", "--out", tmp_path / "out.json")
+    run("segment", tmp_path / "film", "--background", tmp_path / "empty.jpg", *given)
+    with np.load(tmp_path / "masks.npz") as archive:
+        assert archive["masks"].sum((1, 2)).tolist() == [320] * 6
+    with pytest.raises(InputError, match="--color or --background"):
+        run("segment", tmp_path / "film", "--background", tmp_path / "empty.jpg", "--color", "1,200,3", *given[2:])
+
+
 def test_a_recording_is_filmed_and_checked(tmp_path: Path) -> None:
     camera = looking_at("a", [0.15, -1.35, 1.0], [0.0, 0.0, 0.88], focal=650.0)
     save_cameras([camera], tmp_path / "cameras.json")

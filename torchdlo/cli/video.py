@@ -114,7 +114,12 @@ def segment(
     ] = None,
     ranges: Annotated[Path | None, typer.Option(help="Ranges that were saved before.", metavar="FILE")] = None,
     background: Annotated[
-        Path | None, typer.Option(help="Picture of the same view without the rope: take what differs.", metavar="PNG")
+        Path | None,
+        typer.Option(
+            help="Picture of the same view without the rope: take what differs. Of --ranges it takes close, smallest "
+            "and ignore.",
+            metavar="PNG",
+        ),
     ] = None,
     least: Annotated[float, typer.Option(min=1, max=255, help="Smallest difference from it, of 255.")] = 40,
     masks: Annotated[Path | None, typer.Option(help="Write masks, too, and say what is wrong with them.")] = None,
@@ -141,7 +146,10 @@ def segment(
         raise InputError(f"{video}: expected a film in colour, found masks; they are used as they are.")
     chosen = work.load_ranges(ranges) if ranges is not None else work.ranges_of(_rgb(color)) if color else None
     if background is not None:
-        found = work.background_masks(pictures, _background(background, pictures.shape[1:3]), least, work.Ranges())
+        if color is not None:
+            raise InputError("expected --color or --background, found both; --ranges says what else is left out.")
+        empty = _background(background, pictures.shape[1:3])
+        found = work.background_masks(pictures, empty, least, chosen or work.Ranges())
     else:
         if chosen is None:
             _serve(pictures, out, port)
@@ -171,15 +179,13 @@ def _rgb(text: str) -> list[float]:
 
 
 def _background(path: Path, size: tuple[int, int]) -> Any:
-    import cv2
+    from torchdlo.vision.segment import read_picture
 
-    picture = cv2.imread(str(path), cv2.IMREAD_COLOR)
-    if picture is None:
-        raise InputError(f"{path}: expected a picture, but it cannot be read.")
+    picture = read_picture(path)
     if picture.shape[:2] != size:
         found = f"{picture.shape[1]} x {picture.shape[0]}"
         raise InputError(f"{path}: expected {size[1]} x {size[0]} pixels as the film has, found {found}.")
-    return picture[..., ::-1]
+    return picture
 
 
 def _serve(pictures: Any, out: Path, port: int) -> None:

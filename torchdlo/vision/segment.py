@@ -32,6 +32,7 @@ __all__ = [
     "load_ranges",
     "matted",
     "ranges_of",
+    "read_picture",
     "save_masks",
     "save_ranges",
     "tidy",
@@ -253,7 +254,7 @@ def load_film(path: Path) -> tuple[np.ndarray, float | None]:
     if path.suffix == ".npz":
         return _from_archive(path), None
     if path.suffix.lower() in (".png", ".jpg", ".jpeg"):
-        return _maybe_masks(np.stack([_picture(path)])), None
+        return _maybe_masks(np.stack([read_picture(path)])), None
     pictures, fps = read_video(path)
     return _maybe_masks(pictures), fps
 
@@ -281,7 +282,7 @@ def _from_archive(path: Path) -> np.ndarray:
     return masks > (0 if masks.dtype == bool or masks.max(initial=0) <= 1 else 127)
 
 
-def _picture(file: Path) -> np.ndarray:
+def read_picture(file: Path) -> np.ndarray:
     """Return a picture as it is stored, RGB (H, W, 3) uint8: tags that turn it do not count, as cameras do not turn."""
     import cv2
 
@@ -303,7 +304,7 @@ def _from_folder(path: Path) -> np.ndarray:
         raise InputError(f"{path}: expected PNG files, one for each frame, found none.")
     pictures: list[np.ndarray] = []
     for file in files:
-        picture = _picture(file)
+        picture = read_picture(file)
         if pictures and picture.shape != pictures[0].shape:
             raise InputError(
                 f"{file}: expected {pictures[0].shape[1]} x {pictures[0].shape[0]} pixels as {files[0].name} has, "
