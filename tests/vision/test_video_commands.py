@@ -50,6 +50,10 @@ def test_masks_are_made_by_a_colour(tmp_path: Path) -> None:
     assert "8 of 8 frames" in said and load_ranges(tmp_path / "segment.json") == ranges_of(COLORS[0])
     with np.load(tmp_path / "masks.npz") as archive:
         assert archive["masks"].shape == (8, 480, 640)
+    other = ("--out", tmp_path / "other.json", "--masks", tmp_path / "other.npz")
+    with pytest.raises(InputError, match="never visible"):
+        run("segment", tmp_path / "film.mp4", "--color", "200,30,230", *other)
+    assert not (tmp_path / "other.json").exists() and not (tmp_path / "other.npz").exists()
     with pytest.raises(InputError, match="R,G,B"):
         run("segment", tmp_path / "film.mp4", "--color", "green", "--out", tmp_path / "segment.json")
 

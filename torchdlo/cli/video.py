@@ -134,7 +134,6 @@ def segment(
     torchdlo segment my_rope/train_0.a.mp4 --color 25,150,60 --masks masks.npz
     """
     from torchdlo.vision import segment as work
-    from torchdlo.vision.mask_health import check_masks
 
     check_writable(out)
     if masks is not None:
@@ -145,30 +144,36 @@ def segment(
     if pictures.dtype == bool:
         raise InputError(f"{video}: expected a film in colour, found masks; they are used as they are.")
     chosen = work.load_ranges(ranges) if ranges is not None else work.ranges_of(_rgb(color)) if color else None
+    served = background is None and chosen is None
     if background is not None:
         if color is not None:
             raise InputError("expected --color or --background, found both; --ranges says what else is left out.")
         empty = _background(background, pictures.shape[1:3])
         found = work.background_masks(pictures, empty, least, chosen or work.Ranges())
     else:
-        if chosen is None:
+        if served or chosen is None:
             _serve(pictures, out, port)
             if not out.exists():
                 raise stopped("nothing was saved")
             chosen = work.load_ranges(out)
-        else:
+        found = None if masks is None else work.color_masks(pictures, chosen)
+    said = [] if found is None else _healthy(found, str(video), pictures)
+    if background is None and chosen is not None:
+        if not served:
             work.save_ranges(chosen, out)
         typer.echo(f"ranges: {out}")
-        if masks is None:
-            return
-        found = work.color_masks(pictures, chosen)
-    good, issues = check_masks(found, str(video), pictures=pictures)
-    for issue in issues:
-        typer.echo(f"masks: {issue.text}")
-    typer.echo(f"{int(good.sum())} of {len(good)} frames can be used")
-    if masks is not None:
+    typer.echo("\n".join(said), nl=bool(said))
+    if masks is not None and found is not None:
         work.save_masks(found, masks)
         typer.echo(f"masks:  {masks}")
+
+
+def _healthy(masks: Any, where: str, pictures: Any) -> list[str]:
+    """Return what is wrong with masks, and how many can be used; refuse those that say nothing."""
+    from torchdlo.vision.mask_health import check_masks
+
+    good, issues = check_masks(masks, where, pictures=pictures)
+    return [*(f"masks: {issue.text}" for issue in issues), f"{int(good.sum())} of {len(good)} frames can be used"]
 
 
 def _rgb(text: str) -> list[float]:
