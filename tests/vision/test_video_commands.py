@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -36,6 +37,12 @@ def test_a_camera_is_calibrated_and_added_to_others(tmp_path: Path) -> None:
     )
     assert "reprojection error" in said and [c.name for c in load_cameras(out)] == ["a", "c"]
     assert (tmp_path / "cameras_c.png").read_bytes().startswith(b"\x89PNG")
+    save_cameras([replace(load_cameras(out)[1], start=-0.4), front()], out)
+    again = ("calibrate-camera", tmp_path / "board.mp4", "--board", "8x6", "--square", 0.03, "--out", out)
+    assert "start = -0.4 s is kept" in run(*again, "--name", "c") and load_cameras(out)[1].start == -0.4
+    for name in ("a/b", "left cam", ""):
+        with pytest.raises(InputError, match="--name: expected letters"):
+            run(*again, "--name", name)
     run("calibrate-camera", "-", "--board", "8x6", "--print-board", tmp_path / "board.png")
     assert (tmp_path / "board.png").exists()
     with pytest.raises(InputError, match="COLUMNSxROWS"):

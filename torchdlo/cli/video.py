@@ -55,8 +55,9 @@ def calibrate_camera(
     import dataclasses
 
     from torchdlo.vision import calibrate_camera as calibration
-    from torchdlo.vision.camera import load_cameras, save_cameras
+    from torchdlo.vision.camera import check_name, load_cameras, save_cameras
 
+    check_name(name, "--name")
     printed = calibration.Board(*_board(board), square, marker, dictionary)
     if print_board is not None:
         import cv2
@@ -69,7 +70,8 @@ def calibrate_camera(
         )
         return
     picture = out.with_name(f"{out.stem}_{name}.png")
-    others = [c for c in load_cameras(out) if c.name != name] if out.exists() else []
+    known = load_cameras(out) if out.exists() else ()
+    others = [c for c in known if c.name != name]
     if not out.exists():
         check_writable(out)
     check_writable(picture)
@@ -81,20 +83,23 @@ def calibrate_camera(
     from torchdlo.vision.video_file import read_video
 
     shown = read_video(video)[0][found.pictures[0]]
-    save_cameras([*others, found.camera], out)
+    # A board tells nothing of the clock: what a person has written down of it stays.
+    start = next((c.start for c in known if c.name == name), 0.0)
+    camera = dataclasses.replace(found.camera, start=start)
+    save_cameras([*others, camera], out)
     write_atomically(picture, calibration.error_picture(found, shown))
-    camera = found.camera
     typer.echo(
         f"camera {name}: focal length {camera.fx:.1f} x {camera.fy:.1f} px, reprojection error {found.error:.3f} px in "
         f"{len(found.pictures)} pictures; the world is the board in picture {found.pictures[0]}",
         err=as_json,
     )
-    for note in found.notes:
+    notes = [*found.notes, *([f"start = {start:g} s is kept as {out} had it."] if start else [])]
+    for note in notes:
         typer.echo(f"note: {note}", err=as_json)
     typer.echo(f"cameras: {out}\npicture: {picture}", err=as_json)
     if as_json:
         content = {"camera": dataclasses.asdict(camera), "error_px": found.error, "pictures": list(found.pictures)}
-        typer.echo(json.dumps(content | {"notes": list(found.notes)}, indent=1))
+        typer.echo(json.dumps(content | {"notes": notes}, indent=1))
 
 
 def _board(text: str) -> tuple[int, int]:

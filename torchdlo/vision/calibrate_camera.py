@@ -6,6 +6,7 @@ along the rows of the board, y up along its columns, z out of the board.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,6 +25,9 @@ _MOST = 40
 _FEWEST = 4
 """Pictures that are needed."""
 
+_CORNERS = 6
+"""Corners that a picture needs."""
+
 
 @dataclass(frozen=True)
 class Board:
@@ -40,15 +44,31 @@ class Board:
     dictionary: str = "DICT_4X4_50"
     """Markers of ChArUco, as OpenCV calls them."""
 
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.square) and self.square > 0):
+            raise InputError(f"square: expected the side of a square in m, found {self.square:g}.")
+        if self.marker is not None and not 0 < self.marker < self.square:
+            raise InputError(
+                f"marker: expected the side of a marker in m, smaller than a square's of {self.square:g}, found "
+                f"{self.marker:g}."
+            )
+
     def charuco(self):
         """Return OpenCV's board of markers."""
         import cv2
 
-        if not hasattr(cv2.aruco, self.dictionary):
+        number = getattr(cv2.aruco, self.dictionary, None) if self.dictionary.startswith("DICT_") else None
+        if number is None:
             raise InputError(
                 f"dictionary: expected a name that OpenCV knows, such as DICT_4X4_50, found {self.dictionary}."
             )
-        words = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, self.dictionary))
+        words = cv2.aruco.getPredefinedDictionary(number)
+        needed, known = self.columns * self.rows // 2, len(words.bytesList)
+        if needed > known:
+            raise InputError(
+                f"board: expected at most {known} markers, as {self.dictionary} has, found {needed} on {self.columns} "
+                f"x {self.rows} squares; choose fewer squares or another --dictionary, such as DICT_4X4_1000."
+            )
         return cv2.aruco.CharucoBoard((self.columns, self.rows), self.square, self.marker, words)
 
     def corners(self) -> np.ndarray:
@@ -91,14 +111,15 @@ def calibrate_camera(
     import cv2
 
     report = callback or (lambda *_: None)
+    find = _charuco_finder(board) if board.marker is not None else _checkerboard_finder(board)
+    model = board.corners()
     pictures, fps = read_video(path)
     height, width = pictures.shape[1:3]
-    find = _charuco_finder(board) if board.marker is not None else _checkerboard_finder(board)
     tried = np.unique(np.linspace(0, len(pictures) - 1, min(len(pictures), 3 * _MOST)).round().astype(int))
     seen: list[tuple[int, np.ndarray, np.ndarray]] = []
     for done, k in enumerate(tried):
         at, corners = find(cv2.cvtColor(pictures[k], cv2.COLOR_RGB2GRAY))
-        if len(at) >= 6:
+        if len(at) >= _CORNERS and _flat(model[at]):
             seen.append((int(k), at, corners))
         report("finding the board", done + 1, len(tried), f"in {len(seen)} pictures")
     if len(seen) < _FEWEST:
@@ -109,10 +130,15 @@ def calibrate_camera(
         )
     if len(seen) > _MOST:
         seen = [seen[k] for k in np.linspace(0, len(seen) - 1, _MOST).round().astype(int)]
-    model = board.corners()
     objects = [model[at].astype(np.float32)[:, None] for _, at, _ in seen]
     images = [corners.astype(np.float32)[:, None] for *_, corners in seen]
-    error, matrix, lens, turns, shifts = cv2.calibrateCamera(objects, images, (width, height), None, None)
+    try:
+        error, matrix, lens, turns, shifts = cv2.calibrateCamera(objects, images, (width, height), None, None)
+    except cv2.error:
+        raise InputError(
+            f"{path}: expected pictures of a board that tell where the camera is, but those {len(seen)} in which it "
+            "was found do not; film all of it, from several sides."
+        ) from None
     report("fitting the camera", 1, 1, f"{error:.2f} px")
     modelled = tuple(
         cv2.projectPoints(o, r, t, matrix, lens)[0][:, 0] for o, r, t in zip(objects, turns, shifts, strict=True)
@@ -140,6 +166,12 @@ def calibrate_camera(
         modelled,
         tuple(_notes(float(error), normals, images, width, height)),
     )
+
+
+def _flat(points: np.ndarray) -> bool:
+    """Return whether points of a board (N, 3) tell its place: not if all of them, or all but one, are on a line."""
+    rest = [np.delete(points[:, :2], k, 0) for k in range(len(points))]
+    return min(np.linalg.svd(x - x.mean(0), compute_uv=False)[1] for x in rest) > 1e-6 * np.ptp(points)
 
 
 def _notes(error: float, normals: np.ndarray, images: list[np.ndarray], width: int, height: int) -> list[str]:

@@ -26,6 +26,7 @@ __all__ = [
     "Camera",
     "Lens",
     "back_project",
+    "check_name",
     "lens",
     "load_cameras",
     "looking_at",
@@ -210,6 +211,12 @@ _NUMBERS = {"fx": 0.0, "fy": 0.0, "cx": -math.inf, "cy": -math.inf}
 _KNOWN = {"name", "width", "height", "fps", "start", "distortion", "rotation", "translation", *_NUMBERS}
 
 
+def check_name(name: Any, where: str) -> None:
+    """Refuse what cannot be the name of a camera, which names of files hold; `where` begins the sentence."""
+    if not isinstance(name, str) or not name.replace("_", "").replace("-", "").isalnum():
+        raise InputError(f"{where}: expected letters, digits, - and _, found {one_line(repr(name), 100)}.")
+
+
 def _camera(path: Path, k: int, entry: Any) -> Camera:
     where = f"cameras[{k}]"
     if not isinstance(entry, dict):
@@ -221,8 +228,7 @@ def _camera(path: Path, k: int, entry: Any) -> Camera:
         if name not in entry:
             _refuse(path, f"{where}.{name}", "this entry", "none")
     name = entry["name"]
-    if not isinstance(name, str) or not name or not name.replace("_", "").replace("-", "").isalnum():
-        _refuse(path, f"{where}.name", "letters, digits, - and _", repr(name))
+    check_name(name, f"{path}: {where}.name")
     sizes = [_number(path, f"{where}.{key}", entry[key], 0.0) for key in ("width", "height")]
     if any(s != int(s) or s > 2**15 for s in sizes):
         _refuse(path, f"{where}.width and height", "whole numbers of pixels", f"{sizes[0]:g} x {sizes[1]:g}")
