@@ -80,14 +80,11 @@ def calibrate_camera(
             found = calibration.calibrate_camera(video, printed, name=name, callback=callback)
     except KeyboardInterrupt:
         raise stopped("there was no result yet, and nothing was written") from None
-    from torchdlo.vision.video_file import read_video
-
-    shown = read_video(video)[0][found.pictures[0]]
     # A board tells nothing of the clock: what a person has written down of it stays.
     start = next((c.start for c in known if c.name == name), 0.0)
     camera = dataclasses.replace(found.camera, start=start)
     save_cameras([*others, camera], out)
-    write_atomically(picture, calibration.error_picture(found, shown))
+    write_atomically(picture, calibration.error_picture(found))
     typer.echo(
         f"camera {name}: focal length {camera.fx:.1f} x {camera.fy:.1f} px, reprojection error {found.error:.3f} px in "
         f"{len(found.pictures)} pictures; the world is the board in picture {found.pictures[0]}",

@@ -15,7 +15,7 @@ import numpy as np
 
 from torchdlo.errors import InputError
 from torchdlo.vision.camera import Camera, triple
-from torchdlo.vision.video_file import read_video
+from torchdlo.vision.video_file import film_rate, some_pictures
 
 __all__ = ["Board", "Calibrated", "board_picture", "calibrate_camera", "error_picture"]
 
@@ -92,6 +92,8 @@ class Calibrated:
     """Where the camera has them [px], likewise."""
     notes: tuple[str, ...]
     """What a reader should know."""
+    picture: np.ndarray
+    """The first picture of those, RGB uint8, shape (H, W, 3)."""
 
 
 def calibrate_camera(
@@ -111,25 +113,9 @@ def calibrate_camera(
     import cv2
 
     report = callback or (lambda *_: None)
-    find = _charuco_finder(board) if board.marker is not None else _checkerboard_finder(board)
-    model = board.corners()
-    pictures, fps = read_video(path)
-    height, width = pictures.shape[1:3]
-    tried = np.unique(np.linspace(0, len(pictures) - 1, min(len(pictures), 3 * _MOST)).round().astype(int))
-    seen: list[tuple[int, np.ndarray, np.ndarray]] = []
-    for done, k in enumerate(tried):
-        at, corners = find(cv2.cvtColor(pictures[k], cv2.COLOR_RGB2GRAY))
-        if len(at) >= _CORNERS and _flat(model[at]):
-            seen.append((int(k), at, corners))
-        report("finding the board", done + 1, len(tried), f"in {len(seen)} pictures")
-    if len(seen) < _FEWEST:
-        kind = "checkerboard" if board.marker is None else f"ChArUco board ({board.dictionary})"
-        raise InputError(
-            f"{path}: expected a {kind} of {board.columns} x {board.rows} squares in at least {_FEWEST} pictures, "
-            f"found it in {len(seen)} of {len(tried)}; check the numbers of squares, and film it large and sharp."
-        )
-    if len(seen) > _MOST:
-        seen = [seen[k] for k in np.linspace(0, len(seen) - 1, _MOST).round().astype(int)]
+    fps, model = film_rate(path)[0], board.corners()
+    seen, picture = _seen(path, board, report)
+    height, width = picture.shape[:2]
     objects = [model[at].astype(np.float32)[:, None] for _, at, _ in seen]
     images = [corners.astype(np.float32)[:, None] for *_, corners in seen]
     try:
@@ -165,7 +151,39 @@ def calibrate_camera(
         tuple(i[:, 0] for i in images),
         modelled,
         tuple(_notes(float(error), normals, images, width, height)),
+        picture,
     )
+
+
+def _seen(
+    path: Path, board: Board, report: Callable[[str, int, int, str], None]
+) -> tuple[list[tuple[int, np.ndarray, np.ndarray]], np.ndarray]:
+    """Return pictures of a film in which a board is found, and the first one itself, RGB (H, W, 3).
+
+    Of each are its number, the numbers of corners, and where those are [px], (N, 2).
+    """
+    import cv2
+
+    find = _charuco_finder(board) if board.marker is not None else _checkerboard_finder(board)
+    model = board.corners()
+    tried, pictures = some_pictures(path, 3 * _MOST)
+    seen: list[tuple[int, np.ndarray, np.ndarray]] = []
+    first = np.empty((0, 0, 3), np.uint8)
+    for done, (k, picture) in enumerate(pictures):
+        at, corners = find(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY))
+        if len(at) >= _CORNERS and _flat(model[at]):
+            first = first if seen else picture
+            seen.append((k, at, corners))
+        report("finding the board", done + 1, tried, f"in {len(seen)} pictures")
+    if len(seen) < _FEWEST:
+        kind = "checkerboard" if board.marker is None else f"ChArUco board ({board.dictionary})"
+        raise InputError(
+            f"{path}: expected a {kind} of {board.columns} x {board.rows} squares in at least {_FEWEST} pictures, "
+            f"found it in {len(seen)} of {tried}; check the numbers of squares, and film it large and sharp."
+        )
+    if len(seen) > _MOST:
+        seen = [seen[k] for k in np.linspace(0, len(seen) - 1, _MOST).round().astype(int)]
+    return seen, first
 
 
 def _flat(points: np.ndarray) -> bool:
@@ -238,15 +256,15 @@ def board_picture(board: Board, dots: int = 100) -> np.ndarray:
     return np.pad(inner, margin, constant_values=255)
 
 
-def error_picture(found: Calibrated, picture: np.ndarray) -> bytes:
-    """Return a PNG of where corners were found and how far off the camera has them, over a picture RGB (H, W, 3)."""
+def error_picture(found: Calibrated) -> bytes:
+    """Return a PNG of where corners were found and how far off the camera has them, over the first picture."""
     import io
 
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(11, 4.4), layout="constrained")
     left, right = figure.subplots(1, 2, width_ratios=(1.5, 1))
-    left.imshow(picture, alpha=0.35)
+    left.imshow(found.picture, alpha=0.35)
     off = np.concatenate([m - f for m, f in zip(found.modelled, found.found, strict=True)])
     every = np.concatenate(found.found)
     left.scatter(every[:, 0], every[:, 1], s=4, c="#00798c", alpha=0.5, linewidths=0)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Container, Iterator, Sequence
 from contextlib import contextmanager
 from fractions import Fraction
 from pathlib import Path
@@ -13,13 +13,16 @@ import numpy as np
 from torchdlo.errors import InputError
 from torchdlo.files import replace_atomically
 
-__all__ = ["CODECS", "film_rate", "frame_rate", "read_video", "write_video"]
+__all__ = ["CODECS", "film_rate", "frame_rate", "read_video", "some_pictures", "write_video"]
 
 CODECS = ("libx264", "libopenh264", "h264")
 """Encoders, the first that is there is used."""
 
 _UNEVEN = 0.25
 """Distance of a time from the line through all of them, in pictures, from which the frame rate varies."""
+
+_LARGEST = 4 * 2**30
+"""Most that the pictures of a film take [bytes]."""
 
 _MOST = 20_000
 """Pictures that a film may have."""
@@ -43,20 +46,61 @@ def read_video(path: str | Path, *, most: int = _MOST) -> tuple[np.ndarray, floa
         InputError: It cannot be read, or its pictures are turned or not evenly spaced in time.
     """
     path = Path(path)
-    pictures: list[np.ndarray] = []
+    count = film_rate(path)[1]
+    if count > most:
+        raise InputError(f"{path}: expected at most {most} pictures, found {count}; cut the film.")
+    out: np.ndarray | None = None
     times: list[float | None] = []
     for picture, time in _decoded(path):
-        if len(pictures) == most:
-            raise InputError(f"{path}: expected at most {most} pictures, found more; cut the film.")
-        pictures.append(picture)
+        if out is None:
+            _check_size(path, count, picture)
+            # Memory counts once it is written to: what is too much, for pictures that were dropped, costs nothing.
+            out = np.empty((count + count // 4 + 16, *picture.shape), np.uint8)
+        elif len(times) == len(out):
+            out = np.concatenate([out, np.empty_like(out)])
+        out[len(times)] = picture
         times.append(time)
-    if not pictures:
+    if out is None:
         raise InputError(f"{path}: expected a film, found no picture in it; record or copy the file again.")
     slope, number = _clock(path, times)
     if number[-1] >= most:
         raise InputError(f"{path}: expected at most {most} pictures, found times for more; cut the film.")
-    shown = np.searchsorted(number, np.arange(number[-1] + 1), side="right") - 1
-    return np.stack([pictures[k] for k in shown]), 1 / slope
+    if number[-1] >= len(times):
+        _check_size(path, int(number[-1]) + 1, out[0])
+    return _filled(out, number), 1 / slope
+
+
+def _check_size(path: Path, count: int, picture: np.ndarray) -> None:
+    """Refuse as many pictures like one as memory should not hold."""
+    if count * picture.nbytes > _LARGEST:
+        raise InputError(
+            f"{path}: expected at most {_LARGEST / 2**30:.3g} GiB of pictures, found {count} of {picture.shape[1]} x "
+            f"{picture.shape[0]} pixels, {count * picture.nbytes / 2**30:.3g} GiB; cut the film to its trial, or film, "
+            "and calibrate the camera, with fewer pixels."
+        )
+
+
+def _filled(out: np.ndarray, number: np.ndarray) -> np.ndarray:
+    """Return an array whose first pictures are numbers (F,) of a film with all of them, in place where it has room."""
+    last = int(number[-1])
+    if last >= len(out):
+        out = np.concatenate([out, np.empty((last + 1 - len(out), *out.shape[1:]), out.dtype)])
+    # From the end on: pictures move to later places, or stay.
+    for k in range(len(number) - 1, -1, -1):
+        out[number[k] : number[k + 1] if k + 1 < len(number) else last + 1] = out[k]
+    return out[: last + 1]
+
+
+def some_pictures(path: str | Path, most: int) -> tuple[int, Iterator[tuple[int, np.ndarray]]]:
+    """Return how many pictures are chosen evenly of a film, at most `most`, and these, one by one, with their numbers.
+
+    Raises:
+        InputError: It cannot be read, or its pictures are turned or not evenly spaced in time.
+    """
+    path = Path(path)
+    count = film_rate(path)[1]
+    chosen = set(np.linspace(0, count - 1, min(count, most)).round().astype(int).tolist())
+    return len(chosen), ((k, picture) for k, (picture, _) in enumerate(_decoded(path, chosen)) if k in chosen)
 
 
 def frame_rate(path: Path, times: Sequence[float | None]) -> float:
@@ -112,17 +156,19 @@ def film_rate(path: str | Path) -> tuple[float, int]:
     return frame_rate(path, times if None in times else sorted(times)), len(times)
 
 
-def _decoded(path: Path) -> Iterator[tuple[np.ndarray, float | None]]:
+def _decoded(path: Path, chosen: Container[int] | None = None) -> Iterator[tuple[np.ndarray, float | None]]:
+    """Give the pictures of a film and their times; those that are not chosen are empty arrays."""
     with _opened(path) as (container, stream):
         stream.thread_type = "AUTO"
-        for frame in container.decode(stream):
+        for k, frame in enumerate(container.decode(stream)):
             turned = int(getattr(frame, "rotation", 0) or 0)
             if turned % 360:
                 raise InputError(
                     f"{path}: expected pictures as the sensor took them, found a tag that turns them by "
                     f"{abs(turned)} degrees; film with the phone held level, or encode the film again."
                 )
-            yield frame.to_ndarray(format="rgb24"), frame.time
+            here = chosen is None or k in chosen
+            yield frame.to_ndarray(format="rgb24") if here else np.empty((0, 0, 3), np.uint8), frame.time
 
 
 @contextmanager
