@@ -13,7 +13,7 @@ import numpy as np
 from torchdlo.errors import InputError
 from torchdlo.files import replace_atomically
 
-__all__ = ["CODECS", "film_rate", "frame_rate", "read_video", "some_pictures", "write_video"]
+__all__ = ["CODECS", "check_sides", "film_rate", "frame_rate", "read_video", "some_pictures", "write_video"]
 
 CODECS = ("libx264", "libopenh264", "h264")
 """Encoders, the first that is there is used."""
@@ -191,20 +191,34 @@ def _opened(path: Path) -> Iterator[tuple[Any, Any]]:
         ) from None
 
 
+def check_sides(where: str, width: int, height: int) -> None:
+    """Refuse pictures that the encoder cannot take; `where` begins the sentence."""
+    if width % 2 or height % 2:
+        raise InputError(
+            f"{where}: expected even width and height for a film, which has hue at half of the size, found {width} x "
+            f"{height} pixels; masks may have any."
+        )
+
+
 def write_video(path: Path, pictures: np.ndarray, fps: float, *, quality: int = 18) -> None:
-    """Write pictures, RGB (F, H, W, 3) or grey (F, H, W) uint8, as an MP4 that appears complete or not at all."""
+    """Write pictures, RGB (F, H, W, 3) or grey (F, H, W) uint8, as an MP4 that appears complete or not at all.
+
+    Raises:
+        InputError: A side of them is odd: the encoder stores hue at half of their size.
+    """
     package = av()
     codec = next((name for name in CODECS if name in package.codecs_available), None)
     if codec is None:
         raise InputError("films need a build of the package av with H.264; pip install av has it.")
     layout = "rgb24" if pictures.ndim == 4 else "gray"
-    height, width = (side // 2 * 2 for side in pictures.shape[1:3])
+    height, width = pictures.shape[1:3]
+    check_sides(f"{path}", width, height)
     with replace_atomically(path) as temporary, package.open(str(temporary), "w", format="mp4") as container:
         container.metadata["comment"] = "torchdlo"
         stream = container.add_stream(codec, rate=Fraction(fps).limit_denominator(1001))
         stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
         stream.options = {"crf": str(quality), "preset": "medium"} if codec == "libx264" else {}
         for picture in pictures:
-            frame = package.VideoFrame.from_ndarray(np.ascontiguousarray(picture[:height, :width]), format=layout)
+            frame = package.VideoFrame.from_ndarray(np.ascontiguousarray(picture), format=layout)
             container.mux(stream.encode(frame))
         container.mux(stream.encode())

@@ -19,7 +19,7 @@ from torchdlo.vision.camera import Camera, save_cameras
 from torchdlo.vision.film import Film, FilmLook, check_inside, off_camera
 from torchdlo.vision.film import film as film_rope
 from torchdlo.vision.segment import save_masks
-from torchdlo.vision.video_file import write_video
+from torchdlo.vision.video_file import check_sides, write_video
 
 __all__ = ["centre_line", "film_recording", "film_run"]
 
@@ -83,6 +83,7 @@ def film_recording(
             f"{recording.path / 'rope.json'}: radius: expected it to draw the rope, found none; give --radius."
         )
     report = callback or (lambda *_: None)
+    _check_sides(cameras, masks)
     chosen = [*recording.train[:trials], *recording.test[:trials]]
     chosen = [t if seconds is None else _cut(t, seconds) for t in chosen]
     rng = np.random.default_rng(look.seed)
@@ -175,6 +176,7 @@ def film_run(
     if len(time) < 4:
         raise InputError(f"expected a run of at least 4 frames to film, found {len(time)}.")
     report = callback or (lambda *_: None)
+    _check_sides(cameras, masks)
     line, said = pos[:, rope == 0], []
 
     def fill(folder: Path) -> None:
@@ -188,6 +190,12 @@ def film_run(
 
     _new_folder(out, fill)
     return said
+
+
+def _check_sides(cameras: Sequence[Camera], masks: bool) -> None:
+    """Refuse before the work cameras whose pictures cannot be written."""
+    for camera in () if masks else cameras:
+        check_sides(f"camera {camera.name}", camera.width, camera.height)
 
 
 def _write(seen: Film, stem: Path, camera: Camera, masks: bool, quality: int = 18) -> Path:
