@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from typer.testing import CliRunner
@@ -101,6 +103,29 @@ def test_a_recording_is_filmed_and_checked(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="--bar"):
         run(*common, "--out", tmp_path / "other", "--bar", "1,2")
     assert not (tmp_path / "other").exists()
+
+
+def test_a_run_is_filmed_with_its_loop_closed_and_refuses_what_it_would_ignore(tmp_path: Path) -> None:
+    turn = 2 * np.pi * np.arange(24) / 24
+    loop = [[0.2 * np.cos(t), 0.0, 0.5 + 0.2 * np.sin(t)] for t in turn]
+    rope = {"points": loop, "closed": True, "radius": 0.006, "mass": 0.03, "youngs": 1e6}
+    scene = {"format": "torchdlo scene 2", "duration": 0.04, "effects": {}, "ropes": [rope]}
+    (tmp_path / "scene.json").write_text(json.dumps(scene))
+    run("simulate", tmp_path / "scene.json", "--out", tmp_path / "run", "--execution", "eager")
+    camera = looking_at("a", [0.0, -1.0, 0.5], [0.0, 0.0, 0.5], size=(160, 120), focal=150.0)
+    save_cameras([camera], tmp_path / "cameras.json")
+    common = ("film", tmp_path / "run", tmp_path / "cameras.json", "--out", tmp_path / "films")
+    with pytest.raises(InputError, match="--off and --trials and --seconds for a recording only"):
+        run(*common, "--off", 3, "--seconds", 0.1, "--trials", 1)
+    run(*common, "--masks")
+    with np.load(tmp_path / "films" / "a.npz") as archive:
+        around, _ = cv2.connectedComponents((~archive["masks"][0]).astype(np.uint8))
+    assert around == 3  # the mask, what is around the loop, and what is within
+    sizes = []
+    for quality in (10, 45):
+        run(*common[:4], tmp_path / f"films_{quality}", "--quality", quality)
+        sizes.append((tmp_path / f"films_{quality}" / "a.mp4").stat().st_size)
+    assert sizes[0] > 2 * sizes[1]
 
 
 def test_the_film_in_the_package_is_small_and_sound() -> None:

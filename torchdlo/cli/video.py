@@ -231,12 +231,12 @@ def film(
         typer.Option(
             min=0,
             max=5,
-            help="How far the cameras that are written down are off those that filmed: 1 stands for up to 1 degree, "
-            "1 %, 10 mm and half a frame.",
+            help="Of recordings: how far the cameras that are written down are off those that filmed: 1 stands for up "
+            "to 1 degree, 1 %, 10 mm and half a frame.",
         ),
     ] = 0.0,
-    trials: Annotated[int | None, typer.Option(min=1, help="Most trials of each split.")] = None,
-    seconds: Annotated[float | None, typer.Option(min=0.1, help="Most seconds of each trial.")] = None,
+    trials: Annotated[int | None, typer.Option(min=1, help="Of recordings: most trials of each split.")] = None,
+    seconds: Annotated[float | None, typer.Option(min=0.1, help="Of recordings: most seconds of each trial.")] = None,
     quality: Annotated[int, typer.Option(min=0, max=51, help="Of H.264: 0 is lossless, 51 the smallest file.")] = 18,
     seed: Annotated[int, typer.Option(min=0, help="Of noise and faults.")] = 0,
 ) -> None:
@@ -259,10 +259,11 @@ def film(
     look = _look(color, noise, blur, exposure, bar, wrong, seed)
     try:
         with progress() as show, deferred_interrupt(show) as callback:
+            options: dict[str, Any]
             if (source / "rope.json").is_file():
                 from torchdlo.sysid.recordings.recording import load_recording
 
-                options: dict[str, Any] = {"masks": masks, "off": off, "trials": trials, "seconds": seconds}
+                options = {"masks": masks, "off": off, "trials": trials, "seconds": seconds}
                 options |= {"quality": quality}
                 said = film_recording(
                     load_recording(source), shown, out, look, radius=radius, **options, callback=callback
@@ -270,10 +271,15 @@ def film(
             else:
                 from torchdlo.scene_files.run import load_frames
 
+                given = {"--off": off > 0, "--trials": trials is not None, "--seconds": seconds is not None}
+                if any(given.values()):
+                    names = " and ".join(n for n, there in given.items() if there)
+                    raise InputError(f"{source}: expected {names} for a recording only, found a run.")
                 frames = load_frames(source)
                 width = float(frames.radius[0]) if radius is None else radius
                 ropes = (frames.time, frames.pos, frames.rope, width)
-                said = film_run(*ropes, shown, out, look, masks=masks, callback=callback)
+                options = {"masks": masks, "quality": quality, "closed": bool(frames.closed[0])}
+                said = film_run(*ropes, shown, out, look, **options, callback=callback)
     except KeyboardInterrupt:
         raise stopped("nothing was written") from None
     for sentence in said:

@@ -157,7 +157,9 @@ def film_run(
     out: Path,
     look: FilmLook,
     *,
+    closed: bool = False,
     masks: bool = False,
+    quality: int = 18,
     callback: Callback | None = None,
 ) -> list[str]:
     """Write films of the first rope of a run.
@@ -170,7 +172,9 @@ def film_run(
         cameras: that film.
         out: new folder.
         look: what films look like.
+        closed: whether that rope is a loop, whose last vertex is joined to its first.
         masks: write masks in the place of pictures.
+        quality: of H.264, from 0 (lossless) to 51.
         callback: told (stage, films done, in all, message).
     """
     if len(time) < 4:
@@ -178,13 +182,15 @@ def film_run(
     report = callback or (lambda *_: None)
     _check_sides(cameras, masks)
     line, said = pos[:, rope == 0], []
+    if closed:
+        line = np.concatenate([line, line[:, :1]], 1)
 
     def fill(folder: Path) -> None:
         save_cameras(cameras, folder / "cameras.json")
         for k, camera in enumerate(cameras):
             check_inside(camera, line)
             seen = film_rope(camera, time, line, radius, replace(look, seed=look.seed + k))
-            file = _write(seen, folder / camera.name, camera, masks)
+            file = _write(seen, folder / camera.name, camera, masks, quality)
             report("filming", k + 1, len(cameras), camera.name)
             said.append(f"camera {camera.name}: {len(seen.time)} frames, {out / file.name}")
 
