@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,7 +15,7 @@ from typer.testing import CliRunner
 from tests.vision.scenes import front
 from tests.vision.test_calibrate_camera import BOARDS, filmed
 from tests.vision.test_segment import COLORS, swinging
-from torchdlo.cli.app import app
+from torchdlo.cli.app import app, main
 from torchdlo.errors import InputError
 from torchdlo.sysid.recordings.recording import load_recording
 from torchdlo.vision.camera import load_cameras, looking_at, save_cameras
@@ -126,6 +127,21 @@ def test_a_run_is_filmed_with_its_loop_closed_and_refuses_what_it_would_ignore(t
         run(*common[:4], tmp_path / f"films_{quality}", "--quality", quality)
         sizes.append((tmp_path / f"films_{quality}" / "a.mp4").stat().st_size)
     assert sizes[0] > 2 * sizes[1]
+
+
+def test_a_stopped_calibration_of_films_keeps_what_its_help_says(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def stop(*args: object, **options: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("torchdlo.sysid.calibration.calibrate.calibrate_filmed", stop)
+    with pytest.raises(SystemExit) as ended:
+        main(["calibrate", str(DATA / "sample_film"), "--out", str(tmp_path / "model.json")])
+    assert ended.value.code == 130 and "nothing was written" in capsys.readouterr().err
+    assert not (tmp_path / "model.json").exists()
+    for command in ("calibrate", "diagnose"):
+        assert re.search(r"films.{1,20}nothing", run(command, "--help").replace("\n", " "))
 
 
 def test_the_film_in_the_package_is_small_and_sound() -> None:

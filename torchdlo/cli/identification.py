@@ -63,7 +63,7 @@ def calibrate(
 ) -> None:
     """Fit a rope model to the train trials and judge it on the test trials.
 
-    Ctrl-C stops after the running iteration and keeps the best found so far.
+    Ctrl-C stops after the running iteration and keeps the best found so far; of films it keeps nothing.
 
     [bold]Examples:[/bold]
 
@@ -137,7 +137,8 @@ def diagnose(
     """Find what the model lacks: name the missing effect, add it, and show the gap shrink.
 
     The baseline is calibrated first; every effect of the library is then tried on what it leaves over, and kept only if
-    it closes the gap on trials that were not used. Ctrl-C stops after the running step; --resume goes on from there.
+    it closes the gap on trials that were not used. Ctrl-C stops after the running step; --resume goes on from there,
+    but not of films, of which nothing is kept.
 
     [bold]Examples:[/bold]
 
