@@ -266,7 +266,7 @@ def design_experiment(
     loaded = load_recording(recording)
     asked, name = [n.strip() for n in effects.split(",") if n.strip()], recording.resolve().name
     if loaded.filmed or camera:
-        ignored = {"--findings": findings, "--seed": seed, "--vertices": vertices, "--workers": workers}
+        ignored: dict[str, Any] = {"--findings": findings, "--seed": seed, "--vertices": vertices, "--workers": workers}
         ignored |= {"--tip-mass": tip_mass or None, "--resume": resume or None}
         if found := ", ".join(option for option, value in ignored.items() if value is not None):
             raise InputError(f"{recording}: expected none of {found} for films or with --camera, which take no such.")

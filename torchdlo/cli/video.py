@@ -14,6 +14,8 @@ from torchdlo.errors import InputError
 from torchdlo.files import check_writable, write_atomically
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from torchdlo.sysid.recordings.recording import Recording
     from torchdlo.vision.film import FilmLook
     from torchdlo.vision.segment import Ranges
@@ -147,6 +149,7 @@ def segment(
         raise InputError(f"{video}: expected a film in colour, found masks; they are used as they are.")
     chosen = work.load_ranges(ranges) if ranges is not None else work.ranges_of(_rgb(color)) if color else None
     served = background is None and chosen is None
+    found: np.ndarray | None = None
     if background is not None:
         if color is not None:
             raise InputError("expected --color or --background, found both; --ranges says what else is left out.")
@@ -158,7 +161,8 @@ def segment(
             if not out.exists():
                 raise stopped("nothing was saved")
             chosen = work.load_ranges(out)
-        found = None if masks is None else work.color_masks(pictures, chosen)
+        if masks is not None:
+            found = work.color_masks(pictures, chosen)
     said = [] if found is None else _healthy(found, str(video), pictures)
     if background is None and chosen is not None:
         if not served:

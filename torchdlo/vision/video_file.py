@@ -144,7 +144,8 @@ def film_rate(path: str | Path) -> tuple[float, int]:
     Raises:
         InputError: It cannot be read, or its pictures are not evenly spaced in time.
     """
-    path, times = Path(path), []
+    path = Path(path)
+    times: list[float | None] = []
     with _opened(path) as (container, stream):
         for packet in container.demux(stream):
             if packet.size:
@@ -153,7 +154,8 @@ def film_rate(path: str | Path) -> tuple[float, int]:
     if not times:
         raise InputError(f"{path}: expected a film, found no picture in it; record or copy the file again.")
     # Packets come in the order in which they are decoded.
-    return frame_rate(path, times if None in times else sorted(times)), len(times)
+    known = sorted(t for t in times if t is not None)
+    return frame_rate(path, known if len(known) == len(times) else times), len(times)
 
 
 def _decoded(path: Path, chosen: Container[int] | None = None) -> Iterator[tuple[np.ndarray, float | None]]:

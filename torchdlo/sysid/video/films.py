@@ -120,11 +120,11 @@ def film_files(path: Path, trials: Sequence[str]) -> dict[str, tuple[FilmFile, .
             )
     first = next(iter(films))
     names = {trial: sorted(f.camera.name for f in own) for trial, own in films.items()}
-    for trial, own in names.items():
-        if own != names[first]:
+    for trial, seen in names.items():
+        if seen != names[first]:
             raise InputError(
                 f"{path / trial}.npz: expected films of the cameras {', '.join(names[first])} as {first} has, found "
-                f"{', '.join(own)}; trials are judged with the cameras that others were fitted with."
+                f"{', '.join(seen)}; trials are judged with the cameras that others were fitted with."
             )
     return {trial: tuple(sorted(own, key=lambda f: f.camera.name)) for trial, own in films.items()}
 
