@@ -52,7 +52,9 @@ def test_films_are_read_with_their_cameras_and_places(filmed: Path) -> None:
     assert np.isnan(trial.markers[:, ~trial.gripped]).all()
     assert trial.gripped[list(trial.gripper_marker)].all()
     views, notes = views_of(recording, recording.train)
-    assert views[0].good.all() and not notes and np.isfinite(views[0].places).mean() > 0.5
+    assert (
+        views[0].camera.fps == 30.0 and views[0].good.all() and not notes and np.isfinite(views[0].places).mean() > 0.5
+    )
 
 
 def _cameras(filmed: Path) -> None:

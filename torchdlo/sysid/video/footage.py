@@ -127,6 +127,8 @@ def _timed(recording: Recording, films: Sequence[FilmFile]) -> list[FilmFile]:
             )
         return list(films)
     usual = float(np.median([fps for fps, _ in found.values()]))
+    # To rounding it is the one that is written down, by which ends of windows are told.
+    usual = said if abs(usual / said - 1) < 1e-6 else usual
     for path, (fps, count) in found.items():
         if count * abs(fps / usual - 1) > _DRIFT:
             raise InputError(
