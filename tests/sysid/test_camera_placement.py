@@ -167,9 +167,10 @@ def model(tmp_path: Path) -> Path:
 
 
 def test_films_have_options_of_their_own(model: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    for more in (["--findings", "here"], ["--tip-mass", "0.01"], ["--resume"]):
+    dropped = (["--seed", "0"], ["--vertices", "11"], ["--workers", "1"])
+    for more in (["--findings", "here"], ["--tip-mass", "0.01"], ["--resume"], *dropped):
         assert run("design-experiment", str(DATA / "sample_film"), "--model", str(model), *more) == 2
-        assert "for films" in capsys.readouterr().err
+        assert f"none of {more[0]} for films" in capsys.readouterr().err
     assert run("design-experiment", str(DATA / "sample_rope"), "--model", str(model), "--effects", "wind") == 2
     assert "for films only" in capsys.readouterr().err
     for unknown in ("winds", "table_friction"):

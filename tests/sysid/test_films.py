@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +17,7 @@ from torchdlo.sysid.video.footage import masks_of, views_of
 from torchdlo.vision.camera import looking_at, save_cameras
 from torchdlo.vision.film import FilmLook
 from torchdlo.vision.segment import save_masks
+from torchdlo.vision.video_file import read_video, write_video
 
 SAMPLE = Path(__file__).parents[2] / "torchdlo" / "data" / "sample_rope"
 
@@ -49,7 +52,9 @@ def test_films_are_read_with_their_cameras_and_places(filmed: Path) -> None:
     assert np.isnan(trial.markers[:, ~trial.gripped]).all()
     assert trial.gripped[list(trial.gripper_marker)].all()
     views, notes = views_of(recording, recording.train)
-    assert views[0].good.all() and not notes and np.isfinite(views[0].places).mean() > 0.5
+    assert (
+        views[0].camera.fps == 30.0 and views[0].good.all() and not notes and np.isfinite(views[0].places).mean() > 0.5
+    )
 
 
 def _cameras(filmed: Path) -> None:
@@ -60,9 +65,22 @@ def _two(filmed: Path) -> None:
     save_masks(np.zeros((15, 480, 640), bool), filmed / "train_0.a.npz")
 
 
+def _another(filmed: Path) -> None:
+    # A test film of another camera would be judged with pose, zoom and clock that were fitted to the first one's.
+    save_cameras([view_of_sample(), replace(view_of_sample(), name="b")], filmed / "cameras.json")
+    (filmed / "test_0.a.mp4").rename(filmed / "test_0.b.mp4")
+
+
+def _fewer(filmed: Path) -> None:
+    save_cameras([view_of_sample(), replace(view_of_sample(), name="b")], filmed / "cameras.json")
+    save_masks(np.zeros((15, 480, 640), bool), filmed / "train_0.b.npz")
+
+
 @pytest.mark.parametrize(
     ("spoil", "message"),
     [
+        (_another, "cameras a as train_0 has, found b"),
+        (_fewer, "cameras a, b as train_0 has, found a"),
         (_cameras, "expected the file of the cameras"),
         (lambda f: (f / "train_0.a.mp4").rename(f / "train_0.b.mp4"), "name of a camera"),
         (lambda f: (f / "train_0.a.mp4").rename(f / "train_7.a.mp4"), "train_7.npz with the motion"),
@@ -108,7 +126,7 @@ def _twice(filmed: Path) -> None:
         (lambda f: _masks(f, np.zeros((15, 120, 160), bool)), "640 x 480"),
         (lambda f: _masks(f, np.ones((6, 480, 640), bool)), "about 15 pictures"),
         (lambda f: save_cameras([view_of_sample(fps=60.0)], f / "cameras.json"), "60 pictures per second"),
-        (lambda f: save_cameras([view_of_sample(start=-0.2)], f / "cameras.json"), "start with its trial"),
+        (lambda f: save_cameras([view_of_sample(start=-9.0)], f / "cameras.json"), "check start"),
         (lambda f: save_cameras([front(size=(320, 240))], f / "cameras.json"), "320 x 240"),
         (lambda f: _color(f, None), "the rope's colour"),
         (lambda f: _color(f, [220, 220, 220]), "stands out"),
@@ -122,9 +140,59 @@ def test_films_that_cannot_be_used_are_refused(filmed: Path, spoil, message: str
     assert str(caught.value).startswith(str(filmed)) and "\n" not in str(caught.value)
 
 
-def _color(filmed: Path, color: list[int] | None) -> None:
-    import json
+def test_films_have_a_rate_of_their_own(filmed: Path) -> None:
+    pictures, _ = read_video(filmed / "train_0.a.mp4")
+    for name in ("train_0", "test_0"):
+        write_video(filmed / f"{name}.a.mp4", pictures, 30000 / 1001)
+    recording = load_recording(filmed)
+    views, _ = views_of(recording, recording.train)
+    assert recording.train[0].films[0].camera.fps == 30
+    assert views[0].camera.fps == pytest.approx(29.97, rel=1e-5)
+    write_video(filmed / "test_0.a.mp4", pictures.repeat(5, 0), 29.5)
+    with pytest.raises(InputError, match="same settings"):
+        views_of(recording, recording.train)
 
+
+def test_pictures_before_the_trial_are_skipped(filmed: Path) -> None:
+    recording = load_recording(filmed)
+    view = views_of(recording, recording.train)[0][0]
+    masks = masks_of(recording, recording.train[0].films[0])[0]
+    _masks(filmed, np.concatenate([np.zeros((7, 480, 640), bool), masks]))
+    save_masks(np.zeros((22, 480, 640), bool), filmed / "test_0.a.npz")
+    (filmed / "test_0.a.mp4").unlink()
+    save_cameras([view_of_sample(start=-0.23)], filmed / "cameras.json")
+    recording = load_recording(filmed)
+    views, notes = views_of(recording, recording.train)
+    # The seventh picture, at -0.03 s, is the last one that is more than three quarters of a picture early.
+    assert views[0].camera.start == pytest.approx(-0.23 + 7 / 30) and not notes
+    assert np.array_equal(views[0].packed[0], view.packed[0]) and np.array_equal(views[0].good, view.good)
+
+
+def test_masks_need_a_rate_and_as_many_pictures_as_their_trial_has(filmed: Path) -> None:
+    masks = masks_of(load_recording(filmed), load_recording(filmed).train[0].films[0])[0]
+    _masks(filmed, masks)
+    file = filmed / "cameras.json"
+
+    def seen(fps: float | None) -> list[str]:
+        content = json.loads(file.read_text())
+        content["cameras"][0] |= {"fps": fps}
+        content["cameras"][0] = {k: v for k, v in content["cameras"][0].items() if v is not None}
+        file.write_text(json.dumps(content))
+        recording = load_recording(filmed)
+        return views_of(recording, recording.train)[1]
+
+    assert not seen(None) and not seen(30.0)  # the test trial has a film, which says it
+    (filmed / "test_0.a.mp4").unlink()
+    save_masks(masks, filmed / "test_0.a.npz")
+    assert not seen(30.0)
+    with pytest.raises(InputError, match="expected fps of camera a"):
+        seen(None)
+    with pytest.raises(InputError, match=r"expected 11 pictures .* found 16"):
+        seen(20.0)
+    assert "16 pictures for 0.5 s, which have 21 at 40" in seen(40.0)[0]
+
+
+def _color(filmed: Path, color: list[int] | None) -> None:
     rope = json.loads((filmed / "rope.json").read_text())
     rope["color"] = color
     (filmed / "rope.json").write_text(json.dumps(rope))

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from torchdlo.errors import InputError
+from torchdlo.vision import calibrate_camera as calibration
 from torchdlo.vision.calibrate_camera import Board, board_picture, calibrate_camera, error_picture
 from torchdlo.vision.video_file import read_video, write_video
 
@@ -45,11 +46,48 @@ def test_a_known_camera_is_found_again(board: Board, tmp_path: Path) -> None:
     assert camera.cx == pytest.approx(310, abs=5) and camera.cy == pytest.approx(235, abs=5)
     # In the first picture the board faces the camera: its z axis points to it.
     assert camera.rotation[2][2] < -0.99 and 0.3 < camera.translation[2] < 0.6
-    picture = read_video(tmp_path / "board.mp4")[0][found.pictures[0]]
-    assert error_picture(found, picture).startswith(b"\x89PNG")
+    assert np.array_equal(found.picture, read_video(tmp_path / "board.mp4")[0][found.pictures[0]])
+    assert error_picture(found).startswith(b"\x89PNG")
 
 
 def test_a_film_without_a_board_is_refused(tmp_path: Path) -> None:
     write_video(tmp_path / "grey.mp4", np.full((10, 120, 160), 128, np.uint8), 30.0)
     with pytest.raises(InputError, match="found it in 0 of 10"):
         calibrate_camera(tmp_path / "grey.mp4", BOARDS[0])
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"square": float("inf")}, "square: expected"),
+        ({"square": 0.025, "marker": 0.03}, "smaller than a square's"),
+        ({"columns": 40, "rows": 40, "marker": 0.02}, "at most 50 markers"),
+        ({"marker": 0.02, "dictionary": "CORNER_REFINE_NONE"}, "a name that OpenCV knows"),
+        ({"marker": 0.02, "dictionary": "DICT_5X5_5000"}, "a name that OpenCV knows"),
+    ],
+)
+def test_boards_that_cannot_be_are_refused(given: dict, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        board_picture(Board(**{"columns": 9, "rows": 6, "square": 0.03} | given), 20)
+
+
+def test_pictures_with_one_row_of_corners_are_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    filmed(BOARDS[1], tmp_path / "board.mp4", 8)
+    find, seen = calibration._charuco_finder(BOARDS[1]), []
+
+    def some(grey: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        at, corners = find(grey)
+        seen.append(at)
+        if len(seen) > 2:
+            return at, corners
+        # The second row alone, and with one corner beside it: neither says how the board is tilted.
+        rows = np.isin(at, [*range(7, 14), *([0] if len(seen) == 2 else [])])
+        return at[rows], corners[rows]
+
+    monkeypatch.setattr(calibration, "_charuco_finder", lambda board: some)
+    found = calibrate_camera(tmp_path / "board.mp4", BOARDS[1])
+    assert found.pictures == (2, 3, 4, 5, 6, 7) and found.error < 0.3
+    monkeypatch.setattr(calibration, "_flat", lambda points: True)
+    seen.clear()
+    with pytest.raises(InputError, match="from several sides"):
+        calibrate_camera(tmp_path / "board.mp4", BOARDS[1])

@@ -75,6 +75,13 @@ def test_masks_come_as_npz_as_png_files_and_as_a_film(plain: Film, tmp_path: Pat
     assert pictures.shape == plain.pictures.shape and pictures.dtype == np.uint8 and fps == pytest.approx(30)
 
 
+def test_files_of_a_folder_are_read_by_their_numbers(tmp_path: Path) -> None:
+    for k in range(12):
+        cv2.imwrite(str(tmp_path / f"{k}.png"), np.repeat(np.arange(12) == k, 3)[None].repeat(9, 0) * np.uint8(255))
+    masks, _ = load_film(tmp_path)
+    assert masks[:, 0, ::3].argmax(1).tolist() == list(range(12))
+
+
 def test_ranges_are_written_and_read_and_wrong_ones_refused(tmp_path: Path) -> None:
     path = tmp_path / "segment.json"
     save_ranges(ranges_of(COLORS[1]), path)
@@ -105,6 +112,21 @@ def test_wrong_frames_are_left_out(plain: Film, kind: str, spoil) -> None:
     good, issues = check_masks(masks, "film")
     assert not good[5] and good.sum() == len(masks) - 1 and [i.kind for i in issues] == [kind]
     assert "frame 5" in issues[0].text
+
+
+@pytest.mark.parametrize("coloured", [False, True])
+def test_repeats_of_a_rope_that_swings_are_left_out_while_its_grippers_rest(plain: Film, coloured: bool) -> None:
+    masks, pictures, resting = plain.masks.copy(), plain.pictures.copy(), np.zeros(len(plain.masks), bool)
+    for k in (5, 6, 9):
+        masks[k], pictures[k] = masks[k - 1], pictures[k - 1]
+    shown = {"pictures": pictures} if coloured else {}
+    assert np.flatnonzero(~check_masks(masks, "film", moving=resting, **shown)[0]).tolist() == [5, 6, 9]
+    # At rest, pictures are alike, and nothing is wrong with them.
+    masks[:7], pictures[:7] = masks[0], pictures[0]
+    assert np.flatnonzero(~check_masks(masks, "film", moving=resting, **shown)[0]).tolist() == [9]
+    # Masks of a rope that turns round may be alike where pictures are not.
+    pictures[9, 0, 0] ^= 1
+    assert check_masks(masks, "film", moving=resting, pictures=pictures)[0].all()
 
 
 def test_second_blobs_and_ropes_that_leave_the_picture_are_said(plain: Film) -> None:

@@ -63,7 +63,7 @@ def calibrate(
 ) -> None:
     """Fit a rope model to the train trials and judge it on the test trials.
 
-    Ctrl-C stops after the running iteration and keeps the best found so far.
+    Ctrl-C stops after the running iteration and keeps the best found so far; of films it keeps nothing.
 
     [bold]Examples:[/bold]
 
@@ -137,7 +137,8 @@ def diagnose(
     """Find what the model lacks: name the missing effect, add it, and show the gap shrink.
 
     The baseline is calibrated first; every effect of the library is then tried on what it leaves over, and kept only if
-    it closes the gap on trials that were not used. Ctrl-C stops after the running step; --resume goes on from there.
+    it closes the gap on trials that were not used. Ctrl-C stops after the running step; --resume goes on from there,
+    but not of films, of which nothing is kept.
 
     [bold]Examples:[/bold]
 
@@ -221,7 +222,7 @@ def design_experiment(
             metavar="DIR",
         ),
     ] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the search.")] = 0,
+    seed: Annotated[int | None, typer.Option(min=0, help="Seed of the search. Default: 0.")] = None,
     vertices: Annotated[int | None, typer.Option(min=3, help="Vertices of the simulated rope.")] = None,
     workers: Annotated[int | None, typer.Option(min=1, help="Processes; one per core if not given.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the design as JSON.")] = False,
@@ -265,8 +266,10 @@ def design_experiment(
     loaded = load_recording(recording)
     asked, name = [n.strip() for n in effects.split(",") if n.strip()], recording.resolve().name
     if loaded.filmed or camera:
-        if findings is not None or tip_mass or resume:
-            raise InputError(f"{recording}: expected no --findings, --tip-mass or --resume for films or with --camera.")
+        ignored: dict[str, Any] = {"--findings": findings, "--seed": seed, "--vertices": vertices, "--workers": workers}
+        ignored |= {"--tip-mass": tip_mass or None, "--resume": resume or None}
+        if found := ", ".join(option for option, value in ignored.items() if value is not None):
+            raise InputError(f"{recording}: expected none of {found} for films or with --camera, which take no such.")
         path = model or Path("runs") / "calibrate" / name / "model.json"
         out = out or Path("runs") / "design" / name
         return _place_cameras(loaded, path, out, camera, as_json, seconds=seconds, scale=scale, effects=asked)
@@ -281,7 +284,7 @@ def design_experiment(
         check_writable(out / file)
     if (out / "motion.npz").exists() and not (out / "design.json").exists():
         raise InputError(f"{out / 'motion.npz'}: exists without design.json; move it away or choose another --out.")
-    options: dict[str, Any] = {"seconds": seconds, "scale": scale, "mass": tip_mass, "seed": seed}
+    options: dict[str, Any] = {"seconds": seconds, "scale": scale, "mass": tip_mass, "seed": seed or 0}
     journal = out / "journal"
     options |= {"vertices": vertices, "workers": workers, "journal": journal, "resume": resume}
     with at_work(out, *report.FILES):

@@ -14,6 +14,8 @@ from torchdlo.errors import InputError
 from torchdlo.files import check_writable, write_atomically
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from torchdlo.sysid.recordings.recording import Recording
     from torchdlo.vision.film import FilmLook
     from torchdlo.vision.segment import Ranges
@@ -55,8 +57,9 @@ def calibrate_camera(
     import dataclasses
 
     from torchdlo.vision import calibrate_camera as calibration
-    from torchdlo.vision.camera import load_cameras, save_cameras
+    from torchdlo.vision.camera import check_name, load_cameras, save_cameras
 
+    check_name(name, "--name")
     printed = calibration.Board(*_board(board), square, marker, dictionary)
     if print_board is not None:
         import cv2
@@ -69,7 +72,8 @@ def calibrate_camera(
         )
         return
     picture = out.with_name(f"{out.stem}_{name}.png")
-    others = [c for c in load_cameras(out) if c.name != name] if out.exists() else []
+    known = load_cameras(out) if out.exists() else ()
+    others = [c for c in known if c.name != name]
     if not out.exists():
         check_writable(out)
     check_writable(picture)
@@ -78,23 +82,23 @@ def calibrate_camera(
             found = calibration.calibrate_camera(video, printed, name=name, callback=callback)
     except KeyboardInterrupt:
         raise stopped("there was no result yet, and nothing was written") from None
-    from torchdlo.vision.video_file import read_video
-
-    shown = read_video(video)[0][found.pictures[0]]
-    save_cameras([*others, found.camera], out)
-    write_atomically(picture, calibration.error_picture(found, shown))
-    camera = found.camera
+    # A board tells nothing of the clock: what a person has written down of it stays.
+    start = next((c.start for c in known if c.name == name), 0.0)
+    camera = dataclasses.replace(found.camera, start=start)
+    save_cameras([*others, camera], out)
+    write_atomically(picture, calibration.error_picture(found))
     typer.echo(
         f"camera {name}: focal length {camera.fx:.1f} x {camera.fy:.1f} px, reprojection error {found.error:.3f} px in "
         f"{len(found.pictures)} pictures; the world is the board in picture {found.pictures[0]}",
         err=as_json,
     )
-    for note in found.notes:
+    notes = [*found.notes, *([f"start = {start:g} s is kept as {out} had it."] if start else [])]
+    for note in notes:
         typer.echo(f"note: {note}", err=as_json)
     typer.echo(f"cameras: {out}\npicture: {picture}", err=as_json)
     if as_json:
         content = {"camera": dataclasses.asdict(camera), "error_px": found.error, "pictures": list(found.pictures)}
-        typer.echo(json.dumps(content | {"notes": list(found.notes)}, indent=1))
+        typer.echo(json.dumps(content | {"notes": notes}, indent=1))
 
 
 def _board(text: str) -> tuple[int, int]:
@@ -114,7 +118,12 @@ def segment(
     ] = None,
     ranges: Annotated[Path | None, typer.Option(help="Ranges that were saved before.", metavar="FILE")] = None,
     background: Annotated[
-        Path | None, typer.Option(help="Picture of the same view without the rope: take what differs.", metavar="PNG")
+        Path | None,
+        typer.Option(
+            help="Picture of the same view without the rope: take what differs. Of --ranges it takes close, smallest "
+            "and ignore.",
+            metavar="PNG",
+        ),
     ] = None,
     least: Annotated[float, typer.Option(min=1, max=255, help="Smallest difference from it, of 255.")] = 40,
     masks: Annotated[Path | None, typer.Option(help="Write masks, too, and say what is wrong with them.")] = None,
@@ -129,7 +138,6 @@ def segment(
     torchdlo segment my_rope/train_0.a.mp4 --color 25,150,60 --masks masks.npz
     """
     from torchdlo.vision import segment as work
-    from torchdlo.vision.mask_health import check_masks
 
     check_writable(out)
     if masks is not None:
@@ -140,27 +148,38 @@ def segment(
     if pictures.dtype == bool:
         raise InputError(f"{video}: expected a film in colour, found masks; they are used as they are.")
     chosen = work.load_ranges(ranges) if ranges is not None else work.ranges_of(_rgb(color)) if color else None
+    served = background is None and chosen is None
+    found: np.ndarray | None = None
     if background is not None:
-        found = work.background_masks(pictures, _background(background, pictures.shape[1:3]), least, work.Ranges())
+        if color is not None:
+            raise InputError("expected --color or --background, found both; --ranges says what else is left out.")
+        empty = _background(background, pictures.shape[1:3])
+        found = work.background_masks(pictures, empty, least, chosen or work.Ranges())
     else:
-        if chosen is None:
+        if served or chosen is None:
             _serve(pictures, out, port)
             if not out.exists():
                 raise stopped("nothing was saved")
             chosen = work.load_ranges(out)
-        else:
+        if masks is not None:
+            found = work.color_masks(pictures, chosen)
+    said = [] if found is None else _healthy(found, str(video), pictures)
+    if background is None and chosen is not None:
+        if not served:
             work.save_ranges(chosen, out)
         typer.echo(f"ranges: {out}")
-        if masks is None:
-            return
-        found = work.color_masks(pictures, chosen)
-    good, issues = check_masks(found, str(video), pictures=pictures)
-    for issue in issues:
-        typer.echo(f"masks: {issue.text}")
-    typer.echo(f"{int(good.sum())} of {len(good)} frames can be used")
-    if masks is not None:
+    typer.echo("\n".join(said), nl=bool(said))
+    if masks is not None and found is not None:
         work.save_masks(found, masks)
         typer.echo(f"masks:  {masks}")
+
+
+def _healthy(masks: Any, where: str, pictures: Any) -> list[str]:
+    """Return what is wrong with masks, and how many can be used; refuse those that say nothing."""
+    from torchdlo.vision.mask_health import check_masks
+
+    good, issues = check_masks(masks, where, pictures=pictures)
+    return [*(f"masks: {issue.text}" for issue in issues), f"{int(good.sum())} of {len(good)} frames can be used"]
 
 
 def _rgb(text: str) -> list[float]:
@@ -171,15 +190,13 @@ def _rgb(text: str) -> list[float]:
 
 
 def _background(path: Path, size: tuple[int, int]) -> Any:
-    import cv2
+    from torchdlo.vision.segment import read_picture
 
-    picture = cv2.imread(str(path), cv2.IMREAD_COLOR)
-    if picture is None:
-        raise InputError(f"{path}: expected a picture, but it cannot be read.")
+    picture = read_picture(path)
     if picture.shape[:2] != size:
         found = f"{picture.shape[1]} x {picture.shape[0]}"
         raise InputError(f"{path}: expected {size[1]} x {size[0]} pixels as the film has, found {found}.")
-    return picture[..., ::-1]
+    return picture
 
 
 def _serve(pictures: Any, out: Path, port: int) -> None:
@@ -218,12 +235,12 @@ def film(
         typer.Option(
             min=0,
             max=5,
-            help="How far the cameras that are written down are off those that filmed: 1 stands for up to 1 degree, "
-            "1 %, 10 mm and half a frame.",
+            help="Of recordings: how far the cameras that are written down are off those that filmed: 1 stands for up "
+            "to 1 degree, 1 %, 10 mm and half a frame.",
         ),
     ] = 0.0,
-    trials: Annotated[int | None, typer.Option(min=1, help="Most trials of each split.")] = None,
-    seconds: Annotated[float | None, typer.Option(min=0.1, help="Most seconds of each trial.")] = None,
+    trials: Annotated[int | None, typer.Option(min=1, help="Of recordings: most trials of each split.")] = None,
+    seconds: Annotated[float | None, typer.Option(min=0.1, help="Of recordings: most seconds of each trial.")] = None,
     quality: Annotated[int, typer.Option(min=0, max=51, help="Of H.264: 0 is lossless, 51 the smallest file.")] = 18,
     seed: Annotated[int, typer.Option(min=0, help="Of noise and faults.")] = 0,
 ) -> None:
@@ -246,10 +263,11 @@ def film(
     look = _look(color, noise, blur, exposure, bar, wrong, seed)
     try:
         with progress() as show, deferred_interrupt(show) as callback:
+            options: dict[str, Any]
             if (source / "rope.json").is_file():
                 from torchdlo.sysid.recordings.recording import load_recording
 
-                options: dict[str, Any] = {"masks": masks, "off": off, "trials": trials, "seconds": seconds}
+                options = {"masks": masks, "off": off, "trials": trials, "seconds": seconds}
                 options |= {"quality": quality}
                 said = film_recording(
                     load_recording(source), shown, out, look, radius=radius, **options, callback=callback
@@ -257,10 +275,15 @@ def film(
             else:
                 from torchdlo.scene_files.run import load_frames
 
+                given = {"--off": off > 0, "--trials": trials is not None, "--seconds": seconds is not None}
+                if any(given.values()):
+                    names = " and ".join(n for n, there in given.items() if there)
+                    raise InputError(f"{source}: expected {names} for a recording only, found a run.")
                 frames = load_frames(source)
                 width = float(frames.radius[0]) if radius is None else radius
                 ropes = (frames.time, frames.pos, frames.rope, width)
-                said = film_run(*ropes, shown, out, look, masks=masks, callback=callback)
+                options = {"masks": masks, "quality": quality, "closed": bool(frames.closed[0])}
+                said = film_run(*ropes, shown, out, look, **options, callback=callback)
     except KeyboardInterrupt:
         raise stopped("nothing was written") from None
     for sentence in said:

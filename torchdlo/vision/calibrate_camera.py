@@ -6,6 +6,7 @@ along the rows of the board, y up along its columns, z out of the board.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,7 +15,7 @@ import numpy as np
 
 from torchdlo.errors import InputError
 from torchdlo.vision.camera import Camera, triple
-from torchdlo.vision.video_file import read_video
+from torchdlo.vision.video_file import film_rate, some_pictures
 
 __all__ = ["Board", "Calibrated", "board_picture", "calibrate_camera", "error_picture"]
 
@@ -23,6 +24,9 @@ _MOST = 40
 
 _FEWEST = 4
 """Pictures that are needed."""
+
+_CORNERS = 6
+"""Corners that a picture needs."""
 
 
 @dataclass(frozen=True)
@@ -40,15 +44,31 @@ class Board:
     dictionary: str = "DICT_4X4_50"
     """Markers of ChArUco, as OpenCV calls them."""
 
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.square) and self.square > 0):
+            raise InputError(f"square: expected the side of a square in m, found {self.square:g}.")
+        if self.marker is not None and not 0 < self.marker < self.square:
+            raise InputError(
+                f"marker: expected the side of a marker in m, smaller than a square's of {self.square:g}, found "
+                f"{self.marker:g}."
+            )
+
     def charuco(self):
         """Return OpenCV's board of markers."""
         import cv2
 
-        if not hasattr(cv2.aruco, self.dictionary):
+        number = getattr(cv2.aruco, self.dictionary, None) if self.dictionary.startswith("DICT_") else None
+        if number is None:
             raise InputError(
                 f"dictionary: expected a name that OpenCV knows, such as DICT_4X4_50, found {self.dictionary}."
             )
-        words = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, self.dictionary))
+        words = cv2.aruco.getPredefinedDictionary(number)
+        needed, known = self.columns * self.rows // 2, len(words.bytesList)
+        if needed > known:
+            raise InputError(
+                f"board: expected at most {known} markers, as {self.dictionary} has, found {needed} on {self.columns} "
+                f"x {self.rows} squares; choose fewer squares or another --dictionary, such as DICT_4X4_1000."
+            )
         return cv2.aruco.CharucoBoard((self.columns, self.rows), self.square, self.marker, words)
 
     def corners(self) -> np.ndarray:
@@ -72,6 +92,8 @@ class Calibrated:
     """Where the camera has them [px], likewise."""
     notes: tuple[str, ...]
     """What a reader should know."""
+    picture: np.ndarray
+    """The first picture of those, RGB uint8, shape (H, W, 3)."""
 
 
 def calibrate_camera(
@@ -91,28 +113,18 @@ def calibrate_camera(
     import cv2
 
     report = callback or (lambda *_: None)
-    pictures, fps = read_video(path)
-    height, width = pictures.shape[1:3]
-    find = _charuco_finder(board) if board.marker is not None else _checkerboard_finder(board)
-    tried = np.unique(np.linspace(0, len(pictures) - 1, min(len(pictures), 3 * _MOST)).round().astype(int))
-    seen: list[tuple[int, np.ndarray, np.ndarray]] = []
-    for done, k in enumerate(tried):
-        at, corners = find(cv2.cvtColor(pictures[k], cv2.COLOR_RGB2GRAY))
-        if len(at) >= 6:
-            seen.append((int(k), at, corners))
-        report("finding the board", done + 1, len(tried), f"in {len(seen)} pictures")
-    if len(seen) < _FEWEST:
-        kind = "checkerboard" if board.marker is None else f"ChArUco board ({board.dictionary})"
-        raise InputError(
-            f"{path}: expected a {kind} of {board.columns} x {board.rows} squares in at least {_FEWEST} pictures, "
-            f"found it in {len(seen)} of {len(tried)}; check the numbers of squares, and film it large and sharp."
-        )
-    if len(seen) > _MOST:
-        seen = [seen[k] for k in np.linspace(0, len(seen) - 1, _MOST).round().astype(int)]
-    model = board.corners()
+    fps, model = film_rate(path)[0], board.corners()
+    seen, picture = _seen(path, board, report)
+    height, width = picture.shape[:2]
     objects = [model[at].astype(np.float32)[:, None] for _, at, _ in seen]
     images = [corners.astype(np.float32)[:, None] for *_, corners in seen]
-    error, matrix, lens, turns, shifts = cv2.calibrateCamera(objects, images, (width, height), None, None)
+    try:
+        error, matrix, lens, turns, shifts = cv2.calibrateCamera(objects, images, (width, height), None, None)
+    except cv2.error:
+        raise InputError(
+            f"{path}: expected pictures of a board that tell where the camera is, but those {len(seen)} in which it "
+            "was found do not; film all of it, from several sides."
+        ) from None
     report("fitting the camera", 1, 1, f"{error:.2f} px")
     modelled = tuple(
         cv2.projectPoints(o, r, t, matrix, lens)[0][:, 0] for o, r, t in zip(objects, turns, shifts, strict=True)
@@ -139,7 +151,45 @@ def calibrate_camera(
         tuple(i[:, 0] for i in images),
         modelled,
         tuple(_notes(float(error), normals, images, width, height)),
+        picture,
     )
+
+
+def _seen(
+    path: Path, board: Board, report: Callable[[str, int, int, str], None]
+) -> tuple[list[tuple[int, np.ndarray, np.ndarray]], np.ndarray]:
+    """Return pictures of a film in which a board is found, and the first one itself, RGB (H, W, 3).
+
+    Of each are its number, the numbers of corners, and where those are [px], (N, 2).
+    """
+    import cv2
+
+    find = _charuco_finder(board) if board.marker is not None else _checkerboard_finder(board)
+    model = board.corners()
+    tried, pictures = some_pictures(path, 3 * _MOST)
+    seen: list[tuple[int, np.ndarray, np.ndarray]] = []
+    first = np.empty((0, 0, 3), np.uint8)
+    for done, (k, picture) in enumerate(pictures):
+        at, corners = find(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY))
+        if len(at) >= _CORNERS and _flat(model[at]):
+            first = first if seen else picture
+            seen.append((k, at, corners))
+        report("finding the board", done + 1, tried, f"in {len(seen)} pictures")
+    if len(seen) < _FEWEST:
+        kind = "checkerboard" if board.marker is None else f"ChArUco board ({board.dictionary})"
+        raise InputError(
+            f"{path}: expected a {kind} of {board.columns} x {board.rows} squares in at least {_FEWEST} pictures, "
+            f"found it in {len(seen)} of {tried}; check the numbers of squares, and film it large and sharp."
+        )
+    if len(seen) > _MOST:
+        seen = [seen[k] for k in np.linspace(0, len(seen) - 1, _MOST).round().astype(int)]
+    return seen, first
+
+
+def _flat(points: np.ndarray) -> bool:
+    """Return whether points of a board (N, 3) tell its place: not if all of them, or all but one, are on a line."""
+    rest = [np.delete(points[:, :2], k, 0) for k in range(len(points))]
+    return min(np.linalg.svd(x - x.mean(0), compute_uv=False)[1] for x in rest) > 1e-6 * np.ptp(points)
 
 
 def _notes(error: float, normals: np.ndarray, images: list[np.ndarray], width: int, height: int) -> list[str]:
@@ -206,15 +256,15 @@ def board_picture(board: Board, dots: int = 100) -> np.ndarray:
     return np.pad(inner, margin, constant_values=255)
 
 
-def error_picture(found: Calibrated, picture: np.ndarray) -> bytes:
-    """Return a PNG of where corners were found and how far off the camera has them, over a picture RGB (H, W, 3)."""
+def error_picture(found: Calibrated) -> bytes:
+    """Return a PNG of where corners were found and how far off the camera has them, over the first picture."""
     import io
 
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(11, 4.4), layout="constrained")
     left, right = figure.subplots(1, 2, width_ratios=(1.5, 1))
-    left.imshow(picture, alpha=0.35)
+    left.imshow(found.picture, alpha=0.35)
     off = np.concatenate([m - f for m, f in zip(found.modelled, found.found, strict=True)])
     every = np.concatenate(found.found)
     left.scatter(every[:, 0], every[:, 1], s=4, c="#00798c", alpha=0.5, linewidths=0)

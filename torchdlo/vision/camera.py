@@ -21,7 +21,19 @@ from torchdlo.field_docs import with_field_docs
 from torchdlo.files import write_atomically
 from torchdlo.untrusted import one_line, read_json
 
-__all__ = ["NEAR", "Camera", "Lens", "back_project", "lens", "load_cameras", "looking_at", "project", "save_cameras"]
+__all__ = [
+    "NEAR",
+    "Camera",
+    "Lens",
+    "back_project",
+    "check_name",
+    "lens",
+    "load_cameras",
+    "looking_at",
+    "project",
+    "save_cameras",
+    "states_rate",
+]
 
 NEAR = 1e-2
 """Depth below which a point counts as behind the camera [m]."""
@@ -56,7 +68,7 @@ class Camera:
     distortion: tuple[float, ...] = ()
     """Coefficients k1 k2 p1 p2 k3 ... as OpenCV orders them, none for a pinhole."""
     fps: float = 30.0
-    """Pictures per second [1/s]."""
+    """Pictures per second [1/s]; films have their own rate, masks need it."""
     start: float = 0.0
     """When the first picture was taken, on the clock of the recording [s]."""
 
@@ -189,8 +201,20 @@ def load_cameras(path: str | Path) -> tuple[Camera, ...]:
     return cameras
 
 
+def states_rate(path: str | Path) -> frozenset[str]:
+    """Return the names of the cameras of a `cameras.json`, as `load_cameras` reads it, for which `fps` is written."""
+    content = read_json(path, "the file of the cameras that filmed", most=2**20)
+    return frozenset(entry["name"] for entry in content["cameras"] if "fps" in entry)
+
+
 _NUMBERS = {"fx": 0.0, "fy": 0.0, "cx": -math.inf, "cy": -math.inf}
 _KNOWN = {"name", "width", "height", "fps", "start", "distortion", "rotation", "translation", *_NUMBERS}
+
+
+def check_name(name: Any, where: str) -> None:
+    """Refuse what cannot be the name of a camera, which names of files hold; `where` begins the sentence."""
+    if not isinstance(name, str) or not name.replace("_", "").replace("-", "").isalnum():
+        raise InputError(f"{where}: expected letters, digits, - and _, found {one_line(repr(name), 100)}.")
 
 
 def _camera(path: Path, k: int, entry: Any) -> Camera:
@@ -204,8 +228,7 @@ def _camera(path: Path, k: int, entry: Any) -> Camera:
         if name not in entry:
             _refuse(path, f"{where}.{name}", "this entry", "none")
     name = entry["name"]
-    if not isinstance(name, str) or not name or not name.replace("_", "").replace("-", "").isalnum():
-        _refuse(path, f"{where}.name", "letters, digits, - and _", repr(name))
+    check_name(name, f"{path}: {where}.name")
     sizes = [_number(path, f"{where}.{key}", entry[key], 0.0) for key in ("width", "height")]
     if any(s != int(s) or s > 2**15 for s in sizes):
         _refuse(path, f"{where}.width and height", "whole numbers of pixels", f"{sizes[0]:g} x {sizes[1]:g}")

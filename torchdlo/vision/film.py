@@ -159,6 +159,18 @@ def _blocks(camera: Camera, points: np.ndarray, held: Sequence[Sequence[int]], s
     return found
 
 
+def _moments(camera: Camera, end: float, frames: int | None) -> np.ndarray:
+    """Return when pictures are taken [s], (F,), as many as asked for or up to the end of the motion [s]."""
+    if frames is None:
+        if camera.start > end:
+            raise InputError(
+                f"camera {camera.name}: start: expected the first picture before the motion ends at {end:g} s, found "
+                f"{camera.start:g}."
+            )
+        frames = int((end - camera.start) * camera.fps) + 1
+    return camera.start + np.arange(frames) / camera.fps
+
+
 def film(
     camera: Camera,
     time: np.ndarray,
@@ -178,7 +190,10 @@ def film(
         radius: of the rope [m].
         look: see `FilmLook`.
         held: runs of vertices within grippers, whose blocks hide them.
-        frames: how many pictures; as many as the motion lasts if not given.
+        frames: how many pictures; as many as until the motion ends if not given. Before it the rope rests.
+
+    Raises:
+        InputError: The camera starts after the motion, or there are too few pictures for wrong ones among them.
     """
     import cv2
     from scipy.interpolate import CubicSpline
@@ -186,9 +201,8 @@ def film(
     look = look or FilmLook()
     rng = np.random.default_rng(look.seed)
     motion = CubicSpline(time, points, axis=0)
-    if frames is None:
-        frames = int((time[-1] - max(camera.start, 0.0)) * camera.fps) + 1
-    moments = camera.start + np.arange(frames) / camera.fps
+    moments = _moments(camera, float(time[-1]), frames)
+    frames = len(moments)
     back, samples = _texture(camera, look, rng), 3 if look.exposure > 0 else 1
     bar = np.zeros((camera.height, camera.width), bool)
     if look.bar is not None:
@@ -227,6 +241,10 @@ def _spoil(
     wrong = np.zeros(count, bool)
     if not look.wrong:
         return wrong, ()
+    if count < 3:
+        raise InputError(
+            f"wrong: expected at least 3 pictures in a film to spoil one, found {count}; film longer, or none wrong."
+        )
     at = np.sort(rng.choice(np.arange(2, count), max(1, round(look.wrong * count)), replace=False))
     for k in at:
         kind = WRONG[int(rng.integers(len(WRONG)))]

@@ -19,6 +19,9 @@ _FEW = 0.5
 _SLIP = 6.0
 """Shift of the still background from which the camera has slipped [px]."""
 
+_MOVED = 0.1
+"""Change of a mask from one frame to the next, as a share of its area, of a rope that moves: about a quarter pixel."""
+
 _CLEAR = 0.1
 """Response of a phase correlation from which a shift is taken for one."""
 
@@ -55,7 +58,8 @@ def check_masks(
         where: name of the file, which sentences begin with.
         pictures: what they were made from, RGB (F, H, W, 3) uint8, for the background, if at hand.
         moving: frames before which the grippers have moved, so that equal masks are repeated ones, shape (F,) bool;
-            all if not given.
+            all if not given. Of others equal ones are repeated if the rope moves before and after them, and
+            pictures, if at hand, are equal as well.
 
     Raises:
         InputError: Too little is left.
@@ -84,9 +88,7 @@ def check_masks(
     usual = _smooth(np.where(good, area, np.nan))
     leave(np.abs(area / np.maximum(usual, 1.0) - 1) > _JUMP, "area", "the area of the mask jumps")
     leave(_elsewhere(masks, good), "elsewhere", "the mask jumps away and back")
-    same = np.zeros(count, bool)
-    same[1:] = [np.array_equal(a, b) for a, b in zip(masks[1:], masks[:-1], strict=True)]
-    leave(same if moving is None else same & moving, "frozen", "the picture is the one before")
+    leave(_repeated(masks, area, pictures, moving), "frozen", "the picture is the one before")
     blobs = _blobs(masks, good)
     if blobs:
         issues.append(Issue("blobs", blobs))
@@ -107,6 +109,26 @@ def check_masks(
             "film again or set the colour with torchdlo segment."
         )
     return good, issues
+
+
+def _repeated(
+    masks: np.ndarray, area: np.ndarray, pictures: np.ndarray | None, moving: np.ndarray | None
+) -> np.ndarray:
+    """Return frames (F,) bool that are the ones before, though something moves; `area` is that of masks [px], (F,)."""
+    changed = np.array([0, *(np.count_nonzero(a != b) for a, b in zip(masks[1:], masks[:-1], strict=True))])
+    same = changed == 0
+    same[0] = False
+    if moving is None:
+        return same
+    out = same & moving
+    shifts = changed > _MOVED * np.maximum(area, 1.0)
+    rows = np.flatnonzero(same & ~moving)
+    for run in np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1):
+        # A rope at rest has equal frames as well, but it does not move on both sides of them.
+        if len(run) and run[0] > 1 and run[-1] + 1 < len(masks) and shifts[run[0] - 1] and shifts[run[-1] + 1]:
+            equal = [pictures is None or np.array_equal(pictures[k], pictures[k - 1]) for k in run]
+            out[run[equal]] = True
+    return out
 
 
 def _smooth(values: np.ndarray, reach: int = 4) -> np.ndarray:

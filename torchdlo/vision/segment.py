@@ -9,6 +9,7 @@ from __future__ import annotations
 import colorsys
 import json
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -31,6 +32,7 @@ __all__ = [
     "load_ranges",
     "matted",
     "ranges_of",
+    "read_picture",
     "save_masks",
     "save_ranges",
     "tidy",
@@ -252,7 +254,7 @@ def load_film(path: Path) -> tuple[np.ndarray, float | None]:
     if path.suffix == ".npz":
         return _from_archive(path), None
     if path.suffix.lower() in (".png", ".jpg", ".jpeg"):
-        return _maybe_masks(np.stack([_picture(path)])), None
+        return _maybe_masks(np.stack([read_picture(path)])), None
     pictures, fps = read_video(path)
     return _maybe_masks(pictures), fps
 
@@ -280,7 +282,7 @@ def _from_archive(path: Path) -> np.ndarray:
     return masks > (0 if masks.dtype == bool or masks.max(initial=0) <= 1 else 127)
 
 
-def _picture(file: Path) -> np.ndarray:
+def read_picture(file: Path) -> np.ndarray:
     """Return a picture as it is stored, RGB (H, W, 3) uint8: tags that turn it do not count, as cameras do not turn."""
     import cv2
 
@@ -290,13 +292,19 @@ def _picture(file: Path) -> np.ndarray:
     return np.ascontiguousarray(picture[..., ::-1])
 
 
+def _counted(file: Path) -> tuple[list[str | int], str]:
+    """Return what sorts files by the numbers in their names: 2.png before 11.png."""
+    # Every other part is of digits, so that parts at the same place are compared as the same kind.
+    return [int(part) if part.isdecimal() else part for part in re.split(r"([0-9]+)", file.stem)], file.name
+
+
 def _from_folder(path: Path) -> np.ndarray:
-    files = sorted(path.glob("*.png"))
+    files = sorted(path.glob("*.png"), key=_counted)
     if not files:
         raise InputError(f"{path}: expected PNG files, one for each frame, found none.")
     pictures: list[np.ndarray] = []
     for file in files:
-        picture = _picture(file)
+        picture = read_picture(file)
         if pictures and picture.shape != pictures[0].shape:
             raise InputError(
                 f"{file}: expected {pictures[0].shape[1]} x {pictures[0].shape[0]} pixels as {files[0].name} has, "

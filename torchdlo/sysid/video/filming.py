@@ -19,7 +19,7 @@ from torchdlo.vision.camera import Camera, save_cameras
 from torchdlo.vision.film import Film, FilmLook, check_inside, off_camera
 from torchdlo.vision.film import film as film_rope
 from torchdlo.vision.segment import save_masks
-from torchdlo.vision.video_file import write_video
+from torchdlo.vision.video_file import check_sides, write_video
 
 __all__ = ["centre_line", "film_recording", "film_run"]
 
@@ -83,6 +83,7 @@ def film_recording(
             f"{recording.path / 'rope.json'}: radius: expected it to draw the rope, found none; give --radius."
         )
     report = callback or (lambda *_: None)
+    _check_sides(cameras, masks)
     chosen = [*recording.train[:trials], *recording.test[:trials]]
     chosen = [t if seconds is None else _cut(t, seconds) for t in chosen]
     rng = np.random.default_rng(look.seed)
@@ -156,7 +157,9 @@ def film_run(
     out: Path,
     look: FilmLook,
     *,
+    closed: bool = False,
     masks: bool = False,
+    quality: int = 18,
     callback: Callback | None = None,
 ) -> list[str]:
     """Write films of the first rope of a run.
@@ -169,25 +172,36 @@ def film_run(
         cameras: that film.
         out: new folder.
         look: what films look like.
+        closed: whether that rope is a loop, whose last vertex is joined to its first.
         masks: write masks in the place of pictures.
+        quality: of H.264, from 0 (lossless) to 51.
         callback: told (stage, films done, in all, message).
     """
     if len(time) < 4:
         raise InputError(f"expected a run of at least 4 frames to film, found {len(time)}.")
     report = callback or (lambda *_: None)
+    _check_sides(cameras, masks)
     line, said = pos[:, rope == 0], []
+    if closed:
+        line = np.concatenate([line, line[:, :1]], 1)
 
     def fill(folder: Path) -> None:
         save_cameras(cameras, folder / "cameras.json")
         for k, camera in enumerate(cameras):
             check_inside(camera, line)
             seen = film_rope(camera, time, line, radius, replace(look, seed=look.seed + k))
-            file = _write(seen, folder / camera.name, camera, masks)
+            file = _write(seen, folder / camera.name, camera, masks, quality)
             report("filming", k + 1, len(cameras), camera.name)
             said.append(f"camera {camera.name}: {len(seen.time)} frames, {out / file.name}")
 
     _new_folder(out, fill)
     return said
+
+
+def _check_sides(cameras: Sequence[Camera], masks: bool) -> None:
+    """Refuse before the work cameras whose pictures cannot be written."""
+    for camera in () if masks else cameras:
+        check_sides(f"camera {camera.name}", camera.width, camera.height)
 
 
 def _write(seen: Film, stem: Path, camera: Camera, masks: bool, quality: int = 18) -> Path:

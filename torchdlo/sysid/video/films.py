@@ -20,13 +20,16 @@ if TYPE_CHECKING:
     from torchdlo.sysid.recordings.recording import Trial
     from torchdlo.vision.camera import Camera
 
-__all__ = ["STATIONS", "FilmFile", "film_files", "held_still", "photographs", "with_stations"]
+__all__ = ["FILMS", "STATIONS", "FilmFile", "film_files", "held_still", "photographs", "with_stations"]
 
 STATIONS = 41
 """Places along a filmed rope that are compared with its films."""
 
 _PHOTOGRAPHS = (".png", ".jpg", ".jpeg")
-_SUFFIXES = (".mp4", ".mov", ".mkv", ".avi", ".webm", *_PHOTOGRAPHS, ".npz")
+FILMS = (".mp4", ".mov", ".mkv", ".avi", ".webm")
+"""Endings of films, which say when their pictures were taken."""
+
+_SUFFIXES = (*FILMS, *_PHOTOGRAPHS, ".npz")
 
 _STILL_FRAMES, _STILL_STEP = 5, 5e-3
 """Frames of a simulated rope at rest, and the time between them [s]."""
@@ -40,6 +43,8 @@ class FilmFile:
     """The camera, as it was calibrated."""
     path: Path
     """Film, masks, or a folder of pictures."""
+    rate_stated: bool = True
+    """Whether `cameras.json` says how many pictures per second there are."""
 
 
 def photographs(path: Path) -> list[Path]:
@@ -92,9 +97,10 @@ def film_files(path: Path, trials: Sequence[str]) -> dict[str, tuple[FilmFile, .
         )
     if not found and not (path / "cameras.json").is_file():
         return {}
-    from torchdlo.vision.camera import load_cameras  # only films need torch, which takes seconds to start
+    from torchdlo.vision.camera import load_cameras, states_rate  # only films need torch, which takes seconds to start
 
     cameras = {c.name: c for c in load_cameras(path / "cameras.json")}
+    stated = states_rate(path / "cameras.json")
     films: dict[str, list[FilmFile]] = {name: [] for name in trials}
     for file in found:
         trial, _, name = (file.name if file.is_dir() else file.stem).partition(".")
@@ -106,13 +112,21 @@ def film_files(path: Path, trials: Sequence[str]) -> dict[str, tuple[FilmFile, .
             raise InputError(f"{file}: expected {trial}.npz with the motion of the grippers beside it, found none.")
         if any(f.camera.name == name for f in films[trial]):
             raise InputError(f"{file}: expected one film of each trial and camera, found two.")
-        films[trial].append(FilmFile(cameras[name], file))
+        films[trial].append(FilmFile(cameras[name], file, name in stated))
     for trial, own in films.items():
         if not own:
             raise InputError(
                 f"{path / trial}.npz: expected a film {trial}.{next(iter(cameras))}.mp4 of it, found none."
             )
-    return {trial: tuple(own) for trial, own in films.items()}
+    first = next(iter(films))
+    names = {trial: sorted(f.camera.name for f in own) for trial, own in films.items()}
+    for trial, seen in names.items():
+        if seen != names[first]:
+            raise InputError(
+                f"{path / trial}.npz: expected films of the cameras {', '.join(names[first])} as {first} has, found "
+                f"{', '.join(seen)}; trials are judged with the cameras that others were fitted with."
+            )
+    return {trial: tuple(sorted(own, key=lambda f: f.camera.name)) for trial, own in films.items()}
 
 
 def with_stations(trial: Trial, length: float) -> Trial:

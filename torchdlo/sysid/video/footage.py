@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,11 +13,12 @@ import torch
 from torchdlo.errors import InputError
 from torchdlo.sysid.estimation.observation import FilmView
 from torchdlo.sysid.recordings.recording import Recording, Trial
-from torchdlo.sysid.video.films import FilmFile
+from torchdlo.sysid.video.films import FILMS, FilmFile
 from torchdlo.vision.camera import NEAR, lens, project
 from torchdlo.vision.mask_health import check_masks
 from torchdlo.vision.segment import Ranges, color_masks, load_film, load_ranges, ranges_of
 from torchdlo.vision.spine import along, half_width, spine
+from torchdlo.vision.video_file import film_rate
 
 __all__ = ["RANGES", "masks_of", "views_of"]
 
@@ -37,6 +40,15 @@ _STRETCHES = 14
 _TOO_MUCH = 1.15
 """Times its length from which what is seen is more than one rope: one shows 0.4 to 0.8 of it, two 0.7 to 1.6."""
 
+_OTHER_RATE = 0.02
+"""Share by which the rate of a film is another one than `cameras.json` says: 29.97 is 30, 25 is not."""
+
+_DRIFT = 0.25
+"""Pictures by which films of one camera may come apart from a common rate by their ends."""
+
+_FRAMES_OFF = 3
+"""Pictures by which masks without times may differ from the length of their trial: a clock may be off so much."""
+
 _STILL = 5e-4
 """Motion of a gripper between two pictures that shows [m]."""
 
@@ -51,18 +63,13 @@ def views_of(
     """
     report = callback or (lambda *_: None)
     names = [f.camera.name for f in trials[0].films]
-    for trial in trials[1:]:
-        if [f.camera.name for f in trial.films] != names:
-            raise InputError(
-                f"{recording.path / trial.name}.npz: expected films of the cameras {', '.join(names)} as "
-                f"{trials[0].name} has, found {', '.join(f.camera.name for f in trial.films)}."
-            )
     notes: list[str] = []
     views, done, total = [], 0, len(trials) * len(names)
     for k, name in enumerate(names):
         parts = []
-        for trial in trials:
-            parts.append(_reduced(recording, trial, trial.films[k], notes))
+        films, early = _from_start(_timed(recording, [trial.films[k] for trial in trials]))
+        for trial, film in zip(trials, films, strict=True):
+            parts.append(_reduced(recording, trial, film, early, notes))
             done += 1
             report("reading films", done, total, f"{trial.name}, camera {name}")
         frames = max(len(p[0]) for p in parts)
@@ -82,7 +89,7 @@ def views_of(
         lines = (stack(0, 0).astype(bool), stack(1, np.nan), stack(2, np.nan))
         wide = float(np.median([p[3] for p in parts]))
         packed, shown = tuple(p[4] for p in parts), tuple(p[5] for p in parts)
-        views.append(FilmView(trials[0].films[k].camera, *lines, wide, packed, shown))
+        views.append(FilmView(films[0].camera, *lines, wide, packed, shown))
     return views, notes
 
 
@@ -95,13 +102,40 @@ def masks_of(recording: Recording, film: FilmFile) -> tuple[np.ndarray, np.ndarr
             f"{film.path}: expected pictures of {size[1]} x {size[0]} pixels as camera {film.camera.name} has, found "
             f"{found.shape[2]} x {found.shape[1]}."
         )
-    if fps is not None and abs(fps / film.camera.fps - 1) > 0.02:
-        raise InputError(
-            f"{film.path}: expected {film.camera.fps:g} pictures per second as cameras.json says, found {fps:.4g}."
-        )
     if found.dtype == bool:
         return found, None, fps
     return color_masks(found, _ranges(recording, film.path)), found, fps
+
+
+def _timed(recording: Recording, films: Sequence[FilmFile]) -> list[FilmFile]:
+    """Return films of one camera with the rate that all of its films have, those of other trials too.
+
+    `cameras.json` has the rate of the film of a board, or a round number: 29.97 and 30 part by half a picture in 17 s.
+    """
+    name = films[0].camera.name
+    every = [f.path for t in recording.train + recording.test for f in t.films if f.camera.name == name and not t.still]
+    found = {path: film_rate(path) for path in dict.fromkeys(every) if path.suffix.lower() in FILMS and path.is_file()}
+    said, stated = films[0].camera.fps, films[0].rate_stated
+    for path, (fps, _) in found.items():
+        if stated and abs(fps / said - 1) > _OTHER_RATE:
+            raise InputError(f"{path}: expected {said:g} pictures per second as cameras.json says, found {fps:.4g}.")
+    if not found:
+        if every and not stated:
+            raise InputError(
+                f"{films[0].path}: expected fps of camera {name} in cameras.json, found none; masks and folders of "
+                "pictures do not say when they were taken."
+            )
+        return list(films)
+    usual = float(np.median([fps for fps, _ in found.values()]))
+    # To rounding it is the one that is written down, by which ends of windows are told.
+    usual = said if abs(usual / said - 1) < 1e-6 else usual
+    for path, (fps, count) in found.items():
+        if count * abs(fps / usual - 1) > _DRIFT:
+            raise InputError(
+                f"{path}: expected {usual:.5g} pictures per second as other films of camera {name} have, found "
+                f"{fps:.5g}; film all with the same settings."
+            )
+    return [replace(f, camera=replace(f.camera, fps=usual)) for f in films]
 
 
 def _ranges(recording: Recording, film: Path) -> Ranges:
@@ -120,38 +154,30 @@ def _ranges(recording: Recording, film: Path) -> Ranges:
 
 
 def _reduced(
-    recording: Recording, trial: Trial, film: FilmFile, notes: list[str]
+    recording: Recording, trial: Trial, film: FilmFile, early: int, notes: list[str]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, float, np.ndarray, dict[int, np.ndarray]]:
-    """Return good frames, centre lines with tangents, half width, packed masks and some pictures of a film."""
+    """Return good frames, centre lines with tangents, half width, packed masks and some pictures of a film.
+
+    The camera's `start` is when the picture after the first `early` ones was taken, which are left out.
+    """
     nearest = _nearest(trial, film)
-    masks, pictures, _ = masks_of(recording, film)
+    masks, pictures, own_rate = masks_of(recording, film)
     if trial.still:
         return _photographed(trial, film, masks, pictures, notes)
-    time = film.camera.start + np.arange(len(masks)) / film.camera.fps
-    lasts = trial.time[-1]
-    inside = (time > -0.75 / film.camera.fps) & (time < lasts + 0.25 / film.camera.fps)
-    if inside.sum() < 5:
-        raise InputError(
-            f"{film.path}: expected pictures of the {lasts:g} s of {trial.name}.npz, found {int(inside.sum())} in that "
-            "time; check start in cameras.json."
-        )
-    masks, pictures = masks[inside], None if pictures is None else pictures[inside]
-    if not inside[0]:
-        raise InputError(f"{film.path}: expected the film to start with its trial; cut what is before it.")
-    count, expected = len(masks), (lasts - max(time[0], 0.0)) * film.camera.fps
-    if count < 0.6 * expected:
-        raise InputError(
-            f"{film.path}: expected about {expected:.0f} pictures for the {lasts:g} s of {trial.name}.npz, found "
-            f"{count}; were pictures dropped, or is fps in cameras.json wrong?"
-        )
+    rows = slice(early, early + _lasting(trial, film, len(masks) - early))
+    if own_rate is None:
+        _check_length(trial, film, len(masks) - early, notes)
+    masks, pictures = masks[rows], None if pictures is None else pictures[rows]
+    count = len(masks)
+    time = film.camera.start + np.arange(count) / film.camera.fps
     held = trial.markers[:, trial.gripped]
     flat = held.reshape(len(held), -1)
-    where = np.stack([np.interp(time[inside], trial.time, column) for column in flat.T], 1)
+    where = np.stack([np.interp(time, trial.time, column) for column in flat.T], 1)
     moving = np.zeros(count, bool)
     moving[1:] = np.abs(np.diff(where, axis=0)).max(1) > _STILL
     good, issues = check_masks(masks, str(film.path), pictures=pictures, moving=moving)
     notes += [f"{trial.name}, camera {film.camera.name}: {i.text}." for i in issues]
-    suspect = np.interp(time[inside], trial.time, trial.suspect.astype(float)) > 0
+    suspect = np.interp(time, trial.time, trial.suspect.astype(float)) > 0
     good &= ~suspect
     none = (np.full((_POINTS, 2), np.nan),) * 2
     lines = [spine(m, _POINTS) if ok else none for m, ok in zip(masks, good, strict=True)]
@@ -160,6 +186,47 @@ def _reduced(
     _check_amount(recording, film, float(np.median(masks[good].sum((1, 2)))) / max(2 * wide, 1.0), nearest)
     some = np.flatnonzero(good)[np.linspace(0, good.sum() - 1, SHOWN + 1).round().astype(int)[1:]]
     return good, places, tangents, wide, np.packbits(masks.reshape(count, -1), axis=1), _shown(masks, pictures, some)
+
+
+def _from_start(films: Sequence[FilmFile]) -> tuple[list[FilmFile], int]:
+    """Return films of one camera from their first picture of the trial on, and how many pictures are before it."""
+    start, fps = films[0].camera.start, films[0].camera.fps
+    early = max(0, math.floor(-0.75 - start * fps) + 1)
+    return [replace(f, camera=replace(f.camera, start=start + early / fps)) for f in films], early
+
+
+def _lasting(trial: Trial, film: FilmFile, count: int) -> int:
+    """Return how many pictures of a film, of which `count` are left, are of the trial; refuse too few."""
+    lasts, start, fps = trial.time[-1], film.camera.start, film.camera.fps
+    inside = int((start + np.arange(max(count, 0)) / fps < lasts + 0.25 / fps).sum())
+    if inside < 5:
+        raise InputError(
+            f"{film.path}: expected pictures of the {lasts:g} s of {trial.name}.npz, found {inside} in that time; "
+            "check start in cameras.json."
+        )
+    expected = (lasts - max(start, 0.0)) * fps
+    if inside < 0.6 * expected:
+        raise InputError(
+            f"{film.path}: expected about {expected:.0f} pictures for the {lasts:g} s of {trial.name}.npz, found "
+            f"{inside}; were pictures dropped, or is fps in cameras.json wrong?"
+        )
+    return inside
+
+
+def _check_length(trial: Trial, film: FilmFile, count: int, notes: list[str]) -> None:
+    """Refuse masks that have no times and last longer than their trial; say it of shorter ones."""
+    fps, lasts = film.camera.fps, trial.time[-1] - film.camera.start
+    expected = int(lasts * fps + 0.25) + 1
+    if count > expected + _FRAMES_OFF:
+        raise InputError(
+            f"{film.path}: expected {expected} pictures for the {trial.time[-1]:g} s of {trial.name}.npz at {fps:g} "
+            f"per second, found {count}; set fps and start in cameras.json, or leave out what is after the trial."
+        )
+    if count < expected - _FRAMES_OFF:
+        notes.append(
+            f"{trial.name}, camera {film.camera.name}: {count} pictures for {lasts:.3g} s, which have {expected} at "
+            f"{fps:g} per second: check fps if the camera did not stop early."
+        )
 
 
 def _nearest(trial: Trial, film: FilmFile) -> float:
