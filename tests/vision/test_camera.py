@@ -13,7 +13,7 @@ import torch
 
 from tests.vision.scenes import front, hanging
 from torchdlo.errors import InputError
-from torchdlo.vision.camera import NEAR, back_project, lens, load_cameras, project, radial_limit, save_cameras
+from torchdlo.vision.camera import NEAR, Lens, back_project, lens, load_cameras, project, radial_limit, save_cameras
 from torchdlo.vision.film import rope_coverage
 from torchdlo.vision.rasterizer import rope_masks
 
@@ -96,6 +96,22 @@ def test_gradients_with_respect_to_points_and_pose() -> None:
     turn, shift = (torch.full((1, 3), 0.01, dtype=torch.float64, requires_grad=True) for _ in range(2))
     zoom = torch.full((1,), 0.01, dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(lambda p, a, b, c: project(view.moved(a, b, c), p)[0], (points, turn, shift, zoom))
+
+
+@pytest.mark.parametrize("count", [5, 14])
+def test_distortion_that_is_0_has_its_gradient(count: int) -> None:
+    given, points = lens([front(distortion=())]), torch.as_tensor(hanging(5))[None]
+    distortion = torch.zeros(1, count, dtype=torch.float64, requires_grad=True)
+    own = Lens(given.intrinsics, distortion, given.rotation, given.translation)
+    there, depth = project(own, points)
+    torch.testing.assert_close(there, project(given, points)[0])
+    (gradient,) = torch.autograd.grad(there.sum(), distortion)
+    step = 1e-6 * torch.eye(count, dtype=torch.float64)
+    many = [x.expand(count, *x.shape[1:]) for x in (given.intrinsics, given.rotation, given.translation)]
+    ends = [project(Lens(many[0], sign * step, *many[1:]), points)[0].sum((-1, -2)) for sign in (1, -1)]
+    torch.testing.assert_close(gradient[0], (ends[0] - ends[1]) / 2e-6, atol=1e-5, rtol=1e-5)
+    (back,) = torch.autograd.grad(back_project(own, there.detach(), depth.detach()).sum(), distortion)
+    assert torch.isfinite(back).all() and back[..., :4].all()
 
 
 def test_what_is_written_is_read(tmp_path: Path) -> None:

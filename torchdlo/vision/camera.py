@@ -138,6 +138,11 @@ def radial_limit(distortion: tuple[float, ...]) -> float:
     return math.sqrt(real.min()) if len(real) else math.inf
 
 
+def _distorts(view: Lens) -> bool:
+    """Return whether distortion counts: where it is not 0, or has a gradient."""
+    return view.distortion.requires_grad or bool((view.distortion != 0).any())
+
+
 def _limits(distortion: Tensor) -> Tensor:
     """Return `radial_limit` of lenses with coefficients (..., n), shape (...)."""
     # Copies of one lens, as those of candidates of a fit, count once.
@@ -164,7 +169,7 @@ def project(view: Lens, points: Tensor) -> tuple[Tensor, Tensor]:
     local = points @ view.rotation.transpose(-1, -2) + view.translation[..., None, :]
     depth = local[..., 2]
     front = torch.where((depth < NEAR)[..., None], local.new_tensor([0.0, 0.0, 1.0]), local)
-    distorted = bool((view.distortion != 0).any())
+    distorted = _distorts(view)
     if distorted:
         front, depth = _within(front, depth, _limits(view.distortion)[..., None])
     matrix = view.intrinsics.expand(*front.shape[:-2], 3, 3)
@@ -191,7 +196,7 @@ def back_project(view: Lens, pixel: Tensor, depth: Tensor) -> Tensor:
     from kornia.geometry.calibration import undistort_points
 
     matrix = view.intrinsics.expand(*pixel.shape[:-2], 3, 3)
-    if bool((view.distortion != 0).any()):
+    if _distorts(view):
         count = view.distortion.shape[-1]
         pixel = undistort_points(pixel, matrix, view.distortion.expand(*pixel.shape[:-2], count))
     focal = torch.stack([matrix[..., 0, 0], matrix[..., 1, 1]], -1)[..., None, :]
