@@ -141,6 +141,22 @@ def test_a_rope_behind_the_camera_leaves_no_trace() -> None:
     assert not out.any() and not gradient.any()
 
 
+def test_a_vertex_that_is_not_a_number_spoils_no_gradient() -> None:
+    points = torch.as_tensor(hanging(11)).repeat(2, 1, 1)
+    points[1, 4] = torch.nan
+    points.requires_grad_()
+    radius = torch.full((2, 11), 0.006, dtype=torch.float64)
+    radius[1, 9] = torch.nan
+    radius.requires_grad_()
+    pose = [torch.zeros(1, n, dtype=torch.float64, requires_grad=True) for n in (3, 3)]
+    zoom = torch.zeros(1, dtype=torch.float64, requires_grad=True)
+    out = rope_masks(lens([front()]).moved(*pose, zoom), points, radius, (480, 640))
+    weight = torch.linspace(0, 1, 640, dtype=torch.float64)
+    found = torch.autograd.grad((out * weight).sum(), (points, radius, *pose, zoom))
+    assert torch.isfinite(out).all() and all(torch.isfinite(g).all() and g.any() for g in found)
+    assert 0 < out[1].sum() < 0.9 * out[0].sum() and found[0][1, 0].any() and not found[0][1, 4].any()
+
+
 def test_the_pyramid_keeps_what_there_is_and_has_gradients() -> None:
     mask = torch.zeros(2, 96, 128, dtype=torch.float64)
     mask[:, 40:48, 50:70] = 1.0

@@ -208,20 +208,23 @@ def rope_masks(
 
     Args:
         view: the cameras; their leading axes broadcast with those of the points.
-        points: vertices in the world [m], shape (..., V, 3).
+        points: vertices in the world [m], shape (..., V, 3); edges at those that are not finite are left out.
         radius: radii [m], shape (..., V), or one number.
         size: H and W of the pictures.
         after: the vertex after each, see `successors`; one open rope if not given.
         occluder: how much of each pixel hands and fixtures hide [1], shape (..., H, W).
         scale: size of the pictures over those that the cameras were calibrated for.
     """
-    pixel, depth = project(view, points)
+    wide = torch.as_tensor(radius, dtype=points.dtype)
+    # What is not a number goes before the camera: times 0 it would still spoil the gradients of all that share it.
+    known = torch.isfinite(points).all(-1) & torch.isfinite(wide)
+    pixel, depth = project(view, torch.where(known[..., None], points, 0.0))
     focal = 0.5 * (view.intrinsics[..., 0, 0] + view.intrinsics[..., 1, 1])[..., None]
-    wide = torch.as_tensor(radius, dtype=points.dtype) * focal / depth.clamp(min=NEAR)
+    wide = torch.where(known, wide, 0.0) * focal / depth.clamp(min=NEAR)
     # The centre of the top left pixel is at 0 in every size.
     pixel = (pixel + 0.5) * scale - 0.5
     after = successors([points.shape[-2]]) if after is None else after
-    covered = coverage(pixel, wide.expand(depth.shape) * scale, depth >= NEAR, after, size)
+    covered = coverage(pixel, wide.expand(depth.shape) * scale, (depth >= NEAR) & known, after, size)
     return covered if occluder is None else covered * (1 - occluder)
 
 
