@@ -13,7 +13,9 @@ import torch
 
 from tests.vision.scenes import front, hanging
 from torchdlo.errors import InputError
-from torchdlo.vision.camera import back_project, lens, load_cameras, project, save_cameras
+from torchdlo.vision.camera import NEAR, Lens, back_project, lens, load_cameras, project, radial_limit, save_cameras
+from torchdlo.vision.film import rope_coverage
+from torchdlo.vision.rasterizer import rope_masks
 
 
 def test_projection_is_that_of_opencv() -> None:
@@ -44,11 +46,72 @@ def test_points_behind_the_camera_have_finite_pixels_gradients_and_negative_dept
     assert not gradient[0, 1:].any()
 
 
+LENSES = [
+    ((), np.inf),
+    ((-0.3, 0.0, 0.0, 0.0, 0.0), np.sqrt(1 / 0.9)),
+    ((-0.15, 0.05, 1e-3, -5e-4, 0.0), np.inf),
+    ((0.0, 0.0, 0.1, 0.1), np.inf),
+    ((0.1, -0.05, 0.0, 0.0, -0.01), None),
+    ((0.2, -0.4, 0.0, 0.0, 0.3), None),
+    ((0.0, 0.0, 0.0, 0.0, 0.0, 0.3, 0.0, 0.0), np.sqrt(1 / 0.3)),
+    ((0.5, 0.1, 0.0, 0.0, 0.0, -0.25, 0.0, 0.0), 2.0),
+    ((-0.2, 0.01, 0.0, 0.0, 0.002, 0.1, -0.05, 0.001, 0.01, 0.0, 0.01, 0.0), None),
+]
+
+
+@pytest.mark.parametrize(("distortion", "limit"), LENSES)
+def test_radial_distortion_keeps_the_order_up_to_its_limit(distortion: tuple[float, ...], limit: float | None) -> None:
+    found = radial_limit(distortion)
+    assert limit is None or found == pytest.approx(limit)
+    k1, k2, k3, k4, k5, k6 = (*distortion[:2], *distortion[4:8], *[0.0] * 6)[:6]
+    r = np.linspace(0, 10, 200_001)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        seen = r * (1 + k1 * r**2 + k2 * r**4 + k3 * r**6) / (1 + k4 * r**2 + k5 * r**4 + k6 * r**6)
+    falls = np.flatnonzero(~(np.diff(seen) > 0))
+    first = r[falls[0]] if len(falls) else np.inf
+    assert found == pytest.approx(first, abs=1e-4) or (found > 10 and first == np.inf)
+
+
+def test_points_beyond_what_a_lens_shows_are_not_folded_back_into_the_picture() -> None:
+    bent = front(distortion=(-0.3, 0.0, 0.0, 0.0, 0.0), focal=600.0)
+    view = lens([bent, front(distortion=())])
+    # 57 degrees off the axis, and as far off as the corners of the picture.
+    local = np.array([[1.55, 0.0, 1.0], [1.5, 0.3, 1.0], [0.6, 0.45, 1.0]])
+    turn, shift = np.array(bent.rotation), np.array(bent.translation)
+    points = torch.tensor((local - shift) @ turn, requires_grad=True)
+    pixel, depth = project(view, points)
+    assert (depth[0, :2] < NEAR).all() and (depth[1] > NEAR).all()
+    assert float(depth[0, 2].detach()) == pytest.approx(1.0)
+    # They stay beyond the picture, in their direction, and pull at nothing.
+    assert (pixel[0, :2, 0] > bent.width).all() and torch.isfinite(pixel).all()
+    (gradient,) = torch.autograd.grad(pixel[0].sum() + depth[0].sum(), points)
+    assert not gradient[:2].any() and gradient[2].any()
+    far = points.detach()[:2] + torch.linspace(0, 0.1, 2, dtype=torch.float64)[:, None]
+    assert not rope_masks(lens([bent]), far[None], 0.01, (bent.height, bent.width)).any()
+    assert not rope_coverage(bent, far.numpy(), 0.01).any()
+
+
 def test_gradients_with_respect_to_points_and_pose() -> None:
     view, points = lens([front()]), torch.as_tensor(hanging(5))[None].requires_grad_()
     turn, shift = (torch.full((1, 3), 0.01, dtype=torch.float64, requires_grad=True) for _ in range(2))
     zoom = torch.full((1,), 0.01, dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(lambda p, a, b, c: project(view.moved(a, b, c), p)[0], (points, turn, shift, zoom))
+
+
+@pytest.mark.parametrize("count", [5, 14])
+def test_distortion_that_is_0_has_its_gradient(count: int) -> None:
+    given, points = lens([front(distortion=())]), torch.as_tensor(hanging(5))[None]
+    distortion = torch.zeros(1, count, dtype=torch.float64, requires_grad=True)
+    own = Lens(given.intrinsics, distortion, given.rotation, given.translation)
+    there, depth = project(own, points)
+    torch.testing.assert_close(there, project(given, points)[0])
+    (gradient,) = torch.autograd.grad(there.sum(), distortion)
+    step = 1e-6 * torch.eye(count, dtype=torch.float64)
+    many = [x.expand(count, *x.shape[1:]) for x in (given.intrinsics, given.rotation, given.translation)]
+    ends = [project(Lens(many[0], sign * step, *many[1:]), points)[0].sum((-1, -2)) for sign in (1, -1)]
+    torch.testing.assert_close(gradient[0], (ends[0] - ends[1]) / 2e-6, atol=1e-5, rtol=1e-5)
+    (back,) = torch.autograd.grad(back_project(own, there.detach(), depth.detach()).sum(), distortion)
+    assert torch.isfinite(back).all() and back[..., :4].all()
 
 
 def test_what_is_written_is_read(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 import torch
 from scipy.ndimage import distance_transform_edt
 
@@ -25,7 +26,31 @@ def test_the_spine_of_a_rope_is_its_projected_centre_line() -> None:
     edge = at[0].long().clamp(max=59)
     along = torch.nn.functional.normalize(pixel[0, edge + 1] - pixel[0, edge], dim=-1)
     assert (np.abs((along.numpy() * tangents[known]).sum(1)) > 0.97).mean() > 0.95
-    assert abs(half_width(mask) - 0.006 * 650 / 1.2) < 0.5
+    assert abs(half_width(mask) - 0.006 * 650 / 1.2) < 0.2
+
+
+@pytest.mark.parametrize("degrees", [0, 12, 30, 45, 63, 90, 150])
+@pytest.mark.parametrize("half", [0.5, 1.0, 1.5, 2.0, 2.5, 4.0])
+def test_half_widths_of_bands_are_right(half: float, degrees: float) -> None:
+    y, x = np.mgrid[:200, :200]
+    across, along = np.sin(np.radians(degrees)), np.cos(np.radians(degrees))
+    away, far = np.abs((y - 100.2) * along - (x - 99.7) * across), np.abs((x - 99.7) * along + (y - 100.2) * across)
+    band = (away < half) & (far < 80)
+    # At 45 degrees pixels come in steps of 0.7 px: a mask is as wide as the pixels that it has.
+    true = 0.5 * band.sum() / 160
+    assert half_width(band) == pytest.approx(true, rel=0.05) and abs(true - half) < 0.36
+    holes = band & (np.random.default_rng(0).random(band.shape) > 0.03)
+    assert half_width(holes) == pytest.approx(true, rel=0.12)
+
+
+@pytest.mark.parametrize("radius", [0.0008, 0.0015, 0.003, 0.006, 0.012])
+def test_half_widths_of_ropes_are_right(radius: float) -> None:
+    s = np.linspace(0, 1, 121)
+    loop = np.stack([0.42 * (s - 0.5) + 0.12 * np.sin(3 * np.pi * s), 0 * s, 0.15 * np.cos(3 * np.pi * s) - 0.15], 1)
+    for points in (hanging(121), loop):
+        depth = project(lens([front()]), torch.as_tensor(points)[None])[1].numpy()
+        found = half_width(rope_coverage(front(), points, radius) > 0.5)
+        assert found == pytest.approx(radius * 650 * (1 / depth).mean(), rel=0.04, abs=0.06)
 
 
 def test_thinning_leaves_one_pixel_and_an_empty_mask_has_no_spine() -> None:

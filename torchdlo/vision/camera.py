@@ -6,6 +6,7 @@ OpenCV's coefficients. Projection and distortion are kornia's, so they are diffe
 
 from __future__ import annotations
 
+import functools
 import json
 import math
 from collections.abc import Iterable, Sequence
@@ -13,6 +14,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, NoReturn
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -31,6 +33,7 @@ __all__ = [
     "load_cameras",
     "looking_at",
     "project",
+    "radial_limit",
     "save_cameras",
     "states_rate",
 ]
@@ -113,6 +116,43 @@ def lens(cameras: Sequence[Camera], dtype: torch.dtype = torch.float64) -> Lens:
     return Lens(*(torch.tensor(part, dtype=dtype) for part in parts))
 
 
+@functools.lru_cache(4096)
+def radial_limit(distortion: tuple[float, ...]) -> float:
+    """Return how far from the axis a lens's radial distortion keeps the order of points, as a tangent [1].
+
+    Beyond, the polynomial comes back and would show points again in the middle of the picture that no lens does;
+    infinite where it never does.
+
+    Args:
+        distortion: OpenCV's coefficients.
+    """
+    k = [*distortion[:2], *distortion[4:8], *[0.0] * 6][:6] if len(distortion) > 2 else [0.0] * 6
+    if not any(k):
+        return math.inf
+    if not all(map(math.isfinite, k)):
+        return 0.0
+    polynomial = np.polynomial.Polynomial
+    over, under, square = polynomial([1.0, *k[:3]]), polynomial([1.0, *k[3:]]), polynomial([0.0, 1.0])
+    # In the square of the tangent: where the radius has an extremum, and where it has a pole.
+    slope = over * under + 2 * square * (over.deriv() * under - over * under.deriv())
+    roots = np.concatenate([slope.trim().roots(), under.trim().roots()])
+    real = roots.real[(np.abs(roots.imag) <= 1e-9 * np.abs(roots)) & (roots.real > 0)]
+    return math.sqrt(real.min()) if len(real) else math.inf
+
+
+def _distorts(view: Lens) -> bool:
+    """Return whether distortion counts: where it is not 0, or has a gradient."""
+    return view.distortion.requires_grad or bool((view.distortion != 0).any())
+
+
+def _limits(distortion: Tensor) -> Tensor:
+    """Return `radial_limit` of lenses with coefficients (..., n), shape (...)."""
+    # Copies of one lens, as those of candidates of a fit, count once.
+    rows, which = distortion.detach().reshape(-1, distortion.shape[-1]).unique(dim=0, return_inverse=True)
+    limits = distortion.new_tensor([radial_limit(tuple(row)) for row in rows.tolist()])
+    return limits[which].reshape(distortion.shape[:-1])
+
+
 def project(view: Lens, points: Tensor) -> tuple[Tensor, Tensor]:
     """Return where points appear.
 
@@ -122,7 +162,8 @@ def project(view: Lens, points: Tensor) -> tuple[Tensor, Tensor]:
 
     Returns:
         Pixels (..., N, 2), and depths [m] (..., N). Depths below `NEAR` are of points that no picture shows: their
-        pixels are finite and mean nothing.
+        pixels are finite and mean nothing. Points further off the axis than `radial_limit` have depth 0, and pixels in
+        their direction.
     """
     from kornia.geometry.calibration import distort_points
     from kornia.geometry.camera.perspective import project_points
@@ -130,12 +171,26 @@ def project(view: Lens, points: Tensor) -> tuple[Tensor, Tensor]:
     local = points @ view.rotation.transpose(-1, -2) + view.translation[..., None, :]
     depth = local[..., 2]
     front = torch.where((depth < NEAR)[..., None], local.new_tensor([0.0, 0.0, 1.0]), local)
+    distorted = _distorts(view)
+    if distorted:
+        front, depth = _within(front, depth, _limits(view.distortion)[..., None])
     matrix = view.intrinsics.expand(*front.shape[:-2], 3, 3)
     pixel = project_points(front, matrix[..., None, :, :].expand(*front.shape[:-1], 3, 3))
-    if bool((view.distortion != 0).any()):
+    if distorted:
         count = view.distortion.shape[-1]
         pixel = distort_points(pixel, matrix, view.distortion.expand(*front.shape[:-2], count))
     return pixel, depth
+
+
+def _within(front: Tensor, depth: Tensor, limit: Tensor) -> tuple[Tensor, Tensor]:
+    """Return points (..., N, 3) drawn in to limits (..., 1), and their depths, 0 where they were beyond."""
+    with torch.no_grad():
+        off = front[..., :2].norm(dim=-1) / front[..., 2]
+        beyond = off > limit
+        # Not quite to the limit, which may be a pole.
+        share = 0.99 * limit / off.clamp(min=1e-9) / front[..., 2]
+        nearer = torch.cat([front[..., :2] * share[..., None], torch.ones_like(front[..., 2:])], -1)
+    return torch.where(beyond[..., None], nearer, front), torch.where(beyond, 0.0, depth)
 
 
 def back_project(view: Lens, pixel: Tensor, depth: Tensor) -> Tensor:
@@ -143,7 +198,7 @@ def back_project(view: Lens, pixel: Tensor, depth: Tensor) -> Tensor:
     from kornia.geometry.calibration import undistort_points
 
     matrix = view.intrinsics.expand(*pixel.shape[:-2], 3, 3)
-    if bool((view.distortion != 0).any()):
+    if _distorts(view):
         count = view.distortion.shape[-1]
         pixel = undistort_points(pixel, matrix, view.distortion.expand(*pixel.shape[:-2], count))
     focal = torch.stack([matrix[..., 0, 0], matrix[..., 1, 1]], -1)[..., None, :]

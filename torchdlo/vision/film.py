@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from torchdlo.errors import InputError
-from torchdlo.vision.camera import Camera, triple
+from torchdlo.vision.camera import Camera, radial_limit, triple
 
 __all__ = ["Film", "FilmLook", "film", "off_camera", "rope_coverage"]
 
@@ -65,7 +65,7 @@ class Film:
 
 
 def _projected(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return pixels (N, 2) and depths [m] (N,) of points (N, 3)."""
+    """Return pixels (N, 2) and depths [m] (N,) of points (N, 3); depth 0 beyond `radial_limit`."""
     import cv2
 
     turn, shift = np.array(camera.rotation), np.array(camera.translation)
@@ -74,7 +74,8 @@ def _projected(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarr
     lens = np.array(camera.distortion or [0.0] * 5)
     front = np.where(local[:, 2:] > 1e-2, local, [0.0, 0.0, 1.0])
     pixel, _ = cv2.projectPoints(front[:, None], np.zeros(3), np.zeros(3), matrix, lens)
-    return pixel[:, 0], local[:, 2]
+    beyond = np.hypot(front[:, 0], front[:, 1]) > radial_limit(camera.distortion) * front[:, 2]
+    return pixel[:, 0], np.where(beyond, 0.0, local[:, 2])
 
 
 def rope_coverage(

@@ -1,9 +1,11 @@
 """Differentiable pictures of ropes: anti-aliased tubes between projected vertices.
 
 A pixel's signed depth below the outline of an edge is d = r(t) - |p - c(t)|, with c(t) the point of the edge next to
-the pixel and r(t) the radius there; tubes unite by the largest depth. It is covered by
-clamp(min(d, 1/2) + min(2 r - d, 1/2), 0, 1): exactly what a box of one pixel sees of a straight edge, also of tubes
-thinner than a pixel. Where 2 r > 1 that is clamp(d + 1/2, 0, 1).
+the pixel and r(t) the radius there; tubes unite by the largest depth. It is covered by F(d) + F(2 r - d) - 1, where F
+is the share of a box of one pixel on the inner side of a straight line at that signed distance, for the line's
+direction: along the edge, and at right angles to the radius on round ends. F runs from 0 to 1 over the width of the box
+across the line, 1 to 1.41 px. So areas of straight tubes of constant radius are exact in all directions, also of those
+thinner than a pixel; each end has 0.1 to 0.2 square pixels too much.
 
 `coverage` is a C++ operator with a backward pass of its own, which visits only pixels that are partly covered;
 `coverage_reference` has the same formulas as tensor operations. kornia has no rasteriser: cameras, filters and pyramids
@@ -24,6 +26,9 @@ from torchdlo.physics.kernels import native
 from torchdlo.vision.camera import NEAR, Lens, project
 
 __all__ = ["coverage", "coverage_reference", "pyramid", "rope_masks", "successors"]
+
+_LEAST = 1e-7
+"""Least component of a normal, and distance [px] from which a pixel's direction from an end is told."""
 
 _DTYPES = {torch.float32: "float", torch.float64: "double"}
 
@@ -132,11 +137,40 @@ def coverage(pixel: Tensor, radius: Tensor, real: Tensor, after: Tensor, size: t
     return out.reshape(*batch, height, width)
 
 
+def _half_plane(depth: Tensor, normal: Tensor) -> Tensor:
+    """Return the shares (...) of a pixel that are within a straight line.
+
+    Args:
+        depth: signed distance of the pixel's centre from the line [px], positive inside, shape (...).
+        normal: absolute values of the components of the line's unit normal, shape (..., 2).
+    """
+    # The box's shadow on the normal is a trapezoid: level over `major - minor`, with flanks as wide as `minor`.
+    major, minor = normal.amax(-1), normal.amin(-1).clamp(min=_LEAST)
+    far = depth.abs()
+    flank = ((0.5 * (major + minor) - far) / minor).clamp(0.0, 1.0)
+    rest = 0.5 * minor * flank.square() / major
+    return torch.where(far <= 0.5 * (major - minor), 0.5 + depth / major, torch.where(depth > 0, 1 - rest, rest))
+
+
+def _normals(off: Tensor, distance: Tensor, along: Tensor, inner: Tensor) -> Tensor:
+    """Return the absolute values of the unit normals of outlines, shape (..., 2), see `coverage_reference`."""
+    # A quarter turn swaps the components, and shares are the same for both orders.
+    length = along.square().sum(-1, keepdim=True).clamp(min=1e-18).sqrt()
+    level = torch.tensor([1.0, 0.0], dtype=along.dtype, device=along.device)
+    across = torch.where(length > 1e-9, along / length, level)
+    radial = off / distance.clamp(min=_LEAST)[..., None]
+    outer = torch.where((distance > _LEAST)[..., None], radial, across.detach())
+    return torch.where(inner[..., None], across, outer).abs()
+
+
 def coverage_reference(pixel: Tensor, radius: Tensor, real: Tensor, after: Tensor, size: tuple[int, int]) -> Tensor:
     """Return what `coverage` does, by tensor operations: every edge against every pixel."""
     height, width = size
     first = torch.nonzero(after >= 0)[:, 0]
     last = after[first]
+    known = torch.isfinite(pixel).all(-1) & torch.isfinite(radius)
+    pixel, radius = torch.where(known[..., None], pixel, 0.0), torch.where(known, radius, 0.0)
+    real = real & known
     y, x = (torch.arange(n, dtype=pixel.dtype, device=pixel.device) for n in (height, width))
     place = torch.stack(torch.broadcast_tensors(x, y[:, None]), -1).reshape(-1, 2)
     a, b = pixel[..., first, :], pixel[..., last, :]
@@ -150,12 +184,14 @@ def coverage_reference(pixel: Tensor, radius: Tensor, real: Tensor, after: Tenso
     distance = torch.where(squared > 1e-24, squared.clamp(min=1e-24).sqrt(), 0.0)
     ra, rb = radius[..., first, None], radius[..., last, None]
     r = ra + t * (rb - ra)
-    usable = (real[..., first] & real[..., last])[..., None] & torch.isfinite(a.sum(-1) + b.sum(-1))[..., None]
-    depth = torch.where(usable, r - distance, -1.0)
+    depth = torch.where((real[..., first] & real[..., last])[..., None], r - distance, -1.0)
     best = depth.argmax(-2, keepdim=True)
-    depth, r = (torch.gather(part, -2, best)[..., 0, :] for part in (depth, r))
-    covered = (depth.clamp(max=0.5) + (2 * r - depth).clamp(max=0.5)).clamp(0.0, 1.0)
-    return torch.where(depth > -0.5, covered, 0.0).reshape(*pixel.shape[:-2], height, width)
+    depth, r, distance, t = (torch.gather(part, -2, best)[..., 0, :] for part in (depth, r, distance, t))
+    off = torch.gather(off, -3, best[..., None].expand(*best.shape, 2))[..., 0, :, :]
+    along = torch.gather(d, -2, best[..., 0, :, None].expand(*depth.shape, 2))
+    normal = _normals(off, distance, along, (t > 0) & (t < 1))
+    covered = (_half_plane(depth, normal) + _half_plane(2 * r - depth, normal) - 1).clamp(0.0, 1.0)
+    return covered.reshape(*pixel.shape[:-2], height, width)
 
 
 def rope_masks(
@@ -172,20 +208,23 @@ def rope_masks(
 
     Args:
         view: the cameras; their leading axes broadcast with those of the points.
-        points: vertices in the world [m], shape (..., V, 3).
+        points: vertices in the world [m], shape (..., V, 3); edges at those that are not finite are left out.
         radius: radii [m], shape (..., V), or one number.
         size: H and W of the pictures.
         after: the vertex after each, see `successors`; one open rope if not given.
         occluder: how much of each pixel hands and fixtures hide [1], shape (..., H, W).
         scale: size of the pictures over those that the cameras were calibrated for.
     """
-    pixel, depth = project(view, points)
+    wide = torch.as_tensor(radius, dtype=points.dtype)
+    # What is not a number goes before the camera: times 0 it would still spoil the gradients of all that share it.
+    known = torch.isfinite(points).all(-1) & torch.isfinite(wide)
+    pixel, depth = project(view, torch.where(known[..., None], points, 0.0))
     focal = 0.5 * (view.intrinsics[..., 0, 0] + view.intrinsics[..., 1, 1])[..., None]
-    wide = torch.as_tensor(radius, dtype=points.dtype) * focal / depth.clamp(min=NEAR)
+    wide = torch.where(known, wide, 0.0) * focal / depth.clamp(min=NEAR)
     # The centre of the top left pixel is at 0 in every size.
     pixel = (pixel + 0.5) * scale - 0.5
     after = successors([points.shape[-2]]) if after is None else after
-    covered = coverage(pixel, wide.expand(depth.shape) * scale, depth >= NEAR, after, size)
+    covered = coverage(pixel, wide.expand(depth.shape) * scale, (depth >= NEAR) & known, after, size)
     return covered if occluder is None else covered * (1 - occluder)
 
 

@@ -49,16 +49,60 @@ def thin(mask: np.ndarray) -> np.ndarray:
             return left[1:-1, 1:-1].astype(bool)
 
 
-def half_width(mask: np.ndarray) -> float:
-    """Return the usual half width of what a mask (H, W) shows [px], 0 where it shows nothing."""
+def _cut(mask: np.ndarray) -> tuple[np.ndarray, int, int]:
+    """Return the part of a mask (H, W) that is not empty, and its first column and row."""
+    rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
+    part = mask[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
+    return np.ascontiguousarray(part), int(columns[0]), int(rows[0])
+
+
+def _reach(mask: np.ndarray) -> int:
+    """Return how far around a pixel [px] one has to look to see the mask's whole width."""
     import cv2
 
-    area = int(mask.sum())
-    if not area:
-        return 0.0
     inside = cv2.distanceTransform(np.pad(mask, 1).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-    # Distances from the edge are even from 0 to the half width: their mean is half of that.
-    return float(2 * inside[inside > 0].mean() - 0.5)
+    # Distances from the edge are even from 0 to the half width: their mean is half of that. Up to 1 px too large.
+    return int(np.ceil(2 * inside[inside > 0].mean() - 0.5)) + 1
+
+
+def _sums(part: np.ndarray, far: int) -> np.ndarray:
+    """Return the sums of an array (H, W) over squares that reach so far [px] around each pixel."""
+    import cv2
+
+    return cv2.boxFilter(part, -1, (2 * far + 1, 2 * far + 1), normalize=False, borderType=cv2.BORDER_CONSTANT)
+
+
+def _angles(mask: np.ndarray, far: int) -> np.ndarray:
+    """Return the directions [rad] of what a mask (H, W) shows within so far [px] around each pixel."""
+    y, x = np.mgrid[: mask.shape[0], : mask.shape[1]].astype(np.float64)
+    white = mask.astype(np.float64)
+    mass = np.maximum(_sums(white, far), 1.0)
+    mx, my = _sums(white * x, far) / mass, _sums(white * y, far) / mass
+    xx = _sums(white * x**2, far) / mass - mx**2
+    yy = _sums(white * y**2, far) / mass - my**2
+    xy = _sums(white * x * y, far) / mass - mx * my
+    return 0.5 * np.arctan2(2 * xy, xx - yy)
+
+
+def half_width(mask: np.ndarray) -> float:
+    """Return the usual half width of what a mask (H, W) shows [px], 0 where it shows nothing.
+
+    It is half of the area over the length. A line that is `a` off level meets cos(a) columns and sin(a) rows per pixel
+    of its length, and a run of the mask begins in each of them: the sum of cos over runs in columns and of sin over
+    runs in rows is the length.
+    """
+    import cv2
+
+    if not mask.any():
+        return 0.0
+    cut, _, _ = _cut(mask)
+    angle = _angles(cut, _reach(cut))
+    # Runs do not begin anew after holes and gaps of one pixel.
+    whole = cv2.morphologyEx(np.pad(cut, 2).astype(np.uint8), cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8)) > 0
+    inner = np.s_[2:-2, 2:-2]
+    above, left = (whole & ~np.roll(whole, 1, axis) for axis in (0, 1))
+    length = np.abs(np.cos(angle))[above[inner]].sum() + np.abs(np.sin(angle))[left[inner]].sum()
+    return float(0.5 * cut.sum() / max(float(length), 1.0))
 
 
 def spine(mask: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
@@ -71,14 +115,10 @@ def spine(mask: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
     Returns:
         Places [px], (S, 2), and tangents [1], (S, 2); NaN where the line is too short for so many.
     """
-    import cv2
-
     places, tangents = (np.full((count, 2), np.nan) for _ in range(2))
-    rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
-    if not len(rows):
+    if not mask.any():
         return places, tangents
-    y0, x0 = rows[0], columns[0]
-    cut = np.ascontiguousarray(mask[y0 : rows[-1] + 1, x0 : columns[-1] + 1])
+    cut, x0, y0 = _cut(mask)
     y, x = np.nonzero(thin(cut))
     if len(y) > count:
         # One pixel per cell of a grid, then evenly among those.
@@ -86,23 +126,12 @@ def spine(mask: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
         _, first = np.unique((y // cell).astype(int) * 100_000 + (x // cell).astype(int), return_index=True)
         first = first[np.linspace(0, len(first) - 1, min(count, len(first))).round().astype(int)]
         y, x = y[first], x[first]
-    reach = int(np.ceil(half_width(cut))) + 1
+    reach = _reach(cut)
     grid_y, grid_x = np.mgrid[: cut.shape[0], : cut.shape[1]].astype(np.float64)
     white = cut.astype(np.float64)
-
-    def sums(part: np.ndarray, far: int) -> np.ndarray:
-        side = (2 * far + 1, 2 * far + 1)
-        return cv2.boxFilter(part, -1, side, normalize=False, borderType=cv2.BORDER_CONSTANT)[y, x]
-
-    mass = np.maximum(sums(white, reach), 1.0)
-    near = np.stack([sums(white * grid_x, reach), sums(white * grid_y, reach)], 1) / mass[:, None]
-    far = 2 * reach
-    mass = np.maximum(sums(white, far), 1.0)
-    mx, my = sums(white * grid_x, far) / mass, sums(white * grid_y, far) / mass
-    xx = sums(white * grid_x**2, far) / mass - mx**2
-    yy = sums(white * grid_y**2, far) / mass - my**2
-    xy = sums(white * grid_x * grid_y, far) / mass - mx * my
-    angle = 0.5 * np.arctan2(2 * xy, xx - yy)
+    mass = np.maximum(_sums(white, reach), 1.0)
+    near = np.stack([_sums(white * grid_x, reach) / mass, _sums(white * grid_y, reach) / mass], -1)[y, x]
+    angle = _angles(cut, 2 * reach)[y, x]
     places[: len(y)] = near + np.array([x0, y0])
     tangents[: len(y)] = np.stack([np.cos(angle), np.sin(angle)], 1)
     return places, tangents
