@@ -300,7 +300,7 @@ def evaluate(
     from torchdlo.agents.rl.evaluate import PROTOCOLS
     from torchdlo.agents.rl.evaluate import evaluate_policies as judge
     from torchdlo.agents.rl.results import evaluation_summary, load_policies
-    from torchdlo.envs import find
+    from torchdlo.envs import find_stored
 
     quiet_torchrl()
     if len(policies) == 1 and _sees(policies[0]):
@@ -328,7 +328,7 @@ def evaluate(
         for name in ("best.mp4", "worst.mp4"):
             check_video(out / name)
     found, name = load_policies(policies)
-    own, how = find(name), execution_choice(execution)
+    own, how = find_stored(name, policies[0]), execution_choice(execution)
     if any(isinstance(policy, CloudPolicy) for policy in found):
         _judge_student(policies, found, own, starts, reset_seed, out, film or bool(protocol), as_json)
         return
@@ -423,13 +423,13 @@ def _perturb(policies: list[Path], trajectory: Path | None, starts: int, seed: i
     from torchdlo.agents.rl.results import load_policies
     from torchdlo.agents.trajopt.search_result import load_actions
     from torchdlo.agents.trajopt.task_problem import TaskProblem
-    from torchdlo.envs import find
+    from torchdlo.envs import find_stored
 
     check_writable(out / "robustness.json")
     found, name = load_policies(policies)
     if any(isinstance(policy, CloudPolicy) for policy in found):
         raise InputError(f"{policies[0]}: it sees clouds of points; leave out --perturb, cameras are what is varied.")
-    task, actors = find(name), {}
+    task, actors = find_stored(name, policies[0]), {}
     if trajectory is not None:
         problem = TaskProblem(task, execution="eager")
         actors["trajectory replayed"] = robustness.replaying(problem.full(load_actions(trajectory, problem)))

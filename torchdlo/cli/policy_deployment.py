@@ -47,12 +47,13 @@ def distill(
     """
     from torchdlo.agents.policies import CloudPolicy, load_policy
     from torchdlo.agents.rl.student import Student, teach
-    from torchdlo.envs import find
+    from torchdlo.envs import find_stored
 
     quiet_torchrl()
     policy = load_policy(teacher)
     if isinstance(policy, CloudPolicy) or not policy.spec.task:
         raise InputError(f"{teacher}: expected a policy of a task that sees the state, found another one.")
+    task = find_stored(policy.spec.task, teacher)
     folder = teacher if teacher.is_dir() else teacher.parent
     out = out or folder.with_name(f"{folder.name}-cloud")
     check_writable(out / "student.json")
@@ -60,7 +61,7 @@ def distill(
     plan = Student(**{name: value for name, value in given.items() if value is not None})
     try:
         with progress() as show, deferred_interrupt(show) as callback:
-            _, notes = teach(find(policy.spec.task), policy, folder=out, plan=plan, resume=resume, callback=callback)
+            _, notes = teach(task, policy, folder=out, plan=plan, resume=resume, callback=callback)
     except KeyboardInterrupt:
         raise stopped(f"the rounds that are finished are in {out}", resume=True) from None
     for row in notes["log"]:
@@ -167,13 +168,13 @@ def _source(path: Path) -> tuple[Task, Any]:
     from torchdlo.agents.policies import CloudPolicy, load_policy
     from torchdlo.agents.trajopt.search_result import load_actions, read_trajectory
     from torchdlo.agents.trajopt.task_problem import TaskProblem
-    from torchdlo.envs import find
+    from torchdlo.envs import find_stored
 
     if path.is_dir() or path.suffix != ".json":
         policy = load_policy(path)
         if isinstance(policy, CloudPolicy):
             raise InputError(f"{path}: it sees clouds of points; deploy the policy of the state that taught it.")
-        return find(policy.spec.task), policy
+        return find_stored(policy.spec.task, path), policy
     name = read_trajectory(path)["task"].text()
-    problem = TaskProblem(find(name), execution="eager")
+    problem = TaskProblem(find_stored(name, path), execution="eager")
     return problem.task, problem.full(load_actions(path, problem))

@@ -30,6 +30,7 @@ from torchdlo.envs.tasks.wiring_ring import WiringRing
 from torchdlo.envs.tasks.wrapping import Wrapping
 from torchdlo.errors import InputError
 from torchdlo.physics.execution import Execution
+from torchdlo.untrusted import one_line
 
 if TYPE_CHECKING:
     from torchdlo.envs.core.env import DloEnv
@@ -58,6 +59,7 @@ __all__ = [
     "RopeMaterial",
     "Task",
     "find",
+    "find_stored",
     "list_tasks",
     "make",
     "parse_fidelity",
@@ -113,6 +115,25 @@ def find(name: str, rope: RopeMaterial | None = None, grasps: Sequence[int | Non
     task = (known[name] if name in known else _own(name))()
     task = task if rope is None else dataclasses.replace(task, rope=rope)
     return task if grasps is None else dataclasses.replace(task, grasps=tuple(grasps))
+
+
+def find_stored(name: str, where: object) -> Task:
+    """Return the task that a file names. It is one of torchdlo's: files are data, and name no code that is to run.
+
+    Args:
+        name: of the task, as the file has it.
+        where: the file, for what is said of it.
+
+    Raises:
+        InputError: The name is of no task here, or "FILE.py:CLASS".
+    """
+    known = TASKS | PAIRED_TASKS
+    if not isinstance(name, str) or name not in known:
+        raise InputError(
+            f"{one_line(where)}: its task is {one_line(repr(name), 60)}; expected one of {', '.join(sorted(known))}: "
+            "what a file names is never run."
+        )
+    return known[name]()
 
 
 def with_fidelity(task: Task, how: Fidelity | str) -> Task:
