@@ -11,11 +11,12 @@ pytest.importorskip("pytorch_kinematics", reason="arms need the extra robots")
 pytest.importorskip("torchrl", reason="training needs the extra rl")
 
 from torchdlo import envs
-from torchdlo.agents.policies import FeatureSpec, Policy, PolicySpec, chunk_rollout, save_policy
+from torchdlo.agents.policies import FeatureSpec, Policy, PolicySpec, chunk_rollout, save_policy, task_features
+from torchdlo.agents.rl import student
 from torchdlo.cli import app
 from torchdlo.errors import InputError
 
-HOSTILE = "hostile.py:Hostile"
+HOSTILE, OWN = "hostile.py:Hostile", "own.py:Lead"
 
 
 @pytest.fixture(autouse=True)
@@ -65,3 +66,39 @@ def test_policies_that_see_name_no_code_that_is_run(tasks, condition, hostile: P
     with pytest.raises(InputError, match=r"its task is 'hostile|learned no other task"):
         chunk_rollout.evaluate_chunk_policy(Path("seeing.pt"), tasks, None, episodes=1, conditions=[condition])
     assert not hostile.exists()
+
+
+@pytest.fixture
+def own() -> Path:
+    """A policy of a task of one's own, as `train own.py:Lead` would write it."""
+    text = (Path(__file__).parent / "rl" / "lead.py").read_text()
+    Path("own.py").write_text(text.replace('"lead"', '"leading"'))
+    task = envs.find(OWN)
+    spec = PolicySpec(task_features(task), 3, task="leading", reach=task.max_translation, turns=3)
+    save_policy(Policy(spec), Path("policy.pt"))
+    return Path("policy.pt")
+
+
+def test_policies_of_ones_own_tasks_are_judged_and_deployed(own: Path, capsys):
+    assert run("evaluate", own, "--task", OWN, "--protocol", "one", "--execution", "eager", "--json") == 0
+    assert json.loads(capsys.readouterr().out)["task"] == "leading"
+    assert run("evaluate", own, "--task", OWN, "--perturb", "--starts", 1, "--json") == 0
+    assert list(json.loads(capsys.readouterr().out)["actors"]) == [f"policy {Path().resolve().name}"]
+    assert run("deploy", own, "--task", OWN, "--json") == 0
+    assert json.loads(capsys.readouterr().out)["task"] == "leading"
+
+
+def test_policies_of_ones_own_tasks_teach(own: Path, monkeypatch, capsys):
+    tasks = []
+    monkeypatch.setattr(student, "teach", lambda task, *_, **__: tasks.append(task.name) or (None, {"log": []}))
+    assert run("distill", own, "--task", OWN) == 0 and tasks == ["leading"]
+
+
+def test_a_task_of_another_name_is_refused(own: Path, capsys):
+    for command in ("evaluate", "deploy", "distill"):
+        assert run(command, own, "--task", "coiling") == 2
+        assert "its task is 'leading'; the task coiling has the name 'coiling'" in capsys.readouterr().err
+        assert run(command, own) == 2
+        assert "with --task FILE.py:CLASS" in " ".join(capsys.readouterr().err.split())
+    assert run("evaluate", own, "--task", OWN, "--task", OWN) == 2
+    assert "give it once" in capsys.readouterr().err

@@ -259,7 +259,11 @@ def evaluate(
     ] = None,
     task: Annotated[
         list[str] | None,
-        typer.Option(help="Of policies of learn: a task; all that it has learned if none is named.", metavar="NAME"),
+        typer.Option(
+            help="Of policies of learn: a task; all that it has learned if none is named. Of others: where the task of "
+            "your own is, as FILE.py:CLASS.",
+            metavar="NAME",
+        ),
     ] = None,
     reset_seed: Annotated[
         int, typer.Option(min=0, help="Seed of the unseen starts: another one for starts that no judgement has seen.")
@@ -308,8 +312,9 @@ def evaluate(
             raise InputError(f"{policies[0]}: it is a policy of learn; --film and --execution are for those of train.")
         _evaluate_seeing(policies[0], task or [], starts, protocol or ["varied"], out, as_json)
         return
-    if task:
-        raise InputError("--task: policies of train have one task of their own; leave it out.")
+    if len(task or []) > 1:
+        raise InputError("--task: policies of train have one task; give it once, or leave it out.")
+    given = task[0] if task else None
     names = protocol or ["one", "varied"]
     other = sorted(set(names) - set(PROTOCOLS))
     if other:
@@ -319,7 +324,7 @@ def evaluate(
     if trajectory and not perturb:
         raise InputError("--trajectory: it is compared with policies under perturbations; give --perturb as well.")
     if perturb:
-        _perturb(policies, trajectory, starts, reset_seed, out, as_json)
+        _perturb(policies, given, trajectory, starts, reset_seed, out, as_json)
         return
     check_writable(out / "evaluation.json")
     if film:
@@ -328,7 +333,7 @@ def evaluate(
         for name in ("best.mp4", "worst.mp4"):
             check_video(out / name)
     found, name = load_policies(policies)
-    own, how = find_stored(name, policies[0]), execution_choice(execution)
+    own, how = find_stored(name, policies[0], given), execution_choice(execution)
     if any(isinstance(policy, CloudPolicy) for policy in found):
         _judge_student(policies, found, own, starts, reset_seed, out, film or bool(protocol), as_json)
         return
@@ -415,7 +420,15 @@ def _judge_student(
         typer.echo(content)
 
 
-def _perturb(policies: list[Path], trajectory: Path | None, starts: int, seed: int, out: Path, as_json: bool) -> None:
+def _perturb(
+    policies: list[Path],
+    given: str | None,
+    trajectory: Path | None,
+    starts: int,
+    seed: int,
+    out: Path,
+    as_json: bool,
+) -> None:
     """Judge policies, and the trajectory and the experts behind them, under perturbations."""
     from torchdlo.agents.policies import CloudPolicy
     from torchdlo.agents.rl import robustness
@@ -429,14 +442,14 @@ def _perturb(policies: list[Path], trajectory: Path | None, starts: int, seed: i
     found, name = load_policies(policies)
     if any(isinstance(policy, CloudPolicy) for policy in found):
         raise InputError(f"{policies[0]}: it sees clouds of points; leave out --perturb, cameras are what is varied.")
-    task, actors = find_stored(name, policies[0]), {}
+    task, actors = find_stored(name, policies[0], given), {}
     if trajectory is not None:
         problem = TaskProblem(task, execution="eager")
         actors["trajectory replayed"] = robustness.replaying(problem.full(load_actions(trajectory, problem)))
         for expert in candidate_experts(task, [trajectory])[:1]:
             actors["its path followed"] = robustness.following(expert)
     for policy, path in zip(found, policies, strict=True):
-        folder = path if path.is_dir() else path.parent
+        folder = (path if path.is_dir() else path.parent).resolve()
         if (folder / "expert.json").exists():
             actors[f"expert of {folder.name}"] = robustness.following(load_expert(folder / "expert.json", task))
         actors[f"policy {folder.name}"] = robustness.policy_acting(policy)

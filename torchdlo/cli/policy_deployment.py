@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from torchdlo.cli.ending import stopped
+from torchdlo.cli.options import OwnTaskOption
 from torchdlo.cli.policies import quiet_torchrl
 from torchdlo.cli.progress import deferred_interrupt, progress
 from torchdlo.errors import InputError
@@ -32,6 +33,7 @@ def distill(
     count: Annotated[int | None, typer.Option(min=1, help="Episodes of a round. Default: 64.")] = None,
     updates: Annotated[int | None, typer.Option(min=1, help="Steps of learning after a round. Default: 1000.")] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of everything.")] = 0,
+    own: OwnTaskOption = None,
     resume: Annotated[bool, typer.Option("--resume", help="Go on after the last round that is there.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print how it went as JSON.")] = False,
 ) -> None:
@@ -53,8 +55,9 @@ def distill(
     policy = load_policy(teacher)
     if isinstance(policy, CloudPolicy) or not policy.spec.task:
         raise InputError(f"{teacher}: expected a policy of a task that sees the state, found another one.")
-    task = find_stored(policy.spec.task, teacher)
+    task = find_stored(policy.spec.task, teacher, own)
     folder = teacher if teacher.is_dir() else teacher.parent
+    folder = folder if folder.name else folder.resolve()  # the working folder goes by no name
     out = out or folder.with_name(f"{folder.name}-cloud")
     check_writable(out / "student.json")
     given: dict[str, Any] = {"rounds": rounds, "count": count, "updates": updates, "seed": seed}
@@ -113,6 +116,7 @@ def deploy(
     tool: Annotated[str | None, typer.Option(help="Link of that arm that is the tool.", metavar="LINK")] = None,
     speed: Annotated[float, typer.Option(help="Share of the joints' greatest speeds to use.")] = 1.0,
     acceleration: Annotated[float, typer.Option(help="Greatest acceleration of a joint in rad/s^2.")] = 10.0,
+    own: OwnTaskOption = None,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Play the file in the simulator.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print what it came to as JSON.")] = False,
 ) -> None:
@@ -134,7 +138,7 @@ def deploy(
 
     if kind not in deployment.FORMATS:
         raise InputError(f"--format {kind}: expected one of {', '.join(deployment.FORMATS)}.")
-    task, what = _source(source)
+    task, what = _source(source, own)
     folder = source if source.is_dir() else source.parent
     out = out or folder / ("joints.csv" if kind == "csv" else f"joints-{kind}.json")
     marks = {"csv": b"time,", "json": b"torchdlo", "ros2": b"joint_names"}
@@ -163,7 +167,7 @@ def deploy(
         typer.echo(json.dumps(said | {"file": str(out)}, indent=1))
 
 
-def _source(path: Path) -> tuple[Task, Any]:
+def _source(path: Path, own: str | None) -> tuple[Task, Any]:
     """Return the task, and the actions of a trajectory (T, A) or a policy."""
     from torchdlo.agents.policies import CloudPolicy, load_policy
     from torchdlo.agents.trajopt.search_result import load_actions, read_trajectory
@@ -174,7 +178,7 @@ def _source(path: Path) -> tuple[Task, Any]:
         policy = load_policy(path)
         if isinstance(policy, CloudPolicy):
             raise InputError(f"{path}: it sees clouds of points; deploy the policy of the state that taught it.")
-        return find_stored(policy.spec.task, path), policy
+        return find_stored(policy.spec.task, path, own), policy
     name = read_trajectory(path)["task"].text()
-    problem = TaskProblem(find_stored(name, path), execution="eager")
+    problem = TaskProblem(find_stored(name, path, own), execution="eager")
     return problem.task, problem.full(load_actions(path, problem))

@@ -117,21 +117,30 @@ def find(name: str, rope: RopeMaterial | None = None, grasps: Sequence[int | Non
     return task if grasps is None else dataclasses.replace(task, grasps=tuple(grasps))
 
 
-def find_stored(name: str, where: object) -> Task:
+def find_stored(name: str, where: object, own: str | None = None) -> Task:
     """Return the task that a file names. It is one of torchdlo's: files are data, and name no code that is to run.
 
     Args:
         name: of the task, as the file has it.
         where: the file, for what is said of it.
+        own: who asks may know better where the task is, such as "FILE.py:CLASS"; its name has to be that of the file.
 
     Raises:
-        InputError: The name is of no task here, or "FILE.py:CLASS".
+        InputError: The name is of no task here, or not that of `own`.
     """
+    if own is not None:
+        given = find(own)
+        if name not in (given.name, own):
+            raise InputError(
+                f"{one_line(where)}: its task is {one_line(repr(name), 60)}; the task {own} has the name "
+                f"{given.name!r}."
+            )
+        return given
     known = TASKS | PAIRED_TASKS
     if not isinstance(name, str) or name not in known:
         raise InputError(
             f"{one_line(where)}: its task is {one_line(repr(name), 60)}; expected one of {', '.join(sorted(known))}: "
-            "what a file names is never run."
+            "what a file names is never run. Say where a task of your own is with --task FILE.py:CLASS."
         )
     return known[name]()
 
