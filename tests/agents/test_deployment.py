@@ -18,9 +18,14 @@ from lead import Lead
 
 from torchdlo import envs
 from torchdlo.agents import deployment
+from torchdlo.agents.data.demonstrators import make_demonstrator
 from torchdlo.agents.deployment import JointMotion, arms_of, motion_text, play_motion, replay_joints, time_scale
+from torchdlo.agents.policies import Policy, PolicySpec, save_policy, task_features
 from torchdlo.cli import app
+from torchdlo.cli.policies import _perturb
+from torchdlo.cli.policy_deployment import _source
 from torchdlo.coupling.robot.robot_kinematics import panda, tool_pose
+from torchdlo.envs.core.task import straight
 from torchdlo.errors import InputError
 
 HERE = torch.zeros(1, 1, 3)
@@ -124,3 +129,55 @@ def test_the_command_writes_a_file(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     with pytest.raises(SystemExit) as done:
         app.main(["deploy", str(file), "--format", "yaml"])
     assert done.value.code == 2
+
+
+def found(folder: Path, **choices: object) -> Path:
+    """A trajectory of the task that was found in another way than the task says."""
+    said = {"double": False, "execution": "compiled"} | choices
+    file = folder / "trajectory.json"
+    file.write_text(json.dumps({"task": "lead", "actions": actions()[:, :3].tolist(), "choices": said}))
+    return file
+
+
+def test_a_trajectory_is_deployed_as_it_was_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys):
+    monkeypatch.setitem(envs.TASKS, "lead", Lead)
+    fine = {"step": 0.002, "substeps": 1, "integrator": "implicit"}
+    judged = {"reward": {"near": "-z(tool_0)"}, "success": "z(tool_0) > 10"}
+    file = found(tmp_path, double=True, grasps=[6], fidelity=fine, reward=judged)
+    task, what = _source(file)
+    assert (task.grasps, task.arms.vertex, task.fidelity.text) == ((6,), (6,), "2ms/1/implicit")
+    assert what.dtype == torch.float64
+    with pytest.raises(SystemExit):
+        app.main(["deploy", str(file), "--format", "json", "--json"])
+    # Held at its other end, the rope is led 25 mm away; the reward's condition is never true.
+    assert not json.loads(capsys.readouterr().out)["success"]
+    written = json.loads((tmp_path / "joints-json.json").read_text())["position"]
+    full = torch.tensor([[*row, 0.0] for row in written], dtype=torch.float64)
+    tool = tool_pose(panda(base=Lead.arms.base[0]), full).pos
+    start = torch.tensor(straight((0.0, 0.1, 0.05), 8, torch.zeros(1, 3))[0][6].tolist(), dtype=torch.float64)
+    torch.testing.assert_close(tool[0], start, atol=1e-3, rtol=0)
+
+
+def test_what_a_trajectory_was_found_with_is_given_or_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys):
+    monkeypatch.setitem(envs.TASKS, "lead", Lead)
+    for choices, said in (
+        ({"rope": {"bend": 1e-3}}, "found for its own rope; give that one, or another, with --rope-model"),
+        ({"part": {"from": "", "kept": [], "horizon": 6}}, "is a part of a task"),
+    ):
+        with pytest.raises(InputError, match=said):
+            _source(found(tmp_path, **choices))
+    rope = envs.RopeMaterial(line_density=0.05, bend=1e-4, damping=20.0)
+    monkeypatch.setattr("torchdlo.scene_files.cable", lambda path: rope)
+    assert _source(found(tmp_path, rope={"bend": 1e-3}), None, Path("model.json"))[0].rope == rope
+
+
+def test_trajectories_of_other_scenes_are_not_compared_with_policies(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setitem(envs.TASKS, "lead", Lead)
+    task = Lead()
+    spec = PolicySpec(task_features(task), 3, task="lead", reach=task.max_translation, turns=3)
+    save_policy(Policy(spec), tmp_path / "policy.pt")
+    for choices, said in (({"grasps": [6]}, "other grasps"), ({"rope": {"bend": 1e-3}}, "another rope")):
+        with pytest.raises(InputError, match=f"found with {said}"):
+            _perturb([tmp_path], None, found(tmp_path, **choices), 1, 0, tmp_path, False)
+        with pytest.raises(InputError, match=f"found with {said}"):
+            make_demonstrator(task, str(tmp_path / "trajectory.json"))

@@ -434,7 +434,7 @@ def _perturb(
     from torchdlo.agents.rl import robustness
     from torchdlo.agents.rl.expert import candidate_experts, load_expert
     from torchdlo.agents.rl.results import load_policies
-    from torchdlo.agents.trajopt.search_result import load_actions
+    from torchdlo.agents.trajopt.search_result import check_scene, load_actions
     from torchdlo.agents.trajopt.task_problem import TaskProblem
     from torchdlo.envs import find_stored
 
@@ -444,6 +444,7 @@ def _perturb(
         raise InputError(f"{policies[0]}: it sees clouds of points; leave out --perturb, cameras are what is varied.")
     task, actors = find_stored(name, policies[0], given), {}
     if trajectory is not None:
+        check_scene(trajectory)  # the policies' is the one in which all are compared
         problem = TaskProblem(task, execution="eager")
         actors["trajectory replayed"] = robustness.replaying(problem.full(load_actions(trajectory, problem)))
         for expert in candidate_experts(task, [trajectory])[:1]:
