@@ -24,7 +24,7 @@ from torchdlo.agents.policies import Policy, PolicySpec, save_policy, task_featu
 from torchdlo.cli import app
 from torchdlo.cli.policies import _perturb
 from torchdlo.cli.policy_deployment import _source
-from torchdlo.coupling.robot.robot_kinematics import panda, tool_pose
+from torchdlo.coupling.robot.robot_kinematics import load_robot, panda, tool_pose
 from torchdlo.envs.core.task import straight
 from torchdlo.errors import InputError
 
@@ -93,6 +93,40 @@ def test_a_path_out_of_reach_is_refused(path):
     far = path | {"pos": path["pos"] + 3}
     with pytest.raises(InputError, match="cannot get to point 0"):
         time_scale(Lead(), arms_of(Lead()), far, same=False)
+
+
+def gantry(limit: str = 'lower="-5" upper="5" velocity="1"', turn: str = "0 0 0", after: str = "") -> str:
+    """An arm of three slides along x, y and z, whose tool is turned as it is; `after` is what else it has."""
+    links = '<link name="tool"/>' + "".join(f'<link name="link{k}"/>' for k in range(4))
+    slides = "".join(
+        f'<joint name="slide{k}" type="prismatic"><parent link="link{k}"/><child link="link{k + 1}"/>'
+        f'<axis xyz="{axis}"/><limit {limit} effort="1"/></joint>'
+        for k, axis in enumerate(("1 0 0", "0 1 0", "0 0 1"))
+    )
+    hand = f'<parent link="link3"/><child link="tool"/><origin rpy="{turn}"/>'
+    return f'<robot name="gantry">{links}{slides}<joint name="hand" type="fixed">{hand}</joint>{after}</robot>'
+
+
+def of_gantry(path: dict[str, torch.Tensor], **choices: str) -> JointMotion:
+    """How it moves along the path, with its tool turned as the arm of the simulation has it."""
+    quat = path["quat"][:1, 0]
+    path = path | {"quat": quat.expand(len(path["pos"]), 1, 4)}
+    robot = load_robot(gantry(**choices), tool="tool", base=Lead.arms.base[0])
+    return time_scale(Lead(), [robot], path, same=False)
+
+
+def test_tools_that_cannot_be_turned_as_they_should_be_are_refused(path):
+    # Tools of the task point down, half a turn about an axis that lies flat.
+    down = torch.tensor(Lead().arms.quats[0], dtype=torch.float64)
+    assert abs(float(down[0])) < 1e-6 and abs(float(down[3])) < 1e-6
+    yaw = 2 * math.atan2(float(down[2]), float(down[1]))
+    right = f"{math.pi} 0 {yaw}"
+    motion = of_gantry(path, turn=right)
+    full = path["pos"][:, 0] - torch.tensor(Lead.arms.base[0], dtype=torch.float64)
+    torch.testing.assert_close(motion.position, full, atol=1e-3, rtol=0)
+    for turn, off in (("0 0 0", 180), (f"{math.pi} 0 {yaw + math.radians(20)}", 20)):
+        with pytest.raises(InputError, match=f"mm and {off} degrees; place"):
+            of_gantry(path, turn=turn)
 
 
 def test_the_simulator_plays_what_was_written(path):

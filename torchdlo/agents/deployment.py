@@ -35,6 +35,8 @@ FORMATS = ("csv", "json", "ros2")
 _SEARCH = inverse_kinematics.IkSearch(starts=8)
 _NEAR = 1e-3
 """How far a tool may be from where it should be [m]."""
+_ALIGNED = 1e-2
+"""How far a tool may be turned from how it should be [rad]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,11 +102,12 @@ def _joints(robot: Robot, tools: Pose, known: Tensor | None) -> Tensor:
         search = _SEARCH if k == 0 else inverse_kinematics.IkSearch()
         found = inverse_kinematics.solve_ik(robot, target, last, search=search)
         last = found.joints
-        off = float((tool_pose(robot, last).pos - target.pos).norm())
-        if off > _NEAR:
+        off, turned = found.missing[0].tolist()
+        if not (off <= _NEAR and turned <= _ALIGNED):
             raise InputError(
-                f"{robot.name}: its tool cannot get to point {k} of the path, by {1e3 * off:.0f} mm; place its base "
-                "elsewhere, or choose another --tool."
+                f"{robot.name}: its tool cannot get to point {k} of the path turned as it has to be, by "
+                f"{1e3 * off:.0f} mm and {math.degrees(turned):.0f} degrees; place its base elsewhere, or choose another "
+                "--tool: one whose z points out of the hand."
             )
         rows.append(last[0])
     return torch.stack(rows)
