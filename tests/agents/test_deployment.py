@@ -62,17 +62,74 @@ def test_speeds_and_accelerations_stay_within_their_limits(path):
     steps = motion.position.diff(dim=0) / motion.time.diff()[:, None]
     assert (steps.abs() <= 0.5 * limit * (1 + 1e-9)).all()
     assert (motion.velocity.abs() <= 0.5 * limit * (1 + 1e-9)).all()
-    assert float(motion.acceleration.abs().max()) <= 10.0 * (1 + 1e-9)
+    assert motion.acceleration is not None and float(motion.acceleration.abs().max()) <= 10.0 * (1 + 1e-9)
     assert (motion.velocity[0] == 0).all() and (motion.velocity[-1] == 0).all()
     assert float(motion.time[-1]) == pytest.approx(6 * 0.002 * motion.slower)
 
 
-def test_velocities_are_central_differences():
-    x = torch.tensor([[0.0], [1.0], [4.0], [9.0]], dtype=torch.float64)
-    velocity, bend = deployment._derivatives(x, 1.0)
-    assert velocity.flatten().tolist() == [0, 2, 4, 0]
-    # 1 - 0, second differences of squares, and back to rest.
-    assert bend.flatten().tolist() == [1, 2, 2, -5]
+def played(motion: JointMotion, order: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Positions, velocities and accelerations between points, as a controller has them: cubics (4) or quintics (6)."""
+    step, share = float(motion.time[1] - motion.time[0]), torch.linspace(0, 1, 101, dtype=torch.float64)
+
+    def powers(u: torch.Tensor, times: int) -> torch.Tensor:
+        """Derivatives of 1, u, u^2 ... by time, shape (..., order)."""
+        rows = [math.prod(range(n - times + 1, n + 1)) * u ** max(0, n - times) for n in range(order)]
+        return torch.stack(rows, -1) / step**times
+
+    told = [motion.position, motion.velocity, motion.acceleration][: order // 2]
+    ends = torch.stack([powers(torch.tensor(u, dtype=torch.float64), d) for u in (0.0, 1.0) for d in range(len(told))])
+    known = torch.stack([x for part in (slice(None, -1), slice(1, None)) for x in (y[part] for y in told)])
+    solved = torch.linalg.solve(ends, known.flatten(1)).reshape(order, *known.shape[1:])
+    return tuple(torch.einsum("un,nkj->ukj", powers(share, d), solved) for d in range(3))
+
+
+def along(shares: torch.Tensor, joint: int = 0, to: str = "velocity") -> JointMotion:
+    """How the arm is told to move one joint: by shares of its greatest speed per action, or up to its limit."""
+    robot = arms_of(Lead())[0]
+    joints = 0.5 * (robot.lower + robot.upper).expand(len(shares), -1).clone()
+    if to == "velocity":
+        joints[:, joint] += 2e-3 * robot.velocity[joint] * shares
+    else:
+        joints[:, joint] = robot.upper[joint] - shares
+    none = torch.zeros(len(shares), 1, 4, dtype=torch.float64)
+    return time_scale(Lead(), [robot], {"pos": none[..., :3], "quat": none, "joints": joints[:, None]}, same=True)
+
+
+@pytest.mark.parametrize("order", [4, 6])
+@pytest.mark.parametrize("bent", [False, True])
+def test_limits_hold_for_what_controllers_make_of_the_points(order: int, bent: bool):
+    """One joint begins at once at half of its greatest speed, and ends so; or goes to and fro."""
+    shares = torch.arange(40, dtype=torch.float64)
+    motion = along(8 * (0.7 * shares).sin() if bent else 0.5 * shares)
+    position, velocity, acceleration = played(motion, order)
+    limit = panda().velocity[0]
+    assert motion.acceleration is not None and motion.slower > 1
+    assert float(acceleration.abs().max()) == pytest.approx(10, rel=1e-6)
+    assert float(velocity.abs().amax((0, 1))[0] / limit) <= 1 + 1e-9
+    torch.testing.assert_close(position[-1], motion.position[1:], rtol=0, atol=1e-12)
+    assert not motion.velocity[[0, -1]].any()
+
+
+def test_the_greatest_speed_may_be_between_points():
+    robot = arms_of(Lead())[0]
+    x = 0.01 * torch.tensor([0.0, 1, 2, 3, 3, 3], dtype=torch.float64)[:, None].expand(-1, 7)
+    motion = JointMotion((), 0.02 * torch.arange(6.0), x, deployment._velocities(robot, x, 0.02)[0], None, 1.0)
+    velocity = played(motion, 4)[1]
+    assert float(velocity.abs().max()) > 1.02 * float(motion.velocity.abs().max())
+    fastest = deployment._fastest(x, motion.velocity, 0.02)
+    torch.testing.assert_close(velocity.abs().amax((0, 1)), fastest, rtol=1e-3, atol=0)
+
+
+def test_joints_that_stop_at_a_limit_do_not_swing_beyond_it():
+    motion = along(torch.tensor([0.03, 0.03, 0.02, 0.01, 0, 0, 0, 0.01], dtype=torch.float64), joint=1, to="limit")
+    position, _, acceleration = played(motion, 4)
+    assert float(position[..., 1].max()) <= float(panda().upper[1]) + 1e-12
+    assert float(acceleration.abs().max()) == pytest.approx(10, rel=1e-6)
+    # Accelerations differ before and after a point: controllers are left with cubics.
+    assert motion.acceleration is None
+    assert "acceleration" not in json.loads(motion_text(motion, "json", {}))
+    ros = json.loads(motion_text(motion, "ros2", {}))["points"]
+    assert len(ros) == 8 and ros[3]["accelerations"] == [] and len(ros[3]["velocities"]) == 7
 
 
 def test_joints_beyond_their_limits_are_named(path):
