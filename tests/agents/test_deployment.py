@@ -164,6 +164,14 @@ def gantry(limit: str = 'lower="-5" upper="5" velocity="1"', turn: str = "0 0 0"
     return f'<robot name="gantry">{links}{slides}<joint name="hand" type="fixed">{hand}</joint>{after}</robot>'
 
 
+def hanging(off: float = 0.0) -> str:
+    """The turn of a tool as the task has it, and so many degrees about the vertical."""
+    # It points down: half a turn about an axis that lies flat.
+    down = Lead().arms.quats[0]
+    assert abs(down[0]) < 1e-6 and abs(down[3]) < 1e-6
+    return f"{math.pi} 0 {2 * math.atan2(down[2], down[1]) + math.radians(off)}"
+
+
 def of_gantry(path: dict[str, torch.Tensor], **choices: str) -> JointMotion:
     """How it moves along the path, with its tool turned as the arm of the simulation has it."""
     quat = path["quat"][:1, 0]
@@ -173,17 +181,39 @@ def of_gantry(path: dict[str, torch.Tensor], **choices: str) -> JointMotion:
 
 
 def test_tools_that_cannot_be_turned_as_they_should_be_are_refused(path):
-    # Tools of the task point down, half a turn about an axis that lies flat.
-    down = torch.tensor(Lead().arms.quats[0], dtype=torch.float64)
-    assert abs(float(down[0])) < 1e-6 and abs(float(down[3])) < 1e-6
-    yaw = 2 * math.atan2(float(down[2]), float(down[1]))
-    right = f"{math.pi} 0 {yaw}"
-    motion = of_gantry(path, turn=right)
+    motion = of_gantry(path, turn=hanging())
     full = path["pos"][:, 0] - torch.tensor(Lead.arms.base[0], dtype=torch.float64)
     torch.testing.assert_close(motion.position, full, atol=1e-3, rtol=0)
-    for turn, off in (("0 0 0", 180), (f"{math.pi} 0 {yaw + math.radians(20)}", 20)):
+    for turn, off in (("0 0 0", 180), (hanging(20), 20)):
         with pytest.raises(InputError, match=f"mm and {off} degrees; place"):
             of_gantry(path, turn=turn)
+
+
+def mimicking(limit: str, mimic: str) -> str:
+    """A slide that carries nothing and goes as the third one of `gantry` does."""
+    return (
+        '<link name="other"/><joint name="other" type="prismatic"><parent link="link3"/><child link="other"/>'
+        f'<axis xyz="0 0 1"/><limit {limit} effort="1"/><mimic joint="slide2" {mimic}/></joint>'
+    )
+
+
+def test_arms_without_speed_are_refused(path):
+    yaw = hanging()
+    for velocity in ("0", "-1e-3"):
+        with pytest.raises(InputError, match="joint slide0, or one that mimics it, has a greatest speed of"):
+            of_gantry(path, turn=yaw, limit=f'lower="-5" upper="5" velocity="{velocity}"')
+
+
+def test_limits_of_joints_that_mimic_others_hold(path):
+    """The tool stays 50 mm high and goes 25 mm to the side; the third slide stands still, and others follow it."""
+    near = {"lower": -1e-3, "upper": 1e-3, "velocity": 1e-3}
+    limit = " ".join(f'{name}="{value}"' for name, value in near.items())
+    with pytest.raises(InputError, match="its tool cannot get to point 0"):
+        of_gantry(path, turn=hanging(), after=mimicking(limit, 'multiplier="1"'))
+    # An offset of -50 mm, and of 50 mm for one that goes the other way, leave the place where it is within its limits.
+    for mimic in ('multiplier="1" offset="-0.05"', 'multiplier="-1" offset="0.05"'):
+        motion = of_gantry(path, turn=hanging(), after=mimicking(limit, mimic))
+        assert float(motion.position[:, 2].sub(0.05).abs().max()) < 1e-3
 
 
 def test_the_simulator_plays_what_was_written(path):

@@ -144,6 +144,7 @@ def time_scale(
     names, columns, velocities, limits = [], [], [], []
     smooth, step = True, 1e-3 * task.frame_skip
     for k, robot in enumerate(robots):
+        _check_speeds(robot)
         tools = Pose(path["pos"][:, k], path["quat"][:, k])
         found = _joints(robot, tools, path["joints"][:, k] if same else None)[:, robot.arm]
         _check(robot, found)
@@ -159,6 +160,15 @@ def time_scale(
     time = slower * step * torch.arange(len(position), dtype=position.dtype)
     bend = torch.cat([bends[0], bends[1][-1:]]) / slower**2 if smooth else None
     return JointMotion(tuple(names), time, position, velocity / slower, bend, slower)
+
+
+def _check_speeds(robot: Robot) -> None:
+    for joint in robot.arm:
+        if not float(robot.velocity[joint]) > 0:
+            raise InputError(
+                f"{robot.name}: joint {robot.joints[joint]}, or one that mimics it, has a greatest speed of "
+                f"{float(robot.velocity[joint]):g}; give velocity= of its <limit> a positive number [rad/s or m/s]."
+            )
 
 
 def _velocities(robot: Robot, x: Tensor, step: float) -> tuple[Tensor, bool]:

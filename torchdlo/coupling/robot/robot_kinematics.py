@@ -34,11 +34,11 @@ class Robot:
     tool: str
     """The link whose pose is commanded."""
     lower: Tensor
-    """Least joint positions [rad or m], shape (J,)."""
+    """Least joint positions [rad or m], shape (J,); with them, joints that mimic others are within their limits, too."""
     upper: Tensor
-    """Greatest joint positions [rad or m], shape (J,)."""
+    """Greatest joint positions [rad or m], shape (J,), likewise."""
     velocity: Tensor
-    """Greatest joint speeds [rad/s or m/s], shape (J,)."""
+    """Greatest joint speeds [rad/s or m/s], shape (J,), likewise."""
     moved: tuple[int, ...]
     """Which of the moving joints, commanded or mimicking, move the tool."""
     turning: Tensor
@@ -112,9 +112,7 @@ def load_robot(
         tuple(j.name for j in leaders),
         links,
         tool,
-        number([j.lower for j in leaders]),
-        number([j.upper for j in leaders]),
-        number([j.velocity for j in leaders]),
+        *(number(column) for column in zip(*(_limits(said.name, j, moving) for j in leaders), strict=True)),
         moved,
         number([float(j.kind == "revolute") for j in moving]),
         number([j.axis for j in moving]),
@@ -127,6 +125,23 @@ def load_robot(
         Pose(number(base), quat / quat.norm()),
         _chain(said.joints),
     )
+
+
+def _limits(name: str, leader: urdf.Joint, moving: list[urdf.Joint]) -> tuple[float, float, float]:
+    """Return the least and the greatest position and the greatest speed of a joint and of those that mimic it."""
+    lower, upper, velocity = leader.lower, leader.upper, leader.velocity
+    for joint in moving:
+        if joint.mimics != leader.name or joint.factor == 0:
+            continue
+        ends = [(end - joint.offset) / joint.factor for end in (joint.lower, joint.upper)]
+        lower, upper = max(lower, min(ends)), min(upper, max(ends))
+        velocity = min(velocity, joint.velocity / abs(joint.factor))
+    if lower > upper:
+        raise InputError(
+            f"{name}: joint {leader.name!r} and those that mimic it have limits that nowhere hold together; check "
+            "their <limit>, and the sign of multiplier= in <mimic>."
+        )
+    return lower, upper, velocity
 
 
 def panda(
