@@ -34,7 +34,7 @@ class Robot:
     tool: str
     """The link whose pose is commanded."""
     lower: Tensor
-    """Least joint positions [rad or m], shape (J,); with them, joints that mimic others are within their limits, too."""
+    """Least joint positions [rad or m], shape (J,), within which those that mimic these hold their own, too."""
     upper: Tensor
     """Greatest joint positions [rad or m], shape (J,), likewise."""
     velocity: Tensor
