@@ -308,9 +308,9 @@ def evaluate(
 
     quiet_torchrl()
     if len(policies) == 1 and _sees(policies[0]):
-        if film or execution:
-            raise InputError(f"{policies[0]}: it is a policy of learn; --film and --execution are for those of train.")
-        _evaluate_seeing(policies[0], task or [], starts, protocol or ["varied"], out, as_json)
+        only = {"--film": film, "--execution": execution, "--perturb": perturb, "--trajectory": trajectory}
+        _refuse(only, f"{policies[0]}: it is a policy of learn, and {{}} for those of train; leave it out.")
+        _evaluate_seeing(policies[0], task or [], starts, protocol or ["varied"], reset_seed, out, as_json)
         return
     if len(task or []) > 1:
         raise InputError("--task: policies of train have one task; give it once, or leave it out.")
@@ -324,6 +324,8 @@ def evaluate(
     if trajectory and not perturb:
         raise InputError("--trajectory: it is compared with policies under perturbations; give --perturb as well.")
     if perturb:
+        only = {"--film": film, "--protocol": protocol, "--execution": execution}
+        _refuse(only, "--perturb: it has protocols of its own, and {} not for it; leave it out.")
         _perturb(policies, given, trajectory, starts, reset_seed, out, as_json)
         return
     check_writable(out / "evaluation.json")
@@ -335,7 +337,7 @@ def evaluate(
     found, name = load_policies(policies)
     own, how = find_stored(name, policies[0], given), execution_choice(execution)
     if any(isinstance(policy, CloudPolicy) for policy in found):
-        _judge_student(policies, found, own, starts, reset_seed, out, film or bool(protocol), as_json)
+        _judge_student(policies, found, own, starts, reset_seed, out, film or bool(protocol or execution), as_json)
         return
     with progress() as show, deferred_interrupt(show) as callback:
         results, plays = judge(
@@ -358,6 +360,13 @@ def evaluate(
         typer.echo(content)
 
 
+def _refuse(options: dict[str, Any], sentence: str) -> None:
+    """Refuse options that were given and would be passed over; the sentence has a place for "X is" or "X, Y are"."""
+    given = [name for name, value in options.items() if value]
+    if given:
+        raise InputError(sentence.format(f"{', '.join(given)} {'is' if len(given) == 1 else 'are'}"))
+
+
 def _sees(policy: Path) -> bool:
     """Return whether a file holds a policy of learn."""
     from torchdlo.agents.policies.chunk_policy import is_chunk_policy
@@ -366,7 +375,7 @@ def _sees(policy: Path) -> bool:
 
 
 def _evaluate_seeing(
-    policy: Path, tasks: list[str], starts: int, protocols: list[str], out: Path | None, as_json: bool
+    policy: Path, tasks: list[str], starts: int, protocols: list[str], seed: int, out: Path | None, as_json: bool
 ) -> None:
     """Judge a policy that sees, and write what it came to beside it."""
     from torchdlo.agents.data.painting import TaskPainter
@@ -375,7 +384,7 @@ def _evaluate_seeing(
     file = (out or policy.parent) / "evaluation.json"
     check_writable(file)
     with progress() as show, deferred_interrupt(show) as callback:
-        found = judge(policy, tasks, TaskPainter(), episodes=starts, conditions=protocols, callback=callback)
+        found = judge(policy, tasks, TaskPainter(), episodes=starts, seed=seed, conditions=protocols, callback=callback)
     content = json.dumps({"generator": "torchdlo evaluate"} | found, indent=1)
     write_atomically(file, content + "\n")
     for name, rows in found["tasks"].items():
@@ -402,7 +411,7 @@ def _judge_student(
     if len(found) > 1 or other:
         raise InputError(
             f"{paths[0]}: it sees clouds of points, and is judged alone, from unseen starts, by cameras; leave out "
-            "other policies, --protocol and --film."
+            "other policies, --protocol, --film and --execution."
         )
     with progress() as show, deferred_interrupt(show) as callback:
         results = judge_student(found[0], task, starts=starts, seed=seed, callback=callback)
