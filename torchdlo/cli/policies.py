@@ -474,21 +474,20 @@ def _perturb(
 
 
 def _films(task: Task, plays: dict[str, Any], out: Path) -> list[Path]:
-    """Film the best and the worst episode; each is played again alone, with the actions that were taken."""
+    """Film the best and the worst episode; each is played again alone in its scene, with the actions that were taken."""
     import torch
 
-    from torchdlo.envs.core import episode
+    from torchdlo.agents.rl.evaluate import judged_episode
     from torchdlo.report.render.episode_film import film
     from torchdlo.report.render.video_writer import write_video
 
     success, returns = plays["success"].flatten(), plays["returns"].flatten()
     order = sorted(range(len(success)), key=lambda k: (bool(success[k]), float(returns[k])))
-    actions, moved = plays["actions"].flatten(0, 1), plays["moved"].flatten(0, 1)
     files = []
     for name, k in {"best.mp4": order[-1], "worst.mp4": order[0]}.items():
         with torch.no_grad():
-            made = episode.prepare_at(task, moved[k : k + 1], execution="recorded")
-            frames, _ = film(task, actions[k], made=made)
+            made, actions = judged_episode(task, plays, k)
+            frames, _ = film(made.task, actions, made=made)
         with progress() as show, deferred_interrupt(show) as callback:
             write_video(frames, out / name, speed=0.5, callback=callback)
         files.append(out / name)
