@@ -474,7 +474,7 @@ def _perturb(
 
 
 def _films(task: Task, plays: dict[str, Any], out: Path) -> list[Path]:
-    """Film the best and the worst episode; each is played again alone in its scene, with the actions that were taken."""
+    """Film the best and the worst episode; each is played again alone, in its scene and with its actions."""
     import torch
 
     from torchdlo.agents.rl.evaluate import judged_episode

@@ -190,7 +190,8 @@ def make(
         num_envs: scenes in the batch.
         device: where they live.
         dtype: precision of the physics; observations and rewards are in single precision.
-        seed: of the starts and of what is randomised; None draws one from torch's generator (`torch.manual_seed`).
+        seed: of the starts and of what is randomised; None draws one from torch's generator (`torch.manual_seed`). In
+            other processes than the main one, those of `ParallelEnv` too, None begins differently each time.
         gradients: whether rewards and observations carry gradients to actions.
         execution: how steps run: "compiled", minutes at first, then about three times as fast, with gradients too;
             "recorded", seconds at first, then two to three times as fast without gradients; or "eager", at once.

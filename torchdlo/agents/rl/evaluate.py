@@ -54,8 +54,8 @@ def judge_policies(
 ) -> dict[str, dict[str, Any]]:
     """Return how policies do, all in one batch: by protocol what became of all episodes, (policies, starts, ...).
 
-    With "actions", "moved" and "effects", the numbers of effects where they were drawn, `judged_episode` makes an episode
-    again.
+    With "actions", "moved" and "effects" of it, the numbers of effects where they were drawn, `judged_episode` makes an
+    episode again.
 
     Policies take the middle of what they could do. From the one start, each has one episode: others would be the same.
 
