@@ -340,15 +340,8 @@ def evaluate(
         _judge_student(policies, found, own, starts, reset_seed, out, film or bool(protocol or execution), as_json)
         return
     with progress() as show, deferred_interrupt(show) as callback:
-        results, plays = judge(
-            found,
-            own,
-            starts=starts,
-            protocols=names,
-            seed=reset_seed,
-            callback=callback,
-            execution=how,
-        )
+        how_many: dict[str, Any] = {"starts": starts, "protocols": names, "seed": reset_seed}
+        results, plays = judge(found, own, callback=callback, execution=how, **how_many)
     content = json.dumps({"generator": "torchdlo evaluate", "files": [str(p) for p in policies]} | results, indent=1)
     write_atomically(out / "evaluation.json", content + "\n")
     typer.echo(evaluation_summary(results), err=as_json)
