@@ -308,8 +308,8 @@ def evaluate(
 
     quiet_torchrl()
     if len(policies) == 1 and _sees(policies[0]):
-        only = {"--film": film, "--execution": execution, "--perturb": perturb, "--trajectory": trajectory}
-        _refuse(only, f"{policies[0]}: it is a policy of learn, and {{}} for those of train; leave it out.")
+        said = f"{policies[0]}: it is a policy of learn, and {{}} for those of train; leave it out."
+        _refuse(said, film=film, execution=execution, perturb=perturb, trajectory=trajectory)
         _evaluate_seeing(policies[0], task or [], starts, protocol or ["varied"], reset_seed, out, as_json)
         return
     if len(task or []) > 1:
@@ -324,8 +324,8 @@ def evaluate(
     if trajectory and not perturb:
         raise InputError("--trajectory: it is compared with policies under perturbations; give --perturb as well.")
     if perturb:
-        only = {"--film": film, "--protocol": protocol, "--execution": execution}
-        _refuse(only, "--perturb: it has protocols of its own, and {} not for it; leave it out.")
+        said = "--perturb: it has protocols of its own, and {} not for it; leave it out."
+        _refuse(said, film=film, protocol=protocol, execution=execution)
         _perturb(policies, given, trajectory, starts, reset_seed, out, as_json)
         return
     check_writable(out / "evaluation.json")
@@ -353,11 +353,11 @@ def evaluate(
         typer.echo(content)
 
 
-def _refuse(options: dict[str, Any], sentence: str) -> None:
+def _refuse(sentence: str, **options: object) -> None:
     """Refuse options that were given and would be passed over; the sentence has a place for "X is" or "X, Y are"."""
-    given = [name for name, value in options.items() if value]
+    given = [f"--{name}" for name, value in options.items() if value]
     if given:
-        raise InputError(sentence.format(f"{', '.join(given)} {'is' if len(given) == 1 else 'are'}"))
+        raise InputError(sentence.replace("{}", f"{', '.join(given)} {'is' if len(given) == 1 else 'are'}"))
 
 
 def _sees(policy: Path) -> bool:

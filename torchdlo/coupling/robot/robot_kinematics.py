@@ -103,6 +103,7 @@ def load_robot(
     if not moved:
         raise InputError(f"{said.name}: no joint moves the link {tool!r}; choose another tool.")
     leaders = [j for j in moving if not j.mimics]
+    limits = [_limits(said.name, j, moving) for j in leaders]
     mix = [[(j.factor if j.mimics else 1.0) * ((j.mimics or j.name) == k.name) for k in leaders] for j in moving]
     links = (said.joints[0].parent, *(j.child for j in said.joints))
     number = functools.partial(torch.as_tensor, dtype=torch.float64)
@@ -112,7 +113,9 @@ def load_robot(
         tuple(j.name for j in leaders),
         links,
         tool,
-        *(number(column) for column in zip(*(_limits(said.name, j, moving) for j in leaders), strict=True)),
+        number([low for low, _, _ in limits]),
+        number([high for _, high, _ in limits]),
+        number([speed for _, _, speed in limits]),
         moved,
         number([float(j.kind == "revolute") for j in moving]),
         number([j.axis for j in moving]),
