@@ -363,22 +363,22 @@ def _trajectory(folder: Path) -> None:
     problem = TaskProblem(find("lifting"), execution="eager")
     actions = np.full((problem.horizon, problem.width), 0.01)
     tool = np.zeros((problem.horizon, problem.task.arms.count, 3)).tolist()
-    choices = {"double": False, "execution": "compiled", "rope": None, "grasps": [3, None]}
+    choices = {"double": False, "execution": "compiled", "rope": None, "grasps": None}
+    choices |= {"fidelity": {"step": 0.002, "substeps": 1, "integrator": "implicit"}}
     content = {"generator": "torchdlo optimize", "task": "lifting", "choices": choices, "return": 1.0, "success": True}
     (folder / "trajectory.json").write_text(json.dumps(content | {"actions": actions.tolist(), "tool": tool}))
 
 
 def _read_trajectory(folder: Path) -> Any:
     from torchdlo.agents.data.demonstrators import trajectory_demonstrator
-    from torchdlo.agents.trajopt import script
     from torchdlo.agents.trajopt.search_result import load_actions
-    from torchdlo.agents.trajopt.task_problem import TaskProblem
+    from torchdlo.agents.trajopt.task_problem import TaskProblem, trajectory_problem
     from torchdlo.envs import find
 
     path, task = folder / "trajectory.json", find("lifting")
     return (
         load_actions(path, TaskProblem(task, execution="eager")),
-        script._choices(path),
+        trajectory_problem(path, task).choices,
         trajectory_demonstrator(task, path),
     )
 

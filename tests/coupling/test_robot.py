@@ -97,6 +97,18 @@ def test_both_fingers_open_by_one_number():
         assert float((left - right).norm()) == pytest.approx(2 * opening, abs=1e-12)
 
 
+def test_limits_of_mimic_joints_bind_the_joint_that_they_follow():
+    """The follower is at -2 q + 0.05, from -0.02 to 0.03, with |2 v| up to 1."""
+    text = SLIDER.replace('lower="-1" upper="1"', 'lower="-0.02" upper="0.03"')
+    made = robot.load_robot(text, tool="twin")
+    assert (float(made.lower[1]), float(made.upper[1])) == pytest.approx((0.01, 0.035))
+    assert float(made.velocity[1]) == 0.5
+    # The other joint has none that mimics it, and wide limits bind nothing.
+    assert not torch.isfinite(made.lower[0]) and robot.load_robot(SLIDER, tool="twin").upper[1] == 0.2
+    with pytest.raises(InputError, match="'slide' and those that mimic it have limits that nowhere hold together"):
+        robot.load_robot(text.replace('offset="0.05"', 'offset="-5"'), tool="twin")
+
+
 def test_a_mimic_joint_follows_with_factor_and_offset():
     made = robot.load_robot(SLIDER, tool="twin")
     assert made.joints == ("turn", "slide")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import multiprocessing
 import subprocess
 import sys
 
@@ -33,6 +34,38 @@ def made(name: str = "unknotting", horizon: int = 2, **choices):
 @pytest.mark.parametrize("name", TASKS)
 def test_specs_say_what_environments_return(name: str):
     check_env_specs(made(name, variation=False))
+
+
+def _begun_elsewhere(seed: int | None) -> list[list[float]]:
+    """How far things are off their places in three processes that are forked off this one."""
+    reader, writer = multiprocessing.get_context("fork").SimpleQueue(), []
+
+    def begin() -> None:
+        env.set_seed(seed)
+        reader.put(env.task.moved(2, generator=env.generator).flatten().tolist())
+
+    env = made()
+    for _ in range(3):
+        writer.append(multiprocessing.get_context("fork").Process(target=begin))
+        writer[-1].start()
+    found = [reader.get() for _ in writer]
+    for process in writer:
+        process.join()
+    return found
+
+
+def test_environments_of_other_processes_begin_differently_without_a_seed():
+    one, other, third = _begun_elsewhere(None)
+    assert one != other and other != third and one != third
+    assert _begun_elsewhere(3) == [made(seed=3).task.moved(2, generator=made(seed=3).generator).flatten().tolist()] * 3
+    # Here it is torch's generator that decides.
+    seeds = []
+    for _ in range(2):
+        torch.manual_seed(5)
+        env = made()
+        env.set_seed(None)
+        seeds.append(env.generator.initial_seed())
+    assert seeds[0] == seeds[1]
 
 
 def test_the_seed_decides_starts_and_what_follows():

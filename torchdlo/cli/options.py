@@ -13,6 +13,7 @@ if TYPE_CHECKING:
 __all__ = [
     "ExecutionOption",
     "ModelOption",
+    "OwnTaskOption",
     "PhotoOption",
     "RecordingArgument",
     "ResumeOption",
@@ -37,6 +38,10 @@ RopeModelOption = Annotated[
     typer.Option(
         "--rope-model", help="What ropes are made of: model.json of a calibration or diagnosis.", metavar="MODEL"
     ),
+]
+OwnTaskOption = Annotated[
+    str | None,
+    typer.Option("--task", help="Where the task is, if it is one of your own.", metavar="FILE.py:CLASS"),
 ]
 ExecutionOption = Annotated[
     str | None,

@@ -279,7 +279,11 @@ def evaluate(
     ] = None,
     task: Annotated[
         list[str] | None,
-        typer.Option(help="Of policies of learn: a task; all that it has learned if none is named.", metavar="NAME"),
+        typer.Option(
+            help="Of policies of learn: a task; all that it has learned if none is named. Of others: where the task of "
+            "your own is, as FILE.py:CLASS.",
+            metavar="NAME",
+        ),
     ] = None,
     reset_seed: Annotated[
         int, typer.Option(min=0, help="Seed of the unseen starts: another one for starts that no judgement has seen.")
@@ -320,16 +324,17 @@ def evaluate(
     from torchdlo.agents.rl.evaluate import PROTOCOLS
     from torchdlo.agents.rl.evaluate import evaluate_policies as judge
     from torchdlo.agents.rl.results import evaluation_summary, load_policies
-    from torchdlo.envs import find
+    from torchdlo.envs import find_stored
 
     quiet_torchrl()
     if len(policies) == 1 and _sees(policies[0]):
-        if film or execution:
-            raise InputError(f"{policies[0]}: it is a policy of learn; --film and --execution are for those of train.")
-        _evaluate_seeing(policies[0], task or [], starts, protocol or ["varied"], out, as_json)
+        said = f"{policies[0]}: it is a policy of learn, and {{}} for those of train; leave it out."
+        _refuse(said, film=film, execution=execution, perturb=perturb, trajectory=trajectory)
+        _evaluate_seeing(policies[0], task or [], starts, protocol or ["varied"], reset_seed, out, as_json)
         return
-    if task:
-        raise InputError("--task: policies of train have one task of their own; leave it out.")
+    if len(task or []) > 1:
+        raise InputError("--task: policies of train have one task; give it once, or leave it out.")
+    given = task[0] if task else None
     names = protocol or ["one", "varied"]
     other = sorted(set(names) - set(PROTOCOLS))
     if other:
@@ -339,7 +344,9 @@ def evaluate(
     if trajectory and not perturb:
         raise InputError("--trajectory: it is compared with policies under perturbations; give --perturb as well.")
     if perturb:
-        _perturb(policies, trajectory, starts, reset_seed, out, as_json)
+        said = "--perturb: it has protocols of its own, and {} not for it; leave it out."
+        _refuse(said, film=film, protocol=protocol, execution=execution)
+        _perturb(policies, given, trajectory, starts, reset_seed, out, as_json)
         return
     check_writable(out / "evaluation.json")
     if film:
@@ -348,20 +355,13 @@ def evaluate(
         for name in ("best.mp4", "worst.mp4"):
             check_video(out / name)
     found, name = load_policies(policies)
-    own, how = find(name), execution_choice(execution)
+    own, how = find_stored(name, policies[0], given), execution_choice(execution)
     if any(isinstance(policy, CloudPolicy) for policy in found):
-        _judge_student(policies, found, own, starts, reset_seed, out, film or bool(protocol), as_json)
+        _judge_student(policies, found, own, starts, reset_seed, out, film or bool(protocol or execution), as_json)
         return
     with progress() as show, deferred_interrupt(show) as callback:
-        results, plays = judge(
-            found,
-            own,
-            starts=starts,
-            protocols=names,
-            seed=reset_seed,
-            callback=callback,
-            execution=how,
-        )
+        how_many: dict[str, Any] = {"starts": starts, "protocols": names, "seed": reset_seed}
+        results, plays = judge(found, own, callback=callback, execution=how, **how_many)
     content = json.dumps({"generator": "torchdlo evaluate", "files": [str(p) for p in policies]} | results, indent=1)
     write_atomically(out / "evaluation.json", content + "\n")
     typer.echo(evaluation_summary(results), err=as_json)
@@ -373,6 +373,13 @@ def evaluate(
         typer.echo(content)
 
 
+def _refuse(sentence: str, **options: object) -> None:
+    """Refuse options that were given and would be passed over; the sentence has a place for "X is" or "X, Y are"."""
+    given = [f"--{name}" for name, value in options.items() if value]
+    if given:
+        raise InputError(sentence.replace("{}", f"{', '.join(given)} {'is' if len(given) == 1 else 'are'}"))
+
+
 def _sees(policy: Path) -> bool:
     """Return whether a file holds a policy of learn."""
     from torchdlo.agents.policies.chunk_policy import is_chunk_policy
@@ -381,7 +388,7 @@ def _sees(policy: Path) -> bool:
 
 
 def _evaluate_seeing(
-    policy: Path, tasks: list[str], starts: int, protocols: list[str], out: Path | None, as_json: bool
+    policy: Path, tasks: list[str], starts: int, protocols: list[str], seed: int, out: Path | None, as_json: bool
 ) -> None:
     """Judge a policy that sees, and write what it came to beside it."""
     from torchdlo.agents.data.painting import TaskPainter
@@ -390,7 +397,7 @@ def _evaluate_seeing(
     file = (out or policy.parent) / "evaluation.json"
     check_writable(file)
     with progress() as show, deferred_interrupt(show) as callback:
-        found = judge(policy, tasks, TaskPainter(), episodes=starts, conditions=protocols, callback=callback)
+        found = judge(policy, tasks, TaskPainter(), episodes=starts, seed=seed, conditions=protocols, callback=callback)
     content = json.dumps({"generator": "torchdlo evaluate"} | found, indent=1)
     write_atomically(file, content + "\n")
     for name, rows in found["tasks"].items():
@@ -417,7 +424,7 @@ def _judge_student(
     if len(found) > 1 or other:
         raise InputError(
             f"{paths[0]}: it sees clouds of points, and is judged alone, from unseen starts, by cameras; leave out "
-            "other policies, --protocol and --film."
+            "other policies, --protocol, --film and --execution."
         )
     with progress() as show, deferred_interrupt(show) as callback:
         results = judge_student(found[0], task, starts=starts, seed=seed, callback=callback)
@@ -435,28 +442,37 @@ def _judge_student(
         typer.echo(content)
 
 
-def _perturb(policies: list[Path], trajectory: Path | None, starts: int, seed: int, out: Path, as_json: bool) -> None:
+def _perturb(
+    policies: list[Path],
+    given: str | None,
+    trajectory: Path | None,
+    starts: int,
+    seed: int,
+    out: Path,
+    as_json: bool,
+) -> None:
     """Judge policies, and the trajectory and the experts behind them, under perturbations."""
     from torchdlo.agents.policies import CloudPolicy
     from torchdlo.agents.rl import robustness
     from torchdlo.agents.rl.expert import candidate_experts, load_expert
     from torchdlo.agents.rl.results import load_policies
-    from torchdlo.agents.trajopt.search_result import load_actions
+    from torchdlo.agents.trajopt.search_result import check_scene, load_actions
     from torchdlo.agents.trajopt.task_problem import TaskProblem
-    from torchdlo.envs import find
+    from torchdlo.envs import find_stored
 
     check_writable(out / "robustness.json")
     found, name = load_policies(policies)
     if any(isinstance(policy, CloudPolicy) for policy in found):
         raise InputError(f"{policies[0]}: it sees clouds of points; leave out --perturb, cameras are what is varied.")
-    task, actors = find(name), {}
+    task, actors = find_stored(name, policies[0], given), {}
     if trajectory is not None:
+        check_scene(trajectory)  # the policies' is the one in which all are compared
         problem = TaskProblem(task, execution="eager")
         actors["trajectory replayed"] = robustness.replaying(problem.full(load_actions(trajectory, problem)))
         for expert in candidate_experts(task, [trajectory])[:1]:
             actors["its path followed"] = robustness.following(expert)
     for policy, path in zip(found, policies, strict=True):
-        folder = path if path.is_dir() else path.parent
+        folder = (path if path.is_dir() else path.parent).resolve()
         if (folder / "expert.json").exists():
             actors[f"expert of {folder.name}"] = robustness.following(load_expert(folder / "expert.json", task))
         actors[f"policy {folder.name}"] = robustness.policy_acting(policy)
@@ -471,21 +487,20 @@ def _perturb(policies: list[Path], trajectory: Path | None, starts: int, seed: i
 
 
 def _films(task: Task, plays: dict[str, Any], out: Path) -> list[Path]:
-    """Film the best and the worst episode; each is played again alone, with the actions that were taken."""
+    """Film the best and the worst episode; each is played again alone, in its scene and with its actions."""
     import torch
 
-    from torchdlo.envs.core import episode
+    from torchdlo.agents.rl.evaluate import judged_episode
     from torchdlo.report.render.episode_film import film
     from torchdlo.report.render.video_writer import write_video
 
     success, returns = plays["success"].flatten(), plays["returns"].flatten()
     order = sorted(range(len(success)), key=lambda k: (bool(success[k]), float(returns[k])))
-    actions, moved = plays["actions"].flatten(0, 1), plays["moved"].flatten(0, 1)
     files = []
     for name, k in {"best.mp4": order[-1], "worst.mp4": order[0]}.items():
         with torch.no_grad():
-            made = episode.prepare_at(task, moved[k : k + 1], execution="recorded")
-            frames, _ = film(task, actions[k], made=made)
+            made, actions = judged_episode(task, plays, k)
+            frames, _ = film(made.task, actions, made=made)
         with progress() as show, deferred_interrupt(show) as callback:
             write_video(frames, out / name, speed=0.5, callback=callback)
         files.append(out / name)

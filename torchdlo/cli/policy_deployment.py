@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from torchdlo.cli.ending import stopped
+from torchdlo.cli.options import OwnTaskOption, RopeModelOption
 from torchdlo.cli.policies import quiet_torchrl
 from torchdlo.cli.progress import deferred_interrupt, progress
 from torchdlo.errors import InputError
@@ -32,6 +33,7 @@ def distill(
     count: Annotated[int | None, typer.Option(min=1, help="Episodes of a round. Default: 64.")] = None,
     updates: Annotated[int | None, typer.Option(min=1, help="Steps of learning after a round. Default: 1000.")] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of everything.")] = 0,
+    own: OwnTaskOption = None,
     resume: Annotated[bool, typer.Option("--resume", help="Go on after the last round that is there.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print how it went as JSON.")] = False,
 ) -> None:
@@ -47,20 +49,22 @@ def distill(
     """
     from torchdlo.agents.policies import CloudPolicy, load_policy
     from torchdlo.agents.rl.student import Student, teach
-    from torchdlo.envs import find
+    from torchdlo.envs import find_stored
 
     quiet_torchrl()
     policy = load_policy(teacher)
     if isinstance(policy, CloudPolicy) or not policy.spec.task:
         raise InputError(f"{teacher}: expected a policy of a task that sees the state, found another one.")
+    task = find_stored(policy.spec.task, teacher, own)
     folder = teacher if teacher.is_dir() else teacher.parent
+    folder = folder if folder.name else folder.resolve()  # the working folder goes by no name
     out = out or folder.with_name(f"{folder.name}-cloud")
     check_writable(out / "student.json")
     given: dict[str, Any] = {"rounds": rounds, "count": count, "updates": updates, "seed": seed}
     plan = Student(**{name: value for name, value in given.items() if value is not None})
     try:
         with progress() as show, deferred_interrupt(show) as callback:
-            _, notes = teach(find(policy.spec.task), policy, folder=out, plan=plan, resume=resume, callback=callback)
+            _, notes = teach(task, policy, folder=out, plan=plan, resume=resume, callback=callback)
     except KeyboardInterrupt:
         raise stopped(f"the rounds that are finished are in {out}", resume=True) from None
     for row in notes["log"]:
@@ -112,6 +116,8 @@ def deploy(
     tool: Annotated[str | None, typer.Option(help="Link of that arm that is the tool.", metavar="LINK")] = None,
     speed: Annotated[float, typer.Option(help="Share of the joints' greatest speeds to use.")] = 1.0,
     acceleration: Annotated[float, typer.Option(help="Greatest acceleration of a joint in rad/s^2.")] = 10.0,
+    own: OwnTaskOption = None,
+    rope_model: RopeModelOption = None,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Play the file in the simulator.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print what it came to as JSON.")] = False,
 ) -> None:
@@ -133,14 +139,15 @@ def deploy(
 
     if kind not in deployment.FORMATS:
         raise InputError(f"--format {kind}: expected one of {', '.join(deployment.FORMATS)}.")
-    task, what = _source(source)
+    task, what = _source(source, own, rope_model)
     folder = source if source.is_dir() else source.parent
     out = out or folder / ("joints.csv" if kind == "csv" else f"joints-{kind}.json")
     marks = {"csv": b"time,", "json": b"torchdlo", "ros2": b"joint_names"}
     check_writable(out, mark=marks[kind])
     robots = deployment.arms_of(task, urdf, tool)
     seeded = torch.Generator().manual_seed(reset_seed or 0)
-    moved = task.moved(1, generator=seeded, variation=reset_seed is not None)
+    like = what.new_zeros(()) if isinstance(what, torch.Tensor) else None  # in the precision of the search
+    moved = task.moved(1, like=like, generator=seeded, variation=reset_seed is not None)
     path, good = deployment.play_motion(task, what, moved)
     motion = deployment.time_scale(task, robots, path, same=urdf is None, share=speed, acceleration=acceleration)
     said: dict[str, Any] = {"task": task.name, "success": good, "slower": motion.slower}
@@ -162,18 +169,22 @@ def deploy(
         typer.echo(json.dumps(said | {"file": str(out)}, indent=1))
 
 
-def _source(path: Path) -> tuple[Task, Any]:
-    """Return the task, and the actions of a trajectory (T, A) or a policy."""
+def _source(path: Path, own: str | None = None, rope_model: Path | None = None) -> tuple[Task, Any]:
+    """Return the task as it was for what was found, and the actions of a trajectory (T, A) or a policy."""
     from torchdlo.agents.policies import CloudPolicy, load_policy
     from torchdlo.agents.trajopt.search_result import load_actions, read_trajectory
-    from torchdlo.agents.trajopt.task_problem import TaskProblem
-    from torchdlo.envs import find
+    from torchdlo.agents.trajopt.task_problem import trajectory_problem
+    from torchdlo.envs import find_stored
+    from torchdlo.scene_files import cable
 
     if path.is_dir() or path.suffix != ".json":
         policy = load_policy(path)
         if isinstance(policy, CloudPolicy):
             raise InputError(f"{path}: it sees clouds of points; deploy the policy of the state that taught it.")
-        return find(policy.spec.task), policy
+        if rope_model is not None:
+            raise InputError("--rope-model: it belongs to trajectories; policies act on the rope of their task.")
+        return find_stored(policy.spec.task, path, own), policy
     name = read_trajectory(path)["task"].text()
-    problem = TaskProblem(find(name), execution="eager")
+    rope = None if rope_model is None else cable(rope_model)
+    problem = trajectory_problem(path, find_stored(name, path, own), rope)
     return problem.task, problem.full(load_actions(path, problem))

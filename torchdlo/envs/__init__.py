@@ -30,6 +30,7 @@ from torchdlo.envs.tasks.wiring_ring import WiringRing
 from torchdlo.envs.tasks.wrapping import Wrapping
 from torchdlo.errors import InputError
 from torchdlo.physics.execution import Execution
+from torchdlo.untrusted import one_line
 
 if TYPE_CHECKING:
     from torchdlo.envs.core.env import DloEnv
@@ -58,6 +59,7 @@ __all__ = [
     "RopeMaterial",
     "Task",
     "find",
+    "find_stored",
     "list_tasks",
     "make",
     "parse_fidelity",
@@ -115,6 +117,34 @@ def find(name: str, rope: RopeMaterial | None = None, grasps: Sequence[int | Non
     return task if grasps is None else dataclasses.replace(task, grasps=tuple(grasps))
 
 
+def find_stored(name: str, where: object, own: str | None = None) -> Task:
+    """Return the task that a file names. It is one of torchdlo's: files are data, and name no code that is to run.
+
+    Args:
+        name: of the task, as the file has it.
+        where: the file, for what is said of it.
+        own: who asks may know better where the task is, such as "FILE.py:CLASS"; its name has to be that of the file.
+
+    Raises:
+        InputError: The name is of no task here, or not that of `own`.
+    """
+    if own is not None:
+        given = find(own)
+        if name not in (given.name, own):
+            raise InputError(
+                f"{one_line(where)}: its task is {one_line(repr(name), 60)}; the task {own} has the name "
+                f"{given.name!r}."
+            )
+        return given
+    known = TASKS | PAIRED_TASKS
+    if not isinstance(name, str) or name not in known:
+        raise InputError(
+            f"{one_line(where)}: its task is {one_line(repr(name), 60)}; expected one of {', '.join(sorted(known))}: "
+            "what a file names is never run. Say where a task of your own is with --task FILE.py:CLASS."
+        )
+    return known[name]()
+
+
 def with_fidelity(task: Task, how: Fidelity | str) -> Task:
     """Return a task in another fidelity; "coarse" is the task's cheaper one."""
     chosen = (task.coarse if how == "coarse" else parse_fidelity(how)) if isinstance(how, str) else how
@@ -160,7 +190,8 @@ def make(
         num_envs: scenes in the batch.
         device: where they live.
         dtype: precision of the physics; observations and rewards are in single precision.
-        seed: of the starts and of what is randomised; None draws one from torch's generator (`torch.manual_seed`).
+        seed: of the starts and of what is randomised; None draws one from torch's generator (`torch.manual_seed`). In
+            other processes than the main one, those of `ParallelEnv` too, None begins differently each time.
         gradients: whether rewards and observations carry gradients to actions.
         execution: how steps run: "compiled", minutes at first, then about three times as fast, with gradients too;
             "recorded", seconds at first, then two to three times as fast without gradients; or "eager", at once.

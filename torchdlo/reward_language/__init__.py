@@ -8,6 +8,6 @@ from __future__ import annotations
 
 from torchdlo.reward_language.expression import Expression, parse
 from torchdlo.reward_language.functions import FUNCTIONS, Function
-from torchdlo.reward_language.terms import Reward, load_reward, reward
+from torchdlo.reward_language.terms import Reward, load_reward, read_reward, reward
 
-__all__ = ["FUNCTIONS", "Expression", "Function", "Reward", "load_reward", "parse", "reward"]
+__all__ = ["FUNCTIONS", "Expression", "Function", "Reward", "load_reward", "parse", "read_reward", "reward"]

@@ -14,7 +14,7 @@ from torchdlo.errors import InputError
 from torchdlo.reward_language.expression import Expression, parse
 from torchdlo.untrusted import read_json
 
-__all__ = ["Reward", "load_reward", "reward"]
+__all__ = ["Reward", "load_reward", "read_reward", "reward"]
 
 _TERMS = 12
 """Most terms of a reward."""
@@ -70,6 +70,16 @@ def reward(terms: Mapping[str, str], success: str | None = None, where: str = "r
 def load_reward(path: Path) -> Reward:
     """Return the reward of a file: {"reward": {name: expression}, "success": condition}, the latter if wanted."""
     content = read_json(path, 'a reward such as {"reward": {"near": "-dist(tool_0, ring_0)"}}', most=_FILE)
+    return read_reward(content, str(path))
+
+
+def read_reward(content: Any, where: str) -> Reward:
+    """Return the reward that `Reward.plain` wrote.
+
+    Args:
+        content: the plain data, which may be anything.
+        where: they are from, for what is said of them.
+    """
     if not isinstance(content, dict) or "reward" not in content or content.keys() - {"reward", "success"}:
-        raise InputError(f'{path}: expected an object with "reward" and, if wanted, "success", and nothing else.')
-    return reward(content["reward"], content.get("success"), str(path))
+        raise InputError(f'{where}: expected an object with "reward" and, if wanted, "success", and nothing else.')
+    return reward(content["reward"], content.get("success"), where)

@@ -46,6 +46,16 @@ def test_points_of_the_start_are_remembered():
         Features(spec)(now, torch.zeros(1, 1))
 
 
+def test_observations_of_another_size_are_refused():
+    """The points of both would be there in longer ones, and would be others."""
+    spec = FeatureSpec(6, (0, 3), ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0)), memory=(1,))
+    same, share = torch.zeros(1, 6), torch.zeros(1, 1)
+    for size in (9, 5):
+        for seen in ((torch.zeros(1, size), share, same), (same, share, torch.zeros(1, size))):
+            with pytest.raises(InputError, match=f"observations of 6 numbers, and these have {size}; make the env"):
+                Features(spec)(*seen)
+
+
 def test_the_share_of_the_episode_is_told_in_waves():
     spec = FeatureSpec(1, waves=2)
     seen = Features(spec)(torch.zeros(1, 1), torch.full((1, 1), 0.25))[0, 1:]
@@ -146,9 +156,17 @@ def test_a_policy_acts_in_torchrls_rollouts():
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         found = env.rollout(3, policy_module(policy))
     first = found[:, 0]
-    wanted = policy.act(first["observation"], first["progress"], first["start"])
+    seen_first = first["observation"], first["progress"], first["start"]
+    wanted = policy.act(*seen_first)
     torch.testing.assert_close(first["action"], wanted)
     torch.testing.assert_close(found["progress"][0, :, 0], torch.tensor([0, 1 / 3, 2 / 3]))
+    # Where actions are shares of the greatest ways, the same way is done.
+    shares = envs.make(task, num_envs=2, execution="eager", variation=False, scaled_actions=True)
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        same = shares.rollout(3, policy_module(policy, scaled=True))
+    torch.testing.assert_close(same["action"][:, 0], policy.act(*seen_first, scaled=True))
+    torch.testing.assert_close(same["action"][..., :3], found["action"][..., :3] / 0.01)
+    torch.testing.assert_close(same["next", "observation"], found["next", "observation"], rtol=0, atol=1e-5)
     with set_exploration_type(ExplorationType.RANDOM):
         torch.manual_seed(0)
         assert (env.rollout(1, policy_module(policy))["action"][:, 0] - wanted).abs().max() > 0

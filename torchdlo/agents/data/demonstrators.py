@@ -14,7 +14,7 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
-from torchdlo.agents.trajopt.search_result import read_trajectory
+from torchdlo.agents.trajopt.search_result import check_scene, read_trajectory
 from torchdlo.envs import Task
 from torchdlo.envs.core import episode
 from torchdlo.errors import InputError
@@ -130,6 +130,7 @@ def scripted_demonstrator(task: Task) -> FollowPath:
 def trajectory_demonstrator(task: Task, path: Path) -> FollowPath:
     """Return who follows a trajectory that `torchdlo optimize` found."""
     content = read_trajectory(path)
+    check_scene(path)
     name = one_line(content["task"].text(), 60)
     places = torch.tensor(content["tool"].numbers(None, None, 3, most=1e6), dtype=torch.float64)
     if name != task.name or places.dim() != 3 or places.shape[1:] != (task.arms.count, 3):
@@ -170,6 +171,7 @@ def _best(task: Task, folder: Path) -> Path:
         try:
             content = read_trajectory(file)
             if content["task"].text() == task.name and content["success"].flag():
+                check_scene(file)
                 found.append((content["return"].number(), file))
         except InputError:
             continue

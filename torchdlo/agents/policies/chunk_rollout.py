@@ -15,7 +15,7 @@ from torchdlo.agents.data import sentences
 from torchdlo.agents.data.record import EpisodeStart, Noise, Painter, arm_state, draw_starts, play_batch
 from torchdlo.agents.policies import language
 from torchdlo.agents.policies.chunk_policy import ChunkPolicy, load_policy
-from torchdlo.envs import find
+from torchdlo.envs import PAIRED_TASKS, TASKS, find, find_stored
 from torchdlo.envs.core import episode
 from torchdlo.errors import InputError
 
@@ -113,16 +113,17 @@ def evaluate_chunk_policy(
     if wrong:
         raise InputError(f"conditions: expected some of {', '.join(CONDITIONS)}, given {', '.join(sorted(wrong))}.")
     actor, about = PolicyDemonstrator.load(path), load_policy(path)[1]
-    names = list(tasks) or about["tasks"]
+    names = list(tasks) or [_registered(name, path) for name in about["tasks"]]
     if not names:
         raise InputError(f"{path}: it does not say which tasks it has learned; name them.")
+    # Tasks of one's own are code, which the caller may name, and a file may not.
+    known = [name for name in about["tasks"] if name in tasks or name in TASKS | PAIRED_TASKS] or names
     found: dict[str, Any] = {}
     for number, name in enumerate(names):
         made = _prepared(name, episodes)
         for k, condition in enumerate(conditions):
             attempts = [
-                _told(s, name, about["tasks"] or names, condition)
-                for s in draw_starts(made.task, f"evaluate {seed}", range(episodes))
+                _told(s, name, known, condition) for s in draw_starts(made.task, f"evaluate {seed}", range(episodes))
             ]
             who = replace(actor, blank=condition == "blanked")
             with torch.no_grad():
@@ -140,6 +141,11 @@ def evaluate_chunk_policy(
                 callback("evaluate", done, len(names) * len(conditions), f"{name}, {condition}: {share:.0%}")
     means = {c: sum(found[n][c]["success"] for n in names) / len(names) for c in conditions}
     return {"policy": str(path), "seed": seed, "episodes": episodes, "mean": means, "tasks": found}
+
+
+def _registered(name: str, path: Path) -> str:
+    find_stored(name, path)
+    return name
 
 
 def _prepared(name: str, count: int) -> episode.Episode:

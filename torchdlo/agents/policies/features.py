@@ -15,6 +15,7 @@ import torch
 from torch import Tensor, nn
 
 from torchdlo.envs import Task
+from torchdlo.errors import InputError
 
 __all__ = ["FeatureSpec", "Features", "task_features"]
 
@@ -79,8 +80,21 @@ class Features(nn.Module):
         index = (self._at[:, None] + torch.arange(3, device=observation.device)).flatten()
         return observation[..., index].unflatten(-1, (-1, 3))
 
+    def _check(self, observation: Tensor) -> None:
+        if observation.shape[-1] != self.spec.size:
+            raise InputError(
+                f"policy: it was made for observations of {self.spec.size} numbers, and these have "
+                f"{observation.shape[-1]}; make the environment of the task that the policy names, with the ropes and "
+                "bodies that it was trained with."
+            )
+
     def forward(self, observation: Tensor, progress: Tensor, start: Tensor | None = None) -> Tensor:
-        """Return features; `start` are observations at the start (N, O), where points of it are remembered."""
+        """Return features; `start` are observations at the start (N, O), where points of it are remembered.
+
+        Raises:
+            InputError: Observations have another size than those that this was made for.
+        """
+        self._check(observation)
         parts = [observation]
         if self.spec.points:
             points = self._points(observation)
@@ -89,6 +103,7 @@ class Features(nn.Module):
         if self.spec.memory:
             if start is None:
                 raise ValueError("features: this policy remembers the start; give what was observed there, too")
+            self._check(start)
             kept = list(self.spec.memory)
             remembered = (self._points(start)[..., kept, :] - self._centers[kept]).flatten(-2)
             if remembered.shape[:-1] != points.shape[:-2]:

@@ -116,14 +116,33 @@ class Policy(nn.Module):
         squashed = 2 * (math.log(2) - raw - nn.functional.softplus(-2 * raw))
         return raw.tanh(), density - squashed.sum(-1)
 
-    def command(self, action: Tensor) -> Tensor:
-        """Return the environment's action, shape (..., A + turns), of a policy's."""
-        return nn.functional.pad(self.spec.reach * action, (0, self.spec.turns))
+    def command(self, action: Tensor, *, scaled: bool = False) -> Tensor:
+        """Return the environment's action, shape (..., A + turns), of a policy's.
+
+        Args:
+            action: in units of the greatest way of a tool, shape (..., A).
+            scaled: whether the environment's actions are from -1 to 1 (`scaled_actions`), and not in metres.
+        """
+        return nn.functional.pad(action if scaled else self.spec.reach * action, (0, self.spec.turns))
 
     @torch.no_grad()
     def act(
-        self, observation: Tensor, progress: Tensor, start: Tensor | None = None, *, random: bool = False
+        self,
+        observation: Tensor,
+        progress: Tensor,
+        start: Tensor | None = None,
+        *,
+        random: bool = False,
+        scaled: bool = False,
     ) -> Tensor:
-        """Return the environment's actions for observations (N, O), now and at the start, and shares of the episode."""
+        """Return the environment's actions for observations (N, O), now and at the start, and shares of the episode.
+
+        Args:
+            observation: now, shape (N, O).
+            progress: share of the episode that is over, shape (N, 1).
+            start: what was observed at the start, shape (N, O).
+            random: whether to draw them, and not to take the middle.
+            scaled: see `command`.
+        """
         features = self.features(observation, progress, start)
-        return self.command(self.draw(features)[0] if random else self.mean(features))
+        return self.command(self.draw(features)[0] if random else self.mean(features), scaled=scaled)

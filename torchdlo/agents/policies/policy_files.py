@@ -63,10 +63,14 @@ def load_policy(path: Path | str, notes: bool = False) -> Any:
     return (policy, said) if notes else policy
 
 
-def policy_module(policy: Policy) -> Any:
+def policy_module(policy: Policy, *, scaled: bool = False) -> Any:
     """Return a policy as a TensorDictModule from "observation", "progress" and "start" to "action".
 
     It draws actions at random where TorchRL's exploration type is RANDOM, and takes their middle otherwise.
+
+    Args:
+        policy: the policy.
+        scaled: whether it acts in an environment with `scaled_actions`, from -1 to 1, and not in metres and degrees.
     """
     from tensordict.nn import TensorDictModule
     from torchrl.envs.utils import ExplorationType, exploration_type
@@ -79,6 +83,7 @@ def policy_module(policy: Policy) -> Any:
         def forward(self, observation: torch.Tensor, progress: torch.Tensor, start: torch.Tensor) -> torch.Tensor:
             features = self.policy.features(observation, progress, start)
             random = exploration_type() == ExplorationType.RANDOM
-            return self.policy.command(self.policy.draw(features)[0] if random else self.policy.mean(features))
+            action = self.policy.draw(features)[0] if random else self.policy.mean(features)
+            return self.policy.command(action, scaled=scaled)
 
     return TensorDictModule(_Acts(), in_keys=["observation", "progress", "start"], out_keys=["action"])

@@ -14,11 +14,12 @@ from torchdlo.agents.policies import Policy
 from torchdlo.agents.rl.episodes import TaskEpisodes
 from torchdlo.agents.rl.rollout import episode_progress
 from torchdlo.envs import PUBLISHED, Task, with_fidelity
+from torchdlo.envs.core import episode as episodes_of
 from torchdlo.envs.observations.state import observe
 from torchdlo.physics import tree
 from torchdlo.physics.execution import Execution
 
-__all__ = ["PROTOCOLS", "UNSEEN", "evaluate_policies", "judge_policies", "wilson_interval"]
+__all__ = ["PROTOCOLS", "UNSEEN", "evaluate_policies", "judge_policies", "judged_episode", "wilson_interval"]
 
 UNSEEN = 777_000_000
 """Seed of the starts of the judgement; trainers add less than this to theirs."""
@@ -50,8 +51,11 @@ def judge_policies(
     seed: int = 0,
     callback: Callable[[str, int, int, str], None] | None = None,
     execution: Execution | None = None,
-) -> dict[str, dict[str, Tensor]]:
+) -> dict[str, dict[str, Any]]:
     """Return how policies do, all in one batch: by protocol what became of all episodes, (policies, starts, ...).
+
+    With "actions", "moved" and "effects" of it, the numbers of effects where they were drawn, `judged_episode` makes an
+    episode again.
 
     Policies take the middle of what they could do. From the one start, each has one episode: others would be the same.
 
@@ -67,13 +71,13 @@ def judge_policies(
     how = PROTOCOLS[protocols[-1]]
     fine = with_fidelity(task, PUBLISHED)
     many = starts if how["variation"] else 0
-    one = int("one" in protocols)
+    one, drawn = int("one" in protocols), _randomized(fine, how.get("randomize", 0.0))
     episodes = TaskEpisodes(
         fine,
         len(policies) * (many + one),
         seed=UNSEEN + 1000 * seed,
         execution=execution,
-        randomize=_randomized(fine, how.get("randomize", 0.0)),
+        randomize=drawn,
     )
     rng = torch.Generator().manual_seed(UNSEEN + 1000 * seed + 1)
     seen = _shared(episodes, len(policies), many, one)
@@ -98,10 +102,36 @@ def judge_policies(
         "returns": episodes.returns,
         "actions": torch.stack(actions, 1),
         "moved": episodes.env.moved,
+        "effects": episodes.env.episode.params.effects if drawn else {},
     }
-    parts = {name: x.unflatten(0, (len(policies), many + one)) for name, x in found.items()}
-    plays = {protocols[-1]: {name: x[:, :many] for name, x in parts.items()}} if many else {}
-    return plays | ({"one": {name: x[:, many:] for name, x in parts.items()}} if one else {})
+    parts = tree.map(lambda x: x.unflatten(0, (len(policies), many + one)), found)
+    plays = {protocols[-1]: tree.map(lambda x: x[:, :many], parts)} if many else {}
+    return plays | ({"one": tree.map(lambda x: x[:, many:], parts)} if one else {})
+
+
+def judged_episode(
+    task: Task, plays: dict[str, Any], number: int, *, execution: Execution = "recorded"
+) -> tuple[episodes_of.Episode, Tensor]:
+    """Return one of the episodes that were judged, in the scene that it had, and its actions (T, A).
+
+    Args:
+        task: the task.
+        plays: of one protocol, see `judge_policies`.
+        number: of the episode, policy after policy.
+        execution: how its steps run.
+    """
+
+    def own(x: Tensor) -> Tensor:
+        return x.flatten(0, 1)[number : number + 1]
+
+    fine, moved = with_fidelity(task, PUBLISHED), own(plays["moved"])
+    made = episodes_of.prepare_at(fine, moved, execution=execution)
+    if plays["effects"]:
+        # A scene settles with its own numbers.
+        params = tree.replace(made.params, effects=tree.map(own, plays["effects"]))
+        made = replace(made, params=params)
+        made = replace(made, start=episodes_of.begin(made, episodes_of.laid_down(fine, moved)[2]))
+    return made, own(plays["actions"])[0]
 
 
 def _randomized(task: Task, share: float) -> dict[str, float] | None:
@@ -138,7 +168,7 @@ def evaluate_policies(
     seed: int = 0,
     callback: Callable[[str, int, int, str], None] | None = None,
     execution: Execution | None = None,
-) -> tuple[dict[str, Any], dict[str, dict[str, Tensor]]]:
+) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
     """Return results as plain data, and what became of all episodes by protocol, see `judge_policies`.
 
     Args:
@@ -151,7 +181,7 @@ def evaluate_policies(
         execution: see `TaskEpisodes`.
     """
     found: dict[str, Any] = {}
-    plays: dict[str, dict[str, Tensor]] = {}
+    plays: dict[str, dict[str, Any]] = {}
     calm = [name for name in ("one", "varied") if name in protocols]
     for names in (calm, ["disturbed"] if "disturbed" in protocols else []):
         if names:

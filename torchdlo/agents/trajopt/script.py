@@ -9,8 +9,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchdlo.agents.trajopt.search_result import execution_of, load_actions, read_trajectory
-from torchdlo.agents.trajopt.task_problem import task_problem
+from torchdlo.agents.trajopt.search_result import load_actions
+from torchdlo.agents.trajopt.task_problem import TaskProblem, trajectory_problem
 from torchdlo.envs import RopeMaterial, Task, find
 from torchdlo.envs.core import episode
 from torchdlo.errors import InputError
@@ -42,8 +42,9 @@ def script(
 
     Args:
         name: of the task.
-        trajectory: a file that `torchdlo optimize` wrote, played with the precision and the kind of steps with which it
-            was found, so that every bit of it comes back; the scripted demonstration if not given.
+        trajectory: a file that `torchdlo optimize` wrote, played with the precision, the kind of steps, the grasps, the
+            reward and the fidelity with which it was found, so that every bit of it comes back; the scripted
+            demonstration if not given.
         rope: see `torchdlo.envs.make`; a trajectory that was found for another one shows how well it carries over.
         no_op: do nothing.
         reset_seed: seed of a start with noise; without it, the nominal start.
@@ -52,13 +53,12 @@ def script(
     Raises:
         InputError: The trajectory is none, is one of another task, needs a rope, or there is no scripted demonstration.
     """
-    usual: dict[str, Any] = {"execution": execution or episode.quick_execution(find(name))}
-    found = usual if trajectory is None else _choices(trajectory)
-    material = found.pop("rope", None)
-    chosen = task_problem(name, rope, **found)
+    task = find(name, rope)
+    if trajectory is None:
+        chosen = TaskProblem(task, execution=execution or episode.quick_execution(task))
+    else:
+        chosen = trajectory_problem(trajectory, task, rope)
     task = chosen.task
-    if material is not None and rope is None:
-        raise InputError(f"{trajectory}: it was found for its own rope; give that one, or another, with --rope-model.")
     seeded = torch.Generator().manual_seed(reset_seed or 0)
     start: dict[str, Any] = {"generator": seeded, "variation": reset_seed is not None}
     made = episode.prepare(task, 1, like=chosen.like, execution=chosen.execution, **start)
@@ -70,13 +70,3 @@ def script(
     if not bool((way != 0).any()):
         raise InputError(f"{name}: has no scripted demonstration; give a --trajectory, or --no-op.")
     return Script(task, made, way.to(chosen.like))
-
-
-def _choices(path: Path) -> dict[str, Any]:
-    """Return how a trajectory was found."""
-    choices = read_trajectory(path)["choices"]
-    steps: dict[str, Any] = {"execution": execution_of(choices)}
-    if "grasps" in choices:
-        hands = choices["grasps"].items(100)
-        steps["grasps"] = tuple(None if hand.value is None else hand.whole(0, 10**6) for hand in hands)
-    return {"double": choices["double"].flag(), **steps, "rope": choices.get("rope").value}

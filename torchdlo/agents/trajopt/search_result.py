@@ -19,6 +19,7 @@ from torchdlo.physics.execution import EXECUTIONS, Execution, execution_named
 from torchdlo.untrusted import Entry, one_line, read_entry
 
 __all__ = [
+    "check_scene",
     "execution_of",
     "load_actions",
     "plain_evaluation",
@@ -134,6 +135,18 @@ def read_trajectory(path: Path) -> Entry:
     found = read_entry(path, "a trajectory of torchdlo optimize")
     found["task"].text(most=1000)
     return found
+
+
+def check_scene(path: Path) -> None:
+    """Refuse a trajectory that was found in another scene than its task's own, where that one is to be played."""
+    choices = read_trajectory(path).get("choices", {})
+    other = [name for name in ("grasps", "rope", "part") if choices.get(name).value is not None]
+    if other:
+        said = {"grasps": "other grasps", "rope": "another rope", "part": "what another trajectory left"}
+        raise InputError(
+            f"{path}: it was found with {' and '.join(said[name] for name in other)}, and here is the task as it is; "
+            "give one that was searched in that."
+        )
 
 
 def load_actions(path: Path, problem: Problem) -> Tensor:

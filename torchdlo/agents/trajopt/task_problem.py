@@ -6,23 +6,26 @@ import functools
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from torchdlo.agents.trajopt.problem import Evaluation
+from torchdlo.agents.trajopt.search_result import execution_of, read_trajectory
 from torchdlo.coupling.common import step_diagnostics
-from torchdlo.envs import PUBLISHED, RopeMaterial, find
+from torchdlo.envs import PUBLISHED, Fidelity, RopeMaterial, find, with_fidelity
 from torchdlo.envs.core import episode
 from torchdlo.envs.core.subtask import SubTask, with_reward
 from torchdlo.envs.core.task import Task
 from torchdlo.errors import InputError
 from torchdlo.physics import tree
 from torchdlo.physics.execution import Execution
-from torchdlo.reward_language import Reward
+from torchdlo.reward_language import Reward, read_reward
+from torchdlo.untrusted import Entry
 
-__all__ = ["TaskProblem", "task_problem"]
+__all__ = ["TaskProblem", "task_problem", "trajectory_problem"]
 
 
 def task_problem(
@@ -44,6 +47,44 @@ def task_problem(
     """
     task = find(name, rope, grasps)
     return TaskProblem(task if reward is None else with_reward(task, reward), **choices)
+
+
+def trajectory_problem(path: Path, task: Task, rope: RopeMaterial | None = None) -> TaskProblem:
+    """Return the problem in which a trajectory was found: with its grasps, reward, fidelity, precision and steps.
+
+    Args:
+        path: file that `torchdlo optimize` wrote; one without choices was found in the task as it is.
+        task: the task that it names.
+        rope: what ropes are made of, which a trajectory that was found for another rope than the task's needs.
+
+    Raises:
+        InputError: It needs a rope, goes on from another trajectory, or its choices are none.
+    """
+    found = read_trajectory(path)
+    task = task if rope is None else replace(task, rope=rope)
+    if "choices" not in found:
+        return TaskProblem(task, execution=episode.quick_execution(task))
+    choices = found["choices"]
+    if "part" in choices:
+        raise InputError(
+            f"{path}: it is a part of a task, which goes on from where another part ended; give one that was searched "
+            "from the task's start."
+        )
+    if choices.get("rope").value is not None and rope is None:
+        raise InputError(f"{path}: it was found for its own rope; give that one, or another, with --rope-model.")
+    if choices.get("grasps").value is not None:
+        hands = choices["grasps"].items(100)
+        task = replace(task, grasps=tuple(None if hand.value is None else hand.whole(0, 10**6) for hand in hands))
+    if "fidelity" in choices:
+        task = with_fidelity(task, _fidelity(choices["fidelity"]))
+    if "reward" in choices:
+        task = with_reward(task, read_reward(choices["reward"].value, f"{path}: choices.reward"))
+    return TaskProblem(task, double=choices["double"].flag(), execution=execution_of(choices))
+
+
+def _fidelity(said: Entry) -> Fidelity:
+    step, substeps = said["step"].number(1e-3, 1.0, "s"), said["substeps"].whole(1, 1000)
+    return Fidelity(step, substeps, said["integrator"].text(most=20))
 
 
 @dataclass(frozen=True, eq=False)

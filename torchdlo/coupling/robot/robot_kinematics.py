@@ -34,11 +34,11 @@ class Robot:
     tool: str
     """The link whose pose is commanded."""
     lower: Tensor
-    """Least joint positions [rad or m], shape (J,)."""
+    """Least joint positions [rad or m], shape (J,), within which those that mimic these hold their own, too."""
     upper: Tensor
-    """Greatest joint positions [rad or m], shape (J,)."""
+    """Greatest joint positions [rad or m], shape (J,), likewise."""
     velocity: Tensor
-    """Greatest joint speeds [rad/s or m/s], shape (J,)."""
+    """Greatest joint speeds [rad/s or m/s], shape (J,), likewise."""
     moved: tuple[int, ...]
     """Which of the moving joints, commanded or mimicking, move the tool."""
     turning: Tensor
@@ -103,6 +103,7 @@ def load_robot(
     if not moved:
         raise InputError(f"{said.name}: no joint moves the link {tool!r}; choose another tool.")
     leaders = [j for j in moving if not j.mimics]
+    limits = [_limits(said.name, j, moving) for j in leaders]
     mix = [[(j.factor if j.mimics else 1.0) * ((j.mimics or j.name) == k.name) for k in leaders] for j in moving]
     links = (said.joints[0].parent, *(j.child for j in said.joints))
     number = functools.partial(torch.as_tensor, dtype=torch.float64)
@@ -112,9 +113,9 @@ def load_robot(
         tuple(j.name for j in leaders),
         links,
         tool,
-        number([j.lower for j in leaders]),
-        number([j.upper for j in leaders]),
-        number([j.velocity for j in leaders]),
+        number([low for low, _, _ in limits]),
+        number([high for _, high, _ in limits]),
+        number([speed for _, _, speed in limits]),
         moved,
         number([float(j.kind == "revolute") for j in moving]),
         number([j.axis for j in moving]),
@@ -127,6 +128,23 @@ def load_robot(
         Pose(number(base), quat / quat.norm()),
         _chain(said.joints),
     )
+
+
+def _limits(name: str, leader: urdf.Joint, moving: list[urdf.Joint]) -> tuple[float, float, float]:
+    """Return the least and the greatest position and the greatest speed of a joint and of those that mimic it."""
+    lower, upper, velocity = leader.lower, leader.upper, leader.velocity
+    for joint in moving:
+        if joint.mimics != leader.name or joint.factor == 0:
+            continue
+        ends = [(end - joint.offset) / joint.factor for end in (joint.lower, joint.upper)]
+        lower, upper = max(lower, min(ends)), min(upper, max(ends))
+        velocity = min(velocity, joint.velocity / abs(joint.factor))
+    if lower > upper:
+        raise InputError(
+            f"{name}: joint {leader.name!r} and those that mimic it have limits that nowhere hold together; check "
+            "their <limit>, and the sign of multiplier= in <mimic>."
+        )
+    return lower, upper, velocity
 
 
 def panda(

@@ -6,6 +6,8 @@ The environment keeps the state of its scenes itself; tensordicts hold actions, 
 from __future__ import annotations
 
 import dataclasses
+import multiprocessing
+import os
 from collections.abc import Mapping
 from numbers import Integral
 from typing import Any
@@ -29,6 +31,9 @@ from torchdlo.scene import Params, Scene
 from torchdlo.vision.look import Look, draw_look
 
 __all__ = ["DloEnv"]
+
+_MAIN = os.getpid()
+"""The process that imported this; those that are forked off it have another number."""
 
 
 class DloEnv(EnvBase):
@@ -134,7 +139,7 @@ class DloEnv(EnvBase):
 
     def _set_seed(self, seed: int | None) -> None:
         # Without a seed, torch's own generator decides, so that torch.manual_seed holds here too.
-        chosen = int(torch.randint(2**31, (), device="cpu")) if seed is None else seed
+        chosen = _drawn_seed() if seed is None else seed
         self.generator.manual_seed(chosen)
         # Looks have random numbers of their own: starts are the same with and without pictures.
         self._look_generator.manual_seed(chosen)
@@ -244,6 +249,18 @@ class DloEnv(EnvBase):
             flags = {"terminated": failed, "truncated": over, "done": failed | over}
             found = {**self._told(step.terms), "reward": step.reward.float().unsqueeze(-1), **flags}
             return TensorDict(found, self.batch_size, self.device)
+
+
+def _drawn_seed() -> int:
+    """Return a seed out of torch's generator; in other processes than the main one, of the system's as well.
+
+    Processes that were forked have the generator of their parent, those that were spawned have one that is not seeded:
+    their environments would all begin alike.
+    """
+    drawn = int(torch.randint(2**31, (), device="cpu"))
+    if multiprocessing.parent_process() is None and os.getpid() == _MAIN:
+        return drawn
+    return drawn ^ (int.from_bytes(os.urandom(4), "little") >> 1)
 
 
 def _check_device(device: torch.device | str | None) -> None:
