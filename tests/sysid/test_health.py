@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from tests.sysid.swaying import recording as swaying
 from torchdlo.errors import InputError
+from torchdlo.sysid.diagnosis.error_floor import noise_ratio
 from torchdlo.sysid.recordings.data_quality import DataIssue, check
 from torchdlo.sysid.recordings.recording import Recording, Trial, load_recording
 
@@ -234,3 +235,12 @@ def test_real_recordings_lose_few_frames(shared_data: Path) -> None:
         assert lost < 0.02
     for folder in sorted((shared_data / "hidden_effects").glob("dev_*")):
         assert check(load_recording(folder))[1] == []
+
+
+def test_a_noise_in_millimetres_is_refused(sound: dict[str, Recording]) -> None:
+    with pytest.raises(InputError, match=r"marker_noise_std: expected metres, found 0\.3, \d+ times .* is it in mm\?"):
+        check(replace(sound["hanging"], marker_noise_std=0.3))
+    # Smooth markers may have a noise that neighbouring frames do not show.
+    still = spoil(sound["hanging"], lambda t: replace(t, markers=np.repeat(t.markers[:1], len(t.time), 0)), None)
+    assert noise_ratio(replace(still, marker_noise_std=5e-4)) == pytest.approx(2.5)
+    assert noise_ratio(replace(still, marker_noise_std=None)) == 0.0

@@ -45,6 +45,7 @@ def test_a_right_recording_is_not_doubted() -> None:
     [
         (replace(SAMPLE, mass=45.0), "mass: 45 kg are 56.2 kg a metre .*; is it in grams"),
         (replace(SAMPLE, radius=4e-4), "heavier than any metal"),
+        (replace(SAMPLE, marker_noise_std=2.5e-3), "marker_noise_std: it is 2.5 mm, 4 times what neighbouring frames"),
         (replace(SAMPLE, length=800.0), "length: 800 m is a long rope"),
         (replace(SAMPLE, length=8.0), "length: markers span 0.8 m of a rope of 8 m"),
         (

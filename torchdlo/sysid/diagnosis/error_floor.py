@@ -14,6 +14,10 @@ from torchdlo.sysid.model.trial_batch import Start
 from torchdlo.sysid.recordings.recording import Recording, Trial
 
 
+_LITTLE = 2e-4
+"""Noise of markers below which it is not asked how much it is [m]."""
+
+
 @dataclass(frozen=True)
 class ErrorFloor:
     """Parts of the error that no effect explains, root mean square per coordinate [m]."""
@@ -44,6 +48,17 @@ def shown_noise(recording: Recording) -> float:
         # The variance of a fourth difference of white noise is 70 times the noise's; medians pass over jumps.
         parts.append(1.4826 * np.nanmedian(np.abs(fourth)) / np.sqrt(70))
     return float(np.median(parts))
+
+
+def noise_ratio(recording: Recording) -> float:
+    """Return how many times the noise that shows the given one is [1]; 0 where none is given, or no markers are free.
+
+    Smooth markers show less noise than they may have: below 0.2 mm it is not asked how much it is.
+    """
+    if recording.marker_noise_std is None or recording.filmed:
+        return 0.0
+    shown = shown_noise(recording)
+    return recording.marker_noise_std / max(shown, _LITTLE) if np.isfinite(shown) else 0.0
 
 
 def trial_gaps(

@@ -13,6 +13,7 @@ import numpy as np
 
 from torchdlo.errors import InputError
 from torchdlo.sysid.diagnosis.error_floor import marker_noise as noise_of
+from torchdlo.sysid.diagnosis.error_floor import noise_ratio
 from torchdlo.sysid.recordings.marker_spacing import spacing_faults
 from torchdlo.sysid.recordings.recording import Recording, Trial
 
@@ -26,6 +27,9 @@ _GRAVITY = 40.0
 
 _SMALLEST = 4e-3
 """Jumps below this are left in [m]: a robust fit takes them."""
+
+_NOISY = 10.0
+"""Times the noise that neighbouring frames show from which a given one must be in another unit."""
 
 _SHARPEST = 100.0
 """Change of acceleration from frame to frame that a rope may show when it is jerked taut [m/s^2]."""
@@ -56,6 +60,7 @@ def check(recording: Recording) -> tuple[Recording, list[DataIssue]]:
         InputError: No result could be right with these data.
     """
     _check_rope(recording)
+    _check_noise(recording)
     trials = (*recording.train, *recording.test)
     _check_clocks(recording, trials)
     noise, faults, mended = noise_of(recording), [], {}
@@ -97,6 +102,16 @@ def _check_rope(recording: Recording) -> None:
         raise InputError(
             f"{file}: mass, radius and length: together they make {density:.3g} kg/m^3, expected {_DENSITY[0]:g} to "
             f"{_DENSITY[1]:g}; {hint} (kg and m are expected)."
+        )
+
+
+def _check_noise(recording: Recording) -> None:
+    """Refuse a noise beside which nothing that markers do would count."""
+    given, ratio = recording.marker_noise_std, noise_ratio(recording)
+    if given is not None and ratio > _NOISY:
+        raise InputError(
+            f"{recording.path / 'rope.json'}: marker_noise_std: expected metres, found {given:g}, {ratio:.0f} times "
+            "what neighbouring frames show; is it in mm? Give null where it is not known."
         )
 
 

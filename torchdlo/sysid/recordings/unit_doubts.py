@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from torchdlo.sysid.diagnosis.error_floor import noise_ratio
 from torchdlo.sysid.recordings.recording import Recording, Trial
 from torchdlo.sysid.recordings.wrench import force_doubts
 
@@ -30,6 +31,9 @@ _SAG = 0.03
 _ASKEW = 0.5
 """Cosine between gravity, or an axis, and what shows it, below which they disagree (60 degrees)."""
 
+_NOISY = 3.0
+"""Times the noise that neighbouring frames show from which a given one is doubted."""
+
 _GRAVITY = (8.0, 11.0)
 """Size of gravity on earth [m/s^2], roughly."""
 
@@ -38,7 +42,7 @@ def doubts(recording: Recording) -> list[str]:
     """Return what can hardly be, a sentence each with what to look at; none for most recordings."""
     trials = recording.trials("all")
     found = [*_weight(recording), *_length(recording, trials), *_down(recording, trials), *_axes(trials)]
-    return [*found, *force_doubts(recording)]
+    return [*found, *_noise(recording), *force_doubts(recording)]
 
 
 def _weight(recording: Recording) -> list[str]:
@@ -53,6 +57,16 @@ def _weight(recording: Recording) -> list[str]:
             f"{recording.mass / volume:.3g} kg/m^3, heavier than any metal; is the radius right, and the mass in kg?"
         ]
     return []
+
+
+def _noise(recording: Recording) -> list[str]:
+    ratio = noise_ratio(recording)
+    if ratio <= _NOISY:
+        return []
+    return [
+        f"marker_noise_std: it is {1e3 * (recording.marker_noise_std or 0.0):.3g} mm, {ratio:.0f} times what neighbouring "
+        "frames show; is it in metres? Nothing smaller is named."
+    ]
 
 
 def _length(recording: Recording, trials: tuple[Trial, ...]) -> list[str]:
