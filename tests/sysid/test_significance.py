@@ -21,6 +21,7 @@ from torchdlo.sysid.diagnosis.plausibility import implausible, unresolved
 from torchdlo.sysid.diagnosis.score_test import Score
 from torchdlo.sysid.diagnosis.significance import agreement, benjamini_hochberg, f_test, sign_flips
 from torchdlo.sysid.diagnosis.verdict import BestCandidate
+from torchdlo.sysid.estimation.levenberg_marquardt import interval
 from torchdlo.sysid.recordings.metrics import mean_absolute_error
 from torchdlo.sysid.recordings.recording import Recording, Trial
 
@@ -105,6 +106,19 @@ def test_a_range_that_holds_nothing_or_what_cannot_be_is_no_finding() -> None:
     assert "does nothing" in implausible(fitted(BASELINE | {"stretch.EA": 1e6}, ("stretch",)), "stretch")
     # One trial tells no range.
     assert implausible(fitted(BASELINE | {"air_drag.c_d": 1e-4}, ("air_drag",), trials=1), "air_drag") is None
+
+
+def test_ranges_end_where_numbers_do_and_hold_their_values() -> None:
+    play = fitted(BASELINE | {"gripper_damping.stiffness": 10.0, "gripper_damping.loss_time": 0.01}, ("gripper_damping",))
+    far = replace(play.point, gradient=10 * play.point.gradient)
+    low, high = interval(far, play.space, np.array([[0.0, 0.0, 0.0, 1.0, 1.0]]))
+    stiffness, loss = (play.space.names.index(f"gripper_damping.{n}") for n in ("stiffness", "loss_time"))
+    assert 0 < low[stiffness] < 1.0 and high[stiffness] == pytest.approx(1e18)
+    assert low[loss] == 0.0 and 0.01 < high[loss] <= play.space.params[loss].high
+    # Directions turn round.
+    turn = fitted(BASELINE | {"anisotropic_bending.direction": 0.01}, ("anisotropic_bending",))
+    low, high = interval(turn.point, turn.space, np.full((1, 4), 0.5))
+    assert low[3] < 0.0 < 0.01 < high[3]
 
 
 def test_damping_as_small_as_that_of_steps_is_not_told_from_it() -> None:
