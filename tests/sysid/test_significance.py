@@ -17,7 +17,7 @@ from torchdlo.sysid.diagnosis import selection
 from torchdlo.sysid.diagnosis.detection_limit import detection_limits, least_gap, limit_gap
 from torchdlo.sysid.diagnosis.findings import findings, limits_text, mean_absolute_errors, summary
 from torchdlo.sysid.diagnosis.misleading_trials import errors_by_frame, misleading_trials
-from torchdlo.sysid.diagnosis.plausibility import implausible, unresolved
+from torchdlo.sysid.diagnosis.plausibility import implausible, not_told, unresolved
 from torchdlo.sysid.diagnosis.score_test import Score
 from torchdlo.sysid.diagnosis.significance import agreement, benjamini_hochberg, f_test, sign_flips
 from torchdlo.sysid.diagnosis.verdict import BestCandidate
@@ -119,6 +119,24 @@ def test_ranges_end_where_numbers_do_and_hold_their_values() -> None:
     turn = fitted(BASELINE | {"anisotropic_bending.direction": 0.01}, ("anisotropic_bending",))
     low, high = interval(turn.point, turn.space, np.full((1, 4), 0.5))
     assert low[3] < 0.0 < 0.01 < high[3]
+
+
+def test_a_number_whose_range_is_all_that_can_be_is_not_told(rope: Recording) -> None:
+    numbers = BASELINE | {"internal_friction.moment": 0.1, "internal_friction.kappa_c": 1.0}
+    friction = fitted(numbers, ("internal_friction",))
+    friction = replace(friction, point=replace(friction.point, gradient=0.1 * friction.point.gradient))
+    drifts = np.array([[0.0, 0.0, 0.0, 0.0, 5.0]])
+    assert implausible(friction, "internal_friction", drifts) is None
+    assert not_told(friction, "internal_friction", drifts) == ["internal_friction.kappa_c"]
+    assert not_told(friction, "internal_friction", 0.1 * drifts) == []
+    assert not_told(fitted(numbers, ("internal_friction",), trials=1), "internal_friction", drifts) == []
+    found = fake_diagnosis(
+        rope, effects=["internal_friction"], ties={"internal_friction": []}, shares={"internal_friction": 0.9}
+    )
+    found = replace(found, final=friction, drifts=drifts, model=SimpleNamespace(parameters=[*numbers]))
+    assert "kappa_c not told)" in summary(found, rope) and "<td>not told</td>" in diagnosis_html(found, rope)
+    kappa = findings(found, rope)["effects"][0]["parameters"]["kappa_c"]
+    assert kappa["value"] is None and kappa["low"] < 0.2 and kappa["high"] > 20
 
 
 def test_damping_as_small_as_that_of_steps_is_not_told_from_it() -> None:
