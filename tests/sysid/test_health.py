@@ -244,3 +244,15 @@ def test_a_noise_in_millimetres_is_refused(sound: dict[str, Recording]) -> None:
     still = spoil(sound["hanging"], lambda t: replace(t, markers=np.repeat(t.markers[:1], len(t.time), 0)), None)
     assert noise_ratio(replace(still, marker_noise_std=5e-4)) == pytest.approx(2.5)
     assert noise_ratio(replace(still, marker_noise_std=None)) == 0.0
+
+
+def test_trials_with_nothing_to_judge_by_are_left_out_and_said(sound: dict[str, Recording]) -> None:
+    def unseen(x: np.ndarray) -> None:
+        x[4:, 2:] = np.nan
+
+    clean, faults = check(spoil(sound["hanging"], lambda t: moved(t, unseen), "test_0"))
+    assert [t.name for t in clean.test] == ["test_1"] and [(f.trial, f.kind) for f in faults] == [("test_0", "unseen")]
+    hidden = spoil(sound["hanging"], lambda t: replace(t, suspect=np.ones_like(t.suspect)), "train_1")
+    assert [t.name for t in check(hidden)[0].train] == ["train_0", "train_2"]
+    with pytest.raises(InputError, match="found 4, and no better train trial; nothing could be judged"):
+        check(spoil(sound["hanging"], lambda t: moved(t, unseen), None))

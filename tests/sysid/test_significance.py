@@ -318,3 +318,17 @@ def test_where_nothing_can_matter_nothing_does() -> None:
     )
     assert selection.nothing_can_matter(1.3e-3, 1e-3, 1e-3)
     assert not selection.nothing_can_matter(1.0, 1e-3, np.inf)
+
+
+def test_trials_that_fail_without_an_effect_do_not_count_for_it() -> None:
+    train = np.full(3, 8e-3), np.full(3, 4e-3)
+    before, after = np.array([np.inf, 5e-3, 5e-3]), np.array([9e-3, 7e-3, 7e-3])
+    assert selection.gain(before, after, 5e-4) == pytest.approx(-24 / 24.75)
+    assert not selection.matters(*selection.compared([before], before, after), 5e-4, 8e-4)
+    assert selection.refused(train, (before, after), 5e-4, True) == "does not help on the test trials"
+    assert selection.refused(train, (before, 0.4 * after), 5e-4, True) is None
+    # What fails with the effect alone speaks against it.
+    assert selection.refused(train, (after, before), 5e-4, True) == "does not help on the test trials"
+    nothing = np.full(2, np.inf), np.full(2, 1e-3)
+    assert "cannot be compared" in str(selection.refused(train, nothing, 5e-4, True))
+    assert not selection.matters(*selection.compared([nothing[0]], *nothing), 5e-4, 8e-4)

@@ -288,8 +288,8 @@ class _Selector:
         return float(space.to_values(ends[:1] + share * (ends[1:] - ends[:1]))[0, 0])
 
     def _matters(self, first: Fitted, less: Fitted, more: Fitted, split: str) -> bool:
-        whole, before, after = (gap_rms(self.gaps(f, split)) for f in (first, less, more))
-        return selection.matters(whole, before, after, self.noise, self.level)
+        whole, before, after = (self.gaps(f, split) for f in (first, less, more))
+        return selection.matters(*selection.compared([whole], before, after), self.noise, self.level)
 
     def _refused(
         self, first: Fitted, rival: Fitted, fitted: Fitted, test: Agreement, rate: float, looked_at: int

@@ -28,6 +28,9 @@ _GRAVITY = 40.0
 _SMALLEST = 4e-3
 """Jumps below this are left in [m]: a robust fit takes them."""
 
+_FEWEST = 5
+"""Frames with a free marker below which a trial tells nothing."""
+
 _NOISY = 10.0
 """Times the noise that neighbouring frames show from which a given one must be in another unit."""
 
@@ -48,7 +51,7 @@ class DataIssue:
     trial: str
     """Name of the trial, empty if it is about all."""
     kind: str
-    """swap, jump, stall, clock, camera, cut, drift, length, place."""
+    """swap, jump, stall, clock, camera, cut, drift, length, place, unseen."""
     message: str
     """What was found, and what was done about it."""
 
@@ -60,10 +63,11 @@ def check(recording: Recording) -> tuple[Recording, list[DataIssue]]:
         InputError: No result could be right with these data.
     """
     _check_rope(recording)
+    recording, faults = _judgeable(recording)
     _check_noise(recording)
     trials = (*recording.train, *recording.test)
     _check_clocks(recording, trials)
-    noise, faults, mended = noise_of(recording), [], {}
+    noise, mended = noise_of(recording), {}
     for trial in trials:
         mended[trial.name], found = _mend(trial, noise)
         faults += found
@@ -103,6 +107,26 @@ def _check_rope(recording: Recording) -> None:
             f"{file}: mass, radius and length: together they make {density:.3g} kg/m^3, expected {_DENSITY[0]:g} to "
             f"{_DENSITY[1]:g}; {hint} (kg and m are expected)."
         )
+
+
+def _judgeable(recording: Recording) -> tuple[Recording, list[DataIssue]]:
+    """Return the recording without trials that have nothing to judge by, and which these are."""
+    if recording.filmed:
+        return recording, []
+    kept, faults = {}, []
+    for split in ("train", "test"):
+        trials = recording.trials(split)
+        seen = [int((np.isfinite(t.markers[:, ~t.gripped]).all(-1).any(-1) & ~t.suspect).sum()) for t in trials]
+        kept[split] = tuple(t for t, count in zip(trials, seen, strict=True) if count >= _FEWEST)
+        lost = [(t, count) for t, count in zip(trials, seen, strict=True) if count < _FEWEST]
+        if not kept[split]:
+            raise InputError(
+                f"{recording.path / lost[0][0].name}.npz: markers: expected free markers in at least {_FEWEST} frames "
+                f"that are not suspect, found {lost[0][1]}, and no better {split} trial; nothing could be judged."
+            )
+        said = f"free markers are seen in fewer than {_FEWEST} frames that are not suspect: the trial is left out"
+        faults += [DataIssue(t.name, "unseen", said) for t, _ in lost]
+    return replace(recording, train=kept["train"], test=kept["test"]), faults
 
 
 def _check_noise(recording: Recording) -> None:
