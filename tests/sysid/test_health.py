@@ -256,3 +256,12 @@ def test_trials_with_nothing_to_judge_by_are_left_out_and_said(sound: dict[str, 
     assert [t.name for t in check(hidden)[0].train] == ["train_0", "train_2"]
     with pytest.raises(InputError, match="found 4, and no better train trial; nothing could be judged"):
         check(spoil(sound["hanging"], lambda t: moved(t, unseen), None))
+
+
+def test_frames_that_are_all_stored_twice_are_seen(sound: dict[str, Recording]) -> None:
+    def twice(x: np.ndarray) -> None:
+        x[1::2, 2:] = x[:-1:2, 2:]
+
+    trials, faults = found(spoil(sound["hanging"], lambda t: moved(t, twice)))
+    assert [(f.trial, f.kind) for f in faults] == [("train_1", "stall")] and "every other frame" in faults[0].message
+    assert trials["train_1"].suspect[1::2].all() and not trials["train_1"].suspect[::2].any()

@@ -28,6 +28,9 @@ _GRAVITY = 40.0
 _SMALLEST = 4e-3
 """Jumps below this are left in [m]: a robust fit takes them."""
 
+_OTHER = 0.4
+"""Share of frames that repeat the one before from which it is said that every other one does."""
+
 _FEWEST = 5
 """Frames with a free marker below which a trial tells nothing."""
 
@@ -158,7 +161,8 @@ def _mend(trial: Trial, noise: float) -> tuple[Trial, list[DataIssue]]:
     stalled = _stalls(trial, noise)
     if stalled.any():
         suspect |= stalled
-        faults.append(DataIssue(trial.name, "stall", f"{_frames(stalled)} repeat the frame before: left out"))
+        every = " (every other frame: was it filled up to twice its rate?)" if stalled[1:].mean() > _OTHER else ""
+        faults.append(DataIssue(trial.name, "stall", f"{_frames(stalled)} repeat the frame before: left out{every}"))
     seen = np.where(suspect[:, None, None], np.nan, markers)
     steps, frame = _steps(seen), trial.time[1] - trial.time[0]
     size = np.linalg.norm(steps, axis=-1)
@@ -181,7 +185,9 @@ def _stalls(trial: Trial, noise: float) -> np.ndarray:
     same = np.zeros(len(free), bool)
     same[1:] = [np.array_equal(a, b, equal_nan=True) for a, b in zip(free[1:], free[:-1], strict=True)]
     change = np.linalg.norm(np.diff(free, axis=0), axis=-1)
-    moving = noise > 1e-7 and np.nanmedian(change) > 0.5 * noise
+    # Where half the frames repeat others, the median of all changes is 0.
+    changed = change[np.isfinite(change) & (change > 0)]
+    moving = noise > 1e-7 and len(changed) > 0 and np.median(changed) > 0.5 * noise
     return same & moving & ~trial.suspect & np.isfinite(free).any((1, 2))
 
 
