@@ -61,3 +61,8 @@ def test_a_right_recording_is_not_doubted() -> None:
 def test_what_can_hardly_be_is_said(strange: Recording, words: str) -> None:
     (said,) = doubts(strange)
     assert re.search(words, said), said
+
+
+def test_markers_are_to_be_turned_not_gravity() -> None:
+    (said,) = doubts(changed(SAMPLE, y_up))
+    assert said.endswith("turn the markers (not gravity: effects take z for the vertical) so that it hangs along gravity.")

@@ -138,8 +138,8 @@ def _down(recording: Recording, trials: tuple[Trial, ...]) -> list[str]:
     given = ", ".join(f"{g:g}" for g in recording.gravity)
     return [
         *said,
-        f"gravity: it is [{given}], but the rope hangs towards {hangs}{name}; turn the markers, or gravity, so that it "
-        "points the way the rope hangs.",
+        f"gravity: it is [{given}], but the rope hangs towards {hangs}{name}; turn the markers (not gravity: "
+        "effects take z for the vertical) so that it hangs along gravity.",
     ]
 
 
