@@ -15,12 +15,20 @@ from tests.sysid.swaying import recording as swaying
 from torchdlo.report.pages.diagnosis import diagnosis_html
 from torchdlo.sysid.diagnosis import selection
 from torchdlo.sysid.diagnosis.detection_limit import detection_limits, least_gap, limit_gap
+from torchdlo.sysid.diagnosis.effect_search import _Search
 from torchdlo.sysid.diagnosis.findings import findings, limits_text, mean_absolute_errors, summary
 from torchdlo.sysid.diagnosis.misleading_trials import errors_by_frame, misleading_trials
 from torchdlo.sysid.diagnosis.plausibility import implausible, not_told, unresolved
 from torchdlo.sysid.diagnosis.score_test import Score
-from torchdlo.sysid.diagnosis.significance import agreement, benjamini_hochberg, f_test, sign_flips
-from torchdlo.sysid.diagnosis.verdict import BestCandidate
+from torchdlo.sysid.diagnosis.significance import (
+    Agreement,
+    agreement,
+    benjamini_hochberg,
+    chance,
+    f_test,
+    sign_flips,
+)
+from torchdlo.sysid.diagnosis.verdict import BestCandidate, Candidate
 from torchdlo.sysid.estimation.levenberg_marquardt import interval
 from torchdlo.sysid.recordings.metrics import mean_absolute_error
 from torchdlo.sysid.recordings.recording import Recording, Trial
@@ -37,6 +45,7 @@ def test_sign_flips_count_what_is_at_least_as_large() -> None:
     assert sign_flips(np.array([1.0, 2.0, 3.0])) == 1 / 8
     assert sign_flips(np.array([1.0, -2.0, 3.0])) == 3 / 8
     assert sign_flips(-np.ones(3)) == 1.0 and sign_flips(np.zeros(4)) == 1.0
+    assert sign_flips(np.array([1.0, 2.0, 0.0, 3.0])) == 1 / 8
     # Of many units flips are drawn: of 20 equal ones, all but two positive, 1 + 20 + 190 of 2^20 are as good.
     many = np.r_[np.ones(18), -np.ones(2)]
     assert sign_flips(many) == pytest.approx(211 / 2**20, abs=1e-4)
@@ -80,8 +89,70 @@ def test_trials_say_which_dose_they_ask_for(rope: Recording) -> None:
     assert nothing.p > 0.01 and np.abs(nothing.doses).max() < 0.05
     worse = agreement(*shaken(rope.test, -0.5, np.random.default_rng(1)), rope.test)
     assert worse.p > 0.99
-    many = rope.test * 4
-    assert agreement(*shaken(many, 0.8, np.random.default_rng(0)), many).unit == "trial"
+    many = agreement(*shaken(rope.test * 4, 0.8, np.random.default_rng(0)), rope.test * 4, looked_at=12)
+    assert many.unit == "trial" and many.units == 8 and many.could_tell(12)
+    # Eight trials cannot tell one of 17 candidates from chance, blocks of them can.
+    more = agreement(*shaken(rope.test * 4, 0.8, np.random.default_rng(0)), rope.test * 4, looked_at=17)
+    assert more.unit == "block" and more.units == 40 and more.could_tell(17)
+    null = agreement(*shaken(rope.test * 4, 0.0, np.random.default_rng(1)), rope.test * 4, looked_at=17)
+    assert "may explain the test trials by chance" in chance({"air_drag": null}, 17)["air_drag"]
+    assert chance({"air_drag": more}, 17) == {}
+
+
+def swung(count: int, rng: np.random.Generator, *, start: float, dose: float = 0.0) -> tuple[np.ndarray, list[Trial]]:
+    """What an effect changes of swinging markers, and trials off by an error of their start that swings on, and noise."""
+    time, free = np.arange(320) * 0.01, np.linspace(0, 1, 6)[:, None] * np.array([1.0, 0.0, 0.2])
+    changes, trials = [], []
+    for k in range(count):
+        swing = np.exp(-0.5 * time) * np.cos((5 + 0.5 * rng.normal()) * time + rng.uniform(0, 2 * np.pi))
+        changes.append(2e-3 * (time * swing)[:, None, None] * free)
+        off = start * rng.normal() * swing[:, None, None] * free + 5e-4 * rng.normal(size=(320, 6, 3))
+        markers, held = off + dose * changes[-1], np.zeros(6, bool)
+        trials.append(Trial(f"test_{k}", time, markers, free[:, 0], held, None, None, np.zeros(320, bool)))
+    return np.array(changes), trials
+
+
+@pytest.mark.parametrize(("count", "start"), [(2, 3e-3), (5, 3e-3), (2, 0.0)])
+def test_residuals_that_swing_on_are_not_taken_for_many_samples(count: int, start: float) -> None:
+    rng, found = np.random.default_rng(0), []
+    for _ in range(150):
+        changes, trials = swung(count, rng, start=start)
+        found.append(agreement(np.zeros_like(changes), changes, trials, looked_at=17))
+    p, units = np.array([x.p for x in found]), np.mean([x.units for x in found])
+    assert 0.015 <= np.mean(p <= 0.05) <= 0.08 and np.mean(p <= 1e-3) < 0.025
+    if start:
+        # Trials are the units then; short blocks would find one of twenty at 1e-4 and less.
+        assert units < 2 * count and np.mean([x.p_short <= 1e-4 for x in found]) > 0.05
+    else:
+        assert units > 14
+
+
+def test_effects_are_told_from_chance_where_trials_ask_for_the_same_dose() -> None:
+    rng = np.random.default_rng(0)
+    changes, trials = swung(2, rng, start=0.0, dose=1.0)
+    same = agreement(np.zeros_like(changes), changes, trials, looked_at=17)
+    assert same.units == 16 and same.p < 1e-4 and chance({"air_drag": same}, 17) == {}
+    # Two trials that ask for other doses, or one alone, cannot tell; nothing is held against the effect.
+    other = [replace(t, markers=k * t.markers) for k, t in zip((0.7, 1.3), trials, strict=True)]
+    apart = agreement(np.zeros_like(changes), changes, other, looked_at=17)
+    alone = agreement(np.zeros_like(changes[:1]), changes[:1], trials[:1], looked_at=17)
+    assert (apart.units, alone.units) == (2, 1) and not apart.could_tell(17)
+    assert chance({"a": apart, "b": alone}, 17) == {}
+    # Blocks in which nothing changes say nothing.
+    changes[:, 160:] = 0.0
+    assert agreement(np.zeros_like(changes), changes, trials, looked_at=17).units == 8
+
+
+def test_a_candidate_that_too_few_trials_test_is_still_spoken_of() -> None:
+    few = Agreement(2.0**-7, "block", 7, np.ones(1), np.nan, 2.0**-7, 7)
+    best = Candidate("air_drag", 0.5, 0.29, 0.93, "helps on too few trials", few)
+    others = [Candidate(f"e{k}", 0.1, None, None, "its doses explain less") for k in range(16)]
+    search = object.__new__(_Search)
+    told = search._closest({"air_drag": fitted(BASELINE | {"air_drag.c_d": 1.8}, ("air_drag",))}, [best, *others])
+    assert told is not None and told.against.endswith("; there are too few test trials to exclude chance")
+    sure = replace(best, test=replace(few, p=2.0**-10, units=10, p_short=2.0**-10, short_units=10))
+    told = search._closest({"air_drag": fitted(BASELINE | {"air_drag.c_d": 1.8}, ("air_drag",))}, [sure, *others])
+    assert told is not None and told.against == "helps on too few trials"
 
 
 def test_markers_that_are_held_or_not_seen_say_nothing(rope: Recording) -> None:
@@ -261,6 +332,7 @@ def test_the_verdict_has_the_test_and_the_measure_of_the_literature(rope: Record
     found = fake_diagnosis(rope, tests={"air_drag": test})
     said = summary(found, rope)
     assert "with p 0.00098 (sign flips of 10 blocks), at a false discovery rate of 0.0078 with all 8 candidates" in said
+    assert f"; an F test of the doses that trials ask for gives p {test.p_trials:.2g}." in said
     maes = {
         when: np.mean([mean_absolute_error(found.predictions[when][t.name], t) for t in rope.test])
         for when in ("before", "after")

@@ -241,7 +241,7 @@ def confidence(result: Diagnosis) -> dict[str, Any] | None:
     rates = result.false_discovery_rates
     if chance := [name for name in result.effects if rates.get(name, 0.0) > RATE]:
         doubts.append(f"the test trials are too few to exclude that {_listed(chance)} is chance")
-    if len(result.after) < 2:
+    elif len(result.after) < 2:
         doubts.append("there is one test trial only")
     if len(result.final.point.trial_costs) < 3:
         doubts.append("there are fewer than three train trials")
@@ -334,10 +334,11 @@ def limits_text(result: Diagnosis) -> str:
 def _tested(name: str, result: Diagnosis) -> str:
     """Return whether what an effect explains on the test trials could be chance, in a sentence."""
     test, rate = result.tests[name], result.false_discovery_rates[name]
+    doses = "" if np.isnan(test.p_trials) else f"; an F test of the doses that trials ask for gives p {test.p_trials:.2g}"
     return (
         f"Chance explains as much of the test trials as {name.replace('_', ' ')} with p {test.p:.2g} (sign flips of "
         f"{test.units} {test.unit}s), at a false discovery rate of {rate:.2g} with all {result.looked_at} candidates "
-        "that were looked at."
+        f"that were looked at{doses}."
     )
 
 

@@ -17,7 +17,7 @@ from torchdlo.physics.effects.base import Param
 from torchdlo.sysid.diagnosis import selection
 from torchdlo.sysid.diagnosis.error_floor import gap_rms, trial_gaps
 from torchdlo.sysid.diagnosis.plausibility import implausible
-from torchdlo.sysid.diagnosis.significance import RATE, Agreement, agreement, benjamini_hochberg
+from torchdlo.sysid.diagnosis.significance import RATE, Agreement, agreement, benjamini_hochberg, chance
 from torchdlo.sysid.diagnosis.verdict import verdict_word
 from torchdlo.sysid.estimation.jobs import Fitted
 from torchdlo.sysid.estimation.levenberg_marquardt import ParameterSpace, evaluate, improve_points, interval
@@ -167,10 +167,10 @@ class _Selector:
                 break
             rival = self.fit(base.effects, [self.values(base)])
             fits = {name: self._extended(rival, name) for name in names}
-            tests = {name: self.test(rival, fitted) for name, fitted in fits.items()}
+            tests = {name: self.test(rival, fitted, len(names)) for name, fitted in fits.items()}
             tested += tests.items()
-            rates = dict(zip(names, benjamini_hochberg([tests[n].p for n in names], len(names)), strict=True))
-            reasons = {n: self._refused(first, rival, fits[n], tests[n], rates[n], len(names)) for n in names}
+            by_chance = chance(tests, len(names))
+            reasons = {n: self._refused(first, rival, fits[n], by_chance.get(n)) for n in names}
             fair = sorted((n for n in names if reasons[n] is None), key=lambda n: fits[n].point.cost)
             close: list[str] = []
             if fair:
@@ -264,9 +264,10 @@ class _Selector:
         """Return the gap of each trial of a split [m]."""
         return trial_gaps(self.prediction(fitted, split), self.trials[split])
 
-    def test(self, less: Fitted, more: Fitted) -> Agreement:
+    def test(self, less: Fitted, more: Fitted, looked_at: int) -> Agreement:
         """Return whether what an effect explains on the test trials could be chance."""
-        return agreement(self.prediction(less, "test"), self.prediction(more, "test"), self.trials["test"])
+        before, after = (self.prediction(fitted, "test") for fitted in (less, more))
+        return agreement(before, after, self.trials["test"], looked_at=looked_at)
 
     def _extended(self, rival: Fitted, name: str) -> Fitted:
         """Return the best fit with one effect more."""
@@ -291,15 +292,11 @@ class _Selector:
         whole, before, after = (self.gaps(f, split) for f in (first, less, more))
         return selection.matters(*selection.compared([whole], before, after), self.noise, self.level)
 
-    def _refused(
-        self, first: Fitted, rival: Fitted, fitted: Fitted, test: Agreement, rate: float, looked_at: int
-    ) -> str | None:
+    def _refused(self, first: Fitted, rival: Fitted, fitted: Fitted, by_chance: str | None) -> str | None:
         train, held = ((self.gaps(rival, split), self.gaps(fitted, split)) for split in ("train", "test"))
         enough = all(self._matters(first, rival, fitted, split) for split in ("train", "test"))
         why = selection.refused(train, held, self.noise, enough)
-        if why is None and rate > RATE >= looked_at * 2.0**-test.units:
-            why = f"may explain the test trials by chance (p {test.p:.2g}, false discovery rate {rate:.2g})"
-        return why or implausible(fitted, fitted.effects[-1])
+        return why or by_chance or implausible(fitted, fitted.effects[-1])
 
     def _pruned(self, first: Fitted, base: Fitted, ties: dict[str, list[str]], rivals: dict[str, Fitted]) -> Fitted:
         """Return the model without effects that the last one has made needless."""
@@ -323,7 +320,7 @@ class _Selector:
         tested: list[tuple[str, Agreement]],
     ) -> Selection:
         before, after = (gap_rms(self.gaps(f, "test")) for f in (first, final))
-        tests = {name: self.test(rivals[name], final) for name in ties}
+        tests = {name: self.test(rivals[name], final, len(looked)) for name in ties}
         p = [t.p for t in tests.values()] + [t.p for name, t in tested if name not in tests]
         rates = dict(zip(tests, map(float, benjamini_hochberg(p, len(looked))), strict=False))
         ranges = zip(final.space.names, final.values, *interval(final.point, final.space), strict=True)
