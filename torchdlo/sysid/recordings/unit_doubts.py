@@ -42,7 +42,7 @@ def doubts(recording: Recording) -> list[str]:
     """Return what can hardly be, a sentence each with what to look at; none for most recordings."""
     trials = recording.trials("all")
     found = [*_weight(recording), *_length(recording, trials), *_down(recording, trials), *_axes(trials)]
-    return [*found, *_noise(recording), *force_doubts(recording)]
+    return [*found, *_noise(recording), *_copies(recording), *force_doubts(recording)]
 
 
 def _weight(recording: Recording) -> list[str]:
@@ -67,6 +67,29 @@ def _noise(recording: Recording) -> list[str]:
         f"marker_noise_std: it is {1e3 * (recording.marker_noise_std or 0.0):.3g} mm, {ratio:.0f} times what neighbouring "
         "frames show; is it in metres? Nothing smaller is named."
     ]
+
+
+def _copies(recording: Recording) -> list[str]:
+    """Find test trials that are train trials, or stretches of them."""
+    return [
+        f"{test.name}: its markers are those of {train.name}; a test trial that was fitted to judges nothing."
+        for test in recording.test
+        for train in recording.train
+        if not recording.filmed and _overlap(train, test)
+    ]
+
+
+def _overlap(a: Trial, b: Trial) -> bool:
+    """Return whether the free markers of the shorter trial are found in the longer one, from any frame on."""
+    short, long = sorted((t.markers[:, ~t.gripped] for t in (a, b)), key=len)
+    if short.shape[1:] != long.shape[1:]:
+        return False
+    room = len(long) - len(short) + 1
+    middle = len(short) // 2
+    at = np.flatnonzero((long[middle : middle + room] == short[middle]).any((1, 2)))
+    return any(
+        np.isfinite(short).any() and np.array_equal(long[k : k + len(short)], short, equal_nan=True) for k in at
+    )
 
 
 def _length(recording: Recording, trials: tuple[Trial, ...]) -> list[str]:
