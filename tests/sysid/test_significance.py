@@ -14,6 +14,7 @@ from tests.report.fake_diagnosis import BASELINE, fake_diagnosis, fitted
 from tests.sysid.swaying import recording as swaying
 from torchdlo.report.pages.diagnosis import diagnosis_html
 from torchdlo.sysid.diagnosis import selection
+from torchdlo.sysid.diagnosis.backward_elimination import EliminationResult
 from torchdlo.sysid.diagnosis.detection_limit import detection_limits, least_gap, limit_gap
 from torchdlo.sysid.diagnosis.effect_search import _Search
 from torchdlo.sysid.diagnosis.findings import findings, limits_text, mean_absolute_errors, summary
@@ -29,6 +30,7 @@ from torchdlo.sysid.diagnosis.significance import (
     sign_flips,
 )
 from torchdlo.sysid.diagnosis.verdict import BestCandidate, Candidate
+from torchdlo.sysid.estimation.jobs import Fitted
 from torchdlo.sysid.estimation.levenberg_marquardt import interval
 from torchdlo.sysid.recordings.metrics import mean_absolute_error
 from torchdlo.sysid.recordings.recording import Recording, Trial
@@ -404,3 +406,24 @@ def test_trials_that_fail_without_an_effect_do_not_count_for_it() -> None:
     nothing = np.full(2, np.inf), np.full(2, 1e-3)
     assert "cannot be compared" in str(selection.refused(train, nothing, 5e-4, True))
     assert not selection.matters(*selection.compared([nothing[0]], *nothing), 5e-4, 8e-4)
+
+
+def test_an_effect_is_held_against_what_is_left_without_it_and_nothing_else() -> None:
+    drag = fitted(BASELINE | {"air_drag.c_d": 1.4}, ("air_drag",))
+    plain, beside = fitted(BASELINE), fitted(BASELINE | {"stretch.EA": 100.0}, ("stretch",))
+
+    class Known:
+        def known_without(self, *_: object) -> None:
+            return None
+
+        def without(self, *_: object) -> Fitted:
+            return plain
+
+    class Search(_Search):
+        revision = Known()
+
+    search = object.__new__(Search)
+    # The stretch beside which it was found has been dropped.
+    assert search._rival(drag, "air_drag", EliminationResult(rivals={"air_drag": beside})) is plain
+    kept = fitted(BASELINE)
+    assert search._rival(drag, "air_drag", EliminationResult(rivals={"air_drag": kept})) is kept

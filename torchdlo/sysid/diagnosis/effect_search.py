@@ -504,7 +504,7 @@ class _Search:
             effects, gap_rms(self.bench.gaps(final, "test")), self.bench.level, gap_rms(after) / gap_rms(before)
         )
         model = self.pool.local.model(final.effects, final.options)
-        rivals = {n: self.revision.known_without(final, n) or found.rivals[n] for n in effects}
+        rivals = {n: self._rival(final, n, found) for n in effects}
         self.bench.predict([*rivals.values(), final])
         looked_at = sum(map(len, rounds))
         tests = {name: self._agreement(rival, final, looked_at) for name, rival in rivals.items()}
@@ -544,6 +544,13 @@ class _Search:
             misleading=self.misleading,
             forces=None if self.force_before is None else (self.force_before, self._forces(final)),
         )
+
+    def _rival(self, final: Fitted, name: str, found: EliminationResult) -> Fitted:
+        """Return the model without one of the effects that it is held against in the end."""
+        known = self.revision.known_without(final, name) or found.rivals[name]
+        # One that was fitted beside others than are left would show what these do, too.
+        rest = {effect for effect in final.effects if effect != name}
+        return known if set(known.effects) == rest else self.revision.without(final, name)
 
     def _forces(self, fitted: Fitted) -> ForceErrors:
         return tree.part(gripper_forces.force_errors(self.bench, fitted))

@@ -135,6 +135,7 @@ def independent(scores: Sequence[np.ndarray], powers: Sequence[np.ndarray]) -> l
         if square == 0 or alike <= (square / np.sqrt(pairs) if lag == 1 else 0.0):
             break
         together += 2 * alike / square
+    # Longer rather than shorter: the one dose has taken its share of what goes together.
     length = int(np.ceil(together))
     return [np.array([x.sum() for x in np.array_split(s, max(1, round(len(s) / length)))]) for s in scores]
 
