@@ -40,6 +40,12 @@ _DOSES = (1.0, 0.1)
 _HORIZONS = (0.1, 0.3, 1.0)
 """Shares of the trials that the baseline is fitted to, one after the other."""
 
+_FEWEST = 5
+"""Frames with a free point below which a trial tells nothing."""
+
+_EVEN = 0.01
+"""Largest deviation of a time step from the median step, as a share of it: printed times are rounded."""
+
 _SPREAD = (1.0, 0.5, 2.0)
 """Multiples of the baseline's numbers from which its fit starts."""
 
@@ -97,6 +103,8 @@ class Selection:
     """Gap of a perfect model [m]."""
     candidates: list[dict[str, object]] = field(default_factory=list)
     """Round, name, gains on train and test trials, and why it was taken or left."""
+    doubts: list[str] = field(default_factory=list)
+    """What speaks against the names, a sentence each."""
 
 
 def points_trial(name: str, time: np.ndarray, points: np.ndarray, given: np.ndarray | None = None) -> Trial:
@@ -112,8 +120,29 @@ def points_trial(name: str, time: np.ndarray, points: np.ndarray, given: np.ndar
         raise InputError(f"{name}: points have shape {points.shape}; expected ({len(time)}, points, 3) in metres.")
     count = points.shape[1]
     held = np.zeros(count, bool) if given is None else np.asarray(given, bool)
+    _check_readings(name, np.asarray(time, float), np.asarray(points, float), held)
     suspect = np.zeros(len(time), bool)
     return Trial(name, np.asarray(time, float), points, np.arange(count, dtype=float), held, None, None, suspect)
+
+
+def _check_readings(name: str, time: np.ndarray, points: np.ndarray, held: np.ndarray) -> None:
+    """Refuse times that are not even, points that are given but not known, and trials with hardly a free point."""
+    steps = np.diff(time)
+    if len(time) < _FEWEST or not np.isfinite(time).all() or abs(time[0]) > 1e-9 or (steps <= 0).any():
+        raise InputError(f"{name}: time: expected at least {_FEWEST} finite times that rise from 0 s.")
+    step = float(np.median(steps))
+    uneven = np.abs(steps - step) > _EVEN * step
+    if uneven.any():
+        frame = int(np.argmax(uneven)) + 1
+        raise InputError(
+            f"{name}: time: expected even steps of {step:g} s, found {steps[frame - 1]:g} s before frame {frame}; "
+            "interpolate the points to even steps, NaN where too much is missing."
+        )
+    if np.isinf(points).any() or not np.isfinite(points[:, held]).all():
+        raise InputError(f"{name}: points: expected finite numbers in metres, or NaN for a free point that is not seen.")
+    seen = int(np.isfinite(points[:, ~held]).all(-1).any(-1).sum())
+    if seen < _FEWEST:
+        raise InputError(f"{name}: points: expected free points in at least {_FEWEST} frames, found them in {seen}.")
 
 
 def select(
@@ -320,10 +349,28 @@ class _Selector:
         tested: list[tuple[str, Agreement]],
     ) -> Selection:
         before, after = (gap_rms(self.gaps(f, "test")) for f in (first, final))
+        for name in ties:
+            rest = tuple(e for e in final.effects if e != name)
+            if set(rivals[name].effects) != set(rest):
+                # Beside an effect that was dropped, it would show what that one does, too.
+                rivals[name] = self.fit(rest, [self.values(final), self.values(first)])
         tests = {name: self.test(rivals[name], final, len(looked)) for name in ties}
         p = [t.p for t in tests.values()] + [t.p for name, t in tested if name not in tests]
         rates = dict(zip(tests, map(float, benjamini_hochberg(p, len(looked))), strict=False))
         ranges = zip(final.space.names, final.values, *interval(final.point, final.space), strict=True)
         numbers = {n: (float(v), float(min(a, b)), float(max(a, b))) for n, v, a, b in ranges}
         verdict = verdict_word([*ties], after, self.level, after / max(before, 1e-30))
-        return Selection(verdict, [*ties], numbers, ties, tests, rates, before, after, self.level, looked)
+        doubts = self._doubts(ties, rates)
+        return Selection(verdict, [*ties], numbers, ties, tests, rates, before, after, self.level, looked, doubts)
+
+    def _doubts(self, ties: dict[str, list[str]], rates: dict[str, float]) -> list[str]:
+        """Return what speaks against the names; nothing where none are given."""
+        said = [f"{other} would do as well as {name}" for name, others in ties.items() for other in others]
+        train, test = (len(self.trials[split]) for split in ("train", "test"))
+        if few := [name for name, rate in rates.items() if rate > RATE]:
+            said.append(f"the test trials are too few to exclude that {' or '.join(few)} is chance")
+        elif ties and test < 2:
+            said.append("there is one test trial only")
+        if ties and train < 3:
+            said.append("there are fewer than three train trials")
+        return said
