@@ -121,9 +121,7 @@ def fallen(numbers: dict[str, np.ndarray], trials: Sequence[Trial]) -> np.ndarra
 @pytest.mark.parametrize("tests", [1, 9])
 def test_a_name_that_too_few_trials_test_is_doubted(tests: int) -> None:
     baseline = {"g": Param(9.5, 5.0, 15.0, "m/s^2", "log", None, "Gravity.")}
-    drag = EffectSpec(
-        "drag", "a = -k v|v|", {"k": Param(0.0, 0.0, 5.0, "1/m", "linear", 0.0, "Drag.")}, ({"k": 0.05},)
-    )
+    drag = EffectSpec("drag", "a = -k v|v|", {"k": Param(0.0, 0.0, 5.0, "1/m", "linear", 0.0, "Drag.")}, ({"k": 0.05},))
     time, rng = np.arange(36) / 60, np.random.default_rng(0)
     empty = points_trial("a", time, np.zeros((36, 1, 3)))
     true = fallen({"g": np.array([9.81]), "drag.k": np.array([0.3])}, [empty])[0, 0]

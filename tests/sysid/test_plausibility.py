@@ -65,13 +65,17 @@ def test_what_can_hardly_be_is_said(strange: Recording, words: str) -> None:
 
 def test_markers_are_to_be_turned_not_gravity() -> None:
     (said,) = doubts(changed(SAMPLE, y_up))
-    assert said.endswith("turn the markers (not gravity: effects take z for the vertical) so that it hangs along gravity.")
+    assert said.endswith(
+        "turn the markers (not gravity: effects take z for the vertical) so that it hangs along gravity."
+    )
 
 
 def test_a_test_trial_that_is_a_train_trial_is_doubted() -> None:
     train = SAMPLE.train[0]
     whole = replace(train, name="test_0")
-    part = replace(train, name="test_0", time=train.time[:90], markers=train.markers[30:120], suspect=train.suspect[:90])
+    part = replace(
+        train, name="test_0", time=train.time[:90], markers=train.markers[30:120], suspect=train.suspect[:90]
+    )
     for test in (whole, replace(part, gripper_quaternion=None)):
         (said,) = doubts(replace(SAMPLE, test=(test,)))
         assert said == f"test_0: its markers are those of {train.name}; a test trial that was fitted to judges nothing."

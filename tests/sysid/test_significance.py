@@ -102,7 +102,7 @@ def test_trials_say_which_dose_they_ask_for(rope: Recording) -> None:
 
 
 def swung(count: int, rng: np.random.Generator, *, start: float, dose: float = 0.0) -> tuple[np.ndarray, list[Trial]]:
-    """What an effect changes of swinging markers, and trials off by an error of their start that swings on, and noise."""
+    """What an effect changes of swinging markers, and trials that are off by noise and a start error that swings on."""
     time, free = np.arange(320) * 0.01, np.linspace(0, 1, 6)[:, None] * np.array([1.0, 0.0, 0.2])
     changes, trials = [], []
     for k in range(count):
@@ -182,7 +182,9 @@ def test_a_range_that_holds_nothing_or_what_cannot_be_is_no_finding() -> None:
 
 
 def test_ranges_end_where_numbers_do_and_hold_their_values() -> None:
-    play = fitted(BASELINE | {"gripper_damping.stiffness": 10.0, "gripper_damping.loss_time": 0.01}, ("gripper_damping",))
+    play = fitted(
+        BASELINE | {"gripper_damping.stiffness": 10.0, "gripper_damping.loss_time": 0.01}, ("gripper_damping",)
+    )
     far = replace(play.point, gradient=10 * play.point.gradient)
     low, high = interval(far, play.space, np.array([[0.0, 0.0, 0.0, 1.0, 1.0]]))
     stiffness, loss = (play.space.names.index(f"gripper_damping.{n}") for n in ("stiffness", "loss_time"))

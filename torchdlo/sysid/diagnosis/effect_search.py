@@ -514,6 +514,7 @@ class _Search:
             *clamp_models.clamp_notes(model, final),
             *self.bench.predictions.notes(),
             *self._force_notes(final),
+            *error_floor.noise_notes(self.recording, self.bench.floor.noise),
         ]
         predictions = {
             when: {t.name: sim[: len(t.time)] for sim, t in zip(sims, trials["all"], strict=True)}

@@ -334,7 +334,9 @@ def limits_text(result: Diagnosis) -> str:
 def _tested(name: str, result: Diagnosis) -> str:
     """Return whether what an effect explains on the test trials could be chance, in a sentence."""
     test, rate = result.tests[name], result.false_discovery_rates[name]
-    doses = "" if np.isnan(test.p_trials) else f"; an F test of the doses that trials ask for gives p {test.p_trials:.2g}"
+    doses = (
+        "" if np.isnan(test.p_trials) else f"; an F test of the doses that trials ask for gives p {test.p_trials:.2g}"
+    )
     return (
         f"Chance explains as much of the test trials as {name.replace('_', ' ')} with p {test.p:.2g} (sign flips of "
         f"{test.units} {test.unit}s), at a false discovery rate of {rate:.2g} with all {result.looked_at} candidates "

@@ -139,7 +139,9 @@ def _check_readings(name: str, time: np.ndarray, points: np.ndarray, held: np.nd
             "interpolate the points to even steps, NaN where too much is missing."
         )
     if np.isinf(points).any() or not np.isfinite(points[:, held]).all():
-        raise InputError(f"{name}: points: expected finite numbers in metres, or NaN for a free point that is not seen.")
+        raise InputError(
+            f"{name}: points: expected finite numbers in metres, or NaN for a free point that is not seen."
+        )
     seen = int(np.isfinite(points[:, ~held]).all(-1).any(-1).sum())
     if seen < _FEWEST:
         raise InputError(f"{name}: points: expected free points in at least {_FEWEST} frames, found them in {seen}.")

@@ -60,11 +60,11 @@ def _weight(recording: Recording) -> list[str]:
 
 
 def _noise(recording: Recording) -> list[str]:
-    ratio = noise_ratio(recording)
+    ratio, given = noise_ratio(recording), recording.marker_noise_std or 0.0
     if ratio <= _NOISY:
         return []
     return [
-        f"marker_noise_std: it is {1e3 * (recording.marker_noise_std or 0.0):.3g} mm, {ratio:.0f} times what neighbouring "
+        f"marker_noise_std: it is {1e3 * given:.3g} mm, {ratio:.0f} times what neighbouring "
         "frames show; is it in metres? Nothing smaller is named."
     ]
 
@@ -87,9 +87,7 @@ def _overlap(a: Trial, b: Trial) -> bool:
     room = len(long) - len(short) + 1
     middle = len(short) // 2
     at = np.flatnonzero((long[middle : middle + room] == short[middle]).any((1, 2)))
-    return any(
-        np.isfinite(short).any() and np.array_equal(long[k : k + len(short)], short, equal_nan=True) for k in at
-    )
+    return any(np.isfinite(short).any() and np.array_equal(long[k : k + len(short)], short, equal_nan=True) for k in at)
 
 
 def _length(recording: Recording, trials: tuple[Trial, ...]) -> list[str]:
