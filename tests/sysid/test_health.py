@@ -229,8 +229,12 @@ def test_a_jerk_of_the_rope_is_no_fault(sound: dict[str, Recording]) -> None:
 def test_real_recordings_lose_few_frames(shared_data: Path) -> None:
     for name in ("deform_dlo1", "deform_dlo2", "deform_dlo4"):
         rope = load_recording(shared_data / name)
-        clean, _ = check(rope)
-        trials = [(a, b) for a, b in zip(clean.train + clean.test, rope.train + rope.test, strict=True)]
+        clean, faults = check(rope)
+        # One trial of the first cable is suspect throughout.
+        gone = [f.trial for f in faults if f.kind == "unseen"]
+        assert gone == (["train_090"] if name == "deform_dlo1" else [])
+        kept = [t for t in rope.train + rope.test if t.name not in gone]
+        trials = list(zip(clean.train + clean.test, kept, strict=True))
         lost = np.mean([a.suspect.mean() - b.suspect.mean() for a, b in trials])
         assert lost < 0.02
     for folder in sorted((shared_data / "hidden_effects").glob("dev_*")):
