@@ -177,7 +177,7 @@ def told(found: Selection) -> str:
             f"{name.replace('_', ' ')}: {', '.join(own)}; p {test.p:.2g} ({test.units} {test.unit}s), false discovery "
             f"rate {found.rates[name]:.2g}" + (f"; or {', '.join(found.ties[name])}" if found.ties[name] else "") + "."
         )
-    return "\n".join(said)
+    return "\n".join([*said, *(f"Doubt: {doubt}." for doubt in found.doubts)])
 
 
 def main() -> None:

@@ -127,7 +127,7 @@ def _compare(answer: dict[str, Any], found: dict[str, Any]) -> dict[str, Any]:
         name, true = effect["name"], answer["effects"].get(effect["name"])
         if true is None or name not in COMPARED:
             continue
-        got = {k: v["value"] for k, v in effect["parameters"].items()}
+        got = {k: v["value"] for k, v in effect["parameters"].items() if v["value"] is not None}
         a, b = COMPARED[name](dict(true)), COMPARED[name](dict.fromkeys(true, 0.0) | got)
         errors[name] = math.dist(a, b) / max(math.hypot(*a), 1e-30)
         for number in COVERED.get(name, ()):

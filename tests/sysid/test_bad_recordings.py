@@ -223,9 +223,9 @@ CASES: dict[str, tuple[Callable[[Path], None], tuple[str, ...]]] = {
     ),
     "gripped is short": (array("gripped", lambda a: a[:-1]), (TRIAL, "gripped", "(9,)", "(8,)")),
     "suspect is short": (array("suspect", lambda a: a[:-1]), (TRIAL, "suspect", "(40,)", "(39,)")),
-    "two frames": (
-        arrays(lambda c: c.update({k: c[k][:2] for k in ("time", "markers", "suspect", "gripper_quaternion")})),
-        (TRIAL, "markers", "at least 3 frames", "found 2"),
+    "four frames": (
+        arrays(lambda c: c.update({k: c[k][:4] for k in ("time", "markers", "suspect", "gripper_quaternion")})),
+        (TRIAL, "markers", "at least 5 frames", "found 4"),
     ),
     "two markers": (
         arrays(

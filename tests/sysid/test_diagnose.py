@@ -20,7 +20,7 @@ from torchdlo.sysid.diagnosis.budget import BUDGETS
 from torchdlo.sysid.diagnosis.candidate_fits import extension_jobs
 from torchdlo.sysid.diagnosis.findings import findings, findings_json, model_json, summary
 from torchdlo.sysid.diagnosis.score_test import Score
-from torchdlo.sysid.diagnosis.significance import Agreement
+from torchdlo.sysid.diagnosis.significance import Agreement, chance
 from torchdlo.sysid.diagnosis.verdict import verdict_word
 from torchdlo.sysid.diagnosis.workspace import Workspace
 from torchdlo.sysid.estimation.jobs import Fitted
@@ -313,7 +313,7 @@ def test_an_effect_is_left_out_once_only_from_the_same_model() -> None:
     assert len(asked) == 4
 
 
-SURE = Agreement(1e-4, "block", 16, np.ones(2), 0.01)
+SURE = Agreement(1e-4, "block", 16, np.ones(2), 0.01, 1e-4, 16)
 """A test that leaves no doubt."""
 
 
@@ -348,7 +348,7 @@ def test_what_steps_may_do_is_no_finding_nor_what_explains_no_more(
 @pytest.mark.parametrize(("p", "units", "refused"), [(1e-4, 16, False), (0.02, 16, True), (0.25, 2, False)])
 def test_what_may_be_chance_is_refused_where_that_can_be_told(p: float, units: int, refused: bool) -> None:
     tests = {"air_drag": replace(SURE, p=p, units=units)}
-    assert bool(object.__new__(effect_search._Search)._chance(tests, 16)) == refused
+    assert bool(chance(tests, 16)) == refused
 
 
 @pytest.mark.parametrize(("speed", "first"), [(0.02, "air_drag"), (0.4, "wind")])

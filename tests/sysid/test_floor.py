@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.sysid.swaying import PLACES
+from tests.sysid.swaying import NOISE, PLACES
 from tests.sysid.swaying import recording as swaying
 from torchdlo.sysid.diagnosis import error_floor
-from torchdlo.sysid.diagnosis.error_floor import Refinement
+from torchdlo.sysid.diagnosis.error_floor import Refinement, noise_beside, noise_notes, shown_noise
 from torchdlo.sysid.diagnosis.workspace import Workspace
 from torchdlo.sysid.estimation.jobs import Fitted, SimulationJob
 from torchdlo.sysid.estimation.levenberg_marquardt import ParameterSpace, Point
@@ -126,3 +126,25 @@ def test_gaps_are_weighted_by_frame(tmp_path: Path) -> None:
     frame_weights[1], frame_weights[2, :5] = 1.0, 2.0
     np.testing.assert_allclose(error_floor.trial_gaps(sims, trials), 1e-3)
     np.testing.assert_allclose(error_floor.trial_gaps(sims, trials, frame_weights), [0.0, 1e-3, np.sqrt(2) * 1e-3])
+
+
+def test_the_noise_is_no_more_than_a_fit_leaves(tmp_path: Path) -> None:
+    given, unknown = (replace(swaying(tmp_path, frames=600), marker_noise_std=x) for x in (2e-3, None))
+    slow = replace(unknown, train=tuple(_every(t, 20) for t in unknown.train))
+    shown = shown_noise(slow)
+    # At 5 frames a second motion shows, and in fourth differences more of it.
+    fourth = [np.abs(np.diff(t.markers[:, ~t.gripped], n=4, axis=0)) for t in slow.train]
+    assert shown_noise(unknown) == pytest.approx(NOISE, rel=0.05)
+    assert 5 * NOISE < shown < 1.4826 * np.median([np.median(x) for x in fourth]) / np.sqrt(70)
+    small, gaps = np.array([3.1e-4, 3.1e-4, np.inf]), np.full(3, 1e-3)
+    assert noise_beside(slow, small) == pytest.approx(3.1e-4) and noise_beside(unknown, gaps) == shown_noise(unknown)
+    # What is given stands unless it is three times what is left.
+    assert noise_beside(given, gaps) == 2e-3 and noise_beside(given, small) == pytest.approx(3.1e-4)
+    assert noise_beside(given, np.array([np.inf])) == 2e-3
+    assert "what neighbouring frames show" in noise_notes(slow, 3.1e-4)[0] and noise_notes(given, 2e-3) == []
+    assert "what rope.json gives, 2 mm, is too much" in noise_notes(given, 3.1e-4)[0]
+
+
+def _every(trial: Trial, step: int) -> Trial:
+    """A trial with every so manieth frame."""
+    return replace(trial, time=trial.time[::step], markers=trial.markers[::step], suspect=trial.suspect[::step])

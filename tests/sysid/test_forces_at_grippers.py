@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.sysid.swaying import recording as swaying
 from torchdlo.errors import InputError
 from torchdlo.sysid.calibration.calibrate import calibrate
 from torchdlo.sysid.model import initial_state, model_file
@@ -212,3 +213,20 @@ def test_forces_that_do_not_fit_the_grippers_are_refused(
     np.savez(file, **{k: v for k, v in kept.items() if v is not None})
     with pytest.raises(InputError, match=message):
         load_recording(tmp_path / "again")
+
+
+@pytest.mark.parametrize(("marker", "columns"), [([14, 0], [1, 0]), ([0], [0])])
+def test_forces_of_other_grippers_or_in_another_order_are_refused(
+    tmp_path: Path, marker: list[int], columns: list[int]
+) -> None:
+    bare = swaying(tmp_path, both=True, frames=20)
+    wrench = np.zeros((20, 2, 6))
+    train = [replace(t, wrench=wrench, wrench_marker=np.array([0, 14])) for t in bare.train]
+    train[1] = replace(train[1], wrench=wrench[:, columns], wrench_marker=np.array(marker))
+    sensor = ForceSensor("world", 0.01)
+    good = replace(bare, wrench=sensor, train=(*train[::2], replace(train[0], name="train_1")))
+    save_recording(good, tmp_path / "good")
+    assert len(load_recording(tmp_path / "good").train) == 3
+    save_recording(replace(good, train=tuple(train)), tmp_path / "other")
+    with pytest.raises(InputError, match=r"train_1.npz: wrench_marker: expected \[0, 14\] as in train_0.npz, found \["):
+        load_recording(tmp_path / "other")

@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from tests.sysid.swaying import recording as swaying
 from torchdlo.errors import InputError
+from torchdlo.sysid.diagnosis.error_floor import noise_ratio
 from torchdlo.sysid.recordings.data_quality import DataIssue, check
 from torchdlo.sysid.recordings.recording import Recording, Trial, load_recording
 
@@ -228,9 +229,43 @@ def test_a_jerk_of_the_rope_is_no_fault(sound: dict[str, Recording]) -> None:
 def test_real_recordings_lose_few_frames(shared_data: Path) -> None:
     for name in ("deform_dlo1", "deform_dlo2", "deform_dlo4"):
         rope = load_recording(shared_data / name)
-        clean, _ = check(rope)
-        trials = [(a, b) for a, b in zip(clean.train + clean.test, rope.train + rope.test, strict=True)]
+        clean, faults = check(rope)
+        # One trial of the first cable is suspect throughout.
+        gone = [f.trial for f in faults if f.kind == "unseen"]
+        assert gone == (["train_090"] if name == "deform_dlo1" else [])
+        kept = [t for t in rope.train + rope.test if t.name not in gone]
+        trials = list(zip(clean.train + clean.test, kept, strict=True))
         lost = np.mean([a.suspect.mean() - b.suspect.mean() for a, b in trials])
         assert lost < 0.02
     for folder in sorted((shared_data / "hidden_effects").glob("dev_*")):
         assert check(load_recording(folder))[1] == []
+
+
+def test_a_noise_in_millimetres_is_refused(sound: dict[str, Recording]) -> None:
+    with pytest.raises(InputError, match=r"marker_noise_std: expected metres, found 0\.3, \d+ times .* is it in mm\?"):
+        check(replace(sound["hanging"], marker_noise_std=0.3))
+    # Smooth markers may have a noise that neighbouring frames do not show.
+    still = spoil(sound["hanging"], lambda t: replace(t, markers=np.repeat(t.markers[:1], len(t.time), 0)), None)
+    assert noise_ratio(replace(still, marker_noise_std=5e-4)) == pytest.approx(2.5)
+    assert noise_ratio(replace(still, marker_noise_std=None)) == 0.0
+
+
+def test_trials_with_nothing_to_judge_by_are_left_out_and_said(sound: dict[str, Recording]) -> None:
+    def unseen(x: np.ndarray) -> None:
+        x[4:, 2:] = np.nan
+
+    clean, faults = check(spoil(sound["hanging"], lambda t: moved(t, unseen), "test_0"))
+    assert [t.name for t in clean.test] == ["test_1"] and [(f.trial, f.kind) for f in faults] == [("test_0", "unseen")]
+    hidden = spoil(sound["hanging"], lambda t: replace(t, suspect=np.ones_like(t.suspect)), "train_1")
+    assert [t.name for t in check(hidden)[0].train] == ["train_0", "train_2"]
+    with pytest.raises(InputError, match="found 4, and no better train trial; nothing could be judged"):
+        check(spoil(sound["hanging"], lambda t: moved(t, unseen), None))
+
+
+def test_frames_that_are_all_stored_twice_are_seen(sound: dict[str, Recording]) -> None:
+    def twice(x: np.ndarray) -> None:
+        x[1::2, 2:] = x[:-1:2, 2:]
+
+    trials, faults = found(spoil(sound["hanging"], lambda t: moved(t, twice)))
+    assert [(f.trial, f.kind) for f in faults] == [("train_1", "stall")] and "every other frame" in faults[0].message
+    assert trials["train_1"].suspect[1::2].all() and not trials["train_1"].suspect[::2].any()

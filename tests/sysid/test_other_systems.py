@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,7 +13,8 @@ from scipy.integrate import solve_ivp
 
 from torchdlo.errors import InputError
 from torchdlo.physics.effects.base import Param
-from torchdlo.sysid.diagnosis.other_systems import EffectSpec, points_trial, select
+from torchdlo.sysid.diagnosis.other_systems import EffectSpec, System, points_trial, select
+from torchdlo.sysid.recordings.recording import Trial
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "experiments"))
 
@@ -44,7 +46,7 @@ def test_hidden_friction_and_drag_are_both_named(tmp_path: Path) -> None:
     assert set(both.effects) == {"bearing_friction", "air_drag"} and both.verdict == "effects"
     assert both.numbers["air_drag.coefficient"][0] == pytest.approx(0.15, rel=0.2)
     assert both.numbers["bearing_friction.deceleration"][0] == pytest.approx(0.5, rel=0.2)
-    assert both.after < 0.2 * both.before and max(both.rates.values()) < 0.01
+    assert both.after < 0.2 * both.before and max(both.rates.values()) < 0.06
 
 
 def test_nothing_is_named_where_nothing_is_hidden(tmp_path: Path) -> None:
@@ -89,5 +91,42 @@ def test_a_recording_that_cannot_be_read_is_refused_in_a_sentence(tmp_path: Path
         pendulum.read(path, RADIUS)
     with pytest.raises(InputError, match=r"a: points have shape \(3, 2\); expected \(3, points, 3\)"):
         points_trial("a", np.arange(3.0), np.zeros((3, 2)))
+    time, still = 0.02 * np.arange(30), np.zeros((30, 1, 3))
+    for wrong, points, said in (
+        (np.r_[time[:10], time[10:] + 0.05], still, r"even steps of 0.02 s, found 0.07 s before frame 10"),
+        (np.r_[time[:-1], np.nan], still, "at least 5 finite times that rise from 0 s"),
+        (time, np.full((30, 1, 3), np.nan), "free points in at least 5 frames, found them in 0"),
+        (time, np.full((30, 1, 3), np.inf), "expected finite numbers in metres"),
+    ):
+        with pytest.raises(InputError, match=f"a: .*{said}"):
+            points_trial("a", wrong, points)
     with pytest.raises(InputError, match="0 train and 0 test trials are given"):
         select(pendulum.system(RADIUS), [], [], NOISE)
+
+
+def fallen(numbers: dict[str, np.ndarray], trials: Sequence[Trial]) -> np.ndarray:
+    """A ball that falls with drag."""
+    found = np.zeros((len(numbers["g"]), len(trials), len(trials[0].time), 1, 3))
+    step = float(trials[0].time[1]) / 10
+    for b in range(len(trials)):
+        place, speed = np.zeros(len(found)), np.zeros(len(found))
+        for f in range(found.shape[2]):
+            found[:, b, f, 0, 2] = place
+            for _ in range(10):
+                speed = speed - step * (numbers["g"] + numbers["drag.k"] * speed * np.abs(speed))
+                place = place + step * speed
+    return found
+
+
+@pytest.mark.parametrize("tests", [1, 9])
+def test_a_name_that_too_few_trials_test_is_doubted(tests: int) -> None:
+    baseline = {"g": Param(9.5, 5.0, 15.0, "m/s^2", "log", None, "Gravity.")}
+    drag = EffectSpec("drag", "a = -k v|v|", {"k": Param(0.0, 0.0, 5.0, "1/m", "linear", 0.0, "Drag.")}, ({"k": 0.05},))
+    time, rng = np.arange(36) / 60, np.random.default_rng(0)
+    empty = points_trial("a", time, np.zeros((36, 1, 3)))
+    true = fallen({"g": np.array([9.81]), "drag.k": np.array([0.3])}, [empty])[0, 0]
+    trials = [replace(empty, name=f"{k}", markers=true + 1e-3 * rng.normal(size=true.shape)) for k in range(3 + tests)]
+    found = select(System(fallen, baseline, (drag,)), trials[:3], trials[3:], 1e-3)
+    assert found.effects == ["drag"]
+    few = "the test trials are too few to exclude that drag is chance"
+    assert found.doubts == ([few] if tests == 1 else []) and (found.rates["drag"] > 0.05) == (tests == 1)

@@ -45,6 +45,7 @@ def test_a_right_recording_is_not_doubted() -> None:
     [
         (replace(SAMPLE, mass=45.0), "mass: 45 kg are 56.2 kg a metre .*; is it in grams"),
         (replace(SAMPLE, radius=4e-4), "heavier than any metal"),
+        (replace(SAMPLE, marker_noise_std=2.5e-3), "marker_noise_std: it is 2.5 mm, 4 times what neighbouring frames"),
         (replace(SAMPLE, length=800.0), "length: 800 m is a long rope"),
         (replace(SAMPLE, length=8.0), "length: markers span 0.8 m of a rope of 8 m"),
         (
@@ -60,3 +61,21 @@ def test_a_right_recording_is_not_doubted() -> None:
 def test_what_can_hardly_be_is_said(strange: Recording, words: str) -> None:
     (said,) = doubts(strange)
     assert re.search(words, said), said
+
+
+def test_markers_are_to_be_turned_not_gravity() -> None:
+    (said,) = doubts(changed(SAMPLE, y_up))
+    assert said.endswith(
+        "turn the markers (not gravity: effects take z for the vertical) so that it hangs along gravity."
+    )
+
+
+def test_a_test_trial_that_is_a_train_trial_is_doubted() -> None:
+    train = SAMPLE.train[0]
+    whole = replace(train, name="test_0")
+    part = replace(
+        train, name="test_0", time=train.time[:90], markers=train.markers[30:120], suspect=train.suspect[:90]
+    )
+    for test in (whole, replace(part, gripper_quaternion=None)):
+        (said,) = doubts(replace(SAMPLE, test=(test,)))
+        assert said == f"test_0: its markers are those of {train.name}; a test trial that was fitted to judges nothing."

@@ -14,13 +14,24 @@ from tests.report.fake_diagnosis import BASELINE, fake_diagnosis, fitted
 from tests.sysid.swaying import recording as swaying
 from torchdlo.report.pages.diagnosis import diagnosis_html
 from torchdlo.sysid.diagnosis import selection
+from torchdlo.sysid.diagnosis.backward_elimination import EliminationResult
 from torchdlo.sysid.diagnosis.detection_limit import detection_limits, least_gap, limit_gap
+from torchdlo.sysid.diagnosis.effect_search import _Search
 from torchdlo.sysid.diagnosis.findings import findings, limits_text, mean_absolute_errors, summary
 from torchdlo.sysid.diagnosis.misleading_trials import errors_by_frame, misleading_trials
-from torchdlo.sysid.diagnosis.plausibility import implausible, unresolved
+from torchdlo.sysid.diagnosis.plausibility import implausible, not_told, unresolved
 from torchdlo.sysid.diagnosis.score_test import Score
-from torchdlo.sysid.diagnosis.significance import agreement, benjamini_hochberg, f_test, sign_flips
-from torchdlo.sysid.diagnosis.verdict import BestCandidate
+from torchdlo.sysid.diagnosis.significance import (
+    Agreement,
+    agreement,
+    benjamini_hochberg,
+    chance,
+    f_test,
+    sign_flips,
+)
+from torchdlo.sysid.diagnosis.verdict import BestCandidate, Candidate
+from torchdlo.sysid.estimation.jobs import Fitted
+from torchdlo.sysid.estimation.levenberg_marquardt import interval
 from torchdlo.sysid.recordings.metrics import mean_absolute_error
 from torchdlo.sysid.recordings.recording import Recording, Trial
 
@@ -36,6 +47,7 @@ def test_sign_flips_count_what_is_at_least_as_large() -> None:
     assert sign_flips(np.array([1.0, 2.0, 3.0])) == 1 / 8
     assert sign_flips(np.array([1.0, -2.0, 3.0])) == 3 / 8
     assert sign_flips(-np.ones(3)) == 1.0 and sign_flips(np.zeros(4)) == 1.0
+    assert sign_flips(np.array([1.0, 2.0, 0.0, 3.0])) == 1 / 8
     # Of many units flips are drawn: of 20 equal ones, all but two positive, 1 + 20 + 190 of 2^20 are as good.
     many = np.r_[np.ones(18), -np.ones(2)]
     assert sign_flips(many) == pytest.approx(211 / 2**20, abs=1e-4)
@@ -79,8 +91,70 @@ def test_trials_say_which_dose_they_ask_for(rope: Recording) -> None:
     assert nothing.p > 0.01 and np.abs(nothing.doses).max() < 0.05
     worse = agreement(*shaken(rope.test, -0.5, np.random.default_rng(1)), rope.test)
     assert worse.p > 0.99
-    many = rope.test * 4
-    assert agreement(*shaken(many, 0.8, np.random.default_rng(0)), many).unit == "trial"
+    many = agreement(*shaken(rope.test * 4, 0.8, np.random.default_rng(0)), rope.test * 4, looked_at=12)
+    assert many.unit == "trial" and many.units == 8 and many.could_tell(12)
+    # Eight trials cannot tell one of 17 candidates from chance, blocks of them can.
+    more = agreement(*shaken(rope.test * 4, 0.8, np.random.default_rng(0)), rope.test * 4, looked_at=17)
+    assert more.unit == "block" and more.units == 40 and more.could_tell(17)
+    null = agreement(*shaken(rope.test * 4, 0.0, np.random.default_rng(1)), rope.test * 4, looked_at=17)
+    assert "may explain the test trials by chance" in chance({"air_drag": null}, 17)["air_drag"]
+    assert chance({"air_drag": more}, 17) == {}
+
+
+def swung(count: int, rng: np.random.Generator, *, start: float, dose: float = 0.0) -> tuple[np.ndarray, list[Trial]]:
+    """What an effect changes of swinging markers, and trials that are off by noise and a start error that swings on."""
+    time, free = np.arange(320) * 0.01, np.linspace(0, 1, 6)[:, None] * np.array([1.0, 0.0, 0.2])
+    changes, trials = [], []
+    for k in range(count):
+        swing = np.exp(-0.5 * time) * np.cos((5 + 0.5 * rng.normal()) * time + rng.uniform(0, 2 * np.pi))
+        changes.append(2e-3 * (time * swing)[:, None, None] * free)
+        off = start * rng.normal() * swing[:, None, None] * free + 5e-4 * rng.normal(size=(320, 6, 3))
+        markers, held = off + dose * changes[-1], np.zeros(6, bool)
+        trials.append(Trial(f"test_{k}", time, markers, free[:, 0], held, None, None, np.zeros(320, bool)))
+    return np.array(changes), trials
+
+
+@pytest.mark.parametrize(("count", "start"), [(2, 3e-3), (5, 3e-3), (2, 0.0)])
+def test_residuals_that_swing_on_are_not_taken_for_many_samples(count: int, start: float) -> None:
+    rng, found = np.random.default_rng(0), []
+    for _ in range(150):
+        changes, trials = swung(count, rng, start=start)
+        found.append(agreement(np.zeros_like(changes), changes, trials, looked_at=17))
+    p, units = np.array([x.p for x in found]), np.mean([x.units for x in found])
+    assert 0.015 <= np.mean(p <= 0.05) <= 0.08 and np.mean(p <= 1e-3) < 0.025
+    if start:
+        # Trials are the units then; short blocks would find one of twenty at 1e-4 and less.
+        assert units < 2 * count and np.mean([x.p_short <= 1e-4 for x in found]) > 0.05
+    else:
+        assert units > 14
+
+
+def test_effects_are_told_from_chance_where_trials_ask_for_the_same_dose() -> None:
+    rng = np.random.default_rng(0)
+    changes, trials = swung(2, rng, start=0.0, dose=1.0)
+    same = agreement(np.zeros_like(changes), changes, trials, looked_at=17)
+    assert same.units == 16 and same.p < 1e-4 and chance({"air_drag": same}, 17) == {}
+    # Two trials that ask for other doses, or one alone, cannot tell; nothing is held against the effect.
+    other = [replace(t, markers=k * t.markers) for k, t in zip((0.7, 1.3), trials, strict=True)]
+    apart = agreement(np.zeros_like(changes), changes, other, looked_at=17)
+    alone = agreement(np.zeros_like(changes[:1]), changes[:1], trials[:1], looked_at=17)
+    assert (apart.units, alone.units) == (2, 1) and not apart.could_tell(17)
+    assert chance({"a": apart, "b": alone}, 17) == {}
+    # Blocks in which nothing changes say nothing.
+    changes[:, 160:] = 0.0
+    assert agreement(np.zeros_like(changes), changes, trials, looked_at=17).units == 8
+
+
+def test_a_candidate_that_too_few_trials_test_is_still_spoken_of() -> None:
+    few = Agreement(2.0**-7, "block", 7, np.ones(1), np.nan, 2.0**-7, 7)
+    best = Candidate("air_drag", 0.5, 0.29, 0.93, "helps on too few trials", few)
+    others = [Candidate(f"e{k}", 0.1, None, None, "its doses explain less") for k in range(16)]
+    search = object.__new__(_Search)
+    told = search._closest({"air_drag": fitted(BASELINE | {"air_drag.c_d": 1.8}, ("air_drag",))}, [best, *others])
+    assert told is not None and told.against.endswith("; there are too few test trials to exclude chance")
+    sure = replace(best, test=replace(few, p=2.0**-10, units=10, p_short=2.0**-10, short_units=10))
+    told = search._closest({"air_drag": fitted(BASELINE | {"air_drag.c_d": 1.8}, ("air_drag",))}, [sure, *others])
+    assert told is not None and told.against == "helps on too few trials"
 
 
 def test_markers_that_are_held_or_not_seen_say_nothing(rope: Recording) -> None:
@@ -105,6 +179,39 @@ def test_a_range_that_holds_nothing_or_what_cannot_be_is_no_finding() -> None:
     assert "does nothing" in implausible(fitted(BASELINE | {"stretch.EA": 1e6}, ("stretch",)), "stretch")
     # One trial tells no range.
     assert implausible(fitted(BASELINE | {"air_drag.c_d": 1e-4}, ("air_drag",), trials=1), "air_drag") is None
+
+
+def test_ranges_end_where_numbers_do_and_hold_their_values() -> None:
+    play = fitted(
+        BASELINE | {"gripper_damping.stiffness": 10.0, "gripper_damping.loss_time": 0.01}, ("gripper_damping",)
+    )
+    far = replace(play.point, gradient=10 * play.point.gradient)
+    low, high = interval(far, play.space, np.array([[0.0, 0.0, 0.0, 1.0, 1.0]]))
+    stiffness, loss = (play.space.names.index(f"gripper_damping.{n}") for n in ("stiffness", "loss_time"))
+    assert 0 < low[stiffness] < 1.0 and high[stiffness] == pytest.approx(1e18)
+    assert low[loss] == 0.0 and 0.01 < high[loss] <= play.space.params[loss].high
+    # Directions turn round.
+    turn = fitted(BASELINE | {"anisotropic_bending.direction": 0.01}, ("anisotropic_bending",))
+    low, high = interval(turn.point, turn.space, np.full((1, 4), 0.5))
+    assert low[3] < 0.0 < 0.01 < high[3]
+
+
+def test_a_number_whose_range_is_all_that_can_be_is_not_told(rope: Recording) -> None:
+    numbers = BASELINE | {"internal_friction.moment": 0.1, "internal_friction.kappa_c": 1.0}
+    friction = fitted(numbers, ("internal_friction",))
+    friction = replace(friction, point=replace(friction.point, gradient=0.1 * friction.point.gradient))
+    drifts = np.array([[0.0, 0.0, 0.0, 0.0, 5.0]])
+    assert implausible(friction, "internal_friction", drifts) is None
+    assert not_told(friction, "internal_friction", drifts) == ["internal_friction.kappa_c"]
+    assert not_told(friction, "internal_friction", 0.1 * drifts) == []
+    assert not_told(fitted(numbers, ("internal_friction",), trials=1), "internal_friction", drifts) == []
+    found = fake_diagnosis(
+        rope, effects=["internal_friction"], ties={"internal_friction": []}, shares={"internal_friction": 0.9}
+    )
+    found = replace(found, final=friction, drifts=drifts, model=SimpleNamespace(parameters=[*numbers]))
+    assert "kappa_c not told)" in summary(found, rope) and "<td>not told</td>" in diagnosis_html(found, rope)
+    kappa = findings(found, rope)["effects"][0]["parameters"]["kappa_c"]
+    assert kappa["value"] is None and kappa["low"] < 0.2 and kappa["high"] > 20
 
 
 def test_damping_as_small_as_that_of_steps_is_not_told_from_it() -> None:
@@ -229,6 +336,7 @@ def test_the_verdict_has_the_test_and_the_measure_of_the_literature(rope: Record
     found = fake_diagnosis(rope, tests={"air_drag": test})
     said = summary(found, rope)
     assert "with p 0.00098 (sign flips of 10 blocks), at a false discovery rate of 0.0078 with all 8 candidates" in said
+    assert f"; an F test of the doses that trials ask for gives p {test.p_trials:.2g}." in said
     maes = {
         when: np.mean([mean_absolute_error(found.predictions[when][t.name], t) for t in rope.test])
         for when in ("before", "after")
@@ -286,3 +394,38 @@ def test_where_nothing_can_matter_nothing_does() -> None:
     )
     assert selection.nothing_can_matter(1.3e-3, 1e-3, 1e-3)
     assert not selection.nothing_can_matter(1.0, 1e-3, np.inf)
+
+
+def test_trials_that_fail_without_an_effect_do_not_count_for_it() -> None:
+    train = np.full(3, 8e-3), np.full(3, 4e-3)
+    before, after = np.array([np.inf, 5e-3, 5e-3]), np.array([9e-3, 7e-3, 7e-3])
+    assert selection.gain(before, after, 5e-4) == pytest.approx(-24 / 24.75)
+    assert not selection.matters(*selection.compared([before], before, after), 5e-4, 8e-4)
+    assert selection.refused(train, (before, after), 5e-4, True) == "does not help on the test trials"
+    assert selection.refused(train, (before, 0.4 * after), 5e-4, True) is None
+    # What fails with the effect alone speaks against it.
+    assert selection.refused(train, (after, before), 5e-4, True) == "does not help on the test trials"
+    nothing = np.full(2, np.inf), np.full(2, 1e-3)
+    assert "cannot be compared" in str(selection.refused(train, nothing, 5e-4, True))
+    assert not selection.matters(*selection.compared([nothing[0]], *nothing), 5e-4, 8e-4)
+
+
+def test_an_effect_is_held_against_what_is_left_without_it_and_nothing_else() -> None:
+    drag = fitted(BASELINE | {"air_drag.c_d": 1.4}, ("air_drag",))
+    plain, beside = fitted(BASELINE), fitted(BASELINE | {"stretch.EA": 100.0}, ("stretch",))
+
+    class Known:
+        def known_without(self, *_: object) -> None:
+            return None
+
+        def without(self, *_: object) -> Fitted:
+            return plain
+
+    class Search(_Search):
+        revision = Known()
+
+    search = object.__new__(Search)
+    # The stretch beside which it was found has been dropped.
+    assert search._rival(drag, "air_drag", EliminationResult(rivals={"air_drag": beside})) is plain
+    kept = fitted(BASELINE)
+    assert search._rival(drag, "air_drag", EliminationResult(rivals={"air_drag": kept})) is kept

@@ -138,7 +138,12 @@ def _effects(found: dict[str, Any]) -> str:
     parts = []
     for effect in found["effects"]:
         rows = [
-            (words(key), number(n["value"], 4), f"{number(n['low'], 3)} to {number(n['high'], 3)}", n["unit"])
+            (
+                words(key),
+                "not told" if n["value"] is None else number(n["value"], 4),
+                f"{number(n['low'], 3)} to {number(n['high'], 3)}",
+                n["unit"],
+            )
             for key, n in effect["parameters"].items()
         ]
         share = percent(effect["share_of_gap"])

@@ -72,9 +72,9 @@ class Revision:
         What takes away nearly all that the others leave matters, however small that is beside the baseline's gap.
         """
         # A baseline may go astray on a trial: then what it became when it was fitted further tells what a share is.
-        first = min(gap_rms(self.bench.gaps(f, split)) for f in self.plain)
-        before, after = (gap_rms(self.bench.gaps(f, split)) for f in (less, more))
-        return selection.matters(first, before, after, self.bench.floor.noise, self.bench.level)
+        plain, (before, after) = ([self.bench.gaps(f, split) for f in fits] for fits in (self.plain, (less, more)))
+        gaps = selection.compared(plain, before, after)
+        return selection.matters(*gaps, self.bench.floor.noise, self.bench.level)
 
     def pruned(self, fitted: Fitted, found: EliminationResult) -> Fitted:
         """Return the model without the effects that the last one, or other numbers, have made needless."""

@@ -31,7 +31,7 @@ from torchdlo.sysid.diagnosis.misleading_trials import MisleadingTrial, errors_b
 from torchdlo.sysid.diagnosis.plausibility import implausible, unresolved
 from torchdlo.sysid.diagnosis.score_test import Score, score_effects
 from torchdlo.sysid.diagnosis.selection import PAYS
-from torchdlo.sysid.diagnosis.significance import RATE, Agreement, agreement, benjamini_hochberg
+from torchdlo.sysid.diagnosis.significance import TOO_FEW, Agreement, agreement, chance
 from torchdlo.sysid.diagnosis.verdict import (
     UNKNOWN_FLOOR,
     BestCandidate,
@@ -338,9 +338,9 @@ class _Search:
     ) -> tuple[Fitted | None, Fitted, list[Candidate], list[str]]:
         """Return what `_round` does, from fits; those in order lead, best first."""
         refused = {name: self._refused(rival, fits[name]) for name in order}
-        tests = {name: self._agreement(rival, fitted) for name, fitted in fits.items()}
-        chance = self._chance(tests, len(scores))
-        refused = {name: refused[name] or chance.get(name) for name in order}
+        tests = {name: self._agreement(rival, fitted, len(scores)) for name, fitted in fits.items()}
+        by_chance = chance(tests, len(scores))
+        refused = {name: refused[name] or by_chance.get(name) for name in order}
         refused |= self._below_steps(fits, order, refused, rival)
         fair = [name for name in order if refused[name] is None]
         best, rivals = None, []
@@ -394,9 +394,9 @@ class _Search:
 
     def _closest(self, fits: dict[str, Fitted], candidates: Sequence[Candidate]) -> BestCandidate | None:
         """Return the candidate that closes most of the gap on the test trials if that is much, None if it is not."""
-        rates = benjamini_hochberg([c.test.p for c in candidates if c.test is not None], len(candidates))
-        sure = {c.name for c, rate in zip([c for c in candidates if c.test], rates, strict=True) if rate <= RATE}
-        tested = [c for c in candidates if c.name in sure and (c.heldout_gain or 0.0) >= MUCH]
+        tests = {c.name: c.test for c in candidates if c.test is not None}
+        no_chance = [c for c in candidates if c.name in tests and c.name not in chance(tests, len(candidates))]
+        tested = [c for c in no_chance if (c.heldout_gain or 0.0) >= MUCH]
         if not tested:
             return None
         # Of those that close nearly as much, the one that fits better.
@@ -404,7 +404,8 @@ class _Search:
         first = min(
             (c for c in tested if (c.heldout_gain or 0.0) > most - _NEAR), key=lambda c: fits[c.name].point.cost
         )
-        return self._candidate(first, fits[first.name], first.reason)
+        few = "" if tree.part(first.test).could_tell(len(candidates)) else f"; there are {TOO_FEW}"
+        return self._candidate(first, fits[first.name], first.reason + few)
 
     def _candidate(self, candidate: Candidate, fitted: Fitted, against: str) -> BestCandidate:
         """Return a candidate that is not named, with its numbers and what speaks against it."""
@@ -459,20 +460,11 @@ class _Search:
             return why
         return implausible(fitted, fitted.effects[-1])
 
-    def _agreement(self, less: Fitted, more: Fitted) -> Agreement:
+    def _agreement(self, less: Fitted, more: Fitted, looked_at: int) -> Agreement:
         """Return how what the last effect changes agrees with what is left over without it, on the test trials."""
         before, after = (self.bench.prediction(fitted, "test") for fitted in (less, more))
-        return agreement(before, after, self.bench.trials["test"], self.bench.starts["test"].frame_weights)
-
-    def _chance(self, tests: dict[str, Agreement], looked_at: int) -> dict[str, str]:
-        """Return which of the tested effects may explain the test trials by chance, and why that is thought."""
-        rates = benjamini_hochberg([t.p for t in tests.values()], looked_at)
-        # Where no flip at all could tell, nothing is held against an effect but that this is said.
-        return {
-            name: f"may explain the test trials by chance (p {test.p:.2g}, false discovery rate {rate:.2g})"
-            for (name, test), rate in zip(tests.items(), rates, strict=True)
-            if rate > RATE >= looked_at * 2.0**-test.units
-        }
+        weights = self.bench.starts["test"].frame_weights
+        return agreement(before, after, self.bench.trials["test"], weights, looked_at=looked_at)
 
     def _gain(self, base: Fitted, fitted: Fitted, split: str) -> float:
         """Return the share of the excess gap (squared, above noise) that a fit closes."""
@@ -512,15 +504,17 @@ class _Search:
             effects, gap_rms(self.bench.gaps(final, "test")), self.bench.level, gap_rms(after) / gap_rms(before)
         )
         model = self.pool.local.model(final.effects, final.options)
-        rivals = {n: self.revision.known_without(final, n) or found.rivals[n] for n in effects}
+        rivals = {n: self._rival(final, n, found) for n in effects}
         self.bench.predict([*rivals.values(), final])
-        tests = {name: self._agreement(rival, final) for name, rival in rivals.items()}
+        looked_at = sum(map(len, rounds))
+        tests = {name: self._agreement(rival, final, looked_at) for name, rival in rivals.items()}
         limit = limit_gap(self.bench.gaps(final, "test"), self.bench.floor.noise, self.bench.level, PAYS)
         said = [
             *baselines.baseline_notes(tree.part(self.baseline)),
             *clamp_models.clamp_notes(model, final),
             *self.bench.predictions.notes(),
             *self._force_notes(final),
+            *error_floor.noise_notes(self.recording, self.bench.floor.noise),
         ]
         predictions = {
             when: {t.name: sim[: len(t.time)] for sim, t in zip(sims, trials["all"], strict=True)}
@@ -551,6 +545,13 @@ class _Search:
             misleading=self.misleading,
             forces=None if self.force_before is None else (self.force_before, self._forces(final)),
         )
+
+    def _rival(self, final: Fitted, name: str, found: EliminationResult) -> Fitted:
+        """Return the model without one of the effects that it is held against in the end."""
+        known = self.revision.known_without(final, name) or found.rivals[name]
+        # One that was fitted beside others than are left would show what these do, too.
+        rest = {effect for effect in final.effects if effect != name}
+        return known if set(known.effects) == rest else self.revision.without(final, name)
 
     def _forces(self, fitted: Fitted) -> ForceErrors:
         return tree.part(gripper_forces.force_errors(self.bench, fitted))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from math import comb
 
 import numpy as np
 
@@ -12,6 +13,15 @@ from torchdlo.sysid.estimation.jobs import Fitted, SimulationJob
 from torchdlo.sysid.estimation.worker_pool import Pool
 from torchdlo.sysid.model.trial_batch import Start
 from torchdlo.sysid.recordings.recording import Recording, Trial
+
+_ORDERS = (4, 6)
+"""Of differences in time that show noise."""
+
+_OVERESTIMATED = 3.0
+"""Times what a fit leaves from which a noise that is given is too large."""
+
+_LITTLE = 2e-4
+"""Noise of markers below which it is not asked how much it is [m]."""
 
 
 @dataclass(frozen=True)
@@ -37,13 +47,59 @@ def marker_noise(recording: Recording) -> float:
 
 
 def shown_noise(recording: Recording) -> float:
-    """Return the noise of the markers [m] that fourth differences in time say; less than there is if it is coloured."""
+    """Return the noise of the markers [m] that differences in time say; less than there is if it is coloured.
+
+    Of the fourth and the sixth differences the smaller: at low frame rates they show motion, too.
+    """
     parts = []
     for trial in recording.train:
-        fourth = np.diff(trial.markers[:, ~trial.gripped], n=4, axis=0)
+        free = trial.markers[:, ~trial.gripped]
+        orders = [order for order in _ORDERS if len(free) > 2 * order] or [_ORDERS[0]]
         # The variance of a fourth difference of white noise is 70 times the noise's; medians pass over jumps.
-        parts.append(1.4826 * np.nanmedian(np.abs(fourth)) / np.sqrt(70))
+        sizes = [np.nanmedian(np.abs(np.diff(free, n=n, axis=0))) / np.sqrt(comb(2 * n, n)) for n in orders]
+        parts.append(1.4826 * float(np.min(sizes)))
     return float(np.median(parts))
+
+
+def noise_beside(recording: Recording, gaps: np.ndarray) -> float:
+    """Return the noise of the markers [m] beside a fit: no more than the fit leaves of the markers.
+
+    A noise that is given stands unless it is three times that.
+
+    Args:
+        recording: with the noise, if it is given.
+        gaps: of the fit by trial, shape (B,) [m].
+    """
+    noise, left = marker_noise(recording), gaps[np.isfinite(gaps)]
+    if not len(left):
+        return noise
+    bound = gap_rms(left)
+    if recording.marker_noise_std is not None and noise <= _OVERESTIMATED * bound:
+        return noise
+    return min(noise, bound)
+
+
+def noise_notes(recording: Recording, noise: float) -> list[str]:
+    """Return a sentence where the noise that was taken [m] is less than what is given, or shows."""
+    claimed = marker_noise(recording)
+    if recording.filmed or noise >= claimed:
+        return []
+    whose = "what neighbouring frames show" if recording.marker_noise_std is None else "what rope.json gives"
+    return [
+        f"The noise of the markers is taken to be {1e3 * noise:.2g} mm, as the model leaves no more; {whose}, "
+        f"{1e3 * claimed:.2g} mm, is {'motion, too' if recording.marker_noise_std is None else 'too much'}."
+    ]
+
+
+def noise_ratio(recording: Recording) -> float:
+    """Return how many times the noise that shows the given one is [1]; 0 where none is given, or no markers are free.
+
+    Smooth markers show less noise than they may have: below 0.2 mm it is not asked how much it is.
+    """
+    if recording.marker_noise_std is None or recording.filmed:
+        return 0.0
+    shown = shown_noise(recording)
+    return recording.marker_noise_std / max(shown, _LITTLE) if np.isfinite(shown) else 0.0
 
 
 def trial_gaps(
@@ -189,7 +245,8 @@ def refine(pool: Pool, base: Fitted, start: Start, chain: str) -> Refinement:
     sims = dict(pool.simulate(jobs))
     fine, half_steps, as_it_is = (sims[k][0][..., : model.count, :] for k in range(3))
     found = refinement(fine, half_steps, as_it_is, model.numerical_damping, edge)
-    return replace(found, noise=marker_noise(pool.recording), links=length)
+    gaps = trial_gaps(as_it_is, pool.recording.trials("all"))
+    return replace(found, noise=noise_beside(pool.recording, gaps), links=length)
 
 
 def refinement(

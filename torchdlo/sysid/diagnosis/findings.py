@@ -13,7 +13,7 @@ from torchdlo.physics.effects.parameter_name import values_of
 from torchdlo.sysid.diagnosis.detection_limit import HIDDEN
 from torchdlo.sysid.diagnosis.effect_library import effect_equation, separating_experiment
 from torchdlo.sysid.diagnosis.error_floor import gap_rms, trial_gaps
-from torchdlo.sysid.diagnosis.plausibility import implausible
+from torchdlo.sysid.diagnosis.plausibility import implausible, not_told
 from torchdlo.sysid.diagnosis.residual_analysis import localise
 from torchdlo.sysid.diagnosis.significance import RATE, Agreement
 from torchdlo.sysid.diagnosis.verdict import Diagnosis
@@ -113,7 +113,7 @@ def _leading(result: Diagnosis) -> dict[str, Any] | None:
 
 
 def _numbers(result: Diagnosis) -> dict[str, dict[str, Any]]:
-    """Return the fitted numbers with their ranges."""
+    """Return the fitted numbers with their ranges; the value is None where the range is all that can be."""
     space, point = result.final.space, result.final.point
     rows = zip(
         space.names,
@@ -122,8 +122,9 @@ def _numbers(result: Diagnosis) -> dict[str, dict[str, Any]]:
         space.params,
         strict=True,
     )
+    unknown = {key for name in result.effects for key in not_told(result.final, name, result.drifts)}
     return {
-        name: {"value": float(v), "low": float(min(a, b)), "high": float(max(a, b)), "unit": p.unit}
+        name: {"value": None if name in unknown else float(v), "low": float(a), "high": float(b), "unit": p.unit}
         for name, v, a, b, p in rows
     }
 
@@ -240,7 +241,7 @@ def confidence(result: Diagnosis) -> dict[str, Any] | None:
     rates = result.false_discovery_rates
     if chance := [name for name in result.effects if rates.get(name, 0.0) > RATE]:
         doubts.append(f"the test trials are too few to exclude that {_listed(chance)} is chance")
-    if len(result.after) < 2:
+    elif len(result.after) < 2:
         doubts.append("there is one test trial only")
     if len(result.final.point.trial_costs) < 3:
         doubts.append("there are fewer than three train trials")
@@ -333,10 +334,13 @@ def limits_text(result: Diagnosis) -> str:
 def _tested(name: str, result: Diagnosis) -> str:
     """Return whether what an effect explains on the test trials could be chance, in a sentence."""
     test, rate = result.tests[name], result.false_discovery_rates[name]
+    doses = (
+        "" if np.isnan(test.p_trials) else f"; an F test of the doses that trials ask for gives p {test.p_trials:.2g}"
+    )
     return (
         f"Chance explains as much of the test trials as {name.replace('_', ' ')} with p {test.p:.2g} (sign flips of "
         f"{test.units} {test.unit}s), at a false discovery rate of {rate:.2g} with all {result.looked_at} candidates "
-        "that were looked at."
+        f"that were looked at{doses}."
     )
 
 
@@ -356,7 +360,9 @@ def _best(result: Diagnosis) -> str:
 def _named(name: str, numbers: dict[str, dict[str, Any]], ties: list[str]) -> str:
     own = values_of(name, numbers)
     told = ", ".join(
-        f"{key} {n['value']:.3g} [{n['low']:.3g}, {n['high']:.3g}]{'' if n['unit'] == '1' else ' ' + n['unit']}"
+        f"{key} not told"
+        if n["value"] is None
+        else f"{key} {n['value']:.3g} [{n['low']:.3g}, {n['high']:.3g}]{'' if n['unit'] == '1' else ' ' + n['unit']}"
         for key, n in own.items()
     )
     other = f", not to be told from {_listed(ties)}" if ties else ""

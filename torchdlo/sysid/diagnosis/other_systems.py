@@ -17,7 +17,7 @@ from torchdlo.physics.effects.base import Param
 from torchdlo.sysid.diagnosis import selection
 from torchdlo.sysid.diagnosis.error_floor import gap_rms, trial_gaps
 from torchdlo.sysid.diagnosis.plausibility import implausible
-from torchdlo.sysid.diagnosis.significance import RATE, Agreement, agreement, benjamini_hochberg
+from torchdlo.sysid.diagnosis.significance import RATE, Agreement, agreement, benjamini_hochberg, chance
 from torchdlo.sysid.diagnosis.verdict import verdict_word
 from torchdlo.sysid.estimation.jobs import Fitted
 from torchdlo.sysid.estimation.levenberg_marquardt import ParameterSpace, evaluate, improve_points, interval
@@ -39,6 +39,12 @@ _DOSES = (1.0, 0.1)
 
 _HORIZONS = (0.1, 0.3, 1.0)
 """Shares of the trials that the baseline is fitted to, one after the other."""
+
+_FEWEST = 5
+"""Frames with a free point below which a trial tells nothing."""
+
+_EVEN = 0.01
+"""Largest deviation of a time step from the median step, as a share of it: printed times are rounded."""
 
 _SPREAD = (1.0, 0.5, 2.0)
 """Multiples of the baseline's numbers from which its fit starts."""
@@ -97,6 +103,8 @@ class Selection:
     """Gap of a perfect model [m]."""
     candidates: list[dict[str, object]] = field(default_factory=list)
     """Round, name, gains on train and test trials, and why it was taken or left."""
+    doubts: list[str] = field(default_factory=list)
+    """What speaks against the names, a sentence each."""
 
 
 def points_trial(name: str, time: np.ndarray, points: np.ndarray, given: np.ndarray | None = None) -> Trial:
@@ -112,8 +120,31 @@ def points_trial(name: str, time: np.ndarray, points: np.ndarray, given: np.ndar
         raise InputError(f"{name}: points have shape {points.shape}; expected ({len(time)}, points, 3) in metres.")
     count = points.shape[1]
     held = np.zeros(count, bool) if given is None else np.asarray(given, bool)
+    _check_readings(name, np.asarray(time, float), np.asarray(points, float), held)
     suspect = np.zeros(len(time), bool)
     return Trial(name, np.asarray(time, float), points, np.arange(count, dtype=float), held, None, None, suspect)
+
+
+def _check_readings(name: str, time: np.ndarray, points: np.ndarray, held: np.ndarray) -> None:
+    """Refuse times that are not even, points that are given but not known, and trials with hardly a free point."""
+    steps = np.diff(time)
+    if len(time) < _FEWEST or not np.isfinite(time).all() or abs(time[0]) > 1e-9 or (steps <= 0).any():
+        raise InputError(f"{name}: time: expected at least {_FEWEST} finite times that rise from 0 s.")
+    step = float(np.median(steps))
+    uneven = np.abs(steps - step) > _EVEN * step
+    if uneven.any():
+        frame = int(np.argmax(uneven)) + 1
+        raise InputError(
+            f"{name}: time: expected even steps of {step:g} s, found {steps[frame - 1]:g} s before frame {frame}; "
+            "interpolate the points to even steps, NaN where too much is missing."
+        )
+    if np.isinf(points).any() or not np.isfinite(points[:, held]).all():
+        raise InputError(
+            f"{name}: points: expected finite numbers in metres, or NaN for a free point that is not seen."
+        )
+    seen = int(np.isfinite(points[:, ~held]).all(-1).any(-1).sum())
+    if seen < _FEWEST:
+        raise InputError(f"{name}: points: expected free points in at least {_FEWEST} frames, found them in {seen}.")
 
 
 def select(
@@ -167,10 +198,10 @@ class _Selector:
                 break
             rival = self.fit(base.effects, [self.values(base)])
             fits = {name: self._extended(rival, name) for name in names}
-            tests = {name: self.test(rival, fitted) for name, fitted in fits.items()}
+            tests = {name: self.test(rival, fitted, len(names)) for name, fitted in fits.items()}
             tested += tests.items()
-            rates = dict(zip(names, benjamini_hochberg([tests[n].p for n in names], len(names)), strict=True))
-            reasons = {n: self._refused(first, rival, fits[n], tests[n], rates[n], len(names)) for n in names}
+            by_chance = chance(tests, len(names))
+            reasons = {n: self._refused(first, rival, fits[n], by_chance.get(n)) for n in names}
             fair = sorted((n for n in names if reasons[n] is None), key=lambda n: fits[n].point.cost)
             close: list[str] = []
             if fair:
@@ -264,9 +295,10 @@ class _Selector:
         """Return the gap of each trial of a split [m]."""
         return trial_gaps(self.prediction(fitted, split), self.trials[split])
 
-    def test(self, less: Fitted, more: Fitted) -> Agreement:
+    def test(self, less: Fitted, more: Fitted, looked_at: int) -> Agreement:
         """Return whether what an effect explains on the test trials could be chance."""
-        return agreement(self.prediction(less, "test"), self.prediction(more, "test"), self.trials["test"])
+        before, after = (self.prediction(fitted, "test") for fitted in (less, more))
+        return agreement(before, after, self.trials["test"], looked_at=looked_at)
 
     def _extended(self, rival: Fitted, name: str) -> Fitted:
         """Return the best fit with one effect more."""
@@ -288,18 +320,14 @@ class _Selector:
         return float(space.to_values(ends[:1] + share * (ends[1:] - ends[:1]))[0, 0])
 
     def _matters(self, first: Fitted, less: Fitted, more: Fitted, split: str) -> bool:
-        whole, before, after = (gap_rms(self.gaps(f, split)) for f in (first, less, more))
-        return selection.matters(whole, before, after, self.noise, self.level)
+        whole, before, after = (self.gaps(f, split) for f in (first, less, more))
+        return selection.matters(*selection.compared([whole], before, after), self.noise, self.level)
 
-    def _refused(
-        self, first: Fitted, rival: Fitted, fitted: Fitted, test: Agreement, rate: float, looked_at: int
-    ) -> str | None:
+    def _refused(self, first: Fitted, rival: Fitted, fitted: Fitted, by_chance: str | None) -> str | None:
         train, held = ((self.gaps(rival, split), self.gaps(fitted, split)) for split in ("train", "test"))
         enough = all(self._matters(first, rival, fitted, split) for split in ("train", "test"))
         why = selection.refused(train, held, self.noise, enough)
-        if why is None and rate > RATE >= looked_at * 2.0**-test.units:
-            why = f"may explain the test trials by chance (p {test.p:.2g}, false discovery rate {rate:.2g})"
-        return why or implausible(fitted, fitted.effects[-1])
+        return why or by_chance or implausible(fitted, fitted.effects[-1])
 
     def _pruned(self, first: Fitted, base: Fitted, ties: dict[str, list[str]], rivals: dict[str, Fitted]) -> Fitted:
         """Return the model without effects that the last one has made needless."""
@@ -323,10 +351,28 @@ class _Selector:
         tested: list[tuple[str, Agreement]],
     ) -> Selection:
         before, after = (gap_rms(self.gaps(f, "test")) for f in (first, final))
-        tests = {name: self.test(rivals[name], final) for name in ties}
+        for name in ties:
+            rest = tuple(e for e in final.effects if e != name)
+            if set(rivals[name].effects) != set(rest):
+                # Beside an effect that was dropped, it would show what that one does, too.
+                rivals[name] = self.fit(rest, [self.values(final), self.values(first)])
+        tests = {name: self.test(rivals[name], final, len(looked)) for name in ties}
         p = [t.p for t in tests.values()] + [t.p for name, t in tested if name not in tests]
         rates = dict(zip(tests, map(float, benjamini_hochberg(p, len(looked))), strict=False))
         ranges = zip(final.space.names, final.values, *interval(final.point, final.space), strict=True)
         numbers = {n: (float(v), float(min(a, b)), float(max(a, b))) for n, v, a, b in ranges}
         verdict = verdict_word([*ties], after, self.level, after / max(before, 1e-30))
-        return Selection(verdict, [*ties], numbers, ties, tests, rates, before, after, self.level, looked)
+        doubts = self._doubts(ties, rates)
+        return Selection(verdict, [*ties], numbers, ties, tests, rates, before, after, self.level, looked, doubts)
+
+    def _doubts(self, ties: dict[str, list[str]], rates: dict[str, float]) -> list[str]:
+        """Return what speaks against the names; nothing where none are given."""
+        said = [f"{other} would do as well as {name}" for name, others in ties.items() for other in others]
+        train, test = (len(self.trials[split]) for split in ("train", "test"))
+        if few := [name for name, rate in rates.items() if rate > RATE]:
+            said.append(f"the test trials are too few to exclude that {' or '.join(few)} is chance")
+        elif ties and test < 2:
+            said.append("there is one test trial only")
+        if ties and train < 3:
+            said.append("there are fewer than three train trials")
+        return said

@@ -6,10 +6,10 @@ import numpy as np
 
 from torchdlo.physics.effects.parameter_name import ParameterName
 from torchdlo.sysid.estimation.jobs import Fitted
-from torchdlo.sysid.estimation.levenberg_marquardt import reach
+from torchdlo.sysid.estimation.levenberg_marquardt import ParameterSpace, reach
 from torchdlo.sysid.model.rope_model import RopeModel
 
-__all__ = ["implausible", "unresolved"]
+__all__ = ["implausible", "not_told", "unresolved"]
 
 _EDGE = 1e-3
 """Share of the range of a number from whose ends it counts as standing there."""
@@ -43,8 +43,7 @@ def implausible(fitted: Fitted, name: str, drifts: np.ndarray | None = None) -> 
         if which.effect != name:
             continue
         param = space.params[k]
-        ends = space.to_raw(np.array([[p.low for p in space.params], [p.high for p in space.params]]))[:, k]
-        low, high = float(ends.min()), float(ends.max())
+        low, high = (float(end[k]) for end in _bounds(space))
         at, width = float(point.raw[k]), float(far[k])
         if param.off is None:
             continue
@@ -60,6 +59,36 @@ def implausible(fitted: Fitted, name: str, drifts: np.ndarray | None = None) -> 
     if switches and all(switches):
         return "has a range that holds the value at which it does nothing"
     return None
+
+
+def not_told(fitted: Fitted, name: str, drifts: np.ndarray | None = None) -> list[str]:
+    """Return the names of an effect's numbers without an off value whose ranges hold all that can be.
+
+    Of those with one `implausible` says so: the effect is no finding. What others leave open is no reason against it.
+
+    Args:
+        fitted: the model.
+        name: one of its effects.
+        drifts: as in `implausible`.
+    """
+    space, point = fitted.space, fitted.point
+    far = reach(point, space, drifts)
+    if far is None:
+        return []
+    low, high = _bounds(space)
+    whole = (point.raw - far <= low) & (point.raw + far >= high)
+    parts = [(ParameterName.parse(key), param) for key, param in zip(space.names, space.params, strict=True)]
+    return [
+        key
+        for key, (which, param), all_of_it in zip(space.names, parts, whole, strict=True)
+        if which.effect == name and param.off is None and all_of_it
+    ]
+
+
+def _bounds(space: ParameterSpace) -> tuple[np.ndarray, np.ndarray]:
+    """Return the lowest and highest coordinates that are declared, shape (K,) each."""
+    ends = space.to_raw(np.array([[p.low for p in space.params], [p.high for p in space.params]]))
+    return ends.min(0), ends.max(0)
 
 
 def unresolved(fitted: Fitted, name: str, model: RopeModel) -> str | None:

@@ -16,6 +16,7 @@ __all__ = [
     "MATTERS",
     "NEARLY_ALL",
     "PAYS",
+    "compared",
     "gain",
     "helps_on_most",
     "matters",
@@ -47,9 +48,29 @@ _NOISE = 0.3
 
 
 def gain(before: np.ndarray, after: np.ndarray, noise: float) -> float:
-    """Return the share of the excess gap (squared, above noise) that is closed, of gaps by trial (B,) [m]."""
-    old, new = gap_rms(before) ** 2, gap_rms(after) ** 2
+    """Return the share of the excess gap (squared, above noise) that is closed, of gaps by trial (B,) [m].
+
+    Trials that the model before does not get through are left out; NaN where that is none.
+    """
+    kept = np.isfinite(before)
+    if not kept.any():
+        return float("nan")
+    old, new = gap_rms(before[kept]) ** 2, gap_rms(after[kept]) ** 2
     return float((old - new) / max(old - noise**2, (_NOISE * noise) ** 2, 1e-12))
+
+
+def compared(first: Sequence[np.ndarray], before: np.ndarray, after: np.ndarray) -> tuple[float, float, float]:
+    """Return the gaps that `matters` compares [m], on the trials that the model before gets through.
+
+    Args:
+        first: gaps of baselines, of which the smallest counts, shape (B,) each [m].
+        before: gaps without an effect, shape (B,) [m].
+        after: gaps with it, shape (B,) [m].
+    """
+    kept = np.isfinite(before)
+    if not kept.any():
+        return (float("nan"),) * 3
+    return min(gap_rms(gaps[kept]) for gaps in first), gap_rms(before[kept]), gap_rms(after[kept])
 
 
 def helps_on_most(before: np.ndarray, after: np.ndarray) -> bool:
@@ -108,11 +129,13 @@ def refused(
         noise: of what is measured [m].
         enough: whether what it closes `matters`.
     """
-    closed = gain(*train, noise)
+    closed, held = gain(*train, noise), gain(*test, noise)
+    if np.isnan(closed) or np.isnan(held):
+        return "cannot be compared, as no trial is simulated to its end without it"
     if not helps_on_most(*train):
         return "helps on too few trials"
     if closed < PAYS:
         return f"closes {max(closed, 0):.0%} of the gap"
-    if gain(*test, noise) < PAYS:
+    if held < PAYS:
         return "does not help on the test trials"
     return None if enough else "closes less than the floor leaves open"

@@ -3,14 +3,15 @@
 The train trials choose effects and fit their numbers; the test trials judge them. There, what an effect changes of a
 simulation is held against what the model without it leaves over. If the effect is not there, these two agree as often
 as they disagree, so that signs may be flipped at will (Fisher 1935; Winkler et al. 2014,
-doi:10.1016/j.neuroimage.2014.01.060): by trials where there are enough, else by blocks of time. Beside it stands an
-exact F test of the doses that the trials ask for. All candidates that were looked at count (Benjamini and Hochberg
-1995, doi:10.1111/j.2517-6161.1995.tb02031.x).
+doi:10.1016/j.neuroimage.2014.01.060): by trials where there are enough, else by blocks of time, as long as it takes for
+what one dose leaves over to be independent from block to block. Beside it stands an exact F test of the doses that the
+trials ask for. All candidates that were looked at count (Benjamini and Hochberg 1995,
+doi:10.1111/j.2517-6161.1995.tb02031.x).
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,7 +19,17 @@ from scipy import stats
 
 from torchdlo.sysid.recordings.recording import Trial
 
-__all__ = ["RATE", "Agreement", "agreement", "benjamini_hochberg", "f_test", "sign_flips"]
+__all__ = [
+    "RATE",
+    "TOO_FEW",
+    "Agreement",
+    "agreement",
+    "benjamini_hochberg",
+    "chance",
+    "f_test",
+    "independent",
+    "sign_flips",
+]
 
 RATE = 0.05
 """False discovery rate up to which effects are named: of so many names, one may be chance."""
@@ -27,10 +38,10 @@ _KNEE = 2e-3
 """Residual from which it counts less [m], as in fits."""
 
 _BLOCK = 0.4
-"""Time after which what a rope does is taken to be another sample [s]: half a period of a swinging rope of 0.6 m."""
+"""Length of the shortest blocks [s]: half a period of a swinging rope of 0.6 m."""
 
-_TRIALS = 8
-"""Trials from which whole ones are flipped: 1 of 2^8 is below one of a hundred."""
+TOO_FEW = "too few test trials to exclude chance"
+"""What is said where no flip at all could tell an effect from chance."""
 
 _ALL = 16
 """Units up to which all flips are counted; of more, some are drawn."""
@@ -47,15 +58,28 @@ class Agreement:
     unit: str
     """What was flipped: "trial" or "block"."""
     units: int
-    """How many there are."""
+    """How many there are that say anything."""
     doses: np.ndarray
     """By trial: the dose that it asks for, over the one that was fitted [1], shape (B,); NaN where it is not known."""
     p_trials: float
     """Of an exact F test that the mean dose of trials is above 0 [1]; NaN of fewer than two trials."""
+    p_short: float = 1.0
+    """Share of flips likewise if the shortest blocks were independent: less than there is, where they are not."""
+    short_units: int = 0
+    """How many of these there are."""
+
+    def could_tell(self, looked_at: int) -> bool:
+        """Return whether flips could tell an effect from chance at all, among so many candidates."""
+        return looked_at * 2.0**-self.units <= RATE
 
 
 def agreement(
-    less: np.ndarray, more: np.ndarray, trials: Sequence[Trial], frame_weights: np.ndarray | None = None
+    less: np.ndarray,
+    more: np.ndarray,
+    trials: Sequence[Trial],
+    frame_weights: np.ndarray | None = None,
+    *,
+    looked_at: int = 1,
 ) -> Agreement:
     """Hold what an effect changes against what is left over without it.
 
@@ -64,8 +88,9 @@ def agreement(
         more: the same with it.
         trials: B trials.
         frame_weights: what errors of frames are multiplied by [1], shape (B, F); 1 if not given.
+        looked_at: candidates in all: trials are flipped whole where that can tell one from chance among so many.
     """
-    blocks, of_trial = [], []
+    scores, powers = [], []
     for k, trial in enumerate(trials):
         free, count = ~trial.gripped, len(trial.time)
         left = np.where(trial.suspect[:, None, None], np.nan, trial.markers)[:, free] - less[k][:count, free]
@@ -76,18 +101,74 @@ def agreement(
         weight = trust[:, None, None] ** 2 / np.sqrt((trust[:, None, None] * left) ** 2 + _KNEE**2)
         agree, power = (weight * left * change).sum((1, 2)), (weight * change**2).sum((1, 2))
         parts = max(1, round((trial.time[-1] - trial.time[0]) / _BLOCK))
-        blocks += [float(x.sum()) for x in np.array_split(agree, parts)]
-        of_trial.append((float(agree.sum()), float(power.sum())))
-    sums, powers = np.array(of_trial).T
-    doses = np.divide(sums, powers, out=np.full(len(sums), np.nan), where=powers > 0)
-    unit, scores = ("trial", sums) if len(trials) >= _TRIALS else ("block", np.array(blocks))
-    return Agreement(sign_flips(scores), unit, len(scores), doses, f_test(doses[np.isfinite(doses)]))
+        scores.append(np.array([x.sum() for x in np.array_split(agree, parts)]))
+        powers.append(np.array([x.sum() for x in np.array_split(power, parts)]))
+    sums, whole = (np.array([x.sum() for x in each]) for each in (scores, powers))
+    doses = np.divide(sums, whole, out=np.full(len(sums), np.nan), where=whole > 0)
+    short = np.concatenate(scores)
+    few = looked_at * 2.0 ** -np.count_nonzero(sums) > RATE
+    unit, units = ("block", np.concatenate(independent(scores, powers))) if few else ("trial", sums)
+    p, count, known = sign_flips(units), int(np.count_nonzero(units)), doses[np.isfinite(doses)]
+    merged = len(units) < len(short)
+    p_short, short_units = (sign_flips(short), int(np.count_nonzero(short))) if merged else (p, count)
+    return Agreement(p, unit, count, doses, f_test(known), p_short, short_units)
+
+
+def independent(scores: Sequence[np.ndarray], powers: Sequence[np.ndarray]) -> list[np.ndarray]:
+    """Return scores of blocks merged until what one dose leaves over is independent from block to block.
+
+    How much the blocks of a trial go together is the sum of their autocorrelations up to the first that is not above 0,
+    or does not stand out of what independent blocks show. Of one trial alone no dose can be told from what is wrong in
+    that trial. A dose that differs from trial to trial makes blocks of whole trials.
+
+    Args:
+        scores: of blocks, by trial, shape (N,) each.
+        powers: what a dose of 1 would make of them, likewise.
+    """
+    total, power = (sum(float(x.sum()) for x in each) for each in (scores, powers))
+    dose = total / power if len(scores) > 1 and power > 0 else 0.0
+    left = [s - dose * p for s, p in zip(scores, powers, strict=True)]
+    square, together = sum(float(x @ x) for x in left), 1.0
+    for lag in range(1, max(map(len, left))):
+        pairs = sum(max(len(x) - lag, 0) for x in left)
+        alike = sum(float(x[lag:] @ x[:-lag]) for x in left if len(x) > lag)
+        if square == 0 or alike <= (square / np.sqrt(pairs) if lag == 1 else 0.0):
+            break
+        together += 2 * alike / square
+    # Longer rather than shorter: the one dose has taken its share of what goes together.
+    length = int(np.ceil(together))
+    return [np.array([x.sum() for x in np.array_split(s, max(1, round(len(s) / length)))]) for s in scores]
+
+
+def chance(tests: Mapping[str, Agreement], looked_at: int) -> dict[str, str]:
+    """Return which of the tested effects may explain the test trials by chance, and why that is thought.
+
+    What even the shortest blocks do not tell from chance is none either. Where no flip at all could tell, nothing is
+    held against an effect but that this is said.
+
+    Args:
+        tests: by effect.
+        looked_at: candidates in all.
+    """
+    found: dict[str, str] = {}
+    for p, units in (
+        ([t.p for t in tests.values()], [t.units for t in tests.values()]),
+        ([t.p_short for t in tests.values()], [t.short_units for t in tests.values()]),
+    ):
+        rates = benjamini_hochberg(p, looked_at)
+        for name, own, rate, count in zip(tests, p, rates, units, strict=True):
+            if rate > RATE >= looked_at * 2.0**-count:
+                said = f"may explain the test trials by chance (p {own:.2g}, false discovery rate {rate:.2g})"
+                found.setdefault(name, said)
+    return found
 
 
 def sign_flips(scores: np.ndarray) -> float:
     """Return the share of flips of signs with a sum at least as large as that of the scores (N,), these included."""
     scores = np.asarray(scores, float)
-    if not np.isfinite(scores).all() or not np.any(scores):
+    # What says nothing flips into itself.
+    scores = scores[scores != 0]
+    if not len(scores) or not np.isfinite(scores).all():
         return 1.0
     total = scores.sum()
     if len(scores) <= _ALL:

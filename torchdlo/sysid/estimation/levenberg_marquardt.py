@@ -292,11 +292,14 @@ def firm(curvature: np.ndarray) -> np.ndarray:
 
 
 def interval(point: Point, space: ParameterSpace, drifts: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """Return 90 % limits of the values, shape (K,) each; see `reach`."""
+    """Return low and high 90 % limits of the values, shape (K,) each, within what is declared; see `reach`."""
     far = reach(point, space, drifts)
     if far is None:
         return np.array([p.low for p in space.params]), np.array([p.high for p in space.params])
-    return space.to_values(point.raw - far), space.to_values(point.raw + far)
+    ends = np.stack([point.raw - far, point.raw + far])
+    # Angles that turn round have no bounds; a spring in series whose coordinate passed 0 would be negative.
+    ends = space.to_values(np.where([p.periodic for p in space.params], ends, space.clip(ends)))
+    return ends.min(0), ends.max(0)
 
 
 def reach(point: Point, space: ParameterSpace, drifts: np.ndarray | None = None) -> np.ndarray | None:

@@ -13,6 +13,7 @@ import numpy as np
 
 from torchdlo.errors import InputError
 from torchdlo.sysid.diagnosis.error_floor import marker_noise as noise_of
+from torchdlo.sysid.diagnosis.error_floor import noise_ratio
 from torchdlo.sysid.recordings.marker_spacing import spacing_faults
 from torchdlo.sysid.recordings.recording import Recording, Trial
 
@@ -26,6 +27,15 @@ _GRAVITY = 40.0
 
 _SMALLEST = 4e-3
 """Jumps below this are left in [m]: a robust fit takes them."""
+
+_OTHER = 0.4
+"""Share of frames that repeat the one before from which it is said that every other one does."""
+
+_FEWEST = 5
+"""Frames with a free marker below which a trial tells nothing."""
+
+_NOISY = 10.0
+"""Times the noise that neighbouring frames show from which a given one must be in another unit."""
 
 _SHARPEST = 100.0
 """Change of acceleration from frame to frame that a rope may show when it is jerked taut [m/s^2]."""
@@ -44,7 +54,7 @@ class DataIssue:
     trial: str
     """Name of the trial, empty if it is about all."""
     kind: str
-    """swap, jump, stall, clock, camera, cut, drift, length, place."""
+    """swap, jump, stall, clock, camera, cut, drift, length, place, unseen."""
     message: str
     """What was found, and what was done about it."""
 
@@ -56,9 +66,11 @@ def check(recording: Recording) -> tuple[Recording, list[DataIssue]]:
         InputError: No result could be right with these data.
     """
     _check_rope(recording)
+    recording, faults = _judgeable(recording)
+    _check_noise(recording)
     trials = (*recording.train, *recording.test)
     _check_clocks(recording, trials)
-    noise, faults, mended = noise_of(recording), [], {}
+    noise, mended = noise_of(recording), {}
     for trial in trials:
         mended[trial.name], found = _mend(trial, noise)
         faults += found
@@ -100,6 +112,36 @@ def _check_rope(recording: Recording) -> None:
         )
 
 
+def _judgeable(recording: Recording) -> tuple[Recording, list[DataIssue]]:
+    """Return the recording without trials that have nothing to judge by, and which these are."""
+    if recording.filmed:
+        return recording, []
+    kept, faults = {}, []
+    for split in ("train", "test"):
+        trials = recording.trials(split)
+        seen = [int((np.isfinite(t.markers[:, ~t.gripped]).all(-1).any(-1) & ~t.suspect).sum()) for t in trials]
+        kept[split] = tuple(t for t, count in zip(trials, seen, strict=True) if count >= _FEWEST)
+        lost = [(t, count) for t, count in zip(trials, seen, strict=True) if count < _FEWEST]
+        if not kept[split]:
+            raise InputError(
+                f"{recording.path / lost[0][0].name}.npz: markers: expected free markers in at least {_FEWEST} frames "
+                f"that are not suspect, found {lost[0][1]}, and no better {split} trial; nothing could be judged."
+            )
+        said = f"free markers are seen in fewer than {_FEWEST} frames that are not suspect: the trial is left out"
+        faults += [DataIssue(t.name, "unseen", said) for t, _ in lost]
+    return replace(recording, train=kept["train"], test=kept["test"]), faults
+
+
+def _check_noise(recording: Recording) -> None:
+    """Refuse a noise beside which nothing that markers do would count."""
+    given, ratio = recording.marker_noise_std, noise_ratio(recording)
+    if given is not None and ratio > _NOISY:
+        raise InputError(
+            f"{recording.path / 'rope.json'}: marker_noise_std: expected metres, found {given:g}, {ratio:.0f} times "
+            "what neighbouring frames show; is it in mm? Give null where it is not known."
+        )
+
+
 def _check_clocks(recording: Recording, trials: Sequence[Trial]) -> None:
     first = trials[0]
     step = first.time[1] - first.time[0]
@@ -119,7 +161,8 @@ def _mend(trial: Trial, noise: float) -> tuple[Trial, list[DataIssue]]:
     stalled = _stalls(trial, noise)
     if stalled.any():
         suspect |= stalled
-        faults.append(DataIssue(trial.name, "stall", f"{_frames(stalled)} repeat the frame before: left out"))
+        every = " (every other frame: was it filled up to twice its rate?)" if stalled[1:].mean() > _OTHER else ""
+        faults.append(DataIssue(trial.name, "stall", f"{_frames(stalled)} repeat the frame before: left out{every}"))
     seen = np.where(suspect[:, None, None], np.nan, markers)
     steps, frame = _steps(seen), trial.time[1] - trial.time[0]
     size = np.linalg.norm(steps, axis=-1)
@@ -142,7 +185,9 @@ def _stalls(trial: Trial, noise: float) -> np.ndarray:
     same = np.zeros(len(free), bool)
     same[1:] = [np.array_equal(a, b, equal_nan=True) for a, b in zip(free[1:], free[:-1], strict=True)]
     change = np.linalg.norm(np.diff(free, axis=0), axis=-1)
-    moving = noise > 1e-7 and np.nanmedian(change) > 0.5 * noise
+    # Where half the frames repeat others, the median of all changes is 0.
+    changed = change[np.isfinite(change) & (change > 0)]
+    moving = noise > 1e-7 and len(changed) > 0 and np.median(changed) > 0.5 * noise
     return same & moving & ~trial.suspect & np.isfinite(free).any((1, 2))
 
 

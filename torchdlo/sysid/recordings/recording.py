@@ -233,6 +233,22 @@ def _check_together(path: Path, rope: dict, trials: tuple[Trial, ...]) -> None:
         raise InputError(
             f"{path / 'rope.json'}: closed: expected false or none, found true; loops cannot be calibrated yet."
         )
+    _check_sensors(path, rope, trials)
+    rest = rope["rest_positions"]
+    if rest is not None and len(rest) != n_markers:
+        raise InputError(
+            f"{path / 'rope.json'}: rest_positions: expected one position for each of the "
+            f"{n_markers} markers, found {len(rest)}."
+        )
+    if rest is not None and np.ptp(rest, axis=0).max() > 2 * rope["length"]:
+        raise InputError(
+            f"{path / 'rope.json'}: rest_positions: expected metres, found positions "
+            f"{np.ptp(rest, axis=0).max():g} apart for a rope of {rope['length']:g} m."
+        )
+
+
+def _check_sensors(path: Path, rope: dict, trials: tuple[Trial, ...]) -> None:
+    """Forces must say how they were measured, and be of the same grippers in the same order."""
     for trial in trials:
         if trial.wrench is not None and rope["wrench"] is None:
             raise InputError(
@@ -246,17 +262,14 @@ def _check_together(path: Path, rope: dict, trials: tuple[Trial, ...]) -> None:
                     f"{path / trial.name}.npz: gripper_quaternion: expected orientations of all grippers, as forces "
                     f"are in their frames, found none for marker {lacking[0]}; give it, or forces in the world frame."
                 )
-    rest = rope["rest_positions"]
-    if rest is not None and len(rest) != n_markers:
-        raise InputError(
-            f"{path / 'rope.json'}: rest_positions: expected one position for each of the "
-            f"{n_markers} markers, found {len(rest)}."
-        )
-    if rest is not None and np.ptp(rest, axis=0).max() > 2 * rope["length"]:
-        raise InputError(
-            f"{path / 'rope.json'}: rest_positions: expected metres, found positions "
-            f"{np.ptp(rest, axis=0).max():g} apart for a rope of {rope['length']:g} m."
-        )
+    felt = [t for t in trials if t.wrench is not None]
+    for trial in felt[1:]:
+        first, own = (tree.part(t.wrench_marker).tolist() for t in (felt[0], trial))
+        if own != first:
+            raise InputError(
+                f"{path / trial.name}.npz: wrench_marker: expected {first} as in {felt[0].name}.npz, found {own}; "
+                "give the forces of the same grippers in the same order, NaN where one was not measured."
+            )
 
 
 def _to_json(value: object) -> object:

@@ -28,6 +28,11 @@ REQUIRED = ("length", "radius", "mass", "gravity", "table_height", "marker_noise
 OPTIONAL = ("rest_positions", "marker_mass", "closed", "notes", "color", "fluid_density", "wrench")
 """Entries that a rope.json may have."""
 
+_FRAMES = 5
+"""Frames of a motion at least: what markers say of noise, lag and speed takes as many."""
+_FILMED_FRAMES = 3
+"""The same of films."""
+
 _ARRAYS = ("time", "markers", "marker_arclength", "gripped")
 _OPTIONAL_ARRAYS = ("gripper_quaternion", "gripper_marker", "suspect", "wrench", "wrench_marker")
 _VIDEO_ARRAYS = ("masks", "mask", "video", "frames", "images")
@@ -171,8 +176,10 @@ def _check_shapes(path: Path, arrays: Mapping[str, Header], fewest: int) -> None
     n_frames, n_markers = markers.shape[:2]
     if time.shape != (n_frames,):
         _refuse(path, "time", f"shape ({n_frames},), one for each frame", f"{time.shape}")
-    if n_frames < 3 and not (fewest == 1 and n_frames == 1):
-        _refuse(path, "markers", "at least 3 frames" + ", or 1 of a rope at rest" * (fewest == 1), f"{n_frames}")
+    filmed = fewest == 1
+    least = _FILMED_FRAMES if filmed else _FRAMES
+    if n_frames < least and not (filmed and n_frames == 1):
+        _refuse(path, "markers", f"at least {least} frames" + ", or 1 of a rope at rest" * filmed, f"{n_frames}")
     if n_markers < fewest:
         _refuse(path, "markers", f"at least {fewest} marker{'s' if fewest > 1 else ''}", f"{n_markers}")
     for name, size, each in (

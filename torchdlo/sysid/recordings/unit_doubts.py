@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from torchdlo.sysid.diagnosis.error_floor import noise_ratio
 from torchdlo.sysid.recordings.recording import Recording, Trial
 from torchdlo.sysid.recordings.wrench import force_doubts
 
@@ -30,6 +31,9 @@ _SAG = 0.03
 _ASKEW = 0.5
 """Cosine between gravity, or an axis, and what shows it, below which they disagree (60 degrees)."""
 
+_NOISY = 3.0
+"""Times the noise that neighbouring frames show from which a given one is doubted."""
+
 _GRAVITY = (8.0, 11.0)
 """Size of gravity on earth [m/s^2], roughly."""
 
@@ -38,7 +42,7 @@ def doubts(recording: Recording) -> list[str]:
     """Return what can hardly be, a sentence each with what to look at; none for most recordings."""
     trials = recording.trials("all")
     found = [*_weight(recording), *_length(recording, trials), *_down(recording, trials), *_axes(trials)]
-    return [*found, *force_doubts(recording)]
+    return [*found, *_noise(recording), *_copies(recording), *force_doubts(recording)]
 
 
 def _weight(recording: Recording) -> list[str]:
@@ -53,6 +57,37 @@ def _weight(recording: Recording) -> list[str]:
             f"{recording.mass / volume:.3g} kg/m^3, heavier than any metal; is the radius right, and the mass in kg?"
         ]
     return []
+
+
+def _noise(recording: Recording) -> list[str]:
+    ratio, given = noise_ratio(recording), recording.marker_noise_std or 0.0
+    if ratio <= _NOISY:
+        return []
+    return [
+        f"marker_noise_std: it is {1e3 * given:.3g} mm, {ratio:.0f} times what neighbouring "
+        "frames show; is it in metres? Nothing smaller is named."
+    ]
+
+
+def _copies(recording: Recording) -> list[str]:
+    """Find test trials that are train trials, or stretches of them."""
+    return [
+        f"{test.name}: its markers are those of {train.name}; a test trial that was fitted to judges nothing."
+        for test in recording.test
+        for train in recording.train
+        if not recording.filmed and _overlap(train, test)
+    ]
+
+
+def _overlap(a: Trial, b: Trial) -> bool:
+    """Return whether the free markers of the shorter trial are found in the longer one, from any frame on."""
+    short, long = sorted((t.markers[:, ~t.gripped] for t in (a, b)), key=len)
+    if short.shape[1:] != long.shape[1:]:
+        return False
+    room = len(long) - len(short) + 1
+    middle = len(short) // 2
+    at = np.flatnonzero((long[middle : middle + room] == short[middle]).any((1, 2)))
+    return any(np.isfinite(short).any() and np.array_equal(long[k : k + len(short)], short, equal_nan=True) for k in at)
 
 
 def _length(recording: Recording, trials: tuple[Trial, ...]) -> list[str]:
@@ -124,8 +159,8 @@ def _down(recording: Recording, trials: tuple[Trial, ...]) -> list[str]:
     given = ", ".join(f"{g:g}" for g in recording.gravity)
     return [
         *said,
-        f"gravity: it is [{given}], but the rope hangs towards {hangs}{name}; turn the markers, or gravity, so that it "
-        "points the way the rope hangs.",
+        f"gravity: it is [{given}], but the rope hangs towards {hangs}{name}; turn the markers (not gravity: "
+        "effects take z for the vertical) so that it hangs along gravity.",
     ]
 
 
