@@ -21,7 +21,7 @@ from torchdlo.agents.rl.episodes import TaskEpisodes
 from torchdlo.agents.rl.spending import Spending
 from torchdlo.agents.torch_records import tensors_hash
 from torchdlo.agents.trajopt.search_journal import code_versions
-from torchdlo.agents.trajopt.search_result import read_trajectory
+from torchdlo.agents.trajopt.search_result import check_scene, read_trajectory
 from torchdlo.envs import Task
 from torchdlo.errors import InputError
 from torchdlo.files import write_atomically
@@ -122,6 +122,7 @@ def candidate_experts(task: Task, trajectories: list[Path]) -> list[Expert]:
         path = torch.tensor(content["tool"].numbers(None, None, 3, most=1e6), dtype=torch.float32)
         good = content["success"].flag() and content["task"].value == task.name and path.shape == shape[:3]
         if good:
+            check_scene(file)
             found.append(Expert(path, still, f"{file.parent.name}, same places"))
             found.append(Expert(path, along, f"{file.parent.name}, moved along"))
     return found
