@@ -145,7 +145,8 @@ def test_a_run_that_is_not_resumed_begins_afresh(tmp_path: Path):
         train_hybrid(Lead(), [found(tmp_path)], settings(), folder=folder, plan=plan, callback=stop)
     # Going on must not take what the first run has made.
     left = {file.name for file in folder.iterdir()}
-    assert "policy.pt" in left and not left & {"expert.json", "clone.pt", "stages.json", "clone.part"}
+    assert "policy.pt" in left and not left & {"expert.json", "clone.pt", "clone.part"}
+    assert not {"robust", "clone"} & set(json.loads((folder / "stages.json").read_text()))
 
 
 def test_going_on_with_something_else_is_refused_by_what_differs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
