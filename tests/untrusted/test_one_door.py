@@ -25,6 +25,7 @@ OWN = {
     "agents/distributed/sweep.py",
     "sysid/estimation/checkpoint.py",
     "agents/data/making.py",
+    "agents/rl/student.py",
     "agents/rl/training.py",
     "cli/agent.py",
     # Texts of bounded length that are no files.

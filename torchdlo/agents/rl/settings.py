@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -235,12 +234,18 @@ _ENDS = {"coiling": 0.1}
 
 def changed(was: dict[str, Any], now: dict[str, Any], free: tuple[str, ...] = ()) -> list[str]:
     """Return what differs from what a file says, as "rate 0.1 (now 0.2)"; what it does not say is not compared."""
-    plain = json.loads(json.dumps(now))
     return [
         f"{name} {was[name]} (now {value})"
-        for name, value in plain.items()
+        for name, value in _as_written(now).items()
         if name not in free and name in was and was[name] != value
     ]
+
+
+def _as_written(value: Any) -> Any:
+    """Return plain data as JSON has them: tuples are lists."""
+    if isinstance(value, dict):
+        return {name: _as_written(part) for name, part in value.items()}
+    return [_as_written(part) for part in value] if isinstance(value, list | tuple) else value
 
 
 def training_preset(task: str, algorithm: str, **given: Any) -> TrainingSettings:
