@@ -117,7 +117,7 @@ def costs(sims: np.ndarray, measured: np.ndarray, whole: float | None = None) ->
     residual = np.where(seen, sims - measured, 0.0).reshape(len(sims), len(measured), -1)
     mean = robust(residual)[0].sum(-1) / seen.reshape(len(measured), -1).sum(1)
     whole = extent(measured) if whole is None else whole
-    return _together(np.where(np.isfinite(mean), np.minimum(mean, whole), np.inf), _LOST * whole)
+    return together(np.where(np.isfinite(mean), np.minimum(mean, whole), np.inf), _LOST * whole)
 
 
 def extent(measured: np.ndarray) -> float:
@@ -125,7 +125,7 @@ def extent(measured: np.ndarray) -> float:
     return float(np.max(np.nanmax(measured, (1, 2)) - np.nanmin(measured, (1, 2))))
 
 
-def _together(of_trial: np.ndarray, lost: float) -> np.ndarray:
+def together(of_trial: np.ndarray, lost: float) -> np.ndarray:
     """Return the mean cost of trials (..., B), of which those that failed cost `lost`; infinite if all did."""
     ran = np.isfinite(of_trial)
     return np.where(ran.any(-1), np.where(ran, of_trial, lost).mean(-1), np.inf)
@@ -179,8 +179,8 @@ class PointEvaluation:
             # The second derivative of the cost is knee^2 / size^3, where Gauss-Newton takes 1 / size.
             weight = np.where(seen.reshape(weight.shape), weight, 0.0)
             flatter = (weight**3 * KNEE**2).sum(-1) / np.maximum(weight.sum(-1), 1e-300)
-            together = float(_together(of_trial, _LOST * whole))
-            points.append(Point(self.raws[s], together, gradient, curvature, of_trial, flatter))
+            cost_of_all = float(together(of_trial, _LOST * whole))
+            points.append(Point(self.raws[s], cost_of_all, gradient, curvature, of_trial, flatter))
         return points
 
 

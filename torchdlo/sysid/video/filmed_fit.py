@@ -32,6 +32,9 @@ _GATE = 3.0
 _NEAR = 4e-3
 """Distance that is never taken for that of a wrong picture [m]."""
 
+_LOST = 1.0
+"""What a trial costs whose simulation fails [m]."""
+
 _FIRM = 5e-3
 """Share of the cost that a number has to save per squared coordinate to be followed as far as its gradient says."""
 
@@ -209,16 +212,11 @@ def fit(
 
 def total(found: Fit) -> float:
     """Return the mean cost, of which trials that failed have a large one."""
-    return _together(found.costs)
-
-
-def _together(costs: np.ndarray) -> float:
-    ran = np.isfinite(costs)
-    return float(np.where(ran, costs, 1.0).mean()) if ran.any() else np.inf
+    return float(levenberg_marquardt.together(found.costs, _LOST))
 
 
 def _less(least: float, costs: np.ndarray) -> bool:
-    return _together(costs) < least
+    return float(levenberg_marquardt.together(costs, _LOST)) < least
 
 
 def _step(own: FilmedProblem, now: Fit, damping: float) -> tuple[np.ndarray, np.ndarray]:

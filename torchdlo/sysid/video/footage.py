@@ -38,7 +38,9 @@ _STRETCHES = 14
 """Stretches of a rope, of which every other one is left out where there is one photograph only."""
 
 _TOO_MUCH = 1.15
-"""Times its length from which what is seen is more than one rope: one shows 0.4 to 0.8 of it, two 0.7 to 1.6."""
+"""Times its length from which what is seen is more than one rope.
+
+One showed 0.4 to 0.8 of it and two 0.7 to 1.6, when widths were read up to 1 px too large, and lengths too short."""
 
 _OTHER_RATE = 0.02
 """Share by which the rate of a film is another one than `cameras.json` says: 29.97 is 30, 25 is not."""
