@@ -17,8 +17,9 @@ from torchdlo.sysid.estimation.observation import INDEPENDENT, Spines, seen_by
 from torchdlo.sysid.model.rope_model import RopeModel
 from torchdlo.sysid.model.trial_batch import Start
 from torchdlo.sysid.recordings.recording import load_recording
+from torchdlo.sysid.video import filmed_starts
 from torchdlo.sysid.video.filmed import doubts
-from torchdlo.sysid.video.filmed_fit import eliminated, look, normal, spread
+from torchdlo.sysid.video.filmed_fit import Fit, eliminated, fit, look, normal, spread
 from torchdlo.sysid.video.filmed_problem import FilmedProblem, begin_from_balance, filmed_problem
 from torchdlo.sysid.video.filmed_starts import fit_starts, search_starts
 from torchdlo.sysid.video.films import with_stations
@@ -142,6 +143,43 @@ def test_what_is_not_worth_it_is_not_differentiated(swing: FilmedProblem) -> Non
     raw = swing.space.to_raw(np.concatenate([swing.fixed, np.zeros(len(swing.spines.nuisances.names))]))
     whole, cheap = look(swing, raw, swing.offset), look(swing, raw, swing.offset, worth=lambda costs: False)
     assert np.array_equal(whole.costs, cheap.costs) and whole.jacobian.size and not cheap.jacobian.size
+
+
+def test_fits_come_to_their_end_in_fine_steps(swing: FilmedProblem) -> None:
+    raw = swing.space.to_raw(np.concatenate([swing.fixed, np.zeros(len(swing.spines.nuisances.names))]))
+    rough, sharp = replace(swing), replace(swing)
+    basin = fit(rough, raw, 8, tolerance=1e-2)
+    sharp.offset = basin.offset
+    assert fit(sharp, basin.raw, 8, near=True).cost < 0.9 * basin.cost
+
+
+def test_starts_of_trials_that_stand_out_are_looked_for_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    recording = load_recording(DATA / "sample_film")
+    views, _ = views_of(recording, recording.train)
+    own = filmed_problem(recording, recording.train, views, options={"vertices": 7}).shortened(0.1)
+    raw = own.space.to_raw(np.concatenate([own.fixed, np.zeros(len(own.spines.nuisances.names))]))
+    found, searched = look(own, raw, own.offset), []
+
+    def search(part: FilmedProblem, *rest: object, **more: object) -> None:
+        searched.append([t.name for t in part.trials])
+
+    def nothing_better(part: FilmedProblem, *rest: object, **more: object) -> Fit:
+        return replace(found, costs=np.full(len(part.trials), np.inf))
+
+    monkeypatch.setattr(filmed_starts, "search_starts", search)
+    monkeypatch.setattr(filmed_starts, "fit_starts", nothing_better)
+    for costs, names in (
+        ([2e-5, 9e-5], []),  # both are hardly off
+        ([1.2e-4, 4e-4], []),
+        ([1.2e-4, 5e-4], ["train_1"]),
+        ([2e-3, 2e-5], ["train_0"]),
+        ([2e-3, 3e-3], ["train_0", "train_1"]),
+        ([np.inf, 3e-4], ["train_0"]),
+        ([np.inf, np.inf], ["train_0", "train_1"]),
+    ):
+        searched.clear()
+        filmed_starts.restart(replace(own), replace(found, costs=np.array(costs)), 1)
+        assert searched == ([names] if names else []), costs
 
 
 def test_ranges_follow_what_cameras_may_be_off(swing: FilmedProblem) -> None:

@@ -60,6 +60,9 @@ METHODS = ("auto", "differences", "gradient")
 _LAST = 6
 """Most iterations with finer steps, of fits that begin near their minimum."""
 
+_MOST_OF, _ROUGH = 0.7, 1e-2
+"""Share of the time of the first fits of all that is fitted, and what another step has to save there."""
+
 _PROFILE = 12
 """Least iterations of a fit of the stiffness along a rope to centre lines."""
 
@@ -262,11 +265,11 @@ def _fitted(own: FilmedProblem, raw: np.ndarray, iterations: int, report: Callba
         # A scout knows the starts; a model that begins without one has to find them.
         begin_from_balance(own, own.full(values[None])[0])
         refine_start(own, values)
-    best = fit(own, raw, 6, seconds=0.7 * own.lasts)
+    best = fit(own, raw, 6, seconds=_MOST_OF * own.lasts, tolerance=_ROUGH)
     if own.model.mesh.clamps and "clamp_fraction" in own.options and not own.model.effects:
         # The rope may be held up to the last marker of a clamp, or bend between its markers.
         other = own.with_options(clamp_fraction=1.0 - own.model.clamp_fraction)
-        found = fit(other, best.raw, 6, seconds=0.7 * own.lasts)
+        found = fit(other, best.raw, 6, seconds=_MOST_OF * own.lasts, tolerance=_ROUGH)
         if found.cost < best.cost:
             own.take(other)
             best = found
@@ -286,7 +289,7 @@ def sharper(own: FilmedProblem, raw: np.ndarray, iterations: int) -> Fit:
     """Return the fit with half the steps, without wrong frames and with what finer simulations change."""
     # What steps damp is taken for damping.
     own.take(own.with_options(substep=own.model.dt / (2 * own.model.substeps)))
-    best = fit(own, raw, min(iterations, _LAST))
+    best = fit(own, raw, min(iterations, _LAST), near=True)
     gate(own, own.space.to_values(best.raw))
     return _corrected(own, best.raw, iterations)
 
@@ -299,11 +302,11 @@ def _corrected(own: FilmedProblem, raw: np.ndarray, iterations: int) -> Fit:
         return fit(own, raw, iterations)
     before = look(own, raw, offset, fixed=True).cost
     add_correction(own, own.space.to_values(raw))
-    best = fit(own, raw, min(iterations, _LAST))
+    best = fit(own, raw, min(iterations, _LAST), near=True)
     if best.cost > _WORSE * before:
         own.offset = offset
         keep_steps_only(own)
-        best = fit(own, raw, min(iterations, _LAST))
+        best = fit(own, raw, min(iterations, _LAST), near=True)
     return best
 
 

@@ -18,6 +18,7 @@ from torchdlo.sysid.video.filmed import require_simulated, sharper
 from torchdlo.sysid.video.filmed_fit import Fit, film_gaps, fit, gate
 from torchdlo.sysid.video.filmed_model import FilmedModel, Films, extended
 from torchdlo.sysid.video.filmed_problem import FilmedProblem, add_correction, correct
+from torchdlo.sysid.video.filmed_starts import restart
 from torchdlo.sysid.video.fit_pool import FitPool
 
 __all__ = ["NEAR", "alike", "chain_note", "chained", "further", "left_out", "nearer"]
@@ -63,7 +64,7 @@ def nearer(films: Films, best: Fit, report: Callback) -> FilmedModel:
 
 def _followed(own: FilmedProblem, raw: np.ndarray) -> Fit:
     """Return a fit without wrong frames: one of them, that nothing explains, is no reason to go no further."""
-    found = fit(own, raw, _FOLLOW)
+    found = restart(own, fit(own, raw, _FOLLOW), _FOLLOW)
     if np.isfinite(found.cost) and gate(own, own.space.to_values(found.raw)):
         found = fit(own, found.raw, _FOLLOW)
     return found

@@ -29,6 +29,7 @@ from torchdlo.sysid.video.filmed_beginnings import NEAR, chain_note, chained, fu
 from torchdlo.sysid.video.filmed_fit import Fit, film_gaps, fit, look, spread, total
 from torchdlo.sysid.video.filmed_model import FilmedModel, Films, extended
 from torchdlo.sysid.video.filmed_problem import FilmedProblem
+from torchdlo.sysid.video.filmed_starts import restart
 from torchdlo.sysid.video.fit_pool import FitPool
 from torchdlo.sysid.video.footage import views_of
 from torchdlo.sysid.video.overlay import overlays
@@ -315,7 +316,7 @@ def _fitted(base: FilmedModel, score: Score, iterations: int, seconds: float) ->
 def _fitted_on(model: FilmedModel, iterations: int) -> FilmedModel:
     """Return a model with a better fit; the given one and its starts stay what they are."""
     own = replace(model.own)
-    found = fit(own, model.fit.raw, iterations)
+    found = restart(own, fit(own, model.fit.raw, iterations), iterations)
     # Starts of test trials are fitted when they are asked for, and kept where they were found.
     return replace(model, own=own, fit=found, test=own if model.test is model.own else replace(model.test))
 

@@ -35,6 +35,9 @@ _MOST = 5
 _LOST = 1e-3
 """Cost [m] from which a trial may have a wrong start: readings of 3 mm."""
 
+_STANDS_OUT, _SLIGHT = 4.0, 1e-4
+"""Times the least cost of all trials from which one may have a wrong start, too, and the least such cost [m]."""
+
 _RESTARTS = 3
 """How often starts of lost trials are looked for."""
 
@@ -116,7 +119,7 @@ def refine_start(own: FilmedProblem, values: np.ndarray, passes: int = 8, *, sea
 def restart(own: FilmedProblem, found: Fit, iterations: int) -> Fit:
     """Return the fit with the starts of lost trials anew, and all of it improved, where that is better."""
     for _ in range(_RESTARTS if own.offset.shape[1] else 0):
-        lost = np.flatnonzero(~own.start.at_rest & ~(found.costs < _LOST))
+        lost = np.flatnonzero(~own.start.at_rest & ~(found.costs < _lost_from(found.costs)))
         if not len(lost):
             break
         part = own.picked(lost)
@@ -129,6 +132,11 @@ def restart(own: FilmedProblem, found: Fit, iterations: int) -> Fit:
         own.offset[lost[better]] = part.offset[better]
         found = fit(own, found.raw, iterations)
     return found
+
+
+def _lost_from(costs: np.ndarray) -> float:
+    """Return the cost from which a trial may have a wrong start."""
+    return float(min(_LOST, max(_STANDS_OUT * np.nanmin(costs), _SLIGHT)))
 
 
 def search_starts(own: FilmedProblem, raw: np.ndarray, passes: int = 8, *, seconds: float | None = None) -> Fit:
