@@ -56,10 +56,11 @@ def test_fits_leave_models_and_starts_as_they_are(monkeypatch: pytest.MonkeyPatc
         return "better"
 
     monkeypatch.setattr(filmed_diagnosis, "fit", fitted)
+    monkeypatch.setattr(filmed_diagnosis, "restart", lambda problem, found, *more: found)
     model = FilmedModel(own, SimpleNamespace(raw=np.zeros(1)), test)
-    found = filmed_diagnosis._fitted_on(model, 3)
+    found = filmed_diagnosis._fitted_on(model, 3, np.inf)
     found.test.offset = np.ones((1, 2))
     assert found.fit == "better" and found.own.offset.shape == (1, 3)
     assert own.offset.size == test.offset.size == 0 and model.own is own and model.test is test
-    alone = filmed_diagnosis._fitted_on(FilmedModel(own, model.fit, own), 3)
+    alone = filmed_diagnosis._fitted_on(FilmedModel(own, model.fit, own), 3, np.inf)
     assert alone.test is alone.own

@@ -37,6 +37,9 @@ _LONGER = 1.5
 _FOLLOW = 6
 """Most steps of each such fit."""
 
+_ROUGH = 1e-2
+"""Share of the cost that another step has to save of fits that show which way links lie."""
+
 _BETTER = 0.9
 """Share of the cost that is left where the rope is taken for a chain."""
 
@@ -159,7 +162,7 @@ def chained(plain: FilmedModel, pool: FitPool) -> FilmedModel:
 
 def _as_chain(plain: FilmedModel, length: float) -> FilmedModel:
     chain = linked(plain, length)
-    return replace(chain, fit=fit(chain.own, chain.fit.raw, 2))
+    return replace(chain, fit=fit(chain.own, chain.fit.raw, 2, tolerance=_ROUGH))
 
 
 def linked(plain: FilmedModel, length: float) -> FilmedModel:

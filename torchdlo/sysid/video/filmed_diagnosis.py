@@ -76,6 +76,9 @@ _SIGNS, _KEPT = (1.0, -1.0), 3
 _AS_GOOD = 1.1
 """Times what the best fit leaves on test trials up to which another one's numbers may be the true ones as well."""
 
+_EXPLAINED = 2.0
+"""Times the cost of the floor below which a leading model's trials keep their starts."""
+
 _LEADERS = 3
 """Candidates that are fitted to all of the time."""
 
@@ -229,7 +232,9 @@ def _round(
     order = sorted(fits, key=lambda n: fits[n].fit.cost)
     leading = [n for n in order[:_LEADERS] if not fits[n].fit.cost > _BEHIND * fits[order[0]].fit.cost]
     more = plan.more * (_PATIENCE if base.own.trials[0].still else 1)
-    on = [*((fits[name], more) for name in leading), (base, 3)]
+    # Starts that took up what the baseline lacked are not those of a model that has it.
+    enough = _EXPLAINED * levenberg_marquardt.cost_of(level)
+    on = [*((fits[name], more, enough) for name in leading), (base, 3, np.inf)]
     rival = base
     for k, found in pool.map(_fitted_on, on):
         if k == len(leading):
@@ -313,10 +318,13 @@ def _fitted(base: FilmedModel, score: Score, iterations: int, seconds: float) ->
     return replace(best, fit=fit(best.own, best.fit.raw, iterations, seconds=seconds))
 
 
-def _fitted_on(model: FilmedModel, iterations: int) -> FilmedModel:
-    """Return a model with a better fit; the given one and its starts stay what they are."""
+def _fitted_on(model: FilmedModel, iterations: int, enough: float) -> FilmedModel:
+    """Return a model with a better fit; the given one and its starts stay what they are.
+
+    Trials that cost more than `enough` [m] may begin elsewhere.
+    """
     own = replace(model.own)
-    found = restart(own, fit(own, model.fit.raw, iterations), iterations)
+    found = restart(own, fit(own, model.fit.raw, iterations), iterations, enough)
     # Starts of test trials are fitted when they are asked for, and kept where they were found.
     return replace(model, own=own, fit=found, test=own if model.test is model.own else replace(model.test))
 

@@ -116,10 +116,17 @@ def refine_start(own: FilmedProblem, values: np.ndarray, passes: int = 8, *, sea
             search_starts(own, raw, passes, seconds=START_WINDOW)
 
 
-def restart(own: FilmedProblem, found: Fit, iterations: int) -> Fit:
-    """Return the fit with the starts of lost trials anew, and all of it improved, where that is better."""
+def restart(own: FilmedProblem, found: Fit, iterations: int, enough: float = _LOST) -> Fit:
+    """Return the fit with the starts of lost trials anew, and all of it improved, where that is better.
+
+    Args:
+        own: the problem.
+        found: its fit.
+        iterations: most steps of each improvement.
+        enough: cost [m] from which a trial may have a wrong start; less if it stands out.
+    """
     for _ in range(_RESTARTS if own.offset.shape[1] else 0):
-        lost = np.flatnonzero(~own.start.at_rest & ~(found.costs < _lost_from(found.costs)))
+        lost = np.flatnonzero(~own.start.at_rest & ~(found.costs < min(enough, _standing_out(found.costs))))
         if not len(lost):
             break
         part = own.picked(lost)
@@ -134,9 +141,9 @@ def restart(own: FilmedProblem, found: Fit, iterations: int) -> Fit:
     return found
 
 
-def _lost_from(costs: np.ndarray) -> float:
-    """Return the cost from which a trial may have a wrong start."""
-    return float(min(_LOST, max(_STANDS_OUT * np.nanmin(costs), _SLIGHT)))
+def _standing_out(costs: np.ndarray) -> float:
+    """Return the cost from which a trial stands out."""
+    return float(max(_STANDS_OUT * np.nanmin(costs), _SLIGHT))
 
 
 def search_starts(own: FilmedProblem, raw: np.ndarray, passes: int = 8, *, seconds: float | None = None) -> Fit:
