@@ -13,13 +13,13 @@ from torchdlo.errors import InputError
 from torchdlo.sysid.calibration.calibrate import calibrate
 from torchdlo.sysid.diagnosis.effect_search import diagnose
 from torchdlo.sysid.estimation.levenberg_marquardt import KNEE
-from torchdlo.sysid.estimation.observation import INDEPENDENT, Spines, seen_by
+from torchdlo.sysid.estimation.observation import INDEPENDENT, Spines, seen_by, unfitted_clocks
 from torchdlo.sysid.model.rope_model import RopeModel
 from torchdlo.sysid.model.trial_batch import Start
 from torchdlo.sysid.recordings.recording import load_recording
 from torchdlo.sysid.video import filmed_starts
 from torchdlo.sysid.video.filmed import doubts
-from torchdlo.sysid.video.filmed_fit import Fit, eliminated, fit, look, normal, spread
+from torchdlo.sysid.video.filmed_fit import Fit, eliminated, fit, look, normal, spread, time_films
 from torchdlo.sysid.video.filmed_problem import FilmedProblem, begin_from_balance, filmed_problem
 from torchdlo.sysid.video.filmed_starts import fit_starts, search_starts
 from torchdlo.sysid.video.films import with_stations
@@ -137,6 +137,27 @@ def test_near_the_films_derivatives_are_those_of_small_steps(swing: FilmedProble
         exact = (ends[1] - ends[0]) / 2e-3
         gap = np.linalg.norm(here.jacobian[:, k, :, :last] - exact) / np.linalg.norm(exact)
         assert gap < 0.03, (k, gap)
+
+
+def test_test_films_are_compared_when_they_were_taken(swing: FilmedProblem) -> None:
+    numbers, own = np.concatenate([swing.fixed, np.zeros(len(swing.spines.nuisances.names))]), replace(swing)
+    # A film of the simulation itself, begun 10 ms late.
+    motion = torch.as_tensor(own.simulate(numbers[None])).float()
+    old = own.spines.views[0]
+    pixel = seen_by(replace(old, late=0.01), motion, torch.zeros(1, 8), own.model.dt)[0][0].numpy()
+    along = np.diff(pixel, axis=2)
+    parts = {
+        "places": pixel[:, :, :-1] + 0.5 * along,
+        "tangents": along / np.linalg.norm(along, axis=-1)[..., None],
+    }
+    view = replace(old, good=np.ones_like(old.good), **parts)
+    own.spines = Spines([view], own.model.dt, own.extent, own.spines.free)
+    time_films(own, numbers)
+    assert np.array_equal(own.spines.views[0].off, 0.0)  # that of a film that is fitted to is fitted
+    own.spines = Spines(unfitted_clocks([view], [view]), own.model.dt, own.extent, own.spines.free)
+    time_films(own, numbers)
+    assert own.spines.views[0].off == pytest.approx([0.01], abs=1e-3)
+    assert own.spines.times[0, 0, 0] == pytest.approx(old.time[0, 0] + 0.01, abs=1e-3)
 
 
 def test_what_is_not_worth_it_is_not_differentiated(swing: FilmedProblem) -> None:

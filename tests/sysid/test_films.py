@@ -168,6 +168,36 @@ def test_pictures_before_the_trial_are_skipped(filmed: Path) -> None:
     assert np.array_equal(views[0].packed[0], view.packed[0]) and np.array_equal(views[0].good, view.good)
 
 
+def test_films_begin_at_times_of_their_own(filmed: Path) -> None:
+    save_cameras([view_of_sample(start=0.01, starts={"test_0": -0.5, "train_0": 0.04})], filmed / "cameras.json")
+    recording = load_recording(filmed)
+    assert [t.films[0].camera.start for t in recording.trials("all")] == [0.04, -0.5]
+    view = views_of(recording, recording.train)[0][0]
+    assert view.camera.start == 0.04 and view.time[0, 0] == 0.04
+    save_cameras([view_of_sample(starts={"train_7": 0.1})], filmed / "cameras.json")
+    with pytest.raises(InputError, match="starts of camera a: expected names of trials, found 'train_7'"):
+        load_recording(filmed)
+
+
+def test_pictures_before_a_trial_are_skipped_film_by_film(made: Path, tmp_path: Path) -> None:
+    recording = load_recording(SAMPLE)
+    camera = view_of_sample(starts={"train_0": -0.2})
+    film_recording(recording, [camera], tmp_path / "own", FilmLook(noise=1.0), trials=2, seconds=0.5)
+    recording = load_recording(tmp_path / "own")
+    view = views_of(recording, recording.train)[0][0]
+    assert np.allclose(view.late, [0.0, 0.0], atol=1e-9) and np.allclose(view.time[:, 0], 0.0, atol=1e-9)
+    assert view.clocks == ("train_0", "train_1") and view.clock.tolist() == [0, 1]
+
+
+def test_films_may_begin_off_what_is_written(tmp_path: Path) -> None:
+    recording = load_recording(SAMPLE)
+    look = FilmLook(noise=0.0)
+    for name, off in (("exact", 0.0), ("off", 0.5)):
+        film_recording(recording, [view_of_sample()], tmp_path / name, look, trials=1, seconds=0.5, begun_off=off)
+    exact, off = (views_of(r, r.train)[0][0] for r in (load_recording(tmp_path / n) for n in ("exact", "off")))
+    assert exact.camera.start == off.camera.start and not np.array_equal(exact.packed[0], off.packed[0])
+
+
 def test_masks_need_a_rate_and_as_many_pictures_as_their_trial_has(filmed: Path) -> None:
     masks = masks_of(load_recording(filmed), load_recording(filmed).train[0].films[0])[0]
     _masks(filmed, masks)

@@ -11,7 +11,7 @@ import torch
 
 from tests.vision.scenes import front, hanging
 from torchdlo.sysid.estimation import levenberg_marquardt
-from torchdlo.sysid.estimation.observation import FilmView, MarkerObservation, Spines, nuisances, over_time
+from torchdlo.sysid.estimation.observation import FilmView, MarkerObservation, Spines, nuisances, over_time, own_clocks
 from torchdlo.sysid.video.filmed_problem import FilmedProblem
 from torchdlo.vision.camera import lens, looking_at, project
 from torchdlo.vision.film import FilmLook, film, off_camera
@@ -91,6 +91,44 @@ def test_what_a_camera_is_off_is_undone_by_its_numbers(filmed: tuple[np.ndarray,
     assert abs(found - true) < 2e-3  # half a frame is 17 ms
 
 
+def both_late(sims: np.ndarray, late: tuple[float, float]) -> FilmView:
+    """Films of the same motion twice, each begun at its own time, and by a camera that does not know of it."""
+    views = [seen(front(start=start), sims) for start in late]
+    parts = {n: np.concatenate([getattr(v, n) for v in views]) for n in ("good", "places", "tangents")}
+    return replace(views[0], camera=front(), **parts, **own_clocks(["train_0", "train_1"]))
+
+
+def test_each_film_has_a_clock_of_its_own(filmed: tuple[np.ndarray, FilmView]) -> None:
+    sims = np.repeat(filmed[0], 2, 1)
+    view = both_late(filmed[0], (0.012, 0.0))
+    spines = Spines([view], STEP, 0.7, np.ones(PLACES, bool))
+    names = spines.nuisances.names
+    assert names[-2:] == ("camera_a.clock.train_0", "camera_a.clock.train_1") and view.numbers == 9
+    numbers = np.zeros((2, 9))
+    numbers[1, 7] = 0.012
+    wrong, right = np.where(np.isfinite(spines.target), spines.read(np.repeat(sims, 2, 0), numbers), np.nan)
+    ends = spines.priors.start
+    error = [np.sqrt(np.nanmean(x[..., :ends, :] ** 2, (1, 2, 3))) for x in (wrong, right)]
+    assert error[0][0] > 4 * error[1][0] and error[1].max() < 4e-4
+    assert error[0][1] == error[1][1]
+    # Picked twice, trials keep their clocks; what is known of a film beforehand is the same as what is fitted.
+    again = view.picked(np.array([1, 0, 0]))
+    assert again.clock.tolist() == [1, 0, 0] and again.numbers == 9
+    known = replace(view, late=np.array([0.012, 0.0]))
+    given = Spines([known], STEP, 0.7, np.ones(PLACES, bool)).read(sims, np.zeros((1, 9)))
+    assert np.allclose(given[..., :ends, :][:, :, :, :], spines.read(sims, numbers[1:])[..., :ends, :], atol=1e-6)
+    assert np.allclose(known.time[0] - known.time[1], 0.012)
+
+
+def test_first_seconds_end_by_the_clock_of_each_film(filmed: tuple[np.ndarray, FilmView]) -> None:
+    view = replace(both_late(filmed[0], (0.0, 0.0)), late=np.array([0.0, 0.1]))
+    short = view.shortened(0.2)
+    assert short.good.shape == (2, 7) and short.good.sum(1).tolist() == [7, 4]
+    spines = Spines([view], STEP, 0.7, np.ones(PLACES, bool))
+    assert spines.times.shape == spines.target.shape[:3] and spines.times[1, 0, 0] == pytest.approx(0.1)
+    assert replace(view, late=0.0).shortened(0.2).good.base is not None  # what is found wrong later is so in both
+
+
 def test_priors_pull_where_nothing_else_does(filmed: tuple[np.ndarray, FilmView]) -> None:
     _, view = filmed
     space = nuisances([view])
@@ -125,9 +163,9 @@ def test_markers_are_an_observation_too() -> None:
 def test_interpolation_in_time_is_cubic_and_stays_within_the_motion() -> None:
     time = torch.arange(11, dtype=torch.float64) * 0.1
     sims = (time**2)[None, None, :, None, None].expand(1, 1, 11, 2, 3)
-    at = torch.tensor([[0.0, 0.23, 0.5, 0.77, -1.0, 9.0]], dtype=torch.float64)
+    at = torch.tensor([[[0.0, 0.23, 0.5, 0.77, -1.0, 9.0]]], dtype=torch.float64)
     found = over_time(sims, 0.1, at)[0, 0, :, 0, 0]
-    torch.testing.assert_close(found[1:4], at[0, 1:4] ** 2)
+    torch.testing.assert_close(found[1:4], at[0, 0, 1:4] ** 2)
     assert float(found[4]) == 0.0 and float(found[5]) == pytest.approx(1.0)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -115,7 +116,7 @@ def test_distortion_that_is_0_has_its_gradient(count: int) -> None:
 
 
 def test_what_is_written_is_read(tmp_path: Path) -> None:
-    cameras = (front(fps=60.0, start=-0.01),)
+    cameras = (front(fps=60.0, start=-0.01), replace(front(), name="b", starts={"train_0": 0.2, "test_1": -3.0}))
     save_cameras(cameras, tmp_path / "cameras.json")
     assert load_cameras(tmp_path / "cameras.json") == cameras
 
@@ -136,6 +137,8 @@ def _without(name: str) -> Callable[[dict], None]:
         (lambda e: e.update(translation=[0, 0]), "3 numbers"),
         (lambda e: e.update(zoom=1), "unknown key"),
         (lambda e: e.update(name="../x"), "letters"),
+        (lambda e: e.update(starts=[0.1]), "seconds by trial"),
+        (lambda e: e.update(starts={"train_0": "late"}), "starts.train_0: expected a finite number"),
     ],
 )
 def test_wrong_files_are_refused_in_a_sentence(tmp_path: Path, change: Callable[[dict], None], message: str) -> None:

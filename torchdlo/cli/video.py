@@ -83,8 +83,8 @@ def calibrate_camera(
     except KeyboardInterrupt:
         raise stopped("there was no result yet, and nothing was written") from None
     # A board tells nothing of the clock: what a person has written down of it stays.
-    start = next((c.start for c in known if c.name == name), 0.0)
-    camera = dataclasses.replace(found.camera, start=start)
+    before = next((c for c in known if c.name == name), found.camera)
+    camera = dataclasses.replace(found.camera, start=before.start, starts=before.starts)
     save_cameras([*others, camera], out)
     write_atomically(picture, calibration.error_picture(found))
     typer.echo(
@@ -92,7 +92,7 @@ def calibrate_camera(
         f"{len(found.pictures)} pictures; the world is the board in picture {found.pictures[0]}",
         err=as_json,
     )
-    notes = [*found.notes, *([f"start = {start:g} s is kept as {out} had it."] if start else [])]
+    notes = [*found.notes, *([f"start = {camera.start:g} s is kept as {out} had it."] if camera.start else [])]
     for note in notes:
         typer.echo(f"note: {note}", err=as_json)
     typer.echo(f"cameras: {out}\npicture: {picture}", err=as_json)
@@ -239,6 +239,9 @@ def film(
             "to 1 degree, 1 %, 10 mm and half a frame.",
         ),
     ] = 0.0,
+    begun_off: Annotated[
+        float, typer.Option(min=0, max=5, help="Of recordings: each film begins up to so many frames early or late.")
+    ] = 0.0,
     trials: Annotated[int | None, typer.Option(min=1, help="Of recordings: most trials of each split.")] = None,
     seconds: Annotated[float | None, typer.Option(min=0.1, help="Of recordings: most seconds of each trial.")] = None,
     quality: Annotated[int, typer.Option(min=0, max=51, help="Of H.264: 0 is lossless, 51 the smallest file.")] = 18,
@@ -267,7 +270,7 @@ def film(
             if (source / "rope.json").is_file():
                 from torchdlo.sysid.recordings.recording import load_recording
 
-                options = {"masks": masks, "off": off, "trials": trials, "seconds": seconds}
+                options = {"masks": masks, "off": off, "begun_off": begun_off, "trials": trials, "seconds": seconds}
                 options |= {"quality": quality}
                 said = film_recording(
                     load_recording(source), shown, out, look, radius=radius, **options, callback=callback
@@ -275,7 +278,8 @@ def film(
             else:
                 from torchdlo.scene_files.run import load_frames
 
-                given = {"--off": off > 0, "--trials": trials is not None, "--seconds": seconds is not None}
+                given = {"--off": off > 0, "--begun-off": begun_off > 0}
+                given |= {"--trials": trials is not None, "--seconds": seconds is not None}
                 if any(given.values()):
                     names = " and ".join(n for n, there in given.items() if there)
                     raise InputError(f"{source}: expected {names} for a recording only, found a run.")

@@ -10,7 +10,7 @@ import functools
 import json
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -74,6 +74,8 @@ class Camera:
     """Pictures per second [1/s]; films have their own rate, masks need it."""
     start: float = 0.0
     """When the first picture was taken, on the clock of the recording [s]."""
+    starts: dict[str, float] = field(default_factory=dict, hash=False)
+    """The same of trials whose films began at times of their own [s]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -232,7 +234,8 @@ def looking_at(
 
 def save_cameras(cameras: Sequence[Camera], path: Path) -> None:
     """Write `cameras.json`."""
-    content = {"generator": "torchdlo", "cameras": [asdict(c) for c in cameras]}
+    entries = [{k: v for k, v in asdict(c).items() if k != "starts" or v} for c in cameras]
+    content = {"generator": "torchdlo", "cameras": entries}
     write_atomically(path, json.dumps(content, indent=1) + "\n")
 
 
@@ -263,7 +266,7 @@ def states_rate(path: str | Path) -> frozenset[str]:
 
 
 _NUMBERS = {"fx": 0.0, "fy": 0.0, "cx": -math.inf, "cy": -math.inf}
-_KNOWN = {"name", "width", "height", "fps", "start", "distortion", "rotation", "translation", *_NUMBERS}
+_KNOWN = {"name", "width", "height", "fps", "start", "starts", "distortion", "rotation", "translation", *_NUMBERS}
 
 
 def check_name(name: Any, where: str) -> None:
@@ -301,8 +304,12 @@ def _camera(path: Path, k: int, entry: Any) -> Camera:
     shift = triple(_row(path, f"{where}.translation", entry["translation"], 3))
     fps = _number(path, f"{where}.fps", entry.get("fps", 30.0), 0.0)
     start = _number(path, f"{where}.start", entry.get("start", 0.0), -math.inf)
+    starts = entry.get("starts", {})
+    if not isinstance(starts, dict):
+        _refuse(path, f"{where}.starts", 'seconds by trial, as {"train_0": 0.2}', repr(starts)[:60])
+    own = {trial: _number(path, f"{where}.starts.{trial}", value, -math.inf) for trial, value in starts.items()}
     fx, fy, cx, cy = numbers
-    return Camera(name, int(sizes[0]), int(sizes[1]), fx, fy, cx, cy, rows, shift, distortion, fps, start)
+    return Camera(name, int(sizes[0]), int(sizes[1]), fx, fy, cx, cy, rows, shift, distortion, fps, start, own)
 
 
 def triple(numbers: Iterable[float]) -> tuple[float, float, float]:

@@ -9,8 +9,8 @@ rope, both ways, times depth over focal length, with target 0.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
-from typing import Protocol
+from dataclasses import dataclass, field, replace
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -21,7 +21,17 @@ from torchdlo.sysid.estimation.levenberg_marquardt import ParameterSpace
 from torchdlo.vision.camera import NEAR, Camera, Lens, lens, project
 from torchdlo.vision.spine import curve_vectors
 
-__all__ = ["FilmView", "MarkerObservation", "Observation", "Spines", "nuisances", "over_time"]
+__all__ = [
+    "FilmView",
+    "MarkerObservation",
+    "Observation",
+    "Spines",
+    "by_camera",
+    "nuisances",
+    "over_time",
+    "own_clocks",
+    "unfitted_clocks",
+]
 
 
 Pairs = tuple[Tensor, Tensor]
@@ -83,6 +93,14 @@ class FilmView:
     """By trial: masks, eight pixels a byte, shape (F, H W / 8) uint8."""
     shown: tuple[dict[int, np.ndarray], ...] = ()
     """By trial: some pictures by their frames, grey, (H, W) uint8 each."""
+    late: np.ndarray | float = 0.0
+    """By how much films began later than the camera's `start` [s], shape (B,)."""
+    clocks: tuple[str, ...] = ("",)
+    """Names of clocks that are fitted: films that were begun by hand have each their own."""
+    clock: np.ndarray | int = 0
+    """Which of these each film has, -1 for none of them, shape (B,)."""
+    off: np.ndarray | float = 0.0
+    """What clocks of films are off that are not fitted with the rope [s], shape (B,)."""
 
     def masks(self, trial: int, frames: np.ndarray) -> np.ndarray:
         """Return the masks of frames (N,) of a trial, shape (N, H, W) bool."""
@@ -93,19 +111,30 @@ class FilmView:
     def picked(self, rows: np.ndarray) -> FilmView:
         """Return what was seen of these trials, in their order, repeated as given."""
         packed, shown = (tuple(part[b] for b in rows) if part else () for part in (self.packed, self.shown))
-        parts = (self.good[rows], self.places[rows], self.tangents[rows])
-        return FilmView(self.camera, *parts, self.half_width, packed, shown)
+        names = ("good", "places", "tangents", "late", "clock", "off")
+        own: dict[str, Any] = {n: x[rows] for n in names if np.ndim(x := getattr(self, n))}
+        return replace(self, packed=packed, shown=shown, **own)
 
     def shortened(self, seconds: float) -> FilmView:
         """Return what was seen in the first seconds; frames that turn out wrong are so in both."""
-        count = int(np.searchsorted(self.time, seconds, side="right"))
+        inside = self.time <= seconds
+        count = int(inside.sum(1).max())
         good, places, tangents = self.good[:, :count], self.places[:, :count], self.tangents[:, :count]
-        return FilmView(self.camera, good, places, tangents, self.half_width, self.packed, self.shown)
+        if not inside[:, :count].all():
+            good = good & inside[:, :count]
+        return replace(self, good=good, places=places, tangents=tangents)
 
     @property
     def time(self) -> np.ndarray:
-        """Middles of exposures, as the camera's clock has them [s], shape (F,)."""
-        return self.camera.start + np.arange(self.good.shape[1]) / self.camera.fps
+        """Middles of exposures, as clocks have them that are not off [s], shape (B, F)."""
+        trials, frames = self.good.shape
+        begun = self.camera.start + self.late + self.off + np.zeros(trials)
+        return begun[:, None] + np.arange(frames) / self.camera.fps
+
+    @property
+    def numbers(self) -> int:
+        """How many numbers of the camera are fitted: pose, focal length and clocks."""
+        return POSE + len(self.clocks)
 
 
 _PRIORS = (
@@ -117,29 +146,53 @@ _PRIORS = (
 
 
 def nuisances(views: Sequence[FilmView]) -> ParameterSpace:
-    """Return pose, focal length and clock of every camera as coordinates, in units of how far off they may be."""
+    """Return pose, focal length and clocks of every camera as coordinates, in units of how far off they may be."""
     names, params, sizes = [], [], []
     for view in views:
-        for name, size, unit in (*_PRIORS, ("clock", 0.5 / view.camera.fps, "s")):
+        clocks = [(f"clock.{name}" if name else "clock", half_a_picture(view), "s") for name in view.clocks]
+        for name, size, unit in (*_PRIORS, *clocks):
             names.append(f"camera_{view.camera.name}.{name}")
             params.append(Param(0.0, -5 * size, 5 * size, unit, "linear", None, "off what the calibration says"))
             sizes.append(size)
     return ParameterSpace(tuple(names), tuple(params), tuple(sizes))
 
 
-PER_CAMERA = len(_PRIORS) + 1
-"""Numbers of a camera."""
+POSE = len(_PRIORS)
+"""Numbers of a camera before those of its clocks."""
+
+
+def half_a_picture(view: FilmView) -> float:
+    """Return how far clocks are usually off [s]: when in the time of a picture a film was begun."""
+    return 0.5 / view.camera.fps
+
+
+def own_clocks(names: Sequence[str]) -> dict[str, Any]:
+    """Return clocks of a view of trials with these names, each film having its own."""
+    return {"clocks": tuple(names) if len(names) > 1 else ("",), "clock": np.arange(len(names))}
+
+
+def unfitted_clocks(views: Sequence[FilmView], fitted: Sequence[FilmView]) -> list[FilmView]:
+    """Return views of trials that are judged by numbers of others, whose clocks say nothing of theirs."""
+    pairs = zip(views, fitted, strict=True)
+    return [replace(v, clocks=w.clocks, clock=np.full(len(v.good), -1)) for v, w in pairs]
+
+
+def by_camera(views: Sequence[FilmView], numbers: np.ndarray) -> list[np.ndarray]:
+    """Return the numbers of each camera, of those of all of them, shape (..., Q)."""
+    ends = np.cumsum([v.numbers for v in views])
+    return [numbers[..., end - v.numbers : end] for v, end in zip(views, ends, strict=True)]
 
 
 def over_time(sims: Tensor, step: float, time: Tensor) -> Tensor:
-    """Return positions (P, B, T, M, 3), evenly in time by `step` [s], at times (P, F), cubic; shape (P, B, F, M, 3)."""
+    """Return positions (P, B, T, M, 3), evenly in time by `step` [s], at times (P, B, F), cubic; (P, B, F, M, 3)."""
     last = sims.shape[2] - 1
     at = (time / step).clamp(0.0, last)
     first = at.floor().clamp(max=last - 1)
-    x = (at - first)[:, None, :, None, None]
+    x = (at - first)[..., None, None]
     index = first.long()
-    rows = torch.arange(len(sims))[:, None]
-    a, b, c, d = (sims[rows, :, (index + k).clamp(0, last)].transpose(1, 2) for k in (-1, 0, 1, 2))
+    sets, trials = (torch.arange(n) for n in sims.shape[:2])
+    rows, columns = sets[:, None, None], trials[:, None]
+    a, b, c, d = (sims[rows, columns, (index + k).clamp(0, last)] for k in (-1, 0, 1, 2))
     # Catmull and Rom's spline.
     return b + 0.5 * x * (c - a + x * (2 * a - 5 * b + 4 * c - d + x * (3 * (b - c) + d - a)))
 
@@ -150,10 +203,12 @@ def seen_by(view: FilmView, sims: Tensor, numbers: Tensor, step: float) -> tuple
     Args:
         view: the camera and its clock.
         sims: positions [m], shape (P, B, T, M, 3).
-        numbers: those of the camera, shape (P, 8).
+        numbers: those of the camera, shape (P, 7 + C) for C clocks.
         step: time between simulated frames [s].
     """
-    time = torch.as_tensor(view.time, dtype=sims.dtype) + numbers[:, 7:8]
+    none = numbers.new_zeros(len(numbers), 1)
+    clocks = torch.cat([numbers[:, POSE:], none], 1)[:, np.full(len(view.good), view.clock)]
+    time = torch.as_tensor(view.time, dtype=sims.dtype) + clocks[..., None]
     points = over_time(sims, step, time)
     given = lens([view.camera], sims.dtype)
     given = Lens(*(x.expand(len(sims), *x.shape[1:]) for x in vars(given).values()))
@@ -184,7 +239,7 @@ class _Filmed:
         self.nuisances = nuisances(views)
         self.target: np.ndarray = np.empty(0)
         self.times: np.ndarray = np.empty(0)
-        """When readings are taken [s], of priors 0, shape (F, R)."""
+        """When readings are taken [s], of priors 0, shape (B, F, R)."""
         self.priors = slice(0, 0)
 
     def _finish(self, shape: tuple[int, ...], known: list[np.ndarray]) -> None:
@@ -200,10 +255,11 @@ class _Filmed:
         prior = np.full((trials, frames, _COPIES * len(self.nuisances.names), 1), np.nan)
         prior[:, 0] = 0.0
         self.target = np.concatenate([target, prior], 2)
-        taken = np.zeros((frames, self.target.shape[2]))
+        taken = np.zeros(self.target.shape[:3])
         ends = np.cumsum([k.shape[2] for k in known])
         for view, last, each in zip(self.views, ends, known, strict=True):
-            taken[: len(view.time), last - each.shape[2] : last] = view.time[:, None]
+            time = view.time
+            taken[:, : time.shape[1], last - each.shape[2] : last] = time[..., None]
         self.times = taken
 
     def _priors(self, numbers: np.ndarray, frames: int) -> np.ndarray:
@@ -217,14 +273,16 @@ class _Filmed:
         out = []
         for row, own in zip(sims, numbers, strict=True):  # one at a time: they are large
             parts = []
-            for k, view in enumerate(self.views):
-                camera = torch.as_tensor(own[None, PER_CAMERA * k : PER_CAMERA * (k + 1)], dtype=torch.float32)
+            for k, (view, camera) in enumerate(zip(self.views, self._cameras(own[None]), strict=True)):
                 with torch.no_grad():
                     parts.append(self._view(k, view, torch.as_tensor(row[None], dtype=torch.float32), camera))
             frames = self.target.shape[1]
             short = [np.pad(p, ((0, 0), (0, 0), (0, frames - p.shape[2]), (0, 0), (0, 0))) for p in parts]
             out.append(np.concatenate([*short, self._priors(own[None], frames)], 3)[0])
         return np.stack(out)
+
+    def _cameras(self, numbers: np.ndarray) -> list[Tensor]:
+        return [torch.as_tensor(own, dtype=torch.float32) for own in by_camera(self.views, numbers)]
 
     def _view(self, k: int, view: FilmView, sims: Tensor, numbers: Tensor) -> np.ndarray:
         raise NotImplementedError
@@ -289,8 +347,7 @@ class Spines(_Filmed):
         self, sims: np.ndarray, numbers: np.ndarray, pairs: Sequence[Pairs | None]
     ) -> tuple[np.ndarray, list[Pairs]]:
         rope, parts, used = torch.as_tensor(sims, dtype=torch.float32), [], []
-        for k, view in enumerate(self.views):
-            own = torch.as_tensor(numbers[:, PER_CAMERA * k : PER_CAMERA * (k + 1)], dtype=torch.float32)
+        for k, (view, own) in enumerate(zip(self.views, self._cameras(numbers), strict=True)):
             with torch.no_grad():
                 each, found = self._pairs(view, rope, own, pairs[k])
             gap = self.target.shape[1] - each.shape[2]

@@ -18,7 +18,7 @@ import numpy as np
 from torchdlo.errors import InputError
 from torchdlo.sysid.diagnosis import effect_library
 from torchdlo.sysid.diagnosis.budget import model_options
-from torchdlo.sysid.estimation.observation import PER_CAMERA, FilmView
+from torchdlo.sysid.estimation.observation import FilmView
 from torchdlo.sysid.estimation.result import result_json, versions
 from torchdlo.sysid.experiment_design import excitation_motions
 from torchdlo.sysid.experiment_design.design import motion_text
@@ -235,7 +235,7 @@ def _recorded(
         fitted=tuple(given.sizes(model)),
         options=model_options(recording, None) | given.options,
     )
-    values = np.concatenate([own.fixed[list(own.free)], np.zeros(PER_CAMERA * len(views))])
+    values = np.concatenate([own.fixed[list(own.free)], np.zeros(len(own.spines.nuisances.names))])
     names = list(effects) or visible(recording, model, given.effects)
     return second_view(
         own,

@@ -17,13 +17,13 @@ import numpy as np
 
 from torchdlo.errors import InputError
 from torchdlo.sysid.diagnosis.budget import model_options as suited
-from torchdlo.sysid.estimation.observation import FilmView, Spines
+from torchdlo.sysid.estimation.observation import FilmView, Spines, unfitted_clocks
 from torchdlo.sysid.estimation.result import Calibration, Overlay
 from torchdlo.sysid.model import model_file
 from torchdlo.sysid.model.model_file import ModelFile
 from torchdlo.sysid.model.rope_model import MAX_SUBSTEP
 from torchdlo.sysid.recordings.recording import Recording, Trial
-from torchdlo.sysid.video.filmed_fit import Fit, film_gaps, fit, gate, intervals, look, picture_errors
+from torchdlo.sysid.video.filmed_fit import Fit, film_gaps, fit, gate, intervals, look, picture_errors, time_films
 from torchdlo.sysid.video.filmed_problem import (
     FilmedProblem,
     add_correction,
@@ -216,7 +216,9 @@ def test_problem(
     own: FilmedProblem, trials: Sequence[Trial], views: Sequence[FilmView], values: np.ndarray
 ) -> FilmedProblem:
     """Return the problem of test trials that were filmed, see `tested`."""
-    spines = Spines(views, own.model.dt, own.extent, own.spines.free, own.spines.sure)
+    spines = Spines(
+        unfitted_clocks(views, own.spines.views), own.model.dt, own.extent, own.spines.free, own.spines.sure
+    )
     parts: dict[str, Any] = {"trials": tuple(trials), "motion": own.model.motion(trials), "spines": spines}
     here = replace(own, **parts, dropped={}, discretisation_correction=None)
     begin_from_balance(here, own.full(values[None])[0])
@@ -224,10 +226,12 @@ def test_problem(
         coarse = here.with_options(substep=MAX_SUBSTEP)
         refine_start(coarse, values, search=True)
         here.offset = coarse.offset
+    time_films(here, values)
     gate(here, values)
     add_correction(here, values)
     if here.offset.shape[1]:
         fit_starts(here, own.space.to_raw(values), 8, seconds=START_WINDOW)
+        time_films(here, values)
     return here
 
 

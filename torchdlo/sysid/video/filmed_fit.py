@@ -7,6 +7,7 @@ normal equations (Schur complement), and what is left is a problem of the number
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -17,11 +18,19 @@ import torch
 from torchdlo.sysid.estimation import levenberg_marquardt
 from torchdlo.sysid.estimation.levenberg_marquardt import Point
 from torchdlo.sysid.estimation.model_uncertainty import CLAMP_SPREAD, radius_of_clamps, shear_share
-from torchdlo.sysid.estimation.observation import INDEPENDENT, PER_CAMERA, Pairs, Spines, seen_by
+from torchdlo.sysid.estimation.observation import (
+    INDEPENDENT,
+    FilmView,
+    Pairs,
+    Spines,
+    by_camera,
+    half_a_picture,
+    seen_by,
+)
 from torchdlo.sysid.video.filmed_problem import STRETCHES, FilmedProblem
 from torchdlo.vision.spine import curve_vectors
 
-__all__ = ["Fit", "film_gaps", "fit", "gate", "intervals", "look", "picture_errors", "spread", "total"]
+__all__ = ["Fit", "film_gaps", "fit", "gate", "intervals", "look", "picture_errors", "spread", "time_films", "total"]
 
 _BLOCK = 0.5
 """Time over which what simulations get wrong is one and the same error [s]."""
@@ -49,6 +58,9 @@ _FAR, _FINEST = 3e-3, 0.05
 
 A rope that moves answers to its start by ten times as much, and not in proportion: near the films whole steps go past
 the minimum. Begun with, fine ones lead into nearer minima: fits of `sample_film` ended with 16 % less damping."""
+
+_CLOCKS = np.linspace(-3.0, 3.0, 25)
+"""What clocks of test films may be off, in halves of a picture."""
 
 _SHARP = 5e-3
 """Tolerance up to which fits come to their end; others only look for a basin."""
@@ -294,6 +306,52 @@ def gate(own: FilmedProblem, values: np.ndarray) -> int:
     return lost
 
 
+def time_films(own: FilmedProblem, values: np.ndarray) -> None:
+    """Set what clocks of films are off that are not fitted with the rope, those of test trials, at numbers (N,).
+
+    They cannot be known from elsewhere: a film is begun when somebody presses a button.
+    """
+    old = own.spines
+    if all((np.asarray(v.clock) >= 0).all() for v in old.views):
+        return
+    sims, costs = own.simulate(values[None]), []
+    for share in _CLOCKS:
+        views = [_late(v, share) for v in old.views]
+        read = Spines(views, old.step, old.extent, old.free, old.sure).read(sims, values[None, len(own.free) :])[0]
+        costs.append([_cost_of_view(own, read[..., 0], k) + own.prior * share**2 / 2 for k in range(len(views))])
+    best = _lowest(_CLOCKS, np.nan_to_num(np.array(costs), nan=np.inf))
+    views = [_late(v, share) for v, share in zip(old.views, best, strict=True)]
+    own.spines = Spines(views, old.step, old.extent, old.free, old.sure)
+
+
+def _late(view: FilmView, share: np.ndarray | float) -> FilmView:
+    """Return a view whose clocks, where they are not fitted, are off by a share of half a picture."""
+    return replace(view, off=np.where(np.asarray(view.clock) < 0, share * half_a_picture(view), 0.0))
+
+
+def _cost_of_view(own: FilmedProblem, read: np.ndarray, view: int) -> np.ndarray:
+    """Return costs (B,) of the readings (B, F, R) of one view."""
+    widths = [2 * v.places.shape[2] + own.spines.count_free for v in own.spines.views]
+    part = slice(sum(widths[:view]), sum(widths[: view + 1]))
+    residual = np.where(np.isfinite(own.spines.target[..., part, 0]), read[..., part], np.nan)
+    each = levenberg_marquardt.robust(residual)[0]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # a film of which no frame is good
+        return np.nanmean(each.reshape(len(each), -1), 1)
+
+
+def _lowest(places: np.ndarray, costs: np.ndarray) -> np.ndarray:
+    """Return where costs (K, ...) at even places (K,) are lowest, by the parabola through the three lowest; (...)."""
+    least = costs.argmin(0)
+    inner = np.clip(least, 1, len(places) - 2)
+    a, b, c = (np.take_along_axis(costs, (inner + k)[None], 0)[0] for k in (-1, 0, 1))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        shift = 0.5 * (a - c) / (a - 2 * b + c)
+    known = (inner == least) & np.isfinite(shift) & np.isfinite(b)
+    found = np.where(known, places[inner] + shift * (places[1] - places[0]), places[least])
+    return np.where(np.isfinite(costs.min(0)), found, 0.0)
+
+
 def intervals(own: FilmedProblem, found: Fit) -> tuple[np.ndarray, np.ndarray]:
     """Return 90 % limits of the fitted numbers, shape (N,) each; all that is possible where films do not tell."""
     point, drifts = spread(own, found)
@@ -360,7 +418,7 @@ def _blocks(own: FilmedProblem, found: Fit) -> tuple[np.ndarray, np.ndarray]:
     if own.trials[0].still:
         return _stretches(own, found)
     count, size, last = found.offset.shape[1], found.raw.size, own.spines.priors.start
-    data, times = found.residual[..., :last], own.spines.times[:, :last]
+    data, times = found.residual[..., :last], own.spines.times[..., :last]
     blocks = np.floor((times - times.min()) / _BLOCK).astype(int)
     least = 0.3 * _BLOCK / max(np.ptp(times), _BLOCK)
     gradients, curvatures = [], []
@@ -374,7 +432,7 @@ def _blocks(own: FilmedProblem, found: Fit) -> tuple[np.ndarray, np.ndarray]:
             inner = h[0, size:, size:] + 1e-12 * np.eye(count)
             follow = np.linalg.solve(inner, h[0, size:, :size]).T
         for k in range(blocks.max() + 1):
-            inside = np.where(blocks == k, data[single], np.nan)
+            inside = np.where(blocks[single] == k, data[single], np.nan)
             if np.isfinite(inside).sum() < least * max(whole, 1):
                 continue
             g, c = normal(inside, jacobian, found.offset[single], 0 * own.prior[single])
@@ -391,7 +449,7 @@ def _stretches(own: FilmedProblem, found: Fit) -> tuple[np.ndarray, np.ndarray]:
     spots = np.flatnonzero(own.spines.free)
     parts = []
     for k, view in enumerate(own.spines.views):
-        numbers = torch.as_tensor(values[:, len(own.free) :][:, PER_CAMERA * k :][:, :PER_CAMERA], dtype=torch.float32)
+        numbers = torch.as_tensor(by_camera(own.spines.views, values[:, len(own.free) :])[k], dtype=torch.float32)
         pixel = seen_by(view, places, numbers, own.spines.step)[0][0]
         points = torch.as_tensor(view.places, dtype=torch.float32).nan_to_num(1e6)
         along = curve_vectors(pixel, points)[1].numpy()

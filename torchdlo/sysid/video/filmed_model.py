@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from torchdlo.sysid.estimation.observation import FilmView, Spines
+from torchdlo.sysid.estimation.observation import FilmView, Spines, unfitted_clocks
 from torchdlo.sysid.recordings.recording import Trial
 from torchdlo.sysid.video.filmed import test_problem
-from torchdlo.sysid.video.filmed_fit import Fit, film_gaps
+from torchdlo.sysid.video.filmed_fit import Fit, film_gaps, time_films
 from torchdlo.sysid.video.filmed_problem import FilmedProblem, first_frames
 from torchdlo.sysid.video.filmed_starts import fit_starts
 
@@ -43,6 +43,7 @@ class FilmedModel:
             here = self.test
             if here.offset.shape[1]:
                 fit_starts(here, self.fit.raw, 3)
+            time_films(here, self.values)
             read = here.spines.read(here.simulate(self.values[None]), self.values[None, len(here.free) :])[0]
             residual = np.where(np.isfinite(here.spines.target), read, np.nan)[:, :, : here.spines.priors.start, 0]
             self._tested = np.sqrt(np.nanmean(residual**2, (1, 2)))
@@ -75,7 +76,9 @@ class Films:
         if split == "train":
             return model.own.over(self.whole, self.whole.lasts)
         here, model_of = model.test, model.own.model
-        spines = Spines(self.views, model_of.dt, here.extent, here.spines.free, here.spines.sure)
+        pairs = zip(unfitted_clocks(self.views, here.spines.views), here.spines.views, strict=True)
+        views = [replace(v, off=w.off) for v, w in pairs]
+        spines = Spines(views, model_of.dt, here.extent, here.spines.free, here.spines.sure)
         start = replace(here.start, discretisation_correction=None)
         parts: dict[str, Any] = {
             "trials": self.trials,

@@ -212,7 +212,7 @@ class FilmedProblem:
         """Return what readings (B, F, R) of the first seconds should be [m], NaN where there are none."""
         target = self.spines.target[..., 0].copy()
         if seconds is not None:
-            target[:, self.spines.times > seconds] = np.nan
+            target[self.spines.times > seconds] = np.nan
         return target
 
     def readings(self, seconds: float | None = None) -> tuple[levenberg_marquardt.Simulate, np.ndarray]:

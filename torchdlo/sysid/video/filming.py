@@ -55,6 +55,7 @@ def film_recording(
     radius: float | None = None,
     masks: bool = False,
     off: float = 0.0,
+    begun_off: float = 0.0,
     trials: int | None = None,
     seconds: float | None = None,
     quality: int = 18,
@@ -70,6 +71,7 @@ def film_recording(
         radius: of the rope [m], where the recording does not know it.
         masks: write masks in the place of pictures.
         off: how far the cameras that are written down are off, see `vision.film.off_camera`.
+        begun_off: by up to how many frames each film begins earlier or later than is written down.
         trials: most trials of each split.
         seconds: most seconds of each trial.
         quality: of H.264, from 0 (lossless) to 51.
@@ -88,8 +90,8 @@ def film_recording(
     chosen = [t if seconds is None else _cut(t, seconds) for t in chosen]
     rng = np.random.default_rng(look.seed)
     given = [off_camera(c, rng, degrees=off, zoom=0.01 * off, metres=0.01 * off) if off else c for c in cameras]
-    if off > 0:
-        given = [replace(g, start=c.start + off * (g.start - c.start)) for g, c in zip(given, cameras, strict=True)]
+    given = [_later(c, off * (g.start - c.start), g) for g, c in zip(given, cameras, strict=True)]
+    begun = np.random.default_rng([look.seed, 1])
     said, done = [], 0
 
     def fill(folder: Path) -> None:
@@ -112,7 +114,8 @@ def film_recording(
             for j, camera in enumerate(cameras):
                 check_inside(camera, line)
                 own = replace(look, seed=look.seed + 1000 * k + j)
-                seen = film_rope(camera, trial.time, line, wide, own, held=held[0])
+                start = camera.starts.get(trial.name, camera.start) + begun_off * begun.uniform(-1, 1) / camera.fps
+                seen = film_rope(replace(camera, start=start), trial.time, line, wide, own, held=held[0])
                 _write(seen, folder / f"{trial.name}.{camera.name}", camera, masks, quality)
                 done += 1
                 report("filming", done, len(chosen) * len(cameras), trial.name)
@@ -122,6 +125,12 @@ def film_recording(
 
     _new_folder(out, fill)
     return [*said, f"recording: {out}"]
+
+
+def _later(camera: Camera, seconds: float, place: Camera) -> Camera:
+    """Return a camera at the place of another one, all of whose films begin later than its own."""
+    starts = {trial: start + seconds for trial, start in camera.starts.items()}
+    return replace(place, start=camera.start + seconds, starts=starts)
 
 
 _KEPT = ("length", "radius", "mass", "gravity", "table_height", "marker_noise_std")

@@ -102,6 +102,12 @@ def film_files(path: Path, trials: Sequence[str]) -> dict[str, tuple[FilmFile, .
     cameras = {c.name: c for c in load_cameras(path / "cameras.json")}
     stated = states_rate(path / "cameras.json")
     films: dict[str, list[FilmFile]] = {name: [] for name in trials}
+    for camera in cameras.values():
+        if unknown := sorted(set(camera.starts) - set(films)):
+            raise InputError(
+                f"{path / 'cameras.json'}: starts of camera {camera.name}: expected names of trials, found "
+                f"{unknown[0]!r}."
+            )
     for file in found:
         trial, _, name = (file.name if file.is_dir() else file.stem).partition(".")
         if name not in cameras:
@@ -112,7 +118,9 @@ def film_files(path: Path, trials: Sequence[str]) -> dict[str, tuple[FilmFile, .
             raise InputError(f"{file}: expected {trial}.npz with the motion of the grippers beside it, found none.")
         if any(f.camera.name == name for f in films[trial]):
             raise InputError(f"{file}: expected one film of each trial and camera, found two.")
-        films[trial].append(FilmFile(cameras[name], file, name in stated))
+        camera = cameras[name]
+        camera = replace(camera, start=camera.starts.get(trial, camera.start), starts={})
+        films[trial].append(FilmFile(camera, file, name in stated))
     for trial, own in films.items():
         if not own:
             raise InputError(

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from torchdlo.errors import InputError
-from torchdlo.sysid.estimation.observation import FilmView
+from torchdlo.sysid.estimation.observation import FilmView, own_clocks
 from torchdlo.sysid.recordings.recording import Recording, Trial
 from torchdlo.sysid.video.films import FILMS, FilmFile
 from torchdlo.vision.camera import NEAR, lens, project
@@ -69,9 +69,12 @@ def views_of(
     views, done, total = [], 0, len(trials) * len(names)
     for k, name in enumerate(names):
         parts = []
-        films, early = _from_start(_timed(recording, [trial.films[k] for trial in trials]))
-        for trial, film in zip(trials, films, strict=True):
-            parts.append(_reduced(recording, trial, film, early, notes))
+        films = _timed(recording, [trial.films[k] for trial in trials])
+        early = [_early(film) for film in films]
+        begun = [f.camera.start + e / f.camera.fps for f, e in zip(films, early, strict=True)]
+        for trial, film, before, start in zip(trials, films, early, begun, strict=True):
+            own = replace(film, camera=replace(film.camera, start=start))
+            parts.append(_reduced(recording, trial, own, before, notes))
             done += 1
             report("reading films", done, total, f"{trial.name}, camera {name}")
         frames = max(len(p[0]) for p in parts)
@@ -91,7 +94,9 @@ def views_of(
         lines = (stack(0, 0).astype(bool), stack(1, np.nan), stack(2, np.nan))
         wide = float(np.median([p[3] for p in parts]))
         packed, shown = tuple(p[4] for p in parts), tuple(p[5] for p in parts)
-        views.append(FilmView(films[0].camera, *lines, wide, packed, shown))
+        camera = replace(films[0].camera, start=begun[0])
+        clocks = {} if trials[0].still else own_clocks([trial.name for trial in trials])
+        views.append(FilmView(camera, *lines, wide, packed, shown, late=np.array(begun) - begun[0], **clocks))
     return views, notes
 
 
@@ -190,11 +195,9 @@ def _reduced(
     return good, places, tangents, wide, np.packbits(masks.reshape(count, -1), axis=1), _shown(masks, pictures, some)
 
 
-def _from_start(films: Sequence[FilmFile]) -> tuple[list[FilmFile], int]:
-    """Return films of one camera from their first picture of the trial on, and how many pictures are before it."""
-    start, fps = films[0].camera.start, films[0].camera.fps
-    early = max(0, math.floor(-0.75 - start * fps) + 1)
-    return [replace(f, camera=replace(f.camera, start=start + early / fps)) for f in films], early
+def _early(film: FilmFile) -> int:
+    """Return how many pictures of a film are from before its trial."""
+    return max(0, math.floor(-0.75 - film.camera.start * film.camera.fps) + 1)
 
 
 def _lasting(trial: Trial, film: FilmFile, count: int) -> int:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from torchdlo.sysid.estimation.observation import PER_CAMERA, seen_by
+from torchdlo.sysid.estimation.observation import by_camera, seen_by
 from torchdlo.sysid.estimation.result import Overlay
 from torchdlo.sysid.video.footage import RANGES
 from torchdlo.vision.boundary import boundary_f, wide_areas
@@ -40,14 +40,15 @@ def drawn_masks(
         trial: number of the trial, whose masks say how much of the rope grippers hide.
     """
     seen = own.spines.views[view]
-    camera = torch.as_tensor(numbers[None, PER_CAMERA * view : PER_CAMERA * (view + 1)], dtype=torch.float32)
+    camera = torch.as_tensor(by_camera(own.spines.views, numbers[None])[view], dtype=torch.float32)
+    seen = seen.picked(np.array([trial]))
     with torch.no_grad():
         place = torch.as_tensor(sims[None, None], dtype=torch.float32)
         pixel, depth, _ = seen_by(seen, place, camera, own.spines.step)
         pixel, depth = pixel[0, 0, frames], depth[0, 0, frames]
         near = depth.clamp(min=NEAR)
         wide = radius * near.median() / near
-        points = torch.as_tensor(seen.places[trial, frames], dtype=torch.float32)
+        points = torch.as_tensor(seen.places[0, frames], dtype=torch.float32)
         cut, shown = _without_grippers(pixel, points, radius)
         size = (seen.camera.height, seen.camera.width)
         return coverage(cut, wide, shown & (depth >= NEAR), successors([pixel.shape[-2]]), size).numpy()
@@ -138,10 +139,10 @@ def overlays(own: FilmedProblem, split: str, sims: np.ndarray, numbers: np.ndarr
     for k, view in enumerate(own.spines.views):
         with torch.no_grad():
             both = torch.as_tensor(sims, dtype=torch.float32)
-            cameras = torch.as_tensor(numbers[:, PER_CAMERA * k : PER_CAMERA * (k + 1)], dtype=torch.float32)
+            cameras = torch.as_tensor(by_camera(own.spines.views, numbers)[k], dtype=torch.float32)
             pixel = seen_by(view, both, cameras, own.spines.step)[0].numpy()
         for b, trial in enumerate(own.trials):
             for frame, shown in view.shown[b].items():
-                title = f"{trial.name}, camera {view.camera.name}, {view.time[frame]:.2f} s"
+                title = f"{trial.name}, camera {view.camera.name}, {view.time[b, frame]:.2f} s"
                 out.append(Overlay(title, split, shown, pixel[0, b, frame], pixel[1, b, frame]))
     return out

@@ -20,7 +20,7 @@ import torch
 from torchdlo.sysid.diagnosis import effect_library, score_test
 from torchdlo.sysid.diagnosis.detection_limit import DetectionLimit, ProbedEffect, detection_limits
 from torchdlo.sysid.estimation.levenberg_marquardt import ParameterSpace
-from torchdlo.sysid.estimation.observation import INDEPENDENT, PER_CAMERA, SURE, FilmView, nuisances, over_time, seen_by
+from torchdlo.sysid.estimation.observation import INDEPENDENT, POSE, SURE, FilmView, nuisances, over_time, seen_by
 from torchdlo.sysid.model.rope_model import RopeModel
 from torchdlo.sysid.model.trial_batch import Start, TrialBatch
 from torchdlo.sysid.recordings.recording import Recording
@@ -92,7 +92,7 @@ class MotionVariations:
     def at_pictures(self, fps: float) -> np.ndarray:
         """Return all changes at the times of pictures [m], shape (K + D + J, B, F, M, 3)."""
         if fps not in self._sampled:
-            time = torch.arange(self.pictures(fps), dtype=torch.float64)[None] / fps
+            time = torch.arange(self.pictures(fps), dtype=torch.float64).expand(1, len(self.rope), -1) / fps
             parts = [p for p in (self.numbers, self.doses, self.starts) if len(p)]
             rows = [over_time(torch.as_tensor(row[None]), self.step, time)[0].numpy() for part in parts for row in part]
             # Of doses whose simulation fails nothing is said.
@@ -174,7 +174,7 @@ def camera_information(camera: Camera, motion: MotionVariations) -> CameraInform
     blank = np.zeros((trials, count, 1, 2))
     view = FilmView(replace(camera, start=0.0), np.ones((trials, count), bool), blank, blank, 1.0)
     size = 0.1 * nuisances([view]).units
-    rows = np.concatenate([np.zeros((4, PER_CAMERA)), np.diag(size)])
+    rows = np.concatenate([np.zeros((4, len(size))), np.diag(size)])
     ropes = np.repeat(motion.rope[None], len(rows), 0)
     for axis in range(3):
         ropes[1 + axis, ..., axis] += _SHIFT
@@ -251,24 +251,22 @@ def told(cameras: Sequence[CameraInformation], motion: MotionVariations) -> Expe
     """Return what the films of cameras tell together: nuisances take up what they can, and a rope is shared."""
     numbers, count = len(motion.numbers), motion.count
     trials, starts = len(motion.rope), len(motion.starts)
-    own = count + PER_CAMERA * len(cameras)
-    whole = np.zeros((own + trials * starts,) * 2)
+    shared = count + POSE * len(cameras)
+    each = len(cameras) + starts
+    whole = np.zeros((shared + trials * each,) * 2)
     for c, camera in enumerate(cameras):
         for b, part in enumerate(camera.matrix):
-            at = np.concatenate(
-                [
-                    np.arange(count),
-                    count + PER_CAMERA * c + np.arange(PER_CAMERA),
-                    own + starts * b + np.arange(starts),
-                ]
-            )
+            own = shared + each * b
+            # Films have each a clock of their own.
+            pose, start = count + POSE * c + np.arange(POSE), own + len(cameras) + np.arange(starts)
+            at = np.concatenate([np.arange(count), pose, [own + c], start])
             whole[np.ix_(at, at)] += part
-    shared = np.concatenate([np.arange(numbers), np.arange(count, len(whole))])
-    prior = np.ones(len(shared))
+    fitted = np.concatenate([np.arange(numbers), np.arange(count, len(whole))])
+    prior = np.ones(len(fitted))
     prior[:numbers] = [(_UNKNOWN if p.scale == "log" else _WIDE) ** -2.0 for p in motion.space.params]
-    known = whole[np.ix_(shared, shared)] + np.diag(prior)
+    known = whole[np.ix_(fitted, fitted)] + np.diag(prior)
     spread = np.linalg.inv(known)[:numbers, :numbers]
-    mixed = whole[np.ix_(np.arange(numbers, count), shared)]
+    mixed = whole[np.ix_(np.arange(numbers, count), fitted)]
     left = np.diag(whole)[numbers:count] - np.einsum("dn,nd->d", mixed, np.linalg.solve(known, mixed.T))
     weight = sum(c.weight for c in cameras)
     shown = np.sqrt(left.clip(min=0.0) / max(weight, 1e-300))
