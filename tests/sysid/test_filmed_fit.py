@@ -18,7 +18,7 @@ from torchdlo.sysid.model.rope_model import RopeModel
 from torchdlo.sysid.model.trial_batch import Start
 from torchdlo.sysid.recordings.recording import load_recording
 from torchdlo.sysid.video import filmed_starts
-from torchdlo.sysid.video.filmed import doubts
+from torchdlo.sysid.video.filmed import begun_elsewhere, doubts
 from torchdlo.sysid.video.filmed_fit import Fit, eliminated, fit, look, normal, spread, time_films
 from torchdlo.sysid.video.filmed_problem import FilmedProblem, begin_from_balance, filmed_problem
 from torchdlo.sysid.video.filmed_starts import fit_starts, search_starts
@@ -157,6 +157,10 @@ def test_test_films_are_compared_when_they_were_taken(swing: FilmedProblem) -> N
     own.spines = Spines(unfitted_clocks([view], [view]), own.model.dt, own.extent, own.spines.free)
     time_films(own, numbers)
     assert own.spines.views[0].off == pytest.approx([0.01], abs=1e-3)
+    assert not begun_elsewhere(own)
+    late = replace(own.spines.views[0], off=np.array([-0.05]))
+    other = replace(own, spines=Spines([late], own.model.dt, own.extent, own.spines.free))
+    assert begun_elsewhere(other)[0].startswith("train_0, camera a: its film seems to have begun 50 ms earlier")
     assert own.spines.times[0, 0, 0] == pytest.approx(old.time[0, 0] + 0.01, abs=1e-3)
 
 

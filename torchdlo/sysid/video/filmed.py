@@ -17,7 +17,7 @@ import numpy as np
 
 from torchdlo.errors import InputError
 from torchdlo.sysid.diagnosis.budget import model_options as suited
-from torchdlo.sysid.estimation.observation import FilmView, Spines, unfitted_clocks
+from torchdlo.sysid.estimation.observation import FilmView, Spines, half_a_picture, unfitted_clocks
 from torchdlo.sysid.estimation.result import Calibration, Overlay
 from torchdlo.sysid.model import model_file
 from torchdlo.sysid.model.model_file import ModelFile
@@ -341,7 +341,7 @@ def _judged(
     here, numbers = own, len(own.free)
     if split == "test":
         here, said = tested(own, recording, values, report)
-        notes += said
+        notes += [*said, *begun_elsewhere(here)]
     old, _ = picture_errors(here, first)
     new, pixels = picture_errors(here, values)
     sims = here.simulate(np.stack([first, values]))
@@ -362,6 +362,17 @@ def _judged(
     shown = overlays(here, split, sims, np.stack([first, values])[:, numbers:])
     moving = [trial.name for trial, calm in zip(here.trials, here.start.at_rest, strict=True) if not calm]
     return _Judged(trials, predictions, shown, moving)
+
+
+def begun_elsewhere(own: FilmedProblem) -> list[str]:
+    """Return which test films seem to have begun more than a picture off what is written."""
+    return [
+        f"{trial.name}, camera {view.camera.name}: its film seems to have begun {1e3 * abs(off):.0f} ms "
+        f"{'later' if off > 0 else 'earlier'} than cameras.json says, or more; set starts there."
+        for view in own.spines.views
+        for trial, off in zip(own.trials, np.zeros(len(own.trials)) + view.off, strict=True)
+        if abs(off) > 2 * half_a_picture(view)
+    ]
 
 
 def doubts(trials: Sequence[dict[str, Any]], moving: Sequence[str]) -> list[str]:
@@ -396,7 +407,7 @@ def _remarks(own: FilmedProblem, values: np.ndarray, low: np.ndarray, high: np.n
                 f"{name.replace('_', ' ')} is not testable from these views: it may be {a:.2g} to {b:.2g} {p.unit}."
             )
         elif name.startswith("camera_") and abs(v) > 3 * own.space.units[own.space.names.index(name)]:
-            out.append(
-                f"{name.replace('_', ' ')} is off by {v:.3g} {p.unit}: was the camera moved after its calibration?"
-            )
+            clock = ".clock" in name
+            why = "set start or starts in cameras.json" if clock else "was the camera moved after its calibration?"
+            out.append(f"{name.replace('_', ' ')} is off by {v:.3g} {p.unit}: {why}{'.' if clock else ''}")
     return out
