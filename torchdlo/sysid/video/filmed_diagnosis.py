@@ -234,7 +234,7 @@ def _round(
     more = plan.more * (_PATIENCE if base.own.trials[0].still else 1)
     # Starts that took up what the baseline lacked are not those of a model that has it.
     enough = _EXPLAINED * levenberg_marquardt.cost_of(level)
-    on = [*((fits[name], more, enough) for name in leading), (base, 3, np.inf)]
+    on = [*((fits[name], more, enough) for name in leading), (base, 3, None)]
     rival = base
     for k, found in pool.map(_fitted_on, on):
         if k == len(leading):
@@ -318,13 +318,15 @@ def _fitted(base: FilmedModel, score: Score, iterations: int, seconds: float) ->
     return replace(best, fit=fit(best.own, best.fit.raw, iterations, seconds=seconds))
 
 
-def _fitted_on(model: FilmedModel, iterations: int, enough: float) -> FilmedModel:
+def _fitted_on(model: FilmedModel, iterations: int, enough: float | None) -> FilmedModel:
     """Return a model with a better fit; the given one and its starts stay what they are.
 
-    Trials that cost more than `enough` [m] may begin elsewhere.
+    Trials that cost more than `enough` [m] may begin elsewhere, none if it is not given.
     """
     own = replace(model.own)
-    found = restart(own, fit(own, model.fit.raw, iterations), iterations, enough)
+    found = fit(own, model.fit.raw, iterations)
+    if enough is not None:
+        found = restart(own, found, iterations, enough)
     # Starts of test trials are fitted when they are asked for, and kept where they were found.
     return replace(model, own=own, fit=found, test=own if model.test is model.own else replace(model.test))
 
