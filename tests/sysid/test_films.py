@@ -174,8 +174,16 @@ def test_films_begin_at_times_of_their_own(filmed: Path) -> None:
     assert [t.films[0].camera.start for t in recording.trials("all")] == [0.04, -0.5]
     view = views_of(recording, recording.train)[0][0]
     assert view.camera.start == 0.04 and view.time[0, 0] == 0.04
+    save_cameras([view_of_sample(starts={"train_0": 0.2})], filmed / "cameras.json")
+    recording = load_recording(filmed)
+    with pytest.raises(
+        InputError, match=r"from the beginning of train_0.npz on, found one that begins after 0.2 of its"
+    ):
+        views_of(recording, recording.train)
     save_cameras([view_of_sample(starts={"train_7": 0.1})], filmed / "cameras.json")
-    with pytest.raises(InputError, match="starts of camera a: expected names of trials, found 'train_7'"):
+    with pytest.raises(
+        InputError, match=r"starts of camera a: expected names of trials .train_0, test_0., found 'train_7'"
+    ):
         load_recording(filmed)
 
 
@@ -187,6 +195,16 @@ def test_pictures_before_a_trial_are_skipped_film_by_film(made: Path, tmp_path: 
     view = views_of(recording, recording.train)[0][0]
     assert np.allclose(view.late, [0.0, 0.0], atol=1e-9) and np.allclose(view.time[:, 0], 0.0, atol=1e-9)
     assert view.clocks == ("train_0", "train_1") and view.clock.tolist() == [0, 1]
+
+
+def test_starts_of_trials_that_are_not_filmed_are_left_out(tmp_path: Path) -> None:
+    recording, look = load_recording(SAMPLE), FilmLook(noise=1.0)
+    camera = view_of_sample(starts={"train_0": -0.2, "train_1": -0.1})
+    film_recording(recording, [camera], tmp_path / "one", look, trials=1, seconds=0.5)
+    assert load_recording(tmp_path / "one").train[0].films[0].camera.start == -0.2
+    with pytest.raises(InputError, match=r"starts of camera a: expected names of trials .* found 'train_9'"):
+        film_recording(recording, [view_of_sample(starts={"train_9": 0.0})], tmp_path / "no", look)
+    assert not (tmp_path / "no").exists()
 
 
 def test_films_may_begin_off_what_is_written(tmp_path: Path) -> None:

@@ -93,6 +93,7 @@ def calibrate_camera(
         err=as_json,
     )
     notes = [*found.notes, *([f"start = {camera.start:g} s is kept as {out} had it."] if camera.start else [])]
+    notes += [f"starts of {len(camera.starts)} trials are kept as {out} had them."] if camera.starts else []
     for note in notes:
         typer.echo(f"note: {note}", err=as_json)
     typer.echo(f"cameras: {out}\npicture: {picture}", err=as_json)
@@ -240,7 +241,7 @@ def film(
         ),
     ] = 0.0,
     begun_off: Annotated[
-        float, typer.Option(min=0, max=5, help="Of recordings: each film begins up to so many frames early or late.")
+        float, typer.Option(min=0, max=2, help="Of recordings: each film begins up to so many frames early or late.")
     ] = 0.0,
     trials: Annotated[int | None, typer.Option(min=1, help="Of recordings: most trials of each split.")] = None,
     seconds: Annotated[float | None, typer.Option(min=0.1, help="Of recordings: most seconds of each trial.")] = None,

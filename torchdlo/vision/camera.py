@@ -29,6 +29,7 @@ __all__ = [
     "Lens",
     "back_project",
     "check_name",
+    "check_starts",
     "lens",
     "load_cameras",
     "looking_at",
@@ -257,6 +258,16 @@ def load_cameras(path: str | Path) -> tuple[Camera, ...]:
     if len(set(names)) < len(names):
         raise InputError(f"{path}: cameras: expected a different name for each, found {', '.join(names)}.")
     return cameras
+
+
+def check_starts(cameras: Sequence[Camera], trials: Sequence[str], where: str = "") -> None:
+    """Refuse `starts` of other trials than these; `where` begins the sentence."""
+    for camera in cameras:
+        if unknown := sorted(set(camera.starts) - set(trials)):
+            raise InputError(
+                f"{where}starts of camera {camera.name}: expected names of trials ({', '.join(trials)}), found "
+                f"{unknown[0]!r}."
+            )
 
 
 def states_rate(path: str | Path) -> frozenset[str]:

@@ -121,7 +121,8 @@ class FilmView:
         count = int(inside.sum(1).max())
         good, places, tangents = self.good[:, :count], self.places[:, :count], self.tangents[:, :count]
         if not inside[:, :count].all():
-            good = good & inside[:, :count]
+            # Frames that turn out wrong later are so in both: what is too late has no centre line.
+            places = np.where(inside[:, :count, None, None], places, np.nan)
         return replace(self, good=good, places=places, tangents=tangents)
 
     @property
@@ -240,7 +241,7 @@ class _Filmed:
         self.target: np.ndarray = np.empty(0)
         self.times: np.ndarray = np.empty(0)
         """When readings are taken [s], of priors 0, shape (B, F, R)."""
-        self.priors = slice(0, 0)
+        self.priors, self._copies = slice(0, 0), _COPIES
 
     def _finish(self, shape: tuple[int, ...], known: list[np.ndarray]) -> None:
         """Set the target: 0 where something was measured, and one reading of the priors per trial."""
@@ -251,9 +252,12 @@ class _Filmed:
         # A squared reading counts one of `count`; a trial tells as much as `INDEPENDENT` readings per picture.
         share = count / np.maximum(INDEPENDENT * pictures * trials, 1)
         self.priors = slice(target.shape[2], None)
-        self._weight = self.sure * np.sqrt(share / _COPIES)
-        prior = np.full((trials, frames, _COPIES * len(self.nuisances.names), 1), np.nan)
-        prior[:, 0] = 0.0
+        # Copies lie in as many frames as there are: readings are kept for all frames.
+        self._copies = -(-_COPIES // min(frames, _COPIES))
+        rows = -(-_COPIES // self._copies)
+        self._weight = self.sure * np.sqrt(share / (self._copies * rows))
+        prior = np.full((trials, frames, self._copies * len(self.nuisances.names), 1), np.nan)
+        prior[:, :rows] = 0.0
         self.target = np.concatenate([target, prior], 2)
         taken = np.zeros(self.target.shape[:3])
         ends = np.cumsum([k.shape[2] for k in known])
@@ -264,7 +268,7 @@ class _Filmed:
 
     def _priors(self, numbers: np.ndarray, frames: int) -> np.ndarray:
         """Return readings of the priors, shape (P, B, F, R, 1)."""
-        own = np.tile(numbers / self.nuisances.units, _COPIES)
+        own = np.tile(numbers / self.nuisances.units, self._copies)
         out = self._weight[None, :, None] * own[:, None]
         return np.broadcast_to(out[:, :, None, :, None], (*out.shape[:2], frames, out.shape[2], 1))
 

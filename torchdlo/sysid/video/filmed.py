@@ -31,7 +31,7 @@ from torchdlo.sysid.video.filmed_problem import (
     filmed_problem,
     keep_steps_only,
 )
-from torchdlo.sysid.video.filmed_starts import START_WINDOW, fit_starts, refine_start, restart, scout
+from torchdlo.sysid.video.filmed_starts import START_WINDOW, fit_starts, refine_start, restart, scout, start_window
 from torchdlo.sysid.video.footage import views_of
 from torchdlo.sysid.video.overlay import mask_overlaps, overlays
 from torchdlo.sysid.video.picture_gradient import descend, whitening, with_profile
@@ -230,7 +230,7 @@ def test_problem(
     gate(here, values)
     add_correction(here, values)
     if here.offset.shape[1]:
-        fit_starts(here, own.space.to_raw(values), 8, seconds=START_WINDOW)
+        fit_starts(here, own.space.to_raw(values), 8, seconds=start_window(here))
         time_films(here, values)
     return here
 
@@ -342,7 +342,9 @@ def _judged(
     if split == "test":
         here, said = tested(own, recording, values, report)
         notes += [*said, *begun_elsewhere(here)]
-    old, _ = picture_errors(here, first)
+    other = replace(here)
+    time_films(other, first)
+    old, _ = picture_errors(other, first)
     new, pixels = picture_errors(here, values)
     sims = here.simulate(np.stack([first, values]))
     share = mask_overlaps(here, sims[1], values[numbers:])
@@ -365,14 +367,21 @@ def _judged(
 
 
 def begun_elsewhere(own: FilmedProblem) -> list[str]:
-    """Return which test films seem to have begun more than a picture off what is written."""
+    """Return which test films seem to have begun more than one and a half pictures off what is written."""
     return [
-        f"{trial.name}, camera {view.camera.name}: its film seems to have begun {1e3 * abs(off):.0f} ms "
-        f"{'later' if off > 0 else 'earlier'} than cameras.json says, or more; set starts there."
+        begun_text(trial.name, view.camera.name, off)
         for view in own.spines.views
         for trial, off in zip(own.trials, np.zeros(len(own.trials)) + view.off, strict=True)
-        if abs(off) > 2 * half_a_picture(view)
+        if abs(off) > 3 * half_a_picture(view)
     ]
+
+
+def begun_text(trial: str, camera: str, late: float) -> str:
+    """Return that a film began at another time than is written, `late` seconds later."""
+    return (
+        f"{trial}, camera {camera}: its film seems to have begun {1e3 * abs(late):.0f} ms or more "
+        f"{'later' if late > 0 else 'earlier'} than cameras.json says; set starts there."
+    )
 
 
 def doubts(trials: Sequence[dict[str, Any]], moving: Sequence[str]) -> list[str]:
@@ -407,7 +416,12 @@ def _remarks(own: FilmedProblem, values: np.ndarray, low: np.ndarray, high: np.n
                 f"{name.replace('_', ' ')} is not testable from these views: it may be {a:.2g} to {b:.2g} {p.unit}."
             )
         elif name.startswith("camera_") and abs(v) > 3 * own.space.units[own.space.names.index(name)]:
-            clock = ".clock" in name
-            why = "set start or starts in cameras.json" if clock else "was the camera moved after its calibration?"
-            out.append(f"{name.replace('_', ' ')} is off by {v:.3g} {p.unit}: {why}{'.' if clock else ''}")
+            camera, clock, trial = name.partition(".clock")
+            if clock:
+                which = trial.removeprefix(".") or own.trials[0].name
+                out.append(begun_text(which, camera.removeprefix("camera_"), v))
+                continue
+            out.append(
+                f"{name.replace('_', ' ')} is off by {v:.3g} {p.unit}: was the camera moved after its calibration?"
+            )
     return out

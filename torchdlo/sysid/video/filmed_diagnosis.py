@@ -76,6 +76,9 @@ _SIGNS, _KEPT = (1.0, -1.0), 3
 _AS_GOOD = 1.1
 """Times what the best fit leaves on test trials up to which another one's numbers may be the true ones as well."""
 
+_COMPARED = 3
+"""Most steps of the fits of a baseline that leading models are compared with."""
+
 _EXPLAINED = 2.0
 """Times the cost of the floor below which a leading model's trials keep their starts."""
 
@@ -234,7 +237,7 @@ def _round(
     more = plan.more * (_PATIENCE if base.own.trials[0].still else 1)
     # Starts that took up what the baseline lacked are not those of a model that has it.
     enough = _EXPLAINED * levenberg_marquardt.cost_of(level)
-    on = [*((fits[name], more, enough) for name in leading), (base, 3, None)]
+    on = [*((fits[name], more, enough) for name in leading), (base, _COMPARED, None)]
     rival = base
     for k, found in pool.map(_fitted_on, on):
         if k == len(leading):
@@ -243,6 +246,7 @@ def _round(
         fits[leading[k]] = found
         report(f"{stage}: fitting on", 1, 1, f"{leading[k]} {1e3 * found.fit.cost:.3f} mm")
     led = sorted(leading, key=lambda n: fits[n].fit.cost)
+    rival = _begun_alike(rival, fits[led[0]])
     refused = {name: _refused(rival, fits[name], first, floor, level) for name in led}
     fair = [name for name in led if refused[name] is None]
     best, rivals, reasons = None, [], {name: refused.get(name) or "fits worse" for name in fits}
@@ -329,6 +333,15 @@ def _fitted_on(model: FilmedModel, iterations: int, enough: float | None) -> Fil
         found = restart(own, found, iterations, enough)
     # Starts of test trials are fitted when they are asked for, and kept where they were found.
     return replace(model, own=own, fit=found, test=own if model.test is model.own else replace(model.test))
+
+
+def _begun_alike(rival: FilmedModel, other: FilmedModel) -> FilmedModel:
+    """Return a model with the starts of another one if it fits better with these: starts are no merit of an effect."""
+    if not rival.own.offset.shape[1]:
+        return rival
+    own = replace(rival.own, offset=other.own.offset.copy())
+    found = fit(own, rival.fit.raw, _COMPARED)
+    return replace(rival, own=own, fit=found) if found.cost < rival.fit.cost else rival
 
 
 def _dosed(base: FilmedModel, score: Score, dose: dict[str, float], raw: np.ndarray) -> FilmedModel:
@@ -462,7 +475,10 @@ def _concluded(
             trials = problems[0].trials
             predictions[when] |= {t.name: s[: len(t.time)] for t, s in zip(trials, each, strict=True)}
         numbers = [m.values[len(m.own.free) :] for m in (first, final)]
-        shown += overlays(problems[0], split, np.stack(sims), np.stack(numbers))
+        # Each is drawn by the clocks of its own, which are not the same in test films.
+        each = zip(problems, sims, numbers, strict=True)
+        old, new = (overlays(p, split, np.stack([s, s]), np.stack([n, n])) for p, s, n in each)
+        shown += [replace(b, before=a.before) for a, b in zip(old, new, strict=True)]
     done = Diagnosis(
         _verdict(effects, gap_rms(before), gap_rms(after), floor, level if whole else np.inf),
         effects,

@@ -20,6 +20,7 @@ from torchdlo.sysid.estimation.levenberg_marquardt import Point
 from torchdlo.sysid.estimation.model_uncertainty import CLAMP_SPREAD, radius_of_clamps, shear_share
 from torchdlo.sysid.estimation.observation import (
     INDEPENDENT,
+    POSE,
     FilmView,
     Pairs,
     Spines,
@@ -59,8 +60,8 @@ _FAR, _FINEST = 3e-3, 0.05
 A rope that moves answers to its start by ten times as much, and not in proportion: near the films whole steps go past
 the minimum. Begun with, fine ones lead into nearer minima: fits of `sample_film` ended with 16 % less damping."""
 
-_CLOCKS = np.linspace(-3.0, 3.0, 25)
-"""What clocks of test films may be off, in halves of a picture."""
+_CLOCKS = np.linspace(-4.0, 4.0, 33)
+"""What clocks of test films may be off those of the others, in halves of a picture."""
 
 _SHARP = 5e-3
 """Tolerance up to which fits come to their end; others only look for a basin."""
@@ -309,24 +310,31 @@ def gate(own: FilmedProblem, values: np.ndarray) -> int:
 def time_films(own: FilmedProblem, values: np.ndarray) -> None:
     """Set what clocks of films are off that are not fitted with the rope, those of test trials, at numbers (N,).
 
-    They cannot be known from elsewhere: a film is begun when somebody presses a button.
+    A film is begun when somebody presses a button: those of the camera that were fitted to say about when.
     """
     old = own.spines
-    if all((np.asarray(v.clock) >= 0).all() for v in old.views):
+    if own.trials[0].still or all((np.asarray(v.clock) >= 0).all() for v in old.views):
         return
+    told = values[len(own.free) :]
+    usual = [float(n[POSE:].mean()) for n in by_camera(old.views, told)]
     sims, costs = own.simulate(values[None]), []
     for share in _CLOCKS:
-        views = [_late(v, share) for v in old.views]
-        read = Spines(views, old.step, old.extent, old.free, old.sure).read(sims, values[None, len(own.free) :])[0]
-        costs.append([_cost_of_view(own, read[..., 0], k) + own.prior * share**2 / 2 for k in range(len(views))])
+        views = [_late(v, middle, share) for v, middle in zip(old.views, usual, strict=True)]
+        read = Spines(views, old.step, old.extent, old.free, old.sure).read(sims, told[None])[0, ..., 0]
+        costs.append([_cost_of_view(own, read, k) + _prior(own, v) * share**2 / 2 for k, v in enumerate(views)])
     best = _lowest(_CLOCKS, np.nan_to_num(np.array(costs), nan=np.inf))
-    views = [_late(v, share) for v, share in zip(old.views, best, strict=True)]
+    views = [_late(*each) for each in zip(old.views, usual, best, strict=True)]
     own.spines = Spines(views, old.step, old.extent, old.free, old.sure)
 
 
-def _late(view: FilmView, share: np.ndarray | float) -> FilmView:
-    """Return a view whose clocks, where they are not fitted, are off by a share of half a picture."""
-    return replace(view, off=np.where(np.asarray(view.clock) < 0, share * half_a_picture(view), 0.0))
+def _late(view: FilmView, middle: float, share: np.ndarray | float) -> FilmView:
+    """Return a view whose clocks, where they are not fitted, are off by a share of half a picture from the middle."""
+    return replace(view, off=np.where(np.asarray(view.clock) < 0, middle + share * half_a_picture(view), 0.0))
+
+
+def _prior(own: FilmedProblem, view: FilmView) -> np.ndarray:
+    """Return what a squared standard deviation of a number of one film costs [m], shape (B,)."""
+    return own.spines.sure**2 / levenberg_marquardt.KNEE / (INDEPENDENT * np.maximum(view.good.sum(1), 1))
 
 
 def _cost_of_view(own: FilmedProblem, read: np.ndarray, view: int) -> np.ndarray:

@@ -19,7 +19,7 @@ from torchdlo.sysid.model.trial_batch import Start
 from torchdlo.sysid.video.filmed_fit import Fit, fit, look, total
 from torchdlo.sysid.video.filmed_problem import FilmedProblem, begin_from_balance
 
-__all__ = ["START_WINDOW", "fit_starts", "refine_start", "restart", "scout", "search_starts"]
+__all__ = ["START_WINDOW", "fit_starts", "refine_start", "restart", "scout", "search_starts", "start_window"]
 
 Callback = Callable[[str, int, int, str], None]
 
@@ -46,6 +46,12 @@ _PAYS = 0.9
 
 _NEARER, _FASTER = 1.0, 2.0
 """How far off places and speeds along a camera's axis are tried, in standard deviations of their priors."""
+
+
+def start_window(own: FilmedProblem) -> float:
+    """Return the seconds of films that starts in motion are first estimated from: longer where films begin late."""
+    first = np.min([v.time[:, 0] for v in own.spines.views], 0).max()
+    return START_WINDOW + 2 * max(0.0, float(first) - own.model.dt)
 
 
 def fit_starts(
@@ -111,9 +117,9 @@ def refine_start(own: FilmedProblem, values: np.ndarray, passes: int = 8, *, sea
     if own.offset.shape[1]:
         raw = own.space.to_raw(values)
         for share in (0.5, 1.0):
-            fit_starts(own, raw, passes, seconds=share * START_WINDOW)
+            fit_starts(own, raw, passes, seconds=share * start_window(own))
         if search:
-            search_starts(own, raw, passes, seconds=START_WINDOW)
+            search_starts(own, raw, passes, seconds=start_window(own))
 
 
 def restart(own: FilmedProblem, found: Fit, iterations: int, enough: float = _LOST) -> Fit:
@@ -130,7 +136,7 @@ def restart(own: FilmedProblem, found: Fit, iterations: int, enough: float = _LO
         if not len(lost):
             break
         part = own.picked(lost)
-        search_starts(part, found.raw, seconds=START_WINDOW)
+        search_starts(part, found.raw, seconds=start_window(part))
         costs = fit_starts(part, found.raw, 8).costs
         better = costs < _PAYS * found.costs[lost]
         if not better.any():
@@ -190,7 +196,7 @@ def scout(own: FilmedProblem, starts: int, rng: np.random.Generator, report: Cal
 def _scout_moving(own: FilmedProblem, starts: int, report: Callback) -> np.ndarray:
     """Fit rope, cameras and starts of trials in motion together, from several stiffnesses."""
     lasts, stage = own.lasts, "trying starts"
-    shares = (min(1.0, START_WINDOW / lasts), 0.5, 0.7)
+    shares = (min(1.0, start_window(own) / lasts), 0.5, 0.7)
     first = np.concatenate([own.fixed[list(own.free)], np.zeros(len(own.spines.nuisances.names))])
     bend = own.free.index(own.model.parameters.index("bending_stiffness"))
     found: list[tuple[Fit, np.ndarray, Start]] = []
@@ -201,7 +207,7 @@ def _scout_moving(own: FilmedProblem, starts: int, report: Callback) -> np.ndarr
         values[bend : bend + 2] *= factor  # twisting stiffness follows
         begin_from_balance(own, own.full(values[None])[0])
         raw = own.space.clip(own.space.to_raw(values))
-        fit_starts(own, raw, 3, seconds=0.5 * START_WINDOW)
+        fit_starts(own, raw, 3, seconds=0.5 * start_window(own))
         found.append((fit(own, raw, 6, seconds=shares[0] * lasts, tolerance=2e-2), own.offset, own.start))
     for share, keep, passes in ((shares[1], 3, 6), (shares[2], 2, 8)):
         found = sorted(found, key=lambda each: total(each[0]))[:keep]

@@ -15,7 +15,7 @@ import numpy as np
 from torchdlo.errors import InputError
 from torchdlo.sysid.recordings.recording import Recording, Trial, check_new_folder
 from torchdlo.untrusted import read_json
-from torchdlo.vision.camera import Camera, save_cameras
+from torchdlo.vision.camera import Camera, check_starts, save_cameras
 from torchdlo.vision.film import Film, FilmLook, check_inside, off_camera
 from torchdlo.vision.film import film as film_rope
 from torchdlo.vision.segment import save_masks
@@ -86,11 +86,12 @@ def film_recording(
         )
     report = callback or (lambda *_: None)
     _check_sides(cameras, masks)
+    check_starts(cameras, [t.name for t in recording.trials("all")])
     chosen = [*recording.train[:trials], *recording.test[:trials]]
     chosen = [t if seconds is None else _cut(t, seconds) for t in chosen]
     rng = np.random.default_rng(look.seed)
     given = [off_camera(c, rng, degrees=off, zoom=0.01 * off, metres=0.01 * off) if off else c for c in cameras]
-    given = [_later(c, off * (g.start - c.start), g) for g, c in zip(given, cameras, strict=True)]
+    given = [_later(c, off * (g.start - c.start), g, chosen) for g, c in zip(given, cameras, strict=True)]
     begun = np.random.default_rng([look.seed, 1])
     said, done = [], 0
 
@@ -127,9 +128,9 @@ def film_recording(
     return [*said, f"recording: {out}"]
 
 
-def _later(camera: Camera, seconds: float, place: Camera) -> Camera:
-    """Return a camera at the place of another one, all of whose films begin later than its own."""
-    starts = {trial: start + seconds for trial, start in camera.starts.items()}
+def _later(camera: Camera, seconds: float, place: Camera, trials: Sequence[Trial]) -> Camera:
+    """Return a camera at the place of another one, all of whose films of trials begin later than its own."""
+    starts = {t.name: camera.starts[t.name] + seconds for t in trials if t.name in camera.starts}
     return replace(place, start=camera.start + seconds, starts=starts)
 
 
@@ -195,7 +196,7 @@ def film_run(
         line = np.concatenate([line, line[:, :1]], 1)
 
     def fill(folder: Path) -> None:
-        save_cameras(cameras, folder / "cameras.json")
+        save_cameras([replace(c, starts={}) for c in cameras], folder / "cameras.json")
         for k, camera in enumerate(cameras):
             check_inside(camera, line)
             seen = film_rope(camera, time, line, radius, replace(look, seed=look.seed + k))

@@ -97,17 +97,16 @@ def film_files(path: Path, trials: Sequence[str]) -> dict[str, tuple[FilmFile, .
         )
     if not found and not (path / "cameras.json").is_file():
         return {}
-    from torchdlo.vision.camera import load_cameras, states_rate  # only films need torch, which takes seconds to start
+    from torchdlo.vision.camera import (
+        check_starts,
+        load_cameras,
+        states_rate,
+    )  # only films need torch, which takes seconds to start
 
     cameras = {c.name: c for c in load_cameras(path / "cameras.json")}
     stated = states_rate(path / "cameras.json")
     films: dict[str, list[FilmFile]] = {name: [] for name in trials}
-    for camera in cameras.values():
-        if unknown := sorted(set(camera.starts) - set(films)):
-            raise InputError(
-                f"{path / 'cameras.json'}: starts of camera {camera.name}: expected names of trials, found "
-                f"{unknown[0]!r}."
-            )
+    check_starts(list(cameras.values()), trials, f"{path / 'cameras.json'}: ")
     for file in found:
         trial, _, name = (file.name if file.is_dir() else file.stem).partition(".")
         if name not in cameras:

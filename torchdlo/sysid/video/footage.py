@@ -51,6 +51,9 @@ _DRIFT = 0.25
 _FRAMES_OFF = 3
 """Pictures by which masks without times may differ from the length of their trial: a clock may be off so much."""
 
+_LATE = 0.15
+"""Share of a trial that may have passed when its first film begins."""
+
 _STILL = 5e-4
 """Motion of a gripper between two pictures that shows [m]."""
 
@@ -97,7 +100,19 @@ def views_of(
         camera = replace(films[0].camera, start=begun[0])
         clocks = {} if trials[0].still else own_clocks([trial.name for trial in trials])
         views.append(FilmView(camera, *lines, wide, packed, shown, late=np.array(begun) - begun[0], **clocks))
+    _check_beginnings(trials, views)
     return views, notes
+
+
+def _check_beginnings(trials: Sequence[Trial], views: Sequence[FilmView]) -> None:
+    """Refuse films that all begin long after their trial: how it began cannot be seen."""
+    for b, trial in enumerate(trials):
+        first = min(float(v.time[b, 0]) for v in views)
+        if first > max(_LATE * float(trial.time[-1]), 1.0 / views[0].camera.fps):
+            raise InputError(
+                f"{trial.films[0].path}: expected a film from the beginning of {trial.name}.npz on, found one that "
+                f"begins after {first:.3g} of its {trial.time[-1]:.3g} s; cut the trial, or mend start in cameras.json."
+            )
 
 
 def masks_of(recording: Recording, film: FilmFile) -> tuple[np.ndarray, np.ndarray | None, float | None]:
