@@ -13,7 +13,7 @@ from torchdlo.errors import InputError
 from torchdlo.sysid.calibration.calibrate import calibrate
 from torchdlo.sysid.diagnosis.effect_search import diagnose
 from torchdlo.sysid.estimation.levenberg_marquardt import KNEE
-from torchdlo.sysid.estimation.observation import INDEPENDENT, Spines, seen_by, unfitted_clocks
+from torchdlo.sysid.estimation.observation import INDEPENDENT, Spines, own_clocks, seen_by, unfitted_clocks
 from torchdlo.sysid.model.rope_model import RopeModel
 from torchdlo.sysid.model.trial_batch import Start
 from torchdlo.sysid.recordings.recording import load_recording
@@ -154,7 +154,10 @@ def test_test_films_are_compared_when_they_were_taken(swing: FilmedProblem) -> N
     own.spines = Spines([view], own.model.dt, own.extent, own.spines.free)
     time_films(own, numbers)
     assert np.array_equal(own.spines.views[0].off, 0.0)  # that of a film that is fitted to is fitted
-    own.spines = Spines(unfitted_clocks([view], [view]), own.model.dt, own.extent, own.spines.free)
+    alone = replace(view, **own_clocks(["train_0"]))
+    shared = Spines(unfitted_clocks([view], [view]), own.model.dt, own.extent, own.spines.free)
+    assert shared.views[0].clock.tolist() == [0]  # one that all films have is known of test films, too
+    own.spines = Spines(unfitted_clocks([view], [alone]), own.model.dt, own.extent, own.spines.free)
     time_films(own, numbers)
     assert own.spines.views[0].off == pytest.approx([0.01], abs=1e-3)
     assert not begun_elsewhere(own)
@@ -162,10 +165,10 @@ def test_test_films_are_compared_when_they_were_taken(swing: FilmedProblem) -> N
     pixel = seen_by(replace(old, late=0.08), motion, torch.zeros(1, 8), own.model.dt)[0][0].numpy()
     along = np.diff(pixel, axis=2)
     far = replace(view, places=pixel[:, :, :-1] + 0.5 * along)
-    own.spines = Spines(unfitted_clocks([far], [far]), own.model.dt, own.extent, own.spines.free)
+    own.spines = Spines(unfitted_clocks([far], [alone]), own.model.dt, own.extent, own.spines.free)
     time_films(own, np.where(np.arange(len(numbers)) == len(numbers) - 1, 0.07, numbers))
     assert own.spines.views[0].off == pytest.approx([0.08], abs=2e-3) and begun_elsewhere(own)
-    own.spines = Spines(unfitted_clocks([view], [view]), own.model.dt, own.extent, own.spines.free)
+    own.spines = Spines(unfitted_clocks([view], [alone]), own.model.dt, own.extent, own.spines.free)
     time_films(own, numbers)
     late = replace(own.spines.views[0], off=np.array([-0.06]))
     other = replace(own, spines=Spines([late], own.model.dt, own.extent, own.spines.free))

@@ -96,7 +96,7 @@ class FilmView:
     late: np.ndarray | float = 0.0
     """By how much films began later than the camera's `start` [s], shape (B,)."""
     clocks: tuple[str, ...] = ("",)
-    """Names of clocks that are fitted: films that were begun by hand have each their own."""
+    """Names of clocks that are fitted: one of all films, or, of films that were begun by hand, one of each."""
     clock: np.ndarray | int = 0
     """Which of these each film has, -1 for none of them, shape (B,)."""
     off: np.ndarray | float = 0.0
@@ -169,13 +169,13 @@ def half_a_picture(view: FilmView) -> float:
 
 def own_clocks(names: Sequence[str]) -> dict[str, Any]:
     """Return clocks of a view of trials with these names, each film having its own."""
-    return {"clocks": tuple(names) if len(names) > 1 else ("",), "clock": np.arange(len(names))}
+    return {"clocks": tuple(names), "clock": np.arange(len(names))}
 
 
 def unfitted_clocks(views: Sequence[FilmView], fitted: Sequence[FilmView]) -> list[FilmView]:
-    """Return views of trials that are judged by numbers of others, whose clocks say nothing of theirs."""
+    """Return views of trials that are judged by numbers of others; clocks of films of those say nothing of theirs."""
     pairs = zip(views, fitted, strict=True)
-    return [replace(v, clocks=w.clocks, clock=np.full(len(v.good), -1)) for v, w in pairs]
+    return [replace(v, clocks=w.clocks, clock=np.full(len(v.good), -(w.clocks != ("",)))) for v, w in pairs]
 
 
 def by_camera(views: Sequence[FilmView], numbers: np.ndarray) -> list[np.ndarray]:

@@ -17,7 +17,15 @@ import numpy as np
 
 from torchdlo.errors import InputError
 from torchdlo.sysid.diagnosis.budget import model_options as suited
-from torchdlo.sysid.estimation.observation import FilmView, Spines, half_a_picture, unfitted_clocks
+from torchdlo.sysid.estimation.observation import (
+    POSE,
+    FilmView,
+    Spines,
+    by_camera,
+    half_a_picture,
+    own_clocks,
+    unfitted_clocks,
+)
 from torchdlo.sysid.estimation.result import Calibration, Overlay
 from torchdlo.sysid.model import model_file
 from torchdlo.sysid.model.model_file import ModelFile
@@ -68,6 +76,9 @@ _PROFILE = 12
 
 _WORSE = 1.05
 """Times the cost from which a correction of simulations makes the fit worse."""
+
+_CLOCKED = 0.8
+"""Share of the cost that is left where films are taken to have each a clock of its own."""
 
 _DOUBT, _DOUBT_MM = 3.0, 3.0
 """Times the error of the nearest trial, and error [mm], from which a start in motion is not believed."""
@@ -157,6 +168,7 @@ def baseline(
     first = np.concatenate([own.fixed[list(own.free)], np.zeros(len(own.spines.nuisances.names))])
     raw = own.space.to_raw(first) if given is not None else _scouted(own, starts, seed, report)
     best = _fitted(own, raw, iterations, report, near)
+    first = np.concatenate([first[: len(own.free)], np.zeros(len(own.spines.nuisances.names))])
     if not np.isfinite(near):
         require_simulated(recording, best)
     return own, first, best
@@ -284,9 +296,32 @@ def _fitted(own: FilmedProblem, raw: np.ndarray, iterations: int, report: Callba
     report(stage, 2, 3, f"{1e3 * best.cost:.2f} mm")
     if not np.isfinite(best.cost):
         return best
-    best = sharper(own, best.raw, iterations)
+    best = clocked(own, sharper(own, best.raw, iterations), iterations)
     report(stage, 3, 3, f"{1e3 * best.cost:.2f} mm")
     return best
+
+
+def clocked(own: FilmedProblem, best: Fit, iterations: int) -> Fit:
+    """Return the fit with a clock of each film instead of one of each camera, if films fit much better to that.
+
+    Films that were begun by hand, one by one, are each off by another part of a picture.
+    """
+    views = own.spines.views
+    if own.trials[0].still or len(own.trials) < 2 or all(v.clocks != ("",) for v in views):
+        return best
+    many = [v if v.clocks != ("",) else replace(v, **own_clocks([t.name for t in own.trials])) for v in views]
+    values, old = own.space.to_values(best.raw), own.spines
+    parts = by_camera(views, values[len(own.free) :])
+    numbers = [
+        np.concatenate([n[:POSE], np.resize(n[POSE:], v.numbers - POSE)]) for n, v in zip(parts, many, strict=True)
+    ]
+    other = replace(own, spines=Spines(many, old.step, old.extent, old.free, old.sure))
+    raw = other.space.to_raw(np.concatenate([values[: len(own.free)], *numbers]))
+    found = fit(other, raw, min(iterations, _LAST), near=True)
+    if not found.cost < _CLOCKED * best.cost:
+        return best
+    own.take(other)
+    return found
 
 
 def sharper(own: FilmedProblem, raw: np.ndarray, iterations: int) -> Fit:
@@ -403,7 +438,12 @@ def doubts(trials: Sequence[dict[str, Any]], moving: Sequence[str]) -> list[str]
 
 def _remarks(own: FilmedProblem, values: np.ndarray, low: np.ndarray, high: np.ndarray) -> list[str]:
     """Return what these views cannot test."""
-    out = []
+    out = [
+        f"Films of camera {view.camera.name} seem to have begun each at a time of its own: their clocks were fitted "
+        "one by one; starts in cameras.json may say when they began."
+        for view in own.spines.views
+        if view.clocks != ("",) and not view.camera.starts
+    ]
     moving = [t.name for t, calm in zip(own.trials, own.start.at_rest, strict=True) if not calm]
     if moving:
         out.append(

@@ -118,7 +118,7 @@ def film_files(path: Path, trials: Sequence[str]) -> dict[str, tuple[FilmFile, .
         if any(f.camera.name == name for f in films[trial]):
             raise InputError(f"{file}: expected one film of each trial and camera, found two.")
         camera = cameras[name]
-        camera = replace(camera, start=camera.starts.get(trial, camera.start), starts={})
+        camera = replace(camera, start=camera.starts.get(trial, camera.start))
         films[trial].append(FilmFile(camera, file, name in stated))
     for trial, own in films.items():
         if not own:

@@ -98,7 +98,7 @@ def views_of(
         wide = float(np.median([p[3] for p in parts]))
         packed, shown = tuple(p[4] for p in parts), tuple(p[5] for p in parts)
         camera = replace(films[0].camera, start=begun[0])
-        clocks = {} if trials[0].still else own_clocks([trial.name for trial in trials])
+        clocks = own_clocks([trial.name for trial in trials]) if camera.starts else {}
         views.append(FilmView(camera, *lines, wide, packed, shown, late=np.array(begun) - begun[0], **clocks))
     _check_beginnings(trials, views)
     return views, notes

@@ -251,22 +251,25 @@ def told(cameras: Sequence[CameraInformation], motion: MotionVariations) -> Expe
     """Return what the films of cameras tell together: nuisances take up what they can, and a rope is shared."""
     numbers, count = len(motion.numbers), motion.count
     trials, starts = len(motion.rope), len(motion.starts)
-    shared = count + POSE * len(cameras)
-    each = len(cameras) + starts
-    whole = np.zeros((shared + trials * each,) * 2)
+    each = POSE + 1  # a clock of all films
+    own = count + each * len(cameras)
+    whole = np.zeros((own + trials * starts,) * 2)
     for c, camera in enumerate(cameras):
         for b, part in enumerate(camera.matrix):
-            own = shared + each * b
-            # Films have each a clock of their own.
-            pose, start = count + POSE * c + np.arange(POSE), own + len(cameras) + np.arange(starts)
-            at = np.concatenate([np.arange(count), pose, [own + c], start])
+            at = np.concatenate(
+                [
+                    np.arange(count),
+                    count + each * c + np.arange(each),
+                    own + starts * b + np.arange(starts),
+                ]
+            )
             whole[np.ix_(at, at)] += part
-    fitted = np.concatenate([np.arange(numbers), np.arange(count, len(whole))])
-    prior = np.ones(len(fitted))
+    shared = np.concatenate([np.arange(numbers), np.arange(count, len(whole))])
+    prior = np.ones(len(shared))
     prior[:numbers] = [(_UNKNOWN if p.scale == "log" else _WIDE) ** -2.0 for p in motion.space.params]
-    known = whole[np.ix_(fitted, fitted)] + np.diag(prior)
+    known = whole[np.ix_(shared, shared)] + np.diag(prior)
     spread = np.linalg.inv(known)[:numbers, :numbers]
-    mixed = whole[np.ix_(np.arange(numbers, count), fitted)]
+    mixed = whole[np.ix_(np.arange(numbers, count), shared)]
     left = np.diag(whole)[numbers:count] - np.einsum("dn,nd->d", mixed, np.linalg.solve(known, mixed.T))
     weight = sum(c.weight for c in cameras)
     shown = np.sqrt(left.clip(min=0.0) / max(weight, 1e-300))
