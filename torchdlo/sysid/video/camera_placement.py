@@ -164,11 +164,8 @@ def place_cameras(
             raise InputError(
                 f"--effects {name}: expected effects that can act in {recording.path} and that the model lacks."
             )
-    own = (
-        tuple(replace(f.camera, start=0.0, starts={}) for f in recording.train[0].films)
-        if recording.filmed
-        else tuple(cameras)
-    )
+    at_hand = [f.camera for f in recording.train[0].films] if recording.filmed else cameras
+    own = tuple(replace(camera, start=0.0, starts={}) for camera in at_hand)  # those of another recording
     like = lens or (own[0] if own else nominal_camera())
     recorded = _recorded(recording, given, model, effects, own, like, report)
     rig = _rig(recording, scale)
