@@ -18,7 +18,7 @@ from tests.vision.test_segment import COLORS, swinging
 from torchdlo.cli.app import app, main
 from torchdlo.errors import InputError
 from torchdlo.sysid.recordings.recording import load_recording
-from torchdlo.vision.camera import load_cameras, looking_at, save_cameras
+from torchdlo.vision.camera import load_cameras, looking_at, save_cameras, states_rate
 from torchdlo.vision.segment import load_ranges, ranges_of
 from torchdlo.vision.video_file import write_video
 
@@ -40,9 +40,13 @@ def test_a_camera_is_calibrated_and_added_to_others(tmp_path: Path) -> None:
     )
     assert "reprojection error" in said and [c.name for c in load_cameras(out)] == ["a", "c"]
     assert (tmp_path / "cameras_c.png").read_bytes().startswith(b"\x89PNG")
-    save_cameras([replace(load_cameras(out)[1], start=-0.4), front()], out)
+    starts = {"train_0": 0.1}
+    save_cameras([replace(load_cameras(out)[1], start=-0.4, starts=starts), front()], out, unknown_rate={"a"})
     again = ("calibrate-camera", tmp_path / "board.mp4", "--board", "8x6", "--square", 0.03, "--out", out)
-    assert "start = -0.4 s is kept" in run(*again, "--name", "c") and load_cameras(out)[1].start == -0.4
+    said = run(*again, "--name", "c")
+    assert "start = -0.4 s is kept" in said and "starts of 1 trials are kept" in said
+    assert load_cameras(out)[1].start == -0.4 and load_cameras(out)[1].starts == starts
+    assert states_rate(out) == {"c"}  # that of the other one is as unknown as before
     for name in ("a/b", "left cam", ""):
         with pytest.raises(InputError, match="--name: expected letters"):
             run(*again, "--name", name)

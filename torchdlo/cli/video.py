@@ -57,7 +57,7 @@ def calibrate_camera(
     import dataclasses
 
     from torchdlo.vision import calibrate_camera as calibration
-    from torchdlo.vision.camera import check_name, load_cameras, save_cameras
+    from torchdlo.vision.camera import check_name, load_cameras, save_cameras, states_rate
 
     check_name(name, "--name")
     printed = calibration.Board(*_board(board), square, marker, dictionary)
@@ -85,7 +85,8 @@ def calibrate_camera(
     # A board tells nothing of the clock: what a person has written down of it stays.
     before = next((c for c in known if c.name == name), found.camera)
     camera = dataclasses.replace(found.camera, start=before.start, starts=before.starts)
-    save_cameras([*others, camera], out)
+    unknown = {c.name for c in others} - (states_rate(out) if out.exists() else set())
+    save_cameras([*others, camera], out, unknown_rate=unknown)
     write_atomically(picture, calibration.error_picture(found))
     typer.echo(
         f"camera {name}: focal length {camera.fx:.1f} x {camera.fy:.1f} px, reprojection error {found.error:.3f} px in "

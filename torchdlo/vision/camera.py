@@ -9,7 +9,7 @@ from __future__ import annotations
 import functools
 import json
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, NoReturn
@@ -233,9 +233,12 @@ def looking_at(
     return Camera(name, width, height, *place, turned, tuple(translation.tolist()), **others)
 
 
-def save_cameras(cameras: Sequence[Camera], path: Path) -> None:
-    """Write `cameras.json`."""
-    entries = [{k: v for k, v in asdict(c).items() if k != "starts" or v} for c in cameras]
+def save_cameras(cameras: Sequence[Camera], path: Path, *, unknown_rate: Collection[str] = ()) -> None:
+    """Write `cameras.json`, without `fps` of cameras whose rate is not known."""
+    entries = [
+        {k: v for k, v in asdict(c).items() if (k != "starts" or v) and (k != "fps" or c.name not in unknown_rate)}
+        for c in cameras
+    ]
     content = {"generator": "torchdlo", "cameras": entries}
     write_atomically(path, json.dumps(content, indent=1) + "\n")
 
