@@ -17,7 +17,7 @@ from torchdlo.sysid.estimation.observation import INDEPENDENT, Spines, own_clock
 from torchdlo.sysid.model.rope_model import RopeModel
 from torchdlo.sysid.model.trial_batch import Start
 from torchdlo.sysid.recordings.recording import load_recording
-from torchdlo.sysid.video import filmed_starts
+from torchdlo.sysid.video import filmed, filmed_starts
 from torchdlo.sysid.video.filmed import begun_elsewhere, doubts
 from torchdlo.sysid.video.filmed_fit import Fit, eliminated, fit, look, normal, spread, time_films
 from torchdlo.sysid.video.filmed_problem import FilmedProblem, begin_from_balance, filmed_problem
@@ -217,6 +217,26 @@ def test_starts_of_trials_that_stand_out_are_looked_for_again(monkeypatch: pytes
         searched.clear()
         filmed_starts.restart(replace(own), replace(found, costs=np.array(costs)), 1)
         assert searched == ([names] if names else []), costs
+
+
+def test_films_have_clocks_of_their_own_where_they_fit_much_better_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    recording = load_recording(DATA / "sample_film")
+    views, _ = views_of(recording, recording.train)
+    own = filmed_problem(recording, recording.train, views, options={"vertices": 7}).shortened(0.1)
+    numbers = np.concatenate([own.fixed, np.linspace(1e-3, 8e-3, len(own.spines.nuisances.names))])
+    best = look(own, own.space.to_raw(numbers), own.offset)
+    for share, names in ((0.9, 1), (0.5, 2)):
+        monkeypatch.setattr(
+            filmed, "fit", lambda _, raw, *rest, by=share, **more: replace(best, raw=raw, costs=by * best.costs)
+        )
+        found = filmed.clocked(own, best, 6)
+        clocks = [n for n in own.space.names if ".clock" in n]
+        assert len(clocks) == names and (found is best) == (names == 1)
+    # They begin where the clock of all of them was.
+    assert clocks == ["camera_a.clock.train_0", "camera_a.clock.train_1"]
+    values = own.space.to_values(found.raw)
+    assert np.allclose(values[:-1], numbers) and np.isclose(values[-1], numbers[-1])
+    assert filmed.clocked(own, found, 6) is found
 
 
 def test_ranges_follow_what_cameras_may_be_off(swing: FilmedProblem) -> None:
