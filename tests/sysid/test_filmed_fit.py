@@ -156,7 +156,7 @@ def test_test_films_are_compared_when_they_were_taken(swing: FilmedProblem) -> N
     assert np.array_equal(own.spines.views[0].off, 0.0)  # that of a film that is fitted to is fitted
     alone = replace(view, **own_clocks(["train_0"]))
     shared = Spines(unfitted_clocks([view], [view]), own.model.dt, own.extent, own.spines.free)
-    assert shared.views[0].clock.tolist() == [0]  # one that all films have is known of test films, too
+    assert shared.views[0].clock == 0  # one that all films have is known of test films, too
     own.spines = Spines(unfitted_clocks([view], [alone]), own.model.dt, own.extent, own.spines.free)
     time_films(own, numbers)
     assert own.spines.views[0].off == pytest.approx([0.01], abs=1e-3)

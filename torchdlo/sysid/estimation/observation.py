@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 import torch
@@ -173,12 +173,18 @@ def own_clocks(names: Sequence[str]) -> dict[str, Any]:
 
 
 def unfitted_clocks(views: Sequence[FilmView], fitted: Sequence[FilmView]) -> list[FilmView]:
-    """Return views of trials that are judged by numbers of others; clocks of films of those say nothing of theirs."""
+    """Return views of trials that are judged by numbers of others.
+
+    A clock that all films have is theirs, too; clocks of single films say nothing of theirs.
+    """
     pairs = zip(views, fitted, strict=True)
-    return [replace(v, clocks=w.clocks, clock=np.full(len(v.good), -(w.clocks != ("",)))) for v, w in pairs]
+    return [replace(v, clocks=w.clocks, clock=0 if w.clocks == ("",) else -1) for v, w in pairs]
 
 
-def by_camera(views: Sequence[FilmView], numbers: np.ndarray) -> list[np.ndarray]:
+_Numbers = TypeVar("_Numbers", np.ndarray, Tensor)
+
+
+def by_camera(views: Sequence[FilmView], numbers: _Numbers) -> list[_Numbers]:
     """Return the numbers of each camera, of those of all of them, shape (..., Q)."""
     ends = np.cumsum([v.numbers for v in views])
     return [numbers[..., end - v.numbers : end] for v, end in zip(views, ends, strict=True)]

@@ -283,11 +283,9 @@ def film_gaps(own: FilmedProblem, found: Fit) -> np.ndarray:
 def gate(own: FilmedProblem, values: np.ndarray) -> int:
     """Take out frames in which films stay far from the rope while others are near; return how many."""
     found, target = own.readings()[0](values[None])[0], own.spines.target
-    lost, start = 0, 0
-    for view in own.spines.views:
-        width = 2 * view.places.shape[2]
-        part = slice(start, start + width)
-        start += width + int(own.spines.count_free)
+    lost = 0
+    for view, whole in zip(own.spines.views, _of_views(own), strict=True):
+        part = slice(whole.start, whole.start + 2 * view.places.shape[2])
         with np.errstate(invalid="ignore"):
             known = np.isfinite(target[:, :, part, 0])
             size = np.where(known, np.abs(found[:, :, part, 0]), np.nan)
@@ -339,8 +337,7 @@ def _prior(own: FilmedProblem, view: FilmView) -> np.ndarray:
 
 def _cost_of_view(own: FilmedProblem, read: np.ndarray, view: int) -> np.ndarray:
     """Return costs (B,) of the readings (B, F, R) of one view."""
-    widths = [2 * v.places.shape[2] + own.spines.count_free for v in own.spines.views]
-    part = slice(sum(widths[:view]), sum(widths[: view + 1]))
+    part = _of_views(own)[view]
     residual = np.where(np.isfinite(own.spines.target[..., part, 0]), read[..., part], np.nan)
     each = levenberg_marquardt.robust(residual)[0]
     with warnings.catch_warnings():
@@ -358,6 +355,12 @@ def _lowest(places: np.ndarray, costs: np.ndarray) -> np.ndarray:
     known = (inner == least) & np.isfinite(shift) & np.isfinite(b)
     found = np.where(known, places[inner] + shift * (places[1] - places[0]), places[least])
     return np.where(np.isfinite(costs.min(0)), found, 0.0)
+
+
+def _of_views(own: FilmedProblem) -> list[slice]:
+    """Return where the readings of each view are: of its centre lines, two numbers a point, then of the rope."""
+    widths = [2 * v.places.shape[2] + own.spines.count_free for v in own.spines.views]
+    return [slice(sum(widths[:k]), sum(widths[: k + 1])) for k in range(len(widths))]
 
 
 def intervals(own: FilmedProblem, found: Fit) -> tuple[np.ndarray, np.ndarray]:

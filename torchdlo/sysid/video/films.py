@@ -97,11 +97,8 @@ def film_files(path: Path, trials: Sequence[str]) -> dict[str, tuple[FilmFile, .
         )
     if not found and not (path / "cameras.json").is_file():
         return {}
-    from torchdlo.vision.camera import (
-        check_starts,
-        load_cameras,
-        states_rate,
-    )  # only films need torch, which takes seconds to start
+    # Only films need torch, which takes seconds to start.
+    from torchdlo.vision.camera import check_starts, load_cameras, states_rate
 
     cameras = {c.name: c for c in load_cameras(path / "cameras.json")}
     stated = states_rate(path / "cameras.json")

@@ -19,7 +19,7 @@ from torchdlo import scene as scenes
 from torchdlo.physics import tree
 from torchdlo.physics.execution.replay import rollout
 from torchdlo.scene import Control, Params, Scene, State
-from torchdlo.sysid.estimation.observation import seen_by
+from torchdlo.sysid.estimation.observation import by_camera, seen_by
 from torchdlo.sysid.model import equilibrium
 from torchdlo.sysid.video.filmed_fit import eliminated, look
 from torchdlo.sysid.video.filmed_problem import FilmedProblem
@@ -135,9 +135,8 @@ def picture_loss(
     """
     sims = simulated(own, numbers, bend=bend, converged=converged)
     parts = []
-    at = np.cumsum([v.numbers for v in own.spines.views])
-    for view, end in zip(own.spines.views, at, strict=True):
-        off = cameras[None, end - view.numbers : end]
+    views = own.spines.views
+    for view, off in zip(views, by_camera(views, cameras[None]), strict=True):
         pixel, depth, _ = seen_by(view, sims[None], off, own.spines.step)
         pixel, depth = pixel[0], depth[0]
         size = (round(view.camera.height * scale), round(view.camera.width * scale))
