@@ -1,7 +1,8 @@
 """Steps without Python between their operations: recorded once for given shapes, then replayed.
 
-Recording takes less than a second where compiling takes many, and makes steps of small batches two or three times as
-fast as they are in eager mode. It is for simulations without gradients.
+Recording takes less than a second where compiling takes many. A step of two ropes of 40 vertices then takes a quarter
+of the time that its operations take one by one in TorchScript (`programs`), one of 56 ropes two fifths. It is for
+simulations without gradients.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import torch
 from torch.autograd import forward_ad
 
 from torchdlo.physics import tree
+from torchdlo.physics.execution import programs
 
 _ROUND = 8
 """Larger batches are filled up to multiples of this."""
@@ -36,7 +38,7 @@ def record(step: Callable[..., Any], *inputs: Any) -> Callable[..., Any]:
     leaves, build = tree.flatten(inputs)
     rebuild: list[Callable[..., Any]] = []
 
-    def run(*values: torch.Tensor) -> tuple[torch.Tensor, ...]:
+    def traced(*values: torch.Tensor) -> tuple[torch.Tensor, ...]:
         found, back = tree.flatten(step(*build(values)))
         rebuild.append(back)
         return tuple(found)
@@ -45,7 +47,7 @@ def record(step: Callable[..., Any], *inputs: Any) -> Callable[..., Any]:
         # Shapes are meant to be fixed.
         warnings.simplefilter("ignore", torch.jit.TracerWarning)
         # What `torch.jit.trace` makes is kept for as long as the process lives, some 30 MB each.
-        graph, _ = torch._C._create_graph_by_tracing(run, tuple(leaves), lambda _: "", True, False, None, [])
+        graph, _ = torch._C._create_graph_by_tracing(traced, tuple(leaves), lambda _: "", True, False, None, [])
         numbers = _close_constants(graph)
         # Sizes are fixed: numbers made of them are computed now.
         torch._C._jit_pass_peephole(graph, True)
@@ -53,7 +55,7 @@ def record(step: Callable[..., Any], *inputs: Any) -> Callable[..., Any]:
         # Terms of a step look at the same edges and hinges: what several of them compute is computed once.
         torch._C._jit_pass_cse(graph)
         torch._C._jit_pass_dce(graph)
-        recorded = torch._C._create_function_from_graph("step", graph)
+        run = _replay(graph, numbers, programs.ready(leaves))
 
     known: dict[int, tuple[Any, Sequence[torch.Tensor]]] = {}
 
@@ -67,14 +69,38 @@ def record(step: Callable[..., Any], *inputs: Any) -> Callable[..., Any]:
     def replayed(first: Any, *others: Any) -> Any:
         now = kept(1, others[0]) if others else ()
         last = tree.leaves(others[1:])
-        # Nothing here has a gradient: operations need not look, which is a tenth of a step of one scene.
-        with torch._C._AutoDispatchBelowAutograd():
-            found = recorded(*kept(0, first), *now, *last, *numbers)
+        found = run([*kept(0, first), *now, *last])
         made = rebuild[0](found)
         known[1] = made, found
         return made
 
     return replayed
+
+
+_Run = Callable[[Sequence[torch.Tensor]], Sequence[torch.Tensor]]
+
+
+def _replay(graph: Any, numbers: Sequence[torch.Tensor], ready: bool) -> _Run:
+    """Return what does the operations of a graph to its inputs: programs for their strides, or else TorchScript."""
+    known: dict[Hashable, _Run] = {}
+
+    def scripted() -> _Run:
+        function = torch._C._create_function_from_graph("step", graph)
+
+        def run(inputs: Sequence[torch.Tensor]) -> Sequence[torch.Tensor]:
+            # Nothing here has a gradient: operations need not look, which is a tenth of a step of one scene.
+            with torch._C._AutoDispatchBelowAutograd():
+                return function(*inputs, *numbers)
+
+        return run
+
+    def run(inputs: Sequence[torch.Tensor]) -> Sequence[torch.Tensor]:
+        layout = tuple([x.stride() for x in inputs])
+        if layout not in known:
+            known[layout] = programs.program(graph, inputs, numbers) or scripted()
+        return known[layout](inputs)
+
+    return run if ready else scripted()
 
 
 _CLOSE = 1e-6

@@ -62,7 +62,7 @@ def ready(like: Tensor) -> bool:
 
 
 @dataclass(frozen=True)
-class _Plan:
+class Plan:
     """How to call a kernel with inputs of given shapes."""
 
     run: Callable[..., None]
@@ -92,7 +92,7 @@ def _plan(
     system: str,
     numbers: tuple[float, ...],
     layout: _Layout,
-) -> _Plan:
+) -> Plan:
     batch, dtype = tuple(torch.broadcast_shapes(*(shape[:-2] for shape, *_ in layout))), layout[0][2]
     after, scenes = parse(topology).successor(), math.prod(batch)
     places, copied = [], []
@@ -126,14 +126,27 @@ def _plan(
     )
     pointers = ctypes.c_void_p * len(layout)
     size = sum(components) * each
-    return _Plan(run, ctypes.addressof(call), pointers, tuple(copied), batch, size, views, (*kept, call))
+    return Plan(run, ctypes.addressof(call), pointers, tuple(copied), batch, size, views, (*kept, call))
 
 
-def _stored(x: Tensor, batch: Sequence[int], dtype: torch.dtype) -> Tensor:
-    """Return an input as a kernel reads it."""
+def stored(x: Tensor, batch: Sequence[int], dtype: torch.dtype) -> Tensor:
+    """Return one of the inputs that are `copied` as a kernel reads it."""
     if x.dim() < 3:
         return x.to(dtype).contiguous()
     return tree.batch_innermost(x.to(dtype).expand(*batch, *x.shape[-2:]).reshape(-1, *x.shape[-2:]))
+
+
+def plan_of(
+    inputs: Sequence[Tensor],
+    kernel: str,
+    topology: str,
+    components: Sequence[int],
+    system: str,
+    numbers: Sequence[float],
+) -> Plan:
+    """Return how to call a kernel, see `apply`, with these inputs or others of the same shapes and strides."""
+    layout = tuple([(x.shape, x.stride(), x.dtype) for x in inputs])
+    return _plan(kernel, topology, tuple(components), system, tuple(numbers), layout)
 
 
 def run(
@@ -145,11 +158,10 @@ def run(
     numbers: list[float],
 ) -> list[Tensor]:
     """Return what `apply` does, also where nothing is recorded; only where kernels are `available`."""
-    layout = tuple([(x.shape, x.stride(), x.dtype) for x in inputs])
-    plan = _plan(kernel, topology, tuple(components), system, tuple(numbers), layout)
+    plan = plan_of(inputs, kernel, topology, components, system, numbers)
     out = inputs[0].new_empty(plan.size)
     if plan.copied:
-        inputs = [_stored(x, plan.batch, out.dtype) if k in plan.copied else x for k, x in enumerate(inputs)]
+        inputs = [stored(x, plan.batch, out.dtype) if k in plan.copied else x for k, x in enumerate(inputs)]
     addresses = plan.pointers(*[x.data_ptr() for x in inputs])
     plan.run(addresses, out.data_ptr(), plan.call, torch.get_num_threads())
     return [out.as_strided(*view) for view in plan.views]
