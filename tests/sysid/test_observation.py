@@ -156,6 +156,23 @@ def test_changes_are_those_of_readings(filmed: tuple[np.ndarray, FilmView]) -> N
         assert np.quantile(np.abs(fast_change - exact_change), 0.95) < 0.02 * np.abs(exact_change).max()
 
 
+def test_motions_are_read_together_as_they_are_alone(filmed: tuple[np.ndarray, FilmView]) -> None:
+    sims, view = filmed
+    spines = Spines(
+        [view, seen(looking_at("b", (0.9, 1.1, 0.3), (0, 0, -0.2), focal=500.0), sims)],
+        STEP,
+        0.7,
+        np.ones(PLACES, bool),
+    )
+    rng = np.random.default_rng(0)
+    motions = sims + 1e-3 * rng.normal(size=(5, 1, 26, 1, 3))
+    numbers = 1e-3 * rng.normal(size=(5, len(spines.nuisances.names)))
+    pairs = spines.paired(sims, none(spines))[1]
+    alone = [spines.beside(pairs, motions[k : k + 1], numbers[k : k + 1]) for k in range(5)]
+    np.testing.assert_allclose(spines.beside(pairs, motions, numbers), np.concatenate(alone), rtol=1e-5, atol=1e-8)
+    assert spines.beside(pairs, motions[:0], numbers[:0]).shape == (0, *spines.target.shape)
+
+
 def test_markers_are_an_observation_too() -> None:
     markers = MarkerObservation(np.zeros((1, 2, 3, 3)), 1.0)
     sims = np.ones((2, 1, 2, 3, 3))

@@ -11,7 +11,6 @@ doi:10.1016/0021-9991(77)90098-5), so that linear and angular momentum are exact
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -20,6 +19,7 @@ import torch
 from torch import Tensor
 
 from torchdlo.physics import tree
+from torchdlo.physics.execution import tracing
 from torchdlo.physics.kernels import lanes
 from torchdlo.physics.linalg import banded
 from torchdlo.physics.linalg.numerics import dot, safe_norm, total
@@ -451,6 +451,23 @@ _REACHED = 1e-6
 """Share of its length by which an edge may miss it then."""
 
 
+@functools.lru_cache(64)
+def _part(topology: Topology, steps: int) -> tracing.RecordedStep:
+    """Return what takes edges a part of the way to their lengths, in some steps of Newton's method before the last."""
+
+    def reach(given: tuple[Tensor, Tensor, Tensor, Tensor], pos: Tensor, share: Tensor) -> tuple[Tensor]:
+        mobility, rest, active, edge_mask = given
+        none = torch.zeros_like(rest)
+        edge = edge_vectors(topology, pos, edge_mask)
+        length = safe_norm(edge).clamp(min=1e-12)
+        aim = Lengths(topology, length + (rest - length) * share, none, active, edge_mask)
+        found, _ = project(aim, pos, mobility.expand_as(pos), edge / length, torch.zeros_like(active), steps)
+        return (found,)
+
+    # Once is not worth it; fits do it for hundreds of batches.
+    return tracing.RecordedStep(reach, most=16, patience=2)
+
+
 def settle(lengths: Lengths, pos: Tensor, vel: Tensor, mobility: Tensor) -> tuple[Tensor, Tensor]:
     """Return the nearest positions and velocities that agree with fixed lengths, both shape (..., V, 3).
 
@@ -462,14 +479,11 @@ def settle(lengths: Lengths, pos: Tensor, vel: Tensor, mobility: Tensor) -> tupl
     """
     topology = lengths.topology
     answer = mobility.expand_as(pos)
-    stiff = dataclasses.replace(lengths, compliance=torch.zeros_like(lengths.compliance))
 
     def reach(pos: Tensor, parts: int) -> Tensor:
+        given = mobility, lengths.rest, lengths.active, lengths.edge_mask
         for left in range(parts, 0, -1):
-            edge = edge_vectors(topology, pos, lengths.edge_mask)
-            length = safe_norm(edge).clamp(min=1e-12)
-            aim = dataclasses.replace(stiff, rest=length + (lengths.rest - length) / left)
-            pos, _ = project(aim, pos, answer, edge / length, torch.zeros_like(lengths.active), 6 if left == 1 else 1)
+            (pos,) = _part(topology, 6 if left == 1 else 1)(given, pos, lengths.rest.new_tensor(1 / left))
         return pos
 
     near = reach(pos, 1)

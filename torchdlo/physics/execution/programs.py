@@ -225,14 +225,16 @@ def _arranged(operations: Sequence[Operation], scratch: set[int], sizes: Sequenc
         for view in (*own.out, *own.given, *views_in(own.arguments), *views_in(list(own.named.values()))):
             if isinstance(view, BufferView) and view.buffer in scratch:
                 used.setdefault(view.buffer, []).append(k)
+    begins: dict[int, list[int]] = {}
     ends: dict[int, list[int]] = {}
     for buffer, at in used.items():
+        begins.setdefault(at[0], []).append(buffer)
         ends.setdefault(at[-1], []).append(buffer)
     places: dict[int, int] = {}
     free: dict[int, list[int]] = {}
     size = 0
     for k in range(len(operations)):
-        for buffer in [b for b, at in used.items() if at[0] == k]:
+        for buffer in begins.get(k, ()):
             wide = -(-sizes[buffer] // _ALIGNED) * _ALIGNED
             if free.get(wide):
                 places[buffer] = free[wide].pop()

@@ -231,6 +231,9 @@ _ALONG = 12.0
 _COPIES = 16
 """How often a prior is read, so that each reading of it stays small."""
 
+_TOGETHER = 1_000_000
+"""Numbers of motions that are read at once: fewer calls, and what they make stays small."""
+
 SURE = 5e-4
 """What independent readings get wrong [m], against which priors are weighed."""
 
@@ -345,8 +348,12 @@ class Spines(_Filmed):
 
         Which points belong together is kept: differences are those of finite differences, at a tenth of the time.
         """
-        rows = [self._all_views(s[None], n[None], pairs)[0] for s, n in zip(sims, numbers, strict=True)]
-        return np.concatenate(rows) if rows else np.empty((0, len(self.target), *self.target.shape[1:]))
+        out = np.empty((len(sims), *self.target.shape))
+        step = max(1, _TOGETHER // max(1, sims[0].size)) if len(sims) else 1
+        for k in range(0, len(sims), step):
+            part = slice(k, k + step)
+            out[part] = self._all_views(sims[part], numbers[part], pairs)[0]
+        return out
 
     def changes(self, sims: np.ndarray, numbers: np.ndarray) -> np.ndarray:
         """Return readings of several motions near the first one, as `read` does, shape (P, B, F, R, 1)."""
@@ -376,7 +383,7 @@ class Spines(_Filmed):
             away, along = curve_vectors(pixel, places)
             edge = along.floor().long().clamp(max=pixel.shape[-2] - 2)
         else:
-            edge = pairs[0]
+            edge = pairs[0].expand(len(sims), *pairs[0].shape[1:])
             away = _to_edges(pixel, places, edge)
         away = torch.where(torch.as_tensor(np.isfinite(view.places))[None], away, 0.0) * scale[..., None]
         rope = pixel[..., self._free, :]
@@ -384,7 +391,7 @@ class Spines(_Filmed):
             spots, exact = places.expand(*rope.shape[:3], *places.shape[-2:]), "donot_use_mm_for_euclid_dist"
             best = torch.cdist(rope, spots, compute_mode=exact).argmin(-1)[..., None]
         else:
-            best = pairs[1]
+            best = pairs[1].expand(len(sims), *pairs[1].shape[1:])
         both = best.expand(*best.shape[:-1], 2)
         gap = rope - torch.gather(places.expand(*both.shape[:3], *places.shape[-2:]), -2, both)
         tangents = torch.as_tensor(view.tangents, dtype=sims.dtype).nan_to_num(0.0)[None]

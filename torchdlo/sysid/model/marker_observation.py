@@ -32,7 +32,7 @@ class Markers:
     def frame(self, state: scenes.State) -> tuple[Tensor, Tensor, Tensor]:
         """Return positions and material directors at the markers, shape (N, M, 3) each."""
         at, rods = list(self.vertex), state.rods
-        pos = rods.pos[:, at]
+        pos = tree.take_vertices(rods.pos, at)
         if not self.beside:
             return pos, pos, pos
         edge = [min(v, rods.pos.shape[-2] - 2) for v in at]
@@ -53,7 +53,8 @@ class Markers:
             late: whether markers are seen late, too, or at once.
         """
         time = torch.arange(len(frames), dtype=torch.float64) * self.dt
-        pos, first, second = (torch.stack([f[i] for f in frames], 1) for i in range(3))
+        pos = torch.stack([f[0] for f in frames], 1)
+        first, second = (torch.stack([f[i] for f in frames], 1) if self.beside else pos for i in (1, 2))
         track = Track(time, pos, first, second, self.gripped)
         for each in sorted(scene.effects, key=lambda e: e.last):
             if late or not each.last:

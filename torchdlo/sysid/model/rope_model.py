@@ -419,10 +419,8 @@ class RopeModel:
         scene, params, state = self.build(motion, start, values)
         params = tree.map(tree.batch_innermost, params)
         director = self._commands(scene, state, motion)
-        controls = [
-            Control(tree.batch_innermost(motion.held[:, k]), tree.batch_innermost(director[:, k]))
-            for k in range((frames - 1) * self.substeps + 1)
-        ]
+        count = (frames - 1) * self.substeps + 1
+        controls = [*map(Control, _by_step(motion.held, count), _by_step(director, count))]
         step = recorded_step(scene, params, state, controls[0], reactions=keep is not None)
         if start.still is not None and start.still.any():
             resting = equilibrium.come_to_rest(scene, params, state, controls[0])
@@ -467,6 +465,12 @@ class RopeModel:
         )
         rods = tree.replace(state.rods, pos=state.rods.pos + shift, vel=state.rods.vel + drift)
         return length_projection.agreeing_state(scene, params, tree.replace(state, rods=rods))
+
+
+def _by_step(x: Tensor, count: int) -> list[Tensor]:
+    """Return the first of commands (N, S, V, C) by step, each stored with the batch innermost."""
+    stored = x[:, :count].permute(1, 3, 2, 0).contiguous()
+    return [tree.logical(each) for each in stored.unbind()]
 
 
 def _turned(curvature: Tensor, number: dict[str, Tensor]) -> Tensor:
