@@ -480,7 +480,7 @@ def _in_substeps(scene: Scene, params: Params, state: State, control: Control, r
 def stepper(scene: Scene, *, execution: Execution = "compiled"):
     """Return `step` bound to a scene: a function of (params, state, control).
 
-    Recorded steps take seconds at the first call, and then, without gradients, half to a third of the time. Compiled
+    Recorded steps take seconds at the first call, and then, without gradients, a fifth to a tenth of the time. Compiled
     ones take ten seconds to minutes at first, with and without gradients, and are many times faster then. A step of one
     substep is compiled as a whole; of more, the substep is, so that their number does not matter.
     On CUDA devices explicit ones are recorded as CUDA graphs at the third call with tensors of the same shapes.

@@ -62,7 +62,8 @@ ONE = {
     "integers": lambda x: x * torch.tensor(3) + 2,
     "reshaped": lambda x: x.transpose(0, 1).reshape(-1, 2) * 2.0,
     "fused": lambda x: torch.add(x, x.transpose(0, 0), alpha=2) - torch.sub(x, x * x, alpha=0.5),
-    "by torch": lambda x: torch.lerp(x, x * x, 0.3) + torch.linalg.vector_norm(x, dim=-1, keepdim=True),
+    "largest of many": lambda x: x.repeat(1, 5, 1).amax(1),
+    "by torch": lambda x: torch.lerp(x, x * x, x.abs()) + torch.linalg.vector_norm(x, dim=-1, keepdim=True),
     "products": lambda x: (x @ x.transpose(-1, -2)).diagonal(dim1=-2, dim2=-1),
 }
 NEARLY = {  # torch rounds in another way, and sums in another order
@@ -70,6 +71,8 @@ NEARLY = {  # torch rounds in another way, and sums in another order
     "power three": lambda x: x**3,
     "sum": lambda x: x.sum(-1, keepdim=True),
     "sum away": lambda x: x.sum(0),
+    "sum of many": lambda x: x.repeat(1, 5, 1).sum(1, keepdim=True),
+    "between": lambda x: torch.lerp(x, x * x, 0.3) + torch.lerp(x, x * x, 0.7),
     "exp": torch.exp,
     "expm1": torch.expm1,
     "log": lambda x: x.abs().log(),

@@ -194,7 +194,8 @@ def make(
             other processes than the main one, those of `ParallelEnv` too, None begins differently each time.
         gradients: whether rewards and observations carry gradients to actions.
         execution: how steps run: "compiled", minutes at first, then about three times as fast, with gradients too;
-            "recorded", seconds at first, then two to three times as fast without gradients; or "eager", at once.
+            "recorded", seconds at first, then as fast as compiled ones in batches of up to some dozens, without
+            gradients; or "eager", at once.
         segment: frames that gradients run again at once; None keeps all of them in memory.
         variation: whether starts differ, by as much as `Task.reset_noise` says.
         randomize: numbers of effects that differ from scene to scene and are drawn at every reset, e.g.

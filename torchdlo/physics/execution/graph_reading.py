@@ -41,6 +41,9 @@ _MOST_INPUTS = 64
 _FOLDED = 64
 """Most numbers that are summed one after the other: torch sums more of them in pairs."""
 
+_APART = 4
+"""Most of them that are added in loops of their own, each over all sums."""
+
 
 class UnknownGraphError(Exception):
     """A graph that cannot be turned into loops."""
@@ -221,6 +224,8 @@ def _note(reader: _Reader, name: str, out: Any, args: Sequence[Any]) -> None:
         x, power = reader.operand(args[0], out.dtype), float(args[1])
         what = _POWERS.get(power, "pow")
         reader.loop(what, out, [x] if what != "pow" else [x, reader.operand(power, out.dtype)])
+    elif name == "lerp" and not isinstance(args[2], Tensor):
+        reader.loop("lerp", out, [reader.operand(x, out.dtype) for x in args[:2]], float(args[2]))
     elif name in ("where", "masked_fill"):
         _note_choice(reader, name, out, args)
     elif name in ("clamp", "clamp_min", "clamp_max"):
@@ -343,6 +348,12 @@ def _note_fold(reader: _Reader, what: str, out: Tensor, args: Sequence[Any]) -> 
     count = math.prod(x.shape[d] for d in dims)
     if len(dims) != 1 or not 0 < count <= _FOLDED:
         raise UnknownGraphError(f"{what} over {dims}")
+    if count > _APART:
+        # All of them go into one number, the last dimension being the one that is summed over.
+        reader.loop("copy", wide, [x.narrow(dims[0], 0, 1)])
+        rest = x.narrow(dims[0], 1, count - 1)
+        reader.loop(what, wide.expand(rest.shape), [wide, rest])
+        return
     parts = x.split(1, dims[0])
     if count == 1:
         reader.loop("copy", wide, [x])
@@ -387,11 +398,10 @@ def tensors_in(x: Any) -> list[Tensor]:
     return [t for each in x for t in tensors_in(each)] if isinstance(x, (list, tuple)) else []
 
 
-def _is_random(schema: Any) -> bool:
-    """Return whether an operation makes other numbers each time."""
+def _operator(schema: Any) -> Any:
+    """Return an operation, the very overload: finding it among others takes far longer than most of them do."""
     space, _, name = schema.name.partition("::")
-    operator = getattr(getattr(getattr(torch.ops, space), name, None), schema.overload_name or "default", None)
-    return torch.Tag.nondeterministic_seeded in getattr(operator, "tags", ())
+    return getattr(getattr(getattr(torch.ops, space), name), schema.overload_name or "default")
 
 
 def _do(reader: _Reader, node: Any, args: list[Any]) -> Any:
@@ -399,8 +409,8 @@ def _do(reader: _Reader, node: Any, args: list[Any]) -> Any:
     kind = node.kind()
     if kind.endswith("_") and not kind.endswith("__"):
         raise UnknownGraphError(f"{kind} changes what it is given")
-    operator = torch._C._jit_get_operation(kind)[0]
     schema = torch._C.parse_schema(node.schema())
+    operator = _operator(schema)
     named = {a.name: v for a, v in zip(schema.arguments, args, strict=True) if a.kwarg_only}
     plain = args[: len(args) - len(named)]
     before = len(reader.operations)
@@ -410,7 +420,7 @@ def _do(reader: _Reader, node: Any, args: list[Any]) -> Any:
             reader.constant(x)
     out = operator(*plain, **named)
     made = [x for x in tensors_in(out) if x.numel() and not reader.known(x)]
-    changing = any(not reader.is_constant(x) for x in given) or _is_random(schema)
+    changing = any(not reader.is_constant(x) for x in given) or torch.Tag.nondeterministic_seeded in operator.tags
     name = kind.removeprefix("aten::")
     if not tensors_in(out):
         if changing and kind not in _SIZES:

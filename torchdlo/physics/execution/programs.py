@@ -11,6 +11,7 @@ import functools
 import math
 import threading
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -140,8 +141,15 @@ class Program:
                 parts.append(((_Loop * len(loops))(*loops), len(loops)))
                 loops = []
             if own is not None:
-                parts.append(own)
+                named = {key: self._fixed(x) for key, x in own.named.items()}
+                parts.append(replace(own, arguments=self._fixed(own.arguments), named=named))
         return parts
+
+    def _fixed(self, x: Any) -> Any:
+        """Return an argument of an operation of torch, with tensors for buffers that stay where they are."""
+        if isinstance(x, (list, tuple)):
+            return type(x)(self._fixed(each) for each in x)
+        return self._tensor(x, []) if isinstance(x, BufferView) and self._slot[x.buffer] >= self._others else x
 
     def _loop(self, own: Operation) -> _Loop:
         """Return an operation as a kernel reads it."""
@@ -198,7 +206,9 @@ class Program:
         """Let torch do an operation."""
         assert own.operator is not None
         named = {key: self._tensor(x, now) for key, x in own.named.items()}
-        made = tensors_in(own.operator(*(self._tensor(x, now) for x in own.arguments), **named))
+        # Nothing here has a gradient.
+        with torch._C._AutoDispatchBelowAutograd():
+            made = tensors_in(own.operator(*[self._tensor(x, now) for x in own.arguments], **named))
         for view, x in zip(own.out, [x for x in made if x.numel()], strict=True):
             if x.stride() != view.stride or x.storage_offset() * x.itemsize != view.offset:
                 raise RuntimeError(f"{own.operator} stores what it makes in another way than when it was recorded")

@@ -12,7 +12,7 @@ constexpr int DIMS = 4;
 
 #define OPERATIONS(X)                                                                                               \
   X(kernel) X(copy) X(where) X(gather) X(add) X(sub) X(mul) X(div) X(minimum) X(maximum) X(clamp_min) X(clamp_max)    \
-  X(atan2) X(pow) X(neg) X(abs) X(sqrt) X(square) X(reciprocal) X(round) X(floor) X(sign) X(exp) X(log) X(sin)        \
+  X(atan2) X(pow) X(lerp) X(neg) X(abs) X(sqrt) X(square) X(reciprocal) X(round) X(floor) X(sign) X(exp) X(log) X(sin)        \
   X(cos) X(tanh) X(asin) X(expm1) X(eq) X(ne) X(lt) X(le) X(gt) X(ge) X(from_bool) X(cumsum) X(logical_and)              \
   X(logical_or) X(logical_xor) X(logical_not)
 
@@ -37,7 +37,7 @@ struct Loop {
   What what;
   int64_t kind, size[DIMS];
   Place out, in[3];
-  double number;         // factor of the second operand of `add` and `sub`
+  double number;         // factor of the second operand of `add` and `sub`, weight of `lerp`
   const int64_t* rows;   // of `gather`: rows of the input along the third dimension
   void (*run)(void*, void*, void*, int);  // of `kernel`: another kernel, its description, and where its inputs are
   void* call;
@@ -157,6 +157,10 @@ void numbers(const Loop& l, char** base) {
     case What::clamp_max: return binary<T, T>(l, base, [](T a, T b) { return a > b ? b : a; });
     case What::atan2: return binary<T, T>(l, base, [](T a, T b) { return std::atan2(a, b); });
     case What::pow: return binary<T, T>(l, base, [](T a, T b) { return std::pow(a, b); });
+    case What::lerp:
+      return binary<T, T>(l, base, [=](T a, T b) {
+        return std::fabs(alpha) < T(0.5) ? a + alpha * (b - a) : b - (b - a) * (1 - alpha);
+      });
     case What::neg: return unary<T, T>(l, base, [](T a) { return -a; });
     case What::abs: return unary<T, T>(l, base, [](T a) { return std::fabs(a); });
     case What::sqrt: return unary<T, T>(l, base, [](T a) { return std::sqrt(a); });
