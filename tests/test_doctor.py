@@ -129,7 +129,7 @@ def test_the_real_machine_is_looked_at():
     assert done.returncode == 0 and content["ok"], done.stdout
     kernels = next(check for check in content["checks"] if check["name"] == "kernels")
     if native.compiler() is not None:
-        assert kernels["found"] == "15 built and loaded"
+        assert kernels["found"] == "16 built and loaded"
 
 
 def test_the_sample_is_a_recording_of_ones_own(tmp_path, capsys):

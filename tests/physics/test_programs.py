@@ -178,6 +178,85 @@ def test_parts_of_one_tensor_may_be_given():
         assert torch.equal(found, right)
 
 
+def _masked_in_place(x):
+    mask = x > 0
+    mask &= x < 1
+    return mask, mask * x
+
+
+def _into_given(x):
+    out = torch.empty_like(x)
+    torch.mul(x, 2, out=out)
+    return (out,)
+
+
+class _Doubled(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, x):
+        return 2 * x
+
+    @staticmethod
+    def backward(ctx, grad):
+        return 2 * grad
+
+
+@torch.jit.script
+def _scripted(x):
+    if bool(x.sum() > 0):
+        return x * 2
+    return x * 3
+
+
+RARE = {
+    "in place by an operator": _masked_in_place,
+    "into a tensor": _into_given,
+    "of a function": lambda x: (_Doubled.apply(x) + 1,),
+    "scripted": lambda x: (_scripted(x),),
+    "chosen by a mask": lambda x: (x[x > 0].sum(), (x > 0).nonzero() * 1, torch.where(x > 0)[0]),
+    "masks": lambda x: ((x > 0).amax(-1), (x > 0).amin(0), (x > 0).sign(), (x > 0) ^ (x > 1), (x > 0).all()),
+    "integers": lambda x: ((3 * x).long()[:, [1, 0]], (3 * x).long().flip(1), (x > 0).long().sum(1)),
+    "halves": lambda x: (x.half()[:, [1, 0]] + 1,),
+    "masks of bytes": lambda x: (x[:, torch.tensor([1, 0, 1], dtype=torch.uint8)],),
+    "sums of a type": lambda x: (x.sum(dtype=x.dtype), x.sum(1, dtype=torch.float64), x.mean(0)),
+    "of one number": lambda x: ((2 * x[0, 0]).sum(0), (2 * x[0, 0]).cumsum(0), (2 * x[0, 0]).amax(0)),
+    "bounds that are none": lambda x: (x.clamp(min=math.nan), x.clamp(max=x / 0 * 0), torch.clamp_min(x, x * math.nan)),
+    "conjugated": lambda x: (torch.fft.fft(x).conj().imag + 1, torch.view_as_real(torch.fft.fft(x).conj() * 2)),
+    "powers": lambda x: (2.0**x, x.abs() ** x, x**0, x**-2, x.abs() ** -0.5),
+    "rounded": lambda x: (x.round(decimals=1), torch.div(x, 0.3, rounding_mode="floor")),
+    "constants": lambda x: (torch.zeros_like(x), torch.full_like(x, 2.0), x.new_tensor([1.0, 2.0])),
+    "five dimensions": lambda x: (x[:, None, :, None, None].expand(4, 2, 3, 2, 2).permute(4, 1, 0, 3, 2) * x[0, 0],),
+    "one row in place of all": lambda x: ((2 * x)[:1].expand(4, 3),),
+    "many operations": lambda x: (
+        torch.einsum("ij,kj->ik", x, x),
+        torch.softmax(x, -1),
+        x.roll(1, 0),
+        x.std(),
+        x.max(1)[1],
+    ),
+}
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("name", RARE)
+def test_rare_operations_are_done_by_torch_or_torch_script(name):
+    step = RARE[name]
+    x = _numbers(4, 3)
+    recorded = tracing.record(step, x.clone())
+    for given in (x, _numbers(4, 3, seed=1), _numbers(4, 3, seed=2) + 2):
+        for found, right in zip(recorded(given.clone()), step(given.clone()), strict=True):
+            torch.testing.assert_close(found, right, equal_nan=True)
+
+
+def test_what_is_given_back_and_what_was_captured_may_change():
+    factor = torch.ones(3, dtype=torch.float64)
+    recorded = tracing.record(lambda x: (torch.zeros_like(x), x * factor, x * (2 * factor)), _numbers(3))
+    x = _numbers(3)
+    recorded(x)[0].add_(1)
+    factor.fill_(5)
+    zeros, once, twice = recorded(x)
+    assert not zeros.any() and torch.equal(once, x) and torch.equal(twice, 2 * x)
+
+
 @pytest.mark.parametrize(
     "step", [lambda x: (x.add_(1),), lambda x: (x * x.sum().item(),), lambda x: (x[: int(x.abs().sum())],)]
 )

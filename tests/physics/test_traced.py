@@ -84,19 +84,6 @@ def test_recordings_are_found_again_by_key_and_shapes_and_the_oldest_goes():
     assert known.find("double", step, x) is not first and len(calls) == 4
 
 
-def test_steps_that_are_used_once_are_not_recorded():
-    calls = []
-
-    def step(x):
-        calls.append(None)
-        return (2 * x,)
-
-    known, x = tracing.Recordings(2), torch.ones(3)
-    for k in range(5):
-        assert torch.equal(known.find("double", step, x, patience=2)(x)[0], 2 * x)
-        assert len(calls) == min(k + 1, 3)
-
-
 @pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="memory of a process is read from /proc")
 def test_recordings_that_are_let_go_free_their_memory():
     def megabytes():

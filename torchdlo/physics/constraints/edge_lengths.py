@@ -12,7 +12,7 @@ doi:10.1016/0021-9991(77)90098-5), so that linear and angular momentum are exact
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -452,7 +452,7 @@ _REACHED = 1e-6
 
 
 @functools.lru_cache(64)
-def _part(topology: Topology, steps: int) -> tracing.RecordedStep:
+def _part(topology: Topology, steps: int, recorded: bool) -> Callable[..., tuple[Tensor]]:
     """Return what takes edges a part of the way to their lengths, in some steps of Newton's method before the last."""
 
     def reach(given: tuple[Tensor, Tensor, Tensor, Tensor], pos: Tensor, share: Tensor) -> tuple[Tensor]:
@@ -464,11 +464,12 @@ def _part(topology: Topology, steps: int) -> tracing.RecordedStep:
         found, _ = project(aim, pos, mobility.expand_as(pos), edge / length, torch.zeros_like(active), steps)
         return (found,)
 
-    # Once is not worth it; fits do it for hundreds of batches.
-    return tracing.RecordedStep(reach, most=16, patience=2)
+    return tracing.RecordedStep(reach, most=16) if recorded else reach
 
 
-def settle(lengths: Lengths, pos: Tensor, vel: Tensor, mobility: Tensor) -> tuple[Tensor, Tensor]:
+def settle(
+    lengths: Lengths, pos: Tensor, vel: Tensor, mobility: Tensor, *, recorded: bool = False
+) -> tuple[Tensor, Tensor]:
     """Return the nearest positions and velocities that agree with fixed lengths, both shape (..., V, 3).
 
     Args:
@@ -476,6 +477,7 @@ def settle(lengths: Lengths, pos: Tensor, vel: Tensor, mobility: Tensor) -> tupl
         pos: positions that miss it a little, e.g. interpolated measurements [m].
         vel: velocities that may stretch edges [m/s].
         mobility: one over the mass of the vertices, 0 if held, shape (..., V, 1).
+        recorded: whether to record Newton's steps where they have no gradient, for many batches of one size.
     """
     topology = lengths.topology
     answer = mobility.expand_as(pos)
@@ -483,7 +485,7 @@ def settle(lengths: Lengths, pos: Tensor, vel: Tensor, mobility: Tensor) -> tupl
     def reach(pos: Tensor, parts: int) -> Tensor:
         given = mobility, lengths.rest, lengths.active, lengths.edge_mask
         for left in range(parts, 0, -1):
-            (pos,) = _part(topology, 6 if left == 1 else 1)(given, pos, lengths.rest.new_tensor(1 / left))
+            (pos,) = _part(topology, 6 if left == 1 else 1, recorded)(given, pos, lengths.rest.new_tensor(1 / left))
         return pos
 
     near = reach(pos, 1)

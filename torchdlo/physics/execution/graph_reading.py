@@ -35,6 +35,9 @@ DIMS = 4
 KINDS = {torch.bool: 0, torch.float32: 1, torch.float64: 2}
 """Types of numbers that loops know."""
 
+_FLOATS = (torch.float32, torch.float64)
+"""Those that they calculate with."""
+
 _MOST_INPUTS = 64
 """Most inputs of a kernel, as in `loops.cpp`."""
 
@@ -135,7 +138,7 @@ class _Reader:
             return x
         if self.is_constant(x):
             return self.constant(x.to(dtype))
-        if x.dtype != torch.bool or dtype not in (torch.float32, torch.float64):
+        if x.dtype != torch.bool or dtype not in _FLOATS:
             raise UnknownGraphError(f"{x.dtype} as {dtype}")
         out = x.to(dtype)
         self.loop("from_bool", out, [x])
@@ -152,6 +155,13 @@ class _Reader:
         size, strides = _collapsed(out.shape, [out.stride(), *(x.stride() for x in wide)])
         views = [self.view(x) for x in wide]
         self.operations.append(Operation(what, kind, size, [self.view(out)], views, strides, number))
+
+    def along(self, what: str, out: Tensor, x: Tensor, size: list[int], strides: list[list[int]], rows: Any) -> None:
+        """Note a loop in which one dimension is another one than the others."""
+        if out.dtype not in KINDS:
+            raise UnknownGraphError(f"{what} of {out.dtype}")
+        views = [self.view(out)], [self.view(x)]
+        self.operations.append(Operation(what, out.dtype, size, *views, strides, rows=rows))
 
 
 def _collapsed(shape: Sequence[int], strides: Sequence[Sequence[int]]) -> tuple[list[int], list[list[int]]]:
@@ -201,6 +211,7 @@ _UNARY = (
     *("neg", "abs", "sqrt", "square", "reciprocal", "round", "floor", "sign"),
     *("exp", "expm1", "log", "sin", "cos", "tanh", "asin"),
 )
+_MASKS = (torch.bool, torch.uint8)
 _COPIES = ("clone", "contiguous", "reshape", "to", "_to_copy", "view", "flatten")
 _FOLDS = {"sum": "add", "amax": "maximum", "amin": "minimum"}
 _FILLED = ("new_zeros", "new_ones", "new_full", "zeros_like", "ones_like", "full_like")
@@ -218,13 +229,13 @@ def _note(reader: _Reader, name: str, out: Any, args: Sequence[Any]) -> None:
         reader.loop(_TRUTHS[name], out, [reader.operand(x, torch.bool) for x in args[:2]])
     elif name in ("logical_not", "bitwise_not") and args[0].dtype == torch.bool:
         reader.loop("logical_not", out, args[:1])
-    elif name in _UNARY and len(args) == 1:
+    elif name in _UNARY and len(args) == 1 and out.dtype in _FLOATS:
         reader.loop(name, out, [reader.operand(args[0], out.dtype)])
-    elif name == "pow" and not isinstance(args[1], Tensor):
+    elif name == "pow" and isinstance(args[1], (int, float)) and isinstance(args[0], Tensor) and out.dtype in _FLOATS:
         x, power = reader.operand(args[0], out.dtype), float(args[1])
         what = _POWERS.get(power, "pow")
         reader.loop(what, out, [x] if what != "pow" else [x, reader.operand(power, out.dtype)])
-    elif name == "lerp" and not isinstance(args[2], Tensor):
+    elif name == "lerp" and isinstance(args[2], (int, float)):
         reader.loop("lerp", out, [reader.operand(x, out.dtype) for x in args[:2]], float(args[2]))
     elif name in ("where", "masked_fill"):
         _note_choice(reader, name, out, args)
@@ -250,14 +261,14 @@ def _note(reader: _Reader, name: str, out: Any, args: Sequence[Any]) -> None:
 
 
 def _note_binary(reader: _Reader, what: str, out: Tensor, args: Sequence[Any]) -> None:
-    number = float(args[2]) if what in ("add", "sub") and len(args) > 2 else 1.0
     if what == "div" and len(args) > 2 and args[2] is not None:
         raise UnknownGraphError("div with rounding")
     dtype = out.dtype
     if dtype == torch.bool:
         dtype = torch.result_type(*args[:2])
-    if dtype not in (torch.float32, torch.float64):
+    if dtype not in _FLOATS:
         raise UnknownGraphError(f"{what} of {dtype}")
+    number = float(args[2]) if what in ("add", "sub") and len(args) > 2 else 1.0
     reader.loop(what, out, [reader.operand(x, dtype) for x in args[:2]], number)
 
 
@@ -300,7 +311,7 @@ def _rows_of(reader: _Reader, name: str, args: Sequence[Any]) -> tuple[int, Tens
         dim, rows = given[0]
     if not reader.is_constant(rows) or rows.dim() != 1:
         raise UnknownGraphError(name)
-    return dim, rows.nonzero()[:, 0] if rows.dtype == torch.bool else rows
+    return dim, rows.nonzero()[:, 0] if rows.dtype in _MASKS else rows
 
 
 def _note_rows(reader: _Reader, out: Tensor, x: Tensor, dim: int, rows: Tensor) -> None:
@@ -310,23 +321,24 @@ def _note_rows(reader: _Reader, out: Tensor, x: Tensor, dim: int, rows: Tensor) 
     size = [outer, between, out.shape[dim], inner]
     strides = [[*s[:2], each.stride(dim), s[2]] for s, each in zip(strides, (out, x), strict=True)]
     table = (ctypes.c_int64 * len(rows))(*(rows % x.shape[dim]).tolist())
-    views = [reader.view(out)], [reader.view(x)]
-    reader.operations.append(Operation("gather", out.dtype, size, *views, strides, rows=table))
+    reader.along("gather", out, x, size, strides, table)
 
 
 def _note_sums(reader: _Reader, out: Tensor, args: Sequence[Any]) -> None:
     """Note sums along a dimension."""
     x, dim = args[:2]
-    if x.dtype != out.dtype or out.dtype not in (torch.float32, torch.float64):
+    if x.dtype != out.dtype or out.dtype not in _FLOATS:
         raise UnknownGraphError(f"cumsum of {x.dtype}")
     size, strides = _beside(out, x, dim)
     size = [*size, out.shape[dim]]
     strides = [[*s, each.stride(dim)] for s, each in zip(strides, (out, x), strict=True)]
-    reader.operations.append(Operation("cumsum", out.dtype, size, [reader.view(out)], [reader.view(x)], strides))
+    reader.along("cumsum", out, x, size, strides, None)
 
 
 def _beside(out: Tensor, x: Tensor, dim: int) -> tuple[list[int], list[list[int]]]:
     """Return sizes, and strides of both, of three dimensions in place of all but one."""
+    if not x.dim():
+        raise UnknownGraphError("rows of a number")
     rest = [k for k in range(x.dim()) if k != dim % x.dim()]
     size, strides = _collapsed([out.shape[k] for k in rest], [[each.stride(k) for k in rest] for each in (out, x)])
     if size[0] > 1:
@@ -336,8 +348,9 @@ def _beside(out: Tensor, x: Tensor, dim: int) -> tuple[list[int], list[list[int]
 
 def _note_fold(reader: _Reader, what: str, out: Tensor, args: Sequence[Any]) -> None:
     """Note a sum as one addition after the other, each of which goes along all numbers."""
-    x, dims = args[0], args[1] if len(args) > 1 else None
-    if x.dtype != out.dtype or (what == "add" and len(args) > 3 and args[3] is not None):
+    # A sum of all numbers has its type there.
+    x, dims = args[0], args[1] if len(args) > 2 else None
+    if x.dtype != out.dtype or out.dtype not in _FLOATS or not x.dim():
         raise UnknownGraphError(what)
     dims = [dims] if isinstance(dims, int) else list(dims or range(x.dim()))
     dims = [d % x.dim() for d in dims]
@@ -398,27 +411,45 @@ def tensors_in(x: Any) -> list[Tensor]:
     return [t for each in x for t in tensors_in(each)] if isinstance(x, (list, tuple)) else []
 
 
-def _operator(schema: Any) -> Any:
+def _operator(node: Any) -> Any:
     """Return an operation, the very overload: finding it among others takes far longer than most of them do."""
+    if node.schema() == "(no schema)":
+        raise UnknownGraphError(f"{node.kind()} is not an operation of torch")
+    schema = torch._C.parse_schema(node.schema())
     space, _, name = schema.name.partition("::")
-    return getattr(getattr(getattr(torch.ops, space), name), schema.overload_name or "default")
+    operator = getattr(getattr(getattr(torch.ops, space), name), schema.overload_name or "default")
+    if operator._schema.is_mutable:
+        raise UnknownGraphError(f"{node.kind()} changes what it is given")
+    return operator
+
+
+def _check_shapes(reader: _Reader, operator: Any, args: Sequence[Any]) -> None:
+    """Refuse an operation if numbers decide how many there are in what it makes."""
+    if torch.Tag.dynamic_output_shape not in operator.tags and operator is not torch.ops.aten.where.default:
+        return
+    deciding = tensors_in(args)
+    if operator.overloadpacket is torch.ops.aten.index:
+        deciding = [x for x in tensors_in(args[1]) if x.dtype in _MASKS]
+    if not all(reader.is_constant(x) for x in deciding):
+        raise UnknownGraphError(f"{operator} makes as many numbers as others say")
 
 
 def _do(reader: _Reader, node: Any, args: list[Any]) -> Any:
     """Do an operation, and note what it takes to do it again."""
-    kind = node.kind()
-    if kind.endswith("_") and not kind.endswith("__"):
-        raise UnknownGraphError(f"{kind} changes what it is given")
-    schema = torch._C.parse_schema(node.schema())
-    operator = _operator(schema)
-    named = {a.name: v for a, v in zip(schema.arguments, args, strict=True) if a.kwarg_only}
+    kind, operator = node.kind(), _operator(node)
+    arguments = operator._schema.arguments
+    if len(arguments) != len(args):
+        raise UnknownGraphError(f"{kind} has other arguments than its schema says")
+    named = {a.name: v for a, v in zip(arguments, args, strict=True) if a.kwarg_only}
     plain = args[: len(args) - len(named)]
-    before = len(reader.operations)
     given = tensors_in(args)
     for x in given:
         if not reader.known(x):
             reader.constant(x)
+    _check_shapes(reader, operator, args)
     out = operator(*plain, **named)
+    if any(x.is_conj() or x.is_neg() for x in tensors_in(out)):
+        raise UnknownGraphError(f"{kind} leaves numbers to be turned later")
     made = [x for x in tensors_in(out) if x.numel() and not reader.known(x)]
     changing = any(not reader.is_constant(x) for x in given) or torch.Tag.nondeterministic_seeded in operator.tags
     name = kind.removeprefix("aten::")
@@ -429,22 +460,36 @@ def _do(reader: _Reader, node: Any, args: list[Any]) -> Any:
         for x in made:
             reader.constant(x)
     elif made:
-        for x in made:
-            reader.buffer(x)
-        try:
-            if kind == "torchdlo::rods":
-                _note_kernel(reader, out, args)
-            else:
-                _note(reader, name, out, args)
-        except UnknownGraphError:
-            del reader.operations[before:]
-            arguments = tuple(_argument(reader, x) for x in plain)
-            options = {key: _argument(reader, x) for key, x in named.items()}
-            views = [reader.view(x) for x in made]
-            reader.operations.append(
-                Operation("torch", torch.bool, [], views, [], operator=operator, arguments=arguments, named=options)
-            )
+        _note_made(reader, operator, name, out, made, plain, named)
     return out
+
+
+def _note_made(
+    reader: _Reader,
+    operator: Any,
+    name: str,
+    out: Any,
+    made: Sequence[Tensor],
+    plain: Sequence[Any],
+    named: dict[str, Any],
+) -> None:
+    """Note the loops of an operation that made new numbers, or that torch has to do it."""
+    before = len(reader.operations)
+    for x in made:
+        reader.buffer(x)
+    try:
+        if operator.overloadpacket is torch.ops.torchdlo.rods:
+            _note_kernel(reader, out, plain)
+        else:
+            _note(reader, name, out, [*plain, *named.values()])
+    except UnknownGraphError:
+        del reader.operations[before:]
+        arguments = tuple(_argument(reader, x) for x in plain)
+        options = {key: _argument(reader, x) for key, x in named.items()}
+        views = [reader.view(x) for x in made]
+        reader.operations.append(
+            Operation("torch", torch.bool, [], views, [], operator=operator, arguments=arguments, named=options)
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -476,6 +521,8 @@ def read(graph: Any, inputs: Sequence[Tensor], numbers: Sequence[Tensor]) -> Gra
     """
     reader, known = _Reader(), dict[int, Any]()
     with torch.no_grad():
+        if any(x.is_conj() or x.is_neg() for x in inputs):
+            raise UnknownGraphError("numbers that are to be turned later")
         given = [_apart(x) for x in inputs]
         for value, x in zip(graph.inputs(), [*given, *numbers], strict=True):
             known[value.unique()] = x
@@ -504,7 +551,9 @@ def _follow(reader: _Reader, node: Any, known: dict[int, Any]) -> None:
     kind, outputs = node.kind(), list(node.outputs())
     args = [known[x.unique()] for x in node.inputs()]
     if kind == "prim::Constant":
-        known[outputs[0].unique()] = outputs[0].toIValue()
+        value = outputs[0].toIValue()
+        # What was captured stays as it is now.
+        known[outputs[0].unique()] = _apart(value) if isinstance(value, Tensor) else value
     elif kind in ("prim::ListConstruct", "prim::TupleConstruct"):
         known[outputs[0].unique()] = args
     elif kind in ("prim::ListUnpack", "prim::TupleUnpack"):

@@ -188,7 +188,9 @@ class Program:
     def _output(self, slot: int, view: Any, now: list[Tensor]) -> Tensor:
         if view is None:
             return now[slot]
-        return view if slot < 0 else self._tensor(view, now)
+        found = view if slot < 0 else self._tensor(view, now)
+        # Who is given constants may change them.
+        return found.clone() if slot >= self._others else found
 
     def _tensor(self, x: Any, now: list[Tensor]) -> Any:
         """Return an argument of an operation of torch, with tensors for parts of buffers."""
@@ -210,7 +212,7 @@ class Program:
         with torch._C._AutoDispatchBelowAutograd():
             made = tensors_in(own.operator(*[self._tensor(x, now) for x in own.arguments], **named))
         for view, x in zip(own.out, [x for x in made if x.numel()], strict=True):
-            if x.stride() != view.stride or x.storage_offset() * x.itemsize != view.offset:
+            if x.shape != view.size or x.stride() != view.stride or x.storage_offset() * x.itemsize != view.offset:
                 raise RuntimeError(f"{own.operator} stores what it makes in another way than when it was recorded")
             slot = self._slot[view.buffer]
             now += [x] * (slot + 1 - len(now))
@@ -224,8 +226,13 @@ def _fresh(own: GraphReading, buffer: int) -> BufferView:
     if len({v.dtype for v in views}) > 1:
         raise UnknownGraphError("parts of one tensor as numbers of several types")
     size = own.sizes[buffer] // views[0].dtype.itemsize
-    whole = [v for v in views if not v.offset and math.prod(v.size) == size]
+    whole = [v for v in views if not v.offset and math.prod(v.size) == size == _extent(v)]
     return whole[0] if whole else BufferView(buffer, 0, (size,), (1,), views[0].dtype)
+
+
+def _extent(own: BufferView) -> int:
+    """Return how many numbers there are from the first to the last one of a part of a buffer."""
+    return 1 + sum((n - 1) * step for n, step in zip(own.size, own.stride, strict=True))
 
 
 def _arranged(operations: Sequence[Operation], scratch: set[int], sizes: Sequence[int]) -> tuple[dict[int, int], int]:

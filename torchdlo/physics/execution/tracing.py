@@ -138,24 +138,18 @@ class Recordings:
     def __init__(self, most: int) -> None:
         """Prepare to keep `most` of them; each takes some 30 MB."""
         self._most, self._kept = most, OrderedDict[Hashable, Callable[..., Any]]()
-        self._uses: dict[Hashable, int] = {}
 
-    def find(self, key: Hashable, step: Callable[..., Any], *inputs: Any, patience: int = 0) -> Callable[..., Any]:
+    def find(self, key: Hashable, step: Callable[..., Any], *inputs: Any) -> Callable[..., Any]:
         """Return `step`, recorded with inputs of these shapes unless it is known already.
 
         Args:
             key: equal for steps that do the same.
             step: see `record`.
             inputs: likewise.
-            patience: how often the step itself is returned before it is recorded.
         """
         tensors, keys = tree.described(inputs)
         key = key, keys, tuple((x.shape, x.dtype) for x in tensors)
-        uses = self._uses.get(key, 0)
         if key not in self._kept:
-            if uses < patience:
-                self._uses[key] = uses + 1
-                return step
             self._kept[key] = record(step, *inputs)
         self._kept.move_to_end(key)
         if len(self._kept) > self._most:
@@ -169,9 +163,9 @@ class RecordedStep:
     So it does where recording does not know one of its operations.
     """
 
-    def __init__(self, step: Callable[..., Any], most: int = 2, patience: int = 0) -> None:
-        """Prepare the step; see `record`. `most` recordings are kept; see `Recordings.find` for `patience`."""
-        self._step, self._recordings, self._known, self._patience = step, Recordings(most), True, patience
+    def __init__(self, step: Callable[..., Any], most: int = 2) -> None:
+        """Prepare the step; see `record`. `most` recordings are kept."""
+        self._step, self._recordings, self._known = step, Recordings(most), True
 
     def __call__(self, *inputs: Any) -> Any:
         """Do the step."""
@@ -180,7 +174,7 @@ class RecordedStep:
         if with_gradient or not self._known or torch.jit.is_tracing() or torch.compiler.is_compiling():
             return self._step(*inputs)
         try:
-            recorded = self._recordings.find((), self._step, *inputs, patience=self._patience)
+            recorded = self._recordings.find((), self._step, *inputs)
         except RuntimeError:
             self._known = False
             return self._step(*inputs)

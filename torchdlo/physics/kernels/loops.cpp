@@ -153,8 +153,8 @@ void numbers(const Loop& l, char** base) {
     case What::div: return binary<T, T>(l, base, [](T a, T b) { return a / b; });
     case What::minimum: return binary<T, T>(l, base, [](T a, T b) { return is_nan(a) || a < b ? a : b; });
     case What::maximum: return binary<T, T>(l, base, [](T a, T b) { return is_nan(a) || a > b ? a : b; });
-    case What::clamp_min: return binary<T, T>(l, base, [](T a, T b) { return a < b ? b : a; });
-    case What::clamp_max: return binary<T, T>(l, base, [](T a, T b) { return a > b ? b : a; });
+    case What::clamp_min: return binary<T, T>(l, base, [](T a, T b) { return a < b || is_nan(b) ? b : a; });
+    case What::clamp_max: return binary<T, T>(l, base, [](T a, T b) { return a > b || is_nan(b) ? b : a; });
     case What::atan2: return binary<T, T>(l, base, [](T a, T b) { return std::atan2(a, b); });
     case What::pow: return binary<T, T>(l, base, [](T a, T b) { return std::pow(a, b); });
     case What::lerp:

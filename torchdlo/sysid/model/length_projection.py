@@ -38,7 +38,8 @@ def agreeing_state(scene: scenes.Scene, params: scenes.Params, state: scenes.Sta
     lengths = edge_lengths.Lengths(scene.topology, rest.length, torch.zeros_like(rest.length), active, rest.edge_mask)
 
     def settled(pos: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        pos, vel = edge_lengths.settle(lengths, pos, rods.vel, free / params.rods.material.mass)
+        mobility = free / params.rods.material.mass
+        pos, vel = edge_lengths.settle(lengths, pos, rods.vel, mobility, recorded=True)
         edge = torch.roll(pos, -1, -2) - pos
         missed = ((safe_norm(edge) / rest.length - 1).abs() * active).amax(-2, keepdim=True)
         return pos, vel, missed.nan_to_num(torch.inf)
