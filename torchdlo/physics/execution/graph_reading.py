@@ -38,6 +38,9 @@ KINDS = {torch.bool: 0, torch.float32: 1, torch.float64: 2}
 _FLOATS = (torch.float32, torch.float64)
 """Those that they calculate with."""
 
+_OF_TRUTHS = ("copy", "where", "logical_and", "logical_or", "logical_xor", "logical_not")
+"""Loops over truths; all others are over numbers."""
+
 _MOST_INPUTS = 64
 """Most inputs of a kernel, as in `loops.cpp`."""
 
@@ -150,7 +153,7 @@ class _Reader:
             return
         wide = [x.expand(out.shape) for x in given]
         kind = given[-1].dtype if out.dtype == torch.bool else out.dtype
-        if kind not in KINDS:
+        if kind not in (KINDS if what in _OF_TRUTHS else _FLOATS):
             raise UnknownGraphError(f"{what} of {kind}")
         size, strides = _collapsed(out.shape, [out.stride(), *(x.stride() for x in wide)])
         views = [self.view(x) for x in wide]
@@ -245,7 +248,7 @@ def _note(reader: _Reader, name: str, out: Any, args: Sequence[Any]) -> None:
         _note_joined(reader, name, out, args)
     elif name in ("index_select", "index"):
         _note_rows(reader, out, args[0], *_rows_of(reader, name, args))
-    elif name == "flip" and len(args[1]) == 1:
+    elif name == "flip" and len(args[1]) == 1 and out.dim():
         _note_rows(reader, out, args[0], args[1][0], torch.arange(out.shape[args[1][0]]).flip(0))
     elif name == "cumsum":
         _note_sums(reader, out, args)
