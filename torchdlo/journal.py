@@ -17,6 +17,7 @@ import shutil
 import sys
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +25,19 @@ from torchdlo import untrusted
 from torchdlo.errors import InputError
 from torchdlo.files import write_atomically
 
-__all__ = ["MARK", "Journal", "at_work", "locked", "pack", "read_json", "read_record", "sweep", "unpack", "write_json"]
+__all__ = [
+    "MARK",
+    "Journal",
+    "Records",
+    "at_work",
+    "locked",
+    "pack",
+    "read_json",
+    "read_record",
+    "sweep",
+    "unpack",
+    "write_json",
+]
 
 MARK = "journal.json"
 """The file that says what a journal belongs to."""
@@ -203,6 +216,28 @@ def _holder(handle: int) -> str:
     return "another process"
 
 
+@dataclass(frozen=True)
+class Records:
+    """Records of a journal: other processes may read and write them while they work for the one that has it."""
+
+    path: Path
+    """Its folder."""
+    key: str
+    """What they belong to."""
+    suffix: str
+    """How their names end."""
+    old: tuple[bytes, ...] = ()
+    """Beginnings of records without a hash, see `unpack`."""
+
+    def read(self, name: str) -> bytes | None:
+        """Return a record, None if it is not there whole."""
+        return read_record(self.path / f"{name}{self.suffix}", self.key, old=self.old)
+
+    def write(self, name: str, content: bytes) -> None:
+        """Write a record."""
+        write_atomically(self.path / f"{name}{self.suffix}", pack(content, self.key))
+
+
 class Journal:
     """A folder with records of one piece of work, for one process at a time."""
 
@@ -226,9 +261,9 @@ class Journal:
             resume: go on from what is there.
             old: beginnings of records without a hash, see `unpack`.
         """
-        self.path, self._suffix, self._old = path, suffix, old
+        self.path, self._suffix = path, suffix
         self._mark = json.loads(json.dumps(mark))
-        self._key = _seal(self._mark)
+        self.records = Records(path, _seal(self._mark), suffix, old)
         self._open = contextlib.ExitStack()
         if path.exists() and not path.is_dir():
             raise self._foreign()
@@ -285,7 +320,7 @@ class Journal:
     def _lost(self) -> str:
         """Return what is wrong with a journal whose mark is damaged, "" if its records belong here."""
         files = list(self.path.glob(f"*{self._suffix}"))
-        known = not files or any(read_record(file, self._key) is not None for file in files)
+        known = not files or any(read_record(file, self.records.key) is not None for file in files)
         return "" if known else "the journal is damaged, or belongs to other work; leave out --resume."
 
     def _foreign(self) -> InputError:
@@ -293,11 +328,11 @@ class Journal:
 
     def read(self, name: str) -> bytes | None:
         """Return a record, None if it is not there whole."""
-        return read_record(self.path / f"{name}{self._suffix}", self._key, old=self._old)
+        return self.records.read(name)
 
     def write(self, name: str, content: bytes) -> None:
         """Write a record."""
-        write_atomically(self.path / f"{name}{self._suffix}", pack(content, self._key))
+        self.records.write(name, content)
 
     def empty(self) -> None:
         """Delete all records, then the mark, so that what is left is known if this is the end."""

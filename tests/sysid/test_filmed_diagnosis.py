@@ -16,7 +16,7 @@ from torchdlo.sysid.diagnosis.effect_library import library
 from torchdlo.sysid.diagnosis.effect_search import diagnose
 from torchdlo.sysid.diagnosis.findings import findings_json, model_json, summary
 from torchdlo.sysid.recordings.recording import load_recording
-from torchdlo.sysid.video import filmed_diagnosis
+from torchdlo.sysid.video import filmed_diagnosis, filmed_fit
 from torchdlo.sysid.video.filmed_model import FilmedModel
 from torchdlo.sysid.video.filmed_problem import FilmedProblem
 from torchdlo.sysid.video.filming import film_recording
@@ -36,7 +36,8 @@ def test_a_diagnosis_of_films_says_what_it_found(tmp_path: Path, monkeypatch: py
     monkeypatch.setattr(filmed_diagnosis, "chained", lambda model, pool: model)
     monkeypatch.setitem(BUDGETS, "fast", Budget(4, 1, 1, 1, 1))
     others = [n for n in library() if n not in ("air_drag", "point_mass")]
-    found = diagnose(recording, without=others, workers=2)
+    asked: dict[str, Any] = {"without": others, "journal": tmp_path / "journal"}
+    found = diagnose(recording, workers=2, **asked)
     (candidates,) = found.candidates
     assert {c.name for c in candidates} == {"air_drag", "point_mass"} and all(c.reason for c in candidates)
     assert np.isfinite(found.before).all() and found.verdict in ("none", "effects", "partial", "unknown")
@@ -44,6 +45,10 @@ def test_a_diagnosis_of_films_says_what_it_found(tmp_path: Path, monkeypatch: py
     assert set(content["baseline"]) == {"bending_stiffness", "twisting_stiffness", "damping_rate"}
     assert len(content["cameras"]) == 8 and json.loads(model_json(found))["parameters"]
     assert summary(found, recording) in page.diagnosis_html(found, recording).replace("&#x27;", "'")
+    # What was stopped at its end goes on from what it wrote down, and comes to the same.
+    monkeypatch.setattr(filmed_fit, "_improved", lambda *_: pytest.fail("fitted again"))
+    again = json.loads(findings_json(diagnose(recording, workers=1, resume=True, **asked), recording))
+    assert again | {"seconds": 0} == content | {"seconds": 0}
 
 
 def test_fits_leave_models_and_starts_as_they_are(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -9,9 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from torchdlo.errors import InputError
 from torchdlo.sysid.calibration.calibrate import calibrate
-from torchdlo.sysid.diagnosis.effect_search import diagnose
 from torchdlo.sysid.estimation.levenberg_marquardt import KNEE
 from torchdlo.sysid.estimation.observation import INDEPENDENT, Spines, own_clocks, seen_by, unfitted_clocks
 from torchdlo.sysid.model.rope_model import RopeModel
@@ -19,7 +17,7 @@ from torchdlo.sysid.model.trial_batch import Start
 from torchdlo.sysid.recordings.recording import load_recording
 from torchdlo.sysid.video import filmed, filmed_starts
 from torchdlo.sysid.video.filmed import begun_elsewhere, doubts
-from torchdlo.sysid.video.filmed_fit import Fit, eliminated, fit, look, normal, spread, time_films
+from torchdlo.sysid.video.filmed_fit import eliminated, fit, look, normal, spread, time_films
 from torchdlo.sysid.video.filmed_problem import FilmedProblem, begin_from_balance, filmed_problem
 from torchdlo.sysid.video.filmed_starts import fit_starts, search_starts
 from torchdlo.sysid.video.films import with_stations
@@ -200,8 +198,8 @@ def test_starts_of_trials_that_stand_out_are_looked_for_again(monkeypatch: pytes
     def search(part: FilmedProblem, *rest: object, **more: object) -> None:
         searched.append([t.name for t in part.trials])
 
-    def nothing_better(part: FilmedProblem, *rest: object, **more: object) -> Fit:
-        return replace(found, costs=np.full(len(part.trials), np.inf))
+    def nothing_better(part: FilmedProblem, *rest: object, **more: object) -> np.ndarray:
+        return np.full(len(part.trials), np.inf)
 
     monkeypatch.setattr(filmed_starts, "search_starts", search)
     monkeypatch.setattr(filmed_starts, "fit_starts", nothing_better)
@@ -285,15 +283,10 @@ def test_starts_on_the_other_side_of_the_camera_are_found() -> None:
     values = np.concatenate([[3e-3, 2e-3, 0.5], np.zeros(len(own.spines.nuisances.names))])
     begin_from_balance(own, own.full(values[None])[0])
     raw = own.space.to_raw(values)
-    nearest = fit_starts(own, raw, 8, seconds=0.4).costs
+    nearest = fit_starts(own, raw, 8, seconds=0.4)
     searched = search_starts(own, raw, seconds=0.4)
-    assert (searched.costs <= nearest).all()
-    assert np.allclose(look(own, raw, own.offset, 0.4, fixed=True).costs, searched.costs, rtol=1e-6)
+    assert (searched <= nearest).all()
+    assert np.allclose(look(own, raw, own.offset, 0.4, fixed=True).costs, searched, rtol=1e-6)
     # The rope comes and goes by more than a metre per second: the balance that is carried along does not.
     towards = own.offset.reshape(1, 2, -1, 3)[0, 1, 0] @ np.array(views[0].camera.rotation)[2]
     assert 1.5 < abs(towards) < 5.0
-
-
-def test_a_diagnosis_of_films_cannot_be_resumed() -> None:
-    with pytest.raises(InputError, match="no --resume for films"):
-        diagnose(load_recording(DATA / "sample_film"), resume=True)

@@ -50,10 +50,10 @@ def fit_job(value: float = 1.0) -> FitJob:
 
 def test_results_come_back_to_the_last_bit(recording: Recording, tmp_path: Path) -> None:
     journal, job, result = ResultCache(tmp_path / "j", recording, OPTIONS), fit_job(), fitted()
-    assert journal.recall(job) is None
-    journal.keep(job, result)
+    assert journal.results.recall(job) is None
+    journal.results.keep(job, result)
     journal.close()
-    again = ResultCache(tmp_path / "j", recording, OPTIONS, resume=True).recall(fit_job())
+    again = ResultCache(tmp_path / "j", recording, OPTIONS, resume=True).results.recall(fit_job())
     assert digest(again) == digest(result) and again.space.params == result.space.params
     np.testing.assert_array_equal(again.point.curvature, result.point.curvature)
 
@@ -104,19 +104,19 @@ def test_a_pool_reads_what_another_one_computed(recording: Recording, tmp_path: 
 
 def test_a_damaged_result_is_computed_again(recording: Recording, tmp_path: Path) -> None:
     journal, job = ResultCache(tmp_path / "j", recording, OPTIONS), fit_job()
-    journal.keep(job, fitted())
+    journal.results.keep(job, fitted())
     (file,) = (tmp_path / "j").glob("*.npz")
     whole = file.read_bytes()
     for part in (b"", whole[: len(whole) // 2], b"not an archive"):
         file.write_bytes(part)
-        assert journal.recall(job) is None
+        assert journal.results.recall(job) is None
 
 
 def test_another_search_is_refused(recording: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "j"
     with pytest.raises(InputError, match=r"expected the journal of a search to resume, found none; leave out --resume"):
         ResultCache(path, recording, OPTIONS, resume=True)
-    ResultCache(path, recording, OPTIONS).keep(fit_job(), fitted())
+    ResultCache(path, recording, OPTIONS).results.keep(fit_job(), fitted())
     shifted = replace(recording.test[0], markers=recording.test[0].markers + 1e-9)
     for other, options in (
         (replace(recording, test=(shifted, *recording.test[1:])), OPTIONS),
@@ -134,8 +134,8 @@ def test_another_search_is_refused(recording: Recording, tmp_path: Path, monkeyp
 
 
 def test_a_new_search_begins_with_an_empty_journal(recording: Recording, tmp_path: Path) -> None:
-    ResultCache(tmp_path / "j", recording, OPTIONS).keep(fit_job(), fitted())
-    assert ResultCache(tmp_path / "j", recording, OPTIONS).recall(fit_job()) is None
+    ResultCache(tmp_path / "j", recording, OPTIONS).results.keep(fit_job(), fitted())
+    assert ResultCache(tmp_path / "j", recording, OPTIONS).results.recall(fit_job()) is None
 
 
 def test_foreign_folders_are_not_emptied(recording: Recording, tmp_path: Path) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,7 +17,11 @@ from tests.vision.test_segment import COLORS, swinging
 from torchdlo.cli.app import app, main
 from torchdlo.errors import InputError
 from torchdlo.sysid.recordings.recording import load_recording
+from torchdlo.sysid.video import filmed as filmed_fits
+from torchdlo.sysid.video import filmed_fit
+from torchdlo.sysid.video.filming import film_recording
 from torchdlo.vision.camera import load_cameras, looking_at, save_cameras, states_rate
+from torchdlo.vision.film import FilmLook
 from torchdlo.vision.segment import load_ranges, ranges_of
 from torchdlo.vision.video_file import write_video
 
@@ -133,19 +136,30 @@ def test_a_run_is_filmed_with_its_loop_closed_and_refuses_what_it_would_ignore(t
     assert sizes[0] > 2 * sizes[1]
 
 
-def test_a_stopped_calibration_of_films_keeps_what_its_help_says(
+def test_a_stopped_calibration_of_films_goes_on_from_its_fits(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    def stop(*args: object, **options: object) -> None:
+    def stop(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("torchdlo.sysid.calibration.calibrate.calibrate_filmed", stop)
-    with pytest.raises(SystemExit) as ended:
-        main(["calibrate", str(DATA / "sample_film"), "--out", str(tmp_path / "model.json")])
-    assert ended.value.code == 130 and "nothing was written" in capsys.readouterr().err
-    assert not (tmp_path / "model.json").exists()
-    for command in ("calibrate", "diagnose"):
-        assert re.search(r"films.{1,20}nothing", run(command, "--help").replace("\n", " "))
+    camera = looking_at("a", [0.15, -1.35, 1.0], [0.0, 0.0, 0.88], focal=650.0)
+    film_recording(
+        load_recording(DATA / "sample_rope"), [camera], tmp_path / "rope", FilmLook(), trials=1, seconds=0.25
+    )
+    given, out = ["calibrate", str(tmp_path / "rope"), "--starts", "3", "--iterations", "1"], tmp_path / "out"
+    with monkeypatch.context() as patched:
+        patched.setattr(filmed_fits, "tested", stop)
+        with pytest.raises(SystemExit) as ended:
+            main([*given, "--out", str(out)])
+    said = capsys.readouterr().err
+    assert ended.value.code == 130 and f"kept in {out / 'journal'}" in said and "--resume" in said
+    assert not (out / "model.json").exists()
+    monkeypatch.setattr(filmed_fit, "_improved", lambda *_: pytest.fail("fitted again"))
+    run(*given, "--out", out, "--resume")
+    assert (out / "model.json").is_file() and not (out / "journal").exists()
+    with pytest.raises(SystemExit):
+        main([*given, "--out", str(out), "--resume"])
+    assert "leave out --resume" in capsys.readouterr().err
 
 
 def test_the_film_in_the_package_is_small_and_sound() -> None:

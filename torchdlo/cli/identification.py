@@ -59,11 +59,11 @@ def calibrate(
         ),
     ] = "auto",
     quick: Annotated[bool, typer.Option("--quick", help="A rough fit in a fraction of the time.")] = False,
-    resume: Annotated[bool, typer.Option("--resume", help="Go on from the checkpoint beside the model file.")] = False,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on from what is kept beside the model file.")] = False,
 ) -> None:
     """Fit a rope model to the train trials and judge it on the test trials.
 
-    Ctrl-C stops after the running iteration and keeps the best found so far; of films it keeps nothing.
+    Ctrl-C stops after the running iteration and keeps the best found so far; of films --resume goes on from its fits.
 
     [bold]Examples:[/bold]
 
@@ -85,7 +85,8 @@ def calibrate(
         out = Path("runs") / "calibrate" / recording.resolve().name / "model.json"
     elif out.is_dir() or out.suffix != ".json":
         out = out / "model.json"
-    _check_outputs(out, resume)
+    kept = out.with_name("journal" if loaded.filmed else "checkpoint.json")
+    _check_outputs(out, kept, resume)
     options: dict[str, Any] = {"starts": starts, "iterations": iterations, "vertices": vertices}
     if quick:
         options = {name: value or _QUICK.get(name) for name, value in options.items()} | {"refined": False}
@@ -96,17 +97,19 @@ def calibrate(
             seed=seed,
             rest=rest,
             method=method,
-            checkpoint=out.with_name("checkpoint.json"),
+            checkpoint=kept,
             resume=resume,
             **options,
         )
         _write_outputs(result, loaded, recording, out, quiet=as_json)
+        if loaded.filmed:
+            shutil.rmtree(kept, ignore_errors=True)
     if as_json:
         from torchdlo.sysid.estimation.result import summary_json
 
         typer.echo(summary_json(result, recording), nl=False)
     if result.interrupted:
-        raise stopped(f"the best so far is in {out}", resume=not loaded.filmed)
+        raise stopped(f"the best so far is in {out}", resume=True)
 
 
 def diagnose(
@@ -137,8 +140,7 @@ def diagnose(
     """Find what the model lacks: name the missing effect, add it, and show the gap shrink.
 
     The baseline is calibrated first; every effect of the library is then tried on what it leaves over, and kept only if
-    it closes the gap on trials that were not used. Ctrl-C stops after the running step; --resume goes on from there,
-    but not of films, of which nothing is kept.
+    it closes the gap on trials that were not used. Ctrl-C stops after the running step; --resume goes on from there.
 
     [bold]Examples:[/bold]
 
@@ -371,15 +373,13 @@ def _written(out: Path) -> tuple[str, ...]:
     return (out.name, "calibration.json", "checkpoint.json", report.PAGE, report.PICTURE)
 
 
-def _check_outputs(out: Path, resume: bool) -> None:
+def _check_outputs(out: Path, kept: Path, resume: bool) -> None:
     """Refuse before the work what could not be written after it."""
     for name in _written(out):
         check_writable(out.with_name(name))
-    checkpoint = out.with_name("checkpoint.json")
-    if resume and not checkpoint.is_file():
+    if resume and not kept.exists():
         raise InputError(
-            f"{checkpoint}: expected the checkpoint of an earlier calibration to resume, "
-            "found none; leave out --resume."
+            f"{kept}: expected what an earlier calibration kept, to resume it, found nothing; leave out --resume."
         )
 
 

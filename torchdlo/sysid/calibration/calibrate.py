@@ -21,6 +21,7 @@ from torchdlo.sysid.estimation.checkpoint import Checkpoint
 from torchdlo.sysid.estimation.jobs import FitJob
 from torchdlo.sysid.estimation.levenberg_marquardt import ParameterSpace, Point
 from torchdlo.sysid.estimation.result import Calibration
+from torchdlo.sysid.estimation.result_cache import journal_of
 from torchdlo.sysid.estimation.worker_pool import Pool
 from torchdlo.sysid.model import initial_state as starts_of
 from torchdlo.sysid.model import model_file
@@ -115,7 +116,7 @@ def calibrate(
         vertices: vertices of the simulated rope; about two per marker if not given.
         rest: rest shape "straight", "given" (`rest_positions` of the recording), or "auto", whichever of the two
             predicts the train trials better.
-        checkpoint: file that keeps the best so far.
+        checkpoint: file that keeps the best so far; of films the folder of a journal.
         resume: go on from it.
         given: model to start from in place of many starts, with its effects; it says what the rest shape is.
         refined: whether to fit on with a finer mesh, and to find out what steps and mesh do to the numbers.
@@ -133,11 +134,12 @@ def calibrate(
             f"{recording.path}: method: expected {', '.join(METHODS)}, and gradient for films only, found {method!r}."
         )
     if recording.filmed:
-        if rest == "given" or resume:
-            raise InputError(f"{recording.path}: expected neither --rest given nor --resume for films.")
-        options: dict[str, Any] = {"seed": seed, "vertices": vertices, "given": given, "callback": callback}
-        options |= {"method": method}
-        return calibrate_filmed(recording, starts=min(starts, FILMED_STARTS), iterations=iterations, **options)
+        if rest == "given":
+            raise InputError(f"{recording.path}: expected no --rest given for films.")
+        options: dict[str, Any] = {"seed": seed, "vertices": vertices, "given": given, "method": method}
+        options |= {"starts": min(starts, FILMED_STARTS), "iterations": iterations}
+        with journal_of(checkpoint, recording, options, resume=resume, command="calibrate") as results:
+            return calibrate_filmed(recording, **options, callback=callback, results=results)
     begun = time.perf_counter()
     check_forces(recording)
     if rest not in ("auto", "straight", "given"):

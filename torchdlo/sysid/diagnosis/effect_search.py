@@ -43,7 +43,7 @@ from torchdlo.sysid.diagnosis.verdict import (
 from torchdlo.sysid.diagnosis.workspace import CHAIN, SILENT, Callback, Workspace
 from torchdlo.sysid.estimation.jobs import FitJob, Fitted
 from torchdlo.sysid.estimation.levenberg_marquardt import interval
-from torchdlo.sysid.estimation.result_cache import ResultCache
+from torchdlo.sysid.estimation.result_cache import ResultCache, journal_of
 from torchdlo.sysid.estimation.worker_pool import Pool
 from torchdlo.sysid.model.model_file import ModelFile
 from torchdlo.sysid.recordings import data_quality
@@ -101,18 +101,16 @@ def diagnose(
     for name in without:
         effect_library.check_known("without", name)
     if recording.filmed:
-        if resume:
-            raise InputError(f"{recording.path}: expected no --resume for films, whose diagnosis keeps no journal.")
         asked: dict[str, Any] = {
             "budget": budget,
             "seed": seed,
             "vertices": vertices,
             "given": given,
-            "without": without,
-            "workers": workers,
+            "without": tuple(without),
         }
         most = plan.pick_trials(recording, trials or BUDGETS[budget].trials)
-        return diagnose_filmed(most, **asked, callback=callback)
+        with journal_of(journal, most, asked, resume=resume) as results:
+            return diagnose_filmed(most, **asked, workers=workers, callback=callback, results=results)
     begun, report = time.perf_counter(), callback or (lambda *_: None)
     check_forces(recording)
     recording, faults = data_quality.check(recording)

@@ -6,6 +6,7 @@ that it comes to where it was stopped by reading instead of computing. Only plai
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import importlib
 import importlib.metadata
@@ -14,16 +15,16 @@ import json
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import fields, is_dataclass
+from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from torchdlo.journal import Journal
+from torchdlo.journal import Journal, Records
 from torchdlo.sysid.recordings.recording import Recording
 
-__all__ = ["ResultCache", "decode", "digest", "encode", "program"]
+__all__ = ["ResultCache", "Results", "decode", "digest", "encode", "journal_of", "program"]
 
 _DAMAGED = (
     OSError,
@@ -54,8 +55,39 @@ def digest(*things: Any) -> str:
     return found.hexdigest()
 
 
+@dataclass(frozen=True)
+class Results:
+    """Results of finished jobs, of which any process may read and write some; see `Records`."""
+
+    records: Records
+
+    def keep(self, job: Any, result: Any) -> None:
+        """Write a result down."""
+        arrays: list[np.ndarray] = []
+        plain = json.dumps(encode(result, arrays))
+        if sum(a.nbytes for a in arrays) > _LARGEST:
+            return
+        written = io.BytesIO()
+        named: dict[str, Any] = {f"a{k}": a for k, a in enumerate(arrays)}
+        np.savez(written, plain=np.array(plain), **named)
+        self.records.write(_name(job), written.getvalue())
+
+    def recall(self, job: Any) -> Any:
+        """Return the result of a job, None if it is not written down whole."""
+        content = self.records.read(_name(job))
+        if content is None:
+            return None
+        try:
+            with np.load(io.BytesIO(content), allow_pickle=False) as found:
+                arrays = dict(found)
+            return decode(json.loads(str(arrays["plain"])), arrays)
+        except _DAMAGED:
+            # A damaged file costs the time of its job, no more.
+            return None
+
+
 class ResultCache:
-    """A folder with the results of finished jobs."""
+    """A folder with the results of finished jobs, that of this process."""
 
     def __init__(
         self,
@@ -91,6 +123,7 @@ class ResultCache:
 
         # Archives of numpy begin like this; earlier versions wrote them without a hash.
         self._journal = Journal(path, mark, suffix=".npz", other=other, resume=resume, old=(b"PK",))
+        self.results = Results(self._journal.records)
 
     def close(self) -> None:
         """Let others write here."""
@@ -106,38 +139,27 @@ class ResultCache:
         """Yield index and result of every job, those that are written down first, the others as they are computed."""
         missing = []
         for k, job in enumerate(jobs):
-            kept = self.recall(job)
+            kept = self.results.recall(job)
             if kept is None:
                 missing.append(k)
             else:
                 yield k, kept
         for k, result in compute([jobs[k] for k in missing]) if missing else ():
-            self.keep(jobs[missing[k]], result)
+            self.results.keep(jobs[missing[k]], result)
             yield missing[k], result
 
-    def keep(self, job: Any, result: Any) -> None:
-        """Write a result down."""
-        arrays: list[np.ndarray] = []
-        plain = json.dumps(encode(result, arrays))
-        if sum(a.nbytes for a in arrays) > _LARGEST:
-            return
-        written = io.BytesIO()
-        named: dict[str, Any] = {f"a{k}": a for k, a in enumerate(arrays)}
-        np.savez(written, plain=np.array(plain), **named)
-        self._journal.write(_name(job), written.getvalue())
 
-    def recall(self, job: Any) -> Any:
-        """Return the result of a job, None if it is not written down whole."""
-        content = self._journal.read(_name(job))
-        if content is None:
-            return None
-        try:
-            with np.load(io.BytesIO(content), allow_pickle=False) as found:
-                arrays = dict(found)
-            return decode(json.loads(str(arrays["plain"])), arrays)
-        except _DAMAGED:
-            # A damaged file costs the time of its job, no more.
-            return None
+@contextlib.contextmanager
+def journal_of(path: Path | None, *about: Any, **how: Any) -> Iterator[Results | None]:
+    """Hold a journal while the block lasts, see `ResultCache`, and give its results; None where none is kept."""
+    if path is None:
+        yield None
+        return
+    cache = ResultCache(path, *about, **how)
+    try:
+        yield cache.results
+    finally:
+        cache.close()
 
 
 def _name(job: Any) -> str:

@@ -28,6 +28,7 @@ from torchdlo.sysid.estimation.observation import (
     half_a_picture,
     seen_by,
 )
+from torchdlo.sysid.video import fit_memory
 from torchdlo.sysid.video.filmed_problem import STRETCHES, FilmedProblem
 from torchdlo.vision.spine import curve_vectors
 
@@ -211,9 +212,15 @@ def fit(
         first = look(own, raw, own.offset, seconds, worth=lambda costs: False)
         if np.isfinite(first.costs).all():
             own.weigh(first.residual)
-    now = _improved(own, raw, iterations, seconds, tolerance, _FINEST if near else _WHOLE)
-    if tolerance <= _SHARP and not near:
-        now = _improved(own, now.raw, iterations, seconds, tolerance, _FINEST)
+    job = fit_memory.task(own, "fit", raw, iterations, seconds, tolerance, near)
+    stages = [_FINEST] if near else [_WHOLE, _FINEST] if tolerance <= _SHARP else [_WHOLE]
+    if (known := fit_memory.recall(job)) is not None:
+        raw, own.offset = known
+        return look(own, raw, own.offset, seconds, finest=stages[-1])
+    for finest in stages:
+        now = _improved(own, raw, iterations, seconds, tolerance, finest)
+        raw = now.raw
+    fit_memory.keep(job, now.raw, now.offset)
     return now
 
 

@@ -16,6 +16,7 @@ import numpy as np
 from torchdlo.sysid.estimation import levenberg_marquardt
 from torchdlo.sysid.estimation.levenberg_marquardt import ParameterSpace, Point
 from torchdlo.sysid.model.trial_batch import Start
+from torchdlo.sysid.video import fit_memory
 from torchdlo.sysid.video.filmed_fit import Fit, fit, look, total
 from torchdlo.sysid.video.filmed_problem import FilmedProblem, begin_from_balance
 
@@ -56,11 +57,16 @@ def start_window(own: FilmedProblem) -> float:
 
 def fit_starts(
     own: FilmedProblem, raw: np.ndarray, passes: int, *, seconds: float | None = None, tolerance: float = 1e-2
-) -> Fit:
-    """Improve the starts of the problem, which are set to what is found; numbers (N,) stay as they are.
+) -> np.ndarray:
+    """Improve the starts of the problem, which are set to what is found, and return their costs by trial [m], (B,).
 
-    Each trial goes its own way: what one of them gains does not hide what another one loses.
+    Numbers (N,) stay as they are. Each trial goes its own way: what one of them gains does not hide what another one
+    loses.
     """
+    job = fit_memory.task(own, "fit starts", raw, passes, seconds, tolerance)
+    if (known := fit_memory.recall(job)) is not None:
+        own.offset, costs = known
+        return costs
     own.offset = own.offset.copy()
     now = look(own, raw, own.offset, seconds, fixed=True)
     count = own.offset.shape[1]
@@ -83,7 +89,8 @@ def fit_starts(
         damping[rows] = np.where(better, np.maximum(damping[rows] / 5, 1e-6), 8 * damping[rows])
         rows = rows[~slow & (damping[rows] < 1e3)]
     own.offset = now.offset
-    return now
+    fit_memory.keep(job, now.offset, now.costs)
+    return now.costs
 
 
 def _any_less(least: np.ndarray, costs: np.ndarray) -> bool:
@@ -137,7 +144,7 @@ def restart(own: FilmedProblem, found: Fit, iterations: int, enough: float = _LO
             break
         part = own.picked(lost)
         search_starts(part, found.raw, seconds=start_window(part))
-        costs = fit_starts(part, found.raw, 8).costs
+        costs = fit_starts(part, found.raw, 8)
         better = costs < _PAYS * found.costs[lost]
         if not better.any():
             break
@@ -152,11 +159,11 @@ def _standing_out(costs: np.ndarray) -> float:
     return float(max(_STANDS_OUT * np.nanmin(costs), _SLIGHT))
 
 
-def search_starts(own: FilmedProblem, raw: np.ndarray, passes: int = 8, *, seconds: float | None = None) -> Fit:
-    """Look for better starts far from those of the problem, which are set to the best; numbers (N,) stay as they are.
+def search_starts(own: FilmedProblem, raw: np.ndarray, passes: int = 8, *, seconds: float | None = None) -> np.ndarray:
+    """Look for better starts far from those of the problem, which are set to the best; return their costs [m], (B,).
 
     What a camera does not see is how far away the rope is and how fast it comes or goes: starts on either side are
-    followed for a while, then the better half of them, and each trial keeps its best.
+    followed for a while, then the better half of them, and each trial keeps its best. Numbers (N,) stay as they are.
     """
     trials = len(own.trials)
     offset = _places(own)
@@ -164,11 +171,11 @@ def search_starts(own: FilmedProblem, raw: np.ndarray, passes: int = 8, *, secon
         copies = own.picked(np.tile(np.arange(trials), len(offset)))
         copies.offset = offset.reshape(-1, offset.shape[-1])
         found = fit_starts(copies, raw, math.ceil(share * passes), seconds=seconds)
-        costs = np.where(np.isfinite(found.costs), found.costs, np.inf).reshape(len(offset), trials)
+        costs = np.where(np.isfinite(found), found, np.inf).reshape(len(offset), trials)
         rows = np.argsort(costs, axis=0, kind="stable")[:keep] * trials + np.arange(trials)
-        offset = found.offset[rows]
+        offset = copies.offset[rows]
     own.offset = offset[0]
-    return _of(found, rows[0])
+    return found[rows[0]]
 
 
 def _places(own: FilmedProblem) -> np.ndarray:

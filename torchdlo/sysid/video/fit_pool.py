@@ -10,7 +10,9 @@ from concurrent.futures.process import BrokenProcessPool
 from typing import Any
 
 from torchdlo.errors import InputError
+from torchdlo.sysid.estimation.result_cache import Results
 from torchdlo.sysid.estimation.worker_pool import begin_worker
+from torchdlo.sysid.video import fit_memory
 
 __all__ = ["FitPool"]
 
@@ -18,12 +20,14 @@ __all__ = ["FitPool"]
 class FitPool:
     """Processes that are started when there is work for more than one."""
 
-    def __init__(self, workers: int | None = None) -> None:
+    def __init__(self, workers: int | None = None, results: Results | None = None) -> None:
         """Start nothing yet.
 
         Args:
             workers: how many; one per core if not given. One means this process.
+            results: where processes keep what fits come to.
         """
+        self._results = results
         self.workers = workers or max(1, os.cpu_count() or 1)
         self._processes: ProcessPoolExecutor | None = None
 
@@ -51,7 +55,7 @@ class FitPool:
             return
         if self._processes is None:
             context = multiprocessing.get_context("spawn")
-            self._processes = ProcessPoolExecutor(self.workers, context, begin_worker)
+            self._processes = ProcessPoolExecutor(self.workers, context, _begin, (self._results,))
         try:
             waiting: dict[Future, int] = {self._processes.submit(what, *job): k for k, job in enumerate(jobs)}
             while waiting:
@@ -63,3 +67,8 @@ class FitPool:
     def all(self, what: Callable[..., Any], jobs: Sequence[tuple]) -> list[Any]:
         """Return the results of `what` for every job, in their order."""
         return [found for _, found in sorted(self.map(what, jobs), key=lambda pair: pair[0])]
+
+
+def _begin(results: Results | None) -> None:
+    begin_worker()
+    fit_memory.remember(results)
