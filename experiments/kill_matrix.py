@@ -32,6 +32,8 @@ ROOT = Path(__file__).resolve().parents[1]
 SAMPLE = ROOT / "torchdlo" / "data" / "sample_rope"
 TRIALS, FRAMES = ("train_0", "train_1", "test_0"), 60
 """What is taken of the sample."""
+FILMED = 0.25
+"""Length of films [s]."""
 KEPT_EFFECTS = ("air_drag",)
 """What a diagnosis looks for."""
 TIMES = {"seconds", "cpu_seconds", "sha256"}
@@ -53,13 +55,27 @@ def recording(folder: Path) -> str:
     return str(folder)
 
 
-def commands(rope: str) -> dict[str, tuple[str, ...]]:
+def films(rope: str, folder: Path) -> str:
+    """Write a recording with films of another one."""
+    from torchdlo.sysid.recordings.recording import load_recording
+    from torchdlo.sysid.video.filming import film_recording
+    from torchdlo.vision.camera import looking_at
+    from torchdlo.vision.film import FilmLook
+
+    if not folder.is_dir():
+        camera = looking_at("a", [0.15, -1.35, 1.0], [0.0, 0.0, 0.88], focal=650.0)
+        film_recording(load_recording(rope), [camera], folder, FilmLook(), trials=1, seconds=FILMED)
+    return str(folder)
+
+
+def commands(rope: str, filmed: str) -> dict[str, tuple[str, ...]]:
     """Return the smallest real settings of every command."""
     from torchdlo.sysid.diagnosis.effect_library import library
 
     excluded = [word for name in library() if name not in KEPT_EFFECTS for word in ("--exclude-effect", name)]
     return {
         "calibrate": ("calibrate", rope, "--starts", "3", "--iterations", "3", "--vertices", "9", "--rest", "straight"),
+        "calibrate_films": ("calibrate", filmed, "--starts", "3", "--iterations", "2", "--vertices", "9"),
         "diagnose": ("diagnose", rope, "--workers", "1", "--vertices", "9", *excluded),
         "optimize": (
             "optimize",
@@ -250,7 +266,8 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0, help="of the moments")
     parser.add_argument("--out", default="runs/kill_matrix", help="folder for the runs and kill_matrix.json")
     given = parser.parse_args()
-    known = commands(recording(Path(given.out).resolve() / "rope"))
+    rope = recording(Path(given.out).resolve() / "rope")
+    known = commands(rope, films(rope, Path(given.out).resolve() / "films"))
     names = given.commands.split(",") if given.commands else list(known)
     if wrong := [name for name in names if name not in known]:
         parser.error(f"{', '.join(wrong)}: expected some of {', '.join(known)}")

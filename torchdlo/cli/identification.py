@@ -379,7 +379,7 @@ def _check_outputs(out: Path, kept: Path, resume: bool) -> None:
         check_writable(out.with_name(name))
     if resume and not kept.exists():
         raise InputError(
-            f"{kept}: expected what an earlier calibration kept, to resume it, found nothing; leave out --resume."
+            f"{kept}: expected what an earlier calibration kept, to resume it, found none; leave out --resume."
         )
 
 
